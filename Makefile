@@ -7,29 +7,21 @@ BUILT_FROM := pyproject.toml CMakeLists.txt $(shell find native -type f)
 SPLATPILOT := .venv/bin/splatpilot
 NATIVE := $(shell find native -name '*.hpp' -o -name '*.cpp')
 
-.PHONY: fly test lint fuzz crash docs stub messages sanitize nightly clean
+.PHONY: fly test lint docs stub messages sanitize nightly clean
 
 fly: .venv/flying
 	$(SPLATPILOT) fly --out out/fly --overwrite
 
 test: lint
-	.venv/bin/python -m pytest
+	OMP_NUM_THREADS=1 .venv/bin/python -m pytest -n auto --dist loadfile
 
 lint: .venv/installed
 	.venv/bin/ruff check .
 	.venv/bin/ruff format --check .
+	.venv/bin/python lint/words.py
+	.venv/bin/codespell
 	.venv/bin/clang-format --dry-run --Werror $(NATIVE)
 	.venv/bin/pyright
-
-# Every reader on 10,000 damaged files, or as many as CASES says, with limits of memory and time.
-CASES ?= 10000
-fuzz: .venv/installed
-	OMP_NUM_THREADS=1 PYTHONPATH=tests .venv/bin/python -m fuzz --cases $(CASES)
-
-# Commands ended in the middle, in 4 ways x 8 commands x ROUNDS, and what they lose; needs Linux.
-ROUNDS ?= 7
-crash: .venv/installed
-	PYTHONPATH=tests .venv/bin/python -m crash --rounds $(ROUNDS)
 
 # The documentation, in build/site; needs no network.
 docs: .venv/installed
@@ -52,7 +44,7 @@ sanitize: .venv/installed
 	native/sanitize.sh
 
 nightly: sanitize
-	for table in agreement losses rasterize surfels; do .venv/bin/python benchmarks/$$table.py || exit 1; done
+	for table in agreement losses rasterize; do .venv/bin/python benchmarks/$$table.py || exit 1; done
 
 clean:
 	rm -rf .venv build

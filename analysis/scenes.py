@@ -5,9 +5,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from splatpilot.analysis.reconstruction import run as reconstruction
-from splatpilot.analysis.reconstruction.measure_scene import measure_scene
+from splatpilot.analysis.reconstruction.measure_scene import METRICS, measure_scene
 from splatpilot.analysis.reconstruction.run import RenderedSceneConfig
-from splatpilot.analysis.reconstruction.scene_measures import METRICS
 from splatpilot.diagrams.worlds.scene_folder import read_scene_metadata
 from splatpilot.systems.common.config import load_config
 from splatpilot.systems.common.files import DATA, require_existing

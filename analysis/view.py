@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.geometry import Rgba
 
-from splatpilot.diagrams.flight.blocks import goal_of
+from splatpilot.diagrams.flight.blocks import goal_position
 from splatpilot.diagrams.flight.flight_diagram import empty_meshcat
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.scenarios import scenario_file
@@ -103,7 +103,7 @@ def _generated(scenario: Scenario) -> ShownPlace:
     scenario.validate()
     world = make_world(scenario.world, scenario.seed)
     start = world.p_WS if scenario.start is None else np.asarray(scenario.start, dtype=float)
-    ends = start, goal_of(scenario, world)
+    ends = start, goal_position(scenario, world)
     return _place_of(world, f"{world.name}, seed {scenario.seed}", ends)
 
 

@@ -83,13 +83,15 @@ def intrinsics(width: int, height: int) -> np.ndarray:
     return np.array([[width / 2, 0, width / 2], [0, width / 2, height / 2], [0, 0, 1.0]])
 
 
-def tensors_of(scene: GaussianScene) -> dict[str, Any]:
+def scene_tensors(scene: GaussianScene) -> dict[str, Any]:
     arrays = {name: getattr(scene, name) for name in ("means", "quats", "scales", "opacities")}
     arrays["colors"] = scene.base_colors
     return {name: torch.from_numpy(array) for name, array in arrays.items()}
 
 
-def cameras_of(X_WC: RigidTransform, width: int, height: int) -> tuple[torch.Tensor, torch.Tensor]:
+def camera_tensors(
+    X_WC: RigidTransform, width: int, height: int
+) -> tuple[torch.Tensor, torch.Tensor]:
     """viewmats (1, 4, 4) and Ks (1, 3, 3)."""
     X_CW = X_WC.inverse().GetAsMatrix4()
     return (

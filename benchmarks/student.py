@@ -1,9 +1,9 @@
-"""How fast the student learns and decides, on one core.
+"""Times how fast the student learns and plans, on one core.
 
     OMP_NUM_THREADS=1 python benchmarks/student.py [CORPUS]
 
-Samples a second, with and without frozen modules, need a corpus; ticks of flight do not. Times are
-processor time, the least of a few repeats.
+Samples per second, with and without frozen modules, need a corpus. Times are CPU time, the minimum
+of a few repeats.
 """
 
 import sys
@@ -17,15 +17,14 @@ from harness import seconds
 from splatpilot.systems.policies.student import StudentNetwork, StudentSpec, plan
 from splatpilot.systems.vehicle.quadrotor import hover_state
 from splatpilot.systems.vehicle.state import pose_from_state
-from splatpilot.training.policies.student_config import StudentDepthTraining
 from splatpilot.training.policies.student_network import StudentModule
 from splatpilot.training.policies.train import step_optimizer
-from splatpilot.training.policies.train_student import StudentTrainer
+from splatpilot.training.policies.train_student import StudentDepthTraining, StudentTrainer
 
 
 def tick_time(observation: str, width: int, height: int) -> float:
-    """Of a decision [s], from the camera's image to the hypotheses."""
-    spec, rng = StudentSpec(observation, width, height), np.random.default_rng(0)
+    """Times planning [s], from the camera's image to the hypotheses."""
+    spec, rng = StudentSpec(observation, width, height, way_version=2), np.random.default_rng(0)
     weights = {name: w.numpy() for name, w in StudentModule(spec).state_dict().items()}
     network = StudentNetwork(spec, weights)
     color = rng.integers(0, 256, (height, width, 3)).astype(np.uint8)
@@ -35,7 +34,7 @@ def tick_time(observation: str, width: int, height: int) -> float:
 
 
 def samples_per_second(corpus: str, frozen: int, features: str) -> float:
-    """Of training from depth, optimiser and all; features of frozen modules are there already."""
+    """Times training from depth with the optimizer, given the features of frozen modules."""
     config = StudentDepthTraining(corpora=[corpus], frozen=frozen, features=features)
     trainer = StudentTrainer(config)
     optimizer = torch.optim.AdamW(trainer.network.parameters())

@@ -9,10 +9,11 @@ import numpy as np
 import torch
 from harness import seconds
 
-from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK, decide_acceleration
+from splatpilot.systems.policies.base import Observation
+from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK, decide, depth_grid
 from splatpilot.systems.policies.recurrent_network import RecurrentNetwork
 from splatpilot.systems.vehicle.quadrotor import hover_state
-from splatpilot.systems.vehicle.state import pose_from_state
+from splatpilot.systems.vehicle.state import QuadrotorState, pose_from_state
 from splatpilot.training.policies.evaluation import render_depth
 from splatpilot.training.policies.rollouts import DifferentiableRollout, RolloutConfig
 from splatpilot.training.policies.train import step_optimizer
@@ -52,12 +53,13 @@ def main() -> None:
         DIFFAERO_NETWORK,
         {name: rng.normal(size=s) for name, s in DIFFAERO_NETWORK.weight_shapes().items()},
     )
-    X_WB, depth = pose_from_state(hover_state([0, 0, 2])), rng.uniform(0.5, 15.0, (36, 64))
+    state, depth = hover_state([0, 0, 2]), rng.uniform(0.5, 15.0, (36, 64))
     memory, p_WG = network.initial_hidden(), np.array([9.0, 0.0, 2.0])
+    seen = Observation(0.0, pose_from_state(state), QuadrotorState.of(state), p_WG, depth)
 
     def tick() -> None:
         for _ in range(100):
-            decide_acceleration(network, depth, X_WB, np.zeros(3), p_WG, 2.0, memory)
+            decide(network, depth_grid(seen.image), seen, 2.0, memory)
 
     print(f"one tick of diffaero in flight: {10.0 * seconds(tick, 5):.3f} ms")
 

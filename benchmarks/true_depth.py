@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 from pydrake.systems.sensors import ImageDepth32F
 
-from splatpilot.analysis.reconstruction.scene_measures import SceneViews
+from splatpilot.analysis.reconstruction.measure_scene import SceneViews
 from splatpilot.diagrams.flight.flight import fly
 from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.flight.sensors import make_camera
-from splatpilot.diagrams.worlds.solids.solid import Blueprint
+from splatpilot.diagrams.worlds.solids.solid import WorldSpec
 from splatpilot.diagrams.worlds.solids.surfaces import merge
 from splatpilot.diagrams.worlds.world import World
-from splatpilot.diagrams.worlds.world_registry import make_blueprint, make_world
+from splatpilot.diagrams.worlds.world_registry import make_spec, make_world
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.splats.baked_scene import BakedScene
@@ -46,11 +46,11 @@ class TrueDepth:
     is there is not known.
     """
 
-    def __init__(self, blueprint: Blueprint) -> None:
-        self._lower_W, self._upper_W = blueprint.lower_W - _BEYOND, blueprint.upper_W + _BEYOND
-        shapes = [solid.shape for solid in (*blueprint.solids, *blueprint.scenery)]
+    def __init__(self, spec: WorldSpec) -> None:
+        self._lower_W, self._upper_W = spec.lower_W - _BEYOND, spec.upper_W + _BEYOND
+        shapes = [solid.shape for solid in (*spec.solids, *spec.scenery)]
         self._geometry = ShapeGeometry([shapes])
-        scenery = blueprint.surroundings()
+        scenery = spec.surroundings()
         self._scenery = BakedScene(merge(scenery)) if scenery else None
 
     def image(self, camera: OnboardCamera, X_WC: RigidTransform) -> NDArray[np.floating]:
@@ -83,7 +83,7 @@ def frames_along_flight(
         ValueError: for worlds that are not generated or cannot be made.
         InfeasibleFlightError: for flights that cannot be flown.
     """
-    truth = TrueDepth(make_blueprint(scenario.world, scenario.seed))
+    truth = TrueDepth(make_spec(scenario.world, scenario.seed))
     world = make_world(scenario.world, scenario.seed)
     poses = _poses_along_flight(scenario, world, count)
     frames = []

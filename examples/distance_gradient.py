@@ -4,8 +4,8 @@
 
 A distance field answers for many points at once: how far the nearest surface is, in which direction
 that distance grows, and whether anybody knows. The gradient is the exact derivative of `distance`,
-so it can be followed, and trajectories can be optimised through it; in torch, `EsdfTorch` has the
-same with autograd. Fields come from worlds and scenes, depth images, OctoMaps and shapes.
+so it can be followed, and trajectories can be optimized through it, also in torch: `Esdf.distance`
+takes tensors. Fields come from worlds and scenes, depth images, OctoMaps and shapes.
 """
 
 import argparse

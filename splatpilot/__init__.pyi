@@ -10,6 +10,7 @@ from .systems.collision.esdf import Esdf
 from .systems.collision.esdf_collision import EsdfCollision
 from .systems.collision.field_mesh import field_mesh, write_mesh
 from .systems.common.config import dump_config, load_config
+from .systems.common.validation import Config, bounded
 from .systems.policies.hypotheses import HypothesisSelector
 from .systems.policies.planner import PrivilegedPlanner
 from .systems.sensing.noise import ObservationNoise
@@ -33,6 +34,7 @@ __all__ = [
     "BakedScene",
     "BuildFlightDiagram",
     "Capture",
+    "Config",
     "Distortion",
     "Esdf",
     "EsdfCollision",
@@ -54,6 +56,7 @@ __all__ = [
     "StateToPose",
     "World",
     "__version__",
+    "bounded",
     "dump_config",
     "field_mesh",
     "fly",

@@ -58,10 +58,6 @@ class Renderer:
     @property
     def simd(self) -> str: ...
 
-    @property
-    def seconds(self) -> dict[str, float]:
-        """Seconds that each stage of the last frame took."""
-
 def projected(renderer: Renderer, frame: Frame, opacities: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)] | None) -> tuple[Annotated[NDArray[numpy.int64], dict(shape=(None,))], Annotated[NDArray[numpy.int32], dict(shape=(None, 2))], Annotated[NDArray[numpy.float32], dict(shape=(None, 2))], Annotated[NDArray[numpy.float32], dict(shape=(None,))], Annotated[NDArray[numpy.float32], dict(shape=(None, 3))], Annotated[NDArray[numpy.float32], dict(shape=(None,))]]:
     """
     ids (n,), radii (n, 2), means (n, 2), depths (n,), conics (n, 3) and opacities (n,) of
@@ -72,6 +68,18 @@ def render(renderer: Renderer, *, means: Annotated[NDArray[numpy.float32], dict(
     """
     Writes colour (3 channels), depth (1) or both (4) by the shape of image, and alpha. With
     keep, a backward pass can start from the frame.
+    """
+
+def raster_backward(renderer: Renderer, frame: Frame, *, v_image: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)], v_alpha: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)], image: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)], alpha: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)], background: Annotated[NDArray[numpy.float32], dict(shape=(3), order='C', device='cpu', writable=False)], expected_depth: bool, v_splats: Annotated[NDArray[numpy.float32], dict(shape=(None, 16), order='C', device='cpu')], v_means2d: Annotated[NDArray[numpy.float32], dict(shape=(None, 2), order='C', device='cpu')]) -> int:
+    """
+    Writes the gradients of a frame's splats; returns how many (Gaussian, 4x4 block) were
+    composited. v_image etc. are derivatives of the loss by image etc.
+    """
+
+def project_backward(renderer: Renderer, frame: Frame, *, means: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], quats: Annotated[NDArray[numpy.float32], dict(shape=(None, 4), order='C', device='cpu', writable=False)], scales: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], opacities: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], colors: Annotated[NDArray[numpy.float32], dict(shape=(None, None, 3), order='C', device='cpu', writable=False)], sh_degree: int, v_splats: Annotated[NDArray[numpy.float32], dict(shape=(None, 16), order='C', device='cpu', writable=False)], v_means2d: Annotated[NDArray[numpy.float32], dict(shape=(None, 2), order='C', device='cpu', writable=False)], v_means: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu')], v_quats: Annotated[NDArray[numpy.float32], dict(shape=(None, 4), order='C', device='cpu')], v_scales: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu')], v_opacities: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu')], v_colors: Annotated[NDArray[numpy.float32], dict(shape=(None, None, 3), order='C', device='cpu')], overwrite: bool, overwrite_colors: bool) -> Annotated[NDArray[numpy.float64], dict(shape=(5, 3))]:
+    """
+    Adds to, or overwrites, the gradients of the frame's Gaussians. Returns (5, 3) those by
+    R_CW with the camera's centre held, by p_C and by p_W - centre, summed over Gaussians.
     """
 
 class BakedScene:
@@ -85,26 +93,29 @@ class BakedScene:
     def recolored(self, sh: Annotated[NDArray[numpy.float32], dict(shape=(None, None, 3), order='C', device='cpu', writable=False)], sh_degree: int) -> BakedScene:
         """The same Gaussians in other colours."""
 
-def render_baked(scene: BakedScene, renderer: Renderer, *, means: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], quats: Annotated[NDArray[numpy.float32], dict(shape=(None, 4), order='C', device='cpu', writable=False)], scales: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], opacities: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], sh: Annotated[NDArray[numpy.float32], dict(shape=(None, None, 3), order='C', device='cpu', writable=False)], sh_degree: int, K: Annotated[NDArray[numpy.float64], dict(shape=(3, 3), order='C', device='cpu', writable=False)], X_CW: Annotated[NDArray[numpy.float64], dict(shape=(4, 4), order='C', device='cpu', writable=False)], width: int, height: int, near_plane: float, far_plane: float, eps2d: float, background: Annotated[NDArray[numpy.float32], dict(shape=(3), order='C', device='cpu', writable=False)], color: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')], depth: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')], alpha: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')], max_depth: float, distortion: int, lens: Annotated[NDArray[numpy.float64], dict(shape=(13), order='C', device='cpu', writable=False)]) -> None:
+def render_baked(scene: BakedScene, renderer: Renderer, *, means: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], quats: Annotated[NDArray[numpy.float32], dict(shape=(None, 4), order='C', device='cpu', writable=False)], scales: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], opacities: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], sh: Annotated[NDArray[numpy.float32], dict(shape=(None, None, 3), order='C', device='cpu', writable=False)], sh_degree: int, K: Annotated[NDArray[numpy.float64], dict(shape=(3, 3), order='C', device='cpu', writable=False)], X_CW: Annotated[NDArray[numpy.float64], dict(shape=(4, 4), order='C', device='cpu', writable=False)], width: int, height: int, near_plane: float, far_plane: float, eps2d: float, background: Annotated[NDArray[numpy.float32], dict(shape=(3), order='C', device='cpu', writable=False)], color: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')] | None, depth: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')], alpha: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')] | None, max_depth: float, distortion: int, lens: Annotated[NDArray[numpy.float64], dict(shape=(13), order='C', device='cpu', writable=False)]) -> None:
     """
-    Writes colour, median depth and alpha of the scene and of Gaussians among it.
-    """
-
-def render_baked_depth(scene: BakedScene, renderer: Renderer, *, means: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], quats: Annotated[NDArray[numpy.float32], dict(shape=(None, 4), order='C', device='cpu', writable=False)], scales: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], opacities: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], sh: Annotated[NDArray[numpy.float32], dict(shape=(None, None, 3), order='C', device='cpu', writable=False)], sh_degree: int, K: Annotated[NDArray[numpy.float64], dict(shape=(3, 3), order='C', device='cpu', writable=False)], X_CW: Annotated[NDArray[numpy.float64], dict(shape=(4, 4), order='C', device='cpu', writable=False)], width: int, height: int, near_plane: float, far_plane: float, max_depth: float, depth: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')], distortion: int, lens: Annotated[NDArray[numpy.float64], dict(shape=(13), order='C', device='cpu', writable=False)]) -> None:
-    """Writes the median depth alone."""
-
-def photometric_loss(*, rendered: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None, None), order='C', device='cpu', writable=False)], target: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None, None), order='C', device='cpu', writable=False)], ssim_weight: float, gradient: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None, None), order='C', device='cpu')] | None, simd: str = '') -> float:
-    """
-    (1 - w) L1 + w (1 - SSIM) of images (N, H, W, C); writes the gradient unless None.
+    Writes the median depth, and unless they are None colour and alpha, of the scene and of
+    Gaussians among it.
     """
 
-def log_depth_loss(*, rendered: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], depth: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], weights: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)] | None, epsilon: float, far: float, gradient: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu')] | None, simd: str = '') -> float:
+class SurfelFrame:
+    """What remains of a rendered image of surfels."""
+
+def render_surfels(renderer: Renderer, *, means: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], quats: Annotated[NDArray[numpy.float32], dict(shape=(None, 4), order='C', device='cpu', writable=False)], scales: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], opacities: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], colors: Annotated[NDArray[numpy.float32], dict(shape=(None, None, 3), order='C', device='cpu', writable=False)], sh_degree: int, K: Annotated[NDArray[numpy.float64], dict(shape=(3, 3), order='C', device='cpu', writable=False)], X_CW: Annotated[NDArray[numpy.float64], dict(shape=(4, 4), order='C', device='cpu', writable=False)], width: int, height: int, near_plane: float, far_plane: float, radius_clip: float, color: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')], normal: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')], depth: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')], alpha: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')], median: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')], distort: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')] | None, keep: bool) -> SurfelFrame:
+    """Writes images; with keep, a backward pass can start from the frame."""
+
+def surfels_backward(renderer: Renderer, frame: SurfelFrame, *, means: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], quats: Annotated[NDArray[numpy.float32], dict(shape=(None, 4), order='C', device='cpu', writable=False)], scales: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], opacities: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], colors: Annotated[NDArray[numpy.float32], dict(shape=(None, None, 3), order='C', device='cpu', writable=False)], sh_degree: int, v_color: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)] | None, v_normal: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)] | None, v_depth: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)] | None, v_alpha: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)] | None, v_median: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)] | None, v_distort: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)] | None, v_means: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu')], v_quats: Annotated[NDArray[numpy.float32], dict(shape=(None, 4), order='C', device='cpu')], v_scales: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu')], v_opacities: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu')], v_colors: Annotated[NDArray[numpy.float32], dict(shape=(None, None, 3), order='C', device='cpu')], overwrite: bool, overwrite_colors: bool) -> Annotated[NDArray[numpy.float64], dict(shape=(5, 3))]:
     """
-    Mean weighted |log(rendered / depth)| over valid pixels; writes the gradient unless None.
+    Adds to, or overwrites, the gradients of the frame's surfels; returns what
+    project_backward does.
     """
 
-def adam_step(*, parameters: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu')], gradients: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], means: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu')], squares: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu')], rate: float, step: int, mean_decay: float, square_decay: float, epsilon: float, simd: str = '') -> None:
-    """Moves parameters, and the averages of gradients and of their squares."""
+def projected_surfels(renderer: Renderer, frame: SurfelFrame) -> tuple[Annotated[NDArray[numpy.int64], dict(shape=(None,))], Annotated[NDArray[numpy.int32], dict(shape=(None, 2))], Annotated[NDArray[numpy.float32], dict(shape=(None, 2))], Annotated[NDArray[numpy.float32], dict(shape=(None,))], Annotated[NDArray[numpy.float32], dict(shape=(None, 3))]]:
+    """
+    ids (n,), radii (n, 2), means (n, 2), depths (n,) and normals in the world (n, 3) of a
+    frame's surfels, in the order of the input.
+    """
 
 def splat_shapes(*, log_scales: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], logit_opacities: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], smallest: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], scales: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu')], opacities: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu')], simd: str = '') -> None:
     """
@@ -117,6 +128,16 @@ def splat_shapes_backward(*, scales: Annotated[NDArray[numpy.float32], dict(shap
 def surface_loss(*, means: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], quats: Annotated[NDArray[numpy.float32], dict(shape=(None, 4), order='C', device='cpu', writable=False)], scales: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], seen: Annotated[NDArray[numpy.int64], dict(shape=(None,), order='C', device='cpu', writable=False)], draws: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], X_CW: Annotated[NDArray[numpy.float32], dict(shape=(4, 4), order='C', device='cpu', writable=False)], K: Annotated[NDArray[numpy.float32], dict(shape=(3, 3), order='C', device='cpu', writable=False)], depth: Annotated[NDArray[numpy.float32], dict(shape=(None, None), order='C', device='cpu', writable=False)], reach: float, nearest: float, far: float, v_means: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu')], v_quats: Annotated[NDArray[numpy.float32], dict(shape=(None, 4), order='C', device='cpu')], v_scales: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu')]) -> float:
     """
     Mean |log(z / depth)| of points drawn from the Gaussians that are seen; adds gradients.
+    """
+
+def photometric_loss(*, rendered: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None, None), order='C', device='cpu', writable=False)], target: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None, None), order='C', device='cpu', writable=False)], ssim_weight: float, gradient: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None, None), order='C', device='cpu')] | None, simd: str = '') -> float:
+    """
+    (1 - w) L1 + w (1 - SSIM) of images (N, H, W, C); writes the gradient unless None.
+    """
+
+def log_depth_loss(*, rendered: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], depth: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], weights: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)] | None, epsilon: float, far: float, gradient: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu')] | None, simd: str = '') -> float:
+    """
+    Mean weighted |log(rendered / depth)| over valid pixels; writes the gradient unless None.
     """
 
 class ShapeWorlds:
@@ -140,29 +161,17 @@ class ShapeWorlds:
         Writes the distances (N, K) of the K nearest shapes and their gradients (N, K, 3).
         """
 
-def descend(*, times: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)], lower_W: Annotated[NDArray[numpy.float64], dict(shape=(3), order='C', device='cpu', writable=False)], voxel_size: float, p_WG: Annotated[NDArray[numpy.float64], dict(shape=(3), order='C', device='cpu', writable=False)], p_WQ: Annotated[NDArray[numpy.float64], dict(shape=(3), order='C', device='cpu', writable=False)], step: float, length: float, way: Annotated[NDArray[numpy.float64], dict(shape=(None, 4), order='C', device='cpu')]) -> int:
-    """
-    Writes points and the length up to them, rows (4,), down the gradient of `times` from
-    p_WQ to p_WG or until `length` is covered; returns how many.
-    """
-
 class ShapeField:
     """The distance field of analytic shapes."""
 
     def __init__(self, *, shapes: Annotated[NDArray[numpy.float64], dict(shape=(None, 15), order='C', device='cpu', writable=False)], kinds: Annotated[NDArray[numpy.uint8], dict(shape=(None,), order='C', device='cpu', writable=False)]) -> None:
         """Rows and kinds as of `ShapeWorlds`."""
 
-    def nearest(self, *, p_WQ: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C', device='cpu', writable=False)], distances: Annotated[NDArray[numpy.float64], dict(shape=(None,), order='C', device='cpu')], shapes: Annotated[NDArray[numpy.int64], dict(shape=(None,), order='C', device='cpu')]) -> None:
+    def nearest(self, *, p_WQ: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C', device='cpu', writable=False)], distances: Annotated[NDArray[numpy.float64], dict(shape=(None,), order='C', device='cpu')], gradients: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C', device='cpu')] | None = None) -> None:
         """
-        Writes the least signed distances (N,) of N points, infinite where there is no shape,
-        and the shapes that have them, the first of several, -1 where there is none.
+        Writes the signed distances (N,) of N points to the nearest shape and their gradients
+        (N, 3); infinite and zero where there is no shape.
         """
-
-def grid_distances(*, grid: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)], lower_W: Annotated[NDArray[numpy.float64], dict(shape=(3), order='C', device='cpu', writable=False)], upper_W: Annotated[NDArray[numpy.float64], dict(shape=(3), order='C', device='cpu', writable=False)], voxel_size: float, occupied_outside: bool, p_WQ: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C', device='cpu', writable=False)], distances: Annotated[NDArray[numpy.float64], dict(shape=(None,), order='C', device='cpu')]) -> None:
-    """
-    Writes the distances (N,) at N points: between the centres of voxels, those of the grid
-    interpolated trilinearly; outside, minus the way to the box, or NaN.
-    """
 
 class GridWorlds:
     """Regular grids of several worlds, one of each."""
@@ -180,44 +189,15 @@ class GridWorlds:
     def interpolate(self, *, p_WQ: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], world: Annotated[NDArray[numpy.int64], dict(shape=(None,), order='C', device='cpu', writable=False)], values: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu')], gradients: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu')]) -> None:
         """Writes the trilinear interpolants (N,) and their gradients (N, 3)."""
 
-def raster_backward(renderer: Renderer, frame: Frame, *, v_image: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)], v_alpha: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)], image: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)], alpha: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)], background: Annotated[NDArray[numpy.float32], dict(shape=(3), order='C', device='cpu', writable=False)], expected_depth: bool, absolute: bool, v_splats: Annotated[NDArray[numpy.float32], dict(shape=(None, 16), order='C', device='cpu')], v_means2d: Annotated[NDArray[numpy.float32], dict(shape=(None, 2), order='C', device='cpu')]) -> int:
+def grid_distances(*, grid: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)], lower_W: Annotated[NDArray[numpy.float64], dict(shape=(3), order='C', device='cpu', writable=False)], upper_W: Annotated[NDArray[numpy.float64], dict(shape=(3), order='C', device='cpu', writable=False)], voxel_size: float, occupied_outside: bool, p_WQ: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C', device='cpu', writable=False)], distances: Annotated[NDArray[numpy.float64], dict(shape=(None,), order='C', device='cpu')], gradients: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C', device='cpu')] | None = None) -> None:
     """
-    Writes the gradients of a frame's splats; returns how many (Gaussian, 4x4 block) were
-    composited. v_image etc. are derivatives of the loss by image etc.
-    """
-
-def project_backward(renderer: Renderer, frame: Frame, *, means: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], quats: Annotated[NDArray[numpy.float32], dict(shape=(None, 4), order='C', device='cpu', writable=False)], scales: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], opacities: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], colors: Annotated[NDArray[numpy.float32], dict(shape=(None, None, 3), order='C', device='cpu', writable=False)], sh_degree: int, v_splats: Annotated[NDArray[numpy.float32], dict(shape=(None, 16), order='C', device='cpu', writable=False)], v_means2d: Annotated[NDArray[numpy.float32], dict(shape=(None, 2), order='C', device='cpu', writable=False)], v_means: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu')], v_quats: Annotated[NDArray[numpy.float32], dict(shape=(None, 4), order='C', device='cpu')], v_scales: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu')], v_opacities: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu')], v_colors: Annotated[NDArray[numpy.float32], dict(shape=(None, None, 3), order='C', device='cpu')], overwrite: bool, overwrite_colors: bool) -> Annotated[NDArray[numpy.float64], dict(shape=(5, 3))]:
-    """
-    Adds to, or overwrites, the gradients of the frame's Gaussians. Returns (5, 3) those by
-    R_CW with the camera's centre held, by p_C and by p_W - centre, summed over Gaussians.
+    Writes the distances (N,) at N points and their gradients (N, 3): between the centers of
+    voxels the trilinear interpolant of the grid; outside, minus the distance to the box, or
+    NaN with a gradient of zero.
     """
 
-def multiply_add(renderer: Renderer, rounds: int) -> tuple[float, int]:
-    """Does float multiply-adds; returns a sum and how many they were."""
-
-class SurfelFrame:
-    """What remains of a rendered image of surfels."""
-
-def render_surfels(renderer: Renderer, *, means: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], quats: Annotated[NDArray[numpy.float32], dict(shape=(None, 4), order='C', device='cpu', writable=False)], scales: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], opacities: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], colors: Annotated[NDArray[numpy.float32], dict(shape=(None, None, 3), order='C', device='cpu', writable=False)], sh_degree: int, K: Annotated[NDArray[numpy.float64], dict(shape=(3, 3), order='C', device='cpu', writable=False)], X_CW: Annotated[NDArray[numpy.float64], dict(shape=(4, 4), order='C', device='cpu', writable=False)], width: int, height: int, near_plane: float, far_plane: float, radius_clip: float, color: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')], normal: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')], depth: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')], alpha: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')], median: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')], distort: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')] | None, keep: bool) -> SurfelFrame:
-    """Writes images; with keep, a backward pass can start from the frame."""
-
-def surfels_backward(renderer: Renderer, frame: SurfelFrame, *, means: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], quats: Annotated[NDArray[numpy.float32], dict(shape=(None, 4), order='C', device='cpu', writable=False)], scales: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], opacities: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], colors: Annotated[NDArray[numpy.float32], dict(shape=(None, None, 3), order='C', device='cpu', writable=False)], sh_degree: int, v_color: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)] | None, v_normal: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)] | None, v_depth: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)] | None, v_alpha: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)] | None, v_median: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)] | None, v_distort: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)] | None, v_means: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu')], v_quats: Annotated[NDArray[numpy.float32], dict(shape=(None, 4), order='C', device='cpu')], v_scales: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu')], v_opacities: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu')], v_colors: Annotated[NDArray[numpy.float32], dict(shape=(None, None, 3), order='C', device='cpu')]) -> Annotated[NDArray[numpy.float64], dict(shape=(5, 3))]:
+def descend(*, times: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)], lower_W: Annotated[NDArray[numpy.float64], dict(shape=(3), order='C', device='cpu', writable=False)], voxel_size: float, p_WG: Annotated[NDArray[numpy.float64], dict(shape=(3), order='C', device='cpu', writable=False)], p_WQ: Annotated[NDArray[numpy.float64], dict(shape=(3), order='C', device='cpu', writable=False)], step: float, length: float, way: Annotated[NDArray[numpy.float64], dict(shape=(None, 4), order='C', device='cpu')]) -> int:
     """
-    Adds to the gradients of the frame's surfels. Returns (5, 3) those of the camera: by R_CW,
-    by t_CW and by the camera's centre.
-    """
-
-def projected_surfels(renderer: Renderer, frame: SurfelFrame) -> tuple[Annotated[NDArray[numpy.int64], dict(shape=(None,))], Annotated[NDArray[numpy.int32], dict(shape=(None, 2))], Annotated[NDArray[numpy.float32], dict(shape=(None, 2))], Annotated[NDArray[numpy.float32], dict(shape=(None,))], Annotated[NDArray[numpy.float32], dict(shape=(None, 3))]]:
-    """
-    ids (n,), radii (n, 2), means (n, 2), depths (n,) and normals in the world (n, 3) of a
-    frame's surfels, in the order of the input.
-    """
-
-def render_projected(renderer: Renderer, *, means2d: Annotated[NDArray[numpy.float64], dict(shape=(None, 2), order='C', device='cpu', writable=False)], covariances: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C', device='cpu', writable=False)], depths: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], opacities: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], colors: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], width: int, height: int, radius_clip: float, depth_mode: DepthMode, background: Annotated[NDArray[numpy.float32], dict(shape=(3), order='C', device='cpu', writable=False)], image: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')], alpha: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')], keep: bool) -> Frame:
-    """As render, of Gaussians that are projected."""
-
-def splat_factors(renderer: Renderer, frame: Frame) -> Annotated[NDArray[numpy.float32], dict(shape=(None, 3))]:
-    """
-    (n, 3) ux, uy, vy of a frame's splats: u = ux dx + uy dy and v = vy dy make the
-    exponent, in base 2, -u^2 - v^2.
+    Writes points and the length up to them, rows (4,), down the gradient of `times` from
+    p_WQ to p_WG or until `length` is covered; returns how many.
     """

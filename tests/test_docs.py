@@ -113,7 +113,7 @@ def defaults(words: list[str], options: Namespace) -> Any:
 def hedgehop(monkeypatch):
     """What the example package adds is known, as it is where that is installed."""
     for registry in (POLICIES, SENSORS, WORLDS):
-        monkeypatch.setattr(registry, "_kinds", dict(registry._entries))
+        monkeypatch.setattr(registry, "_entries", dict(registry._entries))
     monkeypatch.syspath_prepend(str(ROOT / "examples" / "hedgehop"))
     importlib.import_module("hedgehop.climber")
     importlib.import_module("hedgehop.hedges")

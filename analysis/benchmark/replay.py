@@ -1,4 +1,4 @@
-"""`splatpilot replay`: one flight of a study, flown again."""
+"""`splatpilot replay`: flies one flight of a study again."""
 
 import platform
 from collections.abc import Sequence
@@ -27,14 +27,14 @@ from splatpilot.systems.visualization.video import VideoRecorder
 
 
 class Agreement(NamedTuple):
-    """How a flight agrees with its record."""
+    """Agreement of a flight with its record."""
 
     exact: bool
-    """Whether they are equal to the last bit."""
+    """Whether they are bitwise identical."""
     deviation: float
-    """[m], the greatest distance between them at one time, as long as both last."""
+    """[m], maximum distance at the same time."""
     outcome: str
-    """How the flight ended this time."""
+    """Of this flight."""
 
 
 def run(
@@ -53,14 +53,14 @@ def run(
     Args:
         study: the folder.
         id: of the flight, as in `rollouts.csv`.
-        out: folder for what is filmed; `replays/ID` in the study by default.
-        meshcat: writes `flight.html`, a page to watch it in.
-        video: writes `flight.mp4`, what the onboard camera saw.
-        overwrite: what an earlier replay has left in `out`.
+        out: folder for page and video; `replays/ID` in the study by default.
+        meshcat: writes `flight.html`, a page with the flight.
+        video: writes `flight.mp4` of the onboard camera.
+        overwrite: replaces an earlier replay in `out`.
 
     Raises:
-        FileExistsError: if that is there and not to be overwritten.
-        FileNotFoundError: if there is no study, or the flight is not there yet.
+        FileExistsError: if there is an earlier replay, and not `overwrite`.
+        FileNotFoundError: if there is no study, or the flight is missing.
         ValueError: if the study has no such flight, or its file is damaged.
     """
     folder = StudyFolder(study)
@@ -88,7 +88,7 @@ def run(
     result = compare(flight, recorded, row["digest"])
     print(f"{id}: {result.outcome} after {flight.times[-1]:.2f} s")
     if result.exact:
-        print("The replay equals the recorded flight to the last bit.")
+        print("The replay is bitwise identical to the recorded flight.")
     else:
         print(
             f"THE REPLAY DIFFERS from the recorded flight ({row['outcome']}) by up to "
@@ -96,7 +96,7 @@ def run(
         )
     if filmed:
         files = {"flight.html": meshcat, "flight.mp4": video}
-        written = [name for name, wanted in files.items() if wanted]
+        written = [name for name, write in files.items() if write]
         print(f"Wrote {' and '.join(written)} in {out}")
     return result
 
@@ -105,23 +105,21 @@ def overlay(
     *, study: Path, ids: Sequence[str], out: Path | None = None, overwrite: bool = False
 ) -> Path:
     """
-    Writes a page that shows several recorded flights through one world at once, told apart by
-    colour. Nothing is flown again, so it has neither plans nor what cameras saw.
+    Writes a page with several recorded flights through one world, in different colors, without
+    plans and camera images.
 
     Args:
         study: the folder.
         ids: of the flights, as in `rollouts.csv`.
         out: folder for `flights.html`; `replays/FIRST-ID` in the study by default.
-        overwrite: that page, if it is there.
+        overwrite: replaces the page.
 
     Returns:
         The page.
 
     Raises:
-        FileExistsError: if the page is there and not to be overwritten.
-        FileNotFoundError: if there is no study, or a flight is not there yet.
-        ValueError: if the study has no such flight, its file is damaged, or two flights are of
-            different scenarios or seeds.
+        FileExistsError, FileNotFoundError, ValueError: as `run`, or for flights of different
+            scenarios or seeds.
     """
     folder = StudyFolder(study)
     specs = [find_flight(folder, id) for id in ids]
@@ -153,12 +151,7 @@ def overlay(
 
 
 def find_flight(folder: StudyFolder, id: str) -> RolloutSpec:
-    """
-    The flight of a study that has this name.
-
-    Raises:
-        ValueError: if there is none.
-    """
+    """Finds a flight of a study by its name."""
     specs = {spec.id: spec for spec in folder.config().rollouts()}
     if id not in specs:
         raise ValueError(
@@ -169,40 +162,38 @@ def find_flight(folder: StudyFolder, id: str) -> RolloutSpec:
 
 
 def _record(folder: StudyFolder, spec: RolloutSpec) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """`StudyFolder.read`, which says what to do about a flight that is not there yet."""
+    """Reads a flight; the error of a missing one has a remedy."""
     try:
         return folder.read(spec)
     except FileNotFoundError:
         raise FileNotFoundError(
-            f"{spec.id} has not been flown yet in {folder.path}; run the study again, it goes on"
+            f"{spec.id} has not been flown yet in {folder.path}; run the study again, it resumes"
         ) from None
 
 
 def _likely_reason(folder: StudyFolder, spec: RolloutSpec, scenario: Scenario) -> str:
-    """Why a flight came out otherwise than in the study: its program, its processor or its policy,
-    in one sentence without the full stop."""
+    """Returns the likely reason of a difference: program, machine or policy."""
     recorded = folder.program()
     for name, version in (program() | foreign_code([scenario])).items():
         if recorded.get(name) != version:
             return f"It was flown by {name} {recorded.get(name, 'unknown')}, this is {version}"
-    host = folder.read_timing(spec.id).get("host", "a machine that is not known")
+    host = folder.read_timing(spec.id).get("host", "an unknown machine")
     if host != platform.node():
         return (
             f"It was flown on {host}, this is {platform.node()}: another C library, or a processor "
             "without AVX2, rounds differently"
         )
     return (
-        f"Program and machine are those that flew it: {spec.policy} keeps state outside of the "
-        "Context, or draws numbers without the seed"
+        f"It was flown by this program and machine: {spec.policy} keeps state outside of the "
+        "Context, or draws random numbers without the seed"
     )
 
 
 def compare(flight: Flight, recorded: dict[str, np.ndarray], recorded_digest: str) -> Agreement:
-    """Compares a flight with the arrays and the digest that a study kept."""
+    """Compares a flight with the arrays and the digest in a study."""
     common = min(len(flight.times), len(recorded["times"]))
     flown, before = (
         QuadrotorState.of(states[:common]).p_WB for states in (flight.states, recorded["states"])
     )
-    offsets = flown - before
-    deviation = float(np.linalg.norm(offsets, axis=1).max())
+    deviation = float(np.linalg.norm(flown - before, axis=1).max())
     return Agreement(digest(flight) == recorded_digest, deviation, str(flight.outcome))

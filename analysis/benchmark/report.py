@@ -1,19 +1,16 @@
-"""The report of a study: one HTML file that needs nothing else."""
+"""The report of a study: one HTML file without external resources."""
 
-import io
+import base64
 import math
+from collections.abc import Callable
 from html import escape
-from pathlib import Path
 from typing import Any
 
-import matplotlib
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from splatpilot.analysis.benchmark import html_page
-from splatpilot.analysis.benchmark.external import external_section, external_table
+from splatpilot.analysis.benchmark.external import SOURCES, external_table
 from splatpilot.analysis.benchmark.study import RolloutSpec, StudyConfig
 from splatpilot.analysis.benchmark.study_folder import StudyFolder, kept_flights, kept_scenario
 from splatpilot.analysis.benchmark.tables import (
@@ -21,13 +18,15 @@ from splatpilot.analysis.benchmark.tables import (
     IN_DISTRIBUTION,
     PAPER_FLIGHTS,
     PaperRow,
+    Row,
     compare,
     mean_of,
     paper_rows,
     select,
     success_summary,
 )
-from splatpilot.diagrams.flight.blocks import goal_of
+from splatpilot.analysis.output import write_png
+from splatpilot.diagrams.flight.blocks import goal_position
 from splatpilot.diagrams.worlds.scene_folder import SceneSource
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import make_world
@@ -36,73 +35,323 @@ from splatpilot.systems.common.seeds import SPLIT_NAMES, describe_seeds
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 from splatpilot.systems.vehicle.state import QuadrotorState
 
-matplotlib.use("Agg")
-
 _COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8C6D31")
 _MARKERS = "osD^vP*X"
-_OBSTACLE, _TOO_NEAR, _SPACING = "#5b5f66", "#d9dbde", 0.05  # the last in [m]
+_OBSTACLE, _BLOCKED = "#5b5f66", "#d9dbde"
+_SPACING = 0.05  # [m], of samples of the distance field
+_STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; color: #1c1e21; max-width: 1360px; margin: 2em auto;
+       padding: 0 1em; }
+h1 { font-size: 1.7em; } h2 { font-size: 1.25em; margin-top: 2em; }
+table { display: block; overflow-x: auto; border-collapse: collapse;
+        font-variant-numeric: tabular-nums; margin: .6em 0; }
+th, td { padding: .25em .5em; white-space: nowrap; text-align: right;
+         border-bottom: 1px solid #e3e5e8; }
+th:first-child, td:first-child { text-align: left; }
+th { background: #f4f5f7; font-weight: 600; white-space: normal; }
+img { max-width: 100%; } code { background: #f4f5f7; padding: .1em .3em; font-size: 13px; }
+details { margin: .3em 0; } summary { cursor: pointer; }
+.note { color: #555; } .warn { background: #fff4d6; padding: .5em .8em; border-radius: 4px; }
+"""
 
 
-def policy_color(policy: str, policies: list[str]) -> str:
-    """The colour of a policy, the same in all pictures of a study."""
+def write_report(
+    folder: StudyFolder,
+    config: StudyConfig,
+    rows: list[Row],
+    timings: list[Row],
+    table: list[Row],
+    absent: dict[str, str],
+    damaged: list[str],
+) -> None:
+    """
+    Writes `report.html` and its figures, `success_against_speed.png` and `trajectories.png`.
+
+    Args:
+        folder, config: the study.
+        rows: of its flights.
+        timings: of the same flights.
+        table: `policy_table` of them.
+        absent: reasons of the scenarios that were not flown.
+        damaged: files that were flown again in this run.
+    """
+    paper = paper_rows(config, absent)
+    figure = draw_success_against_speed(table, config.policy_names, paper)
+    success = write_png(figure, folder.path / "success_against_speed.png")
+    seeds = SPLIT_NAMES[config.split] + " seeds"
+    title = f"Navigation benchmark, {seeds}"
+    sections = {
+        f"Policies, {seeds}": _policies(table) + _timing(config, rows, timings),
+        f"Comparison with the paper's Table I, {seeds}": _paper(table, paper),
+        f"Comparison with published results, {seeds}": external_section(rows, config),
+        f"Success against speed, {seeds}": _image(success, "Success rate against velocity"),
+        "Trajectories through one field": _trajectories(folder, config, rows),
+        f"Pairs of policies on the same flights, {seeds}": _pairs(config, rows),
+        f"Scenarios, {seeds}": _scenarios(folder, config, rows, absent),
+        "Flights": _flights(rows),
+        "Program": _table(["part", "version"], [list(p) for p in folder.program().items()]),
+    }
+    body = [f"<h1>{title}</h1><p>{_scope(config, rows)}</p>", _warnings(rows, absent, damaged)]
+    body += [f"<h2>{heading}</h2>{section}" for heading, section in sections.items() if section]
+    with written_atomically(folder.path / "report.html") as path:
+        path.write_text(
+            f'<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
+            f"<style>{_STYLE}</style></head><body>" + "\n".join(body) + "</body></html>\n"
+        )
+
+
+class _Html(str):
+    """A cell that is HTML already."""
+
+
+def _table(header: list[str], rows: list[list[Any]]) -> str:
+    def line(tag: str, cells: list[Any]) -> str:
+        text = (cell if isinstance(cell, _Html) else escape(str(cell)) for cell in cells)
+        return "<tr>" + "".join(f"<{tag}>{cell}</{tag}>" for cell in text) + "</tr>"
+
+    body = "".join(line("td", row) for row in rows)
+    return f"<table><thead>{line('th', header)}</thead><tbody>{body}</tbody></table>"
+
+
+def _image(png: bytes, alt: str) -> str:
+    encoded = base64.b64encode(png).decode()
+    return f'<img src="data:image/png;base64,{encoded}" alt="{escape(alt)}">'
+
+
+def _note(text: str) -> str:
+    return f'<p class="note">{text}</p>'
+
+
+def _number(form: str) -> Callable[[float], str]:
+    """Returns the format of a column, a dash for what is not finite."""
+    return lambda value: format(value, form) if math.isfinite(value) else "–"
+
+
+def _interval(row: Row, kind: str) -> str:
+    return f"<span class=note>[{row[f'{kind}_lower']:.0%}, {row[f'{kind}_upper']:.0%}]</span>"
+
+
+def _rate(row: Row) -> _Html:
+    if not row["flights"]:
+        return _Html("not run")
+    return _Html(f"{row['successes'] / row['flights']:.0%} {_interval(row, 'wilson')}")
+
+
+def _clusters(row: Row) -> _Html:
+    return _Html(_interval(row, "cluster"))
+
+
+def _passed(row: Row) -> str:
+    return f"{row['scenarios_passed']}/{row['scenarios']}"
+
+
+def _scope(config: StudyConfig, rows: list[Row]) -> str:
+    speeds = ", ".join(f"{speed:g}" for speed in config.speeds)
+    return (
+        f"{len(rows)} flights: {len(config.scenarios)} scenarios, {len(config.policies)} policies, "
+        f"{describe_seeds(config.split, config.seeds)}, nominal speeds {speeds} m/s. A flight "
+        "succeeds if it reaches the goal and its clearance at the vehicle's radius is never "
+        "negative. Brackets are 95 % intervals: Wilson's, for these scenarios with new seeds, and "
+        "under “new scenarios” those of a bootstrap over scenarios, for others of the same kinds."
+    )
+
+
+def _warnings(rows: list[Row], absent: dict[str, str], damaged: list[str]) -> str:
+    lines = [
+        f"<b>{escape(name)} was not run</b> and does not count: {escape(reason)}"
+        for name, reason in absent.items()
+    ]
+    lines += [f"{escape(problem)}; the flight was flown again" for problem in damaged]
+    lines += [
+        f"{escape(row['id'])}, {row['outcome']}, counts as a failure: {escape(row['reason'])}"
+        for row in rows
+        if "reason" in row
+    ]
+    return "".join(f'<p class="warn">{line}</p>' for line in lines)
+
+
+_MEANS = {
+    "min. clearance [m]": ("min_clearance_m", "+.2f"),
+    "velocity [m/s]": ("mean_speed_m_s", ".2f"),
+    "path excess": ("path_excess", ".1%"),
+    "jerk [m/s³]": ("jerk_m_s3", ".1f"),
+    "smoothness": ("smoothness", ".1f"),
+}
+
+
+def _policies(table: list[Row]) -> str:
+    header = ["policy", "speed [m/s]", "flights", "success", "new scenarios"]
+    header += [outcome.replace("_", " ") for outcome in FAILURES]
+    header += ["not run", "scenarios passed", *_MEANS]
+    rows = [
+        [row["policy"], f"{row['speed']:g}", row["flights"], _rate(row), _clusters(row)]
+        + [row[outcome] for outcome in FAILURES]
+        + [row["not_run"], _passed(row)]
+        + [_number(form)(row[name]) for name, form in _MEANS.values()]
+        for row in table
+    ]
+    return _table(header, rows)
+
+
+def _timing(config: StudyConfig, rows: list[Row], timings: list[Row]) -> str:
+    header = ["policy", "decision [ms]", "render [ms]", "real-time factor"]
+    names = "policy_ms", "render_ms", "real_time_factor"
+    lines = []
+    for policy in config.policy_names:
+        times = [t for r, t in zip(rows, timings, strict=True) if r["policy"] == policy]
+        lines.append([policy, *(_number(".1f")(mean_of(times, name)) for name in names)])
+    return "<p>Mean times, of this machine and its load:</p>" + _table(header, lines)
+
+
+def _paper(table: list[Row], paper: dict[str, PaperRow]) -> str:
+    if not paper:
+        return ""
+    header = ["policy", "method in the paper", "success, paper", "success, here", "new scenarios"]
+    header += ["scenarios passed", "clearance, paper [m]", "here [m]"]
+    header += ["velocity, paper [m/s]", "here [m/s]"]
+    rows = []
+    for row in table:
+        if row["policy"] not in paper:
+            continue
+        theirs = paper[row["policy"]]
+        name = f"{row['policy']} at {row['speed']:g} m/s"
+        rate = f"{theirs.successes}/{PAPER_FLIGHTS} ({theirs.successes / PAPER_FLIGHTS:.0%})"
+        cells = [name, theirs.method, rate, _rate(row), _clusters(row), _passed(row)]
+        for metric, form in (("min_clearance_m", "+.2f"), ("mean_speed_m_s", ".2f")):
+            cells += [f"{getattr(theirs, metric):{form}}", _number(form)(row[metric])]
+        rows.append(cells)
+    return _table(header, rows) + _note(
+        "The paper flew one flight in each of its own 17 scenarios, in Isaac Sim; the scenarios "
+        "here are others of the same kinds, passed if most flights succeed. The paper's policies "
+        "were trained in reconstructions of TartanAir. The weights that ship were trained in the "
+        f"generators of {', '.join(IN_DISTRIBUTION)}: these scenarios are in their training "
+        "distribution, with other seeds; the others are not."
+    )
+
+
+def external_section(rows: list[Row], config: StudyConfig) -> str:
+    """Formats the external table in HTML; empty if there is none."""
+    table = external_table(rows, config)
+    if not table:
+        return ""
+    header = ["scenario", "policy", "speed [m/s]", "velocity [m/s]", "success"]
+    lines = [
+        [
+            row["scenario"],
+            row["policy"],
+            "published" if row["speed"] is None else f"{row['speed']:g}",
+            _number(".2f")(row["mean_speed_m_s"]),
+            _Html(f"{row['successes']}/{row['flights']} {_interval(row, 'wilson')}"),
+        ]
+        for row in table
+    ]
+    return _table(header, lines) + _note(escape(SOURCES))
+
+
+def _pairs(config: StudyConfig, rows: list[Row]) -> str:
+    lines = [
+        [
+            f"{pair.first} and {pair.second}",
+            f"{pair.speed:g}",
+            pair.only_first,
+            pair.only_second,
+            *(f"{p:.3f}" if p >= 0.001 else f"{p:.0e}" for p in (pair.p_seeds, pair.p_scenarios)),
+        ]
+        for pair in compare(rows, config)
+    ]
+    if not lines:
+        return "<p>One policy: nothing to compare.</p>"
+    header = ["policies", "speed [m/s]", "only the first succeeds", "only the second"]
+    header += ["p, these scenarios", "p, new scenarios"]
+    return _table(header, lines) + _note(
+        "Exact McNemar tests over flights, for these scenarios with new seeds, and sign-flip "
+        "permutation tests over scenarios, for others of the same kinds. Both are corrected by "
+        f"Holm for the {len(lines)} pairs."
+    )
+
+
+def _scenarios(
+    folder: StudyFolder, config: StudyConfig, rows: list[Row], absent: dict[str, str]
+) -> str:
+    columns = [(policy, speed) for policy in config.policy_names for speed in config.speeds]
+    header = [_Html(f"{escape(policy)}<br>{speed:g} m/s") for policy, speed in columns]
+    lines, single = [], []
+    for name in dict.fromkeys(spec.scenario for spec in config.rollouts()):
+        cells = [
+            _rate(success_summary(select(rows, scenario=name, policy=policy, speed=speed)))
+            for policy, speed in columns
+        ]
+        lines.append([name + (" (not run)" if name in absent else ""), *cells])
+        if name not in absent and isinstance(kept_scenario(folder, name).world, SceneSource):
+            single.append(escape(name))
+    note = _note(
+        f"Each of {', '.join(single)} is one environment: other seeds draw other starts and goals "
+        "in it (and other inserted solids), no other environment. Test seeds do not make it unseen."
+    )
+    return _table(["scenario", *header], lines) + (note if single else "")
+
+
+def _flights(rows: list[Row]) -> str:
+    header = ["flight", "outcome", "time [s]", "min. clearance [m]", "velocity [m/s]", "replay"]
+    columns = {"flight_time_s": ".1f", "min_clearance_m": "+.2f", "mean_speed_m_s": ".2f"}
+    sections = ["<p>The commands run in the folder that holds this report.</p>"]
+    for name in dict.fromkeys(row["scenario"] for row in rows):
+        lines = [
+            [row["id"], row["outcome"]]
+            + [_number(form)(row.get(column, math.nan)) for column, form in columns.items()]
+            + [_Html(f"<code>splatpilot replay . {escape(row['id'])} --meshcat</code>")]
+            for row in select(rows, scenario=name)
+        ]
+        summary = f"<summary>{escape(name)}: {len(lines)} flights</summary>"
+        sections.append(f"<details>{summary}{_table(header, lines)}</details>")
+    return "".join(sections)
+
+
+def _color(policy: str, policies: list[str]) -> str:
+    """Returns the color of a policy in all figures of a study."""
     return _COLORS[policies.index(policy) % len(_COLORS)]
 
 
 def draw_success_against_speed(
-    table: list[dict[str, Any]], policies: list[str], paper: dict[str, PaperRow]
+    table: list[Row], policies: list[str], paper: dict[str, PaperRow]
 ) -> Figure:
-    """Fig. 5: success rate with its 95 % interval against mean flight velocity, a line for each
-    policy through its nominal speeds; the paper's points beside those of the same policies."""
-    figure, axes = plt.subplots(figsize=(7.2, 4.6), layout="constrained")
+    """Draws Fig. 5: success rate with its 95 % interval against mean velocity, a line for each
+    policy through its nominal speeds, with the paper's points."""
+    figure = Figure(figsize=(7.2, 4.6), layout="constrained")
+    axes = figure.subplots()
     for policy in policies:
         rows = [row for row in table if row["policy"] == policy and row["flights"]]
-        rows.sort(key=lambda row: row["speed"])
         if not rows:
             continue
-        speeds, rates, lower, upper = (
-            np.array([row[name] for row in rows])
-            for name in ("mean_speed_m_s", "success_rate", "wilson_lower", "wilson_upper")
-        )
-        color, marker = policy_color(policy, policies), _MARKERS[policies.index(policy) % 8]
-        axes.errorbar(
-            speeds,
-            100 * rates,
-            yerr=100 * np.maximum([rates - lower, upper - rates], 0.0),
-            color=color,
-            marker=marker,
-            capsize=3,
-            label=policy,
-        )
+        rows.sort(key=lambda row: row["speed"])
+        names = "mean_speed_m_s", "success_rate", "wilson_lower", "wilson_upper"
+        speeds, rates, lower, upper = (np.array([row[name] for row in rows]) for name in names)
+        color, marker = _color(policy, policies), _MARKERS[policies.index(policy) % len(_MARKERS)]
+        errors = 100 * np.maximum([rates - lower, upper - rates], 0.0)
+        style = {"color": color, "marker": marker, "capsize": 3}
+        axes.errorbar(speeds, 100 * rates, yerr=errors, label=policy, **style)
         if policy in paper:
             theirs = paper[policy]
-            axes.plot(
-                theirs.mean_speed_m_s,
-                100 * theirs.successes / PAPER_FLIGHTS,
-                marker,
-                mfc="none",
-                mec=color,
-                ms=10,
-                label=f"{theirs.method} (paper)",
-            )
+            rate = 100 * theirs.successes / PAPER_FLIGHTS
+            style = {"mfc": "none", "mec": color, "ms": 10, "label": f"{theirs.method} (paper)"}
+            axes.plot(theirs.mean_speed_m_s, rate, marker, **style)
     axes.set(xlabel="mean flight velocity [m/s]", ylabel="success rate [%]", ylim=(-3, 103))
     axes.grid(alpha=0.3)
     axes.legend(frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
     return figure
 
 
-def draw_field_from_above(axes: Axes, world: World, height: float) -> None:
-    """Obstacles at a height [m], cut out of the distance field, and around them where the vehicle's
-    centre cannot be."""
+def _draw_field(axes: Axes, world: World, height: float) -> None:
+    """Draws obstacles at a height [m] from above, and where the vehicle's center cannot be."""
     field = world.distance_field
     x, y = (
         np.arange(low + _SPACING / 2, high, _SPACING)
         for low, high in zip(field.lower_W[:2], field.upper_W[:2], strict=True)
     )
     points = np.stack([*np.meshgrid(x, y), np.full((len(y), len(x)), height)], axis=-1)
-    distance = np.nan_to_num(field.distance(points), nan=np.inf)
-    distance = np.minimum(distance, 10.0)
+    distance = np.minimum(np.nan_to_num(field.distance(points), nan=np.inf), 10.0)
     levels = [-1e3, 0.0, VEHICLE_RADIUS]
-    axes.contourf(x, y, distance, levels=levels, colors=[_OBSTACLE, _TOO_NEAR])
+    axes.contourf(x, y, distance, levels=levels, colors=[_OBSTACLE, _BLOCKED])
     axes.set_aspect("equal")
     axes.set_xlim(field.lower_W[0], field.upper_W[0])
     axes.set_ylim(field.lower_W[1], field.upper_W[1])
@@ -116,21 +365,22 @@ def draw_trajectories(
     policies: list[str],
     title: str,
 ) -> Figure:
-    """Fig. 6: flights through one field from above.
+    """Draws Fig. 6: flights through one field from above.
 
     Args:
         world: the field.
-        flights: by policy, the positions p_WB (N, 3) [m] and the outcome.
+        flights: positions p_WB (N, 3) [m] and outcome, by policy.
         p_WS, p_WG: start and goal (3,) [m].
-        policies: of the study, for their colours.
-        title: of the picture.
+        policies: of the study, for their colors.
+        title: of the figure.
     """
     extent = world.distance_field.upper_W - world.distance_field.lower_W
     height = float(np.clip(9.0 * extent[1] / extent[0], 2.5, 9.0)) + 0.9
-    figure, axes = plt.subplots(figsize=(9.0, height), layout="constrained")
-    draw_field_from_above(axes, world, float(p_WG[2]))
+    figure = Figure(figsize=(9.0, height), layout="constrained")
+    axes = figure.subplots()
+    _draw_field(axes, world, float(p_WG[2]))
     for policy, (p_WB, outcome) in flights.items():
-        color = policy_color(policy, policies)
+        color = _color(policy, policies)
         axes.plot(p_WB[:, 0], p_WB[:, 1], color=color, lw=1.8, label=f"{policy}: {outcome}")
         if outcome != "goal" and len(p_WB):
             axes.plot(*p_WB[-1, :2], "X", color=color, ms=10, mec="white", zorder=5)
@@ -138,26 +388,13 @@ def draw_trajectories(
     axes.plot(*p_WG[:2], "*", color="black", ms=13, zorder=5)
     axes.set(xlabel="x [m]", ylabel="y [m]", title=title)
     if flights:
-        axes.legend(
-            frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=len(flights)
-        )
+        position = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.12)}
+        axes.legend(frameon=False, ncols=len(flights), **position)
     return figure
 
 
-def save_png(figure: Figure, path: Path) -> bytes:
-    """Writes a picture, closes it, and returns the file's bytes: the same for the same picture."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=130, metadata={"Software": None})
-    plt.close(figure)
-    with written_atomically(path) as partial:
-        partial.write_bytes(buffer.getvalue())
-    return buffer.getvalue()
-
-
-def trajectories_section(
-    folder: StudyFolder, config: StudyConfig, rows: list[dict[str, Any]]
-) -> str:
-    """HTML of `trajectories.png`, which it writes: flights through the field that tells most."""
+def _trajectories(folder: StudyFolder, config: StudyConfig, rows: list[Row]) -> str:
+    """Writes `trajectories.png` of the most telling field, and returns its HTML."""
     spec = _telling_flight(rows)
     if spec is None:
         return "<p>Nothing was flown.</p>"
@@ -170,24 +407,21 @@ def trajectories_section(
             flights[policy] = QuadrotorState.of(arrays["states"]).p_WB, row["outcome"]
     p_WS = next((p_WB[0] for p_WB, _ in flights.values()), world.p_WS)
     title = f"{spec.scenario}, seed {spec.seed}, {spec.speed:g} m/s"
-    figure = draw_trajectories(
-        world, flights, p_WS, goal_of(scenario, world), config.policy_names, title
+    p_WG = goal_position(scenario, world)
+    figure = draw_trajectories(world, flights, p_WS, p_WG, config.policy_names, title)
+    return _image(write_png(figure, folder.path / "trajectories.png"), title) + _note(
+        "Dark: obstacles at the height of the goal, from the distance field; light: where the "
+        "vehicle's center would collide."
     )
-    png = save_png(figure, folder.path / "trajectories.png")
-    note = (
-        '<p class="note">Dark: obstacles at the height of the goal, cut out of the distance field; '
-        "light: where the vehicle's centre would touch them.</p>"
-    )
-    return html_page.image(png, title) + note
 
 
-def _telling_flight(rows: list[dict[str, Any]]) -> RolloutSpec | None:
-    """The field whose flights differ most in how they end, the first of equals."""
-    fields: dict[tuple, list[dict[str, Any]]] = {}
+def _telling_flight(rows: list[Row]) -> RolloutSpec | None:
+    """Returns a flight of the field whose flights differ most in success, or None."""
+    fields: dict[tuple, list[Row]] = {}
     for row in rows:
         fields.setdefault((row["scenario"], row["speed"], row["seed"]), []).append(row)
 
-    def variety(flown: list[dict[str, Any]]) -> tuple[int, int, float]:
+    def variety(flown: list[Row]) -> tuple[int, int, float]:
         wins = sum(row["success"] for row in flown)
         length = sum(row.get("path_length_m", 0.0) for row in flown)
         return min(wins, len(flown) - wins), wins, length
@@ -196,238 +430,3 @@ def _telling_flight(rows: list[dict[str, Any]]) -> RolloutSpec | None:
         return None
     row = max(fields.values(), key=variety)[0]
     return RolloutSpec(row["scenario"], row["policy"], row["speed"], row["seed"])
-
-
-_COMPARED = ("min_clearance_m", "+.2f"), ("mean_speed_m_s", ".2f")
-
-
-def write_report(
-    folder: StudyFolder,
-    config: StudyConfig,
-    rows: list[dict[str, Any]],
-    timings: list[dict[str, Any]],
-    table: list[dict[str, Any]],
-    absent: dict[str, str],
-    damaged: list[str],
-) -> None:
-    """
-    Writes `report.html` and its pictures, `success_against_speed.png` and `trajectories.png`.
-
-    Args:
-        folder, config: the study.
-        rows: of its flights.
-        timings: of the same flights.
-        table: `policy_table` of them.
-        absent: the scenarios that were not flown, and why.
-        damaged: files that were flown again in this run.
-    """
-    paper = paper_rows(config, absent)
-    seeds = SPLIT_NAMES[config.split] + " seeds"
-    figure = draw_success_against_speed(table, config.policy_names, paper)
-    success_png = save_png(figure, folder.path / "success_against_speed.png")
-    sections = [
-        f"<h1>Navigation benchmark, {seeds}</h1><p>{_scope(config, rows)}</p>",
-        _warnings(config, rows, absent, damaged),
-        f"<h2>Policies, {seeds}</h2>" + _policies(table) + _timing(config, rows, timings),
-        f"<h2>Beside the paper's Table I, {seeds}</h2>" + _paper(table, paper) if paper else "",
-        external_section(external_table(rows, config), seeds),
-        f"<h2>Success against speed, {seeds}</h2>"
-        + html_page.image(success_png, "Success rate against velocity, with Wilson's intervals"),
-        "<h2>Trajectories through one field</h2>" + trajectories_section(folder, config, rows),
-        f"<h2>Pairs of policies on the same flights, {seeds}</h2>" + _pairs(config, rows),
-        f"<h2>Scenarios, {seeds}</h2>" + _scenarios(folder, config, rows, absent),
-        "<h2>Flights</h2>" + _flights(folder, config, rows),
-        "<h2>Program</h2>" + _program(folder),
-    ]
-    with written_atomically(folder.path / "report.html") as path:
-        path.write_text(html_page.page(f"Navigation benchmark, {seeds}", sections))
-
-
-def _rate(summary: dict[str, Any]) -> str:
-    if not summary["flights"]:
-        return "not run"
-    return (
-        f"{summary['success_rate']:.0%} <span class=note>[{summary['wilson_lower']:.0%}, "
-        f"{summary['wilson_upper']:.0%}]</span>"
-    )
-
-
-def _clusters(row: dict[str, Any]) -> str:
-    return f"<span class=note>[{row['cluster_lower']:.0%}, {row['cluster_upper']:.0%}]</span>"
-
-
-def _passed(row: dict[str, Any]) -> str:
-    return f"{row['scenarios_passed']}/{row['scenarios']}"
-
-
-def _scope(config: StudyConfig, rows: list[dict[str, Any]]) -> str:
-    speeds = ", ".join(f"{speed:g}" for speed in config.speeds)
-    return (
-        f"{len(rows)} flights: {len(config.scenarios)} scenarios, {len(config.policies)} policies, "
-        f"{describe_seeds(config.split, config.seeds)}, nominal speeds {speeds} m/s. A flight "
-        "succeeds when it reaches the goal and its clearance at the vehicle's radius is never "
-        "below zero. Brackets are 95 % intervals: Wilson's, for these scenarios with new seeds, "
-        "and under “new scenarios” those of a bootstrap over scenarios, for others of the same "
-        "kinds."
-    )
-
-
-def _warnings(
-    config: StudyConfig, rows: list[dict[str, Any]], absent: dict[str, str], damaged: list[str]
-) -> str:
-    lines = [
-        f"<b>{escape(name)} was not run</b>, and counts nowhere: {escape(reason)}"
-        for name, reason in absent.items()
-    ]
-    lines += [f"{escape(problem)}; the flight was flown again" for problem in damaged]
-    lines += [
-        f"{escape(row['id'])}, {row['outcome']}, counts as a failure: {escape(row['reason'])}"
-        for row in rows
-        if "reason" in row
-    ]
-    return "".join(f'<p class="warn">{line}</p>' for line in lines)
-
-
-def _policies(table: list[dict[str, Any]]) -> str:
-    header = ["policy", "speed [m/s]", "flights", "success", "new scenarios"]
-    header += [outcome.replace("_", " ") for outcome in FAILURES]
-    header += ["not run", "scenarios passed", "min. clearance [m]"]
-    header += ["velocity [m/s]", "path excess"]
-    header += ["jerk [m/s³]", "smoothness"]
-    rows = [
-        [
-            escape(row["policy"]),
-            f"{row['speed']:g}",
-            str(row["flights"]),
-            _rate(row),
-            _clusters(row),
-            *(str(row[outcome]) for outcome in FAILURES),
-            str(row["not_run"]),
-            _passed(row),
-            html_page.number(row["min_clearance_m"], "+.2f"),
-            html_page.number(row["mean_speed_m_s"], ".2f"),
-            html_page.number(row["path_excess"], ".1%"),
-            html_page.number(row["jerk_m_s3"], ".1f"),
-            html_page.number(row["smoothness"], ".1f"),
-        ]
-        for row in table
-    ]
-    return html_page.table(header, rows)
-
-
-def _timing(config: StudyConfig, rows: list[dict[str, Any]], timings: list[dict[str, Any]]) -> str:
-    header = ["policy", "decision [ms]", "render [ms]", "real-time factor"]
-    names = "policy_ms", "render_ms", "real_time_factor"
-    lines = []
-    for policy in config.policy_names:
-        times = [t for r, t in zip(rows, timings, strict=True) if r["policy"] == policy]
-        lines.append(
-            [escape(policy), *(html_page.number(mean_of(times, name), ".1f") for name in names)]
-        )
-    return "<p>Mean times, of this machine and its load:</p>" + html_page.table(header, lines)
-
-
-def _paper(table: list[dict[str, Any]], paper: dict[str, PaperRow]) -> str:
-    header = ["policy", "method in the paper", "success, paper", "success, here", "new scenarios"]
-    header += [
-        "scenarios passed",
-        "clearance, paper [m]",
-        "here [m]",
-        "velocity, paper [m/s]",
-        "here [m/s]",
-    ]
-    rows = []
-    for row in table:
-        if row["policy"] not in paper:
-            continue
-        theirs = paper[row["policy"]]
-        name = f"{row['policy']} at {row['speed']:g} m/s"
-        there = f"{theirs.successes}/{PAPER_FLIGHTS} ({theirs.successes / PAPER_FLIGHTS:.0%})"
-        cells = [name, theirs.method, there, _rate(row), _clusters(row), _passed(row)]
-        for measure, form in _COMPARED:
-            cells += [f"{getattr(theirs, measure):{form}}", html_page.number(row[measure], form)]
-        rows.append(cells)
-    note = (
-        '<p class="note">The paper flew one flight in each of its own 17 scenarios, in Isaac Sim; '
-        "the scenarios here are others of the same kinds, passed where most flights succeed. The "
-        "paper's policies were trained in reconstructions of TartanAir. The weights that ship were "
-        f"trained in the generators of {', '.join(IN_DISTRIBUTION)}: these scenarios are in their "
-        "training distribution, with other seeds; the others are not.</p>"
-    )
-    return html_page.table(header, rows) + note
-
-
-def _pairs(config: StudyConfig, rows: list[dict[str, Any]]) -> str:
-    lines = [
-        [
-            f"{escape(pair.first)} and {escape(pair.second)}",
-            f"{pair.speed:g}",
-            str(pair.only_first),
-            str(pair.only_second),
-            *(f"{p:.3f}" if p >= 0.001 else f"{p:.0e}" for p in (pair.p_seeds, pair.p_scenarios)),
-        ]
-        for pair in compare(rows, config)
-    ]
-    if not lines:
-        return "<p>One policy: nothing to compare.</p>"
-    header = ["policies", "speed [m/s]", "only the first succeeds", "only the second"]
-    header += ["p, these scenarios", "p, new scenarios"]
-    note = (
-        '<p class="note">Exact McNemar tests over flights, for these scenarios with new seeds, and '
-        "sign-flip permutation tests over scenarios, for others of the same kinds. Both are "
-        f"corrected by Holm for the {len(lines)} pairs.</p>"
-    )
-    return html_page.table(header, lines) + note
-
-
-def _scenarios(
-    folder: StudyFolder, config: StudyConfig, rows: list[dict[str, Any]], absent: dict[str, str]
-) -> str:
-    columns = [(policy, speed) for policy in config.policy_names for speed in config.speeds]
-    header = ["scenario", *(f"{escape(policy)}<br>{speed:g} m/s" for policy, speed in columns)]
-    names = list(dict.fromkeys(spec.scenario for spec in config.rollouts()))
-    lines = []
-    for name in names:
-        cells = []
-        for policy, speed in columns:
-            flown = select(rows, scenario=name, policy=policy, speed=speed)
-            cells.append(_rate(success_summary(flown)))
-        lines.append([escape(name) + (" <b>(not run)</b>" if name in absent else ""), *cells])
-    flown = [name for name in names if name not in absent]
-    worlds = {name: kept_scenario(folder, name).world for name in flown}
-    single = [escape(name) for name, world in worlds.items() if isinstance(world, SceneSource)]
-    note = (
-        f'<p class="note">Each of {", ".join(single)} is one environment: other seeds draw other '
-        "starts and goals in it (and other inserted solids), no other environment. Test seeds do "
-        "not make it unseen.</p>"
-    )
-    return html_page.table(header, lines) + (note if single else "")
-
-
-def _flights(folder: StudyFolder, config: StudyConfig, rows: list[dict[str, Any]]) -> str:
-    header = ["flight", "outcome", "time [s]", "min. clearance [m]", "velocity [m/s]", "replay"]
-    sections = []
-    for name in dict.fromkeys(row["scenario"] for row in rows):
-        flown = select(rows, scenario=name)
-        lines = [
-            [
-                escape(row["id"]),
-                escape(row["outcome"]),
-                html_page.number(row.get("flight_time_s", math.nan), ".1f"),
-                html_page.number(row.get("min_clearance_m", math.nan), "+.2f"),
-                html_page.number(row.get("mean_speed_m_s", math.nan), ".2f"),
-                f"<code>splatpilot replay . {escape(row['id'])} --meshcat</code>",
-            ]
-            for row in flown
-        ]
-        sections.append(
-            f"<details><summary>{escape(name)}: {len(flown)} flights</summary>"
-            f"{html_page.table(header, lines)}</details>"
-        )
-    note = "<p>The commands run in the folder that holds this report.</p>"
-    return note + "".join(sections)
-
-
-def _program(folder: StudyFolder) -> str:
-    rows = [[escape(name), escape(value)] for name, value in folder.program().items()]
-    return html_page.table(["part", "version"], rows)

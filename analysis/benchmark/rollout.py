@@ -1,4 +1,4 @@
-"""One flight of a study, a pure function of its specification, as worker processes run it."""
+"""One flight of a study, as worker processes fly it."""
 
 import functools
 import hashlib
@@ -17,7 +17,7 @@ from pydrake.systems.framework import Diagram
 
 from splatpilot import _native
 from splatpilot.analysis.benchmark.study import RolloutSpec
-from splatpilot.diagrams.flight.blocks import goal_of
+from splatpilot.diagrams.flight.blocks import goal_position
 from splatpilot.diagrams.flight.flight import Flight, Outcome, decision_times, fly
 from splatpilot.diagrams.flight.flight_diagram import LOG_PERIOD, BuildFlightDiagram
 from splatpilot.diagrams.flight.policies import POLICIES
@@ -27,43 +27,42 @@ from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.common.config import dump_config, parse_config
 from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.common.registry import import_modules
-from splatpilot.systems.policies.time_of_arrival import TimeOfArrival, way_lengths
+from splatpilot.systems.policies.time_of_arrival import TimeOfArrival, path_lengths
 from splatpilot.systems.vehicle.state import QuadrotorState
 
 _JERK_STRIDE = 5
-"""Samples between which velocities are differentiated: 0.1 s. The controller's steps every 0.02 s
-are no motion of the vehicle."""
+"""Samples between differentiated velocities: 0.1 s, beyond the controller's steps of 0.02 s."""
 
 
-def flight_measures(flight: Flight, shortest: float) -> dict[str, float | str | bool]:
+def flight_metrics(flight: Flight, shortest: float) -> dict[str, float | str | bool]:
     """
-    The measures of a flight, by the names of their columns.
+    Returns the metrics of a flight, by their columns.
 
-    - `success`: the goal was reached, and the clearance at the vehicle's radius never negative;
+    - `success`: reached the goal, with a clearance at the vehicle's radius that is never negative;
     - `outcome`: `goal`, `collision`, `left_volume`, `timeout` or `error`;
     - `flight_time_s`, `path_length_m`, `mean_speed_m_s`, `min_clearance_m`;
-    - `shortest_path_m`, `path_excess`: the way flown over the shortest way, less one; NaN of
-      flights that did not arrive;
+    - `shortest_path_m`, `path_excess`: the path over the shortest path, minus one; NaN of flights
+      that did not arrive;
     - `jerk_m_s3`: root mean square of the second differences of the velocity at 0.1 s;
     - `smoothness`: the logarithmic dimensionless jerk, -ln(T³ / v_max² ∫ |jerk|² dt) (N. Hogan and
-      D. Sternad, J. Motor Behavior 41, 2009); greater is smoother.
+      D. Sternad, J. Motor Behavior 41, 2009); larger is smoother.
 
     Args:
-        flight: as flown.
-        shortest: length of the shortest way from its start to its goal [m].
+        flight: of a study.
+        shortest: length of the shortest path from start to goal [m].
     """
     summary = flight.summary()
     arrived = flight.outcome == Outcome.GOAL
-    least = float(np.nanmin(flight.clearances))
+    clearance = float(np.nanmin(flight.clearances))
     length, duration = float(summary["path_length_m"]), float(summary["flight_time_s"])
-    jerk, smoothness = jerk_measures(QuadrotorState.of(flight.states).v_WB, flight.times)
+    jerk, smoothness = jerk_metrics(QuadrotorState.of(flight.states).v_WB, flight.times)
     return {
-        "success": arrived and least >= 0.0,
+        "success": arrived and clearance >= 0.0,
         "outcome": str(flight.outcome),
         "flight_time_s": duration,
         "path_length_m": length,
         "mean_speed_m_s": float(summary["mean_speed_m_s"]),
-        "min_clearance_m": least,
+        "min_clearance_m": clearance,
         "shortest_path_m": shortest,
         "path_excess": length / shortest - 1.0 if arrived and shortest > 0 else math.nan,
         "jerk_m_s3": jerk,
@@ -71,10 +70,9 @@ def flight_measures(flight: Flight, shortest: float) -> dict[str, float | str | 
     }
 
 
-def jerk_measures(velocities: np.ndarray, times: np.ndarray) -> tuple[float, float]:
-    """Root mean square jerk [m/s^3] and smoothness [-] of velocities (N, 3) [m/s] at times (N,) [s]
-    `LOG_PERIOD` apart, see `flight_measures`; NaN of flights too short to tell.
-    """
+def jerk_metrics(velocities: np.ndarray, times: np.ndarray) -> tuple[float, float]:
+    """Returns root mean square jerk [m/s^3] and smoothness [-] of velocities (N, 3) [m/s] at times
+    (N,) [s], `LOG_PERIOD` apart, see `flight_metrics`; NaN of short flights."""
     sampled = velocities[np.isclose(np.arange(len(times)) * LOG_PERIOD, times)][::_JERK_STRIDE]
     if len(sampled) < 4:
         return math.nan, math.nan
@@ -88,11 +86,13 @@ def jerk_measures(velocities: np.ndarray, times: np.ndarray) -> tuple[float, flo
 
 
 def shortest_length(lengths: TimeOfArrival, p_WS: np.ndarray, goal_radius: float) -> float:
-    """Length [m] of the shortest way from p_WS (3,) into the sphere that counts as the goal; NaN
-    where the grid shows none.
+    """Returns the length [m] of the shortest path from p_WS (3,) to the goal's sphere; NaN without
+    a path.
 
     Args:
-        lengths: of the ways to the goal, `way_lengths`.
+        lengths: of the paths to the goal, `path_lengths`.
+        p_WS: start.
+        goal_radius: [m].
     """
     if not lengths.is_reachable(p_WS):
         return math.nan
@@ -100,30 +100,29 @@ def shortest_length(lengths: TimeOfArrival, p_WS: np.ndarray, goal_radius: float
 
 
 ARRAYS = "times", "states", "commands", "clearances"
-"""The arrays of `Flight` that a study keeps."""
+"""The arrays of `Flight` in a study."""
 
 INFEASIBLE = "infeasible"
-"""The outcome of a flight that cannot be begun (`InfeasibleFlightError`); it counts as a failure,
-and its row says why. One that becomes infeasible in flight has the outcome `Outcome.ERROR`."""
+"""The outcome of a flight that cannot start (`InfeasibleFlightError`), a failure with a reason. One
+that becomes infeasible in flight has `Outcome.ERROR`."""
 
 
 class Rollout(NamedTuple):
-    """What a flight leaves in a study."""
+    """A flight in a study."""
 
     row: dict[str, Any]
-    """Its specification and measures: the same whenever and wherever it is flown."""
+    """Its specification and metrics, deterministic."""
     trajectory: bytes
-    """An .npz with `row` (JSON) and the arrays of `Flight` but the plans, in single precision; the
-    same bytes too."""
+    """An .npz with `row` (JSON) and `ARRAYS` in single precision, deterministic."""
     timing: dict[str, Any]
-    """How long it took, and where."""
+    """Times and machine."""
 
 
 class Fault(NamedTuple):
-    """An exception that ended a flight and is no failure of it."""
+    """An exception that is not a failure of its flight."""
 
     id: str
-    """Of the flight."""
+    """Name of the flight."""
     reason: str
     """The exception in one line."""
     traceback: str
@@ -134,12 +133,13 @@ def fly_rollouts(
     modules: Sequence[str] = (),
     policies: Sequence[str] = (),
 ) -> list[Rollout | Fault]:
-    """Flies some flights in this process, each with its scenario as YAML, up to the first fault.
-    `modules` are imported first, those of others that register what flies, and `policies` found,
-    those that no module registers: `module:attribute`.
+    """Flies flights in this process, up to the first fault.
 
-    Configurations of Drake's own do not pickle, and so scenarios travel between processes as text;
-    as does what went wrong, because exceptions of others may not either.
+    Args:
+        flights: with their scenarios as YAML; Drake's configurations and some exceptions cannot be
+            pickled.
+        modules: plugins to import.
+        policies: `module:attribute`, not registered by a module.
     """
     import_modules(modules)
     for policy in policies:
@@ -158,13 +158,12 @@ def fly_rollout(spec: RolloutSpec, scenario: Scenario) -> Rollout:
     """
     Flies one flight of a study.
 
-    Flights fail by their outcome, or because they are or become infeasible. Nothing else is a
-    failure of a flight: a policy with a bug, a missing scene or lack of memory says nothing about
-    how the policy flies, and a study that counted them would be wrong unnoticed.
+    Flights fail by their outcome, or if they are or become infeasible. Other exceptions, as of a
+    bug or a missing scene, must stop the study, and are raised.
 
     Args:
         spec: the flight.
-        scenario: complete with the policy and seed of `spec`.
+        scenario: with the policy and seed of `spec`.
     """
     started, cpu_started = time.perf_counter(), time.process_time()
     timing: dict[str, Any] = {"id": spec.id}
@@ -178,26 +177,26 @@ def fly_rollout(spec: RolloutSpec, scenario: Scenario) -> Rollout:
             QuadrotorState.of(flight.states[0]).p_WB,
             scenario.goal_radius,
         )
-        measures = flight_measures(flight, shortest) | {"digest": digest(flight)}
-        if flight.reason:  # deciding again could raise again
-            measures["reason"] = flight.reason
+        metrics = flight_metrics(flight, shortest) | {"digest": digest(flight)}
+        if flight.reason:  # timing the policy could raise again
+            metrics["reason"] = flight.reason
         else:
             timing |= _flight_timing(diagram, scenario, flight)
     except InfeasibleFlightError as error:
         flight = None
-        measures = {"success": False, "outcome": INFEASIBLE, "reason": str(error)}
+        metrics = {"success": False, "outcome": INFEASIBLE, "reason": str(error)}
     timing |= {
         "total_s": time.perf_counter() - started,
         "total_cpu_s": time.process_time() - cpu_started,
         "host": platform.node(),
         "simd": _native.simd_levels()[0],
     }
-    row = spec._asdict() | measures
+    row = spec._asdict() | metrics
     return Rollout({"id": spec.id} | row, encode(row, flight), timing)
 
 
 def encode(row: dict[str, Any], flight: Flight | None) -> bytes:
-    """The .npz of a flight; of one that could not be flown without arrays."""
+    """Returns the .npz of a flight; without arrays if it could not be flown."""
     arrays = {"row": np.array(json.dumps(row))}
     if flight is not None:
         arrays |= {name: getattr(flight, name).astype(np.float32) for name in ARRAYS}
@@ -207,7 +206,7 @@ def encode(row: dict[str, Any], flight: Flight | None) -> bytes:
 
 
 def digest(flight: Flight) -> str:
-    """What tells whether two flights are equal to the last bit."""
+    """Returns a digest, equal for bitwise identical flights."""
     arrays = (np.ascontiguousarray(getattr(flight, name)).tobytes() for name in ARRAYS)
     return hashlib.sha256(b"".join(arrays)).hexdigest()[:16]
 
@@ -215,7 +214,7 @@ def digest(flight: Flight) -> str:
 def chunks[Payload](
     flights: Iterable[tuple[RolloutSpec, Payload]], size: int
 ) -> Iterator[list[tuple[RolloutSpec, Payload]]]:
-    """Neighbours through the same place, at most `size` of them together."""
+    """Yields chunks of at most `size` neighbors through the same world."""
     for _, neighbours in itertools.groupby(flights, lambda f: (f[0].scenario, f[0].seed)):
         yield from map(list, itertools.batched(neighbours, size))
 
@@ -231,7 +230,7 @@ def _flight_timing(diagram: Diagram, scenario: Scenario, flight: Flight) -> dict
 
 
 def study_world(scenario: Scenario) -> World:
-    """The world of a flight; the last two of a process are kept."""
+    """Makes the world of a flight; caches the last two of a process."""
     world = scenario.world
     return _world(_Described(f"{type(world)} {dump_config(world)}", world), scenario.seed)
 
@@ -257,8 +256,8 @@ def _world(described: _Described, seed: int) -> World:
 @functools.lru_cache(maxsize=2)
 def _lengths_to(world: World, p_WG: tuple[float, ...]) -> TimeOfArrival:
     field = world.esdf if world.esdf.occupied_outside else world.esdf.conservative()
-    return way_lengths(field, np.array(p_WG))
+    return path_lengths(field, np.array(p_WG))
 
 
 def _way_lengths(world: World, scenario: Scenario) -> TimeOfArrival:
-    return _lengths_to(world, tuple(goal_of(scenario, world)))
+    return _lengths_to(world, tuple(goal_position(scenario, world)))

@@ -1,4 +1,4 @@
-"""`splatpilot benchmark`: flies a study, or the rest of one, and reports on it."""
+"""`splatpilot benchmark`: flies or resumes a study, and writes its report."""
 
 import functools
 from collections.abc import Callable, Generator, Iterable, Iterator
@@ -6,7 +6,6 @@ from contextlib import closing
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
-from typing import Any
 
 from splatpilot.analysis.benchmark.external import external_table, format_external
 from splatpilot.analysis.benchmark.report import write_report
@@ -20,8 +19,9 @@ from splatpilot.analysis.benchmark.study_folder import (
     kept_flights,
     require_test_scenes,
 )
-from splatpilot.analysis.benchmark.tables import format_table, policy_table
+from splatpilot.analysis.benchmark.tables import Row, format_table, policy_table
 from splatpilot.analysis.benchmark.variants import SCENARIO
+from splatpilot.analysis.output import write_csv
 from splatpilot.diagrams.flight.policies import POLICIES
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.flight.sensors import SENSORS
@@ -36,10 +36,9 @@ from splatpilot.systems.common.provenance import program
 from splatpilot.systems.common.validation import require
 
 CONNECT_TIMEOUT = 10.0
-"""[s], for a scheduler to answer."""
+"""[s], to a scheduler."""
 
-_CHUNK = 6
-"""Most flights through one place handed out together: what of a kill is flown again."""
+_CHUNK = 6  # maximum number of flights through one world that a worker takes together
 
 _Chunk = list[tuple[RolloutSpec, str]]
 _Work = Iterator[_Chunk]
@@ -53,14 +52,14 @@ def fly_all(
     Flies rollouts in worker processes and yields them as they end, in any order.
 
     Args:
-        flights: what to fly; neighbours through the same place are flown by the same worker.
-        jobs: worker processes on this machine, 1 or more.
-        cluster: address of a dask scheduler, whose workers fly instead.
+        flights: to fly; one worker flies neighbors through the same world.
+        jobs: number of worker processes on this machine.
+        cluster: address of a dask scheduler to use instead.
 
     Raises:
-        ModuleNotFoundError: a cluster is wanted and dask.distributed is not installed.
-        OSError: if a worker process dies, or the cluster cannot be reached; all that was yielded
-            before is good.
+        ModuleNotFoundError: if a cluster needs dask.distributed, which is not installed.
+        OSError: if a worker process dies, or the cluster cannot be reached; yielded rollouts are
+            valid.
     """
     modules = sorted(POLICIES.modules() | WORLDS.modules() | SENSORS.modules())
     found = [name for name in POLICIES.registered() if ":" in name]
@@ -82,20 +81,15 @@ def _on_cluster(fly: _Fly, work: _Work, address: str) -> Iterator[Rollout | Faul
             "and workers with `dask worker ADDRESS --nthreads 1`"
         ) from None
     with client:
-        # A chunk whose worker dies is given to another; flights are pure, so that costs only time.
         futures = client.map(fly, list(work), pure=False, retries=3)
         try:
             for _, rollouts in distributed.as_completed(futures, with_results=True):
                 yield from rollouts
         except distributed.KilledWorker as error:
             raise OSError(
-                f"the cluster's workers die of one and the same work ({error}); what was flown is "
-                "kept: give them more memory and run the same command again"
+                f"the cluster's workers die of the same flights ({error}); finished flights are "
+                "kept: give the workers more memory and run the same command again"
             ) from None
-
-
-Row = dict[str, Any]
-"""The specification and measures of a flight."""
 
 
 @holds_folder("out")
@@ -107,27 +101,25 @@ def run(
     cluster: str | None = None,
 ) -> list[Row]:
     """
-    Flies the flights of a study that `out` does not hold yet, each written as it ends, and leaves
-    the tables and the report (`splatpilot.analysis.benchmark.study_folder` says which files).
+    Flies the missing flights of a study, and writes tables and report; for the files, see
+    `splatpilot.analysis.benchmark.study_folder`.
 
-    A run that was interrupted, however, is continued by running it again, and leaves the same bytes
-    as one that was not: in all files but those of the timings. Flights whose files are damaged are
-    flown again. Scenarios whose scene is absent are not flown, and reported as such.
+    The same call resumes an interrupted study, whose files, except timings, are then bitwise
+    identical to those of an uninterrupted one. Flights with damaged files are flown again.
+    Scenarios without their scene are not flown, and reported.
 
     Args:
-        config: what is flown.
-        out: the study's folder.
+        config: the study.
+        out: its folder.
         jobs: worker processes; one for each core by default.
-        cluster: address of a dask scheduler to fly on instead.
+        cluster: address of a dask scheduler to use instead.
 
     Returns:
         The rows of `table.csv`.
 
     Raises:
-        ValueError: for a study that cannot be flown, another one in `out`, or a flight that an
-            exception ended which is no failure of it (`InfeasibleFlightError` is one).
-        OSError: if `out` cannot be written, the workers fail, or nothing can be flown because all
-            scenes are absent.
+        ValueError: for an invalid study, another one in `out`, or a `Fault`.
+        OSError: if `out` cannot be written, workers fail, or all scenes are missing.
     """
     require(jobs is None or jobs >= 1, "--jobs", "at least 1", jobs)
     scenarios = config.load_scenarios()
@@ -147,8 +139,8 @@ def run(
         print(f"{name} is not flown: {reason}")
     for file in config.unflown_policies():
         print(
-            f"The policy that {file} names is not flown, but those of --policies are; add "
-            f"{SCENARIO} to them to fly it."
+            f"The policy of {file} is not flown, but those of --policies are; add {SCENARIO} to "
+            "them to fly it."
         )
 
     rows, damaged = flights_there(folder, specs)
@@ -156,8 +148,13 @@ def run(
         print(f"{problem}; this flight is flown again")
     missing = [spec for spec in specs if spec.id not in rows]
     if rows and missing:
-        _check_program(folder, flown_by)
-        print(f"{len(rows)} of {len(specs)} flights are there already.")
+        for name, version in folder.program().items():
+            if flown_by.get(name) != version:
+                raise ValueError(
+                    f"{out} was started with {name} {version}, this is {flown_by.get(name)}, and "
+                    "one program must fly a study; use that one or choose another --out"
+                )
+        print(f"{len(rows)} of {len(specs)} flights exist already.")
     if missing:
         folder.keep_program(flown_by)
     flights = fly_all(kept_flights(folder, missing), jobs or available_cores(), cluster)
@@ -179,31 +176,32 @@ def conclude(
     Args:
         folder, config: the study.
         rows: of all its flights.
-        absent: the scenarios that were not flown, and why.
-        damaged: what was flown again.
+        absent: reasons of the scenarios that were not flown.
+        damaged: files that were flown again.
 
     Returns:
         The rows of `table.csv`.
     """
     timings = [folder.read_timing(row["id"]) for row in rows]
     table = policy_table(rows, config, len(absent))
-    folder.write_table("rollouts.csv", rows)
-    folder.write_table("timings.csv", timings)
-    folder.write_table("table.csv", table)
+    tables = {"rollouts.csv": rows, "timings.csv": timings, "table.csv": table}
+    if external := external_table(rows, config):
+        tables["external.csv"] = external
+    for name, content in tables.items():
+        write_csv(folder.path / name, content)
     write_report(folder, config, rows, timings, table, absent, damaged)
     print(format_table(table, config))
-    if external := external_table(rows, config):
-        folder.write_table("external.csv", external)
-        print(f"{format_external(external)}\nWrote external.csv in {folder.path}")
+    if external:
+        print(format_external(external))
     for row in rows:
         if "reason" in row:
             print(f"{row['id']}, {row['outcome']}: {row['reason']}")
-    print(f"Wrote rollouts.csv, timings.csv, table.csv and report.html in {folder.path}")
+    print(f"Wrote {', '.join(tables)} and report.html in {folder.path}")
     return table
 
 
 def absent_scenes(scenarios: dict[str, Scenario]) -> dict[str, str]:
-    """Of the scenarios whose scene is not on this machine: why, and what to do."""
+    """Returns the reasons of scenarios without their scene on this machine."""
     absent = {}
     for name, scenario in scenarios.items():
         if isinstance(scenario.world, SceneSource):
@@ -217,8 +215,7 @@ def absent_scenes(scenarios: dict[str, Scenario]) -> dict[str, str]:
 def flights_there(
     folder: StudyFolder, specs: list[RolloutSpec]
 ) -> tuple[dict[str, Row], list[str]]:
-    """The rows by id of the flights that are in the folder, and what is wrong with the files of
-    others."""
+    """Returns the rows of existing flights by id, and the errors of damaged files."""
     rows, damaged = {}, []
     for spec in Progress(specs, "checking flights", unit="flight", leave=False, delay=1.0):
         try:
@@ -231,32 +228,17 @@ def flights_there(
 
 
 def _complete(config: StudyConfig, scenarios: dict[str, Scenario]) -> Iterator[Scenario]:
-    """The scenarios with each policy that flies in them."""
+    """Yields the scenarios with each of their policies."""
     for scenario in scenarios.values():
         for variant in config.variants:
             for speed in config.speeds:
                 yield replace(scenario, policy=variant.config(speed, scenario.policy))
 
 
-def _check_program(folder: StudyFolder, flown_by: dict[str, str]) -> None:
-    """Raises ValueError if the flights in the folder come from another program, weights or
-    scenes."""
-    for name, version in folder.program().items():
-        if flown_by.get(name) != version:
-            raise ValueError(
-                f"{folder.path} was begun with {name} {version}, this is {flown_by.get(name)}, and "
-                "one study is flown by one program; go back to that one or choose another --out"
-            )
-
-
 def _keep(
     folder: StudyFolder, flights: Iterator[Rollout | Fault], rows: dict[str, Row], total: int
 ) -> None:
-    """Writes flights as they end, and adds their rows to those that were there.
-
-    Raises:
-        ValueError: at a fault.
-    """
+    """Writes flights as they end, and adds them to `rows`. Raises ValueError at a fault."""
     successes = sum(row["success"] for row in rows.values())
     bar = Progress(total=total, initial=len(rows), desc="flying", unit="flight")
 
@@ -269,9 +251,9 @@ def _keep(
         for flown in flights:
             if isinstance(flown, Fault):
                 raise ValueError(
-                    f"flight {flown.id} was ended by an exception that is no failure of a flight, "
-                    f"{flown.reason} (traceback in {folder.write_fault(flown)}); mend it and run "
-                    "the same command again, with another --out where code that flies has changed"
+                    f"flight {flown.id} was ended by an exception, {flown.reason} (traceback in "
+                    f"{folder.write_fault(flown)}); fix it and run the same command again, with "
+                    "another --out if code that flies has changed"
                 )
             folder.write(flown)
             rows[flown.row["id"]] = flown.row

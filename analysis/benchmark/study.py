@@ -1,5 +1,4 @@
-"""What a study is: the same flights for every policy, each with a name by which it can be flown
-again."""
+"""Studies: the same flights for every policy, with a unique name each."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -8,7 +7,11 @@ from typing import Any, NamedTuple
 import yaml
 
 from splatpilot.analysis.benchmark.variants import SCENARIO, Variant, parse_variant
-from splatpilot.diagrams.flight.policies import BENCHMARK_POLICIES, MAX_SPEED, speed_of
+from splatpilot.diagrams.flight.policies import (
+    BENCHMARK_POLICIES,
+    MAX_SPEED,
+    speed_of,
+)
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.scenarios import benchmark_scenarios, scenario_file
 from splatpilot.systems.common.config import load_config
@@ -26,12 +29,12 @@ class RolloutSpec(NamedTuple):
 
     @property
     def id(self) -> str:
-        """Its name: unique in a study, and good as the name of a file."""
+        """Its name: unique in a study, and valid as the name of a file."""
         return flight_name(self.scenario, self.policy, self.speed, self.seed)
 
 
 def flight_name(scenario: str, policy: str, speed: float | None, seed: int) -> str:
-    """What a flight is called; `speed` [m/s] is None where the policy flies at its own."""
+    """Returns the name of a flight; `speed` [m/s] is None if the policy has its own."""
     parts = [scenario, policy, *([] if speed is None else [f"{speed:g}"]), f"{seed:03d}"]
     return "-".join(parts)
 
@@ -50,27 +53,26 @@ class StudyConfig:
     seeds: int = 20
     # "dotted.field=YAML value", for all scenarios.
     overrides: list[str] = field(default_factory=list)
-    # Whose seeds: "dev", those by which things are chosen, or "test", see
-    # `systems/common/seeds.py`.
+    # Seeds: "dev", for choosing, or "test", see `systems/common/seeds.py`.
     split: str = "dev"
 
     @property
     def variants(self) -> list[Variant]:
-        """The policies, read."""
+        """The policies, parsed."""
         return [parse_variant(policy) for policy in self.policies]
 
     @property
     def policy_names(self) -> list[str]:
-        """The policies by the labels that their flights bear."""
+        """The labels of the policies."""
         return [variant.label for variant in self.variants]
 
     @property
     def flies_own_policies(self) -> bool:
-        """Whether the scenarios' own policies fly."""
+        """True if the scenarios' own policies fly."""
         return any(variant.policy == SCENARIO for variant in self.variants)
 
     def rollouts(self) -> list[RolloutSpec]:
-        """All flights; those through the same place stand together."""
+        """Returns all flights; those through the same world are neighbors."""
         policies = self.policy_names
         return [
             RolloutSpec(Path(scenario).stem, policy, speed, seed)
@@ -82,11 +84,10 @@ class StudyConfig:
 
     def load_scenarios(self) -> dict[str, Scenario]:
         """
-        The scenarios by name, with the overrides.
+        Loads the scenarios, by name, with the overrides.
 
         Raises:
-            ValueError: for an unknown scenario, policy or speed, anything given twice, and values
-                that cannot be flown; the message names it and what there is.
+            ValueError: for an invalid study or scenario, or an unknown policy.
         """
         self.validate()
         for override in self.overrides:
@@ -106,17 +107,10 @@ class StudyConfig:
         return scenarios
 
     def validate(self) -> None:
-        """
-        Raises:
-            ValueError: for numbers out of range, anything given twice or not at all.
-        """
+        """Raises ValueError for numbers out of range, and missing or repeated names."""
         study_seeds(self.split, self.seeds)
         for speed in self.speeds:
             require(0.0 < speed <= MAX_SPEED, "speeds", f"in (0, {MAX_SPEED:g}] m/s", f"{speed:g}")
-        self._check_names()
-
-    def _check_names(self) -> None:
-        """Raises ValueError unless everything is given, once, and all flights differ in name."""
         given: dict[str, list[Any]] = {
             "scenario": [Path(scenario).stem for scenario in self.scenarios],
             "policy": self.policy_names,
@@ -126,17 +120,15 @@ class StudyConfig:
         for what, names in given.items():
             if not names:
                 raise ValueError(f"the study has no {what}; name at least one")
-            seen = set()
-            for name in names:
-                if name in seen:
-                    raise ValueError(
-                        f"the {what} {name} is given twice; give it once, or another name: "
-                        "policies take one as LABEL=POLICY, scenarios that of their file"
-                    )
-                seen.add(name)
+            repeated = [name for k, name in enumerate(names) if name in names[:k]]
+            if repeated:
+                raise ValueError(
+                    f"the {what} {repeated[0]} is given twice; give it once, or another name: "
+                    "policies take one as LABEL=POLICY, scenarios that of their file"
+                )
 
     def _check_own_policy(self, file: Path, policy: Any) -> None:
-        """Raises ValueError if the scenarios' own policies fly and this one's cannot."""
+        """Raises ValueError if a scenario's own policy should fly and cannot."""
         own = [variant for variant in self.variants if variant.policy == SCENARIO]
         if not own:
             return
@@ -152,14 +144,14 @@ class StudyConfig:
             variant.config(self.speeds[0], policy)
 
     def unflown_policies(self) -> list[Path]:
-        """Files of scenarios with a policy of their own that this study does not fly."""
+        """Returns the files of scenarios with a policy of their own that the study does not fly."""
         if self.flies_own_policies:
             return []
         return [file for file in map(scenario_file, self.scenarios) if has_own_policy(file)]
 
 
 def has_own_policy(file: Path) -> bool:
-    """Whether a scenario file says which policy flies it; False of what is no such file."""
+    """Tells whether a file is a scenario with a `policy`."""
     try:
         root = yaml.compose(file.read_text(), yaml.SafeLoader)
     except (OSError, UnicodeDecodeError, yaml.YAMLError):
@@ -169,24 +161,23 @@ def has_own_policy(file: Path) -> bool:
 
 
 def default_policies(scenarios: list[str]) -> list[str]:
-    """Who flies where nobody is named: the scenarios' own policies, if all of them have one, or all
-    of ours."""
+    """Returns the default policies: the scenarios' own, if all have one, or the benchmark's."""
     own = all(has_own_policy(scenario_file(scenario)) for scenario in scenarios)
     return [SCENARIO] if own else list(BENCHMARK_POLICIES)
 
 
 def _check_override(override: str) -> None:
-    """Raises ValueError for what differs between the flights of a study."""
+    """Raises ValueError for fields that differ between the flights of a study."""
     field, _, value = override.partition("=")
     section, _, inner = field.partition(".")
     if section == "policy":
         example = f"NAME:{inner}={value}" if inner else "NAME"
         raise ValueError(
-            f"the override {override!r} has no place in a study, whose flights have their own "
-            f"policies: write it as one of them, --policies {example}"
+            f"a study must not override {field}, got {override!r}; its flights have their own "
+            f"policies, write --policies {example}"
         )
     if section == "seed":
         raise ValueError(
-            f"the override {override!r} has no place in a study, whose flights have their own "
-            "seeds; say how many with --seeds"
+            f"a study must not override {field}, got {override!r}; its flights have their own "
+            "seeds, give their number with --seeds"
         )

@@ -1,19 +1,18 @@
 """A study on disk.
 
-    study.yaml       what is flown, and the program that flies it
-    scenarios/       the scenarios, every field written out
-    scenes/          the reconstructed scenes they fly in
-    weights/         of policies that were given as files, by their labels
-    rollouts/        a trajectory and its measures for each flight
-    timings/         how long each took, and where: all that differs between two runs of a study
-    errors/          the traceback of a flight that stopped the study
+    study.yaml       the study, and the program that flies it
+    scenarios/       with all fields
+    scenes/          reconstructed scenes of the scenarios
+    weights/         of policies that were given as files, by label
+    rollouts/        trajectory and metrics of each flight
+    timings/         times and machine of each flight, which differ between runs of a study
+    errors/          traceback of a flight that stopped the study
     rollouts.csv, timings.csv, table.csv, report.html
-    external.csv     where others published figures about the scenarios
+    external.csv     for scenarios with published results
 
-A flight is there when its file in `rollouts/` is; files appear whole.
+Files are written atomically; a flight is complete if its file in `rollouts/` exists.
 """
 
-import csv
 import hashlib
 import json
 import shutil
@@ -29,6 +28,7 @@ import yaml
 
 from splatpilot.analysis.benchmark.rollout import ARRAYS, INFEASIBLE, Fault, Rollout
 from splatpilot.analysis.benchmark.study import RolloutSpec, StudyConfig
+from splatpilot.analysis.benchmark.tables import Row
 from splatpilot.analysis.benchmark.variants import SCENARIO
 from splatpilot.diagrams.flight.policies import POLICIES, weights_file
 from splatpilot.diagrams.flight.scenario import Scenario
@@ -52,12 +52,9 @@ from splatpilot.systems.common.files import (
 from splatpilot.systems.common.readers import read_archive, read_text, reason_of
 
 FORMAT_VERSION = 1
-
-
 _SHAPES = {"times": (), "states": (13,), "commands": (4,), "clearances": ()}
-"""Of a sample of the arrays that are kept."""
-
-_MEASURES = "flight_time_s", "path_length_m", "mean_speed_m_s", "min_clearance_m", "jerk_m_s3"
+"""Shapes of a sample of each array."""
+_METRICS = "flight_time_s", "path_length_m", "mean_speed_m_s", "min_clearance_m", "jerk_m_s3"
 
 
 @dataclass(frozen=True)
@@ -67,24 +64,24 @@ class StudyFolder:
     path: Path
 
     def weights(self, label: str) -> Path:
-        """The file that holds the weights of a policy that was given as a file."""
+        """Returns the file with the weights of a policy that was given as a file."""
         return self.path / "weights" / f"{label}.npz"
 
     def trajectory(self, id: str) -> Path:
-        """The file that holds a flight."""
+        """Returns the file of a flight."""
         return self.path / "rollouts" / f"{id}.npz"
 
     def claim(self, config: StudyConfig, program: dict[str, str]) -> None:
         """
-        Makes the folder, or checks that the one there is of the same study.
+        Creates the folder, or checks that it is of the same study.
 
         Args:
-            config: what is flown.
+            config: of the study.
             program: `provenance.program()` and `foreign_code`.
 
         Raises:
-            ValueError: if another study, or something else, is there.
-            OSError: if the folder cannot be written.
+            ValueError: if the folder holds something else.
+            OSError: if it cannot be written.
         """
         described = {
             "format_version": FORMAT_VERSION,
@@ -99,7 +96,6 @@ class StudyFolder:
                 raise ValueError(
                     f"{self.path} is not empty and holds no study; choose another folder"
                 )
-            # Before all else: it makes the folder that of this study.
             self._describe(described)
         require_writable_folder(self.path)
         for folder in ("scenarios", "scenes", "weights", "rollouts", "timings"):
@@ -107,8 +103,7 @@ class StudyFolder:
         shutil.rmtree(self.path / "errors", ignore_errors=True)
 
     def keep_program(self, program: dict[str, str]) -> None:
-        """States another program than `claim` was told of, in a folder without flights, or what
-        else it consists of."""
+        """Replaces the program of `claim`."""
         if self.program() != program:
             self._describe(self._described() | {"program": program})
 
@@ -123,22 +118,21 @@ class StudyFolder:
             if begun[name] != value:
                 raise ValueError(
                     f"{self.path} holds a study with {name} {begun[name]}, not {value}; choose "
-                    "another folder, or ask for the same study"
+                    "another folder, or the same study"
                 )
 
     def _described(self) -> dict[str, Any]:
         file = self.path / "study.yaml"
         if not file.is_file():
             raise FileNotFoundError(
-                f"{file}: there is no such file; a study is a folder that `splatpilot benchmark` "
-                "has written"
+                f"No such file: {file}; a study is a folder of `splatpilot benchmark`"
             )
         text = read_text(file)
         try:
             described = yaml.safe_load(text)
             version = described["format_version"]
         except (yaml.YAMLError, KeyError, TypeError, RecursionError) as error:
-            raise ValueError(f"{file} describes no study: {reason_of(error)}") from None
+            raise ValueError(f"{file} is not a study: {reason_of(error)}") from None
         if version != FORMAT_VERSION:
             raise ValueError(
                 f"{file}: format version {version}, this program knows {FORMAT_VERSION}; use the "
@@ -147,16 +141,16 @@ class StudyFolder:
         for name, kind in (("study", dict), ("program", dict)):
             if not isinstance(described.get(name), kind):
                 raise ValueError(
-                    f"{file} describes no study: {name} is {described.get(name)!r:.80}; restore "
-                    "the file, or fly the study anew in another folder"
+                    f"{file} is not a study: {name} is {described.get(name)!r:.80}; restore the "
+                    "file, or fly the study again in another folder"
                 )
         return described
 
     def config(self) -> StudyConfig:
-        """What is flown.
+        """Reads the study.
 
         Raises:
-            FileNotFoundError, ValueError: if the folder holds no study.
+            FileNotFoundError, ValueError: if the folder holds none.
         """
         file = self.path / "study.yaml"
         text = yaml.safe_dump(self._described()["study"])
@@ -168,11 +162,11 @@ class StudyFolder:
         return config
 
     def program(self) -> dict[str, str]:
-        """What `claim` or `keep_program` was told of the program."""
+        """Reads the program of `claim` or `keep_program`."""
         return self._described()["program"]
 
     def write(self, rollout: Rollout) -> None:
-        """Keeps a flight."""
+        """Writes a flight."""
         id = rollout.row["id"]
         with written_atomically(self.path / "timings" / f"{id}.json") as path:
             path.write_text(json.dumps(rollout.timing))
@@ -180,19 +174,19 @@ class StudyFolder:
             path.write_bytes(rollout.trajectory)
 
     def write_fault(self, fault: Fault) -> Path:
-        """Keeps the traceback of a fault; returns its file."""
+        """Writes the traceback of a fault, and returns its file."""
         file = self.path / "errors" / f"{fault.id}.txt"
         file.parent.mkdir(exist_ok=True)
         with written_atomically(file) as path:
             path.write_text(fault.traceback)
         return file
 
-    def read(self, spec: RolloutSpec) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    def read(self, spec: RolloutSpec) -> tuple[Row, dict[str, np.ndarray]]:
         """
-        The row and the arrays of a flight; no arrays of one that could not be flown.
+        Reads the row and the arrays of a flight; no arrays if it could not be flown.
 
         Raises:
-            FileNotFoundError: if it is not there.
+            FileNotFoundError: if it is missing.
             ValueError: if its file is damaged or of another flight.
         """
         file = self.trajectory(spec.id)
@@ -212,34 +206,23 @@ class StudyFolder:
         return {"id": spec.id} | row, flown
 
     def read_timing(self, id: str) -> dict[str, Any]:
-        """How long a flight took; empty where that is not known."""
+        """Reads times and machine of a flight; empty if unknown."""
         try:
             timing = json.loads(read_text(self.path / "timings" / f"{id}.json"))
         except (OSError, ValueError, RecursionError):
             return {}
         return timing if isinstance(timing, dict) else {}
 
-    def write_table(self, name: str, rows: list[dict[str, Any]]) -> None:
-        """Writes rows as CSV, with the columns of all of them."""
-        columns = list(dict.fromkeys(column for row in rows for column in row))
-        with (
-            written_atomically(self.path / name) as path,
-            path.open("w", newline="") as file,
-        ):
-            writer = csv.DictWriter(file, columns, lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(rows)
 
-
-def _check_flight(file: Path, row: dict[str, Any], flown: dict[str, np.ndarray]) -> None:
-    """Raises ValueError unless this is all that is kept of a flight."""
+def _check_flight(file: Path, row: Row, flown: dict[str, np.ndarray]) -> None:
+    """Raises ValueError unless row and arrays are complete."""
     names = ("reason",) if row.get("outcome") == INFEASIBLE else ("outcome", "digest")
     wrong = [name for name in names if not isinstance(row.get(name), str)]
     if not isinstance(row.get("success"), bool):
         wrong.append("success")
     if row.get("outcome") != INFEASIBLE:
         count = flown["times"].shape[:1] if "times" in flown else ()
-        wrong += [name for name in _MEASURES if type(row.get(name)) not in (int, float)]
+        wrong += [name for name in _METRICS if type(row.get(name)) not in (int, float)]
         wrong += [
             name
             for name, shape in _SHAPES.items()
@@ -250,19 +233,19 @@ def _check_flight(file: Path, row: dict[str, Any], flown: dict[str, np.ndarray])
             or not (name == "clearances" or np.isfinite(flown[name]).all())
         ]
     if wrong:
-        raise ValueError(f"{file} is damaged: {wrong[0]} is missing or of another kind")
+        raise ValueError(f"{file} is damaged: {wrong[0]} is missing or invalid")
 
 
 _FLOWN_FILES = "gaussians.ply", "esdf.npz", FRONTIER, ENVIRONMENT
-"""The files of a scene folder that decide flights."""
+"""The files of a scene folder that flights depend on."""
 
 
 def require_test_scenes(scenarios: dict[str, Scenario]) -> None:
     """
-    Checks that a test study flies only in scenes from which nothing may be learned.
+    Checks that a test study flies only in test scenes.
 
     Raises:
-        ValueError: for a scene of another split; an OctoMap or a file of Gaussians has none.
+        ValueError: for a scene of another split, or without one as a file of Gaussians.
     """
     for name, scenario in scenarios.items():
         if not isinstance(scenario.world, SceneSource):
@@ -281,16 +264,16 @@ def require_test_scenes(scenarios: dict[str, Scenario]) -> None:
 
 def keep_inputs(folder: StudyFolder, config: StudyConfig, scenarios: dict[str, Scenario]) -> None:
     """
-    Keeps what flights depend on, so that the folder alone gives them again.
+    Copies scenarios, scenes and weights into the folder, from which flights can be replayed.
 
     Args:
         folder: of the study.
-        config: what is flown.
-        scenarios: by name, those that can be flown here.
+        config: of the study.
+        scenarios: to be flown, by name.
 
     Raises:
-        ValueError: if something else is kept there already.
-        OSError: if it cannot be read or written.
+        ValueError: if the folder holds others.
+        OSError: if they cannot be read or written.
     """
     for variant in config.variants:
         if variant.weights is not None:
@@ -307,11 +290,8 @@ def keep_inputs(folder: StudyFolder, config: StudyConfig, scenarios: dict[str, S
 
 
 def input_digests(config: StudyConfig, scenarios: dict[str, Scenario]) -> dict[str, str]:
-    """
-    Returns digests of the weights and scenes that a study flies with, beside
-    `provenance.program()`: by "weights of LABEL", for a scenario's own policy "weights of LABEL in
-    SCENARIO", and by "scene of SCENARIO". Scenes that are absent have none.
-    """
+    """Returns digests of weights and existing scenes, to be added to `provenance.program()`: by
+    "weights of LABEL", "weights of LABEL in SCENARIO" and "scene of SCENARIO"."""
     digests = {}
     for name, scenario in scenarios.items():
         for variant in config.variants:
@@ -340,10 +320,10 @@ def _digest(files: list[Path]) -> str:
 
 
 def kept_scenario(folder: StudyFolder, name: str) -> Scenario:
-    """A scenario as a study flies it, its scene and weights in the study's folder.
+    """Reads a scenario of a study, with scene and weights in the study's folder.
 
     Raises:
-        FileNotFoundError, ValueError: if it is not there or damaged.
+        FileNotFoundError, ValueError: if it is missing or damaged.
     """
     file = folder.path / "scenarios" / f"{name}.yaml"
     scenario = load_config(Scenario(), file)
@@ -364,11 +344,11 @@ def kept_flights(
     folder: StudyFolder, specs: Iterable[RolloutSpec]
 ) -> Iterator[tuple[RolloutSpec, Scenario]]:
     """
-    Flights with the scenario of each, complete with policy and seed, from the study's folder alone.
+    Yields flights with their scenario, policy and seed, from the study's folder alone.
 
     Raises:
-        FileNotFoundError, ValueError: if the folder is damaged, or names a module that nobody has
-            imported: files alone import nothing.
+        FileNotFoundError, ValueError: if the folder is damaged, or names a module that is not
+            imported; files never import modules.
     """
     variants = {}
     for variant in folder.config().variants:
@@ -376,7 +356,7 @@ def kept_flights(
         if colon and module not in sys.modules:
             raise ValueError(
                 f"{folder.path} flies {variant.policy}, whose module is not imported; if you trust "
-                f"it, add --import {module} in front of the verb"
+                f"it, add --import {module} in front of the command"
             )
         if variant.weights is not None:
             kept = str(folder.weights(variant.label).absolute())
@@ -397,14 +377,14 @@ def _keep_scenario(folder: StudyFolder, name: str, scenario: Scenario) -> None:
     if file.is_file() and file.read_text() != text:
         raise ValueError(
             f"{file} differs from the scenario {name} of this program; choose another folder with "
-            "--out, or finish the study with the program that began it"
+            "--out, or finish the study with the program that started it"
         )
     with written_atomically(file) as path:
         path.write_text(text)
 
 
 def _keep_scene(folder: StudyFolder, world: SceneSource) -> str:
-    """Copies a scene into the study; returns where to, in its folder."""
+    """Copies a scene into the study, and returns its path there."""
     scene = find_scene(world)
     kept = folder.path / "scenes" / scene.name
     if not kept.exists():
@@ -419,11 +399,11 @@ def _keep_scene(folder: StudyFolder, world: SceneSource) -> str:
 
 
 def _keep_weights(folder: StudyFolder, file: Path, label: str) -> str:
-    """Copies weights into the study; returns where to, in its folder."""
+    """Copies weights into the study, and returns their path there."""
     kept = folder.weights(label)
     if kept.is_file() and kept.read_bytes() != file.read_bytes():
         raise ValueError(
-            f"{file} has changed since {folder.path} was begun; choose another folder with --out"
+            f"{file} has changed since {folder.path} was started; choose another folder with --out"
         )
     kept.parent.mkdir(exist_ok=True)
     with written_atomically(kept) as path:
@@ -432,7 +412,7 @@ def _keep_weights(folder: StudyFolder, file: Path, label: str) -> str:
 
 
 def _own(scenario: str) -> str:
-    """What the weights of a scenario's own policy are kept as; no label is like it."""
+    """Returns the label of the weights of a scenario's own policy; no other label has a slash."""
     return f"scenarios/{scenario}"
 
 
@@ -440,8 +420,8 @@ _KNOWN = {"splatpilot", "__main__"} | sys.stdlib_module_names
 
 
 def foreign_code(scenarios: Iterable[Scenario]) -> dict[str, str]:
-    """A digest of the source of each package of others that has part in flights of scenarios, which
-    are complete with who flies; by "source of PACKAGE", beside `provenance.program()`."""
+    """Returns a digest of the source of each plugin package that scenarios and their policies use,
+    to be added to `provenance.program()`: by "source of PACKAGE"."""
     packages = set()
     for scenario in scenarios:
         packages |= _packages_of(scenario.policy, POLICIES.kind_of(scenario.policy))
@@ -452,7 +432,7 @@ def foreign_code(scenarios: Iterable[Scenario]) -> dict[str, str]:
 
 
 def _packages_of(config: Any, kind: Any) -> set[str]:
-    """Where a configuration, and what makes something of it, is written."""
+    """Returns the packages of a configuration and of its registry entry."""
     made_by = (getattr(kind, field.name) for field in fields(kind))
     modules = [getattr(made, "__module__", None) for made in (type(config), *made_by)]
     return {module.partition(".")[0] for module in modules if module}

@@ -17,17 +17,15 @@ from splatpilot.diagrams.scenarios import benchmark_scenarios
 from splatpilot.systems.common.seeds import describe_seeds
 from splatpilot.training.corpus.library import PROCEDURAL
 
-# How far successes of a finite number of flights can be trusted.
-#
-# Two questions have two answers. Wilson's interval and McNemar's test take flights as independent:
-# they hold for these scenarios with new seeds. Flights of one scenario share what makes it hard, so
-# the cluster bootstrap and the sign-flip test take scenarios as independent: they hold for new
-# scenarios of the same kinds.
+# Wilson's interval and McNemar's test take flights as independent: they hold for these scenarios
+# with new seeds. The cluster bootstrap and the sign-flip test take scenarios as independent, whose
+# flights are correlated: they hold for new scenarios of the same kinds.
 
+Row = dict[str, Any]
+"""The specification and metrics of a flight, or a row of a table."""
 
 _RESAMPLES = 9999
-_EXACT = 17
-"""Up to so many scenarios all 2^n signs are tried, of more scenarios as many random ones."""
+_MAX_EXACT = 17  # scenarios with all 2^n signs; of more scenarios, as many random ones
 
 
 class Interval(NamedTuple):
@@ -38,7 +36,7 @@ class Interval(NamedTuple):
 
 
 def wilson_interval(successes: int, flights: int, confidence: float = 0.95) -> Interval:
-    """The score interval of a success rate (E. B. Wilson, 1927), all of [0, 1] without flights."""
+    """Returns the score interval of a success rate (E. B. Wilson, 1927); [0, 1] without flights."""
     if flights == 0:
         return Interval(0.0, 1.0)
     interval = binomtest(successes, flights).proportion_ci(confidence, method="wilson")
@@ -51,8 +49,8 @@ def cluster_interval(
     """
     Returns the percentile interval of a success rate by a bootstrap over scenarios.
 
-    Fewer than two scenarios say nothing about others. If all have the same rate, resampling shows
-    no spread, and the interval is Wilson's with each scenario counted as one flight.
+    It is [0, 1] for fewer than two scenarios. If all have the same rate, it is Wilson's with each
+    scenario counted as one flight.
 
     Args:
         successes, flights: of each scenario, (S,).
@@ -74,16 +72,16 @@ class PairedCounts(NamedTuple):
     only_first: int
     """Flights in which only the first succeeded."""
     only_second: int
-    """Flights in which only the second did."""
+    """Flights in which only the second succeeded."""
     p_value: float
     """Probability of a difference as large if the policies were equally good."""
 
 
 def mcnemar(first: np.ndarray, second: np.ndarray) -> PairedCounts:
-    """The exact test of McNemar (Psychometrika 12, 1947) on paired successes (n,) bool.
+    """Computes the exact test of McNemar (Psychometrika 12, 1947) on paired successes (n,) bool.
 
-    Where both policies succeed or both fail says nothing; of the other flights each would be won by
-    either with probability one half, so that the count of one is binomial.
+    Of equally good policies, the count of flights in which only the first succeeds is binomial with
+    probability one half among those in which one of them does.
     """
     only_first = int(np.count_nonzero(first & ~second))
     only_second = int(np.count_nonzero(second & ~first))
@@ -96,26 +94,24 @@ def sign_flip(differences: ArrayLike) -> float:
     """
     Returns the two-sided p-value of a paired sign-flip permutation test over scenarios.
 
-    If the policies were equally good in scenarios of these kinds, the difference of their success
-    rates in a scenario would have either sign with probability one half.
+    Of equally good policies, the difference in a scenario has either sign with probability 0.5.
 
     Args:
-        differences: of the success rates of two policies in each scenario, (S,).
+        differences: of the success rates of two policies, by scenario (S,).
     """
     d = np.asarray(differences, float)
     d = d[d != 0]
-    if len(d) <= _EXACT:
+    if len(d) <= _MAX_EXACT:
         bits = np.arange(2 ** len(d))[:, None] >> np.arange(len(d)) & 1
     else:
-        bits = np.random.default_rng(0).integers(2, size=(2**_EXACT, len(d)))
-        bits[0] = 0  # what was observed is one of the possibilities
+        bits = np.random.default_rng(0).integers(2, size=(2**_MAX_EXACT, len(d)))
+        bits[0] = 0  # the observation
     sums = np.abs((1 - 2 * bits) @ d)
     return float(np.mean(sums >= abs(d.sum()) - 1e-12))
 
 
 def holm(p_values: ArrayLike) -> NDArray[np.float64]:
-    """Returns p-values (m,) corrected for the number of tests (S. Holm, Scand. J. Statistics 6,
-    1979): the chance of any false positive among them stays below the level."""
+    """Returns p-values (m,) corrected for multiple tests (S. Holm, Scand. J. Stat. 6, 1979)."""
     p = np.asarray(p_values, float)
     order = np.argsort(p)
     steps = (len(p) - np.arange(len(p))) * p[order]
@@ -125,16 +121,16 @@ def holm(p_values: ArrayLike) -> NDArray[np.float64]:
 
 
 FAILURES = Outcome.COLLISION, Outcome.TIMEOUT, Outcome.LEFT_VOLUME, Outcome.ERROR, INFEASIBLE
-"""The outcomes that tables count, next to the successes."""
+"""The outcomes that tables count, besides successes."""
 
-MEASURES = (
+METRICS = (
     "min_clearance_m",
     "mean_speed_m_s",
     "path_excess",
     "jerk_m_s3",
     "smoothness",
 )
-"""Columns of which the table has the mean over the flights that have them."""
+"""Columns whose means are in the table, over the flights that have them."""
 
 
 class PaperRow(NamedTuple):
@@ -153,30 +149,30 @@ PAPER = {
     "student_depth": PaperRow("Depth", 10, 0.33, 2.28),
     "student_rgb": PaperRow("RGB", 5, -0.09, 2.51),
 }
-"""The paper's Table I, by the names of our policies."""
+"""The paper's Table I, by names of our policies."""
 
 PAPER_FLIGHTS = 17
 
 IN_DISTRIBUTION = (*PROCEDURAL, "R17")
-"""Scenarios made by the generators in which the shipped weights were trained, of other seeds."""
+"""Scenarios of the generators in which the shipped weights were trained, with other seeds."""
 
 
 def paper_rows(config: StudyConfig, absent: Collection[str] = ()) -> dict[str, PaperRow]:
-    """Returns the rows of the paper's table that a study is compared with: of policies that fly as
-    they ship, if all of the benchmark's scenarios were flown as they are and none is `absent`."""
+    """Returns the rows of the paper's table for unchanged policies, if the study flies all of the
+    benchmark's scenarios unchanged."""
     if absent or config.overrides or set(config.scenarios) != set(benchmark_scenarios()):
         return {}
     return {policy: PAPER[policy] for policy in config.policies if policy in PAPER}
 
 
-def select(rows: list[dict[str, Any]], **values: object) -> list[dict[str, Any]]:
-    """The rows that have these values."""
+def select(rows: list[Row], **values: object) -> list[Row]:
+    """Returns the rows with these values."""
     return [row for row in rows if all(row[name] == value for name, value in values.items())]
 
 
-def success_summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Counts flights, successes and how the others ended, and gives the success rate with its 95 %
-    intervals: Wilson's for these scenarios, and by clusters for new ones of the same kinds."""
+def success_summary(rows: list[Row]) -> Row:
+    """Counts flights by outcome, and returns the success rate with 95 % intervals: Wilson's for
+    these scenarios, and by clusters for new ones of the same kinds."""
     successes = sum(row["success"] for row in rows)
     interval = wilson_interval(successes, len(rows))
     flights = Counter(row["scenario"] for row in rows)
@@ -193,18 +189,15 @@ def success_summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
     } | {str(outcome): sum(row["outcome"] == outcome for row in rows) for outcome in FAILURES}
 
 
-def mean_of(rows: list[dict[str, Any]], name: str) -> float:
-    """The mean of a column over the rows that have a number there; NaN without any."""
+def mean_of(rows: list[Row], name: str) -> float:
+    """Returns the mean of a column over the rows with a number; NaN without any."""
     values = [row[name] for row in rows if math.isfinite(row.get(name, math.nan))]
     return float(np.mean(values)) if values else math.nan
 
 
-def policy_table(
-    rows: list[dict[str, Any]], config: StudyConfig, absent: int = 0
-) -> list[dict[str, Any]]:
-    """A row for each policy and speed: `success_summary`, in how many of the scenarios flown most
-    flights succeed, the flights that were not run because `absent` scenarios have no scene here,
-    and the means of `MEASURES`."""
+def policy_table(rows: list[Row], config: StudyConfig, absent: int = 0) -> list[Row]:
+    """Returns a row for each policy and speed: `success_summary`, `scenarios_passed`, the number of
+    flights not run in `absent` scenarios, and the means of `METRICS`."""
     table = []
     for policy in config.policy_names:
         for speed in config.speeds:
@@ -214,13 +207,13 @@ def policy_table(
                 | success_summary(flown)
                 | scenarios_passed(flown)
                 | {"not_run": absent * config.seeds}
-                | {name: mean_of(flown, name) for name in MEASURES}
+                | {name: mean_of(flown, name) for name in METRICS}
             )
     return table
 
 
-def scenarios_passed(rows: list[dict[str, Any]]) -> dict[str, int]:
-    """How many scenarios the flights are in, and in how many more than half of them succeed."""
+def scenarios_passed(rows: list[Row]) -> dict[str, int]:
+    """Counts scenarios, and those in which more than half of the flights succeed."""
     successes: dict[str, list[bool]] = {}
     for row in rows:
         successes.setdefault(row["scenario"], []).append(row["success"])
@@ -236,13 +229,12 @@ class Comparison(NamedTuple):
     speed: float  # [m/s]
     only_first: int  # flights in which only the first succeeded
     only_second: int
-    p_seeds: float  # McNemar's: for these scenarios with new seeds
-    p_scenarios: float  # of sign flips: for new scenarios of the same kinds
+    p_seeds: float  # McNemar's, for these scenarios with new seeds
+    p_scenarios: float  # of sign flips, for new scenarios of the same kinds
 
 
-def compare(rows: list[dict[str, Any]], config: StudyConfig) -> list[Comparison]:
-    """Compares all pairs of a study's policies at each speed. Holm's correction for the number of
-    pairs is in the p-values."""
+def compare(rows: list[Row], config: StudyConfig) -> list[Comparison]:
+    """Compares all pairs of a study's policies at each speed, with Holm's correction."""
 
     def wins(policy: str, speed: float) -> np.ndarray:  # (scenarios, seeds), of one order
         flown = select(rows, policy=policy, speed=speed)
@@ -261,7 +253,7 @@ def compare(rows: list[dict[str, Any]], config: StudyConfig) -> list[Comparison]
     return pairs
 
 
-def format_table(table: list[dict[str, Any]], config: StudyConfig) -> str:
+def format_table(table: list[Row], config: StudyConfig) -> str:
     """Formats the table of policies for a terminal."""
     width = max([16, *(len(row["policy"]) + 2 for row in table)])
     lines = [

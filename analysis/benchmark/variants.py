@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from splatpilot.systems.common.validation import require
 
 SCENARIO = "scenario"
-"""The policy that is the scenario's own: what stands in its `policy` block."""
+"""The policy of the scenario itself, its `policy` block."""
 
 _LABEL = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+-]{0,79}")
 _FIELD = r"[A-Za-z_][\w.]*="
@@ -18,31 +18,30 @@ _OUTSIDE_BRACKETS = r"(?![^\[{(]*[\]})])"
 
 
 class Variant(NamedTuple):
-    """A policy, and what of its configuration differs from how it ships."""
+    """A policy, with a label and changed fields of its configuration."""
 
     label: str
-    """What its flights are named by: good as the name of a file."""
+    """Names its flights, and files."""
     policy: str
     """A registered name, a file of weights (.npz), "module:Class", or `SCENARIO`."""
     overrides: tuple[str, ...] = ()
-    """"dotted.field=YAML value" each, of the policy's configuration."""
+    """"dotted.field=YAML value" of its configuration."""
 
     @property
     def weights(self) -> Path | None:
-        """The file of weights that it flies by, if it is given as one."""
+        """The file of weights, if it is given as one."""
         return Path(self.policy) if self.policy.endswith(".npz") else None
 
     def config(self, speed: float, own: Any) -> Any:
         """
-        The configuration that flies.
+        Returns the configuration of the policy.
 
         Args:
             speed: nominal [m/s].
-            own: the scenario's own policy, flown by `SCENARIO`.
+            own: the scenario's policy, for `SCENARIO`.
 
         Raises:
-            FileNotFoundError, ValueError: see `policy_named`; or for unknown fields and values out
-                of range.
+            FileNotFoundError, ValueError: see `policy_named`; or for invalid overrides.
         """
         # Here, because the command line reads policies before anything slow is imported.
         from splatpilot.diagrams.flight.policies import policy_named
@@ -63,11 +62,11 @@ def parse_variant(text: str) -> Variant:
     """
     Reads `[LABEL=]POLICY[:FIELD=VALUE[:FIELD=VALUE...]]`.
 
-    The label is the name of the policy, of its class or of its file where none is given, followed
-    by the fields that are set: `reactive:margin=0.2` is labelled `reactive-margin-0.2`.
+    The default label is the name of the policy, class or file with the fields that are set:
+    `reactive:margin=0.2` is labeled `reactive-margin-0.2`.
 
     Raises:
-        ValueError: if the label is none that a file can bear, or a field has another place.
+        ValueError: if the label cannot name a file, or the study sets the field.
     """
     label, _, rest = text.partition("=")
     if text.startswith("="):
@@ -96,20 +95,20 @@ def parse_variant(text: str) -> Variant:
         label = "-".join([name, *(override.replace("=", "-", 1) for override in overrides)])
     if not _LABEL.fullmatch(label):
         raise ValueError(
-            f"the policy {text[:100]!r} would be labelled {label[:100]!r}, but labels name files: "
+            f"the policy {text[:100]!r} would be labeled {label[:100]!r}, but labels name files: "
             "give it one of at most 80 letters, digits and _ . + - in front, LABEL=POLICY"
         )
     return Variant(label, policy, tuple(overrides))
 
 
 def split_policies(text: str) -> list[str]:
-    """The policies of a list with commas; those in brackets belong to values."""
+    """Splits a list at commas outside of brackets."""
     return [part.strip() for part in re.split("," + _OUTSIDE_BRACKETS, text) if part.strip()]
 
 
 def sweep(text: str) -> Iterator[str]:
     """
-    The variants of a sweep, `POLICY:FIELD=VALUE,VALUE,...[:FIELD=VALUE,...]`, one for each
+    Yields the variants of a sweep, `POLICY:FIELD=VALUE,VALUE,...[:FIELD=VALUE,...]`, one for each
     combination of values.
 
     Raises:

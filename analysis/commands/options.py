@@ -168,7 +168,6 @@ POLICIES = (
     "diffaero_rgb",
     "student_rgb",
     "student_depth",
-    "pilot_rgb",
 )
 """The names of our own policies."""
 

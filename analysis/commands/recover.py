@@ -59,10 +59,8 @@ def _recover(options: argparse.Namespace) -> None:
     from splatpilot.systems.common.config import load_config
     from splatpilot.systems.common.processes import available_cores
     from splatpilot.training.policies import recover as recovery
-    from splatpilot.training.policies.torchrun import require_one_process
     from splatpilot.training.policies.trainer_registry import TRAINERS
 
-    require_one_process("recover")
     config = load_config(trainer_defaults(options), options.config, options.overrides)
     jobs = available_cores() if options.jobs is None else options.jobs
     make = TRAINERS.find(options.policy).make

@@ -14,7 +14,6 @@ from splatpilot.analysis.commands.options import (
     check_scenario,
     check_trainer,
 )
-from splatpilot.systems.common.validation import require
 
 
 def add_to(verbs: argparse._SubParsersAction) -> None:
@@ -23,8 +22,8 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
         "train",
         _train,
         help="train policies",
-        description="Trains policies, several at a time on several cores, and leaves weights, a "
-        "model card and curves of each. Interrupted, the same command goes on.",
+        description="Trains policies, one after the other, and writes weights, a model card and "
+        "curves of each. If interrupted, the same command resumes.",
         examples=(
             "train diffaero --out out/forests --set 'worlds.kinds=[P02, P03]' --fly P03",
             "train diffaero depthnav --out out/both --seeds 0 1",
@@ -47,9 +46,6 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
         "runs have folders in it, POLICY or seed_N or both",
     )
     train.add_argument("--seeds", type=int, nargs="+", metavar="N", help="train with each of these")
-    train.add_argument(
-        "--jobs", type=int, metavar="N", help="runs at a time, one core each; default: cores"
-    )
     train.add_argument("--config", type=Path, help="YAML file with fields of the configuration")
     train.add_argument(
         "--fly",
@@ -74,7 +70,6 @@ def trainer_defaults(options: argparse.Namespace) -> Any:
 
 
 def _train(options: argparse.Namespace) -> None:
-    require(options.jobs is None or options.jobs >= 1, "--jobs", "at least 1", options.jobs)
     scenarios = [name.strip() for name in options.fly.split(",")] if options.fly else []
     for name in scenarios:
         check_scenario(name)  # before the training, not after it
@@ -89,9 +84,7 @@ def _train(options: argparse.Namespace) -> None:
 
     say(f"training {', '.join(options.policies)} in {options.out}")
     from splatpilot.systems.common.config import load_config
-    from splatpilot.systems.common.processes import available_cores
-    from splatpilot.training.policies.side_by_side import TrainingRun, run_side_by_side
-    from splatpilot.training.policies.torchrun import require_one_process
+    from splatpilot.training.policies import train
     from splatpilot.training.policies.trainer_registry import TRAINERS
 
     runs = []
@@ -104,20 +97,15 @@ def _train(options: argparse.Namespace) -> None:
                 out = out / policy.rpartition(":")[2]
             if seed is not None:
                 out = out / f"seed_{seed}"
-            runs.append(TrainingRun(policy, config, out))
-    if len(runs) > 1:
-        require_one_process("several trainings")
-    if scenarios:
-        require_one_process("--fly")
+            runs.append((policy, config, out))
+    weights = []
     with resumable(lambda: f"checkpoints are in {options.out}; the same command resumes"):
-        summaries = run_side_by_side(runs, options.jobs or available_cores())
+        for policy, config, out in runs:
+            summary = train.run(config=config, out=out, make=TRAINERS.find(policy).make)
+            weights.append(str(out / f"{summary['policy']}.npz"))
     if scenarios:
         from splatpilot.analysis.benchmark import run_study as benchmark
         from splatpilot.analysis.benchmark.study import StudyConfig
 
-        weights = [
-            str(run.out / f"{summary['policy']}.npz")
-            for run, summary in zip(runs, summaries, strict=True)
-        ]
         study = StudyConfig(scenarios=scenarios, policies=weights, seeds=5)
         benchmark.run(config=study, out=options.out / "benchmark")

@@ -1,4 +1,4 @@
-"""`splatpilot hardware faults`: flights in which something goes wrong, many, drawn at random."""
+"""`splatpilot hardware faults`: many flights with random faults."""
 
 import json
 from dataclasses import dataclass, field, replace
@@ -14,6 +14,7 @@ from splatpilot.diagrams.worlds.forest.forest import ForestConfig
 from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.common.files import claim_folder, holds_folder, written_atomically
 from splatpilot.systems.common.progress import Progress
+from splatpilot.systems.common.validation import Config, bounded
 from splatpilot.systems.messaging.flight_limits import FlightLimits
 
 
@@ -22,45 +23,33 @@ def _scenario() -> Scenario:
 
 
 @dataclass
-class FaultsConfig:
+class FaultsConfig(Config):
     """A campaign."""
 
-    # [-] Flights; the kinds of faults, what the vehicle is told, and the policies take turns.
-    trials: int = 600
+    # [-] Number of flights, which alternate between faults, commands and policies.
+    trials: int = bounded(600, "[1, inf)")
     # Seed of everything random.
     seed: int = 0
-    # [-] Worlds that the trials take turns in.
-    worlds: int = 10
-    # [m/s] Of the policies, of which `straight` flies into things.
+    # [-] Number of worlds, which trials alternate between.
+    worlds: int = bounded(10, "[1, inf)")
+    # [m/s] Speed of the policies; `straight` collides without a failsafe.
     speed: float = 2.0
-    # What is kept, by which a trial is judged.
+    # Limits that safe trials keep.
     limits: FlightLimits = field(default_factory=lambda: FlightLimits(max_speed=2.5))
-    # What is flown, but for its policy.
+    # Scenario of the trials, but for its policy and seed.
     scenario: Scenario = field(default_factory=_scenario)
-
-    def validate(self) -> None:
-        """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
-        for name in ("trials", "worlds"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} is {getattr(self, name)}; it must be at least 1")
-        self.limits.validate()
-        self.scenario.validate()
 
 
 @holds_folder("out")
 def run(*, config: FaultsConfig, out: Path) -> dict[str, Any]:
     """
-    Flies the trials, from where an interrupted campaign of the same configuration stopped.
+    Flies the trials, or resumes an interrupted campaign of the same configuration.
 
-    Leaves in `out`: `trials.jsonl`, what `fly_trial` says of each; `config.yaml`; `summary.json`,
-    of each kind of fault how many trials were safe and how they ended.
+    Writes into `out`: `trials.jsonl`, results of `fly_trial`; `config.yaml`; `summary.json`, the
+    number of safe trials and the outcomes by the type of fault.
 
     Returns:
-        What `summary.json` says.
-
-    Raises:
-        ValueError: for a configuration out of range, or another than `out` has.
-        OSError: if `out` cannot be written.
+        The content of `summary.json`.
     """
     config.validate()
     claim_folder(out / "config.yaml", config)
@@ -71,7 +60,7 @@ def run(*, config: FaultsConfig, out: Path) -> dict[str, Any]:
         world_seed = config.seed + number % config.worlds
         if world_seed not in worlds:
             worlds[world_seed] = make_world(config.scenario.world, world_seed)
-        trial = Trial.draw(number, np.random.default_rng([config.seed, number]))
+        trial = Trial.sample(number, np.random.default_rng([config.seed, number]))
         seed, policy = config.seed + number, policy_named(trial.policy, config.speed)
         scenario = replace(config.scenario, seed=seed, policy=policy)
         rows.append(fly_trial(scenario, worlds[world_seed], trial, config.limits, seed))
@@ -89,7 +78,7 @@ def run(*, config: FaultsConfig, out: Path) -> dict[str, Any]:
 
 
 def summarize(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """How many trials were safe, and how those with each kind of fault ended."""
+    """Counts safe trials, and outcomes by the type of fault."""
     kinds = {}
     for kind in KINDS:
         of_kind = [row for row in rows if kind in {fault["kind"] for fault in row["faults"]}]

@@ -1,4 +1,4 @@
-"""One flight in which something goes wrong."""
+"""One flight with faults."""
 
 import heapq
 import math
@@ -12,7 +12,7 @@ from lcm import LCM
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
 from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, LeafSystem
 
-from splatpilot.diagrams.flight.blocks import goal_of, make_policy
+from splatpilot.diagrams.flight.blocks import goal_position, make_policy
 from splatpilot.diagrams.flight.flight import (
     Outcome,
     flight_outcome,
@@ -37,11 +37,8 @@ from splatpilot.systems.messaging.failsafe import FailsafeConfig
 from splatpilot.systems.messaging.flight_limits import FlightLimits
 from splatpilot.systems.messaging.generated import lcmt_bridge_status as status
 from splatpilot.systems.messaging.lcm_ports import PUBLISH_OFFSET
-from splatpilot.systems.messaging.tof_receiver import (
-    TimeOfFlightReceiver,
-    TimeOfFlightStream,
-    UdpConfig,
-)
+from splatpilot.systems.messaging.receiver import UdpConfig
+from splatpilot.systems.messaging.tof_receiver import TimeOfFlightReceiver, TimeOfFlightStream
 from splatpilot.systems.sensing.time_of_flight import GRID_MAGIC
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 from splatpilot.systems.vehicle.state import QuadrotorState
@@ -65,37 +62,33 @@ KINDS = (
     "not_finite",
     "corrupt",
 )
-"""Messages are dropped, 300 ms late, come twice, or overtake each other; the vehicle's clock jumps;
-it says the same state again and again, or one that is meters away; motion capture does not see the
-vehicle, or its messages are dropped; packets of the time-of-flight sensor are dropped, or have bits
-flipped; the policy decides nonsense or raises exceptions, the process that it is in stands still,
-or ends; messages hold a value that is not finite, or have bits flipped.
+"""Types of faults: messages are dropped, 300 ms late, sent twice, or overtake each other; the
+vehicle's clock jumps; its state is constant, or meters off; motion capture loses the vehicle, or
+its messages are dropped; packets of the time-of-flight sensor are dropped, or have flipped bits;
+the policy outputs nonsense or raises exceptions, its process stalls or ends; messages contain NaN,
+or have flipped bits.
 
-Of two at once the earlier is applied first: messages are read before they are corrupted."""
+Of two faults, the earlier one here is applied first: messages are decoded before corruption."""
 
 DELAY = 0.3
-"""[s] of messages that are delayed."""
+"""[s] of delayed messages."""
 
 _FOREVER = 1e6  # [s]
 
 
 @dataclass(frozen=True)
 class Fault:
-    """One of a trial's."""
+    """A fault of a trial."""
 
     kind: str
-    begin: float
-    """[s]"""
-    duration: float
-    """[s]"""
-    fraction: float
-    """[-] Of the messages that are hit."""
-    size: float
-    """[s] By which the clock jumps, and of whose sign the state does."""
+    begin: float  # [s]
+    duration: float  # [s]
+    fraction: float  # [-] of messages with the fault.
+    size: float  # [s] jump of the clock; its sign is that of the jump of the state.
 
     @classmethod
-    def draw(cls, kind: str, random: np.random.Generator) -> "Fault":
-        """One of a kind, the rest drawn."""
+    def sample(cls, kind: str, random: np.random.Generator) -> "Fault":
+        """Samples a fault of a type."""
         return cls(
             kind=kind,
             begin=float(random.uniform(0.5, 3.0)),
@@ -105,38 +98,34 @@ class Fault:
         )
 
     def is_on(self, now: float) -> bool:
-        """Whether it is on at a time [s]."""
+        """Checks if the fault is on at a time [s]."""
         return self.begin <= now < self.begin + self.duration
 
 
 @dataclass(frozen=True)
 class Trial:
-    """What is flown, and what goes wrong."""
+    """Faults, policy and commands of a flight."""
 
     faults: tuple[Fault, ...]
     policy: str
-    setpoints: str
-    """What the vehicle is told, see `HardwareConfig.setpoints`."""
+    setpoints: str  # see `HardwareConfig.setpoints`.
 
     @classmethod
-    def draw(cls, number: int, random: np.random.Generator) -> "Trial":
-        """That of a number: kinds, interfaces and policies take turns, every other has two faults
-        at once, the rest is drawn.
-
-        Faults of the sensor's packets need the policy that sees by them.
-        """
+    def sample(cls, number: int, random: np.random.Generator) -> "Trial":
+        """Samples the trial of a number. Types of faults, commands and policies alternate; about
+        half of the trials have two faults. Faults of grids need the policy with that input."""
         turn, kind = divmod(number, len(KINDS))
         kinds = [kind]
         if random.random() < 0.5:
             kinds.append(int(random.choice([k for k in range(len(KINDS)) if k != kind])))
-        faults = tuple(Fault.draw(KINDS[k], random) for k in sorted(kinds))
+        faults = tuple(Fault.sample(KINDS[k], random) for k in sorted(kinds))
         needs_grid = any(fault.kind.startswith("grid") for fault in faults)
         policy = "diffaero_tof" if needs_grid else ("straight", "reactive")[turn // 2 % 2]
         return cls(faults, policy, ("velocity", "body_rates")[turn % 2])
 
 
 class GridStream:
-    """A sensor's stream by UDP to a port of this host, in the place of an LCM."""
+    """Sends a sensor's packets by UDP to a port of this host."""
 
     def __init__(self, port: int) -> None:
         self._port = port
@@ -149,14 +138,14 @@ class GridStream:
 
 class Relay:
     """
-    Carries messages between two LCMs, as well as faults let it.
+    Carries messages between two LCMs, with faults.
 
     Args:
-        vehicle, bridge: where messages of either come from, and are to go.
-        from_vehicle, from_bridge: what there is to carry.
-        faults: what goes wrong.
-        random: where chance comes from.
-        grids: where grids of the vehicle go instead, as a sensor's packets.
+        vehicle, bridge: transports of either.
+        from_vehicle, from_bridge: codecs of their messages.
+        faults: of the trial.
+        random: source of randomness.
+        grids: replaces the LCM for grids of the vehicle.
     """
 
     def __init__(
@@ -178,7 +167,7 @@ class Relay:
                 sender.subscribe(codec.channel, self._taker(codec, sender is vehicle))
 
     def step(self, now: float) -> None:
-        """Takes what was sent, and delivers what is due at a time [s]."""
+        """Receives messages, and delivers those that are due at a time [s]."""
         self._now = now
         for end in self._ends:
             while end.handle_timeout(0):
@@ -187,13 +176,13 @@ class Relay:
             _, _, receiver, channel, data = heapq.heappop(self._waiting)
             receiver.publish(channel, data)
 
-    def _taker(self, codec: Codec, of_vehicle: bool):
-        # LCM owns what it calls, and is owned by the relay.
+    def _taker(self, codec: Codec, from_vehicle: bool):
+        # The relay owns LCM, which owns its callbacks.
         take = weakly(self._take)
-        return lambda channel, data: take(codec, of_vehicle, channel, data)
+        return lambda channel, data: take(codec, from_vehicle, channel, data)
 
-    def _take(self, codec: Codec, of_vehicle: bool, channel: str, data: bytes) -> None:
-        receiver: LCM | GridStream = self._ends[1 if of_vehicle else 0]
+    def _take(self, codec: Codec, from_vehicle: bool, channel: str, data: bytes) -> None:
+        receiver: LCM | GridStream = self._ends[1 if from_vehicle else 0]
         if codec.port == "depth_grid" and self._grids is not None:
             receiver, message = self._grids, codec.message.decode(data)
             head = GRID_MAGIC, message.header.seq, message.header.utime * 1000
@@ -203,7 +192,7 @@ class Relay:
             copies = [
                 (delay + later, changed)
                 for delay, sent in copies
-                for later, changed in self._treat(fault, codec, sent, of_vehicle)
+                for later, changed in self._treat(fault, codec, sent, from_vehicle)
             ]
         for delay, sent in copies:
             self._count += 1
@@ -211,31 +200,31 @@ class Relay:
             heapq.heappush(self._waiting, (due, self._count, receiver, channel, sent))
 
     def _treat(
-        self, fault: Fault, codec: Codec, data: bytes, of_vehicle: bool
+        self, fault: Fault, codec: Codec, data: bytes, from_vehicle: bool
     ) -> list[tuple[float, bytes]]:
-        """The copies of a message that arrive: the delay [s] of each, and what it is."""
-        random, is_on, as_it_is = self._random, fault.is_on(self._now), [(0.0, data)]
-        if fault.kind == "clock_jump" and of_vehicle and codec.port != "depth_grid":
+        """Applies a fault to a message; returns delays [s] and contents of its copies."""
+        random, is_on, unchanged = self._random, fault.is_on(self._now), [(0.0, data)]
+        if fault.kind == "clock_jump" and from_vehicle and codec.port != "depth_grid":
             jump = round(fault.size * 1e6) if self._now >= fault.begin else 0
             return [(0.0, self._changed(codec, data, utime=jump))]
         if fault.kind == "state_frozen" and codec.port == "state":
             self._state = (self._state or codec.message.decode(data)) if is_on else None
             return [(0.0, self._changed(codec, data, like=self._state))]
         if not is_on:
-            return as_it_is
+            return unchanged
         if fault.kind == "state_jumped" and codec.port == "state":
             moved = math.copysign(1.0 + 2.0 * fault.fraction, fault.size)  # [m]
             return [(0.0, self._changed(codec, data, moved=moved))]
         if random.random() > fault.fraction:
-            return as_it_is
-        hits_port = {
+            return unchanged
+        affected_port = {
             "body_lost": "motion_capture_pose",
             "body_dropped": "motion_capture_pose",
             "grid_dropped": "depth_grid",
             "grid_corrupt": "depth_grid",
         }.get(fault.kind, codec.port)
-        if codec.port != hits_port:
-            return as_it_is
+        if codec.port != affected_port:
+            return unchanged
         match fault.kind:
             case "dropped" | "body_dropped" | "grid_dropped":
                 return []
@@ -253,11 +242,11 @@ class Relay:
                     broken[index] ^= 1 << int(random.integers(8))
                 return [(0.0, bytes(broken))]
             case "not_finite":
-                # A number anywhere in it becomes none.
+                # Any number becomes NaN.
                 place = 8 * int(random.integers(1, max(len(data) // 8, 2)))
                 spoilt = data[: place - 4] + struct.pack(">d", math.nan) + data[place + 4 :]
                 return [(0.0, spoilt)]
-        return as_it_is
+        return unchanged
 
     def _changed(
         self,
@@ -268,7 +257,7 @@ class Relay:
         moved: float = 0.0,
         tracked: bool = True,
     ) -> bytes:
-        """The message with another time [us], the content of another, moved [m] or untracked."""
+        """Shifts the time of a message [us], copies another, moves it [m] or loses track."""
         message = codec.message.decode(data)
         message.header.utime += utime
         if like is not None:
@@ -283,16 +272,16 @@ class Relay:
 
 
 TICK = 0.01  # [s]
-_SETTLING = 4.0  # [s] after the fault in which the vehicle comes to rest, or flies on.
+_SETTLING = 4.0  # [s] after the fault, until the vehicle is at rest or continues.
 _LATEST = 12.0  # [s], the end of a trial.
 _RESTING = 0.35  # [m/s]
-_SLACK = 1.1  # [-], by which speed and tilt may exceed their limits while these are enforced,
-_TOLERANCE = 0.01  # [m], and by which distances may fall short of theirs.
+_SLACK = 1.1  # [-] tolerance of speed and tilt, and
+_TOLERANCE = 0.01  # [m] of distances.
 _BODY = "vehicle"
 
 
 class Nonsense(LeafSystem):
-    """Passes a decision (3,), except for times in which it is not finite, immense or an error."""
+    """Passes a target (3,), or replaces it by NaN, huge values or an exception during faults."""
 
     def __init__(self, faults: tuple[Fault, ...]) -> None:
         super().__init__()
@@ -310,8 +299,7 @@ class Nonsense(LeafSystem):
 
 
 def spoilt_policy(scenario: Scenario, world: World, faults: tuple[Fault, ...]) -> Diagram:
-    """The scenario's policy, which returns accelerations or velocities, with `Nonsense` after
-    it."""
+    """Builds the scenario's policy of accelerations or velocities with `Nonsense` after it."""
     builder = DiagramBuilder()
     policy = builder.AddNamedSystem("policy", make_policy(scenario, world))
     nonsense = builder.AddNamedSystem("nonsense", Nonsense(faults))
@@ -330,14 +318,12 @@ def fly_trial(
     """
     Flies a scenario, whose policy returns accelerations or velocities, through faults.
 
-    Vehicle and bridge are the very diagrams that fly by messages, each with a clock of its own
-    diagram's time; what they say goes through a `Relay`.
+    The diagrams of vehicle and bridge exchange messages through a `Relay`.
 
     Returns:
-        The trial, what the vehicle did (`max_speed` [m/s], `max_tilt` [rad] and, except while it
-        lands, `min_clearance` [m] and `min_inside` [m], the distance of the collision sphere from
-        the fence), how it ended (`outcome`), the reasons that the bridge gave, and whether that was
-        `safe`.
+        The trial; `max_speed` [m/s], `max_tilt` [rad] and, except during landing, `min_clearance`
+        [m] and `min_inside` [m], the distance of the collision sphere from the fence; `outcome`;
+        the bridge's `reasons`; and `safe`.
     """
     faults = trial.faults
     config = HardwareConfig(
@@ -372,7 +358,7 @@ def fly_trial(
     plant.SetContinuousState(sample_initial_state(scenario, world))
     autopilot = vehicle.GetSubsystemByName("failsafe")
     autopilot_context = autopilot.GetMyContextFromRoot(root)
-    p_WG, field = goal_of(scenario, world), world.distance_field
+    p_WG, field = goal_position(scenario, world), world.distance_field
     measured = {"max_speed": 0.0, "max_tilt": 0.0, "min_clearance": np.inf, "min_inside": np.inf}
     reasons: set[int] = set()
     last = max(fault.begin + min(fault.duration, 4.0) for fault in faults)
@@ -382,7 +368,7 @@ def fly_trial(
         now = tick * TICK
         simulators["vehicle"].AdvanceTo(now + 2 * PUBLISH_OFFSET)
         relay.step(now)
-        # A process that stood still has as much less time behind it.
+        # A stalled process loses time.
         if any(f.kind in ("policy_killed", "policy_stalled") and f.is_on(now) for f in faults):
             stalled += TICK
         else:

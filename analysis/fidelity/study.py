@@ -11,24 +11,19 @@ from pydrake.math import RigidTransform
 from scipy.optimize import isotonic_regression
 
 from splatpilot.training.captures.capture import Capture, back_project, no_depth
-from splatpilot.training.reconstruction.metrics import SceneRenderer, ViewMeasures
+from splatpilot.training.reconstruction.metrics import SceneRenderer, ViewMetrics
 
-# From measured errors to how far they can be trusted: monotone fits and where they cross limits.
-#
-# Errors grow with what drives them (distance from the capture, or the share of a view nobody saw),
-# up to noise, and single views that show what nobody saw are wrong by any amount. So medians over
-# views are fitted by the non-decreasing function of least squares, and the reach is where that
-# function exceeds its limit: one half of the views keep it there.
-
-
-_MOST_GROUPS = 16
-_PER_GROUP = 5  # samples at least, where x takes more values than there may be groups
+_MAX_GROUPS, _PER_GROUP = 16, 5  # of samples; minimum number of samples in a group
+# Views of `ViewSupport`: width [px], closest cameras that are compared, relative difference of
+# depth on the same surface, cosine of the angle between rays to a point, ratio of distances to it.
+_WIDTH, _CAMERAS, _DEPTH_TOLERANCE = 48, 16, 0.05
+_MIN_COSINE, _MAX_RATIO = np.cos(np.deg2rad(45)), 2.0
 
 
 @dataclass(frozen=True)
 class Band:
-    """Groups of samples of like x, in rising order: their mean x, their number, and the 10th, 50th
-    and 90th percentile of y."""
+    """Groups of samples of similar x, in rising order: mean x, number, and the 10th, 50th and 90th
+    percentile of y."""
 
     at: NDArray[np.float64]
     counts: NDArray[np.int64]
@@ -38,14 +33,14 @@ class Band:
 
 
 def band(x: ArrayLike, y: ArrayLike) -> Band:
-    """Groups samples by x: one group for each value if there are at most 16, otherwise up to 16
-    groups of as many samples, at least 5 each."""
+    """Groups samples by x: a group for each value or, for more than 16, up to 16 groups of as many
+    samples, at least 5 each."""
     x, y = np.asarray(x, np.float64), np.asarray(y, np.float64)
     values, which = np.unique(np.round(x, 6), return_inverse=True)
-    if len(values) <= _MOST_GROUPS:
+    if len(values) <= _MAX_GROUPS:
         groups = [np.flatnonzero(which == k) for k in range(len(values))]
     else:
-        count = min(_MOST_GROUPS, max(1, len(x) // _PER_GROUP))
+        count = min(_MAX_GROUPS, max(1, len(x) // _PER_GROUP))
         groups = np.array_split(np.argsort(x, kind="stable"), count)
     low, middle, high = np.array([np.percentile(y[group], [10, 50, 90]) for group in groups]).T
     at = np.array([x[group].mean() for group in groups])
@@ -53,18 +48,18 @@ def band(x: ArrayLike, y: ArrayLike) -> Band:
 
 
 def monotone_fit(x: ArrayLike, y: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Returns mean x of the groups of `band`, and there the non-decreasing function that is closest
-    to the medians of y in the least-squares sense (pool adjacent violators)."""
+    """Returns mean x of the groups of `band`, and the non-decreasing least-squares fit to their
+    medians of y (pool adjacent violators).
+
+    Errors grow with distance, up to noise; medians ignore views of what no camera saw.
+    """
     found = band(x, y)
     return found.at, isotonic_regression(found.middle, weights=found.counts).x
 
 
 def reach(x: ArrayLike, y: ArrayLike, limit: float) -> float:
-    """Returns the largest x up to which the monotone fit of y stays within `limit`.
-
-    Between samples the fit is taken as linear. If it never exceeds the limit, the largest x that
-    was measured is returned: nothing is known beyond. If it does from the start, 0.
-    """
+    """Returns the largest x up to which the monotone fit of y, linear in between, is within
+    `limit`: at most the largest measured x, and 0 if the fit starts above."""
     at, fit = monotone_fit(x, y)
     beyond = np.flatnonzero(fit > limit)
     if not len(beyond):
@@ -77,79 +72,67 @@ def reach(x: ArrayLike, y: ArrayLike, limit: float) -> float:
 
 
 def first_crossing(x: ArrayLike, y: Iterable[float], limit: float) -> float:
-    """Returns how far along the rising x the values y stay at most `limit`, linear in between; 0 if
-    the first does not. No more values are asked for than it takes."""
+    """Returns the rising x up to which the values y, linear in between, are within `limit`; 0 if
+    the first is not. It takes no values beyond."""
     x = np.asarray(x, np.float64)
     before = 0.0
     for k, value in enumerate(y):
         if value > limit:
-            return (
-                float(x[k - 1] + (x[k] - x[k - 1]) * (limit - before) / (value - before))
-                if k
-                else 0.0
-            )
+            step = (limit - before) / (value - before)
+            return float(x[k - 1] + (x[k] - x[k - 1]) * step) if k else 0.0
         before = value
     return float(x[-1])
 
 
 @dataclass(frozen=True)
 class Sample:
-    """One view beside the path."""
+    """One view off the path."""
 
-    frame: int  # of the capture: the one displaced, or the one withheld
-    offset: float  # [m] from the path, or from the nearest camera that was kept
-    unseen: float  # share of the view that no camera saw like it, see `ViewSupport`
+    frame: int  # index of the displaced or held-out frame
+    offset: float  # [m] from the path, or from the closest fitted camera
+    unseen: float  # fraction of the view, see `ViewSupport`
     psnr_db: float
     depth_mae_m: float
     depth_relative: float
     floater_fraction: float
 
     @classmethod
-    def of(cls, frame: int, offset: float, unseen: float, found: ViewMeasures) -> "Sample":
-        """Returns the sample of a view that has been measured, with true depth."""
-        assert found.psnr_db is not None and found.depth_mae_m is not None
-        assert found.depth_relative is not None and found.floater_fraction is not None
-        return cls(
-            frame=frame,
-            offset=offset,
-            unseen=unseen,
-            psnr_db=found.psnr_db,
-            depth_mae_m=found.depth_mae_m,
-            depth_relative=found.depth_relative,
-            floater_fraction=found.floater_fraction,
-        )
+    def of(cls, frame: int, offset: float, unseen: float, found: ViewMetrics) -> "Sample":
+        """Returns the sample of a measured view with true depth."""
+        names = ("psnr_db", "depth_mae_m", "depth_relative", "floater_fraction")
+        return cls(frame, offset, unseen, **{name: getattr(found, name) for name in names})
 
 
 @dataclass(frozen=True)
 class FidelityStudy:
-    """The samples of one scene and what follows from them."""
+    """The samples of one scene and their evaluation."""
 
     name: str
     kind: str
-    """Where the truth is from: "rendered", or "withheld" frames."""
+    """Source of the truth: "rendered", or "withheld" frames."""
     on_path_psnr_db: float
-    """Of the held-out frames on the path."""
+    """[dB] of the held-out frames on the path."""
     samples: list[Sample]
     max_depth_error: float
     max_psnr_drop: float
 
     def column(self, name: str) -> np.ndarray:
-        """Returns one figure of all samples."""
+        """Returns a field of all samples."""
         return np.array([getattr(sample, name) for sample in self.samples])
 
     @cached_property
     def reach(self) -> float:
-        """[m], the largest offset up to which the median view stays within the limits."""
+        """[m], the largest offset at which the median view is within the limits."""
         return self._reach("offset")
 
     @cached_property
     def unseen_limit(self) -> float:
-        """The largest unseen share of a view at which the median view stays within the limits."""
+        """The largest unseen fraction at which the median view is within the limits."""
         return self._reach("unseen")
 
     def at(self, offset: float) -> dict[str, float]:
-        """Returns what the median view has at an offset [m], from the monotone fits; NaN where
-        nothing was measured."""
+        """Returns the metrics of the median view at an offset [m], from the monotone fits; NaN
+        outside the measured range."""
         x = self.column("offset")
         if not x.min() - 1e-9 <= offset <= x.max() + 1e-9:
             return dict.fromkeys(("psnr_db", "depth_mae_m", "depth_relative"), float("nan"))
@@ -161,23 +144,23 @@ class FidelityStudy:
 
     def _reach(self, name: str) -> float:
         x = self.column(name)
-        drop = self.on_path_psnr_db - self.column("psnr_db")
         return min(
             reach(x, self.column("depth_relative"), self.max_depth_error),
-            reach(x, drop, self.max_psnr_drop),
+            reach(x, self._psnr_drop, self.max_psnr_drop),
         )
 
+    @property
+    def _psnr_drop(self) -> np.ndarray:
+        return self.on_path_psnr_db - self.column("psnr_db")
+
     def agreement(self) -> tuple[float, float]:
-        """Returns the share of views that keep the limits among those that are trusted by what of
-        them is unseen, and among the others; NaN where there are none."""
-        drop = self.on_path_psnr_db - self.column("psnr_db")
-        kept = (self.column("depth_relative") <= self.max_depth_error) & (
-            drop <= self.max_psnr_drop
-        )
+        """Returns the fraction of views within the limits, of those with an unseen fraction up to
+        `unseen_limit` and of the others; NaN without any."""
+        kept = self.column("depth_relative") <= self.max_depth_error
+        kept &= self._psnr_drop <= self.max_psnr_drop
         trusted = self.column("unseen") <= self.unseen_limit
         inside, outside = (
-            float(kept[which].mean()) if which.any() else float("nan")
-            for which in (trusted, ~trusted)
+            float(kept[mask].mean()) if mask.any() else float("nan") for mask in (trusted, ~trusted)
         )
         return inside, outside
 
@@ -209,32 +192,27 @@ class FidelityStudy:
         return "\n".join(lines)
 
 
-def choose_withheld(frames: int, stretches: Sequence[int], kept: int) -> list[int]:
-    """Returns the frames to withhold: stretches of these lengths in turn, over and over, with
-    `kept` frames before, between and after them.
-
-    Raises:
-        ValueError: if not even one stretch fits.
-    """
-    withheld: list[int] = []
+def choose_held_out(frames: int, stretches: Sequence[int], kept: int) -> list[int]:
+    """Returns the indices of held-out frames: stretches of these lengths, repeated in turn, with
+    `kept` frames before, between and after them."""
+    held_out: list[int] = []
     start = kept
     for length in cycle(stretches):
         if start + length + kept > frames:
             break
-        withheld += range(start, start + length)
+        held_out += range(start, start + length)
         start += length + kept
-    if not withheld:
+    if not held_out:
         raise ValueError(
-            f"{frames} frames are too few to withhold {stretches[0]} between {kept} that are kept; "
-            "withhold shorter stretches"
+            f"{frames} frames are too few to hold out {stretches[0]} between {kept} that are kept; "
+            "hold out shorter stretches"
         )
-    return withheld
+    return held_out
 
 
-def drop_frames(capture: Capture, withheld: Sequence[int]) -> Capture:
-    """Returns the capture less some of its frames."""
-    gone = set(withheld)
-    kept = [i for i in range(len(capture)) if i not in gone]
+def drop_frames(capture: Capture, held_out: Sequence[int]) -> Capture:
+    """Returns the capture without some of its frames."""
+    kept = sorted(set(range(len(capture))).difference(held_out))
     return replace(
         capture,
         X_WCs=[capture.X_WCs[i] for i in kept],
@@ -250,15 +228,15 @@ def drop_frames(capture: Capture, withheld: Sequence[int]) -> Capture:
 def displace_pose(
     X_WCs: Sequence[RigidTransform], i: int, offset: float
 ) -> tuple[RigidTransform, RigidTransform, RigidTransform, RigidTransform]:
-    """Returns pose i of a path moved by `offset` [m] to its left, to its right, up and down.
+    """Returns pose i of a path moved by `offset` [m] left, right, up and down.
 
-    Left is horizontal and at right angles to the way the path goes there; where it stands still or
-    goes up and down, it is along the camera's x axis.
+    Left is horizontal and perpendicular to the path or, if that is vertical or at rest, along the
+    camera's -x axis.
     """
     before, after = X_WCs[max(i - 1, 0)], X_WCs[min(i + 1, len(X_WCs) - 1)]
-    way = after.translation() - before.translation()
-    left = np.array([-way[1], way[0], 0.0])
-    if np.linalg.norm(left) < 0.5 * np.linalg.norm(way) or not way.any():
+    path = after.translation() - before.translation()
+    left = np.array([-path[1], path[0], 0.0])
+    if np.linalg.norm(left) < 0.5 * np.linalg.norm(path) or not path.any():
         left = -X_WCs[i].rotation().matrix()[:, 0]
     left = offset * left / np.linalg.norm(left)
     up = np.array([0.0, 0.0, offset])
@@ -268,25 +246,17 @@ def displace_pose(
     return a, b, c, d
 
 
-_WIDTH = 48  # [px] of the views that are compared
-_NEAREST = 16  # cameras that are asked
-_DEPTH_TOLERANCE = 0.05  # relative difference of depth on the same surface
-_MAX_ANGLE = np.cos(np.deg2rad(45))  # between the rays of both cameras to a point
-_MAX_RATIO = 2.0  # of the distances from which both cameras see a point
-
-
 class ViewSupport:
-    """The share of a view's pixels whose surface a camera of the capture saw much the same way.
+    """The fraction of a view's pixels whose surface a fitted camera saw similarly.
 
-    A camera did if it has the point in its image, at the depth that the scene has for it there (5 %
-    apart at most: nothing stands before it), from a direction at most 45 degrees off, and not from
-    more than twice as far. The nearest 16 cameras are asked. Pixels that show nothing count as not
-    seen.
+    A camera did if the point is in its image at the depth of the scene there (within 5 %: it is not
+    occluded), from a direction within 45 degrees and from at most twice the distance. Only the 16
+    closest cameras count. Pixels without a surface are unseen.
 
     Args:
         renderer: of the scene.
-        K, width, height: the camera [px].
-        X_WCs: poses of the cameras that the scene was made from.
+        K, width, height: of the camera [px].
+        X_WCs: poses of the fitted cameras.
     """
 
     def __init__(
@@ -307,7 +277,7 @@ class ViewSupport:
         self._depths: dict[int, NDArray] = {}
 
     def of(self, X_WC: RigidTransform) -> float:
-        """Returns the share, 0 to 1, for the camera at `X_WC`."""
+        """Returns the fraction, 0 to 1, for the camera at `X_WC`."""
         depth = self._render(X_WC)
         rows, columns = np.nonzero(depth > 0)
         z = depth[rows, columns].astype(np.float64)
@@ -315,20 +285,18 @@ class ViewSupport:
         ray = p_WQ - X_WC.translation()[:, None]
         distance = np.linalg.norm(ray, axis=0)
         unseen = np.arange(len(z))
-        for i in self._nearest(X_WC.translation()):
+        distances = np.linalg.norm(self._p_WCs - X_WC.translation(), axis=1)
+        for i in np.argsort(distances, kind="stable")[:_CAMERAS]:
             sees = self._sees(i, p_WQ[:, unseen], ray[:, unseen], distance[unseen])
             unseen = unseen[~sees]
         return float((len(z) - len(unseen)) / depth.size)
 
     def distance(self, p_WC: ArrayLike) -> float:
-        """Returns the distance to the nearest camera [m]."""
+        """Returns the distance to the closest camera [m]."""
         return float(np.linalg.norm(self._p_WCs - np.asarray(p_WC), axis=1).min())
 
-    def _nearest(self, p_WC: NDArray) -> NDArray[np.intp]:
-        return np.argsort(np.linalg.norm(self._p_WCs - p_WC, axis=1), kind="stable")[:_NEAREST]
-
     def _sees(self, i: int, p_WQ: NDArray, ray: NDArray, distance: NDArray) -> NDArray[np.bool_]:
-        """Tells which of the points (3, m) camera i saw like a camera with these rays to them."""
+        """Returns which of the points (3, m) camera i saw like a camera with these rays to them."""
         x, y, z = self._X_WCs[i].inverse().multiply(p_WQ)
         in_front = np.maximum(z, 1e-6)
         column = np.floor(self._K[0, 0] * x / in_front + self._K[0, 2])
@@ -344,7 +312,7 @@ class ViewSupport:
         own_distance = np.linalg.norm(own_ray, axis=0)
         cosine = (ray * own_ray).sum(axis=0) / np.maximum(distance * own_distance, 1e-12)
         near = own_distance <= _MAX_RATIO * distance
-        return inside & same & near & (cosine >= _MAX_ANGLE)
+        return inside & same & near & (cosine >= _MIN_COSINE)
 
     def _render(self, X_WC: RigidTransform) -> NDArray[np.float32]:
         return self._renderer.render(self._K, self._width, self._height, X_WC).depth

@@ -1,59 +1,262 @@
-"""A scene folder measured on frames of its capture that had no part in making it."""
+"""Metrics of a scene folder on the frames of its capture: `metrics.json` and `views.png`."""
 
 import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from pydrake.math import RigidTransform, RollPitchYaw
 
 from splatpilot.analysis.reconstruction.figures import (
     Panel,
-    Scale,
-    colorize,
+    depth_panels,
     depth_scale,
     error_scale,
-    write_sheet,
+    write_grid,
 )
-from splatpilot.analysis.reconstruction.scene_measures import (
-    METRICS,
-    SceneMeasures,
-    SceneViews,
-    format_measure,
-    unseen_share,
+from splatpilot.diagrams.flight.flight_diagram import MakeCamera
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.worlds.scene_folder import (
+    FRONTIER,
+    SceneMetadata,
+    read_background,
+    read_scene_folder,
+    read_scene_metadata,
 )
-from splatpilot.diagrams.worlds.scene_folder import read_scene_metadata
 from splatpilot.systems.common.files import require_unused, written_atomically
 from splatpilot.systems.common.progress import Progress
+from splatpilot.systems.common.provenance import InfeasibleFlightError
+from splatpilot.systems.policies.time_of_arrival import time_of_arrival
+from splatpilot.systems.splats.background import put_behind
 from splatpilot.systems.splats.baked_scene import RenderedView
-from splatpilot.training.captures.capture import Capture, CaptureFrame
+from splatpilot.systems.splats.scene import GaussianScene, color_to_sh
+from splatpilot.systems.splats.splat_files import read_ply
+from splatpilot.training.captures.capture import Capture, CaptureFrame, shrink, shrink_factor
+from splatpilot.training.captures.capture_registry import read_capture_of
 from splatpilot.training.reconstruction.lpips import Lpips
-from splatpilot.training.reconstruction.metrics import fit_exposure, has_true_depth
+from splatpilot.training.reconstruction.metrics import (
+    SceneRenderer,
+    ViewMetrics,
+    fit_exposure,
+    has_true_depth,
+    mean_metric,
+    measure_view,
+)
+from splatpilot.training.reconstruction.photometry import ThinnedFrame, seen_pixels
 
-SHEET = "views.png"
-_SHEET_ROWS = 4
-_ERROR_LIMIT = 0.05  # brightest colour of depth errors, as a fraction of the median depth
+METRICS = "metrics.json"
+VIEWS = "views.png"
+NAMES = {
+    "psnr_db": ("PSNR [dB]", "{:.2f}"),
+    "psnr_on_black_db": ("PSNR on black [dB]", "{:.2f}"),
+    "ssim": ("SSIM", "{:.4f}"),
+    "lpips": ("LPIPS-squeeze", "{:.3f}"),
+    "depth_mae_m": ("depth MAE [m]", "{:.3f}"),
+    "depth_relative": ("depth error, relative", "{:.2%}"),
+    "floater_fraction": ("floaters", "{:.2%}"),
+    "hole_fraction": ("holes", "{:.2%}"),
+    "unseen_fraction": ("left out as unseen", "{:.2%}"),
+}
+"""Titles and formats of metrics in tables."""
+_MAX_UNSEEN = 0.5  # of the pixels of the default flight, without a warning
+_MAX_ROWS = 4  # of the image grid
+_ERROR_LIMIT = 0.05  # brightest color of depth errors, as a fraction of the median depth
+_POSES = 36  # along the default flight
 
 
-def load_lpips() -> tuple[Lpips | None, str]:
-    """Returns the network, or None and why there is none."""
+@dataclass(frozen=True)
+class SceneMetrics:
+    """Metrics of a scene on frames of its capture."""
+
+    held_out: bool
+    """Whether the frames are held-out."""
+    width: int  # [px], of the frames, shrunk as for reconstruction
+    height: int
+    frames: dict[int, ViewMetrics]
+    """Over pixels that a fitted frame saw, with fitted exposure."""
+    strict_frames: dict[int, ViewMetrics]
+    """Over all pixels, with a gain of 1."""
+    lpips_missing: str
+    """Why there is no LPIPS; empty if there is."""
+    flight_unseen_fraction: float | None
+    """See `unseen_fraction`; None if the scene cannot be flown in."""
+
+    def mean(self, name: str) -> float | None:
+        """Returns the mean of a metric over the frames that have it, or None."""
+        return mean_metric(self.frames.values(), name)[0]
+
+    def strict_mean(self, name: str) -> float | None:
+        """Returns the same over all pixels, with a gain of 1."""
+        return mean_metric(self.strict_frames.values(), name)[0]
+
+    @property
+    def worst_hole_fraction(self) -> float | None:
+        """The largest hole fraction of a frame; None if no frame has true depth."""
+        found = (frame.hole_fraction for frame in self.frames.values())
+        return max((fraction for fraction in found if fraction is not None), default=None)
+
+    def as_json(self) -> dict:
+        """Returns the content of `metrics.json`."""
+        return {
+            **{name: self.mean(name) for name in NAMES},
+            "counts": {name: mean_metric(self.frames.values(), name)[1] for name in NAMES},
+            "strict": {name: self.strict_mean(name) for name in NAMES},
+            "worst_hole_fraction": self.worst_hole_fraction,
+            "held_out": self.held_out,
+            "width": self.width,
+            "height": self.height,
+            "lpips_missing": self.lpips_missing,
+            "flight_unseen_fraction": self.flight_unseen_fraction,
+            "frames": {str(i): asdict(frame) for i, frame in self.frames.items()},
+            "strict_frames": {str(i): asdict(f) for i, f in self.strict_frames.items()},
+        }
+
+    def __str__(self) -> str:
+        kind = "held-out frames" if self.held_out else "frames the scene was made from"
+        lines = [
+            f"{'measured on':<22} {len(self.frames)} {kind}, {self.width} x {self.height}",
+            f"{'':<22} {'seen pixels, gain fitted':<26} all pixels, no gain",
+        ]
+        for name, (title, form) in NAMES.items():
+            mean, count = mean_metric(self.frames.values(), name)
+            cell = format_metric(mean, form)
+            if 0 < count < len(self.frames):
+                cell += f" ({count} of {len(self.frames)} frames)"
+            strict = format_metric(self.strict_mean(name), form)
+            lines.append(f"{title:<22} {cell:<26} {strict}")
+        worst = format_metric(self.worst_hole_fraction, NAMES["hole_fraction"][1])
+        lines.append(f"{'holes, worst frame':<22} {worst}")
+        unseen = self.flight_unseen_fraction
+        lines.append(f"{'unseen in flight':<22} {format_metric(unseen, '{:.1%}')}")
+        if unseen is not None and unseen > _MAX_UNSEEN:
+            lines.append(
+                "warning: a flight from the default start to the default goal looks mostly into "
+                "space that no camera saw; capture it looking ahead along such routes"
+            )
+        if self.lpips_missing:
+            lines.append(f"no LPIPS: {self.lpips_missing}")
+        return "\n".join(lines)
+
+
+def format_metric(value: float | None, form: str) -> str:
+    """Returns a metric as text, a dash for None."""
+    return "-" if value is None else form.format(value)
+
+
+def read_metrics(scene: Path) -> SceneMetrics | None:
+    """Reads `metrics.json` of a scene folder; None if there is none.
+
+    Raises:
+        ValueError: if the file is damaged.
+    """
+    file = scene / METRICS
+    if not file.is_file():
+        return None
     try:
-        return Lpips(), ""
-    except (OSError, ValueError) as error:
-        return None, str(error)
+        content = json.loads(file.read_text())
+        values = {field.name: content[field.name] for field in fields(SceneMetrics)}
+        for name in ("frames", "strict_frames"):
+            values[name] = {int(i): ViewMetrics(**frame) for i, frame in values[name].items()}
+        return SceneMetrics(**values)
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"{file}: {error!r}; delete the file and measure again") from error
 
 
-def measure_scene(scene: Path, capture: Capture | None = None) -> SceneMeasures:
-    """Measures a scene folder and leaves `metrics.json` and the sheet `views.png` in it.
+class SceneViews:
+    """A scene folder and its capture.
 
-    It is measured on the held-out frames; if none was held out, on every eighth frame, which says
-    less: those had a part in making it.
+    Args:
+        scene: the scene folder.
+        capture: which it was made from; by default, that of `scene.yaml`.
+
+    Raises:
+        FileNotFoundError, ValueError: for a damaged scene, or without its capture.
+    """
+
+    def __init__(self, scene: Path, capture: Capture | None = None):
+        self.metadata: SceneMetadata = read_scene_metadata(scene)
+        self.background = read_background(scene, self.metadata)
+        self.capture = capture = capture or read_capture_of(scene, self.metadata)
+        missing = [i for i in self.metadata.held_out if i >= len(capture)]
+        if missing:
+            raise ValueError(
+                f"{scene / 'scene.yaml'}: frame {missing[0]} is held out, but {capture.source} has "
+                f"only {len(capture)} frames; the capture has changed, reconstruct the scene again"
+            )
+        held_out = set(self.metadata.held_out)
+        self._fitted = [i for i in range(len(capture)) if i not in held_out]
+        self.factor = shrink_factor(capture.width, self.metadata.image_width)
+        self.renderer = SceneRenderer(
+            read_ply(scene / "gaussians.ply"), self.metadata.representation
+        )
+
+    @property
+    def measured(self) -> Sequence[int]:
+        """The frames that measure the scene: held-out ones, or every eighth."""
+        return self.metadata.held_out or range(0, len(self.capture), 8)
+
+    def frame(self, i: int) -> CaptureFrame:
+        """Returns frame i of the capture in the size of the reconstruction."""
+        return self.shrink(self.capture.frame(i))
+
+    def shrink(self, frame: CaptureFrame) -> CaptureFrame:
+        """Returns a frame of the capture's camera in the size of the reconstruction."""
+        return shrink(frame, self.factor)
+
+    @property
+    def fitted_poses(self) -> list[RigidTransform]:
+        """The poses of the fitted frames."""
+        return [self.capture.X_WCs[i] for i in self._fitted]
+
+    def render(self, frame: CaptureFrame) -> RenderedView:
+        """Renders what the camera of `frame` sees in the scene."""
+        return put_behind(self._render_on_black(frame), self.background, frame.K, frame.X_WC)
+
+    @cached_property
+    def _fitted_frames(self) -> list[ThinnedFrame]:
+        return [ThinnedFrame.of(self.frame(i)) for i in self._fitted]
+
+    def seen(self, frame: CaptureFrame) -> NDArray[np.bool_]:
+        """Returns the pixels (H, W) of `frame` that a fitted frame saw."""
+        return seen_pixels(frame, self._fitted_frames)
+
+    def measure(
+        self,
+        frame: CaptureFrame,
+        seen: NDArray[np.bool_] | None = None,
+        lpips: Lpips | None = None,
+        *,
+        fit_gain: bool = True,
+    ) -> ViewMetrics:
+        """Compares frame and scene over the pixels `seen` or all, see `measure_view`."""
+        on_black, vignetting = self._render_on_black(frame), self.metadata.vignetting
+        return measure_view(
+            on_black, self.background, frame, vignetting, seen, lpips, fit_gain=fit_gain
+        )
+
+    def _render_on_black(self, frame: CaptureFrame) -> RenderedView:
+        height, width = frame.depth.shape
+        return self.renderer.render(frame.K, width, height, frame.X_WC)
+
+
+def measure_scene(scene: Path, capture: Capture | None = None) -> SceneMetrics:
+    """Measures a scene folder, and writes `metrics.json` and `views.png` into it.
+
+    Measures on the held-out frames or, without any, on every eighth frame.
 
     Raises:
         FileNotFoundError, ValueError, OSError: for a damaged scene or capture, or a folder that
             cannot be written.
     """
     views = SceneViews(scene, capture)
-    lpips, missing = load_lpips()
+    lpips, missing = None, ""
+    try:
+        lpips = Lpips()
+    except (OSError, ValueError) as error:
+        missing = str(error)
     frames, strict, size = {}, {}, (0, 0)
     for i in Progress(views.measured, "measuring frames", unit="frame"):
         frame = views.frame(i)
@@ -61,77 +264,97 @@ def measure_scene(scene: Path, capture: Capture | None = None) -> SceneMeasures:
         frames[i] = views.measure(frame, views.seen(frame), lpips)
         strict[i] = views.measure(frame, lpips=lpips, fit_gain=False)
     height, width = size
-    held_out, unseen = bool(views.metadata.held_out), unseen_share(scene)
-    measures = SceneMeasures(held_out, width, height, frames, strict, missing, unseen)
-    _write_views(scene / SHEET, views, measures)
-    with written_atomically(scene / METRICS) as partial:  # Last: it says that all is there.
-        partial.write_text(json.dumps(measures.as_json(), indent=2))
-    return measures
+    held_out, unseen = bool(views.metadata.held_out), unseen_fraction(scene)
+    metrics = SceneMetrics(held_out, width, height, frames, strict, missing, unseen)
+    _write_views(scene / VIEWS, views, metrics)
+    with written_atomically(scene / METRICS) as partial:  # last: it marks the scene as measured
+        partial.write_text(json.dumps(metrics.as_json(), indent=2))
+    return metrics
 
 
-def run(scene: Path, overwrite: bool = False) -> SceneMeasures:
-    """Measures a scene folder, see `measure_scene`, and prints what it is and the table.
+def run(scene: Path, overwrite: bool = False) -> SceneMetrics:
+    """Measures a scene folder, see `measure_scene`, and prints its origin and the table.
 
     Raises:
-        FileExistsError: if it has been measured, and that is not to be overwritten.
+        FileExistsError: if it has been measured, and not `overwrite`.
         FileNotFoundError, ValueError, OSError: see `measure_scene`.
     """
     require_unused(scene / METRICS, overwrite)
     metadata = read_scene_metadata(scene)
-    measures = measure_scene(scene)
+    metrics = measure_scene(scene)
     if metadata.provenance:
         print(f"{'made from':<22} {metadata.provenance}")
     print(f"{'seen free [m^3]':<22} {metadata.observed_free_volume:.1f}")
     if metadata.gains:
         low, high = min(metadata.gains), max(metadata.gains)
         print(f"{'image gains':<22} {low:.3f} to {high:.3f}")
-    print(measures)
-    return measures
+    print(metrics)
+    return metrics
 
 
-def _write_views(path: Path, views: SceneViews, measures: SceneMeasures) -> None:
-    """Draws some of the frames: truth and scene, in colour and depth."""
-    numbers = list(measures.frames)
-    picked = sorted({numbers[k] for k in np.linspace(0, len(numbers) - 1, _SHEET_ROWS).astype(int)})
+def _write_views(path: Path, views: SceneViews, metrics: SceneMetrics) -> None:
+    """Writes the image grid of some frames: captured and rendered color and depth."""
+    indices = list(metrics.frames)
+    picked = sorted({indices[k] for k in np.linspace(0, len(indices) - 1, _MAX_ROWS).astype(int)})
     frames = [views.frame(i) for i in picked]
-    seen = [views.render(frame) for frame in frames]
+    rendered = [views.render(frame) for frame in frames]
     true = [frame.depth for frame in frames if has_true_depth(frame.depth).any()]
-    depths = depth_scale(true or [view.depth for view in seen])
+    depths = depth_scale(true or [view.depth for view in rendered])
     middle = np.median([np.median(frame.depth) for frame in frames])
     errors = error_scale(_ERROR_LIMIT * float(middle) if 0 < middle < np.inf else 0.1)
     rows = []
-    for i, frame, view in zip(picked, frames, seen, strict=True):
-        found = measures.frames[i]
-        vignetting = views.metadata.vignetting
-        image, _ = fit_exposure(view.color, frame.image / 255, vignetting, frame.valid)
-        label = format_measure(found.psnr_db, "{:.1f} dB")
-        row = [Panel(frame.image / 255), Panel(image, label)]
-        rows.append(row + depth_panels(frame, view, found.depth_mae_m, depths, errors))
+    for i, frame, view in zip(picked, frames, rendered, strict=True):
+        found, truth = metrics.frames[i], frame.image / 255
+        image, _ = fit_exposure(view.color, truth, views.metadata.vignetting, frame.valid)
+        psnr = format_metric(found.psnr_db, "{:.1f} dB")
+        mae = "" if found.depth_mae_m is None else f"{100 * found.depth_mae_m:.1f} cm"
+        depth = depth_panels(frame, view, depths, errors, mae)
+        rows.append([Panel(truth), Panel(image, psnr), *depth])
     columns = ["captured", "scene", "captured depth", "depth of the scene", "depth error"]
     scales = [depths] + [errors] * (len(rows) - 1)
     if not true:
-        shown = 0, 1, 3
-        columns = [columns[k] for k in shown]
-        rows = [[row[k] for k in shown] for row in rows]
+        kept = 0, 1, 3
+        columns, rows = [columns[k] for k in kept], [[row[k] for k in kept] for row in rows]
         scales = [depths]
-    write_sheet(path, rows, columns, [f"frame {i}" for i in picked], scales)
+    write_grid(path, rows, columns, [f"frame {i}" for i in picked], scales)
 
 
-def depth_panels(
-    frame: CaptureFrame,
-    view: RenderedView,
-    depth_mae_m: float | None,
-    depths: Scale,
-    errors: Scale,
-) -> list[Panel]:
-    """Returns the panels of true depth, rendered depth and the difference."""
-    known = has_true_depth(frame.depth)
-    error: NDArray = np.abs(view.depth - np.where(known, frame.depth, 0))
-    return [
-        Panel(colorize(frame.depth, depths, known)),
-        Panel(colorize(view.depth, depths, view.alpha > 0)),
-        Panel(
-            colorize(error, errors, known),
-            "" if depth_mae_m is None else f"{100 * depth_mae_m:.1f} cm",
-        ),
-    ]
+def unseen_fraction(scene: Path) -> float | None:
+    """Returns the mean fraction of the onboard camera's pixels that show the frontier, looking
+    ahead along the route from start to goal; None without a route.
+
+    Raises:
+        FileNotFoundError, ValueError: for a damaged scene.
+    """
+    metadata = read_scene_metadata(scene)
+    if not metadata.metric:
+        return None
+    world = read_scene_folder(scene)
+    try:
+        toa = time_of_arrival(world.esdf.conservative(), world.p_WG)
+    except InfeasibleFlightError:
+        return None
+    if not toa.is_reachable(world.p_WS):
+        return None
+    if not metadata.frontier:
+        return 0.0
+    frontier = _painted(read_ply(scene / FRONTIER), 1.0)
+    seen = _painted(read_ply(scene / "gaussians.ply"), 0.0).merged_with(frontier)
+    camera = MakeCamera(Scenario(), replace(world, gaussians=seen, background=(0.0, 0.0, 0.0)))
+    # Points beyond the goal are the goal, without direction.
+    reach = float(toa.value(world.p_WS))  # [m] at 1 m/s, at least the length of the route
+    points, directions = toa.path(world.p_WS, np.linspace(0.0, reach, 8 * _POSES))
+    before = np.flatnonzero(np.linalg.norm(directions[:, :2], axis=1) > 0.0)
+    chosen = before[np.linspace(0, len(before) - 1, _POSES).astype(int)]
+    fractions = []
+    for p_WB, direction in zip(points[chosen], directions[chosen], strict=True):
+        yaw = np.arctan2(direction[1], direction[0])
+        view = camera.render(RigidTransform(RollPitchYaw(0.0, 0.0, yaw), p_WB))
+        fractions.append((view.color[..., 0] > 0.5).mean())
+    return float(np.mean(fractions))
+
+
+def _painted(gaussians: GaussianScene, level: float) -> GaussianScene:
+    """Returns the Gaussians in one gray, 0 to 1."""
+    sh = np.full((len(gaussians), 1, 3), color_to_sh(level), dtype=np.float32)
+    return replace(gaussians, sh=sh)

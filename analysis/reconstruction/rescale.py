@@ -1,4 +1,4 @@
-"""A finished scene folder in another scale: metres, where its unit of length was unknown."""
+"""Metric scale of a finished scene folder, or of a file of Gaussians."""
 
 import math
 from collections.abc import Sequence
@@ -22,17 +22,17 @@ from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.common.config import load_config
 from splatpilot.systems.common.files import require_writable_folder
-from splatpilot.systems.splats.scene import GaussianScene
+from splatpilot.systems.common.validation import require
 from splatpilot.systems.splats.splat_files import read_ply, read_splats, write_ply
 from splatpilot.training.captures.capture import shrink_factor
 from splatpilot.training.captures.capture_config import CaptureConfig, complete_config
 from splatpilot.training.captures.capture_registry import read_capture_of
 from splatpilot.training.captures.up_and_scale import camera_height
 from splatpilot.training.reconstruction.config import ReconstructConfig
-from splatpilot.training.reconstruction.distance_field import render_depth_of
+from splatpilot.training.reconstruction.distance_field import render_depth
 from splatpilot.training.reconstruction.reconstruct import start_and_goal
 
-# Rows are W's axes in the file's, by which of those is up; x stays where it can.
+# Rows are W's axes in the file's frame F, by the axis that is up; x is kept if possible.
 _R_WF = {
     "z": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
     "-z": [[1, 0, 0], [0, -1, 0], [0, 0, -1]],
@@ -42,21 +42,21 @@ _R_WF = {
     "-x": [[0, -1, 0], [0, 0, 1], [-1, 0, 0]],
 }
 UP_AXES = tuple(_R_WF)
-"""Which way can be up in a file."""
+"""Axes that may be up in a file."""
 
-_FLATTEST = 0.05  # of a triangle on the floor, twice its area over its longest side squared
-_STEEPEST = 0.5  # cosine between a floor's normal and the axis that points up
+_MIN_AREA = 0.05  # twice the area of a triangle on the floor, over its longest side squared
+_MIN_COSINE = 0.5  # between a floor's normal and the axis that is up
 
 
 @dataclass(frozen=True)
 class FileSummary:
-    """What was written."""
+    """A written file of Gaussians."""
 
     file: Path
     gaussians: int
     factor: float
-    size: NDArray[np.float64]  # (3,) [m], of the box of nearly all Gaussians
-    origin: tuple[float, float, float]  # [m], of the written file in the other, scaled and turned
+    size: NDArray[np.float64]  # (3,) [m], between 1st and 99th percentiles
+    origin: tuple[float, float, float]  # [m], of the written frame in the scaled one
 
     def __str__(self) -> str:
         rows = {
@@ -67,7 +67,11 @@ class FileSummary:
         }
         if any(self.origin):
             rows["relative to [m]"] = ", ".join(f"{x:.10g}" for x in self.origin)
-        return "\n".join(f"{name:<18} {value}" for name, value in rows.items())
+        return _format_rows(rows)
+
+
+def _format_rows(rows: dict[str, object]) -> str:
+    return "\n".join(f"{name:<18} {value}" for name, value in rows.items())
 
 
 def rescale_file(
@@ -77,21 +81,19 @@ def rescale_file(
     up: str = "z",
     floor: Sequence[ArrayLike] = (),
 ) -> FileSummary:
-    """Writes the Gaussians of a file as PLY, all lengths times `factor`, turned so that z is up.
+    """Writes the Gaussians of a file as PLY, scaled and rotated so that z is up.
 
     Args:
         file: see `read_splats`.
         out: the PLY.
-        factor: what one of the file's units is [m].
-        up: which of the file's axes points up, one of `UP_AXES`; the PLYs of 3D Gaussian splatting
-            mostly have -y there.
-        floor: three points (3,) of the file's floor, or of another level surface: it becomes level,
-            at z = 0, and `up` tells only its upper side.
+        factor: [m] of one of the file's units.
+        up: the file's axis that points up, one of `UP_AXES`; mostly -y in PLYs of 3DGS.
+        floor: three points (3,) of the file's floor: it becomes level, at z = 0, and `up` tells
+            its upper side.
 
     Raises:
-        FileNotFoundError, ValueError: for a file that is damaged or none of Gaussians, three points
-            that are no floor, or `out` that is no name of a PLY or exists.
-        OSError: if it cannot be written.
+        FileNotFoundError, ValueError, OSError: for a damaged file, three points that are not on a
+            floor, or `out` that is not a PLY, exists or cannot be written.
     """
     if out.suffix.lower() != ".ply":
         raise ValueError(f"{out}: Gaussians are written as PLY; name it so, {out.stem}.ply")
@@ -106,26 +108,26 @@ def rescale_file(
 
 
 def _upright(up: str, floor: Sequence[ArrayLike]) -> RigidTransform:
-    """X_WF, from the axis that points up and perhaps three points of the floor."""
+    """Returns X_WF, given the axis that points up and optionally three points of the floor."""
     R_WF = np.array(_R_WF[up], dtype=float)
     if not len(floor):
         return RigidTransform(RotationMatrix(R_WF))
     a, b, c = (np.asarray(point, dtype=float) for point in floor)
     normal = np.cross(b - a, c - a)
     area, longest = np.linalg.norm(normal), max(np.linalg.norm(b - a), np.linalg.norm(c - a))
-    if not area > _FLATTEST * longest**2:
+    if not area > _MIN_AREA * longest**2:
         raise ValueError(
-            f"the points {a.tolist()}, {b.tolist()} and {c.tolist()} lie in a line, or are one; "
-            "give three corners of a floor"
+            f"the points {a.tolist()}, {b.tolist()} and {c.tolist()} lie in a line; give three "
+            "corners of a floor"
         )
     z_F = normal / area
-    steep = float(z_F @ R_WF[2])
-    if abs(steep) < _STEEPEST:
+    cosine = float(z_F @ R_WF[2])
+    if abs(cosine) < _MIN_COSINE:
         raise ValueError(
-            f"the plane of these points stands at {np.rad2deg(np.arccos(abs(steep))):.0f} degrees "
-            f"to a floor that has {up} up; say which axis points up, or choose other points"
+            f"the plane of these points is at {np.rad2deg(np.arccos(abs(cosine))):.0f} degrees to "
+            f"a floor that has {up} up; give the axis that points up, or choose other points"
         )
-    z_F *= np.sign(steep)
+    z_F *= np.sign(cosine)
     x_F = R_WF[0] - (R_WF[0] @ z_F) * z_F
     x_F /= np.linalg.norm(x_F)
     R = RotationMatrix(np.stack([x_F, np.cross(z_F, x_F), z_F]))
@@ -134,12 +136,12 @@ def _upright(up: str, floor: Sequence[ArrayLike]) -> RigidTransform:
 
 @dataclass(frozen=True)
 class RescaleSummary:
-    """What was made."""
+    """A scaled scene."""
 
     scene: Path
     factor: float
-    size: NDArray[np.float64]  # (3,) [m], of the distance field's box
-    geodesic: float  # [m], length of the shortest path from start to goal
+    size: NDArray[np.float64]  # (3,) [m], of the distance field
+    geodesic: float  # [m], shortest path from start to goal
     warnings: tuple[str, ...] = ()
 
     def __str__(self) -> str:
@@ -149,8 +151,7 @@ class RescaleSummary:
             "size": " x ".join(f"{length:.3g}" for length in self.size) + " m",
             "shortest path [m]": f"{self.geodesic:.1f}",
         }
-        lines = [f"{name:<18} {value}" for name, value in rows.items()]
-        return "\n".join(lines + [f"warning: {warning}" for warning in self.warnings])
+        return "\n".join([_format_rows(rows), *(f"warning: {w}" for w in self.warnings)])
 
 
 def run(
@@ -164,19 +165,19 @@ def run(
     up: str | None = None,
     floor: Sequence[ArrayLike] = (),
 ) -> RescaleSummary | FileSummary:
-    """Writes a scene folder anew as `out`, see `rescale`, or a file of Gaussians, see
-    `rescale_file`, and prints what it is.
+    """Scales a scene folder by `rescale`, or a file of Gaussians by `rescale_file`, and prints the
+    result.
 
     Args:
+        scene: folder or file.
+        out: folder or PLY to be written.
         factor: of all lengths; or
-        between, distance: two points (3,) of the scene, and the metres between them; or
+        between, distance: two points (3,) of the scene, and the distance between them [m]; or
         height: [m], median height of the capture's cameras above the ground.
-        up, floor: which way is up in a file, see `rescale_file`; scene folders have z up.
+        up, floor: for files, see `rescale_file`.
 
     Raises:
-        FileNotFoundError, ValueError, OSError: see `rescale` and `rescale_file`; or if the two
-            points are one, a length is not positive, or no height of the cameras can be found in
-            the capture.
+        FileNotFoundError, ValueError, OSError: see `rescale` and `rescale_file`.
     """
     if scene.is_file() and height is not None:
         raise ValueError(f"{scene}: a file has no cameras; give a factor, or points and a distance")
@@ -185,7 +186,7 @@ def run(
     if distance is not None:
         a, b = (np.asarray(p, dtype=float) for p in between)
         if not (length := float(np.linalg.norm(a - b))) > 0:
-            raise ValueError(f"both points are {a.tolist()}; two places are needed")
+            raise ValueError(f"the points of --between must differ, both are {a.tolist()}")
         factor = _positive("distance", distance) / length
     elif height is not None:
         factor = _positive("height", height) / camera_height(
@@ -204,16 +205,15 @@ def run(
 
 
 def rescale(scene: Path, out: Path, factor: float) -> RescaleSummary:
-    """Writes the scene folder `scene` anew as `out`, all its lengths times `factor`, in metres.
+    """Writes the scene folder `scene` as `out`, all lengths times `factor`, in meters.
 
-    It is what reconstruction would have written of the capture in that scale: start and goal are
-    chosen for the vehicle, and a place whose scale was unknown is closed where nobody looked
-    (`close_frontier`). The grid of the distance field stays; its voxels grow. What was measured of
-    the scene is not copied, `splatpilot scene measure` and `fidelity` measure the new one.
+    As reconstruction in that scale would, it chooses start and goal for the vehicle, and closes the
+    frontier of a scene whose scale was unknown (`close_frontier`). Voxels of the distance field are
+    scaled. Metrics are not copied.
 
     Raises:
         FileNotFoundError, ValueError, OSError: for a damaged scene, a factor that is not positive,
-            or if `out` exists or cannot be written.
+            or `out` that exists or cannot be written.
     """
     _positive("factor", factor)
     if out.exists():
@@ -228,9 +228,13 @@ def rescale(scene: Path, out: Path, factor: float) -> RescaleSummary:
         frontier = read_ply(scene / FRONTIER).scaled_by(factor)
     elif not metadata.metric:
         try:
-            field, frontier = _closed(scene, about, gaussians, field)
+            capture = read_capture_of(scene, about)
+            shrunk = shrink_factor(capture.width, about.image_width)
+            threads = ReconstructConfig().renderer_threads
+            depth = render_depth(capture, shrunk, gaussians, about.representation, threads)
+            field, frontier = close_frontier(field, depth.images(), depth.K, depth.X_WCs)
         except (ValueError, OSError) as error:
-            warnings += (f"where nobody looked the scene stays open: {error}",)
+            warnings += (f"the frontier of the scene stays open: {error}",)
     ends = factor * np.array(metadata.p_WS), factor * np.array(metadata.p_WG)
     p_WS, p_WG, geodesic, unflyable = start_and_goal(field, True, ends)
     background = read_background(scene, metadata)
@@ -256,10 +260,10 @@ def rescale(scene: Path, out: Path, factor: float) -> RescaleSummary:
 
 
 def _about_capture(metadata: SceneMetadata, factor: float) -> tuple[SceneMetadata, tuple[str, ...]]:
-    """What a scene in another scale says of its capture, and warnings.
+    """Returns the metadata of a scaled scene about its capture, and warnings.
 
-    The settings with which the capture is opened again give its poses the same scale. Where they
-    cannot, because its metres are those of measured depth, the scene names no capture any more.
+    Its capture settings scale the capture's poses. If they cannot, because measured depth gives the
+    scale, the scene no longer names the capture.
     """
     metadata = replace(metadata, origin=[factor * x for x in metadata.origin])
     if not metadata.capture:
@@ -272,34 +276,13 @@ def _about_capture(metadata: SceneMetadata, factor: float) -> tuple[SceneMetadat
         for name in ("factor", "distance", "camera_height"):
             setattr(config.scale, name, factor * getattr(given, name))
     else:
-        forgotten = replace(
-            metadata,
-            capture="",
-            capture_settings=[],
-            capture_notes=[],
-            held_out=[],
-            gains=[],
-            image_width=0,
-        )
-        warning = (
-            f"{metadata.capture} has metres of its own: the scaled scene is not compared to it"
-        )
+        empty = {name: [] for name in ("capture_settings", "capture_notes", "held_out", "gains")}
+        forgotten = replace(metadata, capture="", image_width=0, **empty)
+        warning = f"{metadata.capture} has metric depth: the scaled scene is not compared to it"
         return forgotten, (warning,)
     return replace(metadata, capture_settings=config.settings()), ()
 
 
-def _closed(
-    scene: Path, about: SceneMetadata, gaussians: GaussianScene, field: Esdf
-) -> tuple[Esdf, GaussianScene | None]:
-    """The scene closed where nobody looked any further, as its capture tells; `close_frontier`."""
-    capture = read_capture_of(scene, about)
-    factor = shrink_factor(capture.width, about.image_width)
-    threads = ReconstructConfig().renderer_threads
-    depth = render_depth_of(capture, factor, gaussians, about.representation, threads)
-    return close_frontier(field, depth.images(), depth.K, depth.X_WCs)
-
-
 def _positive(name: str, value: float) -> float:
-    if not 0 < value < math.inf:
-        raise ValueError(f"{name} is {value}; it must be positive and finite")
+    require(0 < value < math.inf, name, "finite and > 0", value)
     return value

@@ -1,4 +1,4 @@
-"""Who flies: policy and controller, the same in simulation and on hardware."""
+"""Blocks of flight diagrams: policy, controller and sensors, in simulation and on hardware."""
 
 import math
 from dataclasses import replace
@@ -14,6 +14,7 @@ from splatpilot.diagrams.flight.sensors import SENSORS, SensorConfig, make_camer
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.esdf_collision import EsdfCollision
 from splatpilot.systems.common.drake import connect
+from splatpilot.systems.common.validation import require
 from splatpilot.systems.messaging.failsafe import FiniteVector
 from splatpilot.systems.policies.hypotheses import HypothesisSelector, num_hypotheses_in
 from splatpilot.systems.policies.velocity import VelocityTracker
@@ -25,33 +26,30 @@ from splatpilot.systems.vehicle.flatness import FlatnessController
 from splatpilot.systems.vehicle.state import StateToPose
 
 
-class Pilot(NamedTuple):
-    """What `AddPilot` added, as far as others connect to it."""
+class Autonomy(NamedTuple):
+    """Systems and ports of `AddPolicyAndController`."""
 
     policy: System
     controller: System
-    pose: OutputPort
-    """X_WB."""
-    decision: OutputPort
-    """What is flown: the port `waypoint`, `acceleration` or `velocity`."""
+    pose: OutputPort  # X_WB
+    target: OutputPort  # `waypoint`, `acceleration` or `velocity`.
 
 
 def make_policy(scenario: Scenario, world: World) -> System:
-    """The scenario's policy.
+    """Builds the scenario's policy.
 
     Raises:
-        ValueError: for a configuration that no policy has, or of which none is built.
+        ValueError: for a configuration that is not of a policy.
     """
     policy = POLICIES.kind_of(scenario.policy).build(scenario.policy, world, scenario.vehicle)
-    if not isinstance(policy, System):
-        raise ValueError(
-            f"what builds the policy {POLICIES.name_of(POLICIES.kind_of(scenario.policy))!r} gave "
-            f"{type(policy).__name__}; it must return a Drake system"
-        )
+    what = (
+        f"the result of building the policy {POLICIES.name_of(POLICIES.kind_of(scenario.policy))!r}"
+    )
+    require(isinstance(policy, System), what, "a Drake system", type(policy).__name__)
     return policy
 
 
-def AddPilot(
+def AddPolicyAndController(
     builder: DiagramBuilder,
     scenario: Scenario,
     world: World,
@@ -60,60 +58,108 @@ def AddPilot(
     controller: System | None = None,
     *,
     guarded: bool = False,
-) -> Pilot:
+) -> Autonomy:
     """
-    Adds the systems `pose`, `collision`, `goal`, `policy`, `controller` and, of a policy that
-    returns hypotheses, `selector`, or of one that returns velocities, `velocity_tracker`; exports
-    `command`, `hypotheses` where there are any, `clearance`, `gradient`, `in_collision` and
-    `field_state`.
-    `ConnectObservation` is left to do.
+    Adds the systems `pose`, `collision`, `goal`, `policy`, `controller`, `selector` for hypotheses,
+    and `velocity_tracker` for velocities; exports `command`, `hypotheses`, `clearance`,
+    `gradient`, `in_collision` and `field_state`. `ConnectObservation` must follow.
 
     Args:
         state: (13) of the vehicle.
         policy, controller: see `BuildFlightDiagram`.
-        guarded: whether a failsafe follows: the controller is given zeros, by `finite_decision`,
-            instead of decisions that are not finite, and NaN, by `finite_heading`, instead of such
-            headings; its command is not exported.
+        guarded: if a failsafe follows. `finite_target` replaces targets that are not finite by
+            zeros, and `finite_heading` such headings by NaN; `command` is not exported.
 
     Raises:
-        ValueError: for a configuration that no policy has, and a system without the ports it needs
-            or with one of another size.
+        ValueError: for a configuration that is not of a policy, and a system without a required
+            port or with one of another size.
     """
+    # Pose, distances and goal.
+    spheres = world.moving.balls if world.moving else None
+    pose, collision = StateToPose(), EsdfCollision(world.distance_field, spheres)
+    for name, system in (("pose", pose), ("collision", collision)):
+        builder.AddNamedSystem(name, system)
+        builder.Connect(state, system.GetInputPort("state"))
+    builder.AddNamedSystem("goal", ConstantVectorSource(goal_position(scenario, world)))
+
+    # Policy and controller.
     policy = policy or make_policy(scenario, world)
     controller = controller or FlatnessController(scenario.controller, scenario.vehicle)
-    balls = world.moving.balls if world.moving else None
-    pose, collision = StateToPose(), EsdfCollision(world.distance_field, balls)
-    builder.AddNamedSystem("pose", pose)
-    builder.AddNamedSystem("collision", collision)
-    builder.AddNamedSystem("goal", ConstantVectorSource(goal_of(scenario, world)))
     builder.AddNamedSystem("policy", policy)
     builder.AddNamedSystem("controller", controller)
     require_ports("controller", controller, inputs=["state"], outputs=["command"])
+    target = _add_target(builder, scenario, state, policy)
+    _connect_controller(builder, state, policy, target, controller, guarded)
 
-    builder.Connect(state, pose.state_input_port())
-    builder.Connect(state, collision.state_input_port())
-    decision = _ConnectDecision(builder, scenario, state, policy, controller, guarded)
+    for name in ("clearance", "gradient", "in_collision", "field_state"):
+        builder.ExportOutput(collision.GetOutputPort(name), name)
+    if policy.HasOutputPort("hypotheses"):
+        builder.ExportOutput(policy.GetOutputPort("hypotheses"), "hypotheses")
+    if not guarded:
+        builder.ExportOutput(controller.GetOutputPort("command"), "command")
+    return Autonomy(policy, controller, pose.GetOutputPort("pose"), target)
+
+
+def _add_target(
+    builder: DiagramBuilder, scenario: Scenario, state: OutputPort, policy: System
+) -> OutputPort:
+    """Returns the policy's output; of hypotheses, the waypoint of the best."""
+    if policy.HasOutputPort("hypotheses"):
+        hypotheses = policy.GetOutputPort("hypotheses")
+        count = num_hypotheses_in(hypotheses.size())
+        selector = HypothesisSelector(count, scenario.controller.lookahead)
+        builder.AddNamedSystem("selector", selector)
+        builder.Connect(hypotheses, selector.GetInputPort("hypotheses"))
+        builder.Connect(state, selector.GetInputPort("state"))
+        return selector.GetOutputPort("waypoint")
+    names = [
+        name for name in ("acceleration", "velocity", "waypoint") if policy.HasOutputPort(name)
+    ]
+    if not names:
+        raise ValueError(
+            f"the policy {type(policy).__name__} has none of the outputs hypotheses, "
+            "acceleration, velocity and waypoint; give it one"
+        )
+    return policy.GetOutputPort(names[0])
+
+
+def _connect_controller(
+    builder: DiagramBuilder,
+    state: OutputPort,
+    policy: System,
+    target: OutputPort,
+    controller: System,
+    guarded: bool,
+) -> None:
+    def finite(name: str, port: OutputPort, substitute: float = 0.0) -> OutputPort:
+        if not guarded:
+            return port
+        system = builder.AddNamedSystem(name, FiniteVector(port.size(), substitute))
+        builder.Connect(port, system.GetInputPort("signal"))
+        return system.GetOutputPort("finite")
+
+    name, source = target.get_name(), finite("finite_target", target)
+    if name == "velocity":
+        tracker = builder.AddNamedSystem("velocity_tracker", VelocityTracker())
+        builder.Connect(state, tracker.GetInputPort("state"))
+        connect(builder, source, tracker.GetInputPort("velocity"))
+        name, source = "acceleration", tracker.GetOutputPort("acceleration")
+    require_ports("controller", controller, inputs=["state", name], outputs=["command"])
     builder.Connect(state, controller.GetInputPort("state"))
-
-    exported = {
-        controller: [] if guarded else ["command"],
-        collision: ["clearance", "gradient", "in_collision", "field_state"],
-        policy: ["hypotheses"] if policy.HasOutputPort("hypotheses") else [],
-    }
-    for system, names in exported.items():
-        for name in names:
-            builder.ExportOutput(system.GetOutputPort(name), name)
-    return Pilot(policy, controller, pose.pose_output_port(), decision)
+    connect(builder, source, controller.GetInputPort(name))
+    if policy.HasOutputPort("heading"):
+        heading = finite("finite_heading", policy.GetOutputPort("heading"), math.nan)
+        connect(builder, heading, controller.GetInputPort("heading"))
 
 
 def ConnectObservation(
     builder: DiagramBuilder, observed: dict[str, OutputPort], policy: System
 ) -> None:
     """
-    Leads to each input of the policy what bears its name.
+    Connects each input of the policy to the port of its name.
 
     Raises:
-        ValueError: if there is no such thing, or it has another size.
+        ValueError: if there is none, or it has another size.
     """
     observed = observed | {"goal": builder.GetSubsystemByName("goal").get_output_port(0)}
     for index in range(policy.num_input_ports()):
@@ -127,108 +173,52 @@ def ConnectObservation(
         connect(builder, observed[port.get_name()], port)
 
 
+def ConnectInputs(builder: DiagramBuilder, system: System, sources: dict[str, OutputPort]) -> None:
+    """Connects input ports of a system by their names."""
+    for name, source in sources.items():
+        builder.Connect(source, system.GetInputPort(name))
+
+
 def require_ports(what: str, system: System, inputs: list[str], outputs: list[str]) -> None:
-    """Raises ValueError unless the system, which is `what`, has these ports."""
-    lacking = [name for name in inputs if not system.HasInputPort(name)]
-    lacking += [name for name in outputs if not system.HasOutputPort(name)]
-    if lacking:
+    """Raises ValueError unless the system, named `what`, has these ports."""
+    missing = [name for name in inputs if not system.HasInputPort(name)]
+    missing += [name for name in outputs if not system.HasOutputPort(name)]
+    if missing:
         raise ValueError(
-            f"the {what} {type(system).__name__} has no port {lacking[0]!r}; it needs the inputs "
+            f"the {what} {type(system).__name__} has no port {missing[0]!r}; it needs the inputs "
             f"{inputs} and the outputs {outputs}"
         )
 
 
-def _ConnectDecision(
-    builder: DiagramBuilder,
-    scenario: Scenario,
-    state: OutputPort,
-    policy: System,
-    controller: System,
-    guarded: bool,
-) -> OutputPort:
-    """Leads what the policy decides to the controller, and returns it."""
-    if policy.HasOutputPort("hypotheses"):
-        hypotheses = policy.GetOutputPort("hypotheses")
-        count = num_hypotheses_in(hypotheses.size())
-        selector = HypothesisSelector(count, scenario.controller.lookahead)
-        builder.AddNamedSystem("selector", selector)
-        builder.Connect(hypotheses, selector.hypotheses_input_port())
-        builder.Connect(state, selector.state_input_port())
-        decision = selector.waypoint_output_port()
-    else:
-        kinds = [
-            kind for kind in ("acceleration", "velocity", "waypoint") if policy.HasOutputPort(kind)
-        ]
-        if not kinds:
-            raise ValueError(
-                f"the policy {type(policy).__name__} has none of the outputs hypotheses, "
-                "acceleration, velocity and waypoint; give it one"
-            )
-        decision = policy.GetOutputPort(kinds[0])
-    flown = decision
-    if guarded:
-        finite = FiniteVector(decision.size())
-        builder.AddNamedSystem("finite_decision", finite)
-        builder.Connect(decision, finite.signal_input_port())
-        flown = finite.finite_output_port()
-    kind = decision.get_name()
-    if decision.get_name() == "velocity":
-        tracker = VelocityTracker()
-        builder.AddNamedSystem("velocity_tracker", tracker)
-        builder.Connect(state, tracker.state_input_port())
-        connect(builder, flown, tracker.velocity_input_port())
-        flown = tracker.acceleration_output_port()
-        kind = "acceleration"
-    require_ports("controller", controller, inputs=["state", kind], outputs=["command"])
-    connect(builder, flown, controller.GetInputPort(kind))
-    if policy.HasOutputPort("heading"):
-        heading = policy.GetOutputPort("heading")
-        if guarded:
-            finite = FiniteVector(heading.size(), substitute=math.nan)
-            builder.AddNamedSystem("finite_heading", finite)
-            builder.Connect(heading, finite.signal_input_port())
-            heading = finite.finite_output_port()
-        connect(builder, heading, controller.GetInputPort("heading"))
-    return decision
-
-
-def goal_of(scenario: Scenario, world: World) -> np.ndarray:
-    """The goal p_WG (3,) [m]: the scenario's, or the world's where the scenario leaves it open."""
+def goal_position(scenario: Scenario, world: World) -> np.ndarray:
+    """Returns p_WG (3,) [m] of the scenario, or of the world if the scenario has none."""
     return np.asarray(world.p_WG if scenario.goal is None else scenario.goal, dtype=float)
 
 
-_TAKEN = {
-    *("plant", "pose", "collision", "goal", "policy", "controller", "camera", "video"),
-    *("selector", "velocity_tracker"),
-    *("policy_camera", "policy_camera_start_pose", "delayed_pose"),
-    *("depth_noise", "color_noise", "time_of_flight_grid"),
-    *("flight_visualizer", "camera_visualizer", "balls_visualizer"),
-    *("state_log", "command_log", "hypotheses_log"),
-}
-"""Names of the other systems of a flight."""
+def start_position(scenario: Scenario, world: World) -> np.ndarray:
+    """Returns p_WS (3,) [m] of the scenario, or of the world if the scenario has none."""
+    return np.asarray(world.p_WS if scenario.start is None else scenario.start, dtype=float)
 
 
 def decision_period(scenario: Scenario, policy: System) -> float:
-    """[s] between decisions of a policy: that of its periodic update, or of the scenario's policy
-    where it has none."""
+    """Returns the period [s] of a policy's update; that of the scenario's policy if it has none."""
     update = policy.GetUniquePeriodicDiscreteUpdateAttribute()
     return update.period_sec() if update is not None else 1 / scenario.policy.rate
 
 
-def sensors_of(scenario: Scenario, policy: System | None = None) -> dict[str, SensorConfig]:
-    """What is on board by name: what the policy (the scenario's if None) brings in its `sensors`,
-    and the scenario's."""
+def onboard_sensors(scenario: Scenario, policy: System | None = None) -> dict[str, SensorConfig]:
+    """Returns the sensors of the policy (the scenario's if None), and the scenario's, by name."""
     return getattr(policy or scenario.policy, "sensors", {}) | scenario.sensors
 
 
-def images_of(policy: System) -> list[str]:
-    """The names of the images that a policy has inputs for."""
+def policy_images(policy: System) -> list[str]:
+    """Returns the names of a policy's input images."""
     names = ("depth_image_32f", "color_image", "depth_grid")
     return [name for name in names if policy.HasInputPort(name)]
 
 
-def camera_of(scenario: Scenario, policy: System) -> OnboardCamera:
-    """Through which a policy sees: its own camera, the scenario's policy's, or the default one."""
+def policy_camera(scenario: Scenario, policy: System) -> OnboardCamera:
+    """Returns a policy's camera: its own, that of the scenario's policy, or the default one."""
     config = getattr(policy, "camera", None) or getattr(scenario.policy, "camera", None)
     return config or OnboardCamera()
 
@@ -242,19 +232,21 @@ def AddObservation(
     policy: System,
 ) -> dict[str, OutputPort]:
     """
-    Adds the camera of a policy that sees, as `policy_camera`.
+    Adds `policy_camera` if the policy has images as inputs. The camera renders when the policy
+    updates.
 
-    It renders when the policy looks. Where the scenario asks for them, `delayed_pose` makes its
-    images late, and `depth_noise` or `color_noise` noisy; `time_of_flight_grid` makes grids of
-    them. With a rolling shutter `policy_camera_start_pose` tells where its first row is read.
+    `delayed_pose`, `depth_noise` and `color_noise` apply the scenario's `observation`, and
+    `time_of_flight_grid` makes grids of depth. `policy_camera_start_pose` is for a rolling shutter.
 
     Returns:
-        The images that the policy has inputs for, by their names.
+        The policy's input images, by their names.
     """
-    names = images_of(policy)
+    names = policy_images(policy)
     if not names:
         return {}
-    config, noise = camera_of(scenario, policy), scenario.observation
+
+    # Camera.
+    config, noise = policy_camera(scenario, policy), scenario.observation
     camera = builder.AddNamedSystem("policy_camera", make_camera(config, world, noise.latency))
     frames = FrameTimes.draw(noise, scenario.seed)
     _connect_start_pose(builder, "policy_camera", camera, config, state, frames)
@@ -263,23 +255,25 @@ def AddObservation(
         builder.Connect(state, delayed.GetInputPort("state"))
         pose = delayed.GetOutputPort("pose")
     builder.Connect(pose, camera.GetInputPort("body_pose"))
-    sees_grid = "depth_grid" in names
-    taken = {"depth_image_32f" if name == "depth_grid" else name for name in names}
-    images = {name: camera.GetOutputPort(name) for name in sorted(taken)}
-    for port, name, kind, active in (
+    rendered = {"depth_image_32f" if name == "depth_grid" else name for name in names}
+    images = {name: camera.GetOutputPort(name) for name in sorted(rendered)}
+
+    # Noise.
+    for port, name, noise_type, active in (
         ("depth_image_32f", "depth_noise", DepthNoise, noise.changes_depth),
         ("color_image", "color_noise", ColorNoise, noise.changes_color),
     ):
         if port in images and active:
-            system = kind(noise, config, 1 / decision_period(scenario, policy), scenario.seed)
-            builder.AddNamedSystem(name, system)
+            rate = 1 / decision_period(scenario, policy)
+            system = builder.AddNamedSystem(name, noise_type(noise, config, rate, scenario.seed))
             builder.Connect(images[port], system.get_input_port())
             images[port] = system.get_output_port()
-    if sees_grid:
-        grid = TimeOfFlightGrid(sensor_of(config))
-        builder.AddNamedSystem("time_of_flight_grid", grid)
-        builder.Connect(images["depth_image_32f"], grid.depth_image_32f_input_port())
-        images["depth_grid"] = grid.depth_grid_output_port()
+
+    # Time of flight.
+    if "depth_grid" in names:
+        grid = builder.AddNamedSystem("time_of_flight_grid", TimeOfFlightGrid(sensor_of(config)))
+        builder.Connect(images["depth_image_32f"], grid.GetInputPort("depth_image_32f"))
+        images["depth_grid"] = grid.GetOutputPort("depth_grid")
     return images
 
 
@@ -291,14 +285,25 @@ def _connect_start_pose(
     state: OutputPort,
     frames: FrameTimes,
 ) -> None:
-    """Tells a camera with a rolling shutter where the vehicle was when it read its first row."""
+    """Connects a rolling shutter to the pose at the readout of the first row."""
     if not camera.HasInputPort("start_pose"):
         return
     readout = getattr(config, "readout", 0.0)
     start = DelayedPose(replace(frames, before=readout), period=min(0.02, readout))
     builder.AddNamedSystem(f"{name}_start_pose", start)
-    builder.Connect(state, start.state_input_port())
-    builder.Connect(start.pose_output_port(), camera.GetInputPort("start_pose"))
+    builder.Connect(state, start.GetInputPort("state"))
+    builder.Connect(start.GetOutputPort("pose"), camera.GetInputPort("start_pose"))
+
+
+_RESERVED = {
+    *("plant", "pose", "collision", "goal", "policy", "controller", "camera", "video"),
+    *("selector", "velocity_tracker"),
+    *("policy_camera", "policy_camera_start_pose", "delayed_pose"),
+    *("depth_noise", "color_noise", "time_of_flight_grid"),
+    *("flight_visualizer", "camera_visualizer", "balls_visualizer"),
+    *("state_log", "command_log", "hypotheses_log"),
+}
+"""Names of the other systems of a flight."""
 
 
 def AddSensors(
@@ -315,19 +320,15 @@ def AddSensors(
         Their outputs: `p` of the sensor `s` as `s_p`.
 
     Raises:
-        ValueError: for a configuration that no sensor has, or of which none is built, and a name
-            that is taken.
+        ValueError: for a configuration that is not of a sensor, and a reserved name.
     """
     measured = {}
     for name, config in sensors.items():
-        if name in _TAKEN:
+        if name in _RESERVED:
             raise ValueError(f"a sensor is named {name!r}, as a part of the flight; rename it")
         sensor = SENSORS.kind_of(config).build(config, world)
-        if not isinstance(sensor, System):
-            raise ValueError(
-                f"what builds the sensor {name!r} gave {type(sensor).__name__}; it must return a "
-                "Drake system"
-            )
+        what = f"the result of building the sensor {name!r}"
+        require(isinstance(sensor, System), what, "a Drake system", type(sensor).__name__)
         builder.AddNamedSystem(name, sensor)
         for port, source in (("state", state), ("body_pose", pose)):
             if sensor.HasInputPort(port):

@@ -1,4 +1,4 @@
-"""One flight: from a scenario to a trajectory and how it ended."""
+"""Simulation of one flight, and its record."""
 
 import enum
 import json
@@ -13,7 +13,7 @@ from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
 from pydrake.systems.framework import Context, Diagram, EventStatus
 from pydrake.systems.primitives import VectorLogSink
 
-from splatpilot.diagrams.flight.blocks import goal_of, images_of
+from splatpilot.diagrams.flight.blocks import goal_position, policy_images, start_position
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.distance_field import FieldState
@@ -27,17 +27,15 @@ from splatpilot.systems.vehicle.state import QuadrotorState
 
 def sample_initial_state(scenario: Scenario, world: World) -> np.ndarray:
     """
-    The state (13,) a flight starts in: level, at rest, facing the goal.
+    Samples the initial state (13,): level, at rest, with the heading to the goal.
 
-    The position is drawn from the scenario's seed, uniformly from the ball of `start_radius` about
-    the start.
+    By the scenario's seed the position is uniform in the sphere of `start_radius` about the start.
 
     Raises:
         InfeasibleFlightError: if the start or the goal is outside known space, or nearer to a
             surface than the vehicle's radius; or if the flight would start at its goal.
     """
-    p_WG = goal_of(scenario, world)
-    p_WS = np.asarray(world.p_WS if scenario.start is None else scenario.start, dtype=float)
+    p_WG, p_WS = goal_position(scenario, world), start_position(scenario, world)
     _check_free(world, "start", p_WS)
     _check_free(world, "goal", p_WG)
     apart = float(np.linalg.norm(p_WG - p_WS))
@@ -49,7 +47,7 @@ def sample_initial_state(scenario: Scenario, world: World) -> np.ndarray:
 
     generator = np.random.default_rng(scenario.seed)
     p_WB = None
-    # The start itself is free, and so is a neighbourhood of it: the search ends.
+    # A neighborhood of the start is free: the search ends.
     while p_WB is None or not _is_free(world, p_WB):
         direction = generator.normal(size=3)
         distance = scenario.start_radius * generator.uniform() ** (1 / 3)
@@ -64,7 +62,7 @@ def _is_free(world: World, p_WQ: np.ndarray) -> bool:
 
 
 def _check_free(world: World, what: str, p_WQ: np.ndarray) -> None:
-    """Raises InfeasibleFlightError unless the vehicle fits at p_WQ (3,) [m]."""
+    """Raises InfeasibleFlightError if a vehicle at p_WQ (3,) [m] would collide."""
     field = world.field_at(0.0)
     sample = field.query(p_WQ)
     where = f"{what} {np.round(p_WQ, 3).tolist()}"
@@ -81,12 +79,12 @@ def _check_free(world: World, what: str, p_WQ: np.ndarray) -> None:
         )
 
 
-_TOUCH = 0.03  # [m], of clearance, from which on the vehicle stands,
-_TOUCHDOWN_SPEED = 0.8  # [m/s], if it is slower than that.
+_TOUCH = 0.03  # [m] max clearance of a landed vehicle, and
+_TOUCHDOWN_SPEED = 0.8  # [m/s] its max speed.
 
 
 class Outcome(enum.StrEnum):
-    """How a flight ended."""
+    """Result of a flight."""
 
     GOAL = "goal"
     COLLISION = "collision"
@@ -98,22 +96,21 @@ class Outcome(enum.StrEnum):
 
 @dataclass(frozen=True, eq=False)
 class Flight:
-    """What a flight leaves behind; N samples at `LOG_PERIOD` and one at the end."""
+    """Record of a flight; N samples at `LOG_PERIOD` and one at the end."""
 
     outcome: Outcome
     times: np.ndarray  # (N,) [s]
     states: np.ndarray  # (N, 13): p_WB, v_WB, q_WB, w_WB_B
     commands: np.ndarray  # (N, 4): thrust [m/s^2], body rates [rad/s]
-    # (N,) [m] Distance to the nearest surface less the vehicle's radius; NaN outside the world.
-    clearances: np.ndarray
-    # (M, size) One row a plan, its time first; see splatpilot.systems.policies.hypotheses. (0, 0)
-    # of policies that return none.
+    clearances: np.ndarray  # (N,) [m] from the collision sphere; NaN outside the world
+    # (M, size) One row a plan, its time first; see splatpilot.systems.policies.hypotheses; (0, 0)
+    # without plans.
     hypotheses: np.ndarray
     wall_time: float  # [s] that the simulation took after its initialisation
     reason: str = ""  # of the outcome `ERROR`: when and where which exception was raised
 
     def summary(self) -> dict[str, float | str]:
-        """The flight in numbers; distances along the samples, speed as path length over time."""
+        """Returns metrics; mean speed is the path length, along the samples, over time."""
         p_WB = QuadrotorState.of(self.states).p_WB
         path_length = float(np.linalg.norm(np.diff(p_WB, axis=0), axis=1).sum())
         duration = float(self.times[-1])
@@ -127,19 +124,13 @@ class Flight:
         } | ({"reason": self.reason} if self.reason else {})
 
     def save(self, path: Path) -> None:
-        """Writes the arrays of this flight as a compressed .npz file, the same bytes every time."""
-        np.savez_compressed(
-            path,
-            times=self.times,
-            states=self.states,
-            commands=self.commands,
-            clearances=self.clearances,
-            hypotheses=self.hypotheses,
-        )
+        """Writes the arrays to a compressed .npz file, deterministically."""
+        names = ("times", "states", "commands", "clearances", "hypotheses")
+        np.savez_compressed(path, **{name: getattr(self, name) for name in names})
 
 
 class FlightError(ValueError):
-    """A system of the flight raised; `flight` is what was flown until then."""
+    """An exception of a system; `flight` is the record until then."""
 
     def __init__(self, flight: Flight) -> None:
         super().__init__(f"the flight ended {flight.reason}")
@@ -158,8 +149,8 @@ def fly(
 
     Args:
         diagram, scenario, world: as built.
-        progress: called with the simulated time [s] now and then.
-        realtime_rate: simulated over real time to slow down to; 0 for as fast as possible.
+        progress: called with the simulated time [s].
+        realtime_rate: max simulated over real time; 0 for as fast as possible.
 
     Returns:
         The flight. Its outcome is `ERROR` if a system raised `InfeasibleFlightError` after time 0.
@@ -170,7 +161,6 @@ def fly(
     simulator = flight_simulator(diagram, scenario, world, progress)
     simulator.set_target_realtime_rate(realtime_rate)
     root = simulator.get_mutable_context()
-    # Where a plant that the caller gave starts by default is its own affair.
     plant_context = diagram.GetSubsystemByName("plant").GetMyMutableContextFromRoot(root)
     plant_context.SetContinuousState(sample_initial_state(scenario, world))
     simulator.Initialize()
@@ -188,7 +178,7 @@ def fly(
         raise FlightError(flight) from error
     wall_time = time.perf_counter() - started
 
-    p_WG = goal_of(scenario, world)
+    p_WG = goal_position(scenario, world)
     ended = flight_outcome(diagram, root, p_WG, scenario.goal_radius) or Outcome.TIMEOUT
     return record_flight(diagram, root, world, ended, wall_time)
 
@@ -200,17 +190,16 @@ def flight_simulator(
     progress: Callable[[float], object] | None = None,
 ) -> Simulator:
     """
-    A simulator of a diagram made by `BuildFlightDiagram`, as the scenario has it, that ends when
-    the flight does.
+    Makes a simulator, of a diagram made by `BuildFlightDiagram`, that ends with the flight.
 
     Args:
         diagram, scenario, world: as built.
-        progress: called with the simulated time [s] now and then.
+        progress: called with the simulated time [s].
     """
     scenario.validate()
     simulator = Simulator(diagram)
     ApplySimulatorConfig(scenario.simulator, simulator)
-    p_WG = goal_of(scenario, world)
+    p_WG = goal_position(scenario, world)
 
     def monitor(context: Context) -> EventStatus:
         if progress is not None:
@@ -228,17 +217,17 @@ def decision_times(
     diagram: Diagram, scenario: Scenario, flight: Flight, count: int = 10
 ) -> tuple[float, float]:
     """
-    Mean wall time [s] of a render for the policy, 0 if it does not see, and of its decision
-    without it, at `count` states evenly spaced along a flight.
+    Measures the mean wall time [s] of a render for the policy, 0 without images, and of the
+    policy's update without it, at `count` states evenly spaced along a flight.
     """
     root = Simulator(diagram).get_mutable_context()
     plant = diagram.GetSubsystemByName("plant").GetMyMutableContextFromRoot(root)
     policy = diagram.GetSubsystemByName("policy")
     context = policy.GetMyContextFromRoot(root)
-    images = images_of(policy)
+    images = policy_images(policy)
     rows = np.linspace(0, len(flight.states) - 1, count).astype(int)
     spent = np.zeros((count + 1, 2))  # [s]
-    # The first time through, what is kept for the whole flight is made: it does not count.
+    # The first time fills caches, and does not count.
     for k, row in enumerate([0, *rows]):
         root.SetTime(flight.times[row])
         plant.SetContinuousState(flight.states[row])
@@ -258,7 +247,7 @@ def decision_times(
 def flight_outcome(
     diagram: Diagram, context: Context, p_WG: np.ndarray, goal_radius: float
 ) -> Outcome | None:
-    """How the flight ends at this instant; None while it goes on."""
+    """Returns the outcome at this instant; None during the flight."""
     if _evaluated(diagram, "in_collision", context)[0]:
         return Outcome.COLLISION
     if _evaluated(diagram, "field_state", context)[0] >= FieldState.UNKNOWN:
@@ -270,7 +259,7 @@ def flight_outcome(
 
 
 def has_landed(diagram: Diagram, context: Context) -> bool:
-    """Whether the vehicle touches something level, slowly."""
+    """Checks if the vehicle touches a level surface, slowly."""
     v_WB = QuadrotorState.of(_evaluated(diagram, "state", context)).v_WB
     return bool(
         _evaluated(diagram, "clearance", context)[0] < _TOUCH
@@ -282,14 +271,14 @@ def has_landed(diagram: Diagram, context: Context) -> bool:
 def record_flight(
     diagram: Diagram, root: Context, world: World, outcome: Outcome, wall_time: float
 ) -> Flight:
-    """What a flight left in the loggers of its diagram, which took `wall_time` [s]. After an error
-    no port is evaluated: that could raise it again."""
+    """Collects the logs of a flight, which took `wall_time` [s]. After an error it evaluates no
+    port, which could raise it again."""
     logs = {
         name: cast(VectorLogSink, diagram.GetSubsystemByName(f"{name}_log")).FindLog(root)
         for name in ("state", "command")
     }
     times = logs["state"].sample_times().copy()
-    # Copies: what a log returns is a view of memory that the diagram owns.
+    # Copies, since logs return views of memory of the diagram.
     states, commands = (log.data().T.copy() for log in logs.values())
     if root.get_time() > times[-1] and outcome is not Outcome.ERROR:
         times = np.append(times, root.get_time())
@@ -307,12 +296,12 @@ def record_flight(
 
 
 def _recorded_plans(diagram: Diagram, root: Context, with_last: bool) -> np.ndarray:
-    """All plans that were made (M, size), or (0, 0) of a policy that makes none."""
+    """Returns all plans (M, size), or (0, 0) without any."""
     if not diagram.HasOutputPort("hypotheses"):
         return np.empty((0, 0))
     sink = cast(VectorLogSink, diagram.GetSubsystemByName("hypotheses_log"))
     plans = sink.FindLog(root).data().T.copy()
-    # A log samples before the policy updates at the same instant: it lacks the last plan.
+    # A log samples before the policy updates at the same instant: the last plan is missing.
     if with_last:
         last = _evaluated(diagram, "hypotheses", root)
         if last[0] != plans[-1, 0]:
@@ -321,7 +310,7 @@ def _recorded_plans(diagram: Diagram, root: Context, with_last: bool) -> np.ndar
 
 
 def _reason(error: Exception, time: float, state: np.ndarray) -> str:
-    """When and in which state (13,) which exception was raised."""
+    """Describes an exception with its time and state (13,)."""
     p_WB, v_WB, _, _ = (part.round(2).tolist() for part in QuadrotorState.of(state))
     kind = "" if isinstance(error, InfeasibleFlightError) else f"{type(error).__name__}: "
     return f"at t = {time:.2f} s, p_WB = {p_WB} m, v_WB = {v_WB} m/s: {kind}{error}"
@@ -335,12 +324,8 @@ FLIGHT_FILES = "trajectory.npz", "scenario.yaml", "summary.json"
 
 
 def write_flight(out: Path, scenario: Scenario, flight: Flight) -> None:
-    """
-    Writes into the folder `out`, before anything else is made of the flight:
-
-    - `trajectory.npz`: the arrays of `Flight`;
-    - `scenario.yaml`: the scenario with every field, which gives the same flight again.
-    """
+    """Writes `trajectory.npz`, the arrays of `Flight`, and `scenario.yaml`, the scenario with all
+    fields, into the folder `out`."""
     with written_atomically(out / "trajectory.npz") as path:
         flight.save(path)
     with written_atomically(out / "scenario.yaml") as path:
@@ -348,6 +333,6 @@ def write_flight(out: Path, scenario: Scenario, flight: Flight) -> None:
 
 
 def write_summary(out: Path, summary: dict[str, float | str]) -> None:
-    """Writes `summary.json` into the folder `out`: the flight in numbers."""
+    """Writes `summary.json` into the folder `out`."""
     with written_atomically(out / "summary.json") as path:
         path.write_text(json.dumps(summary, indent=2) + "\n")

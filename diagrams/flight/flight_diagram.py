@@ -1,4 +1,4 @@
-"""The closed loop: a vehicle that flies through what its camera sees."""
+"""BuildFlightDiagram: the closed loop of vehicle, camera, policy and controller."""
 
 from typing import cast
 
@@ -11,13 +11,14 @@ from pydrake.systems.sensors import CameraConfig, CameraInfo
 
 from splatpilot.diagrams.flight.blocks import (
     AddObservation,
-    AddPilot,
+    AddPolicyAndController,
     AddSensors,
     ConnectObservation,
     decision_period,
-    goal_of,
+    goal_position,
+    onboard_sensors,
     require_ports,
-    sensors_of,
+    start_position,
 )
 from splatpilot.diagrams.flight.flight import sample_initial_state
 from splatpilot.diagrams.flight.scenario import Scenario
@@ -39,7 +40,7 @@ from splatpilot.systems.visualization.video import VideoRecorder
 
 
 def empty_meshcat(background: Background) -> Meshcat:
-    """A Meshcat in which nothing stands before the background."""
+    """Returns a Meshcat with the color of the background, and without grid and axes."""
     meshcat = Meshcat(MeshcatParams(host="localhost"))
     meshcat.SetProperty("/Grid", "visible", False)
     meshcat.SetProperty("/Axes", "visible", False)
@@ -49,18 +50,15 @@ def empty_meshcat(background: Background) -> Meshcat:
 
 
 def open_meshcat(scenario: Scenario, world: World) -> Meshcat:
-    """
-    A Meshcat that shows what stands still: goal, distance field and background.
-
-    Its camera sees the start and the goal from behind and above the start.
-    """
+    """Returns a Meshcat with goal, distance field and background; its camera shows start and goal
+    from behind and above the start."""
     meshcat = empty_meshcat(world.background)
-    p_WG = goal_of(scenario, world)
+    p_WG = goal_position(scenario, world)
     draw_goal(meshcat, "/splatpilot/goal", p_WG, scenario.goal_radius)
     draw_distance_slice(meshcat, "/splatpilot/distance_slice", world.distance_field, float(p_WG[2]))
     meshcat.SetProperty("/splatpilot/distance_slice", "visible", False)
 
-    p_WS = np.asarray(world.p_WS if scenario.start is None else scenario.start, dtype=float)
+    p_WS = start_position(scenario, world)
     p_SG_W = p_WG - p_WS
     distance = max(float(np.linalg.norm(p_SG_W)), 1e-6)
     eye = p_WS - 0.2 * p_SG_W + [0.0, 0.0, 3.0 + 0.35 * distance]
@@ -70,15 +68,15 @@ def open_meshcat(scenario: Scenario, world: World) -> Meshcat:
 
 def AddMeshcat(builder: DiagramBuilder, scenario: Scenario, world: World, meshcat: Meshcat) -> None:
     """
-    Draws the world's Gaussians and the vehicle, and adds the systems that draw what moves.
+    Draws the world's Gaussians and the vehicle, and adds visualizers.
 
     Args:
-        builder: of a flight with `plant`, `policy` and `camera`.
-        scenario, world: what is flown.
-        meshcat: where, as `open_meshcat` has made it.
+        builder: with `plant`, `policy` and `camera`.
+        scenario, world: of the flight.
+        meshcat: of `open_meshcat`.
     """
     field = world.distance_field
-    margin = np.array([5.0, 5.0, 3.0])  # [m] of surroundings that are drawn too.
+    margin = np.array([5.0, 5.0, 3.0])  # [m] of surroundings
     draw_gaussians(
         meshcat,
         "/splatpilot/scene",
@@ -118,54 +116,42 @@ def BuildFlightDiagram(
 ) -> Diagram:
     """
     Builds the diagram of one flight. Its default Context is the scenario's start, see
-    `sample_initial_state`, which is also what SetRandomContext makes of it: Drake lets no system
-    written in Python draw its state there. Random flights are those of `random_flights`.
+    `sample_initial_state`; so is the one of SetRandomContext, since Drake does not let systems in
+    Python sample their states. See `random_flights`.
 
-    Systems, by name: `plant`, `pose`, `collision`, `goal`, `policy`, `controller`, and the loggers
-    `state_log`, `command_log`; with a camera `camera`; with a policy that sees `policy_camera`,
-    with one that returns hypotheses `selector` and `hypotheses_log`, with one that returns
-    velocities `velocity_tracker`; the sensors under their names;
+    Systems, by name: `plant`, those of `AddPolicyAndController` and `AddObservation`, the sensors
+    under their names, `camera`, and the loggers `state_log`, `command_log` and `hypotheses_log`;
     with Meshcat also `flight_visualizer` and `camera_visualizer`, with video `video`.
 
     .. pydrake_system::
 
         name: flight
-        output_ports:
-        - state
-        - command
-        - hypotheses
-        - color_image
-        - depth_image_32f
-        - depth_image_16u
-        - clearance
-        - gradient
-        - in_collision
-        - field_state
+        output_ports: [state, command, hypotheses, color_image, depth_image_32f, depth_image_16u,
+            clearance, gradient, in_collision, field_state]
 
-    The port `hypotheses` is there if the policy has it, the images if there is a camera. Each
-    output `p` of a sensor `s` is there as `s_p`.
+    The port `hypotheses` is of policies that have it, the images are of the scenario's camera. Each
+    output `p` of a sensor `s` is `s_p`.
 
     Args:
-        scenario: who flies, how, from where to where.
-        world: what is flown in.
-        meshcat: draws the flight there when given; see `open_meshcat`.
-        video: records the camera's images at its rate, for `VideoRecorder.save` to write.
-        camera: whether the scenario's camera is there; Meshcat and videos need it, flights do not.
-        policy: flies instead of the scenario's. Any system with one of the outputs `hypotheses`
+        scenario: of the flight.
+        world: of the flight.
+        meshcat: draws the flight; see `open_meshcat`.
+        video: records the camera's images at its rate, for `VideoRecorder.save`.
+        camera: adds the scenario's camera; Meshcat and videos need it, flights do not.
+        policy: replaces the scenario's. Any system with one of the outputs `hypotheses`
             (see `splatpilot.systems.policies.hypotheses`), `acceleration`, `velocity` and
-            `waypoint` (3 each), and perhaps `heading` (1), where to look. Its inputs are any of
-            `state` (13), `goal` (3), `depth_image_32f`, `color_image` and `depth_grid` of a camera
-            of its own (its attribute `camera`, an `OnboardCamera`), and the outputs of sensors.
-        plant: flies instead of `QuadrotorPlant`: any system with the input `command` (4), the
-            output `state` (13), and that state as its continuous state; where it is in the default
-            Context is its own affair, but `fly` has it start at the scenario's start.
-        controller: flies instead of `FlatnessController`: any system with the input `state`, that
-            for the policy's output, and the output `command`.
+            `waypoint` (3 each), and optionally `heading` (1). Its inputs are any of `state` (13),
+            `goal` (3), `depth_image_32f`, `color_image` and `depth_grid` of its own camera (its
+            attribute `camera`, an `OnboardCamera`), and the outputs of sensors.
+        plant: replaces `QuadrotorPlant`: any system with the input `command` (4), the output
+            `state` (13), and that state as its continuous state, which `fly` sets to the start.
+        controller: replaces `FlatnessController`: any system with the input `state`, that for the
+            policy's output, and the output `command`.
 
     Raises:
         InfeasibleFlightError: see `sample_initial_state`.
-        ValueError: for a configuration that no policy or sensor has, a system without the ports it
-            needs, and Meshcat or video without the camera.
+        ValueError: for an invalid configuration, a system without the ports it needs, and Meshcat
+            or video without the camera.
     """
     if not camera and (video or meshcat is not None):
         raise ValueError(
@@ -175,52 +161,55 @@ def BuildFlightDiagram(
     scenario.validate()
     world = seen_otherwise(world, scenario.appearance, scenario.seed)
     builder = DiagramBuilder()
-    sensors = sensors_of(scenario, policy)
+
+    # Vehicle.
     if plant is None:
-        plant = cast(
-            System, QuadrotorPlant(scenario.vehicle, sample_initial_state(scenario, world))
-        )
+        start = sample_initial_state(scenario, world)
+        plant = cast(System, QuadrotorPlant(scenario.vehicle, start))
     builder.AddNamedSystem("plant", plant)
     require_ports("plant", plant, inputs=["command"], outputs=["state"])
     state = plant.GetOutputPort("state")
-    pilot = AddPilot(builder, scenario, world, state, policy, controller)
-    policy, controller = pilot.policy, pilot.controller
+    builder.ExportOutput(state, "state")
+
+    # Policy and controller.
+    sensors = onboard_sensors(scenario, policy)
+    policy, controller, pose, _ = AddPolicyAndController(
+        builder, scenario, world, state, policy, controller
+    )
     builder.Connect(controller.GetOutputPort("command"), plant.GetInputPort("command"))
 
-    images = AddObservation(builder, scenario, world, state, pilot.pose, policy)
-    measured = AddSensors(builder, sensors, world, state, pilot.pose)
+    # Sensors.
+    images = AddObservation(builder, scenario, world, state, pose, policy)
+    measured = AddSensors(builder, sensors, world, state, pose)
     ConnectObservation(builder, {"state": state} | images | measured, policy)
-
-    builder.ExportOutput(state, "state")
-    if camera:
-        onboard = builder.AddNamedSystem("camera", MakeCamera(scenario, world))
-        builder.Connect(pilot.pose, onboard.GetInputPort("body_pose"))
-        for name in ("color_image", "depth_image_32f", "depth_image_16u"):
-            builder.ExportOutput(onboard.GetOutputPort(name), name)
     for name, port in measured.items():
         builder.ExportOutput(port, name)
 
-    for system, name in ((plant, "state"), (controller, "command")):
-        LogVectorOutput(system.GetOutputPort(name), builder, LOG_PERIOD).set_name(f"{name}_log")
+    # Camera, video and Meshcat.
+    if camera:
+        onboard = MakeCamera(scenario, world)
+        builder.AddNamedSystem("camera", onboard)
+        builder.Connect(pose, onboard.GetInputPort("body_pose"))
+        for name in ("color_image", "depth_image_32f", "depth_image_16u"):
+            builder.ExportOutput(onboard.GetOutputPort(name), name)
+        if meshcat is not None:
+            AddMeshcat(builder, scenario, world, meshcat)
+        if video:
+            VideoRecorder.AddToBuilder(builder, onboard, scenario.camera.fps)
+
+    # Logs.
+    logs = [(plant, "state", LOG_PERIOD), (controller, "command", LOG_PERIOD)]
     if policy.HasOutputPort("hypotheses"):
-        period = decision_period(scenario, policy)
-        log = LogVectorOutput(policy.GetOutputPort("hypotheses"), builder, period)
-        log.set_name("hypotheses_log")
-
-    if meshcat is not None:
-        AddMeshcat(builder, scenario, world, meshcat)
-
-    if video:
-        onboard = cast(SplatCamera, builder.GetSubsystemByName("camera"))
-        VideoRecorder.AddToBuilder(builder, onboard, scenario.camera.fps)
-
+        logs.append((policy, "hypotheses", decision_period(scenario, policy)))
+    for system, name, period in logs:
+        LogVectorOutput(system.GetOutputPort(name), builder, period).set_name(f"{name}_log")
     diagram = builder.Build()
     diagram.set_name("flight")
     return diagram
 
 
 def MakeCamera(scenario: Scenario, world: World) -> SplatCamera:
-    """The scenario's camera, looking at the world's Gaussians."""
+    """Makes the scenario's camera of the world's Gaussians."""
     config = scenario.camera
     return SplatCamera(
         world.baked,
@@ -236,7 +225,7 @@ def MakeCamera(scenario: Scenario, world: World) -> SplatCamera:
 
 
 def camera_info(config: CameraConfig) -> CameraInfo:
-    """The intrinsics of a camera."""
+    """Returns the intrinsics of a camera."""
     center_x, center_y = config.principal_point()
     return CameraInfo(
         width=config.width,
@@ -249,5 +238,5 @@ def camera_info(config: CameraConfig) -> CameraInfo:
 
 
 def camera_mount(config: CameraConfig) -> RigidTransform:
-    """X_BC, the pose of a camera in the vehicle's body frame."""
+    """Returns X_BC, the pose of a camera in the vehicle's body frame."""
     return config.X_PB.GetDeterministicValue() @ config.X_BC.GetDeterministicValue()

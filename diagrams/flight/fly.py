@@ -1,4 +1,4 @@
-"""`splatpilot fly`: one flight, with everything a person wants to see of it afterwards."""
+"""`splatpilot fly`: one flight with its page and video."""
 
 import contextlib
 import time
@@ -11,7 +11,7 @@ import numpy as np
 from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Diagram
 
-from splatpilot.diagrams.flight.blocks import goal_of
+from splatpilot.diagrams.flight.blocks import goal_position, start_position
 from splatpilot.diagrams.flight.flight import (
     FLIGHT_FILES,
     Flight,
@@ -53,20 +53,13 @@ from splatpilot.systems.visualization.video import VideoRecorder
 
 
 def replayed_flight(name: str, flight: Flight, frames: Frames | None) -> ReplayedFlight:
-    """A flight as a page shows it, with what its camera saw."""
-    return ReplayedFlight(
-        name,
-        str(flight.outcome),
-        flight.times,
-        flight.states,
-        flight.clearances,
-        flight.hypotheses,
-        frames,
-    )
+    """Converts a flight, with its camera's images, for a page."""
+    arrays = flight.times, flight.states, flight.clearances, flight.hypotheses
+    return ReplayedFlight(name, str(flight.outcome), *arrays, frames)
 
 
 def recorded_frames(recorder: VideoRecorder, scenario: Scenario) -> Frames:
-    """The pictures of the scenario's camera."""
+    """Returns the images of the scenario's camera."""
     color, depth = zip(*recorder.frames(scenario.camera.z_far), strict=True)
     return Frames(1 / scenario.camera.fps, color, depth)
 
@@ -79,11 +72,8 @@ def write_flight_page(
 
     Args:
         path: the file, ending in .html.
-        scenario, world: what was flown.
+        scenario, world: of the flights.
         flights: one or more.
-
-    Raises:
-        OSError: if it cannot be written.
     """
     world = seen_otherwise(world, scenario.appearance, scenario.seed)
     lower, upper = _heights(world)
@@ -107,20 +97,16 @@ def write_flight_page(
 
 def write_live_page(path: Path, meshcat: Meshcat, scenario: Scenario, world: World) -> None:
     """
-    Writes a page that shows a flight while it goes on, see `live_page`, at first from above.
+    Writes a page that shows a running flight, see `live_page`, at first from above.
 
     Args:
         path: the file, ending in .html.
         meshcat: draws the flight, see `open_meshcat`.
-        scenario, world: what is flown.
-
-    Raises:
-        OSError: if it cannot be written.
+        scenario, world: of the flight.
     """
     world = seen_otherwise(world, scenario.appearance, scenario.seed)
     lower, upper = _heights(world)
-    start = world.p_WS if scenario.start is None else scenario.start
-    highest = max(start[2], goal_of(scenario, world)[2])
+    highest = max(start_position(scenario, world)[2], goal_position(scenario, world)[2])
     cut = min(highest + 2 * VEHICLE_RADIUS, upper)
     page = live_page(meshcat, world.gaussians, world.background, (lower, upper), cut)
     with written_atomically(path) as partial:
@@ -128,7 +114,7 @@ def write_live_page(path: Path, meshcat: Meshcat, scenario: Scenario, world: Wor
 
 
 def _heights(world: World) -> tuple[float, float]:
-    """[m], of a place's floor and ceiling."""
+    """Returns the heights [m] of floor and ceiling."""
     field = world.distance_field
     return float(np.asarray(field.lower_W)[2]), float(np.asarray(field.upper_W)[2])
 
@@ -147,27 +133,27 @@ def run(
     overwrite: bool = False,
 ) -> dict[str, float | str]:
     """
-    Flies a scenario and leaves in `out`:
+    Flies a scenario and writes into `out`:
 
-    - `flight.html`: a page to watch it in, see `replay_page`;
-    - `flight.mp4`: what the onboard camera saw, colour beside depth;
+    - `flight.html`, see `replay_page`;
+    - `flight.mp4`: the images of the camera, color next to depth;
     - `traceback.txt`, if an exception other than `InfeasibleFlightError` ended the flight;
-    - what `write_flight` and `write_summary` write, the former before any picture is made.
+    - the files of `write_flight` and `write_summary`.
 
     Args:
         live: serves Meshcat while flying, at real time, and afterwards until Enter is pressed;
             `live.html` in `out` shows it with the world's Gaussians.
-        video: whether to write `flight.mp4`.
-        graphviz: where to write the diagram as Graphviz source.
-        overwrite: what is there. An earlier flight stays whole until this one has been flown.
+        video: writes `flight.mp4`.
+        graphviz: file for the diagram as Graphviz source.
+        overwrite: replaces files in `out`, after the flight.
 
     Returns:
         `Flight.summary()` and `render_ms`, the mean time of a render along the flight [ms].
 
     Raises:
         ValueError: for a scenario that cannot be flown.
-        OSError: if `out` holds anything and is not to be overwritten, or cannot be written; nothing
-            is flown then.
+        OSError: before the flight, if `out` is not empty and not to be overwritten, or cannot be
+            written.
     """
     scenario.validate()
     for path in (out, graphviz):
@@ -177,7 +163,7 @@ def run(
         require_writable_folder(graphviz.parent)
     print(f"Building the world, seed {scenario.seed}...", flush=True)
     world = make_world(scenario.world, scenario.seed)
-    sample_initial_state(scenario, world)  # Refuses a start or goal without room before the rest.
+    sample_initial_state(scenario, world)  # Checks start and goal early.
 
     meshcat = open_meshcat(scenario, world) if live else None
     if meshcat is not None:
@@ -225,7 +211,7 @@ def run(
 def fly_with_bar(
     diagram: Diagram, scenario: Scenario, world: World, realtime_rate: float = 0.0
 ) -> Flight:
-    """`fly`, with a progress bar of simulated time."""
+    """Calls `fly` with a progress bar of simulated time."""
     layout = "{desc} {n:.1f} s of at most {total:.0f} s [{elapsed}]"
     with Progress(total=scenario.timeout, desc="flying", bar_format=layout, leave=False) as bar:
         return fly(
@@ -238,7 +224,7 @@ def fly_with_bar(
 
 
 def format_summary(summary: dict[str, float | str]) -> str:
-    """The summary as a table of two columns."""
+    """Formats the summary as a table of two columns."""
     rows = (
         ("outcome", "outcome", "{}"),
         ("flight time", "flight_time_s", "{:.2f} s"),
@@ -252,7 +238,7 @@ def format_summary(summary: dict[str, float | str]) -> str:
 
 
 def _render_ms(camera: SplatCamera, flight: Flight, num_views: int = 30) -> float:
-    """Mean time of a render at poses evenly spaced along a flight [ms]."""
+    """Measures the mean time [ms] of a render at poses evenly spaced along a flight."""
     rows = np.linspace(0, len(flight.states) - 1, num_views).astype(int)
     poses = [pose_from_state(state) for state in flight.states[rows]]
     started = time.perf_counter()

@@ -1,4 +1,4 @@
-"""Flights drawn at random, for Drake's `RandomSimulation` and `MonteCarloSimulation`."""
+"""Random flights for Drake's `RandomSimulation` and `MonteCarloSimulation`."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -18,30 +18,30 @@ def random_flights(
     scenario: Scenario, world: World | None = None
 ) -> Callable[[RandomGenerator], Simulator]:
     """
-    Makes simulators of flights that differ in all that a scenario draws from its seed: where the
-    vehicle starts, the noise of what its policy sees and when that comes, and the world.
+    Makes simulators of flights with random seeds, and so random starts, observation noise, latency
+    and worlds.
 
         def clearance(diagram, context):
             return diagram.GetOutputPort("clearance").Eval(context)[0]
 
         MonteCarloSimulation(random_flights(scenario), clearance, scenario.timeout, 20)
 
-    Each draw is one of `MONTE_CARLO_SEEDS`; the default Context of the diagram is the start of its
-    flight. A simulation ends with its flight: reaching the goal, colliding or leaving the volume.
+    Seeds are of `MONTE_CARLO_SEEDS`; the default Context of the diagram is the start of its
+    flight. A simulation ends at the goal, at a collision or outside of the volume.
 
     Args:
-        scenario: what is flown; its own seed does not matter.
-        world: what all fly in; made anew from each seed if None, which is slow.
+        scenario: of the flights, but for its seed.
+        world: of all flights; by default made of each seed, which is slow.
 
     Returns:
         The `make_simulator` of these functions, which raises `InfeasibleFlightError` for a world
-        without room at its start or goal.
+        without clearance at its start or goal.
     """
 
     def make_simulator(generator: RandomGenerator) -> Simulator:
-        drawn = replace(scenario, seed=MONTE_CARLO_SEEDS[generator() % len(MONTE_CARLO_SEEDS)])
-        flown = world or make_world(drawn.world, drawn.seed)
-        diagram = BuildFlightDiagram(drawn, flown, camera=False)
-        return flight_simulator(diagram, drawn, flown)
+        sample = replace(scenario, seed=MONTE_CARLO_SEEDS[generator() % len(MONTE_CARLO_SEEDS)])
+        flown = world or make_world(sample.world, sample.seed)
+        diagram = BuildFlightDiagram(sample, flown, camera=False)
+        return flight_simulator(diagram, sample, flown)
 
     return make_simulator

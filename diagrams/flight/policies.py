@@ -1,4 +1,4 @@
-"""All policies: their configurations, their names, and how each becomes a system."""
+"""Registry of policies."""
 
 import operator
 from collections.abc import Callable
@@ -26,7 +26,6 @@ from splatpilot.systems.policies.planner import PrivilegedPlanner, PrivilegedPla
 from splatpilot.systems.policies.reactive import Reactive, ReactiveConfig
 from splatpilot.systems.policies.straight import Straight, StraightConfig
 from splatpilot.systems.policies.student import (
-    PilotRgbConfig,
     Student,
     StudentDepthConfig,
     StudentRgbConfig,
@@ -36,38 +35,34 @@ from splatpilot.systems.vehicle.quadrotor import QuadrotorParams
 
 class PolicyConfig(Protocol):
     """
-    The configuration of a policy: a dataclass that imports without torch.
+    Configuration of a policy: a dataclass that imports without torch.
 
-    Beside what follows it may have `camera`, an `OnboardCamera` through which the policy sees;
-    `sensors`, a dictionary of the configurations of others (`diagrams/flight/sensors.py`); and
-    `weights`,
-    a file of weights.
+    It may also have `camera`, an `OnboardCamera` of the policy; `sensors`, a dictionary of
+    configurations (`diagrams/flight/sensors.py`); and `weights`, a file.
     """
 
     __dataclass_fields__: ClassVar[dict[str, Any]]
 
     @property
     def rate(self) -> float:
-        """[Hz], of decisions."""
+        """[Hz] of updates."""
         ...
 
     def validate(self) -> None:
-        """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
+        """Raises ValueError for a value out of range."""
         ...
 
 
 @dataclass(frozen=True)
 class PolicyKind:
-    """How a policy is configured and built."""
+    """Entry of the registry."""
 
-    config: type
-    """The type of its configurations."""
+    config: type  # of its configurations
     build: Callable[[Any, World, QuadrotorParams], System]
-    """From a configuration, the world (for privileged policies) and what is known of the vehicle
-    to a system with the ports that `BuildFlightDiagram` connects."""
+    """Makes a system with the ports that `BuildFlightDiagram` connects of a configuration, the
+    world (for privileged policies) and the vehicle's parameters."""
     speed_field: str
-    """Where in the configuration the nominal speed [m/s] stands, as `speed` or `lattice.speed`;
-    empty if nobody can ask it for one."""
+    """Field of the nominal speed [m/s], as `speed` or `lattice.speed`; empty if it is fixed."""
 
 
 POLICIES = Registry("policy", "splatpilot.policies", PolicyKind)
@@ -82,17 +77,16 @@ def register_policy(
     speed_field: str = "speed",
 ) -> None:
     """
-    Makes a policy known, so that scenarios, studies and the command line can name it.
+    Registers a policy for scenarios, studies and the command line.
 
     Args:
-        config: the type of its configurations, see `PolicyConfig`; its name is their YAML tag.
+        config: type of its configurations, see `PolicyConfig`; its name is their YAML tag.
         build: see `PolicyKind.build`.
-        name: of the policy; that of the type without "Config", in small letters, if empty.
-        speed_field: see `PolicyKind.speed_field`; a configuration that has no `speed` cannot be
-            asked for one.
+        name: of the policy; by default that of the type without "Config", in lower case.
+        speed_field: see `PolicyKind.speed_field`; ignored if the configuration has no `speed`.
 
     Raises:
-        ValueError: if another policy has the name, or the type is none of configurations.
+        ValueError: if another policy has the name, or the type is not a configuration.
     """
     require_configuration(config)
     if speed_field == "speed" and "speed" not in {field.name for field in fields(config)}:
@@ -119,14 +113,6 @@ register_policy(
     name="agile_autonomy",
 )
 
-DEFAULT_SPEED, MAX_SPEED = 2.0, 20.0
-"""[m/s], the nominal speed if none is given, and the largest that a policy can be given."""
-
-BENCHMARK_POLICIES = tuple(POLICIES.registered())
-"""Those that a study flies when nobody says which: our own, whatever else is installed, but for
-those that see by a sensor of their own."""
-
-
 register_policy(
     DiffAeroTofConfig, lambda config, world, vehicle: DiffAeroTof(config), name="diffaero_tof"
 )
@@ -135,27 +121,30 @@ register_policy(
     DiffAeroRgbConfig, lambda config, world, vehicle: DiffAeroRgb(config), name="diffaero_rgb"
 )
 
-for _config, _name in (
-    (StudentRgbConfig, "student_rgb"),
-    (StudentDepthConfig, "student_depth"),
-    (PilotRgbConfig, "pilot_rgb"),
-):
+for _config, _name in ((StudentRgbConfig, "student_rgb"), (StudentDepthConfig, "student_depth")):
     register_policy(_config, lambda config, world, vehicle: Student(config), name=_name)
+
+
+BENCHMARK_POLICIES = "planner", "straight", "reactive", "diffaero", "depthnav", "agile_autonomy"
+"""Default policies of a study."""
+
+DEFAULT_SPEED, MAX_SPEED = 2.0, 20.0
+"""[m/s] Default nominal speed of policies, and its maximum."""
 
 
 def policy_named(name: str, speed: float = DEFAULT_SPEED) -> Any:
     """
-    The configuration of a policy for a nominal speed.
+    Returns the configuration of a policy for a nominal speed.
 
     Args:
-        name: of the policy, `module:attribute` of one that is not installed, or a file of weights
-            (.npz) that one was trained to.
+        name: of the policy, `module:attribute` of one that is not installed, or a file of its
+            trained weights (.npz).
         speed: [m/s].
 
     Raises:
         FileNotFoundError: if there is no such file.
-        ValueError: if there is no such policy, the file holds none, or it does not fly at this
-            speed.
+        ValueError: if there is no such policy, the file has no weights of one, or the speed is
+            invalid.
     """
     weights = name if name.endswith(".npz") else ""
     kind = POLICIES.find(policy_of(weights) if weights else name)
@@ -170,10 +159,10 @@ def policy_named(name: str, speed: float = DEFAULT_SPEED) -> Any:
 
 def at_speed(config: Any, speed: float) -> Any:
     """
-    The configuration of a policy, for another nominal speed [m/s].
+    Changes the nominal speed [m/s] of a policy's configuration.
 
     Raises:
-        ValueError: for a policy that cannot be asked for one.
+        ValueError: for a policy with a fixed speed.
     """
     field = POLICIES.kind_of(config).speed_field
     if not field:
@@ -186,22 +175,18 @@ def at_speed(config: Any, speed: float) -> Any:
 
 
 def speed_of(config: Any) -> float | None:
-    """The nominal speed [m/s] of a policy; None of one that cannot be asked for one."""
+    """Returns the nominal speed [m/s] of a policy; None if it is fixed."""
     field = POLICIES.kind_of(config).speed_field
     return operator.attrgetter(field)(config) if field else None
 
 
 def name_of(config: Any) -> str:
-    """The name of the policy that a configuration is of.
-
-    Raises:
-        ValueError: if it is of none.
-    """
+    """Returns the name of a configuration's policy; raises ValueError if there is none."""
     return POLICIES.name_of(POLICIES.kind_of(config))
 
 
 def weights_file(config: Any) -> Path | None:
-    """Returns the file of weights that a policy flies by; None if it has none."""
+    """Returns a policy's file of weights; None if it has none."""
     given = getattr(config, "weights", None)
     file = Path(given) if given else shipped_weights(name_of(config))
     return file if given is not None and file.is_file() else None

@@ -1,4 +1,4 @@
-"""A scenario: everything one flight depends on, as a dataclass and as YAML."""
+"""Scenario: everything that determines one flight, as a dataclass and as YAML."""
 
 from dataclasses import dataclass, field
 from math import inf
@@ -14,16 +14,22 @@ from splatpilot.diagrams.worlds.forest.forest import ForestConfig
 from splatpilot.diagrams.worlds.world_registry import WORLDS, WorldConfig
 from splatpilot.systems.common.config import open_field
 from splatpilot.systems.common.seeds import check_seed
-from splatpilot.systems.common.validation import FieldError, require
+from splatpilot.systems.common.validation import (
+    Config,
+    FieldError,
+    bounded,
+    require,
+    require_field,
+)
 from splatpilot.systems.policies.planner import PrivilegedPlannerConfig
 from splatpilot.systems.sensing.noise import ObservationNoise
 from splatpilot.systems.vehicle.flatness import FlatnessControllerConfig
 from splatpilot.systems.vehicle.quadrotor import QuadrotorParams
 
-_MAX_PIXELS = 4096 * 2304  # the most that H.264 films
+_MAX_PIXELS = 4096 * 2304  # [-] limit of H.264
 
-# Fields of Drake's CameraConfig about render engines and LCM, which a splat camera has no use for.
-# Its background is the world's, and its depth image is registered with its colour image.
+# Fields of Drake's CameraConfig that a splat camera ignores. Its background is the world's, and its
+# depth image is registered with its color image.
 WITHOUT_EFFECT = (
     "X_BD",
     "renderer_name",
@@ -39,7 +45,7 @@ WITHOUT_EFFECT = (
 
 
 def _default_camera() -> CameraConfig:
-    """A forward-looking 320x240 camera at the nose; X_PB is its pose on the vehicle."""
+    """Returns a forward-looking 320x240 camera; X_PB is its pose on the vehicle."""
     config = CameraConfig(name="camera", width=320, height=240, fps=15.0, z_near=0.1, z_far=20.0)
     config.focal = CameraConfig.FovDegrees(x=90.0)
     # Optical axes (x right, y down, z forward) from body axes (x forward, y left, z up).
@@ -50,72 +56,60 @@ def _default_camera() -> CameraConfig:
 
 
 def _default_simulator() -> SimulatorConfig:
-    """Fixed steps, for repeatability; within 0.2 mm of the solution after 5 s of harsh commands."""
+    """Returns fixed steps, for repeatability; accurate to 0.2 mm after 5 s of harsh commands."""
     return SimulatorConfig(
         integration_scheme="runge_kutta5", max_step_size=0.02, use_error_control=False
     )
 
 
 @dataclass
-class Scenario:
-    """One flight. The same scenario gives the same flight, bit for bit."""
+class Scenario(Config):
+    """One flight. Flights of the same scenario are bitwise identical."""
 
-    # Seed of everything random, in [0, 2147483647]: the environment if it is generated, and the
-    # start's offset.
+    # Seed of everything random: generated world, start, noise.
     seed: int = 0
-    # What is flown in: a generated world, or (!SceneConfig) a reconstructed scene, or another of
-    # `make_world.py` and of other packages.
+    # World: a generated one, (!SceneConfig) a reconstructed scene, or another of the registry.
     world: WorldConfig = open_field(WORLDS, ForestConfig)
-    # [-] How much the world looks other than it is, drawn from the seed: 0 not at all, 1 all it
-    # may, in paint, light, exposure, hue and sky. Its surfaces stay where they are.
-    appearance: float = 0.0
-    # [m] Start p_WS in the world frame; the world's own where left out.
+    # [-] Visual randomization of paint, light, exposure, hue and sky, from 0 (none) to 1. Surfaces
+    # stay in place.
+    appearance: float = bounded(0.0, "[0, 1]")
+    # [m] Start p_WS in the world frame; the world's own if left out.
     start: list[float] | None = None
-    # [m] Goal p_WG in the world frame; the world's own where left out.
+    # [m] Goal p_WG in the world frame; the world's own if left out.
     goal: list[float] | None = None
-    # [m] The vehicle starts anywhere within this distance of the start, level and at rest.
-    start_radius: float = 0.1
+    # [m] The vehicle starts at random within this distance of the start, level and at rest.
+    start_radius: float = bounded(0.1, "[0, 1] m")
     # [m] The goal is reached within this distance.
-    goal_radius: float = 0.3
+    goal_radius: float = bounded(0.3, "(0, inf) m")
     # [s] The flight ends after this time.
-    timeout: float = 60.0
+    timeout: float = bounded(60.0, "(0, 3600] s")
     vehicle: QuadrotorParams = field(default_factory=QuadrotorParams)
-    # What onlookers see from the vehicle; a policy that sees has a camera of its own.
+    # Camera of videos and viewers; policies have cameras of their own.
     camera: CameraConfig = field(default_factory=_default_camera)
-    # Who flies: the privileged planner, or (!ReactiveConfig, ...) another of `policies.py` and of
-    # other packages.
+    # Policy: the privileged planner, or (!ReactiveConfig, ...) another of the registry.
     policy: PolicyConfig = open_field(POLICIES, PrivilegedPlannerConfig)
-    # What is on board beside the cameras of onlookers and policy, by name; see `sensors.py`.
+    # Further onboard sensors, by name; see `sensors.py`.
     sensors: dict[str, SensorConfig] = open_field(SENSORS, dict)
-    # What lies between the policy's camera and the policy; nothing by default.
+    # Noise and latency of the policy's camera; none by default.
     observation: ObservationNoise = field(default_factory=ObservationNoise)
     controller: FlatnessControllerConfig = field(default_factory=FlatnessControllerConfig)
     simulator: SimulatorConfig = field(default_factory=_default_simulator)
 
     def validate(self) -> None:
-        """
-        Checks what can be checked without building the world; systems check their own parts.
-
-        Raises:
-            ValueError: naming the field, its value and its limit.
-        """
-        check_seed(self.seed)
-        require(0 <= self.appearance <= 1, "appearance", "in [0, 1]", self.appearance)
-        require(0 <= self.start_radius <= 1, "start_radius", "in [0, 1] m", self.start_radius)
-        require(0 < self.goal_radius < inf, "goal_radius", "positive and finite", self.goal_radius)
-        require(0 < self.timeout <= 3600, "timeout", "in (0, 3600] s", self.timeout)
-        for name in ("start", "goal"):
-            point = getattr(self, name)
-            valid = point is None or (len(point) == 3 and np.isfinite(point).all())
-            require(valid, name, "three finite numbers x, y, z [m]", point)
         parts = [(WORLDS, self.world), (POLICIES, self.policy)]
         for registry, part in [*parts, *((SENSORS, sensor) for sensor in self.sensors.values())]:
             registry.kind_of(part)
-            try:
-                part.validate()
-            except FieldError as error:
-                raise error.within(self) from None
-        self.observation.validate()
+        try:
+            super().validate()
+        except FieldError as error:
+            raise error.within(self) from None
+
+    def check(self) -> None:
+        check_seed(self.seed)
+        for name in ("start", "goal"):
+            point = getattr(self, name)
+            valid = point is None or (len(point) == 3 and np.isfinite(point).all())
+            require_field(self, name, valid, "three finite numbers x, y, z [m]")
         _check_camera(self.camera)
         _check_simulator(self.simulator)
 
@@ -127,7 +121,7 @@ def _check_camera(camera: CameraConfig) -> None:
     require(valid, "camera", f"at least 2x2 and at most {_MAX_PIXELS} pixels", size)
     try:
         focal = (camera.focal_x(), camera.focal_y())
-    except RuntimeError:  # Drake's way to say that there is neither
+    except RuntimeError:
         raise ValueError("camera.focal must have x or y or both, got neither") from None
     require(all(0 < f < inf for f in focal), "camera.focal", "positive and finite [pixels]", focal)
     center = camera.principal_point()

@@ -1,4 +1,4 @@
-"""All sensors: their configurations, and how each becomes part of a flight."""
+"""Registry of sensors."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,26 +14,25 @@ from splatpilot.systems.splats.splat_camera import SplatCamera
 
 
 class SensorConfig(Protocol):
-    """The configuration of a sensor: a dataclass."""
+    """Configuration of a sensor: a dataclass."""
 
     __dataclass_fields__: ClassVar[dict[str, Any]]
 
     def validate(self) -> None:
-        """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
+        """Raises ValueError for a value out of range."""
         ...
 
 
 @dataclass(frozen=True)
 class SensorKind:
-    """How a sensor is configured and built."""
+    """Entry of the registry."""
 
-    config: type
-    """The type of its configurations."""
+    config: type  # of its configurations
     build: Callable[[Any, World], System]
-    """From a configuration and the world to a system. Its inputs `body_pose` (X_WB), `state` and
-    `start_pose` (X_WB of the configuration's `readout` [s] before), where it has them, are
-    connected to the vehicle; an output `p` of the sensor `s` is the flight's
-    output `s_p`, and a policy that has an input of that name gets it."""
+    """Makes a system of a configuration and the world. Its inputs `body_pose` (X_WB), `state` and
+    `start_pose` (X_WB the configuration's `readout` [s] before) are connected to the vehicle, if
+    any. An output `p` of the sensor `s` is the output `s_p` of the flight, and the input of that
+    name of the policy."""
 
 
 SENSORS = Registry("sensor", "splatpilot.sensors", SensorKind)
@@ -42,22 +41,21 @@ SENSORS = Registry("sensor", "splatpilot.sensors", SensorKind)
 
 def register_sensor(config: type, build: Callable[[Any, World], System]) -> None:
     """
-    Makes a kind of sensor known, so that scenarios and policies can name it by its configuration's
-    type.
+    Registers a sensor.
 
     Args:
-        config: the type of its configurations, see `SensorConfig`; its name is their YAML tag.
+        config: type of its configurations, see `SensorConfig`; its name is their YAML tag.
         build: see `SensorKind.build`.
 
     Raises:
-        ValueError: if another sensor has the name, or the type is none of configurations.
+        ValueError: if another sensor has the name, or the type is not a configuration.
     """
     require_configuration(config)
     SENSORS.add(config.__name__, SensorKind(config, build))
 
 
 def make_camera(config: OnboardCamera, world: World, latency: float = 0.0) -> SplatCamera:
-    """A camera that looks at the Gaussians of the world, as they were `latency` [s] ago."""
+    """Makes a camera of the Gaussians of the world, as they were `latency` [s] ago."""
     return SplatCamera(
         world.baked,
         config.camera_info(),

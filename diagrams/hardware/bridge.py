@@ -1,4 +1,4 @@
-"""The pilot of the flight diagram behind messages: the vehicle is somewhere else."""
+"""Bridge: policy and controller that fly a vehicle by messages."""
 
 import contextlib
 import logging
@@ -14,22 +14,25 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPo
 from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
 from splatpilot.diagrams.flight.blocks import (
-    AddPilot,
+    AddPolicyAndController,
+    Autonomy,
+    ConnectInputs,
     ConnectObservation,
-    Pilot,
-    camera_of,
     decision_period,
-    goal_of,
-    images_of,
+    goal_position,
     make_policy,
+    policy_camera,
+    policy_images,
 )
 from splatpilot.diagrams.flight.flight import Outcome, flight_outcome, has_landed
 from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.hardware.message_ports import MessagePorts
 from splatpilot.diagrams.hardware.real_time import run_in_real_time
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import make_world
+from splatpilot.systems.common.validation import Config, bounded
 from splatpilot.systems.messaging.arrival_triggered import ArrivalTriggered, can_be_triggered
-from splatpilot.systems.messaging.bridge_status import BridgeStatus, UnixClock
+from splatpilot.systems.messaging.bridge_status import BridgeStatus
 from splatpilot.systems.messaging.codecs import (
     Codec,
     ColorImageCodec,
@@ -47,11 +50,11 @@ from splatpilot.systems.messaging.failsafe import Failsafe, FailsafeConfig
 from splatpilot.systems.messaging.generated import lcmt_bridge_status
 from splatpilot.systems.messaging.lcm_ports import (
     DEFAULT_URL,
-    MessagePublisher,
     MessageSubscriber,
     open_lcm,
     recorded,
 )
+from splatpilot.systems.messaging.receiver import Receiver
 from splatpilot.systems.messaging.tof_receiver import TimeOfFlightReceiver, TimeOfFlightStream
 from splatpilot.systems.policies.hypotheses import num_hypotheses_in
 from splatpilot.systems.policies.velocity import VelocitySetpoint
@@ -61,43 +64,27 @@ from splatpilot.systems.vehicle.state import StatePredictor
 
 
 @dataclass
-class HardwareConfig:
-    """Where messages travel, how often, and how old they may be."""
+class HardwareConfig(Config):
+    """Transport, rates and timeouts of messages."""
 
     # LCM's URL.
     url: str = DEFAULT_URL
-    # [s] Time between looks at what messages have come: of ticks of the wall clock.
-    tick: float = 0.002
-    # [Hz] Of states.
-    state_rate: float = 50.0
-    # [Hz] Of the bridge's status.
-    status_rate: float = 5.0
+    # [s] Time between looks for messages: a tick of the wall clock.
+    tick: float = bounded(0.002, "(0, inf) s")
+    # [Hz] Rate of states.
+    state_rate: float = bounded(50.0, "(0, inf) Hz")
+    # [Hz] Rate of the bridge's status.
+    status_rate: float = bounded(5.0, "(0, inf) Hz")
     # [s] Without a message after which bridge and vehicle give up.
-    patience: float = 10.0
-    # What a simulated vehicle is told: "body_rates" or "velocity"; see `px4.setpoints` for PX4.
-    setpoints: str = "body_rates"
-    # The body that motion capture must see; none if empty.
+    patience: float = bounded(10.0, "(0, inf) s")
+    # Commands for a simulated vehicle: "body_rates" or "velocity"; see `px4.setpoints` for PX4.
+    setpoints: str = bounded("body_rates", "{velocity, body_rates}")
+    # Body that motion capture must track; none if empty.
     body: str = ""
-    # The stream of the sensor of a policy that sees by time of flight; LCM's DEPTH_GRID where left
-    # out.
+    # Stream of the time-of-flight sensor of a policy; LCM's DEPTH_GRID if left out.
     time_of_flight: TimeOfFlightStream | None = None
-    # When the vehicle is taken from its policy, and what nobody may exceed.
+    # Limits, and when the failsafe takes over from the policy.
     failsafe: FailsafeConfig = field(default_factory=FailsafeConfig)
-
-    def validate(self) -> None:
-        """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
-        for name in ("tick", "state_rate", "status_rate", "patience"):
-            value = getattr(self, name)
-            if not 0.0 < value < math.inf:
-                raise ValueError(
-                    f"{name} is {value}; it must be positive and finite, as "
-                    f"{getattr(type(self), name)}"
-                )
-        if self.setpoints not in ("velocity", "body_rates"):
-            raise ValueError(f"setpoints must be velocity or body_rates, got {self.setpoints!r}")
-        self.failsafe.validate()
-        if self.time_of_flight is not None:
-            self.time_of_flight.validate()
 
 
 def BuildHardwareDiagram(
@@ -111,214 +98,180 @@ def BuildHardwareDiagram(
 ) -> Diagram:
     """
     Builds the diagram that flies a vehicle by messages: that of `BuildFlightDiagram` with
-    subscribers in the place of plant and camera. It runs with the wall clock, see
-    `run_in_real_time`.
+    subscribers instead of plant and camera. It runs with the wall clock, see `run_in_real_time`.
 
-    Systems, by name: those of `AddPilot`; `clock`; the subscribers `state_subscriber` and one
-    `{image}_subscriber` for each image that the policy sees, or `depth_grid_receiver` for the
-    stream of a time-of-flight sensor; `vehicle_status_subscriber`, which tells when the bridge is
-    in charge; `state_predictor`, which brings the state up to date;
-    `velocity_setpoint`, `failsafe`, through which all goes that is sent to the vehicle, `status`;
-    where motion capture must see a body `motion_capture_pose_subscriber`; and one
-    `{port}_publisher` for each of `command`, `velocity_setpoint`, `status`, and `hypotheses` where
-    the policy has them. Until messages have come, states and images are arbitrary but finite.
+    Systems, by name: those of `AddPolicyAndController` and of `MessagePorts`; `state_predictor`,
+    which predicts the state for now; `velocity_setpoint`; `failsafe`, which all commands pass;
+    `status`; and `depth_grid_receiver` if `config` has a stream. There are subscribers of the
+    state, the policy's images, `vehicle_status` and `motion_capture_pose`, and publishers of
+    `command`, `velocity_setpoint`, `status` and `hypotheses`. Before the first message, states and
+    images are arbitrary but finite.
 
     .. pydrake_system::
 
         name: hardware
-        input_ports:
-        - overruns
-        - lag
-        output_ports:
-        - state
-        - command
-        - hypotheses
-        - color_image
-        - depth_image_32f
-        - clearance
-        - gradient
-        - in_collision
-        - field_state
-        - velocity_setpoint
-        - status
-        - in_charge
+        input_ports: [overruns, lag]
+        output_ports: [state, command, hypotheses, color_image, depth_image_32f, clearance,
+            gradient, in_collision, field_state, velocity_setpoint, status, in_charge]
 
-    The ports are those of `BuildFlightDiagram`, the images those that the policy sees; `status` and
-    `overruns` are those of `BridgeStatus`, `command`, `velocity_setpoint`, `in_charge` and `lag`
-    those of `Failsafe`.
+    The ports are those of `BuildFlightDiagram`, with the policy's images; `status` and `overruns`
+    those of `BridgeStatus`; `command`, `velocity_setpoint`, `in_charge` and `lag` those of
+    `Failsafe`.
 
     Args:
-        scenario: who flies, and where to. Its vehicle is what is known of the one that flies.
-        world: what is flown in, as far as that is known.
-        lcm: where messages travel.
-        config: how often, how old they may be, and within what limits.
+        scenario: policy and goal. Its vehicle is the model of the real one.
+        world: its map, as far as known.
+        lcm: transport of the messages.
+        config: rates, timeouts and limits.
         policy, controller: see `BuildFlightDiagram`.
 
     Raises:
-        ValueError: for a configuration out of range or that no policy has, a system without the
-            ports it needs, sensors, and worlds in which something moves.
+        ValueError: for an invalid configuration, a system without the ports it needs, sensors, and
+            worlds with moving obstacles.
     """
     config = config or HardwareConfig()
     config.validate()
     require_messages_for(scenario, world)
     builder = DiagramBuilder()
-    clock = UnixClock()
-    builder.AddNamedSystem("clock", clock)
+    ports = MessagePorts(builder, lcm, config.tick)
 
-    def add_subscriber(codec: Codec) -> MessageSubscriber:
-        initial = {"state": hover_state(np.zeros(3)), "depth_grid": np.zeros(codec.size)}
-        subscriber = MessageSubscriber(lcm, codec, config.tick, initial.get(codec.port))
-        builder.AddNamedSystem(f"{codec.port}_subscriber", subscriber)
-        builder.Connect(clock.get_output_port(), subscriber.unix_time_input_port())
-        return subscriber
-
-    def add_publisher(
-        codec: Codec,
-        source: OutputPort,
-        period: float,
-        enabled: OutputPort | None = None,
-        decided: OutputPort | None = None,
-    ) -> None:
-        publisher = MessagePublisher(lcm, codec, period, config.tick if decided else None)
-        builder.AddNamedSystem(f"{codec.port}_publisher", publisher)
-        builder.Connect(source, publisher.GetInputPort(codec.port))
-        builder.Connect(clock.get_output_port(), publisher.unix_time_input_port())
-        if enabled is not None:
-            builder.Connect(enabled, publisher.enabled_input_port())
-        if decided is not None:
-            builder.Connect(decided, publisher.decided_input_port())
-
-    received: dict[str, MessageSubscriber | TimeOfFlightReceiver] = {
-        "state": add_subscriber(StateCodec())
+    # State: received, and predicted for now, up to the age at which it is still used.
+    received: dict[str, Receiver] = {
+        "state": ports.subscribe(StateCodec(), hover_state(np.zeros(3)))
     }
-    predictor = StatePredictor(config.failsafe.max_age)  # As long as states are flown by.
-    builder.AddNamedSystem("state_predictor", predictor)
-    builder.Connect(received["state"].GetOutputPort("state"), predictor.measured_state_input_port())
-    builder.Connect(received["state"].age_output_port(), predictor.age_input_port())
-    state = predictor.state_output_port()
+    measured, state_age = (received["state"].GetOutputPort(name) for name in ("state", "age"))
+    predictor = builder.AddNamedSystem("state_predictor", StatePredictor(config.failsafe.max_age))
+    ConnectInputs(builder, predictor, {"measured_state": measured, "age": state_age})
+    state = predictor.GetOutputPort("state")
+
+    # Policy, which updates when images arrive, and controller.
     policy = policy or make_policy(scenario, world)
-    decided, decision = None, decision_period(scenario, policy)
-    codecs = image_codecs(scenario, policy)
+    period, codecs, decided = (
+        decision_period(scenario, policy),
+        image_codecs(scenario, policy),
+        None,
+    )
     if can_be_triggered(policy):
         policy = ArrivalTriggered(policy, config.tick)
-        decided = policy.decided_output_port()
-    pilot = AddPilot(builder, scenario, world, state, policy, controller, guarded=True)
+        decided = policy.GetOutputPort("decided")
+    autonomy = AddPolicyAndController(
+        builder, scenario, world, state, policy, controller, guarded=True
+    )
+
+    # Images.
     for codec in codecs:
         if codec.port == "depth_grid" and config.time_of_flight is not None:
-            receiver = TimeOfFlightReceiver(config.time_of_flight, config.tick)
-            builder.AddNamedSystem("depth_grid_receiver", receiver)
-            received[codec.port] = receiver
+            received[codec.port] = TimeOfFlightReceiver(config.time_of_flight, config.tick)
+            builder.AddNamedSystem("depth_grid_receiver", received[codec.port])
         else:
-            received[codec.port] = add_subscriber(codec)
-    observed = {"state": state}
-    observed |= {name: received[name].GetOutputPort(name) for name in list(received)[1:]}
+            initial = np.zeros(codec.size) if codec.port == "depth_grid" else None
+            received[codec.port] = ports.subscribe(codec, initial)
+    images = list(received)[1:]
+    observed = {"state": state} | {name: received[name].GetOutputPort(name) for name in images}
 
-    status = BridgeStatus(list(received)[1:])
-    builder.AddNamedSystem("status", status)
-    # A policy that sees nothing decides by states.
-    oldest = status.observation_age_output_port()
-    age = {"observation_age": oldest if codecs else received["state"].age_output_port()}
-    ConnectObservation(builder, observed | age, pilot.policy)
-    failsafe = Failsafe(
-        config.failsafe,
-        scenario.controller,
-        scenario.vehicle,
-        world.distance_field.lower_W,
-        world.distance_field.upper_W,
-        world.distance_field,
+    # Status. A policy without images updates by states.
+    status = builder.AddNamedSystem("status", BridgeStatus(images))
+    for signal, receiver in received.items():
+        sources = {
+            f"{signal}_{suffix}": receiver.GetOutputPort(suffix)
+            for suffix in ("age", "gaps", "rejected")
+        }
+        ConnectInputs(builder, status, sources)
+    builder.ExportInput(status.GetInputPort("overruns"), "overruns")
+    observation_age = status.GetOutputPort("observation_age")
+    age = {"observation_age": observation_age if images else state_age}
+    ConnectObservation(builder, observed | age, autonomy.policy)
+
+    # Failsafe.
+    field = world.distance_field
+    failsafe = builder.AddNamedSystem(
+        "failsafe",
+        Failsafe(
+            *(config.failsafe, scenario.controller, scenario.vehicle),
+            *(field.lower_W, field.upper_W, field),
+        ),
     )
-    builder.AddNamedSystem("failsafe", failsafe)
-    for signal, subscriber in received.items():
-        for what in ("age", "gaps", "rejected"):
-            port = status.GetInputPort(f"{signal}_{what}")
-            builder.Connect(subscriber.GetOutputPort(what), port)
-    builder.ExportInput(status.overruns_input_port(), "overruns")
-    builder.ExportInput(failsafe.lag_input_port(), "lag")
-
-    wanted = _AddVelocitySetpoint(builder, scenario, state, pilot).velocity_setpoint_output_port()
+    setpoint = _AddVelocitySetpoint(builder, scenario, state, autonomy)
     collision = builder.GetSubsystemByName("collision")
-    for source, name in (
-        (state, "state"),
-        (received["state"].GetOutputPort("state"), "measured_state"),
-        (received["state"].age_output_port(), "state_age"),
-        (status.observation_age_output_port(), "observation_age"),
-        (wanted, "velocity_setpoint"),
-        (pilot.controller.GetOutputPort("command"), "command"),
-        (collision.GetOutputPort("clearance"), "clearance"),
-        (collision.GetOutputPort("gradient"), "gradient"),
-    ):
-        builder.Connect(source, failsafe.GetInputPort(name))
-    vehicle_status = add_subscriber(VehicleStatusCodec())
-    builder.Connect(
-        vehicle_status.GetOutputPort("vehicle_status"), failsafe.vehicle_status_input_port()
-    )
-    builder.Connect(vehicle_status.age_output_port(), failsafe.vehicle_status_age_input_port())
-    if pilot.policy.HasOutputPort("failed"):
-        builder.Connect(pilot.policy.GetOutputPort("failed"), failsafe.policy_failed_input_port())
+    vehicle_status = ports.subscribe(VehicleStatusCodec())
+    sources = {
+        "state": state,
+        "measured_state": measured,
+        "state_age": state_age,
+        "observation_age": observation_age,
+        "velocity_setpoint": setpoint,
+        "command": autonomy.controller.GetOutputPort("command"),
+        "clearance": collision.GetOutputPort("clearance"),
+        "gradient": collision.GetOutputPort("gradient"),
+        "vehicle_status": vehicle_status.GetOutputPort("vehicle_status"),
+        "vehicle_status_age": vehicle_status.GetOutputPort("age"),
+    }
+    if autonomy.policy.HasOutputPort("failed"):
+        sources["policy_failed"] = autonomy.policy.GetOutputPort("failed")
     if config.body:
-        body = add_subscriber(MotionCaptureCodec(config.body))
-        builder.Connect(body.age_output_port(), failsafe.body_age_input_port())
-    builder.Connect(failsafe.mode_output_port(), status.mode_input_port())
-    command, setpoint = failsafe.command_output_port(), failsafe.velocity_setpoint_output_port()
-    known, period = failsafe.state_is_known_output_port(), scenario.controller.period
-    add_publisher(CommandCodec(), command, period, known)
-    is_ready = failsafe.is_ready_output_port()
-    add_publisher(VelocitySetpointCodec(), setpoint, period, is_ready, decided)
-    add_publisher(StatusCodec(), status.status_output_port(), 1 / config.status_rate)
-    if pilot.policy.HasOutputPort("hypotheses"):
-        plans = pilot.policy.GetOutputPort("hypotheses")
+        body = ports.subscribe(MotionCaptureCodec(config.body))
+        sources["body_age"] = body.GetOutputPort("age")
+    ConnectInputs(builder, failsafe, sources)
+    builder.ExportInput(failsafe.GetInputPort("lag"), "lag")
+    builder.Connect(failsafe.GetOutputPort("mode"), status.GetInputPort("mode"))
+
+    # Publishers.
+    command, setpoint, is_known, is_ready = (
+        failsafe.GetOutputPort(name)
+        for name in ("command", "velocity_setpoint", "state_is_known", "is_ready")
+    )
+    ports.publish(CommandCodec(), command, scenario.controller.period, is_known)
+    codec = VelocitySetpointCodec()
+    ports.publish(codec, setpoint, scenario.controller.period, is_ready, decided)
+    ports.publish(StatusCodec(), status.GetOutputPort("status"), 1 / config.status_rate)
+    if autonomy.policy.HasOutputPort("hypotheses"):
+        plans = autonomy.policy.GetOutputPort("hypotheses")
         codec = HypothesesCodec(num_hypotheses_in(plans.size()))
-        add_publisher(codec, plans, decision, decided=decided)
+        ports.publish(codec, plans, period, decided=decided)
 
     for name, port in observed.items():
         builder.ExportOutput(port, name)
-    builder.ExportOutput(command, "command")
-    builder.ExportOutput(setpoint, "velocity_setpoint")
-    builder.ExportOutput(status.status_output_port(), "status")
-    builder.ExportOutput(failsafe.in_charge_output_port(), "in_charge")
+    for name in ("command", "velocity_setpoint", "in_charge"):
+        builder.ExportOutput(failsafe.GetOutputPort(name), name)
+    builder.ExportOutput(status.GetOutputPort("status"), "status")
     diagram = builder.Build()
     diagram.set_name("hardware")
     return diagram
 
 
+def _AddVelocitySetpoint(
+    builder: DiagramBuilder, scenario: Scenario, state: OutputPort, autonomy: Autonomy
+) -> OutputPort:
+    setpoint = VelocitySetpoint(scenario.controller)
+    builder.AddNamedSystem("velocity_setpoint", setpoint)
+    sources = {"state": state, autonomy.target.get_name(): autonomy.target}
+    if autonomy.policy.HasOutputPort("heading"):
+        sources["heading"] = autonomy.policy.GetOutputPort("heading")
+    ConnectInputs(builder, setpoint, sources)
+    return setpoint.GetOutputPort("velocity_setpoint")
+
+
 def image_codecs(scenario: Scenario, policy: System) -> list[Codec]:
-    """How the images travel that a policy sees."""
-    camera = camera_of(scenario, policy)
-    size, sensor = (camera.width, camera.height), sensor_of(camera)
+    """Returns the codecs of a policy's images."""
+    camera, frame = policy_camera(scenario, policy), "policy_camera"
+    size, tof = (camera.width, camera.height), sensor_of(camera)
     codecs = {
-        "depth_image_32f": DepthImageCodec(ImageDepth32F(*size), "policy_camera"),
-        "color_image": ColorImageCodec(ImageRgba8U(*size), "policy_camera"),
-        "depth_grid": DepthGridCodec(
-            sensor.columns, sensor.rows, sensor.max_range, "policy_camera"
-        ),
+        "depth_image_32f": DepthImageCodec(ImageDepth32F(*size), frame),
+        "color_image": ColorImageCodec(ImageRgba8U(*size), frame),
+        "depth_grid": DepthGridCodec(tof.columns, tof.rows, tof.max_range, frame),
     }
-    return [codecs[name] for name in images_of(policy)]
+    return [codecs[name] for name in policy_images(policy)]
 
 
 def require_messages_for(scenario: Scenario, world: World) -> None:
-    """Raises ValueError for what a scenario or its world has that no message carries."""
+    """Raises ValueError for sensors and moving obstacles, which have no messages."""
     sensors = getattr(scenario.policy, "sensors", {}) | scenario.sensors
     if sensors:
-        raise ValueError(
-            f"no message carries what the sensors {', '.join(sensors)} measure; leave them out"
-        )
+        raise ValueError(f"there are no messages of the sensors {', '.join(sensors)}; remove them")
     if world.moving:
         raise ValueError(
-            f"in {world.name} something moves, and no message says where it is; fly in another "
-            "world"
+            f"there are no messages of the moving obstacles in {world.name}; choose another world"
         )
-
-
-def _AddVelocitySetpoint(
-    builder: DiagramBuilder, scenario: Scenario, state: OutputPort, pilot: Pilot
-) -> VelocitySetpoint:
-    setpoint = VelocitySetpoint(scenario.controller)
-    builder.AddNamedSystem("velocity_setpoint", setpoint)
-    builder.Connect(state, setpoint.state_input_port())
-    builder.Connect(pilot.decision, setpoint.GetInputPort(pilot.decision.get_name()))
-    if pilot.policy.HasOutputPort("heading"):
-        builder.Connect(pilot.policy.GetOutputPort("heading"), setpoint.heading_input_port())
-    return setpoint
 
 
 _log = logging.getLogger(__name__)
@@ -334,22 +287,20 @@ def run(
     """
     Waits for a vehicle's messages and flies it to the scenario's goal.
 
-    The flight begins when the bridge is in charge of a vehicle in the air, however long that takes:
-    the vehicle says that it is armed and flies by the bridge, and touches nothing that the world's
-    map has. It is over at the goal, after the scenario's timeout, if the world's map says that the
-    vehicle has collided or left it while the bridge is in charge, and when it has landed, or state
-    or images were older than allowed for `config.patience` (see `Failsafe` for what happens
-    meanwhile). The vehicle then hears no more, upon which autopilots hold.
+    The flight begins when the bridge is in charge of a vehicle in the air, by the vehicle's status
+    and the world's map. It ends at the goal; after the scenario's timeout; at a collision or
+    outside of the map while in charge; after landing; and if state or images are too old for
+    `config.patience` (meanwhile see `Failsafe`). Then messages cease, and autopilots hold.
 
     Args:
-        scenario: who flies, and where to.
-        config: where messages travel.
-        log: where to write all messages, as LCM's logger does.
-        overwrite: that log, if it is there.
+        scenario: policy and goal.
+        config: of messages.
+        log: file for all messages, as LCM's logger writes it.
+        overwrite: replaces that file.
 
     Returns:
-        How it ended (`outcome`: of `Outcome`, "timeout" or "silence"), `flight_time_s` since it
-        began, and of `BridgeStatus` `gaps`, `rejected` and `overruns`.
+        `outcome` (of `Outcome`, "timeout" or "silence"), `flight_time_s`, and of `BridgeStatus`
+        `gaps`, `rejected` and `overruns`.
 
     Raises:
         ValueError: for a scenario that cannot be flown by messages.
@@ -365,8 +316,8 @@ def run(
         wait_for_messages(diagram, config.patience)
         simulator = Simulator(diagram)
         root = simulator.get_context()
-        flight = BridgeFlight(diagram, root, scenario, goal_of(scenario, world), config)
-        # Decisions are due when images have just come, as long as both come at the same rate.
+        flight = BridgeFlight(diagram, root, scenario, goal_position(scenario, world), config)
+        # Waits again, so that policies update just after images of the same rate.
         run_in_real_time(
             simulator,
             diagram,
@@ -374,26 +325,21 @@ def run(
             flight.is_over,
             ready=lambda: wait_for_messages(diagram, config.patience),
         )
-    gaps, rejected, overruns = np.asarray(diagram.GetOutputPort("status").Eval(root))[4:]
-    summary = {
-        "outcome": flight.outcome,
-        "flight_time_s": flight.duration,
-        "gaps": gaps,
-        "rejected": rejected,
-        "overruns": overruns,
-    }
+    counts = np.asarray(diagram.GetOutputPort("status").Eval(root))[4:]
+    summary = {"outcome": flight.outcome, "flight_time_s": flight.duration}
+    summary |= dict(zip(("gaps", "rejected", "overruns"), counts, strict=True))
     print(*(f"{name:<14} {value}" for name, value in summary.items()), sep="\n")
     return summary
 
 
 class BridgeFlight:
     """
-    A flight as the bridge sees it: it begins when the bridge is in charge of a vehicle in the air.
+    Detects begin and end of a flight.
 
     Args:
         diagram, root: of `BuildHardwareDiagram`, and its Context.
         p_WG: (3,) [m] the goal.
-        config: how old messages may be, and for how long.
+        config: timeouts.
     """
 
     def __init__(
@@ -413,14 +359,14 @@ class BridgeFlight:
         """[s]"""
 
     def is_over(self, now: float) -> bool:
-        """Checks at a time [s] whether the flight is over, and how it ended."""
+        """Checks at a time [s] if the flight is over, and how it ended."""
         status, charge, collision = (
             np.asarray(self._diagram.GetOutputPort(name).Eval(self._root))
             for name in ("status", "in_charge", "in_collision")
         )
         in_charge, landed = bool(charge[0]), has_landed(self._diagram, self._root)
         if in_charge != self._in_charge:
-            # Not printed: a reader that is gone would end the flight.
+            # Not printed: a closed pipe would end the flight.
             _log.warning("%.2f s: the bridge is %sin charge", now, "" if in_charge else "not ")
             self._in_charge = in_charge
         if in_charge and not landed and not collision[0]:
@@ -445,24 +391,23 @@ class BridgeFlight:
 
 def wait_for_messages(diagram: Diagram, patience: float) -> None:
     """
-    Waits until something has come for each subscriber of a diagram.
+    Waits for a message for each subscriber of a diagram.
 
     Args:
         diagram: of `BuildHardwareDiagram`.
         patience: [s], at most.
 
     Raises:
-        TimeoutError: if nothing comes for one; the message names its channel.
+        TimeoutError: without a message; the error names the channel.
     """
     deadline = time.monotonic() + patience
-    subscribers = [
-        s for s in diagram.GetSystems() if isinstance(s, MessageSubscriber | TimeOfFlightReceiver)
-    ]
-    for subscriber in subscribers:
-        while not subscriber.has_message():
+    for system in diagram.GetSystems():
+        if not isinstance(system, MessageSubscriber | TimeOfFlightReceiver):
+            continue
+        while not system.has_message():
             if time.monotonic() > deadline:
                 raise TimeoutError(
-                    f"nothing has come on {subscriber.channel} for {patience:g} s; start the "
+                    f"nothing has come on {system.source} for {patience:g} s; start the "
                     "vehicle, with the same URL and scenario"
                 )
             time.sleep(0.001)

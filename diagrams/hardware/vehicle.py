@@ -1,4 +1,4 @@
-"""The vehicle of the flight diagram behind messages: its pilot is in another process."""
+"""Simulated vehicle that is flown by messages, as a real one."""
 
 import dataclasses
 import math
@@ -20,7 +20,13 @@ from pydrake.systems.primitives import (
     ZeroOrderHold,
 )
 
-from splatpilot.diagrams.flight.blocks import AddObservation, decision_period, goal_of, make_policy
+from splatpilot.diagrams.flight.blocks import (
+    AddObservation,
+    ConnectInputs,
+    decision_period,
+    goal_position,
+    make_policy,
+)
 from splatpilot.diagrams.flight.flight import (
     Flight,
     Outcome,
@@ -34,15 +40,14 @@ from splatpilot.diagrams.flight.flight import (
 from splatpilot.diagrams.flight.flight_diagram import LOG_PERIOD
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.hardware.bridge import HardwareConfig, image_codecs, require_messages_for
+from splatpilot.diagrams.hardware.message_ports import MessagePorts
 from splatpilot.diagrams.hardware.real_time import run_in_real_time
 from splatpilot.diagrams.worlds.appearance import seen_otherwise
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.collision.esdf_collision import EsdfCollision
 from splatpilot.systems.common.files import holds_folder, require_writable_folder
-from splatpilot.systems.messaging.bridge_status import UnixClock
 from splatpilot.systems.messaging.codecs import (
-    Codec,
     CommandCodec,
     MotionCaptureCodec,
     StateCodec,
@@ -51,145 +56,123 @@ from splatpilot.systems.messaging.codecs import (
 )
 from splatpilot.systems.messaging.failsafe import Failsafe, FailsafeConfig
 from splatpilot.systems.messaging.flight_limits import FlightLimits
-from splatpilot.systems.messaging.lcm_ports import MessagePublisher, MessageSubscriber, open_lcm
+from splatpilot.systems.messaging.lcm_ports import open_lcm
 from splatpilot.systems.policies.velocity import VelocityTracker
 from splatpilot.systems.vehicle.flatness import FlatnessController
 from splatpilot.systems.vehicle.quadrotor import QuadrotorPlant
 from splatpilot.systems.vehicle.state import StateToPose
 
 SILENCE = 0.1
-"""[s] without commands after which the vehicle holds where it is, until they come again."""
+"""[s] without commands after which the vehicle holds its position, until they come again."""
 
 STATUS_PERIOD = 0.1
-"""[s] between two messages that say who flies the vehicle."""
+"""[s] between messages of the vehicle's status."""
 
 _NOISE = 1e-6
-"""[m] in published positions: an estimator's output is never the same for long, and a failsafe
-takes one that is for frozen."""
+"""[m] in published positions: a failsafe takes a constant state for frozen."""
 
 
 def BuildVehicleDiagram(
     scenario: Scenario, world: World, lcm: LCM, config: HardwareConfig | None = None
 ) -> Diagram:
     """
-    Builds the diagram of a simulated vehicle that speaks as a real one: it is told body rates or
-    velocities, and says its state, who flies it, its pose in motion capture if that must see it,
-    and, to policies that see, what its camera sees.
+    Builds the diagram of a simulated vehicle with the messages of a real one.
 
-    Systems, by name: `clock`, `plant`, `pose`, `collision`, those of `AddObservation`,
-    `command_subscriber`, `failsafe`, which hovers and then lands if commands cease, as
-    autopilots do, `held_command`, `{port}_publisher` of `state`, `vehicle_status`,
-    `motion_capture_pose` and each image that the scenario's policy sees, and the loggers
-    `state_log`, `command_log`. A vehicle that is told velocities has `setpoint`,
-    `velocity_tracker` and `controller`.
+    Systems, by name: those of `MessagePorts` and `AddObservation`; `plant`, `pose`, `collision`;
+    `failsafe`, which hovers and then lands if commands cease, as autopilots do; `held_command`;
+    and the loggers `state_log`, `command_log`. A vehicle that is commanded by velocities has
+    `setpoint`, `velocity_tracker` and `controller`. There are `command_subscriber` and publishers
+    of `state`, `vehicle_status`, `motion_capture_pose` and the policy's images.
 
     .. pydrake_system::
 
         name: vehicle
-        output_ports:
-        - state
-        - command
-        - command_age
-        - clearance
-        - gradient
-        - in_collision
-        - field_state
+        output_ports: [state, command, command_age, clearance, gradient, in_collision, field_state]
 
-    The ports are those of `BuildFlightDiagram`; `command_age` [s] is infinite until a command has
-    come.
+    The ports are those of `BuildFlightDiagram`; `command_age` [s] is infinite before the first
+    command.
 
     Args:
-        scenario: the vehicle, what its policy sees, and how well.
-        world: what is flown in.
-        lcm: where messages travel.
-        config: how often, and what the vehicle is told.
+        scenario: the vehicle, and the policy's images.
+        world: that it flies in.
+        lcm: transport of the messages.
+        config: rates, and the commands.
 
     Raises:
-        ValueError: for a configuration out of range or that no policy has, sensors, and worlds in
-            which something moves.
+        ValueError: for an invalid configuration, sensors, and worlds with moving obstacles.
     """
     config = config or HardwareConfig()
     config.validate()
     require_messages_for(scenario, world)
     builder = DiagramBuilder()
-    velocities = config.setpoints == "velocity"
-    gravity = scenario.vehicle.gravity
-    initial = np.array([0.0, 0.0, 0.0, np.nan] if velocities else [gravity, 0.0, 0.0, 0.0])
-    codec = VelocitySetpointCodec() if velocities else CommandCodec()
-    subscriber = MessageSubscriber(lcm, codec, config.tick, initial)
-    clock, plant, pose = UnixClock(), QuadrotorPlant(scenario.vehicle), StateToPose()
-    field = world.distance_field
-    max_speed = config.failsafe.limits.max_speed  # As MPC_XY_VEL_MAX of PX4.
-    failsafe = Failsafe(
-        FailsafeConfig(
-            max_age=SILENCE, recovery=config.tick, limits=FlightLimits(max_speed=max_speed)
+    ports = MessagePorts(builder, lcm, config.tick)
+
+    # Vehicle.
+    plant = builder.AddNamedSystem("plant", QuadrotorPlant(scenario.vehicle))
+    pose = builder.AddNamedSystem("pose", StateToPose())
+    collision = builder.AddNamedSystem("collision", EsdfCollision(world.distance_field))
+    state = plant.GetOutputPort("state")
+    for system in (pose, collision):
+        builder.Connect(state, system.GetInputPort("state"))
+
+    # Commands, by a failsafe that knows no map and limits speed as MPC_XY_VEL_MAX of PX4.
+    by_velocity = config.setpoints == "velocity"
+    codec = VelocitySetpointCodec() if by_velocity else CommandCodec()
+    hover = [0.0, 0.0, 0.0, np.nan] if by_velocity else [scenario.vehicle.gravity, 0.0, 0.0, 0.0]
+    subscriber = ports.subscribe(codec, np.array(hover), "command")
+    setpoint = subscriber.GetOutputPort(codec.port)
+    limits = FlightLimits(max_speed=config.failsafe.limits.max_speed)
+    failsafe = builder.AddNamedSystem(
+        "failsafe",
+        Failsafe(
+            FailsafeConfig(max_age=SILENCE, recovery=config.tick, limits=limits),
+            *(scenario.controller, scenario.vehicle),
+            *(np.full(3, -np.inf), np.full(3, np.inf)),
         ),
-        scenario.controller,
-        scenario.vehicle,
-        np.full(3, -np.inf),  # It knows no map.
-        np.full(3, np.inf),
     )
-    held, no_age = ZeroOrderHold(config.tick, 4), ConstantVectorSource(np.zeros(1))
-    collision = EsdfCollision(field)
-    for name, system in (
-        ("clock", clock),
-        ("plant", plant),
-        ("pose", pose),
-        ("collision", collision),
-        ("command_subscriber", subscriber),
-        ("failsafe", failsafe),
-        ("held_command", held),
-        ("no_age", no_age),
-    ):
-        builder.AddNamedSystem(name, system)
-
-    state, command = plant.GetOutputPort("state"), held.get_output_port()
-    builder.Connect(clock.get_output_port(), subscriber.unix_time_input_port())
-    told = subscriber.GetOutputPort(codec.port)
-    commanded = told
-    if velocities:
-        commanded = _AddVelocityControl(builder, scenario, state, told)
-        builder.Connect(told, failsafe.velocity_setpoint_input_port())
-    builder.Connect(commanded, failsafe.command_input_port())
-    builder.Connect(subscriber.age_output_port(), failsafe.observation_age_input_port())
-    builder.Connect(state, failsafe.state_input_port())
-    builder.Connect(no_age.get_output_port(), failsafe.state_age_input_port())
-    builder.Connect(failsafe.command_output_port(), held.get_input_port())
+    no_age = builder.AddNamedSystem("no_age", ConstantVectorSource(np.zeros(1)))
+    sources = {
+        "state": state,
+        "state_age": no_age.get_output_port(),
+        "observation_age": subscriber.GetOutputPort("age"),
+    }
+    if by_velocity:
+        sources["velocity_setpoint"] = setpoint
+        setpoint = _AddVelocityControl(builder, scenario, state, setpoint)
+    ConnectInputs(builder, failsafe, sources | {"command": setpoint})
+    held = builder.AddNamedSystem("held_command", ZeroOrderHold(config.tick, 4))
+    command = held.get_output_port()
+    builder.Connect(failsafe.GetOutputPort("command"), held.get_input_port())
     builder.Connect(command, plant.GetInputPort("command"))
-    builder.Connect(state, pose.state_input_port())
-    builder.Connect(state, collision.state_input_port())
 
-    def add_publisher(codec: Codec, source: OutputPort, period: float) -> None:
-        publisher = MessagePublisher(lcm, codec, period)
-        builder.AddNamedSystem(f"{codec.port}_publisher", publisher)
-        builder.Connect(source, publisher.GetInputPort(codec.port))
-        builder.Connect(clock.get_output_port(), publisher.unix_time_input_port())
-
-    policy = make_policy(scenario, world)  # Only to know what it sees, and how often.
+    # Status, state and motion capture.
     armed = builder.AddSystem(ConstantVectorSource(np.ones(1)))
-    vehicle_status = builder.AddSystem(Multiplexer(2))
-    builder.Connect(armed.get_output_port(), vehicle_status.get_input_port(0))
-    builder.Connect(failsafe.is_ready_output_port(), vehicle_status.get_input_port(1))
-    add_publisher(VehicleStatusCodec(), vehicle_status.get_output_port(0), STATUS_PERIOD)
+    status = builder.AddSystem(Multiplexer(2))
+    builder.Connect(armed.get_output_port(), status.get_input_port(0))
+    builder.Connect(failsafe.GetOutputPort("is_ready"), status.get_input_port(1))
+    ports.publish(VehicleStatusCodec(), status.get_output_port(0), STATUS_PERIOD)
     noise = builder.AddSystem(Sine(np.repeat([_NOISE, 0.0], [3, 10]), np.ones(13), np.zeros(13)))
     estimate = builder.AddSystem(Adder(2, 13))
     builder.Connect(state, estimate.get_input_port(0))
     builder.Connect(noise.get_output_port(0), estimate.get_input_port(1))
-    add_publisher(StateCodec(), estimate.get_output_port(), 1 / config.state_rate)
+    ports.publish(StateCodec(), estimate.get_output_port(), 1 / config.state_rate)
     if config.body:
-        seen = builder.AddSystem(MatrixGain(np.eye(13)[[0, 1, 2, 6, 7, 8, 9]]))
-        builder.Connect(state, seen.get_input_port())
-        add_publisher(
-            MotionCaptureCodec(config.body), seen.get_output_port(), 1 / config.state_rate
-        )
-    images = AddObservation(builder, scenario, world, state, pose.pose_output_port(), policy)
+        tracked = builder.AddSystem(MatrixGain(np.eye(13)[[0, 1, 2, 6, 7, 8, 9]]))
+        builder.Connect(state, tracked.get_input_port())
+        codec = MotionCaptureCodec(config.body)
+        ports.publish(codec, tracked.get_output_port(), 1 / config.state_rate)
+
+    # Images, of which the policy tells size and rate.
+    policy = make_policy(scenario, world)
+    body_pose = pose.GetOutputPort("pose")
+    images = AddObservation(builder, scenario, world, state, body_pose, policy)
     for codec in image_codecs(scenario, policy):
-        add_publisher(codec, images[codec.port], decision_period(scenario, policy))
+        ports.publish(codec, images[codec.port], decision_period(scenario, policy))
 
     for name, port in (("state", state), ("command", command)):
         LogVectorOutput(port, builder, LOG_PERIOD).set_name(f"{name}_log")
         builder.ExportOutput(port, name)
-    builder.ExportOutput(subscriber.age_output_port(), "command_age")
+    builder.ExportOutput(subscriber.GetOutputPort("age"), "command_age")
     for name in ("clearance", "gradient", "in_collision", "field_state"):
         builder.ExportOutput(collision.GetOutputPort(name), name)
     diagram = builder.Build()
@@ -200,34 +183,29 @@ def BuildVehicleDiagram(
 def _AddVelocityControl(
     builder: DiagramBuilder, scenario: Scenario, state: OutputPort, setpoint: OutputPort
 ) -> OutputPort:
-    """Adds what flies velocity setpoints by the vehicle's own state; returns its commands."""
-    parts, tracker = Demultiplexer([3, 1]), VelocityTracker()
-    controller = FlatnessController(scenario.controller, scenario.vehicle)
-    for name, system in (
-        ("setpoint", parts),
-        ("velocity_tracker", tracker),
-        ("controller", controller),
-    ):
-        builder.AddNamedSystem(name, system)
+    """Adds the control of velocity setpoints; returns its commands."""
+    parts = builder.AddNamedSystem("setpoint", Demultiplexer([3, 1]))
+    tracker = builder.AddNamedSystem("velocity_tracker", VelocityTracker())
+    law = FlatnessController(scenario.controller, scenario.vehicle)
+    controller = builder.AddNamedSystem("controller", law)
     builder.Connect(setpoint, parts.get_input_port())
-    builder.Connect(parts.get_output_port(0), tracker.velocity_input_port())
-    builder.Connect(parts.get_output_port(1), controller.heading_input_port())
-    builder.Connect(tracker.acceleration_output_port(), controller.acceleration_input_port())
-    for system in (tracker, controller):
-        builder.Connect(state, system.GetInputPort("state"))
-    return controller.command_output_port()
+    velocity, heading = parts.get_output_port(0), parts.get_output_port(1)
+    ConnectInputs(builder, tracker, {"state": state, "velocity": velocity})
+    acceleration = tracker.GetOutputPort("acceleration")
+    sources = {"state": state, "acceleration": acceleration, "heading": heading}
+    ConnectInputs(builder, controller, sources)
+    return controller.GetOutputPort("command")
 
 
 @holds_folder("out")
 def run(*, scenario: Scenario, config: HardwareConfig, out: Path) -> dict[str, float | str]:
     """
-    Hovers at the scenario's start until commands come, flies by them until the flight ends, hovers
-    and then lands where they cease, and leaves in `out` what `write_flight` and `write_summary`
-    write. Time is counted from the first command.
+    Hovers at the scenario's start and flies by commands until the flight ends; writes the files of
+    `write_flight` and `write_summary` into `out`. Time is counted from the first command.
 
     Args:
-        scenario: the vehicle, its world, its start, and what its policy sees.
-        config: where messages travel.
+        scenario: the vehicle, its world, its start, and the policy's images.
+        config: of messages.
 
     Returns:
         `Flight.summary()` and `overruns`, of ticks.
@@ -250,10 +228,10 @@ def run(*, scenario: Scenario, config: HardwareConfig, out: Path) -> dict[str, f
     root = simulator.get_mutable_context()
     plant = diagram.GetSubsystemByName("plant").GetMyMutableContextFromRoot(root)
     plant.SetContinuousState(start)
-    p_WG = goal_of(scenario, world)
+    p_WG = goal_position(scenario, world)
     took_off = math.inf
 
-    def how_it_ended() -> Outcome | None:
+    def outcome() -> Outcome | None:
         if has_landed(diagram, root):
             return Outcome.LANDED
         return flight_outcome(diagram, root, p_WG, scenario.goal_radius)
@@ -268,15 +246,15 @@ def run(*, scenario: Scenario, config: HardwareConfig, out: Path) -> dict[str, f
                 )
             return False
         took_off = min(took_off, now)
-        return how_it_ended() is not None or now - took_off >= scenario.timeout
+        return outcome() is not None or now - took_off >= scenario.timeout
 
     print(f"Hovering at {config.url} until commands come...", flush=True)
     started = time.monotonic()
     overruns = run_in_real_time(simulator, diagram, config.tick, over)
     wall_time = time.monotonic() - started
-    diagram.ForcedPublish(root)  # Who flies is to know the last state too.
-    outcome = how_it_ended() or Outcome.TIMEOUT
-    flight = _since(took_off, record_flight(diagram, root, world, outcome, wall_time))
+    diagram.ForcedPublish(root)  # The bridge needs the last state too.
+    ended = outcome() or Outcome.TIMEOUT
+    flight = _since(took_off, record_flight(diagram, root, world, ended, wall_time))
     write_flight(out, scenario, flight)
     summary = flight.summary() | {"overruns": overruns}
     write_summary(out, summary)
@@ -285,7 +263,7 @@ def run(*, scenario: Scenario, config: HardwareConfig, out: Path) -> dict[str, f
 
 
 def _since(time: float, flight: Flight) -> Flight:
-    """A flight without what was before `time` [s], which is its time 0."""
+    """Returns the part of a flight from `time` [s] on, which becomes 0."""
     rows = flight.times >= time
     return dataclasses.replace(
         flight,

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from splatpilot.diagrams.worlds.solids.shading import GAMMA
 from splatpilot.diagrams.worlds.world import World
-from splatpilot.systems.collision.esdf import corner_offsets, grid_strides, trilinear
+from splatpilot.systems.collision.esdf import interpolate_grid
 from splatpilot.systems.splats.background import Background, EnvironmentMap
-from splatpilot.systems.splats.scene import C0, GaussianScene
+from splatpilot.systems.splats.scene import GaussianScene, color_to_sh
 
 _PAINT = 0.35  # sRGB, largest change of a colour of paint
 _PAINTS = 4  # along each axis of the colour cube
@@ -108,7 +108,7 @@ def recolored(scene: GaussianScene, look: Appearance) -> GaussianScene:
         linear = painted**GAMMA * (look.exposure * light)[:, None]
         after[some] = _developed(linear @ look.mixing.T)
     sh = scene.sh.copy()
-    sh[:, 0] = (after - 0.5) / C0
+    sh[:, 0] = color_to_sh(after)
     if scene.sh_degree > 0:
         brighter = (after.sum(axis=1) + 0.01) / (before.sum(axis=1) + 0.01)
         sh[:, 1:] *= np.minimum(brighter, 2.0)[:, None, None]
@@ -130,13 +130,11 @@ def recolored_background(background: Background, look: Appearance) -> Background
 
 def _paint(colors: Array, look: Appearance) -> Array:
     """What is added to sRGB colours (N, 3): alike for alike ones, so that a material stays one."""
-    position = colors.T * (_PAINTS - 1)  # (3, N)
-    cell = np.minimum(position.astype(np.intp), _PAINTS - 2)
-    shape = look.paint.shape[:3]
-    corners = corner_offsets(shape) + grid_strides(shape) @ cell  # (2, 2, 2, N)
-    fractions = (position - cell).astype(np.float32)
-    channels = np.moveaxis(look.paint, -1, 0)
-    return np.stack([trilinear(grid.take(corners), *fractions) for grid in channels], axis=1)
+    spacing = 1 / (_PAINTS - 1)
+    lower = np.full(3, -0.5 * spacing)
+    grids = np.moveaxis(look.paint, -1, 0).copy()
+    added = [interpolate_grid(g, lower, spacing, colors, with_gradient=False)[0] for g in grids]
+    return np.stack(added, axis=1).astype(np.float32)
 
 
 def _light(means: Array, normals: Array, look: Appearance) -> Array:

@@ -1,4 +1,4 @@
-"""Whether a way from start to goal exists, proven by search on the distance field."""
+"""Checks by grid search that a collision-free path from start to goal exists; chooses ends."""
 
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
@@ -9,7 +9,7 @@ from scipy.ndimage import label
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 
-from splatpilot.diagrams.worlds.solids.solid import Blueprint
+from splatpilot.diagrams.worlds.solids.solid import WorldSpec
 from splatpilot.systems.collision.distance_field import DistanceField
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.esdf_build import cubes_of_points
@@ -18,47 +18,47 @@ from splatpilot.systems.common.seeds import check_seed
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
 CLEARANCE = 0.8
-"""[m], least distance of start and goal from everything, the bounds included."""
+"""[m], minimum distance of start and goal from obstacles and bounds."""
 
 TRIES = 60
 """Draws of an instance before its parameters are refused."""
 
 
-def draw_feasible(draw: Callable[[np.random.Generator], Blueprint], seed: int) -> Blueprint:
-    """Draws instances of a world from `seed` until one is feasible: the same seed, the same bits.
+def draw_feasible(draw: Callable[[np.random.Generator], WorldSpec], seed: int) -> WorldSpec:
+    """Draws instances of a world from `seed` until one is feasible, deterministically.
 
-    Raises:
-        ValueError: for a seed out of range.
-        InfeasibleFlightError: if none of `TRIES` instances is feasible.
+    Raises InfeasibleFlightError if none of `TRIES` instances is.
     """
     check_seed(seed)
     name = "world"
     for attempt in range(TRIES):
-        blueprint = draw(np.random.default_rng([seed, attempt]))
-        name = blueprint.name
-        if is_feasible(blueprint):
-            return blueprint
+        spec = draw(np.random.default_rng([seed, attempt]))
+        name = spec.name
+        if is_feasible(spec):
+            return spec
     raise InfeasibleFlightError(
         f"{name}: none of {TRIES} instances drawn from seed {seed} leaves a vehicle of radius "
-        f"{VEHICLE_RADIUS} m a way from start to goal; use fewer or smaller obstacles, or more room"
+        f"{VEHICLE_RADIUS} m a route from start to goal; use fewer or smaller obstacles"
     )
 
 
-def is_feasible(blueprint: Blueprint) -> bool:
-    """Whether start and goal are clear and a way between them is proven: on a coarse grid, which
-    shows most ways, or else on finer ones, the last of which shows ways through gaps of 1 m."""
-    field = blueprint.distance_field
-    ends = np.stack([blueprint.p_WS, blueprint.p_WG])
+def is_feasible(spec: WorldSpec) -> bool:
+    """Checks that start and goal are clear and that a path joins them.
+
+    A coarse grid finds most paths; the finest finds those through gaps of 1 m.
+    """
+    field = spec.distance_field
+    ends = np.stack([spec.p_WS, spec.p_WG])
     if not (conservative_distance(field, ends) >= CLEARANCE).all():
         return False
     return any(
-        connects(field, blueprint.p_WS, blueprint.p_WG, VEHICLE_RADIUS, spacing)
+        connects(field, spec.p_WS, spec.p_WG, VEHICLE_RADIUS, spacing)
         for spacing in (0.3, 0.15, 0.12)
     )
 
 
 def conservative_distance(field: DistanceField, p_WQ: NDArray) -> NDArray[np.float64]:
-    """Distance (...,) [m] of points p_WQ (..., 3) inside the bounds to surfaces and the bounds."""
+    """Computes distances (...,) [m] of p_WQ (..., 3) in the bounds to surfaces and bounds."""
     to_bounds = np.minimum(p_WQ - field.lower_W, field.upper_W - p_WQ).min(axis=-1)
     return np.minimum(field.distance(p_WQ), to_bounds)
 
@@ -66,11 +66,11 @@ def conservative_distance(field: DistanceField, p_WQ: NDArray) -> NDArray[np.flo
 def connects(
     field: DistanceField, p_WS: NDArray, p_WG: NDArray, radius: float, spacing: float
 ) -> bool:
-    """Whether a grid proves that a sphere of `radius` [m] can fly from p_WS to p_WG (3,) [m].
+    """Checks by a grid that a sphere of `radius` [m] can fly from p_WS to p_WG (3,) [m].
 
-    Neighbours along an axis, `spacing` h [m] apart, both further than radius + h / 2 from every
+    Neighbors along an axis, `spacing` h [m] apart, both further than radius + h / 2 from every
     obstacle, are joined by a free segment: no point of it is further than h / 2 from one of them,
-    and distances change no faster than the way. The exact field is asked, so that no branch or wire
+    and distances change no faster than the position. The field is exact, so that no branch or wire
     falls between the points of the grid.
     """
     grid = grid_distances(field, spacing)
@@ -79,19 +79,19 @@ def connects(
 
 
 def cell_of(field: DistanceField, grid: NDArray, spacing: float, p_W: NDArray) -> tuple[int, ...]:
-    """The cell of `grid_distances` that p_W (3,) [m] lies in."""
+    """Returns the cell of `grid_distances` around p_W (3,) [m]."""
     cell = np.clip(((p_W - field.lower_W) / spacing).astype(int), 0, np.array(grid.shape) - 1)
     return tuple(int(c) for c in cell)
 
 
 def are_connected(free: NDArray, a: tuple[int, ...], b: tuple[int, ...]) -> bool:
-    """Whether steps along the axes lead from cell a to cell b of a grid, all of them `free`."""
+    """Checks if steps through `free` cells along the axes lead from cell a to cell b."""
     part = np.asarray(label(free)[0])  # pyright: ignore[reportIndexIssue]
     return bool(part[a] == part[b] > 0)
 
 
 def grid_distances(field: DistanceField, spacing: float) -> NDArray[np.float64]:
-    """`conservative_distance` (nx, ny, nz) [m] at lower_W + (i + 0.5) spacing."""
+    """Computes `conservative_distance` (nx, ny, nz) [m] at lower_W + (i + 0.5) spacing."""
     shape = np.maximum(((field.upper_W - field.lower_W) / spacing + 1e-6).astype(int), 1)
     x, y, z = (
         low + spacing * (np.arange(n) + 0.5) for low, n in zip(field.lower_W, shape, strict=True)
@@ -103,10 +103,10 @@ def grid_distances(field: DistanceField, spacing: float) -> NDArray[np.float64]:
 
 
 SHORTEST = 1.0
-"""[m], length of the shortest route that is worth a flight."""
+"""[m], minimum length of a route."""
 
 LONG_ENOUGH = 8.0
-"""[m], length from which on a route shows how a policy flies; the benchmark's own minimum."""
+"""[m], length from which a route is representative; the benchmark's own minimum."""
 
 _GAIN = 1.5
 """[-] How many times as long a path with half of the margin must be to be preferred."""
@@ -135,13 +135,9 @@ def choose_start_and_goal(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
     """Returns p_WS (3,), p_WG (3,) and the length of the shortest path between them, all in [m].
 
-    The ends of (nearly) the longest of all shortest paths that a sphere of `radius` can fly through
-    space known to be free, at least `SHORTEST`, with `margin` [m] to spare or half of that, see
-    `_longest_part`: through less, vehicles hover before gaps that planners do not trust. Paths
-    longer than `longest` [m] are not considered: a flight should end in good time.
-
-    Raises:
-        InfeasibleFlightError: if no free space holds a sphere of `radius` and lets it fly so far.
+    The ends of (nearly) the longest of all shortest paths, `SHORTEST` to `longest` [m], of a sphere
+    of `radius` through known free space, with `margin` [m] to spare or half of that, see
+    `_longest_part`; planners do not trust narrower gaps.
     """
     part = _longest_part(esdf, radius, margin, longest, SHORTEST)
     goal, length = _farthest(part.graph, part.end, longest)
@@ -158,13 +154,10 @@ def draw_start_and_goal(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
     """Returns p_WS (3,), p_WG (3,) and the length of the shortest path between them, all in [m].
 
-    As `choose_start_and_goal`, but anywhere: the start is drawn from the part of free space with
-    the longest path, the goal from those nodes whose shortest path from it is at least 60 % of
-    that, up to `longest` [m], and at least `least` [m]. The same seed gives the same bits; if no
-    start in so many draws has such a goal, it is an end of the longest path.
-
-    Raises:
-        InfeasibleFlightError: if no free space holds a sphere of `radius` and lets it fly so far.
+    As `choose_start_and_goal`, but drawn from `seed`: the start from the part of free space with
+    the longest path, the goal from those nodes whose shortest path is at least 60 % of that, up to
+    `longest` [m], and at least `least` [m]. After `_DRAWS` starts without such a goal, the start is
+    an end of the longest path.
     """
     rng = np.random.default_rng(seed)
     part = _longest_part(esdf, radius, margin, longest, least)
@@ -180,7 +173,7 @@ def draw_start_and_goal(
 
 
 def short_route_warning(length: float) -> str:
-    """Says that a route of this length [m] is too short to show much; empty if it is not."""
+    """Returns a warning if a route of this length [m] is too short to be representative."""
     if length >= LONG_ENOUGH:
         return ""
     return (
@@ -193,11 +186,8 @@ def short_route_warning(length: float) -> str:
 def _longest_part(esdf: Esdf, radius: float, margin: float, longest: float, least: float) -> _Part:
     """Returns the connected part of the free space with the longest path, up to `longest` [m].
 
-    It has all of `margin` [m] if that path is `LONG_ENOUGH`, and else half of it where that makes
-    the path `_GAIN` times as long.
-
-    Raises:
-        InfeasibleFlightError: if no path is at least `least` [m] long.
+    It has all of `margin` [m] if that path is `LONG_ENOUGH`, and else half of it if that makes the
+    path `_GAIN` times as long. Raises InfeasibleFlightError if it is shorter than `least` [m].
     """
     best, reach = None, 0.0
     for graph, p_WN, spacing in _free_graphs(esdf, radius, margin):
@@ -223,8 +213,10 @@ def _longest_part(esdf: Esdf, radius: float, margin: float, longest: float, leas
 def _free_graphs(
     esdf: Esdf, radius: float, margin: float
 ) -> Iterator[tuple[csr_array, NDArray[np.float64], float]]:
-    """Graphs of the space free for a sphere of `radius` [m], their nodes (N, 3) [m] and the spacing
-    of these [m], with ever less margin: all of `margin` [m] and half of it."""
+    """Yields graphs of the space free for a sphere, with all and half of `margin`.
+
+    With each come its nodes (N, 3) [m] and their spacing [m].
+    """
     field = esdf.conservative()
     extent = esdf.upper_W - esdf.lower_W
     spacing = max(esdf.voxel_size, 0.15, float(np.cbrt(np.prod(extent) / _MAX_NODES)))
@@ -257,7 +249,7 @@ def _no_room(
 
 
 def grid_graph(free: NDArray[np.bool_], spacing: float) -> tuple[csr_array, NDArray[np.intp]]:
-    """Returns the graph that joins each free node to its free neighbours among the 26 around it,
+    """Returns the graph that joins each free node to its free neighbors among the 26 around it,
     weighted by distance [m], and the flat index of each of its nodes."""
     nodes = np.flatnonzero(free)
     number = np.full(free.shape, -1)
@@ -266,7 +258,7 @@ def grid_graph(free: NDArray[np.bool_], spacing: float) -> tuple[csr_array, NDAr
     for offset in np.ndindex(3, 3, 3):
         step = np.array(offset) - 1
         if tuple(step) <= (0, 0, 0):
-            continue  # the other half of the neighbours follows by symmetry
+            continue  # the other half of the neighbors follows by symmetry
         here = tuple(
             slice(max(-s, 0), n - max(s, 0)) for s, n in zip(step, free.shape, strict=True)
         )

@@ -1,4 +1,4 @@
-"""A small furnished room."""
+"""Furnished rooms: one, or the floor of an office."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,26 +10,24 @@ from pydrake.math import RotationMatrix
 
 from splatpilot.diagrams.worlds.building_blocks import (
     PASSAGE,
+    VolumeConfig,
     box,
-    check_count,
-    check_ground,
-    check_positive,
-    check_range,
-    check_size,
     clear_of,
     ground,
     hall,
     lamplight,
+    require_order,
     roof,
+    rotated_box,
     signs_in,
     signs_on,
     start_and_goal,
-    turned_box,
+    volume_spec,
 )
 from splatpilot.diagrams.worlds.feasibility import CLEARANCE, draw_feasible
-from splatpilot.diagrams.worlds.solids.solid import Blueprint, Solid
-from splatpilot.diagrams.worlds.solids.surfaces import Plot
+from splatpilot.diagrams.worlds.solids.solid import Solid, WorldSpec
 from splatpilot.systems.collision.shapes import Capsule, Cylinder, Sphere
+from splatpilot.systems.common.validation import bounded, require_field
 
 
 def furnish(
@@ -40,22 +38,21 @@ def furnish(
     free: list[NDArray],
     rng: np.random.Generator,
 ) -> list[Solid]:
-    """
-    Puts furniture into a room, none within `CLEARANCE` of what must stay free.
+    """Draws furniture of a room, none within `CLEARANCE` of `free` points.
 
     Args:
-        items: how many pieces; those for which 50 draws find no place are left out.
-        lower, upper: (2,) [m], between which the middles of pieces are.
+        items: number of pieces; those that do not fit in 50 draws are left out.
+        lower, upper: (2,) [m], bounds of the centers of pieces.
         height: [m], of the ceiling above the floor z = 0.
-        free: points (3,) [m] to stay away from.
+        free: (3,) [m] each.
     """
     furniture: list[Solid] = []
     for _ in range(items):
         make = FURNITURE[rng.integers(len(FURNITURE))]
         for _ in range(50):
-            place = rng.uniform(lower, upper)
-            turn = rng.choice(4) * np.pi / 2 + rng.normal(0, 0.12)
-            item = make(place, turn, height, int(rng.integers(1000)), rng)
+            p = rng.uniform(lower, upper)
+            angle = rng.choice(4) * np.pi / 2 + rng.normal(0, 0.12)
+            item = make(p, angle, height, int(rng.integers(1000)), rng)
             if all(clear_of(solid.shape, free, CLEARANCE) for solid in item):
                 furniture += item
                 break
@@ -63,21 +60,21 @@ def furnish(
 
 
 type Item = Callable[[NDArray, float, float, int, np.random.Generator], list[Solid]]
-"""Builds a piece of furniture from its place (2,) [m], its direction [rad], the height of the room
-[m], a seed for its looks and random numbers for its measures."""
+"""Builds a piece of furniture from its position (2,) [m], its direction [rad], the height of the
+room [m], a seed for its appearance and random numbers for its size."""
 
 
-def _parts(place: NDArray, turn: float, parts: list[tuple], seed: int) -> list[Solid]:
-    """Boxes (center (3,), size (3,), material) of a piece standing at `place`, turned about z."""
-    R = RotationMatrix.MakeZRotation(turn)
-    at = np.array([*place, 0.0])
+def _parts(p: NDArray, angle: float, parts: list[tuple], seed: int) -> list[Solid]:
+    """Returns boxes (center (3,), size (3,), material) of a piece at p (2,), rotated about z."""
+    R = RotationMatrix.MakeZRotation(angle)
+    at = np.array([*p, 0.0])
     return [
-        turned_box(at + R.multiply(np.array(center, float)), R, size, material, seed)
+        rotated_box(at + R.multiply(np.array(center, float)), R, size, material, seed)
         for center, size, material in parts
     ]
 
 
-def _shelf(place, turn, height, seed, rng) -> list[Solid]:
+def _shelf(p, angle, height, seed, rng) -> list[Solid]:
     w, d, h = rng.uniform(1.2, 2.0), 0.4, rng.uniform(1.6, min(2.4, height - 0.2))
     boards = [((0, 0, z), (w, d, 0.05), "wood") for z in np.linspace(0.1, h - 0.03, 5)]
     sides = [((x, 0, h / 2), (0.05, d, h), "wood") for x in (-w / 2, w / 2)]
@@ -90,59 +87,59 @@ def _shelf(place, turn, height, seed, rng) -> list[Solid]:
         for z in np.linspace(0.1, h - 0.03, 5)[:4]
         for s in [rng.uniform(0.12, 0.25)]
     ]
-    return _parts(place, turn, [*boards, *sides, *boxes], seed)
+    return _parts(p, angle, [*boards, *sides, *boxes], seed)
 
 
-def _cabinet(place, turn, height, seed, rng) -> list[Solid]:
+def _cabinet(p, angle, height, seed, rng) -> list[Solid]:
     w, d, h = rng.uniform(0.6, 1.2), rng.uniform(0.45, 0.7), rng.uniform(1.0, 2.0)
-    return _parts(place, turn, [((0, 0, h / 2), (w, d, h), ("metal", "wood")[seed % 2])], seed)
+    return _parts(p, angle, [((0, 0, h / 2), (w, d, h), ("metal", "wood")[seed % 2])], seed)
 
 
-def _table(place, turn, height, seed, rng) -> list[Solid]:
+def _table(p, angle, height, seed, rng) -> list[Solid]:
     w, d, h = rng.uniform(1.1, 1.8), rng.uniform(0.7, 1.0), 0.75
     legs = [
         ((x * (w / 2 - 0.06), y * (d / 2 - 0.06), h / 2), (0.06, 0.06, h), "wood")
         for x in (-1, 1)
         for y in (-1, 1)
     ]
-    return _parts(place, turn, [((0, 0, h), (w, d, 0.05), "wood"), *legs], seed)
+    return _parts(p, angle, [((0, 0, h), (w, d, 0.05), "wood"), *legs], seed)
 
 
-def _sofa(place, turn, height, seed, rng) -> list[Solid]:
+def _sofa(p, angle, height, seed, rng) -> list[Solid]:
     w = rng.uniform(1.4, 2.2)
     parts = [
         ((0, 0, 0.22), (w, 0.85, 0.44), "fabric"),
         ((0, -0.35, 0.5), (w, 0.2, 0.75), "fabric"),
         *(((x * (w / 2 - 0.1), 0, 0.33), (0.2, 0.85, 0.6), "fabric") for x in (-1, 1)),
     ]
-    return _parts(place, turn, parts, seed)
+    return _parts(p, angle, parts, seed)
 
 
-def _crates(place, turn, height, seed, rng) -> list[Solid]:
+def _crates(p, angle, height, seed, rng) -> list[Solid]:
     sizes = rng.uniform(0.45, 0.8, int(rng.integers(1, 4)))
     tops = np.cumsum(sizes)
     parts = [((0, 0, t - s / 2), (s, s, s), "crate") for s, t in zip(sizes, tops, strict=True)]
-    return _parts(place, turn, [p for p, t in zip(parts, tops, strict=True) if t < height], seed)
+    return _parts(p, angle, [p for p, t in zip(parts, tops, strict=True) if t < height], seed)
 
 
-def _column(place, turn, height, seed, rng) -> list[Solid]:
-    foot, head = np.array([*place, -0.1]), np.array([*place, height + 0.1])
+def _column(p, angle, height, seed, rng) -> list[Solid]:
+    foot, head = np.array([*p, -0.1]), np.array([*p, height + 0.1])
     material = ("concrete", "brick", "hazard")[seed % 3]
     return [Solid(Cylinder(foot, head, float(rng.uniform(0.15, 0.3))), material, seed)]
 
 
-def _lamp(place, turn, height, seed, rng) -> list[Solid]:
+def _lamp(p, angle, height, seed, rng) -> list[Solid]:
     z = rng.uniform(1.5, 2.3)
-    head, shade = np.array([*place, height]), np.array([*place, z])
+    head, shade = np.array([*p, height]), np.array([*p, z])
     return [
         Solid(Capsule(shade, head, 0.012), "cable", seed),
         Solid(Sphere(shade, float(rng.uniform(0.15, 0.28))), ("fabric", "metal")[seed % 2], seed),
     ]
 
 
-def _plant(place, turn, height, seed, rng) -> list[Solid]:
-    foot, rim = np.array([*place, 0.0]), np.array([*place, 0.45])
-    top = np.array([*place, rng.uniform(0.9, 1.4)])
+def _plant(p, angle, height, seed, rng) -> list[Solid]:
+    foot, rim = np.array([*p, 0.0]), np.array([*p, 0.45])
+    top = np.array([*p, rng.uniform(0.9, 1.4)])
     return [
         Solid(Cylinder(foot, rim, 0.2), "brick", seed),
         Solid(Capsule(rim, top, 0.03), "oak", seed),
@@ -154,50 +151,30 @@ FURNITURE: tuple[Item, ...] = (_shelf, _cabinet, _table, _sofa, _crates, _column
 
 
 @dataclass
-class RoomConfig:
+class RoomConfig(VolumeConfig):
     """A room with furniture, flown from end to end."""
 
-    length: float = 12.0  # [m] along x: from 0 to length
-    width: float = 10.0  # [m] along y, centred on 0
-    height: float = 3.2  # [m] along z
-    items: int = 16  # [-] pieces of furniture
-    voxel_size: float = 0.1  # [m] of the distance grid
-
-    def validate(self) -> None:
-        """Raises ValueError for the first value with which no room can be furnished."""
-        check_positive(self, "length", "width", "height", "voxel_size")
-        check_ground(self)
-        check_count(self, "items")
-        check_size(self, "room", 6, 4, 2.4)
+    length: float = bounded(12.0, "[6, 200] m")  # [m] along x: from 0 to length
+    width: float = bounded(10.0, "[4, 200] m")  # [m] along y, centered on 0
+    height: float = bounded(3.2, "[2.4, 100] m")  # [m] along z
+    items: int = bounded(16, "[0, 1000]")  # [-] pieces of furniture
+    voxel_size: float = bounded(0.1, "(0, 200] m")  # [m] of the distance grid
 
 
-def room_blueprint(config: RoomConfig, seed: int) -> Blueprint:
-    """Furnishes the room of `config`.
-
-    Raises:
-        ValueError: for values with which none can be made, or without a way through.
-    """
+def room_spec(config: RoomConfig, seed: int) -> WorldSpec:
+    """Furnishes the room of `config`."""
     config.validate()
-    plot = Plot.of_size(config.length, config.width, config.height)
+    plan = config.plan
 
-    def draw(rng: np.random.Generator) -> Blueprint:
-        p_WS, p_WG = start_and_goal(plot, rng, (1.0, min(1.9, config.height - 0.9)))
-        inner = plot.lower[:2] + 0.7, plot.upper[:2] - 0.7
-        furniture = furnish(config.items, *inner, config.height, [p_WS, p_WG], rng)
-        sides = hall(plot, ["plaster", "plaster", "wood", "brick"], rng)
+    def draw(rng: np.random.Generator) -> WorldSpec:
+        ends = start_and_goal(plan, rng, (1.0, min(1.9, config.height - 0.9)))
+        inner = plan.lower[:2] + 0.7, plan.upper[:2] - 0.7
+        furniture = furnish(config.items, *inner, config.height, list(ends), rng)
+        sides = hall(plan, ["plaster", "plaster", "wood", "brick"], rng)
         signs = signs_in(sides, 2, 2, rng)
         floor = ground(("tiles", "wood", "concrete")[rng.integers(3)], int(rng.integers(10)))
-        return Blueprint(
-            name="room",
-            lower_W=plot.lower,
-            upper_W=plot.upper,
-            solids=[floor, roof(plot), *sides, *signs, *furniture],
-            p_WS=p_WS,
-            p_WG=p_WG,
-            light=lamplight(plot, rng),
-            seed=seed,
-            voxel_size=config.voxel_size,
-        )
+        solids = [floor, roof(plan), *sides, *signs, *furniture]
+        return volume_spec("room", config, seed, solids, ends, lamplight(plan, rng))
 
     return draw_feasible(draw, seed)
 
@@ -206,52 +183,37 @@ PARTITION = 0.15
 """[m], thickness of the walls between rooms."""
 
 JAMB = 0.25
-"""[m], least length of wall between a door and a corner."""
+"""[m], minimum length of wall between a door and a corner."""
 
 
 @dataclass
-class OfficeConfig:
+class OfficeConfig(VolumeConfig):
     """A floor divided into rooms, flown from a room at one end to a room at the other.
 
-    Walls divide it, and what is left, until no side is twice `room`. Every wall has a door, so all
-    rooms are connected; some have two, so that there are ways around.
+    Walls divide it until no side is twice `room`. Every wall has a door, so all rooms are
+    connected; some have two, so that there are detours.
     """
 
-    length: float = 22.0  # [m] along x: from 0 to length
-    width: float = 14.0  # [m] along y, centred on 0
-    height: float = 3.0  # [m] along z
-    room: float = 3.2  # [m] least side of a room
-    door_min: float = 1.0  # [m] width of doors: least
-    door_max: float = 1.6  # [m] and most
-    door_height: float = 2.1  # [m] of every other door; the rest reach the ceiling
-    second_doors: float = 0.3  # [-] part of the walls that have two
-    items: int = 20  # [-] pieces of furniture
-    voxel_size: float = 0.1  # [m] of the distance grid
+    length: float = bounded(22.0, "[6, 200] m")  # [m] along x: from 0 to length
+    width: float = bounded(14.0, "[4, 200] m")  # [m] along y, centered on 0
+    height: float = bounded(3.0, "[2.4, 100] m")  # [m] along z
+    room: float = bounded(3.2, "(0, 200] m")  # [m] minimum side of a room
+    door_min: float = bounded(1.0, f"[{PASSAGE:.3f}, 100] m")  # [m] minimum width of doors
+    door_max: float = bounded(1.6, "(0, 100] m")  # [m] maximum width of doors
+    # [m] Height of every other door; the rest reach the ceiling.
+    door_height: float = bounded(2.1, f"[{PASSAGE:.3f}, 200] m")
+    second_doors: float = bounded(0.3, "[0, 1]")  # [-] fraction of the walls that have two
+    items: int = bounded(20, "[0, 1000]")  # [-] pieces of furniture
+    voxel_size: float = bounded(0.1, "(0, 200] m")  # [m] of the distance grid
 
-    def validate(self) -> None:
-        """Raises ValueError for the first value with which no floor can be divided."""
-        check_positive(self, "length", "width", "height", "room", "door_height", "voxel_size")
-        check_ground(self)
-        check_count(self, "items")
-        check_range(self, "door_min", "door_max")
-        check_size(self, "floor", 6, 4, 2.4)
-        if self.door_min < PASSAGE:
-            raise ValueError(
-                f"door_min = {self.door_min} m must be at least {PASSAGE:.2f} m, for the vehicle"
-            )
-        if not PASSAGE <= self.door_height <= self.height:
-            raise ValueError(
-                f"door_height = {self.door_height} m must be {PASSAGE:.2f} m, for the vehicle, to "
-                f"height = {self.height:g} m"
-            )
-        least = max(self.door_max + 2 * JAMB, 2 * CLEARANCE + PARTITION)
-        if not least <= self.room <= min(self.length, self.width):
-            raise ValueError(
-                f"room = {self.room} m must be {least:g} m, for a door, a start or a goal, to "
-                f"{min(self.length, self.width):g} m, the floor's lesser side"
-            )
-        if not 0 <= self.second_doors <= 1:
-            raise ValueError(f"second_doors = {self.second_doors} must be 0 to 1")
+    def check(self) -> None:
+        super().check()
+        require_order(self, "door_min", "door_max")
+        require_order(self, "door_height", "height")
+        # For a door, a start or a goal.
+        low = max(self.door_max + 2 * JAMB, 2 * CLEARANCE + PARTITION)
+        high = min(self.length, self.width)
+        require_field(self, "room", low <= self.room <= high, f"in [{low:g}, {high:g}] m")
 
 
 class _Room(NamedTuple):
@@ -289,29 +251,24 @@ class _Partition(NamedTuple):
         return p
 
 
-def office_blueprint(config: OfficeConfig, seed: int) -> Blueprint:
-    """Divides and furnishes the floor of `config`.
-
-    Raises:
-        ValueError: for values with which none can be made, or without a way through.
-    """
+def office_spec(config: OfficeConfig, seed: int) -> WorldSpec:
+    """Divides and furnishes the floor of `config`."""
     config.validate()
-    plot = Plot.of_size(config.length, config.width, config.height)
+    plan = config.plan
 
-    def draw(rng: np.random.Generator) -> Blueprint:
+    def draw(rng: np.random.Generator) -> WorldSpec:
         partitions: list[_Partition] = []
-        rooms = _divide(_Room(plot.lower[:2], plot.upper[:2]), config, partitions, rng)
-        p_WS = _place_in([r for r in rooms if r.lower[0] == plot.lower[0]], config, rng)
-        p_WG = _place_in([r for r in rooms if r.upper[0] == plot.upper[0]], config, rng)
+        rooms = _divide(_Room(plan.lower[:2], plan.upper[:2]), config, partitions, rng)
+        p_WS = _point_in([r for r in rooms if r.lower[0] == plan.lower[0]], config, rng)
+        p_WG = _point_in([r for r in rooms if r.upper[0] == plan.upper[0]], config, rng)
         free = [p_WS, p_WG]
         free += [wall.point(0, door.middle, 1.1) for wall in partitions for door in wall.doors]
         areas = np.array([np.prod(room.upper - room.lower) for room in rooms])
+        counts = rng.multinomial(config.items, areas / areas.sum())
         furniture: list[Solid] = []
-        for room, items in zip(
-            rooms, rng.multinomial(config.items, areas / areas.sum()), strict=True
-        ):
+        for room, items in zip(rooms, counts, strict=True):
             furniture += furnish(int(items), *room.inside(0.9), config.height, free, rng)
-        sides = hall(plot, ["plaster", "plaster", "concrete"], rng)
+        sides = hall(plan, ["plaster", "plaster", "concrete"], rng)
         signs = signs_in(sides, 3, 2, rng)
         walls: list[Solid] = []
         for partition in partitions:
@@ -321,17 +278,8 @@ def office_blueprint(config: OfficeConfig, seed: int) -> Blueprint:
                 for face in (2 * partition.axis, 2 * partition.axis + 1):
                     signs += signs_on(piece, face, int(rng.integers(2)), rng)
         floor = ground(("tiles", "wood", "concrete")[rng.integers(3)], int(rng.integers(10)))
-        return Blueprint(
-            name="office",
-            lower_W=plot.lower,
-            upper_W=plot.upper,
-            solids=[floor, roof(plot), *sides, *walls, *signs, *furniture],
-            p_WS=p_WS,
-            p_WG=p_WG,
-            light=lamplight(plot, rng),
-            seed=seed,
-            voxel_size=config.voxel_size,
-        )
+        solids = [floor, roof(plan), *sides, *walls, *signs, *furniture]
+        return volume_spec("office", config, seed, solids, (p_WS, p_WG), lamplight(plan, rng))
 
     return draw_feasible(draw, seed)
 
@@ -361,7 +309,7 @@ def _divide(
 
 
 def _ends_in_door(wall: _Partition, axis: int, at: float, whole: _Room) -> bool:
-    """Whether a new wall across `whole` would end in, or at, a door of another one."""
+    """Checks if a new wall across `whole` would end in, or at, a door of another one."""
     bounds = whole.lower[wall.axis], whole.upper[wall.axis]
     return (
         wall.axis != axis
@@ -371,7 +319,7 @@ def _ends_in_door(wall: _Partition, axis: int, at: float, whole: _Room) -> bool:
 
 
 def _doors(low: float, high: float, config: OfficeConfig, rng: np.random.Generator) -> list[_Door]:
-    """One door or two of a wall from `low` to `high` [m], two in different halves of it."""
+    """Draws one door of a wall from `low` to `high` [m], or two in different halves of it."""
     least = config.door_max + 2 * JAMB
     two = rng.random() < config.second_doors and high - low >= 2 * least
     stretches = [(low, (low + high) / 2), ((low + high) / 2, high)] if two else [(low, high)]
@@ -383,14 +331,14 @@ def _doors(low: float, high: float, config: OfficeConfig, rng: np.random.Generat
     return doors
 
 
-def _place_in(rooms: list[_Room], config: OfficeConfig, rng: np.random.Generator) -> NDArray:
-    """A start or goal (3,) [m] in one of the rooms."""
+def _point_in(rooms: list[_Room], config: OfficeConfig, rng: np.random.Generator) -> NDArray:
+    """Draws a start or goal (3,) [m] in one of the rooms."""
     corners = rooms[rng.integers(len(rooms))].inside(CLEARANCE + PARTITION / 2)
     return np.array([*rng.uniform(*corners), rng.uniform(1.0, min(1.9, config.height - 0.9))])
 
 
 def _build(wall: _Partition, height: float, rng: np.random.Generator) -> list[Solid]:
-    """The pieces of a wall between its doors and above them, as boxes."""
+    """Returns the pieces of a wall between its doors and above them, as boxes."""
     material = ("plaster", "plaster", "wood", "brick")[rng.integers(4)]
     seed, half = int(rng.integers(1000)), PARTITION / 2
     edges = [wall.low]

@@ -1,4 +1,4 @@
-"""Reconstructed scenes with obstacles put in: what is seen and what is hit, composed together."""
+"""Reconstructed scenes with obstacles put in, visible and solid."""
 
 from dataclasses import dataclass, replace
 
@@ -7,55 +7,56 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw
 from scipy.ndimage import label
 
-from splatpilot.diagrams.worlds.building_blocks import TIGHT_CLEARING, check_range
+from splatpilot.diagrams.worlds.building_blocks import TIGHT_CLEARING, require_order
 from splatpilot.diagrams.worlds.feasibility import TRIES, draw_start_and_goal
 from splatpilot.diagrams.worlds.scene_folder import SceneSource, read_scene_world
 from splatpilot.diagrams.worlds.solids.shading import Lamplight
-from splatpilot.diagrams.worlds.solids.solid import Blueprint, Solid, faces_of
+from splatpilot.diagrams.worlds.solids.solid import Solid, WorldSpec, faces_of
 from splatpilot.diagrams.worlds.solids.surfels import draw
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.collision.shapes import AnalyticDistanceField, Box, Capsule, Shape, Sphere
+from splatpilot.systems.collision.shapes import (
+    AnalyticDistanceField,
+    Box,
+    Capsule,
+    Shape,
+    ShapeUnion,
+    Sphere,
+)
 from splatpilot.systems.common.provenance import InfeasibleFlightError
+from splatpilot.systems.common.validation import bounded
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
 GAP = 1.3 * 2 * VEHICLE_RADIUS
-"""[m], least width of a gap."""
+"""[m], minimum width of gaps."""
 
 _MATERIALS = ["hazard", "crate", "metal", "foliage", "brick", "wood"]
 
 
 @dataclass
 class InsertedConfig(SceneSource):
-    """A scene on disk with 3 to 5 solids, hanging or standing in its free space."""
+    """A scene on disk with 3 to 5 solids in its free space."""
 
-    least: int = 3  # [-] least number of solids
-    most: int = 5  # [-] greatest number of solids
-    half_min: float = 0.10  # [m] smallest half width of a solid
-    half_max: float = 0.25  # [m] largest half width of a solid
-    gap: float = GAP  # [m] least width of every gap on the way, and between two solids
+    least: int = bounded(3, "[1, 100]")  # [-] minimum number of solids
+    most: int = bounded(5, "[1, 100]")  # [-] maximum number of solids
+    half_min: float = bounded(0.10, "(0, 100] m")  # [m] smallest half width of a solid
+    half_max: float = bounded(0.25, "(0, 100] m")  # [m] largest half width of a solid
+    # [m] Minimum width of every gap on the route, and between two solids.
+    gap: float = bounded(GAP, f"[{2 * VEHICLE_RADIUS:.3f}, 10] m")
 
-    def validate(self) -> None:
-        """Raises ValueError for the first value with which nothing can be put in."""
-        super().validate()
-        check_range(self, "half_min", "half_max")
-        check_range(self, "least", "most")
-        if not 2 * VEHICLE_RADIUS <= self.gap <= 10:
-            raise ValueError(f"gap = {self.gap} m must be {2 * VEHICLE_RADIUS:.3f} to 10 m")
+    def check(self) -> None:
+        super().check()
+        require_order(self, "half_min", "half_max")
+        require_order(self, "least", "most")
 
 
 def inserted_world(config: InsertedConfig, seed: int) -> World:
     """Reads the scene and puts solids into it.
 
-    They are drawn from the seed, in the way: each comes within 0.5 m of the straight line from
-    start to goal or of space at the same height. Any two are at least `gap` apart, start and goal
-    keep 0.9 m, and a way from start to goal is left that is `gap` wide everywhere. Draws without
-    such a way are dropped, and redrawn from the seed; start and goal too, if they are drawn.
-
-    Raises:
-        FileNotFoundError, ValueError: see `read_scene_world`.
-        InfeasibleFlightError: if no draw leaves such a way.
+    They are drawn from the seed, near the straight line from start to goal. Any two are at least
+    `gap` apart, start and goal keep 0.9 m, and a route from start to goal is left that is `gap`
+    wide everywhere. Other draws are repeated; start and goal too, if they are drawn.
     """
     config.validate()
     scene = read_scene_world(config, seed)
@@ -72,23 +73,23 @@ def inserted_world(config: InsertedConfig, seed: int) -> World:
         if len(solids) < config.least:
             continue
         esdf = _compose(world.esdf, solids)
-        if _leaves_way(esdf, world.p_WS, world.p_WG, config.gap):
+        if _leaves_route(esdf, world.p_WS, world.p_WG, config.gap):
             return _with(world, solids, esdf, seed)
     raise InfeasibleFlightError(
         f"{config.path}: none of {TRIES} draws of {config.least} to {config.most} solids leaves a "
-        f"way of {config.gap:.2f} m width from start to goal; use a smaller gap or fewer solids"
+        f"route of {config.gap:.2f} m width from start to goal; use a smaller gap or fewer solids"
     )
 
 
 def _draw_solids(config: InsertedConfig, world: World, rng: np.random.Generator) -> list[Solid]:
-    """Solids that keep their distances from start, goal and each other."""
+    """Draws solids that keep their distances from start, goal and each other."""
     number = int(rng.integers(config.least, config.most + 1))
-    way = world.p_WG - world.p_WS
+    route = world.p_WG - world.p_WS
     solids: list[Solid] = []
     for _ in range(40 * number):
         if len(solids) == number:
             break
-        p = world.p_WS + rng.uniform(0.15, 0.85) * way + rng.uniform(-0.8, 0.8, 3)
+        p = world.p_WS + rng.uniform(0.15, 0.85) * route + rng.uniform(-0.8, 0.8, 3)
         sample = world.esdf.query(p)
         if sample.state != FieldState.FREE or sample.distance < config.half_min:
             continue
@@ -116,18 +117,19 @@ def _shape(config: InsertedConfig, p: NDArray, rng: np.random.Generator) -> Shap
 
 
 def _distances(shape: Shape, p_W: NDArray) -> NDArray:
-    return type(shape).distances(p_W, *shape.parameters())
+    return ShapeUnion.of([shape]).distance(p_W)
 
 
 def _surface(shape: Shape) -> NDArray:
-    """Points (N, 3) all over a shape."""
+    """Samples points (N, 3) all over a shape."""
     s = np.stack(np.meshgrid(*2 * [np.linspace(0, 1, 9)]), axis=-1).reshape(-1, 2)
     zero = np.zeros(3)
     return np.concatenate([face.at(s * face.size)[0] for face in faces_of(shape, zero, zero)])
 
 
 def _compose(esdf: Esdf, solids: list[Solid]) -> Esdf:
-    """The union of a scene and solids: the nearer of both, exact at voxel centres for solids.
+    """Returns the union of a scene and solids, exact at voxel centers for solids.
+
     Solids are known, also where the scene is not."""
     field = AnalyticDistanceField(
         [solid.shape for solid in solids], esdf.lower_W, esdf.upper_W + esdf.voxel_size
@@ -141,13 +143,13 @@ def _compose(esdf: Esdf, solids: list[Solid]) -> Esdf:
     return Esdf(distances, states, esdf.lower_W, esdf.voxel_size)
 
 
-def _leaves_way(esdf: Esdf, p_WS: NDArray, p_WG: NDArray, gap: float) -> bool:
-    """Whether a way `gap` [m] wide joins start and goal, through space known to be free."""
+def _leaves_route(esdf: Esdf, p_WS: NDArray, p_WG: NDArray, gap: float) -> bool:
+    """Checks that a route `gap` [m] wide through known free space joins start and goal."""
     free = esdf.conservative().distances > gap / 2
     part = np.asarray(label(free)[0])  # pyright: ignore[reportIndexIssue]
     parts = []
     for p in (p_WS, p_WG):
-        # The ends themselves may be narrower: the way starts within a radius of them.
+        # The ends themselves may be narrower: the route starts within a radius of them.
         cell = ((p - esdf.lower_W) / esdf.voxel_size).astype(int)
         reach = int(VEHICLE_RADIUS / esdf.voxel_size)
         box = tuple(slice(max(c - reach, 0), c + reach + 1) for c in cell)
@@ -156,12 +158,12 @@ def _leaves_way(esdf: Esdf, p_WS: NDArray, p_WG: NDArray, gap: float) -> bool:
 
 
 def _with(world: World, solids: list[Solid], esdf: Esdf, seed: int) -> World:
-    """The world with solids in it, lit from above."""
+    """Returns the world with solids in it, lit from above."""
     lower, upper = esdf.lower_W, esdf.upper_W
     middle = (world.p_WS + world.p_WG) / 2
     lamps = np.stack([world.p_WS, middle, world.p_WG]) + np.array([0, 0, 1.5])
     light = Lamplight(lamps, np.ones(3), esdf)
-    blueprint = Blueprint(
+    spec = WorldSpec(
         name=f"{world.name}_inserted",
         lower_W=lower,
         upper_W=upper,
@@ -172,8 +174,8 @@ def _with(world: World, solids: list[Solid], esdf: Esdf, seed: int) -> World:
         seed=seed,
     )
     return World(
-        name=blueprint.name,
-        gaussians=world.gaussians.merged_with(draw(blueprint, solids, light)),
+        name=spec.name,
+        gaussians=world.gaussians.merged_with(draw(spec, solids, light)),
         distance_field=esdf,
         esdf=esdf,
         background=world.background,

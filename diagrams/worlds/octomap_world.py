@@ -1,4 +1,4 @@
-"""Worlds from OctoMaps: maps that robots made, as coloured blocks."""
+"""Worlds from OctoMaps, drawn as colored blocks."""
 
 import logging
 from dataclasses import dataclass
@@ -27,6 +27,7 @@ from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.octomap import Octomap, read_octomap
 from splatpilot.systems.common.provenance import InfeasibleFlightError
+from splatpilot.systems.common.validation import require, require_field
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
@@ -34,39 +35,34 @@ OCTOMAP = ".bt"
 """Suffix of binary OctoMaps."""
 
 _MOST_VOXELS = 2e7
-"""Of a map that is flown in whole: some 90 bytes each."""
+"""Of a map that is used whole: some 90 bytes each."""
 
 _log = logging.getLogger(__name__)
 
 
 @dataclass
 class OctomapConfig(SceneSource):
-    """A binary OctoMap (.bt) on disk; `path` is found as that of a scene."""
+    """A binary OctoMap (.bt) on disk; `path` is found like that of a scene."""
 
-    # [m] Lower corner of the part that is flown in; without corners all of the map, or of a map of
-    # more than 20 million voxels so many about the middle of what is free.
+    # [m] Lower corner of the part that is flown in; without corners all of the map, or at most 20
+    # million voxels about the middle of its free space.
     lower: list[float] | None = None
     # [m] Upper corner of that part.
     upper: list[float] | None = None
 
-    def validate(self) -> None:
-        """Raises ValueError for an empty path, or a box with one corner or none in order."""
-        super().validate()
-        if (self.lower is None) != (self.upper is None):
-            raise ValueError("lower and upper must be given both, or neither for all of the map")
+    def check(self) -> None:
+        super().check()
+        both = (self.lower is None) == (self.upper is None)
+        require(both, "lower and upper", "given both, or neither", f"{self.lower}, {self.upper}")
         if self.lower is not None and self.upper is not None:
-            three = len(self.lower) == len(self.upper) == 3
-            if not three or not np.less(self.lower, self.upper).all():
-                raise ValueError(f"lower = {self.lower}, upper = {self.upper} m must span a box")
+            valid = (
+                len(self.lower) == len(self.upper) == 3 and np.less(self.lower, self.upper).all()
+            )
+            require_field(self, "upper", valid, f"above lower = {self.lower} along each axis")
 
 
 def octomap_world(config: OctomapConfig, seed: int) -> World:
-    """Reads the map of `config`; its colours, which it has not, are those of heights.
-
-    Raises:
-        FileNotFoundError, ValueError: for a map that is not there or damaged.
-        InfeasibleFlightError: if no start and goal can be chosen or drawn in it.
-    """
+    """Reads the map of `config`, colored by height."""
     config.validate()
     path = find_scene(config)
     octomap = read_octomap(path)
@@ -99,7 +95,7 @@ def octomap_world(config: OctomapConfig, seed: int) -> World:
 
 
 def _flown_part(config: OctomapConfig, octomap: Octomap) -> tuple[NDArray, NDArray]:
-    """The corners of the part that is flown in (3,) [m]; says so if it is not what is known."""
+    """Returns the corners (3,) [m] of the part that is flown in; logs if it is not all."""
     if config.lower is not None and config.upper is not None:
         return np.array(config.lower, float), np.array(config.upper, float)
     lower_W, upper_W = octomap.part(_MOST_VOXELS)
@@ -114,11 +110,7 @@ def _flown_part(config: OctomapConfig, octomap: Octomap) -> tuple[NDArray, NDArr
 
 
 def voxel_gaussians(esdf: Esdf, hour: Daylight) -> GaussianScene:
-    """A Gaussian for each occupied voxel that a free one touches, facing where it is free.
-
-    Raises:
-        ValueError: if there is none.
-    """
+    """Returns a Gaussian for each occupied voxel that touches a free one, facing free space."""
     occupied = esdf.states == FieldState.OCCUPIED
     shell = occupied & binary_dilation(esdf.states == FieldState.FREE)
     index = np.argwhere(shell)

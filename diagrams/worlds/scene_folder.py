@@ -1,19 +1,19 @@
-"""Scene folders: a reconstructed place on disk.
+"""Scene folders: a reconstructed environment on disk.
 
 `gaussians.ply` is what cameras see, `esdf.npz` what collides, and `scene.yaml` (`SceneMetadata`)
-where it comes from and how it is to be used. `environment.png`, if there is one, has the colours
-of what lies infinitely far (`EnvironmentMap`). `frontier.ply`, if there is one, closes the place
-where nobody looked any further: cameras of flights see it too, measures of the scene do not.
+where it comes from and how it is to be used. `environment.png`, if present, has the colors of the
+background (`EnvironmentMap`). `frontier.ply`, if present, closes the scene at unobserved space:
+cameras of flights see it, metrics of the scene do not.
 """
 
 import functools
 import logging
-import math
 import os
 import shutil
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +49,7 @@ from splatpilot.systems.common.files import (
     written_atomically,
 )
 from splatpilot.systems.common.readers import read_text, reason_of, yaml_errors
+from splatpilot.systems.common.validation import Config, bounded, require, require_field
 from splatpilot.systems.splats.background import FAR, Background, EnvironmentMap, mean_color
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.splats.splat_files import read_ply, read_splats, write_ply
@@ -58,78 +59,76 @@ FORMAT_VERSION = 2
 CAPTURE = "capture"  # folder of a capture that was rendered for the scene
 ENVIRONMENT = "environment.png"
 FRONTIER = "frontier.ply"
+REPRESENTATIONS = "3dgs", "2dgs"
 WORLD_FRAME = "z up"
-REPRESENTATIONS = ("3dgs", "2dgs")
 
 
 @dataclass(kw_only=True)
-class SceneMetadata:
-    """The content of `scene.yaml`. Fields that a file lacks have the defaults given here, except
-    for the vectors, which it must give."""
+class SceneMetadata(Config):
+    """The content of `scene.yaml`. Missing fields have defaults, except for the vectors."""
 
     format_version: int = FORMAT_VERSION
     name: str = ""
     provenance: str = ""
-    """What the scene was made from, and how."""
+    """Describes what the scene was made from, and how."""
     split: str = ""
-    """What the scene is for: "train", "validation" or "test"; empty if unknown."""
+    """"train", "validation" or "test"; empty if unknown."""
     source_digest: list[str] = field(default_factory=list)
-    """Digest of what the scene was made from, see `splits.source_digest`: of the images that it was
-    fitted to, or of the mesh or generated world that they were rendered of. Empty if unknown."""
-    world_frame: str = WORLD_FRAME
+    """Digest of the source, see `splits.source_digest`: of the images that the scene was fitted to,
+    or of the mesh or generated world that they were rendered from. Empty if unknown."""
+    world_frame: str = bounded(WORLD_FRAME, f"{{{WORLD_FRAME}}}")
     metric: bool = True
-    """Whether the unit of length is the metre."""
-    origin: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
+    """True if the unit of length is the meter."""
+    origin: list[float] = bounded(lambda: [0.0] * 3, "(-inf, inf) m")
     """[m], position of the scene's origin in the world of the capture's files, upright and in
     meters; all positions of the scene are relative to it."""
-    lower_W: list[float] = field(default_factory=list)
+    lower_W: list[float] = bounded(list, "(-inf, inf) m")
     """[m], lower corner of the distance field."""
-    upper_W: list[float] = field(default_factory=list)
+    upper_W: list[float] = bounded(list, "(-inf, inf) m")
     """[m], upper corner of the distance field."""
     observed_free_volume: float = 0.0
-    """[m^3], space seen to be free."""
+    """[m^3], volume of observed free space."""
     gains: list[float] = field(default_factory=list)
     """Brightness of each image of the capture relative to the scene, in frame order."""
     vignetting: float = 0.0
-    """Logarithm of the brightness of the capture's image corners relative to their centres; it
-    falls with the square of the distance from the centre. The scene is free of it."""
-    background: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
-    """Colour where no Gaussian is seen; red, green, blue in 0 to 1."""
+    """Logarithm of the brightness of the capture's image corners relative to their centers; it
+    falls with the square of the distance from the center. The scene is free of it."""
+    background: list[float] = bounded(lambda: [0.0] * 3, "[0, 1]")
+    """Color of pixels without Gaussians: red, green, blue."""
     environment: bool = False
-    """Whether `environment.png` has that colour for each direction; `background` is their mean."""
+    """True if `environment.png` has that color for each direction; `background` is its mean."""
     frontier: bool = False
-    """Whether `frontier.ply` stands where the distance field has obstacles that nobody saw."""
-    p_WS: list[float] = field(default_factory=list)
+    """True if `frontier.ply` draws the obstacles of the distance field at unobserved space."""
+    p_WS: list[float] = bounded(list, "(-inf, inf) m")
     """[m], default start."""
-    p_WG: list[float] = field(default_factory=list)
+    p_WG: list[float] = bounded(list, "(-inf, inf) m")
     """[m], default goal."""
-    representation: str = "3dgs"
+    representation: str = bounded("3dgs", f"{{{', '.join(REPRESENTATIONS)}}}")
     """"3dgs": Gaussians; "2dgs": surfels, kept as Gaussians that are as flat as allowed."""
     capture: str = ""
     """Folder of the capture that the scene was made from; empty if unknown."""
     capture_settings: list[str] = field(default_factory=list)
-    """What was set about the capture when it was read, "depth_unit=5000.0" for example; without it
-    the folder would be read otherwise."""
+    """Settings with which the capture was read, for example "depth_unit=5000.0"."""
     capture_notes: list[str] = field(default_factory=list)
-    """What was assumed or not used when the capture was read, and where intrinsics come from."""
-    held_out: list[int] = field(default_factory=list)
-    """Frames of the capture that had no part in making the scene."""
-    image_width: int = 0
-    """[px], to which images were scaled down for the making; 0 if they were not."""
-    perturbation_bound: float | None = None
-    """[m], how far from the poses of the capture images of the scene can be trusted, as
-    `splatpilot scene fidelity` measured it; None before."""
-    pose_perturbation_bounds: list[float] = field(default_factory=list)
+    """Assumptions and unused parts when the capture was read, and the source of intrinsics."""
+    held_out: list[int] = bounded(list, "[0, inf)")
+    """Frames of the capture that were not used to make the scene."""
+    image_width: int = bounded(0, "[0, inf) px")
+    """[px], to which images were scaled down; 0 if they were not."""
+    perturbation_bound: float | None = bounded(None, "[0, inf) m")
+    """[m], distance from the poses of the capture up to which images of the scene can be trusted,
+    as measured by `splatpilot scene fidelity`; None before."""
+    pose_perturbation_bounds: list[float] = bounded(list, "[0, inf) m")
     """[m], the same for each pose of the capture, in frame order; empty before."""
+
+    def check(self) -> None:
+        for name in ("origin", "lower_W", "upper_W", "background", "p_WS", "p_WG"):
+            require_field(self, name, len(getattr(self, name)) == 3, "three finite numbers")
+        check_split(self.split)
 
 
 def read_scene_metadata(path: str | Path) -> SceneMetadata:
-    """Reads `scene.yaml` of the scene folder `path`.
-
-    Raises:
-        ValueError: for unknown or missing fields, values of the wrong kind, vectors that have not
-            three finite components and a format version that is not known.
-    """
+    """Reads `scene.yaml` of the scene folder `path`."""
     file = Path(path) / "scene.yaml"
     text = read_text(file)
     try:
@@ -138,109 +137,60 @@ def read_scene_metadata(path: str | Path) -> SceneMetadata:
     except Exception as error:  # Drake's reader raises any type.
         remedy = "reconstruct the scene again or repair it"
         raise ValueError(f"{file}: {reason_of(error)}; {remedy}") from None
-    if metadata.format_version < FORMAT_VERSION:
-        raise ValueError(
-            f"{file}: format version {metadata.format_version}, from when scenes had no background "
-            "of their own and translucent surfaces; reconstruct the scene again"
-        )
-    if metadata.format_version > FORMAT_VERSION:
-        raise ValueError(
-            f"{file}: format version {metadata.format_version}, this program knows "
-            f"{FORMAT_VERSION}; use the version of the program that wrote the scene"
-        )
-    for name in ("origin", "lower_W", "upper_W", "background", "p_WS", "p_WG"):
-        value = getattr(metadata, name)
-        if len(value) != 3 or not np.isfinite(value).all():
-            raise ValueError(f"{file}: {name} is {value}, three finite numbers are needed")
-    if metadata.world_frame != WORLD_FRAME:
-        raise ValueError(
-            f"{file}: world_frame is {metadata.world_frame!r}, it must be {WORLD_FRAME!r}; "
-            "turn the scene and reconstruct it again"
-        )
-    if not all(0 <= value <= 1 for value in metadata.background):
-        raise ValueError(f"{file}: background is {metadata.background}, 0 to 1 is needed")
-    if metadata.representation not in REPRESENTATIONS:
-        raise ValueError(
-            f"{file}: representation is {metadata.representation!r}, it must be one of "
-            f"{REPRESENTATIONS}"
-        )
-    if metadata.image_width < 0 or any(frame < 0 for frame in metadata.held_out):
-        raise ValueError(
-            f"{file}: image_width is {metadata.image_width} and held_out {metadata.held_out}; "
-            "neither may be negative"
-        )
+    version = metadata.format_version
+    old = version < FORMAT_VERSION
+    remedy = "reconstruct the scene again" if old else "use a newer version of the program"
+    what = f"{file}: format_version"
+    require(version == FORMAT_VERSION, what, str(FORMAT_VERSION), version, remedy)
     try:
-        check_split(metadata.split)
+        metadata.validate()
     except ValueError as error:
         raise ValueError(f"{file}: {error}") from None
-    bounds = np.array([metadata.perturbation_bound or 0.0, *metadata.pose_perturbation_bounds])
-    if not (np.isfinite(bounds) & (bounds >= 0)).all():
-        raise ValueError(
-            f"{file}: perturbation_bound is {metadata.perturbation_bound} and "
-            f"pose_perturbation_bounds {metadata.pose_perturbation_bounds}; finite lengths [m] of "
-            "at least 0 are needed, run `splatpilot scene fidelity` again"
-        )
     return metadata
 
 
 def write_scene_metadata(path: str | Path, metadata: SceneMetadata) -> None:
-    """Replaces `scene.yaml` of the scene folder `path`, whole or not at all.
-
-    Raises:
-        OSError: if it cannot be written.
-    """
+    """Replaces `scene.yaml` of the scene folder `path` atomically."""
     with written_atomically(Path(path) / "scene.yaml") as partial:
         yaml_dump_typed(metadata, filename=str(partial))
 
 
 _log = logging.getLogger(__name__)
 _MAX_VOXELS = 2e7
-_COARSEST = 0.25  # [m], voxels at which a vehicle of 0.354 m radius still finds its way
+_MAX_VOXEL = 0.25  # [m], at which a vehicle of 0.354 m radius still finds a route
 
 
 def read_scene(path: str | Path) -> World:
-    """Reads a scene folder, or a file of Gaussians alone, see `read_splats`.
-
-    Raises:
-        FileNotFoundError, ValueError: if there is no scene at `path`, or a damaged one.
-    """
+    """Reads a scene folder, or a file of Gaussians alone, see `read_splats`."""
     path = Path(path)
     return read_scene_folder(path) if path.is_dir() else _read_bare_gaussians(path)
 
 
 def read_scene_folder(path: str | Path, *, metric: bool = True) -> World:
-    """Reads a scene folder; with `metric` false also one whose unit of length is unknown, to be
-    looked at and measured, not flown in.
-
-    Raises:
-        FileNotFoundError: if the folder or one of its files is missing.
-        ValueError: if a file is damaged, has an unknown field, or the scene is not metric.
-    """
+    """Reads a scene folder; if `metric` is false also without scale, to be viewed and measured."""
     path = Path(path)
     for file in (path, path / "scene.yaml", path / "gaussians.ply", path / "esdf.npz"):
         if not file.exists():
             raise FileNotFoundError(
-                f"{file}: does not exist; a scene is a folder with gaussians.ply, esdf.npz and "
-                "scene.yaml, as `splatpilot reconstruct` writes it"
+                f"No such file: {file}; a scene is a folder with gaussians.ply, esdf.npz and "
+                "scene.yaml, as written by `splatpilot reconstruct`"
             )
     metadata = read_scene_metadata(path)
-    if metric and not metadata.metric:
-        raise ValueError(
-            f"{path / 'scene.yaml'}: the scale of this scene is unknown (metric: false), so no "
-            f"distance in it can be trusted; measure something in `splatpilot view {path}` and "
-            "give the scene its size with `splatpilot scene scale`"
-        )
+    remedy = (
+        f"measure a length in `splatpilot view {path}` and rescale with `splatpilot scene scale`"
+    )
+    if metric:
+        require(metadata.metric, f"{path / 'scene.yaml'}: metric", "true to fly", "false", remedy)
     gaussians = read_ply(path / "gaussians.ply")
     if metadata.frontier:
         gaussians = gaussians.merged_with(read_ply(path / FRONTIER))
     esdf = Esdf.load(path / "esdf.npz")
     for name in ("lower_W", "upper_W"):
-        said, found = getattr(metadata, name), getattr(esdf, name)
-        if not np.allclose(said, found, atol=1e-6):
-            raise ValueError(
-                f"{path}: scene.yaml has {name} {said}, but esdf.npz has {found.tolist()}; "
-                "the files are of different scenes"
-            )
+        stated, found = getattr(metadata, name), getattr(esdf, name)
+        condition = f"that of esdf.npz, {found.tolist()}"
+        remedy = "the files are of different scenes"
+        valid = np.allclose(stated, found, atol=1e-6)
+        require(valid, f"{path / 'scene.yaml'}: {name}", condition, stated, remedy)
     return World(
         name=metadata.name,
         gaussians=gaussians,
@@ -253,11 +203,7 @@ def read_scene_folder(path: str | Path, *, metric: bool = True) -> World:
 
 
 def read_background(path: Path, metadata: SceneMetadata) -> Background:
-    """Returns the background of the scene folder `path`, whose `scene.yaml` says `metadata`.
-
-    Raises:
-        FileNotFoundError, ValueError: if `environment.png` is missing or damaged.
-    """
+    """Returns the background of the scene folder `path` with this metadata."""
     if metadata.environment:
         return EnvironmentMap.load(path / ENVIRONMENT)
     red, green, blue = metadata.background
@@ -265,80 +211,50 @@ def read_background(path: Path, metadata: SceneMetadata) -> Background:
 
 
 def check_scene_target(path: str | Path) -> None:
-    """Checks that a scene may be written to `path`: nothing there, an empty folder, a scene, or the
-    capture that it is made of, in `CAPTURE`.
+    """Checks that a scene may be written to `path`.
 
-    Raises:
-        ValueError: if something else is there.
-        OSError: if the folder in which it would stand cannot be made or written to.
+    It must be absent, an empty folder, a scene, or a folder with the scene's own `CAPTURE`.
     """
     path = Path(path).absolute()
     if path.exists() and not (path / "scene.yaml").is_file():
         own = {CAPTURE, f".{CAPTURE}.partial"}
-        if not path.is_dir() or {entry.name for entry in path.iterdir()} - own:
-            raise ValueError(
-                f"{path}: exists and is no scene, so it is not overwritten; choose another folder"
-            )
+        empty = path.is_dir() and {entry.name for entry in path.iterdir()} <= own
+        require(empty, "scene folder", "new, empty or a scene", path, "choose another folder")
     parent = next(parent for parent in path.parents if parent.exists())
     if not parent.is_dir():
-        raise NotADirectoryError(f"{parent}: is a file, so {path} cannot stand in it")
+        raise NotADirectoryError(f"{parent}: is a file, not a folder for {path.name}")
     require_writable_folder(parent)
 
 
 def write_scene_folder(
-    path: str | Path,
-    world: World,
-    frontier: GaussianScene | None = None,
-    *,
-    provenance: str,
-    gains: Sequence[float] = (),
-    vignetting: float = 0.0,
-    metric: bool = True,
-    representation: str = "3dgs",
-    capture: str = "",
-    capture_settings: Sequence[str] = (),
-    capture_notes: Sequence[str] = (),
-    origin: Sequence[float] | NDArray[np.float64] = (0.0, 0.0, 0.0),
-    held_out: Sequence[int] = (),
-    image_width: int = 0,
-    split: str = "",
-    source_digest: Sequence[str] = (),
+    path: str | Path, world: World, frontier: GaussianScene | None = None, **fields: Any
 ) -> SceneMetadata:
-    """Writes `world` as a scene folder and returns what its `scene.yaml` says; see `SceneMetadata`
-    for what is said about it. Its Gaussians are without the `frontier`, see `close_frontier`.
+    """Writes `world` as a scene folder atomically, replacing a scene there.
 
-    The folder appears whole: it is written beside its place and renamed. A scene that stands there
-    is replaced in the same step. Only the grid of the distance field is kept.
+    Only the grid of the distance field is kept.
 
-    Raises:
-        ValueError, OSError: see `check_scene_target`; or if the disk is full.
+    Args:
+        path: of the folder, see `check_scene_target`.
+        frontier: see `close_frontier`; not part of the world's Gaussians.
+        fields: of `SceneMetadata` that do not follow from the world; numpy arrays become lists.
+
+    Returns:
+        The metadata written.
     """
     path = Path(path).absolute()
     check_scene_target(path)
     esdf = world.esdf
     metadata = SceneMetadata(
         name=world.name,
-        provenance=provenance,
-        split=split,
-        source_digest=list(source_digest),
-        metric=metric,
-        lower_W=[float(x) for x in esdf.lower_W],
-        upper_W=[float(x) for x in esdf.upper_W],
+        lower_W=esdf.lower_W.tolist(),
+        upper_W=esdf.upper_W.tolist(),
         observed_free_volume=esdf.volume(FieldState.FREE),
-        gains=[float(gain) for gain in gains],
-        vignetting=float(vignetting),
         background=[float(x) for x in mean_color(world.background)],
         environment=isinstance(world.background, EnvironmentMap),
-        p_WS=[float(x) for x in world.p_WS],
-        p_WG=[float(x) for x in world.p_WG],
+        p_WS=np.asarray(world.p_WS, float).tolist(),
+        p_WG=np.asarray(world.p_WG, float).tolist(),
         frontier=frontier is not None,
-        representation=representation,
-        capture=capture,
-        capture_settings=list(capture_settings),
-        capture_notes=list(capture_notes),
-        origin=[float(x) for x in origin],
-        held_out=[int(frame) for frame in held_out],
-        image_width=image_width,
+        **{name: np.asarray(value).tolist() for name, value in fields.items()},
     )
     with folder_written_atomically(path, replace=True) as new:
         write_ply(world.gaussians, new / "gaussians.ply")
@@ -354,18 +270,16 @@ def write_scene_folder(
 
 
 def _read_bare_gaussians(path: Path) -> World:
-    """Builds a world from Gaussians alone: every place that no Gaussian fills counts as free."""
+    """Builds a world from Gaussians alone: space without Gaussians counts as free."""
     gaussians = read_splats(path)
-    # A few stray Gaussians far away must not stretch the grid; beyond it all counts as occupied.
+    # A few outliers far away must not stretch the grid; beyond it all counts as occupied.
     lower_W, upper_W = np.percentile(gaussians.means.astype(float), [1, 99], axis=0)
     lower_W, upper_W = lower_W - 0.1, upper_W + 0.1
     voxel_size = max(0.1, float(np.cbrt(np.prod(upper_W - lower_W) / _MAX_VOXELS)))
-    if voxel_size > _COARSEST:
-        raise ValueError(
-            f"{path}: 98 % of the Gaussians span {np.round(upper_W - lower_W, 1).tolist()} m, for "
-            f"which voxels of {voxel_size:.2f} m would be needed, more than {_COARSEST} m; crop "
-            "far Gaussians away, or give it its size with `splatpilot scene scale`"
-        )
+    extent = np.round(upper_W - lower_W, 1).tolist()
+    condition = f"small enough for voxels of {_MAX_VOXEL} m"
+    remedy = "crop far Gaussians away, or rescale with `splatpilot scene scale`"
+    require(voxel_size <= _MAX_VOXEL, f"{path}: extent", condition, f"{extent} m", remedy)
     esdf = esdf_from_gaussians(gaussians, voxel_size, lower_W, upper_W)
     p_WS, p_WG, length = choose_start_and_goal(esdf, VEHICLE_RADIUS)
     if warning := short_route_warning(length):
@@ -382,55 +296,36 @@ def _read_bare_gaussians(path: Path) -> World:
 
 
 @dataclass
-class SceneSource:
-    """A place on disk."""
+class SceneSource(Config):
+    """An environment on disk."""
 
-    # A scene folder, or a file of Gaussians (PLY, SPZ or .splat); one that is not there is looked
-    # for in the folder that the environment variable SPLATPILOT_SCENES names, or in `scenes`.
+    # A scene folder, or a file of Gaussians (PLY, SPZ or .splat): here, or in the folder of the
+    # environment variable SPLATPILOT_SCENES, by default `scenes`.
     path: str = ""
-    # How to get the scene: what the error says if it is not there.
+    # How to get the scene, for the error if it is missing.
     source: str = ""
-    # Whether start and goal are drawn from the seed; otherwise they are the scene's own.
+    # If true, start and goal are drawn from the seed; otherwise they are the scene's own.
     draw_ends: bool = False
-    # [m] Least length of the shortest way between ends that are drawn.
-    least_way: float = SHORTEST
+    # [m] Minimum length of the shortest route between ends that are drawn.
+    least_way: float = bounded(SHORTEST, "[0, inf) m")
 
-    def validate(self) -> None:
-        """
-        Raises:
-            ValueError: if no path is given, or the least way is negative or infinite.
-        """
-        if not self.path:
-            raise ValueError("world.path is empty; name a scene folder or a file of Gaussians")
-        if not 0 <= self.least_way < math.inf:
-            raise ValueError(
-                f"world.least_way is {self.least_way} m; it must be finite and at least 0"
-            )
+    def check(self) -> None:
+        require_field(self, "path", self.path, "a scene folder or a file of Gaussians")
 
 
 @dataclass
 class SceneConfig(SceneSource):
-    """A scene on disk. It is no base of others, for the reason that `ForestConfig` gives."""
+    """A scene on disk. Not a base of others, see `ForestConfig`."""
 
 
 def find_scene(config: SceneSource) -> Path:
-    """The place of a scene.
-
-    Raises:
-        FileNotFoundError: if it is in none of the places where scenes are looked for; the message
-            says how to get it.
-    """
+    """Returns the path of a scene; the error of a missing one says how to get it."""
     config.validate()
     return require_scene(config.path, config.source)
 
 
 def read_scene_world(config: SceneSource, seed: int) -> World:
-    """Reads the scene of `config`.
-
-    Raises:
-        FileNotFoundError, ValueError: see `find_scene` and `read_scene`.
-        InfeasibleFlightError: see `draw_start_and_goal`.
-    """
+    """Reads the scene of `config`."""
     world = read_scene(find_scene(config))
     if not config.draw_ends:
         return world
@@ -442,14 +337,14 @@ _CELL = 2
 """[-] Voxels along the edge of the cells whose faces one surfel covers."""
 
 _SUNK = 0.5
-"""[-] Voxels from the faces into what is hidden, so that no edge of a surfel hangs out of it."""
+"""[-] Voxels from the faces into hidden space, so that no edge of a surfel sticks out."""
 
 _COVERAGE = 0.55
-"""Standard deviation of a surfel over the edge of its square. Less than in generated worlds, whose
-patches may hang over edges a little more: here that would hide what was captured."""
+"""Standard deviation of a surfel over the edge of its square; less than in generated worlds, so
+that no surfel hides captured surfaces."""
 
 _WIDTH = 160
-"""[px], about as wide depth images are thinned to."""
+"""[px], approximate width to which depth images are thinned."""
 
 _FAR_VOXEL, _FAR_VOXELS = 2, 2e6
 """[-] Edge of the voxels in which the frontier beyond the field's range is found, in voxels of the
@@ -459,25 +354,24 @@ _STRIPE = 0.4
 """[m], period of the hatching along each axis."""
 
 _SHADES = np.array([0.62, 0.42])
-"""Grey of its two tones, 0 to 1."""
+"""Gray of its two tones, 0 to 1."""
 
 
 def close_frontier(
     esdf: Esdf, depths: Iterable[np.ndarray], K: np.ndarray, X_WCs: Sequence[RigidTransform]
 ) -> tuple[Esdf, GaussianScene | None]:
-    """Closes a captured scene where space that the vehicle can look into ends in unknown space.
+    """Closes a captured scene where reachable space ends in unknown space.
 
-    Without it nothing would be seen there, and flights would end all the same. What nobody looked
-    into begins with obstacles, and hatched surfels are drawn on them. Space before the sky, and
-    before what was captured beyond the field's range, stays open. There the surfels begin where
-    the images saw no farther, on a coarse grid of its own: none hides what was captured.
+    Unknown space begins with obstacles, on which hatched surfels are drawn. Space before the sky,
+    and before surfaces beyond the field's range, stays open. There the surfels begin where the
+    images saw no farther, on a coarse grid of its own: none hides captured surfaces.
 
     Args:
         esdf: the distance field of the scene.
-        depths, K, X_WCs: what it was made of, see `esdf_from_depth_images`.
+        depths, K, X_WCs: its images, see `esdf_from_depth_images`.
 
     Returns:
-        The distance field with these obstacles, and the surfels; `esdf` and None where there is
+        The distance field with these obstacles, and the surfels; `esdf` and None if there is
         nothing to close.
     """
     images = []
@@ -512,8 +406,9 @@ def _far_frontier(
 
 
 def _draw(esdf: Esdf, centers: NDArray[np.float64], normals: NDArray[np.float64]) -> GaussianScene:
-    """Faces of voxels (F, 3), (F, 3), see `frontier_faces`, as surfels: one for those in each cell,
-    of their mean and their spread, so that it lies across the steps of a slanted frontier."""
+    """Draws faces of voxels (F, 3), (F, 3), see `frontier_faces`, as one surfel per cell.
+
+    It has their mean and spread, so that it lies across the steps of a slanted frontier."""
     _, cell = np.unique((centers // _CELL).astype(int), axis=0, return_inverse=True)
     count = np.bincount(cell)
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import cv2
 
-from splatpilot.diagrams.worlds.solids.solid import Blueprint
+from splatpilot.diagrams.worlds.solids.solid import WorldSpec
 from splatpilot.diagrams.worlds.solids.solid_mesh import Mesh, mesh_of, mesh_of_gaussians
 from splatpilot.diagrams.worlds.solids.surfaces import merge
 from splatpilot.systems.collision.esdf_build import esdf_from_distance_field
@@ -16,8 +16,8 @@ from splatpilot.systems.common.files import written_atomically
 _NEAREST, _LINEAR, _CLAMP = 9728, 9729, 33071
 
 
-def write_gltf(blueprint: Blueprint, path: Path, texel: float = 0.02) -> None:
-    """Writes the world of a blueprint as one self-contained .gltf file.
+def write_gltf(spec: WorldSpec, path: Path, texel: float = 0.02) -> None:
+    """Writes the world of a spec as one self-contained .gltf file.
 
     Its light is baked into the pictures, which are emitted as they are: an engine shows the same
     colours whatever lamps it has. The file is y-up, as glTF is: W's (x, y, z) is its (x, z, -y).
@@ -29,11 +29,9 @@ def write_gltf(blueprint: Blueprint, path: Path, texel: float = 0.02) -> None:
     Raises:
         OSError: if the file cannot be written.
     """
-    light = blueprint.light(
-        esdf_from_distance_field(blueprint.distance_field, blueprint.voxel_size)
-    )
-    meshes = mesh_of(blueprint, light, texel)
-    surroundings = blueprint.surroundings()
+    light = spec.light(esdf_from_distance_field(spec.distance_field, spec.voxel_size))
+    meshes = mesh_of(spec, light, texel)
+    surroundings = spec.surroundings()
     if surroundings:
         meshes.append(mesh_of_gaussians(merge(surroundings)))
     with written_atomically(path) as temporary:

@@ -6,13 +6,13 @@ from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
 from splatpilot.diagrams.worlds.dodgedrone import DodgeDroneConfig, dodgedrone_world
-from splatpilot.diagrams.worlds.forest.forest import forest_blueprint
+from splatpilot.diagrams.worlds.forest.forest import forest_spec
 from splatpilot.diagrams.worlds.forest.layout import ForestConfig
 from splatpilot.diagrams.worlds.indoor import (
     OfficeConfig,
     RoomConfig,
-    office_blueprint,
-    room_blueprint,
+    office_spec,
+    room_spec,
 )
 from splatpilot.diagrams.worlds.inserted import InsertedConfig, inserted_world
 from splatpilot.diagrams.worlds.octomap_world import OCTOMAP, OctomapConfig, octomap_world
@@ -21,13 +21,13 @@ from splatpilot.diagrams.worlds.outdoor import (
     ClutterConfig,
     OverUnderConfig,
     WallsConfig,
-    branches_blueprint,
-    clutter_blueprint,
-    over_under_blueprint,
-    walls_blueprint,
+    branches_spec,
+    clutter_spec,
+    over_under_spec,
+    walls_spec,
 )
 from splatpilot.diagrams.worlds.scene_folder import SceneConfig, read_scene_world
-from splatpilot.diagrams.worlds.solids.solid import Blueprint
+from splatpilot.diagrams.worlds.solids.solid import WorldSpec
 from splatpilot.diagrams.worlds.solids.surfels import build
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.common.config import require_configuration
@@ -52,7 +52,7 @@ class WorldKind:
     # From a configuration and a seed to a world: the same arguments, the same bits.
     make: Callable[[Any, int], World]
     # The same world as solids, start and goal, if it is generated: cheap.
-    make_blueprint: Callable[[Any, int], Blueprint] | None = None
+    make_spec: Callable[[Any, int], WorldSpec] | None = None
 
 
 WORLDS = Registry("world", "splatpilot.worlds", WorldKind)
@@ -62,27 +62,27 @@ WORLDS = Registry("world", "splatpilot.worlds", WorldKind)
 def register_world(
     config: type,
     make: Callable[[Any, int], World] | None = None,
-    make_blueprint: Callable[[Any, int], Blueprint] | None = None,
+    make_spec: Callable[[Any, int], WorldSpec] | None = None,
 ) -> None:
     """
     Makes a kind of world known, so that scenarios can name it by its configuration's type.
 
     Args:
         config: the type of its configurations, see `WorldConfig`; its name is their YAML tag.
-        make: see `WorldKind.make`; draws and samples the blueprint if None.
-        make_blueprint: see `WorldKind.make_blueprint`; needed to train and render captures in it.
+        make: see `WorldKind.make`; draws and samples the spec if None.
+        make_spec: see `WorldKind.make_spec`; needed to train and render captures in it.
 
     Raises:
         ValueError: if another world has the name, the type is none of configurations, or neither
             function is given.
     """
     if make is None:
-        if make_blueprint is None:
-            raise ValueError(f"{config.__name__}: give make or make_blueprint")
-        plan = make_blueprint
+        if make_spec is None:
+            raise ValueError(f"{config.__name__}: give make or make_spec")
+        plan = make_spec
         make = lambda config, seed: build(plan(config, seed))  # noqa: E731
     require_configuration(config)
-    WORLDS.add(config.__name__, WorldKind(config, make, make_blueprint))
+    WORLDS.add(config.__name__, WorldKind(config, make, make_spec))
 
 
 def make_world(config: WorldConfig, seed: int) -> World:
@@ -113,11 +113,11 @@ def place_config(path: Path) -> SceneConfig | OctomapConfig:
 
 
 def is_procedural(config: WorldConfig) -> bool:
-    """Whether the world is generated, so that `make_blueprint` makes it too."""
-    return WORLDS.kind_of(config).make_blueprint is not None
+    """Whether the world is generated, so that `make_spec` makes it too."""
+    return WORLDS.kind_of(config).make_spec is not None
 
 
-def make_blueprint(config: WorldConfig, seed: int) -> Blueprint:
+def make_spec(config: WorldConfig, seed: int) -> WorldSpec:
     """
     Generates a procedural world as solids, start and goal, without Gaussians and grids: cheap.
     `write_gltf` exports it as a mesh, `make_world` of the same arguments gives the same world.
@@ -125,19 +125,19 @@ def make_blueprint(config: WorldConfig, seed: int) -> Blueprint:
     Raises:
         ValueError: for a world that is not generated, and parameters no world can be made of.
     """
-    plan = WORLDS.kind_of(config).make_blueprint
+    plan = WORLDS.kind_of(config).make_spec
     if plan is None:
-        raise ValueError(f"{type(config).__name__} is no generated world: it has no blueprint")
+        raise ValueError(f"{type(config).__name__} is no generated world: it has no spec")
     return plan(config, seed)
 
 
-register_world(ForestConfig, make_blueprint=forest_blueprint)
-register_world(BranchesConfig, make_blueprint=branches_blueprint)
-register_world(ClutterConfig, make_blueprint=clutter_blueprint)
-register_world(WallsConfig, make_blueprint=walls_blueprint)
-register_world(RoomConfig, make_blueprint=room_blueprint)
-register_world(OfficeConfig, make_blueprint=office_blueprint)
-register_world(OverUnderConfig, make_blueprint=over_under_blueprint)
+register_world(ForestConfig, make_spec=forest_spec)
+register_world(BranchesConfig, make_spec=branches_spec)
+register_world(ClutterConfig, make_spec=clutter_spec)
+register_world(WallsConfig, make_spec=walls_spec)
+register_world(RoomConfig, make_spec=room_spec)
+register_world(OfficeConfig, make_spec=office_spec)
+register_world(OverUnderConfig, make_spec=over_under_spec)
 register_world(SceneConfig, read_scene_world)
 register_world(InsertedConfig, inserted_world)
 register_world(OctomapConfig, octomap_world)

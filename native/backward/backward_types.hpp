@@ -31,20 +31,18 @@ struct ImageGradient {
   const float* expected_depth;  // the rendered depth, if it was divided by alpha, else null
   const float* rendered_alpha;
   float background[3];
-  bool absolute;  // absolute screen-space gradients are wanted
 };
 
 // Sums over pixels for one (splat, tile), h = alpha dL/dalpha: h, h u, h v, h u^2, h u v, h v^2,
-// dL/dcolor (3), dL/ddepth, |h u|, |h (u uy + v vy)|.
+// dL/dcolor (3), dL/ddepth.
 struct alignas(64) PairGradient {
   float sums[16];
 };
 
-// dL/d: mean (2) [1/px]; absolute sums of its terms (2); ln of the opacity; h u^2, h u v, h v^2;
-// color (3); depth.
+// dL/d: mean (2) [1/px]; ln of the opacity; h u^2, h u v, h v^2; color (3); depth.
 struct SplatGradient {
-  float mean[2], absolute_mean[2], log_opacity, uu, uv, vv, color[3], depth;
-  float unused[4];
+  float mean[2], log_opacity, uu, uv, vv, color[3], depth;
+  float unused[6];
 };
 static_assert(sizeof(SplatGradient) == 64);
 
@@ -60,7 +58,7 @@ struct GaussianGradients {
   float* scales;
   float* opacities;
   float* colors;
-  // Whether rows, or those of colours, are to be written, zeros included, instead of added to.
+  // Whether rows, or those of colors, are to be written, zeros included, instead of added to.
   bool overwrite, overwrite_colors;
 };
 

@@ -1,4 +1,4 @@
-// From gradients of colours to those of what the input gives for them.
+// From gradients of colors to those of what the input gives for them.
 #pragma once
 
 #include "backward/spherical_harmonics_backward.hpp"
@@ -7,7 +7,7 @@
 namespace splatpilot::SIMD_LEVEL {
 
 // Adds to rows of dL/dcolors and returns dL/d(p_W - centre), which is zero without spherical
-// harmonics. `color_gradient` is zero where a colour is held at 0.
+// harmonics. `color_gradient` is zero where a color is held at 0.
 SP_INLINE Vector16 colors_backward(const GaussianArrays& g, const uint32_t* indices, int lanes,
                                    const Vector16& d_W, const F16 color_gradient[3],
                                    float* gradients) {

@@ -8,6 +8,12 @@ namespace splatpilot::SIMD_LEVEL {
 
 SP_INLINE Vector16 broadcast(const float v[3]) { return {F16(v[0]), F16(v[1]), F16(v[2])}; }
 
+// From a gradient in the camera frame to the same in the world.
+SP_INLINE Vector16 to_world(const Camera& camera, const Vector16& c) {
+  const float* R = camera.R_CW;
+  return c.x * broadcast(R) + (c.y * broadcast(R + 3) + c.z * broadcast(R + 6));
+}
+
 // Splats and their gradients, one pack per field.
 struct SplatGradientPack {
   F16 ux, uy, vy;
@@ -41,13 +47,9 @@ SP_INLINE void factor_gradient(const Camera& camera, const SplatGradientPack& s,
   dp[1] = dp[1] + factor * (dot(q0, q0) * t1 - x01 * t0);
 }
 
-// Rotation R(q) scale = columns; from dL/dcolumns to dL/dquat and dL/dscale.
-SP_INLINE void covariance_factor_backward(const F16 q[4], const F16 scale[3],
-                                          const Vector16 rotation[3], const Vector16 dcolumns[3],
-                                          F16 dq[4], F16 dscale[3]) {
-  for (int k = 0; k < 3; ++k) dscale[k] = dot(dcolumns[k], rotation[k]);
-  const Vector16 c0 = scale[0] * dcolumns[0], c1 = scale[1] * dcolumns[1],
-                 c2 = scale[2] * dcolumns[2];
+// From the gradients of the columns of R(q), q of any length, to that of q.
+SP_INLINE void quaternion_gradient(const F16 q[4], const Vector16& c0, const Vector16& c1,
+                                   const Vector16& c2, F16 dq[4]) {
   const F16 inverse_length =
       F16(1.0f) / sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
   const F16 w = q[0] * inverse_length, x = q[1] * inverse_length, y = q[2] * inverse_length,
@@ -93,13 +95,16 @@ SP_INLINE Vector16 projection_rows_backward(const Camera& camera, const Vector16
 }
 
 struct GaussianGradientPack {
-  F16 mean[3], quat[4], scale[3], opacity;
+  Vector16 mean;
+  F16 quat[4], scale[3], opacity;
 };
 
 SP_INLINE void add_rows(const GaussianGradientPack& pack, const uint32_t* indices, int lanes,
                         const GaussianGradients& out) {
   alignas(64) float soa[11][kLanes];
-  for (int k = 0; k < 3; ++k) store(soa[k], pack.mean[k]);
+  store(soa[0], pack.mean.x);
+  store(soa[1], pack.mean.y);
+  store(soa[2], pack.mean.z);
   for (int k = 0; k < 4; ++k) store(soa[3 + k], pack.quat[k]);
   for (int k = 0; k < 3; ++k) store(soa[7 + k], pack.scale[k]);
   store(soa[10], pack.opacity);
@@ -111,6 +116,36 @@ SP_INLINE void add_rows(const GaussianGradientPack& pack, const uint32_t* indice
     out.opacities[i] += soa[10][lane];
   }
 }
+
+// Sums of PoseSums, lane by lane.
+struct PoseGradientPack {
+  Vector16 R[3], p_C, direction;
+
+  PoseGradientPack() {
+    const Vector16 zero = {F16(0.0f), F16(0.0f), F16(0.0f)};
+    R[0] = R[1] = R[2] = p_C = direction = zero;
+  }
+
+  // From the gradients of p_C and, by way of colors, of d_W = p_W - centre.
+  SP_INLINE void add(const Vector16& by_p_C, const Vector16& d_W, const Vector16& by_direction) {
+    R[0] = R[0] + by_p_C.x * d_W;
+    R[1] = R[1] + by_p_C.y * d_W;
+    R[2] = R[2] + by_p_C.z * d_W;
+    p_C = p_C + by_p_C;
+    direction = direction + by_direction;
+  }
+
+  SP_INLINE void write(PoseSums* sums) const {
+    const Vector16 vectors[5] = {R[0], R[1], R[2], p_C, direction};
+    for (int i = 0; i < 15; ++i) {
+      const Vector16& v = vectors[i / 3];
+      alignas(64) float lanes[kLanes];
+      store(lanes, i % 3 == 0 ? v.x : i % 3 == 1 ? v.y : v.z);
+      sums->values[i] = 0.0;
+      for (const float lane : lanes) sums->values[i] += static_cast<double>(lane);
+    }
+  }
+};
 
 // Gathers 16 splats and their gradients; lanes from `lanes` on repeat the first, without gradient.
 SP_INLINE void gather_splats(const Splat* splats, const SplatGradient* gradients,
@@ -133,7 +168,7 @@ SP_INLINE void gather_splats(const Splat* splats, const SplatGradient* gradients
     soa[7][lane] = keep * g.uv;
     soa[8][lane] = keep * g.vv;
     for (int c = 0; c < 3; ++c) {
-      // A colour that was cut off at 0 does not change with its coefficients.
+      // A color that was cut off at 0 does not change with its coefficients.
       const bool constant = colors_cut_off && !(splat.color[c] > 0.0f);
       soa[9 + c][lane] = constant ? 0.0f : keep * g.color[c];
     }
@@ -150,9 +185,7 @@ SP_INLINE void gather_splats(const Splat* splats, const SplatGradient* gradients
 inline void project_backward(const GaussianArrays& g, const Camera& camera, const Splat* splats,
                              size_t count, const SplatGradient* gradients, const float* means2d,
                              const GaussianGradients& out, PoseSums* pose) {
-  const F16 zero = F16(0.0f);
-  const Vector16 none = {zero, zero, zero};
-  Vector16 dR[3] = {none, none, none}, dp_sum = none, direction_sum = none;
+  PoseGradientPack pose_pack;
   for (size_t first = 0; first < count; first += kLanes) {
     const int lanes = count - first < kLanes ? static_cast<int>(count - first) : kLanes;
     uint32_t indices[kLanes];
@@ -180,32 +213,17 @@ inline void project_backward(const GaussianArrays& g, const Camera& camera, cons
       dm[i] = dp[i].x * columns[0] + (dp[i].y * columns[1] + dp[i].z * columns[2]);
     }
     GaussianGradientPack pack;
-    covariance_factor_backward(in.quat, in.scale, rotation, dcolumns, pack.quat, pack.scale);
-    const Vector16 dp_C = projection_rows_backward(camera, p_C, inverse_z, dm, s, dR);
-    dR[0] = dR[0] + dp_C.x * d_W;
-    dR[1] = dR[1] + dp_C.y * d_W;
-    dR[2] = dR[2] + dp_C.z * d_W;
-    dp_sum = dp_sum + dp_C;
+    for (int k = 0; k < 3; ++k) pack.scale[k] = dot(dcolumns[k], rotation[k]);
+    quaternion_gradient(in.quat, in.scale[0] * dcolumns[0], in.scale[1] * dcolumns[1],
+                        in.scale[2] * dcolumns[2], pack.quat);
+    const Vector16 dp_C = projection_rows_backward(camera, p_C, inverse_z, dm, s, pose_pack.R);
     const Vector16 direction = colors_backward(g, indices, lanes, d_W, s.color, out.colors);
-    direction_sum = direction_sum + direction;
-    const float* R = camera.R_CW;
-    const Vector16 dd_W =
-        dp_C.x * broadcast(R) + (dp_C.y * broadcast(R + 3) + dp_C.z * broadcast(R + 6)) + direction;
-    pack.mean[0] = dd_W.x;
-    pack.mean[1] = dd_W.y;
-    pack.mean[2] = dd_W.z;
+    pose_pack.add(dp_C, d_W, direction);
+    pack.mean = to_world(camera, dp_C) + direction;
     pack.opacity = s.log_opacity / in.opacity;
     add_rows(pack, indices, lanes, out);
   }
-  const Vector16 vectors[5] = {dR[0], dR[1], dR[2], dp_sum, direction_sum};
-  for (int i = 0; i < 15; ++i) {
-    const Vector16& v = vectors[i / 3];
-    alignas(64) float lanes[kLanes];
-    store(lanes, i % 3 == 0 ? v.x : i % 3 == 1 ? v.y : v.z);
-    double sum = 0.0;
-    for (int lane = 0; lane < kLanes; ++lane) sum += static_cast<double>(lanes[lane]);
-    pose->values[i] = sum;
-  }
+  pose_pack.write(pose);
 }
 
 }  // namespace splatpilot::SIMD_LEVEL

@@ -96,7 +96,7 @@ SP_INLINE BlockRecord* replay(BackwardScratch& s, const Pair* pairs, int count, 
 }
 
 // One register at a time, so that the sums stay in registers at every SIMD level.
-template <bool kColor, bool kDepth, bool kAbsolute>
+template <bool kColor, bool kDepth>
 SP_INLINE void backward_pair(const StagedSplat& splat, uint32_t touched, const BlockRecord* record,
                              BlockBackward* blocks, PairGradient& gradient) {
   Register sums[16] = {};
@@ -132,17 +132,12 @@ SP_INLINE void backward_pair(const StagedSplat& splat, uint32_t touched, const B
       sums[3] += hu * u;
       sums[4] += hu * v;
       sums[5] += hv * v;
-      if constexpr (kAbsolute) {
-        const Register along_y = hu * splat.uy + hv * splat.vy;
-        sums[10] += register_max(hu, -hu);
-        sums[11] += register_max(along_y, -along_y);
-      }
     }
   }
   sum_lanes(sums, gradient.sums);
 }
 
-template <bool kColor, bool kDepth, bool kAbsolute>
+template <bool kColor, bool kDepth>
 size_t raster_tile_backward_channels(const RasterInput& in, const StageReader& record,
                                      const ImageGradient& g, int tile, BackwardScratch& s,
                                      PairGradient* gradients) {
@@ -181,8 +176,8 @@ size_t raster_tile_backward_channels(const RasterInput& in, const StageReader& r
     records += static_cast<size_t>(block_record - s.records);
     for (int i = count; i-- > 0;) {
       block_record -= __builtin_popcount(s.touched[i]);
-      backward_pair<kColor, kDepth, kAbsolute>(s.splats[i], s.touched[i], block_record, s.blocks,
-                                               gradients[begin + i]);
+      backward_pair<kColor, kDepth>(s.splats[i], s.touched[i], block_record, s.blocks,
+                                    gradients[begin + i]);
     }
   }
   return records;
@@ -192,18 +187,11 @@ inline size_t raster_tile_backward(const RasterInput& in, const StageReader& rec
                                    const ImageGradient& g, int tile, void* scratch,
                                    PairGradient* gradients) {
   BackwardScratch& s = *static_cast<BackwardScratch*>(scratch);
-  const auto run = [&]<bool kAbsolute>() {
-    if (g.color && g.depth) {
-      return raster_tile_backward_channels<true, true, kAbsolute>(in, record, g, tile, s,
-                                                                  gradients);
-    }
-    if (g.color) {
-      return raster_tile_backward_channels<true, false, kAbsolute>(in, record, g, tile, s,
-                                                                   gradients);
-    }
-    return raster_tile_backward_channels<false, true, kAbsolute>(in, record, g, tile, s, gradients);
-  };
-  return g.absolute ? run.operator()<true>() : run.operator()<false>();
+  if (g.color && g.depth) {
+    return raster_tile_backward_channels<true, true>(in, record, g, tile, s, gradients);
+  }
+  if (g.color) return raster_tile_backward_channels<true, false>(in, record, g, tile, s, gradients);
+  return raster_tile_backward_channels<false, true>(in, record, g, tile, s, gradients);
 }
 
 // Adds up each splat's pairs, tile after tile, and turns sums over u and v into gradients.
@@ -227,7 +215,6 @@ inline void gather_gradients(const Splat* splats, size_t count, const PairRange*
     store(t, total);
     const Splat& s = splats[i];
     gradients[i] = {{two_ln2 * (s.ux * t[1]), two_ln2 * (s.uy * t[1] + s.vy * t[2])},
-                    {two_ln2 * (s.ux * t[10]), two_ln2 * t[11]},
                     t[0],
                     t[3],
                     t[4],

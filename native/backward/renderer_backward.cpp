@@ -18,11 +18,6 @@ Scratch* thread_scratch() {
   return scratch.get();
 }
 
-// Rows [begin, end) of an array of `columns`.
-void zero_rows(float* values, size_t columns, size_t begin, size_t end) {
-  std::fill(values + columns * begin, values + columns * end, 0.0f);
-}
-
 }  // namespace
 
 // Every pair has a place of its own to write to, and a splat's pairs are added in the order of the
@@ -33,13 +28,11 @@ size_t Renderer::raster_backward(const Frame& frame, const ImageGradient& image,
   const RasterInput input = raster_input(frame);
   const StageReader record{frame.later_stages.data(), frame.transmittance.data(),
                            frame.stages_done.data()};
-  lap();
   if (pair_gradients_.size() < frame.pairs.size()) pair_gradients_.resize(frame.pairs.size());
   pool_.for_each(frame.stages_done.size(), [&](size_t tile) {
     composited += kernels_.raster_tile_backward(input, record, image, static_cast<int>(tile),
                                                 thread_scratch(), pair_gradients_.data());
   });
-  seconds_.raster_backward = lap();
   const std::vector<size_t> starts = frame.chunk_starts();
   pool_.for_each(starts.size(), [&](size_t chunk) {
     const size_t first = chunk * kChunkSize;
@@ -50,38 +43,46 @@ size_t Renderer::raster_backward(const Frame& frame, const ImageGradient& image,
       std::copy_n(gradients[i].mean, 2, means2d + 2 * i);
     }
   });
-  seconds_.gather = lap();
   return composited;
+}
+
+void Renderer::clear_chunk(const GaussianArrays& gaussians, size_t chunk,
+                           const GaussianGradients& out) {
+  const size_t begin = chunk * kChunkSize;
+  const size_t end = std::min(gaussians.count, begin + kChunkSize);
+  const auto clear = [&](float* values, size_t columns) {
+    std::fill(values + columns * begin, values + columns * end, 0.0f);
+  };
+  if (out.overwrite) {
+    clear(out.means, 3);
+    clear(out.quats, 4);
+    clear(out.scales, 3);
+    clear(out.opacities, 1);
+  }
+  if (out.overwrite_colors) clear(out.colors, 3 * static_cast<size_t>(gaussians.sh_coefficients));
+}
+
+PoseSums Renderer::total(const std::vector<PoseSums>& parts) {
+  PoseSums sums{};
+  for (const PoseSums& part : parts) {
+    for (size_t i = 0; i < std::size(sums.values); ++i) sums.values[i] += part.values[i];
+  }
+  return sums;
 }
 
 // A chunk's splats come from the chunk's Gaussians, so each task owns the rows it writes.
 PoseSums Renderer::project_backward(const Frame& frame, const GaussianArrays& gaussians,
                                     const SplatGradient* gradients, const float* means2d,
                                     const GaussianGradients& out) {
-  lap();
   const std::vector<size_t> starts = frame.chunk_starts();
   std::vector<PoseSums> sums(starts.size());
-  const size_t color_columns = 3 * static_cast<size_t>(gaussians.sh_coefficients);
   pool_.for_each(starts.size(), [&](size_t chunk) {
-    const size_t begin = chunk * kChunkSize;
-    const size_t end = std::min(gaussians.count, begin + kChunkSize);
-    if (out.overwrite) {
-      zero_rows(out.means, 3, begin, end);
-      zero_rows(out.quats, 4, begin, end);
-      zero_rows(out.scales, 3, begin, end);
-      zero_rows(out.opacities, 1, begin, end);
-    }
-    if (out.overwrite_colors) zero_rows(out.colors, color_columns, begin, end);
-    kernels_.project_backward(gaussians, frame.camera, frame.splats.data() + begin,
+    clear_chunk(gaussians, chunk, out);
+    kernels_.project_backward(gaussians, frame.camera, frame.splats.data() + chunk * kChunkSize,
                               frame.chunk_counts[chunk], gradients + starts[chunk],
                               means2d + 2 * starts[chunk], out, &sums[chunk]);
   });
-  PoseSums total{};
-  for (const PoseSums& part : sums) {
-    for (size_t i = 0; i < std::size(total.values); ++i) total.values[i] += part.values[i];
-  }
-  seconds_.project_backward = lap();
-  return total;
+  return total(sums);
 }
 
 }  // namespace splatpilot

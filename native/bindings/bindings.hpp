@@ -82,22 +82,11 @@ inline void require_rows(const GaussianArrays& g, const Rows3& v_means, const Ro
           "gradients and Gaussians differ in shape");
 }
 
-inline void check_image_size(int width, int height) {
+inline CameraParameters camera_parameters(const Intrinsics& K, const Pose& X_CW, int width,
+                                          int height, double near_plane, double far_plane,
+                                          double radius_clip, double eps2d) {
   require(width > 0 && height > 0 && width <= 32768 && height <= 32768,
           "the image must have pixels, and at most 32768 a side");
-}
-
-// What Python knows of a lens.
-struct LensArguments {
-  DistortionModel model = DistortionModel::kNone;
-  double radial[6] = {}, tangential[2] = {}, most_squared_slope = 0.0;
-  double min_slope[2] = {}, max_slope[2] = {};
-};
-
-inline Camera camera_from(const Intrinsics& K, const Pose& X_CW, int width, int height,
-                          double near_plane, double far_plane, double radius_clip, double eps2d,
-                          bool antialiased = false, const LensArguments& lens = {}) {
-  check_image_size(width, height);
   CameraParameters p{};
   p.width = width;
   p.height = height;
@@ -105,18 +94,9 @@ inline Camera camera_from(const Intrinsics& K, const Pose& X_CW, int width, int 
   p.far_plane = far_plane;
   p.radius_clip = radius_clip;
   p.eps2d = eps2d;
-  p.antialiased = antialiased;
   std::copy_n(K.data(), 9, p.K);
   std::copy_n(X_CW.data(), 16, p.X_CW);
-  p.distortion.model = lens.model;
-  for (int k = 0; k < 6; ++k) p.distortion.radial[k] = static_cast<float>(lens.radial[k]);
-  for (int k = 0; k < 2; ++k) {
-    p.distortion.tangential[k] = static_cast<float>(lens.tangential[k]);
-    p.min_slope[k] = lens.min_slope[k];
-    p.max_slope[k] = lens.max_slope[k];
-  }
-  p.distortion.most_squared_slope = static_cast<float>(lens.most_squared_slope);
-  return make_camera(p);
+  return p;
 }
 
 // Whether `image` is (height, width, channels).
@@ -127,7 +107,7 @@ void check_size(const Array& image, const Camera& camera, size_t channels) {
           "an image has the wrong shape");
 }
 
-// Where an image of colour (3 channels), depth (1) or both (4) and its alpha are to be written.
+// Where an image of color (3 channels), depth (1) or both (4) and its alpha are to be written.
 inline Image output_image(const Output& image, const Output& alpha, const Camera& camera,
                           DepthMode depth_mode, const Floats<nb::shape<3>>& background) {
   const size_t channels = image.shape(2);
@@ -159,24 +139,22 @@ OwnedArray<T, kShape...> new_array(size_t n = 0) {
   return {values.release(), sizeof...(kShape), shape, owner};
 }
 
+inline OwnedArray<double, 5, 3> pose_rows(const PoseSums& sums) {
+  OwnedArray<double, 5, 3> rows = new_array<double, 5, 3>();
+  std::copy_n(sums.values, 15, rows.data());
+  return rows;
+}
+
 // Pixels, rounded up; bounded, so that it fits an integer.
 inline int32_t radius_of(float extent) {
   return static_cast<int32_t>(std::ceil(std::min(extent, 1073741824.0f)));
 }
 
-// Add to the module: baked scenes, the backward pass of Gaussians, the renderer of surfels, the
-// rendering of projected Gaussians, the losses, what fits Gaussians, worlds of shapes, worlds of
-// grids.
+// Add to the module what their files bind.
 void bind_baked(nb::module_& m);
-void bind_gradients(nb::module_& m);
 void bind_surfels(nb::module_& m);
-void bind_projected(nb::module_& m);
-void bind_losses(nb::module_& m);
 void bind_fitting(nb::module_& m);
-void bind_shape_worlds(nb::module_& m);
-void bind_descent(nb::module_& m);
-void bind_shape_field(nb::module_& m);
-void bind_grid_field(nb::module_& m);
-void bind_grid_worlds(nb::module_& m);
+void bind_shapes(nb::module_& m);
+void bind_grids(nb::module_& m);
 
 }  // namespace splatpilot

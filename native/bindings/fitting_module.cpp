@@ -1,49 +1,80 @@
-// Python bindings of what fits Gaussians to images: their shapes, Adam, and how far Gaussians are
-// from the surface that a depth image shows.
+// Python bindings of what fits Gaussians to images: losses, shapes, and the distance of
+// Gaussians from the surface that a depth image shows.
+#include <nanobind/stl/optional.h>
 #include <nanobind/stl/string.h>
 
 #include <cmath>
+#include <optional>
 #include <string>
 #include <vector>
 
 #include "bindings/bindings.hpp"
 #include "core/dispatch.hpp"
 #include "losses/fitting.hpp"
+#include "losses/losses.hpp"
 
 namespace splatpilot {
 namespace {
 
 using namespace nb::literals;
+using Images = Floats<nb::ndim<4>>;
+using ImagesOut = Writable<nb::ndim<4>>;
 using Values = Floats<nb::ndim<1>>;
 using ValuesOut = Writable<nb::ndim<1>>;
 using DepthImage = Floats<nb::ndim<2>>;
 using Indices = nb::ndarray<const int64_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 
-const FittingKernels& fitting(const std::string& simd) { return *kernels(simd).fitting; }
+double photometric_loss(const Images& rendered, const Images& target, float ssim_weight,
+                        const std::optional<ImagesOut>& gradient, const std::string& simd) {
+  for (size_t axis = 0; axis < 4; ++axis) {
+    require(rendered.shape(axis) == target.shape(axis), "images differ in shape");
+    require(!gradient || rendered.shape(axis) == gradient->shape(axis),
+            "the gradient differs in shape");
+    require(axis == 0 || (rendered.shape(axis) > 0 && rendered.shape(axis) <= 32768),
+            "an image has no pixels, or more than 32768 along a side");
+  }
+  require(rendered.shape(0) > 0, "there is no image");
+  const LossKernels& kernels = *splatpilot::kernels(simd).losses;
+  const double count = static_cast<double>(rendered.size());
+  PhotometricInput in{};
+  in.height = static_cast<int>(rendered.shape(1));
+  in.width = static_cast<int>(rendered.shape(2));
+  in.channels = static_cast<int>(rendered.shape(3));
+  in.l1_scale = static_cast<float>((1.0 - ssim_weight) / count);
+  in.ssim_scale = static_cast<float>(-ssim_weight / count);
+  const size_t size = rendered.size() / rendered.shape(0);
 
-void adam_step(const ValuesOut& parameters, const Values& gradients, const ValuesOut& means,
-               const ValuesOut& squares, double rate, int step, double mean_decay,
-               double square_decay, double epsilon, const std::string& simd) {
-  const size_t count = parameters.size();
-  require(gradients.size() == count && means.size() == count && squares.size() == count,
-          "parameters, gradients and their averages differ in size");
-  require(step >= 1, "steps are counted from 1");
-  const AdamInput in{parameters.data(),
-                     gradients.data(),
-                     means.data(),
-                     squares.data(),
-                     count,
-                     static_cast<float>(mean_decay),
-                     static_cast<float>(square_decay),
-                     static_cast<float>(1.0 - mean_decay),
-                     static_cast<float>(1.0 - square_decay),
-                     static_cast<float>(rate / (1.0 - std::pow(mean_decay, step))),
-                     static_cast<float>(1.0 / std::sqrt(1.0 - std::pow(square_decay, step))),
-                     static_cast<float>(epsilon)};
-  const FittingKernels& kernels = fitting(simd);
   const nb::gil_scoped_release release;
-  kernels.adam(in);
+  thread_local std::vector<float> scratch;
+  scratch.resize(kernels.photometric_scratch(in.width, in.channels));
+  in.scratch = scratch.data();
+  PhotometricSums sums = {0.0, 0.0};
+  for (size_t i = 0; i < rendered.shape(0); ++i) {
+    in.rendered = rendered.data() + i * size;
+    in.target = target.data() + i * size;
+    in.gradient = gradient ? gradient->data() + i * size : nullptr;
+    const PhotometricSums image = kernels.photometric(in);
+    sums.l1 += image.l1;
+    sums.dissimilarity += image.dissimilarity;
+  }
+  return ((1.0 - ssim_weight) * sums.l1 + ssim_weight * sums.dissimilarity) / count;
 }
+
+double log_depth_loss(const Values& rendered, const Values& depth,
+                      const std::optional<Values>& weights, float epsilon, float far,
+                      const std::optional<ValuesOut>& gradient, const std::string& simd) {
+  const size_t count = rendered.size();
+  require(depth.size() == count && (!weights || weights->size() == count) &&
+              (!gradient || gradient->size() == count),
+          "depth images differ in size");
+  const LossKernels& kernels = *splatpilot::kernels(simd).losses;
+  const LogDepthInput in{rendered.data(), depth.data(), weights ? weights->data() : nullptr,  count,
+                         epsilon,         far,          gradient ? gradient->data() : nullptr};
+  const nb::gil_scoped_release release;
+  return kernels.log_depth(in);
+}
+
+const FittingKernels& fitting(const std::string& simd) { return *kernels(simd).fitting; }
 
 void splat_shapes(const Means& log_scales, const Opacities& logit_opacities, const Values& smallest,
                   const Rows3& scales, const ValuesOut& opacities, const std::string& simd) {
@@ -99,7 +130,7 @@ void turn(float w, const float* q, const float* v, float* turned) {
   turned[2] = v[2] + w * c[2] + q[0] * c[1] - q[1] * c[0];
 }
 
-// The gradient by an unnormalised quaternion of v . R(q) u, added to `gradient`.
+// The gradient by an unnormalized quaternion of v . R(q) u, added to `gradient`.
 void add_quaternion_gradient(const float* quat, float inverse_norm, const float* u, const float* v,
                              float* gradient) {
   const float w = quat[0] * inverse_norm, x = quat[1] * inverse_norm, y = quat[2] * inverse_norm,
@@ -197,9 +228,6 @@ double surface_loss(const Means& means, const Quats& quats, const Means& scales,
 }  // namespace
 
 void bind_fitting(nb::module_& m) {
-  m.def("adam_step", &adam_step, nb::kw_only(), "parameters"_a, "gradients"_a, "means"_a,
-        "squares"_a, "rate"_a, "step"_a, "mean_decay"_a, "square_decay"_a, "epsilon"_a,
-        "simd"_a = "", "Moves parameters, and the averages of gradients and of their squares.");
   m.def("splat_shapes", &splat_shapes, nb::kw_only(), "log_scales"_a, "logit_opacities"_a,
         "smallest"_a, "scales"_a, "opacities"_a, "simd"_a = "",
         "Writes sqrt(exp(2 log_scales) + smallest^2) and sigmoid(logit_opacities).");
@@ -210,6 +238,13 @@ void bind_fitting(nb::module_& m) {
         "draws"_a, "X_CW"_a, "K"_a, "depth"_a, "reach"_a, "nearest"_a, "far"_a, "v_means"_a,
         "v_quats"_a, "v_scales"_a,
         "Mean |log(z / depth)| of points drawn from the Gaussians that are seen; adds gradients.");
+  m.def("photometric_loss", &photometric_loss, nb::kw_only(), "rendered"_a, "target"_a,
+        "ssim_weight"_a, "gradient"_a.none(), "simd"_a = "",
+        "(1 - w) L1 + w (1 - SSIM) of images (N, H, W, C); writes the gradient unless None.");
+  m.def(
+      "log_depth_loss", &log_depth_loss, nb::kw_only(), "rendered"_a, "depth"_a, "weights"_a.none(),
+      "epsilon"_a, "far"_a, "gradient"_a.none(), "simd"_a = "",
+      "Mean weighted |log(rendered / depth)| over valid pixels; writes the gradient unless None.");
 }
 
 }  // namespace splatpilot

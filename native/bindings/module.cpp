@@ -18,23 +18,6 @@ namespace {
 
 using namespace nb::literals;
 
-nb::typed<nb::dict, nb::str, double> stage_seconds(Renderer& renderer) {
-  StageSeconds s;
-  {
-    const Exclusive use(renderer);
-    s = renderer.seconds();
-  }
-  nb::dict seconds;
-  seconds["project"] = s.project;
-  seconds["sort"] = s.sort;
-  seconds["bin"] = s.bin;
-  seconds["raster"] = s.raster;
-  seconds["raster backward"] = s.raster_backward;
-  seconds["gather"] = s.gather;
-  seconds["project backward"] = s.project_backward;
-  return nb::typed<nb::dict, nb::str, double>(seconds);
-}
-
 // What gsplat calls meta, for the splats of a frame, in the order of the input. Opacities are the
 // rows of `given`, or without it those that the splats had.
 auto projected(Renderer& renderer, const RenderedFrame& rendered,
@@ -76,11 +59,70 @@ RenderedFrame render(Renderer& renderer, const Means& means, const Quats& quats,
                      const Output& image, const Output& alpha, bool keep) {
   const GaussianArrays gaussians =
       gaussian_arrays(means, quats, scales, opacities, colors, sh_degree);
-  const Camera camera =
-      camera_from(K, X_CW, width, height, near_plane, far_plane, radius_clip, eps2d, antialiased);
+  CameraParameters parameters =
+      camera_parameters(K, X_CW, width, height, near_plane, far_plane, radius_clip, eps2d);
+  parameters.antialiased = antialiased;
+  const Camera camera = make_camera(parameters);
   const Image out = output_image(image, alpha, camera, depth_mode, background);
   const Exclusive use(renderer);
   return RenderedFrame(renderer.render(gaussians, camera, out, keep));
+}
+
+size_t raster_backward(Renderer& renderer, const RenderedFrame& rendered, const Pixels& v_image,
+                       const Pixels& v_alpha, const Pixels& image, const Pixels& alpha,
+                       const Floats<nb::shape<3>>& background, bool expected_depth,
+                       const Writable<nb::shape<-1, 16>>& v_splats,
+                       const Writable<nb::shape<-1, 2>>& v_means2d) {
+  const Frame& frame = *rendered.frame;
+  require(frame.kept, "the frame was not kept for a backward pass");
+  const size_t channels = v_image.shape(2);
+  require(channels == 1 || channels == 3 || channels == 4, "an image has 1, 3 or 4 channels");
+  check_size(v_image, frame.camera, channels);
+  check_size(image, frame.camera, channels);
+  check_size(v_alpha, frame.camera, 1);
+  check_size(alpha, frame.camera, 1);
+  require(v_splats.shape(0) == rendered.splat_count && v_means2d.shape(0) == rendered.splat_count,
+          "one row of gradients a splat is needed");
+  ImageGradient g{};
+  if (channels >= 3) g.color = v_image.data();
+  if (channels != 3) g.depth = v_image.data() + channels - 1;
+  if (channels != 3 && expected_depth) g.expected_depth = image.data() + channels - 1;
+  g.stride = static_cast<int>(channels);
+  g.alpha = v_alpha.data();
+  g.rendered_alpha = alpha.data();
+  std::copy_n(background.data(), 3, g.background);
+
+  const nb::gil_scoped_release release;
+  const std::scoped_lock lock(renderer.mutex());
+  return renderer.raster_backward(frame, g, reinterpret_cast<SplatGradient*>(v_splats.data()),
+                                  v_means2d.data());
+}
+
+OwnedArray<double, 5, 3> project_backward(
+    Renderer& renderer, const RenderedFrame& rendered, const Means& means, const Quats& quats,
+    const Means& scales, const Opacities& opacities, const Colors& colors, int sh_degree,
+    const Floats<nb::shape<-1, 16>>& v_splats, const Floats<nb::shape<-1, 2>>& v_means2d,
+    const Rows3& v_means, const Rows4& v_quats, const Rows3& v_scales,
+    const Writable<nb::ndim<1>>& v_opacities, const ColorRows& v_colors, bool overwrite,
+    bool overwrite_colors) {
+  const Frame& frame = *rendered.frame;
+  require(frame.kept, "the frame was not kept for a backward pass");
+  const GaussianArrays gaussians =
+      gaussian_arrays(means, quats, scales, opacities, colors, sh_degree);
+  require(gaussians.count == frame.gaussians, "these are not the Gaussians of the frame");
+  require(v_splats.shape(0) == rendered.splat_count && v_means2d.shape(0) == rendered.splat_count,
+          "one row of gradients a splat is needed");
+  require_rows(gaussians, v_means, v_quats, v_scales, v_opacities, v_colors);
+  PoseSums sums;
+  {
+    const nb::gil_scoped_release release;
+    const std::scoped_lock lock(renderer.mutex());
+    sums = renderer.project_backward(
+        frame, gaussians, reinterpret_cast<const SplatGradient*>(v_splats.data()), v_means2d.data(),
+        {v_means.data(), v_quats.data(), v_scales.data(), v_opacities.data(), v_colors.data(),
+         overwrite, overwrite_colors});
+  }
+  return pose_rows(sums);
 }
 
 }  // namespace
@@ -148,8 +190,7 @@ NB_MODULE(_native, m) {
             new (self) Renderer(threads, simd);
           },
           "threads"_a, "simd"_a = "")
-      .def_prop_ro("simd", [](const Renderer& r) { return std::string(r.kernels().name); })
-      .def_prop_ro("seconds", &stage_seconds, "Seconds that each stage of the last frame took.");
+      .def_prop_ro("simd", [](const Renderer& r) { return std::string(r.kernels().name); });
   m.def("projected", &projected, "renderer"_a, "frame"_a, "opacities"_a.none(),
         "ids (n,), radii (n, 2), means (n, 2), depths (n,), conics (n, 3) and opacities (n,) of\n"
         "a frame's splats.");
@@ -159,18 +200,23 @@ NB_MODULE(_native, m) {
         "background"_a, "image"_a, "alpha"_a, "keep"_a,
         "Writes colour (3 channels), depth (1) or both (4) by the shape of image, and alpha. With\n"
         "keep, a backward pass can start from the frame.");
+  m.def("raster_backward", &raster_backward, "renderer"_a, "frame"_a, nb::kw_only(), "v_image"_a,
+        "v_alpha"_a, "image"_a, "alpha"_a, "background"_a, "expected_depth"_a, "v_splats"_a,
+        "v_means2d"_a,
+        "Writes the gradients of a frame's splats; returns how many (Gaussian, 4x4 block) were\n"
+        "composited. v_image etc. are derivatives of the loss by image etc.");
+  m.def("project_backward", &project_backward, "renderer"_a, "frame"_a, nb::kw_only(), "means"_a,
+        "quats"_a, "scales"_a, "opacities"_a, "colors"_a, "sh_degree"_a, "v_splats"_a,
+        "v_means2d"_a, "v_means"_a, "v_quats"_a, "v_scales"_a, "v_opacities"_a, "v_colors"_a,
+        "overwrite"_a, "overwrite_colors"_a,
+        "Adds to, or overwrites, the gradients of the frame's Gaussians. Returns (5, 3) those by\n"
+        "R_CW with the camera's centre held, by p_C and by p_W - centre, summed over Gaussians.");
 
   bind_baked(m);
-  bind_losses(m);
-  bind_fitting(m);
-  bind_shape_worlds(m);
-  bind_descent(m);
-  bind_shape_field(m);
-  bind_grid_field(m);
-  bind_grid_worlds(m);
-  bind_gradients(m);
   bind_surfels(m);
-  bind_projected(m);
+  bind_fitting(m);
+  bind_shapes(m);
+  bind_grids(m);
 }
 
 }  // namespace splatpilot

@@ -37,8 +37,8 @@ RenderedSurfels render(Renderer& renderer, const Means& means, const Quats& quat
                        const Output& median, const std::optional<Output>& distort, bool keep) {
   const GaussianArrays surfels =
       gaussian_arrays(means, quats, scales, opacities, colors, sh_degree);
-  const Camera camera =
-      camera_from(K, X_CW, width, height, near_plane, far_plane, radius_clip, kBlobVariance);
+  const Camera camera = make_camera(
+      camera_parameters(K, X_CW, width, height, near_plane, far_plane, radius_clip, kBlobVariance));
   const SurfelImages<float> images{plane(color, camera, 3),  plane(normal, camera, 3),
                                    plane(depth, camera, 1),  plane(alpha, camera, 1),
                                    plane(median, camera, 1), plane(distort, camera, 1)};
@@ -53,7 +53,8 @@ OwnedArray<double, 5, 3> backward(
     const std::optional<Pixels>& v_depth, const std::optional<Pixels>& v_alpha,
     const std::optional<Pixels>& v_median, const std::optional<Pixels>& v_distort,
     const Rows3& v_means, const Rows4& v_quats, const Rows3& v_scales,
-    const Writable<nb::ndim<1>>& v_opacities, const ColorRows& v_colors) {
+    const Writable<nb::ndim<1>>& v_opacities, const ColorRows& v_colors, bool overwrite,
+    bool overwrite_colors) {
   const Frame& frame = rendered.frame->bounds;
   require(frame.kept, "the frame was not kept for a backward pass");
   const GaussianArrays surfels =
@@ -64,18 +65,15 @@ OwnedArray<double, 5, 3> backward(
   const SurfelImages<const float> gradients{
       plane(v_color, camera, 3), plane(v_normal, camera, 3), plane(v_depth, camera, 1),
       plane(v_alpha, camera, 1), plane(v_median, camera, 1), plane(v_distort, camera, 1)};
-  CameraGradient by_camera;
+  PoseSums sums;
   {
     const Exclusive use(renderer);
-    by_camera = renderer.surfels_backward(
+    sums = renderer.surfels_backward(
         *rendered.frame, surfels, gradients,
-        {v_means.data(), v_quats.data(), v_scales.data(), v_opacities.data(), v_colors.data()});
+        {v_means.data(), v_quats.data(), v_scales.data(), v_opacities.data(), v_colors.data(),
+         overwrite, overwrite_colors});
   }
-  const auto rows = new_array<double, 5, 3>();
-  std::copy_n(by_camera.R, 9, rows.data());
-  std::copy_n(by_camera.t, 3, rows.data() + 9);
-  std::copy_n(by_camera.centre, 3, rows.data() + 12);
-  return rows;
+  return pose_rows(sums);
 }
 
 auto projected(Renderer& renderer, const RenderedSurfels& rendered) {
@@ -114,13 +112,13 @@ void bind_surfels(nb::module_& m) {
         "near_plane"_a, "far_plane"_a, "radius_clip"_a, "color"_a, "normal"_a, "depth"_a, "alpha"_a,
         "median"_a, "distort"_a.none(), "keep"_a,
         "Writes images; with keep, a backward pass can start from the frame.");
-  m.def(
-      "surfels_backward", &backward, "renderer"_a, "frame"_a, nb::kw_only(), "means"_a, "quats"_a,
-      "scales"_a, "opacities"_a, "colors"_a, "sh_degree"_a, "v_color"_a.none(), "v_normal"_a.none(),
-      "v_depth"_a.none(), "v_alpha"_a.none(), "v_median"_a.none(), "v_distort"_a.none(),
-      "v_means"_a, "v_quats"_a, "v_scales"_a, "v_opacities"_a, "v_colors"_a,
-      "Adds to the gradients of the frame's surfels. Returns (5, 3) those of the camera: by R_CW,\n"
-      "by t_CW and by the camera's centre.");
+  m.def("surfels_backward", &backward, "renderer"_a, "frame"_a, nb::kw_only(), "means"_a, "quats"_a,
+        "scales"_a, "opacities"_a, "colors"_a, "sh_degree"_a, "v_color"_a.none(),
+        "v_normal"_a.none(), "v_depth"_a.none(), "v_alpha"_a.none(), "v_median"_a.none(),
+        "v_distort"_a.none(), "v_means"_a, "v_quats"_a, "v_scales"_a, "v_opacities"_a, "v_colors"_a,
+        "overwrite"_a, "overwrite_colors"_a,
+        "Adds to, or overwrites, the gradients of the frame's surfels; returns what\n"
+        "project_backward does.");
   m.def("projected_surfels", &projected, "renderer"_a, "frame"_a,
         "ids (n,), radii (n, 2), means (n, 2), depths (n,) and normals in the world (n, 3) of a\n"
         "frame's surfels, in the order of the input.");

@@ -2,6 +2,7 @@
 #pragma once
 
 #include "core/gather.hpp"
+#include "fields/trilinear.hpp"
 #include "raster/depth_image.hpp"
 
 namespace splatpilot::SIMD_LEVEL {
@@ -24,36 +25,19 @@ static float interpolate(const GridWorld& grid, const float* p, float* gradient)
   }
   const size_t stride_y = static_cast<size_t>(grid.shape[2]);
   const size_t stride_x = static_cast<size_t>(grid.shape[1]) * stride_y;
-  float v[2][2][2];
-  for (size_t i = 0; i < 8; ++i) {
-    v[i >> 2][i >> 1 & 1][i & 1] =
-        grid.values[cell + (i >> 2) * stride_x + (i >> 1 & 1) * stride_y + (i & 1)];
-  }
-  float yz[2][2], slope_x[2][2];
-  for (int j = 0; j < 2; ++j) {
-    for (int k = 0; k < 2; ++k) {
-      slope_x[j][k] = v[1][j][k] - v[0][j][k];
-      yz[j][k] = v[0][j][k] + f[0] * slope_x[j][k];
-    }
-  }
-  const float slope_y[2] = {yz[1][0] - yz[0][0], yz[1][1] - yz[0][1]};
-  const float z[2] = {yz[0][0] + f[1] * slope_y[0], yz[0][1] + f[1] * slope_y[1]};
-  const float x[2] = {slope_x[0][0] + f[1] * (slope_x[1][0] - slope_x[0][0]),
-                      slope_x[0][1] + f[1] * (slope_x[1][1] - slope_x[0][1])};
-  gradient[0] = (x[0] + f[2] * (x[1] - x[0])) / grid.voxel_size;
-  gradient[1] = (slope_y[0] + f[2] * (slope_y[1] - slope_y[0])) / grid.voxel_size;
-  gradient[2] = (z[1] - z[0]) / grid.voxel_size;
-  return z[0] + f[2] * (z[1] - z[0]);
+  const float value = trilinear(grid.values + cell, stride_x, stride_y, f, gradient);
+  for (int k = 0; k < 3; ++k) gradient[k] /= grid.voxel_size;
+  return value;
 }
 
 // The interpolant at points given in voxels from the first centre, extrapolated beyond the
 // outermost.
 SP_INLINE F16 interpolate(const GridWorld& grid, const F16* at) {
-  I16 cell = to_integer(F16(0.0f));
+  I16 cell = to_int(F16(0.0f));
   F16 f[3];
   for (int k = 0; k < 3; ++k) {
     const F16 last = F16(static_cast<float>(grid.shape[k] - 2));
-    const I16 i = to_integer(clamp(at[k], F16(0.0f), last));
+    const I16 i = to_int(clamp(at[k], F16(0.0f), last));
     cell = multiply(cell, grid.shape[k]) + i;
     f[k] = at[k] - to_float(i);
   }

@@ -3,8 +3,8 @@
 #include "casting/ray_casting.hpp"
 
 #include "casting/grid_casting.hpp"
+#include "casting/nearest_shapes.hpp"
 #include "casting/shape_casting.hpp"
-#include "fields/shape_distances.hpp"
 
 namespace splatpilot::SIMD_LEVEL {
 

@@ -42,7 +42,7 @@ struct GridWorld {
   float voxel_size;       // [m]
 };
 
-// The rays of a camera in its own frame, z = 1, neighbours in columns: much of what stands upright
+// The rays of a camera in its own frame, z = 1, neighbors in columns: much of what stands upright
 // is missed by whole packs of such.
 struct PixelRays {
   const float *x, *y;      // readable in whole packs, whose last ones are filled with rays

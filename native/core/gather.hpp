@@ -11,13 +11,6 @@ SP_INLINE I16 multiply(const I16& a, int32_t b) {
   return c;
 }
 
-// Towards zero.
-SP_INLINE I16 to_integer(const F16& a) {
-  I16 c;
-  SP_EACH_REGISTER(k) c.r[k] = __builtin_convertvector(a.r[k], IntRegister);
-  return c;
-}
-
 // The floats at p, by their index.
 SP_INLINE F16 gather(const float* p, const I16& index) {
   F16 a;

@@ -45,21 +45,6 @@ static bool all_normalisable(const float* quats, size_t count) {
   return all;
 }
 
-static float multiply_add(size_t rounds) {
-  Register sums[kFmaChains];
-  for (int chain = 0; chain < kFmaChains; ++chain) sums[chain] = Register{} + 1.0f * chain;
-  const Register a = Register{} + 0.5f, b = Register{} + 1.0f;
-  for (size_t i = 0; i < rounds; ++i) {
-    for (int k = 0; k < kRegisters; ++k) {
-#pragma GCC unroll 12
-      for (int chain = 0; chain < kFmaChains; ++chain) sums[chain] = sums[chain] * a + b;
-    }
-  }
-  float total = 0.0f;
-  for (int chain = 0; chain < kFmaChains; ++chain) total += sums[chain][0];
-  return total;
-}
-
 extern const SurfelKernels kSurfelKernels;
 extern const LossKernels kLossKernels;
 extern const CastingKernels kCastingKernels;
@@ -72,6 +57,6 @@ const Kernels kKernels = {
     SP_STRING(SIMD_LEVEL), &kSurfelKernels,      &kLossKernels,    &kCastingKernels,
     &kFittingKernels,      project_arrays,       project_baked,    bin_footprints<SplatFootprint>,
     raster_tile,           raster_tile_backward, gather_gradients, project_backward,
-    first_nonfinite,       all_within,           all_normalisable, multiply_add};
+    first_nonfinite,       all_within,           all_normalisable};
 
 }  // namespace splatpilot::SIMD_LEVEL

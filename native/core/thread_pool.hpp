@@ -12,7 +12,7 @@ namespace splatpilot {
 
 // Workers spin for some microseconds after a loop, since the next stage of a frame follows at once,
 // then sleep until called: an idle pool costs nothing, and one that shares its cores does not
-// starve its neighbours. A loop does not wait for workers that have yet to wake. A pool of one
+// starve its neighbors. A loop does not wait for workers that have yet to wake. A pool of one
 // thread runs everything in the caller.
 class ThreadPool {
  public:

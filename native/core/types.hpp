@@ -47,7 +47,7 @@ struct Camera {
   float radius_clip, eps2d;     // [px], [px^2]
   bool antialiased;             // opacities fall as the blur spreads small Gaussians
   float max_depth;              // [m]; what lies beyond has no part in the median depth
-  bool depth_alone;             // Gaussians that hold no pixel's centre are left out, and colours
+  bool depth_alone;             // Gaussians that hold no pixel's centre are left out, and colors
   float R_CW[9];                // row-major
   // The centre in two parts, so that p_W - centre keeps its digits far from the world's origin.
   float centre_high[3], centre_low[3];
@@ -99,7 +99,7 @@ struct GaussianArrays {
   const float* scales;     // (N, 3)
   const float* opacities;  // (N,)
   const float* colors;     // (N, 3), or (N, K, 3) when sh_degree >= 0
-  int sh_degree;           // -1: colours are given
+  int sh_degree;           // -1: colors are given
   int sh_coefficients;     // K
 };
 
@@ -110,7 +110,7 @@ struct BakedArrays {
   // mean 3, lower-triangular factor of the covariance 6 (rows: 00; 10 11; 20 21 22), log2 opacity
   const float* geometry;  // (groups, 10, 16)
   const float* colors;    // (groups, 3 K, 16)
-  int sh_degree;          // 0: colours are final
+  int sh_degree;          // 0: colors are final
   const float* bounds;    // (groups of 16 boxes, 7, 16): centre 3, half size 3,
                           // largest scale; one box per kBoundSize Gaussians
 };
@@ -186,11 +186,8 @@ struct Kernels {
   size_t (*first_nonfinite)(const float*, size_t count);
   // Whether low <= value <= high for all; NaN is not.
   bool (*all_within)(const float*, size_t count, float low, float high);
-  // Whether all quaternions (count, 4) are long and short enough to be normalised.
+  // Whether all quaternions (count, 4) are long and short enough to be normalized.
   bool (*all_normalisable)(const float* quats, size_t count);
-  // kFmaChains independent products and sums of packs, `rounds` times: what the machine can do.
-  float (*multiply_add)(size_t rounds);
 };
-constexpr int kFmaChains = 12;
 
 }  // namespace splatpilot

@@ -1,4 +1,5 @@
-// Signed distances to shapes, as `splatpilot.systems.collision.shapes` defines them.
+// Signed distances to shapes, as `splatpilot.systems.collision.shapes` defines them: in double
+// precision operation by operation. A gradient is written unless it is null.
 #pragma once
 
 #include "casting/ray_casting.hpp"
@@ -6,156 +7,119 @@
 
 namespace splatpilot::SIMD_LEVEL {
 
-// Brings a to unit length; of no length it becomes perpendicular to the unit vector `axis`.
-SP_INLINE void normalise(float* a, const float* axis) {
-  float size = length(a);
-  if (size == 0.0f) {
+SP_INLINE float hypotenuse(float a, float b) { return __builtin_sqrtf(a * a + b * b); }
+SP_INLINE double hypotenuse(double a, double b) { return __builtin_hypot(a, b); }
+
+// Writes a at unit length; of no length, a perpendicular to the unit vector `axis`.
+template <typename Real>
+SP_INLINE void write_direction(Real* a, const Real* axis, Real* gradient) {
+  if (!gradient) return;
+  Real size = length(a);
+  if (size == Real(0)) {
     int least = 0;
     for (int k = 1; k < 3; ++k) {
-      if (__builtin_fabsf(axis[k]) < __builtin_fabsf(axis[least])) least = k;
+      if (magnitude(axis[k]) < magnitude(axis[least])) least = k;
     }
     const int next = (least + 1) % 3, last = (least + 2) % 3;
     a[next] = axis[last];
     a[last] = -axis[next];
     size = length(a);
   }
-  for (int k = 0; k < 3; ++k) a[k] /= size;
+  for (int k = 0; k < 3; ++k) gradient[k] = a[k] / size;
 }
 
-// `gradient` may be null.
-static float sphere_distance(const float* p, const float* center, float radius, float* gradient) {
-  const float up[3] = {0.0f, 0.0f, 1.0f};
-  float away[3];
-  subtract(p, center, away);
-  const float distance = length(away) - radius;
-  if (gradient) {
-    normalise(away, up);
-    std::memcpy(gradient, away, sizeof(away));
-  }
-  return distance;
-}
-
-static float capsule_distance(const float* p, const float* s, float* gradient) {
-  float away[3];
+template <typename Real>
+SP_INLINE Real sphere_distance(const Real* s, const Real* p, Real* gradient) {
+  const Real up[3] = {0, 0, 1};
+  Real away[3];
   subtract(p, s, away);
-  const float along = clamp(dot(away, s + 3), 0.0f, s[6]);
-  for (int k = 0; k < 3; ++k) away[k] -= along * s[3 + k];
-  const float distance = length(away) - s[7];
-  if (gradient) {
-    normalise(away, s + 3);
-    std::memcpy(gradient, away, sizeof(away));
-  }
+  const Real distance = length(away) - s[3];
+  write_direction(away, up, gradient);
   return distance;
 }
 
-static float cylinder_distance(const float* p, const float* s, float* gradient) {
-  const float* axis = s + 3;
-  float radial[3];
+template <typename Real>
+SP_INLINE Real capsule_distance(const Real* s, const Real* p, Real* gradient) {
+  Real away[3];
+  subtract(p, s, away);
+  const Real along = clamp(dot(away, s + 3), Real(0), s[6]);
+  for (int k = 0; k < 3; ++k) away[k] -= along * s[3 + k];
+  const Real distance = length(away) - s[7];
+  write_direction(away, s + 3, gradient);
+  return distance;
+}
+
+template <typename Real>
+SP_INLINE Real cylinder_distance(const Real* s, const Real* p, Real* gradient) {
+  const Real* axis = s + 3;
+  Real radial[3];
   subtract(p, s, radial);
-  const float along = dot(radial, axis);
+  const Real along = dot(radial, axis);
   for (int k = 0; k < 3; ++k) radial[k] -= along * axis[k];
-  const float beyond_end = __builtin_fabsf(along) - s[6], beyond_side = length(radial) - s[7];
-  float end = maximum(beyond_end, 0.0f), side = maximum(beyond_side, 0.0f);
-  const float inner = maximum(beyond_end, beyond_side);
-  const float distance = inner > 0.0f ? __builtin_sqrtf(end * end + side * side) : inner;
+  const Real beyond_end = magnitude(along) - s[6], beyond_side = length(radial) - s[7];
+  Real end = maximum(beyond_end, Real(0)), side = maximum(beyond_side, Real(0));
+  const Real inner = maximum(beyond_end, beyond_side);
+  const Real distance = inner > Real(0) ? hypotenuse(end, side) : inner;
   if (gradient) {
-    if (!(inner > 0.0f)) {
-      end = beyond_end >= beyond_side ? 1.0f : 0.0f;
-      side = 1.0f - end;
+    if (!(inner > Real(0))) {
+      end = beyond_end >= beyond_side ? 1 : 0;
+      side = 1 - end;
     }
-    const float size = __builtin_sqrtf(end * end + side * side);
-    normalise(radial, axis);
-    end = __builtin_copysignf(end, along);
+    const Real size = hypotenuse(end, side);
+    write_direction(radial, axis, radial);
+    end = with_sign(end, along);
     for (int k = 0; k < 3; ++k) gradient[k] = (end * axis[k] + side * radial[k]) / size;
   }
   return distance;
 }
 
-static float box_distance(const float* p, const float* s, float* gradient) {
-  const float *rotation = s + 3, *half = s + 12;
-  float m[3], local[3], beyond[3], way[3];
+template <typename Real>
+SP_INLINE Real box_distance(const Real* s, const Real* p, Real* gradient) {
+  const Real *R = s + 3, *half = s + 12;
+  Real m[3], local[3], beyond[3], way[3];
   subtract(p, s, m);
   int deepest = 0;
   for (int k = 0; k < 3; ++k) {
-    local[k] = m[0] * rotation[k] + m[1] * rotation[3 + k] + m[2] * rotation[6 + k];
-    beyond[k] = __builtin_fabsf(local[k]) - half[k];
-    way[k] = maximum(beyond[k], 0.0f);
+    local[k] = m[0] * R[k] + m[1] * R[3 + k] + m[2] * R[6 + k];
+    beyond[k] = magnitude(local[k]) - half[k];
+    way[k] = maximum(beyond[k], Real(0));
     if (beyond[k] > beyond[deepest]) deepest = k;
   }
-  const bool outside = beyond[deepest] > 0.0f;
-  const float distance = outside ? length(way) : beyond[deepest];
+  const bool outside = beyond[deepest] > Real(0);
+  const Real distance =
+      outside ? root(way[0] * way[0] + way[1] * way[1] + way[2] * way[2]) : beyond[deepest];
   if (gradient) {
-    const float size = outside ? distance : 1.0f;
     for (int k = 0; k < 3; ++k) {
-      const float w = outside ? way[k] : (k == deepest ? 1.0f : 0.0f);
-      way[k] = __builtin_copysignf(w / size, local[k]);
+      const Real w = outside ? way[k] / distance : Real(k == deepest);
+      way[k] = with_sign(w, local[k]);
     }
-    for (int k = 0; k < 3; ++k) gradient[k] = dot(rotation + 3 * k, way);
+    for (int k = 0; k < 3; ++k) {
+      const Real* row = R + 3 * k;
+      gradient[k] = row[0] * way[0] + row[1] * way[1] + row[2] * way[2];
+    }
   }
   return distance;
 }
 
-static float half_space_distance(const float* p, const float* s, float* gradient) {
-  if (gradient) std::memcpy(gradient, s, 3 * sizeof(float));
+template <typename Real>
+SP_INLINE Real half_space_distance(const Real* s, const Real* p, Real* gradient) {
+  if (gradient) std::memcpy(gradient, s, 3 * sizeof(Real));
   return dot(p, s) - s[3];
 }
 
-// Of a body, or after them of a half space.
-static float shape_distance(const ShapeWorld& world, size_t shape, const float* p,
-                            float* gradient) {
-  if (shape >= world.body_count) {
-    const float* s = world.half_spaces + (shape - world.body_count) * kShapeSize;
-    return half_space_distance(p, s, gradient);
-  }
-  const float* s = world.bodies + shape * kShapeSize;
-  switch (world.kinds[shape]) {
+template <typename Real>
+SP_INLINE Real shape_distance(uint8_t kind, const Real* s, const Real* p, Real* gradient) {
+  switch (kind) {
     case kSphere:
-      return sphere_distance(p, s, s[3], gradient);
+      return sphere_distance(s, p, gradient);
     case kCapsule:
-      return capsule_distance(p, s, gradient);
+      return capsule_distance(s, p, gradient);
     case kCylinder:
-      return cylinder_distance(p, s, gradient);
+      return cylinder_distance(s, p, gradient);
+    case kBox:
+      return box_distance(s, p, gradient);
     default:
-      return box_distance(p, s, gradient);
-  }
-}
-
-static void nearest_shapes(const ShapeWorld& world, const float* p, size_t count, float* distances,
-                           float* gradients) {
-  size_t shapes[kMostNearest];
-  for (size_t i = 0; i < count; ++i) distances[i] = __builtin_inff();
-  const auto consider = [&](size_t shape) {
-    const float distance = shape_distance(world, shape, p, nullptr);
-    if (!(distance < distances[count - 1])) return;
-    size_t k = count - 1;
-    for (; k > 0 && distance < distances[k - 1]; --k) {
-      distances[k] = distances[k - 1];
-      shapes[k] = shapes[k - 1];
-    }
-    distances[k] = distance;
-    shapes[k] = shape;
-  };
-  for (size_t i = 0; i < world.half_space_count; ++i) consider(world.body_count + i);
-  for (size_t i = 0; i < world.body_count; i += kLanes) {
-    F16 square = F16(0.0f);  // of the distance to the bounding boxes
-    for (int k = 0; k < 3; ++k) {
-      const F16 away = load(world.bounds + k * world.stride + i) - F16(p[k]);
-      const F16 beyond = max(away, -away) - load(world.bounds + (k + 3) * world.stride + i);
-      const F16 outside = max(beyond, F16(0.0f));
-      square += outside * outside;
-    }
-    const float farthest = maximum(distances[count - 1], 0.0f);
-    uint32_t bits = lane_bits(square <= F16(farthest * farthest));
-    if (world.body_count - i < kLanes) bits &= (1u << (world.body_count - i)) - 1u;
-    for (; bits; bits &= bits - 1u) consider(i + static_cast<size_t>(__builtin_ctz(bits)));
-  }
-  for (size_t i = 0; i < count; ++i) {
-    float* gradient = gradients + 3 * i;
-    if (distances[i] < __builtin_inff()) {
-      shape_distance(world, shapes[i], p, gradient);
-    } else {
-      for (int k = 0; k < 3; ++k) gradient[k] = 0.0f;
-    }
+      return half_space_distance(s, p, gradient);
   }
 }
 

@@ -13,19 +13,6 @@ SP_INLINE void each_pack(size_t total, const Function& f) {
   if (i < total) f(i, total - i);
 }
 
-static void adam(const AdamInput& in) {
-  each_pack(in.count, [&](size_t i, size_t count) {
-    const F16 g = load_first(in.gradients + i, count);
-    const F16 mean = F16(in.mean_decay) * load_first(in.means + i, count) + F16(in.mean_share) * g;
-    const F16 square =
-        F16(in.square_decay) * load_first(in.squares + i, count) + F16(in.square_share) * (g * g);
-    store_first(in.means + i, mean, count);
-    store_first(in.squares + i, square, count);
-    const F16 step = F16(in.rate) * mean / (sqrt(square) * F16(in.square_scale) + F16(in.epsilon));
-    store_first(in.parameters + i, load_first(in.parameters + i, count) - step, count);
-  });
-}
-
 // e^x, of x as far as floats go.
 SP_INLINE F16 exponential(const F16& x) {
   return exp2(clamp(x * F16(1.44269504089f), F16(-126.0f), F16(127.0f)));
@@ -61,6 +48,6 @@ static void shapes_backward(const ShapeGradientInput& in) {
 }
 
 extern const FittingKernels kFittingKernels;
-const FittingKernels kFittingKernels = {adam, shapes, shapes_backward};
+const FittingKernels kFittingKernels = {shapes, shapes_backward};
 
 }  // namespace splatpilot::SIMD_LEVEL

@@ -4,7 +4,7 @@
 // and E[v^2], instead of five. One row after the other is filtered along x, then, as soon as the
 // rows around it are there, along y; the gradient's three windowed means follow in the same way
 // five rows behind. Only 11 rows of either are ever kept, so all of it stays in the cache. A row is
-// taken as it is, width * channels values: along x, the neighbour of a value is `channels` away.
+// taken as it is, width * channels values: along x, the neighbor of a value is `channels` away.
 #pragma once
 
 #include "core/simd.hpp"
@@ -15,7 +15,7 @@ namespace splatpilot::SIMD_LEVEL {
 constexpr int kWindowRadius = 5;
 constexpr int kWindow = 2 * kWindowRadius + 1;
 constexpr float kSsimC1 = 0.01f * 0.01f, kSsimC2 = 0.03f * 0.03f;
-// exp(-k^2 / (2 * 1.5^2)), normalised to a sum of 1 over k = -5..5.
+// exp(-k^2 / (2 * 1.5^2)), normalized to a sum of 1 over k = -5..5.
 constexpr float kGaussian[kWindowRadius + 1] = {0.2660117249f,  0.2130055377f,   0.1093606895f,
                                                 0.03600077213f, 0.007598758135f, 0.001028380084f};
 

@@ -54,7 +54,7 @@ std::vector<uint32_t> morton_order(const GaussianArrays& g) {
   return order;
 }
 
-// The rows of A = R(q) diag(scale), orthogonalised: A = L Q, so L L^T = A A^T.
+// The rows of A = R(q) diag(scale), orthogonalized: A = L Q, so L L^T = A A^T.
 std::array<double, 6> lower_factor(const float* quat, const float* scale) {
   const double w = quat[0], x = quat[1], y = quat[2], z = quat[3];
   const double two = 2.0 / (w * w + x * x + y * y + z * z);

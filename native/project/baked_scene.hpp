@@ -9,21 +9,21 @@
 
 namespace splatpilot {
 
-// Gaussians in Morton order, so that neighbours in space are neighbours in memory and can be culled
+// Gaussians in Morton order, so that neighbours in space are neighbors in memory and can be culled
 // together; covariances as lower-triangular factors L with L L^T = R S^2 R^T, computed in double.
 class BakedScene {
  public:
   explicit BakedScene(const GaussianArrays& gaussians);
 
-  // The Gaussians of another scene in other colours (count, sh_coefficients, 3); what does not
-  // depend on colours is shared.
+  // The Gaussians of another scene in other colors (count, sh_coefficients, 3); what does not
+  // depend on colors is shared.
   BakedScene(const BakedScene& other, const float* colors, int sh_coefficients, int sh_degree);
 
   size_t count() const { return shape_->order.size(); }
   const BakedArrays& arrays() const { return arrays_; }
 
  private:
-  // All but colours.
+  // All but colors.
   struct Shape {
     std::vector<uint32_t> order;  // (count), of the Gaussians as they were given
     std::vector<float> geometry, bounds;

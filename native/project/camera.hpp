@@ -5,7 +5,7 @@
 
 namespace splatpilot {
 
-// Where there is no colour, what is left of the blur [px^2]: so little that it hides no pixel from
+// Where there is no color, what is left of the blur [px^2]: so little that it hides no pixel from
 // a footprint without any, and enough that needles are found in float32.
 constexpr float kDepthBlur = 1e-4f;
 

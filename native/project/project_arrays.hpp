@@ -6,28 +6,38 @@
 
 namespace splatpilot::SIMD_LEVEL {
 
-// Candidate positions among Gaussians [begin, end); returns how many.
-inline size_t cull_arrays(const GaussianArrays& g, const Camera& camera, size_t begin, size_t end,
-                          uint32_t* candidates) {
+// Finds the Gaussians among [begin, end) that may touch the image by position and the largest of
+// their first `kAxes` scales, and returns their number. One of scale s reaches `side_reach` s
+// across the sides of the image. `candidates` is padded with `begin` to whole packs.
+template <int kAxes>
+SP_INLINE size_t cull(const GaussianArrays& g, const Camera& camera, const float* side_reach,
+                      size_t begin, size_t end, uint32_t* candidates) {
   size_t count = 0;
   for (size_t first = begin; first < end; first += kLanes) {
     const size_t lanes = end - first < kLanes ? end - first : kLanes;
-    alignas(64) float soa[6][kLanes] = {};
+    alignas(64) float soa[3 + kAxes][kLanes] = {};
     for (size_t lane = 0; lane < lanes; ++lane) {
-      for (int axis = 0; axis < 3; ++axis) {
-        soa[axis][lane] = g.means[3 * (first + lane) + axis];
-        soa[3 + axis][lane] = g.scales[3 * (first + lane) + axis];
-      }
+      const float* mean = g.means + 3 * (first + lane);
+      const float* scale = g.scales + 3 * (first + lane);
+      for (int axis = 0; axis < 3; ++axis) soa[axis][lane] = mean[axis];
+      for (int axis = 0; axis < kAxes; ++axis) soa[3 + axis][lane] = scale[axis];
     }
     const Vector16 p_C =
         to_camera(camera, from_centre(camera, load(soa[0]), load(soa[1]), load(soa[2])));
-    const F16 largest_scale = max(max(load(soa[3]), load(soa[4])), load(soa[5]));
-    uint32_t bits = lane_bits(may_be_visible(camera, p_C, largest_scale));
-    bits &= (1u << lanes) - 1;
-    for (; bits; bits &= bits - 1) {
+    F16 largest_scale = load(soa[3]);
+    for (int axis = 1; axis < kAxes; ++axis) {
+      largest_scale = max(largest_scale, load(soa[3 + axis]));
+    }
+    Mask16 visible = in_depth_range(camera, p_C.z);
+    for (int side = 0; side < 4; ++side) {
+      const F16 reach = F16(side_reach[side]) * largest_scale;
+      visible = visible & (dot(camera.side_normal[side], p_C) + reach > F16(0.0f));
+    }
+    for (uint32_t bits = lane_bits(visible) & ((1u << lanes) - 1); bits; bits &= bits - 1) {
       candidates[count++] = static_cast<uint32_t>(first) + __builtin_ctz(bits);
     }
   }
+  for (int i = 0; i < kLanes; ++i) candidates[count + i] = static_cast<uint32_t>(begin);
   return count;
 }
 
@@ -79,7 +89,7 @@ SP_INLINE void prefetch_rows(const float* rows, int stride, int used, const uint
   }
 }
 
-// Gathers the colours of the lanes in `bits` and evaluates them.
+// Gathers the colors of the lanes in `bits` and evaluates them.
 SP_INLINE void gather_colors(const GaussianArrays& g, const uint32_t* indices, uint32_t bits,
                              const Vector16& d_W, F16 color[3]) {
   const int used = g.sh_degree < 0 ? 1 : (g.sh_degree + 1) * (g.sh_degree + 1);
@@ -117,10 +127,7 @@ template <bool kDistorted>
 size_t project_arrays_through(const GaussianArrays& g, const Camera& camera, size_t begin,
                               size_t end, Splat* splats, DepthPlane* planes, uint32_t* depth_bits) {
   uint32_t candidates[kChunkSize + kLanes];
-  const size_t candidate_count = cull_arrays(g, camera, begin, end, candidates);
-  // Lanes past the end repeat a Gaussian that exists and are masked out.
-  for (int i = 0; i < kLanes; ++i) candidates[candidate_count + i] = static_cast<uint32_t>(begin);
-
+  const size_t candidate_count = cull<3>(g, camera, camera.side_reach, begin, end, candidates);
   size_t count = 0;
   for (size_t first = 0; first < candidate_count; first += kLanes) {
     const uint32_t* indices = candidates + first;

@@ -1,4 +1,4 @@
-// Projection of baked scenes: boxes of neighbouring Gaussians are culled together, and what is left
+// Projection of baked scenes: boxes of neighboring Gaussians are culled together, and what is left
 // is read straight as packs.
 #pragma once
 

@@ -47,17 +47,6 @@ SP_INLINE Mask16 in_depth_range(const Camera& camera, const F16& z) {
   return (z >= F16(camera.near_plane)) & (z <= F16(camera.far_plane));
 }
 
-// Lanes whose Gaussians may touch the image, judged by position and largest scale alone.
-SP_INLINE Mask16 may_be_visible(const Camera& camera, const Vector16& p_C,
-                                const F16& largest_scale) {
-  Mask16 visible = in_depth_range(camera, p_C.z);
-  for (int side = 0; side < 4; ++side) {
-    const F16 reach = F16(camera.side_reach[side]) * largest_scale;
-    visible = visible & (dot(camera.side_normal[side], p_C) + reach > F16(0.0f));
-  }
-  return visible;
-}
-
 // The image of the world axes under the projection's Jacobian at p_C: m[i] = J_i R_CW, with the
 // slopes x/z and y/z held within 1.3 times the field of view as in the original method.
 template <bool kDistorted = false>

@@ -9,7 +9,6 @@ namespace splatpilot {
 void Renderer::start(Frame& frame, const Camera& camera, bool keep) {
   frame.camera = camera;
   frame.kept = keep;
-  lap();
 }
 
 void Renderer::project(Frame& frame, size_t count, bool median_depth, const ProjectChunk& project) {
@@ -25,7 +24,6 @@ void Renderer::project(Frame& frame, size_t count, bool median_depth, const Proj
         project(begin, std::min(count, begin + kChunkSize), frame.splats.data() + begin,
                 median_depth ? frame.planes.data() + begin : nullptr, depth_bits_.data() + begin);
   });
-  seconds_.project = lap();
 }
 
 void Renderer::sort(const Frame& frame) {
@@ -40,7 +38,6 @@ void Renderer::sort(const Frame& frame) {
   radix_sort(items_, sort_scratch_);
   order_.resize(items_.size());
   for (size_t i = 0; i < items_.size(); ++i) order_[i] = items_[i].value;
-  seconds_.sort = lap();
 }
 
 // Counts the pairs of each tile and each task, then puts every pair where the counts say. Tasks are
@@ -99,7 +96,6 @@ void Renderer::bin(Frame& frame, BinKernel kernel) {
       range.end = k + 1;
     }
   });
-  seconds_.bin = lap();
 }
 
 }  // namespace splatpilot

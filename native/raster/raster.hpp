@@ -17,7 +17,7 @@ struct BlockState {
 };
 
 // Composites the staged splats of one block; returns whether any pixel is still open. A pixel whose
-// colour is finished is open while its median depth is sought.
+// color is finished is open while its median depth is sought.
 template <bool kColor, bool kDepth, bool kMedian>
 SP_INLINE bool composite(const StagedTile& staged, int words, int b, const LaneCentres& pixel,
                          BlockState& state) {

@@ -50,15 +50,6 @@ std::shared_ptr<const Frame> Renderer::render(const BakedArrays& scene,
   return draw(camera, image, false, count, project);
 }
 
-std::shared_ptr<const Frame> Renderer::render(const ProjectedArrays& projected,
-                                              const Camera& camera, const Image& image, bool keep) {
-  const auto project = [&](size_t begin, size_t end, Splat* splats, DepthPlane*,
-                           uint32_t* depth_bits) {
-    return place_splats(projected, camera, begin, end, splats, depth_bits);
-  };
-  return draw(camera, image, keep, projected.count, project);
-}
-
 std::shared_ptr<const Frame> Renderer::draw(const Camera& camera, const Image& image, bool keep,
                                             size_t count, const ProjectChunk& project) {
   const std::shared_ptr<Frame> frame = frames_.take();
@@ -91,14 +82,6 @@ void Renderer::composite(Frame& frame, const Image& image) {
   pool_.for_each(frame.tiles(), [&](size_t tile) {
     kernels_.raster_tile(input, image, frame.kept ? &record : nullptr, static_cast<int>(tile));
   });
-  seconds_.raster = lap();
-}
-
-double Renderer::lap() {
-  const auto now = std::chrono::steady_clock::now();
-  const std::chrono::duration<double> passed = now - lap_start_;
-  lap_start_ = now;
-  return passed.count();
 }
 
 bool Renderer::are_valid(const GaussianArrays& g, size_t color_floats) {

@@ -1,7 +1,6 @@
 // Frames: project, sort by depth, bin into tiles, composite; and the way back.
 #pragma once
 
-#include <chrono>
 #include <functional>
 #include <memory>
 #include <mutex>
@@ -13,15 +12,8 @@
 #include "core/thread_pool.hpp"
 #include "core/types.hpp"
 #include "project/camera.hpp"
-#include "project/projected.hpp"
 
 namespace splatpilot {
-
-// Wall-clock seconds that the last frame's stages took.
-struct StageSeconds {
-  double project, sort, bin, raster;
-  double raster_backward, gather, project_backward;
-};
 
 // Holds threads and scratch memory, which is reused by the next frame and never influences it. Not
 // for use by two threads at a time: hold mutex(). Frames do not change any more once they are
@@ -35,8 +27,6 @@ class Renderer {
   // A baked scene, and among it Gaussians that are not: those that move.
   std::shared_ptr<const Frame> render(const BakedArrays& scene, const GaussianArrays& moving,
                                       const Camera& camera, const Image& image);
-  std::shared_ptr<const Frame> render(const ProjectedArrays& projected, const Camera& camera,
-                                      const Image& image, bool keep);
   // From the image to the frame's splats, in the order of the input; `gradients` and
   // `means2d` (n, 2), a copy of SplatGradient::mean, hold frame.splat_count(). Returns how many
   // (splat, 4x4 block) were composited.
@@ -51,16 +41,15 @@ class Renderer {
   std::shared_ptr<const SurfelFrame> render_surfels(const GaussianArrays& surfels,
                                                     const Camera& camera,
                                                     const SurfelImages<float>& images, bool keep);
-  // Adds gradients of a kept frame, of which `surfels` must be the ones.
-  CameraGradient surfels_backward(const SurfelFrame& frame, const GaussianArrays& surfels,
-                                  const SurfelImages<const float>& gradients,
-                                  const InputGradients& out);
+  // From the images to the surfels, which must be those of the kept frame.
+  PoseSums surfels_backward(const SurfelFrame& frame, const GaussianArrays& surfels,
+                            const SurfelImages<const float>& gradients,
+                            const GaussianGradients& out);
 
   // Whether every number of the Gaussians can be rendered; `colors` are `color_floats` in all. May
   // be false for scales of less than the least normal number.
   bool are_valid(const GaussianArrays& gaussians, size_t color_floats);
 
-  const StageSeconds& seconds() const { return seconds_; }
   const Kernels& kernels() const { return kernels_; }
   std::mutex& mutex() { return mutex_; }
   // Calls visit(i, splat) for the splats of a frame, i counting them in the order of the input; on
@@ -86,14 +75,14 @@ class Renderer {
   void composite(Frame& frame, const Image& image);
   std::shared_ptr<const Frame> draw(const Camera& camera, const Image& image, bool keep,
                                     size_t count, const ProjectChunk& project);
-  // Seconds since it was last called.
-  double lap();
+  // Sets a chunk's rows to zero where they are to be overwritten.
+  static void clear_chunk(const GaussianArrays& gaussians, size_t chunk,
+                          const GaussianGradients& out);
+  static PoseSums total(const std::vector<PoseSums>& parts);
 
   const Kernels& kernels_;
   std::mutex mutex_;
   ThreadPool pool_;
-  StageSeconds seconds_{};
-  std::chrono::steady_clock::time_point lap_start_;
   FramePool<Frame> frames_;
   FramePool<SurfelFrame> surfel_frames_;
   std::vector<uint32_t> depth_bits_;

@@ -150,44 +150,17 @@ SP_INLINE Mask16 surfel_bounds(const Camera& camera, const SurfelPlane& s, const
          (low_y < F16(static_cast<float>(camera.height)));
 }
 
-// The lanes that may be visible by position and larger scale alone: a disc of radius R reaches the
-// half-space n . p > 0 if n . p + |n| R > 0. The sides have room for the blob.
-inline size_t cull_surfels(const GaussianArrays& g, const Camera& camera, size_t begin, size_t end,
-                           uint32_t* candidates) {
+inline size_t project_surfels(const GaussianArrays& g, const Camera& camera, size_t begin,
+                              size_t end, Splat* bounds, Surfel* surfels, uint32_t* depth_bits) {
+  uint32_t candidates[kChunkSize + kLanes];
+  // A disc of radius R reaches the half-space n . p > 0 if n . p + |n| R > 0; the sides have room
+  // for the blob.
   float reach[4];
   for (int side = 0; side < 4; ++side) {
     const float* n = camera.side_normal[side];
     reach[side] = 1.001f * kMaxExtent * __builtin_sqrtf(n[0] * n[0] + n[1] * n[1] + n[2] * n[2]);
   }
-  size_t count = 0;
-  for (size_t first = begin; first < end; first += kLanes) {
-    const size_t lanes = end - first < kLanes ? end - first : kLanes;
-    alignas(64) float soa[5][kLanes] = {};
-    for (size_t lane = 0; lane < lanes; ++lane) {
-      for (int axis = 0; axis < 3; ++axis) soa[axis][lane] = g.means[3 * (first + lane) + axis];
-      for (int k = 0; k < 2; ++k) soa[3 + k][lane] = g.scales[3 * (first + lane) + k];
-    }
-    const Vector16 p_C =
-        to_camera(camera, from_centre(camera, load(soa[0]), load(soa[1]), load(soa[2])));
-    const F16 largest_scale = max(load(soa[3]), load(soa[4]));
-    Mask16 visible = in_depth_range(camera, p_C.z);
-    for (int side = 0; side < 4; ++side) {
-      visible = visible &
-                (dot(camera.side_normal[side], p_C) + F16(reach[side]) * largest_scale > F16(0.0f));
-    }
-    for (uint32_t bits = lane_bits(visible) & ((1u << lanes) - 1); bits; bits &= bits - 1) {
-      candidates[count++] = static_cast<uint32_t>(first) + __builtin_ctz(bits);
-    }
-  }
-  return count;
-}
-
-inline size_t project_surfels(const GaussianArrays& g, const Camera& camera, size_t begin,
-                              size_t end, Splat* bounds, Surfel* surfels, uint32_t* depth_bits) {
-  uint32_t candidates[kChunkSize + kLanes];
-  const size_t candidate_count = cull_surfels(g, camera, begin, end, candidates);
-  for (int i = 0; i < kLanes; ++i) candidates[candidate_count + i] = static_cast<uint32_t>(begin);
-
+  const size_t candidate_count = cull<2>(g, camera, reach, begin, end, candidates);
   size_t count = 0;
   for (size_t first = 0; first < candidate_count; first += kLanes) {
     const uint32_t* indices = candidates + first;

@@ -1,39 +1,13 @@
 // From gradients of surfels to those of the input and of the camera.
 #pragma once
 
-#include "backward/color_backward.hpp"
+#include "backward/projection_backward.hpp"
 #include "surfels/surfel_projection.hpp"
 
 namespace splatpilot::SIMD_LEVEL {
 
-// A gradient in the camera frame, in the world.
-SP_INLINE Vector16 to_world(const Camera& camera, const Vector16& c) {
-  const float* R = camera.R_CW;
-  return {F16(R[0]) * c.x + F16(R[3]) * c.y + F16(R[6]) * c.z,
-          F16(R[1]) * c.x + F16(R[4]) * c.y + F16(R[7]) * c.z,
-          F16(R[2]) * c.x + F16(R[5]) * c.y + F16(R[8]) * c.z};
-}
-
 SP_INLINE Vector16 zero_unless(const Mask16& m, const Vector16& a) {
   return {zero_unless(m, a.x), zero_unless(m, a.y), zero_unless(m, a.z)};
-}
-
-// The gradient with respect to a quaternion of any length, from those of the first two columns of
-// its rotation matrix.
-SP_INLINE void quaternion_gradient(const F16 raw[4], const Vector16& a, const Vector16& b,
-                                   F16 gradient[4]) {
-  const F16 inverse_norm =
-      F16(1.0f) / sqrt(raw[0] * raw[0] + raw[1] * raw[1] + raw[2] * raw[2] + raw[3] * raw[3]);
-  const F16 two = F16(2.0f);
-  const F16 w = raw[0] * inverse_norm, x = raw[1] * inverse_norm, y = raw[2] * inverse_norm,
-            z = raw[3] * inverse_norm;
-  gradient[0] = two * ((z * a.y - y * a.z) + (x * b.z - z * b.x));
-  gradient[1] = two * ((y * a.y + z * a.z) + (y * b.x + w * b.z) - two * x * b.y);
-  gradient[2] = two * ((x * a.y - w * a.z) + (x * b.x + z * b.z) - two * y * a.x);
-  gradient[3] = two * ((w * a.y + x * a.z) + (y * b.z - w * b.x) - two * z * (a.x + b.y));
-  const F16 along = gradient[0] * w + gradient[1] * x + gradient[2] * y + gradient[3] * z;
-  const F16 unit[4] = {w, x, y, z};
-  for (int k = 0; k < 4; ++k) gradient[k] = (gradient[k] - along * unit[k]) * inverse_norm;
 }
 
 // What a gradient of the surfel's fields is in the camera frame, with respect to its centre and its
@@ -85,19 +59,10 @@ SP_INLINE PlaneGradient plane_gradient(const Camera& camera, const SurfelPlane& 
   return out;
 }
 
-// Sums of 16 lanes, of which those not in `bits` are left out.
-SP_INLINE double masked_sum(const F16& a, uint32_t bits) {
-  alignas(64) float lanes[kLanes];
-  store(lanes, a);
-  double total = 0.0;
-  for (; bits; bits &= bits - 1) total += static_cast<double>(lanes[__builtin_ctz(bits)]);
-  return total;
-}
-
 inline void project_surfels_backward(const GaussianArrays& input, const Camera& camera,
                                      const uint32_t* all_indices, const SurfelGradient* gradients,
-                                     size_t count, const InputGradients& out,
-                                     CameraGradient* by_camera) {
+                                     size_t count, const GaussianGradients& out, PoseSums* pose) {
+  PoseGradientPack pose_pack;
   for (size_t first = 0; first < count; first += kLanes) {
     const size_t lanes = count - first < kLanes ? count - first : kLanes;
     const uint32_t bits = (1u << lanes) - 1;
@@ -126,45 +91,29 @@ inline void project_surfels_backward(const GaussianArrays& input, const Camera& 
     const Vector16 by_t1 = to_world(camera, by.t[1]) + cross(by_normal, t_W[0]);
     F16 by_color[3] = {g[10], g[11], g[12]};
     if (input.sh_degree >= 0) {
-      // Colours held at zero do not follow their coefficients.
+      // Colors held at zero do not follow their coefficients.
       F16 color[3];
       gather_colors(input, indices, bits, d_W, color);
       for (int c = 0; c < 3; ++c) by_color[c] = zero_unless(color[c] > zero, by_color[c]);
     }
     const Vector16 by_d =
         colors_backward(input, indices, static_cast<int>(lanes), d_W, by_color, out.colors);
-    const Vector16 by_p = to_world(camera, by.p) + by_d;
+    const Vector16 none = {zero, zero, zero};
+    GaussianGradientPack pack{to_world(camera, by.p) + by_d,
+                              {},
+                              {by.scale[0], by.scale[1], zero},
+                              g[9] / max(in.opacity, F16(1e-30f))};
+    quaternion_gradient(in.quat, by_t0, by_t1, none, pack.quat);
+    add_rows(pack, indices, static_cast<int>(lanes), out);
 
-    F16 rows[10] = {by_p.x, by_p.y, by_p.z,      zero,        zero,
-                    zero,   zero,   by.scale[0], by.scale[1], g[9] / max(in.opacity, F16(1e-30f))};
-    quaternion_gradient(in.quat, by_t0, by_t1, rows + 3);
-    alignas(64) float fields[10][kLanes];
-    for (int f = 0; f < 10; ++f) store(fields[f], rows[f]);
-    for (size_t lane = 0; lane < lanes; ++lane) {
-      const size_t i = indices[lane];
-      for (int k = 0; k < 3; ++k) out.means[3 * i + k] += fields[k][lane];
-      for (int k = 0; k < 4; ++k) out.quats[4 * i + k] += fields[3 + k][lane];
-      for (int k = 0; k < 2; ++k) out.scales[3 * i + k] += fields[7 + k][lane];
-      out.opacities[i] += fields[9][lane];
-    }
-
-    if (!by_camera) continue;
-    // p_C = R p_W + t and t_C = R t_W.
-    const F16 p_W[3] = {in.mean.x, in.mean.y, in.mean.z};
-    const F16 t0_W[3] = {t_W[0].x, t_W[0].y, t_W[0].z}, t1_W[3] = {t_W[1].x, t_W[1].y, t_W[1].z};
-    const F16 by_p_C[3] = {by.p.x, by.p.y, by.p.z};
-    const F16 by_t0_C[3] = {by.t[0].x, by.t[0].y, by.t[0].z};
-    const F16 by_t1_C[3] = {by.t[1].x, by.t[1].y, by.t[1].z};
-    const F16 by_centre[3] = {-by_d.x, -by_d.y, -by_d.z};
-    for (int i = 0; i < 3; ++i) {
-      for (int j = 0; j < 3; ++j) {
-        by_camera->R[3 * i + j] +=
-            masked_sum(by_p_C[i] * p_W[j] + (by_t0_C[i] * t0_W[j] + by_t1_C[i] * t1_W[j]), bits);
-      }
-      by_camera->t[i] += masked_sum(by_p_C[i], bits);
-      by_camera->centre[i] += masked_sum(by_centre[i], bits);
+    pose_pack.add(by.p, d_W, by_d);  // t_C = R t_W
+    for (int k = 0; k < 2; ++k) {
+      pose_pack.R[0] = pose_pack.R[0] + by.t[k].x * t_W[k];
+      pose_pack.R[1] = pose_pack.R[1] + by.t[k].y * t_W[k];
+      pose_pack.R[2] = pose_pack.R[2] + by.t[k].z * t_W[k];
     }
   }
+  pose_pack.write(pose);
 }
 
 }  // namespace splatpilot::SIMD_LEVEL

@@ -28,7 +28,7 @@ struct Surfel {
 constexpr int kSurfelFields = sizeof(Surfel) / sizeof(float);
 
 // The pixels that a surfel may reach are those of an ellipse and of a disc. The ellipse is written
-// as a Splat, with the disc where that has its colour.
+// as a Splat, with the disc where that has its color.
 struct Disc {
   float x, y, radius;  // [px]
 };
@@ -70,17 +70,6 @@ struct alignas(64) SurfelGradient {
 };
 static_assert(sizeof(SurfelGradient) == 64);
 
-// Where the gradients of the input go: added to rows of arrays shaped like the input.
-struct InputGradients {
-  float *means, *quats, *scales, *opacities, *colors;
-};
-
-// Of the camera: world to camera (R row by row, then t), and the camera centre, of which colours
-// by spherical harmonics depend.
-struct CameraGradient {
-  double R[9], t[3], centre[3];
-};
-
 struct SurfelKernels {
   size_t (*project)(const GaussianArrays&, const Camera&, size_t begin, size_t end, Splat* bounds,
                     Surfel*, uint32_t* depth_bits);
@@ -95,8 +84,8 @@ struct SurfelKernels {
   // From gradients of `count` surfels, whose places in the input are `indices`, to those of the
   // input and of the camera.
   void (*project_backward)(const GaussianArrays&, const Camera&, const uint32_t* indices,
-                           const SurfelGradient*, size_t count, const InputGradients&,
-                           CameraGradient*);
+                           const SurfelGradient*, size_t count, const GaussianGradients&,
+                           PoseSums*);
 };
 
 }  // namespace splatpilot

@@ -39,17 +39,15 @@ std::shared_ptr<const SurfelFrame> Renderer::render_surfels(const GaussianArrays
     kernels.raster_tile(input, images, keep ? frame->records.data() : nullptr,
                         static_cast<int>(tile));
   });
-  seconds_.raster = lap();
   return frame;
 }
 
 // As for Gaussians, the sums do not depend on the threads.
-CameraGradient Renderer::surfels_backward(const SurfelFrame& frame, const GaussianArrays& surfels,
-                                          const SurfelImages<const float>& gradients,
-                                          const InputGradients& out) {
+PoseSums Renderer::surfels_backward(const SurfelFrame& frame, const GaussianArrays& surfels,
+                                    const SurfelImages<const float>& gradients,
+                                    const GaussianGradients& out) {
   const SurfelKernels& kernels = *kernels_.surfels;
   const Frame& bounds = frame.bounds;
-  lap();
   if (surfel_pair_gradients_.size() < bounds.pairs.size()) {
     surfel_pair_gradients_.resize(bounds.pairs.size());
   }
@@ -58,10 +56,10 @@ CameraGradient Renderer::surfels_backward(const SurfelFrame& frame, const Gaussi
     kernels.raster_tile_backward(input, frame.records.data(), gradients, static_cast<int>(tile),
                                  surfel_pair_gradients_.data());
   });
-  seconds_.raster_backward = lap();
 
-  std::vector<CameraGradient> by_chunk(bounds.chunk_counts.size());
-  pool_.for_each(by_chunk.size(), [&](size_t chunk) {
+  std::vector<PoseSums> pose_sums(bounds.chunk_counts.size());
+  pool_.for_each(pose_sums.size(), [&](size_t chunk) {
+    clear_chunk(surfels, chunk, out);
     const size_t first = chunk * kChunkSize, count = bounds.chunk_counts[chunk];
     std::vector<uint32_t> indices(count);
     std::vector<SurfelGradient> sums(count);
@@ -77,16 +75,9 @@ CameraGradient Renderer::surfels_backward(const SurfelFrame& frame, const Gaussi
       std::memcpy(static_cast<void*>(&sums[i]), total, sizeof(total));
     }
     kernels.project_backward(surfels, bounds.camera, indices.data(), sums.data(), count, out,
-                             &by_chunk[chunk]);
+                             &pose_sums[chunk]);
   });
-  CameraGradient by_camera{};
-  for (const CameraGradient& part : by_chunk) {
-    for (int k = 0; k < 9; ++k) by_camera.R[k] += part.R[k];
-    for (int k = 0; k < 3; ++k) by_camera.t[k] += part.t[k];
-    for (int k = 0; k < 3; ++k) by_camera.centre[k] += part.centre[k];
-  }
-  seconds_.project_backward = lap();
-  return by_camera;
+  return total(pose_sums);
 }
 
 }  // namespace splatpilot

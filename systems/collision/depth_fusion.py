@@ -8,14 +8,15 @@ from pydrake.math import RigidTransform
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.occupancy import esdf_from_occupancy, grid_shape
 from splatpilot.systems.common.progress import Progress
+from splatpilot.systems.common.validation import require
 
-# Voxels along the edge of a block, the unit in which what a camera cannot see is skipped.
+# Voxels along the edge of a block, the unit in which invisible space is skipped.
 _BLOCK = 8
 # Blocks fused at once.
 _CHUNK = 1024
-# Surfaces seen at a grazing angle count as if seen at this cosine at least.
+# Minimum cosine of incidence.
 _MIN_COSINE = 0.15
-# Truncations behind a surface, along the optical axis, in which a pixel still speaks.
+# Truncations behind a surface, along the optical axis, in which a pixel counts.
 _MAX_DEPTH_BEHIND = 2.0
 
 
@@ -70,7 +71,7 @@ class DepthFusion:
             self.weighted[block] += distance
 
     def grids(self) -> tuple[np.ndarray, np.ndarray]:
-        """The average distance (nx, ny, nz) [m] and where there is one (nx, ny, nz)."""
+        """Returns the average distance (nx, ny, nz) [m] and the mask where it exists."""
         seen = self.weight > 0.0
         np.divide(self.weighted, self.weight, out=self.weighted, where=seen)
         return self._as_grid(self.weighted), self._as_grid(seen)
@@ -85,10 +86,10 @@ class DepthFusion:
     def visible_blocks(
         self, depth: np.ndarray, K: np.ndarray, center_C: np.ndarray, max_range: float
     ) -> np.ndarray:
-        """The indices of the blocks that may hold a voxel the image sees.
+        """Returns the indices of the blocks that may hold a voxel in view.
 
-        A block is a ball that covers at most 2 x 2 pixels in one of the images of farthest depths,
-        each of which halves the one before.
+        The sphere about a block covers at most 2 x 2 pixels at some level of a pyramid of maximum
+        depths.
         """
         height, width = depth.shape
         radius = self.block_radius
@@ -97,7 +98,7 @@ class DepthFusion:
         possible = np.flatnonzero((far > 0.0) & in_range)
         x, y, z = center_C[possible].T
         near = near[possible]
-        # In the plane z > 0 the ball lies between the rays of slope (x +- s) / z; one that reaches
+        # In the plane z > 0 the sphere lies between rays of slope (x +- s) / z; one that reaches
         # behind the camera may cover any pixel.
         with np.errstate(divide="ignore", invalid="ignore"):
             reach = np.where(near > 0.0, radius / near, np.inf)
@@ -130,14 +131,14 @@ class DepthFusion:
 
 
 def _halve(image: np.ndarray) -> np.ndarray:
-    """The maximum over squares of 2 x 2 pixels, ((H + 1) // 2, (W + 1) // 2)."""
+    """Computes the maximum over squares of 2 x 2 pixels, ((H + 1) // 2, (W + 1) // 2)."""
     image = np.pad(image, [(0, n % 2) for n in image.shape])
     image = np.maximum(image[::2], image[1::2])
     return np.maximum(image[:, ::2], image[:, 1::2])
 
 
 def ray_slopes(shape: tuple[int, ...], K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """x / z (W,) and y / z (H,) of the rays through the pixels of an image of shape (H, W)."""
+    """Returns x / z (W,) and y / z (H,) of the pixels' rays in an image (H, W)."""
     height, width = shape
     x = (np.arange(width) + 0.5 - K[0, 2]) / K[0, 0]
     y = (np.arange(height) + 0.5 - K[1, 2]) / K[1, 1]
@@ -145,9 +146,9 @@ def ray_slopes(shape: tuple[int, ...], K: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def _cosine_of_incidence(depth: np.ndarray, K: np.ndarray) -> np.ndarray:
-    """n . (u, v, 1) at each pixel, with n the surface's unit normal and (u, v, 1) the pixel's ray.
+    """Computes n . (u, v, 1) at each pixel: n is the surface's unit normal, (u, v, 1) the ray.
 
-    It turns a difference in depth into a distance from the surface's tangent plane. In normalised
+    It turns a difference in depth into a distance from the surface's tangent plane. In normalized
     image coordinates (u, v) a plane n . X = c has the inverse depth w = n . (u, v, 1) / c, so
     n / c = (w_u, w_v, w - u w_u - v w_v). Of the slopes to the two neighbours along each axis the
     smaller is taken, which stays on the pixel's own surface at a silhouette.
@@ -183,7 +184,7 @@ def esdf_from_depth_images(
     max_range: float = 8.0,
     truncation: float | None = None,
 ) -> Esdf:
-    """Fuses depth images into a distance field that knows what was never seen.
+    """Fuses depth images into a distance field that marks unobserved space.
 
     Each image gives the voxels it sees a signed distance to the surface along the optical axis,
     turned into the distance to the surface's tangent plane by the surface's slope in the image,
@@ -191,14 +192,14 @@ def esdf_from_depth_images(
     (Curless and Levoy 1996). A voxel is FREE when on average before a surface, OCCUPIED when at
     most `truncation` behind one, UNKNOWN when no image saw it. The average places the surface
     within the voxels, see `esdf_from_occupancy`. Against analytic rooms and on a real capture the
-    field near surfaces is unbiased to 0.04 voxel, rms 0.09 to 0.16. What hides less than
+    field near surfaces is unbiased to 0.04 voxel, rms 0.09 to 0.16. Space less than
     `truncation` behind an edge counts as occupied until another image clears it, which is safe.
 
     Args:
         depths: images (H, W) float [m], planar depth along the optical axis; 0, NaN and negative
-            pixels say nothing, infinite ones that nothing stands in the way, as before the sky. One
-            at a time is held in memory.
-        K: (3, 3) intrinsics [px]; pixel (row i, column j) is centred at (j + 0.5, i + 0.5).
+            pixels are unknown, infinite ones free space, as before the sky. Held in memory one at a
+            time.
+        K: (3, 3) intrinsics [px]; pixel (row i, column j) is centered at (j + 0.5, i + 0.5).
         X_WCs: the camera's pose of each image (x right, y down, z forward).
         lower_W, upper_W: (3,) [m], the box to fill, see `bounds_of_depth_images`.
         voxel_size: [m].
@@ -206,17 +207,11 @@ def esdf_from_depth_images(
             clears the space before it.
         truncation: thickness given to surfaces [m], by default 3 voxels.
 
-    Raises:
-        ValueError: for different numbers of images and poses, no images, images of different
-            shapes, intrinsics without focal length, ranges that are not positive, a truncation
-            below 2 voxels or a box that makes no grid (see `grid_shape`).
     """
     truncation = 3.0 * voxel_size if truncation is None else truncation
-    if not truncation >= 2.0 * voxel_size:
-        raise ValueError(
-            f"esdf_from_depth_images: the truncation is {truncation} m; it must be at least 2 "
-            f"voxels, {2.0 * voxel_size} m, or surfaces fall through the grid."
-        )
+    # Through thinner surfaces voxels fall.
+    valid = truncation >= 2.0 * voxel_size
+    require(valid, "truncation", f"at least 2 voxels, {2.0 * voxel_size} m", truncation)
     fusion = DepthFusion(lower_W, upper_W, voxel_size, truncation)
     for depth, X_WC in _pair(depths, X_WCs, "fusing depth"):
         fusion.add(depth, _require_intrinsics(K), X_WC, _require_range(max_range))
@@ -233,7 +228,7 @@ def bounds_of_depth_images(
     max_range: float = 8.0,
     margin: float = 0.2,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The box that holds all points seen within `max_range` [m] and all cameras, and a margin [m].
+    """Returns the box of all points seen within `max_range` [m] and all cameras, and a margin [m].
 
     Takes every fourth pixel along both axes; arguments as for `esdf_from_depth_images`.
 
@@ -259,37 +254,27 @@ def bounds_of_depth_images(
 def _pair(
     depths: Iterable[np.ndarray], X_WCs: Sequence[RigidTransform], what: str
 ) -> Iterator[tuple[np.ndarray, RigidTransform]]:
-    """Pairs images, pixels that say nothing set to 0, with poses; checks and shows progress."""
+    """Pairs images, unknown pixels set to 0, with poses; checks and shows progress."""
     shape, count = None, 0
     for depth in Progress(depths, desc=what, total=len(X_WCs), unit="image", delay=2.0):
         depth = np.asarray(depth, dtype=np.float32)
         shape = depth.shape if shape is None else shape
-        if depth.ndim != 2 or depth.shape != shape:
-            raise ValueError(
-                f"depth image {count} has shape {depth.shape}; needed is (H, W), the same for all "
-                f"images (the first has {shape})."
-            )
+        valid = depth.ndim == 2 and depth.shape == shape
+        require(valid, f"shape of depth image {count}", f"(H, W), the first's {shape}", depth.shape)
         if count < len(X_WCs):
             yield np.where(depth > 0.0, depth, np.float32(0.0)), X_WCs[count]
         count += 1
-    if count != len(X_WCs) or count == 0:
-        raise ValueError(
-            f"{len(X_WCs)} poses for {count} depth images; needed is one pose for each image, and "
-            "at least one image."
-        )
+    require(count == len(X_WCs) and count, "depth images", f"one per pose, {len(X_WCs)}", count)
 
 
 def _require_intrinsics(K: np.ndarray) -> np.ndarray:
     K = np.asarray(K, dtype=float)
-    if K.shape != (3, 3) or not np.isfinite(K).all() or K[0, 0] <= 0.0 or K[1, 1] <= 0.0:
-        raise ValueError(
-            f"depth images: the intrinsics are {K.tolist()}; needed is a finite (3, 3) matrix with "
-            "positive focal lengths [px]."
-        )
+    valid = K.shape == (3, 3) and np.isfinite(K).all() and K[0, 0] > 0.0 and K[1, 1] > 0.0
+    condition = "a finite (3, 3) matrix with positive focal lengths [px]"
+    require(valid, "K", condition, K.tolist())
     return K
 
 
 def _require_range(max_range: float) -> float:
-    if not (np.isfinite(max_range) and max_range > 0.0):
-        raise ValueError(f"depth images: max_range is {max_range} m; it must be positive.")
+    require(0.0 < max_range < np.inf, "max_range", "in (0, inf) m", max_range)
     return max_range

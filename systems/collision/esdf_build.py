@@ -1,4 +1,4 @@
-"""Every way to build an `Esdf`; each has a file of its own."""
+"""Builds an `Esdf` from Gaussians or another distance field; imports the other builders."""
 
 from collections.abc import Iterator
 
@@ -11,6 +11,7 @@ from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.occupancy import esdf_from_occupancy, grid_shape
 from splatpilot.systems.collision.octomap import esdf_from_octomap
 from splatpilot.systems.common.progress import Progress
+from splatpilot.systems.common.validation import require
 from splatpilot.systems.splats.scene import GaussianScene
 
 # Standard deviations beyond which a Gaussian counts as zero.
@@ -19,7 +20,7 @@ _SUPPORT = 3.5
 _FILTER = 0.5
 # Half the thickness left to a thin sheet, in voxels.
 _TRIM = 0.6
-# Evaluations of a Gaussian at a voxel done at once.
+# Evaluations of a Gaussian at a voxel per batch.
 _CHUNK = 2_000_000
 
 
@@ -31,7 +32,7 @@ def esdf_from_gaussians(
     threshold: float = 0.5,
     observed: np.ndarray | None = None,
 ) -> Esdf:
-    """The distance field of the solid where the Gaussians' density reaches a threshold.
+    """Computes the distance field of the solid where the Gaussians' density reaches a threshold.
 
     The density is sum_i o_i exp(-m_i^2 / 2) with m_i the Mahalanobis distance to Gaussian i, whose
     variances are enlarged by (voxel_size / 2)^2: a sheet thinner than a voxel would otherwise fall
@@ -44,27 +45,20 @@ def esdf_from_gaussians(
     Args:
         scene: the Gaussians.
         voxel_size: [m].
-        lower_W, upper_W: (3,) [m], by default the box of all centres and half a metre.
+        lower_W, upper_W: (3,) [m], by default the box of all centers and half a meter.
         threshold: density of the surface, more than 0 and less than 1.
-        observed: (nx, ny, nz) bool, voxels about which something is known, of the shape
+        observed: (nx, ny, nz) bool, observed voxels, of the shape
             `grid_shape` gives for the box; by default all. Others that are not occupied are
             UNKNOWN.
-
-    Raises:
-        ValueError: for an empty scene without bounds, a threshold out of range, `observed` of
-            another shape, or bounds that make no grid or too large a one (see `grid_shape`).
     """
-    if not 0.0 < threshold < 1.0:
-        raise ValueError(f"esdf_from_gaussians: the threshold is {threshold}; needed is 0 to 1.")
-    if len(scene) == 0 and (lower_W is None or upper_W is None):
-        raise ValueError("esdf_from_gaussians: the scene is empty; give lower_W and upper_W.")
+    require(0.0 < threshold < 1.0, "threshold", "in (0, 1)", threshold)
+    bounds = lower_W is not None and upper_W is not None
+    require(len(scene) or bounds, "scene", "not empty", 0, "or give lower_W and upper_W")
     lower_W = scene.means.min(axis=0) - 0.5 if lower_W is None else lower_W
     upper_W = scene.means.max(axis=0) + 0.5 if upper_W is None else upper_W
     shape = grid_shape(lower_W, upper_W, voxel_size)
-    if observed is not None and observed.shape != shape:
-        raise ValueError(
-            f"esdf_from_gaussians: observed has shape {observed.shape}; the grid has {shape}."
-        )
+    valid = observed is None or observed.shape == shape
+    require(valid, "shape of observed", f"{shape}", None if observed is None else observed.shape)
     density = density_on_grid(scene, np.asarray(lower_W, dtype=float), shape, voxel_size)
     offset = _surface_offset(density, threshold, voxel_size)
     occupied = offset <= 0.0
@@ -77,9 +71,9 @@ def esdf_from_gaussians(
 def density_on_grid(
     scene: GaussianScene, lower_W: np.ndarray, shape: tuple[int, int, int], voxel_size: float
 ) -> np.ndarray:
-    """The Gaussians' density at the voxel centres, (nx, ny, nz) float32."""
+    """Computes the Gaussians' density at the voxel centers, (nx, ny, nz) float32."""
     R = scene.rotations
-    # In voxels from the first voxel's centre from here on.
+    # In voxels from the first voxel's center from here on.
     variance = np.square(scene.scales / voxel_size, dtype=float) + _FILTER**2
     mean = (scene.means - lower_W) / voxel_size - 0.5
     reach = _SUPPORT * np.sqrt(np.einsum("nij,nj->ni", R**2, variance))
@@ -131,7 +125,7 @@ def _splat(
 
 
 def _surface_offset(density: np.ndarray, threshold: float, voxel_size: float) -> np.ndarray:
-    """First-order signed distance of the voxel centres to the solid's surface, (nx, ny, nz) [m].
+    """First-order signed distance of the voxel centers to the solid's surface, (nx, ny, nz) [m].
 
     With L = log(density / threshold), the solid is the part of L >= 0 that lies within _TRIM voxels
     of the middle of a sheet. To first order the surface L = 0 is -L / |grad L| away. At x from the
@@ -154,14 +148,11 @@ _SIZES = np.unique(np.r_[0:9, np.ceil(8 * 1.25 ** np.arange(60))].astype(int))
 
 
 def esdf_from_distance_field(field: DistanceField, voxel_size: float) -> Esdf:
-    """Samples a distance field at the voxel centres of a grid over its bounds.
+    """Samples a distance field at the voxel centers of a grid over its bounds.
 
-    The values are the field's own, so exact at the centres for an analytic field. The grid covers
-    the bounds with whole voxels; centres beyond the field's bounds take the value of the nearest
+    The values are the field's own, so exact at the centers for an analytic field. The grid covers
+    the bounds with whole voxels; centers beyond the field's bounds take the value of the nearest
     point inside. States are the field's own.
-
-    Raises:
-        ValueError: see `grid_shape`.
     """
     lower_W, upper_W = np.asarray(field.lower_W, float), np.asarray(field.upper_W, float)
     shape = grid_shape(lower_W, upper_W, voxel_size)
@@ -180,8 +171,7 @@ def esdf_from_distance_field(field: DistanceField, voxel_size: float) -> Esdf:
 def cubes_of_points(
     x: np.ndarray, y: np.ndarray, z: np.ndarray, edge: int = 16
 ) -> Iterator[tuple[tuple[slice, slice, slice], np.ndarray]]:
-    """The points of the grid x (nx,), y (ny,), z (nz,) in cubes of `edge` points a side: the part
-    of the grid that a cube is, and its points (n, n, n, 3).
+    """Yields the points of a grid in cubes of `edge` points a side: slices and points (n, n, n, 3).
 
     Fields find the nearest of many shapes faster for points that lie close together.
     """

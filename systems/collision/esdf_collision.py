@@ -1,4 +1,4 @@
-"""A distance field as a Drake system: how near a vehicle is to the obstacles."""
+"""A Drake system for distances and collisions of a vehicle."""
 
 import weakref
 from typing import Any
@@ -8,14 +8,15 @@ from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import LeafSystem, ValueProducer
 
 from splatpilot.systems.collision.distance_field import DistanceField, in_collision, soft_barrier
-from splatpilot.systems.collision.shapes import MovingBalls
+from splatpilot.systems.collision.shapes import MovingSpheres
 from splatpilot.systems.common.drake import input_port, output_port
+from splatpilot.systems.common.validation import require
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 from splatpilot.systems.vehicle.state import QuadrotorState
 
 
 class EsdfCollision(LeafSystem):
-    """Distance to the nearest obstacle and the collision signals of a vehicle in a distance field.
+    """Computes the distance to obstacles and the collision signals of a vehicle.
 
     .. pydrake_system::
 
@@ -30,23 +31,23 @@ class EsdfCollision(LeafSystem):
         - barrier
         - field_state
 
-    `state` is (p_WB, v_WB, q_WB, w_WB_B) (13), of which the position p_WB [m] in the world is
-    read. `distance` is the signed distance of p_WB to occupied surfaces [m], `gradient` (3) its
-    derivative by p_WB in W [-], `clearance` = distance - radius [m]. `in_collision` is 1 where the
-    clearance is negative, else 0; `barrier` is equation 3 [m], see `soft_barrier`. `field_state` is
-    the `FieldState` as a number: outside the field's bounds (3) the distance, the clearance and the
-    barrier are NaN, the gradient zero and no collision is claimed. The system has no state; all
-    outputs share one query of the field, which is held by reference.
+    - ``state`` (13): ``[p_WB (3) [m], v_WB (3) [m/s], q_WB (4, wxyz), w_WB_B (3) [rad/s]]``.
+    - ``distance`` (1): signed distance [m] of p_WB to occupied surfaces.
+    - ``gradient`` (3): its derivative by p_WB in W [-].
+    - ``clearance`` (1): distance - radius [m].
+    - ``in_collision`` (1): 1 if the clearance is negative, else 0.
+    - ``barrier`` (1): equation 3 [m], see `soft_barrier`.
+    - ``field_state`` (1): the `FieldState` as a number. Outside the field's bounds (3) distance,
+      clearance and barrier are NaN, the gradient is zero and there is no collision.
+
+    Stateless; all outputs share one query of the field, which is held by reference.
 
     Args:
-        field: the truth about obstacles that stand.
-        moving: those that move, where they are at the Context's time.
+        field: of static obstacles.
+        moving: obstacles that move with the Context's time.
         radius: of the vehicle [m].
         beta: sharpness of the barrier [1/m].
         margin: of the barrier [m].
-
-    Raises:
-        ValueError: if the radius is negative or beta not positive.
     """
 
     state_input_port = input_port("state")
@@ -60,20 +61,17 @@ class EsdfCollision(LeafSystem):
     def __init__(
         self,
         field: DistanceField,
-        moving: MovingBalls | None = None,
+        moving: MovingSpheres | None = None,
         radius: float = VEHICLE_RADIUS,
         beta: float = 4.0,
         margin: float = 1.0,
     ) -> None:
         super().__init__()
-        if not radius >= 0.0:
-            raise ValueError(f"EsdfCollision: the radius is {radius} m; it must not be negative.")
-        if not beta > 0.0:
-            raise ValueError(f"EsdfCollision: beta is {beta} 1/m; it must be positive.")
+        require(radius >= 0.0, "radius", "at least 0 m", radius)
+        require(beta > 0.0, "beta", "> 0 1/m", beta)
         self._field, self._moving = field, moving
         state = self.DeclareVectorInputPort("state", 13)
-        # Drake would never free a system that its own callbacks or a kept cache entry refer to:
-        # hence a weak reference, and the entry's index.
+        # Drake never frees a system that its own callbacks refer to.
         collision = weakref.proxy(self)
         cache = self.DeclareCacheEntry(
             description="sample of the distance field at p_WB",

@@ -5,38 +5,27 @@ import numpy as np
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.distance_transform import distances_from_band, occupancy_distances
 from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.common.validation import require
 
 # Voxels a field may have: its arrays and those of its construction stay below about 8 GB.
 MAX_VOXELS = 250_000_000
 
 
 def grid_shape(lower_W: np.ndarray, upper_W: np.ndarray, voxel_size: float) -> tuple[int, int, int]:
-    """Voxels along each axis that cover the box [lower_W, upper_W]; the last may reach beyond it.
+    """Returns the number of voxels along each axis that cover the box [lower_W, upper_W].
 
-    Raises:
-        ValueError: if the box is empty or not finite, the voxel size is not positive, or the grid
-            would have fewer than 2 voxels along an axis or more than `MAX_VOXELS`.
+    The last may reach beyond it. Grids have at least 2 voxels an axis and at most `MAX_VOXELS`.
     """
     extent = np.asarray(upper_W, dtype=float) - np.asarray(lower_W, dtype=float)
-    if extent.shape != (3,) or not np.isfinite(extent).all() or (extent <= 0.0).any():
-        raise ValueError(
-            f"distance field: the box from {lower_W} to {upper_W} m is empty or not finite; "
-            "upper_W must exceed lower_W along each axis."
-        )
-    if not (np.isfinite(voxel_size) and voxel_size > 0.0):
-        raise ValueError(f"distance field: the voxel size is {voxel_size} m; it must be positive.")
+    valid = extent.shape == (3,) and np.isfinite(extent).all() and (extent > 0.0).all()
+    require(valid, "upper_W", f"finite and above lower_W = {lower_W} m", upper_W)
+    require(0.0 < voxel_size < np.inf, "voxel_size", "in (0, inf) m", voxel_size)
     # The slack keeps 36 m / 0.1 m at 360 voxels in spite of rounding.
     count = np.ceil(extent / voxel_size - 1e-6)
-    if count.min() < 2:
-        raise ValueError(
-            f"distance field: a box of {extent} m has fewer than 2 voxels of {voxel_size} m along "
-            "an axis; use a smaller voxel size."
-        )
-    if count.prod() > MAX_VOXELS:
-        raise ValueError(
-            f"distance field: a box of {extent} m has {count.prod():.3g} voxels of {voxel_size} m; "
-            f"the limit is {MAX_VOXELS:.3g}. Use a larger voxel size or smaller bounds."
-        )
+    box = f"a box of {extent} m with voxels of {voxel_size} m"
+    require(count.min() >= 2, box, "at least 2 voxels along each axis", count)
+    limit = f"at most {MAX_VOXELS:.3g} voxels"
+    require(count.prod() <= MAX_VOXELS, box, limit, f"{count.prod():.3g}", "use larger voxels")
     nx, ny, nz = count.astype(int)
     return int(nx), int(ny), int(nz)
 

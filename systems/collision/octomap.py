@@ -17,6 +17,7 @@ from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.occupancy import MAX_VOXELS, esdf_from_occupancy
 from splatpilot.systems.common import readers as git_lfs
 from splatpilot.systems.common.readers import reason_of
+from splatpilot.systems.common.validation import require
 
 _DEPTH = 16  # levels of children below the root
 _FREE, _OCCUPIED, _INNER = 1, 2, 3  # the two bits of a child
@@ -33,17 +34,18 @@ class Octomap:
 
     @property
     def lower_W(self) -> np.ndarray:
-        """Lower corner of the known space, (3,) [m]."""
+        """Lower corner of the known space (3,) [m]."""
         return self.resolution * self.corners.min(axis=0)
 
     @property
     def upper_W(self) -> np.ndarray:
-        """Upper corner of the known space, (3,) [m]."""
+        """Upper corner of the known space (3,) [m]."""
         return self.resolution * (self.corners + self.sizes[:, None]).max(axis=0)
 
     def part(self, most_voxels: float) -> tuple[np.ndarray, np.ndarray]:
-        """The known space, or a box in it of at most so many voxels, as high as all of it and of
-        its proportions, about the middle of what is free.
+        """Returns the known space, or a box of `most_voxels` about the middle of free space.
+
+        The box has the height of the map and its proportions.
 
         Returns:
             lower_W, upper_W: (3,) each [m].
@@ -64,13 +66,9 @@ class Octomap:
         return self.resolution * lower, self.resolution * upper
 
     def esdf(self, lower_W: np.ndarray | None = None, upper_W: np.ndarray | None = None) -> Esdf:
-        """The distance field, at the map's resolution, of a part of it, see `states`.
+        """Computes the distance field of a part of the map, at its resolution, see `states`.
 
-        The surface is the faces of occupied voxels, see `esdf_from_occupancy`: the map knows no
-        better.
-
-        Raises:
-            ValueError: see `states`.
+        The surface is the faces of occupied voxels, see `esdf_from_occupancy`.
         """
         states, lower_W = self.states(lower_W, upper_W)
         return esdf_from_occupancy(
@@ -80,27 +78,19 @@ class Octomap:
     def states(
         self, lower_W: np.ndarray | None = None, upper_W: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """A grid of the map's smallest voxels over a box, by default all the known space.
+        """Returns a grid of the map's smallest voxels over a box, by default all the known space.
 
         Returns:
             states (nx, ny, nz) uint8 `FieldState`, and the grid's lower corner (3,) [m], the box's
             rounded outwards to a voxel.
-
-        Raises:
-            ValueError: if the box is empty or the grid would be too large.
         """
         lower_W = self.lower_W if lower_W is None else np.asarray(lower_W, dtype=float)
         upper_W = self.upper_W if upper_W is None else np.asarray(upper_W, dtype=float)
         lower = np.floor(lower_W / self.resolution + 1e-6).astype(int)
         shape = np.ceil(upper_W / self.resolution - 1e-6).astype(int) - lower
-        if (shape <= 0).any():
-            raise ValueError(f"octomap: the box from {lower_W} to {upper_W} m is empty.")
-        if np.prod(shape.astype(float)) > MAX_VOXELS:
-            raise ValueError(
-                f"octomap: a box of {upper_W - lower_W} m has {np.prod(shape.astype(float)):.3g} "
-                f"voxels of {self.resolution} m; the limit is {MAX_VOXELS:.3g}. Give smaller "
-                "bounds."
-            )
+        require((shape > 0).all(), "upper_W of the box", f"above lower_W = {lower_W} m", upper_W)
+        count, limit = np.prod(shape.astype(float)), f"at most {MAX_VOXELS:.3g}"
+        require(count <= MAX_VOXELS, "voxels", limit, f"{count:.3g}", "give smaller bounds")
         states = np.full(shape, FieldState.UNKNOWN, dtype=np.uint8)
         value = np.where(self.occupied, FieldState.OCCUPIED, FieldState.FREE).astype(np.uint8)
         for size in np.unique(self.sizes):
@@ -120,15 +110,10 @@ class Octomap:
 
 
 def read_octomap(path: str | Path) -> Octomap:
-    """Reads a binary OctoMap (.bt) file.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if the file is no binary OctoMap, or is truncated, damaged or empty.
-    """
+    """Reads a binary OctoMap (.bt) file; raises ValueError for other, damaged or empty files."""
     path = Path(path)
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such OctoMap file (.bt).")
+        raise FileNotFoundError(f"No such file: {path}")
     content = path.read_bytes()
     header, separator, tree = content.partition(b"\ndata\n")
     lines = header.split(b"\n")
@@ -172,15 +157,7 @@ def esdf_from_octomap(
     lower_W: np.ndarray | None = None,
     upper_W: np.ndarray | None = None,
 ) -> Esdf:
-    """The distance field of a binary OctoMap, see `Octomap.esdf`.
-
-    Args:
-        path: of the .bt file.
-        lower_W, upper_W: (3,) [m], the part of the map wanted, by default all known space.
-
-    Raises:
-        FileNotFoundError, ValueError: see `read_octomap` and `Octomap.states`.
-    """
+    """Computes the distance field of a binary OctoMap, by default of all known space."""
     octomap = read_octomap(path)
     try:
         return octomap.esdf(lower_W, upper_W)
@@ -189,10 +166,7 @@ def esdf_from_octomap(
 
 
 def _links(path: Path, masks: np.ndarray, num_bytes: int) -> np.ndarray:
-    """For each inner node in file order 8 * its parent's index + its number as a child; root -1.
-
-    This is the one part that has to follow the file node by node.
-    """
+    """Returns 8 * parent + number as a child of each inner node in file order; -1 for the root."""
     children_of = {}
     for mask in np.unique(masks).tolist():
         # Last child first: the stack gives them back in order.
@@ -219,7 +193,7 @@ def _links(path: Path, masks: np.ndarray, num_bytes: int) -> np.ndarray:
 
 
 def _leaves(masks: np.ndarray, links: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Corners (N, 3), sizes (N,) and occupancy (N,) of the leaves."""
+    """Returns corners (N, 3), sizes (N,) and occupancy (N,) of the leaves."""
     parent, number = links >> 3, links & 7
     corner = np.zeros((len(masks), 3), dtype=np.int64)
     corner[0] = -(2 ** (_DEPTH - 1))

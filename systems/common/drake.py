@@ -35,6 +35,11 @@ def output_port(name: str) -> Callable[[System], OutputPort]:
     return port
 
 
+def vector_input(system: System, name: str, context: Context) -> np.ndarray:
+    """The vector at the input port of that name."""
+    return np.asarray(system.GetInputPort(name).Eval(context))
+
+
 def optional_input(system: System, name: str, context: Context) -> np.ndarray | None:
     """Returns the vector at an input port, None if the port is not connected."""
     port = system.GetInputPort(name)

@@ -1,4 +1,4 @@
-"""ArrivalTriggered: another system's update, when there is something new to update by."""
+"""ArrivalTriggered: runs another system's update when an observation arrives."""
 
 import logging
 import math
@@ -15,83 +15,67 @@ from pydrake.systems.framework import (
     System,
 )
 
-from splatpilot.systems.common.drake import input_port, output_port
+from splatpilot.systems.common.drake import vector_input
+from splatpilot.systems.common.validation import require
 
 _log = logging.getLogger(__name__)
 
-LATEST = 1.6
-"""Periods after the last update in which no observation is waited for."""
+MAX_WAIT = 1.6
+"""[periods] Max time between updates; then no observation is waited for."""
 
-_SAVED = 0.5  # Periods of rest that may be saved up, by which observations may come too early.
-_LEAST = 0.95  # Periods between updates on average, at least: clocks differ.
-_NOISE = 1e-4  # [s] In when the same observation was sent, as its age and the time tell it.
+_SAVED = 0.5  # [periods] of rest that may be saved up for observations that come early.
+_MIN_MEAN = 0.95  # [periods] between updates, min average: clocks differ.
+_NOISE = 1e-4  # [s] error of the time of an observation, computed from its age.
 
 
 class _Last(NamedTuple):
-    """What is kept in the discrete state."""
+    """The discrete state after that of the system."""
 
-    time: float = -math.inf  # [s], of the last update.
-    due: float = -math.inf  # [s], when an observation that comes is not too early.
-    observed: float = -math.inf  # [s], when the observation was sent that the last update saw,
-    looked: float = -math.inf  # and that which was there at the last look.
-    failed: float = 0.0  # Whether the last update raised an exception.
+    time: float = -math.inf  # [s] of the last update.
+    due: float = -math.inf  # [s] from which the next observation is not too early.
+    observed: float = -math.inf  # [s] time of the observation of the last update,
+    looked: float = -math.inf  # and of the one at the last look.
+    failed: float = 0.0  # 1 if the last update raised an exception.
 
 
 class ArrivalTriggered(LeafSystem):
     """Runs the periodic update of a system when an observation comes, instead of at its own times.
 
-    A policy that decides fifteen times a second on images that come fifteen times a second would
-    find each up to a fifteenth of a second old, as the two are started. This one decides as an
-    image comes, as long as that is no more often than at its rate: of faster images some are left
-    out, by the rule of virtual scheduling (ITU-T I.371, the generic cell rate algorithm). Without
-    an image that comes in time it decides 1.6 periods after the last decision.
+    A policy that runs at 15 Hz on images at 15 Hz would see each up to a fifteenth of a second
+    late, by the phase between them. This one runs as an image comes, but no more often than at its
+    rate: it skips some of faster images, by the rule of virtual scheduling (ITU-T I.371, the
+    generic cell rate algorithm). Without a timely image it runs 1.6 periods after the last update.
 
-    An exception that the system raises is logged, once until the system decides again, and ends
-    nothing: the last decision stands, and ``failed`` tells a failsafe not to fly by it.
+    An exception of the system is logged, once until the system succeeds again. Then the state is
+    kept, and ``failed`` tells a failsafe not to use the outputs.
 
     .. pydrake_system::
 
         name: ArrivalTriggered
-        input_ports:
-        - (ports of the system)
-        - observation_age
-        output_ports:
-        - (ports of the system)
-        - decided
-        - failed
+        input_ports: [(ports of the system), observation_age]
+        output_ports: [(ports of the system), decided, failed]
 
     - The ports of the system, by their names.
-    - ``observation_age`` (1): [s] since the observation was sent that the system's inputs have;
-      infinite before the first.
+    - ``observation_age`` (1): [s] since the system's observation was sent; infinite before the
+      first.
     - ``decided`` (1): [s], the time of the last update.
     - ``failed`` (1): 1 if the last update, or an output after it, raised an exception, else 0.
       Outputs that raise one are NaN.
 
-    Looks every ``tick`` seconds from time 0; the first update is by the first observation. The
-    discrete state is that of the system, and after it four times: of the last update, from which on
-    the next may be, of what the last one saw, and of what came since; and ``failed``.
+    Looks every ``tick`` seconds from time 0; the first update is by the first observation.
     """
-
-    observation_age_input_port = input_port("observation_age")
-    decided_output_port = output_port("decided")
-    failed_output_port = output_port("failed")
 
     def __init__(self, system: System, tick: float):
         """Constructs the system.
 
         Args:
             system: whose update it runs, see `can_be_triggered`.
-            tick: [s] between looks at what has come.
-
-        Raises:
-            ValueError: for a system that cannot be triggered.
+            tick: [s] between looks.
         """
         super().__init__()
-        if not can_be_triggered(system):
-            raise ValueError(
-                f"{type(system).__name__} cannot be triggered: it must have discrete state alone, "
-                "updated at one period, and vectors as outputs"
-            )
+        condition = "a system with discrete state of one period and vectors as outputs"
+        name = type(system).__name__
+        require(can_be_triggered(system), "what arrivals trigger", condition, name)
         self._system = system
         update = system.GetUniquePeriodicDiscreteUpdateAttribute()
         assert update is not None
@@ -114,26 +98,25 @@ class ArrivalTriggered(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(tick, 0.0, self._update)
 
     def _declare_output(self, port: OutputPort) -> None:
-        """Declares an output port of the system as one of this."""
-        inputs = [
-            index
-            for index in range(self._system.num_input_ports())
-            if self._system.HasDirectFeedthrough(index, int(port.get_index()))
-        ]
-        tickets = {self.xd_ticket(), *(self.get_input_port(i).ticket() for i in inputs)}
         index = int(port.get_index())
+        inputs = [
+            k
+            for k in range(self._system.num_input_ports())
+            if self._system.HasDirectFeedthrough(k, index)
+        ]
+        tickets = {self.xd_ticket(), *(self.get_input_port(k).ticket() for k in inputs)}
 
         def calc(context: Context, output: BasicVector) -> None:
             inner = self._system.get_output_port(index)
             try:
-                output.SetFromVector(np.asarray(inner.Eval(self._context(context, inputs))))
+                output.SetFromVector(np.asarray(inner.Eval(self._inner(context, inputs))))
             except Exception:  # The next update logs it.
                 output.SetFromVector(np.full(output.size(), np.nan))
 
         self.DeclareVectorOutputPort(port.get_name(), port.size(), calc, tickets)
 
-    def _context(self, context: Context, inputs: list[int]) -> Context:
-        """The system's Context at this instant, with values for some of its inputs."""
+    def _inner(self, context: Context, inputs: list[int]) -> Context:
+        """Returns the system's Context at this instant, with values for some of its inputs."""
         inner = self._system.CreateDefaultContext()
         inner.SetTime(context.get_time())
         for group in range(inner.num_discrete_state_groups()):
@@ -145,23 +128,22 @@ class ArrivalTriggered(LeafSystem):
         return inner
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        last = self._kept(context)
-        now = context.get_time()
-        observed = now - float(np.asarray(self.GetInputPort("observation_age").Eval(context))[0])
+        last, now = self._get_last(context), context.get_time()
+        observed = now - float(vector_input(self, "observation_age", context)[0])
         comes, is_new = (observed > seen + _NOISE for seen in (last.looked, last.observed))
-        wanted = (comes and now >= last.due) or now >= last.time + LATEST * self._period - 1e-6
+        is_late = now >= last.time + MAX_WAIT * self._period - 1e-6
         discrete_state.set_value(self._last, np.array(last._replace(looked=observed)))
-        if math.isinf(observed) or not wanted:
+        if math.isinf(observed) or not ((comes and now >= last.due) or is_late):
             return
         due = last.due
         if is_new:
-            due = max(due, now - _SAVED * self._period) + _LEAST * self._period
-        failed = not self._decide(context, discrete_state)
+            due = max(due, now - _SAVED * self._period) + _MIN_MEAN * self._period
+        failed = not self._run(context, discrete_state)
         discrete_state.set_value(self._last, np.array(_Last(now, due, observed, observed, failed)))
 
-    def _decide(self, context: Context, discrete_state: DiscreteValues) -> bool:
+    def _run(self, context: Context, discrete_state: DiscreteValues) -> bool:
         """Updates the system's state; returns False, and logs why, if it raises an exception."""
-        inner = self._context(context, list(range(self._system.num_input_ports())))
+        inner = self._inner(context, list(range(self._system.num_input_ports())))
         try:
             updated = self._system.EvalUniquePeriodicDiscreteUpdate(inner)
             values = [updated.value(group) for group in range(inner.num_discrete_state_groups())]
@@ -170,26 +152,26 @@ class ArrivalTriggered(LeafSystem):
             for index in range(self._system.num_output_ports()):
                 self._system.get_output_port(index).Eval(inner)
         except Exception:
-            if not self._kept(context).failed:
+            if not self._get_last(context).failed:
                 _log.exception("the policy %s failed", type(self._system).__name__)
             return False
         for group, value in enumerate(values):
             discrete_state.set_value(group, value)
         return True
 
-    def _kept(self, context: Context) -> _Last:
+    def _get_last(self, context: Context) -> _Last:
         return _Last(*np.asarray(context.get_discrete_state(self._last).value()))
 
     def _calc_decided(self, context: Context, output: BasicVector) -> None:
-        output[0] = self._kept(context).time
+        output[0] = self._get_last(context).time
 
     def _calc_failed(self, context: Context, output: BasicVector) -> None:
-        output[0] = self._kept(context).failed
+        output[0] = self._get_last(context).failed
 
 
 def can_be_triggered(system: System) -> bool:
-    """Whether `ArrivalTriggered` can run a system: all its state is discrete and updated at one
-    period, and its outputs are vectors."""
+    """Checks if `ArrivalTriggered` can run a system: all its state is discrete, with updates of
+    one period, and its outputs are vectors."""
     context = system.CreateDefaultContext()
     others = context.num_continuous_states() + context.num_abstract_states()
     outputs = (system.get_output_port(index) for index in range(system.num_output_ports()))

@@ -1,6 +1,5 @@
-"""What messages carry: the arrays of Drake's ports, each packed into its message and unpacked."""
+"""Codecs: conversion between vectors or images and LCM messages."""
 
-import math
 import secrets
 import zlib
 from functools import cached_property
@@ -10,6 +9,7 @@ import numpy as np
 from drake import lcmt_header, lcmt_image, lcmt_image_array
 from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
+from splatpilot.systems.common.validation import require
 from splatpilot.systems.messaging.generated import (
     lcmt_body_rate_command,
     lcmt_bridge_status,
@@ -28,35 +28,26 @@ from splatpilot.systems.policies.hypotheses import (
 )
 from splatpilot.systems.vehicle.state import QuadrotorState
 
-WORLD, BODY = "world", "body"  # What frames are called in headers.
+WORLD, BODY = "world", "body"  # Names of frames in headers.
 
 
 class Codec:
-    """
-    How one signal travels: the channel of its messages, and from array to message and back.
-
-    `unpack` raises ValueError, with the reason, for a message whose content cannot be used.
-    """
+    """Converts a signal to messages of one channel and back."""
 
     channel: ClassVar[str]
-    port: ClassVar[str]
-    """The name of the ports that carry the array."""
-    message: ClassVar[Any]
-    """The type of the messages."""
-    frame: str = WORLD
-    """`header.frame_name` of the messages."""
-    size: int = 0
-    """The length of the array; 0 of images."""
-    image: ImageDepth32F | ImageRgba8U | None = None
-    """An image like those that travel, of signals that are images."""
+    port: ClassVar[str]  # Name of the ports of the signal.
+    message: ClassVar[Any]  # Type of the messages.
+    frame: str = WORLD  # `header.frame_name` of the messages.
+    size: int = 0  # of the vector; 0 of images.
+    image: ImageDepth32F | ImageRgba8U | None = None  # Example of the image; None of vectors.
 
     @cached_property
     def session(self) -> int:
-        """A random number by which subscribers tell two senders on one channel apart."""
+        """A random number that distinguishes two senders on one channel."""
         return secrets.randbits(31)
 
     def stamped(self, header: lcmt_header) -> Any:
-        """An empty message with a header and, unless it is of images, the session."""
+        """Returns an empty message with a header and, except of images, the session."""
         message = self.message()
         message.header = header
         if self.image is None:
@@ -64,17 +55,21 @@ class Codec:
         return message
 
     def pack(self, value: np.ndarray, header: lcmt_header, epoch: float) -> Any:
-        """The message, or None where there is nothing to say yet; `epoch` is the Unix time [s] of
-        the Context's time 0."""
+        """Returns the message, or None without a value yet; `epoch` is the Unix time [s] of the
+        Context's time 0."""
         raise NotImplementedError
 
     def unpack(self, message: Any, epoch: float) -> np.ndarray:
-        """The array of a message whose type and header are as they should be."""
+        """Returns the array of a message of the right type and frame.
+
+        Raises:
+            ValueError: for invalid content.
+        """
         raise NotImplementedError
 
 
 class StateCodec(Codec):
-    """The state (13): p_WB [m], v_WB [m/s], q_WB (wxyz), w_WB_B [rad/s]."""
+    """State (13): p_WB [m], v_WB [m/s], q_WB (wxyz), w_WB_B [rad/s]."""
 
     channel, port, message, size = "QUADROTOR_STATE", "state", lcmt_quadrotor_state, 13
 
@@ -89,7 +84,7 @@ class StateCodec(Codec):
 
 
 class CommandCodec(Codec):
-    """The command (4): thrust over mass [m/s^2] and body rates w_cmd_B [rad/s]."""
+    """Command (4): thrust over mass [m/s^2] and body rates w_cmd_B [rad/s]."""
 
     channel, port, message, size = "BODY_RATE_COMMAND", "command", lcmt_body_rate_command, 4
     frame = BODY
@@ -104,14 +99,10 @@ class CommandCodec(Codec):
 
 
 class VelocitySetpointCodec(Codec):
-    """The velocity setpoint (4): v_WB [m/s] and heading [rad], which is NaN where it is free."""
+    """Velocity setpoint (4): v_WB [m/s] and heading [rad], NaN if it is free."""
 
-    channel, port, message, size = (
-        "VELOCITY_SETPOINT",
-        "velocity_setpoint",
-        lcmt_velocity_setpoint,
-        4,
-    )
+    channel, port, size = "VELOCITY_SETPOINT", "velocity_setpoint", 4
+    message = lcmt_velocity_setpoint
 
     def pack(self, value, header, epoch):
         message = self.stamped(header)
@@ -120,19 +111,15 @@ class VelocitySetpointCodec(Codec):
 
     def unpack(self, message, epoch):
         heading = message.heading
-        if np.isinf(heading):
-            raise ValueError(f"the heading is {heading}; it must be an angle, or NaN for none")
+        require(not np.isinf(heading), "the heading", "finite or NaN", heading)
         return np.append(finite(message.v_WB), heading)
 
 
 class HypothesesCodec(Codec):
-    """A plan of K trajectories, see `splatpilot.systems.policies.hypotheses`."""
+    """Plan of K trajectories, see `splatpilot.systems.policies.hypotheses`."""
 
-    channel, port, message = (
-        "TRAJECTORY_HYPOTHESES",
-        "hypotheses",
-        lcmt_trajectory_hypotheses,
-    )
+    channel, port = "TRAJECTORY_HYPOTHESES", "hypotheses"
+    message = lcmt_trajectory_hypotheses
 
     def __init__(self, num_hypotheses: int):
         self.num_hypotheses, self.size = num_hypotheses, hypotheses_size(num_hypotheses)
@@ -151,15 +138,8 @@ class HypothesesCodec(Codec):
         return message
 
     def unpack(self, message, epoch):
-        if message.num_hypotheses != self.num_hypotheses:
-            raise ValueError(
-                f"there are {message.num_hypotheses} hypotheses; there must be "
-                f"{self.num_hypotheses}"
-            )
-        if message.waypoint_period != WAYPOINT_PERIOD:
-            raise ValueError(
-                f"waypoints are {message.waypoint_period} s apart; it must be {WAYPOINT_PERIOD} s"
-            )
+        _require_equal("num_hypotheses", message.num_hypotheses, self.num_hypotheses)
+        _require_equal("waypoint_period", message.waypoint_period, WAYPOINT_PERIOD)
         require_unit_quaternion(message.q_WP)
         waypoints = np.reshape(message.waypoints_P, self.num_hypotheses * NUM_WAYPOINTS * 3)
         plan_time = message.plan_utime * 1e-6 - epoch
@@ -167,14 +147,10 @@ class HypothesesCodec(Codec):
 
 
 class MotionCaptureCodec(Codec):
-    """The pose (7) of a body in motion capture: p_WB [m] and q_WB (wxyz)."""
+    """Pose (7) of a body in motion capture: p_WB [m] and q_WB (wxyz)."""
 
-    channel, port, message, size = (
-        "MOTION_CAPTURE_POSE",
-        "motion_capture_pose",
-        lcmt_motion_capture_pose,
-        7,
-    )
+    channel, port, size = "MOTION_CAPTURE_POSE", "motion_capture_pose", 7
+    message = lcmt_motion_capture_pose
 
     def __init__(self, body: str):
         self.body = body
@@ -187,16 +163,14 @@ class MotionCaptureCodec(Codec):
         return message
 
     def unpack(self, message, epoch):
-        if message.body != self.body:
-            raise ValueError(f"the body is {message.body!r}; it must be {self.body!r}")
-        if not message.tracked:
-            raise ValueError(f"motion capture does not see {self.body!r}")
+        _require_equal("the body", message.body, self.body)
+        require(message.tracked, f"body {self.body!r}", "tracked", "an untracked pose")
         require_unit_quaternion(message.q_WB)
         return finite([*message.p_WB, *message.q_WB])
 
 
 class DepthGridCodec(Codec):
-    """The proximity 1 - range / max_range (height * width), row by row from the lowest."""
+    """Proximity 1 - range / max_range (height * width), row by row from the lowest."""
 
     channel, port, message = "DEPTH_GRID", "depth_grid", lcmt_depth_grid
 
@@ -204,8 +178,8 @@ class DepthGridCodec(Codec):
         """
         Args:
             width, height: of the grid.
-            max_range: [m], from which on nothing is near.
-            frame: the name of the sensor.
+            max_range: [m] of proximity 0.
+            frame: name of the sensor.
         """
         self.width, self.height, self.max_range, self.frame = width, height, max_range, frame
         self.size = width * height
@@ -218,21 +192,28 @@ class DepthGridCodec(Codec):
         return message
 
     def unpack(self, message, epoch):
-        is_so = message.width, message.height, message.num_values, message.encoding
-        should_be = self.width, self.height, self.size, lcmt_depth_grid.PROXIMITY
-        if is_so != should_be or message.max_range != np.float32(self.max_range):
-            raise ValueError(
-                f"width, height, number of values and encoding are {is_so} with a range of "
-                f"{message.max_range} m; they must be {should_be} with {self.max_range} m"
-            )
+        _require_equal(
+            "(width, height, num_values, encoding, max_range)",
+            (
+                message.width,
+                message.height,
+                message.num_values,
+                message.encoding,
+                message.max_range,
+            ),
+            (
+                *(self.width, self.height, self.size, lcmt_depth_grid.PROXIMITY),
+                float(np.float32(self.max_range)),
+            ),
+        )
         values = finite(message.values)
-        if values.min() < 0.0 or values.max() > 1.0:
-            raise ValueError(f"values are {values.min()} to {values.max()}; they must be 0 to 1")
+        low, high = values.min(), values.max()
+        require(low >= 0.0 and high <= 1.0, "values", "in [0, 1]", f"{low} to {high}")
         return values
 
 
 class StatusCodec(Codec):
-    """The status (7): mode, reason, ages of state and observation [s], gaps, rejected, overruns."""
+    """Status (7): mode, reason, ages of state and observation [s], gaps, rejected, overruns."""
 
     channel, port, message, size = "BRIDGE_STATUS", "status", lcmt_bridge_status, 7
     frame = ""
@@ -251,8 +232,8 @@ class StatusCodec(Codec):
 
 
 class VehicleStatusCodec(Codec):
-    """Who flies the vehicle (2): whether it is armed, and whether it flies by the bridge; NaN, of
-    which there is no message, while that is unknown."""
+    """Vehicle status (2): 1 if it is armed, and 1 if it obeys the bridge; NaN, which is not sent,
+    if unknown."""
 
     channel, port, message, size = "VEHICLE_STATUS", "vehicle_status", lcmt_vehicle_status, 2
     frame = ""
@@ -269,26 +250,24 @@ class VehicleStatusCodec(Codec):
 
 
 def finite(values: Any) -> np.ndarray:
-    """The values as an array.
-
-    Raises:
-        ValueError: if one is infinite or not a number.
-    """
+    """Converts values to an array; raises ValueError if one is not finite."""
     array = np.asarray(values, dtype=float)
-    if not np.isfinite(array).all():
-        raise ValueError(f"values are {array.tolist()}; they must be finite")
+    require(np.isfinite(array).all(), "values", "finite", array.tolist())
     return array
 
 
 def require_unit_quaternion(q: Any) -> None:
     """Raises ValueError unless the quaternion has length 1, within 0.01."""
-    length = math.hypot(*q)
-    if not abs(length - 1.0) < 0.01:
-        raise ValueError(f"the quaternion {list(q)} has length {length}; it must be 1")
+    is_unit = abs(np.linalg.norm(q) - 1.0) < 0.01
+    require(is_unit, "the attitude", "a unit quaternion", np.asarray(q).tolist())
+
+
+def _require_equal(name: str, value: Any, expected: Any) -> None:
+    require(value == expected, name, repr(expected), repr(value))
 
 
 class ImageCodec(Codec):
-    """An image (height, width, channels), sent with zlib, and understood without it too."""
+    """Image (height, width, channels), sent with zlib, received with or without it."""
 
     message = lcmt_image_array
     _format: int
@@ -297,8 +276,8 @@ class ImageCodec(Codec):
     def __init__(self, image: ImageDepth32F | ImageRgba8U, frame: str):
         """
         Args:
-            image: one of the size of those that travel.
-            frame: the name of the camera.
+            image: example.
+            frame: name of the camera.
         """
         self.image, self.frame = image, frame
 
@@ -306,7 +285,7 @@ class ImageCodec(Codec):
         image = lcmt_image()
         image.header = header
         image.height, image.width, _ = value.shape
-        # Compressed, because Drake reads but a quarter of depth images that are not.
+        # Drake reads only a quarter of uncompressed depth images.
         image.data = zlib.compress(value.astype(value.dtype.newbyteorder("<")).tobytes(), level=1)
         image.size, image.row_stride = len(image.data), value.nbytes // image.height
         image.pixel_format, image.channel_type = self._format, self._type
@@ -316,31 +295,25 @@ class ImageCodec(Codec):
         return message
 
     def unpack(self, message, epoch):
-        if message.num_images != 1:
-            raise ValueError(f"there are {message.num_images} images; there must be one")
+        _require_equal("num_images", message.num_images, 1)
         [image] = message.images
         assert self.image is not None
         pixels = np.asarray(self.image.data)
-        is_so = image.width, image.height, image.pixel_format, image.channel_type
-        should_be = self.image.width(), self.image.height(), self._format, self._type
-        if is_so != should_be:
-            raise ValueError(
-                f"width, height, pixel format and channel type are {is_so}; they must be "
-                f"{should_be}"
-            )
-        data = bytes(image.data)
-        if image.compression_method == lcmt_image.COMPRESSION_METHOD_ZLIB:
+        _require_equal(
+            "(width, height, pixel format, channel type)",
+            (image.width, image.height, image.pixel_format, image.channel_type),
+            (self.image.width(), self.image.height(), self._format, self._type),
+        )
+        data, method = bytes(image.data), image.compression_method
+        if method == lcmt_image.COMPRESSION_METHOD_ZLIB:
             try:
                 data = zlib.decompressobj().decompress(data, pixels.nbytes)
             except zlib.error as error:
-                raise ValueError(f"the image is compressed, and damaged: {error}") from None
-        elif image.compression_method != lcmt_image.COMPRESSION_METHOD_NOT_COMPRESSED:
-            raise ValueError(
-                f"the compression method is {image.compression_method}; send images as they are, "
-                "or with zlib"
-            )
-        if len(data) != pixels.nbytes:
-            raise ValueError(f"the image has {len(data)} bytes; it must have {pixels.nbytes}")
+                raise ValueError(f"the compressed image is invalid: {error}") from None
+        else:
+            uncompressed = method == lcmt_image.COMPRESSION_METHOD_NOT_COMPRESSED
+            require(uncompressed, "the compression method", "none or zlib", method)
+        _require_equal("bytes of the image", len(data), pixels.nbytes)
         order = ">" if image.bigendian else "<"
         return np.frombuffer(data, pixels.dtype.newbyteorder(order)).reshape(pixels.shape)
 
@@ -353,13 +326,12 @@ class DepthImageCodec(ImageCodec):
 
     def unpack(self, message, epoch):
         depth = super().unpack(message, epoch)
-        if not (depth >= 0.0).all():
-            raise ValueError("depths are negative or not numbers; they must be at least 0 m")
+        require((depth >= 0.0).all(), "depths", "at least 0 m", "negative ones or NaN")
         return depth
 
 
 class ColorImageCodec(ImageCodec):
-    """Red, green, blue and opacity, 8 bits each."""
+    """RGB and opacity, 8 bits each."""
 
     channel, port = "COLOR_IMAGE", "color_image"
     _format, _type = lcmt_image.PIXEL_FORMAT_RGBA, lcmt_image.CHANNEL_TYPE_UINT8

@@ -1,54 +1,152 @@
-"""How fast a vehicle may fly where, whatever a policy decides."""
+"""Limits on commanded velocities: speed, clearance, geofence and braking distance."""
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from splatpilot.systems.collision.distance_field import Distances
+from splatpilot.systems.common.validation import Config, bounded, require_field
+from splatpilot.systems.messaging.generated import lcmt_bridge_status as status
+from splatpilot.systems.policies.velocity import RESPONSE_TIME
+from splatpilot.systems.vehicle.flatness import FlatnessControllerConfig
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
 LEVEL = 0.7
 """[-] Min z of the normal of surfaces that can be landed on."""
 
 RETURN_SPEED = 1.0
-"""[m/s] Max speed back to where a vehicle may be."""
+"""[m/s] Max speed back into the allowed volume."""
 
-_STEP = 0.05  # [m] Between points of a path that are checked; more on paths
-_MAX_STEPS = 1000  # [-] that would have more, which only states have that cannot be true.
+_STEP = 0.05  # [m] between checked points of a path; more on paths
+_MAX_STEPS = 1000  # [-] that would need more, which only invalid states cause.
 
 
 @dataclass
-class FlightLimits:
-    """What is kept whatever a policy decides."""
+class FlightLimits(Config):
+    """Limits that hold for every policy."""
 
     # [m/s] Max speed.
-    max_speed: float = 6.0
+    max_speed: float = bounded(6.0, "(0, inf) m/s")
     # [rad] Max angle between body z and vertical.
-    max_tilt: float = 1.0
-    # [m/s^2] With which the vehicle is sure to brake; the controller commands up to 6.
-    deceleration: float = 5.0
-    # [m] Min distance from the collision sphere to what is known of the world.
-    min_clearance: float = 0.1
-    # [m] Corners of the box in which the collision sphere stays, the lower one first; the world's
+    max_tilt: float = bounded(1.0, "(0, 1.5707963267948966] rad")
+    # [m/s^2] Assumed braking deceleration; the controller commands up to 6.
+    deceleration: float = bounded(5.0, "(0, inf) m/s^2")
+    # [m] Min distance from the collision sphere to known obstacles.
+    min_clearance: float = bounded(0.1, "[0, 5] m")
+    # [m] Corners of the box that holds the collision sphere, the lower one first; the world's
     # box if left out.
     geofence: list[list[float]] | None = None
 
-    def validate(self) -> None:
-        """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
-        for name in ("max_speed", "max_tilt", "deceleration"):
-            _check(name, getattr(self, name), 0.0 < getattr(self, name) < math.inf, "positive")
-        _check("max_tilt", self.max_tilt, self.max_tilt <= math.pi / 2, "at most pi/2 rad")
-        _check("min_clearance", self.min_clearance, 0.0 <= self.min_clearance <= 5.0, "0 to 5 m")
-        if self.geofence is not None:
-            fence = np.array(self.geofence, dtype=float)
-            min_side = 2.0 * (VEHICLE_RADIUS + self.min_clearance)
-            valid = fence.shape == (2, 3) and bool((fence[1] - fence[0] >= min_side).all())
-            limit = (
-                "two corners of a box, the lower one first, with sides of at least "
-                f"{min_side:.2f} m: those of the collision sphere and min_clearance"
-            )
-            _check("geofence", self.geofence, valid, limit)
+    def check(self) -> None:
+        if self.geofence is None:
+            return
+        fence = np.array(self.geofence, dtype=float)
+        min_side = 2.0 * (VEHICLE_RADIUS + self.min_clearance)
+        valid = fence.shape == (2, 3) and bool((fence[1] - fence[0] >= min_side).all())
+        condition = (
+            "two corners of a box, the lower one first, with sides of at least "
+            f"{min_side:.2f} m: the collision sphere and min_clearance"
+        )
+        require_field(self, "geofence", valid, condition)
+
+
+class Box(NamedTuple):
+    """An axis-aligned box."""
+
+    lower_W: np.ndarray  # (3,) [m]
+    upper_W: np.ndarray  # (3,) [m]
+
+
+class Surroundings(NamedTuple):
+    """Obstacles and bounds near a vehicle."""
+
+    clearance: float  # [m] from the collision sphere to the nearest obstacle; NaN if unknown.
+    gradient: np.ndarray  # (3,) direction away from that obstacle, any length; 0 if unknown.
+    box: Box  # that must hold the collision sphere.
+    field: Distances | None  # distances to known obstacles.
+
+
+class Motion(NamedTuple):
+    """Position and predicted point of rest of a vehicle."""
+
+    p_WB: np.ndarray  # (3,) [m]
+    stop: np.ndarray  # (3,) [m] from there to the point of rest.
+    reaction_time: float  # [s] time constant with which the point of rest may near an obstacle.
+
+    @classmethod
+    def predict(
+        cls,
+        p_WB: np.ndarray,
+        v_WB: np.ndarray,
+        age: float,
+        unpredicted: float,
+        deceleration: float,
+        law: FlatnessControllerConfig,
+    ) -> "Motion":
+        """
+        Predicts where a vehicle that is controlled by a delayed state comes to rest.
+
+        A command takes effect after a dead time: the age of the state, the lag of the attitude, and
+        the period for which commands are held. See `limit_approach`.
+
+        Args:
+            p_WB, v_WB: (3,) [m], [m/s].
+            age: [s] since the measurement, compensated by prediction.
+            unpredicted: [s] further age without prediction.
+            deceleration: [m/s^2].
+            law: that flies the velocities.
+        """
+        stop = stopping_displacement(v_WB, RESPONSE_TIME, deceleration)
+        dead_time = max(age, 0.0) + unpredicted + 1.0 / law.tilt_gain + law.period
+        return cls(p_WB, stop + unpredicted * v_WB, math.e * dead_time)
+
+
+def limit_velocity(
+    desired: np.ndarray, motion: Motion, near: Surroundings, limits: FlightLimits, landing: bool
+) -> tuple[np.ndarray, int]:
+    """
+    Limits a velocity (3,) [m/s], W frame.
+
+    Args:
+        desired: (3,) [m/s].
+        landing: allows leaving the box downwards, and touching level surfaces.
+
+    Returns:
+        The velocity, and the last limit that changed it: a reason of `lcmt_bridge_status` or NONE.
+    """
+    velocity, reason = desired, status.NONE
+
+    def apply(limited: np.ndarray, limit: int) -> None:
+        nonlocal velocity, reason
+        if not np.array_equal(limited, velocity):
+            velocity, reason = limited, limit
+
+    apply(limit_speed(velocity, limits.max_speed), status.LIMITED_SPEED)
+
+    # The nearest obstacle.
+    if not math.isnan(near.clearance) and near.gradient.any():
+        away = near.gradient / np.linalg.norm(near.gradient)
+        if not (landing and away[2] > LEVEL):
+            room = near.clearance - limits.min_clearance + float(motion.stop.dot(away))
+            limited = limit_approach(velocity, away, room, motion.reaction_time)
+            apply(limited, status.LIMITED_CLEARANCE)
+
+    # The box.
+    lower, upper = near.box.lower_W + VEHICLE_RADIUS, near.box.upper_W - VEHICLE_RADIUS
+    if landing:
+        lower[2] = -math.inf
+    limited = limit_to_box(velocity, motion.p_WB + motion.stop, lower, upper, motion.reaction_time)
+    apply(limited, status.LIMITED_GEOFENCE)
+
+    # The path, last: velocities along a fence or an obstacle may lead into another.
+    if near.field is not None and not landing:
+        limited = limit_ahead(
+            velocity, *motion[:2], near.field, limits.min_clearance, motion.reaction_time
+        )
+        apply(limited, status.LIMITED_CLEARANCE)
+    return velocity, reason
 
 
 def limit_speed(velocity: np.ndarray, max_speed: float) -> np.ndarray:
@@ -61,9 +159,9 @@ def stopping_displacement(
     velocity: np.ndarray, response_time: float, deceleration: float
 ) -> np.ndarray:
     """
-    Predicts by how much (3,) [m] a vehicle moves on after it is told to stop.
+    Predicts the displacement (3,) [m] of a vehicle from a command to stop until rest.
 
-    Its velocity v takes up a commanded velocity u as v' = (u - v) / T, with T the response time,
+    Its velocity v follows a commanded velocity u as v' = (u - v) / T, with T the response time,
     but brakes with at most a: over the distance T v, or (v² + (a T)²) / (2 a) from v = a T. The
     point p + T v at which it would rest then moves with exactly the commanded velocity, since
     (p + T v)' = v + (u - v) = u.
@@ -107,13 +205,13 @@ def limit_ahead(
     reaction_time: float,
 ) -> np.ndarray:
     """
-    Limits a commanded velocity (3,) [m/s] by what lies on the path: straight to the point of rest,
-    and from there on along the velocity.
+    Limits a commanded velocity (3,) [m/s] by obstacles on the path: straight to the point of rest,
+    and from there along the velocity.
 
     Args:
         p: (3,) [m] position of the vehicle.
         stop: (3,) [m] from there to the point of rest.
-        field: what is known of the world. Beyond it, where distances are NaN, the path is free.
+        field: distances to known obstacles. Outside of it, where they are NaN, the path is free.
         min_clearance: [m]. A vehicle that is nearer than that may leave.
         reaction_time: [s].
     """
@@ -145,8 +243,3 @@ def limit_to_box(
         velocity = limit_approach(velocity, away, rest[axis] - lower[axis], reaction_time)
         velocity = limit_approach(velocity, -away, upper[axis] - rest[axis], reaction_time)
     return velocity
-
-
-def _check(name: str, value: object, valid: bool, limit: str) -> None:
-    if not valid:
-        raise ValueError(f"limits.{name} must be {limit}, got {value}")

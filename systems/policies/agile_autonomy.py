@@ -1,45 +1,192 @@
-"""AgileAutonomy: three trajectories from one depth image, learned from an expert that samples."""
+"""AgileAutonomy: three trajectories from a depth image, imitated from a sampling expert."""
 
 from dataclasses import dataclass, field
-from typing import cast
+from typing import Any
 
 import numpy as np
-from pydrake.common.value import Value
-from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
-from pydrake.systems.sensors import ImageDepth32F
 
 from splatpilot.systems.common.drake import input_port, output_port
-from splatpilot.systems.policies.agile_autonomy_inference import (
-    AGILE_NETWORK,
-    FARTHEST,
-    FOV_X,
-    IMAGE_SIZE,
-    MODES,
-    RATE,
-    load_network,
-    plan,
+from splatpilot.systems.policies.base import LearnedPolicyConfig, Observation, Policy
+from splatpilot.systems.policies.checkpoint import PolicyCheckpoint, check_weights
+from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS, Hypotheses, no_plan
+from splatpilot.systems.policies.observations import pool_depth, target_velocity
+from splatpilot.systems.policies.recurrent_network import (
+    Convolutions,
+    Layer,
+    convolution_shapes,
+    layer_sizes,
+    leaky_relu,
 )
-from splatpilot.systems.policies.depth_policy_config import DepthPolicyConfig
-from splatpilot.systems.policies.hypotheses import Hypotheses, no_plan
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
-from splatpilot.systems.vehicle.state import pose_from_state
+from splatpilot.systems.vehicle.flatness import array_namespace
+
+RATE = 15.0  # [Hz]
+CAMERA_SIZE = 128, 96  # [px] width and height before pooling
+FOV_X = 90.0  # [deg]
+MIN_DEPTH, MAX_DEPTH = 0.3, 20.0  # [m]
+MODES = 3
+STATE_SIZE = 18
+WAYPOINT_SCALE = 2.0  # [m] per unit of the network's output
+PROGRESS = 0.1
+"""[1/m] Reward for progress; by collision costs alone the cheapest trajectory is often to stay."""
+
+NEAR_TIE = 0.02
+"""Cost difference below which the hypothesis that continues the last plan is preferred."""
+
+IMAGE_SIZE = 24, 32  # [px] height and width
 
 
 @dataclass
-class AgileAutonomyConfig(DepthPolicyConfig):
-    """The policy's weights, and what it is asked for; its camera's pixels are pooled to 32x24."""
+class AgileAutonomyConfig(LearnedPolicyConfig):
+    """Weights, speed and camera, whose pixels are pooled to 32x24."""
 
-    network = AGILE_NETWORK
     rate = RATE
+    image_size = IMAGE_SIZE
 
     camera: OnboardCamera = field(
         default_factory=lambda: OnboardCamera(
-            width=IMAGE_SIZE[0], height=IMAGE_SIZE[1], fov_x=FOV_X, max_depth=FARTHEST
+            width=CAMERA_SIZE[0], height=CAMERA_SIZE[1], fov_x=FOV_X, max_depth=MAX_DEPTH
         )
     )
 
 
-class AgileAutonomy(LeafSystem):
+@dataclass(frozen=True)
+class TrajectoryNetworkSpec:
+    """The architecture: convolutions of the image and layers of the state, joined; one layer to
+    the features of each mode; and one head for all modes."""
+
+    image_height: int = 24
+    image_width: int = 32
+    convolutions: tuple[Layer, ...] = ((16, 5, 2, 2), (32, 3, 2, 1), (64, 3, 2, 1), (32, 3, 1, 1))
+    image_features: int = 128
+    state_features: int = 64
+    mode_features: int = 64
+    head_features: int = 128
+
+    def flat_features(self) -> int:
+        """Numbers after the last convolution."""
+        image = (1, self.image_height, self.image_width)
+        return int(np.prod(layer_sizes(image, self.convolutions)[-1]))
+
+    def weight_shapes(self) -> dict[str, tuple[int, ...]]:
+        """The name and shape of every array of weights."""
+        shapes = convolution_shapes(self.convolutions)
+        joined = self.image_features + self.state_features
+        for name, inputs, outputs in (
+            ("image_layer", self.flat_features(), self.image_features),
+            ("state_layer", STATE_SIZE, self.state_features),
+            ("state_layer_2", self.state_features, self.state_features),
+            ("modes", joined, MODES * self.mode_features),
+            ("head", self.mode_features, self.head_features),
+            ("output", self.head_features, 3 * NUM_WAYPOINTS + 1),
+        ):
+            shapes[f"{name}.weight"], shapes[f"{name}.bias"] = (outputs, inputs), (outputs,)
+        return shapes
+
+
+AGILE_NETWORK = TrajectoryNetworkSpec()
+
+
+class TrajectoryNetwork:
+    """The network with its weights, in numpy.
+
+    Raises:
+        ValueError: if weights are missing, of another shape or not finite.
+    """
+
+    def __init__(self, spec: TrajectoryNetworkSpec, weights: dict[str, np.ndarray]) -> None:
+        self.spec = spec
+        self._weights = check_weights(weights, spec.weight_shapes())
+        image = (1, spec.image_height, spec.image_width)
+        self._convolutions = Convolutions(image, spec.convolutions, self._weights)
+
+    def __call__(self, image: np.ndarray, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Waypoints (3, 10, 3) [m] in the body frame and costs (3,).
+
+        Args:
+            image: (24, 32), encoded depth.
+            state: (18,).
+
+        Raises:
+            ValueError: if an argument has the wrong shape.
+        """
+        spec = self.spec
+        for name, array, shape in (
+            ("image", image, (spec.image_height, spec.image_width)),
+            ("state", state, (STATE_SIZE,)),
+        ):
+            if np.shape(array) != shape:
+                raise ValueError(
+                    f"the policy's {name} has shape {np.shape(array)}, but its network takes "
+                    f"{shape}"
+                )
+        x = leaky_relu(self._linear("image_layer", self._convolutions(image)))
+        y = leaky_relu(self._linear("state_layer", np.asarray(state, np.float32)))
+        y = leaky_relu(self._linear("state_layer_2", y))
+        modes = leaky_relu(self._linear("modes", np.concatenate([x, y])))
+        hidden = leaky_relu(self._linear("head", modes.reshape(MODES, -1)))
+        output = self._linear("output", hidden)
+        waypoints = WAYPOINT_SCALE * output[:, :-1].reshape(MODES, NUM_WAYPOINTS, 3)
+        return waypoints, output[:, -1]
+
+    def _linear(self, name: str, x: np.ndarray) -> np.ndarray:
+        return x @ self._weights[f"{name}.weight"].T + self._weights[f"{name}.bias"]
+
+
+def load_network(path: str | None) -> TrajectoryNetwork:
+    """Loads the network from a file of weights, see `PolicyCheckpoint.load`."""
+    return PolicyCheckpoint.load(path, "agile_autonomy", AGILE_NETWORK).build(TrajectoryNetwork)
+
+
+def state_observation(R_WB: Any, v_WB: Any, w_WB_B: Any, v_target: Any) -> Any:
+    """Returns (..., 18): attitude R_WB (..., 3, 3) row by row, then in the body frame velocity
+    [m/s], rates [rad/s] and target velocity [m/s]. Arrays are numpy or torch."""
+    xp = array_namespace(v_WB)
+    rows = xp.stack([v_WB, v_target], -2) @ R_WB
+    attitude = R_WB.reshape(*R_WB.shape[:-2], 9)
+    return xp.concatenate([attitude, rows[..., 0, :], w_WB_B, rows[..., 1, :]], -1)
+
+
+def plan(
+    network: TrajectoryNetwork, seen: Observation, speed: float, last: Hypotheses | None
+) -> Hypotheses:
+    """Computes the hypotheses.
+
+    A cost is the network's collision cost minus `PROGRESS` per meter towards the goal. Among near
+    ties the hypothesis that continues `last` gets the lowest cost.
+
+    Args:
+        network: of the architecture `AGILE_NETWORK`.
+        seen: with depth (H, W), multiples of 24 and 32 pixels.
+        speed: nominal [m/s].
+        last: the plan of the update before.
+    """
+    image = 1.0 / np.clip(pool_depth(seen.image, *IMAGE_SIZE), MIN_DEPTH, MAX_DEPTH)
+    p_WB, v_WB, _, w_WB_B = seen.state
+    v_target = target_velocity(p_WB, seen.p_WG, speed)
+    state = state_observation(seen.X_WB.rotation().matrix(), v_WB, w_WB_B, v_target)
+    waypoints_B, costs = network(image, state)
+    v_target_B = state[-3:]
+    progress = waypoints_B[:, -1] @ v_target_B / max(float(np.linalg.norm(v_target_B)), 1e-6)
+    costs = costs.astype(float) - PROGRESS * progress
+    new = Hypotheses(seen.time, seen.X_WB, waypoints_B.astype(float), costs)
+    return new if last is None else prefer_continuation(new, last)
+
+
+def prefer_continuation(new: Hypotheses, last: Hypotheses) -> Hypotheses:
+    """Lowers the cost of the near tie that is closest to the best of `last` below all others."""
+    ties = np.flatnonzero(new.costs <= new.costs.min() + NEAR_TIE)
+    if len(ties) < 2:
+        return new
+    expected = last.position_W(new.plan_time + 0.5, last.best)
+    middle = new.waypoints_W[ties, NUM_WAYPOINTS // 2 - 1]
+    costs = new.costs.copy()
+    chosen = ties[np.argmin(np.linalg.norm(middle - expected, axis=1))]
+    costs[chosen] = new.costs.min() - 1e-3
+    return Hypotheses(new.plan_time, new.X_WB, new.waypoints_B, costs)
+
+
+class AgileAutonomy(Policy):
     """Plans three trajectories with costs from a 32x24 depth image.
 
     .. pydrake_system::
@@ -52,50 +199,18 @@ class AgileAutonomy(LeafSystem):
         output_ports:
         - hypotheses
 
-    - ``state`` (13): ``[p_WB (3) [m], v_WB (3) [m/s], q_WB (4, wxyz), w_WB_B (3) [rad/s]]``.
-    - ``goal`` (3): p_WG [m], W frame.
-    - ``depth_image_32f``: planar depth [m] of the camera ``config.camera``.
     - ``hypotheses`` (8 + 31 * 3): as `Hypotheses.to_vector`, in the body frame B at the time of
-      planning; a discrete state, NaN before the first update.
-
-    Updates at 15 Hz from time 0 by
-    :func:`~splatpilot.systems.policies.agile_autonomy_inference.plan`.
-
-    Raises:
-        ValueError, FileNotFoundError: from the constructor on a config out of range, and on weights
-            that are missing, damaged, or of another policy, version or architecture.
+      planning; NaN before the first update.
     """
 
-    state_input_port = input_port("state")
-    goal_input_port = input_port("goal")
     depth_image_32f_input_port = input_port("depth_image_32f")
     hypotheses_output_port = output_port("hypotheses")
 
     def __init__(self, config: AgileAutonomyConfig | None = None) -> None:
-        super().__init__()
-        self._config = config = config or AgileAutonomyConfig()
-        config.validate()
-        self._network = load_network(config.weights)
-        self._state_port = self.DeclareVectorInputPort("state", 13)
-        self._goal_port = self.DeclareVectorInputPort("goal", 3)
-        self._depth_port = self.DeclareAbstractInputPort(
-            "depth_image_32f", Value(ImageDepth32F(config.camera.width, config.camera.height))
-        )
-        self.DeclareStateOutputPort("hypotheses", self.DeclareDiscreteState(no_plan(MODES)))
-        self.DeclarePeriodicDiscreteUpdateEvent(1.0 / config.rate, 0.0, self._update)
+        super().__init__(config or AgileAutonomyConfig(), "depth_image_32f")
+        self._network = load_network(self._config.weights)
+        self.declare_state(no_plan(MODES), "hypotheses")
 
-    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        state = np.asarray(self._state_port.Eval(context))
-        image = cast(ImageDepth32F, self._depth_port.Eval(context))
-        last = np.asarray(context.get_discrete_state(0).value())
-        hypotheses = plan(
-            self._network,
-            context.get_time(),
-            np.asarray(image.data)[..., 0],
-            pose_from_state(state),
-            state,
-            np.asarray(self._goal_port.Eval(context)),
-            self._config.speed,
-            Hypotheses.from_vector(last, MODES),
-        )
-        discrete_state.set_value(hypotheses.to_vector())
+    def decide(self, seen: Observation, *state: np.ndarray) -> list[np.ndarray]:
+        last = Hypotheses.from_vector(state[0], MODES)
+        return [plan(self._network, seen, self._config.speed, last).to_vector()]

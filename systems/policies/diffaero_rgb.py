@@ -1,35 +1,39 @@
-"""DiffAero in colours: it judges the depths that it flies by from a single image."""
+"""DiffAeroRgb: DiffAero that predicts its depth grid from a single RGB image."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import ClassVar, cast
 
 import cv2
 import numpy as np
-from pydrake.common.value import Value
-from pydrake.math import RigidTransform
-from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
-from pydrake.systems.sensors import ImageRgba8U
 
 from splatpilot.systems.common.drake import input_port, output_port
+from splatpilot.systems.common.validation import require, require_field
+from splatpilot.systems.policies.base import LearnedPolicyConfig, Observation, Policy
 from splatpilot.systems.policies.checkpoint import OnnxModel, PolicyCheckpoint, check_weights
-from splatpilot.systems.policies.depth_policy_config import require_speed
-from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK, RATE, decide_by_grid
+from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK, RATE
+from splatpilot.systems.policies.diffaero import decide as decide_by_grid
 from splatpilot.systems.policies.observations import heading_frame
 from splatpilot.systems.policies.recurrent_network import LEAK, NetworkSpec, RecurrentNetwork
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
-from splatpilot.systems.vehicle.state import QuadrotorState, pose_from_state
 
-# Nearest depths in a coarse grid from one colour image: what the network is told, and its layers.
-#
-# Each pixel comes with its ray in the heading frame, so that the network knows where the horizon
-# is, however the vehicle leans.
-
-
-WIDTH, HEIGHT = 160, 90  # [px], of what is looked at
+WIDTH, HEIGHT = 160, 90  # [px] of the view, the middle of the image
 FOV_X = 90.0  # [deg]
-CHANNELS = 6
-"""Of what the network takes: red, green, blue, and a ray."""
+CHANNELS = 6  # red, green, blue, and a ray in the heading frame, which shows the horizon
+
+
+@dataclass
+class DiffAeroRgbConfig(LearnedPolicyConfig):
+    """Weights, speed and a camera of 160 pixels and 90 degrees; its middle 90 rows are used."""
+
+    rate = RATE
+
+    camera: OnboardCamera = field(
+        default_factory=lambda: OnboardCamera(width=WIDTH, height=HEIGHT, fov_x=FOV_X)
+    )
+
+    def check(self) -> None:
+        require_view(self.camera.width, self.camera.height)
+        require_field(self.camera, "fov_x", self.camera.fov_x == FOV_X, f"{FOV_X:g} deg")
 
 
 @dataclass(frozen=True)
@@ -109,54 +113,11 @@ class MonocularDepth:
         self._net = cv2.dnn.readNetFromONNX(model.serialize((2, 9, 16)))
 
     def __call__(self, view: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Inverse depths (9, 16), as `inverse_depth` has them, and the logarithms of their expected
-        absolute errors, of a view (6, 90, 160), see `encode_view`."""
+        """Predicts inverse depths (9, 16) and the logarithms of their expected absolute errors
+        from a view (6, 90, 160), see `encode_view`."""
         self._net.setInput(view[None])
         inverse, log_error = self._net.forward()[0]
         return inverse, log_error
-
-
-def encode_view(color: np.ndarray, R_WB: np.ndarray) -> np.ndarray:
-    """What the network takes (6, 90, 160): colours of -1 to 1, and the pixels' rays in the heading
-    frame.
-
-    Args:
-        color: (H, 160, 3) uint8 of a camera of 90 degrees; its middle 90 rows are looked at.
-        R_WB: (3, 3) attitude.
-
-    Raises:
-        ValueError: for an image of another width, or without 90 rows in its middle.
-    """
-    H, W = color.shape[:2]
-    require_view(W, H)
-    first = (H - HEIGHT) // 2
-    view = np.empty((CHANNELS, HEIGHT, WIDTH), np.float32)
-    view[:3] = color[first : first + HEIGHT].transpose(2, 0, 1) * np.float32(1.0 / 127.5)
-    view[:3] -= np.float32(1.0)
-    R_HB = (heading_frame(R_WB).T @ R_WB).astype(np.float32)
-    view[3:] = (R_HB @ rays_B().reshape(-1, 3).T).reshape(3, HEIGHT, WIDTH)
-    return view
-
-
-def require_view(width: int, height: int) -> None:
-    """Raises ValueError unless images of this size [px] have the pixels that are looked at."""
-    if width != WIDTH or height < HEIGHT or height % 2:
-        raise ValueError(
-            f"the colour image has {width}x{height} pixels, but this policy looks at the middle "
-            f"{WIDTH}x{HEIGHT}; give its camera a width of {WIDTH} and an even height of at least "
-            f"{HEIGHT}"
-        )
-
-
-def rays_B() -> np.ndarray:
-    """Unit vectors (90, 160, 3), float32, through the pixels in the body frame, of a camera that
-    looks along body x."""
-    focal = 0.5 * WIDTH / np.tan(np.deg2rad(0.5 * FOV_X))
-    y = (0.5 * WIDTH - 0.5 - np.arange(WIDTH)) / focal
-    z = (0.5 * HEIGHT - 0.5 - np.arange(HEIGHT)) / focal
-    rays = np.ones((HEIGHT, WIDTH, 3))
-    rays[..., 1], rays[..., 2] = y, z[:, None]
-    return (rays / np.linalg.norm(rays, axis=2, keepdims=True)).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -194,61 +155,59 @@ def load_network(path: str | None) -> DiffAeroRgbNetwork:
     return checkpoint.build(DiffAeroRgbNetwork)
 
 
-def decide(
-    network: DiffAeroRgbNetwork,
-    color: np.ndarray,
-    X_WB: RigidTransform,
-    v_WB: np.ndarray,
-    p_WG: np.ndarray,
-    speed: float,
-    memory: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
-    """The acceleration a_WB (3,) [m/s^2] in W, gravity excluded, and the memory (H,) afterwards.
+def encode_view(color: np.ndarray, R_WB: np.ndarray) -> np.ndarray:
+    """Returns the network's input (6, 90, 160): RGB in [-1, 1] and rays in the heading frame.
 
     Args:
-        network: see `DiffAeroRgbNetwork`.
-        color: (H, 160, 3) uint8, see `encode_view`.
-        X_WB, v_WB: pose and velocity [m/s].
-        p_WG: the goal [m].
-        speed: wanted [m/s].
-        memory: (H,), before.
-
-    Raises:
-        ValueError: for an image of another size.
+        color: (H, 160, 3) uint8 of a camera of 90 degrees.
+        R_WB: (3, 3) attitude.
     """
-    grid, _ = network.monocular(encode_view(color, X_WB.rotation().matrix()))
-    return decide_by_grid(network.policy, grid, X_WB, v_WB, p_WG, speed, memory)
+    H, W = color.shape[:2]
+    require_view(W, H)
+    first = (H - HEIGHT) // 2
+    view = np.empty((CHANNELS, HEIGHT, WIDTH), np.float32)
+    view[:3] = color[first : first + HEIGHT].transpose(2, 0, 1) * np.float32(1.0 / 127.5)
+    view[:3] -= np.float32(1.0)
+    R_WH = heading_frame(np.arctan2(R_WB[1, 0], R_WB[0, 0]))
+    R_HB = (R_WH.T @ R_WB).astype(np.float32)
+    view[3:] = (R_HB @ rays_B().reshape(-1, 3).T).reshape(3, HEIGHT, WIDTH)
+    return view
 
 
-@dataclass
-class DiffAeroRgbConfig:
-    """The policy's weights, and what it is asked for."""
-
-    rate: ClassVar[float] = RATE
-
-    # [m/s] Speed that it is asked to fly at; the model card of its weights says what they know.
-    speed: float = 2.0
-    # File of weights, as `splatpilot train` writes them; those that ship where left empty.
-    weights: str = ""
-    # What it sees through: 160 pixels of 90 degrees wide, level; the middle 90 rows are looked at.
-    camera: OnboardCamera = field(
-        default_factory=lambda: OnboardCamera(width=WIDTH, height=HEIGHT, fov_x=FOV_X)
-    )
-
-    def validate(self) -> None:
-        """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
-        require_speed(self)
-        self.camera.validate()
-        require_view(self.camera.width, self.camera.height)
-        if self.camera.fov_x != FOV_X:
-            raise ValueError(
-                f"camera.fov_x is {self.camera.fov_x} deg, but this policy judges depths through "
-                f"{FOV_X:g}; set it to that"
-            )
+def require_view(width: int, height: int) -> None:
+    """Checks that images of this size [px] contain the view."""
+    valid = width == WIDTH and height >= HEIGHT and height % 2 == 0
+    condition = f"{WIDTH} pixels wide, with an even height of at least {HEIGHT}"
+    require(valid, "the color image", condition, f"{width}x{height}")
 
 
-class DiffAeroRgb(LeafSystem):
-    """Flies to the goal by a colour image and what it remembers.
+def rays_B() -> np.ndarray:
+    """Returns unit vectors (90, 160, 3), float32, through the pixels of a camera along body x."""
+    focal = 0.5 * WIDTH / np.tan(np.deg2rad(0.5 * FOV_X))
+    y = (0.5 * WIDTH - 0.5 - np.arange(WIDTH)) / focal
+    z = (0.5 * HEIGHT - 0.5 - np.arange(HEIGHT)) / focal
+    rays = np.ones((HEIGHT, WIDTH, 3))
+    rays[..., 1], rays[..., 2] = y, z[:, None]
+    return (rays / np.linalg.norm(rays, axis=2, keepdims=True)).astype(np.float32)
+
+
+def decide(
+    network: DiffAeroRgbNetwork, seen: Observation, speed: float, memory: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Computes a_WB (3,) [m/s^2], gravity excluded, and the next hidden state (H,).
+
+    Args:
+        network: of the architecture `DIFFAERO_RGB_NETWORK`.
+        seen: with RGB (H, 160, 3), see `encode_view`.
+        speed: nominal [m/s].
+        memory: (H,), the hidden state.
+    """
+    grid, _ = network.monocular(encode_view(seen.image, seen.X_WB.rotation().matrix()))
+    return decide_by_grid(network.policy, grid, seen, speed, memory)
+
+
+class DiffAeroRgb(Policy):
+    """Flies to the goal by an RGB image and a hidden state.
 
     .. pydrake_system::
 
@@ -260,50 +219,17 @@ class DiffAeroRgb(LeafSystem):
         output_ports:
         - acceleration
 
-    - ``state`` (13): ``[p_WB (3) [m], v_WB (3) [m/s], q_WB (4, wxyz), w_WB_B (3) [rad/s]]``.
-    - ``goal`` (3): p_WG [m], W frame.
-    - ``color_image``: RGBA of the camera ``config.camera``.
-    - ``acceleration`` (3): a_WB [m/s^2], W frame, gravity excluded; zero before the first update.
-
-    Updates at 15 Hz from time 0 by
-    :func:`~splatpilot.systems.policies.diffaero_rgb.decide`. The discrete state holds the
-    acceleration and the network's memory.
-
-    Raises:
-        ValueError, FileNotFoundError: from the constructor on a config out of range, and on weights
-            that are missing, damaged, or of another policy, version or architecture.
+    - ``acceleration`` (3): a_WB [m/s^2], W frame, gravity excluded.
     """
 
-    state_input_port = input_port("state")
-    goal_input_port = input_port("goal")
     color_image_input_port = input_port("color_image")
     acceleration_output_port = output_port("acceleration")
 
     def __init__(self, config: DiffAeroRgbConfig | None = None) -> None:
-        super().__init__()
-        self._config = config = config or DiffAeroRgbConfig()
-        config.validate()
-        self._network = load_network(config.weights)
-        self._state_port = self.DeclareVectorInputPort("state", 13)
-        self._goal_port = self.DeclareVectorInputPort("goal", 3)
-        self._color_port = self.DeclareAbstractInputPort(
-            "color_image", Value(ImageRgba8U(config.camera.width, config.camera.height))
-        )
-        self.DeclareStateOutputPort("acceleration", self.DeclareDiscreteState(3))
-        self._memory = self.DeclareDiscreteState(self._network.policy.initial_hidden())
-        self.DeclarePeriodicDiscreteUpdateEvent(1.0 / config.rate, 0.0, self._update)
+        super().__init__(config or DiffAeroRgbConfig(), "color_image")
+        self._network = load_network(self._config.weights)
+        self.declare_state(np.zeros(3), "acceleration")
+        self.declare_state(self._network.policy.initial_hidden())
 
-    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        state = np.asarray(self._state_port.Eval(context))
-        image = cast(ImageRgba8U, self._color_port.Eval(context))
-        a_WB, memory = decide(
-            self._network,
-            np.asarray(image.data)[..., :3],
-            pose_from_state(state),
-            QuadrotorState.of(state).v_WB,
-            np.asarray(self._goal_port.Eval(context)),
-            self._config.speed,
-            np.asarray(context.get_discrete_state(int(self._memory)).value()),
-        )
-        discrete_state.set_value(0, a_WB)
-        discrete_state.set_value(int(self._memory), memory)
+    def decide(self, seen: Observation, *state: np.ndarray) -> tuple[np.ndarray, ...]:
+        return decide(self._network, seen, self._config.speed, state[1])

@@ -1,7 +1,7 @@
-"""Trajectory hypotheses, what every trajectory policy returns, and their form as a vector.
+"""Trajectory hypotheses: the output of trajectory policies, and the selection of the cheapest.
 
-A policy answers an observation with K candidate trajectories of T = 10 waypoints at 0.1 s, in the
-body frame at the moment of planning, and one cost each. On a Drake port they travel as the vector
+A plan is K trajectories of T = 10 waypoints at 0.1 s, in the body frame at the time of planning,
+and one cost each. A Drake port holds it as the vector
 
     [plan_time, p_WB (3), q_WB (4, wxyz), waypoints_B (K * T * 3, row-major), costs (K)],
 
@@ -18,6 +18,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from splatpilot.systems.common.drake import input_port, output_port
+from splatpilot.systems.common.validation import require
 from splatpilot.systems.vehicle.state import QuadrotorState
 
 NUM_WAYPOINTS = 10
@@ -27,70 +28,44 @@ _HEADER = 8  # plan_time, p_WB, q_WB
 
 
 def hypotheses_size(num_hypotheses: int) -> int:
-    """The length of the vector that holds `num_hypotheses` hypotheses.
-
-    Raises:
-        ValueError: if `num_hypotheses` is less than 1.
-    """
-    if num_hypotheses < 1:
-        raise ValueError(
-            f"The number of hypotheses is {num_hypotheses}, but a policy returns at least 1."
-        )
+    """Returns the length of the vector of `num_hypotheses` hypotheses."""
+    require(num_hypotheses >= 1, "the number of hypotheses", "at least 1", num_hypotheses)
     return _HEADER + num_hypotheses * (NUM_WAYPOINTS * 3 + 1)
 
 
 def num_hypotheses_in(size: int) -> int:
-    """How many hypotheses a vector of this length holds.
-
-    Raises:
-        ValueError: if no number of hypotheses takes this length.
-    """
+    """Returns the number of hypotheses in a vector of this length."""
     count, rest = divmod(size - _HEADER, NUM_WAYPOINTS * 3 + 1)
-    if count < 1 or rest:
-        raise ValueError(
-            f"A hypotheses port has size {size}, but K hypotheses take "
-            f"{_HEADER} + {NUM_WAYPOINTS * 3 + 1} K; see `Hypotheses.to_vector`."
-        )
+    sizes = f"{_HEADER} + {NUM_WAYPOINTS * 3 + 1} K for K >= 1 hypotheses"
+    require(count >= 1 and not rest, "the size of a hypotheses port", sizes, size)
     return count
 
 
 def no_plan(num_hypotheses: int) -> np.ndarray:
-    """The vector that stands for "no plan yet": NaN throughout."""
+    """Returns the vector before the first plan, all NaN."""
     return np.full(hypotheses_size(num_hypotheses), np.nan)
 
 
 @dataclass(frozen=True, eq=False)
 class Hypotheses:
-    """K candidate trajectories in the body frame of the moment they were planned.
+    """K trajectories in the body frame at the time of planning; waypoint `t` is for the time
+    `plan_time + (t + 1) * 0.1` s."""
 
-    Waypoint `t` (from 0) is where the vehicle should be at `plan_time + (t + 1) * 0.1` s. The
-    order is the policy's own; `best` is the one of lowest cost.
-    """
-
-    plan_time: float
-    """When the plan was made [s]."""
-    X_WB: RigidTransform
-    """Pose of the body when the plan was made."""
-    waypoints_B: np.ndarray
-    """(K, T = 10, 3) [m] waypoints in the body frame B of that pose."""
-    costs: np.ndarray
-    """(K,) cost of each trajectory, lower is better; the unit is the policy's own."""
+    plan_time: float  # [s]
+    X_WB: RigidTransform  # at plan_time
+    waypoints_B: np.ndarray  # (K, T = 10, 3) [m]
+    costs: np.ndarray  # (K,), in a unit of the policy's choice
 
     def __post_init__(self) -> None:
         shape, count = np.shape(self.waypoints_B), np.shape(self.costs)
-        if len(shape) != 3 or shape[0] < 1 or shape[1:] != (NUM_WAYPOINTS, 3):
-            raise ValueError(
-                f"The waypoints have shape {shape}; give (K, {NUM_WAYPOINTS}, 3) with K >= 1."
-            )
-        if count != shape[:1]:
-            raise ValueError(
-                f"The costs have shape {count}, but there are {shape[0]} trajectories; give one "
-                "cost for each."
-            )
+        valid = len(shape) == 3 and shape[0] >= 1 and shape[1:] == (NUM_WAYPOINTS, 3)
+        condition = f"(K, {NUM_WAYPOINTS}, 3) with K >= 1"
+        require(valid, "the shape of the waypoints", condition, shape)
+        require(count == shape[:1], "the shape of the costs", str(shape[:1]), count)
 
     @property
     def best(self) -> int:
-        """Index of the hypothesis of lowest cost (the first of equals)."""
+        """Index of the lowest cost, the first of equals."""
         return int(np.argmin(self.costs))
 
     @property
@@ -100,11 +75,8 @@ class Hypotheses:
         return self.waypoints_B @ R_WB.T + self.X_WB.translation()
 
     def position_W(self, time: float, hypothesis: int) -> np.ndarray:
-        """p_WR (3,) [m], where `hypothesis` wants the vehicle at `time` [s].
-
-        Linear between waypoints, from p_WB at `plan_time`; before it p_WB, after the last waypoint
-        the last waypoint.
-        """
+        """Interpolates p_WR (3,) [m] of a hypothesis at `time` [s] linearly, from p_WB at
+        `plan_time` to the last waypoint; constant before and after."""
         along = np.clip((time - self.plan_time) / WAYPOINT_PERIOD, 0.0, NUM_WAYPOINTS)
         i = min(int(along), NUM_WAYPOINTS - 1)
         knots_B = np.vstack([np.zeros(3), self.waypoints_B[hypothesis]])  # (T + 1, 3)
@@ -112,7 +84,7 @@ class Hypotheses:
         return self.X_WB @ p_BR
 
     def to_vector(self) -> np.ndarray:
-        """The vector (8 + 31 K,) described at the top of this file."""
+        """Returns the vector (8 + 31 K,) described at the top of this file."""
         return np.concatenate(
             [
                 [self.plan_time],
@@ -125,18 +97,11 @@ class Hypotheses:
 
     @classmethod
     def from_vector(cls, vector: np.ndarray, num_hypotheses: int) -> Hypotheses | None:
-        """The hypotheses that `vector` holds, or None where nothing is planned yet.
-
-        Raises:
-            ValueError: if `vector` is not as long as `hypotheses_size(num_hypotheses)`.
-        """
+        """Returns the hypotheses in `vector`; None before the first plan."""
         vector = np.asarray(vector, dtype=float)
-        size = hypotheses_size(num_hypotheses)
-        if vector.shape != (size,):
-            raise ValueError(
-                f"The hypotheses vector has shape {vector.shape}, but {num_hypotheses} hypotheses "
-                f"take ({size},); give both ends of the connection the same number of hypotheses."
-            )
+        shape = (hypotheses_size(num_hypotheses),)
+        what = f"the shape of {num_hypotheses} hypotheses"
+        require(vector.shape == shape, what, str(shape), vector.shape)
         if np.isnan(vector[0]):
             return None
         q_WB = vector[4:8]
@@ -149,7 +114,7 @@ class Hypotheses:
 
 
 class HypothesisSelector(LeafSystem):
-    """Follows the hypothesis of lowest cost, a fixed time ahead of now.
+    """Follows the hypothesis of lowest cost, `lookahead` ahead of the present time.
 
     .. pydrake_system::
 
@@ -160,13 +125,14 @@ class HypothesisSelector(LeafSystem):
         output_ports:
         - waypoint
 
-    `hypotheses` is the vector of `Hypotheses.to_vector` for `num_hypotheses` trajectories and
-    `state` the 13 numbers [p_WB, v_WB, q_WB, w_WB_B]. `waypoint` (3) is p_WR [m], W frame: where
-    the cheapest trajectory wants the vehicle at `now + lookahead`, interpolated linearly between
-    its waypoints. A plan that has run out holds its last waypoint; before the first plan the
-    waypoint is the present position, so that the vehicle hovers; it is NaN if the lowest
-    cost is infinite or a cost is NaN, since then no trajectory is the cheapest. Stateless, no rate
-    of its own.
+    - ``hypotheses`` (8 + 31 K): as `Hypotheses.to_vector`.
+    - ``state`` (13): ``[p_WB (3) [m], v_WB (3) [m/s], q_WB (4, wxyz), w_WB_B (3) [rad/s]]``.
+    - ``waypoint`` (3): p_WR [m], W frame, by `Hypotheses.position_W`; p_WB before the first plan;
+      NaN if the lowest cost is infinite or a cost is NaN.
+
+    Args:
+        num_hypotheses: K, as at the policy.
+        lookahead: [s], in (0, 1], as at the controller.
     """
 
     hypotheses_input_port = input_port("hypotheses")
@@ -174,22 +140,9 @@ class HypothesisSelector(LeafSystem):
     waypoint_output_port = output_port("waypoint")
 
     def __init__(self, num_hypotheses: int = 3, lookahead: float = 0.4) -> None:
-        """Constructs the system.
-
-        Args:
-            num_hypotheses: K, as at the policy.
-            lookahead: how far ahead of now the waypoint lies [s], as at the controller.
-
-        Raises:
-            ValueError: if `lookahead` is not within (0, 1] s, the span of a plan.
-        """
         super().__init__()
         span = NUM_WAYPOINTS * WAYPOINT_PERIOD
-        if not 0.0 < lookahead <= span:
-            raise ValueError(
-                f"The lookahead is {lookahead} s, but a plan spans {span} s: choose a lookahead "
-                f"in (0, {span}]."
-            )
+        require(0.0 < lookahead <= span, "lookahead", f"in (0, {span:g}] s", lookahead)
         self._num_hypotheses = num_hypotheses
         self._lookahead = lookahead
         self._hypotheses_port = self.DeclareVectorInputPort(

@@ -1,27 +1,24 @@
-"""Quintics between boundary states, the acceleration that they begin with, fans of velocities, and
-choosing distinct trajectories."""
+"""Motion primitives: quintics, fans of velocities, selection of distinct trajectories."""
 
 import math
 from collections.abc import Sequence
 
 import numpy as np
 
-from splatpilot.systems.vehicle.flatness import cross
 from splatpilot.systems.vehicle.quadrotor import QuadrotorParams
 
-STEEPEST = 0.5  # Cosine of the tilt beyond which the acceleration is taken to grow no further.
+MIN_UPRIGHT = 0.5  # Cosine of the tilt above which `level_acceleration` stays constant.
 
 
 def quintic_basis(times: np.ndarray, horizon: float, derivative: int = 0) -> np.ndarray:
-    """The matrix (n, 6) that evaluates quintics at `times` (n,) [s].
+    """Computes the matrix (n, 6) that evaluates quintics at `times` (n,) [s].
 
-    Times the boundary states (p_0, v_0, a_0, p_1, v_1, a_1) it gives that `derivative` of the one
-    quintic that has position p_0, velocity v_0 and acceleration a_0 at time 0 and p_1, v_1, a_1 at
-    `horizon` [s].
+    Its product with the boundary states (p_0, v_0, a_0, p_1, v_1, a_1) at times 0 and `horizon` [s]
+    is that `derivative` of the quintic between them.
     """
 
     def monomials(t: np.ndarray, order: int) -> np.ndarray:
-        """The derivatives of order `order` of 1, t, ..., t^5: (n, 6)."""
+        """Derivatives (n, 6) of the given order of 1, t, ..., t^5."""
         powers = np.arange(6)
         factors = np.array([math.perm(k, order) for k in range(6)])
         return factors * t[:, None] ** np.maximum(powers - order, 0)
@@ -34,23 +31,21 @@ def quintic_basis(times: np.ndarray, horizon: float, derivative: int = 0) -> np.
 
 
 def level_acceleration(R_WB: np.ndarray, v_WB: np.ndarray, params: QuadrotorParams) -> np.ndarray:
-    """The acceleration a_WB (3,) [m/s^2] of level flight at this attitude and velocity.
+    """Computes a_WB (3,) [m/s^2] of level flight at this attitude and velocity.
 
     The thrust that carries the weight, c = g / (z_B · e_z), accelerates along the horizontal part
-    of the body z axis z_B, against the drag. A plan that starts with this acceleration goes on
-    smoothly from the last.
+    of z_B, against the drag. Plans that start with this acceleration continue the last smoothly.
     """
-    tilt = R_WB[:2, 2] / max(R_WB[2, 2], STEEPEST)
+    tilt = R_WB[:2, 2] / max(R_WB[2, 2], MIN_UPRIGHT)
     return np.append(params.gravity * tilt - params.drag * v_WB[:2], 0.0)
 
 
 def velocity_fan(
     yaws: np.ndarray, pitches: np.ndarray, speeds: Sequence[float] | np.ndarray
 ) -> np.ndarray:
-    """Velocities (N, 3) of each of the speeds in each of the directions.
+    """Returns velocities (N, 3) of all speeds in all directions, in a frame with x ahead.
 
-    Of a frame whose x axis points ahead: yaws [rad] are about z and positive to the left, pitches
-    [rad] positive upwards.
+    Yaws [rad] are positive to the left, pitches [rad] positive upwards.
     """
     yaw, pitch, speed = np.meshgrid(yaws, pitches, speeds, indexing="ij")
     forward, left, up = np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), np.sin(pitch)
@@ -58,24 +53,24 @@ def velocity_fan(
 
 
 def rotation_to(direction_W: np.ndarray) -> np.ndarray:
-    """The rotation R_WL (3, 3) whose x axis points along `direction_W` (3,) and whose y is level.
+    """Returns R_WL (3, 3) with its x axis along `direction_W` (3,) and its y axis level.
 
-    A zero direction gives the world's axes, a vertical one has y along the world's y.
+    A zero direction gives the world's axes; a vertical one has y along the world's y.
     """
     length = np.linalg.norm(direction_W)
     x_W = direction_W / length if length > 0.0 else np.array([1.0, 0.0, 0.0])
     level = math.hypot(x_W[0], x_W[1])
     y_W = np.array([-x_W[1], x_W[0], 0.0]) / level if level > 1e-6 else np.array([0.0, 1.0, 0.0])
-    return np.column_stack([x_W, y_W, cross(x_W, y_W)])
+    return np.column_stack([x_W, y_W, np.cross(x_W, y_W)])
 
 
 def select_distinct(
     positions: np.ndarray, costs: np.ndarray, count: int, separation: float
 ) -> np.ndarray:
-    """The indices (count,) of cheap trajectories that differ, cheapest first.
+    """Returns the indices (count,) of cheap distinct trajectories, cheapest first.
 
-    Greedy: the cheapest, then time and again the cheapest of those whose mean distance from every
-    one chosen exceeds `separation`. Once none does, the most distant of the rest.
+    Greedy: repeatedly the cheapest whose mean distance from all chosen ones exceeds `separation`;
+    if there is none, the most distant.
 
     Args:
         positions: (N, S, 3) [m].
@@ -87,7 +82,7 @@ def select_distinct(
     apart = np.full(len(costs), np.inf)
     while len(chosen) < count:
         apart = np.minimum(apart, lengths(positions - positions[chosen[-1]]).mean(axis=1))
-        apart[chosen] = -1.0  # Never twice.
+        apart[chosen] = -1.0  # not again
         distinct = apart > separation
         if distinct.any():
             chosen.append(int(np.argmin(np.where(distinct, costs, np.inf))))
@@ -97,5 +92,5 @@ def select_distinct(
 
 
 def lengths(vectors: np.ndarray) -> np.ndarray:
-    """Lengths (...,) of vectors (..., 3)."""
+    """Returns the lengths (...,) of vectors (..., 3)."""
     return np.sqrt(np.einsum("...i,...i->...", vectors, vectors))

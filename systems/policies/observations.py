@@ -1,68 +1,64 @@
-"""What depth policies are told: pooled and encoded depth, and the state seen from their heading.
+"""Encodings of observations and network outputs, for numpy arrays and torch tensors.
 
-The heading frame H has its origin in the vehicle, z up and x above the body's x axis. Vectors are
-numpy arrays; training repeats the same formulas in torch
-(`training/policies/torch_observations.py`).
+The heading frame H has its origin in the vehicle, z up and x above the body's x axis. Leading
+dimensions `...` are batches.
 """
 
-import numpy as np
+from typing import Any
+
+from splatpilot.systems.common.validation import require
+from splatpilot.systems.vehicle.flatness import array_namespace
 
 
-def pool_depth(depth: np.ndarray, height: int, width: int) -> np.ndarray:
-    """The nearest depth (height, width) [m] in each block of an image (H, W) of planar depth [m].
+def pool_depth(depth: Any, height: int, width: int) -> Any:
+    """Returns the minimum (..., height, width) [m] of each block of planar depth (..., H, W) [m].
 
-    Obstacles thinner than a coarse pixel stay visible this way.
-
-    Raises:
-        ValueError: unless H and W are multiples of height and width.
+    Obstacles thinner than a coarse pixel stay visible.
     """
-    H, W = depth.shape
+    *batch, H, W = depth.shape
     require_poolable(H, W, height, width)
-    return depth.reshape(height, H // height, width, W // width).min(axis=(1, 3))
+    blocks = depth.reshape(*batch, height, H // height, width, W // width)
+    return array_namespace(depth).amin(blocks, (-3, -1))
 
 
 def require_poolable(H: int, W: int, height: int, width: int) -> None:
-    """Raises ValueError unless images of H x W pixels can be pooled to height x width."""
-    if H < 1 or W < 1 or H % height or W % width:
-        raise ValueError(
-            f"the depth image has {W}x{H} pixels, but this policy pools it to {width}x{height}; "
-            f"give its camera whole multiples of these, as {4 * width}x{4 * height}"
-        )
+    """Checks that images of H x W pixels can be pooled to height x width."""
+    valid = H >= 1 and W >= 1 and H % height == 0 and W % width == 0
+    condition = f"whole multiples of {width}x{height}"
+    remedy = f"give the camera for example {4 * width}x{4 * height}"
+    require(valid, "the size of the depth image", condition, f"{W}x{H}", remedy)
 
 
-def inverse_depth(depth: np.ndarray, nearest: float, farthest: float) -> np.ndarray:
-    """Planar depth (...,) [m] as 3 / z - 0.6, z within [nearest, farthest]; 0 means too near."""
-    return 3.0 / np.clip(depth, nearest, farthest) - 0.6
+def inverse_depth(depth: Any, min_depth: float, max_depth: float) -> Any:
+    """Encodes planar depth (...,) [m] as 3 / z - 0.6, z clipped to [min_depth, max_depth]."""
+    return 3.0 / depth.clip(min_depth, max_depth) - 0.6
 
 
-def heading_frame(R_WB: np.ndarray) -> np.ndarray:
-    """R_WH (3, 3) of the body attitude R_WB (3, 3)."""
-    x, y = R_WB[0, 0], R_WB[1, 0]
-    length = max(np.hypot(x, y), 1e-6)
-    cos, sin = x / length, y / length
-    return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+def heading_frame(yaw: Any) -> Any:
+    """Returns R_WH (..., 3, 3), the rotation about z by `yaw` (...,) [rad]."""
+    xp = array_namespace(yaw)
+    cos, sin = xp.cos(yaw), xp.sin(yaw)
+    zero, one = xp.zeros_like(yaw), xp.ones_like(yaw)
+    entries = xp.stack([cos, -sin, zero, sin, cos, zero, zero, zero, one], -1)
+    return entries.reshape(*entries.shape[:-1], 3, 3)
 
 
-def target_velocity(
-    p_WB: np.ndarray, p_WG: np.ndarray, speed: float, slowing_time: float = 1.0
-) -> np.ndarray:
-    """The velocity (3,) [m/s] straight to the goal, at `speed` until `slowing_time` [s] before it.
-
-    (p_WG - p_WB) / max(distance / speed, slowing_time).
-    """
+def target_velocity(p_WB: Any, p_WG: Any, speed: Any, slowing_time: float = 1.0) -> Any:
+    """Returns the velocity (..., 3) [m/s] straight to the goal: (p_WG - p_WB) / max(distance /
+    speed, slowing_time), at `speed` (...,) [m/s] until `slowing_time` [s] before it."""
     to_goal = p_WG - p_WB
-    return to_goal / max(float(np.linalg.norm(to_goal)) / speed, slowing_time)
+    distance = array_namespace(to_goal).sqrt((to_goal * to_goal).sum(-1).clip(min=1e-6))
+    return to_goal / (distance / speed).clip(min=slowing_time)[..., None]
 
 
-def heading_observation(
-    R_WB: np.ndarray, p_WB: np.ndarray, v_WB: np.ndarray, p_WG: np.ndarray, speed: float
-) -> np.ndarray:
-    """(9,) target velocity, velocity [m/s] and the body's z axis, all in the heading frame."""
-    R_WH = heading_frame(R_WB)
-    rows = np.stack([target_velocity(p_WB, p_WG, speed), v_WB, R_WB[:, 2]])
-    return (rows @ R_WH).ravel()
+def heading_observation(p_WB: Any, v_WB: Any, z_WB: Any, p_WG: Any, speed: Any, R_WH: Any) -> Any:
+    """Returns (..., 9): target velocity, velocity [m/s] and the body's z axis z_WB, all (..., 3),
+    in the heading frame."""
+    rows = [target_velocity(p_WB, p_WG, speed), v_WB, z_WB]
+    rows = array_namespace(v_WB).stack(rows, -2) @ R_WH
+    return rows.reshape(*rows.shape[:-2], 9)
 
 
-def limit_smoothly(output: np.ndarray, limits: np.ndarray) -> np.ndarray:
-    """A network's output (N,) within +-limits (N,), smoothly."""
-    return limits * np.tanh(output / limits)
+def limit_smoothly(output: Any, limits: Any) -> Any:
+    """Limits a network's output (..., N) smoothly to +-limits (N,)."""
+    return limits * array_namespace(output).tanh(output / limits)

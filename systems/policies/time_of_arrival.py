@@ -1,10 +1,9 @@
-"""Time of arrival: how long the way around all obstacles to a goal is, from everywhere.
+"""Time of arrival at a goal around all obstacles, from everywhere in a distance field.
 
-The solution T of the eikonal equation |grad T| = S(d), T(goal) = 0, by fast marching over the
-grid of a conservative distance field (J. A. Sethian, "A fast marching level set method for
-monotonically advancing fronts", PNAS 1996). The slowness S rises with the nearness of obstacles, so
-that the way keeps to open space, and is infinite where the vehicle does not fit. Going down T never
-ends in a trap: its only minimum is the goal.
+T solves the eikonal equation |grad T| = S(d), T(goal) = 0, by fast marching (J. A. Sethian, "A fast
+marching level set method for monotonically advancing fronts", PNAS 1996). The slowness S rises near
+obstacles, so that paths keep to open space, and is infinite where the vehicle does not fit. The
+only minimum of T is the goal.
 """
 
 from __future__ import annotations
@@ -18,32 +17,22 @@ from scipy.ndimage import distance_transform_edt
 
 from splatpilot import _native
 from splatpilot.systems.collision.distance_field import soft_barrier
-from splatpilot.systems.collision.esdf import (
-    Esdf,
-    corner_offsets,
-    grid_strides,
-    trilinear,
-    trilinear_with_gradient,
-)
+from splatpilot.systems.collision.esdf import Esdf, interpolate_grid
 from splatpilot.systems.common.provenance import InfeasibleFlightError
+from splatpilot.systems.common.validation import require
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
-OPEN_CLEARANCE = 0.6
-"""Clearance [m] from which on the vehicle may fly at full speed."""
-
-CONTACT_SPEED = 0.1
-"""Fraction of the full speed [-] at no clearance; linear in between."""
-
-BARRIER_WEIGHT = 1.5
-"""Slowness [-] per metre of the soft barrier, equation (3), which reaches further."""
+OPEN_CLEARANCE = 0.6  # [m] minimum clearance for full speed
+CONTACT_SPEED = 0.1  # [-] fraction of full speed at zero clearance
+BARRIER_WEIGHT = 1.5  # [-] slowness per meter of the soft barrier, equation (3)
 
 
 def slowness(distance: np.ndarray) -> np.ndarray:
-    """The time S(d) [s] that a metre of way at `distance` (...,) [m] from obstacles counts.
+    """Computes the slowness S(d) [s/m] at `distance` (...,) [m] from obstacles.
 
         S = 1 / F + 1.5 soft(d),  F from 0.1 at contact to 1 at 0.6 m clearance
 
-    Close to 1 in the open, where T is the length of the way, and about 11 at contact.
+    About 1 in open space, where T is the length of the path, and 11 at contact.
     """
     openness = (distance - VEHICLE_RADIUS) / OPEN_CLEARANCE
     speed = CONTACT_SPEED + (1.0 - CONTACT_SPEED) * np.minimum(np.maximum(openness, 0.0), 1.0)
@@ -54,40 +43,31 @@ def slowness(distance: np.ndarray) -> np.ndarray:
 class TimeOfArrival:
     """Time of arrival at a goal over a voxel grid, interpolated trilinearly.
 
-    The unit is seconds at 1 m/s in open space. Where the vehicle does not fit, and from where no
-    way leads to the goal, the value is that of the nearest place with a way plus the distance to it
-    at the contact speed: finite, and leading out. Outside the box it is that of the nearest point
-    of the grid. Immutable, shared by reference.
+    The unit is seconds at 1 m/s in open space. Voxels without a path to the goal have the value of
+    the nearest one with a path, plus the distance to it at the contact speed. Outside the box the
+    value is that of the nearest grid point. Immutable, shared by reference.
     """
 
-    p_WG: np.ndarray
-    """(3,) [m] the goal."""
-    times: np.ndarray
-    """(nx, ny, nz) float32 [s] at the voxel centres lower_W + (i + 0.5) voxel_size."""
-    reachable: np.ndarray
-    """(nx, ny, nz) bool, the voxels from which a way leads to the goal."""
-    lower_W: np.ndarray
-    """(3,) [m] lower corner of the box."""
-    voxel_size: float
-    """[m] edge length of a voxel."""
+    p_WG: np.ndarray  # (3,) [m], the goal
+    times: np.ndarray  # (nx, ny, nz) float32 [s] at the centers lower_W + (i + 0.5) voxel_size
+    reachable: np.ndarray  # (nx, ny, nz) bool, the voxels with a path to the goal
+    lower_W: np.ndarray  # (3,) [m], lower corner of the box
+    voxel_size: float  # [m], edge length
 
     def __deepcopy__(self, memo: dict) -> TimeOfArrival:
         return self  # Copies of a Drake Context share it.
 
     def value(self, p_WQ: np.ndarray) -> np.ndarray:
-        """Time of arrival (...,) [s] from p_WQ (..., 3) [m]."""
-        corners, fractions = self._cell(p_WQ)
-        return trilinear(corners, *fractions).reshape(np.shape(p_WQ)[:-1])
+        """Interpolates the time of arrival (...,) [s] at p_WQ (..., 3) [m]."""
+        return self._interpolate(p_WQ)[0]
 
     def gradient(self, p_WQ: np.ndarray) -> np.ndarray:
-        """Its gradient (..., 3) [s/m] at p_WQ (..., 3) [m]; downhill is the way to the goal."""
-        corners, fractions = self._cell(p_WQ)
-        slopes = trilinear_with_gradient(corners, *fractions)[1:]
-        return np.stack(slopes, axis=-1).reshape(np.shape(p_WQ)) / self.voxel_size
+        """Computes the gradient (..., 3) [s/m] of `value` at p_WQ (..., 3) [m]."""
+        return self._interpolate(p_WQ)[1]
 
     def is_reachable(self, p_WQ: np.ndarray, within: float = 0.0) -> bool:
-        """Checks that a route leads to the goal from the voxel of p_WQ (3,) [m], or from one that
-        the cube of half edge `within` [m] about it touches."""
+        """Checks that a path leads to the goal from the voxel of p_WQ (3,) [m], or from one that
+        the cube of half edge `within` [m] around it touches."""
         from_corner = np.asarray(p_WQ) - self.lower_W
         first = np.floor((from_corner - within) / self.voxel_size)
         last = np.floor((from_corner + within) / self.voxel_size)
@@ -97,13 +77,13 @@ class TimeOfArrival:
         cube = tuple(slice(a, b + 1) for a, b in zip(first, last, strict=True))
         return bool(self.reachable[cube].any())
 
-    def way(self, p_WQ: np.ndarray, lengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Points (n, 3) [m] and directions (n, 3) of the way to the goal from p_WQ (3,) [m].
+    def path(self, p_WQ: np.ndarray, lengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns points (n, 3) [m] and directions (n, 3) of the path from p_WQ (3,) [m].
 
-        Each after its length (n,) [m] of way, with the direction of the last quarter of that; or at
-        the goal if that is nearer, with direction zero.
+        Each is after a length (n,) [m], with the direction of its last quarter; or at the goal if
+        that is nearer, with direction zero.
         """
-        step = max(self.voxel_size, 0.1)  # [m] Shorter steps resolve nothing more.
+        step = max(self.voxel_size, 0.1)  # [m] Shorter steps do not resolve more.
         longest = float(np.max(lengths))
         rows = np.empty((ceil(longest / step) + 3, 4))  # both ends, and one for rounding
         count = _native.descend(
@@ -126,24 +106,17 @@ class TimeOfArrival:
         chords[lengths > covered[-1]] = 0.0
         return ends, np.array([_unit(chord) for chord in chords])
 
-    def _cell(self, p_WQ: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Corner values (2, 2, 2, N) and fractions (3, N) of the cells that hold the points."""
-        shape = self.times.shape
-        position = (np.reshape(p_WQ, (-1, 3)) - self.lower_W).T / self.voxel_size - 0.5  # (3, N)
-        last = np.array(shape, dtype=float)[:, None] - 1.0
-        position = np.minimum(np.maximum(position, 0.0), last)
-        cell = np.minimum(np.floor(position), last - 1.0)
-        base = grid_strides(shape) @ cell.astype(np.intp)
-        return self.times.take(corner_offsets(shape) + base), position - cell
+    def _interpolate(self, p_WQ: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Returns values and gradients at the points, brought between the voxel centers."""
+        first = self.lower_W + 0.5 * self.voxel_size
+        last = first + self.voxel_size * (np.array(self.times.shape) - 1.0)
+        p_WQ = np.minimum(np.maximum(p_WQ, first), last)
+        return interpolate_grid(self.times, self.lower_W, self.voxel_size, p_WQ)
 
 
-def way_lengths(field: Esdf, p_WG: np.ndarray) -> TimeOfArrival:
-    """The lengths [m] of the shortest ways to the goal p_WG (3,) [m] that the vehicle fits through:
-    the times of arrival at 1 m/s, however near the obstacles.
-
-    Raises:
-        ValueError, InfeasibleFlightError: see `time_of_arrival`.
-    """
+def path_lengths(field: Esdf, p_WG: np.ndarray) -> TimeOfArrival:
+    """Computes the lengths [m] of the shortest paths to p_WG (3,) [m] that the vehicle fits
+    through, the times of arrival at slowness 1."""
     return time_of_arrival(field, p_WG, slowness=np.ones_like)
 
 
@@ -153,58 +126,56 @@ def time_of_arrival(
     margin: float = 0.0,
     slowness: Callable[[np.ndarray], np.ndarray] = slowness,
 ) -> TimeOfArrival:
-    """The time of arrival at the goal p_WG (3,) [m] from everywhere in a distance field.
+    """Computes the time of arrival at p_WG (3,) [m] from everywhere in a distance field.
 
     Args:
         field: a conservative distance field, `Esdf.conservative()`.
         p_WG: the goal [m].
-        margin: the least clearance of the way [m], beyond the vehicle's radius.
+        margin: minimum clearance of the path [m], beyond the vehicle's radius.
         slowness: S(d) [s/m].
 
     Raises:
-        ValueError: if the field is not conservative, or the goal not finite.
-        InfeasibleFlightError: if the goal is outside the field's box, or at less clearance than
-            `margin`.
+        InfeasibleFlightError: if the goal is outside the box, or its clearance below `margin`.
     """
-    if not field.occupied_outside:
-        raise ValueError(
-            "The distance field counts unknown space as free and ends at its bounds, but ways are "
-            "planned through known free space only; pass esdf.conservative()."
-        )
+    require(
+        field.occupied_outside,
+        "the distance field",
+        "conservative",
+        "unknown space as free",
+        "pass esdf.conservative()",
+    )
     p_WG = np.array(p_WG, dtype=float)
-    if p_WG.shape != (3,) or not np.isfinite(p_WG).all():
-        raise ValueError(f"The goal is {p_WG} but must be 3 finite coordinates [m] in the world.")
-    where = f"The goal p_WG = {_text(p_WG)} m"
+    valid = p_WG.shape == (3,) and bool(np.isfinite(p_WG).all())
+    require(valid, "the goal", "3 finite coordinates [m]", p_WG)
+    goal = f"the goal p_WG = {_text(p_WG)} m"
     box = f"from {_text(field.lower_W)} to {_text(field.upper_W)} m"
     if np.any(p_WG < field.lower_W) or np.any(p_WG > field.upper_W):
-        raise InfeasibleFlightError(
-            f"{where} lies outside the known volume {box}; choose a goal inside it."
-        )
+        raise InfeasibleFlightError(f"{goal} must be inside the known volume {box}")
     goal_distance = field.distance(p_WG)
     clearance = float(goal_distance) - VEHICLE_RADIUS
     if clearance < margin:
         raise InfeasibleFlightError(
-            f"{where} has a clearance of {clearance:.2f} m beyond the vehicle's radius of "
-            f"{VEHICLE_RADIUS} m, but needs at least {margin:.2f} m: it is inside or too close to "
-            f"an obstacle, unknown space or the boundary of the known volume {box}; choose a goal "
-            f"{margin - clearance:.2f} m further into free space."
+            f"the clearance of {goal} must be at least {margin:.2f} m beyond the vehicle's radius "
+            f"of {VEHICLE_RADIUS} m, got {clearance:.2f} m: an obstacle, unknown space or the "
+            f"boundary of the known volume {box} is too close; choose a goal "
+            f"{margin - clearance:.2f} m further into free space"
         )
-    # The march starts from a ball around the goal where the times are known, large enough to hold a
-    # voxel centre: from a point it would start with the grid's largest error.
+    # Starts from a sphere of known times that contains a voxel center; a point start would have
+    # the largest error of the grid.
     start = field.voxel_size
     goal_slowness = float(slowness(goal_distance))
     x, y, z = (c - g for c, g in zip(field.voxel_centers(), p_WG, strict=True))
     to_goal = np.sqrt((x**2)[:, None, None] + (y**2)[:, None] + z**2)  # (nx, ny, nz) [m]
-    ball = to_goal <= start
-    speed = np.where(ball, 1.0 / goal_slowness, 1.0 / slowness(field.distances))
-    blocked = (field.distances < VEHICLE_RADIUS + margin) & ~ball
+    sphere = to_goal <= start
+    speed = np.where(sphere, 1.0 / goal_slowness, 1.0 / slowness(field.distances))
+    blocked = (field.distances < VEHICLE_RADIUS + margin) & ~sphere
     front = np.ma.MaskedArray(to_goal - start, mask=blocked)
-    import skfmm  # Has no wheels for ARM, where all but planning works without it.
+    import skfmm  # no wheels for ARM, which can do everything but plan
 
     marched = skfmm.travel_time(front, speed, dx=field.voxel_size, order=2)
     reachable = ~np.ma.getmaskarray(marched)
-    times = np.where(ball, to_goal, start) * goal_slowness
-    times += np.where(ball, 0.0, np.ma.getdata(marched))
+    times = np.where(sphere, to_goal, start) * goal_slowness
+    times += np.where(sphere, 0.0, np.ma.getdata(marched))
     if not reachable.all():
         gap, nearest = distance_transform_edt(~reachable, return_indices=True)  # type: ignore
         times = times[tuple(nearest)] + gap * (field.voxel_size / CONTACT_SPEED)
@@ -214,7 +185,7 @@ def time_of_arrival(
 
 
 def _unit(vector: np.ndarray) -> np.ndarray:
-    """`vector` (3,) at unit length; zero stays zero."""
+    """Scales `vector` (3,) to unit length; zero stays zero."""
     length = np.sqrt(vector.dot(vector))
     return vector / length if length > 0.0 else vector
 

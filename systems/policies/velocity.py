@@ -1,42 +1,39 @@
-"""From velocities that are wanted to accelerations that a vehicle can fly."""
+"""Tracking of desired velocities, and velocity setpoints for autopilots."""
 
 import math
+from typing import Any
 
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from splatpilot.systems.common.drake import input_port, optional_input, output_port
-from splatpilot.systems.vehicle.flatness import FlatnessControllerConfig, heading_along_motion
+from splatpilot.systems.vehicle.flatness import (
+    FlatnessControllerConfig,
+    array_namespace,
+    heading_along_motion,
+)
 from splatpilot.systems.vehicle.state import QuadrotorState
 
+SLOWING_TIME = 0.75
+"""[s] For `target_velocity`, of classical policies."""
+
 RESPONSE_TIME = 0.4
-"""[s], time constant with which a wanted velocity is approached; the attitude's own is 0.1 s."""
+"""[s] Time constant of velocity tracking; that of the attitude is 0.1 s."""
 
 MAX_ACCELERATION = 6.0
-"""[m/s^2], of what is asked for: a tilt of 31 degrees."""
-
-_SLOWING_TIME = 0.75  # [s], of flight at full speed before the goal in which the speed falls.
+"""[m/s^2] Maximum of velocity tracking, a tilt of 31 degrees."""
 
 
-def approach_velocity(p_WB: np.ndarray, p_WG: np.ndarray, speed: float) -> np.ndarray:
-    """The velocity v_WB (3,) [m/s] straight to the goal at `speed`, falling linearly near it."""
-    to_goal = p_WG - p_WB
-    distance = float(np.sqrt(to_goal.dot(to_goal)))
-    return to_goal * (speed / max(distance, _SLOWING_TIME * speed))
-
-
-def tracking_acceleration(v_WB: np.ndarray, v_wanted: np.ndarray) -> np.ndarray:
-    """The acceleration (3,) [m/s^2] that lets v_WB approach `v_wanted` (3,) [m/s] exponentially.
-
-    a = (v_wanted - v_WB) / 0.4 s, shortened to 6 m/s^2.
-    """
-    acceleration = (v_wanted - v_WB) / RESPONSE_TIME
-    size = float(np.sqrt(acceleration.dot(acceleration)))
-    return acceleration * min(1.0, MAX_ACCELERATION / size) if size > 0.0 else acceleration
+def tracking_acceleration(v_WB: Any, v_desired: Any) -> Any:
+    """Computes a_WB (..., 3) [m/s^2] by which v_WB approaches `v_desired` [m/s] exponentially:
+    (v_desired - v_WB) / 0.4 s, shortened to 6 m/s^2. Arrays are numpy or torch."""
+    a = (v_desired - v_WB) / RESPONSE_TIME
+    size = array_namespace(a).sqrt((a * a).sum(-1).clip(min=1e-12))
+    return a * (MAX_ACCELERATION / size).clip(max=1.0)[..., None]
 
 
 class VelocityTracker(LeafSystem):
-    """Does what an autopilot does that is told velocities.
+    """Tracks velocities as an autopilot does, by `tracking_acceleration`.
 
     .. pydrake_system::
 
@@ -48,11 +45,8 @@ class VelocityTracker(LeafSystem):
         - acceleration
 
     - ``state`` (13): ``[p_WB (3) [m], v_WB (3) [m/s], q_WB (4, wxyz), w_WB_B (3) [rad/s]]``.
-    - ``velocity`` (3): wanted v_WB [m/s], W frame.
+    - ``velocity`` (3): desired v_WB [m/s], W frame.
     - ``acceleration`` (3): a_WB [m/s^2], W frame, gravity excluded.
-
-    Stateless; the law is
-    :func:`~splatpilot.systems.policies.velocity.tracking_acceleration`.
     """
 
     state_input_port = input_port("state")
@@ -67,12 +61,12 @@ class VelocityTracker(LeafSystem):
 
     def _calc(self, context: Context, output: BasicVector) -> None:
         state = QuadrotorState.of(np.asarray(self.GetInputPort("state").Eval(context)))
-        wanted = np.asarray(self.GetInputPort("velocity").Eval(context))
-        output.SetFromVector(tracking_acceleration(state.v_WB, wanted))
+        v_desired = np.asarray(self.GetInputPort("velocity").Eval(context))
+        output.SetFromVector(tracking_acceleration(state.v_WB, v_desired))
 
 
 class VelocitySetpoint(LeafSystem):
-    """Says at which velocity a policy's decision would be flown.
+    """Converts a policy's output to the velocity and heading of an autopilot.
 
     .. pydrake_system::
 
@@ -92,15 +86,16 @@ class VelocitySetpoint(LeafSystem):
       ``velocity``.
     - ``velocity_setpoint`` (4): v [m/s], W frame, and the heading [rad].
 
-    Stateless. Of the others, with T the time in which an autopilot takes a velocity up, and that to
-    the waypoint::
+    Accelerations and waypoints become::
 
-        v = v_WB + T a_WB,  T = RESPONSE_TIME
+        v = v_WB + RESPONSE_TIME a_WB
         v = (p_WR - p_WB) / lookahead
 
-    An autopilot keeps its heading where it is given none. Therefore a heading that is not connected
-    or NaN becomes that along the motion, as the controller has it: toward the waypoint, else along
-    v_WB, from the present heading as far as ``heading_along_motion`` says.
+    If ``heading`` is not connected or NaN, the heading follows the motion as in the controller, by
+    ``heading_along_motion``: toward the waypoint, else along v_WB.
+
+    Args:
+        controller: its `lookahead` and `yaw_speed` are used.
     """
 
     state_input_port = input_port("state")
@@ -111,7 +106,6 @@ class VelocitySetpoint(LeafSystem):
     velocity_setpoint_output_port = output_port("velocity_setpoint")
 
     def __init__(self, controller: FlatnessControllerConfig):
-        """Constructs the system; of the controller it has `lookahead` and `yaw_speed`."""
         super().__init__()
         self._lookahead, self._yaw_speed = controller.lookahead, controller.yaw_speed
         self.DeclareVectorInputPort("state", 13)

@@ -1,103 +1,84 @@
-"""Px4Commander: tells PX4 what the bridge wants."""
+"""Px4Commander: streams setpoints to PX4 and requests its modes."""
 
 import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from pydrake.systems.framework import Context, DiscreteValues, EventStatus, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from splatpilot.systems.common.drake import input_port, optional_input
+from splatpilot.systems.common.drake import optional_input, vector_input
+from splatpilot.systems.common.validation import Config, bounded, require_field
 from splatpilot.systems.messaging.generated import lcmt_bridge_status as status
 from splatpilot.systems.messaging.lcm_ports import PUBLISH_OFFSET, SAME_TIME
-from splatpilot.systems.messaging.tof_receiver import UdpInbox
+from splatpilot.systems.messaging.receiver import UdpInbox
 from splatpilot.systems.px4.mavlink import HOLD, LAND, OFFBOARD, Mavlink
 from splatpilot.systems.px4.telemetry import HEARTBEAT_TIMEOUT
 
-_HEARTBEAT_PERIOD = 1.0  # [s], and of commands that are said again until they are obeyed.
+_HEARTBEAT_PERIOD = 1.0  # [s], also between repeated commands.
 
-_BRAKING = 2.0  # [s] For which PX4 is told to stop when setpoints cease: two of its heartbeats.
+_BRAKING = 2.0  # [s] of stopping PX4 after the last setpoint: two of its heartbeats.
 
 _STOP = np.array([0.0, 0.0, 0.0, math.nan])  # A velocity setpoint.
 
-_TAKEN = -1.0  # Someone else flies: nothing is asked for any more.
+_TAKEN = -1.0  # Someone else flies: nothing is requested any more.
+
+_INPUTS = {
+    **{"setpoint": 4, "setpoint_age": 1, "bridge_mode": 1, "heartbeat_age": 1, "armed": 1},
+    **{"mode": 2, "granted": 2, "motion_capture_pose": 7, "motion_capture_age": 1, "unix_time": 1},
+}
 
 
 @dataclass
-class Px4CommanderConfig:
-    """What is flown by, and what is asked for."""
+class Px4CommanderConfig(Config):
+    """Setpoints and requests of a `Px4Commander`."""
 
-    # What PX4 is told: "velocity" or "body_rates".
-    setpoints: str = "velocity"
+    # Setpoints for PX4: "velocity" or "body_rates".
+    setpoints: str = bounded("velocity", "{velocity, body_rates}")
     # Thrust from 0 to 1 that carries the weight, PX4's MPC_THR_HOVER; for body rates.
-    hover_thrust: float = 0.5
-    # [s] For which setpoints are streamed before offboard mode is asked for.
-    streaming: float = 1.5
-    # [s] Setpoints that are older are not sent on; offboard mode is left then.
-    max_age: float = 0.3
-    # Whether to ask for offboard mode. Who flies by remote control does otherwise.
+    hover_thrust: float = bounded(0.5, "[0.05, 0.95]")
+    # [s] Of streaming setpoints before requesting offboard mode.
+    streaming: float = bounded(1.5, "(0, 10] s")
+    # [s] Max age of setpoints that are sent on; then offboard mode is left.
+    max_age: float = bounded(0.3, "(0, 10] s")
+    # Requests offboard mode; without it the pilot does by remote control.
     engage: bool = False
-    # Whether to arm the motors, in offboard mode.
+    # Arms the motors, in offboard mode.
     arm: bool = False
 
-    def validate(self) -> None:
-        """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
-        if self.setpoints not in ("velocity", "body_rates"):
-            raise ValueError(
-                f"px4.setpoints is {self.setpoints!r}; it must be velocity or body_rates"
-            )
-        if not 0.05 <= self.hover_thrust <= 0.95:
-            raise ValueError(
-                f"px4.hover_thrust is {self.hover_thrust}; it must be 0.05 to 0.95, what PX4 has "
-                "learnt in hover"
-            )
-        for name in ("streaming", "max_age"):
-            if not 0.0 < getattr(self, name) <= 10.0:
-                raise ValueError(
-                    f"px4.{name} is {getattr(self, name)} s; it must be positive and at most 10"
-                )
-        if self.arm and not self.engage:
-            raise ValueError("px4.arm is asked for without px4.engage; give both")
+    def check(self) -> None:
+        require_field(self, "arm", self.engage or not self.arm, "false without engage")
 
 
 class _Memory(NamedTuple):
     """The discrete state."""
 
-    streaming: float = math.nan  # [s], since when setpoints have been sent.
-    entered: float = 0.0  # Whether offboard mode has been reached or granted.
-    flown: float = 0.0  # Whether it has been reached with motors armed.
-    ceased: float = math.nan  # [s], since when the bridge has been silent or landing.
-    left: float = 0.0  # 0, the sub mode that offboard mode is left for, or `_TAKEN`.
-    asked: float = -math.inf  # [s], when something was asked for last.
+    streaming: float = math.nan  # [s] since when setpoints have been sent.
+    entered: float = 0.0  # 1 if offboard mode has been reached or granted.
+    flown: float = 0.0  # 1 if it has been reached with motors armed.
+    ceased: float = math.nan  # [s] since when the bridge has been silent or landing.
+    left: float = 0.0  # 0, the sub mode that replaces offboard mode, or `_TAKEN`.
+    asked: float = -math.inf  # [s] of the last request.
 
 
 class _Arrival(NamedTuple):
-    """The last setpoint or pose, in the discrete state too."""
+    """Time of the last setpoint or pose, in the discrete state too."""
 
-    sent: float = -math.inf  # [s] Unix time, when the last one was sent.
-    time: float = -math.inf  # [s] of the Context, when it came.
+    sent: float = -math.inf  # [s] Unix time.
+    time: float = -math.inf  # [s] of the Context, of its arrival.
 
 
 class Px4Commander(LeafSystem):
-    """Streams setpoints to PX4, enters offboard mode where that is configured, and leaves it.
+    """Streams setpoints to PX4, enters offboard mode if configured, and leaves it.
 
     .. pydrake_system::
 
         name: Px4Commander
-        input_ports:
-        - setpoint
-        - setpoint_age
-        - bridge_mode
-        - heartbeat_age
-        - armed
-        - mode
-        - granted
-        - motion_capture_pose
-        - motion_capture_age
-        - unix_time
+        input_ports: [setpoint, setpoint_age, bridge_mode, heartbeat_age, armed, mode, granted,
+            motion_capture_pose, motion_capture_age, unix_time]
 
     - ``setpoint`` (4), ``setpoint_age`` (1) [s]: a velocity setpoint or a command of body rates, as
-      the configuration says, and its age.
+      configured, and its age.
     - ``bridge_mode`` (1), optional: the mode in the bridge's status, see ``lcmt_bridge_status``.
     - ``heartbeat_age`` (1) [s], ``armed`` (1), ``mode`` (2), ``granted`` (2): of
       :class:`~splatpilot.systems.px4.telemetry.Px4Telemetry`.
@@ -111,7 +92,7 @@ class Px4Commander(LeafSystem):
     may be.
 
     After ``streaming`` seconds of setpoints it requests offboard mode, and in it arming, each if
-    the configuration says so and the bridge flies, once a second until PX4 grants it.
+    configured and if the bridge flies, once a second until PX4 grants it.
 
     If setpoints cease in flight it has PX4 stop, by setpoints of its own, and requests hold. If the
     bridge lands it requests PX4's own landing. Then it sends no more setpoints, and does not enter
@@ -121,17 +102,6 @@ class Px4Commander(LeafSystem):
     heartbeat has come since the reason for it arose, and since its last request. Setpoints need no
     such care: PX4 flies by them in offboard mode only.
     """
-
-    setpoint_input_port = input_port("setpoint")
-    setpoint_age_input_port = input_port("setpoint_age")
-    bridge_mode_input_port = input_port("bridge_mode")
-    heartbeat_age_input_port = input_port("heartbeat_age")
-    armed_input_port = input_port("armed")
-    mode_input_port = input_port("mode")
-    granted_input_port = input_port("granted")
-    motion_capture_pose_input_port = input_port("motion_capture_pose")
-    motion_capture_age_input_port = input_port("motion_capture_age")
-    unix_time_input_port = input_port("unix_time")
 
     def __init__(
         self,
@@ -146,29 +116,22 @@ class Px4Commander(LeafSystem):
         """Constructs the system.
 
         Args:
-            config: what is asked for.
-            inbox: whose socket is sent from.
-            mavlink: that writes the messages.
+            config: of setpoints and requests.
+            inbox: socket to send from.
+            mavlink: writes messages.
             address: host and port of PX4.
             gravity: [m/s^2].
-            period: [s] between setpoints.
-            tick: [s] between looks at whether one has come; the period is whole ticks.
-
-        Raises:
-            ValueError: on a configuration out of range.
+            period: [s] between setpoints, in whole ticks.
+            tick: [s] between looks for arrivals.
         """
         super().__init__()
         config.validate()
         self._config, self._inbox, self._mavlink = config, inbox, mavlink
         self._address, self._gravity, self._period = address, gravity, period
-        for name, size in (
-            *(("setpoint", 4), ("setpoint_age", 1), ("bridge_mode", 1), ("heartbeat_age", 1)),
-            *(("armed", 1), ("mode", 2), ("granted", 2), ("motion_capture_pose", 7)),
-            *(("motion_capture_age", 1), ("unix_time", 1)),
-        ):
+        for name, size in _INPUTS.items():
             self.DeclareVectorInputPort(name, size)
         self.DeclareDiscreteState(np.array(_Memory()))
-        # By the ages of what arrives: the time between two that are sent on [s], and the state.
+        # By the ages of arrivals: the min time between two that are sent on [s], and the state.
         self._arrivals = {
             name: (apart, int(self.DeclareDiscreteState(np.array(_Arrival()))))
             for name, apart in (("setpoint_age", SAME_TIME), ("motion_capture_age", 0.9 * period))
@@ -176,23 +139,20 @@ class Px4Commander(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
         self.DeclarePeriodicDiscreteUpdateEvent(tick, 0.0, self._look)
         self.DeclarePeriodicPublishEvent(period, PUBLISH_OFFSET, self._publish)
-        self.DeclarePeriodicPublishEvent(tick, PUBLISH_OFFSET, self._publish_at_once)
+        self.DeclarePeriodicPublishEvent(tick, PUBLISH_OFFSET, self._publish_arrivals)
 
     def _is_fresh(self, context: Context, name: str) -> bool:
         age = optional_input(self, name, context)
         return age is not None and bool(age[0] <= self._config.max_age)
 
-    def _read(self, context: Context, name: str) -> np.ndarray:
-        return np.asarray(self.GetInputPort(name).Eval(context))
-
     def _is_in(self, context: Context, mode: tuple[int, int]) -> bool:
-        now = self._read(context, "mode")
+        now = vector_input(self, "mode", context)
         return now[0] == mode[0] and (mode == OFFBOARD or now[1] == mode[1])
 
     def _request(self, context: Context) -> bytes | None:
-        """Returns the request that PX4 does not yet fulfill; None if there is none."""
+        """Returns the pending request; None if there is none."""
         memory, config = _memory(context), self._config
-        armed = bool(self._read(context, "armed")[0])
+        armed = bool(vector_input(self, "armed", context)[0])
         if memory.left:
             mode = (HOLD[0], int(memory.left))
             taken = memory.left == _TAKEN or self._is_in(context, mode) or not armed
@@ -204,12 +164,12 @@ class Px4Commander(LeafSystem):
             return None
         if not self._is_in(context, OFFBOARD):
             return None if memory.entered else self._mavlink.set_mode(OFFBOARD)
-        may_arm = config.arm and not (memory.flown or self._read(context, "granted")[1])
+        may_arm = config.arm and not (memory.flown or vector_input(self, "granted", context)[1])
         return self._mavlink.arm() if may_arm and not armed else None
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         now, memory = context.get_time(), _memory(context)
-        age = self._read(context, "heartbeat_age")[0]
+        age = vector_input(self, "heartbeat_age", context)[0]
         heard, is_known = now - age, age <= HEARTBEAT_TIMEOUT
         fresh, offboard = self._is_fresh(context, "setpoint_age"), self._is_in(context, OFFBOARD)
         bridge = optional_input(self, "bridge_mode", context)
@@ -222,9 +182,9 @@ class Px4Commander(LeafSystem):
             memory = memory._replace(ceased=math.nan)
         elif math.isnan(memory.ceased):
             memory = memory._replace(ceased=now)
-        if offboard or self._read(context, "granted")[0]:
+        if offboard or vector_input(self, "granted", context)[0]:
             memory = memory._replace(entered=1.0)
-        if offboard and self._read(context, "armed")[0]:
+        if offboard and vector_input(self, "armed", context)[0]:
             memory = memory._replace(flown=1.0)
         if memory.flown and is_known and not offboard:  # By us, PX4 or a pilot, who is not fought.
             memory = memory._replace(left=_TAKEN)
@@ -236,7 +196,7 @@ class Px4Commander(LeafSystem):
         discrete_state.set_value(0, np.array(memory))
 
     def _look(self, context: Context, discrete_state: DiscreteValues) -> None:
-        unix_time = self._read(context, "unix_time")[0]
+        unix_time = vector_input(self, "unix_time", context)[0]
         for name, (apart, index) in self._arrivals.items():
             age = optional_input(self, name, context)
             last = _Arrival(*np.asarray(context.get_discrete_state(index).value()))
@@ -248,17 +208,16 @@ class Px4Commander(LeafSystem):
         came = context.get_discrete_state(self._arrivals[name][1])[1]
         return context.get_time() - came < 2.0 * PUBLISH_OFFSET and self._is_fresh(context, name)
 
-    def _publish_at_once(self, context: Context) -> None:
+    def _publish_arrivals(self, context: Context) -> None:
         now = context.get_time() - PUBLISH_OFFSET
-        is_due = abs(math.remainder(now, self._period)) < PUBLISH_OFFSET  # And is sent anyway.
+        is_due = abs(math.remainder(now, self._period)) < PUBLISH_OFFSET  # `_publish` sends it.
         if self._has_come(context, "setpoint_age") and not is_due:
             self._publish_setpoint(context)
         if self._has_come(context, "motion_capture_age"):
-            pose = self._read(context, "motion_capture_pose")
-            unix_time, age = (
-                self._read(context, name)[0] for name in ("unix_time", "motion_capture_age")
-            )
-            exposed = max(unix_time - age, 0.0)  # MAVLink has no time before its epoch.
+            pose = vector_input(self, "motion_capture_pose", context)
+            age = vector_input(self, "motion_capture_age", context)[0]
+            # MAVLink has no time before its epoch.
+            exposed = max(vector_input(self, "unix_time", context)[0] - age, 0.0)
             self._send(self._mavlink.odometry(pose, round(exposed * 1e6)))
 
     def _publish_setpoint(self, context: Context) -> None:
@@ -269,25 +228,21 @@ class Px4Commander(LeafSystem):
             if memory.flown and now - memory.ceased <= _BRAKING:
                 self._send(self._mavlink.velocity_setpoint(_STOP, now))
             return
-        setpoint = self._read(context, "setpoint")
+        setpoint = vector_input(self, "setpoint", context)
         if self._config.setpoints == "velocity":
             self._send(self._mavlink.velocity_setpoint(setpoint, now))
         else:
             thrust = self._config.hover_thrust
             self._send(self._mavlink.body_rates(setpoint, thrust, self._gravity, now))
 
-    def _publish(self, context: Context) -> EventStatus:
-        memory = _memory(context)
-        now = context.get_time() - PUBLISH_OFFSET
+    def _publish(self, context: Context) -> None:
+        now, memory = context.get_time() - PUBLISH_OFFSET, _memory(context)
         tick = round(now / self._period)
         if tick % round(_HEARTBEAT_PERIOD / self._period) == 0:
             self._send(self._mavlink.heartbeat())
         self._publish_setpoint(context)
-        if abs(now - memory.asked) < 0.5 * self._period:
-            request = self._request(context)
-            if request is not None:
-                self._send(request)
-        return EventStatus.Succeeded()
+        if abs(now - memory.asked) < 0.5 * self._period and (request := self._request(context)):
+            self._send(request)
 
     def _send(self, packet: bytes) -> None:
         self._inbox.send(packet, self._address)

@@ -1,4 +1,4 @@
-"""MAVLink's messages to and from PX4, in our frames."""
+"""Mavlink: messages to and from PX4, in our frames."""
 
 import math
 from typing import Any, NamedTuple
@@ -6,14 +6,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from splatpilot.systems.common.extras import import_extra
-from splatpilot.systems.px4.frames import (
-    attitude_from_px4,
-    attitude_to_px4,
-    from_px4,
-    heading_to_px4,
-    thrust_to_px4,
-    to_px4,
-)
+from splatpilot.systems.messaging.codecs import finite, require_unit_quaternion
+from splatpilot.systems.px4.frames import swap_px4, swap_px4_attitude, thrust_to_px4
 
 _ONBOARD_COMPUTER = 191  # MAV_COMP_ID_ONBOARD_COMPUTER
 _CUSTOM_MODE, _ARMED = 1, 128  # MAV_MODE_FLAGs
@@ -23,22 +17,21 @@ SET_MODE, ARM = 176, 400
 """Commands: MAV_CMD_DO_SET_MODE and MAV_CMD_COMPONENT_ARM_DISARM."""
 
 VELOCITY_AND_YAW_RATE, VELOCITY_AND_YAW, BODY_RATES = 1479, 2503, 128
-"""What a setpoint ignores: all but what the name says."""
+"""Type masks of setpoints: fields that PX4 ignores."""
 
 OFFBOARD, HOLD, LAND = (6, 0), (4, 3), (4, 6)
 """PX4's main and sub modes."""
 
 
 class Heartbeat(NamedTuple):
-    """What PX4 says of itself."""
+    """PX4's mode."""
 
     armed: bool
-    mode: tuple[int, int]
-    """Main and sub mode."""
+    mode: tuple[int, int]  # main and sub mode
 
 
 class Position(NamedTuple):
-    """Where PX4 estimates that it is."""
+    """Position and velocity that PX4 estimates."""
 
     time: float  # [s] since PX4 began.
     p_WB: np.ndarray  # (3,) [m]
@@ -46,7 +39,7 @@ class Position(NamedTuple):
 
 
 class Attitude(NamedTuple):
-    """The attitude that PX4 estimates."""
+    """Attitude and body rates that PX4 estimates."""
 
     time: float  # [s] since PX4 began.
     q_WB: np.ndarray  # (4, wxyz)
@@ -54,14 +47,14 @@ class Attitude(NamedTuple):
 
 
 class Timesync(NamedTuple):
-    """A question what time it is, or an answer."""
+    """A request for the time, or an answer."""
 
-    answer: int  # [ns] by the clock of the one who answers; 0 in a question.
-    question: int  # [ns] by the clock of the one who asks.
+    answer: int  # [ns] by the clock of the one that answers; 0 in a request.
+    question: int  # [ns] by the clock of the one that asks.
 
 
 class Granted(NamedTuple):
-    """An answer that a command of ours is accepted."""
+    """Acceptance of a command of ours."""
 
     command: int
 
@@ -70,12 +63,7 @@ Message = Heartbeat | Position | Attitude | Timesync | Granted
 
 
 class Mavlink:
-    """
-    Writes and reads messages as the onboard computer of a vehicle.
-
-    Raises:
-        ModuleNotFoundError: where pymavlink is not installed.
-    """
+    """Writes and reads messages as the onboard computer of a vehicle."""
 
     def __init__(self, system: int = 1) -> None:
         self._dialect: Any = import_extra("pymavlink.dialects.v20.common", "px4")
@@ -84,20 +72,20 @@ class Mavlink:
 
     def velocity_setpoint(self, setpoint: np.ndarray, time: float) -> bytes:
         """
-        Flies a velocity.
+        Writes a velocity setpoint.
 
         Args:
             setpoint: (4,) v_WB [m/s] and heading [rad], NaN to keep it.
             time: [s] since the start.
         """
-        d, velocity, heading = self._dialect, to_px4(setpoint[:3]), float(setpoint[3])
+        d, velocity, heading = self._dialect, swap_px4(setpoint[:3]), float(setpoint[3])
         free = math.isnan(heading)
         return self._packed(
             d.MAVLink_set_position_target_local_ned_message(
                 *(_milliseconds(time), self._system, 1, d.MAV_FRAME_LOCAL_NED),
                 VELOCITY_AND_YAW_RATE if free else VELOCITY_AND_YAW,
                 *(0.0, 0.0, 0.0, *map(float, velocity), 0.0, 0.0, 0.0),
-                0.0 if free else heading_to_px4(heading),
+                0.0 if free else -heading,  # Yaw is clockwise.
                 0.0,
             )
         )
@@ -106,7 +94,7 @@ class Mavlink:
         self, command: np.ndarray, hover_thrust: float, gravity: float, time: float
     ) -> bytes:
         """
-        Flies body rates.
+        Writes body rates.
 
         Args:
             command: (4,) thrust over mass [m/s^2], w_cmd_B [rad/s].
@@ -117,14 +105,14 @@ class Mavlink:
         return self._packed(
             self._dialect.MAVLink_set_attitude_target_message(
                 *(_milliseconds(time), self._system, 1, BODY_RATES, [1.0, 0.0, 0.0, 0.0]),
-                *map(float, to_px4(command[1:])),
+                *map(float, swap_px4(command[1:])),
                 thrust,
             )
         )
 
     def odometry(self, pose: np.ndarray, utime: int) -> bytes:
         """
-        Says where motion capture sees the vehicle.
+        Writes the pose of the vehicle in motion capture.
 
         Args:
             pose: (7,) p_WB [m] and q_WB (wxyz).
@@ -134,15 +122,15 @@ class Mavlink:
         return self._packed(
             d.MAVLink_odometry_message(
                 *(utime, d.MAV_FRAME_LOCAL_FRD, d.MAV_FRAME_BODY_FRD),
-                *map(float, to_px4(pose[:3])),
-                [float(x) for x in attitude_to_px4(pose[3:])],
+                *map(float, swap_px4(pose[:3])),
+                [float(x) for x in swap_px4_attitude(pose[3:])],
                 *[math.nan] * 6,
                 *(unknown, unknown, 0, d.MAV_ESTIMATOR_TYPE_MOCAP, 0),
             )
         )
 
     def heartbeat(self) -> bytes:
-        """Says that an onboard computer is there."""
+        """Writes the heartbeat of an onboard computer."""
         d = self._dialect
         return self._packed(
             d.MAVLink_heartbeat_message(
@@ -151,24 +139,22 @@ class Mavlink:
         )
 
     def set_mode(self, mode: tuple[int, int]) -> bytes:
-        """Asks for a mode."""
+        """Writes a command for a mode."""
         return self._command(SET_MODE, _CUSTOM_MODE, *mode)
 
     def arm(self) -> bytes:
-        """Asks for the motors to be armed."""
+        """Writes a command to arm the motors."""
         return self._command(ARM, 1.0)
 
     def timesync(self, timesync: Timesync) -> bytes:
-        """Writes a question what time it is, or an answer."""
+        """Writes a request for the time, or an answer."""
         return self._packed(self._dialect.MAVLink_timesync_message(*timesync))
 
     def read(self, packet: bytes) -> tuple[list[Message], list[str]]:
-        """
-        Reads a packet: its messages, and why others in it are refused. Messages of other kinds and
-        of other systems are left out.
-        """
+        """Reads the messages of a packet, and the reasons for rejecting others; ignores messages of
+        other types and of other systems."""
         parser = self._dialect.MAVLink(None)
-        parser.robust_parsing = True  # Messages that are not known are none of ours, but no error.
+        parser.robust_parsing = True  # Unknown messages are not errors.
         parsed = parser.parse_buffer(packet) or []
         bad = [message.reason for message in parsed if message.get_type() == "BAD_DATA"]
         refused = [f"the packet must be MAVLink, got {bad[0]}"] if bad else []
@@ -198,33 +184,21 @@ def _milliseconds(time: float) -> int:
 
 
 def _message(m: Any) -> list[Message]:
-    """
-    Converts a message of PX4's; a message of another kind becomes an empty list.
-
-    Raises:
-        ValueError: if its numbers cannot be used.
-    """
+    """Converts a message, those of other types to an empty list; raises ValueError for invalid
+    numbers."""
     kind = m.get_type()
     if kind == "HEARTBEAT":
         mode = (m.custom_mode >> 16) & 0xFF, (m.custom_mode >> 24) & 0xFF
         return [Heartbeat(bool(m.base_mode & _ARMED), mode)]
     if kind == "LOCAL_POSITION_NED":
-        p, v = _finite([m.x, m.y, m.z]), _finite([m.vx, m.vy, m.vz])
-        return [Position(1e-3 * m.time_boot_ms, from_px4(p), from_px4(v))]
+        p, v = finite([m.x, m.y, m.z]), finite([m.vx, m.vy, m.vz])
+        return [Position(1e-3 * m.time_boot_ms, swap_px4(p), swap_px4(v))]
     if kind == "ATTITUDE_QUATERNION":
-        q = _finite([m.q1, m.q2, m.q3, m.q4])
-        w = _finite([m.rollspeed, m.pitchspeed, m.yawspeed])
-        if not abs(np.linalg.norm(q) - 1.0) < 0.01:
-            raise ValueError(f"the attitude must be a unit quaternion, got {q.tolist()}")
-        return [Attitude(1e-3 * m.time_boot_ms, attitude_from_px4(q), from_px4(w))]
+        q = finite([m.q1, m.q2, m.q3, m.q4])
+        w = finite([m.rollspeed, m.pitchspeed, m.yawspeed])
+        require_unit_quaternion(q)
+        return [Attitude(1e-3 * m.time_boot_ms, swap_px4_attitude(q), swap_px4(w))]
     if kind == "TIMESYNC":
         return [Timesync(m.tc1, m.ts1)]
     is_ours = kind == "COMMAND_ACK" and m.target_component in (0, _ONBOARD_COMPUTER)
     return [Granted(m.command)] if is_ours and m.result == _ACCEPTED else []
-
-
-def _finite(values: list[float]) -> np.ndarray:
-    array = np.array(values, dtype=float)
-    if not np.isfinite(array).all():
-        raise ValueError(f"values must be finite, got {array.tolist()}")
-    return array

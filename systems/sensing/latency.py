@@ -1,7 +1,8 @@
-"""When a camera takes its frames, and which of them has come."""
+"""Times and delays of camera frames, and the pose of the last one that arrived."""
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from pydrake.common.value import Value
@@ -9,36 +10,37 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from splatpilot.systems.common.drake import input_port, output_port, weakly
+from splatpilot.systems.common.validation import require
 from splatpilot.systems.sensing.noise import ObservationNoise
-from splatpilot.systems.vehicle.state import pose_from_state
+from splatpilot.systems.vehicle.state import array_namespace, pose_from_state
 
 CYCLE = 64
-"""Frames whose delays differ; those of the frames that follow are the same again."""
+"""Number of frames after which their delays repeat."""
 
-_SPARE = 8  # Frames that may be lost one after another; if more are, the last of them is seen.
+_SPARE = 8  # Consecutive frames that may be lost; if more are, the last of them is seen.
 
 
 @dataclass(frozen=True, eq=False)
 class FrameTimes:
     """Frame k is taken at (k + phase) / rate, and comes `delays[k % CYCLE]` later.
 
-    Without a rate, one is taken whenever somebody looks, and comes `delays[0]` later.
+    Without a rate, one is taken at each evaluation, and comes `delays[0]` later.
     """
 
     delays: np.ndarray  # (CYCLE,) or (1,) [s], infinite of frames that never come
     rate: float | None = None  # [Hz]
     phase: float = 0.0  # [-]
-    lookback: int = 0  # [-] Frames that are looked through.
-    before: float = 0.0  # [s] By how much something else happened before a frame was taken.
+    lookback: int = 0  # [-] Frames to search.
+    before: float = 0.0  # [s] By which another event precedes each frame.
 
     @classmethod
     def late(cls, latency: float) -> "FrameTimes":
-        """Frames of whenever somebody looks, `latency` [s] late."""
+        """Returns frames that are taken at each evaluation, `latency` [s] late."""
         return cls(np.array([latency]))
 
     @classmethod
     def draw(cls, noise: ObservationNoise, seed: int) -> "FrameTimes":
-        """Those of one flight."""
+        """Draws the frames of one flight."""
         if not noise.frame_rate:
             return cls.late(noise.latency)
         lower, upper = noise.frame_rate
@@ -48,27 +50,48 @@ class FrameTimes:
         return cls(delays, rate, phase, lookback(noise))
 
     def age(self, time: float) -> float:
-        """[s], at a time [s], of the last frame that has come, or of what happened `before`."""
+        """Returns the age [s], at a time [s], of the last frame that arrived, plus `before`."""
         if self.rate is None:
             return float(self.delays[0]) + self.before
-        newest = math.floor(time * self.rate - self.phase)
-        age = 0.0
-        for number in range(newest, newest - self.lookback, -1):
-            age = time - (number + self.phase) / self.rate
-            if self.delays[number % CYCLE] <= age:
-                break
-        return age + self.before
+        rate, phase, now = (np.array([x]) for x in (self.rate, self.phase, time))
+        [age] = frame_ages(self.delays[None], rate, phase, self.lookback, now)
+        return float(age) + self.before
 
     @property
     def oldest(self) -> float:
-        """[s], that no age exceeds."""
+        """Maximum age [s]."""
         oldest = float(self.delays[0]) if self.rate is None else self.lookback / self.rate
         return oldest + self.before
 
 
-def frame_delays(noise: ObservationNoise, late: np.ndarray, lost: np.ndarray) -> np.ndarray:
-    """How late frames come [s], infinite if never: of numbers drawn from U(0, 1), of any shape."""
-    return np.where(lost < noise.frame_dropout, np.inf, noise.latency + noise.jitter * late)
+def frame_delays(noise: ObservationNoise, late: Any, lost: Any) -> Any:
+    """Computes delays of frames [s], infinite if they never come.
+
+    Args:
+        late, lost: arrays or tensors of one shape, drawn from U(0, 1).
+    """
+    delays = noise.latency + noise.jitter * late
+    return array_namespace(lost).where(lost < noise.frame_dropout, math.inf, delays)
+
+
+def frame_ages(delays: Any, rate: Any, phase: Any, lookback: int, time: Any) -> Any:
+    """Computes the ages (N,) [s] at a time of the last frames that have come, of N streams.
+
+    Args:
+        delays: (N, CYCLE) [s], see `FrameTimes`; arrays or tensors.
+        rate: (N,) [Hz].
+        phase: (N,) [-].
+        lookback: number of frames to look through; if none of them has come, the last is seen.
+        time: (N,) [s].
+    """
+    xp = array_namespace(time)
+    streams = xp.arange(len(time), device=time.device)
+    back = xp.arange(lookback, device=time.device)
+    number = xp.floor(time * rate - phase)[:, None] - back  # newest first
+    ages = time[:, None] - (number + phase[:, None]) / rate[:, None]
+    came = delays[streams[:, None], xp.asarray(number % CYCLE, dtype=xp.int64)] <= ages
+    came[:, -1] = True
+    return ages[streams, xp.asarray(came, dtype=xp.int64).argmax(1)]
 
 
 def lookback(noise: ObservationNoise) -> int:
@@ -77,7 +100,7 @@ def lookback(noise: ObservationNoise) -> int:
 
 
 class DelayedPose(LeafSystem):
-    """The pose within a quadrotor's state when the last frame was taken that has come.
+    """Computes the pose of a quadrotor when the last frame that arrived was taken.
 
     .. pydrake_system::
 
@@ -88,11 +111,11 @@ class DelayedPose(LeafSystem):
         - pose
 
     - ``state`` (13): ``[p_WB (3) [m], v_WB (3) [m/s], q_WB (4, wxyz), w_WB_B (3) [rad/s]]``.
-    - ``pose`` (abstract, RigidTransform): X_WB at ``now - age``, the age that of the last frame;
-      before there is anything that old, the earliest known.
+    - ``pose`` (abstract, RigidTransform): X_WB at ``now - age``, with the age of the last frame,
+      or the earliest known.
 
     The discrete state holds samples of time and state every ``period`` (0.02 s); between them
-    the state is interpolated linearly, and its quaternion normalised.
+    the state is interpolated linearly, and its quaternion normalized.
     """
 
     state_input_port = input_port("state")
@@ -102,18 +125,14 @@ class DelayedPose(LeafSystem):
         """Constructs the system.
 
         Args:
-            frames: when they are taken, and when they come.
+            frames: times and delays.
             period: time between samples [s].
-
-        Raises:
-            ValueError: if a delay of frames is negative, or `period` not positive.
         """
         super().__init__()
-        if not (frames.delays.min() >= 0.0 and math.isfinite(frames.oldest) and period > 0.0):
-            raise ValueError(
-                f"DelayedPose: frames come {frames.delays.min()} s late and the period is "
-                f"{period} s; they must be at least 0 and finite, and more than 0"
-            )
+        late = frames.delays.min()
+        valid = late >= 0.0 and math.isfinite(frames.oldest)
+        require(valid, "delays of frames", "in [0, inf) s", late)
+        require(period > 0.0, "period", "> 0 s", period)
         self._frames = frames
         samples = math.ceil(frames.oldest / period) + 1
         self._state_port = self.DeclareVectorInputPort("state", 13)

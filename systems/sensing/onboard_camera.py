@@ -1,70 +1,54 @@
-"""The camera through which a policy sees."""
+"""Configuration of a policy's camera."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.sensors import CameraInfo
 
-from splatpilot.systems.common.validation import require_field
+from splatpilot.systems.common.validation import Config, bounded, require_field
 from splatpilot.systems.splats.lens import Distortion
-
-_LARGEST = 4096  # [px]
 
 _R_BC_LEVEL = RotationMatrix(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]))
 """Optical axes (x right, y down, z forward) of a level camera that looks ahead, in body axes."""
 
 
 @dataclass
-class OnboardCamera:
-    """A camera and its mount; it takes images when its policy looks."""
+class OnboardCamera(Config):
+    """A camera and its mount; it takes an image at each update of its policy."""
 
     # [px] Width of its images.
-    width: int = 64
+    width: int = bounded(64, "[1, 4096] px")
     # [px] Height of its images.
-    height: int = 36
+    height: int = bounded(36, "[1, 4096] px")
     # [deg] Horizontal field of view, from edge to edge through the middle.
-    fov_x: float = 90.0
-    # [deg] Vertical field of view; that of square pixels where left out.
-    fov_y: float | None = None
-    # Of the lens; a pinhole where left out.
+    fov_x: float = bounded(90.0, "[1, 170] deg")
+    # [deg] Vertical field of view; that of square pixels if left out.
+    fov_y: float | None = bounded(None, "[1, 170] deg")
+    # Of the lens; a pinhole if left out.
     distortion: Distortion | None = None
-    # [m] Least depth that its depth images show.
-    min_depth: float = 0.1
-    # [m] Greatest depth that its depth images show.
-    max_depth: float = 20.0
-    # [m] Where it sits on the vehicle.
-    p_BC: list[float] = field(default_factory=lambda: [0.1, 0.0, 0.0])
-    # [deg] How far it looks up.
-    pitch: float = 0.0
+    # [m] Minimum depth of its depth images.
+    min_depth: float = bounded(0.1, "[0, inf) m")
+    # [m] Maximum depth of its depth images.
+    max_depth: float = bounded(20.0, "(0, inf) m")
+    # [m] Position on the vehicle.
+    p_BC: list[float] = bounded(lambda: [0.1, 0.0, 0.0], "(-inf, inf) m")
+    # [deg] Upward pitch.
+    pitch: float = bounded(0.0, "[-90, 90] deg")
     # [s] Between reading the first row of an image and the last; 0 is a global shutter.
-    readout: float = 0.0
+    readout: float = bounded(0.0, "[0, 0.2] s")
 
-    def validate(self) -> None:
-        """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
-        for name in ("width", "height"):
-            value = getattr(self, name)
-            require_field(self, name, 1 <= value <= _LARGEST, f"1 to {_LARGEST} pixels")
-        for name in ("fov_x", "fov_y"):
-            value = getattr(self, name)
-            require_field(self, name, value is None or 1.0 <= value <= 170.0, "1 to 170 deg")
+    def check(self) -> None:
         if self.distortion is not None:
-            self.distortion.validate()
             widest = 2.0 * math.degrees(math.atan(self.distortion.limit))
             for name in ("fov_x", "fov_y"):
                 value = getattr(self, name)
-                shown = value is None or value < widest
-                require_field(
-                    self, name, shown, f"less than the {widest:.1f} deg that the lens shows"
-                )
-        require_field(self, "min_depth", self.min_depth >= 0.0, "at least 0 m")
-        farther = self.min_depth < self.max_depth < math.inf
-        require_field(self, "max_depth", farther, "more than min_depth, and finite")
-        mounted = len(self.p_BC) == 3 and bool(np.isfinite(self.p_BC).all())
-        require_field(self, "p_BC", mounted, "three finite numbers x, y, z in metres")
-        require_field(self, "readout", 0.0 <= self.readout <= 0.2, "0 to 0.2 s")
-        require_field(self, "pitch", -90.0 <= self.pitch <= 90.0, "-90 to 90 deg")
+                valid = value is None or value < widest
+                require_field(self, name, valid, f"below {widest:.1f} deg, the limit of the lens")
+        valid = self.min_depth < self.max_depth
+        require_field(self, "max_depth", valid, f"above min_depth = {self.min_depth} m")
+        require_field(self, "p_BC", len(self.p_BC) == 3, "three finite numbers x, y, z in m")
 
     @property
     def focal_x(self) -> float:
@@ -85,7 +69,7 @@ class OnboardCamera:
         return pixels / float(bent[1] - bent[0])
 
     def camera_info(self) -> CameraInfo:
-        """The intrinsics, the principal point in the middle."""
+        """Returns the intrinsics, with the principal point in the middle."""
         return CameraInfo(
             width=self.width,
             height=self.height,
@@ -96,17 +80,17 @@ class OnboardCamera:
         )
 
     def X_BC(self) -> RigidTransform:
-        """Pose of the camera (x right, y down, z forward) in the body."""
+        """Returns the pose of the camera (x right, y down, z forward) in the body."""
         R_BC = RotationMatrix.MakeYRotation(-math.radians(self.pitch)) @ _R_BC_LEVEL
         return RigidTransform(R_BC, np.array(self.p_BC))
 
     def ray_slopes(self) -> np.ndarray:
-        """(height, width, 3) The points p_CQ at planar depth 1 that the pixels look at."""
+        """Returns the points p_CQ (height, width, 3) of the pixels at planar depth 1."""
         x = (np.arange(self.width) + 0.5 - 0.5 * self.width) / self.focal_x
         y = (np.arange(self.height) + 0.5 - 0.5 * self.height) / self.focal_y
         return np.stack([*np.meshgrid(x, y), np.ones((self.height, self.width))], axis=-1)
 
 
 def focal_length(size: int, fov: float) -> float:
-    """[px], of an axis with `size` pixels and a field of view [deg]."""
+    """Returns the focal length [px] of an axis with `size` pixels and a field of view [deg]."""
     return 0.5 * size / math.tan(math.radians(0.5 * fov))

@@ -1,8 +1,8 @@
-"""From the raw frame of a time-of-flight sensor to the grid that policies see.
+"""Converts raw frames of a time-of-flight sensor to the grid that policies observe.
 
-The order of the steps is that of the streamer which feeds such a policy on a Starling 2 Max: turn
-the frame upright, crop it to the policy's field of view, take what was not measured for far, turn
-depth into range, take the nearest of each cell, encode it, and turn the grid upside down.
+The steps are those of the streamer on a Starling 2 Max: rotate the frame upright, crop it to the
+policy's field of view, replace unmeasured depth by the maximum, convert depth to range, take the
+minimum of each cell, encode it, and turn the grid upside down.
 """
 
 import math
@@ -16,59 +16,49 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem
 from pydrake.systems.sensors import ImageDepth32F
 
 from splatpilot.systems.common.drake import input_port, output_port
-from splatpilot.systems.common.validation import require_field
+from splatpilot.systems.common.validation import Config, bounded, require, require_field
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera, focal_length
 
 LEAST_DEPTH = 1e-3
-"""[m], up to which the sensor has measured nothing."""
+"""[m], up to which depth counts as unmeasured."""
+
+_ANCHORS = ("top", "center", "bottom")
 
 
 @dataclass
-class TimeOfFlight:
-    """The sensor, and what part of its frame the policy sees; defaults are those of the drone."""
+class TimeOfFlight(Config):
+    """The sensor, and the part of its frame that the policy sees; by default the drone's."""
 
-    # [px] Width of its frames; one that lies on its side is stood up.
-    width: int = 180
+    # [px] Width of its frames; one that lies on its side is rotated upright.
+    width: int = bounded(180, "[1, inf) px")
     # [px] Height of its frames.
-    height: int = 240
+    height: int = bounded(240, "[1, inf) px")
     # [deg] Horizontal field of view.
-    fov_x: float = 86.0
+    fov_x: float = bounded(86.0, "[1, 180) deg")
     # [deg] Vertical field of view.
-    fov_y: float = 106.0
-    # [deg] Field of view, both ways, that is left by the crop.
-    fov: float = 86.0
-    # Which part of the height is left: "top", "center" or "bottom".
-    anchor: str = "bottom"
-    # [px] By how much that part then moves down; what leaves the frame is lost.
+    fov_y: float = bounded(106.0, "[1, 180) deg")
+    # [deg] Field of view after the crop, in both directions.
+    fov: float = bounded(86.0, "[1, 180) deg")
+    # Part of the height that the crop keeps.
+    anchor: str = bounded("bottom", f"{{{', '.join(_ANCHORS)}}}")
+    # [px] By which that part then moves down; what leaves the frame is lost.
     shift: int = -100
-    # [m] From which on nothing is near.
-    max_range: float = 5.0
+    # [m] Range from which proximity is 0.
+    max_range: float = bounded(5.0, "(0, inf) m")
     # [-] Cells across.
-    columns: int = 16
+    columns: int = bounded(16, "[1, inf)")
     # [-] Cells down.
-    rows: int = 9
+    rows: int = bounded(9, "[1, inf)")
 
-    def validate(self) -> None:
-        """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
-        for name in ("fov_x", "fov_y", "fov"):
-            value = getattr(self, name)
-            require_field(self, name, 1.0 <= value < 180.0, "at least 1 and below 180 deg")
-        require_field(self, "anchor", self.anchor in _ANCHORS, f"one of {', '.join(_ANCHORS)}")
-        require_field(self, "max_range", 0.0 < self.max_range < math.inf, "positive and finite")
-        for name in ("width", "height", "columns", "rows"):
-            value = getattr(self, name)
-            require_field(self, name, value >= 1, "at least 1")
+    def check(self) -> None:
         crop = self.crop(self.height, self.width, self.fov_x, self.fov_y)
-        for count, part, name in zip(
-            (self.rows, self.columns), crop, ("rows", "columns"), strict=True
-        ):
+        for name, part in zip(("rows", "columns"), crop, strict=True):
             left = part.stop - part.start
-            require_field(
-                self, name, count <= left, f"at most {left}, the pixels that the crop leaves"
-            )
+            valid = getattr(self, name) <= left
+            require_field(self, name, valid, f"at most {left}, the pixels after the crop")
 
     def crop(self, height: int, width: int, fov_x: float, fov_y: float) -> tuple[slice, slice]:
-        """The rows and columns that are left of an upright frame with these fields of view."""
+        """Returns the rows and columns kept of an upright frame with these fields of view."""
         half_x, half_y = (
             focal_length(size, fov) * math.tan(math.radians(0.5 * self.fov))
             for size, fov in ((width, fov_x), (height, fov_y))
@@ -87,16 +77,11 @@ class TimeOfFlight:
 
 
 def sensor_of(camera: OnboardCamera) -> TimeOfFlight:
-    """The sensor that a policy's camera is: all of its image is left.
+    """Returns the sensor that equals a policy's camera, without a crop.
 
-    Raises:
-        ValueError: for a camera whose lens distorts; frames of such sensors come rectified.
+    Its lens must not distort: frames of such sensors come rectified.
     """
-    if camera.distortion is not None:
-        raise ValueError(
-            f"OnboardCamera.distortion is {camera.distortion}; a time-of-flight sensor has none: "
-            "leave it out"
-        )
+    require_field(camera, "distortion", camera.distortion is None, "left out")
     fov_y = math.degrees(2.0 * math.atan(0.5 * camera.height / camera.focal_y))
     return TimeOfFlight(
         width=camera.width,
@@ -109,32 +94,24 @@ def sensor_of(camera: OnboardCamera) -> TimeOfFlight:
     )
 
 
-_ANCHORS = ("top", "center", "bottom")
-
-
 def time_of_flight_grid(depth: np.ndarray, sensor: TimeOfFlight) -> np.ndarray:
     """
-    The proximities (rows, columns) in a frame: 1 - range / max_range, 1 touched, 0 nothing near.
+    Computes the proximities (rows, columns) of a frame: 1 - range / max_range, at least 0.
 
     Row 0 is the lowest: the grid is upside down.
 
     Args:
-        depth: (H, W) [m] along the optical axis; what is not finite, or at most 1 mm, was not
-            measured. A frame that lies on its side is turned by 90 degrees, counterclockwise.
+        depth: (H, W) [m] along the optical axis; not finite, or at most 1 mm, if unmeasured. A
+            frame that lies on its side is rotated by 90 degrees, counterclockwise.
         sensor: a valid configuration.
-
-    Raises:
-        ValueError: for a frame of another size.
     """
     H, W = sensor.height, sensor.width
-    if depth.shape not in ((H, W), (W, H)):
-        raise ValueError(
-            f"the frame has {depth.shape[1]}x{depth.shape[0]} pixels; it must have {W}x{H}, or lie "
-            "on its side"
-        )
+    found = f"{depth.shape[1]}x{depth.shape[0]}"
+    condition = f"{W}x{H} pixels, or on its side"
+    require(depth.shape in ((H, W), (W, H)), "frame", condition, found)
     lying = depth.shape != (H, W)
     upright = np.rot90(depth) if lying else depth
-    # The streamer takes the fields of view of a frame that lay with it as they were.
+    # The streamer does not swap the fields of view of a frame that lies on its side.
     fov_x, fov_y = (sensor.fov_y, sensor.fov_x) if lying else (sensor.fov_x, sensor.fov_y)
     rows, columns = sensor.crop(H, W, fov_x, fov_y)
     cropped = upright[rows, columns]
@@ -148,14 +125,14 @@ def time_of_flight_grid(depth: np.ndarray, sensor: TimeOfFlight) -> np.ndarray:
 
 
 def range_of_depth(height: int, width: int, fov_x: float, fov_y: float) -> np.ndarray:
-    """(height, width) [-] How far what pixels see is, by its depth along the optical axis."""
+    """Returns the range of pixels over their depth along the optical axis, (height, width)."""
     x = (np.arange(width) - 0.5 * width) / focal_length(width, fov_x)
     y = (np.arange(height) - 0.5 * height) / focal_length(height, fov_y)
     return np.sqrt(1.0 + x**2 + y[:, None] ** 2)
 
 
 class TimeOfFlightGrid(LeafSystem):
-    """Turns raw frames into grids of proximities, see `time_of_flight_grid`.
+    """Converts raw frames to grids of proximities, see `time_of_flight_grid`.
 
     .. pydrake_system::
 
@@ -169,9 +146,6 @@ class TimeOfFlightGrid(LeafSystem):
     - ``depth_grid`` (rows * columns): 1 - range / max_range, row by row from the lowest.
 
     Stateless.
-
-    Raises:
-        ValueError: from the constructor on a configuration out of range.
     """
 
     depth_image_32f_input_port = input_port("depth_image_32f")
@@ -193,37 +167,35 @@ class TimeOfFlightGrid(LeafSystem):
         output.SetFromVector(grid.ravel())
 
 
-# The packets of a Starling's time-of-flight streamer: grids, and raw frames in chunks.
-#
-# A grid (TOF2) is a packet of its own. A raw frame (TOF3) comes in chunks, in any order.
-
+# The packets of a Starling's time-of-flight streamer: a grid (TOF2) each, or chunks of a raw frame
+# (TOF3) in any order.
 
 GRID_MAGIC, FRAME_MAGIC = 0x544F4632, 0x544F4633
 _GRID_HEADER = struct.Struct("<IIQ")  # magic, sequence, time [ns]
 _FRAME_HEADER = struct.Struct("<IIIHHQHH")
 """Magic, sequence, number of the frame, of the chunk, of chunks, time [ns], width, height."""
 
-_LARGEST_FRAME = 4096 * 4096
+_MAX_PIXELS = 4096 * 4096
 
 
 @dataclass(frozen=True, eq=False)
 class Stream:
-    """What has come of a stream. Nothing in it changes: Contexts may share it."""
+    """State of a stream, immutable: Contexts may share it."""
 
     grid: np.ndarray | None = None
     """(rows, columns), the newest."""
     time_ns: int = -1
-    """By the sensor's clock, of that."""
+    """Time of the grid, by the sensor's clock."""
     seq: int = -1
     gaps: int = 0
-    """Packets' numbers that were left out."""
+    """Number of packets that were missed."""
     frame: tuple[int, ...] = ()
-    """Of the raw frame that is coming: number, chunks, time, width, height."""
+    """Incomplete raw frame: number, chunks, time, width, height."""
     chunks: dict[int, bytes] = field(default_factory=dict)
-    """Those of it that have come."""
+    """Its received chunks."""
 
     def restarted(self) -> "Stream":
-        """The same as if another stream began: its clock and numbers are not compared."""
+        """Returns the state for a new stream: clock and numbers are not compared."""
         return replace(self, time_ns=-1, seq=-1)
 
     def __deepcopy__(self, memo: dict) -> "Stream":
@@ -232,75 +204,57 @@ class Stream:
 
 def after_packet(stream: Stream, packet: bytes, sensor: TimeOfFlight) -> Stream:
     """
-    The stream after another packet.
+    Returns the stream after another packet.
 
     Args:
-        sensor: what raw frames are, and what grids are made of them.
+        sensor: of raw frames, and of the grids made of them.
 
     Raises:
-        ValueError: for a packet that cannot be used, with the reason: of another kind or length,
-            of what is no grid or chunk, no newer than what there is.
+        ValueError: for an unusable packet: of another kind or length, with invalid values, or not
+            newer than the last.
     """
-    if len(packet) < 4:
-        raise ValueError(f"the packet has {len(packet)} bytes; it must have 4 or more")
+    require(len(packet) >= 4, "packet", "at least 4 bytes", len(packet))
     (magic,) = struct.unpack_from("<I", packet)
-    if magic == GRID_MAGIC:
-        return _after_grid(stream, packet, sensor)
-    if magic == FRAME_MAGIC:
-        return _after_chunk(stream, packet, sensor)
-    raise ValueError(
-        f"the packet begins with {magic:#010x}; it must be {GRID_MAGIC:#010x} or "
-        f"{FRAME_MAGIC:#010x}"
-    )
+    kinds = {GRID_MAGIC: _after_grid, FRAME_MAGIC: _after_chunk}
+    condition = f"{GRID_MAGIC:#010x} or {FRAME_MAGIC:#010x}"
+    require(magic in kinds, "magic number of the packet", condition, f"{magic:#010x}")
+    return kinds[magic](stream, packet, sensor)
 
 
 def _after_grid(stream: Stream, packet: bytes, sensor: TimeOfFlight) -> Stream:
-    count = sensor.rows * sensor.columns
-    length = _GRID_HEADER.size + 4 * count
-    if len(packet) != length:
-        raise ValueError(f"the packet of a grid has {len(packet)} bytes; it must have {length}")
+    length = _GRID_HEADER.size + 4 * sensor.rows * sensor.columns
+    require(len(packet) == length, "packet of a grid", f"{length} bytes", len(packet))
     _, seq, time_ns = _GRID_HEADER.unpack_from(packet)
     values = np.frombuffer(packet, "<f4", offset=_GRID_HEADER.size).astype(float)
-    if not (np.isfinite(values).all() and values.min() >= 0.0 and values.max() <= 1.0):
-        raise ValueError("the grid has values that are no proximities, 0 to 1")
+    valid = ((values >= 0.0) & (values <= 1.0)).all()
+    require(valid, "proximities", "in [0, 1]", values[~((values >= 0.0) & (values <= 1.0))][:1])
     return _after_image(stream, values.reshape(sensor.rows, sensor.columns), seq, time_ns)
 
 
 def _after_chunk(stream: Stream, packet: bytes, sensor: TimeOfFlight) -> Stream:
-    if len(packet) <= _FRAME_HEADER.size:
-        raise ValueError(
-            f"the packet of a chunk has {len(packet)} bytes; it must have more than "
-            f"{_FRAME_HEADER.size}"
-        )
+    header = _FRAME_HEADER.size
+    require(len(packet) > header, "packet of a chunk", f"over {header} bytes", len(packet))
     _, seq, number, index, count, time_ns, width, height = _FRAME_HEADER.unpack_from(packet)
-    payload = packet[_FRAME_HEADER.size :]
-    if not (index < count and 0 < width * height <= _LARGEST_FRAME):
-        raise ValueError(f"it is chunk {index} of {count} of a frame of {width}x{height} pixels")
-    if sorted((width, height)) != sorted((sensor.width, sensor.height)):
-        raise ValueError(
-            f"the frame has {width}x{height} pixels; it must have {sensor.width}x{sensor.height}"
-        )
-    if time_ns <= stream.time_ns:
-        raise ValueError("the frame is no newer than the one before")
+    size = f"{width}x{height}"
+    require(index < count, "chunk", f"below {count}", index)
+    require(0 < width * height <= _MAX_PIXELS, "frame", f"at most {_MAX_PIXELS} pixels", size)
+    same = sorted((width, height)) == sorted((sensor.width, sensor.height))
+    require(same, "frame", f"{sensor.width}x{sensor.height} pixels", size)
+    require(time_ns > stream.time_ns, "time of the frame", f"after {stream.time_ns} ns", time_ns)
     frame = (number, count, time_ns, width, height)
-    chunks = {index: payload} | (stream.chunks if frame == stream.frame else {})
-    if sum(map(len, chunks.values())) > 4 * width * height:
-        raise ValueError(f"the chunks of frame {number} are more than its {width}x{height} pixels")
+    chunks = {index: packet[header:]} | (stream.chunks if frame == stream.frame else {})
+    received, length = sum(map(len, chunks.values())), 4 * width * height
+    require(received <= length, "chunks of a frame", f"at most {length} bytes", received)
     if len(chunks) < count:
         return replace(stream, frame=frame, chunks=chunks)
+    require(received == length, "frame", f"{length} bytes", received)
     data = b"".join(chunks[i] for i in range(count))
-    if len(data) != 4 * width * height:
-        raise ValueError(
-            f"the frame has {len(data)} bytes; it must have {4 * width * height} for "
-            f"{width}x{height} pixels"
-        )
     depth = np.frombuffer(data, "<f4").reshape(height, width).astype(float)
     grid = time_of_flight_grid(depth, sensor)
     return _after_image(replace(stream, frame=(), chunks={}), grid, seq, time_ns)
 
 
 def _after_image(stream: Stream, grid: np.ndarray, seq: int, time_ns: int) -> Stream:
-    if time_ns <= stream.time_ns:
-        raise ValueError("the grid is no newer than the one before")
+    require(time_ns > stream.time_ns, "time of the grid", f"after {stream.time_ns} ns", time_ns)
     missed = max(seq - stream.seq - 1, 0) if stream.seq >= 0 else 0
     return replace(stream, grid=grid, seq=seq, time_ns=time_ns, gaps=stream.gaps + missed)

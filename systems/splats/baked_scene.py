@@ -1,19 +1,25 @@
-"""Rendering of scenes that do not change: the renderer of the flight path (numpy only, CPU)."""
+"""Fast rendering of Gaussian scenes that do not change (numpy only, CPU)."""
 
 import os
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from splatpilot import _native
-from splatpilot.systems.splats.lens import Distortion, hidden_pixels, native_lens
-from splatpilot.systems.splats.scene import GaussianScene, degree_of
+from splatpilot.systems.common.validation import require
+from splatpilot.systems.splats.lens import PINHOLE, Distortion, hidden_pixels, native_lens
+from splatpilot.systems.splats.scene import GaussianScene, harmonic_degree
+
+if TYPE_CHECKING:
+    from pydrake.math import RigidTransform
+
+EPS2D = 0.3  # [px^2] variance by which the pixel blurs every Gaussian, as in gsplat
 
 
 class PlacedGaussians(NamedTuple):
-    """N Gaussians in W; float32, see `GaussianScene`. An opacity may be zero."""
+    """N Gaussians in W, see `GaussianScene`; opacities may be zero."""
 
     means: NDArray[np.float32]  # (N, 3) [m]
     quats: NDArray[np.float32]  # (N, 4)
@@ -28,12 +34,11 @@ NO_GAUSSIANS = PlacedGaussians(
 
 
 class MovingGaussians:
-    """M bodies of Gaussians that move without turning.
+    """M bodies of Gaussians that move without rotating.
 
     Args:
-        bodies: each about its own centre; all of one degree of spherical harmonics.
-        centers: from a time [s] to where the centres are, (M, 3) [m]; infinite for a body that is
-            nowhere.
+        bodies: each about its own center; all of one degree of spherical harmonics.
+        centers: from a time [s] to the centers (M, 3) [m]; infinite for an absent body.
     """
 
     def __init__(
@@ -49,7 +54,7 @@ class MovingGaussians:
         self._centers = centers
 
     def at(self, time: float) -> PlacedGaussians:
-        """The Gaussians at a time [s]; those of bodies that are nowhere have no opacity."""
+        """Returns the Gaussians at a time [s]; those of absent bodies have no opacity."""
         centers = self._centers(time)
         present = np.isfinite(centers).all(axis=1)
         own = self._about_centers
@@ -60,165 +65,118 @@ class MovingGaussians:
         return placed._replace(opacities=own.opacities * present[self._body])
 
 
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
-    from pydrake.math import RigidTransform
-
-    from splatpilot.systems.splats.scene import GaussianScene
-
-EPS2D = 0.3  # [px^2] variance by which the pixel blurs every Gaussian, as in gsplat
-
-
 class RenderedView(NamedTuple):
-    """What a camera sees of a scene, float32."""
+    """Images of one camera, float32."""
 
-    color: "NDArray[np.float32]"  # (H, W, 3), over the background
-    depth: "NDArray[np.float32]"  # (H, W) [m] median z, see `rasterize`; 0: no surface
-    alpha: "NDArray[np.float32]"  # (H, W) in [0, 1]
+    color: NDArray[np.float32]  # (H, W, 3), over the background
+    depth: NDArray[np.float32]  # (H, W) [m] median z, see `rasterize`; 0: no surface
+    alpha: NDArray[np.float32]  # (H, W) in [0, 1]
 
 
 def create_renderer(threads: int = 1, simd: str = "") -> _native.Renderer:
-    """CPU threads, and memory that one image after another is rendered in.
+    """Creates CPU threads and scratch memory, to be shared by the renderings of several images.
 
-    Whatever renders several images should do so with one renderer: the first image asks the system
-    for memory, and later ones use it again. Python threads that share one take turns. What is
-    rendered depends neither on the threads nor on earlier images.
+    Python threads that share one take turns. Images depend neither on the number of threads nor on
+    earlier images.
 
-    `simd` (default: the environment variable SPLATPILOT_SIMD, else the widest that the machine has)
-    is one of `splatpilot._native.simd_levels()`.
+    Args:
+        threads: 1 to 1024.
+        simd: one of `splatpilot._native.simd_levels()`; by default the environment variable
+            SPLATPILOT_SIMD, else the widest of this machine.
 
     Raises:
-        ValueError: `threads` is not a positive integer, or this machine lacks the SIMD level.
+        ValueError: `threads` or `simd` is invalid here.
         OSError: the system does not let this process start so many threads.
     """
-    if not 1 <= int(threads) <= 1024:
-        raise ValueError(f"threads is {threads}; it must lie between 1 and 1024")
+    require(1 <= int(threads) <= 1024, "threads", "in [1, 1024]", threads)
     try:
         return _native.Renderer(int(threads), simd or os.environ.get("SPLATPILOT_SIMD", ""))
     except RuntimeError as error:
-        raise OSError(f"{error}; ask for fewer threads") from error
+        raise OSError(f"{error}; request fewer threads") from error
 
 
-def check_camera(K: "ArrayLike", width: int, height: int, near: float, far: float) -> np.ndarray:
-    """Returns `K` as a (3, 3) float64 array, or raises ValueError naming what is wrong."""
+def check_camera(K: ArrayLike, width: int, height: int, near: float, far: float) -> np.ndarray:
+    """Checks a pinhole camera and returns `K` as a (3, 3) float64 array."""
     K = np.asarray(K, dtype=np.float64)
-    if K.shape != (3, 3):
-        raise ValueError(f"K has shape {K.shape}; it must be the 3x3 matrix of intrinsics [px]")
-    if not np.all(np.isfinite(K)):
-        raise ValueError(f"K has a NaN or infinite entry: {K.tolist()}")
-    if K[0, 0] <= 0 or K[1, 1] <= 0:
-        raise ValueError(
-            f"focal lengths K[0, 0] = {K[0, 0]:g}, K[1, 1] = {K[1, 1]:g} must be positive [px]"
-        )
-    if not (0 < width <= 32768 and 0 < height <= 32768):
-        raise ValueError(f"image size is {width} x {height}; both must lie between 1 and 32768")
-    if not 0 < near < far:
-        raise ValueError(f"depth range is {near:g} to {far:g} m; it must satisfy 0 < near < far")
+    require(K.shape == (3, 3), "K", "of shape (3, 3)", K.shape)
+    require(np.isfinite(K).all(), "K", "finite", K.tolist())
+    focal = K[0, 0], K[1, 1]
+    require(min(focal) > 0, "the focal lengths of K", "> 0 px", "{:g}, {:g}".format(*focal))
+    size = 0 < width <= 32768 and 0 < height <= 32768
+    require(size, "the image size", "in [1, 32768] px", f"{width} x {height}")
+    require(0 < near < far, "the depth range", "0 < near < far", f"{near:g} to {far:g} m")
     return K
 
 
 class BakedScene:
     """A Gaussian scene prepared for fast repeated rendering.
 
-    Baking reorders the Gaussians so that neighbours in space are neighbours in memory (Morton
-    order), factors their covariances and bounds groups of them with boxes; each frame then skips
-    whole groups and starts from what is precomputed. Images agree with `rasterize` up to rounding,
-    except that Gaussians of exactly equal depth blend in Morton order.
-
-    The same scene, camera and size give the same bits, for any number of threads. Several Python
-    threads may call `render` at once; they take turns.
+    Baking sorts the Gaussians in Morton order, factors their covariances and bounds groups of them
+    with boxes, by which each frame culls. Images agree with `rasterize` up to rounding, except that
+    Gaussians of exactly equal depth blend in Morton order. Rendering is deterministic for any
+    number of threads. Several Python threads may call `render` at once; they take turns.
     """
 
-    def __init__(self, scene: "GaussianScene", threads: int = 1, simd: str = ""):
-        """Bakes `scene`, of which no reference is kept.
-
-        Raises:
-            ValueError: see `create_renderer`.
-        """
+    def __init__(self, scene: GaussianScene, threads: int = 1, simd: str = ""):
+        """Bakes a scene without keeping a reference to it; see `create_renderer`."""
         self._renderer = create_renderer(threads, simd)
-        names = ("means", "quats", "scales", "opacities", "sh")
+        names = PlacedGaussians._fields
         arrays = {n: np.ascontiguousarray(getattr(scene, n), dtype=np.float32) for n in names}
-        self._scene = _native.BakedScene(**arrays, sh_degree=degree_of(scene.sh.shape[1]))
+        self._scene = _native.BakedScene(**arrays, sh_degree=harmonic_degree(scene.sh.shape[1]))
 
     def recolored(self, sh: np.ndarray) -> "BakedScene":
-        """The same Gaussians in other colours, by the same renderer, without baking anew: what does
-        not depend on colours is shared.
+        """Returns the same Gaussians in other colors without baking again.
 
         Args:
-            sh: (N, K, 3), see `GaussianScene`, in the order of the scene that was baked.
-
-        Raises:
-            ValueError: on another shape, or another number of Gaussians.
+            sh: (N, K, 3), see `GaussianScene`, in the order of the baked scene.
         """
         sh = np.ascontiguousarray(sh, dtype=np.float32)
-        if sh.ndim != 3 or len(sh) != self._scene.count or sh.shape[2] != 3:
-            raise ValueError(
-                f"sh has shape {sh.shape}; it must be ({self._scene.count}, K, 3), a row for each "
-                "Gaussian that was baked"
-            )
-        seen = object.__new__(BakedScene)
-        seen._scene = self._scene.recolored(sh, degree_of(sh.shape[1]))
-        seen._renderer = self._renderer
-        return seen
+        count = self._scene.count
+        valid = sh.ndim == 3 and len(sh) == count and sh.shape[2] == 3
+        require(valid, "sh", f"of shape ({count}, K, 3)", sh.shape)
+        recolored = object.__new__(BakedScene)
+        recolored._scene = self._scene.recolored(sh, harmonic_degree(sh.shape[1]))
+        recolored._renderer = self._renderer
+        return recolored
 
     def render(
         self,
-        K: "ArrayLike",
+        K: ArrayLike,
         width: int,
         height: int,
         X_WC: "RigidTransform",
         near: float = 0.01,
         far: float = 1e10,
-        background: "ArrayLike" = (0.0, 0.0, 0.0),
+        background: ArrayLike = (0.0, 0.0, 0.0),
         moving: PlacedGaussians = NO_GAUSSIANS,
         distortion: Distortion | None = None,
         max_depth: float = np.inf,
     ) -> RenderedView:
-        """Renders colour, median depth and alpha.
+        """Renders color, median depth and alpha.
 
         Args:
-            K: (3, 3) pinhole intrinsics [px]; skew is ignored. Pixel (i, j) has its centre at
+            K: (3, 3) pinhole intrinsics [px]; skew is ignored. Pixel (i, j) has its center at
                 (i + 1/2, j + 1/2).
             width: Image width [px].
             height: Image height [px].
             X_WC: Pose of the camera (x right, y down, z forward) in the world.
-            near: Gaussians whose centre is nearer than this along z are left out [m].
+            near: Gaussians whose center is nearer than this along z are left out [m].
             far: The same for those farther away [m].
-            background: (3,) colour behind everything.
-            moving: Gaussians among those of the scene, in this image alone; trusted to be valid.
-            distortion: of the lens; None for a pinhole. What it does not show is black,
-                of alpha and depth 0.
-            max_depth: Gaussians of which no surface may lie so near [m] have no part in the depth:
-                what an image of depth does not show hides nothing that it shows.
-
-        Raises:
-            ValueError: intrinsics, image size, depth range or background make no sense.
+            background: (3,) color behind everything.
+            moving: Gaussians added to those of the scene for this image; not checked.
+            distortion: Lens; a pinhole if None. Pixels without a ray are black, with alpha and
+                depth 0.
+            max_depth: Gaussians beyond this depth [m] are left out of the depth image.
         """
         background = np.ascontiguousarray(background, dtype=np.float32)
-        if background.shape != (3,) or not np.all(np.isfinite(background)):
-            raise ValueError(f"background is {background.tolist()}; it must be 3 finite numbers")
-        camera = _camera(K, width, height, X_WC, near, far, distortion)
-        color = np.empty((height, width, 3), dtype=np.float32)
-        depth = np.empty((height, width, 1), dtype=np.float32)
-        alpha = np.empty((height, width, 1), dtype=np.float32)
-        _native.render_baked(
-            self._scene,
-            self._renderer,
-            **_among(moving),
-            **camera,
-            eps2d=EPS2D,
-            background=background,
-            color=color,
-            depth=depth,
-            alpha=alpha,
-            max_depth=_positive(max_depth),
-        )
-        _hide((color, depth, alpha), distortion, camera)
-        return RenderedView(color, depth[..., 0], alpha[..., 0])
+        valid = background.shape == (3,) and np.isfinite(background).all()
+        require(valid, "background", "3 finite numbers", background.tolist())
+        camera = (K, width, height, X_WC, near, far)
+        return self._render(camera, background, moving, distortion, max_depth, depth_alone=False)
 
     def render_depth(
         self,
-        K: "ArrayLike",
+        K: ArrayLike,
         width: int,
         height: int,
         X_WC: "RigidTransform",
@@ -227,67 +185,46 @@ class BakedScene:
         max_depth: float = np.inf,
         moving: PlacedGaussians = NO_GAUSSIANS,
         distortion: Distortion | None = None,
-    ) -> "NDArray[np.float32]":
-        """Renders the median depth of `render` alone, (H, W) [m], in a fraction of its time.
+    ) -> NDArray[np.float32]:
+        """Renders the median depth (H, W) [m], bitwise identical to that of `render` but faster."""
+        camera, black = (K, width, height, X_WC, near, far), np.zeros(3, np.float32)
+        return self._render(camera, black, moving, distortion, max_depth, depth_alone=True).depth
 
-        The arguments are those of `render`, and so are the bits.
-
-        Raises:
-            ValueError: intrinsics, image size or depth range make no sense.
-        """
-        camera = _camera(K, width, height, X_WC, near, far, distortion)
-        depth = np.empty((height, width, 1), dtype=np.float32)
-        _native.render_baked_depth(
+    def _render(
+        self,
+        camera: tuple[Any, int, int, Any, float, float],
+        background: NDArray[np.float32],
+        moving: PlacedGaussians,
+        distortion: Distortion | None,
+        max_depth: float,
+        depth_alone: bool,
+    ) -> RenderedView:
+        K, width, height, X_WC, near, far = camera
+        K = check_camera(K, width, height, near, far)
+        require(max_depth > 0, "max_depth", "> 0 m", max_depth)
+        lens = PINHOLE if distortion is None else native_lens(distortion, K, width, height)
+        color, depth, alpha = (np.empty((height, width, n), np.float32) for n in (3, 1, 1))
+        _native.render_baked(
             self._scene,
             self._renderer,
-            **_among(moving),
-            **camera,
-            max_depth=_positive(max_depth),
+            **moving._asdict(),
+            sh_degree=harmonic_degree(moving.sh.shape[1]),
+            K=K,
+            X_CW=np.ascontiguousarray(X_WC.inverse().GetAsMatrix4()),
+            width=width,
+            height=height,
+            near_plane=near,
+            far_plane=far,
+            eps2d=EPS2D,
+            background=background,
+            color=None if depth_alone else color,
             depth=depth,
+            alpha=None if depth_alone else alpha,
+            max_depth=max_depth,
+            **lens._asdict(),
         )
-        _hide((depth,), distortion, camera)
-        return depth[..., 0]
-
-
-def _camera(
-    K: "ArrayLike",
-    width: int,
-    height: int,
-    X_WC: "RigidTransform",
-    near: float,
-    far: float,
-    distortion: Distortion | None,
-) -> dict[str, Any]:
-    """The camera as `_native` takes it."""
-    K = check_camera(K, width, height, near, far)
-    return {
-        "K": K,
-        "X_CW": np.ascontiguousarray(X_WC.inverse().GetAsMatrix4()),
-        "width": width,
-        "height": height,
-        "near_plane": near,
-        "far_plane": far,
-        **native_lens(distortion, K, width, height)._asdict(),
-    }
-
-
-def _positive(max_depth: float) -> float:
-    if not max_depth > 0:
-        raise ValueError(f"max_depth is {max_depth:g} m; it must be positive")
-    return max_depth
-
-
-def _among(moving: PlacedGaussians) -> dict[str, Any]:
-    """The Gaussians among those of a scene as `_native` takes them."""
-    return {**moving._asdict(), "sh_degree": degree_of(moving.sh.shape[1])}
-
-
-def _hide(
-    images: tuple["NDArray[np.float32]", ...], distortion: Distortion | None, camera: dict[str, Any]
-) -> None:
-    """Sets what a lens does not show to 0."""
-    if distortion is None:
-        return
-    hidden = hidden_pixels(distortion, camera["K"], camera["width"], camera["height"])
-    for image in images if len(hidden) else ():
-        image.reshape(-1, image.shape[2])[hidden] = 0.0
+        if distortion is not None:
+            hidden = hidden_pixels(distortion, K, width, height)
+            for image in (depth,) if depth_alone else (color, depth, alpha):
+                image.reshape(-1, image.shape[2])[hidden] = 0.0
+        return RenderedView(color, depth[..., 0], alpha[..., 0])

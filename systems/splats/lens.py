@@ -1,38 +1,34 @@
-"""Lenses that bend what a pinhole camera would see.
+"""Lenses that bend the rays of a pinhole camera: OpenCV's rational and fisheye models.
 
-OpenCV's models ("Camera Calibration and 3D Reconstruction" and "Fisheye camera model"; Kannala and
-Brandt, PAMI 2006), on the image plane of focal length 1: what pixels there are is the intrinsics'
-business.
+All is on the image plane of focal length 1; see "Camera Calibration and 3D Reconstruction" and
+"Fisheye camera model" of OpenCV, and Kannala and Brandt, PAMI 2006.
 """
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from functools import lru_cache
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache, wraps
 from typing import TYPE_CHECKING, NamedTuple
 
+import cv2
 import numpy as np
 from numpy.polynomial import Polynomial
 
+from splatpilot.systems.common.validation import Config, bounded, require_field
+
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    from numpy.typing import ArrayLike, NDArray
 
-MODELS = {"opencv": 6, "fisheye": 4}
-"""Names of the models, and how many radial coefficients they have at most."""
+NUM_RADIAL = {"opencv": 6, "fisheye": 4}
+"""Largest number of radial coefficients of each model."""
 
-MOST_ANGLE = 85.0
-"""[deg] from the optical axis that a lens shows at most: depth is along it."""
-
-_MARGIN = 0.15
-"""Part of the image around it in which what is seen is still projected as if it were in it."""
-
-_STEPS = 60
-"""Bisections, to the last bit."""
+_MARGIN = 0.15  # fraction of the image around it in which rays are still projected as if inside
+_SAMPLES, _STEPS = 4097, 6  # of the radial table and of its refinement, to rounding
 
 
 @dataclass
-class Distortion:
-    """How a lens bends rays.
+class Distortion(Config):
+    """Lens model.
 
     A ray of slopes (x, y) = (X / Z, Y / Z), r^2 = x^2 + y^2, meets the image plane at (x', y'),
     pixels K (x', y', 1). "opencv", with g = (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4
@@ -40,188 +36,165 @@ class Distortion:
     "fisheye", with a = atan r: (x', y') = a (1 + k1 a^2 + k2 a^4 + k3 a^6 + k4 a^8) (x, y) / r.
     """
 
-    # "opencv" or "fisheye".
-    model: str = "opencv"
-    # k1, k2, ...: up to six of "opencv", up to four of "fisheye"; those left out are zero.
-    radial: list[float] = field(default_factory=list)
-    # p1, p2 of "opencv"; zero where left out.
-    tangential: list[float] = field(default_factory=list)
-    # [deg] From the optical axis beyond which the lens shows nothing.
-    max_angle: float = MOST_ANGLE
+    # OpenCV's rational model or its fisheye.
+    model: str = bounded("opencv", "{opencv, fisheye}")
+    # k1, k2, ...: up to six of "opencv", up to four of "fisheye"; the others are zero.
+    radial: list[float] = bounded(list, "(-inf, inf)")
+    # p1, p2 of "opencv"; zero if empty.
+    tangential: list[float] = bounded(list, "(-inf, inf)")
+    # [deg] Largest angle from the optical axis that the lens shows; depth is along that axis.
+    max_angle: float = bounded(85.0, "(0, 85] deg")
 
-    def validate(self) -> None:
-        """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
-        if self.model not in MODELS:
-            raise ValueError(f"model is {self.model!r}; choose {' or '.join(MODELS)}")
-        most, tangential = MODELS[self.model], 2 if self.model == "opencv" else 0
-        if len(self.radial) > most:
-            raise ValueError(f"radial has {len(self.radial)} numbers; {self.model} has {most}")
-        if len(self.tangential) not in (0, tangential):
-            raise ValueError(
-                f"tangential has {len(self.tangential)} numbers; {self.model} has {tangential}"
-            )
-        for name in ("radial", "tangential"):
-            if not np.isfinite(getattr(self, name)).all():
-                raise ValueError(f"{name} is {getattr(self, name)}; it must be finite numbers")
-        if not 0.0 < self.max_angle <= MOST_ANGLE:
-            raise ValueError(
-                f"max_angle is {self.max_angle}; it must be more than 0, at most {MOST_ANGLE} deg"
-            )
+    def check(self) -> None:
+        most = NUM_RADIAL[self.model]
+        require_field(self, "radial", len(self.radial) <= most, f"at most {most} numbers")
+        count = 2 if self.model == "opencv" else 0
+        valid = len(self.tangential) in (0, count)
+        require_field(self, "tangential", valid, f"{count} numbers of {self.model}, or none")
 
     @property
     def limit(self) -> float:
-        """The greatest r that has a place on the image: beyond, the lens would fold it back."""
-        k = _padded(self.radial, MODELS[self.model])
+        """The largest r on the image: beyond, the lens would fold it back."""
+        k = _padded(self.radial, NUM_RADIAL[self.model])
         widest = math.radians(self.max_angle)
-        if self.model == "fisheye":
-            return math.tan(min(widest, fisheye_limit(k)))
-        return min(math.tan(widest), opencv_limit(k))
-
-    def project(self, slopes: "NDArray[np.float64]") -> "NDArray[np.float64]":
-        """Where rays of `slopes` (..., 2) meet the image plane (..., 2); NaN beyond `limit`."""
-        slopes = np.asarray(slopes, dtype=np.float64)
-        x, y = np.moveaxis(slopes, -1, 0)
-        p1, p2 = _padded(self.tangential, 2)
-        s = x * x + y * y
-        g = self._scale(np.sqrt(s))
-        bent = np.stack(
-            [
-                g * x + 2 * p1 * x * y + p2 * (s + 2 * x * x),
-                g * y + p1 * (s + 2 * y * y) + 2 * p2 * x * y,
-            ],
-            -1,
+        if self.model == "fisheye":  # where a (1 + k1 a^2 + ...) stops growing
+            factors = zip((3, 5, 7, 9), k, strict=True)
+            growth = Polynomial([1.0, *(n * each for n, each in factors)])  # of a^2
+            return math.tan(min(widest, math.sqrt(_first_root(growth))))
+        top, bottom = Polynomial([1.0, *k[:3]]), Polynomial([1.0, *k[3:]])  # of r^2
+        growth = top * bottom + 2 * Polynomial([0, 1]) * (
+            top.deriv() * bottom - top * bottom.deriv()
         )
-        return np.where((s < self.limit**2)[..., None], bent, np.nan)
+        return min(math.tan(widest), math.sqrt(min(_first_root(growth), _first_root(bottom))))
 
-    def slopes(self, points: "NDArray[np.float64]") -> "NDArray[np.float64]":
-        """The slopes (..., 2) of the rays that meet the image plane at `points` (..., 2); NaN where
-        none does."""
+    def project(self, slopes: "ArrayLike") -> "NDArray[np.float64]":
+        """Projects rays of `slopes` (..., 2) to the image plane (..., 2); NaN beyond `limit`."""
+        slopes = np.asarray(slopes, dtype=np.float64)
+        return np.where(
+            _lengths(slopes)[..., None] < self.limit, self._bent(slopes, self.tangential), np.nan
+        )
+
+    def slopes(self, points: "ArrayLike") -> "NDArray[np.float64]":
+        """Inverts `project`: slopes (..., 2) of rays to `points` (..., 2); NaN without one.
+
+        OpenCV's own inverses diverge towards the limit.
+        """
         points = np.asarray(points, dtype=np.float64)
         slopes = self._undistort_radially(points)
-        if any(self.tangential):
-            for _ in range(_STEPS):
-                off = self.project(slopes) - self._scale(_lengths(slopes))[..., None] * slopes
-                slopes = self._undistort_radially(points - off)
+        for _ in range(60 if any(self.tangential) else 0):
+            off = self.project(slopes) - self._bent(slopes, [])
+            last, slopes = slopes, self._undistort_radially(points - off)
+            if np.nanmax(np.abs(slopes - last), initial=0.0) < 1e-12:
+                break
         return slopes
 
-    def _scale(self, r: "NDArray[np.float64]") -> "NDArray[np.float64]":
-        """g(r), the radial part of the image over r."""
-        k = _padded(self.radial, MODELS[self.model])
+    def _bent(
+        self, slopes: "NDArray[np.float64]", tangential: Sequence[float]
+    ) -> "NDArray[np.float64]":
+        k = _padded(self.radial, NUM_RADIAL[self.model])
+        flat = np.nan_to_num(slopes).reshape(-1, 1, 2)
         if self.model == "fisheye":
-            angle = np.arctan(r)
-            share = np.divide(angle, r, out=np.ones_like(r), where=r > 0)
-            return share * Polynomial([1.0, *k])(angle * angle)
-        return Polynomial([1.0, *k[:3]])(r * r) / Polynomial([1.0, *k[3:]])(r * r)
+            bent = cv2.fisheye.distortPoints(flat, np.eye(3), np.array(k))
+        else:
+            rays = np.concatenate([flat, np.ones_like(flat[..., :1])], axis=2)
+            coefficients = np.array([*k[:2], *_padded(tangential, 2), *k[2:]])
+            bent, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), np.eye(3), coefficients)
+        return np.asarray(bent, dtype=np.float64).reshape(slopes.shape)
+
+    def _radius(self, r: "NDArray[np.float64]") -> "NDArray[np.float64]":
+        """Returns r g(r), the image radius without the tangential part."""
+        return self._bent(np.stack([r, np.zeros_like(r)], -1), [])[..., 0]
 
     def _undistort_radially(self, points: "NDArray[np.float64]") -> "NDArray[np.float64]":
-        wanted = _lengths(points)
-        low, high = np.zeros_like(wanted), np.full_like(wanted, self.limit)
-        beyond = ~(wanted < self.limit * self._scale(high))
+        table = np.linspace(0.0, self.limit, _SAMPLES)
+        radii = self._radius(table)
+        desired = _lengths(points)
+        cell = np.clip(np.searchsorted(radii, desired) - 1, 0, _SAMPLES - 2)
+        low, high = table[cell], table[cell + 1]
+        chord = (high - low) / (radii[cell + 1] - radii[cell])
+        r = low + (desired - radii[cell]) * chord
         for _ in range(_STEPS):
-            middle = 0.5 * (low + high)
-            short = middle * self._scale(middle) < wanted
-            low, high = np.where(short, middle, low), np.where(short, high, middle)
-        share = np.divide(0.5 * (low + high), wanted, out=np.ones_like(wanted), where=wanted > 0)
-        return np.where(beyond, np.nan, share)[..., None] * points
+            r = np.clip(r + (desired - self._radius(r)) * chord, low, high)
+        share = np.divide(r, desired, out=np.ones_like(r), where=desired > 0)
+        return np.where(desired < radii[-1], share, np.nan)[..., None] * points
 
 
 class NativeLens(NamedTuple):
     """A lens before an image, as the renderer takes it."""
 
     distortion: int
-    lens: "NDArray[np.float64]"  # (13,): radial (6), tangential (2), limit^2, least, most slopes
+    lens: "NDArray[np.float64]"  # (13,): radial 6, tangential 2, limit^2, min and max slopes
 
 
 PINHOLE = NativeLens(0, np.zeros(13))
 
-
-def native_lens(distortion: Distortion | None, K: "NDArray", width: int, height: int) -> NativeLens:
-    """The lens of a camera with the intrinsics K (3, 3) [px] for `_native.render_baked`."""
-    if distortion is None:
-        return PINHOLE
-    return _native_lens(*_key(distortion, K), width, height)
+type _Intrinsics = tuple[float, float, float, float]  # fx, fy, cx, cy
 
 
-def pixel_slopes(
-    distortion: Distortion, K: "NDArray", width: int, height: int
-) -> "NDArray[np.float64]":
-    """Slopes (height, width, 2) in which the pixels of a camera look; NaN where a lens shows
-    nothing. Kept, for the next image."""
-    return _pixel_slopes(*_key(distortion, K), width, height)
+def _cached[T](maxsize: int) -> Callable[[Callable[..., T]], Callable[..., T]]:
+    """Caches a function of a lens, intrinsics, width and height by their values."""
+
+    def decorate(compute: Callable[..., T]) -> Callable[..., T]:
+        @lru_cache(maxsize)
+        def cached(model, radial, tangential, max_angle, intrinsics, width, height) -> T:
+            lens = Distortion(model, list(radial), list(tangential), max_angle)
+            return compute(lens, intrinsics, width, height)
+
+        @wraps(compute)
+        def call(distortion: Distortion, K: "NDArray", width: int, height: int) -> T:
+            d, intrinsics = distortion, tuple(map(float, K[[0, 1, 0, 1], [0, 1, 2, 2]]))
+            lens = d.model, tuple(d.radial), tuple(d.tangential), d.max_angle
+            return cached(*lens, intrinsics, width, height)
+
+        return call
+
+    return decorate
 
 
-def hidden_pixels(
-    distortion: Distortion, K: "NDArray", width: int, height: int
-) -> "NDArray[np.intp]":
-    """Which pixels, counted row by row, a lens shows nothing in. Kept, as `pixel_slopes`."""
-    return _hidden_pixels(*_key(distortion, K), width, height)
-
-
-def opencv_limit(radial: Sequence[float]) -> float:
-    """Least r at which ``r g(r)`` of k1, ..., k6 stops growing or g has a pole; may be inf."""
-    top, bottom = Polynomial([1, *radial[:3]]), Polynomial([1, *radial[3:]])  # of r^2
-    s = Polynomial([0, 1])
-    growth = top * bottom + 2 * s * (top.deriv() * bottom - top * bottom.deriv())
-    return math.sqrt(min(_first_root(growth), _first_root(bottom)))
-
-
-def fisheye_limit(radial: Sequence[float]) -> float:
-    """Least angle [rad] at which the image radius of k1, ..., k4 stops growing; may be inf."""
-    factors = zip((3, 5, 7, 9), radial, strict=True)
-    return math.sqrt(_first_root(Polynomial([1, *(n * k for n, k in factors)])))
-
-
-type _Key = tuple[str, tuple[float, ...], tuple[float, ...], float, tuple[float, ...]]
-
-
-def _key(distortion: Distortion, K: "NDArray") -> _Key:
-    lens = distortion
-    focal = float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
-    return lens.model, tuple(lens.radial), tuple(lens.tangential), lens.max_angle, focal
-
-
-def _restored(model: str, radial: tuple, tangential: tuple, max_angle: float) -> Distortion:
-    return Distortion(model, list(radial), list(tangential), max_angle)
-
-
-@lru_cache(maxsize=512)  # each band of a rolling shutter has one
-def _native_lens(model, radial, tangential, max_angle, focal, width, height) -> NativeLens:
-    distortion = _restored(model, radial, tangential, max_angle)
-    limit = distortion.limit
-    size = np.array([width, height])
+@_cached(512)  # each band of a rolling shutter has one
+def native_lens(
+    distortion: Distortion, intrinsics: _Intrinsics, width: int, height: int
+) -> NativeLens:
+    """Returns the lens of a camera with the intrinsics K (3, 3) [px] for `_native.render_baked`."""
+    fx, fy, cx, cy = intrinsics
     along = np.linspace(-_MARGIN, 1.0 + _MARGIN, 257)
     edges = [(along, np.full(257, end)) for end in (-_MARGIN, 1.0 + _MARGIN)]
     border = np.concatenate([np.stack(pair, -1) for a, b in edges for pair in ((a, b), (b, a))])
-    fx, fy, cx, cy = focal
-    points = (border * size - [cx, cy]) / [fx, fy]
+    points = (border * [width, height] - [cx, cy]) / [fx, fy]
     slopes = distortion.slopes(points)
-    # Where the border lies beyond what the lens shows, that ends it.
-    outward = limit * points / np.maximum(_lengths(points), 1e-12)[:, None]
+    # The limit of the lens takes the place of a border beyond it.
+    outward = distortion.limit * points / np.maximum(_lengths(points), 1e-12)[:, None]
     slopes = np.where(np.isnan(slopes), outward, slopes)
     numbers = [
         *_padded(distortion.radial, 6),
         *_padded(distortion.tangential, 2),
-        min(limit**2, 1e12),
+        min(distortion.limit**2, 1e12),
         *slopes.min(axis=0),
         *slopes.max(axis=0),
     ]
-    return NativeLens(1 + list(MODELS).index(model), np.array(numbers))
+    return NativeLens(1 + list(NUM_RADIAL).index(distortion.model), np.array(numbers))
 
 
-@lru_cache(maxsize=8)
-def _pixel_slopes(model, radial, tangential, max_angle, focal, width, height):
-    fx, fy, cx, cy = focal
+@_cached(8)
+def pixel_slopes(
+    distortion: Distortion, intrinsics: _Intrinsics, width: int, height: int
+) -> "NDArray[np.float64]":
+    """Returns the slopes (height, width, 2) of a camera's pixels; NaN without a ray."""
+    fx, fy, cx, cy = intrinsics
     u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    points = np.stack([(u - cx) / fx, (v - cy) / fy], -1)
-    slopes = _restored(model, radial, tangential, max_angle).slopes(points)
+    slopes = distortion.slopes(np.stack([(u - cx) / fx, (v - cy) / fy], -1))
     slopes.setflags(write=False)
     return slopes
 
 
-@lru_cache(maxsize=8)
-def _hidden_pixels(model, radial, tangential, max_angle, focal, width, height):
-    slopes = _pixel_slopes(model, radial, tangential, max_angle, focal, width, height)
-    return np.flatnonzero(np.isnan(slopes[..., 0]))
+@_cached(8)
+def hidden_pixels(
+    distortion: Distortion, intrinsics: _Intrinsics, width: int, height: int
+) -> "NDArray[np.intp]":
+    """Returns the pixels without a ray, counted row by row."""
+    fx, fy, cx, cy = intrinsics
+    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    return np.flatnonzero(np.isnan(pixel_slopes(distortion, K, width, height)[..., 0]))
 
 
 def _padded(numbers: Sequence[float], count: int) -> list[float]:
@@ -233,7 +206,7 @@ def _lengths(points: "NDArray[np.float64]") -> "NDArray[np.float64]":
 
 
 def _first_root(polynomial: Polynomial) -> float:
-    """Least positive real root; inf without one."""
+    """Returns the least positive real root; inf without one."""
     roots = polynomial.trim().roots()
     positive = roots.real[(roots.imag == 0) & (roots.real > 0)]
     return float(np.min(positive, initial=math.inf))

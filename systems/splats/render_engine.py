@@ -1,4 +1,4 @@
-"""Gaussians as the background of any Drake simulation."""
+"""Gaussian scenes in any Drake simulation."""
 
 from typing import Any, cast
 
@@ -29,6 +29,7 @@ from pydrake.systems.framework import Context
 from pydrake.systems.sensors import ImageDepth32F, ImageLabel16I, ImageRgba8U
 
 from splatpilot.systems.common.extras import load_triton
+from splatpilot.systems.common.validation import require
 from splatpilot.systems.splats.background import BLACK, Background, EnvironmentMap, pixel_rays
 from splatpilot.systems.splats.baked_scene import BakedScene, RenderedView
 from splatpilot.systems.splats.splat_camera import (
@@ -40,7 +41,7 @@ from splatpilot.systems.splats.splat_camera import (
 
 _SHAPES = "shapes"
 
-# The sky, and enough from the camera that no side of a shape is black.
+# A sky, and light from the camera, so that no side of a shape is black.
 _LIGHTS = [
     LightParameter(type="directional", frame="world", direction=[0.3, 0.2, -1], intensity=0.7),
     LightParameter(type="point", frame="camera", position=[0, 0, 0], intensity=0.8),
@@ -49,29 +50,25 @@ _LIGHTS = [
 
 class SplatRenderEngine(RenderEngine):
     """
-    Renders a Gaussian scene together with the shapes of a SceneGraph, the nearer of the two in each
-    pixel.
+    Renders a Gaussian scene together with the shapes of a SceneGraph, the nearer in each pixel.
 
     Add it with `scene_graph.AddRenderer("splats", SplatRenderEngine(scene))` and name "splats" in
     the cameras of `RgbdSensor`. The frame of the Gaussians is SceneGraph's world frame.
 
-    The shapes are rendered by a second engine with the same camera. Per pixel, with its colour c
-    and depth d (infinite where there is no shape) and the Gaussians' colour C, alpha A and median
-    depth D:
+    A second engine with the same camera renders the shapes. Per pixel, with its color c and depth d
+    (infinite without a shape) and the Gaussians' color C, alpha A and median depth D:
 
-    - colour is c where d <= D, else C + (1 - A) c: a shape behind thin leaves shines through them,
-      and where nothing is seen, it is the background of the shapes' engine or the environment;
-    - depth is the lesser of d and D, planar z in metres, 0 nearer than the camera's depth range and
-      infinity beyond it; where the Gaussians have no surface, it is d;
-    - labels are those of the shapes where d <= D or there is no D, else
-      `RenderLabel.kUnspecified`.
+    - color is c if d <= D, else C + (1 - A) c, with c that of the background or environment where
+      there is no shape;
+    - depth is min(d, D), planar z in meters, 0 nearer than the camera's depth range and infinity
+      beyond it; d if the Gaussians have no surface;
+    - labels are those of the shapes if d <= D or there is no D, else `RenderLabel.kUnspecified`.
 
-    A pixel has one D: a shape that stands between two translucent layers of Gaussians is drawn
-    before or behind both. Gaussians cast no shadows on shapes nor shapes on them.
+    A pixel has one D: a shape between two translucent layers of Gaussians is drawn before or behind
+    both. Gaussians cast no shadows on shapes, nor shapes on Gaussians.
 
     Drake copies an engine for every SceneGraph, Context and sensor that holds it; copies share the
-    scene. The last view of the Gaussians is kept, so that colour, depth and labels of one camera
-    cost one rendering of them.
+    scene. The last view is cached, so that all images of one camera cost one rendering.
     """
 
     def __init__(
@@ -82,16 +79,11 @@ class SplatRenderEngine(RenderEngine):
     ):
         """
         Args:
-            scene: the Gaussians, held by reference.
-            shapes: renders SceneGraph's shapes, and what is behind everything; it is copied.
-                RenderEngineVtk in front of `background` when None, which needs an OpenGL that works
-                without a display (Debian: libegl1 libegl-mesa0 libgl1-mesa-dri libglib2.0-0
-                libx11-6 libsm6).
-            background: what is behind everything: a colour, red, green, blue in [0, 1], of the
-                default `shapes`, where any other engine has its own; or an environment, for all.
-
-        Raises:
-            ValueError: `background` is not three numbers in [0, 1].
+            scene: Gaussians, held by reference.
+            shapes: engine of the shapes and the background, copied; RenderEngineVtk if None, which
+                needs an OpenGL that works without a display (Debian: libegl1 libegl-mesa0
+                libgl1-mesa-dri libglib2.0-0 libx11-6 libsm6).
+            background: color in [0, 1], of the default `shapes`; or an environment, of any.
         """
         super().__init__()
         environment, color = None, np.asarray(BLACK)
@@ -99,21 +91,21 @@ class SplatRenderEngine(RenderEngine):
             environment = background
         else:
             color = np.asarray(background)
-        if color.shape != (3,) or not np.all((color >= 0) & (color <= 1)):
-            raise ValueError(f"background is {background}; it must be three numbers in [0, 1]")
+        valid = color.shape == (3,) and np.all((color >= 0) & (color <= 1))
+        require(valid, "background", "three numbers in [0, 1]", background)
         load_triton()
         if shapes is None:
             shapes = MakeRenderEngineVtk(
                 RenderEngineVtkParams(default_clear_color=color, lights=_LIGHTS)
             )
-        # A SceneGraph of our own: the poses of what an engine holds are moved by SceneGraph alone.
+        # A SceneGraph of our own: only SceneGraph moves the geometries of an engine.
         scene_graph = SceneGraph()
         scene_graph.AddRenderer(_SHAPES, shapes)
         self._share(scene, environment, scene_graph)
         self._source = scene_graph.RegisterSource(_SHAPES)
         self._frames: dict[GeometryId, FrameId] = {}  # of every geometry ever registered
         self._X_WG: dict[FrameId, RigidTransform] = {}
-        self._geometries: dict[GeometryId, GeometryId] = {}  # theirs to that in _scene_graph
+        self._geometries: dict[GeometryId, GeometryId] = {}  # to that in _scene_graph
         self._X_WC = RigidTransform()
 
     def _share(
@@ -134,8 +126,8 @@ class SplatRenderEngine(RenderEngine):
         copy._X_WG = dict(self._X_WG)
         copy._geometries = dict(self._geometries)
         copy._X_WC = self._X_WC
-        # Of Python engines Drake does not copy the list of geometries whose poses it updates; only
-        # registration makes one. What the copy holds already, DoRegisterVisual leaves as it is.
+        # Drake does not copy the list of geometries with poses to update of a Python engine; only
+        # registration makes one. DoRegisterVisual ignores geometries that the copy already has.
         inspector = self._scene_graph.model_inspector()
         for id, ours in self._geometries.items():
             copy.RegisterVisual(
@@ -148,10 +140,8 @@ class SplatRenderEngine(RenderEngine):
 
     @property
     def scene(self) -> BakedScene:
-        """The Gaussians, one object for all copies of the engine."""
+        """The Gaussians, shared by all copies of the engine."""
         return self._scene
-
-    # What Drake calls.
 
     def UpdateViewpoint(self, X_WR: RigidTransform) -> None:
         self._X_WC = RigidTransform(X_WR)
@@ -170,7 +160,7 @@ class SplatRenderEngine(RenderEngine):
             self._frames[id] = self._scene_graph.RegisterFrame(self._source, GeometryFrame(name))
         self._X_WG[self._frames[id]] = RigidTransform(X_WG)
         properties = PerceptionProperties(properties)
-        # Which renderers accept the shape was decided in the SceneGraph that called.
+        # The calling SceneGraph has decided which renderers accept the shape.
         if properties.HasProperty("renderer", "accepting"):
             properties.RemoveProperty("renderer", "accepting")
         instance = GeometryInstance(RigidTransform(), shape, name)
@@ -224,8 +214,6 @@ class SplatRenderEngine(RenderEngine):
         labels = np.where(shape_seen & (shapes != empty), shapes, splats)
         np.asarray(label_image_out.mutable_data)[..., 0] = labels
 
-    # The two halves of an image.
-
     def _view(self, core: RenderCameraCore) -> RenderedView:
         key = self._key(core)
         if self._last_view is None or self._last_view[0] != key:
@@ -243,7 +231,7 @@ class SplatRenderEngine(RenderEngine):
         return self._last_view[1]
 
     def _depth(self, core: RenderCameraCore) -> NDArray[np.float32]:
-        """That of `_view`, which is not made for it  # (H, W) [m]."""
+        """Returns the depth (H, W) [m] of the cached view, else renders it alone."""
         if self._last_view is not None and self._last_view[0] == self._key(core):
             return self._last_view[1].depth
         info, clipping = core.intrinsics(), core.clipping()
@@ -251,7 +239,7 @@ class SplatRenderEngine(RenderEngine):
         return self._scene.render_depth(K, *size, self._X_WC, clipping.near(), clipping.far())
 
     def _key(self, core: RenderCameraCore) -> bytes:
-        """The camera and where it is."""
+        """Returns camera and pose as bytes."""
         info, clipping = core.intrinsics(), core.clipping()
         camera = [info.width(), info.height(), clipping.near(), clipping.far()]
         numbers = [camera, info.intrinsic_matrix().ravel(), self._X_WC.GetAsMatrix34().ravel()]
@@ -267,7 +255,7 @@ class SplatRenderEngine(RenderEngine):
         return cast(QueryObject, self._scene_graph.get_query_output_port().Eval(self._context))
 
     def _same(self, camera: Any) -> tuple[Any, FrameId, RigidTransform]:
-        """Arguments of QueryObject's functions that give `camera`, where it is, to our shapes."""
+        """Returns a camera of the shapes' renderer, at our pose, as QueryObject takes it."""
         core = camera.core()
         core = RenderCameraCore(_SHAPES, core.intrinsics(), core.clipping(), RigidTransform())
         if isinstance(camera, DepthRenderCamera):
@@ -277,7 +265,7 @@ class SplatRenderEngine(RenderEngine):
         return camera, self._scene_graph.world_frame_id(), self._X_WC
 
     def _shape_depth(self, core: RenderCameraCore) -> NDArray[np.float32]:
-        """Depth of the shapes wherever the camera sees any  # (H, W) [m]."""
+        """Returns the depth (H, W) [m] of the shapes between the clipping planes."""
         clipping = core.clipping()
         camera = DepthRenderCamera(core, DepthRange(clipping.near(), clipping.far()))
         return np.asarray(self._shapes().RenderDepthImage(*self._same(camera)).data)[..., 0]

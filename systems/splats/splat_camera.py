@@ -1,4 +1,4 @@
-"""A camera that sees Gaussians."""
+"""Cameras in Gaussian scenes."""
 
 import math
 from collections.abc import Iterator
@@ -20,6 +20,7 @@ from pydrake.systems.sensors import (
 )
 
 from splatpilot.systems.common.drake import input_port, output_port, weakly
+from splatpilot.systems.common.validation import require
 from splatpilot.systems.splats.background import BLACK, Background, EnvironmentMap, put_behind
 from splatpilot.systems.splats.baked_scene import (
     NO_GAUSSIANS,
@@ -46,11 +47,7 @@ def render_view(
     distortion: Distortion | None = None,
     max_depth: float = np.inf,
 ) -> RenderedView:
-    """What a camera of intrinsics K [px] at X_WC sees, through a lens; see `BakedScene.render`.
-
-    Drake's renderers and ours both have the centre of pixel (i, j) at (i + 1/2, j + 1/2), so its
-    intrinsics are taken as they are.
-    """
+    """Renders the view of a camera before any background; see `BakedScene.render`."""
     camera = (K, width, height, X_WC, near, far)
     if not isinstance(background, EnvironmentMap):
         return scene.render(*camera, background, moving, distortion, max_depth)
@@ -59,98 +56,59 @@ def render_view(
 
 
 def color_pixels(color: NDArray) -> NDArray[np.uint8]:
-    """Colours in [0, 1], clipped, as the nearest of 0 to 255."""
+    """Converts colors in [0, 1], clipped, to 8 bits."""
     return np.clip(color * 255.0 + 0.5, 0.0, 255.0).astype(np.uint8)
 
 
 def ranged_depth(
     depth: NDArray[np.float32], min_depth: float, max_depth: float
 ) -> NDArray[np.float32]:
-    """Planar depth (H, W) [m], 0 where there is no surface, as Drake's cameras show it.
+    """Converts planar depth (H, W) [m], 0 without a surface, to that of Drake's cameras.
 
-    Nearer than `min_depth` reads 0 and farther than `max_depth` reads infinity; so does a pixel
-    without a surface.
+    Nearer than `min_depth` reads 0; farther than `max_depth` and without a surface, infinity.
     """
-    seen = (depth > 0) & (depth <= max_depth)
-    return np.where(seen, np.where(depth < min_depth, np.float32(0), depth), np.inf)
+    in_range = (depth > 0) & (depth <= max_depth)
+    return np.where(in_range, np.where(depth < min_depth, np.float32(0), depth), np.inf)
 
 
 def surface_labels(view: RenderedView) -> NDArray[np.int16]:
-    """`RenderLabel.kUnspecified` where there is a surface and `RenderLabel.kEmpty` elsewhere:
-    Gaussians carry no semantics  # (H, W).
-    """
+    """Labels pixels (H, W) with a surface `kUnspecified` and others `kEmpty`."""
     unspecified, empty = int(RenderLabel.kUnspecified), int(RenderLabel.kEmpty)
     return np.where(view.depth > 0, unspecified, empty).astype(np.int16)
 
 
-# Rolling shutters: each row of an image is seen from where the camera was when it was read.
-#
-# Rows are read one after the other at even times, the first at the pose X_WC0 and the last at
-# X_WC1, those between at `pose_between`. Rows between which an image hardly moves are rendered
-# together, as a band, from the pose of their middle.
+# Rolling shutters: rows are read one after the other at even times, the first at the pose X_WC0 and
+# the last at X_WC1, those between at `pose_between`. Rows between which an image hardly moves are
+# rendered together, as a band, from the pose of their middle.
 
-
-_STEP = 0.5
-"""[px] that an image may move between two bands, so that no row is off by more than half of it."""
-_NEAREST = 1.0
-"""[m] Depth of what is told to move so far; what is nearer moves more."""
+_MAX_STEP = 0.5
+"""[px] by which the image of a point at `_NEAR` [m] may move from one band to the next."""
+_NEAR = 1.0
+_MIN_BANDS = 8
+"""Bands of an image with a rolling shutter if Gaussians move."""
 
 
 def row_bands(
-    X_WC0: RigidTransform, X_WC1: RigidTransform, focal: float, height: int, fewest: int = 1
+    X_WC0: RigidTransform, X_WC1: RigidTransform, focal: float, height: int, min_count: int = 1
 ) -> list[tuple[int, int]]:
-    """First row and row after the last of each band of an image.
+    """Divides an image into bands, from a first row to a row after the last.
 
     Args:
         X_WC0, X_WC1: poses of the camera at the first and the last row.
         focal: [px]
         height: [px]
-        fewest: bands at least, for what moves before a camera at rest.
+        min_count: number of bands at least.
     """
-    turned = (X_WC0.rotation().inverse() @ X_WC1.rotation()).ToAngleAxis().angle()
-    travelled = np.linalg.norm(X_WC1.translation() - X_WC0.translation())
-    moved = focal * (abs(turned) + float(travelled) / _NEAREST)
-    count = min(height, max(fewest, math.ceil(moved / _STEP)))
+    angle = (X_WC0.rotation().inverse() @ X_WC1.rotation()).ToAngleAxis().angle()
+    distance = np.linalg.norm(X_WC1.translation() - X_WC0.translation())
+    shift = focal * (abs(angle) + float(distance) / _NEAR)
+    count = min(height, max(min_count, math.ceil(shift / _MAX_STEP)))
     edges = np.linspace(0, height, count + 1).round().astype(int).tolist()
     return list(pairwise(edges))
 
 
-class Band(NamedTuple):
-    """Rows of an image that are rendered from one pose, as an image of their own."""
-
-    K: NDArray[np.float64]
-    """Its intrinsics (3, 3) [px]."""
-    height: int
-    """[px]"""
-    X_WC: RigidTransform
-    """Where its middle row is read."""
-    s: float
-    """When: 0 as the first row of all is, 1 as the last."""
-
-
-def camera_bands(
-    K: NDArray[np.float64],
-    height: int,
-    X_WC0: RigidTransform,
-    X_WC1: RigidTransform,
-    fewest: int = 1,
-) -> Iterator[Band]:
-    """The bands of an image of intrinsics K (3, 3) [px] from its first row to its last; else as
-    `row_bands`."""
-    focal = float(max(K[0, 0], K[1, 1]))
-    for first, last in row_bands(X_WC0, X_WC1, focal, height, fewest):
-        s = 0.5 * (first + last) / height
-        cropped = K.copy()
-        cropped[1, 2] -= first
-        yield Band(cropped, last - first, pose_between(X_WC0, X_WC1, s), s)
-
-
-_BANDS = 8
-"""Into which an image with a rolling shutter is cut at least where something moves."""
-
-
-class _Rows(NamedTuple):
-    """What is rendered from one pose."""
+class _Band(NamedTuple):
+    """Rows that are rendered from one pose."""
 
     camera: tuple[np.ndarray, int, int, RigidTransform]  # K (3, 3) [px], width, height, X_WC
     moving: PlacedGaussians
@@ -158,7 +116,7 @@ class _Rows(NamedTuple):
 
 class SplatCamera(LeafSystem):
     """
-    Colour, depth and label images of a Gaussian scene, with the output ports of Drake's
+    Renders color, depth and label images of a Gaussian scene, with the output ports of Drake's
     `RgbdSensor`.
 
     .. pydrake_system::
@@ -175,19 +133,17 @@ class SplatCamera(LeafSystem):
         - body_pose_in_world
         - image_time
 
-    `body_pose` is the pose X_WB of the body that carries the camera; the camera sits at X_WC = X_WB
-    X_BC with x right, y down and z forward, and images all of colour, depth and labels from there.
-    With a `readout`, a rolling shutter, that is where its last row is read, and `start_pose` the
-    pose X_WB where the first was; see `rolling_shutter`.
-    The images are rendered when a port is evaluated, once for all of them, and again only when the
-    pose has changed, or the time where something moves. Depth that is looked at alone is rendered
-    alone, which is faster, and has the same bits.
+    `body_pose` is the pose X_WB of the body that carries the camera; the camera has the pose X_WC =
+    X_WB X_BC with x right, y down and z forward for all images. With a `readout`, a rolling
+    shutter, that is the pose at the last row, and `start_pose` X_WB at the first.
 
-    Depth is planar z of the surface, the median depth of `rasterize`, in metres
-    (`depth_image_32f`) or millimetres (`depth_image_16u`). As in Drake, nearer than `min_depth`
-    reads 0, farther than `max_depth` reads infinity or 65535, and so does a pixel without a
-    surface. Labels are `RenderLabel.kUnspecified` where there is a surface and
-    `RenderLabel.kEmpty` elsewhere: Gaussians carry no semantics.
+    Images are rendered when a port is evaluated, and again if the pose has changed, or the time if
+    Gaussians move. Depth alone renders faster and is bitwise identical.
+
+    Depth is planar z of the surface, the median depth of `rasterize`, in meters
+    (`depth_image_32f`) or millimeters (`depth_image_16u`). As in Drake, nearer than `min_depth`
+    reads 0; farther than `max_depth` and pixels without a surface read infinity or 65535. Labels
+    are those of `surface_labels`.
     """
 
     body_pose_input_port = input_port("body_pose")
@@ -219,37 +175,25 @@ class SplatCamera(LeafSystem):
     ):
         """
         Args:
-            scene: what there is to see. A `BakedScene` is held by reference, so that many cameras
-                share one; a `GaussianScene` is baked for this camera alone.
+            scene: a `BakedScene` is held by reference, and many cameras may share it; a
+                `GaussianScene` is baked for this camera.
             camera_info: intrinsics, width and height.
-            X_BC: pose of the camera in the body that carries it; identity when None.
+            X_BC: pose of the camera in the body that carries it; identity if None.
             min_depth, max_depth: range of the depth image [m].
-            near, far: Gaussians whose centre is not between these planes are not drawn [m].
-            background: colour behind everything, red, green, blue in [0, 1], or one for each
-                direction.
-            moving: what moves among the scene's Gaussians.
-            latency: age of the images [s]: what moves is where it was so long ago. The pose that
-                the camera is given must be as old.
-            distortion: of the lens; None for a pinhole. What it does not show is no surface.
+            near, far: Gaussians with a center outside these planes are not drawn [m].
+            background: color in [0, 1] or environment behind everything.
+            moving: Gaussians that move among the scene's.
+            latency: age of the images [s], by which moving Gaussians are late. The pose that the
+                camera is given must be as old.
+            distortion: lens; a pinhole if None. Pixels without a ray have no surface.
             readout: time between reading the first row and the last [s]; 0 reads all at once.
-
-        Raises:
-            ValueError: if the depth range is empty, a focal length is not positive or `readout` is
-                negative; for a distortion that makes no sense.
         """
         super().__init__()
-        if not 0 <= min_depth < max_depth < np.inf:
-            raise ValueError(
-                f"camera depth range is [{min_depth}, {max_depth}] m; it must satisfy "
-                "0 <= min_depth < max_depth < inf"
-            )
-        if camera_info.focal_x() <= 0 or camera_info.focal_y() <= 0:
-            raise ValueError(
-                f"camera focal lengths are {camera_info.focal_x()}, {camera_info.focal_y()} "
-                "pixels; both must be positive"
-            )
-        if not 0.0 <= readout < np.inf:
-            raise ValueError(f"camera readout is {readout} s; it must be at least 0 and finite")
+        valid, got = 0 <= min_depth < max_depth < np.inf, f"[{min_depth}, {max_depth}] m"
+        require(valid, "the depth range", "0 <= min_depth < max_depth < inf", got)
+        focal = camera_info.focal_x(), camera_info.focal_y()
+        require(min(focal) > 0, "the focal lengths", "> 0 px", focal)
+        require(0.0 <= readout < np.inf, "readout", "finite and >= 0 s", readout)
         self._scene = BakedScene(scene) if isinstance(scene, GaussianScene) else scene
         self._camera_info = camera_info
         self._X_BC = RigidTransform() if X_BC is None else X_BC
@@ -304,31 +248,29 @@ class SplatCamera(LeafSystem):
         )
 
     def camera_info(self) -> CameraInfo:
-        """The intrinsics."""
         return self._camera_info
 
     def X_BC(self) -> RigidTransform:
-        """The pose of the camera in the body that carries it."""
         return self._X_BC
 
     def render(
         self, X_WB: RigidTransform, time: float = 0.0, X_WB_start: RigidTransform | None = None
     ) -> RenderedView:
-        """The view from body pose X_WB at a time [s]: float colour, depth up to the camera's
-        `max_depth`, and alpha, before they become Drake images. Where X_WB_start is given, the
-        first row is read there, `readout` before.
+        """Renders the view from body pose X_WB at a time [s], before it becomes Drake images.
+
+        The first row is read from X_WB_start, unless that is None, `readout` before.
         """
         views = [
             render_view(
                 self._scene,
-                *rows.camera,
+                *band.camera,
                 *self._clipping,
                 background=self._background,
-                moving=rows.moving,
+                moving=band.moving,
                 distortion=self._distortion,
                 max_depth=self._depth_range[1],
             )
-            for rows in self._bands(X_WB, time, X_WB_start)
+            for band in self._bands(X_WB, time, X_WB_start)
         ]
         if len(views) == 1:
             return views[0]
@@ -336,24 +278,27 @@ class SplatCamera(LeafSystem):
 
     def _bands(
         self, X_WB: RigidTransform, time: float, X_WB_start: RigidTransform | None
-    ) -> Iterator[_Rows]:
-        """Rows that are rendered from one pose, from the first to the last."""
+    ) -> Iterator[_Band]:
         info, time = self._camera_info, time - self._latency
         K, width, height = info.intrinsic_matrix(), info.width(), info.height()
         X_WC1 = X_WB @ self._X_BC
         if X_WB_start is None:
-            yield _Rows((K, width, height, X_WC1), self._among(time))
+            yield _Band((K, width, height, X_WC1), self._moved(time))
             return
-        X_WC0, fewest = X_WB_start @ self._X_BC, 1 if self._moving is None else _BANDS
-        for band in camera_bands(K, height, X_WC0, X_WC1, fewest):
-            camera = (band.K, width, band.height, band.X_WC)
-            yield _Rows(camera, self._among(time - (1.0 - band.s) * self._readout))
+        X_WC0, min_count = X_WB_start @ self._X_BC, 1 if self._moving is None else _MIN_BANDS
+        focal = float(max(K[0, 0], K[1, 1]))
+        for first, last in row_bands(X_WC0, X_WC1, focal, height, min_count):
+            s = 0.5 * (first + last) / height  # of the time from the first row to the last
+            K_band = K.copy()
+            K_band[1, 2] -= first
+            camera = (K_band, width, last - first, pose_between(X_WC0, X_WC1, s))
+            yield _Band(camera, self._moved(time - (1.0 - s) * self._readout))
 
-    def _among(self, time: float) -> PlacedGaussians:
+    def _moved(self, time: float) -> PlacedGaussians:
         return NO_GAUSSIANS if self._moving is None else self._moving.at(max(0.0, time))
 
     def _poses(self, context) -> tuple[RigidTransform, float, RigidTransform | None]:
-        """Where the last row is read, when, and where the first is with a rolling shutter."""
+        """Returns X_WB at the last row, the time, and X_WB at the first row if it differs."""
         X_WB = cast(RigidTransform, self.GetInputPort("body_pose").Eval(context))
         start = None
         if self._readout > 0.0:
@@ -364,20 +309,19 @@ class SplatCamera(LeafSystem):
         value.set_value(self.render(*self._poses(context)))
 
     def _calc_depth(self, context, value) -> None:
-        """(H, W) [m], with 0 and inf out of range."""
         entry = self.get_cache_entry(self._view_index)
         if not entry.is_out_of_date(context):
             depth = self._view(context).depth
         else:
             depths = [
                 self._scene.render_depth(
-                    *rows.camera,
+                    *band.camera,
                     *self._clipping,
                     max_depth=self._depth_range[1],
-                    moving=rows.moving,
+                    moving=band.moving,
                     distortion=self._distortion,
                 )
-                for rows in self._bands(*self._poses(context))
+                for band in self._bands(*self._poses(context))
             ]
             depth = depths[0] if len(depths) == 1 else np.concatenate(depths)
         value.set_value(ranged_depth(depth, *self._depth_range))
@@ -397,8 +341,8 @@ class SplatCamera(LeafSystem):
         value.get_mutable_value().mutable_data[..., 0] = self._depth(context)
 
     def _calc_depth_16u(self, context, value) -> None:
-        millimetres = np.minimum(self._depth(context) * 1000.0 + 0.5, 65535.0)
-        value.get_mutable_value().mutable_data[..., 0] = millimetres
+        millimeters = np.minimum(self._depth(context) * 1000.0 + 0.5, 65535.0)
+        value.get_mutable_value().mutable_data[..., 0] = millimeters
 
     def _calc_label(self, context, value) -> None:
         value.get_mutable_value().mutable_data[..., 0] = surface_labels(self._view(context))

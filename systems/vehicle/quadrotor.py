@@ -8,7 +8,6 @@ Expression, and torch batches, so that the simulated plant and the training loop
 """
 
 import math
-import sys
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass
 from typing import Any
@@ -21,7 +20,8 @@ from pydrake.systems.framework import (
 from pydrake.systems.scalar_conversion import TemplateSystem
 
 from splatpilot.systems.common.drake import input_port, output_port
-from splatpilot.systems.vehicle.state import QuadrotorState
+from splatpilot.systems.common.validation import Config, bounded
+from splatpilot.systems.vehicle.state import QuadrotorState, array_namespace
 
 VEHICLE_RADIUS = 0.354
 """Propeller-tip radius of the vehicle [m]: closer than this to a surface is a collision."""
@@ -33,38 +33,26 @@ _NORM_GAIN = 5.0  # [1/s] pull of the quaternion towards unit length; errors dec
 
 
 @dataclass
-class QuadrotorParams:
+class QuadrotorParams(Config):
     """Parameters of the quadrotor; the defaults describe a small camera drone."""
 
     # [1/s] Linear drag coefficient over mass. Identified racing quadrotors have 0.39-0.54
     # (Faessler, Franchi, Scaramuzza, RA-L 2018).
-    drag: float = 0.375
+    drag: float = bounded(0.375, "[0, inf) 1/s")
     # [s] First-order lag of the body rates behind their command.
-    rate_time_constant: float = 0.05
+    rate_time_constant: float = bounded(0.05, "(0, inf) s")
     # [m/s^2] Gravitational acceleration, along -z of the world.
-    gravity: float = GRAVITY
-
-    def validate(self) -> None:
-        """Raises ValueError unless drag >= 0, rate_time_constant > 0, gravity >= 0, all finite."""
-        for name, unit in (("drag", "1/s"), ("rate_time_constant", "s"), ("gravity", "m/s^2")):
-            value = getattr(self, name)
-            positive = name == "rate_time_constant"
-            if not math.isfinite(value) or value < 0.0 or (positive and value == 0.0):
-                limit = "positive" if positive else "at least 0"
-                raise ValueError(
-                    f"QuadrotorParams.{name} is {value} {unit} but must be finite and {limit}; "
-                    f"the default is {getattr(QuadrotorParams, name)}"
-                )
+    gravity: float = bounded(GRAVITY, "[0, inf) m/s^2")
 
 
 def hover_state(p_WB: Sequence[float] | np.ndarray, yaw: float = 0.0) -> np.ndarray:
-    """The state (13,) at rest and level at ``p_WB`` (3,) [m], facing ``yaw`` [rad] from world x."""
+    """Returns the state (13,) at rest, level at `p_WB` (3,) [m], facing `yaw` [rad] from x."""
     q_WB = [math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)]
     return QuadrotorState(p_WB, np.zeros(3), q_WB, np.zeros(3)).to_vector()
 
 
 def quadrotor_derivatives(state: Any, command: Any, params: QuadrotorParams) -> Any:
-    """Time derivative (..., 13) of ``state`` (..., 13) under ``command`` (..., 4).
+    """Returns the time derivative (..., 13) of ``state`` (..., 13) under ``command`` (..., 4).
 
     Both are numpy arrays (of float, AutoDiffXd or Expression) or both torch tensors; their
     leading shapes broadcast. The equations, with z_B the body z axis and ⊗ the Hamilton product::
@@ -75,26 +63,14 @@ def quadrotor_derivatives(state: Any, command: Any, params: QuadrotorParams) -> 
         d/dt w_WB_B = (w_cmd_B - w_WB_B) / rate_time_constant
 
     The last term of the quaternion rate holds its length at one against integration error. The
-    attitude is that of the normalised quaternion, which must not be zero.
+    attitude is that of the normalized quaternion, which must not be zero.
     """
-    torch = sys.modules.get("torch")  # A tensor can only come from a torch already imported.
-    if torch is not None and isinstance(state, torch.Tensor):
-        rates = component_derivatives(
-            state.unbind(-1),
-            command.unbind(-1),
-            params.drag,
-            params.rate_time_constant,
-            params.gravity,
-        )
-        return torch.stack(torch.broadcast_tensors(*rates), dim=-1)
-    state, command = np.asarray(state), np.asarray(command)
     rates = component_derivatives(
-        [state[..., i] for i in range(13)],
-        [command[..., i] for i in range(4)],
-        params.drag,
-        params.rate_time_constant,
-        params.gravity,
+        [state[..., i] for i in range(13)], [command[..., i] for i in range(4)], *astuple(params)
     )
+    xp = array_namespace(state)
+    if xp is not np:
+        return xp.stack(xp.broadcast_tensors(*rates), dim=-1)
     shape = np.broadcast_shapes(state.shape[:-1], command.shape[:-1])
     derivatives = np.empty((*shape, 13), np.result_type(state, command))
     for i, rate in enumerate(rates):
@@ -105,10 +81,9 @@ def quadrotor_derivatives(state: Any, command: Any, params: QuadrotorParams) -> 
 def component_derivatives(
     state: Any, command: Any, drag: Any, rate_time_constant: Any, gravity: Any
 ) -> tuple[Any, ...]:
-    """The 13 components of :func:`quadrotor_derivatives`, each from the 13 + 4 components given.
+    """Returns the 13 components of :func:`quadrotor_derivatives` from 13 + 4 components.
 
-    Components may be anything with arithmetic; plain Python floats are by far the fastest for a
-    single vehicle.
+    Plain Python floats are by far the fastest for a single vehicle.
     """
     _, _, _, vx, vy, vz, qw, qx, qy, qz, wx, wy, wz = state
     c, wx_cmd, wy_cmd, wz_cmd = command
@@ -134,7 +109,7 @@ def component_derivatives(
 
 
 def rk4_step(state: Any, command: Any, params: QuadrotorParams, dt: Any) -> Any:
-    """The state (..., 13) after ``dt`` [s] of constant ``command`` (..., 4).
+    """Returns the state (..., 13) after ``dt`` [s] of constant ``command`` (..., 4).
 
     One step of the classical fourth-order Runge-Kutta method, for the array types of
     :func:`quadrotor_derivatives` and differentiable as they are.
@@ -149,7 +124,7 @@ def rk4_step(state: Any, command: Any, params: QuadrotorParams, dt: Any) -> Any:
 @TemplateSystem.define("QuadrotorPlant_")
 def QuadrotorPlant_(T):
     class Impl(LeafSystem_[T]):
-        """A quadrotor that follows commanded thrust exactly and body rates with a short lag.
+        """Simulates a quadrotor: exact thrust, body rates with a short lag.
 
         .. pydrake_system::
 
@@ -171,10 +146,6 @@ def QuadrotorPlant_(T):
         scalars float, AutoDiffXd and Expression. Integrate in steps of at most 0.02 s without error
         control: after 5 s of new random commands every 0.02 s, ``runge_kutta3`` is within 2 cm of
         the solution and ``runge_kutta5``, at twice the cost, within 0.2 mm.
-
-        Raises:
-            ValueError: if a parameter is out of range, see :class:`QuadrotorParams`, or the initial
-                state has another shape.
         """
 
         command_input_port = input_port("command")
@@ -210,9 +181,8 @@ def QuadrotorPlant_(T):
                 rates = component_derivatives(state, command, drag, tau, gravity)
             except ZeroDivisionError:
                 raise ValueError(
-                    f"QuadrotorPlant: at t = {context.get_time()} s q_WB is {state[6:10]} and "
-                    f"rate_time_constant is {tau} s but neither may be zero; set a unit "
-                    "quaternion (w, x, y, z) and a positive time constant in the Context"
+                    f"q_WB and rate_time_constant of {self.get_name()} must not be zero, got "
+                    f"{state[6:10]} and {tau} s at t = {context.get_time()} s"
                 ) from None
             derivatives.get_mutable_vector().SetFromVector(np.array(rates))
 

@@ -1,6 +1,8 @@
-"""The 13 numbers of a quadrotor's state, by name."""
+"""A quadrotor's state by name, its pose and prediction, and quaternions (wxyz)."""
 
 import math
+import sys
+from types import ModuleType
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -8,13 +10,14 @@ from pydrake.common.eigen_geometry import Quaternion
 from pydrake.common.value import Value
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
+from scipy.spatial.transform import Rotation
 
 from splatpilot.systems.common.drake import input_port, output_port, weakly
+from splatpilot.systems.common.validation import require
 
 
 class QuadrotorState(NamedTuple):
-    """States (..., 13) in their parts, which are numpy arrays (of float, AutoDiffXd or Expression)
-    or torch tensors."""
+    """Parts of states (..., 13): numpy arrays (float, AutoDiffXd, Expression) or torch tensors."""
 
     p_WB: Any
     """(..., 3) [m], position in the world."""
@@ -27,46 +30,89 @@ class QuadrotorState(NamedTuple):
 
     @classmethod
     def of(cls, x: Any) -> Self:
-        """The parts of states x (..., 13), as views: what is written to them is written to x.
-
-        Raises:
-            ValueError: if x has another shape.
-        """
-        if x.shape[-1:] != (13,):
-            raise ValueError(f"a state has shape {tuple(x.shape)}; it must be (..., 13)")
+        """Returns the parts of states x (..., 13), as views that write through."""
+        require(x.shape[-1:] == (13,), "shape of states", "(..., 13)", tuple(x.shape))
         return cls(x[..., 0:3], x[..., 3:6], x[..., 6:10], x[..., 10:13])
 
     @property
     def tilt(self) -> np.ndarray:
-        """(...) [rad], between body z and vertical, of parts that are numpy arrays of float."""
+        """(...) [rad], between body z and vertical, for numpy arrays of float."""
         w, x, y, z = np.moveaxis(self.q_WB, -1, 0)
         return np.arccos(np.clip(w * w - x * x - y * y + z * z, -1.0, 1.0))
 
     @property
     def heading(self) -> np.ndarray:
-        """(...) [rad], of body x seen from above, of parts that are numpy arrays of float."""
+        """(...) [rad], of body x seen from above, for numpy arrays of float."""
         w, x, y, z = np.moveaxis(self.q_WB, -1, 0)
         return np.arctan2(2.0 * (w * z + x * y), w * w + x * x - y * y - z * z)
 
     def to_vector(self) -> np.ndarray:
-        """The states (..., 13) of these parts, numpy arrays."""
+        """Returns the states (..., 13) of these parts, numpy arrays."""
         return np.concatenate(self, axis=-1)
 
 
 def pose_from_state(state: np.ndarray) -> RigidTransform:
-    """X_WB of ``state`` (13,), its quaternion normalised.
-
-    Raises:
-        ValueError: if the quaternion is zero or not finite.
-    """
+    """Returns X_WB of `state` (13,), whose quaternion may have any length but zero."""
     p_WB, _, q_WB, _ = QuadrotorState.of(state)
+    return RigidTransform(Quaternion(q_WB / require_rotation(q_WB)), p_WB)
+
+
+def require_rotation(q_WB: np.ndarray) -> float:
+    """Returns the length of a quaternion (4,); raises ValueError if it is zero or not finite."""
     norm = math.sqrt(q_WB.dot(q_WB))
-    if not 1e-9 < norm < math.inf:
-        raise ValueError(
-            f"the attitude quaternion q_WB = {q_WB.tolist()} has length {norm} and is no rotation; "
-            "set entries 6 to 9 of the state to a unit quaternion (w, x, y, z)"
-        )
-    return RigidTransform(Quaternion(q_WB / norm), p_WB)
+    condition = "a rotation (w, x, y, z), entries 6 to 9 of the state,"
+    require(1e-9 < norm < math.inf, "q_WB", condition, q_WB.tolist())
+    return norm
+
+
+def array_namespace(array: Any) -> ModuleType:
+    """Returns the module whose functions take an array: numpy or torch."""
+    torch = sys.modules.get("torch")  # A tensor can only come from an imported torch.
+    return torch if torch is not None and isinstance(array, torch.Tensor) else np
+
+
+def stack(parts: list) -> Any:
+    """Stacks numbers or arrays along a new last axis; a list of rows along two."""
+    rows = isinstance(parts[0], list)
+    first = parts[0][0] if rows else parts[0]
+    if np.ndim(first) == 0 and array_namespace(first) is np:
+        return np.array(parts)  # numpy's stack costs several times as much on single numbers
+    arrays = [stack(row) for row in parts] if rows else parts
+    return array_namespace(first).stack(arrays, -2 if rows else -1)
+
+
+def clip(x: Any, low: float | None = None, high: float | None = None) -> Any:
+    """Clips as `numpy.clip`, which costs several times as much on single numbers."""
+    if array_namespace(x) is not np:
+        return x.clip(low, high)
+    x = x if low is None else np.maximum(x, low)
+    return x if high is None else np.minimum(x, high)
+
+
+def lengths(vectors: Any) -> Any:
+    """Returns the lengths (..., 1) of vectors (..., n), with zero gradient at zero."""
+    xp = array_namespace(vectors)
+    if xp is np:
+        return np.sqrt((vectors * vectors).sum(-1, keepdims=True))
+    return xp.linalg.vector_norm(vectors, dim=-1, keepdim=True)
+
+
+def unit_vectors(vectors: Any) -> Any:
+    """Returns vectors (..., n) at unit length; zero stays zero."""
+    return vectors / clip(lengths(vectors), low=1e-12)
+
+
+def rotation_matrices(q: Any) -> Any:
+    """Returns the rotation matrices (..., 3, 3) of quaternions (..., 4) wxyz of any length."""
+    q = unit_vectors(q)
+    w, x, y, z = (q[..., i] for i in range(4))
+    return stack(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
 
 
 class StateToPose(LeafSystem):
@@ -81,9 +127,8 @@ class StateToPose(LeafSystem):
         - pose
 
     - ``state`` (13): ``[p_WB (3) [m], v_WB (3) [m/s], q_WB (4, wxyz), w_WB_B (3) [rad/s]]``.
-    - ``pose`` (abstract, RigidTransform): X_WB; the quaternion is normalised first.
-
-    Evaluating ``pose`` raises ValueError if the quaternion is zero or not finite.
+    - ``pose`` (abstract, RigidTransform): X_WB; the quaternion is normalized first. A zero or
+      non-finite quaternion is an error.
     """
 
     state_input_port = input_port("state")
@@ -102,22 +147,19 @@ class StateToPose(LeafSystem):
 
 
 LONGEST_PREDICTION = 0.1
-"""[s], how old states can be brought up to date."""
+"""[s], maximum age of states that are predicted to the present."""
 
 
 def predict_state(state: np.ndarray, duration: float) -> np.ndarray:
-    """The state (13,) `duration` [s] later, if neither velocity nor body rates change meanwhile."""
+    """Returns the state (13,) `duration` [s] later, at constant velocity and body rates."""
     p_WB, v_WB, q_WB, w_WB_B = QuadrotorState.of(state)
-    half = 0.5 * duration * w_WB_B
-    angle = math.hypot(*half)
-    turn = np.append(math.cos(angle), half * (np.sinc(angle / math.pi)))
-    s, v, t, u = q_WB[0], q_WB[1:], turn[0], turn[1:]
-    q = np.append(s * t - v.dot(u), s * u + t * v + np.cross(v, u))
+    R_WB = Rotation.from_quat(q_WB, scalar_first=True) * Rotation.from_rotvec(duration * w_WB_B)
+    q = R_WB.as_quat(scalar_first=True)
     return QuadrotorState(p_WB + duration * v_WB, v_WB, q, w_WB_B).to_vector()
 
 
 class StatePredictor(LeafSystem):
-    """Brings a measured state up to date, see `predict_state`.
+    """Predicts a measured state to the present, see `predict_state`.
 
     .. pydrake_system::
 
@@ -130,8 +172,8 @@ class StatePredictor(LeafSystem):
 
     - ``measured_state`` (13), ``state`` (13): as those of
       :class:`~splatpilot.systems.vehicle.quadrotor.QuadrotorPlant`.
-    - ``age`` (1): [s] since it was measured; it counts for 0 to ``longest``, so that neither clocks
-      that disagree nor a vehicle that fell silent lead far away.
+    - ``age`` (1): [s] since it was measured, clipped to [0, ``longest``] against clocks that
+      disagree and vehicles that fell silent.
 
     Stateless.
     """
@@ -141,7 +183,7 @@ class StatePredictor(LeafSystem):
     state_output_port = output_port("state")
 
     def __init__(self, longest: float = LONGEST_PREDICTION):
-        """Constructs the system; `longest` is how far it predicts [s]."""
+        """Constructs the system, which predicts at most `longest` [s] ahead."""
         super().__init__()
         self._longest = longest
         self.DeclareVectorInputPort("measured_state", 13)
@@ -155,9 +197,8 @@ class StatePredictor(LeafSystem):
 
 
 def pose_between(X_WC0: RigidTransform, X_WC1: RigidTransform, s: float) -> RigidTransform:
-    """The pose at the fraction s of the way from X_WC0 to X_WC1: along the line between the
-    positions, and turned about one axis."""
-    turn = (X_WC0.rotation().inverse() @ X_WC1.rotation()).ToAngleAxis()
-    turn.set_angle(s * turn.angle())
+    """Returns the pose at the fraction s from X_WC0 to X_WC1: straight, about one axis."""
+    rotation = (X_WC0.rotation().inverse() @ X_WC1.rotation()).ToAngleAxis()
+    rotation.set_angle(s * rotation.angle())
     p_WC = (1.0 - s) * X_WC0.translation() + s * X_WC1.translation()
-    return RigidTransform(X_WC0.rotation() @ RotationMatrix(turn), p_WC)
+    return RigidTransform(X_WC0.rotation() @ RotationMatrix(rotation), p_WC)

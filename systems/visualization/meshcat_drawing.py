@@ -1,4 +1,4 @@
-"""What stands still on a Meshcat scene: world, goal, vehicle, distance field."""
+"""Drawing in Meshcat: world, goal, vehicle, distances, hypotheses and camera images."""
 
 import json
 from typing import cast
@@ -15,8 +15,7 @@ from pydrake.systems.sensors import CameraInfo, ImageRgba8U
 
 from splatpilot.systems.collision.distance_field import DistanceField, FieldState
 from splatpilot.systems.collision.field_mesh import add_primitive, data_uri
-from splatpilot.systems.collision.shapes import MovingBalls
-from splatpilot.systems.common.drake import input_port
+from splatpilot.systems.collision.shapes import MovingSpheres
 from splatpilot.systems.policies.hypotheses import Hypotheses, hypotheses_size, num_hypotheses_in
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.splats.splat_camera import SplatCamera
@@ -32,22 +31,21 @@ def draw_gaussians(
     max_points: int = 120_000,
 ) -> None:
     """
-    Draws the centres of the Gaussians inside a box as coloured points, evenly thinned.
+    Draws the centers of the Gaussians inside a box as colored points, evenly thinned.
 
-    The points are as large as the median Gaussian, so that surfaces look closed.
+    Points have the size of the median Gaussian, so that surfaces look closed.
 
     Args:
         path: Meshcat path of the point cloud.
-        lower_W, upper_W: corners of the box (3,) [m]; what lies outside (sky, far hills) is left
-            out.
-        max_points: most points drawn.
+        lower_W, upper_W: corners of the box (3,) [m].
+        max_points: max number of points.
     """
     inside = np.flatnonzero(np.all((scene.means >= lower_W) & (scene.means <= upper_W), axis=1))
     if len(inside) > max_points:
         inside = inside[np.linspace(0, len(inside) - 1, max_points).astype(int)]
     cloud = PointCloud(len(inside), Fields(BaseField.kXYZs | BaseField.kRGBs))
     cloud.mutable_xyzs()[:] = scene.means[inside].T
-    # Meshcat takes the colours of points for linear light and encodes them for the screen itself.
+    # Meshcat expects linear colors of points.
     cloud.mutable_rgbs()[:] = (scene.base_colors[inside].T ** 2.2 * 255).astype(np.uint8)
     extent = np.median(scene.scales[inside].max(axis=1)) if len(inside) else 0.05
     meshcat.SetObject(path, cloud, point_size=2.0 * float(extent))
@@ -119,16 +117,16 @@ def distance_slice(
     field: DistanceField, height: float, spacing: float, reach: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """
-    The horizontal slice of a distance field at z = `height` [m], as a coloured mesh.
+    The horizontal slice of a distance field at z = `height` [m], as a colored mesh.
 
     Red is at or inside a surface, fading through yellow to blue at `reach` [m] and more; unknown
-    space is grey.
+    space is gray.
 
     Args:
         spacing: distance between the samples [m].
 
     Returns:
-        Its vertices p_WQ (N, 3) [m], faces (M, 3), which are seen from above, and the colours of
+        Its vertices p_WQ (N, 3) [m], faces (M, 3), which are seen from above, and the colors of
         the vertices (N, 3), 0 to 1.
     """
     lower_W, upper_W = np.asarray(field.lower_W), np.asarray(field.upper_W)
@@ -161,7 +159,7 @@ def draw_distance_slice(
     Draws the `distance_slice` of a field, blue from 2 m on.
 
     Args:
-        path: Meshcat path of the coloured mesh.
+        path: Meshcat path of the colored mesh.
         height: of the slice, z [m].
         spacing: distance between the samples [m].
     """
@@ -170,7 +168,7 @@ def draw_distance_slice(
 
 
 _TRAIL = 120
-"""How many pictures the trail reaches back."""
+"""[-] Number of images that the trail spans."""
 
 
 class FlightVisualizer(LeafSystem):
@@ -180,18 +178,11 @@ class FlightVisualizer(LeafSystem):
     .. pydrake_system::
 
         name: FlightVisualizer
-        input_ports:
-        - state
-        - hypotheses
+        input_ports: [state, hypotheses]
 
-    Publishes every `period` seconds, for who watches live: a Meshcat recording keeps the vehicle's
-    pose alone, where `replay_page` has the rest. The vehicle's shape is expected at
-    `<path>/vehicle` (see `draw_vehicle`). The trail is one line, and the fan one mesh: hypotheses
-    run from green (cheapest) to red (dearest).
+    Publishes every `period` seconds. `<path>/vehicle` must have the vehicle's shape, see
+    `draw_vehicle`. Hypotheses are green (lowest cost) to red (highest).
     """
-
-    state_input_port = input_port("state")
-    hypotheses_input_port = input_port("hypotheses")
 
     def __init__(
         self,
@@ -203,10 +194,9 @@ class FlightVisualizer(LeafSystem):
         """
         Args:
             meshcat: where to draw.
-            num_hypotheses: how many trajectories the `hypotheses` port carries; without any there
-                is no such port, and no fan.
-            period: time between two pictures [s].
-            path: Meshcat path under which everything is drawn.
+            num_hypotheses: number of trajectories; 0 for no port `hypotheses`.
+            period: time between images [s].
+            path: Meshcat path of all objects.
         """
         super().__init__()
         self._meshcat = meshcat
@@ -216,7 +206,7 @@ class FlightVisualizer(LeafSystem):
         self.DeclareVectorInputPort("state", 13)
         if num_hypotheses:
             self.DeclareVectorInputPort("hypotheses", hypotheses_size(num_hypotheses))
-        # Positions of the last pictures, the latest last; NaN where there were fewer.
+        # Positions of the last images, the latest last; NaN before.
         self.DeclareDiscreteState(np.full(3 * _TRAIL, np.nan))
         self.DeclarePeriodicPublishEvent(period, 0.0, self._publish)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._extend_trail)
@@ -228,20 +218,20 @@ class FlightVisualizer(LeafSystem):
         meshcat: Meshcat,
         hypotheses_port: OutputPort | None = None,
     ) -> "FlightVisualizer":
-        """Adds a visualizer, named `flight_visualizer`, of a state and perhaps of hypotheses."""
+        """Adds a visualizer, named `flight_visualizer`."""
         count = num_hypotheses_in(hypotheses_port.size()) if hypotheses_port is not None else 0
         visualizer = FlightVisualizer(meshcat, count)
         builder.AddNamedSystem("flight_visualizer", visualizer)
-        builder.Connect(state_port, visualizer.state_input_port())
+        builder.Connect(state_port, visualizer.GetInputPort("state"))
         if hypotheses_port is not None:
-            builder.Connect(hypotheses_port, visualizer.hypotheses_input_port())
+            builder.Connect(hypotheses_port, visualizer.GetInputPort("hypotheses"))
         return visualizer
 
     def _eval(self, port: str, context: Context) -> np.ndarray:
         return np.asarray(self.GetInputPort(port).Eval(context))
 
     def _trail(self, context: Context) -> np.ndarray:
-        """(n, 3) [m] The positions of the last pictures and of this one."""
+        """Returns the positions (n, 3) [m] of the last images and of this one."""
         before = context.get_discrete_state_vector().value().reshape(-1, 3)
         p_WB = QuadrotorState.of(self._eval("state", context)).p_WB
         return np.vstack([before[~np.isnan(before[:, 0])], p_WB])
@@ -267,13 +257,13 @@ class FlightVisualizer(LeafSystem):
 
 def fan_mesh(plan: Hypotheses, width: float = 0.02) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """
-    Level ribbons along K hypotheses, from green (cheapest) to red (dearest).
+    Makes level ribbons along K hypotheses, from green (lowest cost) to red (highest).
 
     Args:
         width: of a ribbon [m].
 
     Returns:
-        Vertices (3, V) [m], triangles (3, F) int32 seen from both sides, colours (3, V) in 0 to 1.
+        Vertices (3, V) [m], triangles (3, F) int32 seen from both sides, colors (3, V) in 0 to 1.
     """
     K = len(plan.costs)
     start = np.broadcast_to(plan.X_WB.translation(), (K, 1, 3))
@@ -282,9 +272,9 @@ def fan_mesh(plan: Hypotheses, width: float = 0.02) -> tuple[np.ndarray, np.ndar
     across = np.stack([-along[..., 1], along[..., 0], np.zeros(along.shape[:2])], axis=-1)
     across /= np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-9)
     sides = np.stack([path - 0.5 * width * across, path + 0.5 * width * across], axis=2)
-    dearness = (plan.costs - plan.costs.min()) / max(np.ptp(plan.costs), 1e-9)
+    cost = (plan.costs - plan.costs.min()) / max(np.ptp(plan.costs), 1e-9)
     color = np.column_stack(
-        [np.minimum(1, 2 * dearness), np.minimum(1, 2 * (1 - dearness)), np.full(K, 0.1)]
+        [np.minimum(1, 2 * cost), np.minimum(1, 2 * (1 - cost)), np.full(K, 0.1)]
     )
     T = path.shape[1]
     first = (2 * (np.arange(K)[:, None] * T + np.arange(T - 1))).ravel()
@@ -295,19 +285,16 @@ def fan_mesh(plan: Hypotheses, width: float = 0.02) -> tuple[np.ndarray, np.ndar
 
 class CameraVisualizer(LeafSystem):
     """
-    Hangs what the camera sees in front of it in Meshcat, as a picture across the view frustum.
+    Shows the camera's image in Meshcat, across its view frustum.
 
     .. pydrake_system::
 
         name: CameraVisualizer
-        input_ports:
-        - color_image
+        input_ports: [color_image]
 
-    Takes an image every `period` seconds and shows every `stride`-th. The picture is a child of the
-    vehicle's Meshcat path, so it moves with the vehicle at X_BC and needs no pose of its own.
+    Evaluates an image every `period` seconds and shows every `stride`-th. Its Meshcat path is below
+    that of the vehicle, at X_BC.
     """
-
-    color_image_input_port = input_port("color_image")
 
     def __init__(
         self,
@@ -323,10 +310,9 @@ class CameraVisualizer(LeafSystem):
         Args:
             meshcat: where to draw.
             camera_info, X_BC: intrinsics, and pose of the camera in the vehicle's body frame.
-            period: time between two images [s]; as other readers of the camera have it, or it
-                renders for each.
-            stride: how many images there are to a picture that is shown.
-            depth: distance from the camera to the picture [m].
+            period: time between images [s], equal to that of other users of the camera.
+            stride: number of images per shown one.
+            depth: distance from the camera to the image [m].
             path: Meshcat path of the camera.
         """
         super().__init__()
@@ -353,7 +339,7 @@ class CameraVisualizer(LeafSystem):
         """Adds a visualizer, named `camera_visualizer`, of the images of a camera."""
         visualizer = CameraVisualizer(meshcat, camera.camera_info(), camera.X_BC(), period)
         builder.AddNamedSystem("camera_visualizer", visualizer)
-        builder.Connect(camera.color_image_output_port(), visualizer.color_image_input_port())
+        builder.Connect(camera.GetOutputPort("color_image"), visualizer.GetInputPort("color_image"))
         return visualizer
 
     def _publish(self, context: Context) -> EventStatus:
@@ -369,11 +355,11 @@ class CameraVisualizer(LeafSystem):
 
 def picture_gltf(rgb: np.ndarray, corners: np.ndarray) -> str:
     """
-    A glTF 2.0 document of one rectangle textured with a picture, unlit and seen from both sides.
+    Makes a glTF 2.0 document of an image on a rectangle, unlit and visible from both sides.
 
     Args:
         rgb: (H, W, 3) uint8.
-        corners: (4, 3) [m], the picture's top left, top right, bottom right and bottom left corner.
+        corners: (4, 3) [m], top left, top right, bottom right and bottom left corner.
     """
     _, jpeg = cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 80])
     document = {
@@ -412,7 +398,7 @@ class BallsVisualizer(LeafSystem):
     def __init__(
         self,
         meshcat: Meshcat,
-        balls: MovingBalls,
+        balls: MovingSpheres,
         period: float = 1 / 15,
         path: str = "/splatpilot/balls",
     ):
@@ -420,8 +406,8 @@ class BallsVisualizer(LeafSystem):
         Args:
             meshcat: where to draw.
             balls: what is drawn.
-            period: time between two pictures [s].
-            path: Meshcat path under which everything is drawn.
+            period: time between images [s].
+            path: Meshcat path of all objects.
         """
         super().__init__()
         self._meshcat, self._balls, self._path = meshcat, balls, path
@@ -431,7 +417,7 @@ class BallsVisualizer(LeafSystem):
 
     @staticmethod
     def AddToBuilder(
-        builder: DiagramBuilder, balls: MovingBalls, meshcat: Meshcat
+        builder: DiagramBuilder, balls: MovingSpheres, meshcat: Meshcat
     ) -> "BallsVisualizer":
         """Adds a visualizer of balls, named `balls_visualizer`."""
         visualizer = BallsVisualizer(meshcat, balls)

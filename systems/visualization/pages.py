@@ -1,4 +1,4 @@
-"""A page to look at a place in: its Gaussians, distances, where it was captured from, a ruler."""
+"""Self-contained HTML pages: a scene, a replayed flight, and a running flight."""
 
 import base64
 import gzip
@@ -16,7 +16,7 @@ from pydrake.math import RigidTransform
 
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.collision.shapes import MovingBalls
+from splatpilot.systems.collision.shapes import MovingSpheres
 from splatpilot.systems.policies.hypotheses import Hypotheses, num_hypotheses_in
 from splatpilot.systems.splats.background import Background, EnvironmentMap
 from splatpilot.systems.splats.scene import GaussianScene
@@ -24,23 +24,22 @@ from splatpilot.systems.vehicle.state import QuadrotorState
 from splatpilot.systems.visualization.meshcat_drawing import UNKNOWN_GREY, distance_colors
 
 _COVARIANCE_SCALE = 256.0
-"""Keeps the covariances of 1 mm to 16 m within what a half holds."""
+"""Scales covariances of 1 mm to 16 m to the range of half floats."""
 
 
 def pack_gaussians(scene: GaussianScene) -> NDArray[np.uint32]:
     """
-    N Gaussians as the page's shader reads them, (N, 8) words each of 32 bits.
+    Packs N Gaussians for the page's shader into (N, 8) words of 32 bits.
 
-    The centre as three floats [m]; red, green, blue (without their dependence on direction) and
-    opacity as bytes, lowest first; the covariance's xx, xy, xz, yy, yz, zz as halves
-    [m^2 / 256], lowest first; and nothing.
+    They are the center as three floats [m]; RGB of degree 0 and opacity as bytes, lowest first; the
+    covariance's xx, xy, xz, yy, yz, zz as half floats [m^2 / 256], lowest first; and 0.
     """
     words = np.zeros((len(scene.means), 8), np.uint32)
     words[:, :3] = scene.means.view(np.uint32)
     shades = np.column_stack([scene.base_colors, scene.opacities])
     words[:, 3] = np.round(255 * shades).astype(np.uint8).view(np.uint32)[:, 0]
     covariances = _COVARIANCE_SCALE * scene.covariances
-    # What is larger than a half holds shrinks as a whole, and stays an ellipsoid.
+    # Larger ones are scaled down as a whole, to ellipsoids of the same shape.
     largest = np.abs(covariances).max(axis=(1, 2), keepdims=True)
     covariances *= np.minimum(1, np.finfo(np.float16).max / np.maximum(largest, 1e-30))
     halves = covariances[(slice(None), *np.triu_indices(3))]
@@ -60,14 +59,14 @@ def splat_page(
     start: str,
 ) -> str:
     """
-    The HTML of a page that needs nothing else, not even a network.
+    Makes a self-contained HTML page.
 
     Args:
         meshcat_page: `Meshcat.StaticHtml()`.
-        gaussians, background: what cameras see.
-        data: what else the page shows, of numbers, text, lists and dictionaries.
-        scripts: names of the files in `page` that show it, each after those that it needs.
-        start: what they run in the end: JavaScript in which `splats` and `data` are known.
+        gaussians, background: of the scene.
+        data: further content, as for JSON.
+        scripts: names of files in `page`, in the order of their dependencies.
+        start: JavaScript of `splats` and `data` that runs last.
     """
     sky = ""
     if isinstance(background, EnvironmentMap):
@@ -88,17 +87,17 @@ def splat_page(
 
 
 def compressed(data: bytes) -> str:
-    """Bytes as text, which `unpack` of `page/page.js` reads; the same every time."""
+    """Compresses bytes to text for `unpack` of `page/page.js`, deterministically."""
     return base64.b64encode(gzip.compress(data, 6, mtime=0)).decode()
 
 
 def rounded(values: NDArray[np.floating]) -> list:
-    """Numbers for a page: as nested lists, to a tenth of a millimetre."""
+    """Rounds numbers to 0.1 mm, as nested lists."""
     return np.round(values, 4).tolist()
 
 
 def jpeg(image: NDArray[np.uint8]) -> str:
-    """An image (H, W, 3), blue first, for a page."""
+    """Encodes an image (H, W, 3), BGR, for a page."""
     return base64.b64encode(cv2.imencode(".jpg", image, _JPEG)[1].tobytes()).decode()
 
 
@@ -108,7 +107,7 @@ def _source(name: str) -> str:
 
 _MAX_VOXELS = 3e6
 _SCRIPTS = "pick.js", "ruler.js", "distance_slice.js", "capture_cameras.js", "place_view.js"
-_REACH = 2.0  # [m], distance from which on all have one colour
+_REACH = 2.0  # [m], distance from which on all have one color
 _REACH_UNKNOWN = 40  # [-] the same in voxels, where the unit of length is unknown
 
 
@@ -125,7 +124,7 @@ class CapturedImages:
 
     @property
     def p_WCs(self) -> NDArray[np.float64]:
-        """(N, 3) [m], where the cameras were."""
+        """(N, 3) [m], positions of the cameras."""
         return np.array([X_WC.translation() for X_WC in self.X_WCs])
 
 
@@ -145,13 +144,13 @@ class ShownPlace:
     num_unknown: int = 0  # of the Gaussians, at their end: where nobody looked any further
     beyond: bool = True  # whether Gaussians beyond the bounds are shown at first
     metric: bool = True
-    legend: Sequence[tuple[str, str]] = ()  # colours, as in CSS, of what is drawn, and its names
+    legend: Sequence[tuple[str, str]] = ()  # colors, as in CSS, of what is drawn, and its names
     notes: Sequence[str] = ()  # sentences about the place
     scale_command: str = ""  # to which two points and the length between them need be added
 
     @property
     def reach(self) -> float:
-        """[m], the distance to surfaces from which on all have one colour."""
+        """[m], the distance to surfaces from which on all have one color."""
         if self.metric or self.field is None:
             return _REACH
         return _REACH_UNKNOWN * self.field.voxel_size
@@ -159,11 +158,11 @@ class ShownPlace:
 
 def place_page(meshcat_page: str, place: ShownPlace) -> str:
     """
-    The HTML of a page that needs nothing else, not even a network.
+    Makes a self-contained HTML page of a scene.
 
     Args:
-        meshcat_page: `Meshcat.StaticHtml()` with what else is to be seen.
-        place: what is shown.
+        meshcat_page: `Meshcat.StaticHtml()` with further objects.
+        place: the scene.
     """
     size = place.upper_W - place.lower_W
     unit = "m" if place.metric else "units"
@@ -197,8 +196,8 @@ def place_page(meshcat_page: str, place: ShownPlace) -> str:
 
 
 def _grid(field: Esdf, reach: float) -> dict[str, Any]:
-    """The distances as bytes, of every so many-th voxel along each axis: 0 at a surface, 254 at
-    `reach`, 255 where nobody looked."""
+    """Converts distances to bytes, of a subsampled grid: 0 at a surface, 254 at `reach`, 255 in
+    unknown space."""
     stride = int(np.ceil(np.cbrt(field.distances.size / _MAX_VOXELS)))
     thin = (slice(stride // 2, None, stride),) * 3
     values = np.round(254 * np.clip(field.distances[thin] / reach, 0, 1)).astype(np.uint8)
@@ -235,11 +234,11 @@ _BALLS_PERIOD = 0.1  # [s], between which balls go straight
 
 @dataclass(frozen=True, eq=False)
 class Frames:
-    """What the onboard camera saw, `period` seconds apart from the start on."""
+    """Images of the onboard camera, `period` seconds apart from the start on."""
 
     period: float  # [s]
     color: Sequence[NDArray[np.uint8]]  # (H, W, 3) each, blue first, as OpenCV has it
-    depth: Sequence[NDArray[np.uint8]]  # (H, W, 3) each, in colours
+    depth: Sequence[NDArray[np.uint8]]  # (H, W, 3) each, in colors
 
 
 @dataclass(frozen=True, eq=False)
@@ -257,7 +256,7 @@ class ReplayedFlight:
 
 @dataclass(frozen=True, eq=False)
 class ReplayView:
-    """What a page knows of the vehicle and the place."""
+    """Vehicle, camera and heights of a page."""
 
     X_BC: RigidTransform  # pose of the onboard camera in the vehicle's body frame
     fov_y: float  # [rad], of the onboard camera
@@ -273,17 +272,17 @@ def replay_page(
     background: Background,
     view: ReplayView,
     flights: Sequence[ReplayedFlight],
-    balls: MovingBalls | None = None,
+    balls: MovingSpheres | None = None,
 ) -> str:
     """
-    The HTML of a page that needs nothing else, not even a network.
+    Makes a self-contained HTML page of flights.
 
     Args:
-        meshcat_page: `Meshcat.StaticHtml()` with what stands still, and the vehicle of flight k at
+        meshcat_page: `Meshcat.StaticHtml()` with static objects, and the vehicle of flight k at
             `/splatpilot/vehicles/k`.
-        gaussians, background: what cameras see.
-        view: the vehicle and the place.
-        flights: one or more, the first of which is shown at first.
+        gaussians, background: of the scene.
+        view: vehicle, camera and heights.
+        flights: one or more; the first is selected at first.
         balls: what moves beside them.
 
     Raises:
@@ -342,7 +341,7 @@ def _flight_data(flight: ReplayedFlight, color: str) -> dict[str, Any]:
     }
 
 
-def _balls_data(balls: MovingBalls, duration: float) -> dict[str, Any]:
+def _balls_data(balls: MovingSpheres, duration: float) -> dict[str, Any]:
     times = np.arange(0.0, duration + 2 * _BALLS_PERIOD, _BALLS_PERIOD)
     centers = [np.round(balls.centers(time), 3).tolist() for time in times]
     return {
@@ -356,7 +355,7 @@ def _balls_data(balls: MovingBalls, duration: float) -> dict[str, Any]:
 
 
 def _plans(vectors: NDArray[np.float64]) -> list[dict[str, Any]]:
-    """The plans in W, in the order of their times, each once."""
+    """Converts the plans to W, in the order of their times, each once."""
     plans: dict[float, dict[str, Any]] = {}
     for vector in vectors:
         plan = Hypotheses.from_vector(vector, num_hypotheses_in(len(vector)))
@@ -378,14 +377,14 @@ def live_page(
     cut: float,
 ) -> str:
     """
-    The HTML of a page that holds the Gaussians and hears the rest from `meshcat`, on this machine.
+    Makes an HTML page with the Gaussians that receives the rest from `meshcat`, on this machine.
 
-    Gaussians that Meshcat draws as points at `/splatpilot/scene` are hidden in it, and what Meshcat
-    would give out as files, as the onboard camera's picture, is left out.
+    It hides the points at `/splatpilot/scene`, and objects that Meshcat serves as files, as the
+    onboard camera's image.
 
     Args:
-        meshcat: as it is now, which the page shows until it hears more.
-        gaussians, background: what cameras see.
+        meshcat: of the flight.
+        gaussians, background: of the scene.
         heights: from floor to ceiling [m], between which `cut` may be moved.
         cut: height above which Gaussians are left out at first [m].
     """

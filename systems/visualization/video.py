@@ -1,4 +1,4 @@
-"""A video of what the camera saw: colour beside depth."""
+"""VideoRecorder: video of a camera, color next to depth."""
 
 import tempfile
 from collections.abc import Iterator
@@ -14,36 +14,28 @@ from pydrake.common.value import Value
 from pydrake.systems.framework import Context, DiagramBuilder, EventStatus, LeafSystem
 from pydrake.systems.sensors import ImageDepth16U, ImageRgba8U
 
-from splatpilot.systems.common.drake import input_port
 from splatpilot.systems.common.files import written_atomically
 from splatpilot.systems.splats.splat_camera import SplatCamera
 
 
 class VideoRecorder(LeafSystem):
     """
-    Collects colour and depth images at a fixed rate; afterwards `frames` has them as pictures and
-    `save` writes them as a video.
+    Records color and depth images at a fixed rate; `frames` reads them, and `save` writes a video.
 
     .. pydrake_system::
 
         name: VideoRecorder
-        input_ports:
-        - color_image
-        - depth_image_16u
+        input_ports: [color_image, depth_image_16u]
 
-    The images wait in a temporary file (0.4 MB each at 320x240) and are encoded after the flight.
-    Like every recorder it writes outside the Context: one recorder is for one simulation at a
-    time.
+    Images are in a temporary file (0.4 MB each at 320x240), outside the Context, and are encoded
+    after the flight: one recorder is for one simulation at a time.
     """
-
-    color_image_input_port = input_port("color_image")
-    depth_image_16u_input_port = input_port("depth_image_16u")
 
     def __init__(self, width: int, height: int, fps: float):
         """
         Args:
             width, height: size of the images [pixels].
-            fps: images a second of simulated time, and of the video.
+            fps: images per second of simulated time, and of the video.
         """
         super().__init__()
         self._fps = fps
@@ -58,12 +50,14 @@ class VideoRecorder(LeafSystem):
 
     @staticmethod
     def AddToBuilder(builder: DiagramBuilder, camera: SplatCamera, fps: float) -> "VideoRecorder":
-        """Adds a recorder, named `video`, of the images of a camera."""
+        """Adds a recorder, named `video`, of a camera."""
         info = camera.camera_info()
         recorder = VideoRecorder(info.width(), info.height(), fps)
         builder.AddNamedSystem("video", recorder)
-        builder.Connect(camera.color_image_output_port(), recorder.color_image_input_port())
-        builder.Connect(camera.depth_image_16u_output_port(), recorder.depth_image_16u_input_port())
+        builder.Connect(camera.GetOutputPort("color_image"), recorder.GetInputPort("color_image"))
+        builder.Connect(
+            camera.GetOutputPort("depth_image_16u"), recorder.GetInputPort("depth_image_16u")
+        )
         return recorder
 
     def _clear(self, context: Context) -> EventStatus:
@@ -81,18 +75,18 @@ class VideoRecorder(LeafSystem):
             self._file.write(frame.tobytes())
         except OSError as error:
             raise OSError(
-                f"the pictures of the flight cannot wait in {tempfile.gettempdir()} "
-                f"({error.strerror}); make room there, name another folder by TMPDIR, or film "
-                "fewer and smaller ones (camera.fps, camera.width)"
+                f"cannot record images in {tempfile.gettempdir()} ({error.strerror}); make room, "
+                "name another folder by TMPDIR, or record fewer and smaller ones (camera.fps, "
+                "camera.width)"
             ) from None
         return EventStatus.Succeeded()
 
     def frames(self, max_depth: float) -> Iterator[tuple[NDArray[np.uint8], NDArray[np.uint8]]]:
         """
-        Yields the pictures of colour and of depth, (H, W, 3) each in OpenCV's channel order.
+        Yields the images of color and of depth, (H, W, 3) each in OpenCV's channel order.
 
         Args:
-            max_depth: depth at which the depth picture's colours end [m].
+            max_depth: [m], see `colorize_depth`.
         """
         frames = self._file.tell() // self._frame.itemsize
         self._file.seek(0)
@@ -102,30 +96,26 @@ class VideoRecorder(LeafSystem):
 
     def save(self, path: Path, max_depth: float) -> None:
         """
-        Writes the video (H.264 in MP4, which every browser and player plays) atomically.
+        Writes the video (H.264 in MP4) atomically.
 
         Args:
-            path: the file, ending in .mp4.
-            max_depth: as for `frames`.
-
-        Raises:
-            OSError: if the file cannot be written.
+            path: of the file, ending in .mp4.
+            max_depth: [m], see `colorize_depth`.
         """
         with written_atomically(path, self._check) as partial:
             self._encode(partial, max_depth)
 
     def _check(self, path: Path) -> None:
-        """Raises OSError unless all pictures can be found in a video: its writer does not say when
-        the disk is full."""
+        """Raises OSError if a video is incomplete: its writer ignores full disks."""
         recorded = self._file.tell() // self._frame.itemsize
         with av.open(str(path)) as container:
             found = sum(packet.size > 0 for packet in container.demux(video=0))
         if found != recorded:
-            raise OSError(f"{found} of {recorded} pictures are there")
+            raise OSError(f"only {found} of {recorded} images are written")
 
     def _encode(self, path: Path, max_depth: float) -> None:
         height, width = self._frame["depth"].shape
-        odd = height % 2  # Players want even numbers of rows and columns.
+        odd = height % 2  # Players need even sizes.
         with av.open(str(path), "w") as container:
             rate = Fraction(self._fps).limit_denominator(1000)
             stream = container.add_stream("libx264", rate, {"preset": "ultrafast", "crf": "20"})
@@ -138,7 +128,7 @@ class VideoRecorder(LeafSystem):
 
 def colorize_depth(depth: np.ndarray, max_depth: float) -> np.ndarray:
     """
-    Depth (H, W) [m] as a picture (H, W, 3) uint8 in OpenCV's channel order.
+    Converts depth (H, W) [m] to an image (H, W, 3) uint8 in OpenCV's channel order.
 
     Near is bright and far dark, in inverse depth from 0.5 m to `max_depth`; out of range is black.
     """

@@ -9,7 +9,7 @@ from true_depth import TrueDepth, frames_along_flight, ghosts_along_flight
 
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.scenarios import scenario_file
-from splatpilot.diagrams.worlds.world_registry import make_blueprint, make_world
+from splatpilot.diagrams.worlds.world_registry import make_spec, make_world
 from splatpilot.systems.collision.shapes import AnalyticDistanceField
 from splatpilot.systems.common.config import load_config
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
@@ -21,13 +21,13 @@ CAMERA = OnboardCamera(64, 36)
 @pytest.mark.parametrize("scenario", ["P04", "P10", "P11"])
 def test_rays_end_where_the_distance_is_zero_and_meet_nothing_before(scenario):
     config = load_config(Scenario(), scenario_file(scenario))
-    blueprint = replace(make_blueprint(config.world, 0), surroundings=list)
-    X_WC = RigidTransform(blueprint.p_WS) @ CAMERA.X_BC()
-    depth = TrueDepth(blueprint).image(CAMERA, X_WC)
+    spec = replace(make_spec(config.world, 0), surroundings=list)
+    X_WC = RigidTransform(spec.p_WS) @ CAMERA.X_BC()
+    depth = TrueDepth(spec).image(CAMERA, X_WC)
     hit = np.isfinite(depth)
     assert hit.mean() > 0.4
     rays_W = CAMERA.ray_slopes()[hit] @ X_WC.rotation().matrix().T
-    shapes = [solid.shape for solid in (*blueprint.solids, *blueprint.scenery)]
+    shapes = [solid.shape for solid in (*spec.solids, *spec.scenery)]
     field = AnalyticDistanceField(shapes, np.full(3, -500.0), np.full(3, 500.0))
     p_WQ = X_WC.translation() + depth[hit][:, None] * rays_W
     np.testing.assert_allclose(field.distance(p_WQ), 0, atol=3e-3)
@@ -38,10 +38,10 @@ def test_rays_end_where_the_distance_is_zero_and_meet_nothing_before(scenario):
 
 def test_scenery_has_no_truth():
     config = load_config(Scenario(), scenario_file("P04"))
-    blueprint = make_blueprint(config.world, 0)
-    X_WC = RigidTransform(blueprint.p_WG - (4, 0, 0)) @ CAMERA.X_BC()  # the end is in sight
-    bare = TrueDepth(replace(blueprint, surroundings=list)).image(CAMERA, X_WC)
-    truth = TrueDepth(blueprint).image(CAMERA, X_WC)
+    spec = make_spec(config.world, 0)
+    X_WC = RigidTransform(spec.p_WG - (4, 0, 0)) @ CAMERA.X_BC()  # the end is in sight
+    bare = TrueDepth(replace(spec, surroundings=list)).image(CAMERA, X_WC)
+    truth = TrueDepth(spec).image(CAMERA, X_WC)
     unknown = np.isnan(truth) & ~np.isnan(bare)
     assert unknown.mean() > 0.1
     assert not unknown[bare < 5].any()

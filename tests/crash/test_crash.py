@@ -1,17 +1,120 @@
-"""Commands ended in the middle; `make crash` does it to more of them, and more often."""
+"""Commands ended while they run answer in one line and leave neither processes nor partial files;
+the same command again leaves what an undisturbed one does."""
+
+import hashlib
+import multiprocessing
+import os
+import resource
+import shutil
+import signal
+import sys
+import time
+from pathlib import Path
 
 import pytest
+from room import write_room_capture
 
-from crash.campaign import Campaign
+SCENARIO = """\
+world: {length: 8, width: 5, height: 3, rocks: 0, logs: 0, voxel_size: 0.25}
+camera: {width: 64, height: 48}
+timeout: 0.8
+"""
+COMMANDS = {
+    "fly": (
+        "fly --scenario short.yaml --policy straight --overwrite --out out",
+        "trajectory.npz scenario.yaml flight.mp4",
+    ),
+    "benchmark": (
+        "benchmark --scenarios short.yaml --seeds 2 --policies straight --jobs 1 --out out",
+        "*.yaml rollouts.csv table.csv rollouts/* scenarios/*",
+    ),
+    "reconstruct": (
+        "reconstruct room --overwrite --out out/scene --set iterations=12 --set voxel_size=0.2"
+        " --set threads=1 --set checkpoint_every=4 --set initial_gaussians=500"
+        " --set lpips_weight=0",
+        "scene/*",
+    ),
+}
+"""Arguments, and patterns of the files in `out` that must be equal."""
 
 
-@pytest.fixture(scope="module")
-def campaign(tmp_path_factory) -> Campaign:
-    return Campaign(tmp_path_factory.mktemp("crash"))
+def execute(words: list[str], folder: Path, limit: int) -> None:
+    """Runs a command in this process, in which no file can have more than `limit` bytes."""
+    from splatpilot.analysis.commands.main import run
+
+    os.setpgid(0, 0)
+    os.environ["OMP_NUM_THREADS"] = "1"
+    os.chdir(folder)
+    os.dup2(os.open("errors", os.O_WRONLY), 2)
+    if limit:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+    sys.argv = ["splatpilot", *words]
+    run()
 
 
-@pytest.mark.parametrize("way", ["SIGTERM", "full disk"])
-def test_flight_that_is_ended_loses_nothing(campaign, way):
-    """A flight ended in any way answers in one line, leaves nothing behind, and the same command
-    again leaves the same as if it had not been ended."""
-    assert campaign.round("fly", way, seed=3).wrong == ""
+class Command:
+    """A command and what it leaves undisturbed."""
+
+    def __init__(self, root: Path, name: str) -> None:
+        words, self._patterns = COMMANDS[name]
+        self._words, self._valid, self._folder = words.split(), root / "valid", root / "run"
+        self._context = multiprocessing.get_context("forkserver")
+        self._context.set_forkserver_preload(
+            ["splatpilot.analysis.commands.main", "splatpilot.training.reconstruction.reconstruct"]
+        )
+        write_room_capture(self._valid / "room")
+        (self._valid / "short.yaml").write_text(SCENARIO)
+        started = time.monotonic()
+        assert self.run() == (0, "")
+        self.seconds, self.files = time.monotonic() - started, self.digests()
+        outputs = [file.stat().st_size for file in self._folder.rglob("out/**/*") if file.is_file()]
+        self.largest = max(outputs)
+
+    def run(self, number: int = 0, after: float = 60.0, limit: int = 0, again: bool = False):
+        """Returns exit status and last line of errors; sends a signal `after` so many seconds."""
+        if not again:
+            shutil.rmtree(self._folder, ignore_errors=True)
+            shutil.copytree(self._valid, self._folder)
+            os.mkfifo(self._folder / "errors")
+        errors = os.open(self._folder / "errors", os.O_RDONLY | os.O_NONBLOCK)
+        child = self._context.Process(target=execute, args=(self._words, self._folder, limit))
+        child.start()
+        child.join(after)
+        if child.is_alive():
+            os.kill(child.pid, number)
+        child.join()
+        with pytest.raises(ProcessLookupError):
+            os.killpg(child.pid, 0)
+        with os.fdopen(errors, "rb") as stream:
+            text = (stream.read() or b"").decode().replace("\r", "\n").strip()
+        assert "Traceback" not in text
+        return child.exitcode, text.splitlines()[-1] if text and child.exitcode else ""
+
+    def digests(self) -> dict[str, str]:
+        files = [
+            f for pattern in self._patterns.split() for f in self._folder.glob(f"out/{pattern}")
+        ]
+        return {f.name: hashlib.sha256(f.read_bytes()).hexdigest() for f in files if f.is_file()}
+
+    def check_again(self) -> None:
+        assert self.run(again=True) == (0, "")
+        assert self.digests() == self.files
+        assert not list(self._folder.rglob("*.partial*"))
+
+
+@pytest.fixture(scope="module", params=COMMANDS)
+def command(request, tmp_path_factory) -> Command:
+    return Command(tmp_path_factory.mktemp("crash"), request.param)
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+def test_ended_command_loses_nothing(command, number):
+    status, message = command.run(number, after=0.5 * command.seconds)
+    assert status in (0, -number) or (status, message) == (143, "splatpilot: terminated")
+    command.check_again()
+
+
+def test_full_disk_loses_nothing(command):
+    status, message = command.run(limit=command.largest // 2)
+    assert status == 1 and message.startswith("splatpilot: ")
+    command.check_again()

@@ -149,7 +149,7 @@ def test_crash_replayed(tmp_path):
     wall = "world: !WallsConfig {pattern: big_wall, length: 14, width: 14, wall: 8}\n"
     (tmp_path / "wall.yaml").write_text(wall)
     out = run("crash_replayed.py", "--scenario", "wall.yaml", cwd=tmp_path)
-    assert "equals the recorded flight to the last bit" in out
+    assert "is bitwise identical to the recorded flight" in out
     assert number(r"along \[(\S+),", out) == pytest.approx(1.0, abs=0.05)
     speed = number(r"at (\S+) m/s", out)
     ahead = number(r"was (\S+) m away", out)

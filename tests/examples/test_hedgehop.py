@@ -54,7 +54,7 @@ def test_its_world_sensor_and_policy_fly_in_a_study(installed, tmp_path):
     assert rows["climber"][2] == "2/2"
     assert "climber" in (tmp_path / "study" / "report.html").read_text()
     replay = splatpilot("replay", "study", "hedges-climber-2-001", path=installed, cwd=tmp_path)
-    assert "equals the recorded flight to the last bit" in replay
+    assert "is bitwise identical to the recorded flight" in replay
 
 
 def test_its_captures_are_read(installed, tmp_path):
@@ -98,7 +98,7 @@ def test_it_flies_uninstalled(tmp_path):
     assert "2/2" in out
     words = ["replay", "study", "hedges-mine-2-000"]
     replay = splatpilot(*imports, *words, path=EXAMPLE, cwd=tmp_path)
-    assert "equals the recorded flight to the last bit" in replay
+    assert "is bitwise identical to the recorded flight" in replay
     # A study's files say what to import; only who replays it does.
     refusal = splatpilot(*imports[:2], *words, path=EXAMPLE, cwd=tmp_path, status=1)
     assert "add --import hedgehop.climber" in refusal

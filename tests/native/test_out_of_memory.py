@@ -56,13 +56,10 @@ def run(program: str) -> list[str]:
 
 
 def test_frame_beyond_memory_is_an_error_that_leaves_the_renderer_usable():
-    """Allocations fail on all threads; Python sees MemoryError, and the next frame has the bits of
-    the one before."""
     assert run(FRAME) == ["MemoryError", "True"]
 
 
 def test_threads_that_cannot_be_started_are_an_error():
-    """OSError says how many threads there could be, and the process goes on."""
     message, shape = run(THREADS)
     assert "of 1024 threads could be started" in message and "fewer threads" in message
     assert shape == "(8, 8)"

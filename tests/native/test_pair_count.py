@@ -27,7 +27,6 @@ int main() {
 
 @pytest.mark.skipif(shutil.which("c++") is None, reason="needs a C++ compiler")
 def test_more_pairs_than_32_bits_count_are_an_error(tmp_path):
-    """2^32 - 1 pairs are accepted; 2^32 and 2^32 + 5, which wrap around to 0 and 5, are refused."""
     source = tmp_path / "pair_count.cpp"
     source.write_text(PROGRAM)
     compiler = ["c++", "-std=c++20", f"-I{NATIVE}", str(source), "-o", str(tmp_path / "check")]

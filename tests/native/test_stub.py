@@ -10,7 +10,6 @@ STUB = Path(__file__).parents[2] / "splatpilot" / "_native.pyi"
 
 
 def test_stub_is_what_the_module_gives():
-    """Generating the stub again changes nothing: `make stub` was run after the last change."""
     generator = StubGen(_native)
     generator.put(_native)
     assert generator.get() == STUB.read_text()

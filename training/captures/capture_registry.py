@@ -1,4 +1,4 @@
-"""Opens a capture of any known kind."""
+"""Capture formats by name."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -7,51 +7,27 @@ from pathlib import Path
 from splatpilot.diagrams.worlds.scene_folder import SceneMetadata
 from splatpilot.systems.common.config import load_config
 from splatpilot.systems.common.registry import Registry
+from splatpilot.training.captures import colmap, nerfstudio, phone, ros, scans, tartanair, tum
 from splatpilot.training.captures.capture import Capture
 from splatpilot.training.captures.capture_config import CaptureConfig, complete_config
-from splatpilot.training.captures.colmap import (
-    is_video,
-    model_folder,
-    photographs_in,
-    read_colmap,
-    read_photographs,
-    read_video,
-)
-from splatpilot.training.captures.nerfstudio import is_nerfstudio, read_nerfstudio
-from splatpilot.training.captures.phone import is_polycam, is_record3d, read_polycam, read_record3d
 from splatpilot.training.captures.refine_poses import refined_capture
-from splatpilot.training.captures.ros import is_rosbag, read_rosbag
-from splatpilot.training.captures.scans import (
-    is_scannet,
-    is_seven_scenes,
-    read_scannet,
-    read_seven_scenes,
-)
-from splatpilot.training.captures.tartanair import (
-    is_tartanair_v1,
-    is_tartanair_v2,
-    read_tartanair_v1,
-    read_tartanair_v2,
-)
-from splatpilot.training.captures.tum import is_tum, read_tum
 from splatpilot.training.captures.up_and_scale import move_origin
 
 
 @dataclass(frozen=True)
-class CaptureKind:
-    """How captures of one kind are told from others, and opened."""
+class CaptureFormat:
+    """Recognizes and reads captures of one format."""
 
     recognizes: Callable[[Path], bool]
-    """Tells whether a path looks like one, whole or not: a folder, or a file."""
+    """Tells whether a folder or file looks like one, complete or not."""
     read: Callable[[Path, CaptureConfig], Capture]
-    """Opens the capture in a folder. Raises FileNotFoundError, OSError or ValueError that names the
-    file where it is damaged."""
+    """Opens a capture; raises OSError or ValueError that names the damaged file."""
     description: str = ""
-    """What it is called in messages, with the files by which it is known; empty for its name."""
+    """Its name in messages, with the files that it is recognized by; empty for its name."""
 
 
-CAPTURES = Registry("kind of capture", "splatpilot.captures", CaptureKind)
-"""All kinds of captures by the names that `CaptureConfig.kind` takes."""
+CAPTURES = Registry("capture format", "splatpilot.captures", CaptureFormat)
+"""Capture formats by the names that `CaptureConfig.kind` takes."""
 
 
 def register_capture(
@@ -60,131 +36,116 @@ def register_capture(
     read: Callable[[Path, CaptureConfig], Capture],
     *,
     description: str = "",
-) -> CaptureKind:
-    """Makes a kind of capture known, so that `read_capture` opens it, and returns the kind.
+) -> CaptureFormat:
+    """Registers a capture format, so that `read_capture` opens it, and returns it.
 
     Args:
-        name: what `capture.kind` calls it.
-        recognizes, read, description: see `CaptureKind`.
-
-    Raises:
-        ValueError: if another kind has the name.
+        name: value of `capture.kind`.
+        recognizes, read, description: see `CaptureFormat`.
     """
-    kind = CaptureKind(recognizes, read, description)
-    CAPTURES.add(name, kind)
-    return kind
+    added = CaptureFormat(recognizes, read, description)
+    CAPTURES.add(name, added)
+    return added
 
 
-# In this order: what the first recognises is not asked of the others.
-register_capture(
-    "tartanair_v1",
-    is_tartanair_v1,
-    read_tartanair_v1,
-    description="TartanAir V1 (image_left/, depth_left/, pose_left.txt)",
-)
-register_capture(
-    "tartanair_v2",
-    is_tartanair_v2,
-    read_tartanair_v2,
-    description="TartanAir V2 (image_lcam_front/, depth_lcam_front/, pose_lcam_front.txt)",
-)
-register_capture(
-    "nerfstudio", is_nerfstudio, read_nerfstudio, description="nerfstudio (transforms.json)"
-)
-register_capture(
-    "tum", is_tum, read_tum, description="TUM RGB-D (rgb.txt, depth.txt, groundtruth.txt)"
-)
-register_capture(
-    "seven_scenes",
-    is_seven_scenes,
-    read_seven_scenes,
-    description="7-Scenes (frame-000000.color.png, .depth.png, .pose.txt)",
-)
-register_capture(
-    "scannet",
-    is_scannet,
-    read_scannet,
-    description="ScanNet (color/, depth/, pose/, intrinsic/)",
-)
-register_capture("polycam", is_polycam, read_polycam, description="Polycam's raw data (keyframes/)")
-register_capture(
-    "record3d", is_record3d, read_record3d, description="Record3D (metadata.json, rgb/, depth/)"
-)
-register_capture(
-    "colmap",
-    lambda path: model_folder(path) is not None,
-    read_colmap,
-    description="COLMAP (images/, sparse/0/)",
-)
-register_capture(
-    "photographs",
-    lambda path: len(photographs_in(path)) > 0,
-    read_photographs,
-    description="photographs alone",
-)
-
-register_capture("rosbag", is_rosbag, read_rosbag, description="a ROS bag")
-register_capture("video", is_video, read_video, description="a video (.mp4, .mov, ...)")
-
-_OURS = CAPTURES.registered()
+# The first format that recognizes a path reads it.
+_BUILT_IN = {
+    "tartanair_v1": CaptureFormat(
+        tartanair.recognizes_tartanair_v1,
+        tartanair.read_tartanair_v1,
+        "TartanAir V1 (image_left/, depth_left/, pose_left.txt)",
+    ),
+    "tartanair_v2": CaptureFormat(
+        tartanair.recognizes_tartanair_v2,
+        tartanair.read_tartanair_v2,
+        "TartanAir V2 (image_lcam_front/, depth_lcam_front/, pose_lcam_front.txt)",
+    ),
+    "nerfstudio": CaptureFormat(
+        nerfstudio.recognizes, nerfstudio.read, "nerfstudio (transforms.json)"
+    ),
+    "tum": CaptureFormat(
+        tum.recognizes, tum.read, "TUM RGB-D (rgb.txt, depth.txt, groundtruth.txt)"
+    ),
+    "seven_scenes": CaptureFormat(
+        scans.recognizes_seven_scenes,
+        scans.read_seven_scenes,
+        "7-Scenes (frame-000000.color.png, .depth.png, .pose.txt)",
+    ),
+    "scannet": CaptureFormat(
+        scans.recognizes_scannet,
+        scans.read_scannet,
+        "ScanNet (color/, depth/, pose/, intrinsic/)",
+    ),
+    "polycam": CaptureFormat(
+        phone.recognizes_polycam, phone.read_polycam, "Polycam's raw data (keyframes/)"
+    ),
+    "record3d": CaptureFormat(
+        phone.recognizes_record3d, phone.read_record3d, "Record3D (metadata.json, rgb/, depth/)"
+    ),
+    "colmap": CaptureFormat(
+        colmap.recognizes_model, colmap.read_model, "COLMAP (images/, sparse/0/)"
+    ),
+    "photographs": CaptureFormat(
+        colmap.recognizes_photographs, colmap.read_photographs, "photographs alone"
+    ),
+    "rosbag": CaptureFormat(ros.recognizes, ros.read, "a ROS bag"),
+    "video": CaptureFormat(colmap.is_video, colmap.read_video, "a video (.mp4, .mov, ...)"),
+}
+for _name, _format in _BUILT_IN.items():
+    CAPTURES.add(_name, _format)
 
 
 def read_capture(path: str | Path, config: CaptureConfig | None = None) -> Capture:
-    """Opens the capture in a folder, or a video, whose kind is told from what lies in it.
+    """Opens a capture of any format, which is recognized by its files.
 
-    Kinds of other packages are asked first: any folder of images passes for photographs.
+    Formats of other packages are tried first, because any folder of images passes for photographs.
 
     Args:
-        path: the folder or the video.
-        config: what the files leave open; a file `capture.yaml` in the folder gives what it does
-            not.
+        path: a folder or a video.
+        config: what the files leave open; `capture.yaml` in the folder completes it.
 
     Raises:
-        FileNotFoundError: if there is nothing there.
-        ValueError: if it is no capture of a known kind, or a damaged one, or `config` makes
-            no sense, or its poses are to be refined and cannot be.
+        ValueError, OSError: if it is missing, damaged or of an unknown format, or its poses cannot
+            be refined.
     """
     path = Path(path)
     if not path.exists():
-        raise FileNotFoundError(f"{path}: there is no such folder or video")
-    said = config or CaptureConfig()
-    if said.cache:  # found again from wherever the capture is opened with these settings
-        said = replace(said, cache=str(Path(said.cache).absolute()))
-    config = complete_config(path, said)
-    kind = CAPTURES.find(config.kind) if config.kind else _recognize(path)
-    capture = kind.read(path, config)
+        raise FileNotFoundError(f"No such file or folder: {path}")
+    given = config or CaptureConfig()
+    if given.cache:  # The same from any working directory.
+        given = replace(given, cache=str(Path(given.cache).absolute()))
+    config = complete_config(path, given)
+    capture = (CAPTURES.find(config.kind) if config.kind else _recognize(path)).read(path, config)
     if not isinstance(capture, Capture):
         raise ValueError(
-            f"{path}: what reads its kind gave {type(capture).__name__}; it must return a Capture"
+            f"{path}: the reader of its format must return a Capture, got {type(capture).__name__}"
         )
     capture = move_origin(capture, config.origin)
     if config.refine_poses:
         capture = refined_capture(capture, path, config)
-    return replace(capture, folder=str(path.absolute()), config=said)
+    return replace(capture, folder=str(path.absolute()), config=given)
 
 
-def _recognize(path: Path) -> CaptureKind:
-    kinds = {
-        name: CAPTURES.find(name) for name in sorted(CAPTURES.names(), key=lambda n: n in _OURS)
-    }
-    for kind in kinds.values():
-        if kind.recognizes(path):
-            return kind
-    known = ", ".join(kinds[name].description or name for name in CAPTURES.names())
-    raise ValueError(f"{path}: no capture of a known kind; known are {known}")
+def _recognize(path: Path) -> CaptureFormat:
+    names = sorted(CAPTURES.names(), key=lambda name: name in _BUILT_IN)
+    for name in names:
+        if (found := CAPTURES.find(name)).recognizes(path):
+            return found
+    known = ", ".join(CAPTURES.find(name).description or name for name in CAPTURES.names())
+    raise ValueError(f"{path}: unknown capture format; known are {known}")
 
 
 def read_capture_of(scene: Path, metadata: SceneMetadata) -> Capture:
-    """Opens the capture that a scene folder was made from, with the settings it was made with.
+    """Opens the capture that a scene folder was made from, with its settings.
 
     Raises:
-        FileNotFoundError, ValueError, OSError: if `metadata` names none, or it cannot be opened.
+        ValueError, OSError: if `metadata` names none, or it cannot be opened.
     """
     file = scene / "scene.yaml"
     if not metadata.capture:
         raise ValueError(
-            f"{file}: names no capture to compare the scene with: it came without one, or has "
-            "another size than the depth that its capture measured; measure the scene that "
+            f"{file}: names no capture to compare the scene with: it came without one, or was "
+            "rescaled against the depth of its capture; measure the scene that "
             "`splatpilot reconstruct` wrote"
         )
     try:

@@ -1,7 +1,7 @@
-"""Whether poses, intrinsics and depth of a capture agree, and if not, which mistake explains it.
+"""Checks whether poses, intrinsics and depth of a capture agree, and finds a likely mistake if not.
 
-The capture as it was read and readings with one known mistake each are measured on the same pairs
-of frames, see `frame_agreement`. Of a capture without depth only what was read is reported.
+The capture as read, and readings of its files that each undo one known mistake, are measured on the
+same pairs of frames.
 """
 
 from collections.abc import Callable, Sequence
@@ -14,6 +14,7 @@ from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform, RotationMatrix
 from scipy.optimize import minimize
 
+from splatpilot.systems.common.validation import Config, bounded
 from splatpilot.training.captures.capture import Capture
 from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.capture_registry import read_capture
@@ -24,8 +25,8 @@ from splatpilot.training.captures.frame_comparison import (
     ReadingFit,
     choose_pairs,
     fit_color_camera,
+    initial_reading,
     measure_reading,
-    reading_of,
 )
 
 _BODIES = {
@@ -34,81 +35,88 @@ _BODIES = {
     "a north-east-down body (x forward, y right, z down)": [[0, 0, 1], [1, 0, 0], [0, 1, 0]],
     "an east-north-up body (x forward, y left, z up)": [[0, 0, 1], [-1, 0, 0], [0, -1, 0]],
 }
+_WORLDS = {
+    "east and north": [[0, 1, 0], [1, 0, 0], [0, 0, -1]],
+    "y and z": [[0, 0, 1], [1, 0, 0], [0, 1, 0]],
+    "up and down": np.diag([1, -1, -1]),
+}
+_DEPTH_FACTORS = (0.001, 0.01, 0.1, 0.2, 0.5, 2.0, 5.0, 10.0, 100.0, 1000.0)
+_IMAGE_FACTORS = (0.25, 0.5, 0.75, 4 / 3, 2.0, 4.0)
+_MIN_POINTS = 200
+"""Of all pairs together, for a conclusion."""
+_TOLERANCE = 0.02
+"""Median relative error up to which a capture agrees with itself."""
+_NEGLIGIBLE = 0.002
+"""Median relative error up to which other readings are ignored."""
+_MIN_GAIN = 0.5
+"""Maximum fraction of the error that another reading may leave to be accepted."""
 
 
-def undo_mistakes(as_read: Reading, capture: Capture) -> list[Reading]:
-    """Returns the readings with one known mistake each undone; their names say the mistake."""
+def _readings_without_mistakes(as_read: Reading, capture: Capture) -> list[Reading]:
+    """Returns the readings with one known mistake each undone, which is their name."""
+    readings = []
+
+    def add(name: str, **changes: object) -> None:
+        readings.append(replace(as_read, name=name, **changes))  # pyright: ignore[reportArgumentType]
+
     present = next(
         (name for name, R in _BODIES.items() if np.allclose(R, as_read.R_BC.matrix())), "its axes"
     )
-    readings = [
-        replace(
-            as_read,
-            name="depth is the distance from the camera, read as depth along its axis",
-            is_range=True,
-        ),
-        replace(as_read, name="quaternions are w x y z, read as x y z w", pose=_from_wxyz),
-        replace(
-            as_read,
-            name="rotations are stored column by column, read row by row",
-            pose=lambda X_FB: RigidTransform(X_FB.rotation().inverse(), X_FB.translation()),
-        ),
-    ]
+    add("depth is the distance from the camera, read as depth along its axis", is_range=True)
+    add("quaternions are w x y z, read as x y z w", pose=_from_wxyz)
+    add(
+        "rotations are stored column by column, read row by row",
+        pose=lambda X_FB: RigidTransform(X_FB.rotation().inverse(), X_FB.translation()),
+    )
     for name, R in _BODIES.items():
         R_BC = RotationMatrix(np.array(R, dtype=float))
-        if name != present:
-            readings.append(
-                replace(as_read, name=f"poses are those of {name}, read as {present}", R_BC=R_BC)
-            )
         also = "" if name == present else f", and of {name}"
-        readings.append(
-            replace(
-                as_read,
-                name=f"poses are world to camera{also}, read as camera to world",
-                R_BC=R_BC,
-                pose=lambda X_FB: X_FB.inverse(),
-            )
+        if also:
+            add(f"poses are those of {name}, read as {present}", R_BC=R_BC)
+        add(
+            f"poses are world to camera{also}, read as camera to world",
+            R_BC=R_BC,
+            pose=lambda X_FB: X_FB.inverse(),
         )
     for axis, S in zip("xyz", 1 - 2 * np.eye(3), strict=True):
-        readings.append(
-            replace(as_read, name=f"the world is left-handed: {axis} is mirrored", pose=_mirror(S))
+        add(f"the world is left-handed: {axis} is mirrored", pose=_mirror(np.diag(S)))
+    for name, M in _WORLDS.items():
+        add(
+            f"positions and rotations are in different worlds: {name} differ",
+            pose=_move(np.array(M, dtype=float)),
         )
-    for name, M in (
-        ("east and north", [[0, 1, 0], [1, 0, 0], [0, 0, -1]]),
-        ("y and z", [[0, 0, 1], [1, 0, 0], [0, 1, 0]]),
-        ("up and down", np.diag([1, -1, -1])),
-    ):
-        readings.append(
-            replace(
-                as_read,
-                name=f"positions and rotations are in different worlds: {name} differ",
-                pose=_move(np.array(M, dtype=float)),
-            )
-        )
-    for factor in (0.001, 0.01, 0.1, 0.2, 0.5, 2.0, 5.0, 10.0, 100.0, 1000.0):
-        readings.append(
-            replace(
-                as_read,
-                name=f"depth is {1 / factor:g} times too large, or positions too small"
-                if factor < 1
-                else f"depth is {factor:g} times too small, or positions too large",
-                factor=factor,
-            )
-        )
-    for factor in (0.25, 0.5, 0.75, 4 / 3, 2.0, 4.0):
+    for factor in _DEPTH_FACTORS:
+        large = f"depth is {1 / factor:g} times too large, or positions too small"
+        small = f"depth is {factor:g} times too small, or positions too large"
+        add(large if factor < 1 else small, factor=factor)
+    for factor in _IMAGE_FACTORS:
         K = np.diag([factor, factor, 1]) @ as_read.K
-        readings.append(
-            replace(as_read, name=f"intrinsics belong to images {1 / factor:g} times as large", K=K)
-        )
+        add(f"intrinsics belong to images {1 / factor:g} times as large", K=K)
     camera = capture.depth_camera or capture
     K = as_read.K.copy()
     K[:2, 2] = camera.width / 2, camera.height / 2
     if not np.allclose(K, as_read.K, atol=1):
-        readings.append(replace(as_read, name="the principal point is the image's centre", K=K))
+        add("the principal point is the image's center", K=K)
     return readings
 
 
-def fit_readings(as_read: Reading, pairs: Sequence[FramePair]) -> list[Reading]:
+def _from_wxyz(X_FB: RigidTransform) -> RigidTransform:
+    """Undoes that w x y z was read as x y z w."""
+    w, x, y, z = X_FB.rotation().ToQuaternion().wxyz()
+    return RigidTransform(Quaternion(np.array([x, y, z, w])), X_FB.translation())
+
+
+def _mirror(M: NDArray[np.float64]) -> Callable[[RigidTransform], RigidTransform]:
+    return lambda X_FB: RigidTransform(
+        RotationMatrix(M @ X_FB.rotation().matrix() @ M), M @ X_FB.translation()
+    )
+
+
+def _move(M: NDArray[np.float64]) -> Callable[[RigidTransform], RigidTransform]:
+    return lambda X_FB: RigidTransform(X_FB.rotation(), M @ X_FB.translation())
+
+
+def _fitted_readings(as_read: Reading, pairs: Sequence[FramePair]) -> list[Reading]:
     """Returns readings whose focal length, or principal point, fits best."""
 
     def focal(x: NDArray) -> Reading:
@@ -135,36 +143,9 @@ def fit_readings(as_read: Reading, pairs: Sequence[FramePair]) -> list[Reading]:
     return readings
 
 
-def _from_wxyz(X_FB: RigidTransform) -> RigidTransform:
-    """Undoes that w x y z was read as x y z w."""
-    w, x, y, z = X_FB.rotation().ToQuaternion().wxyz()
-    return RigidTransform(Quaternion(np.array([x, y, z, w])), X_FB.translation())
-
-
-def _mirror(S: NDArray[np.float64]) -> Callable[[RigidTransform], RigidTransform]:
-    M = np.diag(S)
-    return lambda X_FB: RigidTransform(
-        RotationMatrix(M @ X_FB.rotation().matrix() @ M), M @ X_FB.translation()
-    )
-
-
-def _move(M: NDArray[np.float64]) -> Callable[[RigidTransform], RigidTransform]:
-    return lambda X_FB: RigidTransform(X_FB.rotation(), M @ X_FB.translation())
-
-
-_FEWEST = 200
-"""Points, of all pairs together, below which nothing can be told."""
-TOLERANCE = 0.02
-"""Median relative error up to which a capture agrees with itself."""
-_NEGLIGIBLE = 0.002
-"""Median relative error below which no other reading is looked for."""
-_BETTER = 0.5
-"""What fraction of the error another reading must leave to be believed."""
-
-
 @dataclass(frozen=True)
 class CheckReport:
-    """What `check_capture` found."""
+    """The result of `check_capture`."""
 
     capture: str
     frames: int
@@ -193,7 +174,7 @@ class CheckReport:
             *self.notes,
         ]
         if not self.metric:
-            lines.append("the scale is unknown; capture.scale gives it, if flights are to be flown")
+            lines.append("the scale is unknown; set capture.scale to fly in the scene")
         if self.agreement is None:
             return "\n".join([*lines, "not compared: there is no depth"])
         lines.append(f"{'median error':>12}  {'overlap':>7}  reading")
@@ -208,26 +189,19 @@ class CheckReport:
 
 
 @dataclass(kw_only=True)
-class CheckConfig:
+class CheckConfig(Config):
     """How a capture is checked."""
 
-    pairs: int = 12
-    """How many pairs of frames are compared."""
+    pairs: int = bounded(12, "[1, 1000]")
+    """Number of pairs of frames that are compared."""
     capture: CaptureConfig = field(default_factory=CaptureConfig)
-    """What the capture's files leave open."""
-
-    def validate(self) -> None:
-        """Raises ValueError for values that make no sense."""
-        if not 1 <= self.pairs <= 1000:
-            raise ValueError(f"pairs is {self.pairs}; 1 to 1000 are needed")
 
 
 def run(*, capture: str | Path, config: CheckConfig) -> CheckReport:
     """Checks the capture in a folder and prints the report.
 
     Raises:
-        FileNotFoundError, OSError: if files are missing.
-        ValueError: if the capture is damaged or cannot be compared.
+        ValueError, OSError: if the capture is missing, damaged or cannot be compared.
     """
     config.validate()
     report = check_capture(read_capture(capture, config.capture), config.pairs)
@@ -236,7 +210,7 @@ def run(*, capture: str | Path, config: CheckConfig) -> CheckReport:
 
 
 def doubts(capture: Capture) -> tuple[str, ...]:
-    """Returns, as a warning or none, what `check_capture` holds against a capture with depth."""
+    """Returns the mistake that `check_capture` finds, if any, as a warning."""
     if not capture.has_depth:
         return ()
     try:
@@ -245,22 +219,20 @@ def doubts(capture: Capture) -> tuple[str, ...]:
         return (f"not checked whether the capture agrees with itself: {error}",)
     if not mistake:
         return ()
-    return (
-        f"the capture does not agree with itself, {mistake}; `splatpilot capture check` tells more",
-    )
+    return (f"the capture does not agree with itself, {mistake}; see `splatpilot capture check`",)
 
 
 def check_capture(capture: Capture, pairs: int = 12) -> CheckReport:
-    """Measures how well a capture agrees with itself, as it is read and in other readings.
+    """Measures how well a capture agrees with itself, as read and in other readings.
 
-    A capture agrees if its median relative error is at most 2 %, no other reading leaves less than
-    half of an error above 0.2 %, and colors follow depth about as well as they can.
+    It agrees if its median relative error is at most 2 %, no other reading leaves less than half of
+    an error above 0.2 %, and colors follow depth. Without depth only its properties are reported.
 
     Args:
-        pairs: how many pairs of frames are compared.
+        pairs: number of pairs of frames that are compared.
 
     Raises:
-        ValueError: if it has depth, but too little of it to tell.
+        ValueError: if it has depth, but too little of it.
     """
     report = CheckReport(
         capture=capture.source,
@@ -272,32 +244,30 @@ def check_capture(capture: Capture, pairs: int = 12) -> CheckReport:
     if not capture.has_depth:
         return report
     found = choose_pairs(capture, pairs)
-    if sum(len(pair.depth) for pair in found) < _FEWEST:
+    if sum(len(pair.depth) for pair in found) < _MIN_POINTS:
         raise ValueError(f"{capture.source}: too few pixels have depth in two frames to compare")
-    as_read = reading_of(capture)
+    as_read = initial_reading(capture)
     agreement = measure_reading(as_read, found)
-    others = [measure_reading(other, found) for other in undo_mistakes(as_read, capture)]
-    others += [measure_reading(other, found) for other in fit_readings(as_read, found)]
-    others.sort(key=lambda each: each.error)
-    best = others[0]
-    color = None
-    mistake = ""
-    if _stands_still(capture):
+    readings = _readings_without_mistakes(as_read, capture) + _fitted_readings(as_read, found)
+    others = sorted((measure_reading(each, found) for each in readings), key=lambda fit: fit.error)
+    best, color = others[0], None
+    X_CW = capture.X_WCs[0].inverse()
+    if all((X_CW @ X_WC).IsNearlyIdentity(1e-9) for X_WC in capture.X_WCs):
         mistake = (
             f"all {len(capture)} poses are the same; if the camera moved, look at the file that "
             "they were read from"
         )
-    elif agreement.error > _NEGLIGIBLE and best.error < _BETTER * agreement.error:
+    elif agreement.error > _NEGLIGIBLE and best.error < _MIN_GAIN * agreement.error:
         mistake = (
             f"most likely {best.name}: the median error would be {best.error:.2%} instead of "
             f"{agreement.error:.2%}"
         )
-    elif agreement.error > TOLERANCE:
+    elif agreement.error > _TOLERANCE:
         mistake = (
-            f"the median error of depth between frames is {agreement.error:.1%}, at most "
-            f"{TOLERANCE:.0%} is needed, and no known mistake explains it (the best, {best.name}, "
-            f"leaves {best.error:.1%}); poses may be inaccurate, which capture.refine_poses may "
-            "mend, or things may have moved"
+            f"the median error of depth between frames is {agreement.error:.1%}, more than "
+            f"{_TOLERANCE:.0%}, and no known mistake explains it (the best, {best.name}, "
+            f"leaves {best.error:.1%}); poses may be inaccurate, try capture.refine_poses, or "
+            "things may have moved"
         )
     else:
         color = fit_color_camera(capture, [pair.frames for pair in found])
@@ -310,8 +280,3 @@ def check_capture(capture: Capture, pairs: int = 12) -> CheckReport:
         color=color,
         mistake=mistake,
     )
-
-
-def _stands_still(capture: Capture) -> bool:
-    X_CW = capture.X_WCs[0].inverse()
-    return all((X_CW @ X_WC).IsNearlyIdentity(1e-9) for X_WC in capture.X_WCs)

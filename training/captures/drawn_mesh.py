@@ -1,12 +1,11 @@
-"""Meshes as they are drawn: every face has two sides, and alpha is what glTF says that it is.
+"""Meshes as they are drawn: faces have two sides, and alpha is what glTF says.
 
-Drake draws all alpha as translucency, and its depth knows none. So what it is given has no alpha
-but that of panes, whose depth is that of the pane; and surfaces whose textures cut holes are taken
-out of it, for `CutOuts` to draw.
+Drake draws any alpha as translucent, and its depth ignores alpha. So it gets a mesh without alpha
+but that of panes, whose depth is that of the pane; `CutOuts` draws surfaces with holes in their
+textures.
 """
 
 import base64
-import binascii
 import copy
 import json
 import struct
@@ -28,26 +27,38 @@ from trimesh.visual import TextureVisuals
 
 from splatpilot.systems.collision.field_mesh import data_uri
 from splatpilot.systems.common.readers import reason_of, require_readable_size
-from splatpilot.training.captures.capture import CaptureFrame
+from splatpilot.training.captures.capture import CaptureFrame, pixel_rays
 
-GAMMA = 2.2
-"""Of textures and images, as VTK has it."""
+SUFFIXES = (".gltf", ".glb", ".obj")
+_GAMMA = 2.2
+"""Of textures and images, as in VTK."""
 _GLOSS = 0.01
-"""What VTK's rough surfaces reflect of white light, whatever their color."""
+"""Fraction of white light that VTK's rough surfaces reflect, whatever their color."""
 _STEP = 1e-4
-"""[m], and of the depth, from one surface to where the next is looked for."""
+"""[m], and fraction of the depth, from a surface to the start of the search for the next."""
 _HIDDEN = 0.01
-"""Part of the light from behind below which nothing there is looked for."""
+"""Fraction of the light from behind below which the search ends."""
+_MAX_POSITION = 1e6  # [m]
+_CUTOFF = 0.5
+"""glTF's default alpha from which a MASK is opaque."""
+_VISIBLE = 1 / 255
+"""Alpha from which a BLEND is visible."""
+_NEAREST = 9728
+_WRAPS = {33071: "clamp", 33648: "mirror"}
+_UP = {
+    "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
+    "z": np.eye(3),
+}
+"""R_WM, of the axes of a file M by the one that points up."""
 
 
-def sample_surface(
-    path: Path, surface: trimesh.Trimesh, density: float
+def _sample_surface(
+    path: Path, triangles: NDArray[np.float64], density: float
 ) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
-    """Returns points (N, 3) [m] on a surface, so many [1/m^2], and the triangle (N,) of each.
-
-    Raises:
-        ValueError: if they would take too much memory; the message names the file `path`.
-    """
+    """Returns points (N, 3) [m] on triangles (T, 3, 3), with a density [1/m^2], and the triangle
+    (N,) of each."""
+    faces = np.arange(3 * len(triangles)).reshape(-1, 3)
+    surface = trimesh.Trimesh(triangles.reshape(-1, 3), faces, process=False)
     if not 0 < surface.area < np.inf:
         return np.zeros((0, 3)), np.zeros(0, dtype=np.intp)
     count = int(density * surface.area) + 1
@@ -58,20 +69,20 @@ def sample_surface(
 
 @dataclass(frozen=True, eq=False)
 class CutMaterial:
-    """The base color of a surface, and where it is."""
+    """The base color of a surface with holes."""
 
     pixels: NDArray[np.float32]  # (H, W, 4), linear, colors times alpha
     transform: NDArray[np.float64]  # (2, 3), of texture coordinates
-    wrap: tuple[str, str]  # repeat, mirror or clamp, across and down
+    wrap: Sequence[str]  # repeat, mirror or clamp, across and down
     nearest: bool  # whether texels are not interpolated
-    cutoff: float  # alpha from which there is a surface
+    cutoff: float  # alpha from which the surface exists
     translucent: bool  # or opaque
 
-    def at(self, uv: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Returns colors (n, 3), linear, and alphas (n,), 0 where there is no surface.
+    def sample(self, uv: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Returns linear colors (n, 3) and alphas (n,), 0 in holes.
 
         Args:
-            uv: (n, 2), texture coordinates as glTF has them, from the upper left corner.
+            uv: (n, 2), texture coordinates as in glTF, from the upper left corner.
         """
         size = np.array(self.pixels.shape[1::-1])
         position = (uv @ self.transform[:, :2].T + self.transform[:, 2]) * size - 0.5
@@ -79,41 +90,40 @@ class CutMaterial:
             position = np.round(position)
         first = np.floor(position).astype(int)
         weight = position - first
-        found = np.zeros((len(uv), 4))
+        texel = np.zeros((len(uv), 4))
         for down in (0, 1):
             for across in (0, 1):
                 column, row = (
-                    _wrapped(first[:, k] + step, size[k], self.wrap[k])
+                    _wrap(first[:, k] + step, size[k], self.wrap[k])
                     for k, step in enumerate((across, down))
                 )
                 share = np.abs(1 - across - weight[:, 0]) * np.abs(1 - down - weight[:, 1])
-                found += share[:, None] * self.pixels[row, column]
-        alpha = found[:, 3]
-        color = found[:, :3] / np.maximum(alpha, 1e-6)[:, None]
-        there = alpha >= self.cutoff
-        return color, np.where(there, alpha if self.translucent else 1.0, 0.0)
+                texel += share[:, None] * self.pixels[row, column]
+        alpha = texel[:, 3]
+        color = texel[:, :3] / np.maximum(alpha, 1e-6)[:, None]
+        return color, np.where(alpha >= self.cutoff, alpha if self.translucent else 1.0, 0.0)
 
 
-def _lit(
-    albedo: NDArray[np.float64],
-    normal: NDArray[np.float64],
-    lamps: Sequence[tuple[Sequence[float], float]],
-) -> NDArray[np.float64]:
-    """Returns colors (n, 3), 0 to 1, of surfaces as VTK lights rough ones that are not metal."""
-    light = np.zeros(len(normal))
-    for direction, intensity in lamps:
-        toward = -np.asarray(direction) / np.linalg.norm(direction)
-        light += intensity / np.pi * np.maximum(normal @ toward, 0)
-    return np.clip((albedo + _GLOSS) * light[:, None], 0, 1) ** (1 / GAMMA)
-
-
-def _wrapped(texel: NDArray[np.intp], size: int, wrap: str) -> NDArray[np.intp]:
+def _wrap(texel: NDArray[np.intp], size: int, wrap: str) -> NDArray[np.intp]:
     if wrap == "clamp":
         return texel.clip(0, size - 1)
     if wrap == "mirror":
         texel = texel % (2 * size)
         return np.minimum(texel, 2 * size - 1 - texel)
     return texel % size
+
+
+def _shade(
+    albedo: NDArray[np.float64],
+    normal: NDArray[np.float64],
+    lamps: Sequence[tuple[Sequence[float], float]],
+) -> NDArray[np.float64]:
+    """Returns colors (n, 3), 0 to 1, of rough dielectric surfaces as VTK lights them."""
+    light = np.zeros(len(normal))
+    for direction, intensity in lamps:
+        toward = -np.asarray(direction) / np.linalg.norm(direction)
+        light += intensity / np.pi * np.maximum(normal @ toward, 0)
+    return np.clip((albedo + _GLOSS) * light[:, None], 0, 1) ** (1 / _GAMMA)
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,8 +142,8 @@ class CutOuts:
             from embreex.rtcore_scene import EmbreeScene
         except ModuleNotFoundError:
             raise ModuleNotFoundError(
-                "textures that cut holes need embreex, of which there is no wheel for this "
-                "processor; render the capture on another machine",
+                "textures with holes need embreex, which has no wheel for this processor; render "
+                "the capture on another machine",
                 name="embreex",
             ) from None
         scene = EmbreeScene()
@@ -146,63 +156,57 @@ class CutOuts:
         normals = np.cross(b - a, c - a)
         return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
 
-    def _at(
-        self, triangle: NDArray[np.intp], weights: NDArray[np.float64]
+    def _sample_at(
+        self, triangle: NDArray[np.intp], p_WQ: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Returns colors (n, 3) and alphas (n,) of points by their barycentric weights (n, 3)."""
+        """Returns colors (n, 3) and alphas (n,) of points (n, 3) on triangles (n,)."""
+        weights = trimesh.triangles.points_to_barycentric(self.triangles[triangle], p_WQ)
         uv = (weights[..., None] * self.uv[triangle]).sum(axis=1)
         color, alpha = np.zeros((len(uv), 3)), np.zeros(len(uv))
         for i, material in enumerate(self.materials):
             own = self.material[triangle] == i
-            color[own], alpha[own] = material.at(uv[own])
+            color[own], alpha[own] = material.sample(uv[own])
         return color, alpha
 
     def sample(self, path: Path, density: float) -> NDArray[np.float64]:
-        """Returns points (N, 3) [m] that are in no hole; see `sample_surface`."""
-        faces = np.arange(3 * len(self.triangles)).reshape(-1, 3)
-        surface = trimesh.Trimesh(self.triangles.reshape(-1, 3), faces, process=False)
-        points, triangle = sample_surface(path, surface, density)
-        weights = trimesh.triangles.points_to_barycentric(self.triangles[triangle], points)
-        return points[self._at(triangle, weights)[1] > 0]
+        """Returns points (N, 3) [m] outside of holes; see `_sample_surface`."""
+        points, triangle = _sample_surface(path, self.triangles, density)
+        return points[self._sample_at(triangle, points)[1] > 0]
 
     def draw(
-        self, frame: CaptureFrame, near: float, lamps: Sequence[tuple[Sequence[float], float]]
+        self, frame: CaptureFrame, min_depth: float, lamps: Sequence[tuple[Sequence[float], float]]
     ) -> CaptureFrame:
-        """Returns the frame with these surfaces in it, where nothing in it hides them.
+        """Returns the frame with these surfaces drawn where nothing in it hides them.
 
         Depth is that of the first surface, opaque or not.
 
         Args:
-            near: [m], depth from which on surfaces are seen.
+            min_depth: [m], from which surfaces are visible.
             lamps: direction of the light, and its intensity.
         """
         height, width = frame.depth.shape
-        v, u = np.mgrid[:height, :width] + 0.5
-        # Their depth is 1, so that distances along them are depths.
-        rays = frame.back_project(u, v, np.ones_like(u)).reshape(-1, 3)
+        # Rays have depth 1, so that distances along them are depths.
+        rays = pixel_rays(frame.K, width, height).reshape(-1, 3)
         rays = rays @ frame.X_WC.rotation().matrix().T
         p_WC = frame.X_WC.translation()
         depth, color = frame.depth.reshape(-1).astype(np.float64), np.zeros((len(rays), 3))
         limit = depth.copy()
-        behind, reached = np.ones(len(rays)), np.full(len(rays), near)
-        active = np.flatnonzero(limit > near)
+        behind, reached = np.ones(len(rays)), np.full(len(rays), min_depth)
+        active = np.flatnonzero(limit > min_depth)
         while len(active):
-            triangle = self._first(p_WC + reached[active, None] * rays[active], rays[active])
+            triangle = self._first_hit(p_WC + reached[active, None] * rays[active], rays[active])
             active, triangle = active[triangle >= 0], triangle[triangle >= 0]
-            # Again in double precision.
+            # Intersect again in double precision.
             normal, ray = self._normals[triangle], rays[active]
             slope = (ray * normal).sum(axis=1)
             offset = ((self.triangles[triangle, 0] - p_WC) * normal).sum(axis=1)
             z = np.maximum(offset / np.where(slope == 0, 1, slope), reached[active])
             seen = z < limit[active]
             active, triangle, z, ray = active[seen], triangle[seen], z[seen], ray[seen]
-            weights = trimesh.triangles.points_to_barycentric(
-                self.triangles[triangle], p_WC + z[:, None] * ray
-            )
-            albedo, alpha = self._at(triangle, weights)
+            albedo, alpha = self._sample_at(triangle, p_WC + z[:, None] * ray)
             facing = -np.sign(slope[seen])[:, None] * normal[seen]
             share = behind[active] * alpha
-            color[active] += share[:, None] * _lit(albedo, facing, lamps)
+            color[active] += share[:, None] * _shade(albedo, facing, lamps)
             first = (behind[active] == 1) & (alpha > 0)
             depth[active[first]] = z[first]
             behind[active] -= share
@@ -216,203 +220,12 @@ class CutOuts:
             depth=depth.reshape(height, width).astype(np.float32),
         )
 
-    def _first(self, origins: NDArray[np.float64], rays: NDArray[np.float64]) -> NDArray[np.intp]:
-        """Returns the first triangle (n,) that each ray meets, -1 for none."""
-        found = self._scene.run(
+    def _first_hit(self, origins: NDArray[np.float64], rays: NDArray[np.float64]) -> NDArray:
+        """Returns the first triangle (n,) on each ray, -1 for none."""
+        hits = self._scene.run(
             origins.astype(np.float32), rays.astype(np.float32), query="INTERSECT"
         )
-        return np.asarray(found, dtype=np.intp)
-
-
-SUFFIXES = (".gltf", ".glb", ".obj")
-_GLB = b"glTF"
-
-
-@dataclass(frozen=True, eq=False)
-class GltfFile:
-    """A glTF document whose buffers are read."""
-
-    folder: Path  # to which URIs are relative
-    document: dict[str, Any]
-    buffers: list[bytes]
-
-    def view(self, number: int) -> bytes:
-        """Returns the content of a buffer view."""
-        view = self.document["bufferViews"][number]
-        start = view.get("byteOffset", 0)
-        return self.buffers[view["buffer"]][start : start + view["byteLength"]]
-
-    def image(self, number: int) -> Image.Image:
-        """Returns an image, not yet decoded.
-
-        Raises:
-            ValueError, OSError: if it is missing or not an image.
-        """
-        image = self.document["images"][number]
-        inside = "bufferView" in image
-        content = self.view(image["bufferView"]) if inside else _read(self.folder, image["uri"])
-        opened = Image.open(BytesIO(content))
-        require_readable_size(self.folder, 4 * opened.width * opened.height)
-        return opened
-
-
-def read_gltf(path: Path) -> GltfFile:
-    """Reads a mesh as glTF.
-
-    Raises:
-        Exception: anything, if it is damaged.
-    """
-    require_readable_size(path, 4 * path.stat().st_size)
-    content, binary = path.read_bytes(), b""
-    if path.suffix == ".obj":
-        scene: Any = trimesh.load(path, force="scene", process=False)
-        for mesh in scene.geometry.values():
-            # Its materials are not of metal, as glTF's are if nothing is said.
-            mesh.visual = mesh.visual if mesh.visual.kind == "texture" else TextureVisuals()
-            mesh.visual.material = mesh.visual.material.to_pbr()
-            mesh.visual.material.metallicFactor, mesh.visual.material.roughnessFactor = 0.0, 1.0
-        content = scene.export(file_type="glb")
-    if content.startswith(_GLB):
-        content, binary = _chunks(content)
-    document = json.loads(content)
-    buffers = [
-        _read(path.parent, buffer["uri"]) if "uri" in buffer else binary
-        for buffer in document["buffers"]
-    ]
-    return GltfFile(path.parent, document, buffers)
-
-
-def _chunks(content: bytes) -> tuple[bytes, bytes]:
-    """Returns the document and the buffer of a binary glTF."""
-    parts, start = [], 12
-    for _ in range(2):
-        if start + 8 <= len(content):
-            (length,) = struct.unpack_from("<I", content, start)
-            parts.append(content[start + 8 : start + 8 + length])
-            start += 8 + length
-    return parts[0], parts[1] if len(parts) > 1 else b""
-
-
-def _read(folder: Path, uri: str) -> bytes:
-    kind, comma, data = uri.partition(",")
-    if kind.startswith("data:") and comma:
-        try:
-            return base64.b64decode(data, validate=True)
-        except binascii.Error as error:
-            raise ValueError(f"data that is not base64: {error}") from None
-    file = folder / urllib.parse.unquote(uri)
-    require_readable_size(file, file.stat().st_size)
-    return file.read_bytes()
-
-
-# Whether a glTF file is as large as it claims, and its triangles are of vertices that it has.
-#
-# Readers of meshes believe both: a count that is wrong makes them take all memory, and an index
-# that is wrong ends the process.
-
-
-_TYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
-_MAX_POSITION = 1e6  # [m]
-
-
-def check_gltf_claims(document: dict[str, Any], buffers: list[bytes]) -> None:
-    """
-    Raises:
-        ValueError: for a document whose accessors are not within their buffers, or whose triangles
-            or positions are none.
-    """
-    _Claims(document, buffers).check()
-
-
-class _Claims:
-    def __init__(self, document: dict[str, Any], buffers: list[bytes]) -> None:
-        self._document, self._buffers = document, buffers
-        for buffer, content in zip(document["buffers"], buffers, strict=True):
-            if _count(buffer["byteLength"]) > len(content):
-                raise ValueError(f"a buffer claims {buffer['byteLength']} bytes of {len(content)}")
-
-    def check(self) -> None:
-        arrays = [self._array(accessor) for accessor in self._document.get("accessors", [])]
-        for mesh in self._document.get("meshes", []):
-            for primitive in mesh["primitives"]:
-                self._check_primitive(primitive, arrays)
-        _require_tree(self._document.get("nodes", []))
-
-    def _array(self, accessor: dict[str, Any]) -> np.ndarray:
-        """What an accessor is of, (count, width)."""
-        if "sparse" in accessor or "bufferView" not in accessor:
-            raise ValueError("an accessor without a view of a buffer")
-        view = self._document["bufferViews"][_count(accessor["bufferView"])]
-        content = self._buffers[_count(view["buffer"])]
-        start, length = _count(view.get("byteOffset", 0)), _count(view["byteLength"])
-        if start + length > len(content):
-            raise ValueError(f"a view claims bytes {start} to {start + length} of {len(content)}")
-        dtype, width = np.dtype(_TYPES[accessor["componentType"]]), _WIDTHS[accessor["type"]]
-        count, offset = _count(accessor["count"]), _count(accessor.get("byteOffset", 0))
-        row = dtype.itemsize * width
-        stride = _count(view.get("byteStride", row))
-        if count == 0 or stride < row or offset + stride * (count - 1) + row > length:
-            raise ValueError(f"an accessor claims {count} rows of {stride} bytes, of {length}")
-        return np.ndarray((count, width), dtype, content, start + offset, (stride, dtype.itemsize))
-
-    def _check_primitive(self, primitive: dict[str, Any], arrays: list[np.ndarray]) -> None:
-        attributes = {
-            name: arrays[_count(number)] for name, number in primitive["attributes"].items()
-        }
-        positions = attributes["POSITION"]
-        if positions.dtype.kind != "f" or positions.shape[1] != 3:
-            raise ValueError("positions are no vectors of floats")
-        if not (np.abs(positions) <= _MAX_POSITION).all():
-            raise ValueError(f"positions are not finite or beyond {_MAX_POSITION:g} m")
-        for name, array in attributes.items():
-            if len(array) != len(positions):
-                raise ValueError(f"{len(array)} of {name} for {len(positions)} vertices")
-        if "indices" in primitive:
-            indices = arrays[_count(primitive["indices"])]
-            if indices.dtype.kind != "u" or indices.shape[1] != 1:
-                raise ValueError("indices are no whole numbers")
-            if indices.max() >= len(positions):
-                raise ValueError(f"vertex {indices.max()} of {len(positions)}")
-
-
-def _count(value: Any) -> int:
-    if not isinstance(value, int) or isinstance(value, bool) or value < 0:
-        raise ValueError(f"{value!r} stands where a count belongs")
-    return value
-
-
-def _require_tree(nodes: list[dict[str, Any]]) -> None:
-    """Raises ValueError where a node is in itself, or in two others."""
-    parents = [0] * len(nodes)
-    for node in nodes:
-        for child in node.get("children", []):
-            parents[_count(child)] += 1
-        for name, size in (("translation", 3), ("rotation", 4), ("scale", 3), ("matrix", 16)):
-            values = np.array(node.get(name, np.zeros(size)), dtype=float)
-            if values.shape != (size,) or not (np.abs(values) <= _MAX_POSITION).all():
-                raise ValueError(f"{name} of a node is {node[name]}")
-    if any(count > 1 for count in parents):
-        raise ValueError("a node is in two others")
-    reached = [i for i, count in enumerate(parents) if count == 0]
-    for i in reached:
-        reached.extend(nodes[i].get("children", []))
-    if len(reached) < len(nodes):
-        raise ValueError("a node is in itself")
-
-
-_CUTOFF = 0.5
-"""Alpha from which a MASK is opaque, where the file does not say."""
-_VISIBLE = 1 / 255
-"""Alpha from which a BLEND is there."""
-_SOLID = "solid.gltf"
-_NEAREST = 9728
-_WRAPS = {33071: "clamp", 33648: "mirror"}
-_UP = {
-    "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
-    "z": np.eye(3),
-}
-"""R_WM, of the axes of a file M by that which points up."""
+        return np.asarray(hits, dtype=np.intp)
 
 
 @dataclass(frozen=True, eq=False)
@@ -421,12 +234,12 @@ class DrawnMesh:
 
     path: Path  # where it comes from
     solid: Path | None  # .gltf without holes
-    surface: trimesh.Trimesh  # of the same, in W
+    triangles: NDArray[np.float64]  # (T, 3, 3) [m] of the same, corners in W
     cut_outs: CutOuts | None  # in W
 
     def sample(self, density: float) -> NDArray[np.float64]:
-        """Returns points (N, 3) [m] on its surfaces in W, so many [1/m^2]; see `sample_surface`."""
-        points = [sample_surface(self.path, self.surface, density)[0]]
+        """Returns points (N, 3) [m] on its surfaces in W, with a density [1/m^2]."""
+        points = [_sample_surface(self.path, self.triangles, density)[0]]
         if self.cut_outs is not None:
             points.append(self.cut_outs.sample(self.path, density))
         return np.concatenate(points)
@@ -434,10 +247,10 @@ class DrawnMesh:
 
 @contextmanager
 def drawn_mesh(path: Path, up: str) -> Iterator[DrawnMesh]:
-    """Opens a mesh as it is to be drawn.
+    """Opens a mesh for drawing.
 
     Args:
-        path: see `read_gltf`.
+        path: .gltf, .glb or .obj.
         up: the axis of the file's coordinates that points up, "y" or "z".
 
     Raises:
@@ -455,26 +268,24 @@ def drawn_mesh(path: Path, up: str) -> Iterator[DrawnMesh]:
 
 
 def _split(path: Path, folder: Path, R_WM: NDArray[np.float64]) -> DrawnMesh:
-    file = read_gltf(path)
-    check_gltf_claims(file.document, file.buffers)
+    file = _read_gltf(path)
+    _check_for_vtk(file.document)
     for i, content in enumerate(file.buffers):
         (folder / f"{i}.bin").write_bytes(content)
     given = file.document.get("materials", [])
     cut = {i: found for i in range(len(given)) if (found := _cut_material(file, i))}
-    # A mask without a texture is there or not.
-    gone = {
+    # A mask without a texture is visible or not as a whole.
+    invisible = {
         i
         for i, material in enumerate(given)
         if material.get("alphaMode") == "MASK"
         and i not in cut
         and _base_color(material)[3] < material.get("alphaCutoff", _CUTOFF)
     }
-    solid = _part(file, lambda i: i not in cut and i not in gone)
-    surface, cut_outs = trimesh.Trimesh(), None
+    solid = _part(file, lambda i: i not in cut and i not in invisible)
+    triangles, cut_outs, solid_file = np.zeros((0, 3, 3)), None, None
     if solid is not None:
         triangles, _, _ = _triangles(solid, folder, R_WM)
-        faces = np.arange(3 * len(triangles)).reshape(-1, 3)
-        surface = trimesh.Trimesh(triangles.reshape(-1, 3), faces, process=False)
         for mesh in solid["meshes"]:
             for primitive in mesh["primitives"]:
                 primitive.setdefault("material", len(given))
@@ -487,17 +298,92 @@ def _split(path: Path, folder: Path, R_WM: NDArray[np.float64]) -> DrawnMesh:
                 material["alphaMode"] = "OPAQUE"
         if "images" in solid:
             solid["images"] = [_without_alpha(file, i) for i in range(len(solid["images"]))]
-        (folder / _SOLID).write_text(json.dumps(solid))
+        solid_file = folder / "solid.gltf"
+        solid_file.write_text(json.dumps(solid))
     rest = _part(file, lambda i: i in cut)
     if rest is not None:
-        triangles, uv, numbers = _triangles(rest, folder, R_WM)
+        holed, uv, numbers = _triangles(rest, folder, R_WM)
         order = {number: i for i, number in enumerate(cut)}
-        cut_outs = CutOuts(triangles, uv, np.array([order[i] for i in numbers]), list(cut.values()))
-    return DrawnMesh(path, folder / _SOLID if solid else None, surface, cut_outs)
+        cut_outs = CutOuts(holed, uv, np.array([order[i] for i in numbers]), list(cut.values()))
+    return DrawnMesh(path, solid_file, triangles, cut_outs)
 
 
-def _part(file: GltfFile, has: Callable[[int], bool]) -> dict[str, Any] | None:
-    """Returns the document with those primitives alone whose material is one of the part, -1 for
+@dataclass(frozen=True, eq=False)
+class _Gltf:
+    """A glTF document with its buffers."""
+
+    folder: Path  # that URIs are relative to
+    document: dict[str, Any]
+    buffers: list[bytes]
+
+    def image(self, number: int) -> Image.Image:
+        """Returns an image, not yet decoded."""
+        image = self.document["images"][number]
+        if "bufferView" in image:
+            view = self.document["bufferViews"][image["bufferView"]]
+            start = view.get("byteOffset", 0)
+            content = self.buffers[view["buffer"]][start : start + view["byteLength"]]
+        else:
+            content = _read_uri(self.folder, image["uri"])
+        opened = Image.open(BytesIO(content))
+        require_readable_size(self.folder, 4 * opened.width * opened.height)
+        return opened
+
+
+def _read_gltf(path: Path) -> _Gltf:
+    require_readable_size(path, 4 * path.stat().st_size)
+    content, binary = path.read_bytes(), b""
+    if path.suffix == ".obj":
+        scene: Any = trimesh.load(path, force="scene", process=False)
+        for mesh in scene.geometry.values():
+            # Its materials are not metallic, as glTF's are by default.
+            mesh.visual = mesh.visual if mesh.visual.kind == "texture" else TextureVisuals()
+            mesh.visual.material = mesh.visual.material.to_pbr()
+            mesh.visual.material.metallicFactor, mesh.visual.material.roughnessFactor = 0.0, 1.0
+        content = scene.export(file_type="glb")
+    if content.startswith(b"glTF"):  # binary: a header, then the document and a buffer
+        (size,) = struct.unpack_from("<I", content, 12)
+        binary, content = content[28 + size :], content[20 : 20 + size]
+    document = json.loads(content)
+    buffers = [
+        _read_uri(path.parent, buffer["uri"]) if "uri" in buffer else binary[: buffer["byteLength"]]
+        for buffer in document["buffers"]
+    ]
+    return _Gltf(path.parent, document, buffers)
+
+
+def _read_uri(folder: Path, uri: str) -> bytes:
+    start, comma, data = uri.partition(",")
+    if start.startswith("data:") and comma:
+        return base64.b64decode(data, validate=True)
+    file = folder / urllib.parse.unquote(uri)
+    require_readable_size(file, file.stat().st_size)
+    return file.read_bytes()
+
+
+def _check_for_vtk(document: dict[str, Any]) -> None:
+    """Refuses what ends the process in VTK: attributes of different lengths and loops of nodes."""
+    accessors = document.get("accessors", [])
+    if not all("bufferView" in each and "sparse" not in each for each in accessors):
+        raise ValueError("an accessor without a buffer view")
+    for mesh in document.get("meshes", []):
+        for primitive in mesh["primitives"]:
+            used = [accessors[number] for number in primitive["attributes"].values()]
+            if len({accessor["count"] for accessor in used}) > 1:
+                raise ValueError("attributes of different lengths")
+    children = [node.get("children", []) for node in document.get("nodes", [])]
+    listed = [child for each in children for child in each]
+    reached = [i for i in range(len(children)) if i not in listed]
+    if len(set(listed)) < len(listed):
+        raise ValueError("a node in two others")
+    for i in reached:
+        reached.extend(children[i])
+    if len(reached) < len(children):
+        raise ValueError("a node in itself")
+
+
+def _part(file: _Gltf, has: Callable[[int], bool]) -> dict[str, Any] | None:
+    """Returns the document with only those primitives whose material is one of the part, -1 for
     those without; None if there are none."""
     document, kept, numbers = copy.deepcopy(file.document), [], {}
     for i, mesh in enumerate(document.get("meshes", [])):
@@ -518,8 +404,8 @@ def _base_color(material: dict[str, Any]) -> list[float]:
     return material.get("pbrMetallicRoughness", {}).get("baseColorFactor", [1.0, 1.0, 1.0, 1.0])
 
 
-def _without_alpha(file: GltfFile, number: int) -> dict[str, Any]:
-    """Returns an image that is in the document, and not translucent."""
+def _without_alpha(file: _Gltf, number: int) -> dict[str, Any]:
+    """Returns an image that is embedded and opaque."""
     image = file.document["images"][number]
     opened = file.image(number)
     if not opened.has_transparency_data and "bufferView" in image:
@@ -529,8 +415,8 @@ def _without_alpha(file: GltfFile, number: int) -> dict[str, Any]:
     return {"uri": data_uri("image/png", stream.getvalue())}
 
 
-def _cut_material(file: GltfFile, number: int) -> CutMaterial | None:
-    """Returns a material whose texture cuts holes, None for any other."""
+def _cut_material(file: _Gltf, number: int) -> CutMaterial | None:
+    """Returns a material whose texture has holes, None for any other."""
     material = file.document["materials"][number]
     texture_info = material.get("pbrMetallicRoughness", {}).get("baseColorTexture")
     mode = material.get("alphaMode", "OPAQUE")
@@ -541,27 +427,23 @@ def _cut_material(file: GltfFile, number: int) -> CutMaterial | None:
     if not image.has_transparency_data:
         return None
     if texture_info.get("texCoord", 0) != 0:
-        raise ValueError("the texture of a cut-out uses TEXCOORD_1; only TEXCOORD_0 is read")
+        raise ValueError("the texture of a cut-out must use TEXCOORD_0")
     pixels = np.asarray(image.convert("RGBA"), dtype=np.float32) / 255
-    pixels[..., :3] **= GAMMA
+    pixels[..., :3] **= _GAMMA
     pixels *= np.asarray(_base_color(material), dtype=np.float32)
     pixels[..., :3] *= pixels[..., 3:]
     sampler = file.document.get("samplers", [{}])[texture.get("sampler", 0)]
+    transform = texture_info.get("extensions", {}).get("KHR_texture_transform", {})
+    cos, sin = np.cos(transform.get("rotation", 0.0)), np.sin(transform.get("rotation", 0.0))
+    linear = np.array([[cos, -sin], [sin, cos]]) * transform.get("scale", [1.0, 1.0])
     return CutMaterial(
         pixels.astype(np.float32),
-        _transform(texture_info.get("extensions", {}).get("KHR_texture_transform", {})),
-        wrap=tuple(_WRAPS.get(sampler.get(key, 0), "repeat") for key in ("wrapS", "wrapT")),  # pyright: ignore[reportArgumentType]
+        np.column_stack([linear, transform.get("offset", [0.0, 0.0])]),
+        wrap=[_WRAPS.get(sampler.get(key, 0), "repeat") for key in ("wrapS", "wrapT")],
         nearest=sampler.get("magFilter") == _NEAREST,
         cutoff=material.get("alphaCutoff", _CUTOFF) if mode == "MASK" else _VISIBLE,
         translucent=mode == "BLEND",
     )
-
-
-def _transform(given: dict[str, Any]) -> NDArray[np.float64]:
-    """Returns the matrix (2, 3) of KHR_texture_transform."""
-    cos, sin = np.cos(given.get("rotation", 0.0)), np.sin(given.get("rotation", 0.0))
-    turned = np.array([[cos, -sin], [sin, cos]]) * given.get("scale", [1.0, 1.0])
-    return np.column_stack([turned, given.get("offset", [0.0, 0.0])])
 
 
 def _triangles(
@@ -574,7 +456,7 @@ def _triangles(
     file = folder / "bare.gltf"
     file.write_text(json.dumps(bare))
     scene: Any = trimesh.load(file, force="scene", process=False)
-    triangles, uv, material = [], [], []
+    triangles, uv, material = [np.zeros((0, 3, 3))], [np.zeros((0, 3, 2))], [np.zeros(0, int)]
     for node in scene.graph.nodes_geometry:
         X_MN, name = scene.graph[node]
         mesh = scene.geometry[name]
@@ -585,6 +467,9 @@ def _triangles(
         uv.append(own[mesh.faces])
         named = getattr(getattr(mesh.visual, "material", None), "name", None)
         material.append(np.full(len(mesh.faces), -1 if named is None else int(named)))
-    if not triangles:
+    corners = np.concatenate(triangles)
+    if not len(corners):
         raise ValueError("it holds no triangles")
-    return np.concatenate(triangles), np.concatenate(uv), np.concatenate(material)
+    if not (np.abs(corners) <= _MAX_POSITION).all():
+        raise ValueError(f"positions must be finite and within {_MAX_POSITION:g} m")
+    return corners, np.concatenate(uv), np.concatenate(material)

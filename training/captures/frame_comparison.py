@@ -1,4 +1,4 @@
-"""How depth and brightness of what two frames see differ, and how that changes with their poses."""
+"""Comparison of what two frames of a capture see: depth, contrast and colors."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -9,32 +9,53 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 from scipy.optimize import minimize
 
-from splatpilot.training.captures.capture import Capture, CaptureFrame, back_project
+from splatpilot.training.captures.capture import (
+    Capture,
+    CaptureFrame,
+    back_project,
+    depth_points,
+    project_points,
+)
 
 WIDTH = 320
-"""[px] That images to be compared are about wide: what is in pixels below is of such."""
+"""[px] Approximate width of compared images, to which lengths in pixels below refer."""
 REACH = 0.08
-"""[-] Relative difference of depth up to which two frames can show the same, and change of inverse
-depth from one pixel to the next that a surface can have."""
-_POINTS, _FEWEST = 1000, 50
-"""Of each frame that are compared, at most; and of a pair at least."""
+"""[-] Relative difference of depth up to which two frames can show the same surface, and maximum
+change of its inverse depth from one pixel to the next."""
+_NUM_POINTS, _MIN_POINTS = 1000, 50
+"""Maximum compared points per frame, and minimum per pair."""
 _FINE, _COARSE = 1.5, 10.0
-"""[px] Brightness is blurred by the first, so that it is smooth over the steps that are made, and
-divided by what the second leaves: neither exposure nor the lens's dark corners are in the ratio."""
+"""[px] Brightness is blurred by the first, to be smooth over steps, and divided by what the second
+leaves: exposure and vignetting cancel in the ratio."""
 _BLACK = 0.05
-"""Added to what brightness (0 to 1) is divided by."""
-
+"""Added to the divisor of brightness (0 to 1)."""
 _AROUND = np.ones((5, 5), np.uint8)
+
+_COLOR_POINTS = 3000
+"""Approximate number of pixels per image whose colors are compared."""
+_BLUR = 1.5  # [px]
+_SAME_SURFACE = 0.03
+_MIN_PIXELS = 300
+_MIN_GAIN = 0.6
+"""Maximum fraction of the disagreement that another color camera may leave to be accepted."""
+_NEGLIGIBLE, _MAX_DISAGREEMENT = 0.01, 0.3
+"""Disagreement up to which no other color camera is searched, and above which colors are wrong.
+It is 0.02 to 0.04 in captures of real cameras, and 0.11 if one is wrongly read as registered."""
+_MIN_SHIFT, _MIN_LOG_ZOOM = 0.008, 0.015
+_READING_POINTS = 5000
+"""Approximate number of pixels per image whose depth is carried into another."""
+_MIN_INSIDE = 0.1
+"""Fraction of points that must fall onto measured depth for a reading to count."""
 
 
 @dataclass(frozen=True, eq=False)
 class ComparedFrame:
-    """What of a frame is compared."""
+    """Depth and contrast of a frame."""
 
     K: NDArray[np.float64]  # (3, 3) [px]
     inverse_depth: NDArray[np.float32]
-    """(H, W) [1/m]; 0 where it is not known, or not of one surface all around."""
-    contrast: NDArray[np.float32]  # (H, W), brightness relative to what is around
+    """(H, W) [1/m]; 0 where it is unknown or not of one surface all around."""
+    contrast: NDArray[np.float32]  # (H, W), brightness relative to its neighborhood
     p_CQ: NDArray[np.float64]  # (n, 3) [m], points that it sees
     point_contrast: NDArray[np.float64]  # (n,), of these
 
@@ -42,15 +63,15 @@ class ComparedFrame:
     def of(cls, frame: CaptureFrame) -> "ComparedFrame":
         """Prepares a frame that is about `WIDTH` wide."""
         depth = np.where(np.isfinite(frame.depth), frame.depth, 0).astype(np.float32)
-        least, most = cv2.erode(depth, _AROUND), cv2.dilate(depth, _AROUND)
-        surface = (least > 0) & (most < (1 + REACH) * least)
-        # That of a plane is linear in the pixel coordinates: a blur leaves it as it is.
+        lower, upper = cv2.erode(depth, _AROUND), cv2.dilate(depth, _AROUND)
+        surface = (lower > 0) & (upper < (1 + REACH) * lower)
+        # On a plane it is linear in the pixel coordinates, and a blur preserves it.
         inverse = cv2.GaussianBlur(1 / np.where(depth > 0, depth, 1), _AROUND.shape, 0)
         inverse = np.where(surface, inverse, 0).astype(np.float32)
         gray = cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY).astype(np.float32) / 255
         fine, coarse = (cv2.GaussianBlur(gray, (0, 0), sigma) for sigma in (_FINE, _COARSE))
         contrast = (fine / (coarse + _BLACK)).astype(np.float32)
-        chosen = np.random.default_rng(0).permutation(np.flatnonzero(surface))[:_POINTS]
+        chosen = np.random.default_rng(0).permutation(np.flatnonzero(surface))[:_NUM_POINTS]
         rows, columns = np.divmod(chosen, depth.shape[1])
         z = 1 / inverse.flat[chosen].astype(np.float64)
         p_CQ = back_project(frame.K, columns + 0.5, rows + 0.5, z)
@@ -59,13 +80,13 @@ class ComparedFrame:
     def sees(
         self, p_CQ: NDArray[np.float64], reach: float = REACH
     ) -> tuple[NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]]:
-        """Returns which of the points (n, 3) are on the surfaces that it sees, up to a relative
-        difference of depth; the image coordinates (2, n) of all; and its inverse depth there, see
-        `_at`."""
+        """Returns which of the points (n, 3) are on surfaces that it sees, up to a relative
+        difference of depth; the image coordinates (2, n) of all; and its inverse depth there with
+        derivatives (3, n)."""
         z = p_CQ[:, 2].clip(min=1e-3)
         u = np.array([self.K[k, k] * p_CQ[:, k] / z + self.K[k, 2] for k in (0, 1)])
-        inverse = _at(self.inverse_depth, u)
-        # Beside what is not known it falls to zero.
+        inverse = _sample(self.inverse_depth, u)
+        # Next to unknown depth it falls to zero.
         steep = np.abs(inverse[1:]).max(axis=0) > REACH * inverse[0]
         same = np.abs(inverse[0] * p_CQ[:, 2] - 1) < reach
         return (inverse[0] > 0) & ~steep & same, u, inverse
@@ -73,14 +94,14 @@ class ComparedFrame:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Two frames, where both see the same."""
+    """Differences of two frames at points that both see."""
 
     residuals: NDArray[np.float64]
-    """(2, n): e = w(u) q_z - 1, the relative difference of depth of a point that one sees and the
-    other has at q, in the pixel u, with the inverse depth w(u); and c(u) - c, that of contrast."""
+    """(2, n): e = w(u) q_z - 1, the relative difference of depth of a point that one frame sees and
+    that is at q in the other, in the pixel u, of inverse depth w(u); and c(u) - c, of contrast."""
     derivatives: NDArray[np.float64]
-    """(2, n, 12), by small turns [rad] of one frame about its centre, its steps [m], and those of
-    the other, all in the axes of the world."""
+    """(2, n, 12), by small rotations [rad] of one frame about its center, its translation [m], and
+    those of the other, all in the axes of the world."""
 
 
 def compare_frames(
@@ -90,16 +111,16 @@ def compare_frames(
     X_WC_other: RigidTransform,
     reach: float,
 ) -> Comparison | None:
-    """Returns how the points of one frame differ from what the other sees there; None where less
-    than fifty are on surfaces that it sees, see `ComparedFrame.sees`."""
+    """Compares the points of one frame with what another sees there, see `ComparedFrame.sees`; None
+    if fewer than fifty are on surfaces that it sees."""
     R, p = X_WC_other.rotation().matrix(), X_WC_other.translation()
     p_WQ = one.p_CQ @ X_WC.rotation().matrix().T + X_WC.translation()
     q = (p_WQ - p) @ R
     same, u, inverse = other.sees(q, reach)
-    if same.sum() < _FEWEST:
+    if same.sum() < _MIN_POINTS:
         return None
     p_WQ, q, u, inverse = p_WQ[same], q[same], u[:, same], inverse[:, same]
-    contrast = _at(other.contrast, u)
+    contrast = _sample(other.contrast, u)
     residuals = np.array([inverse[0] * q[:, 2] - 1, contrast[0] - one.point_contrast[same]])
     # A plane has w = m . ray, so that e = m . q - 1.
     f, c = np.diag(other.K)[:2, None], other.K[:2, 2, None]
@@ -112,7 +133,7 @@ def compare_frames(
     return Comparison(residuals, np.concatenate([turn, by_p_WQ, -turn_other, -by_p_WQ], axis=2))
 
 
-def _at(image: NDArray[np.float32], u: NDArray[np.float64]) -> NDArray[np.float64]:
+def _sample(image: NDArray[np.float32], u: NDArray[np.float64]) -> NDArray[np.float64]:
     """Returns an image and its derivatives [1/px] along rows and columns, (3, n), at the image
     coordinates u (2, n); zero outside."""
     x, y = (u - 0.5).clip(-9, 1e4).astype(np.float32)[:, None]
@@ -124,31 +145,10 @@ def _at(image: NDArray[np.float32], u: NDArray[np.float64]) -> NDArray[np.float6
     return np.array([center, (right - left) / 2, (below - above) / 2])
 
 
-# Whether colour and depth come from one camera, told from how colours agree between frames.
-#
-# A point on a surface has about the same colour in two frames. Depth says where it is in both; a
-# wrong idea of the colour camera samples the wrong colours, and ones that change from frame to
-# frame. The measure is 1 - the correlation of luminance between frames, which exposure does not
-# change, averaged over pairs.
-
-
-_MAX_REGISTRATION_POINTS = 3000
-"""About how many pixels of an image are compared."""
-_BLUR = 1.5  # [px]
-_SAME_SURFACE = 0.03
-_MIN_PIXELS = 300
-_MIN_GAIN = 0.6
-"""What fraction of the disagreement another colour camera must leave to be believed."""
-_NEGLIGIBLE, _LARGEST = 0.01, 0.3
-"""Disagreement below which no other color camera is looked for, and above which none is believed.
-It is 0.02 to 0.04 in captures of real cameras, and 0.11 where one is wrongly read as registered."""
-_SHORTEST = 0.008
-_SMALLEST = 0.015
-
-
 @dataclass(frozen=True)
 class ColorFit:
-    """How colours agree with the colour camera as read, and with the one that fits best."""
+    """Disagreement of colors, 1 - their correlation, with the color camera as read and the one that
+    fits best."""
 
     cost: float
     best_cost: float
@@ -159,8 +159,8 @@ class ColorFit:
     def __str__(self) -> str:
         x, y = self.p_DC
         return (
-            f"{self.cost:12.4f}  as it was read\n{self.best_cost:12.4f}  best: colour focal length "
-            f"{self.focal_length:.0f} px, colour camera at ({x:+.3f}, {y:+.3f}, 0) m in the depth "
+            f"{self.cost:12.4f}  as it was read\n{self.best_cost:12.4f}  best: color focal length "
+            f"{self.focal_length:.0f} px, color camera at ({x:+.3f}, {y:+.3f}, 0) m in the depth "
             "camera"
         )
 
@@ -172,16 +172,14 @@ class _ColoredPair:
     """(H, W) each, luminance, NaN in invalid pixels."""
 
 
-def grid_step(image: NDArray, count: int) -> int:
-    """Returns every how manieth pixel along each axis to take so that about `count` are left."""
-    return max(1, round((image.size / count) ** 0.5))
-
-
 def fit_color_camera(capture: Capture, pairs: Sequence[tuple[int, int]]) -> ColorFit | None:
-    """Fits the focal length and position of the colour camera, its axes parallel to depth's.
+    """Fits the focal length and position of the color camera, its axes parallel to depth's.
+
+    A point on a surface has about the same luminance in two frames; a wrong color camera samples
+    other points, which differ from frame to frame. Correlation does not depend on exposure.
 
     Args:
-        pairs: numbers of frames to compare.
+        pairs: indices of frames to compare.
 
     Returns:
         The fit, or None if too few points are seen twice.
@@ -196,39 +194,36 @@ def fit_color_camera(capture: Capture, pairs: Sequence[tuple[int, int]]) -> Colo
     def cost(x: NDArray[np.float64]) -> float:
         K = capture.K.copy()
         K[:2, :2] *= np.exp(x[0])
-        p = X_DC.translation() + np.array([x[1], x[2], 0])
-        found = [
-            1 - correlation
-            for pair in colored
-            if (correlation := _correlation(pair, K, RigidTransform(X_DC.rotation(), p)))
-            is not None
-        ]
+        X = RigidTransform(X_DC.rotation(), X_DC.translation() + np.array([x[1], x[2], 0]))
+        correlations = [_correlation(pair, K, X) for pair in colored]
+        found = [1 - each for each in correlations if each is not None]
         return float(np.mean(found)) if len(found) > len(colored) / 2 else 2.0
 
     as_read = cost(np.zeros(3))
     simplex = np.concatenate([np.zeros((1, 3)), np.diag([-0.1, 0.03, 0.03])])
-    fit = minimize(
-        cost,
-        np.zeros(3),
-        method="Nelder-Mead",
-        options={"initial_simplex": simplex, "xatol": 1e-3, "fatol": 1e-5, "maxfev": 90},
-    )
+    options = {"initial_simplex": simplex, "xatol": 1e-3, "fatol": 1e-5, "maxfev": 90}
+    fit = minimize(cost, np.zeros(3), method="Nelder-Mead", options=options)
     focal_length = float(capture.K[0, 0] * np.exp(fit.x[0]))
     x, y = (X_DC.translation()[:2] + fit.x[1:]).tolist()
     mistake = ""
-    moved = np.linalg.norm(fit.x[1:]) > _SHORTEST or abs(fit.x[0]) > _SMALLEST
+    moved = np.linalg.norm(fit.x[1:]) > _MIN_SHIFT or abs(fit.x[0]) > _MIN_LOG_ZOOM
     if as_read > _NEGLIGIBLE and fit.fun < _MIN_GAIN * as_read and moved:
         mistake = (
-            "most likely colour and depth are not registered: a colour camera of focal length "
+            "most likely color and depth are not registered: a color camera of focal length "
             f"{focal_length:.0f} px at ({x:+.3f}, {y:+.3f}, 0) m in the depth camera leaves "
-            f"{fit.fun:.3f} of disagreement between colours instead of {as_read:.3f}"
+            f"{fit.fun:.3f} of disagreement between colors instead of {as_read:.3f}"
         )
-    elif as_read > _LARGEST:
+    elif as_read > _MAX_DISAGREEMENT:
         mistake = (
             f"colors do not follow depth: 1 - their correlation between frames is {as_read:.2f}, "
-            f"at most {_LARGEST} is believed; intrinsics may be those of another camera"
+            f"at most {_MAX_DISAGREEMENT} is plausible; intrinsics may be those of another camera"
         )
     return ColorFit(as_read, float(fit.fun), focal_length, (x, y), mistake)
+
+
+def _grid_step(image: NDArray, count: int) -> int:
+    """Returns the step along both axes that leaves about `count` pixels."""
+    return max(1, round((image.size / count) ** 0.5))
 
 
 def _color_pair(
@@ -238,20 +233,11 @@ def _color_pair(
     a, b = capture.measured_depth(i), capture.measured_depth(j)
     if a is None or b is None:
         return None
-    step = grid_step(a, _MAX_REGISTRATION_POINTS)
-    rows, columns = np.mgrid[0 : a.shape[0] : step, 0 : a.shape[1] : step]
-    z = a[rows, columns].astype(np.float64)
-    known = (z > 0) & np.isfinite(z)
-    z, rows, columns = z[known], rows[known], columns[known]
-    p_DQ = back_project(K_D, columns + 0.5, rows + 0.5, z).T
+    p_DQ = depth_points(K_D, a, _grid_step(a, _COLOR_POINTS))[0].T
     X_WDs = [capture.X_WCs[k] @ X_DC.inverse() for k in (i, j)]
     q = (X_WDs[1].inverse() @ X_WDs[0]).multiply(p_DQ)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        u = np.floor(K_D[0, 0] * q[0] / q[2] + K_D[0, 2])
-        v = np.floor(K_D[1, 1] * q[1] / q[2] + K_D[1, 2])
-    seen = (q[2] > 0) & (u >= 0) & (u < b.shape[1]) & (v >= 0) & (v < b.shape[0])
-    found = b[v[seen].astype(np.intp), u[seen].astype(np.intp)]
-    seen[seen] = np.abs(found - q[2][seen]) < _SAME_SURFACE * q[2][seen]
+    seen, rows, columns = project_points(K_D, q.T, b.shape[1], b.shape[0])
+    seen[seen] = np.abs(b[rows, columns] - q[2][seen]) < _SAME_SURFACE * q[2][seen]
     if seen.sum() < _MIN_PIXELS:
         return None
     return _ColoredPair(
@@ -269,14 +255,14 @@ def _luminance(capture: Capture, i: int) -> NDArray[np.float32]:
 
 
 def _correlation(pair: _ColoredPair, K: NDArray[np.float64], X_DC: RigidTransform) -> float | None:
-    """Returns the correlation of the colours of a pair, None if too few are inside both images."""
+    """Returns the correlation of the luminance of a pair, None if too few points are inside both
+    images."""
     samples = []
     for p_DQ, image in zip(pair.p_DQs, pair.images, strict=True):
         x, y, z = X_DC.inverse().multiply(p_DQ)
         u = (K[0, 0] * x / z + K[0, 2] - 0.5).astype(np.float32)
         v = (K[1, 1] * y / z + K[1, 2] - 0.5).astype(np.float32)
-        outside = -1.0
-        sampled = cv2.remap(image, u[None], v[None], cv2.INTER_LINEAR, borderValue=outside)[0]
+        sampled = cv2.remap(image, u[None], v[None], cv2.INTER_LINEAR, borderValue=-1.0)[0]
         height, width = image.shape
         inside = (z > 0) & (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)
         samples.append((sampled, inside & np.isfinite(sampled)))
@@ -285,18 +271,6 @@ def _correlation(pair: _ColoredPair, K: NDArray[np.float64], X_DC: RigidTransfor
     if both.sum() < _MIN_PIXELS or a[both].std() == 0 or b[both].std() == 0:
         return None
     return float(np.corrcoef(a[both], b[both])[0, 1])
-
-
-# How well depth of one frame, carried into another, agrees with the depth that stands there.
-#
-# With the right reading of a capture's files both are the same surface. The measure is the median
-# of |z' / z - 1| over points of many pairs of frames, z carried over and z' found.
-
-
-_MAX_POINTS = 5000
-"""About how many pixels of an image are carried over."""
-_LEAST_INSIDE = 0.1
-"""Of the points, the fraction that must fall onto measured depth for a reading to count."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -310,36 +284,33 @@ class FramePair:
     frames: tuple[int, int]
 
 
-def _same(X_FB: RigidTransform) -> RigidTransform:
-    return X_FB
-
-
 @dataclass(frozen=True, eq=False)
 class Reading:
-    """One way to understand the files of a capture."""
+    """One interpretation of the files of a capture."""
 
     name: str
     K: NDArray[np.float64]  # (3, 3) [px], of the depth camera
     R_BC: RotationMatrix
-    pose: Callable[[RigidTransform], RigidTransform] = _same
+    pose: Callable[[RigidTransform], RigidTransform] = lambda X_FB: X_FB
     factor: float = 1.0
-    """Times what depth is taken to be."""
+    """Scale of depth."""
     is_range: bool = False
-    """Whether what is stored is the distance from the camera, not depth along its axis."""
+    """Whether the distance from the camera is stored instead of depth along its axis."""
 
 
 @dataclass(frozen=True)
 class ReadingFit:
-    """How well a reading fits."""
+    """Agreement of depth between frames under a reading."""
 
     name: str
     error: float
-    """Median relative error of depth; infinite if the frames hardly overlap."""
+    """Median of |z' / z - 1|, depth z carried into another frame and z' found there; infinite if
+    the frames hardly overlap."""
     inside: float
     """The fraction of points that fall onto measured depth in the other frame."""
 
 
-def reading_of(capture: Capture) -> Reading:
+def initial_reading(capture: Capture) -> Reading:
     """Returns the reading of the capture as it was opened."""
     R_BC = capture.axes.R_BC if capture.axes is not None else RotationMatrix()
     K = capture.depth_camera.K if capture.depth_camera is not None else capture.K
@@ -349,42 +320,34 @@ def reading_of(capture: Capture) -> Reading:
 def choose_pairs(capture: Capture, count: int) -> list[FramePair]:
     """Chooses frames spread over the capture, each with a later one that sees it differently.
 
-    Later means by at most 16 frames: the first whose camera has moved by an eighth of the median
-    depth or turned by ten degrees, but by no more than 45, and the last if none has.
+    That is at most 16 frames later: the first whose camera has moved by an eighth of the median
+    depth or rotated by ten degrees, but by no more than 45, else the last.
     """
-    X_CD = capture.depth_camera.X_CD if capture.depth_camera is not None else RigidTransform()
-    axes = capture.axes
-    R_WF = RigidTransform(axes.R_WF) if axes is not None else RigidTransform()
-    R_BC = RigidTransform(axes.R_BC) if axes is not None else RigidTransform()
-
-    X_OW = RigidTransform(capture.origin)
-
-    def X_FB(i: int) -> RigidTransform:
-        return R_WF.inverse() @ X_OW @ capture.X_WCs[i] @ X_CD @ R_BC.inverse()
-
+    axes, camera = capture.axes, capture.depth_camera
+    X_CD = camera.X_CD if camera is not None else RigidTransform()
+    X_WF = RigidTransform(axes.R_WF) if axes is not None else RigidTransform()
+    X_BC = RigidTransform(axes.R_BC) if axes is not None else RigidTransform()
+    X_FW = X_WF.inverse() @ RigidTransform(capture.origin)
     pairs = []
     for i in np.unique(np.linspace(0, len(capture) - 2, count).astype(int)).tolist():
         depth = capture.measured_depth(i)
         if depth is None:
             continue
-        step = grid_step(depth, _MAX_POINTS)
-        rows, columns = np.mgrid[
-            step // 2 : depth.shape[0] : step, step // 2 : depth.shape[1] : step
-        ]
-        z = depth[rows, columns].astype(np.float64)
-        known = (z > 0) & np.isfinite(z)
-        if not known.any():
+        step = _grid_step(depth, _READING_POINTS)
+        p_CQ, rows, columns = depth_points(capture.K, depth, step, start=step // 2)
+        if not len(p_CQ):
             continue
-        j = _partner(capture, i, float(np.median(z[known])))
+        j = _later_frame(capture, i, float(np.median(p_CQ[:, 2])))
         other = capture.measured_depth(j) if j is not None else None
         if j is None or other is None:
             continue
-        pixels = np.stack([columns[known] + 0.5, rows[known] + 0.5])
-        pairs.append(FramePair(pixels, z[known], (X_FB(i), X_FB(j)), other, (i, j)))
+        X_FBs = tuple(X_FW @ capture.X_WCs[k] @ X_CD @ X_BC.inverse() for k in (i, j))
+        pixels = np.array([columns + 0.5, rows + 0.5], dtype=np.float64)
+        pairs.append(FramePair(pixels, p_CQ[:, 2], X_FBs, other, (i, j)))
     return pairs
 
 
-def _partner(capture: Capture, i: int, depth: float) -> int | None:
+def _later_frame(capture: Capture, i: int, depth: float) -> int | None:
     j = None
     for j in range(i + 1, min(i + 17, len(capture))):
         X = capture.X_WCs[i].inverse() @ capture.X_WCs[j]
@@ -397,37 +360,28 @@ def _partner(capture: Capture, i: int, depth: float) -> int | None:
 
 def measure_reading(reading: Reading, pairs: Sequence[FramePair]) -> ReadingFit:
     """Measures a reading on pairs of frames."""
-    errors, total = [], 0
-    for pair in pairs:
-        error = _relative_errors(reading, pair)
-        errors.append(error)
-        total += len(pair.depth)
-    error = np.concatenate(errors)
-    inside = len(error) / total
-    if inside < _LEAST_INSIDE:
-        return ReadingFit(reading.name, np.inf, inside)
-    return ReadingFit(reading.name, float(np.median(error)), inside)
+    error = np.concatenate([_relative_errors(reading, pair) for pair in pairs])
+    inside = len(error) / sum(len(pair.depth) for pair in pairs)
+    median = float(np.median(error)) if inside >= _MIN_INSIDE else np.inf
+    return ReadingFit(reading.name, median, inside)
 
 
 def _relative_errors(reading: Reading, pair: FramePair) -> NDArray[np.float64]:
-    f, c = np.diag(reading.K)[:2], reading.K[:2, 2]
-    u, v = pair.pixels
-    rays = back_project(reading.K, u, v, np.ones_like(u)).T
+    def stretch(u: NDArray, v: NDArray) -> NDArray[np.float64]:
+        """Returns the distance of points at depth 1."""
+        return np.linalg.norm(back_project(reading.K, u, v, np.ones(u.shape)), axis=-1)
+
     z = reading.factor * pair.depth
     if reading.is_range:
-        z = z / np.linalg.norm(rays, axis=0)
+        z = z / stretch(*pair.pixels)
     R_BC = RigidTransform(reading.R_BC)
     a, b = (reading.pose(X_FB) @ R_BC for X_FB in pair.X_FBs)
-    x, y, z = (b.inverse() @ a).multiply(z * rays)
-    front = z > 0
-    x, y, z = x[front] / z[front], y[front] / z[front], z[front]
+    u, v = pair.pixels
+    p_CQ = (b.inverse() @ a).multiply(back_project(reading.K, u, v, z).T).T
     height, width = pair.other.shape
-    u = np.floor(f[0] * x + c[0])
-    v = np.floor(f[1] * y + c[1])
-    hit = (u >= 0) & (u < width) & (v >= 0) & (v < height)
-    u, v, z = u[hit].astype(np.intp), v[hit].astype(np.intp), z[hit]
-    found = reading.factor * pair.other[v, u].astype(np.float64)
+    hit, rows, columns = project_points(reading.K, p_CQ, width, height)
+    found = reading.factor * pair.other[rows, columns].astype(np.float64)
     if reading.is_range:
-        found /= np.hypot(1, np.hypot((u + 0.5 - c[0]) / f[0], (v + 0.5 - c[1]) / f[1]))
+        found /= stretch(columns + 0.5, rows + 0.5)
     known = (found > 0) & np.isfinite(found)
-    return np.minimum(np.abs(found[known] / z[known] - 1), 1.0)
+    return np.minimum(np.abs(found[known] / p_CQ[hit, 2][known] - 1), 1.0)

@@ -1,15 +1,15 @@
-"""From lists of files and poses to a `Capture`; every format that keeps frames in files ends here.
+"""Opens captures that keep their frames in files.
 
-What is wrong with single frames leaves those out, with a message each in `Capture.dropped`: files
-that are missing, empty, unreadable or of another size, poses that are not finite, no rotation or
-far from all others. It is an error if more than a fifth of the frames are left out, because then it
-is the capture that is read wrongly.
+Frames with a missing, damaged or differently sized file, or with an invalid or distant pose, are
+left out, with a message each in `Capture.dropped`. More than a fifth of them are an error, because
+then the capture is read wrongly.
 """
 
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from os.path import isfile
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +17,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
-from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform, RotationMatrix
+from scipy.spatial.transform import Rotation
 
 from splatpilot.systems.common.extras import import_extra
 from splatpilot.systems.common.readers import (
@@ -28,6 +28,7 @@ from splatpilot.systems.common.readers import (
     reason_of,
     require_readable_size,
 )
+from splatpilot.systems.common.validation import require
 from splatpilot.training.captures.capture import (
     Capture,
     DepthCamera,
@@ -40,64 +41,27 @@ from splatpilot.training.captures.capture import (
     resampling_maps,
 )
 
-
-def exr_size(file: Path) -> tuple[int, int]:
-    """Returns width and height [px] without reading the pixels.
-
-    Raises:
-        ValueError: if it is no EXR file.
-        ModuleNotFoundError: if the extra `exr` is not installed.
-    """
-    (left, top), (right, bottom) = _open(file, header_only=True).header()["dataWindow"]
-    return int(right - left + 1), int(bottom - top + 1)
-
-
-def read_exr(file: Path) -> NDArray[np.float32]:
-    """Returns the pixels (H, W) of a file of one channel, or of its first if it has several.
-
-    Raises:
-        ValueError: if it is no EXR file.
-        ModuleNotFoundError: if the extra `exr` is not installed.
-    """
-    channels = _open(file, separate_channels=True).channels()
-    return np.asarray(next(iter(channels.values())).pixels, dtype=np.float32)
-
-
-def _open(file: Path, **options: bool) -> Any:
-    OpenEXR: Any = import_extra("OpenEXR", "exr")
-    try:
-        return OpenEXR.File(str(file), **options)
-    except Exception as error:  # OpenEXR raises anything of damaged files
-        raise ValueError(f"{file}: not a readable EXR file ({error}); copy it again") from None
-
-
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp"}
 
-_DEPTH_IS = "depth is one number a pixel, of integers of more than 8 bits or floats"
+_DEPTH = "one number per pixel, an integer of more than 8 bits or a float"
 # Pillow's modes of images without depth; four channels may be the bytes of one number.
 _NO_DEPTH = {"1", "L", "P", "LA", "PA", "RGB", "CMYK", "YCbCr"}
 _ALPHA = {"RGBA", "LA", "PA"}
 _ENDS = {"PNG": b"IEND", "JPEG": b"\xff\xd9"}
+_MAX_POSITION = 1e8  # [m]
 
 
 def image_size(file: Path) -> tuple[int, int]:
     """Returns width and height [px] of an image without decoding it.
 
     Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if it is empty, no image or cut short.
+        ValueError, OSError: if it is missing, not an image or truncated.
     """
     return _image_header(file)[0]
 
 
-def image_layout(file: Path) -> tuple[tuple[int, int], bool]:
-    """Returns what `image_size` does, and whether the image has an alpha channel."""
-    size, mode = _image_header(file)
-    return size, mode in _ALPHA
-
-
 def _image_header(file: Path) -> tuple[tuple[int, int], str]:
-    """Its size, and Pillow's name for what its pixels are."""
+    """Returns width and height [px], and Pillow's mode of the pixels."""
     _require_content(file)
     try:
         with Image.open(file) as image:
@@ -105,55 +69,37 @@ def _image_header(file: Path) -> tuple[tuple[int, int], str]:
             if "transparency" in image.info:  # of one color, or of those of a palette
                 mode = "RGBA"
     except Exception as error:  # Pillow raises anything of damaged files
-        raise ValueError(
-            f"{file}: not a readable image ({_reason(error)}); copy it again"
-        ) from None
+        reason = reason_of(error).partition(" '")[0]
+        raise ValueError(f"{file}: not a readable image ({reason}); copy it again") from None
     require_readable_size(file, 4 * size[0] * size[1])
     with file.open("rb") as stream:
-        # Cameras append previews and padding to JPEGs, so the end is looked for, not asked for.
+        # Cameras append previews and padding to JPEGs, so the end is searched.
         stream.seek(max(0, file.stat().st_size - 65536))
         if _ENDS.get(kind or "", b"") not in stream.read():
-            raise ValueError(f"{file}: not a readable image (it is cut short); copy it again")
+            raise ValueError(f"{file}: not a readable image (truncated); copy it again")
     return size, mode
 
 
-def array_shape(file: Path) -> tuple[int, ...]:
-    """Returns the shape of an array in a `.npy` file without reading it.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if it is empty, no array or cut short.
-    """
-    return _depth_layout(file)[0]
-
-
-def _depth_layout(file: Path) -> tuple[tuple[int, ...], np.dtype]:
-    _require_content(file)
-    shape, dtype = array_layout(file)
-    if dtype.kind not in "iuf" or dtype.itemsize == 1:
-        raise ValueError(f"{file}: an array of {dtype}; {_DEPTH_IS}")
-    return shape, dtype
-
-
 def depth_size(file: Path) -> tuple[int, int]:
-    """Returns width and height [px] of a depth image or array; raises as the two above."""
+    """Returns width and height [px] of a depth image or array without reading its pixels."""
+    _require_content(file)
     if file.suffix == ".exr":
-        _require_content(file)
-        return exr_size(file)
-    if file.suffix != ".npy":
-        size, mode = _image_header(file)
-        if mode in _NO_DEPTH:
-            raise ValueError(f"{file}: pixels of 8 bits or several channels; {_DEPTH_IS}")
-        return size
-    shape = array_shape(file)
-    if len(shape) != 2:
-        raise ValueError(f"{file}: an array of shape {shape}; depth has rows and columns alone")
-    return shape[1], shape[0]
+        (left, top), (right, bottom) = _open_exr(file, header_only=True).header()["dataWindow"]
+        return int(right - left + 1), int(bottom - top + 1)
+    if file.suffix == ".npy":
+        shape, dtype = array_layout(file)
+        valid = len(shape) == 2 and dtype.kind in "iuf" and dtype.itemsize > 1
+        require(valid, f"{file}: depth", _DEPTH, f"an array of {dtype} of shape {shape}")
+        return shape[1], shape[0]
+    size, mode = _image_header(file)
+    require(mode not in _NO_DEPTH, f"{file}: depth", _DEPTH, f"an image of mode {mode}")
+    return size
 
 
 def read_image(file: Path) -> NDArray[np.uint8]:
-    """Returns an image as (H, W, 3) red, green, blue; raises ValueError if it is unreadable."""
-    # The pixels as they are stored: poses and intrinsics belong to them, not to the turned picture.
+    """Returns an image as (H, W, 3) red, green, blue."""
+    # The pixels as stored: poses and intrinsics belong to them, not to the rotated
+    # picture.
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
     return cv2.cvtColor(_decode(file, flags), cv2.COLOR_BGR2RGB)  # pyright: ignore[reportReturnType]
 
@@ -168,28 +114,28 @@ def read_alpha(file: Path) -> NDArray[np.bool_]:
 
 
 def read_mask(file: Path) -> NDArray[np.bool_]:
-    """Returns where a mask (H, W) is not black; raises ValueError if it is unreadable."""
+    """Returns where a mask (H, W) is not black."""
     return _decode(file, cv2.IMREAD_ANYDEPTH) > 0
 
 
 def read_depth(file: Path, unit: float) -> NDArray[np.float32]:
     """Returns depth (H, W) [m] from `.npy`, `.exr`, or an image of integers or floats.
 
-    Args:
-        unit: how many units of the file make a metre.
+    NaN, negative depth and the largest 16-bit number, which sensors write where they see nothing,
+    become 0, unknown.
 
-    What is no number or not in front of the camera, and the largest 16-bit number, which sensors
-    write where they see nothing, become 0, unknown.
+    Args:
+        unit: units of the file per meter.
     """
     if file.suffix == ".npy":
-        _depth_layout(file)
         raw = read_array(file)
     elif file.suffix == ".exr":
-        raw = read_exr(file)
+        channels = _open_exr(file, separate_channels=True).channels()
+        raw = np.asarray(next(iter(channels.values())).pixels, dtype=np.float32)
     else:
         raw = _decode(file, cv2.IMREAD_UNCHANGED)
-    if raw.ndim != 2 or raw.dtype == np.uint8:
-        raise ValueError(f"{file}: a {raw.dtype} array of shape {raw.shape}; {_DEPTH_IS}")
+    valid = raw.ndim == 2 and raw.dtype.kind in "iuf" and raw.dtype.itemsize > 1
+    require(valid, f"{file}: depth", _DEPTH, f"an array of {raw.dtype} of shape {raw.shape}")
     depth = raw.astype(np.float32) / np.float32(unit)
     if raw.dtype == np.uint16:
         depth[raw == 65535] = 0
@@ -199,32 +145,10 @@ def read_depth(file: Path, unit: float) -> NDArray[np.float32]:
 def read_packed_depth(file: Path) -> NDArray[np.float32]:
     """Returns depth (H, W) [m] from a PNG whose four channels hold the bytes of a float32."""
     raw = _decode(file, cv2.IMREAD_UNCHANGED)
-    if raw.ndim != 3 or raw.shape[2] != 4 or raw.dtype != np.uint8:
-        raise ValueError(
-            f"{file}: a {raw.dtype} array of shape {raw.shape}; four channels of 8 bits, the bytes "
-            "of 32-bit depth, are needed"
-        )
+    valid = raw.ndim == 3 and raw.shape[2] == 4 and raw.dtype == np.uint8
+    found = f"an array of {raw.dtype} of shape {raw.shape}"
+    require(valid, f"{file}: depth", "four channels of 8 bits", found)
     return _clean(np.ascontiguousarray(raw).view("<f4")[..., 0].copy())
-
-
-def numbered_files(folder: Path, pattern: str) -> dict[int, Path]:
-    """Returns the files of `folder` by the number in their name, in its order.
-
-    Args:
-        pattern: regular expression of the whole name, whose group is the number.
-
-    Raises:
-        FileNotFoundError: if there is no such folder, or no name is like that.
-    """
-    if not folder.is_dir():
-        raise FileNotFoundError(f"{folder}: the folder is missing")
-    files = {}
-    for file in folder.iterdir():
-        if match := re.fullmatch(pattern, file.name):
-            files[int(match[1])] = file
-    if not files:
-        raise FileNotFoundError(f"{folder}: holds no file named like {pattern}")
-    return dict(sorted(files.items()))
 
 
 def _clean(depth: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -243,26 +167,34 @@ def _decode(file: Path, flags: int) -> NDArray:
     return image
 
 
-def _require_content(file: Path) -> None:
+def _open_exr(file: Path, **options: bool) -> Any:
+    OpenEXR: Any = import_extra("OpenEXR", "exr")
     try:
-        there = file.is_file()
-    except OSError as error:  # its name is too long, or that of a folder
-        raise ValueError(
-            f"{str(file)[:200]}...: {error.strerror}; correct the name where it is listed"
-        ) from None
-    if not there:
-        raise FileNotFoundError(f"{file}: the file is missing")
+        return OpenEXR.File(str(file), **options)
+    except Exception as error:  # OpenEXR raises anything of damaged files
+        raise ValueError(f"{file}: not a readable EXR file ({error}); copy it again") from None
+
+
+def _require_content(file: Path) -> None:
+    if not isfile(file):
+        raise FileNotFoundError(f"No such file: {file}")
     if file.stat().st_size == 0:
         raise ValueError(f"{file}: the file is empty; copy it again")
 
 
-def _reason(error: Exception) -> str:
-    return reason_of(error).partition(" '")[0]
+def numbered_files(folder: Path, pattern: str) -> dict[int, Path]:
+    """Returns the files of a folder by the number in their name, in its order.
 
-
-_LAST_ROW = (0.0, 0.0, 0.0, 1.0)
-_LARGEST = 1e8
-"""[m], beyond which a position is not on Earth, whatever its origin."""
+    Args:
+        pattern: regular expression of the whole name, whose group is the number.
+    """
+    if not folder.is_dir():
+        raise FileNotFoundError(f"No such folder: {folder}")
+    found = ((re.fullmatch(pattern, file.name), file) for file in folder.iterdir())
+    files = {int(match[1]): file for match, file in found if match}
+    if not files:
+        raise FileNotFoundError(f"{folder}: holds no file named like {pattern}")
+    return dict(sorted(files.items()))
 
 
 def read_rows(file: Path, columns: int, what: str) -> list[NDArray[np.float64]]:
@@ -270,12 +202,9 @@ def read_rows(file: Path, columns: int, what: str) -> list[NDArray[np.float64]]:
 
     Lines that start with # and empty lines at the end are left out.
 
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if a line does not hold `columns` numbers, which `what` describes.
+    Args:
+        what: a row is, for messages.
     """
-    if not file.is_file():
-        raise FileNotFoundError(f"{file}: the file is missing")
     rows = []
     for number, line in enumerate(read_text(file, "replace").rstrip().splitlines(), start=1):
         if line.startswith("#"):
@@ -284,100 +213,87 @@ def read_rows(file: Path, columns: int, what: str) -> list[NDArray[np.float64]]:
             row = np.array(line.split(), dtype=np.float64)
         except ValueError:
             row = np.array([])
-        if row.shape != (columns,):
-            raise ValueError(f"{file}, line {number}: {line[:80]!r} is no {what}")
+        require(row.shape == (columns,), f"{file}, line {number}", what, repr(line[:80]))
         rows.append(row)
     return rows
 
 
 def read_matrix(file: Path) -> NDArray[np.float64]:
-    """Returns the matrix (4, 4) in a text file; NaN and infinities are read as such.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if it does not hold four rows of four numbers.
-    """
-    rows = read_rows(file, 4, "row of a 4x4 matrix; four numbers are needed")
-    if len(rows) != 4:
-        raise ValueError(f"{file}: {len(rows)} rows, 4 are needed")
+    """Returns the matrix (4, 4) in a text file; NaN and infinities are read as such."""
+    rows = read_rows(file, 4, "a row of a 4x4 matrix")
+    require(len(rows) == 4, f"{file}", "a 4x4 matrix", f"{len(rows)} rows")
     return np.array(rows)
 
 
 def pose_from_quaternion(row: NDArray[np.float64], source: str) -> RigidTransform:
-    """Returns the pose of a row tx ty tz qx qy qz qw.
-
-    Raises:
-        ValueError: if it is no pose; the message starts with `source`.
-    """
-    _require_finite(row, source)
-    _require_position(row[:3], source)
+    """Returns the pose of a row tx ty tz qx qy qz qw; errors start with `source`."""
+    _require_position(row, row[:3], source)
     norm = np.linalg.norm(row[3:])
-    if not abs(norm - 1) < 1e-3:
-        raise ValueError(
-            f"{source}: the quaternion has the length {norm:.6g}, 1 within 0.001 is needed; the "
-            "order should be tx ty tz qx qy qz qw"
-        )
-    x, y, z, w = row[3:]
-    return RigidTransform(Quaternion(np.array([w, x, y, z]) / norm), row[:3])
+    remedy = "the order is tx ty tz qx qy qz qw"
+    unit = abs(norm - 1) < 1e-3
+    require(unit, f"{source}: the length of the quaternion", "1 +- 0.001", f"{norm:.6g}", remedy)
+    return RigidTransform(RotationMatrix(Rotation.from_quat(row[3:]).as_matrix()), row[:3])
+
+
+def pose_row(X: RigidTransform) -> str:
+    """Returns a pose as a text tx ty tz qx qy qz qw."""
+    xyzw = Rotation.from_matrix(X.rotation().matrix()).as_quat(canonical=True)
+    return " ".join(f"{number:.17g}" for number in (*X.translation(), *xyzw))
 
 
 def pose_from_matrix(matrix: NDArray[np.float64], source: str) -> RigidTransform:
-    """Returns the pose of a matrix (4, 4), or (3, 4) without its last row, whose rotation may be
-    off by rounding.
-
-    Raises:
-        ValueError: if it is not a pose; the message starts with `source`.
-    """
-    _require_finite(matrix, source)
-    if not np.allclose(matrix[3:], _LAST_ROW, atol=1e-6):
-        columns = np.allclose(matrix[:, 3], _LAST_ROW, atol=1e-6)
-        why = "the matrix is stored column by column; transpose it" if columns else "copy it again"
-        raise ValueError(
-            f"{source}: the last row of a pose must be 0 0 0 1, got {matrix[3].tolist()}: {why}"
-        )
+    """Returns the pose of a matrix (4, 4) or (3, 4), whose rotation may be off by rounding; errors
+    start with `source`."""
     R, p = matrix[:3, :3], matrix[:3, 3]
-    _require_position(p, source)
-    error = np.abs(R @ R.T - np.eye(3)).max()
-    if error > 0.01 or np.linalg.det(R) < 0:
-        raise ValueError(
-            f"{source}: no rotation (R R^T is off by {error:.2g}, the determinant is "
-            f"{np.linalg.det(R):.3g}); a rigid transform is needed"
-        )
+    _require_position(matrix, p, source)
+    last = (0.0, 0.0, 0.0, 1.0)
+    columns = np.allclose(matrix[:, 3], last[: len(matrix)], atol=1e-6)
+    require(
+        np.allclose(matrix[3:], last, atol=1e-6),
+        f"{source}: the last row of a pose",
+        "0 0 0 1",
+        matrix[-1].tolist(),
+        "the matrix is stored column by column, transpose it" if columns else "copy it again",
+    )
+    error, determinant = np.abs(R @ R.T - np.eye(3)).max(), np.linalg.det(R)
+    require(
+        error < 0.01 and determinant > 0,
+        f"{source}: the rotation",
+        "orthonormal and right-handed",
+        f"R R^T - I of {error:.2g} and determinant {determinant:.3g}",
+    )
     return RigidTransform(RotationMatrix.ProjectToRotationMatrix(R), p)
 
 
-def _require_finite(pose: NDArray[np.float64], source: str) -> None:
+def _require_position(pose: NDArray[np.float64], p: NDArray[np.float64], source: str) -> None:
     if not np.isfinite(pose).all():
         raise ValueError(f"{source}: the pose is not finite (tracking was lost?)")
+    inside = np.abs(p).max() <= _MAX_POSITION
+    require(inside, f"{source}: the position", f"within {_MAX_POSITION:g} m", p)
 
 
-def _require_position(p: NDArray[np.float64], source: str) -> None:
-    if np.abs(p).max() > _LARGEST:
-        raise ValueError(f"{source}: the position {p} is more than {_LARGEST:g} m away")
+def outlier_frames(positions: NDArray[np.float64]) -> NDArray[np.intp]:
+    """Returns the indices of positions (N, 3) that are invalid, far from all others.
 
-
-def stray_frames(positions: NDArray[np.float64]) -> NDArray[np.intp]:
-    """Returns the numbers of positions (N, 3) so far from the others that they must be mistakes.
-
-    Those are farther from the median position than 20 times what four in five are, and than 10 m.
+    Those are farther from the median position than 10 m and 20 times what four in five are.
     """
     distance = np.linalg.norm(positions - np.median(positions, axis=0), axis=1)
     return np.flatnonzero(distance > max(10.0, 20 * np.quantile(distance, 0.8)))
 
 
-MAX_DROPPED = 0.2
+_MAX_DROPPED = 0.2
 """The fraction of frames that may be left out."""
 _MAPS = 8
 """Cameras whose resampling is kept at a time."""
-_WHOLE = 0.999
-"""Part of a resampled pixel that must come from valid ones."""
+_VALID = 0.999
+"""Fraction of a resampled pixel that must come from valid ones."""
 _SAME_SHAPE = 0.02
-"""Relative difference of the ratios of width to height, below which depth shows the same view."""
+"""Relative difference of aspect ratios below which depth shows the same view."""
 
 
 @dataclass(frozen=True, eq=False)
 class FrameFiles:
-    """One frame of a capture, not yet looked at."""
+    """One frame of a capture, not yet inspected."""
 
     image: Path
     X_FB: Callable[[], RigidTransform]
@@ -396,7 +312,7 @@ class FrameFiles:
 
 @dataclass(frozen=True, eq=False)
 class _Frame:
-    """A frame whose files look whole."""
+    """A frame whose files look complete."""
 
     files: FrameFiles
     size: tuple[int, int]  # width and height [px]
@@ -407,11 +323,11 @@ class _Frame:
 
 def open_frames(
     path: Path,
-    kind: str,
+    source: str,
     frames: Sequence[FrameFiles],
     *,
     axes: FileAxes,
-    lens: Callable[[int, int], Lens] = lambda width, height: _no_lens(),
+    lens: Callable[[int, int], Lens] | None = None,
     intrinsics: Sequence[float] = (),
     read_depth: Callable[[Path], NDArray[np.float32]] | None = None,
     depth_camera: Callable[[int, int], DepthCamera] | None = None,
@@ -419,19 +335,19 @@ def open_frames(
     dropped: Sequence[str] = (),
     notes: Sequence[str] = (),
 ) -> Capture:
-    """Opens the frames; images and depths are read when asked for.
+    """Opens frames, whose images and depths are read on demand.
 
     Args:
         path: the capture's folder or file.
-        kind: what it is called in `Capture.source`.
+        source: the format's name in `Capture.source`.
         axes: the axes of the files' poses.
-        lens: gives the camera of images of a width and height [px], for frames that bring none.
+        lens: returns the camera of images of a width and height [px], for frames without their own.
         intrinsics: fx, fy, cx, cy [px] that replace those of `lens`; or empty.
         read_depth: reads the depth [m] in a file; None if there is none.
-        depth_camera: gives the camera of depth images of a width and height [px]; None if depth has
-            the pixels of the images before they are undistorted.
-        stretch_depth: whether depth, without a camera of its own, may show in fewer pixels or more
-            what the image shows.
+        depth_camera: returns the camera of depth images of a width and height [px]; None if depth
+            has the pixels of the images before they are undistorted.
+        stretch_depth: whether depth, without a camera of its own, may have another resolution than
+            the image.
         dropped: messages about frames that were left out already, which do not count further.
         notes: the first of `Capture.notes`.
 
@@ -439,104 +355,98 @@ def open_frames(
         ValueError: if fewer than two frames, or less than four fifths of them, can be used.
     """
     messages = list(dropped)
-    sound: list[_Frame] = []
-    for frame in frames:
-        try:
-            sound.append(_inspect(frame))
-        except (ValueError, OSError) as error:
-            messages.append(str(error))
-    sound = _keep_usual_size(sound, messages, registered=not (depth_camera or stretch_depth))
-    if stretch_depth:
-        sound = _keep_same_view(sound, messages)
-    if sound:
-        stray = set(stray_frames(np.array([frame.X_FB.translation() for frame in sound])).tolist())
-        for i in sorted(stray):
-            p = sound[i].X_FB.translation().round(1)
-            messages.append(f"{sound[i].files.image}: its position {p} is far from all others")
-        sound = [frame for i, frame in enumerate(sound) if i not in stray]
-    if len(sound) < max(2, (1 - MAX_DROPPED) * len(frames)):
+    valid = _usable_frames(frames, messages, not (depth_camera or stretch_depth), stretch_depth)
+    if valid:
+        outliers = set(outlier_frames(np.array([f.X_FB.translation() for f in valid])).tolist())
+        for i in sorted(outliers):
+            p = valid[i].X_FB.translation().round(1)
+            messages.append(f"{valid[i].files.image}: its position {p} is far from all others")
+        valid = [frame for i, frame in enumerate(valid) if i not in outliers]
+    if len(valid) < max(2, (1 - _MAX_DROPPED) * len(frames)):
         first = f"; the first that cannot: {messages[0]}" if messages else ""
         raise ValueError(
-            f"{path}: {len(sound)} of {len(frames)} frames can be used, at least 2 and "
-            f"{1 - MAX_DROPPED:.0%} are needed{first}"
+            f"{path}: {len(valid)} of {len(frames)} frames can be used, at least 2 and "
+            f"{1 - _MAX_DROPPED:.0%} must be{first}"
         )
 
     def shared_lens() -> Lens:
-        width, height = next(frame.size for frame in sound if frame.files.lens is None)
+        width, height = next(frame.size for frame in valid if frame.files.lens is None)
         if intrinsics:
             return Lens(pinhole(*intrinsics), width, height, source="capture.intrinsics")
+        if lens is None:
+            raise ValueError("unknown intrinsics; set capture.intrinsics to [fx, fy, cx, cy]")
         return lens(width, height)
 
     try:
-        shared = shared_lens() if any(frame.files.lens is None for frame in sound) else None
-        lenses = [frame.files.lens or shared for frame in sound]
+        shared = shared_lens() if any(frame.files.lens is None for frame in valid) else None
+        lenses = [frame.files.lens or shared for frame in valid]
         distinct = [each for each in dict.fromkeys(lenses) if each is not None]
         camera = common_pinhole(distinct)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
-    # Some cameras focus anew with each frame: their maps would fill the memory.
-    map_of = lru_cache(_MAPS)(lambda lens: resampling_maps(lens, camera))
-    has_depth = read_depth is not None and any(frame.files.depth for frame in sound)
+    # Some cameras focus every frame again: the maps of all would fill the memory.
+    cached_maps = lru_cache(_MAPS)(lambda lens: resampling_maps(lens, camera))
+    has_depth = read_depth is not None and any(frame.files.depth for frame in valid)
 
     def load_image(i: int) -> NDArray[np.uint8]:
-        file = sound[i].files.image
-        return _resample(_require_size(read_image(file), file, sound[i].size), i, cv2.INTER_LINEAR)
+        file = valid[i].files.image
+        return resample(_require_size(read_image(file), file, valid[i].size), i, cv2.INTER_LINEAR)
 
     def load_valid(i: int) -> NDArray[np.bool_]:
-        files, size = sound[i].files, sound[i].size
-        valid = np.ones(size[::-1], dtype=bool)
+        files, size = valid[i].files, valid[i].size
+        mask = np.ones(size[::-1], dtype=bool)
         if files.mask is not None:
-            valid &= _require_size(read_mask(files.mask), files.mask, size)
-        if sound[i].has_alpha:
-            valid &= _require_size(read_alpha(files.image), files.image, size)
-        # No pixel is valid whose color is interpolated from one that is not.
-        return _resample(valid.astype(np.float32), i, cv2.INTER_LINEAR) > _WHOLE
+            mask &= _require_size(read_mask(files.mask), files.mask, size)
+        if valid[i].has_alpha:
+            mask &= _require_size(read_alpha(files.image), files.image, size)
+        # A pixel interpolated from an invalid one is invalid.
+        return resample(mask.astype(np.float32), i, cv2.INTER_LINEAR) > _VALID
 
     def load_depth(i: int) -> NDArray[np.float32] | None:
-        file, size = sound[i].files.depth, sound[i].depth_size
+        file, size = valid[i].files.depth, valid[i].depth_size
         if file is None or size is None or read_depth is None:
             return None
         depth = _require_size(read_depth(file), file, size)
         if depth_camera:
             return depth
-        # Between surfaces an average would be a place where nothing is.
-        if size != sound[i].size:
-            depth = cv2.resize(depth, sound[i].size, interpolation=cv2.INTER_NEAREST_EXACT)
-        return _resample(depth, i, cv2.INTER_NEAREST)
+        # An average between two surfaces would lie on neither.
+        if size != valid[i].size:
+            depth = cv2.resize(depth, valid[i].size, interpolation=cv2.INTER_NEAREST_EXACT)
+        return resample(depth, i, cv2.INTER_NEAREST)
 
-    def _resample(image: NDArray, i: int, interpolation: int) -> NDArray:
+    def resample(image: NDArray, i: int, interpolation: int) -> NDArray:
         lens = lenses[i]
-        if lens is None or (found := map_of(lens)) is None:
+        if lens is None or (maps := cached_maps(lens)) is None:
             return image
         # The pinhole sees up to half a pixel more than the lens, which is not black.
-        return cv2.remap(image, *found, interpolation, borderMode=cv2.BORDER_REPLICATE)
+        return cv2.remap(image, *maps, interpolation, borderMode=cv2.BORDER_REPLICATE)
 
     R_WF, R_BC = RigidTransform(axes.R_WF), RigidTransform(axes.R_BC)
-    depth_sizes = [frame.depth_size for frame in sound if frame.depth_size]
-    held_out = [i for i, frame in enumerate(sound) if frame.files.held_out]
-    masked = sum(frame.files.mask is not None for frame in sound)
-    transparent = sum(frame.has_alpha for frame in sound)
+    depth_sizes = [frame.depth_size for frame in valid if frame.depth_size]
+    held_out = [i for i, frame in enumerate(valid) if frame.files.held_out]
+    masked = sum(frame.files.mask is not None for frame in valid)
+    transparent = sum(frame.has_alpha for frame in valid)
     return Capture(
         name=path.resolve().name,
-        source=f"{kind} {path.resolve()}",
+        source=f"{source} {path.resolve()}",
         K=camera.K,
         width=camera.width,
         height=camera.height,
-        X_WCs=[R_WF @ frame.X_FB @ R_BC for frame in sound],
+        X_WCs=[R_WF @ frame.X_FB @ R_BC for frame in valid],
         load_image=load_image,
         load_depth=load_depth if has_depth else no_depth,
         load_valid=load_valid if masked or transparent else all_valid,
         depth_camera=depth_camera(*depth_sizes[0]) if depth_camera and has_depth else None,
-        frame_names=[frame.files.name or frame.files.image.name for frame in sound],
+        frame_names=[frame.files.name or frame.files.image.name for frame in valid],
         dropped=messages,
         held_out=held_out if any(frame.held_out for frame in frames) else None,
-        notes=[*notes, *_notes(distinct, masked, transparent, len(sound))],
+        notes=[*notes, *_notes(distinct, masked, transparent, len(valid))],
         axes=axes,
     )
 
 
 def _notes(lenses: Sequence[Lens], masked: int, transparent: int, total: int) -> list[str]:
-    """Returns what is noted of every capture: its intrinsics, and which pixels are not used."""
+    """Returns notes on the intrinsics and on the pixels that are not used."""
     notes = [f"intrinsics: {lenses[0]}"]
     if len(lenses) > 1:
         notes[0] += f", and {len(lenses) - 1} more cameras"
@@ -547,68 +457,67 @@ def _notes(lenses: Sequence[Lens], masked: int, transparent: int, total: int) ->
             "intrinsics those of images of this size?"
         )
     if masked:
-        notes.append(f"{masked} of {total} images have a mask, and are not used where it is black")
+        notes.append(f"{masked} of {total} images have a mask; black pixels are not used")
     if transparent:
         notes.append(
-            f"{transparent} of {total} images have an alpha channel, and are not used where it is "
-            "less than a half"
+            f"{transparent} of {total} images have an alpha channel; pixels of less than a half "
+            "are not used"
         )
     return notes
 
 
-def _no_lens() -> Lens:
-    raise ValueError("the intrinsics are unknown; set capture.intrinsics to [fx, fy, cx, cy]")
-
-
-def _inspect(frame: FrameFiles) -> _Frame:
-    size, has_alpha = image_layout(frame.image)
-    if frame.lens is not None and size != (frame.lens.width, frame.lens.height):
-        raise ValueError(_size_message(frame.image, size, (frame.lens.width, frame.lens.height)))
-    if frame.mask is not None and (found := image_size(frame.mask)) != size:
-        raise ValueError(_size_message(frame.mask, found, size))
-    found = depth_size(frame.depth) if frame.depth is not None else None
-    return _Frame(frame, size, found, has_alpha, frame.X_FB())
-
-
-def _keep_usual_size(
-    frames: Sequence[_Frame], messages: list[str], registered: bool
+def _usable_frames(
+    frames: Sequence[FrameFiles], messages: list[str], registered: bool, same_view: bool
 ) -> list[_Frame]:
-    """Leaves out frames of another size than most, or whose depth is."""
-    sizes = [frame.size for frame in frames if frame.files.lens is None]
+    """Returns the frames whose files are complete, in the most frequent sizes of images and depth.
+
+    Args:
+        messages: to which those about other frames are appended.
+        registered: whether depth must have the size of its image.
+        same_view: whether it must have the aspect ratio of its image.
+    """
+    complete = []
+    for frame in frames:
+        try:
+            complete.append(_inspect(frame))
+        except (ValueError, OSError) as error:
+            messages.append(str(error))
+    sizes = [frame.size for frame in complete if frame.files.lens is None]
     usual = max(sizes, key=sizes.count, default=None)
-    depth_sizes = [frame.depth_size for frame in frames if frame.depth_size]
+    depth_sizes = [frame.depth_size for frame in complete if frame.depth_size]
     usual_depth = max(depth_sizes, key=depth_sizes.count, default=None)
     kept = []
-    for frame in frames:
-        files, wanted = frame.files, frame.size if registered else usual_depth
+    for frame in complete:
+        files, expected = frame.files, frame.size if registered else usual_depth
+        (width, height), (w, h) = frame.size, frame.depth_size or frame.size
         if files.lens is None and usual is not None and frame.size != usual:
             messages.append(_size_message(files.image, frame.size, usual))
-        elif files.depth and frame.depth_size and wanted and frame.depth_size != wanted:
-            messages.append(_size_message(files.depth, frame.depth_size, wanted))
-        else:
-            kept.append(frame)
-    return kept
-
-
-def _keep_same_view(frames: Sequence[_Frame], messages: list[str]) -> list[_Frame]:
-    """Leaves out frames whose depth has another shape than their image."""
-    kept = []
-    for frame in frames:
-        (width, height), (w, h) = frame.size, frame.depth_size or frame.size
-        if abs(w * height - h * width) > _SAME_SHAPE * w * height:
+        elif files.depth and frame.depth_size and expected and frame.depth_size != expected:
+            messages.append(_size_message(files.depth, frame.depth_size, expected))
+        elif same_view and abs(w * height - h * width) > _SAME_SHAPE * w * height:
             messages.append(
-                f"{frame.files.depth}: {w}x{h} pixels of depth do not show what {width}x{height} "
-                "pixels of an image do; width and height must have one ratio"
+                f"{files.depth}: {w}x{h} pixels of depth do not show what {width}x{height} pixels "
+                "of an image do; width and height must have one ratio"
             )
         else:
             kept.append(frame)
     return kept
 
 
-def _size_message(file: Path, size: tuple[int, int], wanted: tuple[int, int]) -> str:
+def _inspect(frame: FrameFiles) -> _Frame:
+    size, mode = _image_header(frame.image)
+    if frame.lens is not None and size != (frame.lens.width, frame.lens.height):
+        raise ValueError(_size_message(frame.image, size, (frame.lens.width, frame.lens.height)))
+    if frame.mask is not None and (found := image_size(frame.mask)) != size:
+        raise ValueError(_size_message(frame.mask, found, size))
+    found = depth_size(frame.depth) if frame.depth is not None else None
+    return _Frame(frame, size, found, mode in _ALPHA, frame.X_FB())
+
+
+def _size_message(file: Path, size: tuple[int, int], expected: tuple[int, int]) -> str:
     return (
-        f"{file}: {size[0]}x{size[1]} pixels where {wanted[0]}x{wanted[1]} are expected; all "
-        "images of a camera, and all depths, must have one size"
+        f"{file}: must be of {expected[0]}x{expected[1]} pixels, as the others, got "
+        f"{size[0]}x{size[1]}"
     )
 
 

@@ -1,11 +1,11 @@
 """Captures in nerfstudio's `transforms.json`.
 
 As nerfstudio documents it: `transform_matrix` takes camera axes of OpenGL (x right, y up, z back)
-to a world with z up; intrinsics and distortion stand once or with each frame; a `depth_file_path`
-holds planar depth in units of `depth_unit_scale_factor` (0.001); `mask_path` holds an image that is
-black where the other is not to be used; `ply_file_path` holds points; `train_filenames`,
-`val_filenames` and `test_filenames` split the frames. ScanNet++ adds `is_bad` and `test_frames`.
-Whether lengths are metres the file does not say: they are taken to be if there is depth.
+to a world with z up; intrinsics and distortion are given once or with each frame; a
+`depth_file_path` holds planar depth in units of `depth_unit_scale_factor` (0.001); `mask_path`
+holds an image that is black where the other is not to be used; `ply_file_path` holds points;
+`train_filenames`, `val_filenames` and `test_filenames` split the frames. ScanNet++ adds `is_bad`
+and `test_frames`. Lengths are taken to be in meters if there is depth.
 """
 
 import dataclasses
@@ -19,14 +19,15 @@ import numpy as np
 from pydrake.math import RigidTransform
 
 from splatpilot.systems.common.readers import read_ply_file, read_text, reason_of
+from splatpilot.systems.common.validation import require
 from splatpilot.training.captures.capture import (
     OPENGL_AXES,
     Capture,
     Lens,
     SfmPoints,
     fisheye_lens,
+    opencv_lens,
     pinhole,
-    polynomial_lens,
 )
 from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.frames import (
@@ -38,50 +39,49 @@ from splatpilot.training.captures.frames import (
 )
 from splatpilot.training.captures.up_and_scale import make_metric, turn_upright
 
-TRANSFORMS = "transforms.json"
-
+_TRANSFORMS = "transforms.json"
 _MAX_DISTORTION = 100.0
 _FISHEYE = "OPENCV_FISHEYE"
-# Perspective ones differ in which terms of their distortion are given.
-_MODELS = {"OPENCV", "PINHOLE", "RADIAL", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", _FISHEYE}
+# Perspective models differ in the terms of distortion that are given.
+_MODELS = ("OPENCV", _FISHEYE, "PINHOLE", "RADIAL", "SIMPLE_PINHOLE", "SIMPLE_RADIAL")
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 _SPLIT = {part: f"{part}_filenames" for part in ("train", "val", "test")}
 _CAMERA = {"camera_model", "w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "is_fisheye"}
 _CAMERA |= {*_DISTORTION, "distortion_params", "fisheye_crop_radius"}
-# With those that say how the file was made, which changes nothing.
+# Including keys that tell only how the file was made.
 _KNOWN = _CAMERA | {*_SPLIT.values(), "frames", "test_frames", "depth_unit_scale_factor"}
 _KNOWN |= {"ply_file_path", "applied_transform", "applied_scale"}
 _KNOWN_OF_FRAME = _CAMERA | {"file_path", "transform_matrix", "depth_file_path", "mask_path"}
 _KNOWN_OF_FRAME |= {"is_bad", "colmap_im_id"}
 
 
-def is_nerfstudio(path: Path) -> bool:
-    """Tells whether the folder holds a `transforms.json`."""
-    return (path / TRANSFORMS).exists()
+def recognizes(path: Path) -> bool:
+    """Tells whether a folder holds a `transforms.json`."""
+    return (path / _TRANSFORMS).exists()
 
 
-def read_nerfstudio(path: Path, config: CaptureConfig) -> Capture:
+def read(path: Path, config: CaptureConfig) -> Capture:
     """Opens a capture in nerfstudio's format.
 
     Raises:
-        FileNotFoundError: if there is no `transforms.json`.
-        ValueError: if it is not as it should be, too many frames cannot be used, or the scale
-            cannot be had as `config` asks.
+        ValueError, OSError: if it is missing or invalid, too many frames cannot be used, or the
+            scale cannot be determined as `config` says.
     """
-    file = path / TRANSFORMS
+    file = path / _TRANSFORMS
     try:
         content = json.loads(read_text(file))
         entries, held_out = _split(content)
         named = [(str(entry["file_path"]), entry["transform_matrix"], entry) for entry in entries]
-        points, unit = content.get("ply_file_path") or "", _depth_unit(content, config)
-        paths = [entry.get(key) for entry in entries for key in ("depth_file_path", "mask_path")]
-        for path_like in (points, *paths):
-            if not isinstance(path_like or "", str):
-                raise TypeError(f"{path_like!r:.40} stands where a path belongs")
+        unit = config.depth_unit or _depth_unit(content)
+        points = path / (content.get("ply_file_path") or "")
+        depths, masks = (
+            [path / entry[key] if entry.get(key) else None for entry in entries]
+            for key in ("depth_file_path", "mask_path")
+        )
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise ValueError(
-            f"{file}: not nerfstudio's format ({reason_of(error)}); `frames` with `file_path` and "
-            "`transform_matrix` is needed"
+            f"{file}: not nerfstudio's format ({reason_of(error)}); it must have `frames` with "
+            "`file_path` and `transform_matrix`"
         ) from None
     lenses: dict[tuple, Lens] = {}  # Equal cameras share one, and one resampling.
     frames, bad = [], []
@@ -89,15 +89,14 @@ def read_nerfstudio(path: Path, config: CaptureConfig) -> Capture:
         if entry.get("is_bad") or held_out[i] is None:
             bad.append(f"{file}: {name} {'is_bad' if entry.get('is_bad') else 'is in no split'}")
             continue
-        image = _image_file(path, name)
-        depth, mask = entry.get("depth_file_path"), entry.get("mask_path")
+        image = _image_file(path / name)
         frames.append(
             FrameFiles(
                 image,
                 _pose(matrix, f"{file}, frame {i} ({name})"),
-                path / depth if depth else None,
+                depths[i],
                 _lens(file, {**content, **entry}, image, config, lenses),
-                path / mask if mask else None,
+                masks[i],
                 name=_name(name),
                 held_out=bool(held_out[i]),
             )
@@ -114,9 +113,9 @@ def read_nerfstudio(path: Path, config: CaptureConfig) -> Capture:
         dropped=bad,
         notes=[f"{file.name}: {listed} is not used"] if unused else (),
     )
-    if points:
-        capture = dataclasses.replace(capture, points=_read_points(path / points))
-    if config.scale.given() or not capture.has_depth:
+    if points != path:
+        capture = dataclasses.replace(capture, points=_read_points(points))
+    if config.scale.sources() or not capture.has_depth:
         capture = make_metric(capture, config.scale)
     return turn_upright(capture, config.up or "z")
 
@@ -124,9 +123,9 @@ def read_nerfstudio(path: Path, config: CaptureConfig) -> Capture:
 def _split(content: dict[str, Any]) -> tuple[list[dict[str, Any]], list[bool | None]]:
     """Returns the frames, and whether the file holds each out; None if its split leaves it out."""
     frames = [dict(entry) for entry in content["frames"]]
-    tests = content.get("test_frames") or []  # frames of their own, or names of others
-    apart = [dict(entry) for entry in tests if not isinstance(entry, str)]
-    names = [_name(entry["file_path"]) for entry in frames + apart]
+    tests = content.get("test_frames") or []  # frames themselves, or names of others
+    added = [dict(entry) for entry in tests if not isinstance(entry, str)]
+    names = [_name(entry["file_path"]) for entry in frames + added]
     parts = {part: set(map(_name, content[key])) for part, key in _SPLIT.items() if key in content}
     held_out = {_name(each) for each in tests if isinstance(each, str)}.union(
         names[len(frames) :], parts.get("val", ()), parts.get("test", ())
@@ -137,21 +136,18 @@ def _split(content: dict[str, Any]) -> tuple[list[dict[str, Any]], list[bool | N
     roles = [name in held_out if name in held_out | fitted else None for name in names]
     if False not in roles:
         raise ValueError("its split leaves no frame to train with")
-    return frames + apart, roles
+    return frames + added, roles
 
 
 def _name(path: Any) -> str:
     return str(PurePath(str(path)))
 
 
-def _depth_unit(content: dict[str, Any], config: CaptureConfig) -> float:
-    """How many units of the stored depth make a metre."""
-    if config.depth_unit:
-        return config.depth_unit
-    metres = float(content.get("depth_unit_scale_factor", 1e-3))
-    if not 1e-9 < metres < 1e9:
-        raise ValueError(f"depth_unit_scale_factor is {metres}; it must be the metres of a unit")
-    return 1 / metres
+def _depth_unit(content: dict[str, Any]) -> float:
+    """Returns the units of the stored depth per meter."""
+    meters = float(content.get("depth_unit_scale_factor", 1e-3))
+    require(1e-9 < meters < 1e9, "depth_unit_scale_factor", "in (1e-9, 1e9) m", meters)
+    return 1 / meters
 
 
 def _pose(matrix: Any, source: str) -> Callable[[], RigidTransform]:
@@ -160,22 +156,18 @@ def _pose(matrix: Any, source: str) -> Callable[[], RigidTransform]:
             array = np.array(matrix, dtype=np.float64)
         except (TypeError, ValueError, OverflowError):
             array = np.zeros(0)
-        if array.shape not in ((4, 4), (3, 4)):
-            raise ValueError(f"{source}: transform_matrix is no 4x4 matrix of numbers")
+        valid = array.shape in ((4, 4), (3, 4))
+        require(valid, f"{source}: transform_matrix", "a 4x4 matrix", f"{matrix!r:.40}")
         return pose_from_matrix(array, source)
 
     return X_FB
 
 
-def _image_file(path: Path, name: str) -> Path:
-    """Returns the file of an image, whose name may lack its suffix."""
-    file = path / name
-    try:
-        if isfile(file) or file.suffix:
-            return file
-        return next((f for f in sorted(file.parent.glob(file.name + ".*")) if isfile(f)), file)
-    except (OSError, ValueError, NotImplementedError):  # no name of a file: it is left out
+def _image_file(file: Path) -> Path:
+    """Returns the file of an image, whose name may be without its suffix."""
+    if isfile(file) or file.suffix or not file.parent.is_dir():
         return file
+    return next((f for f in sorted(file.parent.iterdir()) if f.stem == file.name), file)
 
 
 def _lens(
@@ -187,9 +179,7 @@ def _lens(
 ) -> Lens | None:
     """Returns the camera that `values` describe, None if the image's size is needed and unknown."""
     model = str(values.get("camera_model", _FISHEYE if values.get("is_fisheye") else "OPENCV"))
-    if model not in _MODELS:
-        known = ", ".join(sorted(_MODELS))
-        raise ValueError(f"{file}: camera_model must be one of {known}, got {model}")
+    require(model in _MODELS, f"{file}: camera_model", f"one of {', '.join(_MODELS)}", model)
     try:
         if "w" in values and "h" in values:
             width, height = int(values["w"]), int(values["h"])
@@ -206,16 +196,16 @@ def _lens(
             cx, cy = (float(values.get(k, n / 2)) for k, n in (("cx", width), ("cy", height)))
         listed = dict(zip(_DISTORTION, values.get("distortion_params") or (), strict=False))
         distortion = tuple(float({**values, **listed}.get(k, 0.0)) for k in _DISTORTION)
-        if not np.abs(distortion).max(initial=0.0) <= _MAX_DISTORTION:
-            raise ValueError(f"a distortion of {distortion} is none of a lens")
+        valid = np.abs(distortion).max() <= _MAX_DISTORTION
+        require(valid, "the distortion", f"within {_MAX_DISTORTION:g}", distortion)
         radius = float(values.get("fisheye_crop_radius") or np.inf) if model == _FISHEYE else np.inf
         key = (model, width, height, fx, fy, cx, cy, distortion, radius)
         if key not in lenses:
-            K, radial, tangential = pinhole(fx, fy, cx, cy), distortion[:4], distortion[4:]
+            K, (k1, k2, k3, k4, p1, p2) = pinhole(fx, fy, cx, cy), distortion
             if model == _FISHEYE:
-                lens = fisheye_lens(K, width, height, radial)
+                lens = fisheye_lens(K, width, height, (k1, k2, k3, k4))
             else:
-                lens = polynomial_lens(K, width, height, radial, tangential)
+                lens = opencv_lens(K, width, height, (k1, k2, p1, p2, k3), k4)
             given = file.name if {"cx", "cy"} <= values.keys() else f"{file.name}, centered"
             source = "capture.intrinsics" if config.intrinsics else given
             lenses[key] = dataclasses.replace(lens, radius=radius, source=source)
@@ -224,8 +214,8 @@ def _lens(
         return None
     except (LookupError, TypeError, ValueError, OverflowError) as error:
         raise ValueError(
-            f"{file}: the camera of {image.name} is not described ({reason_of(error)}); w, h, "
-            "fl_x, fl_y, cx and cy, or camera_angle_x, are needed"
+            f"{file}: invalid camera of {image.name} ({reason_of(error)}); it must have w, h, "
+            "fl_x, fl_y, cx and cy, or camera_angle_x"
         ) from None
 
 
@@ -235,7 +225,7 @@ def _read_points(file: Path) -> SfmPoints:
         p_WQ = np.column_stack([vertices[axis] for axis in "xyz"]).astype(np.float64)
         colors = np.column_stack([vertices[name] for name in ("red", "green", "blue")])
     except (OSError, LookupError, TypeError, ValueError) as error:
-        raise ValueError(f"{file}: not a PLY of coloured points ({reason_of(error)})") from None
+        raise ValueError(f"{file}: not a PLY of colored points ({reason_of(error)})") from None
     if not (np.isfinite(p_WQ).all() and np.isfinite(colors).all()):
-        raise ValueError(f"{file}: points or colours are not finite; export it again")
+        raise ValueError(f"{file}: points or colors are not finite; export it again")
     return SfmPoints(p_WQ, colors.astype(np.float64) / 255)

@@ -1,9 +1,8 @@
-"""Poses in which frames agree: all are moved to where depth and brightness fit best.
+"""Refines poses so that depth and brightness of all frames agree.
 
-Poses of trackers drift by centimetres and degrees, those of phones, of KinectFusion and of odometry
-alike, and what is reconstructed from them shows every surface twice. This is direct bundle
-adjustment of RGB-D frames (Kerl, Sturm and Cremers 2013; Schops, Sattler and Pollefeys 2019), by
-Gauss-Newton, of all frames at once.
+Poses of phones, KinectFusion and odometry drift by centimeters and degrees, and a reconstruction
+shows every surface twice. This is direct bundle adjustment of RGB-D frames (Kerl, Sturm and Cremers
+2013; Schops, Sattler and Pollefeys 2019), by Gauss-Newton, of all frames at once.
 """
 
 import hashlib
@@ -38,36 +37,38 @@ from splatpilot.training.captures.frame_comparison import (
 )
 
 _PARTNERS, _OVERLAP, _PROBES = 16, 0.2, 64
-"""With how many others a frame is compared, at most, and what part of so many of its points these
-must see."""
+"""Maximum number of frames that each is compared with, and the fraction of so many of its points
+that these must see."""
 _REACHES = REACH, 0.06, 0.05, 0.04
-"""Of the first rounds, and of all later ones."""
+"""Of the first rounds; the last of all later ones."""
 _ROUNDS, _SETTLED = 30, 1e-3
-"""At most, and steps [m], [rad] below which it is done."""
+"""Maximum number of rounds, and steps [m], [rad] below which they end."""
 _SPREADS = np.array([0.01, 0.03])
-"""Of residuals in the first round; then as they are found."""
+"""Of residuals in the first round; later ones measure them."""
 _INDEPENDENT = 10
-"""What the points of a pair count for together: what one has wrong, its neighbours have too."""
+"""Number of independent points that the points of a pair count for: neighbors share errors."""
 _DRIFT, _BELIEF = 0.005, 0.1
-"""[m], [rad] Standard deviations of what drifts from one frame to the next, and of poses: what no
-other frame sees, or sees only along stripes, moves as those before and after it do."""
+"""[m], [rad] Standard deviations of the drift from one frame to the next, and of poses: what no
+other frame constrains moves as the frames before and after it."""
+_VERSION = 1
+"""Of the result for the same frames."""
 
 
 @dataclass(frozen=True, eq=False)
 class RefinedPoses:
-    """Poses, and how well frames agree in them."""
+    """Poses, and the agreement of frames in them."""
 
     X_WCs: list[RigidTransform]
     moved: float  # [m], mean over frames
-    turned: float  # [rad], mean over frames
+    rotated: float  # [rad], mean over frames
     depth: tuple[float, float]
     """Median relative difference of depth between frames, before and after."""
     contrast: tuple[float, float]
     """Median difference of contrast, before and after."""
 
     def __str__(self) -> str:
-        turned = np.rad2deg(self.turned)
-        lines = [f"poses moved by {self.moved:.3f} m and {turned:.1f} degrees on average"]
+        rotated = np.rad2deg(self.rotated)
+        lines = [f"poses moved by {self.moved:.3f} m and {rotated:.1f} degrees on average"]
         for name in ("depth", "contrast"):
             before, after = getattr(self, name)
             lines.append(f"{name} differs between frames by {after:.2%}, before by {before:.2%}")
@@ -75,12 +76,11 @@ class RefinedPoses:
 
 
 def refine_poses(frames: Sequence[ComparedFrame], X_WCs: Iterable[RigidTransform]) -> RefinedPoses:
-    """Returns poses in which frames differ least: of the squares of all residuals, see
-    `Comparison`, over their spreads.
+    """Returns the poses of the smallest squared residuals over their spreads, see `Comparison`.
 
-    It mends drift of centimetres and of a degree or two, no lost tracking: nothing is compared
-    where depths differ by more than 8 %. Squares are not bounded further: weights as narrow as the
-    noise of a sensor hold frames where they are.
+    This removes drift of centimeters and of a degree or two, not lost tracking: points whose depths
+    differ by more than 8 % are not compared. Robust weights as narrow as the noise of a sensor
+    would keep frames where they are.
 
     Args:
         frames: in the order in which they were taken.
@@ -116,12 +116,12 @@ def refine_poses(frames: Sequence[ComparedFrame], X_WCs: Iterable[RigidTransform
             rounds.set_postfix_str(f"largest step {largest:.4f}")
             if number >= len(_REACHES) and largest < _SETTLED:
                 break
-    turned, moved = np.split(_corrections(poses, given), 2, axis=1)
+    rotated, moved = np.split(_corrections(poses, given), 2, axis=1)
     (depth, contrast), (depth_after, contrast_after) = history[0].tolist(), history[-1].tolist()
     return RefinedPoses(
         poses,
         float(np.linalg.norm(moved, axis=1).mean()),
-        float(np.linalg.norm(turned, axis=1).mean()),
+        float(np.linalg.norm(rotated, axis=1).mean()),
         (depth, depth_after),
         (contrast, contrast_after),
     )
@@ -130,8 +130,8 @@ def refine_poses(frames: Sequence[ComparedFrame], X_WCs: Iterable[RigidTransform
 def _pairs(
     frames: Sequence[ComparedFrame], X_WCs: Sequence[RigidTransform]
 ) -> list[tuple[int, int]]:
-    """Returns each frame with those that it is compared with: of all that see it most of those
-    nearest in the sequence, and ever fewer of those farther off, which keep the whole together."""
+    """Returns pairs of each frame with frames that see it: most of the nearest in the sequence, and
+    fewer of those farther away."""
     X_CWs = np.array([X_WC.inverse().GetAsMatrix34() for X_WC in X_WCs])
     pairs = []
     for i in Progress(range(len(frames)), "comparing frames", unit="frame"):
@@ -151,7 +151,7 @@ def _pairs(
 
 
 def _inside(frame: ComparedFrame, p_CQs: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Returns which points (..., 3, n) in a camera's axes fall into an image of it, (..., n)."""
+    """Returns which points p_CQ (..., 3, n) fall into the image of a frame, (..., n)."""
     height, width = frame.contrast.shape
     x, y, z = np.moveaxis(frame.K @ p_CQs, -2, 0)
     return (z > 0) & (x > 0) & (x < width * z) & (y > 0) & (y < height * z)
@@ -159,9 +159,9 @@ def _inside(frame: ComparedFrame, p_CQs: NDArray[np.float64]) -> NDArray[np.bool
 
 @dataclass(frozen=True, eq=False)
 class _Term:
-    """What one pair adds to the normal equations of all frames, six unknowns each."""
+    """The part of one pair in the normal equations of all frames, six unknowns each."""
 
-    unknowns: NDArray[np.intp]  # (12,), their numbers
+    unknowns: NDArray[np.intp]  # (12,), their indices
     hessian: NDArray[np.float64]  # (12, 12), of Gauss-Newton
     gradient: NDArray[np.float64]  # (12,)
 
@@ -174,7 +174,7 @@ class _Term:
 
 
 def _step(terms: Sequence[_Term], corrections: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns the step (N, 6) of Gauss-Newton from poses that have been corrected by so much."""
+    """Returns the step (N, 6) of Gauss-Newton from poses with `corrections` (N, 6) so far."""
     count = len(corrections)
     unknowns = np.array([term.unknowns for term in terms])
     hessians = np.array([term.hessian for term in terms])
@@ -190,7 +190,7 @@ def _step(terms: Sequence[_Term], corrections: NDArray[np.float64]) -> NDArray[n
 
 
 def _moved(X_WC: RigidTransform, step: NDArray[np.float64]) -> RigidTransform:
-    """Returns a pose turned by step[:3] [rad] about its own centre and moved by step[3:] [m]."""
+    """Returns a pose rotated by step[:3] [rad] about its center and moved by step[3:] [m]."""
     turn = RotationMatrix(Rotation.from_rotvec(step[:3]).as_matrix())
     R_WC = RotationMatrix.ProjectToRotationMatrix((turn @ X_WC.rotation()).matrix())
     return RigidTransform(R_WC, X_WC.translation() + step[3:])
@@ -199,7 +199,7 @@ def _moved(X_WC: RigidTransform, step: NDArray[np.float64]) -> RigidTransform:
 def _corrections(
     X_WCs: Sequence[RigidTransform], given: Sequence[RigidTransform]
 ) -> NDArray[np.float64]:
-    """Returns by how much each pose is turned [rad] and moved [m] from that given, (N, 6)."""
+    """Returns the rotations [rad] and translations [m] of poses from those given, (N, 6)."""
     turns = [
         (X_WC.rotation() @ X_WG.rotation().inverse()).matrix()
         for X_WC, X_WG in zip(X_WCs, given, strict=True)
@@ -210,28 +210,20 @@ def _corrections(
     return np.concatenate([Rotation.from_matrix(turns).as_rotvec(), moves], axis=1)
 
 
-_VERSION = 1
-"""Of what `refine_poses` makes of the same frames; another is refined anew."""
-
-
 def refined_capture(capture: Capture, path: Path, config: CaptureConfig) -> Capture:
-    """Returns a capture with the poses of `refine_poses`, from the cache or put there.
-
-    All its frames have a part in that, those too by which a scene is judged later, as all
-    photographs have in structure from motion.
+    """Returns a capture with refined poses of all its frames, held-out ones too; the cache keeps
+    them.
 
     Args:
-        capture: what was read.
-        path: from where.
-        config: how.
+        capture: as read from `path`.
 
     Raises:
-        ValueError: if it has no depth, or no two frames see the same.
-        OSError: if the cache cannot be written.
+        ValueError, OSError: if it has no depth, no two frames see the same, or the cache cannot be
+            written.
     """
     if not capture.has_depth:
         raise ValueError(
-            f"{path}: capture.refine_poses compares depth, and this capture has none; leave it out"
+            f"{path}: capture.refine_poses needs depth, which this capture is without; omit it"
         )
     file = cache_folder(config, "poses") / f"poses-{_key(capture, path)}.npy"
     if not file.is_file():
@@ -246,18 +238,15 @@ def refined_capture(capture: Capture, path: Path, config: CaptureConfig) -> Capt
         say(f"{path}: {refined}")
         with written_atomically(file) as written, written.open("wb") as stream:
             np.save(stream, np.array([X_WC.GetAsMatrix34() for X_WC in refined.X_WCs]))
-    return replace(capture, X_WCs=[_pose(matrix) for matrix in np.load(file)])
-
-
-def _pose(matrix: np.ndarray) -> RigidTransform:
-    return RigidTransform(RotationMatrix(matrix[:, :3]), matrix[:, 3])
+    X_WCs = [RigidTransform(RotationMatrix(X[:, :3]), X[:, 3]) for X in np.load(file)]
+    return replace(capture, X_WCs=X_WCs)
 
 
 def _key(capture: Capture, path: Path) -> str:
-    """Names a capture by its files and by how they were read."""
+    """Returns the cache key of a capture, by its files and their reading."""
     files = sorted(path.rglob("*")) if path.is_dir() else [path]
-    said = [capture.K, *(X_WC.GetAsMatrix34() for X_WC in capture.X_WCs)]
+    parts = [capture.K, *(X_WC.GetAsMatrix34() for X_WC in capture.X_WCs)]
     if capture.depth_camera is not None:
-        said += [capture.depth_camera.K, capture.depth_camera.X_CD.GetAsMatrix34()]
-    read = hashlib.sha256(b"".join(each.tobytes() for each in said)).hexdigest()
+        parts += [capture.depth_camera.K, capture.depth_camera.X_CD.GetAsMatrix34()]
+    read = hashlib.sha256(b"".join(each.tobytes() for each in parts)).hexdigest()
     return cache_key((file for file in files if file.is_file()), _VERSION, np.__version__, read)

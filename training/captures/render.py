@@ -1,4 +1,4 @@
-"""Captures rendered of meshes: images, exact depth and poses anywhere, as TartanAir V1 has them."""
+"""Captures rendered of meshes and generated worlds, with exact depth."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -33,7 +33,7 @@ from splatpilot.diagrams.scenarios import benchmark_scenarios
 from splatpilot.diagrams.worlds.feasibility import grid_graph
 from splatpilot.diagrams.worlds.splits import check_split, choose_split, part_digests, source_digest
 from splatpilot.diagrams.worlds.world_gltf import write_gltf
-from splatpilot.diagrams.worlds.world_registry import WorldConfig, is_procedural, make_blueprint
+from splatpilot.diagrams.worlds.world_registry import WorldConfig, is_procedural, make_spec
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.esdf_build import esdf_from_distance_field, esdf_from_occupancy
 from splatpilot.systems.collision.occupancy import grid_shape
@@ -43,70 +43,55 @@ from splatpilot.systems.common.files import held_folder, require_writable_folder
 from splatpilot.systems.common.progress import Progress, resumable
 from splatpilot.systems.common.readers import reason_of
 from splatpilot.systems.common.seeds import TRAINING_SEEDS, VALIDATION_SEEDS
+from splatpilot.systems.common.validation import Config, bounded, require, require_field
 from splatpilot.systems.splats.scene import GaussianScene
-from splatpilot.training.captures.capture import Capture, CaptureFrame
+from splatpilot.training.captures.capture import Capture, CaptureFrame, depth_points, pinhole
 from splatpilot.training.captures.drawn_mesh import SUFFIXES, drawn_mesh
+from splatpilot.training.captures.frames import pose_row
 from splatpilot.training.captures.tartanair import AXES
 
 
 @dataclass(kw_only=True)
-class RenderConfig:
+class RenderConfig(Config):
     """How a world is captured."""
 
-    width: int = 640  # [px] of the images
-    height: int = 480  # [px] of the images
-    # [m] Points x, y, z that the camera goes through; left out, it visits all the free space
-    # between the heights, no two visited places being closer than `apart` on the way.
+    width: int = bounded(640, "[8, 4096] px")  # of the images
+    height: int = bounded(480, "[8, 4096] px")  # of the images
+    # [m] Points x, y, z of the camera path; empty: one that visits all free space between the
+    # heights, with a visited point every `apart` along it.
     path: list[list[float]] = field(default_factory=list)
-    lowest: float = 1.0  # [m] of the path where it is not given
-    highest: float = 2.2  # [m] of the path where it is not given
-    apart: float = 3.0  # [m] least distance of two visited places
-    clearance: float = 0.5  # [m] that the camera keeps from surfaces
-    spacing: float = 0.6  # [m] between stops on the path
-    # [deg] Directions in which the camera looks at each stop, from that of travel to the left.
-    yaws: list[float] = field(default_factory=lambda: [0.0, 90.0, -90.0])
-    pitch: float = -5.0  # [deg] by which the camera looks up
-    # [m] to the camera's left, negative to its right: for each, a second capture `offset_...` from
-    # there, of the poses that have room for the camera.
-    offsets: list[float] = field(default_factory=list)
-    up: str = "y"  # axis of the file's coordinates that points up: y, as glTF says, or z
-    # Colour where there is no mesh; red, green, blue in 0 to 1.
-    background: list[float] = field(default_factory=lambda: [0.6, 0.75, 0.9])
-    voxel_size: float = 0.1  # [m] of the grid in which the path is found
-    # What scenes of the capture are for: train, validation or test. Empty: train, but test for what
+    lowest: float = bounded(1.0, "(-inf, inf) m")  # height of a path that is not given
+    highest: float = bounded(2.2, "(-inf, inf) m")  # height of a path that is not given
+    apart: float = bounded(3.0, "[0.01, inf) m")  # minimum distance of two visited points
+    clearance: float = bounded(0.5, "[0, inf) m")  # of the camera from surfaces
+    spacing: float = bounded(0.6, "[0.01, inf) m")  # between stops on the path
+    # [deg] Viewing directions at each stop, from that of travel to the left.
+    yaws: list[float] = bounded(lambda: [0.0, 90.0, -90.0], "(-inf, inf) deg")
+    pitch: float = bounded(-5.0, "(-90, 90) deg")  # of the camera, upward
+    # [m] To the camera's left, negative to its right: each adds a second capture `offset_...` of
+    # the poses that are free there.
+    offsets: list[float] = bounded(list, "(-inf, inf) m")
+    up: str = bounded("y", "{y, z}")  # axis of the file that points up: y, as glTF says, or z
+    # Color of the background; red, green, blue in 0 to 1.
+    background: list[float] = bounded(lambda: [0.6, 0.75, 0.9], "[0, 1]")
+    voxel_size: float = bounded(0.1, "[0.01, inf) m")  # of the grid in which the path is planned
+    # Split of scenes of the capture: train, validation or test. Empty: train, but test for what
     # the benchmark tests in, and for its worlds of seeds below those of training.
     split: str = ""
 
-    def validate(self) -> None:
-        """Raises ValueError for values that make no sense."""
+    def check(self) -> None:
         check_split(self.split)
-        for name in ("width", "height"):
-            if not 8 <= getattr(self, name) <= 4096:
-                raise ValueError(f"{name} is {getattr(self, name)} px, 8 to 4096 is needed")
-        for name in ("apart", "spacing", "voxel_size"):
-            if not 0.01 <= getattr(self, name) < np.inf:
-                raise ValueError(f"{name} is {getattr(self, name)} m, at least 0.01 is needed")
-        if not 0 <= self.clearance < np.inf:
-            raise ValueError(f"clearance is {self.clearance} m, it must not be negative")
-        if not self.lowest < self.highest:
-            raise ValueError(
-                f"lowest is {self.lowest} m and highest {self.highest} m: nothing lies between"
-            )
-        if not self.yaws or not np.isfinite([*self.yaws, self.pitch]).all():
-            raise ValueError(f"yaws are {self.yaws}, pitch {self.pitch}: finite angles are needed")
-        if abs(self.pitch) >= 90:
-            raise ValueError(f"pitch is {self.pitch} deg, between -90 and 90 is needed")
-        if not all(np.isfinite(offset) and offset for offset in self.offsets):
-            raise ValueError(f"offsets are {self.offsets} m; finite ones other than 0 are needed")
-        if len(self.background) != 3 or not all(0 <= value <= 1 for value in self.background):
-            raise ValueError(f"background is {self.background}, three numbers 0 to 1 are needed")
+        require_field(self, "lowest", self.lowest < self.highest, f"below highest, {self.highest}")
+        require_field(self, "yaws", self.yaws, "at least one angle")
+        require_field(self, "offsets", all(self.offsets), "other than 0")
+        require_field(self, "background", len(self.background) == 3, "red, green and blue")
 
 
-NEAREST, FARTHEST = 0.05, 150.0
+MIN_DEPTH, MAX_DEPTH = 0.05, 150.0
 """[m], range of the depth images; nearer is 0, farther is inf."""
 
 # Lamps at infinity: one overhead, four from the sides so that no wall is dark or like its
-# neighbour, one from below for undersides.
+# neighbor, one from below for undersides.
 _LAMPS = (
     ((0.15, 0.25, -1.0), 1.6),
     ((1.0, 0.15, -0.5), 1.1),
@@ -118,27 +103,29 @@ _LAMPS = (
 
 
 class MeshRenderer:
-    """Renders a mesh that stands in the world.
+    """Renders a mesh.
 
     Args:
         mesh: .gltf, .glb, or .obj with its materials.
         up: the axis of the file's coordinates that points up, "y" (as glTF says) or "z".
-        background: colour where there is no mesh; red, green, blue in 0 to 1.
+        background: red, green, blue in 0 to 1.
 
     Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if the file is of another kind.
-        OSError: if there is no OpenGL that works without a display.
+        ValueError, OSError: if the file is missing or damaged, or OpenGL does not work without a
+            display.
     """
 
-    def __init__(self, mesh: Path, up: str, background: tuple[float, float, float]):
-        check_mesh(mesh, up)
+    def __init__(self, mesh: Path, up: str, background: Sequence[float]):
+        _check_mesh(mesh, up)
         require_opengl()
         lights = [
             LightParameter(
-                type="directional", frame="world", direction=np.array(way), intensity=intensity
+                type="directional",
+                frame="world",
+                direction=np.array(direction),
+                intensity=intensity,
             )
-            for way, intensity in _LAMPS
+            for direction, intensity in _LAMPS
         ]
         self._engine = MakeRenderEngineVtk(
             RenderEngineVtkParams(
@@ -147,7 +134,7 @@ class MeshRenderer:
         )
         properties = PerceptionProperties()
         properties.AddProperty("label", "id", RenderLabel(1))
-        # The engine turns glTF's y up to z by itself.
+        # The engine rotates glTF's y up to z.
         X_WM = RigidTransform(RotationMatrix.MakeXRotation(0.0 if up == "y" else -np.pi / 2))
         with drawn_mesh(mesh, up) as drawn:
             self._cut_outs = drawn.cut_outs
@@ -165,28 +152,27 @@ class MeshRenderer:
         self, X_WC: RigidTransform, K: NDArray[np.float64], width: int, height: int
     ) -> CaptureFrame:
         """Returns the view of a camera at X_WC with intrinsics K (3, 3) [px], with exact depth."""
-        # OpenGL's image plane: there the principal point of a symmetric view is width / 2, which is
-        # what K says whose pixel centres lie at + 0.5.
+        # In OpenGL's image plane, too, the principal point of a symmetric view is width / 2.
         info = CameraInfo(width, height, K[0, 0], K[1, 1], K[0, 2], K[1, 2])
-        core = RenderCameraCore("", info, ClippingRange(NEAREST, FARTHEST), RigidTransform())
+        core = RenderCameraCore("", info, ClippingRange(MIN_DEPTH, MAX_DEPTH), RigidTransform())
         color, depth = ImageRgba8U(width, height), ImageDepth32F(width, height)
         self._engine.UpdateViewpoint(X_WC)
         self._engine.RenderColorImage(ColorRenderCamera(core), color)
-        self._engine.RenderDepthImage(DepthRenderCamera(core, DepthRange(NEAREST, FARTHEST)), depth)
+        self._engine.RenderDepthImage(
+            DepthRenderCamera(core, DepthRange(MIN_DEPTH, MAX_DEPTH)), depth
+        )
         frame = CaptureFrame(
             np.array(color.data)[..., :3], np.array(depth.data)[..., 0], X_WC, np.array(K)
         )
-        return frame if self._cut_outs is None else self._cut_outs.draw(frame, NEAREST, _LAMPS)
+        return frame if self._cut_outs is None else self._cut_outs.draw(frame, MIN_DEPTH, _LAMPS)
 
 
-def check_mesh(mesh: Path, up: str) -> None:
-    """Raises what `MeshRenderer` says about its arguments before it reads the file."""
+def _check_mesh(mesh: Path, up: str) -> None:
     if not mesh.is_file():
         raise FileNotFoundError(f"No such file: {mesh}")
-    if mesh.suffix not in SUFFIXES:
-        raise ValueError(f"{mesh}: a mesh must be one of {', '.join(SUFFIXES)}; export it as .glb")
-    if up not in ("y", "z"):
-        raise ValueError(f"up is {up!r}; 'y' (as glTF says) or 'z' is needed")
+    suffixes = ", ".join(SUFFIXES)
+    require(mesh.suffix in SUFFIXES, f"{mesh}: the suffix", f"one of {suffixes}", mesh.suffix)
+    require(up in ("y", "z"), "up", "y (as glTF says) or z", up)
 
 
 _STEP = 0.05  # [m], of a path while it is smoothed
@@ -202,10 +188,10 @@ def visiting_path(
 ) -> NDArray[np.float64]:
     """Returns a path (N, 3) [m] that visits all the free space of a box.
 
-    In the largest connected part of the space with `clearance` [m], places are chosen each farthest
-    from those before, as paths go, until none is farther than `apart` [m] from one. The path begins
-    at the one in the middle, whose farthest is nearest, so that what lies before the first camera
-    is seen by later ones too, and goes on to the nearest place not visited yet, by shortest paths.
+    In the largest connected part of the space with `clearance` [m], stops are chosen farthest from
+    those before, along paths, until none is farther than `apart` [m] from one. The path begins at
+    the stop in the middle, so that later cameras see its surroundings too, and continues to the
+    nearest stop not visited yet, by shortest paths.
 
     Raises:
         ValueError: if no space has that much clearance.
@@ -220,8 +206,8 @@ def visiting_path(
     if np.count_nonzero(found > clearance) < 2:
         raise ValueError(
             f"no camera path: the largest clearance from {np.round(lower_W, 1).tolist()} to "
-            f"{np.round(upper_W, 1).tolist()} is {found.max():.2f} m, {clearance} m is asked for; "
-            "ask for less clearance, or allow other heights"
+            f"{np.round(upper_W, 1).tolist()} is {found.max():.2f} m, {clearance} m is required; "
+            "require less clearance, or allow other heights"
         )
     graph, nodes = grid_graph(found > clearance, spacing)
     p_WF = p_WN.reshape(-1, 3)[nodes]
@@ -233,20 +219,20 @@ def visiting_path(
         lengths[~part] = -1
         return lengths, before
 
-    places = [int(np.argmax(lengths_from(int(np.argmax(part)))[0]))]
-    tables = [lengths_from(places[0])]
+    stops = [int(np.argmax(lengths_from(int(np.argmax(part)))[0]))]
+    tables = [lengths_from(stops[0])]
     nearest = tables[0][0].copy()
     while nearest.max() > apart:
-        places.append(int(np.argmax(nearest)))
-        tables.append(lengths_from(places[-1]))
+        stops.append(int(np.argmax(nearest)))
+        tables.append(lengths_from(stops[-1]))
         np.minimum(nearest, tables[-1][0], out=nearest)
 
-    here = min(range(len(places)), key=lambda k: tables[k][0].max())
-    path, left = [places[here]], set(range(len(places))) - {here}
+    here = min(range(len(stops)), key=lambda k: tables[k][0].max())
+    path, left = [stops[here]], set(range(len(stops))) - {here}
     while left:
         lengths, before = tables[here]
-        here = min(left, key=lambda k: (lengths[places[k]], k))
-        leg = [places[here]]
+        here = min(left, key=lambda k: (lengths[stops[k]], k))
+        leg = [stops[here]]
         while leg[-1] != path[-1]:
             leg.append(int(before[leg[-1]]))
         path += leg[-2::-1]
@@ -257,33 +243,29 @@ def visiting_path(
 def poses_along(
     path: NDArray[np.float64], spacing: float, yaws: Sequence[float], pitch: float
 ) -> list[RigidTransform]:
-    """Returns the poses X_WC of a camera that stops on a path and turns.
-
-    The path's corners are rounded. A stop lies every `spacing` [m] along it, has one pose for each
-    of `yaws` [deg], measured from the direction of travel to the left, all looking up by `pitch`
-    [deg].
+    """Returns the poses X_WC of a camera that stops on a path, with rounded corners, and turns.
 
     Args:
         path: (N, 3) [m], N >= 1; a path of one point is one stop that travels along x.
-
-    Raises:
-        ValueError: if `path` is no list of finite points.
+        spacing: [m] between stops.
+        yaws: [deg] of the poses of a stop, from the direction of travel to the left.
+        pitch: [deg], upward.
     """
     path = np.asarray(path, dtype=np.float64)
-    if path.ndim != 2 or path.shape[1] != 3 or not len(path) or not np.isfinite(path).all():
-        raise ValueError(f"the path has shape {path.shape}; finite points x, y, z are needed")
+    valid = path.ndim == 2 and path.shape[1] == 3 and len(path) and np.isfinite(path).all()
+    require(valid, "path", "of finite points x, y, z", f"shape {path.shape}")
     p_WP = resample(path, _STEP)
     if len(p_WP) > 1:
-        # Continued beyond its ends point-symmetrically, so that they stay where they are.
+        # Padded point-symmetrically, so that the ends do not move.
         more = min(len(p_WP) - 1, int(4 * _ROUNDING / _STEP))
         p_WP = np.pad(p_WP, ((more, more), (0, 0)), mode="reflect", reflect_type="odd")
         p_WP = gaussian_filter1d(p_WP, _ROUNDING / _STEP, axis=0)[more : len(p_WP) - more]
     p_WP = resample(p_WP, spacing)
-    way = np.gradient(p_WP, axis=0) if len(p_WP) > 1 else np.array([[1.0, 0, 0]])
-    # Where the way is up or down, the heading stays what it was.
-    level = np.linalg.norm(way[:, :2], axis=1) > 0.1 * np.linalg.norm(way, axis=1)
-    last = np.maximum.accumulate(np.where(level, np.arange(len(way)), 0))
-    headings = np.arctan2(way[last, 1], way[last, 0])
+    tangent = np.gradient(p_WP, axis=0) if len(p_WP) > 1 else np.array([[1.0, 0, 0]])
+    # On climbs the heading stays.
+    level = np.linalg.norm(tangent[:, :2], axis=1) > 0.1 * np.linalg.norm(tangent, axis=1)
+    last = np.maximum.accumulate(np.where(level, np.arange(len(tangent)), 0))
+    headings = np.arctan2(tangent[last, 1], tangent[last, 0])
     return [
         look_along(p, heading + np.deg2rad(yaw), np.deg2rad(pitch))
         for p, heading in zip(p_WP, headings, strict=True)
@@ -310,10 +292,10 @@ def move_left(X_WC: RigidTransform, offset: float) -> RigidTransform:
 def resample(path: NDArray[np.float64], spacing: float) -> NDArray[np.float64]:
     """Returns points of a polyline, evenly spaced by about `spacing` [m], ends included."""
     lengths = np.append(0.0, np.linalg.norm(np.diff(path, axis=0), axis=1).cumsum())
-    wanted = np.linspace(0, lengths[-1], max(round(lengths[-1] / spacing), 1) + 1)
     if lengths[-1] == 0:
         return path[:1]
-    return np.stack([np.interp(wanted, lengths, column) for column in path.T], axis=1)
+    desired = np.linspace(0, lengths[-1], max(round(lengths[-1] / spacing), 1) + 1)
+    return np.stack([np.interp(desired, lengths, column) for column in path.T], axis=1)
 
 
 RECIPE = "world.yaml"
@@ -324,36 +306,36 @@ _SAMPLES_PER_VOXEL_FACE = 8
 
 @dataclass
 class RenderedWorld:
-    """The content of `world.yaml`: what a capture shows, so that more of it can be rendered."""
+    """The content of `world.yaml`, from which more of a captured world can be rendered."""
 
     # The mesh, absolute or relative to the capture.
     mesh: str = ""
-    # What it was made from.
+    # The file or scenario that it was made from.
     origin: str = ""
     # How the capture was rendered.
     config: RenderConfig = field(default_factory=RenderConfig)
-    # What scenes of the capture are for: train, validation or test.
+    # Split of scenes of the capture: train, validation or test.
     split: str = ""
     # Digest of the mesh's triangles, or of the generated world, see `splits.source_digest`.
     source_digest: list[str] = field(default_factory=list)
-    # Of how meshes were drawn; 1 where nothing is said.
+    # Of the way meshes were drawn.
     version: int = 1
 
 
 def run(*, world: str | Path, out: str | Path, config: RenderConfig, seed: int = 0) -> None:
-    """Renders a capture of a world to the folder `out`.
+    """Renders a capture of a world to the folder `out`, as a TartanAir V1 sequence.
 
-    Frames are kept in `.NAME.partial` beside `out` until all are there; run again after an
-    interruption, it goes on from there. A capture that is there already is left as it is.
+    Frames are collected in `.NAME.partial` next to `out`, where the same command resumes after an
+    interruption. A complete capture is left as it is.
 
     Args:
         world: a mesh (.gltf, .glb or .obj), or a scenario whose world is procedural, one of the
-            benchmark's ("P02") or a file (.yaml): that world is exported, with what `seed` draws,
-            as `world.gltf` into the capture.
+            benchmark's ("P02") or a file (.yaml): that world, drawn from `seed`, is exported as
+            `world.gltf` into the capture.
 
     Raises:
-        FileNotFoundError, ValueError, OSError: for a world or settings that cannot be rendered, a
-            path through walls, something else in `out`, or a full disk.
+        ValueError, OSError: for a world or settings that cannot be rendered, a path through walls,
+            something else in `out`, or a full disk.
     """
     config.validate()
     out = Path(out).absolute()
@@ -370,57 +352,56 @@ def run(*, world: str | Path, out: str | Path, config: RenderConfig, seed: int =
 
 
 def _render(world: Path, out: Path, partial: Path, config: RenderConfig, seed: int) -> None:
-    blueprint = None
+    spec = None
     if world.suffix in (".yaml", ".yml"):
         scenario = load_config(Scenario(), world)
         if not is_procedural(scenario.world):
             raise ValueError(
-                f"{world}: its world is a {type(scenario.world).__name__}; a generated one is "
-                "needed"
+                f"{world}: its world must be a generated one, got {type(scenario.world).__name__}"
             )
-        blueprint = make_blueprint(scenario.world, seed)
+        spec = make_spec(scenario.world, seed)
         recipe = RenderedWorld("world.gltf", f"{world.name}, seed {seed}", config, version=_VERSION)
         described = f"{type(scenario.world).__name__} {seed}\n{dump_config(scenario.world)}"
         digests, found = part_digests([described.encode()]), _generated_split(scenario.world, seed)
     else:
-        check_mesh(world, config.up)
+        _check_mesh(world, config.up)
         recipe = RenderedWorld(str(world), world.name, config, version=_VERSION)
         digests, found = mesh_digests(world), "train"
     recipe.split = choose_split(recipe.origin, digests, config.split, found)
     recipe.source_digest = source_digest(digests)
     text = dump_config(recipe)
-    if _is_same(out, text):
-        print(f"{out}: is rendered already")
+
+    def has_recipe(folder: Path) -> bool:
+        file = folder / RECIPE
+        return file.is_file() and file.read_text() == text
+
+    if has_recipe(out):
+        print(f"{out}: is complete already")
         return
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise ValueError(
             f"{out}: holds something other than this capture; choose another folder, or remove it"
         )
-    if (partial / RECIPE).is_file() and not _is_same(partial, text):
+    if (partial / RECIPE).is_file() and not has_recipe(partial):
         raise ValueError(
-            f"{partial}: holds a part of another capture; remove it, or repeat what was begun"
+            f"{partial}: holds a part of another capture; remove it, or repeat that command"
         )
-    if blueprint is None:
+    if spec is None:
         esdf = mesh_distance(world, config.up, config.voxel_size)
     else:
-        esdf = esdf_from_distance_field(blueprint.distance_field, config.voxel_size)
+        esdf = esdf_from_distance_field(spec.distance_field, config.voxel_size)
     X_WCs = _poses(esdf, config)
     with written_atomically(partial / RECIPE) as file:
         file.write_text(text)
     mesh = partial / recipe.mesh
-    if blueprint is not None and not mesh.is_file():
-        write_gltf(blueprint, mesh)
-    renderer = _renderer(mesh, config)
-    K = intrinsics(config.width, config.height)
-
-    def view(X_WC: RigidTransform) -> CaptureFrame:
-        return renderer.frame(X_WC, K, config.width, config.height)
-
+    if spec is not None and not mesh.is_file():
+        write_gltf(spec, mesh)
+    view = _camera(mesh, config)
     _write_frames(partial, "rendering frames", X_WCs, view)
     for offset in config.offsets:
         moved = [move_left(X_WC, offset) for X_WC in X_WCs]
-        room = [X_WC for X_WC in moved if _has_room(esdf, X_WC.translation(), config.clearance)]
-        _write_frames(partial / f"offset_{offset:+.2f}", f"offset {offset:+.2f} m", room, view)
+        free = [X_WC for X_WC in moved if _is_free(esdf, X_WC.translation(), config.clearance)]
+        _write_frames(partial / f"offset_{offset:+.2f}", f"offset {offset:+.2f} m", free, view)
     if out.exists():
         out.rmdir()
     partial.rename(out)
@@ -429,46 +410,39 @@ def _render(world: Path, out: Path, partial: Path, config: RenderConfig, seed: i
 
 
 def true_camera(capture: Path) -> Callable[[RigidTransform], CaptureFrame] | None:
-    """Returns what renders the truth at any pose X_WC of the world that a capture was rendered of,
-    in the camera of the capture; None if the capture was not rendered.
+    """Returns a function that renders the world of a rendered capture at any pose X_WC, in the
+    capture's camera; None if the capture was not rendered.
 
     Raises:
-        FileNotFoundError, ValueError, OSError: if its world is gone, damaged or cannot be rendered.
+        ValueError, OSError: if its world is missing, damaged or cannot be rendered.
     """
     recipe = rendered_world(capture)
     if recipe is None:
         return None
-    if recipe.version != _VERSION:
-        raise ValueError(
-            f"{capture / RECIPE}: version must be {_VERSION}, got {recipe.version}; render it again"
-        )
-    config = recipe.config
-    config.validate()
-    renderer = _renderer(capture / recipe.mesh, config)
-    K = intrinsics(config.width, config.height)
-    return lambda X_WC: renderer.frame(X_WC, K, config.width, config.height)
+    current, what = recipe.version == _VERSION, f"{capture / RECIPE}: version"
+    require(current, what, f"{_VERSION}", recipe.version, "render it again")
+    recipe.config.validate()
+    return _camera(capture / recipe.mesh, recipe.config)
+
+
+def _camera(mesh: Path, config: RenderConfig) -> Callable[[RigidTransform], CaptureFrame]:
+    """Returns a function that renders a mesh with a camera as TartanAir's, 90 degrees wide."""
+    renderer = MeshRenderer(mesh, config.up, config.background)
+    width, height = config.width, config.height
+    K = pinhole(width / 2, width / 2, width / 2, height / 2)
+    return lambda X_WC: renderer.frame(X_WC, K, width, height)
 
 
 def rendered_world(capture: Path) -> RenderedWorld | None:
-    """Returns what a capture was rendered of; None if it was not rendered.
-
-    Raises:
-        ValueError: if its `world.yaml` is damaged.
-    """
+    """Returns the world that a capture was rendered of; None if it was not rendered."""
     file = capture / RECIPE
     return load_config(RenderedWorld(), file) if file.is_file() else None
 
 
-def intrinsics(width: int, height: int) -> NDArray[np.float64]:
-    """Returns K (3, 3) [px] of a camera as TartanAir's: 90 degrees wide, centred."""
-    return np.array([[width / 2, 0, width / 2], [0, width / 2, height / 2], [0, 0, 1.0]])
-
-
 def _generated_split(world: WorldConfig, seed: int) -> str:
-    """Returns the split of a generated world, which has that of its seed if it is of the kinds that
-    the benchmark flies in."""
-    kinds = [load_config(Scenario(), file).world for file in benchmark_scenarios().values()]
-    if world not in kinds:
+    """Returns the split of a generated world: that of its seed if the benchmark flies in it."""
+    worlds = [load_config(Scenario(), file).world for file in benchmark_scenarios().values()]
+    if world not in worlds:
         return "train"
     if seed < TRAINING_SEEDS:
         return "test"
@@ -476,75 +450,47 @@ def _generated_split(world: WorldConfig, seed: int) -> str:
 
 
 def mesh_digests(mesh: Path) -> set[str]:
-    """Returns a digest of each triangle of a mesh, by its corners to a millimeter: whatever the
-    file's format, and without its materials.
-
-    Raises:
-        ValueError: if the file cannot be read or holds no surface.
-    """
-    corners = np.round(_read_surface(mesh).triangles * 1000).astype(np.int64)
-    packed = corners @ np.array([1 << 42, 1 << 21, 1])  # (N, 3): one number a corner
-    triangles = np.unique(np.sort(packed, axis=1), axis=0)
-    return part_digests(triangle.tobytes() for triangle in triangles)
-
-
-def mesh_distance(mesh: Path, up: str, voxel_size: float) -> Esdf:
-    """Returns the distance to the surface of a mesh, from points sampled on it.
-
-    Where textures cut holes there is no surface.
-
-    Raises:
-        ValueError: if the file cannot be read or holds no surface.
-    """
-    with drawn_mesh(mesh, up) as drawn:
-        p_WQ = drawn.sample(_SAMPLES_PER_VOXEL_FACE / voxel_size**2)
-    if not len(p_WQ):
-        raise ValueError(f"{mesh}: holds no surface; export it again")
-    try:
-        grid_shape(p_WQ.min(axis=0) - voxel_size, p_WQ.max(axis=0) + voxel_size, voxel_size)
-    except ValueError as error:
-        raise ValueError(f"{mesh}: {error}") from None
-    lower_W = p_WQ.min(axis=0) - voxel_size
-    shape = np.ceil((p_WQ.max(axis=0) + voxel_size - lower_W) / voxel_size).astype(int)
-    occupied = np.zeros(shape, dtype=bool)
-    occupied[tuple(((p_WQ - lower_W) / voxel_size).astype(int).T)] = True
-    return esdf_from_occupancy(occupied, None, lower_W, voxel_size)
-
-
-def _read_surface(mesh: Path) -> trimesh.Trimesh:
+    """Returns a digest of each triangle of a mesh, by its corners to a millimeter, independent of
+    the file's format and materials."""
     try:
         surface = trimesh.load(mesh, force="mesh")
         area = surface.area if isinstance(surface, trimesh.Trimesh) else 0.0
-    except Exception as error:  # whatever its reader meets in a damaged file
+    except Exception as error:  # trimesh raises anything of damaged files
         raise ValueError(
             f"{mesh}: not a readable mesh ({reason_of(error)}); export it again"
         ) from error
     if not isinstance(surface, trimesh.Trimesh) or not 0 < area < np.inf:
         raise ValueError(f"{mesh}: holds no surface; export it again")
-    return surface
+    corners = np.round(surface.triangles * 1000).astype(np.int64)
+    packed = corners @ np.array([1 << 42, 1 << 21, 1])  # (N, 3): one number per corner
+    triangles = np.unique(np.sort(packed, axis=1), axis=0)
+    return part_digests(triangle.tobytes() for triangle in triangles)
 
 
-def _is_same(folder: Path, text: str) -> bool:
-    file = folder / RECIPE
-    return file.is_file() and file.read_text() == text
-
-
-def _renderer(mesh: Path, config: RenderConfig) -> MeshRenderer:
-    red, green, blue = config.background
-    return MeshRenderer(mesh, config.up, (red, green, blue))
+def mesh_distance(mesh: Path, up: str, voxel_size: float) -> Esdf:
+    """Returns the distance to the surface of a mesh, from points sampled on it outside of holes."""
+    with drawn_mesh(mesh, up) as drawn:
+        p_WQ = drawn.sample(_SAMPLES_PER_VOXEL_FACE / voxel_size**2)
+    if not len(p_WQ):
+        raise ValueError(f"{mesh}: holds no surface; export it again")
+    lower_W, upper_W = p_WQ.min(axis=0) - voxel_size, p_WQ.max(axis=0) + voxel_size
+    try:
+        grid_shape(lower_W, upper_W, voxel_size)
+    except ValueError as error:
+        raise ValueError(f"{mesh}: {error}") from None
+    shape = np.ceil((upper_W - lower_W) / voxel_size).astype(int)
+    occupied = np.zeros(shape, dtype=bool)
+    occupied[tuple(((p_WQ - lower_W) / voxel_size).astype(int).T)] = True
+    return esdf_from_occupancy(occupied, None, lower_W, voxel_size)
 
 
 def _poses(esdf: Esdf, config: RenderConfig) -> list[RigidTransform]:
-    """Returns the camera poses of the path, given or found.
-
-    Raises:
-        ValueError: if the path touches something, or none can be found.
-    """
+    """Returns the camera poses of the path, given or planned."""
     if config.path:
         X_WCs = poses_along(np.array(config.path), config.spacing, config.yaws, config.pitch)
         stops = np.array([X_WC.translation() for X_WC in X_WCs])
         for p_W in resample(stops, esdf.voxel_size / 2):
-            if not _has_room(esdf, p_W, min(config.clearance, esdf.voxel_size)):
+            if not _is_free(esdf, p_W, min(config.clearance, esdf.voxel_size)):
                 raise ValueError(
                     f"the path touches something at {np.round(p_W, 2).tolist()} m; lead it around"
                 )
@@ -559,8 +505,8 @@ def _poses(esdf: Esdf, config: RenderConfig) -> list[RigidTransform]:
     return poses_along(path, config.spacing, config.yaws, config.pitch)
 
 
-def _has_room(esdf: Esdf, p_WQ: NDArray, clearance: float) -> bool:
-    # Outside the grid there is nothing, so that NaN is room enough.
+def _is_free(esdf: Esdf, p_WQ: NDArray, clearance: float) -> bool:
+    # Outside the grid, where distance is NaN, all is free.
     return not esdf.distance(p_WQ) < clearance
 
 
@@ -570,13 +516,14 @@ def _write_frames(
     X_WCs: Sequence[RigidTransform],
     view: Callable[[RigidTransform], CaptureFrame],
 ) -> None:
-    """Writes the frames that are not there yet, as a TartanAir V1 sequence."""
+    """Writes the missing frames of a TartanAir V1 sequence."""
     images, depths = folder / "image_left", folder / "depth_left"
     for part in (images, depths):
         require_writable_folder(part)
     rows = []
     for i, X_WC in enumerate(Progress(X_WCs, what, unit="frame")):
-        rows.append(_row(X_WC))
+        R_FW = RigidTransform(AXES.R_WF.inverse())
+        rows.append(f"{pose_row(R_FW @ X_WC @ RigidTransform(AXES.R_BC.inverse()))}\n")
         image = images / f"{i:06d}_left.png"
         depth = depths / f"{i:06d}_left_depth.npy"
         if image.is_file() and depth.is_file():
@@ -591,15 +538,6 @@ def _write_frames(
         file.write_text("".join(rows))
 
 
-def _row(X_WC: RigidTransform) -> str:
-    """The pose as a line tx ty tz qx qy qz qw in the axes of TartanAir's files."""
-    R_FW = AXES.R_WF.inverse()
-    R_FB = R_FW @ X_WC.rotation() @ AXES.R_BC.inverse()
-    w, x, y, z = R_FB.ToQuaternion().wxyz()
-    numbers = (*R_FW.multiply(X_WC.translation()), x, y, z, w)
-    return " ".join(f"{number:.17g}" for number in numbers) + "\n"
-
-
 _MAX_POINTS = 2_000_000
 _MAX_GAUSSIANS = 200_000
 _SPREAD = 0.6
@@ -607,12 +545,8 @@ _SPREAD = 0.6
 
 
 def capture_gaussians(capture: Capture, frames: Sequence[int]) -> GaussianScene | None:
-    """Returns round Gaussians about the points that are known: measured depth of some frames or,
-    without any, those of the registration; None if there are neither.
-
-    Raises:
-        OSError, ValueError: if a file cannot be read.
-    """
+    """Returns round Gaussians at the measured depth of some frames or, without depth, at the points
+    of the registration; None without either."""
     if capture.has_depth:
         points, colors = _points_from_depth(capture, frames)
     elif capture.points is not None:
@@ -624,7 +558,7 @@ def capture_gaussians(capture: Capture, frames: Sequence[int]) -> GaussianScene 
     kept = _thinned(points, _MAX_GAUSSIANS)
     points, colors = points[kept], colors[kept]
     distances, _ = KDTree(points).query(points, k=2)
-    # A point that stands alone is no larger than the others are.
+    # A point far from others is not larger than they are.
     size = np.minimum(distances[:, 1], 4 * np.median(distances[:, 1])) + 1e-6
     return GaussianScene.from_colors(
         points,
@@ -638,22 +572,20 @@ def capture_gaussians(capture: Capture, frames: Sequence[int]) -> GaussianScene 
 def _points_from_depth(
     capture: Capture, frames: Sequence[int]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Points p_WQ (N, 3) [m] and colours (N, 3), 0 to 1, of every so many-th pixel."""
+    """Returns points p_WQ (N, 3) [m] and colors (N, 3), 0 to 1, of a grid of pixels."""
     pixels = len(frames) * capture.width * capture.height
     step = max(1, int(np.ceil(np.sqrt(pixels / _MAX_POINTS))))
     points, colors = [], []
     for i in Progress(frames, "reading depth", unit="frame", delay=2.0):
         frame = capture.frame(i)
-        depth = frame.depth[::step, ::step]
-        rows, columns = np.nonzero((depth > 0) & np.isfinite(depth))
-        p_CQ = frame.back_project(step * columns + 0.5, step * rows + 0.5, depth[rows, columns])
-        points.append(frame.X_WC.multiply(p_CQ.T.astype(float)).T)
-        colors.append(frame.image[::step, ::step][rows, columns] / 255)
+        p_CQ, rows, columns = depth_points(frame.K, frame.depth, step)
+        points.append(frame.X_WC.multiply(p_CQ.T).T)
+        colors.append(frame.image[rows, columns] / 255)
     return np.concatenate(points), np.concatenate(colors)
 
 
 def _thinned(points: NDArray[np.float64], count: int) -> NDArray[np.intp]:
-    """The first point in each cell of the finest grid in which at most `count` cells have one."""
+    """Returns the first point in each cell of the finest grid of at most `count` occupied cells."""
     lower = points.min(axis=0)
     # Few points far away must not make the cells large.
     extent = float(np.percentile(np.ptp(points, axis=0), 50)) or 1.0

@@ -1,12 +1,11 @@
 """ROS bags, of ROS 1 (`.bag`) or ROS 2 (a folder with `metadata.yaml`), as RGB-D sequences.
 
-What is in a bag is told from its topics: images of colour, images of depth in their pixels (16UC1
-in millimetres or 32FC1 in metres), the calibration of the colour camera, and poses. Poses are those
-of the only topic of `PoseStamped`, `PoseWithCovarianceStamped`, `TransformStamped` or `Odometry`,
-of the body that `child_frame_id` names, and of the camera itself where nothing in `/tf_static`
-leads from there to the frame of the images; without such a topic they are those of `/tf`, from its
-root to that frame. Images and poses are written to the cache as a TUM sequence once, and read as
-that.
+A bag has topics of color images, of depth images in their pixels (16UC1 in millimeters or 32FC1 in
+meters), of the calibration of the color camera, and of poses. Poses are those of the only topic of
+`PoseStamped`, `PoseWithCovarianceStamped`, `TransformStamped` or `Odometry`, of the body that
+`child_frame_id` names, moved to the frame of the images if `/tf_static` connects them; without such
+a topic they are those of `/tf`, from its root to that frame. Images and poses are written to the
+cache once, in TUM's format.
 """
 
 import json
@@ -37,141 +36,14 @@ from splatpilot.training.captures.capture import (
     prepare_cache,
 )
 from splatpilot.training.captures.capture_config import CaptureConfig
-from splatpilot.training.captures.frames import pose_from_quaternion
-from splatpilot.training.captures.tum import open_sequence
+from splatpilot.training.captures.frames import pose_from_quaternion, pose_row
+from splatpilot.training.captures.tum import MAX_GAP, open_sequence
 
-COLORS = {"rgb8": -1, "bgr8": cv2.COLOR_BGR2RGB, "rgba8": cv2.COLOR_RGBA2RGB}
-COLORS |= {"bgra8": cv2.COLOR_BGRA2RGB, "mono8": cv2.COLOR_GRAY2RGB}
-DEPTHS = {"16UC1": np.uint16, "mono16": np.uint16, "32FC1": np.float32}
-DEPTH_UNIT = 1000.0
-"""Units a metre of the depth that is written."""
-
-
-def write_color(message: Any, file: Path) -> Path:
-    """Writes the colours of an `Image` or `CompressedImage` to `file` with the extension of its
-    kind, which it returns.
-
-    Raises:
-        KeyError, ValueError: for an encoding that is not known, or pixels that do not fit.
-        OSError: if it cannot be written.
-    """
-    if hasattr(message, "format"):
-        file = file.parent / f"{file.name}.{'png' if 'png' in message.format else 'jpg'}"
-        file.write_bytes(bytes(message.data))
-        return file
-    pixels = _pixels(message, np.uint8)
-    if (code := COLORS[message.encoding]) >= 0:
-        pixels = cv2.cvtColor(pixels, code)
-    return _write_png(file, pixels[..., ::-1])
-
-
-def write_depth(message: Any, file: Path) -> Path:
-    """Writes planar depth as `write_color` does colours: a PNG of 16 bits, in units of a
-    millimetre, 0 where none is known."""
-    if hasattr(message, "format"):
-        # A header of an enumeration and two floats, then a PNG; of floats 1 / depth is stored.
-        _, a, b = struct.unpack("<iff", bytes(message.data[:12]))
-        stored = cv2.imdecode(np.asarray(message.data[12:], np.uint8), cv2.IMREAD_UNCHANGED)
-        if stored is None:
-            raise ValueError("no PNG")
-        depth = stored
-        if "32FC1" in message.format:
-            inverse = stored.astype(np.float32) - np.float32(b)
-            depth = np.where(stored > 0, np.float32(a) / np.maximum(inverse, 1e-6), 0)
-    else:
-        depth = _pixels(message, DEPTHS[message.encoding])[..., 0]
-    if depth.dtype != np.uint16:
-        known = np.isfinite(depth) & (depth > 0) & (depth < 65.5)
-        units = np.where(known, np.round(DEPTH_UNIT * np.where(known, depth, 0)), 0)
-        depth = units.astype(np.uint16)
-    return _write_png(file, depth)
-
-
-def _pixels(message: Any, dtype: type) -> NDArray:
-    """(H, W, C), of rows that may be padded."""
-    rows = np.asarray(message.data, np.uint8).reshape(message.height, message.step)
-    item = np.dtype(dtype).newbyteorder(">" if message.is_bigendian else "<")
-    channels = rows.shape[1] // message.width // item.itemsize
-    rows = np.ascontiguousarray(rows[:, : message.width * channels * item.itemsize])
-    return rows.view(item).reshape(message.height, message.width, channels).astype(dtype)
-
-
-def _write_png(file: Path, pixels: NDArray) -> Path:
-    file = file.parent / f"{file.name}.png"
-    if not cv2.imwrite(str(file), np.ascontiguousarray(pixels), [cv2.IMWRITE_PNG_COMPRESSION, 1]):
-        raise OSError(f"{file}: cannot be written; is the disk full?")
-    return file
-
-
-_MAX_GAP = 0.12
-"""[s] between two poses that one is interpolated from."""
-
-
-class TransformTree:
-    """Frames by name, each with its parent, at rest in it or moving."""
-
-    def __init__(self) -> None:
-        self._parents: dict[str, str] = {}
-        self._fixed: dict[str, RigidTransform] = {}
-        self._moving: dict[str, list[tuple[float, RigidTransform]]] = {}
-        self._times: dict[str, NDArray[np.float64]] = {}  # of what is sorted
-
-    def fix(self, parent: str, child: str, X_PC: RigidTransform) -> None:
-        """Says where a frame always is."""
-        self._parents[child], self._fixed[child] = parent, X_PC
-
-    def move(self, parent: str, child: str, time: float, X_PC: RigidTransform) -> None:
-        """Says where a frame was at a time [s]."""
-        self._parents[child] = parent
-        self._moving.setdefault(child, []).append((time, X_PC))
-        self._times.pop(child, None)
-
-    def fixed_pose(self, ancestor: str, frame: str) -> RigidTransform | None:
-        """The pose of a frame in one above it, None unless all between them is at rest."""
-        X = RigidTransform()
-        for name in self._upwards(frame):
-            if name == ancestor:
-                return X
-            if name not in self._fixed:
-                return None
-            X = self._fixed[name] @ X
-        return None
-
-    def pose(self, frame: str, time: float) -> RigidTransform | None:
-        """The pose of a frame in its root at a time [s], None where the poses around it are too far
-        apart or missing."""
-        X = RigidTransform()
-        for name in self._upwards(frame):
-            if name not in self._parents:
-                return X
-            here = self._fixed.get(name) or self._interpolated(name, time)
-            if here is None:
-                return None
-            X = here @ X
-        return None
-
-    def _upwards(self, frame: str) -> list[str]:
-        """The frame, its parent, and so on; not round and round."""
-        names = [frame]
-        while (parent := self._parents.get(names[-1])) is not None and parent not in names:
-            names.append(parent)
-        return names
-
-    def _interpolated(self, child: str, time: float) -> RigidTransform | None:
-        poses = self._moving.get(child, [])
-        if child not in self._times:
-            poses.sort(key=lambda pose: pose[0])
-            self._times[child] = np.array([t for t, _ in poses])
-        times = self._times[child]
-        after = int(np.searchsorted(times, time))
-        if after < len(times) and times[after] == time:
-            return poses[after][1]
-        if not 0 < after < len(times) or times[after] - times[after - 1] > _MAX_GAP:
-            return None
-        (t0, a), (t1, b) = poses[after - 1], poses[after]
-        return pose_between(a, b, (time - t0) / (t1 - t0))
-
-
+_COLORS = {"rgb8": -1, "bgr8": cv2.COLOR_BGR2RGB, "rgba8": cv2.COLOR_RGBA2RGB}
+_COLORS |= {"bgra8": cv2.COLOR_BGRA2RGB, "mono8": cv2.COLOR_GRAY2RGB}
+_DEPTHS = {"16UC1": np.uint16, "mono16": np.uint16, "32FC1": np.float32}
+_DEPTH_UNIT = 1000.0
+"""Units per meter of the depth that is written."""
 _METADATA = "metadata.yaml"
 _IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _INFO = "sensor_msgs/msg/CameraInfo"
@@ -185,30 +57,30 @@ _POSES = {
 _TRANSPORTS = ("/compressed", "/compressedDepth", "/theora")
 _CAMERA = "camera.json"
 _VERSION = 2
-"""Of what is written to the cache; another is written again."""
+"""Of the cache's content; other versions are written again."""
 _MODELS = {"": opencv_lens, "plumb_bob": opencv_lens, "rational_polynomial": opencv_lens}
 _MODELS |= {"equidistant": fisheye_lens, "fisheye": fisheye_lens}
 
 
-def is_rosbag(path: Path) -> bool:
-    """Tells whether the path looks like a bag, readable or not."""
+def recognizes(path: Path) -> bool:
+    """Tells whether a path looks like a bag, readable or not."""
     if path.suffix in {".bag", ".db3", ".mcap"}:
         return True
     file = path / _METADATA
     return file.is_file() and b"rosbag2_bagfile_information" in file.read_bytes()[:4096]
 
 
-def read_rosbag(path: Path, config: CaptureConfig) -> Capture:
-    """Opens a bag. `config.topics` names the topics of colour, depth and poses where there are
-    several; `config.intrinsics` comes before the bag's calibration.
+def read(path: Path, config: CaptureConfig) -> Capture:
+    """Opens a bag. `config.topics` chooses among several topics; `config.intrinsics` replace the
+    bag's calibration.
 
     Raises:
-        ValueError: if it is no readable bag, lacks what is needed, or has it more than once.
-        OSError: if the cache cannot be written.
+        ValueError, OSError: if it is not readable, a topic is missing or ambiguous, or the cache
+            cannot be written.
         ModuleNotFoundError: if the extra `ros` is not installed.
     """
     if path.suffix in {".db3", ".mcap"}:
-        raise ValueError(f"{path}: a part of a bag; name its folder, in which {_METADATA} lies")
+        raise ValueError(f"{path}: a part of a bag; name its folder, which holds {_METADATA}")
     files = sorted(path.iterdir()) if path.is_dir() else [path]
     folder = cache_folder(config, "bags", cache_key(files, config.topics, _VERSION)) / path.stem
     if not folder.is_dir():
@@ -224,12 +96,12 @@ def read_rosbag(path: Path, config: CaptureConfig) -> Capture:
                 "images without distortion"
             )
         fx, fy, cx, cy = camera["intrinsics"]
+        K = pinhole(fx, fy, cx + 0.5, cy + 0.5)  # ROS counts from the first pixel's center.
         make = _MODELS[camera["model"]]
-        K = pinhole(fx, fy, cx + 0.5, cy + 0.5)  # ROS counts from the first pixel's centre
         own = make(K, camera["width"], camera["height"], camera["distortion"])
         return replace(own, source=camera["source"]).scale_to(width, height)
 
-    return open_sequence(folder, "ROS bag", config, lens, DEPTH_UNIT)
+    return open_sequence(folder, "ROS bag", config, lens, _DEPTH_UNIT)
 
 
 @contextmanager
@@ -249,78 +121,73 @@ def _opened(path: Path) -> Iterator[Any]:
 
 
 class _Bag:
-    """An open bag, of which it is known what shows what."""
+    """An open bag, with the topics of color, depth and poses."""
 
     def __init__(self, path: Path, reader: Any, topics: list[str]):
         self._path, self._reader = path, reader
         self._types = {c.topic: c.msgtype for c in reader.connections}
-        images = {topic: self._kind(topic) for topic in self._of(*_IMAGES)}
-        wanted = topics or ["", "", ""]
-        self._color = self._one("colour images", self._which(images, "colour"), wanted[0])
-        self._depth = self._one("depth images", self._which(images, "depth"), wanted[1])
-        poses = self._of(*_POSES) or [t for t in self._of(_TF) if t != "/tf_static"]
-        self._pose = self._one("poses", poses, wanted[2])
+        shown = {topic: self._content(topic) for topic in self._topics(*_IMAGES)}
+        colors, depths = (
+            [topic for topic, content in shown.items() if content == name]
+            for name in ("color", "depth")
+        )
+        poses = self._topics(*_POSES) or [t for t in self._topics(_TF) if t != "/tf_static"]
+        given = topics or ["", "", ""]
+        self._color = self._choose("color images", colors, given[0])
+        self._depth = self._choose("depth images", depths, given[1])
+        self._pose = self._choose("poses", poses, given[2])
 
     def write(self, folder: Path) -> None:
         """Writes images, lists of times and poses, and the calibration."""
-        tree, frame = self._transforms(), self._first(self._color).header.frame_id.lstrip("/")
-        colors, poses = self._images(folder, "rgb", self._color, write_color), []
-        self._images(folder, "depth", self._depth, write_depth)
+        tree, frame = self._transforms(), _frame(self._first(self._color))
+        colors, poses = self._write_images(folder, "rgb", self._color, _write_color), []
+        self._write_images(folder, "depth", self._depth, _write_depth)
         if self._types[self._pose] == _TF:
             found = ((time, tree.pose(frame, time)) for time in colors)
             poses = [(time, X_WC) for time, X_WC in found if X_WC is not None]
         else:
-            field = _POSES[self._types[self._pose]]
+            pose_field = _POSES[self._types[self._pose]]
             for message in self._messages(self._pose):
                 body = getattr(message, "child_frame_id", "").lstrip("/")
                 X_BC = tree.fixed_pose(body, frame) or RigidTransform()
-                poses.append((_time(message), _pose(field(message), self._pose) @ X_BC))
+                poses.append((_time(message), _pose(pose_field(message), self._pose) @ X_BC))
         if len(poses) < 2:
             raise ValueError(
                 f"{self._path}: {self._pose} gives {len(poses)} poses of {frame!r}, the frame of "
                 f"{self._color}; at least 2 are needed"
             )
-        with (folder / "groundtruth.txt").open("w") as file:
-            for time, X_WC in poses:
-                w, x, y, z = X_WC.rotation().ToQuaternion().wxyz()
-                numbers = " ".join(f"{n:.17g}" for n in (*X_WC.translation(), x, y, z, w))
-                file.write(f"{time:.9f} {numbers}\n")
+        lines = [f"{time:.9f} {pose_row(X_WC)}\n" for time, X_WC in poses]
+        (folder / "groundtruth.txt").write_text("".join(lines))
         (folder / _CAMERA).write_text(json.dumps(self._calibration(frame)))
 
-    def _of(self, *types: str) -> list[str]:
-        return sorted(topic for topic, kind in self._types.items() if kind in types)
+    def _topics(self, *types: str) -> list[str]:
+        return sorted(topic for topic, each in self._types.items() if each in types)
 
-    def _one(self, what: str, topics: list[str], wanted: str) -> str:
-        if wanted:
-            if wanted not in self._types:
-                known = ", ".join(sorted(self._types))
-                raise ValueError(f"{self._path}: has no topic {wanted}; it has {known}")
-            return wanted
-        if len(topics) == 1:
-            return topics[0]
-        if topics:
+    def _choose(self, what: str, topics: list[str], given: str) -> str:
+        known = ", ".join(sorted(self._types))
+        if given:
+            if given not in self._types:
+                raise ValueError(f"{self._path}: has no topic {given}; it has {known}")
+            return given
+        if not topics:
+            raise ValueError(f"{self._path}: has no topic of {what}; it has {known}")
+        if len(topics) > 1:
             raise ValueError(
                 f"{self._path}: {what} are in {', '.join(topics)}; set capture.topics to the names "
-                "of colour, depth and poses that are meant"
+                "of color, depth and poses"
             )
-        raise ValueError(
-            f"{self._path}: has no topic of {what}; it has {', '.join(sorted(self._types))}"
-        )
+        return topics[0]
 
-    @staticmethod
-    def _which(images: dict[str, str], kind: str) -> list[str]:
-        return [topic for topic, found in images.items() if found == kind]
-
-    def _kind(self, topic: str) -> str:
-        """What images show: colour, depth or neither."""
+    def _content(self, topic: str) -> str:
+        """Returns whether images show color, depth or neither."""
         message = self._first(topic)
         if message is None:
             return ""
         if hasattr(message, "format"):
-            return "depth" if "compressedDepth" in message.format else "colour"
-        if message.encoding in DEPTHS:
+            return "depth" if "compressedDepth" in message.format else "color"
+        if message.encoding in _DEPTHS:
             return "depth"
-        return "colour" if message.encoding in COLORS else ""
+        return "color" if message.encoding in _COLORS else ""
 
     def _messages(self, *topics: str) -> Iterator[Any]:
         connections = [c for c in self._reader.connections if c.topic in topics]
@@ -330,20 +197,19 @@ class _Bag:
     def _first(self, topic: str) -> Any:
         return next(self._messages(topic), None)
 
-    def _transforms(self) -> TransformTree:
+    def _transforms(self) -> "TransformTree":
         tree = TransformTree()
-        for topic in self._of(_TF):
+        for topic in self._topics(_TF):
             for message in self._messages(topic):
                 for moved in message.transforms:
-                    parent = moved.header.frame_id.lstrip("/")
-                    child, X_PC = moved.child_frame_id.lstrip("/"), _pose(moved.transform, topic)
+                    parent, child = _frame(moved), moved.child_frame_id.lstrip("/")
                     if topic == "/tf_static":
-                        tree.fix(parent, child, X_PC)
+                        tree.fix(parent, child, _pose(moved.transform, topic))
                     else:
-                        tree.move(parent, child, _time(moved), X_PC)
+                        tree.move(parent, child, _time(moved), _pose(moved.transform, topic))
         return tree
 
-    def _images(
+    def _write_images(
         self, folder: Path, name: str, topic: str, write: Callable[[Any, Path], Path]
     ) -> list[float]:
         """Writes the images of a topic and the list of their times, which it returns [s]."""
@@ -355,7 +221,7 @@ class _Bag:
                 times.append(_time(message))
                 try:
                     image = write(message, folder / name / f"{times[-1]:.9f}")
-                except (cv2.error, ValueError, TypeError) as error:
+                except (cv2.error, LookupError, ValueError, TypeError, struct.error) as error:
                     raise ValueError(
                         f"{self._path}: the image of {topic} at {times[-1]:.3f} s is unreadable "
                         f"({error})"
@@ -364,27 +230,24 @@ class _Bag:
         return times
 
     def _calibration(self, frame: str) -> dict[str, Any]:
-        """That of the camera of the color images, which are in `frame`, or why there is none.
+        """Returns that of the camera of the color images, which are in `frame`, or the problem.
 
         It is in the namespace of the images or, without one there, has their frame. K and D
-        describe images as the camera took them, P alone those that are rectified (CameraInfo).
+        describe images as the camera took them, P those that are rectified (CameraInfo).
         """
         images = self._color
         for transport in _TRANSPORTS:
             images = images.removesuffix(transport)
         namespace, _, image = images.rpartition("/")
-        infos = {topic: self._first(topic) for topic in self._of(_INFO)}
-        near = [topic for topic in infos if topic.rpartition("/")[0] == namespace and infos[topic]]
-        found = near or [
-            topic
-            for topic, info in infos.items()
-            if info is not None and info.header.frame_id.lstrip("/") == frame
-        ]
+        infos = {topic: self._first(topic) for topic in self._topics(_INFO)}
+        infos = {topic: info for topic, info in infos.items() if info is not None}
+        near = [topic for topic in infos if topic.rpartition("/")[0] == namespace]
+        found = near or [topic for topic, info in infos.items() if _frame(info) == frame]
         if not found:
             return {"problem": "has no calibration of the color camera (CameraInfo)"}
         topic, message = found[0], infos[found[0]]
-        matrix, projection, distortion = (_field(message, name) for name in "KPD")
-        if any(not np.array_equal(_field(infos[each], "K"), matrix) for each in found):
+        matrix, projection, distortion = (_info_field(message, name) for name in "kpd")
+        if any(not np.array_equal(_info_field(infos[each], "k"), matrix) for each in found):
             return {"problem": f"{', '.join(found)} differ, and none is beside {self._color}"}
         K, model = np.asarray(matrix, dtype=float).reshape(3, 3), message.distortion_model
         if image.startswith("image_rect"):
@@ -403,15 +266,131 @@ class _Bag:
         }
 
 
-def _field(message: Any, name: str) -> Any:
-    """Of a CameraInfo, whose fields are in capitals in ROS 1."""
-    return getattr(message, name) if hasattr(message, name) else getattr(message, name.lower())
+class TransformTree:
+    """Frames by name, each with its parent, fixed in it or moving."""
+
+    def __init__(self) -> None:
+        self._parents: dict[str, str] = {}
+        self._fixed: dict[str, RigidTransform] = {}
+        self._moving: dict[str, list[tuple[float, RigidTransform]]] = {}
+        self._times: dict[str, NDArray[np.float64]] = {}  # of sorted poses
+
+    def fix(self, parent: str, child: str, X_PC: RigidTransform) -> None:
+        """Adds a fixed frame."""
+        self._parents[child], self._fixed[child] = parent, X_PC
+
+    def move(self, parent: str, child: str, time: float, X_PC: RigidTransform) -> None:
+        """Adds the pose of a moving frame at a time [s]."""
+        self._parents[child] = parent
+        self._moving.setdefault(child, []).append((time, X_PC))
+        self._times.pop(child, None)
+
+    def fixed_pose(self, ancestor: str, frame: str) -> RigidTransform | None:
+        """Returns the pose of a frame in an ancestor, None unless all between them is fixed."""
+        X = RigidTransform()
+        for name in self._upwards(frame):
+            if name == ancestor:
+                return X
+            if name not in self._fixed:
+                return None
+            X = self._fixed[name] @ X
+        return None
+
+    def pose(self, frame: str, time: float) -> RigidTransform | None:
+        """Returns the pose of a frame in its root at a time [s], None if the poses around it are
+        missing or too far apart."""
+        X = RigidTransform()
+        for name in self._upwards(frame):
+            if name not in self._parents:
+                return X
+            here = self._fixed.get(name) or self._interpolate(name, time)
+            if here is None:
+                return None
+            X = here @ X
+        return None
+
+    def _upwards(self, frame: str) -> list[str]:
+        """Returns the frame, its parent, and so on, up to the root or a repetition."""
+        names = [frame]
+        while (parent := self._parents.get(names[-1])) is not None and parent not in names:
+            names.append(parent)
+        return names
+
+    def _interpolate(self, child: str, time: float) -> RigidTransform | None:
+        poses = self._moving.get(child, [])
+        if child not in self._times:
+            poses.sort(key=lambda pose: pose[0])
+            self._times[child] = np.array([t for t, _ in poses])
+        times = self._times[child]
+        after = int(np.searchsorted(times, time))
+        if after < len(times) and times[after] == time:
+            return poses[after][1]
+        if not 0 < after < len(times) or times[after] - times[after - 1] > MAX_GAP:
+            return None
+        (t0, a), (t1, b) = poses[after - 1], poses[after]
+        return pose_between(a, b, (time - t0) / (t1 - t0))
+
+
+def _write_color(message: Any, file: Path) -> Path:
+    """Writes the colors of an `Image` or `CompressedImage` to `file` with the suffix of its
+    format, which it returns."""
+    if hasattr(message, "format"):
+        file = file.parent / f"{file.name}.{'png' if 'png' in message.format else 'jpg'}"
+        file.write_bytes(bytes(message.data))
+        return file
+    pixels = _pixels(message, np.uint8)
+    if (code := _COLORS[message.encoding]) >= 0:
+        pixels = cv2.cvtColor(pixels, code)
+    return _write_png(file, pixels[..., ::-1])
+
+
+def _write_depth(message: Any, file: Path) -> Path:
+    """Writes planar depth as a PNG of 16 bits in millimeters, 0 if unknown."""
+    if hasattr(message, "format"):
+        # A header of an enumeration and two floats, then a PNG, which holds floats as 1 / depth.
+        _, a, b = struct.unpack("<iff", bytes(message.data[:12]))
+        depth = cv2.imdecode(np.asarray(message.data[12:], np.uint8), cv2.IMREAD_UNCHANGED)
+        if depth is None:
+            raise ValueError("no PNG")
+        if "32FC1" in message.format:
+            inverse = depth.astype(np.float32) - np.float32(b)
+            depth = np.where(depth > 0, np.float32(a) / np.maximum(inverse, 1e-6), 0)
+    else:
+        depth = _pixels(message, _DEPTHS[message.encoding])[..., 0]
+    if depth.dtype != np.uint16:
+        known = np.isfinite(depth) & (depth > 0) & (depth < 65.5)
+        depth = np.round(_DEPTH_UNIT * np.where(known, depth, 0)).astype(np.uint16)
+    return _write_png(file, depth)
+
+
+def _pixels(message: Any, dtype: type) -> NDArray:
+    """Returns the pixels (H, W, C) of rows that may be padded."""
+    rows = np.asarray(message.data, np.uint8).reshape(message.height, message.step)
+    item = np.dtype(dtype).newbyteorder(">" if message.is_bigendian else "<")
+    channels = rows.shape[1] // message.width // item.itemsize
+    rows = np.ascontiguousarray(rows[:, : message.width * channels * item.itemsize])
+    return rows.view(item).reshape(message.height, message.width, channels).astype(dtype)
+
+
+def _write_png(file: Path, pixels: NDArray) -> Path:
+    file = file.parent / f"{file.name}.png"
+    if not cv2.imwrite(str(file), np.ascontiguousarray(pixels), [cv2.IMWRITE_PNG_COMPRESSION, 1]):
+        raise OSError(f"{file}: cannot be written; is the disk full?")
+    return file
+
+
+def _info_field(info: Any, name: str) -> Any:
+    """Returns a field of a CameraInfo, whose name is in capitals in ROS 1."""
+    return getattr(info, name) if hasattr(info, name) else getattr(info, name.upper())
+
+
+def _frame(message: Any) -> str:
+    return message.header.frame_id.lstrip("/")
 
 
 def _time(message: Any) -> float:
-    """[s]"""
     stamp = message.header.stamp
-    return stamp.sec + 1e-9 * stamp.nanosec
+    return stamp.sec + 1e-9 * stamp.nanosec  # [s]
 
 
 def _pose(message: Any, source: str) -> RigidTransform:

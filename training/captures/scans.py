@@ -1,10 +1,4 @@
-"""Folders as ScanNet's reader exports its scans: `color/`, `depth/`, `pose/`, `intrinsic/`.
-
-Layout as published with the data set (Dai et al., "ScanNet", CVPR 2017), which later data sets
-took over: `color/0.jpg`, `depth/0.png` in millimetres, `pose/0.txt` 4x4, camera to world, -inf
-where tracking was lost, `intrinsic/intrinsic_color.txt` and `intrinsic_depth.txt` 4x4, counted from
-the first pixel's centre. The axes of both cameras are the same. Up is z.
-"""
+"""ScanNet and 7-Scenes: RGB-D scans with a color camera apart from the depth camera."""
 
 from pathlib import Path
 
@@ -27,21 +21,28 @@ from splatpilot.training.captures.up_and_scale import turn_upright
 _SCANNET_COLOR = Path("intrinsic", "intrinsic_color.txt")
 _SCANNET_DEPTH = Path("intrinsic", "intrinsic_depth.txt")
 
+# fx, fy, cx, cy [px] of 7-Scenes at 640x480. Those of depth are published; the color camera and its
+# position in the depth camera [m] were measured on redkitchen by agreement of colors.
+_SEVEN_SCENES_DEPTH = (585.0, 585.0, 320.0, 240.0)
+_SEVEN_SCENES_COLOR = (523.0, 523.0, 320.0, 240.0)
+_P_DC = (0.024, 0.005, 0.0)
 
-def is_scannet(path: Path) -> bool:
-    """Tells whether the folder looks like an exported scan of ScanNet, whole or not."""
+
+def recognizes_scannet(path: Path) -> bool:
+    """Tells whether a folder looks like an exported scan of ScanNet, complete or not."""
     return (path / _SCANNET_COLOR).is_file() and (path / "pose").is_dir()
 
 
 def read_scannet(path: Path, config: CaptureConfig) -> Capture:
-    """Opens a folder as ScanNet's reader exports it.
+    """Opens a folder as ScanNet's reader exports it (Dai et al., "ScanNet", CVPR 2017).
 
-    `config.intrinsics` and `config.depth_intrinsics` are at the images' own size, and count from
-    the first pixel's corner as all of this package does.
+    `color/0.jpg`, `depth/0.png` in millimeters, `pose/0.txt` 4x4, camera to world with z up, -inf
+    where tracking was lost, `intrinsic/intrinsic_color.txt` and `intrinsic_depth.txt` 4x4, counted
+    from the first pixel's center. The axes of both cameras are the same.
 
     Raises:
-        FileNotFoundError: if there is no image.
-        ValueError: if the intrinsics are not as they should be, or too many frames cannot be used.
+        ValueError, OSError: if there is no image, the intrinsics are invalid, or too many frames
+            cannot be used.
     """
     colors = numbered_files(path / "color", r"(\d+)\.(?:jpg|jpeg|png)")
     lost = [number for number in colors if _is_lost(path / "pose" / f"{number}.txt")]
@@ -61,8 +62,7 @@ def read_scannet(path: Path, config: CaptureConfig) -> Capture:
         )
 
     def depth_camera(width: int, height: int) -> DepthCamera:
-        K = Lens(K_D, width, height).K  # which a camera of that size can have
-        return DepthCamera(K, width, height, RigidTransform())
+        return DepthCamera(Lens(K_D, width, height).K, width, height, RigidTransform())
 
     capture = open_frames(
         path,
@@ -79,7 +79,6 @@ def read_scannet(path: Path, config: CaptureConfig) -> Capture:
 
 
 def _is_lost(pose: Path) -> bool:
-    """Tells whether a pose is there, and not finite."""
     try:
         return not np.isfinite(read_matrix(pose)).all()
     except (OSError, ValueError):
@@ -91,53 +90,36 @@ def _intrinsics(file: Path) -> NDArray[np.float64]:
     return pinhole(K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5)
 
 
-# RGB-D folders of the 7-Scenes kind: `frame-%06d.color.png`, `.depth.png`, `.pose.txt`.
-#
-# Layout as published with the data set (Shotton et al., "Scene Coordinate Regression Forests", CVPR
-# 2013): depth in millimetres with 0 and 65535 invalid; poses 4x4, camera to world, of the depth
-# camera, whose intrinsics are published: 585 px at the centre of 640x480. Colour comes from another
-# camera, which the data set does not calibrate. What is used here unless the configuration says
-# otherwise was measured on redkitchen by agreement of colours between frames.
-
-
-# fx, fy, cx, cy [px] at 640x480, and the colour camera's position in the depth camera [m].
-_SEVEN_SCENES_COLOR = (523.0, 523.0, 320.0, 240.0)
-_SEVEN_SCENES_DEPTH = (585.0, 585.0, 320.0, 240.0)
-_P_DC = (0.024, 0.005, 0.0)
-
-_COLOR_NAME = r"frame-(\d+)\.color\.(?:jpg|jpeg|png)"
-
-
-def is_seven_scenes(path: Path) -> bool:
-    """Tells whether the folder holds frames named as in 7-Scenes."""
+def recognizes_seven_scenes(path: Path) -> bool:
+    """Tells whether a folder holds frames named as in 7-Scenes."""
     return next(path.glob("frame-*.color.*"), None) is not None
 
 
 def read_seven_scenes(path: Path, config: CaptureConfig) -> Capture:
-    """Opens an RGB-D folder of the 7-Scenes kind.
+    """Opens a folder as 7-Scenes (Shotton et al., CVPR 2013): `frame-%06d.color.png`,
+    `.depth.png` in millimeters with 0 and 65535 invalid, `.pose.txt` 4x4, depth camera to world.
 
-    `config.intrinsics` and `config.depth_intrinsics` are at the images' own size. Setting
-    `intrinsics` and `depth_intrinsics` equal with `p_DC` zero says that depth is registered.
+    `config.intrinsics` and `depth_intrinsics`, if equal and with `p_DC` zero, describe depth that
+    is registered to color.
 
     Raises:
-        FileNotFoundError: if there is no colour image.
-        ValueError: if too many frames cannot be used.
+        ValueError, OSError: if there is no image, or too many frames cannot be used.
     """
-    colors = numbered_files(path, _COLOR_NAME)
+    colors = numbered_files(path, r"frame-(\d+)\.color\.(?:jpg|jpeg|png)")
     unit = config.depth_unit or 1000.0
     X_DC = RigidTransform(np.array(config.p_DC or _P_DC))
 
-    def frame(number: int, color: Path) -> FrameFiles:
+    def frame(color: Path) -> FrameFiles:
         stem = color.name.partition(".")[0]
         pose = path / f"{stem}.pose.txt"
-
-        def X_FC() -> RigidTransform:
-            return pose_from_matrix(read_matrix(pose), str(pose)) @ X_DC
-
-        return FrameFiles(color, X_FC, path / f"{stem}.depth.png")
+        return FrameFiles(
+            color,
+            lambda: pose_from_matrix(read_matrix(pose), str(pose)) @ X_DC,
+            path / f"{stem}.depth.png",
+        )
 
     def lens(width: int, height: int) -> Lens:
-        source = "what was measured on redkitchen: set capture.intrinsics if the camera is another"
+        source = "what was measured on redkitchen: set capture.intrinsics of another camera"
         return Lens(pinhole(*_SEVEN_SCENES_COLOR), 640, 480, source=source).scale_to(width, height)
 
     def depth_camera(width: int, height: int) -> DepthCamera:
@@ -149,8 +131,8 @@ def read_seven_scenes(path: Path, config: CaptureConfig) -> Capture:
 
     capture = open_frames(
         path,
-        "RGB-D folder",
-        [frame(number, color) for number, color in colors.items()],
+        "7-Scenes folder",
+        [frame(color) for color in colors.values()],
         axes=OPTICAL_AXES,
         lens=lens,
         intrinsics=config.intrinsics,

@@ -1,11 +1,10 @@
-"""RGB-D sequences of the TUM kind: `rgb.txt`, `depth.txt`, `groundtruth.txt` with time stamps.
+"""RGB-D sequences in TUM's format: `rgb.txt`, `depth.txt`, `groundtruth.txt` with time stamps.
 
-Layout, intrinsics and the 5000 units a metre as published with the data set (Sturm et al., "A
-Benchmark for the Evaluation of RGB-D SLAM Systems", IROS 2012). Depth is registered to colour;
-poses `tx ty tz qx qy qz qw` are those of the optical axes in a world with z up. A colour image is
-paired with the depth nearest in time, and its pose is interpolated between two measured ones.
-Where poses are those of keyframes, too far apart to interpolate, images take the pose of their own
-time, and those between keyframes have none.
+Layout, intrinsics and the 5000 units per meter as published with the data set (Sturm et al., "A
+Benchmark for the Evaluation of RGB-D SLAM Systems", IROS 2012). Depth is registered to color;
+poses `tx ty tz qx qy qz qw` are those of the optical axes in a world with z up. A color image takes
+the depth nearest in time, and a pose interpolated between two measured ones or, where poses are
+those of keyframes, the pose of its own time.
 """
 
 import re
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
 from splatpilot.systems.common.readers import read_text
+from splatpilot.systems.common.validation import require
 from splatpilot.systems.vehicle.state import pose_between
 from splatpilot.training.captures.capture import OPTICAL_AXES, Capture, Lens, opencv_lens, pinhole
 from splatpilot.training.captures.capture_config import CaptureConfig
@@ -30,17 +30,16 @@ from splatpilot.training.captures.frames import (
 )
 from splatpilot.training.captures.up_and_scale import turn_upright
 
-_MAX_APART = 0.02
-"""[s] between a colour image and its depth, as the data set's own tools have it."""
-_MAX_GAP = 0.12
+MAX_GAP = 0.12
 """[s] between two poses that one is interpolated from."""
+_MAX_APART = 0.02
+"""[s] between a color image and its depth, as in the data set's own tools."""
 _SAME_TIME = 0.005
-"""[s] between an image and the pose of a keyframe that is its own."""
+"""[s] between an image and the pose of its keyframe."""
 
 # fx, fy, cx, cy [px], counted from the first pixel's center, and distortion k1 k2 p1 p2 k3, for
-# images of 640x480 px, of the cameras that the names of sequences tell apart: those of the folder,
-# or of the bag that its lists name. Published with the data sets: TUM's, and that of Bonn's dynamic
-# scenes (Palazzolo et al. 2019).
+# images of 640x480 px, by the name of the folder or of the bag that its lists name. Published with
+# the data sets: TUM's, and Bonn's dynamic scenes (Palazzolo et al. 2019).
 _NAMES = r"(?:freiburg|(?<![a-z])fr)([123])(?![0-9])|rgbd_(bonn)_"
 _CAMERAS = {
     "1": ((517.3, 516.5, 318.6, 255.3), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
@@ -53,103 +52,106 @@ _CAMERAS = {
 }
 _DEFAULT = (525.0, 525.0, 319.5, 239.5)
 _CALIBRATION = "calibration.txt"
-"""With fx, fy, cx, cy and distortion of the images themselves, as ETH3D's sequences have it."""
+"""Holds fx, fy, cx, cy and distortion of the images themselves, as in ETH3D's sequences."""
 
 
-def is_tum(path: Path) -> bool:
-    """Tells whether the folder looks like a TUM RGB-D sequence, whole or not."""
+def recognizes(path: Path) -> bool:
+    """Tells whether a folder looks like a TUM RGB-D sequence, complete or not."""
     return (path / "rgb.txt").exists() and (path / "groundtruth.txt").exists()
 
 
-def read_tum(path: Path, config: CaptureConfig) -> Capture:
-    """Opens a TUM RGB-D sequence. Colour images without depth or pose in time are left out.
+def read(path: Path, config: CaptureConfig) -> Capture:
+    """Opens a TUM RGB-D sequence, without the color images that have no depth or pose in time.
 
     Raises:
-        FileNotFoundError: if a list is missing.
-        ValueError: if a list is not as it should be, or too many frames cannot be used.
+        ValueError, OSError: if a list is missing or invalid, or too many frames cannot be used.
     """
 
     def lens(width: int, height: int) -> Lens:
         file = path / _CALIBRATION
         if file.is_file():
-            numbers = read_calibration(file)
-            own = opencv_lens(_K(*numbers[:4]), width, height, numbers[4:].tolist())
+            numbers = _read_calibration(file)
+            own = opencv_lens(_intrinsics(*numbers[:4]), width, height, numbers[4:].tolist())
             return replace(own, source=file.name)
-        said = f"{path.resolve().name}\n{read_text(path / 'rgb.txt', 'replace')[:1000]}"
-        if found := re.search(_NAMES, said):
+        text = f"{path.resolve().name}\n{read_text(path / 'rgb.txt', 'replace')[:1000]}"
+        if found := re.search(_NAMES, text):
             focal, distortion = _CAMERAS[found[1] or found[2]]
-            own = opencv_lens(_K(*focal), 640, 480, distortion)
+            own = opencv_lens(_intrinsics(*focal), 640, 480, distortion)
             return replace(own, source=f"the name {found[0]}").scale_to(width, height)
-        assumed = "what TUM's driver assumes: set capture.intrinsics if the camera is another"
-        return Lens(_K(*_DEFAULT), 640, 480, source=assumed).scale_to(width, height)
+        assumed = "what TUM's driver assumes: set capture.intrinsics of another camera"
+        return Lens(_intrinsics(*_DEFAULT), 640, 480, source=assumed).scale_to(width, height)
 
     return open_sequence(path, "TUM RGB-D sequence", config, lens, 5000.0)
 
 
-def read_calibration(file: Path) -> NDArray[np.float64]:
-    """Returns fx, fy, cx, cy [px] and what follows of distortion, (4,) to (9,).
-
-    Raises:
-        ValueError: if the file holds anything else.
-    """
+def _read_calibration(file: Path) -> NDArray[np.float64]:
+    """Returns fx, fy, cx, cy [px] and the distortion that follows, (4,) to (9,)."""
+    text = read_text(file)
     try:
-        numbers = np.array(read_text(file).split(), dtype=np.float64)
+        numbers = np.array(text.split(), dtype=np.float64)
     except ValueError:
         numbers = np.zeros(0)
-    if len(numbers) not in (4, 8, 9) or not np.isfinite(numbers).all():
-        raise ValueError(
-            f"{file}: must be fx fy cx cy, and k1 k2 p1 p2 (k3) of a distorted camera; correct it, "
-            "or set capture.intrinsics"
-        )
+    require(
+        len(numbers) in (4, 8, 9) and np.isfinite(numbers).all(),
+        f"{file}",
+        "fx fy cx cy, and k1 k2 p1 p2 (k3) of a distorted camera",
+        repr(text[:80]),
+        "correct it, or set capture.intrinsics",
+    )
     return numbers
 
 
-def _K(fx: float, fy: float, cx: float, cy: float) -> NDArray[np.float64]:
+def _intrinsics(fx: float, fy: float, cx: float, cy: float) -> NDArray[np.float64]:
     return pinhole(fx, fy, cx + 0.5, cy + 0.5)
 
 
 def open_sequence(
-    path: Path, kind: str, config: CaptureConfig, lens: Callable[[int, int], Lens], unit: float
+    path: Path, source: str, config: CaptureConfig, lens: Callable[[int, int], Lens], unit: float
 ) -> Capture:
-    """Opens lists and images as TUM has them, of any camera.
+    """Opens lists and images in TUM's format, of any camera.
 
     Args:
         path: the folder of the lists.
-        kind: what it is called in `Capture.source`.
-        lens: gives the camera of images of a width and height [px].
-        unit: how many units of the stored depth make a metre, unless `config` says.
-
-    Raises:
-        FileNotFoundError, ValueError: see `read_tum`.
+        source: the format's name in `Capture.source`.
+        lens: returns the camera of images of a width and height [px].
+        unit: units of the stored depth per meter, unless `config` has them.
     """
     color_times, colors = _read_list(path / "rgb.txt")
     depth_times, depths = _read_list(path / "depth.txt")
     pose_file = path / "groundtruth.txt"
-    rows = read_rows(pose_file, 8, "pose; eight numbers t tx ty tz qx qy qz qw are needed")
+    rows = read_rows(pose_file, 8, "a pose t tx ty tz qx qy qz qw")
     rows = np.array([row for row in rows if np.isfinite(row).all()]).reshape(-1, 8)
-    if len(rows) < 2:
-        raise ValueError(f"{pose_file}: {len(rows)} finite poses, at least 2 are needed")
+    require(len(rows) >= 2, f"{pose_file}: finite poses", "at least 2", len(rows))
     rows = rows[np.argsort(rows[:, 0], kind="stable")]
-
     _require_overlap(path / "rgb.txt", color_times, pose_file, rows[:, 0])
     _require_overlap(path / "rgb.txt", color_times, path / "depth.txt", depth_times)
+
+    def frame(color: str, depth: str, around: NDArray[np.float64], time: float) -> FrameFiles:
+        def X_FC() -> RigidTransform:
+            poses = [pose_from_quaternion(row[1:], f"{pose_file}, {row[0]} s") for row in around]
+            if len(poses) == 1:
+                return poses[0]
+            s = (time - around[0, 0]) / (around[1, 0] - around[0, 0])
+            return pose_between(poses[0], poses[1], s)
+
+        return FrameFiles(path / color, X_FC, path / depth)
 
     frames = []
     for time, color in zip(color_times, colors, strict=True):
         nearest = int(np.argmin(np.abs(depth_times - time)))
         around = _poses_around(rows, time)
         if abs(depth_times[nearest] - time) <= _MAX_APART and len(around):
-            frames.append(_frame(path, color, depths[nearest], around, time))
+            frames.append(frame(color, depths[nearest], around, time))
     alone = len(colors) - len(frames)
     dropped = [
-        f"{path / 'rgb.txt'}: {alone} of {len(colors)} colour images have no depth within "
-        f"{_MAX_APART} s, or neither two poses within {_MAX_GAP} s around them nor one within "
+        f"{path / 'rgb.txt'}: {alone} of {len(colors)} color images have no depth within "
+        f"{_MAX_APART} s, or neither two poses within {MAX_GAP} s around them nor one within "
         f"{_SAME_TIME} s"
     ]
     unit = config.depth_unit or unit
     capture = open_frames(
         path,
-        kind,
+        source,
         frames,
         axes=OPTICAL_AXES,
         lens=lens,
@@ -163,46 +165,24 @@ def open_sequence(
 def _require_overlap(
     images: Path, times: NDArray[np.float64], other: Path, others: NDArray[np.float64]
 ) -> None:
-    """Raises ValueError if two lists have no time in common."""
-    margin = _MAX_APART
-    if times.max() < others.min() - margin or others.max() < times.min() - margin:
+    if times.max() < others.min() - _MAX_APART or others.max() < times.min() - _MAX_APART:
         raise ValueError(
             f"{other}: runs from {others.min():.3f} to {others.max():.3f} s, but {images} from "
-            f"{times.min():.3f} to {times.max():.3f} s; they have no time in common, write both by "
-            "one clock"
+            f"{times.min():.3f} to {times.max():.3f} s; write both by one clock"
         )
 
 
 def _poses_around(rows: NDArray[np.float64], time: float) -> NDArray[np.float64]:
-    """Returns the rows from which the pose at `time` is had: two around it, one, or none."""
+    """Returns the rows that give the pose at `time`: two around it, one, or none."""
     after = int(np.searchsorted(rows[:, 0], time))
-    if 0 < after < len(rows) and rows[after, 0] - rows[after - 1, 0] <= _MAX_GAP:
+    if 0 < after < len(rows) and rows[after, 0] - rows[after - 1, 0] <= MAX_GAP:
         return rows[after - 1 : after + 1]
     nearest = int(np.argmin(np.abs(rows[:, 0] - time)))
     return rows[nearest : nearest + int(abs(rows[nearest, 0] - time) <= _SAME_TIME)]
 
 
-def _frame(
-    path: Path, color: str, depth: str, rows: NDArray[np.float64], time: float
-) -> FrameFiles:
-    """`rows` are one pose or two."""
-
-    def X_FC() -> RigidTransform:
-        poses = [
-            pose_from_quaternion(row[1:], f"{path / 'groundtruth.txt'}, {row[0]} s") for row in rows
-        ]
-        if len(poses) == 1:
-            return poses[0]
-        s = (time - rows[0, 0]) / (rows[1, 0] - rows[0, 0])
-        return pose_between(poses[0], poses[1], s)
-
-    return FrameFiles(path / color, X_FC, path / depth)
-
-
 def _read_list(file: Path) -> tuple[NDArray[np.float64], list[str]]:
     """Returns the times [s] and file names of a list."""
-    if not file.is_file():
-        raise FileNotFoundError(f"{file}: the file is missing; a TUM sequence needs it")
     times, names = [], []
     for number, line in enumerate(read_text(file, "replace").splitlines(), start=1):
         if not line.strip() or line.startswith("#"):
@@ -212,7 +192,7 @@ def _read_list(file: Path) -> tuple[NDArray[np.float64], list[str]]:
             times.append(float(time))
         except ValueError:
             raise ValueError(
-                f"{file}, line {number}: {line[:80]!r} is not a time and a file name"
+                f"{file}, line {number} must be a time and a file name, got {line[:80]!r}"
             ) from None
         names.append(name)
     if not names:

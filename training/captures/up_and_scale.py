@@ -1,4 +1,4 @@
-"""Which way is up in a capture whose files do not say."""
+"""Up direction, metric scale and origin of a capture whose files leave them open."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -9,31 +9,41 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
 from splatpilot.systems.splats.scene import choose_origin
-from splatpilot.training.captures.capture import Capture, FileAxes, SfmPoints, back_project
+from splatpilot.training.captures.capture import (
+    Capture,
+    FileAxes,
+    SfmPoints,
+    depth_points,
+    project_points,
+)
 from splatpilot.training.captures.capture_config import ScaleConfig
 
-# How much cameras that look level count against images that are level.
 _LEVEL_GAZE = 0.01
-
+"""Weight of cameras that look level against images that are level."""
 _TRIALS = 2000
 _GROUND_SHARE = 0.02
 _MAX_TILT = np.deg2rad(35)
+_MIN_POINTS = 20
+"""Points whose depth must be known for a scale."""
+_MAX_SCALE_TILT = 10.0
+"""[deg] of a ground against what level cameras call level."""
+_MAX_SPREAD = 0.25
+"""Of the cameras' heights over a ground, 10 to 90 %, relative to their median."""
 
 
-def up_of_cameras(X_WCs: list[RigidTransform]) -> NDArray[np.float64]:
-    """Returns the direction (3,) that people who hold their cameras level would call up.
+def up_of_cameras(X_WCs: Sequence[RigidTransform]) -> NDArray[np.float64]:
+    """Returns the up direction (3,) of cameras that are held level.
 
     Level images have horizontal x axes, so up is the direction most nearly at right angles to all
-    of them. Where all cameras look the same way that leaves a choice, and among what is left it is
-    the one nearest to the mean of the cameras' own up: the eigenvector of the smallest eigenvalue
-    of sum x x^T + 0.01 sum (I - m m^T), with m that mean's direction.
+    of them and, where that leaves a choice, nearest to the mean m of the cameras' own up: the
+    eigenvector of the smallest eigenvalue of sum x x^T + 0.01 sum (I - m m^T).
     """
     R = np.array([X_WC.rotation().matrix() for X_WC in X_WCs])
     mean = -R[:, :, 1].mean(axis=0)
     if np.linalg.norm(mean) < 0.1:
         raise ValueError(
-            "the cameras have no direction in common that could be up; set capture.up to ground "
-            "or to an axis of the files' world"
+            "the cameras have no common up direction; set capture.up to ground or to an axis of "
+            "the files' world"
         )
     mean /= np.linalg.norm(mean)
     cost = np.einsum("ni,nj->ij", R[:, :, 0], R[:, :, 0])
@@ -45,23 +55,19 @@ def up_of_cameras(X_WCs: list[RigidTransform]) -> NDArray[np.float64]:
 def fit_ground(
     p_WQ: NDArray[np.float64], p_WCs: NDArray[np.float64], up: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], float]:
-    """Fits the plane n.p = d that is the ground.
+    """Fits the ground plane n.p = d.
 
-    Of planes through three random points whose normal is within 35 degrees of `up` and which lie
-    below the median camera, the one with the most points near it wins, where a point lower than it
-    counts against it: under the ground there is nothing. Near is 2 % of the cameras' median
-    distance from the points. The winner is refined by least squares.
+    Of planes through three random points, within 35 degrees of `up` and below the median camera,
+    the one with the most points near it wins; a point below it counts against it. Near is 2 % of
+    the cameras' median distance from the points. The winner is refined by least squares.
 
     Args:
-        p_WQ: (N, 3), points of the place.
+        p_WQ: (N, 3), points of the scene.
         p_WCs: (M, 3), cameras.
         up: (3,), roughly.
 
     Returns:
         n (3,), upward unit normal, and d.
-
-    Raises:
-        ValueError: if no plane holds a fiftieth of the points.
     """
     rng = np.random.default_rng(0)
     camera = np.median(p_WCs, axis=0)
@@ -103,29 +109,26 @@ def fit_ground(
 
 
 def turn_upright(capture: Capture, up: str) -> Capture:
-    """Turns the world of a capture so that z is up.
+    """Rotates the world of a capture so that z is up.
 
     Args:
         up: x, y, z, -x, -y or -z of the present world, `cameras` or `ground`; see
-            `up_of_cameras` and `fit_ground`, which takes points or, without them, depth.
-
-    Raises:
-        ValueError: if no up direction can be found.
+            `up_of_cameras` and `fit_ground`.
     """
     if up == "z":
         return capture
     if up in ("cameras", "ground"):
-        direction = up_of_cameras(list(capture.X_WCs))
+        direction = up_of_cameras(capture.X_WCs)
         if up == "ground":
             cameras = np.array([X_WC.translation() for X_WC in capture.X_WCs])
-            direction, _ = fit_ground(known_points(capture), cameras, direction)
+            direction, _ = fit_ground(_known_points(capture), cameras, direction)
     else:
         direction = np.eye(3)["xyz".index(up[-1])] * (-1 if up.startswith("-") else 1)
-    return turn_and_scale(capture, _turn_to_z(direction))
+    return _rotate_and_scale(capture, _rotation_to_z(direction))
 
 
-def turn_and_scale(capture: Capture, R_NW: RotationMatrix, scale: float = 1.0) -> Capture:
-    """Returns the capture in a world N, turned and with lengths times `scale`; not its depth."""
+def _rotate_and_scale(capture: Capture, R_NW: RotationMatrix, scale: float = 1.0) -> Capture:
+    """Returns the capture in a world N, rotated and with lengths times `scale`, but its depth."""
     points, axes = capture.points, capture.axes
     return dataclasses.replace(
         capture,
@@ -138,29 +141,23 @@ def turn_and_scale(capture: Capture, R_NW: RotationMatrix, scale: float = 1.0) -
     )
 
 
-def known_points(capture: Capture) -> NDArray[np.float64]:
-    """Returns points (N, 3) of the place: those known or, without them, of up to 20 depth images.
-
-    Raises:
-        ValueError: if there are neither.
-    """
+def _known_points(capture: Capture) -> NDArray[np.float64]:
+    """Returns points (N, 3) of the scene: the capture's or, without them, of 20 depth images."""
     if capture.points is not None:
         return capture.points.p_WQ
     parts = []
     for i in np.unique(np.linspace(0, len(capture) - 1, 20).astype(int)).tolist():
-        depth = capture.registered_depth(i)[::16, ::16]
-        rows, columns = np.nonzero((depth > 0) & np.isfinite(depth))
-        p_CQ = back_project(capture.K, 16 * columns + 0.5, 16 * rows + 0.5, depth[rows, columns])
+        p_CQ, _, _ = depth_points(capture.K, capture.registered_depth(i), step=16)
         parts.append(capture.X_WCs[i].multiply(p_CQ.T).T)
     if not sum(len(part) for part in parts):
         raise ValueError(
-            f"{capture.source}: neither points nor depth are known, so no ground can be found; set "
-            "capture.up or capture.scale in another way"
+            f"{capture.source}: has neither points nor depth to find the ground; set capture.up or "
+            "capture.scale in another way"
         )
     return np.concatenate(parts)
 
 
-def _turn_to_z(up: NDArray[np.float64]) -> RotationMatrix:
+def _rotation_to_z(up: NDArray[np.float64]) -> RotationMatrix:
     """Returns the smallest rotation that takes the unit vector `up` to z."""
     z = np.array([0.0, 0.0, 1.0])
     if up @ z < -1 + 1e-12:
@@ -170,46 +167,35 @@ def _turn_to_z(up: NDArray[np.float64]) -> RotationMatrix:
     return RotationMatrix.ProjectToRotationMatrix(np.eye(3) + V + V @ V / (1 + up @ z))
 
 
-_FEWEST = 20
-"""Points whose depth must be known for a scale."""
-_MAX_SCALE_TILT = 10.0
-"""[deg] of a ground against what level cameras call level."""
-_MAX_SPREAD = 0.25
-"""Of the cameras' heights over a ground, 10 to 90 %, relative to their median."""
-
-
 def make_metric(
     capture: Capture,
     scale: ScaleConfig,
     locate: Callable[[str, NDArray[np.float64]], NDArray[np.float64]] | None = None,
 ) -> Capture:
-    """Gives a capture in unknown units its scale, or marks it as not metric if `scale` has none.
+    """Scales a capture in unknown units to meters, or marks it as not metric without a scale.
 
     Args:
-        capture: its depth, if any, is in metres already; its poses and points are not.
-        scale: where metres come from.
+        capture: its depth, if any, is in meters already; its poses and points are not.
+        scale: the source of the scale.
         locate: returns the point (3,) that is seen in the image of a name at a pixel (2,), or
             raises ValueError; None if pixels cannot be located.
-
-    Raises:
-        ValueError: if the scale cannot be had in the way that is asked for.
     """
-    given = scale.given()
-    if not given:
+    sources = scale.sources()
+    if not sources:
         return dataclasses.replace(capture, metric=False)
     if scale.factor:
         factor = scale.factor
     elif scale.distance:
         a, b = (_locate(capture, each, locate) for each in scale.between)
         if (length := float(np.linalg.norm(a - b))) < 1e-9:
-            raise ValueError(f"scale.between: {' and '.join(scale.between)} are the same place")
+            raise ValueError(f"scale.between: {' and '.join(scale.between)} are the same point")
         factor = scale.distance / length
     elif scale.camera_height:
         factor = scale.camera_height / camera_height(capture)
     else:
         factor = _factor_from_depth(capture)
-    source = f"{capture.source}, scale {factor:.6g} from {given[0]}"
-    return dataclasses.replace(turn_and_scale(capture, RotationMatrix(), factor), source=source)
+    source = f"{capture.source}, scale {factor:.6g} from {sources[0]}"
+    return dataclasses.replace(_rotate_and_scale(capture, RotationMatrix(), factor), source=source)
 
 
 def _locate(
@@ -217,7 +203,7 @@ def _locate(
     what: str,
     locate: Callable[[str, NDArray[np.float64]], NDArray[np.float64]] | None,
 ) -> NDArray[np.float64]:
-    """Returns the camera ("a.jpg") or the point ("a.jpg@812,344") that is meant, (3,)."""
+    """Returns the position (3,) of a camera ("a.jpg") or of a point ("a.jpg@812,344")."""
     name, at, pixel = what.partition("@")
     names, parts = list(capture.frame_names), PurePath(name).parts
     found = [i for i, each in enumerate(names) if PurePath(each).parts == parts] or [
@@ -230,7 +216,7 @@ def _locate(
     if not at:
         return capture.X_WCs[found[0]].translation()
     if locate is None:
-        raise ValueError(f"scale.between: {what!r}: this kind of capture knows only cameras")
+        raise ValueError(f"scale.between: {what!r}: this capture format knows only cameras")
     try:
         u, v = (float(x) for x in pixel.split(","))
     except ValueError:
@@ -242,21 +228,19 @@ def camera_height(capture: Capture) -> float:
     """Returns the median height of the cameras above the ground, in the capture's units.
 
     Raises:
-        ValueError: if no ground can be found, see `fit_ground` and `known_points`; or if it is
-            none that the cameras were carried over at one height, each about level.
+        ValueError: if no ground is found above which the cameras were carried level at one height.
     """
     cameras = np.array([X_WC.translation() for X_WC in capture.X_WCs])
-    up = up_of_cameras(list(capture.X_WCs))
-    n, d = fit_ground(known_points(capture), cameras, up)
+    up = up_of_cameras(capture.X_WCs)
+    n, d = fit_ground(_known_points(capture), cameras, up)
     tilt = float(np.rad2deg(np.arccos(min(n @ up, 1.0))))
     low, median, high = np.quantile(cameras @ n - d, [0.1, 0.5, 0.9])
     if tilt > _MAX_SCALE_TILT or not high - low < _MAX_SPREAD * median:
         raise ValueError(
-            f"{capture.source}: what looks most like ground tilts by {tilt:.0f} degrees against "
-            f"the cameras (at most {_MAX_SCALE_TILT:g} are believed), which are {low:.3g} to "
-            f"{high:.3g} units above it, {median:.3g} in the middle (at most {_MAX_SPREAD:.0%} of "
-            "it apart); "
-            "a height gives no scale; measure a length: scale.between and scale.distance"
+            f"{capture.source}: the most likely ground tilts by {tilt:.0f} degrees against the "
+            f"cameras (at most {_MAX_SCALE_TILT:g}), which are {low:.3g} to {high:.3g} units above "
+            f"it, {median:.3g} in the middle (at most {_MAX_SPREAD:.0%} of it apart); give a "
+            "length instead: scale.between and scale.distance"
         )
     return float(median)
 
@@ -264,36 +248,30 @@ def camera_height(capture: Capture) -> float:
 def _factor_from_depth(capture: Capture) -> float:
     """Returns the median ratio of measured depth to that of the points, over all images with depth.
 
-    A point that is hidden in an image has a ratio too small; the median bears that while fewer
-    than half are.
+    A point that is hidden in an image has a ratio too small; the median bears fewer than half.
     """
-    ratios = []
-    points = capture.points
-    for i in range(len(capture) if points is not None and capture.has_depth else 0):
-        depth = capture.registered_depth(i)
-        x, y, z = capture.X_WCs[i].inverse().multiply(points.p_WQ.T)  # pyright: ignore
-        with np.errstate(divide="ignore", invalid="ignore"):
-            u = capture.K[0, 0] * x / z + capture.K[0, 2]
-            v = capture.K[1, 1] * y / z + capture.K[1, 2]
-        seen = (z > 0) & (u >= 0) & (u < capture.width) & (v >= 0) & (v < capture.height)
-        measured = depth[v[seen].astype(int), u[seen].astype(int)]
+    ratios = [np.zeros(0)]
+    points = capture.points.p_WQ if capture.points is not None else np.zeros((0, 3))
+    for i in range(len(capture) if capture.has_depth and len(points) else 0):
+        p_CQ = capture.X_WCs[i].inverse().multiply(points.T).T
+        inside, rows, columns = project_points(capture.K, p_CQ, capture.width, capture.height)
+        measured = capture.registered_depth(i)[rows, columns]
         known = (measured > 0) & np.isfinite(measured)
-        ratios.append(measured[known] / z[seen][known])
-    ratio = np.concatenate(ratios) if ratios else np.zeros(0)
-    if len(ratio) < _FEWEST:
+        ratios.append(measured[known] / p_CQ[inside, 2][known])
+    ratio = np.concatenate(ratios)
+    if len(ratio) < _MIN_POINTS:
         raise ValueError(
-            f"scale.depth_folder: {len(ratio)} points have a measured depth, at least {_FEWEST} "
-            "are needed; is there a depth file for each of some images, of its name and in its "
-            "subfolder?"
+            f"scale.depth_folder: {len(ratio)} points have a measured depth, at least "
+            f"{_MIN_POINTS} must; depth files must have the names and subfolders of their images"
         )
     return float(np.median(ratio))
 
 
 def move_origin(capture: Capture, origin: Sequence[float]) -> Capture:
-    """Returns the capture in a world whose origin is at `origin` (3,) of that which it has.
+    """Returns the capture in a world whose origin is at `origin` (3,) of its present one.
 
-    Gaussians are in single precision, in which a step is 0.06 m at 800 km. Empty, `origin` is where
-    the cameras are if they are far away, and 0 otherwise.
+    Gaussians are in single precision, in which a step is 0.06 m at 800 km. If `origin` is empty, it
+    is the middle of the cameras if they are far away, else 0.
     """
     p_WCs = np.array([X_WC.translation() for X_WC in capture.X_WCs])
     p = np.array(origin, dtype=np.float64) if origin else choose_origin(p_WCs)

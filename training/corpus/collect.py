@@ -1,4 +1,4 @@
-"""Gathering a corpus, in any number of worlds side by side."""
+"""Collects a corpus in any number of worlds in parallel."""
 
 import shutil
 from collections.abc import Iterable
@@ -20,7 +20,7 @@ from splatpilot.systems.common.files import claim_folder, holds_folder, require_
 from splatpilot.systems.common.processes import available_cores, map_processes
 from splatpilot.systems.common.progress import Progress, resumable, say
 from splatpilot.systems.common.provenance import InfeasibleFlightError, revision
-from splatpilot.systems.common.validation import require
+from splatpilot.systems.common.validation import FieldError, require
 from splatpilot.systems.splats.splat_camera import color_pixels, ranged_depth
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 from splatpilot.systems.vehicle.state import QuadrotorState, pose_from_state
@@ -60,8 +60,7 @@ class Demonstration(NamedTuple):
 
 
 def keep_clear(labels: Iterable[Label], field: Esdf) -> list[Demonstration]:
-    """The labels less the trajectories that touch something: those that do not stand first, and
-    states without any are left out."""
+    """Drops trajectories that touch something, and states that have no others."""
     kept = []
     for state, plan in labels:
         waypoints_W = plan.waypoints_W
@@ -120,15 +119,13 @@ def see_states(
     return samples
 
 
-# States that no good flight comes to: anywhere in free space, half of them before a surface.
-#
-# An expert keeps clear of everything, so what it sees is never near and straight ahead; whoever
-# learns to judge distances from its flights alone does not know what is. Nor does it ever stand a
-# few metres from its goal; whoever learns from its flights alone stops there, and stays.
+# States off the expert's paths: anywhere in free space, half of them before a surface. An expert
+# keeps clear of everything, so no image of its flights shows an obstacle near and straight ahead.
+# Nor does it stop near its goal; students of its flights alone do, and stay.
 
 
 STATES_A_LOOK = 60
-"""Whoever changes the look of the world does so after so many."""
+"""Number of states with the same appearance of the world."""
 
 _CLEARANCE = 0.05  # [m], least clearance
 _BEFORE = 1.0  # [m], greatest clearance before a surface
@@ -145,20 +142,20 @@ def draw_off_path(
     labeller: Labeller, count: int, speed: float, rng: np.random.Generator
 ) -> np.ndarray:
     """
-    States (count, 13) from which a way leads to the goal.
+    Draws states (count, 13) from which a path leads to the goal.
 
-    Half are within a metre of a surface that is not the ground's and look at it, if there are so
-    many among candidates. Of the others half are within 4 m of the goal, as many at any distance,
-    and look anywhere; half are uniform in space and look along the way. All deviate from that, and
-    fly where they look, at up to `speed` [m/s] and no faster than they can stop.
+    Half are within a meter of a surface other than the ground and look at it.
+    Of the others half are within 4 m of the goal, uniform in distance, and look anywhere; half are
+    uniform in space and look along the path. All deviate from that, and fly where they look, at up
+    to `speed` [m/s] and no faster than they can stop.
 
     Raises:
-        InfeasibleFlightError: if no place has room.
+        InfeasibleFlightError: if there is no free position.
     """
     field, toa = labeller.field, labeller.toa
     cells = np.argwhere(toa.reachable & (field.distances > VEHICLE_RADIUS + _CLEARANCE))
     if len(cells) == 0:
-        raise InfeasibleFlightError("no place from which a way leads to the goal has room")
+        raise InfeasibleFlightError("no position from which a path leads to the goal is free")
     centers = field.lower_W + field.voxel_size * (cells + 0.5)
     candidates = centers[rng.integers(len(centers), size=_CANDIDATES * count)]
     to_goal = np.linalg.norm(centers - toa.p_WG, axis=1)
@@ -196,12 +193,12 @@ def draw_off_path(
     )
 
 
-_ROOM = 0.3  # [m], clearance of a start that is drawn
+_START_CLEARANCE = 0.3  # [m]
 
 
-def gather_world(folder: Path, config: CorpusConfig, index: int, revision: str) -> None:
+def collect_world(folder: Path, config: CorpusConfig, index: int, revision: str) -> None:
     """
-    Gathers the world `index` of the library into a corpus: its record, then its shard.
+    Collects the world `index` of the library: its record, then its shards.
 
     Args:
         folder: of the corpus.
@@ -217,7 +214,7 @@ def gather_world(folder: Path, config: CorpusConfig, index: int, revision: str) 
     world = make_world(source.world, source.seed)
     labeller = Labeller(world.esdf, world.p_WG, config.expert)
     record_world(folder / "worlds" / source.name, source, world.esdf)
-    _gather_off_path(folder, config, source, world, labeller, revision)
+    _collect_off_path(folder, config, source, world, labeller, revision)
     rngs = [np.random.default_rng([config.seed, source.seed, k]) for k in range(config.flights)]
     starts = np.stack([world.p_WS, *(_draw_start(labeller, world.p_WS, rng) for rng in rngs[1:])])
     parts, entries = [], []
@@ -252,11 +249,11 @@ def gather_world(folder: Path, config: CorpusConfig, index: int, revision: str) 
 
 
 def shard_folder(folder: Path, world: str, source: int = EXPERT) -> Path:
-    """Where what is seen in a world is kept: on the expert's flights, or off its path."""
+    """Names the folder of a world's samples of a source."""
     return folder / "shards" / f"{SOURCES[source]}-{world}"
 
 
-def _gather_off_path(
+def _collect_off_path(
     folder: Path,
     config: CorpusConfig,
     source: WorldSource,
@@ -264,7 +261,7 @@ def _gather_off_path(
     labeller: Labeller,
     revision: str,
 ) -> None:
-    """Writes the shard of states that lie on no flight, if any are asked for."""
+    """Writes the shard of states off the expert's paths, if the corpus has any."""
     if not config.off_path:
         return
     alone = replace(config, perturbation=replace(config.perturbation, copies=0))
@@ -291,7 +288,7 @@ def _gather_off_path(
 def _fly(
     starts: np.ndarray, world: World, config: CorpusConfig, labeller: Labeller
 ) -> Iterable[ExpertFlight]:
-    """The expert's flights from each of the starts (N, 3) [m] to the goal of the world."""
+    """Flies the expert from each of the starts (N, 3) [m] to the goal of the world."""
     if config.expert.policy == PLANNER:
         return fly_planner(starts, world, config.expert, labeller)
     scenarios = (Scenario(start=start, start_radius=0.0) for start in starts.tolist())
@@ -299,27 +296,27 @@ def _fly(
 
 
 def _draw_start(labeller: Labeller, p_WS: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """A free place (3,) [m] with room, at least half as far from the goal as p_WS (3,) [m]."""
+    """Draws a free position (3,) [m], at least half as far from the goal as p_WS (3,) [m]."""
     field, toa = labeller.field, labeller.toa
-    roomy = toa.reachable & (field.distances > VEHICLE_RADIUS + _ROOM)
+    roomy = toa.reachable & (field.distances > VEHICLE_RADIUS + _START_CLEARANCE)
     cells = np.argwhere(roomy & (toa.times > 0.5 * toa.value(p_WS)))
     if len(cells) == 0:
-        raise InfeasibleFlightError("no place half as far from the goal as the start has room")
+        raise InfeasibleFlightError("no position half as far from the goal as the start is free")
     return field.lower_W + field.voxel_size * (cells[rng.integers(len(cells))] + 0.5)
 
 
 @holds_folder("out")
 def run(*, config: CorpusConfig, out: Path, worlds: int, jobs: int | None = None) -> Corpus:
     """
-    Gathers what a corpus in `out` lacks of its first `worlds` worlds.
+    Collects the first `worlds` worlds of a corpus in `out`, except those that it has already.
 
-    Interrupted, even by `kill -9`, the same command goes on and leaves the same bytes. With more
-    worlds it adds to what is there. A shard that is damaged is gathered again.
+    An interrupted run is resumed by the same call, with bitwise identical results. Damaged shards
+    are collected again.
 
     Args:
-        config: how; it decides every sample.
+        config: configuration, which determines every sample.
         out: folder; see `splatpilot.training.corpus.corpus`.
-        worlds: in how many worlds.
+        worlds: number of worlds.
         jobs: worker processes; one for each core by default.
 
     Returns:
@@ -327,10 +324,13 @@ def run(*, config: CorpusConfig, out: Path, worlds: int, jobs: int | None = None
 
     Raises:
         FileNotFoundError, ValueError: on a config out of range, another corpus in `out`, a shard
-            of another version, or if nothing was gathered.
+            of another version, or if nothing was collected.
         OSError: if `out` cannot be written, or a worker process dies.
     """
-    config.validate()
+    try:
+        config.validate()
+    except FieldError as error:
+        raise error.within(config) from None
     jobs = available_cores() if jobs is None else jobs
     require(jobs >= 1, "--jobs", "at least 1", jobs)
     require(worlds >= 1, "--worlds", "at least 1", worlds)
@@ -338,10 +338,10 @@ def run(*, config: CorpusConfig, out: Path, worlds: int, jobs: int | None = None
     claim_folder(out / CONFIG, config)
     for part in ("worlds", "shards"):
         require_writable_folder(out / part)
-    there = [k for k in range(worlds) if shard_folder(out, sources[k].name).exists()]
-    checked = Progress(there, "checking worlds", unit="world", leave=False, delay=1.0)
+    present = [k for k in range(worlds) if shard_folder(out, sources[k].name).exists()]
+    checked = Progress(present, "checking worlds", unit="world", leave=False, delay=1.0)
     damage = {k: reason for k in checked if (reason := _damage(out, sources[k], config))}
-    missing = sorted(set(range(worlds)) - set(there) | set(damage))
+    missing = sorted(set(range(worlds)) - set(present) | set(damage))
     program = revision()
     if missing:
         _require_same_program(out, program)
@@ -349,14 +349,14 @@ def run(*, config: CorpusConfig, out: Path, worlds: int, jobs: int | None = None
         if k in damage:
             say(f"{damage[k]}: {sources[k].name} is collected again")
         _remove(out, sources[k].name)
-    gather = partial(_gather, out, config, program)
+    collect = partial(_collect, out, config, program)
     bar = Progress(total=worlds, initial=worlds - len(missing), desc="collecting", unit="world")
 
     def kept() -> str:
         return f"{bar.n} of {worlds} worlds are in {out}; the same command resumes there"
 
     with bar, resumable(kept):
-        for reason in map_processes(gather, missing, jobs):
+        for reason in map_processes(collect, missing, jobs):
             if reason:
                 say(reason)
             bar.update()
@@ -366,10 +366,10 @@ def run(*, config: CorpusConfig, out: Path, worlds: int, jobs: int | None = None
 
 
 def _damage(out: Path, source: WorldSource, config: CorpusConfig) -> str:
-    """Tells what is wrong with a world of which there is a shard; empty if nothing is.
+    """Describes the damage of a collected world; empty if there is none.
 
     Raises:
-        ValueError: if it is of another version, or was made of another definition.
+        ValueError: if it is of another version or definition.
     """
     try:
         record = WorldRecord(out / "worlds" / source.name)
@@ -405,16 +405,16 @@ def _require_same_program(out: Path, program: str) -> None:
 
 
 def _remove(out: Path, world: str) -> None:
-    """Removes what an interruption or damage has left of a world."""
+    """Removes the incomplete or damaged folders of a world."""
     shutil.rmtree(out / "worlds" / world, ignore_errors=True)
     for source in (OFF_PATH, EXPERT):
         shutil.rmtree(shard_folder(out, world, source), ignore_errors=True)
 
 
-def _gather(out: Path, config: CorpusConfig, revision: str, index: int) -> str:
-    """Gathers a world; returns why not, if it cannot be flown in."""
+def _collect(out: Path, config: CorpusConfig, revision: str, index: int) -> str:
+    """Collects a world; returns the reason if it is infeasible."""
     try:
-        gather_world(out, config, index, revision)
+        collect_world(out, config, index, revision)
     except InfeasibleFlightError as error:
         return f"world {index} is left out: {error}"
     return ""

@@ -1,9 +1,9 @@
-"""A corpus: samples to learn from, in shards, and the worlds that they come from.
+"""A corpus: samples to learn from, in shards, and their worlds.
 
-corpus.yaml      how it is gathered, every field
+corpus.yaml      every field of its configuration
 worlds/NAME/     a world: `world.yaml`, `esdf.npz`
 shards/NAME/     samples of one world, see `splatpilot.training.corpus.samples`
-ledger.csv       where everything comes from, a row for each flight
+ledger.csv       sources of all samples, a row for each flight
 """
 
 import csv
@@ -24,6 +24,7 @@ from splatpilot.systems.common.files import (
     written_atomically,
 )
 from splatpilot.systems.common.seeds import first_training_seed
+from splatpilot.systems.common.validation import Config, bounded
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.training.corpus.expert import ExpertConfig
 from splatpilot.training.corpus.library import LibraryConfig, PerturbationConfig, WorldRecord
@@ -31,8 +32,8 @@ from splatpilot.training.corpus.samples import OFF_PATH, SOURCES, Samples, Sampl
 
 
 @dataclass
-class CorpusConfig:
-    """Everything that decides what is gathered, but in how many worlds."""
+class CorpusConfig(Config):
+    """Everything that determines a corpus, except its number of worlds."""
 
     # Seed of everything random, 0 to 999.
     seed: int = 0
@@ -40,37 +41,22 @@ class CorpusConfig:
     expert: ExpertConfig = field(default_factory=ExpertConfig)
     # [-] Flights of the expert in each world, all to its goal: the first from its start, the others
     # from anywhere at least half as far away.
-    flights: int = 16
-    # [-] States in each world that lie on no flight: anywhere in free space, half of them before a
+    flights: int = bounded(16, "[1, 1000]")
+    # [-] States in each world off the expert's paths: anywhere in free space, half of them before a
     # surface; see `training/corpus/collect.py`.
-    off_path: int = 0
-    # What the student will see through.
+    off_path: int = bounded(0, "[0, 100000]")
+    # Camera of the samples.
     camera: OnboardCamera = field(default_factory=lambda: OnboardCamera(width=160, height=120))
     perturbation: PerturbationConfig = field(default_factory=PerturbationConfig)
-    # [-] How much the look of a world changes from flight to flight: 0 not at all, 1 all it may.
-    appearance: float = 1.0
+    # [-] How much the appearance of a world changes from flight to flight.
+    appearance: float = bounded(1.0, "[0, 1]")
 
-    def validate(self) -> None:
-        """
-        Raises:
-            FileNotFoundError: for a scene that is not there.
-            ValueError: on a value out of range, naming it, its limit and the remedy.
-        """
+    def check(self) -> None:
         first_training_seed(self.seed)
-        self.worlds.validate()
-        self.expert.validate()
-        if not 1 <= self.flights <= 1000:
-            raise ValueError(f"flights is {self.flights}; it must be 1 to 1000")
-        if not 0 <= self.off_path <= 100_000:
-            raise ValueError(f"off_path is {self.off_path}; it must be 0 to 100000")
-        self.camera.validate()
-        self.perturbation.validate()
-        if not 0.0 <= self.appearance <= 1.0:
-            raise ValueError(f"appearance is {self.appearance}; it must be 0 to 1")
 
     @property
     def size(self) -> SampleSize:
-        """Of the samples."""
+        """Size of the samples."""
         return SampleSize(self.camera.height, self.camera.width, self.expert.num_hypotheses)
 
 
@@ -81,7 +67,7 @@ LEDGER = "ledger.csv"
 class Corpus:
     """The samples of a folder, numbered through its shards in order of their names.
 
-    Images are mapped into memory: what is not asked for is not read.
+    Images are mapped into memory and read when they are used.
 
     Raises:
         FileNotFoundError: if there is no corpus.
@@ -151,7 +137,7 @@ class Corpus:
                 )
 
     def samples(self, indices: np.ndarray) -> Samples:
-        """Copies of the samples of `indices` (N,), in their order.
+        """Copies samples (N,), in the order of `indices`.
 
         Raises:
             IndexError: if one is not from 0 to less than the length.
@@ -171,7 +157,7 @@ class Corpus:
 
 
 def entries(folder: Path) -> list[Path]:
-    """The folders in a folder by name, without those that are only being written."""
+    """Lists the folders in a folder by name, without those that are being written."""
     return sorted(path for path in folder.iterdir() if not path.name.startswith("."))
 
 
@@ -193,9 +179,10 @@ def distinct_worlds(corpora: Sequence[Corpus]) -> dict[str, WorldRecord]:
 
 
 def distinct_shards(corpora: Sequence[Corpus]) -> list[list[Shard]]:
-    """The shards of each corpus that none before it has: those of two students' recovery link to
-    what both began with. The same are two with one name and all that they state, checksums of every
-    file among it."""
+    """Lists the shards of each corpus that none before it has.
+
+    Two are the same if their names and their descriptions, with checksums of all files, are.
+    """
     seen: set[tuple[str, bytes]] = set()
     kept: list[list[Shard]] = []
     for corpus in corpora:
@@ -209,7 +196,7 @@ def distinct_shards(corpora: Sequence[Corpus]) -> list[list[Shard]]:
 
 
 def write_ledger(folder: Path, corpus: Corpus) -> None:
-    """Writes `ledger.csv` anew, from what the shards say.
+    """Writes `ledger.csv` from the descriptions of the shards.
 
     Raises:
         OSError: if it cannot be written.
@@ -230,25 +217,24 @@ def write_ledger(folder: Path, corpus: Corpus) -> None:
         table.writerows(rows)
 
 
-_PARTS = ("worlds", "world.yaml"), ("shards", "shard.json")  # and what tells one from others
+_PARTS = ("worlds", "world.yaml"), ("shards", "shard.json")  # folders and their descriptions
 
 
 def link_corpus(source: Path, folder: Path) -> None:
-    """Makes `folder` a corpus of what `source` has, and of what was added to it; what `folder`
-    lacks of the former is brought there again.
+    """Links the content of the corpus `source` that is missing in `folder`.
 
     Raises:
-        ValueError: if it holds others of the same name: what `source` has was gathered anew.
+        ValueError: if `folder` has other content of the same name.
         OSError: if it cannot be written.
     """
     for kind, about in _PARTS:
-        for there in entries(source / kind):
-            target = folder / kind / there.name
+        for entry in entries(source / kind):
+            target = folder / kind / entry.name
             if not target.exists():
-                _link_folder(there, target)
-            elif (target / about).read_bytes() != (there / about).read_bytes():
+                _link_folder(entry, target)
+            elif (target / about).read_bytes() != (entry / about).read_bytes():
                 raise ValueError(
-                    f"{there} is another than when {target} was made of it; choose another --out"
+                    f"{entry} is another than when {target} was made of it; choose another --out"
                 )
     if not (folder / CONFIG).exists():
         _link(source / CONFIG, folder / CONFIG)

@@ -1,4 +1,4 @@
-"""The expert to imitate: who flies, and what the best ways are from any state."""
+"""The expert to imitate: its flights, and the best trajectories from any state."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -14,14 +14,14 @@ from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.common.provenance import InfeasibleFlightError
+from splatpilot.systems.common.validation import Config, bounded
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS, WAYPOINT_PERIOD, Hypotheses
 from splatpilot.systems.policies.lattice import LatticeConfig, TrajectoryLattice
 from splatpilot.systems.policies.planner import plan
 from splatpilot.systems.policies.time_of_arrival import time_of_arrival
 from splatpilot.systems.vehicle.flatness import (
     FlatnessControllerConfig,
-    flatness_commands,
-    lengths,
+    flatness_command,
     reaching_acceleration,
 )
 from splatpilot.systems.vehicle.quadrotor import (
@@ -30,7 +30,7 @@ from splatpilot.systems.vehicle.quadrotor import (
     hover_state,
     rk4_step,
 )
-from splatpilot.systems.vehicle.state import QuadrotorState
+from splatpilot.systems.vehicle.state import QuadrotorState, lengths
 
 PLANNER = "planner"
 
@@ -45,27 +45,22 @@ class Label(NamedTuple):
 
 
 @dataclass
-class ExpertConfig:
-    """Who flies, how fast, and how often is asked."""
+class ExpertConfig(Config):
+    """The expert's policy, speed and labels."""
 
-    # `planner`, which knows the way, or a policy of the benchmark that flies by depth, or a file of
+    # `planner`, which knows the world, a policy of the benchmark that flies by depth, or a file of
     # weights.
     policy: str = PLANNER
     # [m/s] Nominal speed of the expert.
     speed: float = 2.0
-    # [s] Between two labelled states; when the planner flies, also between two of its plans.
-    period: float = 0.4
-    # [-] Trajectories a state is labelled with, K.
+    # [s] Time between labeled states, and between plans of a planner that flies. Plans last 1 s, of
+    # which the controller looks 0.4 s ahead.
+    period: float = bounded(0.4, f"[0.02, {_LONGEST:g}] s")
+    # [-] Trajectories of each label, K.
     num_hypotheses: int = 3
 
-    def validate(self) -> None:
-        """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
+    def check(self) -> None:
         policy_named(self.policy, self.speed)
-        if not 0.02 <= self.period <= _LONGEST:
-            raise ValueError(
-                f"expert.period is {self.period} s; it must be 0.02 to {_LONGEST:g}, as plans last "
-                "1 s and the controller looks 0.4 s ahead"
-            )
         self.lattice().validate()
 
     def lattice(self) -> LatticeConfig:
@@ -191,7 +186,7 @@ def fly_planner(
             p_WR = _along(ways, step * dt + control.lookahead)
             a_WB = reaching_acceleration(p_WR, p_WB, v_WB, control.lookahead)
             heading = np.arctan2(p_WR[:, 1] - p_WB[:, 1], p_WR[:, 0] - p_WB[:, 0])
-            command = flatness_commands(states, a_WB, control, params, heading)
+            command = flatness_command(states, a_WB, v_WB, heading, control, params)
             states = rk4_step(states, command, params, dt)
             p_WB = QuadrotorState.of(states).p_WB
             for n, p in zip(flying, p_WB, strict=True):

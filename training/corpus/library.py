@@ -1,6 +1,6 @@
 """The worlds that a corpus is gathered in: generated ones, and scenes with obstacles put in."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from math import inf
@@ -27,6 +27,7 @@ from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.common.config import dump_config, load_config, open_field
 from splatpilot.systems.common.files import folder_written_atomically
 from splatpilot.systems.common.seeds import SEEDS_PER_RUN, VALIDATION_SEEDS, first_training_seed
+from splatpilot.systems.common.validation import Config, bounded
 
 _ABOUT, _ESDF = "world.yaml", "esdf.npz"
 
@@ -137,14 +138,16 @@ def world_of(kind: str) -> WorldConfig:
     return load_config(Scenario(), scenario_file(kind)).world
 
 
-def check_generated(kind: str) -> None:
-    """Raises ValueError unless the world of a scenario is generated; FileNotFoundError, ValueError
-    if there is no such scenario."""
-    if not is_procedural(world_of(kind)):
-        raise ValueError(
-            f"worlds.kinds has {kind}, whose world is not generated; choose kinds from "
-            f"{', '.join(PROCEDURAL)} and files, and put captured places into worlds.scenes"
-        )
+def check_library(kinds: Sequence[str], scenes: Sequence[str]) -> None:
+    """Checks that there are kinds or scenes, and that the worlds of the kinds are generated."""
+    if not kinds and not scenes:
+        raise ValueError("worlds must have kinds or scenes, got neither")
+    for kind in kinds:
+        if not is_procedural(world_of(kind)):
+            raise ValueError(
+                f"worlds.kinds must be of generated worlds, got {kind}; choose from "
+                f"{', '.join(PROCEDURAL)} and files, and put captured scenes into worlds.scenes"
+            )
 
 
 def place_to_learn_in(scene: str, split: str = "train") -> Path:
@@ -205,8 +208,8 @@ def require_untested(digests: Collection[str], what: str) -> None:
 
 
 @dataclass
-class LibraryConfig:
-    """Which worlds; a corpus is gathered in so many of them, in turn."""
+class LibraryConfig(Config):
+    """Worlds of a corpus, which take turns."""
 
     # Scenarios whose worlds are generated, the benchmark's or files; naming one twice doubles its
     # part.
@@ -217,16 +220,8 @@ class LibraryConfig:
     # Whether the seeds are those of validation instead of training.
     held_out: bool = False
 
-    def validate(self) -> None:
-        """
-        Raises:
-            FileNotFoundError: for a scene that is not there.
-            ValueError: on a value out of range, naming it, its limit and the remedy.
-        """
-        if not self.kinds and not self.scenes:
-            raise ValueError("worlds has neither kinds nor scenes; name some")
-        for kind in self.kinds:
-            check_generated(kind)
+    def check(self) -> None:
+        check_library(self.kinds, self.scenes)
         for scene in self.scenes:
             _measured_scene(self, scene)
 
@@ -277,27 +272,17 @@ def _measured_scene(library: LibraryConfig, scene: str) -> tuple[float, list[str
 
 
 @dataclass
-class PerturbationConfig:
-    """How far, at most."""
+class PerturbationConfig(Config):
+    """Maximum perturbations of poses."""
 
-    # [-] Perturbed poses that each labelled state is rendered from, beside its own.
-    copies: int = 1
-    # [m] Displacement, in worlds whose fidelity bound is no less.
-    distance: float = 0.3
-    # [rad] Turn about the vertical.
-    yaw: float = 0.2
-    # [rad] Turn about each of the other axes.
-    tilt: float = 0.1
-
-    def validate(self) -> None:
-        """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
-        if not 0 <= self.copies <= 100:
-            raise ValueError(f"perturbation.copies is {self.copies}; it must be 0 to 100")
-        for name, limit in (("distance", 5.0), ("yaw", np.pi), ("tilt", 1.0)):
-            if not 0.0 <= getattr(self, name) <= limit:
-                raise ValueError(
-                    f"perturbation.{name} is {getattr(self, name)}; it must be 0 to {limit:.4g}"
-                )
+    # [-] Number of perturbed poses of each labeled state, besides its own.
+    copies: int = bounded(1, "[0, 100]")
+    # [m] Displacement, at most the world's fidelity bound.
+    distance: float = bounded(0.3, "[0, 5] m")
+    # [rad] Rotation about the vertical.
+    yaw: float = bounded(0.2, "[0, 3.1416] rad")
+    # [rad] Rotation about each of the other axes.
+    tilt: float = bounded(0.1, "[0, 1] rad")
 
 
 def perturbed(

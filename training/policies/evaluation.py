@@ -1,73 +1,78 @@
-"""Flights of a policy through worlds, many at once: how well it does."""
+"""Evaluation: flights of a policy in many worlds at once."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
+from splatpilot.systems.common.seeds import first_training_seed
+from splatpilot.systems.common.validation import Config, bounded, require_field
 from splatpilot.systems.sensing.noise import ObservationNoise
 from splatpilot.systems.vehicle.flatness import FlatnessControllerConfig
-from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
+from splatpilot.training.policies.augmentation import noisy_depth
 from splatpilot.training.policies.ray_casting import Geometry, PixelRays
-from splatpilot.training.policies.torch_observations import Observation, noisy_depth
-from splatpilot.training.policies.training_worlds import WorldBatch
+from splatpilot.training.policies.trainer import Trainer, TrainingConfig
+from splatpilot.training.policies.training_worlds import (
+    WorldBatch,
+    WorldSelection,
+    training_worlds,
+    validation_worlds,
+)
 from splatpilot.training.policies.vehicles import (
     BodyRate,
-    Frames,
+    History,
+    Observation,
     PointMass,
     Vehicle,
-    delayed,
-    draw_frames,
-    frame_ages,
-    remember,
-    remembered,
+    take_rows,
 )
 
 CAMERA_AHEAD = 0.1
-"""[m], of the camera before the vehicle's centre, along body x."""
+"""Offset [m] of the camera from the vehicle's center along body x."""
 
 
 class Agent(Protocol):
-    """What observes through a camera and decides, for N vehicles at once."""
+    """A policy that flies N vehicles at once by a camera."""
 
     rate: float  # [Hz]
     rays: PixelRays
 
     def initial_memory(self, count: int) -> Tensor:
-        """What N vehicles remember at first, (N, ...)."""
+        """Returns the hidden states (N, ...) of N vehicles at their start."""
         ...
 
     def decide(self, seen: Observation, memory: Tensor) -> tuple[Tensor, Tensor | None, Tensor]:
-        """Accelerations (N, 3) [m/s^2] in W, headings (N,) [rad] or None, and the memory after."""
+        """Computes accelerations (N, 3) [m/s^2] in W, headings (N,) [rad] or None, and the next
+        hidden states."""
         ...
 
 
 @torch.no_grad()
 def render_depth(vehicle: Vehicle, geometry: Geometry, rays: PixelRays, world: Tensor) -> Tensor:
-    """Depth (N, R) [m] from the vehicles' cameras, each in its `world` (N,)."""
+    """Renders depth (N, R) [m] from the vehicles' cameras, each in its `world` (N,)."""
     x, y, z = vehicle.attitude().unbind(2)
     R_WC = torch.stack([-y, -z, x], 2)
     return geometry.depth(vehicle.p + CAMERA_AHEAD * x, R_WC, rays, world)
 
 
 class Outcomes(NamedTuple):
-    """How N flights went."""
+    """Outcomes of N flights."""
 
     reached: Tensor  # (N,) bool
     collided: Tensor  # (N,) bool
     left: Tensor  # (N,) bool, the volume
     least_clearance: Tensor  # (N,) [m]
     mean_speed: Tensor  # (N,) [m/s]
-    wanted_speed: Tensor  # (N,) [m/s]
+    nominal_speed: Tensor  # (N,) [m/s]
 
-    def measures(self, kinds: list[str] | None = None) -> dict[str, float]:
-        """Parts of the flights that reached the goal, collided and left; what remains took too
-        long. Means of least clearance [m] and speed [m/s]. Success is also given for each speed
-        that was wanted and, flight n being of kind n modulo their number, each of `kinds`."""
+    def metrics(self, kinds: Sequence[str] = ()) -> dict[str, float]:
+        """Computes fractions of flights that reached the goal, collided and left, means of minimum
+        clearance [m] and speed [m/s], and the success at each nominal speed and in each of the
+        `kinds` of worlds, flight n being of kind n modulo their number."""
         flown: dict[str, list[bool]] = {}
-        flights = zip(self.reached.tolist(), self.wanted_speed.tolist(), strict=True)
+        flights = zip(self.reached.tolist(), self.nominal_speed.tolist(), strict=True)
         for n, (reached, speed) in enumerate(flights):
             for name in [f"{speed:g} m/s", *([kinds[n % len(kinds)]] if kinds else [])]:
                 flown.setdefault(name, []).append(reached)
@@ -82,29 +87,22 @@ class Outcomes(NamedTuple):
 
 
 @dataclass
-class FlightConditions:
-    """Of the flights that measure a policy."""
+class FlightConditions(Config):
+    """Conditions of flights that evaluate a policy."""
 
-    # [m/s] Asked of the policy, each in as many worlds, drawn at random.
-    speeds: list[float] = field(default_factory=lambda: [2.0, 3.0, 4.0])
+    # [m/s] Nominal speeds, each in as many worlds, drawn at random.
+    speeds: list[float] = bounded(lambda: [2.0, 3.0, 4.0], "[0.1, 10] m/s")
     # [m] The goal is reached within this distance.
     goal_radius: float = 0.3
-    # [-] Flights end after this multiple of the time that the straight way takes at that speed.
+    # [-] Maximum time of flights, in times of the straight line at the nominal speed.
     patience: float = 2.5
     # [s] Lag of the acceleration of point masses.
     lag: float = 0.12
-    # Whether the body-rate quadrotor flies, instead of a point mass.
+    # Flies the body-rate quadrotor instead of a point mass.
     body_rate: bool = False
 
-    def validate(self) -> None:
-        """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
-        validate_speeds(self.speeds, "validation.speeds")
-
-
-def validate_speeds(speeds: Sequence[float], name: str) -> None:
-    """Raises ValueError unless all are speeds that can be asked for."""
-    if not speeds or not all(0.1 <= speed <= 10.0 for speed in speeds):
-        raise ValueError(f"{name} is {speeds}; give one or more of 0.1 to 10 m/s")
+    def check(self) -> None:
+        require_field(self, "speeds", self.speeds, "one speed or more")
 
 
 @torch.no_grad()
@@ -115,8 +113,8 @@ def evaluate_agent(
     noise: ObservationNoise,
     seed: int = 0,
 ) -> Outcomes:
-    """Flies every world once from its start, at rest, level and facing the goal; the images are
-    disturbed and late as `noise` says."""
+    """Flies through every world once, from rest at its start, level and facing the goal, with noisy
+    and late images."""
     device = worlds.p_WS.device
     generator = torch.Generator(device).manual_seed(seed)
     count = len(worlds)
@@ -131,8 +129,7 @@ def evaluate_agent(
     memory, control = agent.initial_memory(count), FlatnessControllerConfig()
     shuffled = torch.randperm(count, generator=generator, device=device)
     speed = torch.tensor(conditions.speeds, device=device)[shuffled % len(conditions.speeds)]
-    past = remembered(vehicle, noise, agent.rate)
-    frames = draw_frames(noise, count, generator)
+    history = History.start(vehicle, noise, agent.rate, generator)
 
     reached, collided, left = (torch.zeros(count, dtype=torch.bool, device=device) for _ in "rcl")
     clearance = torch.full((count,), torch.inf, device=device)
@@ -141,24 +138,21 @@ def evaluate_agent(
     limit = conditions.patience * to_goal.norm(dim=1) / speed
     dt = 1.0 / agent.rate
     while len(flying):
-        distances, _ = worlds.geometry.nearest(vehicle.p, flying, 1)
-        here = distances[:, 0] - VEHICLE_RADIUS
+        here, inside = worlds.clearance(vehicle.p, flying)
         clearance[flying] = torch.minimum(clearance[flying], here)
-        inside = (vehicle.p > worlds.lower_W[flying]) & (vehicle.p < worlds.upper_W[flying])
         collided[flying] = here < 0.0
-        left[flying] = ~inside.all(1) & ~collided[flying]
+        left[flying] = ~inside & ~collided[flying]
         done = (vehicle.p - p_WG[flying]).norm(dim=1) < conditions.goal_radius
         reached[flying] = done & ~collided[flying] & ~left[flying]
         ended = (reached | collided | left | (time > limit))[flying]
         if ended.any():
             keep = (~ended).nonzero()[:, 0]
             flying, memory = flying[keep], memory[keep]
-            vehicle, past = (type(vehicle)(*(x[keep] for x in of)) for of in (vehicle, past))
-            frames = Frames(*(x[keep] for x in frames))
+            vehicle, history = take_rows(keep, (vehicle, history))
             continue
-        past = remember(past, vehicle)
-        then = delayed(past, frame_ages(frames, noise, time[flying]), agent.rate)
-        depth = render_depth(then, worlds.geometry, agent.rays, flying)
+        history = history.push(vehicle)
+        past = history.seen(noise, agent.rate, time[flying])
+        depth = render_depth(past, worlds.geometry, agent.rays, flying)
         depth = noisy_depth(depth, noise, generator)
         seen = Observation(depth, vehicle, p_WG[flying], speed[flying])
         a_cmd, heading, memory = agent.decide(seen, memory)
@@ -167,3 +161,37 @@ def evaluate_agent(
         path[flying] += (vehicle.p - before).norm(dim=1)
         time[flying] += dt
     return Outcomes(reached, collided, left, clearance, path / time.clamp(min=dt), speed)
+
+
+@dataclass
+class FlightTraining(TrainingConfig):
+    """Fields of trainers that fly in training worlds."""
+
+    worlds: WorldSelection = field(default_factory=WorldSelection)
+    # Conditions of the flights that select among checkpoints.
+    validation: FlightConditions = field(default_factory=FlightConditions)
+
+    def check(self) -> None:
+        first_training_seed(self.seed)
+
+
+class FlightTrainer(Trainer):
+    """Base class of trainers that fly in training worlds, evaluated by flights in held-out ones.
+
+    Args:
+        config: configuration.
+        agent: the policy, with its network.
+        noise: of images.
+    """
+
+    def __init__(self, config: FlightTraining, agent: Any, noise: ObservationNoise) -> None:
+        self.network, self.spec = agent.network, agent.network.spec
+        self.agent, self.noise, self.conditions = agent, noise, config.validation
+        self.generator = torch.Generator(config.device).manual_seed(config.seed)
+        self.worlds = training_worlds(config.worlds, config.seed, config.device)
+        self._validation = validation_worlds(config.worlds, config.device)
+        self._kinds = config.worlds.turns
+
+    def evaluate(self) -> dict[str, float]:
+        outcomes = evaluate_agent(self.agent, self._validation, self.conditions, self.noise)
+        return outcomes.metrics(self._kinds)

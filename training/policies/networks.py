@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from splatpilot.systems.policies.agile_autonomy_inference import (
+from splatpilot.systems.policies.agile_autonomy import (
     MODES,
     STATE_SIZE,
     WAYPOINT_SCALE,
@@ -44,7 +44,7 @@ class TrainableNetwork(nn.Module):
 
 class TrajectoryModule(nn.Module):
     """The network of a `TrajectoryNetworkSpec`, with the names of weights that
-    `systems.policies.agile_autonomy_inference.TrajectoryNetwork` takes."""
+    `systems.policies.agile_autonomy.TrajectoryNetwork` takes."""
 
     def __init__(self, spec: TrajectoryNetworkSpec) -> None:
         super().__init__()

@@ -1,10 +1,10 @@
-"""The student's two stages: from what its expert shows, and then also from what the expert would
-have done where the student came too near to something.
+"""Trains in two stages: on what an expert shows, then also on what it would have done where the
+student came too close to something.
 
-After the paper, Sec. III-B. The student of the first stage flies, without any guard, the ways that
-the expert flew in the worlds that it was trained in; the second is trained from nothing on all. For
-`diffaero_rgb`, which learns from the same corpora what it sees, the images alone matter. Another
-policy's flights may take the place of the first stage, as those of the round before.
+After the paper, Sec. III-B. The student of the first stage flies the expert's paths in its training
+worlds, without a guard; the second is trained on all samples. Flights of another policy may replace
+the first stage, as those of the round before. `diffaero_rgb` recovers too: it learns from the same
+corpora.
 """
 
 import json
@@ -15,7 +15,7 @@ from functools import partial
 from hashlib import blake2b
 from itertools import chain
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -43,27 +43,26 @@ from splatpilot.training.corpus.recovery_labels import StudentFlight, add_recove
 from splatpilot.training.corpus.samples import EXPERT, RECOVERY, Shard
 from splatpilot.training.policies import train
 from splatpilot.training.policies.student_data import is_held_out
-from splatpilot.training.policies.trainer import Trainer, TrainingConfig
+from splatpilot.training.policies.trainer import CorpusTraining, Trainer
 
 _PATIENCE = 2.0
-"""How many times as long as the expert took a student may fly."""
-
+"""Maximum time of a student's flight, in times of the expert's."""
 
 _ARRAYS = "p_WG", "times", "states", "clearances"
-"""Of each flight in a file of flights, see `StudentFlight`."""
+"""Arrays of each flight in a file of flights, see `StudentFlight`."""
 
 
 @dataclass(frozen=True)
 class Task:
-    """A way that the expert flew."""
+    """A path that the expert flew."""
 
     start: list[float]  # [m]
     goal: list[float]  # [m]
     timeout: float  # [s]
 
 
-def tasks_of(shards: Sequence[Shard], flights: int) -> dict[str, list[Task]]:
-    """By world the ways of the expert's first `flights`, of those that shards are from."""
+def list_tasks(shards: Sequence[Shard], flights: int) -> dict[str, list[Task]]:
+    """Lists, by world, the expert's first `flights` in shards."""
     tasks: dict[str, list[Task]] = {}
     for shard in shards:
         if shard.source == EXPERT:
@@ -72,13 +71,14 @@ def tasks_of(shards: Sequence[Shard], flights: int) -> dict[str, list[Task]]:
                 for flight in shard.flights
                 if flight["states"]
             )
-    return {world: ways[:flights] for world, ways in tasks.items() if ways}
+    return {world: paths[:flights] for world, paths in tasks.items() if paths}
 
 
 def fly_worlds(
-    corpus: Corpus, tasks: dict[str, list[Task]], pilot: str, folder: Path, jobs: int
+    corpus: Corpus, tasks: dict[str, list[Task]], policy: str, folder: Path, jobs: int
 ) -> tuple[list[StudentFlight], Counter[str]]:
-    """The flights of a policy, or a file of weights, in worlds of a corpus, and how they ended."""
+    """Flies a policy, or a file of weights, in worlds of a corpus; returns flights and counts of
+    their outcomes."""
     folder.mkdir(parents=True, exist_ok=True)
     work = [
         (record, tasks[record.name], folder / f"{record.name}.npz")
@@ -86,7 +86,7 @@ def fly_worlds(
         if record.name in tasks
     ]
     missing = [piece for piece in work if not _is_whole(piece[2])]
-    fly_world = partial(_fly_world, pilot, corpus.config)
+    fly_world = partial(_fly_world, policy, corpus.config)
     bar = Progress(total=len(work), initial=len(work) - len(missing), desc="flying", unit="world")
 
     def kept() -> str:
@@ -106,7 +106,7 @@ def fly_worlds(
 
 
 def _is_whole(file: Path) -> bool:
-    """Whether a file of flights is there; one that is damaged goes, to be flown again."""
+    """Tells whether a file of flights exists; removes it if damaged."""
     if not file.exists():
         return False
     try:
@@ -118,14 +118,13 @@ def _is_whole(file: Path) -> bool:
     return True
 
 
-def _fly_world(
-    pilot: str, config: CorpusConfig, work: tuple[WorldRecord, list[Task], Path]
-) -> None:
-    """Flies the tasks of one world, as fast as the expert did, and writes the flights to a file."""
+def _fly_world(name: str, config: CorpusConfig, work: tuple[WorldRecord, list[Task], Path]) -> None:
+    """Flies the tasks of one world at the expert's speed, and writes the flights to a file."""
     record, tasks, file = work
-    policy, world = policy_named(pilot, config.expert.speed), record.make()
-    learns_from_corpora = isinstance(policy, StudentConfig | DiffAeroRgbConfig)
-    policy = replace(policy, **({"camera": config.camera} if learns_from_corpora else {}))
+    policy: Any = policy_named(name, config.expert.speed)
+    world = record.make()
+    if isinstance(policy, StudentConfig | DiffAeroRgbConfig):
+        policy = replace(policy, camera=config.camera)
     arrays: dict[str, Any] = {}
     outcomes = []
     for task in tasks:
@@ -150,28 +149,17 @@ def _fly_world(
         np.savez(path, outcomes=np.array(outcomes, dtype="U16"), **arrays)
 
 
-class CorpusTraining(TrainingConfig, Protocol):
-    """What the configuration of a trainer has that learns from corpora, a dataclass."""
-
-    __dataclass_fields__: ClassVar[dict[str, Any]]
-
-    corpora: list[str]
-    """Their folders."""
-    held_out: float
-    """Part of their worlds, by name, that is not trained with."""
-
-
 @dataclass
 class RecoveryFlights:
-    """The content of `recovery.yaml`: what decides a run beside the configuration of training."""
+    """Content of `recovery.yaml`: what determines a run besides the configuration of training."""
 
-    # [-] Of the student, at most, in each world.
+    # [-] Maximum number of flights in each world.
     flights: int = 6
-    # Policy, or file of weights, that flies; the first stage's where left empty.
+    # Policy, or file of weights, that flies; the first stage's if empty.
     flown_by: str = ""
-    # What tells the content of that file from what it may have later.
+    # Digest of that file.
     flown_by_digest: str = ""
-    # Folders of the corpora, and the part of their worlds that is not trained with.
+    # Folders of the corpora, and the fraction of their worlds that is not trained with.
     corpora: list[str] = field(default_factory=list)
     held_out: float = 0.0
 
@@ -187,26 +175,26 @@ def run[Config: CorpusTraining](
     flown_by: str = "",
 ) -> dict[str, Any]:
     """
-    Trains a student, has it fly, gathers what it was to have done, and trains another on all.
+    Trains a student, flies it, labels its near-misses, and trains another on all samples.
 
-    Interrupted anywhere, even by `kill -9`, the same call goes on and leaves the same. The corpora
-    that `config` names stay as they are.
+    An interrupted run is resumed by the same call. The corpora of `config` are not changed.
 
-    Leaves in `out`: `stage_1`, unless another policy flies, and `stage_2`, see `train.run`;
-    `corpora`, links to those of `config` with the recovery samples beside them; `flights`, what the
-    student flew, a file a world; `recovery.yaml`, how many they may be, whose and where;
-    `recovery.json`, how many of what there are.
+    Writes to `out`: `stage_1`, unless another policy flies, and `stage_2`, see `train.run`;
+    `corpora`, links to those of `config` with the recovery samples beside them; `flights`, a file
+    per world; `recovery.yaml`, see `RecoveryFlights`; `recovery.json`, counts of flights and
+    samples.
 
     Args:
-        config: of both stages.
-        make: the trainer of that configuration.
-        flights: of the student, at most, in each world.
+        config: configuration of both stages.
+        make: makes the trainer of a configuration.
+        out: folder.
+        flights: maximum number of flights in each world.
         jobs: processes that fly.
-        flown_by: a policy or a file of weights that flies instead of a first stage. Students see
+        flown_by: policy or file of weights that flies instead of a first stage. Students see
             through the corpora's camera, others through their own.
 
     Returns:
-        What `recovery.json` says.
+        The content of `recovery.json`.
 
     Raises:
         FileNotFoundError, ValueError: see `train.run`, `add_recovery` and `policy_named`; or if
@@ -215,18 +203,19 @@ def run[Config: CorpusTraining](
     """
     for name, value in (("flights", flights), ("jobs", jobs)):
         require(value >= 1, f"--{name}", "at least 1", value)
-    # What is not there is refused before anything is written.
+    # Missing inputs are refused before anything is written.
+    train.validate(config)
     if flown_by:
         policy_named(flown_by)
     worlds = distinct_worlds([Corpus(Path(source)) for source in config.corpora])
     digest = _digest(Path(flown_by)) if flown_by.endswith(".npz") else ""
     decisive = RecoveryFlights(flights, flown_by, digest, list(config.corpora), config.held_out)
     claim_folder(out / "recovery.yaml", decisive)
-    pilot, first = flown_by, {}
+    policy, first = flown_by, {}
     if not flown_by:
         say(f"first stage, in {out / 'stage_1'}")
         first = train.run(config=config, out=out / "stage_1", make=make)
-        pilot = str(out / "stage_1" / f"{first['policy']}.npz")
+        policy = str(out / "stage_1" / f"{first['policy']}.npz")
     folders = [out / "corpora" / str(k) for k in range(len(config.corpora))]
     for source, folder in zip(config.corpora, folders, strict=True):
         link_corpus(Path(source), folder)
@@ -234,14 +223,14 @@ def run[Config: CorpusTraining](
     others = {s.revision for corpus in corpora for s in corpus.shards} - {revision()}
     if others:
         say(
-            f"what the corpora hold was labelled by revision {', '.join(sorted(others))} of the "
-            f"program, recovery by {revision()}; ledger.csv tells which"
+            f"samples of the corpora were labeled by revision {', '.join(sorted(others))} of the "
+            f"program, recovery by {revision()}; ledger.csv lists which"
         )
     held_out = {name for name in worlds if is_held_out(name, config.held_out)}
     outcomes: Counter[str] = Counter()
     for folder, corpus, shards in zip(folders, corpora, distinct_shards(corpora), strict=True):
-        tasks = tasks_of([shard for shard in shards if shard.world not in held_out], flights)
-        flown, ended = fly_worlds(corpus, tasks, pilot, out / "flights" / folder.name, jobs)
+        tasks = list_tasks([shard for shard in shards if shard.world not in held_out], flights)
+        flown, ended = fly_worlds(corpus, tasks, policy, out / "flights" / folder.name, jobs)
         outcomes += ended
         add_recovery(folder, flown, jobs)
     both = replace(config, corpora=[str(folder) for folder in folders])
@@ -260,7 +249,7 @@ def _digest(file: Path) -> str:
 
 
 def _ledger(corpora: Sequence[Corpus], outcomes: Counter[str]) -> dict[str, Any]:
-    """How many flights ended how, near-misses that they had, and samples by where they are from."""
+    """Counts outcomes of flights, near-misses, and samples by source."""
     shards = list(chain.from_iterable(distinct_shards(corpora)))
     recovered = [shard for shard in shards if shard.source == RECOVERY]
     return {

@@ -1,6 +1,6 @@
-"""What the student learns from: samples of several corpora, and the distances in their worlds."""
+"""Samples of corpora for training: labels, images, distances in their worlds, cached features."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 from hashlib import blake2b
 from itertools import chain
@@ -13,22 +13,29 @@ import torch
 from torch import Tensor
 
 from splatpilot.diagrams.worlds.scene_folder import SceneSource
-from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.vehicle.flatness import rotation_matrices
+from splatpilot.systems.common.files import require_writable_folder, written_atomically
+from splatpilot.systems.common.progress import Progress, say
+from splatpilot.systems.common.readers import reason_of
+from splatpilot.systems.policies.student import encode_color, encode_depth
+from splatpilot.systems.vehicle.state import rotation_matrices
 from splatpilot.training.corpus.corpus import Corpus, distinct_shards, distinct_worlds
 from splatpilot.training.corpus.library import require_untested
-from splatpilot.training.corpus.samples import RECOVERY
+from splatpilot.training.corpus.samples import RECOVERY, Shard
 from splatpilot.training.policies.ray_casting import EsdfGeometry
+from splatpilot.training.policies.student_network import StudentModule
 
-_PARTS = 1 << 20
-"""[-] That a chance is counted in."""
+_CHANCES = 1 << 20
+"""Resolution of random choices."""
 
 _DIGESTS = 1 << 64
-"""Number of digests that a name may have."""
+"""Number of possible digests of a name."""
+
+_BATCH = 8
+"""Images that are encoded at once; their activations fit a processor's caches."""
 
 
 class Labels(NamedTuple):
-    """Of N samples, float32 in the body frame B; see `Samples`."""
+    """Labels of N samples, float32, in the body frame B; see `Samples`."""
 
     X_WB: Tensor  # (N, 7) quaternion wxyz and position [m]
     v_B: Tensor  # (N, 3) [m/s]
@@ -38,73 +45,62 @@ class Labels(NamedTuple):
 
 
 class StudentData:
-    """Corpora as one, their worlds known by name, some of them held out.
+    """The distinct samples of several corpora, numbered through, some of their worlds held out.
 
     Args:
-        corpora: may share worlds, and shards, which count once.
-        held_out: part of the worlds whose samples are not trained with, see `is_held_out`.
-        device: where labels live; images stay on disk.
-        worlds: how many of the others are trained in, all if 0. More of them are the same and more.
+        corpora: may share worlds and shards.
+        held_out: fraction of the worlds whose samples are not trained with, see `is_held_out`.
+        device: device of the labels; images stay on disk.
 
     Raises:
-        ValueError: if the corpora's samples differ in kind, two of their worlds have one name and
-            differ, or too few worlds are left to train in.
+        ValueError: if the samples differ in kind, two worlds of one name differ, or there are no
+            samples to train or to validate with.
     """
 
-    def __init__(
-        self, corpora: Sequence[Corpus], held_out: float, device: str = "cpu", worlds: int = 0
-    ) -> None:
+    def __init__(self, corpora: Sequence[Corpus], held_out: float, device: str = "cpu") -> None:
         configs = [corpus.config for corpus in corpora]
         self.camera, self.speed = configs[0].camera, configs[0].expert.speed
-        """What the samples were seen through; the expert's nominal speed [m/s]."""
+        """Camera of the samples; the expert's nominal speed [m/s]."""
         for config in configs:
             if (config.camera, config.size) != (self.camera, configs[0].size):
                 raise ValueError(
-                    f"the corpora were gathered with different cameras or numbers of trajectories, "
+                    f"the corpora have different cameras or numbers of trajectories, "
                     f"{configs[0].size} by {self.camera} and {config.size} by {config.camera}; "
-                    "gather them alike"
+                    "collect them with the same"
                 )
             if config.expert.speed != self.speed:
                 raise ValueError(
-                    f"the corpora's experts flew at {self.speed} and {config.expert.speed} m/s; a "
-                    "student has one nominal speed: gather them at the same"
+                    f"the corpora's experts flew at {self.speed} and {config.expert.speed} m/s; "
+                    "collect them at the same speed"
                 )
         records = distinct_worlds(corpora)
         for record in records.values():
             if isinstance(record.source.world, SceneSource):
                 require_untested(record.source.source_digest, str(record.path))
-        self.held_out_worlds = sorted(name for name in records if is_held_out(name, held_out))
-        others = sorted(records.keys() - set(self.held_out_worlds), key=_digest)
-        if worlds > len(others):
-            raise ValueError(
-                f"worlds is {worlds}, but of the corpora's {len(records)} worlds {len(others)} are "
-                "left to train in; gather in more worlds, or say fewer"
-            )
-        self.worlds = sorted([*self.held_out_worlds, *others[: worlds or None]])
+        self.worlds = sorted(records)
         """Names."""
-        chosen = set(self.worlds)
+        self.held_out_worlds = [name for name in self.worlds if is_held_out(name, held_out)]
         shards = chain.from_iterable(distinct_shards(corpora))
-        self.shards = [shard for shard in shards if len(shard) and shard.world in chosen]
-        """Blocks of samples, which are numbered through them."""
+        self.shards = [shard for shard in shards if len(shard)]
         counts = [len(shard) for shard in self.shards]
         self.first = np.cumsum([0, *counts])
-        """The number of each shard's first sample."""
+        """Index of the first sample of each shard."""
         number = {name: k for k, name in enumerate(self.worlds)}
         world = np.repeat([number[shard.world] for shard in self.shards], counts)
         outside = np.isin(world, [number[name] for name in self.held_out_worlds])
         self.training, self.held_out = np.flatnonzero(~outside), np.flatnonzero(outside)
-        """Numbers of samples."""
+        """Indices of samples."""
         recovered = np.repeat([shard.source == RECOVERY for shard in self.shards], counts)
         self.recovered = np.flatnonzero(~outside & recovered)
-        """Numbers of those to train with that a student came to."""
+        """Indices of training samples from flights of students."""
         self._shown = np.flatnonzero(~outside & ~recovered)
         if not (len(self.training) and len(self.held_out)):
-            least = ceil(100 * min(map(_digest, records)) / _DIGESTS) / 100
+            smallest = ceil(100 * min(map(_digest, records)) / _DIGESTS) / 100
             raise ValueError(
                 f"of {len(self.worlds)} worlds {len(self.held_out_worlds)} are held out, which "
                 f"leaves {len(self.training)} samples to train with and {len(self.held_out)} to "
                 "validate with; collect in more worlds, or change held_out: from "
-                f"{least} on it holds out one of these"
+                f"{smallest} on it holds out one of these"
             )
 
         def joined(name: str) -> Tensor:
@@ -121,49 +117,50 @@ class StudentData:
         self._records = records
 
     def digest(self, *files: str) -> str:
-        """What tells these samples, and the content of the `files` that are named, from others."""
-        what = blake2b(digest_size=16)
-        for shard in self.shards:  # each states the checksums of all that it has
-            what.update(shard.path.name.encode() + (shard.path / "shard.json").read_bytes())
-        what.update(" ".join(self.held_out_worlds).encode())
+        """Computes a digest of the samples, their split and the content of files."""
+        digest = blake2b(digest_size=16)
+        for shard in self.shards:
+            digest.update(shard.path.name.encode() + _identity(shard))
+        digest.update(" ".join(self.held_out_worlds).encode())
         for file in filter(None, files):
-            what.update(Path(file).read_bytes())
-        return what.hexdigest()
+            digest.update(Path(file).read_bytes())
+        return digest.hexdigest()
 
-    def drawn(self, draw: Callable[[int], np.ndarray], recovery_share: float = 0.0) -> np.ndarray:
-        """Numbers (N,) of samples to train with.
+    def draw(
+        self, integers: Callable[[int], np.ndarray], recovery_share: float = 0.0
+    ) -> np.ndarray:
+        """Draws indices (N,) of training samples.
 
         Args:
-            draw: gives N whole numbers, each from 0 to before a count, whichever is as likely.
-            recovery_share: chance of each to be of recovery; where it is 0, or none is, all samples
-                are as likely.
+            integers: draws N integers from [0, n) for an n.
+            recovery_share: probability of samples of recovery; if 0, all samples are as likely.
         """
         if not (recovery_share and len(self.recovered)):
-            return self.training[draw(len(self.training))]
-        met, shown = (group[draw(len(group))] for group in (self.recovered, self._shown))
-        return np.where(draw(_PARTS) < recovery_share * _PARTS, met, shown)
+            return self.training[integers(len(self.training))]
+        recovered, shown = (g[integers(len(g))] for g in (self.recovered, self._shown))
+        return np.where(integers(_CHANCES) < recovery_share * _CHANCES, recovered, shown)
 
-    def labels(self, numbers: np.ndarray) -> "Labels":
-        """What belongs to the images of the samples of `numbers` (N,)."""
-        chosen = torch.from_numpy(numbers).to(self._labels.world.device)
+    def labels(self, indices: np.ndarray) -> Labels:
+        """Returns the labels of samples (N,)."""
+        chosen = torch.from_numpy(indices).to(self._labels.world.device)
         return Labels(*(values[chosen] for values in self._labels))
 
-    def pixels(self, numbers: np.ndarray, name: str) -> np.ndarray:
-        """The images `color` or `depth` of the samples of `numbers` (N,), see `Samples`."""
+    def pixels(self, indices: np.ndarray, name: str) -> np.ndarray:
+        """Reads the images `color` or `depth` of samples (N,), see `Samples`."""
         arrays = [shard.arrays[name] for shard in self.shards]
-        found = np.empty((len(numbers), *arrays[0].shape[1:]), arrays[0].dtype)
-        for row, (k, within) in enumerate(zip(*self.places(numbers), strict=True)):
+        found = np.empty((len(indices), *arrays[0].shape[1:]), arrays[0].dtype)
+        for row, (k, within) in enumerate(self.locate(indices)):
             found[row] = arrays[k][within]
         return found
 
-    def places(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """In which shards, and where in these, the samples of `numbers` (N,) are."""
-        shard = np.searchsorted(self.first, numbers, side="right") - 1
-        return shard, numbers - self.first[shard]
+    def locate(self, indices: np.ndarray) -> Iterator[tuple[int, int]]:
+        """Yields the shard of each sample (N,) and its index there."""
+        shard = np.searchsorted(self.first, indices, side="right") - 1
+        return zip(shard, indices - self.first[shard], strict=True)
 
     def distance_along(self, waypoints_B: Tensor, labels: Labels) -> Tensor:
-        """Signed distance (N, M, T) [m] at waypoints (N, M, T, 3) [m] from samples' poses,
-        differentiable by the waypoints."""
+        """Computes signed distances (N, M, T) [m] at waypoints (N, M, T, 3) [m], differentiable by
+        the waypoints."""
         N, M, T, _ = waypoints_B.shape
         R_WB, p_WB = rotation_matrices(labels.X_WB[:, :4]), labels.X_WB[:, None, 4:]
         p_WQ = (waypoints_B.flatten(1, 2) @ R_WB.mT + p_WB).flatten(0, 1)
@@ -174,24 +171,90 @@ class StudentData:
 
     @cached_property
     def _fields(self) -> EsdfGeometry:
-        """The distances in all worlds, which not everybody asks for."""
-        return EsdfGeometry([_trusted(self._records[name].esdf()) for name in self.worlds])
+        """Distances in all worlds; unknown space is occupied, as for the expert."""
+        fields = [self._records[name].esdf() for name in self.worlds]
+        return EsdfGeometry([f if f.occupied_outside else f.conservative() for f in fields])
 
 
-def is_held_out(name: str, share: float) -> bool:
-    """Tells whether a world validates; about `share` of all worlds do.
+def is_held_out(name: str, fraction: float) -> bool:
+    """Tells whether a world validates, as about `fraction` of all worlds do.
 
-    Its name alone decides, so that it stays on its side when a corpus grows or another is added,
-    and those of a smaller share are among those of a larger one.
+    Its name alone decides, so it stays on its side when corpora grow. The worlds of a smaller
+    fraction are among those of a larger one.
     """
-    return _digest(name) < share * _DIGESTS
+    return _digest(name) < fraction * _DIGESTS
 
 
 def _digest(name: str) -> int:
-    """Returns a number below `_DIGESTS` that depends on nothing but the name."""
+    """Returns a number in [0, `_DIGESTS`) that depends on the name alone."""
     return int.from_bytes(blake2b(name.encode()).digest()[:8])
 
 
-def _trusted(esdf: Esdf) -> Esdf:
-    """Unknown space counts as occupied, as for the expert."""
-    return esdf if esdf.occupied_outside else esdf.conservative()
+def _identity(shard: Shard) -> bytes:
+    """Returns the description of a shard, which has the checksums of its files."""
+    return (shard.path / "shard.json").read_bytes()
+
+
+def encode_images(pixels: np.ndarray, device: str | torch.device = "cpu") -> Tensor:
+    """Encodes images (N, H, W, 3) or planar depth (N, H, W) [m] for the network, (N, 3, H, W)."""
+    images = torch.from_numpy(pixels).to(device).float()
+    return encode_color(images) if images.ndim == 4 else encode_depth(images)
+
+
+class FrozenFeatures:
+    """Outputs of the network's first modules for all samples, computed once and kept in files.
+
+    A file of a shard is named by a digest of the images and of the modules' weights, so that runs
+    share files and corpora may grow.
+
+    Args:
+        folder: of the files.
+        data: the samples.
+        network: network with these modules.
+        frozen: number of modules, of `IMAGE_MODULES`.
+
+    Raises:
+        OSError: if `folder` cannot be written.
+    """
+
+    def __init__(
+        self, folder: Path, data: StudentData, network: StudentModule, frozen: int
+    ) -> None:
+        require_writable_folder(folder)
+        self._data, self._network, self._frozen = data, network, frozen
+        key = blake2b(network.spec.observation.encode(), digest_size=16)
+        for values in network.image_modules(frozen).parameters():
+            key.update(values.detach().cpu().numpy().tobytes())
+        shards = Progress(data.shards, f"encoding images by {frozen} frozen modules", unit="shard")
+        self._files = []
+        for shard in shards:
+            digest = key.copy()
+            digest.update(_identity(shard))
+            self._files.append(self._open(folder / f"{digest.hexdigest()}.npy", shard))
+
+    def __call__(self, indices: np.ndarray) -> Tensor:
+        """Reads the features (N, ...) of samples (N,)."""
+        rows = [self._files[k][within] for k, within in self._data.locate(indices)]
+        return torch.from_numpy(np.stack(rows)).float()
+
+    def _open(self, file: Path, shard: Shard) -> np.ndarray:
+        try:
+            return np.load(file, mmap_mode="r")
+        except FileNotFoundError:
+            pass
+        except (ValueError, EOFError) as error:
+            say(f"{file} is damaged ({reason_of(error)}): it is computed again")
+            file.unlink()
+        with written_atomically(file) as path:
+            np.save(path, self._encode(shard.arrays[self._network.spec.pixels]))
+        return np.load(file, mmap_mode="r")
+
+    @torch.no_grad()
+    def _encode(self, pixels: np.ndarray) -> np.ndarray:
+        """Computes features (n, ...) float16."""
+        device, features = next(self._network.parameters()).device, []
+        for first in range(0, len(pixels), _BATCH):
+            images = encode_images(np.array(pixels[first : first + _BATCH]), device)
+            encoded = self._network.encode_image(images, 0, self._frozen)
+            features.append(encoded.half().cpu().numpy())
+        return np.concatenate(features)

@@ -1,6 +1,5 @@
-"""The student's network for torch; `systems.policies.student_inference` flies it."""
+"""The student's network in torch, and the weights that its encoder begins with."""
 
-import math
 import os
 from pathlib import Path
 
@@ -9,28 +8,27 @@ from torch import Tensor, nn
 from torchvision.models import mobilenet_v2
 
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS
-from splatpilot.systems.policies.lattice import BASIS
+from splatpilot.systems.policies.lattice import BASIS, unobstructed_way
 from splatpilot.systems.policies.student import (
     BLOCKS,
     CHANNELS,
-    FARTHEST,
     HYPOTHESES,
-    NEAREST,
     STATE_SIZE,
     StudentSpec,
     adds_input,
+    deviations,
     mobilenet_blocks,
 )
 
 IMAGE_MODULES = BLOCKS + 1
-"""Modules that an image goes through: the encoder's, and the layer of its cells."""
+"""Number of modules that an image passes: the encoder's, and the layer of its cells."""
 
 
 class StudentModule(nn.Module):
     """The network of a `StudentSpec`, with the names of weights that `StudentNetwork` takes.
 
-    The encoder is torchvision's, with a bias in the place of each batch norm: what is trained is
-    what flies, and no sample depends on the others of its batch.
+    The encoder is torchvision's with a bias instead of each batch norm. So training, at any batch
+    size, and flight compute the same.
     """
 
     _basis: Tensor
@@ -43,15 +41,16 @@ class StudentModule(nn.Module):
         self.cell_layer = nn.Linear(CHANNELS, spec.cell_features)
         self.state_layer = nn.Linear(STATE_SIZE, spec.state_features)
         self.state_layer_2 = nn.Linear(spec.state_features, spec.state_features)
-        joined = spec.image_features() + spec.state_features
-        if spec.head_features:
-            self.hidden_layer = nn.Linear(joined, spec.head_features)
-        self.head = nn.Linear(spec.head_features or joined, HYPOTHESES * (3 * NUM_WAYPOINTS + 1))
+        joined = spec.image_features + spec.state_features
+        self.hidden_layer = nn.Linear(joined, spec.head_features)
+        self.head = nn.Linear(spec.head_features, HYPOTHESES * (3 * NUM_WAYPOINTS + 1))
         self.register_buffer("_basis", torch.from_numpy(BASIS).float(), persistent=False)
 
     def _initialize_encoder(self) -> None:
-        """Has numbers keep their size through the encoder, as no batch norm sees to it: a rectifier
-        halves their squares, and modules that add their input begin with adding nothing."""
+        """Keeps the variance of activations through the encoder, which has no batch norms.
+
+        Modules that add their input begin with adding zero to it.
+        """
         weights = self.state_dict()
         for block in mobilenet_blocks():
             rectified = False
@@ -62,24 +61,13 @@ class StudentModule(nn.Module):
             if adds_input(block):
                 nn.init.zeros_(weights[block[-1].weight])
 
-    def load_encoder(self, weights: dict[str, Tensor]) -> None:
-        """Has the encoder begin with weights by the names of `mobilenet_shapes`."""
-        with torch.no_grad():
-            for name, value in self.state_dict().items():
-                if name in weights:
-                    value.copy_(weights[name])
-
     def image_modules(self, count: int) -> nn.ModuleList:
-        """The first of the `IMAGE_MODULES`."""
+        """Returns the first of the `IMAGE_MODULES`."""
         return nn.ModuleList([*self.features, self.cell_layer][:count])
 
-    def freeze(self, count: int) -> None:
-        """Has the first of the `IMAGE_MODULES` keep their weights."""
-        self.image_modules(count).requires_grad_(False)
-
     def encode_image(self, image: Tensor, first: int = 0, last: int = IMAGE_MODULES) -> Tensor:
-        """What the `IMAGE_MODULES` from `first` to before `last` make of images (N, 3, height,
-        width), or of what those before `first` made of them."""
+        """Passes images (N, 3, height, width), or the output of the modules before `first`, through
+        the `IMAGE_MODULES` from `first` to before `last`."""
         if first < last:
             image = self.features[first:last](image)
         if first < last == IMAGE_MODULES:
@@ -87,31 +75,28 @@ class StudentModule(nn.Module):
         return image
 
     def forward(self, image: Tensor, state: Tensor, first: int = 0) -> tuple[Tensor, Tensor]:
-        """Waypoints (N, 3, 10, 3) [m] and costs (N, 3).
+        """Computes waypoints (N, 3, 10, 3) [m] and costs (N, 3).
 
         Args:
-            image: (N, 3, height, width), or what the `first` of the `IMAGE_MODULES` made of it.
-            state: (N, 9), see `encode_state`.
-            first: module that takes `image`.
+            image: (N, 3, height, width), or the output of the first of the `IMAGE_MODULES`.
+            state: (N, 9), see `systems.policies.student.encode_state`.
+            first: the module that takes `image`.
         """
         # On a GPU convolutions of half the bits take half the time.
         with torch.autocast(image.device.type, torch.bfloat16, enabled=image.is_cuda):
             cells = self.encode_image(image, first)
-        cells = cells.float()
         y = self.state_layer_2(self.state_layer(state).relu()).relu()
-        joined = torch.cat([cells, y], 1)
-        if self.spec.head_features:
-            joined = self.hidden_layer(joined).relu()
-        output = self.head(joined).unflatten(1, (HYPOTHESES, -1))
+        hidden = self.hidden_layer(torch.cat([cells.float(), y], 1)).relu()
+        output = self.head(hidden).unflatten(1, (HYPOTHESES, -1))
         waypoints = output[..., :-1].unflatten(2, (NUM_WAYPOINTS, 3))
-        v_B, towards, up_B = state.unflatten(1, (3, 3)).unbind(1)
-        goal_B = self.spec.reach * towards
-        way = self.spec.way(v_B, goal_B, up_B, self.spec.nominal_speed, self._basis)
-        return way[:, None] + self.spec.deviations(waypoints, goal_B), output[..., -1]
+        v_B, direction, up_B = state.unflatten(1, (3, 3)).unbind(1)
+        goal_B = self.spec.reach * direction
+        reference = unobstructed_way(v_B, goal_B, up_B, self.spec.nominal_speed, self._basis)
+        return reference[:, None] + deviations(waypoints, goal_B), output[..., -1]
 
 
 class _Bias(nn.Module):
-    """What is left of a batch norm that is folded into the convolution before it."""
+    """A batch norm that is folded into the convolution before it."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -121,78 +106,45 @@ class _Bias(nn.Module):
         return x + self.bias[:, None, None]
 
 
-def encode_state(R_WB: Tensor, v_B: Tensor, goal_B: Tensor, reach: float) -> Tensor:
-    """What the network is told (N, 9), see `student_observation`: of attitudes (N, 3, 3),
-    velocities (N, 3) [m/s] and vectors to the goal (N, 3) [m], whose lengths are told within
-    `reach` [m]."""
-    towards = goal_B / goal_B.norm(dim=1, keepdim=True).clamp(min=reach)
-    return torch.cat([v_B, towards, R_WB[:, 2]], 1)
-
-
-def encode_color(color: Tensor) -> Tensor:
-    """Colours (N, H, W, 3), 0 to 255, as (N, 3, H, W): -1 to 1."""
-    return color.movedim(3, 1) / 127.5 - 1.0
-
-
-def encode_depth(depth: Tensor) -> Tensor:
-    """Planar depth (N, H, W) [m] as grey images (N, 3, H, W), see `student_observation`."""
-    z = depth.clamp(NEAREST, FARTHEST).log()
-    near, far = math.log(NEAREST), math.log(FARTHEST)
-    encoded = (far + near - 2.0 * z) / (far - near)
-    return encoded[:, None].expand(-1, 3, -1, -1)
-
-
 IN_DATA = Path("weights") / "mobilenet_v2_imagenet.pt"
 """In the folder `$SPLATPILOT_DATA`."""
 
 _DOWNLOADED = Path("checkpoints") / "mobilenet_v2-7ebf99e0.pth"
-"""What torchvision's `mobilenet_v2(weights="DEFAULT")` leaves in torch's folder."""
+"""In torch's folder, by torchvision's `mobilenet_v2(weights="DEFAULT")`."""
 
 _MEAN, _STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-"""[-] Of the images that torchvision's weights were trained with, 0 to 1."""
+"""[-] of the images that torchvision's weights were trained with, 0 to 1."""
 
 
-def imagenet_weights(file: str = "") -> dict[str, Tensor]:
+def imagenet_weights() -> dict[str, Tensor]:
     """
-    The encoder's weights by the names of `mobilenet_shapes`, for images of -1 to 1.
+    Reads the encoder's weights by the names of `mobilenet_shapes`, for images of -1 to 1.
 
-    Batch norms are folded into the convolutions before them. The input scaling of torchvision's
-    weights, (x - mean) / std of each channel, is folded into the first, but for its border: there
-    padding stands for grey of -1 to 1 and not for the mean.
-
-    Args:
-        file: a state dictionary of torchvision's `mobilenet_v2`, as torch saves it; in one whose
-            batch norms are folded already (variances of 1) images are -1 to 1. If empty,
-            `$SPLATPILOT_DATA/weights/mobilenet_v2_imagenet.pt`, or else what torchvision has
-            downloaded.
+    The file is a state dictionary of torchvision's `mobilenet_v2`: `IN_DATA`, or else torchvision's
+    download. Batch norms and torchvision's input scaling, (x - mean) / std, are folded into the
+    convolutions. A file whose batch norms are folded already is of images of -1 to 1.
 
     Raises:
-        FileNotFoundError: if there is no such file; the message says how to get one.
+        FileNotFoundError: if there is no such file.
         ValueError: if it holds something else.
     """
-    path = _find(file)
+    data = os.environ.get("SPLATPILOT_DATA")
+    paths = [Path(data) / IN_DATA] if data else []
+    paths.append(Path(torch.hub.get_dir()) / _DOWNLOADED)
+    path = next(filter(Path.is_file, paths), None)
+    if path is None:
+        raise FileNotFoundError(
+            f"No such file: {' or '.join(map(str, paths))}; download the weights of MobileNetV2 "
+            "with \"import torchvision; torchvision.models.mobilenet_v2(weights='DEFAULT')\", or "
+            "train from scratch with pretrained=false"
+        )
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
         return _folded({name: values.float() for name, values in state.items()})
     except Exception as error:
         raise ValueError(
-            f"{path}: no weights of MobileNetV2 ({str(error)[:200]}); give a state dictionary of "
-            "torchvision's mobilenet_v2"
+            f"{path}: must be a state dictionary of torchvision's mobilenet_v2 ({str(error)[:200]})"
         ) from None
-
-
-def _find(file: str) -> Path:
-    data = os.environ.get("SPLATPILOT_DATA")
-    places = [Path(data) / IN_DATA] if data else []
-    places = [Path(file)] if file else [*places, Path(torch.hub.get_dir()) / _DOWNLOADED]
-    for path in places:
-        if path.is_file():
-            return path
-    raise FileNotFoundError(
-        f"no weights of MobileNetV2 at {' or '.join(map(str, places))}; download them with "
-        "\"import torchvision; torchvision.models.mobilenet_v2(weights='DEFAULT')\", or train from "
-        "nothing with pretrained=false"
-    )
 
 
 def _folded(state: dict[str, Tensor]) -> dict[str, Tensor]:

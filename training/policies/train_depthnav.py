@@ -1,18 +1,17 @@
-"""Training DepthNav: through the dynamics, to where the time of arrival falls, nose first.
+"""Trains DepthNav: through the dynamics, down the time of arrival, heading along the path.
 
 After "Quadrotor Navigation using Reinforcement Learning with Privileged Information" (2025,
 arXiv:2509.08177). As published: depth of 128x72 pixels, 0.25 to 20 m, inverted and max-pooled to
 16x12; state and target in the frame of the start; convolutions of 32, 64 and 128 channels and a
 gated recurrent unit of 192; commanded acceleration and yaw; AdamW; worlds without obstacles first;
-the wanted velocity down the gradient of the time of arrival, which only the loss knows; and the
-weights of the loss: velocity 4, collision 6, acceleration 0.01, jerk 0.001, rates 0.3, yaw 4.
+the desired velocity down the gradient of the time of arrival, in the loss alone; and the weights of
+the loss: velocity 4, collision 6, acceleration 0.01, jerk 0.001, rates 0.3, yaw 4.
 
-Chosen here, where the publication is silent or a CPU too slow: 25 Hz instead of 50, 32 vehicles,
-40 steps an update instead of 150; the mean velocity of 0.5 s instead of 2 s and a gradient decay of
-0.4 a second, without which, in so short flights, the push away from obstacles outweighs the pull
-along the way and vehicles learn to hover; velocity and attitude quaternion as the state, target
-velocity and speed as the target; the yaw as an angle from the direction of the goal, whose loss is
-1 - cos of its angle to the way; rates from the jerk over gravity.
+Chosen here, because the publication is silent or a CPU too slow: 25 Hz instead of 50, 32 vehicles,
+40 steps per update instead of 150; the mean velocity of 0.5 s instead of 2 s and a gradient decay
+of 0.4 per second, without which vehicles learn to hover; velocity and attitude quaternion as the
+state, target velocity and speed as the target; yaw as an angle from the direction of the goal, with
+the loss 1 - cos of its angle to the path; rates from jerk over gravity.
 """
 
 from dataclasses import dataclass, field
@@ -22,32 +21,36 @@ from torch import Tensor
 
 from splatpilot.systems.policies.depthnav import (
     ACCELERATION_LIMITS,
+    CAMERA_SIZE,
     DEPTHNAV_NETWORK,
-    FARTHEST,
     FOV_X,
-    IMAGE_SIZE,
-    NEAREST,
+    MAX_DEPTH,
+    MIN_DEPTH,
     RATE,
 )
+from splatpilot.systems.policies.observations import (
+    heading_frame,
+    limit_smoothly,
+    target_velocity,
+)
 from splatpilot.systems.vehicle.quadrotor import GRAVITY
-from splatpilot.training.policies import torch_observations as observation
 from splatpilot.training.policies.networks import TrainableNetwork
 from splatpilot.training.policies.ray_casting import PixelRays
 from splatpilot.training.policies.rollouts import RolloutConfig, RolloutTraining, Transitions
-from splatpilot.training.policies.torch_observations import Observation
 from splatpilot.training.policies.trainer import Schedule
+from splatpilot.training.policies.vehicles import Observation
 
 
 @dataclass
 class DepthNavLoss:
-    """Weights of the terms."""
+    """Weights of the terms of the loss."""
 
-    # [s/m] Smooth L1 of the mean velocity less the velocity wanted.
+    # [s/m] Smooth L1 of the mean velocity's error.
     velocity: float = 4.0
-    # [-] Velocity towards the nearest obstacle times max(0, 1 - d)², d [m], and its nearness.
+    # [-] Velocity towards the nearest obstacle times max(0, 1 - d)², d [m], and its proximity.
     collision: float = 6.0
-    # [m/s] Of that, times ln(1 + exp(-6 d)): what nearness costs, however one moves. With the 2.5
-    # of the publication slits are never flown through.
+    # [m/s] Weight of ln(1 + exp(-6 d)) in that, at any velocity. With the 2.5 of the publication
+    # vehicles do not fly through slits.
     nearness: float = 0.5
     # [s^4/m^2] Square of the acceleration.
     acceleration: float = 0.01
@@ -55,13 +58,13 @@ class DepthNavLoss:
     jerk: float = 0.001
     # [s^2] Square of the rates of tilt.
     rate: float = 0.3
-    # [-] 1 - cos of the angle between the heading asked for and the way.
+    # [-] 1 - cos of the angle between the commanded heading and the path.
     yaw: float = 4.0
 
 
 @dataclass
 class DepthNavTraining(RolloutTraining):
-    """A training run."""
+    """A training run of DepthNav."""
 
     schedule: Schedule = field(default_factory=lambda: Schedule(updates=12000, validate_every=500))
     rollout: RolloutConfig = field(
@@ -72,7 +75,7 @@ class DepthNavTraining(RolloutTraining):
 
 
 class DepthNavLearner:
-    """See `splatpilot.training.policies.rollouts.Learner`."""
+    """Flies by DepthNav's network, see `splatpilot.training.policies.rollouts.Learner`."""
 
     rate = RATE
 
@@ -82,14 +85,14 @@ class DepthNavLearner:
             spec.image_width,
             spec.image_height,
             FOV_X,
-            cell_aspect=(IMAGE_SIZE[1] / spec.image_height) / (IMAGE_SIZE[0] / spec.image_width),
+            cell_aspect=(CAMERA_SIZE[1] / spec.image_height) / (CAMERA_SIZE[0] / spec.image_width),
         )
         self.network = TrainableNetwork(spec, head_scale=1.0).to(device)
         self._loss = loss
         self._limits = torch.tensor(ACCELERATION_LIMITS, dtype=torch.float32, device=device)
 
     def initial_memory(self, count: int) -> Tensor:
-        """The network's memory and, last, the yaw of the start frame, NaN until it is known."""
+        """Returns the network's hidden states and the yaw of the start frame, NaN at first."""
         memory = torch.zeros(count, self.network.spec.hidden_size + 1, device=self._limits.device)
         memory[:, -1] = torch.nan
         return memory
@@ -97,15 +100,15 @@ class DepthNavLearner:
     def decide(self, seen: Observation, memory: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         spec, vehicle, speed = self.network.spec, seen.vehicle, seen.speed
         start_yaw = torch.where(memory[:, -1].isnan(), vehicle.yaw, memory[:, -1]).detach()
-        R_WS = observation.heading_frame(start_yaw)
-        image = 1.0 / seen.depth.clamp(NEAREST, FARTHEST)
-        v_target = observation.target_velocity(vehicle.p, seen.p_WG, speed)
+        R_WS = heading_frame(start_yaw)
+        image = 1.0 / seen.depth.clamp(MIN_DEPTH, MAX_DEPTH)
+        v_target = target_velocity(vehicle.p, seen.p_WG, speed)
         q_SB = quaternion_from_rotation(R_WS.mT @ vehicle.attitude())
         state = torch.cat([_rows(vehicle.v, R_WS), q_SB, _rows(v_target, R_WS), speed[:, None]], 1)
         output, hidden = self.network(
             image.reshape(-1, spec.image_height, spec.image_width), state, memory[:, :-1]
         )
-        a_S = observation.limit_smoothly(output[:, :3], self._limits)
+        a_S = limit_smoothly(output[:, :3], self._limits)
         to_goal = torch.atan2(v_target[:, 1], v_target[:, 0]).detach()
         heading = to_goal + torch.pi * torch.tanh(output[:, 3] / torch.pi)
         return (
@@ -123,22 +126,22 @@ class DepthNavLearner:
             transitions.v_mean, transitions.v_target, reduction="none"
         )
         assert transitions.heading is not None
-        way = torch.atan2(transitions.v_target[:, 1], transitions.v_target[:, 0])
+        path = torch.atan2(transitions.v_target[:, 1], transitions.v_target[:, 0])
         terms = {
             "velocity": velocity.sum(1),
             "collision": collision,
             "acceleration": transitions.a.square().sum(1),
             "jerk": transitions.jerk.square().sum(1),
             "rate": transitions.jerk[:, :2].square().sum(1) / GRAVITY**2,
-            "yaw": 1.0 - torch.cos(transitions.heading - way),
+            "yaw": 1.0 - torch.cos(transitions.heading - path),
         }
         return {name: getattr(weights, name) * term.mean() for name, term in terms.items()}
 
 
 def quaternion_from_rotation(R: Tensor) -> Tensor:
-    """The quaternions (N, 4) wxyz, w >= 0, of rotations (N, 3, 3), differentiable.
+    """Computes the quaternions (N, 4) wxyz, w >= 0, of rotations (N, 3, 3), differentiable.
 
-    Of the four ways to take square roots, each row takes the one whose root is largest.
+    Each is computed from its largest component.
     """
     m00, m11, m22 = R[:, 0, 0], R[:, 1, 1], R[:, 2, 2]
     yz, zx, xy = R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]
@@ -159,5 +162,5 @@ def quaternion_from_rotation(R: Tensor) -> Tensor:
 
 
 def _rows(vectors: Tensor, R: Tensor) -> Tensor:
-    """R^T v (N, 3) of vectors (N, 3)."""
+    """Computes R^T v (N, 3) of vectors (N, 3)."""
     return (vectors[:, None, :] @ R)[:, 0]

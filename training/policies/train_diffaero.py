@@ -1,19 +1,17 @@
-"""Training DiffAero: analytic gradients of a loss through the dynamics of flight.
+"""Trains DiffAero: analytic gradients of a loss through the dynamics of flight.
 
 After "DiffAero: A GPU-Accelerated Differentiable Simulation Framework for Efficient Quadrotor
-Policy Learning" (2025). As published: a 16x9 image of depth, a state of nine
-numbers (target velocity, velocity and body z axis in the heading frame), target velocity =
-way / max(distance / speed, 1 s), commanded accelerations of a point mass with a lag, 32 steps of
-flight an update, gradients that decay on their way back, and a loss of velocity (smooth L1 on a
-moving average), nearness of obstacles weighted with the velocity towards them, and jerk.
+Policy Learning" (2025). As published: a 16x9 depth image; nine numbers of state (target velocity,
+velocity and body z axis in the heading frame); commanded accelerations of a point mass with a lag;
+32 steps of flight per update; gradients that decay backward in time; a loss of velocity (smooth L1
+of a moving average), proximity of obstacles weighted with the velocity towards them, and jerk.
 
-Chosen differently, because it learns faster or flies better here: the convolutional and recurrent
-variant instead of the perceptron; depth to 12 m as 3 / z - 0.6 instead of 1 - range / 5 m; the
-nearest surface in each pixel instead of one ray; 15 Hz instead of 30; accelerations without
-gravity; 64 environments instead of 1024; the velocity wanted points along the way around obstacles
-(time of arrival) instead of straight at the goal, in the loss alone; the clearance terms of "Back
-to Newton's Laws: Learning Vision-based Agile Flight via Differentiable Physics" (2024); the
-benchmark's own kinds of worlds.
+Different here: the convolutional and recurrent variant instead of the perceptron; depth to 12 m as
+3 / z - 0.6 instead of 1 - range / 5 m; the nearest surface in each pixel instead of one ray; 15 Hz
+instead of 30; accelerations without gravity; 64 environments instead of 1024; in the loss, desired
+velocities along the path around obstacles (time of arrival) instead of straight to the goal; the
+clearance terms of "Back to Newton's Laws: Learning Vision-based Agile Flight via Differentiable
+Physics" (2024); the benchmark's kinds of worlds.
 """
 
 from dataclasses import dataclass, field
@@ -24,28 +22,34 @@ from torch import Tensor
 from splatpilot.systems.policies.diffaero import (
     ACCELERATION_LIMITS,
     DIFFAERO_NETWORK,
-    FARTHEST,
     FOV_X,
-    NEAREST,
+    MAX_DEPTH,
+    MIN_DEPTH,
     RATE,
     VELOCITY_LIMITS,
     DiffAeroTofConfig,
 )
+from splatpilot.systems.policies.observations import (
+    heading_frame,
+    heading_observation,
+    inverse_depth,
+    limit_smoothly,
+)
+from splatpilot.systems.policies.velocity import tracking_acceleration
 from splatpilot.systems.sensing.noise import ObservationNoise
-from splatpilot.systems.sensing.time_of_flight import range_of_depth, sensor_of
-from splatpilot.training.policies import torch_observations as observation
+from splatpilot.systems.sensing.time_of_flight import LEAST_DEPTH, range_of_depth, sensor_of
 from splatpilot.training.policies.networks import TrainableNetwork
 from splatpilot.training.policies.ray_casting import PixelRays
 from splatpilot.training.policies.rollouts import RolloutConfig, RolloutTraining, Transitions
-from splatpilot.training.policies.torch_observations import Observation
 from splatpilot.training.policies.trainer import Schedule
+from splatpilot.training.policies.vehicles import Observation
 
 
 @dataclass
 class DiffAeroLoss:
-    """Weights of the terms."""
+    """Weights of the terms of the loss."""
 
-    # [s/m] Smooth L1 of the mean velocity less the velocity wanted.
+    # [s/m] Smooth L1 of the mean velocity's error.
     velocity: float = 3.0
     # [s/m^3] Velocity towards an obstacle times max(0, 1 m - d)², d its distance; four nearest.
     clearance: float = 2.0
@@ -55,20 +59,20 @@ class DiffAeroLoss:
     acceleration: float = 0.01
     # [s^6/m^2] Square of the jerk.
     jerk: float = 0.001
-    # [m] What d is less than the clearance: kept for errors of tracking.
+    # [m] Subtracted from d, for errors of tracking.
     margin: float = 0.1
 
 
 @dataclass
 class DiffAeroTraining(RolloutTraining):
-    """A training run."""
+    """A training run of DiffAero."""
 
     schedule: Schedule = field(default_factory=lambda: Schedule(updates=12000, validate_every=500))
     loss: DiffAeroLoss = field(default_factory=DiffAeroLoss)
 
 
 class DiffAeroLearner:
-    """See `splatpilot.training.policies.rollouts.Learner`."""
+    """Flies by DiffAero's network, see `splatpilot.training.policies.rollouts.Learner`."""
 
     rate = RATE
 
@@ -84,13 +88,13 @@ class DiffAeroLearner:
 
     def decide(self, seen: Observation, memory: Tensor) -> tuple[Tensor, None, Tensor]:
         spec = self.network.spec
-        R_WH = observation.heading_frame(seen.vehicle.yaw)
-        image = observation.inverse_depth(seen.depth, NEAREST, FARTHEST)
-        state = observation.heading_observation(seen, R_WH)
+        R_WH = heading_frame(seen.vehicle.yaw)
+        image = inverse_depth(seen.depth, MIN_DEPTH, MAX_DEPTH)
+        state = _state_observation(seen, R_WH)
         output, memory = self.network(
             image.reshape(-1, spec.image_height, spec.image_width), state, memory
         )
-        a_H = observation.limit_smoothly(output, self._limits)
+        a_H = limit_smoothly(output, self._limits)
         return (R_WH @ a_H[:, :, None])[:, :, 0], None, memory
 
     def losses(self, transitions: Transitions) -> dict[str, Tensor]:
@@ -111,16 +115,33 @@ class DiffAeroLearner:
         }
 
 
-# Training DiffAero on the grid of a time-of-flight sensor, with velocities as commands.
-#
-# As `splatpilot.training.policies.train_diffaero`, but closer to what was published: ranges to 5 m
-# as 1 - range / 5 m, of 86 x 48.4 degrees; and as such a sensor streams: 64x36 pixels pooled to
-# 16x9, 10 to 30 images a second, some late and some lost. What the network decides is a velocity,
-# as autopilots take, and the vehicle takes it up as `VelocityTracker` does.
+def _state_observation(seen: Observation, R_WH: Tensor) -> Tensor:
+    p, v, z = seen.vehicle.p, seen.vehicle.v, seen.vehicle.body_z()
+    return heading_observation(p, v, z, seen.p_WG, seen.speed, R_WH)
+
+
+def proximity_grid(
+    depth: Tensor, range_of_depth: Tensor, max_range: float, height: int, width: int
+) -> Tensor:
+    """The proximities (N, height, width) in images of depth (N, R) [m], the lowest row first.
+
+    See `splatpilot.systems.sensing.time_of_flight`, also for `range_of_depth` (H, W); H and W must
+    be multiples of height and width.
+    """
+    H, W = range_of_depth.shape
+    measured = torch.where(depth > LEAST_DEPTH, depth, max_range).reshape(-1, H, W)
+    blocks = (measured * range_of_depth).reshape(-1, height, H // height, width, W // width)
+    return (1.0 - blocks.amin((2, 4)).clamp(0.0, max_range) / max_range).flip(1)
+
+
+# DiffAero on the grid of a time-of-flight sensor: ranges to 5 m as 1 - range / 5 m, of 86 x 48.4
+# degrees; as such a sensor streams, 64x36 pixels pooled to 16x9, 10 to 30 images a second, some
+# late and some lost. The network commands velocities, which the vehicle tracks as
+# `VelocityTracker` does.
 
 
 def streaming_noise() -> ObservationNoise:
-    """How the images of such a sensor are disturbed unless a configuration says otherwise."""
+    """Returns the default noise of such a sensor."""
     return ObservationNoise(
         depth_multiplicative=0.03,
         depth_additive=0.02,
@@ -134,16 +155,14 @@ def streaming_noise() -> ObservationNoise:
 
 @dataclass
 class DiffAeroTofTraining(DiffAeroTraining):
-    """A training run."""
+    """A training run of DiffAero by time of flight."""
 
     schedule: Schedule = field(default_factory=lambda: Schedule(updates=6000, validate_every=500))
     rollout: RolloutConfig = field(default_factory=lambda: RolloutConfig(noise=streaming_noise()))
 
 
 class DiffAeroTofLearner(DiffAeroLearner):
-    """See `splatpilot.training.policies.rollouts.Learner`."""
-
-    rate = RATE
+    """Flies by the network of DiffAeroTof."""
 
     def __init__(self, loss: DiffAeroLoss, device: torch.device | str = "cpu") -> None:
         super().__init__(loss, device)
@@ -157,12 +176,12 @@ class DiffAeroTofLearner(DiffAeroLearner):
         self._limits = torch.tensor(VELOCITY_LIMITS, dtype=torch.float32, device=device)
 
     def decide(self, seen: Observation, memory: Tensor) -> tuple[Tensor, None, Tensor]:
-        sensor, R_WH = self._sensor, observation.heading_frame(seen.vehicle.yaw)
-        grid = observation.proximity_grid(
+        sensor, R_WH = self._sensor, heading_frame(seen.vehicle.yaw)
+        grid = proximity_grid(
             seen.depth, self._range_of_depth, sensor.max_range, sensor.rows, sensor.columns
         )
-        state = observation.heading_observation(seen, R_WH)
+        state = _state_observation(seen, R_WH)
         output, memory = self.network(grid, state, memory)
-        v_H = observation.limit_smoothly(output, self._limits)
-        v_wanted = (R_WH @ v_H[:, :, None])[:, :, 0]
-        return observation.tracking_acceleration(seen.vehicle.v, v_wanted), None, memory
+        v_H = limit_smoothly(output, self._limits)
+        v_desired = (R_WH @ v_H[:, :, None])[:, :, 0]
+        return tracking_acceleration(seen.vehicle.v, v_desired), None, memory

@@ -1,114 +1,131 @@
-"""What trains a policy, and how long."""
+"""Interfaces between the training loop and what is trained."""
 
-from dataclasses import dataclass
-from typing import Any, Protocol
+from dataclasses import dataclass, field
+from typing import Any
 
+import numpy as np
 import torch
+from torch import Tensor
+
+from splatpilot.systems.common.seeds import check_seed
+from splatpilot.systems.common.validation import Config, bounded, require_field
+from splatpilot.systems.sensing.noise import ObservationNoise
+from splatpilot.training.policies.augmentation import Appearance
 
 
 @dataclass
-class Schedule:
-    """How long training takes and what it leaves."""
+class Schedule(Config):
+    """Duration and outputs of training."""
 
-    # [-] Steps of the optimiser.
-    updates: int = 1400
-    # [-] Updates between two measurements of the success on held-out worlds; the weights of the
-    # best are kept.
-    validate_every: int = 200
-    # [-] Updates between two checkpoints that training goes on from when it was interrupted, and
-    # between two rows of the curves.
-    checkpoint_every: int = 100
-    # [-] Step size of AdamW, which falls to nothing over the last part `decay` of the updates.
-    learning_rate: float = 1e-3
-    # [-] Last part of the updates, over which the step size falls.
-    decay: float = 0.3
-    # [-] AdamW's decay of the weights.
+    # [-] Steps of the optimizer.
+    updates: int = bounded(1400, "[1, inf)")
+    # [-] Updates between two evaluations in held-out worlds, which select the weights.
+    validate_every: int = bounded(200, "[1, inf)")
+    # [-] Updates between two checkpoints for resuming, and between two rows of the curves.
+    checkpoint_every: int = bounded(100, "[1, inf)")
+    # [-] Learning rate of AdamW.
+    learning_rate: float = bounded(1e-3, "(0, inf)")
+    # [-] Last fraction of the updates, over which the learning rate falls.
+    decay: float = bounded(0.3, "[0, 1]")
+    # [-] Weight decay of AdamW.
     weight_decay: float = 0.01
-    # [-] Greatest norm of the gradient.
-    clip: float = 1.0
-    # Whether curves are also written for TensorBoard.
+    # [-] Maximum norm of the gradient.
+    clip: float = bounded(1.0, "(0, inf)")
+    # Also writes curves for TensorBoard.
     tensorboard: bool = False
 
-    def validate(self) -> None:
-        """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
-        for name in ("updates", "validate_every", "checkpoint_every"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"schedule.{name} is {getattr(self, name)}; it must be at least 1")
-        for name in ("learning_rate", "clip"):
-            if not 0.0 < getattr(self, name) < float("inf"):
-                raise ValueError(f"schedule.{name} is {getattr(self, name)}; it must be positive")
-        if not 0.0 <= self.decay <= 1.0:
-            raise ValueError(f"schedule.decay is {self.decay}; it must be between 0 and 1")
-
     def due(self, update: int) -> tuple[bool, bool]:
-        """Whether to keep a checkpoint after an update, and whether to measure the success: also
-        with the first checkpoint, so that curves and weights are there early, and at the end."""
-        keep, last = update % self.checkpoint_every == 0, update == self.updates
-        measure = update % self.validate_every == 0 or update == self.checkpoint_every
-        return keep or last, measure or last
+        """Tells whether to write a checkpoint and whether to evaluate after an update.
+
+        The first checkpoint is evaluated too, so that weights exist early.
+        """
+        last = update == self.updates
+        evaluate = update % self.validate_every == 0 or update == self.checkpoint_every
+        return last or update % self.checkpoint_every == 0, last or evaluate
 
     def factor(self, update: int) -> float:
-        """What the step size is multiplied by at an update."""
+        """Computes the factor of the learning rate at an update."""
         left = (self.updates - update) / max(self.decay * self.updates, 1e-9)
         return min(1.0, max(left, 0.02))
 
 
-class TrainingConfig(Protocol):
-    """What every trainer's configuration, a dataclass with defaults, has beside its own."""
+@dataclass
+class TrainingConfig(Config):
+    """Fields of every trainer's configuration."""
 
-    seed: int
-    device: str
-    schedule: Schedule
+    # Seed of everything random.
+    seed: int = 0
+    # Device of the tensors: cpu, or cuda.
+    device: str = "cpu"
+    schedule: Schedule = field(default_factory=Schedule)
 
-    def validate(self) -> None:
-        """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
-        ...
+
+@dataclass
+class CorpusTraining(TrainingConfig):
+    """Fields of trainers that learn from corpora."""
+
+    # Folders of the corpora, see `splatpilot corpus make`.
+    corpora: list[str] = field(default_factory=lambda: ["out/corpus"])
+    # [-] Fraction of the worlds, by name, that select among checkpoints instead.
+    held_out: float = bounded(0.1, "[0, 0.9]")
+    # [-] Samples per step of the optimizer.
+    batch: int = bounded(32, "[1, inf)")
+    # File of this policy's weights to continue from; none if empty.
+    begin: str = ""
+    # Changes of the look of images.
+    appearance: Appearance = field(default_factory=Appearance)
+    # Noise of images.
+    noise: ObservationNoise = field(default_factory=ObservationNoise)
+
+    def check(self) -> None:
+        require_field(self, "corpora", self.corpora, "one folder of a corpus or more")
+        check_seed(self.seed)
 
 
 FLIGHTS = """\
-Flown in simulation as in training. `success` is the part that reached the goal; `collisions` and
-`left` (the volume) are the failures that are not for lack of time; a scenario's name stands before
-the success in worlds of its kind."""
-"""What `evaluate` measures, where a trainer's own `measures` does not say that it is other."""
+Flown in simulation as in training. `success` is the fraction that reached the goal; `collisions`
+and `left` (the volume) are failures, as is running out of time; a scenario's name stands before the
+success in worlds of its kind."""
 
 
-class Trainer(Protocol):
-    """What trains one policy, whatever it learns from. It may have `measures`, a text for the model
-    card on what `evaluate` measures, see `FLIGHTS`, and `evaluated`, of what `success` is a part:
-    "flights" if it has none; and `take_part(rank, count)`, after which
-    `losses` are of one of `count` equal parts of every batch, so that processes learn together; and
-    `learns_from`, a text that tells the content of the files that it reads from all others, without
-    which an interrupted run would go on with files that have changed."""
+class Trainer:
+    """Base class of trainers: the network of a policy, the terms of its loss and its evaluation."""
 
     policy: str
     """Name of the policy, and of its file of weights."""
     spec: Any
-    """The network's architecture, a dataclass, which the file states and `PolicyCheckpoint.load`
-    asks for."""
-
-    @property
-    def network(self) -> torch.nn.Module:
-        """What is trained."""
-        ...
+    """Architecture of the network, a dataclass, see `PolicyCheckpoint`."""
+    network: Any  # torch.nn.Module
+    generator: torch.Generator
+    """Source of all random numbers of the losses."""
+    learns_from: str = ""
+    """Digest of the files that it reads. A run is not resumed if they have changed."""
+    evaluated: str = "flights"
+    """What `success` is a fraction of."""
+    metrics: str = FLIGHTS
+    """Description of the results of `evaluate` for the model card."""
 
     def begin_update(self, update: int) -> None:
-        """Called before each update with its number."""
-        ...
+        """Prepares an update; called with its number."""
 
-    def losses(self) -> dict[str, torch.Tensor]:
-        """The terms of the loss, differentiable by the network's weights, and what else the curves
-        are to show, which has no gradient."""
-        ...
+    def losses(self) -> dict[str, Tensor]:
+        """Computes the terms of the loss; entries without gradient are only plotted."""
+        raise NotImplementedError
 
     def evaluate(self) -> dict[str, float]:
-        """Success and more on held-out worlds; `success` chooses among checkpoints."""
-        ...
+        """Measures `success`, which selects among checkpoints, and more in held-out worlds."""
+        raise NotImplementedError
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything but weights that the next losses depend on: tensors, numbers and text, in
-        lists and dictionaries."""
-        ...
+        """Returns everything but weights that the next losses depend on: tensors, numbers and text,
+        in lists and dictionaries."""
+        return {"generator": self.generator.get_state()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """The inverse of `state_dict`."""
-        ...
+        """Restores the result of `state_dict`."""
+        self.generator.set_state(state["generator"])
+
+
+def spread(indices: np.ndarray, count: int = 2000) -> np.ndarray:
+    """Selects `count` of the indices (N,), evenly spaced, or all if there are fewer."""
+    return indices[np.linspace(0, len(indices) - 1, min(count, len(indices))).astype(int)]

@@ -1,4 +1,4 @@
-"""All policies that can be trained, by their names."""
+"""Trainers by the names of their policies."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -6,7 +6,6 @@ from typing import Any
 
 from splatpilot.systems.common.registry import Registry
 from splatpilot.training.policies.rollouts import RolloutTrainer
-from splatpilot.training.policies.student_config import StudentDepthTraining, StudentRgbTraining
 from splatpilot.training.policies.train_agile_autonomy import (
     AgileAutonomyTrainer,
     AgileAutonomyTraining,
@@ -19,32 +18,35 @@ from splatpilot.training.policies.train_diffaero import (
     DiffAeroTraining,
 )
 from splatpilot.training.policies.train_diffaero_rgb import DiffAeroRgbTrainer, DiffAeroRgbTraining
-from splatpilot.training.policies.train_student import StudentTrainer
+from splatpilot.training.policies.train_student import (
+    StudentDepthTraining,
+    StudentRgbTraining,
+    StudentTrainer,
+)
 from splatpilot.training.policies.trainer import Trainer
 
 
 @dataclass(frozen=True)
 class TrainerKind:
-    """How a policy is trained."""
+    """A registered trainer."""
 
     config: type
-    """The type of its configurations, a dataclass with what `TrainingConfig` has."""
+    """Type of its configurations, a dataclass with the fields of `TrainingConfig`."""
     make: Callable[[Any], Trainer]
-    """From a configuration to its trainer."""
+    """Makes the trainer of a configuration."""
 
 
 TRAINERS = Registry("trainer", "splatpilot.trainers", TrainerKind)
-"""All trainers, by the names of their policies."""
 
 
 def register_trainer(name: str, config: type, make: Callable[[Any], Trainer]) -> None:
     """
-    Makes a trainer known, so that `splatpilot train` can name it.
+    Registers a trainer for `splatpilot train`.
 
     Args:
-        name: of the policy.
-        config: the type of its configurations, see `splatpilot.training.policies.trainer`.
-        make: from a configuration to a `Trainer`.
+        name: name of the policy.
+        config: type of its configurations, see `splatpilot.training.policies.trainer`.
+        make: makes the `Trainer` of a configuration.
 
     Raises:
         ValueError: if another trainer has the name.
@@ -52,23 +54,16 @@ def register_trainer(name: str, config: type, make: Callable[[Any], Trainer]) ->
     TRAINERS.add(name, TrainerKind(config, make))
 
 
-register_trainer(
-    "diffaero",
-    DiffAeroTraining,
-    lambda config: RolloutTrainer("diffaero", DiffAeroLearner(config.loss, config.device), config),
-)
-register_trainer(
-    "depthnav",
-    DepthNavTraining,
-    lambda config: RolloutTrainer("depthnav", DepthNavLearner(config.loss, config.device), config),
-)
-register_trainer(
-    "diffaero_tof",
-    DiffAeroTofTraining,
-    lambda config: RolloutTrainer(
-        "diffaero_tof", DiffAeroTofLearner(config.loss, config.device), config
-    ),
-)
+for _name, _config, _learner in (
+    ("diffaero", DiffAeroTraining, DiffAeroLearner),
+    ("depthnav", DepthNavTraining, DepthNavLearner),
+    ("diffaero_tof", DiffAeroTofTraining, DiffAeroTofLearner),
+):
+
+    def _make(config: Any, name: str = _name, learner: Any = _learner) -> Trainer:
+        return RolloutTrainer(name, learner(config.loss, config.device), config)
+
+    register_trainer(_name, _config, _make)
 register_trainer("agile_autonomy", AgileAutonomyTraining, AgileAutonomyTrainer)
 register_trainer("diffaero_rgb", DiffAeroRgbTraining, DiffAeroRgbTrainer)
 register_trainer("student_rgb", StudentRgbTraining, StudentTrainer)

@@ -20,7 +20,7 @@ from torch import Tensor
 from splatpilot.diagrams.worlds.feasibility import draw_start_and_goal
 from splatpilot.diagrams.worlds.world_registry import (
     WorldConfig,
-    make_blueprint,
+    make_spec,
     make_world,
     place_config,
 )
@@ -45,12 +45,13 @@ from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.common.provenance import program
 from splatpilot.systems.common.readers import read_archive
 from splatpilot.systems.common.seeds import SEEDS_PER_RUN, VALIDATION_SEEDS, first_training_seed
+from splatpilot.systems.common.validation import Config, bounded
 from splatpilot.systems.policies.time_of_arrival import TimeOfArrival, time_of_arrival
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 from splatpilot.training.corpus.library import (
     PROCEDURAL,
     ROUNDABOUT,
-    check_generated,
+    check_library,
     place_to_learn_in,
     world_of,
 )
@@ -67,7 +68,7 @@ _SHAPES = {shape.__name__: shape for shape in (Sphere, Capsule, Cylinder, Box, H
 """Shapes that can be kept."""
 
 _POINTS = "lower_W", "upper_W", "p_WS", "p_WG"
-"""Of a `Blueprint`, each (3,) [m]."""
+"""Of a `WorldSpec`, each (3,) [m]."""
 
 ShapesAndPoints = tuple[list[Shape], *tuple[np.ndarray, ...]]
 
@@ -85,18 +86,18 @@ class WorldCache:
         with contextlib.suppress(OSError):
             require_writable_folder(self._folder)
 
-    def blueprint(self, config: WorldConfig, seed: int) -> ShapesAndPoints:
+    def spec(self, config: WorldConfig, seed: int) -> ShapesAndPoints:
         """Returns the shapes of a generated world, and its `lower_W`, `upper_W`, `p_WS` and `p_WG`.
 
         Raises:
-            ValueError: see `make_blueprint`.
+            ValueError: see `make_spec`.
         """
         file = self._file("json", f"{dump_config(config)}{seed}".encode())
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
             kept = json.loads(file.read_text())
             os.utime(file)
             return [_shape(one) for one in kept["shapes"]], *(np.array(kept[p]) for p in _POINTS)
-        plan = make_blueprint(config, seed)
+        plan = make_spec(config, seed)
         shapes = [solid.shape for solid in plan.solids]
         if all(type(shape) in _SHAPES.values() for shape in shapes):
             content = {"shapes": [_described(shape) for shape in shapes]}
@@ -264,11 +265,11 @@ class WorldBatch:
         empty._times = None
         return empty
 
-    def way(self, p_WQ: Tensor, world: Tensor) -> Tensor:
-        """The direction (N, 3) of the way to the goal at p_WQ (N, 3) [m] in `world` (N,).
+    def direction(self, p_WQ: Tensor, world: Tensor) -> Tensor:
+        """Computes directions (N, 3) of the paths to the goals at p_WQ (N, 3) [m] in `world` (N,).
 
-        Down the gradient of the time of arrival; straight within a metre of the goal, and where
-        there is none.
+        They are down the gradient of the time of arrival, and straight within a meter of the goal
+        and where there is no gradient.
         """
         to_goal = self.p_WG[world] - p_WQ
         if self._times is None:
@@ -277,6 +278,13 @@ class WorldBatch:
         near = to_goal.square().sum(1, keepdim=True) < _NEAR_GOAL**2
         downhill = torch.where(near, to_goal, -uphill)
         return torch.nn.functional.normalize(downhill, dim=1)
+
+    def clearance(self, p_WQ: Tensor, world: Tensor) -> tuple[Tensor, Tensor]:
+        """Computes distances (N,) [m] of vehicles at p_WQ (N, 3) [m] in `world` (N,) to the nearest
+        obstacle beyond their radius, and whether they are inside the volume (N,)."""
+        distances, _ = self.geometry.nearest(p_WQ, world, 1)
+        inside = (p_WQ > self.lower_W[world]) & (p_WQ < self.upper_W[world])
+        return distances[:, 0] - VEHICLE_RADIUS, inside.all(1)
 
     def distance(self, p_WQ: Tensor, world: Tensor) -> Tensor:
         """Signed distance (N,) [m] at p_WQ (N, 3) [m] in `world` (N,), from the grid: the bounds of
@@ -318,36 +326,26 @@ PLACE_LONGEST = 25.0
 
 
 @dataclass
-class WorldSelection:
-    """Which worlds, and how many."""
+class WorldSelection(Config):
+    """Selection of training worlds."""
 
-    # Scenarios whose generated worlds are trained in, the benchmark's or files, in turn; naming one
-    # twice doubles its part.
+    # Scenarios whose generated worlds take turns, the benchmark's or files; naming one twice
+    # doubles its share.
     kinds: list[str] = field(default_factory=lambda: [*PROCEDURAL, *ROUNDABOUT])
-    # Captured places, scene folders or OctoMaps, that take their turns after the kinds, each time
-    # with another start and goal; those of held-out worlds differ too, their places do not.
+    # Scene folders or OctoMaps that take turns after the kinds, each time with another start and
+    # goal; also in held-out worlds.
     scenes: list[str] = field(default_factory=list)
-    # [-] Worlds trained in.
-    count: int = 180
-    # [-] Held-out worlds that choose among checkpoints.
-    held_out: int = 72
-    # [m] Of the grids of the time of arrival, which are kept in the user's cache, up to 1 GiB.
-    voxel_size: float = 0.25
+    # [-] Number of training worlds.
+    count: int = bounded(180, f"[1, {SEEDS_PER_RUN}]")
+    # [-] Number of held-out worlds, which select among checkpoints.
+    held_out: int = bounded(72, f"[1, {SEEDS_PER_RUN}]")
+    # [m] Voxel size of the time of arrival, which is kept in the user's cache, up to 1 GiB.
+    voxel_size: float = bounded(0.25, "[0.05, 0.5] m")
 
-    def validate(self) -> None:
-        """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
-        if not self.turns:
-            raise ValueError("worlds has neither kinds nor scenes; name some")
-        for kind in self.kinds:
-            check_generated(kind)
+    def check(self) -> None:
+        check_library(self.kinds, self.scenes)
         for scene in self.scenes:
             place_to_learn_in(scene)
-        for name in ("count", "held_out"):
-            value = getattr(self, name)
-            if not 1 <= value <= SEEDS_PER_RUN:
-                raise ValueError(f"worlds.{name} is {value}; it must be 1 to {SEEDS_PER_RUN}")
-        if not 0.05 <= self.voxel_size <= 0.5:
-            raise ValueError(f"worlds.voxel_size is {self.voxel_size} m; it must be 0.05 to 0.5")
 
     @property
     def turns(self) -> list[str]:
@@ -358,7 +356,7 @@ class WorldSelection:
 def make_training_world(kind: str, seed: int, cache: WorldCache) -> TrainingWorld:
     """Makes the world of a scenario and seed as the benchmark flies it, without what cameras
     see."""
-    return TrainingWorld(*cache.blueprint(world_of(kind), seed))
+    return TrainingWorld(*cache.spec(world_of(kind), seed))
 
 
 def training_worlds(

@@ -1,36 +1,33 @@
-"""Many vehicles in flight at once, differentiable, in torch.
+"""Batches of vehicles for training: their dynamics, differentiable, and their late images.
 
-`PointMass` follows accelerations with a lag and turns its nose along its motion, which is what
-`FlatnessController` makes of the body-rate quadrotor: cheap enough to learn through. `BodyRate` is
-that quadrotor, with the very equations of the simulated plant
-(`systems.vehicle.quadrotor_dynamics`), under the controller's own law: what it does beyond the
-point mass tells what the latter leaves out.
+`PointMass` follows accelerations with a lag and turns its heading along its motion, as
+`FlatnessController` makes the quadrotor do: cheap enough to train through. `BodyRate` has the
+equations of `QuadrotorPlant` under the law of `FlatnessController`.
 """
 
 import math
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple, Self
 
 import torch
 from torch import Tensor
 
-from splatpilot.systems.sensing.latency import CYCLE, lookback
+from splatpilot.systems.sensing.latency import CYCLE, frame_ages, frame_delays, lookback
 from splatpilot.systems.sensing.noise import ObservationNoise
 from splatpilot.systems.vehicle.flatness import (
     FlatnessControllerConfig,
-    attitudes_from_thrust,
-    flatness_commands,
-    headings_and_pulls,
-    rotation_matrices,
-    unit_vectors,
+    attitude_from_thrust,
+    flatness_command,
+    heading_along_motion,
 )
 from splatpilot.systems.vehicle.quadrotor import QuadrotorParams, rk4_step
-from splatpilot.systems.vehicle.state import QuadrotorState
+from splatpilot.systems.vehicle.state import QuadrotorState, rotation_matrices, unit_vectors
 
 _SUBSTEP = 0.02  # [s], at most, of integration and control
 
 
 class PointMass(NamedTuple):
-    """N point masses with a yaw."""
+    """N point masses with yaw."""
 
     p: Tensor  # (N, 3) [m], p_WB
     v: Tensor  # (N, 3) [m/s], v_WB
@@ -40,7 +37,7 @@ class PointMass(NamedTuple):
 
     def attitude(self) -> Tensor:
         """R_WB (N, 3, 3): z along the thrust that this acceleration takes, x where yaw points."""
-        return attitudes_from_thrust(self._thrust(), self.yaw)
+        return attitude_from_thrust(self._thrust(), self.yaw)
 
     def body_z(self) -> Tensor:
         """The z axes (N, 3) of the body in W."""
@@ -58,10 +55,10 @@ class PointMass(NamedTuple):
         control: FlatnessControllerConfig,
         heading: Tensor | None = None,
     ) -> "PointMass":
-        """The state after `dt` [s] under constant commanded accelerations (N, 3) [m/s^2].
+        """Computes the state after `dt` [s] of constant commanded accelerations (N, 3) [m/s^2].
 
-        Exact for da/dt = (a_cmd - a) / lag. The nose turns towards `heading` (N,) [rad], or along
-        the velocity, as under the controller.
+        Exact for da/dt = (a_cmd - a) / lag. The vehicle turns towards `heading` (N,) [rad], or
+        along the velocity, as under the controller.
         """
         decay = torch.exp(-dt / self.lag)
         behind = self.a - a_cmd
@@ -75,7 +72,7 @@ class PointMass(NamedTuple):
         return PointMass(p, v, torch.addcmul(a_cmd, decay, behind), yaw, self.lag)
 
     def decay_gradient(self, factor: float) -> "PointMass":
-        """The same state, its gradient multiplied by `factor` on the way back."""
+        """Multiplies the gradient of the state by `factor` in the backward pass."""
         return self._replace(
             p=_decay_gradient(self.p, factor),
             v=_decay_gradient(self.v, factor),
@@ -128,13 +125,14 @@ class BodyRate(NamedTuple):
         control: FlatnessControllerConfig,
         heading: Tensor | None = None,
     ) -> "BodyRate":
-        """The state after `dt` [s]: RK4 and new commands every 0.02 s or a little less."""
+        """Computes the state after `dt` [s]: RK4 and new commands every 0.02 s or less."""
         params = QuadrotorParams()
         count = int(-(-dt // _SUBSTEP))
         state, before = self.state, self.state
         for _ in range(count):
             before = state
-            command = flatness_commands(state, a_cmd, control, params, heading)
+            v_WB = QuadrotorState.of(state).v_WB
+            command = flatness_command(state, a_cmd, v_WB, heading, control, params)
             state = rk4_step(state, command, params, dt / count)
         change = QuadrotorState.of(state).v_WB - QuadrotorState.of(before).v_WB
         return BodyRate(state, change * (count / dt))
@@ -143,29 +141,30 @@ class BodyRate(NamedTuple):
 Vehicle = PointMass | BodyRate
 
 
+class Observation(NamedTuple):
+    """Inputs of a policy for N vehicles at one step."""
+
+    depth: Tensor  # (N, R) [m], planar, inf beyond
+    vehicle: Vehicle
+    p_WG: Tensor  # (N, 3) [m]
+    speed: Tensor  # (N,) [m/s], nominal
+
+
 def reaching_acceleration(p_WR: Tensor, vehicle: Vehicle) -> Tensor:
-    """The acceleration (N, 3) [m/s^2] that leads to p_WR (N, 3) in the lookahead."""
+    """Computes accelerations (N, 3) [m/s^2] that reach p_WR (N, 3) in the lookahead."""
     T = FlatnessControllerConfig.lookahead
     return 2.0 * (p_WR - vehicle.p - T * vehicle.v) / T**2
-
-
-def choose_rows[V: Vehicle](chosen: Tensor, these: V, others: V) -> V:
-    """The rows of `these` vehicles where `chosen` (N,), those of the others elsewhere."""
-    return type(these)(*(where_rows(chosen, a, b) for a, b in zip(these, others, strict=True)))
-
-
-def where_rows(chosen: Tensor, these: Tensor, others: Tensor) -> Tensor:
-    """The rows of one tensor (N, ...) where `chosen` (N,), those of the other elsewhere."""
-    return torch.where(chosen.reshape(-1, *[1] * (these.dim() - 1)), these, others)
 
 
 def yaw_rate(
     yaw: Tensor, v: Tensor, control: FlatnessControllerConfig, heading: Tensor | None
 ) -> Tensor:
-    """The controller's yaw rate (N,) [rad/s] of level vehicles at `yaw` (N,) [rad]."""
-    towards, pull = headings_and_pulls(v, control, heading)
-    error = torch.remainder(towards - yaw + torch.pi, 2 * torch.pi) - torch.pi
-    return (control.yaw_gain * pull * error).clamp(-control.max_yaw_rate, control.max_yaw_rate)
+    """Computes the controller's yaw rates (N,) [rad/s] of level vehicles at `yaw` (N,) [rad]."""
+    along, strength = heading_along_motion(v, control.yaw_speed)
+    if heading is not None:
+        along, strength = heading, torch.ones_like(strength)
+    error = torch.remainder(along - yaw + torch.pi, 2 * torch.pi) - torch.pi
+    return (control.yaw_gain * strength * error).clamp(-control.max_yaw_rate, control.max_yaw_rate)
 
 
 def _up(like: Tensor, size: float) -> Tensor:
@@ -176,82 +175,87 @@ def _decay_gradient(x: Tensor, factor: float) -> Tensor:
     return torch.lerp(x.detach(), x, factor)
 
 
-# Vehicles as they were when the image was taken that was the last to come, in torch.
-#
-# The twin of `splatpilot.systems.sensing.latency.DelayedPose` and of its `FrameTimes`, whose
-# samples are the steps of the policy.
+def map_tensors(function: Callable[..., Tensor], first: Any, *others: Any) -> Any:
+    """Applies a function to the tensors of nested named tuples of one type."""
+    if isinstance(first, Tensor):
+        return function(first, *others)
+    parts = zip(first, *others, strict=True)
+    return type(first)(*(map_tensors(function, *part) for part in parts))
 
 
-class Frames(NamedTuple):
-    """When the images of N vehicles are taken and come, as `FrameTimes` has it."""
+def choose_rows(chosen: Tensor, these: Any, others: Any) -> Any:
+    """Takes rows of `these` tensors (N, ...) where `chosen` (N,), and of the others elsewhere."""
 
-    delays: Tensor  # (N, CYCLE) [s], or (N, 1) where images are taken when somebody looks
-    rate: Tensor  # (N,) [Hz]
+    def choose(a: Tensor, b: Tensor) -> Tensor:
+        return torch.where(chosen.reshape(-1, *[1] * (a.dim() - 1)), a, b)
+
+    return map_tensors(choose, these, others)
+
+
+def take_rows(rows: Tensor, tensors: Any) -> Any:
+    """Takes rows (n,) of nested tuples of tensors (N, ...)."""
+    return map_tensors(lambda x: x[rows], tensors)
+
+
+class History(NamedTuple):
+    """The last states of N vehicles, and when their images are taken and come.
+
+    Images are as late as by `systems.sensing.latency.DelayedPose`, whose samples are here the steps
+    of the policy.
+    """
+
+    past: Any  # vehicles with tensors (N, K, ...), oldest first, without gradient
+    delays: Tensor  # (N, CYCLE) [s], or (N, 1) of images that are taken at each step
+    frame_rate: Tensor  # (N,) [Hz]
     phase: Tensor  # (N,) [-]
 
+    @classmethod
+    def start(
+        cls, vehicle: Vehicle, noise: ObservationNoise, rate: float, generator: torch.Generator
+    ) -> Self:
+        """Begins flights at `rate` [Hz], with as many states as images are old."""
+        count, device = len(vehicle.p), generator.device
 
-def draw_frames(noise: ObservationNoise, count: int, generator: torch.Generator) -> Frames:
-    """Those of `count` flights."""
-    device = generator.device
+        def uniform(*size: int) -> Tensor:
+            return torch.rand(*size, generator=generator, device=device)
 
-    def uniform(*size: int) -> Tensor:
-        return torch.rand(*size, generator=generator, device=device)
+        if noise.frame_rate:
+            lower, upper = noise.frame_rate
+            oldest = lookback(noise) / lower
+            frame_rate, phase = lower + (upper - lower) * uniform(count), uniform(count)
+            delays = frame_delays(noise, uniform(count, CYCLE), uniform(count, CYCLE))
+        else:
+            oldest, frame_rate = noise.latency, torch.zeros(count, device=device)
+            delays, phase = torch.full((count, 1), oldest, device=device), frame_rate
+        samples = math.ceil(oldest * rate) + 1
+        past = map_tensors(lambda x: torch.stack([x.detach()] * samples, 1), vehicle)
+        return cls(past, delays, frame_rate, phase)
 
-    if not noise.frame_rate:
-        zero = torch.zeros(count, device=device)
-        return Frames(torch.full((count, 1), noise.latency, device=device), zero, zero)
-    lower, upper = noise.frame_rate
-    rate, phase = lower + (upper - lower) * uniform(count), uniform(count)
-    late, lost = uniform(count, CYCLE), uniform(count, CYCLE)
-    delays = noise.latency + noise.jitter * late
-    return Frames(torch.where(lost < noise.frame_dropout, torch.inf, delays), rate, phase)
+    def push(self, vehicle: Vehicle) -> Self:
+        """Adds the current states and drops the oldest."""
 
+        def push(old: Tensor, now: Tensor) -> Tensor:
+            return torch.cat([old[:, 1:], now.detach()[:, None]], 1)
 
-def frame_ages(frames: Frames, noise: ObservationNoise, time: Tensor) -> Tensor:
-    """The ages (N,) [s], at times (N,) [s], of the last images that have come."""
-    delays, rate, phase = frames
-    if delays.shape[1] == 1:
-        return delays[:, 0]
-    back = torch.arange(lookback(noise), device=time.device)
-    number = (time * rate - phase).floor()[:, None] - back  # newest first
-    ages = time[:, None] - (number + phase[:, None]) / rate[:, None]
-    came = delays.gather(1, number.long() % CYCLE) <= ages
-    came[:, -1] = True
-    return ages.gather(1, came.int().argmax(1, keepdim=True))[:, 0]
+        return self._replace(past=map_tensors(push, self.past, vehicle))
 
+    def ages(self, noise: ObservationNoise, time: Tensor) -> Tensor:
+        """Computes the ages (N,) [s], at times (N,) [s], of the last images that have come."""
+        if not noise.frame_rate:
+            return self.delays[:, 0]
+        return frame_ages(self.delays, self.frame_rate, self.phase, lookback(noise), time)
 
-def remembered[V: Vehicle](vehicle: V, noise: ObservationNoise, rate: float) -> V:
-    """The past of N vehicles that have none: its tensors (N, K, ...) hold the last K states at
-    `rate` [Hz], as far back as images are old, oldest first, and before there are so many the
-    earliest known."""
-    oldest = lookback(noise) / noise.frame_rate[0] if noise.frame_rate else noise.latency
-    samples = math.ceil(oldest * rate) + 1
+    def seen(self, noise: ObservationNoise, rate: float, time: Tensor) -> Any:
+        """Interpolates the vehicles linearly when the images that they see at times (N,) [s] were
+        taken."""
+        ages = self.ages(noise, time)
+        rows, last = torch.arange(len(ages), device=ages.device), self.past[0].shape[1] - 1
+        at = (last - ages * rate).clamp(min=0.0)
+        before = at.long()
+        after, part = (before + 1).clamp(max=last), at - before
 
-    def fill(x: Tensor) -> Tensor:
-        return torch.stack([x.detach()] * samples, 1)
+        def interpolate(x: Tensor) -> Tensor:
+            weight = part.reshape(-1, *[1] * (x.dim() - 2)).to(x.dtype)
+            return torch.lerp(x[rows, before], x[rows, after], weight)
 
-    return type(vehicle)(*map(fill, vehicle))
-
-
-def remember[V: Vehicle](past: V, vehicle: V) -> V:
-    """The past (N, K, ...) with what the vehicles are now, and without the oldest state."""
-
-    def push(old: Tensor, now: Tensor) -> Tensor:
-        return torch.cat([old[:, 1:], now.detach()[:, None]], 1)
-
-    return type(vehicle)(*map(push, past, vehicle))
-
-
-def delayed[V: Vehicle](past: V, ages: Tensor, rate: float) -> V:
-    """The N vehicles `ages` (N,) [s] before the newest of their past (N, K, ...) at `rate` [Hz],
-    without gradient: between samples the state is interpolated linearly, as in flight."""
-    everyone, last = torch.arange(len(ages), device=ages.device), past[0].shape[1] - 1
-    at = (last - ages * rate).clamp(min=0.0)
-    before = at.long()
-    after, part = (before + 1).clamp(max=last), at - before
-
-    def interpolate(x: Tensor) -> Tensor:
-        weight = part.reshape(-1, *[1] * (x.dim() - 2)).to(x.dtype)
-        return torch.lerp(x[everyone, before], x[everyone, after], weight)
-
-    return type(past)(*map(interpolate, past))
+        return map_tensors(interpolate, self.past)

@@ -1,4 +1,4 @@
-"""Checkpoints of an optimisation: whole files that say what they belong to."""
+"""Checkpoints of an optimization, and its log for tensorboard."""
 
 import hashlib
 import shutil
@@ -17,26 +17,38 @@ from splatpilot.systems.common.readers import reason_of
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.views import ReconstructionViews
 
+_VERSION = 3
+_REMEDY = "start again with --restart, which discards it"
+_UNCOMPARED = {
+    "threads",
+    "checkpoint_every",
+    "tensorboard",
+    "voxel_size",
+    "max_range",
+    "distance_field",
+    "split",
+}
+"""Fields that a run may be resumed with other values of: they do not change the optimization."""
+
 
 def save_tensors(content: dict[str, Any], path: Path) -> None:
-    """Writes what `torch.load` reads with `weights_only`, whole or not at all.
+    """Writes a file for `load_tensors`, atomically.
 
     Raises:
-        OSError: if it cannot be written; what was there before is kept.
+        OSError: if it cannot be written; an existing file is kept.
     """
     with written_atomically(path) as partial:
         try:
             torch.save(content, partial)
-        except RuntimeError as error:  # so torch says that the disk is full
+        except RuntimeError as error:  # torch's error of a full disk
             raise OSError(f"perhaps the disk is full: {reason_of(error)}") from error
 
 
 def load_tensors(path: Path) -> Any:
-    """Reads what `save_tensors` wrote.
+    """Reads a file of `save_tensors`.
 
     Raises:
-        OSError, ValueError: if it cannot be read, or is not what was written: torch takes numbers
-            for what they are, without a look at the checksums that are there.
+        OSError, ValueError: if it cannot be read or is damaged; torch itself ignores checksums.
     """
     try:
         with zipfile.ZipFile(path) as archive:
@@ -46,27 +58,12 @@ def load_tensors(path: Path) -> Any:
         return torch.load(path, weights_only=True)
     except (OSError, ValueError):
         raise
-    except Exception as error:  # of a damaged file, zipfile and the unpickler may raise anything
+    except Exception as error:  # zipfile and the unpickler may raise anything
         raise ValueError(reason_of(error)) from None
 
 
-VERSION = 2
-_REMEDY = "start anew with --restart, which discards it"
-# What may differ when an interrupted run goes on, for it changes nothing that is computed.
-_INDIFFERENT = (
-    "threads",
-    "checkpoint_every",
-    "measure_every",
-    "tensorboard",
-    "voxel_size",
-    "max_range",
-    "distance_field",
-    "split",
-)
-
-
 def work_folder(out: Path) -> Path:
-    """Where what is not finished of the scene folder `out` is kept, beside it."""
+    """Returns the folder of an unfinished scene folder `out`, next to it."""
     out = out.absolute()
     return out.with_name(f".{out.name}.partial")
 
@@ -76,58 +73,47 @@ def _checkpoint_file(out: Path) -> Path:
 
 
 def kept_work(out: Path) -> str:
-    """Tells what is kept of an unfinished scene folder `out`, and how to resume."""
+    """Tells how to resume an unfinished scene folder `out`."""
     if _checkpoint_file(out).exists():
         return f"the last checkpoint is in {work_folder(out)}; the same command resumes from it"
     return "nothing is kept yet; the same command starts again"
 
 
 class Checkpoint:
-    """The one file in which an optimisation is kept while it runs, in a work folder beside `out`.
+    """The file with the state of an optimization, in `work_folder(out)`.
 
     Args:
-        out: the scene folder that is to be made.
-        config: the run's.
-        views: what it is fitted to.
+        out: scene folder to be written.
+        config: of the run.
+        views: fitted views.
     """
 
     def __init__(self, out: Path, config: ReconstructConfig, views: ReconstructionViews):
-        self.folder = work_folder(out)
-        self.file = _checkpoint_file(out)
+        self.folder, self.file = work_folder(out), _checkpoint_file(out)
         self._config = _compared_fields(config)
         digest = hashlib.sha256()
-        for tensor in (
-            views.images,
-            views.depths,
-            views.valid,
-            views.viewmats,
-            views.K,
-            views.gains,
-        ):
-            digest.update(tensor.numpy().tobytes())
+        for name in ("images", "depths", "valid", "viewmats", "K", "gains"):
+            digest.update(getattr(views, name).numpy().tobytes())
         self._capture = digest.hexdigest()
 
     def save(self, content: dict[str, Any]) -> None:
-        """Replaces what was kept.
+        """Replaces the checkpoint.
 
         Raises:
-            OSError: if it cannot be written, for example because the disk is full; what was kept
-                before is kept.
+            OSError: if it cannot be written; the last checkpoint is kept.
         """
-        own = {"version": VERSION, "config": self._config, "capture": self._capture}
+        header = {"version": _VERSION, "config": self._config, "capture": self._capture}
         self.folder.mkdir(parents=True, exist_ok=True)
-        save_tensors({**own, **content}, self.file)
+        save_tensors(header | content, self.file)
 
     def load(self) -> dict[str, Any] | None:
-        """Returns what was kept last, or None if nothing was.
+        """Returns the last checkpoint, or None.
 
         Raises:
-            ValueError: if the file is damaged, or belongs to another configuration or capture.
+            ValueError: if it is damaged, or of another configuration or capture.
         """
         content = _read(self.file, self._config)
-        if content is None:
-            return None
-        if content["capture"] != self._capture:
+        if content is not None and content["capture"] != self._capture:
             raise ValueError(
                 f"{self.file}: an interrupted run on another capture, or its files have changed; "
                 f"{_REMEDY}"
@@ -140,55 +126,54 @@ class Checkpoint:
 
 
 def require_same_run(out: Path, config: ReconstructConfig) -> None:
-    """Checks what an interrupted run has left beside `out`, before anything slow is prepared.
+    """Checks a checkpoint of `out` before anything slow is prepared.
 
     Raises:
-        ValueError: if that is damaged, or of another configuration.
+        ValueError: if it is damaged, or of another configuration.
     """
     _read(_checkpoint_file(out), _compared_fields(config))
 
 
 def _compared_fields(config: ReconstructConfig) -> dict[str, Any]:
-    fields = asdict(config)
-    return {name: fields[name] for name in fields if name not in _INDIFFERENT}
+    return {name: value for name, value in asdict(config).items() if name not in _UNCOMPARED}
 
 
 def _read(file: Path, config: dict[str, Any]) -> dict[str, Any] | None:
-    """What a file holds, which must be of a run with `config`; None if there is no file."""
+    """Returns the content of a checkpoint of a run with `config`; None if there is no file."""
     if not file.exists():
         return None
     try:
         content = load_tensors(file)
     except ValueError as error:
         raise ValueError(f"{file}: not a readable checkpoint ({error}); {_REMEDY}") from None
-    if content.get("version") != VERSION:
+    if content.get("version") != _VERSION:
         raise ValueError(f"{file}: written by another version of the program; {_REMEDY}")
     for name, value in config.items():
-        kept = content["config"].get(name)
-        if kept != value:
+        saved = content["config"].get(name)
+        if saved != value:
             raise ValueError(
-                f"{file}: an interrupted run with {name} {kept}, not {value}; "
-                f"set it so to go on; or {_REMEDY}"
+                f"{file}: an interrupted run with {name} {saved}, not {value}; set {name}={saved} "
+                f"to resume, or {_REMEDY}"
             )
     return content
 
 
 @contextmanager
 def event_log(folder: str) -> Iterator[Callable[[int, dict[str, float]], None]]:
-    """Yields a function that logs numbers of a step for tensorboard; it does nothing without a
-    folder.
+    """Yields a function that logs metrics of a step for tensorboard; without a folder, it does
+    nothing.
 
     Raises:
-        ModuleNotFoundError: tensorboard is wanted and not installed.
+        ModuleNotFoundError: if tensorboard is required and not installed.
     """
     if not folder:
-        yield lambda step, figures: None
+        yield lambda step, metrics: None
         return
     tensorboard = import_extra("torch.utils.tensorboard", "tensorboard")
     with tensorboard.SummaryWriter(folder) as writer:
 
-        def log(step: int, figures: dict[str, float]) -> None:
-            for name, value in figures.items():
+        def log(step: int, metrics: dict[str, float]) -> None:
+            for name, value in metrics.items():
                 writer.add_scalar(name, value, step)
 
         yield log

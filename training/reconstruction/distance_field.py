@@ -1,10 +1,9 @@
-"""The distance field of a reconstruction: from depth rendered at the poses of the capture."""
+"""The distance field of a reconstruction, fused from depth at the poses of the capture."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
@@ -12,29 +11,27 @@ from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.esdf_build import bounds_of_depth_images, esdf_from_depth_images
 from splatpilot.systems.splats.background import FAR
-from splatpilot.systems.splats.baked_scene import create_renderer
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.training.captures.capture import Capture, shrink_mask
 from splatpilot.training.reconstruction.config import ReconstructConfig
-from splatpilot.training.reconstruction.splat_rendering import render
+from splatpilot.training.reconstruction.metrics import SceneRenderer
 from splatpilot.training.reconstruction.views import ShrunkFrames
 
-# Fields are compared where the true one is at most this far from a surface [m].
+# Fields are compared up to this distance from true surfaces [m].
 _NEAR = 0.5
-# The median depth of a scene of unknown scale is taken to be this [m].
+# If the scale is unknown, the median depth counts as this [m].
 _MEDIAN_DEPTH = 2.0
-# What is not given: rooms have this range and these voxels [m], larger places multiples of their
-# median depth, and as many voxels as a flight loads in seconds.
+# Defaults: range and voxels of rooms [m]; range of larger scenes in median depths, and their number
+# of voxels, which a flight loads in seconds.
 _RANGE, _VOXEL_SIZE = 8.0, 0.05
 _RANGE_OF_MEDIAN = 1.5
 _VOXELS = 20e6
-# So many images are enough for the median of their depths.
-_MEDIAN_IMAGES = 100
+_MEDIAN_IMAGES = 100  # whose depths give the median
 
 
 @dataclass(frozen=True)
 class DepthSource:
-    """Depth images (H, W) [m] with their poses, loaded one by one and as often as wanted."""
+    """Depth images (H, W) [m] with their poses, loaded one by one."""
 
     load: Callable[[int], NDArray[np.float32]]
     K: NDArray[np.float64]  # (3, 3) [px]
@@ -44,7 +41,7 @@ class DepthSource:
         return (self.load(i) for i in range(len(self.X_WCs)))
 
     def median(self, far: float) -> float:
-        """[m], of what is nearer than `far` [m] in images all along the path; 0 if nothing is."""
+        """Returns the median depth [m] below `far` [m] of images along the path; 0 without any."""
         step = -(-len(self.X_WCs) // _MEDIAN_IMAGES)
         depths = [self.load(i)[::4, ::4] for i in range(0, len(self.X_WCs), step)]
         depth = np.concatenate([d[(d > 0) & (d < far)] for d in depths])
@@ -52,73 +49,41 @@ class DepthSource:
 
 
 def render_depth(
-    gaussians: GaussianScene,
-    representation: str,
-    K: NDArray[np.float64],
-    width: int,
-    height: int,
-    X_WCs: Sequence[RigidTransform],
-    threads: int,
-) -> DepthSource:
-    """Returns what cameras would measure in the scene: median depth, 0 where no surface is."""
-    tensors = tuple(
-        torch.from_numpy(getattr(gaussians, name))
-        for name in ("means", "quats", "scales", "opacities", "sh")
-    )
-    renderer = create_renderer(threads)
-
-    def load(i: int) -> NDArray[np.float32]:
-        viewmat = torch.from_numpy(X_WCs[i].inverse().GetAsMatrix4()).float()[None]
-        with torch.no_grad():
-            rendering = render(
-                representation,
-                tensors,  # pyright: ignore[reportArgumentType]
-                viewmat,
-                torch.from_numpy(K).float()[None],
-                width,
-                height,
-                depth_mode="MD",
-                renderer=renderer,
-            )
-        return rendering.depth.numpy()
-
-    return DepthSource(load, K, X_WCs)
-
-
-def render_depth_of(
     capture: Capture, factor: int, gaussians: GaussianScene, representation: str, threads: int
 ) -> DepthSource:
-    """Returns what the cameras of a capture would measure in the scene, see `render_depth`, in
-    images shrunken by a whole `factor`; nothing in pixels of which some is invalid."""
+    """Returns the median depth that the cameras of a capture measure in the scene, 0 without a
+    surface and in invalid pixels, in images shrunk by a whole `factor`."""
     K = capture.K.copy()
     K[:2] /= factor
     width, height = capture.width // factor, capture.height // factor
-    rendered = render_depth(gaussians, representation, K, width, height, capture.X_WCs, threads)
+    renderer = SceneRenderer(gaussians, representation, threads)
 
     def load(i: int) -> NDArray[np.float32]:
         valid = np.broadcast_to(capture.load_valid(i), (capture.height, capture.width))
-        return np.where(shrink_mask(valid, factor), rendered.load(i), np.float32(0))
+        depth = renderer.render(K, width, height, capture.X_WCs[i]).depth
+        return np.where(shrink_mask(valid, factor), depth, np.float32(0))
 
     return DepthSource(load, K, capture.X_WCs)
 
 
 def add_sky(rendered: DepthSource, frames: ShrunkFrames) -> DepthSource:
-    """Returns rendered depth that is infinite where nothing is rendered and the frame of the same
-    number shows the infinitely far: there the space before the sky was seen to be free."""
-    places = {number: k for k, number in enumerate(frames.numbers)}
+    """Returns rendered depth that is infinite where nothing is rendered and the fitted frame shows
+    the sky, which frees the space before it."""
+    positions = {number: k for k, number in enumerate(frames.numbers)}
 
     def load(i: int) -> NDArray[np.float32]:
         depth = rendered.load(i)
-        if i not in places:
+        if i not in positions:
             return depth
-        return np.where((depth == 0) & (frames[places[i]].depth >= FAR), np.float32(np.inf), depth)
+        sky = (depth == 0) & (frames[positions[i]].depth >= FAR)
+        return np.where(sky, np.float32(np.inf), depth)
 
     return DepthSource(load, rendered.K, rendered.X_WCs)
 
 
 @dataclass(frozen=True)
 class FieldGrid:
-    """The grid of a distance field, and how far depth is believed."""
+    """The grid of a distance field, and the maximum depth that counts."""
 
     lower_W: NDArray[np.float64]  # (3,) [m]
     upper_W: NDArray[np.float64]  # (3,) [m]
@@ -127,9 +92,8 @@ class FieldGrid:
 
 
 def choose_grid(source: DepthSource, metric: bool, config: ReconstructConfig) -> FieldGrid:
-    """Returns the grid that holds what depth images show, as fine and as far as the config says or,
-    where it says nothing, as suits the place. Lengths of the config are metres, or those of a place
-    whose median depth is `_MEDIAN_DEPTH` where the scale is unknown."""
+    """Returns the grid that holds the depth images, with the config's voxels and range or their
+    defaults; see `ReconstructConfig` for their unit."""
     median = source.median(FAR if metric else np.inf)
     unit = 1.0 if metric else max(median, 1e-6) / _MEDIAN_DEPTH
     max_range = config.max_range * unit or max(_RANGE * unit, _RANGE_OF_MEDIAN * median)
@@ -140,7 +104,7 @@ def choose_grid(source: DepthSource, metric: bool, config: ReconstructConfig) ->
 
 
 def fuse(source: DepthSource, grid: FieldGrid) -> Esdf:
-    """Fuses depth images into a distance field; space that no image saw is marked unknown."""
+    """Fuses depth images into a distance field; space that no image saw is unknown."""
     return esdf_from_depth_images(
         source.images(),
         source.K,
@@ -154,13 +118,13 @@ def fuse(source: DepthSource, grid: FieldGrid) -> Esdf:
 
 @dataclass(frozen=True)
 class FieldDifference:
-    """How a distance field differs from the true one, near surfaces and where both are known."""
+    """Errors of a distance field near true surfaces, where both fields are known."""
 
-    mean: float  # [m], positive: surfaces seem farther than they are
+    mean: float  # [m], positive: surfaces seem too far
     median_absolute: float  # [m]
     p95_absolute: float  # [m]
-    blocked: float  # fraction of space that is free by a voxel or more, but counts as occupied
-    opened: float  # fraction of space that is occupied, but counts as free by a voxel or more
+    blocked: float  # fraction of space free by a voxel or more that is occupied in the field
+    opened: float  # fraction of occupied space that is free by a voxel or more in the field
 
     def __str__(self) -> str:
         return (
@@ -171,7 +135,7 @@ class FieldDifference:
 
 
 def compare_fields(field: Esdf, truth: Esdf) -> FieldDifference | None:
-    """Compares two fields on the same grid; None if nothing near a surface is known in both."""
+    """Compares two fields on the same grid; None if they share nothing near a surface."""
     d, d_true = field.distances, truth.distances
     known = (field.states != FieldState.UNKNOWN) & (truth.states != FieldState.UNKNOWN)
     free = known & (d_true > truth.voxel_size)
@@ -192,33 +156,35 @@ def compare_fields(field: Esdf, truth: Esdf) -> FieldDifference | None:
 def make_distance_field(
     capture: Capture, frames: ShrunkFrames, gaussians: GaussianScene, config: ReconstructConfig
 ) -> tuple[Esdf, FieldDifference | None, DepthSource]:
-    """Returns the distance field of a reconstruction, from depth rendered or captured; if the
-    capture has depth and was optimised, how the former differs from that of all captured depth;
-    and all depth that is known best: captured or, without any, rendered.
+    """Makes the distance field of a reconstruction.
 
     Args:
-        capture: what was seen.
-        frames: those of its frames that were fitted, as small as they were for that.
-        gaussians: what came of it.
-        config: how.
+        capture: source of captured depth.
+        frames: fitted frames, as they were fitted.
+        gaussians: reconstructed.
+        config: how to reconstruct.
+
+    Returns:
+        The field; the difference between rendered and captured field, if the capture has depth and
+        was optimized; the captured depth or, if there is none, the rendered depth.
     """
-    every = DepthSource(capture.registered_depth, capture.K, capture.X_WCs)
+    captured = DepthSource(capture.registered_depth, capture.K, capture.X_WCs)
     if config.iterations == 0:
-        return fuse(every, choose_grid(every, capture.metric, config)), None, every
-    rendered = render_depth_of(
+        return fuse(captured, choose_grid(captured, capture.metric, config)), None, captured
+    rendered = render_depth(
         capture, frames.factor, gaussians, config.representation, config.renderer_threads
     )
     if not capture.has_depth:
         return fuse(rendered, choose_grid(rendered, capture.metric, config)), None, rendered
-    grid = choose_grid(every, capture.metric, config)
-    truth = fuse(every, grid)
+    grid = choose_grid(captured, capture.metric, config)
+    truth = fuse(captured, grid)
     field = fuse(add_sky(rendered, frames), grid)
     difference = compare_fields(field, truth)
     if config.distance_field == "rendered":
-        return field, difference, every
-    seen = DepthSource(
+        return field, difference, captured
+    fitted = DepthSource(
         lambda k: capture.registered_depth(frames.numbers[k]),
         capture.K,
         [capture.X_WCs[i] for i in frames.numbers],
     )
-    return fuse(seen, choose_grid(seen, capture.metric, config)), difference, every
+    return fuse(fitted, choose_grid(fitted, capture.metric, config)), difference, captured

@@ -4,21 +4,29 @@ import importlib.util
 import os
 from functools import cache
 from pathlib import Path
-from pickle import UnpicklingError
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import adaptive_avg_pool2d, conv2d
 
-# The layers of SqueezeNet 1.1 (Iandola et al. 2016) below its classifier.
-#
-# They are torchvision's in order and names, so that its weights fit. Importing torchvision takes
-# seconds and loads Triton, whose LLVM ends the process where that of Mesa's OpenGL is there
-# already.
+from splatpilot.systems.common.validation import require
+
+_FILE = Path("weights") / "lpips_squeeze.pt"
+_BACKBONE = "squeezenet1_1-b8a52dc0.pth"
+# ImageNet's, which LPIPS applies as a shift and a scale of images in [-1, 1].
+_MEAN, _STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+# Layers of SqueezeNet 1.1 after which features are compared.
+_TAPS = (1, 4, 7, 9, 10, 11, 12)
+_CHANNELS = (64, 128, 256, 384, 384, 512, 512)
+_MIN_SIZE = 17  # [px] for the last pooling
+
+# SqueezeNet 1.1 (Iandola et al. 2016) without its classifier, with torchvision's names of weights.
+# Importing torchvision takes seconds and loads Triton, whose LLVM aborts the process if Mesa's
+# OpenGL has loaded another.
 
 
 class Fire(nn.Module):
-    """A 1x1 convolution that narrows, then 1x1 and 3x3 ones beside each other that widen."""
+    """A 1x1 convolution to few channels, then parallel 1x1 and 3x3 convolutions to many."""
 
     def __init__(self, inputs: int, narrow: int, wide: int):
         super().__init__()
@@ -32,28 +40,17 @@ class Fire(nn.Module):
 
 
 def squeezenet_features() -> nn.Sequential:
-    """The layers, with weights that nobody has trained: (N, 3, H, W) to (N, 512, h, w)."""
+    """Returns the untrained layers, (N, 3, H, W) to (N, 512, h, w)."""
 
-    def smaller() -> nn.MaxPool2d:
+    def pool() -> nn.MaxPool2d:
         return nn.MaxPool2d(3, 2, ceil_mode=True)
 
     return nn.Sequential(
-        *(nn.Conv2d(3, 64, 3, 2), nn.ReLU(), smaller()),
-        *(Fire(64, 16, 64), Fire(128, 16, 64), smaller()),
-        *(Fire(128, 32, 128), Fire(256, 32, 128), smaller()),
+        *(nn.Conv2d(3, 64, 3, 2), nn.ReLU(), pool()),
+        *(Fire(64, 16, 64), Fire(128, 16, 64), pool()),
+        *(Fire(128, 32, 128), Fire(256, 32, 128), pool()),
         *(Fire(256, 48, 192), Fire(384, 48, 192), Fire(384, 64, 256), Fire(512, 64, 256)),
     )
-
-
-# ImageNet's, which LPIPS applies as a shift and a scale of images in [-1, 1].
-_MEAN, _STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-# Layers of SqueezeNet 1.1 after which features are compared.
-_TAPS = (1, 4, 7, 9, 10, 11, 12)
-_CHANNELS = (64, 128, 256, 384, 384, 512, 512)
-_SMALLEST = 17  # [px], below which the last pooling has nothing left
-
-_FILE = Path("weights") / "lpips_squeeze.pt"
-_BACKBONE = "squeezenet1_1-b8a52dc0.pth"
 
 
 class Lpips:
@@ -61,19 +58,17 @@ class Lpips:
     Deep Features as a Perceptual Metric", CVPR 2018).
 
     With f_l the features of layer l, each pixel's scaled to unit length over channels, the distance
-    is the sum over seven layers of the mean over pixels of w_l . (f_l(a) - f_l(b))^2. Its figures
-    ("LPIPS-squeeze") are not to be compared with those of the AlexNet or VGG backbones.
-
-    The network is loaded once a process.
+    is the sum over seven layers of the mean over pixels of w_l . (f_l(a) - f_l(b))^2. It is not
+    comparable with that of the AlexNet or VGG backbones. A process loads the network once.
 
     Args:
-        weights: a file `{"squeezenet1_1": state dict, "lin": state dict}` as torch saves it. When
-            None, `$SPLATPILOT_DATA/weights/lpips_squeeze.pt`; without that, torchvision's
-            downloaded SqueezeNet with the linear layers of the installed package `lpips`.
+        weights: a file `{"squeezenet1_1": state dict, "lin": state dict}` of torch. By default,
+            `$SPLATPILOT_DATA/weights/lpips_squeeze.pt` or else torchvision's downloaded SqueezeNet
+            with the linear layers of the installed package `lpips`.
 
     Raises:
-        FileNotFoundError: no weights are there; the message says how to get them.
-        ValueError: the file holds something else.
+        FileNotFoundError: if there are no weights; the message says how to get them.
+        ValueError: if the file holds something else.
     """
 
     def __init__(self, weights: Path | None = None):
@@ -85,18 +80,17 @@ class Lpips:
         Returns the distance of two images, a scalar at least 0, differentiable in `a`.
 
         Args:
-            a, b: (..., H, W, 3) float32, red, green, blue in [0, 1]; of several the mean is taken.
-            weights: (..., H, W) of the pixels; a cell of a layer has the mean weight of the pixels
-                that it stands for. Equal weights, as published, if None.
-
-        Raises:
-            ValueError: the shapes differ, are none of images, or smaller than 17 pixels.
+            a, b: (..., H, W, 3) float32, RGB in [0, 1]; the distance of several is their mean.
+            weights: (..., H, W) of the pixels, averaged over each cell of a layer. Equal by
+                default, as published.
         """
-        if a.shape != b.shape or a.ndim < 3 or a.shape[-1] != 3 or min(a.shape[-3:-1]) < _SMALLEST:
-            raise ValueError(
-                f"images have shapes {tuple(a.shape)} and {tuple(b.shape)}; both must be "
-                f"(..., H, W, 3) of one size, at least {_SMALLEST} pixels high and wide"
-            )
+        valid = a.shape == b.shape and a.ndim >= 3 and a.shape[-1] == 3
+        require(
+            valid and min(a.shape[-3:-1]) >= _MIN_SIZE,
+            "images",
+            f"(..., H, W, 3) of one size of at least {_MIN_SIZE} pixels",
+            f"{tuple(a.shape)} and {tuple(b.shape)}",
+        )
         layers, linear = _load(self._source, a.device)
         features = _features(layers, a)
         with torch.no_grad():
@@ -134,7 +128,7 @@ def _find(weights: Path | None) -> tuple[Path, ...]:
     """Returns one file with all weights, or torchvision's backbone and the package's layers."""
     if weights is not None:
         if not weights.is_file():
-            raise FileNotFoundError(f"{weights}: no such file, LPIPS weights are expected there")
+            raise FileNotFoundError(f"No such file: {weights}")
         return (weights,)
     in_data = Path(os.environ.get("SPLATPILOT_DATA", "")) / _FILE
     if "SPLATPILOT_DATA" in os.environ and in_data.is_file():
@@ -145,7 +139,7 @@ def _find(weights: Path | None) -> tuple[Path, ...]:
         return (backbone, Path(package.origin).parent / "weights" / "v0.1" / "squeeze.pth")
     raise FileNotFoundError(
         "LPIPS has no weights: neither $SPLATPILOT_DATA/weights/lpips_squeeze.pt nor torchvision's "
-        f"{backbone} with the package `lpips` is there; run `pip install lpips` and `python -c "
+        f"{backbone} with the package `lpips` exists; run `pip install lpips` and `python -c "
         "\"import torchvision; torchvision.models.squeezenet1_1(weights='DEFAULT')\"` once"
     )
 
@@ -168,17 +162,8 @@ def _load(source: tuple[Path, ...], device: torch.device) -> tuple[nn.Sequential
         )
         weights = [linear[f"lin{i}.model.1.weight"].float() for i in range(len(_TAPS))]
         if [w.shape for w in weights] != [(1, channels, 1, 1) for channels in _CHANNELS]:
-            raise ValueError("linear layers of other sizes")
-    except (
-        UnpicklingError,
-        OSError,
-        RuntimeError,
-        LookupError,
-        TypeError,
-        AttributeError,
-        ValueError,
-        EOFError,
-    ) as error:
+            raise ValueError("linear layers have other sizes")
+    except Exception as error:  # unpickling may raise anything
         raise ValueError(
             f"{' and '.join(map(str, source))}: no LPIPS-squeeze weights ({str(error)[:200]}); "
             "get them again"

@@ -1,4 +1,4 @@
-"""How bright each image of a capture is beside the others, and how much its corners darken."""
+"""Photometry of a capture: overlap of its frames, gains of its images and vignetting."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
@@ -17,15 +17,14 @@ from splatpilot.training.captures.capture import CaptureFrame, back_project
 
 
 def radius_squared(width: int, height: int) -> NDArray[np.float64]:
-    """Returns rho^2 (height, width) of each pixel: rho is the distance from the image's centre, 1
-    in the corners."""
+    """Returns rho^2 (height, width), rho being the distance from the center, 1 in the corners."""
     x = np.arange(width) + 0.5 - width / 2
     y = (np.arange(height) + 0.5 - height / 2)[:, None]
     return (x**2 + y**2) / ((width**2 + height**2) / 4)
 
 
 def vignette(vignetting: float, width: int, height: int) -> NDArray[np.float64]:
-    """Returns the brightness (height, width) of each pixel relative to the image's centre.
+    """Returns the brightness (height, width) of each pixel relative to the image's center.
 
     Args:
         vignetting: logarithm of the relative brightness of the corners.
@@ -35,25 +34,25 @@ def vignette(vignetting: float, width: int, height: int) -> NDArray[np.float64]:
 
 
 STRIDE = 2
-"""Views keep every second pixel along each axis."""
+"""Thinned frames keep every second pixel along each axis."""
 
-# Depths agree within this fraction, plus what the slope of the surface does to one pixel.
-_DEPTH_TOLERANCE = 0.01
-
-_COARSER = 1.5
+_DEPTH_TOLERANCE = 0.01  # relative, of depth on the same surface, without its slope
+_COARSER = 1.5  # size of pixels that count as finest, relative to the finest
+_SAMPLES_PER_PAIR = 100
+_BRIGHTNESS = (0.1, 0.98)  # outside, noise or saturation spoils the ratio
 
 
 @dataclass(frozen=True, eq=False)
 class ThinnedFrame:
-    """A frame thinned to what the comparison of frames needs; (h, w) = (H, W) / `STRIDE`."""
+    """A frame for comparison with others; (h, w) = (H, W) / `STRIDE`."""
 
     X_WC: RigidTransform
     K: NDArray[np.float64]  # (3, 3) [px], of the whole frame
-    depth: NDArray[np.floating]  # (h, w) [m]; 0 where there is none, or what is infinitely far
+    depth: NDArray[np.floating]  # (h, w) [m]; 0 if unknown or sky
     tolerance: NDArray[np.floating]  # (h, w) [m], difference of depth on the same surface
     pixel_size: NDArray[np.floating]  # (h, w) [m], longest extent of a whole pixel on the surface
     luminance: NDArray[np.floating]  # (h, w), 0 to 1
-    radius_squared: NDArray[np.floating]  # (h, w), squared distance from the image centre; corner 1
+    radius_squared: NDArray[np.floating]  # (h, w), see `radius_squared`
 
     @classmethod
     def of(cls, frame: CaptureFrame) -> "ThinnedFrame":
@@ -65,9 +64,9 @@ class ThinnedFrame:
             w = np.where(depth > 0, 1 / depth, 0)
         w_v, w_u = (_smaller_difference(w, axis)[thin] for axis in (0, 1))
         depth = depth[thin]
-        # A plane is linear in inverse depth w: z changes by z^2 dw over one pixel, and the surface
-        # is turned away from the ray by about f z |dw|.
-        slope = depth * np.hypot(w_u, w_v)  # relative change of depth a pixel
+        # A plane is linear in inverse depth w: z changes by z^2 dw over one pixel, and the slope
+        # against the ray is about f z |dw|.
+        slope = depth * np.hypot(w_u, w_v)  # relative change of depth per pixel
         f = frame.K[0, 0]
         return cls(
             X_WC=frame.X_WC,
@@ -90,10 +89,8 @@ class ThinnedFrame:
         return self.X_WC.multiply(p_CQ.T), index
 
     def find(self, p_WQ: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Finds which of the points (3, n) this view sees.
-
-        Returns their numbers and the flat index of the pixel that shows each.
-        """
+        """Returns the indices of the points (3, n) that this view sees, and the flat index of the
+        pixel of each."""
         h, w = self.depth.shape
         x, y, z = self.X_WC.inverse().multiply(p_WQ)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -110,9 +107,8 @@ def find_new_pixels(
 ) -> list[NDArray[np.bool_]]:
     """Finds, for each view, the pixels (h, w) to keep so that every point is kept about once.
 
-    Kept are pixels that are nearly the finest which any view has of their point (at most `_COARSER`
-    times as large on the surface), in the first view that has them: views are visited from the
-    closest to the farthest, those numbered in `last` after the others.
+    Keeps pixels that are nearly the finest of their point, in the first view that has them. Views
+    are visited from the closest to the farthest, those with an index in `last` after the others.
     """
     points = [view.points() for view in views]
     overlapping = [_overlapping(view, views) for view in views]
@@ -140,24 +136,23 @@ def find_new_pixels(
                 number, shown = views[j].find(p_WQ)
                 covered[pixel[number]] |= new[j].flat[shown]
         keep = fine[i] & ~covered.reshape(view.depth.shape)
-        # Without the speckle where two views are about equally fine.
+        # Without speckle where two views are about equally fine.
         new[i] = (cv2.medianBlur(keep.astype(np.uint8), 5) > 0) & (view.depth > 0)
     return [new[i] for i in range(len(views))]
 
 
 def seen_pixels(frame: CaptureFrame, views: Sequence[ThinnedFrame]) -> NDArray[np.bool_]:
-    """Returns the pixels (H, W) of a frame whose point one of the views has seen; and those without
-    depth, of which nobody can say."""
+    """Returns the pixels (H, W) of a frame whose point one of the views saw, or without depth."""
     own = ThinnedFrame.of(frame)
     p_WQ, pixel = own.points()
     seen = own.depth.ravel() == 0
     p_WC = own.X_WC.translation()
-    # The nearest first: most points are found there.
+    # The closest first: they find most points.
     for view in sorted(views, key=lambda v: float(np.linalg.norm(v.X_WC.translation() - p_WC))):
         number, _ = view.find(p_WQ)
         seen[pixel[number]] = True
         p_WQ, pixel = np.delete(p_WQ, number, axis=1), np.delete(pixel, number)
-    # With the speckle along edges, where depths of one point disagree.
+    # Closes speckle along edges, where depths of one point disagree.
     image = seen.reshape(own.depth.shape).astype(np.uint8)
     image = cv2.morphologyEx(image, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     height, width = frame.depth.shape
@@ -165,13 +160,13 @@ def seen_pixels(frame: CaptureFrame, views: Sequence[ThinnedFrame]) -> NDArray[n
 
 
 def _overlapping(view: ThinnedFrame, views: Sequence[ThinnedFrame]) -> list[int]:
-    """Returns the numbers of the views that see some of a few points of `view`."""
+    """Returns the indices of the views that see some points of `view`."""
     p_WQ, _ = view.points(step=8)
     return [j for j, other in enumerate(views) if len(other.find(p_WQ)[0])]
 
 
 def _smaller_difference(values: NDArray, axis: int) -> NDArray:
-    """Returns the forward or backward difference, whichever is smaller: edges do not spoil it."""
+    """Returns the smaller of forward and backward difference, which ignores edges."""
     step = np.diff(values, axis=axis)
     ends = [(0, 0), (0, 0)]
     ends[axis] = (0, 1)
@@ -181,19 +176,14 @@ def _smaller_difference(values: NDArray, axis: int) -> NDArray:
     return np.where(np.abs(forward) < np.abs(backward), forward, backward)
 
 
-_SAMPLES_PER_PAIR = 100
-_BRIGHTNESS = (0.1, 0.98)  # outside, noise or saturation spoils the ratio
-
-
 @dataclass(frozen=True, eq=False)
 class Photometry:
     """Relates image values I to those of the scene S: I = gain_i exp(vignetting rho^2) S.
 
-    rho is the distance from the image centre, 1 in the corners. The scene has the mean brightness
-    of the image centres: the logarithms of the gains have the mean 0.
+    The logarithms of the gains have the mean 0. For rho, see `radius_squared`.
     """
 
-    gains: NDArray[np.float64]  # (n,), one for each image
+    gains: NDArray[np.float64]  # (n,)
     vignetting: float  # logarithm of the relative brightness of the corners, at most 0
 
     def factor(self, i: int, height: int, width: int) -> NDArray[np.float32]:
@@ -202,12 +192,11 @@ class Photometry:
 
 
 def estimate_photometry(views: Sequence[ThinnedFrame], seed: int) -> Photometry:
-    """Estimates gains and vignetting from the points that two views or more show.
+    """Estimates gains and vignetting from points that at least two views show.
 
-    Each such point gives one equation, log I_i - log I_j = g_i - g_j + a (rho_i^2 - rho_j^2); they
-    are solved for the log gains g and the vignetting a with the least sum of absolute residuals
-    (iteratively reweighted least squares), since surfaces that shine break some of them. What the
-    equations leave open is pulled to 0.
+    Each gives an equation, log I_i - log I_j = g_i - g_j + a (rho_i^2 - rho_j^2), for the log gains
+    g and the vignetting a. Iteratively reweighted least squares minimize the sum of absolute
+    residuals, for shiny surfaces give outliers; damping makes free variables 0.
     """
     rng = np.random.default_rng(seed)
     n = len(views)
@@ -217,8 +206,8 @@ def estimate_photometry(views: Sequence[ThinnedFrame], seed: int) -> Photometry:
         for j, other in enumerate(views):
             if i == j:
                 continue
-            number, pixel_j = other.find(p_WQ)
-            I_i, I_j = view.luminance.flat[pixel_i[number]], other.luminance.flat[pixel_j]
+            index, pixel_j = other.find(p_WQ)
+            I_i, I_j = view.luminance.flat[pixel_i[index]], other.luminance.flat[pixel_j]
             low, high = _BRIGHTNESS
             usable = np.flatnonzero((np.minimum(I_i, I_j) > low) & (np.maximum(I_i, I_j) < high))
             if len(usable) < _SAMPLES_PER_PAIR:
@@ -228,7 +217,7 @@ def estimate_photometry(views: Sequence[ThinnedFrame], seed: int) -> Photometry:
             second.append(np.full(_SAMPLES_PER_PAIR, j))
             log_ratio.append(np.log(I_i[usable] / I_j[usable]))
             radius_difference.append(
-                view.radius_squared.flat[pixel_i[number[usable]]]
+                view.radius_squared.flat[pixel_i[index[usable]]]
                 - other.radius_squared.flat[pixel_j[usable]]
             )
     if not first:
@@ -251,8 +240,8 @@ def estimate_photometry(views: Sequence[ThinnedFrame], seed: int) -> Photometry:
 
 
 def fit_gain(color: Tensor, image: Tensor, valid: Tensor) -> float:
-    """Returns the factor by which `color` (H, W, 3) comes nearest to `image` in the least-squares
-    sense, over pixels `valid` (H, W) that are not saturated."""
+    """Returns the least-squares factor from `color` (H, W, 3) to `image`, over unsaturated pixels
+    `valid` (H, W)."""
     usable = (image < _BRIGHTNESS[1]) & valid[..., None]
     x, y = color[usable].double(), image[usable].double()
     return float((x * y).sum() / (x * x).sum().clamp(min=1e-9))

@@ -1,4 +1,4 @@
-"""From a capture to a scene folder that can be flown in."""
+"""Reconstruction of a capture as a scene folder."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -27,14 +27,14 @@ from splatpilot.training.reconstruction.checkpoint import Checkpoint, require_sa
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.distance_field import FieldDifference, make_distance_field
 from splatpilot.training.reconstruction.initialize import (
-    detail_of,
     gaussians_from_depth,
     held_out_frames,
     make_initial_gaussians,
     resolve_config,
+    surface_detail,
 )
 from splatpilot.training.reconstruction.lpips import Lpips
-from splatpilot.training.reconstruction.metrics import HeldOutMeasures
+from splatpilot.training.reconstruction.metrics import HeldOutMetrics
 from splatpilot.training.reconstruction.optimize import Optimization
 from splatpilot.training.reconstruction.photometry import (
     Photometry,
@@ -47,28 +47,28 @@ from splatpilot.training.reconstruction.views import (
     learn_background,
 )
 
-_NAMED = 10
-"""Of frames that lack something, how many are named."""
+_MAX_NAMED = 10
+"""Maximum number of frames in a warning."""
 
 
 @dataclass(frozen=True)
 class ReconstructSummary:
-    """What was made."""
+    """A reconstructed scene."""
 
     scene: Path
     frames: int
     gaussians: int
     vignetting: float
     gain_range: tuple[float, float]
-    metric: bool  # lengths are in units of their own where it is false
+    metric: bool  # whether lengths are in meters
     lower_W: NDArray[np.float64]  # (3,) [m]
     upper_W: NDArray[np.float64]  # (3,) [m]
-    voxel_size: float  # [m], of the distance field
+    voxel_size: float  # [m]
     observed_free_volume: float  # [m^3]
     p_WS: NDArray[np.float64]  # (3,) [m]
     p_WG: NDArray[np.float64]  # (3,) [m]
-    geodesic: float  # [m], length of the shortest path from start to goal
-    held_out: HeldOutMeasures | None = None
+    geodesic: float  # [m], shortest path from start to goal
+    held_out: HeldOutMetrics | None = None
     field_difference: FieldDifference | None = None
     notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
@@ -108,16 +108,14 @@ class ReconstructSummary:
 def reconstruct(
     capture: Capture, out: str | Path, config: ReconstructConfig, *, restart: bool = False
 ) -> ReconstructSummary:
-    """Turns a capture into the scene folder `out`.
+    """Reconstructs a capture as the scene folder `out`.
 
-    While it runs, checkpoints are kept in the folder `.NAME.partial` beside `out`; run again after
-    an interruption, it goes on from there and ends in the same scene, bit for bit. With `restart`
-    it begins anew.
+    Checkpoints are in the folder `.NAME.partial` next to `out`; after an interruption, the same
+    call resumes and ends in the bitwise identical scene. With `restart` it starts again.
 
     Raises:
-        ValueError, OSError: for a damaged capture, a config that makes no sense, a checkpoint of
-            another run, or a folder `out` that cannot be written or holds something else. No scene
-            is written then.
+        ValueError, OSError: for a damaged capture, an invalid config, a checkpoint of another run,
+            or a folder `out` that cannot be written or holds something else. No scene is written.
     """
     out = Path(out)
     config.validate()
@@ -137,25 +135,24 @@ def reconstruct(
     del thinned
     background = learn_background(frames, photometry)
     gains = np.ones(len(capture))
-    checkpoint = None
-    measured = None
+    checkpoint = metrics = None
     if config.iterations == 0:
         gains[fitted] = photometry.gains
-        gaussians = gaussians_from_depth(frames, photometry, detail_of(config))
+        gaussians = gaussians_from_depth(frames, photometry, surface_detail(config))
         how = "depth back-projected"
     else:
         views = ReconstructionViews(frames, photometry)
-        withheld = None
+        test_views = None
         if held_out:
             unknown = Photometry(np.ones(len(held_out)), photometry.vignetting)
-            withheld = ReconstructionViews(ShrunkFrames(capture, held_out, factor), unknown)
+            test_views = ReconstructionViews(ShrunkFrames(capture, held_out, factor), unknown)
         checkpoint = Checkpoint(out, config, views)
         if restart:
             checkpoint.remove()
         optimization = Optimization(
             config,
             views,
-            withheld,
+            test_views,
             background,
             lambda: make_initial_gaussians(capture, frames, photometry, views, config),
             checkpoint,
@@ -165,9 +162,9 @@ def reconstruct(
         optimization.run()
         gains[fitted] = optimization.gains
         gaussians = optimization.splats.scene(flat=config.representation == "2dgs")
-        measured = optimization.measure()
-        if measured is not None:
-            gains[held_out] = [view.gain for view in measured.views]
+        metrics = optimization.measure()
+        if metrics is not None:
+            gains[held_out] = [view.gain for view in metrics.views]
         how = f"{config.representation}, {config.iterations} steps"
 
     field, difference, depth = make_distance_field(capture, frames, gaussians, config)
@@ -210,7 +207,7 @@ def reconstruct(
         p_WS=p_WS,
         p_WG=p_WG,
         geodesic=geodesic,
-        held_out=measured,
+        held_out=metrics,
         field_difference=difference,
         notes=tuple(capture.notes),
         warnings=(*capture.dropped, *without_depth, *warnings),
@@ -218,7 +215,7 @@ def reconstruct(
 
 
 def _digested(capture: Capture, digests: set[str]) -> Capture:
-    """Returns the capture, which adds a digest of the pixels of each image that is loaded."""
+    """Returns the capture, which adds a digest of the pixels of each loaded image to `digests`."""
 
     def load_image(i: int) -> NDArray[np.uint8]:
         image = capture.load_image(i)
@@ -228,23 +225,19 @@ def _digested(capture: Capture, digests: set[str]) -> Capture:
     return replace(capture, load_image=load_image)
 
 
-def _source_and_split(capture: Capture, images: set[str], asked: str) -> tuple[list[str], str]:
-    """
-    Returns the digest of what a scene is made from, and its split: of the world that the capture
-    was rendered of, or else of its images.
+def _source_and_split(capture: Capture, images: set[str], split: str) -> tuple[list[str], str]:
+    """Returns the source digest of a scene and its split: those of the world that the capture was
+    rendered of, or else of its images.
 
     Args:
-        images: digests of those that the scene is fitted to.
-        asked: the split that the user gives it; empty for none.
-
-    Raises:
-        ValueError: if `asked` is another split than test for what is only tested in, or the capture
-            does not say what it was rendered of.
+        capture: of the scene.
+        images: digests of the fitted images.
+        split: given by the user; empty for none.
     """
     name = capture.folder or capture.name
     folder = Path(capture.folder)
     rendered = None
-    if capture.folder:  # the captures beside a rendered one stand in its folder
+    if capture.folder:  # a rendered capture may hold others
         rendered = rendered_world(folder) or rendered_world(folder.parent)
     if rendered is None:
         digests, found = images, "train"
@@ -252,28 +245,26 @@ def _source_and_split(capture: Capture, images: set[str], asked: str) -> tuple[l
         digests, found = set(rendered.source_digest), rendered.split
     else:
         raise ValueError(f"{name}/{RECIPE} has no source_digest; render the capture again")
-    return source_digest(digests), choose_split(name, digests, asked, found)
+    return source_digest(digests), choose_split(name, digests, split, found)
 
 
 def _without_depth(
     capture: Capture, numbers: Sequence[int], frames: Sequence[ThinnedFrame]
 ) -> tuple[str, ...]:
-    """A warning that names frames in which no pixel has depth, where others have."""
+    """Returns a warning that names frames without depth, if others have depth."""
     empty = [i for i, frame in zip(numbers, frames, strict=True) if not frame.depth.any()]
     if not capture.has_depth or not empty:
         return ()
     names = [capture.frame_names[i] if capture.frame_names else f"frame {i}" for i in empty]
-    listed = ", ".join(names[:_NAMED]) + (", ..." if len(names) > _NAMED else "")
+    listed = ", ".join(names[:_MAX_NAMED]) + (", ..." if len(names) > _MAX_NAMED else "")
     return (f"{len(empty)} of {len(frames)} frames have no pixel with depth: {listed}",)
 
 
 def start_and_goal(
-    field: Esdf, metric: bool, otherwise: tuple[NDArray[np.float64], NDArray[np.float64]]
+    field: Esdf, metric: bool, default: tuple[NDArray[np.float64], NDArray[np.float64]]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float, tuple[str, ...]]:
-    """Returns p_WS, p_WG, the length of the shortest path [m] and warnings.
-
-    Where nothing can fly, the scene can still be looked at: there the ends are `otherwise`.
-    """
+    """Returns p_WS, p_WG, the length of the shortest path [m] and warnings; the points `default` if
+    nothing can fly in the scene."""
     try:
         if metric:
             p_WS, p_WG, length = choose_start_and_goal(field, VEHICLE_RADIUS)
@@ -282,4 +273,4 @@ def start_and_goal(
         reason = "its scale is unknown"
     except InfeasibleFlightError as error:
         reason = str(error)
-    return *otherwise, float("nan"), (f"this scene cannot be flown in: {reason}",)
+    return *default, float("nan"), (f"this scene cannot be flown in: {reason}",)

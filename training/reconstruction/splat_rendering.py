@@ -1,4 +1,4 @@
-"""Rendering of Gaussians or surfels for reconstruction: the two rasterisers behind one call."""
+"""Rendering of Gaussians or surfels for reconstruction."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -8,7 +8,7 @@ from torch import Tensor
 
 from splatpilot._native import Renderer
 from splatpilot.systems.splats.rasterization import EPS2D, rasterize
-from splatpilot.systems.splats.scene import degree_of
+from splatpilot.systems.splats.scene import harmonic_degree
 from splatpilot.systems.splats.surfel_rasterization import rasterize_surfels
 
 
@@ -19,10 +19,10 @@ class Rendering:
     color: Tensor  # (H, W, 3)
     depth: Tensor  # (H, W) [m], accumulated, expected or median
     alpha: Tensor  # (H, W)
-    meta: dict[str, Any]  # of the rasteriser
+    meta: dict[str, Any]  # of the rasterizer
     normals: Tensor | None = None  # (H, W, 3) sum of weight and normal; surfels only
     surface_normals: Tensor | None = None  # (H, W, 3) from depth; surfels only
-    distortion: Tensor | None = None  # (H, W) [m]; surfels only, if asked for
+    distortion: Tensor | None = None  # (H, W) [m]; surfels only, if requested
 
 
 def render(
@@ -36,11 +36,10 @@ def render(
     background: Tensor | None = None,
     depth_mode: str = "D",
     eps2d: float = EPS2D,
-    absgrad: bool = False,
     distortion: bool = False,
     renderer: Renderer | None = None,
 ) -> Rendering:
-    """Renders colour and depth.
+    """Renders color and depth.
 
     Args:
         representation: "3dgs" or "2dgs".
@@ -48,23 +47,22 @@ def render(
         viewmat: (1, 4, 4) world to camera.
         K: (1, 3, 3) [px].
         width, height: [px].
-        background: (1, 3), black if None.
+        background: (1, 3), black by default.
         depth_mode: "D", accumulated, "ED", expected, or "MD", median, which has no gradient and
-            is 0 where no surface is.
-        eps2d: of Gaussians, see `rasterize`; surfels have a blur of their own.
-        absgrad: see `rasterize`.
-        distortion: whether surfels render it.
+            is 0 without a surface.
+        eps2d: blur of Gaussians, see `rasterize`; surfels have their own.
+        distortion: whether surfels render the distortion along their rays.
         renderer: see `rasterize`.
     """
     scene = *gaussians, viewmat, K, width, height
     options: dict[str, Any] = {
-        "sh_degree": degree_of(gaussians[4].shape[1]),
+        "sh_degree": harmonic_degree(gaussians[4].shape[1]),
         "backgrounds": background,
         "renderer": renderer,
     }
     if representation == "3dgs":
         image, alpha, meta = rasterize(
-            *scene, **options, render_mode=f"RGB+{depth_mode}", eps2d=eps2d, absgrad=absgrad
+            *scene, **options, render_mode=f"RGB+{depth_mode}", eps2d=eps2d
         )
         color, depth = image[0].split((3, 1), dim=-1)
         return Rendering(color, depth.reshape(height, width), alpha.reshape(height, width), meta)

@@ -1,4 +1,4 @@
-"""The images that a reconstruction is compared with, shrunk and ready."""
+"""Frames of a capture for reconstruction, shrunk and as tensors, and the learned background."""
 
 from collections.abc import Sequence
 from functools import cache
@@ -18,25 +18,23 @@ from splatpilot.systems.splats.background import (
     Background,
     EnvironmentMap,
     pixel_rays,
-    texel_of,
+    texel_position,
 )
 from splatpilot.training.captures.capture import Capture, CaptureFrame, shrink
 from splatpilot.training.reconstruction.losses import depth_edge_weights
 from splatpilot.training.reconstruction.photometry import Photometry
 
-# [bytes], of colour, depth and validity together, and what the frames of a capture may take.
-_PIXEL_SIZE, _MEMORY = 8, 1e9
+_PIXEL_SIZE, _MEMORY = 8, 1e9  # [bytes], of a pixel with depth and validity; of cached frames
+_HEIGHT, _WIDTH = 128, 256  # texels of the background, powers of two
 
 
 class ShrunkFrames(Sequence[CaptureFrame]):
-    """Some frames of a capture, shrunk by a whole factor, each loaded when asked for.
-
-    They are kept from then on, unless all of them would take more than 1 GB.
+    """Some frames of a capture, loaded on first use and kept if all of them take at most 1 GB.
 
     Args:
-        capture: what was seen.
-        numbers: the frames to take.
-        factor: see `shrink`.
+        capture: source of the frames.
+        numbers: indices of the frames.
+        factor: whole factor by which they are shrunk.
     """
 
     def __init__(self, capture: Capture, numbers: Sequence[int], factor: int):
@@ -98,7 +96,7 @@ class ReconstructionViews:
 
     def extent(self) -> tuple[NDArray[np.float64], float]:
         """Returns the mean position (3,) [m] of the cameras and 1.1 times the largest distance from
-        it [m], by which learning rates and sizes are scaled; 1 m if all stand in one place."""
+        it [m], which scales learning rates and sizes; 1 m if all cameras coincide."""
         X_CWs = self.viewmats.double().numpy()
         p_WCs = -np.einsum("nji,nj->ni", X_CWs[:, :3, :3], X_CWs[:, :3, 3])
         center = p_WCs.mean(axis=0)
@@ -106,43 +104,40 @@ class ReconstructionViews:
         return center, extent if extent > 1e-6 else 1.0
 
     def frame(self, k: int) -> CaptureFrame:
-        """Returns a frame as it was given."""
+        """Returns a frame as given."""
         X_WC = RigidTransform(self.viewmats[k].double().numpy()).inverse()
         K = self.K[0].double().numpy()
         arrays = (self.images[k].numpy(), self.depths[k].numpy())
         return CaptureFrame(*arrays, X_WC, K, self.valid[k].numpy())
 
-    def target(self, k: int, gain: Tensor, backdrop: Tensor) -> Tensor:
-        """(H, W, 3), what the scene should look like before a `backdrop` (3,): the image freed of
-        its gain and vignetting, about 0 to 1, and nothing where it shows the infinitely far."""
+    def target(self, k: int, gain: Tensor, background: Tensor) -> Tensor:
+        """Returns the image (H, W, 3) without gain and vignetting, about 0 to 1, with `background`
+        (3,) in the sky."""
         color = self.images[k].float().mul_((1 / (255 * gain * self.vignette))[..., None])
-        color[self.depths[k] >= FAR] = backdrop
+        color[self.depths[k] >= FAR] = background
         return color
 
 
-_HEIGHT, _WIDTH = 128, 256  # texels, powers of two
-
-
 def learn_background(frames: Sequence[CaptureFrame], photometry: Photometry) -> Background:
-    """Returns what the frames show infinitely far away, in every direction; black if they show
-    nothing there.
+    """Learns the sky of the frames in every direction; black without any.
 
-    Each texel has the mean colour, freed of gains and vignetting, of the pixels that look into it;
-    where none does, it is interpolated between its neighbours.
+    Each texel has the mean color, without gains and vignetting, of the pixels that look into it, or
+    else is interpolated.
 
     Args:
         frames: with true depth; loaded one by one.
-        photometry: their brightness, in their order.
+        photometry: of the frames, in their order.
     """
     sums, counts = np.zeros((_HEIGHT * _WIDTH, 3)), np.zeros(_HEIGHT * _WIDTH)
     for k, frame in enumerate(frames):
-        far = frame.depth >= FAR
-        if not far.any():
+        sky = frame.depth >= FAR
+        if not sky.any():
             continue
-        rows, columns = np.nonzero(far)
-        factor = photometry.factor(k, *far.shape)
-        color = frame.image[far] / (255 * factor[far])[:, None]
-        row, column = texel_of(pixel_rays(frame.K, rows, columns, frame.X_WC), _HEIGHT, _WIDTH)
+        rows, columns = np.nonzero(sky)
+        factor = photometry.factor(k, *sky.shape)
+        color = frame.image[sky] / (255 * factor[sky])[:, None]
+        v_W = pixel_rays(frame.K, rows, columns, frame.X_WC)
+        row, column = texel_position(v_W, _HEIGHT, _WIDTH)
         row, column = np.minimum(row.astype(int), _HEIGHT - 1), column.astype(int) % _WIDTH
         np.add.at(sums, row * _WIDTH + column, color)
         np.add.at(counts, row * _WIDTH + column, 1)
@@ -153,14 +148,14 @@ def learn_background(frames: Sequence[CaptureFrame], photometry: Photometry) -> 
 
 
 def _fill(sums: NDArray[np.float64], counts: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns the means (h, w, 3) of texels, those without any interpolated from means of four."""
+    """Returns the means (h, w, 3) of texels; empty ones are interpolated from means of four."""
     means = sums / np.maximum(counts, 1)[..., None]
     if counts.all():
         return means
     height, width = counts.shape
     block = (max(height // 2, 1), min(height, 2), width // 2, 2)
     coarse = _fill(sums.reshape(*block, 3).sum(axis=(1, 3)), counts.reshape(block).sum(axis=(1, 3)))
-    # One more column on either side, from the other end: azimuth goes round.
+    # One more column on either side, because azimuth is periodic.
     around = np.pad(coarse, ((0, 0), (1, 1), (0, 0)), mode="wrap")
     around = cv2.resize(around, (width + 4, height), interpolation=cv2.INTER_LINEAR)
     return np.where(counts[..., None] > 0, means, around[:, 2:-2])

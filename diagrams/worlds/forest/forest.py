@@ -11,13 +11,13 @@ from splatpilot.diagrams.worlds.forest import scenery as trees
 from splatpilot.diagrams.worlds.forest.layout import MARGIN, ForestConfig, TrunksConfig, lay_out
 from splatpilot.diagrams.worlds.forest.scenery import ForestLight
 from splatpilot.diagrams.worlds.solids.shading import Daylight
-from splatpilot.diagrams.worlds.solids.solid import Blueprint
+from splatpilot.diagrams.worlds.solids.solid import WorldSpec
 from splatpilot.diagrams.worlds.solids.surfaces import merge
 from splatpilot.systems.common.seeds import check_seed
 from splatpilot.systems.splats.scene import GaussianScene
 
 
-def forest_blueprint(config: ForestConfig, seed: int) -> Blueprint:
+def forest_spec(config: ForestConfig, seed: int) -> WorldSpec:
     """Grows the forest of `config`: the same config and seed give the same bits.
 
     Trunks stand at Poisson-disk distances, a little tilted; rocks and logs lie between them. From
@@ -34,14 +34,14 @@ def forest_blueprint(config: ForestConfig, seed: int) -> Blueprint:
     Raises:
         ValueError: for values with which no forest can be grown, or a negative seed.
     """
-    return Forest(config, seed).blueprint()
+    return Forest(config, seed).spec()
 
 
 class Forest:
     """What `config` and `seed` determine of a forest: where things stand, and the light.
 
     Raises:
-        ValueError: see `forest_blueprint`.
+        ValueError: see `forest_spec`.
     """
 
     def __init__(self, config: TrunksConfig, seed: int) -> None:
@@ -55,10 +55,10 @@ class Forest:
         self.layout = lay_out(config, layout_rng, [self.p_WS[:2], self.p_WG[:2]], CLEARING)
         self.light = ForestLight(Daylight.sample(light_rng), self.layout, seed)
 
-    def blueprint(self) -> Blueprint:
+    def spec(self) -> WorldSpec:
         """The forest before anything is drawn."""
         solids, scenery = self.layout.solids()
-        return Blueprint(
+        return WorldSpec(
             name="forest",
             lower_W=self.layout.lower,
             upper_W=self.layout.upper,

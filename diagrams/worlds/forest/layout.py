@@ -10,31 +10,32 @@ from splatpilot.diagrams.worlds.building_blocks import (
     CLEARING,
     INSET,
     PASSAGE,
-    check_count,
-    check_ground,
+    VolumeConfig,
     poisson_disk,
+    require_order,
 )
 from splatpilot.diagrams.worlds.solids.solid import Solid
-from splatpilot.diagrams.worlds.solids.surfaces import Plot
+from splatpilot.diagrams.worlds.solids.surfaces import FloorPlan
 from splatpilot.diagrams.worlds.solids.textures import BIRCH, OAK, PINE
 from splatpilot.systems.collision.shapes import Capsule, HalfSpace, Sphere
+from splatpilot.systems.common.validation import bounded, require_field
 
 
 @dataclass
-class TrunksConfig:
-    """What all forests have."""
+class TrunksConfig(VolumeConfig):
+    """Common to all forests."""
 
-    length: float = 36.0  # [m] flyable volume along x: from 0 to length
-    width: float = 16.0  # [m] along y, centred on 0
-    height: float = 6.0  # [m] along z, from the ground to where the crowns begin
-    spacing: float = 3.0  # [m] least distance of two trunks on the ground, axis to axis
-    radius_min: float = 0.25  # [m] thinnest trunk
-    radius_max: float = 0.45  # [m] thickest trunk
-    lean_max: float = 1.5  # [deg] largest tilt of a trunk
-    rocks: int = 10  # [-] boulders, at most knee-high, fewer where there is no room
-    logs: int = 5  # [-] fallen trunks on the ground, fewer where there is no room
-    flight_height: float = 1.8  # [m] height of start and goal
-    voxel_size: float = 0.15  # [m] of the distance grid
+    length: float = bounded(36.0, f"[{2 * (INSET + CLEARING):g}, inf) m")  # [m] along x, from 0
+    width: float = bounded(16.0, "(0, inf) m")  # [m] along y, centered on 0
+    # [m] Minimum distance of two trunks on the ground, axis to axis.
+    spacing: float = bounded(3.0, "(0, inf) m")
+    radius_min: float = bounded(0.25, "(0, inf) m")  # [m] thinnest trunk
+    radius_max: float = bounded(0.45, "(0, inf) m")  # [m] thickest trunk
+    lean_max: float = bounded(1.5, "[0, 10] deg")  # [deg] largest tilt of a trunk
+    rocks: int = bounded(10, "[0, 1000]")  # [-] boulders, at most knee-high, fewer if cramped
+    logs: int = bounded(5, "[0, 1000]")  # [-] fallen trunks on the ground, fewer if cramped
+    # [m] Height of start and goal.
+    flight_height: float = bounded(1.8, f"[{CLEARING:g}, inf) m")
 
     @property
     def narrowest(self) -> float:
@@ -42,57 +43,26 @@ class TrunksConfig:
         tilt = self.height * np.tan(np.deg2rad(self.lean_max))
         return float(self.spacing - 2 * self.radius_max - 2 * tilt)
 
-    def validate(self) -> None:
-        """Raises ValueError for the first value with which no forest can be grown."""
-        positive = "length", "width", "height", "spacing", "radius_min", "radius_max", "voxel_size"
-        for name in positive:
-            if not 0 < getattr(self, name) < np.inf:
-                raise ValueError(f"{name} = {getattr(self, name)} m must be positive and finite")
-        check_ground(self)
-        check_count(self, "rocks", "logs")
-        if not 0 <= self.lean_max <= 10:
-            raise ValueError(f"lean_max = {self.lean_max} deg must be between 0 and 10 deg")
-        least = 2 * (INSET + CLEARING)
-        if self.length < least:
-            raise ValueError(
-                f"length = {self.length} m must be at least {least:g} m, since start and goal are "
-                f"{INSET:g} m from the ends"
-            )
-        least = 2 * (self.radius_max + PASSAGE)
-        if self.width < least:
-            raise ValueError(
-                f"width = {self.width} m must be at least {least:g} m, or one trunk can block it"
-            )
-        if not CLEARING <= self.flight_height <= self.height - CLEARING:
-            raise ValueError(
-                f"flight_height = {self.flight_height} m must be between {CLEARING:g} m and "
-                f"height - {CLEARING:g} m = {self.height - CLEARING:g} m"
-            )
-        if self.radius_max < self.radius_min:
-            raise ValueError(
-                f"radius_max = {self.radius_max} m must not be below radius_min = "
-                f"{self.radius_min} m"
-            )
-        if self.radius_max >= self.spacing / 2:
-            raise ValueError(
-                f"radius_max = {self.radius_max} m must be below half the spacing "
-                f"{self.spacing} m, or trunks touch: use thinner trunks or a wider spacing"
-            )
-        if self.narrowest < PASSAGE:
-            raise ValueError(
-                f"spacing = {self.spacing} m leaves gaps of {self.narrowest:.2f} m between trunks "
-                f"of radius {self.radius_max} m that lean up to {self.lean_max} deg, the vehicle "
-                f"needs {PASSAGE:.2f} m: use a spacing of at least "
-                f"{self.spacing + PASSAGE - self.narrowest:.2f} m"
-            )
+    def check(self) -> None:
+        super().check()
+        # A narrower forest can be blocked by one trunk.
+        narrow = 2 * (self.radius_max + PASSAGE)
+        require_field(self, "width", self.width >= narrow, f"at least {narrow:g} m")
+        highest = self.height - CLEARING
+        condition = f"at most height - {CLEARING:g} m = {highest:g} m"
+        require_field(self, "flight_height", self.flight_height <= highest, condition)
+        require_order(self, "radius_min", "radius_max")
+        # The vehicle fits between any two trunks.
+        spacing = self.spacing + PASSAGE - self.narrowest
+        require_field(self, "spacing", self.spacing >= spacing, f"at least {spacing:.2f} m")
 
 
 @dataclass
 class ForestConfig(TrunksConfig):
     """A forest.
 
-    It is no base of others: written to YAML, their worlds would become plain forests, since Drake
-    takes the first type of a union that a value is an instance of.
+    Not a base of others: Drake would write them to YAML as plain forests, since it takes the first
+    type of a union that a value is an instance of.
     """
 
 
@@ -125,7 +95,7 @@ class Trees:
 
 
 @dataclass(frozen=True, eq=False)
-class ForestLayout(Plot):
+class ForestLayout(FloorPlan):
     """Trees, rocks and fallen logs on the ground z = 0."""
 
     trees: Trees
@@ -192,8 +162,8 @@ def lay_out(
 ) -> ForestLayout:
     """Places everything, leaving discs of radius `clearance` [m] about `clear` (K, 2) open."""
     clear = np.asarray(clear)
-    plot = Plot.of_size(config.length, config.width, config.height)
-    lower, upper = plot.lower, plot.upper
+    plan = FloorPlan.of_size(config.length, config.width, config.height)
+    lower, upper = plan.lower, plan.upper
     base = poisson_disk(lower[:2] - MARGIN, upper[:2] + MARGIN, config.spacing, rng)
     N = len(base)
     radius = rng.uniform(config.radius_min, config.radius_max, N)

@@ -12,7 +12,7 @@ from splatpilot.diagrams.worlds.solids import textures
 from splatpilot.diagrams.worlds.solids.shading import Daylight, shade
 from splatpilot.diagrams.worlds.solids.surfaces import (
     COVERAGE,
-    Plot,
+    FloorPlan,
     Surfels,
     ground_rings,
     inset,
@@ -188,11 +188,11 @@ BUSHES, LEAVES = 170, 26
 """Bushes drawn, some of which fall into the volume and are left out, and leaves on each."""
 
 
-def bushes(plot: Plot, light: Daylight, rng: np.random.Generator) -> GaussianScene:
+def bushes(plan: FloorPlan, light: Daylight, rng: np.random.Generator) -> GaussianScene:
     """Grows leafy half-spheres in the belt of trees, out of reach of the volume."""
     reach = MARGIN - 3
-    foot = rng.uniform(plot.lower[:2] - reach, plot.upper[:2] + reach, (BUSHES, 2))
-    foot = foot[plot.outside(foot) > 2.0]
+    foot = rng.uniform(plan.lower[:2] - reach, plan.upper[:2] + reach, (BUSHES, 2))
+    foot = foot[plan.outside(foot) > 2.0]
     n = rng.normal(size=(len(foot), LEAVES, 3))
     n[..., 2] = np.abs(n[..., 2])
     n = _unit(n)
@@ -205,16 +205,19 @@ def bushes(plot: Plot, light: Daylight, rng: np.random.Generator) -> GaussianSce
     extent = rng.uniform(0.7, 1.3, (len(p), 1)) * (0.19, 0.11)
     foot = 0.45 + 0.55 * smoothstep(0.0, 0.8, p[:, 2])  # the ground hides the sky from it
     albedo = textures.leaf(OAK, p) * foot[:, None]
-    sunlit = light.through_canopy(p, plot.upper[2] + 3, seed=5)
-    return paint_leaves(Surfels(p, n, t, extent), albedo, light, sunlit, plot.outside(p), 0.9)
+    sunlit = light.through_canopy(p, plan.upper[2] + 3, seed=5)
+    return paint_leaves(Surfels(p, n, t, extent), albedo, light, sunlit, plan.outside(p), 0.9)
 
 
 def edge(
-    plot: Plot, light: Daylight, away: float, top: float, rng: np.random.Generator
+    plan: FloorPlan, light: Daylight, away: float, top: float, rng: np.random.Generator
 ) -> GaussianScene:
     """Hangs a curtain of large patches `away` from the volume, ragged on top; both in metres."""
     spacing = 1.1
-    centre, half = (plot.lower + plot.upper)[:2] / 2, (plot.upper - plot.lower)[:2] / 2
+    centre, half = (
+        (plan.lower + plan.upper)[:2] / 2,
+        (plan.upper - plan.lower)[:2] / 2,
+    )
     angle = np.arange(0, 2 * np.pi, spacing / (half.max() + away))
     around = np.column_stack([np.cos(angle), np.sin(angle)])
     on_box = np.clip(around / np.abs(around).max(axis=1, keepdims=True), -1, 1) * half
@@ -232,15 +235,15 @@ def edge(
     return paint_leaves(Surfels(p, n, up, extent), albedo, light, sunlit, distance, 0.95)
 
 
-def trees_around(plot: Plot, hour: Daylight, seed: int) -> Callable[[], list[GaussianScene]]:
+def trees_around(plan: FloorPlan, hour: Daylight, seed: int) -> Callable[[], list[GaussianScene]]:
     """Draws bushes and two rows of trees far around the volume."""
 
     def draw() -> list[GaussianScene]:
         rngs = [np.random.default_rng([seed, 50 + k]) for k in range(3)]
         return [
-            bushes(plot, hour, rngs[0]),
-            edge(plot, hour, 15.0, 9.0, rngs[1]),
-            edge(plot, hour, 22.0, 14.0, rngs[2]),
+            bushes(plan, hour, rngs[0]),
+            edge(plan, hour, 15.0, 9.0, rngs[1]),
+            edge(plan, hour, 22.0, 14.0, rngs[2]),
         ]
 
     return draw

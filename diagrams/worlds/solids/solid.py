@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from splatpilot.diagrams.worlds.solids import patterns
 from splatpilot.diagrams.worlds.solids.shading import Illumination
-from splatpilot.diagrams.worlds.solids.surfaces import GROUND_REACH, Plot, perpendicular
+from splatpilot.diagrams.worlds.solids.surfaces import GROUND_REACH, FloorPlan, perpendicular
 from splatpilot.diagrams.worlds.solids.textures import BIRCH, OAK, PINE
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.shapes import (
@@ -247,19 +247,19 @@ def _disc(center: Array, e_1: Array, axis: Array, radius: float, _: float) -> Fa
     return Face((2 * np.pi * radius, radius), at, curved=(radius, np.inf), round=True)
 
 
-_BlueprintArray = NDArray[np.float64]
+_FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Blueprint:
+class WorldSpec:
     """Everything of a procedural world, in W, from which Gaussians, distances and meshes come."""
 
     name: str
-    lower_W: _BlueprintArray  # (3,) [m], flyable volume
-    upper_W: _BlueprintArray  # (3,) [m]
+    lower_W: _FloatArray  # (3,) [m], flyable volume
+    upper_W: _FloatArray  # (3,) [m]
     solids: list[Solid]  # what can be hit, and is seen
-    p_WS: _BlueprintArray  # (3,) [m], start
-    p_WG: _BlueprintArray  # (3,) [m], goal
+    p_WS: _FloatArray  # (3,) [m], start
+    p_WG: _FloatArray  # (3,) [m], goal
     light: Callable[[Esdf], Illumination]  # the light, given a grid of the distances
     seed: int = 0
     voxel_size: float = 0.15  # [m], of the distance grid
@@ -278,6 +278,6 @@ class Blueprint:
         )
 
     @property
-    def plot(self) -> Plot:
+    def plan(self) -> FloorPlan:
         """The volume, seen from above."""
-        return Plot(self.lower_W, self.upper_W)
+        return FloorPlan(self.lower_W, self.upper_W)

@@ -1,4 +1,4 @@
-"""Solids as textured triangles: the faces of a blueprint, packed into one picture."""
+"""Solids as textured triangles: the faces of a spec, packed into one picture."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from splatpilot.diagrams.worlds.solids.shading import Illumination, shade
-from splatpilot.diagrams.worlds.solids.solid import MATERIALS, Blueprint, Face, Solid, faces_of
+from splatpilot.diagrams.worlds.solids.solid import MATERIALS, Face, Solid, WorldSpec, faces_of
 from splatpilot.diagrams.worlds.solids.surfaces import GROUND_REACH
 from splatpilot.systems.collision.shapes import HalfSpace
 from splatpilot.systems.splats.scene import GaussianScene
@@ -45,13 +45,13 @@ class _Tile:
     pixels: NDArray[np.integer]  # (2,) width and height, with padding
 
 
-def mesh_of(blueprint: Blueprint, light: Illumination, texel: float) -> list[Mesh]:
+def mesh_of(spec: WorldSpec, light: Illumination, texel: float) -> list[Mesh]:
     """Triangles and pictures of all solids, `texel` [m] a pixel; signs are finer."""
     tiles = [
         tile
-        for solids, step in ((blueprint.solids, texel), (blueprint.scenery, 4 * texel))
+        for solids, step in ((spec.solids, texel), (spec.scenery, 4 * texel))
         for solid in solids
-        for face in faces_of(solid.shape, blueprint.lower_W, blueprint.upper_W)
+        for face in faces_of(solid.shape, spec.lower_W, spec.upper_W)
         for tile in _tiles(solid, face, step)
     ]
     tiles.sort(key=lambda tile: (-tile.pixels[1], -tile.pixels[0]))  # stable: same in, same out
@@ -60,7 +60,7 @@ def mesh_of(blueprint: Blueprint, light: Illumination, texel: float) -> list[Mes
         picture = np.zeros((height, _PAGE, 3), dtype=np.uint8)
         parts = []
         for tile, (x, y) in page:
-            picture[y : y + tile.pixels[1], x : x + tile.pixels[0]] = _paint(tile, blueprint, light)
+            picture[y : y + tile.pixels[1], x : x + tile.pixels[0]] = _paint(tile, spec, light)
             parts.append(_triangulate(tile, x, y, height))
         counts = np.cumsum([0, *(len(vertices) for vertices, _, _ in parts)])
         meshes.append(
@@ -115,7 +115,7 @@ def _shelves(tiles: list[_Tile]) -> list[tuple[list[tuple[_Tile, tuple[int, int]
     return pages
 
 
-def _paint(tile: _Tile, blueprint: Blueprint, light: Illumination) -> NDArray[np.uint8]:
+def _paint(tile: _Tile, spec: WorldSpec, light: Illumination) -> NDArray[np.uint8]:
     """The tile's part of the picture (H, W, 3), u to the right and v downwards."""
     width, height = (int(n) for n in tile.pixels)
 
@@ -135,7 +135,7 @@ def _paint(tile: _Tile, blueprint: Blueprint, light: Illumination) -> NDArray[np
     q, n, _ = tile.face.at(at(columns, rows))
     falls = light.irradiance(q, n).astype(np.float32).reshape(coarse[1], coarse[0], 3)
     falls = np.asarray(cv2.resize(falls, (width, height)), dtype=np.float32).reshape(-1, 3)
-    colors = shade(albedo, falls, light.haze, blueprint.plot.outside(p))
+    colors = shade(albedo, falls, light.haze, spec.plan.outside(p))
     return np.round(255 * np.clip(colors, 0, 1)).astype(np.uint8).reshape(height, width, 3)
 
 

@@ -12,18 +12,17 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from splatpilot.systems.splats.scene import GaussianScene
-from splatpilot.systems.vehicle.flatness import cross
 
 
 @dataclass(frozen=True, eq=False)
-class Plot:
+class FloorPlan:
     """A flyable volume, seen from above."""
 
     lower: NDArray[np.float64]  # (3,) [m], in W
     upper: NDArray[np.float64]  # (3,) [m]
 
     @classmethod
-    def of_size(cls, length: float, width: float, height: float) -> Plot:
+    def of_size(cls, length: float, width: float, height: float) -> FloorPlan:
         """The volume from x = 0 to length, centred on y = 0, on the ground z = 0, all in [m]."""
         return cls(np.array([0.0, -width / 2, 0.0]), np.array([length, width / 2, height]))
 
@@ -86,7 +85,7 @@ def to_gaussians(surfels: Surfels, colors: ArrayLike, opacity: ArrayLike) -> Gau
     R_WP = np.stack([surfels.t, np.cross(surfels.n, surfels.t), surfels.n], axis=-1)
     return GaussianScene.from_colors(
         means=surfels.p,
-        quats=np.roll(Rotation.from_matrix(R_WP).as_quat(), 1, axis=1),
+        quats=Rotation.from_matrix(R_WP).as_quat(scalar_first=True),
         scales=np.column_stack([surfels.extent, np.full(N, THICKNESS)]),
         opacities=np.broadcast_to(opacity, N),
         colors=np.clip(colors, 0, 1),
@@ -109,7 +108,7 @@ def perpendicular(d: ArrayLike) -> NDArray[np.float64]:
 
 def _perpendicular_to_one(d: NDArray[np.float64]) -> NDArray[np.float64]:
     """`perpendicular` of a single vector (3,), a tenth of the time."""
-    v = cross(np.array((0.0, 0.0, 1.0) if abs(d[2]) < 0.9 else (1.0, 0.0, 0.0)), d)
+    v = np.cross(np.array((0.0, 0.0, 1.0) if abs(d[2]) < 0.9 else (1.0, 0.0, 0.0)), d)
     x, y, z = v.tolist()
     return v / math.sqrt(x * x + y * y + z * z)
 
@@ -127,15 +126,15 @@ def rectangle(
 
 
 def ground_rings(
-    plot: Plot, spacings: Sequence[float], rng: np.random.Generator
+    plan: FloorPlan, spacings: Sequence[float], rng: np.random.Generator
 ) -> Iterator[NDArray[np.float64]]:
     """Samples the ground in and around a volume ring by ring: points (N, 2) of each, from the
     volume to `GROUND_REACH`, at the `spacings` [m] of the five rings."""
-    lower, upper = plot.lower[:2], plot.upper[:2]
+    lower, upper = plan.lower[:2], plan.upper[:2]
     inner = 0.0
     for outer, spacing in zip(_RINGS, spacings, strict=True):
         p = rectangle(lower - outer, upper + outer, spacing, rng)
-        yield p[plot.outside(p) >= inner]
+        yield p[plan.outside(p) >= inner]
         inner = outer
 
 
@@ -207,7 +206,7 @@ def tube(
     s = np.clip((j + 0.5 + offset + jitter[1]) / rows, 0, 1).ravel()
     width = 1 + (taper - 1) * s
     e_1 = _perpendicular_to_one(axis)
-    normal = np.outer(np.cos(angle), e_1) + np.outer(np.sin(angle), cross(axis, e_1))
+    normal = np.outer(np.cos(angle), e_1) + np.outer(np.sin(angle), np.cross(axis, e_1))
     across = COVERAGE * 2 * np.pi * radius / columns
     return Surfels(
         p=p_A + np.outer(s * length, axis) + (radius * width)[:, None] * normal,

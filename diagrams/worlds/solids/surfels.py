@@ -6,10 +6,10 @@ from numpy.typing import NDArray
 from splatpilot.diagrams.worlds.solids.shading import Illumination, shade
 from splatpilot.diagrams.worlds.solids.solid import (
     MATERIALS,
-    Blueprint,
     Face,
     Marks,
     Solid,
+    WorldSpec,
     faces_of,
 )
 from splatpilot.diagrams.worlds.solids.surfaces import (
@@ -40,35 +40,35 @@ _BURIED = 0.05
 """[m], depth inside another solid at which a patch cannot be seen any more."""
 
 
-def draw(blueprint: Blueprint, solids: list[Solid], light: Illumination) -> GaussianScene:
-    """Covers `solids`, all or some of the blueprint's, with Gaussians."""
-    rng = np.random.default_rng([blueprint.seed, 99])
-    drawn = [_patches(solid, blueprint, rng) for solid in solids]
+def draw(spec: WorldSpec, solids: list[Solid], light: Illumination) -> GaussianScene:
+    """Covers `solids`, all or some of the spec's, with Gaussians."""
+    rng = np.random.default_rng([spec.seed, 99])
+    drawn = [_patches(solid, spec, rng) for solid in solids]
     patches, albedos, opacities = zip(*drawn, strict=True)
     surfels = Surfels.concatenate(list(patches))
     albedo, opacity = np.concatenate(albedos), np.concatenate(opacities)
-    seen = _is_seen(blueprint, surfels)
+    seen = _is_seen(spec, surfels)
     surfels, albedo, opacity = surfels[seen], np.clip(albedo[seen], 0, 1), opacity[seen]
     irradiance = light.irradiance(surfels.p, surfels.n)
-    colors = shade(albedo, irradiance, light.haze, blueprint.plot.outside(surfels.p))
+    colors = shade(albedo, irradiance, light.haze, spec.plan.outside(surfels.p))
     return to_gaussians(surfels, colors, opacity)
 
 
 def _patches(
-    solid: Solid, blueprint: Blueprint, rng: np.random.Generator
+    solid: Solid, spec: WorldSpec, rng: np.random.Generator
 ) -> tuple[Surfels, Array, Array]:
     """Surfels of one solid with their albedo (N, 3) and opacity (N,)."""
     material = MATERIALS[solid.material]
     is_ground = isinstance(solid.shape, HalfSpace)
     layers = []  # of patches, opacity, and the points at which the pattern is asked
-    for face in faces_of(solid.shape, blueprint.lower_W, blueprint.upper_W):
+    for face in faces_of(solid.shape, spec.lower_W, spec.upper_W):
         if is_ground:
-            uv, extent = _ground(face, material.spacing, blueprint, rng)
+            uv, extent = _ground(face, material.spacing, spec, rng)
         elif face.round:
             uv, extent = _spiral(face, material.spacing, rng)
         else:
             uv, extent = _lattice(face, material.spacing, rng)
-        facing = blueprint.plot.is_faced(*face.at(uv)[:2])
+        facing = spec.plan.is_faced(*face.at(uv)[:2])
         if not facing.any():
             continue
         uv, extent = uv[facing], extent[facing]
@@ -180,48 +180,48 @@ def _spiral(face: Face, spacing: float, rng: np.random.Generator) -> tuple[Array
 
 
 def _ground(
-    face: Face, spacing: float, blueprint: Blueprint, rng: np.random.Generator
+    face: Face, spacing: float, spec: WorldSpec, rng: np.random.Generator
 ) -> tuple[Array, Array]:
     """Covers a horizontal plane: finely in the volume, coarsely far out."""
-    corner = blueprint.lower_W[:2] - GROUND_REACH
+    corner = spec.lower_W[:2] - GROUND_REACH
     uv, extent = [], []
     coarser = 1.0, 2.0, 4.0, 7.0, 12.0
-    rings = ground_rings(blueprint.plot, [times * spacing for times in coarser], rng)
+    rings = ground_rings(spec.plan, [times * spacing for times in coarser], rng)
     for times, p in zip(coarser, rings, strict=True):
         uv.append(p - corner)
         extent.append(COVERAGE * times * spacing * rng.uniform(0.85, 1.2, (len(p), 2)))
     return np.concatenate(uv), np.concatenate(extent)
 
 
-def _is_seen(blueprint: Blueprint, surfels: Surfels) -> NDArray[np.bool_]:
+def _is_seen(spec: WorldSpec, surfels: Surfels) -> NDArray[np.bool_]:
     """Whether a patch faces the volume and lies in no other solid."""
-    seen = blueprint.plot.is_faced(surfels.p, surfels.n)
+    seen = spec.plan.is_faced(surfels.p, surfels.n)
     field = AnalyticDistanceField(
-        [solid.shape for solid in blueprint.solids],
-        blueprint.lower_W - 40.0,
-        blueprint.upper_W + 40.0,
+        [solid.shape for solid in spec.solids],
+        spec.lower_W - 40.0,
+        spec.upper_W + 40.0,
     )
     rows = np.flatnonzero(seen)
     seen[rows] = field.distance(surfels.p[rows]) > -_BURIED
     return seen
 
 
-def build(blueprint: Blueprint) -> World:
-    """Draws a blueprint's Gaussians and samples its distance grid."""
-    field = blueprint.distance_field
-    esdf = esdf_from_distance_field(field, blueprint.voxel_size)
-    light = blueprint.light(esdf)
-    if blueprint.gaussians is not None:
-        gaussians = blueprint.gaussians(light)
+def build(spec: WorldSpec) -> World:
+    """Draws a spec's Gaussians and samples its distance grid."""
+    field = spec.distance_field
+    esdf = esdf_from_distance_field(field, spec.voxel_size)
+    light = spec.light(esdf)
+    if spec.gaussians is not None:
+        gaussians = spec.gaussians(light)
     else:
-        solids = draw(blueprint, blueprint.solids, light)
-        gaussians = merge([solids, *blueprint.surroundings()])
+        solids = draw(spec, spec.solids, light)
+        gaussians = merge([solids, *spec.surroundings()])
     return World(
-        name=blueprint.name,
+        name=spec.name,
         gaussians=gaussians,
         distance_field=field,
         esdf=esdf,
         background=(float(light.haze[0]), float(light.haze[1]), float(light.haze[2])),
-        p_WS=blueprint.p_WS,
-        p_WG=blueprint.p_WG,
+        p_WS=spec.p_WS,
+        p_WG=spec.p_WG,
     )

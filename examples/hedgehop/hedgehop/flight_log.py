@@ -1,4 +1,4 @@
-"""A kind of capture: the log of a drone that takes photographs where it flies."""
+"""A capture format: the log of a drone that takes photographs where it flies."""
 
 import csv
 from pathlib import Path

@@ -7,8 +7,8 @@ import numpy as np
 from splatpilot import register_world
 from splatpilot.diagrams.worlds.building_blocks import box, daylight, ground, start_and_goal
 from splatpilot.diagrams.worlds.feasibility import draw_feasible
-from splatpilot.diagrams.worlds.solids.solid import Blueprint
-from splatpilot.diagrams.worlds.solids.surfaces import Plot
+from splatpilot.diagrams.worlds.solids.solid import WorldSpec
+from splatpilot.diagrams.worlds.solids.surfaces import FloorPlan
 
 
 @dataclass
@@ -29,22 +29,25 @@ class HedgesConfig:
             raise ValueError(f"tallest = {self.tallest} m must be 0.5 to {self.height - 1.5} m")
 
 
-def hedges_blueprint(config: HedgesConfig, seed: int) -> Blueprint:
+def hedges_spec(config: HedgesConfig, seed: int) -> WorldSpec:
     """The field that `config` and `seed` determine, as solids, start and goal."""
     config.validate()
-    plot, half = Plot.of_size(config.length, config.width, config.height), config.width / 2
+    plan, half = (
+        FloorPlan.of_size(config.length, config.width, config.height),
+        config.width / 2,
+    )
 
-    def draw(rng: np.random.Generator) -> Blueprint:
-        p_WS, p_WG = start_and_goal(plot, rng)
+    def draw(rng: np.random.Generator) -> WorldSpec:
+        p_WS, p_WG = start_and_goal(plan, rng)
         hedges = []
         for x in np.linspace(0, config.length, config.hedges + 2)[1:-1]:
             top = config.tallest * rng.uniform(0.5, 1.0)
             hedges.append(box([x, -half, 0], [x + 0.5, half, top], "foliage", int(x)))
         _, light = daylight(rng)
         solids = [ground("tiles"), *hedges]
-        return Blueprint("hedges", plot.lower, plot.upper, solids, p_WS, p_WG, light, seed)
+        return WorldSpec("hedges", plan.lower, plan.upper, solids, p_WS, p_WG, light, seed)
 
     return draw_feasible(draw, seed)
 
 
-register_world(HedgesConfig, make_blueprint=hedges_blueprint)
+register_world(HedgesConfig, make_spec=hedges_spec)

@@ -32,7 +32,7 @@ class DistanceSlice {
     this.mesh.position.z = z;
   }
 
-  // What the colours mean.
+  // What the colors mean.
   drawLegend(canvas, unit) {
     const context = canvas.getContext("2d"), {width} = canvas, wide = 0.68 * width;
     context.font = "22px system-ui, sans-serif";

@@ -20,12 +20,11 @@ function showLive(splats, {url, lower, upper, cut}) {
   connection.onclose = () => { status.style.display = "block"; };
   viewer.connection = connection;
 
-  const bar = Object.assign(document.createElement("div"), {className: "bar"});
+  const bar = addElement(document.body, "div", {className: "bar"});
   const slider = addHeightSlider(bar, "live-cut", lower, upper, (z) => {
     splats.cut = z;
     viewer.set_dirty();
   });
   slider.value = cut;
   slider.oninput();
-  document.body.append(bar);
 }

@@ -35,6 +35,19 @@ function placeCamera(viewer, pose) {
     .decompose(camera.position, camera.quaternion, camera.scale);
 }
 
+function addElement(parent, tag, properties = {}) {
+  return parent.appendChild(Object.assign(document.createElement(tag), properties));
+}
+
+// Calls a function of `keys`, by the names of keys.
+function bindKeys(keys) {
+  document.addEventListener("keydown", (event) => {
+    if (event.ctrlKey || event.altKey || event.metaKey || !(event.key in keys)) return;
+    event.preventDefault();
+    keys[event.key]();
+  });
+}
+
 // Adds a slider of heights from `lower` to `upper` [m]; what is above one is to be hidden.
 function addHeightSlider(bar, id, lower, upper, change) {
   const slider = Object.assign(document.createElement("input"), {

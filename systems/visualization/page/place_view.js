@@ -50,44 +50,42 @@ class PlaceView {
 
   build() {
     const {data} = this;
-    const add = (parent, tag, properties = {}) =>
-      parent.appendChild(Object.assign(document.createElement(tag), properties));
-    const panel = add(document.body, "div", {id: "view-panel", className: "panel"});
-    add(panel, "b", {textContent: data.name});
-    add(panel, "div", {textContent: data.size, id: "view-size"});
-    for (const note of data.notes) add(panel, "div", {className: "part", textContent: note});
-    const legend = add(panel, "div", {className: "legend"});
+    const panel = addElement(document.body, "div", {id: "view-panel", className: "panel"});
+    addElement(panel, "b", {textContent: data.name});
+    addElement(panel, "div", {textContent: data.size, id: "view-size"});
+    for (const note of data.notes) addElement(panel, "div", {className: "part", textContent: note});
+    const legend = addElement(panel, "div", {className: "legend"});
     for (const [color, text] of data.legend) {
-      add(legend, "span", {className: "mark"}).style.background = color;
+      addElement(legend, "span", {className: "mark"}).style.background = color;
       legend.append(`${text} `);
     }
     if (this.slice) {
-      add(panel, "div", {className: "part", textContent: "distance to the nearest surface:"});
-      const canvas = add(panel, "canvas", {width: 648, height: 56, id: "view-legend"});
+      addElement(panel, "div", {className: "part", textContent: "distance to the nearest surface:"});
+      const canvas = addElement(panel, "canvas", {width: 648, height: 56, id: "view-legend"});
       this.slice.drawLegend(canvas, data.unit);
     }
     if (this.cameras) {
-      const row = add(panel, "div", {className: "part"});
+      const row = addElement(panel, "div", {className: "part"});
       const step = (by) => {
         const {chosen, poses} = this.cameras;
         this.choose(chosen === null ? 0 : (chosen + by + poses.length) % poses.length);
       };
-      add(row, "button", {textContent: "◀", onclick: () => step(-1)});
+      addElement(row, "button", {textContent: "◀", onclick: () => step(-1)});
       row.append(" ");
-      add(row, "button", {textContent: "▶", id: "view-next", onclick: () => step(1)});
+      addElement(row, "button", {textContent: "▶", id: "view-next", onclick: () => step(1)});
       row.append(" ");
-      this.lookButton = add(row, "button", {
+      this.lookButton = addElement(row, "button", {
         textContent: "look from there", id: "view-look", onclick: () => this.lookFromCamera()});
-      this.caption = add(row, "span");
-      this.image = add(panel, "img", {id: "view-image"});
+      this.caption = addElement(row, "span");
+      this.image = addElement(panel, "img", {id: "view-image"});
     }
-    this.result = add(panel, "div", {className: "part", id: "view-result"});
+    this.result = addElement(panel, "div", {className: "part", id: "view-result"});
 
-    const bar = add(document.body, "div", {id: "view-bar", className: "bar"});
+    const bar = addElement(document.body, "div", {id: "view-bar", className: "bar"});
     const keys = {1: () => this.look()};
-    add(bar, "button", {textContent: "from above (1)", onclick: keys[1]});
+    addElement(bar, "button", {textContent: "from above (1)", onclick: keys[1]});
     const toggle = (key, name, text, start, change) => {
-      const button = add(bar, "button", {textContent: `${text} (${key})`, id: `view-${name}`});
+      const button = addElement(bar, "button", {textContent: `${text} (${key})`, id: `view-${name}`});
       this.switches[name] = (on) => {
         button.classList.toggle("chosen", on);
         change(on);
@@ -110,11 +108,8 @@ class PlaceView {
     }
     this.slider = addHeightSlider(
       bar, "view-height", data.lower[2], data.upper[2], (z) => this.setHeight(z));
-    this.heightText = add(bar, "span");
-    document.addEventListener("keydown", (event) => {
-      if (event.ctrlKey || event.altKey || event.metaKey || !(event.key in keys)) return;
-      keys[event.key]();
-    });
+    this.heightText = addElement(bar, "span");
+    bindKeys(keys);
   }
 
   setHeight(z) {

@@ -1,7 +1,7 @@
 // A flight, or several through one world, in a Meshcat page: vehicle, trail, plans, what the camera
 // saw, speed and clearance, all at the time of one slider.
 //
-// Keys: space plays and pauses, arrows step, 1 2 3 choose the view, d switches colour and depth.
+// Keys: space plays and pauses, arrows step, 1 2 3 choose the view, d switches color and depth.
 "use strict";
 
 class Replay {
@@ -36,22 +36,20 @@ class Replay {
   }
 
   build() {
-    const add = (parent, tag, properties = {}) =>
-      parent.appendChild(Object.assign(document.createElement(tag), properties));
-    const panel = add(document.body, "div", {id: "replay-panel", className: "panel"});
+    const panel = addElement(document.body, "div", {id: "replay-panel", className: "panel"});
     for (const flight of this.flights) {
-      flight.button = add(panel, "button", {
+      flight.button = addElement(panel, "button", {
         className: "flight", onclick: () => this.choose(flight)});
       flight.button.innerHTML = `<span class="mark" style="background:${flight.color}"></span>`;
       flight.button.append(`${flight.name}: ${flight.outcome}, ${flight.duration.toFixed(1)} s`);
     }
-    this.picture = add(panel, "canvas", {width: 648, height: 486, id: "replay-picture"});
-    this.depthButton = add(panel, "button", {
-      textContent: "colour / depth (d)", id: "replay-depth", onclick: () => this.switchDepth()});
-    this.plot = add(panel, "canvas", {width: 648, height: 300, id: "replay-plot"});
+    this.picture = addElement(panel, "canvas", {width: 648, height: 486, id: "replay-picture"});
+    this.depthButton = addElement(panel, "button", {
+      textContent: "color / depth (d)", id: "replay-depth", onclick: () => this.switchDepth()});
+    this.plot = addElement(panel, "canvas", {width: 648, height: 300, id: "replay-plot"});
     this.plot.onclick = (event) =>
       this.seek(event.offsetX / this.plot.clientWidth * this.duration);
-    add(panel, "div", {className: "legend", innerHTML: `
+    addElement(panel, "div", {className: "legend", innerHTML: `
       <span class="mark" style="background:#6fb7ff"></span>speed
       <span class="mark" style="background:#ffc04d"></span>clearance, red below
       ${this.margin} m<br>
@@ -59,25 +57,20 @@ class Replay {
       <span class="mark" style="background:#ff1a1a"></span>dearest plan
       <span class="mark" style="background:#1ae64d"></span>goal`});
 
-    const bar = add(document.body, "div", {id: "replay-bar", className: "bar"});
-    this.playButton = add(bar, "button", {onclick: () => this.play(!this.playing)});
-    this.slider = add(bar, "input", {
+    const bar = addElement(document.body, "div", {id: "replay-bar", className: "bar"});
+    this.playButton = addElement(bar, "button", {onclick: () => this.play(!this.playing)});
+    this.slider = addElement(bar, "input", {
       type: "range", min: 0, max: this.duration, step: 0.01, id: "replay-time"});
     this.slider.oninput = () => {
       this.play(false);
       this.seek(Number(this.slider.value));
     };
-    this.clock = add(bar, "span");
-    this.viewButtons = ["overview", "chase", "onboard"].map((name, k) => add(bar, "button", {
+    this.clock = addElement(bar, "span");
+    this.viewButtons = ["overview", "chase", "onboard"].map((name, k) => addElement(bar, "button", {
       textContent: `${name} (${k + 1})`, id: `replay-${name}`, onclick: () => this.look(name)}));
     this.cutSlider = addHeightSlider(
       bar, "replay-cut", this.lower, this.upper, (z) => this.setCut(z));
-    document.addEventListener("keydown", (event) => this.key(event));
-    this.play(false);
-  }
-
-  key(event) {
-    const keys = {
+    bindKeys({
       " ": () => this.play(!this.playing),
       ArrowLeft: () => this.seek(this.time - 0.1),
       ArrowRight: () => this.seek(this.time + 0.1),
@@ -85,10 +78,8 @@ class Replay {
       2: () => this.look("chase"),
       3: () => this.look("onboard"),
       d: () => this.switchDepth(),
-    };
-    if (event.ctrlKey || event.altKey || event.metaKey || !(event.key in keys)) return;
-    event.preventDefault();
-    keys[event.key]();
+    });
+    this.play(false);
   }
 
   play(playing) {

@@ -128,7 +128,7 @@ class ReplayFlight {
   }
 }
 
-// Balls that move; a centre of nulls is nowhere.
+// Balls that move; a center of nulls is nowhere.
 class ReplayBalls {
   constructor({period, radii, centers}) {
     const THREE = MeshCat.THREE;

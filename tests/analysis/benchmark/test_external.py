@@ -6,10 +6,10 @@ from splatpilot.analysis.benchmark import run_study as benchmark
 from splatpilot.analysis.benchmark.external import (
     DODGEDRONE,
     DODGEDRONE_SPEEDS,
-    external_section,
     external_table,
     format_external,
 )
+from splatpilot.analysis.benchmark.report import external_section
 from splatpilot.analysis.benchmark.study import StudyConfig
 from splatpilot.analysis.commands.main import main
 from splatpilot.diagrams.flight.policies import BENCHMARK_POLICIES, policy_named
@@ -25,8 +25,6 @@ ROWS = [
 
 
 def test_published_figures_stand_before_our_own():
-    """Of a scenario of others, what they published comes first, and then each policy and speed of
-    the study; its other scenarios are left out."""
     table = external_table(ROWS, CONFIG)
     assert {row["scenario"] for row in table} == {"dodgedrone_medium"}
     *published, slow, fast = table
@@ -37,21 +35,18 @@ def test_published_figures_stand_before_our_own():
     )
     assert (fast["successes"], fast["mean_speed_m_s"]) == (0, 2.5)
     assert fast["wilson_lower"] == pytest.approx(0.0) and 0 < fast["wilson_upper"] < 1
-    for text in (format_external(table), external_section(table, "test seeds")):
+    for text in (format_external(table), external_section(ROWS, CONFIG)):
         assert text.index("187/303") < text.index("1/2") and "arseniid/agile_flight" in text
 
 
 def test_only_scenarios_as_they_are_are_compared():
-    """A study of other scenarios, or with overrides, has no such table."""
     assert external_table(ROWS, StudyConfig(scenarios=["P01"], policies=["straight"])) == []
     CONFIG_CHANGED = StudyConfig(**(vars(CONFIG) | {"overrides": ["timeout=100"]}))
     assert external_table(ROWS, CONFIG_CHANGED) == []
-    assert external_section([], "test seeds") == ""
+    assert external_section(ROWS, CONFIG_CHANGED) == ""
 
 
 def test_one_command_flies_the_challenge(monkeypatch, tmp_path):
-    """`benchmark --dodgedrone` flies all policies through all levels at 2, 3, 5 and 7 m/s, and
-    fewer where fewer are named."""
     studies = []
     monkeypatch.setattr(benchmark, "run", lambda *, config, **_: studies.append(config))
     command = ["benchmark", "--dodgedrone", "--out", str(tmp_path)]
@@ -66,6 +61,5 @@ def test_one_command_flies_the_challenge(monkeypatch, tmp_path):
 
 @pytest.mark.parametrize("policy", BENCHMARK_POLICIES)
 def test_all_policies_fly_at_its_speeds(policy):
-    """None refuses a speed of the table."""
     for speed in DODGEDRONE_SPEEDS:
         policy_named(policy, speed)

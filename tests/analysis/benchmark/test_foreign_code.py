@@ -47,13 +47,11 @@ def package(tmp_path, monkeypatch):
     (package / "policy.py").write_text(POLICY)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))
-    monkeypatch.setattr(POLICIES, "_kinds", dict(POLICIES._entries))  # gone again for other tests
+    monkeypatch.setattr(POLICIES, "_entries", dict(POLICIES._entries))  # gone again for other tests
     return package
 
 
 def test_a_study_is_flown_by_one_version_of_the_code_of_others(package, tmp_path, capsys):
-    """Their source, whichever of a package's files it stands in, is part of a study: changed since,
-    it does not fly what is missing, and a replay says so."""
     (tmp_path / "short.yaml").write_text(
         "world: {length: 8, width: 5, height: 3, rocks: 0, logs: 0, voxel_size: 0.25}\n"
         "timeout: 0.4\n"
@@ -70,7 +68,7 @@ def test_a_study_is_flown_by_one_version_of_the_code_of_others(package, tmp_path
     first.unlink()
     capsys.readouterr()
     assert main(words) == 1
-    assert "was begun with source of straying" in capsys.readouterr().err
+    assert "was started with source of straying" in capsys.readouterr().err
     row = second.stem
     # By the code that was imported: this process has what flew.
     assert main(["--import", "straying.policy", "replay", "study", row]) == 0
@@ -83,5 +81,4 @@ def test_a_study_is_flown_by_one_version_of_the_code_of_others(package, tmp_path
 
 
 def test_our_own_code_is_the_program():
-    """It has its revision already."""
     assert foreign_code([Scenario()]) == {}

@@ -13,15 +13,12 @@ from splatpilot.analysis.commands.main import main
 
 
 def test_replay_equals_the_record_and_says_so(study, tmp_path, capsys):
-    """From a copy of the folder elsewhere a flight replays to the last bit, and a record that was
-    changed by a millimetre does not agree.
-    """
     config, whole = study
     copy = tmp_path / "elsewhere"
     shutil.copytree(whole, copy)
     spec = config.rollouts()[1]
     assert main(["replay", str(copy), spec.id, "--meshcat", "--video"]) == 0
-    assert "equals the recorded flight to the last bit" in capsys.readouterr().out
+    assert "is bitwise identical to the recorded flight" in capsys.readouterr().out
     assert (copy / "replays" / spec.id / "flight.html").stat().st_size > 1e5
     assert (copy / "replays" / spec.id / "flight.mp4").stat().st_size > 1e3
 
@@ -36,7 +33,7 @@ def test_replay_equals_the_record_and_says_so(study, tmp_path, capsys):
     assert result.deviation == pytest.approx(0.001, rel=0.01)
     printed = capsys.readouterr().out
     assert "THE REPLAY DIFFERS" in printed
-    assert f"Program and machine are those that flew it: {spec.policy} keeps state" in printed
+    assert f"It was flown by this program and machine: {spec.policy} keeps state" in printed
     assert main(["replay", str(copy), spec.id]) == 1
     assert f"{spec.id}: the replay differs" in capsys.readouterr().err
 

@@ -21,9 +21,6 @@ from splatpilot.systems.policies.straight import Straight
 
 
 def test_infeasible_flight_fails_with_a_reason(short_scenario, tmp_path, capsys, rows_of):
-    """A goal where no vehicle fits, and one so near the ground that the planner's margin leaves no
-    way to it, end flights and not the study: their rows tell why, and they cannot be replayed.
-    """
     overrides = ["goal=[6.5, 0, 0.36]"]
     config = StudyConfig([str(short_scenario)], ["straight", "planner"], [2.0], 1, overrides)
     table = benchmark.run(config=config, out=tmp_path / "near", jobs=1)
@@ -93,13 +90,10 @@ def test_a_policy_that_raises_stops_the_study(short_scenario, tmp_path, monkeypa
 
 
 def test_exception_stops_the_study(short_scenario, tmp_path, capsys, rows_of):
-    """An exception is no failed flight: one message names the file of its traceback, no table is
-    written, and once it is mended the study goes on and nothing is left of the error.
-    """
     out = tmp_path / "out"
     words = ["benchmark", "--out", str(out), "--scenarios", str(short_scenario), "--seeds", "2"]
     words += ["--policies", "straight,straight:rate=7", "--jobs", "2"]
-    measures = "splatpilot.analysis.benchmark.rollout.flight_measures"
+    measures = "splatpilot.analysis.benchmark.rollout.flight_metrics"
 
     def refuse(flight, shortest):
         raise ZeroDivisionError("of the policy\nwith a second line")
@@ -120,9 +114,6 @@ def test_exception_stops_the_study(short_scenario, tmp_path, capsys, rows_of):
 
 
 def test_fault_in_a_worker_process_stops_the_study(short_scenario, tmp_path):
-    """Weights that vanish while the study flies are told by the worker that misses them, and the
-    flights that others have ended are kept.
-    """
     shipped = PolicyCheckpoint.load("", "diffaero", DIFFAERO_NETWORK)
     mine = tmp_path / "mine.npz"
     PolicyCheckpoint("diffaero", shipped.spec, dict(shipped.weights), {}).save(mine)
@@ -140,7 +131,6 @@ def test_fault_in_a_worker_process_stops_the_study(short_scenario, tmp_path):
 
 
 def test_worlds_of_two_types_with_the_same_fields_are_two(monkeypatch):
-    """The worlds that a process keeps are told apart by the types of their configurations too."""
 
     @dataclass
     class OtherForestConfig(ForestConfig):

@@ -20,9 +20,6 @@ from splatpilot.analysis.commands.main import main
 
 
 def test_study_leaves_what_it_promises(study, rows_of):
-    """Each flight has a row, a trajectory that agrees with it and a timing; the report holds its
-    pictures.
-    """
     config, out = study
     rows = rows_of(out / "rollouts.csv")
     assert [row["id"] for row in rows] == [spec.id for spec in config.rollouts()]
@@ -43,9 +40,6 @@ def test_study_leaves_what_it_promises(study, rows_of):
 
 
 def test_killed_study_is_finished_and_equals_an_uninterrupted_one(study, tmp_path, contents):
-    """A study with two workers is killed without warning after its first flight; finished by
-    another number of workers, all its files but the timings equal the uninterrupted study's.
-    """
     config, whole = study
     out = tmp_path / "killed"
     command = [
@@ -75,9 +69,6 @@ def test_killed_study_is_finished_and_equals_an_uninterrupted_one(study, tmp_pat
 
 
 def test_damaged_file_is_flown_again_and_reported(study, tmp_path, capsys, contents):
-    """A truncated trajectory, and one of another flight, are named, flown again and equal what was
-    there; nothing else is flown.
-    """
     config, whole = study
     out = tmp_path / "damaged"
     shutil.copytree(whole, out)
@@ -90,16 +81,13 @@ def test_damaged_file_is_flown_again_and_reported(study, tmp_path, capsys, conte
     printed = capsys.readouterr().out
     assert f"{files[0]} is damaged" in printed
     assert f"{files[3]} is of another flight" in printed
-    assert "4 of 6 flights are there already" in printed
+    assert "4 of 6 flights exist already" in printed
     assert contents(out) == contents(whole)
     assert files[1].stat().st_mtime_ns == untouched
     assert "is damaged" in (out / "report.html").read_text()
 
 
 def test_folder_of_another_study_is_refused(study, tmp_path, contents):
-    """Another specification, another program and a folder that holds something else are refused,
-    and nothing in them changes.
-    """
     config, whole = study
     before = contents(whole)
     with pytest.raises(ValueError, match=r"holds a study with seeds 3, not 4"):
@@ -112,7 +100,7 @@ def test_folder_of_another_study_is_refused(study, tmp_path, contents):
     next(other.glob("rollouts/*")).unlink()
     text = (other / "study.yaml").read_text()
     (other / "study.yaml").write_text(re.sub(r"numpy: .*", "numpy: 0.1", text))
-    with pytest.raises(ValueError, match=r"begun with numpy 0.1, this is"):
+    with pytest.raises(ValueError, match=r"started with numpy 0.1, this is"):
         benchmark.run(config=config, out=other, jobs=1)
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "thesis.txt").write_text("")
@@ -121,9 +109,6 @@ def test_folder_of_another_study_is_refused(study, tmp_path, contents):
 
 
 def test_absent_scene_is_not_run_and_never_passed(short_scenario, tmp_path, capsys):
-    """A scenario without its scene is reported with what to do, and counts neither as flown nor as
-    failed.
-    """
     absent = tmp_path / "R99.yaml"
     absent.write_text(f"world: !SceneConfig {{path: {tmp_path / 'nowhere'}}}\n")
     config = StudyConfig([str(short_scenario), str(absent)], ["straight"], [2.0], seeds=2)
@@ -135,7 +120,6 @@ def test_absent_scene_is_not_run_and_never_passed(short_scenario, tmp_path, caps
 
 
 def test_nothing_flown_is_no_success(tmp_path, capsys):
-    """A study whose scenes are all absent ends with a message and status 1, without a table."""
     absent = tmp_path / "R99.yaml"
     absent.write_text(f"world: !SceneConfig {{path: {tmp_path / 'nowhere'}}}\n")
     out = tmp_path / "out"
@@ -147,9 +131,6 @@ def test_nothing_flown_is_no_success(tmp_path, capsys):
 
 
 def test_each_flight_is_read_once(study, tmp_path, monkeypatch, contents):
-    """A study that is there is reported on with one reading of each flight, and of those in the
-    picture of one field a second.
-    """
     config, whole = study
     out = tmp_path / "copy"
     shutil.copytree(whole, out)
@@ -171,7 +152,6 @@ def test_each_flight_is_read_once(study, tmp_path, monkeypatch, contents):
 
 
 def test_study_interrupted_while_it_begins_is_finished(study, tmp_path, monkeypatch, contents):
-    """A kill before the first flight, while scenes are copied, leaves a folder that goes on."""
     config, whole = study
     out = tmp_path / "begun"
 
@@ -189,7 +169,7 @@ def test_study_interrupted_while_it_begins_is_finished(study, tmp_path, monkeypa
     ("arguments", "message"),
     [
         (["replay", "{out}", "short-planner-2-999"], "has no flight 'short-planner-2-999'"),
-        (["replay", "{out}/rollouts", "a"], "study.yaml: there is no such file"),
+        (["replay", "{out}/rollouts", "a"], "No such file: {out}/rollouts/study.yaml"),
         (["benchmark", "--out", "{out}", "--scenarios", "P99"], "there is no scenario 'P99'"),
         (["benchmark", "--out", "{out}", "--speeds", "fast"], "numbers in m/s, got 'fast'"),
         (
@@ -203,19 +183,15 @@ def test_study_interrupted_while_it_begins_is_finished(study, tmp_path, monkeypa
     ],
 )
 def test_bad_command_is_one_message(study, arguments, message, capsys):
-    """Every user error ends with one message and exit status 1."""
     config, out = study
     words = [word.format(out=out, scenario=config.scenarios[0]) for word in arguments]
     assert main(words) == 1
     error = capsys.readouterr().err
     assert error.splitlines()[-1].startswith("splatpilot: ")
-    assert message in error
+    assert message.format(out=out) in error
 
 
 def test_cluster_flies_the_same_study_and_survives_the_death_of_a_worker(study, tmp_path, contents):
-    """Two worker processes of a dask cluster fly the study; one is killed once both have begun, and
-    the files equal those of the study flown here.
-    """
     distributed = pytest.importorskip("distributed")
     config, whole = study
     with distributed.LocalCluster(
@@ -243,7 +219,6 @@ def test_cluster_flies_the_same_study_and_survives_the_death_of_a_worker(study, 
 
 
 def test_cluster_that_is_not_there_is_named(study, tmp_path, monkeypatch):
-    """An address nobody answers at is named with what to start."""
     config, _ = study
     monkeypatch.setattr("splatpilot.analysis.benchmark.run_study.CONNECT_TIMEOUT", 0.5)
     with pytest.raises(OSError, match=r"tcp://127.0.0.1:1 .*dask worker"):

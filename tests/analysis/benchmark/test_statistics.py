@@ -24,14 +24,12 @@ from splatpilot.analysis.benchmark.tables import (
     ],
 )
 def test_wilson_interval_is_the_published_one(successes, flights, lower, upper):
-    """The interval agrees with Newcombe's worked examples to the digits he gives."""
     interval = wilson_interval(successes, flights)
     assert interval.lower == pytest.approx(lower, abs=5e-5)
     assert interval.upper == pytest.approx(upper, abs=5e-5)
 
 
 def test_interval_without_flights_is_everything():
-    """Nothing flown says nothing."""
     assert wilson_interval(0, 0) == (0.0, 1.0)
 
 
@@ -42,9 +40,6 @@ def paired(only_first: int, only_second: int, both: int, neither: int):
 
 
 def test_mcnemar_is_the_binomial_of_unequal_pairs():
-    """With 6 and 16 unequal pairs p is 2 P(X <= 6) of 22 fair coins, 0.0525, whatever the equal
-    pairs; swapping the policies swaps the counts.
-    """
     first, second = paired(6, 16, 80, 59)
     result = mcnemar(first, second)
     assert (result.only_first, result.only_second) == (6, 16)
@@ -54,7 +49,6 @@ def test_mcnemar_is_the_binomial_of_unequal_pairs():
 
 
 def test_mcnemar_without_unequal_pairs():
-    """Policies that always do alike do not differ."""
     assert mcnemar(*paired(0, 0, 5, 3)) == (0, 0, 1.0)
 
 

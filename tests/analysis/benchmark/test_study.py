@@ -10,7 +10,6 @@ from splatpilot.diagrams.scenarios import benchmark_scenarios
 
 
 def test_rollouts_are_all_combinations(short_scenario):
-    """Each scenario, policy, speed and seed is flown once, under a name of its own."""
     config = StudyConfig([str(short_scenario)], ["planner", "straight"], [1.5, 2.0], seeds=3)
     specs = config.rollouts()
     assert len(specs) == len(set(specs)) == len({spec.id for spec in specs}) == 12
@@ -26,7 +25,6 @@ def test_split_decides_the_seeds(short_scenario, split, seeds):
 
 
 def test_chunks_are_flights_through_one_place(short_scenario):
-    """All flights are handed out once, in order, never more than the size, nor of two places."""
     config = StudyConfig([str(short_scenario)], ["planner", "straight"], [1.5, 2.0], seeds=3)
     flights = [(spec, spec.id) for spec in config.rollouts()]
     parts = list(chunks(flights, 3))
@@ -58,21 +56,17 @@ def test_chunks_are_flights_through_one_place(short_scenario):
         ({"seeds": 101}, r"seeds of split dev must be in \[1, 100\], got 101"),
         ({"split": "fresh"}, "split must be one of dev, test, got 'fresh'"),
         ({"overrides": ["world.spacing=0.1"]}, "scenario short: .*spacing"),
-        ({"overrides": ["policy.rate=3"]}, "write it as one of them, --policies NAME:rate=3"),
-        ({"overrides": ["seed=3"]}, "say how many with --seeds"),
+        ({"overrides": ["policy.rate=3"]}, "write --policies NAME:rate=3"),
+        ({"overrides": ["seed=3"]}, "give their number with --seeds"),
         ({"overrides": ["wrld.spacing=1"]}, "did you mean world"),
     ],
 )
 def test_bad_study_is_named(short_study, changes, message):
-    """Unknown scenarios, policies and speeds, and infeasible parameters, are refused by name."""
     with pytest.raises((ValueError, FileNotFoundError), match=message):
         replace(short_study, **changes).load_scenarios()
 
 
 def test_flights_of_one_name_are_refused(short_scenario):
-    """A hyphen may stand in the names of scenarios and policies; two flights of one name, which
-    would be one file, may not be in a study.
-    """
     other = short_scenario.with_name("short-a.yaml")
     other.write_text(short_scenario.read_text())
     config = StudyConfig([str(short_scenario), str(other)], ["a-b=planner", "b=planner"], seeds=1)
@@ -84,9 +78,6 @@ OWN = "policy: !ReactiveConfig {speed: 1.5, margin: 0.4}\n"
 
 
 def test_own_policies_fly_where_nobody_is_named(short_scenario):
-    """Files that all have a policy are flown by it, others by all policies; and a policy that is
-    not flown is listed.
-    """
     own = short_scenario.with_name("own.yaml")
     own.write_text(short_scenario.read_text() + OWN)
     assert default_policies([str(own)]) == ["scenario"]
@@ -97,7 +88,6 @@ def test_own_policies_fly_where_nobody_is_named(short_scenario):
 
 
 def test_own_policy_flies_at_its_own_speed(short_scenario):
-    """A study whose speed is another one is refused, and says which to give."""
     short_scenario.write_text(short_scenario.read_text() + OWN)
     config = StudyConfig([str(short_scenario)], ["scenario"], seeds=1)
     with pytest.raises(ValueError, match=r"flies at 1.5 m/s, its own speed; give --speeds 1.5"):
@@ -107,7 +97,6 @@ def test_own_policy_flies_at_its_own_speed(short_scenario):
 
 
 def test_all_benchmark_scenarios_load():
-    """Every scenario of the benchmark is valid, and found by its name."""
     config = StudyConfig()
     assert config.scenarios == list(benchmark_scenarios())
     if config.scenarios:

@@ -15,7 +15,6 @@ from splatpilot.systems.common.provenance import program
 
 @pytest.mark.parametrize("row", [[1, 2], 3, {}, {"success": True, "outcome": "goal"}])
 def test_rows_that_are_none_are_damage(study, tmp_path, row):
-    """A flight's file that can be read and says nothing of use counts as damaged."""
     config, whole = study
     spec = config.rollouts()[0]
     folder = StudyFolder(tmp_path)
@@ -31,10 +30,10 @@ def test_rows_that_are_none_are_damage(study, tmp_path, row):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "describes no study"),
-        ("[1", "describes no study"),
-        ("format_version: 1", "describes no study: study is None"),
-        ("format_version: 1\nstudy: {}\nprogram: null", "describes no study: program is None"),
+        ("", "is not a study"),
+        ("[1", "is not a study"),
+        ("format_version: 1", "is not a study: study is None"),
+        ("format_version: 1\nstudy: {}\nprogram: null", "is not a study: program is None"),
         ("format_version: 1\nstudy: {sedes: 3}\nprogram: {}", "there is no field sedes"),
         ("format_version: 1\nstudy: {seeds: many}\nprogram: {}", ".*many"),
         ("format_version: 1\nstudy: {seeds: 1000000000}\nprogram: {}", "got 1000000000"),
@@ -43,15 +42,12 @@ def test_rows_that_are_none_are_damage(study, tmp_path, row):
     ],
 )
 def test_descriptions_that_are_none_name_the_file(tmp_path, text, message):
-    """A `study.yaml` with fields missing, null, unknown or out of range is refused by name."""
     (tmp_path / "study.yaml").write_text(text)
     with pytest.raises(ValueError, match=rf"study\.yaml:? .*{message}"):
         StudyFolder(tmp_path).config()
 
 
 def test_study_that_was_killed_before_it_began_is_begun(study, tmp_path, contents):
-    """What a kill leaves in a folder, at any moment before the first flight, is no other study's:
-    half a `study.yaml`, and half a scenario behind a whole one."""
     config, whole = study
     out = tmp_path / "killed"
     begun = (
@@ -71,8 +67,6 @@ def test_study_that_was_killed_before_it_began_is_begun(study, tmp_path, content
 
 
 def test_fields_that_came_later_are_as_they_are_by_default(study, tmp_path):
-    """A study that was begun before a field was known goes on with the field's default, and not
-    with another value."""
     config, _ = study
     folder = StudyFolder(tmp_path / "out")
     folder.claim(config, program())

@@ -22,9 +22,6 @@ from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK
 
 
 def test_weights_of_ones_own_fly_in_a_study_that_keeps_them(short_scenario, tmp_path, rows_of):
-    """A policy given as a file of weights is named after it or as is said, flies by them and not by
-    those that ship, replays without the file, and the study is refused when the file changes.
-    """
     shipped = PolicyCheckpoint.load("", "diffaero", DIFFAERO_NETWORK)
 
     def write(thrust: float) -> None:
@@ -52,9 +49,6 @@ def test_weights_of_ones_own_fly_in_a_study_that_keeps_them(short_scenario, tmp_
 
 
 def test_variants_of_a_policy_fly_side_by_side(short_scenario, tmp_path, rows_of):
-    """Variants, a sweep and the policy as it ships are flights of their own, each with its fields;
-    the study keeps what was asked for, and its flights replay.
-    """
     out = tmp_path / "out"
     words = ["--scenarios", str(short_scenario), "--seeds", "1", "--jobs", "1"]
     words += ["--policies", "slow=planner:rate=2,planner", "--sweep", "straight:rate=5,10"]
@@ -72,9 +66,6 @@ def test_variants_of_a_policy_fly_side_by_side(short_scenario, tmp_path, rows_of
 
 
 def test_own_policy_of_a_scenario_flies_and_is_kept(short_scenario, tmp_path, capsys):
-    """A scenario's policy flies where nobody is named, with its weights, which the study keeps;
-    where others are named the study says that it does not.
-    """
     shipped = PolicyCheckpoint.load("", "diffaero", DIFFAERO_NETWORK)
     mine = tmp_path / "mine.npz"
     weights = {name: 0.0 * array for name, array in shipped.weights.items()}
@@ -94,7 +85,7 @@ def test_own_policy_of_a_scenario_flies_and_is_kept(short_scenario, tmp_path, ca
     assert replay.run(study=moved, id="short-scenario-2-000").exact
 
     assert main([*words, "--out", str(tmp_path / "other"), "--policies", "straight"]) == 0
-    assert f"The policy that {short_scenario} names is not flown" in capsys.readouterr().out
+    assert f"The policy of {short_scenario} is not flown" in capsys.readouterr().out
 
 
 def test_study_is_not_continued_with_other_shipped_weights(short_scenario, tmp_path, monkeypatch):
@@ -111,7 +102,7 @@ def test_study_is_not_continued_with_other_shipped_weights(short_scenario, tmp_p
     zeros = {name: 0.0 * array for name, array in shipped.weights.items()}
     PolicyCheckpoint("diffaero", shipped.spec, zeros, {}).save(tmp_path / "diffaero.npz")
     folder.trajectory("short-diffaero-2-001").unlink()
-    with pytest.raises(ValueError, match="was begun with weights of diffaero"):
+    with pytest.raises(ValueError, match="was started with weights of diffaero"):
         benchmark.run(config=config, out=folder.path, jobs=1)
 
 
@@ -131,7 +122,6 @@ def test_digest_of_a_scene_is_that_of_what_flies(place, tmp_path):
 
 
 def test_begun_study_leaves_its_scenarios_as_they_are(place, tmp_path):
-    """Keeping a scene in the study's folder changes the copy of the scenario, not the scenario."""
     scene = place.scene("hall")
     file = tmp_path / "hall.yaml"
     file.write_text(f"world: !SceneConfig {{path: {scene}}}\n")

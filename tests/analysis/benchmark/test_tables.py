@@ -27,14 +27,12 @@ def flights(policy: str, scenario: str, successes: list[bool]) -> list[dict]:
 
 
 def test_scenario_is_passed_where_most_flights_succeed():
-    """Two of three flights pass a scenario, one of two does not, nor does none."""
     rows = flights("a", "P01", [True, True, False]) + flights("a", "P02", [True, False])
     rows += flights("a", "P03", [False])
     assert scenarios_passed(rows) == {"scenarios": 3, "scenarios_passed": 1}
 
 
 def test_table_has_a_row_for_each_policy():
-    """Each row counts its own policy's flights alone, and says so in the terminal."""
     rows = flights("planner", "P01", [True, True]) + flights("straight", "P01", [True, False])
     config = StudyConfig(["P01"], ["planner", "straight"], [2.0], seeds=2)
     table = policy_table(rows, config)
@@ -47,9 +45,6 @@ def test_table_has_a_row_for_each_policy():
 
 
 def test_paper_stands_beside_what_it_is_about():
-    """The paper's rows are shown for its policies as they ship, in the whole benchmark; not for
-    variants of them, in other scenarios or with other parameters.
-    """
     seventeen = list(benchmark_scenarios())
     assert len(seventeen) == 17
     policies = ["planner", "diffaero", "depthnav:camera.width=128"]

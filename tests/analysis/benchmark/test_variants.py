@@ -27,15 +27,14 @@ from splatpilot.systems.policies.reactive import ReactiveConfig
     ],
 )
 def test_variants_are_read(text, variant):
-    """Label, policy and fields are told apart, whatever stands in files and values."""
     assert parse_variant(text) == variant
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("a/b=reactive", "labelled 'a/b', but labels name files"),
-        (".=reactive", "labelled '.'"),
+        ("a/b=reactive", "labeled 'a/b', but labels name files"),
+        (".=reactive", "labeled '.'"),
         ("=reactive", "'=reactive' has no label before its ="),
         ("reactive:yaws=[1, 2]", r"LABEL=POLICY"),
         ("x" * 81 + "=reactive", "at most 80"),
@@ -49,13 +48,11 @@ def test_variants_are_read(text, variant):
     ],
 )
 def test_bad_variants_are_refused(text, message):
-    """A label that no file can bear, and fields that have a place of their own."""
     with pytest.raises(ValueError, match=message):
         parse_variant(text)
 
 
 def test_variant_changes_the_fields_it_names():
-    """The rest is the policy's own, at the study's speed."""
     config = parse_variant("wide=reactive:margin=0.4:camera.width=32").config(1.5, None)
     assert isinstance(config, ReactiveConfig)
     assert (config.speed, config.margin, config.camera.width) == (1.5, 0.4, 32)
@@ -67,7 +64,6 @@ def test_variant_changes_the_fields_it_names():
 
 
 def test_variant_of_a_file_flies_by_its_weights(tmp_path):
-    """Fields of a policy given as a file can be set too."""
     shipped = PolicyCheckpoint.load("", "diffaero", DIFFAERO_NETWORK)
     file = tmp_path / "mine.npz"
     PolicyCheckpoint("diffaero", shipped.spec, dict(shipped.weights), {}).save(file)
@@ -78,7 +74,6 @@ def test_variant_of_a_file_flies_by_its_weights(tmp_path):
 
 
 def test_lists_are_split_outside_brackets():
-    """Commas inside values stay there."""
     assert split_policies("a, b=c:x=[1,2]:y={z: 1,w: 2},d") == [
         "a",
         "b=c:x=[1,2]:y={z: 1,w: 2}",
@@ -87,7 +82,6 @@ def test_lists_are_split_outside_brackets():
 
 
 def test_sweep_is_all_combinations():
-    """Each combination of values is a variant of its own; a sweep of nothing is refused."""
     assert list(sweep("reactive:margin=0.1,0.2")) == [
         "reactive:margin=0.1",
         "reactive:margin=0.2",

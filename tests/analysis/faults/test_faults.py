@@ -64,14 +64,12 @@ class Line:
 
 
 def test_without_a_fault_everything_arrives_at_once():
-    """Before and after a fault messages are the very bytes that were sent, in order."""
     line = Line("policy_killed")
     assert [data for _, data in line.heard] == line.sent
     np.testing.assert_allclose([now for now, _ in line.heard], 0.02 * np.arange(150))
 
 
 def test_a_relay_ends_with_what_it_connects():
-    """Hundreds of trials in one process open no more files than one."""
     Line("dropped")
     before = len(os.listdir("/proc/self/fd"))
     for _ in range(3):
@@ -80,7 +78,6 @@ def test_a_relay_ends_with_what_it_connects():
 
 
 def test_each_fault_of_messages_is_what_it_is_called():
-    """All messages of its second are lost, late, doubled or mixed up, and none of the others."""
     assert Line("dropped").numbers() == [*range(50), *range(100, 150)]
     late = Line("delayed")
     by_number = dict(zip(late.numbers(), (now for now, _ in late.heard), strict=True))
@@ -92,8 +89,6 @@ def test_each_fault_of_messages_is_what_it_is_called():
 
 
 def test_contents_are_spoilt_as_they_are_called():
-    """Corrupt messages differ from what was sent; frozen ones have new times and one content; after
-    a jump of the clock all times are off."""
     assert not {data for _, data in Line("corrupt").during} & set(Line("corrupt").sent[50:100])
     frozen = [StateCodec.message.decode(data) for _, data in Line("state_frozen").during]
     assert {message.p_WB for message in frozen} == {(5.0, 0.0, 2.0)}
@@ -159,7 +154,7 @@ def test_grids_travel_as_packets_of_the_sensor(kind, came):
 
 def test_kinds_interfaces_and_policies_take_turns_and_repeat():
     count = 4 * len(KINDS)
-    trials = [Trial.draw(n, np.random.default_rng([0, n])) for n in range(count)]
+    trials = [Trial.sample(n, np.random.default_rng([0, n])) for n in range(count)]
     for number, trial in enumerate(trials):
         kinds = [fault.kind for fault in trial.faults]
         assert KINDS[number % len(KINDS)] in kinds and len(set(kinds)) == len(kinds)
@@ -169,7 +164,7 @@ def test_kinds_interfaces_and_policies_take_turns_and_repeat():
     assert {trial.policy for trial in trials} == {"straight", "reactive", "diffaero_tof"}
     pairs = sum(len(trial.faults) == 2 for trial in trials)
     assert 0.3 * count < pairs < 0.7 * count
-    assert trials[3] == Trial.draw(3, np.random.default_rng([0, 3])) != trials[3 + len(KINDS)]
+    assert trials[3] == Trial.sample(3, np.random.default_rng([0, 3])) != trials[3 + len(KINDS)]
 
 
 @pytest.mark.parametrize("setpoints", ["velocity", "body_rates"])
@@ -186,8 +181,6 @@ def test_a_state_that_freezes_while_images_are_lost_ends_in_no_accident(setpoint
 
 
 def test_a_campaign_is_safe_goes_on_where_it_stopped_and_repeats(tmp_path):
-    """Trials of some kinds end in no accident; the campaign, interrupted after one of them, ends as
-    one that was not, and its summary says how."""
     settings = ["world.length=12.0", "world.width=6.0", "start_radius=0.05"]
     sets = [word for setting in settings for word in ("--set", f"scenario.{setting}")]
     words = ["hardware", "faults", "--set", "trials=2", "--set", "worlds=1", *sets]
@@ -206,7 +199,6 @@ def test_a_campaign_is_safe_goes_on_where_it_stopped_and_repeats(tmp_path):
 
 
 def test_accidents_are_counted():
-    """A trial that was not safe is no safe one in the summary."""
     row = {"faults": [{"kind": "dropped"}], "safe": True, "outcome": "hover"}
     summary = summarize([row, {**row, "safe": False, "outcome": "collision"}])
     assert (summary["trials"], summary["safe"]) == (2, 1)
@@ -214,6 +206,5 @@ def test_accidents_are_counted():
 
 
 def test_bad_config_is_named():
-    """A value out of range names the field."""
     with pytest.raises(ValueError, match="trials is 0; it must be at least 1"):
         FaultsConfig(trials=0).validate()

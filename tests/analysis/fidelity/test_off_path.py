@@ -2,19 +2,17 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 
-from splatpilot.analysis.fidelity.study import choose_withheld, displace_pose, drop_frames
+from splatpilot.analysis.fidelity.study import choose_held_out, displace_pose, drop_frames
 
 
 def test_withheld_stretches():
-    """Stretches come in turn, with as many kept frames before, between and after them."""
-    assert choose_withheld(16, [1, 3], 2) == [2, 5, 6, 7, 10]
-    assert choose_withheld(5, [1], 2) == [2]
-    with pytest.raises(ValueError, match="4 frames are too few to withhold 1 between 2"):
-        choose_withheld(4, [1], 2)
+    assert choose_held_out(16, [1, 3], 2) == [2, 5, 6, 7, 10]
+    assert choose_held_out(5, [1], 2) == [2]
+    with pytest.raises(ValueError, match="4 frames are too few to hold out 1 between 2"):
+        choose_held_out(4, [1], 2)
 
 
 def test_capture_without_frames(place):
-    """The rest of a capture has the other frames, in order, with their images and depths."""
     rest = drop_frames(place.capture, [0, 2, 3])
     assert len(rest) == 13
     for k, i in ((0, 1), (1, 4), (12, 15)):
@@ -25,8 +23,6 @@ def test_capture_without_frames(place):
 
 
 def test_displaced_poses():
-    """Along a path, left is horizontal and at right angles to it, up is up, and the camera keeps
-    looking the same way."""
     R_WC = RotationMatrix.MakeZRotation(0.3)
     path = [RigidTransform(R_WC, [1.0 * i, 2.0 * i, 0.5 * i]) for i in range(4)]
     p_WC = path[1].translation()
@@ -38,7 +34,6 @@ def test_displaced_poses():
 
 
 def test_displaced_poses_without_a_way():
-    """Where a path stands still or climbs, left is to the left of the camera."""
     R_WC = RotationMatrix.MakeZRotation(0.3)
     climb = [RigidTransform(R_WC, [0.0, 0.0, 1.0 * i]) for i in range(3)]
     for path in (climb[:1], climb):

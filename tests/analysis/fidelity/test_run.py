@@ -27,7 +27,6 @@ def samples_of(offsets: np.ndarray, psnr, relative) -> list[Sample]:
 
 
 def test_reach_is_where_the_first_limit_is_met():
-    """Of a linear fall of PSNR and a linear rise of depth errors, the earlier limit counts."""
     offsets = np.linspace(0, 1, 11)
     by_depth = study(samples_of(offsets, lambda x: 30 - 5 * x, lambda x: 0.125 * x))
     assert by_depth.reach == pytest.approx(0.4)
@@ -59,8 +58,6 @@ def rows_of(folder) -> list[dict]:
 
 
 def test_a_perfect_scene_is_trusted_as_far_as_measured(place, rendered_world, capsys):
-    """Against a world that is the scene itself there are no errors at any offset, and the bound is
-    the largest that was tried."""
     scene = place.scene("perfect")
     config = FidelityConfig(offsets=[0.0, 0.2, 0.4])
     fidelity.run([scene], place.folder / "out", config, rendered_world)
@@ -77,7 +74,6 @@ def test_a_perfect_scene_is_trusted_as_far_as_measured(place, rendered_world, ca
 
 
 def test_a_wrong_scene_is_trusted_less(place, rendered_world):
-    """A scene whose left wall is missing is worse to the left, and poses are bounded."""
     gaussians = place.gaussians
     there = ~((gaussians.means[:, 1] > 2.9) & (gaussians.means[:, 0] > 3.0))
     part = replace(
@@ -95,7 +91,6 @@ def test_a_wrong_scene_is_trusted_less(place, rendered_world):
 
 
 def test_walls_are_not_walked_through(place, rendered_world):
-    """Offsets that end nearer than the clearance to something are left out."""
     scene = place.scene("room_with_walls", held_out=[0])
     # The room's walls are 1.5 m to either side; the field knows nothing beyond them.
     config = FidelityConfig(offsets=[0.0, 1.0, 1.4])
@@ -104,8 +99,6 @@ def test_walls_are_not_walked_through(place, rendered_world):
 
 
 def test_withheld_stretches(place):
-    """Without a world, frames are withheld from a reconstruction of its own and measured against
-    the distance to the nearest frame that was kept; what was made is used again."""
     scene = place.scene("real", held_out=[0])
     settings = [
         "stretches=[1, 3]",
@@ -136,8 +129,6 @@ def test_withheld_stretches(place):
 
 
 def test_studies_are_not_mixed(place, rendered_world):
-    """Bounds of another study in a scene, and another study in the folder, are refused and stay as
-    they are, unless they may be overwritten."""
     scene, out = place.scene("perfect", held_out=[0]), place.folder / "out"
     narrow, wide = (FidelityConfig(offsets=[0.0, offset]) for offset in (0.2, 0.4))
     fidelity.run([scene], out, narrow, rendered_world)
@@ -158,21 +149,20 @@ def test_studies_are_not_mixed(place, rendered_world):
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
-        ("offsets=[0.5, 0.1]", r"offsets are [0.5, 0.1]"),
-        ("kept=0", "kept is 0"),
-        ("clearance=0.0", "clearance is 0.0"),
-        ("reconstruct.hold_out=1", "hold_out"),
+        ("offsets=[0.5, 0.1]", "offsets must be at least one, rising, got [0.5, 0.1]"),
+        ("stretches=[]", "stretches must be at least one, got []"),
+        ("kept=0", "kept must be in [1, inf), got 0"),
+        ("clearance=0.0", "clearance must be in (0, inf) m, got 0.0"),
+        ("reconstruct.hold_out=1", "hold_out must be 0 or at least 2, got 1"),
     ],
 )
 def test_bad_settings(place, capsys, setting, message):
-    """Settings that make no sense are refused before any work."""
     scene, out = place.scene("scene"), place.folder / "out"
     assert main(["scene", "fidelity", str(scene), "--out", str(out), "--set", setting]) == 1
     assert message in capsys.readouterr().err
 
 
 def test_capture_without_depth(place, monkeypatch, capsys):
-    """Without metric depth there is nothing to compare depth with."""
     from splatpilot.training.captures import capture_registry as capture_of_scene
     from splatpilot.training.captures.capture import no_depth
 

@@ -5,7 +5,6 @@ from splatpilot.analysis.fidelity.study import band, first_crossing, monotone_fi
 
 
 def test_fit_pools_violators():
-    """The fit keeps what rises and averages what falls; of equal x the median counts."""
     x, fit = monotone_fit([3, 0, 1, 2, 2, 2, 2], [4, 0, 3, -90, 1, 3, 90])
     np.testing.assert_allclose(x, [0, 1, 2, 3])
     # At 2 the median is 2 (four times the weight), below the 3 at 1: pooled to 11/5.
@@ -13,7 +12,6 @@ def test_fit_pools_violators():
 
 
 def test_reach_is_where_the_fit_crosses():
-    """Errors that grow linearly reach a limit where the line does."""
     x = np.linspace(0, 2, 21)
     assert reach(x, 0.3 * x, 0.15) == pytest.approx(0.5)
     rng = np.random.default_rng(0)
@@ -22,7 +20,6 @@ def test_reach_is_where_the_fit_crosses():
 
 
 def test_one_wrong_view_does_not_move_the_reach():
-    """A view that shows what nobody saw, wrong by a thousand times the others, changes nothing."""
     x = np.repeat(np.linspace(0, 1, 11), 9)
     y = 0.3 * x
     y[:1] = 300.0
@@ -30,8 +27,6 @@ def test_one_wrong_view_does_not_move_the_reach():
 
 
 def test_bands():
-    """Few values of x are a group each; many are cut into groups of as many samples; both have the
-    percentiles of what is in them."""
     found = band(np.repeat([0.5, 0.0], 11), np.r_[np.arange(11), np.full(11, 7)])
     np.testing.assert_allclose(found.at, [0, 0.5])
     np.testing.assert_allclose([found.low, found.middle, found.high], [[7, 1], [7, 5], [7, 9]])
@@ -42,15 +37,11 @@ def test_bands():
 
 
 def test_reach_ends_where_nothing_was_measured():
-    """Errors that never exceed the limit are trusted as far as was measured, those that always do
-    nowhere."""
     assert reach([0.0, 0.4, 0.8], [0, 0.1, 0.2], 1.0) == 0.8
     assert reach([0.1, 0.4, 0.8], [2, 2, 2], 1.0) == 0
 
 
 def test_first_crossing():
-    """The first crossing counts, even if values fall again, and values beyond it are not asked
-    for."""
 
     def values():
         yield from (0.0, 1.0, 0.0)

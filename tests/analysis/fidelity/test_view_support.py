@@ -16,7 +16,6 @@ def support(place) -> ViewSupport:
 
 
 def test_own_view_is_seen(place, support):
-    """What a camera saw is seen from its own pose, and its distance to itself is 0."""
     X_WC = RigidTransform(place.capture.X_WCs[0].rotation(), [1.0, 1.5, 1.2])
     assert support.of(X_WC) > 0.98
     assert support.distance([1.0, 1.5, 1.2]) == 0
@@ -24,7 +23,6 @@ def test_own_view_is_seen(place, support):
 
 
 def test_less_is_seen_the_farther_a_camera_goes(place, support):
-    """Backwards, a camera sees more of the walls than was seen; the share falls steadily."""
     R_WC = place.capture.X_WCs[0].rotation()
     shares = [support.of(RigidTransform(R_WC, [x, 1.5, 1.2])) for x in (1.0, 0.8, 0.5, 0.2)]
     assert shares == sorted(shares, reverse=True)
@@ -32,13 +30,11 @@ def test_less_is_seen_the_farther_a_camera_goes(place, support):
 
 
 def test_the_other_way_nothing_was_seen(place, support):
-    """Turned round, a camera sees nothing that was seen."""
     R_WC = RotationMatrix.MakeZRotation(np.pi) @ place.capture.X_WCs[0].rotation()
     assert support.of(RigidTransform(R_WC, [1.0, 1.5, 1.2])) == 0
 
 
 def test_what_stands_behind_something_is_not_seen(place):
-    """A camera behind a pillar sees little of what one before it saw."""
     from splatpilot.systems.splats.scene import GaussianScene
 
     y, z = (g.ravel() for g in np.meshgrid(np.arange(0, 3, 0.08), np.arange(0, 2.5, 0.08)))
@@ -60,7 +56,6 @@ def test_what_stands_behind_something_is_not_seen(place):
 
 
 def test_seen_from_afar_is_not_seen(place):
-    """A surface that was seen from more than twice as far does not count."""
     capture = place.capture
     renderer = SceneRenderer(place.gaussians, "3dgs")
     R_WC = capture.X_WCs[0].rotation()

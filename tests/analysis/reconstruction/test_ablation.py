@@ -9,10 +9,10 @@ import pytest
 from splatpilot.analysis.commands.main import main
 from splatpilot.analysis.reconstruction import ablation
 from splatpilot.analysis.reconstruction.ablation import ARMS, AblationResult, arm_config
-from splatpilot.analysis.reconstruction.scene_measures import SceneMeasures
+from splatpilot.analysis.reconstruction.measure_scene import SceneMetrics
 from splatpilot.diagrams.worlds.scene_folder import read_scene_metadata
 from splatpilot.training.reconstruction.config import ReconstructConfig
-from splatpilot.training.reconstruction.metrics import ViewMeasures
+from splatpilot.training.reconstruction.metrics import ViewMetrics
 
 SETTINGS = ("iterations=12", "threads=1", "initial_gaussians=2000", "voxel_size=0.2")
 
@@ -25,8 +25,6 @@ def ablate(place, *words: str, captures: tuple[str, ...] = ("room",)) -> int:
 
 
 def test_ablation_end_to_end(place, capsys, monkeypatch):
-    """Eight arms are made and measured on held-out frames, the paper's table is beside ours, and a
-    second run makes nothing again."""
     assert ablate(place) == 0
     printed = capsys.readouterr().out
     assert "paper    3DGS + depth term" in printed
@@ -62,8 +60,6 @@ def test_ablation_end_to_end(place, capsys, monkeypatch):
 
 
 def test_studies_are_not_mixed(place, monkeypatch, capsys):
-    """The folder of a study of other settings, or of other captures, is refused and stays as it is;
-    with --overwrite all arms are made anew."""
 
     def make(capture, scene, config):
         place.scene(f"out/room/{scene.name}")
@@ -109,8 +105,8 @@ def test_each_arm_adds_what_its_name_says():
         )
 
 
-def measures(psnr: float, mae: float, share: float) -> SceneMeasures:
-    view = ViewMeasures(
+def measures(psnr: float, mae: float, share: float) -> SceneMetrics:
+    view = ViewMetrics(
         psnr_db=psnr,
         psnr_on_black_db=psnr - 1,
         ssim=0.9,
@@ -122,11 +118,10 @@ def measures(psnr: float, mae: float, share: float) -> SceneMeasures:
         unseen_fraction=0.0,
         gain=1.0,
     )
-    return SceneMeasures(True, 8, 8, {0: view}, {0: view}, "none", None)
+    return SceneMetrics(True, 8, 8, {0: view}, {0: view}, "none", None)
 
 
 def test_means_and_spreads():
-    """Over several captures come means with the sample standard deviation, and what depth did."""
     one = {arm.key: measures(30, 1.0, 0.1) for arm in ARMS}
     one["3dgs_depth_term"] = measures(29.75, 0.1, 0.005)
     two = {arm.key: measures(34, 3.0, 0.3) for arm in ARMS}
@@ -154,16 +149,18 @@ def test_means_and_spreads():
 
 @pytest.mark.parametrize(
     ("setting", "message"),
-    [("hold_out=0", "hold_out is 0"), ("iterations=0", "iterations 0"), ("hold_out=1", "hold_out")],
+    [
+        ("hold_out=0", "hold_out must be not 0"),
+        ("iterations=0", "iterations must be not 0"),
+        ("hold_out=1", "hold_out must be 0 or"),
+    ],
 )
 def test_bad_settings(place, capsys, setting, message):
-    """Without held-out frames or steps there is nothing to compare."""
     assert main(["scene", "ablate", "room", "--out", str(place.folder), "--set", setting]) == 1
     assert message in capsys.readouterr().err
 
 
 def test_two_captures_of_one_name(place, capsys):
-    """Two captures of one name would overwrite each other; a scene stands for its capture."""
     for other in ("room", str(place.scene("scene"))):
         assert main(["scene", "ablate", "room", other, "--out", str(place.folder / "out")]) == 1
         assert "two captures are called room" in capsys.readouterr().err

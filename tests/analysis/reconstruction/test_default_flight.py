@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from splatpilot.analysis.reconstruction.scene_measures import SceneMeasures, unseen_share
+from splatpilot.analysis.reconstruction.measure_scene import SceneMetrics, unseen_fraction
 from splatpilot.diagrams.worlds.scene_folder import write_scene_folder
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.esdf_build import esdf_from_occupancy
@@ -46,16 +46,16 @@ def write_scene(tmp_path):
     [(5.8, -20.0, 1.0), (5.8, 1.5, 0.5), (6.0, -20.0, 0.0), (0.1, -20.0, 0.0)],
 )
 def test_the_share_is_that_of_the_pixels_that_show_the_frontier(write_scene, x, lower_y, expected):
-    assert unseen_share(write_scene(wall(x, lower_y, 0.5))) == pytest.approx(expected, abs=0.04)
+    assert unseen_fraction(write_scene(wall(x, lower_y, 0.5))) == pytest.approx(expected, abs=0.04)
 
 
 def test_a_scene_that_cannot_be_flown_in_has_no_share(write_scene):
-    assert unseen_share(write_scene(None)) == 0.0
-    assert unseen_share(write_scene(None, metric=False)) is None
+    assert unseen_fraction(write_scene(None)) == 0.0
+    assert unseen_fraction(write_scene(None, metric=False)) is None
 
 
 def test_a_flight_that_looks_mostly_into_unseen_space_is_warned_of():
-    measures = SceneMeasures(True, 8, 8, {}, {}, "", flight_unseen_fraction=0.2)
+    measures = SceneMetrics(True, 8, 8, {}, {}, "", flight_unseen_fraction=0.2)
     assert "unseen in flight       20.0%" in str(measures)
     assert "warning" not in str(measures)
     assert "warning: a flight" in str(replace(measures, flight_unseen_fraction=0.6))

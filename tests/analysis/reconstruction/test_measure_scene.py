@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from splatpilot.analysis.commands.main import main
-from splatpilot.analysis.reconstruction.measure_scene import measure_scene
-from splatpilot.analysis.reconstruction.scene_measures import SceneViews, read_measures
+from splatpilot.analysis.reconstruction.measure_scene import SceneViews, measure_scene, read_metrics
 from splatpilot.systems.splats.scene import GaussianScene
 
 
@@ -26,7 +25,6 @@ def with_curtain(gaussians: GaussianScene, x: float) -> GaussianScene:
 
 
 def test_a_scene_against_its_own_views(place):
-    """Against views rendered from itself a scene has no errors beyond the rounding of images."""
     measures = measure_scene(place.scene("same"))
     assert list(measures.frames) == [0, 8] and measures.held_out
     assert measures.as_json()["psnr_db"] > 55
@@ -35,8 +33,6 @@ def test_a_scene_against_its_own_views(place):
 
 
 def test_a_curtain_is_a_floater(place):
-    """A curtain before the camera is a floater wherever the room is farther than it by the margin,
-    and the depth error is the mean depth beyond it."""
     scene = place.scene("curtain", with_curtain(place.gaussians, x=2.0), held_out=[8])
     found = measure_scene(scene).frames[8]
     truth = place.capture.load_depth(8)
@@ -50,7 +46,6 @@ def test_a_curtain_is_a_floater(place):
 
 
 def test_metrics_file(place, capsys):
-    """The verb writes means and the measures of each frame, and prints them as a table."""
     scene = place.scene("same", with_curtain(place.gaussians, 3.0))
     assert main(["scene", "measure", str(scene)]) == 0
     printed = capsys.readouterr().out
@@ -65,13 +60,12 @@ def test_metrics_file(place, capsys):
     row = f"PSNR [dB]              {content['psnr_db']:<26.2f} {content['strict']['psnr_db']:.2f}\n"
     assert row in printed
     assert "measured on            2 held-out frames, 64 x 48\n" in printed
-    measures = read_measures(scene)
+    measures = read_metrics(scene)
     assert measures is not None and measures.as_json() == content
     assert np.shape(cv2.imread(str(scene / "views.png")))[1] > 5 * 64
 
 
 def test_without_lpips_weights(place, capsys):
-    """Where LPIPS has no weights it is null, and the reason is written and printed."""
     scene = place.scene("same")
     assert main(["scene", "measure", str(scene)]) == 0
     content = json.loads((scene / "metrics.json").read_text())
@@ -81,7 +75,6 @@ def test_without_lpips_weights(place, capsys):
 
 
 def test_nothing_held_out(place, capsys):
-    """Without held-out frames every eighth is measured, and that is said."""
     scene = place.scene("all", held_out=[])
     measures = measure_scene(scene)
     assert list(measures.frames) == [0, 8] and not measures.held_out
@@ -89,7 +82,6 @@ def test_nothing_held_out(place, capsys):
 
 
 def test_images_are_shrunk_as_for_the_making(place):
-    """A scene made from images of half the size is measured at half the size."""
     measures = measure_scene(place.scene("small", image_width=32))
     assert (measures.width, measures.height) == (32, 24)
     assert measures.as_json()["psnr_db"] > 22
@@ -97,7 +89,6 @@ def test_images_are_shrunk_as_for_the_making(place):
 
 
 def test_capture_without_depth(place):
-    """Without depth only colours are measured, and the sheet has no columns for what is unknown."""
     blind = replace(place.capture, load_depth=lambda i: None)
     scene, seeing = place.scene("blind"), place.scene("seeing")
     measures = measure_scene(scene, blind)
@@ -110,13 +101,12 @@ def test_capture_without_depth(place):
 
 
 def test_scenes_that_cannot_be_measured(place):
-    """A scene without capture, or with another one, and damaged metrics are refused by name."""
     with pytest.raises(ValueError, match=r"scene\.yaml: names no capture"):
         SceneViews(place.scene("lost", capture=""))
     with pytest.raises(ValueError, match=r"frame 16 is held out, but a room .* only 16 frames"):
         SceneViews(place.scene("other", held_out=[0, 16]))
     scene = place.scene("damaged")
-    assert read_measures(scene) is None
+    assert read_metrics(scene) is None
     (scene / "metrics.json").write_text("{}")
     with pytest.raises(ValueError, match=r"metrics\.json: .* measure again"):
-        read_measures(scene)
+        read_metrics(scene)

@@ -88,9 +88,6 @@ def unscaled(seen_room, photographs, tmp_path):
 def test_scene_of_photographs_can_be_flown_in_once_it_has_its_size(
     unscaled, seen_room, tmp_path, capsys
 ):
-    """Two points 6 m apart give an unflyable scene its metres: the same pictures from the scaled
-    poses, of the capture as of the scene, depth and distances times the factor, a start and a goal
-    for the vehicle, and obstacles where nobody looked; the scene it came from stays."""
     with pytest.raises(ValueError, match=r"splatpilot view .* `splatpilot scene scale`"):
         read_scene(unscaled)
     before = {file.name: file.read_bytes() for file in unscaled.iterdir()}
@@ -138,8 +135,6 @@ def test_scene_of_photographs_can_be_flown_in_once_it_has_its_size(
 
 
 def test_factors_multiply(unscaled, tmp_path):
-    """A scene that has metres is scaled again: distances are exactly those times the factor, and
-    its capture, opened with its settings, has the poses of both factors."""
     rescale(unscaled, tmp_path / "once", 4.0)
     summary = rescale(tmp_path / "once", tmp_path / "twice", 0.5)
     once, twice = (read_scene(tmp_path / name) for name in ("once", "twice"))
@@ -166,15 +161,13 @@ def test_origin_is_scaled_with_the_scene(unscaled, tmp_path):
 
 
 def test_known_height_of_the_cameras_gives_the_scale(unscaled, tmp_path):
-    """The cameras were 1.2 m above the floor; told that, the scene has the room's size."""
     summary = run(scene=unscaled, out=tmp_path / "scaled", height=1.2)
     assert summary.factor == pytest.approx(1 / SHRUNK, rel=0.02)
 
 
 def test_scene_of_measured_depth_is_not_compared_with_its_capture_any_more(place, tmp_path):
-    """The metres of a capture with depth stay as they are; a scene in others does not name it."""
     summary = rescale(place.scene("metric"), tmp_path / "scaled", 2.0)
-    assert "has metres of its own" in str(summary)
+    assert "has metric depth" in str(summary)
     metadata = read_scene_metadata(tmp_path / "scaled")
     assert (metadata.capture, metadata.held_out, metadata.gains) == ("", [], [])
 
@@ -182,22 +175,20 @@ def test_scene_of_measured_depth_is_not_compared_with_its_capture_any_more(place
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--factor", "-1"], "factor is -1.0; it must be positive"),
-        (["--height", "nan"], "height is nan; it must be positive"),
-        (["--between", "0,0,0", "0,0,0", "--distance", "1"], "two places are needed"),
+        (["--factor", "-1"], "factor must be finite and > 0, got -1.0"),
+        (["--height", "nan"], "height must be finite and > 0, got nan"),
+        (["--between", "0,0,0", "0,0,0", "--distance", "1"], "points of --between must differ"),
         (["--between", "0,0", "0,0,0", "--distance", "1"], "a point X,Y,Z is needed"),
         (["--between", "0,0,1", "0,0,0"], "--between and --distance belong together"),
         (["--factor", "2", "--distance", "1"], "--between and --distance belong together"),
     ],
 )
 def test_scales_that_make_no_sense_are_refused(unscaled, tmp_path, capsys, words, message):
-    """One sentence says why, and nothing is written."""
     assert main(["scene", "scale", str(unscaled), "--out", str(tmp_path / "scaled"), *words]) == 1
     assert message in capsys.readouterr().err
     assert not (tmp_path / "scaled").exists()
 
 
 def test_nothing_is_overwritten(unscaled):
-    """Not even the scene itself."""
     with pytest.raises(ValueError, match="exists already"):
         rescale(unscaled, unscaled, 2.0)

@@ -15,8 +15,6 @@ SHRUNK = 0.25
 
 @pytest.mark.parametrize("up", UP_AXES)
 def test_file_of_gaussians_in_metres_and_upright(seen_room, tmp_path, up):
-    """Of a room whose file has another axis up and another unit, `scale` writes one that looks the
-    same from the same place, up to a turn about the vertical."""
     gaussians, capture = seen_room
     along = "xyz".index(up[-1])
     up_F = np.eye(3)[along] * (-1 if up.startswith("-") else 1)
@@ -48,8 +46,6 @@ def test_file_of_gaussians_in_metres_and_upright(seen_room, tmp_path, up):
 
 
 def test_a_tilted_file_becomes_level(seen_room, tmp_path):
-    """Three points of the floor, in whichever order, make a tilted room level: its floor lies at
-    z = 0 and its heights are what they were, times the factor."""
     gaussians, _ = seen_room
     X_FW = RigidTransform(RollPitchYaw(0.3, -0.2, 0.5), [1.0, 2.0, 3.0])
     file = tmp_path / "file.ply"
@@ -76,7 +72,6 @@ def _turn(before, after) -> float:
 
 
 def test_length_in_a_file_of_gaussians(seen_room, tmp_path, capsys):
-    """Two points and their distance give a file its size; upright alone it keeps its own."""
     gaussians, _ = seen_room
     file = tmp_path / "file.ply"
     write_ply(gaussians, file)
@@ -96,7 +91,10 @@ def test_length_in_a_file_of_gaussians(seen_room, tmp_path, capsys):
         (["room.ply", "--out", "out.spz", "--factor", "2"], "written as PLY; name it so, out.ply"),
         (["room.ply", "--out", "room.ply", "--factor", "2"], "room.ply: exists already"),
         (["room.ply", "--out", "out.ply", "--height", "2"], "a file has no cameras"),
-        (["room.ply", "--out", "out.ply", "--factor", "0"], "factor is 0.0; it must be positive"),
+        (
+            ["room.ply", "--out", "out.ply", "--factor", "0"],
+            "factor must be finite and > 0, got 0",
+        ),
         (["unscaled", "--out", "out", "--up", "-y"], "z is up in scene folders; leave --up"),
         (["room.ply", "--out", "out.ply", "--floor", "0,0,0", "1,0,0", "2,0,0"], "lie in a line"),
         (["room.ply", "--out", "out.ply", "--floor", "0,0,0", "1,0,0", "0,0,1"], "at 90 degrees"),
@@ -105,7 +103,6 @@ def test_length_in_a_file_of_gaussians(seen_room, tmp_path, capsys):
     ],
 )
 def test_files_that_cannot_be_scaled(place, monkeypatch, capsys, words, message):
-    """One sentence says why, and nothing is written."""
     scene, folder = place.scene("unscaled"), place.folder
     monkeypatch.chdir(folder)
     (folder / "room.ply").write_bytes((scene / "gaussians.ply").read_bytes())

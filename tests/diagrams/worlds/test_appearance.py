@@ -1,5 +1,3 @@
-"""Other looks of the same Gaussians."""
-
 from dataclasses import replace
 
 import numpy as np
@@ -39,7 +37,6 @@ def draw(seed: int, strength: float = 1.0):
 
 
 def test_no_strength_changes_nothing(scene):
-    """At strength 0 colours and background are as they were, to rounding, whatever is drawn."""
     same = recolored(scene, draw(1, strength=0.0))
     np.testing.assert_allclose(same.base_colors, scene.base_colors, atol=1e-5)
     np.testing.assert_allclose(same.sh[:, 1:], scene.sh[:, 1:], atol=1e-5)
@@ -48,7 +45,6 @@ def test_no_strength_changes_nothing(scene):
 
 
 def test_geometry_stays_and_colours_change(scene):
-    """Shapes and opacities are the very same arrays; two seeds give two looks, one seed one."""
     first, again, other = (recolored(scene, draw(seed)) for seed in (1, 1, 2))
     for name in ("means", "quats", "scales", "opacities"):
         np.testing.assert_array_equal(getattr(first, name), getattr(scene, name))
@@ -58,7 +54,6 @@ def test_geometry_stays_and_colours_change(scene):
 
 
 def test_exposure_is_in_stops(scene):
-    """Twice the light doubles linear brightness, colour by colour, below white."""
     dark = replace(draw(0, strength=0.0), exposure=0.1)
     light = replace(dark, exposure=0.2)
     a, b = (recolored(scene, look).base_colors ** 2.2 for look in (dark, light))
@@ -66,7 +61,6 @@ def test_exposure_is_in_stops(scene):
 
 
 def test_one_paint_stays_one_paint(scene):
-    """Gaussians of one colour, place and orientation have one colour in any look."""
     one = {name: getattr(scene, name)[np.zeros(COUNT, int)] for name in ARRAYS}
     alike = GaussianScene(**one)
     colors = recolored(alike, draw(3)).base_colors
@@ -74,7 +68,6 @@ def test_one_paint_stays_one_paint(scene):
 
 
 def test_hue_turns_colours_and_leaves_greys(scene):
-    """A turn of the hue by 120 degrees makes red green; grey stays what it is."""
     grey_axis = np.ones((3, 3)) / 3
     turn = np.array([[0, -1, 1], [1, 0, -1], [-1, 1, 0]]) / np.sqrt(3)
     hue = grey_axis - (np.eye(3) - grey_axis) / 2 + np.sqrt(3) / 2 * turn
@@ -88,8 +81,6 @@ def test_hue_turns_colours_and_leaves_greys(scene):
 
 
 def test_light_from_one_side_falls_off_with_the_cosine(scene):
-    """Flat Gaussians that face the light are brighter than those it grazes, as |cos| of the angle
-    between their normal and the light."""
     angles = np.linspace(0, np.pi / 2, 7)
     quats = np.column_stack([np.cos(angles / 2), np.sin(angles / 2), *np.zeros((2, 7))])
     flat = GaussianScene.from_colors(
@@ -102,7 +93,6 @@ def test_light_from_one_side_falls_off_with_the_cosine(scene):
 
 
 def test_environments_are_recoloured_in_every_direction():
-    """Each texel of an environment changes as a background of that colour does."""
     texels = np.random.default_rng(0).uniform(0, 1, (4, 8, 3)).astype(np.float32)
     look = draw(7)
     found = recolored_background(EnvironmentMap(texels), look).texels
@@ -111,7 +101,6 @@ def test_environments_are_recoloured_in_every_direction():
 
 
 def test_world_in_another_look_is_rendered_as_if_made_so():
-    """Its own colours, bit for bit as if baked anew, and depth as before."""
     world = make_world(ForestConfig(length=8.0, width=6.0, height=4.0), 1)
     seen = with_appearance(world, draw(3))
     camera = OnboardCamera(width=64, height=48)

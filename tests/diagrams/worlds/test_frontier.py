@@ -1,5 +1,3 @@
-"""The surface that closes a captured place: seen where it is hit, and nowhere before."""
-
 import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
@@ -64,7 +62,6 @@ def seen_depth(frontier: GaussianScene, X_WC: RigidTransform) -> np.ndarray:
 
 
 def test_frontier_hides_nothing_that_was_captured(captured, closed):
-    """From the poses of the capture hardly a pixel of the frontier stands before the walls."""
     _, depths, X_WCs = captured
     for depth, X_WC in zip(depths, X_WCs, strict=True):
         assert np.mean(seen_depth(closed[1], X_WC) < depth - 0.1) < 0.005
@@ -83,8 +80,6 @@ def test_what_was_captured_beyond_the_range_of_the_field_is_not_hidden(captured)
 
 
 def test_frontier_is_seen_where_it_is_hit(captured, closed):
-    """From inside, looking about, rays that end at the frontier's obstacles see it there, hardly
-    any farther than two voxels behind, and its surfels are few."""
     field, (distances, frontier) = captured[0], closed
     missed, ends = 0, 0
     for yaw in np.arange(4) * np.pi / 2:
@@ -103,8 +98,6 @@ def test_frontier_is_seen_where_it_is_hit(captured, closed):
 
 
 def test_touching_the_frontier_is_a_collision(captured, closed):
-    """A vehicle that leaves for what nobody saw left the volume before; now it hits the frontier,
-    already when it comes within its radius."""
     scenario = Scenario(policy=policy_named("straight"))
     p_WS, p_WG = np.array([2.8, 2.0, 1.5]), np.array([4.0, 2.0, 1.5])
     hidden_W = [0.7, 2.0, 0.3]  # beside the near camera, below all it saw
@@ -121,7 +114,6 @@ def test_touching_the_frontier_is_a_collision(captured, closed):
 
 
 def test_closed_place_is_left_as_it_is(captured):
-    """Where everything was seen there is nothing to close."""
     field = captured[0]
     known = Esdf(np.abs(field.distances) + 0.4, 0 * field.states, field.lower_W, VOXEL)
     assert close_frontier(known, [], K, []) == (known, None)

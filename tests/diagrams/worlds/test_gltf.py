@@ -1,5 +1,3 @@
-"""Worlds as meshes: what Drake's render engine sees of them is where the distances are zero."""
-
 import json
 
 import numpy as np
@@ -21,7 +19,7 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageRgba8U
 
 from splatpilot.diagrams.worlds.solids.shading import Daylight, Sunlight
-from splatpilot.diagrams.worlds.solids.solid import Blueprint, Solid
+from splatpilot.diagrams.worlds.solids.solid import Solid, WorldSpec
 from splatpilot.diagrams.worlds.solids.surfels import build
 from splatpilot.diagrams.worlds.world_gltf import write_gltf
 from splatpilot.systems.collision.shapes import Box, Capsule, Cylinder, HalfSpace, Sphere
@@ -30,11 +28,11 @@ WIDTH, HEIGHT, FOCAL = 160, 120, 80.0
 
 
 @pytest.fixture(scope="module")
-def blueprint() -> Blueprint:
+def spec() -> WorldSpec:
     """One solid of each shape on the ground of a volume of 8 x 6 x 4 m."""
     tilted = RigidTransform(RollPitchYaw(0.3, 0.2, 0.5), [5.0, -1.5, 1.2])
     hour = Daylight.sample(np.random.default_rng(3))
-    return Blueprint(
+    return WorldSpec(
         name="sampler",
         lower_W=np.array([0.0, -2.5, 0]),
         upper_W=np.array([7.0, 2.5, 4]),
@@ -75,22 +73,20 @@ def _rendered(path, X_WC) -> tuple[np.ndarray, np.ndarray]:
     return color.data[..., :3] / 255.0, depth.data[..., 0].astype(float)
 
 
-def test_mesh_lies_on_the_surfaces_and_looks_like_the_gaussians(opengl, blueprint, X_WC, tmp_path):
-    """Every pixel that Drake renders of the mesh lies, un-projected, on the analytic surfaces, and
-    on average shows the colour that the Gaussians show there."""
+def test_mesh_lies_on_the_surfaces_and_looks_like_the_gaussians(opengl, spec, X_WC, tmp_path):
     path = tmp_path / "world.gltf"
-    write_gltf(blueprint, path)
+    write_gltf(spec, path)
     color, depth = _rendered(path, X_WC)
     v, u = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     rays = np.stack([(u - WIDTH / 2) / FOCAL, (v - HEIGHT / 2) / FOCAL, np.ones_like(u)], axis=-1)
     seen = np.isfinite(depth)
     p_WQ = X_WC.multiply((rays[seen] * depth[seen, None]).T).T
-    distance = blueprint.distance_field.distance(p_WQ)
+    distance = spec.distance_field.distance(p_WQ)
     inside = np.isfinite(distance)
     assert inside.sum() > 0.25 * depth.size
     assert np.abs(distance[inside]).max() < 0.004
 
-    world = build(blueprint)
+    world = build(spec)
     K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
     view = world.baked.render(K, WIDTH, HEIGHT, X_WC, background=world.background)
     solid = seen & (view.alpha > 0.99)
@@ -102,11 +98,10 @@ def test_mesh_lies_on_the_surfaces_and_looks_like_the_gaussians(opengl, blueprin
     assert np.median(np.abs(view.depth - depth)[near]) < 0.08
 
 
-def test_file_is_whole_and_the_same_twice(blueprint, tmp_path):
-    """One file holds everything, W's z is its y, and writing again gives the same bytes."""
+def test_file_is_whole_and_the_same_twice(spec, tmp_path):
     one, two = tmp_path / "one.gltf", tmp_path / "two.gltf"
-    write_gltf(blueprint, one, texel=0.1)
-    write_gltf(blueprint, two, texel=0.1)
+    write_gltf(spec, one, texel=0.1)
+    write_gltf(spec, two, texel=0.1)
     assert one.read_bytes() == two.read_bytes()
     document = json.loads(one.read_text())
     uris = [part["uri"] for kind in ("buffers", "images") for part in document[kind]]
@@ -118,7 +113,6 @@ def test_file_is_whole_and_the_same_twice(blueprint, tmp_path):
     assert position["max"][1] == pytest.approx(3.8, abs=0.02)
 
 
-def test_a_folder_that_does_not_exist_is_an_error(blueprint, tmp_path):
-    """Where nothing can be written the error names the folder."""
+def test_a_folder_that_does_not_exist_is_an_error(spec, tmp_path):
     with pytest.raises(OSError, match="nowhere"):
-        write_gltf(blueprint, tmp_path / "nowhere" / "world.gltf", texel=0.2)
+        write_gltf(spec, tmp_path / "nowhere" / "world.gltf", texel=0.2)

@@ -1,5 +1,3 @@
-"""Worlds of OctoMaps."""
-
 import numpy as np
 import pytest
 
@@ -32,8 +30,6 @@ def in_map(tmp_path, monkeypatch):
 
 
 def test_large_maps_are_cropped_about_free_space(in_map, monkeypatch, caplog):
-    """Of a map of more voxels than are flown in whole, a part of its proportions and height is, and
-    which is said; a part that is named is taken as it is."""
     octomap = hall(80, 40)
     whole = in_map(octomap)
     np.testing.assert_allclose(whole.esdf.upper_W - whole.esdf.lower_W, [20, 10, 4])
@@ -60,7 +56,6 @@ def test_drawn_ends_are_as_far_apart_as_the_scenario_says(in_map):
 
 
 def test_maps_without_free_space_are_refused(in_map):
-    """Where nothing is known to be free there is nowhere to fly."""
     octomap = hall(20, 20)
     octomap.occupied[:] = True
     with pytest.raises(
@@ -70,6 +65,5 @@ def test_maps_without_free_space_are_refused(in_map):
 
 
 def test_places_are_told_apart_by_suffix(tmp_path):
-    """A `.bt` is a map, and anything else a scene."""
     assert place_config(tmp_path / "a.bt") == OctomapConfig(path=str(tmp_path / "a.bt"))
     assert place_config(tmp_path / "a.spz") == SceneConfig(path=str(tmp_path / "a.spz"))

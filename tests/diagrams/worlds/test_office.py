@@ -1,5 +1,3 @@
-"""Floors of rooms: what divides them, and that every room can be reached."""
-
 from dataclasses import replace
 
 import numpy as np
@@ -7,21 +5,21 @@ import pytest
 from scipy.ndimage import label
 
 from splatpilot.diagrams.worlds.feasibility import CLEARANCE, connects
-from splatpilot.diagrams.worlds.indoor import PARTITION, OfficeConfig, office_blueprint
-from splatpilot.diagrams.worlds.solids.solid import Blueprint
+from splatpilot.diagrams.worlds.indoor import PARTITION, OfficeConfig, office_spec
+from splatpilot.diagrams.worlds.solids.solid import WorldSpec
 from splatpilot.systems.collision.shapes import AnalyticDistanceField
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
 EMPTY = OfficeConfig(items=0)
 
 
-def plan(blueprint: Blueprint, z: float, step: float = 0.05) -> np.ndarray:
+def plan(spec: WorldSpec, z: float, step: float = 0.05) -> np.ndarray:
     """Distances (nx, ny) [m] on a level plane to everything but signs."""
-    shapes = [solid.shape for solid in blueprint.solids if solid.material != "signage"]
-    field = AnalyticDistanceField(shapes, blueprint.lower_W, blueprint.upper_W)
+    shapes = [solid.shape for solid in spec.solids if solid.material != "signage"]
+    field = AnalyticDistanceField(shapes, spec.lower_W, spec.upper_W)
     x, y = (
         np.arange(low + step / 2, high, step)
-        for low, high in zip(blueprint.lower_W[:2], blueprint.upper_W[:2], strict=True)
+        for low, high in zip(spec.lower_W[:2], spec.upper_W[:2], strict=True)
     )
     p = np.stack(np.meshgrid(x, y, [z], indexing="ij"), axis=-1)
     return field.distance(p.reshape(-1, 3)).reshape(len(x), len(y))
@@ -29,22 +27,18 @@ def plan(blueprint: Blueprint, z: float, step: float = 0.05) -> np.ndarray:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_every_room_has_a_door_that_the_vehicle_passes(seed):
-    """Without furniture, where a vehicle finds room it comes to from anywhere else, at the height
-    of doors; above the doors there are fewer ways, or as many where all reach the ceiling."""
-    blueprint = office_blueprint(EMPTY, seed)
-    free = plan(blueprint, 1.2) > VEHICLE_RADIUS
+    spec = office_spec(EMPTY, seed)
+    free = plan(spec, 1.2) > VEHICLE_RADIUS
     count = np.asarray(label(free)[0]).max()
     assert count == 1 and free.mean() > 0.4
-    assert np.asarray(label(plan(blueprint, 2.55) > VEHICLE_RADIUS)[0]).max() >= count
+    assert np.asarray(label(plan(spec, 2.55) > VEHICLE_RADIUS)[0]).max() >= count
 
 
 def test_rooms_and_doors_have_the_sizes_asked_for():
-    """Straight lines through the floor meet walls of the thickness of partitions, no nearer to
-    one another than rooms are wide, and nowhere gaps of less than a door."""
     config = replace(EMPTY, second_doors=1.0)
     gaps = []
     for seed in range(3):
-        walls = plan(office_blueprint(config, seed), 1.2, 0.02) < 0.0
+        walls = plan(office_spec(config, seed), 1.2, 0.02) < 0.0
         for lines in (walls, walls.T):
             for line in lines[:: len(lines) // 80]:
                 edges = np.flatnonzero(np.diff(np.concatenate([[1], line, [1]]).astype(int)))
@@ -57,11 +51,10 @@ def test_rooms_and_doors_have_the_sizes_asked_for():
 
 
 def test_ends_are_at_both_ends_and_the_way_leads_through_doors():
-    """Start and goal lie in rooms at the two ends; most ways are longer than the straight one."""
     detours = []
     for seed in range(8):
-        blueprint = office_blueprint(OfficeConfig(), seed)
-        field, ends = blueprint.distance_field, np.stack([blueprint.p_WS, blueprint.p_WG])
+        spec = office_spec(OfficeConfig(), seed)
+        field, ends = spec.distance_field, np.stack([spec.p_WS, spec.p_WG])
         assert field.distance(ends).min() >= CLEARANCE
         assert ends[1, 0] - ends[0, 0] > 8.0
         line = np.linspace(*ends, 200)
@@ -71,7 +64,6 @@ def test_ends_are_at_both_ends_and_the_way_leads_through_doors():
 
 
 def test_same_seed_same_floor():
-    """The same seed gives the same bits, another another floor."""
-    one, again, other = (plan(office_blueprint(OfficeConfig(), seed), 1.2) for seed in (5, 5, 6))
+    one, again, other = (plan(office_spec(OfficeConfig(), seed), 1.2) for seed in (5, 5, 6))
     np.testing.assert_array_equal(one, again)
     assert np.abs(one - other).max() > 0.5

@@ -58,7 +58,6 @@ def world() -> World:
 
 
 def test_round_trip(tmp_path, world):
-    """A written scene reads back as the same world, with its metadata."""
     folder = tmp_path / "scene"
     written = write_scene_folder(
         folder, world, provenance="a test", gains=[1.0, 1.25], vignetting=-0.5
@@ -82,8 +81,6 @@ def test_round_trip(tmp_path, world):
 
 
 def test_frontier_is_seen_in_flight_and_kept_apart(tmp_path, world):
-    """What closes a scene is among the Gaussians of its world, not of its `gaussians.ply`; a scene
-    that has lost it is refused."""
     folder, frontier = tmp_path / "scene", box_of_gaussians(step=1.0)
     written = write_scene_folder(folder, world, frontier, provenance="")
     assert written.frontier and len(read_ply(folder / "gaussians.ply")) == len(world.gaussians)
@@ -95,7 +92,6 @@ def test_frontier_is_seen_in_flight_and_kept_apart(tmp_path, world):
 
 
 def test_how_it_was_made_is_kept(tmp_path, world):
-    """What is said of a scene's making reads back, and so do bounds that are measured later."""
     folder = tmp_path / "scene"
     written = write_scene_folder(
         folder,
@@ -119,8 +115,6 @@ def test_how_it_was_made_is_kept(tmp_path, world):
 
 
 def test_an_environment_is_kept(tmp_path, world):
-    """What is seen infinitely far away by direction comes back to 8 bits; without its file the
-    scene is refused, and a scene in its place without one has none."""
     folder = tmp_path / "scene"
     texels = np.random.default_rng(0).random((8, 16, 3), np.float32)
     sky = replace(world, background=EnvironmentMap(texels))
@@ -130,14 +124,13 @@ def test_an_environment_is_kept(tmp_path, world):
     np.testing.assert_allclose(back.texels, texels, atol=0.5 / 255 + 1e-6)
     assert metadata.background == pytest.approx(mean_color(sky.background))
     (folder / "environment.png").unlink()
-    with pytest.raises(FileNotFoundError, match=r"environment\.png: there is no such file"):
+    with pytest.raises(FileNotFoundError, match=r"No such file: .*environment\.png"):
         read_scene(folder)
     write_scene_folder(folder, world, provenance="")
     assert read_scene(folder).background == world.background
 
 
 def test_scene_from_before_these_fields(tmp_path, world):
-    """A scene.yaml that lacks the fields of later versions has their defaults."""
     folder = tmp_path / "scene"
     write_scene_folder(folder, world, provenance="")
     later = ("representation", "capture", "held_out", "image_width", "perturb", "pose_perturb")
@@ -152,7 +145,6 @@ def test_scene_from_before_these_fields(tmp_path, world):
 
 
 def test_a_scene_is_replaced_whole(tmp_path, world):
-    """Writing over a scene leaves nothing of the old one."""
     folder = tmp_path / "scene"
     write_scene_folder(folder, world, provenance="first")
     (folder / "metrics.json").write_text("{}")
@@ -164,7 +156,6 @@ def test_a_scene_is_replaced_whole(tmp_path, world):
 
 @pytest.mark.parametrize("failing", ["write_ply", "write_scene_metadata"])
 def test_failed_write_keeps_the_old_scene(tmp_path, world, monkeypatch, failing):
-    """A write that fails at any file leaves the old scene as it was, and nothing beside it."""
     folder = tmp_path / "scene"
     write_scene_folder(folder, world, provenance="first")
 
@@ -179,12 +170,11 @@ def test_failed_write_keeps_the_old_scene(tmp_path, world, monkeypatch, failing)
 
 
 def test_other_folders_are_not_overwritten(tmp_path, world):
-    """A folder with other files, or a file, is refused and left alone."""
     folder = tmp_path / "holiday"
     folder.mkdir()
     (folder / "photo.jpg").write_bytes(b"x")
     for target in (folder, folder / "photo.jpg"):
-        with pytest.raises(ValueError, match="exists and is no scene"):
+        with pytest.raises(ValueError, match="scene folder must be new, empty or a scene"):
             write_scene_folder(target, world, provenance="")
     assert (folder / "photo.jpg").read_bytes() == b"x"
     empty = tmp_path / "empty"
@@ -193,9 +183,6 @@ def test_other_folders_are_not_overwritten(tmp_path, world):
 
 
 def test_unwritable_place(tmp_path, world):
-    """Parent folders are made; a file or a write-protected folder in their place is named before
-    any work is done.
-    """
     write_scene_folder(tmp_path / "new" / "folder" / "scene", world, provenance="")
     assert read_scene(tmp_path / "new" / "folder" / "scene").name == world.name
     (tmp_path / "file").write_text("")
@@ -207,41 +194,38 @@ def test_unwritable_place(tmp_path, world):
 
 @pytest.mark.parametrize("missing", ["gaussians.ply", "esdf.npz", "scene.yaml"])
 def test_missing_file(tmp_path, world, missing):
-    """A scene without one of its files is refused with the name of the file."""
     folder = tmp_path / "scene"
     write_scene_folder(folder, world, provenance="")
     (folder / missing).unlink()
-    with pytest.raises(FileNotFoundError, match=rf"{missing}: does not exist; a scene is"):
+    with pytest.raises(FileNotFoundError, match=rf"No such file: .*{missing}"):
         read_scene(folder)
 
 
 def test_missing_scene(tmp_path):
-    """A path with nothing there is refused."""
     with pytest.raises(FileNotFoundError, match="nowhere"):
         read_scene(tmp_path / "nowhere")
-    with pytest.raises(FileNotFoundError, match="nowhere: does not exist"):
+    with pytest.raises(FileNotFoundError, match=r"No such file: .*nowhere"):
         read_scene_folder(tmp_path / "nowhere")
 
 
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("metric: true", "metric: false", "scale of this scene is unknown"),
+        ("metric: true", "metric: false", "metric must be true to fly, got false"),
         ("metric: true", "metrik: true", "metrik"),
-        ("format_version: 2", "format_version: 3", "format version 3, this program knows 2"),
-        ("format_version: 2", "format_version: 1", "had no background .*; reconstruct the scene"),
-        ("p_WS: [2.0, 3.0, 4.0]", "p_WS: [2.0, 3.0]", "p_WS is .*three finite numbers"),
-        ("p_WG: [3.0, 3.0, 4.0]", "p_WG: [3.0, .nan, 4.0]", "p_WG is .*three finite numbers"),
-        ("p_WS: [2.0, 3.0, 4.0]", "", r"p_WS is \[\]"),
+        ("format_version: 2", "format_version: 3", "format_version must be 2, got 3"),
+        ("format_version: 2", "format_version: 1", "format_version must be 2, got 1; reconstruct"),
+        ("p_WS: [2.0, 3.0, 4.0]", "p_WS: [2.0, 3.0]", "p_WS must be three finite numbers, got"),
+        ("p_WG: [3.0, 3.0, 4.0]", "p_WG: [3.0, .nan, 4.0]", "p_WG must be in .* got .*nan"),
+        ("p_WS: [2.0, 3.0, 4.0]", "", r"p_WS must be .* got \[\]"),
         ("vignetting: 0.0", "vignetting: dark", "dark"),
         ("metric: true", "metric: [", r"line 9: expected"),
-        ("representation: 3dgs", "representation: nerf", "representation is 'nerf', it must be"),
-        ("held_out: []", "held_out: [-1]", r"held_out \[-1\]; neither may be negative"),
-        ("image_width: 0", "perturbation_bound: -0.5", r"perturbation_bound is -0\.5"),
+        ("representation: 3dgs", "representation: nerf", "representation must be .* got nerf"),
+        ("held_out: []", "held_out: [-1]", r"held_out must be .* got \[-1\]"),
+        ("image_width: 0", "perturbation_bound: -0.5", r"perturbation_bound must be .* got -0\.5"),
     ],
 )
 def test_bad_metadata(tmp_path, world, old, new, message):
-    """Wrong, unknown and missing entries of scene.yaml are refused with file and reason."""
     folder = tmp_path / "scene"
     write_scene_folder(folder, world, provenance="")
     text = (folder / "scene.yaml").read_text()
@@ -252,7 +236,6 @@ def test_bad_metadata(tmp_path, world, old, new, message):
 
 
 def test_bare_ply(tmp_path):
-    """Gaussians alone become a world whose walls collide and whose inside can be flown."""
     path = tmp_path / "hall.ply"
     write_ply(box_of_gaussians(), path)
     world = read_scene(path)
@@ -268,7 +251,6 @@ def test_bare_ply(tmp_path):
 
 
 def test_stray_gaussians_do_not_stretch_a_bare_ply(tmp_path):
-    """A few Gaussians a kilometre away leave the grid as it is."""
     scene = box_of_gaussians()
     stray = GaussianScene.from_colors(
         [[1000, 0, 0]], [[1, 0, 0, 0]], [[1, 1, 1]], [0.9], [[1, 1, 1]]
@@ -280,13 +262,12 @@ def test_stray_gaussians_do_not_stretch_a_bare_ply(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("world_frame: z up", "world_frame: y up", "world_frame is 'y up', it must be 'z up'"),
-        ("background: [", "background: [7.0, -1.0, 0.5] #", "background is .*0 to 1 is needed"),
+        ("world_frame: z up", "world_frame: y up", "world_frame must be in {z up}, got y up"),
+        ("background: [", "background: [7.0, -1.0, 0.5] #", "background must be in .* got"),
         ("lower_W: [", "lower_W: [-99.0, -99.0, -99.0] #", "files are of different scenes"),
     ],
 )
 def test_metadata_is_believed_or_refused(tmp_path, world, old, new, message):
-    """What scene.yaml says and the scene does not bear out is refused."""
     folder = tmp_path / "scene"
     write_scene_folder(folder, world, provenance="")
     file = folder / "scene.yaml"
@@ -298,7 +279,6 @@ def test_metadata_is_believed_or_refused(tmp_path, world, old, new, message):
 
 
 def test_space_beside_a_bare_ply_is_not_flown_through(tmp_path):
-    """In the box around three parallel walls, outside counts as occupied: there is no way round."""
     y, z = (grid.ravel() for grid in np.meshgrid(np.arange(0, 10, 0.1), np.arange(0, 8, 0.1)))
     walls = [np.column_stack([np.full(y.size, x), y, z]) for x in (0.0, 3.0, 6.0)]
     means = np.concatenate(walls)

@@ -1,5 +1,3 @@
-"""Splits of scenes, by what they show."""
-
 import pytest
 
 from splatpilot.diagrams.worlds import splits

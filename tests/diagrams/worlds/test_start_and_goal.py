@@ -30,7 +30,6 @@ ALONG_Y = ((4.2, 0.2, 0.2), (5.8, 5.8, 1.8))
 
 
 def test_ends_of_a_corridor():
-    """In a straight corridor start and goal are at its two ends, clear of the walls."""
     esdf = corridors(ALONG_X)
     p_WS, p_WG, length = choose_start_and_goal(esdf, RADIUS, margin=0.2)
     ends = sorted([p_WS[0], p_WG[0]])
@@ -41,7 +40,6 @@ def test_ends_of_a_corridor():
 
 
 def test_length_is_measured_around_the_corner():
-    """In an L-shaped place the path goes around the corner, longer than the straight line."""
     p_WS, p_WG, length = choose_start_and_goal(corridors(ALONG_X, ALONG_Y), RADIUS, margin=0.1)
     straight = np.linalg.norm(p_WS - p_WG)
     assert straight < length < 9
@@ -50,7 +48,6 @@ def test_length_is_measured_around_the_corner():
 
 
 def test_longest_path_is_bounded():
-    """No path is longer than asked for, and one nearly as long is found."""
     esdf = corridors(ALONG_X)
     p_WS, p_WG, length = choose_start_and_goal(esdf, RADIUS, margin=0.1, longest=3.0)
     assert 2.7 < length <= 3.0
@@ -58,14 +55,12 @@ def test_longest_path_is_bounded():
 
 
 def test_unknown_space_is_not_flown_through():
-    """A stretch of unknown space cuts the corridor; the longer part is used."""
     esdf = corridors(ALONG_X, unknown=[((1.5, 0.2, 0.2), (2.0, 1.8, 1.8))])
     p_WS, p_WG, _ = choose_start_and_goal(esdf, RADIUS, margin=0.1)
     assert min(p_WS[0], p_WG[0]) > 2.0 + RADIUS
 
 
 def test_narrow_places_get_less_margin():
-    """Where no space has the margin, half of it is asked for, and that the planner can fly."""
     esdf = corridors(((0.2, 0.2, 0.2), (5.8, 1.3, 1.3)))
     p_WS, p_WG, length = choose_start_and_goal(esdf, RADIUS, margin=0.2)
     assert length > 3
@@ -99,7 +94,6 @@ def test_half_of_the_margin_is_taken_for_a_much_longer_route():
 
 
 def test_no_room_at_all():
-    """A place too narrow for the vehicle is an error that names radius and largest clearance."""
     with pytest.raises(
         InfeasibleFlightError,
         match=r"radius 0\.354 m with 0\.1 m to spare: the largest clearance is 0\.\d\d m",
@@ -108,7 +102,6 @@ def test_no_room_at_all():
 
 
 def test_no_way_worth_a_flight():
-    """A place in which the vehicle cannot fly a metre is an error that names the longest way."""
     cell = corridors(((0.2, 0.2, 0.2), (1.8, 1.4, 1.4)))
     for choose in (choose_start_and_goal, lambda *given: draw_start_and_goal(*given, seed=0)):
         with pytest.raises(
@@ -118,7 +111,6 @@ def test_no_way_worth_a_flight():
 
 
 def test_same_field_same_choice():
-    """The choice is deterministic."""
     esdf = corridors(ALONG_X, ALONG_Y)
     first, second = (choose_start_and_goal(esdf, RADIUS) for _ in range(2))
     np.testing.assert_array_equal(first[0], second[0])
@@ -127,8 +119,6 @@ def test_same_field_same_choice():
 
 @pytest.mark.parametrize("seed", range(5))
 def test_drawn_ends_are_as_far_apart_as_asked(seed):
-    """In an L the drawn way is as long as asked, also if that is more than 60 % of the longest; to
-    ask for more than there is is an error with what there is."""
     esdf = corridors(ALONG_X, ALONG_Y)
     _, _, longest = choose_start_and_goal(esdf, RADIUS)
     _, _, length = draw_start_and_goal(esdf, RADIUS, seed, least=0.8 * longest)

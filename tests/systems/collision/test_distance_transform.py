@@ -1,5 +1,3 @@
-"""Distance transforms of voxel grids against analytic solids, in voxels."""
-
 import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
@@ -39,7 +37,6 @@ SOLIDS = {
 
 
 def test_distance_to_voxels_against_a_nearest_neighbour_search():
-    """The transform is the exact distance to the nearest marked centre, in metres."""
     random = np.random.default_rng(0)
     voxels = random.random((20, 14, 11)) < 0.01
     index = np.stack(np.meshgrid(*map(np.arange, voxels.shape), indexing="ij"), -1)
@@ -48,7 +45,6 @@ def test_distance_to_voxels_against_a_nearest_neighbour_search():
 
 
 def test_grids_without_a_surface_have_finite_distances():
-    """With nothing marked the answer is the diagonal of the grid, finite and beyond all else."""
     none = np.zeros((3, 4, 12), bool)
     assert distance_to_voxels(none, 0.5).min() == pytest.approx(6.5)
     assert occupancy_distances(none, 0.5).min() > 6.0
@@ -67,8 +63,6 @@ def distance_to_cubes(voxels: np.ndarray, p: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("share", [0.003, 0.05, 0.3, 0.6, "blobs"])
 def test_occupancy_is_never_farther_than_its_voxels(share):
-    """Between voxel centres too, the field is at most the distance to the nearest occupied voxel,
-    not positive within one, and on average less than half a voxel too small."""
     rng = np.random.default_rng(0)
     noise = rng.random((70, 24, 18))
     occupied = noise < share if share != "blobs" else gaussian_filter(noise, 2.0) > 0.52
@@ -83,7 +77,6 @@ def test_occupancy_is_never_farther_than_its_voxels(share):
 
 
 def test_occupancy_is_exact_beside_walls():
-    """Distances to a flat wall and to its back lose nothing."""
     wall = np.zeros((40, 8, 8), bool)
     wall[10:15] = True
     x = np.arange(40) + 0.5
@@ -96,8 +89,6 @@ def test_occupancy_is_exact_beside_walls():
 
 @pytest.mark.parametrize("solid", SOLIDS)
 def test_the_surface_within_the_voxels_makes_the_field_accurate(solid):
-    """With the surface's own values: rms under 0.2 voxel, mean error within 0.15 and near the
-    surface within 0.1 voxel, the sign everywhere right."""
     phi = SOLIDS[solid].astype(np.float32)
     band = np.where(np.abs(phi) < 1.0, phi, np.float32(np.nan))
     distances = distances_from_band(phi < 0.0, band, 1.0)
@@ -115,7 +106,6 @@ def test_the_surface_within_the_voxels_makes_the_field_accurate(solid):
 
 @pytest.mark.parametrize("solid", SOLIDS)
 def test_passing_sites_to_neighbours_only_tightens_the_bounds(solid):
-    """More sweeps never enlarge a distance and never fall below the true one."""
     phi = SOLIDS[solid].astype(np.float32)
     band = np.where(np.abs(phi) < 1.0, phi, np.float32(np.nan))
     loose, tight = (distances_from_band(phi < 0.0, band, 1.0, sweeps=n) for n in (0, 2))
@@ -125,7 +115,6 @@ def test_passing_sites_to_neighbours_only_tightens_the_bounds(solid):
 
 
 def test_distances_scale_with_the_voxel():
-    """The same grid with voxels of 5 cm gives the same distances in voxels."""
     phi = SOLIDS["union"].astype(np.float32)
     band = np.where(np.abs(phi) < 1.0, phi, np.float32(np.nan))
     np.testing.assert_allclose(

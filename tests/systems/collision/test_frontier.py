@@ -1,5 +1,3 @@
-"""Where seen, free space ends in space nobody looked into."""
-
 import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
@@ -30,8 +28,6 @@ def half_seen_room(closet: bool = False) -> Esdf:
 
 
 def test_only_what_a_vehicle_can_look_into_is_closed():
-    """The room is reachable for a sphere that fits; a closet apart from it, and a room for spheres
-    too large, are not."""
     field = half_seen_room(closet=True)
     free = field.states == FieldState.FREE
     expected = free.copy()
@@ -42,8 +38,6 @@ def test_only_what_a_vehicle_can_look_into_is_closed():
 
 
 def test_obstacles_begin_two_voxels_behind_what_was_seen():
-    """Of a plane between seen and unknown space every voxel is closed but those at the walls'
-    corners; distances before it are the nearer of walls' and plane's, what planners trust stays."""
     field = half_seen_room()
     reachable = reachable_space(field, 0.35)
     hidden, before, _ = hidden_frontier(field, reachable, [], K, [])

@@ -1,5 +1,3 @@
-"""Binary OctoMaps, written by hand and real."""
-
 import os
 from pathlib import Path
 
@@ -39,7 +37,6 @@ def deep_tree() -> bytes:
 
 
 def test_a_tree_written_by_hand(tmp_path):
-    """Corners, sizes and occupancy of the leaves follow from their places in the tree."""
     path = tmp_path / "map.bt"
     path.write_bytes(deep_tree())
     octomap = read_octomap(path)
@@ -60,7 +57,6 @@ def test_a_tree_written_by_hand(tmp_path):
 
 
 def test_axes_of_the_children(tmp_path):
-    """Child 1 lies towards +x, child 2 towards +y, child 4 towards +z; siblings stay in order."""
     branch = [node(c0=INNER)] * 14
     # Two inner children of the root, 3 (+x +y -z) and 6 (-x +y +z), with a voxel at the corner.
     masks = [node(c3=INNER, c6=INNER)]
@@ -74,7 +70,6 @@ def test_axes_of_the_children(tmp_path):
 
 
 def test_grid_and_distance_field(tmp_path):
-    """In a box the voxels have their states; the rest is unknown; the field is the box's."""
     path = tmp_path / "map.bt"
     path.write_bytes(deep_tree())
     lower, upper = np.array([-0.5, 0.0, 0.0]), np.array([2.0, 1.0, 1.0])
@@ -90,12 +85,11 @@ def test_grid_and_distance_field(tmp_path):
 
 
 def test_boxes_too_large_or_empty_are_refused(tmp_path):
-    """The whole space of a tree with a huge leaf is refused with the number of voxels."""
     path = tmp_path / "map.bt"
     path.write_bytes(deep_tree())
-    with pytest.raises(ValueError, match=r"the limit is 2\.5e\+08. Give smaller bounds"):
+    with pytest.raises(ValueError, match=r"at most 2\.5e\+08, .*give smaller bounds"):
         esdf_from_octomap(path)
-    with pytest.raises(ValueError, match="is empty"):
+    with pytest.raises(ValueError, match="upper_W of the box"):
         esdf_from_octomap(path, np.ones(3), np.zeros(3))
 
 
@@ -119,7 +113,6 @@ def test_boxes_too_large_or_empty_are_refused(tmp_path):
     ],
 )
 def test_damaged_and_foreign_files_are_refused(tmp_path, damage, message):
-    """Truncated, padded, mislabelled and foreign files each end in a message naming the file."""
     path = tmp_path / "map.bt"
     path.write_bytes(damage(deep_tree()))
     with pytest.raises(ValueError, match=message) as error:
@@ -128,7 +121,6 @@ def test_damaged_and_foreign_files_are_refused(tmp_path, damage, message):
 
 
 def test_a_missing_file_is_reported(tmp_path):
-    """Reading what is not there names the path."""
     with pytest.raises(FileNotFoundError, match=r"nowhere\.bt"):
         read_octomap(tmp_path / "nowhere.bt")
 
@@ -150,14 +142,12 @@ def maps() -> Path:
     ],
 )
 def test_real_maps(maps, name, resolution, extent):
-    """Real maps are read whole (their node counts agree) and have their published extent."""
     octomap = read_octomap(maps / f"{name}.bt")
     assert octomap.resolution == resolution
     np.testing.assert_allclose(octomap.upper_W - octomap.lower_W, extent, atol=1e-6)
 
 
 def test_the_field_of_a_real_forest(maps):
-    """The synthetic forest fills its box, has a ground and trunks, and room to fly between them."""
     field = esdf_from_octomap(maps / "forest0.bt")
     assert field.shape == (100, 100, 50)
     assert field.volume(UNKNOWN) == 0.0

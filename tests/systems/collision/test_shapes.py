@@ -1,5 +1,3 @@
-"""Analytic solids and the distance field of their union."""
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -14,6 +12,8 @@ from splatpilot.systems.collision.shapes import (
     Capsule,
     Cylinder,
     HalfSpace,
+    MovingSpheres,
+    ShapeUnion,
     Sphere,
 )
 
@@ -64,7 +64,6 @@ def surface_points(name: str) -> np.ndarray:
 
 @pytest.mark.parametrize("name", SHAPES)
 def test_distance_is_that_to_the_nearest_surface_point(name):
-    """Inside and outside, the magnitude is the distance to a dense sampling of the surface."""
     p = np.random.default_rng(1).uniform(-1.5, 1.5, (400, 3))
     distance = field_of(SHAPES[name]).distance(p)
     nearest, _ = KDTree(surface_points(name)).query(p)
@@ -74,7 +73,6 @@ def test_distance_is_that_to_the_nearest_surface_point(name):
 
 
 def test_signs_and_values_at_hand_computed_points():
-    """Centres, faces, edges and corners of each kind have their known distances."""
     x, y, z = np.eye(3)
     box = Box(RigidTransform(RollPitchYaw(0.0, 0.0, np.pi / 2), x), [2.0, 4.0, 6.0])
     cylinder = Cylinder(-z, z, 0.5)
@@ -101,7 +99,6 @@ def test_signs_and_values_at_hand_computed_points():
 @settings(deadline=None, max_examples=60)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_gradient_is_the_derivative_of_the_distance(name, seed):
-    """The gradient has length one and equals central differences where they are consistent."""
     field = field_of(SHAPES[name])
     p = np.random.default_rng(seed).uniform(-1.8, 1.8, (40, 3))
     sample = field.query(p)
@@ -120,7 +117,6 @@ def test_gradient_is_the_derivative_of_the_distance(name, seed):
 
 
 def test_gradient_is_a_unit_vector_where_it_is_not_unique():
-    """At centres, on axes and at edges the gradient is finite, of length one and not inward."""
     z = np.array([0.0, 0.0, 1.0])
     for shape in (Sphere(0.0 * z, 1.0), Capsule(-z, z, 0.5), Cylinder(-z, z, 0.5)):
         gradient = field_of(shape).query([[0.0, 0.0, 0.0], [0.0, 0.0, 0.2]]).gradient
@@ -143,19 +139,17 @@ def many_shapes(count: int = 60) -> list:
 
 
 def test_union_is_the_minimum_over_its_shapes():
-    """However many points are asked at once, the answer is the least of the single shapes', whose
-    formulas stand in Python; a point that is not finite changes none of the others'."""
     shapes = many_shapes(30) + list(SHAPES.values())
     lower, upper = np.array([-2.0, -2.0, -1.0]), np.array([36.0, 16.0, 6.0])
     union = AnalyticDistanceField(shapes, lower, upper)
     p = np.random.default_rng(6).uniform(lower, upper, (1500, 3))
     p = np.concatenate([p, [10.0, 5.0, 2.0] + 0.4 * np.random.default_rng(7).random((1500, 3))])
-    alone = np.stack([type(shape).distances(p, *shape.parameters()) for shape in shapes])
+    alone = np.stack([ShapeUnion.of([shape]).distance(p) for shape in shapes])
     expected, nearest = alone.min(axis=0), alone.argmin(axis=0)
     sample = union.query(p)
     np.testing.assert_allclose(sample.distance, expected, rtol=0.0, atol=1e-14)
     np.testing.assert_array_equal(union.distance(p), sample.distance)
-    gradients = np.stack([type(s).gradients(p, *s.parameters()) for s in shapes])
+    gradients = np.stack([ShapeUnion.of([shape]).nearest(p)[1] for shape in shapes])
     np.testing.assert_allclose(sample.gradient, gradients[nearest, np.arange(len(p))], atol=1e-9)
     for row in (0, 700):
         broken = p.copy()
@@ -169,7 +163,6 @@ def test_union_is_the_minimum_over_its_shapes():
 @settings(deadline=None, max_examples=50)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_unions_are_lipschitz(seed):
-    """No distance grows faster than the distance travelled."""
     field = field_of(*SHAPES.values())
     random = np.random.default_rng(seed)
     p, q = random.uniform(-3.0, 3.0, (2, 60, 3))
@@ -178,7 +171,6 @@ def test_unions_are_lipschitz(seed):
 
 
 def test_states_and_bounds():
-    """Inside the bounds points are free or occupied; outside nothing is claimed, nor for NaN."""
     field = field_of(SHAPES["sphere"])
     p = [[0.1, 0.2, -0.3], [2.9, 0.0, 0.0], [3.1, 0.0, 0.0], [np.nan, 0.0, 0.0]]
     sample = field.query(p)
@@ -190,7 +182,6 @@ def test_states_and_bounds():
 
 
 def test_an_empty_union_is_infinitely_far():
-    """Without shapes every point inside the bounds is free and infinitely far from anything."""
     field = field_of()
     for p in (np.zeros(3), np.zeros((600, 3))):
         assert (field.distance(p) == np.inf).all()
@@ -200,22 +191,95 @@ def test_an_empty_union_is_infinitely_far():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: Sphere(np.zeros(3), 0.0), "Sphere.radius is 0.0 m; it must be positive"),
-        (lambda: Capsule(A, B, -1.0), "Capsule.radius is -1.0"),
-        (lambda: Cylinder(A, A, 1.0), "both ends are at"),
-        (lambda: Cylinder(A, B, np.nan), "Cylinder.radius is nan"),
-        (lambda: Box(X_WO, np.array([1.0, 0.0, 1.0])), "each edge must be positive"),
-        (lambda: HalfSpace(np.zeros(3), 1.0), "normal is zero"),
-        (lambda: Sphere(np.array([0.0, np.nan, 0.0]), 1.0), "Sphere.p_WO is"),
+        (lambda: Sphere(np.zeros(3), 0.0), "Sphere.radius must be .* got 0.0"),
+        (lambda: Capsule(A, B, -1.0), "Capsule.radius must be .* got -1.0"),
+        (lambda: Cylinder(A, A, 1.0), "Cylinder.p_WB must be apart"),
+        (lambda: Cylinder(A, B, np.nan), "Cylinder.radius must be .* got nan"),
+        (lambda: Box(X_WO, np.array([1.0, 0.0, 1.0])), "Box.size must be > 0"),
+        (lambda: HalfSpace(np.zeros(3), 1.0), "normal must be a direction"),
+        (lambda: Sphere(np.array([0.0, np.nan, 0.0]), 1.0), "Sphere.p_WO must be"),
     ],
 )
 def test_impossible_shapes_are_refused(make, message):
-    """Sizes that are not positive and coordinates that are not finite are named."""
     with pytest.raises(ValueError, match=message):
         field_of(make())
 
 
 def test_empty_bounds_are_refused():
-    """A box without volume holds no field."""
-    with pytest.raises(ValueError, match="are empty"):
+    with pytest.raises(ValueError, match="upper_W must be above"):
         AnalyticDistanceField([], np.zeros(3), np.array([1.0, 0.0, 1.0]))
+
+
+LOWER, UPPER = np.full(3, -5.0), np.full(3, 5.0)
+AWAY = np.full(3, np.inf)
+PATHS = [
+    np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]]),
+    np.array([[-3.0, 0, 0]]),
+    np.array([[0.0, 3, 0], AWAY]),
+]
+SPHERES = MovingSpheres([0.5, 0.25, 1.0], PATHS, period=0.5)
+
+
+def test_paths_are_followed_there_and_back():
+    x = [SPHERES.centers(0.5 * step)[0, 0] for step in range(9)]
+    assert x == [0, 1, 2, 1, 0, 1, 2, 1, 0]
+    np.testing.assert_array_equal(SPHERES.centers(0.74), SPHERES.centers(0.5))
+    np.testing.assert_array_equal(SPHERES.centers(7.3)[1], PATHS[1][0])
+    assert np.isinf(SPHERES.centers(0.5)[2]).all() and np.isfinite(SPHERES.centers(1.0)[2]).all()
+
+
+def test_steps_of_a_simulation_reach_their_rows():
+    steps = np.arange(1500)
+    balls = MovingSpheres([1.0], [np.column_stack([steps, steps, steps])], period=0.02)
+    time = 0.0
+    for step in steps:
+        assert balls.centers(time)[0, 0] == step == balls.centers(0.02 * step)[0, 0]
+        time += 0.02
+
+
+@pytest.mark.parametrize("time", [0.0, 0.5, 1.2])
+def test_the_field_is_that_of_everything_where_it_is(time):
+    standing = Sphere([0.0, -2.0, 1.0], 0.7)
+    placed = [
+        Sphere(center, radius)
+        for center, radius in zip(SPHERES.centers(time), SPHERES.radii, strict=True)
+        if np.isfinite(center).all()
+    ]
+    p_WQ = np.random.default_rng(0).uniform(-5.5, 5.5, (40, 5, 3))
+    expected = AnalyticDistanceField([standing, *placed], LOWER, UPPER).query(p_WQ)
+    field = SPHERES.among(AnalyticDistanceField([standing], LOWER, UPPER), time)
+    sample = field.query(p_WQ)
+    np.testing.assert_allclose(sample.distance, expected.distance, atol=1e-12)
+    np.testing.assert_allclose(sample.gradient, expected.gradient, atol=1e-12)
+    np.testing.assert_array_equal(sample.state, expected.state)
+    np.testing.assert_array_equal(field.distance(p_WQ), sample.distance)
+    assert field.query(p_WQ[0, 0]).distance.shape == ()
+
+
+def test_samples_of_trajectories_meet_the_balls_of_their_times():
+    field = AnalyticDistanceField([Sphere([0.0, -2.0, 1.0], 0.7)], LOWER, UPPER)
+    times = np.array([0.2, 0.6, 1.1, 1.4])
+    p_WQ = np.random.default_rng(1).uniform(-4.0, 4.0, (30, 4, 3))
+    along = SPHERES.along(field, times).distance(p_WQ)
+    assert along.shape == (30, 4)
+    for s, time in enumerate(times):
+        expected = SPHERES.among(field, time).distance(p_WQ[:, s])
+        np.testing.assert_array_equal(along[:, s], expected)
+
+
+def test_the_gradient_at_a_spheres_center_is_a_unit_vector():
+    sample = SPHERES.among(AnalyticDistanceField([], LOWER, UPPER), 0.0).query(PATHS[1][0])
+    assert sample.distance == -0.25 and sample.state == FieldState.OCCUPIED
+    assert np.linalg.norm(sample.gradient) == pytest.approx(1.0)
+
+
+def test_balls_without_a_path_are_refused():
+    path = np.zeros((1, 3))
+    for radii, paths, period, match in (
+        ([1.0, 1.0], [path], 0.1, "paths must be 2"),
+        ([1.0], [path[:0]], 0.1, "at least one row"),
+        ([0.0], [path], 0.1, "radii must be > 0"),
+        ([1.0], [path], 0.0, "period must be > 0"),
+    ):
+        with pytest.raises(ValueError, match=match):
+            MovingSpheres(radii, paths, period)

@@ -65,7 +65,7 @@ def run(times: np.ndarray, until: float) -> np.ndarray:
     camera = builder.AddSystem(Camera(times))
     triggered = builder.AddSystem(ArrivalTriggered(Policy(), TICK))
     builder.Connect(camera.GetOutputPort("image"), triggered.GetInputPort("image"))
-    builder.Connect(camera.GetOutputPort("age"), triggered.observation_age_input_port())
+    builder.Connect(camera.GetOutputPort("age"), triggered.GetInputPort("observation_age"))
     simulator = Simulator(builder.Build())
     context = triggered.GetMyContextFromRoot(simulator.get_context())
     rows = []
@@ -82,8 +82,6 @@ def decisions(rows: np.ndarray) -> np.ndarray:
 
 
 def test_decides_as_images_come():
-    """Images of the policy's own rate, of any phase, are decided on in the tick they come in, and
-    each once; before the first there is no decision."""
     rows = run(0.037 + PERIOD * np.arange(10), 1.0)
     made = decisions(rows)
     np.testing.assert_array_equal(made[:, 1], np.arange(10))
@@ -94,8 +92,6 @@ def test_decides_as_images_come():
 
 @pytest.mark.parametrize("faster", [1.33, 2.0, 3.0])
 def test_fast_images_do_not_make_it_faster(faster):
-    """Of images that are faster than its rate some are left out, so that the rate is kept within
-    the twentieth that clocks may differ; those that are not are decided on as they come."""
     made = decisions(run(PERIOD / faster * np.arange(400), 10.0))
     late = made[:, 0] - (made[:, 1] * PERIOD / faster + 0.01)
     assert late.max() < TICK
@@ -104,8 +100,6 @@ def test_fast_images_do_not_make_it_faster(faster):
 
 @pytest.mark.parametrize("phase", [0.2, 0.4, 0.6, 0.8])
 def test_images_that_change_their_phase_are_found_again(phase):
-    """After a jump of the images' phase they are decided on as they come again, from the second
-    one on; so they are where each comes early or late by a fifth of a period."""
     jitter = 0.2 * PERIOD * np.random.default_rng(0).uniform(-1.0, 1.0, 60)
     times = PERIOD * (np.arange(60) + np.where(np.arange(60) < 20, 0.0, phase)) + 0.05 + jitter
     made = decisions(run(times, 6.0))
@@ -115,8 +109,6 @@ def test_images_that_change_their_phase_are_found_again(phase):
 
 
 def test_without_images_it_goes_on():
-    """Where images are missing it decides by the last one, 1.6 periods apart; afterwards
-    it decides as they come again, from the first."""
     made = decisions(run(np.append(PERIOD * np.arange(5), PERIOD * np.arange(10, 15)), 1.5))
     missing = made[(made[:, 0] > 0.42) & (made[:, 0] < 1.0)]
     assert (missing[:, 1] == 4.0).all()
@@ -126,7 +118,6 @@ def test_without_images_it_goes_on():
 
 
 def test_outputs_are_the_systems():
-    """Its other outputs are computed of its state, and of its inputs where they pass through."""
     triggered = ArrivalTriggered(Policy(), TICK)
     context = triggered.CreateDefaultContext()
     context.SetDiscreteState(0, [3.0])
@@ -163,7 +154,7 @@ def test_what_the_system_raises_is_told_and_logged_once(caplog, broken, said):
     simulator = Simulator(triggered)
     context = simulator.get_mutable_context()
     triggered.GetInputPort("image").FixValue(context, [3.0])
-    triggered.observation_age_input_port().FixValue(context, [0.0])
+    triggered.GetInputPort("observation_age").FixValue(context, [0.0])
 
     def out(name: str) -> float:
         return triggered.GetOutputPort(name).Eval(context)[0]
@@ -182,6 +173,5 @@ def test_what_the_system_raises_is_told_and_logged_once(caplog, broken, said):
 
 
 def test_what_cannot_be_triggered_is_an_error():
-    """A system without a periodic update is refused by name."""
-    with pytest.raises(ValueError, match=r"LeafSystem cannot be triggered"):
+    with pytest.raises(ValueError, match=r"what arrivals trigger must be .* got LeafSystem"):
         ArrivalTriggered(LeafSystem(), TICK)

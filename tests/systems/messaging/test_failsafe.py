@@ -1,4 +1,4 @@
-"""What is flown if policy, state or observation cannot be trusted."""
+"""Failsafe."""
 
 from dataclasses import replace
 
@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from failsafe_bench import LOWER, UPPER, Bench
 
-from splatpilot.systems.messaging.failsafe import FailsafeConfig
+from splatpilot.systems.messaging.failsafe import FailsafeConfig, FiniteVector
 from splatpilot.systems.messaging.flight_limits import FlightLimits
 from splatpilot.systems.messaging.generated import lcmt_bridge_status as status
 from splatpilot.systems.vehicle.quadrotor import hover_state
 
 CONFIG = FailsafeConfig(patience=2.0)
+
 IN_CHARGE, NOT_IN_CHARGE = [1.0, 1.0], [1.0, 0.0]
 
 
@@ -281,5 +282,24 @@ def test_a_vehicle_on_the_ground_below_its_fence_takes_off_into_it():
 
 @pytest.mark.parametrize("name", ["max_age", "max_lag", "recovery", "patience", "descent"])
 def test_bad_config_is_named(name):
-    with pytest.raises(ValueError, match=rf"failsafe\.{name} is 0"):
+    with pytest.raises(ValueError, match=rf"{name} must be in .* got 0"):
         FailsafeConfig(**{name: 0.0}).validate()
+
+
+@pytest.mark.parametrize(
+    ("signal", "finite"),
+    [([1.0, -2.0], [1.0, -2.0]), ([1.0, np.nan], [0.0, 0.0]), ([-np.inf, 0.0], [0.0, 0.0])],
+)
+def test_signal_is_whole_or_zero(signal, finite):
+    system = FiniteVector(2)
+    context = system.CreateDefaultContext()
+    system.GetInputPort("signal").FixValue(context, signal)
+    np.testing.assert_array_equal(system.GetOutputPort("finite").Eval(context), finite)
+
+
+def test_what_is_not_finite_becomes_the_substitute():
+    system = FiniteVector(1, substitute=np.nan)
+    context = system.CreateDefaultContext()
+    for signal, finite in ((0.5, 0.5), (np.inf, np.nan), (np.nan, np.nan)):
+        system.GetInputPort("signal").FixValue(context, [signal])
+        np.testing.assert_array_equal(system.GetOutputPort("finite").Eval(context), [finite])

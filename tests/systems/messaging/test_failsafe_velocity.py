@@ -1,5 +1,6 @@
 """Velocities that a failsafe tells a vehicle to fly."""
 
+import itertools
 import math
 
 import numpy as np
@@ -10,17 +11,13 @@ from hypothesis import strategies as st
 from pydrake.math import RigidTransform
 
 from splatpilot.systems.collision.shapes import AnalyticDistanceField, Box, Cylinder
-from splatpilot.systems.messaging import failsafe as failsafe_checks
-from splatpilot.systems.messaging.failsafe import (
-    FailsafeConfig,
-    Memory,
-    Motion,
-    Surroundings,
-    flown_setpoint,
-)
+from splatpilot.systems.messaging import flight_limits
+from splatpilot.systems.messaging.failsafe import FailsafeConfig, Modes, limited_setpoint
 from splatpilot.systems.messaging.flight_limits import (
     RETURN_SPEED,
     FlightLimits,
+    Motion,
+    Surroundings,
     stopping_displacement,
 )
 from splatpilot.systems.messaging.generated import lcmt_bridge_status as status
@@ -51,10 +48,10 @@ def test_no_state_and_no_map_is_flown_faster_than_the_limit(
 ):
     limits = FlightLimits(max_speed=max_speed)
     motion = Motion.predict(p_WB, v_WB, age, 0.1, limits.deceleration, LAW) if known else None
-    memory = Memory(mode, status.NONE, 0.0, 0.0, *held)
-    near = Surroundings(clearance, gradient, failsafe_checks.Box(-np.ones(3), np.ones(3)), field)
+    modes = Modes(mode, status.NONE, p_WH=held)
+    near = Surroundings(clearance, gradient, flight_limits.Box(-np.ones(3), np.ones(3)), field)
     config = FailsafeConfig(limits=limits)
-    setpoint, _ = flown_setpoint(mode, np.append(desired, 0.0), motion, memory, near, config)
+    setpoint, _ = limited_setpoint(mode, np.append(desired, 0.0), motion, modes, near, config)
     most = max_speed if mode == status.FLYING else min(max_speed, RETURN_SPEED)
     assert np.linalg.norm(setpoint[:3]) <= most * (1 + 1e-9)
 
@@ -94,11 +91,15 @@ def room_left(bench: Bench, box) -> float:
     return min(inside, float(bench.field.distance(p_WB)) - VEHICLE_RADIUS - 0.1)
 
 
-@pytest.mark.parametrize("speed", [1.0, 3.0, 6.0])
-@pytest.mark.parametrize(
-    ("by", "age"), [("velocity", 0.3), ("body_rates", 0.0), ("body_rates", 0.1)]
-)
-@pytest.mark.parametrize("what", AHEAD)
+HEAD_ON = [
+    *itertools.product(["wall", "post"], ["velocity", "body_rates"], [0.1], [1.0, 6.0]),
+    *itertools.product(["wall", "fence", "floor", "ceiling"], ["velocity"], [0.3], [3.0, 6.0]),
+    *itertools.product(["fence", "floor", "ceiling"], ["body_rates"], [0.1], [1.0, 6.0]),
+    *itertools.product(["post", "floor"], ["body_rates"], [0.0], [3.0]),
+]
+
+
+@pytest.mark.parametrize(("what", "by", "age", "speed"), HEAD_ON)
 def test_limits_are_kept_head_on_at_any_speed_and_age(what, by, age, speed):
     field, box, direction = AHEAD[what]
     v_WB = speed * np.array(direction)
@@ -108,7 +109,7 @@ def test_limits_are_kept_head_on_at_any_speed_and_age(what, by, age, speed):
     p_WB = -(away + 0.2) * np.array(direction)
     bench = Bench(None, p_WB, v_WB, age, by, box, field)
     closest = math.inf
-    for _ in range(150):
+    for _ in range(120):
         bench.advance(0.02, want=v_WB)
         closest = min(closest, room_left(bench, box))
         assert bench.out("mode")[0] == status.FLYING

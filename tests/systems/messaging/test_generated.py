@@ -25,14 +25,12 @@ def python_in(folder: Path) -> dict[str, str]:
 
 
 def test_generated_python_is_that_of_the_types(regenerated):
-    """The Python in the repository is what lcm-gen makes of lcmtypes/, file by file."""
     assert python_in(GENERATED) == python_in(regenerated)
     assert len(python_in(GENERATED)) == len(TYPES) + 1  # And __init__.py.
 
 
 @pytest.mark.parametrize("path", TYPES, ids=lambda path: path.stem)
 def test_every_message_says_when_and_which(path):
-    """Each message begins with Drake's header, which has time, sequence number and frame."""
     text = path.read_text()
     assert text.count("struct") == 1
     assert text.index("drake.lcmt_header header;") < text.index(";", text.index("struct")) + 1

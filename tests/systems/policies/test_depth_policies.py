@@ -8,11 +8,11 @@ from pydrake.common.value import Value
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.sensors import ImageDepth32F
 
-from splatpilot.systems.policies import agile_autonomy_inference as agile_policy
+from splatpilot.systems.policies import agile_autonomy as agile_policy
 from splatpilot.systems.policies import depthnav as depthnav_policy
 from splatpilot.systems.policies import diffaero as diffaero_policy
-from splatpilot.systems.policies import diffaero as tof_policy
 from splatpilot.systems.policies.agile_autonomy import AgileAutonomy, AgileAutonomyConfig
+from splatpilot.systems.policies.base import Observation
 from splatpilot.systems.policies.checkpoint import PolicyCheckpoint
 from splatpilot.systems.policies.depthnav import DepthNav, DepthNavConfig
 from splatpilot.systems.policies.diffaero import (
@@ -26,7 +26,7 @@ from splatpilot.systems.policies.observations import pool_depth
 from splatpilot.systems.policies.recurrent_network import RecurrentNetwork
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.vehicle.quadrotor import hover_state
-from splatpilot.systems.vehicle.state import pose_from_state
+from splatpilot.systems.vehicle.state import QuadrotorState, pose_from_state
 
 SPECS = {
     "diffaero": diffaero_policy.DIFFAERO_NETWORK,
@@ -70,6 +70,11 @@ def depth_of(config) -> np.ndarray:
     return rng.uniform(0.5, 15.0, (config.camera.height, config.camera.width)).astype(np.float32)
 
 
+def observation(image: np.ndarray) -> Observation:
+    x = state()
+    return Observation(0.0, pose_from_state(x), QuadrotorState.of(x), P_WG, image)
+
+
 def simulator_of(system, config) -> Simulator:
     simulator = Simulator(system)
     context = simulator.get_mutable_context()
@@ -90,18 +95,14 @@ def test_recurrent_policy_decides_and_remembers_at_its_rate(name, files):
     config = configure(weights=files[name], speed=1.7)
     system = make(config)
     network = RecurrentNetwork(SPECS[name], weights(name))
-    X_WB, memory = pose_from_state(state()), network.initial_hidden()
-    v_WB, depth = state()[3:6], depth_of(config)
+    seen, memory = observation(depth_of(config)), network.initial_hidden()
     a_WB, heading = np.zeros(3), np.nan
     for _ in range(3):
         if name == "diffaero":
-            a_WB, memory = diffaero_policy.decide_acceleration(
-                network, depth, X_WB, v_WB, P_WG, 1.7, memory
-            )
+            grid = diffaero_policy.depth_grid(seen.image)
+            a_WB, memory = diffaero_policy.decide(network, grid, seen, 1.7, memory)
         else:
-            a_WB, heading, memory = depthnav_policy.decide(
-                network, depth, X_WB, v_WB, P_WG, 1.7, 0.6, memory
-            )
+            a_WB, heading, memory = depthnav_policy.decide(network, seen, 1.7, 0.6, memory)
     for _ in range(2):
         simulator = simulator_of(system, config)
         simulator.AdvanceTo(2.5 / config.rate)
@@ -117,15 +118,15 @@ def test_policy_of_time_of_flight_decides_and_remembers_at_its_rate(tmp_path):
     """After three periods the output is that of three steps of the pure policy, and a fresh Context
     begins anew."""
     file = tmp_path / "mine.npz"
-    spec = tof_policy.DIFFAERO_NETWORK
+    spec = diffaero_policy.DIFFAERO_NETWORK
     PolicyCheckpoint("diffaero_tof", spec, weights("diffaero"), {}).save(file)
     config = DiffAeroTofConfig(weights=str(file), speed=1.7)
     system, network = DiffAeroTof(config), RecurrentNetwork(spec, weights("diffaero"))
     grid = np.random.default_rng(1).uniform(size=(9, 16))
     velocity, memory = np.zeros(3), network.initial_hidden()
     for _ in range(3):
-        velocity, memory = tof_policy.decide_velocity(
-            network, grid, pose_from_state(state()), state()[3:6], P_WG, 1.7, memory
+        velocity, memory = diffaero_policy.decide(
+            network, grid, observation(grid), 1.7, memory, diffaero_policy.VELOCITY_LIMITS
         )
     for _ in range(2):
         simulator = Simulator(system)
@@ -148,9 +149,7 @@ def test_trajectory_policy_plans_at_its_rate(files):
     found = Hypotheses.from_vector(vector, 3)
     assert found is not None and found.plan_time == pytest.approx(1.0 / config.rate)
     network = agile_policy.TrajectoryNetwork(SPECS["agile_autonomy"], weights("agile_autonomy"))
-    expected = agile_policy.plan(
-        network, 0.0, depth_of(config), pose_from_state(state()), state(), P_WG, 2.0, None
-    )
+    expected = agile_policy.plan(network, observation(depth_of(config)), 2.0, None)
     np.testing.assert_allclose(found.waypoints_B, expected.waypoints_B, atol=1e-9)
 
 
@@ -164,7 +163,7 @@ def test_near_ties_continue_the_last_plan(files):
 
     def followed(costs) -> int:
         new = Hypotheses(0.1, X_WB, np.stack([left, right, far]), np.array(costs))
-        return agile_policy._prefer_continuation(new, last).best
+        return agile_policy.prefer_continuation(new, last).best
 
     assert followed([0.100, 0.101, 0.9]) == 1
     assert followed([0.100, 0.900, 0.9]) == 0
@@ -183,7 +182,8 @@ def test_progress_is_worth_some_cost():
     network = Equal(SPECS["agile_autonomy"], weights("agile_autonomy"))
     x = hover_state([0, 0, 2])
     depth = np.full((24, 32), 9.0)
-    plan = agile_policy.plan(network, 0.0, depth, pose_from_state(x), x, [9, 0, 2], 2.0, None)
+    seen = Observation(0.0, pose_from_state(x), QuadrotorState.of(x), np.array([9, 0, 2]), depth)
+    plan = agile_policy.plan(network, seen, 2.0, None)
     np.testing.assert_allclose(plan.costs, [0.28, 0.2, 0.4])
 
 
@@ -192,7 +192,7 @@ def test_cameras_that_cannot_be_pooled_are_refused(name, files):
     """A camera of 50x30 pixels is refused with the sizes that would do."""
     make, configure = SYSTEMS[name]
     config = configure(weights=files[name], camera=OnboardCamera(width=50, height=30))
-    with pytest.raises(ValueError, match=r"50x30 pixels, but this policy pools it to"):
+    with pytest.raises(ValueError, match=r"whole multiples of .* got 50x30"):
         make(config)
     with pytest.raises(ValueError, match=r"speed .* got 0"):
         make(configure(weights=files[name], speed=0.0))

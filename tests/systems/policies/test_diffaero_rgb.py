@@ -8,8 +8,14 @@ from pydrake.common.value import Value
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.sensors import ImageRgba8U
 
+from splatpilot.systems.policies.base import Observation
 from splatpilot.systems.policies.checkpoint import PolicyCheckpoint
-from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK, FARTHEST, NEAREST, decide_by_grid
+from splatpilot.systems.policies.diffaero import (
+    DIFFAERO_NETWORK,
+    MAX_DEPTH,
+    MIN_DEPTH,
+)
+from splatpilot.systems.policies.diffaero import decide as decide_by_grid
 from splatpilot.systems.policies.diffaero_rgb import (
     DIFFAERO_RGB_NETWORK,
     DiffAeroRgb,
@@ -22,7 +28,7 @@ from splatpilot.systems.policies.observations import inverse_depth
 from splatpilot.systems.policies.recurrent_network import load_network as load_recurrent
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.vehicle.quadrotor import hover_state
-from splatpilot.systems.vehicle.state import pose_from_state
+from splatpilot.systems.vehicle.state import QuadrotorState, pose_from_state
 
 P_WG = np.array([12.0, 3.0, 2.0])
 
@@ -48,6 +54,10 @@ def file(tmp_path_factory) -> str:
     return str(path)
 
 
+def observation(state: np.ndarray, color: np.ndarray) -> Observation:
+    return Observation(0.0, pose_from_state(state), QuadrotorState.of(state), P_WG, color)
+
+
 def test_decides_at_its_rate(file):
     """The acceleration is that of the pure policy at the last multiple of the period, with the
     memory of the one before."""
@@ -67,8 +77,8 @@ def test_decides_at_its_rate(file):
     network, memory = load_network(file), load_recurrent(None, "diffaero", DIFFAERO_NETWORK)
     memory, expected = memory.initial_hidden(), np.zeros(3)
     for _ in range(2):
-        color, X_WB = np.asarray(image.data)[..., :3], pose_from_state(state)
-        expected, memory = decide(network, color, X_WB, state[3:6], P_WG, 3.0, memory)
+        seen = observation(state, np.asarray(image.data)[..., :3])
+        expected, memory = decide(network, seen, 3.0, memory)
     found = system.GetOutputPort("acceleration").Eval(context)
     assert np.linalg.norm(expected) > 1e-3
     np.testing.assert_array_equal(found, expected)
@@ -84,13 +94,13 @@ def test_decides_as_diffaero_of_what_it_judges(tmp_path):
     network = load_network(str(path))
     color = np.random.default_rng(3).integers(0, 256, (90, 160, 3)).astype(np.uint8)
     state = hover_state([1.0, 2.0, 1.5], yaw=0.3)
-    X_WB, memory = pose_from_state(state), policy.initial_hidden()
-    grid, log_error = network.monocular(encode_view(color, X_WB.rotation().matrix()))
-    found, _ = decide(network, color, X_WB, state[3:6], P_WG, 2.0, memory)
-    expected, _ = decide_by_grid(policy, grid, X_WB, state[3:6], P_WG, 2.0, memory)
+    seen, memory = observation(state, color), policy.initial_hidden()
+    grid, log_error = network.monocular(encode_view(color, seen.X_WB.rotation().matrix()))
+    found, _ = decide(network, seen, 2.0, memory)
+    expected, _ = decide_by_grid(policy, grid, seen, 2.0, memory)
     assert grid.shape == log_error.shape == (9, 16)
     np.testing.assert_allclose(found, expected, atol=1e-6)
-    assert inverse_depth(np.array(NEAREST), NEAREST, FARTHEST) == pytest.approx(9.4)
+    assert inverse_depth(np.array(MIN_DEPTH), MIN_DEPTH, MAX_DEPTH) == pytest.approx(9.4)
 
 
 def test_weights_and_cameras_that_do_not_fit_are_refused(file, tmp_path):
@@ -107,9 +117,9 @@ def test_weights_and_cameras_that_do_not_fit_are_refused(file, tmp_path):
     PolicyCheckpoint("diffaero_rgb", DIFFAERO_RGB_NETWORK, weights, {}).save(broken)
     with pytest.raises(ValueError, match=r"broken\.npz: the weights monocular\.head\.bias are not"):
         DiffAeroRgb(DiffAeroRgbConfig(weights=str(broken)))
-    with pytest.raises(ValueError, match="has 64x48 pixels"):
+    with pytest.raises(ValueError, match="got 64x48"):
         DiffAeroRgb(DiffAeroRgbConfig(weights=file, camera=OnboardCamera(width=64, height=48)))
-    with pytest.raises(ValueError, match=r"camera\.fov_x is 80\.0 deg"):
+    with pytest.raises(ValueError, match=r"fov_x must be 90 deg, got 80\.0"):
         camera = OnboardCamera(width=160, height=90, fov_x=80.0)
         DiffAeroRgb(DiffAeroRgbConfig(weights=file, camera=camera))
     with pytest.raises(ValueError, match=r"DiffAeroRgbConfig\.speed .* got 0\.0"):

@@ -276,7 +276,7 @@ def test_unknown_space_is_not_planned_through(make_forest):
 def test_a_goal_that_is_cut_off_is_refused(closed_wall):
     """With no way from start to goal the update says so, with both places and the remedy."""
     toa = time_of_arrival(closed_wall, np.array([9.0, 5.0, 2.0]))
-    message = r"No way leads from p_WB = \[3.0, 5.0, 2.0\].*clearance 1.\d+ m.*\[9.0, 5.0, 2.0\]"
+    message = r"no path leads from p_WB = \[3.0, 5.0, 2.0\].*clearance 1.\d+ m.*\[9.0, 5.0, 2.0\]"
     with pytest.raises(ValueError, match=message):
         plan(0.0, hover_state([3.0, 5.0, 2.0]), closed_wall, toa, TrajectoryLattice())
 

@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
 
+from splatpilot.systems.policies.observations import target_velocity
 from splatpilot.systems.policies.straight import Straight, StraightConfig
 from splatpilot.systems.policies.velocity import (
     MAX_ACCELERATION,
     RESPONSE_TIME,
-    approach_velocity,
+    SLOWING_TIME,
     tracking_acceleration,
 )
 from splatpilot.systems.vehicle.quadrotor import hover_state
@@ -17,11 +18,11 @@ from splatpilot.systems.vehicle.quadrotor import hover_state
 def test_velocity_points_to_the_goal_and_falls_near_it():
     """Far away it has the set speed; within 0.75 s of the goal it is in proportion to the way."""
     p_WG = np.array([3.0, -4.0, 2.0])
-    far = approach_velocity(np.array([0.0, 0.0, 2.0]), p_WG, speed=2.0)
+    far = target_velocity(np.array([0.0, 0.0, 2.0]), p_WG, 2.0, SLOWING_TIME)
     np.testing.assert_allclose(far, [1.2, -1.6, 0.0])
-    near = approach_velocity(p_WG - [0.3, 0.0, 0.0], p_WG, speed=2.0)
+    near = target_velocity(p_WG - [0.3, 0.0, 0.0], p_WG, 2.0, SLOWING_TIME)
     np.testing.assert_allclose(near, [0.4, 0.0, 0.0])
-    np.testing.assert_array_equal(approach_velocity(p_WG, p_WG, 2.0), np.zeros(3))
+    np.testing.assert_array_equal(target_velocity(p_WG, p_WG, 2.0, SLOWING_TIME), np.zeros(3))
 
 
 def test_tracking_is_exponential_and_limited():

@@ -41,7 +41,7 @@ def test_trajectories_keep_their_ends(pillar):
     R_WL = rotation_to(-toa.gradient(p))
     ends = p + 2.0 * 2.0 * final_velocities(lattice.config) @ R_WL.T
     np.testing.assert_allclose(trajectories.positions[:-3, -1], ends, atol=1e-12)
-    way, _ = toa.way(p, 4.0 * np.array(lattice.config.speed_fractions))
+    way, _ = toa.path(p, 4.0 * np.array(lattice.config.speed_fractions))
     np.testing.assert_allclose(trajectories.positions[-3:, -1], way, atol=1e-12)
 
 
@@ -89,11 +89,11 @@ def test_best_are_in_order_and_distinct(pillar):
         ({"speed": 0.0}, r"speed must be in \(0, 20\] m/s, got 0.0"),
         ({"horizon": 0.9}, "horizon must be a multiple of 0.1 s and at least 1.0 s, got 0.9"),
         ({"horizon": 1.55}, "multiple of 0.1 s"),
-        ({"num_yaws": 0}, "num_yaws must be at least 1, got 0"),
-        ({"max_pitch": 1.6}, "max_pitch must be less than pi/2, got 1.6"),
-        ({"margin": -0.1}, "margin must be 0 to 1e6, got -0.1"),
+        ({"num_yaws": 0}, r"num_yaws must be in \[1, inf\), got 0"),
+        ({"max_pitch": 1.6}, r"max_pitch must be in \[0, 1.5707\] rad, got 1.6"),
+        ({"margin": -0.1}, r"margin must be in \[0, 1e6\] m, got -0.1"),
         ({"speed_fractions": []}, "one or more values"),
-        ({"speed_fractions": [0.5, 1.2]}, r"values in \(0, 1\]"),
+        ({"speed_fractions": [0.5, 1.2]}, r"must be in \(0, 1\]"),
         ({"num_hypotheses": 600}, "at most 525"),
         ({"jerk_weight": float("nan")}, "jerk_weight .* got nan"),
     ],

@@ -27,7 +27,7 @@ class _Open:
     def gradient(self, p_W: np.ndarray) -> np.ndarray:
         return (p_W - self.p_WG) / self.value(p_W)
 
-    def way(self, p_W: np.ndarray, lengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def path(self, p_W: np.ndarray, lengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         towards, distance = -self.gradient(p_W), self.value(p_W)
         going = (np.asarray(lengths) < distance)[:, None]
         ends = p_W + np.minimum(lengths, distance)[:, None] * towards

@@ -10,13 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from splatpilot.systems.px4.frames import (
     attitude_from_optitrack,
-    attitude_from_px4,
-    attitude_to_px4,
     from_optitrack,
-    from_px4,
-    heading_to_px4,
+    swap_px4,
+    swap_px4_attitude,
     thrust_to_px4,
-    to_px4,
 )
 
 NED_FROM_W = Rotation.from_euler("x", 180, degrees=True)
@@ -33,20 +30,17 @@ def assert_same_attitude(q: np.ndarray, expected: np.ndarray) -> None:
 
 
 def test_vectors_are_turned_as_scipy_turns_them():
-    """North stays north, west becomes minus east, up minus down, and back again."""
     for v in np.random.default_rng(0).normal(size=(10, 3)):
-        np.testing.assert_allclose(to_px4(v), NED_FROM_W.apply(v), atol=1e-12)
-        np.testing.assert_allclose(from_px4(to_px4(v)), v)
-    np.testing.assert_array_equal(to_px4(np.array([1.0, 2.0, 3.0])), [1, -2, -3])
+        np.testing.assert_allclose(swap_px4(v), NED_FROM_W.apply(v), atol=1e-12)
+        np.testing.assert_allclose(swap_px4(swap_px4(v)), v)
+    np.testing.assert_array_equal(swap_px4(np.array([1.0, 2.0, 3.0])), [1, -2, -3])
 
 
 def test_attitudes_are_those_of_scipy_and_of_pymavlink():
-    """PX4's attitude turns PX4's body axes to where ours point, by scipy's rotations and by the
-    matrices of pymavlink, whose Euler angles it has."""
     for R_WB in ATTITUDES:
-        q = attitude_to_px4(wxyz(R_WB))
+        q = swap_px4_attitude(wxyz(R_WB))
         assert_same_attitude(q, wxyz(NED_FROM_W * R_WB * NED_FROM_W.inv()))
-        assert_same_attitude(attitude_from_px4(q), wxyz(R_WB))
+        assert_same_attitude(swap_px4_attitude(q), wxyz(R_WB))
         dcm = Quaternion(q).dcm
         forward, left = R_WB.apply([1.0, 0, 0]), R_WB.apply([0.0, 1, 0])
         for axis, ours in ((Vector3(1, 0, 0), forward), (Vector3(0, 1, 0), -left)):
@@ -57,38 +51,31 @@ def test_attitudes_are_those_of_scipy_and_of_pymavlink():
 
 @pytest.mark.parametrize(("roll", "pitch", "yaw"), [(0.3, 0, 0), (0, 0.3, 0), (0, 0, 0.3)])
 def test_euler_angles_have_the_signs_of_aviation(roll, pitch, yaw):
-    """A roll to the right, a nose up and a turn to the right, in pymavlink's words, are a turn
-    about x, one about minus y and one about minus z in ours."""
     matrix = Matrix3()
     matrix.from_euler(roll, pitch, yaw)
     q = np.array(Quaternion(matrix).q)
-    rotation = Rotation.from_quat(np.roll(attitude_from_px4(q), -1))
+    rotation = Rotation.from_quat(np.roll(swap_px4_attitude(q), -1))
     np.testing.assert_allclose(rotation.as_rotvec(), [roll, -pitch, -yaw], atol=1e-6)
 
 
 def test_heading_is_the_yaw_of_the_attitude():
-    """The yaw that is sent for a heading is that of a body that looks there, by pymavlink."""
     for heading in (-2.0, 0.0, 0.7, 3.0):
-        q = attitude_to_px4(wxyz(Rotation.from_euler("z", heading)))
+        q = swap_px4_attitude(wxyz(Rotation.from_euler("z", heading)))
         _, _, yaw = Quaternion(q).dcm.to_euler()
-        assert math.remainder(heading_to_px4(heading) - yaw, math.tau) == pytest.approx(0, abs=1e-9)
+        assert math.remainder(-heading - yaw, math.tau) == pytest.approx(0, abs=1e-9)
 
 
 def test_optitrack_is_px4s_recipe():
-    """PX4's documentation makes (x, z, -y) of a position of OptiTrack, and the same of the vector
-    part of a quaternion; here that is the local frame of what we make of it."""
     for v in np.random.default_rng(1).normal(size=(10, 3)):
         x, y, z = v
-        np.testing.assert_allclose(to_px4(from_optitrack(v)), [x, z, -y])
+        np.testing.assert_allclose(swap_px4(from_optitrack(v)), [x, z, -y])
     for rotation in ATTITUDES:
         x, y, z, w = rotation.as_quat()
         q_WB = attitude_from_optitrack(rotation.as_quat())
-        np.testing.assert_allclose(attitude_to_px4(q_WB), [w, x, z, -y])
+        np.testing.assert_allclose(swap_px4_attitude(q_WB), [w, x, z, -y])
 
 
 def test_optitracks_attitudes_are_those_of_scipy():
-    """W is OptiTrack's world turned a quarter about x, and so are the bodies: attitudes are turned
-    from both sides."""
     W_from_O = Rotation.from_euler("x", 90, degrees=True)
     for R_OR in ATTITUDES:
         expected = wxyz(W_from_O * R_OR * W_from_O.inv())
@@ -98,8 +85,6 @@ def test_optitracks_attitudes_are_those_of_scipy():
 
 
 def test_hover_thrust_carries_the_weight():
-    """The weight is carried by the hover thrust, twice of it by twice that, and nothing leaves 0 to
-    1."""
     assert thrust_to_px4(9.81, 0.45, 9.81) == 0.45
     assert thrust_to_px4(19.62, 0.45, 9.81) == 0.9
     assert (thrust_to_px4(99.0, 0.45, 9.81), thrust_to_px4(-1.0, 0.45, 9.81)) == (1.0, 0.0)

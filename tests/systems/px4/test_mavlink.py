@@ -36,7 +36,6 @@ def sent(*messages) -> bytes:
 
 
 def test_velocity_setpoint_is_in_the_local_frame():
-    """North, east and down of a velocity, and only that, or that and a yaw, are to be flown."""
     message = received(OURS.velocity_setpoint(np.array([1.0, 2.0, 3.0, math.nan]), 2.5))
     assert (message.vx, message.vy, message.vz, message.yaw_rate) == (1.0, -2.0, -3.0, 0.0)
     assert message.coordinate_frame == dialect.MAV_FRAME_LOCAL_NED
@@ -53,7 +52,6 @@ def test_velocity_setpoint_is_in_the_local_frame():
 
 
 def test_body_rates_have_thrust_from_0_to_1():
-    """Rates are forward, right, down, attitudes ignored; the weight takes the hover thrust."""
     message = received(OURS.body_rates(np.array([9.81, 0.5, 0.25, -0.125]), 0.375, 9.81, 0.0))
     rates = message.body_roll_rate, message.body_pitch_rate, message.body_yaw_rate
     assert rates == (0.5, -0.25, 0.125)
@@ -62,7 +60,6 @@ def test_body_rates_have_thrust_from_0_to_1():
 
 
 def test_odometry_is_what_ekf2_takes():
-    """Pose in the local frame, forward right down; velocities unknown."""
     q_WB = np.array([0.5, 0.5, 0.5, -0.5])
     message = received(OURS.odometry(np.array([1.0, 2.0, 3.0, *q_WB]), 1_800_000_000_000_000))
     assert message.frame_id == dialect.MAV_FRAME_LOCAL_FRD
@@ -74,8 +71,6 @@ def test_odometry_is_what_ekf2_takes():
 
 
 def test_requests_are_those_of_px4():
-    """Offboard is main mode 6, hold is 3 of the automatic ones, and to arm is a request of its
-    own."""
     message = received(OURS.set_mode(OFFBOARD))
     assert message.command == dialect.MAV_CMD_DO_SET_MODE
     assert (message.param1, message.param2, message.param3) == (1.0, 6.0, 0.0)
@@ -88,8 +83,6 @@ def test_requests_are_those_of_px4():
 
 
 def test_what_px4_says_is_in_our_frames():
-    """Position, velocity, attitude, rates, mode and arming are read, several in a packet; what is
-    of no interest, and what others say, is left out."""
     d = dialect
     custom = (6 << 16) | (0 << 24)
     packet = sent(

@@ -13,8 +13,6 @@ from px4_stand_in import OFFBOARD, Px4StandIn
 
 
 def test_mavsdk_takes_the_stand_in_for_px4():
-    """MAVSDK's client connects, cannot start offboard mode without setpoints, and can with them;
-    what it sends is what the stand-in flies."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]

@@ -1,5 +1,3 @@
-"""The camera of a policy."""
-
 import numpy as np
 import pytest
 
@@ -8,7 +6,6 @@ from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 
 @pytest.mark.parametrize("fov_y", [None, 60.0])
 def test_rays_agree_with_drakes_intrinsics(fov_y):
-    """A ray's point, projected with the intrinsics that Drake is given, falls on its pixel."""
     camera = OnboardCamera(width=6, height=4, fov_x=70.0, fov_y=fov_y)
     pixels = camera.ray_slopes() @ camera.camera_info().intrinsic_matrix().T  # (4, 6, 3)
     columns, rows = np.meshgrid(np.arange(6) + 0.5, np.arange(4) + 0.5)
@@ -20,7 +17,6 @@ def test_rays_agree_with_drakes_intrinsics(fov_y):
 
 
 def test_mount_looks_ahead_and_up():
-    """The optical axis is the body's x axis, turned up by the pitch; image x is its right."""
     R_BC = OnboardCamera(pitch=30.0).X_BC().rotation().matrix()
     np.testing.assert_allclose(R_BC[:, 2], [np.cos(np.pi / 6), 0, 0.5], atol=1e-12)
     np.testing.assert_allclose(R_BC[:, 0], [0, -1, 0], atol=1e-12)
@@ -39,6 +35,5 @@ def test_mount_looks_ahead_and_up():
     ],
 )
 def test_bad_config_is_named(field, value):
-    """A value out of range names the field."""
     with pytest.raises(ValueError, match=rf"OnboardCamera.{field} must"):
         OnboardCamera(**{field: value}).validate()

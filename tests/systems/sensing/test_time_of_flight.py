@@ -1,6 +1,5 @@
-"""From raw frames of a time-of-flight sensor to grids."""
-
 import math
+import struct
 
 import numpy as np
 import pytest
@@ -8,8 +7,10 @@ from pydrake.common.value import Value
 from pydrake.systems.sensors import ImageDepth32F
 
 from splatpilot.systems.sensing.time_of_flight import (
+    Stream,
     TimeOfFlight,
     TimeOfFlightGrid,
+    after_packet,
     time_of_flight_grid,
 )
 
@@ -38,8 +39,6 @@ def pixel_by_pixel(depth: np.ndarray, top: int, bottom: int) -> np.ndarray:
 
 
 def test_grid_is_that_of_a_loop_over_pixels():
-    """Crop, range, nearest of each cell, encoding and flip agree with the same done one pixel at a
-    time; the drone's crop leaves the upper 140 rows."""
     generator = np.random.default_rng(5)
     depth = generator.uniform(0.3, 8.0, (240, 180))
     depth[generator.uniform(size=depth.shape) < 0.1] = np.nan
@@ -50,8 +49,6 @@ def test_grid_is_that_of_a_loop_over_pixels():
 
 
 def test_wall_ahead_is_farther_at_the_edges():
-    """Of a wall square ahead the encoded range is the distance along each ray, not along the
-    axis."""
     grid = time_of_flight_grid(frame(2.0), WHOLE)
     assert grid[4, 8] == pytest.approx(1 - 2.0 / 5.0, abs=1e-3)
     # The pixel of the lower left cell that is nearest to the axis: row 213, column 10.
@@ -61,13 +58,10 @@ def test_wall_ahead_is_farther_at_the_edges():
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 0.0, 1e-3, 5.0, 100.0])
 def test_nothing_measured_is_nothing_near(value):
-    """Pixels that were not measured, and those beyond the range, are 0."""
     assert (time_of_flight_grid(frame(value), TimeOfFlight()) == 0.0).all()
 
 
 def test_one_near_pixel_fills_its_cell():
-    """What is thinner than a cell is seen, in that cell alone; the frame's upper left is the grid's
-    lower left."""
     depth = frame()
     depth[3, 5] = 1.0
     grid = time_of_flight_grid(depth, WHOLE)
@@ -76,8 +70,6 @@ def test_one_near_pixel_fills_its_cell():
 
 
 def test_frames_on_their_side_are_stood_upright():
-    """A frame that is wider than high is turned counterclockwise: its upper right corner becomes
-    the upper left one."""
     depth = np.full((180, 240), 10.0)
     depth[5, 236] = 1.0
     grid = time_of_flight_grid(depth, WHOLE)
@@ -95,8 +87,6 @@ def test_frames_on_their_side_are_stood_upright():
     ],
 )
 def test_crop_keeps_86_degrees(anchor, shift, rows):
-    """Of 106 degrees in 240 rows, 86 are 2 * 120 tan(43) / tan(53) = 168.7 rows, placed by anchor
-    and shift and cut at the frame's edge."""
     sensor = TimeOfFlight(anchor=anchor, shift=shift)
     height, width = sensor.crop(240, 180, 86.0, 106.0)
     assert (height.start, height.stop) == rows
@@ -104,7 +94,6 @@ def test_crop_keeps_86_degrees(anchor, shift, rows):
 
 
 def test_system_gives_the_same_grid():
-    """The system's output is the function's grid, row by row."""
     system = TimeOfFlightGrid()
     context = system.CreateDefaultContext()
     image = ImageDepth32F(180, 240)
@@ -127,12 +116,104 @@ def test_system_gives_the_same_grid():
     ],
 )
 def test_bad_config_is_named(field, value):
-    """A value out of range names the field."""
     with pytest.raises(ValueError, match=rf"TimeOfFlight.{field} must"):
         TimeOfFlightGrid(TimeOfFlight(**{field: value}))
 
 
 def test_frames_of_another_size_are_refused():
-    """A frame of another size says which it must have."""
-    with pytest.raises(ValueError, match="100x80 pixels; it must have 180x240"):
+    with pytest.raises(ValueError, match=r"frame must be 180x240 pixels.* got 100x80"):
         time_of_flight_grid(np.ones((80, 100)), TimeOfFlight())
+
+
+SENSOR = TimeOfFlight()
+
+
+def grid_packet(values: np.ndarray, seq: int, time_ns: int) -> bytes:
+    return struct.pack("<IIQ144f", 0x544F4632, seq, time_ns, *values.ravel())
+
+
+def frame_packets(depth: np.ndarray, number: int, time_ns: int, largest: int) -> list[bytes]:
+    data, (height, width) = depth.astype("<f4").tobytes(), depth.shape
+    count = -(-len(data) // largest)
+    return [
+        struct.pack("<IIIHHQHH", 0x544F4633, number, number, i, count, time_ns, width, height)
+        + data[i * largest : (i + 1) * largest]
+        for i in range(count)
+    ]
+
+
+def after(*packets: bytes) -> Stream:
+    stream = Stream()
+    for packet in packets:
+        stream = after_packet(stream, packet, SENSOR)
+    return stream
+
+
+def test_grids_come_as_they_were_sent():
+    values = np.random.default_rng(0).uniform(size=(9, 16)).astype(np.float32)
+    first, later = grid_packet(values, 7, 100), grid_packet(values[::-1], 10, 200)
+    assert len(first) == 592
+    np.testing.assert_array_equal(after(first).grid, values)
+    stream = after(first, later)
+    np.testing.assert_array_equal(stream.grid, values[::-1])
+    assert (stream.gaps, stream.time_ns) == (2, 200)
+
+
+@pytest.mark.parametrize("largest", [60000, 64000, 1000, 172800])
+def test_raw_frames_become_the_grids_of_their_depth(largest):
+    depth = np.random.default_rng(1).uniform(0.2, 7.0, (240, 180)).astype(np.float32)
+    packets = frame_packets(depth, 4, 100, largest)
+    np.random.default_rng(2).shuffle(packets)
+    assert len(packets) == 1 or after(*packets[:-1]).grid is None
+    grid = after(*packets).grid
+    assert grid is not None
+    np.testing.assert_array_equal(grid, time_of_flight_grid(depth.astype(float), SENSOR))
+
+
+def test_a_frame_that_lost_a_chunk_gives_way_to_the_next():
+    near, far = np.full((240, 180), 1.0), np.full((240, 180), 4.0)
+    lost = frame_packets(near, 4, 100, 60000)[:2]
+    whole = frame_packets(far, 5, 200, 60000)
+    stream = after(*lost, whole[0], *whole)
+    assert stream.grid is not None
+    np.testing.assert_array_equal(stream.grid, time_of_flight_grid(far, SENSOR))
+
+
+GOOD = grid_packet(np.full((9, 16), 0.5), 1, 100)
+CHUNK = frame_packets(np.ones((240, 180)), 1, 200, 172800)[0]
+
+
+@pytest.mark.parametrize(
+    ("packet", "why"),
+    [
+        (b"", "got 0"),
+        (b"TOF", "got 3"),
+        (b"LC02" + GOOD[4:], "got 0x3230434c"),
+        (GOOD[:-1], "592 bytes, got 591"),
+        (GOOD + b"1", "got 593"),
+        (GOOD, "after 100 ns, got 100"),
+        (grid_packet(np.full((9, 16), np.nan), 2, 200), "proximities must be in"),
+        (grid_packet(np.full((9, 16), 1.1), 2, 200), "proximities must be in"),
+        (CHUNK[:28], "over 28 bytes, got 28"),
+        (CHUNK[:12] + b"\x05\x00" + CHUNK[14:], "chunk must be below 1, got 5"),
+        (CHUNK[:-4], "172800 bytes, got 172796"),
+        (CHUNK + b"1234", "at most 172800 bytes, got 172804"),
+        (frame_packets(np.ones((80, 100)), 1, 200, 60000)[0], "180x240 pixels, got 100x80"),
+        (frame_packets(np.ones((240, 180)), 1, 100, 172800)[0], "after 100 ns, got 100"),
+    ],
+)
+def test_what_is_no_packet_is_refused(packet, why):
+    with pytest.raises(ValueError, match=why):
+        after_packet(after(GOOD), packet, SENSOR)
+
+
+def test_no_bytes_do_worse_than_be_refused():
+    random = np.random.default_rng(3)
+    stream = Stream()
+    for header in (GOOD[:4], GOOD[:16], CHUNK[:4], CHUNK[:24], CHUNK[:32]):
+        for length in random.integers(0, 700, 100):
+            try:
+                stream = after_packet(stream, header + random.bytes(length), SENSOR)
+            except ValueError:
+                continue
+            assert sum(map(len, stream.chunks.values())) <= 4 * 240 * 180

@@ -24,7 +24,7 @@ def median_depth(
     On a Gaussian with the covariance S about c, in the camera frame, the depth is where the ray d
     (of unit depth) meets the plane n . p = n . c with n = S^-1 c, turned until no part within
     `REACH` standard deviations is nearer or farther by more than 0.9 of the inverse depth. Where
-    that is farther than the centre, a distance on the image counts as much longer. Also returns
+    that is farther than the center, a distance on the image counts as much longer. Also returns
     how near (H, W) an alpha or what is left came to a threshold.
     """
     arguments = (a.double() for a in (means, quats, scales, opacities, viewmat, K))

@@ -147,9 +147,9 @@ def composite(projection: Projection, colors: Tensor, width: int, height: int) -
         row = []
         for left in range(0, width, TILE):
             w, h = min(TILE, width - left), min(TILE, height - top)
-            centre = torch.tensor([left + w / 2, top + h / 2])
+            center = torch.tensor([left + w / 2, top + h / 2])
             half = torch.tensor([w / 2, h / 2])
-            gap = ((projection.mean - centre).abs() - half).amax(1)
+            gap = ((projection.mean - center).abs() - half).amax(1)
             near = torch.nonzero(gap < reach)[:, 0]
             v, u = torch.meshgrid(
                 torch.arange(top, top + h) + 0.5, torch.arange(left, left + w) + 0.5, indexing="ij"
@@ -203,8 +203,8 @@ def render(
     if sh_degree is None:
         seen = colors[p.ids]
     else:
-        centre = -torch.linalg.inv(viewmat[:3, :3]) @ viewmat[:3, 3]
-        direction = means[p.ids] - centre
+        center = -torch.linalg.inv(viewmat[:3, :3]) @ viewmat[:3, 3]
+        direction = means[p.ids] - center
         basis = sh_basis(sh_degree, direction / direction.norm(dim=1, keepdim=True))
         coefficients = colors[p.ids, : (sh_degree + 1) ** 2]
         seen = torch.clamp(0.5 + torch.einsum("nk,nkc->nc", basis, coefficients), min=0)

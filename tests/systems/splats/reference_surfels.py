@@ -64,7 +64,7 @@ def render(
     facing = (normal_C * p_C).sum(1)
     normal_W = axes_W[:, :, 2] * -torch.sign(facing)[:, None]
     edge_on = facing.abs() <= EDGE_ON * p_C.norm(dim=1)
-    centre = (p_C @ K.T)[:, :2] / p_C[:, 2:]
+    center = (p_C @ K.T)[:, :2] / p_C[:, 2:]
 
     if sh_degree is None:
         seen = colors[index]
@@ -84,7 +84,7 @@ def render(
     uv = point[..., :2] / torch.where(parallel, 1.0, point[..., 2])[..., None]
     z = (uv * H[:, 2, :2]).sum(-1) + H[:, 2, 2]
     on_plane = (uv * uv).sum(-1)
-    of_blob = ((x - centre[:, 0]) ** 2 + (y - centre[:, 1]) ** 2) / BLOB_SIGMA**2
+    of_blob = ((x - center[:, 0]) ** 2 + (y - center[:, 1]) ** 2) / BLOB_SIGMA**2
     hit = ~parallel & ~edge_on & (z >= near) & (on_plane <= of_blob)
     r2 = torch.where(hit, on_plane, of_blob)
     depth = torch.where(hit, z, p_C[:, 2])

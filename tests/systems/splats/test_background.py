@@ -18,17 +18,13 @@ def gradient(height: int = 64, width: int = 128) -> EnvironmentMap:
     return EnvironmentMap((0.5 + 0.4 * v_W).astype(np.float32))
 
 
-def test_each_direction_has_its_colour():
-    """Colours are where azimuth and height put them, continuous where azimuth goes round, for
-    directions of any length; up to half a texel at the poles."""
+def test_each_direction_has_its_color():
     expected = 0.5 + 0.4 * AXES[:, [2, 0, 1]]
     np.testing.assert_allclose(gradient().color(AXES), expected, atol=0.011)
     np.testing.assert_array_equal(gradient().color(3 * AXES), gradient().color(AXES))
 
 
 def test_a_camera_sees_what_lies_behind():
-    """Behind each pixel is the colour of its own ray, in proportion to the light that is let
-    through; an opaque pixel is as it was."""
     X_WC = RigidTransform(RotationMatrix.MakeYRotation(0.7) @ RotationMatrix.MakeXRotation(-0.4))
     alpha = np.random.default_rng(0).uniform(size=(24, 32)).astype(np.float32)
     alpha[:4] = 1
@@ -48,8 +44,6 @@ def test_a_camera_sees_what_lies_behind():
 
 
 def test_the_mean_counts_directions_alike():
-    """The mean colour of a map is that over the sphere, where rows near the poles are small; that
-    of a plain background is itself."""
     assert mean_color(gradient()) == pytest.approx((0.5, 0.5, 0.5), abs=1e-3)
     cap = np.zeros((64, 128, 3), np.float32)
     cap[:16] = 1  # within 45 deg of the zenith
@@ -59,12 +53,11 @@ def test_the_mean_counts_directions_alike():
 
 
 def test_files(tmp_path):
-    """A map is read as it was written, to 8 bits; a file that is none is refused."""
     gradient().save(tmp_path / "map.png")
     back = EnvironmentMap.load(tmp_path / "map.png")
     np.testing.assert_allclose(back.texels, gradient().texels, atol=0.5 / 255 + 1e-6)
     (tmp_path / "bad.png").write_text("no image")
     with pytest.raises(ValueError, match=r"bad\.png: cannot be read as an image"):
         EnvironmentMap.load(tmp_path / "bad.png")
-    with pytest.raises(FileNotFoundError, match=r"none\.png: there is no such file"):
+    with pytest.raises(FileNotFoundError, match=r"No such file: .*none\.png"):
         EnvironmentMap.load(tmp_path / "none.png")

@@ -4,17 +4,27 @@ import subprocess
 import sys
 import threading
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 from baked_scenes import HEIGHT, LEVELS, WIDTH, X_WC, K, random_scene
-from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+from pydrake.systems.sensors import CameraInfo
+from random_scenes import random_scene as random_gaussians
+from reference_median_depth import median_depth
+from reference_rasterizer import single_gaussian
 
-from splatpilot.systems.splats import rasterize
-from splatpilot.systems.splats.baked_scene import BakedScene, create_renderer
+from splatpilot.systems.splats import rasterize, rasterize_surfels
+from splatpilot.systems.splats.baked_scene import (
+    BakedScene,
+    MovingGaussians,
+    PlacedGaussians,
+    create_renderer,
+)
+from splatpilot.systems.splats.lens import Distortion
 from splatpilot.systems.splats.scene import GaussianScene
+from splatpilot.systems.splats.splat_camera import SplatCamera
 
 
 def rasterized(scene, background=(0.0, 0.0, 0.0), X=X_WC, **options):
@@ -39,7 +49,6 @@ def rasterized(scene, background=(0.0, 0.0, 0.0), X=X_WC, **options):
 @pytest.mark.parametrize("simd", LEVELS)
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_agrees_with_rasterize(simd, degree):
-    """Baking changes the order of work, not the picture: colour, median depth and alpha agree."""
     scene = random_scene(sh_degree=degree, count=1003)
     background = (0.2, 0.5, 0.9)
     view = BakedScene(scene, simd=simd).render(K, WIDTH, HEIGHT, X_WC, background=background)
@@ -55,9 +64,8 @@ def test_agrees_with_rasterize(simd, degree):
         assert np.median(error) < 2e-6 and np.quantile(error, 0.999) < 2e-2
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(4))
 def test_culling_by_boxes_loses_nothing(seed):
-    """From cameras inside, at the edge of and outside the scene, no visible Gaussian is dropped."""
     rng = np.random.default_rng(seed)
     scene = random_scene(count=4000, seed=seed, sh_degree=0)
     X = RigidTransform(RollPitchYaw(*rng.uniform(-3, 3, 3)), rng.uniform(-2.5, 2.5, 3))
@@ -69,8 +77,7 @@ def test_culling_by_boxes_loses_nothing(seed):
 
 
 @pytest.mark.parametrize("degree", [0, 3])
-def test_other_colours_are_as_if_baked_anew(degree):
-    """Bit for bit, whatever the degree that the scene was baked with; its own colours stay."""
+def test_other_colors_equal_a_new_scene(degree):
     scene = random_scene(count=3000, sh_degree=1)
     other = replace(scene, sh=random_scene(count=3000, seed=1, sh_degree=degree).sh)
     baked = BakedScene(scene)
@@ -85,20 +92,19 @@ def test_other_colours_are_as_if_baked_anew(degree):
 @pytest.mark.parametrize(
     ("shape", "message"),
     [
-        ((300, 3), r"\(300, 3\); it must be \(300, K, 3\)"),
-        ((299, 1, 3), r"\(299, 1, 3\); it must be \(300, K, 3\)"),
+        ((300, 3), r"sh must be of shape \(300, K, 3\), got \(300, 3\)"),
+        ((299, 1, 3), r"sh must be of shape \(300, K, 3\), got \(299, 1, 3\)"),
         ((300, 2, 3), "1, 4, 9 or 16"),
     ],
 )
-def test_colours_of_other_gaussians_are_refused(shape, message):
+def test_colors_of_other_gaussians_are_refused(shape, message):
     baked = BakedScene(random_scene(count=300))
     with pytest.raises(ValueError, match=message):
         baked.recolored(np.zeros(shape, np.float32))
 
 
 @pytest.mark.parametrize("simd", LEVELS)
-def test_threads_and_repeats_give_equal_bits(simd):
-    """The same view has the same bits for any thread count, in any frame, from any thread."""
+def test_threads_and_repeats_give_identical_views(simd):
     scene = random_scene(count=5000)
     first = BakedScene(scene, simd=simd).render(K, WIDTH, HEIGHT, X_WC)
     shared = BakedScene(scene, threads=3, simd=simd)
@@ -120,18 +126,8 @@ def test_threads_and_repeats_give_equal_bits(simd):
             np.testing.assert_array_equal(got, want)
 
 
-def test_views_do_not_share_memory():
-    """A view stays as it was when the next one is rendered."""
-    baked = BakedScene(random_scene())
-    view = baked.render(K, WIDTH, HEIGHT, X_WC)
-    copy = view.color.copy()
-    baked.render(K, WIDTH, HEIGHT, RigidTransform(np.array([0, 0, -9.0])))
-    np.testing.assert_array_equal(view.color, copy)
-
-
-@pytest.mark.parametrize("count", [0, 1, 15, 16, 17, 64, 65])
+@pytest.mark.parametrize("count", [0, 15, 17, 65])
 def test_counts_that_do_not_fill_groups(count):
-    """Scenes that end inside a pack or a box render as `rasterize` does."""
     scene = random_scene(count=count, sh_degree=1)
     view = BakedScene(scene).render(K, WIDTH, HEIGHT, X_WC)
     image, alpha = rasterized(scene)
@@ -140,7 +136,6 @@ def test_counts_that_do_not_fill_groups(count):
 
 
 def test_flat_and_needle_gaussians_keep_their_shape():
-    """Covariances of rank one and two, to working precision, survive the baked factorisation."""
     rng = np.random.default_rng(1)
     scene = random_scene(count=200, sh_degree=0)
     scales = scene.scales.copy()
@@ -152,8 +147,7 @@ def test_flat_and_needle_gaussians_keep_their_shape():
     assert np.quantile(np.abs(view.color - image[..., :3]), 0.99) < 1e-4
 
 
-def test_near_and_far_cut_by_depth_of_centre():
-    """The Gaussians whose centre is between near and far are drawn, as if there were no others."""
+def test_near_and_far_cut_by_depth_of_center():
     scene = random_scene()
     baked = BakedScene(scene)
     view = baked.render(K, WIDTH, HEIGHT, X_WC, near=2.5, far=3.0)
@@ -170,18 +164,18 @@ def test_near_and_far_cut_by_depth_of_centre():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"K": np.eye(4)}, r"K has shape \(4, 4\)"),
-        ({"K": np.diag([0.0, 1.0, 1.0])}, r"K\[0, 0\] = 0, K\[1, 1\] = 1 must be positive"),
-        ({"K": np.diag([1.0, np.nan, 1.0])}, "K has a NaN"),
-        ({"width": 0}, "image size is 0 x 61"),
-        ({"height": -1}, "image size is 83 x -1"),
+        ({"K": np.eye(4)}, r"K must be of shape \(3, 3\), got \(4, 4\)"),
+        ({"K": np.diag([0.0, 1.0, 1.0])}, r"focal lengths of K must be > 0 px, got 0, 1"),
+        ({"K": np.diag([1.0, np.nan, 1.0])}, "K must be finite"),
+        ({"width": 0}, "image size must be .* got 0 x 61"),
+        ({"height": -1}, "image size must be .* got 83 x -1"),
         ({"near": 0.0}, "0 < near < far"),
-        ({"near": 5.0, "far": 4.0}, "depth range is 5 to 4 m"),
-        ({"background": (1.0, 2.0)}, r"background is \[1.0, 2.0\]"),
+        ({"near": 5.0, "far": 4.0}, "depth range must be .* got 5 to 4 m"),
+        ({"max_depth": -1.0}, "max_depth must be > 0 m, got -1"),
+        ({"background": (1.0, 2.0)}, r"background must be 3 finite numbers, got \[1.0, 2.0\]"),
     ],
 )
 def test_bad_cameras_are_named(change, message):
-    """A camera that makes no sense raises ValueError with the value and the limit."""
     baked = BakedScene(random_scene(count=5))
     arguments = {"K": K, "width": WIDTH, "height": HEIGHT, "X_WC": X_WC} | change
     with pytest.raises(ValueError, match=message):
@@ -191,22 +185,7 @@ def test_bad_cameras_are_named(change, message):
             baked.render_depth(**arguments)
 
 
-def test_a_greatest_depth_that_is_none_is_named():
-    """Depth is rendered up to a positive number of metres."""
-    baked = BakedScene(random_scene(count=5))
-    for render in (baked.render, baked.render_depth):
-        with pytest.raises(ValueError, match="max_depth is -1 m; it must be positive"):
-            render(K, WIDTH, HEIGHT, X_WC, max_depth=-1.0)
-
-
-def test_bad_thread_counts_are_named():
-    """Thread counts below one are refused."""
-    with pytest.raises(ValueError, match="threads is 0"):
-        BakedScene(random_scene(count=5), threads=0)
-
-
 def test_environment_selects_the_simd_level():
-    """SPLATPILOT_SIMD forces a level and is refused when the machine lacks it; torch stays out."""
     code = (
         "import sys; from splatpilot.systems.splats.baked_scene import create_renderer;"
         "print(create_renderer(1).simd, 'torch' in sys.modules)"
@@ -230,11 +209,288 @@ def test_environment_selects_the_simd_level():
     assert done.returncode != 0 and "'v9' is not available" in done.stderr
 
 
-def test_only_attributes_of_the_scene_are_needed():
-    """Any object with the arrays of a GaussianScene can be baked."""
-    scene = random_scene(count=50)
-    bare = SimpleNamespace(**{n: getattr(scene, n) for n in scene.__dataclass_fields__})
-    np.testing.assert_array_equal(
-        BakedScene(bare).render(K, 20, 20, X_WC).color,  # pyright: ignore[reportArgumentType]
-        BakedScene(scene).render(K, 20, 20, X_WC).color,
+@pytest.mark.parametrize("simd", LEVELS)
+@pytest.mark.parametrize("lens", [None, Distortion(model="fisheye", radial=[0.05, 0.0, 0.0, 0.0])])
+@pytest.mark.parametrize("size", [0.02, 0.3, 1.0, 6.0])
+def test_depth_alone_is_identical(simd, lens, size):
+    bodies = random_scene(count=200, seed=1, sh_degree=0)
+    moving = PlacedGaussians(
+        *(getattr(bodies, name) for name in ("means", "quats", "scales", "opacities", "sh"))
     )
+    scene = random_scene(count=3000)
+    scene = BakedScene(replace(scene, scales=np.float32(size) * scene.scales), simd=simd)
+    camera = {"K": K, "width": WIDTH, "height": HEIGHT, "moving": moving, "distortion": lens}
+    for X in (X_WC, RigidTransform([0.1, 0.2, -0.5])):
+        assert (scene.render(X_WC=X, **camera).depth > 0).mean() > 0.1
+        for max_depth in (0.2, 2.0, np.inf):
+            whole = scene.render(X_WC=X, max_depth=max_depth, **camera).depth
+            alone = scene.render_depth(X_WC=X, max_depth=max_depth, **camera)
+            np.testing.assert_array_equal(alone, whole)
+
+
+@pytest.mark.parametrize("simd", LEVELS)
+def test_needles_seen_edge_on_have_the_same_depth_alone(simd):
+    rng = np.random.default_rng(4)
+    scene = random_scene(count=2000, sh_degree=0)
+    towards = scene.means - np.array([0.0, 0.0, -3.0])
+    normals = np.cross(towards, rng.normal(size=towards.shape))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals += 1e-3 * rng.normal(size=normals.shape)
+    x, y, z = normals.T / np.linalg.norm(normals, axis=1)
+    quats = np.stack([1.0 + z, -y, x, np.zeros_like(z)], axis=1)  # turns the z axis to the normal
+    scales = np.tile([0.5, 0.5, 1e-5], (len(quats), 1))
+    sheets = replace(scene, quats=quats.astype(np.float32), scales=scales.astype(np.float32))
+    baked = BakedScene(replace(sheets, opacities=np.ones_like(scene.opacities)), simd=simd)
+    X = RigidTransform([0.0, 0.0, -3.0])
+    whole = baked.render(K, WIDTH, HEIGHT, X).depth
+    assert (whole > 0).mean() > 0.1
+    np.testing.assert_array_equal(baked.render_depth(K, WIDTH, HEIGHT, X), whole)
+
+
+@pytest.mark.parametrize("simd", LEVELS)
+def test_a_disc_seen_exactly_edge_on_has_depth_alone(simd):
+    disc = GaussianScene(
+        means=np.array([[0.0, 0.0, 2.0]], np.float32),
+        quats=np.array([[1.0, 0.0, 0.0, 0.0]], np.float32),
+        scales=np.array([[1e-30, 0.3, 0.3]], np.float32),
+        opacities=np.ones(1, np.float32),
+        sh=np.zeros((1, 1, 3), np.float32),
+    )
+    through_centers = np.array([[70.0, 0, 41.5], [0, 75.0, 30.5], [0, 0, 1]])
+    camera = (through_centers, WIDTH, HEIGHT, RigidTransform())
+    depth = BakedScene(disc, simd=simd).render_depth(*camera)
+    assert depth[30, 41] == pytest.approx(2.0)
+    np.testing.assert_array_equal(np.unique(np.nonzero(depth)[1]), [41])
+
+
+@pytest.mark.parametrize("simd", LEVELS)
+def test_what_is_too_far_hides_nothing(simd):
+    half = 0.5**0.5
+    scene = GaussianScene(
+        means=np.array([[0.0, 0.0, 6.0], [0.0, 2.0, 6.5]], np.float32),
+        quats=np.array([[1.0, 0.0, 0.0, 0.0], [half, half, 0.0, 0.0]], np.float32),
+        scales=np.array([[4.0, 4.0, 0.001], [1.75, 1.75, 0.001]], np.float32),
+        opacities=np.ones(2, np.float32),
+        sh=np.zeros((2, 1, 3), np.float32),
+    )
+    baked = BakedScene(scene, simd=simd)
+    floor = 2.0 / ((57.5 - 30.0) / 75.0)  # 2 m below, at the slope of row 57
+    for max_depth, expected in ((5.6, floor), (7.0, 6.0)):
+        depth = baked.render_depth(K, WIDTH, HEIGHT, RigidTransform(), max_depth=max_depth)
+        assert depth[57, 41] == pytest.approx(expected, abs=0.001)
+
+
+SIZE = {"width": 67, "height": 45}
+K_WALL = np.array([[40.0, 0, 32.0], [0, 40.0, 18.0], [0, 0, 1]])
+
+
+def wall(X_CP, half_width, half_height, step=0.05):
+    """Flat opaque Gaussians (N) on the plane z = 0 of P, in a frame C."""
+    x, y = np.meshgrid(
+        np.arange(-half_width + step / 2, half_width, step),
+        np.arange(-half_height + step / 2, half_height, step),
+    )
+    p_P = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)])
+    N = x.size
+    return {
+        "means": X_CP.multiply(p_P).T,
+        "quats": np.tile(X_CP.rotation().ToQuaternion().wxyz(), (N, 1)),
+        "scales": np.tile([0.7 * step, 0.7 * step, 1e-4], (N, 1)),
+        "opacities": np.full(N, 0.99),
+    }
+
+
+def wall_scene(*walls):
+    joined = {name: np.concatenate([w[name] for w in walls]) for name in walls[0]}
+    return GaussianScene.from_colors(**joined, colors=np.full((len(joined["means"]), 3), 0.5))
+
+
+def plane_depth(X_CP, width, height):
+    """(H, W) [m] where the pixels' rays meet the plane z = 0 of P."""
+    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    rays = np.stack(
+        [(u - K_WALL[0, 2]) / K_WALL[0, 0], (v - K_WALL[1, 2]) / K_WALL[1, 1], np.ones_like(u)], -1
+    )
+    n = X_CP.rotation().matrix()[:, 2]
+    return n @ X_CP.translation() / (rays @ n)
+
+
+@pytest.mark.parametrize("simd", LEVELS)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_agrees_with_reference(simd, seed):
+    scene = random_gaussians(seed=seed, count=900)
+    names = ("means", "quats", "scales", "opacities")
+    geometry = {name: scene[name] for name in names}
+    camera = {"viewmat": scene["viewmats"][0], "K": scene["Ks"][0]}
+    expected, margin = median_depth(**geometry, **camera, **SIZE)
+    clear = margin > 1e-3
+    assert clear.float().mean() > 0.5 and (expected[clear] > 0).float().mean() > 0.5
+    renderer = create_renderer(2, simd)
+    plain, alpha, _ = rasterize(**scene, **SIZE, renderer=renderer)
+    for mode in ("MD", "RGB+MD"):
+        image, also_alpha, _ = rasterize(**scene, **SIZE, render_mode=mode, renderer=renderer)
+        error = (image[0, ..., -1].double() - expected).abs() / expected.clamp(min=1)
+        assert error[clear].median() < 1e-6 and error[clear].max() < 2e-3
+        assert (error > 2e-3).float().mean() < 0.01
+        assert torch.equal(alpha, also_alpha)
+    assert torch.equal(image[..., :3], plain)
+
+
+@pytest.mark.parametrize("simd", LEVELS)
+def test_a_slanted_plane_has_the_depth_of_the_plane(simd):
+    X_CP = RigidTransform(RollPitchYaw(0.9, -0.5, 0.2), [0.1, 0.2, 4.0])
+    scene = wall_scene(wall(X_CP, 8.0, 8.0, step=0.1))
+    view = BakedScene(scene, simd=simd).render(K_WALL, **SIZE, X_WC=RigidTransform())
+    truth = plane_depth(X_CP, **SIZE)
+    inside = (truth > 1.0) & (truth < 6.0)
+    assert inside.mean() > 0.5
+    np.testing.assert_allclose(view.depth[inside], truth[inside], rtol=2e-4)
+
+
+@pytest.mark.parametrize("simd", LEVELS)
+def test_large_gaussians_close_to_the_camera_are_no_haze(simd):
+    X_CP = RigidTransform(RotationMatrix.MakeXRotation(np.pi / 2), [0.0, 0.5, 0.0])
+    truth = plane_depth(X_CP, **SIZE)
+    above = np.arange(SIZE["height"]) + 0.5 < K_WALL[1, 2]
+    near = ~above[:, None] & (truth < 8.0)
+    assert near.mean() > 0.4
+    for deviation, limit in ((0.3, 0.05), (0.15, 1e-5)):
+        floor = wall_scene(wall(X_CP, 12.0, 12.0, step=deviation / 0.7))
+        depth = BakedScene(floor, simd=simd).render(K_WALL, **SIZE, X_WC=RigidTransform()).depth
+        assert (depth[above] == 0).all()
+        assert np.median(np.abs(depth / truth - 1)[near]) < limit
+
+
+def test_a_pixel_beside_an_edge_shows_what_is_behind():
+    near, far = RigidTransform([-2.0, 0, 1.0]), RigidTransform([0, 0, 6.0])
+    scene = wall_scene(wall(near, 2.0, 2.0), wall(far, 8.0, 8.0, step=0.1))  # near ends at x = 0
+    depth = BakedScene(scene).render(K_WALL, **SIZE, X_WC=RigidTransform()).depth
+    error = np.minimum(np.abs(depth - 1.0), np.abs(depth - 6.0))
+    assert error.max() < 1e-3
+    x = (np.arange(SIZE["width"]) + 0.5 - K_WALL[0, 2]) / K_WALL[0, 0]  # [m] on the near wall
+    assert (depth[:, x < 0.0] < 2.0).all() and (depth[:, x > 0.07] > 5.0).all()
+    tensors = {n: torch.from_numpy(getattr(scene, n)) for n in ("means", "quats", "scales")}
+    expected = rasterize(
+        **tensors,
+        opacities=torch.from_numpy(scene.opacities),
+        colors=torch.from_numpy(scene.base_colors),
+        viewmats=torch.eye(4)[None],
+        Ks=torch.from_numpy(K_WALL).float()[None],
+        **SIZE,
+        render_mode="ED",
+    )[0][0, ..., 0]
+    assert ((expected > 1.2) & (expected < 5.5)).any()
+
+
+def test_half_of_the_light_decides():
+    one = single_gaussian(opacity=0.4)
+    size = {"width": 33, "height": 33}
+    assert (rasterize(**one, **size, render_mode="MD")[0] == 0).all()
+    two = one | {
+        name: torch.cat([one[name], one[name]])
+        for name in ("means", "quats", "scales", "opacities", "colors")
+    }
+    two["means"][1, 2] = 3.0
+    depth = rasterize(**two, **size, render_mode="MD")[0][0, ..., 0]
+    assert abs(depth[16, 16].item() - 3.0) < 1e-5 and depth[0, 0] == 0
+
+
+def test_it_is_constant_in_gradients():
+    scene = random_gaussians(count=200)
+    gradients = []
+    for mode in ("RGB", "RGB+MD"):
+        means = scene["means"].clone().requires_grad_()
+        image, _, _ = rasterize(**scene | {"means": means}, **SIZE, render_mode=mode)
+        (image[..., :3].square().sum() + image[..., 3:].sum()).backward()
+        gradients.append(means.grad)
+    assert torch.equal(*gradients)
+
+
+def test_antialiased_images_and_surfels_have_no_median_depth():
+    scene = random_gaussians(count=10)
+    with pytest.raises(
+        ValueError, match=r"rasterize_mode of render_mode 'RGB\+MD' must be 'classic'"
+    ):
+        rasterize(**scene, **SIZE, render_mode="RGB+MD", rasterize_mode="antialiased")
+    with pytest.raises(ValueError, match=r"render_mode must be one of RGB, D, ED, .* got 'MD'"):
+        rasterize_surfels(**scene, **SIZE, render_mode="MD")
+
+
+def disc(color: tuple[float, float, float]) -> GaussianScene:
+    """A flat, opaque patch that faces along z, about the origin."""
+    size = np.array([[0.5, 0.5, 0.001]])
+    return GaussianScene.from_colors(
+        np.zeros((1, 3)), [[1.0, 0, 0, 0]], size, [0.99], np.array([color])
+    )
+
+
+def along(*places: float):
+    """From a time to a center at that place on the z axis."""
+    return lambda time: np.array([[0.0, 0.0, places[int(time)]]])
+
+
+@pytest.mark.parametrize("count", [40, 2048, 5000])
+def test_a_body_is_drawn_like_what_stands(count):
+    scene, body = random_scene(count, seed=1, sh_degree=1), random_scene(300, seed=2, sh_degree=0)
+    center = np.array([0.3, 0.2, 0.5])
+    moving = MovingGaussians([body], lambda time: time * center[None])
+    whole = scene.merged_with(body, RigidTransform(center))
+    expected = BakedScene(whole).render(K, WIDTH, HEIGHT, X_WC, background=(0.1, 0.2, 0.3))
+    view = BakedScene(scene).render(
+        K, WIDTH, HEIGHT, X_WC, background=(0.1, 0.2, 0.3), moving=moving.at(1.0)
+    )
+    for name in ("color", "alpha"):
+        difference = np.abs(getattr(view, name) - getattr(expected, name))
+        assert difference.max() < 2e-3, name
+    far_off = np.abs(view.depth - expected.depth) > 1e-3
+    assert far_off.mean() < 2e-3
+
+
+@pytest.mark.parametrize("simd", LEVELS)
+def test_moving_views_are_identical_for_any_number_of_threads(simd):
+    scene, body = random_scene(5000, seed=1), random_scene(3000, seed=2, sh_degree=0)
+    moving = MovingGaussians([body], lambda time: np.array([[0.0, 0.0, 0.5]]))
+    nowhere = MovingGaussians([body], lambda time: np.full((1, 3), np.inf))
+    baked = [BakedScene(scene, threads, simd) for threads in (1, 3)]
+    one, three = (b.render(K, WIDTH, HEIGHT, X_WC, moving=moving.at(0.0)) for b in baked)
+    alone = baked[0].render(K, WIDTH, HEIGHT, X_WC)
+    without = baked[0].render(K, WIDTH, HEIGHT, X_WC, moving=nowhere.at(0.0))
+    for first, second in ((one, three), (alone, without)):
+        for a, b in zip(first, second, strict=True):
+            np.testing.assert_array_equal(a, b)
+    assert not np.array_equal(one.color, alone.color)
+
+
+def test_a_body_hides_and_is_hidden():
+    camera = SplatCamera(
+        disc((0.0, 1.0, 0.0)),
+        CameraInfo(64, 48, 40.0, 40.0, 32.0, 24.0),
+        moving=MovingGaussians([disc((1.0, 0.0, 0.0))], along(-1.0, 1.0)),
+    )
+    context = camera.CreateDefaultContext()
+    X_WB = RigidTransform(RotationMatrix(), np.array([0.0, 0.0, -3.0]))
+    camera.GetInputPort("body_pose").FixValue(context, X_WB)
+    for time, seen, depth in ((0.0, 0, 2.0), (1.0, 1, 3.0), (0.5, 0, 2.0)):
+        context.SetTime(time)
+        color = camera.color_image_output_port().Eval(context).data[24, 32, :3]
+        assert color.argmax() == seen and color.max() > 240
+        assert camera.depth_image_32f_output_port().Eval(context).data[24, 32, 0] == (
+            pytest.approx(depth, abs=0.01)
+        )
+
+
+def test_late_images_show_bodies_where_they_were():
+    info = CameraInfo(64, 48, 40.0, 40.0, 32.0, 24.0)
+    moving = MovingGaussians([disc((1.0, 0.0, 0.0))], along(1.0, 2.0, 3.0))
+    camera = SplatCamera(disc((0.0, 1.0, 0.0)), info, moving=moving, latency=1.0)
+    prompt = SplatCamera(disc((0.0, 1.0, 0.0)), info, moving=moving)
+    X_WB = RigidTransform(np.array([1.2, 0.0, -3.0]))
+    for time, then in ((0.5, 0.0), (1.5, 0.5), (2.5, 1.5)):
+        np.testing.assert_array_equal(
+            camera.render(X_WB, time).color, prompt.render(X_WB, then).color
+        )
+    assert not np.array_equal(prompt.render(X_WB, 0.0).color, prompt.render(X_WB, 1.0).color)
+
+
+def test_no_bodies_are_no_gaussians():
+    assert len(MovingGaussians([], lambda time: np.zeros((0, 3))).at(0.0).means) == 0

@@ -14,9 +14,12 @@ from pydrake.geometry import (
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.sensors import CameraInfo, RgbdSensor
 
-from splatpilot.systems.splats.baked_scene import BakedScene
+from splatpilot.systems.splats.background import EnvironmentMap
+from splatpilot.systems.splats.baked_scene import BakedScene, MovingGaussians, PlacedGaussians
+from splatpilot.systems.splats.lens import Distortion
 from splatpilot.systems.splats.scene import GaussianScene
-from splatpilot.systems.splats.splat_camera import SplatCamera
+from splatpilot.systems.splats.splat_camera import SplatCamera, row_bands
+from splatpilot.systems.vehicle.state import pose_between
 
 INFO = CameraInfo(width=32, height=24, fov_y=np.pi / 2)
 # Camera z along body x, as on the vehicle.
@@ -60,7 +63,6 @@ def evaluate(camera: SplatCamera, port: str, X_WB: RigidTransform) -> np.ndarray
 
 
 def test_output_ports_are_those_of_rgbd_sensor():
-    """A diagram wired for RgbdSensor's output ports can be wired to a SplatCamera instead."""
     core = RenderCameraCore("none", INFO, ClippingRange(0.01, 10), RigidTransform())
     sensor = RgbdSensor(
         SceneGraph.world_frame_id(),
@@ -81,16 +83,13 @@ def test_output_ports_are_those_of_rgbd_sensor():
     assert camera.body_pose_input_port().get_name() == "body_pose"
 
 
-def test_wall_is_seen_at_its_distance_and_in_its_colour():
-    """A wall 3 m ahead of the body reads 2.9 m from a camera 0.1 m ahead of the body, in both depth
-    formats.
-    """
+def test_wall_is_seen_at_its_distance_and_in_its_color():
     camera = SplatCamera(wall(3), INFO, X_BC)
     np.testing.assert_allclose(
         evaluate(camera, "depth_image_32f", RigidTransform()), 2.9, rtol=2e-3
     )
-    millimetres = evaluate(camera, "depth_image_16u", RigidTransform())
-    np.testing.assert_allclose(millimetres, 2900, rtol=2e-3)
+    millimeters = evaluate(camera, "depth_image_16u", RigidTransform())
+    np.testing.assert_allclose(millimeters, 2900, rtol=2e-3)
     assert np.all(
         evaluate(camera, "label_image", RigidTransform()) == int(RenderLabel.kUnspecified)
     )
@@ -101,22 +100,20 @@ def test_wall_is_seen_at_its_distance_and_in_its_colour():
 
 
 @pytest.mark.parametrize(
-    ("x", "opacity", "metres", "millimetres"),
+    ("x", "opacity", "meters", "millimeters"),
     [
         (1.0, 0.99, 0.0, 0),  # nearer than the range
         (9.0, 0.99, np.inf, 65535),  # farther than the range
         (3.0, 0.02, np.inf, 65535),  # hardly there
     ],
 )
-def test_out_of_range_reads_as_in_drake(x, opacity, metres, millimetres):
-    """Too near reads 0; too far, and too faint to be a surface, reads infinity or 65535."""
+def test_out_of_range_reads_as_in_drake(x, opacity, meters, millimeters):
     camera = SplatCamera(wall(x, opacity), INFO, X_BC, min_depth=2.0, max_depth=5.0)
-    assert np.all(evaluate(camera, "depth_image_32f", RigidTransform()) == metres)
-    assert np.all(evaluate(camera, "depth_image_16u", RigidTransform()) == millimetres)
+    assert np.all(evaluate(camera, "depth_image_32f", RigidTransform()) == meters)
+    assert np.all(evaluate(camera, "depth_image_16u", RigidTransform()) == millimeters)
 
 
 def test_nothing_in_view_is_background():
-    """Looking away from the wall shows the background, infinite depth and the empty label."""
     camera = SplatCamera(wall(3), INFO, X_BC, background=(0.2, 0.4, 0.6))
     X_WB = RigidTransform(RotationMatrix.MakeZRotation(np.pi), [0, 0, 0])
     assert np.all(np.isinf(evaluate(camera, "depth_image_32f", X_WB)))
@@ -132,8 +129,6 @@ def test_nothing_in_view_is_background():
 
 
 def test_renders_once_per_pose_and_only_when_asked():
-    """All images of one pose cost one render, time alone costs none, and no pull costs none; depth
-    that is pulled first, or alone, is rendered alone."""
     scene = wall(3)
     camera = SplatCamera(scene, INFO, X_BC)
     context = camera.CreateDefaultContext()
@@ -161,13 +156,11 @@ def test_renders_once_per_pose_and_only_when_asked():
 
 
 def test_depth_range_must_not_be_empty():
-    """A depth range that holds nothing is refused by name and value."""
-    with pytest.raises(ValueError, match=r"depth range is \[2.0, 1.0\]"):
+    with pytest.raises(ValueError, match=r"depth range must be .* got \[2.0, 1.0\]"):
         SplatCamera(wall(3), INFO, min_depth=2.0, max_depth=1.0)
 
 
 def test_gaussian_scene_is_baked():
-    """A camera of Gaussians that are not baked sees what one of baked Gaussians sees."""
     scene = GaussianScene.from_colors(
         means=[[2.0, 0, 0]],
         quats=[[1.0, 0, 0, 0]],
@@ -180,3 +173,112 @@ def test_gaussian_scene_is_baked():
         for given in (scene, BakedScene(scene))
     ]
     assert images[0].any() and np.array_equal(*images)
+
+
+WIDTH, HEIGHT, FOCAL = 64, 48, 40.0
+SHUTTER_INFO = CameraInfo(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
+
+
+def pole(x: float = 0.0) -> GaussianScene:
+    """An upright line, 4 m ahead of a camera at the origin with optical axes."""
+    y = np.arange(-6.0, 6.0, 0.02)
+    return GaussianScene.from_colors(
+        means=np.column_stack([np.full(y.size, x), y, np.full(y.size, 4.0)]),
+        quats=np.tile([1.0, 0, 0, 0], (y.size, 1)),
+        scales=np.full((y.size, 3), 0.08),
+        opacities=np.full(y.size, 0.99),
+        colors=np.tile([1.0, 1.0, 1.0], (y.size, 1)),
+    )
+
+
+def columns(color: np.ndarray) -> np.ndarray:
+    """Where each row [px] sees the pole."""
+    weights = color.mean(axis=2)
+    return (weights * (np.arange(WIDTH) + 0.5)).sum(axis=1) / weights.sum(axis=1)
+
+
+def yawed(angle: float) -> RigidTransform:
+    """A camera that has turned right [rad]."""
+    return RigidTransform(RotationMatrix.MakeYRotation(angle))
+
+
+def test_a_pole_leans_as_the_camera_turns():
+    view = SplatCamera(pole(), SHUTTER_INFO, readout=0.02).render(yawed(0.1), 0.0, yawed(-0.1))
+    angle = np.interp(np.arange(HEIGHT) + 0.5, [0, HEIGHT], [-0.1, 0.1])
+    expected = WIDTH / 2 - FOCAL * np.tan(angle)
+    assert np.abs(columns(view.color) - expected).max() < 0.3
+    assert np.ptp(columns(SplatCamera(pole(), SHUTTER_INFO).render(yawed(0.1)).color)) < 0.1
+
+
+def test_each_row_is_that_of_its_pose():
+    camera = SplatCamera(pole(), SHUTTER_INFO, readout=0.02)
+    X_0 = RigidTransform(RotationMatrix.MakeXRotation(0.3), [0.1, 0.0, -0.2])
+    X_1 = RigidTransform(RotationMatrix.MakeYRotation(0.6), [0.3, 0.1, 0.4])
+    assert len(row_bands(X_0, X_1, FOCAL, HEIGHT)) == HEIGHT
+    view = camera.render(X_1, 0.0, X_0)
+    for row in range(0, HEIGHT, 7):
+        own = camera.render(pose_between(X_0, X_1, (row + 0.5) / HEIGHT))
+        np.testing.assert_allclose(view.color[row], own.color[row], atol=2e-2)
+        seen = own.depth[row] > 0
+        assert seen.any() and (view.depth[row] > 0)[seen].mean() > 0.9
+        both = seen & (view.depth[row] > 0)
+        np.testing.assert_allclose(view.depth[row][both], own.depth[row][both], rtol=5e-3)
+
+
+def test_bands():
+    X = RigidTransform()
+    assert row_bands(X, X, FOCAL, HEIGHT) == [(0, HEIGHT)]
+    bands = row_bands(X, RigidTransform([0.1, 0, 0]), FOCAL, HEIGHT)
+    assert len(bands) == 8  # 0.1 m at 1 m are 4 px
+    assert [row for band in bands for row in range(*band)] == list(range(HEIGHT))
+    assert len(row_bands(X, yawed(1.0), FOCAL, HEIGHT)) == HEIGHT
+
+
+def ports(camera: SplatCamera, X_0: RigidTransform, X_1: RigidTransform, names: list[str]):
+    context = camera.CreateDefaultContext()
+    camera.GetInputPort("start_pose").FixValue(context, X_0)
+    camera.GetInputPort("body_pose").FixValue(context, X_1)
+    images = [np.array(camera.GetOutputPort(name).Eval(context).data) for name in names]
+    camera.GetInputPort("start_pose").FixValue(context, X_1)
+    return images, np.array(camera.GetOutputPort(names[-1]).Eval(context).data)
+
+
+@pytest.mark.parametrize("distortion", [None, Distortion("fisheye", [-0.02, 0.01, 0, 0])])
+def test_ports(distortion):
+    sky = EnvironmentMap(np.tile([[0.2, 0.4, 0.9]], (8, 16, 1)).astype(np.float32))
+    camera = SplatCamera(
+        pole(), SHUTTER_INFO, readout=0.02, distortion=distortion, background=sky, max_depth=30.0
+    )
+    names = ["color_image", "depth_image_32f"]
+    (color, depth), still = ports(camera, yawed(-0.1), yawed(0.1), names)
+    (alone,), _ = ports(camera, yawed(-0.1), yawed(0.1), names[1:])
+    np.testing.assert_array_equal(depth, alone)
+    assert np.any(still != depth)
+    where = np.isfinite(depth[..., 0])
+    assert where.any(axis=1).all()
+    assert color[..., :3][where].min() > 100 and (color[0, 0, :3] == [51, 102, 230]).all()
+
+
+def test_what_moves_is_where_it_was_when_its_row_was_read():
+    scene, line = pole(50.0), pole()
+
+    def placed(time: float) -> PlacedGaussians:
+        means = (line.means + np.array([2.0 * time, 0, 0])).astype(np.float32)
+        return PlacedGaussians(means, *(getattr(line, n) for n in PlacedGaussians._fields[1:]))
+
+    class Moving(MovingGaussians):
+        def __init__(self) -> None:
+            pass
+
+        def at(self, time: float) -> PlacedGaussians:
+            return placed(time)
+
+    camera = SplatCamera(BakedScene(scene), SHUTTER_INFO, readout=0.2, moving=Moving())
+    seen = columns(camera.render(RigidTransform(), 0.5, RigidTransform()).color)
+    times = np.interp(np.arange(HEIGHT) + 0.5, [0, HEIGHT], [0.3, 0.5])
+    assert np.abs(seen - (WIDTH / 2 + FOCAL * 2.0 * times / 4.0)).max() < 0.4
+
+
+def test_readout_must_be_a_time():
+    with pytest.raises(ValueError, match=r"readout must be finite and >= 0 s, got -0\.01"):
+        SplatCamera(pole(), SHUTTER_INFO, readout=-0.01)

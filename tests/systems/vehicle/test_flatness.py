@@ -1,130 +1,345 @@
 import math
+from dataclasses import fields
 
 import numpy as np
 import pytest
-from hypothesis import assume, example, given
+import torch
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
+from pydrake.systems.framework import DiagramBuilder, LeafSystem
+from pydrake.systems.primitives import VectorLogSink
 from scipy.spatial.transform import Rotation
 
 from splatpilot.systems.vehicle.flatness import (
-    attitude_error,
+    FlatnessController,
+    FlatnessControllerConfig,
     attitude_from_thrust,
-    limit_norm,
-    limit_thrust,
+    flatness_command,
     reaching_acceleration,
-    thrust_for_acceleration,
 )
-from splatpilot.systems.vehicle.quadrotor import QuadrotorParams, quadrotor_derivatives
+from splatpilot.systems.vehicle.quadrotor import (
+    QuadrotorParams,
+    QuadrotorPlant,
+    hover_state,
+    quadrotor_derivatives,
+)
 
-# Vectors of ordinary and of extreme length, with exact zeros.
-elements = st.floats(-20, 20) | st.sampled_from([0.0, 1e-12, -1e6])
-vectors = st.lists(elements, min_size=3, max_size=3).map(np.array)
+CONFIG = FlatnessControllerConfig()
+PARAMS = QuadrotorParams(drag=0.4, gravity=9.7)
+vectors = st.lists(st.floats(-20, 20) | st.just(0.0), min_size=3, max_size=3).map(np.array)
 rotations = st.lists(st.floats(-1, 1), min_size=4, max_size=4).map(
     lambda q: Rotation.from_quat(np.array(q) + np.array([0.0, 0.0, 0.0, 1e-3]))
 )
 angles = st.floats(-math.pi, math.pi)
+UNLIMITED = FlatnessControllerConfig(
+    min_thrust=1e-6, max_thrust=1e3, max_tilt=1.57, tilt_gain=10, max_tilt_rate=1e3,
+    yaw_gain=10, max_yaw_rate=1e3,
+)  # fmt: skip
 
 
 @given(p_WR=vectors, p_WB=vectors, v_WB=vectors, lookahead=st.floats(0.2, 2))
 def test_reaching_acceleration_arrives(p_WR, p_WB, v_WB, lookahead):
-    """Held for the lookahead, the acceleration takes the vehicle to the waypoint."""
     a_WB = reaching_acceleration(p_WR, p_WB, v_WB, lookahead)
     end = p_WB + lookahead * v_WB + lookahead**2 / 2 * a_WB
     np.testing.assert_allclose(end, p_WR, rtol=1e-9, atol=1e-8)
 
 
-@given(a_WB=vectors, v_WB=vectors, yaw=angles)
-def test_thrust_and_attitude_invert_the_dynamics(a_WB, v_WB, yaw):
-    """With the thrust and the attitude found, the plant's acceleration is the one wanted."""
-    params = QuadrotorParams(drag=0.4, gravity=9.7)
-    f_W = thrust_for_acceleration(a_WB, v_WB, params.drag, params.gravity)
-    R_WB = Rotation.from_matrix(attitude_from_thrust(f_W, yaw))
-    state = np.concatenate([np.zeros(3), v_WB, R_WB.as_quat(scalar_first=True), np.zeros(3)])
-    command = np.array([np.linalg.norm(f_W), 0.0, 0.0, 0.0])
-    v_dot = quadrotor_derivatives(state, command, params)[3:6]
-    np.testing.assert_allclose(v_dot, a_WB, rtol=1e-6, atol=1e-6)
+@given(R_WB=rotations, a_WB=vectors, v_WB=vectors, heading=angles)
+def test_rates_lead_to_the_attitude_of_the_acceleration(R_WB, a_WB, v_WB, heading):
+    """By the shortest tilt, then yaw; the thrust there accelerates as desired."""
+    assume(a_WB[2] + PARAMS.drag * v_WB[2] > -9.0)
+    q_WB = R_WB.as_quat(scalar_first=True)
+    state = np.concatenate([np.zeros(3), v_WB, q_WB, np.zeros(3)])
+    rates = flatness_command(state, a_WB, v_WB, heading, UNLIMITED, PARAMS)[1:] / 10
+    tilt = Rotation.from_rotvec([*rates[:2], 0.0])
+    R_WD = R_WB * tilt * Rotation.from_euler("z", rates[2])
+    state[6:10] = R_WD.as_quat(scalar_first=True)
+    command = flatness_command(state, a_WB, v_WB, heading, UNLIMITED, PARAMS)
+    np.testing.assert_allclose(command[1:], 0.0, atol=1e-5)
+    v_dot = quadrotor_derivatives(state, command, PARAMS)[3:6]
+    np.testing.assert_allclose(v_dot, a_WB, atol=1e-5)
+    x, _, z = R_WD.as_matrix().T
+    assert x @ [-math.sin(heading), math.cos(heading), 0.0] == pytest.approx(0.0, abs=1e-6)
+    assert x @ [math.cos(heading), math.sin(heading), 0.0] > 0.0
+    assert math.cos(tilt.magnitude()) == pytest.approx(R_WB.as_matrix()[:, 2] @ z, abs=1e-6)
 
 
-@given(f_W=vectors, yaw=angles)
-@example(f_W=np.zeros(3), yaw=0.3)
-@example(f_W=np.array([0.0, 0.0, -9.81]), yaw=0.3)
-@example(f_W=np.array([9.81, 0.0, 0.0]), yaw=0.0)  # pitched by 90 deg
-@example(f_W=np.array([0.0, 9.81, 0.0]), yaw=0.0)  # rolled by 90 deg: heading undefined
-@example(f_W=np.array([0.0, -9.81, 0.0]), yaw=math.pi)
-def test_attitude_is_a_rotation_along_the_thrust(f_W, yaw):
-    """The attitude is a proper rotation with z along the thrust, whatever the thrust."""
-    R_WD = attitude_from_thrust(f_W, yaw)
-    np.testing.assert_allclose(R_WD.T @ R_WD, np.eye(3), atol=1e-9)
-    assert np.linalg.det(R_WD) == pytest.approx(1.0)
-    if np.linalg.norm(f_W) > 1e-6:
-        np.testing.assert_allclose(R_WD[:, 2], f_W / np.linalg.norm(f_W), atol=1e-9)
+@pytest.mark.parametrize(
+    ("a_WB", "thrust"),
+    [
+        ([3.0, -2.0, -0.81], [3.0, -2.0, 9.0]),
+        ([40.0, 0.0, 0.0], [9.81 * math.tan(0.8), 0.0, 9.81]),  # lift before sideways thrust
+        ([0.0, 0.0, -30.0], [0.0, 0.0, 2.0]),
+        ([0.0, 0.0, 30.0], [0.0, 0.0, 20.0]),
+    ],
+)
+def test_thrust_is_limited_in_tilt_and_size(a_WB, thrust):
+    x = attitude_from_thrust(np.array(thrust), 0.3)
+    q_WB = Rotation.from_matrix(x).as_quat(scalar_first=True)
+    state = np.concatenate([np.zeros(6), q_WB, np.zeros(3)])
+    command = flatness_command(state, np.array(a_WB), np.zeros(3), 0.3, CONFIG, QuadrotorParams())
+    expected = [np.linalg.norm(thrust), 0.0, 0.0, 0.0]
+    np.testing.assert_allclose(command, expected, atol=1e-9)
 
 
-@given(f_W=vectors, yaw=angles)
-def test_attitude_points_along_yaw_seen_from_above(f_W, yaw):
-    """At any thrust with an upward or downward part, body x projects onto the heading."""
-    assume(abs(f_W[2]) > 0.1 * np.linalg.norm(f_W) > 0.0)
-    x_W = attitude_from_thrust(f_W, yaw)[:, 0]
-    assert x_W @ [math.cos(yaw), math.sin(yaw), 0.0] > 0.0
-    assert x_W @ [-math.sin(yaw), math.cos(yaw), 0.0] == pytest.approx(0.0, abs=1e-9)
+def test_an_inverted_body_rotates_about_its_x_axis():
+    state = hover_state([0.0, 0.0, 0.0])
+    state[6:10] = [0.0, 1.0, 0.0, 0.0]
+    command = flatness_command(state, np.zeros(3), np.zeros(3), None, CONFIG, PARAMS)
+    np.testing.assert_allclose(command[1:], [CONFIG.max_tilt_rate, 0.0, 0.0], atol=1e-9)
 
 
-def test_zero_thrust_is_level():
-    """Without a thrust direction the attitude is level and faces yaw."""
-    expected = Rotation.from_euler("z", 0.7).as_matrix()
-    np.testing.assert_allclose(attitude_from_thrust(np.zeros(3), 0.7), expected, atol=1e-12)
+@pytest.mark.parametrize("make", [np.asarray, torch.as_tensor], ids=["numpy", "torch"])
+@pytest.mark.parametrize("heading", [None, 0.4, math.nan])
+def test_batches_equal_single_vehicles(make, heading):
+    rng = np.random.default_rng(3)
+    states, a_WB = rng.normal(size=(8, 13)), 10 * rng.normal(size=(8, 3))
+    v_WB = states[:, 3:6]
+    given = None if heading is None else make(np.full(8, heading))
+    batch = flatness_command(make(states), make(a_WB), make(v_WB), given, CONFIG, PARAMS)
+    singles = [
+        flatness_command(state, a, v, heading, CONFIG, PARAMS)
+        for state, a, v in zip(states, a_WB, v_WB, strict=True)
+    ]
+    np.testing.assert_allclose(batch, singles, atol=1e-9)
 
 
-@given(R_WB=rotations, R_WD=rotations)
-def test_attitude_error_turns_b_into_d(R_WB, R_WD):
-    """Turning by the tilt and then by the yaw gives exactly the desired attitude."""
-    tilt_B, yaw = attitude_error(R_WB.as_matrix(), R_WD.as_matrix())
-    turned = R_WB * Rotation.from_rotvec([*tilt_B, 0.0]) * Rotation.from_euler("z", yaw)
-    np.testing.assert_allclose(turned.as_matrix(), R_WD.as_matrix(), atol=1e-6)
+def test_gradients_at_rest_are_finite():
+    state = torch.as_tensor(hover_state([0.0, 0.0, 2.0]))[None].float().requires_grad_()
+    a_WB = torch.zeros(1, 3, requires_grad=True)
+    flatness_command(state, a_WB, state[:, 3:6], None, CONFIG, PARAMS).sum().backward()
+    assert state.grad is not None and torch.isfinite(state.grad).all()
+    assert a_WB.grad is not None and torch.isfinite(a_WB.grad).all()
+    assert a_WB.grad[0, 2] == pytest.approx(1.0)  # thrust
+    assert a_WB.grad[0, 0].abs() == pytest.approx(CONFIG.tilt_gain / PARAMS.gravity, rel=1e-4)
 
 
-@given(R_WB=rotations, R_WD=rotations)
-def test_the_tilt_is_the_shortest_turn(R_WB, R_WD):
-    """The length of the tilt is the angle between the two z axes."""
-    tilt_B, _ = attitude_error(R_WB.as_matrix(), R_WD.as_matrix())
-    cosine = R_WB.as_matrix()[:, 2] @ R_WD.as_matrix()[:, 2]
-    assert math.cos(np.linalg.norm(tilt_B)) == pytest.approx(cosine, abs=1e-9)
-    assert np.linalg.norm(tilt_B) <= math.pi + 1e-9
+class Signal(LeafSystem):
+    """A function of time (3,) as an output port."""
+
+    def __init__(self, function):
+        super().__init__()
+        self.DeclareVectorOutputPort(
+            "value", 3, lambda context, output: output.SetFromVector(function(context.get_time()))
+        )
 
 
-def test_an_inverted_body_turns_over():
-    """With opposite z axes the tilt is half a turn about body x, not a NaN and not zero."""
-    tilt_B, yaw = attitude_error(np.eye(3), np.diag([1.0, -1.0, -1.0]))
-    np.testing.assert_allclose(tilt_B, [math.pi, 0.0])
-    assert yaw == pytest.approx(0.0)
+def fly(state, duration, *, config=None, params=None, **inputs):
+    """Times (N,), states (N, 13) and commands (N, 4) every 20 ms of plant and controller.
+
+    `inputs` are functions of time for the controller's `waypoint` or `acceleration`.
+    """
+    builder = DiagramBuilder()
+    plant = builder.AddSystem(QuadrotorPlant(params))
+    controller = builder.AddSystem(FlatnessController(config, params))
+    builder.Connect(plant.get_output_port(), controller.GetInputPort("state"))
+    builder.Connect(controller.get_output_port(), plant.get_input_port())
+    for port, function in inputs.items():
+        signal = builder.AddSystem(Signal(function))
+        builder.Connect(signal.get_output_port(), controller.GetInputPort(port))
+    sinks = []
+    for system, size in ((plant, 13), (controller, 4)):
+        sinks.append(builder.AddSystem(VectorLogSink(size, 0.02)))
+        builder.Connect(system.get_output_port(), sinks[-1].get_input_port())
+    simulator = Simulator(builder.Build())
+    ResetIntegratorFromFlags(simulator, "runge_kutta3", 0.02)
+    simulator.get_mutable_integrator().set_fixed_step_mode(True)
+    context = simulator.get_mutable_context()
+    context.SetContinuousState(state)
+    simulator.AdvanceTo(duration)
+    states, commands = (sink.FindLog(context) for sink in sinks)
+    return states.sample_times(), states.data().T, commands.data().T
 
 
-@given(f_W=vectors)
-@example(f_W=np.zeros(3))
-@example(f_W=np.array([30.0, -4.0, -9.81]))
-def test_limited_thrust_is_within_the_limits_and_keeps_its_bearing(f_W):
-    """Any thrust comes into the tilt cone and the thrust range without turning sideways."""
-    limited = limit_thrust(f_W, 2.0, 20.0, 0.8)
-    assert 2.0 - 1e-9 <= np.linalg.norm(limited) <= 20.0 + 1e-9
-    assert math.hypot(*limited[:2]) <= math.tan(0.8) * limited[2] * (1 + 1e-9)
-    assert limited[0] * f_W[1] == pytest.approx(limited[1] * f_W[0], rel=1e-9, abs=1e-9)
-    assert limited[:2] @ f_W[:2] >= 0.0
+def command_for(state, config=None, time=0.0, **inputs):
+    """The command (4,) that one update computes, and the hover command it replaces."""
+    controller = FlatnessController(config)
+    context = controller.CreateDefaultContext()
+    context.SetTime(time)
+    for port, value in {"state": state, **inputs}.items():
+        controller.GetInputPort(port).FixValue(context, value)
+    return controller.EvalUniquePeriodicDiscreteUpdate(context).value(0)
 
 
-def test_thrust_within_the_limits_is_unchanged():
-    """An admissible thrust passes as it is."""
-    f_W = np.array([3.0, -2.0, 9.0])
-    np.testing.assert_allclose(limit_thrust(f_W, 2.0, 20.0, 0.8), f_W)
+def yaw_of(states):
+    return np.unwrap(Rotation.from_quat(states[:, 6:10], scalar_first=True).as_euler("ZYX")[:, 0])
 
 
-def test_limiting_the_tilt_keeps_the_vertical_thrust():
-    """Too much sideways thrust is given up before any lift is."""
-    limited = limit_thrust(np.array([40.0, 0.0, 9.81]), 2.0, 20.0, 0.8)
-    np.testing.assert_allclose(limited, [9.81 * math.tan(0.8), 0.0, 9.81])
+def test_hover_thrust_is_published_before_the_first_update():
+    """A fresh Context commands the weight and no rotation, without needing any input."""
+    controller = FlatnessController(params=QuadrotorParams(gravity=3.7))
+    context = controller.CreateDefaultContext()
+    command = controller.GetOutputPort("command").Eval(context)
+    np.testing.assert_array_equal(command, [3.7, 0.0, 0.0, 0.0])
 
 
-def test_limit_norm_shortens_only_what_is_too_long():
-    """Length is cut at the limit and direction is kept."""
-    np.testing.assert_array_equal(limit_norm(np.array([3.0, 4.0]), 5.0), [3.0, 4.0])
-    np.testing.assert_allclose(limit_norm(np.array([3.0, 4.0]), 1.0), [0.6, 0.8])
-    np.testing.assert_array_equal(limit_norm(np.zeros(2), 1.0), np.zeros(2))
+def test_the_command_is_held_between_updates():
+    """With a period of 0.1 s the command changes only at its multiples."""
+    config = FlatnessControllerConfig(period=0.1)
+    _, _, commands = fly(
+        hover_state([0.0, 0.0, 0.0]), 1.0, config=config, waypoint=lambda t: [t, -t, 1.0]
+    )
+    changed = np.nonzero(np.any(np.diff(commands, axis=0) != 0.0, axis=1))[0]
+    assert len(changed) >= 9
+    assert set(changed % 5) == {0}
+
+
+def test_hover_holds():
+    """At the waypoint, at rest, the vehicle stays, whatever way it faces."""
+    state = hover_state([1.0, 2.0, 3.0], yaw=2.5)
+    _, states, _ = fly(state, 5.0, waypoint=lambda t: [1.0, 2.0, 3.0])
+    np.testing.assert_allclose(states, np.tile(state, (len(states), 1)), atol=1e-9)
+
+
+@pytest.mark.parametrize("step", [[3.0, 0.0, 0.0], [-2.0, 2.0, 4.0], [0.0, 0.0, -3.0], [30, 40, 5]])
+def test_a_step_of_the_waypoint_converges(step):
+    """A waypoint that jumps, even by 50 m, is reached and held to a millimetre."""
+    _, states, _ = fly(hover_state([0.0, 0.0, 0.0]), 20.0, waypoint=lambda t: step)
+    assert np.isfinite(states).all()
+    np.testing.assert_allclose(states[-1, 0:3], step, atol=1e-3)
+    np.testing.assert_allclose(states[-1, 3:6], 0.0, atol=1e-3)
+
+
+def test_recovers_from_upside_down():
+    """Released inverted and spinning, it rights itself and returns to the waypoint."""
+    state = hover_state([0.0, 0.0, 10.0])
+    state[6:10] = [0.0, 1.0, 0.0, 0.0]
+    state[10:13] = [3.0, -2.0, 5.0]
+    _, states, _ = fly(state, 8.0, waypoint=lambda t: [0.0, 0.0, 10.0])
+    assert states[:, 2].min() > 5.0
+    np.testing.assert_allclose(states[-1, 0:3], [0.0, 0.0, 10.0], atol=1e-3)
+
+
+def circle(t, radius=3.0, speed=2.0):
+    angle = speed / radius * t
+    return np.array([radius * math.cos(angle), radius * math.sin(angle), 1.5])
+
+
+def test_tracks_a_circle_to_a_centimetre():
+    """On a circle of 3 m at 2 m/s the steady error is under 1 cm and yaw is within 6 degrees."""
+    state = hover_state(circle(0.0), yaw=math.pi / 2)
+    state[3:6] = [0.0, 2.0, 0.0]
+    times, states, _ = fly(state, 20.0, waypoint=lambda t: circle(t + CONFIG.lookahead))
+    error = np.linalg.norm(states[:, 0:3] - [circle(t) for t in times], axis=1)
+    steady = times > 8.0
+    assert error[steady].max() < 0.01
+    assert error.max() < 0.05
+    yaw_error = yaw_of(states) - (math.pi / 2 + 2.0 / 3.0 * times)
+    assert np.abs(yaw_error[steady]).max() < math.radians(6.0)
+
+
+def test_an_acceleration_is_reproduced():
+    """Without drag a constant acceleration is flown exactly; with drag within 1 percent of g."""
+    a_WB = np.array([1.0, -2.0, 0.5])
+    for drag, tolerance in ((0.0, 1e-5), (0.375, 0.1)):
+        params = QuadrotorParams(drag=drag)
+        _, states, commands = fly(
+            hover_state([0.0, 0.0, 0.0]), 8.0, params=params, acceleration=lambda t: a_WB
+        )
+        v_dot = quadrotor_derivatives(states, commands, params)[-1, 3:6]
+        np.testing.assert_allclose(v_dot, a_WB, atol=tolerance)
+
+
+@pytest.mark.parametrize("direction", [-3.0, -1.0, 0.5, 2.0])
+def test_yaw_turns_towards_motion(direction):
+    """Flying straight in any direction ends facing that way, having turned at a limited rate."""
+    heading = np.array([math.cos(direction), math.sin(direction), 0.0])
+    _, states, commands = fly(
+        hover_state([0.0, 0.0, 0.0]), 6.0, waypoint=lambda t: 1.5 * (t + CONFIG.lookahead) * heading
+    )
+    assert yaw_of(states)[-1] == pytest.approx(direction, abs=math.radians(0.5))
+    assert np.abs(commands[:, 3]).max() <= CONFIG.max_yaw_rate
+
+
+def test_yaw_follows_the_velocity_when_an_acceleration_is_flown():
+    """While braking, the vehicle faces where it still flies, not where it is pushed."""
+    state = hover_state([0.0, 0.0, 0.0], yaw=0.8)
+    state[3:6] = [4.0, 0.0, 0.0]
+    _, states, _ = fly(state, 2.5, acceleration=lambda t: [-1.0, 0.0, 0.0])
+    assert states[-1, 3] > 1.0
+    assert yaw_of(states)[-1] == pytest.approx(0.0, abs=math.radians(1.0))
+
+
+def test_yaw_rests_when_slow():
+    """Creeping sideways at 1 cm/s, or rising straight up, does not turn the vehicle."""
+    for velocity in ([0.0, 0.01, 0.0], [0.0, 0.0, 1.0]):
+        _, states, _ = fly(
+            hover_state([0.0, 0.0, 0.0]),
+            5.0,
+            waypoint=lambda t, v=velocity: (t + CONFIG.lookahead) * np.array(v),
+        )
+        assert np.abs(yaw_of(states)).max() < math.radians(1.0)
+
+
+finite = st.floats(-1e6, 1e6) | st.floats(-3, 3)
+
+
+@settings(max_examples=200)
+@given(
+    state=st.lists(finite, min_size=13, max_size=13),
+    port=st.sampled_from(["waypoint", "acceleration"]),
+    value=st.lists(finite, min_size=3, max_size=3),
+)
+def test_commands_are_limited_for_any_input(state, port, value):
+    """Whatever the finite inputs, the command is finite and within every limit."""
+    state = np.array(state)
+    if np.linalg.norm(state[6:10]) < 1e-6:
+        state[6] = 1.0
+    command = command_for(state, **{port: value})
+    assert CONFIG.min_thrust <= command[0] <= CONFIG.max_thrust
+    assert math.hypot(command[1], command[2]) <= CONFIG.max_tilt_rate * (1 + 1e-12)
+    assert abs(command[3]) <= CONFIG.max_yaw_rate
+
+
+def test_the_attitude_stays_within_the_tilt_limit():
+    """Chasing a waypoint that jumps about, the tilt exceeds its limit by under 5 degrees."""
+    corners = np.random.default_rng(0).uniform(-20, 20, size=(10, 3))
+    _, states, _ = fly(hover_state([0.0, 0.0, 0.0]), 10.0, waypoint=lambda t: corners[int(t) % 10])
+    z_W = Rotation.from_quat(states[:, 6:10], scalar_first=True).apply([0.0, 0.0, 1.0])
+    tilt = np.arccos(z_W[:, 2])
+    assert 0.9 * CONFIG.max_tilt < tilt.max() < CONFIG.max_tilt + math.radians(5.0)
+
+
+def test_one_of_the_two_targets_must_be_connected():
+    """Neither or both of waypoint and acceleration is an error at the first update."""
+    state = hover_state([0.0, 0.0, 0.0])
+    with pytest.raises(ValueError, match="got neither"):
+        fly(state, 0.1)
+    with pytest.raises(ValueError, match="got both"):
+        fly(state, 0.1, waypoint=lambda t: np.zeros(3), acceleration=lambda t: np.zeros(3))
+
+
+@pytest.mark.parametrize("port", ["state", "waypoint", "acceleration"])
+def test_an_input_that_is_not_finite_is_an_error(port):
+    """A NaN at any input is refused by the port's name and the time."""
+    inputs = {"state": hover_state([0.0, 0.0, 0.0]), "waypoint": np.zeros(3)}
+    if port == "acceleration":
+        inputs[port] = inputs.pop("waypoint")
+    inputs[port][1] = math.nan
+    with pytest.raises(
+        ValueError, match=rf"input '{port}' .* at t = 0\.5 s must be finite, got .*nan"
+    ):
+        command_for(time=0.5, **inputs)
+
+
+@pytest.mark.parametrize("field", [field.name for field in fields(FlatnessControllerConfig)])
+@pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf])
+def test_every_field_must_be_positive_and_finite(field, value):
+    with pytest.raises(ValueError, match=f"{field} must be in .*, got {value}"):
+        FlatnessController(FlatnessControllerConfig(**{field: value}))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"period": 1e-5}, r"period .* got 1e-05"),
+        ({"min_thrust": 25.0}, r"min_thrust .* below max_thrust.* got 25\.0"),
+        ({"max_tilt": 1.6}, r"max_tilt .* got 1\.6"),
+        ({"max_thrust": 12.0}, r"max_thrust must be above 14\.08 .* got 12\.0"),
+        ({"lookahead": 0.1}, r"lookahead .* at least 2 / tilt_gain = 0\.2 s, got 0\.1"),
+    ],
+)
+def test_limits_that_contradict_each_other_are_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        FlatnessController(FlatnessControllerConfig(**changes))

@@ -16,9 +16,6 @@ SKY = EnvironmentMap(np.full((4, 8, 3), [0.2, 0.9, 0.9], np.float32))
 
 
 def test_page_follows_meshcat(open_in_browser):
-    """The Gaussians are there, and not what Meshcat draws as points; what is drawn in Meshcat after
-    the page has been opened appears, before the Gaussians, and moves; the sky
-    stays; the height hides the Gaussian; a mesh that Meshcat would serve is left out in silence."""
     meshcat = Meshcat()
     meshcat.SetCameraPose([-4, 0, 0], [0, 0, 0])
     for path in ("/Grid", "/Axes"):

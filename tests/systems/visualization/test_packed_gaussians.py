@@ -9,8 +9,6 @@ from splatpilot.systems.visualization.pages import pack_gaussians
 
 
 def test_words_hold_centres_shades_and_covariances():
-    """Unpacked by hand, centres are exact, colours and opacities to half a 255th, and covariances
-    to the 11 bits of a half, from 1 mm to 10 m."""
     generator = np.random.default_rng(0)
     n = 50
     scene = GaussianScene.from_colors(
@@ -36,7 +34,6 @@ def test_words_hold_centres_shades_and_covariances():
 
 
 def test_what_no_half_holds_shrinks_as_a_whole():
-    """A disc of 60 m, turned so that its covariance has large negative entries, keeps its shape."""
     scene = GaussianScene.from_colors(
         means=np.zeros((1, 3)),
         quats=[[np.cos(np.pi / 8), 0, 0, -np.sin(np.pi / 8)]],  # -45 degrees about z

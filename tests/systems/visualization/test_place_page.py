@@ -21,7 +21,7 @@ SHADES = ((40, 40, 200), (40, 200, 40), (200, 40, 40))  # of the images, blue fi
 
 
 def disks(step: float = 0.08) -> GaussianScene:
-    """Walls, floor and ceiling of the room, in waves of grey, as flat disks."""
+    """Walls, floor and ceiling of the room, in waves of gray, as flat disks."""
     means, quats = [], []
     turns = [(0.5**0.5, 0, 0.5**0.5, 0), (0.5**0.5, 0.5**0.5, 0, 0), (1, 0, 0, 0)]
     for axis in range(3):
@@ -98,9 +98,6 @@ def differ(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def test_ruler_measures_the_room(open_page):
-    """Two clicks on known places of floor and wall, from above through the ceiling that is hidden,
-    give their distance and each its place to 3 cm, and the command that scales the scene by them;
-    a click beside the room says that nothing is there."""
     page = open_page(room(images=None), width=900)
     floor, wall = [1.0, 1.0, 0.0], [4.5, 4.0, 1.1]
     page.tab.click("#view-ruler")
@@ -124,8 +121,6 @@ def test_ruler_measures_the_room(open_page):
 
 
 def test_surface_of_a_ray_is_where_the_camera_measures_it(open_page):
-    """Along the rays of pixels of a camera in the room, points are at the depth that the onboard
-    camera has there, to 1 cm where surfaces are seen at more than a glance."""
     place = room()
     page = open_page(place)
     page.run("() => { view.choose(0); view.lookFromCamera(); }")
@@ -141,8 +136,6 @@ def test_surface_of_a_ray_is_where_the_camera_measures_it(open_page):
 
 
 def test_slider_and_switches_change_the_picture(open_page):
-    """The height hides what is above it and moves the distances, whose colours are those of the
-    field at that height; what was never seen has a shade of its own."""
     page = open_page(room(images=None))
     low = page.picture()
     whole = page.run("() => view.setHeight(2.7)") or page.picture()
@@ -175,8 +168,6 @@ def test_slider_and_switches_change_the_picture(open_page):
 
 
 def test_frustum_shows_its_image_when_clicked(open_page):
-    """A click on a camera shows what it saw, in the panel and in its frustum; looked through, the
-    room has its perspective; what nobody looked into is apart."""
     place = room()
     page = open_page(place)
     page.run("() => view.setHeight(1.5)")
@@ -202,8 +193,6 @@ def test_frustum_shows_its_image_when_clicked(open_page):
 
 
 def test_hatched_surfaces_and_surroundings_are_apart(open_page):
-    """What is beyond the bounds, and the last Gaussians where nobody looked, are shown when they
-    are asked for, and only then is there a surface."""
     gaussians = disks()
     beyond = GaussianScene.from_colors(
         [[9.0, 2, 0.5]], [[1, 0, 0, 0]], [[0.5] * 3], [0.95], [[1] * 3]

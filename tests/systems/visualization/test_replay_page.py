@@ -11,7 +11,7 @@ from pydrake.geometry import Meshcat
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.sensors import CameraInfo
 
-from splatpilot.systems.collision.shapes import MovingBalls
+from splatpilot.systems.collision.shapes import MovingSpheres
 from splatpilot.systems.policies.hypotheses import Hypotheses
 from splatpilot.systems.splats.background import EnvironmentMap
 from splatpilot.systems.splats.baked_scene import BakedScene
@@ -114,8 +114,6 @@ SKY = EnvironmentMap(
 
 @pytest.mark.parametrize("background", [(0.2, 0.4, 0.6), SKY])
 def test_page_shows_what_the_camera_sees(open_page, background):
-    """Seen from the vehicle in a banked turn, splats and what is behind them are those of the
-    onboard camera, to 30 dB; without the splats they are not."""
     gaussians = cloud(np.random.default_rng(0))
     page = open_page(gaussians, [straight("a", "goal", roll=0.4)], background)
     page.run(
@@ -131,9 +129,6 @@ def test_page_shows_what_the_camera_sees(open_page, background):
 
 
 def test_controls_move_time_and_view(open_page):
-    """The slider, the keys and the views change the picture; in the chase view the vehicle is
-    within the middle of the window; the sphere is red where the clearance is below the margin, and
-    the picture is the camera's at that time."""
     page = open_page(cloud(np.random.default_rng(1)), [straight("a", "goal")])
     page.run("() => replay.look('chase')")
     for time in (0.0, 1.0, 3.9):
@@ -172,10 +167,7 @@ def test_controls_move_time_and_view(open_page):
 
 
 def test_flights_are_told_apart_and_crashes_start_before_their_end(open_page):
-    """Two flights have vehicles and trails of their own, and colours; the page starts two seconds
-    before the crash of the first; a chosen flight's plan alone is shown; balls are where they
-    are."""
-    balls = MovingBalls([0.5], [np.array([[3.0, 0, 1], [4.0, 0, 1], [np.inf] * 3])], period=2.0)
+    balls = MovingSpheres([0.5], [np.array([[3.0, 0, 1], [4.0, 0, 1], [np.inf] * 3])], period=2.0)
     flights = [straight("a", "collision"), straight("b", "goal", y=1.0)]
     page = open_page(cloud(np.random.default_rng(2)), flights, balls=balls)
     assert page.run("() => replay.time") == pytest.approx(2.0)
@@ -197,7 +189,6 @@ def test_flights_are_told_apart_and_crashes_start_before_their_end(open_page):
 
 
 def test_page_holds_its_gaussians_and_is_the_same_every_time():
-    """What is compressed into the page comes back by gzip and base64; there is no date in it."""
     gaussians, flights = cloud(np.random.default_rng(4)), [straight("a", "goal")]
     pages = [replay_page("<body></body>", gaussians, SKY, VIEW, flights) for _ in range(2)]
     assert pages[0] == pages[1]
@@ -208,6 +199,5 @@ def test_page_holds_its_gaussians_and_is_the_same_every_time():
 
 
 def test_page_without_flights_is_refused():
-    """There is nothing to replay."""
     with pytest.raises(ValueError, match="flights is empty"):
         replay_page("<body></body>", cloud(np.random.default_rng(3)), (0.0, 0.0, 0.0), VIEW, [])

@@ -71,7 +71,6 @@ def misread_quaternion(X: RigidTransform) -> RigidTransform:
 
 
 def test_sound_capture_agrees(room):
-    """Exact depth agrees to a fraction of a pixel's slope, and nothing fits better by half."""
     report = check_capture(room())
     assert report.agrees and report.agreement is not None
     assert report.agreement.error < 0.005 and report.agreement.inside > 0.5
@@ -101,7 +100,6 @@ FLU = RotationMatrix(np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]]))
     ],
 )  # fmt: skip
 def test_wrong_poses_are_named(room, change, mistake):
-    """Each usual mistake with poses is found by its name."""
     capture = room()
     report = check_capture(room(X_WCs=as_files(capture, change)))
     assert not report.agrees
@@ -137,14 +135,12 @@ def intrinsics(change):
     ],
 )
 def test_wrong_depth_and_intrinsics_are_named(room, change, mistake):
-    """Each usual mistake with depth or intrinsics is found by its name."""
     report = check_capture(room(**change(room)))
     assert not report.agrees
     assert re.search(mistake, report.mistake), str(report)
 
 
 def test_colour_and_depth_that_are_not_registered(room, room_views, room_poses):
-    """Depth of another camera that passes for the colour camera's is found, and its place."""
     p_DC = np.array([0.06, 0.02, 0.0])
     K_D = np.array([[125.0, 0, 80.0], [0, 125.0, 60.0], [0, 0, 1]])
     K_C = np.array([[110.0, 0, 80.0], [0, 110.0, 60.0], [0, 0, 1]])
@@ -158,7 +154,7 @@ def test_colour_and_depth_that_are_not_registered(room, room_views, room_poses):
         load_depth=lambda i: depths[i].depth.astype(np.float32),
     )
     report = check_capture(capture)
-    assert "colour and depth are not registered" in report.mistake
+    assert "color and depth are not registered" in report.mistake
     assert report.color is not None
     assert report.color.focal_length == pytest.approx(110, rel=0.02)
     np.testing.assert_allclose(report.color.p_DC, p_DC[:2], atol=0.015)
@@ -186,7 +182,6 @@ def test_masked_pixels_have_no_part_in_the_comparison(room, masked_room):
 
 
 def test_inaccurate_poses(room):
-    """Poses off at random disagree, and no mistake is made up."""
     rng = np.random.default_rng(0)
     off = [X @ RigidTransform(rng.normal(0, 0.3, 3)) for X in room().X_WCs]
     report = check_capture(room(X_WCs=off))
@@ -194,7 +189,6 @@ def test_inaccurate_poses(room):
 
 
 def test_poses_that_are_all_the_same(room):
-    """A file of poses that says one pose of all frames is named for that."""
     capture = room()
     report = check_capture(room(X_WCs=[capture.X_WCs[0]] * len(capture)))
     assert not report.agrees
@@ -202,7 +196,6 @@ def test_poses_that_are_all_the_same(room):
 
 
 def test_doubts(room):
-    """Who only wants to go on is told in one sentence, where there is anything to tell."""
     assert doubts(room()) == () == doubts(room(load_depth=no_depth))
     [doubt] = doubts(room(**scaled(5)(room)))
     assert "does not agree with itself, most likely depth is 5 times too large" in doubt
@@ -224,7 +217,6 @@ def test_too_little_depth_is_refused(room):
 
 
 def test_command(tmp_path, write_room, capsys):
-    """`splatpilot capture check` prints the table and ends with 0, or with 1 and the mistake."""
     poses = [((0.8 + 0.3 * i, 0.1 * i, -1.2), 0.1 * i - 0.3, -0.05 * i) for i in range(8)]
     path = write_room(tmp_path / "room", width=160, height=120, poses=poses)
     assert main(["capture", "check", str(path)]) == 0
@@ -237,7 +229,7 @@ def test_command(tmp_path, write_room, capsys):
     assert "quaternions are w x y z, read as x y z w" in captured.err
     assert captured.out.rstrip().endswith("does not agree")
     assert main(["capture", "check", str(path), "--set", "pairs=0"]) == 1
-    assert "pairs is 0" in capsys.readouterr().err
+    assert "pairs must be in [1, 1000], got 0" in capsys.readouterr().err
 
 
 @pytest.mark.skipif("SPLATPILOT_DATA" not in os.environ, reason="SPLATPILOT_DATA is not set")
@@ -247,11 +239,10 @@ def test_command(tmp_path, write_room, capsys):
         ("tartanair/hospital", [], (0.0005, 0.001), ""),
         ("redkitchen", [], (0.002, 0.01), ""),
         ("redkitchen", ["intrinsics=[585, 585, 320, 240]", "p_DC=[0, 0, 0]"], (0.002, 0.01),
-         r"not registered: a colour camera of focal length 52\d px at \(\+0\.0[12]"),
+         r"not registered: a color camera of focal length 52\d px at \(\+0\.0[12]"),
     ],
 )  # fmt: skip
 def test_real_captures(name, overrides, error, mistake):
-    """The real captures agree, and redkitchen read as registered is found out, with its numbers."""
     config = load_config(CaptureConfig(), overrides=overrides)
     report = check_capture(read_capture(Path(os.environ["SPLATPILOT_DATA"]) / name, config))
     assert report.agreement is not None and error[0] < report.agreement.error < error[1]

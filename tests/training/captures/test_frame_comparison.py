@@ -22,8 +22,6 @@ def seen(room_views):
 
 
 def test_true_poses_leave_no_difference(seen, room_poses):
-    """In the true poses depth agrees to what bilinear interpolation leaves, and contrast nearly,
-    though one image is exposed by two thirds."""
     X_WC, X_WC_other = room_poses[2:4]
     found = compare_frames(seen(X_WC), seen(X_WC_other, 0.67), X_WC, X_WC_other, 0.04)
     assert found is not None
@@ -34,7 +32,6 @@ def test_true_poses_leave_no_difference(seen, room_poses):
 
 @pytest.mark.parametrize("number", range(12))
 def test_derivatives(seen, room_poses, number):
-    """Differences change with either pose as the derivatives say."""
     X_WC, X_WC_other = room_poses[5:7]
     frames = seen(X_WC), seen(X_WC_other)
 
@@ -60,8 +57,6 @@ def test_derivatives(seen, room_poses, number):
 
 
 def test_edges_and_holes_are_not_compared():
-    """What lies beside a hole, or before another surface, is not compared, nor the infinitely
-    far."""
     depth = np.full((48, 64), 2.0, np.float32)
     depth[:, 40:] = 3.0
     depth[20, 10] = 0
@@ -79,7 +74,6 @@ def test_edges_and_holes_are_not_compared():
 
 
 def test_too_few_in_common(seen, room_poses):
-    """Frames that look at different walls are not compared."""
     X_WC = room_poses[0]
     behind = X_WC @ RigidTransform(RotationMatrix.MakeYRotation(np.pi), [0, 0, 0])
     assert compare_frames(seen(X_WC), seen(behind), X_WC, behind, 0.08) is None

@@ -50,14 +50,12 @@ def write(tmp_path, K, room_views, room_poses, trace_rays):
 
 
 def test_room(write, shows_room):
-    """Camera axes are OpenGL's, depth is in thousandths."""
     capture = read_capture(write())
     assert capture.metric and capture.depth_camera is None
     shows_room(capture, color=0.5)
 
 
 def test_distortion_is_taken_out(write, K, shows_room):
-    """Images and depth of a distorted camera become those of a pinhole."""
     v, u = np.mgrid[0:48, 0:64] + 0.5
     pixels = np.stack([u, v], axis=-1).reshape(-1, 1, 2)
     coefficients = np.array([DISTORTION[name] for name in ("k1", "k2", "p1", "p2")])
@@ -75,7 +73,6 @@ def test_distortion_is_taken_out(write, K, shows_room):
 
 
 def test_edges_of_undistorted_images_are_not_dark(write, K):
-    """At the edges of the pinhole's images is what the lens sees there, and nothing black."""
     path = write(camera_model="OPENCV", k1=0.02)
     for i in range(10):
         cv2.imwrite(str(path / f"{i:02d}.png"), np.full((48, 64, 3), 200, np.uint8))
@@ -83,7 +80,6 @@ def test_edges_of_undistorted_images_are_not_dark(write, K):
 
 
 def test_fisheye(write, K, shows_room):
-    """An equidistant fisheye becomes a pinhole."""
     v, u = np.mgrid[0:48, 0:64] + 0.5
     bent = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]], axis=-1)
     theta = np.linalg.norm(bent, axis=-1, keepdims=True)
@@ -92,7 +88,6 @@ def test_fisheye(write, K, shows_room):
 
 
 def test_each_frame_may_have_its_camera(write, shows_room):
-    """Frames with intrinsics of their own are resampled into one pinhole."""
     path = write()
     content = json.loads((path / "transforms.json").read_text())
     for name in ("cx", "cy"):
@@ -109,7 +104,6 @@ def test_each_frame_may_have_its_camera(write, shows_room):
 
 
 def test_small_depth(write, shows_room, room_views, K):
-    """Depth of a lower resolution than the images is carried into their pixels."""
     path = write()
     for i, view in enumerate(room_views(np.diag([0.5, 0.5, 1]) @ K, 32, 24)):
         np.save(path / f"{i:02d}.npy", (1000 * view.depth).astype(np.float32))
@@ -119,7 +113,6 @@ def test_small_depth(write, shows_room, room_views, K):
 
 
 def test_depth_of_another_view_is_refused(write, room_views, K):
-    """Depth whose ratio of width to height is not the images' cannot show what they show."""
     path = write()
     for i in range(10):
         np.save(path / f"{i:02d}.npy", np.ones((24, 24), np.float32))
@@ -182,7 +175,7 @@ def test_frame_with_a_mask_of_another_size_is_left_out(write):
     path = write()
     cv2.imwrite(str(path / "mask.png"), np.ones((24, 32), np.uint8))
     capture = read_capture(change(path, frame_0={"mask_path": "mask.png"}))
-    assert len(capture) == 9 and "mask.png: 32x24 pixels" in capture.dropped[0]
+    assert len(capture) == 9 and "mask.png: must be of 64x48 pixels" in capture.dropped[0]
 
 
 @pytest.mark.parametrize(
@@ -268,7 +261,6 @@ def test_eccentric_principal_point_is_noted(write):
 
 
 def test_scale(write, room_poses):
-    """Without depth the scale is unknown, until two cameras' distance is given."""
     path = write(depth=False)
     capture = read_capture(path)
     assert not capture.metric and not capture.has_depth
@@ -283,7 +275,6 @@ def test_scale(write, room_poses):
 
 
 def test_points(write):
-    """Points of a PLY are read with their colours."""
     path = write(ply_file_path="points.ply")
     rows = [(1.0, 2.0, 3.0, 255, 0, 51)]
     kinds = [("x", "f4"), ("y", "f4"), ("z", "f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
@@ -299,41 +290,56 @@ def test_points(write):
     ("change", "message"),
     [
         ({"camera_model": "EQUIRECTANGULAR"}, "camera_model must be .*, got EQUIRECTANGULAR"),
-        ({"fl_x": "wide"}, r"transforms\.json: the camera of 00\.png is not described"),
+        ({"fl_x": "wide"}, r"transforms\.json: invalid camera of 00\.png"),
         ({"frames": 3}, r"transforms\.json: not nerfstudio's format"),
         ({"frames": [{"file_path": "00.png"}]}, r"transforms\.json: .*transform_matrix"),
-        ({"ply_file_path": "00.png"}, r"00\.png: not a PLY of coloured points"),
-        ({"ply_file_path": 3}, r"transforms\.json: .*3 stands where a path belongs"),
-        ({"depth_unit_scale_factor": 0}, r"transforms\.json: .*depth_unit_scale_factor is 0"),
+        ({"ply_file_path": "00.png"}, r"00\.png: not a PLY of colored points"),
+        ({"ply_file_path": 3}, r"transforms\.json: not nerfstudio's format"),
+        (
+            {"depth_unit_scale_factor": 0},
+            r"transforms\.json: .*depth_unit_scale_factor must be .* got 0",
+        ),
         ({"depth_unit_scale_factor": None}, r"transforms\.json: not nerfstudio's format"),
-        ({"depth_unit_scale_factor": -1}, r"transforms\.json: .*depth_unit_scale_factor is -1"),
-        ({"depth_unit_scale_factor": np.nan}, r"transforms\.json: .*scale_factor is nan"),
-        ({"w": np.inf}, r"transforms\.json: the camera of 00\.png .*infinity"),
-        ({"w": 10**9}, r"transforms\.json: the camera of .*images of 1000000000x48 pixels"),
-        ({"fl_x": -40}, r"transforms\.json: the camera of 00\.png .*focal lengths of \[-40"),
-        ({"fl_x": 1e300}, r"transforms\.json: the camera of 00\.png .*focal lengths of \[1e\+300"),
-        ({"fl_x": np.nan}, r"transforms\.json: the camera of 00\.png .*focal lengths of \[nan"),
+        (
+            {"depth_unit_scale_factor": -1},
+            r"transforms\.json: .*depth_unit_scale_factor must be .* got -1",
+        ),
+        (
+            {"depth_unit_scale_factor": np.nan},
+            r"transforms\.json: .*scale_factor must be .* got nan",
+        ),
+        ({"w": np.inf}, r"transforms\.json: invalid camera of 00\.png .*infinity"),
+        (
+            {"w": 10**9},
+            r"transforms\.json: invalid camera of .*image size must be .* got 1000000000x48",
+        ),
+        (
+            {"fl_x": -40},
+            r"transforms\.json: invalid camera of 00\.png .*focal lengths must be .* got \[-40",
+        ),
+        (
+            {"fl_x": 1e300},
+            r"transforms\.json: invalid camera of 00\.png .*focal lengths must be .* got \[1e\+300",
+        ),
+        (
+            {"fl_x": np.nan},
+            r"transforms\.json: invalid camera of 00\.png .*focal lengths must be .* got \[nan",
+        ),
         ({"cx": 64.5}, r"principal point must be in the image of 64x48 px, got \[64\.5"),
         ({"test_filenames": ["99.png"]}, r"its split names 99\.png"),
         ({"train_filenames": []}, "its split leaves no frame"),
-        ({"cx": np.nan}, r"transforms\.json: the camera of 00\.png .*principal point .* got \[nan"),
-        ({"k1": np.nan}, r"transforms\.json: the camera of 00\.png .*distortion"),
+        (
+            {"cx": np.nan},
+            r"transforms\.json: invalid camera of 00\.png .*principal point .* got \[nan",
+        ),
+        ({"k1": np.nan}, r"transforms\.json: invalid camera of 00\.png .*distortion"),
     ],
 )
 def test_bad_transforms(write, change, message):
-    """What is wrong in the file is said."""
     path = write()
     content = json.loads((path / "transforms.json").read_text()) | change
     (path / "transforms.json").write_text(json.dumps(content))
     with pytest.raises(ValueError, match=message):
-        read_capture(path)
-
-
-def test_nesting_without_end(write):
-    """Brackets in brackets are refused by file, however many."""
-    path = write()
-    (path / "transforms.json").write_text('{"frames": ' + "[" * 10**5 + "]" * 10**5 + "}")
-    with pytest.raises(ValueError, match=r"transforms\.json: not nerfstudio's format"):
         read_capture(path)
 
 
@@ -348,7 +354,6 @@ def test_nesting_without_end(write):
     ],
 )
 def test_bad_depth_drops_its_frame(write, depth):
-    """A depth that is none, or whose header claims what is not there, drops its own frame only."""
     path = write()
     if isinstance(depth, bytes):
         (path / "03.npy").write_bytes(depth)
@@ -359,21 +364,9 @@ def test_bad_depth_drops_its_frame(write, depth):
 
 
 def test_bad_matrix_is_left_out(write):
-    """A frame whose matrix is none is left out and named."""
     path = write()
     content = json.loads((path / "transforms.json").read_text())
     content["frames"][2]["transform_matrix"] = [[1, 2], [3, 4]]
     (path / "transforms.json").write_text(json.dumps(content))
     capture = read_capture(path)
     assert len(capture) == 9 and "frame 2 (./02.png): transform_matrix" in capture.dropped[0]
-
-
-def test_depth_name_that_no_file_system_takes(write):
-    """A frame whose depth has a name of 5000 letters is left out, and told shortened."""
-    path = write()
-    content = json.loads((path / "transforms.json").read_text())
-    content["frames"][0]["depth_file_path"] = "n" * 5000
-    (path / "transforms.json").write_text(json.dumps(content))
-    capture = read_capture(path)
-    assert len(capture) == 9
-    assert "File name too long" in capture.dropped[0] and len(capture.dropped[0]) < 1000

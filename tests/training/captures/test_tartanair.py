@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from splatpilot.training.captures.tartanair import (
-    is_tartanair_v1,
-    is_tartanair_v2,
     read_tartanair_v1,
     read_tartanair_v2,
+    recognizes_tartanair_v1,
+    recognizes_tartanair_v2,
 )
 
 
@@ -22,7 +22,6 @@ def back_projected(frame) -> np.ndarray:
 
 
 def test_world_is_north_west_up(tmp_path, write_room, room_in_W):
-    """Depth back-projects onto the walls of the room, mirrored from north-east-down to z up."""
     capture = read_tartanair_v1(write_room(tmp_path / "room"))
     assert (len(capture), capture.width, capture.height, capture.name) == (12, 64, 48, "room")
     lower, upper = room_in_W
@@ -34,7 +33,6 @@ def test_world_is_north_west_up(tmp_path, write_room, room_in_W):
 
 
 def test_first_pose_by_hand(tmp_path, write_room):
-    """A level camera that looks north looks along x, with the image's right along -y."""
     capture = read_tartanair_v1(write_room(tmp_path / "room"))
     X_WC = capture.frame(0).X_WC
     np.testing.assert_allclose(X_WC.translation(), [0.8, 0, 1.1], atol=1e-9)
@@ -44,7 +42,6 @@ def test_first_pose_by_hand(tmp_path, write_room):
 
 
 def test_colors_belong_to_the_points(tmp_path, write_room, color_of_room):
-    """The RGB of each pixel is that of the point its depth leads to."""
     capture = read_tartanair_v1(write_room(tmp_path / "room"))
     frame = capture.frame(5)
     p_N = back_projected(frame) * [1, -1, -1]
@@ -53,13 +50,11 @@ def test_colors_belong_to_the_points(tmp_path, write_room, color_of_room):
 
 
 def test_intrinsics_scale_with_the_image(tmp_path, write_room):
-    """The field of view is 90 degrees at every size."""
     capture = read_tartanair_v1(write_room(tmp_path / "room", width=80, height=60))
     np.testing.assert_array_equal(capture.K, [[40, 0, 40], [0, 40, 30], [0, 0, 1]])
 
 
 def test_frames_are_loaded_when_asked_for(tmp_path, write_room):
-    """Opening a capture decodes nothing; what is damaged since then fails when it is loaded."""
     room = write_room(tmp_path / "room")
     bad = room / "image_left" / "000007_left.png"
     capture = read_tartanair_v1(room)
@@ -72,7 +67,6 @@ def test_frames_are_loaded_when_asked_for(tmp_path, write_room):
 
 
 def test_invalid_depth_is_unknown(tmp_path, write_room):
-    """NaN and negative depths become 0, unknown; infinite ones stay."""
     room = write_room(tmp_path / "room")
     file = room / "depth_left" / "000000_left_depth.npy"
     depth = np.load(file)
@@ -85,22 +79,19 @@ def test_invalid_depth_is_unknown(tmp_path, write_room):
 
 @pytest.mark.parametrize("part", ["image_left", "depth_left", "pose_left.txt"])
 def test_missing_part(tmp_path, write_room, part):
-    """A missing folder or pose file is named, with the layout that is needed."""
     room = write_room(tmp_path / "room")
     (room / part).rename(room / "elsewhere")
-    with pytest.raises(FileNotFoundError, match=rf"{part}: does not exist; a TartanAir V1"):
+    with pytest.raises(FileNotFoundError, match=part):
         read_tartanair_v1(room)
 
 
 def test_missing_folder(tmp_path):
-    """A folder that is not there is named."""
-    with pytest.raises(FileNotFoundError, match="nowhere: does not exist"):
+    with pytest.raises(FileNotFoundError, match=r"No such folder: .*nowhere"):
         read_tartanair_v1(tmp_path / "nowhere")
-    assert not is_tartanair_v1(tmp_path / "nowhere")
+    assert not recognizes_tartanair_v1(tmp_path / "nowhere")
 
 
 def test_empty_image_folder(tmp_path, write_room):
-    """A folder without images is an error."""
     room = write_room(tmp_path / "room")
     for file in (room / "image_left").iterdir():
         file.unlink()
@@ -109,31 +100,28 @@ def test_empty_image_folder(tmp_path, write_room):
 
 
 def test_missing_file_of_a_frame(tmp_path, write_room):
-    """A frame that lacks its image or its depth is left out, and the others keep their poses."""
     room = write_room(tmp_path / "room")
     whole = read_tartanair_v1(room)
     (room / "image_left" / "000003_left.png").unlink()
     (room / "depth_left" / "000008_left_depth.npy").unlink()
     capture = read_tartanair_v1(room)
     assert len(capture) == 10 and len(capture.dropped) == 2
-    assert "000003_left.png: the file is missing" in capture.dropped[0]
-    assert "000008_left_depth.npy: the file is missing" in capture.dropped[1]
+    assert "000003_left.png" in capture.dropped[0]
+    assert "000008_left_depth.npy" in capture.dropped[1]
     assert capture.frame_names[3] == "000004_left.png"
     assert capture.X_WCs[3].IsExactlyEqualTo(whole.X_WCs[4])
 
 
 def test_extra_depth(tmp_path, write_room):
-    """A depth without image and pose is left out."""
     room = write_room(tmp_path / "room")
     depth = room / "depth_left" / "000012_left_depth.npy"
     depth.write_bytes((room / "depth_left" / "000011_left_depth.npy").read_bytes())
     capture = read_tartanair_v1(room)
-    assert len(capture) == 12 and "000012_left_depth.npy: there is no image" in capture.dropped[0]
+    assert len(capture) == 12 and "000012_left_depth.npy: has no image" in capture.dropped[0]
 
 
 @pytest.mark.parametrize("change", [lambda lines: lines[:-1], lambda lines: [*lines, lines[0]]])
 def test_other_number_of_poses(tmp_path, write_room, change):
-    """With more or fewer poses than frames nobody can tell which is whose: an error with counts."""
     room = write_room(tmp_path / "room")
     lines = change((room / "pose_left.txt").read_text().splitlines())
     (room / "pose_left.txt").write_text("\n".join(lines))
@@ -149,10 +137,9 @@ def spoilt_line(room, line):
 
 @pytest.mark.parametrize("line", ["0 0 0 0 0 0", "a b c d e f g", ""])
 def test_line_that_is_no_pose(tmp_path, write_room, line):
-    """A line that is not seven numbers is an error that names file and line."""
     room = write_room(tmp_path / "room")
     spoilt_line(room, line)
-    with pytest.raises(ValueError, match=r"pose_left\.txt, line 5: .*is no pose; seven numbers"):
+    with pytest.raises(ValueError, match=r"pose_left\.txt, line 5 must be a pose tx ty tz"):
         read_tartanair_v1(room)
 
 
@@ -160,14 +147,13 @@ def test_line_that_is_no_pose(tmp_path, write_room, line):
     ("line", "message"),
     [
         ("0 0 nan 0 0 0 1", "the pose is not finite"),
-        ("0 0 0 0 0 0 1.1", "the quaternion has the length 1.1, 1 within 0.001"),
-        ("0 0 0 0 0 0 0", "the quaternion has the length 0, 1 within 0.001"),
+        ("0 0 0 0 0 0 1.1", "the quaternion must be 1 +- 0.001, got 1.1"),
+        ("0 0 0 0 0 0 0", "the quaternion must be 1 +- 0.001, got 0"),
         ("0 0 0 nan 0 0 1", "the pose is not finite"),
-        ("3e8 0 0 0 0 0 1", "more than 1e+08 m away"),
+        ("3e8 0 0 0 0 0 1", "must be within 1e+08 m"),
     ],
 )
 def test_absurd_pose(tmp_path, write_room, line, message):
-    """A frame whose pose cannot be one is left out and named by line."""
     room = write_room(tmp_path / "room")
     spoilt_line(room, line)
     capture = read_tartanair_v1(room)
@@ -178,7 +164,6 @@ def test_absurd_pose(tmp_path, write_room, line, message):
 @pytest.mark.parametrize("file", ["image_left/000002_left.png", "depth_left/000002_left_depth.npy"])
 @pytest.mark.parametrize("keep", [0, 20])
 def test_empty_or_cut_file(tmp_path, write_room, file, keep):
-    """A frame whose file is empty or cut short is left out on opening."""
     room = write_room(tmp_path / "room")
     (room / file).write_bytes((room / file).read_bytes()[:keep])
     capture = read_tartanair_v1(room)
@@ -190,18 +175,21 @@ def test_empty_or_cut_file(tmp_path, write_room, file, keep):
 
 
 def test_other_size(tmp_path, write_room):
-    """Frames of another size than most are left out with both sizes."""
     room = write_room(tmp_path / "room")
     np.save(room / "depth_left" / "000001_left_depth.npy", np.ones((24, 32), np.float32))
     cv2.imwrite(str(room / "image_left" / "000000_left.png"), np.zeros((24, 32, 3), np.uint8))
     capture = read_tartanair_v1(room)
     assert (capture.width, capture.height, len(capture)) == (64, 48, 10)
-    assert "000000_left.png: 32x24 pixels where 64x48 are expected" in capture.dropped[0]
-    assert "000001_left_depth.npy: 32x24 pixels where 64x48 are expected" in capture.dropped[1]
+    assert (
+        "000000_left.png: must be of 64x48 pixels, as the others, got 32x24" in capture.dropped[0]
+    )
+    assert (
+        "000001_left_depth.npy: must be of 64x48 pixels, as the others, got 32x24"
+        in capture.dropped[1]
+    )
 
 
 def test_v2(tmp_path, write_room):
-    """A V2 sequence, its depth in the bytes of four channels, is the same capture as in V1."""
     room = write_room(tmp_path / "room")
     v2 = tmp_path / "P000"
     (v2 / "image_lcam_front").mkdir(parents=True)
@@ -216,7 +204,7 @@ def test_v2(tmp_path, write_room):
         cv2.imwrite(str(v2 / "depth_lcam_front" / f"{i:06d}_lcam_front_depth.png"), packed)
     (v2 / "pose_left.txt").rename(room / "pose_left.txt")
     one, two = read_tartanair_v1(room), read_tartanair_v2(v2)
-    assert is_tartanair_v2(v2) and not is_tartanair_v1(v2) and len(two) == 12
+    assert recognizes_tartanair_v2(v2) and not recognizes_tartanair_v1(v2) and len(two) == 12
     for i in (0, 7):
         np.testing.assert_array_equal(one.frame(i).image, two.frame(i).image)
         np.testing.assert_array_equal(one.frame(i).depth, two.frame(i).depth)
@@ -226,7 +214,6 @@ def test_v2(tmp_path, write_room):
 
 @pytest.mark.skipif("SPLATPILOT_DATA" not in os.environ, reason="SPLATPILOT_DATA is not set")
 def test_hospital_reprojects_onto_itself():
-    """In the real sequence, depth carried from frame to frame agrees to a tenth of a percent."""
     capture = read_tartanair_v1(Path(os.environ["SPLATPILOT_DATA"]) / "tartanair" / "hospital")
     assert len(capture) == 71
     errors = []

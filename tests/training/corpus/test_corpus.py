@@ -87,8 +87,6 @@ def test_what_is_missing_is_named(folder, tmp_path):
 
 
 def test_every_byte_is_checked(folder):
-    """Sound as gathered; a shard that the ledger tells of and that is gone is named, and so are
-    images of another size than the configuration's."""
     Corpus(folder).verify()
     config = (folder / "corpus.yaml").read_text()
     (folder / "corpus.yaml").write_text(config.replace("width: 32", "width: 80"))

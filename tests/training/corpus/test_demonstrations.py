@@ -142,7 +142,6 @@ def test_trajectories_that_touch_something_are_no_demonstrations(labeller):
 
 
 def test_a_look_changes_colours_and_not_depth(world, labeller):
-    """With another appearance the same states have other colours and the same depth."""
     _, plain = see(world, labeller)
     config = replace(CONFIG, appearance=1.0, perturbation=PerturbationConfig(copies=0))
     _, other = see(world, labeller, config=config)

@@ -26,17 +26,17 @@ def test_interrupted_and_run_again_leaves_the_same_bytes(small, gathered, tmp_pa
     """Stopped within the second world, with a folder half written, the same command ends in the
     files that an uninterrupted run wrote; so does adding a world to a corpus of one."""
     whole = all_bytes(gathered.shards[0].path.parents[1])
-    write_shard = make.gather_world.__globals__["write_shard"]
+    write_shard = make.collect_world.__globals__["write_shard"]
 
     def killed(path, *args, **kwargs):
         (path.parent / f".{path.name}.1.partial").mkdir()
         raise KeyboardInterrupt
 
     make.run(config=small, out=tmp_path, worlds=1, jobs=1)
-    monkeypatch.setitem(make.gather_world.__globals__, "write_shard", killed)
+    monkeypatch.setitem(make.collect_world.__globals__, "write_shard", killed)
     with pytest.raises(KeyboardInterrupt):
         make.run(config=small, out=tmp_path, worlds=2, jobs=1)
-    monkeypatch.setitem(make.gather_world.__globals__, "write_shard", write_shard)
+    monkeypatch.setitem(make.collect_world.__globals__, "write_shard", write_shard)
     make.run(config=small, out=tmp_path, worlds=2, jobs=1)
     assert all_bytes(tmp_path) == whole
 
@@ -47,8 +47,8 @@ def test_what_is_damaged_is_gathered_again(small, gathered, tmp_path, monkeypatc
     folder = gathered.shards[0].path.parents[1]
     out = shutil.copytree(folder, tmp_path / "corpus")
     asked = []
-    gather = make.gather_world
-    monkeypatch.setattr(make, "gather_world", lambda *a: (asked.append(a[2]), gather(*a)))
+    gather = make.collect_world
+    monkeypatch.setattr(make, "collect_world", lambda *a: (asked.append(a[2]), gather(*a)))
     make.run(config=small, out=out, worlds=2, jobs=1)
     assert asked == []
     depth = out / "shards" / gathered.shards[1].path.name / "depth.npy"
@@ -130,7 +130,7 @@ def test_worlds_that_cannot_be_flown_are_left_out(small, gathered, tmp_path, mon
             raise InfeasibleFlightError("no way")
         shutil.copytree(gathered.shards[0].path.parents[1], folder, dirs_exist_ok=True)
 
-    monkeypatch.setattr(make, "gather_world", gather)
+    monkeypatch.setattr(make, "collect_world", gather)
     make.run(config=small, out=tmp_path, worlds=2, jobs=1)
     assert "world 0 is left out: no way" in "".join(capsys.readouterr())
 
@@ -138,14 +138,14 @@ def test_worlds_that_cannot_be_flown_are_left_out(small, gathered, tmp_path, mon
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("appearance=1.5", "appearance is 1.5"),
-        ("flights=0", "flights is 0"),
+        ("appearance=1.5", r"appearance must be in \[0, 1\], got 1.5"),
+        ("flights=0", "flights must be .*, got 0"),
         ("seed=1000", "seed must be .* got 1000"),
-        ("expert.period=0.8", "expert.period is 0.8"),
+        ("expert.period=0.8", "expert.period must be .*, got 0.8"),
         ("expert.policy=nobody", "no policy 'nobody'"),
-        ("perturbation.distance=-1", "perturbation.distance is -1"),
-        ("perturbation.copies=-1", "perturbation.copies is -1"),
-        ("worlds.kinds=[R13]", "R13, whose world is not generated"),
+        ("perturbation.distance=-1", "perturbation.distance must be .*, got -1"),
+        ("perturbation.copies=-1", "perturbation.copies must be .*, got -1"),
+        ("worlds.kinds=[R13]", "worlds.kinds must be of generated worlds, got R13"),
     ],
 )
 def test_values_out_of_range_are_named(small, tmp_path, override, message):
@@ -198,7 +198,6 @@ def test_what_an_interruption_left_of_a_world_is_not_used(small, gathered, tmp_p
 
 
 def test_another_corpus_is_not_added_to(small, gathered):
-    """A folder keeps to the configuration that it was begun with."""
     folder = gathered.shards[0].path.parents[1]
     other = load_config(small, overrides=["flights=3"])
     with pytest.raises(ValueError, match="another configuration"):

@@ -74,8 +74,7 @@ def test_same_seed_draws_the_same_states():
 
 
 def test_a_place_without_room_is_named():
-    """Nothing can be drawn where nothing has room."""
     labeller = labeller_of()
     labeller.toa = replace(labeller.toa, reachable=np.zeros_like(labeller.toa.reachable))
-    with pytest.raises(InfeasibleFlightError, match="no place from which a way leads"):
+    with pytest.raises(InfeasibleFlightError, match="no position from which a path leads"):
         draw_off_path(labeller, 5, 2.0, np.random.default_rng(0))

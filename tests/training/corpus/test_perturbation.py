@@ -40,7 +40,6 @@ def test_yaw_turns_about_the_vertical():
 
 
 def test_tilt_keeps_its_limit():
-    """With tilt alone the body's z axis leans by no more than both angles together."""
     config = PerturbationConfig(yaw=0.0, tilt=0.1)
     rng = np.random.default_rng(2)
     z = [perturbed(X_WB, config, 1.0, rng).rotation().matrix()[:, 2] for _ in range(200)]

@@ -154,7 +154,6 @@ def test_the_same_flights_add_nothing_twice(folder, gathered):
 
 
 def test_flights_elsewhere_are_refused(folder, gathered):
-    """A flight in a world that the corpus does not have is named."""
     flight = straight_flight(gathered.worlds[0])
     stray = StudentFlight("P99-7", flight.p_WG, flight.times, flight.states, flight.clearances)
     with pytest.raises(ValueError, match="not gathered in the world 'P99-7'"):

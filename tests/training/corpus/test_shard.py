@@ -139,7 +139,6 @@ def test_descriptions_that_cannot_be(tmp_path, change, message):
 
 
 def test_a_description_of_more_than_there_is(tmp_path):
-    """The number of samples that is said must be that of the arrays."""
     path = write(tmp_path / "a", random_samples(3))
     about = json.loads((path / "shard.json").read_text())
     (path / "shard.json").write_text(json.dumps(about | {"samples": 5}))

@@ -6,7 +6,7 @@ import torch
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
-from splatpilot.systems.policies.agile_autonomy_inference import FOV_X
+from splatpilot.systems.policies.agile_autonomy import FOV_X
 from splatpilot.systems.sensing.latency import DelayedPose, FrameTimes
 from splatpilot.systems.sensing.noise import ObservationNoise
 from splatpilot.training.policies.evaluation import (
@@ -24,12 +24,7 @@ from splatpilot.training.policies.train_agile_autonomy import (
 from splatpilot.training.policies.training_worlds import WorldSelection, training_worlds
 from splatpilot.training.policies.vehicles import (
     BodyRate,
-    Frames,
-    delayed,
-    draw_frames,
-    frame_ages,
-    remember,
-    remembered,
+    History,
 )
 
 PERIOD = 1.0 / 15.0  # [s]
@@ -70,48 +65,49 @@ def test_past_is_what_delayed_pose_gives(noise):
     context = system.GetMyContextFromRoot(simulator.get_mutable_context())
 
     vehicles = [BodyRate(torch.tensor(state)[None], torch.zeros(1, 3)) for state in states]
-    past = remembered(vehicles[0], noise, 1.0 / PERIOD)
-    frames = same_frames(times)
+    history = begin(vehicles[0], noise, times)
     for step, vehicle in enumerate(vehicles):
         simulator.AdvanceTo(step * PERIOD)
         X_WB = system.GetOutputPort("pose").Eval(context)
-        past = remember(past, vehicle)
+        history = history.push(vehicle)
         now = torch.tensor([step * PERIOD], dtype=torch.float64)
-        then = delayed(past, frame_ages(frames, noise, now), 1.0 / PERIOD)
+        then = history.seen(noise, 1.0 / PERIOD, now)
         np.testing.assert_allclose(then.p[0], X_WB.translation(), atol=1e-9)
         np.testing.assert_allclose(then.attitude()[0], X_WB.rotation().matrix(), atol=1e-9)
 
 
-def same_frames(times: FrameTimes) -> Frames:
+def begin(vehicle: BodyRate, noise: ObservationNoise, times: FrameTimes) -> History:
+    """The history of a vehicle whose images have these times."""
     numbers = times.delays, times.rate or 0.0, times.phase
-    return Frames(*(torch.tensor(np.array(x), dtype=torch.float64)[None] for x in numbers))
+    tensors = (torch.tensor(np.array(x), dtype=torch.float64)[None] for x in numbers)
+    history = History.start(vehicle, noise, 1.0 / PERIOD, torch.Generator())
+    return History(history.past, *tensors)
 
 
 def test_frames_are_as_old_in_training_as_in_flight():
-    """At any time the last image that has come is of the same age in torch as in `FrameTimes`."""
     now = torch.tensor([0.371], dtype=torch.float64)
+    hovering = BodyRate.hovering(torch.zeros(1, 3), torch.zeros(1))
     for seed in range(20):
         times = FrameTimes.draw(STREAM, seed)
+        history = begin(hovering, STREAM, times)
         for step in range(40):
-            age = frame_ages(same_frames(times), STREAM, step * now)
+            age = history.ages(STREAM, step * now)
             assert age.item() == pytest.approx(times.age(step * now.item()), abs=1e-9)
 
 
-def test_frames_are_drawn_as_asked_for():
-    """Rates, delays and losses have their ranges and parts, and no age exceeds what vehicles
-    remember."""
-    generator = torch.Generator().manual_seed(0)
-    frames = draw_frames(STREAM, 2000, generator)
-    assert frames.rate.min() >= 10.0 and frames.rate.max() <= 30.0
-    assert float(frames.rate.mean()) == pytest.approx(20.0, abs=0.5)
-    came = frames.delays.isfinite()
+def test_frames_have_their_ranges():
+    hovering = BodyRate.hovering(torch.zeros(2000, 3), torch.zeros(2000))
+    history = History.start(hovering, STREAM, 15.0, torch.Generator().manual_seed(0))
+    rate, delays = history.frame_rate, history.delays
+    assert rate.min() >= 10.0 and rate.max() <= 30.0
+    assert float(rate.mean()) == pytest.approx(20.0, abs=0.5)
+    came = delays.isfinite()
     assert float((~came).float().mean()) == pytest.approx(0.2, abs=0.005)
-    assert frames.delays.min() >= 0.05 and frames.delays[came].max() <= 0.0901
-    assert float(frames.delays[came].mean()) == pytest.approx(0.07, abs=0.001)
-    ages = torch.stack([frame_ages(frames, STREAM, torch.full((2000,), t / 7)) for t in range(99)])
+    assert delays.min() >= 0.05 and delays[came].max() <= 0.0901
+    assert float(delays[came].mean()) == pytest.approx(0.07, abs=0.001)
+    ages = torch.stack([history.ages(STREAM, torch.full((2000,), t / 7)) for t in range(99)])
     assert ages.min() >= 0.05
-    some = BodyRate.hovering(torch.zeros(1, 3), torch.zeros(1))
-    assert (ages.max() * 15).ceil() < remembered(some, STREAM, 15.0).state.shape[1]
+    assert (ages.max() * 15).ceil() < history.past.state.shape[1]
 
 
 class Watcher:
@@ -170,7 +166,6 @@ def test_measured_flights_see_late_images():
 
 
 def test_imitation_learns_from_late_images():
-    """The images that the student imitates with are of two steps before what the expert knew."""
     config = AgileAutonomyTraining(
         worlds=SELECTION, environments=1, steps=6, ask_every=1, noise=TWO_STEPS
     )

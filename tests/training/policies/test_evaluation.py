@@ -3,10 +3,16 @@
 import pytest
 import torch
 
+from splatpilot.training.policies.augmentation import depth_noise
 from splatpilot.training.policies.evaluation import FlightConditions, Outcomes, evaluate_agent
 from splatpilot.training.policies.ray_casting import PixelRays
-from splatpilot.training.policies.torch_observations import training_noise
-from splatpilot.training.policies.training_worlds import WorldSelection, validation_worlds
+from splatpilot.training.policies.rollouts import DifferentiableRollout, RolloutConfig
+from splatpilot.training.policies.train_diffaero import DiffAeroLearner, DiffAeroLoss
+from splatpilot.training.policies.training_worlds import (
+    WorldSelection,
+    training_worlds,
+    validation_worlds,
+)
 
 WORLDS = WorldSelection(kinds=["P01"], held_out=7)
 
@@ -34,14 +40,14 @@ def test_each_speed_is_flown_in_as_many_worlds():
     goes at its own, and the same seed draws the same."""
     agent = Straight()
     worlds = validation_worlds(WORLDS)
-    outcomes = evaluate_agent(agent, worlds, FlightConditions(), training_noise())
+    outcomes = evaluate_agent(agent, worlds, FlightConditions(), depth_noise())
     asked = agent.speeds[0]
     counts = [(asked == speed).sum().item() for speed in (2.0, 3.0, 4.0)]
     assert sorted(counts) == [2, 2, 3]
-    assert torch.equal(outcomes.wanted_speed, asked)
+    assert torch.equal(outcomes.nominal_speed, asked)
     assert outcomes.mean_speed[asked == 4.0].min() > outcomes.mean_speed[asked == 2.0].max()
     again = Straight()
-    evaluate_agent(again, worlds, FlightConditions(), training_noise())
+    evaluate_agent(again, worlds, FlightConditions(), depth_noise())
     assert torch.equal(again.speeds[0], asked)
 
 
@@ -49,13 +55,29 @@ def test_success_is_told_apart_by_speed_and_kind():
     """Four flights of two kinds and speeds, of which three arrive."""
     reached = torch.tensor([True, True, True, False])
     zero, speed = torch.zeros(4), torch.tensor([2.0, 2.0, 4.0, 4.0])
-    measures = Outcomes(reached, ~reached, zero, zero, zero, speed).measures(["P01", "P02"])
-    assert measures["success"] == 0.75 and measures["collisions"] == 0.25
-    assert (measures["2 m/s"], measures["4 m/s"]) == (1.0, 0.5)
-    assert (measures["P01"], measures["P02"]) == (1.0, 0.5)
+    metrics = Outcomes(reached, ~reached, zero, zero, zero, speed).metrics(["P01", "P02"])
+    assert metrics["success"] == 0.75 and metrics["collisions"] == 0.25
+    assert (metrics["2 m/s"], metrics["4 m/s"]) == (1.0, 0.5)
+    assert (metrics["P01"], metrics["P02"]) == (1.0, 0.5)
 
 
 @pytest.mark.parametrize("speeds", [[], [2.0, 0.0], [11.0]])
 def test_speeds_out_of_range_are_refused(speeds):
-    with pytest.raises(ValueError, match=r"validation.speeds is \[.*0.1 to 10 m/s"):
+    with pytest.raises(ValueError, match=r"FlightConditions.speeds must be .*, got \["):
         FlightConditions(speeds=speeds).validate()
+
+
+def test_gradients_are_finite_where_obstacles_are_missing():
+    worlds = training_worlds(WorldSelection(kinds=["P02"], count=1, voxel_size=0.5), seed=0)
+    learner = DiffAeroLearner(DiffAeroLoss())
+    rollout = DifferentiableRollout(
+        learner,
+        worlds.without_obstacles(),
+        RolloutConfig(environments=8, steps=6),
+        torch.Generator().manual_seed(0),
+    )
+    terms = rollout.losses()
+    torch.stack(list(terms.values())).sum().backward()
+    assert all(term.isfinite() for term in terms.values())
+    gradients = [weight.grad for weight in learner.network.parameters()]
+    assert all(g is not None and g.isfinite().all() and g.any() for g in gradients)

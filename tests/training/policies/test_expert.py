@@ -48,8 +48,6 @@ def test_flights_that_fail_are_no_demonstrations(world):
 
 
 def test_states_without_a_way_on_are_not_labelled():
-    """Of states on either side of a wall that closes off the goal, the one on its side alone has a
-    label."""
     wall = np.zeros((60, 20, 20), bool)
     wall[30] = True
     esdf = esdf_from_occupancy(wall, np.zeros_like(wall), np.zeros(3), 0.2)

@@ -5,7 +5,8 @@ import pytest
 import torch
 from pydrake.math import RigidTransform, RollPitchYaw
 
-from splatpilot.systems.policies import agile_autonomy_inference as agile_policy
+from splatpilot.systems.policies import agile_autonomy as agile_policy
+from splatpilot.systems.policies import base as policy_base
 from splatpilot.systems.policies import depthnav as depthnav_policy
 from splatpilot.systems.policies import diffaero as diffaero_policy
 from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK, DiffAeroTofConfig
@@ -13,8 +14,8 @@ from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS
 from splatpilot.systems.policies.recurrent_network import RecurrentNetwork
 from splatpilot.systems.policies.velocity import tracking_acceleration
 from splatpilot.systems.sensing.time_of_flight import sensor_of, time_of_flight_grid
+from splatpilot.systems.vehicle.state import QuadrotorState
 from splatpilot.training.policies.networks import TrajectoryModule
-from splatpilot.training.policies.torch_observations import Observation
 from splatpilot.training.policies.train_agile_autonomy import AgileAutonomyAgent
 from splatpilot.training.policies.train_depthnav import (
     DepthNavLearner,
@@ -26,7 +27,7 @@ from splatpilot.training.policies.train_diffaero import (
     DiffAeroLoss,
     DiffAeroTofLearner,
 )
-from splatpilot.training.policies.vehicles import BodyRate
+from splatpilot.training.policies.vehicles import BodyRate, Observation
 
 P_WG = np.array([9.0, 2.0, 1.5])
 
@@ -51,8 +52,9 @@ def observed(depth: np.ndarray, body: BodyRate) -> Observation:
     )
 
 
-def pose(state: np.ndarray) -> RigidTransform:
-    return RigidTransform(RollPitchYaw(0.3, -0.2, 2.0), state[:3])
+def flown(state: np.ndarray, image: np.ndarray) -> policy_base.Observation:
+    X_WB = RigidTransform(RollPitchYaw(0.3, -0.2, 2.0), state[:3])
+    return policy_base.Observation(1.0, X_WB, QuadrotorState.of(state), P_WG, image)
 
 
 def test_policy_of_time_of_flight_flies_as_it_was_trained():
@@ -72,9 +74,8 @@ def test_policy_of_time_of_flight_flies_as_it_was_trained():
         with torch.no_grad():
             a_cmd, _, memory = learner.decide(observed(depth, body), memory)
         grid = time_of_flight_grid(depth, sensor)
-        v_wanted, hidden = diffaero_policy.decide_velocity(
-            network, grid, pose(state), state[3:6], P_WG, 2.0, hidden
-        )
+        seen, limits = flown(state, grid), diffaero_policy.VELOCITY_LIMITS
+        v_wanted, hidden = diffaero_policy.decide(network, grid, seen, 2.0, hidden, limits)
         a_WB = tracking_acceleration(state[3:6], v_wanted)
         np.testing.assert_allclose(a_WB, a_cmd[0].numpy(), atol=2e-4)
         np.testing.assert_allclose(hidden, memory[0].numpy(), atol=1e-5)
@@ -86,9 +87,9 @@ def test_what_flies_is_what_was_trained(name):
     """For three images in a row the numpy policy decides and remembers what torch does."""
     torch.manual_seed(1)
     if name == "diffaero":
-        learner, decide = DiffAeroLearner(DiffAeroLoss()), diffaero_policy.decide_acceleration
+        learner = DiffAeroLearner(DiffAeroLoss())
     else:
-        learner, decide = DepthNavLearner(DepthNavLoss()), depthnav_policy.decide
+        learner = DepthNavLearner(DepthNavLoss())
     spec = learner.network.spec
     with torch.no_grad():
         learner.network.head.weight.mul_(10.0)
@@ -105,9 +106,11 @@ def test_what_flies_is_what_was_trained(name):
             a_cmd, heading, memory = learner.decide(observed(depth, body), memory)
         fine = depth.repeat(4, axis=0).repeat(4, axis=1)  # pooled back to the same
         if name == "diffaero":
-            a_WB, hidden = decide(network, fine, pose(state), state[3:6], P_WG, 2.0, hidden)
+            grid = diffaero_policy.depth_grid(fine)
+            a_WB, hidden = diffaero_policy.decide(network, grid, flown(state, fine), 2.0, hidden)
         else:
-            decision = decide(network, fine, pose(state), state[3:6], P_WG, 2.0, start_yaw, hidden)
+            seen = flown(state, fine)
+            decision = depthnav_policy.decide(network, seen, 2.0, start_yaw, hidden)
             a_WB, hidden = decision.a_WB, decision.memory
             assert heading is not None
             assert float(heading[0]) == pytest.approx(decision.heading, abs=1e-4)
@@ -127,14 +130,13 @@ def test_trajectories_that_fly_are_those_trained():
     depth = np.random.default_rng(0).uniform(0.0, 25.0, (24, 32)).astype(np.float32)
     with torch.no_grad():
         waypoints, costs = agent.hypotheses(observed(depth, body))
-    found = agile_policy.plan(network, 1.0, depth, pose(state), state, P_WG, 2.0, None)
+    found = agile_policy.plan(network, flown(state, depth), 2.0, None)
     assert found.waypoints_B.shape == (3, NUM_WAYPOINTS, 3)
     np.testing.assert_allclose(found.waypoints_B, waypoints[0].numpy(), atol=1e-4)
     np.testing.assert_allclose(found.costs, costs[0].numpy(), atol=1e-4)
 
 
 def test_quaternions_of_rotations():
-    """Rotations of all kinds, half turns included, give back their quaternion with w >= 0."""
     angles = [(0, 0, 0), (np.pi, 0, 0), (0, np.pi, 0), (0, 0, np.pi), (0.3, -2.0, 1.0), (3, 1, -2)]
     for roll, pitch, yaw in angles:
         rpy = RollPitchYaw(roll, pitch, yaw)

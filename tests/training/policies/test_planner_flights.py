@@ -78,8 +78,6 @@ def test_labels_keep_the_period_and_lead_on(world, flights):
 
 
 def test_flights_that_fail_are_no_demonstrations(starts, world, labeller, monkeypatch):
-    """A flight that takes too long ends as a timeout; one that begins against a surface ends at
-    once, as a collision."""
     monkeypatch.setattr(planner_flights, "TIMEOUT", 0.8)
     low = starts[0] * [1, 1, 0] + [0, 0, VEHICLE_RADIUS - 0.05]
     slow, low = fly_planner(np.stack([starts[0], low]), world, ExpertConfig(), labeller)

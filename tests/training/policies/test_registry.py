@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import torch
 
 from splatpilot import register_trainer
-from splatpilot.training.policies.trainer import Schedule
+from splatpilot.training.policies.trainer import Schedule, Trainer, TrainingConfig
 
 
 @dataclass(frozen=True)
@@ -23,41 +23,26 @@ class Spec:
 
 
 @dataclass
-class MeanTraining:
-    seed: int = 0
-    device: str = "cpu"
+class MeanTraining(TrainingConfig):
     target: float = 3.0
     schedule: Schedule = field(
         default_factory=lambda: Schedule(updates=200, learning_rate=0.1, weight_decay=0.0)
     )
 
-    def validate(self) -> None:
-        self.schedule.validate()
-
-
-class MeanTrainer:
+class MeanTrainer(Trainer):
     """Learns a number."""
 
     policy, spec = "mean", Spec()
 
     def __init__(self, config):
         self.network, self._target = torch.nn.Linear(1, 1, bias=False), config.target
-
-    def begin_update(self, update):
-        pass
+        self.generator = torch.Generator()
 
     def losses(self):
         return {"distance": (self.network.weight - self._target).square().sum()}
 
     def evaluate(self):
         return {"success": float((self.network.weight - self._target).abs().item() < 0.1)}
-
-    def state_dict(self):
-        return {}
-
-    def load_state_dict(self, state):
-        pass
-
 
 register_trainer("mean", MeanTraining, MeanTrainer)
 '''
@@ -76,7 +61,7 @@ def test_a_trainer_of_another_package_trains_by_the_same_verb(installed, tmp_pat
         point = f"[splatpilot.trainers]\n{name} = {name}:{name}Training\n"
         (about / "entry_points.txt").write_text(point)
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(TRAINERS, "_kinds", dict(TRAINERS._entries))
+    monkeypatch.setattr(TRAINERS, "_entries", dict(TRAINERS._entries))
     out = tmp_path / "out"
     trainer = name if installed else f"{name}:{name}Training"
     assert main(["train", trainer, "--out", str(out), "--set", "target=-2"]) == 0
@@ -87,7 +72,6 @@ def test_a_trainer_of_another_package_trains_by_the_same_verb(installed, tmp_pat
 
 
 def test_what_nobody_trains_is_refused_with_what_there_is(tmp_path, capsys):
-    """A name without a trainer is an error that lists those there are, before anything is made."""
     assert main(["train", "planner", "--out", str(tmp_path / "out")]) == 1
     message = capsys.readouterr().err
     assert "no trainer 'planner'" in message

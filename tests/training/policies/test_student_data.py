@@ -1,5 +1,6 @@
-"""Samples of several corpora as one, split by world."""
+"""Samples of several corpora as one, split by world, and features of their images."""
 
+import copy
 import shutil
 from dataclasses import replace
 
@@ -10,9 +11,16 @@ import torch
 from splatpilot.diagrams.worlds import splits
 from splatpilot.diagrams.worlds.inserted import InsertedConfig
 from splatpilot.systems.common.config import dump_config
+from splatpilot.systems.policies.student import StudentSpec, encode_color, encode_depth
 from splatpilot.training.corpus.corpus import CONFIG, Corpus, CorpusConfig
 from splatpilot.training.corpus.library import world_source
-from splatpilot.training.policies.student_data import StudentData, is_held_out
+from splatpilot.training.policies.student_data import (
+    FrozenFeatures,
+    StudentData,
+    encode_images,
+    is_held_out,
+)
+from splatpilot.training.policies.student_network import StudentModule
 
 HELD_OUT = 0.2
 """Share of which one of the three worlds is."""
@@ -28,8 +36,6 @@ def two(student_corpus, tmp_path_factory) -> list[Corpus]:
 
 
 def test_worlds_are_on_one_side_whatever_is_gathered_later(two):
-    """A third of the worlds is held out with all samples of theirs; more samples of the same worlds
-    change no world's side, and what both corpora have counts once."""
     alone, joined = StudentData(two[1:], HELD_OUT), StudentData(two[::-1], HELD_OUT)
     assert alone.held_out_worlds == joined.held_out_worlds and len(alone.held_out_worlds) == 1
     for data, count in ((alone, 48), (joined, 72)):
@@ -39,23 +45,7 @@ def test_worlds_are_on_one_side_whatever_is_gathered_later(two):
         assert outside == set(data.held_out_worlds) and not outside & inside
 
 
-def test_fewer_worlds_are_a_part_of_more(two):
-    """One world to train in, beside the one held out: samples of no other are there, the held-out
-    ones are the same, and a world more than there are is refused."""
-    whole, one = StudentData(two, HELD_OUT), StudentData(two, HELD_OUT, worlds=1)
-    assert one.held_out_worlds == whole.held_out_worlds
-    assert len(one.worlds) == 2 and set(one.worlds) < set(whole.worlds)
-    trained_in = {one.worlds[w] for w in one.labels(one.training).world}
-    assert trained_in == set(one.worlds) - set(one.held_out_worlds)
-    np.testing.assert_array_equal(one.labels(one.held_out).X_WB, whole.labels(whole.held_out).X_WB)
-    both = StudentData(two, HELD_OUT, worlds=2)
-    assert both.worlds == whole.worlds and len(both.training) == len(whole.training)
-    with pytest.raises(ValueError, match=r"worlds is 3, but .* 2 are left"):
-        StudentData(two, HELD_OUT, worlds=3)
-
-
 def test_samples_keep_their_order_and_world(two):
-    """Numbers from both corpora in any order give what each corpus says of them."""
     data = StudentData(two[::-1], HELD_OUT)
     numbers = np.array([60, 3, 47, 48, 5, 71])
     depth, color = data.pixels(numbers, "depth"), data.pixels(numbers, "color")
@@ -72,8 +62,6 @@ def test_samples_keep_their_order_and_world(two):
 
 
 def test_distances_along_trajectories_are_those_of_the_world(two):
-    """At the waypoints of the experts, brought into the world by the sample's pose, the distance is
-    the one of the recorded field, which counts unknown space as occupied."""
     data = StudentData(two, HELD_OUT)
     labels = data.labels(np.arange(0, 72, 5))
     found = data.distance_along(labels.trajectories_B, labels)
@@ -88,8 +76,6 @@ def test_distances_along_trajectories_are_those_of_the_world(two):
 
 
 def test_distances_change_as_waypoints_do(two):
-    """A millimetre along the gradient, and back, makes the difference that it says, in all but the
-    few that cross from one voxel to the next."""
     data = StudentData(two, HELD_OUT)
     labels = data.labels(np.arange(0, 72, 5))
     waypoints = labels.trajectories_B.nan_to_num().requires_grad_()
@@ -140,7 +126,6 @@ def test_different_worlds_of_one_name_are_refused(two, tmp_path):
 
 
 def test_corpora_that_do_not_fit_are_refused(two, tmp_path):
-    """Another camera is named, and so are shares that leave no world to one side."""
     other = tmp_path / "corpus"
     shutil.copytree(two[1].worlds[0].path.parents[1], other)
     config = two[0].config
@@ -153,3 +138,67 @@ def test_corpora_that_do_not_fit_are_refused(two, tmp_path):
         StudentData(two[:1], 0.16)
     with pytest.raises(ValueError, match="of 3 worlds 3 are held out, which leaves 0 samples"):
         StudentData(two[:1], 1.0)
+
+
+FROZEN = 7
+
+
+@pytest.fixture(scope="module")
+def network() -> StudentModule:
+    torch.manual_seed(0)
+    return StudentModule(StudentSpec("depth", 32, 24, way_version=2))
+
+
+@pytest.fixture
+def data(student_corpus) -> StudentData:
+    return StudentData([Corpus(student_corpus)], HELD_OUT)
+
+
+@pytest.mark.parametrize("observation", ["color", "depth"])
+def test_images_of_training_are_those_of_flight(observation):
+    rng = np.random.default_rng(0)
+    if observation == "color":
+        pixels = rng.integers(0, 256, (4, 6, 8, 3)).astype(np.uint8)
+        expected = encode_color(pixels.astype(np.float32))
+    else:
+        pixels = rng.uniform(0.1, 25.0, (4, 6, 8)).astype(np.float16)
+        pixels[:, 0, 0], pixels[:, 1, 1] = 0.0, np.inf
+        expected = encode_depth(pixels.astype(np.float32))
+        np.testing.assert_allclose(expected[:, 0, 0, 0], 1.0, atol=1e-6)
+        np.testing.assert_allclose(expected[:, 0, 1, 1], -1.0, atol=1e-6)
+    images = encode_images(pixels)
+    np.testing.assert_allclose(images, expected, atol=2e-6)
+    assert images.abs().max() <= 1.0 + 1e-6
+
+
+def test_features_are_those_of_the_modules(data, network, tmp_path):
+    indices = np.concatenate([data.held_out[[3, 0]], data.training[[5, 30]]])
+    with torch.no_grad():
+        expected = network.features[:FROZEN](encode_images(data.pixels(indices, "depth")))
+    found = FrozenFeatures(tmp_path, data, network, FROZEN)(indices)
+    torch.testing.assert_close(found, expected, atol=4e-3, rtol=4e-3)
+
+
+def test_features_are_computed_once_for_the_same_weights(data, network, tmp_path):
+    FrozenFeatures(tmp_path, data, network, FROZEN)
+    made = {file: (file.stat().st_mtime_ns, file.read_bytes()) for file in tmp_path.iterdir()}
+    assert len(made) == len(data.shards)
+    lost = min(made)
+    lost.unlink()
+    FrozenFeatures(tmp_path, data, network, FROZEN)
+    for file, (time, content) in made.items():
+        assert file.read_bytes() == content and (file == lost) != (file.stat().st_mtime_ns == time)
+    changed = copy.deepcopy(network)
+    with torch.no_grad():
+        changed.features[0][0].weight[0, 0, 0, 0] += 1.0
+    FrozenFeatures(tmp_path, data, changed, FROZEN)
+    assert len(list(tmp_path.iterdir())) == 2 * len(made)
+
+
+@pytest.mark.parametrize("content", [b"", b"junk", None])
+def test_damaged_features_are_computed_again(data, network, tmp_path, content):
+    expected = FrozenFeatures(tmp_path, data, network, FROZEN)(data.training[[5]])
+    for file in tmp_path.iterdir():
+        file.write_bytes(file.read_bytes()[:-100] if content is None else content)
+    found = FrozenFeatures(tmp_path, data, network, FROZEN)(data.training[[5]])
+    torch.testing.assert_close(found, expected, atol=0, rtol=0)

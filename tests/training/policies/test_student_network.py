@@ -1,6 +1,7 @@
 """The student's network in torch, against the one that flies and against torchvision's."""
 
 import os
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,14 +13,14 @@ from splatpilot.systems.policies.student import (
     STATE_SIZE,
     StudentNetwork,
     StudentSpec,
+    encode_state,
     mobilenet_shapes,
     plan,
 )
-from splatpilot.training.policies.student_images import clean_images
+from splatpilot.training.policies.student_data import encode_images
 from splatpilot.training.policies.student_network import (
     IN_DATA,
     StudentModule,
-    encode_state,
     imagenet_weights,
 )
 
@@ -36,14 +37,9 @@ def disturbed(module: StudentModule) -> StudentModule:
 @pytest.mark.parametrize("observation", ["rgb", "depth"])
 @pytest.mark.parametrize("size", [(64, 48), (80, 70)])
 @pytest.mark.parametrize("p_WG", [[4.0, 2.0, 1.5], [1.0, -2.0, 0.5], [0.0, 0.0, 0.0]])
-@pytest.mark.parametrize(("hidden", "way_version"), [(0, 2), (20, 1), (20, 2)])
-def test_what_flies_is_what_was_trained(observation, size, p_WG, hidden, way_version):
-    """From the image of a camera and the state of a vehicle, `plan` makes the waypoints and costs
-    that the module in torch makes of what a corpus would hold of them; whole cells or not."""
+def test_what_flies_is_what_was_trained(observation, size, p_WG):
     torch.manual_seed(0)
-    spec = StudentSpec(
-        observation, *size, head_features=hidden, nominal_speed=2.6, way_version=way_version
-    )
+    spec = StudentSpec(observation, *size, head_features=20, nominal_speed=2.6, way_version=2)
     module = disturbed(StudentModule(spec))
     weights = {name: w.numpy() for name, w in module.state_dict().items()}
     assert {name: w.shape for name, w in weights.items()} == spec.weight_shapes()
@@ -59,7 +55,7 @@ def test_what_flies_is_what_was_trained(observation, size, p_WG, hidden, way_ver
 
     image = color if observation == "rgb" else depth
     with torch.no_grad():
-        expected = module(clean_images(image[None]), state)
+        expected = module(encode_images(image[None]), state)
     found = plan(StudentNetwork(spec, weights), 0.5, image, X_WB, v_WB, p_WG)
     np.testing.assert_allclose(found.waypoints_B, expected[0][0], atol=1e-4)
     np.testing.assert_allclose(found.costs, expected[1][0], atol=1e-4)
@@ -67,18 +63,17 @@ def test_what_flies_is_what_was_trained(observation, size, p_WG, hidden, way_ver
 
 
 def test_images_of_another_size_are_refused():
-    """The size that would do is named."""
-    spec = StudentSpec("depth", 64, 48)
+    spec = StudentSpec("depth", 64, 48, way_version=2)
     weights = {name: np.zeros(shape, np.float32) for name, shape in spec.weight_shapes().items()}
-    with pytest.raises(ValueError, match="give it a camera of 64x48"):
+    with pytest.raises(
+        ValueError, match=r"must be \(3, 48, 64\), got \(3, 48, 65\); give it a camera of 64x48"
+    ):
         StudentNetwork(spec, weights)(np.zeros((3, 48, 65), np.float32), np.zeros(6))
 
 
 def test_untrained_encoder_lets_images_through():
-    """Numbers of an image are neither lost nor blown up on their way through an encoder that begins
-    from nothing."""
     torch.manual_seed(0)
-    module = StudentModule(StudentSpec("rgb", 96, 64))
+    module = StudentModule(StudentSpec("rgb", 96, 64, way_version=2))
     with torch.no_grad():
         features = module.features(torch.rand(4, 3, 64, 96) * 2.0 - 1.0)
     assert 0.05 < features.std().item() < 2.0
@@ -86,10 +81,8 @@ def test_untrained_encoder_lets_images_through():
 
 
 def test_frozen_modules_and_modules_in_parts():
-    """What the first modules make of an image can be handed over in its place; frozen ones have no
-    gradient, the others have."""
-    module = StudentModule(StudentSpec("depth", 64, 48))
-    module.freeze(14)
+    module = StudentModule(StudentSpec("depth", 64, 48, way_version=2))
+    module.image_modules(14).requires_grad_(False)
     image, state = torch.randn(2, 3, 48, 64), torch.randn(2, STATE_SIZE)
     whole = module(image, state)
     for first in 0, 14, 19, 20:
@@ -101,15 +94,20 @@ def test_frozen_modules_and_modules_in_parts():
 
 
 def folded_features(weights: dict[str, torch.Tensor], image: torch.Tensor) -> torch.Tensor:
-    module = StudentModule(StudentSpec())
-    module.load_encoder(weights)
+    module = StudentModule(StudentSpec(way_version=2))
+    module.load_state_dict(weights, strict=False)
     with torch.no_grad():
         return module.features(image)
 
 
-def test_batch_norms_and_scaling_are_folded(tmp_path):
-    """Torchvision's network, of any statistics, on an image scaled its way has the features of ours
-    on an image of -1 to 1, but where the first layer sees padding."""
+@pytest.fixture
+def encoder_file(tmp_path, monkeypatch) -> Path:
+    monkeypatch.setenv("SPLATPILOT_DATA", str(tmp_path))
+    (tmp_path / IN_DATA).parent.mkdir()
+    return tmp_path / IN_DATA
+
+
+def test_batch_norms_and_scaling_are_folded(encoder_file):
     torch.manual_seed(0)
     theirs = mobilenet_v2()
     with torch.no_grad():
@@ -120,43 +118,38 @@ def test_batch_norms_and_scaling_are_folded(tmp_path):
                         values.uniform_(0.5, 1.5)
                     elif name != "num_batches_tracked":
                         values.normal_(0.0, 0.1)
-    torch.save(theirs.state_dict(), tmp_path / "theirs.pth")
-    weights = imagenet_weights(str(tmp_path / "theirs.pth"))
+    torch.save(theirs.state_dict(), encoder_file)
+    weights = imagenet_weights()
     image = torch.rand(1, 3, 64, 96)
     mean, std = torch.tensor([0.485, 0.456, 0.406]), torch.tensor([0.229, 0.224, 0.225])
     scaled = (image - mean[:, None, None]) / std[:, None, None]
     with torch.no_grad():
         first = theirs.eval().features[0](scaled)
         rest = theirs.features[1:](first)
-    module = StudentModule(StudentSpec())
-    module.load_encoder(weights)
+    module = StudentModule(StudentSpec(way_version=2))
+    module.load_state_dict(weights, strict=False)
     with torch.no_grad():
         ours = module.features[0](2.0 * image - 1.0)
         torch.testing.assert_close(ours[..., 1:, 1:], first[..., 1:, 1:], atol=1e-5, rtol=0)
         torch.testing.assert_close(module.features[1:](first), rest, atol=1e-4, rtol=1e-3)
 
 
-def test_folded_weights_keep_their_scaling(tmp_path):
-    """A file whose variances are 1 already is of images of -1 to 1: its first filters stay."""
+def test_folded_weights_keep_their_scaling(encoder_file):
     theirs = mobilenet_v2()
-    torch.save(theirs.state_dict(), tmp_path / "folded.pt")
-    weights = imagenet_weights(str(tmp_path / "folded.pt"))
+    torch.save(theirs.state_dict(), encoder_file)
+    weights = imagenet_weights()
     assert weights.keys() == mobilenet_shapes().keys()
     first = theirs.state_dict()["features.0.0.weight"]
     torch.testing.assert_close(weights["features.0.0.weight"], first, atol=1e-5, rtol=1e-4)
 
 
-def test_what_is_no_encoder_is_refused(tmp_path, monkeypatch):
-    """A missing file and one of something else are named with the remedy; without the data folder
-    torchvision's download is looked for."""
-    with pytest.raises(FileNotFoundError, match=r"absent\.pt; download them with"):
-        imagenet_weights(str(tmp_path / "absent.pt"))
-    torch.save({"layer.weight": torch.zeros(3)}, tmp_path / "other.pt")
-    with pytest.raises(ValueError, match=r"other\.pt: no weights of MobileNetV2"):
-        imagenet_weights(str(tmp_path / "other.pt"))
-    monkeypatch.delenv("SPLATPILOT_DATA", raising=False)
+def test_other_files_are_refused(encoder_file, tmp_path, monkeypatch):
+    torch.save({"layer.weight": torch.zeros(3)}, encoder_file)
+    with pytest.raises(ValueError, match=r"imagenet\.pt: must be a state dictionary"):
+        imagenet_weights()
+    encoder_file.unlink()
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
-    with pytest.raises(FileNotFoundError, match=r"mobilenet_v2-7ebf99e0\.pth"):
+    with pytest.raises(FileNotFoundError, match=r"imagenet\.pt or .*7ebf99e0\.pth; download"):
         imagenet_weights()
     (tmp_path / "checkpoints").mkdir()
     torch.save(mobilenet_v2().state_dict(), tmp_path / "checkpoints/mobilenet_v2-7ebf99e0.pth")
@@ -165,8 +158,6 @@ def test_what_is_no_encoder_is_refused(tmp_path, monkeypatch):
 
 @pytest.mark.skipif("SPLATPILOT_DATA" not in os.environ, reason="SPLATPILOT_DATA is not set")
 def test_weights_of_the_data_folder_see_edges(monkeypatch):
-    """They are found without being named, and what they make of a photograph's worth of noise is
-    neither nothing nor saturated."""
     assert IN_DATA.name == "mobilenet_v2_imagenet.pt"
     features = folded_features(imagenet_weights(), torch.rand(1, 3, 96, 128) * 2.0 - 1.0)
     assert 0.02 < (features > 0.0).float().mean().item() < 0.9 and features.max() <= 6.0

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+import zipfile
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -20,13 +21,13 @@ from splatpilot.analysis.commands.main import main
 from splatpilot.diagrams.flight.policies import policy_named
 from splatpilot.systems.common.config import load_config
 from splatpilot.systems.common.files import claim_folder
+from splatpilot.systems.common.progress import CheckpointClock
 from splatpilot.systems.common.seeds import TRAINING_SEEDS
 from splatpilot.systems.policies import checkpoint as policy_checkpoint
 from splatpilot.systems.policies.checkpoint import PolicyCheckpoint, policy_of
 from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK
 from splatpilot.training.policies import train, training_worlds
 from splatpilot.training.policies.evaluation import evaluate_agent
-from splatpilot.training.policies.side_by_side import TrainingRun, run_side_by_side
 from splatpilot.training.policies.train import run
 from splatpilot.training.policies.train_diffaero import DiffAeroLearner, DiffAeroTraining
 from splatpilot.training.policies.trainer_registry import TRAINERS
@@ -103,21 +104,12 @@ def test_killed_run_ends_as_one_that_was_not(finished, tmp_path):
     assert rows == (finished / "curves.csv").read_text()
 
 
-def test_runs_side_by_side_learn_as_if_alone(finished, tmp_path):
-    """Two seeds at once, in processes of their own, each end as if alone, in a folder each; where
-    one stops the other is finished, and the error names the folder and the reason."""
+def test_a_command_trains_seeds_one_after_the_other(finished, tmp_path):
     overrides = [argument for override in TINY for argument in ("--set", override)]
-    command = ["train", "diffaero", "--seeds", "0", "1", "--jobs", "2", "--out", str(tmp_path)]
+    command = ["train", "diffaero", "--seeds", "0", "1", "--out", str(tmp_path)]
     assert main([*command, *overrides]) == 0
     assert_same(tmp_path / "seed_0", finished)
     assert json.loads((tmp_path / "seed_1" / "summary.json").read_text())["seed"] == 1
-    runs = [
-        TrainingRun("diffaero", tiny("schedule.learning_rate=1e30"), tmp_path / "diverges"),
-        TrainingRun("diffaero", tiny(), tmp_path / "beside"),
-    ]
-    with pytest.raises(ValueError, match="diverges: training stopped at update"):
-        run_side_by_side(runs, jobs=2)
-    assert_same(tmp_path / "beside", finished)
 
 
 @pytest.mark.parametrize("policy", ["depthnav", "agile_autonomy"])
@@ -205,9 +197,9 @@ def test_other_configuration_or_broken_checkpoint_is_refused(finished, tmp_path)
         run(config=tiny("seed=1"), out=finished, make=TRAINERS.find("diffaero").make)
     claim_folder(tmp_path / "config.yaml", tiny())
     (tmp_path / "checkpoint.pt").write_bytes(b"nonsense")
-    with pytest.raises(ValueError, match="delete it to begin anew"):
+    with pytest.raises(ValueError, match=r"delete .*checkpoint\.pt to start again"):
         run(config=tiny(), out=tmp_path, make=TRAINERS.find("diffaero").make)
-    with pytest.raises(ValueError, match=r"schedule\.updates is 0"):
+    with pytest.raises(ValueError, match=r"schedule\.updates must be in \[1, inf\), got 0"):
         run(config=tiny("schedule.updates=0"), out=tmp_path, make=TRAINERS.find("diffaero").make)
     with pytest.raises(ValueError, match=r"seed must be in \[0, 999\], got 10{20}$"):
         run(config=tiny(f"seed={10**20}"), out=tmp_path, make=TRAINERS.find("diffaero").make)
@@ -251,9 +243,99 @@ def test_training_seeds_are_not_the_benchmarks(monkeypatch):
         training_worlds.training_worlds(selection, 1000)
 
 
+class Reader(TinyTrainer):
+    """Says that it learns from a corpus."""
+
+    learns_from = "one corpus"
+
+
+class OtherReader(Reader):
+    """Learns from something else."""
+
+    learns_from = "another"
+
+
+class Interrupted(TinyTrainer):
+    """Is ended from outside in its sixth update, and tells with which it begins."""
+
+    first: int | None = None
+
+    def begin_update(self, update: int) -> None:
+        if Interrupted.first is None:
+            Interrupted.first = update
+        if update == 5:
+            raise KeyboardInterrupt
+
+
+def test_an_ended_run_says_what_it_kept_and_resumes_there(tmp_path, monkeypatch, capsys):
+    config = TinyTraining()
+    with pytest.raises(KeyboardInterrupt) as ended:
+        run(config=config, out=tmp_path / "at_updates", make=Interrupted)
+    kept = f"update 4 of 9 is in {tmp_path / 'at_updates'}; the same command resumes there"
+    assert ended.value.__notes__ == [kept]
+    monkeypatch.setattr(CheckpointClock, "is_due", True)
+    with pytest.raises(KeyboardInterrupt):
+        run(config=config, out=tmp_path / "by_time", make=Interrupted)
+    capsys.readouterr()
+    monkeypatch.setattr(Interrupted, "first", None)
+    with pytest.raises(KeyboardInterrupt):
+        run(config=config, out=tmp_path / "by_time", make=Interrupted)
+    assert Interrupted.first == 5
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0] == f"resuming {tmp_path / 'by_time'} at update 5 of 9"
+
+
+def test_a_run_that_kept_nothing_says_so(tmp_path):
+    def interrupted(config):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt) as ended:
+        run(config=TinyTraining(), out=tmp_path, make=interrupted)
+    [note] = ended.value.__notes__
+    assert note == f"no update is in {tmp_path} yet; the same command starts again"
+
+
+def test_a_run_goes_on_with_what_it_began_with_alone(tmp_path):
+    """Files that the trainer learns from and that have changed since are refused, as are a flipped
+    byte in the checkpoint and weights that are gone; curves that a kill left behind are mended."""
+
+    config = TinyTraining()
+    summary = run(config=config, out=tmp_path, make=Reader)
+    curves = (tmp_path / "curves.csv").read_text()
+    (tmp_path / "curves.csv").write_text(curves.splitlines()[0])
+    assert run(config=config, out=tmp_path, make=Reader) == summary
+    assert (tmp_path / "curves.csv").read_text() == curves
+    with pytest.raises(ValueError, match="learned from other files: corpora, or the weights"):
+        run(config=config, out=tmp_path, make=OtherReader)
+    weights = (tmp_path / "diffaero.npz").read_bytes()
+    (tmp_path / "diffaero.npz").unlink()
+    with pytest.raises(ValueError, match=r"No such file: .*diffaero\.npz, .* delete .*checkpoint"):
+        run(config=config, out=tmp_path, make=Reader)
+    (tmp_path / "diffaero.npz").write_bytes(weights)
+    with zipfile.ZipFile(tmp_path / "checkpoint.pt") as archive:
+        largest = max(archive.infolist(), key=lambda entry: entry.file_size)
+    content = bytearray((tmp_path / "checkpoint.pt").read_bytes())
+    content[largest.header_offset + 500] ^= 1
+    (tmp_path / "checkpoint.pt").write_bytes(content)
+    with pytest.raises(ValueError, match=r"must be a checkpoint .*; delete .* to start again"):
+        run(config=config, out=tmp_path, make=Reader)
+
+
+def test_a_mistake_in_what_a_run_names_leaves_its_folder_free(student_corpus, tmp_path):
+    """Put right, the same command works in the same folder."""
+    trainer = TRAINERS.find("student_depth")
+    tiny_student = ["pretrained=false", "frozen=0", "batch=2", "held_out=0.2"]
+    tiny_student += ["schedule.updates=1", "schedule.checkpoint_every=1"]
+    wrong = load_config(trainer.config(), overrides=["corpora=[nowhere]", *tiny_student])
+    with pytest.raises(FileNotFoundError, match="nowhere holds no corpus"):
+        run(config=wrong, out=tmp_path / "out", make=trainer.make)
+    right = load_config(trainer.config(), overrides=[f"corpora=[{student_corpus}]", *tiny_student])
+    run(config=right, out=tmp_path / "out", make=trainer.make)
+    with pytest.raises(ValueError, match=r"another configuration, with corpora: .*; choose"):
+        run(config=wrong, out=tmp_path / "out", make=trainer.make)
+
+
 def test_miniature_learns_to_fly(tmp_path):
-    """Some seconds of training reach goals among sparse poles that the untrained policy, flown as
-    the trained one is, never reaches."""
     overrides = [
         "worlds.kinds=[P01]",
         "worlds.count=3",
@@ -272,5 +354,5 @@ def test_miniature_learns_to_fly(tmp_path):
     untrained = DiffAeroLearner(config.loss)
     before = evaluate_agent(untrained, held_out, config.validation, config.rollout.noise)
     summary = run(config=config, out=tmp_path, make=TRAINERS.find("diffaero").make)
-    assert before.measures()["success"] == 0.0
+    assert before.metrics()["success"] == 0.0
     assert summary["best"]["success"] >= 0.5

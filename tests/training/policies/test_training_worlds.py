@@ -107,7 +107,7 @@ def test_ways_in_places_lead_around_what_stands_there(yard):
     p, world = torch.tensor([[3.0, 3.5, 1.5]]), torch.tensor([1])
     field = field_of(yard)
     for _ in range(300):
-        p = p + 0.05 * worlds.way(p, world)
+        p = p + 0.05 * worlds.direction(p, world)
         assert field.distance(p[0].double().numpy()) > 0.2
     assert (p - worlds.p_WG[1]).norm() < 0.2
 
@@ -129,15 +129,14 @@ def test_policies_learn_in_places(yard):
 
 
 def test_bad_selections_are_refused(yard, tmp_path):
-    """Nothing to choose from, places that are flown in, and kinds that are captured places."""
     WorldSelection(kinds=["office"]).validate()  # other scenarios than the benchmark's are kinds
     tested = write_place(tmp_path / "warehouse", "test")
     for fields, message in (
-        ({"kinds": []}, "worlds has neither kinds nor scenes"),
-        ({"kinds": ["R13"]}, "worlds.kinds has R13, whose world is not generated"),
+        ({"kinds": []}, "worlds must have kinds or scenes"),
+        ({"kinds": ["R13"]}, "worlds.kinds must be of generated worlds, got R13"),
         ({"scenes": [tested]}, "split of .*warehouse must be train, got 'test'"),
         ({"scenes": [f"{yard}/gaussians.ply"]}, "is no scene folder"),
-        ({"count": 1001}, "worlds.count is 1001; it must be 1 to 1000"),
+        ({"count": 1001}, r"count must be in \[1, 1000\], got 1001"),
     ):
         with pytest.raises(ValueError, match=message):
             WorldSelection(**fields).validate()

@@ -90,7 +90,6 @@ def test_body_rate_vehicle_flies_as_plant_and_controller_do():
 
 
 def test_gradients_flow_through_the_body_rate_vehicle():
-    """The derivative of where it ends by what was commanded is that of finite differences."""
 
     def end(a: torch.Tensor) -> torch.Tensor:
         vehicle = BodyRate.hovering(torch.zeros(1, 3, dtype=torch.float64), torch.zeros(1))

@@ -76,13 +76,13 @@ def test_what_was_not_used_for_longest_goes_first(folder, monkeypatch):
 
 @pytest.mark.parametrize("kind", ["P02", "P05", "P10", "P11"])
 def test_generated_worlds_are_read_again(folder, monkeypatch, kind):
-    made = WorldCache().blueprint(world_of(kind), 7)
-    monkeypatch.setattr(world_cache, "make_blueprint", None)
-    shapes, *points = WorldCache().blueprint(world_of(kind), 7)
+    made = WorldCache().spec(world_of(kind), 7)
+    monkeypatch.setattr(world_cache, "make_spec", None)
+    shapes, *points = WorldCache().spec(world_of(kind), 7)
     for a, b in zip(shapes, made[0], strict=True):
         assert type(a) is type(b)
         for x, y in zip(a.parameters(), b.parameters(), strict=True):
             np.testing.assert_array_equal(x, y)
     np.testing.assert_array_equal(points, made[1:])
     with pytest.raises(TypeError):
-        WorldCache().blueprint(world_of(kind), 8)
+        WorldCache().spec(world_of(kind), 8)

@@ -84,9 +84,6 @@ def assert_same_scene(tmp_path, room, out) -> None:
 
 
 def test_a_killed_run_goes_on_and_ends_in_the_same_scene(tmp_path, room, write_room, monkeypatch):
-    """After `kill -9`, another configuration is refused before an image is read, another capture
-    too, and the same command goes on from the checkpoint and writes the same bytes as a run that
-    was not interrupted."""
     out = tmp_path / "scene"
     kill_a_run(tmp_path, room, out, "step")
     unread = replace(read_capture(room), load_image=lambda i: pytest.fail("an image was read"))
@@ -109,8 +106,6 @@ def test_a_killed_run_goes_on_and_ends_in_the_same_scene(tmp_path, room, write_r
 
 
 def test_a_run_killed_while_it_wrote_a_checkpoint(tmp_path, room):
-    """Half a checkpoint is not taken for one: the run goes on from the one before. A damaged one is
-    refused, and discarded by `restart`."""
     out = tmp_path / "scene"
     kill_a_run(tmp_path, room, out, "checkpoint")
     reconstruct(read_capture(room), out, CONFIG)
@@ -127,7 +122,6 @@ def test_a_run_killed_while_it_wrote_a_checkpoint(tmp_path, room):
 
 
 def test_a_full_disk_is_one_message_and_leaves_the_last_checkpoint(tmp_path, room):
-    """When files can grow no more, the message says so, and nothing half written is left."""
     out = tmp_path / "scene"
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)

@@ -1,5 +1,3 @@
-"""Photometric and log-depth losses."""
-
 import math
 
 import numpy as np
@@ -7,6 +5,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pydrake.math import RigidTransform, RollPitchYaw
 from random_scenes import normal_tensor
 from scipy.ndimage import correlate1d
 
@@ -15,8 +14,10 @@ from splatpilot.training.reconstruction.losses import (
     depth_edge_weights,
     log_depth_loss,
     log_depth_loss_torch,
+    outline_loss,
     photometric_loss,
     photometric_loss_torch,
+    surface_loss,
 )
 
 
@@ -80,9 +81,6 @@ SHAPES = [(1, 1, 1), (1, 40, 3), (40, 1, 3), (5, 7, 1), (11, 11, 4), (17, 16, 1)
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
 def test_photometric_agrees_with_autograd_in_float64(shape, weight, simd, monkeypatch):
-    """On every SIMD level, for images smaller and larger than the window, value and gradient are
-    those of torch in float64.
-    """
     monkeypatch.setenv("SPLATPILOT_SIMD", simd)
     x, y = image_pair(shape)
     value, gradient = value_and_gradient(photometric_loss, x, y, weight)
@@ -95,7 +93,6 @@ def test_photometric_agrees_with_autograd_in_float64(shape, weight, simd, monkey
 
 
 def test_photometric_agrees_with_scipy():
-    """L1 and SSIM are those of numpy and scipy."""
     x, y = image_pair((24, 31, 3))
     a, b = x.double().numpy(), y.double().numpy()
     assert photometric_loss(x, y, 0.0).item() == pytest.approx(np.abs(a - b).mean(), rel=1e-6)
@@ -105,16 +102,12 @@ def test_photometric_agrees_with_scipy():
 
 
 def test_equal_images_have_no_loss_and_no_gradient():
-    """Of equal images, value and gradient are exactly 0."""
     _, y = image_pair((20, 33, 3))
     value, gradient = value_and_gradient(photometric_loss, y, y)
     assert value == 0.0 and not gradient.any()
 
 
 def test_constant_images():
-    """Of two flat images a and b, away from the border, L1 is |a - b| and SSIM its luminance term
-    (2ab + C1) / (a^2 + b^2 + C1); moving a by one unit moves L1 by one.
-    """
     a, b = 0.6, 0.5
     x, y = torch.full((24, 24, 1), a), torch.full((24, 24, 1), b)
     value, gradient = value_and_gradient(photometric_loss, x, y, 0.0)
@@ -132,7 +125,6 @@ def test_constant_images():
 
 @pytest.mark.parametrize("loss", ["photometric", "depth"])
 def test_gradient_is_that_of_finite_differences(loss):
-    """In float64, torch's gradcheck passes for the formulas that the kernels are held against."""
     if loss == "photometric":
         x, y = image_pair((6, 7, 2))
         y = y.double()
@@ -148,9 +140,6 @@ def test_gradient_is_that_of_finite_differences(loss):
 @pytest.mark.parametrize("shape", [(1,), (15,), (16,), (2, 31, 33)])
 @pytest.mark.parametrize("weighted", [False, True])
 def test_log_depth_agrees_with_autograd_in_float64(shape, weighted, simd, monkeypatch):
-    """On every SIMD level, value and gradient are those of torch in float64, with and without
-    weights, and only known depths count.
-    """
     monkeypatch.setenv("SPLATPILOT_SIMD", simd)
     x, d = depth_pair(shape)
     d.view(-1)[-1] = 3.0
@@ -167,9 +156,6 @@ def test_log_depth_agrees_with_autograd_in_float64(shape, weighted, simd, monkey
 
 
 def test_log_depth_of_a_constant_factor():
-    """Depths too large by one factor cost its logarithm at any range, and too small as much; the
-    gradient is sign / (count rendered).
-    """
     depth = torch.tensor([0.1, 1.0, 10.0, 100.0])
     for factor in (1.25, 0.8):
         value, gradient = value_and_gradient(log_depth_loss, factor * depth, depth)
@@ -183,7 +169,6 @@ def test_log_depth_of_a_constant_factor():
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_depth_below_epsilon_counts_as_epsilon(dtype):
-    """A render of 0, where nothing was drawn, costs log(depth / epsilon) and has no gradient."""
     rendered, depth = torch.tensor([0.0, 2.0], dtype=dtype), torch.tensor([1.0, 2.0], dtype=dtype)
     value, gradient = value_and_gradient(log_depth_loss, rendered, depth)
     assert value == pytest.approx(math.log(1e3) / 2, rel=1e-6)
@@ -192,7 +177,6 @@ def test_depth_below_epsilon_counts_as_epsilon(dtype):
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_nothing_to_compare_costs_nothing(dtype):
-    """Without a single known depth, value and gradient are 0, whatever was rendered."""
     depth = torch.tensor([math.nan, 0.0, -1.0, math.inf, 150.0, 1e-3], dtype=dtype)
     rendered = torch.tensor([1.0, math.nan, 2.0, math.inf, 3.0, 0.0], dtype=dtype)
     value, gradient = value_and_gradient(log_depth_loss, rendered, depth)
@@ -202,7 +186,6 @@ def test_nothing_to_compare_costs_nothing(dtype):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("mistake", [math.nan, math.inf])
 def test_mistakes_in_a_render_are_not_hidden(dtype, mistake):
-    """NaN or infinity in a render makes the loss NaN."""
     rendered, depth = torch.ones(20, dtype=dtype), torch.ones(20, dtype=dtype)
     rendered[3] = mistake
     assert math.isnan(log_depth_loss(rendered, depth).item())
@@ -217,7 +200,6 @@ def test_mistakes_in_a_render_are_not_hidden(dtype, mistake):
     seed=st.integers(0, 999),
 )
 def test_any_size(shape, seed):
-    """For any size, all values of the gradient are written, and twice the same bits come out."""
     x, y = image_pair(shape, seed)
     first, second = (value_and_gradient(photometric_loss, x, y, 0.5) for _ in range(2))
     assert first[0] == second[0] and torch.equal(first[1], second[1])
@@ -226,7 +208,6 @@ def test_any_size(shape, seed):
 
 
 def test_number_of_threads_changes_nothing():
-    """The same bits come out whatever torch's number of threads is."""
     x, y = image_pair((48, 64, 3))
     results = []
     for count in (1, 2, 4):
@@ -237,7 +218,6 @@ def test_number_of_threads_changes_nothing():
 
 
 def test_layout_in_memory_does_not_matter():
-    """Channels-first memory and one channel cut from an image give what contiguous tensors give."""
     x, y = image_pair((9, 12, 3))
     planar = x.permute(2, 0, 1).contiguous().permute(1, 2, 0)
     value, gradient = value_and_gradient(photometric_loss, x, y)
@@ -252,7 +232,6 @@ def test_layout_in_memory_does_not_matter():
 
 
 def test_gradient_is_scaled_by_what_follows():
-    """The chain rule: half the loss has half the gradient."""
     x, y = image_pair((9, 12, 3))
     _, whole = value_and_gradient(photometric_loss, x, y)
     _, half = value_and_gradient(lambda *a: 0.5 * photometric_loss(*a), x, y)
@@ -260,16 +239,12 @@ def test_gradient_is_scaled_by_what_follows():
 
 
 def test_slanted_planes_have_no_edges():
-    """Planes of any slant weigh 1 everywhere, however steeply their depth grows."""
     v, u = torch.meshgrid(torch.arange(30.0), torch.arange(40.0), indexing="ij")
     plane = 1 / (0.002 + 0.01 * v + 0.001 * u)  # 2.9 m to 150 m and beyond, as a floor
     assert torch.equal(depth_edge_weights(plane, far=1e6), torch.ones(30, 40))
 
 
 def test_thin_structures_weigh_more():
-    """A branch one pixel wide before the sky weighs 1 + gain, as does what is within the radius; a
-    pixel of unknown depth does not.
-    """
     depth = torch.full((2, 20, 30), math.inf)
     depth[0, :, 12] = 5.0
     depth[1, 10, 12] = math.nan
@@ -282,7 +257,6 @@ def test_thin_structures_weigh_more():
 
 @pytest.mark.parametrize("factor, edge", [(1.05, False), (1.25, True)])
 def test_jump_is_the_least_step(factor, edge):
-    """A step in depth is an edge if it is larger than the given fraction."""
     depth = torch.full((10, 20), 4.0)
     depth[:, 10:] *= factor
     assert bool((depth_edge_weights(depth, jump=0.1) > 1).any()) == edge
@@ -294,21 +268,135 @@ IMAGE = torch.full((4, 5, 3), 0.5)
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: photometric_loss(IMAGE, IMAGE[:3]), r"shape \(4, 5, 3\) but target \(3, 5, 3\)"),
-        (lambda: photometric_loss(IMAGE, IMAGE.double()), "target is torch.float64"),
-        (lambda: photometric_loss(IMAGE.int(), IMAGE.int()), "divided by 255"),
-        (lambda: photometric_loss(IMAGE[..., 0], IMAGE[..., 0]), r"must be \(..., H, W, C\)"),
-        (lambda: photometric_loss(IMAGE[:0], IMAGE[:0]), "at least one"),
-        (lambda: photometric_loss(IMAGE, IMAGE, 1.5), "ssim_weight is 1.5"),
-        (lambda: photometric_loss(IMAGE, IMAGE.clone().requires_grad_()), "target wants a grad"),
-        (lambda: log_depth_loss(IMAGE, IMAGE[:3]), r"but depth \(3, 5, 3\)"),
-        (lambda: log_depth_loss(IMAGE, IMAGE, IMAGE[:3]), r"but weights \(3, 5, 3\)"),
-        (lambda: log_depth_loss(IMAGE, IMAGE, far=0.0), "depth range is 0.001 to 0.0"),
-        (lambda: depth_edge_weights(IMAGE[0, 0]), r"must be floating-point \(..., H, W\)"),
-        (lambda: depth_edge_weights(IMAGE, radius=-1), "radius -1"),
+        (lambda: photometric_loss(IMAGE, IMAGE[:3]), r"target must be \(4, 5, 3\) .* got \(3,"),
+        (lambda: photometric_loss(IMAGE, IMAGE.double()), "target must be .* torch.float64"),
+        (lambda: photometric_loss(IMAGE.int(), IMAGE.int()), "divide images by 255"),
+        (lambda: photometric_loss(IMAGE[..., 0], IMAGE[..., 0]), r"rendered must be \(..., H"),
+        (lambda: photometric_loss(IMAGE[:0], IMAGE[:0]), "rendered must be .*not empty"),
+        (lambda: photometric_loss(IMAGE, IMAGE, 1.5), "ssim_weight must be .* got 1.5"),
+        (lambda: photometric_loss(IMAGE, IMAGE.clone().requires_grad_()), "target must be without"),
+        (lambda: log_depth_loss(IMAGE, IMAGE[:3]), r"depth must be \(4, 5, 3\) .* got \(3,"),
+        (lambda: log_depth_loss(IMAGE, IMAGE, IMAGE[:3]), r"weights must be .* got \(3, 5, 3\)"),
+        (lambda: log_depth_loss(IMAGE, IMAGE, far=0.0), "epsilon, far must be .* got 0.001, 0.0"),
+        (lambda: depth_edge_weights(IMAGE[0, 0]), r"depth must be floating-point \(..., H, W\)"),
+        (lambda: depth_edge_weights(IMAGE, radius=-1), "radius.* must be .* got 0.1, -1"),
     ],
 )
 def test_mistakes_are_named(call, message):
-    """What cannot be compared is refused with its name, its value and what it must be."""
     with pytest.raises(ValueError, match=message):
         call()
+
+
+HEIGHT, WIDTH, F = 40, 60, 20.0
+K = torch.tensor([[F, 0, WIDTH / 2], [0, F, HEIGHT / 2], [0, 0, 1]])
+# The camera stands half a metre behind the origin.
+VIEWMAT = torch.eye(4)
+VIEWMAT[2, 3] = 0.5
+UPRIGHT = torch.tensor([1.0, 0.0, 0.0, 0.0])
+
+
+def loss_of(means, quats, scales, depth, seed=0):
+    everyone = torch.arange(len(means))
+    rng = np.random.default_rng(seed)
+    return surface_loss(means, quats, scales, everyone, VIEWMAT, K, depth, rng)
+
+
+def test_gaussians_are_drawn_to_the_surface_they_belong_to():
+    depth = torch.full((HEIGHT, WIDTH), 2.0)
+    depth[:, 40:] = torch.inf
+    z = torch.tensor([2.06, 1.98, 1.5, 2.02, 2.02])
+    column = torch.tensor([10.5, 30.5, 20.5, -0.5, 50.5])
+    means = torch.stack([(column - WIDTH / 2) / F * z, 0.0 * z, z - 0.5], dim=1).requires_grad_()
+    loss = loss_of(means, UPRIGHT.expand(5, 4), torch.full((5, 3), 1e-9), depth)
+    assert loss.item() == pytest.approx((np.log(1.03) - np.log(0.99)) / 2, rel=1e-4)
+    loss.backward()
+    expected = np.zeros((5, 3))
+    expected[:2, 2] = 0.5 / 2.06, -0.5 / 1.98
+    np.testing.assert_allclose(means.grad, expected, rtol=1e-4)
+
+
+def test_thick_gaussians_flatten_and_those_askew_turn():
+    n = 2000
+    depth = torch.full((HEIGHT, WIDTH), 2.0)
+    means = torch.tensor([0.0, 0.0, 1.5]).expand(n, 3)
+
+    def thick(scales):
+        return loss_of(means, UPRIGHT.expand(n, 4), scales.expand(n, 3), depth)
+
+    scales = torch.tensor([0.03, 0.03, 0.02], requires_grad=True)
+    thick(scales).backward()
+    assert scales.grad is not None
+    across = np.sqrt(2 / np.pi) / 2.0  # of |log z - log 2| about its mean, by the deviation of z
+    np.testing.assert_allclose(scales.grad, [0.0, 0.0, across], atol=0.02)
+
+    def tilted(angle):
+        quats = torch.stack([torch.cos(angle / 2), torch.sin(angle / 2), 0 * angle, 0 * angle])
+        return loss_of(
+            means, quats.expand(n, 4), torch.tensor([0.1, 0.1, 1e-4]).expand(n, 3), depth
+        )
+
+    angle = torch.tensor(0.1, requires_grad=True)
+    tilted(angle).backward()
+    assert angle.grad is not None
+    step = 1e-3
+    slope = (tilted(angle.detach() + step) - tilted(angle.detach() - step)) / (2 * step)
+    assert angle.grad.item() == pytest.approx(slope.item(), rel=0.02)
+    assert slope > 0.02
+
+
+def test_points_are_drawn_by_the_generator_alone():
+    depth = torch.full((HEIGHT, WIDTH), 2.0)
+    scene = torch.tensor([[0.0, 0.0, 1.51]]), UPRIGHT[None], torch.full((1, 3), 0.02), depth
+    assert loss_of(*scene, seed=1).item() == loss_of(*scene, seed=1).item()
+    assert loss_of(*scene, seed=1).item() != loss_of(*scene, seed=2).item()
+
+
+def test_without_true_depth_there_is_no_loss():
+    means = torch.ones((1, 3), requires_grad=True)
+    nothing = torch.zeros(HEIGHT, WIDTH)
+    loss = loss_of(means, UPRIGHT[None], torch.full((1, 3), 0.02), nothing)
+    loss.backward()
+    assert means.grad is not None
+    assert loss.item() == 0 and not means.grad.any()
+
+
+def test_outlines_are_those_of_what_is_solid():
+    depth = torch.tensor([[2.0, torch.inf, 0.0, 200.0]])
+    weights = torch.tensor([[1.0, 5.0, 5.0, 1.0]])
+    alpha = torch.full((1, 4), 0.5, requires_grad=True)
+    loss = outline_loss(alpha, depth, weights)
+    assert loss.item() == pytest.approx(0.5 * (1 + 5 + 1) / 3)
+    loss.backward()
+    assert alpha.grad is not None
+    np.testing.assert_allclose(alpha.grad, [[-1 / 3, 5 / 3, 0, 1 / 3]], rtol=1e-5)
+    assert outline_loss(alpha, 0 * weights, weights).item() == 0
+
+
+def test_native_code_and_formulas_agree():
+    rng = np.random.default_rng(5)
+    n = 2000
+    X_WC = RigidTransform(RollPitchYaw(0.1, -0.2, 0.3), [0.1, 0.2, -0.5])
+    viewmat = torch.from_numpy(X_WC.inverse().GetAsMatrix4())
+    depth = torch.from_numpy(rng.uniform(1.5, 2.5, (HEIGHT, WIDTH)))
+    depth[:5], depth[5:10] = 0, torch.inf
+    means = torch.from_numpy(rng.uniform([-3, -2, 1], [3, 2, 2.5], (n, 3)))
+    quats = torch.from_numpy(rng.normal(size=(n, 4)))
+    scales = torch.from_numpy(rng.uniform(0.001, 0.1, (n, 3)))
+    seen = torch.from_numpy(rng.permutation(n)[: n // 2])
+    draws = torch.from_numpy(rng.normal(size=(n // 2, 3)).astype(np.float32))
+
+    class Draws:  # in place of a generator
+        def standard_normal(self, *_):
+            return draws.numpy()
+
+    def found(dtype):
+        leaves = [x.detach().to(dtype, copy=True).requires_grad_() for x in (means, quats, scales)]
+        rest = (viewmat.to(dtype), K.to(dtype), depth.to(dtype), Draws())
+        loss = surface_loss(*leaves, seen, *rest)
+        (3 * loss).backward()
+        return [loss.detach(), *(leaf.grad for leaf in leaves)]
+
+    exact = found(torch.float64)
+    assert (exact[1] != 0).any(dim=1).sum() > 20
+    for native, reference in zip(found(torch.float32), exact, strict=True):
+        np.testing.assert_allclose(native, reference, rtol=1e-4, atol=1e-7)

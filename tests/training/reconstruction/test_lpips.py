@@ -93,7 +93,6 @@ def images(height: int = 40, width: int = 51) -> tuple[torch.Tensor, torch.Tenso
 
 
 def test_distance_is_that_of_the_definition(weights, weights_file):
-    """The distance equals the published formula written out layer by layer."""
     a, b = images()
     expected = reference(weights, a, b)
     assert expected > 1e-3
@@ -112,7 +111,6 @@ def test_pixels_without_weight_hardly_count(weights_file):
 
 
 def test_batches_are_averaged(weights_file):
-    """Of several pairs of images it is the mean."""
     lpips = Lpips(weights_file)
     a, b = images()
     other = b.flip(0)
@@ -121,7 +119,6 @@ def test_batches_are_averaged(weights_file):
 
 
 def test_gradient(weights_file):
-    """The gradient in the first image predicts what a small step does."""
     lpips = Lpips(weights_file)
     a, b = images()
     a.requires_grad_()
@@ -136,7 +133,6 @@ def test_gradient(weights_file):
 
 
 def test_weights_are_read_once(weights_file):
-    """A second network from the same file needs the file no more."""
     a, b = images()
     first = Lpips(weights_file)(a, b)
     content = weights_file.read_bytes()
@@ -146,7 +142,6 @@ def test_weights_are_read_once(weights_file):
 
 
 def test_absent_weights(tmp_path, monkeypatch):
-    """Without weights the error says where they are looked for and how to get them."""
     monkeypatch.setenv("SPLATPILOT_DATA", str(tmp_path))
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
     with pytest.raises(
@@ -156,12 +151,11 @@ def test_absent_weights(tmp_path, monkeypatch):
     monkeypatch.delenv("SPLATPILOT_DATA")
     with pytest.raises(FileNotFoundError, match="no weights"):
         Lpips()
-    with pytest.raises(FileNotFoundError, match=r"mine\.pt: no such file"):
+    with pytest.raises(FileNotFoundError, match=r"No such file: .*mine\.pt"):
         Lpips(tmp_path / "mine.pt")
 
 
 def test_places_where_weights_are_found(tmp_path, monkeypatch, weights):
-    """Weights are taken from SPLATPILOT_DATA, or else from torchvision's and lpips' own files."""
     a, b = images()
     expected = pytest.approx(reference(weights, a, b), rel=1e-4)
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
@@ -185,7 +179,6 @@ def test_places_where_weights_are_found(tmp_path, monkeypatch, weights):
 
 @pytest.mark.parametrize("content", [b"x", None])
 def test_other_files_are_refused(tmp_path, weights, content):
-    """A file that holds no such weights is refused by name."""
     file = tmp_path / "other.pt"
     if content is None:
         torch.save({"squeezenet1_1": weights["lin"], "lin": weights["lin"]}, file)
@@ -197,16 +190,12 @@ def test_other_files_are_refused(tmp_path, weights, content):
 
 @pytest.mark.parametrize("shape", [(16, 40, 3), (40, 40, 4), (40, 40)])
 def test_bad_images(weights_file, shape):
-    """What is no image of three colours, or too small, is refused with its shape."""
-    with pytest.raises(ValueError, match=r"images have shapes .* at least 17 pixels"):
+    with pytest.raises(ValueError, match=r"images must be .* at least 17 pixels, got \("):
         Lpips(weights_file)(torch.zeros(shape), torch.zeros(shape))
 
 
 @pytest.mark.skipif("SPLATPILOT_DATA" not in os.environ, reason="SPLATPILOT_DATA is not set")
 def test_real_weights_rank_what_people_see():
-    """With the trained weights, blur of a photograph is farther from it than a slight brightening
-    of equal mean squared error.
-    """
     import cv2
 
     folder = Path(os.environ["SPLATPILOT_DATA"]) / "tartanair" / "hospital" / "image_left"
@@ -220,7 +209,6 @@ def test_real_weights_rank_what_people_see():
 
 
 def test_nothing_large_is_imported(weights_file):
-    """Neither torchvision nor Triton, which ends processes in which Mesa's OpenGL is, is loaded."""
     script = (
         "import sys, torch; from pathlib import Path\n"
         "from splatpilot.training.reconstruction.lpips import Lpips\n"

@@ -1,12 +1,12 @@
-"""Reconstruction by optimisation, on a small room."""
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from pydrake.math import RigidTransform
 
 from splatpilot.diagrams.worlds.scene_folder import read_scene, read_scene_metadata
+from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.splats.splat_files import read_ply
 from splatpilot.training.captures.capture import CaptureFrame, SfmPoints, no_depth
 from splatpilot.training.captures.capture_registry import read_capture
@@ -18,9 +18,12 @@ from splatpilot.training.reconstruction.initialize import (
     gaussians_from_points,
     random_points,
 )
-from splatpilot.training.reconstruction.optimize import Optimization
+from splatpilot.training.reconstruction.losses import photometric_loss
+from splatpilot.training.reconstruction.optimize import DefaultStrategy, Objective, Optimization
+from splatpilot.training.reconstruction.parameters import SplatParameters
 from splatpilot.training.reconstruction.photometry import Photometry
 from splatpilot.training.reconstruction.reconstruct import reconstruct
+from splatpilot.training.reconstruction.splat_rendering import Rendering, render
 from splatpilot.training.reconstruction.views import ReconstructionViews
 
 CONFIG = ReconstructConfig(
@@ -47,7 +50,6 @@ def room(tmp_path, write_room):
 
 @pytest.mark.parametrize("representation", ["3dgs", "2dgs"])
 def test_held_out_frames_come_out(tmp_path, room, representation):
-    """Frames that nothing was fitted to are rendered with the right colours and depth."""
     # A surfel is blurred by no pixel, so more are needed.
     count = {"3dgs": 3000, "2dgs": 8000}[representation]
     config = replace(CONFIG, representation=representation, initial_gaussians=count, iterations=300)
@@ -64,7 +66,6 @@ def test_held_out_frames_come_out(tmp_path, room, representation):
 
 
 def test_same_seed_same_scene_whatever_the_threads(tmp_path, room):
-    """Two runs with different numbers of threads end in the same bytes."""
     for name, threads in (("a", 1), ("b", 2)):
         config = replace(CONFIG, iterations=20, threads=threads)
         reconstruct(read_capture(room), tmp_path / name, config)
@@ -73,8 +74,6 @@ def test_same_seed_same_scene_whatever_the_threads(tmp_path, room):
 
 
 def test_what_is_solid_is_opaque(tmp_path, room):
-    """Withheld frames look the same before black as before anything else, whatever the colour of
-    the walls, and none of their pixels is a hole."""
     summary = reconstruct(read_capture(room), tmp_path / "scene", replace(CONFIG, iterations=300))
     assert summary.held_out is not None
     for view in summary.held_out.views:
@@ -87,7 +86,6 @@ def test_what_is_solid_is_opaque(tmp_path, room):
 
 
 def test_metric_depth_is_what_places_surfaces(tmp_path, room):
-    """From random Gaussians, the depth term brings depth much nearer to the truth."""
     config = replace(CONFIG, initialization="random", initial_gaussians=3000, iterations=300)
     errors = []
     for weight in (0.0, 0.2):
@@ -99,8 +97,6 @@ def test_metric_depth_is_what_places_surfaces(tmp_path, room):
 
 
 def test_gaussians_are_added_where_depth_puts_none(tmp_path, room):
-    """Left to itself, a reconstruction adds Gaussians where they start at random, but none where
-    they start from depth."""
     config = replace(CONFIG, initial_gaussians=300, iterations=80, refine_start=5, refine_every=10)
 
     def count(**changes) -> int:
@@ -115,8 +111,6 @@ def test_gaussians_are_added_where_depth_puts_none(tmp_path, room):
 
 
 def test_without_depth_from_points(tmp_path, write_room):
-    """A capture without depth is reconstructed from points: withheld images come out, and the gains
-    of all images are found."""
     factors = np.where(np.arange(12) % 3 == 1, 0.8, 1.0)
     dim = write_room(
         tmp_path / "dim", poses=POSES, brightness=lambda i, rho: np.full(1, factors[i])
@@ -139,7 +133,6 @@ def test_without_depth_from_points(tmp_path, write_room):
 
 
 def test_gains_that_are_fitted_leave_the_images_as_they_were(tmp_path, room):
-    """The optimisation keeps the gains that it finds to itself."""
     frames = list(read_capture(room).frames())
     views = ReconstructionViews(frames, Photometry(np.ones(len(frames)), 0.0))
     config = replace(CONFIG, iterations=10, strategy="none", depth_weight=0.0)
@@ -154,8 +147,6 @@ def test_gains_that_are_fitted_leave_the_images_as_they_were(tmp_path, room):
 
 
 def test_what_stands_before_the_sky_is_kept_to_its_outline(tmp_path):
-    """Seen through a depth camera, which has no blur, a plate before the sky is opaque up to its
-    edge: with the outlines in the loss fewer of its pixels are holes than without."""
     K = np.array([[40.0, 0, 32], [0, 40.0, 24], [0, 0, 1]])
     v, u = np.mgrid[:48, :64] + 0.5
     frames = []
@@ -165,7 +156,7 @@ def test_what_stands_before_the_sky_is_kept_to_its_outline(tmp_path):
         depth = np.where(on_plate, 2.0, np.inf).astype(np.float32)
         frames.append(CaptureFrame(image, depth, RigidTransform([x, 0, 0]), K))
     views = ReconstructionViews(frames, Photometry(np.ones(5), 0.0))
-    cells = {"contrast": 1.0, "max_cell": 4, "max_extent": 0.2, "opacity": 0.9}
+    cells = {"contrast": 1.0, "max_cell": 4, "max_extent": 0.2}
     detail = Detail(max_gaussians=300, optimized=True, **cells)
     start = gaussians_from_depth(frames, Photometry(np.ones(5), 0.0), detail)
     holes = []
@@ -181,7 +172,6 @@ def test_what_stands_before_the_sky_is_kept_to_its_outline(tmp_path):
 
 
 def test_unknown_scale_is_never_flown_in(tmp_path, room):
-    """A capture of unknown scale becomes a scene that says so and that `read_scene` refuses."""
     capture = replace(read_capture(room), metric=False)
     summary = reconstruct(capture, tmp_path / "scene", replace(CONFIG, iterations=5))
     assert "cannot be flown in: its scale is unknown" in str(summary)
@@ -191,9 +181,153 @@ def test_unknown_scale_is_never_flown_in(tmp_path, room):
 
 
 def test_what_a_capture_lacks_is_said(tmp_path, room):
-    """Asked to start from points that are not there, it says what there is."""
     with pytest.raises(ValueError, match="initialization is 'points', but room has none; choose"):
         reconstruct(
             read_capture(room), tmp_path / "scene", replace(CONFIG, initialization="points")
         )
     assert not (tmp_path / "scene").exists()
+
+
+SMALL_K = torch.tensor([[[40.0, 0, 32], [0, 40, 24], [0, 0, 1]]])
+VIEWMAT = torch.eye(4)[None]
+
+
+def three_gaussians(scales=(0.005, 0.5, 0.005), opacities=(0.9, 0.9, 0.9)) -> SplatParameters:
+    means = [[-0.3, 0, 2.0], [0.3, 0, 2.0], [0.0, 0.3, 2.0]]
+    scene = GaussianScene.from_colors(
+        means,
+        np.tile([1.0, 0, 0, 0], (3, 1)),
+        np.repeat(scales, 3).reshape(3, 3),
+        opacities,
+        [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+    )
+    return SplatParameters.of_scene(scene, 0, "cpu")
+
+
+def strategy_for(splats: SplatParameters, **changes) -> DefaultStrategy:
+    config = ReconstructConfig(
+        **{"strategy": "default", "iterations": 100, "refine_start": 1, "refine_every": 1}
+        | {"reset_every": 0, "refine_fraction": 1.0}
+        | changes
+    )
+    return DefaultStrategy(config, torch.zeros(3), 1.0, len(splats))
+
+
+def test_large_gradients_double_small_gaussians_and_split_large_ones():
+    splats = three_gaussians()
+    strategy = strategy_for(splats)
+    strategy.gradients, strategy.counts = torch.tensor([1.0, 1.0, 0.0]), torch.ones(3)
+    small, large, other = splats["means"].detach().clone()
+    strategy.refine(1, splats)
+    assert len(splats) == 5
+    means, scales = splats["means"], splats.scales[:, 0]
+    assert (means == small).all(dim=1).sum() == 2 and (means == other).all(dim=1).sum() == 1
+    parts = torch.nonzero(scales > 0.1)[:, 0]
+    np.testing.assert_allclose(scales[parts].detach(), [0.5 / 1.6] * 2, rtol=1e-6)
+    distance = (means[parts] - large).norm(dim=1)
+    assert (distance > 0).all() and (distance < 3).all()
+    assert (splats.sh[parts] == splats.sh[parts[0]]).all()
+
+
+def test_only_the_strongest_grow_up_to_the_limit():
+    splats = three_gaussians(scales=(0.005, 0.005, 0.005))
+    strategy = strategy_for(splats, max_gaussians=4)
+    strategy.gradients, strategy.counts = torch.tensor([1.0, 3.0, 2.0]), torch.ones(3)
+    strongest = splats["means"][1].detach().clone()
+    strategy.refine(1, splats)
+    assert len(splats) == 4
+    assert (splats["means"] == strongest).all(dim=1).sum() == 2
+
+
+def test_faint_and_huge_gaussians_are_removed_and_opacities_reset():
+    splats = three_gaussians(scales=(0.005, 0.5, 0.005), opacities=(0.9, 0.9, 0.004))
+    strategy = strategy_for(splats, reset_every=2)
+    strategy.refine(1, splats)
+    assert len(splats) == 2
+    strategy.refine(2, splats)
+    np.testing.assert_allclose(splats.opacities.detach(), [0.01, 0.01], rtol=1e-4)
+    strategy.refine(3, splats)
+    assert splats.scales.max() < 0.01
+
+
+@pytest.mark.parametrize("representation", ["3dgs", "2dgs"])
+def test_gradients_are_those_of_places_on_the_image(representation):
+    splats = three_gaussians(scales=(0.1, 0.1, 0.1))
+    strategy = strategy_for(splats, representation=representation)
+    torch.manual_seed(0)
+    weights = torch.rand((48, 64, 3))
+
+    def loss(means):
+        gaussians = (means, splats["quats"], splats.scales, splats.opacities, splats.sh)
+        rendering = render(representation, gaussians, VIEWMAT, SMALL_K, 64, 48)
+        return rendering, (rendering.color * weights).sum()
+
+    rendering, value = loss(splats["means"])
+    strategy.watch(rendering)
+    value.backward()
+    strategy.observe(rendering, splats, VIEWMAT, SMALL_K)
+    with torch.no_grad():
+        for i in range(3):
+            slope = []
+            for axis, half in ((0, 32), (1, 24)):
+                step = torch.zeros_like(splats["means"])
+                step[i, axis] = 0.01 * splats["means"][i, 2] / 40  # a hundredth of a pixel
+                change = loss(splats["means"] + step)[1] - loss(splats["means"] - step)[1]
+                slope.append(change.item() / 0.02 * half)
+            assert strategy.gradients[i].item() == pytest.approx(np.hypot(*slope), rel=0.3)
+
+
+HEIGHT, WIDTH = 24, 32
+LOSS_K = np.array([[30.0, 0, 16], [0, 30.0, 12], [0, 0, 1]])
+
+
+def loss_and_gradient(color: np.ndarray, image: np.ndarray, valid: np.ndarray):
+    """The loss of a rendered color (H, W, 3) against an image, and its gradient."""
+    depth = np.where(valid, np.float32(2), np.float32(0))
+    views = ReconstructionViews(
+        [CaptureFrame(image, depth, RigidTransform(), LOSS_K, valid)], Photometry(np.ones(1), 0.0)
+    )
+    rendered = torch.tensor(color, dtype=torch.float32, requires_grad=True)
+    ones = torch.ones(HEIGHT, WIDTH)
+    objective = Objective(ReconstructConfig(surface_weight=0, depth_weight=0), views, None)
+    loss = objective.loss(
+        Rendering(rendered, 2 * ones, ones, {}),
+        (ones,) * 5,
+        0,
+        torch.tensor(1.0),
+        0,
+        torch.zeros(1, 3),
+        outlines=False,
+    )
+    loss.backward()
+    assert rendered.grad is not None
+    return loss.item(), rendered.grad.numpy()
+
+
+@pytest.fixture
+def images():
+    """A rendered color and an image that differs from it everywhere."""
+    rng = np.random.default_rng(0)
+    image = rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+    return rng.uniform(size=(HEIGHT, WIDTH, 3)), image
+
+
+def test_masked_pixels_have_no_part_in_the_loss(images):
+    color, image = images
+    valid = np.ones((HEIGHT, WIDTH), bool)
+    valid[5:15, 8:20] = False
+    blob = np.where(valid[..., None], image, np.uint8([255, 0, 0]))
+    loss, gradient = loss_and_gradient(color, image, valid)
+    other_loss, other_gradient = loss_and_gradient(color, blob, valid)
+    assert loss == other_loss
+    np.testing.assert_array_equal(gradient, other_gradient)
+    assert not gradient[~valid].any() and gradient[valid].all()
+
+
+def test_without_a_mask_the_loss_is_photometric(images):
+    color, image = images
+    loss, _ = loss_and_gradient(color, image, np.ones((HEIGHT, WIDTH), bool))
+    expected = photometric_loss(
+        torch.tensor(color, dtype=torch.float32), torch.tensor(image).float() / 255
+    )
+    assert loss == pytest.approx(expected.item(), rel=1e-6)

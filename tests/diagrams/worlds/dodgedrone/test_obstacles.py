@@ -1,5 +1,3 @@
-"""The obstacles of the DodgeDrone challenge, beside lists that came with it."""
-
 import numpy as np
 import pytest
 
@@ -47,8 +45,6 @@ STORED = {
 
 @pytest.mark.parametrize(("level", "seed"), STORED)
 def test_agrees_with_the_stored_lists(level, seed):
-    """From seed and level come the diameters and first places of the challenge's own lists, to the
-    last digit that both have."""
     obstacles = draw_obstacles(LEVELS[level], seed)
     for number, diameter, place in STORED[level, seed]:
         obstacle = obstacles[number]
@@ -58,8 +54,6 @@ def test_agrees_with_the_stored_lists(level, seed):
 
 
 def test_an_accelerated_path_agrees_with_the_stored_one():
-    """All of a path that came with the simulator: 71 rows until it leaves its region, of an
-    obstacle behind 88 others that move and 988 that stand."""
     flat = (0.0, -10.0, 0.0), (60.0, 10.0, 10.0)
     third = (40.0, -10.0, 0.0), (60.0, 10.0, 10.0)
     groups = (
@@ -83,8 +77,6 @@ def test_an_accelerated_path_agrees_with_the_stored_one():
 
 @pytest.mark.parametrize("level", LEVELS)
 def test_nothing_is_near_start_and_target(level):
-    """At no time does the centre of an obstacle lie in the boxes that are kept free, nor does one
-    that moves leave its region but by its first step."""
     for obstacle in draw_obstacles(LEVELS[level], 3):
         x, y, z = obstacle.path.T
         near = (abs(y) < 3) & (z > 0) & (z < 5)

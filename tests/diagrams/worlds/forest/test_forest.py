@@ -13,7 +13,12 @@ from splatpilot.diagrams.worlds.building_blocks import CLEARING, INSET, PASSAGE
 from splatpilot.diagrams.worlds.forest.layout import ForestConfig, lay_out
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import make_world
-from splatpilot.systems.collision.shapes import AnalyticDistanceField, Capsule, Sphere
+from splatpilot.systems.collision.shapes import (
+    AnalyticDistanceField,
+    Capsule,
+    ShapeUnion,
+    Sphere,
+)
 from splatpilot.systems.splats.background import mean_color
 from splatpilot.systems.splats.baked_scene import BakedScene
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
@@ -66,7 +71,6 @@ def _digest(world: World) -> str:
 
 
 def test_the_same_seed_gives_the_same_bits_in_another_process():
-    """Two processes that grow one forest agree on every bit of what is seen and what is hit."""
     code = (
         f"import sys; sys.path.insert(0, {str(__file__.rsplit('/', 1)[0])!r})\n"
         "from test_forest import SMALL, _digest, make_world\n"
@@ -77,7 +81,6 @@ def test_the_same_seed_gives_the_same_bits_in_another_process():
 
 
 def test_another_seed_gives_another_forest():
-    """Seeds change where trees stand and where the sun is."""
     a, b = make_world(SMALL, seed=0), make_world(SMALL, seed=1)
     places = np.random.default_rng(0).uniform((0, -3.5, 1), (9, 3.5, 3), (200, 3))
     difference = a.distance_field.distance(places) - b.distance_field.distance(places)
@@ -87,7 +90,6 @@ def test_another_seed_gives_another_forest():
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_trunks_are_as_far_apart_and_as_thick_as_configured(kind):
-    """On the ground axes are at least the spacing apart; radii lie in the range and fill it."""
     config = KINDS[kind]
     for seed in range(4):
         trees = _layout(config, seed)[0].trees
@@ -100,7 +102,6 @@ def test_trunks_are_as_far_apart_and_as_thick_as_configured(kind):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_vehicle_can_fly_from_start_to_goal(kind):
-    """Start and goal have 1 m around them, and level flight connects them past the trunks."""
     config = KINDS[kind]
     spacing = 0.1
     for seed in range(4):
@@ -118,7 +119,6 @@ def test_a_vehicle_can_fly_from_start_to_goal(kind):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_gaps_between_trunks_let_the_vehicle_through_at_every_height(kind):
-    """The gap of every two trunks, at every height, is at least what the check promises."""
     config = KINDS[kind]
     assert config.narrowest >= PASSAGE
     trees = _layout(config, seed=1)[0].trees
@@ -130,21 +130,19 @@ def test_gaps_between_trunks_let_the_vehicle_through_at_every_height(kind):
 
 
 def test_everything_seen_in_the_volume_is_there_to_be_hit(world):
-    """Gaussians in the volume lie on analytic surfaces: no leaf hangs in the air."""
     distance = np.abs(world.distance_field.distance(_inside(world)))
     assert distance.max() < 0.07
     assert np.quantile(distance, 0.95) < 0.04
 
 
 def test_leaves_around_the_volume_stay_out_of_it(world):
-    """Crowns, bushes and the far edge end, three standard deviations out, before the volume."""
     scene, field = world.gaussians, world.distance_field
     p = scene.means.astype(float)
     beyond = np.linalg.norm(p - np.clip(p, field.lower_W, field.upper_W), axis=1)
     solid = p[:, 2] < 0.1  # ground and litter
     for shape in _shapes(world):
         if isinstance(shape, (Capsule, Sphere)):
-            solid |= np.abs(type(shape).distances(p, *shape.parameters())) < 0.15
+            solid |= np.abs(ShapeUnion.of([shape]).distance(p)) < 0.15
     reach = 3 * scene.scales.max(axis=1)
     leaves = (beyond > 0) & ~solid
     assert leaves.sum() > 10_000
@@ -152,7 +150,6 @@ def test_leaves_around_the_volume_stay_out_of_it(world):
 
 
 def test_every_shape_to_hit_is_seen(world):
-    """Around every trunk, rock and log in the volume there are Gaussians on its surface."""
     p = world.gaussians.means.astype(float)
     field = world.distance_field
     seen = 0
@@ -165,14 +162,13 @@ def test_every_shape_to_hit_is_seen(world):
             continue
         if ((centre < field.lower_W) | (centre > field.upper_W))[:2].any():
             continue
-        on_it = np.abs(type(shape).distances(p, *shape.parameters())) < 0.03
+        on_it = np.abs(ShapeUnion.of([shape]).distance(p)) < 0.03
         assert on_it.sum() > 40
         seen += 1
     assert seen > 30
 
 
 def test_trees_left_out_of_the_field_are_never_the_nearest():
-    """Adding all trees of the belt to the field changes no distance in the volume."""
     layout, field, *_ = _layout(SMALL, seed=3)
     trees = layout.trees
     every = [
@@ -200,8 +196,6 @@ def baked(world) -> BakedScene:
 
 @pytest.mark.parametrize("p_WC, yaw, pitch", VIEWS)
 def test_rendered_depth_is_the_distance_to_what_is_hit(world, baked, p_WC, yaw, pitch):
-    """Depth of the splats agrees with rays marched through the analytic field to a few cm, and
-    wherever a ray hits something in the volume the picture is opaque."""
     width, height = 160, 120
     K = np.array([[80.0, 0, 80], [0, 80, 60], [0, 0, 1]])
     forward = np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)])
@@ -239,7 +233,6 @@ def _march(world, K, width, height, R_WC, p_WC):
 
 
 def test_start_and_goal_face_each_other_with_room_around(world):
-    """Start and goal are near the two short ends, at the flight height, 1 m from everything."""
     np.testing.assert_allclose(world.p_WS, (1.5, 0, 1.8))
     np.testing.assert_allclose(world.p_WG, (34.5, 0, 1.8))
     ends = np.stack([world.p_WS, world.p_WG])
@@ -247,7 +240,6 @@ def test_start_and_goal_face_each_other_with_room_around(world):
 
 
 def test_the_grid_for_planning_agrees_with_the_truth(world):
-    """The grid's distance at flight height is the analytic one to a fraction of a voxel."""
     p = np.random.default_rng(0).uniform((0.5, -7.5, 1), (35.5, 7.5, 3), (2000, 3))
     error = world.esdf.distance(p) - world.distance_field.distance(p)
     assert np.abs(error).max() < ForestConfig().voxel_size / 2
@@ -255,14 +247,12 @@ def test_the_grid_for_planning_agrees_with_the_truth(world):
 
 
 def test_a_forest_without_rocks_and_logs_grows():
-    """Zero rocks and logs leave trunks and ground alone."""
     config = ForestConfig(**{**vars(SMALL), "rocks": 0, "logs": 0})
     kinds = [type(shape) for shape in _shapes(make_world(config, seed=0))]
     assert Sphere not in kinds and kinds.count(Capsule) == len(kinds) - 1
 
 
 def test_the_config_loads_from_yaml():
-    """Fields given in YAML replace the defaults; a misspelt one is an error."""
     config = yaml_load_typed(schema=ForestConfig, data="{spacing: 5.0, rocks: 0}")
     assert config == ForestConfig(spacing=5.0, rocks=0)
     with pytest.raises(RuntimeError, match="spacin"):
@@ -272,37 +262,34 @@ def test_the_config_loads_from_yaml():
 @pytest.mark.parametrize(
     "values, message",
     [
-        ({"length": 0.0}, r"length = 0.0 m must be positive"),
-        ({"width": -16.0}, r"width = -16.0 m must be positive"),
-        ({"height": float("nan")}, r"height = nan m must be positive"),
-        ({"voxel_size": 0.0}, r"voxel_size = 0.0 m must be positive"),
-        ({"radius_max": float("nan")}, r"radius_max = nan m must be positive"),
-        ({"radius_min": -0.1}, r"radius_min = -0.1 m must be positive"),
-        ({"rocks": -1}, r"rocks = -1 must be 0 to 1000"),
-        ({"lean_max": 40.0}, r"lean_max = 40.0 deg must be between 0 and 10"),
-        ({"length": 4.0}, r"length = 4.0 m must be at least 5 m"),
-        ({"width": 2.0}, r"width = 2.0 m must be at least 2.5"),
-        ({"flight_height": 5.5}, r"flight_height = 5.5 m must be between 1 m and .* = 5 m"),
-        ({"radius_min": 0.6}, r"radius_max = 0.45 m must not be below radius_min = 0.6 m"),
-        ({"spacing": 0.8}, r"radius_max = 0.45 m must be below half the spacing 0.8 m"),
-        ({"spacing": 1.9}, r"spacing = 1.9 m leaves gaps of 0.69 m .* use a spacing of at least"),
+        ({"length": 0.0}, r"length must be .* got 0.0"),
+        ({"width": -16.0}, r"width must be .* got -16.0"),
+        ({"height": float("nan")}, r"height must be .* got nan"),
+        ({"voxel_size": 0.0}, r"voxel_size must be .* got 0.0"),
+        ({"radius_max": float("nan")}, r"radius_max must be .* got nan"),
+        ({"radius_min": -0.1}, r"radius_min must be .* got -0.1"),
+        ({"rocks": -1}, r"rocks must be .* got -1"),
+        ({"lean_max": 40.0}, r"lean_max must be .* got 40.0"),
+        ({"length": 4.0}, r"length must be in \[5, .* got 4.0"),
+        ({"width": 2.0}, r"width must be at least 2.5.* got 2.0"),
+        ({"flight_height": 5.5}, r"flight_height must be at most .* = 5 m, got 5.5"),
+        ({"radius_min": 0.6}, r"radius_min must be at most radius_max = 0.45, got 0.6"),
+        ({"spacing": 0.8}, r"spacing must be at least 2.02 m, got 0.8"),
+        ({"spacing": 1.9}, r"spacing must be at least 2.02 m, got 1.9"),
     ],
 )
 def test_a_forest_that_cannot_be_grown_is_refused(values, message):
-    """Each bad value ends with what is wrong, its limit and the remedy."""
     with pytest.raises(ValueError, match=message):
         make_world(ForestConfig(**values), seed=0)
 
 
 def test_the_spacing_the_error_asks_for_is_enough():
-    """A spacing rejected with 'at least X' is accepted at X."""
     with pytest.raises(ValueError) as error:
         ForestConfig(spacing=1.9).validate()
-    needed = float(str(error.value).rsplit("at least ", 1)[1].removesuffix(" m"))
+    needed = float(str(error.value).rsplit("at least ", 1)[1].partition(" m")[0])
     ForestConfig(spacing=needed + 0.005).validate()
 
 
 def test_a_negative_seed_is_refused():
-    """Seeds count from 0."""
     with pytest.raises(ValueError, match=r"seed must be .*, got -1"):
         make_world(SMALL, seed=-1)

@@ -10,7 +10,6 @@ def light() -> Daylight:
 
 
 def test_the_sun_is_up_and_its_direction_follows_from_the_seed():
-    """Directions are unit vectors 32 to 58 degrees above the horizon, the same for a seed."""
     for seed in range(20):
         a, b = (Daylight.sample(np.random.default_rng(seed)) for _ in range(2))
         np.testing.assert_array_equal(a.direction, b.direction)
@@ -19,7 +18,6 @@ def test_the_sun_is_up_and_its_direction_follows_from_the_seed():
 
 
 def test_surfaces_facing_the_sun_are_brightest(light):
-    """Sun brightens the face turned to it, and changes nothing on the face turned away."""
     to_sun = light.direction[None]
     sunny, shady = (light.irradiance(to_sun, np.array([s])) for s in (1.0, 0.0))
     assert (sunny > shady + 0.1).all()
@@ -29,7 +27,6 @@ def test_surfaces_facing_the_sun_are_brightest(light):
 
 
 def test_leaves_shine_from_both_sides(light):
-    """Sun on the back of a leaf lights it as on the front."""
     front, back = (
         light.irradiance(n, np.ones(1), leafy=True) - light.irradiance(n, np.zeros(1), leafy=True)
         for n in _horizontal(light)
@@ -45,7 +42,6 @@ def _horizontal(light: Daylight) -> list[np.ndarray]:
 
 
 def test_a_trunk_throws_its_shadow_away_from_the_sun(light):
-    """Ground behind a trunk, as seen from the sun, is dark; in front, beside and far behind lit."""
     trunk, radius, height = np.array([3.0, -1.0]), 0.3, 9.0
     flat = light.direction[:2] / np.linalg.norm(light.direction[:2])
     side = np.array([-flat[1], flat[0]])
@@ -62,7 +58,6 @@ def test_a_trunk_throws_its_shadow_away_from_the_sun(light):
 
 
 def test_sun_flecks_move_with_the_point_against_the_sun(light):
-    """Two points on one ray of the sun under the leaves see the same gap."""
     p = np.random.default_rng(1).uniform((-20, -20, 0), (20, 20, 1), (500, 3))
     through = light.through_canopy(p, 8.0, seed=3)
     np.testing.assert_allclose(
@@ -72,7 +67,6 @@ def test_sun_flecks_move_with_the_point_against_the_sun(light):
 
 
 def test_haze_swallows_the_distance():
-    """Nothing changes at the eye, 1 - 1/e of the way is done at the range, all is haze far off."""
     color, haze = np.array([[0.1, 0.2, 0.3]] * 3), np.array([0.8, 0.9, 1.0])
     faded = fade(color, haze, [0, HAZE_RANGE, 1e4])
     np.testing.assert_allclose(faded[0], color[0])

@@ -1,11 +1,16 @@
-"""Solids: faces on their surfaces, Gaussians and meshes from them."""
-
 import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from splatpilot.diagrams.worlds.solids.solid import MATERIALS, Solid, faces_of
-from splatpilot.systems.collision.shapes import Box, Capsule, Cylinder, HalfSpace, Sphere
+from splatpilot.systems.collision.shapes import (
+    Box,
+    Capsule,
+    Cylinder,
+    HalfSpace,
+    ShapeUnion,
+    Sphere,
+)
 
 BOX = Box(RigidTransform(RollPitchYaw(0.2, -0.4, 1.0), [1.0, 0, 2]), [1.0, 2.0, 0.5])
 SHAPES = {
@@ -27,20 +32,18 @@ BOUNDS = np.array([0.0, -2, 0]), np.array([10.0, 2, 5])
 
 @pytest.mark.parametrize("kind", SHAPES)
 def test_faces_lie_on_the_surface_and_look_outwards(kind):
-    """Points of all faces have distance zero and the distance's gradient as their normal."""
     shape = SHAPES[kind]
     rng = np.random.default_rng(0)
     for face in faces_of(shape, *BOUNDS):
         p, n, t = face.at(rng.uniform(0.02, 0.98, (200, 2)) * face.size)
-        np.testing.assert_allclose(type(shape).distances(p, *shape.parameters()), 0, atol=1e-12)
-        outwards = type(shape).gradients(p + 1e-6 * n, *shape.parameters())
+        np.testing.assert_allclose(ShapeUnion.of([shape]).distance(p), 0, atol=1e-12)
+        outwards = ShapeUnion.of([shape]).nearest(p + 1e-6 * n)[1]
         np.testing.assert_allclose(outwards, n, atol=1e-4)
         np.testing.assert_allclose(np.einsum("nk,nk->n", n, t), 0, atol=1e-12)
 
 
 @pytest.mark.parametrize("kind", SHAPES)
 def test_faces_cover_the_whole_surface(kind):
-    """The area that the faces' coordinates span is the surface's."""
     area = 0.0
     s = (np.stack(np.meshgrid(*2 * [np.arange(40)], indexing="ij"), -1).reshape(-1, 2) + 0.5) / 40
     for face in faces_of(SHAPES[kind], *BOUNDS):
@@ -54,8 +57,6 @@ def test_faces_cover_the_whole_surface(kind):
 
 @pytest.mark.parametrize("material", MATERIALS)
 def test_materials_have_colours_and_something_to_see(material):
-    """Every material gives colours, the same for the same place, that vary over 2 by 2 metres and
-    between solids."""
     rng = np.random.default_rng(1)
     uv = rng.uniform(0, 2, (4000, 2))
     ground = material in ("grass", "paving", "forest_floor")
@@ -71,12 +72,10 @@ def test_materials_have_colours_and_something_to_see(material):
 
 
 def test_unknown_material_is_refused():
-    """A material that does not exist is an error that lists those that do."""
     with pytest.raises(ValueError, match=r"material is 'gold'; .*brick, concrete"):
         Solid(SHAPES["sphere"], "gold")
 
 
 def test_tilted_ground_is_refused():
-    """Only horizontal half spaces can be drawn."""
     with pytest.raises(ValueError, match=r"only horizontal"):
         faces_of(HalfSpace([0.1, 0, 1], 0.0), *BOUNDS)

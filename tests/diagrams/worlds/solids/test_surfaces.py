@@ -27,7 +27,6 @@ def _along_and_radial(p: NDArray) -> tuple[NDArray, NDArray]:
 
 
 def test_patches_of_a_tube_lie_on_the_cylinder():
-    """Centres are one radius from the axis between its ends, normals outwards, tangents along."""
     surfels = _tube()
     along, radial = _along_and_radial(surfels.p)
     length = np.linalg.norm(P_B - P_A)
@@ -38,14 +37,12 @@ def test_patches_of_a_tube_lie_on_the_cylinder():
 
 
 def test_a_tapered_tube_narrows_linearly():
-    """The radius falls linearly along the axis to `taper` times that at the start."""
     along, radial = _along_and_radial(_tube(taper=0.25).p)
     expected = 0.4 * (1 - 0.75 * along / np.linalg.norm(P_B - P_A))
     np.testing.assert_allclose(np.linalg.norm(radial, axis=1), expected, atol=1e-12)
 
 
 def test_patches_of_a_sphere_lie_on_it():
-    """Centres are one radius from the centre; normals point outwards, tangents lie in it."""
     surfels = sphere((1, 2, 3), 0.7, 0.1)
     np.testing.assert_allclose(surfels.p, np.array([1, 2, 3]) + 0.7 * surfels.n, atol=1e-12)
     np.testing.assert_allclose(np.linalg.norm(surfels.n, axis=1), 1)
@@ -62,7 +59,6 @@ def _transmittance(surfels: Surfels, p: NDArray, n: NDArray) -> NDArray:
 
 
 def test_layers_have_no_holes():
-    """Tubes, spheres and grids on the ground let almost nothing through at any place."""
     rng = np.random.default_rng(1)
     angle, s = rng.uniform(0, 2 * np.pi, 300), rng.uniform(0.1, 0.9, 300)
     axis = (P_B - P_A) / np.linalg.norm(P_B - P_A)
@@ -83,7 +79,6 @@ def test_layers_have_no_holes():
 
 
 def test_gaussians_are_as_flat_and_oriented_as_their_patches():
-    """Means and colours are kept, the axes of the Gaussians are t, n x t and n, in that order."""
     surfels = _tube()
     colors = np.random.default_rng(2).uniform(size=(len(surfels), 3))
     scene = to_gaussians(surfels, colors, 0.7)
@@ -98,7 +93,6 @@ def test_gaussians_are_as_flat_and_oriented_as_their_patches():
 
 
 def test_merging_keeps_every_gaussian_in_order():
-    """The merged scene is the concatenation of its parts."""
     surfels = _tube()
     parts = [
         to_gaussians(surfels[np.arange(10)], np.full((10, 3), 0.2), 0.99),

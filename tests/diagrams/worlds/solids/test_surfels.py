@@ -1,5 +1,3 @@
-"""Gaussians of solids: they end where the solids end."""
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -7,9 +5,16 @@ import pytest
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
-from splatpilot.diagrams.worlds.solids.solid import Blueprint, Solid
+from splatpilot.diagrams.worlds.solids.solid import Solid, WorldSpec
 from splatpilot.diagrams.worlds.solids.surfels import draw
-from splatpilot.systems.collision.shapes import Box, Capsule, Cylinder, Shape, Sphere
+from splatpilot.systems.collision.shapes import (
+    Box,
+    Capsule,
+    Cylinder,
+    Shape,
+    ShapeUnion,
+    Sphere,
+)
 from splatpilot.systems.splats.baked_scene import BakedScene
 
 SIZE, FOCAL, AWAY = 200, 400.0, 5.0  # [px], [px], [m]
@@ -37,12 +42,10 @@ SHAPES = {
 
 @pytest.mark.parametrize("kind", SHAPES)
 def test_outlines_are_those_of_the_solid(kind):
-    """From all around, the area in which there is depth is the solid's own: nothing hangs over its
-    edges by more than 12 mm, 2 mm of a wire, nor is it smaller by that."""
     shape, material = SHAPES[kind]
     bounds = np.full(3, -9.0), np.full(3, 9.0)
-    blueprint = Blueprint(kind, *bounds, [Solid(shape, material)], *bounds, light=lambda _: _Even())
-    scene = BakedScene(draw(blueprint, blueprint.solids, _Even()))
+    spec = WorldSpec(kind, *bounds, [Solid(shape, material)], *bounds, light=lambda _: _Even())
+    scene = BakedScene(draw(spec, spec.solids, _Even()))
     drawn = solid = rim = 0
     for azimuth in np.linspace(0, 2 * np.pi, 5, endpoint=False):
         X_WC = RigidTransform(
@@ -67,7 +70,7 @@ def _is_seen(shape: Shape, X_WC: RigidTransform) -> NDArray[np.bool_]:
     rays_W /= np.linalg.norm(rays_W, axis=1, keepdims=True)
     p_WQ = np.tile(X_WC.translation(), (len(rays_W), 1))
     for _ in range(40):
-        distance = type(shape).distances(p_WQ, *shape.parameters())
+        distance = ShapeUnion.of([shape]).distance(p_WQ)
         p_WQ += np.minimum(distance, 1.0)[:, None] * rays_W
-    near = type(shape).distances(p_WQ, *shape.parameters()) < 1e-3
+    near = ShapeUnion.of([shape]).distance(p_WQ) < 1e-3
     return near.reshape(SIZE, SIZE)

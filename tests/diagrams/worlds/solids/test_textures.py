@@ -21,7 +21,6 @@ def points():
 
 
 def test_hash_is_uniform_and_uncorrelated_between_neighbours():
-    """Over a block of cells, negative ones too, the hash fills [0, 1) evenly and independently."""
     cells = np.stack(np.meshgrid(*[np.arange(-30, 30)] * 3, indexing="ij"), axis=-1)
     h = hash_unit(cells, seed=3)
     assert h.min() >= 0 and h.max() < 1
@@ -34,7 +33,6 @@ def test_hash_is_uniform_and_uncorrelated_between_neighbours():
 
 
 def test_hash_depends_on_the_seed():
-    """Two seeds give uncorrelated numbers in the same cells."""
     cells = np.argwhere(np.ones((100, 100)))
     a, b = hash_unit(cells, seed=0), hash_unit(cells, seed=1)
     assert abs(np.corrcoef(a, b)[0, 1]) < 0.03
@@ -42,7 +40,6 @@ def test_hash_depends_on_the_seed():
 
 @pytest.mark.parametrize("dimension", [1, 2, 3])
 def test_value_noise_takes_the_lattice_values_with_zero_slope(dimension):
-    """At lattice points the noise equals their random value and its gradient vanishes."""
     cells = np.random.default_rng(1).integers(-50, 50, (200, dimension))
     value = 2 * hash_unit(cells, seed=5) - 1
     np.testing.assert_allclose(value_noise(cells, seed=5), value, atol=1e-6)
@@ -53,14 +50,12 @@ def test_value_noise_takes_the_lattice_values_with_zero_slope(dimension):
 
 
 def test_value_noise_is_continuous_across_cells(points):
-    """A step of a thousandth of a cell changes the noise by no more than its largest slope."""
     p = np.round(points)  # on cell borders, where a wrong blend would jump
     a, b = value_noise(p - 5e-4), value_noise(p + 5e-4)
     assert np.abs(a - b).max() < 1e-3 * 3 * 2 * 1.875
 
 
 def test_a_point_has_its_noise_whatever_is_asked_beside_it(points):
-    """Noise is a function of position: shape and order of the batch change no bit."""
     whole = fbm(points, 4, seed=2)
     order = np.random.default_rng(2).permutation(len(points))
     np.testing.assert_array_equal(fbm(points[order], 4, seed=2), whole[order])
@@ -68,7 +63,6 @@ def test_a_point_has_its_noise_whatever_is_asked_beside_it(points):
 
 
 def test_fbm_adds_octaves_twice_as_fine_and_half_as_strong(points):
-    """Two octaves are (noise(p) + noise(2 p) / 2) / 1.5 with seeds of their own, within [-1, 1]."""
     expected = (value_noise(points, 4) + value_noise(2 * points, 5) / 2) / 1.5
     np.testing.assert_allclose(fbm(points, 2, seed=4), expected, atol=1e-6)
     np.testing.assert_array_equal(fbm(points, 1, seed=4), value_noise(points, seed=4))
@@ -76,13 +70,11 @@ def test_fbm_adds_octaves_twice_as_fine_and_half_as_strong(points):
 
 
 def test_smoothstep_rises_and_falls_between_its_ends():
-    """The step is 0 and 1 at its ends, 1/2 midway, and swaps direction with them."""
     np.testing.assert_allclose(smoothstep(2, 4, [0, 2, 3, 4, 9]), [0, 0, 0.5, 1, 1])
     np.testing.assert_allclose(smoothstep(4, 2, [0, 2, 3, 4, 9]), [1, 1, 0.5, 0, 0])
 
 
 def test_mix_and_ramp_are_linear():
-    """Blends by 0, 1/2 and 1 give one colour, the mean and the other colour."""
     a, b = np.array([0.0, 0.2, 1.0]), np.array([1.0, 0.4, 0.0])
     for blend in (mix(a, b, [0, 0.5, 1]), ramp([a, b], [0, 0.5, 1])):
         np.testing.assert_allclose(blend, [a, (a + b) / 2, b], atol=1e-6)
@@ -101,7 +93,6 @@ def test_mix_and_ramp_are_linear():
     ],
 )
 def test_materials_are_varied_colours(material, points):
-    """Every material gives colours in 0 to 1 that vary over it, the same at each call."""
     colors = material(points)
     assert colors.shape == (len(points), 3)
     assert colors.min() >= 0 and colors.max() <= 1
@@ -110,6 +101,5 @@ def test_materials_are_varied_colours(material, points):
 
 
 def test_fissures_are_darker_than_the_bark_between_them(points):
-    """At every point a fissure of oak or pine is darker than the plate beside it."""
     for species in (OAK, PINE):
         assert (textures.fissure(species, points) < textures.bark(species, points)).all()

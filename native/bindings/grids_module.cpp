@@ -1,0 +1,201 @@
+// Python bindings of worlds of regular grids, of distances in one of them, and of descent along
+// the gradient of another.
+#include <nanobind/stl/optional.h>
+
+#include <limits>
+#include <optional>
+
+#include "bindings/casting_bindings.hpp"
+#include "fields/grid_interpolation.hpp"
+
+namespace splatpilot {
+namespace {
+
+using namespace nb::literals;
+using Grid = Floats<nb::ndim<3>>;
+using Point = Doubles<nb::shape<3>>;
+using QueryPoints = Doubles<nb::shape<-1, 3>>;
+using Distances = nb::ndarray<double, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+using Gradients = nb::ndarray<double, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
+using WayPoints = nb::ndarray<double, nb::shape<-1, 4>, nb::c_contig, nb::device::cpu>;
+using GridShapes = nb::ndarray<const int64_t, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
+
+class GridWorlds : Casting {
+ public:
+  GridWorlds(const Floats<nb::ndim<1>>& values, const GridShapes& shapes, const Points& lower_W,
+             const Floats<nb::ndim<1>>& voxel_sizes, int threads, const std::string& simd)
+      : Casting(threads, simd), values_(values.data(), values.data() + values.size()) {
+    const size_t count = shapes.shape(0);
+    require(lower_W.shape(0) == count && voxel_sizes.size() == count,
+            "shapes, lower corners and voxel sizes of grids differ in number");
+    size_t begin = 0;
+    for (size_t w = 0; w < count; ++w) {
+      GridWorld grid{};
+      size_t size = 1;
+      grid.voxel_size = voxel_sizes.data()[w];
+      require(grid.voxel_size > 0.0f && std::isfinite(grid.voxel_size),
+              "a voxel's size must be positive");
+      for (int k = 0; k < 3; ++k) {
+        const int64_t length = shapes.data()[3 * w + k];
+        require(length >= 2 && length <= 32768, "a grid needs 2 to 32768 voxels along each axis");
+        grid.shape[k] = static_cast<int32_t>(length);
+        grid.first_center[k] = lower_W.data()[3 * w + k] + 0.5f * grid.voxel_size;
+        require(std::isfinite(grid.first_center[k]), "a grid's lower corner must be finite");
+        size *= static_cast<size_t>(length);
+      }
+      require(size <= 0x7fffffff, "a grid has more than 2^31 - 1 voxels");
+      require(size <= values_.size() - begin, "there are fewer values than voxels");
+      grid.values = values_.data() + begin;
+      begin += size;
+      grids_.push_back(grid);
+    }
+    require(begin == values_.size(), "there are more values than voxels");
+  }
+
+  size_t size() const { return grids_.size(); }
+
+  void depth(const Points& p, const Rotations& R, const Numbers& world, const Points& directions,
+             float half_pixel, const DepthRows& depth) {
+    for_each_camera(p, R, world, size(), directions, half_pixel, depth, 0,
+                    [this](size_t w, auto&&... rest) { kernels_.cast_grid(grids_[w], rest...); });
+  }
+
+  void interpolate(const Points& p, const Numbers& world, const Writable<nb::ndim<1>>& values,
+                   const Rows3& gradients) {
+    const size_t n = p.shape(0);
+    require(values.size() == n && gradients.shape(0) == n,
+            "points, values and gradients differ in number");
+    require_worlds(world, n, size());
+    const nb::gil_scoped_release release;
+    for (size_t i = 0; i < n; ++i) {
+      values.data()[i] = kernels_.interpolate(grids_[static_cast<size_t>(world.data()[i])],
+                                              p.data() + 3 * i, gradients.data() + 3 * i);
+    }
+  }
+
+ private:
+  std::vector<float> values_;
+  std::vector<GridWorld> grids_;
+};
+
+void grid_distances(const Grid& grid, const Point& lower_W, const Point& upper_W, double voxel_size,
+                    bool occupied_outside, const QueryPoints& p_WQ, const Distances& distances,
+                    const std::optional<Gradients>& gradients) {
+  const size_t count = p_WQ.shape(0);
+  require(distances.size() == count && (!gradients || gradients->shape(0) == count),
+          "points, distances and gradients differ in number");
+  require(voxel_size > 0.0, "voxels need a size");
+  VoxelGrid voxels{grid.data(), {}, {}, voxel_size};
+  for (int k = 0; k < 3; ++k) {
+    voxels.shape[k] = static_cast<int64_t>(grid.shape(k));
+    require(voxels.shape[k] >= 2, "a grid needs at least 2 voxels along each axis");
+    voxels.lower_W[k] = lower_W.data()[k];
+  }
+  const double *lower = lower_W.data(), *upper = upper_W.data();
+  for (size_t i = 0; i < count; ++i) {
+    const double* p = p_WQ.data() + 3 * i;
+    double in_box[3], beyond[3];
+    bool inside = true;
+    for (int k = 0; k < 3; ++k) {
+      in_box[k] = p[k] < lower[k] ? lower[k] : p[k] > upper[k] ? upper[k] : p[k];
+      beyond[k] = p[k] - in_box[k];
+      inside = inside && p[k] == in_box[k];  // false also for NaN
+    }
+    double* gradient = gradients ? gradients->data() + 3 * i : nullptr;
+    if (!inside && !occupied_outside) {
+      distances.data()[i] = std::numeric_limits<double>::quiet_NaN();
+      if (gradient) std::fill_n(gradient, 3, 0.0);
+      continue;
+    }
+    Interpolant at = voxels.interpolate(in_box);
+    if (!inside) {
+      const double away =
+          std::sqrt(beyond[0] * beyond[0] + beyond[1] * beyond[1] + beyond[2] * beyond[2]);
+      at.value -= away;
+      for (int k = 0; k < 3; ++k) {
+        at.gradient[k] = (beyond[k] == 0.0 ? at.gradient[k] : 0.0) - beyond[k] / away;
+      }
+    }
+    distances.data()[i] = at.value;
+    if (gradient) std::copy_n(at.gradient, 3, gradient);
+  }
+}
+
+struct Vector {
+  double x, y, z;
+
+  Vector operator-(const Vector& other) const { return {x - other.x, y - other.y, z - other.z}; }
+  Vector operator/(double s) const { return {x / s, y / s, z / s}; }
+  double length() const { return std::sqrt(x * x + y * y + z * z); }
+  // Zero stays zero.
+  Vector unit() const { return length() > 0.0 ? *this / length() : *this; }
+};
+
+Vector vector(const Point& p) { return {p.data()[0], p.data()[1], p.data()[2]}; }
+
+// The gradient at a point brought between the outermost voxel centers.
+Vector gradient(const VoxelGrid& grid, const Vector& p_WQ) {
+  double p[3] = {p_WQ.x, p_WQ.y, p_WQ.z};
+  for (int k = 0; k < 3; ++k) {
+    const double first = grid.lower_W[k] + 0.5 * grid.voxel_size;
+    const double last = first + static_cast<double>(grid.shape[k] - 1) * grid.voxel_size;
+    p[k] = std::min(std::max(first, p[k]), last);  // NaN becomes `first`
+  }
+  const Interpolant at = grid.interpolate(p);
+  return {at.gradient[0], at.gradient[1], at.gradient[2]};
+}
+
+size_t descend(const Grid& times, const Point& lower_W, double voxel_size, const Point& p_WG,
+               const Point& p_WQ, double step, double length, const WayPoints& way) {
+  require(voxel_size > 0.0 && step > 0.0, "voxels and steps need a size");
+  VoxelGrid grid{times.data(), {}, {}, voxel_size};
+  for (int k = 0; k < 3; ++k) {
+    grid.shape[k] = static_cast<int64_t>(times.shape(k));
+    require(grid.shape[k] >= 2, "a grid needs at least 2 voxels along each axis");
+    grid.lower_W[k] = lower_W.data()[k];
+  }
+  const Vector goal = vector(p_WG);
+  Vector p = vector(p_WQ), direction = {0.0, 0.0, 0.0};
+  double covered = 0.0;
+  for (size_t count = 0; count < way.shape(0); ++count) {
+    const double row[4] = {p.x, p.y, p.z, covered};
+    std::copy_n(row, 4, way.data() + 4 * count);
+    const Vector to_goal = goal - p;
+    const double distance = to_goal.length();
+    if (!(covered < length) || distance < 1e-9) return count + 1;
+    // The mean with the last direction: plain steepest descent zigzags in a valley.
+    direction =
+        distance < 2.0 * step ? to_goal / distance : (direction - gradient(grid, p).unit()).unit();
+    const double stride = std::min(step, distance);
+    p = {p.x + stride * direction.x, p.y + stride * direction.y, p.z + stride * direction.z};
+    covered += stride;
+  }
+  return way.shape(0);
+}
+
+}  // namespace
+
+void bind_grids(nb::module_& m) {
+  nb::class_<GridWorlds>(m, "GridWorlds", "Regular grids of several worlds, one of each.")
+      .def(nb::init<const Floats<nb::ndim<1>>&, const GridShapes&, const Points&,
+                    const Floats<nb::ndim<1>>&, int, const std::string&>(),
+           nb::kw_only(), "values"_a, "shapes"_a, "lower_W"_a, "voxel_sizes"_a, "threads"_a = 1,
+           "simd"_a = "", "The values of all grids, one after another.")
+      .def("__len__", &GridWorlds::size)
+      .def("depth", &GridWorlds::depth, nb::kw_only(), "p_WC"_a, "R_WC"_a, "world"_a,
+           "directions_C"_a, "half_pixel"_a, "depth"_a,
+           "Writes the depth images of N cameras where the values are signed distances.")
+      .def("interpolate", &GridWorlds::interpolate, nb::kw_only(), "p_WQ"_a, "world"_a, "values"_a,
+           "gradients"_a, "Writes the trilinear interpolants (N,) and their gradients (N, 3).");
+  m.def("grid_distances", &grid_distances, nb::kw_only(), "grid"_a, "lower_W"_a, "upper_W"_a,
+        "voxel_size"_a, "occupied_outside"_a, "p_WQ"_a, "distances"_a, "gradients"_a = nb::none(),
+        "Writes the distances (N,) at N points and their gradients (N, 3): between the centers of\n"
+        "voxels the trilinear interpolant of the grid; outside, minus the distance to the box, or\n"
+        "NaN with a gradient of zero.");
+  m.def("descend", &descend, nb::kw_only(), "times"_a, "lower_W"_a, "voxel_size"_a, "p_WG"_a,
+        "p_WQ"_a, "step"_a, "length"_a, "way"_a,
+        "Writes points and the length up to them, rows (4,), down the gradient of `times` from\n"
+        "p_WQ to p_WG or until `length` is covered; returns how many.");
+}
+
+}  // namespace splatpilot

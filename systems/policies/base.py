@@ -1,0 +1,124 @@
+"""Base classes of policies: what they observe, how they are configured and how they update."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, NamedTuple, cast
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydrake.common.value import Value
+from pydrake.math import RigidTransform
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
+from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
+
+from splatpilot.systems.common.drake import input_port
+from splatpilot.systems.common.validation import Config, bounded, require_field
+from splatpilot.systems.policies.observations import require_poolable
+from splatpilot.systems.sensing.onboard_camera import OnboardCamera
+from splatpilot.systems.vehicle.state import QuadrotorState, pose_from_state
+
+GRID_SHAPE = 9, 16  # rows and columns of a depth grid
+
+_CHANNELS = {"depth_image_32f": (ImageDepth32F, 0), "color_image": (ImageRgba8U, slice(3))}
+
+
+class Observation(NamedTuple):
+    """The inputs of a policy at an update."""
+
+    time: float  # [s]
+    X_WB: RigidTransform
+    state: QuadrotorState
+    p_WG: np.ndarray  # (3,) [m], the goal
+    # (H, W) [m] planar depth, (H, W, 3) uint8 RGB, or (9, 16) proximities; else empty.
+    image: np.ndarray
+
+
+@dataclass
+class LearnedPolicyConfig(Config):
+    """The weights, speed and camera of a learned policy."""
+
+    rate: ClassVar[float]
+    """[Hz], of updates, as in training."""
+    image_size: ClassVar[tuple[int, int]] = (1, 1)
+    """Height and width [px] to which images are pooled."""
+
+    # [m/s] Nominal speed; the model card of the weights names the speeds of training.
+    speed: float = bounded(2.0, "[0.1, 10] m/s")
+    # File of weights, as `splatpilot train` writes them; those that ship if empty.
+    weights: str = ""
+    # Camera of the policy; its width and height must be multiples of the network's.
+    camera: OnboardCamera = field(default_factory=OnboardCamera)
+
+    def check(self) -> None:
+        require_poolable(self.camera.height, self.camera.width, *self.image_size)
+
+
+def require_speed(config: Any) -> None:
+    """Checks the nominal speed of a learned policy."""
+    require_field(config, "speed", 0.1 <= config.speed <= 10.0, "in [0.1, 10] m/s")
+
+
+class Policy(LeafSystem):
+    """Base class of policies: updates its discrete state by `decide`, from time 0 at the rate of
+    its configuration.
+
+    A subclass declares its outputs and memory with `declare_state`; output ports hold the initial
+    values before the first update. The input ports are ``state`` (13), ``goal`` (3), p_WG [m] in
+    the world, and the image:
+
+    - ``depth_image_32f``: planar depth [m] of the camera ``config.camera``;
+    - ``color_image``: RGBA of that camera;
+    - ``depth_grid`` (144): proximities in 16x9 cells, see
+      :class:`~splatpilot.systems.sensing.time_of_flight.TimeOfFlightGrid`.
+
+    Args:
+        config: has `rate` [Hz] and `validate()`; with an image of a camera, `camera`.
+        image: name of the image port; empty if the policy has none.
+    """
+
+    state_input_port = input_port("state")
+    goal_input_port = input_port("goal")
+
+    def __init__(self, config: Any, image: str = "") -> None:
+        super().__init__()
+        config.validate()
+        self._config, self._image = config, image
+        self._state_port = self.DeclareVectorInputPort("state", 13)
+        self._goal_port = self.DeclareVectorInputPort("goal", 3)
+        if image in _CHANNELS:
+            size = config.camera.width, config.camera.height
+            value = Value(cast(Any, _CHANNELS[image][0])(*size))
+            self._image_port = self.DeclareAbstractInputPort(image, value)
+        elif image:
+            self._image_port = self.DeclareVectorInputPort(image, int(np.prod(GRID_SHAPE)))
+        self.DeclarePeriodicDiscreteUpdateEvent(1.0 / config.rate, 0.0, self._update)
+
+    def declare_state(self, initial: ArrayLike, output: str = "") -> None:
+        """Declares a group of the discrete state, with an output port if it has a name."""
+        group = self.DeclareDiscreteState(np.asarray(initial, dtype=float))
+        if output:
+            self.DeclareStateOutputPort(output, group)
+
+    def decide(self, seen: Observation, *state: np.ndarray) -> Sequence[np.ndarray]:
+        """Returns the next values of the groups of `declare_state`, from the present ones."""
+        raise NotImplementedError
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        x = np.asarray(self._state_port.Eval(context))
+        p_WG = np.asarray(self._goal_port.Eval(context))
+        image = self._read_image(context)
+        seen = Observation(
+            context.get_time(), pose_from_state(x), QuadrotorState.of(x), p_WG, image
+        )
+        old = context.get_discrete_state()
+        groups = [np.array(old.value(i)) for i in range(old.num_groups())]
+        for i, value in enumerate(self.decide(seen, *groups)):
+            discrete_state.set_value(i, value)
+
+    def _read_image(self, context: Context) -> np.ndarray:
+        if not self._image:
+            return np.empty(0)
+        image = self._image_port.Eval(context)
+        if self._image in _CHANNELS:
+            return np.asarray(cast(Any, image).data)[..., _CHANNELS[self._image][1]]
+        return np.reshape(cast(Any, image), GRID_SHAPE)

@@ -1,0 +1,132 @@
+"""Flights among bodies that move: seen, hit and planned around where they are at the time."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pydrake.geometry import Meshcat
+from pydrake.systems.analysis import Simulator
+
+from splatpilot.diagrams.flight.flight import Outcome, fly, sample_initial_state
+from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
+from splatpilot.diagrams.flight.policies import policy_named
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.worlds.world import MovingBodies, World
+from splatpilot.systems.collision.shapes import MovingSpheres
+from splatpilot.systems.common.provenance import InfeasibleFlightError
+from splatpilot.systems.splats.baked_scene import MovingGaussians
+from splatpilot.systems.splats.scene import GaussianScene
+from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
+
+
+def with_ball(world: World, path: np.ndarray, radius: float = 0.5) -> World:
+    """The world with one red ball on a path, a row every 0.02 s."""
+    directions = np.random.default_rng(0).normal(size=(300, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    ball = GaussianScene.from_colors(
+        radius * directions,
+        np.tile([1.0, 0, 0, 0], (300, 1)),
+        np.full((300, 3), 0.06),
+        np.full(300, 0.99),
+        np.tile([1.0, 0.0, 0.0], (300, 1)),
+    )
+    balls = MovingSpheres([radius], [path], 0.02)
+    return replace(world, moving=MovingBodies(balls, MovingGaussians([ball], balls.centers)))
+
+
+def falling(x: float, y: float, speed: float) -> np.ndarray:
+    """A path down from 9 m over (x, y) at a speed [m/s]."""
+    z = 9.0 - 0.02 * speed * np.arange(1000)
+    return np.column_stack([np.full(1000, x), np.full(1000, y), z])
+
+
+def hovering(**changes) -> Scenario:
+    """A vehicle that goes nowhere: its waypoint is where it is."""
+    return Scenario(timeout=4.0, start_radius=0.0, policy=policy_named("straight", 0.01), **changes)
+
+
+def test_a_ball_hits_at_its_time(post_world):
+    hit_at = (9.0 - 2.0 - 0.5 - VEHICLE_RADIUS) / 3.0
+    scenario = hovering()
+    for aside, outcome in ((0.0, Outcome.COLLISION), (2.5, Outcome.TIMEOUT)):
+        world = with_ball(post_world, falling(1.0, aside, 3.0))
+        flight = fly(BuildFlightDiagram(scenario, world, camera=False), scenario, world)
+        assert flight.outcome == outcome
+        if not aside:
+            assert flight.times[-1] == pytest.approx(hit_at, abs=0.045)
+            assert flight.clearances[-1] < 0 < flight.clearances[-3]
+    # The record of clearances has the ball at the time of each sample.
+    fall = 3.0 * flight.times
+    ball = np.column_stack([np.ones_like(fall), np.full_like(fall, 2.5), 9.0 - fall])
+    apart = np.linalg.norm(flight.states[:, :3] - ball, axis=1) - 0.5 - VEHICLE_RADIUS
+    to_post = np.linalg.norm(flight.states[:, :2] - [5.0, 0.0], axis=1) - 0.5 - VEHICLE_RADIUS
+    np.testing.assert_allclose(flight.clearances, np.minimum(apart, to_post), atol=0.07)
+
+
+@pytest.mark.parametrize("policy", ["planner", "reactive"])
+def test_the_same_flight_bit_for_bit(post_world, policy):
+    scenario = Scenario(timeout=2.0, policy=policy_named(policy))
+    world = with_ball(post_world, falling(3.0, 0.6, 2.0))
+    diagram = BuildFlightDiagram(scenario, world, camera=False)
+    first, again = fly(diagram, scenario, world), fly(diagram, scenario, world)
+    other = fly(BuildFlightDiagram(scenario, world, camera=False), scenario, world)
+    for flight in (again, other):
+        for name in ("times", "states", "commands", "clearances", "hypotheses"):
+            np.testing.assert_array_equal(getattr(flight, name), getattr(first, name))
+
+
+def test_the_camera_of_a_flight_sees_the_ball_come(post_world):
+    scenario = hovering()
+    approach = np.column_stack([4.0 - 0.02 * np.arange(100), np.zeros(100), np.full(100, 2.0)])
+    world = with_ball(post_world, approach)
+    diagram = BuildFlightDiagram(scenario, world)
+    root = Simulator(diagram).get_mutable_context()
+    plant = diagram.GetSubsystemByName("plant").GetMyMutableContextFromRoot(root)
+    plant.SetContinuousState(sample_initial_state(scenario, world))
+    depths, red = [], []
+    for time in (0.0, 0.5, 1.0):
+        root.SetTime(time)
+        depth = diagram.GetOutputPort("depth_image_32f").Eval(root).data[..., 0]
+        color = diagram.GetOutputPort("color_image").Eval(root).data.astype(int)
+        depths.append(depth[120, 160])
+        red.append((color[..., 0] > color[..., 1] + 150).sum())
+    # The camera sits 0.1 m before the vehicle's center, at x = 1.
+    np.testing.assert_allclose(depths, [2.4, 1.9, 1.4], atol=0.08)
+    assert red[0] < red[1] < red[2]
+
+
+def test_the_planner_leaves_room_to_a_ball(post_world):
+    scenario = Scenario(timeout=15.0)
+    blind = fly(BuildFlightDiagram(scenario, post_world, camera=False), scenario, post_world)
+    in_the_way = blind.states[np.argmax(blind.states[:, 0] > 2.8), :3]
+    world = with_ball(post_world, in_the_way[None])
+    flight = fly(BuildFlightDiagram(scenario, world, camera=False), scenario, world)
+    assert flight.outcome == Outcome.GOAL and flight.clearances.min() > 0
+
+
+def test_the_planner_looks_ahead(post_world):
+    scenario = Scenario(timeout=15.0)
+    blind = fly(BuildFlightDiagram(scenario, post_world, camera=False), scenario, post_world)
+    meeting = np.argmax(blind.states[:, 0] > 3.0)
+    way = 4.0 * (0.02 * np.arange(600) - blind.times[meeting])
+    path = blind.states[meeting, :3] + np.column_stack([0 * way, way, 0 * way])
+    world = with_ball(post_world, path)
+    hit = world.distances(blind.times, blind.states[:, :3]) - VEHICLE_RADIUS
+    assert hit.min() < -0.4
+    flight = fly(BuildFlightDiagram(scenario, world, camera=False), scenario, world)
+    assert flight.outcome == Outcome.GOAL and flight.clearances.min() > 0
+
+
+def test_a_start_in_a_ball_is_refused(post_world):
+    world = with_ball(post_world, falling(1.0, 0.0, 3.0) - [0.0, 0.0, 7.0])
+    with pytest.raises(InfeasibleFlightError, match=r"start .* from the nearest surface"):
+        sample_initial_state(hovering(), world)
+
+
+def test_meshcat_shows_the_ball_if_there_is_one(post_world):
+    scenario, meshcat = hovering(), Meshcat()
+    world = with_ball(post_world, falling(1.0, 0.0, 3.0))
+    for flown, shown in ((post_world, False), (world, True)):
+        diagram = BuildFlightDiagram(scenario, flown, meshcat=meshcat)
+        assert diagram.HasSubsystemNamed("balls_visualizer") == shown
+        assert meshcat.HasPath("/splatpilot/balls/0") == shown

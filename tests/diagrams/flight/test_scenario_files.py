@@ -1,0 +1,35 @@
+"""Finding scenarios by name or path, and writing them."""
+
+import pytest
+
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.scenarios import benchmark_scenarios, other_scenarios, scenario_file
+from splatpilot.systems.common.config import dump_config, load_config, parse_config
+
+
+def test_names_and_paths_are_found(tmp_path):
+    assert scenario_file("P01") == benchmark_scenarios()["P01"]
+    assert scenario_file("P01").is_file()
+    other = tmp_path / "other"
+    other.write_text("")
+    assert scenario_file(str(other)) == other
+    assert scenario_file("mine.yaml").name == "mine.yaml"
+
+
+def test_scenarios_outside_the_benchmark_have_names_too():
+    assert len(benchmark_scenarios()) == 17
+    assert not set(benchmark_scenarios()) & set(other_scenarios())
+    assert scenario_file("alley_splat").is_file()
+
+
+def test_unknown_scenario_lists_those_there_are():
+    with pytest.raises(ValueError, match=r"no scenario 'nothing'.*P01, P02"):
+        scenario_file("nothing")
+
+
+@pytest.mark.parametrize("name", benchmark_scenarios() | other_scenarios())
+def test_scenario_that_was_written_is_the_same(name):
+    scenario = load_config(Scenario(), scenario_file(name))
+    again = parse_config(Scenario(), dump_config(scenario), name)
+    assert type(again.world) is type(scenario.world)
+    assert again.world == scenario.world

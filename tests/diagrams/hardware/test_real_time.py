@@ -1,0 +1,78 @@
+"""Diagrams that keep up with the wall clock, and some that do not."""
+
+import time
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder, LeafSystem
+
+from splatpilot.diagrams.hardware.real_time import MAX_LAG, run_in_real_time
+from splatpilot.systems.messaging.bridge_status import UnixClock
+
+
+class Worker(LeafSystem):
+    """Updates every 0.01 s, and needs some time for the update at 0.05 s."""
+
+    def __init__(self, needs: float):
+        super().__init__()
+        self._needs = needs
+        self.DeclareVectorInputPort("overruns", 1)
+        self.DeclareDiscreteState(1)
+        self.DeclarePeriodicDiscreteUpdateEvent(0.01, 0.0, self._update)
+
+    def _update(self, context, state) -> None:
+        if abs(context.get_time() - 0.05) < 1e-9:
+            time.sleep(self._needs)
+        state.set_value(context.get_discrete_state(0).value() + 1)
+
+
+def ran(needs: float, until: float = 0.2):
+    """Updates that are missing, overruns as returned and as the diagram was told, how long it took,
+    and by how much its clock is off at the end."""
+    builder = DiagramBuilder()
+    clock, worker = UnixClock(), Worker(needs)
+    builder.AddNamedSystem("clock", clock)
+    builder.AddSystem(worker)
+    builder.ExportInput(worker.get_input_port(), "overruns")
+    diagram = builder.Build()
+    simulator = Simulator(diagram)
+    root = simulator.get_mutable_context()
+    diagram.GetInputPort("overruns").FixValue(root, np.zeros(1))
+    started, looked = [], []
+
+    def over(now: float) -> bool:
+        looked.append(now)
+        return now >= until - 1e-9
+
+    overruns = run_in_real_time(
+        simulator,
+        diagram,
+        0.01,
+        over,
+        ready=lambda: started.append(time.monotonic()),
+    )
+    took = time.monotonic() - started[0]
+    unix = clock.get_output_port().Eval(clock.GetMyContextFromRoot(root))[0]
+    told = worker.get_input_port().Eval(worker.GetMyContextFromRoot(root))[0]
+    updates = worker.GetMyContextFromRoot(root).get_discrete_state(0).value()[0]
+    missing = round(looked[-1] / 0.01) + 1 - updates
+    return missing, overruns, told, took, time.time() - unix
+
+
+def test_no_tick_begins_early():
+    missing, overruns, told, took, _ = ran(needs=0.0)
+    assert missing == 0
+    assert took >= 0.2
+    assert told == overruns
+
+
+@pytest.mark.parametrize("needs", [0.03, 0.4])
+def test_overruns_are_counted_and_leave_nothing_out(needs):
+    missing, overruns, told, took, behind = ran(needs)
+    assert missing == 0
+    assert overruns == told >= 1
+    assert took >= max(0.2, needs + 0.15 - MAX_LAG)
+    assert behind >= -1e-3
+    # All that was lost beyond what is allowed has been left behind: only waiting remains.
+    assert behind <= MAX_LAG + 0.1

@@ -1,0 +1,44 @@
+import numpy as np
+
+from splatpilot.diagrams.worlds.building_blocks import (
+    hall,
+    roof,
+    signs_in,
+    start_and_goal,
+)
+from splatpilot.diagrams.worlds.solids.surfaces import FloorPlan
+from splatpilot.systems.collision.shapes import AnalyticDistanceField
+
+PLOT = FloorPlan.of_size(12.0, 8.0, 4.0)
+
+
+def _distance(solids, p_W: np.ndarray) -> np.ndarray:
+    shapes = [solid.shape for solid in solids]
+    return AnalyticDistanceField(shapes, PLOT.lower - 2, PLOT.upper + 2).distance(p_W)
+
+
+def test_walls_and_roof_enclose_the_volume():
+    p = np.random.default_rng(0).uniform(PLOT.lower, PLOT.upper, (500, 3))
+    to_bounds = np.minimum((p - PLOT.lower)[:, :2].min(axis=1), (PLOT.upper - p).min(axis=1))
+    solids = [*hall(PLOT, ["brick"], np.random.default_rng(1)), roof(PLOT)]
+    np.testing.assert_allclose(_distance(solids, p), to_bounds, atol=1e-12)
+
+
+def test_signs_hang_on_the_inner_faces_of_a_hall():
+    walls = hall(PLOT, ["brick"], np.random.default_rng(1))
+    signs = signs_in(walls, 3, 1, np.random.default_rng(2))
+    middles = np.array([sign.shape.X_WO.translation() for sign in signs])
+    assert len(signs) == 8
+    np.testing.assert_allclose(middles[:3, 1], -4 + 0.01)
+    np.testing.assert_allclose(middles[3:6, 1], 4 - 0.01)
+    np.testing.assert_allclose(middles[6:, 0], (0.01, 12 - 0.01))
+    assert ((middles > PLOT.lower) & (middles < PLOT.upper)).all()
+    assert not signs_in(walls, 0, 0, np.random.default_rng(2))
+
+
+def test_start_and_goal_are_at_the_ends_and_at_the_heights_asked_for():
+    rng = np.random.default_rng(0)
+    ends = np.array([start_and_goal(PLOT, rng, (0.5, 0.7)) for _ in range(50)])  # (50, 2, 3)
+    np.testing.assert_allclose(ends[..., 0], np.tile((1.5, 10.5), (50, 1)))
+    assert np.abs(ends[..., 1]).max() < 4 and np.ptp(ends[..., 1]) > 2
+    assert ends[..., 2].min() >= 0.5 and ends[..., 2].max() <= 0.7

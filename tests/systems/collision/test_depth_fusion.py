@@ -1,0 +1,263 @@
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydrake.common.eigen_geometry import Quaternion
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+
+from splatpilot.systems.collision.depth_fusion import (
+    DepthFusion,
+    bounds_of_depth_images,
+    esdf_from_depth_images,
+)
+from splatpilot.systems.collision.distance_field import FieldState
+from splatpilot.systems.collision.shapes import (
+    AnalyticDistanceField,
+    Box,
+    Cylinder,
+    HalfSpace,
+    Sphere,
+)
+
+FREE, OCCUPIED, UNKNOWN, _ = FieldState
+K = np.array([[60.0, 0.0, 60.0], [0.0, 60.0, 45.0], [0.0, 0.0, 1.0]])
+WIDTH, HEIGHT = 120, 90
+# From a camera's axes to those of a body that looks along its x axis.
+R_BC = RotationMatrix(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]))
+
+
+def room() -> AnalyticDistanceField:
+    """A room of 4 x 3 x 2.5 m with a ball, a pillar and a crate."""
+    walls = [
+        HalfSpace(np.array(normal, float), offset)
+        for normal, offset in (
+            ([1, 0, 0], 0.0),
+            ([-1, 0, 0], -4.0),
+            ([0, 1, 0], 0.0),
+            ([0, -1, 0], -3.0),
+            ([0, 0, 1], 0.0),
+            ([0, 0, -1], -2.5),
+        )
+    ]
+    things = [
+        Sphere(np.array([2.5, 1.5, 0.8]), 0.5),
+        Cylinder(np.array([1.2, 2.2, 0.0]), np.array([1.3, 2.2, 2.5]), 0.15),
+        Box(
+            RigidTransform(RollPitchYaw(0.0, 0.0, 0.5), np.array([3.2, 0.6, 0.3])), [0.6, 0.4, 0.6]
+        ),
+    ]
+    return AnalyticDistanceField([*walls, *things], np.full(3, -1.0), np.array([5.0, 4.0, 3.5]))
+
+
+def render(field: AnalyticDistanceField, X_WC: RigidTransform) -> np.ndarray:
+    """The depth image of a distance field, by sphere tracing."""
+    row, column = np.mgrid[0:HEIGHT, 0:WIDTH] + 0.5
+    ray_C = np.stack([(column - 60.0) / 60.0, (row - 45.0) / 60.0, np.ones_like(row)], -1)
+    length = np.linalg.norm(ray_C, axis=-1)
+    way_W = (ray_C / length[..., None]) @ X_WC.rotation().matrix().T
+    travelled = np.zeros_like(length)
+    for _ in range(40):
+        travelled += field.distance(X_WC.translation() + travelled[..., None] * way_W)
+    return (travelled / length).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def capture() -> tuple[list[np.ndarray], list[RigidTransform]]:
+    """Sixteen views that turn about at four places of the room."""
+    X_WCs = [
+        RigidTransform(
+            RotationMatrix(RollPitchYaw(0.0, 0.3 * (k % 3 - 1), k * np.pi / 4)).multiply(R_BC),
+            np.array([1.0 + 2.0 * (k % 2), 0.8 + 1.4 * (k // 8), 1.2 + 0.2 * (k % 3)]),
+        )
+        for k in range(16)
+    ]
+    return [render(room(), X_WC) for X_WC in X_WCs], X_WCs
+
+
+def test_the_fused_field_is_that_of_the_room(capture):
+    depths, X_WCs = capture
+    lower_W, upper_W = bounds_of_depth_images(depths, K, X_WCs)
+    voxel_size = 0.1
+    field = esdf_from_depth_images(depths, K, X_WCs, lower_W, upper_W, voxel_size)
+    p = np.stack(np.meshgrid(*field.voxel_centers(), indexing="ij"), -1)
+    truth = room().distance(p)
+    free = field.states == FREE
+    error = (field.distances - truth) / voxel_size
+    near = free & (truth < 1.5 * voxel_size)
+    assert abs(error[near].mean()) < 0.05
+    assert np.sqrt(np.mean(error[near] ** 2)) < 0.2
+    # Space hidden behind an edge may count as occupied, so distances far away err to the safe side.
+    assert -0.2 < error[free].mean() < 0.05
+    assert np.quantile(error[free], 0.99) < 0.5
+    # What is free is free and most of the room was seen.
+    assert truth[free].min() > -0.5 * voxel_size
+    assert np.mean(field.states[truth > 0.0] != UNKNOWN) > 0.9
+    assert np.mean(truth[field.states == OCCUPIED] < 0.5 * voxel_size) > 0.988
+
+
+def test_space_behind_surfaces_and_out_of_view_stays_unknown(capture):
+    depths, X_WCs = capture
+    box = np.full(3, -0.5), np.array([4.5, 3.5, 3.0])
+    field = esdf_from_depth_images(depths[:1], K, X_WCs[:1], *box, 0.1, max_range=2.0)
+    p_WC, R_WC = X_WCs[0].translation(), X_WCs[0].rotation().matrix()
+    p = np.stack(np.meshgrid(*field.voxel_centers(), indexing="ij"), -1)
+    p_C = (p - p_WC) @ R_WC
+    slope = np.abs(p_C[..., :2]) / np.maximum(p_C[..., 2:], 1e-9)
+    seen = (p_C[..., 2] > 0.0) & (slope[..., 0] <= 1.0) & (slope[..., 1] <= 0.75)
+    seen &= np.linalg.norm(p_C, axis=-1) <= 2.0
+    assert (field.states[~seen] == UNKNOWN).all()
+    open_air = seen & (room().distance(p) > 0.3) & (p[..., 0] < 2.0)
+    assert (field.states[open_air] == FREE).mean() > 0.97
+    assert (field.states[room().distance(p) < -0.35] == UNKNOWN).all()
+
+
+@pytest.mark.parametrize("voxel_size", [0.1, 0.037])
+def test_skipping_unseen_blocks_changes_nothing(capture, monkeypatch, voxel_size):
+    depths, X_WCs = capture
+    box = np.array([0.3, 0.2, -0.1]), np.array([2.9, 2.6, 1.6])
+    skipping = esdf_from_depth_images(depths[:5], K, X_WCs[:5], *box, voxel_size)
+    monkeypatch.setattr(
+        DepthFusion,
+        "visible_blocks",
+        lambda self, depth, K, center_C, max_range: np.arange(len(center_C)),
+    )
+    complete = esdf_from_depth_images(depths[:5], K, X_WCs[:5], *box, voxel_size)
+    np.testing.assert_array_equal(skipping.states, complete.states)
+    np.testing.assert_array_equal(skipping.distances, complete.distances)
+
+
+def wall(distance: float, slope: float = 0.0) -> np.ndarray:
+    """The depth of a plane z = distance + slope x of the camera frame."""
+    u = (np.arange(WIDTH) + 0.5 - 60.0) / 60.0
+    return np.tile((distance / (1.0 - slope * u)).astype(np.float32), (HEIGHT, 1))
+
+
+@pytest.mark.parametrize("slope", [0.0, 1.0, 2.0])
+def test_a_wall_is_measured_along_its_normal(slope):
+    box = np.array([-0.5, -0.4, 0.2]), np.array([0.5, 0.4, 2.4])
+    field = esdf_from_depth_images([wall(1.5, slope)], K, [RigidTransform()], *box, 0.05)
+    p = np.stack(np.meshgrid(*field.voxel_centers(), indexing="ij"), -1)
+    plane = (1.5 + slope * p[..., 0] - p[..., 2]) / np.sqrt(1.0 + slope**2)
+    # Away from the sides of the box, beyond which the wall goes on.
+    near = (np.abs(plane) < 0.07) & (np.abs(p[..., 0]) < 0.4) & (field.states != UNKNOWN)
+    assert np.count_nonzero(near) > 300
+    # A pixel is 2.5 cm wide there, a voxel takes the depth of the pixel it falls in.
+    np.testing.assert_allclose(field.distances[near], plane[near], atol=0.02)
+    assert abs(np.mean(field.distances[near] - plane[near])) < 0.004
+
+
+def test_pixels_without_depth_say_nothing():
+    box = np.array([-0.5, -0.4, 0.2]), np.array([0.5, 0.4, 2.4])
+    clean = wall(1.5)
+    for nothing in (0.0, np.nan, -1.0):
+        depth = clean.copy()
+        depth[:, :60] = nothing
+        field = esdf_from_depth_images([depth], K, [RigidTransform()], *box, 0.05)
+        half = field.shape[0] // 2
+        assert (field.states[:half] == UNKNOWN).all()
+        assert (field.states[half:] == FREE).any() and (field.states[half:] == OCCUPIED).any()
+        blind = esdf_from_depth_images(
+            [np.full_like(depth, nothing)], K, [RigidTransform()], *box, 0.05
+        )
+        assert (blind.states == UNKNOWN).all()
+
+
+def test_the_sky_clears_the_space_before_it():
+    box = np.array([-0.5, -0.4, 0.2]), np.array([0.5, 0.4, 2.4])
+    half_sky = wall(1.5)
+    half_sky[:, :60] = np.inf
+    field = esdf_from_depth_images([half_sky], K, [RigidTransform()], *box, 0.05, max_range=2.0)
+    sample = field.query([[-0.2, 0.0, 0.5], [-0.2, 0.0, 1.7], [-0.2, 0.0, 2.2], [0.2, 0.0, 1.6]])
+    np.testing.assert_array_equal(sample.state, [FREE, FREE, UNKNOWN, OCCUPIED])
+    both = [half_sky, wall(1.5)], K, [RigidTransform()] * 2
+    field = esdf_from_depth_images(*both, *box, 0.05)
+    assert (field.query([[-0.2, 0.0, 1.56], [0.2, 0.0, 1.56]]).state == OCCUPIED).all()
+    np.testing.assert_allclose(
+        bounds_of_depth_images([half_sky], K, [RigidTransform()])[1][2], 1.7, atol=1e-6
+    )
+
+
+def test_a_wall_out_of_range_clears_the_space_before_it():
+    box = np.array([-0.3, -0.3, 0.2]), np.array([0.3, 0.3, 3.0])
+    field = esdf_from_depth_images([wall(2.5)], K, [RigidTransform()], *box, 0.1, max_range=1.6)
+    assert not (field.states == OCCUPIED).any()
+    sample = field.query([[0.0, 0.0, 1.3], [0.0, 0.0, 1.9], [0.0, 0.0, 2.8]])
+    np.testing.assert_array_equal(sample.state, [FREE, UNKNOWN, UNKNOWN])
+
+
+def test_bounds_hold_all_seen_points_and_cameras(capture):
+    depths, X_WCs = capture
+    lower_W, upper_W = bounds_of_depth_images(depths, K, X_WCs, margin=0.2)
+    np.testing.assert_allclose(lower_W, [-0.2, -0.2, -0.2], atol=0.01)
+    np.testing.assert_allclose(upper_W, [4.2, 3.2, 2.7], atol=0.01)
+    lower_W, upper_W = bounds_of_depth_images(
+        [wall(9.0)], K, [RigidTransform(np.array([1.0, 2.0, 3.0]))], max_range=2.0, margin=0.0
+    )
+    assert (lower_W >= np.array([1.0, 2.0, 3.0]) - 2.0).all()
+    assert 4.9 < upper_W[2] <= 5.0 and lower_W[2] == 3.0
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"depths": []}, "one per pose, 1, got 0"),
+        ({"depths": [wall(1.0)] * 3}, "one per pose, 1, got 3"),
+        ({"X_WCs": [RigidTransform()] * 4}, "one per pose, 4, got 1"),
+        ({"depths": [np.zeros((4, 4, 3))]}, r"depth image 0 must be .* got \(4, 4, 3\)"),
+        ({"K": np.diag([0.0, 60.0, 1.0])}, "positive focal lengths"),
+        ({"K": np.eye(2)}, r"a finite \(3, 3\) matrix"),
+        ({"max_range": 0.0}, r"max_range must be .* got 0.0"),
+        ({"truncation": 0.1}, "truncation must be at least 2 voxels, 0.2 m, got 0.1"),
+        ({"upper_W": np.zeros(3)}, "upper_W must be finite and above"),
+    ],
+)
+def test_bad_arguments_are_refused(change, message):
+    good = {
+        "depths": [wall(1.0)],
+        "K": K,
+        "X_WCs": [RigidTransform()],
+        "lower_W": np.zeros(3),
+        "upper_W": np.ones(3),
+        "voxel_size": 0.1,
+    }
+    esdf_from_depth_images(**good)
+    with pytest.raises(ValueError, match=message):
+        esdf_from_depth_images(**good | change)
+
+
+def test_images_of_different_shapes_are_refused():
+    with pytest.raises(ValueError, match=r"depth image 1 must be .* got \(4, 4\)"):
+        bounds_of_depth_images([wall(1.0), np.ones((4, 4))], K, [RigidTransform()] * 2)
+
+
+def test_the_hospital():
+    if "SPLATPILOT_DATA" not in os.environ:
+        pytest.skip("SPLATPILOT_DATA is not set: the TartanAir hospital capture is needed")
+    folder = Path(os.environ["SPLATPILOT_DATA"]) / "tartanair" / "hospital"
+    K = np.array([[320.0, 0.0, 320.0], [0.0, 320.0, 240.0], [0.0, 0.0, 1.0]])
+    ned_to_world = np.diag([1.0, -1.0, -1.0])
+    camera_to_ned_body = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    X_WCs = []
+    for pose in np.loadtxt(folder / "pose_left.txt"):
+        q = Quaternion(np.roll(pose[3:], 1) / np.linalg.norm(pose[3:]))
+        R_WC = ned_to_world @ RotationMatrix(q).matrix() @ camera_to_ned_body
+        X_WCs.append(RigidTransform(RotationMatrix(R_WC), ned_to_world @ pose[:3]))
+    files = sorted((folder / "depth_left").glob("*.npy"))
+
+    def depths():
+        return (np.load(file) for file in files)
+
+    lower_W, upper_W = bounds_of_depth_images(depths(), K, X_WCs)
+    field = esdf_from_depth_images(depths(), K, X_WCs, lower_W, upper_W, 0.05)
+    assert 80.0 < field.volume(FREE) < 95.0
+    assert 0.78 < np.mean(field.states == UNKNOWN) < 0.88
+    random = np.random.default_rng(0)
+    for i in (0, 35, 70):
+        row, column = random.integers(0, 480, 2000), random.integers(0, 640, 2000)
+        z = np.load(files[i])[row, column]
+        p_CQ = np.stack([(column + 0.5 - 320) / 320 * z, (row + 0.5 - 240) / 320 * z, z], -1)
+        p_WQ = (p_CQ @ X_WCs[i].rotation().matrix().T + X_WCs[i].translation())[z < 5.0]
+        distance = field.distance(p_WQ) / 0.05
+        assert abs(np.mean(distance)) < 0.1
+        assert np.sqrt(np.mean(distance**2)) < 0.25

@@ -1,0 +1,250 @@
+"""What PX4 is told, and what it is not asked for."""
+
+import socket
+from typing import Any
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+from pymavlink.dialects.v20 import common as dialect
+
+from splatpilot.systems.messaging.generated import lcmt_bridge_status as status
+from splatpilot.systems.messaging.receiver import UdpConfig, UdpInbox
+from splatpilot.systems.px4.commander import Px4Commander, Px4CommanderConfig
+from splatpilot.systems.px4.mavlink import HOLD, LAND, OFFBOARD, Mavlink
+
+TICK, UNIX_TIME = 0.002, 1_800_000_000.0  # [s] The latter is that of time 0.
+
+
+class Told:
+    """A commander, and what it sends. A setpoint of age 0 is one of a stream at 50 Hz."""
+
+    def __init__(self, config: Px4CommanderConfig, **inputs):
+        self.px4 = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.px4.bind(("127.0.0.1", 0))
+        self.px4.settimeout(0.0)
+        self.inbox = UdpInbox(UdpConfig(port=0))
+        self.system = Px4Commander(config, self.inbox, Mavlink(), self.px4.getsockname(), 9.81)
+        self.simulator = Simulator(self.system)
+        self.give(setpoint=[1.0, 0, 0, np.nan], setpoint_age=[0.0], armed=[0.0], mode=[3.0, 0.0])
+        self.give(heartbeat_age=[0.0], granted=[0.0, 0.0], unix_time=[UNIX_TIME], **inputs)
+        self.simulator.Initialize()
+
+    @property
+    def now(self) -> float:
+        return self.simulator.get_context().get_time()
+
+    def give(self, **inputs) -> None:
+        context = self.simulator.get_mutable_context()
+        for name, value in inputs.items():
+            self.system.GetInputPort(name).FixValue(context, value)
+        if "setpoint_age" in inputs:
+            self.sent = self.now - inputs["setpoint_age"][0]
+            self.is_stream = self.sent == self.now
+
+    def advance(self, duration: float) -> list:
+        """What is sent meanwhile, heartbeats left out."""
+        context = self.simulator.get_mutable_context()
+        for tick in range(round(self.now / TICK), round((self.now + duration) / TICK)):
+            if self.is_stream and tick % 10 == 0:
+                self.sent = tick * TICK
+            self.system.GetInputPort("setpoint_age").FixValue(context, [tick * TICK - self.sent])
+            self.system.GetInputPort("unix_time").FixValue(context, [UNIX_TIME + tick * TICK])
+            self.simulator.AdvanceTo((tick + 1) * TICK)
+        messages: list[Any] = []
+        while True:
+            try:
+                packet = self.px4.recv(4096)
+            except BlockingIOError:
+                break
+            messages += dialect.MAVLink(None).parse_buffer(packet) or []
+        return [message for message in messages if message.get_type() != "HEARTBEAT"]
+
+    def close(self) -> None:
+        self.px4.close()
+        self.inbox.close()
+
+
+@pytest.fixture
+def told():
+    made = []
+
+    def make(config: Px4CommanderConfig, **inputs) -> Told:
+        made.append(Told(config, **inputs))
+        return made[-1]
+
+    yield make
+    for each in made:
+        each.close()
+
+
+def modes(messages: list) -> list[tuple[float, float]]:
+    return [
+        (message.param2, message.param3)
+        for message in messages
+        if message.get_type() == "COMMAND_LONG" and message.command == 176
+    ]
+
+
+def test_setpoints_are_sent_at_50_hz_while_they_are_fresh(told):
+    vehicle = told(Px4CommanderConfig())
+    assert len(vehicle.advance(1.0)) == pytest.approx(50, abs=1)
+    vehicle.give(setpoint_age=[0.31])
+    assert vehicle.advance(1.0) == []
+
+
+def test_setpoints_are_sent_as_they_come(told):
+    vehicle = told(Px4CommanderConfig())
+    vehicle.advance(0.105)
+    vehicle.give(setpoint_age=[0.012])
+    assert vehicle.advance(0.002) == []
+    vehicle.give(setpoint=[0.0, 2.0, 0, np.nan], setpoint_age=[0.001])
+    sent = vehicle.advance(0.006)
+    assert [(m.vx, m.vy) for m in sent] == [(0.0, -2.0)]
+    vehicle.give(setpoint_age=[0.5])
+    vehicle.advance(0.02)
+    vehicle.give(setpoint_age=[0.4])
+    assert vehicle.advance(0.05) == []
+
+
+@pytest.mark.parametrize("mode", [status.WAITING, status.HOLDING, status.LANDING])
+def test_offboard_mode_is_not_asked_for_unless_the_bridge_flies(told, mode):
+    config = Px4CommanderConfig(engage=True, arm=True)
+    vehicle = told(config, bridge_mode=[float(mode)])
+    assert modes(vehicle.advance(4.0)) == []
+    vehicle.give(bridge_mode=[float(status.FLYING)])
+    asked = modes(vehicle.advance(2.5))
+    assert len(asked) == 3 and set(asked) == {OFFBOARD}
+
+
+def test_arming_is_asked_for_in_offboard_mode_alone(told):
+    vehicle = told(Px4CommanderConfig(engage=True, arm=True))
+    vehicle.advance(2.0)
+    vehicle.give(mode=[6.0, 0.0])
+    armed = [m.command for m in vehicle.advance(2.0) if m.get_type() == "COMMAND_LONG"]
+    assert armed == [dialect.MAV_CMD_COMPONENT_ARM_DISARM] * 2
+    vehicle.give(armed=[1.0])
+    assert not [m for m in vehicle.advance(3.0) if m.get_type() == "COMMAND_LONG"]
+
+
+def test_where_the_bridge_lands_px4_does(told):
+    vehicle = told(Px4CommanderConfig(engage=True), bridge_mode=[float(status.FLYING)])
+    vehicle.advance(2.0)
+    vehicle.give(mode=[6.0, 0.0], armed=[1.0])
+    vehicle.advance(0.5)
+    vehicle.give(bridge_mode=[float(status.LANDING)])
+    vehicle.advance(0.04)
+    messages = vehicle.advance(2.0)
+    assert set(modes(messages)) == {LAND}
+    assert len(messages) == len(modes(messages)) == 2
+    vehicle.give(mode=[4.0, 6.0], bridge_mode=[float(status.FLYING)])
+    assert vehicle.advance(3.0) == []
+
+
+FLYING = {"bridge_mode": [float(status.FLYING)], "mode": [6.0, 0.0], "armed": [1.0]}
+LOST = {"setpoint_age": [0.31]}
+LANDS = {"bridge_mode": [float(status.LANDING)]}
+
+
+def setpoints(messages: list) -> list[tuple[float, float, float]]:
+    kind = "SET_POSITION_TARGET_LOCAL_NED"
+    return [(m.vx, m.vy, m.vz) for m in messages if m.get_type() == kind]
+
+
+@pytest.mark.parametrize(("loss", "asked"), [(LOST, HOLD), (LANDS, LAND)])
+def test_a_mode_is_requested_after_a_heartbeat_that_is_newer_than_the_loss(told, loss, asked):
+    vehicle = told(Px4CommanderConfig(), **FLYING)
+    vehicle.advance(1.0)
+    vehicle.give(**loss)
+    for age in np.arange(0.02, 0.9, 0.02):
+        vehicle.give(heartbeat_age=[age])
+        assert modes(vehicle.advance(0.02)) == []
+    vehicle.give(heartbeat_age=[0.0])
+    assert modes(vehicle.advance(0.04)) == [asked]
+    for age in np.arange(0.02, 1.5, 0.02):
+        vehicle.give(heartbeat_age=[age])
+        assert modes(vehicle.advance(0.02)) == []
+    vehicle.give(heartbeat_age=[0.0])
+    assert modes(vehicle.advance(0.04)) == [asked]
+
+
+@pytest.mark.parametrize("interface", ["velocity", "body_rates"])
+def test_until_then_the_vehicle_is_told_to_stop(told, interface):
+    vehicle = told(Px4CommanderConfig(setpoints=interface), **FLYING)
+    vehicle.advance(1.0)
+    vehicle.give(**LOST)
+    sent = []
+    for age in np.arange(0.02, 3.0, 0.02):
+        vehicle.give(heartbeat_age=[age])
+        sent += vehicle.advance(0.02)
+    assert set(setpoints(sent)) == {(0.0, 0.0, 0.0)}
+    assert len(sent) == pytest.approx(100, abs=2)
+
+
+def test_a_bridge_that_comes_back_in_time_flies_on(told):
+    vehicle = told(Px4CommanderConfig(), **FLYING)
+    vehicle.advance(1.0)
+    vehicle.give(heartbeat_age=[0.5], **LOST)
+    vehicle.advance(0.1)
+    vehicle.give(setpoint_age=[0.0])
+    vehicle.advance(0.02)
+    vehicle.give(heartbeat_age=[0.0])
+    sent = vehicle.advance(1.0)
+    assert modes(sent) == [] and set(setpoints(sent)) == {(1.0, 0.0, 0.0)}
+
+
+@pytest.mark.parametrize("loss", [{}, LOST, LANDS])
+def test_without_heartbeats_nothing_is_requested(told, loss):
+    vehicle = told(Px4CommanderConfig(engage=True, arm=True), **FLYING)
+    vehicle.advance(2.0)
+    vehicle.give(heartbeat_age=[3.1], mode=[0.0, 0.0], armed=[0.0], **loss)
+    sent = vehicle.advance(3.0)
+    assert not [m for m in sent if m.get_type() == "COMMAND_LONG"]
+    assert len(setpoints(sent)) >= 100
+
+
+@pytest.mark.parametrize(
+    ("mode", "granted", "command"), [(3.0, [1.0, 0.0], 176), (6.0, [1.0, 1.0], 400)]
+)
+def test_what_was_granted_is_not_requested_again(told, mode, granted, command):
+    vehicle = told(Px4CommanderConfig(engage=True, arm=True), mode=[mode, 0.0])
+    assert [m.command for m in vehicle.advance(1.6) if m.get_type() == "COMMAND_LONG"] == [command]
+    vehicle.give(granted=granted)
+    assert not [m for m in vehicle.advance(3.0) if m.get_type() == "COMMAND_LONG"]
+
+
+@pytest.mark.parametrize(("interval", "sent"), [(0.005, 50), (1 / 120, 40), (0.02, 50), (0.1, 10)])
+def test_poses_are_sent_once_as_they_come_at_50_hz_at_most(told, interval, sent):
+    vehicle = told(Px4CommanderConfig(), motion_capture_age=[np.inf])
+    vehicle.give(motion_capture_pose=[np.nan] * 7)
+    messages = []
+    for tick in range(500):
+        now, seen = 0.002 * tick, interval * np.floor(0.002 * tick / interval + 1e-6)
+        vehicle.give(motion_capture_pose=[seen, 2, 3, 1, 0, 0, 0])
+        vehicle.give(motion_capture_age=[now - seen + 0.01])
+        messages += vehicle.advance(0.002)
+    poses = [m for m in messages if m.get_type() == "ODOMETRY"]
+    assert len(poses) == pytest.approx(sent, abs=1)
+    times = np.array([m.time_usec for m in poses]) * 1e-6 - UNIX_TIME
+    np.testing.assert_allclose(times, [m.x - 0.01 for m in poses], atol=0.0021)
+    assert (np.diff(times) > 1e-4).all() and not np.isnan([m.x for m in poses]).any()
+
+
+def test_an_old_pose_is_not_sent(told):
+    vehicle = told(Px4CommanderConfig(), motion_capture_age=[0.31])
+    vehicle.give(motion_capture_pose=[1.0, 2, 3, 1, 0, 0, 0])
+    assert not [m for m in vehicle.advance(0.1) if m.get_type() == "ODOMETRY"]
+
+
+@pytest.mark.parametrize(
+    ("config", "why"),
+    [
+        (Px4CommanderConfig(setpoints="position"), "setpoints must be .* got position"),
+        (Px4CommanderConfig(hover_thrust=0.0), r"hover_thrust must be .* got 0"),
+        (Px4CommanderConfig(max_age=0.0), r"max_age must be .* got 0"),
+        (Px4CommanderConfig(arm=True), r"arm must be false without engage"),
+    ],
+)
+def test_bad_config_is_named(config, why):
+    with pytest.raises(ValueError, match=why):
+        config.validate()

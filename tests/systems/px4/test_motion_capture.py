@@ -1,0 +1,148 @@
+"""OptiTrack's stream, written here byte by byte and read by `natnet`."""
+
+import socket
+import struct
+import time
+
+import numpy as np
+import pytest
+from natnet_frame import natnet_frame
+from pydrake.systems.analysis import Simulator
+from scipy.spatial.transform import Rotation
+
+from splatpilot.systems.messaging.receiver import UdpConfig
+from splatpilot.systems.px4.motion_capture import MotionCaptureConfig, MotionCaptureReceiver
+
+LATENCY = 0.02
+
+
+class Camera:
+    """A receiver, and who sends to it."""
+
+    def __init__(self, udp: UdpConfig, now=None):
+        config = MotionCaptureConfig(udp, body_id=3, version=[4, 0], latency=LATENCY)
+        self.system = MotionCaptureReceiver(config, 0.01, now)
+        self.simulator = Simulator(self.system)
+        self.number = 0
+        self._tell_time()
+        self.simulator.Initialize()
+
+    def _tell_time(self) -> None:
+        context = self.simulator.get_mutable_context()
+        self.system.GetInputPort("unix_time").FixValue(context, [context.get_time()])
+
+    def see(
+        self, body: int = 3, position=(1.0, 2.0, 3.0), q=(0, 0, 0, 1), tracked=True, number=None
+    ):
+        self.number = self.number + 1 if number is None else number
+        self.send(natnet_frame(self.number, body, position, q, tracked))
+
+    def send(self, data: bytes, to: str = "127.0.0.1", sender: str = "127.0.0.1") -> None:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
+            out.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton(sender))
+            out.bind((sender, 0))
+            out.sendto(data, (to, self.system.port))
+        time.sleep(0.01)
+
+    def after(self, duration: float) -> tuple[np.ndarray, float, float]:
+        context = self.simulator.get_mutable_context()
+        for _ in range(round(duration / 0.01)):
+            self.simulator.AdvanceTo(context.get_time() + 0.01)
+            self._tell_time()
+        names = "motion_capture_pose", "age", "rejected"
+        pose, age, rejected = (self.system.GetOutputPort(n).Eval(context).copy() for n in names)
+        return pose, age[0], rejected[0]
+
+
+def test_pose_is_that_of_the_body_in_our_frames():
+    stream = Camera(UdpConfig(port=0))
+    assert stream.after(0.0)[1] == np.inf
+    turn = Rotation.from_euler("y", 0.5)  # about the vertical
+    stream.see(3, [1.0, 2.0, 3.0], turn.as_quat())
+    stream.see(4, [9.0, 9.0, 9.0])
+    pose, age, rejected = stream.after(0.05)
+    np.testing.assert_allclose(pose[:3], [1, -3, 2])
+    expected = Rotation.from_euler("z", 0.5).as_quat()
+    np.testing.assert_allclose(pose[3:], np.roll(expected, 1), atol=1e-6)
+    assert age == pytest.approx(0.05 + LATENCY) and rejected == 0
+
+
+@pytest.mark.parametrize(
+    "seen",
+    [
+        {"tracked": False},
+        {"body": 4},
+        {"position": (np.nan, 2.0, 3.0)},
+        {"q": (0.0, 0.0, 0.0, 2.0)},
+        None,
+    ],
+)
+def test_a_body_that_is_not_seen_grows_old(seen):
+    stream = Camera(UdpConfig(port=0))
+    stream.see()
+    before, _, _ = stream.after(0.05)
+    for _ in range(19):
+        if seen is not None:
+            stream.see(**seen)
+        stream.after(0.01)
+    pose, age, rejected = stream.after(0.01)
+    np.testing.assert_array_equal(pose, before)
+    assert age == pytest.approx(0.25 + LATENCY) and rejected == 0
+
+
+def test_frames_that_are_not_newer_are_counted_and_change_nothing():
+    stream = Camera(UdpConfig(port=0))
+    stream.see(position=(5.0, 2.0, 3.0), number=1000)
+    stream.after(0.1)
+    for number in (1000, 999, 3):
+        stream.see(position=(1.0, 2.0, 3.0), number=number)
+    pose, age, rejected = stream.after(0.1)
+    assert pose[0] == 5.0 and rejected == 3
+    assert age == pytest.approx(0.2 + LATENCY)
+
+
+def test_a_stream_that_was_silent_may_start_again():
+    stream = Camera(UdpConfig(port=0))
+    stream.see(number=1000)
+    stream.after(1.1)
+    stream.see(position=(7.0, 2.0, 3.0), number=1)
+    pose, age, rejected = stream.after(0.02)
+    assert pose[0] == 7.0 and rejected == 0
+    assert age == pytest.approx(0.02 + LATENCY)
+
+
+def test_in_a_process_with_the_wall_clock_the_time_of_reading_counts():
+    stream = Camera(UdpConfig(port=0), now=lambda: 0.04)
+    stream.see()
+    assert stream.after(0.05)[1] == pytest.approx(0.01 + LATENCY)
+
+
+def test_what_is_no_frame_is_counted(caplog):
+    stream = Camera(UdpConfig(port=0))
+    good = natnet_frame(1, 3, [1.0, 2.0, 3.0], [0, 0, 0, 1])
+    stream.send(good)
+    before, _, _ = stream.after(0.02)
+    cut = good[:40]
+    for data in (good[:-1], struct.pack("<HH", 7, len(cut) - 4) + cut[4:], b"", b"x" * 7):
+        stream.send(data)
+    stream.send(natnet_frame(2, 3, [7.0, 7.0, 7.0], [0, 0, 0, 1]), sender="127.0.0.9")
+    pose, _, rejected = stream.after(0.02)
+    np.testing.assert_array_equal(pose, before)
+    assert rejected == 5
+    assert "motion capture: message rejected, 1 so far" in caplog.text
+
+
+def test_a_multicast_group_is_joined_where_one_is_named():
+    stream = Camera(UdpConfig(port=0, group="239.255.42.199"))
+    stream.send(natnet_frame(1, 3, [1.0, 2.0, 3.0], [0, 0, 0, 1]), to="239.255.42.199")
+    pose, _, _ = stream.after(0.02)
+    np.testing.assert_allclose(pose[:3], [1, -3, 2])
+
+
+def test_bad_config_is_named():
+    with pytest.raises(ValueError, match=r"version must be .* got \[1, 0\]"):
+        MotionCaptureConfig(version=[1, 0]).validate()
+    with pytest.raises(ValueError, match=r"group must be .* got 10.0.0.1"):
+        MotionCaptureConfig(UdpConfig(group="10.0.0.1")).validate()
+    with pytest.raises(ValueError, match=r"latency must be .* got 2"):
+        MotionCaptureConfig(latency=2.0).validate()

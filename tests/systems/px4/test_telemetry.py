@@ -1,0 +1,236 @@
+"""What PX4 says, and what others do."""
+
+import socket
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+from pymavlink.dialects.v20 import common as dialect
+from scipy.spatial.transform import Rotation
+
+from splatpilot.systems.messaging.receiver import UdpConfig, UdpInbox
+from splatpilot.systems.px4.mavlink import Mavlink
+from splatpilot.systems.px4.telemetry import Px4Telemetry
+
+EPOCH = 1_800_000_000.0  # [s] Unix time of the Context's time 0.
+BOOT = 1_799_999_000.0  # [s] Unix time when PX4 began.
+HEARTBEAT = dialect.MAVLink_heartbeat_message(2, 12, 129, 6 << 16, 4, 3)
+
+
+def position(time: float, x: float = 1.0):
+    return dialect.MAVLink_local_position_ned_message(round(1e3 * time), x, 2.0, -3.0, 0.5, 0, 0)
+
+
+def attitude(time: float, yaw: float = 0.0, rate: float = 0.0):
+    q = np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)
+    return dialect.MAVLink_attitude_quaternion_message(round(1e3 * time), *q, 0.1, 0.2, rate)
+
+
+class Link:
+    """Telemetry, and PX4's end of it."""
+
+    def __init__(self, now: Callable[[], float] | None = None):
+        self.px4 = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.px4.bind(("127.0.0.1", 0))
+        self.px4.settimeout(0.0)
+        self.inbox = UdpInbox(UdpConfig(port=0))
+        self.mavlink = dialect.MAVLink(None, 1, 1)
+        self.system = Px4Telemetry(self.inbox, Mavlink(), self.px4.getsockname(), 0.01, now)
+        self.simulator = Simulator(self.system)
+        self.tell_time()
+        self.simulator.Initialize()
+
+    @property
+    def now(self) -> float:
+        return self.simulator.get_context().get_time()
+
+    @property
+    def boot_time(self) -> float:
+        """[s] By PX4's clock."""
+        return EPOCH + self.now - BOOT
+
+    def tell_time(self) -> None:
+        context = self.simulator.get_mutable_context()
+        self.system.GetInputPort("unix_time").FixValue(context, [EPOCH + context.get_time()])
+
+    def send(self, *messages, raw: bytes = b"", sender: str = "127.0.0.1") -> None:
+        packet = b"".join(bytes(message.pack(self.mavlink)) for message in messages) + raw
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
+            out.bind((sender, 0))
+            out.sendto(packet, ("127.0.0.1", self.inbox.port))
+
+    def advance(self, duration: float) -> list:
+        """The TIMESYNC messages that are sent meanwhile."""
+        for _ in range(round(duration / 0.01)):
+            self.simulator.AdvanceTo(round(self.now + 0.01, 6))
+            self.tell_time()
+        messages = []
+        while True:
+            try:
+                messages += dialect.MAVLink(None).parse_buffer(self.px4.recv(4096)) or []
+            except BlockingIOError:
+                return messages
+
+    def out(self, name: str):
+        value = self.system.GetOutputPort(name).Eval(self.simulator.get_context()).copy()
+        return value if len(value) > 1 else value[0]
+
+
+@pytest.fixture
+def make():
+    made = []
+
+    def make(*args) -> Link:
+        made.append(Link(*args))
+        return made[-1]
+
+    yield make
+    for each in made:
+        each.px4.close()
+        each.inbox.close()
+
+
+@pytest.fixture
+def link(make):
+    return make()
+
+
+def test_state_needs_position_and_attitude(link, caplog):
+    link.send(position(link.boot_time))
+    link.advance(0.1)
+    assert link.out("age") == np.inf
+    link.send(position(link.boot_time), attitude(link.boot_time, rate=0.3))
+    link.advance(0.05)
+    expected = [1, -2, 3, 0.5, 0, 0, 1, 0, 0, 0, 0.1, -0.2, -0.3]
+    np.testing.assert_allclose(link.out("state"), expected, rtol=1e-6)
+    assert link.out("age") == pytest.approx(0.05, abs=1e-3)
+    link.send(raw=b"nonsense")
+    link.send(position(link.boot_time, x=7.0), sender="127.0.0.9")
+    link.advance(0.05)
+    np.testing.assert_allclose(link.out("state"), expected, rtol=1e-6)
+    assert link.out("rejected") == 2
+    assert "PX4: message rejected" in caplog.text
+
+
+@pytest.mark.parametrize("late", ["position", "attitude"])
+def test_position_and_attitude_are_brought_to_the_time_of_the_older(link, late):
+    start = link.boot_time
+    link.send(position(start), attitude(start, yaw=1.0, rate=2.0))
+    link.advance(0.04)
+    newer = (
+        position(start + 0.04, x=1.02) if late == "attitude" else attitude(start + 0.04, 1.08, 2)
+    )
+    link.send(newer)
+    link.advance(0.01)
+    state = link.out("state")
+    assert link.out("age") == pytest.approx(0.05, abs=1e-3)
+    assert state[0] == pytest.approx(1.0, abs=1e-6)
+    yaw = Rotation.from_quat(state[6:10], scalar_first=True).as_euler("ZYX")[0]
+    assert yaw == pytest.approx(-1.0, abs=1e-3)
+
+
+@pytest.mark.parametrize("back", [0.0, 0.5, 20.0])
+def test_what_is_no_newer_is_counted_and_changes_nothing(link, back):
+    link.advance(0.5)
+    link.send(position(link.boot_time), attitude(link.boot_time), HEARTBEAT)
+    link.advance(0.1)
+    link.send(position(link.boot_time - 0.1 - back, x=9.0), attitude(link.boot_time - 0.1 - back))
+    link.advance(0.01)
+    assert link.out("state")[0] == 1.0
+    assert link.out("age") == pytest.approx(0.11, abs=1e-3)
+    assert link.out("rejected") == 2
+
+
+def test_px4_may_start_again(link):
+    link.send(position(link.boot_time), attitude(link.boot_time))
+    link.advance(1.5)
+    link.send(position(2.0, x=9.0))
+    link.advance(0.02)
+    assert link.out("age") == np.inf
+    link.send(attitude(2.02))
+    link.advance(0.03)
+    assert link.out("state")[0] == pytest.approx(9.0)
+    assert link.out("age") == pytest.approx(0.05, abs=1e-3)
+    assert link.out("rejected") == 0
+
+
+@pytest.mark.parametrize("silence", [0.0, 1.5])
+def test_a_link_that_buffers_is_seen_in_the_age(link, silence):
+    for _ in range(20):
+        link.send(position(link.boot_time), attitude(link.boot_time))
+        link.advance(0.02)
+    link.advance(silence)
+    for _ in range(20):
+        link.send(position(link.boot_time - 0.1), attitude(link.boot_time - 0.1))
+        link.advance(0.02)
+    assert link.out("age") == pytest.approx(0.12, abs=2e-3)
+
+
+def test_a_link_that_is_slow_from_the_start_is_seen_by_answers(link):
+    waiting = []
+    for _ in range(150):
+        waiting += [
+            (link.now + 0.07, dialect.MAVLink_timesync_message(round(1e9 * at), message.ts1))
+            for message in link.advance(0.01)
+            for at in [link.boot_time + 0.03]
+        ]
+        link.send(position(link.boot_time - 0.04), attitude(link.boot_time - 0.04))
+        while waiting and waiting[0][0] <= link.now + 1e-6:
+            link.send(waiting.pop(0)[1])
+    assert link.out("age") == pytest.approx(0.05, abs=2e-3)
+
+
+def test_a_process_that_is_behind_takes_no_message_for_faster(make):
+    late = 0.0
+    link = make(lambda: EPOCH + link.now + late)
+    for late in (0.0, 0.05, 0.0):
+        stamp = link.boot_time + late
+        link.send(position(stamp), attitude(stamp))
+        link.advance(0.1)
+    assert link.out("age") == pytest.approx(0.1, abs=1e-3)
+
+
+def test_px4s_questions_what_time_it_is_are_answered(link):
+    link.advance(0.5)
+    link.send(dialect.MAVLink_timesync_message(0, 12345))
+    (answer,) = link.advance(0.05)
+    assert (answer.ts1, answer.tc1) == (12345, pytest.approx(1e9 * (EPOCH + 0.5), abs=2e4))
+
+
+def test_mode_and_arming_are_unknown_without_heartbeats(link):
+    assert link.out("heartbeat_age") == np.inf
+    link.send(HEARTBEAT)
+    link.advance(2.9)
+    assert link.out("armed") == 1 and link.out("mode").tolist() == [6.0, 0.0]
+    link.advance(0.2)
+    assert link.out("armed") == 0 and link.out("mode").tolist() == [0.0, 0.0]
+    assert link.out("heartbeat_age") == pytest.approx(3.1, abs=0.011)
+
+
+def test_a_value_that_is_not_finite_hides_no_heartbeat(link):
+    link.send(position(link.boot_time, x=np.nan), HEARTBEAT)
+    link.advance(0.02)
+    assert link.out("armed") == 1 and link.out("rejected") == 1
+
+
+def test_what_px4_grants_is_remembered(link):
+    link.advance(0.02)
+    assert link.out("granted").tolist() == [0, 0]
+    link.send(dialect.MAVLink_command_ack_message(176, dialect.MAV_RESULT_ACCEPTED))
+    link.send(dialect.MAVLink_command_ack_message(400, dialect.MAV_RESULT_DENIED))
+    link.advance(0.02)
+    assert link.out("granted").tolist() == [1, 0]
+
+
+@pytest.mark.parametrize(
+    ("base", "mode", "told"), [(129, 6, [1, 1]), (129, 3, [1, 0]), (1, 6, [0, 1]), (1, 3, [0, 0])]
+)
+def test_vehicle_status_is_that_of_the_last_heartbeat_unless_it_is_old(link, base, mode, told):
+    link.advance(0.1)
+    assert np.isnan(link.out("vehicle_status")).all()
+    link.send(dialect.MAVLink_heartbeat_message(2, 12, base, mode << 16, 4, 3))
+    link.advance(2.9)
+    assert link.out("vehicle_status").tolist() == told
+    link.advance(0.2)
+    assert np.isnan(link.out("vehicle_status")).all()

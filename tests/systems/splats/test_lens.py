@@ -1,0 +1,156 @@
+"""Tests of lenses in the flying camera."""
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.systems.sensors import CameraInfo
+
+from splatpilot.systems.sensing.onboard_camera import OnboardCamera
+from splatpilot.systems.sensing.time_of_flight import sensor_of
+from splatpilot.systems.splats.background import EnvironmentMap
+from splatpilot.systems.splats.baked_scene import BakedScene
+from splatpilot.systems.splats.lens import Distortion, pixel_slopes
+from splatpilot.systems.splats.scene import GaussianScene
+from splatpilot.systems.splats.splat_camera import SplatCamera
+
+WIDTH, HEIGHT = 160, 120
+FISHEYE = Distortion("fisheye", [0.04, -0.012, 0.005, -0.001])
+BARREL = Distortion("opencv", [-0.28, 0.09, -0.012, 0.03, 0.01, 0.002], [0.003, -0.002])
+FEW = Distortion("opencv", [-0.2, 0.05])
+LENSES = (FISHEYE, BARREL, FEW)
+K = np.array([[110.0, 0, 78.0], [0, 105.0, 61.0], [0, 0, 1]])
+# Of a fisheye whose image circle lies in the image.
+K_CIRCLE = np.array([[45.0, 0, 78.0], [0, 45.0, 61.0], [0, 0, 1]])
+
+
+def opencv_pixels(lens: Distortion, p_C: np.ndarray) -> np.ndarray:
+    """OpenCV's pixels (N, 2) of points, with centers at +1/2 as ours."""
+    none = np.zeros(3)
+    if lens.model == "fisheye":
+        return cv2.fisheye.projectPoints(p_C[None], none, none, K, np.array(lens.radial))[0][0]
+    k = [*lens.radial, *[0.0] * (6 - len(lens.radial))]
+    p = lens.tangential or [0.0, 0.0]
+    coefficients = np.array([*k[:2], *p, *k[2:]])
+    return cv2.projectPoints(p_C, none, none, K, coefficients)[0][:, 0]
+
+
+def blobs(count: int, size: float, seed: int = 0) -> GaussianScene:
+    """Gaussians of `size` times their depth at slopes of up to 0.7."""
+    random = np.random.default_rng(seed)
+    z = random.uniform(2.0, 4.0, (count, 1))
+    arrays = (
+        np.hstack([random.uniform(-0.7, 0.7, (count, 2)) * z, z]),
+        random.normal(size=(count, 4)),
+        size * z * random.uniform(0.5, 1.5, (count, 3)),
+        random.uniform(0.3, 0.9, count),
+        random.uniform(-1.5, 1.5, (count, 1, 3)),
+    )
+    return GaussianScene(*(a.astype(np.float32) for a in arrays))
+
+
+def wall(n_W: np.ndarray, offset: float) -> GaussianScene:
+    """Flat Gaussians side by side on the plane n_W . p = offset [m], in front of the origin."""
+    u, v = np.meshgrid(np.arange(-4.0, 4.0, 0.04), np.arange(-4.0, 4.0, 0.04))
+    x, y = u.ravel(), v.ravel()
+    z = (offset - n_W[0] * x - n_W[1] * y) / n_W[2]
+    count = len(x)
+    turn = np.cross([0.0, 0.0, 1.0], n_W)
+    quat = np.array([1.0 + n_W[2], *turn])
+    arrays = (
+        np.stack([x, y, z], -1),
+        np.tile(quat / np.linalg.norm(quat), (count, 1)),
+        np.tile([0.04, 0.04, 1e-4], (count, 1)),
+        np.full(count, 0.95),
+        np.zeros((count, 1, 3)),
+    )
+    return GaussianScene(*(a.astype(np.float32) for a in arrays))
+
+
+@pytest.mark.parametrize("lens", LENSES, ids=lambda lens: f"{lens.model}{len(lens.radial)}")
+def test_points_are_where_opencv_has_them(lens):
+    slopes = np.random.default_rng(0).uniform(-0.8, 0.8, (500, 2))
+    points = lens.project(slopes)
+    expected = opencv_pixels(lens, np.hstack([slopes, np.ones((500, 1))]))
+    np.testing.assert_allclose(points * [110, 105] + [78, 61], expected, atol=1e-9)
+    np.testing.assert_allclose(lens.slopes(points), slopes, atol=1e-9)
+
+
+def test_pixels_beyond_the_lens_look_nowhere():
+    slopes = pixel_slopes(FISHEYE, K_CIRCLE, WIDTH, HEIGHT)
+    shown = np.isfinite(slopes[..., 0])
+    assert shown[60, 77] and not shown[0, 0] and 0.3 < shown.mean() < 0.8
+    assert np.hypot(*slopes[shown].T).max() < math.tan(math.radians(85.0))
+    folding = Distortion("opencv", [-0.3])
+    assert folding.limit == pytest.approx(math.sqrt(1 / 0.9))  # (r - 0.3 r^3)' = 0
+    assert np.isnan(folding.project(np.array([1.1, 0.0]))).all()
+
+
+@pytest.mark.parametrize("lens", [FISHEYE, BARREL], ids=lambda lens: lens.model)
+def test_depth_of_a_plane_is_that_of_the_rays(lens):
+    n_W = RollPitchYaw(0.3, -0.4, 0.0).ToRotationMatrix().matrix()[:, 2]
+    view = BakedScene(wall(n_W, 2.0)).render(K, WIDTH, HEIGHT, RigidTransform(), distortion=lens)
+    slopes = pixel_slopes(lens, K, WIDTH, HEIGHT)
+    expected = 2.0 / (slopes @ n_W[:2] + n_W[2])
+    x, y = expected * slopes[..., 0], expected * slopes[..., 1]
+    inside = (expected > 0) & (np.maximum(np.abs(x), np.abs(y)) < 3.8)
+    assert inside.mean() > 0.5
+    error = np.abs(view.depth / expected - 1)[inside]
+    assert np.median(error) < 1e-3
+    assert np.quantile(error, 0.99) < 0.01
+
+
+def test_only_what_the_lens_shows_is_drawn():
+    scene = blobs(2000, 0.2, seed=1)
+    images = []
+    for threads in (1, 3):
+        camera = SplatCamera(
+            BakedScene(scene, threads),
+            CameraInfo(WIDTH, HEIGHT, 45.0, 45.0, 78.0, 61.0),
+            background=EnvironmentMap(np.ones((4, 8, 3), np.float32)),
+            distortion=FISHEYE,
+        )
+        images.append(camera.render(RigidTransform()))
+    for one, other in zip(*images, strict=True):
+        np.testing.assert_array_equal(one, other)
+    shown = np.isfinite(pixel_slopes(FISHEYE, K_CIRCLE, WIDTH, HEIGHT)[..., 0])
+    view = images[0]
+    assert (view.color[~shown] == 0).all() and (view.alpha[~shown] == 0).all()
+    assert (view.depth[~shown] == 0).all()
+    # The map is white, and what is not covered shows it.
+    clear = shown & (view.alpha == 0)
+    assert clear.any() and (view.color[clear] == 1).all()
+
+
+def test_onboard_cameras_have_lenses():
+    camera = OnboardCamera(width=WIDTH, height=HEIGHT, fov_x=150.0, distortion=FISHEYE)
+    camera.validate()
+    info = camera.camera_info()
+    slopes = pixel_slopes(FISHEYE, info.intrinsic_matrix(), WIDTH, HEIGHT)
+    half_pixel = abs(slopes[60, 1, 0] - slopes[60, 0, 0])
+    assert slopes[60, 0, 0] == pytest.approx(-math.tan(math.radians(75.0)), abs=half_pixel)
+    with pytest.raises(
+        ValueError, match=r"fov_x must be less than the 170\.0 deg that the lens shows, got 170"
+    ):
+        OnboardCamera(fov_x=170.0, distortion=FISHEYE).validate()
+    with pytest.raises(ValueError, match="a time-of-flight sensor has none"):
+        sensor_of(camera)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"model": "pinhole"}, "model must be in {opencv, fisheye}, got pinhole"),
+        ({"radial": [0.1] * 7}, "radial must be at most 6 numbers"),
+        ({"model": "fisheye", "radial": [0.1] * 5}, "radial must be at most 4 numbers"),
+        ({"model": "fisheye", "tangential": [0.1, 0.1]}, "tangential must be 0 numbers of fisheye"),
+        ({"tangential": [0.1]}, "tangential must be 2 numbers of opencv"),
+        ({"radial": [math.nan]}, r"radial must be in .*, got \[nan\]"),
+        ({"max_angle": 90.0}, r"max_angle must be in \(0, 85\] deg, got 90"),
+    ],
+)
+def test_bad_lenses_are_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        Distortion(**changes).validate()

@@ -1,0 +1,242 @@
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pydrake.common.eigen_geometry import Quaternion
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+from scipy.special import sph_harm_y
+
+from splatpilot.systems.splats.scene import (
+    C0,
+    GaussianScene,
+    choose_origin,
+    harmonic_degree,
+    sh_basis,
+    sh_rotations,
+)
+
+
+def evaluate_sh(sh: Any, directions: Any) -> np.ndarray:
+    """Returns the sum over the basis (..., 3) of coefficients (..., K, 3)."""
+    sh = np.asarray(sh, dtype=np.float64)
+    basis = sh_basis(directions, harmonic_degree(sh.shape[-2]))
+    return np.einsum("...k,...kc->...c", basis, sh)
+
+
+def random_arrays(N: int = 6, K: int = 4, seed: int = 0) -> dict[str, Any]:
+    rng = np.random.default_rng(seed)
+    return {
+        "means": rng.normal(size=(N, 3)),
+        "quats": rng.normal(size=(N, 4)),
+        "scales": np.exp(rng.normal(size=(N, 3))),
+        "opacities": rng.uniform(0.01, 1, size=N),
+        "sh": rng.normal(size=(N, K, 3)),
+    }
+
+
+def covariances(scene: GaussianScene) -> np.ndarray:
+    """R diag(s)^2 R^T through Drake, apart from the code under test."""
+    result = []
+    for quat, scale in zip(scene.quats, scene.scales, strict=True):
+        wxyz = quat.astype(float) / np.linalg.norm(quat.astype(float))
+        R = RotationMatrix(Quaternion(wxyz)).matrix()
+        result.append(R @ np.diag(scale.astype(float) ** 2) @ R.T)
+    return np.array(result)
+
+
+def test_arrays_are_float32_contiguous_with_unit_quaternions():
+    arrays = random_arrays()
+    arrays["means"] = np.asfortranarray(arrays["means"])
+    scene = GaussianScene(**arrays)
+    for name in arrays:
+        array = getattr(scene, name)
+        assert array.dtype == np.float32 and array.flags.c_contiguous
+    quats = arrays["quats"] / np.linalg.norm(arrays["quats"], axis=1, keepdims=True)
+    np.testing.assert_allclose(scene.quats, quats, atol=1e-7)
+    assert (len(scene), scene.sh_degree) == (6, 1)
+
+
+def test_tiny_quaternions_are_normalized():
+    arrays = random_arrays()
+    scene = GaussianScene(**arrays | {"quats": (arrays["quats"] * 1e-6).astype(np.float32)})
+    np.testing.assert_allclose(scene.quats, GaussianScene(**arrays).quats, atol=1e-6)
+
+
+def test_from_colors_gives_those_colors_from_everywhere():
+    arrays = random_arrays()
+    del arrays["sh"]
+    colors = np.random.default_rng(1).uniform(size=(6, 3))
+    scene = GaussianScene.from_colors(**arrays, colors=colors)
+    np.testing.assert_allclose(0.5 + C0 * scene.sh[:, 0], colors, atol=1e-6)
+    np.testing.assert_allclose(scene.base_colors, colors, atol=1e-6)
+    assert scene.sh_degree == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "index", "value", "message"),
+    [
+        ("means", (3, 1), np.nan, r"means\[3, 1\] must be finite, got nan \(1 of 6"),
+        ("sh", (2, 0, 1), np.inf, r"sh\[2, 0, 1\] must be finite, got inf"),
+        ("scales", (1, 2), 0.0, r"scales\[1, 2\] must be > 0 m, got 0\.0"),
+        ("scales", (1, 2), -0.5, r"scales\[1, 2\] must be > 0 m, got -0\.5.*exponential"),
+        ("scales", (4, 0), np.inf, r"scales\[4, 0\] must be finite, got inf"),
+        ("opacities", (5,), 0.0, r"opacities\[5\] must be in \(0, 1\], got 0\.0.*sigmoid"),
+        ("opacities", (0,), 1.5, r"opacities\[0\] must be in \(0, 1\], got 1\.5"),
+        ("quats", (2,), 0.0, r"quats\[2\] must be of a length > 0.*\(1, 0, 0, 0\)"),
+    ],
+)
+def test_bad_values_are_named(name, index, value, message):
+    arrays = random_arrays()
+    arrays[name][index] = value
+    with pytest.raises(ValueError, match=message):
+        GaussianScene(**arrays)
+
+
+def test_wrong_shapes_and_lengths_are_refused():
+    arrays = random_arrays()
+    with pytest.raises(ValueError, match=r"quats must be of shape \(N, 4\), got \(6, 3\)"):
+        GaussianScene(**arrays | {"quats": arrays["means"]})
+    with pytest.raises(ValueError, match=r"sh must be of shape \(N, K, 3\), got \(6, 4\)"):
+        GaussianScene(**arrays | {"sh": np.zeros((6, 4), np.float32)})
+    with pytest.raises(ValueError, match=r"of one length.*'means': 6.*'scales': 5"):
+        GaussianScene(**arrays | {"scales": arrays["scales"][:5]})
+    with pytest.raises(ValueError, match="1, 4, 9 or 16, got 5"):
+        GaussianScene(**arrays | {"sh": np.zeros((6, 5, 3), np.float32)})
+
+
+def test_transform_moves_points_shapes_and_view_dependence():
+    scene = GaussianScene(**random_arrays(K=16))
+    X_WO = RigidTransform(RollPitchYaw(0.4, -1.1, 2.3), np.array([1.0, -2.0, 3.0]))
+    moved = scene.transformed_by(X_WO)
+    R = X_WO.rotation().matrix()
+    np.testing.assert_allclose(moved.means, X_WO.multiply(scene.means.T).T, atol=1e-5)
+    np.testing.assert_allclose(
+        covariances(moved), R @ covariances(scene) @ R.T, rtol=1e-4, atol=1e-4
+    )
+    d_W = np.random.default_rng(2).normal(size=(50, 1, 3))
+    d_W /= np.linalg.norm(d_W, axis=-1, keepdims=True)
+    np.testing.assert_allclose(
+        evaluate_sh(moved.sh, d_W), evaluate_sh(scene.sh, d_W @ R), atol=1e-5
+    )
+
+
+def test_transform_there_and_back_is_the_identity():
+    scene = GaussianScene(**random_arrays(K=9))
+    X = RigidTransform(RollPitchYaw(1, 2, 3), np.array([0.5, 0.25, -1.0]))
+    back = scene.transformed_by(X).transformed_by(X.inverse())
+    for name in ("means", "scales", "opacities", "sh"):
+        np.testing.assert_allclose(getattr(back, name), getattr(scene, name), atol=1e-5)
+    np.testing.assert_allclose(covariances(back), covariances(scene), rtol=1e-4, atol=1e-4)
+
+
+def test_scaled_scene_has_all_lengths_times_the_factor():
+    scene = GaussianScene(**random_arrays(K=9))
+    scaled = scene.scaled_by(2.5)
+    np.testing.assert_allclose(scaled.means, 2.5 * scene.means, rtol=1e-6)
+    np.testing.assert_allclose(covariances(scaled), 2.5**2 * covariances(scene), rtol=1e-4)
+    for name in ("quats", "opacities", "sh"):
+        np.testing.assert_array_equal(getattr(scaled, name), getattr(scene, name))
+
+
+def test_merge_places_the_other_scene_and_pads_the_lower_degree():
+    first = GaussianScene(**random_arrays(N=3, K=9))
+    other = GaussianScene(**random_arrays(N=2, K=4, seed=5))
+    X_WO = RigidTransform(RollPitchYaw(0.1, 0.2, 0.3), np.array([10.0, 0.0, 0.0]))
+    merged = first.merged_with(other, X_WO)
+    placed = other.transformed_by(X_WO)
+    assert (len(merged), merged.sh_degree) == (5, 2)
+    for name in ("means", "quats", "scales", "opacities"):
+        expected = np.concatenate([getattr(first, name), getattr(placed, name)])
+        np.testing.assert_array_equal(getattr(merged, name), expected)
+    np.testing.assert_array_equal(merged.sh[:3], first.sh)
+    np.testing.assert_array_equal(merged.sh[3:, :4], placed.sh)
+    assert not merged.sh[3:, 4:].any()
+    reverse = other.merged_with(first)
+    np.testing.assert_array_equal(reverse.means, np.concatenate([other.means, first.means]))
+    assert reverse.sh_degree == 2
+
+
+def random_directions(count: int, seed: int = 0) -> np.ndarray:
+    d = np.random.default_rng(seed).normal(size=(count, 3))
+    return d / np.linalg.norm(d, axis=1, keepdims=True)
+
+
+def test_basis_is_the_real_part_of_the_complex_harmonics():
+    d = random_directions(200)
+    polar, azimuth = np.arccos(d[:, 2]), np.arctan2(d[:, 1], d[:, 0])
+    columns = []
+    for degree in range(4):
+        for m in range(-degree, degree + 1):
+            Y = sph_harm_y(degree, abs(m), polar, azimuth)
+            columns.append(Y.real if m == 0 else np.sqrt(2) * (Y.real if m > 0 else Y.imag))
+    np.testing.assert_allclose(sh_basis(d, 3), np.stack(columns, axis=-1), atol=1e-14)
+
+
+def test_basis_keeps_the_published_signs():
+    x, y, z = random_directions(1)[0]
+    expected = [0.28209479, -0.48860251 * y, 0.48860251 * z, -0.48860251 * x, 1.09254843 * x * y]
+    np.testing.assert_allclose(sh_basis([x, y, z], 3)[:5], expected, rtol=1e-7)
+
+
+def test_constant_coefficient_is_direction_independent():
+    np.testing.assert_allclose(
+        evaluate_sh([[[1.0, 2.0, 3.0]]], random_directions(9)), C0 * np.tile([1, 2, 3], (9, 1))
+    )
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    rpy=st.tuples(*[st.floats(-7, 7)] * 3),
+    degree=st.integers(0, 3),
+    seed=st.integers(0, 2**16),
+)
+def test_rotated_coefficients_describe_the_rotated_function(rpy, degree, seed):
+    R_WO = RollPitchYaw(*rpy).ToRotationMatrix().matrix()
+    sh_O = np.random.default_rng(seed).normal(size=((degree + 1) ** 2, 3))
+    matrices = sh_rotations(R_WO, degree)
+    sh_W = np.concatenate(
+        [M @ sh_O[k * k : (k + 1) ** 2] for k, M in zip(range(degree + 1), matrices, strict=True)]
+    )
+    d_W = random_directions(20, seed)
+    d_O = d_W @ R_WO
+    np.testing.assert_allclose(evaluate_sh(sh_W, d_W), evaluate_sh(sh_O, d_O), atol=1e-12)
+    for M in matrices:
+        np.testing.assert_allclose(M @ M.T, np.eye(len(M)), atol=1e-12)
+
+
+def test_degree_of_counts():
+    assert [harmonic_degree(K) for K in (1, 4, 9, 16)] == [0, 1, 2, 3]
+    with pytest.raises(ValueError, match="1, 4, 9 or 16, got 5"):
+        harmonic_degree(5)
+    with pytest.raises(ValueError, match="0 to 3, got 4"):
+        sh_basis([0, 0, 1], 4)
+
+
+NEAR = np.random.default_rng(0).normal(size=(100, 3))
+
+
+@pytest.mark.parametrize(
+    ("scale", "offset", "moves"),
+    [
+        (1.0, 900.0, False),
+        (1.0, 1100.0, True),
+        (1000.0, 900.0, False),  # as large as it is far
+        (1e-3, 0.9, False),
+        (1e-3, 5.0, True),  # in units of kilometers
+        (0.0, 900.0, False),
+        (0.0, 1100.0, True),
+    ],
+)
+def test_origin_moves_to_what_is_far(scale, offset, moves):
+    positions = scale * NEAR + [offset, 0, 0]
+    origin = choose_origin(positions)
+    assert origin.any() == moves
+    if moves:
+        assert np.linalg.norm(np.median(positions - origin, axis=0)) <= 1
+
+
+def test_origin_is_in_whole_meters():
+    origin = choose_origin(5 * NEAR + [456789.3, 812345.6, -283.1])
+    np.testing.assert_array_equal(origin, np.round(origin))

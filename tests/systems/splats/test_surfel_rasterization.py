@@ -1,0 +1,535 @@
+"""Tests of the surfel renderer against an independent reference and analytic oracles."""
+
+import math
+import types
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+import reference_surfels as reference
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from random_scenes import normal, normal_tensor, rotation_matrix
+from random_scenes import random_scene as random_gaussians
+from reference_rasterizer import rotation_matrices
+
+from splatpilot import _native
+from splatpilot.systems.splats import rasterize, surfel_rasterization
+from splatpilot.systems.splats.baked_scene import create_renderer
+from splatpilot.systems.splats.surfel_rasterization import depth_to_normals, rasterize_surfels
+
+LEVELS = _native.simd_levels()
+WIDTH, HEIGHT = 67, 45
+LEARNED = ("means", "quats", "scales", "opacities", "colors", "viewmats")
+OUTPUTS = ("color", "alpha", "normal", "depth", "median", "distort")
+
+
+def random_scene(**options) -> dict[str, Any]:
+    """Surfels of many sizes in front of, around and behind cameras that look at the origin."""
+    return random_gaussians(log2_scale=(-3.3, 1.0), **options)
+
+
+def edge_on_scene(sine: float, count: int = 60) -> dict[str, Any]:
+    """Surfels whose planes meet the rays through their centers at `sine`, all on the image."""
+    scene = random_scene(count=8 * count)
+    generator = np.random.default_rng(0)
+    X_CW = scene["viewmats"][0].double().numpy()
+    kept, means = [], []
+    for i, quat in enumerate(scene["quats"].double().tolist()):
+        n_W = [row[2] for row in rotation_matrix(*quat)]
+        ray_W = X_CW[2, :3] + 0.1 * normal(generator, 3)
+        depth, slope = 1.5 + 2.0 * generator.random(), dot(ray_W, n_W)
+        if abs(slope) > 0.3:
+            continue  # the plane passes too far beside that ray
+        a_W = [r - slope * n for r, n in zip(ray_W, n_W, strict=True)]  # in the plane
+        x, y = depth * (1.0 - sine * sine) ** 0.5 / dot(a_W, a_W) ** 0.5, depth * sine
+        center_W = [-dot(X_CW[:3, k], X_CW[:3, 3]) for k in range(3)]
+        means.append([c + x * a + y * n for c, a, n in zip(center_W, a_W, n_W, strict=True)])
+        kept.append(i)
+    for name in ("quats", "scales", "opacities", "colors"):
+        scene[name] = scene[name][kept[:count]]
+    return scene | {"means": torch.tensor(means[:count], dtype=torch.float64).float()}
+
+
+def dot(a, b) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def single_surfel(opacity=0.5, scale=0.1, depth=2.0, quat=(1.0, 0, 0, 0)) -> dict[str, Any]:
+    return {
+        "means": torch.tensor([[0.0, 0.0, depth]]),
+        "quats": torch.tensor([quat]),
+        "scales": torch.full((1, 3), scale),
+        "opacities": torch.tensor([opacity]),
+        "colors": torch.tensor([[0.2, 0.4, 0.8]]),
+        "viewmats": torch.eye(4)[None],
+        "Ks": torch.tensor([[[100.0, 0, 16.5], [0, 100.0, 16.5], [0, 0, 1]]]),
+    }
+
+
+def render(scene, width=WIDTH, height=HEIGHT, **options) -> dict[str, torch.Tensor]:
+    """The images of the first camera, by name."""
+    options = {"render_mode": "RGB+D", "distloss": True} | options
+    image, alpha, normal, surface, distort, median, _ = rasterize_surfels(
+        **scene, width=width, height=height, **options
+    )
+    named = {"alpha": alpha, "distort": distort, "median": median}
+    images = {name: a[0, ..., 0] for name, a in named.items()}
+    images |= {"color": image[0, ..., :3], "depth": image[0, ..., -1], "normal": normal[0]}
+    return images if surface is None else images | {"surface": surface[0]}
+
+
+def total(images: dict[str, torch.Tensor]) -> torch.Tensor:
+    return torch.stack([(image * image).sum() for image in images.values()]).sum()
+
+
+def call_reference(scene, width=WIDTH, height=HEIGHT, **options):
+    s = {name: a for name, a in scene.items() if name not in ("viewmats", "Ks")}
+    return reference.render(
+        **s, viewmat=scene["viewmats"][0], K=scene["Ks"][0], width=width, height=height, **options
+    )
+
+
+@pytest.mark.parametrize("simd", LEVELS)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_images_agree_with_reference(simd, seed):
+    scene = random_scene(seed=seed)
+    expected = call_reference(scene, background=(0.1, 0.7, 0.3))
+    clear = expected.margin > 1e-4
+    assert clear.float().mean() > 0.99
+    images = render(
+        scene, backgrounds=torch.tensor([[0.1, 0.7, 0.3]]), renderer=create_renderer(1, simd)
+    )
+    for name in OUTPUTS:
+        wanted = getattr(expected, name)
+        error = (images[name].double() - wanted).abs()
+        assert error.median() < 5e-7, name
+        assert (error / wanted.abs().clamp(min=1))[clear].max() < 1e-4, name
+
+
+def loss_gradients(call, scene, clear, dtype) -> dict[str, torch.Tensor]:
+    """The gradients, by all that is learned, of a random linear function of the clear pixels."""
+    leaves = {
+        k: v.detach().clone().to(dtype).requires_grad_(k in LEARNED) for k, v in scene.items()
+    }
+    images = call(leaves)
+    loss = torch.zeros(())
+    for seed, name in enumerate(OUTPUTS):
+        weight = normal_tensor(seed, *images[name].shape).to(dtype)
+        loss = loss + (images[name] * weight)[clear].sum()
+    loss.backward()
+    return {name: leaves[name].grad.double() for name in LEARNED}
+
+
+def reference_gradients(scene, clear, dtype=torch.float64, **options) -> dict[str, torch.Tensor]:
+    def call(s):
+        return call_reference(s, dtype=dtype, **options)._asdict()
+
+    return loss_gradients(call, scene, clear, dtype)
+
+
+def lengths(gradient: torch.Tensor) -> torch.Tensor:
+    """Of a surfel's part of a gradient, or of the camera's."""
+    return gradient.reshape(len(gradient), -1).norm(dim=1)
+
+
+@pytest.mark.parametrize("sh_degree", [None, 3])
+def test_gradients_agree_with_reference(sh_degree):
+    scene = random_scene(seed=3, sh_degree=sh_degree)
+    clear = call_reference(scene, sh_degree=sh_degree).margin > 1e-4
+    exact = reference_gradients(scene, clear, sh_degree=sh_degree)
+    # The change of float64 by half a last place of the inputs, the largest of three.
+    moved = {name: torch.zeros(len(exact[name]), dtype=torch.float64) for name in LEARNED}
+    for seed in range(3):
+        ends = {
+            k: scene[k].double() * (1 + 2.0**-24 * normal_tensor(seed, *scene[k].shape).sign())
+            for k in LEARNED
+        }
+        other = reference_gradients(scene | ends, clear, sh_degree=sh_degree)
+        moved = {k: torch.maximum(m, lengths(other[k] - exact[k])) for k, m in moved.items()}
+    for simd in LEVELS:
+        call = partial(render, sh_degree=sh_degree, renderer=create_renderer(1, simd))
+        ours = loss_gradients(call, scene, clear, torch.float32)
+        for name in LEARNED:
+            error = (ours[name] - exact[name]).abs()
+            allowed = 1e-3 + 1e-5 * exact[name].abs()
+            if name != "viewmats":  # each entry sums over the whole scene
+                assert (error <= allowed).double().mean() > 0.99, name
+            assert (lengths(error) <= lengths(allowed) + moved[name]).all(), name
+            assert exact[name].abs().max() > 1
+
+
+@pytest.mark.parametrize("sine", [1e-4, 1e-2])
+def test_nearly_edge_on_surfels_keep_their_digits(sine):
+    scene = edge_on_scene(sine)
+    clear = call_reference(scene).margin > 1e-2
+    assert clear.float().mean() > 0.8
+    exact = reference_gradients(scene, clear)
+    single = reference_gradients(scene, clear, torch.float32)
+    for simd in LEVELS:
+        ours = loss_gradients(
+            lambda s, simd=simd: render(s, renderer=create_renderer(1, simd)),
+            scene,
+            clear,
+            torch.float32,
+        )
+        for name in ("means", "quats"):
+            size = lengths(exact[name])
+            seen = size > 0.1
+            assert seen.sum() > 30
+            error, theirs = (
+                (lengths(g[name] - exact[name]) / size)[seen].square().mean().sqrt()
+                for g in (ours, single)
+            )
+            assert error <= theirs, (simd, name)
+
+
+def test_third_scale_does_not_matter():
+    scene = random_scene(seed=2)
+    other = scene | {"scales": scene["scales"].clone()}
+    other["scales"][:, 2] = torch.tensor([0.0, math.nan, 1e9]).repeat(100)
+    before, after = render(scene), render(other)
+    assert all(torch.equal(before[name], after[name]) for name in OUTPUTS)
+
+
+def test_surfel_facing_the_camera_is_a_gaussian_disc():
+    images = render(single_surfel(opacity=0.8), width=33, height=33)
+    y, x = torch.meshgrid(torch.arange(33.0) - 16, torch.arange(33.0) - 16, indexing="ij")
+    expected = 0.8 * torch.exp(-(x**2 + y**2) / (2 * 5.0**2))  # 100 px * 0.1 m / 2 m
+    expected[expected < 1 / 255] = 0
+    torch.testing.assert_close(images["alpha"], expected, rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(images["depth"], 2 * expected, rtol=1e-5, atol=1e-6)
+    towards = torch.tensor([0.0, 0.0, -1.0])
+    torch.testing.assert_close(images["normal"], expected[..., None] * towards)
+    assert (images["median"] - 2 * (expected > 0)).abs().max() < 1e-6
+    assert not images["distort"].abs().max() > 1e-6
+
+
+def test_small_surfel_is_the_blob():
+    images = render(single_surfel(scale=1e-6), width=33, height=33)
+    y, x = torch.meshgrid(torch.arange(33.0) - 16, torch.arange(33.0) - 16, indexing="ij")
+    expected = 0.5 * torch.exp(-(x**2 + y**2))
+    expected[expected < 1 / 255] = 0
+    torch.testing.assert_close(images["alpha"], expected, rtol=1e-5, atol=1e-6)
+
+
+def tilted_plane(tilt=1.1) -> tuple[dict[str, Any], torch.Tensor, torch.Tensor]:
+    """Surfels on the plane through (0, 0, 2) with a normal turned about x; its normal and depth."""
+    g = torch.Generator().manual_seed(0)
+    normal = torch.tensor([0.0, math.sin(tilt), -math.cos(tilt)])
+    in_plane = torch.tensor([[1.0, 0, 0], [0.0, math.cos(tilt), math.sin(tilt)]])
+    count = 3000
+    scene = single_surfel(opacity=0.5, scale=0.15)
+    scene["means"] = torch.tensor([0.0, 0, 2]) + (torch.rand(count, 2, generator=g) - 0.5) @ (
+        in_plane * torch.tensor([[2.0], [3.0]])
+    )
+    quat = (math.cos(tilt / 2), math.sin(tilt / 2), 0.0, 0.0)  # z axis to minus the normal
+    for name in ("scales", "opacities", "colors"):
+        scene[name] = scene[name].expand(count, *scene[name].shape[1:])
+    scene["quats"] = torch.tensor([quat]).expand(count, 4)
+    y, x = torch.meshgrid(torch.arange(33.0) - 16, torch.arange(33.0) - 16, indexing="ij")
+    rays = torch.stack([x / 100, y / 100, torch.ones_like(x)], -1)
+    return scene, normal, (2 * normal[2]) / (rays @ normal)
+
+
+def test_tilted_plane_has_exact_depth_and_normals():
+    scene, normal, depth = tilted_plane()
+    axis = rotation_matrices(scene["quats"][:1])[0, :, 2]
+    assert (axis.cross(normal, dim=0)).norm() < 1e-6
+    images = render(scene, width=33, height=33, render_mode="RGB+ED")
+    assert images["alpha"].min() > 0.99
+    assert (images["depth"] / depth - 1).abs().max() < 1e-5
+    assert (images["median"] / depth - 1).abs().max() < 1e-5
+    assert images["distort"].abs().max() < 1e-4
+    torch.testing.assert_close(images["normal"], images["alpha"][..., None] * normal)
+    inner = images["surface"][1:-1, 1:-1]
+    assert (inner - normal).abs().max() < 1e-3 and not images["surface"][0].any()
+
+    gaussians, _, _ = rasterize(**scene, width=33, height=33, render_mode="RGB+ED")
+    assert (gaussians[0, ..., 3] / depth - 1).abs().max() > 0.01
+
+
+def test_surface_normals_are_in_the_world_and_differentiable():
+    scene, normal, _ = tilted_plane()
+    R = rotation_matrices(torch.tensor([[1.0, 0.1, -0.2, 0.3]]))[0]
+    turned = scene | {"means": scene["means"] @ R.T, "viewmats": scene["viewmats"].clone()}
+    turned["viewmats"][0, :3, :3] = R.T
+    turned["quats"] = quaternion_product(torch.tensor([1.0, 0.1, -0.2, 0.3]), scene["quats"])
+    turned["means"] = turned["means"].requires_grad_()
+    images = render(turned, width=33, height=33, depth_mode="median")
+    for name in ("normal", "surface"):
+        inner = torch.nn.functional.normalize(images[name][1:-1, 1:-1], dim=-1)
+        assert (inner - R @ normal).abs().max() < 2e-3, name
+    images["surface"][..., 0].sum().backward()
+    assert turned["means"].grad is not None and turned["means"].grad.abs().max() > 0
+
+
+def test_depth_without_a_plane_has_no_normal():
+    depths = torch.zeros(1, 7, 7, 1)
+    depths[0, 3, 3] = 2.0
+    depths[0, 1, 1:5] = 2.0
+    depths.requires_grad_()
+    Ks = torch.tensor([[[100.0, 0, 3.5], [0, 100.0, 3.5], [0, 0, 1]]])
+    normals = depth_to_normals(depths, torch.eye(4)[None], Ks)
+    assert not normals[0, 5, 5].any() and torch.isfinite(normals).all()
+    (
+        normals * torch.rand(normals.shape, generator=torch.Generator().manual_seed(0))
+    ).sum().backward()
+    assert depths.grad is not None and depths.grad.abs().max() < 1e3
+    with pytest.raises(ValueError, match=r"depths must be of shape .* got \(7, 7\)"):
+        depth_to_normals(depths[0, ..., 0], torch.eye(4)[None], Ks)
+
+
+def quaternion_product(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    real = a[0] * b[:, :1] - (b[:, 1:] @ a[1:])[:, None]
+    cross = torch.linalg.cross(a[1:].expand(len(b), 3), b[:, 1:])
+    return torch.cat([real, a[0] * b[:, 1:] + b[:, :1] * a[1:] + cross], 1)
+
+
+def test_distortion_is_the_weighted_spread():
+    scene = single_surfel(opacity=0.5)
+    scene = {
+        k: v if k in ("viewmats", "Ks") else v.repeat(2, *[1] * (v.ndim - 1))
+        for k, v in scene.items()
+    }
+    scene["means"][1, 2] = 2.6
+    images = render(scene, width=33, height=33)
+    assert images["distort"][16, 16] == pytest.approx(2 * 0.5 * 0.25 * 0.6, abs=1e-6)
+    # Half of the light does not pass the first: the second is no median.
+    assert images["median"][16, 16] == pytest.approx(2.0)
+    off = render(scene, width=33, height=33, distloss=False)
+    assert not off["distort"].any() and torch.equal(off["color"], images["color"])
+
+
+@pytest.mark.parametrize("quat", [(1.0, 1.0, 0, 0), (1.0, 1.0 + 1e-6, 0, 0), (1.0, 1.001, 0, 0)])
+def test_edge_on_surfel_is_its_blob(quat):
+    scene = single_surfel(quat=quat)
+    for name in LEARNED:
+        scene[name] = scene[name].requires_grad_()
+    images = render(scene, width=33, height=33)
+    assert images["alpha"][16, 16].item() == pytest.approx(0.5, abs=1e-5)
+    assert images["depth"][16, 16].item() == pytest.approx(1.0, abs=1e-4)
+    total(images).backward()
+    assert all(torch.isfinite(scene[name].grad).all() for name in LEARNED)
+
+
+@pytest.mark.parametrize(
+    ("depth", "visible"), [(-2.0, False), (0.0, False), (0.0099, False), (0.01, True), (5.0, True)]
+)
+def test_near_plane_is_the_limit(depth, visible):
+    images = render(single_surfel(depth=depth, scale=0.001), width=33, height=33)
+    assert bool(images["alpha"].any()) == visible
+
+
+def test_surfel_through_the_camera_plane_is_drawn_in_front_only():
+    quat = (math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0)  # normal along -y
+    scene = single_surfel(opacity=0.9, scale=3.0, depth=1.0, quat=quat)
+    scene["means"][0, 1] = 0.5
+    expected = call_reference(scene, 33, 33, near=0.2)
+    images = render(scene, width=33, height=33, near_plane=0.2)
+    assert not images["alpha"][:16].any() and images["alpha"][24:].min() > 0.01
+    assert (images["alpha"].double() - expected.alpha).abs().max() < 1e-5
+    assert (images["depth"].double() - expected.depth).abs().max() < 1e-4
+
+
+def test_empty_scene_is_background():
+    scene = random_scene(count=0)
+    for name in LEARNED:
+        scene[name] = scene[name].requires_grad_()
+    background = torch.tensor([[0.1, 0.2, 0.3]])
+    images = render(scene, width=20, height=10, backgrounds=background, render_mode="RGB+ED")
+    assert torch.equal(images["color"], background.expand(10, 20, 3))
+    assert not any(images[name].any() for name in ("alpha", "depth", "normal", "median"))
+    images["color"].sum().backward()
+    assert not scene["viewmats"].grad.any()
+
+
+@pytest.mark.parametrize("size", [(1, 1), (17, 33), (97, 1)])
+def test_odd_sizes_agree_with_reference(size):
+    width, height = size
+    scene = random_scene(seed=8, size=size)
+    expected = call_reference(scene, width, height)
+    images = render(scene, width=width, height=height)
+    clear = expected.margin > 1e-4
+    assert (images["color"].double() - expected.color).abs()[clear].max() < 1e-4
+
+
+def all_bits(scene, **options):
+    leaves = {k: v.clone().requires_grad_(k in LEARNED) for k, v in scene.items()}
+    images = render(leaves, **options)
+    total(images).backward()
+    return [images[name] for name in OUTPUTS] + [leaves[name].grad for name in LEARNED]
+
+
+@pytest.mark.parametrize("simd", LEVELS)
+def test_same_bits_for_any_number_of_threads(simd):
+    scene = random_scene(count=6000, seed=6, size=(150, 110), sh_degree=1)
+    options = {"width": 150, "height": 110, "sh_degree": 1}
+    renderer = create_renderer(1, simd)
+    single = all_bits(scene, renderer=renderer, **options)
+    render(random_scene(seed=7), renderer=renderer)
+    for used in (renderer, create_renderer(2, simd), create_renderer(4, simd)):
+        bits = all_bits(scene, renderer=used, **options)
+        assert all(torch.equal(a, b) for a, b in zip(single, bits, strict=True))
+
+
+def test_batch_of_cameras_equals_single_calls():
+    scene = random_scene(seed=3, cameras=3)
+    scene["colors"] = torch.rand(3, 300, 3, generator=torch.Generator().manual_seed(9))
+    leaves = {k: v.clone().requires_grad_(k in LEARNED) for k, v in scene.items()}
+    options: dict[str, Any] = {"width": 40, "height": 30}
+    images, _, _, _, _, _, meta = rasterize_surfels(**leaves, **options)
+    (images**2).sum().backward()
+    losses = []
+    again = {k: v.clone().requires_grad_(k in LEARNED) for k, v in scene.items()}
+    for c in range(3):
+        one = again | {k: again[k][c : c + 1] for k in ("viewmats", "Ks", "colors")}
+        image, _, _, _, _, _, single = rasterize_surfels(**one, **options)
+        assert torch.equal(image[0], images[c])
+        assert torch.equal(meta["means2d"][meta["camera_ids"] == c], single["means2d"])
+        losses.append((image**2).sum())
+    torch.stack(losses[::-1]).sum().backward()
+    for name in LEARNED:
+        torch.testing.assert_close(leaves[name].grad, again[name].grad, rtol=1e-4, atol=1e-4)
+
+
+def test_modes_and_meta():
+    scene = random_scene(seed=4)
+    depth = render(scene)
+    expected = depth["depth"] / depth["alpha"].clamp(min=1e-10)
+    meta = {}
+    for mode, channels in {"RGB": 3, "D": 1, "ED": 1, "RGB+D": 4, "RGB+ED": 4}.items():
+        image, _, _, surface, _, _, meta = rasterize_surfels(
+            **scene, width=WIDTH, height=HEIGHT, render_mode=mode
+        )
+        assert image.shape == (1, HEIGHT, WIDTH, channels)
+        assert (surface is None) == (mode == "RGB")
+        if "ED" in mode:
+            assert torch.equal(image[0, ..., -1], expected)
+    ids = meta["gaussian_ids"]
+    X_CW, K = scene["viewmats"][0].double(), scene["Ks"][0].double()
+    p_C = scene["means"][ids].double() @ X_CW[:3, :3].T + X_CW[:3, 3]
+    torch.testing.assert_close(meta["depths"].double(), p_C[:, 2], rtol=1e-5, atol=1e-6)
+    pixels = (p_C @ K.T)[:, :2] / p_C[:, 2:]
+    torch.testing.assert_close(meta["means2d"].double(), pixels, rtol=1e-4, atol=1e-3)
+    assert (meta["normals"].double() @ X_CW[:3, :3].T * p_C).sum(1).max() <= 1e-6
+    assert (meta["radii"] >= 1).all() and 0 < len(ids) < 300
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    seed=st.integers(0, 2**31),
+    count=st.integers(0, 60),
+    width=st.integers(1, 40),
+    height=st.integers(1, 40),
+    spread=st.floats(-3, 3),
+    log_scale=st.floats(-30, 15),
+    simd=st.sampled_from(LEVELS),
+    threads=st.integers(1, 2),
+)
+def test_fuzz_finite_and_bounded(seed, count, width, height, spread, log_scale, simd, threads):
+    scene = random_scene(count=count, seed=seed, size=(width, height))
+    scene["means"] *= 10.0**spread
+    scene["scales"] = 10.0 ** (log_scale + normal_tensor(seed, count, 3))
+    for name in LEARNED:
+        scene[name] = scene[name].requires_grad_()
+    images = render(scene, width=width, height=height, renderer=create_renderer(threads, simd))
+    assert all(torch.isfinite(image).all() for image in images.values())
+    assert (images["alpha"] >= 0).all() and (images["alpha"] <= 1 + 1e-6).all()
+    assert (images["color"] >= 0).all() and (images["color"] <= 1 + 1e-5).all()
+    total({name: images[name] for name in OUTPUTS}).backward()
+    assert all(torch.isfinite(scene[name].grad).all() for name in LEARNED)
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 2**31), spread=st.floats(-1, 1), log_scale=st.floats(-3, 1))
+def test_fuzz_agrees_with_reference(seed, spread, log_scale):
+    scene = random_scene(count=80, seed=seed, size=(29, 23))
+    scene["means"] *= 10.0**spread
+    scene["scales"] = scene["scales"] * 10.0**log_scale
+    expected = call_reference(scene, 29, 23)
+    images = render(scene, width=29, height=23)
+    clear = expected.margin > 1e-2
+    error = (images["alpha"].double() - expected.alpha).abs()
+    assert not clear.any() or error[clear].max() < 2e-3
+
+
+def _set(name, index, value):
+    def change(scene):
+        tensor = scene[name].clone()
+        tensor[index] = value
+        return scene | {name: tensor}
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda s: s | {"quats": s["quats"][:-1]}, r"quats must .* got \(299, 4\)"),
+        (lambda s: s | {"scales": s["scales"][:, :2]}, r"scales must .* got \(300, 2\)"),
+        (
+            lambda s: s | {"means": s["means"].double()},
+            r"means must be torch.float32, got torch.float64",
+        ),
+        (_set("means", (7, 1), math.nan), r"means\[7, 1\] must be finite, got nan"),
+        (_set("scales", (3, 1), 0.0), r"scales\[3, 1\] must be > 0 m, got 0"),
+        (_set("opacities", 4, 1.5), r"opacities\[4\] must be in \[0, 1\], got 1.5"),
+        (_set("quats", 5, 0.0), r"quats\[5\] must .* got \[0.0, 0.0, 0.0, 0.0\]"),
+        (_set("viewmats", 0, 2 * torch.eye(4)), r"viewmats\[0\] must be a rigid transform"),
+        (_set("Ks", (0, 0, 0), 0.0), r"focal lengths of K must be > 0 px, got 0"),
+        (lambda s: s | {"render_mode": "RGBD"}, r"render_mode must .* got 'RGBD'"),
+        (lambda s: s | {"depth_mode": "mean"}, r"depth_mode must .* got 'mean'"),
+        (
+            lambda s: s | {"distloss": True},
+            r"render_mode must be one with depth for distloss, got RGB",
+        ),
+        (lambda s: s | {"radius_clip": -1.0}, r"radius_clip must .* got -1"),
+        (lambda s: s | {"width": 0}, r"image size must .* got 0 x 45"),
+        (lambda s: s | {"near_plane": 0.0}, r"0 < near < far"),
+        (lambda s: s | {"sh_degree": 1}, r"colors must be of shape \(300, K, 3\)"),
+        (lambda s: s | {"Ks": s["Ks"].requires_grad_()}, r"Ks must be without a gradient"),
+        (lambda s: {k: v.to("meta") if torch.is_tensor(v) else v for k, v in s.items()}, r"meta"),
+    ],
+)
+def test_bad_input_is_named(change, message):
+    scene = change(random_scene() | {"width": WIDTH, "height": HEIGHT})
+    with pytest.raises(ValueError, match=message):
+        rasterize_surfels(**scene)
+
+
+def test_gsplat_gives_pairs_with_normals_in_the_world(monkeypatch):
+    C, N = 1, 5
+    shown = torch.rand(C, HEIGHT, WIDTH, 4)
+    alpha, normals = torch.rand(C, HEIGHT, WIDTH, 1), torch.rand(C, N, 3)
+    radii = torch.tensor([[[3, 3], [0, 2], [1, 1], [0, 0], [2, 0]]], dtype=torch.int32)
+
+    def rasterization_2dgs(*arguments, **_):
+        assert arguments[4].shape == (C, N, 3)  # as gsplat joins depths (C, N, 1) to colors
+        meta = {name: torch.rand(C, N) for name in ("depths", "opacities", "means2d")}
+        meta |= {"radii": radii, "normals": normals}
+        return shown, alpha, shown[..., :3], shown[0, ..., :3], alpha, alpha, meta
+
+    stand_in = types.SimpleNamespace(rasterization_2dgs=rasterization_2dgs)
+    monkeypatch.setattr(surfel_rasterization, "import_extra", lambda *_: stand_in)
+    monkeypatch.setattr(surfel_rasterization, "check_shapes", lambda *_: None)
+    scene = random_scene(count=N) | {"means": FakeCuda(N)}
+    scene["viewmats"][0, :3, :3] = R = torch.tensor([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
+    options = {"width": WIDTH, "height": HEIGHT, "render_mode": "RGB+ED"}
+    _, _, _, surface, _, _, meta = rasterize_surfels(**scene, **options)
+    assert surface is not None and surface.shape == (1, HEIGHT, WIDTH, 3)
+    assert meta["gaussian_ids"].tolist() == [0, 2] and meta["camera_ids"].tolist() == [0, 0]
+    assert len(meta["radii"]) == len(meta["depths"]) == 2
+    torch.testing.assert_close(meta["normals"], normals[0, [0, 2]] @ R)
+
+
+class FakeCuda(types.SimpleNamespace):
+    """Stands for a tensor on a GPU."""
+
+    def __init__(self, count: int):
+        super().__init__(device=torch.device("cuda"), count=count)
+
+    def __len__(self) -> int:
+        return self.count

@@ -1,0 +1,155 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from pydrake.autodiffutils import InitializeAutoDiff
+from pydrake.common.eigen_geometry import AngleAxis, Quaternion
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.symbolic import MakeVectorContinuousVariable, Variable
+from scipy.spatial.transform import Rotation
+
+from splatpilot.systems.vehicle.quadrotor import hover_state
+from splatpilot.systems.vehicle.state import (
+    QuadrotorState,
+    StatePredictor,
+    StateToPose,
+    lengths,
+    pose_between,
+    predict_state,
+    rotation_matrices,
+)
+
+
+def test_parts_are_where_the_plant_has_them():
+    """The parts of one state and of many are entries 0-2, 3-5, 6-9 and 10-12, and give it back."""
+    for x in (np.arange(13.0), np.arange(2 * 3 * 13.0).reshape(2, 3, 13)):
+        state = QuadrotorState.of(x)
+        np.testing.assert_array_equal(state.p_WB, x[..., [0, 1, 2]])
+        np.testing.assert_array_equal(state.v_WB, x[..., [3, 4, 5]])
+        np.testing.assert_array_equal(state.q_WB, x[..., [6, 7, 8, 9]])
+        np.testing.assert_array_equal(state.w_WB_B, x[..., [10, 11, 12]])
+        np.testing.assert_array_equal(state.to_vector(), x)
+
+
+@pytest.mark.parametrize("zeros", [np.zeros, torch.zeros])
+def test_parts_are_views(zeros):
+    """What is written to a part is written to the states."""
+    x = zeros((2, 13))
+    QuadrotorState.of(x).v_WB[:, 1] = 3.0
+    assert x[:, 4].tolist() == [3.0, 3.0] and x.sum() == 6.0
+
+
+def test_parts_of_derivatives_and_expressions():
+    """Arrays of AutoDiffXd and of Expression have parts, and those pack, as floats do."""
+    x = InitializeAutoDiff(np.arange(13.0)).ravel()
+    packed = QuadrotorState.of(x).to_vector()
+    assert [component.value() for component in packed] == list(range(13))
+    np.testing.assert_array_equal(packed[7].derivatives(), np.eye(13)[7])
+    variables: list[Variable] = MakeVectorContinuousVariable(13, "x").tolist()
+    q_WB = QuadrotorState.of(np.array(variables)).q_WB
+    assert [str(component) for component in q_WB] == ["x(6)", "x(7)", "x(8)", "x(9)"]
+
+
+def test_heading_is_that_of_body_x_seen_from_above():
+    rotations = Rotation.random(20, random_state=0)
+    states = np.zeros((20, 13))
+    states[:, 6:10] = rotations.as_quat(scalar_first=True)
+    x_W = rotations.apply([1.0, 0.0, 0.0])
+    expected = np.arctan2(x_W[:, 1], x_W[:, 0])
+    np.testing.assert_allclose(QuadrotorState.of(states).heading, expected, atol=1e-12)
+
+
+def test_other_shapes_are_refused():
+    """What has not 13 numbers is no state."""
+    with pytest.raises(ValueError, match=r"got \(13, 2\)"):
+        QuadrotorState.of(np.zeros((13, 2)))
+
+
+def pose_of(state):
+    system = StateToPose()
+    context = system.CreateDefaultContext()
+    system.GetInputPort("state").FixValue(context, state)
+    X_WB = system.GetOutputPort("pose").Eval(context)
+    assert isinstance(X_WB, RigidTransform)
+    return X_WB
+
+
+@given(q=st.lists(st.floats(-2, 2), min_size=4, max_size=4))
+def test_pose_has_the_position_and_the_attitude_of_the_normalised_quaternion(q):
+    """Any nonzero quaternion gives the rotation scipy gives it, beside the position."""
+    assume(np.linalg.norm(q) > 1e-6)
+    state = np.arange(13.0)
+    state[6:10] = q
+    X_WB = pose_of(state)
+    np.testing.assert_array_equal(X_WB.translation(), [0.0, 1.0, 2.0])
+    expected = Rotation.from_quat(q, scalar_first=True).as_matrix()
+    np.testing.assert_allclose(X_WB.rotation().matrix(), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("w", [0.0, math.nan, math.inf])
+def test_a_quaternion_that_is_no_rotation_is_an_error(w):
+    """Zero and non-finite quaternions are refused with their value and the remedy."""
+    state = hover_state([0.0, 0.0, 0.0])
+    state[6] = w
+    with pytest.raises(ValueError, match=f"q_WB must be .* got \\[{w}, "):
+        pose_of(state)
+
+
+NUMBERS = st.floats(-3, 3)
+VECTORS = st.tuples(NUMBERS, NUMBERS, NUMBERS).map(np.array)
+
+
+@given(p=VECTORS, v=VECTORS, axis=VECTORS, w=VECTORS, duration=st.floats(0, 0.5))
+def test_turns_and_moves_as_drakes_rotations_say(p, v, axis, w, duration):
+    """The position moves on by velocity and the attitude turns about the body rates by their size
+    times the duration; velocities stay."""
+    q_WB = Quaternion(np.append(1.0, axis) / np.linalg.norm(np.append(1.0, axis)))
+    state = np.concatenate([p, v, q_WB.wxyz(), w])
+    later = QuadrotorState.of(predict_state(state, duration))
+    np.testing.assert_allclose(later.p_WB, p + duration * v, atol=1e-12)
+    np.testing.assert_array_equal(later.v_WB, v)
+    np.testing.assert_array_equal(later.w_WB_B, w)
+    rate = np.linalg.norm(w)
+    axis = w / rate if rate > 1e-9 else np.array([1.0, 0.0, 0.0])
+    turned = q_WB.multiply(AngleAxis(rate * duration, axis).quaternion()).wxyz()
+    np.testing.assert_allclose(later.q_WB, turned, atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("age", "moved"), [(0.0, 0.0), (0.05, 0.1), (0.5, 0.2), (-1.0, 0.0), (np.inf, 0.2)]
+)
+def test_ages_of_no_use_lead_nowhere(age, moved):
+    """Negative ages count for nothing, long and infinite ones for the longest."""
+    system = StatePredictor(longest=0.1)
+    context = system.CreateDefaultContext()
+    state = np.array([1.0, 0, 0, 2, 0, 0, 1, 0, 0, 0, 0, 0, 0])
+    system.measured_state_input_port().FixValue(context, state)
+    system.age_input_port().FixValue(context, [age])
+    assert system.state_output_port().Eval(context)[0] == pytest.approx(1.0 + moved)
+
+
+def test_poses_between():
+    X_0 = RigidTransform(RotationMatrix.MakeZRotation(0.4), [1.0, 0, 0])
+    X_1 = RigidTransform(RotationMatrix.MakeZRotation(1.0), [3.0, 2, 0])
+    expected = RigidTransform(RotationMatrix.MakeZRotation(0.7), [2.0, 1, 0])
+    assert pose_between(X_0, X_1, 0.5).IsNearlyEqualTo(expected, 1e-12)
+    assert pose_between(X_0, X_1, 0.0).IsNearlyEqualTo(X_0, 1e-12)
+    assert pose_between(X_0, X_1, 1.0).IsNearlyEqualTo(X_1, 1e-12)
+    assert pose_between(X_0, X_0, 0.3).IsNearlyEqualTo(X_0, 1e-12)
+
+
+@pytest.mark.parametrize("make", [np.asarray, torch.as_tensor], ids=["numpy", "torch"])
+def test_rotation_matrices_are_scipys(make):
+    q = 3.0 * np.random.default_rng(0).normal(size=(6, 4))
+    expected = Rotation.from_quat(q, scalar_first=True).as_matrix()
+    np.testing.assert_allclose(rotation_matrices(make(q)), expected, atol=1e-12)
+    np.testing.assert_allclose(rotation_matrices(make(q[0])), expected[0], atol=1e-12)
+
+
+def test_the_length_of_zero_has_no_gradient():
+    zero = torch.zeros(2, 3, requires_grad=True)
+    lengths(zero).sum().backward()
+    assert zero.grad is not None and (zero.grad == 0).all()

@@ -1,0 +1,221 @@
+"""What is drawn in Meshcat."""
+
+import base64
+import json
+
+import cv2
+import msgpack
+import numpy as np
+import pytest
+from pydrake.common.value import Value
+from pydrake.geometry import Meshcat
+from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder, LeafSystem
+from pydrake.systems.primitives import ConstantVectorSource, TrajectorySource
+from pydrake.systems.sensors import CameraInfo, ImageRgba8U
+from pydrake.trajectories import PiecewisePolynomial
+
+from splatpilot.systems.collision.distance_field import FieldState
+from splatpilot.systems.collision.shapes import AnalyticDistanceField, MovingSpheres, Sphere
+from splatpilot.systems.policies.hypotheses import Hypotheses
+from splatpilot.systems.splats.scene import GaussianScene
+from splatpilot.systems.vehicle.quadrotor import hover_state
+from splatpilot.systems.visualization.meshcat_drawing import (
+    BallsVisualizer,
+    CameraVisualizer,
+    FlightVisualizer,
+    draw_distance_slice,
+    draw_gaussians,
+    draw_goal,
+    draw_vehicle,
+    fan_mesh,
+    picture_gltf,
+)
+
+
+@pytest.fixture(scope="module")
+def shared_meshcat():
+    return Meshcat()
+
+
+@pytest.fixture
+def meshcat(shared_meshcat):
+    shared_meshcat.Delete("/splatpilot")
+    return shared_meshcat
+
+
+def test_flight_is_drawn_with_its_trail_and_plan(meshcat):
+    waypoints_B = np.cumsum(np.full((3, 10, 3), 0.1), axis=1)
+    plan = Hypotheses(0.0, RigidTransform([1, 0, 2]), waypoints_B, np.array([1.0, 2.0, 3.0]))
+    ends = [hover_state([x, 0, 2]) for x in (1, 3)]
+    builder = DiagramBuilder()
+    motion = PiecewisePolynomial.FirstOrderHold([0.0, 1.0], np.column_stack(ends))
+    state = builder.AddSystem(TrajectorySource(motion))
+    hypotheses = builder.AddSystem(ConstantVectorSource(plan.to_vector()))
+    visualizer = builder.AddSystem(FlightVisualizer(meshcat, num_hypotheses=3, period=0.1))
+    builder.Connect(state.get_output_port(), visualizer.GetInputPort("state"))
+    builder.Connect(hypotheses.get_output_port(), visualizer.GetInputPort("hypotheses"))
+    draw_vehicle(meshcat, "/splatpilot/vehicle", radius=0.354)
+    Simulator(builder.Build()).AdvanceTo(0.35)
+    assert meshcat.HasPath("/splatpilot/vehicle/body")
+    trail = vertices(drawn(meshcat, "/splatpilot/trail"), "position")
+    np.testing.assert_allclose(trail, [[1 + 0.2 * k, 0, 2] for k in range(4)], atol=1e-6)
+    fan = vertices(drawn(meshcat, "/splatpilot/hypotheses"), "position")
+    assert len(fan) == 3 * 11 * 2
+
+
+def test_fan_is_ribbons_along_the_plans_in_the_colors_of_their_costs():
+    generator = np.random.default_rng(0)
+    waypoints_B = np.cumsum(generator.uniform(-0.1, 0.4, (4, 10, 3)), axis=1)
+    X_WB = RigidTransform(RollPitchYaw(0.1, 0.2, 0.3), [1, 2, 3])
+    plan = Hypotheses(0.0, X_WB, waypoints_B, np.array([2.0, 1.0, 4.0, 3.0]))
+    points, faces, colors = fan_mesh(plan, width=0.05)
+    sides = points.T.reshape(4, 11, 2, 3)
+    np.testing.assert_allclose(sides.mean(axis=2)[:, 1:], plan.waypoints_W, atol=1e-12)
+    np.testing.assert_allclose(sides.mean(axis=2)[:, 0], np.tile([1, 2, 3], (4, 1)))
+    across = sides[:, :, 1] - sides[:, :, 0]
+    np.testing.assert_allclose(np.linalg.norm(across, axis=-1), 0.05)
+    np.testing.assert_allclose(across[..., 2], 0, atol=1e-12)
+    shades = colors.T.reshape(4, 22, 3)
+    assert (shades == shades[:, :1]).all()
+    np.testing.assert_allclose(shades[[1, 2], 0], [[0, 1, 0.1], [1, 0, 0.1]])
+    assert faces.min() == 0 and faces.max() == 4 * 22 - 1
+    assert (faces // 22 == faces[0] // 22).all()
+
+
+def test_balls_are_drawn_where_they_are(meshcat):
+    paths = [np.array([[1.0, 2, 3], [2, 2, 3], [4, 2, 3]]), np.array([[0.0, 0, 1], [np.inf] * 3])]
+    balls = MovingSpheres([0.5, 0.25], paths, period=0.1)
+    builder = DiagramBuilder()
+    builder.AddSystem(BallsVisualizer(meshcat, balls, period=0.1))
+    simulator = Simulator(builder.Build())
+    for time, places in ((0.15, [[2, 2, 3], [0, 0, -1000]]), (0.25, [[4, 2, 3], [0, 0, 1]])):
+        simulator.AdvanceTo(time)
+        for k, place in enumerate(places):
+            packed = msgpack.unpackb(meshcat._GetPackedTransform(f"/splatpilot/balls/{k}"))
+            assert packed["matrix"][12:15] == place
+    assert drawn(meshcat, "/splatpilot/balls/1")["geometries"][0]["radius"] == 0.25
+
+
+def drawn(meshcat, path: str) -> dict:
+    """The object at a path, as the page gets it: its geometry, its material and itself."""
+    return msgpack.unpackb(meshcat._GetPackedObject(path))["object"]
+
+
+def vertices(drawing: dict, attribute: str) -> np.ndarray:
+    """(n, 3) An attribute of the vertices of a drawing: position [m] or color."""
+    packed = drawing["geometries"][0]["data"]["attributes"][attribute]["array"]
+    return np.frombuffer(packed.data, "<f4").reshape(-1, 3)
+
+
+def test_gaussians_are_drawn_as_points_of_their_size(meshcat):
+    scene = GaussianScene.from_colors(
+        means=[[1, 0, 1], [2, 0.5, 1], [100, 0, 1]],
+        quats=np.tile([1.0, 0, 0, 0], (3, 1)),
+        scales=[[0.1, 0.02, 0.01], [0.01, 0.3, 0.1], [9, 9, 9]],
+        opacities=np.full(3, 0.9),
+        colors=[[1.0, 0.5, 0.0], [0.2, 0.2, 0.8], [1, 1, 1]],
+    )
+    draw_gaussians(meshcat, "/splatpilot/scene", scene, np.zeros(3) - 1, np.full(3, 4.0))
+    drawing = drawn(meshcat, "/splatpilot/scene")
+    np.testing.assert_array_equal(vertices(drawing, "position"), [[1, 0, 1], [2, 0.5, 1]])
+    shown = vertices(drawing, "color") ** (1 / 2.2)  # as the screen encodes it
+    np.testing.assert_allclose(shown, [[1, 0.5, 0], [0.2, 0.2, 0.8]], atol=0.02)
+    # As wide as the median over Gaussians of their largest deviations, 0.1 m and 0.3 m.
+    assert drawing["materials"][0]["size"] == pytest.approx(2 * 0.2)
+
+
+def test_many_gaussians_are_thinned_evenly(meshcat):
+    x = np.arange(301.0)
+    scene = GaussianScene.from_colors(
+        means=np.column_stack([x, 0 * x, 0 * x]),
+        quats=np.tile([1.0, 0, 0, 0], (301, 1)),
+        scales=np.full((301, 3), 0.1),
+        opacities=np.full(301, 0.9),
+        colors=np.full((301, 3), 0.5),
+    )
+    box = np.full(3, 1e3)
+    draw_gaussians(meshcat, "/splatpilot/scene", scene, -box, box, max_points=101)
+    position = vertices(drawn(meshcat, "/splatpilot/scene"), "position")
+    np.testing.assert_array_equal(position[:, 0], x[::3])
+
+
+def test_goal_is_a_ball_at_its_place(meshcat):
+    draw_goal(meshcat, "/splatpilot/goal", np.array([3.0, -1.0, 2.0]), radius=0.3)
+    drawing = drawn(meshcat, "/splatpilot/goal")
+    assert drawing["geometries"][0]["radius"] == 0.3
+    assert drawing["materials"][0]["transparent"]
+    matrix = msgpack.unpackb(meshcat._GetPackedTransform("/splatpilot/goal"))["matrix"]
+    assert matrix[12:15] == [3.0, -1.0, 2.0]
+
+
+def test_distance_slice_is_colored_by_distance(meshcat):
+    field = AnalyticDistanceField([Sphere([2, 0, 1], 0.5)], [0, -1, 0], [6, 1, 2])
+    draw_distance_slice(meshcat, "/splatpilot/slice", field, height=1.0)
+    drawing = drawn(meshcat, "/splatpilot/slice")
+    p, color = (vertices(drawing, name) for name in ("position", "color"))
+    index = np.frombuffer(drawing["geometries"][0]["data"]["index"]["array"].data, "<u4")
+    a, b, c = np.moveaxis(p[index].reshape(-1, 3, 3), 1, 0)
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2
+    assert area == pytest.approx(6 * 2, rel=5e-3)
+    assert (p[:, 2] == 1).all()
+    distance = np.linalg.norm(p - [2, 0, 1], axis=1) - 0.5
+    assert (distance < 0).any() and (distance > 2).any()
+    np.testing.assert_allclose(color[distance < 0], np.tile([1, 0, 0], (sum(distance < 0), 1)))
+    np.testing.assert_allclose(color[distance > 2], np.tile([0, 0, 1], (sum(distance > 2), 1)))
+    about_1 = color[abs(distance - 1) < 0.05]
+    assert len(about_1) and (about_1[:, :2] > 0.9).all() and (about_1[:, 2] < 0.3).all()
+
+    class Unknown(AnalyticDistanceField):
+        def query(self, p_WQ):
+            sample = super().query(p_WQ)
+            sample.state[...] = FieldState.UNKNOWN
+            return sample
+
+    unknown = Unknown([Sphere([2, 0, 1], 0.5)], [0, -1, 0], [6, 1, 2])
+    draw_distance_slice(meshcat, "/splatpilot/slice", unknown, height=1.0)
+    color = vertices(drawn(meshcat, "/splatpilot/slice"), "color")
+    np.testing.assert_allclose(color, 0.4)
+
+
+def test_camera_picture_is_hung_at_its_rate(meshcat):
+    info = CameraInfo(width=32, height=24, fov_y=1.0)
+    builder = DiagramBuilder()
+    shown_at = []
+
+    class Image(LeafSystem):
+        def __init__(self):
+            super().__init__()
+            self.DeclareAbstractOutputPort("image", lambda: Value(ImageRgba8U(32, 24)), self._note)
+
+        def _note(self, context, value):
+            shown_at.append(context.get_time())
+
+    image = builder.AddSystem(Image())
+    picture = builder.AddSystem(CameraVisualizer(meshcat, info, RigidTransform(), 0.1, stride=2))
+    builder.Connect(image.get_output_port(), picture.GetInputPort("color_image"))
+    Simulator(builder.Build()).AdvanceTo(0.5)
+    assert meshcat.HasPath("/splatpilot/vehicle/camera/frustum")
+    assert meshcat.HasPath("/splatpilot/vehicle/camera/picture")
+    assert shown_at == pytest.approx([0.0, 0.2, 0.4])
+
+
+def test_picture_document_is_the_picture():
+    rgb = np.zeros((24, 32, 3), np.uint8)
+    rgb[:12, :, 0] = 250
+    corners = np.array([[-1.0, -2, 3], [1, -2, 3], [1, 2, 3], [-1, 2, 3]])
+    document = json.loads(picture_gltf(rgb, corners))
+    decoded = cv2.imdecode(_bytes(document["images"][0]["uri"]), cv2.IMREAD_COLOR)[..., ::-1]
+    assert np.abs(decoded.astype(int) - rgb).mean() < 3
+    binary = _bytes(document["buffers"][0]["uri"])
+    assert len(binary) == document["buffers"][0]["byteLength"]
+    positions = binary[:48].view("<f4").reshape(4, 3)
+    # glTF's (x, y, z) is Drake's (x, -z, y).
+    np.testing.assert_allclose(
+        np.column_stack([positions[:, 0], -positions[:, 2], positions[:, 1]]), corners
+    )
+
+
+def _bytes(uri: str) -> np.ndarray:
+    return np.frombuffer(base64.b64decode(uri.split(",")[1]), np.uint8)

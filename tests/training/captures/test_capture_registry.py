@@ -1,0 +1,126 @@
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splatpilot.systems.common.config import load_config
+from splatpilot.training.captures import capture_registry as module
+from splatpilot.training.captures.capture_config import CaptureConfig
+from splatpilot.training.captures.capture_registry import read_capture, register_capture
+
+_PACKAGE = '''
+import cv2
+import numpy as np
+from pydrake.math import RigidTransform
+
+from splatpilot.training.captures.capture import Capture
+from splatpilot.training.captures.capture_registry import CaptureFormat
+
+
+def read(path, config):
+    """Two images of one camera, whose focal length the configuration may give."""
+    f = config.intrinsics[0] if config.intrinsics else 20.0
+    return Capture(
+        name=path.name,
+        source=f"pair {path}",
+        K=np.array([[f, 0, 16], [0, f, 12], [0, 0, 1]]),
+        width=32,
+        height=24,
+        X_WCs=[RigidTransform(), RigidTransform([0.1, 0, 0])],
+        load_image=lambda i: cv2.imread(str(path / f"{i}.png")),
+    )
+
+
+PAIR = CaptureFormat(lambda path: (path / "pair.txt").exists(), read)
+NUMBER = 3
+'''
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A capture of a kind of which splatpilot knows nothing, in a folder of images, and the package
+    that reads it, which can be imported but is not installed."""
+    packages = tmp_path / "packages"
+    packages.mkdir()
+    (packages / "pairs.py").write_text(_PACKAGE)
+    monkeypatch.syspath_prepend(packages)
+    # What a test registers is forgotten after it.
+    monkeypatch.setattr(module.CAPTURES, "_entries", dict(module.CAPTURES._entries))
+    capture = tmp_path / "capture"
+    capture.mkdir()
+    (capture / "pair.txt").touch()
+    (capture / "0.png").touch()
+    yield capture
+    sys.modules.pop("pairs", None)
+
+
+def test_a_kind_of_another_package(folder, tmp_path):
+    info = tmp_path / "packages" / "pairs-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: pairs\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[splatpilot.captures]\npair = pairs:PAIR\n")
+    config = CaptureConfig(intrinsics=[30.0, 30.0, 16.0, 12.0])
+    capture = read_capture(folder, config)
+    assert capture.source == f"pair {folder}" and len(capture) == 2
+    assert capture.K[0, 0] == 30
+    assert (capture.folder, capture.config) == (str(folder), config)
+    plain = read_capture(folder, CaptureConfig(kind="pair", cache="kept"))
+    assert plain.K[0, 0] == 20 and plain.config.cache == str(Path("kept").absolute())
+
+
+def test_a_kind_that_is_not_installed(folder):
+    assert read_capture(folder, CaptureConfig(kind="pairs:PAIR")).source == f"pair {folder}"
+    for kind, message in (
+        ("pairs:NUMBER", "pairs:NUMBER is no capture format"),
+        ("pairs:NOWHERE", "'pairs:NOWHERE' is not at"),
+        ("kinect", r"no capture format 'kinect'; there are tartanair_v1, .*photographs"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            read_capture(folder, CaptureConfig(kind=kind))
+
+
+def test_registered_kinds_are_listed(folder):
+    register_capture(
+        "cubes", lambda path: False, lambda path, config: None, description="cubes (*)"
+    )
+    (folder / "0.png").unlink()
+    with pytest.raises(
+        ValueError,
+        match=r"known are TartanAir V1 .*, photographs alone, a ROS bag, a video .*, cubes",
+    ):
+        read_capture(folder)
+    with pytest.raises(ValueError, match="there is a capture format 'tum' already"):
+        register_capture("tum", lambda path: True, lambda path, config: None)
+
+
+def test_settings_say_what_is_not_as_usual(folder):
+    config = CaptureConfig(depth_unit=1e-05, up="-y", p_DC=[0.0, 1e-7, np.pi])
+    config.scale.between = ["a b.jpg@1,2", "c: #d.jpg"]
+    config.scale.distance = 2.0
+    settings = config.settings()
+    assert [setting.partition("=")[0] for setting in settings] == [
+        *("p_DC", "depth_unit", "up", "scale.between", "scale.distance")
+    ]
+    assert load_config(CaptureConfig(), overrides=settings) == config
+    assert CaptureConfig().settings() == []
+
+
+def test_captures_are_read_without_torch_and_pycolmap(tmp_path):
+    (tmp_path / "model").mkdir()
+    for part in ("cameras", "images"):
+        (tmp_path / "model" / f"{part}.txt").touch()
+    program = (
+        "import sys; sys.modules['torch'] = sys.modules['pycolmap'] = None\n"
+        "from splatpilot.training.captures.capture_registry import read_capture\n"
+        "try:\n"
+        "    read_capture(sys.argv[1])\n"
+        "except ModuleNotFoundError as error:\n"
+        "    print(error)\n"
+    )
+    found = subprocess.run(
+        [sys.executable, "-c", program, tmp_path / "model"], capture_output=True, text=True
+    )
+    assert found.stderr == ""
+    assert "pip install 'splatpilot[photos]'" in found.stdout

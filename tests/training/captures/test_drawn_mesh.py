@@ -1,0 +1,168 @@
+import json
+import struct
+from io import BytesIO
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from splatpilot.systems.collision.field_mesh import add_primitive, data_uri
+from splatpilot.training.captures.render import MeshRenderer, look_along, mesh_distance
+
+K = np.array([[16.0, 0, 16], [0, 16, 12], [0, 0, 1]])
+X_WC = look_along(np.zeros(3), 0.0, 0.0)  # along x
+WALL, QUAD = 3.0, 2.0  # [m], along x
+SKY = (0.0, 0.0, 1.0)
+RED, GREEN = [0.8, 0.0, 0.0, 1.0], [0.0, 0.8, 0.0, 1.0]
+
+
+def square(x: float, half: float, back: bool = False):
+    """Corners, texture coordinates and triangles of a square across the x axis."""
+    p = np.array([[x, half, half], [x, -half, half], [x, -half, -half], [x, half, -half]])
+    uv = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
+    triangles = np.array([[0, 3, 2], [0, 2, 1]])
+    return p, uv, triangles[:, ::-1] if back else triangles
+
+
+def png(alpha: np.ndarray, color=(255, 255, 255)) -> str:
+    """A picture of one color with an alpha (H, W), 0 to 255."""
+    pixels = np.dstack([np.full((*alpha.shape, 3), color, np.uint8), alpha.astype(np.uint8)])
+    stream = BytesIO()
+    Image.fromarray(pixels).save(stream, "PNG")
+    return data_uri("image/png", stream.getvalue())
+
+
+@pytest.fixture
+def scene(tmp_path):
+    """Writes a red wall, and before it a square of a material and texture; returns the file."""
+
+    def scene(material: dict, picture: str | None = None, back: bool = False, binary: bool = False):
+        document: dict = {"asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0, 1]}]}
+        base = {"metallicFactor": 0, "roughnessFactor": 1}
+        wall = {"pbrMetallicRoughness": base | {"baseColorFactor": RED}, "doubleSided": True}
+        pbr = base | material.pop("pbrMetallicRoughness", {"baseColorFactor": GREEN})
+        if picture:
+            pbr["baseColorTexture"] = {"index": 0}
+            document |= {"images": [{"uri": picture}], "textures": [{"source": 0}]}
+        document["materials"] = [wall, material | {"pbrMetallicRoughness": pbr}]
+        document["meshes"] = [
+            {"primitives": [{**add_primitive(document, *shape), "material": i}]}
+            for i, shape in enumerate((square(WALL, 4.0), square(QUAD, 1.0, back)))
+        ]
+        document["nodes"] = [{"mesh": 0}, {"mesh": 1}]
+        file = tmp_path / ("scene.glb" if binary else "scene.gltf")
+        file.write_bytes(_glb(document) if binary else json.dumps(document).encode())
+        return file
+
+    return scene
+
+
+def _glb(document: dict) -> bytes:
+    """The document in binary, its buffers as one."""
+    import base64
+
+    content, start = b"", []
+    for buffer in document["buffers"]:
+        start.append(len(content))
+        content += base64.b64decode(buffer["uri"].partition(",")[2])
+    for view in document["bufferViews"]:
+        view["byteOffset"], view["buffer"] = start[view["buffer"]], 0
+    document["buffers"] = [{"byteLength": len(content)}]
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text
+    chunks += struct.pack("<I4s", len(content), b"BIN\0") + content
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+def view(file):
+    return MeshRenderer(file, "y", SKY).frame(X_WC, K, 32, 24)
+
+
+HALVES = np.repeat(np.r_[np.zeros(16), np.full(16, 255)][None], 32, axis=0)  # right half opaque
+
+
+def sides(frame):
+    """The pixels (row 12) of the left and the right half of the square."""
+    return [(frame.image[12, column].tolist(), frame.depth[12, column]) for column in (12, 19)]
+
+
+def is_red(color) -> bool:
+    return color[0] > 100 and color[1] < 60
+
+
+def is_green(color) -> bool:
+    return color[1] > 100 and color[0] < 60
+
+
+@pytest.mark.parametrize("mode", ["MASK", "BLEND"])
+@pytest.mark.parametrize("binary", [False, True])
+def test_holes_show_what_is_behind_in_color_and_depth(opengl, scene, mode, binary):
+    (left, hole), (right, surface) = sides(
+        view(scene({"alphaMode": mode}, png(HALVES), binary=binary))
+    )
+    assert is_red(left) and hole == pytest.approx(WALL, abs=1e-4)
+    assert is_green(right) and surface == pytest.approx(QUAD, abs=1e-4)
+
+
+@pytest.mark.parametrize(("alpha", "there"), [(100, False), (127, False), (128, True), (200, True)])
+def test_masks_are_there_or_not_by_their_cutoff(opengl, scene, alpha, there):
+    masked = {"alphaMode": "MASK", "alphaCutoff": 0.5}
+    for material, picture in (
+        (masked, png(np.full((4, 4), alpha))),
+        (masked | {"pbrMetallicRoughness": {"baseColorFactor": [0, 0.8, 0, alpha / 255]}}, None),
+    ):
+        frame = view(scene(dict(material), picture))
+        for color, depth in sides(frame):
+            assert is_green(color) == there and is_red(color) != there
+            assert depth == pytest.approx(QUAD if there else WALL, abs=1e-4)
+
+
+def test_alpha_of_opaque_materials_is_ignored(opengl, scene):
+    for color, depth in sides(view(scene({}, png(HALVES)))):
+        assert is_green(color) and depth == pytest.approx(QUAD, abs=1e-4)
+
+
+def test_panes_are_translucent_and_have_depth(opengl, scene):
+    glass = {"baseColorFactor": [0.0, 0.8, 0.0, 0.5]}
+    factor = view(scene({"alphaMode": "BLEND", "pbrMetallicRoughness": glass}))
+    texture = view(scene({"alphaMode": "BLEND"}, png(np.full((4, 4), 128))))
+    for frame in (factor, texture):
+        for color, depth in sides(frame):
+            assert color[0] > 60 and color[1] > 60
+            assert depth == pytest.approx(QUAD, abs=1e-4)
+
+
+@pytest.mark.parametrize("back", [False, True])
+def test_faces_have_two_sides(opengl, scene, back):
+    for color, depth in sides(view(scene({"doubleSided": False}, back=back))):
+        assert is_green(color) and depth == pytest.approx(QUAD, abs=1e-4)
+
+
+def test_cut_out_looks_like_what_is_opaque(opengl, scene):
+    opaque = view(scene({}, png(np.full((4, 4), 255))))
+    masked = view(
+        scene({"alphaMode": "MASK"}, png(np.r_[np.full((63, 64), 255), np.zeros((1, 64))]))
+    )
+    np.testing.assert_allclose(masked.image[12, 12:20].astype(int), opaque.image[12, 12:20], atol=4)
+    np.testing.assert_allclose(masked.depth[12], opaque.depth[12], atol=1e-4)
+
+
+@pytest.mark.parametrize(("mode", "expected"), [("MASK", 0.5), ("OPAQUE", 0.0)])
+def test_there_is_room_in_holes(scene, mode, expected):
+    esdf = mesh_distance(scene({"alphaMode": mode}, png(HALVES)), "y", 0.05)
+    left, right = esdf.distance(np.array([[QUAD, 0.5, 0.0], [QUAD, -0.5, 0.0]]))
+    assert left == pytest.approx(expected, abs=0.1) and right == pytest.approx(0, abs=0.1)
+
+
+def test_nothing_is_cut_behind_what_is_opaque(opengl, scene):
+    file = scene({"alphaMode": "MASK"}, png(HALVES))
+    behind = look_along(np.array([6.0, 0, 0]), np.pi, 0.0)
+    frame = MeshRenderer(file, "y", SKY).frame(behind, K, 32, 24)
+    assert is_red(frame.image[12, 12]) and is_red(frame.image[12, 19])
+    np.testing.assert_allclose(frame.depth[12, 8:24], 6 - WALL, atol=1e-4)
+
+
+def test_missing_texture_is_named(scene):
+    with pytest.raises(ValueError, match=r"scene\.gltf: not a readable mesh \(.*nowhere\.png"):
+        mesh_distance(scene({"alphaMode": "MASK"}, "nowhere.png"), "y", 0.1)

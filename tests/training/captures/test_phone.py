@@ -1,0 +1,151 @@
+import json
+
+import cv2
+import numpy as np
+import OpenEXR
+import pytest
+from pydrake.math import RigidTransform, RotationMatrix
+
+from splatpilot.training.captures.capture_registry import read_capture
+
+OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+# The room's z is the files' y.
+X_RF = RigidTransform(RotationMatrix.MakeXRotation(np.pi / 2))
+
+
+@pytest.fixture
+def write(tmp_path, K, room_views):
+    """Writes the room as Polycam does: y up, each keyframe focused by itself, small depth."""
+
+    def write(prefix: str = ""):
+        folder = tmp_path / "keyframes"
+        for name in (f"{prefix}images", f"{prefix}cameras", "depth"):
+            (folder / name).mkdir(parents=True)
+        for i in range(10):
+            focused = np.diag([1 + 0.01 * (i % 3), 1 + 0.01 * (i % 3), 1]) @ K
+            focused[:2, 2] = K[:2, 2]
+            view = room_views(focused, 64, 48)[i]
+            depth = room_views(np.diag([0.5, 0.5, 1]) @ focused, 32, 24)[i].depth
+            stem = str(638443502 + i)
+            cv2.imwrite(
+                str(folder / f"{prefix}images/{stem}.jpg"),
+                view.image[..., ::-1],
+                [cv2.IMWRITE_JPEG_QUALITY, 100],
+            )
+            millimetres = np.round(1000 * depth).astype(np.uint16)
+            cv2.imwrite(str(folder / f"depth/{stem}.png"), millimetres)
+            pose = (X_RF.inverse() @ view.X_WC).GetAsMatrix4() @ OPENGL
+            camera = {f"t_{r}{c}": pose[r, c] for r in range(3) for c in range(4)}
+            camera |= {"fx": focused[0, 0], "fy": focused[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
+            camera |= {"width": 64, "height": 48, "blur_score": 12.5}
+            (folder / f"{prefix}cameras/{stem}.json").write_text(json.dumps(camera))
+        return tmp_path
+
+    return write
+
+
+@pytest.mark.parametrize("prefix", ["", "corrected_"])
+def test_room(write, shows_room, prefix):
+    capture = read_capture(write(prefix))
+    assert capture.source.startswith("Polycam") and capture.metric and not capture.dropped
+    shows_room(capture, color=4.0, depth=0.03)
+
+
+def test_corrected_poses_come_first(write, shows_room):
+    path = write("corrected_")
+    (path / "keyframes/cameras").mkdir()
+    assert len(read_capture(path)) == 10
+
+
+def test_damaged_keyframes_are_named(write):
+    path = write()
+    cameras = sorted((path / "keyframes/cameras").iterdir())
+    cameras[2].write_text("{}")
+    (path / "keyframes/depth" / f"{cameras[4].stem}.png").unlink()
+    capture = read_capture(path)
+    assert len(capture) == 9
+    assert "638443504.json: not the camera of a keyframe" in capture.dropped[0]
+    assert not capture.registered_depth(3).any() and capture.registered_depth(2).any()
+    for camera in cameras[3:6]:
+        camera.write_text('{"fx": "wide"}')
+    with pytest.raises(ValueError, match="6 of 10 frames can be used"):
+        read_capture(path)
+
+
+OPENGL_RECORD3D = np.diag([1.0, -1.0, -1.0])
+
+
+def write_exr(file, depth) -> None:
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with OpenEXR.File(header, {"R": depth.astype(np.float32)}) as exr:
+        exr.write(str(file))
+
+
+@pytest.fixture
+def write_record3d(tmp_path, K, room_views):
+    """Writes the room as Record3D exports it: the world is that of the first camera."""
+
+    def write_record3d(intrinsics=None, **extra):
+        (tmp_path / "rgb").mkdir()
+        (tmp_path / "depth").mkdir()
+        views = room_views(K, 64, 48)
+        depths = room_views(np.diag([0.5, 0.5, 1]) @ K, 32, 24)
+        poses = []
+        for i, (view, small) in enumerate(zip(views, depths, strict=True)):
+            cv2.imwrite(str(tmp_path / f"rgb/{i}.png"), view.image[..., ::-1])
+            write_exr(tmp_path / f"depth/{i}.exr", small.depth)
+            X = views[0].X_WC.inverse() @ view.X_WC
+            w, x, y, z = X.rotation().ToQuaternion().wxyz()
+            # From optical axes to OpenGL's at both ends.
+            poses.append([x, -y, -z, w, *(OPENGL_RECORD3D @ X.translation())])
+        content = {"w": 64, "h": 48, "K": K.T.ravel().tolist(), "poses": poses, "fps": 60}
+        (tmp_path / "metadata.json").write_text(json.dumps(content | extra))
+        return tmp_path
+
+    return write_record3d
+
+
+def relative(capture, room_poses):
+    """The pose of the capture's world in the room, from the first camera."""
+    return room_poses[0] @ capture.X_WCs[0].inverse()
+
+
+def test_record3d_room(write_record3d, shows_room, room_poses):
+    capture = read_capture(write_record3d())
+    assert capture.source.startswith("Record3D") and capture.metric and not capture.dropped
+    X_RW = relative(capture, room_poses)
+    shows_room(capture, X_RW, color=0.5, depth=0.03)
+    assert X_RW.rotation().matrix()[2, 2] > np.cos(np.deg2rad(15))
+
+
+def test_intrinsics_of_each_frame(write_record3d, K, shows_room, room_poses):
+    own = [[K[0, 0], K[1, 1], K[0, 2], K[1, 2]]] * 10
+    wrong = np.diag([2.0, 2.0, 1]) @ K
+    path = write_record3d(K=wrong.T.ravel().tolist(), perFrameIntrinsicCoeffs=own)
+    capture = read_capture(path)
+    shows_room(capture, relative(capture, room_poses), color=0.5, depth=0.03)
+
+
+def test_what_is_not_an_export(write_record3d, tmp_path):
+    recording = tmp_path / "room.r3d"
+    recording.write_bytes(b"PK")
+    with pytest.raises(ValueError, match=r'own format.*export the recording as "EXR'):
+        read_capture(recording)
+    path = write_record3d()
+    content = json.loads((path / "metadata.json").read_text())
+    (path / "metadata.json").write_text(json.dumps(content | {"poses": content["poses"][:4]}))
+    with pytest.raises(ValueError, match=r"4 poses, but 9\.png is frame 9"):
+        read_capture(path)
+    (path / "metadata.json").write_text(json.dumps(content | {"poses": [[1, 2]]}))
+    with pytest.raises(
+        ValueError, match=r"invalid metadata of Record3D \(poses must be .* got \(1, 2\)"
+    ):
+        read_capture(path)
+
+
+def test_damaged_depth_is_named(write_record3d):
+    path = write_record3d()
+    whole = (path / "depth/3.exr").read_bytes()
+    (path / "depth/3.exr").write_bytes(whole[:40])
+    capture = read_capture(path)
+    assert len(capture) == 9 and "3.exr: not a readable EXR file" in capture.dropped[0]

@@ -1,0 +1,146 @@
+import cv2
+import numpy as np
+import pytest
+
+from splatpilot.training.captures import colmap as video
+from splatpilot.training.captures import frames as image_files
+from splatpilot.training.captures.capture_config import CaptureConfig
+from splatpilot.training.captures.capture_registry import read_capture
+from splatpilot.training.captures.colmap import (
+    import_pycolmap,
+    likely_pairs,
+    similarity,
+    vlad_similarity,
+)
+
+
+@pytest.mark.parametrize("partners", [4, 8])
+def test_likely_pairs(partners):
+    rng = np.random.default_rng(0)
+    noise = rng.uniform(0, 0.1, (40, 40))
+    similarity = noise + noise.T
+    for a in range(20):  # The second half goes the way of the first again.
+        similarity[a, a + 20] = similarity[a + 20, a] = 1.0
+    pairs = likely_pairs(similarity, partners)
+    assert pairs == sorted(set(pairs)) and all(a < b for a, b in pairs)
+    assert {(a, a + 1) for a in range(39)} <= set(pairs)
+    assert {(a, a + 20) for a in range(20)} <= set(pairs)
+    assert 40 * partners / 2 - partners**2 <= len(pairs) <= 40 * partners
+
+
+def test_images_of_one_place_look_alike():
+    rng = np.random.default_rng(1)
+    places = [rng.normal(size=(400, 16)).astype(np.float32) for _ in range(3)]
+    features = [
+        place[rng.choice(400, 250, replace=False)] + rng.normal(0, 0.05, (250, 16))
+        for place in places
+        for _ in range(2)
+    ]
+    features = [each.astype(np.float32) for each in features] + [np.zeros((0, 16), np.float32)]
+    similarity = vlad_similarity(features)
+    np.testing.assert_allclose(similarity, similarity.T, atol=1e-12)
+    np.testing.assert_allclose(np.diag(similarity)[:6], 1.0)
+    for i in range(6):
+        others = np.delete(similarity[i], [i, i ^ 1])
+        assert similarity[i, i ^ 1] > others.max() + 0.2
+    assert np.abs(similarity[6]).max() < 1e-6
+
+
+def test_features_of_a_database(tmp_path):
+    pycolmap = import_pycolmap()
+    rng = np.random.default_rng(2)
+    places = [
+        cv2.resize(rng.integers(0, 255, (60, 80), dtype=np.uint8), (320, 240)) for _ in range(2)
+    ]
+    names = [f"{i}.png" for i in range(4)]
+    for name, image in zip(
+        names, [p[:, s : s + 280] for p in places for s in (0, 40)], strict=True
+    ):
+        cv2.imwrite(str(tmp_path / name), image)
+    file = tmp_path / "features.db"
+    pycolmap.Database.open(file).close()
+    pycolmap.import_images(file, tmp_path, pycolmap.CameraMode.SINGLE, names)
+    pycolmap.extract_features(
+        file, tmp_path, names, extraction_options=pycolmap.FeatureExtractionOptions(use_gpu=False)
+    )
+    database = pycolmap.Database.open(file)
+    found = similarity(database, names)
+    database.close()
+    assert min(found[0, 1], found[2, 3]) > found[:2, 2:].max() + 0.2
+
+
+RATE = 30.0  # [Hz]
+
+
+def write_video(path, frames) -> None:
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), RATE, (160, 120))
+    assert writer.isOpened()
+    for frame in frames:
+        writer.write(frame)
+    writer.release()
+
+
+def frames(count: int, sharp: set[int]) -> list[np.ndarray]:
+    """Frames whose brightness tells their number, with a pattern that is blurred in most."""
+    rng = np.random.default_rng(0)
+    pattern = cv2.resize(rng.integers(0, 80, (30, 40), dtype=np.uint8), (160, 120), interpolation=0)
+    made = []
+    for i in range(count):
+        image = np.stack([pattern + 2 * i] * 3, axis=-1).astype(np.uint8)
+        made.append(image if i in sharp else cv2.GaussianBlur(image, (0, 0), 4))
+    return made
+
+
+@pytest.fixture
+def registered(monkeypatch):
+    """The folders of frames that were to be registered, and their brightness."""
+    seen = {}
+
+    def read(path, config):
+        files = sorted(path.iterdir())
+        seen[path] = [image_files.read_image(file).mean() for file in files]
+        seen["names"] = [file.name for file in files]
+        raise ValueError(f"{path}: enough")
+
+    monkeypatch.setattr(video, "read_photographs", read)
+    return seen
+
+
+def test_the_sharpest_frame_of_each_interval_is_taken(tmp_path, registered):
+    made = frames(60, sharp={3, 29, 30, 50})
+    write_video(tmp_path / "flight.mp4", made)
+    config = CaptureConfig(cache=str(tmp_path / "cache"))
+    for _ in range(2):
+        with pytest.raises(ValueError, match="enough"):
+            read_capture(tmp_path / "flight.mp4", config)
+        brightness = registered[tmp_path / "cache/frames"]
+        expected = [made[i].mean() for i in (3, 29, 30, 50)]
+        # 15 frames an interval: 0 to 14, 15 to 29, 30 to 44, 45 to 59.
+        np.testing.assert_allclose(brightness, expected, atol=3)
+    assert registered["names"] == [f"{i:05d}.jpg" for i in range(4)]
+
+
+def test_rate(tmp_path, registered):
+    write_video(tmp_path / "flight.mp4", frames(60, sharp=set()))
+    config = CaptureConfig(cache=str(tmp_path / "cache"), video_rate=10)
+    with pytest.raises(ValueError, match="enough"):
+        read_capture(tmp_path / "flight.mp4", config)
+    assert len(registered["names"]) == 20
+
+
+def test_what_is_no_video(tmp_path):
+    config = CaptureConfig(cache=str(tmp_path / "cache"))
+    (tmp_path / "a.mp4").write_bytes(b"something else")
+    with pytest.raises(ValueError, match=r"a\.mp4: not a readable video"):
+        read_capture(tmp_path / "a.mp4", config)
+    write_video(tmp_path / "b.mp4", frames(20, sharp=set()))
+    with pytest.raises(ValueError, match=r"b\.mp4: 20 frames in 0\.7 s give 2 of 2 a second"):
+        read_capture(tmp_path / "b.mp4", config)
+    assert list((tmp_path / "cache").iterdir()) == []
+    with pytest.raises(ValueError, match=r"video_rate must be in \(0, 100\] Hz, got 0"):
+        read_capture(tmp_path / "b.mp4", CaptureConfig(video_rate=0))
+    with pytest.raises(ValueError, match=r"partners must be in \[0, inf\), got -1"):
+        read_capture(tmp_path / "b.mp4", CaptureConfig(partners=-1))
+    (tmp_path / "c.txt").write_text("a text")
+    with pytest.raises(ValueError, match=r"c\.txt: unknown capture format.*a video"):
+        read_capture(tmp_path / "c.txt")

@@ -1,0 +1,210 @@
+import json
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform, RotationMatrix
+from scipy.spatial.transform import Rotation
+
+from splatpilot.training.captures import refine_poses as module
+from splatpilot.training.captures.capture import CaptureFrame
+from splatpilot.training.captures.capture_config import CaptureConfig
+from splatpilot.training.captures.capture_registry import read_capture
+from splatpilot.training.captures.frame_comparison import ComparedFrame, fit_color_camera
+from splatpilot.training.captures.refine_poses import refine_poses
+
+K = np.array([[300.0, 0, 162.0], [0, 304.0, 118.0], [0, 0, 1]])
+
+
+@pytest.fixture
+def frames(room_views):
+    """Returns the room as compared from poses, with noise of so much in depth."""
+
+    def views(poses: list[RigidTransform], noise: float = 0.0) -> list[ComparedFrame]:
+        rng = np.random.default_rng(5)
+        return [
+            ComparedFrame.of(
+                CaptureFrame(
+                    view.image,
+                    (view.depth * (1 + noise * rng.standard_normal(view.depth.shape))).astype(
+                        np.float32
+                    ),
+                    view.X_WC,
+                    K,
+                )
+            )
+            for view in room_views(K, 320, 240, poses, finer=8.0)
+        ]
+
+    return views
+
+
+def drifting(poses: list[RigidTransform], turned: float, moved: float) -> list[RigidTransform]:
+    """Adds a random walk that ends about so far off [rad], [m]."""
+    walk = np.random.default_rng(1).standard_normal((len(poses), 6)).cumsum(axis=0)
+    walk *= np.repeat([turned, moved], 3) / np.sqrt(len(poses))
+    return [
+        RigidTransform(
+            RotationMatrix(Rotation.from_rotvec(step[:3]).as_matrix()) @ X_WC.rotation(),
+            X_WC.translation() + step[3:],
+        )
+        for step, X_WC in zip(walk, poses, strict=True)
+    ]
+
+
+def errors(poses: list[RigidTransform], truth: list[RigidTransform]) -> np.ndarray:
+    """Root mean square of what is wrong between each pose and the next, turned [rad] and moved
+    [m]: the place as a whole may lie anywhere."""
+    wrong = [
+        (a.inverse() @ b).inverse() @ (c.inverse() @ d)
+        for a, b, c, d in zip(poses, poses[1:], truth, truth[1:], strict=False)
+    ]
+    return np.array(
+        [
+            np.sqrt(np.mean([X.rotation().ToAngleAxis().angle() ** 2 for X in wrong])),
+            np.sqrt(np.mean([X.translation() @ X.translation() for X in wrong])),
+        ]
+    )
+
+
+@pytest.mark.parametrize(("noise", "left"), [(0.0, 0.1), (0.005, 0.3)])
+def test_drift_is_mended(frames, room_poses, noise, left):
+    given = drifting(room_poses, 0.02, 0.02)
+    refined = refine_poses(frames(room_poses, noise), given)
+    assert (errors(refined.X_WCs, room_poses) < left * errors(given, room_poses)).all()
+    assert refined.contrast[1] < refined.contrast[0]
+    assert refined.depth[1] < refined.depth[0]
+    assert refined.moved > 0.001
+    assert "poses moved by" in str(refined)
+
+
+def test_exact_poses_stay(frames, room_poses):
+    refined = refine_poses(frames(room_poses), room_poses)
+    turned, moved = errors(refined.X_WCs, room_poses)
+    assert turned < 1e-3
+    assert moved < 1e-3
+
+
+def test_who_sees_nothing_goes_with_its_neighbours(frames, room_poses):
+    given = drifting(room_poses, 0.02, 0.02)
+    seen = frames(room_poses)
+    blind = CaptureFrame(
+        np.zeros((240, 320, 3), np.uint8), np.zeros((240, 320), np.float32), given[5], K
+    )
+    seen[5] = ComparedFrame.of(blind)
+    refined = refine_poses(seen, given).X_WCs
+    before, own, after = (refined[i].translation() - given[i].translation() for i in (4, 5, 6))
+    np.testing.assert_allclose(own, (before + after) / 2, atol=1e-3)
+    others = [i for i in range(len(given)) if i != 5]
+    left = errors([refined[i] for i in others], [room_poses[i] for i in others])
+    assert (left < 0.1 * errors(given, room_poses)).all()
+
+
+def test_nothing_in_common(frames, room_poses):
+    X_WC = room_poses[0]
+    behind = X_WC @ RigidTransform(RotationMatrix.MakeYRotation(np.pi), [0, 0, 0])
+    with pytest.raises(ValueError, match="no two frames see the same"):
+        refine_poses(frames([X_WC, behind]), [X_WC, behind])
+
+
+K_REFINED_CAPTURE = np.array([[300.0, 0, 160.0], [0, 300.0, 120.0], [0, 0, 1]])
+
+
+@pytest.fixture
+def folder(tmp_path, room_views, room_poses) -> Path:
+    """The room as a folder of the 7-Scenes kind, whose poses are off by a centimetre and more
+    along its length."""
+    path = tmp_path / "capture"
+    path.mkdir()
+    for i, view in enumerate(room_views(K_REFINED_CAPTURE, 320, 240, finer=8.0)):
+        stem = path / f"frame-{i:06d}"
+        cv2.imwrite(f"{stem}.color.png", view.image[..., ::-1])
+        cv2.imwrite(f"{stem}.depth.png", np.round(1000 * view.depth).astype(np.uint16))
+        off = RigidTransform([0.01 * np.sin(2 * i), 0, 0])
+        np.savetxt(f"{stem}.pose.txt", (off @ room_poses[i]).GetAsMatrix4())
+    return path
+
+
+@pytest.fixture
+def config(tmp_path) -> CaptureConfig:
+    intrinsics = [300.0, 300.0, 160.0, 120.0]
+    return CaptureConfig(
+        intrinsics=intrinsics,
+        depth_intrinsics=intrinsics,
+        p_DC=[0.0, 0.0, 0.0],
+        up="z",
+        refine_poses=True,
+        cache=str(tmp_path / "cache"),
+    )
+
+
+def test_poses_are_refined_once(folder, config, room_poses, monkeypatch, capfd):
+    capture = read_capture(folder, config)
+    assert "poses moved by" in capfd.readouterr().err
+    wrong = [
+        np.linalg.norm((X.inverse() @ truth).translation() - (Y.inverse() @ other).translation())
+        for X, truth, Y, other in zip(
+            capture.X_WCs, room_poses, capture.X_WCs[1:], room_poses[1:], strict=False
+        )
+    ]
+    assert np.mean(wrong) < 0.003  # of 0.011
+    assert "refine_poses=true" in capture.config.settings()
+
+    def refused(*_):
+        raise AssertionError("refined again")
+
+    monkeypatch.setattr(module, "refine_poses", refused)
+    again = read_capture(folder, config)
+    for X_WC, same in zip(capture.X_WCs, again.X_WCs, strict=True):
+        assert X_WC.IsExactlyEqualTo(same)
+    assert capfd.readouterr().err == ""
+    (folder / "frame-000003.depth.png").touch()
+    with pytest.raises(AssertionError, match="refined again"):
+        read_capture(folder, config)
+
+
+def test_without_depth(tmp_path, config):
+    path = tmp_path / "nerfstudio"
+    path.mkdir()
+    cv2.imwrite(str(path / "0.png"), np.zeros((240, 320, 3), np.uint8))
+    frame = {"file_path": "0.png", "transform_matrix": np.eye(4).tolist()}
+    camera = {"fl_x": 300, "fl_y": 300, "cx": 160, "cy": 120, "w": 320, "h": 240}
+    (path / "transforms.json").write_text(json.dumps(camera | {"frames": [frame, frame]}))
+    with pytest.raises(ValueError, match=r"nerfstudio: .* needs depth"):
+        read_capture(path, CaptureConfig(refine_poses=True, cache=config.cache))
+    assert not Path(config.cache).exists()
+
+
+def test_no_place_for_the_cache(folder, config, tmp_path, monkeypatch):
+    (tmp_path / "cache").touch()
+    monkeypatch.setattr(module, "refine_poses", lambda *_: pytest.fail("refined"))
+    with pytest.raises(OSError, match=r"cache: cannot be written .*; set capture\.cache to a"):
+        read_capture(folder, config)
+
+
+def test_refined_capture_nothing_in_common(folder, config):
+    for file in folder.glob("*.pose.txt"):
+        X_WC = np.loadtxt(file)
+        X_WC[:3, 3] *= 100
+        np.savetxt(file, X_WC)
+    with pytest.raises(ValueError, match="capture: no two frames see the same"):
+        read_capture(folder, config)
+
+
+@pytest.mark.skipif("SPLATPILOT_DATA" not in os.environ, reason="SPLATPILOT_DATA is not set")
+def test_redkitchen(tmp_path):
+    capture = tmp_path / "redkitchen"
+    capture.mkdir()
+    for file in sorted((Path(os.environ["SPLATPILOT_DATA"]) / "redkitchen").iterdir())[: 3 * 40]:
+        (capture / file.name).symlink_to(file)
+    pairs = [(i, i + 7) for i in range(0, 33, 5)]
+    given, refined = (
+        fit_color_camera(
+            read_capture(capture, CaptureConfig(refine_poses=refine, cache=str(tmp_path))), pairs
+        )
+        for refine in (False, True)
+    )
+    assert given is not None and refined is not None
+    assert refined.cost < 0.6 * given.cost

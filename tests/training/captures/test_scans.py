@@ -1,0 +1,209 @@
+import os
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform, RotationMatrix
+
+from splatpilot.training.captures.capture_config import CaptureConfig
+from splatpilot.training.captures.capture_registry import read_capture
+
+P_DC = [0.2, -0.1, 0.0]
+K_D = np.array([[55.0, 0, 32], [0, 55.0, 24], [0, 0, 1]])
+
+
+@pytest.fixture
+def write(tmp_path, K, room_views, room_poses):
+    """Writes the room as two cameras see it, colour at P_DC in the depth camera."""
+
+    def write() -> Path:
+        X_DC = RigidTransform(np.array(P_DC))
+        colors = room_views(K, 64, 48)
+        depths = room_views(K_D, 64, 48, [X_WC @ X_DC.inverse() for X_WC in room_poses])
+        for i, (color, depth) in enumerate(zip(colors, depths, strict=True)):
+            stem = str(tmp_path / f"frame-{10 * i:06d}")
+            cv2.imwrite(f"{stem}.color.png", color.image[..., ::-1])
+            millimetres = np.round(1000 * depth.depth).astype(np.uint16)
+            millimetres[0, 0], millimetres[0, 1] = 0, 65535
+            cv2.imwrite(f"{stem}.depth.png", millimetres)
+            np.savetxt(f"{stem}.pose.txt", depth.X_WC.GetAsMatrix4())
+        return tmp_path
+
+    return write
+
+
+@pytest.fixture
+def config(K):
+    def config(**changes) -> CaptureConfig:
+        fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+        intrinsics = {"intrinsics": [fx, fy, cx, cy], "depth_intrinsics": [55.0, 55.0, 32.0, 24.0]}
+        return CaptureConfig(**({"p_DC": P_DC, "up": "z"} | intrinsics | changes))
+
+    return config
+
+
+def test_two_cameras(write, config, shows_room):
+    capture = read_capture(write(), config())
+    assert capture.depth_camera is not None and len(capture) == 10 and not capture.dropped
+    shows_room(capture, color=0.5, depth=0.01)
+
+
+def test_invalid_depth(write, config):
+    depth = read_capture(write(), config()).load_depth(0)
+    assert depth is not None
+    np.testing.assert_array_equal(depth[0, :2], 0)
+    assert (depth[1:] > 0).all() and depth.max() < 10
+
+
+def test_depth_unit(write, config):
+    path = write()
+    one, two = (read_capture(path, config(depth_unit=unit)).load_depth(3) for unit in (1000, 500))
+    assert one is not None
+    np.testing.assert_allclose(two, 2 * one)
+
+
+def test_config_file_in_the_folder(write, config):
+    path = write()
+    (path / "capture.yaml").write_text("intrinsics: [40, 41, 30, 20]\nup: z\n")
+    np.testing.assert_array_equal(read_capture(path).K, [[40, 0, 30], [0, 41, 20], [0, 0, 1]])
+    np.testing.assert_array_equal(read_capture(path, config()).K[0], [50, 0, 31])
+    for text, message in (
+        ("intrinsic: [1]\n", "there is no field intrinsic"),
+        ("intrinsics: [0, 1, 2, 3]\n", r".*intrinsics must be of focal lengths > 0, got \[0.0"),
+    ):
+        (path / "capture.yaml").write_text(text)
+        with pytest.raises(ValueError, match=rf"capture\.yaml: {message}"):
+            read_capture(path)
+
+
+def test_up_of_level_cameras(write, config):
+    path = write()
+    R = RotationMatrix.MakeXRotation(1.0) @ RotationMatrix.MakeYRotation(0.4)
+    for file in path.glob("*.pose.txt"):
+        np.savetxt(file, RigidTransform(R, [0, 0, 0]).GetAsMatrix4() @ np.loadtxt(file))
+    capture = read_capture(path, config(up=""))
+    right = np.array([X_WC.rotation().matrix()[:, 0] for X_WC in capture.X_WCs])
+    assert np.abs(right[:, 2]).max() < 0.03
+    assert all(X_WC.rotation().matrix()[2, 1] < 0 for X_WC in capture.X_WCs)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda p: (p / "frame-000040.pose.txt").write_text("nan " * 4 + "\n" + "0 0 0 1\n" * 3),
+         "000040.pose.txt: the pose is not finite"),
+        (lambda p: (p / "frame-000040.pose.txt").unlink(), "o such file"),
+        (lambda p: (p / "frame-000040.pose.txt").write_text("1 0 0\n"),
+         "000040.pose.txt, line 1 must be a row of a 4x4 matrix, got '1 0 0'"),
+        (lambda p: np.savetxt(p / "frame-000040.pose.txt", np.diag([2, 1, 1, 1])),
+         "000040.pose.txt: the rotation must be"),
+        (lambda p: np.savetxt(p / "frame-000040.pose.txt", np.diag([1, 1, -1, 1])),
+         "000040.pose.txt: the rotation must be .*determinant -1"),
+        (lambda p: np.savetxt(p / "frame-000040.pose.txt",
+                              RigidTransform([900, 0, 0]).GetAsMatrix4()),
+         "000040.color.png: its position .* is far from all others"),
+        (lambda p: (p / "frame-000040.depth.png").write_bytes(b""),
+         "000040.depth.png: the file is empty"),
+        (lambda p: (p / "frame-000040.depth.png").unlink(),
+         "No such file: .*000040.depth.png"),
+        (lambda p: (p / "frame-000040.color.png").write_bytes(b"no image"),
+         "000040.color.png: not a readable image"),
+        (lambda p: (f := p / "frame-000040.color.png").write_bytes(f.read_bytes()[:-500]),
+         "000040.color.png: not a readable image .truncated"),
+        (lambda p: cv2.imwrite(str(p / "frame-000040.color.png"), np.zeros((24, 32, 3), np.uint8)),
+         "000040.color.png: must be of 64x48 pixels, as the others, got 32x24"),
+        (lambda p: cv2.imwrite(str(p / "frame-000040.depth.png"), np.zeros((24, 32), np.uint16)),
+         "000040.depth.png: must be of 64x48 pixels, as the others, got 32x24"),
+    ],
+)  # fmt: skip
+def test_one_bad_frame_is_left_out(write, config, spoil, message):
+    path = write()
+    whole = read_capture(path, config())
+    spoil(path)
+    capture = read_capture(path, config())
+    assert len(capture.dropped) == 1 and len(capture) == 9
+    assert re.search(message, capture.dropped[0])
+    assert "frame-000040.color.png" not in capture.frame_names
+    np.testing.assert_array_equal(capture.frame(4).image, whole.frame(5).image)
+    assert capture.X_WCs[4].IsNearlyEqualTo(whole.X_WCs[5], 0)
+
+
+def test_too_many_bad_frames(write, config):
+    path = write()
+    for i in (0, 3, 5):
+        (path / f"frame-{10 * i:06d}.depth.png").unlink()
+    with pytest.raises(
+        ValueError, match=r"7 of 10 frames .* 80%.*No such file: .*000000\.depth\.png"
+    ):
+        read_capture(path, config())
+
+
+@pytest.mark.parametrize("shape", [(48, 64), (48, 64, 3)])
+def test_pictures_of_depth(write, config, shape):
+    path = write()
+    cv2.imwrite(str(path / "frame-000010.depth.png"), np.zeros(shape, np.uint8))
+    capture = read_capture(path, config())
+    assert len(capture) == 9 and "frame-000010.color.png" not in capture.frame_names
+    [message] = capture.dropped
+    assert re.search(r"000010\.depth\.png: depth must be one number per pixel", message)
+
+
+@pytest.mark.skipif("SPLATPILOT_DATA" not in os.environ, reason="SPLATPILOT_DATA is not set")
+def test_redkitchen():
+    capture = read_capture(Path(os.environ["SPLATPILOT_DATA"]) / "redkitchen")
+    assert len(capture) == 200 and not capture.dropped
+    depth = capture.registered_depth(0)
+    assert depth.shape == (480, 640)
+    assert (depth[60:-60, 80:-80] > 0).mean() > 0.8
+    assert not depth[:15].any()
+
+
+K_D_SCANNET = np.array([[24.0, 0, 16], [0, 24.0, 12], [0, 0, 1]])
+
+
+@pytest.fixture
+def write_scannet(tmp_path, K, room_views):
+    """Writes the room as ScanNet's reader does: depth of another camera, at the same place."""
+    for name in ("color", "depth", "pose", "intrinsic"):
+        (tmp_path / name).mkdir()
+    colors, depths = room_views(K, 64, 48), room_views(K_D_SCANNET, 32, 24)
+    for i, (color, depth) in enumerate(zip(colors, depths, strict=True)):
+        cv2.imwrite(str(tmp_path / f"color/{i}.png"), color.image[..., ::-1])
+        millimetres = np.round(1000 * depth.depth).astype(np.uint16)
+        cv2.imwrite(str(tmp_path / f"depth/{i}.png"), millimetres)
+        np.savetxt(tmp_path / f"pose/{i}.txt", color.X_WC.GetAsMatrix4())
+    for name, intrinsics in (("color", K), ("depth", K_D_SCANNET)):
+        matrix = np.eye(4)
+        matrix[:3, :3] = intrinsics
+        matrix[:2, 2] -= 0.5  # counted from the first pixel's centre
+        np.savetxt(tmp_path / f"intrinsic/intrinsic_{name}.txt", matrix)
+    return tmp_path
+
+
+def test_room(write_scannet, shows_room):
+    capture = read_capture(write_scannet)
+    assert capture.source.startswith("ScanNet") and not capture.dropped
+    shows_room(capture, color=0.5, depth=0.03)
+
+
+def test_intrinsics_of_larger_images_are_refused(write_scannet, K):
+    matrix = np.eye(4)
+    matrix[:2, :3] = [[117.019, 0, 64.275], [0, 117.019, 47.875]]
+    np.savetxt(write_scannet / "intrinsic/intrinsic_color.txt", matrix)
+    with pytest.raises(ValueError, match=r"principal point must be in the image of 64x48 px, got"):
+        read_capture(write_scannet)
+    given = CaptureConfig(intrinsics=[K[0, 0], K[1, 1], K[0, 2], K[1, 2]])
+    np.testing.assert_allclose(read_capture(write_scannet, given).K, K)
+
+
+def test_lost_tracking_is_no_damage(write_scannet):
+    for i in (1, 4, 5):
+        np.savetxt(write_scannet / f"pose/{i}.txt", np.full((4, 4), -np.inf))
+    capture = read_capture(write_scannet)
+    assert len(capture) == 7 and "tracking was lost in 3 frames" in capture.dropped[0]
+    for i in (2, 3):
+        (write_scannet / f"pose/{i}.txt").write_text("1 2\n")
+    with pytest.raises(ValueError, match=r"5 of 7 frames can be used.*tracking was lost"):
+        read_capture(write_scannet)

@@ -1,0 +1,213 @@
+"""The student's two stages, as one command."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splatpilot.systems.common.config import load_config
+from splatpilot.systems.policies.checkpoint import policy_of
+from splatpilot.systems.sensing.onboard_camera import OnboardCamera
+from splatpilot.training.corpus import collect as make
+from splatpilot.training.corpus.corpus import Corpus, CorpusConfig
+from splatpilot.training.corpus.expert import ExpertConfig
+from splatpilot.training.corpus.library import LibraryConfig
+from splatpilot.training.corpus.samples import EXPERT, RECOVERY
+from splatpilot.training.policies import recover as recovery
+from splatpilot.training.policies import recover as student_flights
+from splatpilot.training.policies.student_data import StudentData
+from splatpilot.training.policies.train_diffaero_rgb import DiffAeroRgbTrainer, DiffAeroRgbTraining
+from splatpilot.training.policies.train_student import StudentDepthTraining, StudentTrainer
+
+TINY = [
+    "pretrained=false",
+    "frozen=0",
+    "held_out=0.5",
+    "batch=2",
+    "schedule.updates=2",
+    "schedule.checkpoint_every=2",
+]
+
+
+def gather(folder: Path, worlds: Path, camera: OnboardCamera) -> None:
+    """A corpus of one short flight in each of two small forests."""
+    grove = worlds / "grove.yaml"
+    grove.write_text("world: !ForestConfig {length: 10, width: 8, height: 4}\n")
+    config = CorpusConfig(
+        worlds=LibraryConfig(kinds=[str(grove)]),
+        expert=ExpertConfig(period=0.5, speed=1.5),
+        flights=1,
+        camera=camera,
+    )
+    make.run(config=config, out=folder, worlds=2, jobs=1)
+
+
+@pytest.fixture(scope="module")
+def expert(tmp_path_factory) -> Path:
+    """The folder of a corpus in depth and colours for students."""
+    folder = tmp_path_factory.mktemp("expert")
+    gather(folder, tmp_path_factory.mktemp("worlds"), OnboardCamera(width=32, height=24))
+    return folder
+
+
+def both_stages(expert: Path, out: Path) -> dict:
+    config = load_config(StudentDepthTraining(), overrides=[f"corpora=[{expert}]", *TINY])
+    return recovery.run(config=config, make=StudentTrainer, out=out, flights=1, jobs=1)
+
+
+def weights(out: Path) -> dict[str, np.ndarray]:
+    with np.load(out / "stage_2" / "student_depth.npz") as file:
+        return {name: file[name] for name in file.files if name != "about"}
+
+
+def test_student_flies_and_is_trained_anew_with_what_it_lacked(expert, tmp_path, monkeypatch):
+    """The student flies once in the world that it was trained in; what is added are samples of
+    recovery of that world alone, to a corpus of the run's own; the ledger counts what there is.
+    Interrupted before the flight and before the second stage, it ends with the same weights."""
+    before = {path: path.stat().st_mtime_ns for path in expert.rglob("*")}
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    ledger = both_stages(expert, whole)
+    assert {path: path.stat().st_mtime_ns for path in expert.rglob("*")} == before
+    corpus = Corpus(whole / "corpora" / "0")
+    samples = corpus.samples(np.arange(len(corpus)))
+    assert ledger["expert_samples"] == (samples.source == EXPERT).sum() == len(Corpus(expert))
+    assert ledger["recovery_samples"] == (samples.source == RECOVERY).sum() > 0
+    assert sum(ledger["flights"].values()) == 1 <= ledger["near_misses"]
+    assert len(set(samples.world[samples.source == RECOVERY])) == 1
+    assert len(list((whole / "flights" / "0").iterdir())) == 1
+    assert json.loads((whole / "recovery.json").read_text()) == ledger
+
+    for module, step in ((student_flights, "_fly_world"), (recovery, "_ledger")):
+        with monkeypatch.context() as patch:
+            patch.setattr(module, step, interrupt)
+            with pytest.raises(KeyboardInterrupt):
+                both_stages(expert, parts)
+    config = load_config(StudentDepthTraining(), overrides=[f"corpora=[{expert}]", *TINY])
+    with pytest.raises(ValueError, match=r"recovery.yaml holds another configuration"):
+        recovery.run(config=config, make=StudentTrainer, out=parts, flights=2, jobs=1)
+    monkeypatch.setattr(student_flights, "_fly_world", interrupt)  # which has been done
+    assert both_stages(expert, parts)["flights"] == ledger["flights"]
+    expected, found = weights(whole), weights(parts)
+    assert all(np.array_equal(found[name], value) for name, value in expected.items())
+
+
+def test_another_round_is_flown_by_the_weights_of_the_one_before(expert, tmp_path, monkeypatch):
+    """No first stage is trained: what flies is the file that is named, through the corpus's camera,
+    and its samples join those of the round before. No other round goes on in the same folder."""
+    both_stages(expert, tmp_path / "first")
+    flown, fly = [], student_flights.fly
+
+    def watched(diagram, scenario, world):
+        flown.append(scenario.policy)
+        return fly(diagram, scenario, world)
+
+    monkeypatch.setattr(student_flights, "fly", watched)
+    corpus, out = tmp_path / "first" / "corpora" / "0", tmp_path / "second"
+    pilot = str(tmp_path / "first" / "stage_2" / "student_depth.npz")
+    config = load_config(StudentDepthTraining(), overrides=[f"corpora=[{corpus}]", *TINY])
+    round_of = {"config": config, "make": StudentTrainer, "out": out, "flights": 1, "jobs": 1}
+    ledger = recovery.run(**round_of, flown_by=pilot)
+    assert [(policy.weights, policy.camera.width) for policy in flown] == [(pilot, 32)]
+    assert ledger["flown_by"] == pilot and not (out / "stage_1").exists()
+    before = Corpus(corpus)
+    earlier = (before.samples(np.arange(len(before))).source == RECOVERY).sum()
+    assert ledger["recovery_samples"] > earlier > 0
+    with pytest.raises(ValueError, match=r"recovery.yaml holds another configuration"):
+        recovery.run(**round_of)
+    others = load_config(StudentDepthTraining(), overrides=[f"corpora=[{expert}]", *TINY])
+    with pytest.raises(ValueError, match=r"holds another configuration, with .*first/corpora/0"):
+        recovery.run(**round_of | {"config": others}, flown_by=pilot)
+    with pytest.raises(FileNotFoundError, match="nowhere holds no corpus"):
+        nowhere = load_config(StudentDepthTraining(), overrides=["corpora=[nowhere]", *TINY])
+        recovery.run(**round_of | {"config": nowhere, "out": tmp_path / "fourth"}, flown_by=pilot)
+    assert not (tmp_path / "fourth").exists()
+    with pytest.raises(ValueError, match="nobody"):
+        recovery.run(**round_of | {"out": tmp_path / "third"}, flown_by="nobody")
+    assert not (tmp_path / "third").exists()
+
+
+def test_what_was_lost_or_damaged_is_made_again(expert, tmp_path, capsys):
+    """Of a run that ended, a linked shard that has gone is linked and a damaged file of flights
+    flown again, with the same result; a corpus that was gathered anew meanwhile is refused."""
+    source = tmp_path / "source"
+    shutil.copytree(expert, source)
+    ledger = both_stages(source, tmp_path / "out")
+    expected = weights(tmp_path / "out")
+    [flights] = (tmp_path / "out" / "flights" / "0").iterdir()
+    flights.write_bytes(flights.read_bytes()[:-50])
+    lost = sorted((tmp_path / "out" / "corpora" / "0" / "shards").glob("expert-*"))[0]
+    shutil.rmtree(lost)
+    assert both_stages(source, tmp_path / "out") == ledger
+    assert lost.exists() and "flown again" in capsys.readouterr().err
+    assert all(np.array_equal(expected[k], v) for k, v in weights(tmp_path / "out").items())
+    about = source / "shards" / lost.name / "shard.json"
+    about.write_text(about.read_text().replace('"revision": "', '"revision": "0'))
+    with pytest.raises(ValueError, match=r"learned from other files|is another than when"):
+        both_stages(source, tmp_path / "out")
+
+
+def test_recovery_share_is_the_part_that_students_came_to(expert, tmp_path):
+    """Of 4000 draws; without a share, or where there are none, all samples are as likely."""
+    both_stages(expert, tmp_path)
+    data = StudentData([Corpus(tmp_path / "corpora" / "0")], 0.5)
+    rng = np.random.default_rng(0)
+
+    def draw(count: int) -> np.ndarray:
+        return rng.integers(count, size=4000)
+
+    natural = len(data.recovered) / len(data.training)
+    assert 0.0 < natural < 1.0
+    for share, part in ((0.0, natural), (0.25, 0.25), (0.8, 0.8), (1.0, 1.0)):
+        drawn = data.draw(draw, share)
+        assert set(drawn) <= set(data.training)
+        assert np.isin(drawn, data.recovered).mean() == pytest.approx(part, abs=0.03)
+    plain = StudentData([Corpus(expert)], 0.5)
+    assert set(plain.draw(draw, 0.5)) == set(plain.training)
+
+
+def test_what_corpora_share_is_flown_once(expert, tmp_path):
+    """Of a corpus and another that holds the same samples the student flies each way once, and the
+    ledger counts each sample once."""
+    shutil.copytree(expert, tmp_path / "copy")
+    both = f"corpora=[{expert}, {tmp_path / 'copy'}]"
+    config = load_config(StudentDepthTraining(), overrides=[both, *TINY])
+    out = tmp_path / "out"
+    ledger = recovery.run(config=config, make=StudentTrainer, out=out, flights=1, jobs=1)
+    assert sum(ledger["flights"].values()) == 1
+    assert ledger["expert_samples"] == len(Corpus(expert))
+
+
+def test_what_sees_in_colours_recovers_too(tmp_path, monkeypatch):
+    """DiffAero in colours flies by what it judges, as fast as the expert did, and both its stages
+    see images of its corpus."""
+    speeds, fly = [], student_flights.fly
+
+    def watched(diagram, scenario, world):
+        speeds.append(scenario.policy.speed)
+        return fly(diagram, scenario, world)
+
+    monkeypatch.setattr(student_flights, "fly", watched)
+    gather(tmp_path / "expert", tmp_path, OnboardCamera(width=160, height=90))
+    tiny = [setting for setting in TINY if not setting.startswith(("pretrained", "frozen"))]
+    overrides = [f"corpora=[{tmp_path / 'expert'}]", *tiny]
+    config = load_config(DiffAeroRgbTraining(), overrides=overrides)
+    out = tmp_path / "out"
+    ledger = recovery.run(config=config, make=DiffAeroRgbTrainer, out=out, flights=1, jobs=1)
+    assert sum(ledger["flights"].values()) == 1 and ledger["recovery_samples"] > 0
+    assert speeds == [1.5]
+    assert policy_of(out / "stage_2" / "diffaero_rgb.npz") == "diffaero_rgb"
+
+
+def interrupt(*_args) -> None:
+    raise KeyboardInterrupt
+
+
+def test_counts_out_of_range_are_refused(expert, tmp_path):
+    config = load_config(StudentDepthTraining(), overrides=[f"corpora=[{expert}]", *TINY])
+    with pytest.raises(ValueError, match=r"--flights .* got 0"):
+        recovery.run(config=config, make=StudentTrainer, out=tmp_path, flights=0, jobs=1)
+    with pytest.raises(ValueError, match=r"--jobs .* got -1"):
+        recovery.run(config=config, make=StudentTrainer, out=tmp_path, flights=1, jobs=-1)
+    assert not list(tmp_path.iterdir())

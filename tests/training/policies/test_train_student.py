@@ -1,0 +1,246 @@
+"""The student's loss, and its training from a corpus to a flight."""
+
+import csv
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from splatpilot.diagrams.flight.flight import fly
+from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
+from splatpilot.diagrams.flight.policies import policy_named
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.worlds.forest.forest import ForestConfig
+from splatpilot.diagrams.worlds.world_registry import make_world
+from splatpilot.systems.common.config import load_config
+from splatpilot.systems.policies.hypotheses import Hypotheses
+from splatpilot.systems.sensing.onboard_camera import OnboardCamera
+from splatpilot.training.policies.train import run
+from splatpilot.training.policies.train_student import (
+    StudentTraining,
+    cost_targets,
+    hypothesis_errors,
+    imitation_terms,
+    missing_clearances,
+    penalties,
+    root_mean_square,
+)
+from splatpilot.training.policies.trainer_registry import TRAINERS
+
+OVERRIDES = [
+    "pretrained=false",
+    "frozen=0",
+    "held_out=0.2",
+    "batch=8",
+    "schedule.updates=25",
+    "schedule.validate_every=25",
+    "schedule.checkpoint_every=5",
+    "schedule.learning_rate=0.002",
+]
+ONE_STEP = [f"schedule.{name}=1" for name in ("updates", "validate_every", "checkpoint_every")]
+
+
+def configure(corpus: Path, observation: str, *overrides: str) -> StudentTraining:
+    config = TRAINERS.find(f"student_{observation}").config()
+    return load_config(config, overrides=[f"corpora=[{corpus}]", *OVERRIDES, *overrides])
+
+
+def train(config: StudentTraining, out: Path) -> dict[str, np.ndarray]:
+    """Trains a student and returns its weights."""
+    name = f"student_{config.observation}"
+    run(config=config, out=out, make=TRAINERS.find(name).make)
+    with np.load(out / f"{name}.npz") as file:
+        return {key: file[key] for key in file.files if key != "about"}
+
+
+def curves(out: Path) -> list[dict[str, float]]:
+    rows = csv.DictReader((out / "curves.csv").open())
+    return [{name: float(value) for name, value in row.items() if value} for row in rows]
+
+
+@pytest.fixture(scope="module")
+def trained(student_corpus, tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("trained")
+    train(configure(student_corpus, "depth"), out)
+    return out
+
+
+def straight(*ends) -> torch.Tensor:
+    """(1, n, 10, 3) [m] straight paths to these ends."""
+    along = torch.linspace(0.1, 1.0, 10, dtype=torch.float64)[:, None]
+    return torch.stack([along * torch.tensor(end, dtype=torch.float64) for end in ends])[None]
+
+
+def random(seed: int, *shape: int) -> torch.Tensor:
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def test_error_of_a_shifted_trajectory():
+    expert = straight((2, 0, 0))[:, 0]
+    errors = hypothesis_errors(expert, (expert + torch.tensor([0.0, 0.3, 0.4]))[:, None])
+    assert errors.item() == pytest.approx(10 / 3 * 0.25)
+    assert root_mean_square(errors).item() == pytest.approx(0.5)
+
+
+def test_the_closest_takes_nearly_all_of_the_pull():
+    waypoints = straight((2, 0.1, 0), (2, 1, 0), (0, 0, 2))
+    closest, others = imitation_terms(hypothesis_errors(straight((2, 0, 0))[:, 0], waypoints), 0.05)
+    mean_square = sum((k / 10) ** 2 for k in range(1, 11)) / 10
+    assert closest.item() == pytest.approx(0.95 * 10 / 3 * mean_square * 0.1**2)
+    assert others.item() == pytest.approx(0.025 * 10 / 3 * mean_square * (1**2 + 8))
+
+
+def test_cost_targets_are_those_of_equation_4():
+    distances = torch.tensor([[[1.354] * 10, [100.0] * 10]], dtype=torch.float64)
+    errors = torch.tensor([[0.3, 0.1]], dtype=torch.float64)
+    found = penalties(errors, distances)
+    assert found[0].tolist() == pytest.approx([0.3 + math.log(2.0) / 4.0, 0.1])
+    targets = cost_targets(found)
+    assert targets[0].tolist() == pytest.approx((found / found.mean())[0].tolist(), rel=1e-5)
+    assert cost_targets(torch.zeros(1, 3)).tolist() == [[0.0, 0.0, 0.0]]
+
+
+def test_missing_clearance_counts_up_to_the_cap():
+    distances = torch.tensor([0.3, 0.9], dtype=torch.float64)[:, None].expand(2, 2, 10)
+    expert = torch.tensor([0.5, 3.0], dtype=torch.float64)[:, None].expand(2, 10)
+    found = missing_clearances(distances, expert)
+    assert found[:, 0].tolist() == pytest.approx([10 / 3 * 0.2**2, 10 / 3 * 0.5**2])
+    assert found[:, 1].tolist() == [0.0, 0.0]
+
+
+def test_gradients_are_those_of_finite_differences():
+    expert, waypoints = random(0, 2, 3, 3), random(1, 2, 3, 3, 3).requires_grad_()
+    distances = (1.0 + 0.3 * random(2, 2, 3, 3)).requires_grad_()
+    check, kept = torch.autograd.gradcheck, 0.8 + 0.3 * random(5, 2, 3)
+    assert check(lambda w: imitation_terms(hypothesis_errors(expert, w), 0.05), waypoints)
+    assert check(lambda d: missing_clearances(d, kept), distances)
+    assert check(lambda w, d: penalties(hypothesis_errors(expert, w), d), (waypoints, distances))
+
+
+def test_student_learns(trained):
+    curve = curves(trained)
+    assert curve[-1]["winners"] < 0.9 * curve[0]["winners"]
+    votes = [[row[f"votes_{m}"] for m in range(3)] for row in curve]
+    np.testing.assert_allclose(np.sum(votes, axis=1), 1.0, atol=1e-5)
+    terms = sum(curve[-1][name] for name in ("winners", "unvoted", "cost", "clearance"))
+    assert curve[-1]["loss"] == pytest.approx(terms, rel=1e-5)
+    best = max(row["success"] for row in curve if "success" in row)
+    assert f"| success | {best:.2f} |" in (trained / "student_depth.md").read_text()
+
+
+def test_student_flies_by_its_weights(trained):
+    config = replace(
+        policy_named(str(trained / "student_depth.npz")),
+        camera=OnboardCamera(width=32, height=24),
+    )
+    world = make_world(ForestConfig(length=12.0, width=8.0, height=4.0), 1_000_000)
+    scenario = Scenario(seed=1_000_000, policy=config, timeout=1.0)
+    flight = fly(BuildFlightDiagram(scenario, world, camera=False), scenario, world)
+    plans = [Hypotheses.from_vector(row, 3) for row in flight.hypotheses]
+    first, to_goal = plans[0], world.p_WG - flight.states[0, :3]
+    assert len(plans) >= 15 and first is not None
+    ahead = first.waypoints_W[first.best, -1] - flight.states[0, :3]
+    assert ahead @ to_goal > 0.5 * np.linalg.norm(ahead) * np.linalg.norm(to_goal) > 0.0
+    assert np.linalg.norm(flight.states[-1, :3] - flight.states[0, :3]) > 0.1
+
+
+def test_interrupted_training_ends_as_an_uninterrupted_one(student_corpus, tmp_path):
+    kind = TRAINERS.find("student_rgb")
+    steps = ["schedule.updates=3", "schedule.validate_every=3", "schedule.checkpoint_every=2"]
+    augmented = ["noise.color_noise=0.1", "appearance.hue=20"]
+    config = configure(student_corpus, "rgb", "batch=2", *steps, *augmented)
+
+    def make_interrupted(config):
+        trainer = kind.make(config)
+
+        def interrupt(update: int) -> None:
+            if update == 2:
+                raise KeyboardInterrupt
+
+        trainer.begin_update = interrupt
+        return trainer
+
+    with pytest.raises(KeyboardInterrupt):
+        run(config=config, out=tmp_path / "again", make=make_interrupted)
+    again, expected = (train(config, tmp_path / name) for name in ("again", "whole"))
+    for name, values in expected.items():
+        np.testing.assert_array_equal(again[name], values)
+    assert curves(tmp_path / "again") == curves(tmp_path / "whole")
+
+
+def test_training_continues_from_given_weights(trained, student_corpus, tmp_path):
+    began = trained / "student_depth.npz"
+    small_step = "schedule.learning_rate=1e-9"
+    config = configure(student_corpus, "depth", *ONE_STEP, small_step, f"begin={began}")
+    after = train(config, tmp_path)
+    with np.load(began) as before:
+        for name, values in after.items():
+            np.testing.assert_allclose(values, before[name], atol=1e-3)
+
+
+def test_students_learn_to_keep_clear(trained, student_corpus, tmp_path):
+    began = f"begin={trained / 'student_depth.npz'}"
+    head = ["frozen=20", f"features={tmp_path / 'features'}", "clearance_weight=50.0"]
+    train(configure(student_corpus, "depth", began, *head), tmp_path / "run")
+    curve = curves(tmp_path / "run")
+    assert curve[-1]["clearance"] < 0.8 * curve[0]["clearance"]
+
+
+@pytest.mark.parametrize("frozen", [18, 20])
+def test_frozen_modules_keep_their_weights(frozen, trained, student_corpus, tmp_path):
+    began = trained / "student_depth.npz"
+    overrides = [f"begin={began}", f"frozen={frozen}", f"features={tmp_path / 'features'}"]
+    after = train(configure(student_corpus, "depth", *overrides, *ONE_STEP), tmp_path / "run")
+    trainable = ["features.18.", "cell_layer."] if frozen == 18 else []
+    with np.load(began) as before:
+        for name, values in after.items():
+            free = name.startswith((*trainable, "state_", "hidden_", "head."))
+            assert np.array_equal(before[name], values) != free, name
+
+
+def test_features_of_frozen_modules_train_as_images_do(trained, student_corpus, tmp_path):
+    """A step with cached features has the loss of a step whose encoder is not updated."""
+    losses, began = [], f"begin={trained / 'student_depth.npz'}"
+    for frozen in (0, 20):
+        overrides = [began, f"frozen={frozen}", f"features={tmp_path / 'features'}"]
+        out = tmp_path / str(frozen)
+        train(configure(student_corpus, "depth", *overrides, *ONE_STEP), out)
+        losses.append(curves(out)[0]["loss"])
+    assert losses[0] == pytest.approx(losses[1], rel=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("corpora=[]", r"corpora must be one folder"),
+        ("held_out=1", r"held_out must be in \[0, 0\.9\], got 1\.0"),
+        ("batch=0", r"batch must be in \[1, inf\), got 0"),
+        ("frozen=21", r"frozen must be in \[0, 20\], got 21"),
+        ("frozen=20", "frozen must be at most 0 without `begin`"),
+        ("schedule.updates=0", r"schedule\.updates must be in \[1, inf\), got 0"),
+        ("noise.latency=0.1", r"noise\.latency must be left out, got 0\.1"),
+        ("noise.color_noise=2", r"noise\.color_noise must be in \[0, 1\], got 2"),
+        ("appearance.hue=200", r"appearance\.hue must be in \[0, 180\] deg, got 200"),
+        ("seed=-1", r"seed must be in .*, got -1"),
+        ("corpora=[absent]", r"absent holds no corpus"),
+    ],
+)
+def test_configurations_out_of_range_are_refused(override, message, student_corpus, tmp_path):
+    config = configure(student_corpus, "rgb", override)
+    with pytest.raises((ValueError, FileNotFoundError), match=message):
+        train(config, tmp_path)
+
+
+@pytest.mark.parametrize("override", ["noise.color_noise=0.1", "appearance.hue=10"])
+def test_frozen_modules_see_images_as_they_are(override, student_corpus):
+    config = configure(student_corpus, "rgb", "pretrained=true", "frozen=7", override)
+    with pytest.raises(ValueError, match="frozen must be 0 with noise or appearance, got 7"):
+        config.validate()
+
+
+def test_depth_has_no_appearance(student_corpus):
+    with pytest.raises(ValueError, match="appearance must be left out"):
+        configure(student_corpus, "depth", "appearance.hue=10").validate()

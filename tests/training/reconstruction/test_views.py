@@ -1,0 +1,62 @@
+from dataclasses import replace
+
+import numpy as np
+from pydrake.math import RigidTransform, RotationMatrix
+
+from splatpilot.systems.splats.background import EnvironmentMap
+from splatpilot.training.captures.capture import CaptureFrame
+from splatpilot.training.reconstruction.photometry import Photometry
+from splatpilot.training.reconstruction.views import learn_background
+
+HEIGHT, WIDTH = 48, 64
+K = np.array([[32.0, 0, 32], [0, 32.0, 24], [0, 0, 1]])
+# Camera axes in W, looking along x.
+R_LEVEL = RotationMatrix(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]))
+
+
+def sky(v_W: np.ndarray) -> np.ndarray:
+    """Colours of a smooth sky in the directions v_W (..., 3) of length 1."""
+    return 0.5 + 0.3 * v_W[..., [2, 0, 1]]
+
+
+def frame(yaw: float, gain: float = 1.0, ground: bool = True) -> CaptureFrame:
+    """The sky above black ground 2 m below, turned to the left by `yaw` [rad]."""
+    X_WC = RigidTransform(RotationMatrix.MakeZRotation(yaw) @ R_LEVEL, np.zeros(3))
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
+    rays = np.stack([(columns + 0.5 - 32) / 32, (rows + 0.5 - 24) / 32, np.ones((HEIGHT, WIDTH))])
+    v_W = np.einsum("ij,jkl->kli", X_WC.rotation().matrix(), rays)
+    v_W /= np.linalg.norm(v_W, axis=-1, keepdims=True)
+    below = (rows >= 24) & ground
+    color = np.where(below[..., None], 0, gain * sky(v_W))
+    depth = np.where(below, 2 * 32 / np.maximum(rows + 0.5 - 24, 0.5), np.inf)
+    image = np.round(255 * color).astype(np.uint8)
+    return CaptureFrame(image, depth.astype(np.float32), X_WC, K)
+
+
+def test_the_sky_is_learned_and_the_ground_is_not():
+    gains = np.array([1.0, 0.8, 1.2, 1.0])
+    frames = [frame(yaw, gain) for yaw, gain in zip(np.pi / 2 * np.arange(4), gains, strict=True)]
+    background = learn_background(frames, Photometry(gains, 0.0))
+    assert isinstance(background, EnvironmentMap)
+    rng = np.random.default_rng(0)
+    azimuth, elevation = rng.uniform(-np.pi, np.pi, 500), rng.uniform(0.1, 0.4, 500)
+    v_W = np.column_stack(
+        [
+            np.cos(elevation) * np.cos(azimuth),
+            np.cos(elevation) * np.sin(azimuth),
+            np.sin(elevation),
+        ]
+    )
+    np.testing.assert_allclose(background.color(v_W), sky(v_W), atol=0.02)
+    assert np.abs(np.diff(background.texels, axis=0)).max() < 0.1
+    assert background.texels.min() > 0.15
+
+
+def test_beyond_the_far_limit_is_infinitely_far():
+    distant = frame(0.0, ground=False)
+    depth = np.where(np.isinf(distant.depth), np.float32(151), distant.depth)
+    one = Photometry(np.ones(1), 0.0)
+    a, b = (learn_background([f], one) for f in (distant, replace(distant, depth=depth)))
+    assert isinstance(a, EnvironmentMap) and isinstance(b, EnvironmentMap)
+    np.testing.assert_array_equal(a.texels, b.texels)
+    assert learn_background([replace(distant, depth=depth - 2)], one) == (0.0, 0.0, 0.0)
