@@ -1,5 +1,3 @@
-"""The learned depth policies as Drake systems."""
-
 from pathlib import Path
 
 import numpy as np
@@ -89,8 +87,6 @@ def simulator_of(system, config) -> Simulator:
 
 @pytest.mark.parametrize("name", ["diffaero", "depthnav"])
 def test_recurrent_policy_decides_and_remembers_at_its_rate(name, files):
-    """After three periods the output is that of three steps of the pure policy, whose memory is in
-    the Context: a fresh Context begins anew."""
     make, configure = SYSTEMS[name]
     config = configure(weights=files[name], speed=1.7)
     system = make(config)
@@ -115,8 +111,6 @@ def test_recurrent_policy_decides_and_remembers_at_its_rate(name, files):
 
 
 def test_policy_of_time_of_flight_decides_and_remembers_at_its_rate(tmp_path):
-    """After three periods the output is that of three steps of the pure policy, and a fresh Context
-    begins anew."""
     file = tmp_path / "mine.npz"
     spec = diffaero_policy.DIFFAERO_NETWORK
     PolicyCheckpoint("diffaero_tof", spec, weights("diffaero"), {}).save(file)
@@ -140,7 +134,6 @@ def test_policy_of_time_of_flight_decides_and_remembers_at_its_rate(tmp_path):
 
 
 def test_trajectory_policy_plans_at_its_rate(files):
-    """The hypotheses are those of the pure policy at the last multiple of the period."""
     config = AgileAutonomyConfig(weights=files["agile_autonomy"])
     system = AgileAutonomy(config)
     simulator = simulator_of(system, config)
@@ -154,8 +147,6 @@ def test_trajectory_policy_plans_at_its_rate(files):
 
 
 def test_near_ties_continue_the_last_plan(files):
-    """Of two hypotheses of nearly equal cost the one beside the last plan is followed; a clearly
-    cheaper one is followed wherever it leads."""
     way = np.linspace(0.1, 1.0, 10)[:, None]
     left, right, far = way * [1.0, 1.0, 0.0], way * [1.0, -1.0, 0.0], way * [0.0, 0.0, 1.0]
     X_WB = pose_from_state(hover_state([0, 0, 2]))
@@ -171,9 +162,6 @@ def test_near_ties_continue_the_last_plan(files):
 
 
 def test_progress_is_worth_some_cost():
-    """Of hypotheses that cost the same by the network, the one that leads furthest towards the goal
-    is cheapest, by 0.1 a metre."""
-
     class Equal(agile_policy.TrajectoryNetwork):
         def __call__(self, image, state):
             way = np.linspace(0.1, 1.0, 10)[:, None] * [1, 0, 0]
@@ -189,7 +177,6 @@ def test_progress_is_worth_some_cost():
 
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_cameras_that_cannot_be_pooled_are_refused(name, files):
-    """A camera of 50x30 pixels is refused with the sizes that would do."""
     make, configure = SYSTEMS[name]
     config = configure(weights=files[name], camera=OnboardCamera(width=50, height=30))
     with pytest.raises(ValueError, match=r"whole multiples of .* got 50x30"):
@@ -199,7 +186,6 @@ def test_cameras_that_cannot_be_pooled_are_refused(name, files):
 
 
 def test_pooling_keeps_the_nearest():
-    """Each coarse pixel is the least of its block; 0, too near, stays."""
     depth = np.full((4, 6), 9.0)
     depth[1, 1], depth[3, 5], depth[0, 4] = 2.0, 0.0, np.inf
     np.testing.assert_array_equal(pool_depth(depth, 2, 3), [[2.0, 9.0, 9.0], [9.0, 9.0, 0.0]])

@@ -1,10 +1,10 @@
-"""DiffAero in colours as a Drake system."""
-
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from pydrake.common.value import Value
+from pydrake.math import RollPitchYaw
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.sensors import ImageRgba8U
 
@@ -20,9 +20,12 @@ from splatpilot.systems.policies.diffaero_rgb import (
     DIFFAERO_RGB_NETWORK,
     DiffAeroRgb,
     DiffAeroRgbConfig,
+    MonocularDepth,
+    MonocularSpec,
     decide,
     encode_view,
     load_network,
+    rays_B,
 )
 from splatpilot.systems.policies.observations import inverse_depth
 from splatpilot.systems.policies.recurrent_network import load_network as load_recurrent
@@ -34,7 +37,6 @@ P_WG = np.array([12.0, 3.0, 2.0])
 
 
 def random_weights(policy: dict[str, np.ndarray] | None = None) -> dict[str, np.ndarray]:
-    """Of what sees, and of what decides unless that is given."""
     rng, spec = np.random.default_rng(0), DIFFAERO_RGB_NETWORK
     shapes = {f"monocular.{k}": v for k, v in spec.monocular.weight_shapes().items()}
     if policy is None:
@@ -48,7 +50,6 @@ def random_weights(policy: dict[str, np.ndarray] | None = None) -> dict[str, np.
 
 @pytest.fixture(scope="module")
 def file(tmp_path_factory) -> str:
-    """Random weights."""
     path = tmp_path_factory.mktemp("weights") / "diffaero_rgb.npz"
     PolicyCheckpoint("diffaero_rgb", DIFFAERO_RGB_NETWORK, random_weights(), {}).save(path)
     return str(path)
@@ -59,8 +60,6 @@ def observation(state: np.ndarray, color: np.ndarray) -> Observation:
 
 
 def test_decides_at_its_rate(file):
-    """The acceleration is that of the pure policy at the last multiple of the period, with the
-    memory of the one before."""
     config = DiffAeroRgbConfig(weights=file, speed=3.0)
     system, rng = DiffAeroRgb(config), np.random.default_rng(1)
     simulator = Simulator(system)
@@ -85,7 +84,6 @@ def test_decides_at_its_rate(file):
 
 
 def test_decides_as_diffaero_of_what_it_judges(tmp_path):
-    """With DiffAero's weights it accelerates as DiffAero does at depths of what it judged."""
     policy = load_recurrent(None, "diffaero", DIFFAERO_NETWORK)
     shipped = PolicyCheckpoint.load(None, "diffaero", DIFFAERO_NETWORK).weights
     path = tmp_path / "weights.npz"
@@ -104,8 +102,6 @@ def test_decides_as_diffaero_of_what_it_judges(tmp_path):
 
 
 def test_weights_and_cameras_that_do_not_fit_are_refused(file, tmp_path):
-    """Weights of another policy, of none or not finite, and a camera with another view are
-    named."""
     with pytest.raises(FileNotFoundError, match="train them with: splatpilot train diffaero_rgb"):
         DiffAeroRgb(DiffAeroRgbConfig(weights=str(tmp_path / "absent.npz")))
     other = Path(__file__).parents[3] / "systems" / "policies" / "weights" / "diffaero.npz"
@@ -124,3 +120,92 @@ def test_weights_and_cameras_that_do_not_fit_are_refused(file, tmp_path):
         DiffAeroRgb(DiffAeroRgbConfig(weights=file, camera=camera))
     with pytest.raises(ValueError, match=r"DiffAeroRgbConfig\.speed .* got 0\.0"):
         DiffAeroRgb(DiffAeroRgbConfig(weights=file, speed=0.0))
+
+
+def test_rays_are_those_of_the_camera():
+    camera = OnboardCamera(width=160, height=90)
+    rays = rays_B()
+    np.testing.assert_allclose(np.linalg.norm(rays, axis=2), 1.0, atol=1e-6)
+    rng = np.random.default_rng(0)
+    for row, column in zip(rng.integers(0, 90, 9), rng.integers(0, 160, 9), strict=True):
+        x, y, z = rays[row, column]
+        u = camera.width / 2 - camera.focal_x * y / x
+        v = camera.height / 2 - camera.focal_x * z / x
+        assert (u, v) == pytest.approx((column + 0.5, row + 0.5), abs=1e-4)
+
+
+@pytest.mark.parametrize("height", [90, 120])
+def test_view_is_the_middle_of_the_image_with_rays_that_know_the_horizon(height):
+    rng = np.random.default_rng(1)
+    color = rng.integers(0, 256, (height, 160, 3)).astype(np.uint8)
+    roll, pitch = 0.2, -0.3
+    views = []
+    for yaw in (0.0, 2.0):
+        R_WB = RollPitchYaw(roll, pitch, yaw).ToRotationMatrix().matrix()
+        views.append(encode_view(color, R_WB))
+        np.testing.assert_allclose(views[-1][5], rays_B() @ R_WB[2], atol=1e-5)
+    np.testing.assert_allclose(views[0], views[1], atol=1e-5)
+    first = (height - 90) // 2
+    shown = np.rint((views[0][:3] + 1.0) * 127.5).astype(np.uint8).transpose(1, 2, 0)
+    np.testing.assert_array_equal(shown, color[first : first + 90])
+
+
+@pytest.mark.parametrize("shape", [(90, 128, 3), (88, 160, 3), (91, 160, 3)])
+def test_images_of_another_size_are_refused(shape):
+    with pytest.raises(ValueError, match=f"160 pixels wide.* got {shape[1]}x{shape[0]}"):
+        encode_view(np.zeros(shape, np.uint8), np.eye(3))
+
+
+def test_network_computes_its_definition():
+    spec, rng = MonocularSpec(4, (1, 2), 6, (1, 4)), np.random.default_rng(2)
+    weights = {
+        name: rng.normal(scale=0.3 / np.sqrt(np.prod(shape[1:])), size=shape).astype(np.float32)
+        for name, shape in spec.weight_shapes().items()
+    }
+    view = rng.uniform(-1.0, 1.0, (6, 90, 160)).astype(np.float32)
+
+    def convolved(x: np.ndarray, name: str, stride: int = 1, dilation: int = 1) -> np.ndarray:
+        weight, bias = weights[f"{name}.weight"].astype(float), weights[f"{name}.bias"]
+        kernel = weight.shape[2]
+        pad = dilation * (kernel // 2)
+        x = np.pad(x, ((0, 0), (pad, pad), (pad, pad)))
+        span = dilation * (kernel - 1) + 1
+        height, width = ((size - span) // stride + 1 for size in x.shape[1:])
+        y = np.zeros((len(weight), height, width)) + bias[:, None, None]
+        for i in range(kernel):
+            for j in range(kernel):
+                rows = slice(i * dilation, i * dilation + stride * (height - 1) + 1, stride)
+                columns = slice(j * dilation, j * dilation + stride * (width - 1) + 1, stride)
+                y += np.einsum("oc,chw->ohw", weight[:, :, i, j], x[:, rows, columns])
+        return y
+
+    def leaky(x: np.ndarray) -> np.ndarray:
+        return np.where(x > 0.0, x, 0.05 * x)
+
+    x = leaky(convolved(view, "stem", 5))
+    for i, dilation in enumerate((1, 2)):
+        inner = leaky(convolved(x, f"fine.{i}.0", dilation=dilation))
+        x = x + convolved(inner, f"fine.{i}.1")
+    x = leaky(convolved(x, "halving", 2))
+    for i, dilation in enumerate((1, 4)):
+        inner = leaky(convolved(x, f"coarse.{i}.0", dilation=dilation))
+        x = x + convolved(inner, f"coarse.{i}.1")
+    expected = convolved(x, "head")
+    found = np.stack(MonocularDepth(spec, weights)(view))
+    assert expected.shape == (2, 9, 16) and expected.std() > 0.01
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
+def test_threads_of_opencv_change_no_bit():
+    spec, rng = MonocularSpec(4, (1, 2), 6, (1, 4)), np.random.default_rng(0)
+    shapes = spec.weight_shapes().items()
+    network = MonocularDepth(spec, {k: rng.normal(size=v).astype(np.float32) for k, v in shapes})
+    view = rng.uniform(-1.0, 1.0, (6, 90, 160)).astype(np.float32)
+    threads, outputs = cv2.getNumThreads(), []
+    try:
+        for count in (1, 2, 3):
+            cv2.setNumThreads(count)
+            outputs.append(np.stack(network(view)))
+    finally:
+        cv2.setNumThreads(threads)
+    assert all(np.array_equal(outputs[0], other) for other in outputs[1:])

@@ -4,10 +4,12 @@ from pydrake.math import RigidTransform, RollPitchYaw
 
 from splatpilot.systems.policies.hypotheses import (
     Hypotheses,
+    HypothesisSelector,
     hypotheses_size,
     no_plan,
     num_hypotheses_in,
 )
+from splatpilot.systems.vehicle.quadrotor import hover_state
 
 
 def some_hypotheses(count=3, plan_time=2.0):
@@ -18,7 +20,6 @@ def some_hypotheses(count=3, plan_time=2.0):
 
 @pytest.mark.parametrize("count", [1, 3])
 def test_vector_round_trip(count):
-    """A vector holds plan time, pose, waypoints and costs, and gives them back."""
     plan = some_hypotheses(count)
     vector = plan.to_vector()
     assert vector.shape == (hypotheses_size(count),)
@@ -31,7 +32,6 @@ def test_vector_round_trip(count):
 
 
 def test_layout_of_the_vector():
-    """The vector is [plan_time, p_WB, q_WB, waypoints of each hypothesis in turn, costs]."""
     plan = some_hypotheses()
     vector = plan.to_vector()
     assert vector[0] == 2.0
@@ -42,12 +42,10 @@ def test_layout_of_the_vector():
 
 
 def test_before_the_first_plan_there_is_none():
-    """The vector of no plan reads as None."""
     assert Hypotheses.from_vector(no_plan(3), 3) is None
 
 
 def test_waypoints_in_the_world():
-    """World waypoints are X_WB applied to each body waypoint."""
     plan = some_hypotheses()
     np.testing.assert_allclose(
         plan.waypoints_W[2, 7], plan.X_WB @ plan.waypoints_B[2, 7], atol=1e-14
@@ -55,13 +53,11 @@ def test_waypoints_in_the_world():
 
 
 def test_best_is_the_cheapest():
-    """`best` is the index of the lowest cost, wherever it stands."""
     plan = Hypotheses(0.0, RigidTransform(), np.zeros((3, 10, 3)), np.array([3.0, 1.0, 2.0]))
     assert plan.best == 1
 
 
 def test_position_interpolates_between_waypoints():
-    """Waypoint t stands at plan_time + (t + 1) / 10 s; between is linear, outside the ends hold."""
     plan = some_hypotheses()
     way_W = np.vstack([plan.X_WB.translation(), plan.waypoints_W[1]])
     for time, expected in [
@@ -76,7 +72,6 @@ def test_position_interpolates_between_waypoints():
 
 
 def test_errors_name_sizes_and_remedy():
-    """Vectors and arrays of the wrong size are refused with both sizes in the message."""
     with pytest.raises(ValueError, match=r"2 hypotheses must be \(70,\), got \(101,\)"):
         Hypotheses.from_vector(no_plan(3), 2)
     with pytest.raises(ValueError, match=r"\(K, 10, 3\).* got \(3, 9, 3\)"):
@@ -88,8 +83,43 @@ def test_errors_name_sizes_and_remedy():
 
 
 def test_size_tells_the_number_of_hypotheses():
-    """The number is found back from the size; a size of no number is refused."""
     assert [num_hypotheses_in(hypotheses_size(k)) for k in (1, 3, 7)] == [1, 3, 7]
     for size in (8, 13, 40):
         with pytest.raises(ValueError, match=f"hypotheses, got {size}"):
             num_hypotheses_in(size)
+
+
+def waypoint(selector, vector, time):
+    context = selector.CreateDefaultContext()
+    context.SetTime(time)
+    selector.GetInputPort("hypotheses").FixValue(context, vector)
+    selector.GetInputPort("state").FixValue(context, hover_state([7.0, 8.0, 9.0]))
+    return np.asarray(selector.GetOutputPort("waypoint").Eval(context))
+
+
+def test_hovers_before_the_first_plan():
+    np.testing.assert_array_equal(waypoint(HypothesisSelector(3), no_plan(3), 0.5), [7, 8, 9])
+
+
+def test_follows_the_cheapest_a_lookahead_ahead():
+    X_WB = RigidTransform(RollPitchYaw(0.1, 0.2, 1.5), np.array([1.0, 2.0, 3.0]))
+    velocities_B = np.array([[1.0, 0, 0], [0, 2.0, 0.5], [0, 0, 3.0]])
+    times = 0.1 * np.arange(1, 11)
+    plan = Hypotheses(
+        4.0, X_WB, velocities_B[:, None] * times[:, None], costs=np.array([5.0, 1.0, 9.0])
+    )
+    got = waypoint(HypothesisSelector(3, lookahead=0.4), plan.to_vector(), 4.03)
+    np.testing.assert_allclose(got, X_WB @ (0.43 * velocities_B[1]), atol=1e-12)
+
+
+@pytest.mark.parametrize("costs", [[1.0, np.nan], [np.nan, 1.0], [np.inf, np.inf], [0.0, -np.inf]])
+def test_without_a_cheapest_hypothesis_there_is_no_waypoint(costs):
+    plan = Hypotheses(0.0, RigidTransform(), np.ones((2, 10, 3)), np.array(costs))
+    got = waypoint(HypothesisSelector(2), plan.to_vector(), 0.1)
+    np.testing.assert_array_equal(got, np.full(3, np.nan))
+
+
+@pytest.mark.parametrize("lookahead", [0.0, -0.1, 1.01, np.nan])
+def test_a_lookahead_beyond_the_plan_is_refused(lookahead):
+    with pytest.raises(ValueError, match=r"lookahead must be in \(0, 1\] s, got "):
+        HypothesisSelector(3, lookahead)

@@ -14,7 +14,6 @@ from splatpilot.systems.vehicle.quadrotor import QuadrotorParams
 
 @pytest.mark.parametrize("derivative", [0, 1, 2])
 def test_quintics_meet_their_boundary_states(derivative):
-    """At both ends position, velocity and acceleration are those asked for."""
     basis = quintic_basis(np.array([0.0, 1.7]), 1.7, derivative)
     expected = np.zeros((2, 6))
     expected[0, derivative] = expected[1, 3 + derivative] = 1.0
@@ -23,7 +22,6 @@ def test_quintics_meet_their_boundary_states(derivative):
 
 @pytest.mark.parametrize("derivative", [0, 1, 2, 3])
 def test_quintics_equal_the_polynomial(derivative):
-    """Any quintic polynomial is reproduced, with its derivatives, from its boundary states."""
     polynomial = Polynomial([0.3, -1.0, 2.0, 0.7, -0.4, 0.09])
     times, horizon = np.linspace(0.0, 2.0, 21), 2.0
     boundary = [polynomial.deriv(order)(t) for t in (0.0, horizon) for order in range(3)]
@@ -36,7 +34,6 @@ def test_quintics_equal_the_polynomial(derivative):
 
 @pytest.mark.parametrize("direction", [[3, 0, 0], [-1, 2, 0.5], [0, 0, 2], [0, 0, -1], [0, 0, 0]])
 def test_lattice_frame(direction):
-    """The frame is a rotation whose x axis is the direction and whose y axis is level."""
     direction = np.array(direction, dtype=float)
     R_WL = rotation_to(direction)
     np.testing.assert_allclose(R_WL.T @ R_WL, np.eye(3), atol=1e-14)
@@ -46,7 +43,6 @@ def test_lattice_frame(direction):
 
 
 def test_selection_falls_back_to_the_most_distant():
-    """Where no trajectory is distinct any more the most distant ones fill up, none twice."""
     positions = np.array([0.0, 0.01, 0.02, 1.0, 0.03])[:, None, None] * np.ones((5, 4, 3))
     costs = np.array([1.0, 2.0, 3.0, 9.0, 4.0])
     np.testing.assert_array_equal(select_distinct(positions, costs, 3, 0.35), [0, 4, 3])
@@ -56,7 +52,6 @@ def test_selection_falls_back_to_the_most_distant():
 
 
 def test_level_acceleration():
-    """Tilt accelerates by g tan(tilt) along the tilt; in steady flight the drag takes it away."""
     params = QuadrotorParams(drag=0.4, gravity=3.7)
     R_WB = RollPitchYaw(0.0, 0.3, 1.0).ToRotationMatrix().matrix()
     expected = 3.7 * np.tan(0.3) * np.array([np.cos(1.0), np.sin(1.0), 0.0])

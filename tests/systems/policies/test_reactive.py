@@ -1,5 +1,3 @@
-"""The classical policy that sees depth."""
-
 import numpy as np
 import pytest
 from pydrake.common.value import Value
@@ -28,9 +26,6 @@ def empty_image() -> np.ndarray:
 
 
 def test_nearest_points_are_those_of_single_pixels():
-    """A near pixel stands for its block, at its own ray and depth; blocks without any are NaN, as
-    are pixels without a measurement.
-    """
     depth = empty_image()
     depth[5, 9], depth[6, 10] = 2.0, 3.0  # Both in block (1, 2).
     depth[35, 63] = 0.0
@@ -40,7 +35,6 @@ def test_nearest_points_are_those_of_single_pixels():
 
 
 def test_responses_solve_the_tracking_equation():
-    """Positions follow v' = (v_wanted - v) / tau, integrated numerically."""
     p, v, wanted = np.array([1.0, 2.0, 3.0]), np.array([2.0, 0.0, -1.0]), np.array([0.0, 1.0, 1.0])
     positions = responses(p, v, wanted[None], horizon=1.5)[0]
     step, expected = 1e-4, []
@@ -53,7 +47,6 @@ def test_responses_solve_the_tracking_equation():
 
 
 def test_seen_is_inside_the_image_and_before_its_depth():
-    """Points before a surface are seen; behind it, beside the image and behind the camera not."""
     depth = empty_image()
     depth[:] = 4.0
     points = np.array([[0, 0, 3.9], [0, 0, 4.1], [1.9, 0, 2], [2.1, 0, 2], [0, 0, -1]], float)
@@ -74,13 +67,11 @@ def cost_of(points_W, velocities, seen=True):
 
 
 def test_cost_in_the_open_is_the_way_left():
-    """Without obstacles, in seen space, a candidate costs the distance from its end to the goal."""
     (cost,), positions = cost_of([], [[2.0, 0, 0]])
     assert cost == pytest.approx(10.0 - positions[0, -1, 0], abs=0.01)
 
 
 def test_contact_and_the_unseen_cost():
-    """Touching a seen point costs more than any way around; unseen space costs by its length."""
     ahead = [2.0, 0, 0]
     (through, beside), _ = cost_of([[2.0, 0, 0]], [ahead, [1.2, 1.2, 0]])
     assert through > beside
@@ -95,7 +86,6 @@ def test_contact_and_the_unseen_cost():
 
 
 def test_fan_is_about_the_goal_and_ends_with_rest():
-    """The middle of the fan points to the goal, no candidate is faster than the speed."""
     v = candidate_velocities(np.array([0.0, 5.0, 0.0]), CONFIG)
     speeds = np.linalg.norm(v, axis=1)
     assert speeds.max() == pytest.approx(CONFIG.speed)
@@ -104,7 +94,6 @@ def test_fan_is_about_the_goal_and_ends_with_rest():
 
 
 def test_angles_mean_what_they_mean_to_the_planner():
-    """The same max_yaw and max_pitch [rad] give both policies the same fan of directions."""
     angles = {"max_yaw": 0.7, "max_pitch": 0.2, "num_yaws": 5, "num_pitches": 3}
     v = candidate_velocities(np.array([1.0, 0.0, 0.0]), ReactiveConfig(**angles))
     lattice = final_velocities(LatticeConfig(**angles))
@@ -126,9 +115,6 @@ def decide(depth: np.ndarray) -> np.ndarray:
 
 
 def test_flies_ahead_in_the_open_and_aside_of_a_post():
-    """It accelerates to the goal when nothing is seen; a post left of the middle sends it right, a
-    post right of it left.
-    """
     ahead = decide(empty_image())
     assert ahead[0] > 3.0
     assert np.abs(ahead[1:]).max() < 0.5
@@ -141,7 +127,6 @@ def test_flies_ahead_in_the_open_and_aside_of_a_post():
 
 
 def test_remembers_what_it_no_longer_sees():
-    """Points of an image stay in the state, in the world frame, until `memory` images later."""
     config = ReactiveConfig(memory=2)
     policy = Reactive(config)
     context = policy.CreateDefaultContext()
@@ -175,7 +160,6 @@ def test_remembers_what_it_no_longer_sees():
     ],
 )
 def test_bad_config_is_named(field, value):
-    """A value out of range names the field."""
     name = "OnboardCamera.width" if field == "camera" else f"ReactiveConfig.{field}"
     with pytest.raises(ValueError, match=name):
         Reactive(ReactiveConfig(**{field: value}))

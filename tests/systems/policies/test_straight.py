@@ -1,5 +1,3 @@
-"""The policy that flies straight."""
-
 import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
@@ -16,7 +14,6 @@ from splatpilot.systems.vehicle.quadrotor import hover_state
 
 
 def test_velocity_points_to_the_goal_and_falls_near_it():
-    """Far away it has the set speed; within 0.75 s of the goal it is in proportion to the way."""
     p_WG = np.array([3.0, -4.0, 2.0])
     far = target_velocity(np.array([0.0, 0.0, 2.0]), p_WG, 2.0, SLOWING_TIME)
     np.testing.assert_allclose(far, [1.2, -1.6, 0.0])
@@ -26,9 +23,6 @@ def test_velocity_points_to_the_goal_and_falls_near_it():
 
 
 def test_tracking_is_exponential_and_limited():
-    """A point mass under it closes 1 - 1/e of a small difference in the response time; a large
-    difference asks for the greatest acceleration, in its direction.
-    """
     v, wanted, step = np.zeros(3), np.array([0.5, 0.0, 0.2]), 1e-4
     for _ in range(round(RESPONSE_TIME / step)):
         v = v + step * tracking_acceleration(v, wanted)
@@ -38,7 +32,6 @@ def test_tracking_is_exponential_and_limited():
 
 
 def test_system_decides_by_state_and_goal():
-    """The output is zero before the first update and the tracking acceleration after it."""
     policy = Straight(StraightConfig(speed=3.0))
     context = policy.CreateDefaultContext()
     policy.GetInputPort("state").FixValue(context, hover_state([1.0, 2.0, 3.0]))
@@ -52,6 +45,5 @@ def test_system_decides_by_state_and_goal():
 
 @pytest.mark.parametrize(("field", "value"), [("speed", 0.0), ("speed", np.nan), ("rate", -1.0)])
 def test_bad_config_is_named(field, value):
-    """A value out of range names the field."""
     with pytest.raises(ValueError, match=rf"StraightConfig.{field} .* got {value}"):
         Straight(StraightConfig(**{field: value}))

@@ -21,7 +21,9 @@ from splatpilot.systems.policies.student import (
     StudentNetwork,
     StudentRgbConfig,
     StudentSpec,
+    adds_input,
     load_network,
+    mobilenet_blocks,
     plan,
 )
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
@@ -204,3 +206,12 @@ def test_weights_that_ship_see_colours():
     assert left[-1, 1] > 0.2 and right[-1, 1] < -0.2
     ahead = [4.0, 0.0, 1.5]
     assert np.abs(waypoints_B(trunk, ahead) - waypoints_B(meadow, ahead)).max() > 0.05
+
+
+def test_encoder_has_the_published_shape():
+    blocks = mobilenet_blocks()
+    assert len(blocks) == 19 and sum(map(adds_input, blocks)) == 10
+    shapes = [shape for block in blocks for layer in block for shape in layer.shapes().values()]
+    # The encoder's part of the published 3.5 million, less a scale of batch norm a channel.
+    assert sum(int(np.prod(shape)) for shape in shapes) == 2_223_872 - 17_056
+    assert np.prod([layer.stride for block in blocks for layer in block]) == 32

@@ -9,7 +9,6 @@ from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
 
 def open_space(voxel_size, size=(8.0, 6.0, 4.0)):
-    """A field 50 m from every obstacle, so that the slowness is 1 everywhere."""
     shape = tuple(round(extent / voxel_size) for extent in size)
     return Esdf(
         np.full(shape, 50.0, np.float32), np.zeros(shape, np.uint8), np.zeros(3), voxel_size, True
@@ -18,7 +17,6 @@ def open_space(voxel_size, size=(8.0, 6.0, 4.0)):
 
 @pytest.mark.parametrize("voxel_size", [0.4, 0.2, 0.1])
 def test_is_the_distance_in_open_space(voxel_size):
-    """Without obstacles it is the distance to the goal, with an error of the order of a voxel."""
     p_WG = np.array([6.83, 2.21, 1.47])
     toa = time_of_arrival(open_space(voxel_size), p_WG)
     lower, upper = 0.5 * voxel_size, np.array([8.0, 6.0, 4.0]) - 0.5 * voxel_size
@@ -29,7 +27,6 @@ def test_is_the_distance_in_open_space(voxel_size):
 
 
 def test_goes_around_a_wall(half_wall):
-    """Behind a wall it is the length of the way around, plus what nearness to the wall adds."""
     p_WG, p_WB = np.array([9.0, 2.0, 2.0]), np.array([3.0, 2.0, 2.0])
     toa = time_of_arrival(half_wall, p_WG)
     corner = np.array([6.2, 6.0 + VEHICLE_RADIUS, 2.0])
@@ -41,7 +38,6 @@ def test_goes_around_a_wall(half_wall):
 
 
 def test_gradient_is_the_slowness(pillar):
-    """The norm of the gradient is the slowness: the eikonal equation holds."""
     toa = time_of_arrival(pillar, np.array([13.0, 4.0, 3.0]))
     p_WQ = np.random.default_rng(1).uniform([1.5, 1.5, 2], [10.0, 6.5, 4], (4000, 3))
     distance = pillar.distance(p_WQ)
@@ -52,7 +48,6 @@ def test_gradient_is_the_slowness(pillar):
 
 
 def test_gradient_is_that_of_the_value(pillar):
-    """The gradient agrees with central differences of the value."""
     toa = time_of_arrival(pillar, np.array([13.0, 4.0, 3.0]))
     cells = np.random.default_rng(2).integers([2, 2, 2], [70, 35, 25], (200, 3))
     p_WQ = (cells + 1.0) * 0.2  # cell centres, away from the kinks between cells
@@ -64,7 +59,6 @@ def test_gradient_is_that_of_the_value(pillar):
 
 
 def test_way_goes_down_the_gradient(u_trap):
-    """From anywhere, in the box and outside, the first step of the way is one down the gradient."""
     toa = time_of_arrival(u_trap, np.array([10.0, 4.0, 2.0]))
     rng = np.random.default_rng(0)
     points = rng.uniform(u_trap.lower_W - 0.5, u_trap.upper_W + 0.5, (200, 3))
@@ -78,7 +72,6 @@ def test_way_goes_down_the_gradient(u_trap):
 
 
 def test_slowness_rises_towards_contact():
-    """One in the open, above ten at contact and falling with distance in between."""
     distance = np.linspace(0.0, 6.0, 500)
     values = slowness(distance)
     assert np.all(np.diff(values) < 0.0)
@@ -87,7 +80,6 @@ def test_slowness_rises_towards_contact():
 
 
 def test_way_leads_to_the_goal(u_trap):
-    """From inside a U the way leads out and around to the goal, clear of the walls, without end."""
     p_WG = np.array([12.0, 5.0, 2.0])
     toa = time_of_arrival(u_trap, p_WG, margin=0.05)
     lengths = np.arange(0.0, 40.0, 0.2)
@@ -104,7 +96,6 @@ def test_way_leads_to_the_goal(u_trap):
 
 
 def test_leads_out_of_obstacles(pillar):
-    """Inside an obstacle and outside the box the values are finite and fall towards free space."""
     toa = time_of_arrival(pillar, np.array([13.0, 4.0, 3.0]))
     assert np.isfinite(toa.times).all()
     assert not toa.is_reachable(np.array([6.0, 4.0, 3.0]))
@@ -114,7 +105,6 @@ def test_leads_out_of_obstacles(pillar):
 
 
 def test_knows_what_is_cut_off(closed_wall):
-    """Behind a closed wall nothing is reachable, before it everything free is."""
     toa = time_of_arrival(closed_wall, np.array([9.0, 5.0, 2.0]))
     assert not toa.is_reachable(np.array([3.0, 5.0, 2.0]))
     assert toa.is_reachable(np.array([11.0, 2.0, 2.0]))
@@ -130,19 +120,16 @@ def test_knows_what_is_cut_off(closed_wall):
     ],
 )
 def test_bad_goals_are_refused(pillar, p_WG, message):
-    """A goal in an obstacle, near the boundary, outside or not finite: value, limit and remedy."""
     with pytest.raises(ValueError, match=message):
         time_of_arrival(pillar, np.array(p_WG), margin=0.05)
 
 
 def test_a_field_with_unknown_ends_is_refused():
-    """Only a conservative field is planned in."""
     field = Esdf(np.ones((9, 9, 9), np.float32), np.zeros((9, 9, 9), np.uint8), np.zeros(3), 0.2)
     with pytest.raises(ValueError, match=r"pass esdf.conservative\(\)"):
         time_of_arrival(field, np.full(3, 0.9))
 
 
 def test_copies_share_the_grid(empty):
-    """A deep copy, as of a Drake Context, is the same object."""
     toa = time_of_arrival(empty, np.array([8.0, 4.0, 3.0]))
     assert copy.deepcopy(toa) is toa

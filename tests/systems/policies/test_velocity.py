@@ -1,11 +1,25 @@
-"""What autopilots are told that take velocities."""
-
 import numpy as np
 import pytest
 
-from splatpilot.systems.policies.velocity import VelocitySetpoint, tracking_acceleration
+from splatpilot.systems.policies.velocity import (
+    VelocitySetpoint,
+    VelocityTracker,
+    tracking_acceleration,
+)
 from splatpilot.systems.vehicle.flatness import FlatnessController, FlatnessControllerConfig
 from splatpilot.systems.vehicle.quadrotor import QuadrotorParams, hover_state
+
+
+def test_velocities_are_approached_in_four_tenths_of_a_second():
+    system = VelocityTracker()
+    context = system.CreateDefaultContext()
+    state = np.array([9.0, 9, 9, 1, 0, -1, 1, 0, 0, 0, 0, 0, 0])
+    system.state_input_port().FixValue(context, state)
+    for wanted, expected in (([2, 1, -1], [2.5, 2.5, 0]), ([1, 0, 7], [0, 0, 6])):
+        system.velocity_input_port().FixValue(context, np.array(wanted, dtype=float))
+        found = system.acceleration_output_port().Eval(context)
+        np.testing.assert_allclose(found, expected, atol=1e-12)
+
 
 CONTROLLER = FlatnessControllerConfig(lookahead=0.5)
 STATE = np.array([1.0, 2, 3, 0.5, -0.5, 0.2, 1, 0, 0, 0, 0, 0, 0])
@@ -20,19 +34,16 @@ def setpoint(**inputs) -> np.ndarray:
 
 
 def test_acceleration_leads_to_the_velocity_that_was_wanted():
-    """It undoes `tracking_acceleration`: the velocity that asks for an acceleration is told."""
     wanted = np.array([1.5, 0.5, -0.3])
     acceleration = tracking_acceleration(STATE[3:6], wanted)
     np.testing.assert_allclose(setpoint(acceleration=acceleration)[:3], wanted)
 
 
 def test_velocity_is_told_as_it_is():
-    """A policy's velocity is the setpoint."""
     np.testing.assert_array_equal(setpoint(velocity=np.array([1.0, -2, 3]))[:3], [1, -2, 3])
 
 
 def test_waypoint_is_reached_in_time():
-    """At the velocity to a waypoint the vehicle is there when it is due; the heading goes along."""
     told = setpoint(waypoint=np.array([2.0, 2, 2]), heading=np.array([0.7]))
     np.testing.assert_allclose(told, [2.0, 0.0, -2.0, 0.7])
 

@@ -29,7 +29,6 @@ PARAMS = QuadrotorParams(drag=0.4, gravity=3.7)
 
 
 def flying(p_WB, v_WB, a_WB=(0.0, 0.0, 0.0)):
-    """The state in level flight: tilted as the acceleration and the drag of 0.375 1/s ask for."""
     state = hover_state(p_WB)
     state[3:6] = v_WB
     thrust_W = np.array([a_WB[0] + 0.375 * v_WB[0], a_WB[1] + 0.375 * v_WB[1], 9.81])
@@ -42,7 +41,6 @@ def flying(p_WB, v_WB, a_WB=(0.0, 0.0, 0.0)):
 
 
 def fly(esdf, p_WB, p_WG, duration, config=None, truth=None, arrival_distance=0.0):
-    """Flies the closed loop: the states (N, 13) every 0.02 s and the plans every 0.2 s."""
     builder = DiagramBuilder()
     config = config or PrivilegedPlannerConfig()
     plant = builder.AddNamedSystem("plant", QuadrotorPlant())
@@ -84,7 +82,6 @@ def fly(esdf, p_WB, p_WG, duration, config=None, truth=None, arrival_distance=0.
 
 
 def test_flies_straight_at_nominal_speed(empty):
-    """On a clear path the best plan is straight on, at the nominal speed."""
     toa = time_of_arrival(empty, np.array([14.0, 4.0, 3.0]))
     state = flying([3.0, 4.0, 3.0], [2.0, 0.0, 0.0])
     way_W = plan(0.0, state, empty, toa, TrajectoryLattice()).waypoints_W[0]
@@ -93,7 +90,6 @@ def test_flies_straight_at_nominal_speed(empty):
 
 
 def test_waypoints_are_in_the_body_frame(empty):
-    """Seen in the world the plan is the same whatever the yaw of the vehicle."""
     toa = time_of_arrival(empty, np.array([14.0, 4.0, 3.0]))
     lattice = TrajectoryLattice()
     plans = [plan(0.0, hover_state([3, 3, 3], yaw), empty, toa, lattice) for yaw in (0.0, 2.0)]
@@ -105,7 +101,6 @@ def test_waypoints_are_in_the_body_frame(empty):
 
 @pytest.mark.parametrize("y", [3.6, 4.0, 4.3])
 def test_all_hypotheses_avoid_an_obstacle(pillar, y):
-    """Before an obstacle with free space around, every hypothesis keeps clear of it."""
     toa = time_of_arrival(pillar, np.array([14.0, 4.0, 3.0]), MARGIN)
     state = flying([3.5, y, 3.0], [2.0, 0.0, 0.0])
     hypotheses = plan(0.0, state, pillar, toa, TrajectoryLattice())
@@ -114,7 +109,6 @@ def test_all_hypotheses_avoid_an_obstacle(pillar, y):
 
 
 def test_a_state_in_an_obstacle_leads_out(pillar):
-    """Where every trajectory starts in contact, the plan leads to greater distance."""
     toa = time_of_arrival(pillar, np.array([14.0, 4.0, 3.0]))
     state = hover_state([5.4, 4.1, 3.0])
     way_W = plan(0.0, state, pillar, toa, TrajectoryLattice()).waypoints_W[0]
@@ -124,7 +118,6 @@ def test_a_state_in_an_obstacle_leads_out(pillar):
 
 @pytest.mark.parametrize("p_WB", [[7.0, 5.0, 2.0], [7.3, 6.5, 2.0], [4.5, 3.0, 1.5]])
 def test_escapes_a_u_trap(u_trap, p_WB):
-    """A point mass that follows the best plan leaves a dead end and arrives, never in contact."""
     p_WG = np.array([12.0, 5.0, 2.0])
     toa, lattice = time_of_arrival(u_trap, p_WG, MARGIN), TrajectoryLattice()
     p, v, a = np.array(p_WB), np.zeros(3), np.zeros(3)
@@ -138,7 +131,6 @@ def test_escapes_a_u_trap(u_trap, p_WB):
 
 
 def test_passes_a_narrow_door(doorway):
-    """A door with 0.25 m to spare on either side is flown through, not hovered before."""
     states, _ = fly(doorway, [2.0, 2.0, 1.5], [10.0, 6.0, 1.5], 9.0, arrival_distance=0.3)
     assert np.linalg.norm(states[-1, :3] - [10.0, 6.0, 1.5]) < 0.3
     assert doorway.distance(states[:, :3]).min() > VEHICLE_RADIUS
@@ -162,7 +154,6 @@ def test_a_vehicle_that_drifts_to_less_than_the_margin_is_not_cut_off(narrow_ben
 
 @pytest.mark.parametrize("clearance", [0.1, 0.5])
 def test_arrives_and_stops_near_an_obstacle(pillar, clearance):
-    """The vehicle arrives at a goal, also close to an obstacle, and stays there."""
     p_WG = np.array([6.0 - 0.4 - VEHICLE_RADIUS - clearance, 4.0, 3.0])
     states, _ = fly(pillar, [2.0, 2.5, 2.5], p_WG, 9.0)
     rest = states[-50:]  # the last second
@@ -173,7 +164,6 @@ def test_arrives_and_stops_near_an_obstacle(pillar, clearance):
 
 @pytest.mark.parametrize("seed", range(4))
 def test_flies_through_a_forest(make_forest, seed):
-    """The whole Diagram flies through random forests, in time and with positive clearance."""
     world, esdf = make_forest(seed)
     p_WB, p_WG = np.array([1.5, 5.0, 1.5]), np.array([18.5, 5.0, 1.5])
     states, plans = fly(esdf, p_WB, p_WG, 16.0, truth=world, arrival_distance=0.5)
@@ -186,7 +176,6 @@ def test_flies_through_a_forest(make_forest, seed):
 
 
 def test_same_flight_bit_for_bit(make_forest):
-    """The same flight twice gives the same bits."""
     _, esdf = make_forest(7)
     flights = [fly(esdf, [1.5, 5.0, 1.5], [18.5, 5.0, 1.5], 2.0) for _ in range(2)]
     np.testing.assert_array_equal(flights[0][0], flights[1][0])
@@ -200,7 +189,6 @@ def test_same_flight_bit_for_bit(make_forest):
 )
 @settings(max_examples=150, deadline=None)
 def test_any_state_gets_finite_plans(pillar_plan, p, v, rpy):
-    """From any state, in obstacles, upside down or outside the bounds, the plans are finite."""
     q = RollPitchYaw(rpy).ToQuaternion().wxyz()
     hypotheses = pillar_plan(np.array([*p, *v, *q, 0.0, 0.0, 0.0]))
     assert np.isfinite(hypotheses.to_vector()).all()
@@ -214,7 +202,6 @@ def pillar_plan(pillar):
 
 
 def test_time_of_arrival_is_computed_once_per_goal(empty, monkeypatch):
-    """The march runs at the first update and again when the goal moves, and at no other."""
     goals = []
     march = privileged_planner.time_of_arrival
     monkeypatch.setattr(
@@ -233,7 +220,6 @@ def test_time_of_arrival_is_computed_once_per_goal(empty, monkeypatch):
 
 
 def test_is_freed(empty):
-    """A planner that has flown, its Context and a copy are freed when nobody holds them."""
     planner = PrivilegedPlanner(empty)
     simulator = Simulator(planner)
     context = simulator.get_mutable_context()
@@ -247,7 +233,6 @@ def test_is_freed(empty):
 
 
 def test_plans_at_its_rate(empty):
-    """There is no plan before the first update, and each plan carries the time of its update."""
     planner = PrivilegedPlanner(empty, PrivilegedPlannerConfig(rate=10.0))
     simulator = Simulator(planner)
     context = simulator.get_mutable_context()
@@ -263,7 +248,6 @@ def test_plans_at_its_rate(empty):
 
 
 def test_unknown_space_is_not_planned_through(make_forest):
-    """A plain field is made conservative: its bounds are not open space to the planner."""
     _, esdf = make_forest(0)
     planner = PrivilegedPlanner(esdf)
     context = planner.CreateDefaultContext()
@@ -274,7 +258,6 @@ def test_unknown_space_is_not_planned_through(make_forest):
 
 
 def test_a_goal_that_is_cut_off_is_refused(closed_wall):
-    """With no way from start to goal the update says so, with both places and the remedy."""
     toa = time_of_arrival(closed_wall, np.array([9.0, 5.0, 2.0]))
     message = r"no path leads from p_WB = \[3.0, 5.0, 2.0\].*clearance 1.\d+ m.*\[9.0, 5.0, 2.0\]"
     with pytest.raises(ValueError, match=message):
@@ -282,7 +265,6 @@ def test_a_goal_that_is_cut_off_is_refused(closed_wall):
 
 
 def test_a_state_that_is_not_finite_is_refused(pillar_plan):
-    """A NaN in the state is an error of its source, not a plan."""
     state = hover_state([3.0, 4.0, 3.0])
     state[4] = np.nan
     with pytest.raises(ValueError, match="must be 13 finite numbers"):
@@ -290,7 +272,6 @@ def test_a_state_that_is_not_finite_is_refused(pillar_plan):
 
 
 def test_config_in_yaml():
-    """The config survives YAML, and a typo in it is an error."""
     config = PrivilegedPlannerConfig(rate=5.0, lattice=LatticeConfig(speed=3.0))
     text = yaml_dump_typed(config)
     assert yaml_load_typed(schema=PrivilegedPlannerConfig, data=text) == config
@@ -306,6 +287,5 @@ def test_config_in_yaml():
     ],
 )
 def test_configs_out_of_range_are_refused(empty, config, message):
-    """Construction fails on a value out of range, naming it and its limit."""
     with pytest.raises(ValueError, match=message):
         PrivilegedPlanner(empty, config)
