@@ -40,11 +40,11 @@ IMAGE = re.compile(r"!\[[^]]*\]\(([^)]+)\)")
 
 CONFIGS: dict[str, Any] = {
     "reconstruct": ReconstructConfig,
-    "ablate": ReconstructConfig,
-    "places": RenderedSceneConfig,
-    "fidelity": FidelityConfig,
-    "px4": Px4Config,
-    "faults": FaultsConfig,
+    "scene ablate": ReconstructConfig,
+    "scene fetch": RenderedSceneConfig,
+    "scene fidelity": FidelityConfig,
+    "hardware px4": Px4Config,
+    "hardware faults": FaultsConfig,
     "capture check": CheckConfig,
     "capture render": RenderConfig,
     "corpus make": CorpusConfig,

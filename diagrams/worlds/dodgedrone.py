@@ -126,6 +126,7 @@ _STATIC, _MOVING = ("stone", "concrete", "metal"), "hazard"
 class DodgeDroneConfig(Config):
     """A course of the challenge, on an open field."""
 
+    # Density and speed of the obstacles.
     level: str = bounded("medium", f"{{{', '.join(LEVELS)}}}")
     # Seed of the challenge's generator for the course of seed 0; the next one for that of seed 1.
     first_seed: int = bounded(SEED, f"[0, {2**31 - 1}]")

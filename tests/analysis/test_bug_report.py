@@ -38,7 +38,7 @@ def test_mistakes_of_the_program_leave_a_report(failing, tmp_path, capsys):
     [report] = tmp_path.iterdir()
     assert said == (f"splatpilot: internal error in fly (KeyError); the report is {report}\n")
     text = report.read_text()
-    assert "splatpilot fly" in text and "Traceback" in text and "of our own" in text
+    assert ": fly\n" in text and "Traceback" in text and "of our own" in text
 
 
 def test_mistakes_of_imported_modules_are_theirs(failing, tmp_path, monkeypatch, capsys):

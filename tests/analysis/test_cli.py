@@ -253,7 +253,7 @@ def test_scene_of_another_unit_is_refused(tmp_path, capsys):
     means = generator.uniform(0, 2e4, scene.means.shape).astype(np.float32)
     write_ply(dataclasses.replace(scene, means=means), ply)
     error = fails(["fly", "--scene", str(ply), "--out", str(tmp_path / "o")], capsys)
-    assert "give it its size with `splatpilot scene scale`" in error
+    assert "rescale with `splatpilot scene scale`" in error
 
 
 def test_foreign_scene_is_refused(tmp_path, capsys):

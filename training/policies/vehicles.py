@@ -176,11 +176,11 @@ def _decay_gradient(x: Tensor, factor: float) -> Tensor:
 
 
 def map_tensors(function: Callable[..., Tensor], first: Any, *others: Any) -> Any:
-    """Applies a function to the tensors of nested named tuples of one type."""
+    """Applies a function to the tensors of nested tuples of one type."""
     if isinstance(first, Tensor):
         return function(first, *others)
-    parts = zip(first, *others, strict=True)
-    return type(first)(*(map_tensors(function, *part) for part in parts))
+    mapped = [map_tensors(function, *part) for part in zip(first, *others, strict=True)]
+    return type(first)(*mapped) if hasattr(first, "_fields") else tuple(mapped)
 
 
 def choose_rows(chosen: Tensor, these: Any, others: Any) -> Any:

@@ -285,7 +285,7 @@ def test_truncated_file(tmp_path, missing):
 )
 def test_foreign_file(tmp_path, content):
     (tmp_path / "b.ply").write_bytes(content)
-    with pytest.raises(ValueError, match=r"b\.ply: not a PLY file"):
+    with pytest.raises(ValueError, match=r"b\.ply: not a readable PLY file"):
         read_ply(tmp_path / "b.ply")
 
 

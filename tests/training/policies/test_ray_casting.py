@@ -98,9 +98,7 @@ def wide_depth(shape: Shape, p_WC: np.ndarray, R_WC: np.ndarray, rays: PixelRays
         """Of a shape about p_WA (3,), `wider` by half a pixel there."""
         away = p_WA - p_WC
         half = rays.half_pixel * max(away @ R_WC[:, 2], 0.0) ** 2 / np.linalg.norm(away)
-        widened = wider(half)
-        parameters = widened.parameters()
-        depth = marched(lambda p: widened.distances(p, *parameters), p_WC, rays_W)
+        depth = marched(ShapeUnion.of([wider(half)]).distance, p_WC, rays_W)
         return np.where(depth < 50.0, depth + half, np.inf)
 
     if isinstance(shape, Sphere):

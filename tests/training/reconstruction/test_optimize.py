@@ -176,7 +176,7 @@ def test_unknown_scale_is_never_flown_in(tmp_path, room):
     summary = reconstruct(capture, tmp_path / "scene", replace(CONFIG, iterations=5))
     assert "cannot be flown in: its scale is unknown" in str(summary)
     assert "units of an unknown length" in str(summary) and "[m]" not in str(summary)
-    with pytest.raises(ValueError, match=r"scene\.yaml: the scale of this scene is unknown"):
+    with pytest.raises(ValueError, match=r"scene\.yaml: metric must be true to fly, got false"):
         read_scene(tmp_path / "scene")
 
 
