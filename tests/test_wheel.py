@@ -133,11 +133,10 @@ def test_verb_without_its_extra_says_which(run, tmp_path, words, missing, extra)
     assert "Traceback" not in ended.stderr
 
 
-def test_checkout_does_not_hide_what_is_installed(environment):
-    """Python that is started in the checkout's root imports the installed package, whole."""
+def test_the_command_in_the_checkout_is_the_installed_one(environment):
     program = "import splatpilot.systems.common.registry as r; print(r.__file__)"
     answer = subprocess.run(
-        [environment / "bin" / "python", "-c", program],
+        [environment / "bin" / "python", "-P", "-c", program],
         cwd=CHECKOUT,
         capture_output=True,
         text=True,

@@ -26,7 +26,7 @@ def test_infeasible_flight_fails_with_a_reason(short_scenario, tmp_path, capsys,
     table = benchmark.run(config=config, out=tmp_path / "near", jobs=1)
     assert [row["infeasible"] for row in table] == [0, 1]
     assert (table[1]["flights"], table[1]["successes"]) == (1, 0)
-    assert "needs at least" in rows_of(tmp_path / "near" / "rollouts.csv")[1]["reason"]
+    assert "must be at least" in rows_of(tmp_path / "near" / "rollouts.csv")[1]["reason"]
 
     config = replace(config, overrides=["goal=[50, 0, 1.8]"])
     table = benchmark.run(config=config, out=tmp_path / "far", jobs=1)

@@ -73,7 +73,7 @@ def test_a_kind_of_another_package(folder, tmp_path):
 def test_a_kind_that_is_not_installed(folder):
     assert read_capture(folder, CaptureConfig(kind="pairs:PAIR")).source == f"pair {folder}"
     for kind, message in (
-        ("pairs:NUMBER", "pairs:NUMBER is no capture format"),
+        ("pairs:NUMBER", "pairs:NUMBER must be a CaptureFormat"),
         ("pairs:NOWHERE", "'pairs:NOWHERE' is not at"),
         ("kinect", r"no capture format 'kinect'; there are tartanair_v1, .*photographs"),
     ):

@@ -184,7 +184,8 @@ def test_training_continues_from_given_weights(trained, student_corpus, tmp_path
 def test_students_learn_to_keep_clear(trained, student_corpus, tmp_path):
     began = f"begin={trained / 'student_depth.npz'}"
     head = ["frozen=20", f"features={tmp_path / 'features'}", "clearance_weight=50.0"]
-    train(configure(student_corpus, "depth", began, *head), tmp_path / "run")
+    steps = ["schedule.updates=200", "schedule.validate_every=100"]
+    train(configure(student_corpus, "depth", began, *head, *steps), tmp_path / "run")
     curve = curves(tmp_path / "run")
     assert curve[-1]["clearance"] < 0.8 * curve[0]["clearance"]
 
