@@ -37,7 +37,7 @@ def test_rendering_on_a_gpu_needs_gsplat(monkeypatch):
 
 def test_other_words_are_refused():
     """A misspelled device is named with those that there are."""
-    with pytest.raises(ValueError, match="device must be cpu .*got 'gpu'"):
+    with pytest.raises(ValueError, match=r"device must be cpu .*got 'gpu'"):
         require_device("gpu")
 
 

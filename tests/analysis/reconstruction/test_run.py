@@ -110,7 +110,7 @@ def test_refusals(tmp_path, config, capsys):
         run(capture=tmp_path / "nowhere", out=tmp_path, config=config)
     with pytest.raises(ValueError, match="unknown capture format; known are TartanAir V1"):
         run(capture=tmp_path, out=tmp_path / "scene", config=config)
-    with pytest.raises(FileNotFoundError, match="No such file or folder: .*nowhere"):
+    with pytest.raises(FileNotFoundError, match=r"No such file or folder: .*nowhere"):
         run(capture=tmp_path / "nowhere", out=tmp_path / "scene", config=config)
     words = ["reconstruct", str(tmp_path), "--out", str(tmp_path / "scene"), "--iterations", "5"]
     assert main([*words, "--set", "iterations=6"]) == 1
