@@ -1,4 +1,7 @@
+import ast
 import re
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 
@@ -7,12 +10,14 @@ from splatpilot.diagrams.flight.flight import Outcome
 README = Path(__file__).parents[1] / "README.md"
 
 
-def test_the_policy_and_the_flight_in_python_run(capsys):
+def test_the_policy_and_the_flight_in_python_run(tmp_path):
     policy, flight = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
-    names: dict = {"__name__": "my_policy"}
-    exec(policy, names)
-    exec(flight, names)
-    summary = eval(capsys.readouterr().out)
+    (tmp_path / "my_policy.py").write_text(policy)
+    (tmp_path / "flight.py").write_text("from my_policy import *\n" + flight)
+    flown = subprocess.run(
+        [sys.executable, "flight.py"], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    summary = ast.literal_eval(flown.stdout)
     assert summary["outcome"] in set(Outcome) and summary["path_length_m"] > 1.0
 
 

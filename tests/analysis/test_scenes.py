@@ -55,7 +55,7 @@ def test_a_scene_is_made_once_and_measured_again(opengl, tmp_path, capsys, monke
     (room / "metrics.json").unlink()
     capsys.readouterr()
     scenes.run(**arguments)
-    assert "is rendered already" in capsys.readouterr().out
+    assert "is complete already" in capsys.readouterr().out
     assert (room / "metrics.json").is_file()
     scenes.run(**arguments)
     assert "is reconstructed already" in capsys.readouterr().out

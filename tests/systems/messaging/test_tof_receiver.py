@@ -69,7 +69,7 @@ def test_what_is_of_no_use_is_counted_and_harms_nothing(caplog):
     np.testing.assert_array_equal(sensor.out("depth_grid"), np.full(144, 0.5))
     assert sensor.out("rejected")[0] == 7
     assert len(caplog.records) == 3
-    assert "rejected, 4 so far: the packet of a grid has 591 bytes" in caplog.text
+    assert "rejected, 4 so far: packet of a grid must be 592 bytes" in caplog.text
 
 
 def test_a_sensor_that_starts_again_is_received_again():

@@ -49,7 +49,7 @@ def test_video_that_its_writer_broke_is_not_kept(recorder_after_one_second, tmp_
                 yield pictures
 
     monkeypatch.setattr(recorder_after_one_second, "frames", seven)
-    with pytest.raises(OSError, match=r"video\.mp4: cannot be written \(7 of 10 pictures"):
+    with pytest.raises(OSError, match=r"video\.mp4: cannot be written \(only 7 of 10 images"):
         recorder_after_one_second.save(path, max_depth=20.0)
     assert path.read_bytes() == before
     assert list(tmp_path.iterdir()) == [path]
