@@ -39,13 +39,14 @@ _COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#0
 _MARKERS = "osD^vP*X"
 _OBSTACLE, _BLOCKED = "#5b5f66", "#d9dbde"
 _SPACING = 0.05  # [m], of samples of the distance field
+_LEGEND_COLUMNS = 4
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #1c1e21; max-width: 1360px; margin: 2em auto;
        padding: 0 1em; }
 h1 { font-size: 1.7em; } h2 { font-size: 1.25em; margin-top: 2em; }
-table { display: block; overflow-x: auto; border-collapse: collapse;
+table { display: block; overflow-x: auto; border-collapse: collapse; font-size: 14px;
         font-variant-numeric: tabular-nums; margin: .6em 0; }
-th, td { padding: .25em .5em; white-space: nowrap; text-align: right;
+th, td { padding: .25em .4em; white-space: nowrap; text-align: right;
          border-bottom: 1px solid #e3e5e8; }
 th:first-child, td:first-child { text-align: left; }
 th { background: #f4f5f7; font-weight: 600; white-space: normal; }
@@ -375,7 +376,8 @@ def draw_trajectories(
         title: of the figure.
     """
     extent = world.distance_field.upper_W - world.distance_field.lower_W
-    height = float(np.clip(9.0 * extent[1] / extent[0], 2.5, 9.0)) + 0.9
+    legend_rows = math.ceil(len(flights) / _LEGEND_COLUMNS)
+    height = float(np.clip(9.0 * extent[1] / extent[0], 2.5, 9.0)) + 0.8 + 0.25 * legend_rows
     figure = Figure(figsize=(9.0, height), layout="constrained")
     axes = figure.subplots()
     _draw_field(axes, world, float(p_WG[2]))
@@ -388,8 +390,7 @@ def draw_trajectories(
     axes.plot(*p_WG[:2], "*", color="black", ms=13, zorder=5)
     axes.set(xlabel="x [m]", ylabel="y [m]", title=title)
     if flights:
-        position = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.12)}
-        axes.legend(frameon=False, ncols=len(flights), **position)
+        figure.legend(frameon=False, loc="outside lower center", ncols=_LEGEND_COLUMNS)
     return figure
 
 
