@@ -30,11 +30,11 @@ class Agreement(NamedTuple):
     """Agreement of a flight with its record."""
 
     exact: bool
-    """Whether they are bitwise identical."""
+    """True if both are bitwise identical."""
     deviation: float
     """[m], maximum distance at the same time."""
     outcome: str
-    """Of this flight."""
+    """Outcome of the flight, not of its record."""
 
 
 def run(

@@ -133,7 +133,7 @@ def add_overwrite(parser: argparse.ArgumentParser) -> None:
 
 
 class FailureWithResultError(ValueError):
-    """A failure of which there is something to print nevertheless, with `--json`."""
+    """A failure with a result that `--json` prints."""
 
     def __init__(self, message: str, result: Any) -> None:
         super().__init__(message)
@@ -204,7 +204,7 @@ _KINDS = {
     "map": ("an OctoMap", _FLY),
     "scenario": ("a scenario", "fly it with `splatpilot fly --scenario {path}`"),
 }
-"""What may be named as an environment, and what to do with it."""
+"""Kinds of environments: their name, and the command that uses one."""
 
 
 def check_policy(variant: Variant) -> None:
@@ -354,7 +354,7 @@ def add_scenario(parser: argparse.ArgumentParser) -> None:
         "--scene",
         type=Path,
         metavar="DIR_OR_FILE",
-        help="fly in this scene folder, file of Gaussians (PLY, SPZ, .splat; metres, z up) or "
+        help="fly in this scene folder, file of Gaussians (PLY, SPZ, .splat; meters, z up) or "
         "OctoMap (.bt)",
     )
     parser.add_argument("--seed", type=int, help="seed of the world and the start")
@@ -408,8 +408,7 @@ def read_scenario(options: argparse.Namespace) -> "Scenario":
 
 
 def name_of_flight(options: argparse.Namespace, scenario: "Scenario") -> str:
-    """What a flight is called, as in a study: after its scenario, or else its scene or its world,
-    its policy, its speed and its seed."""
+    """Names a flight by its scenario, scene or world, policy, speed and seed, as studies do."""
     from splatpilot.analysis.benchmark.study import flight_name
     from splatpilot.diagrams.flight.policies import name_of, speed_of
 

@@ -12,7 +12,7 @@ from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
 from splatpilot.systems.common.drake import input_port
-from splatpilot.systems.common.validation import Config, bounded, require_field
+from splatpilot.systems.common.validation import Config, bounded
 from splatpilot.systems.policies.observations import require_poolable
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.vehicle.state import QuadrotorState, pose_from_state
@@ -51,11 +51,6 @@ class LearnedPolicyConfig(Config):
 
     def check(self) -> None:
         require_poolable(self.camera.height, self.camera.width, *self.image_size)
-
-
-def require_speed(config: Any) -> None:
-    """Checks the nominal speed of a learned policy."""
-    require_field(config, "speed", 0.1 <= config.speed <= 10.0, "in [0.1, 10] m/s")
 
 
 class Policy(LeafSystem):
