@@ -1,4 +1,4 @@
-"""A sheet of samples of a corpus: colour and depth, with the labels drawn over them."""
+"""A sheet of samples of a corpus: color and depth, with the labels drawn over them."""
 
 from pathlib import Path
 

@@ -100,7 +100,7 @@ def march(
     field: DistanceField, p_W: NDArray, way: NDArray, radius: float, longest: float
 ) -> NDArray:
     """How far (N,) [m] a ball of `radius` flies from p_W (N, 3) along the unit vectors `way` (N, 3)
-    until it touches a surface or its centre leaves the bounds, at most `longest`, by sphere
+    until it touches a surface or its center leaves the bounds, at most `longest`, by sphere
     tracing."""
     flown, going = np.zeros(len(p_W)), np.arange(len(p_W))
     for _ in range(200):
@@ -191,7 +191,7 @@ def traversability(field: DistanceField, rng: np.random.Generator, samples: int 
 
 
 def relative_gap_size(field: DistanceField, height: float) -> float:
-    """Mean gap between an obstacle and its nearest neighbour, in diameters of the vehicle.
+    """Mean gap between an obstacle and its nearest neighbor, in diameters of the vehicle.
 
     AvoidBench's obstacles stand upright; here they are the connected parts of what is occupied in
     the slice z = `height` [m], on a grid of 0.1 m, with everything thinner than a cell grown to
@@ -218,8 +218,8 @@ def traversability_obstacle(field: DistanceField, path: NDArray) -> float:
     """FlightBench's TO: (R / 2N) sum of 1 / r_i over the N narrower half of the balls of a corridor
     along the path (K, 3) [m]; R is the sensing range. High is hard.
 
-    A ball's radius is the clearance at its centre, 5 cm to R. Each is about the place where the
-    path leaves the ball before. FlightBench draws 40 centres about it at random and takes the best;
+    A ball's radius is the clearance at its center, 5 cm to R. Each is about the place where the
+    path leaves the ball before. FlightBench draws 40 centers about it at random and takes the best;
     here they are the 52 at 0.25 and 0.5 m from it in fixed directions: a path has one value.
     """
     points = resampled(path, 0.05)

@@ -3,7 +3,7 @@
     python benchmarks/rollouts.py [--flights 8]
 
 Prints the real-time factor of flights through the default forest: without images (the planner),
-with depth images alone (the reactive policy, and DiffAero in P02), and with colour and depth at
+with depth images alone (the reactive policy, and DiffAero in P02), and with color and depth at
 320x240 and 15 Hz. Then the rollouts per minute of one and of two worker processes, on the same
 flights. Run it on an idle machine: factors are of wall time, the best of three; CPU time is given
 beside them.
@@ -34,7 +34,7 @@ def time_policies(repeats: int = 3) -> None:
         ("planner, no images", forest, "planner", False),
         ("reactive, depth 64x36 at 15 Hz", forest, "reactive", False),
         ("diffaero in P02, depth 64x36 at 15 Hz", p02, "diffaero", False),
-        ("planner, colour 320x240 at 15 Hz", forest, "planner", True),
+        ("planner, color 320x240 at 15 Hz", forest, "planner", True),
     ):
         world = make_world(scenario.world, scenario.seed)
         scenario.policy = policy_named(policy)

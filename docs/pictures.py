@@ -35,7 +35,7 @@ Picture = np.ndarray  # (H, W, 3) uint8, red first
 
 
 def frames(video: Path) -> list[Picture]:
-    """All frames of a flight's video, colour beside depth."""
+    """All frames of a flight's video, color beside depth."""
     stream, found = cv2.VideoCapture(str(video)), []
     while (read := stream.read())[0]:
         found.append(read[1][..., ::-1])
@@ -45,7 +45,7 @@ def frames(video: Path) -> list[Picture]:
 
 
 def moments(video: Path, out: Path) -> None:
-    """Three moments of a flight, colour above depth."""
+    """Three moments of a flight, color above depth."""
     shown = frames(video)
     columns = [
         np.vstack(np.hsplit(shown[round(part * (len(shown) - 1))], 2)) for part in (0.25, 0.5, 0.75)
@@ -54,7 +54,7 @@ def moments(video: Path, out: Path) -> None:
 
 
 def moving(video: Path, out: Path) -> None:
-    """A whole flight, colour beside depth, in every third of its pictures."""
+    """A whole flight, color beside depth, in every third of its pictures."""
     rate = cv2.VideoCapture(str(video)).get(cv2.CAP_PROP_FPS) / 3
     first, *others = [Image.fromarray(shrunk(frame, 800)) for frame in frames(video)[::3]]
     first.save(out, save_all=True, append_images=others, duration=1000 / rate, loop=0, quality=50)

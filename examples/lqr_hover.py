@@ -1,4 +1,4 @@
-"""LQR about hover: the quadrotor is a Drake plant, so Drake linearises it and finds the gains.
+"""LQR about hover: the quadrotor is a Drake plant, so Drake linearizes it and finds the gains.
 
     python examples/lqr_hover.py
 
@@ -39,7 +39,7 @@ def main(seconds: float) -> None:
     log = LogVectorOutput(plant.get_output_port(), builder, 0.02)
     simulator = Simulator(builder.Build())
 
-    # A metre away, moving, tilted by 30 degrees and turned by 40: the rest is linear control.
+    # A meter away, moving, tilted by 30 degrees and turned by 40: the rest is linear control.
     state = sp.hover_state(p_WG + np.array([1.0, -0.5, 0.3]))
     state[3:6] = [0.0, 1.0, 0.0]
     state[6:10] = RollPitchYaw(np.deg2rad([30.0, 0.0, 40.0])).ToQuaternion().wxyz()

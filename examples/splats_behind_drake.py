@@ -50,7 +50,7 @@ def main(out: Path, width: int, seconds: float) -> None:
     # Optical axes (x right, y down, z forward) of a camera that looks along x of the world.
     R_WC = RotationMatrix(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]))
     X_WC = RigidTransform(R_WC, world.p_WS)
-    sees = DepthRenderCamera(core, DepthRange(0.1, 20.0))  # and colours, by the same camera
+    sees = DepthRenderCamera(core, DepthRange(0.1, 20.0))  # and colors, by the same camera
     camera = builder.AddSystem(RgbdSensor(SceneGraph.world_frame_id(), X_WC, sees))
     builder.Connect(scene_graph.get_query_output_port(), camera.query_object_input_port())
     simulator = Simulator(builder.Build())

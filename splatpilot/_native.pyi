@@ -20,7 +20,7 @@ def scene_is_valid(renderer: Renderer, *, means: Annotated[NDArray[numpy.float32
 
 def first_zero_quaternion(quats: Annotated[NDArray[numpy.float32], dict(shape=(None, 4), order='C', device='cpu', writable=False)]) -> int:
     """
-    Index of the first quaternion too short or too long to be normalised, or -1.
+    Index of the first quaternion too short or too long to be normalized, or -1.
     """
 
 class DepthMode(enum.Enum):
@@ -66,7 +66,7 @@ def projected(renderer: Renderer, frame: Frame, opacities: Annotated[NDArray[num
 
 def render(renderer: Renderer, *, means: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], quats: Annotated[NDArray[numpy.float32], dict(shape=(None, 4), order='C', device='cpu', writable=False)], scales: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], opacities: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], colors: Annotated[NDArray[numpy.float32], dict(shape=(None, None, 3), order='C', device='cpu', writable=False)], sh_degree: int, K: Annotated[NDArray[numpy.float64], dict(shape=(3, 3), order='C', device='cpu', writable=False)], X_CW: Annotated[NDArray[numpy.float64], dict(shape=(4, 4), order='C', device='cpu', writable=False)], width: int, height: int, near_plane: float, far_plane: float, radius_clip: float, eps2d: float, antialiased: bool, depth_mode: DepthMode, background: Annotated[NDArray[numpy.float32], dict(shape=(3), order='C', device='cpu', writable=False)], image: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')], alpha: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')], keep: bool) -> Frame:
     """
-    Writes colour (3 channels), depth (1) or both (4) by the shape of image, and alpha. With
+    Writes color (3 channels), depth (1) or both (4) by the shape of image, and alpha. With
     keep, a backward pass can start from the frame.
     """
 
@@ -79,7 +79,7 @@ def raster_backward(renderer: Renderer, frame: Frame, *, v_image: Annotated[NDAr
 def project_backward(renderer: Renderer, frame: Frame, *, means: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], quats: Annotated[NDArray[numpy.float32], dict(shape=(None, 4), order='C', device='cpu', writable=False)], scales: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], opacities: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], colors: Annotated[NDArray[numpy.float32], dict(shape=(None, None, 3), order='C', device='cpu', writable=False)], sh_degree: int, v_splats: Annotated[NDArray[numpy.float32], dict(shape=(None, 16), order='C', device='cpu', writable=False)], v_means2d: Annotated[NDArray[numpy.float32], dict(shape=(None, 2), order='C', device='cpu', writable=False)], v_means: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu')], v_quats: Annotated[NDArray[numpy.float32], dict(shape=(None, 4), order='C', device='cpu')], v_scales: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu')], v_opacities: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu')], v_colors: Annotated[NDArray[numpy.float32], dict(shape=(None, None, 3), order='C', device='cpu')], overwrite: bool, overwrite_colors: bool) -> Annotated[NDArray[numpy.float64], dict(shape=(5, 3))]:
     """
     Adds to, or overwrites, the gradients of the frame's Gaussians. Returns (5, 3) those by
-    R_CW with the camera's centre held, by p_C and by p_W - centre, summed over Gaussians.
+    R_CW with the camera's center held, by p_C and by p_W - center, summed over Gaussians.
     """
 
 class BakedScene:
@@ -91,11 +91,11 @@ class BakedScene:
     def count(self) -> int: ...
 
     def recolored(self, sh: Annotated[NDArray[numpy.float32], dict(shape=(None, None, 3), order='C', device='cpu', writable=False)], sh_degree: int) -> BakedScene:
-        """The same Gaussians in other colours."""
+        """The same Gaussians in other colors."""
 
 def render_baked(scene: BakedScene, renderer: Renderer, *, means: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], quats: Annotated[NDArray[numpy.float32], dict(shape=(None, 4), order='C', device='cpu', writable=False)], scales: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], opacities: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)], sh: Annotated[NDArray[numpy.float32], dict(shape=(None, None, 3), order='C', device='cpu', writable=False)], sh_degree: int, K: Annotated[NDArray[numpy.float64], dict(shape=(3, 3), order='C', device='cpu', writable=False)], X_CW: Annotated[NDArray[numpy.float64], dict(shape=(4, 4), order='C', device='cpu', writable=False)], width: int, height: int, near_plane: float, far_plane: float, eps2d: float, background: Annotated[NDArray[numpy.float32], dict(shape=(3), order='C', device='cpu', writable=False)], color: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')] | None, depth: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')], alpha: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')] | None, max_depth: float, distortion: int, lens: Annotated[NDArray[numpy.float64], dict(shape=(13), order='C', device='cpu', writable=False)]) -> None:
     """
-    Writes the median depth, and unless they are None colour and alpha, of the scene and of
+    Writes the median depth, and unless they are None color and alpha, of the scene and of
     Gaussians among it.
     """
 
@@ -145,9 +145,9 @@ class ShapeWorlds:
 
     def __init__(self, *, shapes: Annotated[NDArray[numpy.float32], dict(shape=(None, 15), order='C', device='cpu', writable=False)], kinds: Annotated[NDArray[numpy.uint8], dict(shape=(None,), order='C', device='cpu', writable=False)], first: Annotated[NDArray[numpy.int64], dict(shape=(None,), order='C', device='cpu', writable=False)], threads: int = 1, simd: str = '') -> None:
         """
-        World w has the rows first[w] to first[w + 1]. A row holds, by its kind: 0 centre and
-        radius of a sphere; 1 end, axis, length and radius of a capsule; 2 centre, axis, half
-        length and radius of a cylinder; 3 centre, rotation and half sizes of a box; 4 normal
+        World w has the rows first[w] to first[w + 1]. A row holds, by its kind: 0 center and
+        radius of a sphere; 1 end, axis, length and radius of a capsule; 2 center, axis, half
+        length and radius of a cylinder; 3 center, rotation and half sizes of a box; 4 normal
         and offset of a half space.
         """
 

@@ -12,7 +12,7 @@ UPPER_N = np.array([6.0, 1.5, 0.0])
 
 
 def room_color(p_N: np.ndarray) -> np.ndarray:
-    """Colour (..., 3), 0 to 1, of the points (..., 3) on the walls: broad coloured waves."""
+    """Color (..., 3), 0 to 1, of the points (..., 3) on the walls: broad colored waves."""
     north, east, down = np.moveaxis(p_N, -1, 0)
     return np.stack(
         [
@@ -32,7 +32,7 @@ def tiled_color(p_N: np.ndarray) -> np.ndarray:
 
 
 def trace_room(p_N: np.ndarray, R_NB: np.ndarray, width: int, height: int, color_at=room_color):
-    """Depth (H, W) [m] along the body's x axis and colour (H, W, 3) of the room from inside."""
+    """Depth (H, W) [m] along the body's x axis and color (H, W, 3) of the room from inside."""
     f = width / 2
     v, u = np.mgrid[0:height, 0:width] + 0.5
     d_B = np.stack([np.ones_like(u), (u - width / 2) / f, (v - height / 2) / f], axis=-1)
@@ -71,7 +71,7 @@ def write_room_capture(
     brightness: Callable[[int, np.ndarray], np.ndarray] = lambda i, rho_squared: np.ones(1),
     color_at: Callable[[np.ndarray], np.ndarray] = room_color,
 ) -> Path:
-    """Writes the room, coloured as `color_at` says, as a TartanAir V1 sequence, image i times
+    """Writes the room, colored as `color_at` says, as a TartanAir V1 sequence, image i times
     brightness(i, (H, W) rho^2)."""
     (path / "image_left").mkdir(parents=True)
     (path / "depth_left").mkdir()

@@ -215,8 +215,8 @@ def chunks[Payload](
     flights: Iterable[tuple[RolloutSpec, Payload]], size: int
 ) -> Iterator[list[tuple[RolloutSpec, Payload]]]:
     """Yields chunks of at most `size` neighbors through the same world."""
-    for _, neighbours in itertools.groupby(flights, lambda f: (f[0].scenario, f[0].seed)):
-        yield from map(list, itertools.batched(neighbours, size))
+    for _, neighbors in itertools.groupby(flights, lambda f: (f[0].scenario, f[0].seed)):
+        yield from map(list, itertools.batched(neighbors, size))
 
 
 def _flight_timing(diagram: Diagram, scenario: Scenario, flight: Flight) -> dict[str, float]:

@@ -78,7 +78,7 @@ def _add_inspect(actions: argparse._SubParsersAction) -> None:
         "inspect",
         _inspect,
         help="draw samples with their trajectories, and check every byte",
-        description="Reads a whole corpus, checks every byte of it, and draws some samples: colour "
+        description="Reads a whole corpus, checks every byte of it, and draws some samples: color "
         "above depth, with the trajectories over both.",
         examples=(
             "corpus inspect out/corpus --out sheet.png",

@@ -37,7 +37,7 @@ def add_to(verbs: argparse._SubParsersAction) -> None:
         help="folder of a capture, a mesh (.glb, .gltf, .obj), or a scenario: P01 or a file",
     )
     reconstruct.add_argument("--out", type=Path, required=True, help="scene folder to write")
-    reconstruct.add_argument("--iterations", type=int, help="optimisation steps")
+    reconstruct.add_argument("--iterations", type=int, help="optimization steps")
     reconstruct.add_argument(
         "--up", choices=("y", "z"), help="axis of the mesh file that points up"
     )

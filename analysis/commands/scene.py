@@ -44,7 +44,7 @@ def _add_scale(verbs: argparse._SubParsersAction) -> None:
         help="give a scene its size: by a factor, a measured length, or the cameras' height",
         description="Writes the scene anew with all its lengths times one factor. A scene of "
         "photographs alone, whose scale is unknown, can be flown in then. Of a file of "
-        "Gaussians it writes a PLY in metres with z up.",
+        "Gaussians it writes a PLY in meters with z up.",
         examples=(
             "scene scale scenes/room --out scenes/room_metric --height 1.5",
             "scene scale scenes/room --out scenes/room_metric --between 0,0,1 2,0,1 --distance 3.2",
@@ -81,7 +81,7 @@ def _add_scale(verbs: argparse._SubParsersAction) -> None:
 
 def _scale(options: argparse.Namespace) -> None:
     if (options.between is None) != (options.distance is None):
-        raise ValueError("--between and --distance belong together: two points and the metres")
+        raise ValueError("--between and --distance belong together: two points and the meters")
     given = options.factor, options.between, options.height, options.up, options.floor
     if all(each is None for each in given):
         raise ValueError("what is its size? Give --factor, --between with --distance, or --height")

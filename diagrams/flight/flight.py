@@ -106,7 +106,7 @@ class Flight:
     # (M, size) One row a plan, its time first; see splatpilot.systems.policies.hypotheses; (0, 0)
     # without plans.
     hypotheses: np.ndarray
-    wall_time: float  # [s] that the simulation took after its initialisation
+    wall_time: float  # [s] that the simulation took after its initialization
     reason: str = ""  # of the outcome `ERROR`: when and where which exception was raised
 
     def summary(self) -> dict[str, float | str]:

@@ -1,4 +1,4 @@
-"""How else a world might look: other paint, light, exposure and sky, as functions of its colours.
+"""How else a world might look: other paint, light, exposure and sky, as functions of its colors.
 
 Of the geometry nothing changes: means, shapes and opacities of the Gaussians stay.
 """
@@ -14,8 +14,8 @@ from splatpilot.systems.collision.esdf import interpolate_grid
 from splatpilot.systems.splats.background import Background, EnvironmentMap
 from splatpilot.systems.splats.scene import GaussianScene, color_to_sh
 
-_PAINT = 0.35  # sRGB, largest change of a colour of paint
-_PAINTS = 4  # along each axis of the colour cube
+_PAINT = 0.35  # sRGB, largest change of a color of paint
+_PAINTS = 4  # along each axis of the color cube
 _TINT = 0.25  # natural logarithm of the light's red, green and blue, over the mean
 _EXPOSURE = -1.0, 0.5  # [EV], least and greatest: brighter ones would burn out
 _HUE = 1.0  # [rad]
@@ -24,12 +24,12 @@ _RELIEF = 0.6  # part of the light that comes from one direction
 _MOTTLE = 0.15  # relative, of brightness over space
 _SHORTEST, _LONGEST = 0.5, 5.0  # [m], wavelengths of the mottling
 _WAVES = 5
-_SKY = 0.7  # part of another colour in the background
+_SKY = 0.7  # part of another color in the background
 _AT_ONCE = 16384  # Gaussians: what they take meanwhile stays in the cache
 _LOOKS = 7  # tells the looks of flights from what else a flight's seed draws
 
-_GREY = np.full((3, 3), 1 / 3)
-_TURN = np.array([[0, -1, 1], [1, 0, -1], [-1, 1, 0]]) / np.sqrt(3)  # about the axis of greys
+_GRAY = np.full((3, 3), 1 / 3)
+_TURN = np.array([[0, -1, 1], [1, 0, -1], [-1, 1, 0]]) / np.sqrt(3)  # about the axis of grays
 
 Array = NDArray[np.float32]
 
@@ -38,7 +38,7 @@ Array = NDArray[np.float32]
 class Appearance:
     """One look, drawn by `draw_appearance`."""
 
-    paint: Array  # (4, 4, 4, 3) added to sRGB colours, a grid over their cube
+    paint: Array  # (4, 4, 4, 3) added to sRGB colors, a grid over their cube
     exposure: float  # factor of linear light
     mixing: Array  # (3, 3) of linear red, green, blue: tint, hue and saturation
     light_W: Array  # (3,) unit vector to the light
@@ -58,8 +58,8 @@ def draw_appearance(rng: np.random.Generator, strength: float) -> Appearance:
     paint = uniform(_PAINT, (*[_PAINTS] * 3, 3))
     tint = np.exp(uniform(_TINT, (3,)))
     angle, saturation = uniform(_HUE), np.exp(uniform(_SATURATION))
-    colorful = np.eye(3) - _GREY
-    hue = _GREY + saturation * (np.cos(angle) * colorful + np.sin(angle) * _TURN)
+    colorful = np.eye(3) - _GRAY
+    hue = _GRAY + saturation * (np.cos(angle) * colorful + np.sin(angle) * _TURN)
     light = rng.normal(size=3)
     waves = rng.normal(size=(_WAVES, 4))
     waves[:, :3] /= np.linalg.norm(waves[:, :3], axis=1, keepdims=True)
@@ -87,16 +87,16 @@ def seen_otherwise(world: World, strength: float, seed: int) -> World:
 
 
 def with_appearance(world: World, look: Appearance) -> World:
-    """The same world, seen otherwise. What moves in it keeps its colours."""
+    """The same world, seen otherwise. What moves in it keeps its colors."""
     return world.recolored(
         recolored(world.gaussians, look), recolored_background(world.background, look)
     )
 
 
 def recolored(scene: GaussianScene, look: Appearance) -> GaussianScene:
-    """The same Gaussians in other colours.
+    """The same Gaussians in other colors.
 
-    Each is one piece of paint: its colour without view dependence is repainted and relit, and the
+    Each is one piece of paint: its color without view dependence is repainted and relit, and the
     view dependence grows or shrinks with its brightness.
     """
     before, normals = scene.base_colors, scene.normals  # (N, 3)
@@ -129,7 +129,7 @@ def recolored_background(background: Background, look: Appearance) -> Background
 
 
 def _paint(colors: Array, look: Appearance) -> Array:
-    """What is added to sRGB colours (N, 3): alike for alike ones, so that a material stays one."""
+    """What is added to sRGB colors (N, 3): alike for alike ones, so that a material stays one."""
     spacing = 1 / (_PAINTS - 1)
     lower = np.full(3, -0.5 * spacing)
     grids = np.moveaxis(look.paint, -1, 0).copy()
@@ -148,5 +148,5 @@ def _light(means: Array, normals: Array, look: Appearance) -> Array:
 
 
 def _developed(linear: NDArray) -> Array:
-    """The sRGB colours of linear light."""
+    """The sRGB colors of linear light."""
     return (np.clip(linear, 0, 1) ** (1 / GAMMA)).astype(np.float32)

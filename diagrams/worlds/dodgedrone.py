@@ -38,7 +38,7 @@ class Group:
     """Obstacles of one distribution."""
 
     count: int
-    lower: Triple  # [m], corners of the region of their centres
+    lower: Triple  # [m], corners of the region of their centers
     upper: Triple
     diameters: tuple[float, float]  # [m], least and largest
     speed: Triple = (0.0, 0.0, 0.0)  # [m/s], largest along each axis at first; zero: static

@@ -220,7 +220,7 @@ def walls_spec(config: WallsConfig, seed: int) -> WorldSpec:
     """Builds the hall of `config`.
 
     `big_wall` leaves a gap at either side of one wall, one of them wider; `u_trap` opens a
-    cul-de-sac towards the start; the walls of `slits` have one slit each, well aside of the last;
+    cul-de-sac toward the start; the walls of `slits` have one slit each, well aside of the last;
     those of `slalom` leave a gap at one side and the other in turn.
     """
     config.validate()

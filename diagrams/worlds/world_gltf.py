@@ -20,7 +20,7 @@ def write_gltf(spec: WorldSpec, path: Path, texel: float = 0.02) -> None:
     """Writes the world of a spec as one self-contained .gltf file.
 
     Its light is baked into the pictures, which are emitted as they are: an engine shows the same
-    colours whatever lamps it has. The file is y-up, as glTF is: W's (x, y, z) is its (x, z, -y).
+    colors whatever lamps it has. The file is y-up, as glTF is: W's (x, y, z) is its (x, z, -y).
     Drake's render engines turn glTF's y up to z themselves: there it stands in W at the identity.
 
     Args:

@@ -62,7 +62,7 @@ struct GaussianGradients {
   bool overwrite, overwrite_colors;
 };
 
-// dL/dR_CW with the centre held (9, row-major), dL/dp_C (3) and dL/d(p_W - centre) by way of
+// dL/dR_CW with the center held (9, row-major), dL/dp_C (3) and dL/d(p_W - center) by way of
 // spherical harmonics alone (3), summed over Gaussians.
 struct PoseSums {
   double values[15];

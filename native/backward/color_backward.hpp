@@ -6,7 +6,7 @@
 
 namespace splatpilot::SIMD_LEVEL {
 
-// Adds to rows of dL/dcolors and returns dL/d(p_W - centre), which is zero without spherical
+// Adds to rows of dL/dcolors and returns dL/d(p_W - center), which is zero without spherical
 // harmonics. `color_gradient` is zero where a color is held at 0.
 SP_INLINE Vector16 colors_backward(const GaussianArrays& g, const uint32_t* indices, int lanes,
                                    const Vector16& d_W, const F16 color_gradient[3],

@@ -126,7 +126,7 @@ struct PoseGradientPack {
     R[0] = R[1] = R[2] = p_C = direction = zero;
   }
 
-  // From the gradients of p_C and, by way of colors, of d_W = p_W - centre.
+  // From the gradients of p_C and, by way of colors, of d_W = p_W - center.
   SP_INLINE void add(const Vector16& by_p_C, const Vector16& d_W, const Vector16& by_direction) {
     R[0] = R[0] + by_p_C.x * d_W;
     R[1] = R[1] + by_p_C.y * d_W;
@@ -193,7 +193,7 @@ inline void project_backward(const GaussianArrays& g, const Camera& camera, cons
     gather_splats(splats + first, gradients + first, means2d + 2 * first, lanes, g.sh_degree >= 0,
                   indices, s);
     const GatheredGaussians in = gather_gaussians(g, indices);
-    const Vector16 d_W = from_centre(camera, in.mean.x, in.mean.y, in.mean.z);
+    const Vector16 d_W = from_center(camera, in.mean.x, in.mean.y, in.mean.z);
     const Vector16 p_C = to_camera(camera, d_W);
     const F16 inverse_z = F16(1.0f) / p_C.z;
     const F16 unit[3] = {F16(1.0f), F16(1.0f), F16(1.0f)};

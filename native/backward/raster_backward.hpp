@@ -17,7 +17,7 @@ struct BlockRecord {
 };
 
 struct BlockBackward {
-  LaneCentres pixel;
+  LaneCenters pixel;
   F16 transmittance;
   F16 red, green, blue, depth, alpha;  // dL/d of what the pixel shows
   F16 behind;
@@ -144,12 +144,12 @@ size_t raster_tile_backward_channels(const RasterInput& in, const StageReader& r
   const int left = tile % in.tiles_x * kTileSize, top = tile / in.tiles_x * kTileSize;
   const size_t first = in.tile_offsets[tile], last = in.tile_offsets[tile + 1];
   const size_t stages = record.stages_done[tile];
-  const LaneCentres centres = lane_centres();
+  const LaneCenters centers = lane_centers();
   F16 inside[kBlocksPerTile];
   for (int b = 0; b < kBlocksPerTile; ++b) {
     const int block_left = kBlockSize * (b % 4), block_top = kBlockSize * (b / 4);
-    inside[b] = ones_inside(in.width, in.height, centres, left, top, b);
-    s.blocks[b].pixel = block_centres(centres, b);
+    inside[b] = ones_inside(in.width, in.height, centers, left, top, b);
+    s.blocks[b].pixel = block_centers(centers, b);
     load_block<kColor, kDepth>(in, g, left + block_left, top + block_top, s.blocks[b]);
   }
 

@@ -31,7 +31,7 @@ void render_baked(const BakedScene& scene, Renderer& renderer, const Means& mean
                   const Output& depth, const std::optional<Output>& alpha, double max_depth,
                   int distortion, const Doubles<nb::shape<13>>& lens) {
   require(sh_degree >= 0, "moving Gaussians need spherical harmonics");
-  require(color.has_value() == alpha.has_value(), "colour and alpha are rendered together");
+  require(color.has_value() == alpha.has_value(), "color and alpha are rendered together");
   const GaussianArrays moving = gaussian_arrays(means, quats, scales, opacities, sh, sh_degree);
   CameraParameters parameters = camera_parameters(K, X_CW, width, height, near_plane, far_plane,
                                                   0.0, color ? eps2d : kDepthBlur);
@@ -69,17 +69,17 @@ void bind_baked(nb::module_& m) {
           "recolored",
           [](const BakedScene& scene, const Colors& sh, int sh_degree) {
             const int coefficients = static_cast<int>(sh.shape(1));
-            require(sh.shape(0) == scene.count(), "there must be as many colours as Gaussians");
+            require(sh.shape(0) == scene.count(), "there must be as many colors as Gaussians");
             require(sh_degree >= 0 && coefficients >= (sh_degree + 1) * (sh_degree + 1),
                     "too few spherical-harmonic coefficients for the degree");
             return BakedScene(scene, sh.data(), coefficients, sh_degree);
           },
-          "sh"_a, "sh_degree"_a, "The same Gaussians in other colours.");
+          "sh"_a, "sh_degree"_a, "The same Gaussians in other colors.");
   m.def("render_baked", &render_baked, "scene"_a, "renderer"_a, nb::kw_only(), "means"_a, "quats"_a,
         "scales"_a, "opacities"_a, "sh"_a, "sh_degree"_a, "K"_a, "X_CW"_a, "width"_a, "height"_a,
         "near_plane"_a, "far_plane"_a, "eps2d"_a, "background"_a, "color"_a.none(), "depth"_a,
         "alpha"_a.none(), "max_depth"_a, "distortion"_a, "lens"_a,
-        "Writes the median depth, and unless they are None colour and alpha, of the scene and of\n"
+        "Writes the median depth, and unless they are None color and alpha, of the scene and of\n"
         "Gaussians among it.");
 }
 

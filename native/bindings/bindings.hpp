@@ -128,7 +128,7 @@ inline Image output_image(const Output& image, const Output& alpha, const Camera
 template <typename T, nb::ssize_t... kShape>
 using OwnedArray = nb::ndarray<nb::numpy, T, nb::shape<kShape...>>;
 
-// `n` takes the place of -1. The values are not initialised.
+// `n` takes the place of -1. The values are not initialized.
 template <typename T, nb::ssize_t... kShape>
 OwnedArray<T, kShape...> new_array(size_t n = 0) {
   const size_t shape[] = {(kShape == -1 ? n : static_cast<size_t>(kShape))...};

@@ -168,7 +168,7 @@ NB_MODULE(_native, m) {
         }
         return -1;
       },
-      "quats"_a, "Index of the first quaternion too short or too long to be normalised, or -1.");
+      "quats"_a, "Index of the first quaternion too short or too long to be normalized, or -1.");
 
   nb::enum_<DepthMode>(m, "DepthMode", "What the depth of a pixel is.")
       .value("ACCUMULATED", DepthMode::kAccumulated, "sum w z")
@@ -198,7 +198,7 @@ NB_MODULE(_native, m) {
         "opacities"_a, "colors"_a, "sh_degree"_a, "K"_a, "X_CW"_a, "width"_a, "height"_a,
         "near_plane"_a, "far_plane"_a, "radius_clip"_a, "eps2d"_a, "antialiased"_a, "depth_mode"_a,
         "background"_a, "image"_a, "alpha"_a, "keep"_a,
-        "Writes colour (3 channels), depth (1) or both (4) by the shape of image, and alpha. With\n"
+        "Writes color (3 channels), depth (1) or both (4) by the shape of image, and alpha. With\n"
         "keep, a backward pass can start from the frame.");
   m.def("raster_backward", &raster_backward, "renderer"_a, "frame"_a, nb::kw_only(), "v_image"_a,
         "v_alpha"_a, "image"_a, "alpha"_a, "background"_a, "expected_depth"_a, "v_splats"_a,
@@ -210,7 +210,7 @@ NB_MODULE(_native, m) {
         "v_means2d"_a, "v_means"_a, "v_quats"_a, "v_scales"_a, "v_opacities"_a, "v_colors"_a,
         "overwrite"_a, "overwrite_colors"_a,
         "Adds to, or overwrites, the gradients of the frame's Gaussians. Returns (5, 3) those by\n"
-        "R_CW with the camera's centre held, by p_C and by p_W - centre, summed over Gaussians.");
+        "R_CW with the camera's center held, by p_C and by p_W - center, summed over Gaussians.");
 
   bind_baked(m);
   bind_surfels(m);

@@ -22,7 +22,7 @@ using Distances = nb::ndarray<double, nb::ndim<1>, nb::c_contig, nb::device::cpu
 using Gradients = nb::ndarray<double, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
 using Kinds = nb::ndarray<const uint8_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 
-// Centre and half size along each axis of what encloses a body, a little more than needed.
+// Center and half size along each axis of what encloses a body, a little more than needed.
 void bound(uint8_t kind, const float* s, float* center, float* half) {
   for (int k = 0; k < 3; ++k) {
     const float axis = s[3 + k];
@@ -180,7 +180,7 @@ class ShapeField {
     return SIMD_LEVEL::shape_distance(kinds_[shape], row, p, gradient);
   }
 
-  // Distances are 1-Lipschitz: within R of a centre c the nearest shape is at most min d(c) + R
+  // Distances are 1-Lipschitz: within R of a center c the nearest shape is at most min d(c) + R
   // away, so a shape with d(c) > min d(c) + 2 R is nowhere the nearest.
   void nearest_of_batch(const double* p, size_t count, double* distances, size_t* shapes,
                         std::vector<double>& at_center) const {
@@ -224,9 +224,9 @@ void bind_shapes(nb::module_& m) {
   nb::class_<ShapeWorlds>(m, "ShapeWorlds", "The analytic shapes of several worlds.")
       .def(nb::init<const Rows&, const Kinds&, const Numbers&, int, const std::string&>(),
            nb::kw_only(), "shapes"_a, "kinds"_a, "first"_a, "threads"_a = 1, "simd"_a = "",
-           "World w has the rows first[w] to first[w + 1]. A row holds, by its kind: 0 centre and\n"
-           "radius of a sphere; 1 end, axis, length and radius of a capsule; 2 centre, axis, half\n"
-           "length and radius of a cylinder; 3 centre, rotation and half sizes of a box; 4 normal\n"
+           "World w has the rows first[w] to first[w + 1]. A row holds, by its kind: 0 center and\n"
+           "radius of a sphere; 1 end, axis, length and radius of a capsule; 2 center, axis, half\n"
+           "length and radius of a cylinder; 3 center, rotation and half sizes of a box; 4 normal\n"
            "and offset of a half space.")
       .def("__len__", &ShapeWorlds::size)
       .def("depth", &ShapeWorlds::depth, nb::kw_only(), "p_WC"_a, "R_WC"_a, "world"_a,

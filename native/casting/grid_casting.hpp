@@ -30,7 +30,7 @@ static float interpolate(const GridWorld& grid, const float* p, float* gradient)
   return value;
 }
 
-// The interpolant at points given in voxels from the first centre, extrapolated beyond the
+// The interpolant at points given in voxels from the first center, extrapolated beyond the
 // outermost.
 SP_INLINE F16 interpolate(const GridWorld& grid, const F16* at) {
   I16 cell = to_int(F16(0.0f));

@@ -14,8 +14,8 @@ namespace splatpilot {
 // In the order of the numbers that Python gives them.
 enum ShapeKind : uint8_t { kSphere, kCapsule, kCylinder, kBox, kHalfSpace, kShapeKinds };
 
-// A row of them describes a shape [m]: centre and radius of a sphere; end, axis, length and radius
-// of a capsule; centre, axis, half length and radius of a cylinder; centre, rotation row by row and
+// A row of them describes a shape [m]: center and radius of a sphere; end, axis, length and radius
+// of a capsule; center, axis, half length and radius of a cylinder; center, rotation row by row and
 // half sizes of a box; outward normal and offset of a half space.
 constexpr int kShapeSize = 15;
 
@@ -26,7 +26,7 @@ struct ShapeWorld {
   const float* bodies;  // rows of kShapeSize
   const uint8_t* kinds;
   size_t body_count;
-  // Centres x, y, z and half sizes x, y, z of bounding boxes: six arrays `stride` apart, which may
+  // Centers x, y, z and half sizes x, y, z of bounding boxes: six arrays `stride` apart, which may
   // be read in whole packs.
   const float* bounds;
   size_t stride;
@@ -34,7 +34,7 @@ struct ShapeWorld {
   size_t half_space_count;
 };
 
-// Values at the centres of voxels, the last axis fastest.
+// Values at the centers of voxels, the last axis fastest.
 struct GridWorld {
   const float* values;
   int32_t shape[3];
@@ -71,7 +71,7 @@ struct CastingKernels {
   // (count, 3); infinite and 0 for shapes that there are not.
   void (*nearest_shapes)(const ShapeWorld&, const float* p, size_t count, float* distances,
                          float* gradients);
-  // The trilinear interpolant at p and its gradient [1/m]; beyond the outermost centres of voxels
+  // The trilinear interpolant at p and its gradient [1/m]; beyond the outermost centers of voxels
   // those at the nearest point of the box that they span.
   float (*interpolate)(const GridWorld&, const float* p, float* gradient);
 };

@@ -34,7 +34,7 @@ static bool all_within(const float* values, size_t count, float low, float high)
   return within;
 }
 
-static bool all_normalisable(const float* quats, size_t count) {
+static bool all_normalizable(const float* quats, size_t count) {
   bool all = true;
   for (size_t i = 0; i < count; ++i) {
     const float* q = quats + 4 * i;
@@ -57,6 +57,6 @@ const Kernels kKernels = {
     SP_STRING(SIMD_LEVEL), &kSurfelKernels,      &kLossKernels,    &kCastingKernels,
     &kFittingKernels,      project_arrays,       project_baked,    bin_footprints<SplatFootprint>,
     raster_tile,           raster_tile_backward, gather_gradients, project_backward,
-    first_nonfinite,       all_within,           all_normalisable};
+    first_nonfinite,       all_within,           all_normalizable};
 
 }  // namespace splatpilot::SIMD_LEVEL

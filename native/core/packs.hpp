@@ -208,7 +208,7 @@ SP_INLINE F16 to_float(const I16& a) {
   return c;
 }
 
-// Towards zero.
+// Toward zero.
 SP_INLINE I16 to_int(const F16& a) {
   I16 c;
   SP_EACH_REGISTER(k) c.r[k] = __builtin_convertvector(a.r[k], IntRegister);

@@ -22,7 +22,7 @@ constexpr float kAlphaCut = 1.0f / 255.0f;
 constexpr float kLog2AlphaCut = -7.994353437f;  // log2(1/255)
 constexpr float kMaxAlpha = 0.99f;
 constexpr float kMinTransmittance = 1e-4f;
-// How far the inverse depth of a Gaussian may fall towards its rim, of that of its centre.
+// How far the inverse depth of a Gaussian may fall toward its rim, of that of its center.
 constexpr float kMostFall = 0.9f;
 // sqrt(2 ln 255) = 3.3291: beyond so many sigmas no opacity <= 1 is above the alpha cut.
 constexpr float kMaxExtent = 3.33f;
@@ -47,10 +47,10 @@ struct Camera {
   float radius_clip, eps2d;     // [px], [px^2]
   bool antialiased;             // opacities fall as the blur spreads small Gaussians
   float max_depth;              // [m]; what lies beyond has no part in the median depth
-  bool depth_alone;             // Gaussians that hold no pixel's centre are left out, and colors
+  bool depth_alone;             // Gaussians that hold no pixel's center are left out, and colors
   float R_CW[9];                // row-major
-  // The centre in two parts, so that p_W - centre keeps its digits far from the world's origin.
-  float centre_high[3], centre_low[3];
+  // The center in two parts, so that p_W - center keeps its digits far from the world's origin.
+  float center_high[3], center_low[3];
   float min_slope_x, max_slope_x, min_slope_y, max_slope_y;  // where x/z, y/z are held in J
   // A Gaussian at p_C with largest scale s can touch the image only if for each of the four sides
   // side_normal . p_C + side_reach s > 0 (left, right, top, bottom).
@@ -111,7 +111,7 @@ struct BakedArrays {
   const float* geometry;  // (groups, 10, 16)
   const float* colors;    // (groups, 3 K, 16)
   int sh_degree;          // 0: colors are final
-  const float* bounds;    // (groups of 16 boxes, 7, 16): centre 3, half size 3,
+  const float* bounds;    // (groups of 16 boxes, 7, 16): center 3, half size 3,
                           // largest scale; one box per kBoundSize Gaussians
 };
 
@@ -187,7 +187,7 @@ struct Kernels {
   // Whether low <= value <= high for all; NaN is not.
   bool (*all_within)(const float*, size_t count, float low, float high);
   // Whether all quaternions (count, 4) are long and short enough to be normalized.
-  bool (*all_normalisable)(const float* quats, size_t count);
+  bool (*all_normalizable)(const float* quats, size_t count);
 };
 
 }  // namespace splatpilot

@@ -59,9 +59,9 @@ SP_INLINE double sum_of(const F16& a) {
 
 // Windowed means along x of a padded row at p, and of its square.
 SP_INLINE void filter_with_square(const float* p, size_t stride, F16& mean, F16& square) {
-  const F16 centre = load(p);
-  mean = F16(kGaussian[0]) * centre;
-  square = mean * centre;
+  const F16 center = load(p);
+  mean = F16(kGaussian[0]) * center;
+  square = mean * center;
 #pragma GCC unroll 5
   for (int k = 1; k <= kWindowRadius; ++k) {
     const F16 a = load(p - k * stride), b = load(p + k * stride);

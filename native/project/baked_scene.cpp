@@ -117,10 +117,10 @@ std::vector<float> bounds_of(const GaussianArrays& g, const std::vector<uint32_t
         low = std::min(low, value);
         high = std::max(high, value);
       }
-      const double centre = 0.5 * (low + high), half = 0.5 * (high - low);
-      pack[axis * kPack] = static_cast<float>(centre);
+      const double center = 0.5 * (low + high), half = 0.5 * (high - low);
+      pack[axis * kPack] = static_cast<float>(center);
       // Widened so that rounding never leaves a Gaussian outside its box.
-      const double slack = 1e-5 * (half + std::fabs(centre)) + 1e-30;
+      const double slack = 1e-5 * (half + std::fabs(center)) + 1e-30;
       pack[(3 + axis) * kPack] = static_cast<float>(half + slack);
     }
   }

@@ -9,7 +9,7 @@
 
 namespace splatpilot {
 
-// Gaussians in Morton order, so that neighbours in space are neighbors in memory and can be culled
+// Gaussians in Morton order, so that neighbors in space are neighbors in memory and can be culled
 // together; covariances as lower-triangular factors L with L L^T = R S^2 R^T, computed in double.
 class BakedScene {
  public:

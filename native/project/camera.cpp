@@ -75,7 +75,7 @@ Camera make_camera(const CameraParameters& p) {
   c.antialiased = p.antialiased;
   c.max_depth = std::numeric_limits<float>::infinity();
 
-  // centre = -R^-1 t by cofactors: R may be a rotation only to single precision.
+  // center = -R^-1 t by cofactors: R may be a rotation only to single precision.
   double R[3][3], t[3];
   for (int i = 0; i < 3; ++i) {
     for (int j = 0; j < 3; ++j) {
@@ -93,10 +93,10 @@ Camera make_camera(const CameraParameters& p) {
   }
   for (int j = 0; j < 3; ++j) det += R[0][j] * cofactor[0][j];
   for (int j = 0; j < 3; ++j) {
-    double centre = 0.0;
-    for (int i = 0; i < 3; ++i) centre -= cofactor[i][j] * t[i] / det;
-    c.centre_high[j] = static_cast<float>(centre);
-    c.centre_low[j] = static_cast<float>(centre - c.centre_high[j]);
+    double center = 0.0;
+    for (int i = 0; i < 3; ++i) center -= cofactor[i][j] * t[i] / det;
+    c.center_high[j] = static_cast<float>(center);
+    c.center_low[j] = static_cast<float>(center - c.center_high[j]);
   }
 
   c.distortion = p.distortion;

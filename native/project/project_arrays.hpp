@@ -23,7 +23,7 @@ SP_INLINE size_t cull(const GaussianArrays& g, const Camera& camera, const float
       for (int axis = 0; axis < kAxes; ++axis) soa[3 + axis][lane] = scale[axis];
     }
     const Vector16 p_C =
-        to_camera(camera, from_centre(camera, load(soa[0]), load(soa[1]), load(soa[2])));
+        to_camera(camera, from_center(camera, load(soa[0]), load(soa[1]), load(soa[2])));
     F16 largest_scale = load(soa[3]);
     for (int axis = 1; axis < kAxes; ++axis) {
       largest_scale = max(largest_scale, load(soa[3 + axis]));
@@ -132,7 +132,7 @@ size_t project_arrays_through(const GaussianArrays& g, const Camera& camera, siz
   for (size_t first = 0; first < candidate_count; first += kLanes) {
     const uint32_t* indices = candidates + first;
     const GatheredGaussians in = gather_gaussians(g, indices);
-    const Vector16 d_W = from_centre(camera, in.mean.x, in.mean.y, in.mean.z);
+    const Vector16 d_W = from_center(camera, in.mean.x, in.mean.y, in.mean.z);
     const Vector16 p_C = to_camera(camera, d_W);
     const F16 inverse_z = F16(1.0f) / p_C.z;
     Vector16 columns[3], m[2];

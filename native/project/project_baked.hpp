@@ -10,7 +10,7 @@ namespace splatpilot::SIMD_LEVEL {
 SP_INLINE uint32_t visible_boxes(const BakedArrays& scene, const Camera& camera, size_t group) {
   const float* bounds = scene.bounds + group * 7 * kLanes;
   const Vector16 p_C = to_camera(
-      camera, from_centre(camera, load(bounds), load(bounds + kLanes), load(bounds + 2 * kLanes)));
+      camera, from_center(camera, load(bounds), load(bounds + kLanes), load(bounds + 2 * kLanes)));
   const F16 half[3] = {load(bounds + 3 * kLanes), load(bounds + 4 * kLanes),
                        load(bounds + 5 * kLanes)};
   const F16 largest_scale = load(bounds + 6 * kLanes);
@@ -59,7 +59,7 @@ SP_INLINE size_t project_baked_group(const BakedArrays& scene, const Camera& cam
                                      Splat* splats, DepthPlane* planes, uint32_t* depth_bits) {
   const float* geometry = scene.geometry + group * 10 * kLanes;
   const auto field = [&](int f) { return load(geometry + f * kLanes); };
-  const Vector16 d_W = from_centre(camera, field(0), field(1), field(2));
+  const Vector16 d_W = from_center(camera, field(0), field(1), field(2));
   const Vector16 p_C = to_camera(camera, d_W);
   if (!any(in_depth_range(camera, p_C.z))) return 0;
   const F16 inverse_z = F16(1.0f) / p_C.z;

@@ -32,11 +32,11 @@ SP_INLINE F16 dot(const float n[3], const Vector16& p) {
   return F16(n[0]) * p.x + (F16(n[1]) * p.y + F16(n[2]) * p.z);
 }
 
-// p_W relative to the camera centre, still in world axes.
-SP_INLINE Vector16 from_centre(const Camera& camera, const F16& x, const F16& y, const F16& z) {
-  return {(x - F16(camera.centre_high[0])) - F16(camera.centre_low[0]),
-          (y - F16(camera.centre_high[1])) - F16(camera.centre_low[1]),
-          (z - F16(camera.centre_high[2])) - F16(camera.centre_low[2])};
+// p_W relative to the camera center, still in world axes.
+SP_INLINE Vector16 from_center(const Camera& camera, const F16& x, const F16& y, const F16& z) {
+  return {(x - F16(camera.center_high[0])) - F16(camera.center_low[0]),
+          (y - F16(camera.center_high[1])) - F16(camera.center_low[1]),
+          (z - F16(camera.center_high[2])) - F16(camera.center_low[2])};
 }
 
 SP_INLINE Vector16 to_camera(const Camera& camera, const Vector16& d_W) {
@@ -82,8 +82,8 @@ SP_INLINE F16 largest_component(const Vector16& a) {
   return max(max(max(a.x, -a.x), max(a.y, -a.y)), max(a.z, -a.z));
 }
 
-// Lanes whose interval mean -+ extent holds the centre of a pixel.
-SP_INLINE Mask16 hold_centre(const F16& mean, const F16& extent) {
+// Lanes whose interval mean -+ extent holds the center of a pixel.
+SP_INLINE Mask16 hold_center(const F16& mean, const F16& extent) {
   // The nearest integer: adding 1.5 * 2^23 rounds. Means beyond have no fraction to lose.
   const F16 corner = mean - F16(0.5f);
   const F16 away = corner - ((corner + F16(12582912.0f)) - F16(12582912.0f));
@@ -149,7 +149,7 @@ SP_INLINE Mask16 finish_projection(const Camera& camera, const Vector16& p_C, co
             (out.mean_y - out.extent_y < height);
   if (camera.depth_alone) {
     visible =
-        visible & hold_centre(out.mean_x, out.extent_x) & hold_centre(out.mean_y, out.extent_y);
+        visible & hold_center(out.mean_x, out.extent_x) & hold_center(out.mean_y, out.extent_y);
   }
   // An overflow somewhere leaves an infinity or a NaN in one of these.
   const F16 finite = (out.ux + out.vy) * F16(0.0f) + out.uy * F16(0.0f);

@@ -54,9 +54,9 @@ SP_INLINE PlanePack depth_plane(const Camera& camera, const Vector16& p_C, const
   return out;
 }
 
-// Lanes that may show a surface within the camera's max_depth. Of a Gaussian whose centre is at
+// Lanes that may show a surface within the camera's max_depth. Of a Gaussian whose center is at
 // depth z, and whose deviation along the optical axis is sigma, the plane of the median depth comes
-// no nearer than z^2 / (z + kMaxExtent sigma) where alpha is above the cut: towards its rim the
+// no nearer than z^2 / (z + kMaxExtent sigma) where alpha is above the cut: toward its rim the
 // inverse depth rises by kMaxExtent sqrt(w^T S w), w being the plane's (w_x, w_y) and S the
 // covariance on the image, which is at most kMaxExtent sigma / z^2. Boxes of Gaussians are judged
 // with `slack`.

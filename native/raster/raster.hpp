@@ -19,7 +19,7 @@ struct BlockState {
 // Composites the staged splats of one block; returns whether any pixel is still open. A pixel whose
 // color is finished is open while its median depth is sought.
 template <bool kColor, bool kDepth, bool kMedian>
-SP_INLINE bool composite(const StagedTile& staged, int words, int b, const LaneCentres& pixel,
+SP_INLINE bool composite(const StagedTile& staged, int words, int b, const LaneCenters& pixel,
                          BlockState& state) {
   BlockState s = state;
   bool open = true, seeking = kMedian;
@@ -108,12 +108,12 @@ template <bool kColor, bool kDepth, bool kMedian>
 void raster_tile_channels(const RasterInput& in, const Image& image, const StageWriter* record,
                           int tile) {
   const int left = tile % in.tiles_x * kTileSize, top = tile / in.tiles_x * kTileSize;
-  const LaneCentres centres = lane_centres();
+  const LaneCenters centers = lane_centers();
   BlockState state[kBlocksPerTile];
   uint32_t inside = 0;
   for (int b = 0; b < kBlocksPerTile; ++b) {
     const F16 zero = F16(0.0f);
-    const F16 open = ones_inside(in.width, in.height, centres, left, top, b);
+    const F16 open = ones_inside(in.width, in.height, centers, left, top, b);
     state[b] = {open, zero, zero, zero, zero, zero, open, zero};
     if (any(state[b].transmittance > zero)) inside |= 1u << b;
   }
@@ -138,7 +138,7 @@ void raster_tile_channels(const RasterInput& in, const Image& image, const Stage
     const int words = (count + 63) / 64;
     for (uint32_t bits = live; bits; bits &= bits - 1) {
       const int b = __builtin_ctz(bits);
-      const LaneCentres pixel = block_centres(centres, b);
+      const LaneCenters pixel = block_centers(centers, b);
       const bool seeks = kMedian && (seeking >> b & 1);
       const bool open = seeks
                             ? composite<kColor, kDepth, kMedian>(staged, words, b, pixel, state[b])
@@ -157,7 +157,7 @@ void raster_tile_channels(const RasterInput& in, const Image& image, const Stage
 
 // Seeks the median depth of one block among the staged splats; returns whether a pixel has none
 // yet.
-SP_INLINE bool seek_block(const StagedTile& staged, int words, int b, const LaneCentres& pixel,
+SP_INLINE bool seek_block(const StagedTile& staged, int words, int b, const LaneCenters& pixel,
                           F16& transmittance, F16& median_w) {
   for (int word = 0; word < words; ++word) {
     for (uint64_t bits = staged.touching[b][word]; bits; bits &= bits - 1) {
@@ -174,11 +174,11 @@ SP_INLINE bool seek_block(const StagedTile& staged, int words, int b, const Lane
 // The median depth of one tile and nothing else, with the bits of `raster_tile_channels`.
 inline void seek_tile(const RasterInput& in, const Image& image, int tile) {
   const int left = tile % in.tiles_x * kTileSize, top = tile / in.tiles_x * kTileSize;
-  const LaneCentres centres = lane_centres();
+  const LaneCenters centers = lane_centers();
   F16 transmittance[kBlocksPerTile], median_w[kBlocksPerTile];
   uint32_t inside = 0;
   for (int b = 0; b < kBlocksPerTile; ++b) {
-    transmittance[b] = ones_inside(in.width, in.height, centres, left, top, b);
+    transmittance[b] = ones_inside(in.width, in.height, centers, left, top, b);
     median_w[b] = F16(0.0f);
     if (any(transmittance[b] > F16(0.0f))) inside |= 1u << b;
   }
@@ -190,7 +190,7 @@ inline void seek_tile(const RasterInput& in, const Image& image, int tile) {
     stage(in, true, begin, count, static_cast<float>(left), static_cast<float>(top), staged);
     for (uint32_t bits = seeking; bits; bits &= bits - 1) {
       const int b = __builtin_ctz(bits);
-      const LaneCentres pixel = block_centres(centres, b);
+      const LaneCenters pixel = block_centers(centers, b);
       if (!seek_block(staged, (count + 63) / 64, b, pixel, transmittance[b], median_w[b])) {
         seeking &= ~(1u << b);
       }

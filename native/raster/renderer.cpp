@@ -95,7 +95,7 @@ bool Renderer::are_valid(const GaussianArrays& g, size_t color_floats) {
     const size_t color_begin = color_floats * chunk / chunks;
     const size_t color_count = color_floats * (chunk + 1) / chunks - color_begin;
     if (!kernels_.all_within(g.means + 3 * begin, 3 * count, -kMost, kMost) ||
-        !kernels_.all_normalisable(g.quats + 4 * begin, count) ||
+        !kernels_.all_normalizable(g.quats + 4 * begin, count) ||
         !kernels_.all_within(g.scales + 3 * begin, 3 * count, kLeast, kMost) ||
         !kernels_.all_within(g.opacities + begin, count, 0.0f, 1.0f) ||
         !kernels_.all_within(g.colors + color_begin, color_count, -kMost, kMost)) {

@@ -84,12 +84,12 @@ SP_INLINE void stage(const RasterInput& in, bool planes, size_t begin, int count
   transpose_blocks(blocks, count, staged.touching);
 }
 
-// Pixel centres of the 16 lanes of a block, from its corner.
-struct LaneCentres {
+// Pixel centers of the 16 lanes of a block, from its corner.
+struct LaneCenters {
   F16 x, y;
 };
 
-SP_INLINE LaneCentres lane_centres() {
+SP_INLINE LaneCenters lane_centers() {
   alignas(64) float x[kLanes], y[kLanes];
   for (int lane = 0; lane < kLanes; ++lane) {
     x[lane] = static_cast<float>(lane % kBlockSize) + 0.5f;
@@ -99,18 +99,18 @@ SP_INLINE LaneCentres lane_centres() {
 }
 
 // The same of block b of a tile, from the tile's corner.
-SP_INLINE LaneCentres block_centres(const LaneCentres& centres, int b) {
-  return {centres.x + F16(static_cast<float>(kBlockSize * (b % 4))),
-          centres.y + F16(static_cast<float>(kBlockSize * (b / 4)))};
+SP_INLINE LaneCenters block_centers(const LaneCenters& centers, int b) {
+  return {centers.x + F16(static_cast<float>(kBlockSize * (b % 4))),
+          centers.y + F16(static_cast<float>(kBlockSize * (b / 4)))};
 }
 
 // 1 for pixels of block b of the tile that lie inside the image, else 0.
-SP_INLINE F16 ones_inside(int width, int height, const LaneCentres& centres, int left, int top,
+SP_INLINE F16 ones_inside(int width, int height, const LaneCenters& centers, int left, int top,
                           int b) {
   const int columns = width - left - kBlockSize * (b % 4);
   const int rows = height - top - kBlockSize * (b / 4);
   return zero_unless(
-      (centres.x < F16(static_cast<float>(columns))) & (centres.y < F16(static_cast<float>(rows))),
+      (centers.x < F16(static_cast<float>(columns))) & (centers.y < F16(static_cast<float>(rows))),
       F16(1.0f));
 }
 

@@ -14,7 +14,7 @@ struct BlockBoxes {
   alignas(64) int32_t left[kLanes], top[kLanes], right[kLanes], bottom[kLanes];
 };
 
-// Blocks [first, last] along one axis with a pixel centre in [low, high], which reaches into the
+// Blocks [first, last] along one axis with a pixel center in [low, high], which reaches into the
 // image: block b has them at 4 b + 1/2 to 4 b + 7/2.
 SP_INLINE void block_range(const F16& low, const F16& high, int tiles, int32_t* first,
                            int32_t* last) {
@@ -25,7 +25,7 @@ SP_INLINE void block_range(const F16& low, const F16& high, int tiles, int32_t* 
   store(last, to_int(clamp((high - F16(0.5f)) * F16(kPerPixel), zero, most)));
 }
 
-// The 16 blocks of a tile: pixel centres of block b span [left, left + 3] x [top, top + 3].
+// The 16 blocks of a tile: pixel centers of block b span [left, left + 3] x [top, top + 3].
 struct BlockGrid {
   F16 left, top;
 };

@@ -23,9 +23,9 @@ SP_INLINE DoubleVector16 to_camera(const Camera& camera, const DoubleVector16& d
           D16(R[6]) * d_W.x + (D16(R[7]) * d_W.y + D16(R[8]) * d_W.z)};
 }
 
-// A coordinate of world points relative to the camera centre.
-SP_INLINE D16 from_centre(const Camera& camera, const F16& p_W, int axis) {
-  return D16(p_W) - D16(static_cast<double>(camera.centre_high[axis]) + camera.centre_low[axis]);
+// A coordinate of world points relative to the camera center.
+SP_INLINE D16 from_center(const Camera& camera, const F16& p_W, int axis) {
+  return D16(p_W) - D16(static_cast<double>(camera.center_high[axis]) + camera.center_low[axis]);
 }
 
 // The unit tangents of surfels in the world: the first columns of R(q).
@@ -44,7 +44,7 @@ struct SurfelPlane {
   F16 facing;                // n . p
   F16 inverse_facing;
   Vector16 u, v, w;
-  F16 mean[2], rest[2];  // the centre's pixel is their sum [px]
+  F16 mean[2], rest[2];  // the center's pixel is their sum [px]
   Mask16 edge_on;
 };
 
@@ -55,8 +55,8 @@ SP_INLINE SurfelPlane surfel_plane(const Camera& camera, const GatheredGaussians
   surfel_tangents(in.quat, t_W);
   const DoubleVector16 t[2] = {to_camera(camera, t_W[0]), to_camera(camera, t_W[1])};
   const DoubleVector16 p =
-      to_camera(camera, {from_centre(camera, in.mean.x, 0), from_centre(camera, in.mean.y, 1),
-                         from_centre(camera, in.mean.z, 2)});
+      to_camera(camera, {from_center(camera, in.mean.x, 0), from_center(camera, in.mean.y, 1),
+                         from_center(camera, in.mean.z, 2)});
   const DoubleVector16 n = cross(t[0], t[1]);
   SurfelPlane s;
   s.p = to_float(p);
@@ -81,7 +81,7 @@ SP_INLINE SurfelPlane surfel_plane(const Camera& camera, const GatheredGaussians
 }
 
 // Where alpha can reach the cut: the image of the disc of radius r standard deviations about the
-// centre, an ellipse while the disc is beyond the near plane, and the blob. Returns the lanes of
+// center, an ellipse while the disc is beyond the near plane, and the blob. Returns the lanes of
 // which some of it is on the image.
 SP_INLINE Mask16 surfel_bounds(const Camera& camera, const SurfelPlane& s, const F16 scale[2],
                                const F16& log2_opacity, SplatPack& out, F16& disc_radius) {
@@ -100,7 +100,7 @@ SP_INLINE Mask16 surfel_bounds(const Camera& camera, const SurfelPlane& s, const
   }
   const F16 reach = r * sqrt(c[0] * c[0] + c[1] * c[1]);
   const Mask16 beyond = s.p.z - reach >= F16(camera.near_plane);
-  // Dual of the conic, about the mean: an ellipse centred at -r^2 A c / d with the covariance
+  // Dual of the conic, about the mean: an ellipse centered at -r^2 A c / d with the covariance
   // (outer product of that) + r^2 A A^T / d, d = z^2 - r^2 |c|^2.
   const F16 inverse_d = one / select(beyond, (s.p.z - reach) * (s.p.z + reach), one);
   const F16 offset_scale = -(r * r * inverse_d);
@@ -165,7 +165,7 @@ inline size_t project_surfels(const GaussianArrays& g, const Camera& camera, siz
   for (size_t first = 0; first < candidate_count; first += kLanes) {
     const uint32_t* indices = candidates + first;
     const GatheredGaussians in = gather_gaussians(g, indices);
-    const Vector16 d_W = from_centre(camera, in.mean.x, in.mean.y, in.mean.z);
+    const Vector16 d_W = from_center(camera, in.mean.x, in.mean.y, in.mean.z);
     const SurfelPlane s = surfel_plane(camera, in);
     const F16 log2_opacity = log2(max(in.opacity, F16(1e-30f)));
     SplatPack pack;
@@ -179,7 +179,7 @@ inline size_t project_surfels(const GaussianArrays& g, const Camera& camera, siz
     disc[1] = s.mean[1];
     const F16 inverse_fx = F16(1.0f / camera.fx), inverse_fy = F16(1.0f / camera.fy);
     const F16 zero = F16(0.0f), one = F16(1.0f);
-    const F16 towards = select(s.facing > zero, -one, one);
+    const F16 toward = select(s.facing > zero, -one, one);
     F16 rows[3][3];  // u, v and w
     const Vector16* planes[3] = {&s.u, &s.v, &s.w};
     for (int i = 0; i < 3; ++i) {
@@ -204,9 +204,9 @@ inline size_t project_surfels(const GaussianArrays& g, const Camera& camera, siz
                                        color[0],
                                        color[1],
                                        color[2],
-                                       towards * s.t_W[2].x,
-                                       towards * s.t_W[2].y,
-                                       towards * s.t_W[2].z};
+                                       toward * s.t_W[2].x,
+                                       toward * s.t_W[2].y,
+                                       toward * s.t_W[2].z};
     alignas(64) float soa[kSurfelFields][kLanes];
     for (int f = 0; f < kSurfelFields; ++f) store(soa[f], fields[f]);
     size_t next = count;

@@ -10,7 +10,7 @@ SP_INLINE Vector16 zero_unless(const Mask16& m, const Vector16& a) {
   return {zero_unless(m, a.x), zero_unless(m, a.y), zero_unless(m, a.z)};
 }
 
-// What a gradient of the surfel's fields is in the camera frame, with respect to its centre and its
+// What a gradient of the surfel's fields is in the camera frame, with respect to its center and its
 // tangents, and with respect to its scales.
 struct PlaneGradient {
   Vector16 p, t[2];
@@ -79,14 +79,14 @@ inline void project_surfels_backward(const GaussianArrays& input, const Camera& 
     for (int f = 0; f < 16; ++f) g[f] = load(soa[f]);
 
     const GatheredGaussians in = gather_gaussians(input, indices);
-    const Vector16 d_W = from_centre(camera, in.mean.x, in.mean.y, in.mean.z);
+    const Vector16 d_W = from_center(camera, in.mean.x, in.mean.y, in.mean.z);
     const SurfelPlane s = surfel_plane(camera, in);
     const Vector16* t_W = s.t_W;
     const PlaneGradient by = plane_gradient(camera, s, in.scale, g);
 
     const F16 one = F16(1.0f), zero = F16(0.0f);
-    const F16 towards = select(s.facing > zero, -one, one);
-    const Vector16 by_normal = {towards * g[13], towards * g[14], towards * g[15]};
+    const F16 toward = select(s.facing > zero, -one, one);
+    const Vector16 by_normal = {toward * g[13], toward * g[14], toward * g[15]};
     const Vector16 by_t0 = to_world(camera, by.t[0]) + cross(t_W[1], by_normal);
     const Vector16 by_t1 = to_world(camera, by.t[1]) + cross(by_normal, t_W[0]);
     F16 by_color[3] = {g[10], g[11], g[12]};

@@ -40,7 +40,7 @@ struct SurfelSample {
 
 // alpha = o exp(-r2 / 2): r2 is the lesser of u^2 + v^2 on the surfel's plane and of the blob's
 // |d|^2 / kBlobVariance (the larger of the two Gaussians; Huang et al. 2024, equation 11).
-SP_INLINE SurfelSample sample_surfel(const Surfel& s, const LaneCentres& pixel,
+SP_INLINE SurfelSample sample_surfel(const Surfel& s, const LaneCenters& pixel,
                                      const F16& near_plane) {
   SurfelSample a;
   a.dx = pixel.x - F16(s.mean[0]);
@@ -70,7 +70,7 @@ struct SurfelBlockState {
 // whether any pixel is still open.
 template <bool kDistort, bool kRecord>
 SP_INLINE bool composite_surfels(const StagedSurfels& staged, int words, int b,
-                                 const LaneCentres& pixel, float first, const F16& near_plane,
+                                 const LaneCenters& pixel, float first, const F16& near_plane,
                                  SurfelBlockState& state) {
   SurfelBlockState s = state;
   bool open = true;
@@ -129,11 +129,11 @@ void raster_surfels_of(const SurfelRasterInput& in, const SurfelImages<float>& o
                        SurfelBlockRecord* records, int tile) {
   const int left = tile % in.tiles_x * kTileSize, top = tile / in.tiles_x * kTileSize;
   const F16 zero = F16(0.0f), one = F16(1.0f), near_plane = F16(in.near_plane);
-  const LaneCentres centres = lane_centres();
+  const LaneCenters centers = lane_centers();
   SurfelBlockState state[kBlocksPerTile];
   uint32_t inside = 0;
   for (int b = 0; b < kBlocksPerTile; ++b) {
-    const F16 open = ones_inside(in.width, in.height, centres, left, top, b);
+    const F16 open = ones_inside(in.width, in.height, centers, left, top, b);
     state[b] = {open, {zero, zero, zero}, {zero, zero, zero}, zero, zero, zero, zero, one, zero,
                 -one};
     if (any(open > zero)) inside |= 1u << b;
@@ -148,7 +148,7 @@ void raster_surfels_of(const SurfelRasterInput& in, const SurfelImages<float>& o
     for (uint32_t bits = live; bits; bits &= bits - 1) {
       const int b = __builtin_ctz(bits);
       const bool open = composite_surfels<kDistort, kRecord>(
-          staged, (count + 63) / 64, b, block_centres(centres, b),
+          staged, (count + 63) / 64, b, block_centers(centers, b),
           static_cast<float>(begin - start), near_plane, state[b]);
       if (!open) live &= ~(1u << b);
     }

@@ -49,7 +49,7 @@ SP_INLINE BackwardBlock backward_block(const SurfelRasterInput& in,
 
 // Adds what 16 pixels give to the gradient of a surfel; fields as in SurfelGradient.
 template <bool kDistort>
-SP_INLINE void accumulate_surfel(const Surfel& surfel, const LaneCentres& pixel, const F16& index,
+SP_INLINE void accumulate_surfel(const Surfel& surfel, const LaneCenters& pixel, const F16& index,
                                  const F16& near_plane, BackwardBlock& block, F16 sums[16]) {
   const F16 zero = F16(0.0f), one = F16(1.0f);
   const SurfelSample a = sample_surfel(surfel, pixel, near_plane);
@@ -113,7 +113,7 @@ void raster_surfels_backward_of(const SurfelRasterInput& in, const SurfelBlockRe
                                 const SurfelImages<const float>& g, int tile, SurfelGradient* out) {
   const int left = tile % in.tiles_x * kTileSize, top = tile / in.tiles_x * kTileSize;
   const F16 near_plane = F16(in.near_plane), zero = F16(0.0f);
-  const LaneCentres centres = lane_centres();
+  const LaneCenters centers = lane_centers();
   BackwardBlock blocks[kBlocksPerTile];
   float passed[kBlocksPerTile] = {};
   for (int b = 0; b < kBlocksPerTile; ++b) {
@@ -140,7 +140,7 @@ void raster_surfels_backward_of(const SurfelRasterInput& in, const SurfelBlockRe
     for (uint32_t bits = pair.blocks; bits; bits &= bits - 1) {
       const int b = __builtin_ctz(bits);
       if (index >= passed[b]) continue;
-      accumulate_surfel<kDistort>(surfel, block_centres(centres, b), F16(index), near_plane,
+      accumulate_surfel<kDistort>(surfel, block_centers(centers, b), F16(index), near_plane,
                                   blocks[b], sums);
     }
     sum_lanes(sums, reinterpret_cast<float*>(out + i));

@@ -7,23 +7,23 @@ namespace splatpilot {
 
 // The pixel's low-pass filter: a blob with a standard deviation of sqrt(1/2) px.
 constexpr float kBlobVariance = 0.5f;
-// Surfels whose plane meets the ray through their centre at a smaller sine are seen edge-on: only
+// Surfels whose plane meets the ray through their center at a smaller sine are seen edge-on: only
 // their blob is drawn.
 constexpr float kEdgeOn = 1e-5f;
 // exp(-r2 / 2) = exp2(-kHalfLog2e r2).
 constexpr float kHalfLog2e = 0.72134752f;
 
 // A visible surfel. With d = (pixel - mean, 1) the ray through the pixel meets its plane at the
-// depth z = 1 / (w . d), at z (u . d) and z (v . d) standard deviations from its centre: the third
-// entries are what the rounding of mean leaves, and in w the inverse depth of the centre.
+// depth z = 1 / (w . d), at z (u . d) and z (v . d) standard deviations from its center: the third
+// entries are what the rounding of mean leaves, and in w the inverse depth of the center.
 // Seen edge-on, w is (0, 0, -1): no ray meets the plane in front of the camera.
 struct Surfel {
   float mean[2];           // [px]
   float u[3], v[3], w[3];  // [1/(m px)], the third entries [1/m]
-  float depth;             // of the centre [m]
+  float depth;             // of the center [m]
   float log2_opacity;
   float color[3];
-  float normal[3];  // in the world, towards the camera
+  float normal[3];  // in the world, toward the camera
 };
 constexpr int kSurfelFields = sizeof(Surfel) / sizeof(float);
 

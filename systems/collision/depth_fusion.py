@@ -150,7 +150,7 @@ def _cosine_of_incidence(depth: np.ndarray, K: np.ndarray) -> np.ndarray:
 
     It turns a difference in depth into a distance from the surface's tangent plane. In normalized
     image coordinates (u, v) a plane n . X = c has the inverse depth w = n . (u, v, 1) / c, so
-    n / c = (w_u, w_v, w - u w_u - v w_v). Of the slopes to the two neighbours along each axis the
+    n / c = (w_u, w_v, w - u w_u - v w_v). Of the slopes to the two neighbors along each axis the
     smaller is taken, which stays on the pixel's own surface at a silhouette.
 
     Returns:

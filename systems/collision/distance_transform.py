@@ -12,7 +12,7 @@ _SLAB = 32  # [voxels] along x that are looked at at a time, for the sake of mem
 
 
 def distance_to_voxels(voxels: np.ndarray, voxel_size: float) -> np.ndarray:
-    """Distance from every voxel's centre to the nearest centre of the marked voxels.
+    """Distance from every voxel's center to the nearest center of the marked voxels.
 
     Args:
         voxels: (nx, ny, nz) bool.
@@ -31,7 +31,7 @@ def occupancy_distances(occupied: np.ndarray, voxel_size: float) -> np.ndarray:
     """Signed distance to occupied voxels whose surface is the faces of the voxels, never farther
     than it is, where it is interpolated trilinearly.
 
-    At voxel centres the exact distance, less what the interpolant is too large by in the half
+    At voxel centers the exact distance, less what the interpolant is too large by in the half
     voxels around: distances to an edge or corner are convex, and a chord is above them. Beside
     flat walls that is nothing. Against the faces of random voxels the interpolant is 0.1 to 0.4
     voxel near on average, up to 1 at worst, and never far; in occupied voxels it is not positive.
@@ -46,7 +46,7 @@ def occupancy_distances(occupied: np.ndarray, voxel_size: float) -> np.ndarray:
     if not occupied.any() or occupied.all():
         far = np.float32(_diagonal(occupied.shape, voxel_size))
         return np.full(occupied.shape, -far if occupied.any() else far)
-    # In half voxels: sample 2i + 1 is the centre of voxel i, 2i and 2i + 2 are its faces.
+    # In half voxels: sample 2i + 1 is the center of voxel i, 2i and 2i + 2 are its faces.
     distances = edt.edt(~_with_faces(occupied), parallel=1)
     distances -= edt.edt(~_with_faces(~occupied), parallel=1)
     near = np.empty(occupied.shape, np.float32)
@@ -54,7 +54,7 @@ def occupancy_distances(occupied: np.ndarray, voxel_size: float) -> np.ndarray:
     for start in range(0, length, _SLAB):
         first, last = max(start - 1, 0), min(start + _SLAB + 1, length)
         part = distances[2 * first + 1 : 2 * last]
-        part = part[:, 1:-1, 1:-1]  # from centre to centre along the other axes too
+        part = part[:, 1:-1, 1:-1]  # from center to center along the other axes too
         excess = np.maximum(_between(part[::2, ::2, ::2]) - part, 0.0)
         excess = maximum_filter(excess, 3, mode="nearest")[::2, ::2, ::2]
         safe = part[::2, ::2, ::2] - excess
@@ -73,7 +73,7 @@ def _with_faces(voxels: np.ndarray) -> np.ndarray:
 
 
 def _between(values: np.ndarray) -> np.ndarray:
-    """Values (n, ...) and what lies halfway between neighbours: (2n - 1, ...)."""
+    """Values (n, ...) and what lies halfway between neighbors: (2n - 1, ...)."""
     for axis in range(values.ndim):
         values = np.moveaxis(values, axis, 0)
         finer = np.empty((2 * len(values) - 1, *values.shape[1:]), values.dtype)
@@ -88,17 +88,17 @@ def distances_from_band(
 ) -> np.ndarray:
     """Signed distance continued from a band of known values around the surface.
 
-    A distance field cannot grow faster than the distance travelled, so every voxel s of the band
+    A distance field cannot grow faster than the distance traveled, so every voxel s of the band
     bounds that of a voxel x by |x - s| + |band(s)|, with the sign of band(s) turned where s and x
     lie on different sides. The nearest s (by the exact transform) gives the first bound; passing
-    the s of the six face neighbours along, `sweeps` times, finds others that bound x tighter.
+    the s of the six face neighbors along, `sweeps` times, finds others that bound x tighter.
 
     Args:
         occupied: (nx, ny, nz) bool.
         band: (nx, ny, nz) float32 [m], signed distance to the surface where it is known, NaN
             elsewhere; not positive in occupied voxels and not negative in the others.
         voxel_size: [m].
-        sweeps: rounds of passing sites to neighbours.
+        sweeps: rounds of passing sites to neighbors.
 
     Returns:
         (nx, ny, nz) float32 [m]; plus or minus the diagonal of the grid when the band is empty.
@@ -128,7 +128,7 @@ def distances_from_band(
             ahead = tuple(slice(1, None) if a == axis else slice(None) for a in range(3))
             behind = tuple(slice(None, -1) if a == axis else slice(None) for a in range(3))
             here, there = (ahead, behind) if step == 1 else (behind, ahead)
-            # Copies: the neighbours' sites are read as they were before this pass.
+            # Copies: the neighbors' sites are read as they were before this pass.
             candidate, candidate_offset = site[:, *there].copy(), offset[there].copy()
             tighter = bound(here, candidate, candidate_offset)
             closer = tighter < best[here]
@@ -167,7 +167,7 @@ def conservative_distances(
 
 
 def _distance_to_faces(shape: tuple[int, ...], voxel_size: float) -> np.ndarray:
-    """Distance of the voxel centres to the nearest face of the grid, (nx, ny, nz) float32 [m]."""
+    """Distance of the voxel centers to the nearest face of the grid, (nx, ny, nz) float32 [m]."""
     x, y, z = (
         voxel_size * np.minimum(np.arange(n) + 0.5, n - np.arange(n) - 0.5).astype(np.float32)
         for n in shape

@@ -17,9 +17,9 @@ SUFFIXES = ".gltf", ".obj"
 _MOVED = 0.1, 0.05
 """[voxels] by which a surface may move where triangles are merged: the first that folds none."""
 _FOLD = np.deg2rad(170)
-"""Between the normals of neighbours; where they are turned further Drake knows no distances."""
+"""Between the normals of neighbors; where they are turned further Drake knows no distances."""
 _LEAST = 0.1
-"""[voxels] that a voxel's centre counts as from a surface that is nearer: triangles of next to no
+"""[voxels] that a voxel's center counts as from a surface that is nearer: triangles of next to no
 area fold, or tear the mesh."""
 
 

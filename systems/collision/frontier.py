@@ -29,7 +29,7 @@ def frontier_faces(
     """The faces that voxels `before` the frontier (nx, ny, nz) share with those `hidden` behind it.
 
     Returns:
-        Their centres (F, 3) in voxels from the lower corner of the grid, and their unit normals
+        Their centers (F, 3) in voxels from the lower corner of the grid, and their unit normals
         (F, 3), out of what is hidden.
     """
     centers, normals = [], []

@@ -49,7 +49,7 @@ def esdf_from_occupancy(
         unknown: (nx, ny, nz) bool, voxels never observed, none of them occupied; None for none.
         lower_W: (3,) [m], lower corner of the grid.
         voxel_size: [m].
-        surface_offset: (nx, ny, nz) [m], signed distance of a voxel's centre from the surface, not
+        surface_offset: (nx, ny, nz) [m], signed distance of a voxel's center from the surface, not
             positive in occupied voxels and not negative in others; NaN where it is not known.
             Values beyond one voxel are not used. Where a surface has no value on either side of it,
             it is the faces of its voxels.

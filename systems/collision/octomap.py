@@ -3,7 +3,7 @@
 The format: header lines `id OcTree`, `size` (nodes), `res` (edge of the smallest voxel [m]), then
 `data` and the tree. Each inner node is 16 bits, two for each of its eight children, lowest child in
 the lowest bits: 00 unknown, 01 a free leaf, 10 an occupied leaf, 11 an inner node. The inner nodes
-follow each other depth first. Child c of a cube is its half towards +x (c & 1), +y (c & 2), +z
+follow each other depth first. Child c of a cube is its half toward +x (c & 1), +y (c & 2), +z
 (c & 4); the root spans 2^16 voxels an edge about the origin.
 """
 

@@ -183,7 +183,7 @@ def limit_approach(
     """
     Limits a commanded velocity (3,) [m/s] so that the point of rest stays off an obstacle.
 
-    Only the part towards the obstacle is reduced, to at most room / reaction_time; if the room is
+    Only the part toward the obstacle is reduced, to at most room / reaction_time; if the room is
     negative it leads away, by at most `RETURN_SPEED`. A point that obeys after a dead time t
     approaches without overshoot if reaction_time >= e t.
 

@@ -152,7 +152,7 @@ def plan(
 ) -> Hypotheses:
     """Computes the hypotheses.
 
-    A cost is the network's collision cost minus `PROGRESS` per meter towards the goal. Among near
+    A cost is the network's collision cost minus `PROGRESS` per meter toward the goal. Among near
     ties the hypothesis that continues `last` gets the lowest cost.
 
     Args:

@@ -159,7 +159,7 @@ def noisy_color(
 
 def turned_hue(color: Any, cos: Any, sin: Any) -> Any:
     """
-    Rotates colors (..., 3), 0 to 255, about gray: red towards green, green towards blue; clips.
+    Rotates colors (..., 3), 0 to 255, about gray: red toward green, green toward blue; clips.
 
     Arrays or tensors, of floats. Rodrigues' formula with the axis k = (1, 1, 1) / sqrt(3).
 

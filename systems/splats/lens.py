@@ -77,7 +77,7 @@ class Distortion(Config):
     def slopes(self, points: "ArrayLike") -> "NDArray[np.float64]":
         """Inverts `project`: slopes (..., 2) of rays to `points` (..., 2); NaN without one.
 
-        OpenCV's own inverses diverge towards the limit.
+        OpenCV's own inverses diverge toward the limit.
         """
         points = np.asarray(points, dtype=np.float64)
         slopes = self._undistort_radially(points)

@@ -97,7 +97,7 @@ class RasterizeSurfels(torch.autograd.Function):
 def depth_to_normals(depths: Tensor, viewmats: Tensor, Ks: Tensor) -> Tensor:
     """Computes unit normals of the surface in depth images by central differences.
 
-    ``(p_below - p_above) x (p_right - p_left)`` of the neighbors' points, towards the camera (Huang
+    ``(p_below - p_above) x (p_right - p_left)`` of the neighbors' points, toward the camera (Huang
     et al. 2024, equation 15). Differentiable with respect to depths and viewmats.
 
     Args:
@@ -183,7 +183,7 @@ def rasterize_surfels(
     Returns:
         render_colors: (C, H, W, X), X = 3, 1 or 4 by `render_mode`.
         render_alphas: (C, H, W, 1).
-        render_normals: (C, H, W, 3) sum of weight and normal, in the world, towards the camera.
+        render_normals: (C, H, W, 3) sum of weight and normal, in the world, toward the camera.
         surf_normals: (C, H, W, 3) from depth, see `depth_to_normals`; None for "RGB".
         render_distort: (C, H, W, 1) sum over pairs of surfels i, j of ``w_i w_j (z_i - z_j)``, i
             behind j in the order of blending, times 2 [m]; zero without `distloss`.

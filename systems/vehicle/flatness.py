@@ -198,7 +198,7 @@ class FlatnessController(LeafSystem):
         w_cmd_B = [tilt_gain · tilt, yaw_gain · yaw]
 
     where tilt and yaw rotate the body so that z lies along f_W and x along the heading or the
-    motion: towards the waypoint, or along v_WB if an acceleration is given. See
+    motion: toward the waypoint, or along v_WB if an acceleration is given. See
     :mod:`~splatpilot.systems.vehicle.flatness`.
     """
 

@@ -29,7 +29,7 @@ VEHICLE_RADIUS = 0.354
 GRAVITY = 9.81
 """Standard gravity [m/s^2], along -z of the world."""
 
-_NORM_GAIN = 5.0  # [1/s] pull of the quaternion towards unit length; errors decay as exp(-10 t).
+_NORM_GAIN = 5.0  # [1/s] pull of the quaternion toward unit length; errors decay as exp(-10 t).
 
 
 @dataclass

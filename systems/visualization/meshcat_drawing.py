@@ -102,12 +102,12 @@ def draw_vehicle(meshcat: Meshcat, path: str, radius: float) -> None:
         )
 
 
-UNKNOWN_GREY = 0.4
+UNKNOWN_GRAY = 0.4
 """Shade of space that nobody saw."""
 
 
 def distance_colors(distances: np.ndarray) -> np.ndarray:
-    """Colours (N, 3), 0 to 1, of distances (N,) in units of that from which on all are alike: red
+    """Colors (N, 3), 0 to 1, of distances (N,) in units of that from which on all are alike: red
     at or inside a surface, fading through yellow at one half to blue."""
     ramp = np.clip(distances, 0.0, 1.0)
     return np.stack([np.interp(ramp, (0.5, 1), (1, 0)), 1 - np.abs(2 * ramp - 1), ramp**2], -1)
@@ -139,7 +139,7 @@ def distance_slice(
     p_WQ = np.stack(np.meshgrid(xs, ys, [height], indexing="ij"), axis=-1).reshape(-1, 3)
     sample = field.query(p_WQ)
     colors = distance_colors(np.nan_to_num(sample.distance) / reach)
-    colors[sample.state >= FieldState.UNKNOWN] = UNKNOWN_GREY
+    colors[sample.state >= FieldState.UNKNOWN] = UNKNOWN_GRAY
 
     i, j = np.meshgrid(np.arange(counts[0] - 1), np.arange(counts[1] - 1), indexing="ij")
     corner = (i * counts[1] + j).ravel()

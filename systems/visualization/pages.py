@@ -21,7 +21,7 @@ from splatpilot.systems.policies.hypotheses import Hypotheses, num_hypotheses_in
 from splatpilot.systems.splats.background import Background, EnvironmentMap
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.vehicle.state import QuadrotorState
-from splatpilot.systems.visualization.meshcat_drawing import UNKNOWN_GREY, distance_colors
+from splatpilot.systems.visualization.meshcat_drawing import UNKNOWN_GRAY, distance_colors
 
 _COVARIANCE_SCALE = 256.0
 """Scales covariances of 1 mm to 16 m to the range of half floats."""
@@ -130,7 +130,7 @@ class CapturedImages:
 
 @dataclass(frozen=True, eq=False)
 class ShownPlace:
-    """A place and what is known of it; its lengths are metres unless `metric` is false."""
+    """A place and what is known of it; its lengths are meters unless `metric` is false."""
 
     name: str
     gaussians: GaussianScene
@@ -202,7 +202,7 @@ def _grid(field: Esdf, reach: float) -> dict[str, Any]:
     thin = (slice(stride // 2, None, stride),) * 3
     values = np.round(254 * np.clip(field.distances[thin] / reach, 0, 1)).astype(np.uint8)
     values[field.states[thin] == FieldState.UNKNOWN] = 255
-    colors = np.append(distance_colors(np.arange(255) / 254), np.full((1, 3), UNKNOWN_GREY), 0)
+    colors = np.append(distance_colors(np.arange(255) / 254), np.full((1, 3), UNKNOWN_GRAY), 0)
     return {
         "shape": list(values.shape),
         "lower": rounded(field.lower_W),

@@ -24,7 +24,7 @@ R_WC = RotationMatrix(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]))  # lookin
 
 
 def room() -> GaussianScene:
-    """The inside of the room, in broad coloured waves."""
+    """The inside of the room, in broad colored waves."""
     means = []
     for axis in range(3):
         other = [a for a in range(3) if a != axis]

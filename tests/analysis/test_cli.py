@@ -57,7 +57,7 @@ def test_fly_leaves_what_it_promises(tmp_path, capsys):
     ok, frame = video.read()
     assert ok
     assert frame.shape == (240, 640, 3)
-    assert frame[:, :320].std() > 20  # Not one colour: a picture of something,
+    assert frame[:, :320].std() > 20  # Not one color: a picture of something,
     assert frame[:, 320:].std() > 20  # and a depth picture beside it.
 
     page = (out / "flight.html").read_text()
@@ -246,8 +246,8 @@ def test_nothing_is_trained_twice(words, message, tmp_path, capsys):
 
 
 def test_scene_of_another_unit_is_refused(tmp_path, capsys):
-    """A PLY that spans kilometres is not flown with voxels larger than the vehicle."""
-    ply = tmp_path / "millimetres.ply"
+    """A PLY that spans kilometers is not flown with voxels larger than the vehicle."""
+    ply = tmp_path / "millimeters.ply"
     generator = np.random.default_rng(0)
     scene = make_scene(generator.uniform(0, 1, 500))
     means = generator.uniform(0, 2e4, scene.means.shape).astype(np.float32)
@@ -291,7 +291,7 @@ def test_reconstruct_without_capture_is_refused(tmp_path, capsys):
 
 @pytest.mark.skipif("SPLATPILOT_DATA" not in os.environ, reason="SPLATPILOT_DATA is not set")
 def test_flight_through_a_real_capture(tmp_path):
-    """TartanAir's hospital, reconstructed without optimisation, is flown for at least 6 m to the
+    """TartanAir's hospital, reconstructed without optimization, is flown for at least 6 m to the
     goal without touching anything.
     """
     capture = Path(os.environ["SPLATPILOT_DATA"]) / "tartanair" / "hospital"

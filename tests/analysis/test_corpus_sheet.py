@@ -34,7 +34,7 @@ def folder(tmp_path_factory):
 
 
 def test_inspect_draws_what_the_corpus_holds(folder, tmp_path, capsys):
-    """A sheet has a tile a sample, colour above depth, three times as large; its first pixels are
+    """A sheet has a tile a sample, color above depth, three times as large; its first pixels are
     the image's own where nothing is drawn over them."""
     sheet = tmp_path / "sheets" / "sheet.png"
     words = ["corpus", "inspect", str(folder), "--out", str(sheet), "--samples", "3"]

@@ -21,7 +21,7 @@ def test_no_way_is_an_error():
 
 
 def test_march_stops_at_walls_and_bounds():
-    """A ball stops at its radius before a wall; its centre at the bounds, whichever are met first;
+    """A ball stops at its radius before a wall; its center at the bounds, whichever are met first;
     nothing flies on longer.
     """
     x = np.array([[1.0, 0.0, 0.0]])

@@ -59,7 +59,7 @@ def test_flight_by_hand(tmp_path):
 
 def test_splats_behind_drake(opengl, tmp_path):
     """A trunk hides the ball, wholly on its way, and then the ball hides a trunk; the rest of the
-    image has the forest's colours."""
+    image has the forest's colors."""
     red = []
     for seconds in (0.0, 0.2, 0.5):
         words = "--width", 240, "--seconds", seconds, "--out", tmp_path / "ball.png"
@@ -158,7 +158,7 @@ def test_crash_replayed(tmp_path):
 
 
 def test_drakes_quadrotor(tmp_path):
-    """Drake's quadrotor flies towards where it is to hover, and a video of it can be read."""
+    """Drake's quadrotor flies toward where it is to hover, and a video of it can be read."""
     out = run("drakes_quadrotor.py", "--seconds", 1, "--out", "flight.mp4", cwd=tmp_path)
     assert number(r"flown \[(\S+),", out) > 0.5
     video = cv2.VideoCapture(str(tmp_path / "flight.mp4"))

@@ -16,7 +16,7 @@ def write_room() -> Callable[..., Path]:
 
 @pytest.fixture
 def color_of_room() -> Callable[[np.ndarray], np.ndarray]:
-    """Colour of points in north-east-down coordinates, see `room_color`."""
+    """Color of points in north-east-down coordinates, see `room_color`."""
     return room_color
 
 

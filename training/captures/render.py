@@ -541,7 +541,7 @@ def _write_frames(
 _MAX_POINTS = 2_000_000
 _MAX_GAUSSIANS = 200_000
 _SPREAD = 0.6
-"""Standard deviation of a Gaussian over the distance to its neighbours."""
+"""Standard deviation of a Gaussian over the distance to its neighbors."""
 
 
 def capture_gaussians(capture: Capture, frames: Sequence[int]) -> GaussianScene | None:

@@ -29,7 +29,7 @@ from splatpilot.training.corpus.expert import (
     PLANNER,
     ExpertFlight,
     Label,
-    Labeller,
+    Labeler,
     fly_planner,
     fly_policy,
 )
@@ -74,7 +74,7 @@ def keep_clear(labels: Iterable[Label], field: Esdf) -> list[Demonstration]:
 def see_states(
     demonstrations: list[Demonstration],
     world: World,
-    labeller: Labeller,
+    labeler: Labeler,
     config: CorpusConfig,
     bound: float,
     rng: np.random.Generator,
@@ -85,7 +85,7 @@ def see_states(
     Args:
         demonstrations: n of them.
         world: where; its look is drawn anew.
-        labeller: that of the labels.
+        labeler: that of the labels.
         config: of the corpus.
         bound: how far poses may be perturbed in this world [m].
         rng: draws look and perturbations.
@@ -103,7 +103,7 @@ def see_states(
     for state, waypoints_W in demonstrations:
         p_WB, v_WB, _, _ = QuadrotorState.of(state)
         X_WB = pose_from_state(state)
-        clearance = float(labeller.field.distance(p_WB)) - VEHICLE_RADIUS
+        clearance = float(labeler.field.distance(p_WB)) - VEHICLE_RADIUS
         reach = min(bound, clearance)
         around = [perturbed(X_WB, config.perturbation, reach, rng) for _ in range(copies)]
         for X_WP in [X_WB, *around]:
@@ -113,7 +113,7 @@ def see_states(
             samples.depth[row] = ranged_depth(view.depth, optics.min_depth, optics.max_depth)
             samples.X_WB[row] = *X_WP.rotation().ToQuaternion().wxyz(), *p_WP
             samples.v_B[row] = R_PW @ v_WB
-            samples.goal_B[row] = R_PW @ (labeller.toa.p_WG - p_WP)
+            samples.goal_B[row] = R_PW @ (labeler.toa.p_WG - p_WP)
             samples.trajectories_B[row] = (waypoints_W - p_WP) @ R_PW.T
             row += 1
     return samples
@@ -139,7 +139,7 @@ _SIDEWAYS = 0.3  # [m/s], standard deviation
 
 
 def draw_off_path(
-    labeller: Labeller, count: int, speed: float, rng: np.random.Generator
+    labeler: Labeler, count: int, speed: float, rng: np.random.Generator
 ) -> np.ndarray:
     """
     Draws states (count, 13) from which a path leads to the goal.
@@ -152,7 +152,7 @@ def draw_off_path(
     Raises:
         InfeasibleFlightError: if there is no free position.
     """
-    field, toa = labeller.field, labeller.toa
+    field, toa = labeler.field, labeler.toa
     cells = np.argwhere(toa.reachable & (field.distances > VEHICLE_RADIUS + _CLEARANCE))
     if len(cells) == 0:
         raise InfeasibleFlightError("no position from which a path leads to the goal is free")
@@ -170,9 +170,9 @@ def draw_off_path(
     before = np.flatnonzero(before)[: count // 2]
     chosen = np.concatenate([before, np.arange(count - len(before))])
     p_WB, distance = candidates[chosen], seen.distance[chosen]
-    towards = toa.gradient(p_WB)
-    towards[: len(before)] = seen.gradient[before]
-    yaw = np.arctan2(-towards[:, 1], -towards[:, 0]) + _TURN * rng.normal(size=count)
+    toward = toa.gradient(p_WB)
+    toward[: len(before)] = seen.gradient[before]
+    yaw = np.arctan2(-toward[:, 1], -toward[:, 0]) + _TURN * rng.normal(size=count)
     yaw[len(before) : len(before) + near] = rng.uniform(-np.pi, np.pi, near)
     roll, pitch = _LEAN * rng.normal(size=(2, count))
     fastest = np.sqrt(2.0 * _BRAKING * np.maximum(distance - VEHICLE_RADIUS, 0.0))
@@ -212,19 +212,19 @@ def collect_world(folder: Path, config: CorpusConfig, index: int, revision: str)
     """
     source = world_source(config.worlds, config.seed, index)
     world = make_world(source.world, source.seed)
-    labeller = Labeller(world.esdf, world.p_WG, config.expert)
+    labeler = Labeler(world.esdf, world.p_WG, config.expert)
     record_world(folder / "worlds" / source.name, source, world.esdf)
-    _collect_off_path(folder, config, source, world, labeller, revision)
+    _collect_off_path(folder, config, source, world, labeler, revision)
     rngs = [np.random.default_rng([config.seed, source.seed, k]) for k in range(config.flights)]
-    starts = np.stack([world.p_WS, *(_draw_start(labeller, world.p_WS, rng) for rng in rngs[1:])])
+    starts = np.stack([world.p_WS, *(_draw_start(labeler, world.p_WS, rng) for rng in rngs[1:])])
     parts, entries = [], []
     for number, (flight, rng) in enumerate(
-        zip(_fly(starts, world, config, labeller), rngs, strict=True)
+        zip(_fly(starts, world, config, labeler), rngs, strict=True)
     ):
         labels = flight.labels if flight.is_demonstration else []
-        demonstrations = keep_clear(labels, labeller.field)
+        demonstrations = keep_clear(labels, labeler.field)
         bound = source.perturbation_bound
-        parts.append(see_states(demonstrations, world, labeller, config, bound, rng))
+        parts.append(see_states(demonstrations, world, labeler, config, bound, rng))
         entries.append(
             {
                 "flight": number,
@@ -258,7 +258,7 @@ def _collect_off_path(
     config: CorpusConfig,
     source: WorldSource,
     world: World,
-    labeller: Labeller,
+    labeler: Labeler,
     revision: str,
 ) -> None:
     """Writes the shard of states off the expert's paths, if the corpus has any."""
@@ -270,10 +270,10 @@ def _collect_off_path(
         # The expert's flights have the numbers from 0 on.
         rng = np.random.default_rng([config.seed, source.seed, config.flights + first])
         count = min(STATES_A_LOOK, config.off_path - first)
-        states = draw_off_path(labeller, count, config.expert.speed, rng)
-        demonstrations = keep_clear(labeller.labels(states), labeller.field)
+        states = draw_off_path(labeler, count, config.expert.speed, rng)
+        demonstrations = keep_clear(labeler.labels(states), labeler.field)
         bound = source.perturbation_bound
-        parts.append(see_states(demonstrations, world, labeller, alone, bound, rng))
+        parts.append(see_states(demonstrations, world, labeler, alone, bound, rng))
     write_shard(
         shard_folder(folder, source.name, OFF_PATH),
         parts,
@@ -286,18 +286,18 @@ def _collect_off_path(
 
 
 def _fly(
-    starts: np.ndarray, world: World, config: CorpusConfig, labeller: Labeller
+    starts: np.ndarray, world: World, config: CorpusConfig, labeler: Labeler
 ) -> Iterable[ExpertFlight]:
     """Flies the expert from each of the starts (N, 3) [m] to the goal of the world."""
     if config.expert.policy == PLANNER:
-        return fly_planner(starts, world, config.expert, labeller)
+        return fly_planner(starts, world, config.expert, labeler)
     scenarios = (Scenario(start=start, start_radius=0.0) for start in starts.tolist())
-    return (fly_policy(scenario, world, config.expert, labeller) for scenario in scenarios)
+    return (fly_policy(scenario, world, config.expert, labeler) for scenario in scenarios)
 
 
-def _draw_start(labeller: Labeller, p_WS: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def _draw_start(labeler: Labeler, p_WS: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Draws a free position (3,) [m], at least half as far from the goal as p_WS (3,) [m]."""
-    field, toa = labeller.field, labeller.toa
+    field, toa = labeler.field, labeler.toa
     roomy = toa.reachable & (field.distances > VEHICLE_RADIUS + _START_CLEARANCE)
     cells = np.argwhere(roomy & (toa.times > 0.5 * toa.value(p_WS)))
     if len(cells) == 0:

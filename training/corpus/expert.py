@@ -83,7 +83,7 @@ class ExpertFlight:
         return self.outcome is Outcome.GOAL and self.least_clearance > 0.0
 
 
-class Labeller:
+class Labeler:
     """What the best trajectories are from any state of a place: the planner with its global hint.
 
     Args:
@@ -127,7 +127,7 @@ class Labeller:
 
 
 def fly_policy(
-    scenario: Scenario, world: World, config: ExpertConfig, labeller: Labeller
+    scenario: Scenario, world: World, config: ExpertConfig, labeler: Labeler
 ) -> ExpertFlight:
     """Flies `scenario` in `world` by the expert's policy, as in the benchmark.
 
@@ -142,7 +142,7 @@ def fly_policy(
         flight.outcome,
         float(flight.times[-1]),
         float(np.nanmin(flight.clearances)),
-        labeller.labels(flight.states[np.searchsorted(flight.times, times - 1e-9)]),
+        labeler.labels(flight.states[np.searchsorted(flight.times, times - 1e-9)]),
     )
 
 
@@ -153,9 +153,9 @@ _STEP = 0.02  # [s], at most, between two commands
 
 
 def fly_planner(
-    p_WS: np.ndarray, world: World, config: ExpertConfig, labeller: Labeller
+    p_WS: np.ndarray, world: World, config: ExpertConfig, labeler: Labeler
 ) -> list[ExpertFlight]:
-    """Flies from each of the starts p_WS (N, 3) [m] to the labeller's goal.
+    """Flies from each of the starts p_WS (N, 3) [m] to the labeler's goal.
 
     The vehicles have the equations of the simulated plant and the law of its controller; a step of
     many costs as much as one of one. They look along their way, and fly by their labels: a plan
@@ -164,7 +164,7 @@ def fly_planner(
     Raises:
         ValueError: if no way leads to the goal from a state along a flight.
     """
-    control, params, p_WG = FlatnessControllerConfig(), QuadrotorParams(), labeller.toa.p_WG
+    control, params, p_WG = FlatnessControllerConfig(), QuadrotorParams(), labeler.toa.p_WG
     substeps = ceil(config.period / _STEP - 1e-9)
     dt = config.period / substeps
     yaws = np.arctan2(p_WG[1] - p_WS[:, 1], p_WG[0] - p_WS[:, 0])
@@ -178,7 +178,7 @@ def fly_planner(
             break
         ways = np.empty((len(flying), NUM_WAYPOINTS + 1, 3))
         for row, (n, state) in enumerate(zip(flying, states, strict=True)):
-            plan = labeller.label(number * config.period, state)
+            plan = labeler.label(number * config.period, state)
             labels[n].append(Label(state, plan))
             ways[row] = np.vstack([state[:3], plan.waypoints_W[plan.best]])
         for step in range(substeps):
@@ -192,7 +192,7 @@ def fly_planner(
             for n, p in zip(flying, p_WB, strict=True):
                 traces[n].append(p)
             arrived = lengths(p_WB - p_WG)[:, 0] <= GOAL_RADIUS
-            touched = labeller.field.distance(p_WB) < VEHICLE_RADIUS
+            touched = labeler.field.distance(p_WB) < VEHICLE_RADIUS
             for n in flying[arrived]:
                 outcomes[n] = Outcome.GOAL
             for n in flying[touched]:

@@ -1,6 +1,6 @@
 """Recovery: what the expert would have done just before a student came too near, or lost its way.
 
-The student has flown; nothing is flown here. The states before its near-misses are labelled anew
+The student has flown; nothing is flown here. The states before its near-misses are labeled anew
 and rendered offline. Beyond the paper, so are states all along flights that did not reach their
 goal: who hovers before it, circles it or leaves the volume comes near to nothing.
 """
@@ -21,7 +21,7 @@ from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.common.provenance import revision
 from splatpilot.training.corpus.collect import keep_clear, see_states
 from splatpilot.training.corpus.corpus import Corpus, CorpusConfig, write_ledger
-from splatpilot.training.corpus.expert import Labeller
+from splatpilot.training.corpus.expert import Labeler
 from splatpilot.training.corpus.library import WorldRecord
 from splatpilot.training.corpus.samples import RECOVERY, write_shard
 
@@ -99,7 +99,7 @@ def rows_before(times: np.ndarray, events: np.ndarray, period: float) -> np.ndar
 
 
 def rows_to_recover(flight: StudentFlight, events: np.ndarray, period: float) -> np.ndarray:
-    """The samples (n,) of a flight that are labelled, none of them in contact: before near-misses,
+    """The samples (n,) of a flight that are labeled, none of them in contact: before near-misses,
     and all along if it did not arrive.
 
     Args:
@@ -152,7 +152,7 @@ def add_recovery(folder: Path, flights: Sequence[StudentFlight], jobs: int | Non
         if not path.exists():
             work.append((path, records[world], flown))
     add = partial(_add_world, corpus.config, revision())
-    with Progress(total=len(work), desc="labelling near-misses", unit="world") as bar:
+    with Progress(total=len(work), desc="labeling near-misses", unit="world") as bar:
         for _ in map_processes(add, work, jobs or available_cores()):
             bar.update()
     corpus = Corpus(folder)
@@ -165,19 +165,19 @@ def _add_world(
 ) -> None:
     path, record, flights = work
     world, source = record.make(), record.source
-    labellers: dict[bytes, Labeller] = {}
+    labelers: dict[bytes, Labeler] = {}
     parts, entries = [], []
     for number, flight in enumerate(flights):
         goal = flight.p_WG.tobytes()
-        if goal not in labellers:
-            labellers[goal] = Labeller(world.esdf, flight.p_WG, config.expert)
+        if goal not in labelers:
+            labelers[goal] = Labeler(world.esdf, flight.p_WG, config.expert)
         clearances = obstacle_clearances(flight, world.distance_field)
         events = near_misses(flight.times, clearances)
         states = flight.states[rows_to_recover(flight, events, config.expert.period)]
-        labeller, bound = labellers[goal], source.perturbation_bound
-        demonstrations = keep_clear(labeller.labels(states), labeller.field)
+        labeler, bound = labelers[goal], source.perturbation_bound
+        demonstrations = keep_clear(labeler.labels(states), labeler.field)
         rng = np.random.default_rng(int(flight.digest(), 16))
-        parts.append(see_states(demonstrations, world, labeller, config, bound, rng))
+        parts.append(see_states(demonstrations, world, labeler, config, bound, rng))
         entries.append(
             {
                 "flight": number,

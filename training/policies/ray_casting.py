@@ -90,7 +90,7 @@ class Grids:
     """Values over the voxels of several worlds, interpolated trilinearly.
 
     Args:
-      values: (nx, ny, nz) of each, at the centres of voxels, at least two along each axis.
+      values: (nx, ny, nz) of each, at the centers of voxels, at least two along each axis.
       lower_W: (W, 3) [m], lower corners.
       voxel_sizes: (W,) [m].
       threads, simd: see `ShapeGeometry`.
@@ -117,7 +117,7 @@ class Grids:
         )
 
     def interpolate(self, p_WQ: Tensor, world: Tensor) -> tuple[Tensor, Tensor]:
-        """Values (N,) and gradients (N, 3) [1/m] at p_WQ (N, 3) [m]; beyond the outermost centres
+        """Values (N,) and gradients (N, 3) [1/m] at p_WQ (N, 3) [m]; beyond the outermost centers
         of voxels those at the nearest point between them."""
         return _query(self._native.interpolate, p_WQ, world)
 

@@ -42,7 +42,7 @@ class Transitions(NamedTuple):
     jerk: Tensor  # (M, 3) [m/s^3]
     # (M, K) [m], beyond the vehicle's radius, of the nearest obstacles and last the volume's top
     clearance: Tensor
-    approach: Tensor  # (M, K) [m/s], velocity towards them
+    approach: Tensor  # (M, K) [m/s], velocity toward them
     heading: Tensor | None  # (M,) [rad], commanded
 
 

@@ -10,7 +10,7 @@ Chosen here: the expert is the lattice of `systems.policies.lattice` instead of 
 Metropolis-Hastings sampler; a convolutional encoder of 32x24 pixels, trained with the rest, instead
 of a frozen MobileNet at 224; dense layers instead of convolutions of length one; trajectories of
 the expert that are much worse than its best are not imitated; contact costs 2, which the published
-cost has at 0.3 m, at the vehicle's own radius; a meter towards the goal reduces the cost by 0.1
+cost has at 0.3 m, at the vehicle's own radius; a meter toward the goal reduces the cost by 0.1
 when a hypothesis is chosen.
 """
 

@@ -47,7 +47,7 @@ class DepthNavLoss:
 
     # [s/m] Smooth L1 of the mean velocity's error.
     velocity: float = 4.0
-    # [-] Velocity towards the nearest obstacle times max(0, 1 - d)², d [m], and its proximity.
+    # [-] Velocity toward the nearest obstacle times max(0, 1 - d)², d [m], and its proximity.
     collision: float = 6.0
     # [m/s] Weight of ln(1 + exp(-6 d)) in that, at any velocity. With the 2.5 of the publication
     # vehicles do not fly through slits.

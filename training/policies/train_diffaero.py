@@ -4,7 +4,7 @@ After "DiffAero: A GPU-Accelerated Differentiable Simulation Framework for Effic
 Policy Learning" (2025). As published: a 16x9 depth image; nine numbers of state (target velocity,
 velocity and body z axis in the heading frame); commanded accelerations of a point mass with a lag;
 32 steps of flight per update; gradients that decay backward in time; a loss of velocity (smooth L1
-of a moving average), proximity of obstacles weighted with the velocity towards them, and jerk.
+of a moving average), proximity of obstacles weighted with the velocity toward them, and jerk.
 
 Different here: the convolutional and recurrent variant instead of the perceptron; depth to 12 m as
 3 / z - 0.6 instead of 1 - range / 5 m; the nearest surface in each pixel instead of one ray; 15 Hz
@@ -51,9 +51,9 @@ class DiffAeroLoss:
 
     # [s/m] Smooth L1 of the mean velocity's error.
     velocity: float = 3.0
-    # [s/m^3] Velocity towards an obstacle times max(0, 1 m - d)², d its distance; four nearest.
+    # [s/m^3] Velocity toward an obstacle times max(0, 1 m - d)², d its distance; four nearest.
     clearance: float = 2.0
-    # [s/m] Velocity towards an obstacle times softplus(-32 d / m) / 4.
+    # [s/m] Velocity toward an obstacle times softplus(-32 d / m) / 4.
     contact: float = 10.0
     # [s^4/m^2] Square of the acceleration.
     acceleration: float = 0.01

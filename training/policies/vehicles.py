@@ -57,7 +57,7 @@ class PointMass(NamedTuple):
     ) -> "PointMass":
         """Computes the state after `dt` [s] of constant commanded accelerations (N, 3) [m/s^2].
 
-        Exact for da/dt = (a_cmd - a) / lag. The vehicle turns towards `heading` (N,) [rad], or
+        Exact for da/dt = (a_cmd - a) / lag. The vehicle turns toward `heading` (N,) [rad], or
         along the velocity, as under the controller.
         """
         decay = torch.exp(-dt / self.lag)

@@ -81,7 +81,7 @@ class Trees:
     """N trees with round, straight trunks."""
 
     base: NDArray[np.float64]  # (N, 2) [m], where the axis meets the ground
-    lean: NDArray[np.float64]  # (N, 2), way of the axis in x and y per metre of height
+    lean: NDArray[np.float64]  # (N, 2), way of the axis in x and y per meter of height
     radius: NDArray[np.float64]  # (N,) [m]
     height: NDArray[np.float64]  # (N,) [m], of the tip
     species: NDArray[np.int64]  # (N,), OAK, PINE or BIRCH
@@ -99,7 +99,7 @@ class ForestLayout(FloorPlan):
     """Trees, rocks and fallen logs on the ground z = 0."""
 
     trees: Trees
-    rocks: NDArray[np.float64]  # (M, 4) [m], spheres: centre and radius
+    rocks: NDArray[np.float64]  # (M, 4) [m], spheres: center and radius
     logs: NDArray[np.float64]  # (L, 7) [m], capsules: two ends and radius
 
     def room(self, p: ArrayLike) -> NDArray[np.float64]:
@@ -203,7 +203,7 @@ def lay_out(
 def _free_spot(
     rng: np.random.Generator, lower: NDArray, upper: NDArray, taken: NDArray, radius: float
 ) -> NDArray[np.float64] | None:
-    """Draws the centre (2,) of a disc that meets none of the discs `taken` (K, 3): x, y, radius."""
+    """Draws the center (2,) of a disc that meets none of the discs `taken` (K, 3): x, y, radius."""
     draws = rng.uniform(lower[:2], upper[:2], (100, 2))
     gap = np.linalg.norm(draws[:, None] - taken[:, :2], axis=-1) - taken[:, 2] - radius
     free = (gap > 0.15).all(axis=1)

@@ -176,7 +176,7 @@ def _grow_moss(light, surfels, albedo) -> GaussianScene:
 
 
 def _on_floor(layout, light, surfels, albedo, opacity) -> GaussianScene:
-    """Colours patches of the ground: none under trunks, rocks and logs, dark against their feet."""
+    """Colors patches of the ground: none under trunks, rocks and logs, dark against their feet."""
     room = layout.room(surfels.p)
     open_ = room > -0.05
     shade = 0.55 + 0.45 * smoothstep(-0.05, 0.45, room)
@@ -212,21 +212,21 @@ def bushes(plan: FloorPlan, light: Daylight, rng: np.random.Generator) -> Gaussi
 def edge(
     plan: FloorPlan, light: Daylight, away: float, top: float, rng: np.random.Generator
 ) -> GaussianScene:
-    """Hangs a curtain of large patches `away` from the volume, ragged on top; both in metres."""
+    """Hangs a curtain of large patches `away` from the volume, ragged on top; both in meters."""
     spacing = 1.1
-    centre, half = (
+    center, half = (
         (plan.lower + plan.upper)[:2] / 2,
         (plan.upper - plan.lower)[:2] / 2,
     )
     angle = np.arange(0, 2 * np.pi, spacing / (half.max() + away))
     around = np.column_stack([np.cos(angle), np.sin(angle)])
     on_box = np.clip(around / np.abs(around).max(axis=1, keepdims=True), -1, 1) * half
-    rim = centre + on_box + around * away
+    rim = center + on_box + around * away
     z = np.arange(0.3, top, spacing)
     p = np.column_stack([np.tile(rim, (len(z), 1)), np.repeat(z, len(rim))])
     p += rng.uniform(-0.5, 0.5, p.shape)
     p = p[p[:, 2] < top * (0.75 + 0.35 * textures.fbm(p * 0.2, 2, seed=91))]
-    n = _unit(np.column_stack([centre - p[:, :2], np.zeros(len(p))]))
+    n = _unit(np.column_stack([center - p[:, :2], np.zeros(len(p))]))
     stems = smoothstep(0.2, 0.6, textures.value_noise(p[:, :2] * 1.3, seed=92))
     albedo = 0.8 * mix(textures.leaf(OAK, p * 0.4), (0.22, 0.20, 0.17), stems)
     extent = rng.uniform(0.8, 1.2, (len(p), 1)) * (0.85, 0.62)
@@ -297,7 +297,7 @@ _MARKS = {
 
 
 def trunks(layout: ForestLayout, light: ForestLight, rng: np.random.Generator) -> GaussianScene:
-    """Covers all trunks: a closed layer in the colour of fissures, marks of bark on top of it."""
+    """Covers all trunks: a closed layer in the color of fissures, marks of bark on top of it."""
     trees, ceiling = layout.trees, layout.upper[2]
     away = layout.outside(trees.base)
     foot, middle, top = trees.at(-0.1), trees.at(0.6 * ceiling), trees.at(ceiling)

@@ -1,4 +1,4 @@
-"""Procedural colours of surfaces: a `Pattern` each."""
+"""Procedural colors of surfaces: a `Pattern` each."""
 
 from collections.abc import Callable
 from functools import cache
@@ -23,7 +23,7 @@ from splatpilot.diagrams.worlds.solids.textures import (
 Array = NDArray[np.floating]
 type Pattern = Callable[[Array, Array, int], Array]
 """Maps face coordinates uv (N, 2) [m] (v upwards on upright faces), points p (N, 3) [m] in the
-solid's own frame and the solid's seed to colours (N, 3), sRGB in 0 to 1."""
+solid's own frame and the solid's seed to colors (N, 3), sRGB in 0 to 1."""
 
 
 def _tone(seed: int, strength: float = 0.35) -> Array:
@@ -65,16 +65,16 @@ def brick(uv: Array, p: Array, seed: int) -> Array:
 
 def concrete(uv: Array, p: Array, seed: int) -> Array:
     """`Pattern` of cast concrete, streaked by rain, with joints every 2.4 m and 1.2 m."""
-    grey = ramp(
+    gray = ramp(
         [(0.42, 0.41, 0.39), (0.60, 0.59, 0.57), (0.74, 0.73, 0.70)],
         0.5 + 0.55 * fbm(p * 0.7, 4, seed=111) + 0.12 * value_noise(p * 11, seed=112),
     )
     panel, joint = _cells(uv, 2.4, 1.2, 0.0)
-    grey = grey * (0.9 + 0.2 * hash_unit(panel, seed))[:, None]
+    gray = gray * (0.9 + 0.2 * hash_unit(panel, seed))[:, None]
     # Rain leaves dark streaks under the joints.
     streak = smoothstep(0.15, 0.5, fbm(np.stack([uv[:, 0] * 5, uv[:, 1] * 0.4], -1), 2, seed=113))
-    grey = mix(grey, (0.29, 0.28, 0.25), 0.55 * streak)
-    return mix((0.25, 0.24, 0.23), grey, smoothstep(0.01, 0.05, joint)) * _tone(seed)
+    gray = mix(gray, (0.29, 0.28, 0.25), 0.55 * streak)
+    return mix((0.25, 0.24, 0.23), gray, smoothstep(0.01, 0.05, joint)) * _tone(seed)
 
 
 def wood(uv: Array, p: Array, seed: int) -> Array:
@@ -115,7 +115,7 @@ def metal(uv: Array, p: Array, seed: int) -> Array:
 
 
 def hazard(uv: Array, p: Array, seed: int) -> Array:
-    """`Pattern` of slanted warning stripes, worn; two pairs of colours."""
+    """`Pattern` of slanted warning stripes, worn; two pairs of colors."""
     stripe = smoothstep(-0.08, 0.08, np.sin((uv[:, 0] + uv[:, 1]) * (2 * np.pi / 0.7)))
     pair = (((0.88, 0.68, 0.08), (0.10, 0.10, 0.10)), ((0.86, 0.85, 0.82), (0.72, 0.12, 0.10)))
     light, dark = pair[seed % 2]
@@ -227,7 +227,7 @@ def stone(uv: Array, p: Array, seed: int) -> Array:
 
 
 def cable(uv: Array, p: Array, seed: int) -> Array:
-    """`Pattern` of black rubber with a coloured sleeve every 1.5 m along z."""
+    """`Pattern` of black rubber with a colored sleeve every 1.5 m along z."""
     sleeve = smoothstep(0.38, 0.42, np.abs(p[:, 2] / 1.5 % 1.0 - 0.5))
     return mix((0.10, 0.10, 0.11), np.broadcast_to(_PAINTS[seed % 3], (len(p), 3)), sleeve)
 

@@ -103,7 +103,7 @@ class Daylight:
 def shade(
     albedo: NDArray, irradiance: ArrayLike, haze: ArrayLike, distance: ArrayLike
 ) -> NDArray[np.float64]:
-    """Colours (N, 3), sRGB, of surfaces as they are seen.
+    """Colors (N, 3), sRGB, of surfaces as they are seen.
 
     Args:
         albedo: (N, 3), sRGB, not negative.
@@ -115,7 +115,7 @@ def shade(
 
 
 def develop(linear: ArrayLike) -> NDArray[np.float32]:
-    """The sRGB colours of linear light: exposed like film, so that nothing clips."""
+    """The sRGB colors of linear light: exposed like film, so that nothing clips."""
     return ((1 - np.exp(-1.25 * np.asarray(linear))) ** (1 / GAMMA)).astype(np.float32)
 
 
@@ -130,7 +130,7 @@ Array = NDArray[np.floating]
 
 
 class Illumination(Protocol):
-    """Light baked into colours."""
+    """Light baked into colors."""
 
     @property
     def haze(self) -> Array:
@@ -155,15 +155,15 @@ class Sunlight:
 
     def irradiance(self, p_W: Array, n_W: Array) -> Array:
         sunlit = np.zeros(len(p_W))
-        towards = np.flatnonzero(n_W @ self.daylight.direction > 0)
-        sunlit[towards] = self._sunlit(p_W[towards] + 0.12 * n_W[towards])
+        toward = np.flatnonzero(n_W @ self.daylight.direction > 0)
+        sunlit[toward] = self._sunlit(p_W[toward] + 0.12 * n_W[toward])
         # What is flat on something else gets little sky.
         return self.daylight.irradiance(n_W, sunlit) * openness(self.esdf, p_W, n_W)[:, None]
 
     def _sunlit(self, p_W: Array) -> Array:
         """Part of the sun (N,) in [0, 1] that reaches points p_W (N, 3).
 
-        Steps towards the sun as far as the distance allows; the narrowest passage, as an angle,
+        Steps toward the sun as far as the distance allows; the narrowest passage, as an angle,
         tells how much of the sun is covered: shadows are softer the further away what throws them.
         """
         lit = np.ones(len(p_W))

@@ -1,7 +1,7 @@
 """Solids: shapes that can be hit, made of a material that can be seen.
 
-A solid's surface is cut into faces, each with coordinates (u, v) in metres. Gaussians and meshes
-are both drawn from these faces and ask the same material for colours, so they look alike.
+A solid's surface is cut into faces, each with coordinates (u, v) in meters. Gaussians and meshes
+are both drawn from these faces and ask the same material for colors, so they look alike.
 """
 
 from collections.abc import Callable
@@ -40,11 +40,11 @@ class Marks:
 
 @dataclass(frozen=True)
 class Material:
-    """A surface's colours and the spacing of the Gaussians that show them."""
+    """A surface's colors and the spacing of the Gaussians that show them."""
 
     albedo: patterns.Pattern
-    spacing: float  # [m], of the closed layer, which has the mean colours of the pattern
-    marks: tuple[Marks, ...] = ()  # in front of it, in the pattern's own colours
+    spacing: float  # [m], of the closed layer, which has the mean colors of the pattern
+    marks: tuple[Marks, ...] = ()  # in front of it, in the pattern's own colors
 
 
 def _joints(width: float, height: float, line: float, bond: bool = False) -> tuple[Marks, ...]:
@@ -104,7 +104,7 @@ class Solid:
             )
 
     def albedo(self, uv: Array, p_W: Array) -> NDArray[np.floating]:
-        """Colours (N, 3), sRGB, of the points p_W (N, 3) [m] with face coordinates uv (N, 2)."""
+        """Colors (N, 3), sRGB, of the points p_W (N, 3) [m] with face coordinates uv (N, 2)."""
         return MATERIALS[self.material].albedo(uv, self._own(p_W), self.seed)
 
     def _own(self, p_W: Array) -> Array:

@@ -18,7 +18,7 @@ type Indices = NDArray[np.integer]
 
 _SAGITTA = 0.002
 """[m], how far a triangle of a curved face may be from the surface."""
-_PAD = 2  # [px] around each face in the picture, so that filters see no neighbour
+_PAD = 2  # [px] around each face in the picture, so that filters see no neighbor
 _LIGHT_STEP = 6  # [px] between places where light is computed; it varies more slowly than patterns
 _PAGE = 4096  # [px] width and height of a picture
 GROUND_BELT = 6.0
@@ -165,7 +165,7 @@ def _triangulate(tile: _Tile, x: int, y: int, page_height: int) -> tuple[Array, 
 
 
 def mesh_of_gaussians(scene: GaussianScene) -> Mesh:
-    """Flat Gaussians, leaves, as opaque diamonds, each in the colour of one pixel."""
+    """Flat Gaussians, leaves, as opaque diamonds, each in the color of one pixel."""
     N = len(scene)
     columns = int(np.ceil(np.sqrt(max(N, 1))))
     picture = np.zeros((columns, columns, 3), dtype=np.uint8)

@@ -23,7 +23,7 @@ class FloorPlan:
 
     @classmethod
     def of_size(cls, length: float, width: float, height: float) -> FloorPlan:
-        """The volume from x = 0 to length, centred on y = 0, on the ground z = 0, all in [m]."""
+        """The volume from x = 0 to length, centered on y = 0, on the ground z = 0, all in [m]."""
         return cls(np.array([0.0, -width / 2, 0.0]), np.array([length, width / 2, height]))
 
     def outside(self, p: ArrayLike) -> NDArray[np.float64]:
@@ -40,13 +40,13 @@ class FloorPlan:
 
 COVERAGE = 0.62
 """Standard deviation over spacing at which a single layer of splats leaves no holes: midway between
-four neighbours, 0.71 spacings away, each still covers half of what lies behind it."""
+four neighbors, 0.71 spacings away, each still covers half of what lies behind it."""
 
 THICKNESS = 0.001
 """[m], standard deviation of a splat across its surface."""
 
 RIM = 1.9
-"""How many standard deviations beyond the centres of its outermost patches a closed layer ends. One
+"""How many standard deviations beyond the centers of its outermost patches a closed layer ends. One
 layer lets half of the light through at 1.4, the two that meet at an edge a little farther out."""
 
 _BULGE = 2.0
@@ -59,9 +59,9 @@ GROUND_REACH = _RINGS[-1]
 
 @dataclass(frozen=True, eq=False)
 class Surfels:
-    """N elliptic patches of surface in W, not coloured yet."""
+    """N elliptic patches of surface in W, not colored yet."""
 
-    p: NDArray[np.float64]  # (N, 3) [m], centres
+    p: NDArray[np.float64]  # (N, 3) [m], centers
     n: NDArray[np.float64]  # (N, 3), unit normals, outwards
     t: NDArray[np.float64]  # (N, 3), unit directions of the first extent, in the surface
     extent: NDArray[np.float64]  # (N, 2) [m], standard deviations along t and along n x t
@@ -143,7 +143,7 @@ def on_ground(p: ArrayLike, angle: ArrayLike, extent: ArrayLike, height: ArrayLi
 
     Args:
         p: (N, 2) [m], where.
-        angle: (N,) [rad], direction of the first extent, from x towards y.
+        angle: (N,) [rad], direction of the first extent, from x toward y.
         extent: (N, 2) or (2,) [m], standard deviations.
         height: [m], a number or (N,), z of the patches.
     """

@@ -1,4 +1,4 @@
-"""Solids as Gaussians: flat patches on their faces, in the colours of their materials."""
+"""Solids as Gaussians: flat patches on their faces, in the colors of their materials."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -1,7 +1,7 @@
-"""Procedural textures: colours as pure functions of position, seeded, without image files.
+"""Procedural textures: colors as pure functions of position, seeded, without image files.
 
-Every function is vectorised over leading axes, written (...), and gives the same bits for the same
-input. Colours are sRGB in 0 to 1. Positions are in metres; scale them before the call to stretch a
+Every function is vectorized over leading axes, written (...), and gives the same bits for the same
+input. Colors are sRGB in 0 to 1. Positions are in meters; scale them before the call to stretch a
 pattern.
 """
 
@@ -80,7 +80,7 @@ def smoothstep(low: float, high: float, x: ArrayLike) -> Array:
 
 
 def mix(a: ArrayLike, b: ArrayLike, t: ArrayLike) -> Array:
-    """Blends the colours a (..., 3) and b (..., 3) by the weight t (...,) of b."""
+    """Blends the colors a (..., 3) and b (..., 3) by the weight t (...,) of b."""
     t = np.asarray(t, dtype=np.float32)[..., None]
     return np.asarray(a, dtype=np.float32) * (1 - t) + np.asarray(b, dtype=np.float32) * t
 
@@ -98,7 +98,7 @@ OAK, PINE, BIRCH = range(3)
 
 
 def bark(species: int, p: ArrayLike) -> Array:
-    """Colour of bare bark at p (..., 3) of the species OAK, PINE or BIRCH."""
+    """Color of bare bark at p (..., 3) of the species OAK, PINE or BIRCH."""
     p = np.asarray(p, dtype=np.float64)
     patches = fbm(p * (1.6, 1.6, 0.9), 3, seed=11)
     grain = fbm(p * (24, 24, 5), 2, seed=12)
@@ -120,7 +120,7 @@ def bark(species: int, p: ArrayLike) -> Array:
 
 
 def fissure(species: int, p: ArrayLike) -> Array:
-    """Colour of the bottom of the cracks between the plates of the bark, at p (..., 3)."""
+    """Color of the bottom of the cracks between the plates of the bark, at p (..., 3)."""
     if species == BIRCH:
         return bark(BIRCH, p)
     tint = (0.60, 0.53, 0.48) if species == PINE else (0.50, 0.47, 0.44)
@@ -128,7 +128,7 @@ def fissure(species: int, p: ArrayLike) -> Array:
 
 
 def moss(p: ArrayLike) -> Array:
-    """Colour of moss at p (..., 3)."""
+    """Color of moss at p (..., 3)."""
     p = np.asarray(p, dtype=np.float64)
     return ramp(
         [(0.19, 0.24, 0.10), (0.31, 0.36, 0.15), (0.45, 0.46, 0.22)],
@@ -137,17 +137,17 @@ def moss(p: ArrayLike) -> Array:
 
 
 def stone(p: ArrayLike) -> Array:
-    """Colour of weathered rock at p (..., 3)."""
+    """Color of weathered rock at p (..., 3)."""
     p = np.asarray(p, dtype=np.float64)
-    grey = ramp(
+    gray = ramp(
         [(0.24, 0.24, 0.23), (0.36, 0.35, 0.33), (0.48, 0.46, 0.43)],
         0.5 + 0.7 * fbm(p * 5, 4, seed=31),
     )
-    return mix(grey, (0.56, 0.56, 0.45), 0.4 * smoothstep(0.2, 0.4, fbm(p * 7, 2, seed=32)))
+    return mix(gray, (0.56, 0.56, 0.45), 0.4 * smoothstep(0.2, 0.4, fbm(p * 7, 2, seed=32)))
 
 
 def forest_floor(p: ArrayLike) -> tuple[Array, Array]:
-    """Colour of soil, needles and moss at p (..., 2), and how mossy it is, (...,) in [0, 1]."""
+    """Color of soil, needles and moss at p (..., 2), and how mossy it is, (...,) in [0, 1]."""
     p = np.asarray(p, dtype=np.float64)
     litter = ramp(
         [(0.25, 0.18, 0.12), (0.40, 0.29, 0.19), (0.53, 0.40, 0.26)],
@@ -159,7 +159,7 @@ def forest_floor(p: ArrayLike) -> tuple[Array, Array]:
 
 
 def fallen_leaf(p: ArrayLike) -> Array:
-    """Colour of the dead leaf at p (..., 2): one colour per cell of 5 mm, so one per leaf."""
+    """Color of the dead leaf at p (..., 2): one color per cell of 5 mm, so one per leaf."""
     pick = hash_unit(np.floor(np.asarray(p) / 0.005), seed=51)
     return ramp(
         [
@@ -175,7 +175,7 @@ def fallen_leaf(p: ArrayLike) -> Array:
 
 
 def leaf(species: int, p: ArrayLike) -> Array:
-    """Colour of living leaves or needles at p (..., 3)."""
+    """Color of living leaves or needles at p (..., 3)."""
     p = np.asarray(p, dtype=np.float64)
     palettes = {
         OAK: [(0.20, 0.32, 0.09), (0.34, 0.46, 0.14), (0.50, 0.58, 0.20)],

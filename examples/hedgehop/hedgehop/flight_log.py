@@ -29,7 +29,7 @@ def is_flight_log(path: Path) -> bool:
 
 def read_flight_log(path: Path, config: CaptureConfig) -> Capture:
     """
-    Opens a log: lines `image, x, y, z, qx, qy, qz, qw`, metres, with a heading of these names.
+    Opens a log: lines `image, x, y, z, qx, qy, qz, qw`, meters, with a heading of these names.
 
     Raises:
         ValueError: for a line that is none, or without `capture.intrinsics`.

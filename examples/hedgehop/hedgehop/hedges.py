@@ -16,7 +16,7 @@ class HedgesConfig:
     """Hedges from side to side, one behind the other."""
 
     length: float = 24.0  # [m] flyable volume along x: from 0 to length
-    width: float = 10.0  # [m] along y, centred on 0
+    width: float = 10.0  # [m] along y, centered on 0
     height: float = 5.0  # [m] along z, from the ground
     hedges: int = 3  # [-]
     tallest: float = 2.5  # [m] height of the tallest hedge; others reach at least half of it

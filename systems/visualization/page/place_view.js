@@ -151,7 +151,7 @@ class PlaceView {
     if (points.length === 2 && scale_command) {
       const command = document.createElement("code");
       command.textContent = `${scale_command} --between "${text(points[0])}" `
-        + `"${text(points[1])}" --distance METRES`;
+        + `"${text(points[1])}" --distance METERS`;
       this.result.append(document.createElement("br"), "With the true length, in a shell:", command);
     }
   }

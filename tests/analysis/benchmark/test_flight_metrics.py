@@ -14,7 +14,7 @@ from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
 
 def straight_flight(outcome=Outcome.GOAL, clearance=0.5) -> Flight:
-    """Two metres a second along x for three seconds, and a last sample between two periods."""
+    """Two meters a second along x for three seconds, and a last sample between two periods."""
     times = np.append(np.arange(151) * 0.02, 3.007)
     states = np.zeros((152, 13))
     states[:, 0], states[:, 3] = 2.0 * times, 2.0

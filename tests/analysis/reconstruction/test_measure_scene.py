@@ -11,7 +11,7 @@ from splatpilot.systems.splats.scene import GaussianScene
 
 
 def with_curtain(gaussians: GaussianScene, x: float) -> GaussianScene:
-    """The scene with a grey sheet across the room at x."""
+    """The scene with a gray sheet across the room at x."""
     y, z = (g.ravel() for g in np.meshgrid(np.arange(-1, 4, 0.08), np.arange(-1, 3.5, 0.08)))
     count = len(y)
     curtain = GaussianScene.from_colors(

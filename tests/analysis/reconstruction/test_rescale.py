@@ -24,7 +24,7 @@ from splatpilot.systems.splats.baked_scene import BakedScene
 from splatpilot.training.captures.capture_registry import read_capture_of
 
 SHRUNK = 0.25
-"""Units of the photographs' registration a metre."""
+"""Units of the photographs' registration a meter."""
 
 
 @pytest.fixture

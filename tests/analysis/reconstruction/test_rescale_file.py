@@ -1,4 +1,4 @@
-"""Files of Gaussians in metres and upright."""
+"""Files of Gaussians in meters and upright."""
 
 import numpy as np
 import pytest
@@ -10,11 +10,11 @@ from splatpilot.systems.splats.baked_scene import BakedScene
 from splatpilot.systems.splats.splat_files import read_ply, write_ply
 
 SHRUNK = 0.25
-"""Units of the file a metre."""
+"""Units of the file a meter."""
 
 
 @pytest.mark.parametrize("up", UP_AXES)
-def test_file_of_gaussians_in_metres_and_upright(seen_room, tmp_path, up):
+def test_file_of_gaussians_in_meters_and_upright(seen_room, tmp_path, up):
     gaussians, capture = seen_room
     along = "xyz".index(up[-1])
     up_F = np.eye(3)[along] * (-1 if up.startswith("-") else 1)

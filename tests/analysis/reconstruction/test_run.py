@@ -25,7 +25,7 @@ SMALL = ReconstructConfig(
 @pytest.fixture
 def folder(seen_room, tmp_path):
     """The room in nerfstudio's format, overexposed, with a focal length that is twice the right
-    one and depth in units of which there are 500 a metre, which the file does not say."""
+    one and depth in units of which there are 500 a meter, which the file does not say."""
     _, capture = seen_room
     path = tmp_path / "capture"
     path.mkdir()

@@ -121,7 +121,7 @@ def test_mavsdks_vehicle_is_engaged_armed_flown_and_landed(post_world, inbox, ve
     run_until(lambda: time.monotonic() > asked + 2.0, tells=True)
     assert (vehicle.modes, vehicle.armed) == ([FlightMode.OFFBOARD], [True])
     sent = np.array([[s["vx"], s["vy"], s["vz"]] for s in vehicle.setpoints[-50:]])
-    towards = np.subtract(GOAL, START) * [1, -1, -1]
-    assert np.all(sent @ towards > 0.95 * np.linalg.norm(sent, axis=1) * np.linalg.norm(towards))
+    toward = np.subtract(GOAL, START) * [1, -1, -1]
+    assert np.all(sent @ toward > 0.95 * np.linalg.norm(sent, axis=1) * np.linalg.norm(toward))
     run_until(lambda: len(vehicle.modes) > 1, tells=False)
     assert vehicle.modes == [FlightMode.OFFBOARD, FlightMode.LAND]

@@ -44,7 +44,7 @@ def test_no_strength_changes_nothing(scene):
     np.testing.assert_allclose(sky, (0.2, 0.5, 0.9), atol=1e-5)
 
 
-def test_geometry_stays_and_colours_change(scene):
+def test_geometry_stays_and_colors_change(scene):
     first, again, other = (recolored(scene, draw(seed)) for seed in (1, 1, 2))
     for name in ("means", "quats", "scales", "opacities"):
         np.testing.assert_array_equal(getattr(first, name), getattr(scene, name))
@@ -67,10 +67,10 @@ def test_one_paint_stays_one_paint(scene):
     np.testing.assert_allclose(colors, np.tile(colors[0], (COUNT, 1)), atol=1e-6)
 
 
-def test_hue_turns_colours_and_leaves_greys(scene):
-    grey_axis = np.ones((3, 3)) / 3
+def test_hue_turns_colors_and_leaves_grays(scene):
+    gray_axis = np.ones((3, 3)) / 3
     turn = np.array([[0, -1, 1], [1, 0, -1], [-1, 1, 0]]) / np.sqrt(3)
-    hue = grey_axis - (np.eye(3) - grey_axis) / 2 + np.sqrt(3) / 2 * turn
+    hue = gray_axis - (np.eye(3) - gray_axis) / 2 + np.sqrt(3) / 2 * turn
     look = replace(draw(0, strength=0.0), mixing=hue.astype(np.float32))
     colors = [[0.8, 0.1, 0.1], [0.4, 0.4, 0.4]]
     two = GaussianScene.from_colors(
@@ -92,7 +92,7 @@ def test_light_from_one_side_falls_off_with_the_cosine(scene):
     np.testing.assert_allclose(linear, 2 * 0.5**2.2 * np.cos(angles), atol=1e-5)
 
 
-def test_environments_are_recoloured_in_every_direction():
+def test_environments_are_recolored_in_every_direction():
     texels = np.random.default_rng(0).uniform(0, 1, (4, 8, 3)).astype(np.float32)
     look = draw(7)
     found = recolored_background(EnvironmentMap(texels), look).texels

@@ -10,7 +10,7 @@ from splatpilot.systems.common.provenance import InfeasibleFlightError
 
 
 def hall(length: int, width: int) -> Octomap:
-    """A hall of voxels of 0.25 m, four metres high, free within its floor and walls."""
+    """A hall of voxels of 0.25 m, four meters high, free within its floor and walls."""
     x, y, z = np.meshgrid(range(length), range(width), range(16), indexing="ij")
     corners = np.stack([x, y, z], axis=-1).reshape(-1, 3)
     walls = (corners[:, 0] == 0) | (corners[:, 1] == 0) | (corners[:, 2] == 0)

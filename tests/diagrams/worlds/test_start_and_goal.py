@@ -15,7 +15,7 @@ RADIUS = 0.354
 
 
 def corridors(*boxes, unknown=(), size=(60, 60, 20), voxel_size=0.1):
-    """A solid block of voxels with free (or unknown) boxes, given in metres as (lower, upper)."""
+    """A solid block of voxels with free (or unknown) boxes, given in meters as (lower, upper)."""
     occupied = np.ones(size, bool)
     hidden = np.zeros(size, bool)
     for grid, value, some in ((occupied, False, (*boxes, *unknown)), (hidden, True, unknown)):

@@ -56,10 +56,10 @@ def render(field: AnalyticDistanceField, X_WC: RigidTransform) -> np.ndarray:
     ray_C = np.stack([(column - 60.0) / 60.0, (row - 45.0) / 60.0, np.ones_like(row)], -1)
     length = np.linalg.norm(ray_C, axis=-1)
     way_W = (ray_C / length[..., None]) @ X_WC.rotation().matrix().T
-    travelled = np.zeros_like(length)
+    traveled = np.zeros_like(length)
     for _ in range(40):
-        travelled += field.distance(X_WC.translation() + travelled[..., None] * way_W)
-    return (travelled / length).astype(np.float32)
+        traveled += field.distance(X_WC.translation() + traveled[..., None] * way_W)
+    return (traveled / length).astype(np.float32)
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ INDEX = np.stack(np.meshgrid(*[np.arange(SIZE) + 0.5] * 3, indexing="ij"), -1)
 
 
 def exact(*shapes) -> np.ndarray:
-    """The distance of a union of shapes at the voxel centres, in voxels."""
+    """The distance of a union of shapes at the voxel centers, in voxels."""
     return AnalyticDistanceField(shapes, np.zeros(3), np.full(3, float(SIZE))).distance(INDEX)
 
 
@@ -36,7 +36,7 @@ SOLIDS = {
 }
 
 
-def test_distance_to_voxels_against_a_nearest_neighbour_search():
+def test_distance_to_voxels_against_a_nearest_neighbor_search():
     random = np.random.default_rng(0)
     voxels = random.random((20, 14, 11)) < 0.01
     index = np.stack(np.meshgrid(*map(np.arange, voxels.shape), indexing="ij"), -1)
@@ -105,7 +105,7 @@ def test_the_surface_within_the_voxels_makes_the_field_accurate(solid):
 
 
 @pytest.mark.parametrize("solid", SOLIDS)
-def test_passing_sites_to_neighbours_only_tightens_the_bounds(solid):
+def test_passing_sites_to_neighbors_only_tightens_the_bounds(solid):
     phi = SOLIDS[solid].astype(np.float32)
     band = np.where(np.abs(phi) < 1.0, phi, np.float32(np.nan))
     loose, tight = (distances_from_band(phi < 0.0, band, 1.0, sweeps=n) for n in (0, 2))

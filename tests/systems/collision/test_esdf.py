@@ -15,7 +15,7 @@ VOXEL = 0.1
 
 
 def grid_of(function, shape=(20, 16, 12), states=None) -> Esdf:
-    """A field whose values at the voxel centres are function(x, y, z)."""
+    """A field whose values at the voxel centers are function(x, y, z)."""
     x, y, z = (
         lower + VOXEL * (np.arange(n) + 0.5) for lower, n in zip(LOWER_W, shape, strict=True)
     )
@@ -204,8 +204,8 @@ def test_conservative_field_goes_on_outside_the_box():
     sample = field.query(p)
     np.testing.assert_allclose(sample.distance[:2], -away[:2], atol=1e-6)  # before a face
     np.testing.assert_allclose(sample.distance[2:], -away[2:], atol=0.76 * VOXEL)  # at an edge
-    towards_box = np.sum(sample.gradient * (nearest - p), axis=1) / away
-    np.testing.assert_allclose(towards_box, 1.0, atol=1e-9)
+    toward_box = np.sum(sample.gradient * (nearest - p), axis=1) / away
+    np.testing.assert_allclose(toward_box, 1.0, atol=1e-9)
     np.testing.assert_array_equal(sample.state, OUTSIDE)
     np.testing.assert_array_equal(sample.distance, field.distance(p))
 
@@ -230,12 +230,12 @@ def test_conservative_field_is_lipschitz(seed):
     random = np.random.default_rng(seed)
     p = random.uniform(field.lower_W - 0.5, field.upper_W + 0.5, (64, 3))
     q = p + random.normal(size=(64, 3)) * 10.0 ** random.uniform(-3, 0, (64, 1))
-    travelled = np.linalg.norm(p - q, axis=1)
+    traveled = np.linalg.norm(p - q, axis=1)
     inside = ((np.stack([p, q]) > field.lower_W) & (np.stack([p, q]) < field.upper_W)).all((0, 2))
     # Before a face with unknown space behind it depth grows both along and across it, see
     # Esdf.conservative.
     limit = np.where(inside, 1.35, 1.5)
-    assert (np.abs(field.distance(p) - field.distance(q)) <= limit * travelled + 1e-6).all()
+    assert (np.abs(field.distance(p) - field.distance(q)) <= limit * traveled + 1e-6).all()
 
 
 CONSERVATIVE = half_known_field().conservative()

@@ -130,7 +130,7 @@ def test_values_at_the_voxel_centers_are_the_fields_own():
     grid = esdf_from_distance_field(field, 0.1)
     assert grid.shape == (20, 11, 8)
     p = np.stack(np.meshgrid(*grid.voxel_centers(), indexing="ij"), -1)
-    p[..., 2] = np.minimum(p[..., 2], 0.75)  # the last layer's centres lie on the bounds
+    p[..., 2] = np.minimum(p[..., 2], 0.75)  # the last layer's centers lie on the bounds
     np.testing.assert_allclose(grid.distances, field.distance(p), atol=1e-6)
     np.testing.assert_array_equal(grid.states, field.query(p).state)
     assert (grid.states == FieldState.OCCUPIED).any()

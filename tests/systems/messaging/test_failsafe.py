@@ -195,7 +195,7 @@ def test_the_most_severe_reason_is_told():
     assert bench.out("mode")[1] == status.BODY_LOST
 
 
-def test_a_vehicle_that_tips_over_is_levelled():
+def test_a_vehicle_that_tips_over_is_leveled():
     bench = Bench()
     bench.advance(0.06)
     tilted = hover_state([10.0, 0.0, 3.0])

@@ -52,7 +52,7 @@ def closed_wall() -> Esdf:
 
 @pytest.fixture(scope="session")
 def u_trap() -> Esdf:
-    """14 x 10 x 4 m with a U of walls open towards -x, inside 4 <= x <= 8, 2 <= y <= 8."""
+    """14 x 10 x 4 m with a U of walls open toward -x, inside 4 <= x <= 8, 2 <= y <= 8."""
     walls = [
         box([8, 1.6, -1], [8.4, 8.4, 5]),
         box([4, 1.6, -1], [8.4, 2, 5]),

@@ -114,10 +114,10 @@ class _Open:
         return (p_W - self.p_WG) / self.value(p_W)
 
     def path(self, p_W: np.ndarray, lengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        towards, distance = -self.gradient(p_W), self.value(p_W)
+        toward, distance = -self.gradient(p_W), self.value(p_W)
         going = (np.asarray(lengths) < distance)[:, None]
-        ends = p_W + np.minimum(lengths, distance)[:, None] * towards
-        return ends, going * towards
+        ends = p_W + np.minimum(lengths, distance)[:, None] * toward
+        return ends, going * toward
 
 
 @pytest.mark.parametrize("distance", [0.4, 1.5, 3.0, 4.9, 12.0])

@@ -128,7 +128,7 @@ def test_flies_as_fast_as_it_is_asked_to(name, files):
 
 @pytest.mark.parametrize(("distance", "scale"), [(0.0, 0.0), (0.5, 0.5), (1.0, 2.0), (5.0, 2.0)])
 def test_deviations_fade_at_the_goal(distance, scale):
-    """Of a network that always says 0.1, whose hypotheses are a fifth of a metre beside the
+    """Of a network that always says 0.1, whose hypotheses are a fifth of a meter beside the
     unobstructed way, and on it where they arrive."""
     spec = StudentSpec("depth", 64, 48, nominal_speed=2.6, way_version=2)
     weights = {name: np.zeros(shape, np.float32) for name, shape in spec.weight_shapes().items()}
@@ -142,7 +142,7 @@ def test_deviations_fade_at_the_goal(distance, scale):
 
 
 def test_rounding_does_not_decide_the_reference():
-    """Of a network that says nothing, towards a goal out of reach, in forty headings: one way in
+    """Of a network that says nothing, toward a goal out of reach, in forty headings: one way in
     the body frame. In version 2 it flies on; in version 1 it is the mean of that and of one that
     stops, which a goal just within reach has."""
     spec = StudentSpec("depth", 64, 48, nominal_speed=2.6, way_version=2)
@@ -175,7 +175,7 @@ def corridor(low: int, high: int, distance: float) -> np.ndarray:
 
 
 def test_weights_that_ship_fly_around_what_stands_ahead():
-    """At 2 m/s towards a goal straight ahead, the student that sees depth goes on where nothing
+    """At 2 m/s toward a goal straight ahead, the student that sees depth goes on where nothing
     stands, passes a wall on its free side, and slows before one that leaves none."""
     network = load_network("", "depth", 2.6)
     X_WB, v_WB, p_WG = RigidTransform([0.0, 0.0, 1.5]), np.array([2.0, 0.0, 0.0]), [12.0, 0.0, 1.5]
@@ -190,7 +190,7 @@ def test_weights_that_ship_fly_around_what_stands_ahead():
     assert end(corridor(0, 95, 2.0))[1] < -0.4 and end(corridor(65, 160, 2.0))[1] > 0.4
 
 
-def test_weights_that_ship_see_colours():
+def test_weights_that_ship_see_colors():
     network, X_WB = load_network("", "rgb", 2.6), RigidTransform([0.0, 0.0, 1.5])
     v_WB = np.array([1.5, 0.0, 0.0])
     meadow = np.full((120, 160, 3), [150, 180, 220], np.uint8)

@@ -50,7 +50,7 @@ def test_gradient_is_the_slowness(pillar):
 def test_gradient_is_that_of_the_value(pillar):
     toa = time_of_arrival(pillar, np.array([13.0, 4.0, 3.0]))
     cells = np.random.default_rng(2).integers([2, 2, 2], [70, 35, 25], (200, 3))
-    p_WQ = (cells + 1.0) * 0.2  # cell centres, away from the kinks between cells
+    p_WQ = (cells + 1.0) * 0.2  # cell centers, away from the kinks between cells
     step = 1e-2
     for axis in range(3):
         offset = step * np.eye(3)[axis]
@@ -71,7 +71,7 @@ def test_way_goes_down_the_gradient(u_trap):
         np.testing.assert_allclose(ends[0], p_WQ + step * down, rtol=0, atol=1e-14)
 
 
-def test_slowness_rises_towards_contact():
+def test_slowness_rises_toward_contact():
     distance = np.linspace(0.0, 6.0, 500)
     values = slowness(distance)
     assert np.all(np.diff(values) < 0.0)

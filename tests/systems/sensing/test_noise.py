@@ -75,8 +75,8 @@ def test_hue_and_blur():
         r, g, b = seen[0, 0]
         turns.append(math.degrees(math.atan2(math.sqrt(3.0) * (g - b), 2.0 * r - g - b)))
     assert -31.0 < min(turns) < -27.0 and 27.0 < max(turns) < 31.0
-    grey = np.full((4, 4, 3), 100, dtype=np.uint8)
-    np.testing.assert_array_equal(noisy_color(grey, noise, image_generator(0, 1)), grey)
+    gray = np.full((4, 4, 3), 100, dtype=np.uint8)
+    np.testing.assert_array_equal(noisy_color(gray, noise, image_generator(0, 1)), gray)
     point = np.zeros((41, 41, 3), dtype=np.uint8)
     point[20, 20] = 255
     spread = noisy_color(point, ObservationNoise(blur=1.5), image_generator(0, 0))[..., 0]
@@ -87,13 +87,13 @@ def test_hue_and_blur():
 
 def test_exposure():
     noise = ObservationNoise(exposure_error=1.0)
-    grey, error = np.full((4, 4, 3), 100.0), 0.5
-    light = (expose(grey, noise, error, np.zeros(grey.shape)) / 255) ** 2.2
+    gray, error = np.full((4, 4, 3), 100.0), 0.5
+    light = (expose(gray, noise, error, np.zeros(gray.shape)) / 255) ** 2.2
     np.testing.assert_allclose(light, 2**0.5 * (100 / 255) ** 2.2, rtol=1e-9)
     assert (expose(np.full(3, 250.0), noise, 1.0, np.zeros(3)) == 255.0).all()
     factors = []
     for number in range(200):
-        seen = noisy_color(grey.astype(np.uint8), noise, image_generator(1, number))
+        seen = noisy_color(gray.astype(np.uint8), noise, image_generator(1, number))
         assert len(np.unique(seen)) == 1
         factors.append((seen[0, 0, 0] / 100) ** 2.2)
     assert 0.5 <= min(factors) < 0.55 and 1.85 < max(factors) < 2.03

@@ -232,8 +232,8 @@ def test_depth_alone_is_identical(simd, lens, size):
 def test_needles_seen_edge_on_have_the_same_depth_alone(simd):
     rng = np.random.default_rng(4)
     scene = random_scene(count=2000, sh_degree=0)
-    towards = scene.means - np.array([0.0, 0.0, -3.0])
-    normals = np.cross(towards, rng.normal(size=towards.shape))
+    toward = scene.means - np.array([0.0, 0.0, -3.0])
+    normals = np.cross(toward, rng.normal(size=toward.shape))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     normals += 1e-3 * rng.normal(size=normals.shape)
     x, y, z = normals.T / np.linalg.norm(normals, axis=1)

@@ -201,8 +201,8 @@ def test_surfel_facing_the_camera_is_a_gaussian_disc():
     expected[expected < 1 / 255] = 0
     torch.testing.assert_close(images["alpha"], expected, rtol=1e-5, atol=1e-6)
     torch.testing.assert_close(images["depth"], 2 * expected, rtol=1e-5, atol=1e-6)
-    towards = torch.tensor([0.0, 0.0, -1.0])
-    torch.testing.assert_close(images["normal"], expected[..., None] * towards)
+    toward = torch.tensor([0.0, 0.0, -1.0])
+    torch.testing.assert_close(images["normal"], expected[..., None] * toward)
     assert (images["median"] - 2 * (expected > 0)).abs().max() < 1e-6
     assert not images["distort"].abs().max() > 1e-6
 

@@ -194,7 +194,7 @@ def test_hover_holds():
 
 @pytest.mark.parametrize("step", [[3.0, 0.0, 0.0], [-2.0, 2.0, 4.0], [0.0, 0.0, -3.0], [30, 40, 5]])
 def test_a_step_of_the_waypoint_converges(step):
-    """A waypoint that jumps, even by 50 m, is reached and held to a millimetre."""
+    """A waypoint that jumps, even by 50 m, is reached and held to a millimeter."""
     _, states, _ = fly(hover_state([0.0, 0.0, 0.0]), 20.0, waypoint=lambda t: step)
     assert np.isfinite(states).all()
     np.testing.assert_allclose(states[-1, 0:3], step, atol=1e-3)
@@ -216,7 +216,7 @@ def circle(t, radius=3.0, speed=2.0):
     return np.array([radius * math.cos(angle), radius * math.sin(angle), 1.5])
 
 
-def test_tracks_a_circle_to_a_centimetre():
+def test_tracks_a_circle_to_a_centimeter():
     """On a circle of 3 m at 2 m/s the steady error is under 1 cm and yaw is within 6 degrees."""
     state = hover_state(circle(0.0), yaw=math.pi / 2)
     state[3:6] = [0.0, 2.0, 0.0]
@@ -242,7 +242,7 @@ def test_an_acceleration_is_reproduced():
 
 
 @pytest.mark.parametrize("direction", [-3.0, -1.0, 0.5, 2.0])
-def test_yaw_turns_towards_motion(direction):
+def test_yaw_turns_toward_motion(direction):
     """Flying straight in any direction ends facing that way, having turned at a limited rate."""
     heading = np.array([math.cos(direction), math.sin(direction), 0.0])
     _, states, commands = fly(

@@ -78,7 +78,7 @@ def pose_of(state):
 
 
 @given(q=st.lists(st.floats(-2, 2), min_size=4, max_size=4))
-def test_pose_has_the_position_and_the_attitude_of_the_normalised_quaternion(q):
+def test_pose_has_the_position_and_the_attitude_of_the_normalized_quaternion(q):
     """Any nonzero quaternion gives the rotation scipy gives it, beside the position."""
     assume(np.linalg.norm(q) > 1e-6)
     state = np.arange(13.0)

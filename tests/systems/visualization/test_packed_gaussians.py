@@ -8,7 +8,7 @@ from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.visualization.pages import pack_gaussians
 
 
-def test_words_hold_centres_shades_and_covariances():
+def test_words_hold_centers_shades_and_covariances():
     generator = np.random.default_rng(0)
     n = 50
     scene = GaussianScene.from_colors(

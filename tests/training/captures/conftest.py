@@ -12,7 +12,7 @@ LOWER, UPPER = np.array([0.0, -1.5, 0.0]), np.array([6.0, 1.5, 2.5])
 
 
 def color_at(p_W: np.ndarray) -> np.ndarray:
-    """Colour (..., 3), 0 to 255, of the points (..., 3) on the walls."""
+    """Color (..., 3), 0 to 255, of the points (..., 3) on the walls."""
     x, y, z = np.moveaxis(p_W, -1, 0)
     waves = [
         np.sin(3.1 * x) * np.cos(4 * z + 1),
@@ -50,7 +50,7 @@ POSES = [
 
 
 def trace(X_WC: RigidTransform, rays: np.ndarray, finer: float = 1.0) -> RoomView:
-    """What a camera sees along rays (H, W, 2), x/z and y/z, colours changing so much faster."""
+    """What a camera sees along rays (H, W, 2), x/z and y/z, colors changing so much faster."""
     d_C = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], axis=-1)
     d_W = d_C @ X_WC.rotation().matrix().T
     p_W = X_WC.translation()
@@ -66,9 +66,9 @@ def pinhole_rays(K: np.ndarray, width: int, height: int) -> np.ndarray:
 
 
 def assert_shows_room(capture, X_RW=None, color=6.0, depth: float | None = 1e-5) -> None:
-    """Every pixel's depth leads to a wall, and its colour is that of the wall seen there.
+    """Every pixel's depth leads to a wall, and its color is that of the wall seen there.
 
-    X_RW takes the capture's world to the room's; colours may be off by `color` on average.
+    X_RW takes the capture's world to the room's; colors may be off by `color` on average.
     """
     X_RW = X_RW or RigidTransform()
     for i in range(len(capture)):

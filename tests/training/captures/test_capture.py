@@ -160,7 +160,7 @@ def test_pixels_are_valid_that_replace_valid_ones_alone():
     np.testing.assert_array_equal(small.depth > 0, expected)
 
 
-def test_colours_are_averaged():
+def test_colors_are_averaged():
     frame = frame_of(np.ones((4, 6)))
     mean = frame.image.reshape(2, 2, 3, 2, 3).mean(axis=(1, 3))
     assert np.abs(shrink(frame, 2).image - mean).max() <= 0.5

@@ -140,7 +140,7 @@ def test_wrong_depth_and_intrinsics_are_named(room, change, mistake):
     assert re.search(mistake, report.mistake), str(report)
 
 
-def test_colour_and_depth_that_are_not_registered(room, room_views, room_poses):
+def test_color_and_depth_that_are_not_registered(room, room_views, room_poses):
     p_DC = np.array([0.06, 0.02, 0.0])
     K_D = np.array([[125.0, 0, 80.0], [0, 125.0, 60.0], [0, 0, 1]])
     K_C = np.array([[110.0, 0, 80.0], [0, 110.0, 60.0], [0, 0, 1]])

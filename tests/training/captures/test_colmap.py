@@ -99,11 +99,11 @@ def test_camera_height(model, room_poses):
 @pytest.mark.parametrize("turn", [RotationMatrix.MakeXRotation, RotationMatrix.MakeYRotation])
 def test_ground_that_cameras_contradict(model, turn):
     level = read_capture(model)
-    centre = np.mean([X_WC.translation() for X_WC in level.X_WCs], axis=0)
+    center = np.mean([X_WC.translation() for X_WC in level.X_WCs], axis=0)
 
     def over_slope(degrees: float, depth: float) -> Capture:
         p_SQ = np.random.default_rng(0).uniform([-5, -5, 0], [5, 5, 0], (500, 3))
-        p_WQ = centre + turn(np.deg2rad(degrees)).multiply(p_SQ.T).T - [0, 0, depth]
+        p_WQ = center + turn(np.deg2rad(degrees)).multiply(p_SQ.T).T - [0, 0, depth]
         return dataclasses.replace(level, points=SfmPoints(p_WQ, np.zeros((500, 3))))
 
     assert camera_height(over_slope(5, 2.0)) == pytest.approx(2.0, rel=0.05)
@@ -131,8 +131,8 @@ def test_depth_of_some_images(model, K, room_views, room_poses):
     (model / "depth").mkdir()
     views = room_views(K, 64, 48)
     for i in (2, 5):
-        millimetres = np.round(1000 * views[i].depth).astype(np.uint16)
-        cv2.imwrite(str(model / f"depth/{i:02d}.png"), millimetres)
+        millimeters = np.round(1000 * views[i].depth).astype(np.uint16)
+        cv2.imwrite(str(model / f"depth/{i:02d}.png"), millimeters)
     capture = read_capture(model, CaptureConfig(scale=ScaleConfig(depth_folder="depth")))
     assert capture.metric and capture.has_depth
     np.testing.assert_allclose(lengths(capture), true_lengths(room_poses), rtol=0.02)

@@ -51,7 +51,7 @@ def test_derivatives(seen, room_poses, number):
     assert less is not None and here is not None and more is not None
     expected = (more.residuals - less.residuals) / (2 * h)
     found = here.derivatives[..., number]
-    # Slopes are those over two pixels, which is less where colours turn: most points, about.
+    # Slopes are those over two pixels, which is less where colors turn: most points, about.
     error = np.abs(found - expected) / (np.abs(expected).max(axis=1, keepdims=True) + 1e-6)
     assert (np.median(error, axis=1) < [0.001, 0.1]).all()
 

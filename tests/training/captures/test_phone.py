@@ -32,8 +32,8 @@ def write(tmp_path, K, room_views):
                 view.image[..., ::-1],
                 [cv2.IMWRITE_JPEG_QUALITY, 100],
             )
-            millimetres = np.round(1000 * depth).astype(np.uint16)
-            cv2.imwrite(str(folder / f"depth/{stem}.png"), millimetres)
+            millimeters = np.round(1000 * depth).astype(np.uint16)
+            cv2.imwrite(str(folder / f"depth/{stem}.png"), millimeters)
             pose = (X_RF.inverse() @ view.X_WC).GetAsMatrix4() @ OPENGL
             camera = {f"t_{r}{c}": pose[r, c] for r in range(3) for c in range(4)}
             camera |= {"fx": focused[0, 0], "fy": focused[1, 1], "cx": K[0, 2], "cy": K[1, 2]}

@@ -87,7 +87,7 @@ def test_exact_poses_stay(frames, room_poses):
     assert moved < 1e-3
 
 
-def test_who_sees_nothing_goes_with_its_neighbours(frames, room_poses):
+def test_who_sees_nothing_goes_with_its_neighbors(frames, room_poses):
     given = drifting(room_poses, 0.02, 0.02)
     seen = frames(room_poses)
     blind = CaptureFrame(
@@ -114,7 +114,7 @@ K_REFINED_CAPTURE = np.array([[300.0, 0, 160.0], [0, 300.0, 120.0], [0, 0, 1]])
 
 @pytest.fixture
 def folder(tmp_path, room_views, room_poses) -> Path:
-    """The room as a folder of the 7-Scenes kind, whose poses are off by a centimetre and more
+    """The room as a folder of the 7-Scenes kind, whose poses are off by a centimeter and more
     along its length."""
     path = tmp_path / "capture"
     path.mkdir()

@@ -257,7 +257,7 @@ def test_path_visits_all_free_space_and_keeps_clear(divided_hall):
     lower_W, upper_W = np.array([0, 0, 1.0]), np.array([12, 8, 2.0])
     path = visiting_path(divided_hall, lower_W, upper_W, clearance, apart)
     assert divided_hall.conservative().distance(path).min() > clearance
-    # Neighbours on a grid of 0.2 m: nothing is jumped over.
+    # Neighbors on a grid of 0.2 m: nothing is jumped over.
     assert np.linalg.norm(np.diff(path, axis=0), axis=1).max() < 0.2 * np.sqrt(3) + 1e-9
     x, y = np.meshgrid(np.arange(1.0, 11.1, 0.5), np.arange(1.0, 7.1, 0.5))
     places = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 1.5)])

@@ -60,7 +60,7 @@ class Bag:
             time = START + i / 30
             header = self.header(time, FRAME)
             depth = view.depth.astype(np.float32)
-            millimetres = np.round(1000 * depth).astype(np.uint16)
+            millimeters = np.round(1000 * depth).astype(np.uint16)
             if compressed:
                 png = cv2.imencode(".png", view.image[..., ::-1])[1]
                 self.write(
@@ -68,7 +68,7 @@ class Bag:
                     header=header, format="bgr8; png compressed bgr8", data=png.ravel(),
                 )  # fmt: skip
                 a, b = 2000.0, 100.0
-                stored = np.round(a / depth + b).astype(np.uint16) if depth32 else millimetres
+                stored = np.round(a / depth + b).astype(np.uint16) if depth32 else millimeters
                 packed = cv2.imencode(".png", stored)[1].ravel()
                 parameters = np.frombuffer(struct.pack("<iff", 0, a, b), np.uint8)
                 kind = "32FC1" if depth32 else "16UC1"
@@ -84,7 +84,7 @@ class Bag:
             for topic, encoding, pixels, step in (
                 (color, "bgr8", padded, 3 * (width + 2)),
                 ("/depth", "32FC1", depth, 4 * width) if depth32 else
-                ("/depth", "16UC1", millimetres, 2 * width),
+                ("/depth", "16UC1", millimeters, 2 * width),
             ):  # fmt: skip
                 self.write(
                     topic, "sensor_msgs/msg/Image", time, header=header, height=height,

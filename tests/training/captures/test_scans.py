@@ -16,7 +16,7 @@ K_D = np.array([[55.0, 0, 32], [0, 55.0, 24], [0, 0, 1]])
 
 @pytest.fixture
 def write(tmp_path, K, room_views, room_poses):
-    """Writes the room as two cameras see it, colour at P_DC in the depth camera."""
+    """Writes the room as two cameras see it, color at P_DC in the depth camera."""
 
     def write() -> Path:
         X_DC = RigidTransform(np.array(P_DC))
@@ -25,9 +25,9 @@ def write(tmp_path, K, room_views, room_poses):
         for i, (color, depth) in enumerate(zip(colors, depths, strict=True)):
             stem = str(tmp_path / f"frame-{10 * i:06d}")
             cv2.imwrite(f"{stem}.color.png", color.image[..., ::-1])
-            millimetres = np.round(1000 * depth.depth).astype(np.uint16)
-            millimetres[0, 0], millimetres[0, 1] = 0, 65535
-            cv2.imwrite(f"{stem}.depth.png", millimetres)
+            millimeters = np.round(1000 * depth.depth).astype(np.uint16)
+            millimeters[0, 0], millimeters[0, 1] = 0, 65535
+            cv2.imwrite(f"{stem}.depth.png", millimeters)
             np.savetxt(f"{stem}.pose.txt", depth.X_WC.GetAsMatrix4())
         return tmp_path
 
@@ -171,13 +171,13 @@ def write_scannet(tmp_path, K, room_views):
     colors, depths = room_views(K, 64, 48), room_views(K_D_SCANNET, 32, 24)
     for i, (color, depth) in enumerate(zip(colors, depths, strict=True)):
         cv2.imwrite(str(tmp_path / f"color/{i}.png"), color.image[..., ::-1])
-        millimetres = np.round(1000 * depth.depth).astype(np.uint16)
-        cv2.imwrite(str(tmp_path / f"depth/{i}.png"), millimetres)
+        millimeters = np.round(1000 * depth.depth).astype(np.uint16)
+        cv2.imwrite(str(tmp_path / f"depth/{i}.png"), millimeters)
         np.savetxt(tmp_path / f"pose/{i}.txt", color.X_WC.GetAsMatrix4())
     for name, intrinsics in (("color", K), ("depth", K_D_SCANNET)):
         matrix = np.eye(4)
         matrix[:3, :3] = intrinsics
-        matrix[:2, 2] -= 0.5  # counted from the first pixel's centre
+        matrix[:2, 2] -= 0.5  # counted from the first pixel's center
         np.savetxt(tmp_path / f"intrinsic/intrinsic_{name}.txt", matrix)
     return tmp_path
 

@@ -9,7 +9,7 @@ FX, CX = 525.0, 320.0
 
 @pytest.fixture
 def write(tmp_path, room_views, room_poses):
-    """Writes the room as TUM does, at 80x60: depth 10 ms and poses 5 ms off the colour images."""
+    """Writes the room as TUM does, at 80x60: depth 10 ms and poses 5 ms off the color images."""
     K = np.array([[FX, 0, CX], [0, FX, 240.0], [0, 0, 1]]) * [[1 / 8], [1 / 8], [1]]
     (tmp_path / "rgb").mkdir()
     (tmp_path / "depth").mkdir()

@@ -15,7 +15,7 @@ from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.vehicle.state import QuadrotorState, pose_from_state
 from splatpilot.training.corpus.collect import Demonstration, keep_clear, see_states
 from splatpilot.training.corpus.corpus import CorpusConfig
-from splatpilot.training.corpus.expert import ExpertConfig, Label, Labeller
+from splatpilot.training.corpus.expert import ExpertConfig, Label, Labeler
 from splatpilot.training.corpus.library import PerturbationConfig
 
 BALL = np.array([5.0, 1.2, 2.6])  # p_W, ahead, to the left and above of the states below
@@ -44,8 +44,8 @@ def world() -> World:
 
 
 @pytest.fixture(scope="module")
-def labeller(world) -> Labeller:
-    return Labeller(world.esdf, world.p_WG, ExpertConfig())
+def labeler(world) -> Labeler:
+    return Labeler(world.esdf, world.p_WG, ExpertConfig())
 
 
 def tilted_state(p_WB) -> np.ndarray:
@@ -58,20 +58,20 @@ def tilted_state(p_WB) -> np.ndarray:
 STATES = [tilted_state(p) for p in ([1.5, 0.2, 2.0], [2.0, -0.5, 1.5])]
 
 
-def see(world, labeller, bound=np.inf, config=CONFIG):
-    demonstrations = keep_clear(labeller.labels(STATES), labeller.field)
+def see(world, labeler, bound=np.inf, config=CONFIG):
+    demonstrations = keep_clear(labeler.labels(STATES), labeler.field)
     rng = np.random.default_rng(3)
-    return demonstrations, see_states(demonstrations, world, labeller, config, bound, rng)
+    return demonstrations, see_states(demonstrations, world, labeler, config, bound, rng)
 
 
 def poses(samples) -> list[RigidTransform]:
     return [RigidTransform(Quaternion(wxyz=row[:4]), row[4:]) for row in samples.X_WB]
 
 
-def test_labels_are_the_same_in_the_world_from_every_pose(world, labeller):
+def test_labels_are_the_same_in_the_world_from_every_pose(world, labeler):
     """Brought back to the world by the pose rendered from, waypoints, velocity and goal of a state
     are those of the state itself, for its own pose and the perturbed ones."""
-    demonstrations, samples = see(world, labeller)
+    demonstrations, samples = see(world, labeler)
     assert len(samples) == 6
     for k, X_WP in enumerate(poses(samples)):
         state, waypoints_W = demonstrations[k // 3]
@@ -85,10 +85,10 @@ def test_labels_are_the_same_in_the_world_from_every_pose(world, labeller):
         assert poses(samples)[k].IsNearlyEqualTo(pose_from_state(STATES[k // 3]), 1e-9)
 
 
-def test_images_are_taken_from_the_pose_that_is_recorded(world, labeller):
-    """The ball stands in colour and depth where a pinhole at the recorded pose projects it: left is
+def test_images_are_taken_from_the_pose_that_is_recorded(world, labeler):
+    """The ball stands in color and depth where a pinhole at the recorded pose projects it: left is
     left, up is up, and depth is along the optical axis."""
-    _, samples = see(world, labeller)
+    _, samples = see(world, labeler)
     camera = CONFIG.camera
     for k, X_WP in enumerate(poses(samples)):
         forward, left, up = X_WP.inverse().multiply(BALL) - np.array(camera.p_BC)
@@ -105,9 +105,9 @@ def test_images_are_taken_from_the_pose_that_is_recorded(world, labeller):
 
 
 @pytest.mark.parametrize(("bound", "farthest"), [(np.inf, 0.3), (0.1, 0.1), (0.0, 0.0)])
-def test_perturbations_keep_the_bound_of_the_world(world, labeller, bound, farthest):
+def test_perturbations_keep_the_bound_of_the_world(world, labeler, bound, farthest):
     """No pose is farther from its state than the fidelity bound, nor than the configuration's."""
-    _, samples = see(world, labeller, bound)
+    _, samples = see(world, labeler, bound)
     moved = [
         np.linalg.norm(X.translation() - STATES[k // 3][:3]) for k, X in enumerate(poses(samples))
     ]
@@ -115,18 +115,18 @@ def test_perturbations_keep_the_bound_of_the_world(world, labeller, bound, farth
     assert max(moved) > 0.4 * farthest or farthest == 0.0
 
 
-def test_perturbations_keep_clear_of_obstacles(world, labeller):
+def test_perturbations_keep_clear_of_obstacles(world, labeler):
     """Beside the hall's edge, poses move no farther than there is room."""
     config = replace(CONFIG, perturbation=PerturbationConfig(copies=50, distance=1.0))
     state = tilted_state([5.0, 0.0, 0.5])  # 0.15 m of clearance above the floor of the hall
     demonstration = Demonstration(state, np.zeros((3, 10, 3)))
     rng = np.random.default_rng(0)
-    samples = see_states([demonstration], world, labeller, config, np.inf, rng)
+    samples = see_states([demonstration], world, labeler, config, np.inf, rng)
     moved = np.linalg.norm(samples.X_WB[:, 4:] - state[:3], axis=1)
     assert 0.05 < moved.max() <= 0.5 - 0.354 + 1e-9
 
 
-def test_trajectories_that_touch_something_are_no_demonstrations(labeller):
+def test_trajectories_that_touch_something_are_no_demonstrations(labeler):
     """Of three trajectories the first leaves the hall: the others move up, NaN stands last; a state
     all of whose trajectories do is left out."""
     X_WB = RigidTransform([5.0, 0.0, 2.0])
@@ -134,16 +134,16 @@ def test_trajectories_that_touch_something_are_no_demonstrations(labeller):
     out = 3.0 * ahead[:, [1, 0, 2]]  # 3 m to the left, to the hall's edge
     plan = Hypotheses(0.0, X_WB, np.stack([out, ahead, 0.5 * ahead]), np.arange(3.0))
     hopeless = Hypotheses(0.0, X_WB, np.stack([out, out, out]), np.arange(3.0))
-    kept = keep_clear([Label(STATES[0], plan), Label(STATES[1], hopeless)], labeller.field)
+    kept = keep_clear([Label(STATES[0], plan), Label(STATES[1], hopeless)], labeler.field)
     assert len(kept) == 1
     np.testing.assert_array_equal(kept[0].state, STATES[0])
     np.testing.assert_allclose(kept[0].waypoints_W[:2], plan.waypoints_W[1:])
     assert np.isnan(kept[0].waypoints_W[2]).all()
 
 
-def test_a_look_changes_colours_and_not_depth(world, labeller):
-    _, plain = see(world, labeller)
+def test_a_look_changes_colors_and_not_depth(world, labeler):
+    _, plain = see(world, labeler)
     config = replace(CONFIG, appearance=1.0, perturbation=PerturbationConfig(copies=0))
-    _, other = see(world, labeller, config=config)
+    _, other = see(world, labeler, config=config)
     np.testing.assert_array_equal(plain.depth[::3], other.depth)
     assert np.abs(plain.color[::3].astype(int) - other.color).max() > 10

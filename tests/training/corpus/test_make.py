@@ -115,7 +115,7 @@ def test_the_ledger_accounts_for_every_sample(gathered):
 
 
 def test_looks_differ_between_flights_of_one_world(gathered):
-    """The two flights through a world show it in other colours."""
+    """The two flights through a world show it in other colors."""
     shard = gathered.shards[0]
     first = 2 * shard.flights[0]["states"]
     means = [c.mean(axis=(0, 1, 2)) for c in np.split(shard.arrays["color"], [first])]

@@ -1,4 +1,4 @@
-"""States before near-misses, labelled and added."""
+"""States before near-misses, labeled and added."""
 
 import shutil
 

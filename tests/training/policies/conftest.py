@@ -14,7 +14,7 @@ from splatpilot.systems.common.files import claim_folder
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.training.corpus.collect import shard_folder
 from splatpilot.training.corpus.corpus import CONFIG, CorpusConfig
-from splatpilot.training.corpus.expert import Labeller
+from splatpilot.training.corpus.expert import Labeler
 from splatpilot.training.corpus.library import WorldSource, record_world
 from splatpilot.training.corpus.samples import EXPERT, Samples, write_shard
 from splatpilot.training.policies.evaluation import CAMERA_AHEAD
@@ -53,16 +53,16 @@ def _write_corpus(folder: Path, worlds: int, states: int, camera: OnboardCamera)
         esdf = esdf_from_distance_field(exact, 0.25)
         source = WorldSource(f"pillars-{number}", seed=number)
         record_world(folder / "worlds" / source.name, source, esdf)
-        labeller, rows = Labeller(esdf, P_WG, config.expert), []
+        labeler, rows = Labeler(esdf, P_WG, config.expert), []
         while len(rows) < states:
             p_WB = rng.uniform([1, 2, 1], [9, 6, 2])
-            if labeller.field.distance(p_WB) < 0.7:
+            if labeler.field.distance(p_WB) < 0.7:
                 continue
             yaw = np.arctan2(*(P_WG - p_WB)[1::-1]) + rng.normal(0, 0.4)
             rotation = RollPitchYaw(*rng.normal(0, 0.1, 2), yaw)
             v_WB = rotation.ToRotationMatrix() @ rng.normal([1.5, 0, 0], 0.3)
             q_WB = rotation.ToQuaternion().wxyz()
-            label = labeller.label(0.0, np.concatenate([p_WB, v_WB, q_WB, np.zeros(3)]))
+            label = labeler.label(0.0, np.concatenate([p_WB, v_WB, q_WB, np.zeros(3)]))
             rows.append((q_WB, p_WB, v_WB, label.waypoints_B))
         samples = _seen(rows, shapes, config)
         write_shard(

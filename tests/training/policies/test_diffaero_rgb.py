@@ -1,4 +1,4 @@
-"""Training DiffAero in colours, from a corpus to weights that fly."""
+"""Training DiffAero in colors, from a corpus to weights that fly."""
 
 import csv
 from pathlib import Path
@@ -68,7 +68,7 @@ def test_what_flies_is_what_was_trained():
 
 
 def test_trainer_shows_what_flight_shows(wide_corpus):
-    """Colours, rays and nearest depths of a sample are those of `encode_view` and of its depth."""
+    """Colors, rays and nearest depths of a sample are those of `encode_view` and of its depth."""
     trainer = DiffAeroRgbTrainer(training(wide_corpus))
     numbers = np.array([3, 20])
     color, rays, target = trainer._samples(numbers)

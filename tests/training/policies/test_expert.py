@@ -10,7 +10,7 @@ from splatpilot.diagrams.worlds.forest.forest import ForestConfig
 from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.collision.esdf_build import esdf_from_occupancy
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS, hover_state
-from splatpilot.training.corpus.expert import ExpertConfig, Labeller, fly_policy
+from splatpilot.training.corpus.expert import ExpertConfig, Labeler, fly_policy
 
 WORLD = ForestConfig(length=12.0, width=8.0, height=4.0)
 REACTIVE = ExpertConfig(policy="reactive")
@@ -26,8 +26,8 @@ def test_a_policy_flies_and_the_planner_labels(world):
     the best label of every 0.4 s keeps clear."""
     p_WS, p_WG, _ = draw_start_and_goal(world.esdf, VEHICLE_RADIUS, seed=2)
     scenario = Scenario(world=WORLD, start=p_WS.tolist(), goal=p_WG.tolist(), start_radius=0.0)
-    labeller = Labeller(world.esdf, p_WG, REACTIVE)
-    flight = fly_policy(scenario, world, REACTIVE, labeller)
+    labeler = Labeler(world.esdf, p_WG, REACTIVE)
+    flight = fly_policy(scenario, world, REACTIVE, labeler)
     assert flight.outcome is Outcome.GOAL
     assert flight.is_demonstration
     assert flight.least_clearance > 0.0
@@ -40,19 +40,19 @@ def test_a_policy_flies_and_the_planner_labels(world):
 
 def test_flights_that_fail_are_no_demonstrations(world):
     """A flight that does not arrive in time is none; a policy nobody knows is an error."""
-    labeller = Labeller(world.esdf, world.p_WG, REACTIVE)
-    flight = fly_policy(Scenario(world=WORLD, timeout=1.0), world, REACTIVE, labeller)
+    labeler = Labeler(world.esdf, world.p_WG, REACTIVE)
+    flight = fly_policy(Scenario(world=WORLD, timeout=1.0), world, REACTIVE, labeler)
     assert (flight.outcome, flight.is_demonstration) == (Outcome.TIMEOUT, False)
     with pytest.raises(ValueError, match="no policy 'nobody'"):
         ExpertConfig(policy="nobody").validate()
 
 
-def test_states_without_a_way_on_are_not_labelled():
+def test_states_without_a_way_on_are_not_labeled():
     wall = np.zeros((60, 20, 20), bool)
     wall[30] = True
     esdf = esdf_from_occupancy(wall, np.zeros_like(wall), np.zeros(3), 0.2)
-    labeller = Labeller(esdf, np.array([10.0, 2.0, 2.0]), REACTIVE)
+    labeler = Labeler(esdf, np.array([10.0, 2.0, 2.0]), REACTIVE)
     beside, behind = hover_state([8.0, 2.0, 2.0]), hover_state([3.0, 2.0, 2.0])
-    labels = labeller.labels([behind, beside])
+    labels = labeler.labels([behind, beside])
     assert len(labels) == 1
     np.testing.assert_array_equal(labels[0].state, beside)

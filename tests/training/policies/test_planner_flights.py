@@ -12,7 +12,7 @@ from splatpilot.systems.policies.hypotheses import Hypotheses
 from splatpilot.systems.policies.planner import PrivilegedPlannerConfig
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 from splatpilot.training.corpus import expert as planner_flights
-from splatpilot.training.corpus.expert import ExpertConfig, Labeller, fly_planner
+from splatpilot.training.corpus.expert import ExpertConfig, Labeler, fly_planner
 
 WORLD = ForestConfig(length=12.0, width=8.0, height=4.0)
 
@@ -23,8 +23,8 @@ def world():
 
 
 @pytest.fixture(scope="module")
-def labeller(world):
-    return Labeller(world.esdf, world.p_WG, ExpertConfig())
+def labeler(world):
+    return Labeler(world.esdf, world.p_WG, ExpertConfig())
 
 
 @pytest.fixture(scope="module")
@@ -33,12 +33,12 @@ def starts(world):
 
 
 @pytest.fixture(scope="module")
-def flights(starts, world, labeller):
-    return fly_planner(starts, world, ExpertConfig(), labeller)
+def flights(starts, world, labeler):
+    return fly_planner(starts, world, ExpertConfig(), labeler)
 
 
 def test_flies_as_the_diagram_does(world, starts, flights):
-    """The same planner in Drake, with its plant and controller, takes the same way: every labelled
+    """The same planner in Drake, with its plant and controller, takes the same way: every labeled
     state is within 0.15 m of the diagram's at that time, and both arrive together."""
     policy = PrivilegedPlannerConfig(rate=2.5)
     start = starts[0].tolist()
@@ -52,9 +52,9 @@ def test_flies_as_the_diagram_does(world, starts, flights):
         assert np.linalg.norm(label.state[:3] - drake.states[there, :3]) < 0.15
 
 
-def test_each_flight_is_its_own(starts, world, labeller, flights):
+def test_each_flight_is_its_own(starts, world, labeler, flights):
     """A flight is the same whoever flies beside it, and ends at the goal."""
-    alone = fly_planner(starts[1:], world, ExpertConfig(), labeller)[0]
+    alone = fly_planner(starts[1:], world, ExpertConfig(), labeler)[0]
     assert alone.time == flights[1].time
     assert alone.least_clearance == pytest.approx(flights[1].least_clearance, abs=1e-9)
     for a, b in zip(alone.labels, flights[1].labels, strict=True):
@@ -77,10 +77,10 @@ def test_labels_keep_the_period_and_lead_on(world, flights):
             assert (world.distance_field.distance(way) > VEHICLE_RADIUS).all()
 
 
-def test_flights_that_fail_are_no_demonstrations(starts, world, labeller, monkeypatch):
+def test_flights_that_fail_are_no_demonstrations(starts, world, labeler, monkeypatch):
     monkeypatch.setattr(planner_flights, "TIMEOUT", 0.8)
     low = starts[0] * [1, 1, 0] + [0, 0, VEHICLE_RADIUS - 0.05]
-    slow, low = fly_planner(np.stack([starts[0], low]), world, ExpertConfig(), labeller)
+    slow, low = fly_planner(np.stack([starts[0], low]), world, ExpertConfig(), labeler)
     assert (slow.outcome, slow.is_demonstration) == (Outcome.TIMEOUT, False)
     assert slow.time == pytest.approx(0.8)
     assert (low.outcome, low.is_demonstration) == (Outcome.COLLISION, False)

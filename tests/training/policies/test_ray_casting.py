@@ -232,7 +232,7 @@ def test_fewer_shapes_than_asked_for_are_infinitely_far():
 
 
 def test_normals_are_unit_vectors_where_distances_have_a_ridge():
-    """At centres and on axes, where many ways out are equally long, one of them is the normal."""
+    """At centers and on axes, where many ways out are equally long, one of them is the normal."""
     ball, log, post = Sphere([1, 1, 1], 0.5), Capsule([0] * 3, [2, 0, 0], 0.5), [0.0, 0.0, 3.0]
     geometry = ShapeGeometry([[ball], [log], [Cylinder([0, 0, 0], [0, 0, 6], 0.5)]])
     _, normals = geometry.nearest(floats([[1, 1, 1], [1, 0, 0], post]), numbers(3), 1)
@@ -274,7 +274,7 @@ def test_cameras_outside_a_field_see_into_it_and_nothing_beyond():
 
 
 def test_grids_are_interpolated_as_the_distance_field_is():
-    """Values and gradients are those of `Esdf.query`, and beyond the centres those at the edge."""
+    """Values and gradients are those of `Esdf.query`, and beyond the centers those at the edge."""
     fields = [field_of(some_world(seed)) for seed in range(2)]
     geometry = EsdfGeometry(fields)
     p_WQ = np.random.default_rng(0).uniform(LOWER + 0.06, UPPER - 0.06, (300, 3))

@@ -46,7 +46,7 @@ def gather(folder: Path, worlds: Path, camera: OnboardCamera) -> None:
 
 @pytest.fixture(scope="module")
 def expert(tmp_path_factory) -> Path:
-    """The folder of a corpus in depth and colours for students."""
+    """The folder of a corpus in depth and colors for students."""
     folder = tmp_path_factory.mktemp("expert")
     gather(folder, tmp_path_factory.mktemp("worlds"), OnboardCamera(width=32, height=24))
     return folder
@@ -179,8 +179,8 @@ def test_what_corpora_share_is_flown_once(expert, tmp_path):
     assert ledger["expert_samples"] == len(Corpus(expert))
 
 
-def test_what_sees_in_colours_recovers_too(tmp_path, monkeypatch):
-    """DiffAero in colours flies by what it judges, as fast as the expert did, and both its stages
+def test_what_sees_in_colors_recovers_too(tmp_path, monkeypatch):
+    """DiffAero in colors flies by what it judges, as fast as the expert did, and both its stages
     see images of its corpus."""
     speeds, fly = [], student_flights.fly
 

@@ -74,7 +74,7 @@ def test_no_gaussian_stands_infinitely_far(write_room, tmp_path):
     assert np.abs(below.means).max() <= np.abs(whole.means).max() + 0.1
 
 
-def test_too_many_surfaces_to_optimise_are_thinned_out(write_room, tmp_path, capsys):
+def test_too_many_surfaces_to_optimize_are_thinned_out(write_room, tmp_path, capsys):
     capture = read_tartanair_v1(write_room(tmp_path / "room"))
     frames = list(capture.frames())
     photometry = estimate_photometry([ThinnedFrame.of(frame) for frame in frames], 0)
@@ -150,7 +150,7 @@ def test_random_points_lie_in_view(write_room, tmp_path):
 HEIGHT, WIDTH, F = 48, 64, 50.0
 K = np.array([[F, 0, WIDTH / 2], [0, F, HEIGHT / 2], [0, 0, 1]])
 X_WC = RigidTransform(RollPitchYaw(0.3, -0.2, 1.0), np.array([1.0, 2.0, 3.0]))
-GREY = np.full((HEIGHT, WIDTH, 3), 0.5, np.float32)
+GRAY = np.full((HEIGHT, WIDTH, 3), 0.5, np.float32)
 ALL = np.ones((HEIGHT, WIDTH), bool)
 
 
@@ -173,7 +173,7 @@ def covered(cells) -> np.ndarray:
 
 def test_plain_plane_takes_the_largest_cells():
     frame = plane_frame([0.5, 0.2, 0.8], 1.6)
-    cells = BlockMeans(frame, GREY, ALL, 8).split(0.05, 8, 0.75, 9)
+    cells = BlockMeans(frame, GRAY, ALL, 8).split(0.05, 8, 0.75, 9)
     assert set(cells.size) == {8}
     assert (covered(cells) == 1).all()
 
@@ -183,7 +183,7 @@ def test_texture_and_edges_take_small_cells():
     depth = frame.depth.copy()
     depth[:, 41:] = 3.0
     frame = CaptureFrame(frame.image, depth, X_WC, K)
-    image = GREY.copy()
+    image = GRAY.copy()
     image[20] = 0.1
     cells = BlockMeans(frame, image, ALL, 8).split(0.05, 8, 0.75, 9)
     assert (covered(cells) == 1).all()
@@ -200,7 +200,7 @@ def test_only_wanted_pixels_with_depth_are_covered():
     depth[:4], depth[4:8] = 0, np.inf
     wanted = ALL.copy()
     wanted[:, 32:] = False
-    cells = BlockMeans(CaptureFrame(frame.image, depth, X_WC, K), GREY, wanted, 8).split(
+    cells = BlockMeans(CaptureFrame(frame.image, depth, X_WC, K), GRAY, wanted, 8).split(
         1, 8, 0.75, 9
     )
     count = covered(cells)
@@ -211,7 +211,7 @@ def test_only_wanted_pixels_with_depth_are_covered():
 def test_sizes_that_are_no_multiple_of_the_cells_are_covered():
     frame = plane_frame([0, 0, 1], 2.0)
     frame = CaptureFrame(frame.image[:-3, :-5], frame.depth[:-3, :-5], X_WC, K)
-    cells = BlockMeans(frame, GREY[:-3, :-5], ALL[:-3, :-5], 16).split(1, 16, 0.75, 9)
+    cells = BlockMeans(frame, GRAY[:-3, :-5], ALL[:-3, :-5], 16).split(1, 16, 0.75, 9)
     assert (covered(cells)[:-3, :-5] == 1).all()
 
 
@@ -219,7 +219,7 @@ def test_gaussians_lie_flat_on_the_plane():
     normal_C = np.array([0.5, 0.2, 0.8])
     normal_C /= np.linalg.norm(normal_C)
     frame = plane_frame(normal_C, 1.6)
-    cells = BlockMeans(frame, GREY, ALL, 4).split(0.05, 4, 0.75, 9)
+    cells = BlockMeans(frame, GRAY, ALL, 4).split(0.05, 4, 0.75, 9)
     p_WQ, covariances = cell_gaussians(frame, cells, spread=0.5)
     p_CQ = X_WC.inverse().multiply(p_WQ.T).T
     np.testing.assert_allclose(p_CQ @ normal_C, 1.6, atol=1e-5)
@@ -232,7 +232,7 @@ def test_gaussians_lie_flat_on_the_plane():
 
 def test_gaussians_cover_their_cell_in_the_image():
     frame = plane_frame([0.3, -0.4, 0.85], 2.0)
-    cells = BlockMeans(frame, GREY, ALL, 4).split(0.05, 4, 0.75, 9)
+    cells = BlockMeans(frame, GRAY, ALL, 4).split(0.05, 4, 0.75, 9)
     p_WQ, covariances = cell_gaussians(frame, cells, spread=0.5)
     R_CW = X_WC.rotation().matrix().T
     p_CQ = X_WC.inverse().multiply(p_WQ.T).T
@@ -245,7 +245,7 @@ def test_gaussians_cover_their_cell_in_the_image():
 
 def test_cells_do_not_extend_too_far():
     frame = plane_frame([0.6, 0, 0.8], 1.0)
-    cells = BlockMeans(frame, GREY, ALL, 16).split(1, 16, 0.75, 0.1)
+    cells = BlockMeans(frame, GRAY, ALL, 16).split(1, 16, 0.75, 0.1)
     assert (covered(cells) == 1).all()
     _, covariances = cell_gaussians(frame, cells, spread=1)
     longest = np.sqrt(np.linalg.eigvalsh(covariances)[:, 2])
@@ -259,7 +259,7 @@ def test_underlay_lies_behind_and_closes_gaps():
     wide = K * np.array([[10, 1, 1], [1, 10, 1], [1, 1, 1]])
     depth = np.full((HEIGHT, WIDTH), 2, np.float32)
     frame = CaptureFrame(np.zeros((HEIGHT, WIDTH, 3), np.uint8), depth, X_WC, wide)
-    p_WQ, covariances, colors = frame_gaussians(frame, GREY, ALL, 0.05, 4, 1.0)
+    p_WQ, covariances, colors = frame_gaussians(frame, GRAY, ALL, 0.05, 4, 1.0)
     z = X_WC.inverse().multiply(p_WQ.T)[2]
     surface, under = np.abs(z - 2) < 1e-5, np.abs(z - 2.06) < 1e-5
     assert (surface.sum(), under.sum(), len(z)) == (12 * 16, 6 * 8, 12 * 16 + 6 * 8)

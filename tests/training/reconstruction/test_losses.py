@@ -289,7 +289,7 @@ def test_mistakes_are_named(call, message):
 
 HEIGHT, WIDTH, F = 40, 60, 20.0
 K = torch.tensor([[F, 0, WIDTH / 2], [0, F, HEIGHT / 2], [0, 0, 1]])
-# The camera stands half a metre behind the origin.
+# The camera stands half a meter behind the origin.
 VIEWMAT = torch.eye(4)
 VIEWMAT[2, 3] = 0.5
 UPRIGHT = torch.tensor([1.0, 0.0, 0.0, 0.0])

@@ -42,7 +42,7 @@ def test_views_that_share_nothing_have_gain_one(tmp_path, write_room):
     assert (found.gains.tolist(), found.vignetting) == ([1.0], 0.0)
 
 
-def test_factor_is_gain_in_the_centre_and_darker_in_the_corners():
+def test_factor_is_gain_in_the_center_and_darker_in_the_corners():
     factor = Photometry(np.array([1.0, 2.0]), -0.5).factor(1, 481, 641)
     assert factor.shape == (481, 641)
     assert factor[240, 320] == pytest.approx(2)

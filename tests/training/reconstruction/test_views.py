@@ -15,7 +15,7 @@ R_LEVEL = RotationMatrix(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]))
 
 
 def sky(v_W: np.ndarray) -> np.ndarray:
-    """Colours of a smooth sky in the directions v_W (..., 3) of length 1."""
+    """Colors of a smooth sky in the directions v_W (..., 3) of length 1."""
     return 0.5 + 0.3 * v_W[..., [2, 0, 1]]
 
 

@@ -4,7 +4,7 @@ import pytest
 from splatpilot.diagrams.worlds.dodgedrone import LEVELS, Group, draw_obstacles
 
 # Rows of obstacle lists that are stored with the challenge's simulator (uzh-rpg/flightmare) and
-# forks of it: number of the obstacle, diameter [m], first centre [m] (1000: it is kept away).
+# forks of it: number of the obstacle, diameter [m], first center [m] (1000: it is kept away).
 PUBLISHED_SEED = 20220301
 STORED = {
     ("easy", 22529): [

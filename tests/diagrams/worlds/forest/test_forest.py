@@ -37,7 +37,7 @@ def world() -> World:
 
 
 def _inside(world: World) -> np.ndarray:
-    """Centres (N, 3) of the Gaussians in the flyable volume."""
+    """Centers (N, 3) of the Gaussians in the flyable volume."""
     p = world.gaussians.means.astype(float)
     lower, upper = world.distance_field.lower_W, world.distance_field.upper_W
     return p[((p >= lower) & (p <= upper)).all(axis=1)]
@@ -111,7 +111,7 @@ def test_a_vehicle_can_fly_from_start_to_goal(kind):
         x = np.arange(r, config.length - r, spacing)
         y = np.arange(r - config.width / 2, config.width / 2 - r, spacing)
         p = np.stack([*np.meshgrid(x, y, indexing="ij"), np.full((len(x), len(y)), 1.8)], axis=-1)
-        # 4-connected cells whose centres leave half a cell to spare are connected in truth.
+        # 4-connected cells whose centers leave half a cell to spare are connected in truth.
         part = np.asarray(label(field.distance(p) > r + spacing / 2)[0])  # pyright: ignore[reportIndexIssue]
         cells = [(np.abs(x - q[0]).argmin(), np.abs(y - q[1]).argmin()) for q in (p_WS, p_WG)]
         assert part[cells[0]] == part[cells[1]] > 0
@@ -155,12 +155,12 @@ def test_every_shape_to_hit_is_seen(world):
     seen = 0
     for shape in _shapes(world):
         if isinstance(shape, Capsule):
-            centre = (np.asarray(shape.p_WA) + np.asarray(shape.p_WB)) / 2
+            center = (np.asarray(shape.p_WA) + np.asarray(shape.p_WB)) / 2
         elif isinstance(shape, Sphere):
-            centre = np.asarray(shape.p_WO)
+            center = np.asarray(shape.p_WO)
         else:
             continue
-        if ((centre < field.lower_W) | (centre > field.upper_W))[:2].any():
+        if ((center < field.lower_W) | (center > field.upper_W))[:2].any():
             continue
         on_it = np.abs(ShapeUnion.of([shape]).distance(p)) < 0.03
         assert on_it.sum() > 40

@@ -36,7 +36,7 @@ def test_leaves_shine_from_both_sides(light):
 
 
 def _horizontal(light: Daylight) -> list[np.ndarray]:
-    """The two horizontal directions towards and away from the sun, (1, 3): sky is alike on both."""
+    """The two horizontal directions toward and away from the sun, (1, 3): sky is alike on both."""
     flat = np.array([[*light.direction[:2], 0.0]])
     return [flat / np.linalg.norm(flat), -flat / np.linalg.norm(flat)]
 

@@ -56,7 +56,7 @@ def test_faces_cover_the_whole_surface(kind):
 
 
 @pytest.mark.parametrize("material", MATERIALS)
-def test_materials_have_colours_and_something_to_see(material):
+def test_materials_have_colors_and_something_to_see(material):
     rng = np.random.default_rng(1)
     uv = rng.uniform(0, 2, (4000, 2))
     ground = material in ("grass", "paving", "forest_floor")

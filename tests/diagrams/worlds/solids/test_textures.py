@@ -20,7 +20,7 @@ def points():
     return np.random.default_rng(0).uniform(-20, 20, (4000, 3))
 
 
-def test_hash_is_uniform_and_uncorrelated_between_neighbours():
+def test_hash_is_uniform_and_uncorrelated_between_neighbors():
     cells = np.stack(np.meshgrid(*[np.arange(-30, 30)] * 3, indexing="ij"), axis=-1)
     h = hash_unit(cells, seed=3)
     assert h.min() >= 0 and h.max() < 1
@@ -92,7 +92,7 @@ def test_mix_and_ramp_are_linear():
         lambda p: textures.fallen_leaf(p[:, :2]),
     ],
 )
-def test_materials_are_varied_colours(material, points):
+def test_materials_are_varied_colors(material, points):
     colors = material(points)
     assert colors.shape == (len(points), 3)
     assert colors.min() >= 0 and colors.max() <= 1
