@@ -29,13 +29,10 @@ from splatpilot.diagrams.worlds.feasibility import (
 from splatpilot.diagrams.worlds.solids.surfaces import Surfels, to_gaussians
 from splatpilot.diagrams.worlds.splits import check_split
 from splatpilot.diagrams.worlds.world import World
+from splatpilot.systems.collision.depth_fusion import bounds_of_depth_images, esdf_from_depth_images
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.collision.esdf_build import (
-    bounds_of_depth_images,
-    esdf_from_depth_images,
-    esdf_from_gaussians,
-)
+from splatpilot.systems.collision.esdf_build import esdf_from_gaussians
 from splatpilot.systems.collision.frontier import (
     frontier_faces,
     hidden_frontier,

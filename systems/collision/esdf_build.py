@@ -1,27 +1,24 @@
-"""Builds an `Esdf` from Gaussians or another distance field; imports the other builders."""
+"""Builds an `Esdf` from Gaussians or another distance field."""
 
+import itertools
 from collections.abc import Iterator
 
 import numpy as np
 from scipy.ndimage import binary_dilation
 
-from splatpilot.systems.collision.depth_fusion import bounds_of_depth_images, esdf_from_depth_images
 from splatpilot.systems.collision.distance_field import DistanceField
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.occupancy import esdf_from_occupancy, grid_shape
-from splatpilot.systems.collision.octomap import esdf_from_octomap
 from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.splats.scene import GaussianScene
 
-# Standard deviations beyond which a Gaussian counts as zero.
-_SUPPORT = 3.5
-# Standard deviation of the filter that keeps thin Gaussians from falling between voxels, in voxels.
-_FILTER = 0.5
-# Half the thickness left to a thin sheet, in voxels.
-_TRIM = 0.6
-# Evaluations of a Gaussian at a voxel per batch.
-_CHUNK = 2_000_000
+_SUPPORT = 3.5  # [standard deviations] beyond which a Gaussian counts as zero
+_FILTER = 0.5  # [voxels] standard deviation of the filter that keeps thin Gaussians visible
+_TRIM = 0.6  # [voxels] half the thickness left to a thin sheet; 0.5 is the least without holes
+_CHUNK = 2_000_000  # evaluations of a Gaussian at a voxel per batch
+# [voxels] to which extents are rounded up: 0 to 8, then rising by a quarter.
+_SIZES = np.unique(np.r_[0:9, np.ceil(8 * 1.25 ** np.arange(60))].astype(int))
 
 
 def esdf_from_gaussians(
@@ -35,21 +32,18 @@ def esdf_from_gaussians(
     """Computes the distance field of the solid where the Gaussians' density reaches a threshold.
 
     The density is sum_i o_i exp(-m_i^2 / 2) with m_i the Mahalanobis distance to Gaussian i, whose
-    variances are enlarged by (voxel_size / 2)^2: a sheet thinner than a voxel would otherwise fall
-    between the voxels. What this adds to a sheet's thickness is cut back to 0.6 voxel on both sides
-    of its middle; half a voxel is the least that leaves no holes. So a thin opaque sheet is seen
-    half a voxel too near (spheres of flat Gaussians: bias -0.48 to -0.56, spread 0.08 voxel), the
-    safe side; one with a thickness of its own reaches about as far as its density does. Inside a
-    hollow shell of Gaussians space counts as free unless `observed` says otherwise.
+    variances are enlarged by (voxel_size / 2)^2 so that thin sheets do not fall between voxels.
+    Sheets are then trimmed to 0.6 voxel on both sides of their middle: a thin opaque one is seen
+    half a voxel too near, the safe side. Space in a hollow shell of Gaussians counts as free unless
+    `observed` says otherwise.
 
     Args:
         scene: the Gaussians.
         voxel_size: [m].
         lower_W, upper_W: (3,) [m], by default the box of all centers and half a meter.
-        threshold: density of the surface, more than 0 and less than 1.
-        observed: (nx, ny, nz) bool, observed voxels, of the shape
-            `grid_shape` gives for the box; by default all. Others that are not occupied are
-            UNKNOWN.
+        threshold: density of the surface, in (0, 1).
+        observed: (nx, ny, nz) bool, observed voxels of the `grid_shape` of the box; by default all.
+            Others that are not occupied are UNKNOWN.
     """
     require(0.0 < threshold < 1.0, "threshold", "in (0, 1)", threshold)
     bounds = lower_W is not None and upper_W is not None
@@ -80,8 +74,7 @@ def density_on_grid(
     first = np.maximum(np.ceil(mean - reach), 0.0)
     last = np.minimum(np.floor(mean + reach), np.array(shape) - 1.0)
     extent = np.where(first <= last, last - first + 1.0, 0.0).astype(int)  # (N, 3) voxels
-    # Gaussians of the same extent are evaluated together on the same box of voxels; extents are
-    # rounded up to few values, in steps of a quarter at most.
+    # Gaussians of the same extent are evaluated together on the same box of voxels.
     extent = _SIZES[np.searchsorted(_SIZES, extent)]
     # M maps a vector to the principal axes in standard deviations.
     M = R.transpose(0, 2, 1) / np.sqrt(variance)[:, :, None]
@@ -125,13 +118,13 @@ def _splat(
 
 
 def _surface_offset(density: np.ndarray, threshold: float, voxel_size: float) -> np.ndarray:
-    """First-order signed distance of the voxel centers to the solid's surface, (nx, ny, nz) [m].
+    """Computes the signed distance of voxel centers to the surface to first order [m].
 
-    With L = log(density / threshold), the solid is the part of L >= 0 that lies within _TRIM voxels
-    of the middle of a sheet. To first order the surface L = 0 is -L / |grad L| away. At x from the
-    middle of a sheet of standard deviation s, enlarged to S^2 = s^2 + f^2 by the filter f, |grad L|
-    is x / S^2; so f^2 |grad L| = x f^2 / S^2 is the distance to the middle of a thin sheet, and
-    less than that in one thick enough to need no trimming. NaN where there is no density.
+    With L = log(density / threshold), the solid is the part of L >= 0 within _TRIM voxels of the
+    middle of a sheet. The surface L = 0 is -L / |grad L| away. At x from the middle of a sheet of
+    standard deviation s, enlarged to S^2 = s^2 + f^2 by the filter f, |grad L| is x / S^2; so
+    f^2 |grad L| = x f^2 / S^2 is the distance to the middle of a thin sheet, and less in a thick
+    one, which needs no trimming. NaN without density.
     """
     some = density > 0.0
     level = np.log(np.where(some, density, np.float32(1e-6)) / np.float32(threshold))
@@ -143,16 +136,10 @@ def _surface_offset(density: np.ndarray, threshold: float, voxel_size: float) ->
     return np.where(some, offset, np.float32(np.nan))
 
 
-# 0, 1, ... 8, then rising by about a quarter, up to the largest grid.
-_SIZES = np.unique(np.r_[0:9, np.ceil(8 * 1.25 ** np.arange(60))].astype(int))
-
-
 def esdf_from_distance_field(field: DistanceField, voxel_size: float) -> Esdf:
     """Samples a distance field at the voxel centers of a grid over its bounds.
 
-    The values are the field's own, so exact at the centers for an analytic field. The grid covers
-    the bounds with whole voxels; centers beyond the field's bounds take the value of the nearest
-    point inside. States are the field's own.
+    Centers beyond the bounds, if these are not whole voxels apart, take the nearest value inside.
     """
     lower_W, upper_W = np.asarray(field.lower_W, float), np.asarray(field.upper_W, float)
     shape = grid_shape(lower_W, upper_W, voxel_size)
@@ -175,19 +162,7 @@ def cubes_of_points(
 
     Fields find the nearest of many shapes faster for points that lie close together.
     """
-    for i in range(0, len(x), edge):
-        for j in range(0, len(y), edge):
-            for k in range(0, len(z), edge):
-                part = np.s_[i : i + edge, j : j + edge, k : k + edge]
-                axes = np.meshgrid(x[part[0]], y[part[1]], z[part[2]], indexing="ij")
-                yield part, np.stack(axes, axis=-1)
-
-
-__all__ = [
-    "bounds_of_depth_images",
-    "esdf_from_depth_images",
-    "esdf_from_distance_field",
-    "esdf_from_gaussians",
-    "esdf_from_occupancy",
-    "esdf_from_octomap",
-]
+    for i, j, k in itertools.product(*(range(0, len(axis), edge) for axis in (x, y, z))):
+        part = np.s_[i : i + edge, j : j + edge, k : k + edge]
+        axes = np.meshgrid(x[part[0]], y[part[1]], z[part[2]], indexing="ij")
+        yield part, np.stack(axes, axis=-1)
