@@ -75,7 +75,7 @@ def AddPolicyAndController(
             port or with one of another size.
     """
     # Pose, distances and goal.
-    spheres = world.moving.balls if world.moving else None
+    spheres = world.moving.spheres if world.moving else None
     pose, collision = StateToPose(), EsdfCollision(world.distance_field, spheres)
     for name, system in (("pose", pose), ("collision", collision)):
         builder.AddNamedSystem(name, system)

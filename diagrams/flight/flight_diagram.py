@@ -22,7 +22,7 @@ from splatpilot.diagrams.flight.blocks import (
 )
 from splatpilot.diagrams.flight.flight import sample_initial_state
 from splatpilot.diagrams.flight.scenario import Scenario
-from splatpilot.diagrams.worlds.appearance import seen_otherwise
+from splatpilot.diagrams.worlds.appearance import randomize_appearance
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.splats.background import Background, mean_color
 from splatpilot.systems.splats.splat_camera import SplatCamera
@@ -95,7 +95,7 @@ def AddMeshcat(builder: DiagramBuilder, scenario: Scenario, world: World, meshca
         policy.GetOutputPort("hypotheses") if plans else None,
     )
     if world.moving:
-        BallsVisualizer.AddToBuilder(builder, world.moving.balls, meshcat)
+        BallsVisualizer.AddToBuilder(builder, world.moving.spheres, meshcat)
     camera = cast(SplatCamera, builder.GetSubsystemByName("camera"))
     CameraVisualizer.AddToBuilder(builder, camera, meshcat, period=1 / scenario.camera.fps)
 
@@ -159,7 +159,7 @@ def BuildFlightDiagram(
             "camera out"
         )
     scenario.validate()
-    world = seen_otherwise(world, scenario.appearance, scenario.seed)
+    world = randomize_appearance(world, scenario.appearance, scenario.seed)
     builder = DiagramBuilder()
 
     # Vehicle.

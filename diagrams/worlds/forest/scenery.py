@@ -1,4 +1,4 @@
-"""What cameras see of a forest floor and of what lies on it."""
+"""Draws the Gaussians of forests: floor, trunks, crowns, bushes and the edge of the trees."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ from splatpilot.systems.splats.scene import GaussianScene
 
 @dataclass(frozen=True, eq=False)
 class ForestLight:
-    """Daylight in which trees throw their shadows: an `Illumination`."""
+    """Daylight with the shadows of trees: an `Illumination`."""
 
     daylight: Daylight
     layout: ForestLayout
@@ -45,29 +45,29 @@ class ForestLight:
         return self.daylight.irradiance(n_W, self._sunlit(p_W)) * foot[:, None]
 
     def paint(self, surfels: Surfels, albedo: NDArray, opacity: ArrayLike) -> GaussianScene:
-        """The patches as Gaussians of `albedo` (N, 3), sRGB, and `opacity`, a number or (N,)."""
+        """Draws patches of `albedo` (N, 3), sRGB, and `opacity`, a number or (N,)."""
         irradiance = self.daylight.irradiance(surfels.n, self._sunlit(surfels.p))
         colors = shade(albedo, irradiance, self.haze, self.layout.outside(surfels.p))
         return to_gaussians(surfels, colors, opacity)
 
     def _sunlit(self, p: NDArray) -> NDArray:
-        """Part of the sun (N,) in [0, 1] that trunks and leaves let through to p (N, 3) [m]."""
+        """Computes the fraction of the sun (N,) past trunks and leaves at p (N, 3) [m]."""
         near, trees, top = self._shading, self.layout.trees, float(self.layout.upper[2]) + 3
         past = self.daylight.past_trunks(p, trees.at(2.0)[near, :2], trees.radius[near], top)
         return past * self.daylight.through_canopy(p, top, self.seed)
 
     @cached_property
     def _shading(self) -> NDArray[np.bool_]:
-        """Which trees are near enough to shade the volume."""
+        """Marks the trees near enough to shade the volume."""
         return self.layout.outside(self.layout.trees.base) < self.layout.upper[2]
 
 
 SUNK = 0.006
-"""[m], depth of the closed layer under the ground: what lies on it is seen in front of it."""
+"""[m], depth of the closed layer under the ground, so that litter is in front of it."""
 
 
 def floor(layout: ForestLayout, light: ForestLight, rng: np.random.Generator) -> GaussianScene:
-    """Covers the ground: soil, moss and needles, fine inside the volume, coarser further out."""
+    """Covers the ground with soil, moss and needles, coarser outside the volume."""
     spacings = 0.18, 0.36, 0.7, 1.2, 2.2
     parts = []
     for spacing, p in zip(spacings, ground_rings(layout, spacings, rng), strict=True):
@@ -81,47 +81,47 @@ def floor(layout: ForestLayout, light: ForestLight, rng: np.random.Generator) ->
 
 
 def litter(layout: ForestLayout, light: ForestLight, rng: np.random.Generator) -> GaussianScene:
-    """Strews leaves, twigs, blades of moss and flat ferns over the ground of the volume."""
+    """Scatters leaves, twigs, blades of moss and flat ferns over the ground of the volume."""
     lower, upper = layout.lower[:2] - 0.5, layout.upper[:2] + 0.5
     area = np.prod(upper - lower)
 
-    def strew(density):
+    def scatter(density):
         return rng.uniform(lower, upper, (round(density * area), 2))
 
-    p = strew(36)
+    p = scatter(36)
     _, mossy = textures.forest_floor(p)
     p = p[rng.uniform(size=len(p)) > 0.8 * mossy]
     extent = rng.uniform(0.6, 1.3, (len(p), 1)) * (0.045, 0.026)
     leaves = on_ground(p, rng.uniform(0, np.pi, len(p)), extent, rng.uniform(0.025, 0.04, len(p)))
     scenes = [_on_floor(layout, light, leaves, textures.fallen_leaf(p), 0.93)]
 
-    p = strew(1.6)
+    p = scatter(1.6)
     extent = np.column_stack([rng.uniform(0.05, 0.16, len(p)), np.full(len(p), 0.007)])
     twigs = on_ground(p, rng.uniform(0, np.pi, len(p)), extent, 0.035)
     albedo = ramp([(0.20, 0.15, 0.11), (0.50, 0.43, 0.35)], rng.uniform(size=len(p)))
     scenes.append(_on_floor(layout, light, twigs, albedo, 0.9))
 
-    p = strew(20)
+    p = scatter(20)
     _, mossy = textures.forest_floor(p)
     p = p[rng.uniform(size=len(p)) < mossy]
     extent = rng.uniform(0.7, 1.3, (len(p), 1)) * (0.055, 0.017)
     blades = on_ground(p, rng.uniform(0, np.pi, len(p)), extent, 0.035)
     albedo = textures.moss(blades.p * 3) * rng.uniform(0.6, 1.9, (len(p), 1))
     scenes.append(_on_floor(layout, light, blades, albedo, 0.85))
-    scenes.append(_ferns(layout, light, strew(0.10), rng))
+    scenes.append(_ferns(layout, light, scatter(0.10), rng))
     return merge(scenes)
 
 
 def _ferns(layout, light, p, rng) -> GaussianScene:
-    """Spreads a rosette of fronds, each a row of pointed leaflets, flat about each p (N, 2)."""
+    """Draws a rosette of fronds, each a row of pointed leaflets, flat about each p (N, 2)."""
     fronds, leaflets = 8, 6
     N = len(p)
     angle = (np.arange(fronds) + rng.uniform(-0.3, 0.3, (N, fronds))) * (2 * np.pi / fronds)
     length = rng.uniform(0.28, 0.5, (N, 1)) * rng.uniform(0.8, 1.2, (N, fronds))
     s = (np.arange(leaflets) + 0.7) / leaflets
     bend = angle[..., None] + 0.25 * s * rng.choice([-1, 1], (N, fronds, 1))
-    way = np.stack([np.cos(bend), np.sin(bend)], axis=-1)
-    q = p[:, None, None] + way * (length[..., None] * s)[..., None]
+    direction = np.stack([np.cos(bend), np.sin(bend)], axis=-1)
+    q = p[:, None, None] + direction * (length[..., None] * s)[..., None]
     along = np.broadcast_to(length[..., None] * 0.10, bend.shape)
     across = length[..., None] * 0.11 * (1.15 - s) * np.ones_like(bend)
     height = 0.02 + 0.025 * np.sin(np.pi * s) * np.ones_like(bend)
@@ -141,10 +141,10 @@ def _ferns(layout, light, p, rng) -> GaussianScene:
 def rocks_and_logs(
     layout: ForestLayout, light: ForestLight, rng: np.random.Generator
 ) -> list[GaussianScene]:
-    """Covers boulders and fallen trunks, mossy on top; the list is empty if there are none."""
+    """Covers boulders and fallen trunks, mossy on top."""
     scenes = []
     if len(layout.rocks):
-        surfels = Surfels.concatenate([_ball(rock[:3], rock[3]) for rock in layout.rocks])
+        surfels = Surfels.concatenate([_sphere(rock[:3], rock[3]) for rock in layout.rocks])
         scenes.append(_grow_moss(light, surfels, textures.stone(surfels.p)))
     if len(layout.logs):
         parts = []
@@ -152,7 +152,7 @@ def rocks_and_logs(
             side = tube(log[:3], log[3:6], log[6], (0.05, 0.11), rng)
             parts.append(inset(side, side.extent[:, 1], log[6]))
             for p_E, inwards in ((log[:3], log[3:6] - log[:3]), (log[3:6], log[:3] - log[3:6])):
-                cap = _ball(p_E, log[6])
+                cap = _sphere(p_E, log[6])
                 parts.append(cap[cap.n @ inwards < 0])
         surfels = Surfels.concatenate(parts)
         rotten = textures.bark(OAK, surfels.p) * (0.82, 0.68, 0.54)
@@ -160,13 +160,13 @@ def rocks_and_logs(
     return scenes
 
 
-def _ball(p_C: NDArray, radius: float) -> Surfels:
+def _sphere(p_C: NDArray, radius: float) -> Surfels:
     patches = sphere(p_C, radius, 0.05)
     return inset(patches, patches.extent[:, 0], radius)
 
 
 def _grow_moss(light, surfels, albedo) -> GaussianScene:
-    seen = surfels.p[:, 2] > -0.05
+    seen = surfels.p[:, 2] > -0.05  # above ground
     surfels, albedo = surfels[seen], albedo[seen]
     cover = surfels.n[:, 2] - 0.35 + 0.9 * textures.fbm(surfels.p * 2.5, 3, seed=81)
     moss = textures.moss(surfels.p * 3)
@@ -176,20 +176,20 @@ def _grow_moss(light, surfels, albedo) -> GaussianScene:
 
 
 def _on_floor(layout, light, surfels, albedo, opacity) -> GaussianScene:
-    """Colors patches of the ground: none under trunks, rocks and logs, dark against their feet."""
-    room = layout.room(surfels.p)
-    open_ = room > -0.05
-    shade = 0.55 + 0.45 * smoothstep(-0.05, 0.45, room)
+    """Draws patches of the ground: none under trunks, rocks and logs, dark beside them."""
+    clearance = layout.clearance(surfels.p)
+    open_ = clearance > -0.05
+    shade = 0.55 + 0.45 * smoothstep(-0.05, 0.45, clearance)
     albedo = albedo * shade[:, None]
     return light.paint(surfels[open_], albedo[open_], opacity)
 
 
 BUSHES, LEAVES = 170, 26
-"""Bushes drawn, some of which fall into the volume and are left out, and leaves on each."""
+"""Number of bushes, of which those in the volume are left out, and of leaves on each."""
 
 
 def bushes(plan: FloorPlan, light: Daylight, rng: np.random.Generator) -> GaussianScene:
-    """Grows leafy half-spheres in the belt of trees, out of reach of the volume."""
+    """Draws leafy half-spheres in the belt of trees outside the volume."""
     reach = MARGIN - 3
     foot = rng.uniform(plan.lower[:2] - reach, plan.upper[:2] + reach, (BUSHES, 2))
     foot = foot[plan.outside(foot) > 2.0]
@@ -212,12 +212,9 @@ def bushes(plan: FloorPlan, light: Daylight, rng: np.random.Generator) -> Gaussi
 def edge(
     plan: FloorPlan, light: Daylight, away: float, top: float, rng: np.random.Generator
 ) -> GaussianScene:
-    """Hangs a curtain of large patches `away` from the volume, ragged on top; both in meters."""
+    """Draws a curtain of large patches `away` [m] from the volume, about `top` [m] high."""
     spacing = 1.1
-    center, half = (
-        (plan.lower + plan.upper)[:2] / 2,
-        (plan.upper - plan.lower)[:2] / 2,
-    )
+    center, half = (plan.lower + plan.upper)[:2] / 2, (plan.upper - plan.lower)[:2] / 2
     angle = np.arange(0, 2 * np.pi, spacing / (half.max() + away))
     around = np.column_stack([np.cos(angle), np.sin(angle)])
     on_box = np.clip(around / np.abs(around).max(axis=1, keepdims=True), -1, 1) * half
@@ -236,7 +233,7 @@ def edge(
 
 
 def trees_around(plan: FloorPlan, hour: Daylight, seed: int) -> Callable[[], list[GaussianScene]]:
-    """Draws bushes and two rows of trees far around the volume."""
+    """Returns a function that draws bushes and two rows of trees around the volume."""
 
     def draw() -> list[GaussianScene]:
         rngs = [np.random.default_rng([seed, 50 + k]) for k in range(3)]
@@ -257,12 +254,12 @@ def paint_leaves(
     distance: ArrayLike,
     opacity: ArrayLike,
 ) -> GaussianScene:
-    """Patches that let light through as Gaussians.
+    """Draws patches that let light through.
 
     Args:
         albedo: (N, 3), sRGB.
-        sunlit: (N,) in [0, 1], the part of the sun that reaches them.
-        distance: (N,) [m], the way through the haze.
+        sunlit: (N,) in [0, 1], fraction of the sun that reaches them.
+        distance: (N,) [m], through the haze.
         opacity: a number or (N,).
     """
     irradiance = light.irradiance(surfels.n, sunlit, leafy=True)
@@ -270,23 +267,23 @@ def paint_leaves(
 
 
 def _unit(v: NDArray) -> NDArray[np.float64]:
-    """The vectors v (..., 3) scaled to length one."""
+    """Normalizes vectors (..., 3)."""
     return v / np.linalg.norm(v, axis=-1, keepdims=True)
 
 
 _INSET = 0.012
-"""[m], how deep the closed layer may lie inside a trunk, where patches are finest: fissures."""
+"""[m], maximum depth of the closed layer, the fissures, inside a trunk with the finest patches."""
 
 
 @dataclass(frozen=True)
 class _Marks:
-    """What stands out of the bark: plates and ridges, or the dark lines on birches."""
+    """Marks on bark: plates and ridges, or the dark lines of birches."""
 
     around: float  # [m], spacing around the trunk
     along: float  # [m], spacing along the trunk
     fill: tuple[float, float]  # size along and around, over that of a closed layer
     turn: float  # [rad], standard deviation of the direction about the axis
-    kept: float  # part of the marks that is there
+    kept: float  # fraction of the marks that is drawn
 
 
 _MARKS = {
@@ -297,7 +294,7 @@ _MARKS = {
 
 
 def trunks(layout: ForestLayout, light: ForestLight, rng: np.random.Generator) -> GaussianScene:
-    """Covers all trunks: a closed layer in the color of fissures, marks of bark on top of it."""
+    """Covers all trunks with a closed layer in the color of fissures and marks of bark on it."""
     trees, ceiling = layout.trees, layout.upper[2]
     away = layout.outside(trees.base)
     foot, middle, top = trees.at(-0.1), trees.at(0.6 * ceiling), trees.at(ceiling)
@@ -339,7 +336,7 @@ def trunks(layout: ForestLayout, light: ForestLight, rng: np.random.Generator) -
 
 
 def _roughen(surfels: Surfels, marks: _Marks, rng: np.random.Generator) -> Surfels:
-    """Patches of a closed layer as single marks of various sizes and directions."""
+    """Turns patches of a closed layer into marks of various sizes and directions."""
     N = len(surfels)
     extent = surfels.extent * marks.fill * rng.uniform(0.6, 1.25, (N, 2))
     turn = rng.normal(0, marks.turn, N)[:, None]
@@ -348,10 +345,9 @@ def _roughen(surfels: Surfels, marks: _Marks, rng: np.random.Generator) -> Surfe
 
 
 def _bark(layout, light, species, layer, surfels, tree) -> NDArray:
-    """Albedo (N, 3) of patches of one species; `tree` (N,) says whose they are."""
-    trees = layout.trees
-    z = surfels.p[:, 2]
-    p_T = surfels.p.copy()  # along the trunk's own axis, every trunk elsewhere in the texture
+    """Computes the albedo (N, 3) of patches on the trunks of the trees with indices `tree` (N,)."""
+    trees, z = layout.trees, surfels.p[:, 2]
+    p_T = surfels.p.copy()  # along the trunk's own axis, at another part of the texture per trunk
     p_T[:, :2] -= trees.base[tree] + z[:, None] * trees.lean[tree]
     p_T[:, :2] += 7.3 * tree[:, None]
     if layer == "fissures":
@@ -375,11 +371,10 @@ def _bark(layout, light, species, layer, surfels, tree) -> NDArray:
 
 
 def crowns(layout: ForestLayout, light: Daylight, rng: np.random.Generator) -> GaussianScene:
-    """Hangs leaves above the ceiling: cones of whorls on pines, clouds of clumps on the others."""
-    trees = layout.trees
+    """Draws leaves above the ceiling: cones of whorls on pines, clouds of clumps on the others."""
+    trees, ceiling = layout.trees, layout.upper[2]
     away = layout.outside(trees.base)
-    ceiling = layout.upper[2]
-    p, n, size, species, depth = [], [], [], [], []
+    leaves = []
     for i in range(len(trees)):
         kind, coarse = trees.species[i], 1 + 0.12 * away[i]
         low, high = ceiling + rng.uniform(0.5, 1.4), trees.height[i]
@@ -390,10 +385,10 @@ def crowns(layout: ForestLayout, light: Daylight, rng: np.random.Generator) -> G
             h = (np.floor(h * 9) + rng.uniform(0, 0.35, N)) / 9  # branches leave in whorls
             out = np.sqrt(rng.uniform(0.05, 1, N))
             angle = rng.uniform(0, 2 * np.pi, N)
-            way = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(N)])
-            q = way * (reach * (1 - 0.85 * h) * out)[:, None]
+            outwards = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(N)])
+            q = outwards * (reach * (1 - 0.85 * h) * out)[:, None]
             q[:, 2] = low + h * (high - low) - 0.35 * reach * (out**2) * (1 - h) + 0.2
-            normal = way * 0.35 + (0, 0, 1) + rng.normal(0, 0.3, (N, 3))
+            normal = outwards * 0.35 + (0, 0, 1) + rng.normal(0, 0.3, (N, 3))
             inner = 1 - out
             extent = np.array([0.27, 0.115])
         else:
@@ -411,13 +406,9 @@ def crowns(layout: ForestLayout, light: Daylight, rng: np.random.Generator) -> G
         q[:, :2] += trees.base[i] + q[:, 2:] * trees.lean[i]
         spread = rng.uniform(0.7, 1.3, (len(q), 1)) * extent * coarse
         keep = q[:, 2] - 3 * spread.max(axis=1) > ceiling  # out of the volume to the last percent
-        for parts, values in zip(
-            (p, n, size, species, depth),
-            (q, normal, spread, np.full(len(q), kind), inner),
-            strict=True,
-        ):
-            parts.append(values[keep])
-    p, n, size, species, depth = (np.concatenate(a) for a in (p, n, size, species, depth))
+        values = q, normal, spread, np.full(len(q), kind), inner
+        leaves.append([value[keep] for value in values])
+    p, n, size, species, depth = map(np.concatenate, zip(*leaves, strict=True))
     n /= np.linalg.norm(n, axis=1, keepdims=True)
     t = perpendicular(n)
     turn = rng.uniform(0, 2 * np.pi, (len(p), 1))

@@ -4,7 +4,7 @@ import pytest
 from splatpilot.diagrams.worlds import octomap_world as module
 from splatpilot.diagrams.worlds.octomap_world import OctomapConfig, octomap_world
 from splatpilot.diagrams.worlds.scene_folder import SceneConfig
-from splatpilot.diagrams.worlds.world_registry import place_config
+from splatpilot.diagrams.worlds.world_registry import scene_config
 from splatpilot.systems.collision.octomap import Octomap
 from splatpilot.systems.common.provenance import InfeasibleFlightError
 
@@ -65,5 +65,5 @@ def test_maps_without_free_space_are_refused(in_map):
 
 
 def test_places_are_told_apart_by_suffix(tmp_path):
-    assert place_config(tmp_path / "a.bt") == OctomapConfig(path=str(tmp_path / "a.bt"))
-    assert place_config(tmp_path / "a.spz") == SceneConfig(path=str(tmp_path / "a.spz"))
+    assert scene_config(tmp_path / "a.bt") == OctomapConfig(path=str(tmp_path / "a.bt"))
+    assert scene_config(tmp_path / "a.spz") == SceneConfig(path=str(tmp_path / "a.spz"))

@@ -85,7 +85,7 @@ def test_a_course_repeats(course):
     assert again.moving and course.moving
     for time in (0.0, 11.0):
         np.testing.assert_array_equal(
-            again.moving.balls.centers(time), course.moving.balls.centers(time)
+            again.moving.spheres.centers(time), course.moving.spheres.centers(time)
         )
     same = dodgedrone_world(EASY, 1)
     assert same.moving
