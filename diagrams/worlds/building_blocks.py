@@ -12,7 +12,7 @@ from splatpilot.diagrams.worlds.solids.shading import Daylight, Illumination, La
 from splatpilot.diagrams.worlds.solids.solid import Solid, WorldSpec
 from splatpilot.diagrams.worlds.solids.surfaces import FloorPlan
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.collision.occupancy import grid_shape
+from splatpilot.systems.collision.esdf_build import grid_shape
 from splatpilot.systems.collision.shapes import Box, HalfSpace, Shape, ShapeUnion
 from splatpilot.systems.common.validation import (
     Config,
@@ -24,21 +24,15 @@ from splatpilot.systems.common.validation import (
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
-WALL = 0.3
-"""[m], thickness of walls."""
-
-INSET = 1.5
-"""[m], distance of start and goal from the ends of the volume."""
+WALL = 0.3  # [m], thickness of walls
+INSET = 1.5  # [m], distance of start and goal from the ends of the volume
 
 CLEARING, TIGHT_CLEARING = 1.0, 0.9
 """[m], obstacle-free radius about start and goal in the open, and among thin or reconstructed
 obstacles; above `CLEARANCE`."""
 
-MAX_GROUND, MAX_HEIGHT = 20_000.0, 100.0
-"""[m²] and [m], of generated worlds: 20 million Gaussians."""
-
-PASSAGE = 2 * VEHICLE_RADIUS + 0.1
-"""[m], minimum width of gaps for the vehicle."""
+MAX_GROUND, MAX_HEIGHT = 20_000.0, 100.0  # [m²] and [m], of generated worlds: 20 million Gaussians
+PASSAGE = 2 * VEHICLE_RADIUS + 0.1  # [m], minimum width of gaps for the vehicle
 
 
 def box(lower: ArrayLike, upper: ArrayLike, material: str, seed: int) -> Solid:
@@ -141,7 +135,7 @@ def start_and_goal(
     return np.array([x[0], y[0], z[0]]), np.array([x[1], y[1], z[1]])
 
 
-def clear_of(shape: Shape, p_W: ArrayLike, clearance: float) -> bool:
+def has_clearance(shape: Shape, p_W: ArrayLike, clearance: float) -> bool:
     """Checks that all points (N, 3) [m] are at least `clearance` [m] from a shape."""
     return bool((ShapeUnion.of([shape]).distance(p_W) >= clearance).all())
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatpilot.diagrams.worlds.building_blocks import daylight, ground
-from splatpilot.diagrams.worlds.forest.scenery import trees_around
+from splatpilot.diagrams.worlds.forest.forest import trees_around
 from splatpilot.diagrams.worlds.solids.shading import Illumination
 from splatpilot.diagrams.worlds.solids.solid import Solid, WorldSpec
 from splatpilot.diagrams.worlds.solids.surfaces import FloorPlan
@@ -20,12 +20,8 @@ from splatpilot.systems.splats.scene import GaussianScene
 Array = NDArray[np.float64]
 type Triple = tuple[float, float, float]
 
-SEED = 20220301
-"""Published seed of the generator."""
-
-PERIOD = 0.02
-"""[s] between the rows of a path."""
-
+SEED = 20220301  # Published seed of the generator
+PERIOD = 0.02  # [s] between the rows of a path
 _ROWS = 1500  # of a path that never leaves its region: 30 s
 # [m] Corners of the boxes about start and target in which obstacles vanish.
 _KEPT_FREE = ((-3.0, -3.0, 0.0), (3.0, 3.0, 5.0)), ((57.0, -3.0, 0.0), (61.0, 3.0, 5.0))

@@ -19,11 +19,8 @@ from splatpilot.systems.common.seeds import check_seed
 from splatpilot.systems.common.validation import Config
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
-CLEARANCE = 0.8
-"""[m], minimum distance of start and goal from obstacles and bounds."""
-
-TRIES = 60
-"""Maximum number of draws of an instance."""
+CLEARANCE = 0.8  # [m], minimum distance of start and goal from obstacles and bounds
+TRIES = 60  # Maximum number of draws of an instance
 
 
 def draw_feasible(draw: Callable[[np.random.Generator], WorldSpec], seed: int) -> WorldSpec:
@@ -79,10 +76,10 @@ def connects(
     """
     grid = grid_distances(field, spacing)
     free = grid > radius + spacing / 2
-    return are_connected(free, *(cell_of(field, grid, spacing, p) for p in (p_WS, p_WG)))
+    return are_connected(free, *(grid_cell(field, grid, spacing, p) for p in (p_WS, p_WG)))
 
 
-def cell_of(field: DistanceField, grid: NDArray, spacing: float, p_W: NDArray) -> tuple[int, ...]:
+def grid_cell(field: DistanceField, grid: NDArray, spacing: float, p_W: NDArray) -> tuple[int, ...]:
     """Returns the cell of `grid_distances` that holds p_W (3,) [m]."""
     cell = np.clip(((p_W - field.lower_W) / spacing).astype(int), 0, np.array(grid.shape) - 1)
     return tuple(int(c) for c in cell)
@@ -106,12 +103,8 @@ def grid_distances(field: DistanceField, spacing: float) -> NDArray[np.float64]:
     return grid
 
 
-SHORTEST = 1.0
-"""[m], minimum length of a route."""
-
-LONG_ENOUGH = 8.0
-"""[m], minimum length of a representative route, as in the benchmark."""
-
+SHORTEST = 1.0  # [m], minimum length of a route
+LONG_ENOUGH = 8.0  # [m], minimum length of a representative route, as in the benchmark
 _GAIN = 1.5  # minimum ratio of route lengths for which half of the margin is preferred
 _MAX_NODES = 250_000
 _DRAWS = 20

@@ -12,9 +12,9 @@ from splatpilot.diagrams.worlds.building_blocks import (
     PASSAGE,
     VolumeConfig,
     box,
-    clear_of,
     ground,
     hall,
+    has_clearance,
     lamplight,
     require_order,
     roof,
@@ -52,7 +52,7 @@ def furnish(
             p = rng.uniform(lower, upper)
             angle = rng.choice(4) * np.pi / 2 + rng.normal(0, 0.12)
             item = make(p, angle, height, int(rng.integers(1000)), rng)
-            if all(clear_of(solid.shape, free, CLEARANCE) for solid in item):
+            if all(has_clearance(solid.shape, free, CLEARANCE) for solid in item):
                 furniture += item
                 break
     return furniture

@@ -7,11 +7,11 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw
 from scipy.ndimage import label
 
-from splatpilot.diagrams.worlds.building_blocks import TIGHT_CLEARING, clear_of, require_order
+from splatpilot.diagrams.worlds.building_blocks import TIGHT_CLEARING, has_clearance, require_order
 from splatpilot.diagrams.worlds.feasibility import TRIES, draw_start_and_goal
 from splatpilot.diagrams.worlds.scene_folder import SceneSource, read_scene_world
 from splatpilot.diagrams.worlds.solids.shading import Lamplight
-from splatpilot.diagrams.worlds.solids.solid import Solid, WorldSpec, faces_of
+from splatpilot.diagrams.worlds.solids.solid import Solid, WorldSpec, cut_faces
 from splatpilot.diagrams.worlds.solids.surfels import draw
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.distance_field import FieldState
@@ -27,8 +27,7 @@ from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.common.validation import bounded
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
-GAP = 1.3 * 2 * VEHICLE_RADIUS
-"""[m], minimum width of gaps."""
+GAP = 1.3 * 2 * VEHICLE_RADIUS  # [m], minimum width of gaps
 
 _MATERIALS = ["hazard", "crate", "metal", "foliage", "brick", "wood"]
 
@@ -91,10 +90,10 @@ def _draw_solids(config: InsertedConfig, world: World, rng: np.random.Generator)
         if sample.state != FieldState.FREE or sample.distance < config.half_min:
             continue
         shape = _shape(config, p, rng)
-        if not clear_of(shape, [world.p_WS, world.p_WG], TIGHT_CLEARING):
+        if not has_clearance(shape, [world.p_WS, world.p_WG], TIGHT_CLEARING):
             continue
         surface = _surface(shape)
-        if not all(clear_of(other.shape, surface, config.gap) for other in solids):
+        if not all(has_clearance(other.shape, surface, config.gap) for other in solids):
             continue
         material = _MATERIALS[rng.integers(len(_MATERIALS))]
         solids.append(Solid(shape, material, int(rng.integers(1000))))
@@ -116,7 +115,7 @@ def _surface(shape: Shape) -> NDArray:
     """Samples points (N, 3) on a shape."""
     s = np.stack(np.meshgrid(*2 * [np.linspace(0, 1, 9)]), axis=-1).reshape(-1, 2)
     zero = np.zeros(3)
-    return np.concatenate([face.at(s * face.size)[0] for face in faces_of(shape, zero, zero)])
+    return np.concatenate([face.at(s * face.size)[0] for face in cut_faces(shape, zero, zero)])
 
 
 def _merge(esdf: Esdf, solids: list[Solid]) -> Esdf:

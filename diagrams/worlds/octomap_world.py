@@ -31,11 +31,8 @@ from splatpilot.systems.common.validation import require, require_field
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
-OCTOMAP = ".bt"
-"""Suffix of binary OctoMaps."""
-
-_MAX_VOXELS = 2e7
-"""Of a map that is used whole: some 90 bytes each."""
+OCTOMAP = ".bt"  # Suffix of binary OctoMaps
+_MAX_VOXELS = 2e7  # of a map that is used whole: some 90 bytes each
 
 _log = logging.getLogger(__name__)
 

@@ -15,10 +15,10 @@ from splatpilot.diagrams.worlds.building_blocks import (
     WALL,
     VolumeConfig,
     box,
-    clear_of,
     daylight,
     ground,
     hall,
+    has_clearance,
     lamplight,
     require_order,
     roof,
@@ -29,9 +29,8 @@ from splatpilot.diagrams.worlds.building_blocks import (
     volume_spec,
 )
 from splatpilot.diagrams.worlds.feasibility import TRIES, is_feasible, until_feasible
-from splatpilot.diagrams.worlds.forest.forest import Forest
+from splatpilot.diagrams.worlds.forest.forest import Forest, trees_around
 from splatpilot.diagrams.worlds.forest.layout import BARK, TrunksConfig
-from splatpilot.diagrams.worlds.forest.scenery import trees_around
 from splatpilot.diagrams.worlds.solids.solid import Solid, WorldSpec
 from splatpilot.diagrams.worlds.solids.surfaces import FloorPlan, merge
 from splatpilot.diagrams.worlds.solids.surfels import draw
@@ -77,7 +76,7 @@ def clutter_spec(config: ClutterConfig, seed: int, rng: np.random.Generator) -> 
         for _ in range(number):
             for _ in range(50):  # again, if it is too near the start or goal
                 solid = make(config, plan, rng)
-                if clear_of(solid.shape, list(ends), CLEARING):
+                if has_clearance(solid.shape, list(ends), CLEARING):
                     obstacles.append(solid)
                     break
     hour, light = daylight(rng)
@@ -165,7 +164,7 @@ def _limbs_and_wires(
         ends[:, [0, 2]] += rng.uniform(-0.8, 0.8, (2, 2))
         radius = rng.uniform(config.thickness_min, config.thickness_max) / 2
         thin.append(Solid(Capsule(ends[0], ends[1], float(radius)), "cable", k))
-    return [s for s in thin if clear_of(s.shape, [forest.p_WS, forest.p_WG], TIGHT_CLEARING)]
+    return [s for s in thin if has_clearance(s.shape, [forest.p_WS, forest.p_WG], TIGHT_CLEARING)]
 
 
 PATTERNS = "big_wall", "u_trap", "slits", "slalom"

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from splatpilot.diagrams.worlds.solids.shading import Illumination, shade
-from splatpilot.diagrams.worlds.solids.solid import MATERIALS, Face, Solid, WorldSpec, faces_of
+from splatpilot.diagrams.worlds.solids.solid import MATERIALS, Face, Solid, WorldSpec, cut_faces
 from splatpilot.diagrams.worlds.solids.surfaces import GROUND_REACH, merge
 from splatpilot.systems.collision.esdf_build import esdf_from_distance_field
 from splatpilot.systems.collision.field_mesh import add_primitive, data_uri
@@ -116,7 +116,7 @@ def _solid_meshes(spec: WorldSpec, light: Illumination, texel: float) -> list[_M
         tile
         for solids, step in ((spec.solids, texel), (spec.scenery, 4 * texel))
         for solid in solids
-        for face in faces_of(solid.shape, spec.lower_W, spec.upper_W)
+        for face in cut_faces(solid.shape, spec.lower_W, spec.upper_W)
         for tile in _tiles(solid, face, step)
     ]
     tiles.sort(key=lambda tile: (-tile.pixels[1], -tile.pixels[0]))

@@ -48,8 +48,8 @@ class WorldKind:
     make_spec: Callable[[Any, int], WorldSpec] | None = None  # the same as solids, if generated
 
 
+# All worlds, by the names of their configurations' types
 WORLDS = Registry("world", "splatpilot.worlds", WorldKind)
-"""All worlds, by the names of their configurations' types."""
 
 
 def register_world(

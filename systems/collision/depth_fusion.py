@@ -7,7 +7,7 @@ import numpy as np
 from pydrake.math import RigidTransform
 
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.collision.occupancy import esdf_from_occupancy, grid_shape
+from splatpilot.systems.collision.esdf_build import esdf_from_occupancy, grid_shape
 from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.common.validation import require
 
@@ -20,11 +20,9 @@ _MAX_DEPTH_BEHIND = 2.0  # [truncations] behind a surface in which a pixel count
 class DepthFusion:
     """Weighted averages of truncated signed distances, kept in blocks of _BLOCK^3 voxels."""
 
-    def __init__(
-        self, lower_W: np.ndarray, upper_W: np.ndarray, voxel_size: float, truncation: float
-    ) -> None:
+    def __init__(self, lower_W: np.ndarray, upper_W: np.ndarray, voxel_size: float) -> None:
         self.shape = grid_shape(lower_W, upper_W, voxel_size)
-        self.truncation = truncation
+        self.truncation = 3.0 * voxel_size
         self.blocks = tuple(-(-n // _BLOCK) for n in self.shape)
         count = int(np.prod(self.blocks))
         self.weighted = np.zeros((count, _BLOCK**3), dtype=np.float32)  # sum of weight * distance
@@ -175,15 +173,14 @@ def esdf_from_depth_images(
     upper_W: np.ndarray,
     voxel_size: float,
     max_range: float = 8.0,
-    truncation: float | None = None,
 ) -> Esdf:
     """Fuses depth images into a distance field that marks unobserved space.
 
     Each image gives the voxels it sees a signed distance to the surface's tangent plane. These are
     truncated and averaged with the cosine of incidence as weight (Curless and Levoy 1996). A voxel
-    is FREE if on average before a surface, OCCUPIED at most `truncation` behind one, UNKNOWN if no
-    image saw it. Space less than `truncation` behind an edge counts as occupied until another
-    image clears it.
+    is FREE if on average before a surface, OCCUPIED at most 3 voxels behind one, UNKNOWN if no
+    image saw it. Space less than 3 voxels behind an edge counts as occupied until another image
+    clears it.
 
     Args:
         depths: images (H, W) float [m], planar depth; 0, NaN and negative pixels are unknown,
@@ -194,12 +191,8 @@ def esdf_from_depth_images(
         voxel_size: [m].
         max_range: distance from the camera up to which space is seen [m]; a surface beyond it still
             clears the space before it.
-        truncation: thickness given to surfaces [m], by default 3 voxels.
     """
-    truncation = 3.0 * voxel_size if truncation is None else truncation
-    valid = truncation >= 2.0 * voxel_size  # thinner surfaces would have holes
-    require(valid, "truncation", f"at least 2 voxels, {2.0 * voxel_size} m", truncation)
-    fusion = DepthFusion(lower_W, upper_W, voxel_size, truncation)
+    fusion = DepthFusion(lower_W, upper_W, voxel_size)
     for depth, X_WC in _pair(depths, K, X_WCs, max_range, "fusing depth"):
         fusion.add(depth, np.asarray(K, dtype=float), X_WC, max_range)
     distance, seen = fusion.grids()

@@ -87,22 +87,19 @@ def _between(values: np.ndarray) -> np.ndarray:
     return values
 
 
-def distances_from_band(
-    occupied: np.ndarray, band: np.ndarray, voxel_size: float, sweeps: int = 2
-) -> np.ndarray:
+def distances_from_band(occupied: np.ndarray, band: np.ndarray, voxel_size: float) -> np.ndarray:
     """Continues signed distances from a band of known values around the surface.
 
     A distance field cannot grow faster than the distance traveled, so every voxel s of the band
     bounds that of a voxel x by |x - s| + |band(s)|, with the opposite sign of band(s) if s and x
     lie on different sides. The nearest s gives the first bound; passing the s of the six face
-    neighbors along, `sweeps` times, finds tighter ones.
+    neighbors along, twice, finds tighter ones.
 
     Args:
         occupied: (nx, ny, nz) bool.
         band: (nx, ny, nz) float32 [m], NaN where unknown; not positive in occupied voxels and not
             negative in the others.
         voxel_size: [m].
-        sweeps: rounds of passing sites to neighbors.
 
     Returns:
         (nx, ny, nz) float32 [m]; plus or minus the diagonal of the grid if the band is empty.
@@ -116,28 +113,25 @@ def distances_from_band(
     offset = band[tuple(nearest)] / np.float32(voxel_size)  # band(s), in voxels
     site = nearest.astype(np.float32)  # (3, nx, ny, nz), the index of s
     sign = np.where(occupied, np.float32(-1.0), np.float32(1.0))
-    index = np.meshgrid(
-        *(np.arange(n, dtype=np.float32) for n in occupied.shape), indexing="ij", sparse=True
-    )
+    axes = (np.arange(n, dtype=np.float32) for n in occupied.shape)
+    index = [
+        np.broadcast_to(x, occupied.shape) for x in np.meshgrid(*axes, indexing="ij", sparse=True)
+    ]
 
     def bound(where: tuple[slice, ...], site: np.ndarray, offset: np.ndarray) -> np.ndarray:
-        squared = np.float32(0.0)
-        for axis in range(3):
-            x = index[axis][tuple(w if a == axis else slice(None) for a, w in enumerate(where))]
-            squared = squared + np.square(x - site[axis])
-        return np.sqrt(squared) + sign[where] * offset
+        x, y, z = (np.square(i[where] - s) for i, s in zip(index, site, strict=True))
+        return np.sqrt(x + y + z) + sign[where] * offset
 
     best = bound((slice(None),) * 3, site, offset)
-    for _ in range(sweeps):
-        for axis, step in itertools.product(range(3), (1, -1)):
-            there, here = neighbor_slices(axis)[::step]
-            # Copies: the neighbors' sites are read as they were before this pass.
-            candidate, candidate_offset = site[:, *there].copy(), offset[there].copy()
-            tighter = bound(here, candidate, candidate_offset)
-            closer = tighter < best[here]
-            np.copyto(best[here], tighter, where=closer)
-            np.copyto(site[:, *here], candidate, where=closer)
-            np.copyto(offset[here], candidate_offset, where=closer)
+    for _, axis, step in itertools.product(range(2), range(3), (1, -1)):
+        there, here = neighbor_slices(axis)[::step]
+        # Copies: the neighbors' sites are read as they were before this pass.
+        candidate, candidate_offset = site[:, *there].copy(), offset[there].copy()
+        tighter = bound(here, candidate, candidate_offset)
+        closer = tighter < best[here]
+        np.copyto(best[here], tighter, where=closer)
+        np.copyto(site[:, *here], candidate, where=closer)
+        np.copyto(offset[here], candidate_offset, where=closer)
     return sign * best * np.float32(voxel_size)
 
 

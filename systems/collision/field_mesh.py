@@ -14,12 +14,11 @@ from splatpilot.systems.common.validation import require
 
 SUFFIXES = ".gltf", ".obj"
 
+# [voxels] by which a surface may move where triangles are merged: the first without folds
 _SHIFTS = 0.1, 0.05
-"""[voxels] by which a surface may move where triangles are merged: the first without folds."""
+# [rad] Largest angle between the normals of neighbors for which Drake computes distances
 _FOLD = np.deg2rad(170)
-"""[rad] Largest angle between the normals of neighbors for which Drake computes distances."""
-_MIN_DISTANCE = 0.1
-"""[voxels] Minimum distance of voxel centers: slivers fold, or tear the mesh."""
+_MIN_DISTANCE = 0.1  # [voxels] Minimum distance of voxel centers: slivers fold, or tear the mesh
 
 
 def field_mesh(esdf: Esdf, conservative: bool = False) -> trimesh.Trimesh:

@@ -14,7 +14,7 @@ import numpy as np
 
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.collision.occupancy import MAX_VOXELS, esdf_from_occupancy
+from splatpilot.systems.collision.esdf_build import MAX_VOXELS, esdf_from_occupancy
 from splatpilot.systems.common.readers import POINTER, REFUSAL, require_file
 from splatpilot.systems.common.validation import require
 
@@ -62,21 +62,8 @@ class Octomap:
         return self.resolution * lower, self.resolution * upper
 
     def esdf(self, lower_W: np.ndarray | None = None, upper_W: np.ndarray | None = None) -> Esdf:
-        """Computes the distance field of a part of the map, at its resolution, see `states`."""
-        states, lower_W = self.states(lower_W, upper_W)
-        return esdf_from_occupancy(
-            states == FieldState.OCCUPIED, states == FieldState.UNKNOWN, lower_W, self.resolution
-        )
-
-    def states(
-        self, lower_W: np.ndarray | None = None, upper_W: np.ndarray | None = None
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the states of the smallest voxels in a box, by default all the known space.
-
-        Returns:
-            states (nx, ny, nz) uint8 `FieldState`, and the grid's lower corner (3,) [m], the box's
-            rounded outwards to a voxel.
-        """
+        """Computes the distance field of a box, by default all the known space, at the map's
+        resolution; its corners are rounded outwards to a voxel."""
         lower_W = self.lower_W if lower_W is None else np.asarray(lower_W, dtype=float)
         upper_W = self.upper_W if upper_W is None else np.asarray(upper_W, dtype=float)
         lower = np.floor(lower_W / self.resolution + 1e-6).astype(int)
@@ -91,15 +78,14 @@ class Octomap:
             start = np.maximum(self.corners[of_size] - lower, 0)
             stop = np.minimum(self.corners[of_size] - lower + size, shape)
             inside = (start < stop).all(axis=1)
-            start, stop, of_size = start[inside], stop[inside], value[of_size][inside]
+            start, stop, leaves = start[inside], stop[inside], value[of_size][inside]
             if size == 1:
-                states[tuple(start.T)] = of_size
+                states[tuple(start.T)] = leaves
                 continue
-            for (i0, j0, k0), (i1, j1, k1), leaf in zip(
-                start.tolist(), stop.tolist(), of_size.tolist(), strict=True
-            ):
-                states[i0:i1, j0:j1, k0:k1] = leaf
-        return states, self.resolution * lower
+            for a, b, leaf in zip(start.tolist(), stop.tolist(), leaves.tolist(), strict=True):
+                states[a[0] : b[0], a[1] : b[1], a[2] : b[2]] = leaf
+        occupied, unknown = states == FieldState.OCCUPIED, states == FieldState.UNKNOWN
+        return esdf_from_occupancy(occupied, unknown, self.resolution * lower, self.resolution)
 
 
 def read_octomap(path: str | Path) -> Octomap:
@@ -133,19 +119,6 @@ def read_octomap(path: str | Path) -> Octomap:
     nodes = len(masks) + len(sizes)
     require(nodes == count, f"{path}: number of nodes", f"size = {count}", nodes)
     return Octomap(resolution, corners, sizes, occupied)
-
-
-def esdf_from_octomap(
-    path: str | Path,
-    lower_W: np.ndarray | None = None,
-    upper_W: np.ndarray | None = None,
-) -> Esdf:
-    """Computes the distance field of a binary OctoMap, by default of all known space."""
-    octomap = read_octomap(path)
-    try:
-        return octomap.esdf(lower_W, upper_W)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
 
 
 def _links(masks: np.ndarray) -> np.ndarray:

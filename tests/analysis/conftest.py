@@ -11,7 +11,7 @@ from splatpilot.analysis.benchmark.study import StudyConfig
 from splatpilot.analysis.reconstruction import ablation
 from splatpilot.diagrams.worlds.scene_folder import write_scene_folder
 from splatpilot.diagrams.worlds.world import World
-from splatpilot.systems.collision.occupancy import esdf_from_occupancy
+from splatpilot.systems.collision.esdf_build import esdf_from_occupancy
 from splatpilot.systems.splats.baked_scene import BakedScene
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.training.captures import capture_registry as capture_of_scene

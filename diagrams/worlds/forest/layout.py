@@ -63,11 +63,8 @@ class ForestConfig(TrunksConfig):
     """A forest. Not a base of others: Drake would write these to YAML as plain forests."""
 
 
-MARGIN = 14.0
-"""[m], width of the belt of trees around the flyable volume."""
-
-BURIED = 1.0
-"""[m], depth of trunks in the ground."""
+MARGIN = 14.0  # [m], width of the belt of trees around the flyable volume
+BURIED = 1.0  # [m], depth of trunks in the ground
 
 BARK = {OAK: "oak", PINE: "pine", BIRCH: "birch"}
 

@@ -48,8 +48,7 @@ _BRICKS = (
     [(0.33, 0.32, 0.32), (0.48, 0.46, 0.44), (0.60, 0.58, 0.54)],
     [(0.78, 0.75, 0.68), (0.86, 0.84, 0.79), (0.62, 0.38, 0.28)],
 )
-BRICK = 0.30, 0.15
-"""[m], width and height of a brick with its mortar."""
+BRICK = 0.30, 0.15  # [m], width and height of a brick with its mortar
 
 
 def brick(uv: Array, p: Array, seed: int) -> Array:
@@ -117,8 +116,7 @@ def hazard(uv: Array, p: Array, seed: int) -> Array:
     return mix(color, (0.46, 0.45, 0.43), 0.7 * worn)
 
 
-SIGN = 1.2, 0.6
-"""[m], width and height of one sign; larger faces repeat it."""
+SIGN = 1.2, 0.6  # [m], width and height of one sign; larger faces repeat it
 _WORDS = "EXIT", "GATE 7", "SPLATPILOT", "BAY 12", "SLOW", "NO ENTRY", "ROW C", "CAFE", "LEVEL 2"
 
 

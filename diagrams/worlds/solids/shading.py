@@ -10,9 +10,7 @@ from splatpilot.diagrams.worlds.solids.textures import fbm, smoothstep
 from splatpilot.systems.collision.esdf import Esdf
 
 GAMMA = 2.2
-
-HAZE_RANGE = 16.0
-"""[m], distance through the surroundings over which colors fade by a factor e."""
+HAZE_RANGE = 16.0  # [m], distance through the surroundings over which colors fade by a factor e
 
 
 @dataclass(frozen=True, eq=False)

@@ -131,7 +131,7 @@ class Face:
     round: bool = False  # a disc or part of a sphere, on which lines of constant u meet
 
 
-def faces_of(shape: Shape, lower: Array, upper: Array) -> list[Face]:
+def cut_faces(shape: Shape, lower: Array, upper: Array) -> list[Face]:
     """Cuts the surface of `shape` into faces.
 
     A half space must be horizontal; its face ends `GROUND_REACH` beyond [lower, upper] (3,).
@@ -191,29 +191,29 @@ def _axes(shape: Capsule | Cylinder) -> tuple[Array, Array, Array, float]:
     return e_1, np.cross(p_AB / length, e_1), p_AB / length, length
 
 
-def _side(p_WA: Array, e_1: Array, axis: Array, radius: float, length: float) -> Face:
-    e_2 = np.cross(axis, e_1)
+def _ring(uv: Array, radius: float, e_1: Array, axis: Array) -> tuple[Array, Array]:
+    """Returns unit vectors (N, 3) from an axis to the points of a face, and around the axis."""
+    angle, e_2 = uv[:, :1] / radius, np.cross(axis, e_1)
+    return np.cos(angle) * e_1 + np.sin(angle) * e_2, -np.sin(angle) * e_1 + np.cos(angle) * e_2
 
+
+def _side(p_WA: Array, e_1: Array, axis: Array, radius: float, length: float) -> Face:
     def at(uv):
-        angle = uv[:, :1] / radius
-        n = np.cos(angle) * e_1 + np.sin(angle) * e_2
-        p = p_WA + uv[:, 1:] * axis + radius * n
-        return p, n, -np.sin(angle) * e_1 + np.cos(angle) * e_2
+        n, around = _ring(uv, radius, e_1, axis)
+        return p_WA + uv[:, 1:] * axis + radius * n, n, around
 
     return Face((2 * np.pi * radius, length), at, curved=(radius, np.inf))
 
 
 def _dome(center: Array, e_1: Array, axis: Array, radius: float, low: float) -> Face:
     """The part of a sphere above `low` radii along the axis: -1 for all, 0 for half."""
-    e_2 = np.cross(axis, e_1)
     first = float(np.arcsin(low))
 
     def at(uv):
-        longitude = uv[:, :1] / radius
         latitude = np.clip(first + uv[:, 1:] / radius, first, np.pi / 2)
-        around = np.cos(longitude) * e_1 + np.sin(longitude) * e_2
-        n = np.cos(latitude) * around + np.sin(latitude) * axis
-        return center + radius * n, n, -np.sin(longitude) * e_1 + np.cos(longitude) * e_2
+        out, around = _ring(uv, radius, e_1, axis)
+        n = np.cos(latitude) * out + np.sin(latitude) * axis
+        return center + radius * n, n, around
 
     size = (2 * np.pi * radius, (np.pi / 2 - first) * radius)
     return Face(size, at, curved=(radius, radius), round=True)
@@ -221,13 +221,11 @@ def _dome(center: Array, e_1: Array, axis: Array, radius: float, low: float) -> 
 
 def _disc(center: Array, e_1: Array, axis: Array, radius: float, _: float) -> Face:
     """A flat end: u around, v outwards from the middle."""
-    e_2 = np.cross(axis, e_1)
 
     def at(uv):
-        angle = uv[:, :1] / radius
-        out = np.clip(uv[:, 1:], 0, radius) * (np.cos(angle) * e_1 + np.sin(angle) * e_2)
-        along = -np.sin(angle) * e_1 + np.cos(angle) * e_2
-        return center + out, np.tile(axis, (len(uv), 1)), along
+        out, around = _ring(uv, radius, e_1, axis)
+        p = center + np.clip(uv[:, 1:], 0, radius) * out
+        return p, np.tile(axis, (len(uv), 1)), around
 
     return Face((2 * np.pi * radius, radius), at, curved=(radius, np.inf), round=True)
 

@@ -42,8 +42,7 @@ COVERAGE = 0.62
 """Standard deviation over spacing at which a layer of splats has no holes: midway between four
 neighbors each is still half opaque."""
 
-THICKNESS = 0.001
-"""[m], standard deviation of a splat across its surface."""
+THICKNESS = 0.001  # [m], standard deviation of a splat across its surface
 
 RIM = 1.9
 """[standard deviations] from the centers of the outermost patches to the edge of a layer. One layer
@@ -51,8 +50,7 @@ is half opaque at 1.4, two that meet at an edge a little farther out."""
 
 _BULGE = 2.0  # the same of flat patches around a curved surface, which overlap along its outline
 _RINGS = 0.5, 4.0, 9.0, 16.0, 28.0  # [m], from the volume to the outer edges of rings of ground
-GROUND_REACH = _RINGS[-1]
-"""[m], width of the ground around the volume."""
+GROUND_REACH = _RINGS[-1]  # [m], width of the ground around the volume
 
 
 @dataclass(frozen=True, eq=False)

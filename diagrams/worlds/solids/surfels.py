@@ -10,7 +10,7 @@ from splatpilot.diagrams.worlds.solids.solid import (
     Marks,
     Solid,
     WorldSpec,
-    faces_of,
+    cut_faces,
 )
 from splatpilot.diagrams.worlds.solids.surfaces import (
     COVERAGE,
@@ -57,7 +57,7 @@ def _patches(
     material = MATERIALS[solid.material]
     is_ground = isinstance(solid.shape, HalfSpace)
     layers = []  # of patches, opacity, face and coordinates at which the pattern is sampled
-    for face in faces_of(solid.shape, spec.lower_W, spec.upper_W):
+    for face in cut_faces(solid.shape, spec.lower_W, spec.upper_W):
         if is_ground:
             uv, extent = _ground(face, material.spacing, spec, rng)
         else:

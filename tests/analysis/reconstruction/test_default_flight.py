@@ -8,7 +8,7 @@ import pytest
 from splatpilot.analysis.reconstruction.measure_scene import SceneMetrics, unseen_fraction
 from splatpilot.diagrams.worlds.scene_folder import write_scene_folder
 from splatpilot.diagrams.worlds.world import World
-from splatpilot.systems.collision.occupancy import esdf_from_occupancy
+from splatpilot.systems.collision.esdf_build import esdf_from_occupancy
 from splatpilot.systems.splats.scene import GaussianScene
 
 

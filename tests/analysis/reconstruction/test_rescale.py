@@ -19,7 +19,7 @@ from splatpilot.diagrams.worlds.scene_folder import (
 )
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.distance_field import FieldState
-from splatpilot.systems.collision.occupancy import esdf_from_occupancy
+from splatpilot.systems.collision.esdf_build import esdf_from_occupancy
 from splatpilot.systems.splats.baked_scene import BakedScene
 from splatpilot.training.captures.capture_registry import read_capture_of
 

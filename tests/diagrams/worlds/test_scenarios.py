@@ -22,8 +22,7 @@ from splatpilot.diagrams.worlds.solids.shading import Daylight
 from splatpilot.diagrams.worlds.solids.solid import WorldSpec
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import make_spec, make_world
-from splatpilot.systems.collision.esdf_build import esdf_from_distance_field
-from splatpilot.systems.collision.occupancy import esdf_from_occupancy
+from splatpilot.systems.collision.esdf_build import esdf_from_distance_field, esdf_from_occupancy
 from splatpilot.systems.collision.shapes import AnalyticDistanceField, Box, Capsule, HalfSpace
 from splatpilot.systems.common.config import load_config
 from splatpilot.systems.common.provenance import InfeasibleFlightError

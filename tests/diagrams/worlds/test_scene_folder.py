@@ -13,7 +13,7 @@ from splatpilot.diagrams.worlds.scene_folder import (
     write_scene_metadata,
 )
 from splatpilot.diagrams.worlds.world import World
-from splatpilot.systems.collision.occupancy import esdf_from_occupancy
+from splatpilot.systems.collision.esdf_build import esdf_from_occupancy
 from splatpilot.systems.policies.time_of_arrival import time_of_arrival
 from splatpilot.systems.splats.background import EnvironmentMap, mean_color
 from splatpilot.systems.splats.scene import GaussianScene

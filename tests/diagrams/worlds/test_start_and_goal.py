@@ -6,7 +6,7 @@ from splatpilot.diagrams.worlds.feasibility import (
     draw_start_and_goal,
     short_route_warning,
 )
-from splatpilot.systems.collision.occupancy import esdf_from_occupancy
+from splatpilot.systems.collision.esdf_build import esdf_from_occupancy
 from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.policies.lattice import LatticeConfig
 from splatpilot.systems.policies.time_of_arrival import time_of_arrival

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from splatpilot.systems.collision.distance_field import FieldState
-from splatpilot.systems.collision.occupancy import MAX_VOXELS, esdf_from_occupancy, grid_shape
+from splatpilot.systems.collision.esdf_build import MAX_VOXELS, esdf_from_occupancy, grid_shape
 
 FREE, OCCUPIED, UNKNOWN, _ = FieldState
 

@@ -6,7 +6,7 @@ import pytest
 from pydrake.geometry import Meshcat
 from pydrake.math import RigidTransform, RotationMatrix
 
-from splatpilot.systems.collision.occupancy import esdf_from_occupancy
+from splatpilot.systems.collision.esdf_build import esdf_from_occupancy
 from splatpilot.systems.splats.baked_scene import BakedScene
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.visualization.meshcat_drawing import draw_box

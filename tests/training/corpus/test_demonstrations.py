@@ -8,7 +8,7 @@ from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform
 
 from splatpilot.diagrams.worlds.world import World
-from splatpilot.systems.collision.occupancy import esdf_from_occupancy
+from splatpilot.systems.collision.esdf_build import esdf_from_occupancy
 from splatpilot.systems.policies.hypotheses import Hypotheses
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.splats.scene import GaussianScene

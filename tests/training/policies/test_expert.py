@@ -8,7 +8,7 @@ from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.worlds.feasibility import draw_start_and_goal
 from splatpilot.diagrams.worlds.forest.forest import ForestConfig
 from splatpilot.diagrams.worlds.world_registry import make_world
-from splatpilot.systems.collision.occupancy import esdf_from_occupancy
+from splatpilot.systems.collision.esdf_build import esdf_from_occupancy
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS, hover_state
 from splatpilot.training.corpus.expert import ExpertConfig, Labeler, fly_policy
 
