@@ -300,7 +300,7 @@ _RESERVED = {
     *("selector", "velocity_tracker"),
     *("policy_camera", "policy_camera_start_pose", "delayed_pose"),
     *("depth_noise", "color_noise", "time_of_flight_grid"),
-    *("flight_visualizer", "camera_visualizer", "balls_visualizer"),
+    *("flight_visualizer", "camera_visualizer", "spheres_visualizer"),
     *("state_log", "command_log", "hypotheses_log"),
 }
 """Names of the other systems of a flight."""

@@ -28,9 +28,9 @@ from splatpilot.systems.splats.background import Background, mean_color
 from splatpilot.systems.splats.splat_camera import SplatCamera
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS, QuadrotorPlant
 from splatpilot.systems.visualization.meshcat_drawing import (
-    BallsVisualizer,
     CameraVisualizer,
     FlightVisualizer,
+    MovingSpheresVisualizer,
     draw_distance_slice,
     draw_gaussians,
     draw_goal,
@@ -95,7 +95,7 @@ def AddMeshcat(builder: DiagramBuilder, scenario: Scenario, world: World, meshca
         policy.GetOutputPort("hypotheses") if plans else None,
     )
     if world.moving:
-        BallsVisualizer.AddToBuilder(builder, world.moving.balls, meshcat)
+        MovingSpheresVisualizer.AddToBuilder(builder, world.moving.balls, meshcat)
     camera = cast(SplatCamera, builder.GetSubsystemByName("camera"))
     CameraVisualizer.AddToBuilder(builder, camera, meshcat, period=1 / scenario.camera.fps)
 
