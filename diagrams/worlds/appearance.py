@@ -60,7 +60,8 @@ def draw_appearance(rng: np.random.Generator, strength: float) -> Appearance:
     light = rng.normal(size=3)
     waves = rng.normal(size=(_WAVES, 4))
     waves[:, :3] /= np.linalg.norm(waves[:, :3], axis=1, keepdims=True)
-    waves[:, :3] *= 2 * np.pi / np.exp(rng.uniform(*np.log(_WAVELENGTHS), (_WAVES, 1)))
+    shortest, longest = np.log(_WAVELENGTHS)
+    waves[:, :3] *= 2 * np.pi / np.exp(rng.uniform(shortest, longest, (_WAVES, 1)))
     return Appearance(
         paint=paint.astype(np.float32),
         exposure=float(2 ** (strength * rng.uniform(*_EXPOSURE))),

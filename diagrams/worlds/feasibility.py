@@ -54,8 +54,8 @@ def is_feasible(spec: WorldSpec) -> bool:
 
     A coarse grid finds most paths; the finest finds those through gaps of 1 m.
     """
-    field, ends = spec.distance_field, np.stack([spec.p_WS, spec.p_WG])
-    if not (conservative_distance(field, ends) >= CLEARANCE).all():
+    field, ends = spec.distance_field, (spec.p_WS, spec.p_WG)
+    if not (conservative_distance(field, np.stack(ends)) >= CLEARANCE).all():
         return False
     return any(connects(field, *ends, VEHICLE_RADIUS, spacing) for spacing in (0.3, 0.15, 0.12))
 

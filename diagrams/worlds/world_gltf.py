@@ -131,7 +131,8 @@ def _solid_meshes(spec: WorldSpec, light: Illumination, texel: float) -> list[_M
             uvs.append(uv)
             triangles.append(corners + count)
             count += len(p)
-        meshes.append(_Mesh(*map(np.concatenate, (vertices, uvs, triangles)), picture))
+        p, uv, corners = map(np.concatenate, (vertices, uvs, triangles))
+        meshes.append(_Mesh(p, uv, corners, picture))
     return meshes
 
 

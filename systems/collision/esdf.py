@@ -213,10 +213,10 @@ class Esdf:
             kind = f"an array of {ndim} dimensions, of kind {' or '.join(kinds)}"
             found = "nothing" if array is None else f"{array.dtype} of {array.shape}"
             require(valid, f"{path}: {name}", kind, found)
-        version = int(archive.pop("version"))
+        version, *fields = (archive[name] for name in _ENTRIES)
         require(version == FORMAT_VERSION, f"{path}: version", str(FORMAT_VERSION), version)
         try:
-            return cls(**{name: archive[name] for name in _ENTRIES if name in archive})
+            return cls(*fields)
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from error
 
