@@ -88,11 +88,7 @@ def AddMeshcat(builder: DiagramBuilder, scenario: Scenario, world: World, meshca
         policy.GetOutputPort("hypotheses") if plans else None,
     )
     if world.moving:
-<<<<<<< HEAD
-        BallsVisualizer.AddToBuilder(builder, world.moving.spheres, meshcat)
-=======
         MovingSpheresVisualizer.AddToBuilder(builder, world.moving.spheres, meshcat)
->>>>>>> house
     camera = cast(SplatCamera, builder.GetSubsystemByName("camera"))
     CameraVisualizer.AddToBuilder(builder, camera, meshcat, period=1 / scenario.camera.fps)
 

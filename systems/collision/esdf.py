@@ -114,7 +114,6 @@ class Esdf:
             lower_W=lower_W,
             upper_W=upper_W,
             voxel_size=voxel_size,
-            occupied_outside=bool(self.occupied_outside),
         )
 
     @property
@@ -213,10 +212,10 @@ class Esdf:
             kind = f"an array of {ndim} dimensions, of kind {' or '.join(kinds)}"
             found = "nothing" if array is None else f"{array.dtype} of {array.shape}"
             require(valid, f"{path}: {name}", kind, found)
-        version, *fields = (archive[name] for name in _ENTRIES)
+        version, *arrays, voxel_size, outside = (archive[name] for name in _ENTRIES)
         require(version == FORMAT_VERSION, f"{path}: version", str(FORMAT_VERSION), version)
         try:
-            return cls(*fields)
+            return cls(*arrays, float(voxel_size), bool(outside))
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from error
 
