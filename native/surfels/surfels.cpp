@@ -1,4 +1,4 @@
-// Frames of surfels, and the way back.
+// Frames of surfels, and their backward pass.
 #include <algorithm>
 #include <cstring>
 

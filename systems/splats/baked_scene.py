@@ -2,20 +2,21 @@
 
 import os
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from splatpilot import _native
 from splatpilot.systems.common.validation import require
-from splatpilot.systems.splats.lens import PINHOLE, Distortion, hidden_pixels, native_lens
+from splatpilot.systems.splats.lens import Distortion, hidden_pixels, native_lens
 from splatpilot.systems.splats.scene import GaussianScene, harmonic_degree
 
 if TYPE_CHECKING:
     from pydrake.math import RigidTransform
 
 EPS2D = 0.3  # [px^2] variance by which the pixel blurs every Gaussian, as in gsplat
+_BLACK = np.zeros(3, np.float32)
 
 
 class PlacedGaussians(NamedTuple):
@@ -44,12 +45,11 @@ class MovingGaussians:
     def __init__(
         self, bodies: Sequence[GaussianScene], centers: Callable[[float], NDArray]
     ) -> None:
-        self._about_centers = PlacedGaussians(
-            *(
-                np.concatenate([getattr(body, name) for body in bodies] or [none])
-                for name, none in NO_GAUSSIANS._asdict().items()
-            )
+        arrays = (
+            np.concatenate([getattr(body, name) for body in bodies] or [none])
+            for name, none in NO_GAUSSIANS._asdict().items()
         )
+        self._about_centers = PlacedGaussians(*arrays)
         self._body = np.repeat(np.arange(len(bodies)), [len(body) for body in bodies])
         self._centers = centers
 
@@ -80,13 +80,9 @@ def create_renderer(threads: int = 1, simd: str = "") -> _native.Renderer:
     earlier images.
 
     Args:
-        threads: 1 to 1024.
+        threads: 1 to 1024; an OSError if the system refuses to start them.
         simd: one of `splatpilot._native.simd_levels()`; by default the environment variable
             SPLATPILOT_SIMD, else the widest of this machine.
-
-    Raises:
-        ValueError: `threads` or `simd` is invalid here.
-        OSError: the system does not let this process start so many threads.
     """
     require(1 <= int(threads) <= 1024, "threads", "in [1, 1024]", threads)
     try:
@@ -108,6 +104,21 @@ def check_camera(K: ArrayLike, width: int, height: int, near: float, far: float)
     return K
 
 
+def _native_gaussians(gaussians: "GaussianScene | PlacedGaussians") -> _native.Gaussians:
+    means, quats, scales, opacities, sh = (
+        np.ascontiguousarray(getattr(gaussians, name), dtype=np.float32)
+        for name in PlacedGaussians._fields
+    )
+    return _native.Gaussians(
+        means=means,
+        quats=quats,
+        scales=scales,
+        opacities=opacities,
+        colors=sh,
+        sh_degree=harmonic_degree(sh.shape[1]),
+    )
+
+
 class BakedScene:
     """A Gaussian scene prepared for fast repeated rendering.
 
@@ -120,16 +131,10 @@ class BakedScene:
     def __init__(self, scene: GaussianScene, threads: int = 1, simd: str = ""):
         """Bakes a scene without keeping a reference to it; see `create_renderer`."""
         self._renderer = create_renderer(threads, simd)
-        names = PlacedGaussians._fields
-        arrays = {n: np.ascontiguousarray(getattr(scene, n), dtype=np.float32) for n in names}
-        self._scene = _native.BakedScene(**arrays, sh_degree=harmonic_degree(scene.sh.shape[1]))
+        self._scene = _native.BakedScene(_native_gaussians(scene))
 
     def recolored(self, sh: np.ndarray) -> "BakedScene":
-        """Returns the same Gaussians in other colors without baking again.
-
-        Args:
-            sh: (N, K, 3), see `GaussianScene`, in the order of the baked scene.
-        """
+        """Returns the same Gaussians in other colors, `sh` (N, K, 3), without baking again."""
         sh = np.ascontiguousarray(sh, dtype=np.float32)
         count = self._scene.count
         valid = sh.ndim == 3 and len(sh) == count and sh.shape[2] == 3
@@ -171,8 +176,10 @@ class BakedScene:
         background = np.ascontiguousarray(background, dtype=np.float32)
         valid = background.shape == (3,) and np.isfinite(background).all()
         require(valid, "background", "3 finite numbers", background.tolist())
+        color, alpha = (np.empty((height, width, n), np.float32) for n in (3, 1))
         camera = (K, width, height, X_WC, near, far)
-        return self._render(camera, background, moving, distortion, max_depth, depth_alone=False)
+        depth = self._render(*camera, moving, distortion, max_depth, color, alpha, background)
+        return RenderedView(color, depth, alpha[..., 0])
 
     def render_depth(
         self,
@@ -187,28 +194,28 @@ class BakedScene:
         distortion: Distortion | None = None,
     ) -> NDArray[np.float32]:
         """Renders the median depth (H, W) [m], bitwise identical to that of `render` but faster."""
-        camera, black = (K, width, height, X_WC, near, far), np.zeros(3, np.float32)
-        return self._render(camera, black, moving, distortion, max_depth, depth_alone=True).depth
+        return self._render(K, width, height, X_WC, near, far, moving, distortion, max_depth)
 
     def _render(
         self,
-        camera: tuple[Any, int, int, Any, float, float],
-        background: NDArray[np.float32],
+        K: ArrayLike,
+        width: int,
+        height: int,
+        X_WC: "RigidTransform",
+        near: float,
+        far: float,
         moving: PlacedGaussians,
         distortion: Distortion | None,
         max_depth: float,
-        depth_alone: bool,
-    ) -> RenderedView:
-        K, width, height, X_WC, near, far = camera
+        color: NDArray[np.float32] | None = None,
+        alpha: NDArray[np.float32] | None = None,
+        background: NDArray[np.float32] = _BLACK,
+    ) -> NDArray[np.float32]:
+        """Returns the depth (H, W); also writes `color` and `alpha` unless they are None."""
         K = check_camera(K, width, height, near, far)
         require(max_depth > 0, "max_depth", "> 0 m", max_depth)
-        lens = PINHOLE if distortion is None else native_lens(distortion, K, width, height)
-        color, depth, alpha = (np.empty((height, width, n), np.float32) for n in (3, 1, 1))
-        _native.render_baked(
-            self._scene,
-            self._renderer,
-            **moving._asdict(),
-            sh_degree=harmonic_degree(moving.sh.shape[1]),
+        lens = {} if distortion is None else native_lens(distortion, K, width, height)._asdict()
+        camera = _native.Camera(
             K=K,
             X_CW=np.ascontiguousarray(X_WC.inverse().GetAsMatrix4()),
             width=width,
@@ -216,15 +223,18 @@ class BakedScene:
             near_plane=near,
             far_plane=far,
             eps2d=EPS2D,
-            background=background,
-            color=None if depth_alone else color,
-            depth=depth,
-            alpha=None if depth_alone else alpha,
             max_depth=max_depth,
-            **lens._asdict(),
+            **lens,
+        )
+        depth = np.empty((height, width, 1), np.float32)
+        images = {"color": color, "depth": depth, "alpha": alpha}
+        gaussians = _native_gaussians(moving)
+        _native.render_baked(
+            self._scene, self._renderer, gaussians, camera, background=background, **images
         )
         if distortion is not None:
             hidden = hidden_pixels(distortion, K, width, height)
-            for image in (depth,) if depth_alone else (color, depth, alpha):
-                image.reshape(-1, image.shape[2])[hidden] = 0.0
-        return RenderedView(color, depth[..., 0], alpha[..., 0])
+            for image in images.values():
+                if image is not None:
+                    image.reshape(-1, image.shape[2])[hidden] = 0.0
+        return depth[..., 0]

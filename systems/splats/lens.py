@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
 NUM_RADIAL = {"opencv": 6, "fisheye": 4}
-"""Largest number of radial coefficients of each model."""
+"""Maximum number of radial coefficients of each model."""
 
 _MARGIN = 0.15  # fraction of the image around it in which rays are still projected as if inside
 _SAMPLES, _STEPS = 4097, 6  # of the radial table and of its refinement, to rounding
@@ -126,8 +126,6 @@ class NativeLens(NamedTuple):
     lens: "NDArray[np.float64]"  # (13,): radial 6, tangential 2, limit^2, min and max slopes
 
 
-PINHOLE = NativeLens(0, np.zeros(13))
-
 type _Intrinsics = tuple[float, float, float, float]  # fx, fy, cx, cy
 
 
@@ -136,17 +134,17 @@ def _cached[T](maxsize: int) -> Callable[[Callable[..., T]], Callable[..., T]]:
 
     def decorate(compute: Callable[..., T]) -> Callable[..., T]:
         @lru_cache(maxsize)
-        def cached(model, radial, tangential, max_angle, intrinsics, width, height) -> T:
-            lens = Distortion(model, list(radial), list(tangential), max_angle)
-            return compute(lens, intrinsics, width, height)
+        def cached(lens: tuple, intrinsics: _Intrinsics, width: int, height: int) -> T:
+            model, radial, tangential, max_angle = lens
+            distortion = Distortion(model, list(radial), list(tangential), max_angle)
+            return compute(distortion, intrinsics, width, height)
 
-        @wraps(compute)
-        def call(distortion: Distortion, K: "NDArray", width: int, height: int) -> T:
-            d, intrinsics = distortion, tuple(map(float, K[[0, 1, 0, 1], [0, 1, 2, 2]]))
+        def call(d: Distortion, K: "NDArray", width: int, height: int) -> T:
+            intrinsics = tuple(map(float, K[[0, 1, 0, 1], [0, 1, 2, 2]]))
             lens = d.model, tuple(d.radial), tuple(d.tangential), d.max_angle
-            return cached(*lens, intrinsics, width, height)
+            return cached(lens, intrinsics, width, height)
 
-        return call
+        return wraps(compute)(call)
 
     return decorate
 
