@@ -77,47 +77,41 @@ def surface_labels(view: RenderedView) -> NDArray[np.int16]:
     return np.where(view.depth > 0, unspecified, empty).astype(np.int16)
 
 
-# Rolling shutters: rows are read one after the other at even times, the first at the pose X_WC0 and
-# the last at X_WC1, those between at `pose_between`. Rows between which an image hardly moves are
-# rendered together, as a band, from the pose of their middle.
-
-_MAX_STEP = 0.5
-"""[px] by which the image of a point at `_NEAR` [m] may move from one band to the next."""
-_NEAR = 1.0
-_MIN_BANDS = 8
-"""Bands of an image with a rolling shutter if Gaussians move."""
+_MAX_STEP = 0.5  # [px] that a point at 1 m may move on the image from one band to the next
+_MIN_BANDS = 8  # of an image with a rolling shutter if Gaussians move
 
 
 def row_bands(
     X_WC0: RigidTransform, X_WC1: RigidTransform, focal: float, height: int, min_count: int = 1
 ) -> list[tuple[int, int]]:
-    """Divides an image into bands, from a first row to a row after the last.
+    """Divides an image of a rolling shutter into bands of rows that render from one pose.
 
     Args:
         X_WC0, X_WC1: poses of the camera at the first and the last row.
         focal: [px]
         height: [px]
-        min_count: number of bands at least.
+        min_count: minimum number of bands.
+
+    Returns:
+        The first row of each band, and the row after its last.
     """
     angle = (X_WC0.rotation().inverse() @ X_WC1.rotation()).ToAngleAxis().angle()
     distance = np.linalg.norm(X_WC1.translation() - X_WC0.translation())
-    shift = focal * (abs(angle) + float(distance) / _NEAR)
+    shift = focal * (abs(angle) + float(distance))
     count = min(height, max(min_count, math.ceil(shift / _MAX_STEP)))
     edges = np.linspace(0, height, count + 1).round().astype(int).tolist()
     return list(pairwise(edges))
 
 
 class _Band(NamedTuple):
-    """Rows that are rendered from one pose."""
+    """Rows that render from one pose."""
 
     camera: tuple[np.ndarray, int, int, RigidTransform]  # K (3, 3) [px], width, height, X_WC
     moving: PlacedGaussians
 
 
 class SplatCamera(LeafSystem):
-    """
-    Renders color, depth and label images of a Gaussian scene, with the output ports of Drake's
-    `RgbdSensor`.
+    """Renders color, depth and label images of a Gaussian scene, with the ports of `RgbdSensor`.
 
     .. pydrake_system::
 
@@ -135,9 +129,10 @@ class SplatCamera(LeafSystem):
 
     `body_pose` is the pose X_WB of the body that carries the camera; the camera has the pose X_WC =
     X_WB X_BC with x right, y down and z forward for all images. With a `readout`, a rolling
-    shutter, that is the pose at the last row, and `start_pose` X_WB at the first.
+    shutter, that is the pose at the last row, and `start_pose` X_WB at the first. Rows between
+    which an image hardly moves render together, from the pose at the middle of their readout.
 
-    Images are rendered when a port is evaluated, and again if the pose has changed, or the time if
+    Images render when a port is evaluated, and again if the pose has changed, or the time if
     Gaussians move. Depth alone renders faster and is bitwise identical.
 
     Depth is planar z of the surface, the median depth of `rasterize`, in meters
@@ -173,7 +168,8 @@ class SplatCamera(LeafSystem):
         distortion: Distortion | None = None,
         readout: float = 0.0,
     ):
-        """
+        """Bakes the scene unless it is baked.
+
         Args:
             scene: a `BakedScene` is held by reference, and many cameras may share it; a
                 `GaussianScene` is baked for this camera.
@@ -183,8 +179,8 @@ class SplatCamera(LeafSystem):
             near, far: Gaussians with a center outside these planes are not drawn [m].
             background: color in [0, 1] or environment behind everything.
             moving: Gaussians that move among the scene's.
-            latency: age of the images [s], by which moving Gaussians are late. The pose that the
-                camera is given must be as old.
+            latency: age of the images [s], by which moving Gaussians are late; the pose at the
+                input port must be as old.
             distortion: lens; a pinhole if None. Pixels without a ray have no surface.
             readout: time between reading the first row and the last [s]; 0 reads all at once.
         """
@@ -258,7 +254,7 @@ class SplatCamera(LeafSystem):
     ) -> RenderedView:
         """Renders the view from body pose X_WB at a time [s], before it becomes Drake images.
 
-        The first row is read from X_WB_start, unless that is None, `readout` before.
+        With X_WB_start, the first row is read at that pose, `readout` earlier.
         """
         views = [
             render_view(
@@ -298,12 +294,10 @@ class SplatCamera(LeafSystem):
         return NO_GAUSSIANS if self._moving is None else self._moving.at(max(0.0, time))
 
     def _poses(self, context) -> tuple[RigidTransform, float, RigidTransform | None]:
-        """Returns X_WB at the last row, the time, and X_WB at the first row if it differs."""
-        X_WB = cast(RigidTransform, self.GetInputPort("body_pose").Eval(context))
-        start = None
-        if self._readout > 0.0:
-            start = cast(RigidTransform, self.GetInputPort("start_pose").Eval(context))
-        return X_WB, context.get_time(), start
+        """Returns X_WB at the last row, the time, and X_WB at the first row of a readout."""
+        names = ["body_pose", "start_pose"] if self._readout > 0.0 else ["body_pose"]
+        X_WB, *start = (cast(RigidTransform, self.GetInputPort(n).Eval(context)) for n in names)
+        return X_WB, context.get_time(), start[0] if start else None
 
     def _calc_view(self, context, value) -> None:
         value.set_value(self.render(*self._poses(context)))

@@ -1,8 +1,4 @@
-"""Gaussian splatting in float64 torch, straight from the published equations, to test against.
-
-Written for clarity, not speed: covariances are multiplied out, every pixel sees every Gaussian
-whose generous bounding circle meets its tile, and everything is differentiable.
-"""
+"""Gaussian splatting in float64 torch, differentiable, from the published equations."""
 
 import math
 from typing import Any, NamedTuple
@@ -81,6 +77,15 @@ def sh_basis(degree: int, directions: Tensor) -> Tensor:
                 bands[-m] = scale * value * phase.imag
         columns += [bands[m] for m in range(-l, l + 1)]
     return torch.stack(columns, 1)
+
+
+def seen_colors(means: Tensor, colors: Tensor, viewmat: Tensor, sh_degree: int | None) -> Tensor:
+    if sh_degree is None:
+        return colors
+    direction = means + torch.linalg.inv(viewmat[:3, :3]) @ viewmat[:3, 3]
+    basis = sh_basis(sh_degree, direction / direction.norm(dim=1, keepdim=True))
+    coefficients = colors[:, : (sh_degree + 1) ** 2]
+    return torch.clamp(0.5 + torch.einsum("nk,nkc->nc", basis, coefficients), min=0)
 
 
 def project(
@@ -200,14 +205,7 @@ def render(
         a.to(dtype) for a in (means, quats, scales, opacities, colors, viewmat, K)
     )
     p = project(means, quats, scales, opacities, viewmat, K, width, height, **projection_options)
-    if sh_degree is None:
-        seen = colors[p.ids]
-    else:
-        center = -torch.linalg.inv(viewmat[:3, :3]) @ viewmat[:3, 3]
-        direction = means[p.ids] - center
-        basis = sh_basis(sh_degree, direction / direction.norm(dim=1, keepdim=True))
-        coefficients = colors[p.ids, : (sh_degree + 1) ** 2]
-        seen = torch.clamp(0.5 + torch.einsum("nk,nkc->nc", basis, coefficients), min=0)
+    seen = seen_colors(means[p.ids], colors[p.ids], viewmat, sh_degree)
     result = composite(p, seen, width, height)
     behind = (1 - result.alpha)[..., None] * torch.as_tensor(background, dtype=dtype)
     return result._replace(color=result.color + behind)
