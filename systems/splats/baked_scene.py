@@ -176,10 +176,9 @@ class BakedScene:
         background = np.ascontiguousarray(background, dtype=np.float32)
         valid = background.shape == (3,) and np.isfinite(background).all()
         require(valid, "background", "3 finite numbers", background.tolist())
-        color, alpha = (np.empty((height, width, n), np.float32) for n in (3, 1))
         camera = (K, width, height, X_WC, near, far)
-        depth = self._render(*camera, moving, distortion, max_depth, color, alpha, background)
-        return RenderedView(color, depth, alpha[..., 0])
+        images = self._render(*camera, moving, distortion, max_depth, background)
+        return RenderedView(images["color"], images["depth"][..., 0], images["alpha"][..., 0])
 
     def render_depth(
         self,
@@ -194,7 +193,8 @@ class BakedScene:
         distortion: Distortion | None = None,
     ) -> NDArray[np.float32]:
         """Renders the median depth (H, W) [m], bitwise identical to that of `render` but faster."""
-        return self._render(K, width, height, X_WC, near, far, moving, distortion, max_depth)
+        camera = (K, width, height, X_WC, near, far)
+        return self._render(*camera, moving, distortion, max_depth)["depth"][..., 0]
 
     def _render(
         self,
@@ -207,11 +207,9 @@ class BakedScene:
         moving: PlacedGaussians,
         distortion: Distortion | None,
         max_depth: float,
-        color: NDArray[np.float32] | None = None,
-        alpha: NDArray[np.float32] | None = None,
-        background: NDArray[np.float32] = _BLACK,
-    ) -> NDArray[np.float32]:
-        """Returns the depth (H, W); also writes `color` and `alpha` unless they are None."""
+        background: NDArray[np.float32] | None = None,
+    ) -> dict[str, NDArray[np.float32]]:
+        """Returns depth (H, W, 1) and, with a background, color (H, W, 3) and alpha (H, W, 1)."""
         K = check_camera(K, width, height, near, far)
         require(max_depth > 0, "max_depth", "> 0 m", max_depth)
         lens = {} if distortion is None else native_lens(distortion, K, width, height)._asdict()
@@ -226,15 +224,18 @@ class BakedScene:
             max_depth=max_depth,
             **lens,
         )
-        depth = np.empty((height, width, 1), np.float32)
-        images = {"color": color, "depth": depth, "alpha": alpha}
-        gaussians = _native_gaussians(moving)
+        channels = {"depth": 1} if background is None else {"depth": 1, "color": 3, "alpha": 1}
+        images = {name: np.empty((height, width, n), np.float32) for name, n in channels.items()}
         _native.render_baked(
-            self._scene, self._renderer, gaussians, camera, background=background, **images
+            self._scene,
+            self._renderer,
+            _native_gaussians(moving),
+            camera,
+            background=_BLACK if background is None else background,
+            **{"color": None, "alpha": None} | images,
         )
         if distortion is not None:
             hidden = hidden_pixels(distortion, K, width, height)
             for image in images.values():
-                if image is not None:
-                    image.reshape(-1, image.shape[2])[hidden] = 0.0
-        return depth[..., 0]
+                image.reshape(-1, image.shape[2])[hidden] = 0.0
+        return images

@@ -424,7 +424,3 @@ def test_late_images_show_bodies_where_they_were():
             camera.render(X_WB, time).color, prompt.render(X_WB, then).color
         )
     assert not np.array_equal(prompt.render(X_WB, 0.0).color, prompt.render(X_WB, 1.0).color)
-
-
-def test_no_bodies_are_no_gaussians():
-    assert len(MovingGaussians([], lambda time: np.zeros((0, 3))).at(0.0).means) == 0

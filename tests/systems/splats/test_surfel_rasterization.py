@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 import reference_surfels as reference
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from random_scenes import normal, normal_tensor, rotation_matrix
 from random_scenes import random_scene as random_gaussians
 from reference_rasterizer import rotation_matrices
@@ -320,56 +318,6 @@ def test_surfel_through_the_camera_plane_is_drawn_in_front_only():
     assert (images["depth"].double() - expected.depth).abs().max() < 1e-4
 
 
-def test_empty_scene_is_background():
-    scene = random_scene(count=0)
-    for name in LEARNED:
-        scene[name] = scene[name].requires_grad_()
-    background = torch.tensor([[0.1, 0.2, 0.3]])
-    images = render(scene, width=20, height=10, backgrounds=background, render_mode="RGB+ED")
-    assert torch.equal(images["color"], background.expand(10, 20, 3))
-    assert not any(images[name].any() for name in ("alpha", "depth", "normal", "median"))
-    images["color"].sum().backward()
-    assert not scene["viewmats"].grad.any()
-
-
-def everything(scene, **options):
-    leaves = {k: v.clone().requires_grad_(k in LEARNED) for k, v in scene.items()}
-    images = render(leaves, **options)
-    total(images).backward()
-    return [images[name] for name in OUTPUTS] + [leaves[name].grad for name in LEARNED]
-
-
-@pytest.mark.parametrize("simd", LEVELS)
-def test_results_are_identical_for_any_number_of_threads(simd):
-    scene = random_scene(count=6000, seed=6, size=(150, 110), sh_degree=1)
-    options = {"width": 150, "height": 110, "sh_degree": 1}
-    renderer = create_renderer(1, simd)
-    single = everything(scene, renderer=renderer, **options)
-    render(random_scene(seed=7), renderer=renderer)
-    for used in (renderer, create_renderer(2, simd), create_renderer(4, simd)):
-        again = everything(scene, renderer=used, **options)
-        assert all(torch.equal(a, b) for a, b in zip(single, again, strict=True))
-
-
-def test_batch_of_cameras_equals_single_calls():
-    scene = random_scene(seed=3, cameras=3)
-    scene["colors"] = torch.rand(3, 300, 3, generator=torch.Generator().manual_seed(9))
-    batch, single = (
-        {k: v.clone().requires_grad_(k in LEARNED) for k, v in scene.items()} for _ in range(2)
-    )
-    size: dict[str, Any] = {"width": 40, "height": 30}
-    images, *_, meta = rasterize_surfels(**batch, **size)
-    (images**2).sum().backward()
-    for c in range(3):
-        one = single | {k: single[k][c : c + 1] for k in ("viewmats", "Ks", "colors")}
-        image, *_, own = rasterize_surfels(**one, **size)
-        assert torch.equal(image[0], images[c])
-        assert torch.equal(meta["means2d"][meta["camera_ids"] == c], own["means2d"])
-        (image**2).sum().backward()
-    for name in LEARNED:
-        torch.testing.assert_close(batch[name].grad, single[name].grad, rtol=1e-4, atol=1e-4)
-
-
 def test_modes_and_meta():
     scene = random_scene(seed=4)
     depth = render(scene)
@@ -391,31 +339,6 @@ def test_modes_and_meta():
     torch.testing.assert_close(meta["means2d"].double(), pixels, rtol=1e-4, atol=1e-3)
     assert (meta["normals"].double() @ X_CW[:3, :3].T * p_C).sum(1).max() <= 1e-6
     assert (meta["radii"] >= 1).all() and 0 < len(ids) < 300
-
-
-@settings(max_examples=30, deadline=None)
-@given(
-    seed=st.integers(0, 2**31),
-    count=st.integers(0, 60),
-    width=st.integers(1, 40),
-    height=st.integers(1, 40),
-    spread=st.floats(-3, 3),
-    log_scale=st.floats(-30, 15),
-    simd=st.sampled_from(LEVELS),
-    threads=st.integers(1, 2),
-)
-def test_fuzz_finite_and_bounded(seed, count, width, height, spread, log_scale, simd, threads):
-    scene = random_scene(count=count, seed=seed, size=(width, height))
-    scene["means"] *= 10.0**spread
-    scene["scales"] = 10.0 ** (log_scale + normal_tensor(seed, count, 3))
-    for name in LEARNED:
-        scene[name] = scene[name].requires_grad_()
-    images = render(scene, width=width, height=height, renderer=create_renderer(threads, simd))
-    assert all(torch.isfinite(image).all() for image in images.values())
-    assert (images["alpha"] >= 0).all() and (images["alpha"] <= 1 + 1e-6).all()
-    assert (images["color"] >= 0).all() and (images["color"] <= 1 + 1e-5).all()
-    total({name: images[name] for name in OUTPUTS}).backward()
-    assert all(torch.isfinite(scene[name].grad).all() for name in LEARNED)
 
 
 @pytest.mark.parametrize(
