@@ -9,12 +9,13 @@ import numpy as np
 
 from splatpilot.systems.common.files import written_atomically
 from splatpilot.systems.common.readers import require_file, require_readable_size
-from splatpilot.systems.splats.baked_scene import RenderedView
 from splatpilot.systems.splats.lens import Distortion, pixel_slopes
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
     from pydrake.math import RigidTransform
+
+    from splatpilot.systems.splats.baked_scene import RenderedView
 
 FAR = 150.0
 """[m], depth from which on a pixel shows the background; some renderers give it a number."""
@@ -93,12 +94,12 @@ def pixel_rays(
 
 
 def put_behind(
-    view: RenderedView,
+    view: "RenderedView",
     background: Background,
     K: "NDArray",
     X_WC: "RigidTransform",
     distortion: Distortion | None = None,
-) -> RenderedView:
+) -> "RenderedView":
     """Adds a background to a view on black; pixels without a ray stay black. K is (3, 3) [px]."""
     color = view.color.copy()
     rows, columns = np.nonzero(view.alpha < 1 - _MIN_LIGHT)

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from splatpilot import _native
 from splatpilot.systems.common.validation import require
+from splatpilot.systems.splats.background import BLACK, Background, EnvironmentMap, put_behind
 from splatpilot.systems.splats.lens import Distortion, hidden_pixels, native_lens
 from splatpilot.systems.splats.scene import GaussianScene, harmonic_degree
 
@@ -16,7 +17,6 @@ if TYPE_CHECKING:
     from pydrake.math import RigidTransform
 
 EPS2D = 0.3  # [px^2] variance by which the pixel blurs every Gaussian, as in gsplat
-_BLACK = np.zeros(3, np.float32)
 
 
 class PlacedGaussians(NamedTuple):
@@ -152,7 +152,7 @@ class BakedScene:
         X_WC: "RigidTransform",
         near: float = 0.01,
         far: float = 1e10,
-        background: ArrayLike = (0.0, 0.0, 0.0),
+        background: Background = BLACK,
         moving: PlacedGaussians = NO_GAUSSIANS,
         distortion: Distortion | None = None,
         max_depth: float = np.inf,
@@ -167,18 +167,22 @@ class BakedScene:
             X_WC: Pose of the camera (x right, y down, z forward) in the world.
             near: Gaussians whose center is nearer than this along z are left out [m].
             far: The same for those farther away [m].
-            background: (3,) color behind everything.
+            background: color or environment behind everything.
             moving: Gaussians added to those of the scene for this image; not checked.
             distortion: Lens; a pinhole if None. Pixels without a ray are black, with alpha and
                 depth 0.
             max_depth: Gaussians beyond this depth [m] are left out of the depth image.
         """
-        background = np.ascontiguousarray(background, dtype=np.float32)
-        valid = background.shape == (3,) and np.isfinite(background).all()
-        require(valid, "background", "3 finite numbers", background.tolist())
+        environment = background if isinstance(background, EnvironmentMap) else None
+        color = np.array(BLACK if environment else background, dtype=np.float32)
+        valid = color.shape == (3,) and np.isfinite(color).all()
+        require(valid, "background", "3 finite numbers", color.tolist())
         camera = (K, width, height, X_WC, near, far)
-        images = self._render(*camera, moving, distortion, max_depth, background)
-        return RenderedView(images["color"], images["depth"][..., 0], images["alpha"][..., 0])
+        images = self._render(*camera, moving, distortion, max_depth, color)
+        view = RenderedView(images["color"], images["depth"][..., 0], images["alpha"][..., 0])
+        if environment is None:
+            return view
+        return put_behind(view, environment, np.asarray(K), X_WC, distortion)
 
     def render_depth(
         self,
@@ -231,7 +235,7 @@ class BakedScene:
             self._renderer,
             _native_gaussians(moving),
             camera,
-            background=_BLACK if background is None else background,
+            background=np.zeros(3, np.float32) if background is None else background,
             **{"color": None, "alpha": None} | images,
         )
         if distortion is not None:

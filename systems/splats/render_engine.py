@@ -35,7 +35,6 @@ from splatpilot.systems.splats.baked_scene import BakedScene, RenderedView
 from splatpilot.systems.splats.splat_camera import (
     color_pixels,
     ranged_depth,
-    render_view,
     surface_labels,
 )
 
@@ -206,7 +205,7 @@ class SplatRenderEngine(RenderEngine):
     def _view(self, core: RenderCameraCore) -> RenderedView:
         camera, key = self._camera(core)
         if self._last_view is None or self._last_view[0] != key:
-            self._last_view = key, render_view(self._scene, *camera)
+            self._last_view = key, self._scene.render(*camera)
         return self._last_view[1]
 
     def _depth(self, core: RenderCameraCore) -> NDArray[np.float32]:

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterator
 from itertools import pairwise
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,7 @@ from pydrake.systems.sensors import (
 
 from splatpilot.systems.common.drake import input_port, output_port, weakly
 from splatpilot.systems.common.validation import require
-from splatpilot.systems.splats.background import BLACK, Background, EnvironmentMap, put_behind
+from splatpilot.systems.splats.background import BLACK, Background
 from splatpilot.systems.splats.baked_scene import (
     NO_GAUSSIANS,
     BakedScene,
@@ -32,27 +32,6 @@ from splatpilot.systems.splats.baked_scene import (
 from splatpilot.systems.splats.lens import Distortion
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.vehicle.state import pose_between
-
-
-def render_view(
-    scene: BakedScene,
-    K: NDArray[np.float64],
-    width: int,
-    height: int,
-    X_WC: RigidTransform,
-    near: float,
-    far: float,
-    background: Background = BLACK,
-    moving: PlacedGaussians = NO_GAUSSIANS,
-    distortion: Distortion | None = None,
-    max_depth: float = np.inf,
-) -> RenderedView:
-    """Renders the view of a camera before any background; see `BakedScene.render`."""
-    camera = (K, width, height, X_WC, near, far)
-    if not isinstance(background, EnvironmentMap):
-        return scene.render(*camera, background, moving, distortion, max_depth)
-    view = scene.render(*camera, BLACK, moving, distortion, max_depth)
-    return put_behind(view, background, K, X_WC, distortion)
 
 
 def color_pixels(color: NDArray) -> NDArray[np.uint8]:
@@ -101,13 +80,6 @@ def row_bands(
     count = min(height, max(min_count, math.ceil(shift / _MAX_STEP)))
     edges = np.linspace(0, height, count + 1).round().astype(int).tolist()
     return list(pairwise(edges))
-
-
-class _Band(NamedTuple):
-    """Rows that render from one pose."""
-
-    camera: tuple[np.ndarray, int, int, RigidTransform]  # K (3, 3) [px], width, height, X_WC
-    moving: PlacedGaussians
 
 
 class SplatCamera(LeafSystem):
@@ -199,7 +171,7 @@ class SplatCamera(LeafSystem):
         self._moving, self._latency, self._readout = moving, latency, readout
         if distortion is not None:
             distortion.validate()
-        self._distortion = distortion
+        self._options: dict[str, Any] = {"distortion": distortion, "max_depth": max_depth}
 
         pose_port = self.DeclareAbstractInputPort("body_pose", Value(RigidTransform()))
         pose_ticket = self.input_port_ticket(pose_port.get_index())
@@ -257,16 +229,8 @@ class SplatCamera(LeafSystem):
         With X_WB_start, the first row is read at that pose, `readout` earlier.
         """
         views = [
-            render_view(
-                self._scene,
-                *band.camera,
-                *self._clipping,
-                background=self._background,
-                moving=band.moving,
-                distortion=self._distortion,
-                max_depth=self._depth_range[1],
-            )
-            for band in self._bands(X_WB, time, X_WB_start)
+            self._scene.render(*camera, background=self._background, moving=moving, **self._options)
+            for camera, moving in self._bands(X_WB, time, X_WB_start)
         ]
         if len(views) == 1:
             return views[0]
@@ -274,12 +238,13 @@ class SplatCamera(LeafSystem):
 
     def _bands(
         self, X_WB: RigidTransform, time: float, X_WB_start: RigidTransform | None
-    ) -> Iterator[_Band]:
+    ) -> Iterator[tuple[tuple[Any, ...], PlacedGaussians]]:
+        """Yields K (3, 3) [px], width, height, X_WC, near and far of each band, and its bodies."""
         info, time = self._camera_info, time - self._latency
         K, width, height = info.intrinsic_matrix(), info.width(), info.height()
         X_WC1 = X_WB @ self._X_BC
         if X_WB_start is None:
-            yield _Band((K, width, height, X_WC1), self._moved(time))
+            yield (K, width, height, X_WC1, *self._clipping), self._moved(time)
             return
         X_WC0, min_count = X_WB_start @ self._X_BC, 1 if self._moving is None else _MIN_BANDS
         focal = float(max(K[0, 0], K[1, 1]))
@@ -287,8 +252,9 @@ class SplatCamera(LeafSystem):
             s = 0.5 * (first + last) / height  # of the time from the first row to the last
             K_band = K.copy()
             K_band[1, 2] -= first
-            camera = (K_band, width, last - first, pose_between(X_WC0, X_WC1, s))
-            yield _Band(camera, self._moved(time - (1.0 - s) * self._readout))
+            X_WC = pose_between(X_WC0, X_WC1, s)
+            moved = self._moved(time - (1.0 - s) * self._readout)
+            yield (K_band, width, last - first, X_WC, *self._clipping), moved
 
     def _moved(self, time: float) -> PlacedGaussians:
         return NO_GAUSSIANS if self._moving is None else self._moving.at(max(0.0, time))
@@ -308,14 +274,8 @@ class SplatCamera(LeafSystem):
             depth = self._view(context).depth
         else:
             depths = [
-                self._scene.render_depth(
-                    *band.camera,
-                    *self._clipping,
-                    max_depth=self._depth_range[1],
-                    moving=band.moving,
-                    distortion=self._distortion,
-                )
-                for band in self._bands(*self._poses(context))
+                self._scene.render_depth(*camera, moving=moving, **self._options)
+                for camera, moving in self._bands(*self._poses(context))
             ]
             depth = depths[0] if len(depths) == 1 else np.concatenate(depths)
         value.set_value(ranged_depth(depth, *self._depth_range))
