@@ -136,9 +136,9 @@ SP_INLINE void backward_pair(const StagedSplat& splat, uint32_t touched, const B
 }
 
 template <bool kColor, bool kDepth>
-size_t raster_tile_backward_channels(const RasterInput& in, const StageReader& record,
-                                     const ImageGradient& g, int tile, BackwardScratch& s,
-                                     PairGradient* gradients) {
+void raster_tile_backward_channels(const RasterInput& in, const StageReader& record,
+                                   const ImageGradient& g, int tile, BackwardScratch& s,
+                                   PairGradient* gradients) {
   const int left = tile % in.tiles_x * kTileSize, top = tile / in.tiles_x * kTileSize;
   const size_t first = in.tile_offsets[tile], last = in.tile_offsets[tile + 1];
   const size_t stages = record.stages_done[tile];
@@ -153,7 +153,6 @@ size_t raster_tile_backward_channels(const RasterInput& in, const StageReader& r
 
   const size_t reached = first + stages * kStageSize < last ? first + stages * kStageSize : last;
   for (size_t slot = reached; slot < last; ++slot) gradients[slot] = {};
-  size_t records = 0;
   for (size_t stage = stages; stage-- > 0;) {
     const size_t begin = first + stage * kStageSize;
     const int count = static_cast<int>(last - begin < kStageSize ? last - begin : kStageSize);
@@ -171,25 +170,23 @@ size_t raster_tile_backward_channels(const RasterInput& in, const StageReader& r
       if (any(s.blocks[b].transmittance > F16(kMinTransmittance))) live |= 1u << b;
     }
     const BlockRecord* block_record = replay(s, in.pairs + begin, count, live);
-    records += static_cast<size_t>(block_record - s.records);
     for (int i = count; i-- > 0;) {
       block_record -= __builtin_popcount(s.touched[i]);
       backward_pair<kColor, kDepth>(s.splats[i], s.touched[i], block_record, s.blocks,
                                     gradients[begin + i]);
     }
   }
-  return records;
 }
 
-inline size_t raster_tile_backward(const RasterInput& in, const StageReader& record,
-                                   const ImageGradient& g, int tile, void* scratch,
-                                   PairGradient* gradients) {
+inline void raster_tile_backward(const RasterInput& in, const StageReader& record,
+                                 const ImageGradient& g, int tile, void* scratch,
+                                 PairGradient* gradients) {
   BackwardScratch& s = *static_cast<BackwardScratch*>(scratch);
-  if (g.color && g.depth) {
-    return raster_tile_backward_channels<true, true>(in, record, g, tile, s, gradients);
-  }
-  if (g.color) return raster_tile_backward_channels<true, false>(in, record, g, tile, s, gradients);
-  return raster_tile_backward_channels<false, true>(in, record, g, tile, s, gradients);
+  if (!g.depth)
+    return raster_tile_backward_channels<true, false>(in, record, g, tile, s, gradients);
+  if (!g.color)
+    return raster_tile_backward_channels<false, true>(in, record, g, tile, s, gradients);
+  raster_tile_backward_channels<true, true>(in, record, g, tile, s, gradients);
 }
 
 // Adds up each splat's pairs, tile after tile, and turns sums over u and v into gradients.

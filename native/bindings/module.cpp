@@ -138,11 +138,11 @@ void render_baked(const BakedScene& scene, Renderer& renderer, const Gaussians& 
   renderer.render(scene.arrays(), moving.arrays(), camera, out);
 }
 
-size_t raster_backward(Renderer& renderer, const RenderedFrame& rendered, const Pixels& v_image,
-                       const Pixels& v_alpha, const Pixels& image, const Pixels& alpha,
-                       const Background& background, bool expected_depth,
-                       const Writable<nb::shape<-1, 16>>& v_splats,
-                       const Writable<nb::shape<-1, 2>>& v_means2d) {
+void raster_backward(Renderer& renderer, const RenderedFrame& rendered, const Pixels& v_image,
+                     const Pixels& v_alpha, const Pixels& image, const Pixels& alpha,
+                     const Background& background, bool expected_depth,
+                     const Writable<nb::shape<-1, 16>>& v_splats,
+                     const Writable<nb::shape<-1, 2>>& v_means2d) {
   const Frame& frame = *rendered.frame;
   require(frame.kept, "the frame was not kept for a backward pass");
   const size_t channels = check_images(v_image, v_alpha, frame.camera.height, frame.camera.width);
@@ -158,8 +158,8 @@ size_t raster_backward(Renderer& renderer, const RenderedFrame& rendered, const 
   g.rendered_alpha = alpha.data();
   std::copy_n(background.data(), 3, g.background);
   const Exclusive use(renderer);
-  return renderer.raster_backward(frame, g, reinterpret_cast<SplatGradient*>(v_splats.data()),
-                                  v_means2d.data());
+  renderer.raster_backward(frame, g, reinterpret_cast<SplatGradient*>(v_splats.data()),
+                           v_means2d.data());
 }
 
 OwnedArray<double, 5, 3> project_backward(Renderer& renderer, const RenderedFrame& rendered,
@@ -221,10 +221,7 @@ NB_MODULE(_native, m) {
            "antialiased"_a = false, "max_depth"_a = std::numeric_limits<double>::infinity(),
            "distortion"_a = 0, "lens"_a = nb::none());
   nb::class_<RenderedFrame>(m, "Frame", "A rendered image, for its backward pass.")
-      .def_ro("splat_count", &RenderedFrame::splat_count, "Number of visible Gaussians.")
-      .def_prop_ro(
-          "pair_count", [](const RenderedFrame& r) { return r.frame->pairs.size(); },
-          "Number of pairs of a Gaussian and a tile that it touches.");
+      .def_ro("splat_count", &RenderedFrame::splat_count, "Number of visible Gaussians.");
   m.def("projected", &projected, "renderer"_a, "frame"_a, "opacities"_a.none(),
         "ids (n,), radii (n, 2), means (n, 2), depths (n,), conics (n, 3) and opacities (n,) of\n"
         "a frame's splats.");
@@ -235,8 +232,8 @@ NB_MODULE(_native, m) {
   m.def("raster_backward", &raster_backward, "renderer"_a, "frame"_a, nb::kw_only(), "v_image"_a,
         "v_alpha"_a, "image"_a, "alpha"_a, "background"_a, "expected_depth"_a, "v_splats"_a,
         "v_means2d"_a,
-        "Writes the gradients of a frame's splats; returns the number of composited (Gaussian,\n"
-        "4x4 block). v_image etc. are derivatives of the loss by image etc.");
+        "Writes the gradients of a frame's splats. v_image etc. are derivatives of the loss by\n"
+        "image etc.");
   m.def("project_backward", &project_backward, "renderer"_a, "frame"_a, "gaussians"_a,
         "gradients"_a, nb::kw_only(), "v_splats"_a, "v_means2d"_a,
         "Writes the gradients of the frame's Gaussians. Returns (5, 3) those by R_CW with the\n"

@@ -110,17 +110,17 @@ SP_INLINE F16& operator+=(F16& a, const F16& b) { return a = a + b; }
 
 using Register = FloatRegister;
 #if defined(__AVX512F__)
-SP_INLINE Register register_min(Register a, Register b) { return _mm512_min_ps(a, b); }
-SP_INLINE Register register_max(Register a, Register b) { return _mm512_max_ps(a, b); }
-SP_INLINE Register register_sqrt(Register a) { return _mm512_sqrt_ps(a); }
+#define SP_INTRINSIC(name) _mm512_##name
 #elif defined(__AVX2__)
-SP_INLINE Register register_min(Register a, Register b) { return _mm256_min_ps(a, b); }
-SP_INLINE Register register_max(Register a, Register b) { return _mm256_max_ps(a, b); }
-SP_INLINE Register register_sqrt(Register a) { return _mm256_sqrt_ps(a); }
+#define SP_INTRINSIC(name) _mm256_##name
 #elif defined(__SSE4_1__)
-SP_INLINE Register register_min(Register a, Register b) { return _mm_min_ps(a, b); }
-SP_INLINE Register register_max(Register a, Register b) { return _mm_max_ps(a, b); }
-SP_INLINE Register register_sqrt(Register a) { return _mm_sqrt_ps(a); }
+#define SP_INTRINSIC(name) _mm_##name
+#endif
+#ifdef SP_INTRINSIC
+SP_INLINE Register register_min(Register a, Register b) { return SP_INTRINSIC(min_ps)(a, b); }
+SP_INLINE Register register_max(Register a, Register b) { return SP_INTRINSIC(max_ps)(a, b); }
+SP_INLINE Register register_sqrt(Register a) { return SP_INTRINSIC(sqrt_ps)(a); }
+#undef SP_INTRINSIC
 #else
 SP_INLINE Register register_min(Register a, Register b) { return a < b ? a : b; }
 SP_INLINE Register register_max(Register a, Register b) { return a > b ? a : b; }

@@ -226,10 +226,9 @@ struct Kernels {
   BinKernel bin;
   // `record` is null when no backward pass follows.
   void (*raster_tile)(const RasterInput&, const Image&, const StageWriter* record, int tile);
-  // Writes the gradients of a tile's pairs and returns the number of composited (splat, block);
-  // `scratch` has kBackwardScratchBytes, aligned to 64.
-  size_t (*raster_tile_backward)(const RasterInput&, const StageReader&, const ImageGradient&,
-                                 int tile, void* scratch, PairGradient*);
+  // Writes the gradients of a tile's pairs; `scratch` has kBackwardScratchBytes, aligned to 64.
+  void (*raster_tile_backward)(const RasterInput&, const StageReader&, const ImageGradient&,
+                               int tile, void* scratch, PairGradient*);
   // Adds up the pairs of `count` splats.
   void (*sum_pairs)(const Splat*, size_t count, const PairRange*, const uint32_t* slots,
                     const PairGradient*, SplatGradient*);

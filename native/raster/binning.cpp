@@ -6,11 +6,6 @@
 
 namespace splatpilot {
 
-void Renderer::start(Frame& frame, const Camera& camera, bool keep) {
-  frame.camera = camera;
-  frame.kept = keep;
-}
-
 void Renderer::project(Frame& frame, size_t count, bool median_depth, const ProjectChunk& project) {
   const size_t chunks = (count + kChunkSize - 1) / kChunkSize;
   frame.gaussians = count;

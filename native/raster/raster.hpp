@@ -183,16 +183,12 @@ inline void seek_tile(const RasterInput& in, const Image& image, int tile) {
 inline void raster_tile(const RasterInput& in, const Image& image, const StageWriter* record,
                         int tile) {
   if (!image.alpha) return seek_tile(in, image, tile);
-  if (image.depth && image.depth_mode == DepthMode::kMedian) {
-    image.color ? raster_tile_channels<true, false, true>(in, image, record, tile)
-                : raster_tile_channels<false, false, true>(in, image, record, tile);
-  } else if (image.color && image.depth) {
-    raster_tile_channels<true, true, false>(in, image, record, tile);
-  } else if (image.color) {
-    raster_tile_channels<true, false, false>(in, image, record, tile);
-  } else {
-    raster_tile_channels<false, true, false>(in, image, record, tile);
-  }
+  const bool color = image.color, median = image.depth && image.depth_mode == DepthMode::kMedian;
+  if (median && color) return raster_tile_channels<true, false, true>(in, image, record, tile);
+  if (median) return raster_tile_channels<false, false, true>(in, image, record, tile);
+  if (color && image.depth) return raster_tile_channels<true, true, false>(in, image, record, tile);
+  if (color) return raster_tile_channels<true, false, false>(in, image, record, tile);
+  raster_tile_channels<false, true, false>(in, image, record, tile);
 }
 
 }  // namespace splatpilot::SIMD_LEVEL

@@ -67,7 +67,8 @@ std::shared_ptr<const Frame> Renderer::render(const BakedArrays& scene,
 std::shared_ptr<const Frame> Renderer::draw(const Camera& camera, const Image& image, bool keep,
                                             size_t count, const ProjectChunk& project) {
   const std::shared_ptr<Frame> frame = frames_.take();
-  start(*frame, camera, keep);
+  frame->camera = camera;
+  frame->kept = keep;
   this->project(*frame, count, image.depth_mode == DepthMode::kMedian, project);
   sort(*frame);
   bin(*frame, kernels_.bin);
@@ -120,16 +121,15 @@ bool Renderer::are_valid(const GaussianArrays& g) {
 
 // Every pair is written separately, and a splat's pairs are added in the order of the tiles: the
 // sums do not depend on the threads.
-size_t Renderer::raster_backward(const Frame& frame, const ImageGradient& image,
-                                 SplatGradient* gradients, float* means2d) {
-  std::atomic<size_t> composited{0};
+void Renderer::raster_backward(const Frame& frame, const ImageGradient& image,
+                               SplatGradient* gradients, float* means2d) {
   const RasterInput input = raster_input(frame);
   const StageReader record{frame.later_stages.data(), frame.transmittance.data(),
                            frame.stages_done.data()};
   if (pair_gradients_.size() < frame.pairs.size()) pair_gradients_.resize(frame.pairs.size());
   pool_.for_each(frame.stages_done.size(), [&](size_t tile) {
-    composited += kernels_.raster_tile_backward(input, record, image, static_cast<int>(tile),
-                                                thread_scratch(), pair_gradients_.data());
+    kernels_.raster_tile_backward(input, record, image, static_cast<int>(tile), thread_scratch(),
+                                  pair_gradients_.data());
   });
   const std::vector<size_t> starts = frame.chunk_starts();
   pool_.for_each(starts.size(), [&](size_t chunk) {
@@ -141,7 +141,6 @@ size_t Renderer::raster_backward(const Frame& frame, const ImageGradient& image,
       std::copy_n(gradients[i].mean, 2, means2d + 2 * i);
     }
   });
-  return composited;
 }
 
 void Renderer::clear_chunk(const GaussianArrays& gaussians, size_t chunk,

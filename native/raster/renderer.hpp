@@ -86,10 +86,9 @@ class Renderer {
   std::shared_ptr<const Frame> render(const BakedArrays& scene, const GaussianArrays& moving,
                                       const Camera& camera, const Image& image);
   // From the image to the frame's splats, in the order of the input; `gradients` and
-  // `means2d` (n, 2), a copy of SplatGradient::mean, hold frame.splat_count(). Returns the
-  // number of composited (splat, 4x4 block).
-  size_t raster_backward(const Frame& frame, const ImageGradient& image, SplatGradient* gradients,
-                         float* means2d);
+  // `means2d` (n, 2), a copy of SplatGradient::mean, hold frame.splat_count().
+  void raster_backward(const Frame& frame, const ImageGradient& image, SplatGradient* gradients,
+                       float* means2d);
   // From the splats to the Gaussians of the frame; `means2d` (n, 2) replaces SplatGradient::mean.
   PoseSums project_backward(const Frame& frame, const GaussianArrays& gaussians,
                             const SplatGradient* gradients, const float* means2d,
@@ -122,7 +121,6 @@ class Renderer {
  private:
   using ProjectChunk = std::function<size_t(size_t begin, size_t end, Splat* splats,
                                             DepthPlane* planes, uint32_t* depth_bits)>;
-  void start(Frame& frame, const Camera& camera, bool keep);
   // Projects Gaussians [0, count), chunk by chunk, and their planes for `median_depth`. project()
   // returns the number of splats.
   void project(Frame& frame, size_t count, bool median_depth, const ProjectChunk& project);

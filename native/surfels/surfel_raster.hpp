@@ -159,13 +159,10 @@ void raster_surfel_tile(const SurfelRasterInput& in, const SurfelImages<float>& 
 
 inline void raster_surfels(const SurfelRasterInput& in, const SurfelImages<float>& out,
                            SurfelBlockRecord* records, int tile) {
-  if (out.distort) {
-    records ? raster_surfel_tile<true, true>(in, out, records, tile)
-            : raster_surfel_tile<true, false>(in, out, records, tile);
-  } else {
-    records ? raster_surfel_tile<false, true>(in, out, records, tile)
-            : raster_surfel_tile<false, false>(in, out, records, tile);
-  }
+  if (out.distort && records) return raster_surfel_tile<true, true>(in, out, records, tile);
+  if (out.distort) return raster_surfel_tile<true, false>(in, out, records, tile);
+  if (records) return raster_surfel_tile<false, true>(in, out, records, tile);
+  raster_surfel_tile<false, false>(in, out, records, tile);
 }
 
 // Back to front, surfel by surfel, over the blocks that each touches, so that sums over pixels are
@@ -315,11 +312,8 @@ void raster_surfel_tile_backward(const SurfelRasterInput& in, const SurfelBlockR
 inline void raster_surfels_backward(const SurfelRasterInput& in, const SurfelBlockRecord* records,
                                     const SurfelImages<const float>& g, int tile,
                                     SurfelGradient* out) {
-  if (g.distort) {
-    raster_surfel_tile_backward<true>(in, records, g, tile, out);
-  } else {
-    raster_surfel_tile_backward<false>(in, records, g, tile, out);
-  }
+  if (g.distort) return raster_surfel_tile_backward<true>(in, records, g, tile, out);
+  raster_surfel_tile_backward<false>(in, records, g, tile, out);
 }
 
 }  // namespace splatpilot::SIMD_LEVEL

@@ -1,6 +1,6 @@
 """Lenses that bend the rays of a pinhole camera: OpenCV's rational and fisheye models.
 
-All is on the image plane of focal length 1; see "Camera Calibration and 3D Reconstruction" and
+Points are on the image plane of focal length 1; see "Camera Calibration and 3D Reconstruction" and
 "Fisheye camera model" of OpenCV, and Kannala and Brandt, PAMI 2006.
 """
 
@@ -51,6 +51,9 @@ class Distortion(Config):
         count = 2 if self.model == "opencv" else 0
         valid = len(self.tangential) in (0, count)
         require_field(self, "tangential", valid, f"{count} numbers of {self.model}, or none")
+
+    def __hash__(self) -> int:
+        return hash((self.model, *self.radial, *self.tangential, self.max_angle))
 
     @property
     def limit(self) -> float:
@@ -133,16 +136,11 @@ def _cached[T](maxsize: int) -> Callable[[Callable[..., T]], Callable[..., T]]:
     """Caches a function of a lens, intrinsics, width and height by their values."""
 
     def decorate(compute: Callable[..., T]) -> Callable[..., T]:
-        @lru_cache(maxsize)
-        def cached(lens: tuple, intrinsics: _Intrinsics, width: int, height: int) -> T:
-            model, radial, tangential, max_angle = lens
-            distortion = Distortion(model, list(radial), list(tangential), max_angle)
-            return compute(distortion, intrinsics, width, height)
+        cached = lru_cache(maxsize)(compute)
 
-        def call(d: Distortion, K: "NDArray", width: int, height: int) -> T:
+        def call(distortion: Distortion, K: "NDArray", width: int, height: int) -> T:
             intrinsics = tuple(map(float, K[[0, 1, 0, 1], [0, 1, 2, 2]]))
-            lens = d.model, tuple(d.radial), tuple(d.tangential), d.max_angle
-            return cached(lens, intrinsics, width, height)
+            return cached(distortion, intrinsics, width, height)
 
         return wraps(compute)(call)
 
@@ -160,7 +158,7 @@ def native_lens(
     border = np.concatenate([np.stack(pair, -1) for a, b in edges for pair in ((a, b), (b, a))])
     points = (border * [width, height] - [cx, cy]) / [fx, fy]
     slopes = distortion.slopes(points)
-    # The limit of the lens takes the place of a border beyond it.
+    # The limit of the lens replaces a border beyond it.
     outward = distortion.limit * points / np.maximum(_lengths(points), 1e-12)[:, None]
     slopes = np.where(np.isnan(slopes), outward, slopes)
     numbers = [

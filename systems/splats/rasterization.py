@@ -27,7 +27,7 @@ SPLAT_GRADIENT = 16
 type Arrays = dict[str, NDArray[Any]]
 
 
-def require_one_of(name: str, value: str, values: Iterable[str]) -> None:
+def require_choice(name: str, value: str, values: Iterable[str]) -> None:
     require(value in values, name, f"one of {', '.join(values)}", repr(value))
 
 
@@ -406,15 +406,10 @@ def rasterize(
         camera_ids, gaussian_ids, depths, opacities (M,), radii, means2d (M, 2), conics (M, 3), and
         width, height, tile_size, tile_width, tile_height, n_cameras. After
         ``meta["means2d"].retain_grad()``, its ``.grad`` holds screen-space gradients [1/px].
-
-    Raises:
-        ValueError: a tensor has the wrong shape, dtype, device or values, or Ks a gradient.
-        NotImplementedError: median depth of tensors on a GPU.
-        ModuleNotFoundError: tensors are on a GPU and gsplat is not installed.
     """
     scene = (means, quats, scales, opacities, colors, viewmats)
-    require_one_of("render_mode", render_mode, CHANNELS)
-    require_one_of("rasterize_mode", rasterize_mode, ("classic", "antialiased"))
+    require_choice("render_mode", render_mode, CHANNELS)
+    require_choice("rasterize_mode", rasterize_mode, ("classic", "antialiased"))
     median, antialiased = "MD" in render_mode, rasterize_mode == "antialiased"
     what = f"rasterize_mode of render_mode {render_mode!r}"
     require(not (median and antialiased), what, "'classic'", repr(rasterize_mode))

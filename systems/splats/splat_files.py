@@ -173,9 +173,7 @@ def read_ply(path: str | Path, recenter: bool = False) -> GaussianScene:
 
     Surfels, whose files have two scales (2DGS), get a third of `_THICKNESS` times the smaller one.
 
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: the file is not a PLY of Gaussians, or damaged.
+    Raises FileNotFoundError, or ValueError for a file that is damaged or without Gaussians.
     """
     path = Path(path)
     ply = read_ply_file(path)
@@ -334,12 +332,7 @@ _RECORD = np.dtype([("p", "<f4", 3), ("s", "<f4", 3), ("rgba", "u1", 4), ("q", "
 
 
 def read_splats(path: str | Path) -> GaussianScene:
-    """Reads the Gaussians of a PLY, SPZ or `.splat` file.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: it is another file, empty, damaged or too large.
-    """
+    """Reads the Gaussians of a PLY, SPZ or `.splat` file; for errors see `read_ply`."""
     path = Path(path)
     require_file(path)
     with path.open("rb") as file:

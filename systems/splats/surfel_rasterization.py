@@ -16,7 +16,7 @@ from splatpilot.systems.splats.rasterization import (
     over_backgrounds,
     pair_meta,
     prepare,
-    require_one_of,
+    require_choice,
     requires_gradients,
 )
 
@@ -161,14 +161,10 @@ def rasterize_surfels(
         meta: dict on the M visible (camera, surfel) pairs: camera_ids, gaussian_ids, depths,
             opacities (M,), radii, means2d (M, 2), normals (M, 3) in the world, and width, height,
             tile_size, tile_width, tile_height, n_cameras, render_distort.
-
-    Raises:
-        ValueError: a tensor has the wrong shape, dtype, device or values.
-        ModuleNotFoundError: tensors are on a GPU and gsplat is not installed.
     """
     scene = (means, quats, scales, opacities, colors, viewmats)
-    require_one_of("render_mode", render_mode, RENDER_MODES)
-    require_one_of("depth_mode", depth_mode, ("expected", "median"))
+    require_choice("render_mode", render_mode, RENDER_MODES)
+    require_choice("depth_mode", depth_mode, ("expected", "median"))
     with_depth = "D" in render_mode
     require(not distloss or with_depth, "render_mode", "one with depth for distloss", render_mode)
     tensors = named_tensors(*scene, Ks, backgrounds, sh_degree=sh_degree)

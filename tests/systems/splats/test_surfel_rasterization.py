@@ -97,10 +97,10 @@ def test_images_agree_with_reference(simd, seed):
         scene, backgrounds=torch.tensor([[0.1, 0.7, 0.3]]), renderer=create_renderer(1, simd)
     )
     for name in OUTPUTS:
-        wanted = getattr(expected, name)
-        error = (images[name].double() - wanted).abs()
+        want = getattr(expected, name)
+        error = (images[name].double() - want).abs()
         assert error.median() < 5e-7, name
-        assert (error / wanted.abs().clamp(min=1))[clear].max() < 1e-4, name
+        assert (error / want.abs().clamp(min=1))[clear].max() < 1e-4, name
 
 
 def loss_gradients(call, scene, clear, dtype) -> dict[str, torch.Tensor]:
@@ -132,7 +132,7 @@ def test_gradients_agree_with_reference(sh_degree):
     scene = random_scene(seed=3, sh_degree=sh_degree)
     clear = call_reference(scene, sh_degree=sh_degree).margin > 1e-4
     exact = reference_gradients(scene, clear, sh_degree=sh_degree)
-    # The change of float64 by half a last place of the inputs, the largest of three.
+    # The change of float64 by half a unit in the last digit of the inputs, the largest of three.
     moved = {name: torch.zeros(len(exact[name]), dtype=torch.float64) for name in LEARNED}
     for seed in range(3):
         ends = {
