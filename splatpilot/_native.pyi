@@ -59,10 +59,6 @@ class Frame:
     def splat_count(self) -> int:
         """Number of visible Gaussians."""
 
-    @property
-    def pair_count(self) -> int:
-        """Number of pairs of a Gaussian and a tile that it touches."""
-
 def projected(renderer: Renderer, frame: Frame, opacities: Annotated[NDArray[numpy.float32], dict(shape=(None,), order='C', device='cpu', writable=False)] | None) -> tuple[Annotated[NDArray[numpy.int64], dict(shape=(None,))], Annotated[NDArray[numpy.int32], dict(shape=(None, 2))], Annotated[NDArray[numpy.float32], dict(shape=(None, 2))], Annotated[NDArray[numpy.float32], dict(shape=(None,))], Annotated[NDArray[numpy.float32], dict(shape=(None, 3))], Annotated[NDArray[numpy.float32], dict(shape=(None,))]]:
     """
     ids (n,), radii (n, 2), means (n, 2), depths (n,), conics (n, 3) and opacities (n,) of
@@ -75,10 +71,10 @@ def render(renderer: Renderer, gaussians: Gaussians, camera: Camera, *, depth_mo
     keep, a backward pass can start from the frame.
     """
 
-def raster_backward(renderer: Renderer, frame: Frame, *, v_image: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)], v_alpha: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)], image: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)], alpha: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)], background: Annotated[NDArray[numpy.float32], dict(shape=(3), order='C', device='cpu', writable=False)], expected_depth: bool, v_splats: Annotated[NDArray[numpy.float32], dict(shape=(None, 16), order='C', device='cpu')], v_means2d: Annotated[NDArray[numpy.float32], dict(shape=(None, 2), order='C', device='cpu')]) -> int:
+def raster_backward(renderer: Renderer, frame: Frame, *, v_image: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)], v_alpha: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)], image: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)], alpha: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)], background: Annotated[NDArray[numpy.float32], dict(shape=(3), order='C', device='cpu', writable=False)], expected_depth: bool, v_splats: Annotated[NDArray[numpy.float32], dict(shape=(None, 16), order='C', device='cpu')], v_means2d: Annotated[NDArray[numpy.float32], dict(shape=(None, 2), order='C', device='cpu')]) -> None:
     """
-    Writes the gradients of a frame's splats; returns the number of composited (Gaussian,
-    4x4 block). v_image etc. are derivatives of the loss by image etc.
+    Writes the gradients of a frame's splats. v_image etc. are derivatives of the loss by
+    image etc.
     """
 
 def project_backward(renderer: Renderer, frame: Frame, gaussians: Gaussians, gradients: GaussianGradients, *, v_splats: Annotated[NDArray[numpy.float32], dict(shape=(None, 16), order='C', device='cpu', writable=False)], v_means2d: Annotated[NDArray[numpy.float32], dict(shape=(None, 2), order='C', device='cpu', writable=False)]) -> Annotated[NDArray[numpy.float64], dict(shape=(5, 3))]:

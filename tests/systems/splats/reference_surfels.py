@@ -29,22 +29,21 @@ class Reference(NamedTuple):
 
 
 def render(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    viewmat: Tensor,
-    K: Tensor,
-    width: int,
-    height: int,
-    near: float = 0.01,
-    far: float = 1e10,
-    sh_degree: int | None = None,
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    dtype: torch.dtype = torch.float64,
+    means,
+    quats,
+    scales,
+    opacities,
+    colors,
+    viewmat,
+    K,
+    width,
+    height,
+    near=0.01,
+    far=1e10,
+    sh_degree=None,
+    background=(0.0, 0.0, 0.0),
+    dtype=torch.float64,
 ) -> Reference:
-    """One camera; tensors are cast to `dtype`."""
     means, quats, scales, opacities, colors, viewmat, K = (
         a.to(dtype) for a in (means, quats, scales, opacities, colors, viewmat, K)
     )

@@ -1,6 +1,6 @@
 import subprocess
 import sys
-import threading
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -10,8 +10,7 @@ from baked_scenes import HEIGHT, LEVELS, WIDTH, X_WC, K, random_scene
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.sensors import CameraInfo
 from random_scenes import random_scene as random_gaussians
-from reference_median_depth import median_depth
-from reference_rasterizer import single_gaussian
+from reference_rasterizer import median_depth, single_gaussian
 
 from splatpilot.systems.splats import rasterize
 from splatpilot.systems.splats.baked_scene import (
@@ -26,11 +25,9 @@ from splatpilot.systems.splats.splat_camera import SplatCamera
 
 
 def rasterized(scene, background=(0.0, 0.0, 0.0), X=X_WC, **options):
+    names = ("means", "quats", "scales", "opacities")
     image, alpha, _ = rasterize(
-        means=torch.from_numpy(scene.means),
-        quats=torch.from_numpy(scene.quats),
-        scales=torch.from_numpy(scene.scales),
-        opacities=torch.from_numpy(scene.opacities),
+        **{name: torch.from_numpy(getattr(scene, name)) for name in names},
         colors=torch.from_numpy(scene.sh),
         viewmats=torch.from_numpy(X.inverse().GetAsMatrix4().astype(np.float32))[None],
         Ks=torch.from_numpy(K.astype(np.float32))[None],
@@ -98,22 +95,15 @@ def test_threads_and_repeats_give_identical_views(simd):
     scene = random_scene(count=5000)
     first = BakedScene(scene, simd=simd).render(K, WIDTH, HEIGHT, X_WC)
     shared = BakedScene(scene, threads=3, simd=simd)
-    views = []
 
-    def fly():
-        views.append(shared.render(K, WIDTH, HEIGHT, X_WC))
-        shared.render(K, 20, 90, RigidTransform(np.array([0, 0, -5.0])))
-        views.append(shared.render(K, WIDTH, HEIGHT, X_WC))
+    def render(repeat):
+        shared.render(K, 20, 90 + repeat, RigidTransform(np.array([0, 0, -5.0])))
+        return shared.render(K, WIDTH, HEIGHT, X_WC)
 
-    workers = [threading.Thread(target=fly) for _ in range(3)]
-    for worker in workers:
-        worker.start()
-    for worker in workers:
-        worker.join()
-    assert len(views) == 6
-    for view in views:
-        for got, want in zip(view, first, strict=True):
-            np.testing.assert_array_equal(got, want)
+    with ThreadPoolExecutor(3) as pool:
+        for view in pool.map(render, range(6)):
+            for got, want in zip(view, first, strict=True):
+                np.testing.assert_array_equal(got, want)
 
 
 @pytest.mark.parametrize("count", [0, 17])
@@ -123,18 +113,6 @@ def test_counts_that_do_not_fill_groups(count):
     image, alpha = rasterized(scene)
     np.testing.assert_allclose(view.alpha, alpha, atol=1e-4)
     np.testing.assert_allclose(view.color, image[..., :3], atol=1e-4)
-
-
-def test_flat_and_needle_gaussians_keep_their_shape():
-    rng = np.random.default_rng(1)
-    scene = random_scene(count=200, sh_degree=0)
-    scales = scene.scales.copy()
-    scales[:100, rng.integers(0, 3)] = 1e-9
-    scales[50:150, :2] = 1e-12
-    scene = GaussianScene(scene.means, scene.quats, scales, scene.opacities, scene.sh)
-    view = BakedScene(scene).render(K, WIDTH, HEIGHT, X_WC)
-    image, _ = rasterized(scene)
-    assert np.quantile(np.abs(view.color - image[..., :3]), 0.99) < 1e-4
 
 
 def test_near_and_far_cut_by_depth_of_center():
@@ -155,9 +133,7 @@ def test_near_and_far_cut_by_depth_of_center():
     ("change", "message"),
     [
         ({"K": np.eye(4)}, r"K must be of shape \(3, 3\), got \(4, 4\)"),
-        ({"K": np.diag([0.0, 1.0, 1.0])}, r"focal lengths of K must be > 0 px, got 0, 1"),
         ({"K": np.diag([1.0, np.nan, 1.0])}, "K must be finite"),
-        ({"width": 0}, "image size must be .* got 0 x 61"),
         ({"height": -1}, "image size must be .* got 83 x -1"),
         ({"near": 0.0}, "0 < near < far"),
         ({"near": 5.0, "far": 4.0}, "depth range must be .* got 5 to 4 m"),
@@ -205,22 +181,6 @@ def test_depth_alone_is_identical(simd, lens, size):
             whole = scene.render(X_WC=X, max_depth=max_depth, **camera).depth
             alone = scene.render_depth(X_WC=X, max_depth=max_depth, **camera)
             np.testing.assert_array_equal(alone, whole)
-
-
-@pytest.mark.parametrize("simd", LEVELS)
-def test_a_disc_seen_exactly_edge_on_has_depth_alone(simd):
-    disc = GaussianScene(
-        means=np.array([[0.0, 0.0, 2.0]], np.float32),
-        quats=np.array([[1.0, 0.0, 0.0, 0.0]], np.float32),
-        scales=np.array([[1e-30, 0.3, 0.3]], np.float32),
-        opacities=np.ones(1, np.float32),
-        sh=np.zeros((1, 1, 3), np.float32),
-    )
-    through_centers = np.array([[70.0, 0, 41.5], [0, 75.0, 30.5], [0, 0, 1]])
-    camera = (through_centers, WIDTH, HEIGHT, RigidTransform())
-    depth = BakedScene(disc, simd=simd).render_depth(*camera)
-    assert depth[30, 41] == pytest.approx(2.0)
-    np.testing.assert_array_equal(np.unique(np.nonzero(depth)[1]), [41])
 
 
 @pytest.mark.parametrize("simd", LEVELS)
@@ -380,19 +340,12 @@ def test_a_moving_body_is_drawn_like_a_static_one():
     assert far_off.mean() < 2e-3
 
 
-@pytest.mark.parametrize("simd", LEVELS)
-def test_moving_views_are_identical_for_any_number_of_threads(simd):
-    scene, body = random_scene(5000, seed=1), random_scene(3000, seed=2, sh_degree=0)
-    moving = MovingGaussians([body], lambda time: np.array([[0.0, 0.0, 0.5]]))
-    nowhere = MovingGaussians([body], lambda time: np.full((1, 3), np.inf))
-    baked = [BakedScene(scene, threads, simd) for threads in (1, 3)]
-    one, three = (b.render(K, WIDTH, HEIGHT, X_WC, moving=moving.at(0.0)) for b in baked)
-    alone = baked[0].render(K, WIDTH, HEIGHT, X_WC)
-    without = baked[0].render(K, WIDTH, HEIGHT, X_WC, moving=nowhere.at(0.0))
-    for first, second in ((one, three), (alone, without)):
-        for a, b in zip(first, second, strict=True):
-            np.testing.assert_array_equal(a, b)
-    assert not np.array_equal(one.color, alone.color)
+def test_an_absent_body_is_not_drawn():
+    scene, body = BakedScene(random_scene(500, seed=1)), random_scene(300, seed=2, sh_degree=0)
+    absent = MovingGaussians([body], lambda time: np.full((1, 3), np.inf)).at(0.0)
+    alone = scene.render(K, WIDTH, HEIGHT, X_WC)
+    for a, b in zip(alone, scene.render(K, WIDTH, HEIGHT, X_WC, moving=absent), strict=True):
+        np.testing.assert_array_equal(a, b)
 
 
 def test_a_body_hides_and_is_hidden():

@@ -2,8 +2,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from scipy.special import sph_harm_y
@@ -130,18 +128,14 @@ def test_merge_places_the_other_scene_and_pads_the_lower_degree():
     first = GaussianScene(**random_arrays(N=3, K=9))
     other = GaussianScene(**random_arrays(N=2, K=4, seed=5))
     X_WO = RigidTransform(RollPitchYaw(0.1, 0.2, 0.3), np.array([10.0, 0.0, 0.0]))
-    merged = first.merged_with(other, X_WO)
-    placed = other.transformed_by(X_WO)
-    assert (len(merged), merged.sh_degree) == (5, 2)
+    merged, placed = first.merged_with(other, X_WO), other.transformed_by(X_WO)
     for name in ("means", "quats", "scales", "opacities"):
         expected = np.concatenate([getattr(first, name), getattr(placed, name)])
         np.testing.assert_array_equal(getattr(merged, name), expected)
     np.testing.assert_array_equal(merged.sh[:3], first.sh)
     np.testing.assert_array_equal(merged.sh[3:, :4], placed.sh)
     assert not merged.sh[3:, 4:].any()
-    reverse = other.merged_with(first)
-    np.testing.assert_array_equal(reverse.means, np.concatenate([other.means, first.means]))
-    assert reverse.sh_degree == 2
+    assert other.merged_with(first).sh_degree == 2
 
 
 def random_directions(count: int, seed: int = 0) -> np.ndarray:
@@ -160,15 +154,12 @@ def test_basis_is_the_real_part_of_the_complex_harmonics():
     np.testing.assert_allclose(sh_basis(d, 3), np.stack(columns, axis=-1), atol=1e-14)
 
 
-@settings(max_examples=30, deadline=None)
-@given(
-    rpy=st.tuples(*[st.floats(-7, 7)] * 3),
-    degree=st.integers(0, 3),
-    seed=st.integers(0, 2**16),
-)
-def test_rotated_coefficients_describe_the_rotated_function(rpy, degree, seed):
-    R_WO = RollPitchYaw(*rpy).ToRotationMatrix().matrix()
-    sh_O = np.random.default_rng(seed).normal(size=((degree + 1) ** 2, 3))
+@pytest.mark.parametrize("degree", range(4))
+@pytest.mark.parametrize("seed", range(3))
+def test_rotated_coefficients_describe_the_rotated_function(degree, seed):
+    rng = np.random.default_rng(seed)
+    R_WO = RollPitchYaw(*rng.uniform(-7, 7, 3)).ToRotationMatrix().matrix()
+    sh_O = rng.normal(size=((degree + 1) ** 2, 3))
     matrices = sh_rotations(R_WO, degree)
     sh_W = np.concatenate(
         [M @ sh_O[k * k : (k + 1) ** 2] for k, M in zip(range(degree + 1), matrices, strict=True)]

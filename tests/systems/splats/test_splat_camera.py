@@ -38,23 +38,21 @@ class CountingScene(BakedScene):
 
 def wall(x: float, opacity: float = 0.99) -> CountingScene:
     y, z = (grid.ravel() for grid in np.meshgrid(*[np.arange(-30, 30.1, 0.5)] * 2))
-    means = np.column_stack([np.full(y.size, x), y, z])
-    count = len(means)
-    return CountingScene(
-        GaussianScene.from_colors(
-            means=means,
-            quats=np.tile([1.0, 0, 0, 0], (count, 1)),
-            scales=np.tile([1e-3, 0.5, 0.5], (count, 1)),
-            opacities=np.full(count, opacity),
-            colors=np.tile([1.0, 0.5, 0.0], (count, 1)),
-        )
+    count = y.size
+    scene = GaussianScene.from_colors(
+        means=np.column_stack([np.full(count, x), y, z]),
+        quats=np.tile([1.0, 0, 0, 0], (count, 1)),
+        scales=np.tile([1e-3, 0.5, 0.5], (count, 1)),
+        opacities=np.full(count, opacity),
+        colors=np.tile([1.0, 0.5, 0.0], (count, 1)),
     )
+    return CountingScene(scene)
 
 
 def evaluate(camera: SplatCamera, port: str, X_WB: RigidTransform) -> np.ndarray:
     context = camera.CreateDefaultContext()
     camera.GetInputPort("body_pose").FixValue(context, X_WB)
-    return camera.GetOutputPort(port).Eval(context).data[..., 0]
+    return camera.GetOutputPort(port).Eval(context).data
 
 
 def test_output_ports_are_those_of_rgbd_sensor():
@@ -80,18 +78,14 @@ def test_output_ports_are_those_of_rgbd_sensor():
 
 def test_wall_is_seen_at_its_distance_and_in_its_color():
     camera = SplatCamera(wall(3), INFO, X_BC)
-    np.testing.assert_allclose(
-        evaluate(camera, "depth_image_32f", RigidTransform()), 2.9, rtol=2e-3
-    )
-    millimeters = evaluate(camera, "depth_image_16u", RigidTransform())
-    np.testing.assert_allclose(millimeters, 2900, rtol=2e-3)
-    assert np.all(
-        evaluate(camera, "label_image", RigidTransform()) == int(RenderLabel.kUnspecified)
-    )
-    context = camera.CreateDefaultContext()
-    camera.GetInputPort("body_pose").FixValue(context, RigidTransform())
-    rgba = camera.GetOutputPort("color_image").Eval(context).data
-    np.testing.assert_allclose(rgba.reshape(-1, 4), [[255, 127.5, 0, 255]] * 32 * 24, atol=3)
+    images = [
+        evaluate(camera, port, RigidTransform())
+        for port in ("depth_image_32f", "depth_image_16u", "label_image", "color_image")
+    ]
+    np.testing.assert_allclose(images[0], 2.9, rtol=2e-3)
+    np.testing.assert_allclose(images[1], 2900, rtol=2e-3)
+    assert np.all(images[2] == int(RenderLabel.kUnspecified))
+    np.testing.assert_allclose(images[3].reshape(-1, 4), [[255, 127.5, 0, 255]] * 32 * 24, atol=3)
 
 
 @pytest.mark.parametrize(
@@ -113,10 +107,7 @@ def test_nothing_in_view_is_background():
     X_WB = RigidTransform(RotationMatrix.MakeZRotation(np.pi), [0, 0, 0])
     assert np.all(np.isinf(evaluate(camera, "depth_image_32f", X_WB)))
     assert np.all(evaluate(camera, "label_image", X_WB) == int(RenderLabel.kEmpty))
-    context = camera.CreateDefaultContext()
-    camera.GetInputPort("body_pose").FixValue(context, X_WB)
-    rgba = camera.GetOutputPort("color_image").Eval(context).data[0, 0]
-    np.testing.assert_array_equal(rgba, [51, 102, 153, 255])
+    np.testing.assert_array_equal(evaluate(camera, "color_image", X_WB)[0, 0], [51, 102, 153, 255])
 
 
 def test_renders_once_per_pose_and_only_when_asked():
