@@ -2,25 +2,31 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import cv2
 import numpy as np
 
 from splatpilot.systems.common.files import written_atomically
-from splatpilot.systems.common.readers import require_file, require_readable_size
+from splatpilot.systems.common.readers import readable, require_file, require_readable_size
 from splatpilot.systems.splats.lens import Distortion, pixel_slopes
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
     from pydrake.math import RigidTransform
 
-    from splatpilot.systems.splats.baked_scene import RenderedView
-
 FAR = 150.0
 """[m], depth from which on a pixel shows the background; some renderers give it a number."""
 
 _MIN_LIGHT = 1e-3  # 1 - alpha below which the background is not looked up
+
+
+class RenderedView(NamedTuple):
+    """Images of one camera, float32."""
+
+    color: "NDArray[np.float32]"  # (H, W, 3), over the background
+    depth: "NDArray[np.float32]"  # (H, W) [m] median z, see `rasterize`; 0: no surface
+    alpha: "NDArray[np.float32]"  # (H, W) in [0, 1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,14 +44,11 @@ class EnvironmentMap:
         """Reads an image file."""
         require_file(file)
         require_readable_size(file, file.stat().st_size)
-        content = file.read_bytes()
-        try:
-            image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
-        except cv2.error:  # more pixels than OpenCV decodes
-            image = None
-        if image is None:
-            raise ValueError(f"{file}: cannot be read as an image; reconstruct the scene again")
-        return cls((image[..., ::-1] / 255).astype(np.float32))
+        with readable(file, "image"):
+            image = cv2.imdecode(np.fromfile(file, np.uint8), cv2.IMREAD_COLOR)
+            if image is None:
+                raise ValueError("unknown format")
+            return cls((image[..., ::-1] / 255).astype(np.float32))
 
     def save(self, file: Path) -> None:
         """Writes `png` atomically."""
@@ -94,12 +97,12 @@ def pixel_rays(
 
 
 def put_behind(
-    view: "RenderedView",
+    view: RenderedView,
     background: Background,
     K: "NDArray",
     X_WC: "RigidTransform",
     distortion: Distortion | None = None,
-) -> "RenderedView":
+) -> RenderedView:
     """Adds a background to a view on black; pixels without a ray stay black. K is (3, 3) [px]."""
     color = view.color.copy()
     rows, columns = np.nonzero(view.alpha < 1 - _MIN_LIGHT)

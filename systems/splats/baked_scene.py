@@ -9,7 +9,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from splatpilot import _native
 from splatpilot.systems.common.validation import require
-from splatpilot.systems.splats.background import BLACK, Background, EnvironmentMap, put_behind
+from splatpilot.systems.splats.background import (
+    BLACK,
+    Background,
+    EnvironmentMap,
+    RenderedView,
+    put_behind,
+)
 from splatpilot.systems.splats.lens import Distortion, hidden_pixels, native_lens
 from splatpilot.systems.splats.scene import GaussianScene, harmonic_degree
 
@@ -63,14 +69,6 @@ class MovingGaussians:
         if present.all():
             return placed
         return placed._replace(opacities=own.opacities * present[self._body])
-
-
-class RenderedView(NamedTuple):
-    """Images of one camera, float32."""
-
-    color: NDArray[np.float32]  # (H, W, 3), over the background
-    depth: NDArray[np.float32]  # (H, W) [m] median z, see `rasterize`; 0: no surface
-    alpha: NDArray[np.float32]  # (H, W) in [0, 1]
 
 
 def create_renderer(threads: int = 1, simd: str = "") -> _native.Renderer:
@@ -178,8 +176,8 @@ class BakedScene:
         valid = color.shape == (3,) and np.isfinite(color).all()
         require(valid, "background", "3 finite numbers", color.tolist())
         camera = (K, width, height, X_WC, near, far)
-        images = self._render(*camera, moving, distortion, max_depth, color)
-        view = RenderedView(images["color"], images["depth"][..., 0], images["alpha"][..., 0])
+        depth, seen, alpha = self._render(*camera, moving, distortion, max_depth, color)
+        view = RenderedView(seen, depth[..., 0], alpha[..., 0])
         if environment is None:
             return view
         return put_behind(view, environment, np.asarray(K), X_WC, distortion)
@@ -198,7 +196,7 @@ class BakedScene:
     ) -> NDArray[np.float32]:
         """Renders the median depth (H, W) [m], bitwise identical to that of `render` but faster."""
         camera = (K, width, height, X_WC, near, far)
-        return self._render(*camera, moving, distortion, max_depth)["depth"][..., 0]
+        return self._render(*camera, moving, distortion, max_depth)[0][..., 0]
 
     def _render(
         self,
@@ -212,7 +210,7 @@ class BakedScene:
         distortion: Distortion | None,
         max_depth: float,
         background: NDArray[np.float32] | None = None,
-    ) -> dict[str, NDArray[np.float32]]:
+    ) -> list[NDArray[np.float32]]:
         """Returns depth (H, W, 1) and, with a background, color (H, W, 3) and alpha (H, W, 1)."""
         K = check_camera(K, width, height, near, far)
         require(max_depth > 0, "max_depth", "> 0 m", max_depth)
@@ -228,18 +226,21 @@ class BakedScene:
             max_depth=max_depth,
             **lens,
         )
-        channels = {"depth": 1} if background is None else {"depth": 1, "color": 3, "alpha": 1}
-        images = {name: np.empty((height, width, n), np.float32) for name, n in channels.items()}
+        depth, color, alpha = (np.empty((height, width, n), np.float32) for n in (1, 3, 1))
+        whole = background is not None
         _native.render_baked(
             self._scene,
             self._renderer,
             _native_gaussians(moving),
             camera,
-            background=np.zeros(3, np.float32) if background is None else background,
-            **{"color": None, "alpha": None} | images,
+            background=background if whole else np.zeros(3, np.float32),
+            color=color if whole else None,
+            depth=depth,
+            alpha=alpha if whole else None,
         )
+        images = [depth, color, alpha] if whole else [depth]
         if distortion is not None:
             hidden = hidden_pixels(distortion, K, width, height)
-            for image in images.values():
+            for image in images:
                 image.reshape(-1, image.shape[2])[hidden] = 0.0
         return images

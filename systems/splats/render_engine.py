@@ -30,8 +30,14 @@ from pydrake.systems.sensors import ImageDepth32F, ImageLabel16I, ImageRgba8U
 
 from splatpilot.systems.common.extras import load_triton
 from splatpilot.systems.common.validation import require
-from splatpilot.systems.splats.background import BLACK, Background, EnvironmentMap, pixel_rays
-from splatpilot.systems.splats.baked_scene import BakedScene, RenderedView
+from splatpilot.systems.splats.background import (
+    BLACK,
+    Background,
+    EnvironmentMap,
+    RenderedView,
+    pixel_rays,
+)
+from splatpilot.systems.splats.baked_scene import BakedScene
 from splatpilot.systems.splats.splat_camera import (
     color_pixels,
     ranged_depth,

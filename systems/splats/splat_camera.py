@@ -21,13 +21,12 @@ from pydrake.systems.sensors import (
 
 from splatpilot.systems.common.drake import input_port, output_port, weakly
 from splatpilot.systems.common.validation import require
-from splatpilot.systems.splats.background import BLACK, Background
+from splatpilot.systems.splats.background import BLACK, Background, RenderedView
 from splatpilot.systems.splats.baked_scene import (
     NO_GAUSSIANS,
     BakedScene,
     MovingGaussians,
     PlacedGaussians,
-    RenderedView,
 )
 from splatpilot.systems.splats.lens import Distortion
 from splatpilot.systems.splats.scene import GaussianScene

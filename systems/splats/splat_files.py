@@ -29,7 +29,7 @@ _MAX_INVALID = 0.2  # fraction of invalid Gaussians that are dropped instead of 
 _MIN_OPACITY = 1e-6  # of an opacity that a format rounds to 0
 _EXPORT = "export the scene in the layout of 3D Gaussian splatting"
 
-type Arrays = dict[str, NDArray[Any]]  # of `GaussianScene`, not checked yet
+type Arrays = dict[str, NDArray[Any]]  # of `GaussianScene`, in its order, not checked yet
 
 
 def _drop_invalid(path: Path, arrays: Arrays, recenter: bool = True) -> GaussianScene:
@@ -57,14 +57,14 @@ def _drop_invalid(path: Path, arrays: Arrays, recenter: bool = True) -> Gaussian
     count = int((~valid).sum())
     if count > _MAX_INVALID * len(valid):
         try:
-            return GaussianScene(**arrays)  # names the first invalid one
+            return GaussianScene(*arrays.values())  # names the first invalid one
         except ValueError as error:
             invalid = f"{count} of {len(valid)} Gaussians are invalid"
             raise ValueError(f"{path}: {invalid}; {error}") from None
     if count:
         _log.warning("%s: %d of %d Gaussians are invalid and dropped", path, count, len(valid))
         arrays = {name: array[valid] for name, array in arrays.items()}
-    return GaussianScene(**arrays, origin=origin)
+    return GaussianScene(*arrays.values(), origin=origin)
 
 
 def _insert_largest(small: NDArray, which: NDArray) -> NDArray[np.float64]:

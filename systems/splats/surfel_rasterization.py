@@ -169,7 +169,7 @@ def rasterize_surfels(
     require(not distloss or with_depth, "render_mode", "one with depth for distloss", render_mode)
     tensors = named_tensors(*scene, Ks, backgrounds, sh_degree=sh_degree)
     if means.device.type == "cuda":
-        image, *others = _rasterize_by_gsplat(
+        image, alpha, *others = _rasterize_by_gsplat(
             *scene,
             Ks,
             width,
@@ -182,7 +182,8 @@ def rasterize_surfels(
             distloss=distloss,
             depth_mode=depth_mode,
         )
-        return over_backgrounds(backgrounds, image, others[0], render_mode), *others
+        image = over_backgrounds(backgrounds, image, alpha, render_mode)
+        return image, alpha, *others  # pyright: ignore[reportReturnType]
     clipping = near_plane, far_plane, radius_clip
     views, arrays = prepare(tensors, (width, height), clipping, sh_degree, renderer, scale_axes=2)
     keep = requires_gradients(tensors)
