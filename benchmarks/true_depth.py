@@ -23,7 +23,7 @@ from splatpilot.diagrams.worlds.world_registry import make_spec, make_world
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.splats.baked_scene import BakedScene
-from splatpilot.systems.splats.splat_camera import ranged_depth, render_view
+from splatpilot.systems.splats.splat_camera import ranged_depth
 from splatpilot.systems.splats.splat_files import read_ply
 from splatpilot.systems.vehicle.state import pose_from_state
 from splatpilot.training.policies.ray_casting import PixelRays, ShapeGeometry
@@ -68,7 +68,7 @@ class TrueDepth:
             unknown = np.isfinite(depth) & (p_WQ[..., 2] > self._upper_W[2])
         if self._scenery is not None:
             K, size = camera.camera_info().intrinsic_matrix(), (camera.width, camera.height)
-            view = render_view(self._scenery, K, *size, X_WC, near=0.01, far=camera.max_depth)
+            view = self._scenery.render(K, *size, X_WC, near=0.01, far=camera.max_depth)
             unknown |= outside & (view.alpha > _VEIL)
         return np.where(unknown, np.nan, depth)
 
@@ -154,7 +154,7 @@ def frames_of_capture(scene: Path, cameras: list[OnboardCamera]) -> list[list[De
         captured = views.capture.frame(i)
         for config, seen in zip(cameras, frames, strict=True):
             K, size = config.camera_info().intrinsic_matrix(), (config.width, config.height)
-            view = render_view(gaussians, K, *size, captured.X_WC, 0.01, 1e10)
+            view = gaussians.render(K, *size, captured.X_WC, 0.01, 1e10)
             depth = ranged_depth(view.depth, config.min_depth, config.max_depth)
             truth = sampled(captured.depth, captured.K, config)
             seen.append(DepthFrame(depth, truth))

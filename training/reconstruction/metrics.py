@@ -8,8 +8,8 @@ import torch
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
-from splatpilot.systems.splats.background import FAR, Background, put_behind
-from splatpilot.systems.splats.baked_scene import BakedScene, RenderedView, create_renderer
+from splatpilot.systems.splats.background import FAR, Background, RenderedView, put_behind
+from splatpilot.systems.splats.baked_scene import BakedScene, create_renderer
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.training.captures.capture import CaptureFrame
 from splatpilot.training.reconstruction.losses import ssim_map

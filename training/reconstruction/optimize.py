@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from splatpilot.systems.common.progress import CheckpointClock, Progress, resumable
-from splatpilot.systems.splats.background import FAR, Background
-from splatpilot.systems.splats.baked_scene import RenderedView, create_renderer
+from splatpilot.systems.splats.background import FAR, Background, RenderedView
+from splatpilot.systems.splats.baked_scene import create_renderer
 from splatpilot.systems.splats.rasterization import EPS2D
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.vehicle.state import rotation_matrices
