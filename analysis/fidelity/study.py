@@ -11,7 +11,8 @@ from pydrake.math import RigidTransform
 from scipy.optimize import isotonic_regression
 
 from splatpilot.training.captures.capture import Capture, back_project, no_depth
-from splatpilot.training.reconstruction.metrics import SceneRenderer, ViewMetrics
+from splatpilot.training.reconstruction.metrics import ViewMetrics
+from splatpilot.training.reconstruction.splat_rendering import SceneRenderer
 
 _MAX_GROUPS, _PER_GROUP = 16, 5  # of samples; minimum number of samples in a group
 # Views of `ViewSupport`: width [px], closest cameras that are compared, relative difference of

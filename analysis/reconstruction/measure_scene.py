@@ -38,7 +38,6 @@ from splatpilot.training.captures.capture import Capture, CaptureFrame, shrink, 
 from splatpilot.training.captures.capture_registry import read_capture_of
 from splatpilot.training.reconstruction.lpips import Lpips
 from splatpilot.training.reconstruction.metrics import (
-    SceneRenderer,
     ViewMetrics,
     fit_exposure,
     has_true_depth,
@@ -46,6 +45,7 @@ from splatpilot.training.reconstruction.metrics import (
     measure_view,
 )
 from splatpilot.training.reconstruction.photometry import ThinnedFrame, seen_pixels
+from splatpilot.training.reconstruction.splat_rendering import SceneRenderer
 
 METRICS = "metrics.json"
 VIEWS = "views.png"

@@ -23,7 +23,7 @@ from splatpilot.systems.common.torch_device import one_torch_thread
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 from splatpilot.training.captures.capture import Capture, shrink_factor
 from splatpilot.training.captures.render import RECIPE, rendered_world
-from splatpilot.training.reconstruction.checkpoint import Checkpoint, require_same_run
+from splatpilot.training.reconstruction.checkpoint import Checkpoint
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.distance_field import FieldDifference, make_distance_field
 from splatpilot.training.reconstruction.initialize import (
@@ -31,7 +31,6 @@ from splatpilot.training.reconstruction.initialize import (
     held_out_frames,
     make_initial_gaussians,
     resolve_config,
-    surface_detail,
 )
 from splatpilot.training.reconstruction.lpips import Lpips
 from splatpilot.training.reconstruction.metrics import HeldOutMetrics
@@ -47,8 +46,7 @@ from splatpilot.training.reconstruction.views import (
     learn_background,
 )
 
-_MAX_NAMED = 10
-"""Maximum number of frames in a warning."""
+_MAX_NAMED = 10  # frames in a warning
 
 
 @dataclass(frozen=True)
@@ -115,14 +113,14 @@ def reconstruct(
 
     Raises:
         ValueError, OSError: for a damaged capture, an invalid config, a checkpoint of another run,
-            or a folder `out` that cannot be written or holds something else. No scene is written.
+            or a folder `out` that cannot be written or holds something else.
     """
     out = Path(out)
     config.validate()
     check_scene_target(out)
     config = resolve_config(config, capture)
     if not restart and config.iterations:
-        require_same_run(out, config)
+        Checkpoint(out, config).load()  # raises ValueError before anything slow is prepared
     held_out = held_out_frames(capture, config)
     fitted = [i for i in range(len(capture)) if i not in held_out]
     factor = shrink_factor(capture.width, config.image_width if config.iterations else 0)
@@ -138,7 +136,9 @@ def reconstruct(
     checkpoint = metrics = None
     if config.iterations == 0:
         gains[fitted] = photometry.gains
-        gaussians = gaussians_from_depth(frames, photometry, surface_detail(config))
+        gaussians = gaussians_from_depth(
+            frames, photometry, config.max_gaussians, config.contrast, optimized=False
+        )
         how = "depth back-projected"
     else:
         views = ReconstructionViews(frames, photometry)
@@ -154,7 +154,7 @@ def reconstruct(
             views,
             test_views,
             background,
-            lambda: make_initial_gaussians(capture, frames, photometry, views, config),
+            lambda extent: make_initial_gaussians(capture, frames, photometry, extent, config),
             checkpoint,
             Lpips() if config.lpips_weight > 0 else None,
             fit_gains=not capture.has_depth,

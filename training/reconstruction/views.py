@@ -1,8 +1,8 @@
 """Frames of a capture for reconstruction, shrunk and as tensors, and the learned background."""
 
+import hashlib
 from collections.abc import Sequence
 from functools import cache
-from typing import overload
 
 import cv2
 import numpy as np
@@ -34,7 +34,7 @@ class ShrunkFrames(Sequence[CaptureFrame]):
     Args:
         capture: source of the frames.
         numbers: indices of the frames.
-        factor: whole factor by which they are shrunk.
+        factor: integer factor by which they are shrunk.
     """
 
     def __init__(self, capture: Capture, numbers: Sequence[int], factor: int):
@@ -46,13 +46,7 @@ class ShrunkFrames(Sequence[CaptureFrame]):
     def __len__(self) -> int:
         return len(self.numbers)
 
-    @overload
-    def __getitem__(self, k: int) -> CaptureFrame: ...
-    @overload
-    def __getitem__(self, k: slice) -> "ShrunkFrames": ...
-    def __getitem__(self, k):
-        if isinstance(k, slice):
-            return ShrunkFrames(self._capture, self.numbers[k], self.factor)
+    def __getitem__(self, k: int) -> CaptureFrame:  # pyright: ignore[reportIncompatibleMethodOverride]
         return self._load(range(len(self))[k])
 
     def _load_and_shrink(self, k: int) -> CaptureFrame:
@@ -89,6 +83,14 @@ class ReconstructionViews:
 
     def __len__(self) -> int:
         return len(self.images)
+
+    def digest(self) -> str:
+        """Returns a digest of images, depths and cameras."""
+        tensors = (self.images, self.depths, self.valid, self.viewmats, self.K, self.gains)
+        digest = hashlib.sha256()
+        for tensor in tensors:
+            digest.update(tensor.numpy().tobytes())
+        return digest.hexdigest()
 
     def camera(self, k: int, device: str) -> tuple[Tensor, Tensor]:
         """Returns X_CW (1, 4, 4) and K (1, 3, 3) [px] of view k on a device."""

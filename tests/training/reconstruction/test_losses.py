@@ -101,26 +101,17 @@ def test_photometric_agrees_with_scipy():
     assert photometric_loss(x.double(), y.double(), 1.0).item() == pytest.approx(expected, 1e-12)
 
 
-def test_equal_images_have_no_loss_and_no_gradient():
-    _, y = image_pair((20, 33, 3))
-    value, gradient = value_and_gradient(photometric_loss, y, y)
-    assert value == 0.0 and not gradient.any()
-
-
 def test_constant_images():
     a, b = 0.6, 0.5
     x, y = torch.full((24, 24, 1), a), torch.full((24, 24, 1), b)
     value, gradient = value_and_gradient(photometric_loss, x, y, 0.0)
     assert value == pytest.approx(0.1, rel=1e-5)
     torch.testing.assert_close(gradient, torch.full_like(x, 1 / x.numel()))
-    # The sum of the gradients is the derivative for moving all pixels together.
-    moved = photometric_loss(x.double() + 1e-6, y.double(), 1.0)
-    still = photometric_loss(x.double() - 1e-6, y.double(), 1.0)
-    _, gradient = value_and_gradient(photometric_loss, x, y, 1.0)
-    assert gradient.sum().item() == pytest.approx((moved - still).item() / 2e-6, rel=1e-3)
     luminance = (2 * a * b + 1e-4) / (a * a + b * b + 1e-4)
     large = torch.full((200, 200, 1), a), torch.full((200, 200, 1), b)
     assert photometric_loss(*large, 1.0).item() == pytest.approx(1 - luminance, rel=0.1)
+    value, gradient = value_and_gradient(photometric_loss, x, x)
+    assert value == 0.0 and not gradient.any()
 
 
 @pytest.mark.parametrize("loss", ["photometric", "depth"])
@@ -184,13 +175,13 @@ def test_nothing_to_compare_costs_nothing(dtype):
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("mistake", [math.nan, math.inf])
-def test_mistakes_in_a_render_are_not_hidden(dtype, mistake):
+@pytest.mark.parametrize("invalid", [math.nan, math.inf])
+def test_invalid_values_of_a_render_are_not_hidden(dtype, invalid):
     rendered, depth = torch.ones(20, dtype=dtype), torch.ones(20, dtype=dtype)
-    rendered[3] = mistake
+    rendered[3] = invalid
     assert math.isnan(log_depth_loss(rendered, depth).item())
     x, y = (t.to(dtype) for t in image_pair((20, 20, 3)))
-    x[3, 4, 1] = mistake
+    x[3, 4, 1] = invalid
     assert math.isnan(photometric_loss(x, y).item())
 
 
@@ -222,20 +213,14 @@ def test_layout_in_memory_does_not_matter():
     planar = x.permute(2, 0, 1).contiguous().permute(1, 2, 0)
     value, gradient = value_and_gradient(photometric_loss, x, y)
     other = value_and_gradient(
-        lambda t, y: photometric_loss(t.permute(1, 2, 0), y), planar.permute(2, 0, 1), y
+        lambda t, y: 0.5 * photometric_loss(t.permute(1, 2, 0), y), planar.permute(2, 0, 1), y
     )
-    assert value == other[0] and torch.equal(gradient, other[1].permute(1, 2, 0))
+    assert 0.5 * value == other[0]
+    assert torch.equal(0.5 * gradient, other[1].permute(1, 2, 0))
     image = image_pair((9, 12, 4))[0].clamp(0.1, 0.9).requires_grad_()
     log_depth_loss(image[..., 3], torch.ones(9, 12)).backward()
     assert image.grad is not None
     assert image.grad[..., 3].all() and not image.grad[..., :3].any()
-
-
-def test_gradient_is_scaled_by_what_follows():
-    x, y = image_pair((9, 12, 3))
-    _, whole = value_and_gradient(photometric_loss, x, y)
-    _, half = value_and_gradient(lambda *a: 0.5 * photometric_loss(*a), x, y)
-    torch.testing.assert_close(half, 0.5 * whole)
 
 
 def test_slanted_planes_have_no_edges():
@@ -256,7 +241,7 @@ def test_thin_structures_weigh_more():
 
 
 @pytest.mark.parametrize("factor, edge", [(1.05, False), (1.25, True)])
-def test_jump_is_the_least_step(factor, edge):
+def test_jump_is_the_minimum_step(factor, edge):
     depth = torch.full((10, 20), 4.0)
     depth[:, 10:] *= factor
     assert bool((depth_edge_weights(depth, jump=0.1) > 1).any()) == edge
@@ -282,16 +267,15 @@ IMAGE = torch.full((4, 5, 3), 0.5)
         (lambda: depth_edge_weights(IMAGE, radius=-1), "radius.* must be .* got 0.1, -1"),
     ],
 )
-def test_mistakes_are_named(call, message):
+def test_invalid_arguments(call, message):
     with pytest.raises(ValueError, match=message):
         call()
 
 
 HEIGHT, WIDTH, F = 40, 60, 20.0
 K = torch.tensor([[F, 0, WIDTH / 2], [0, F, HEIGHT / 2], [0, 0, 1]])
-# The camera stands half a meter behind the origin.
 VIEWMAT = torch.eye(4)
-VIEWMAT[2, 3] = 0.5
+VIEWMAT[2, 3] = 0.5  # half a meter behind the origin
 UPRIGHT = torch.tensor([1.0, 0.0, 0.0, 0.0])
 
 
@@ -315,7 +299,7 @@ def test_gaussians_are_drawn_to_the_surface_they_belong_to():
     np.testing.assert_allclose(means.grad, expected, rtol=1e-4)
 
 
-def test_thick_gaussians_flatten_and_those_askew_turn():
+def test_thick_gaussians_flatten_and_tilted_ones_rotate():
     n = 2000
     depth = torch.full((HEIGHT, WIDTH), 2.0)
     means = torch.tensor([0.0, 0.0, 1.5]).expand(n, 3)
@@ -344,20 +328,16 @@ def test_thick_gaussians_flatten_and_those_askew_turn():
     assert slope > 0.02
 
 
-def test_points_are_drawn_by_the_generator_alone():
+def test_points_depend_only_on_the_generator():
     depth = torch.full((HEIGHT, WIDTH), 2.0)
-    scene = torch.tensor([[0.0, 0.0, 1.51]]), UPRIGHT[None], torch.full((1, 3), 0.02), depth
-    assert loss_of(*scene, seed=1).item() == loss_of(*scene, seed=1).item()
-    assert loss_of(*scene, seed=1).item() != loss_of(*scene, seed=2).item()
-
-
-def test_without_true_depth_there_is_no_loss():
-    means = torch.ones((1, 3), requires_grad=True)
-    nothing = torch.zeros(HEIGHT, WIDTH)
-    loss = loss_of(means, UPRIGHT[None], torch.full((1, 3), 0.02), nothing)
-    loss.backward()
+    means = torch.tensor([[0.0, 0.0, 1.51]], requires_grad=True)
+    scene = means, UPRIGHT[None], torch.full((1, 3), 0.02)
+    a, b, c = (loss_of(*scene, depth, seed).item() for seed in (1, 1, 2))
+    assert a == b != c
+    unknown = loss_of(*scene, torch.zeros(HEIGHT, WIDTH))
+    unknown.backward()
     assert means.grad is not None
-    assert loss.item() == 0 and not means.grad.any()
+    assert unknown.item() == 0 and not means.grad.any()
 
 
 def test_outlines_are_those_of_what_is_solid():

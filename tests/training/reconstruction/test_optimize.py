@@ -13,7 +13,6 @@ from splatpilot.training.captures.capture_registry import read_capture
 from splatpilot.training.reconstruction.checkpoint import Checkpoint
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.initialize import (
-    Detail,
     gaussians_from_depth,
     gaussians_from_points,
     random_points,
@@ -139,7 +138,7 @@ def test_gains_that_are_fitted_leave_the_images_as_they_were(tmp_path, room):
     points = gaussians_from_points(*random_points(frames, 500, 0.5, 4.0, seed=0))
     checkpoint = Checkpoint(tmp_path / "scene", config, views)
     optimization = Optimization(
-        config, views, None, (0.0, 0.0, 0.0), lambda: points, checkpoint, fit_gains=True
+        config, views, None, (0.0, 0.0, 0.0), lambda _: points, checkpoint, fit_gains=True
     )
     optimization.run()
     assert (views.gains == 1).all()
@@ -156,14 +155,14 @@ def test_what_stands_before_the_sky_is_kept_to_its_outline(tmp_path):
         depth = np.where(on_plate, 2.0, np.inf).astype(np.float32)
         frames.append(CaptureFrame(image, depth, RigidTransform([x, 0, 0]), K))
     views = ReconstructionViews(frames, Photometry(np.ones(5), 0.0))
-    cells = {"contrast": 1.0, "max_cell": 4, "max_extent": 0.2}
-    detail = Detail(max_gaussians=300, optimized=True, **cells)
-    start = gaussians_from_depth(frames, Photometry(np.ones(5), 0.0), detail)
+    one = Photometry(np.ones(5), 0.0)
+    cells = {"max_cell": 4, "max_extent": 0.2}
+    start = gaussians_from_depth(frames, one, 300, 1.0, optimized=True, **cells)
     holes = []
     for weight in (0.0, 1.0):
         config = replace(CONFIG, iterations=200, strategy="none", outline_weight=weight)
         checkpoint = Checkpoint(tmp_path / f"{weight}", config, views)
-        run = Optimization(config, views, views, (0.0, 0.0, 0.0), lambda: start, checkpoint)
+        run = Optimization(config, views, views, (0.0, 0.0, 0.0), lambda _: start, checkpoint)
         run.run()
         measured = run.measure()
         assert measured is not None
