@@ -63,12 +63,9 @@ def kept_work(out: Path) -> str:
 
 
 class Checkpoint:
-    """The file with the state of an optimization, in `work_folder(out)`.
+    """The file with the state of an optimization of the scene folder `out`, in `work_folder(out)`.
 
-    Args:
-        out: scene folder to be written.
-        config: of the run.
-        views: fitted views; None compares only the config with that of the checkpoint.
+    Without the fitted `views`, it compares only the config with that of the checkpoint.
     """
 
     def __init__(

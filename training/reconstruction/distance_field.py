@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
-from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.esdf_build import bounds_of_depth_images, esdf_from_depth_images
 from splatpilot.systems.splats.background import FAR
@@ -17,7 +16,6 @@ from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.splat_rendering import SceneRenderer
 from splatpilot.training.reconstruction.views import ShrunkFrames
 
-_NEAR = 0.5  # [m], distance from true surfaces up to which fields are compared
 _MEDIAN_DEPTH = 2.0  # [m], median depth of a capture without scale
 _RANGE, _VOXEL_SIZE = 8.0, 0.05  # [m], minimum range, and voxels of rooms
 _RANGE_OF_MEDIAN = 1.5  # range relative to the median depth
@@ -110,67 +108,27 @@ def fuse(source: DepthSource, grid: FieldGrid) -> Esdf:
     return esdf_from_depth_images(source.images(), source.K, source.X_WCs, **vars(grid))
 
 
-@dataclass(frozen=True)
-class FieldDifference:
-    """Errors of a distance field near true surfaces, in space that both fields know."""
-
-    mean: float  # [m], positive: surfaces seem too far
-    median_absolute: float  # [m]
-    p95_absolute: float  # [m]
-    blocked: float  # fraction of space free by a voxel or more that is occupied in the field
-    opened: float  # fraction of occupied space that is free by a voxel or more in the field
-
-    def __str__(self) -> str:
-        return (
-            f"{self.mean:+.3f} m mean, {self.median_absolute:.3f} m median, "
-            f"{self.p95_absolute:.3f} m 95th percentile; free taken as occupied "
-            f"{100 * self.blocked:.2f} %, occupied as free {100 * self.opened:.2f} %"
-        )
-
-
-def compare_fields(field: Esdf, truth: Esdf) -> FieldDifference | None:
-    """Compares two fields on the same grid; None if they share nothing near a surface."""
-    d, d_true = field.distances, truth.distances
-    known = (field.states != FieldState.UNKNOWN) & (truth.states != FieldState.UNKNOWN)
-    free = known & (d_true > truth.voxel_size)
-    occupied = known & (truth.states == FieldState.OCCUPIED)
-    near = known & (np.abs(d_true) < _NEAR)
-    if not near.any():
-        return None
-    error = (d - d_true)[near]
-    return FieldDifference(
-        mean=float(error.mean()),
-        median_absolute=float(np.median(np.abs(error))),
-        p95_absolute=float(np.percentile(np.abs(error), 95)),
-        blocked=float((field.states == FieldState.OCCUPIED)[free].mean()),
-        opened=float((d[occupied] > field.voxel_size).mean()),
-    )
-
-
 def make_distance_field(
     capture: Capture, frames: ShrunkFrames, gaussians: GaussianScene, config: ReconstructConfig
-) -> tuple[Esdf, FieldDifference | None, DepthSource]:
+) -> tuple[Esdf, DepthSource]:
     """Makes the distance field of a reconstruction from its fitted frames and Gaussians.
 
     Returns:
-        The field; the difference between rendered and captured field, if the capture has depth and
-        was optimized; and the captured depth, or the rendered depth of a capture without any.
+        The field, and the captured depth, or the rendered depth of a capture without any.
     """
-
-    def choose_and_fuse(source: DepthSource) -> Esdf:
-        return fuse(source, choose_grid(source, capture.metric, config))
-
     captured = captured_depth(capture, range(len(capture)))
+
+    def fuse_within(source: DepthSource, bounds: DepthSource) -> Esdf:
+        return fuse(source, choose_grid(bounds, capture.metric, config))
+
     if config.iterations == 0:
-        return choose_and_fuse(captured), None, captured
+        return fuse_within(captured, captured), captured
+    if capture.has_depth and config.distance_field == "captured":
+        fitted = captured_depth(capture, frames.numbers)
+        return fuse_within(fitted, fitted), captured
     rendered = render_depth(
         capture, frames.factor, gaussians, config.representation, config.renderer_threads
     )
     if not capture.has_depth:
-        return choose_and_fuse(rendered), None, rendered
-    grid = choose_grid(captured, capture.metric, config)
-    field = fuse(add_sky(rendered, frames), grid)
-    difference = compare_fields(field, fuse(captured, grid))
-    if config.distance_field == "captured":
-        field = choose_and_fuse(captured_depth(capture, frames.numbers))
-    return field, difference, captured
+        return fuse_within(rendered, rendered), rendered
+    return fuse_within(add_sky(rendered, frames), captured), captured

@@ -70,14 +70,8 @@ class Cells:
 
 
 class BlockMeans:
-    """Means over the square blocks of an image, for every power of two as their edge [px].
-
-    Args:
-        frame: the depth.
-        image: (H, W, 3), the colors to use, in 0 to 1.
-        mask: (H, W), pixels to cover.
-        max_size: maximum edge [px], a power of two.
-    """
+    """Means over the square blocks of a frame, for powers of two up to `max_size` as edge [px]:
+    depth, colors of `image` (H, W, 3) in [0, 1], and `mask` (H, W), the pixels to cover."""
 
     def __init__(self, frame: CaptureFrame, image: NDArray, mask: NDArray, max_size: int):
         pad = [(0, -n % max_size) for n in frame.depth.shape]
@@ -429,9 +423,7 @@ def _triangulate(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Returns points (n, 3) and their colors (n, 3), 0 to 1.
 
-    Args:
-        work: folder with `images` and `masks`, intrinsics (3, 3) [px], and poses X_CW (3, 4) by
-            name.
+    `work` is the folder of `images` and `masks`, K (3, 3) [px], and poses X_CW (3, 4) by name.
     """
     folder, K, poses = work
     pycolmap = import_pycolmap()

@@ -46,11 +46,6 @@ def photometric_loss(rendered: Tensor, target: Tensor, ssim_weight: float = 0.2)
         shape, native = (-1, *rendered.shape[-3:]), _native.photometric_loss
         truth = {"target": target, "ssim_weight": ssim_weight}
         return _Fused.apply(rendered, native, shape, truth)  # pyright: ignore[reportReturnType]
-    return photometric_loss_torch(rendered, target, ssim_weight)
-
-
-def photometric_loss_torch(rendered: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
-    """Computes `photometric_loss` by torch, on any device and dtype, without checks."""
     l1 = (rendered - target).abs().mean()
     return (1 - ssim_weight) * l1 + ssim_weight * (1 - ssim_map(rendered, target).mean())
 
@@ -102,13 +97,6 @@ def log_depth_loss(
         native = _native.log_depth_loss
         truth = {"depth": depth, "weights": weights, "epsilon": epsilon, "far": far}
         return _Fused.apply(rendered, native, (-1,), truth)  # pyright: ignore[reportReturnType]
-    return log_depth_loss_torch(rendered, depth, weights, epsilon, far)
-
-
-def log_depth_loss_torch(
-    rendered: Tensor, depth: Tensor, weights: Tensor | None, epsilon: float, far: float
-) -> Tensor:
-    """Computes `log_depth_loss` by torch, on any device and dtype, without checks."""
     valid = (depth > epsilon) & (depth < far)
     rendered, depth = rendered[valid], depth[valid]
     loss = (rendered.clamp(min=epsilon).log() - depth.log()).abs()
@@ -205,12 +193,7 @@ def surface_loss(
 
 def outline_loss(alpha: Tensor, depth: Tensor, weights: Tensor) -> Tensor:
     """Returns the mean of weight |alpha - 1| on surfaces and of weight alpha in the sky, over the
-    pixels whose depth is known; color leaves the last pixel before the sky half transparent.
-
-    Args:
-        alpha: (H, W), rendered.
-        depth: (H, W) [m], the truth.
-        weights: (H, W), for example from `depth_edge_weights`.
+    pixels (H, W) whose depth is known; color leaves the last pixel before the sky half transparent.
     """
     solid = ((depth > 0) & (depth < FAR)).to(alpha.dtype)
     known = depth > 0

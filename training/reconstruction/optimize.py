@@ -50,13 +50,8 @@ class DefaultStrategy:
     """Densification of 3D Gaussian splatting (Kerbl et al. 2023, section 5.2).
 
     Clones small and splits large Gaussians with a large gradient on the image, removes faint and
-    huge ones, and resets opacities periodically.
-
-    Args:
-        config: with the schedule.
-        center: (3,) [m], mean position of the cameras.
-        extent: [m], radius of the cameras.
-        count: number of Gaussians.
+    huge ones, and resets opacities periodically. The cameras are within `extent` [m] of `center`
+    (3,) [m].
     """
 
     def __init__(self, config: ReconstructConfig, center: Tensor, extent: float, count: int):
@@ -72,7 +67,7 @@ class DefaultStrategy:
     def observe(
         self, rendering: Rendering, splats: SplatParameters, viewmat: Tensor, K: Tensor
     ) -> None:
-        """Adds up the gradients of a backward pass, in half widths and heights of the image."""
+        """Sums the gradients of a backward pass, in half widths and heights of the image."""
         meta = rendering.meta
         rows = meta["gaussian_ids"]
         if self._config.representation == "3dgs":
@@ -132,82 +127,59 @@ class DefaultStrategy:
         splats.rebuild(torch.nonzero(~(grow & large))[:, 0], added)
 
 
-class Objective:
-    """The loss of one view.
+def needs_distortion(config: ReconstructConfig, step: int) -> bool:
+    return config.representation == "2dgs" and step >= _DISTORTION_START * config.iterations
 
-    Args:
-        config: with the weights.
-        views: true images and depth.
-        perceptual: LPIPS of two images (H, W, 3), or None.
-    """
 
-    def __init__(
-        self,
-        config: ReconstructConfig,
-        views: ReconstructionViews,
-        perceptual: Callable[[Tensor, Tensor], Tensor] | None,
-    ):
-        self._config, self._views, self._perceptual = config, views, perceptual
-
-    def needs_distortion(self, step: int) -> bool:
-        config = self._config
-        return config.representation == "2dgs" and step >= _DISTORTION_START * config.iterations
-
-    def loss(
-        self,
-        rendering: Rendering,
-        gaussians: tuple[Tensor, Tensor, Tensor, Tensor, Tensor],
-        k: int,
-        gain: Tensor,
-        step: int,
-        background: Tensor,
-        outlines: bool,
-    ) -> Tensor:
-        """Returns a scalar.
-
-        Args:
-            rendering: of view `k`, before `background`.
-            gaussians: means, quats, scales, opacities and spherical harmonics rendered.
-            k: index of the view.
-            gain: brightness of its image.
-            step: index of the step, which seeds random numbers.
-            background: (1, 3), a color.
-            outlines: fits outlines instead of colors.
-        """
-        config, device = self._config, self._config.device
-        depth = self._views.depths[k].to(device)
-        edges = self._views.edges[k].to(device).float()
-        if outlines:
-            loss = config.outline_weight * outline_loss(rendering.alpha, depth, edges)
-        else:
-            target = self._views.target(k, gain, background.cpu()[0]).to(device)
-            valid = self._views.valid[k].to(device)[..., None]
-            color, invalid = rendering.color, rendering.color.detach()
-            # Invalid pixels are equal in both, so that no window compares them.
-            color, target = (torch.where(valid, image, invalid) for image in (color, target))
-            loss = photometric_loss(color, target)
-            late = step >= (1 - _LPIPS_FRACTION) * config.iterations
-            if self._perceptual is not None and late and step % _LPIPS_EVERY == 0:
-                distance = self._perceptual(color.clamp(0, 1), target.clamp(0, 1))
-                loss = loss + config.lpips_weight * _LPIPS_EVERY * distance
-        if config.depth_weight > 0:
-            loss = loss + config.depth_weight * log_depth_loss(rendering.depth, depth, edges)
-        if config.surface_weight > 0:
-            rng = np.random.default_rng([config.seed, step, 2])
-            seen = rendering.meta["gaussian_ids"]
-            seen = seen[torch.from_numpy(rng.random(len(seen)) < _SURFACE_FRACTION).to(device)]
-            viewmat, K = self._views.camera(k, device)
-            on_surface = surface_loss(*gaussians[:3], seen, viewmat[0], K[0], depth, rng)
-            loss = loss + config.surface_weight * on_surface
-        if rendering.normals is None or rendering.surface_normals is None:
-            return loss
-        if self.needs_distortion(step) and rendering.distortion is not None:
-            loss = loss + _DISTORTION_WEIGHT * rendering.distortion.mean()
-        if step >= _NORMAL_START * config.iterations:
-            surface = rendering.surface_normals * rendering.alpha.detach()[..., None]
-            cosine = (rendering.normals * surface).sum(dim=-1)
-            loss = loss + _NORMAL_WEIGHT * (1 - cosine).mean()
+def view_loss(
+    config: ReconstructConfig,
+    views: ReconstructionViews,
+    k: int,
+    rendering: Rendering,
+    gaussians: tuple[Tensor, Tensor, Tensor, Tensor, Tensor],
+    *,
+    gain: Tensor,
+    step: int,
+    background: Tensor,
+    outlines: bool,
+    perceptual: Callable[[Tensor, Tensor], Tensor] | None = None,
+) -> Tensor:
+    """Returns the loss of the rendering of view `k` before `background` (1, 3), in an image of this
+    gain; `outlines` are fitted instead of colors. `perceptual` is LPIPS of two images (H, W, 3)."""
+    device = config.device
+    depth = views.depths[k].to(device)
+    edges = views.edges[k].to(device).float()
+    if outlines:
+        loss = config.outline_weight * outline_loss(rendering.alpha, depth, edges)
+    else:
+        target = views.target(k, gain, background.cpu()[0]).to(device)
+        valid = views.valid[k].to(device)[..., None]
+        color, invalid = rendering.color, rendering.color.detach()
+        # Invalid pixels are equal in both, so that no window compares them.
+        color, target = (torch.where(valid, image, invalid) for image in (color, target))
+        loss = photometric_loss(color, target)
+        late = step >= (1 - _LPIPS_FRACTION) * config.iterations
+        if perceptual is not None and late and step % _LPIPS_EVERY == 0:
+            distance = perceptual(color.clamp(0, 1), target.clamp(0, 1))
+            loss = loss + config.lpips_weight * _LPIPS_EVERY * distance
+    if config.depth_weight > 0:
+        loss = loss + config.depth_weight * log_depth_loss(rendering.depth, depth, edges)
+    if config.surface_weight > 0:
+        rng = np.random.default_rng([config.seed, step, 2])
+        seen = rendering.meta["gaussian_ids"]
+        seen = seen[torch.from_numpy(rng.random(len(seen)) < _SURFACE_FRACTION).to(device)]
+        viewmat, K = views.camera(k, device)
+        on_surface = surface_loss(*gaussians[:3], seen, viewmat[0], K[0], depth, rng)
+        loss = loss + config.surface_weight * on_surface
+    if rendering.normals is None or rendering.surface_normals is None:
         return loss
+    if needs_distortion(config, step) and rendering.distortion is not None:
+        loss = loss + _DISTORTION_WEIGHT * rendering.distortion.mean()
+    if step >= _NORMAL_START * config.iterations:
+        surface = rendering.surface_normals * rendering.alpha.detach()[..., None]
+        cosine = (rendering.normals * surface).sum(dim=-1)
+        loss = loss + _NORMAL_WEIGHT * (1 - cosine).mean()
+    return loss
 
 
 class Optimization:
@@ -216,13 +188,12 @@ class Optimization:
     Args:
         config: of the reconstruction.
         views: fitted views.
-        held_out: views that measure the scene, or None.
+        held_out: views that measure the scene.
         background: of the scene.
-        initial: makes the initial Gaussians, given the extent of the cameras [m]; not called if
-            there is a checkpoint.
+        initial: makes the Gaussians of a first step, given the extent of the cameras [m].
         checkpoint: of this run.
-        perceptual: LPIPS of two images (H, W, 3), or None.
-        fit_gains: fits the gains of `views`, which are unknown.
+        perceptual: LPIPS of two images (H, W, 3).
+        fit_gains: fits the gains of `views`.
     """
 
     def __init__(
@@ -248,7 +219,7 @@ class Optimization:
         solid = (views.depths > 0) & ~sky
         both = sky.flatten(1).any(dim=1) & solid.flatten(1).any(dim=1)
         self._has_outlines = (both & (config.outline_weight > 0)).tolist()
-        self._objective = Objective(config, views, perceptual)
+        self._perceptual = perceptual
         center, self.extent = views.extent()
         state = checkpoint.load()
         if state is None:
@@ -310,11 +281,20 @@ class Optimization:
             background=background,
             depth_mode=config.depth_mode,
             eps2d=0.0 if outlines else EPS2D,
-            distortion=self._objective.needs_distortion(self.step),
+            distortion=needs_distortion(config, self.step),
             renderer=self._renderer,
         )
-        loss = self._objective.loss(
-            rendering, gaussians, k, self.gains[k], self.step, background, outlines
+        loss = view_loss(
+            config,
+            self._views,
+            k,
+            rendering,
+            gaussians,
+            gain=self.gains[k],
+            step=self.step,
+            background=background,
+            outlines=outlines,
+            perceptual=self._perceptual,
         )
         if self._strategy is not None:
             self._strategy.watch(rendering)

@@ -3,7 +3,7 @@
 import math
 import os
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -42,12 +42,8 @@ def learning_rates(config: ReconstructConfig, extent: float, progress: float) ->
     """Returns the learning rate of each parameter of `SplatParameters`.
 
     Gaussians that start from depth are on surfaces already: their means move slower, their other
-    parameters faster at first.
-
-    Args:
-        config: of the reconstruction.
-        extent: [m] of the scene, by which the means' rate is scaled.
-        progress: fraction of all steps, 0 to 1.
+    parameters faster at first. `progress` is the fraction of all steps, `extent` [m] scales the
+    rate of the means.
     """
     rates = {"means": config.means_rate * extent * _FINAL_MEANS**progress} | _RATES
     if config.initialization != "depth":
@@ -109,27 +105,9 @@ class _Shapes(torch.autograd.Function):
         return v_log_scales, v_logits, None
 
 
-class ScaleLimits(NamedTuple):
-    """Limits of the standard deviations of N Gaussians."""
-
-    smallest: Tensor  # (N,) [m], added in squares; 0 if no view sees the center
-    largest: Tensor  # (N,) [m]
-
-    @classmethod
-    def none(cls, like: Tensor) -> "ScaleLimits":
-        """Returns no limits for the N Gaussians of `like` (N,)."""
-        return cls(torch.zeros_like(like), torch.full_like(like, torch.inf))
-
-    def rebuild(self, rows: Tensor, added: int) -> "ScaleLimits":
-        """Returns the limits of the Gaussians `rows`, and of `added` ones, which have none."""
-        new = ScaleLimits.none(self.smallest.new_empty(added))
-        pairs = zip(self, new, strict=True)
-        return ScaleLimits(*(torch.cat([old[rows], more]) for old, more in pairs))
-
-
 @torch.no_grad()
-def scale_limits(means: Tensor, views: ReconstructionViews, bounded: bool) -> ScaleLimits:
-    """Returns the limits of Gaussians at `means` (N, 3) [m] by the fitted views.
+def scale_limits(means: Tensor, views: ReconstructionViews, bounded: bool) -> list[Tensor]:
+    """Returns the smallest and largest scales (N,) [m] of Gaussians at `means` (N, 3) [m].
 
     The smallest is the 3D smoothing filter of Mip-Splatting (Yu et al. 2024), 0.2 square pixels in
     the closest view: depth images, which have no blur, and closer cameras would look through the
@@ -153,8 +131,8 @@ def scale_limits(means: Tensor, views: ReconstructionViews, bounded: bool) -> Sc
     seen = depth.isfinite()
     smallest = torch.where(seen, _MIN_VARIANCE**0.5 / K[0, 0] * depth, 0)
     if not bounded:
-        return ScaleLimits(smallest, torch.full_like(depth, torch.inf))
-    return ScaleLimits(smallest, _MAX_DEVIATION * torch.where(seen, depth, distance))
+        return [smallest, torch.full_like(depth, torch.inf)]
+    return [smallest, _MAX_DEVIATION * torch.where(seen, depth, distance)]
 
 
 class SplatParameters:
@@ -166,7 +144,8 @@ class SplatParameters:
     Args:
         tensors: these, by name.
         optimizer: state of Adam, see `state`.
-        limits: of the scales; none by default.
+        limits: smallest and largest scale (N,) [m]; 0 and infinity by default. The smallest is
+            added in squares.
     """
 
     def __init__(
@@ -182,8 +161,7 @@ class SplatParameters:
         self._adam = torch.optim.Adam(groups, eps=_EPSILON, fused=True)
         if optimizer is not None:
             self._adam.load_state_dict(optimizer)
-        none = ScaleLimits.none(tensors["logit_opacities"])
-        self.limit_scales(none if limits is None else ScaleLimits(*limits))
+        self.limit_scales(limits or _no_limits(tensors["logit_opacities"]))
 
     @classmethod
     def of_scene(cls, scene: GaussianScene, sh_degree: int, device: str) -> "SplatParameters":
@@ -227,7 +205,7 @@ class SplatParameters:
     def shapes(self) -> tuple[Tensor, Tensor]:
         """Returns scales (N, 3) [m] and opacities (N,) in (0, 1)."""
         logits = self["logit_opacities"]
-        return splat_shapes(self["log_scales"], logits, self._limits.smallest)
+        return splat_shapes(self["log_scales"], logits, self._limits[0])
 
     @property
     def scales(self) -> Tensor:
@@ -239,10 +217,10 @@ class SplatParameters:
         """(N,)."""
         return self.shapes()[1]
 
-    def limit_scales(self, limits: ScaleLimits) -> None:
+    def limit_scales(self, limits: Sequence[Tensor]) -> None:
         """Clamps scales to these limits, now and after each step."""
         self._limits = limits
-        self._max_log_scales = torch.log(limits.largest)[:, None]
+        self._max_log_scales = torch.log(limits[1])[:, None]
         self._clamp_scales()
 
     def step(self, rates: Mapping[str, float]) -> None:
@@ -267,7 +245,8 @@ class SplatParameters:
                 if average in state:
                     state[average] = torch.cat([state[average][rows], torch.zeros_like(extra)])
             self._adam.state[new] = state
-        self.limit_scales(self._limits.rebuild(rows, 0 if added is None else len(added["means"])))
+        limits = zip(self._limits, _no_limits(self["logit_opacities"][len(rows) :]), strict=True)
+        self.limit_scales([torch.cat([old[rows], new]) for old, new in limits])
 
     @torch.no_grad()
     def overwrite(self, name: str, values: Tensor) -> None:
@@ -299,3 +278,7 @@ class SplatParameters:
     def _clamp_scales(self) -> None:
         # The parameters, not a function of them: its gradient would vanish at the limit.
         self["log_scales"].clamp_(max=self._max_log_scales)
+
+
+def _no_limits(like: Tensor) -> list[Tensor]:
+    return [torch.zeros_like(like), torch.full_like(like, torch.inf)]

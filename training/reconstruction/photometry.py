@@ -102,7 +102,10 @@ def find_new_pixels(
     are visited from the closest to the farthest, those with an index in `last` after the others.
     """
     points = [view.points() for view in views]
-    overlapping = [_overlapping(view, views) for view in views]
+    overlapping = []  # views that see some points
+    for view in views:
+        p_WQ, _ = view.points(step=8)
+        overlapping.append([j for j, other in enumerate(views) if len(other.find(p_WQ)[0])])
 
     fine = []  # pixels that are nearly the finest
     for i, view in enumerate(Progress(views, "comparing frames", unit="frame")):
@@ -150,20 +153,11 @@ def seen_pixels(frame: CaptureFrame, views: Sequence[ThinnedFrame]) -> NDArray[n
     return image.repeat(STRIDE, axis=0).repeat(STRIDE, axis=1)[:height, :width] > 0
 
 
-def _overlapping(view: ThinnedFrame, views: Sequence[ThinnedFrame]) -> list[int]:
-    """Returns the indices of the views that see some points of `view`."""
-    p_WQ, _ = view.points(step=8)
-    return [j for j, other in enumerate(views) if len(other.find(p_WQ)[0])]
-
-
 def _smaller_difference(values: NDArray, axis: int) -> NDArray:
     """Returns the smaller of forward and backward difference, which ignores edges."""
     step = np.diff(values, axis=axis)
-    ends = [(0, 0), (0, 0)]
-    ends[axis] = (0, 1)
-    forward = np.pad(step, ends, mode="edge")
-    ends[axis] = (1, 0)
-    backward = np.pad(step, ends, mode="edge")
+    forward = np.concatenate([step, step.take([-1], axis)], axis)
+    backward = np.concatenate([step.take([0], axis), step], axis)
     return np.where(np.abs(forward) < np.abs(backward), forward, backward)
 
 

@@ -45,20 +45,14 @@ def render(
     distortion: bool = False,
     renderer: Renderer | None = None,
 ) -> Rendering:
-    """Renders color and depth.
+    """Renders color and depth of one camera, see `rasterize` for the arguments.
 
     Args:
-        representation: "3dgs" or "2dgs".
-        gaussians: means, quats, scales, opacities and spherical harmonics, as for `rasterize`.
-        viewmat: (1, 4, 4) world to camera.
-        K: (1, 3, 3) [px].
-        width, height: [px].
-        background: (1, 3), black by default.
+        gaussians: means, quats, scales, opacities and spherical harmonics.
         depth_mode: "D", accumulated, "ED", expected, or "MD", median, which has no gradient and
             is 0 without a surface.
-        eps2d: blur of Gaussians, see `rasterize`; surfels have their own.
+        eps2d: blur of Gaussians; surfels have their own.
         distortion: renders the distortion of surfels along their rays.
-        renderer: see `rasterize`.
     """
     scene = *gaussians, viewmat, K, width, height
     options: dict[str, Any] = {

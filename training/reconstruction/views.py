@@ -29,13 +29,8 @@ _HEIGHT, _WIDTH = 128, 256  # texels of the background, powers of two
 
 
 class ShrunkFrames(Sequence[CaptureFrame]):
-    """Some frames of a capture, loaded on first use and kept if all of them take at most 1 GB.
-
-    Args:
-        capture: source of the frames.
-        numbers: indices of the frames.
-        factor: integer factor by which they are shrunk.
-    """
+    """The frames `numbers` of a capture, shrunk by an integer `factor`, loaded on first use and
+    kept if all of them take at most 1 GB."""
 
     def __init__(self, capture: Capture, numbers: Sequence[int], factor: int):
         self._capture, self.numbers, self.factor = capture, list(numbers), factor
@@ -54,12 +49,7 @@ class ShrunkFrames(Sequence[CaptureFrame]):
 
 
 class ReconstructionViews:
-    """Frames as tensors on the CPU.
-
-    Args:
-        frames: all of one size and with one K.
-        photometry: their gains, in their order, and their vignetting.
-    """
+    """Frames of one size and K, with their photometry, as tensors on the CPU."""
 
     def __init__(self, frames: Sequence[CaptureFrame], photometry: Photometry):
         images, depths, edges, valid, viewmats = [], [], [], [], []
@@ -125,10 +115,6 @@ def learn_background(frames: Sequence[CaptureFrame], photometry: Photometry) -> 
 
     Each texel has the mean color, without gains and vignetting, of the pixels that look into it, or
     else is interpolated.
-
-    Args:
-        frames: with true depth; loaded one by one.
-        photometry: of the frames, in their order.
     """
     sums, counts = np.zeros((_HEIGHT * _WIDTH, 3)), np.zeros(_HEIGHT * _WIDTH)
     for k, frame in enumerate(frames):

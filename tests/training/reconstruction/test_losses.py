@@ -13,10 +13,8 @@ from splatpilot import _native
 from splatpilot.training.reconstruction.losses import (
     depth_edge_weights,
     log_depth_loss,
-    log_depth_loss_torch,
     outline_loss,
     photometric_loss,
-    photometric_loss_torch,
     surface_loss,
 )
 
@@ -85,7 +83,7 @@ def test_photometric_agrees_with_autograd_in_float64(shape, weight, simd, monkey
     x, y = image_pair(shape)
     value, gradient = value_and_gradient(photometric_loss, x, y, weight)
     expected, expected_gradient = value_and_gradient(
-        photometric_loss_torch, x.double(), y.double(), weight
+        photometric_loss, x.double(), y.double(), weight
     )
     assert value == pytest.approx(expected, rel=1e-5)
     error = (gradient - expected_gradient).abs().max()
@@ -101,30 +99,10 @@ def test_photometric_agrees_with_scipy():
     assert photometric_loss(x.double(), y.double(), 1.0).item() == pytest.approx(expected, 1e-12)
 
 
-def test_constant_images():
-    a, b = 0.6, 0.5
-    x, y = torch.full((24, 24, 1), a), torch.full((24, 24, 1), b)
-    value, gradient = value_and_gradient(photometric_loss, x, y, 0.0)
-    assert value == pytest.approx(0.1, rel=1e-5)
-    torch.testing.assert_close(gradient, torch.full_like(x, 1 / x.numel()))
-    luminance = (2 * a * b + 1e-4) / (a * a + b * b + 1e-4)
-    large = torch.full((200, 200, 1), a), torch.full((200, 200, 1), b)
-    assert photometric_loss(*large, 1.0).item() == pytest.approx(1 - luminance, rel=0.1)
-    value, gradient = value_and_gradient(photometric_loss, x, x)
+def test_equal_images_have_no_loss_and_no_gradient():
+    _, y = image_pair((20, 33, 3))
+    value, gradient = value_and_gradient(photometric_loss, y, y)
     assert value == 0.0 and not gradient.any()
-
-
-@pytest.mark.parametrize("loss", ["photometric", "depth"])
-def test_gradient_is_that_of_finite_differences(loss):
-    if loss == "photometric":
-        x, y = image_pair((6, 7, 2))
-        y = y.double()
-        x = (x.double() + 0.003).requires_grad_()  # nowhere equal: the L1 has a kink there
-        assert torch.autograd.gradcheck(lambda x: photometric_loss(x, y, 0.3), x, fast_mode=True)
-    else:
-        x, d = depth_pair((6, 7))
-        x = x.double().requires_grad_()
-        assert torch.autograd.gradcheck(lambda x: log_depth_loss(x, d.double()), x)
 
 
 @pytest.mark.parametrize("simd", _native.simd_levels())
@@ -137,9 +115,7 @@ def test_log_depth_agrees_with_autograd_in_float64(shape, weighted, simd, monkey
     w = torch.rand(shape, generator=torch.Generator().manual_seed(1)) if weighted else None
     value, gradient = value_and_gradient(log_depth_loss, x, d, w)
     w = None if w is None else w.double()
-    expected, expected_gradient = value_and_gradient(
-        log_depth_loss_torch, x.double(), d.double(), w, 1e-3, 150.0
-    )
+    expected, expected_gradient = value_and_gradient(log_depth_loss, x.double(), d.double(), w)
     assert value == pytest.approx(expected, rel=1e-5)
     torch.testing.assert_close(gradient.double(), expected_gradient, rtol=1e-5, atol=1e-12)
     unknown = ~((d > 1e-3) & (d < 150))
@@ -159,15 +135,11 @@ def test_log_depth_of_a_constant_factor():
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_depth_below_epsilon_counts_as_epsilon(dtype):
+def test_depth_outside_the_range(dtype):
     rendered, depth = torch.tensor([0.0, 2.0], dtype=dtype), torch.tensor([1.0, 2.0], dtype=dtype)
-    value, gradient = value_and_gradient(log_depth_loss, rendered, depth)
+    value, gradient = value_and_gradient(log_depth_loss, rendered, depth)  # 0 counts as epsilon
     assert value == pytest.approx(math.log(1e3) / 2, rel=1e-6)
     assert gradient.tolist() == [0.0, 0.0]
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_nothing_to_compare_costs_nothing(dtype):
     depth = torch.tensor([math.nan, 0.0, -1.0, math.inf, 150.0, 1e-3], dtype=dtype)
     rendered = torch.tensor([1.0, math.nan, 2.0, math.inf, 3.0, 0.0], dtype=dtype)
     value, gradient = value_and_gradient(log_depth_loss, rendered, depth)
@@ -190,22 +162,16 @@ def test_invalid_values_of_a_render_are_not_hidden(dtype, invalid):
     shape=st.tuples(st.integers(1, 14), st.integers(1, 40), st.integers(1, 5)),
     seed=st.integers(0, 999),
 )
-def test_any_size(shape, seed):
+def test_any_size_and_number_of_threads(shape, seed):
     x, y = image_pair(shape, seed)
-    first, second = (value_and_gradient(photometric_loss, x, y, 0.5) for _ in range(2))
-    assert first[0] == second[0] and torch.equal(first[1], second[1])
-    _, expected = value_and_gradient(photometric_loss_torch, x.double(), y.double(), 0.5)
-    assert (first[1] - expected).abs().max() <= 1e-5 * expected.abs().max()
-
-
-def test_number_of_threads_changes_nothing():
-    x, y = image_pair((48, 64, 3))
     results = []
-    for count in (1, 2, 4):
-        torch.set_num_threads(count)
-        results.append(value_and_gradient(photometric_loss, x, y))
-    for value, gradient in results[1:]:
-        assert value == results[0][0] and torch.equal(gradient, results[0][1])
+    for threads in (1, 2):
+        torch.set_num_threads(threads)
+        results.append(value_and_gradient(photometric_loss, x, y, 0.5))
+    first, second = results
+    assert first[0] == second[0] and torch.equal(first[1], second[1])
+    _, expected = value_and_gradient(photometric_loss, x.double(), y.double(), 0.5)
+    assert (first[1] - expected).abs().max() <= 1e-5 * expected.abs().max()
 
 
 def test_layout_in_memory_does_not_matter():
@@ -223,28 +189,22 @@ def test_layout_in_memory_does_not_matter():
     assert image.grad[..., 3].all() and not image.grad[..., :3].any()
 
 
-def test_slanted_planes_have_no_edges():
+def test_depth_edges():
     v, u = torch.meshgrid(torch.arange(30.0), torch.arange(40.0), indexing="ij")
-    plane = 1 / (0.002 + 0.01 * v + 0.001 * u)  # 2.9 m to 150 m and beyond, as a floor
-    assert torch.equal(depth_edge_weights(plane, far=1e6), torch.ones(30, 40))
-
-
-def test_thin_structures_weigh_more():
-    depth = torch.full((2, 20, 30), math.inf)
-    depth[0, :, 12] = 5.0
-    depth[1, 10, 12] = math.nan
-    weights = depth_edge_weights(depth, radius=2, gain=4.0)
+    floor = 1 / (0.002 + 0.01 * v + 0.001 * u)  # 2.9 m to 150 m and beyond
+    assert torch.equal(depth_edge_weights(floor, far=1e6), torch.ones(30, 40))
+    for factor, edge in ((1.05, False), (1.25, True)):
+        step = torch.full((10, 20), 4.0)
+        step[:, 10:] *= factor
+        assert bool((depth_edge_weights(step, jump=0.1) > 1).any()) == edge
+    thin = torch.full((2, 20, 30), math.inf)
+    thin[0, :, 12] = 5.0
+    thin[1, 10, 12] = math.nan
+    weights = depth_edge_weights(thin, radius=2, gain=4.0)
     columns = torch.arange(30)
     expected = torch.where((columns >= 9) & (columns <= 15), 5.0, 1.0).expand(20, 30)
     torch.testing.assert_close(weights[0], expected)
     assert torch.equal(weights[1], torch.ones(20, 30))
-
-
-@pytest.mark.parametrize("factor, edge", [(1.05, False), (1.25, True)])
-def test_jump_is_the_minimum_step(factor, edge):
-    depth = torch.full((10, 20), 4.0)
-    depth[:, 10:] *= factor
-    assert bool((depth_edge_weights(depth, jump=0.1) > 1).any()) == edge
 
 
 IMAGE = torch.full((4, 5, 3), 0.5)
@@ -304,28 +264,17 @@ def test_thick_gaussians_flatten_and_tilted_ones_rotate():
     depth = torch.full((HEIGHT, WIDTH), 2.0)
     means = torch.tensor([0.0, 0.0, 1.5]).expand(n, 3)
 
-    def thick(scales):
-        return loss_of(means, UPRIGHT.expand(n, 4), scales.expand(n, 3), depth)
-
     scales = torch.tensor([0.03, 0.03, 0.02], requires_grad=True)
-    thick(scales).backward()
+    loss_of(means, UPRIGHT.expand(n, 4), scales.expand(n, 3), depth).backward()
     assert scales.grad is not None
     across = np.sqrt(2 / np.pi) / 2.0  # of |log z - log 2| about its mean, by the deviation of z
     np.testing.assert_allclose(scales.grad, [0.0, 0.0, across], atol=0.02)
 
-    def tilted(angle):
-        quats = torch.stack([torch.cos(angle / 2), torch.sin(angle / 2), 0 * angle, 0 * angle])
-        return loss_of(
-            means, quats.expand(n, 4), torch.tensor([0.1, 0.1, 1e-4]).expand(n, 3), depth
-        )
-
     angle = torch.tensor(0.1, requires_grad=True)
-    tilted(angle).backward()
-    assert angle.grad is not None
-    step = 1e-3
-    slope = (tilted(angle.detach() + step) - tilted(angle.detach() - step)) / (2 * step)
-    assert angle.grad.item() == pytest.approx(slope.item(), rel=0.02)
-    assert slope > 0.02
+    quats = torch.stack([torch.cos(angle / 2), torch.sin(angle / 2), 0 * angle, 0 * angle])
+    flat = torch.tensor([0.1, 0.1, 1e-4]).expand(n, 3)
+    loss_of(means, quats.expand(n, 4), flat, depth).backward()
+    assert angle.grad is not None and angle.grad > 0.02
 
 
 def test_points_depend_only_on_the_generator():
