@@ -48,7 +48,7 @@ def print_devices(
     header(f"{name}, ours against gsplat's", "median", "p99", "max", "beyond 1e-3", "max there")
     for label, got in ours.items():
         error = (got - theirs[label]).abs()
-        # A threshold that falls the other way changes a pixel by up to 1/255 of a color.
+        # A threshold that only one of them passes changes a pixel by up to 1/255 of a color.
         clear = error <= 1e-3
         p99 = float(np.quantile(error[clear].numpy(), 0.99))
         flipped = float(error[~clear].max()) if bool((~clear).any()) else 0.0

@@ -8,7 +8,6 @@ The cameras follow flights of the privileged planner. A pixel is wrong if it is 
 
 import argparse
 from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import NamedTuple, cast
 
 import numpy as np
@@ -48,27 +47,19 @@ class DepthFrame(NamedTuple):
     truth: NDArray[np.floating]
 
 
-@dataclass(frozen=True)
-class DepthErrors:
+class DepthErrors(NamedTuple):
     """Errors of pixels."""
 
     pixels: int  # with known truth
+    wrong: float  # fraction of pixels beyond the tolerance
     bias: float  # median relative error below 4 m
-    too_near: float  # fraction of pixels that are nearer than the truth by more than the tolerance
-    too_far: float
-
-    @property
-    def wrong(self) -> float:
-        return self.too_near + self.too_far
 
 
 def depth_errors(frames: Iterable[DepthFrame], reach: float, edges: bool = True) -> DepthErrors:
     """Compares depth with the truth.
 
     Args:
-        frames: of any sizes.
-        reach: [m], maximum depth of the camera, which says infinity beyond; greater true depths
-            count as `reach`.
+        reach: [m], maximum depth of the camera; greater depths count as `reach`.
         edges: includes pixels within 2 px of a discontinuity of the truth.
     """
     pairs = []
@@ -83,12 +74,8 @@ def depth_errors(frames: Iterable[DepthFrame], reach: float, edges: bool = True)
     error = np.minimum(depth, reach) - truth
     tolerance = np.maximum(_TOLERANCE, _RELATIVE_TOLERANCE * truth)
     near = (truth < _NEAR) & np.isfinite(depth)
-    return DepthErrors(
-        pixels=len(truth),
-        bias=float(np.median(error[near] / truth[near])),
-        too_near=float((error < -tolerance).mean()),
-        too_far=float((error > tolerance).mean()),
-    )
+    bias = np.median(error[near] / truth[near])
+    return DepthErrors(len(truth), float((np.abs(error) > tolerance).mean()), float(bias))
 
 
 class TrueDepth:

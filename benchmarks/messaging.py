@@ -1,6 +1,6 @@
-"""Measures messages between the processes of vehicle and bridge, over UDP.
+"""Measures messages between vehicle and bridge that fly `diffaero_tof` in P02, over UDP.
 
-    python benchmarks/messaging.py [--scenario P02] [--policy diffaero_tof] [--seeds 4]
+    python benchmarks/messaging.py [--seeds 4]
 
 This process listens as `lcm-logger` does, and prints for each channel the lost messages, the
 latency from a message's `utime` to its arrival, and by how much intervals of regular messages
@@ -21,7 +21,7 @@ from pathlib import Path
 
 import lcm
 import numpy as np
-from drake import lcmt_header, lcmt_image_array
+from drake import lcmt_image_array
 from harness import header, machine, row
 
 from splatpilot.systems.messaging.generated import (
@@ -72,7 +72,7 @@ class Listener:
 
     def _hear(self, channel: str, data: bytes) -> None:
         now = time.time()
-        stamp: lcmt_header = TYPES[channel].decode(data).header
+        stamp = TYPES[channel].decode(data).header
         self.heard[channel].append((stamp.seq, 1e-6 * stamp.utime, now))
 
 
@@ -102,22 +102,20 @@ def quantiles(parts: list[np.ndarray]) -> tuple[str, ...]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--scenario", default="P02")
-    parser.add_argument("--policy", default="diffaero_tof")
     parser.add_argument("--seeds", type=int, default=4)
-    arguments = parser.parse_args()
+    seeds = parser.parse_args().seeds
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("", 0))
         url = f"udpm://239.255.76.67:{free.getsockname()[1]}?ttl=0&recv_buf_size=4000000"
-    options = ["--scenario", arguments.scenario, "--policy", arguments.policy]
-    options += ["--patience", "120", "--lcm-url", url]
+    options = ["--scenario", "P02", "--policy", "diffaero_tof", "--lcm-url", url]
+    options += ["--patience", "120"]
     print(machine())
     outcomes: list[str] = []
     lost = collections.Counter[str]()
     latency, jitter = collections.defaultdict(list), collections.defaultdict(list)
     loops: list[np.ndarray] = []
     with tempfile.TemporaryDirectory() as root:
-        for seed in range(arguments.seeds):
+        for seed in range(seeds):
             with Listener(url) as listener:
                 outcomes.append(fly([*options, "--seed", str(seed)], Path(root) / str(seed)))
             heard = {name: np.array(values) for name, values in listener.heard.items()}
@@ -132,7 +130,7 @@ def main() -> None:
                     jitter[name].append(np.abs(intervals - PERIOD))
             for name in {"DEPTH_IMAGE", "DEPTH_GRID"} & set(heard):
                 loops.append(loop_times(heard[name], heard["VELOCITY_SETPOINT"]))
-    print(f"{outcomes.count('goal')} of {arguments.seeds} flights reached the goal")
+    print(f"{outcomes.count('goal')} of {seeds} flights reached the goal")
     header("[ms]", "messages", "lost", "median", "99 of 100", "maximum")
     row("image to velocity setpoint", sum(map(len, loops)), "", *quantiles(loops))
     for name, parts in sorted(latency.items()):

@@ -186,37 +186,23 @@ def study_scene(
     )
 
 
-def pose_bounds(views: SceneViews, study: FidelityStudy) -> list[float]:
-    """Returns the maximum displacement [m] of each pose of the capture.
+def store_bounds(scene: Path, study: FidelityStudy) -> SceneMetadata:
+    """Writes the maximum displacement [m] of each pose of the capture, and of all poses, into
+    `scene.yaml`.
 
     A pose may move left, right, up and down while its view keeps within the study's limit of unseen
-    pixels, at most as far as was measured.
+    pixels, at most as far as was measured. The bound of all poses is the study's reach if the truth
+    was rendered, and otherwise the median over the poses: holding frames out removes views, too.
     """
-    support = _support(views)
+    views = SceneViews(scene)
+    support, X_WCs = _support(views), views.capture.X_WCs
     farthest = study.column("offset").max()
     grid = np.append(np.arange(0, farthest - 1e-9, _STEP), farthest)
     bounds = []
-    X_WCs = views.capture.X_WCs
     for i in Progress(range(len(X_WCs)), "finding bounds", unit="pose"):
         sides = zip(*(displace_pose(X_WCs, i, offset) for offset in grid), strict=True)
-        bounds.append(
-            min(
-                first_crossing(
-                    grid, (1 - support.fraction(X_WC) for X_WC in side), study.unseen_limit
-                )
-                for side in sides
-            )
-        )
-    return bounds
-
-
-def store_bounds(scene: Path, study: FidelityStudy) -> SceneMetadata:
-    """Writes the perturbation bounds of each pose, and of all poses, into `scene.yaml`.
-
-    The latter is the study's reach if the truth was rendered, and otherwise the median over the
-    poses: holding frames out removes views, too.
-    """
-    bounds = pose_bounds(SceneViews(scene), study)
+        unseen = ((1 - support.fraction(X_WC) for X_WC in side) for side in sides)
+        bounds.append(min(first_crossing(grid, values, study.unseen_limit) for values in unseen))
     metadata = replace(
         read_scene_metadata(scene),
         perturbation_bound=study.reach if study.kind == "rendered" else float(np.median(bounds)),
@@ -278,11 +264,6 @@ def write_curves(path: Path, studies: Sequence[FidelityStudy]) -> None:
         ("depth_mae_m", "depth MAE [m]", 1.0),
         ("depth_relative", "relative depth error [%]", 100.0),
     )
-    kinds = {study.kind for study in studies}
-    label = "offset from the capture path [m]"
-    if len(kinds) == 1:
-        rendered = kinds == {"rendered"}
-        label = "lateral offset [m]" if rendered else "distance to the nearest camera kept [m]"
     for axis, (name, title, factor) in zip(axes, panels, strict=True):
         for k, study in enumerate(studies):
             color = colormaps["tab10"](k)
@@ -292,13 +273,13 @@ def write_curves(path: Path, studies: Sequence[FidelityStudy]) -> None:
             axis.fill_between(found.at, found.low, found.high, color=color, alpha=0.2, linewidth=0)
             axis.plot(found.at, found.middle, "o-", color=color, markersize=4, label=study.name)
             axis.axvline(study.reach, color=color, linestyle="--", linewidth=1)
-        axis.set_xlabel(label)
+        axis.set_xlabel("offset from the capture path [m]")
         axis.set_ylabel(title)
         axis.grid(alpha=0.3)
         axis.set_xlim(left=0)
         if name != "psnr_db":
             top = max(np.percentile(factor * study.column(name), 92) for study in studies)
-            axis.set_ylim(0, 1.1 * top)
+            axis.set_ylim(0, 1.1 * top or None)
     limit = {"color": "black", "linestyle": ":", "linewidth": 1}
     if len(studies) == 1:
         axes[0].axhline(studies[0].on_path_psnr_db - studies[0].max_psnr_drop, **limit)

@@ -57,15 +57,7 @@ def monotone_fit(x: ArrayLike, y: ArrayLike) -> tuple[NDArray[np.float64], NDArr
 def reach(x: ArrayLike, y: ArrayLike, limit: float) -> float:
     """Returns the largest x up to which the monotone fit of y, linear in between, is within
     `limit`: at most the largest measured x, and 0 if the fit starts above."""
-    at, fit = monotone_fit(x, y)
-    beyond = np.flatnonzero(fit > limit)
-    if not len(beyond):
-        return float(at[-1])
-    first = beyond[0]
-    if first == 0:
-        return 0.0
-    (x0, x1), (y0, y1) = at[first - 1 : first + 1], fit[first - 1 : first + 1]
-    return float(x0 + (x1 - x0) * (limit - y0) / (y1 - y0))
+    return first_crossing(*monotone_fit(x, y), limit)
 
 
 def first_crossing(x: ArrayLike, y: Iterable[float], limit: float) -> float:

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -47,28 +48,28 @@ COLUMNS = (
     "hole_fraction",
     "psnr_on_black_db",
 )
-STEPS = {
-    "points": "from points, photometric",
-    "depth_start": "from depth, photometric",
-    "surfaces": "+ surface and outline losses",
-    "depth_term": "+ depth term",
+_NO_DEPTH_LOSSES = {"depth_weight": 0.0, "surface_weight": 0.0, "outline_weight": 0.0}
+_STEPS: dict[str, tuple[str, dict[str, Any]]] = {
+    "points": (
+        "from points, photometric",
+        {"initialization": "points", "strategy": "default", **_NO_DEPTH_LOSSES},
+    ),
+    "depth_start": ("from depth, photometric", {"initialization": "depth", **_NO_DEPTH_LOSSES}),
+    "surfaces": (
+        "+ surface and outline losses",
+        {"initialization": "depth", "depth_weight": 0.0},
+    ),
+    "depth_term": ("+ depth term", {"initialization": "depth"}),
 }
-"""Titles of the steps from one arm of a representation to the next."""
+"""Titles of the steps from one arm of a representation to the next, and the settings of the arm
+that differ from the study's."""
 _RECIPE = "reconstruct.yaml"
 _ERROR_LIMIT = 0.5  # [m], brightest color of depth errors
-_NO_DEPTH_LOSSES = {"depth_weight": 0.0, "surface_weight": 0.0, "outline_weight": 0.0}
-_SETTINGS = {
-    "points": {"initialization": "points", "strategy": "default", **_NO_DEPTH_LOSSES},
-    "depth_start": {"initialization": "depth", **_NO_DEPTH_LOSSES},
-    "surfaces": {"initialization": "depth", "depth_weight": 0.0},
-    "depth_term": {"initialization": "depth"},
-}
-"""Settings of each step that differ from the study's."""
 
 
 @dataclass(frozen=True)
 class Arm:
-    """A representation and the last of the `STEPS` that it takes."""
+    """A representation and the last of the `_STEPS` that it takes."""
 
     representation: str
     step: str
@@ -81,10 +82,10 @@ class Arm:
     @property
     def title(self) -> str:
         """Name in tables."""
-        return f"{self.representation.upper()} {STEPS[self.step]}"
+        return f"{self.representation.upper()} {_STEPS[self.step][0]}"
 
 
-ARMS = tuple(Arm(representation, step) for representation in ("3dgs", "2dgs") for step in STEPS)
+ARMS = tuple(Arm(representation, step) for representation in ("3dgs", "2dgs") for step in _STEPS)
 PAPER = {
     Arm("3dgs", "points"): (29.35, 0.8706, 0.215, 0.974, 0.115, None, None),
     Arm("3dgs", "depth_term"): (28.89, 0.8676, 0.184, 0.085, 0.004, None, None),
@@ -178,7 +179,7 @@ def arm_config(arm: Arm, config: ReconstructConfig) -> ReconstructConfig:
         config,
         representation=arm.representation,
         distance_field="captured",
-        **_SETTINGS[arm.step],
+        **_STEPS[arm.step][1],
     )
 
 

@@ -16,7 +16,6 @@ from splatpilot.systems.splats.baked_scene import RenderedView
 from splatpilot.training.captures.capture import CaptureFrame
 from splatpilot.training.reconstruction.metrics import has_true_depth
 
-_DEPTH_COLORS, _ERROR_COLORS = "turbo_r", "inferno"
 _RED = np.array([0.95, 0.05, 0.05])
 _GRAY = 0.35  # of unknown values
 _CELL = 2.6  # [in], width of an image
@@ -46,18 +45,12 @@ def depth_scale(truths: Sequence[NDArray]) -> Scale:
     low, high = np.percentile(values, [1, 99]) if len(values) else (0.1, 1.0)
     norm = LogNorm(low, max(high, 1.01 * low), clip=True)
     ticks = [d * 10.0**k for k in range(-3, 4) for d in (1, 2, 5) if low <= d * 10.0**k <= high]
-    return Scale(_DEPTH_COLORS, norm, "depth [m]", ticks)
+    return Scale("turbo_r", norm, "depth [m]", ticks)
 
 
 def error_scale(limit: float) -> Scale:
     """Returns a scale from 0 to `limit` [m] for depth errors."""
-    return Scale(_ERROR_COLORS, Normalize(0, limit, clip=True), "depth error [m]")
-
-
-def colorize(values: NDArray, scale: Scale, known: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Returns values (H, W) as colors (H, W, 3), gray if not known."""
-    colors = colormaps[scale.colors](scale.norm(np.where(known, values, 1.0)))[..., :3]
-    return np.where(known[..., None], colors, _GRAY)
+    return Scale("inferno", Normalize(0, limit, clip=True), "depth error [m]")
 
 
 def mark_floaters(image: NDArray, mask: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -76,6 +69,11 @@ def view_panels(
 ) -> list[Panel]:
     """Returns the panels of the frame, of the exposed `image` of its view, of true and rendered
     depth and of the error of depth, with labels of image and error."""
+
+    def colorize(values: NDArray, scale: Scale, known: NDArray[np.bool_]) -> NDArray:
+        colors = colormaps[scale.colors](scale.norm(np.where(known, values, 1.0)))[..., :3]
+        return np.where(known[..., None], colors, _GRAY)
+
     known = has_true_depth(frame.depth)
     error: NDArray = np.abs(view.depth - np.where(known, frame.depth, 0))
     return [

@@ -32,16 +32,7 @@ from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.distance_field import render_depth
 from splatpilot.training.reconstruction.reconstruct import start_and_goal
 
-# Rows are W's axes in the file's frame F, by the axis that is up; x is kept if possible.
-_R_WF = {
-    "z": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
-    "-z": [[1, 0, 0], [0, -1, 0], [0, 0, -1]],
-    "y": [[1, 0, 0], [0, 0, -1], [0, 1, 0]],
-    "-y": [[1, 0, 0], [0, 0, 1], [0, -1, 0]],
-    "x": [[0, 1, 0], [0, 0, 1], [1, 0, 0]],
-    "-x": [[0, -1, 0], [0, 0, 1], [-1, 0, 0]],
-}
-UP_AXES = tuple(_R_WF)
+UP_AXES = ("z", "-z", "y", "-y", "x", "-x")
 """Axes that may be up in a file."""
 
 _MIN_AREA = 0.05  # twice the area of a triangle on the floor, over its longest side squared
@@ -70,11 +61,7 @@ class RescaleSummary:
 
 
 def rescale_file(
-    file: Path,
-    out: Path,
-    factor: float = 1.0,
-    up: str = "z",
-    floor: Sequence[ArrayLike] = (),
+    file: Path, out: Path, factor: float, up: str, floor: Sequence[ArrayLike]
 ) -> RescaleSummary:
     """Writes the Gaussians of a file as PLY, scaled and rotated so that z is up.
 
@@ -103,29 +90,31 @@ def rescale_file(
 
 def _upright(up: str, floor: Sequence[ArrayLike]) -> RigidTransform:
     """Returns X_WF, given the axis that points up and optionally three points of the floor."""
-    R_WF = np.array(_R_WF[up], dtype=float)
-    if not len(floor):
-        return RigidTransform(RotationMatrix(R_WF))
-    a, b, c = (np.asarray(point, dtype=float) for point in floor)
-    normal = np.cross(b - a, c - a)
-    area, longest = np.linalg.norm(normal), max(np.linalg.norm(b - a), np.linalg.norm(c - a))
-    if not area > _MIN_AREA * longest**2:
-        raise ValueError(
-            f"the points {a.tolist()}, {b.tolist()} and {c.tolist()} lie in a line; give three "
-            "corners of a floor"
-        )
-    z_F = normal / area
-    cosine = float(z_F @ R_WF[2])
-    if abs(cosine) < _MIN_COSINE:
-        raise ValueError(
-            f"the plane of these points is at {np.rad2deg(np.arccos(abs(cosine))):.0f} degrees to "
-            f"a floor that has {up} up; give the axis that points up, or choose other points"
-        )
-    z_F *= np.sign(cosine)
-    x_F = R_WF[0] - (R_WF[0] @ z_F) * z_F
-    x_F /= np.linalg.norm(x_F)
-    R = RotationMatrix(np.stack([x_F, np.cross(z_F, x_F), z_F]))
-    return RigidTransform(R, np.array([0.0, 0.0, -(z_F @ a)]))
+    sign, k = -1.0 if up.startswith("-") else 1.0, "xyz".index(up[-1])
+    z_F = sign * np.eye(3)[k]
+    x_F = np.eye(3)[0] if k else np.roll(z_F, 1)  # x is kept if possible
+    origin = 0.0
+    if len(floor):
+        a, b, c = (np.asarray(point, dtype=float) for point in floor)
+        normal = np.cross(b - a, c - a)
+        area, longest = np.linalg.norm(normal), max(np.linalg.norm(b - a), np.linalg.norm(c - a))
+        if not area > _MIN_AREA * longest**2:
+            raise ValueError(
+                f"the points {a.tolist()}, {b.tolist()} and {c.tolist()} lie in a line; give three "
+                "corners of a floor"
+            )
+        cosine = float(normal @ z_F / area)
+        if abs(cosine) < _MIN_COSINE:
+            raise ValueError(
+                f"the plane of these points is at {np.rad2deg(np.arccos(abs(cosine))):.0f} degrees "
+                f"to a floor that has {up} up; give the axis that points up, or other points"
+            )
+        z_F = np.sign(cosine) * normal / area
+        x_F = x_F - (x_F @ z_F) * z_F
+        x_F /= np.linalg.norm(x_F)
+        origin = -float(z_F @ a)
+    R_WF = RotationMatrix(np.stack([x_F, np.cross(z_F, x_F), z_F]))
+    return RigidTransform(R_WF, np.array([0.0, 0.0, origin]))
 
 
 def run(
@@ -139,12 +128,10 @@ def run(
     up: str | None = None,
     floor: Sequence[ArrayLike] = (),
 ) -> RescaleSummary:
-    """Scales a scene folder by `rescale`, or a file of Gaussians by `rescale_file`, and prints the
-    result.
+    """Scales a scene folder by `rescale`, or a file of Gaussians by `rescale_file`.
 
     Args:
-        scene: folder or file.
-        out: folder or PLY to be written.
+        scene, out: folders, or files.
         factor: of all lengths; or
         between, distance: two points (3,) of the scene, and the distance between them [m]; or
         height: [m], median height of the capture's cameras above the ground.

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from splatpilot.training.captures.capture_registry import read_capture
+from splatpilot.training.reconstruction.checkpoint import event_log
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.optimize import Optimization
 from splatpilot.training.reconstruction.reconstruct import reconstruct
@@ -102,3 +103,15 @@ def test_full_disk_leaves_no_half_checkpoint(tmp_path, room):
         signal.signal(signal.SIGXFSZ, handler)
     assert not out.exists()
     assert list((tmp_path / ".scene.partial").iterdir()) == []
+
+
+def test_tensorboard_reads_logged_metrics(tmp_path):
+    with event_log("") as log:
+        log(1, {"psnr_db": 30.0})
+    accumulator = pytest.importorskip(
+        "tensorboard.backend.event_processing.event_accumulator", reason="no tensorboard"
+    )
+    with event_log(str(tmp_path / "events")) as log:
+        log(500, {"psnr_db": 30.0})
+    events = accumulator.EventAccumulator(str(tmp_path / "events")).Reload()
+    assert [(e.step, e.value) for e in events.Scalars("psnr_db")] == [(500, 30.0)]

@@ -202,32 +202,22 @@ def test_only_masked_pixels_with_depth_are_covered():
     assert count[:8].sum() == count[:, 32:].sum() == 0
 
 
-def test_gaussians_lie_flat_on_the_plane():
-    normal_C = np.array([0.5, 0.2, 0.8])
+def test_gaussians_are_flat_and_cover_their_cell_in_the_image():
+    normal_C = np.array([0.3, -0.4, 0.85])
     normal_C /= np.linalg.norm(normal_C)
-    frame = plane_frame(normal_C, 1.6)
-    cells = BlockMeans(frame, GRAY, ALL, 4).split(0.05, 4, 0.75, 9)
-    p_WQ, covariances = cell_gaussians(frame, cells, spread=0.5)
-    p_CQ = X_WC.inverse().multiply(p_WQ.T).T
-    np.testing.assert_allclose(p_CQ @ normal_C, 1.6, atol=1e-5)
-    normal_W = X_WC.rotation().matrix() @ normal_C
-    across = np.sqrt(np.einsum("i,nij,j->n", normal_W, covariances, normal_W))
-    variances = np.linalg.eigvalsh(covariances)
-    np.testing.assert_allclose(across, np.sqrt(variances[:, 0]), rtol=1e-3)
-    assert (across < 0.25 * np.sqrt(variances[:, 1])).all()
-
-
-def test_gaussians_cover_their_cell_in_the_image():
-    frame = plane_frame([0.3, -0.4, 0.85], 2.0)
+    frame = plane_frame(normal_C, 2.0)
     cells = BlockMeans(frame, GRAY, ALL, 4).split(0.05, 4, 0.75, 9)
     p_WQ, covariances = cell_gaussians(frame, cells, spread=0.5)
     R_CW = X_WC.rotation().matrix().T
-    p_CQ = X_WC.inverse().multiply(p_WQ.T).T
-    for (x, y, z), covariance in zip(p_CQ, R_CW @ covariances @ R_CW.T, strict=True):
+    p_CQ, covariances = X_WC.inverse().multiply(p_WQ.T).T, R_CW @ covariances @ R_CW.T
+    np.testing.assert_allclose(p_CQ @ normal_C, 2.0, atol=1e-5)
+    for (x, y, z), covariance in zip(p_CQ, covariances, strict=True):
+        across, narrow, _ = np.linalg.eigvalsh(covariance) ** 0.5
+        assert (normal_C @ covariance @ normal_C) ** 0.5 == pytest.approx(across, rel=1e-3)
+        assert across < 0.25 * narrow
         J = F / z * np.array([[1, 0, -x / z], [0, 1, -y / z]])
-        np.testing.assert_allclose(
-            J @ covariance @ J.T, np.diag([(0.5 * 4) ** 2] * 2), rtol=0.02, atol=0.08
-        )
+        image = J @ covariance @ J.T
+        np.testing.assert_allclose(image, np.diag([(0.5 * 4) ** 2] * 2), rtol=0.02, atol=0.08)
 
 
 def test_cells_do_not_extend_too_far():
