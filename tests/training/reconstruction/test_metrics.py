@@ -32,27 +32,23 @@ def noise(seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).uniform(0.2, 0.8, (HEIGHT, WIDTH, 3))
 
 
-@pytest.mark.parametrize(("difference", "expected"), [(0.1, 20.0), (0.01, 40.0), (1.0, 0.0)])
-def test_psnr_of_a_known_difference(difference, expected):
+def test_psnr_of_a_known_difference():
     truth = np.zeros((HEIGHT, WIDTH, 3))
-    assert psnr_db(truth + difference, truth) == pytest.approx(expected)
+    assert psnr_db(truth + 0.1, truth) == pytest.approx(20.0)
     assert psnr_db(truth, truth) == np.inf
 
 
-def test_ssim_of_flat_images():
+def test_ssim():
     a, b = np.full((64, 64, 3), 0.4), np.full((64, 64, 3), 0.6)
     everywhere = np.ones((64, 64), bool)
     luminance = (2 * 0.4 * 0.6 + 1e-4) / (0.4**2 + 0.6**2 + 1e-4)
     assert ssim(a, b, everywhere) == pytest.approx(luminance, abs=0.03)
     assert ssim(a, a, everywhere) == pytest.approx(1, abs=1e-6)
-    assert ssim(noise(0), noise(1), EVERYWHERE) < 0.3
-
-
-@pytest.mark.parametrize("fraction", [0.2, 0.5, 0.8])
-def test_pixels_that_are_left_out_do_not_raise_ssim(fraction):
-    a, b = noise(0), noise(1)
-    seen = np.random.default_rng(2).random((HEIGHT, WIDTH)) >= fraction
-    assert ssim(a, b, seen) == pytest.approx(ssim(a, b, EVERYWHERE), abs=0.03)
+    whole = ssim(noise(0), noise(1), EVERYWHERE)
+    assert whole < 0.3
+    for fraction in (0.2, 0.5, 0.8):
+        part = np.random.default_rng(2).random((HEIGHT, WIDTH)) >= fraction
+        assert ssim(noise(0), noise(1), part) == pytest.approx(whole, abs=0.03)
 
 
 def test_depth_metrics_are_over_pixels_with_true_depth():
@@ -112,17 +108,12 @@ def test_a_plane_in_front_is_all_floater(representation):
         assert found["floater_fraction"] == fraction
 
 
-def test_exposure_is_fitted():
-    scene = 0.5 * noise()
-    truth = 1.4 * scene * vignette(-0.5, WIDTH, HEIGHT)[..., None]
-    image, gain = fit_exposure(scene, truth, -0.5, EVERYWHERE)
-    assert gain == pytest.approx(1.4)
-    np.testing.assert_allclose(image, truth, atol=1e-12)
+def test_exposure_is_the_least_squares_fit():
+    scene, truth = 0.5 * noise(), noise(1)
     black, gain = fit_exposure(np.zeros_like(scene), truth, -0.5, EVERYWHERE)
     assert gain == 1.0 and not black.any()
-    other = noise(1)
-    _, best = fit_exposure(scene, other, 0.0, EVERYWHERE)
-    errors = [np.sum((g * scene - other) ** 2) for g in (best - 0.01, best, best + 0.01)]
+    _, best = fit_exposure(scene, truth, 0.0, EVERYWHERE)
+    errors = [np.sum((g * scene - truth) ** 2) for g in (best - 0.01, best, best + 0.01)]
     assert errors[1] < min(errors[0], errors[2])
 
 

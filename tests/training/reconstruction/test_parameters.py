@@ -62,13 +62,12 @@ def test_native_shapes_agree_with_torch_in_float64():
         np.testing.assert_allclose(found, expected, rtol=2e-5, atol=2e-7)
 
 
-def test_smallest_scale_is_added_in_squares():
-    log_scales = torch.tensor([[-50.0, np.log(0.3), -np.inf]])
-    scales, opacities = splat_shapes(log_scales, torch.tensor([0.0]), torch.tensor([0.4]))
-    np.testing.assert_allclose(scales, [[0.4, 0.5, 0.4]], rtol=1e-6)
-    assert opacities.item() == 0.5
-    _, extreme = splat_shapes(torch.zeros(2, 3), torch.tensor([-200.0, 200.0]), torch.zeros(2))
-    np.testing.assert_allclose(extreme, [0.0, 1.0], atol=1e-30)
+def test_extreme_logits_and_scales():
+    log_scales = torch.tensor([[-50.0, np.log(0.3), -np.inf]]).expand(2, 3)
+    logits, smallest = torch.tensor([-200.0, 200.0]), torch.full((2,), 0.4)
+    scales, opacities = splat_shapes(log_scales, logits, smallest)
+    np.testing.assert_allclose(scales, [[0.4, 0.5, 0.4]] * 2, rtol=1e-6)
+    np.testing.assert_allclose(opacities, [0.0, 1.0], atol=1e-30)
 
 
 def views(wall: float) -> ReconstructionViews:

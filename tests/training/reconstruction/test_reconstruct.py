@@ -76,23 +76,23 @@ def test_images_are_read_once_on_one_thread(tmp_path, write_room, iterations):
     assert sorted(read) == [(i, 1) for i in range(len(capture))]
 
 
-def test_number_of_gaussians_is_kept(tmp_path, write_room):
-    room = write_room(tmp_path / "room")
-    free = reconstruct(read_capture(room), tmp_path / "a", CONFIG).gaussians
-    limited = reconstruct(
-        read_capture(room), tmp_path / "b", replace(CONFIG, max_gaussians=free // 3)
-    ).gaussians
-    assert 0 < limited <= free // 3
-    with pytest.raises(ValueError, match="10 Gaussians are too few for 12 frames"):
-        reconstruct(read_capture(room), tmp_path / "c", replace(CONFIG, max_gaussians=10))
-    assert not (tmp_path / "c").exists()
+def test_number_of_gaussians_is_limited(tmp_path, write_room):
+    capture = read_capture(write_room(tmp_path / "room"))
+    free = reconstruct(capture, tmp_path / "a", CONFIG).gaussians
+    limit = replace(CONFIG, max_gaussians=free // 3)
+    assert 0 < reconstruct(capture, tmp_path / "b", limit).gaussians <= free // 3
+
+
+def remove_depth(room, indices) -> None:
+    files = sorted((room / "depth_left").iterdir())
+    for i in indices:
+        np.save(files[i], np.zeros_like(np.load(files[i])))
 
 
 @pytest.mark.parametrize("iterations", [0, 2])
 def test_a_capture_without_any_depth_leaves_nothing(tmp_path, write_room, iterations):
     room = write_room(tmp_path / "room")
-    for file in (room / "depth_left").iterdir():
-        np.save(file, np.zeros_like(np.load(file)))
+    remove_depth(room, range(12))
     config = replace(CONFIG, iterations=iterations)
     with pytest.raises(ValueError, match=r"no pixel of \d+ frames has a depth that a"):
         reconstruct(read_capture(room), tmp_path / "scene", config)
@@ -101,9 +101,7 @@ def test_a_capture_without_any_depth_leaves_nothing(tmp_path, write_room, iterat
 
 def test_frames_without_depth_are_named(tmp_path, write_room):
     room = write_room(tmp_path / "room")
-    files = sorted((room / "depth_left").iterdir())
-    for file in files[3:5]:
-        np.save(file, np.zeros_like(np.load(file)))
+    remove_depth(room, (3, 4))
     summary = reconstruct(read_capture(room), tmp_path / "scene", CONFIG)
     names = "000003_left.png, 000004_left.png"
     assert f"2 of 12 frames have no pixel with depth: {names}" in summary.warnings
