@@ -242,11 +242,8 @@ def make_initial_gaussians(
 ) -> GaussianScene:
     """Makes the Gaussians that `config` starts from; `extent` [m] is that of the cameras."""
     kind, available = config.initialization, _available(capture)
-    if not available[kind]:
-        raise ValueError(
-            f"initialization is {kind!r}, but {capture.name} has none; choose "
-            + " or ".join(repr(name) for name, exists in available.items() if exists)
-        )
+    possible = " or ".join(name for name, exists in available.items() if exists)
+    require(available[kind], "initialization", f"{possible} for {capture.name}", kind)
     count = config.initial_gaussians
     if kind == "depth":
         return gaussians_from_depth(frames, photometry, count, config.contrast, optimized=True)

@@ -35,8 +35,7 @@ def photometric_loss(rendered: Tensor, target: Tensor, ssim_weight: float = 0.2)
     range of 1 and zeros outside the image.
 
     Args:
-        rendered: (..., H, W, C), values about [0, 1].
-        target: as `rendered`; the truth.
+        rendered, target: (..., H, W, C), values about [0, 1].
         ssim_weight: w, in [0, 1].
     """
     _check_pair("rendered", rendered, "target", target)
@@ -84,9 +83,8 @@ def log_depth_loss(
     The same relative error costs the same at any range.
 
     Args:
-        rendered: (...) expected or accumulated depth [m].
-        depth: as `rendered`; the truth.
-        weights: as `rendered`; for example from `depth_edge_weights`. 1 by default.
+        rendered, depth: (...) [m], expected or accumulated depth, and the truth.
+        weights: (...), for example from `depth_edge_weights`; 1 by default.
         epsilon, far: range of depths that count [m].
     """
     _check_pair("rendered", rendered, "depth", depth)

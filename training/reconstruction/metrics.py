@@ -122,23 +122,23 @@ def floaters(depth: NDArray, truth: NDArray) -> NDArray[np.bool_]:
 
 
 def fit_exposure(
-    color: NDArray, truth: NDArray, vignetting: float, seen: NDArray[np.bool_]
+    color: NDArray,
+    truth: NDArray,
+    vignetting: float,
+    seen: NDArray[np.bool_],
+    fit_gain: bool = True,
 ) -> tuple[NDArray, float]:
     """Returns a rendered image (H, W, 3) with vignetting and exposure of the camera, and its gain.
 
     The gain is the least-squares fit to the true image over the pixels `seen` (H, W): that of a
-    held-out frame is unknown, and does not depend on the scene.
+    held-out frame is unknown, and does not depend on the scene. Without `fit_gain` it is 1.
     """
-    image = _darken_corners(color, vignetting)
-    x, y = image[seen], truth[seen]
-    energy = float((x * x).sum())
-    gain = float((x * y).sum()) / energy if energy > 0 else 1.0
-    return np.clip(gain * image, 0, 1), gain
-
-
-def _darken_corners(color: NDArray, vignetting: float) -> NDArray:
     height, width = color.shape[:2]
-    return np.clip(color, 0, None) * vignette(vignetting, width, height)[..., None]
+    image = np.clip(color, 0, None) * vignette(vignetting, width, height)[..., None]
+    gain, x, y = 1.0, image[seen], truth[seen]
+    if fit_gain and (energy := float((x * x).sum())) > 0:
+        gain = float((x * y).sum()) / energy
+    return np.clip(gain * image, 0, 1), gain
 
 
 def measure_view(
@@ -165,15 +165,11 @@ def measure_view(
     """
     truth, sky = frame.image / 255, frame.depth >= FAR
     seen = frame.valid if seen is None else seen & frame.valid
-
-    def expose(color: NDArray) -> tuple[NDArray, float]:
-        if fit_gain:
-            return fit_exposure(color, truth, vignetting, seen)
-        return _darken_corners(color, vignetting).clip(max=1), 1.0
-
+    camera = truth, vignetting, seen, fit_gain
     view = put_behind(on_black, background, frame.K, frame.X_WC)
-    exposed, gain = expose(view.color)
-    exposed_before_black, _ = expose(np.where(sky[..., None], view.color, on_black.color))
+    exposed, gain = fit_exposure(view.color, *camera)
+    before_black = np.where(sky[..., None], view.color, on_black.color)
+    exposed_before_black, _ = fit_exposure(before_black, *camera)
     distance = None
     if lpips is not None and seen.any():
         with torch.no_grad():

@@ -185,7 +185,7 @@ def estimate_photometry(views: Sequence[ThinnedFrame], seed: int) -> Photometry:
     """
     rng = np.random.default_rng(seed)
     n = len(views)
-    first, second, log_ratio, radius_difference = [], [], [], []
+    samples = []
     for i, view in enumerate(views):
         p_WQ, pixel_i = view.points(step=4)
         for j, other in enumerate(views):
@@ -198,16 +198,13 @@ def estimate_photometry(views: Sequence[ThinnedFrame], seed: int) -> Photometry:
             if len(usable) < _SAMPLES_PER_PAIR:
                 continue
             usable = rng.choice(usable, _SAMPLES_PER_PAIR, replace=False)
-            first.append(np.full(_SAMPLES_PER_PAIR, i))
-            second.append(np.full(_SAMPLES_PER_PAIR, j))
-            log_ratio.append(np.log(I_i[usable] / I_j[usable]))
-            radius_difference.append(
-                view.radius_squared.flat[pixel_i[index[usable]]]
-                - other.radius_squared.flat[pixel_j[usable]]
-            )
-    if not first:
+            rho_i = view.radius_squared.flat[pixel_i[index[usable]]]
+            rho_j = other.radius_squared.flat[pixel_j[usable]]
+            pair = np.full(_SAMPLES_PER_PAIR, i), np.full(_SAMPLES_PER_PAIR, j)
+            samples.append((*pair, np.log(I_i[usable] / I_j[usable]), rho_i - rho_j))
+    if not samples:
         return Photometry(np.ones(n), 0.0)
-    i, j, b, r = map(np.concatenate, (first, second, log_ratio, radius_difference))
+    i, j, b, r = (np.concatenate(column) for column in zip(*samples, strict=True))
     equation = np.arange(len(b))
     A = coo_array(
         (

@@ -218,13 +218,7 @@ def _digested(capture: Capture, digests: set[str]) -> Capture:
 
 def _source_and_split(capture: Capture, images: set[str], split: str) -> tuple[list[str], str]:
     """Returns the source digest of a scene and its split: those of the world that the capture was
-    rendered of, or else of its images.
-
-    Args:
-        capture: of the scene.
-        images: digests of the fitted images.
-        split: given by the user; empty for none.
-    """
+    rendered of, or else of its fitted `images`, by digest. `split` is the user's, or empty."""
     name = capture.folder or capture.name
     folder = Path(capture.folder)
     rendered = None

@@ -7,39 +7,22 @@ import pytest
 import torch
 from torch.nn.functional import conv2d, max_pool2d
 
-from splatpilot.training.reconstruction.lpips import Lpips
-
-FIRES = {
-    3: (64, 16, 64),
-    4: (128, 16, 64),
-    6: (128, 32, 128),
-    7: (256, 32, 128),
-    9: (256, 48, 192),
-    10: (384, 48, 192),
-    11: (384, 64, 256),
-    12: (512, 64, 256),
-}
+from splatpilot.training.reconstruction.lpips import Lpips, squeezenet_features
 
 
 @pytest.fixture(scope="module")
 def weights() -> dict:
     """Random weights in the layout of the file, of a size that keeps features alive."""
     generator = torch.Generator().manual_seed(0)
-
-    def convolution(name: str, n_out: int, n_in: int, size: int) -> dict:
-        bound = (6 / (n_in * size**2)) ** 0.5
-        w = (2 * torch.rand(n_out, n_in, size, size, generator=generator) - 1) * bound
-        return {f"{name}.weight": w, f"{name}.bias": torch.zeros(n_out)}
-
-    backbone = convolution("features.0", 64, 3, 3)
-    for i, (n_in, squeeze, expand) in FIRES.items():
-        backbone |= convolution(f"features.{i}.squeeze", squeeze, n_in, 1)
-        backbone |= convolution(f"features.{i}.expand1x1", expand, squeeze, 1)
-        backbone |= convolution(f"features.{i}.expand3x3", expand, squeeze, 3)
-    channels = (64, 128, 256, 384, 384, 512, 512)
+    backbone = {
+        f"features.{name}": torch.zeros(w.shape)
+        if w.ndim == 1
+        else (2 * torch.rand(w.shape, generator=generator) - 1) * (6 / w[0].numel()) ** 0.5
+        for name, w in squeezenet_features().state_dict().items()
+    }
     linear = {
         f"lin{i}.model.1.weight": torch.rand(1, n, 1, 1, generator=generator)
-        for i, n in enumerate(channels)
+        for i, n in enumerate((64, 128, 256, 384, 384, 512, 512))
     }
     return {"squeezenet1_1": backbone, "lin": linear}
 
@@ -75,12 +58,12 @@ def reference(weights: dict, a: torch.Tensor, b: torch.Tensor) -> float:
         x = layer(x, "0", stride=2)
         found = [x]
         for i in range(2, 13):
-            if i in FIRES:
+            if i in (2, 5, 8):
+                x = max_pool2d(x, 3, stride=2, ceil_mode=True)
+            else:
                 x = layer(x, f"{i}.squeeze")
                 wide = layer(x, f"{i}.expand3x3", padding=1)
                 x = torch.cat([layer(x, f"{i}.expand1x1"), wide], dim=1)
-            else:
-                x = max_pool2d(x, 3, stride=2, ceil_mode=True)
             if i in (4, 7, 9, 10, 11, 12):
                 found.append(x)
         return [f / (f.norm(dim=1, keepdim=True) + 1e-10) for f in found]
