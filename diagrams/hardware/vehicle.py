@@ -22,7 +22,6 @@ from pydrake.systems.primitives import (
 
 from splatpilot.diagrams.flight.blocks import (
     AddObservation,
-    ConnectInputs,
     decision_period,
     goal_position,
     make_policy,
@@ -41,7 +40,7 @@ from splatpilot.diagrams.flight.flight_diagram import LOG_PERIOD
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.hardware.bridge import HardwareConfig, image_codecs, require_messages_for
 from splatpilot.diagrams.hardware.message_ports import MessagePorts
-from splatpilot.diagrams.hardware.real_time import run_in_real_time
+from splatpilot.diagrams.hardware.real_time import output, run_in_real_time
 from splatpilot.diagrams.worlds.appearance import seen_otherwise
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import make_world
@@ -68,8 +67,7 @@ SILENCE = 0.1
 STATUS_PERIOD = 0.1
 """[s] between messages of the vehicle's status."""
 
-_NOISE = 1e-6
-"""[m] in published positions: a failsafe takes a constant state for frozen."""
+_NOISE = 1e-6  # [m] in published positions: a failsafe takes a constant state for frozen.
 
 
 def BuildVehicleDiagram(
@@ -95,8 +93,6 @@ def BuildVehicleDiagram(
     Args:
         scenario: the vehicle, and the policy's images.
         world: that it flies in.
-        lcm: transport of the messages.
-        config: rates, and the commands.
 
     Raises:
         ValueError: for an invalid configuration, sensors, and worlds with moving obstacles.
@@ -109,41 +105,34 @@ def BuildVehicleDiagram(
 
     # Vehicle.
     plant = builder.AddNamedSystem("plant", QuadrotorPlant(scenario.vehicle))
-    pose = builder.AddNamedSystem("pose", StateToPose())
-    collision = builder.AddNamedSystem("collision", EsdfCollision(world.distance_field))
     state = plant.GetOutputPort("state")
-    for system in (pose, collision):
-        builder.Connect(state, system.GetInputPort("state"))
+    pose = ports.add("pose", StateToPose(), state=state).GetOutputPort("pose")
+    collision = ports.add("collision", EsdfCollision(world.distance_field), state=state)
 
     # Commands, by a failsafe that knows no map and limits speed as MPC_XY_VEL_MAX of PX4.
     by_velocity = config.setpoints == "velocity"
     codec = VelocitySetpointCodec() if by_velocity else CommandCodec()
     hover = [0.0, 0.0, 0.0, np.nan] if by_velocity else [scenario.vehicle.gravity, 0.0, 0.0, 0.0]
     subscriber = ports.subscribe(codec, np.array(hover), "command")
-    setpoint = subscriber.GetOutputPort(codec.port)
+    received, command_age = subscriber.GetOutputPort(codec.port), subscriber.GetOutputPort("age")
+    command = _AddVelocityControl(ports, scenario, state, received) if by_velocity else received
     limits = FlightLimits(max_speed=config.failsafe.limits.max_speed)
-    failsafe = builder.AddNamedSystem(
+    law = FailsafeConfig(max_age=SILENCE, recovery=config.tick, limits=limits)
+    no_age = ports.add("no_age", ConstantVectorSource(np.zeros(1)))
+    failsafe = ports.add(
         "failsafe",
         Failsafe(
-            FailsafeConfig(max_age=SILENCE, recovery=config.tick, limits=limits),
-            *(scenario.controller, scenario.vehicle),
-            *(np.full(3, -np.inf), np.full(3, np.inf)),
+            law, scenario.controller, scenario.vehicle, np.full(3, -np.inf), np.full(3, np.inf)
         ),
+        state=state,
+        state_age=no_age.get_output_port(),
+        observation_age=command_age,
+        velocity_setpoint=received if by_velocity else None,
+        command=command,
     )
-    no_age = builder.AddNamedSystem("no_age", ConstantVectorSource(np.zeros(1)))
-    sources = {
-        "state": state,
-        "state_age": no_age.get_output_port(),
-        "observation_age": subscriber.GetOutputPort("age"),
-    }
-    if by_velocity:
-        sources["velocity_setpoint"] = setpoint
-        setpoint = _AddVelocityControl(builder, scenario, state, setpoint)
-    ConnectInputs(builder, failsafe, sources | {"command": setpoint})
     held = builder.AddNamedSystem("held_command", ZeroOrderHold(config.tick, 4))
-    command = held.get_output_port()
     builder.Connect(failsafe.GetOutputPort("command"), held.get_input_port())
-    builder.Connect(command, plant.GetInputPort("command"))
+    builder.Connect(held.get_output_port(), plant.GetInputPort("command"))
 
     # Status, state and motion capture.
     armed = builder.AddSystem(ConstantVectorSource(np.ones(1)))
@@ -162,17 +151,16 @@ def BuildVehicleDiagram(
         codec = MotionCaptureCodec(config.body)
         ports.publish(codec, tracked.get_output_port(), 1 / config.state_rate)
 
-    # Images, of which the policy tells size and rate.
+    # Images, whose size and rate are the policy's.
     policy = make_policy(scenario, world)
-    body_pose = pose.GetOutputPort("pose")
-    images = AddObservation(builder, scenario, world, state, body_pose, policy)
+    images = AddObservation(builder, scenario, world, state, pose, policy)
     for codec in image_codecs(scenario, policy):
         ports.publish(codec, images[codec.port], decision_period(scenario, policy))
 
-    for name, port in (("state", state), ("command", command)):
+    for name, port in (("state", state), ("command", held.get_output_port())):
         LogVectorOutput(port, builder, LOG_PERIOD).set_name(f"{name}_log")
         builder.ExportOutput(port, name)
-    builder.ExportOutput(subscriber.GetOutputPort("age"), "command_age")
+    builder.ExportOutput(command_age, "command_age")
     for name in ("clearance", "gradient", "in_collision", "field_state"):
         builder.ExportOutput(collision.GetOutputPort(name), name)
     diagram = builder.Build()
@@ -181,19 +169,19 @@ def BuildVehicleDiagram(
 
 
 def _AddVelocityControl(
-    builder: DiagramBuilder, scenario: Scenario, state: OutputPort, setpoint: OutputPort
+    ports: MessagePorts, scenario: Scenario, state: OutputPort, setpoint: OutputPort
 ) -> OutputPort:
     """Adds the control of velocity setpoints; returns its commands."""
-    parts = builder.AddNamedSystem("setpoint", Demultiplexer([3, 1]))
-    tracker = builder.AddNamedSystem("velocity_tracker", VelocityTracker())
-    law = FlatnessController(scenario.controller, scenario.vehicle)
-    controller = builder.AddNamedSystem("controller", law)
-    builder.Connect(setpoint, parts.get_input_port())
+    parts = ports.add("setpoint", Demultiplexer([3, 1]), u0=setpoint)
     velocity, heading = parts.get_output_port(0), parts.get_output_port(1)
-    ConnectInputs(builder, tracker, {"state": state, "velocity": velocity})
-    acceleration = tracker.GetOutputPort("acceleration")
-    sources = {"state": state, "acceleration": acceleration, "heading": heading}
-    ConnectInputs(builder, controller, sources)
+    tracker = ports.add("velocity_tracker", VelocityTracker(), state=state, velocity=velocity)
+    controller = ports.add(
+        "controller",
+        FlatnessController(scenario.controller, scenario.vehicle),
+        state=state,
+        acceleration=tracker.GetOutputPort("acceleration"),
+        heading=heading,
+    )
     return controller.GetOutputPort("command")
 
 
@@ -202,10 +190,6 @@ def run(*, scenario: Scenario, config: HardwareConfig, out: Path) -> dict[str, f
     """
     Hovers at the scenario's start and flies by commands until the flight ends; writes the files of
     `write_flight` and `write_summary` into `out`. Time is counted from the first command.
-
-    Args:
-        scenario: the vehicle, its world, its start, and the policy's images.
-        config: of messages.
 
     Returns:
         `Flight.summary()` and `overruns`, of ticks.
@@ -238,7 +222,7 @@ def run(*, scenario: Scenario, config: HardwareConfig, out: Path) -> dict[str, f
 
     def over(now: float) -> bool:
         nonlocal took_off
-        if math.isinf(np.asarray(diagram.GetOutputPort("command_age").Eval(root))[0]):
+        if math.isinf(output(diagram, "command_age", root)[0]):
             if now > config.patience:
                 raise TimeoutError(
                     f"no command has come for {config.patience:g} s; start the bridge, with the "

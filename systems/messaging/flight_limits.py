@@ -19,8 +19,8 @@ LEVEL = 0.7
 RETURN_SPEED = 1.0
 """[m/s] Max speed back into the allowed volume."""
 
-_STEP = 0.05  # [m] between checked points of a path; more on paths
-_MAX_STEPS = 1000  # [-] that would need more, which only invalid states cause.
+_STEP = 0.05  # [m] between checked points of a path.
+_MAX_STEPS = 1000  # Only invalid states need more.
 
 
 @dataclass
@@ -45,10 +45,7 @@ class FlightLimits(Config):
         fence = np.array(self.geofence, dtype=float)
         min_side = 2.0 * (VEHICLE_RADIUS + self.min_clearance)
         valid = fence.shape == (2, 3) and bool((fence[1] - fence[0] >= min_side).all())
-        condition = (
-            "two corners of a box, the lower one first, with sides of at least "
-            f"{min_side:.2f} m: the collision sphere and min_clearance"
-        )
+        condition = f"two corners of a box, the lower one first, at least {min_side:.2f} m apart"
         require_field(self, "geofence", valid, condition)
 
 
@@ -92,11 +89,9 @@ class Motion(NamedTuple):
         the period for which commands are held. See `limit_approach`.
 
         Args:
-            p_WB, v_WB: (3,) [m], [m/s].
             age: [s] since the measurement, compensated by prediction.
             unpredicted: [s] further age without prediction.
-            deceleration: [m/s^2].
-            law: that flies the velocities.
+            law: controller of the velocity.
         """
         stop = stopping_displacement(v_WB, RESPONSE_TIME, deceleration)
         dead_time = max(age, 0.0) + unpredicted + 1.0 / law.tilt_gain + law.period
@@ -110,7 +105,6 @@ def limit_velocity(
     Limits a velocity (3,) [m/s], W frame.
 
     Args:
-        desired: (3,) [m/s].
         landing: allows leaving the box downwards, and touching level surfaces.
 
     Returns:
@@ -142,9 +136,7 @@ def limit_velocity(
 
     # The path, last: velocities along a fence or an obstacle may lead into another.
     if near.field is not None and not landing:
-        limited = limit_ahead(
-            velocity, *motion[:2], near.field, limits.min_clearance, motion.reaction_time
-        )
+        limited = limit_ahead(velocity, motion, near.field, limits.min_clearance)
         apply(limited, status.LIMITED_CLEARANCE)
     return velocity, reason
 
@@ -165,11 +157,6 @@ def stopping_displacement(
     but brakes with at most a: over the distance T v, or (v² + (a T)²) / (2 a) from v = a T. The
     point p + T v at which it would rest then moves with exactly the commanded velocity, since
     (p + T v)' = v + (u - v) = u.
-
-    Args:
-        velocity: (3,) [m/s].
-        response_time: T [s].
-        deceleration: a [m/s^2].
     """
     speed, exponential = float(np.linalg.norm(velocity)), deceleration * response_time
     if speed <= exponential:
@@ -189,32 +176,24 @@ def limit_approach(
 
     Args:
         away: (3,) unit vector that leads away from the obstacle.
-        room: [m] from the point of rest to the obstacle, see `stopping_displacement`.
-        reaction_time: [s].
+        room: [m] from the point of rest to the obstacle.
     """
     fastest = max(room / reaction_time, -RETURN_SPEED)
     return velocity + away * max(0.0, -float(velocity.dot(away)) - fastest)
 
 
 def limit_ahead(
-    velocity: np.ndarray,
-    p: np.ndarray,
-    stop: np.ndarray,
-    field: Distances,
-    min_clearance: float,
-    reaction_time: float,
+    velocity: np.ndarray, motion: Motion, field: Distances, min_clearance: float
 ) -> np.ndarray:
     """
     Limits a commanded velocity (3,) [m/s] by obstacles on the path: straight to the point of rest,
     and from there along the velocity.
 
     Args:
-        p: (3,) [m] position of the vehicle.
-        stop: (3,) [m] from there to the point of rest.
         field: distances to known obstacles. Outside of it, where they are NaN, the path is free.
         min_clearance: [m]. A vehicle that is nearer than that may leave.
-        reaction_time: [s].
     """
+    p, stop, reaction_time = motion
     nearest = min(min_clearance, float(field.distance(p)) - VEHICLE_RADIUS)
     for start, path in ((p, stop), (p + stop, velocity * reaction_time)):
         length = float(np.linalg.norm(path))

@@ -42,9 +42,8 @@ class _Offset(NamedTuple):
     def heard(self, sent: float, now: float) -> Self:
         """Returns the bounds after a message arrived `now` [s] that PX4 sent at `sent` [s]."""
         drift = _MAX_DRIFT * (now - self.time)
-        return self._replace(
-            latest=min(self.latest + drift, now - sent), earliest=self.earliest - drift, time=now
-        )
+        latest = min(self.latest + drift, now - sent)
+        return self._replace(latest=latest, earliest=self.earliest - drift, time=now)
 
     def answered(self, question: float, answer: float) -> Self:
         """Returns the bounds after PX4 answered at `answer` [s] a question of `question` [s]."""
@@ -72,11 +71,8 @@ class _Telemetry(Received):
     asked: float = -math.inf  # [s] of the Context, of its arrival.
 
     def after(self, message: Message, now: float, unix_time: float) -> Self:
-        """Returns the state after a message came `now` [s] in the Context, at `unix_time` [s].
-
-        Raises:
-            ValueError: if it is no newer than the one before.
-        """
+        """Returns the state after a message came `now` [s] in the Context, at `unix_time` [s];
+        raises ValueError if it is no newer than the one before."""
         if isinstance(message, Heartbeat):
             return replace(self, heartbeat=message, heard=now)
         if isinstance(message, Granted):
@@ -124,20 +120,22 @@ class _Telemetry(Received):
             return hover_state(np.zeros(3))
         state = QuadrotorState(p.p_WB, p.v_WB, a.q_WB, a.w_WB_B).to_vector()
         time = min(p.time, a.time)
-        p_WB, v_WB, _, _ = QuadrotorState.of(predict_state(state, time - p.time))
-        _, _, q_WB, w_WB_B = QuadrotorState.of(predict_state(state, time - a.time))
-        return QuadrotorState(p_WB, v_WB, q_WB, w_WB_B).to_vector()
+        moved, rotated = (predict_state(state, time - each.time) for each in (p, a))
+        return np.append(moved[:6], rotated[6:])
 
-    def mode(self, now: float) -> tuple[bool, bool, int, int]:
-        """Returns if the mode is known at `now` [s], if the vehicle is armed, and its mode."""
+    def mode(self, now: float) -> tuple[bool, int, int] | None:
+        """Returns if PX4 is armed, and its mode; None if they are unknown at `now` [s]."""
         is_known = now - self.heard <= HEARTBEAT_TIMEOUT
-        armed, mode = self.heartbeat if is_known else (False, (0, 0))
-        return is_known, armed, *mode
+        return (self.heartbeat.armed, *self.heartbeat.mode) if is_known else None
 
-    def vehicle_status(self, now: float) -> list[float]:
-        """Returns the signal of `VehicleStatusCodec` at `now` [s]."""
-        is_known, armed, main, _ = self.mode(now)
-        return [armed, main == OFFBOARD[0]] if is_known else [math.nan, math.nan]
+
+_UNKNOWN = False, 0, 0
+
+
+def _vehicle_status(received: _Telemetry, now: float) -> list[float]:
+    """Returns the signal of `VehicleStatusCodec` at `now` [s]."""
+    mode = received.mode(now)
+    return [math.nan, math.nan] if mode is None else [mode[0], mode[1] == OFFBOARD[0]]
 
 
 class Px4Telemetry(Receiver[_Telemetry]):
@@ -181,24 +179,17 @@ class Px4Telemetry(Receiver[_Telemetry]):
         period: float,
         now: Callable[[], float] | None = None,
     ):
-        """Constructs the system.
-
-        Args:
-            inbox: socket to receive and send.
-            mavlink: reads and writes messages.
-            address: host and port of PX4.
-            period: [s] between updates.
-            now: see `Receiver`.
-        """
+        """Constructs the system, which exchanges messages with PX4 at `address` through `inbox`;
+        `period` and `now` are those of `Receiver`."""
         super().__init__(_Telemetry(), "PX4", period, now)
         self._inbox, self._mavlink, self._address = inbox, mavlink, address
         self._declare_age(lambda received: received.measured)
         self._declare("state", 13, lambda received, _: received.state)
         self._declare("granted", 2, lambda got, _: [SET_MODE in got.granted, ARM in got.granted])
         self._declare("heartbeat_age", 1, lambda got, now: now - got.heard, timed=True)
-        self._declare("armed", 1, lambda got, now: got.mode(now)[1], timed=True)
-        self._declare("mode", 2, lambda got, now: got.mode(now)[2:], timed=True)
-        self._declare("vehicle_status", 2, lambda got, now: got.vehicle_status(now), timed=True)
+        self._declare("armed", 1, lambda got, now: (got.mode(now) or _UNKNOWN)[0], timed=True)
+        self._declare("mode", 2, lambda got, now: (got.mode(now) or _UNKNOWN)[1:], timed=True)
+        self._declare("vehicle_status", 2, _vehicle_status, timed=True)
         self.DeclarePeriodicPublishEvent(period, PUBLISH_OFFSET, self._answer)
         self.DeclarePeriodicPublishEvent(_QUESTION_PERIOD, PUBLISH_OFFSET, self._ask)
 

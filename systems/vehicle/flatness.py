@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from splatpilot.systems.common.drake import input_port, optional_input, output_port
+from splatpilot.systems.common.drake import optional_input, vector_input
 from splatpilot.systems.common.validation import Config, bounded, require, require_field
 from splatpilot.systems.vehicle.quadrotor import QuadrotorParams
 from splatpilot.systems.vehicle.state import (
@@ -67,9 +67,9 @@ def heading_along_motion(motion_W: Any, full_speed: float) -> tuple[Any, Any]:
     The strength, 0 to 1, falls as the square of the horizontal speed below `full_speed` [m/s], so
     that noise does not rotate a hovering vehicle.
     """
-    xp = array_namespace(motion_W)
     x, y = motion_W[..., 0], motion_W[..., 1]
-    return xp.arctan2(y, x), clip((x * x + y * y) / full_speed**2, high=1.0)
+    heading = array_namespace(motion_W).arctan2(y, x)
+    return heading, clip((x * x + y * y) / full_speed**2, high=1.0)
 
 
 @dataclass
@@ -121,7 +121,7 @@ def flatness_command(
         state: (..., 13).
         a_WB: (..., 3) [m/s^2], gravity excluded.
         motion_W: (..., 3) [m/s], gives the heading where `heading` does not.
-        heading: (...) [rad], NaN where there is none; or None.
+        heading: (...) [rad], NaN if free; or None.
     """
     xp = array_namespace(state)
     _, v_WB, q_WB, _ = QuadrotorState.of(state)
@@ -173,13 +173,8 @@ class FlatnessController(LeafSystem):
     .. pydrake_system::
 
         name: FlatnessController
-        input_ports:
-        - state
-        - waypoint
-        - acceleration
-        - heading
-        output_ports:
-        - command
+        input_ports: [state, waypoint, acceleration, heading]
+        output_ports: [command]
 
     - ``state`` (13): ``[p_WB (3) [m], v_WB (3) [m/s], q_WB (4, wxyz), w_WB_B (3) [rad/s]]``.
     - ``waypoint`` (3): p_WR [m], where the vehicle should be ``lookahead`` seconds from now.
@@ -198,15 +193,8 @@ class FlatnessController(LeafSystem):
         w_cmd_B = [tilt_gain · tilt, yaw_gain · yaw]
 
     where tilt and yaw rotate the body so that z lies along f_W and x along the heading or the
-    motion: toward the waypoint, or along v_WB if an acceleration is given. See
-    :mod:`~splatpilot.systems.vehicle.flatness`.
+    motion: toward the waypoint, or along v_WB if an acceleration is given.
     """
-
-    state_input_port = input_port("state")
-    waypoint_input_port = input_port("waypoint")
-    acceleration_input_port = input_port("acceleration")
-    heading_input_port = input_port("heading")
-    command_output_port = output_port("command")
 
     def __init__(
         self,
@@ -231,11 +219,9 @@ class FlatnessController(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(self._config.period, 0.0, self._update)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        config = self._config
-        state = self._eval_finite("state", context)
+        config, state = self._config, self._eval_finite("state", context)
         p_WB, v_WB, q_WB, _ = QuadrotorState.of(state)
         require_rotation(q_WB)
-
         use_waypoint = self.GetInputPort("waypoint").HasValue(context)
         if use_waypoint == self.GetInputPort("acceleration").HasValue(context):
             raise ValueError(
@@ -247,16 +233,14 @@ class FlatnessController(LeafSystem):
             a_WB = reaching_acceleration(p_WR, p_WB, v_WB, config.lookahead)
             motion_W = (p_WR - p_WB) / config.lookahead
         else:
-            a_WB = self._eval_finite("acceleration", context)
-            motion_W = v_WB
+            a_WB, motion_W = self._eval_finite("acceleration", context), v_WB
         heading = optional_input(self, "heading", context)
         heading = None if heading is None else heading[0]
-        discrete_state.set_value(
-            flatness_command(state, a_WB, motion_W, heading, config, self._params)
-        )
+        command = flatness_command(state, a_WB, motion_W, heading, config, self._params)
+        discrete_state.set_value(command)
 
     def _eval_finite(self, name: str, context: Context) -> np.ndarray:
-        value = np.asarray(self.GetInputPort(name).Eval(context))
+        value = vector_input(self, name, context)
         what = f"input '{name}' of '{self.get_name()}' at t = {context.get_time()} s"
         require(np.isfinite(value).all(), what, "finite", value.tolist())
         return value

@@ -59,7 +59,7 @@ class Chain:
         for simulator in self.simulators.values():
             clock = simulator.get_system().GetSubsystemByName("clock")
             root = simulator.get_mutable_context()
-            clock.set_epoch(clock.GetMyMutableContextFromRoot(root), EPOCH)
+            clock.set_epoch(root, EPOCH)
         self.alive = {"bridge", "link"}
         self.now = 0.0
         self.sees = dict(body=3) if motion_capture else None
