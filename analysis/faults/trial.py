@@ -27,24 +27,13 @@ from splatpilot.diagrams.hardware.real_time import output
 from splatpilot.diagrams.hardware.vehicle import BuildVehicleDiagram
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.common.drake import vector_input, weakly
+from splatpilot.systems.messaging import codecs
 from splatpilot.systems.messaging.bridge_status import UnixClock
-from splatpilot.systems.messaging.codecs import (
-    Codec,
-    CommandCodec,
-    MotionCaptureCodec,
-    StateCodec,
-    VehicleStatusCodec,
-    VelocitySetpointCodec,
-)
 from splatpilot.systems.messaging.failsafe import FailsafeConfig
 from splatpilot.systems.messaging.flight_limits import FlightLimits
 from splatpilot.systems.messaging.generated import lcmt_bridge_status as status
 from splatpilot.systems.messaging.lcm_ports import PUBLISH_OFFSET
-from splatpilot.systems.messaging.receiver import (
-    TimeOfFlightReceiver,
-    TimeOfFlightStream,
-    UdpConfig,
-)
+from splatpilot.systems.messaging.receiver import TimeOfFlightStream, UdpConfig
 from splatpilot.systems.sensing.time_of_flight import GRID_MAGIC
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 from splatpilot.systems.vehicle.state import QuadrotorState
@@ -148,8 +137,8 @@ class Relay:
         self,
         vehicle: LCM,
         bridge: LCM,
-        from_vehicle: list[Codec],
-        from_bridge: list[Codec],
+        from_vehicle: list[codecs.Codec],
+        from_bridge: list[codecs.Codec],
         faults: tuple[Fault, ...],
         random: np.random.Generator,
         grid_port: int | None = None,
@@ -159,8 +148,8 @@ class Relay:
         self._waiting: list[tuple[float, int, Callable[[bytes], None], bytes]] = []
         self._state: bytes | None = None  # that is frozen
         take = weakly(self._take)  # The relay owns LCM, which owns its callbacks.
-        for sender, codecs in ((vehicle, from_vehicle), (bridge, from_bridge)):
-            for codec in codecs:
+        for sender, signals in ((vehicle, from_vehicle), (bridge, from_bridge)):
+            for codec in signals:
                 sender.subscribe(codec.channel, partial(take, codec, sender is vehicle))
 
     def step(self, now: float) -> None:
@@ -177,7 +166,7 @@ class Relay:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
             out.sendto(packet, ("127.0.0.1", self._grid_port))
 
-    def _take(self, codec: Codec, from_vehicle: bool, channel: str, data: bytes) -> None:
+    def _take(self, codec: codecs.Codec, from_vehicle: bool, channel: str, data: bytes) -> None:
         send = partial(self._ends[1 if from_vehicle else 0].publish, channel)
         if codec.port == "depth_grid" and self._grid_port is not None:
             send, message = self._send_grid, codec.message.decode(data)
@@ -195,7 +184,7 @@ class Relay:
             heapq.heappush(self._waiting, (self._now + delay, self._count, send, sent))
 
     def _apply(
-        self, fault: Fault, codec: Codec, data: bytes, from_vehicle: bool
+        self, fault: Fault, codec: codecs.Codec, data: bytes, from_vehicle: bool
     ) -> list[tuple[float, bytes]]:
         """Applies a fault to a message; returns delays [s] and contents of its copies."""
         random, is_on, unchanged = self._random, fault.is_on(self._now), [(0.0, data)]
@@ -304,18 +293,11 @@ def fly_trial(
     bridge = BuildHardwareDiagram(scenario, world, far, config, policy=policy)
     grid_port = None
     if bridge.HasSubsystemNamed("depth_grid_receiver"):
-        receiver = bridge.GetSubsystemByName("depth_grid_receiver")
-        grid_port = cast(TimeOfFlightReceiver, receiver).port
-    images = image_codecs(scenario, policy)
-    relay = Relay(
-        near,
-        far,
-        [StateCodec(), VehicleStatusCodec(), MotionCaptureCodec(_BODY), *images],
-        [CommandCodec(), VelocitySetpointCodec()],
-        faults,
-        np.random.default_rng(seed),
-        grid_port,
-    )
+        grid_port = cast(Any, bridge.GetSubsystemByName("depth_grid_receiver")).port
+    sent = [codecs.StateCodec(), codecs.VehicleStatusCodec(), codecs.MotionCaptureCodec(_BODY)]
+    sent += image_codecs(scenario, policy)
+    commands = [codecs.CommandCodec(), codecs.VelocitySetpointCodec()]
+    relay = Relay(near, far, sent, commands, faults, np.random.default_rng(seed), grid_port)
     vehicle_simulator, bridge_simulator = Simulator(vehicle), Simulator(bridge)
     ApplySimulatorConfig(scenario.simulator, vehicle_simulator)
     root, bridge_root = (

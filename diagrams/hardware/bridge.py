@@ -29,21 +29,9 @@ from splatpilot.diagrams.hardware.real_time import output, run_in_real_time
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.common.validation import Config, bounded
+from splatpilot.systems.messaging import codecs
 from splatpilot.systems.messaging.arrival_triggered import ArrivalTriggered, can_be_triggered
 from splatpilot.systems.messaging.bridge_status import BridgeStatus
-from splatpilot.systems.messaging.codecs import (
-    Codec,
-    ColorImageCodec,
-    CommandCodec,
-    DepthGridCodec,
-    DepthImageCodec,
-    HypothesesCodec,
-    MotionCaptureCodec,
-    StateCodec,
-    StatusCodec,
-    VehicleStatusCodec,
-    VelocitySetpointCodec,
-)
 from splatpilot.systems.messaging.failsafe import Failsafe, FailsafeConfig
 from splatpilot.systems.messaging.generated import lcmt_bridge_status
 from splatpilot.systems.messaging.lcm_ports import (
@@ -52,11 +40,7 @@ from splatpilot.systems.messaging.lcm_ports import (
     open_lcm,
     recorded,
 )
-from splatpilot.systems.messaging.receiver import (
-    Receiver,
-    TimeOfFlightReceiver,
-    TimeOfFlightStream,
-)
+from splatpilot.systems.messaging.receiver import TimeOfFlightReceiver, TimeOfFlightStream
 from splatpilot.systems.policies.hypotheses import num_hypotheses_in
 from splatpilot.systems.policies.velocity import VelocitySetpoint
 from splatpilot.systems.sensing.time_of_flight import equivalent_sensor
@@ -103,12 +87,9 @@ def BuildHardwareDiagram(
     Builds the diagram that flies a vehicle by messages: that of `BuildFlightDiagram` with
     subscribers instead of plant and camera. It runs with the wall clock, see `run_in_real_time`.
 
-    Systems, by name: those of `AddPolicyAndController` and of `MessagePorts`; `state_predictor`,
-    which predicts the state for now; `velocity_setpoint`; `failsafe`, which all commands pass;
-    `status`; and `depth_grid_receiver` if `config` has a stream. There are subscribers of the
-    state, the policy's images, `vehicle_status` and `motion_capture_pose`, and publishers of
-    `command`, `velocity_setpoint`, `status` and `hypotheses`. Before the first message, states and
-    images are arbitrary but finite.
+    Systems, by name: those of `AddPolicyAndController` and `MessagePorts`; `state_predictor`;
+    `velocity_setpoint`; `failsafe`, which all commands pass; `status`; and `depth_grid_receiver` if
+    `config` has a stream. Before the first message, states and images are arbitrary but finite.
 
     .. pydrake_system::
 
@@ -117,18 +98,13 @@ def BuildHardwareDiagram(
         output_ports: [state, command, hypotheses, color_image, depth_image_32f, clearance,
             gradient, in_collision, field_state, velocity_setpoint, status, in_charge]
 
-    The ports are those of `BuildFlightDiagram`, with the policy's images; `status` and `overruns`
-    those of `BridgeStatus`; `command`, `velocity_setpoint`, `in_charge` and `lag` those of
-    `Failsafe`.
+    `status` and `overruns` are those of `BridgeStatus`; `command`, `velocity_setpoint`, `in_charge`
+    and `lag` those of `Failsafe`; the others those of `BuildFlightDiagram`.
 
     Args:
         scenario: policy and goal. Its vehicle is the model of the real one.
         world: its map, as far as known.
         policy, controller: see `BuildFlightDiagram`.
-
-    Raises:
-        ValueError: for an invalid configuration, a system without the ports it needs, sensors, and
-            worlds with moving obstacles.
     """
     config = config or HardwareConfig()
     config.validate()
@@ -137,9 +113,8 @@ def BuildHardwareDiagram(
     ports = MessagePorts(builder, lcm, config.tick)
 
     # State: received, and predicted for now, up to the age at which it is still used.
-    receivers: dict[str, Receiver] = {
-        "state": ports.subscribe(StateCodec(), hover_state(np.zeros(3)))
-    }
+    receivers: dict[str, System] = {}
+    receivers["state"] = ports.subscribe(codecs.StateCodec(), hover_state(np.zeros(3)))
     measured, state_age = (receivers["state"].GetOutputPort(name) for name in ("state", "age"))
     predictor = StatePredictor(config.failsafe.max_age)
     ports.add("state_predictor", predictor, measured_state=measured, age=state_age)
@@ -147,7 +122,7 @@ def BuildHardwareDiagram(
 
     # Policy, which updates when images arrive, and controller.
     policy = policy or make_policy(scenario, world)
-    codecs, period = image_codecs(scenario, policy), decision_period(scenario, policy)
+    cameras, period = image_codecs(scenario, policy), decision_period(scenario, policy)
     if can_be_triggered(policy):
         policy = ArrivalTriggered(policy, config.tick)
     decided, failed, heading, plans = (
@@ -159,7 +134,7 @@ def BuildHardwareDiagram(
     )
 
     # Images.
-    for codec in codecs:
+    for codec in cameras:
         if codec.port == "depth_grid" and config.time_of_flight is not None:
             receiver = TimeOfFlightReceiver(config.time_of_flight, config.tick)
             receivers[codec.port] = ports.add("depth_grid_receiver", receiver)
@@ -187,8 +162,8 @@ def BuildHardwareDiagram(
     setpoint = VelocitySetpoint(scenario.controller)
     ports.add("velocity_setpoint", setpoint, state=state, heading=heading, **target)
     collision = builder.GetSubsystemByName("collision")
-    vehicle_status = ports.subscribe(VehicleStatusCodec())
-    body = ports.subscribe(MotionCaptureCodec(config.body)) if config.body else None
+    vehicle_status = ports.subscribe(codecs.VehicleStatusCodec())
+    body = ports.subscribe(codecs.MotionCaptureCodec(config.body)) if config.body else None
     field = world.distance_field
     limits = config.failsafe, scenario.controller, scenario.vehicle
     failsafe = ports.add(
@@ -215,12 +190,12 @@ def BuildHardwareDiagram(
         failsafe.GetOutputPort(name)
         for name in ("command", "velocity_setpoint", "state_is_known", "is_ready")
     )
-    ports.publish(CommandCodec(), command, scenario.controller.period, is_known)
-    codec = VelocitySetpointCodec()
+    ports.publish(codecs.CommandCodec(), command, scenario.controller.period, is_known)
+    codec = codecs.VelocitySetpointCodec()
     ports.publish(codec, setpoint, scenario.controller.period, is_ready, decided)
-    ports.publish(StatusCodec(), status.GetOutputPort("status"), 1 / config.status_rate)
+    ports.publish(codecs.StatusCodec(), status.GetOutputPort("status"), 1 / config.status_rate)
     if plans is not None:
-        codec = HypothesesCodec(num_hypotheses_in(plans.size()))
+        codec = codecs.HypothesesCodec(num_hypotheses_in(plans.size()))
         ports.publish(codec, plans, period, decided=decided)
 
     for name, port in observed.items():
@@ -233,16 +208,16 @@ def BuildHardwareDiagram(
     return diagram
 
 
-def image_codecs(scenario: Scenario, policy: System) -> list[Codec]:
+def image_codecs(scenario: Scenario, policy: System) -> list[codecs.Codec]:
     """Returns the codecs of a policy's images."""
     camera, frame = policy_camera(scenario, policy), "policy_camera"
     size, tof = (camera.width, camera.height), equivalent_sensor(camera)
-    codecs = {
-        "depth_image_32f": DepthImageCodec(ImageDepth32F(*size), frame),
-        "color_image": ColorImageCodec(ImageRgba8U(*size), frame),
-        "depth_grid": DepthGridCodec(tof.columns, tof.rows, tof.max_range, frame),
+    images = {
+        "depth_image_32f": codecs.DepthImageCodec(ImageDepth32F(*size), frame),
+        "color_image": codecs.ColorImageCodec(ImageRgba8U(*size), frame),
+        "depth_grid": codecs.DepthGridCodec(tof.columns, tof.rows, tof.max_range, frame),
     }
-    return [codecs[name] for name in policy_images(policy)]
+    return [images[name] for name in policy_images(policy)]
 
 
 def require_messages_for(scenario: Scenario, world: World) -> None:
@@ -277,10 +252,6 @@ def run(
     Returns:
         `outcome` (of `Outcome`, "timeout" or "silence"), `flight_time_s`, and of `BridgeStatus`
         `gaps`, `rejected` and `overruns`.
-
-    Raises:
-        ValueError: for a scenario that cannot be flown by messages.
-        OSError: if LCM does not work, nothing comes, or the log cannot be written.
     """
     scenario.validate()
     config.validate()

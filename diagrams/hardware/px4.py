@@ -15,14 +15,7 @@ from splatpilot.diagrams.hardware.message_ports import MessagePorts
 from splatpilot.diagrams.hardware.real_time import output, run_in_real_time
 from splatpilot.diagrams.hardware.vehicle import STATUS_PERIOD
 from splatpilot.systems.common.validation import Config, bounded, require_field
-from splatpilot.systems.messaging.codecs import (
-    CommandCodec,
-    MotionCaptureCodec,
-    StateCodec,
-    StatusCodec,
-    VehicleStatusCodec,
-    VelocitySetpointCodec,
-)
+from splatpilot.systems.messaging import codecs
 from splatpilot.systems.messaging.lcm_ports import DEFAULT_URL, open_lcm
 from splatpilot.systems.messaging.receiver import UdpConfig, UdpInbox
 from splatpilot.systems.px4.commander import Px4Commander, Px4CommanderConfig
@@ -70,9 +63,7 @@ def BuildPx4Diagram(
     Builds the diagram between the bridge's messages and PX4. It replaces `BuildVehicleDiagram`,
     except for images, which sensors send themselves.
 
-    Systems, by name: `telemetry`, `commander`, those of `MessagePorts`: `state_publisher`,
-    `vehicle_status_publisher`, `setpoint_subscriber`, `status_subscriber`; and with motion capture
-    `motion_capture_subscriber`, or `motion_capture_receiver` and `motion_capture_publisher`.
+    Systems, by name: those of `MessagePorts`, `telemetry` and `commander`.
 
     .. pydrake_system::
 
@@ -94,21 +85,21 @@ def BuildPx4Diagram(
     telemetry = Px4Telemetry(inbox, mavlink, address, config.tick, now)
     ports.add("telemetry", telemetry)
     state, age = telemetry.GetOutputPort("state"), telemetry.GetOutputPort("age")
-    ports.publish_measurement("state", StateCodec(), state, age)
+    ports.publish_measurement("state", codecs.StateCodec(), state, age)
     vehicle_status = telemetry.GetOutputPort("vehicle_status")
-    ports.publish(VehicleStatusCodec(), vehicle_status, STATUS_PERIOD)
+    ports.publish(codecs.VehicleStatusCodec(), vehicle_status, STATUS_PERIOD)
 
     # Setpoints and mode, from the bridge to PX4.
     by_velocity = config.commander.setpoints == "velocity"
-    codec = VelocitySetpointCodec() if by_velocity else CommandCodec()
+    codec = codecs.VelocitySetpointCodec() if by_velocity else codecs.CommandCodec()
     setpoint = ports.subscribe(codec, name="setpoint")
-    status = ports.subscribe(StatusCodec()).GetOutputPort("status")
-    mode = ports.add("status_mode", Demultiplexer([1, StatusCodec.size - 1]), u0=status)
+    status = ports.subscribe(codecs.StatusCodec()).GetOutputPort("status")
+    mode = ports.add("status_mode", Demultiplexer([1, codecs.StatusCodec.size - 1]), u0=status)
 
     # Motion capture, to PX4 and, if it is not from there, to the bridge.
     pose = pose_age = None
     if config.body:
-        body = MotionCaptureCodec(config.body)
+        body = codecs.MotionCaptureCodec(config.body)
         if config.motion_capture is None:
             camera = ports.subscribe(body, name="motion_capture")
         else:
@@ -144,11 +135,6 @@ def run(*, config: Px4Config, duration: float = np.inf) -> None:
     Connects the bridge and PX4, for `duration` [s], or until it is interrupted.
 
     Prints changes of PX4's mode, and every ten seconds how long there has been no heartbeat.
-
-    Raises:
-        ValueError: for an invalid configuration.
-        OSError: if LCM does not work or the port is in use.
-        ModuleNotFoundError: without pymavlink.
     """
     config.validate()
     lcm, inbox = open_lcm(config.url), UdpInbox(config.udp)

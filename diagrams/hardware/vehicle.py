@@ -46,13 +46,7 @@ from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.collision.esdf_collision import EsdfCollision
 from splatpilot.systems.common.files import holds_folder, require_writable_folder
-from splatpilot.systems.messaging.codecs import (
-    CommandCodec,
-    MotionCaptureCodec,
-    StateCodec,
-    VehicleStatusCodec,
-    VelocitySetpointCodec,
-)
+from splatpilot.systems.messaging import codecs
 from splatpilot.systems.messaging.failsafe import Failsafe, FailsafeConfig
 from splatpilot.systems.messaging.flight_limits import FlightLimits
 from splatpilot.systems.messaging.lcm_ports import open_lcm
@@ -74,13 +68,12 @@ def BuildVehicleDiagram(
     scenario: Scenario, world: World, lcm: LCM, config: HardwareConfig | None = None
 ) -> Diagram:
     """
-    Builds the diagram of a simulated vehicle with the messages of a real one.
+    Builds the diagram of a simulated vehicle, in a world, with the messages of a real one.
 
     Systems, by name: those of `MessagePorts` and `AddObservation`; `plant`, `pose`, `collision`;
     `failsafe`, which hovers and then lands if commands cease, as autopilots do; `held_command`;
     and the loggers `state_log`, `command_log`. A vehicle that is commanded by velocities has
-    `setpoint`, `velocity_tracker` and `controller`. There are `command_subscriber` and publishers
-    of `state`, `vehicle_status`, `motion_capture_pose` and the policy's images.
+    `setpoint`, `velocity_tracker` and `controller`.
 
     .. pydrake_system::
 
@@ -89,13 +82,6 @@ def BuildVehicleDiagram(
 
     The ports are those of `BuildFlightDiagram`; `command_age` [s] is infinite before the first
     command.
-
-    Args:
-        scenario: the vehicle, and the policy's images.
-        world: that it flies in.
-
-    Raises:
-        ValueError: for an invalid configuration, sensors, and worlds with moving obstacles.
     """
     config = config or HardwareConfig()
     config.validate()
@@ -111,19 +97,18 @@ def BuildVehicleDiagram(
 
     # Commands, by a failsafe that knows no map and limits speed as MPC_XY_VEL_MAX of PX4.
     by_velocity = config.setpoints == "velocity"
-    codec = VelocitySetpointCodec() if by_velocity else CommandCodec()
+    codec = codecs.VelocitySetpointCodec() if by_velocity else codecs.CommandCodec()
     hover = [0.0, 0.0, 0.0, np.nan] if by_velocity else [scenario.vehicle.gravity, 0.0, 0.0, 0.0]
     subscriber = ports.subscribe(codec, np.array(hover), "command")
     received, command_age = subscriber.GetOutputPort(codec.port), subscriber.GetOutputPort("age")
     command = _AddVelocityControl(ports, scenario, state, received) if by_velocity else received
     limits = FlightLimits(max_speed=config.failsafe.limits.max_speed)
-    law = FailsafeConfig(max_age=SILENCE, recovery=config.tick, limits=limits)
+    autopilot = FailsafeConfig(max_age=SILENCE, recovery=config.tick, limits=limits)
+    model, box = (scenario.controller, scenario.vehicle), np.full(3, np.inf)
     no_age = ports.add("no_age", ConstantVectorSource(np.zeros(1)))
     failsafe = ports.add(
         "failsafe",
-        Failsafe(
-            law, scenario.controller, scenario.vehicle, np.full(3, -np.inf), np.full(3, np.inf)
-        ),
+        Failsafe(autopilot, *model, -box, box),
         state=state,
         state_age=no_age.get_output_port(),
         observation_age=command_age,
@@ -139,16 +124,16 @@ def BuildVehicleDiagram(
     status = builder.AddSystem(Multiplexer(2))
     builder.Connect(armed.get_output_port(), status.get_input_port(0))
     builder.Connect(failsafe.GetOutputPort("is_ready"), status.get_input_port(1))
-    ports.publish(VehicleStatusCodec(), status.get_output_port(0), STATUS_PERIOD)
+    ports.publish(codecs.VehicleStatusCodec(), status.get_output_port(0), STATUS_PERIOD)
     noise = builder.AddSystem(Sine(np.repeat([_NOISE, 0.0], [3, 10]), np.ones(13), np.zeros(13)))
     estimate = builder.AddSystem(Adder(2, 13))
     builder.Connect(state, estimate.get_input_port(0))
     builder.Connect(noise.get_output_port(0), estimate.get_input_port(1))
-    ports.publish(StateCodec(), estimate.get_output_port(), 1 / config.state_rate)
+    ports.publish(codecs.StateCodec(), estimate.get_output_port(), 1 / config.state_rate)
     if config.body:
         tracked = builder.AddSystem(MatrixGain(np.eye(13)[[0, 1, 2, 6, 7, 8, 9]]))
         builder.Connect(state, tracked.get_input_port())
-        codec = MotionCaptureCodec(config.body)
+        codec = codecs.MotionCaptureCodec(config.body)
         ports.publish(codec, tracked.get_output_port(), 1 / config.state_rate)
 
     # Images, whose size and rate are the policy's.
@@ -191,13 +176,7 @@ def run(*, scenario: Scenario, config: HardwareConfig, out: Path) -> dict[str, f
     Hovers at the scenario's start and flies by commands until the flight ends; writes the files of
     `write_flight` and `write_summary` into `out`. Time is counted from the first command.
 
-    Returns:
-        `Flight.summary()` and `overruns`, of ticks.
-
-    Raises:
-        ValueError: for a scenario that cannot be flown by messages.
-        OSError: if LCM does not work, no command comes within `config.patience`, or `out` cannot be
-            written.
+    Returns `Flight.summary()` and `overruns`, of ticks.
     """
     scenario.validate()
     config.validate()

@@ -50,16 +50,8 @@ _log = logging.getLogger(__name__)
 
 
 def open_lcm(url: str = DEFAULT_URL) -> LCM:
-    """
-    Opens LCM and checks that it delivers.
-
-    Args:
-        url: as LCM has it, `udpm://GROUP:PORT?ttl=HOPS` or, within this process, `memq://`.
-
-    Raises:
-        OSError: if there is no such provider, the port is in use, or there is no route for
-            multicast.
-    """
+    """Opens LCM at `udpm://GROUP:PORT?ttl=HOPS` or, within this process, `memq://`; raises OSError
+    unless it delivers."""
     if not url.startswith(("udpm://", "memq://")):
         raise OSError(f"the LCM URL must begin with udpm:// or memq://, got {url!r}")
     with open(os.devnull) as file:
@@ -344,12 +336,8 @@ def replay(path: Path, lcm: LCM, simulator: Simulator, clock: UnixClock) -> None
     """
     Simulates a diagram while it receives the messages of a log at the times of their arrival.
 
-    The same log gives a bitwise identical simulation.
-
-    Args:
-        lcm: of the diagram's systems, of `memq://`.
-        simulator: of the diagram, at time 0, which is the time of the first message.
-        clock: of the diagram.
+    The same log gives a bitwise identical simulation. The diagram, with its `clock`, has an LCM of
+    `memq://`; its time is 0, the time of the first message.
     """
     if not path.is_file():
         raise FileNotFoundError(f"No such file: {path}")

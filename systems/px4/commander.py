@@ -87,10 +87,10 @@ class Px4Commander(LeafSystem):
       the vehicle.
     - ``unix_time`` (1): [s].
 
-    Every ``period`` from time 0 it sends the setpoint, if it is fresh, and also as it comes, for
-    which it looks every ``tick``; every second a heartbeat. It sends poses on as ODOMETRY when they
-    come, each once, unless they follow another within 0.9 ``period`` or are older than a setpoint
-    may be.
+    Every ``period`` [s] from time 0 it sends the setpoint, if it is fresh, and also as it comes,
+    for which it looks every ``tick`` [s]; every second a heartbeat. It sends poses on as ODOMETRY
+    when they come, each once, unless they follow another within 0.9 ``period`` or are older than a
+    setpoint may be.
 
     After ``streaming`` seconds of setpoints it requests offboard mode, and in it arming, each if
     configured and if the bridge flies, once a second until PX4 grants it.
@@ -100,8 +100,7 @@ class Px4Commander(LeafSystem):
     offboard mode again. Nor does it if someone else has left it.
 
     A pilot may have taken over since PX4's last heartbeat. Therefore it requests nothing until a
-    heartbeat has come since the reason for it arose, and since its last request. Setpoints need no
-    such care: PX4 flies by them in offboard mode only.
+    heartbeat has come since the reason for it arose, and since its last request.
     """
 
     def __init__(
@@ -114,14 +113,7 @@ class Px4Commander(LeafSystem):
         period: float = 0.02,
         tick: float = 0.002,
     ):
-        """Constructs the system.
-
-        Args:
-            inbox: socket to send from, to PX4 at `address`.
-            gravity: [m/s^2].
-            period: [s] between setpoints, in whole ticks.
-            tick: [s] between looks for arrivals.
-        """
+        """Constructs the system, which sends from `inbox` to PX4 at `address`."""
         super().__init__()
         config.validate()
         self._config, self._mavlink, self._gravity, self._period = config, mavlink, gravity, period
