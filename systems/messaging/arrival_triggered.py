@@ -39,13 +39,11 @@ class _Last(NamedTuple):
 class ArrivalTriggered(LeafSystem):
     """Runs the periodic update of a system when an observation comes, instead of at its own times.
 
-    A policy that runs at 15 Hz on images at 15 Hz would see each up to a fifteenth of a second
-    late, by the phase between them. This one runs as an image comes, but no more often than at its
-    rate: it skips some of faster images, by the rule of virtual scheduling (ITU-T I.371, the
-    generic cell rate algorithm). Without a timely image it runs 1.6 periods after the last update.
-
-    An exception of the system is logged, once until the system succeeds again. Then the state is
-    kept, and ``failed`` tells a failsafe not to use the outputs.
+    At its own times, a policy would see images up to a period late. This one runs as an image
+    comes, but no more often than at its rate: it skips some of faster images, by the rule of
+    virtual scheduling (ITU-T I.371, the generic cell rate algorithm). Without a timely image it
+    runs 1.6 periods after the last update. An exception of the system is logged, once until the
+    system succeeds again, and its state is kept.
 
     .. pydrake_system::
 
@@ -84,9 +82,15 @@ class ArrivalTriggered(LeafSystem):
         self._last = int(self.DeclareDiscreteState(np.array(_Last())))
         for index in range(system.num_output_ports()):
             self._declare_output(system.get_output_port(index))
-        self.DeclareVectorOutputPort("decided", 1, self._calc_decided, {self.xd_ticket()})
-        self.DeclareVectorOutputPort("failed", 1, self._calc_failed, {self.xd_ticket()})
+        self._declare_last("decided", "time")
+        self._declare_last("failed", "failed")
         self.DeclarePeriodicDiscreteUpdateEvent(tick, 0.0, self._update)
+
+    def _declare_last(self, name: str, field: str) -> None:
+        def calc(context: Context, output: BasicVector) -> None:
+            output[0] = getattr(self._get_last(context), field)
+
+        self.DeclareVectorOutputPort(name, 1, calc, {self.xd_ticket()})
 
     def _declare_output(self, port: OutputPort) -> None:
         system, index = self._system, int(port.get_index())
@@ -150,12 +154,6 @@ class ArrivalTriggered(LeafSystem):
 
     def _get_last(self, context: Context) -> _Last:
         return _Last(*np.asarray(context.get_discrete_state(self._last).value()))
-
-    def _calc_decided(self, context: Context, output: BasicVector) -> None:
-        output[0] = self._get_last(context).time
-
-    def _calc_failed(self, context: Context, output: BasicVector) -> None:
-        output[0] = self._get_last(context).failed
 
 
 def can_be_triggered(system: System) -> bool:

@@ -210,13 +210,8 @@ class Failsafe(LeafSystem):
         upper_W: np.ndarray,
         field: Distances | None = None,
     ):
-        """Constructs the system.
-
-        Args:
-            controller: law that flies velocities; its limits hold for commands.
-            lower_W, upper_W: (3,) [m] corners of the flight volume, if `config` has no geofence.
-            field: distances to known obstacles, to check the path.
-        """
+        """Constructs the system, for a box (3,) [m], if `config` has no geofence, and distances to
+        known obstacles. `controller` flies velocities; its limits hold for commands."""
         super().__init__()
         config.validate()
         self._field = field

@@ -36,18 +36,12 @@ class Received:
 
 class Receiver[R: Received](LeafSystem):
     """
-    Base of systems that take all messages every `period` seconds from time 0.
+    Base of systems that take all messages of a `source` every `period` [s] from time 0.
 
     The update is unrestricted, so that discrete updates of the same instant see it. All systems
     have the output ``rejected`` (1): the number of messages that could not be used. The reason is
-    logged at the first, second, fourth, eighth... rejection.
-
-    Args:
-        initial: state before the first message.
-        source: name of the sender in the log.
-        period: [s] between updates.
-        now: tells the Unix time [s] of a process that runs with the wall clock; by default it is
-            the input `unix_time`.
+    logged at the first, second, fourth, eighth... rejection. `now` is the Unix time [s] of a
+    process that runs with the wall clock; by default it is the input `unix_time`.
     """
 
     def __init__(
@@ -69,8 +63,7 @@ class Receiver[R: Received](LeafSystem):
         """Declares an output: `value` of the state and, if `timed`, the time [s]."""
 
         def calc(context: Context, output: BasicVector) -> None:
-            received = cast(R, context.get_abstract_state(0).get_value())
-            numbers = np.atleast_1d(value(received, context.get_time()))
+            numbers = np.ravel(value(self._received(context), context.get_time()))
             output.SetFromVector(numbers.astype(float))
 
         tickets = {self.all_sources_ticket()} if timed else self._state
@@ -78,13 +71,13 @@ class Receiver[R: Received](LeafSystem):
 
     def _declare_age(self, stamp: Callable[[R], float]) -> None:
         """Declares the input `unix_time` and the output `age` since a Unix time `stamp` [s]."""
-        self._stamp = stamp
-        self.DeclareVectorInputPort("unix_time", 1)
-        self.DeclareVectorOutputPort("age", 1, self._calc_age)
 
-    def _calc_age(self, context: Context, output: BasicVector) -> None:
-        unix_time = vector_input(self, "unix_time", context)[0]
-        output[0] = unix_time - self._stamp(self._received(context))
+        def calc(context: Context, output: BasicVector) -> None:
+            unix_time = vector_input(self, "unix_time", context)[0]
+            output[0] = unix_time - stamp(self._received(context))
+
+        self.DeclareVectorInputPort("unix_time", 1)
+        self.DeclareVectorOutputPort("age", 1, calc)
 
     def _received(self, context: Context) -> R:
         return cast(R, context.get_abstract_state(0).get_value())
@@ -94,24 +87,15 @@ class Receiver[R: Received](LeafSystem):
         state.get_mutable_abstract_state(0).set_value(received)
 
     def _time_of_reading(self, context: Context) -> float:
-        """
-        Returns the Unix time [s] at which messages have been read; call it after that.
-
-        A process may be behind the wall clock, also within an update. By the Context's time,
-        messages would seem to have come before they were sent.
-        """
+        """Returns the Unix time [s] after messages have been read. By the Context's time, which may
+        be behind the wall clock, messages would seem to have come before they were sent."""
         return self._now() if self._now else float(vector_input(self, "unix_time", context)[0])
 
     def _take(
         self, received: R, messages: Iterable[bytes], strangers: int, read: Callable[[R, bytes], R]
     ) -> R:
-        """
-        Reads messages.
-
-        Args:
-            strangers: number of messages of other senders, which are rejected.
-            read: returns the state after a message; ValueError and struct.error reject it.
-        """
+        """Reads messages by `read`, which returns the state after one; rejects those for which it
+        raises ValueError or struct.error, and a number of messages of strangers."""
         if strangers:
             received = self._reject(received, "its sender is not in `senders`", strangers)
         for message in messages:
@@ -127,8 +111,6 @@ class Receiver[R: Received](LeafSystem):
             _log.warning("%s: message rejected, %d so far: %s", self.source, total, reason)
         return replace(received, rejected=total)
 
-
-# UDP ----------------------------------------------------------------------------------------------
 
 _MAX_PACKET = 65536  # [bytes]
 _BUFFER = 4_000_000  # [bytes] in the kernel: a second of raw frames.
@@ -148,11 +130,9 @@ class UdpConfig(Config):
     group: str = ""
 
     def check(self) -> None:
-        for name, addresses in (
-            ("host", [self.host]),
-            ("senders", self.senders),
-            ("group", [self.group] if self.group else []),
-        ):
+        groups = [self.group] if self.group else []
+        given = {"host": [self.host], "senders": self.senders, "group": groups}
+        for name, addresses in given.items():
             valid = all(map(_is_address, addresses))
             require_field(self, name, valid, "an IPv4 address, as 127.0.0.1")
         multicast = not self.group or 224 <= int(self.group.partition(".")[0]) <= 239
@@ -225,9 +205,6 @@ class UdpInbox:
                 strangers += 1
 
 
-# Time of flight -----------------------------------------------------------------------------------
-
-
 @dataclass
 class TimeOfFlightStream(Config):
     """The stream of a time-of-flight sensor."""
@@ -267,12 +244,11 @@ class TimeOfFlightReceiver(Receiver[_Grid]):
         super().__init__(_Grid(), f"UDP port {inbox.port}", period)
         weakref.finalize(self, inbox.close)
         self._sensor, self._inbox, self._waiting = config.sensor, inbox, list[Datagrams]()
-        size, latency = config.sensor.rows * config.sensor.columns, config.latency
-        zeros = np.zeros(size)
+        shape, latency = (config.sensor.rows, config.sensor.columns), config.latency
         self._declare(
             "depth_grid",
-            size,
-            lambda got, _: zeros if got.stream.grid is None else got.stream.grid.ravel(),
+            math.prod(shape),
+            lambda got, _: np.zeros(shape) if got.stream.grid is None else got.stream.grid,
         )
         self._declare("age", 1, lambda got, now: now - got.time + latency, timed=True)
         self._declare("gaps", 1, lambda got, _: got.stream.gaps)

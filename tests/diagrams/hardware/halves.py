@@ -27,8 +27,9 @@ class Halves:
         policy=None,
         **fields,
     ):
-        self.lcm, self.heard = lcm.LCM("memq://"), []
-        self.lcm.subscribe("BODY_RATE_COMMAND", lambda _, data: self.heard.append(data))
+        self.lcm = lcm.LCM("memq://")
+        self.heard = heard = []  # The callback must not keep the diagrams alive.
+        self.lcm.subscribe("BODY_RATE_COMMAND", lambda _, data: heard.append(data))
         config = replace(HardwareConfig(), **{"tick": TICK} | fields)
         self.tick_period = config.tick
         self.vehicle = BuildVehicleDiagram(vehicle or scenario, world, self.lcm, config)
