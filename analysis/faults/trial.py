@@ -52,11 +52,8 @@ or have flipped bits.
 
 Of two faults, the earlier one here is applied first: messages are decoded before corruption."""
 
-DELAY = 0.3
-"""[s] of delayed messages."""
-
-TICK = 0.01
-"""[s] of both diagrams."""
+DELAY = 0.3  # [s] of delayed messages.
+TICK = 0.01  # [s] of both diagrams.
 
 _PORTS = {
     **{"body_lost": "motion_capture_pose", "body_dropped": "motion_capture_pose"},

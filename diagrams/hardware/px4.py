@@ -24,8 +24,7 @@ from splatpilot.systems.px4.motion_capture import MotionCaptureConfig, MotionCap
 from splatpilot.systems.px4.telemetry import HEARTBEAT_TIMEOUT, Px4Telemetry
 from splatpilot.systems.vehicle.quadrotor import GRAVITY
 
-REMINDER = 10.0
-"""[s] of silence between messages that there is no heartbeat."""
+REMINDER = 10.0  # [s] of silence between messages that there is no heartbeat.
 
 
 @dataclass

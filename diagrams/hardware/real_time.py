@@ -12,9 +12,7 @@ from pydrake.systems.framework import Context, Diagram
 from splatpilot.systems.messaging.bridge_status import UnixClock
 from splatpilot.systems.messaging.lcm_ports import PUBLISH_OFFSET
 
-MAX_LAG = 0.05
-"""[s] Max lag of a diagram behind the wall clock."""
-
+MAX_LAG = 0.05  # [s] Max lag of a diagram behind the wall clock.
 _WATCH_PERIOD = 0.02  # [s] between calls of `over`, which is slower than most ticks.
 
 
@@ -34,19 +32,14 @@ def run_in_real_time(
     Advances a diagram, which has a `UnixClock` named `clock`, tick by tick. No tick is updated
     before its time on the wall clock.
 
-    A tick that ends after the begin of the next is an overrun; the diagram's inputs `overruns` and
-    `lag` [s], if any, tell their number and the delay. The next tick is then longer, to catch up
-    without leaving anything out. A lag above `MAX_LAG` is not caught up with: the diagram's time
-    stops meanwhile, and its `UnixClock` is set.
+    A tick that ends after the begin of the next is an overrun; their number is returned. The
+    diagram's inputs `overruns` and `lag` [s], if any, tell number and delay. The next tick is then
+    longer, to catch up without leaving anything out. A lag above `MAX_LAG` is not caught up
+    with: the diagram's time stops meanwhile, and its `UnixClock` is set.
 
     Args:
-        simulator: of the diagram, at time 0.
-        tick: [s].
         over: called with the time [s] fifty times a second, after a tick; returns True to end.
         ready: called after the first tick, which may be long; then time begins to pass.
-
-    Returns:
-        The number of overruns.
     """
     root = simulator.get_mutable_context()
     clock = cast(UnixClock, diagram.GetSubsystemByName("clock"))

@@ -58,9 +58,7 @@ from splatpilot.systems.vehicle.state import StateToPose
 SILENCE = 0.1
 """[s] without commands after which the vehicle holds its position, until they come again."""
 
-STATUS_PERIOD = 0.1
-"""[s] between messages of the vehicle's status."""
-
+STATUS_PERIOD = 0.1  # [s] between messages of the vehicle's status.
 _NOISE = 1e-6  # [m] in published positions: a failsafe takes a constant state for frozen.
 
 

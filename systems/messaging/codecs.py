@@ -10,16 +10,7 @@ from drake import lcmt_header, lcmt_image, lcmt_image_array
 from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
 from splatpilot.systems.common.validation import require
-from splatpilot.systems.messaging.generated import (
-    lcmt_body_rate_command,
-    lcmt_bridge_status,
-    lcmt_depth_grid,
-    lcmt_motion_capture_pose,
-    lcmt_quadrotor_state,
-    lcmt_trajectory_hypotheses,
-    lcmt_vehicle_status,
-    lcmt_velocity_setpoint,
-)
+from splatpilot.systems.messaging import generated
 from splatpilot.systems.policies.hypotheses import (
     NUM_WAYPOINTS,
     WAYPOINT_PERIOD,
@@ -87,14 +78,19 @@ class Codec:
 class StateCodec(Codec):
     """State (13): p_WB [m], v_WB [m/s], q_WB (wxyz), w_WB_B [rad/s]."""
 
-    channel, port, message, size = "QUADROTOR_STATE", "state", lcmt_quadrotor_state, 13
+    channel, port, message, size = "QUADROTOR_STATE", "state", generated.lcmt_quadrotor_state, 13
     fields = "p_WB", "v_WB", "q_WB", "w_WB_B"
 
 
 class CommandCodec(Codec):
     """Command (4): thrust over mass [m/s^2] and body rates w_cmd_B [rad/s]."""
 
-    channel, port, message, size = "BODY_RATE_COMMAND", "command", lcmt_body_rate_command, 4
+    channel, port, message, size = (
+        "BODY_RATE_COMMAND",
+        "command",
+        generated.lcmt_body_rate_command,
+        4,
+    )
     fields, frame = ("thrust", "w_cmd_B"), "body"
 
 
@@ -102,7 +98,7 @@ class VelocitySetpointCodec(Codec):
     """Velocity setpoint (4): v_WB [m/s] and heading [rad], NaN if it is free."""
 
     channel, port, size = "VELOCITY_SETPOINT", "velocity_setpoint", 4
-    message, fields, unbounded = lcmt_velocity_setpoint, ("v_WB", "heading"), ("heading",)
+    message, fields, unbounded = generated.lcmt_velocity_setpoint, ("v_WB", "heading"), ("heading",)
 
     def unpack(self, message, epoch):
         valid = not np.isinf(message.heading)
@@ -114,7 +110,7 @@ class MotionCaptureCodec(Codec):
     """Pose (7) of a body in motion capture: p_WB [m] and q_WB (wxyz)."""
 
     channel, port, size = "MOTION_CAPTURE_POSE", "motion_capture_pose", 7
-    message, fields = lcmt_motion_capture_pose, ("p_WB", "q_WB")
+    message, fields = generated.lcmt_motion_capture_pose, ("p_WB", "q_WB")
 
     def __init__(self, body: str):
         self.body = body
@@ -133,7 +129,7 @@ class MotionCaptureCodec(Codec):
 class StatusCodec(Codec):
     """Status (7): mode, reason, ages of state and observation [s], gaps, rejected, overruns."""
 
-    channel, port, message, size = "BRIDGE_STATUS", "status", lcmt_bridge_status, 7
+    channel, port, message, size = "BRIDGE_STATUS", "status", generated.lcmt_bridge_status, 7
     fields = (
         *("mode", "reason", "state_age", "observation_age"),
         *("num_gaps", "num_rejected", "num_overruns"),
@@ -145,7 +141,12 @@ class VehicleStatusCodec(Codec):
     """Vehicle status (2): 1 if it is armed, and 1 if it obeys the bridge; NaN, which is not sent,
     if unknown."""
 
-    channel, port, message, size = "VEHICLE_STATUS", "vehicle_status", lcmt_vehicle_status, 2
+    channel, port, message, size = (
+        "VEHICLE_STATUS",
+        "vehicle_status",
+        generated.lcmt_vehicle_status,
+        2,
+    )
     fields, frame = ("armed", "offboard"), ""
 
     def pack(self, value, header, epoch):
@@ -156,7 +157,7 @@ class HypothesesCodec(Codec):
     """Plan of K trajectories, see `splatpilot.systems.policies.hypotheses`."""
 
     channel, port = "TRAJECTORY_HYPOTHESES", "hypotheses"
-    message = lcmt_trajectory_hypotheses
+    message = generated.lcmt_trajectory_hypotheses
 
     def __init__(self, num_hypotheses: int):
         self.num_hypotheses, self.size = num_hypotheses, hypotheses_size(num_hypotheses)
@@ -184,20 +185,19 @@ class HypothesesCodec(Codec):
 
 
 class DepthGridCodec(Codec):
-    """Proximity 1 - range / max_range (height * width), row by row from the lowest."""
+    """Proximity 1 - range / max_range (height * width) of a sensor, `frame`, row by row from the
+    lowest."""
 
-    channel, port, message = "DEPTH_GRID", "depth_grid", lcmt_depth_grid
+    channel, port, message = "DEPTH_GRID", "depth_grid", generated.lcmt_depth_grid
 
     def __init__(self, width: int, height: int, max_range: float, frame: str):
-        """
-        Args:
-            max_range: [m] of proximity 0.
-            frame: name of the sensor.
-        """
         self.size, self.frame = width * height, frame
         self._content = {
             **{"width": width, "height": height, "num_values": self.size},
-            **{"encoding": lcmt_depth_grid.PROXIMITY, "max_range": float(np.float32(max_range))},
+            **{
+                "encoding": generated.lcmt_depth_grid.PROXIMITY,
+                "max_range": float(np.float32(max_range)),
+            },
         }
 
     def pack(self, value, header, epoch):
@@ -217,18 +217,14 @@ class DepthGridCodec(Codec):
 
 
 class ImageCodec(Codec):
-    """Image (height, width, channels), sent with zlib, received with or without it."""
+    """Image (height, width, channels) as an example, of a camera, `frame`; sent with zlib, received
+    with or without it."""
 
     message = lcmt_image_array
     _format: int
     _type: int
 
     def __init__(self, image: ImageDepth32F | ImageRgba8U, frame: str):
-        """
-        Args:
-            image: example.
-            frame: name of the camera.
-        """
         self.image, self.frame = image, frame
 
     def pack(self, value, header, epoch):

@@ -75,14 +75,8 @@ class Modes(NamedTuple):
     def after(
         self, fault: int, waits: bool, in_charge: bool | None, now: float, config: FailsafeConfig
     ) -> "Modes":
-        """
-        Returns the modes after another period.
-
-        Args:
-            waits: True if an input has never come.
-            in_charge: True if the vehicle obeys; None if unknown, which keeps the last value: a
-                landing continues if the vehicle is not heard any more.
-        """
+        """Returns the modes after another period; `waits` if an input has never come. An unknown
+        `in_charge` keeps its last value: a landing continues if the vehicle is not heard."""
         healthy = now if math.isnan(self.healthy) else self.healthy
         healthy = math.nan if fault or waits else healthy
         in_charge = bool(self.in_charge) if in_charge is None else in_charge
@@ -122,17 +116,9 @@ class Modes(NamedTuple):
         near: Surroundings,
         config: FailsafeConfig,
     ) -> tuple[np.ndarray, int]:
-        """
-        Computes the velocity setpoint of the mode.
-
-        Args:
-            desired: (4,) setpoint of the policy; None if only commands are sent.
-            motion: of the vehicle; None without a valid state.
-
-        Returns:
-            Velocity [m/s], W frame, and heading [rad] or NaN (4,), and the limit that changed the
-            desired one: a reason of `lcmt_bridge_status` or NONE.
-        """
+        """Computes the velocity setpoint (4,) of the mode from that of the policy, None if only
+        commands are sent; `motion` is None without a valid state. Also returns the limit that
+        changed it, a reason of `lcmt_bridge_status`, or NONE."""
         landing, max_speed = self.mode == status.LANDING, config.limits.max_speed
         descent = -min(config.descent, max_speed) if landing else 0.0
         if motion is None:
@@ -142,7 +128,7 @@ class Modes(NamedTuple):
                 return np.full(4, math.nan), status.NONE
             limited, limit = limit_velocity(desired[:3], motion, near, config.limits, landing=False)
             return np.append(limit_speed(limited, max_speed), desired[3]), limit
-        offset = np.nan_to_num(self.p_WH - motion.p_WB)  # [m] 0 without a held position.
+        offset = np.zeros(3) if math.isnan(self.p_WH[0]) else self.p_WH - motion.p_WB  # [m]
         back = limit_speed(_HOLDING_GAIN * offset, RETURN_SPEED)
         if landing:
             back[2] = descent
@@ -150,8 +136,7 @@ class Modes(NamedTuple):
         return np.append(limit_speed(limited, min(max_speed, RETURN_SPEED)), math.nan), status.NONE
 
 
-MAX_STATUS_AGE = 1.0
-"""[s] Max age of a vehicle's status."""
+MAX_STATUS_AGE = 1.0  # [s] Max age of a vehicle's status.
 
 _INPUTS = {
     **{"state": 13, "measured_state": 13, "velocity_setpoint": 4, "command": 4},

@@ -46,14 +46,10 @@ class Signals(NamedTuple):
         law: FlatnessControllerConfig,
         box: Box,
     ) -> int:
-        """
-        Returns the most severe fault, a reason of `lcmt_bridge_status`, or NONE.
+        """Returns the most severe fault, a reason of `lcmt_bridge_status`, or NONE.
 
-        Args:
-            max_age, max_lag, max_tilt: [s], [s] and [rad].
-            law: controller whose limits hold for the command.
-            box: that must hold the vehicle, unless only commands are sent: their sender is
-                responsible for the position.
+        The limits of `law` hold for the command. The box must hold the vehicle, unless only
+        commands are sent: their sender is responsible for the position.
         """
         max_rates = _TOLERANCE * np.array([law.max_tilt_rate, law.max_tilt_rate, law.max_yaw_rate])
         max_thrust = _TOLERANCE * law.max_thrust
@@ -101,8 +97,7 @@ class Track(NamedTuple):
         return cls(*vector[:3], state=vector[3:16], expected=vector[16:])
 
     def after(self, state: np.ndarray, time: float, now: float, max_gap: float) -> "Track":
-        """
-        Adds a state (13,) that was measured at `time` [s].
+        """Adds a state (13,) that was measured at `time` [s].
 
         It has jumped if it is not where the velocities of the states have led, or not rotated as
         their angular velocities say. Small differences fade. A jump remains one until the state

@@ -13,12 +13,8 @@ from splatpilot.systems.policies.velocity import RESPONSE_TIME
 from splatpilot.systems.vehicle.flatness import FlatnessControllerConfig
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
-LEVEL = 0.7
-"""[-] Min z of the normal of surfaces that can be landed on."""
-
-RETURN_SPEED = 1.0
-"""[m/s] Max speed back into the allowed volume."""
-
+LEVEL = 0.7  # [-] Min z of the normal of surfaces that can be landed on.
+RETURN_SPEED = 1.0  # [m/s] Max speed back into the allowed volume.
 _STEP = 0.05  # [m] between checked points of a path.
 _MAX_STEPS = 1000  # Only invalid states need more.
 
@@ -82,16 +78,10 @@ class Motion(NamedTuple):
         deceleration: float,
         law: FlatnessControllerConfig,
     ) -> "Motion":
-        """
-        Predicts where a vehicle that is controlled by a delayed state comes to rest.
+        """Predicts where a vehicle that is controlled by a delayed state comes to rest.
 
-        A command takes effect after a dead time: the age of the state, the lag of the attitude, and
-        the period for which commands are held. See `limit_approach`.
-
-        Args:
-            age: [s] since the measurement, compensated by prediction.
-            unpredicted: [s] further age without prediction.
-            law: controller of the velocity.
+        A command takes effect after a dead time: the `age` of the state [s], for which it is
+        predicted, `unpredicted` age [s], the lag of the attitude, and the period of commands.
         """
         stop = stopping_displacement(v_WB, RESPONSE_TIME, deceleration)
         dead_time = max(age, 0.0) + unpredicted + 1.0 / law.tilt_gain + law.period
@@ -101,15 +91,9 @@ class Motion(NamedTuple):
 def limit_velocity(
     desired: np.ndarray, motion: Motion, near: Surroundings, limits: FlightLimits, landing: bool
 ) -> tuple[np.ndarray, int]:
-    """
-    Limits a velocity (3,) [m/s], W frame.
-
-    Args:
-        landing: allows leaving the box downwards, and touching level surfaces.
-
-    Returns:
-        The velocity, and the last limit that changed it: a reason of `lcmt_bridge_status` or NONE.
-    """
+    """Limits a velocity (3,) [m/s]. Also returns the last limit that changed it, a reason of
+    `lcmt_bridge_status`, or NONE. `landing` allows leaving the box downwards, and touching level
+    surfaces."""
     velocity, reason = desired, status.NONE
 
     def apply(limited: np.ndarray, limit: int) -> None:
@@ -150,8 +134,7 @@ def limit_speed(velocity: np.ndarray, max_speed: float) -> np.ndarray:
 def stopping_displacement(
     velocity: np.ndarray, response_time: float, deceleration: float
 ) -> np.ndarray:
-    """
-    Predicts the displacement (3,) [m] of a vehicle from a command to stop until rest.
+    """Predicts the displacement (3,) [m] of a vehicle from a command to stop until rest.
 
     Its velocity v follows a commanded velocity u as v' = (u - v) / T, with T the response time,
     but brakes with at most a: over the distance T v, or (v² + (a T)²) / (2 a) from v = a T. The
@@ -167,16 +150,12 @@ def stopping_displacement(
 def limit_approach(
     velocity: np.ndarray, away: np.ndarray, room: float, reaction_time: float
 ) -> np.ndarray:
-    """
-    Limits a commanded velocity (3,) [m/s] so that the point of rest stays off an obstacle.
+    """Limits a commanded velocity (3,) [m/s] so that the point of rest stays off an obstacle, which
+    is `room` [m] away against the unit vector `away` (3,).
 
     Only the part toward the obstacle is reduced, to at most room / reaction_time; if the room is
     negative it leads away, by at most `RETURN_SPEED`. A point that obeys after a dead time t
     approaches without overshoot if reaction_time >= e t.
-
-    Args:
-        away: (3,) unit vector that leads away from the obstacle.
-        room: [m] from the point of rest to the obstacle.
     """
     fastest = max(room / reaction_time, -RETURN_SPEED)
     return velocity + away * max(0.0, -float(velocity.dot(away)) - fastest)
@@ -185,14 +164,9 @@ def limit_approach(
 def limit_ahead(
     velocity: np.ndarray, motion: Motion, field: Distances, min_clearance: float
 ) -> np.ndarray:
-    """
-    Limits a commanded velocity (3,) [m/s] by obstacles on the path: straight to the point of rest,
-    and from there along the velocity.
-
-    Args:
-        field: distances to known obstacles. Outside of it, where they are NaN, the path is free.
-        min_clearance: [m]. A vehicle that is nearer than that may leave.
-    """
+    """Limits a commanded velocity (3,) [m/s] by obstacles on the path: straight to the point of
+    rest, and from there along the velocity. Outside of the field, where distances are NaN, the path
+    is free. A vehicle that is nearer than `min_clearance` [m] may leave."""
     p, stop, reaction_time = motion
     nearest = min(min_clearance, float(field.distance(p)) - VEHICLE_RADIUS)
     for start, path in ((p, stop), (p + stop, velocity * reaction_time)):

@@ -34,12 +34,8 @@ PUBLISH_OFFSET = 1e-6
 """[s] from the updates of an instant to publishing their results: publish events of the same
 instant would see the state before the updates."""
 
-SAME_TIME = 1e-4
-"""[s] Max difference of equal times of measurement, computed from ages."""
-
-MAX_AHEAD = 0.2
-"""[s] Max lead of a sender's clock; ours is behind while the process is busy."""
-
+SAME_TIME = 1e-4  # [s] Max difference of equal times of measurement, computed from ages.
+MAX_AHEAD = 0.2  # [s] Max lead of a sender's clock; ours is behind while the process is busy.
 _PROBE = "SPLATPILOT_PROBE"
 _QUEUE = 1000  # Max number of waiting messages. LCM's 30 are half a second of states.
 
@@ -216,8 +212,7 @@ def decode_message(codec: Codec, data: bytes) -> Any:
 
 
 class MessageSubscriber(Receiver[_Received]):
-    """Outputs the signal of the last LCM message, its age, and the numbers of lost and rejected
-    ones.
+    """Outputs the signal of the last LCM message, its age, and numbers of lost and rejected ones.
 
     .. pydrake_system::
 
@@ -228,16 +223,13 @@ class MessageSubscriber(Receiver[_Received]):
     - ``unix_time`` (1): [s], see :class:`~splatpilot.systems.messaging.bridge_status.UnixClock`.
     - The port of the codec: the vector or image of the last message; before the first ``initial``,
       by default NaN or a black image.
-    - ``age`` (1): [s] since the last message was sent, by the sender's clock, which must be ours or
-      synchronized with it; infinity before the first.
-    - ``gaps`` (1): number of messages that were sent between those that came. A restart of the
-      sender leaves no gap.
+    - ``age`` (1): [s] since the last message was sent, by the sender's clock, which must be
+      synchronized with ours; infinity before the first.
+    - ``gaps`` (1): number of messages that did not come; a restart of the sender leaves no gap.
     - ``rejected`` (1): number of messages of another type or frame, malformed, not finite, no newer
-      than the one before, sent more than 0.2 s ahead of our clock, or by a second sender, which is
-      not heard while the first sends.
+      than the one before, sent more than 0.2 s ahead of our clock, or by a second sender.
 
-    Updates every ``period`` [s]. The ``lcm.LCM``, outside the Context, keeps 1000 messages between
-    updates.
+    The ``lcm.LCM``, outside the Context, keeps 1000 messages between updates.
     """
 
     def __init__(self, lcm: LCM, codec: Codec, period: float, initial: np.ndarray | None = None):
@@ -304,12 +296,8 @@ class MessageSubscriber(Receiver[_Received]):
 
 @contextmanager
 def recorded(lcm: LCM, path: Path, overwrite: bool = False) -> Iterator[None]:
-    """
-    Writes the messages of all channels into a log, with the times of their arrival.
-
-    A full disk ends the log, with one warning, but not the flight. OSError if the file exists,
-    unless with `overwrite`, or cannot be written.
-    """
+    """Writes the messages of all channels into a log, with the times of their arrival. A full disk
+    ends the log, with one warning, but not the flight."""
     require_unused(path, overwrite)
     log, is_writable = EventLog(path, "w", overwrite=overwrite), True
 

@@ -18,8 +18,7 @@ from splatpilot.systems.common.drake import vector_input
 from splatpilot.systems.common.validation import Config, bounded, require_field
 from splatpilot.systems.sensing.time_of_flight import Stream, TimeOfFlight, after_packet
 
-RESTART = 1.0
-"""[s] Silence after which a stream may be another."""
+RESTART = 1.0  # [s] Silence after which a stream may be another.
 
 _log = logging.getLogger(__name__)
 

@@ -78,13 +78,10 @@ class Px4Commander(LeafSystem):
         input_ports: [setpoint, setpoint_age, bridge_mode, heartbeat_age, armed, mode, granted,
             motion_capture_pose, motion_capture_age, unix_time]
 
-    - ``setpoint`` (4), ``setpoint_age`` (1) [s]: a velocity setpoint or a command of body rates, as
-      configured, and its age.
+    - ``setpoint`` (4), ``setpoint_age`` (1) [s]: velocities or body rates, as configured.
     - ``bridge_mode`` (1), optional: the mode in the bridge's status, see ``lcmt_bridge_status``.
-    - ``heartbeat_age`` (1) [s], ``armed`` (1), ``mode`` (2), ``granted`` (2): of
-      :class:`~splatpilot.systems.px4.telemetry.Px4Telemetry`.
-    - ``motion_capture_pose`` (7), ``motion_capture_age`` (1) [s], optional: p_WB [m] and q_WB of
-      the vehicle.
+    - ``heartbeat_age`` (1) [s], ``armed`` (1), ``mode`` (2), ``granted`` (2): of `Px4Telemetry`.
+    - ``motion_capture_pose`` (7), ``motion_capture_age`` (1) [s], optional: p_WB [m] and q_WB.
     - ``unix_time`` (1): [s].
 
     Every ``period`` [s] from time 0 it sends the setpoint, if it is fresh, and also as it comes,

@@ -12,15 +12,11 @@ from splatpilot.systems.px4.frames import swap_px4, thrust_to_px4
 _ONBOARD_COMPUTER = 191  # MAV_COMP_ID_ONBOARD_COMPUTER
 _CUSTOM_MODE, _ARMED = 1, 128  # MAV_MODE_FLAGs
 _ACCEPTED = 0  # MAV_RESULT_ACCEPTED
-
-SET_MODE, ARM = 176, 400
-"""Commands: MAV_CMD_DO_SET_MODE and MAV_CMD_COMPONENT_ARM_DISARM."""
-
+SET_MODE, ARM = 176, 400  # Commands: MAV_CMD_DO_SET_MODE and MAV_CMD_COMPONENT_ARM_DISARM.
 VELOCITY_AND_YAW_RATE, VELOCITY_AND_YAW, BODY_RATES = 1479, 2503, 128
 """Type masks of setpoints: fields that PX4 ignores."""
 
-OFFBOARD, HOLD, LAND = (6, 0), (4, 3), (4, 6)
-"""PX4's main and sub modes."""
+OFFBOARD, HOLD, LAND = (6, 0), (4, 3), (4, 6)  # PX4's main and sub modes.
 
 
 class Heartbeat(NamedTuple):

@@ -148,10 +148,9 @@ class Px4Telemetry(Receiver[_Telemetry]):
         output_ports: [state, age, heartbeat_age, armed, mode, granted, vehicle_status, rejected]
 
     - ``unix_time`` (1): [s].
-    - ``state`` (13): p_WB [m], v_WB [m/s], q_WB (wxyz), w_WB_B [rad/s], of LOCAL_POSITION_NED and
-      ATTITUDE_QUATERNION; at rest in the origin before both have come. Its time is that of the
-      older of the two; the other is brought back to it by its velocity or its rates.
-    - ``age`` (1): [s] since then; infinity before both have come.
+    - ``state`` (13), ``age`` (1) [s]: of LOCAL_POSITION_NED and ATTITUDE_QUATERNION, at the time of
+      the older; the other is brought back to it by its velocity or its rates. At rest in the
+      origin, and infinite, before both have come.
     - ``heartbeat_age`` (1): [s] since the last HEARTBEAT; infinity before the first.
     - ``armed`` (1), ``mode`` (2): of that; main and sub mode. 0 if it is older than 3 s.
     - ``vehicle_status`` (2): 1 if armed, and 1 in offboard mode; NaN if the last HEARTBEAT is older
@@ -160,10 +159,9 @@ class Px4Telemetry(Receiver[_Telemetry]):
     - ``rejected`` (1): number of packets and messages that were not MAVLink, not finite, of other
       senders, or no newer than the one before.
 
-    Requests PX4's time every second, and answers PX4's requests (TIMESYNC).
-
-    Ages are by PX4's own stamps, to include the delay of the link. The Unix time at which PX4's
-    clock was 0 is bounded by its fastest message and by its fastest answer::
+    Requests PX4's time every second, and answers PX4's requests (TIMESYNC). Ages are by PX4's own
+    stamps, to include the delay of the link. The Unix time at which PX4's clock was 0 is bounded by
+    its fastest message and by its fastest answer::
 
         question - answer <= zero <= arrival - stamp
 

@@ -14,9 +14,7 @@ from splatpilot.systems.common.validation import require
 from splatpilot.systems.sensing.noise import ObservationNoise
 from splatpilot.systems.vehicle.state import array_namespace, pose_from_state
 
-CYCLE = 64
-"""Number of frames after which their delays repeat."""
-
+CYCLE = 64  # Number of frames after which their delays repeat.
 _SPARE = 8  # Consecutive frames that may be lost; if more are, the last of them is seen.
 
 
@@ -72,14 +70,9 @@ def frame_delays(noise: ObservationNoise, late: Any, lost: Any) -> Any:
 
 
 def frame_ages(delays: Any, rate: Any, phase: Any, lookback: int, time: Any) -> Any:
-    """Computes the ages (N,) [s] at a time of the last frames that have come, of N streams.
-
-    Args:
-        delays: (N, CYCLE) [s], see `FrameTimes`; arrays or tensors.
-        rate, phase: (N,) [Hz], [-].
-        lookback: number of frames to search; if none of them has come, the last is seen.
-        time: (N,) [s].
-    """
+    """Computes the ages (N,) [s] at a `time` (N,) [s] of the last frames that have come, of N
+    streams, see `FrameTimes`. If none of `lookback` frames has come, the last of them is seen.
+    `delays` are (N, CYCLE), the others (N,)."""
     xp = array_namespace(time)
     streams = xp.arange(len(time), device=time.device)
     back = xp.arange(lookback, device=time.device)

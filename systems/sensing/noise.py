@@ -102,17 +102,14 @@ def corrupt_depth(
     max_depth: float = math.inf,
 ) -> Any:
     """
-    Adds errors and holes to planar depth [m].
+    Adds errors and holes to planar depth [m]: `relative` n_1 and `absolute` n_2 are drawn from
+    N(0, 1), `drop` u from U(0, 1), each of the depth's shape.
 
         z' = z (1 + depth_multiplicative n_1) + depth_additive n_2
 
     Pixels of 0 or infinity keep that. Beyond the range of the camera the result is as of Drake's
-    cameras: 0 below `min_depth`, infinity above `max_depth` [m]. Where u < depth_dropout it is
-    infinity.
-
-    Args:
-        relative, absolute: n_1 and n_2, of the depth's shape, drawn from N(0, 1).
-        drop: u, of the depth's shape, drawn from U(0, 1).
+    cameras: 0 below `min_depth`, infinity above `max_depth` [m]. It is infinity if
+    u < depth_dropout.
     """
     xp = array_namespace(depth)
     measured = xp.isfinite(depth) & (depth > 0.0)
@@ -138,14 +135,11 @@ def rotate_hue(color: Any, cos: Any, sin: Any) -> Any:
 
 def expose(color: Any, noise: ObservationNoise, error: Any, photons: Any) -> Any:
     """
-    Exposes colors (..., 3), 0 to 255, with shot and read noise.
+    Exposes colors (..., 3), 0 to 255, with shot and read noise; `error` u is drawn from U(-1, 1)
+    for each image, `photons` n from N(0, 1), of the colors' shape.
 
         light' = 2^(exposure_error u) (c / 255)^2.2
         c' = 255 clip(light' + n sqrt(light' / full_well + (read_noise / full_well)^2))^(1 / 2.2)
-
-    Args:
-        error: u, drawn from U(-1, 1) for each image, of a shape that broadcasts.
-        photons: n, of the colors' shape, drawn from N(0, 1).
     """
     light = (color / 255.0) ** _GAMMA * 2.0 ** (noise.exposure_error * error)
     if noise.full_well > 0.0:
@@ -156,13 +150,10 @@ def expose(color: Any, noise: ObservationNoise, error: Any, photons: Any) -> Any
 
 def corrupt_color(color: Any, noise: ObservationNoise, brighter: Any, grain: Any) -> Any:
     """
-    Changes the brightness of colors (..., 3), 0 to 255, and adds noise.
+    Changes the brightness of colors (..., 3), 0 to 255, and adds noise; `brighter` u is drawn from
+    U(-1, 1) for each image, `grain` n from N(0, 1), of the colors' shape.
 
         c' = clip(c (1 + brightness_jitter u) + 255 color_noise n)
-
-    Args:
-        brighter: u, drawn from U(-1, 1) for each image, of a shape that broadcasts.
-        grain: n, of the colors' shape, drawn from N(0, 1).
     """
     gain = 1.0 + noise.brightness_jitter * brighter
     return (gain * color + 255.0 * noise.color_noise * grain).clip(0.0, 255.0)

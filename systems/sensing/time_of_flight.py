@@ -18,8 +18,7 @@ from pydrake.systems.sensors import ImageDepth32F
 from splatpilot.systems.common.validation import Config, bounded, require, require_field
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera, focal_length
 
-UNMEASURED_DEPTH = 1e-3
-"""[m], up to which depth counts as unmeasured."""
+UNMEASURED_DEPTH = 1e-3  # [m], up to which depth counts as unmeasured.
 
 
 @dataclass
@@ -90,10 +89,8 @@ def equivalent_sensor(camera: OnboardCamera) -> TimeOfFlight:
 
 
 def time_of_flight_grid(depth: np.ndarray, sensor: TimeOfFlight) -> np.ndarray:
-    """
-    Computes the proximities (rows, columns) of a frame: 1 - range / max_range, at least 0.
-
-    Row 0 is the lowest: the grid is upside down.
+    """Computes the proximities (rows, columns) of a frame: 1 - range / max_range, at least 0; row 0
+    is the lowest.
 
     Args:
         depth: (H, W) [m] along the optical axis; not finite, or at most 1 mm, if unmeasured. A

@@ -1,12 +1,11 @@
 """Differential flatness of the quadrotor: from an acceleration to thrust and body rates.
 
-A quadrotor's position and yaw determine its attitude. The specific thrust supplies the desired
-acceleration, carries the weight and overcomes drag; its direction is the body z axis, and yaw
-fixes the rest (D. Mellinger and V. Kumar, "Minimum snap trajectory generation and control for
-quadrotors", ICRA 2011; with drag: M. Faessler, A. Franchi and D. Scaramuzza, "Differential flatness
-of quadrotor dynamics subject to rotor drag", RA-L 2018). Rates tilt the body z axis by the shortest
-rotation and yaw slower, since only tilt moves the vehicle (D. Brescianini and R. D'Andrea,
-"Tilt-prioritized quadrocopter attitude control", T-CST 2018).
+The specific thrust supplies the desired acceleration, carries the weight and overcomes drag; its
+direction is the body z axis, and yaw fixes the rest (Mellinger and Kumar, "Minimum snap trajectory
+generation and control for quadrotors", ICRA 2011; with drag: Faessler, Franchi and Scaramuzza,
+RA-L 2018). Rates tilt the body z axis by the shortest rotation and yaw slower, since only tilt
+moves the vehicle (Brescianini and D'Andrea, "Tilt-prioritized quadrocopter attitude control",
+T-CST 2018).
 
 Frames: W world, B body, D the desired body. The functions take numpy arrays or torch tensors of one
 vehicle or of N, and are differentiable. Thrust is over mass [m/s^2], angles are in rad.
@@ -38,20 +37,16 @@ _TINY = 1e-12  # Keeps directions and gradients finite where a length is zero.
 def reaching_acceleration(p_WR: Any, p_WB: Any, v_WB: Any, lookahead: float) -> Any:
     """Returns the constant acceleration (..., 3) [m/s^2] that reaches p_WR [m] in `lookahead` [s].
 
-    a = 2 (p_WR - p_WB - T v_WB) / T². Applied continually with p_WR(t) = r(t + T), it makes p_WB
-    follow r with the transfer function e^x / (1 + x + x²/2), x = sT: an error of third order in T,
-    damped at 1/√2. A lag of T/3 between commanded and actual acceleration removes the third order
-    too.
+    Applied continually with p_WR(t) = r(t + T), it makes p_WB follow r with the transfer function
+    e^x / (1 + x + x²/2), x = sT: an error of third order in T, damped at 1/√2. A lag of T/3 between
+    commanded and actual acceleration removes the third order too.
     """
     return 2.0 * (p_WR - p_WB - lookahead * v_WB) / lookahead**2
 
 
 def attitude_from_thrust(f_W: Any, yaw: Any) -> Any:
-    """Returns R_WD (..., 3, 3): z along the upward `f_W` (..., 3), x along `yaw` (...) from above.
-
-    Seen from above, body x points exactly along yaw: it is perpendicular to the horizontal
-    left-hand direction.
-    """
+    """Returns R_WD (..., 3, 3): z along the upward `f_W` (..., 3), and x, seen from above, exactly
+    along `yaw` (...)."""
     xp = array_namespace(f_W)
     zx, zy, zz = _components(unit_vectors(f_W))
     cos, sin = xp.cos(yaw), xp.sin(yaw)

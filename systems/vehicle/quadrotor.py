@@ -25,8 +25,7 @@ from splatpilot.systems.vehicle.state import QuadrotorState, array_namespace
 VEHICLE_RADIUS = 0.354
 """Propeller-tip radius of the vehicle [m]: closer than this to a surface is a collision."""
 
-GRAVITY = 9.81
-"""Standard gravity [m/s^2], along -z of the world."""
+GRAVITY = 9.81  # Standard gravity [m/s^2], along -z of the world.
 
 _NORM_GAIN = 5.0  # [1/s] pull of the quaternion toward unit length; errors decay as exp(-10 t).
 

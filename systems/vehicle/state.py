@@ -15,8 +15,7 @@ from scipy.spatial.transform import Rotation
 from splatpilot.systems.common.drake import vector_input, weakly
 from splatpilot.systems.common.validation import require
 
-LONGEST_PREDICTION = 0.1
-"""[s], maximum age of states that are predicted to the present."""
+LONGEST_PREDICTION = 0.1  # [s], maximum age of states that are predicted to the present.
 
 
 class QuadrotorState(NamedTuple):
