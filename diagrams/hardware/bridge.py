@@ -232,11 +232,7 @@ def require_messages_for(scenario: Scenario, world: World) -> None:
 
 
 def run(
-    *,
-    scenario: Scenario,
-    config: HardwareConfig,
-    log: Path | None = None,
-    overwrite: bool = False,
+    *, scenario: Scenario, config: HardwareConfig, log: Path | None = None, overwrite: bool = False
 ) -> dict[str, float | str]:
     """
     Waits for a vehicle's messages and flies it to the scenario's goal.

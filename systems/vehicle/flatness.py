@@ -192,9 +192,7 @@ class FlatnessController(LeafSystem):
     """
 
     def __init__(
-        self,
-        config: FlatnessControllerConfig | None = None,
-        params: QuadrotorParams | None = None,
+        self, config: FlatnessControllerConfig | None = None, params: QuadrotorParams | None = None
     ):
         super().__init__()
         self._config = replace(config or FlatnessControllerConfig())

@@ -20,12 +20,7 @@ class Halves:
     """Vehicle and bridge, whose time is two ticks behind; the test advances both."""
 
     def __init__(
-        self,
-        scenario: Scenario,
-        world,
-        vehicle: Scenario | None = None,
-        policy=None,
-        **fields,
+        self, scenario: Scenario, world, vehicle: Scenario | None = None, policy=None, **fields
     ):
         self.lcm = lcm.LCM("memq://")
         self.heard = heard = []  # The callback must not keep the diagrams alive.
