@@ -85,13 +85,8 @@ class StateCodec(Codec):
 class CommandCodec(Codec):
     """Command (4): thrust over mass [m/s^2] and body rates w_cmd_B [rad/s]."""
 
-    channel, port, message, size = (
-        "BODY_RATE_COMMAND",
-        "command",
-        generated.lcmt_body_rate_command,
-        4,
-    )
-    fields, frame = ("thrust", "w_cmd_B"), "body"
+    channel, port, size, frame = "BODY_RATE_COMMAND", "command", 4, "body"
+    message, fields = generated.lcmt_body_rate_command, ("thrust", "w_cmd_B")
 
 
 class VelocitySetpointCodec(Codec):
@@ -141,13 +136,8 @@ class VehicleStatusCodec(Codec):
     """Vehicle status (2): 1 if it is armed, and 1 if it obeys the bridge; NaN, which is not sent,
     if unknown."""
 
-    channel, port, message, size = (
-        "VEHICLE_STATUS",
-        "vehicle_status",
-        generated.lcmt_vehicle_status,
-        2,
-    )
-    fields, frame = ("armed", "offboard"), ""
+    channel, port, size, frame = "VEHICLE_STATUS", "vehicle_status", 2, ""
+    message, fields = generated.lcmt_vehicle_status, ("armed", "offboard")
 
     def pack(self, value, header, epoch):
         return None if np.isnan(value).any() else super().pack(value, header, epoch)
@@ -192,12 +182,10 @@ class DepthGridCodec(Codec):
 
     def __init__(self, width: int, height: int, max_range: float, frame: str):
         self.size, self.frame = width * height, frame
+        max_range, encoding = float(np.float32(max_range)), self.message.PROXIMITY
         self._content = {
             **{"width": width, "height": height, "num_values": self.size},
-            **{
-                "encoding": generated.lcmt_depth_grid.PROXIMITY,
-                "max_range": float(np.float32(max_range)),
-            },
+            **{"encoding": encoding, "max_range": max_range},
         }
 
     def pack(self, value, header, epoch):
