@@ -44,11 +44,8 @@ KINDS = (
     *("policy_nonsense", "policy_raises", "policy_stalled", "policy_killed"),
     *("not_finite", "corrupt"),
 )
-"""Types of faults: messages are dropped, 300 ms late, sent twice, or overtake each other; the
-vehicle's clock jumps; its state is constant, or meters off; motion capture loses the vehicle, or
-its messages are dropped; packets of the time-of-flight sensor are dropped, or have flipped bits;
-the policy outputs nonsense or raises exceptions, its process stalls or ends; messages contain NaN,
-or have flipped bits.
+"""Types of faults. Clocks, states and grids are the vehicle's. Messages of "not_finite" contain NaN,
+those of "corrupt" are truncated and have flipped bits.
 
 Of two faults, the earlier one here is applied first: messages are decoded before corruption."""
 

@@ -111,15 +111,14 @@ class MessagePublisher(_Publisher):
         name: MessagePublisher
         input_ports: [(port of the codec), unix_time, enabled, decided]
 
-    - The port of the codec: a vector or an image.
     - ``unix_time`` (1): [s], see :class:`~splatpilot.systems.messaging.bridge_status.UnixClock`.
     - ``enabled`` (1), optional: 0 sends no messages.
-    - ``decided`` (1), optional: [s], when the signal was computed last. With a ``tick`` it is sent
-      then too, between two periods.
+    - ``decided`` (1), optional: [s], when the signal was computed last. With a ``tick`` [s], it is
+      sent then too, between two periods.
 
-    Publishes every ``period`` [s] from time 0, a microsecond later, and when forced. Looks at
-    ``decided`` every ``tick`` [s], never if None. Stateless: the sequence number is the Context's
-    time in whole periods, so that subscribers count messages that were not sent as missing.
+    Publishes every ``period`` [s] from time 0, a microsecond later, and when forced. The sequence
+    number is the Context's time in whole periods: subscribers count messages that were not sent as
+    missing.
     """
 
     def __init__(self, lcm: LCM, codec: Codec, period: float, tick: float | None = None):
@@ -163,8 +162,7 @@ class MeasurementPublisher(_Publisher):
         name: MeasurementPublisher
         input_ports: [(port of the codec), age, unix_time]
 
-    - The port of the codec: the last measured vector.
-    - ``age`` (1): [s] since its measurement; infinite before the first.
+    - ``age`` (1): [s] since the measurement; infinite before the first.
     - ``unix_time`` (1): [s], see :class:`~splatpilot.systems.messaging.bridge_status.UnixClock`.
 
     Looks every ``period`` [s] from time 0 and sends a microsecond later, with the time of the

@@ -57,11 +57,8 @@ def attitude_from_thrust(f_W: Any, yaw: Any) -> Any:
 
 
 def heading_along_motion(motion_W: Any, full_speed: float) -> tuple[Any, Any]:
-    """Returns the heading (...) [rad] of a motion (..., 3) [m/s] and how strongly to follow it.
-
-    The strength, 0 to 1, falls as the square of the horizontal speed below `full_speed` [m/s], so
-    that noise does not rotate a hovering vehicle.
-    """
+    """Returns the heading (...) [rad] of a motion (..., 3) [m/s] and how strongly, 0 to 1, to follow
+    it: less below a horizontal speed of `full_speed` [m/s], so that noise rotates no vehicle."""
     x, y = motion_W[..., 0], motion_W[..., 1]
     heading = array_namespace(motion_W).arctan2(y, x)
     return heading, clip((x * x + y * y) / full_speed**2, high=1.0)
@@ -172,15 +169,14 @@ class FlatnessController(LeafSystem):
         output_ports: [command]
 
     - ``state`` (13): ``[p_WB (3) [m], v_WB (3) [m/s], q_WB (4, wxyz), w_WB_B (3) [rad/s]]``.
-    - ``waypoint`` (3): p_WR [m], where the vehicle should be ``lookahead`` seconds from now.
-    - ``acceleration`` (3): a_WB [m/s^2], the desired acceleration, gravity excluded.
-    - ``heading`` (1), optional: where body x should point, seen from above, [rad] from world x;
-      along the motion if it is not connected or NaN.
+    - ``waypoint`` (3): p_WR [m], where the vehicle should be ``lookahead`` seconds from now; or
+      ``acceleration`` (3): a_WB [m/s^2], gravity excluded. Connect exactly one.
+    - ``heading`` (1), optional: of body x, seen from above, [rad] from world x; along the motion if
+      it is not connected or NaN.
     - ``command`` (4): ``[c [m/s^2], w_cmd_B (3) [rad/s]]``, held between updates; hover thrust
       before the first.
 
-    Connect exactly one of ``waypoint`` and ``acceleration``. Updates every ``period`` seconds from
-    time 0. With z_B the body z axis and limits applied to every step::
+    Updates every ``period`` [s] from time 0. With z_B the body z axis and limits at every step::
 
         a_WB    = 2 (p_WR - p_WB - T v_WB) / T²
         f_W     = a_WB + g e_z + drag v_WB

@@ -3,8 +3,8 @@
 State (13): ``[p_WB (3) [m], v_WB (3) [m/s], q_WB (4, wxyz), w_WB_B (3) [rad/s]]``.
 Command (4): ``[c [m/s^2], w_cmd_B (3) [rad/s]]``, with c the thrust over mass along body +z.
 
-The same formula serves single floats, numpy batches, arrays of Drake's AutoDiffXd or symbolic
-Expression, and torch batches, so that the simulated plant and the training loop share one model.
+The same formula serves floats, torch and numpy batches, and Drake's AutoDiffXd and Expression, so
+that the simulated plant and the training loop share one model.
 """
 
 import math
@@ -52,16 +52,14 @@ def hover_state(p_WB: Sequence[float] | np.ndarray, yaw: float = 0.0) -> np.ndar
 def quadrotor_derivatives(state: Any, command: Any, params: QuadrotorParams) -> Any:
     """Returns the time derivative (..., 13) of ``state`` (..., 13) under ``command`` (..., 4).
 
-    Both are numpy arrays (of float, AutoDiffXd or Expression) or both torch tensors; their
-    leading shapes broadcast. The equations, with z_B the body z axis and ⊗ the Hamilton product::
+    Their leading shapes broadcast. With z_B the body z axis and ⊗ the Hamilton product::
 
         d/dt p_WB   = v_WB
         d/dt v_WB   = c z_B - g e_z - drag v_WB
         d/dt q_WB   = 1/2 q_WB ⊗ (0, w_WB_B) + 5 (1 - |q_WB|²) q_WB
         d/dt w_WB_B = (w_cmd_B - w_WB_B) / rate_time_constant
 
-    The last term of the quaternion rate holds its length at one against integration error. The
-    attitude is that of the normalized quaternion, which must not be zero.
+    The last term of the quaternion rate holds its length at one against integration error.
     """
     rates = component_derivatives(
         [state[..., i] for i in range(13)], [command[..., i] for i in range(4)], *astuple(params)
@@ -79,10 +77,8 @@ def quadrotor_derivatives(state: Any, command: Any, params: QuadrotorParams) -> 
 def component_derivatives(
     state: Any, command: Any, drag: Any, rate_time_constant: Any, gravity: Any
 ) -> tuple[Any, ...]:
-    """Returns the 13 components of :func:`quadrotor_derivatives` from 13 + 4 components.
-
-    Plain Python floats are by far the fastest for a single vehicle.
-    """
+    """Returns the 13 components of :func:`quadrotor_derivatives` from 13 + 4 components; plain
+    Python floats are by far the fastest for a single vehicle."""
     _, _, _, vx, vy, vz, qw, qx, qy, qz, wx, wy, wz = state
     c, wx_cmd, wy_cmd, wz_cmd = command
     norm2 = qw * qw + qx * qx + qy * qy + qz * qz
@@ -130,11 +126,9 @@ def QuadrotorPlant_(T):
           continuous; by default ``initial_state``, a level hover at the world's origin.
         - Numeric parameter 0 (3): ``[drag [1/s], rate_time_constant [s], gravity [m/s^2]]``.
 
-        The equations are those of
-        :func:`~splatpilot.systems.vehicle.quadrotor.quadrotor_derivatives`. Supports the scalars
-        float, AutoDiffXd and Expression. Integrate in steps of at most 0.02 s without error
-        control: after 5 s of random commands at 50 Hz, ``runge_kutta3`` is within 2 cm of the
-        solution.
+        See :func:`~splatpilot.systems.vehicle.quadrotor.quadrotor_derivatives`. Supports the
+        scalars float, AutoDiffXd and Expression. Integrate in steps of at most 0.02 s: after 5 s of
+        random commands at 50 Hz, ``runge_kutta3`` is within 2 cm of the solution.
         """
 
         def _construct(

@@ -130,8 +130,7 @@ def rotation_matrices(q: Any) -> Any:
 
 
 class StateToPose(LeafSystem):
-    """Extracts the pose X_WB (RigidTransform) from the ``state`` (13) of a quadrotor, whose
-    quaternion is normalized. A zero or non-finite quaternion is an error.
+    """Extracts the pose X_WB (RigidTransform) from the ``state`` (13), see `pose_from_state`.
 
     .. pydrake_system::
 
