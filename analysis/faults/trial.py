@@ -44,8 +44,8 @@ KINDS = (
     *("policy_nonsense", "policy_raises", "policy_stalled", "policy_killed"),
     *("not_finite", "corrupt"),
 )
-"""Types of faults. Clocks, states and grids are the vehicle's. Messages of "not_finite" contain NaN,
-those of "corrupt" are truncated and have flipped bits.
+"""Types of faults. Clocks, states and grids are the vehicle's. Messages that are "not_finite"
+contain NaN, those that are "corrupt" are truncated and have flipped bits.
 
 Of two faults, the earlier one here is applied first: messages are decoded before corruption."""
 

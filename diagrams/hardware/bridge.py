@@ -13,15 +13,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, System
 from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
-from splatpilot.diagrams.flight.blocks import (
-    AddPolicyAndController,
-    ConnectObservation,
-    decision_period,
-    goal_position,
-    make_policy,
-    policy_camera,
-    policy_images,
-)
+from splatpilot.diagrams.flight import blocks
 from splatpilot.diagrams.flight.flight import Outcome, flight_outcome, has_landed
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.hardware.message_ports import MessagePorts
@@ -121,15 +113,15 @@ def BuildHardwareDiagram(
     state = predictor.GetOutputPort("state")
 
     # Policy, which updates when images arrive, and controller.
-    policy = policy or make_policy(scenario, world)
-    cameras, period = image_codecs(scenario, policy), decision_period(scenario, policy)
+    policy = policy or blocks.make_policy(scenario, world)
+    cameras, period = image_codecs(scenario, policy), blocks.decision_period(scenario, policy)
     if can_be_triggered(policy):
         policy = ArrivalTriggered(policy, config.tick)
     decided, failed, heading, plans = (
         policy.GetOutputPort(name) if policy.HasOutputPort(name) else None
         for name in ("decided", "failed", "heading", "hypotheses")
     )
-    autonomy = AddPolicyAndController(
+    autonomy = blocks.AddPolicyAndController(
         builder, scenario, world, state, policy, controller, guarded=True
     )
 
@@ -155,7 +147,7 @@ def BuildHardwareDiagram(
     builder.ExportInput(status.GetInputPort("overruns"), "overruns")
     observation_age = status.GetOutputPort("observation_age")
     age = observation_age if images else state_age
-    ConnectObservation(builder, observed | {"observation_age": age}, autonomy.policy)
+    blocks.ConnectObservation(builder, observed | {"observation_age": age}, autonomy.policy)
 
     # Failsafe.
     target = {autonomy.target.get_name(): autonomy.target}
@@ -210,14 +202,14 @@ def BuildHardwareDiagram(
 
 def image_codecs(scenario: Scenario, policy: System) -> list[codecs.Codec]:
     """Returns the codecs of a policy's images."""
-    camera, frame = policy_camera(scenario, policy), "policy_camera"
+    camera, frame = blocks.policy_camera(scenario, policy), "policy_camera"
     size, tof = (camera.width, camera.height), equivalent_sensor(camera)
     images = {
         "depth_image_32f": codecs.DepthImageCodec(ImageDepth32F(*size), frame),
         "color_image": codecs.ColorImageCodec(ImageRgba8U(*size), frame),
         "depth_grid": codecs.DepthGridCodec(tof.columns, tof.rows, tof.max_range, frame),
     }
-    return [images[name] for name in policy_images(policy)]
+    return [images[name] for name in blocks.policy_images(policy)]
 
 
 def require_messages_for(scenario: Scenario, world: World) -> None:
@@ -259,7 +251,8 @@ def run(
         wait_for_messages(diagram, config.patience)
         simulator = Simulator(diagram)
         root = simulator.get_context()
-        flight = BridgeFlight(diagram, root, scenario, goal_position(scenario, world), config)
+        p_WG = blocks.goal_position(scenario, world)
+        flight = BridgeFlight(diagram, root, scenario, p_WG, config)
         # Waits again, so that policies update just after images of the same rate.
         run_in_real_time(
             simulator,

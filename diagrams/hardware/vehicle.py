@@ -7,25 +7,11 @@ from pathlib import Path
 
 import numpy as np
 from lcm import LCM
+from pydrake.systems import primitives
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
 from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort
-from pydrake.systems.primitives import (
-    Adder,
-    ConstantVectorSource,
-    Demultiplexer,
-    LogVectorOutput,
-    MatrixGain,
-    Multiplexer,
-    Sine,
-    ZeroOrderHold,
-)
 
-from splatpilot.diagrams.flight.blocks import (
-    AddObservation,
-    decision_period,
-    goal_position,
-    make_policy,
-)
+from splatpilot.diagrams.flight import blocks
 from splatpilot.diagrams.flight.flight import (
     Flight,
     Outcome,
@@ -103,7 +89,7 @@ def BuildVehicleDiagram(
     limits = FlightLimits(max_speed=config.failsafe.limits.max_speed)
     autopilot = FailsafeConfig(max_age=SILENCE, recovery=config.tick, limits=limits)
     model, box = (scenario.controller, scenario.vehicle), np.full(3, np.inf)
-    no_age = ports.add("no_age", ConstantVectorSource(np.zeros(1)))
+    no_age = ports.add("no_age", primitives.ConstantVectorSource(np.zeros(1)))
     failsafe = ports.add(
         "failsafe",
         Failsafe(autopilot, *model, -box, box),
@@ -113,35 +99,36 @@ def BuildVehicleDiagram(
         velocity_setpoint=received if by_velocity else None,
         command=command,
     )
-    held = builder.AddNamedSystem("held_command", ZeroOrderHold(config.tick, 4))
+    held = builder.AddNamedSystem("held_command", primitives.ZeroOrderHold(config.tick, 4))
     builder.Connect(failsafe.GetOutputPort("command"), held.get_input_port())
     builder.Connect(held.get_output_port(), plant.GetInputPort("command"))
 
     # Status, state and motion capture.
-    armed = builder.AddSystem(ConstantVectorSource(np.ones(1)))
-    status = builder.AddSystem(Multiplexer(2))
+    armed = builder.AddSystem(primitives.ConstantVectorSource(np.ones(1)))
+    status = builder.AddSystem(primitives.Multiplexer(2))
     builder.Connect(armed.get_output_port(), status.get_input_port(0))
     builder.Connect(failsafe.GetOutputPort("is_ready"), status.get_input_port(1))
     ports.publish(codecs.VehicleStatusCodec(), status.get_output_port(0), STATUS_PERIOD)
-    noise = builder.AddSystem(Sine(np.repeat([_NOISE, 0.0], [3, 10]), np.ones(13), np.zeros(13)))
-    estimate = builder.AddSystem(Adder(2, 13))
+    sizes = np.repeat([_NOISE, 0.0], [3, 10])
+    noise = builder.AddSystem(primitives.Sine(sizes, np.ones(13), np.zeros(13)))
+    estimate = builder.AddSystem(primitives.Adder(2, 13))
     builder.Connect(state, estimate.get_input_port(0))
     builder.Connect(noise.get_output_port(0), estimate.get_input_port(1))
     ports.publish(codecs.StateCodec(), estimate.get_output_port(), 1 / config.state_rate)
     if config.body:
-        tracked = builder.AddSystem(MatrixGain(np.eye(13)[[0, 1, 2, 6, 7, 8, 9]]))
+        tracked = builder.AddSystem(primitives.MatrixGain(np.eye(13)[[0, 1, 2, 6, 7, 8, 9]]))
         builder.Connect(state, tracked.get_input_port())
         codec = codecs.MotionCaptureCodec(config.body)
         ports.publish(codec, tracked.get_output_port(), 1 / config.state_rate)
 
     # Images, whose size and rate are the policy's.
-    policy = make_policy(scenario, world)
-    images = AddObservation(builder, scenario, world, state, pose, policy)
+    policy = blocks.make_policy(scenario, world)
+    images = blocks.AddObservation(builder, scenario, world, state, pose, policy)
     for codec in image_codecs(scenario, policy):
-        ports.publish(codec, images[codec.port], decision_period(scenario, policy))
+        ports.publish(codec, images[codec.port], blocks.decision_period(scenario, policy))
 
     for name, port in (("state", state), ("command", held.get_output_port())):
-        LogVectorOutput(port, builder, LOG_PERIOD).set_name(f"{name}_log")
+        primitives.LogVectorOutput(port, builder, LOG_PERIOD).set_name(f"{name}_log")
         builder.ExportOutput(port, name)
     builder.ExportOutput(command_age, "command_age")
     for name in ("clearance", "gradient", "in_collision", "field_state"):
@@ -155,7 +142,7 @@ def _AddVelocityControl(
     ports: MessagePorts, scenario: Scenario, state: OutputPort, setpoint: OutputPort
 ) -> OutputPort:
     """Adds the control of velocity setpoints; returns its commands."""
-    parts = ports.add("setpoint", Demultiplexer([3, 1]), u0=setpoint)
+    parts = ports.add("setpoint", primitives.Demultiplexer([3, 1]), u0=setpoint)
     velocity, heading = parts.get_output_port(0), parts.get_output_port(1)
     tracker = ports.add("velocity_tracker", VelocityTracker(), state=state, velocity=velocity)
     controller = ports.add(
@@ -189,7 +176,7 @@ def run(*, scenario: Scenario, config: HardwareConfig, out: Path) -> dict[str, f
     root = simulator.get_mutable_context()
     plant = diagram.GetSubsystemByName("plant").GetMyMutableContextFromRoot(root)
     plant.SetContinuousState(start)
-    p_WG = goal_position(scenario, world)
+    p_WG = blocks.goal_position(scenario, world)
     took_off = math.inf
 
     def outcome() -> Outcome | None:

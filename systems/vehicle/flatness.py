@@ -57,8 +57,8 @@ def attitude_from_thrust(f_W: Any, yaw: Any) -> Any:
 
 
 def heading_along_motion(motion_W: Any, full_speed: float) -> tuple[Any, Any]:
-    """Returns the heading (...) [rad] of a motion (..., 3) [m/s] and how strongly, 0 to 1, to follow
-    it: less below a horizontal speed of `full_speed` [m/s], so that noise rotates no vehicle."""
+    """Returns the heading (...) [rad] of a motion (..., 3) [m/s] and how strongly to follow it: 1,
+    or less below a horizontal speed of `full_speed` [m/s], so that noise has no effect."""
     x, y = motion_W[..., 0], motion_W[..., 1]
     heading = array_namespace(motion_W).arctan2(y, x)
     return heading, clip((x * x + y * y) / full_speed**2, high=1.0)
