@@ -57,16 +57,8 @@ class BridgeStatus(LeafSystem):
 
 
 class UnixClock(LeafSystem):
-    """Outputs the Unix time of the Context's time, to stamp messages and to compute their ages.
-
-    .. pydrake_system::
-
-        name: UnixClock
-        output_ports: [unix_time]
-
-    - ``unix_time`` (1): [s], the epoch plus the Context's time.
-    - Numeric parameter 0 (1): the epoch [s], the Unix time of the Context's time 0.
-    """
+    """Outputs ``unix_time`` (1) [s], to stamp messages and to compute their ages: the epoch, numeric
+    parameter 0, plus the Context's time."""
 
     def __init__(self):
         super().__init__()

@@ -343,16 +343,8 @@ def _calc_is_ready(context: Context, output: BasicVector) -> None:
 
 
 class FiniteVector(LeafSystem):
-    """Replaces a vector if any of its elements is not finite.
-
-    .. pydrake_system::
-
-        name: FiniteVector
-        input_ports: [signal]
-        output_ports: [finite]
-
-    Both have the same size; ``finite`` is ``signal`` or ``substitute`` in all elements.
-    """
+    """Passes the input ``signal`` to the output ``finite``, or ``substitute`` in all elements if any
+    of the signal is not finite."""
 
     def __init__(self, size: int, substitute: float = 0.0):
         super().__init__()

@@ -82,7 +82,6 @@ class Px4Commander(LeafSystem):
     - ``bridge_mode`` (1), optional: the mode in the bridge's status, see ``lcmt_bridge_status``.
     - ``heartbeat_age`` (1) [s], ``armed`` (1), ``mode`` (2), ``granted`` (2): of `Px4Telemetry`.
     - ``motion_capture_pose`` (7), ``motion_capture_age`` (1) [s], optional: p_WB [m] and q_WB.
-    - ``unix_time`` (1): [s].
 
     Every ``period`` [s] from time 0 it sends the setpoint, if it is fresh, and also as it comes,
     for which it looks every ``tick`` [s]; every second a heartbeat. It sends poses on as ODOMETRY

@@ -51,7 +51,6 @@ class MotionCaptureReceiver(Receiver[_Pose]):
         input_ports: [unix_time]
         output_ports: [motion_capture_pose, age, rejected]
 
-    - ``unix_time`` (1): [s].
     - ``motion_capture_pose`` (7): last p_WB [m] and q_WB (wxyz) of the tracked body; NaN before.
     - ``age`` (1): [s] since the exposure of that; infinity before. It grows without frames, and
       while frames do not track the body.

@@ -136,7 +136,6 @@ class Px4Telemetry(Receiver[_Telemetry]):
         input_ports: [unix_time]
         output_ports: [state, age, heartbeat_age, armed, mode, granted, vehicle_status, rejected]
 
-    - ``unix_time`` (1): [s].
     - ``state`` (13), ``age`` (1) [s]: of LOCAL_POSITION_NED and ATTITUDE_QUATERNION, at the time of
       the older; the other is brought back to it by its velocity or its rates. At rest in the
       origin, and infinite, before both have come.

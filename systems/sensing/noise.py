@@ -190,14 +190,7 @@ class _ImageNoise(LeafSystem):
 
 
 class DepthNoise(_ImageNoise):
-    """Adds errors and holes to images of planar depth [m], see `corrupt_depth`.
-
-    .. pydrake_system::
-
-        name: DepthNoise
-        input_ports: [depth_image_32f]
-        output_ports: [depth_image_32f]
-    """
+    """Adds errors and holes to ``depth_image_32f`` of planar depth [m], see `corrupt_depth`."""
 
     port, image = "depth_image_32f", ImageDepth32F
 
@@ -208,15 +201,8 @@ class DepthNoise(_ImageNoise):
 
 
 class ColorNoise(_ImageNoise):
-    """Changes hue, blur, exposure and brightness of color images, and adds noise to each pixel; see
-    `rotate_hue`, `expose` and `corrupt_color`. Alpha is kept.
-
-    .. pydrake_system::
-
-        name: ColorNoise
-        input_ports: [color_image]
-        output_ports: [color_image]
-    """
+    """Changes hue, blur, exposure and brightness of ``color_image``, and adds noise to each pixel;
+    see `rotate_hue`, `expose` and `corrupt_color`. Alpha is kept."""
 
     port, image = "color_image", ImageRgba8U
 

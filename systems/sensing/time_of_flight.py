@@ -123,17 +123,8 @@ def range_of_depth(height: int, width: int, fov_x: float, fov_y: float) -> np.nd
 
 
 class TimeOfFlightGrid(LeafSystem):
-    """Converts raw frames to grids of proximities, see `time_of_flight_grid`.
-
-    .. pydrake_system::
-
-        name: TimeOfFlightGrid
-        input_ports: [depth_image_32f]
-        output_ports: [depth_grid]
-
-    - ``depth_image_32f``: planar depth [m], of the sensor's size.
-    - ``depth_grid`` (rows * columns): 1 - range / max_range, row by row from the lowest.
-    """
+    """Converts frames ``depth_image_32f`` to proximities ``depth_grid`` (rows * columns), row by row
+    from the lowest, see `time_of_flight_grid`."""
 
     def __init__(self, sensor: TimeOfFlight | None = None):
         super().__init__()

@@ -130,14 +130,7 @@ def rotation_matrices(q: Any) -> Any:
 
 
 class StateToPose(LeafSystem):
-    """Extracts the pose X_WB (RigidTransform) from the ``state`` (13), see `pose_from_state`.
-
-    .. pydrake_system::
-
-        name: StateToPose
-        input_ports: [state]
-        output_ports: [pose]
-    """
+    """Outputs the ``pose`` X_WB (RigidTransform) of a ``state`` (13), see `pose_from_state`."""
 
     def __init__(self):
         super().__init__()
