@@ -343,8 +343,8 @@ def _calc_is_ready(context: Context, output: BasicVector) -> None:
 
 
 class FiniteVector(LeafSystem):
-    """Passes the input ``signal`` to the output ``finite``, or ``substitute`` in all elements if any
-    of the signal is not finite."""
+    """Passes the input ``signal`` to the output ``finite``, or ``substitute`` in all elements if
+    any of the signal is not finite."""
 
     def __init__(self, size: int, substitute: float = 0.0):
         super().__init__()

@@ -123,8 +123,8 @@ def range_of_depth(height: int, width: int, fov_x: float, fov_y: float) -> np.nd
 
 
 class TimeOfFlightGrid(LeafSystem):
-    """Converts frames ``depth_image_32f`` to proximities ``depth_grid`` (rows * columns), row by row
-    from the lowest, see `time_of_flight_grid`."""
+    """Converts frames ``depth_image_32f`` to proximities ``depth_grid`` (rows * columns), row by
+    row from the lowest, see `time_of_flight_grid`."""
 
     def __init__(self, sensor: TimeOfFlight | None = None):
         super().__init__()
