@@ -57,8 +57,8 @@ class BridgeStatus(LeafSystem):
 
 
 class UnixClock(LeafSystem):
-    """Outputs ``unix_time`` (1) [s], which stamps messages: the epoch, numeric parameter 0, plus the
-    Context's time."""
+    """Outputs ``unix_time`` (1) [s], which stamps messages: the epoch, numeric parameter 0, plus
+    the Context's time."""
 
     def __init__(self):
         super().__init__()

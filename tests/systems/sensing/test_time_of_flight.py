@@ -61,13 +61,6 @@ def test_unmeasured_depth_is_far(value):
     assert (time_of_flight_grid(frame(value), TimeOfFlight()) == 0.0).all()
 
 
-def test_one_near_pixel_fills_its_cell():
-    depth = frame()
-    depth[3, 5] = 1.0
-    grid = time_of_flight_grid(depth, WHOLE)
-    assert grid[8, 0] > 0.4 and np.count_nonzero(grid) == 1
-
-
 def test_frames_on_their_side_are_rotated_upright():
     depth = np.full((180, 240), 10.0)
     depth[5, 236] = 1.0
