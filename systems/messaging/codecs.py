@@ -66,13 +66,16 @@ class Codec:
     def unpack(self, message: Any, epoch: float) -> np.ndarray:
         """Returns the array of a message of the right type and frame; raises ValueError for invalid
         content."""
-        parts = {name: getattr(message, name) for name in self.fields}
-        for name, part in parts.items():
+        numbers, bounded = [], []
+        for name in self.fields:
+            part = getattr(message, name)
             if name.startswith("q_"):
                 require_unit_quaternion(part)
-            if name not in self.unbounded:
-                finite(part)
-        return np.hstack(list(parts.values())).astype(float)
+            part = part if isinstance(part, tuple | list) else (part,)
+            numbers += part
+            bounded += part if name not in self.unbounded else ()
+        finite(bounded)
+        return np.array(numbers, dtype=float)
 
 
 class StateCodec(Codec):
