@@ -52,15 +52,15 @@ class Codec:
     def pack(self, value: np.ndarray, header: lcmt_header, epoch: float) -> Any:
         """Returns the message, or None without a value yet; `epoch` is the Unix time [s] of the
         Context's time 0."""
-        message, start = self.stamped(header), 0
+        message, numbers = self.stamped(header), value.tolist()
         for name in self.fields:
             default = getattr(message, name)
             if isinstance(default, list):
-                part = value[start : start + len(default)]
+                part, numbers = numbers[: len(default)], numbers[len(default) :]
             else:
-                part = type(default)(value[start])
+                part, *numbers = numbers
+                part = type(default)(part)
             setattr(message, name, part)
-            start += np.size(default)
         return message
 
     def unpack(self, message: Any, epoch: float) -> np.ndarray:
