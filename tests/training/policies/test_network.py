@@ -13,7 +13,7 @@ from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK, DiffAeroTofCo
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS
 from splatpilot.systems.policies.recurrent_network import RecurrentNetwork
 from splatpilot.systems.policies.velocity import tracking_acceleration
-from splatpilot.systems.sensing.time_of_flight import sensor_of, time_of_flight_grid
+from splatpilot.systems.sensing.time_of_flight import equivalent_sensor, time_of_flight_grid
 from splatpilot.systems.vehicle.state import QuadrotorState
 from splatpilot.training.policies.networks import TrajectoryModule
 from splatpilot.training.policies.train_agile_autonomy import AgileAutonomyAgent
@@ -65,7 +65,7 @@ def test_policy_of_time_of_flight_flies_as_it_was_trained():
     with torch.no_grad():
         learner.network.head.weight.mul_(10.0)
     network = RecurrentNetwork(DIFFAERO_NETWORK, weights_of(learner.network))
-    body, sensor = vehicle(), sensor_of(DiffAeroTofConfig().camera)
+    body, sensor = vehicle(), equivalent_sensor(DiffAeroTofConfig().camera)
     state = body.state[0].double().numpy()
     memory, hidden = learner.initial_memory(1), network.initial_hidden()
     for seed in range(3):
