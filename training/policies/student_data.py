@@ -172,7 +172,7 @@ class StudentData:
     @cached_property
     def _fields(self) -> EsdfGeometry:
         """Distances in all worlds; unknown space is occupied, as for the expert."""
-        fields = [self._records[name].esdf() for name in self.worlds]
+        fields = [self._records[name].esdf for name in self.worlds]
         return EsdfGeometry([f if f.occupied_outside else f.conservative() for f in fields])
 
 

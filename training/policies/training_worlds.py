@@ -52,8 +52,8 @@ from splatpilot.training.corpus.library import (
     PROCEDURAL,
     ROUNDABOUT,
     check_library,
-    place_to_learn_in,
-    world_of,
+    training_scene,
+    scenario_world,
 )
 from splatpilot.training.policies.ray_casting import Geometry, Grids, MixedGeometry, ShapeGeometry
 
@@ -345,7 +345,7 @@ class WorldSelection(Config):
     def check(self) -> None:
         check_library(self.kinds, self.scenes)
         for scene in self.scenes:
-            place_to_learn_in(scene)
+            training_scene(scene)
 
     @property
     def turns(self) -> list[str]:
@@ -356,7 +356,7 @@ class WorldSelection(Config):
 def make_training_world(kind: str, seed: int, cache: WorldCache) -> TrainingWorld:
     """Makes the world of a scenario and seed as the benchmark flies it, without what cameras
     see."""
-    return TrainingWorld(*cache.spec(world_of(kind), seed))
+    return TrainingWorld(*cache.spec(scenario_world(kind), seed))
 
 
 def training_worlds(
@@ -398,7 +398,7 @@ class _Place(NamedTuple):
 
     @classmethod
     def read(cls, scene: str) -> "_Place":
-        esdf = make_world(place_config(place_to_learn_in(scene)), seed=0).esdf
+        esdf = make_world(place_config(training_scene(scene)), seed=0).esdf
         return cls(esdf, esdf.conservative())
 
     def world(self, seed: int) -> TrainingWorld:

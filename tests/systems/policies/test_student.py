@@ -1,5 +1,3 @@
-"""The student as a Drake system."""
-
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -56,8 +54,6 @@ def config_of(name: str, files: dict[str, str], **camera) -> StudentConfig:
 
 @pytest.mark.parametrize("name", CONFIGS)
 def test_plans_at_its_rate(name, files):
-    """The hypotheses are those of the pure policy at the last multiple of the period, from the kind
-    of image that the student sees and no other."""
     config = config_of(name, files)
     system, rng = Student(config), np.random.default_rng(1)
     simulator = Simulator(system)
@@ -89,8 +85,6 @@ def test_plans_at_its_rate(name, files):
 
 
 def test_weights_and_cameras_that_do_not_fit_are_refused(files, tmp_path):
-    """Weights of the other observation, of none, of an architecture that there is not, and a camera
-    other than in training are named."""
     with pytest.raises(ValueError, match="holds weights of the policy 'student_rgb'"):
         Student(StudentDepthConfig(weights=files["rgb"]))
     with pytest.raises(FileNotFoundError, match="train them with: splatpilot train student_rgb"):
@@ -110,8 +104,6 @@ def test_weights_and_cameras_that_do_not_fit_are_refused(files, tmp_path):
 
 @pytest.mark.parametrize("name", CONFIGS)
 def test_flies_as_fast_as_it_is_asked_to(name, files):
-    """Upright and far from the goal it plans half as far at half of its expert's speed as at all of
-    it, with the same costs; a speed that nobody flies at is refused."""
     image = np.zeros((48, 64, 3), np.uint8) if name == "rgb" else np.full((48, 64), 5.0, np.float32)
     X_WB, v_WB = RigidTransform([1.0, 2.0, 1.5]), np.array([1.2, -0.4, 0.0])
 
@@ -128,8 +120,6 @@ def test_flies_as_fast_as_it_is_asked_to(name, files):
 
 @pytest.mark.parametrize(("distance", "scale"), [(0.0, 0.0), (0.5, 0.5), (1.0, 2.0), (5.0, 2.0)])
 def test_deviations_fade_at_the_goal(distance, scale):
-    """Of a network that always says 0.1, whose hypotheses are a fifth of a meter beside the
-    unobstructed way, and on it where they arrive."""
     spec = StudentSpec("depth", 64, 48, nominal_speed=2.6, way_version=2)
     weights = {name: np.zeros(shape, np.float32) for name, shape in spec.weight_shapes().items()}
     weights["head.bias"][:] = 0.1
@@ -142,9 +132,6 @@ def test_deviations_fade_at_the_goal(distance, scale):
 
 
 def test_rounding_does_not_decide_the_reference():
-    """Of a network that says nothing, toward a goal out of reach, in forty headings: one way in
-    the body frame. In version 2 it flies on; in version 1 it is the mean of that and of one that
-    stops, which a goal just within reach has."""
     spec = StudentSpec("depth", 64, 48, nominal_speed=2.6, way_version=2)
     weights = {name: np.zeros(shape, np.float32) for name, shape in spec.weight_shapes().items()}
     network = StudentNetwork(spec, weights)
@@ -175,8 +162,6 @@ def corridor(low: int, high: int, distance: float) -> np.ndarray:
 
 
 def test_weights_that_ship_fly_around_what_stands_ahead():
-    """At 2 m/s toward a goal straight ahead, the student that sees depth goes on where nothing
-    stands, passes a wall on its free side, and slows before one that leaves none."""
     network = load_network("", "depth", 2.6)
     X_WB, v_WB, p_WG = RigidTransform([0.0, 0.0, 1.5]), np.array([2.0, 0.0, 0.0]), [12.0, 0.0, 1.5]
 

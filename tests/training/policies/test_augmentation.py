@@ -1,5 +1,3 @@
-"""Random changes of training images, with the formulas of flights."""
-
 import cv2
 import numpy as np
 import pytest

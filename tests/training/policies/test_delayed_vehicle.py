@@ -1,5 +1,3 @@
-"""Images as late in training as in flight."""
-
 import numpy as np
 import pytest
 import torch
@@ -33,8 +31,6 @@ TWO_STEPS = ObservationNoise(latency=2 * PERIOD)
 
 
 class Wandering(LeafSystem):
-    """The states (n, 13) of a flight, one every period."""
-
     def __init__(self, states: np.ndarray) -> None:
         super().__init__()
         self._states = states
@@ -52,8 +48,6 @@ STREAM = ObservationNoise(latency=0.05, frame_rate=[10.0, 30.0], jitter=0.04, fr
     [*(ObservationNoise(latency=x) for x in (0.0, 0.05, PERIOD, 3 * PERIOD, 0.18)), STREAM],
 )
 def test_past_is_what_delayed_pose_gives(noise):
-    """At every step of a flight the delayed vehicle has the pose that `DelayedPose` gives of the
-    same samples, also before there is anything that old."""
     times = FrameTimes.draw(noise, seed=3)
     states = np.cumsum(np.random.default_rng(0).normal(scale=0.1, size=(8, 13)), axis=0)
     states[:, 6] += 1.0
@@ -111,8 +105,6 @@ def test_frames_have_their_ranges():
 
 
 class Watcher:
-    """Accelerates ahead and notes what it observes."""
-
     rate = 1.0 / PERIOD
     rays = PixelRays.of(16, 9, 90.0)
 
@@ -131,8 +123,6 @@ class Watcher:
 
 
 def test_rollouts_see_late_images_and_know_their_state():
-    """The depth of each step is what the vehicle saw two steps before, over the end of an update
-    too, and at first what it sees now; an episode that begins anew has no past."""
     worlds, watcher = training_worlds(SELECTION, seed=0), Watcher()
     config = RolloutConfig(environments=6, steps=3, noise=TWO_STEPS)
     rollout = DifferentiableRollout(watcher, worlds, config, torch.Generator().manual_seed(0))
@@ -154,7 +144,6 @@ def test_rollouts_see_late_images_and_know_their_state():
 
 
 def test_measured_flights_see_late_images():
-    """So do the flights that measure a policy."""
     worlds, watcher = training_worlds(SELECTION, seed=0), Watcher()
     evaluate_agent(watcher, worlds, FlightConditions(speeds=[2.0], patience=0.05), TWO_STEPS)
     assert len(watcher.seen) > 4

@@ -1,5 +1,3 @@
-"""Networks and observations in torch against those in numpy that fly."""
-
 import numpy as np
 import pytest
 import torch
@@ -58,8 +56,6 @@ def flown(state: np.ndarray, image: np.ndarray) -> policy_base.Observation:
 
 
 def test_policy_of_time_of_flight_flies_as_it_was_trained():
-    """From three raw images in a row, by the grid that a sensor's frames become and the law that
-    takes up velocities, the numpy policy accelerates as torch does."""
     torch.manual_seed(1)
     learner = DiffAeroTofLearner(DiffAeroLoss())
     with torch.no_grad():
@@ -84,7 +80,6 @@ def test_policy_of_time_of_flight_flies_as_it_was_trained():
 
 @pytest.mark.parametrize("name", ["diffaero", "depthnav"])
 def test_what_flies_is_what_was_trained(name):
-    """For three images in a row the numpy policy decides and remembers what torch does."""
     torch.manual_seed(1)
     if name == "diffaero":
         learner = DiffAeroLearner(DiffAeroLoss())
@@ -120,7 +115,6 @@ def test_what_flies_is_what_was_trained(name):
 
 
 def test_trajectories_that_fly_are_those_trained():
-    """Waypoints and costs of the numpy network are torch's, from the same observation."""
     torch.manual_seed(2)
     module = TrajectoryModule(agile_policy.AGILE_NETWORK)
     agent = AgileAutonomyAgent(module)

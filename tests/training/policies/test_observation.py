@@ -1,5 +1,3 @@
-"""What policies in training are told, against what those in flight are."""
-
 import numpy as np
 import pytest
 import torch
@@ -18,8 +16,6 @@ from splatpilot.training.policies.train_diffaero import DiffAeroTraining, proxim
 
 @pytest.mark.parametrize("camera", [DiffAeroTofConfig().camera, OnboardCamera(32, 18, 100.0)])
 def test_training_has_the_grid_of_the_sensor(camera):
-    """In images of any depth, not measured and infinite too, torch finds the proximities that
-    frames of that sensor become."""
     sensor = sensor_of(camera)
     depth = np.random.default_rng(0).uniform(0.0, 9.0, (5, camera.height, camera.width))
     depth[depth < 1.0], depth[depth > 8.0] = 0.0, np.inf

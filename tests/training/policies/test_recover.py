@@ -1,5 +1,3 @@
-"""The student's two stages, as one command."""
-
 import json
 import shutil
 from pathlib import Path
@@ -63,9 +61,6 @@ def weights(out: Path) -> dict[str, np.ndarray]:
 
 
 def test_student_flies_and_is_trained_anew_with_what_it_lacked(expert, tmp_path, monkeypatch):
-    """The student flies once in the world that it was trained in; what is added are samples of
-    recovery of that world alone, to a corpus of the run's own; the ledger counts what there is.
-    Interrupted before the flight and before the second stage, it ends with the same weights."""
     before = {path: path.stat().st_mtime_ns for path in expert.rglob("*")}
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     ledger = both_stages(expert, whole)
@@ -94,8 +89,6 @@ def test_student_flies_and_is_trained_anew_with_what_it_lacked(expert, tmp_path,
 
 
 def test_another_round_is_flown_by_the_weights_of_the_one_before(expert, tmp_path, monkeypatch):
-    """No first stage is trained: what flies is the file that is named, through the corpus's camera,
-    and its samples join those of the round before. No other round goes on in the same folder."""
     both_stages(expert, tmp_path / "first")
     flown, fly = [], student_flights.fly
 
@@ -129,8 +122,6 @@ def test_another_round_is_flown_by_the_weights_of_the_one_before(expert, tmp_pat
 
 
 def test_what_was_lost_or_damaged_is_made_again(expert, tmp_path, capsys):
-    """Of a run that ended, a linked shard that has gone is linked and a damaged file of flights
-    flown again, with the same result; a corpus that was gathered anew meanwhile is refused."""
     source = tmp_path / "source"
     shutil.copytree(expert, source)
     ledger = both_stages(source, tmp_path / "out")
@@ -149,7 +140,6 @@ def test_what_was_lost_or_damaged_is_made_again(expert, tmp_path, capsys):
 
 
 def test_recovery_share_is_the_part_that_students_came_to(expert, tmp_path):
-    """Of 4000 draws; without a share, or where there are none, all samples are as likely."""
     both_stages(expert, tmp_path)
     data = StudentData([Corpus(tmp_path / "corpora" / "0")], 0.5)
     rng = np.random.default_rng(0)
@@ -168,8 +158,6 @@ def test_recovery_share_is_the_part_that_students_came_to(expert, tmp_path):
 
 
 def test_what_corpora_share_is_flown_once(expert, tmp_path):
-    """Of a corpus and another that holds the same samples the student flies each way once, and the
-    ledger counts each sample once."""
     shutil.copytree(expert, tmp_path / "copy")
     both = f"corpora=[{expert}, {tmp_path / 'copy'}]"
     config = load_config(StudentDepthTraining(), overrides=[both, *TINY])
@@ -180,8 +168,6 @@ def test_what_corpora_share_is_flown_once(expert, tmp_path):
 
 
 def test_what_sees_in_colors_recovers_too(tmp_path, monkeypatch):
-    """DiffAero in colors flies by what it judges, as fast as the expert did, and both its stages
-    see images of its corpus."""
     speeds, fly = [], student_flights.fly
 
     def watched(diagram, scenario, world):

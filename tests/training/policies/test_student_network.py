@@ -1,5 +1,3 @@
-"""The student's network in torch, against the one that flies and against torchvision's."""
-
 import os
 from pathlib import Path
 

@@ -1,5 +1,3 @@
-"""The student's loss, and its training from a corpus to a flight."""
-
 import csv
 import math
 from dataclasses import replace
@@ -203,7 +201,6 @@ def test_frozen_modules_keep_their_weights(frozen, trained, student_corpus, tmp_
 
 
 def test_features_of_frozen_modules_train_as_images_do(trained, student_corpus, tmp_path):
-    """A step with cached features has the loss of a step whose encoder is not updated."""
     losses, began = [], f"begin={trained / 'student_depth.npz'}"
     for frozen in (0, 20):
         overrides = [began, f"frozen={frozen}", f"features={tmp_path / 'features'}"]
