@@ -155,9 +155,7 @@ def test_another_program_adds_no_worlds(small, gathered, tmp_path, monkeypatch):
     content = depth.read_bytes()
     for wrong in (content, content[:-1]):
         depth.write_bytes(wrong)
-        with pytest.raises(
-            ValueError, match="must be that of the program, another, got .*; go back"
-        ):
+        with pytest.raises(ValueError, match="must be that of the program, another, got"):
             make.run(config=small, out=out, worlds=2 + (wrong == content), jobs=1)
     depth.write_bytes(content)
     assert all_bytes(out) == before

@@ -124,10 +124,10 @@ def test_bad_selections_are_refused(yard, tmp_path):
     WorldSelection(kinds=["office"]).validate()  # other scenarios than the benchmark's are kinds
     tested = write_place(tmp_path / "warehouse", "test")
     for fields, message in (
-        ({"kinds": []}, "worlds must have kinds or scenes"),
+        ({"kinds": []}, "must be one kind or more"),
         ({"kinds": ["R13"]}, "worlds.kinds must be of generated worlds, got R13"),
         ({"scenes": [tested]}, "split of .*warehouse must be train, got 'test'"),
-        ({"scenes": [f"{yard}/gaussians.ply"]}, "is no scene folder"),
+        ({"scenes": [f"{yard}/gaussians.ply"]}, "must be scene folders or OctoMaps"),
         ({"count": 1001}, r"count must be in \[1, 1000\], got 1001"),
     ):
         with pytest.raises(ValueError, match=message):

@@ -8,7 +8,7 @@ from splatpilot.systems.collision.shapes import Capsule, HalfSpace
 from splatpilot.systems.common.files import cache_folder
 from splatpilot.training.corpus.library import scenario_world
 from splatpilot.training.policies import training_worlds as world_cache
-from splatpilot.training.policies.training_worlds import WorldCache
+from splatpilot.training.policies.training_worlds import TrainingWorld, WorldCache
 
 GROUND = HalfSpace([0, 0, 1], 0.0)
 VOLUME = np.zeros(3), np.array([6.0, 4.0, 3.0])
@@ -22,7 +22,8 @@ def folder(tmp_path, monkeypatch) -> Path:
 
 def arrival(goal: float = 1.5, radius: float = 0.3):
     post = Capsule([3.0, 2.0, 0.0], [3.0, 2.0, 3.0], radius)
-    return WorldCache().arrival([GROUND, post], *VOLUME, np.array([5.0, 2.0, goal]), 0.25)
+    world = TrainingWorld([GROUND, post], *VOLUME, np.ones(3), np.array([5.0, 2.0, goal]))
+    return WorldCache().arrival(world, 0.25)
 
 
 def assert_same(a, b) -> None:
