@@ -14,9 +14,10 @@ import numpy as np
 import torch
 from harness import seconds
 
+from splatpilot.systems.policies.base import Observation
 from splatpilot.systems.policies.student import StudentNetwork, StudentSpec, plan
 from splatpilot.systems.vehicle.quadrotor import hover_state
-from splatpilot.systems.vehicle.state import pose_from_state
+from splatpilot.systems.vehicle.state import QuadrotorState, pose_from_state
 from splatpilot.training.policies.student_network import StudentModule
 from splatpilot.training.policies.train import step_optimizer
 from splatpilot.training.policies.train_student import StudentDepthTraining, StudentTrainer
@@ -24,13 +25,14 @@ from splatpilot.training.policies.train_student import StudentDepthTraining, Stu
 
 def tick_time(observation: str, width: int, height: int) -> float:
     """Times planning [s], from the camera's image to the hypotheses."""
-    spec, rng = StudentSpec(observation, width, height, way_version=2), np.random.default_rng(0)
+    spec, rng = StudentSpec(observation, width, height), np.random.default_rng(0)
     weights = {name: w.numpy() for name, w in StudentModule(spec).state_dict().items()}
     network = StudentNetwork(spec, weights)
     color = rng.integers(0, 256, (height, width, 3)).astype(np.uint8)
     image = color if observation == "rgb" else rng.uniform(0.5, 15.0, (height, width))
-    X_WB, p_WG = pose_from_state(hover_state([0, 0, 2])), np.array([9.0, 0.0, 2.0])
-    return seconds(lambda: plan(network, 0.0, image, X_WB, np.zeros(3), p_WG), 30)
+    x, p_WG = hover_state([0, 0, 2]), np.array([9.0, 0.0, 2.0])
+    seen = Observation(0.0, pose_from_state(x), QuadrotorState.of(x), p_WG, image)
+    return seconds(lambda: plan(network, seen), 30)
 
 
 def samples_per_second(corpus: str, frozen: int, features: str) -> float:

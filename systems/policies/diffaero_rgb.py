@@ -38,9 +38,9 @@ class DiffAeroRgbConfig(LearnedPolicyConfig):
 
 @dataclass(frozen=True)
 class MonocularSpec:
-    """The architecture: residual blocks at a fifth and at a tenth of the image's size.
+    """Architecture: residual blocks at a fifth and at a tenth of the image's size.
 
-    A block adds to its input a convolution of 3x3, dilated, and one of 1x1.
+    A block adds to its input a dilated convolution of 3x3, followed by one of 1x1.
     """
 
     fine_channels: int = 32
@@ -49,7 +49,7 @@ class MonocularSpec:
     coarse_dilations: tuple[int, ...] = (1, 2, 4, 1, 2, 4)
 
     def layers(self) -> "list[Layer]":
-        """First to last."""
+        """Lists the convolutions, first to last."""
         fine, coarse = self.fine_channels, self.coarse_channels
         layers = [Layer("stem", CHANNELS, fine, 7, stride=5)]
         for i, dilation in enumerate(self.fine_dilations):
@@ -60,11 +60,11 @@ class MonocularSpec:
         return [*layers, Layer("head", coarse, 2, 1, rectified=False)]
 
     def weight_shapes(self) -> dict[str, tuple[int, ...]]:
-        """The name and shape of every array of weights."""
+        """Returns the shapes of all arrays of weights by name."""
         shapes: dict[str, tuple[int, ...]] = {}
         for layer in self.layers():
-            shape = (layer.outputs, layer.inputs, layer.kernel, layer.kernel)
-            shapes[f"{layer.name}.weight"] = shape
+            kernel = layer.kernel, layer.kernel
+            shapes[f"{layer.name}.weight"] = layer.outputs, layer.inputs, *kernel
             shapes[f"{layer.name}.bias"] = (layer.outputs,)
         return shapes
 
@@ -79,10 +79,8 @@ class Layer:
     kernel: int
     stride: int = 1
     dilation: int = 1
-    rectified: bool = True
-    """Whether a leaky rectifier follows."""
-    adds_to_block: bool = False
-    """Whether what the layer before the last one took is added."""
+    rectified: bool = True  # followed by a leaky ReLU
+    adds_to_block: bool = False  # adds the input of the layer before
 
 
 def _block(name: str, channels: int, dilation: int) -> list[Layer]:
@@ -93,12 +91,7 @@ def _block(name: str, channels: int, dilation: int) -> list[Layer]:
 
 
 class MonocularDepth:
-    """The network with its weights, run by OpenCV: the same bits on any number of its threads.
-
-    Args:
-        spec: the architecture.
-        weights: arrays by the names of `MonocularSpec.weight_shapes`, single precision.
-    """
+    """The network with its weights, by the names of `weight_shapes`, in OpenCV."""
 
     def __init__(self, spec: MonocularSpec, weights: Mapping[str, np.ndarray]) -> None:
         model, before = OnnxModel((CHANNELS, HEIGHT, WIDTH)), []
@@ -107,9 +100,9 @@ class MonocularDepth:
             weight, bias = weights[f"{layer.name}.weight"], weights[f"{layer.name}.bias"]
             model.convolution(weight, bias, stride=layer.stride, dilation=layer.dilation)
             if layer.rectified:
-                model.leaky_relu(LEAK)
+                model.add("LeakyRelu", alpha=LEAK)
             if layer.adds_to_block:
-                model.add(before[-2])
+                model.add("Add", before[-2])
         self._net = cv2.dnn.readNetFromONNX(model.serialize((2, 9, 16)))
 
     def __call__(self, view: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -122,7 +115,7 @@ class MonocularDepth:
 
 @dataclass(frozen=True)
 class DiffAeroRgbSpec:
-    """The architecture: what sees, and what decides."""
+    """Architecture of both networks."""
 
     monocular: MonocularSpec = field(default_factory=MonocularSpec)
     policy: NetworkSpec = DIFFAERO_NETWORK
@@ -132,25 +125,20 @@ DIFFAERO_RGB_NETWORK = DiffAeroRgbSpec()
 
 
 class DiffAeroRgbNetwork:
-    """Both networks with their weights, whose names begin with `monocular.` and `policy.`.
-
-    Raises:
-        ValueError: if an array is missing, of another shape or not finite.
-    """
+    """Both networks with their weights, whose names begin with `monocular.` and `policy.`."""
 
     def __init__(self, spec: DiffAeroRgbSpec, weights: dict[str, np.ndarray]) -> None:
         def part(name: str, shapes: dict[str, tuple[int, ...]]) -> dict[str, np.ndarray]:
             checked = check_weights(weights, {f"{name}.{key}": shapes[key] for key in shapes})
             return {key.removeprefix(f"{name}."): value for key, value in checked.items()}
 
-        self.monocular = MonocularDepth(
-            spec.monocular, part("monocular", spec.monocular.weight_shapes())
-        )
+        monocular = part("monocular", spec.monocular.weight_shapes())
+        self.monocular = MonocularDepth(spec.monocular, monocular)
         self.policy = RecurrentNetwork(spec.policy, part("policy", spec.policy.weight_shapes()))
 
 
 def load_network(path: str | None) -> DiffAeroRgbNetwork:
-    """The networks from a file of weights; see `PolicyCheckpoint.load`."""
+    """Loads the networks from a file of weights, see `PolicyCheckpoint.load`."""
     checkpoint = PolicyCheckpoint.load(path, "diffaero_rgb", DIFFAERO_RGB_NETWORK)
     return checkpoint.build(DiffAeroRgbNetwork)
 
@@ -194,14 +182,8 @@ def rays_B() -> np.ndarray:
 def decide(
     network: DiffAeroRgbNetwork, seen: Observation, speed: float, memory: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Computes a_WB (3,) [m/s^2], gravity excluded, and the next hidden state (H,).
-
-    Args:
-        network: of the architecture `DIFFAERO_RGB_NETWORK`.
-        seen: with RGB (H, 160, 3), see `encode_view`.
-        speed: nominal [m/s].
-        memory: (H,), the hidden state.
-    """
+    """Computes a_WB (3,) [m/s^2], gravity excluded, and the next hidden state (H,), from RGB
+    (H, 160, 3), the nominal speed [m/s] and the hidden state (H,)."""
     grid, _ = network.monocular(encode_view(seen.image, seen.X_WB.rotation().matrix()))
     return decide_by_grid(network.policy, grid, seen, speed, memory)
 

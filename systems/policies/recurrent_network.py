@@ -1,26 +1,31 @@
 """A small recurrent network from a depth image and a state to a command, in numpy.
 
-Convolutions of the image, a linear layer of the state, a gated recurrent unit and a linear head, as
-torch trains them (`torch.nn.Conv2d`, `Linear`, `GRUCell`, with their names and layouts of weights).
-One step costs a fraction of a millisecond, and the same input gives the same bits.
+Convolutions of the image, a linear layer of the state, a gated recurrent unit and a linear head,
+with the names and layouts of weights of `torch.nn.Conv2d`, `Linear` and `GRUCell`.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from math import prod
 
 import numpy as np
 
-from splatpilot.systems.policies.checkpoint import PolicyCheckpoint, check_weights
+from splatpilot.systems.policies.checkpoint import (
+    PolicyCheckpoint,
+    check_weights,
+    linear_shapes,
+    require_shape,
+)
 
 LEAK = 0.05
-"""Slope of the rectifiers for negative numbers."""
+"""Slope of the leaky ReLU for negative numbers."""
 
 Layer = tuple[int, int, int, int]
 """Channels, width of the kernel, stride and padding of a convolution."""
 
 
 class Convolutions:
-    """Convolutions, each followed by a leaky rectifier.
+    """Convolutions, each followed by a leaky ReLU.
 
     Args:
         image: channels, height and width of the input.
@@ -42,7 +47,7 @@ class Convolutions:
             self._layers.append((patches, padding, filters, weights[f"convolutions.{i}.bias"]))
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
-        """The features (F,), in torch's order, of an image (height, width)."""
+        """Computes the features (F,), in torch's order, of an image (height, width)."""
         x = np.asarray(image, np.float32)[None]
         for patches, padding, filters, bias in self._layers:
             padded = np.pad(x, ((0, 0), (padding, padding), (padding, padding)))
@@ -51,8 +56,20 @@ class Convolutions:
         return x.ravel()
 
 
+def _patches(
+    size: tuple[int, int, int], out: tuple[int, int, int], kernel: int, stride: int, padding: int
+) -> np.ndarray:
+    """Returns flat indices (height, width, inputs * kernel²) of patches of the padded image."""
+    channels, height, width = size[0], size[1] + 2 * padding, size[2] + 2 * padding
+    k = np.arange(kernel)
+    planes = (np.arange(channels) * height * width)[:, None, None]
+    within = (planes + (k * width)[:, None] + k).ravel()
+    first = (stride * width * np.arange(out[1]))[:, None] + stride * np.arange(out[2])
+    return first[:, :, None] + within
+
+
 def convolution_shapes(layers: Sequence[Layer]) -> dict[str, tuple[int, ...]]:
-    """The name and shape of every array of weights of convolutions of an image of one channel."""
+    """Returns the shapes of weights by name of convolutions of an image of one channel."""
     shapes: dict[str, tuple[int, ...]] = {}
     inputs = 1
     for i, (channels, kernel, _, _) in enumerate(layers):
@@ -63,7 +80,7 @@ def convolution_shapes(layers: Sequence[Layer]) -> dict[str, tuple[int, ...]]:
 
 
 def layer_sizes(image: tuple[int, int, int], layers: Sequence[Layer]) -> list[tuple[int, int, int]]:
-    """Channels, height and width of the image and after each convolution."""
+    """Computes channels, height and width of the image and after each convolution."""
     sizes = [image]
     for channels, kernel, stride, padding in layers:
         height, width = ((size + 2 * padding - kernel) // stride + 1 for size in sizes[-1][1:])
@@ -72,26 +89,13 @@ def layer_sizes(image: tuple[int, int, int], layers: Sequence[Layer]) -> list[tu
 
 
 def leaky_relu(x: np.ndarray) -> np.ndarray:
-    """x where positive, else x times `LEAK`."""
+    """Multiplies negative numbers by `LEAK`."""
     return np.maximum(x, np.float32(LEAK) * x)
-
-
-def _patches(
-    size: tuple[int, int, int], out: tuple[int, int, int], kernel: int, stride: int, padding: int
-) -> np.ndarray:
-    """Flat indices (height, width, inputs * kernel²) into the padded image of a layer's patches."""
-    channels, height, width = size[0], size[1] + 2 * padding, size[2] + 2 * padding
-    k = np.arange(kernel)
-    within = (
-        (np.arange(channels) * height * width)[:, None, None] + (k * width)[:, None] + k
-    ).ravel()
-    first = (stride * width * np.arange(out[1]))[:, None] + stride * np.arange(out[2])
-    return first[:, :, None] + within
 
 
 @dataclass(frozen=True)
 class NetworkSpec:
-    """The architecture."""
+    """Architecture of the network."""
 
     image_height: int
     image_width: int
@@ -102,87 +106,60 @@ class NetworkSpec:
     output_size: int
 
     def image_features(self) -> int:
-        """Numbers after the last convolution."""
-        image = (1, self.image_height, self.image_width)
-        return int(np.prod(layer_sizes(image, self.convolutions)[-1]))
+        """Returns the number of outputs of the last convolution."""
+        return prod(layer_sizes((1, self.image_height, self.image_width), self.convolutions)[-1])
 
     def weight_shapes(self) -> dict[str, tuple[int, ...]]:
-        """The name and shape of every array of weights."""
+        """Returns the shapes of all arrays of weights by name."""
+        H, inputs = self.hidden_size, self.image_features() + self.state_features
         shapes = convolution_shapes(self.convolutions)
-        H = self.hidden_size
-        shapes["state_layer.weight"] = (self.state_features, self.state_size)
-        shapes["state_layer.bias"] = (self.state_features,)
-        shapes["memory.weight_ih"] = (3 * H, self.image_features() + self.state_features)
-        shapes["memory.weight_hh"] = (3 * H, H)
-        shapes["memory.bias_ih"] = shapes["memory.bias_hh"] = (3 * H,)
-        shapes["head.weight"], shapes["head.bias"] = (self.output_size, H), (self.output_size,)
-        return shapes
+        shapes |= linear_shapes(
+            ("state_layer", self.state_size, self.state_features), ("head", H, self.output_size)
+        )
+        shapes |= {"memory.weight_ih": (3 * H, inputs), "memory.weight_hh": (3 * H, H)}
+        return shapes | {"memory.bias_ih": (3 * H,), "memory.bias_hh": (3 * H,)}
 
 
 class RecurrentNetwork:
-    """The network with its weights.
-
-    Args:
-        spec: the architecture.
-        weights: arrays by the names of `NetworkSpec.weight_shapes`.
-
-    Raises:
-        ValueError: if an array is missing, of another shape or not finite.
-    """
+    """The network with its weights, by the names of `NetworkSpec.weight_shapes`."""
 
     def __init__(self, spec: NetworkSpec, weights: Mapping[str, np.ndarray]) -> None:
         self.spec = spec
-        own = check_weights(weights, spec.weight_shapes())
-        self._convolutions = Convolutions(
-            (1, spec.image_height, spec.image_width), spec.convolutions, own
-        )
-        self._weights = own
+        self._weights = check_weights(weights, spec.weight_shapes())
+        image = 1, spec.image_height, spec.image_width
+        self._convolutions = Convolutions(image, spec.convolutions, self._weights)
 
     def initial_hidden(self) -> np.ndarray:
-        """The memory (H,) before the first image."""
+        """Returns the hidden state (H,) before the first image."""
         return np.zeros(self.spec.hidden_size, np.float32)
 
     def step(
         self, image: np.ndarray, state: np.ndarray, hidden: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """The output (O,) and the memory (H,) after one observation.
+        """Computes the output (O,) and the next hidden state (H,).
 
         Args:
             image: (height, width), encoded depth.
             state: (S,).
-            hidden: (H,), the memory before.
-
-        Raises:
-            ValueError: if an argument has the wrong shape.
+            hidden: (H,), the hidden state.
         """
-        spec, w = self.spec, self._weights
-        for name, array, shape in (
-            ("image", image, (spec.image_height, spec.image_width)),
-            ("state", state, (spec.state_size,)),
-            ("memory", hidden, (spec.hidden_size,)),
-        ):
-            if np.shape(array) != shape:
-                raise ValueError(
-                    f"the policy's {name} has shape {np.shape(array)}, but its network takes "
-                    f"{shape}"
-                )
+        spec, w, H = self.spec, self._weights, self.spec.hidden_size
+        require_shape("image", image, (spec.image_height, spec.image_width))
+        require_shape("state", state, (spec.state_size,))
+        require_shape("hidden state", hidden, (H,))
         x = self._convolutions(image)
         state, hidden = np.asarray(state, np.float32), np.asarray(hidden, np.float32)
         features = leaky_relu(w["state_layer.weight"] @ state + w["state_layer.bias"])
         features = np.concatenate([x, features])
-        H = spec.hidden_size
         from_input = w["memory.weight_ih"] @ features + w["memory.bias_ih"]
-        from_memory = w["memory.weight_hh"] @ hidden + w["memory.bias_hh"]
-        reset, update = _sigmoid((from_input + from_memory)[: 2 * H]).reshape(2, H)
-        new = np.tanh(from_input[2 * H :] + reset * from_memory[2 * H :])
+        from_hidden = w["memory.weight_hh"] @ hidden + w["memory.bias_hh"]
+        gates = 0.5 * np.tanh(0.5 * (from_input + from_hidden)[: 2 * H]) + 0.5  # sigmoid
+        reset, update = gates.reshape(2, H)
+        new = np.tanh(from_input[2 * H :] + reset * from_hidden[2 * H :])
         hidden = ((1 - update) * new + update * hidden).astype(np.float32)
         return w["head.weight"] @ hidden + w["head.bias"], hidden
 
 
 def load_network(path: str | None, policy: str, spec: NetworkSpec) -> RecurrentNetwork:
-    """The network of `policy` from a file of weights; see `PolicyCheckpoint.load`."""
+    """Loads the network of `policy` from a file, see `PolicyCheckpoint.load`."""
     return PolicyCheckpoint.load(path, policy, spec).build(RecurrentNetwork)
-
-
-def _sigmoid(x: np.ndarray) -> np.ndarray:
-    return 0.5 * np.tanh(0.5 * x) + 0.5

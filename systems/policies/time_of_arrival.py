@@ -68,7 +68,7 @@ class TimeOfArrival:
     def is_reachable(self, p_WQ: np.ndarray, within: float = 0.0) -> bool:
         """Checks that a path leads to the goal from the voxel of p_WQ (3,) [m], or from one that
         the cube of half edge `within` [m] around it touches."""
-        from_corner = np.asarray(p_WQ) - self.lower_W
+        from_corner = p_WQ - self.lower_W
         first = np.floor((from_corner - within) / self.voxel_size)
         last = np.floor((from_corner + within) / self.voxel_size)
         if np.any(last < 0) or np.any(first >= self.reachable.shape):
@@ -96,15 +96,16 @@ class TimeOfArrival:
             length=longest,
             way=rows,
         )
-        *way, covered = rows[:count].T  # 3 of (m,), (m,)
+        *path, covered = rows[:count].T  # 3 of (m,), (m,)
 
         def point_at(length: np.ndarray) -> np.ndarray:
-            return np.stack([np.interp(length, covered, along) for along in way], -1)
+            return np.stack([np.interp(length, covered, along) for along in path], -1)
 
         ends = point_at(lengths)
         chords = ends - point_at(0.75 * lengths)
         chords[lengths > covered[-1]] = 0.0
-        return ends, np.array([_unit(chord) for chord in chords])
+        sizes = np.sqrt([chord.dot(chord) for chord in chords])[:, None]
+        return ends, np.divide(chords, sizes, out=np.zeros_like(chords), where=sizes > 0.0)
 
     def _interpolate(self, p_WQ: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns values and gradients at the points, brought between the voxel centers."""
@@ -137,13 +138,8 @@ def time_of_arrival(
     Raises:
         InfeasibleFlightError: if the goal is outside the box, or its clearance below `margin`.
     """
-    require(
-        field.occupied_outside,
-        "the distance field",
-        "conservative",
-        "unknown space as free",
-        "pass esdf.conservative()",
-    )
+    what, remedy = "the distance field", "pass esdf.conservative()"
+    require(field.occupied_outside, what, "conservative", "unknown space as free", remedy)
     p_WG = np.array(p_WG, dtype=float)
     valid = p_WG.shape == (3,) and bool(np.isfinite(p_WG).all())
     require(valid, "the goal", "3 finite coordinates [m]", p_WG)
@@ -182,12 +178,6 @@ def time_of_arrival(
     times = times.astype(np.float32)
     times.flags.writeable = reachable.flags.writeable = p_WG.flags.writeable = False
     return TimeOfArrival(p_WG, times, reachable, field.lower_W, field.voxel_size)
-
-
-def _unit(vector: np.ndarray) -> np.ndarray:
-    """Scales `vector` (3,) to unit length; zero stays zero."""
-    length = np.sqrt(vector.dot(vector))
-    return vector / length if length > 0.0 else vector
 
 
 def _text(p_W: np.ndarray) -> str:

@@ -1,4 +1,4 @@
-"""The networks of depth policies, for torch; `systems.policies` flies them in numpy."""
+"""Networks of depth policies in torch, with the names of weights of those in numpy that fly."""
 
 from collections.abc import Sequence
 
@@ -11,15 +11,13 @@ from splatpilot.systems.policies.agile_autonomy import (
     WAYPOINT_SCALE,
     TrajectoryNetworkSpec,
 )
+from splatpilot.systems.policies.checkpoint import PolicyCheckpoint
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS
 from splatpilot.systems.policies.recurrent_network import LEAK, Layer, NetworkSpec
 
 
 class TrainableNetwork(nn.Module):
-    """The network of `spec`, with the names and shapes of weights that `RecurrentNetwork` takes.
-
-    `head_scale` multiplies the head's first weights: small ones begin with about hovering.
-    """
+    """The network of a `NetworkSpec`; `head_scale` multiplies the head's initial weights."""
 
     def __init__(self, spec: NetworkSpec, head_scale: float = 0.1) -> None:
         super().__init__()
@@ -33,18 +31,18 @@ class TrainableNetwork(nn.Module):
             self.head.bias.zero_()
 
     def forward(self, image: Tensor, state: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
-        """Output (N, O) and memory (N, H) of images (N, height, width), states and memories."""
+        """Computes outputs (N, O) and hidden states (N, H) from images (N, height, width), states
+        (N, S) and hidden states."""
         x = image[:, None]
         for layer in self.convolutions:
-            x = nn.functional.leaky_relu(layer(x), LEAK)
-        features = nn.functional.leaky_relu(self.state_layer(state), LEAK)
+            x = _leaky(layer(x))
+        features = _leaky(self.state_layer(state))
         hidden = self.memory(torch.cat([x.flatten(1), features], 1), hidden)
         return self.head(hidden), hidden
 
 
 class TrajectoryModule(nn.Module):
-    """The network of a `TrajectoryNetworkSpec`, with the names of weights that
-    `systems.policies.agile_autonomy.TrajectoryNetwork` takes."""
+    """The network of a `TrajectoryNetworkSpec`."""
 
     def __init__(self, spec: TrajectoryNetworkSpec) -> None:
         super().__init__()
@@ -59,18 +57,30 @@ class TrajectoryModule(nn.Module):
         self.output = nn.Linear(spec.head_features, 3 * NUM_WAYPOINTS + 1)
 
     def forward(self, image: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Waypoints (N, 3, 10, 3) [m] and costs (N, 3) of images (N, H, W) and states (N, 18)."""
+        """Computes waypoints (N, 3, 10, 3) [m] and costs (N, 3) from images (N, H, W) and states
+        (N, 18)."""
         x = image[:, None]
         for layer in self.convolutions:
-            x = nn.functional.leaky_relu(layer(x), LEAK)
-        x = nn.functional.leaky_relu(self.image_layer(x.flatten(1)), LEAK)
-        y = nn.functional.leaky_relu(self.state_layer(state), LEAK)
-        y = nn.functional.leaky_relu(self.state_layer_2(y), LEAK)
-        modes = nn.functional.leaky_relu(self.modes(torch.cat([x, y], 1)), LEAK)
-        modes = modes.reshape(len(image), MODES, -1)
-        output = self.output(nn.functional.leaky_relu(self.head(modes), LEAK))
+            x = _leaky(layer(x))
+        x = _leaky(self.image_layer(x.flatten(1)))
+        y = _leaky(self.state_layer_2(_leaky(self.state_layer(state))))
+        modes = _leaky(self.modes(torch.cat([x, y], 1))).reshape(len(image), MODES, -1)
+        output = self.output(_leaky(self.head(modes)))
         waypoints = WAYPOINT_SCALE * output[..., :-1].unflatten(2, (NUM_WAYPOINTS, 3))
         return waypoints, output[..., -1]
+
+
+def load_weights(module: nn.Module, checkpoint: PolicyCheckpoint, prefix: str = "") -> None:
+    """Loads the weights whose names begin with `prefix`."""
+    weights = checkpoint.weights.items()
+    state = {
+        k.removeprefix(prefix): torch.from_numpy(v) for k, v in weights if k.startswith(prefix)
+    }
+    module.load_state_dict(state)
+
+
+def _leaky(x: Tensor) -> Tensor:
+    return nn.functional.leaky_relu(x, LEAK)
 
 
 def _convolutions(layers: Sequence[Layer]) -> nn.ModuleList:

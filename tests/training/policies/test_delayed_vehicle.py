@@ -23,6 +23,7 @@ from splatpilot.training.policies.training_worlds import WorldSelection, trainin
 from splatpilot.training.policies.vehicles import (
     BodyRate,
     History,
+    map_tensors,
 )
 
 PERIOD = 1.0 / 15.0  # [s]
@@ -131,7 +132,7 @@ def test_rollouts_see_late_images_and_know_their_state():
     rollout.episodes = rollout.episodes._replace(age=torch.tensor([99.0, 0, 0, 0, 0, 0]))
     rollout.losses()
     geometry, world = worlds.geometry, rollout.episodes.world
-    seen = [step.vehicle.detach() for step in watcher.seen]
+    seen = [map_tensors(torch.Tensor.detach, step.vehicle) for step in watcher.seen]
     went_on = (seen[3].p - seen[2].p).norm(dim=1) < 1.0
     assert not went_on[0] and went_on.sum() >= 3
     for now, then in enumerate([0, 0, 0, 1, 2, 3]):

@@ -131,7 +131,7 @@ def test_sight_is_trained_further(trained, wide_corpus, tmp_path):
     assert trainer.evaluate()["success"] == pytest.approx(best, abs=1e-6)
     other = tmp_path / "diffaero.npz"
     PolicyCheckpoint.load(None, "diffaero", DIFFAERO_NETWORK).save(other)
-    with pytest.raises(ValueError, match="holds weights of the policy 'diffaero'"):
+    with pytest.raises(ValueError, match="got 'diffaero'"):
         DiffAeroRgbTrainer(training(wide_corpus, f"begin={other}"))
 
 

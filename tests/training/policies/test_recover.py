@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from splatpilot.systems.common.config import load_config
-from splatpilot.systems.policies.checkpoint import policy_of
+from splatpilot.systems.policies.checkpoint import checkpoint_policy
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.training.corpus import collect as make
 from splatpilot.training.corpus.corpus import Corpus, CorpusConfig
@@ -183,7 +183,7 @@ def test_what_sees_in_colors_recovers_too(tmp_path, monkeypatch):
     ledger = recovery.run(config=config, make=DiffAeroRgbTrainer, out=out, flights=1, jobs=1)
     assert sum(ledger["flights"].values()) == 1 and ledger["recovery_samples"] > 0
     assert speeds == [1.5]
-    assert policy_of(out / "stage_2" / "diffaero_rgb.npz") == "diffaero_rgb"
+    assert checkpoint_policy(out / "stage_2" / "diffaero_rgb.npz") == "diffaero_rgb"
 
 
 def interrupt(*_args) -> None:

@@ -22,7 +22,7 @@ from splatpilot.systems.common.files import claim_folder
 from splatpilot.systems.common.progress import CheckpointClock
 from splatpilot.systems.common.seeds import TRAINING_SEEDS
 from splatpilot.systems.policies import checkpoint as policy_checkpoint
-from splatpilot.systems.policies.checkpoint import PolicyCheckpoint, policy_of
+from splatpilot.systems.policies.checkpoint import PolicyCheckpoint, checkpoint_policy
 from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK
 from splatpilot.training.policies import train, training_worlds
 from splatpilot.training.policies.evaluation import evaluate_agent
@@ -137,7 +137,7 @@ def test_interrupted_training_ends_as_whole(policy, tmp_path):
 def test_model_cards_hold_configurations_that_train(card, tmp_path, monkeypatch):
     config = tmp_path / "config.yaml"
     config.write_text(re.search("```yaml\n(.*?)```", card.read_text(), re.DOTALL)[1])
-    trainer = TRAINERS.find(policy_of(card.with_suffix(".npz")))
+    trainer = TRAINERS.find(checkpoint_policy(card.with_suffix(".npz")))
     made_with = load_config(trainer.config(), config)
     if getattr(getattr(made_with, "worlds", None), "scenes", ()):
         if "SPLATPILOT_DATA" not in os.environ:
