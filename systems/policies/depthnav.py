@@ -66,11 +66,7 @@ class Decision(NamedTuple):
 
 
 def decide(
-    network: RecurrentNetwork,
-    seen: Observation,
-    speed: float,
-    start_yaw: float,
-    memory: np.ndarray,
+    network: RecurrentNetwork, seen: Observation, speed: float, start_yaw: float, memory: np.ndarray
 ) -> Decision:
     """Computes the commands and the next hidden state, from depth (H, W), the nominal speed [m/s],
     the yaw of the start frame [rad] and the hidden state (H,)."""

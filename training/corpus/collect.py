@@ -23,13 +23,7 @@ from splatpilot.systems.common.validation import FieldError, require
 from splatpilot.systems.splats.splat_camera import color_pixels, ranged_depth
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 from splatpilot.systems.vehicle.state import QuadrotorState, pose_from_state
-from splatpilot.training.corpus.corpus import (
-    CONFIG,
-    Corpus,
-    CorpusConfig,
-    subfolders,
-    write_ledger,
-)
+from splatpilot.training.corpus.corpus import CONFIG, Corpus, CorpusConfig, subfolders, write_ledger
 from splatpilot.training.corpus.expert import PLANNER, Label, Labeler, fly_planner, fly_policy
 from splatpilot.training.corpus.library import (
     WorldRecord,

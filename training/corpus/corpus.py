@@ -27,20 +27,8 @@ from splatpilot.systems.common.seeds import first_training_seed
 from splatpilot.systems.common.validation import Config, bounded, require
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.training.corpus.expert import ExpertConfig
-from splatpilot.training.corpus.library import (
-    WORLD,
-    LibraryConfig,
-    PerturbationConfig,
-    WorldRecord,
-)
-from splatpilot.training.corpus.samples import (
-    OFF_PATH,
-    SHARD,
-    SOURCES,
-    Samples,
-    SampleSize,
-    Shard,
-)
+from splatpilot.training.corpus.library import WORLD, LibraryConfig, PerturbationConfig, WorldRecord
+from splatpilot.training.corpus.samples import OFF_PATH, SHARD, SOURCES, Samples, SampleSize, Shard
 
 CONFIG = "corpus.yaml"
 LEDGER = "ledger.csv"

@@ -28,11 +28,7 @@ from splatpilot.systems.policies.depthnav import (
     MIN_DEPTH,
     RATE,
 )
-from splatpilot.systems.policies.observations import (
-    heading_frame,
-    limit_smoothly,
-    target_velocity,
-)
+from splatpilot.systems.policies.observations import heading_frame, limit_smoothly, target_velocity
 from splatpilot.systems.vehicle.quadrotor import GRAVITY
 from splatpilot.training.policies.networks import TrainableNetwork
 from splatpilot.training.policies.ray_casting import PixelRays

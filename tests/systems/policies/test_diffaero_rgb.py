@@ -10,11 +10,7 @@ from pydrake.systems.sensors import ImageRgba8U
 
 from splatpilot.systems.policies.base import Observation
 from splatpilot.systems.policies.checkpoint import PolicyCheckpoint
-from splatpilot.systems.policies.diffaero import (
-    DIFFAERO_NETWORK,
-    MAX_DEPTH,
-    MIN_DEPTH,
-)
+from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK, MAX_DEPTH, MIN_DEPTH
 from splatpilot.systems.policies.diffaero import decide as decide_by_grid
 from splatpilot.systems.policies.diffaero_rgb import (
     DIFFAERO_RGB_NETWORK,

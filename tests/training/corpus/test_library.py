@@ -92,8 +92,7 @@ def test_own_scene_of_a_benchmark_name_is_learned_in(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("split", "held_out"),
-    [("test", False), ("validation", False), ("", False), ("train", True)],
+    ("split", "held_out"), [("test", False), ("validation", False), ("", False), ("train", True)]
 )
 def test_scene_of_another_split_is_refused(tmp_path, split, held_out):
     scene = write_scene(tmp_path / "attic", 0.2, split=split)

@@ -20,11 +20,7 @@ from splatpilot.training.policies.train_agile_autonomy import (
     AgileAutonomyTraining,
 )
 from splatpilot.training.policies.training_worlds import WorldSelection, training_worlds
-from splatpilot.training.policies.vehicles import (
-    BodyRate,
-    History,
-    map_tensors,
-)
+from splatpilot.training.policies.vehicles import BodyRate, History, map_tensors
 
 PERIOD = 1.0 / 15.0  # [s]
 SELECTION = WorldSelection(kinds=["P02"], count=1, voxel_size=0.5)
@@ -45,8 +41,7 @@ STREAM = ObservationNoise(latency=0.05, frame_rate=[10.0, 30.0], jitter=0.04, fr
 
 
 @pytest.mark.parametrize(
-    "noise",
-    [*(ObservationNoise(latency=x) for x in (0.0, 0.05, PERIOD, 3 * PERIOD, 0.18)), STREAM],
+    "noise", [*(ObservationNoise(latency=x) for x in (0.0, 0.05, PERIOD, 3 * PERIOD, 0.18)), STREAM]
 )
 def test_past_is_what_delayed_pose_gives(noise):
     times = FrameTimes.draw(noise, seed=3)

@@ -6,11 +6,7 @@ from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.systems.common.config import load_config
 from splatpilot.systems.policies.diffaero import DiffAeroTofConfig
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
-from splatpilot.systems.sensing.time_of_flight import (
-    range_of_depth,
-    sensor_of,
-    time_of_flight_grid,
-)
+from splatpilot.systems.sensing.time_of_flight import range_of_depth, sensor_of, time_of_flight_grid
 from splatpilot.training.policies.train_diffaero import DiffAeroTraining, proximity_grid
 
 

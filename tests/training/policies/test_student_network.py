@@ -18,11 +18,7 @@ from splatpilot.systems.policies.student import (
 )
 from splatpilot.systems.vehicle.state import QuadrotorState
 from splatpilot.training.policies.student_data import encode_images
-from splatpilot.training.policies.student_network import (
-    IN_DATA,
-    StudentModule,
-    imagenet_weights,
-)
+from splatpilot.training.policies.student_network import IN_DATA, StudentModule, imagenet_weights
 
 
 def disturbed(module: StudentModule) -> StudentModule:

@@ -131,8 +131,7 @@ def test_student_learns(trained):
 
 def test_student_flies_by_its_weights(trained):
     config = replace(
-        policy_named(str(trained / "student_depth.npz")),
-        camera=OnboardCamera(width=32, height=24),
+        policy_named(str(trained / "student_depth.npz")), camera=OnboardCamera(width=32, height=24)
     )
     world = make_world(ForestConfig(length=12.0, width=8.0, height=4.0), 1_000_000)
     scenario = Scenario(seed=1_000_000, policy=config, timeout=1.0)

@@ -110,10 +110,7 @@ def test_policies_learn_in_places(yard):
     for batch in (worlds, worlds.without_obstacles()):
         learner = DiffAeroLearner(DiffAeroLoss())
         rollout = DifferentiableRollout(
-            learner,
-            batch,
-            RolloutConfig(environments=8, steps=6),
-            torch.Generator().manual_seed(0),
+            learner, batch, RolloutConfig(environments=8, steps=6), torch.Generator().manual_seed(0)
         )
         torch.stack(list(rollout.losses().values())).sum().backward()
         gradients = [weight.grad for weight in learner.network.parameters()]
