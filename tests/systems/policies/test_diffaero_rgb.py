@@ -10,8 +10,7 @@ from pydrake.systems.sensors import ImageRgba8U
 
 from splatpilot.systems.policies.base import Observation
 from splatpilot.systems.policies.checkpoint import PolicyCheckpoint
-from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK, MAX_DEPTH, MIN_DEPTH
-from splatpilot.systems.policies.diffaero import decide as decide_by_grid
+from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK
 from splatpilot.systems.policies.diffaero_rgb import (
     DIFFAERO_RGB_NETWORK,
     DiffAeroRgb,
@@ -23,7 +22,6 @@ from splatpilot.systems.policies.diffaero_rgb import (
     load_network,
     rays_B,
 )
-from splatpilot.systems.policies.observations import inverse_depth
 from splatpilot.systems.policies.recurrent_network import load_network as load_recurrent
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.vehicle.quadrotor import hover_state
@@ -79,24 +77,6 @@ def test_decides_at_its_rate(file):
     np.testing.assert_array_equal(found, expected)
 
 
-def test_decides_as_diffaero_of_what_it_judges(tmp_path):
-    policy = load_recurrent(None, "diffaero", DIFFAERO_NETWORK)
-    shipped = PolicyCheckpoint.load(None, "diffaero", DIFFAERO_NETWORK).weights
-    path = tmp_path / "weights.npz"
-    weights = random_weights(dict(shipped))
-    PolicyCheckpoint("diffaero_rgb", DIFFAERO_RGB_NETWORK, weights, {}).save(path)
-    network = load_network(str(path))
-    color = np.random.default_rng(3).integers(0, 256, (90, 160, 3)).astype(np.uint8)
-    state = hover_state([1.0, 2.0, 1.5], yaw=0.3)
-    seen, memory = observation(state, color), policy.initial_hidden()
-    grid, log_error = network.monocular(encode_view(color, seen.X_WB.rotation().matrix()))
-    found, _ = decide(network, seen, 2.0, memory)
-    expected, _ = decide_by_grid(policy, grid, seen, 2.0, memory)
-    assert grid.shape == log_error.shape == (9, 16)
-    np.testing.assert_allclose(found, expected, atol=1e-6)
-    assert inverse_depth(np.array(MIN_DEPTH), MIN_DEPTH, MAX_DEPTH) == pytest.approx(9.4)
-
-
 def test_weights_and_cameras_that_do_not_fit_are_refused(file, tmp_path):
     with pytest.raises(FileNotFoundError, match="train them with: splatpilot train diffaero_rgb"):
         DiffAeroRgb(DiffAeroRgbConfig(weights=str(tmp_path / "absent.npz")))
@@ -146,52 +126,6 @@ def test_view_is_the_middle_of_the_image_with_rays_that_know_the_horizon(height)
     first = (height - 90) // 2
     shown = np.rint((views[0][:3] + 1.0) * 127.5).astype(np.uint8).transpose(1, 2, 0)
     np.testing.assert_array_equal(shown, color[first : first + 90])
-
-
-@pytest.mark.parametrize("shape", [(90, 128, 3), (88, 160, 3), (91, 160, 3)])
-def test_images_of_another_size_are_refused(shape):
-    with pytest.raises(ValueError, match=f"160 pixels wide.* got {shape[1]}x{shape[0]}"):
-        encode_view(np.zeros(shape, np.uint8), np.eye(3))
-
-
-def test_network_computes_its_definition():
-    spec, rng = MonocularSpec(4, (1, 2), 6, (1, 4)), np.random.default_rng(2)
-    weights = {
-        name: rng.normal(scale=0.3 / np.sqrt(np.prod(shape[1:])), size=shape).astype(np.float32)
-        for name, shape in spec.weight_shapes().items()
-    }
-    view = rng.uniform(-1.0, 1.0, (6, 90, 160)).astype(np.float32)
-
-    def convolved(x: np.ndarray, name: str, stride: int = 1, dilation: int = 1) -> np.ndarray:
-        weight, bias = weights[f"{name}.weight"].astype(float), weights[f"{name}.bias"]
-        kernel = weight.shape[2]
-        pad = dilation * (kernel // 2)
-        x = np.pad(x, ((0, 0), (pad, pad), (pad, pad)))
-        span = dilation * (kernel - 1) + 1
-        height, width = ((size - span) // stride + 1 for size in x.shape[1:])
-        y = np.zeros((len(weight), height, width)) + bias[:, None, None]
-        for i in range(kernel):
-            for j in range(kernel):
-                rows = slice(i * dilation, i * dilation + stride * (height - 1) + 1, stride)
-                columns = slice(j * dilation, j * dilation + stride * (width - 1) + 1, stride)
-                y += np.einsum("oc,chw->ohw", weight[:, :, i, j], x[:, rows, columns])
-        return y
-
-    def leaky(x: np.ndarray) -> np.ndarray:
-        return np.where(x > 0.0, x, 0.05 * x)
-
-    x = leaky(convolved(view, "stem", 5))
-    for i, dilation in enumerate((1, 2)):
-        inner = leaky(convolved(x, f"fine.{i}.0", dilation=dilation))
-        x = x + convolved(inner, f"fine.{i}.1")
-    x = leaky(convolved(x, "halving", 2))
-    for i, dilation in enumerate((1, 4)):
-        inner = leaky(convolved(x, f"coarse.{i}.0", dilation=dilation))
-        x = x + convolved(inner, f"coarse.{i}.1")
-    expected = convolved(x, "head")
-    found = np.stack(MonocularDepth(spec, weights)(view))
-    assert expected.shape == (2, 9, 16) and expected.std() > 0.01
-    np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
 def test_threads_of_opencv_change_no_bit():

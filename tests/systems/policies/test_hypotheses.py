@@ -41,22 +41,6 @@ def test_layout_of_the_vector():
     np.testing.assert_array_equal(vector[-3:], plan.costs)
 
 
-def test_before_the_first_plan_there_is_none():
-    assert Hypotheses.from_vector(no_plan(3), 3) is None
-
-
-def test_waypoints_in_the_world():
-    plan = some_hypotheses()
-    np.testing.assert_allclose(
-        plan.waypoints_W[2, 7], plan.X_WB @ plan.waypoints_B[2, 7], atol=1e-14
-    )
-
-
-def test_best_is_the_cheapest():
-    plan = Hypotheses(0.0, RigidTransform(), np.zeros((3, 10, 3)), np.array([3.0, 1.0, 2.0]))
-    assert plan.best == 1
-
-
 def test_position_interpolates_between_waypoints():
     plan = some_hypotheses()
     way_W = np.vstack([plan.X_WB.translation(), plan.waypoints_W[1]])

@@ -74,17 +74,6 @@ def begin(vehicle: BodyRate, noise: ObservationNoise, times: FrameTimes) -> Hist
     return History(history.past, *tensors)
 
 
-def test_frames_are_as_old_in_training_as_in_flight():
-    now = torch.tensor([0.371], dtype=torch.float64)
-    hovering = BodyRate.hovering(torch.zeros(1, 3), torch.zeros(1))
-    for seed in range(20):
-        times = FrameTimes.draw(STREAM, seed)
-        history = begin(hovering, STREAM, times)
-        for step in range(40):
-            age = history.ages(STREAM, step * now)
-            assert age.item() == pytest.approx(times.age(step * now.item()), abs=1e-9)
-
-
 def test_frames_have_their_ranges():
     hovering = BodyRate.hovering(torch.zeros(2000, 3), torch.zeros(2000))
     history = History.start(hovering, STREAM, 15.0, torch.Generator().manual_seed(0))

@@ -135,34 +135,6 @@ def test_sight_is_trained_further(trained, wide_corpus, tmp_path):
         DiffAeroRgbTrainer(training(wide_corpus, f"begin={other}"))
 
 
-def test_interrupted_training_ends_as_whole(wide_corpus, tmp_path):
-    overrides = ["schedule.updates=4", "schedule.validate_every=4", "schedule.checkpoint_every=2"]
-    config, make = training(wide_corpus, *overrides), TRAINERS.find("diffaero_rgb").make
-
-    def make_interrupted(config):
-        trainer = make(config)
-
-        def interrupt(update: int) -> None:
-            if update == 3:
-                raise KeyboardInterrupt
-
-        trainer.begin_update = interrupt
-        return trainer
-
-    run(config=config, out=tmp_path / "whole", make=make)
-    with pytest.raises(KeyboardInterrupt):
-        run(config=config, out=tmp_path / "again", make=make_interrupted)
-    run(config=config, out=tmp_path / "again", make=make)
-    with (
-        np.load(tmp_path / "whole" / "diffaero_rgb.npz") as whole,
-        np.load(tmp_path / "again" / "diffaero_rgb.npz") as again,
-    ):
-        for name in whole.files:
-            np.testing.assert_array_equal(whole[name], again[name])
-    curves = [(tmp_path / name / "curves.csv").read_text() for name in ("whole", "again")]
-    assert curves[0] == curves[1]
-
-
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [

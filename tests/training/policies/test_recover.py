@@ -157,16 +157,6 @@ def test_recovery_share_is_the_part_that_students_came_to(expert, tmp_path):
     assert set(plain.draw(draw, 0.5)) == set(plain.training)
 
 
-def test_what_corpora_share_is_flown_once(expert, tmp_path):
-    shutil.copytree(expert, tmp_path / "copy")
-    both = f"corpora=[{expert}, {tmp_path / 'copy'}]"
-    config = load_config(StudentDepthTraining(), overrides=[both, *TINY])
-    out = tmp_path / "out"
-    ledger = recovery.run(config=config, make=StudentTrainer, out=out, flights=1, jobs=1)
-    assert sum(ledger["flights"].values()) == 1
-    assert ledger["expert_samples"] == len(Corpus(expert))
-
-
 def test_what_sees_in_colors_recovers_too(tmp_path, monkeypatch):
     speeds, fly = [], student_flights.fly
 
