@@ -176,10 +176,17 @@ class OnnxModel:
         """Name of the last operator's output."""
 
     def convolution(
-        self, weight: np.ndarray, bias: np.ndarray, stride: int = 1, groups: int = 1, dilation=1
+        self,
+        weight: np.ndarray,
+        bias: np.ndarray,
+        *,
+        stride: int = 1,
+        groups: int = 1,
+        dilation: int = 1,
+        padding: int | None = None,
     ) -> None:
-        """Convolves (N, C, H, W) by `weight` (outputs, C / groups, k, k), k odd, padded by k // 2
-        times the dilation, and adds `bias` (outputs,)."""
+        """Convolves (N, C, H, W) by `weight` (outputs, C / groups, k, k) and adds `bias`
+        (outputs,); padded by k // 2 times the dilation by default."""
         kernel, names = weight.shape[2], []
         for values in (weight, bias):
             names.append(f"tensor{len(self._tensors)}")
@@ -190,7 +197,7 @@ class OnnxModel:
         attributes = {
             "kernel_shape": [kernel] * 2,
             "strides": [stride] * 2,
-            "pads": [dilation * (kernel // 2)] * 4,
+            "pads": [dilation * (kernel // 2) if padding is None else padding] * 4,
             "dilations": [dilation] * 2,
             "group": groups,
         }

@@ -8,9 +8,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import prod
 
+import cv2
 import numpy as np
 
 from splatpilot.systems.policies.checkpoint import (
+    OnnxModel,
     PolicyCheckpoint,
     check_weights,
     linear_shapes,
@@ -25,7 +27,7 @@ Layer = tuple[int, int, int, int]
 
 
 class Convolutions:
-    """Convolutions, each followed by a leaky ReLU.
+    """Convolutions, each followed by a leaky ReLU, run by OpenCV.
 
     Args:
         image: channels, height and width of the input.
@@ -39,33 +41,17 @@ class Convolutions:
         layers: Sequence[Layer],
         weights: Mapping[str, np.ndarray],
     ) -> None:
-        sizes = layer_sizes(image, layers)
-        self._layers = []
-        for i, (channels, kernel, stride, padding) in enumerate(layers):
-            filters = weights[f"convolutions.{i}.weight"].reshape(channels, -1).T.copy()
-            patches = _patches(sizes[i], sizes[i + 1], kernel, stride, padding)
-            self._layers.append((patches, padding, filters, weights[f"convolutions.{i}.bias"]))
+        model = OnnxModel(image)
+        for i, (_, _, stride, padding) in enumerate(layers):
+            weight, bias = (weights[f"convolutions.{i}.{part}"] for part in ("weight", "bias"))
+            model.convolution(weight, bias, stride=stride, padding=padding)
+            model.add("LeakyRelu", alpha=LEAK)
+        self._net = cv2.dnn.readNetFromONNX(model.serialize(layer_sizes(image, layers)[-1]))
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
-        """Computes the features (F,), in torch's order, of an image (height, width)."""
-        x = np.asarray(image, np.float32)[None]
-        for patches, padding, filters, bias in self._layers:
-            padded = np.pad(x, ((0, 0), (padding, padding), (padding, padding)))
-            x = leaky_relu(padded.take(patches) @ filters + bias)  # (height, width, channels)
-            x = x.transpose(2, 0, 1)
-        return x.ravel()
-
-
-def _patches(
-    size: tuple[int, int, int], out: tuple[int, int, int], kernel: int, stride: int, padding: int
-) -> np.ndarray:
-    """Returns flat indices (height, width, inputs * kernel²) of patches of the padded image."""
-    channels, height, width = size[0], size[1] + 2 * padding, size[2] + 2 * padding
-    k = np.arange(kernel)
-    planes = (np.arange(channels) * height * width)[:, None, None]
-    within = (planes + (k * width)[:, None] + k).ravel()
-    first = (stride * width * np.arange(out[1]))[:, None] + stride * np.arange(out[2])
-    return first[:, :, None] + within
+        """Computes the features (F,) of an image (height, width)."""
+        self._net.setInput(np.asarray(image, np.float32)[None, None])
+        return self._net.forward().ravel()
 
 
 def convolution_shapes(layers: Sequence[Layer]) -> dict[str, tuple[int, ...]]:
