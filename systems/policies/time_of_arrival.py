@@ -44,8 +44,8 @@ class TimeOfArrival:
     """Time of arrival at a goal over a voxel grid, interpolated trilinearly.
 
     The unit is seconds at 1 m/s in open space. Voxels without a path to the goal have the value of
-    the nearest one with a path, plus the distance to it at the contact speed. Outside the box the
-    value is that of the nearest grid point. Immutable, shared by reference.
+    the nearest one with a path, plus the distance to it at the contact speed. Values are constant
+    outside the box. Immutable, shared by reference.
     """
 
     p_WG: np.ndarray  # (3,) [m], the goal
@@ -78,24 +78,14 @@ class TimeOfArrival:
         return bool(self.reachable[cube].any())
 
     def path(self, p_WQ: np.ndarray, lengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns points (n, 3) [m] and directions (n, 3) of the path from p_WQ (3,) [m].
-
-        Each is after a length (n,) [m], with the direction of its last quarter; or at the goal if
-        that is nearer, with direction zero.
-        """
+        """Returns points (n, 3) [m] of the path from p_WQ (3,) [m] after lengths (n,) [m], and the
+        directions (n, 3) of their last quarters; beyond the goal, the goal and zero."""
         step = max(self.voxel_size, 0.1)  # [m] Shorter steps do not resolve more.
         longest = float(np.max(lengths))
         rows = np.empty((ceil(longest / step) + 3, 4))  # both ends, and one for rounding
-        count = _native.descend(
-            times=self.times,
-            lower_W=self.lower_W,
-            voxel_size=self.voxel_size,
-            p_WG=self.p_WG,
-            p_WQ=np.ascontiguousarray(p_WQ, dtype=float),
-            step=step,
-            length=longest,
-            way=rows,
-        )
+        grid = {name: getattr(self, name) for name in ("times", "lower_W", "voxel_size", "p_WG")}
+        p_WQ = np.ascontiguousarray(p_WQ, dtype=float)
+        count = _native.descend(**grid, p_WQ=p_WQ, step=step, length=longest, way=rows)
         *path, covered = rows[:count].T  # 3 of (m,), (m,)
 
         def point_at(length: np.ndarray) -> np.ndarray:
@@ -151,10 +141,10 @@ def time_of_arrival(
     clearance = float(goal_distance) - VEHICLE_RADIUS
     if clearance < margin:
         raise InfeasibleFlightError(
-            f"the clearance of {goal} must be at least {margin:.2f} m beyond the vehicle's radius "
-            f"of {VEHICLE_RADIUS} m, got {clearance:.2f} m: an obstacle, unknown space or the "
-            f"boundary of the known volume {box} is too close; choose a goal "
-            f"{margin - clearance:.2f} m further into free space"
+            f"the clearance of {goal} beyond the vehicle's radius must be at least {margin:.2f} m, "
+            f"got {clearance:.2f} m: an obstacle, unknown space or the boundary of the known "
+            f"volume {box} is too close; choose a goal {margin - clearance:.2f} m further into "
+            "free space"
         )
     # Starts from a sphere of known times that contains a voxel center; a point start would have
     # the largest error of the grid.

@@ -8,6 +8,7 @@ from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
+from torchvision.transforms.functional import gaussian_blur
 
 from splatpilot.systems.common.validation import Config, bounded, require_field
 from splatpilot.systems.sensing.noise import (
@@ -46,8 +47,7 @@ def check_noise(
     color, or of time, as late and lost images."""
     for has, names in ((depth, _DEPTH), (color, _COLOR), (time, _TIME)):
         for name in () if has else names:
-            condition = "left out, as it has no effect on these images"
-            require_field(noise, name, not getattr(noise, name), condition)
+            require_field(noise, name, not getattr(noise, name), "left out")
 
 
 def noisy_depth(depth: Tensor, noise: ObservationNoise, generator: torch.Generator) -> Tensor:
@@ -79,13 +79,7 @@ def noisy_color(color: Tensor, noise: ObservationNoise, generator: torch.Generat
 def blur(color: Tensor, sigma: float) -> Tensor:
     """Blurs colors (N, H, W, 3) by a Gaussian of a standard deviation [px], as `cv2.GaussianBlur`
     does floats: it ends after 4 sigma, and images are reflected at their borders."""
-    reach = (round(8 * sigma + 1) | 1) // 2
-    x = torch.arange(-reach, reach + 1, dtype=color.dtype, device=color.device)
-    weights = torch.exp(-0.5 * (x / sigma) ** 2)
-    across = (weights / weights.sum()).expand(3, 1, 1, -1)
-    images = torch.nn.functional.pad(color.movedim(-1, 1), [reach] * 4, mode="reflect")
-    images = torch.nn.functional.conv2d(images, across, groups=3)
-    return torch.nn.functional.conv2d(images, across.mT, groups=3).movedim(1, -1)
+    return gaussian_blur(color.movedim(-1, 1), round(8 * sigma + 1) | 1, sigma).movedim(1, -1)
 
 
 def change_appearance(color: Tensor, appearance: Appearance, generator: torch.Generator) -> Tensor:

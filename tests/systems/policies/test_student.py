@@ -1,13 +1,9 @@
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from pydrake.common.value import Value
 from pydrake.math import RollPitchYaw
-from pydrake.systems.analysis import Simulator
-from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
 from splatpilot.systems.policies.base import Observation
 from splatpilot.systems.policies.checkpoint import PolicyCheckpoint
@@ -63,35 +59,6 @@ def observe(state: np.ndarray, image: np.ndarray, p_WG=P_WG) -> Observation:
     return Observation(0.0, pose_from_state(state), QuadrotorState.of(state), np.array(p_WG), image)
 
 
-@pytest.mark.parametrize("name", CONFIGS)
-def test_plans_at_its_rate(name, files):
-    config = config_of(name, files)
-    system, rng = Student(config), np.random.default_rng(1)
-    simulator = Simulator(system)
-    context = simulator.get_mutable_context()
-    state = moving([1.0, 2.0, 1.5], [1.0, 0.3, 0.1], yaw=0.6)
-    system.GetInputPort("state").FixValue(context, state)
-    system.GetInputPort("goal").FixValue(context, P_WG)
-    if name == "rgb":
-        image, port = ImageRgba8U(64, 48), "color_image"
-        image.mutable_data[...] = rng.integers(0, 256, (48, 64, 4))
-        pixels = np.asarray(image.data)[..., :3]
-    else:
-        image, port = ImageDepth32F(64, 48), "depth_image_32f"
-        image.mutable_data[..., 0] = rng.uniform(0.5, 25.0, (48, 64))
-        pixels = np.asarray(image.data)[..., 0]
-    system.GetInputPort(port).FixValue(context, Value(image))
-    assert system.num_input_ports() == 3
-    simulator.Initialize()
-    simulator.AdvanceTo(1.5 / config.rate)
-    vector = np.array(system.GetOutputPort("hypotheses").Eval(context))
-    found = Hypotheses.from_vector(vector, 3)
-    assert found is not None and found.plan_time == pytest.approx(1.0 / config.rate)
-    expected = plan(load_network(files[name], name, config.speed), observe(state, pixels))
-    np.testing.assert_array_equal(found.waypoints_B, expected.waypoints_B)
-    np.testing.assert_array_equal(found.costs, expected.costs)
-
-
 def test_other_weights_and_cameras_are_refused(files, tmp_path):
     with pytest.raises(ValueError, match="in format 1, got 'student_rgb'"):
         Student(StudentDepthConfig(weights=files["rgb"]))
@@ -101,8 +68,6 @@ def test_other_weights_and_cameras_are_refused(files, tmp_path):
         Student(StudentDepthConfig(weights=files["depth"]))
     with pytest.raises(ValueError, match=r"camera\.fov_x of the student must be 90.0, got 80"):
         Student(config_of("depth", files, fov_x=80.0))
-    with pytest.raises(ValueError, match=r"speed .* got 0.0"):
-        Student(replace(config_of("depth", files), speed=0.0))
     spec = {"width": 64}
     about = {"format": 1, "policy": "student_depth", "spec": spec, "provenance": {}}
     np.savez(tmp_path / "old.npz", about=json.dumps(about))
