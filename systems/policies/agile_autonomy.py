@@ -1,7 +1,6 @@
 """AgileAutonomy: three trajectories from a depth image, imitated from a sampling expert."""
 
 from dataclasses import dataclass, field
-from math import prod
 from typing import Any
 
 import numpy as np
@@ -15,13 +14,14 @@ from splatpilot.systems.policies.checkpoint import (
     linear_shapes,
     require_shape,
 )
+from splatpilot.systems.policies.convolutions import convolution_shapes
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS, Hypotheses, no_plan
 from splatpilot.systems.policies.observations import pool_depth, target_velocity
 from splatpilot.systems.policies.recurrent_network import (
-    Convolutions,
-    Layer,
-    convolution_shapes,
-    layer_sizes,
+    DepthEncoder,
+    DepthLayer,
+    DepthSpec,
+    depth_layers,
     leaky_relu,
 )
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
@@ -58,27 +58,28 @@ class AgileAutonomyConfig(LearnedPolicyConfig):
 
 
 @dataclass(frozen=True)
-class TrajectoryNetworkSpec:
+class TrajectoryNetworkSpec(DepthSpec):
     """Architecture: convolutions of the image and layers of the state, joined; one layer to the
     features of each mode; and one head for all modes."""
 
     image_height: int = 24
     image_width: int = 32
-    convolutions: tuple[Layer, ...] = ((16, 5, 2, 2), (32, 3, 2, 1), (64, 3, 2, 1), (32, 3, 1, 1))
+    convolutions: tuple[DepthLayer, ...] = (
+        (16, 5, 2, 2),
+        (32, 3, 2, 1),
+        (64, 3, 2, 1),
+        (32, 3, 1, 1),
+    )
     image_features: int = 128
     state_features: int = 64
     mode_features: int = 64
     head_features: int = 128
 
-    def flat_features(self) -> int:
-        """Returns the number of outputs of the last convolution."""
-        return prod(layer_sizes((1, self.image_height, self.image_width), self.convolutions)[-1])
-
     def weight_shapes(self) -> dict[str, tuple[int, ...]]:
         """Returns the shapes of all arrays of weights by name."""
         joined = self.image_features + self.state_features
-        return convolution_shapes(self.convolutions) | linear_shapes(
-            ("image_layer", self.flat_features(), self.image_features),
+        return convolution_shapes(depth_layers(self.convolutions)) | linear_shapes(
+            ("image_layer", self.image_outputs(), self.image_features),
             ("state_layer", STATE_SIZE, self.state_features),
             ("state_layer_2", self.state_features, self.state_features),
             ("modes", joined, MODES * self.mode_features),
@@ -96,8 +97,7 @@ class TrajectoryNetwork:
     def __init__(self, spec: TrajectoryNetworkSpec, weights: dict[str, np.ndarray]) -> None:
         self.spec = spec
         self._weights = check_weights(weights, spec.weight_shapes())
-        image = (1, spec.image_height, spec.image_width)
-        self._convolutions = Convolutions(image, spec.convolutions, self._weights)
+        self._encoder = DepthEncoder(spec, self._weights)
 
     def __call__(self, image: np.ndarray, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Computes waypoints (3, 10, 3) [m] in the body frame and costs (3,).
@@ -106,9 +106,8 @@ class TrajectoryNetwork:
             image: (24, 32), encoded depth.
             state: (18,), see `state_observation`.
         """
-        require_shape("image", image, (self.spec.image_height, self.spec.image_width))
         require_shape("state", state, (STATE_SIZE,))
-        x = self._layer("image_layer", self._convolutions(image))
+        x = self._layer("image_layer", self._encoder(image))
         y = self._layer("state_layer_2", self._layer("state_layer", np.asarray(state, np.float32)))
         modes = self._layer("modes", np.concatenate([x, y]))
         output = linear(self._weights, "output", self._layer("head", modes.reshape(MODES, -1)))

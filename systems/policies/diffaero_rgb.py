@@ -3,17 +3,21 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-import cv2
 import numpy as np
 
 from splatpilot.systems.common.drake import input_port, output_port
 from splatpilot.systems.common.validation import require, require_field
 from splatpilot.systems.policies.base import LearnedPolicyConfig, Observation, Policy
-from splatpilot.systems.policies.checkpoint import OnnxModel, PolicyCheckpoint, check_weights
+from splatpilot.systems.policies.checkpoint import PolicyCheckpoint, check_weights
+from splatpilot.systems.policies.convolutions import (
+    Convolution,
+    convolution_shapes,
+    opencv_net,
+)
 from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK, RATE
 from splatpilot.systems.policies.diffaero import decide as decide_by_grid
 from splatpilot.systems.policies.observations import heading_frame
-from splatpilot.systems.policies.recurrent_network import LEAK, NetworkSpec, RecurrentNetwork
+from splatpilot.systems.policies.recurrent_network import NetworkSpec, RecurrentNetwork
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 
 WIDTH, HEIGHT = 160, 90  # [px] of the view, the middle of the image
@@ -48,45 +52,31 @@ class MonocularSpec:
     coarse_channels: int = 64
     coarse_dilations: tuple[int, ...] = (1, 2, 4, 1, 2, 4)
 
-    def layers(self) -> "list[Layer]":
+    def layers(self) -> list[Convolution]:
         """Lists the convolutions, first to last."""
         fine, coarse = self.fine_channels, self.coarse_channels
-        layers = [Layer("stem", CHANNELS, fine, 7, stride=5)]
+        layers = [_convolution("stem", CHANNELS, fine, 7, stride=5)]
         for i, dilation in enumerate(self.fine_dilations):
             layers += _block(f"fine.{i}", fine, dilation)
-        layers.append(Layer("halving", fine, coarse, 3, stride=2))
+        layers.append(_convolution("halving", fine, coarse, 3, stride=2))
         for i, dilation in enumerate(self.coarse_dilations):
             layers += _block(f"coarse.{i}", coarse, dilation)
-        return [*layers, Layer("head", coarse, 2, 1, rectified=False)]
+        return [*layers, _convolution("head", coarse, 2, 1, activation="")]
 
     def weight_shapes(self) -> dict[str, tuple[int, ...]]:
         """Returns the shapes of all arrays of weights by name."""
-        shapes: dict[str, tuple[int, ...]] = {}
-        for layer in self.layers():
-            kernel = layer.kernel, layer.kernel
-            shapes[f"{layer.name}.weight"] = layer.outputs, layer.inputs, *kernel
-            shapes[f"{layer.name}.bias"] = (layer.outputs,)
-        return shapes
+        return convolution_shapes(self.layers())
 
 
-@dataclass(frozen=True)
-class Layer:
-    """A convolution with bias, padded by half its kernel times its dilation."""
-
-    name: str
-    inputs: int
-    outputs: int
-    kernel: int
-    stride: int = 1
-    dilation: int = 1
-    rectified: bool = True  # followed by a leaky ReLU
-    adds_to_block: bool = False  # adds the input of the layer before
+def _convolution(name: str, *sizes: int, activation="leaky_relu", **options: int) -> Convolution:
+    weight, bias = f"{name}.weight", f"{name}.bias"
+    return Convolution(weight, bias, *sizes, activation=activation, **options)
 
 
-def _block(name: str, channels: int, dilation: int) -> list[Layer]:
+def _block(name: str, channels: int, dilation: int) -> list[Convolution]:
     return [
-        Layer(f"{name}.0", channels, channels, 3, dilation=dilation),
-        Layer(f"{name}.1", channels, channels, 1, rectified=False, adds_to_block=True),
+        _convolution(f"{name}.0", channels, channels, 3, dilation=dilation),
+        _convolution(f"{name}.1", channels, channels, 1, activation="", skip=2),
     ]
 
 
@@ -94,16 +84,7 @@ class MonocularDepth:
     """The network with its weights, by the names of `weight_shapes`, in OpenCV."""
 
     def __init__(self, spec: MonocularSpec, weights: Mapping[str, np.ndarray]) -> None:
-        model, before = OnnxModel((CHANNELS, HEIGHT, WIDTH)), []
-        for layer in spec.layers():
-            before.append(model.output)
-            weight, bias = weights[f"{layer.name}.weight"], weights[f"{layer.name}.bias"]
-            model.convolution(weight, bias, stride=layer.stride, dilation=layer.dilation)
-            if layer.rectified:
-                model.add("LeakyRelu", alpha=LEAK)
-            if layer.adds_to_block:
-                model.add("Add", before[-2])
-        self._net = cv2.dnn.readNetFromONNX(model.serialize((2, 9, 16)))
+        self._net = opencv_net((CHANNELS, HEIGHT, WIDTH), spec.layers(), weights)
 
     def __call__(self, view: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Predicts inverse depths (9, 16) and the logarithms of their expected absolute errors

@@ -8,70 +8,66 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import prod
 
-import cv2
 import numpy as np
 
 from splatpilot.systems.policies.checkpoint import (
-    OnnxModel,
     PolicyCheckpoint,
     check_weights,
     linear_shapes,
     require_shape,
 )
+from splatpilot.systems.policies.convolutions import (
+    LEAK,
+    Convolution,
+    convolution_shapes,
+    opencv_net,
+    output_size,
+)
 
-LEAK = 0.05
-"""Slope of the leaky ReLU for negative numbers."""
-
-Layer = tuple[int, int, int, int]
+DepthLayer = tuple[int, int, int, int]
 """Channels, width of the kernel, stride and padding of a convolution."""
 
 
-class Convolutions:
-    """Convolutions, each followed by a leaky ReLU, run by OpenCV.
+def depth_layers(layers: Sequence[DepthLayer]) -> list[Convolution]:
+    """Returns convolutions of an image of one channel, each followed by a leaky ReLU."""
+    convolutions, inputs = [], 1
+    for i, (outputs, kernel, stride, padding) in enumerate(layers):
+        weight, bias = f"convolutions.{i}.weight", f"convolutions.{i}.bias"
+        sizes = inputs, outputs, kernel, stride
+        layer = Convolution(weight, bias, *sizes, activation="leaky_relu", pad=padding)
+        convolutions.append(layer)
+        inputs = outputs
+    return convolutions
 
-    Args:
-        image: channels, height and width of the input.
-        layers: first to last.
-        weights: arrays by the names of `convolution_shapes`, single precision.
-    """
 
-    def __init__(
-        self,
-        image: tuple[int, int, int],
-        layers: Sequence[Layer],
-        weights: Mapping[str, np.ndarray],
-    ) -> None:
-        model = OnnxModel(image)
-        for i, (_, _, stride, padding) in enumerate(layers):
-            weight, bias = (weights[f"convolutions.{i}.{part}"] for part in ("weight", "bias"))
-            model.convolution(weight, bias, stride=stride, padding=padding)
-            model.add("LeakyRelu", alpha=LEAK)
-        self._net = cv2.dnn.readNetFromONNX(model.serialize(layer_sizes(image, layers)[-1]))
+class DepthSpec:
+    """Base class of architectures with convolutions of a depth image."""
+
+    image_height: int
+    image_width: int
+    convolutions: tuple[DepthLayer, ...]
+
+    def image_size(self) -> tuple[int, int, int]:
+        """Returns channels, height and width of the image."""
+        return 1, self.image_height, self.image_width
+
+    def image_outputs(self) -> int:
+        """Returns the number of outputs of the last convolution."""
+        return prod(output_size(self.image_size(), depth_layers(self.convolutions)))
+
+
+class DepthEncoder:
+    """The convolutions of a `DepthSpec` with their weights."""
+
+    def __init__(self, spec: DepthSpec, weights: Mapping[str, np.ndarray]) -> None:
+        self._net = opencv_net(spec.image_size(), depth_layers(spec.convolutions), weights)
+        self._size = spec.image_size()[1:]
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
         """Computes the features (F,) of an image (height, width)."""
+        require_shape("image", image, self._size)
         self._net.setInput(np.asarray(image, np.float32)[None, None])
         return self._net.forward().ravel()
-
-
-def convolution_shapes(layers: Sequence[Layer]) -> dict[str, tuple[int, ...]]:
-    """Returns the shapes of weights by name of convolutions of an image of one channel."""
-    shapes: dict[str, tuple[int, ...]] = {}
-    inputs = 1
-    for i, (channels, kernel, _, _) in enumerate(layers):
-        shapes[f"convolutions.{i}.weight"] = (channels, inputs, kernel, kernel)
-        shapes[f"convolutions.{i}.bias"] = (channels,)
-        inputs = channels
-    return shapes
-
-
-def layer_sizes(image: tuple[int, int, int], layers: Sequence[Layer]) -> list[tuple[int, int, int]]:
-    """Computes channels, height and width of the image and after each convolution."""
-    sizes = [image]
-    for channels, kernel, stride, padding in layers:
-        height, width = ((size + 2 * padding - kernel) // stride + 1 for size in sizes[-1][1:])
-        sizes.append((channels, height, width))
-    return sizes
 
 
 def leaky_relu(x: np.ndarray) -> np.ndarray:
@@ -80,25 +76,21 @@ def leaky_relu(x: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class NetworkSpec:
+class NetworkSpec(DepthSpec):
     """Architecture of the network."""
 
     image_height: int
     image_width: int
-    convolutions: tuple[Layer, ...]
+    convolutions: tuple[DepthLayer, ...]
     state_size: int
     state_features: int
     hidden_size: int
     output_size: int
 
-    def image_features(self) -> int:
-        """Returns the number of outputs of the last convolution."""
-        return prod(layer_sizes((1, self.image_height, self.image_width), self.convolutions)[-1])
-
     def weight_shapes(self) -> dict[str, tuple[int, ...]]:
         """Returns the shapes of all arrays of weights by name."""
-        H, inputs = self.hidden_size, self.image_features() + self.state_features
-        shapes = convolution_shapes(self.convolutions)
+        H, inputs = self.hidden_size, self.image_outputs() + self.state_features
+        shapes = convolution_shapes(depth_layers(self.convolutions))
         shapes |= linear_shapes(
             ("state_layer", self.state_size, self.state_features), ("head", H, self.output_size)
         )
@@ -112,8 +104,7 @@ class RecurrentNetwork:
     def __init__(self, spec: NetworkSpec, weights: Mapping[str, np.ndarray]) -> None:
         self.spec = spec
         self._weights = check_weights(weights, spec.weight_shapes())
-        image = 1, spec.image_height, spec.image_width
-        self._convolutions = Convolutions(image, spec.convolutions, self._weights)
+        self._encoder = DepthEncoder(spec, self._weights)
 
     def initial_hidden(self) -> np.ndarray:
         """Returns the hidden state (H,) before the first image."""
@@ -130,10 +121,9 @@ class RecurrentNetwork:
             hidden: (H,), the hidden state.
         """
         spec, w, H = self.spec, self._weights, self.spec.hidden_size
-        require_shape("image", image, (spec.image_height, spec.image_width))
         require_shape("state", state, (spec.state_size,))
         require_shape("hidden state", hidden, (H,))
-        x = self._convolutions(image)
+        x = self._encoder(image)
         state, hidden = np.asarray(state, np.float32), np.asarray(hidden, np.float32)
         features = leaky_relu(w["state_layer.weight"] @ state + w["state_layer.bias"])
         features = np.concatenate([x, features])

@@ -5,25 +5,23 @@ runs without torch: the encoder in OpenCV, the rest in numpy.
 """
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, ClassVar
 
-import cv2
 import numpy as np
 
 from splatpilot.systems.common.drake import output_port
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.policies.base import LearnedPolicyConfig, Observation, Policy
 from splatpilot.systems.policies.checkpoint import (
-    OnnxModel,
     PolicyCheckpoint,
     check_weights,
     linear,
     linear_shapes,
     require_shape,
 )
+from splatpilot.systems.policies.convolutions import Convolution, convolution_shapes, opencv_net
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS, Hypotheses, no_plan
 from splatpilot.systems.policies.lattice import HORIZON, reference_trajectory
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
@@ -82,30 +80,11 @@ _STAGES = (
 """Expansion, channels, blocks and first stride of each stage between the first and last."""
 
 
-@dataclass(frozen=True)
-class Convolution:
-    """A convolution with bias."""
-
-    weight: str  # name of its weights (outputs, inputs / groups, kernel, kernel)
-    bias: str  # name of its biases (outputs,)
-    inputs: int
-    outputs: int
-    kernel: int = 1
-    stride: int = 1
-    groups: int = 1
-    rectified: bool = True  # output limited to 0 to 6
-
-    def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Returns the shapes of its arrays of weights by name."""
-        shape = (self.outputs, self.inputs // self.groups, self.kernel, self.kernel)
-        return {self.weight: shape, self.bias: (self.outputs,)}
-
-
 def mobilenet_blocks() -> list[list[Convolution]]:
-    """Lists the convolutions of each of the `BLOCKS` modules; see `adds_input` for skips."""
+    """Lists the convolutions of each of the `BLOCKS` modules."""
 
-    def convolution(prefix: str, *numbers) -> Convolution:
-        return Convolution(f"{prefix}.0.weight", f"{prefix}.1.bias", *numbers)
+    def convolution(prefix: str, *sizes: int) -> Convolution:
+        return Convolution(f"{prefix}.0.weight", f"{prefix}.1.bias", *sizes, activation="relu6")
 
     blocks = [[convolution("features.0", 3, 32, 3, 2)]]
     inputs = 32
@@ -117,37 +96,16 @@ def mobilenet_blocks() -> list[list[Convolution]]:
             n = len(block)
             block.append(convolution(f"{name}.{n}", hidden, hidden, 3, stride, hidden))
             weight, bias = f"{name}.{n + 1}.weight", f"{name}.{n + 2}.bias"
-            block.append(Convolution(weight, bias, hidden, outputs, rectified=False))
+            skip = n + 2 if stride == 1 and inputs == outputs else 0
+            block.append(Convolution(weight, bias, hidden, outputs, skip=skip))
             blocks.append(block)
             inputs = outputs
     return [*blocks, [convolution("features.18", inputs, CHANNELS)]]
 
 
-def adds_input(block: list[Convolution]) -> bool:
-    """Tells whether a module adds its input to its output."""
-    same = block[0].inputs == block[-1].outputs and all(c.stride == 1 for c in block)
-    return len(block) > 1 and same
-
-
 def mobilenet_shapes() -> dict[str, tuple[int, ...]]:
     """Returns the shapes of all arrays of weights by name."""
-    return {k: v for block in mobilenet_blocks() for c in block for k, v in c.shapes().items()}
-
-
-def _mobilenet(height: int, width: int, weights: Mapping[str, np.ndarray]) -> cv2.dnn.Net:
-    """Builds the encoder for images of a size [px] from float32 weights by name."""
-    model = OnnxModel((3, height, width))
-    for block in mobilenet_blocks():
-        before = model.output
-        for layer in block:
-            weight, bias = weights[layer.weight], weights[layer.bias]
-            model.convolution(weight, bias, stride=layer.stride, groups=layer.groups)
-            if layer.rectified:
-                model.add("Clip", min=0.0, max=6.0)
-        if adds_input(block):
-            model.add("Add", before)
-    features = CHANNELS, -(-height // 32), -(-width // 32)
-    return cv2.dnn.readNetFromONNX(model.serialize(features))
+    return convolution_shapes([layer for block in mobilenet_blocks() for layer in block])
 
 
 HYPOTHESES = 3
@@ -249,7 +207,8 @@ class StudentNetwork:
         self.pace = self.speed / spec.nominal_speed
         self.reach = HORIZON * self.speed  # [m], see `StudentSpec.reach`
         self._weights = check_weights(weights, spec.weight_shapes())
-        self._encoder = _mobilenet(spec.height, spec.width, self._weights)
+        layers = [layer for block in mobilenet_blocks() for layer in block]
+        self._encoder = opencv_net((3, spec.height, spec.width), layers, self._weights)
 
     def __call__(self, image: np.ndarray, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Computes waypoints (3, 10, 3) [m] in the body frame and costs (3,).

@@ -1,7 +1,5 @@
 """Networks of depth policies in torch, with the names of weights of those in numpy that fly."""
 
-from collections.abc import Sequence
-
 import torch
 from torch import Tensor, nn
 
@@ -12,8 +10,9 @@ from splatpilot.systems.policies.agile_autonomy import (
     TrajectoryNetworkSpec,
 )
 from splatpilot.systems.policies.checkpoint import PolicyCheckpoint
+from splatpilot.systems.policies.convolutions import LEAK, Convolution
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS
-from splatpilot.systems.policies.recurrent_network import LEAK, Layer, NetworkSpec
+from splatpilot.systems.policies.recurrent_network import DepthSpec, NetworkSpec, depth_layers
 
 
 class TrainableNetwork(nn.Module):
@@ -22,9 +21,9 @@ class TrainableNetwork(nn.Module):
     def __init__(self, spec: NetworkSpec, head_scale: float = 0.1) -> None:
         super().__init__()
         self.spec = spec
-        self.convolutions = _convolutions(spec.convolutions)
+        self.convolutions = _convolutions(spec)
         self.state_layer = nn.Linear(spec.state_size, spec.state_features)
-        self.memory = nn.GRUCell(spec.image_features() + spec.state_features, spec.hidden_size)
+        self.memory = nn.GRUCell(spec.image_outputs() + spec.state_features, spec.hidden_size)
         self.head = nn.Linear(spec.hidden_size, spec.output_size)
         with torch.no_grad():
             self.head.weight.mul_(head_scale)
@@ -47,9 +46,9 @@ class TrajectoryModule(nn.Module):
     def __init__(self, spec: TrajectoryNetworkSpec) -> None:
         super().__init__()
         self.spec = spec
-        self.convolutions = _convolutions(spec.convolutions)
+        self.convolutions = _convolutions(spec)
         joined = spec.image_features + spec.state_features
-        self.image_layer = nn.Linear(spec.flat_features(), spec.image_features)
+        self.image_layer = nn.Linear(spec.image_outputs(), spec.image_features)
         self.state_layer = nn.Linear(STATE_SIZE, spec.state_features)
         self.state_layer_2 = nn.Linear(spec.state_features, spec.state_features)
         self.modes = nn.Linear(joined, MODES * spec.mode_features)
@@ -83,9 +82,11 @@ def _leaky(x: Tensor) -> Tensor:
     return nn.functional.leaky_relu(x, LEAK)
 
 
-def _convolutions(layers: Sequence[Layer]) -> nn.ModuleList:
-    inputs = [1, *(layer[0] for layer in layers)]
-    return nn.ModuleList(
-        nn.Conv2d(size, channels, kernel, stride, padding)
-        for size, (channels, kernel, stride, padding) in zip(inputs, layers, strict=False)
-    )
+def _convolutions(spec: DepthSpec) -> nn.ModuleList:
+    return nn.ModuleList(map(make_convolution, depth_layers(spec.convolutions)))
+
+
+def make_convolution(layer: Convolution) -> nn.Conv2d:
+    """Makes the module of a layer, without activation and skip."""
+    sizes = layer.inputs, layer.outputs, layer.kernel, layer.stride, layer.padding
+    return nn.Conv2d(*sizes, layer.dilation, layer.groups)

@@ -15,7 +15,6 @@ from splatpilot.systems.policies.student import (
     HYPOTHESES,
     STATE_SIZE,
     StudentSpec,
-    adds_input,
     deviations,
     mobilenet_blocks,
 )
@@ -54,8 +53,8 @@ class StudentModule(nn.Module):
             for layer in block:
                 kind = "relu" if rectified else "linear"
                 nn.init.kaiming_normal_(weights[layer.weight], nonlinearity=kind)
-                rectified = layer.rectified
-            if adds_input(block):
+                rectified = bool(layer.activation)
+            if block[-1].skip:
                 nn.init.zeros_(weights[block[-1].weight])
 
     def image_modules(self, count: int) -> nn.ModuleList:

@@ -16,24 +16,27 @@ from torch import Tensor, nn
 from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.common.validation import bounded
 from splatpilot.systems.policies.checkpoint import PolicyCheckpoint
+from splatpilot.systems.policies.convolutions import LEAK
 from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK, MAX_DEPTH, MIN_DEPTH
 from splatpilot.systems.policies.diffaero_rgb import (
     DIFFAERO_RGB_NETWORK,
     HEIGHT,
     WIDTH,
-    Layer,
     MonocularSpec,
     rays_B,
     require_view,
 )
 from splatpilot.systems.policies.observations import heading_frame, inverse_depth
-from splatpilot.systems.policies.recurrent_network import LEAK
 from splatpilot.systems.policies.student import encode_color
 from splatpilot.systems.sensing.noise import ObservationNoise
 from splatpilot.systems.vehicle.state import rotation_matrices
 from splatpilot.training.corpus.corpus import Corpus
 from splatpilot.training.policies.augmentation import change_appearance, check_noise, noisy_color
-from splatpilot.training.policies.networks import TrainableNetwork, load_weights
+from splatpilot.training.policies.networks import (
+    TrainableNetwork,
+    load_weights,
+    make_convolution,
+)
 from splatpilot.training.policies.student_data import StudentData
 from splatpilot.training.policies.trainer import (
     CorpusTraining,
@@ -48,7 +51,9 @@ class MonocularModule(nn.Module):
 
     def __init__(self, spec: MonocularSpec) -> None:
         super().__init__()
-        made = {layer.name: _convolution(layer) for layer in spec.layers()}
+        made = {
+            layer.weight.removesuffix(".weight"): make_convolution(layer) for layer in spec.layers()
+        }
 
         def blocks(name: str, count: int) -> nn.Sequential:
             return nn.Sequential(
@@ -95,11 +100,6 @@ class DiffAeroRgbModule(nn.Module):
         """Loads the monocular network from a file of weights of `diffaero_rgb`."""
         checkpoint = PolicyCheckpoint.load(weights, "diffaero_rgb", DIFFAERO_RGB_NETWORK)
         load_weights(self.monocular, checkpoint, "monocular.")
-
-
-def _convolution(layer: Layer) -> nn.Conv2d:
-    padding, sizes = layer.dilation * (layer.kernel // 2), (layer.kernel, layer.stride)
-    return nn.Conv2d(layer.inputs, layer.outputs, *sizes, padding, layer.dilation)
 
 
 _NEAR = 6.0  # [m] maximum depth of cells that are evaluated

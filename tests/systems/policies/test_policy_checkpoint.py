@@ -2,11 +2,10 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
-from splatpilot.systems.policies.checkpoint import OnnxModel, PolicyCheckpoint
+from splatpilot.systems.policies.checkpoint import PolicyCheckpoint
 from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK
 from splatpilot.systems.policies.recurrent_network import RecurrentNetwork, load_network
 from splatpilot.systems.policies.student import load_network as load_student
@@ -94,39 +93,3 @@ def test_observations_of_the_wrong_size_are_refused():
         network.step(image.T, state, network.initial_hidden())
     with pytest.raises(ValueError, match=r"state must be \(9,\), got \(8,\)"):
         network.step(image, state[:8], network.initial_hidden())
-
-
-def convolved(x: np.ndarray, weight: np.ndarray, bias: np.ndarray, stride: int) -> np.ndarray:
-    outputs, within, kernel, _ = weight.shape
-    pad, groups = kernel // 2, x.shape[0] // within
-    padded = np.pad(x, ((0, 0), (pad, pad), (pad, pad)))
-    height, width = (-(-size // stride) for size in x.shape[1:])
-    y = np.zeros((outputs, height, width))
-    for o in range(outputs):
-        first = (o // (outputs // groups)) * within
-        for i in range(height):
-            for j in range(width):
-                patch = padded[first : first + within, i * stride :, j * stride :]
-                y[o, i, j] = (patch[:, :kernel, :kernel] * weight[o]).sum() + bias[o]
-    return y
-
-
-def test_opencv_runs_the_model():
-    rng = np.random.default_rng(0)
-    image = rng.normal(size=(4, 7, 9)).astype(np.float32)
-    layers = [(6, 4, 3, 2, 1), (6, 1, 3, 1, 6), (6, 6, 1, 1, 1)]
-    model, x = OnnxModel((4, 7, 9)), image.astype(float)
-    before, y = "", x
-    for n, (outputs, within, kernel, stride, groups) in enumerate(layers):
-        weight = rng.normal(size=(outputs, within, kernel, kernel)).astype(np.float32)
-        bias = rng.normal(size=outputs).astype(np.float32)
-        model.convolution(weight, bias, stride=stride, groups=groups)
-        x = convolved(x, weight, bias, stride)
-        if n == 0:
-            model.add("Clip", min=0.0, max=2.5)
-            x = y = np.clip(x, 0.0, 2.5)
-            before = model.output
-    model.add("Add", before)
-    net = cv2.dnn.readNetFromONNX(model.serialize((6, 4, 5)))
-    net.setInput(image[None])
-    np.testing.assert_allclose(net.forward()[0], x + y, atol=1e-4)
