@@ -14,11 +14,9 @@ from typing import Any
 
 import pytest
 
+from splatpilot.analysis.commands.checks import SCENARIOS
 from splatpilot.analysis.commands.main import main
-from splatpilot.analysis.commands.options import SCENARIOS
-from splatpilot.analysis.faults.campaign import FaultsConfig
-from splatpilot.analysis.fidelity.fidelity import FidelityConfig
-from splatpilot.analysis.reconstruction.run import RenderedSceneConfig
+from splatpilot.analysis.commands.options import read_scenario
 from splatpilot.diagrams.flight.policies import POLICIES, policy_named
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.flight.sensors import SENSORS
@@ -28,28 +26,10 @@ from splatpilot.diagrams.worlds.world_registry import WORLDS
 from splatpilot.systems.common.config import load_config
 from splatpilot.systems.common.field_help import describe_fields
 from splatpilot.training.captures.capture_config import CaptureConfig
-from splatpilot.training.captures.check import CheckConfig
-from splatpilot.training.captures.render import RenderConfig
-from splatpilot.training.corpus.corpus import CorpusConfig
-from splatpilot.training.policies.trainer_registry import TRAINERS
-from splatpilot.training.reconstruction.config import ReconstructConfig
 
 ROOT = Path(__file__).parents[1]
 PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").glob("*.md"))]
 IMAGE = re.compile(r"!\[[^]]*\]\(([^)]+)\)")
-
-CONFIGS: dict[str, Any] = {
-    "reconstruct": ReconstructConfig,
-    "scene ablate": ReconstructConfig,
-    "scene fetch": RenderedSceneConfig,
-    "scene fidelity": FidelityConfig,
-    "hardware px4": Px4Config,
-    "hardware faults": FaultsConfig,
-    "capture check": CheckConfig,
-    "capture render": RenderConfig,
-    "corpus make": CorpusConfig,
-}
-"""What `--set` sets; the other verbs set a scenario or a policy's training."""
 
 
 def blocks(page: Path, *languages: str) -> list[str]:
@@ -91,21 +71,15 @@ def parse(monkeypatch):
     return parse
 
 
-def defaults(words: list[str], options: Namespace) -> Any:
-    """The configuration that a command's `--set` changes."""
-    for verb, config in CONFIGS.items():
-        if words[: len(verb.split())] == verb.split():
-            return config()
-    if words[0] == "train":
-        return TRAINERS.find(options.policies[0]).config()
-    if words[0] == "view" and options.what not in SCENARIOS:
+def default_config(options: Namespace) -> Any:
+    """Makes the configuration that a command's `--set` changes, without reading files."""
+    if options.command.name == "view" and options.what not in SCENARIOS:
         return CaptureConfig()
-    if words[0] == "recover":
-        return TRAINERS.find(options.policy).config()
+    if options.default_config is not read_scenario:
+        return options.default_config(options)
     scenario = Scenario()
-    policy = getattr(options, "policy", None)
-    if policy in POLICIES.names():
-        scenario.policy = policy_named(policy)
+    if options.policy in POLICIES.names():
+        scenario.policy = policy_named(options.policy)
     return scenario
 
 
@@ -135,11 +109,8 @@ def test_commands_are_understood(page, parse, hedgehop):
         if words[0] != "splatpilot":
             continue
         options = parse(words[1:])
-        verb = words[1:]
-        while verb[0] == "--import":
-            verb = verb[2:]
-        overrides = getattr(options, "overrides", [])
-        load_config(defaults(verb, options), overrides=overrides)
+        if hasattr(options, "overrides"):
+            load_config(default_config(options), overrides=options.overrides)
 
 
 @pytest.mark.parametrize(
@@ -247,7 +218,7 @@ def test_every_configuration_of_a_verb_is_there(configurations):
     """What the command line loads a file or overrides into has a section."""
     loaded = set()
     for module in (ROOT / "analysis" / "commands").glob("*.py"):
-        loaded |= set(re.findall(r"\b(\w+Config|Scenario)\(\)", module.read_text()))
+        loaded |= set(re.findall(r"\b(\w+Config|Scenario)(?:\(\)|\"\))", module.read_text()))
     assert len(loaded) >= 8
     assert loaded <= {type(config).__name__ for config in configurations}
 
