@@ -218,7 +218,7 @@ def test_every_configuration_of_a_verb_is_there(configurations):
     """What the command line loads a file or overrides into has a section."""
     loaded = set()
     for module in (ROOT / "analysis" / "commands").glob("*.py"):
-        loaded |= set(re.findall(r"\b(\w+Config|Scenario)(?:\(\)|\"\))", module.read_text()))
+        loaded |= set(re.findall(r"\b(\w+Config|Scenario)(?:\(\)|\")", module.read_text()))
     assert len(loaded) >= 8
     assert loaded <= {type(config).__name__ for config in configurations}
 
