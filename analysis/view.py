@@ -32,13 +32,13 @@ from splatpilot.systems.common.files import (
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.splats.splat_files import read_ply, read_splats
 from splatpilot.systems.visualization.meshcat_drawing import (
-    BALL,
+    MARKER_RADIUS,
     GOAL_COLOR,
     START_COLOR,
     draw_box,
     draw_goal,
 )
-from splatpilot.systems.visualization.pages import CapturedImages, ShownPlace, place_page
+from splatpilot.systems.visualization.pages import CapturedImages, ViewerScene, scene_page
 from splatpilot.training.captures.capture import Capture
 from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.capture_registry import read_capture, read_capture_of
@@ -97,9 +97,9 @@ def run(
     for p_W, end, color in zip(
         shown.ends or (), ("start", "goal"), (START_COLOR, GOAL_COLOR), strict=False
     ):
-        draw_goal(meshcat, f"/splatpilot/{end}", p_W, BALL, color)
+        draw_goal(meshcat, f"/splatpilot/{end}", p_W, MARKER_RADIUS, color)
     with written_atomically(out) as partial:
-        partial.write_text(place_page(meshcat.StaticHtml(), shown))
+        partial.write_text(scene_page(meshcat.StaticHtml(), shown))
     print(f"Wrote {out}, a page for any browser")
     return out
 
@@ -122,7 +122,7 @@ def _may_hold_gaussians(path: Path) -> bool:
     return path.is_file() and suffix not in _SCENARIOS | {OCTOMAP} and not is_video(path)
 
 
-def _generated(scenario: Scenario) -> ShownPlace:
+def _generated(scenario: Scenario) -> ViewerScene:
     scenario.validate()
     world = make_world(scenario.world, scenario.seed)
     p_WS = world.p_WS if scenario.start is None else np.asarray(scenario.start, dtype=float)
@@ -130,7 +130,7 @@ def _generated(scenario: Scenario) -> ShownPlace:
     return _show_world(world, f"{world.name}, seed {scenario.seed}", ends)
 
 
-def _scene(path: Path) -> ShownPlace:
+def _scene(path: Path) -> ViewerScene:
     metadata = read_scene_metadata(path)
     world = read_scene_folder(path, metric=False)
     notes, images = [], None
@@ -145,7 +145,7 @@ def _scene(path: Path) -> ShownPlace:
     target = shlex.quote(f"{path}-scaled")
     return replace(
         _show_world(world, world.name, ends, images),
-        num_unknown=len(read_ply(path / FRONTIER)) if metadata.frontier else 0,
+        num_frontier=len(read_ply(path / FRONTIER)) if metadata.frontier else 0,
         beyond=False,
         metric=metadata.metric,
         notes=notes,
@@ -153,7 +153,7 @@ def _scene(path: Path) -> ShownPlace:
     )
 
 
-def _gaussians(path: Path) -> ShownPlace:
+def _gaussians(path: Path) -> ViewerScene:
     """Shows a file of Gaussians, with distances if its world can be made."""
     try:
         world = read_scene(path)
@@ -161,7 +161,7 @@ def _gaussians(path: Path) -> ShownPlace:
         gaussians = read_splats(path)
         lower_W, upper_W = _bounds(gaussians.means)
         notes = [f"Without distances, start and goal: {error}."]
-        return ShownPlace(
+        return ViewerScene(
             name=path.stem,
             gaussians=gaussians,
             background=(0.0, 0.0, 0.0),
@@ -181,7 +181,7 @@ def _origin_notes(origin: Sequence[float]) -> list[str]:
     return [f"Positions are relative to {', '.join(f'{x:.10g}' for x in origin)} of the files."]
 
 
-def _capture(path: Path, overrides: Sequence[str]) -> ShownPlace:
+def _capture(path: Path, overrides: Sequence[str]) -> ViewerScene:
     capture = read_capture(path, load_config(CaptureConfig(), overrides=list(overrides)))
     gaussians = capture_gaussians(capture, _shown_frames(capture))
     if gaussians is None:
@@ -195,7 +195,7 @@ def _capture(path: Path, overrides: Sequence[str]) -> ShownPlace:
     notes += [f"{note[0].upper()}{note[1:]}." for note in capture.notes]
     if not capture.metric:
         notes.append("The unit of length is unknown; set capture.scale.")
-    return ShownPlace(
+    return ViewerScene(
         name=capture.name,
         gaussians=gaussians,
         background=(0.1, 0.1, 0.1),
@@ -214,13 +214,13 @@ def _show_world(
     name: str,
     ends: tuple[NDArray[np.float64], NDArray[np.float64]] | None,
     images: CapturedImages | None = None,
-) -> ShownPlace:
+) -> ViewerScene:
     lower_W, upper_W = world.esdf.lower_W, world.esdf.upper_W
     p_WQ = images.p_WCs if images else np.array([world.p_WS, world.p_WG])
     legend = [_BOUNDS]
     if ends is not None:
         legend += [(_css(START_COLOR), "start"), (_css(GOAL_COLOR), "goal")]
-    return ShownPlace(
+    return ViewerScene(
         name=name,
         gaussians=world.gaussians,
         background=world.background,
