@@ -78,7 +78,7 @@ def shortest_path(field: DistanceField, p_WS: NDArray, p_WG: NDArray) -> NDArray
     """Returns points (K, 3) [m] of a shortest path for the vehicle, found on a grid and shortened
     by straight segments that are free in the exact field.
 
-    Raises InfeasibleFlightError if there is none on the grid.
+    Raises InfeasibleFlightError if the grid has no path.
     """
     lengths = path_lengths(esdf_from_distance_field(field, SPACING).conservative(), p_WG)
     if not lengths.is_reachable(p_WS):

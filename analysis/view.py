@@ -32,8 +32,8 @@ from splatpilot.systems.common.files import (
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.splats.splat_files import read_ply, read_splats
 from splatpilot.systems.visualization.meshcat_drawing import (
-    MARKER_RADIUS,
     GOAL_COLOR,
+    MARKER_RADIUS,
     START_COLOR,
     draw_box,
     draw_goal,

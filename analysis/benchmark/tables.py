@@ -177,7 +177,7 @@ def select(rows: list[Row], **values: object) -> list[Row]:
     return [row for row in rows if all(row[name] == value for name, value in values.items())]
 
 
-def mean_of(rows: list[Row], name: str) -> float:
+def mean_column(rows: list[Row], name: str) -> float:
     """Computes the mean of a column over the rows with a number; NaN without any."""
     values = [row[name] for row in rows if math.isfinite(row.get(name, math.nan))]
     return float(np.mean(values)) if values else math.nan
@@ -223,7 +223,7 @@ def policy_table(rows: list[Row], config: StudyConfig, absent: int = 0) -> list[
                 {"policy": policy, "speed": speed}
                 | success_summary(flown)
                 | {"not_run": absent * config.seeds}
-                | {name: mean_of(flown, name) for name in METRICS}
+                | {name: mean_column(flown, name) for name in METRICS}
             )
     return table
 
@@ -240,7 +240,7 @@ def external_table(rows: list[Row], config: StudyConfig) -> list[Row]:
             for speed in config.speeds:
                 flown = select(rows, scenario=scenario, policy=policy, speed=speed)
                 successes = sum(row["success"] for row in flown)
-                mean_speed = mean_of(flown, "mean_speed_m_s")
+                mean_speed = mean_column(flown, "mean_speed_m_s")
                 entries.append((policy, speed, mean_speed, successes, len(flown)))
         for policy, speed, mean_speed, successes, flights in entries:
             row = {"scenario": scenario, "policy": policy, "speed": speed}

@@ -25,7 +25,7 @@ _RENDERED = {".gltf", ".glb", ".obj", ".yaml", ".yml"}
 
 
 def _is_rendered(source: str) -> bool:
-    """Returns True for meshes and scenarios, of which captures are rendered."""
+    """Returns True for meshes and scenarios, which are rendered to captures."""
     return Path(source).suffix.lower() in _RENDERED or source in SCENARIOS
 
 

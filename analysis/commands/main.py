@@ -118,7 +118,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def run() -> NoReturn:
-    """Runs `main`; signals before and after it end the process at once, in the same way."""
+    """Runs `main`; signals before and after it end the process at once, alike."""
     heeded = _heeded_signals()
     for number in heeded:
         signal.signal(number, _exit_at_once)

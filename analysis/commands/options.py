@@ -36,9 +36,9 @@ class Option:
     keywords: dict[str, Any]  # of `ArgumentParser.add_argument`
     resolve: Callable[[Any], Any] | None = None
     """Checks a value, each of several, before slow imports; returns it or what it names."""
-    unused: bool = False  # True for a path that must not exist without --overwrite
+    unused: bool = False  # the path must not exist without --overwrite
     completions: Sequence[str] = ()  # for shells
-    exclusive: bool = False  # True for options of which at most one is given
+    exclusive: bool = False  # at most one of these options may be given
 
     @property
     def name(self) -> str:

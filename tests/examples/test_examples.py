@@ -71,10 +71,10 @@ def test_splats_behind_drake(opengl, tmp_path):
     assert red[1] == 0 and 0 < red[0] < 0.6 * red[2]
 
 
-def test_bouncing_ball(tmp_path):
+def test_bouncing_sphere(tmp_path):
     """It falls on the ground that the distance field knows, bounces, and comes to rest on it."""
-    run("bouncing_ball.py", "--out", tmp_path / "ball.csv", cwd=tmp_path)
-    _, _, _, z, clearance = np.loadtxt(tmp_path / "ball.csv", delimiter=",", skiprows=1).T
+    run("bouncing_sphere.py", "--out", tmp_path / "sphere.csv", cwd=tmp_path)
+    _, _, _, z, clearance = np.loadtxt(tmp_path / "sphere.csv", delimiter=",", skiprows=1).T
     first = np.flatnonzero(np.diff(z) > 0)[0]
     assert z[0] - z[first] > 1.0
     assert z[first:].max() > z[first] + 0.05
@@ -114,7 +114,7 @@ def test_photographs_to_flight(opengl, tmp_path):
     render_capture.run(world=tmp_path / "room.obj", out=tmp_path / "photos", config=config)
     out = run("photographs_to_flight.py", "photos", "--iterations", 20, cwd=tmp_path)
     assert re.search(r"outcome +goal", out)
-    assert (tmp_path / "out/place/flight/flight.html").is_file()
+    assert (tmp_path / "out/photos/flight/flight.html").is_file()
 
 
 def test_monte_carlo(tmp_path):
@@ -133,7 +133,7 @@ def test_distance_gradient(tmp_path):
     every point to where there is room."""
     out = run("distance_gradient.py", "--points", 4000, cwd=tmp_path)
     assert number(r"predict to (\S+) m", out) < 1e-6
-    assert number(r"(\d+)% have room", out) > 95
+    assert number(r"(\d+)% have clearance", out) > 95
 
 
 def test_lqr_hover(tmp_path):
