@@ -27,9 +27,8 @@ from splatpilot.diagrams.worlds.feasibility import (
     grid_distances,
 )
 from splatpilot.diagrams.worlds.world_registry import make_world
-from splatpilot.systems.collision.distance_field import DistanceField
+from splatpilot.systems.collision.distance_field import DistanceField, FieldState
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.collision.esdf_build import esdf_from_distance_field
 from splatpilot.systems.common.config import load_config
 from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.common.provenance import InfeasibleFlightError
@@ -62,7 +61,8 @@ def difficulty(field: DistanceField, p_WS: NDArray, p_WG: NDArray, seed: int = 0
 
     Raises InfeasibleFlightError if there is no path.
     """
-    path = shortest_path(field, p_WS, p_WG)
+    grid = grid_distances(field, SPACING)
+    path = shortest_path(field, grid, p_WS, p_WG)
     return Difficulty(
         traversability=traversability(field, np.random.default_rng(seed)),
         relative_gap_size=relative_gap_size(field, float((p_WS[2] + p_WG[2]) / 2)),
@@ -70,17 +70,19 @@ def difficulty(field: DistanceField, p_WS: NDArray, p_WG: NDArray, seed: int = 0
         view_obstacle=view_obstacle(field, path),
         angle_over_length=angle_over_length(path),
         detour_ratio=float(path_length(path) / np.linalg.norm(p_WG - p_WS)),
-        bottleneck_m=bottleneck(field, p_WS, p_WG),
+        bottleneck_m=bottleneck(field, grid, p_WS, p_WG),
     )
 
 
-def shortest_path(field: DistanceField, p_WS: NDArray, p_WG: NDArray) -> NDArray:
-    """Returns points (K, 3) [m] of a shortest path for the vehicle, found on a grid and shortened
-    by straight segments that are free in the exact field.
+def shortest_path(field: DistanceField, grid: NDArray, p_WS: NDArray, p_WG: NDArray) -> NDArray:
+    """Returns points (K, 3) [m] of a shortest path for the vehicle, found on `grid_distances` and
+    shortened by straight segments that are free in the exact field.
 
     Raises InfeasibleFlightError if the grid has no path.
     """
-    lengths = path_lengths(esdf_from_distance_field(field, SPACING).conservative(), p_WG)
+    states = np.where(grid > 0, FieldState.FREE, FieldState.OCCUPIED).astype(np.uint8)
+    esdf = Esdf(grid.astype(np.float32), states, np.asarray(field.lower_W, float), SPACING)
+    lengths = path_lengths(esdf.conservative(), p_WG)
     if not lengths.is_reachable(p_WS):
         raise InfeasibleFlightError(
             f"no path from start to goal was found on a grid of {SPACING:g} m"
@@ -257,10 +259,9 @@ def angle_over_length(path: NDArray) -> float:
     return float(np.expm1(2 * theta / np.pi).sum() / path_length(path))
 
 
-def bottleneck(field: DistanceField, p_WS: NDArray, p_WG: NDArray) -> float:
+def bottleneck(field: DistanceField, grid: NDArray, p_WS: NDArray, p_WG: NDArray) -> float:
     """Computes by bisection to 1 cm the largest clearance [m], beyond the vehicle's radius, of any
-    path on the grid. The grid may miss the middle of a gap by half a cell."""
-    grid = grid_distances(field, SPACING)
+    path on `grid_distances`. The grid may miss the middle of a gap by half a cell."""
     ends = [cell_of(field, grid, SPACING, p) for p in (p_WS, p_WG)]
     low, high = 0.0, float(min(grid[end] for end in ends))
     while high - low > 0.01:

@@ -18,6 +18,7 @@ from splatpilot.analysis.difficulty import (
     traversability_obstacle,
     view_obstacle,
 )
+from splatpilot.diagrams.worlds.feasibility import grid_distances
 from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.collision.shapes import AnalyticDistanceField, Box, Capsule
 from splatpilot.systems.common.provenance import InfeasibleFlightError
@@ -49,7 +50,7 @@ def test_an_empty_volume_is_easy():
 
 def test_detour_and_bend_around_a_wall_are_those_of_the_triangle():
     field = AnalyticDistanceField([wall(-4.0, 1.0)], LOWER, UPPER)
-    path = shortest_path(field, START, GOAL)
+    path = shortest_path(field, grid_distances(field, SPACING), START, GOAL)
     assert (field.distance(resample(path, 0.02)) > R - 1e-3).all()
     side = np.hypot(4.5, 0.9 + R)
     assert path_length(path) == pytest.approx(2 * side, rel=0.03)
@@ -61,7 +62,8 @@ def test_detour_and_bend_around_a_wall_are_those_of_the_triangle():
 @pytest.mark.parametrize("gap", [1.2, 2.0])
 def test_bottleneck_is_half_the_gap(gap):
     field = AnalyticDistanceField([wall(-4.0, -gap / 2), wall(gap / 2, 4.0)], LOWER, UPPER)
-    assert 0 <= gap / 2 - R - bottleneck(field, START, GOAL) < SPACING / 2 + 0.02
+    found = bottleneck(field, grid_distances(field, SPACING), START, GOAL)
+    assert 0 <= gap / 2 - R - found < SPACING / 2 + 0.02
 
 
 def test_traversability_of_an_empty_volume_is_the_mean_distance_to_its_bounds():
@@ -133,7 +135,7 @@ def test_infeasible_seeds_are_counted(tmp_path, monkeypatch):
 
 def test_a_closed_wall_leaves_no_path():
     with pytest.raises(InfeasibleFlightError, match="no path"):
-        shortest_path(CLOSED, START, GOAL)
+        shortest_path(CLOSED, grid_distances(CLOSED, SPACING), START, GOAL)
 
 
 def test_march_stops_at_walls_and_bounds():
