@@ -19,6 +19,7 @@ from hypothesis import strategies as st
 from plyfile import PlyData, PlyElement
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
+from room import write_room_capture
 
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.worlds.scene_folder import read_scene, write_scene_folder
@@ -55,12 +56,6 @@ GAUSSIANS = GaussianScene(
 )
 _STATES = RNG.integers(0, 3, (5, 4, 3), dtype=np.uint8)
 ESDF = Esdf(RNG.normal(size=(5, 4, 3)).astype(np.float32), _STATES, np.zeros(3), 0.5)
-
-
-def write_ascii_ply(folder: Path) -> None:
-    write_ply(GAUSSIANS, folder / "scene.ply")
-    ply = PlyData.read(str(folder / "scene.ply"), mmap=False)
-    PlyData(ply.elements, text=True).write(str(folder / "scene.ply"))
 
 
 def write_compressed_ply(folder: Path) -> None:
@@ -120,15 +115,6 @@ def pose_row(X: RigidTransform) -> str:
     return " ".join(f"{value:.9f}" for value in (*X.translation(), x, y, z, w))
 
 
-def write_tartanair(folder: Path) -> None:
-    (folder / "image_left").mkdir()
-    (folder / "depth_left").mkdir()
-    for i in range(FRAMES):
-        write_image(folder / f"image_left/{i:06d}_left.png", i)
-        np.save(folder / f"depth_left/{i:06d}_left_depth.npy", DEPTH)
-    (folder / "pose_left.txt").write_text("\n".join(map(pose_row, POSES)) + "\n")
-
-
 def write_tum(folder: Path) -> None:
     (folder / "rgb").mkdir()
     (folder / "depth").mkdir()
@@ -163,7 +149,7 @@ def write_nerfstudio(folder: Path) -> None:
     (folder / "transforms.json").write_text(json.dumps(content | {"frames": frames}))
 
 
-def write_colmap(folder: Path, text: bool) -> None:
+def write_colmap(folder: Path) -> None:
     (folder / "images").mkdir()
     model, params = pycolmap.Reconstruction(), [10.0, 10.0, 8.0, 6.0]
     camera = pycolmap.Camera(
@@ -179,7 +165,7 @@ def write_colmap(folder: Path, text: bool) -> None:
         track = pycolmap.Track([pycolmap.TrackElement(1, k), pycolmap.TrackElement(2, k)])
         model.add_point3D([2.0, 0.1 * k, 1.0], track, [10, 20, 30])
     (folder / "sparse/0").mkdir(parents=True)
-    (model.write_text if text else model.write)(folder / "sparse/0")
+    model.write(folder / "sparse/0")
 
 
 def write_grids(folder: Path) -> None:
@@ -277,19 +263,17 @@ MESSAGES = {
 UNNAMED = {"scenario", "packets", *MESSAGES}  # errors name a field, or a caller adds the sender
 SPLATS = {
     "PLY": lambda folder: write_ply(GAUSSIANS, folder / "scene.ply"),
-    "ASCII PLY": write_ascii_ply,
     "compressed PLY": write_compressed_ply,
     "SPZ by gzip": lambda folder: write_spz(folder, 3),
     "SPZ by zstd": lambda folder: write_spz(folder, 4),
     "splat": write_splat,
 }
 CAPTURES = {
-    "TartanAir": write_tartanair,
+    "TartanAir": lambda folder: write_room_capture(folder / "room", width=16, height=12),
     "TUM": write_tum,
     "7-Scenes": write_seven_scenes,
     "nerfstudio": write_nerfstudio,
-    "COLMAP": lambda folder: write_colmap(folder, False),
-    "COLMAP text": lambda folder: write_colmap(folder, True),
+    "COLMAP": write_colmap,
 }
 READERS = {
     **{name: (write, read_gaussians, use_gaussians) for name, write in SPLATS.items()},

@@ -5,21 +5,8 @@ from pathlib import Path
 from typing import Any
 
 from splatpilot.analysis.benchmark.variants import split_policies, sweep
+from splatpilot.analysis.commands import options as cli
 from splatpilot.analysis.commands.checks import SCENARIOS, check_policy, check_scenario
-from splatpilot.analysis.commands.options import (
-    JOBS,
-    OVERWRITE,
-    FailureWithResultError,
-    announce,
-    call,
-    command,
-    existing,
-    flag,
-    json_option,
-    option,
-    out_option,
-    set_option,
-)
 from splatpilot.systems.common.validation import require
 
 QUICK = {
@@ -41,28 +28,28 @@ def _speed(text: str) -> float:
         raise ValueError(f"--speeds must be numbers in m/s, got {text!r}") from None
 
 
-@command(
+@cli.command(
     "benchmark",
     "fly policies through scenarios many times, and report",
-    out_option("folder of the study"),
-    flag(
+    cli.out_option("folder of the study"),
+    cli.flag(
         "--quick",
         f"a study of a few minutes: {', '.join(QUICK['scenarios'])}, "
         f"{', '.join(QUICK['policies'])}, {QUICK['seeds']} seeds, unless others are given",
     ),
-    flag(
+    cli.flag(
         "--dodgedrone",
         "the DodgeDrone challenge, easy, medium and hard, at 2, 3, 5 and 7 m/s, next to published "
         "results, unless other scenarios and speeds are given",
     ),
-    option(
+    cli.Option(
         "--policies A,B.npz,C:FIELD=VALUE,...",
         "names, files of weights or module:Class, with LABEL= before and fields after; scenario: "
         "each scenario's own; default: that, if all have one, or all policies",
         split_policies,
         resolve=check_policy,
     ),
-    option(
+    cli.Option(
         "--sweep A:FIELD=1,2,3",
         "a policy with each of these values of a field, and all combinations of the values of "
         "several (repeatable)",
@@ -70,22 +57,22 @@ def _speed(text: str) -> float:
         default=[],
         resolve=lambda text: [check_policy(policy) for policy in sweep(text)],
     ),
-    option(
+    cli.Option(
         "--scenarios P02,FILE.yaml",
         "default: all of the benchmark",
         _names,
         resolve=check_scenario,
     ),
-    option("--speeds 2,3", "nominal, m/s; default: 2", _names, resolve=_speed),
-    option("--seeds N", "flights of each; default: 20", int),
-    option("--split", "seeds to fly: dev (default) for development, test for final results"),
-    JOBS,
-    option("--cluster ADDRESS", "fly on the workers of this dask scheduler"),
-    set_option(
+    cli.Option("--speeds 2,3", "nominal, m/s; default: 2", _names, resolve=_speed),
+    cli.Option("--seeds N", "flights of each; default: 20", int),
+    cli.Option("--split", "seeds to fly: dev (default) for development, test for final results"),
+    cli.JOBS,
+    cli.Option("--cluster ADDRESS", "fly on the workers of this dask scheduler"),
+    cli.set_option(
         *("observation.depth_multiplicative=0.03", "timeout=90"),
         configuration="splatpilot.diagrams.flight.scenario:Scenario",
     ),
-    json_option("the rows of table.csv"),
+    cli.json_option("the rows of table.csv"),
     examples=(
         "benchmark --out out/quick --quick",
         "benchmark --out out/study --scenarios P02,P03 --policies planner,reactive:margin=0.2",
@@ -96,7 +83,7 @@ def benchmark(options: argparse.Namespace) -> Any:
     """Flies scenarios x policies x speeds x seeds, and writes rollouts.csv, table.csv and
     report.html. The same command resumes an interrupted study. Exits with status 1 if no flight
     could be flown."""
-    announce(f"flying a study in {options.out}")
+    cli.announce(f"flying a study in {options.out}")
     from splatpilot.analysis.benchmark import run_study
     from splatpilot.analysis.benchmark.study import StudyConfig, default_policies
     from splatpilot.analysis.benchmark.tables import DODGEDRONE_SPEEDS, PUBLISHED
@@ -114,33 +101,33 @@ def benchmark(options: argparse.Namespace) -> Any:
     config = StudyConfig(**fields)
     if "policies" not in fields:
         config.policies = default_policies(config.scenarios)
-    table = call(run_study.run, options, config=config)
+    table = cli.call(run_study.run, options, config=config)
     if table and all(row["infeasible"] == row["flights"] for row in table):
-        raise FailureWithResultError(
+        raise cli.FailureWithResultError(
             "none of the flights could be flown; rollouts.csv has the reasons", table
         )
     return table
 
 
-@command(
+@cli.command(
     "replay",
     "fly one flight of a study again, and check it",
-    option(
+    cli.Option(
         "study",
         "folder of `splatpilot benchmark`",
         Path,
-        resolve=existing("the folder of a study"),
+        resolve=cli.existing("the folder of a study"),
     ),
-    option(
+    cli.Option(
         "ids",
         "of a flight, as in rollouts.csv; several through one world are drawn on a page",
         nargs="+",
         metavar="id",
     ),
-    flag("--meshcat", "write flight.html, to watch the flight"),
-    flag("--video", "write flight.mp4, the onboard video"),
-    out_option("folder for these (STUDY/replays/ID)", required=False),
-    OVERWRITE,
+    cli.flag("--meshcat", "write flight.html, to watch the flight"),
+    cli.flag("--video", "write flight.mp4, the onboard video"),
+    cli.out_option("folder for these (STUDY/replays/ID)", required=False),
+    cli.OVERWRITE,
     examples=(
         "replay out/study P08-reactive-2-003 --meshcat --video",
         "replay out/study P08-planner-2-003 P08-reactive-2-003 --overwrite",
@@ -153,15 +140,15 @@ def replay(options: argparse.Namespace) -> None:
 
     first, *others = options.ids
     if others:
-        call(replay.overlay, options)
-    elif not call(replay.run, options, id=first).exact:
+        cli.call(replay.overlay, options)
+    elif not cli.call(replay.run, options, id=first).exact:
         raise ValueError(f"{first}: the replay differs from the recorded flight")
 
 
-@command(
+@cli.command(
     "difficulty",
     "print how hard scenarios are, and how many seeds are feasible",
-    option(
+    cli.Option(
         "scenarios",
         "P01 to R17 or YAML files (default: all)",
         nargs="*",
@@ -169,7 +156,7 @@ def replay(options: argparse.Namespace) -> None:
         resolve=check_scenario,
         completions=SCENARIOS,
     ),
-    option("--seeds", "seeds of each (%(default)s)", int, default=5),
+    cli.Option("--seeds", "seeds of each (%(default)s)", int, default=5),
     examples=("difficulty", "difficulty P06 P07 --seeds 10"),
 )
 def difficulty(options: argparse.Namespace) -> None:
@@ -178,4 +165,4 @@ def difficulty(options: argparse.Namespace) -> None:
     require(options.seeds >= 1, "--seeds", "at least 1", options.seeds)
     from splatpilot.analysis import difficulty
 
-    call(difficulty.run, options)
+    cli.call(difficulty.run, options)

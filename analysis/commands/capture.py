@@ -4,22 +4,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from splatpilot.analysis.commands import options as cli
 from splatpilot.analysis.commands.checks import SCENARIOS, find_input
-from splatpilot.analysis.commands.options import (
-    OVERWRITE,
-    SEED,
-    UP,
-    FailureWithResultError,
-    announce,
-    call,
-    command,
-    flag,
-    json_option,
-    option,
-    out_option,
-    read_config,
-    set_option,
-)
 
 _RENDERED = {".gltf", ".glb", ".obj", ".yaml", ".yml"}
 
@@ -37,21 +23,21 @@ def _defaults(options: argparse.Namespace) -> Any:
     return RenderedSceneConfig() if rendered else ReconstructConfig()
 
 
-@command(
+@cli.command(
     "reconstruct",
     "make a scene to fly in from a capture, a mesh or a generated world",
-    option(
+    cli.Option(
         "source",
         "folder of a capture, a mesh (.glb, .gltf, .obj), or a scenario: P01 or a file",
         resolve=lambda source: find_input(source, "capture", "mesh", "scenario"),
     ),
-    out_option("scene folder to write"),
-    option("--iterations", "optimization steps", int),
-    UP,
-    SEED,
-    flag("--restart", "discard an interrupted run"),
-    OVERWRITE,
-    set_option(
+    cli.out_option("scene folder to write"),
+    cli.Option("--iterations", "optimization steps", int),
+    cli.UP,
+    cli.SEED,
+    cli.flag("--restart", "discard an interrupted run"),
+    cli.OVERWRITE,
+    cli.set_option(
         *("voxel_size=0.1", "image_width=640", "max_gaussians=200000", "device=cuda"),
         configuration=_defaults,
     ),
@@ -69,7 +55,7 @@ def reconstruct(options: argparse.Namespace) -> None:
     for name in ("up", "seed"):
         if getattr(options, name) is not None and not rendered:
             raise ValueError(f"--{name} must be of a mesh or a scenario, got a capture, {source}")
-    announce(f"reconstructing {source} as {options.out}")
+    cli.announce(f"reconstructing {source} as {options.out}")
     from splatpilot.analysis.reconstruction import run
 
     overrides = []
@@ -77,25 +63,25 @@ def reconstruct(options: argparse.Namespace) -> None:
         if any(override.startswith("iterations=") for override in options.overrides):
             raise ValueError("iterations are given by --iterations and by --set; keep one of them")
         overrides = [f"iterations={options.iterations}"]
-    config: Any = read_config(options, *overrides)
+    config: Any = cli.read_config(options, *overrides)
     if not rendered:
-        call(run.run, options, capture=Path(source), config=config)
+        cli.call(run.run, options, capture=Path(source), config=config)
         return
     if options.up is not None:
         config.render.up = options.up
     seed = options.seed or 0
-    call(run.run_rendered, options, world=Path(source), config=config, seed=seed)
+    cli.call(run.run_rendered, options, world=Path(source), config=config, seed=seed)
 
 
-@command(
+@cli.command(
     "capture check",
     "check that poses, intrinsics and depth of a capture agree",
-    option("capture", "folder of a capture", resolve=lambda path: find_input(path, "capture")),
-    set_option(
+    cli.Option("capture", "folder of a capture", resolve=lambda path: find_input(path, "capture")),
+    cli.set_option(
         *("pairs=30", "capture.depth_unit=5000"),
         configuration="splatpilot.training.captures.check:CheckConfig",
     ),
-    json_option("the report"),
+    cli.json_option("the report"),
     examples=(
         "capture check data/hospital",
         "capture check data/office --set capture.depth_unit=5000 --json",
@@ -105,12 +91,12 @@ def check(options: argparse.Namespace) -> Any:
     """Projects depth from frame to frame and compares. If it disagrees, tests the usual errors,
     names the most likely one, and exits with status 1. Without depth, it reports what was read or
     registered."""
-    announce(f"checking {options.capture}")
+    cli.announce(f"checking {options.capture}")
     from splatpilot.training.captures import check
 
-    report = check.run(capture=Path(options.capture), config=read_config(options))
+    report = check.run(capture=Path(options.capture), config=cli.read_config(options))
     if report.mistake:
-        raise FailureWithResultError(f"{options.capture}: {report.mistake}", report)
+        raise cli.FailureWithResultError(f"{options.capture}: {report.mistake}", report)
     return report
 
 
@@ -121,19 +107,21 @@ def _points(text: str) -> list[list[float]]:
         raise ValueError(f"--path must be points X,Y,Z with spaces between, got {text!r}") from None
 
 
-@command(
+@cli.command(
     "capture render",
     "render a capture of a mesh or a generated world, with exact depth",
-    option(
+    cli.Option(
         "world",
         ".glb, .gltf or .obj, or a scenario of a generated world: P01 or a file",
         resolve=lambda path: find_input(path, "mesh", "scenario"),
     ),
-    out_option("capture folder to write"),
-    option('--path "X,Y,Z X,Y,Z ..."', "points that the camera goes through [m]", resolve=_points),
-    UP,
-    SEED,
-    set_option(
+    cli.out_option("capture folder to write"),
+    cli.Option(
+        '--path "X,Y,Z X,Y,Z ..."', "points that the camera goes through [m]", resolve=_points
+    ),
+    cli.UP,
+    cli.SEED,
+    cli.set_option(
         *("spacing=0.8", "highest=2.0", "offsets=[-0.5,0.5]"),
         configuration="splatpilot.training.captures.render:RenderConfig",
     ),
@@ -145,9 +133,9 @@ def _points(text: str) -> list[list[float]]:
 def render(options: argparse.Namespace) -> None:
     """Writes a TartanAir V1 sequence. Without --path the camera visits all free space between the
     heights."""
-    announce(f"rendering {options.world} to {options.out}")
+    cli.announce(f"rendering {options.world} to {options.out}")
     from splatpilot.training.captures import render
 
-    config = read_config(options, up=options.up, path=options.path)
+    config = cli.read_config(options, up=options.up, path=options.path)
     world, seed = Path(options.world), options.seed or 0
-    call(render.run, options, world=world, config=config, seed=seed)
+    cli.call(render.run, options, world=world, config=config, seed=seed)

@@ -3,13 +3,13 @@
 import argparse
 from typing import Any
 
-from splatpilot.analysis.commands.options import command, json_option
+from splatpilot.analysis.commands import options as cli
 
 
-@command(
+@cli.command(
     "doctor",
     "list what works on this machine, and what to install or set for the rest",
-    json_option("the findings"),
+    cli.json_option("the findings"),
     examples=("doctor", "doctor --json"),
 )
 def doctor(options: argparse.Namespace) -> Any:

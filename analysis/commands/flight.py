@@ -5,38 +5,25 @@ from pathlib import Path
 from typing import Any
 
 from splatpilot.analysis.benchmark.variants import parse_variant
+from splatpilot.analysis.commands import options as cli
 from splatpilot.analysis.commands.checks import SCENARIOS, find_input
-from splatpilot.analysis.commands.options import (
-    OVERWRITE,
-    SCENARIO_OPTIONS,
-    SEED,
-    FailureWithResultError,
-    call,
-    command,
-    flag,
-    json_option,
-    option,
-    out_option,
-    read_scenario,
-    set_option,
-)
 from splatpilot.diagrams.scenarios import scenario_file
 
 
-@command(
+@cli.command(
     "fly",
     "fly to a goal and write a page, a video and a trajectory",
-    *SCENARIO_OPTIONS,
-    out_option(
+    *cli.SCENARIO_OPTIONS,
+    cli.out_option(
         "output folder (default: out/NAME, named by scenario, policy, speed and seed)",
         required=False,
         unused=True,
     ),
-    OVERWRITE,
-    flag("--live", "serve Meshcat during the flight, in real time"),
-    flag("--no-video", "do not write flight.mp4"),
-    option("--graphviz FILE", "write the diagram as Graphviz", Path, unused=True),
-    json_option("the summary"),
+    cli.OVERWRITE,
+    cli.flag("--live", "serve Meshcat during the flight, in real time"),
+    cli.flag("--no-video", "do not write flight.mp4"),
+    cli.Option("--graphviz FILE", "write the diagram as Graphviz", Path, unused=True),
+    cli.json_option("the summary"),
     examples=(
         "fly --scenario P02 --policy diffaero --speed 3",
         "fly --scene scenes/hospital --policy reactive:margin=0.2 --no-video --json",
@@ -45,13 +32,13 @@ from splatpilot.diagrams.scenarios import scenario_file
 def fly(options: argparse.Namespace) -> Any:
     """Flies one scenario, by default a forest. Writes a page to watch the flight, the onboard
     video, the trajectory, its summary, and the scenario with all fields."""
-    scenario = read_scenario(options)
+    scenario = cli.read_scenario(options)
     out = options.out or Path("out") / _flight_name(options, scenario)
     from splatpilot.diagrams.flight import fly
 
-    summary = call(fly.run, options, scenario=scenario, out=out, video=not options.no_video)
+    summary = cli.call(fly.run, options, scenario=scenario, out=out, video=not options.no_video)
     if "reason" in summary:
-        raise FailureWithResultError(f"the flight ended {summary['reason']}", summary)
+        raise cli.FailureWithResultError(f"the flight ended {summary['reason']}", summary)
     return summary
 
 
@@ -77,21 +64,23 @@ def _scenario_defaults(options: argparse.Namespace) -> Any:
     )
 
 
-WORLD_FIELDS = set_option("world.spacing=2.4", "world.height=8", configuration=_scenario_defaults)
+WORLD_FIELDS = cli.set_option(
+    "world.spacing=2.4", "world.height=8", configuration=_scenario_defaults
+)
 
 
-@command(
+@cli.command(
     "view",
     "view a scene, a map, a capture or a generated world, and measure in it",
-    option(
+    cli.Option(
         "what",
         "scene folder, file of Gaussians (PLY, SPZ, .splat), OctoMap (.bt), folder of a capture, "
         "or a scenario: P02 or a file",
         resolve=lambda what: find_input(what, "scene", "gaussians", "map", "capture", "scenario"),
     ),
-    out_option("page to write (default: out/view/NAME.html)", required=False, unused=True),
-    SEED,
-    OVERWRITE,
+    cli.out_option("page to write (default: out/view/NAME.html)", required=False, unused=True),
+    cli.SEED,
+    cli.OVERWRITE,
     WORLD_FIELDS,
     examples=("view scenes/hospital", "view P02 --seed 3 --set world.spacing=2.4"),
 )
@@ -100,4 +89,4 @@ def view(options: argparse.Namespace) -> None:
     to surfaces, captured images at their poses, a ruler."""
     from splatpilot.analysis import view
 
-    call(view.run, options)
+    cli.call(view.run, options)

@@ -6,33 +6,20 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from splatpilot.analysis.commands.options import (
-    CONFIG,
-    OVERWRITE,
-    SCENARIO_OPTIONS,
-    call,
-    command,
-    existing,
-    flag,
-    option,
-    out_option,
-    read_config,
-    read_scenario,
-    set_option,
-)
+from splatpilot.analysis.commands import options as cli
 
-_LCM_URL = option("--lcm-url URL", "LCM's multicast group and port")
+_LCM_URL = cli.Option("--lcm-url URL", "LCM's multicast group and port")
 _MESSAGING = (
-    option(
+    cli.Option(
         "--hardware FILE",
         "YAML file with fields of HardwareConfig",
         Path,
-        resolve=existing("a YAML file of a configuration"),
+        resolve=cli.existing("a YAML file of a configuration"),
     ),
     _LCM_URL,
-    option("--patience S", "maximum wait for messages [s]", float),
-    OVERWRITE,
-    *SCENARIO_OPTIONS,
+    cli.Option("--patience S", "maximum wait for messages [s]", float),
+    cli.OVERWRITE,
+    *cli.SCENARIO_OPTIONS,
 )
 
 
@@ -45,10 +32,10 @@ def _hardware_config(options: argparse.Namespace) -> Any:
     return replace(load_config(HardwareConfig(), options.hardware), **given)
 
 
-@command(
+@cli.command(
     "hardware vehicle",
     "simulate a vehicle that is flown by LCM messages",
-    out_option("output folder", "out/vehicle", unused=True),
+    cli.out_option("output folder", "out/vehicle", unused=True),
     *_MESSAGING,
     examples=(
         "hardware vehicle --scenario P02 --policy diffaero",
@@ -58,16 +45,16 @@ def _hardware_config(options: argparse.Namespace) -> Any:
 def vehicle(options: argparse.Namespace) -> None:
     """Hovers at the scenario's start until it receives commands, and follows them in real time.
     `splatpilot hardware bridge` flies it instead of a real vehicle."""
-    scenario = read_scenario(options)
+    scenario = cli.read_scenario(options)
     from splatpilot.diagrams.hardware import vehicle
 
-    call(vehicle.run, options, scenario=scenario, config=_hardware_config(options))
+    cli.call(vehicle.run, options, scenario=scenario, config=_hardware_config(options))
 
 
-@command(
+@cli.command(
     "hardware bridge",
     "fly a vehicle, real or simulated, by LCM messages",
-    option("--log", "write all messages to this file, as lcm-logger does", Path, unused=True),
+    cli.Option("--log", "write all messages to this file, as lcm-logger does", Path, unused=True),
     *_MESSAGING,
     examples=(
         "hardware bridge --scenario P02 --policy diffaero",
@@ -77,20 +64,20 @@ def vehicle(options: argparse.Namespace) -> None:
 def bridge(options: argparse.Namespace) -> None:
     """Runs policy, controller and failsafe for a vehicle that sends its state and its images, and
     follows commands."""
-    scenario = read_scenario(options)
+    scenario = cli.read_scenario(options)
     from splatpilot.diagrams.hardware import bridge
 
-    call(bridge.run, options, scenario=scenario, config=_hardware_config(options))
+    cli.call(bridge.run, options, scenario=scenario, config=_hardware_config(options))
 
 
-@command(
+@cli.command(
     "hardware px4",
     "connect the bridge to PX4 by MAVLink",
-    CONFIG,
+    cli.CONFIG,
     _LCM_URL,
-    flag("--engage", "request offboard mode"),
-    flag("--arm", "arm the motors, in offboard mode"),
-    set_option(
+    cli.flag("--engage", "request offboard mode"),
+    cli.flag("--arm", "arm the motors, in offboard mode"),
+    cli.set_option(
         *("vehicle_host=192.168.8.1", "udp.host=0.0.0.0"),
         configuration="splatpilot.diagrams.hardware.px4:Px4Config",
     ),
@@ -103,7 +90,7 @@ def px4(options: argparse.Namespace) -> None:
     """Sends the estimate of PX4 to the bridge, and its commands to PX4. Arms only with --arm."""
     from splatpilot.diagrams.hardware import px4
 
-    config = read_config(options)
+    config = cli.read_config(options)
     if options.lcm_url is not None:
         config.url = options.lcm_url
     config.commander.engage |= options.engage
@@ -111,12 +98,12 @@ def px4(options: argparse.Namespace) -> None:
     px4.run(config=config)
 
 
-@command(
+@cli.command(
     "hardware faults",
     "fly with faults of messages, clocks and policies",
-    out_option("output folder", "out/faults"),
-    CONFIG,
-    set_option(
+    cli.out_option("output folder", "out/faults"),
+    cli.CONFIG,
+    cli.set_option(
         *("trials=30", "seed=1", "scenario.timeout=20"),
         configuration="splatpilot.analysis.faults.campaign:FaultsConfig",
     ),
@@ -137,7 +124,7 @@ def faults(options: argparse.Namespace) -> None:
     try:
         for logger in loggers:
             logger.setLevel(logging.CRITICAL)
-        run(config=read_config(options), out=options.out)
+        run(config=cli.read_config(options), out=options.out)
     finally:
         for logger, level in zip(loggers, levels, strict=True):
             logger.setLevel(level)

@@ -28,53 +28,43 @@ if TYPE_CHECKING:
 EXAMPLES = "examples:"
 
 
-@dataclass(frozen=True)
 class Option:
-    """An option or argument of commands."""
-
-    flag: str
-    keywords: dict[str, Any]  # of `ArgumentParser.add_argument`
-    resolve: Callable[[Any], Any] | None = None
-    """Checks a value, each of several, before slow imports; returns it or what it names."""
-    unused: bool = False  # the path must not exist without --overwrite
-    completions: Sequence[str] = ()  # for shells
-    exclusive: bool = False  # at most one of these options may be given
-
-    @property
-    def name(self) -> str:
-        """The attribute of the parsed options."""
-        return self.keywords.get("dest") or self.flag.lstrip("-").replace("-", "_")
-
-
-def option(
-    spec: str,
-    help: str,
-    type: Callable[[str], Any] = str,
-    *,
-    resolve: Callable[[Any], Any] | None = None,
-    unused: bool = False,
-    completions: Sequence[str] = (),
-    exclusive: bool = False,
-    **keywords: Any,
-) -> Option:
     """
-    Declares an option or argument.
+    An option or argument of commands.
 
     Args:
         spec: flag, or name of an argument, and its metavar, such as "--seeds N".
         help, type, keywords: of `ArgumentParser.add_argument`.
-        resolve, unused, completions, exclusive: see `Option`.
+        resolve: checks a value, each of several, before slow imports; returns it or what it names.
+        unused: the path must not exist without --overwrite.
+        completions: for shells.
+        exclusive: at most one of these options may be given.
     """
-    name, _, metavar = spec.partition(" ")
-    keywords |= {"help": help} | ({"metavar": metavar} if metavar else {})
-    if "action" not in keywords or keywords["action"] == "append":
-        keywords["type"] = type
-    return Option(name, keywords, resolve, unused, completions, exclusive)
+
+    def __init__(
+        self,
+        spec: str,
+        help: str,
+        type: Callable[[str], Any] = str,
+        *,
+        resolve: Callable[[Any], Any] | None = None,
+        unused: bool = False,
+        completions: Sequence[str] = (),
+        exclusive: bool = False,
+        **keywords: Any,
+    ) -> None:
+        self.flag, _, metavar = spec.partition(" ")
+        self.resolve, self.unused, self.exclusive = resolve, unused, exclusive
+        self.completions = completions
+        self.keywords = keywords | {"help": help} | ({"metavar": metavar} if metavar else {})
+        if keywords.get("action", "append") == "append":
+            self.keywords["type"] = type
+        self.name = keywords.get("dest") or self.flag.lstrip("-").replace("-", "_")
 
 
 def flag(name: str, help: str) -> Option:
     """Declares an option without a value."""
-    return option(name, help, action="store_true")
+    return Option(name, help, action="store_true")
 
 
 @dataclass(frozen=True)
@@ -209,7 +199,7 @@ def set_option(*examples: str, configuration: str | Callable[[argparse.Namespace
         module, _, name = str(configuration).partition(":")
         return getattr(import_module(module), name)()
 
-    return option(
+    return Option(
         "--set FIELD=VALUE",
         f"override one field of the configuration, for example {', '.join(examples)} "
         "(repeatable); --set help lists all",
@@ -253,19 +243,19 @@ def out_option(help: str, default: str | None = None, **keywords: Any) -> Option
     if default is not None:
         keywords["default"], help = Path(default), f"{help} (%(default)s)"
     keywords = {"required": default is None} | keywords
-    return option("--out", help, Path, **keywords)
+    return Option("--out", help, Path, **keywords)
 
 
 OVERWRITE = flag("--overwrite", "replace existing output, otherwise an error")
-CONFIG = option(
+CONFIG = Option(
     "--config FILE",
     "YAML file with fields of the configuration",
     Path,
     resolve=existing("a YAML file of a configuration"),
 )
-JOBS = option("--jobs N", "worker processes; default: cores", int)
-SEED = option("--seed", "seed of a generated world", int)
-UP = option("--up", "axis of the mesh file that points up", choices=("y", "z"))
+JOBS = Option("--jobs N", "worker processes; default: cores", int)
+SEED = Option("--seed", "seed of a generated world", int)
+UP = Option("--up", "axis of the mesh file that points up", choices=("y", "z"))
 
 
 def read_scenario(options: argparse.Namespace) -> "Scenario":
@@ -295,28 +285,28 @@ def _check_scene(path: Path) -> Path:
 
 
 SCENARIO_OPTIONS = (
-    option(
+    Option(
         "--scenario P02|FILE.yaml",
         "scenario to fly: one of the benchmark, or a file",
         resolve=check_scenario,
         completions=SCENARIOS,
     ),
-    option(
+    Option(
         "--policy NAME[:FIELD=VALUE]",
         "policy, as in the benchmark: planner, straight, reactive, diffaero, depthnav, "
         "agile_autonomy, ..., a file of weights, or module:Class",
         resolve=check_policy,
         completions=POLICIES,
     ),
-    option("--speed M/S", "nominal, of any policy", float),
-    option(
+    Option("--speed M/S", "nominal, of any policy", float),
+    Option(
         "--scene DIR_OR_FILE",
         "fly in this scene folder, file of Gaussians (PLY, SPZ, .splat; meters, z up) or OctoMap "
         "(.bt)",
         Path,
         resolve=_check_scene,
     ),
-    option("--seed", "seed of the world and the start", int),
+    Option("--seed", "seed of the world and the start", int),
     set_option(
         *("timeout=20", "goal=[12,0,2]", "world.spacing=2.4", "policy.lattice.margin=0.2"),
         configuration=read_scenario,

@@ -3,21 +3,9 @@
 import argparse
 from pathlib import Path
 
+from splatpilot.analysis.commands import options as cli
 from splatpilot.analysis.commands.checks import check_kind, find_input
 from splatpilot.analysis.commands.flight import WORLD_FIELDS
-from splatpilot.analysis.commands.options import (
-    OVERWRITE,
-    SEED,
-    announce,
-    call,
-    command,
-    existing,
-    flag,
-    option,
-    out_option,
-    read_config,
-    set_option,
-)
 from splatpilot.systems.common.extras import import_extra
 from splatpilot.systems.common.files import data_folder, require_existing, scenes_folder
 
@@ -30,26 +18,28 @@ def _point(text: str) -> list[float]:
     return [x, y, z]
 
 
-@command(
+@cli.command(
     "scene scale",
     "scale a scene by a factor, a measured length, or the height of the cameras",
-    option(
+    cli.Option(
         "scene",
         "scene folder, or file of Gaussians",
         Path,
-        resolve=existing("a scene folder or a file of Gaussians"),
+        resolve=cli.existing("a scene folder or a file of Gaussians"),
     ),
-    out_option("scene folder, or PLY, to write"),
-    option("--up", "axis of a file that points up (z)", choices=("x", "-x", "y", "-y", "z", "-z")),
-    option(
+    cli.out_option("scene folder, or PLY, to write"),
+    cli.Option(
+        "--up", "axis of a file that points up (z)", choices=("x", "-x", "y", "-y", "z", "-z")
+    ),
+    cli.Option(
         "--floor X,Y,Z",
         "three points of the floor in a file, to level it at z = 0",
         nargs=3,
         resolve=_point,
         default=[],
     ),
-    option("--factor", "length of a unit of the scene [m]", float, exclusive=True),
-    option(
+    cli.Option("--factor", "length of a unit of the scene [m]", float, exclusive=True),
+    cli.Option(
         "--between X,Y,Z",
         "two points of the scene, as the ruler of `splatpilot view` gives them",
         nargs=2,
@@ -57,13 +47,13 @@ def _point(text: str) -> list[float]:
         exclusive=True,
         default=[],
     ),
-    option(
+    cli.Option(
         "--height",
         "median height of the capture's cameras above the ground [m]",
         float,
         exclusive=True,
     ),
-    option("--distance", "true length between these points [m]", float),
+    cli.Option("--distance", "true length between these points [m]", float),
     examples=(
         "scene scale scenes/room --out scenes/room_metric --between 0,0,1 2,0,1 --distance 3.2",
         "scene scale garden.ply --out level.ply --up -y --floor 0,1.1,2 1,1.2,2 0,0.9,3",
@@ -81,41 +71,41 @@ def scale(options: argparse.Namespace) -> None:
     check_kind(options.scene, "scene", "gaussians")
     from splatpilot.analysis.reconstruction import rescale
 
-    call(rescale.run, options)
+    cli.call(rescale.run, options)
 
 
-@command(
+@cli.command(
     "scene measure",
     "compare a scene with the held-out frames of its capture",
-    option("scene", "scene folder", Path, resolve=existing("a scene folder")),
-    OVERWRITE,
+    cli.Option("scene", "scene folder", Path, resolve=cli.existing("a scene folder")),
+    cli.OVERWRITE,
     examples=("scene measure scenes/room_metric", "scene measure scenes/hospital --overwrite"),
 )
 def measure(options: argparse.Namespace) -> None:
     """Writes metrics.json (PSNR, SSIM, LPIPS, depth errors, floaters) and views.png into a scene
     folder. `splatpilot reconstruct` has written them already."""
-    announce(f"measuring {options.scene}")
+    cli.announce(f"measuring {options.scene}")
     check_kind(options.scene, "scene")
     from splatpilot.analysis.reconstruction import measure_scene
 
-    call(measure_scene.run, options)
+    cli.call(measure_scene.run, options)
 
 
-@command(
+@cli.command(
     "scene mesh",
     "write the surfaces of a scene, a map or a generated world as a mesh for collisions",
-    option(
+    cli.Option(
         "what",
         "scene folder, OctoMap (.bt), or a scenario: P02 or a file",
         resolve=lambda what: find_input(what, "scene", "map", "scenario"),
     ),
-    out_option("file to write: .obj or .gltf", unused=True),
-    flag(
+    cli.out_option("file to write: .obj or .gltf", unused=True),
+    cli.flag(
         "--conservative",
         "unknown space and everything outside the bounds are solid, as for vehicles",
     ),
-    SEED,
-    OVERWRITE,
+    cli.SEED,
+    cli.OVERWRITE,
     WORLD_FIELDS,
     examples=(
         "scene mesh scenes/hospital --out hospital.obj",
@@ -128,22 +118,22 @@ def mesh(options: argparse.Namespace) -> None:
     import_extra("manifold3d", "mesh")
     from splatpilot.analysis import mesh
 
-    call(mesh.run, options)
+    cli.call(mesh.run, options)
 
 
-@command(
+@cli.command(
     "scene ablate",
     "reconstruct captures with increasing use of depth, as 3DGS and 2DGS, and compare",
-    option(
+    cli.Option(
         "captures",
         "folder of a capture, or a scene",
         nargs="+",
         metavar="CAPTURE",
         resolve=lambda path: Path(find_input(path, "capture", "scene")),
     ),
-    out_option("output folder", "out/ablation"),
-    OVERWRITE,
-    set_option(
+    cli.out_option("output folder", "out/ablation"),
+    cli.OVERWRITE,
+    cli.set_option(
         *("iterations=3000", "image_width=320"),
         configuration="splatpilot.training.reconstruction.config:ReconstructConfig",
     ),
@@ -156,26 +146,26 @@ def ablate(options: argparse.Namespace) -> None:
     """Extends the paper's ablation: reconstructs each capture as 3DGS and as 2DGS from points, from
     depth, with the surface and outline losses, and with the depth term, measures them, and writes a
     table and pictures. If interrupted, the same command resumes."""
-    announce(f"reconstructing {len(options.captures)} captures in every arm in {options.out}")
+    cli.announce(f"reconstructing {len(options.captures)} captures in every arm in {options.out}")
     from splatpilot.analysis.reconstruction import ablation
 
-    call(ablation.run, options, config=read_config(options))
+    cli.call(ablation.run, options, config=cli.read_config(options))
 
 
-@command(
+@cli.command(
     "scene fidelity",
     "measure how far from its capture's path a scene can be trusted",
-    option(
+    cli.Option(
         "scenes",
         "scene folder",
         Path,
         nargs="+",
         metavar="SCENE",
-        resolve=existing("a scene folder"),
+        resolve=cli.existing("a scene folder"),
     ),
-    out_option("output folder", "out/fidelity"),
-    OVERWRITE,
-    set_option(
+    cli.out_option("output folder", "out/fidelity"),
+    cli.OVERWRITE,
+    cli.set_option(
         "max_depth_error=0.03", configuration="splatpilot.analysis.fidelity.fidelity:FidelityConfig"
     ),
     examples=(
@@ -186,21 +176,23 @@ def ablate(options: argparse.Namespace) -> None:
 def fidelity(options: argparse.Namespace) -> None:
     """Renders scenes from poses off their captures' paths, compares with the truth or, without it,
     with other frames, and writes the trusted distance from the path into each scene.yaml."""
-    announce(f"comparing views off the path of {len(options.scenes)} scenes in {options.out}")
+    cli.announce(f"comparing views off the path of {len(options.scenes)} scenes in {options.out}")
     for scene in options.scenes:
         check_kind(scene, "scene")
     from splatpilot.analysis.fidelity import fidelity
 
-    call(fidelity.run, options, config=read_config(options))
+    cli.call(fidelity.run, options, config=cli.read_config(options))
 
 
-@command(
+@cli.command(
     "scene fetch",
     "make the scenes of the benchmark's photorealistic scenarios",
-    option("names", "hospital, bookstore, ... (default: R13 to R17)", nargs="*", metavar="NAME"),
-    option("--data", "folder of captures and meshes (default: $SPLATPILOT_DATA)", Path),
-    out_option("folder of scenes (default: $SPLATPILOT_SCENES, or scenes)", required=False),
-    set_option(
+    cli.Option(
+        "names", "hospital, bookstore, ... (default: R13 to R17)", nargs="*", metavar="NAME"
+    ),
+    cli.Option("--data", "folder of captures and meshes (default: $SPLATPILOT_DATA)", Path),
+    cli.out_option("folder of scenes (default: $SPLATPILOT_SCENES, or scenes)", required=False),
+    cli.set_option(
         *("iterations=3000", "render.spacing=1"),
         configuration="splatpilot.analysis.scenes:default_config",
     ),
@@ -212,9 +204,9 @@ def fetch(options: argparse.Namespace) -> None:
     data, scenes = options.data or data_folder(), options.out or scenes_folder()
     if data is not None:
         require_existing(data, "the folder of captures and meshes")
-    announce(f"making {', '.join(options.names) or 'the scenes of the benchmark'} in {scenes}")
+    cli.announce(f"making {', '.join(options.names) or 'the scenes of the benchmark'} in {scenes}")
     from splatpilot.analysis import scenes as recipes
     from splatpilot.systems.common.progress import resumable
 
     with resumable(lambda: f"scenes that are finished are in {scenes}; the same command resumes"):
-        call(recipes.run, options, data=data, scenes=scenes)
+        cli.call(recipes.run, options, data=data, scenes=scenes)

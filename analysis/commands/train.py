@@ -5,25 +5,13 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+from splatpilot.analysis.commands import options as cli
 from splatpilot.analysis.commands.checks import (
     LEARN_FROM_CORPORA,
     TRAINERS,
     check_corpora,
     check_scenario,
     check_trainer,
-)
-from splatpilot.analysis.commands.options import (
-    CONFIG,
-    JOBS,
-    OVERWRITE,
-    announce,
-    call,
-    command,
-    existing,
-    option,
-    out_option,
-    read_config,
-    set_option,
 )
 from splatpilot.systems.common.validation import require
 
@@ -38,10 +26,10 @@ def _trainer_defaults(options: argparse.Namespace) -> Any:
     return TRAINERS.find(named if isinstance(named, str) else named[0]).config()
 
 
-@command(
+@cli.command(
     "train",
     "train policies",
-    option(
+    cli.Option(
         "policies",
         "name of a trainer, such as diffaero, or module:attribute",
         nargs="+",
@@ -49,18 +37,18 @@ def _trainer_defaults(options: argparse.Namespace) -> Any:
         resolve=check_trainer,
         completions=TRAINERS,
     ),
-    out_option(
+    cli.out_option(
         "folder to write; resumes an interrupted run of the same configuration; several runs have "
         "subfolders POLICY, seed_N or POLICY/seed_N"
     ),
-    option("--seeds N", "train with each of these", int, nargs="+"),
-    CONFIG,
-    option(
+    cli.Option("--seeds N", "train with each of these", int, nargs="+"),
+    cli.CONFIG,
+    cli.Option(
         "--fly P02,P03",
         "scenarios of the benchmark to fly after training, five seeds of each",
         resolve=lambda text: [check_scenario(name.strip()) for name in text.split(",")],
     ),
-    set_option("schedule.updates=2000", "seed=1", configuration=_trainer_defaults),
+    cli.set_option("schedule.updates=2000", "seed=1", configuration=_trainer_defaults),
     examples=(
         "train diffaero --out out/forests --set 'worlds.kinds=[P02, P03]' --fly P03",
         "train diffaero depthnav --out out/both --seeds 0 1",
@@ -74,7 +62,7 @@ def train(options: argparse.Namespace) -> None:
         if repeated := [one for k, one in enumerate(given) if one in given[:k]]:
             raise ValueError(f"the {what} {repeated[0]} is given twice; leave one out")
     check_corpora(options.policies, options.overrides, options.config)
-    announce(f"training {', '.join(options.policies)} in {options.out}")
+    cli.announce(f"training {', '.join(options.policies)} in {options.out}")
     from splatpilot.systems.common.config import load_config
     from splatpilot.systems.common.progress import resumable
     from splatpilot.training.policies import train
@@ -101,21 +89,21 @@ def train(options: argparse.Namespace) -> None:
         run_study.run(config=study, out=options.out / "benchmark")
 
 
-@command(
+@cli.command(
     "recover",
     "train a student, fly it, and train it again with corrections of its near-misses",
-    option("policy", "student to train", choices=LEARN_FROM_CORPORA),
-    out_option("folder to write; resumes an interrupted run of the same configuration"),
-    option("--flights N", "in each world, at most (%(default)s)", int, default=6),
-    option(
+    cli.Option("policy", "student to train", choices=LEARN_FROM_CORPORA),
+    cli.out_option("folder to write; resumes an interrupted run of the same configuration"),
+    cli.Option("--flights N", "in each world, at most (%(default)s)", int, default=6),
+    cli.Option(
         "--flown-by POLICY",
         "name or file of weights of the policy that flies, instead of a student that is trained "
         "first",
         default="",
     ),
-    JOBS,
-    CONFIG,
-    set_option(
+    cli.JOBS,
+    cli.CONFIG,
+    cli.set_option(
         *("'corpora=[out/corpus]'", "schedule.updates=2000"), configuration=_trainer_defaults
     ),
     examples=(
@@ -128,16 +116,16 @@ def recover(options: argparse.Namespace) -> None:
     """Trains a student on corpora, flies it in their worlds, labels what came before its
     near-misses and crashes, and trains it again. If interrupted, the same command resumes."""
     check_corpora([options.policy], options.overrides, options.config)
-    announce(f"training {options.policy} with recovery in {options.out}")
+    cli.announce(f"training {options.policy} with recovery in {options.out}")
     from splatpilot.systems.common.processes import available_cores
     from splatpilot.systems.common.progress import resumable
     from splatpilot.training.policies import recover
     from splatpilot.training.policies.trainer_registry import TRAINERS
 
-    config, make = read_config(options), TRAINERS.find(options.policy).make
+    config, make = cli.read_config(options), TRAINERS.find(options.policy).make
     jobs = available_cores() if options.jobs is None else options.jobs
     with resumable(lambda: f"what is finished is in {options.out}; the same command resumes"):
-        result = call(recover.run, options, config=config, make=make, jobs=jobs)
+        result = cli.call(recover.run, options, config=config, make=make, jobs=jobs)
     flown = ", ".join(f"{count} {outcome}" for outcome, count in result["flights"].items())
     print(
         f"{flown}; {result['near_misses']} near-misses; {result['recovery_samples']} samples of "
@@ -146,14 +134,14 @@ def recover(options: argparse.Namespace) -> None:
     )
 
 
-@command(
+@cli.command(
     "corpus make",
     "fly the expert through many worlds and record images and labels",
-    out_option("folder of the corpus"),
-    option("--worlds N", "number of worlds", int, required=True),
-    JOBS,
-    CONFIG,
-    set_option(
+    cli.out_option("folder of the corpus"),
+    cli.Option("--worlds N", "number of worlds", int, required=True),
+    cli.JOBS,
+    cli.CONFIG,
+    cli.set_option(
         *("expert.speed=2.5", "worlds.held_out=true", "perturbation.copies=3"),
         configuration="splatpilot.training.corpus.corpus:CorpusConfig",
     ),
@@ -165,20 +153,22 @@ def recover(options: argparse.Namespace) -> None:
 def make_corpus(options: argparse.Namespace) -> None:
     """Collects the samples that the folder is missing. The same command resumes, and extends the
     corpus to more worlds."""
-    announce(f"collecting a corpus of {options.worlds} worlds in {options.out}")
+    cli.announce(f"collecting a corpus of {options.worlds} worlds in {options.out}")
     from splatpilot.training.corpus import collect
 
-    print(f"{call(collect.run, options, config=read_config(options))} in {options.out}")
+    print(f"{cli.call(collect.run, options, config=cli.read_config(options))} in {options.out}")
 
 
-@command(
+@cli.command(
     "corpus inspect",
     "draw samples with their trajectories, and check every byte",
-    option("corpus", "folder of a corpus", Path, resolve=existing("the folder of a corpus")),
-    out_option("image to draw", metavar="PNG", unused=True),
-    option("--samples N", "(%(default)s)", int, default=12),
-    option("--seed", "of the choice of samples (%(default)s)", int, default=0),
-    OVERWRITE,
+    cli.Option(
+        "corpus", "folder of a corpus", Path, resolve=cli.existing("the folder of a corpus")
+    ),
+    cli.out_option("image to draw", metavar="PNG", unused=True),
+    cli.Option("--samples N", "(%(default)s)", int, default=12),
+    cli.Option("--seed", "of the choice of samples (%(default)s)", int, default=0),
+    cli.OVERWRITE,
     examples=(
         "corpus inspect out/corpus --out samples.png",
         "corpus inspect out/corpus --out samples.png --samples 24 --seed 1 --overwrite",

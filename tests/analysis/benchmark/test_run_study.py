@@ -14,7 +14,7 @@ from splatpilot.analysis.benchmark import run_study
 from splatpilot.analysis.benchmark.run_study import chunks
 from splatpilot.analysis.benchmark.study import StudyConfig
 from splatpilot.analysis.benchmark.study_folder import StudyFolder
-from splatpilot.analysis.benchmark.tables import DODGEDRONE_SPEEDS, PUBLISHED, policy_table
+from splatpilot.analysis.benchmark.tables import DODGEDRONE_SPEEDS, PUBLISHED
 from splatpilot.analysis.commands.main import main
 from splatpilot.diagrams.flight.policies import BENCHMARK_POLICIES, policy_named
 
@@ -139,27 +139,6 @@ def test_absent_scene_is_not_run_and_never_passed(short_scenario, tmp_path, caps
     with pytest.raises(FileNotFoundError, match=r"nothing can be flown: .*nowhere"):
         run_study.run(config=replace(config, scenarios=[str(absent)]), out=tmp_path / "none")
     assert not (tmp_path / "none").exists()
-
-
-def test_each_flight_is_read_once(study, tmp_path, monkeypatch, contents):
-    config, whole = study
-    out = tmp_path / "copy"
-    shutil.copytree(whole, out)
-    read, tables = [], []
-    monkeypatch.setattr(StudyFolder, "read_file", StudyFolder.read, raising=False)
-    monkeypatch.setattr(
-        StudyFolder, "read", lambda self, spec: read.append(spec) or self.read_file(spec)
-    )
-    monkeypatch.setattr(
-        run_study, "policy_table", lambda *words: tables.append(policy_table(*words)) or tables[-1]
-    )
-    run_study.run(config=config, out=out, jobs=1)
-    drawn = read[len(config.rollouts()) :]
-    assert read[: len(config.rollouts())] == config.rollouts()
-    assert [spec.policy for spec in drawn] == config.policy_names
-    assert len({(spec.scenario, spec.seed) for spec in drawn}) == 1
-    assert len(tables) == 1
-    assert contents(out) == contents(whole)
 
 
 def test_cluster_flies_the_same_study_and_survives_the_death_of_a_worker(

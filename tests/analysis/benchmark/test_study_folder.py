@@ -1,5 +1,4 @@
 import json
-import subprocess
 import sys
 from dataclasses import replace
 
@@ -58,25 +57,6 @@ def test_invalid_descriptions_name_the_file(tmp_path, text, message):
     (tmp_path / "study.yaml").write_text(text)
     with pytest.raises(ValueError, match=rf"study\.yaml:? .*{message}"):
         StudyFolder(tmp_path).config()
-
-
-def test_files_that_a_killed_process_left_are_removed(study, tmp_path, contents):
-    config, whole = study
-    out = tmp_path / "killed"
-    begun = (
-        "import os, signal, sys; from pathlib import Path\n"
-        "from splatpilot.systems.common.files import written_atomically\n"
-        "with written_atomically(Path(sys.argv[1])) as file:\n"
-        "    file.write_text('half'); os.kill(os.getpid(), signal.SIGKILL)\n"
-    )
-    out.mkdir()
-    for file in ("study.yaml", "scenarios/short.yaml"):
-        (out / file).parent.mkdir(exist_ok=True)
-        subprocess.run([sys.executable, "-c", begun, str(out / file)], check=False)
-        StudyFolder(out).begin(config, program())
-    assert not list(out.rglob("*.partial*"))
-    run_study.run(config=config, out=out, jobs=1)
-    assert contents(out) == contents(whole)
 
 
 def test_missing_fields_have_their_defaults(study, tmp_path):
