@@ -160,17 +160,10 @@ def _gaussians(path: Path) -> ViewerScene:
     except ValueError as error:
         gaussians = read_splats(path)
         lower_W, upper_W = _bounds(gaussians.means)
-        notes = [f"Without distances, start and goal: {error}."]
-        return ViewerScene(
-            name=path.stem,
-            gaussians=gaussians,
-            background=(0.0, 0.0, 0.0),
-            lower_W=lower_W,
-            upper_W=upper_W,
-            height=float(upper_W[2]),
-            legend=[_BOUNDS],
-            notes=notes + _origin_notes(gaussians.origin),
-        )
+        notes = [f"Without distances, start and goal: {error}.", *_origin_notes(gaussians.origin)]
+        bounds = lower_W, upper_W, float(upper_W[2])
+        black = (0.0, 0.0, 0.0)
+        return ViewerScene(path.stem, gaussians, black, *bounds, legend=[_BOUNDS], notes=notes)
     shown = _show_world(world, world.name, (world.p_WS, world.p_WG))
     return replace(shown, notes=_origin_notes(world.gaussians.origin))
 

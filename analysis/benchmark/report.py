@@ -26,7 +26,6 @@ from splatpilot.analysis.benchmark.tables import (
 from splatpilot.analysis.output import write_png
 from splatpilot.diagrams.flight.blocks import goal_position
 from splatpilot.diagrams.worlds.scene_folder import SceneSource
-from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.common.files import written_atomically
 from splatpilot.systems.common.seeds import SPLIT_NAMES, describe_seeds
@@ -75,15 +74,15 @@ def write_report(
         damaged: errors of files that were flown again in this run.
     """
     paper = paper_rows(config, absent)
-    figure = draw_success_against_speed(table, config.policy_names, paper)
-    success = write_png(figure, folder.path / "success_against_speed.png")
     seeds = SPLIT_NAMES[config.split] + " seeds"
     title = f"Navigation benchmark, {seeds}"
     sections = {
         f"Policies, {seeds}": _policies(table) + _timing(config, rows, timings),
         f"Comparison with the paper's Table I, {seeds}": _paper(table, paper),
         f"Comparison with published results, {seeds}": external_section(external),
-        f"Success against speed, {seeds}": _image(success, "Success rate against velocity"),
+        f"Success against speed, {seeds}": _success_against_speed(
+            folder, table, config.policy_names, paper
+        ),
         "Trajectories through one field": _trajectories(folder, config, rows),
         f"Pairs of policies on the same flights, {seeds}": _pairs(config, rows),
         f"Scenarios, {seeds}": _scenarios(folder, config, rows, absent),
@@ -299,17 +298,15 @@ def _color(policy: str, policies: list[str]) -> str:
     return _COLORS[policies.index(policy) % len(_COLORS)]
 
 
-def draw_success_against_speed(
-    table: list[Row], policies: list[str], paper: dict[str, PaperRow]
-) -> Figure:
-    """Draws Fig. 5: success rate with its 95 % interval against mean velocity, a line for each
-    policy through its nominal speeds, with the paper's points."""
+def _success_against_speed(
+    folder: StudyFolder, table: list[Row], policies: list[str], paper: dict[str, PaperRow]
+) -> str:
+    """Draws Fig. 5 as `success_against_speed.png`: success rate with its 95 % interval against mean
+    velocity, a line for each policy, with the paper's points; returns its HTML."""
     figure = Figure(figsize=(7.2, 4.6), layout="constrained")
     axes = figure.subplots()
     for policy in policies:
         rows = [row for row in table if row["policy"] == policy and row["flights"]]
-        if not rows:
-            continue
         rows.sort(key=lambda row: row["speed"])
         names = "mean_speed_m_s", "success_rate", "wilson_lower", "wilson_upper"
         speeds, rates, lower, upper = (np.array([row[name] for row in rows]) for name in names)
@@ -325,32 +322,21 @@ def draw_success_against_speed(
     axes.set(xlabel="mean flight velocity [m/s]", ylabel="success rate [%]", ylim=(-3, 103))
     axes.grid(alpha=0.3)
     axes.legend(frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
-    return figure
+    png = write_png(figure, folder.path / "success_against_speed.png")
+    return _image(png, "Success rate against velocity")
 
 
-def draw_trajectories(
-    world: World,
-    flights: dict[str, tuple[np.ndarray, str]],
-    p_WS: np.ndarray,
-    p_WG: np.ndarray,
-    policies: list[str],
-    title: str,
-) -> Figure:
-    """Draws Fig. 6: flights through one field from above.
-
-    Args:
-        world: the field.
-        flights: positions p_WB (N, 3) [m] and outcome, by policy.
-        p_WS, p_WG: start and goal (3,) [m].
-        policies: of the study, for their colors.
-        title: of the figure.
-    """
-    extent = world.distance_field.upper_W - world.distance_field.lower_W
-    legend_rows = math.ceil(len(flights) / _LEGEND_COLUMNS)
+def _trajectories(folder: StudyFolder, config: StudyConfig, rows: list[Row]) -> str:
+    """Draws Fig. 6, flights through one field, as `trajectories.png`; returns its HTML."""
+    spec = _telling_flight(rows)
+    _, scenario = next(kept_flights(folder, [spec]))
+    world = make_world(scenario.world, scenario.seed)
+    field, p_WG = world.distance_field, goal_position(scenario, world)
+    extent = field.upper_W - field.lower_W
+    legend_rows = math.ceil(len(config.policies) / _LEGEND_COLUMNS)
     height = float(np.clip(9.0 * extent[1] / extent[0], 2.5, 9.0)) + 0.8 + 0.25 * legend_rows
     figure = Figure(figsize=(9.0, height), layout="constrained")
     axes = figure.subplots()
-    field = world.distance_field
     x, y = (
         np.arange(low + _SPACING / 2, high, _SPACING)
         for low, high in zip(field.lower_W[:2], field.upper_W[:2], strict=True)
@@ -359,46 +345,32 @@ def draw_trajectories(
     distance = np.minimum(np.nan_to_num(field.distance(points), nan=np.inf), 10.0)
     levels = [-1e3, 0.0, VEHICLE_RADIUS]
     axes.contourf(x, y, distance, levels=levels, colors=[_OBSTACLE, _BLOCKED])
-    axes.set_aspect("equal")
-    axes.set_xlim(field.lower_W[0], field.upper_W[0])
-    axes.set_ylim(field.lower_W[1], field.upper_W[1])
-    for policy, (p_WB, outcome) in flights.items():
-        color = _color(policy, policies)
-        axes.plot(p_WB[:, 0], p_WB[:, 1], color=color, lw=1.8, label=f"{policy}: {outcome}")
-        if outcome != "goal" and len(p_WB):
+    p_WS = world.p_WS
+    for policy in config.policy_names:
+        row, arrays = folder.read(spec._replace(policy=policy))
+        if not arrays:
+            continue
+        p_WB = QuadrotorState.of(arrays["states"]).p_WB
+        p_WS, color = p_WB[0], _color(policy, config.policy_names)
+        label = f"{policy}: {row['outcome']}"
+        axes.plot(p_WB[:, 0], p_WB[:, 1], color=color, lw=1.8, label=label)
+        if row["outcome"] != "goal":
             axes.plot(*p_WB[-1, :2], "X", color=color, ms=10, mec="white", zorder=5)
     axes.plot(*p_WS[:2], "o", color="black", ms=7, zorder=5)
     axes.plot(*p_WG[:2], "*", color="black", ms=13, zorder=5)
-    axes.set(xlabel="x [m]", ylabel="y [m]", title=title)
-    if flights:
-        figure.legend(frameon=False, loc="outside lower center", ncols=_LEGEND_COLUMNS)
-    return figure
-
-
-def _trajectories(folder: StudyFolder, config: StudyConfig, rows: list[Row]) -> str:
-    """Writes `trajectories.png` of the field with the most different flights; returns its HTML."""
-    spec = _telling_flight(rows)
-    if spec is None:
-        return "<p>Nothing was flown.</p>"
-    _, scenario = next(kept_flights(folder, [spec]))
-    world = make_world(scenario.world, scenario.seed)
-    flights = {}
-    for policy in config.policy_names:
-        row, arrays = folder.read(spec._replace(policy=policy))
-        if arrays:
-            flights[policy] = QuadrotorState.of(arrays["states"]).p_WB, row["outcome"]
-    p_WS = next((p_WB[0] for p_WB, _ in flights.values()), world.p_WS)
     title = f"{spec.scenario}, seed {spec.seed}, {spec.speed:g} m/s"
-    p_WG = goal_position(scenario, world)
-    figure = draw_trajectories(world, flights, p_WS, p_WG, config.policy_names, title)
+    axes.set(xlabel="x [m]", ylabel="y [m]", title=title, aspect="equal")
+    axes.set(xlim=(x[0], x[-1]), ylim=(y[0], y[-1]))
+    if axes.get_legend_handles_labels()[0]:
+        figure.legend(frameon=False, loc="outside lower center", ncols=_LEGEND_COLUMNS)
     return _image(write_png(figure, folder.path / "trajectories.png"), title) + _note(
         "Dark: obstacles at the height of the goal, from the distance field; light: where the "
         "vehicle's center would collide."
     )
 
 
-def _telling_flight(rows: list[Row]) -> RolloutSpec | None:
-    """Returns a flight of the field whose flights differ most in success, or None."""
+def _telling_flight(rows: list[Row]) -> RolloutSpec:
+    """Returns a flight of the field whose flights differ most in success."""
     fields: dict[tuple, list[Row]] = {}
     for row in rows:
         fields.setdefault((row["scenario"], row["speed"], row["seed"]), []).append(row)
@@ -407,7 +379,5 @@ def _telling_flight(rows: list[Row]) -> RolloutSpec | None:
         wins = sum(row["success"] for row in flown)
         return min(wins, len(flown) - wins), wins, sum(r.get("path_length_m", 0.0) for r in flown)
 
-    if not fields:
-        return None
     row = max(fields.values(), key=variety)[0]
     return RolloutSpec(*(row[name] for name in RolloutSpec._fields))
