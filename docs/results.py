@@ -269,10 +269,10 @@ def write() -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    verbs = parser.add_subparsers(dest="verb", required=True)
-    verbs.add_parser("write", help=write.__doc__)
-    kept = verbs.add_parser("keep", help=keep.__doc__)
+    commands = parser.add_subparsers(dest="command", required=True)
+    commands.add_parser("write", help=write.__doc__)
+    kept = commands.add_parser("keep", help=keep.__doc__)
     kept.add_argument("study", type=Path)
     kept.add_argument("name")
     options = vars(parser.parse_args())
-    {"keep": keep, "write": write}[options.pop("verb")](**options)
+    {"keep": keep, "write": write}[options.pop("command")](**options)

@@ -1,7 +1,6 @@
 """`splatpilot benchmark`, `replay` and `difficulty`."""
 
 import argparse
-from pathlib import Path
 from typing import Any
 
 from splatpilot.analysis.benchmark.variants import split_policies, sweep
@@ -57,12 +56,7 @@ def _speed(text: str) -> float:
         default=[],
         resolve=lambda text: [check_policy(policy) for policy in sweep(text)],
     ),
-    cli.Option(
-        "--scenarios P02,FILE.yaml",
-        "default: all of the benchmark",
-        _names,
-        resolve=check_scenario,
-    ),
+    cli.Option("--scenarios P02,FILE.yaml", "default: all", _names, resolve=check_scenario),
     cli.Option("--speeds 2,3", "nominal, m/s; default: 2", _names, resolve=_speed),
     cli.Option("--seeds N", "flights of each; default: 20", int),
     cli.Option("--split", "seeds to fly: dev (default) for development, test for final results"),
@@ -112,18 +106,8 @@ def benchmark(options: argparse.Namespace) -> Any:
 @cli.command(
     "replay",
     "fly one flight of a study again, and check it",
-    cli.Option(
-        "study",
-        "folder of `splatpilot benchmark`",
-        Path,
-        resolve=cli.existing("the folder of a study"),
-    ),
-    cli.Option(
-        "ids",
-        "of a flight, as in rollouts.csv; several through one world are drawn on a page",
-        nargs="+",
-        metavar="id",
-    ),
+    cli.path_option("study", "the folder of a study"),
+    cli.Option("ids", "of flights through one world, see rollouts.csv", nargs="+", metavar="id"),
     cli.flag("--meshcat", "write flight.html, to watch the flight"),
     cli.flag("--video", "write flight.mp4, the onboard video"),
     cli.out_option("folder for these (STUDY/replays/ID)", required=False),

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from splatpilot.analysis.commands import options as cli
-from splatpilot.analysis.commands.checks import SCENARIOS, find_input
+from splatpilot.analysis.commands.checks import SCENARIOS
 
 _RENDERED = {".gltf", ".glb", ".obj", ".yaml", ".yml"}
 
@@ -26,11 +26,7 @@ def _defaults(options: argparse.Namespace) -> Any:
 @cli.command(
     "reconstruct",
     "make a scene to fly in from a capture, a mesh or a generated world",
-    cli.Option(
-        "source",
-        "folder of a capture, a mesh (.glb, .gltf, .obj), or a scenario: P01 or a file",
-        resolve=lambda source: find_input(source, "capture", "mesh", "scenario"),
-    ),
+    cli.input_option("source", "capture", "mesh", "scenario"),
     cli.out_option("scene folder to write"),
     cli.Option("--iterations", "optimization steps", int),
     cli.UP,
@@ -76,7 +72,7 @@ def reconstruct(options: argparse.Namespace) -> None:
 @cli.command(
     "capture check",
     "check that poses, intrinsics and depth of a capture agree",
-    cli.Option("capture", "folder of a capture", resolve=lambda path: find_input(path, "capture")),
+    cli.input_option("capture", "capture"),
     cli.set_option(
         *("pairs=30", "capture.depth_unit=5000"),
         configuration="splatpilot.training.captures.check:CheckConfig",
@@ -110,15 +106,9 @@ def _points(text: str) -> list[list[float]]:
 @cli.command(
     "capture render",
     "render a capture of a mesh or a generated world, with exact depth",
-    cli.Option(
-        "world",
-        ".glb, .gltf or .obj, or a scenario of a generated world: P01 or a file",
-        resolve=lambda path: find_input(path, "mesh", "scenario"),
-    ),
+    cli.input_option("world", "mesh", "scenario"),
     cli.out_option("capture folder to write"),
-    cli.Option(
-        '--path "X,Y,Z X,Y,Z ..."', "points that the camera goes through [m]", resolve=_points
-    ),
+    cli.Option('--path "X,Y,Z X,Y,Z ..."', "points on the camera's path [m]", resolve=_points),
     cli.UP,
     cli.SEED,
     cli.set_option(

@@ -1,7 +1,7 @@
 """Checks of names and paths that the command line makes before slow imports."""
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from splatpilot.analysis.benchmark.variants import SCENARIO, parse_variant
@@ -113,8 +113,22 @@ def check_kind(path: Path, *accepted: str) -> None:
 
 
 def _list_kinds(kinds: Sequence[str]) -> str:
-    *first, last = (_KINDS[kind][0] for kind in kinds)
+    return _join(_KINDS[kind][0] for kind in kinds)
+
+
+def _join(words: Iterable[str]) -> str:
+    *first, last = words
     return f"{', '.join(first)} or {last}" if first else last
+
+
+def describe_kinds(kinds: Sequence[str]) -> str:
+    """Lists kinds of environments with their suffixes, for the help of a command."""
+    described = []
+    for kind in kinds:
+        forms = ["P02"] if kind == "scenario" else []
+        forms += [suffix for suffix, other in _SUFFIXES.items() if other == kind]
+        described.append(_KINDS[kind][0] + (f" ({', '.join(forms)})" if forms else ""))
+    return _join(described)
 
 
 def _is_capture(path: Path) -> bool:

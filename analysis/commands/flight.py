@@ -6,7 +6,7 @@ from typing import Any
 
 from splatpilot.analysis.benchmark.variants import parse_variant
 from splatpilot.analysis.commands import options as cli
-from splatpilot.analysis.commands.checks import SCENARIOS, find_input
+from splatpilot.analysis.commands.checks import SCENARIOS
 from splatpilot.diagrams.scenarios import scenario_file
 
 
@@ -14,11 +14,7 @@ from splatpilot.diagrams.scenarios import scenario_file
     "fly",
     "fly to a goal and write a page, a video and a trajectory",
     *cli.SCENARIO_OPTIONS,
-    cli.out_option(
-        "output folder (default: out/NAME, named by scenario, policy, speed and seed)",
-        required=False,
-        unused=True,
-    ),
+    cli.out_option("output folder (default: out/FLIGHT)", required=False, unused=True),
     cli.OVERWRITE,
     cli.flag("--live", "serve Meshcat during the flight, in real time"),
     cli.flag("--no-video", "do not write flight.mp4"),
@@ -72,12 +68,7 @@ WORLD_FIELDS = cli.set_option(
 @cli.command(
     "view",
     "view a scene, a map, a capture or a generated world, and measure in it",
-    cli.Option(
-        "what",
-        "scene folder, file of Gaussians (PLY, SPZ, .splat), OctoMap (.bt), folder of a capture, "
-        "or a scenario: P02 or a file",
-        resolve=lambda what: find_input(what, "scene", "gaussians", "map", "capture", "scenario"),
-    ),
+    cli.input_option("what", "scene", "gaussians", "map", "capture", "scenario"),
     cli.out_option("page to write (default: out/view/NAME.html)", required=False, unused=True),
     cli.SEED,
     cli.OVERWRITE,

@@ -10,12 +10,7 @@ from splatpilot.analysis.commands import options as cli
 
 _LCM_URL = cli.Option("--lcm-url URL", "LCM's multicast group and port")
 _MESSAGING = (
-    cli.Option(
-        "--hardware FILE",
-        "YAML file with fields of HardwareConfig",
-        Path,
-        resolve=cli.existing("a YAML file of a configuration"),
-    ),
+    cli.path_option("--hardware FILE", "a YAML file of a HardwareConfig"),
     _LCM_URL,
     cli.Option("--patience S", "maximum wait for messages [s]", float),
     cli.OVERWRITE,

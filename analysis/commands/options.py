@@ -19,6 +19,8 @@ from splatpilot.analysis.commands.checks import (
     check_kind,
     check_policy,
     check_scenario,
+    describe_kinds,
+    find_input,
 )
 from splatpilot.systems.common.files import require_existing, require_scene, require_unused
 
@@ -223,14 +225,20 @@ def read_config(options: argparse.Namespace, *overrides: str, **changes: Any) ->
     return load_config(config, file, [*options.overrides, *overrides])
 
 
-def existing(what: str) -> Callable[[Path], Path]:
-    """Returns a check that a path exists; `what` is expected there."""
+def path_option(spec: str, what: str, **keywords: Any) -> Option:
+    """Declares an option or argument for existing paths, with `what` there."""
 
     def check(path: Path) -> Path:
         require_existing(path, what)
         return path
 
-    return check
+    return Option(spec, what, Path, resolve=check, **keywords)
+
+
+def input_option(name: str, *kinds: str, **keywords: Any) -> Option:
+    """Declares an argument for environments of these kinds, see `find_input`."""
+    help = describe_kinds(kinds)
+    return Option(name, help, resolve=lambda path: find_input(path, *kinds), **keywords)
 
 
 def json_option(what: str) -> Option:
@@ -247,12 +255,7 @@ def out_option(help: str, default: str | None = None, **keywords: Any) -> Option
 
 
 OVERWRITE = flag("--overwrite", "replace existing output, otherwise an error")
-CONFIG = Option(
-    "--config FILE",
-    "YAML file with fields of the configuration",
-    Path,
-    resolve=existing("a YAML file of a configuration"),
-)
+CONFIG = path_option("--config FILE", "a YAML file of a configuration")
 JOBS = Option("--jobs N", "worker processes; default: cores", int)
 SEED = Option("--seed", "seed of a generated world", int)
 UP = Option("--up", "axis of the mesh file that points up", choices=("y", "z"))

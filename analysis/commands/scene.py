@@ -4,10 +4,12 @@ import argparse
 from pathlib import Path
 
 from splatpilot.analysis.commands import options as cli
-from splatpilot.analysis.commands.checks import check_kind, find_input
+from splatpilot.analysis.commands.checks import check_kind
 from splatpilot.analysis.commands.flight import WORLD_FIELDS
 from splatpilot.systems.common.extras import import_extra
 from splatpilot.systems.common.files import data_folder, require_existing, scenes_folder
+
+_AXES = "x", "-x", "y", "-y", "z", "-z"
 
 
 def _point(text: str) -> list[float]:
@@ -21,19 +23,12 @@ def _point(text: str) -> list[float]:
 @cli.command(
     "scene scale",
     "scale a scene by a factor, a measured length, or the height of the cameras",
-    cli.Option(
-        "scene",
-        "scene folder, or file of Gaussians",
-        Path,
-        resolve=cli.existing("a scene folder or a file of Gaussians"),
-    ),
+    cli.path_option("scene", "a scene folder or a file of Gaussians"),
     cli.out_option("scene folder, or PLY, to write"),
-    cli.Option(
-        "--up", "axis of a file that points up (z)", choices=("x", "-x", "y", "-y", "z", "-z")
-    ),
+    cli.Option("--up", "axis of a file that points up (z)", choices=_AXES),
     cli.Option(
         "--floor X,Y,Z",
-        "three points of the floor in a file, to level it at z = 0",
+        "points of the floor in a file, to level it at z = 0",
         nargs=3,
         resolve=_point,
         default=[],
@@ -47,12 +42,7 @@ def _point(text: str) -> list[float]:
         exclusive=True,
         default=[],
     ),
-    cli.Option(
-        "--height",
-        "median height of the capture's cameras above the ground [m]",
-        float,
-        exclusive=True,
-    ),
+    cli.Option("--height", "of the capture's cameras, median [m]", float, exclusive=True),
     cli.Option("--distance", "true length between these points [m]", float),
     examples=(
         "scene scale scenes/room --out scenes/room_metric --between 0,0,1 2,0,1 --distance 3.2",
@@ -77,7 +67,7 @@ def scale(options: argparse.Namespace) -> None:
 @cli.command(
     "scene measure",
     "compare a scene with the held-out frames of its capture",
-    cli.Option("scene", "scene folder", Path, resolve=cli.existing("a scene folder")),
+    cli.path_option("scene", "a scene folder"),
     cli.OVERWRITE,
     examples=("scene measure scenes/room_metric", "scene measure scenes/hospital --overwrite"),
 )
@@ -94,16 +84,9 @@ def measure(options: argparse.Namespace) -> None:
 @cli.command(
     "scene mesh",
     "write the surfaces of a scene, a map or a generated world as a mesh for collisions",
-    cli.Option(
-        "what",
-        "scene folder, OctoMap (.bt), or a scenario: P02 or a file",
-        resolve=lambda what: find_input(what, "scene", "map", "scenario"),
-    ),
+    cli.input_option("what", "scene", "map", "scenario"),
     cli.out_option("file to write: .obj or .gltf", unused=True),
-    cli.flag(
-        "--conservative",
-        "unknown space and everything outside the bounds are solid, as for vehicles",
-    ),
+    cli.flag("--conservative", "unknown space and outside of the bounds are solid"),
     cli.SEED,
     cli.OVERWRITE,
     WORLD_FIELDS,
@@ -124,13 +107,7 @@ def mesh(options: argparse.Namespace) -> None:
 @cli.command(
     "scene ablate",
     "reconstruct captures with increasing use of depth, as 3DGS and 2DGS, and compare",
-    cli.Option(
-        "captures",
-        "folder of a capture, or a scene",
-        nargs="+",
-        metavar="CAPTURE",
-        resolve=lambda path: Path(find_input(path, "capture", "scene")),
-    ),
+    cli.input_option("captures", "capture", "scene", nargs="+", metavar="CAPTURE"),
     cli.out_option("output folder", "out/ablation"),
     cli.OVERWRITE,
     cli.set_option(
@@ -149,20 +126,14 @@ def ablate(options: argparse.Namespace) -> None:
     cli.announce(f"reconstructing {len(options.captures)} captures in every arm in {options.out}")
     from splatpilot.analysis.reconstruction import ablation
 
-    cli.call(ablation.run, options, config=cli.read_config(options))
+    captures = [Path(capture) for capture in options.captures]
+    cli.call(ablation.run, options, captures=captures, config=cli.read_config(options))
 
 
 @cli.command(
     "scene fidelity",
     "measure how far from its capture's path a scene can be trusted",
-    cli.Option(
-        "scenes",
-        "scene folder",
-        Path,
-        nargs="+",
-        metavar="SCENE",
-        resolve=cli.existing("a scene folder"),
-    ),
+    cli.path_option("scenes", "a scene folder", nargs="+", metavar="SCENE"),
     cli.out_option("output folder", "out/fidelity"),
     cli.OVERWRITE,
     cli.set_option(

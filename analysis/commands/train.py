@@ -2,7 +2,6 @@
 
 import argparse
 from itertools import product
-from pathlib import Path
 from typing import Any
 
 from splatpilot.analysis.commands import options as cli
@@ -162,9 +161,7 @@ def make_corpus(options: argparse.Namespace) -> None:
 @cli.command(
     "corpus inspect",
     "draw samples with their trajectories, and check every byte",
-    cli.Option(
-        "corpus", "folder of a corpus", Path, resolve=cli.existing("the folder of a corpus")
-    ),
+    cli.path_option("corpus", "the folder of a corpus"),
     cli.out_option("image to draw", metavar="PNG", unused=True),
     cli.Option("--samples N", "(%(default)s)", int, default=12),
     cli.Option("--seed", "of the choice of samples (%(default)s)", int, default=0),
