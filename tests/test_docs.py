@@ -168,23 +168,17 @@ def test_every_picture_has_its_command():
     assert shown <= made
 
 
-def load_results() -> Any:
-    """Loads the script that writes the tables of pages."""
-    spec = importlib.util.spec_from_file_location("results", ROOT / "docs" / "results.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+RESULTS = runpy.run_path(str(ROOT / "docs" / "results.py"))
 
 
 @pytest.mark.parametrize("page", PAGES, ids=[page.stem for page in PAGES])
 def test_tables_of_pages_are_those_of_the_results(page):
-    assert load_results().with_tables(page.read_text()) == page.read_text()
+    assert RESULTS["with_tables"](page.read_text()) == page.read_text()
 
 
 @pytest.mark.parametrize("page", [p for p in PAGES if p.stem != "CHANGELOG"], ids=lambda p: p.stem)
 def test_success_of_flights_stands_in_tables_of_results_alone(page):
-    text = load_results().TABLE.sub("", page.read_text())
+    text = RESULTS["TABLE"].sub("", page.read_text())
     success = r"\d+/\d+ \(\d+ ?%\)|\d+ of (its )?\d+ (flights|goals)|arrives? in \d+|\d+/\d\d+ at"
     assert not re.findall(success, text)
 
