@@ -1,5 +1,4 @@
 import importlib
-import importlib.util
 import re
 import runpy
 import shlex

@@ -54,10 +54,6 @@ def fly_all(
         flights: to fly; one worker flies neighbors through the same world.
         jobs: number of worker processes on this machine.
         cluster: address of a dask scheduler to use instead.
-
-    Raises:
-        OSError: if a worker process dies, or the cluster cannot be reached; yielded rollouts are
-            valid.
     """
     modules = sorted(POLICIES.modules() | WORLDS.modules() | SENSORS.modules())
     found = [name for name in POLICIES.registered() if ":" in name]
@@ -118,10 +114,6 @@ def run(
 
     Returns:
         The rows of `table.csv`.
-
-    Raises:
-        ValueError: for an invalid study, another one in `out`, or a `Fault`.
-        OSError: if `out` cannot be written, workers fail, or all scenes are missing.
     """
     require(jobs is None or jobs >= 1, "--jobs", "at least 1", jobs)
     scenarios = config.load_scenarios()
@@ -200,13 +192,8 @@ def _keep_flights(
     """Writes flights as they end, and adds them to `rows`. Raises ValueError at a fault."""
     successes = sum(row["success"] for row in rows.values())
     bar = Progress(total=total, initial=len(rows), desc="flying", unit="flight")
-
-    def kept() -> str:
-        return (
-            f"{len(rows)} of {total} flights are in {folder.path}; the same command resumes there"
-        )
-
-    with bar, resumable(kept):
+    where = f"flights are in {folder.path}; the same command resumes there"
+    with bar, resumable(lambda: f"{len(rows)} of {total} {where}"):
         for flown in flights:
             if isinstance(flown, Fault):
                 raise ValueError(

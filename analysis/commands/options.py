@@ -296,8 +296,7 @@ SCENARIO_OPTIONS = (
     ),
     Option(
         "--policy NAME[:FIELD=VALUE]",
-        "policy, as in the benchmark: planner, straight, reactive, diffaero, depthnav, "
-        "agile_autonomy, ..., a file of weights, or module:Class",
+        f"policy: {', '.join(POLICIES)}, a file of weights, or module:Class",
         resolve=check_policy,
         completions=POLICIES,
     ),
