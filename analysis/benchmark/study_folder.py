@@ -138,11 +138,9 @@ class StudyFolder:
         with yaml_errors(str(file)):
             described = yaml.safe_load(read_text(file))
         described = described if isinstance(described, dict) else {}
-        version = described.get("format_version")
+        what, version = f"format_version of {file}", described.get("format_version")
         remedy = "use the version of the program that made the study"
-        require(
-            version == FORMAT_VERSION, f"format_version of {file}", FORMAT_VERSION, version, remedy
-        )
+        require(version == FORMAT_VERSION, what, str(FORMAT_VERSION), version, remedy)
         for name in ("study", "program"):
             value = described.get(name)
             remedy = "restore the file, or fly the study again in another folder"

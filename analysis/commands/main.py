@@ -109,7 +109,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--version", action=_PrintVersion, nargs=0, help="show the version and exit"
     )
-    groups = {"": parser.add_subparsers(required=True, metavar="COMMAND")}
+    groups: dict[str, Any] = {"": parser.add_subparsers(required=True, metavar="COMMAND")}
     for command in COMMANDS:
         added = command.add_to(groups[command.name.rpartition(" ")[0]])
         if command.function is None:

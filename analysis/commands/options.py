@@ -197,7 +197,7 @@ def set_option(*examples: str, configuration: str | Callable[[argparse.Namespace
             options before `--set`.
     """
 
-    def make_default(_: argparse.Namespace) -> Any:
+    def make_default(options: argparse.Namespace) -> Any:
         module, _, name = str(configuration).partition(":")
         return getattr(import_module(module), name)()
 

@@ -22,13 +22,12 @@ def test_examples_parse_and_fields_in_the_help_can_be_set(command):
         defaults |= {"policy": "student_depth"}
     for example in command.examples:
         assert example.startswith(command.name)
-        parsed = build_parser().parse_args(shlex.split(example))
-        assert parsed.command is command
+        assert build_parser().parse_args(shlex.split(example)).command is command
     for option in command.options:
         if option.name == "overrides":
             fields = option.keywords["help"].partition("for example ")[2].partition(" (rep")[0]
             for override in shlex.split(fields.replace(", ", " ")):
-                config = parsed.default_config(argparse.Namespace(**defaults))
+                config = option.keywords["configuration"](argparse.Namespace(**defaults))
                 load_config(config, overrides=[override])
 
 
