@@ -269,7 +269,7 @@ SPLATS = {
     "splat": write_splat,
 }
 CAPTURES = {
-    "TartanAir": lambda folder: write_room_capture(folder / "room", width=16, height=12),
+    "TartanAir": lambda folder: write_room_capture(folder, width=16, height=12),
     "TUM": write_tum,
     "7-Scenes": write_seven_scenes,
     "nerfstudio": write_nerfstudio,
