@@ -22,8 +22,8 @@ from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.scenarios import benchmark_scenarios, scenario_file
 from splatpilot.diagrams.worlds.feasibility import (
     are_connected,
-    cell_of,
     conservative_distance,
+    grid_cell,
     grid_distances,
 )
 from splatpilot.diagrams.worlds.world_registry import make_world
@@ -262,7 +262,7 @@ def angle_over_length(path: NDArray) -> float:
 def bottleneck(field: DistanceField, grid: NDArray, p_WS: NDArray, p_WG: NDArray) -> float:
     """Computes by bisection to 1 cm the largest clearance [m], beyond the vehicle's radius, of any
     path on `grid_distances`. The grid may miss the middle of a gap by half a cell."""
-    ends = [cell_of(field, grid, SPACING, p) for p in (p_WS, p_WG)]
+    ends = [grid_cell(field, grid, SPACING, p) for p in (p_WS, p_WG)]
     low, high = 0.0, float(min(grid[end] for end in ends))
     while high - low > 0.01:
         middle = (low + high) / 2

@@ -89,7 +89,7 @@ RENDER = "got a mesh; render a capture of it with `splatpilot capture render roo
         ("view fast.yaml --out fast.yaml", "fast.yaml is there already; choose another, or repl"),
         ("scene mesh nowhere --out a.obj", "No such file or folder: nowhere"),
         ("scene mesh room.gltf --out a.obj", RENDER),
-        ("scene mesh P02 --out a.stl", "a.stl: a mesh is written as .gltf or .obj"),
+        ("scene mesh P02 --out a.stl", "a.stl: suffix must be .gltf or .obj, got .stl"),
         ("scene mesh folder --out a.obj", "folder must be a scene folder, OctoMap or scenario"),
         ("scene mesh scene --seed 1 --out a.obj", "--seed must be of a generated world"),
         ("scene mesh scene --out room.gltf", "room.gltf is there already"),
