@@ -40,8 +40,8 @@ from splatpilot.systems.visualization.meshcat_drawing import (
 from splatpilot.systems.visualization.pages import CapturedImages, ShownPlace, place_page
 from splatpilot.training.captures.capture import Capture
 from splatpilot.training.captures.capture_config import CaptureConfig
-from splatpilot.training.captures.capture_registry import read_capture, read_capture_of
-from splatpilot.training.captures.colmap import is_video
+from splatpilot.training.captures.capture_registry import read_capture, read_scene_capture
+from splatpilot.training.captures.photographs import is_video
 from splatpilot.training.captures.render import capture_gaussians
 
 _SCENARIOS = {".yaml", ".yml"}
@@ -112,7 +112,7 @@ def _scene(path: Path) -> ShownPlace:
     world = read_scene_folder(path, metric=False)
     notes, images = [], None
     try:
-        images = _images_of(read_capture_of(path, metadata))
+        images = _images_of(read_scene_capture(path, metadata))
     except (ValueError, OSError, ModuleNotFoundError) as error:
         notes.append(f"Captured images are not shown: {error}.")
     if any(metadata.origin):

@@ -65,8 +65,8 @@ def _check(options: argparse.Namespace) -> Any:
 
     config = load_config(_check_defaults(options), overrides=options.overrides)
     report = check.run(capture=options.capture, config=config)
-    if report.mistake:
-        raise FailureWithResultError(f"{options.capture}: {report.mistake}", report)
+    if report.problem:
+        raise FailureWithResultError(f"{options.capture}: {report.problem}", report)
     return report
 
 

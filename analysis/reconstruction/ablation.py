@@ -34,7 +34,7 @@ from splatpilot.systems.common.torch_device import require_renderer
 from splatpilot.systems.common.validation import require
 from splatpilot.training.captures.capture import Capture
 from splatpilot.training.captures.capture_config import CaptureConfig
-from splatpilot.training.captures.capture_registry import read_capture, read_capture_of
+from splatpilot.training.captures.capture_registry import read_capture, read_scene_capture
 from splatpilot.training.reconstruction.checkpoint import kept_work
 from splatpilot.training.reconstruction.config import HOLD_OUT, ReconstructConfig
 from splatpilot.training.reconstruction.initialize import MAX_STEPS, held_out_frames, triangulate
@@ -233,7 +233,7 @@ def run(
 def _open(path: Path, config: CaptureConfig) -> Capture:
     """Opens a capture, or the capture of a scene folder."""
     if (path / "scene.yaml").is_file():
-        return read_capture_of(path, read_scene_metadata(path))
+        return read_scene_capture(path, read_scene_metadata(path))
     return read_capture(path, config)
 
 

@@ -91,10 +91,10 @@ def read_archive(path: Path) -> dict[str, np.ndarray]:
         ValueError: if it is damaged, holds Python objects or is too large.
     """
     require_file(path)
-    with _readable(path, "numpy archive"), zipfile.ZipFile(path) as archive:
+    with readable(path, "numpy archive"), zipfile.ZipFile(path) as archive:
         size = sum(entry.file_size for entry in archive.infolist())
     require_readable_size(path, size)
-    with _readable(path, "numpy archive"), np.load(path, allow_pickle=False) as arrays:
+    with readable(path, "numpy archive"), np.load(path, allow_pickle=False) as arrays:
         read = dict(arrays)
         if other := [name for name, array in read.items() if not isinstance(array, np.ndarray)]:
             raise ValueError(f"{other[0]} is not an array")
@@ -116,7 +116,7 @@ def array_layout(path: Path) -> tuple[tuple[int, ...], np.dtype]:
 
 def _mapped(path: Path) -> np.ndarray:
     require_file(path)
-    with _readable(path, "array"):
+    with readable(path, "array"):
         return np.lib.format.open_memmap(path, mode="r")
 
 
@@ -124,15 +124,16 @@ def read_ply_file(path: Path) -> PlyData:
     """Reads the elements of a PLY file; for errors see `read_archive`."""
     require_file(path)
     require_readable_size(path, path.stat().st_size)
-    with _readable(path, "PLY file"):
+    with readable(path, "PLY file"):
         return PlyData.read(str(path))
 
 
 @contextmanager
-def _readable(path: Path, what: str) -> Iterator[None]:
+def readable(path: Path, what: str) -> Iterator[None]:
+    """Converts errors of a library that reads a file to "`path`: not a readable `what` (...)"."""
     try:
         yield
-    except Exception as error:  # zipfile, numpy and plyfile raise any type for damaged files.
+    except Exception as error:  # Libraries raise any type for damaged files.
         raise ValueError(
             f"{path}: not a readable {what} ({reason_of(error)}); it is truncated or damaged, "
             "copy it again"

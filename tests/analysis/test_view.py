@@ -91,7 +91,7 @@ def test_scene_without_scale_or_capture_is_shown(place, of_room, monkeypatch):
     def lost(path, metadata):
         raise FileNotFoundError("room: no such folder")
 
-    monkeypatch.setattr(shown_place, "read_capture_of", lost)
+    monkeypatch.setattr(shown_place, "read_scene_capture", lost)
     scene = place.scene("scene")
     write_scene_metadata(scene, replace(read_scene_metadata(scene), metric=False))
     data = of_room(scene)

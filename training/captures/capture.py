@@ -1,21 +1,19 @@
 """A capture: posed images of a scene, with the cameras that took them."""
 
-import hashlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
-from splatpilot.systems.common import files
 from splatpilot.systems.common.validation import require
+from splatpilot.systems.splats.lens import Distortion
 from splatpilot.training.captures.capture_config import CaptureConfig
 
 _MAX_SIZE = 1 << 16  # [px]
-_MAX_FOCAL_LENGTH = 1e6  # [px]
+_MAX_FOCAL = 1e6  # [px]
 _MAX_ZOOM = 4.0
 _FAR = 1e9  # [m], depth beyond range while points are moved: no baseline matters there
 _ONE_SURFACE = 0.1
@@ -33,34 +31,24 @@ class Lens:
     width: int  # [px]
     height: int  # [px]
     project: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None
-    """Takes rays (N, 2), x/z and y/z, to image coordinates (N, 2) [px]; None for a pinhole."""
+    """Takes rays (N, 2), x/z and y/z, to image coordinates (N, 2) [px], NaN where the lens folds
+    them; None for a pinhole."""
     radius: float = np.inf
     """[px], distance from the center of the image within which it is used."""
     source: str = "the files"
-    """Where the intrinsics come from, for messages."""
+    """Origin of the intrinsics, for messages."""
 
     def __post_init__(self) -> None:
         focal, center = np.diag(self.K)[:2], self.K[:2, 2]
         size = np.array([self.width, self.height])
-        require(
-            ((size >= 1) & (size <= _MAX_SIZE)).all(),
-            "the image size",
-            f"in [1, {_MAX_SIZE}] px",
-            f"{self.width}x{self.height}",
-        )
-        require(
-            ((focal > 0) & (focal <= _MAX_FOCAL_LENGTH)).all(),
-            "focal lengths",
-            f"in (0, {_MAX_FOCAL_LENGTH:g}] px",
-            focal.tolist(),
-        )
-        require(
-            ((center > 0) & (center < size)).all(),
-            "the principal point",
-            f"in the image of {self.width}x{self.height} px",
-            f"{center.tolist()} px",
-            "intrinsics may be those of images of another size: set capture.intrinsics",
-        )
+        shape = f"{self.width}x{self.height}"
+        remedy = "intrinsics may be those of images of another size: set capture.intrinsics"
+        inside, valid = (size >= 1) & (size <= _MAX_SIZE), (focal > 0) & (focal <= _MAX_FOCAL)
+        centered = (center > 0) & (center < size)
+        require(inside.all(), "the image size", f"in [1, {_MAX_SIZE}] px", shape)
+        require(valid.all(), "focal lengths", f"in (0, {_MAX_FOCAL:g}] px", focal.tolist())
+        condition = f"in the image of {shape} px"
+        require(centered.all(), "the principal point", condition, f"{center.tolist()} px", remedy)
 
     def __str__(self) -> str:
         fx, fy, cx, cy = np.round([*np.diag(self.K)[:2], *self.K[:2, 2]], 2).tolist()
@@ -69,7 +57,7 @@ class Lens:
 
     @property
     def is_eccentric(self) -> bool:
-        """Whether the principal point is farther from the center than a quarter of the image."""
+        """True if the principal point is farther from the center than a quarter of the image."""
         size = np.array([self.width, self.height])
         return bool((np.abs(self.K[:2, 2] - size / 2) > size / 4).any())
 
@@ -101,35 +89,33 @@ def pinhole(fx: float, fy: float, cx: float, cy: float) -> NDArray[np.float64]:
 def opencv_lens(
     K: NDArray[np.float64], width: int, height: int, distortion: Sequence[float], k4: float = 0.0
 ) -> Lens:
-    """Returns a lens of OpenCV's model.
+    """Returns a lens of OpenCV's rational model.
 
     Args:
-        distortion: k1, k2, p1, p2, k3, ... as `cv2.projectPoints` takes them.
-        k4: radial term of r^8, which OpenCV's model leaves out.
+        distortion: k1, k2, p1, p2, k3, ... in OpenCV's order.
+        k4: radial term of r^8, which OpenCV's model is without.
     """
     if not np.any(distortion) and not k4:
         return Lens(K, width, height)
-    coefficients = np.array(distortion, dtype=np.float64)
-
-    def project(rays: NDArray[np.float64]) -> NDArray[np.float64]:
-        points = np.column_stack([rays, np.ones(len(rays))])
-        pixels = cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, coefficients)[0][:, 0]
-        r8 = (rays**2).sum(axis=1, keepdims=True) ** 4
-        return np.asarray(pixels + k4 * r8 * rays * np.diag(K)[:2], dtype=np.float64)
-
-    return Lens(K, width, height, project)
+    radial = [*distortion[:2], *distortion[4:]]
+    return _bent_lens(K, width, height, Distortion("opencv", radial, [*distortion[2:4]]), k4)
 
 
 def fisheye_lens(
     K: NDArray[np.float64], width: int, height: int, distortion: Sequence[float]
 ) -> Lens:
     """Returns a lens of OpenCV's fisheye model (Kannala and Brandt 2006) with k1 to k4."""
-    coefficients = np.array(distortion, dtype=np.float64)
+    return _bent_lens(K, width, height, Distortion("fisheye", [*distortion]))
+
+
+def _bent_lens(
+    K: NDArray[np.float64], width: int, height: int, bend: Distortion, k4: float = 0.0
+) -> Lens:
+    bend.validate()
 
     def project(rays: NDArray[np.float64]) -> NDArray[np.float64]:
-        points = np.column_stack([rays, np.ones(len(rays))])[:, None]
-        pixels = cv2.fisheye.projectPoints(points, np.zeros(3), np.zeros(3), K, coefficients)[0]
-        return np.asarray(pixels, dtype=np.float64)[:, 0]
+        r8 = (rays**2).sum(axis=1, keepdims=True) ** 4
+        return (bend.project(rays) + k4 * r8 * rays) @ K[:2, :2].T + K[:2, 2]
 
     return Lens(K, width, height, project)
 
@@ -283,7 +269,7 @@ class CaptureFrame:
     X_WC: RigidTransform  # pose of the camera (x right, y down, z forward) in the world
     K: NDArray[np.float64]  # (3, 3) [px], pinhole intrinsics
     valid: NDArray[np.bool_] = field(default_factory=lambda: _EVERYWHERE)
-    """(H, W), the pixels that are used: no other has depth, is fitted or is measured."""
+    """(H, W), the pixels that are used; no other has depth."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "valid", np.broadcast_to(self.valid, self.depth.shape))
@@ -347,7 +333,7 @@ class Capture:
 
     name: str
     source: str
-    """Where it was read from, for messages."""
+    """Format and path, for messages."""
     K: NDArray[np.float64]  # (3, 3) [px], of the color camera
     width: int  # [px]
     height: int  # [px]
@@ -363,18 +349,18 @@ class Capture:
     """The camera that measured depth; None if depth has the pixels of the images."""
     points: SfmPoints | None = None
     metric: bool = True
-    """Whether lengths are in meters; if not, nothing can fly there."""
+    """True if lengths are in meters; otherwise nothing can fly in the scene."""
     frame_names: Sequence[str] = ()
     """Path of each image as the files give it; empty if unknown."""
     dropped: Sequence[str] = ()
-    """Why frames were left out, one message each that names the file."""
+    """Reasons why frames were left out, one message each that names the file."""
     held_out: Sequence[int] | None = None
     """The frames that the files hold out from training; None if they do not say."""
     notes: Sequence[str] = ()
-    """What was assumed or ignored when the files were read, one sentence each."""
+    """Assumptions of the reader and what it ignored, one sentence each."""
     origin: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
     """(3,) [m], position of W's origin in the world of the files, upright and in meters."""
-    axes: FileAxes | None = None
+    axes: FileAxes = OPTICAL_AXES
     folder: str = ""
     """The absolute path from which `read_capture` opens it again, with `config`; empty if it
     cannot."""
@@ -386,7 +372,7 @@ class Capture:
 
     @property
     def has_depth(self) -> bool:
-        """Whether any frame has depth."""
+        """True if any frame has depth."""
         return self.load_depth is not no_depth
 
     def measured_depth(self, i: int) -> NDArray[np.float32] | None:
@@ -408,11 +394,7 @@ class Capture:
         return np.where(self.load_valid(i), depth, np.float32(0))
 
     def frame(self, i: int) -> CaptureFrame:
-        """Loads frame i, 0 <= i < len(self), with its registered depth.
-
-        Raises:
-            OSError, ValueError: if its files cannot be read or have changed their size.
-        """
+        """Loads frame i, 0 <= i < len(self), with its registered depth."""
         if not 0 <= i < len(self):
             raise IndexError(f"frame {i} of {self.name}: it has the frames 0 to {len(self) - 1}")
         return CaptureFrame(
@@ -471,28 +453,3 @@ def shrink(frame: CaptureFrame, factor: int) -> CaptureFrame:
     K = frame.K.copy()
     K[:2] /= factor
     return CaptureFrame(np.asarray(image, dtype=np.uint8), depth, frame.X_WC, K, valid)
-
-
-def cache_folder(config: CaptureConfig, *parts: str) -> Path:
-    """Returns `config.cache` or, without it, a folder in the user's cache."""
-    return Path(config.cache) if config.cache else files.cache_folder(*parts)
-
-
-def cache_key(paths: Iterable[Path], *others: object) -> str:
-    """Returns a key of files, by their paths, sizes and times, and of all else that decides."""
-    key = hashlib.sha256(repr(others).encode())
-    for path in paths:
-        status = path.stat()
-        key.update(f"{path.resolve()} {status.st_size} {status.st_mtime_ns}".encode())
-    return key.hexdigest()[:16]
-
-
-def prepare_cache(folder: Path) -> None:
-    """Makes a cache folder and removes leftovers of interrupted writers."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OSError(
-            f"{folder}: cannot be written ({error.strerror}); set capture.cache to another folder"
-        ) from None
-    files.remove_leftovers(folder)

@@ -25,10 +25,8 @@ from splatpilot.training.captures.frames import (
     FrameFiles,
     open_frames,
     pose_from_quaternion,
-    read_depth,
     read_rows,
 )
-from splatpilot.training.captures.up_and_scale import turn_upright
 
 MAX_GAP = 0.12
 """[s] between two poses that one is interpolated from."""
@@ -56,16 +54,12 @@ _CALIBRATION = "calibration.txt"
 
 
 def recognizes(path: Path) -> bool:
-    """Tells whether a folder looks like a TUM RGB-D sequence, complete or not."""
+    """Tells whether a folder looks like a TUM RGB-D sequence."""
     return (path / "rgb.txt").exists() and (path / "groundtruth.txt").exists()
 
 
 def read(path: Path, config: CaptureConfig) -> Capture:
-    """Opens a TUM RGB-D sequence, without the color images that have no depth or pose in time.
-
-    Raises:
-        ValueError, OSError: if a list is missing or invalid, or too many frames cannot be used.
-    """
+    """Opens a TUM RGB-D sequence, without the color images that have no depth or pose in time."""
 
     def lens(width: int, height: int) -> Lens:
         file = path / _CALIBRATION
@@ -108,14 +102,7 @@ def _intrinsics(fx: float, fy: float, cx: float, cy: float) -> NDArray[np.float6
 def open_sequence(
     path: Path, source: str, config: CaptureConfig, lens: Callable[[int, int], Lens], unit: float
 ) -> Capture:
-    """Opens lists and images in TUM's format, of any camera.
-
-    Args:
-        path: the folder of the lists.
-        source: the format's name in `Capture.source`.
-        lens: returns the camera of images of a width and height [px].
-        unit: units of the stored depth per meter, unless `config` has them.
-    """
+    """Opens lists and images in TUM's format, of any camera; see `open_frames`."""
     color_times, colors = _read_list(path / "rgb.txt")
     depth_times, depths = _read_list(path / "depth.txt")
     pose_file = path / "groundtruth.txt"
@@ -123,8 +110,13 @@ def open_sequence(
     rows = np.array([row for row in rows if np.isfinite(row).all()]).reshape(-1, 8)
     require(len(rows) >= 2, f"{pose_file}: finite poses", "at least 2", len(rows))
     rows = rows[np.argsort(rows[:, 0], kind="stable")]
-    _require_overlap(path / "rgb.txt", color_times, pose_file, rows[:, 0])
-    _require_overlap(path / "rgb.txt", color_times, path / "depth.txt", depth_times)
+    for file, times in ((pose_file, rows[:, 0]), (path / "depth.txt", depth_times)):
+        begin, end = color_times.min(), color_times.max()
+        if end < times.min() - _MAX_APART or times.max() < begin - _MAX_APART:
+            raise ValueError(
+                f"{file}: runs from {times.min():.3f} to {times.max():.3f} s, but "
+                f"{path / 'rgb.txt'} from {begin:.3f} to {end:.3f} s; write both by one clock"
+            )
 
     def frame(color: str, depth: str, around: NDArray[np.float64], time: float) -> FrameFiles:
         def X_FC() -> RigidTransform:
@@ -148,28 +140,16 @@ def open_sequence(
         f"{_MAX_APART} s, or neither two poses within {MAX_GAP} s around them nor one within "
         f"{_SAME_TIME} s"
     ]
-    unit = config.depth_unit or unit
-    capture = open_frames(
+    return open_frames(
         path,
         source,
         frames,
         axes=OPTICAL_AXES,
+        config=config,
         lens=lens,
-        intrinsics=config.intrinsics,
-        read_depth=lambda file: read_depth(file, unit),
+        depth_unit=unit,
         dropped=dropped if alone else (),
     )
-    return turn_upright(capture, config.up or "z")
-
-
-def _require_overlap(
-    images: Path, times: NDArray[np.float64], other: Path, others: NDArray[np.float64]
-) -> None:
-    if times.max() < others.min() - _MAX_APART or others.max() < times.min() - _MAX_APART:
-        raise ValueError(
-            f"{other}: runs from {others.min():.3f} to {others.max():.3f} s, but {images} from "
-            f"{times.min():.3f} to {times.max():.3f} s; write both by one clock"
-        )
 
 
 def _poses_around(rows: NDArray[np.float64], time: float) -> NDArray[np.float64]:

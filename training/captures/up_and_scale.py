@@ -137,7 +137,7 @@ def _rotate_and_scale(capture: Capture, R_NW: RotationMatrix, scale: float = 1.0
             for X in capture.X_WCs
         ],
         points=points and SfmPoints(scale * points.p_WQ @ R_NW.matrix().T, points.colors),
-        axes=axes and FileAxes(axes.name, R_NW @ axes.R_WF, axes.R_BC),
+        axes=FileAxes(axes.name, R_NW @ axes.R_WF, axes.R_BC),
     )
 
 

@@ -21,7 +21,7 @@ from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf_build import esdf_from_occupancy
 from splatpilot.systems.splats.baked_scene import BakedScene
-from splatpilot.training.captures.capture_registry import read_capture_of
+from splatpilot.training.captures.capture_registry import read_scene_capture
 
 SHRUNK = 0.25
 """Units of the photographs' registration a meter."""
@@ -111,7 +111,7 @@ def test_scene_of_photographs_can_be_flown_in_once_it_has_its_size(
     np.testing.assert_allclose(new.gaussians.means[: len(gaussians)], gaussians.means, atol=1e-5)
     metadata = read_scene_metadata(out)
     assert (metadata.split, metadata.source_digest) == ("validation", ["0123456789abcdef"])
-    again = read_capture_of(out, metadata)
+    again = read_scene_capture(out, metadata)
     assert again.metric
     for i in (0, 15):
         X_WC = capture.X_WCs[i]
@@ -144,7 +144,7 @@ def test_factors_multiply(unscaled, tmp_path):
     np.testing.assert_allclose(summary.size, [3, 1.5, 1.25])
     metadata = read_scene_metadata(tmp_path / "twice")
     assert metadata.capture_settings == ["scale.factor=2.0"]
-    poses = read_capture_of(tmp_path / "twice", metadata).X_WCs
+    poses = read_scene_capture(tmp_path / "twice", metadata).X_WCs
     np.testing.assert_allclose(poses[0].translation(), [0.25, 0.75, 0.6], atol=1e-9)
 
 
@@ -152,11 +152,11 @@ def test_origin_is_scaled_with_the_scene(unscaled, tmp_path):
     origin = [100.0, 200.0, -30.0]
     metadata = replace(read_scene_metadata(unscaled), origin=origin)
     write_scene_metadata(unscaled, metadata)
-    poses = read_capture_of(unscaled, metadata).X_WCs
+    poses = read_scene_capture(unscaled, metadata).X_WCs
     rescale(unscaled, tmp_path / "scaled", 4.0)
     scaled = read_scene_metadata(tmp_path / "scaled")
     assert scaled.origin == [400.0, 800.0, -120.0]
-    for X, Y in zip(poses, read_capture_of(tmp_path / "scaled", scaled).X_WCs, strict=True):
+    for X, Y in zip(poses, read_scene_capture(tmp_path / "scaled", scaled).X_WCs, strict=True):
         np.testing.assert_allclose(Y.translation(), 4 * X.translation(), atol=1e-9)
 
 

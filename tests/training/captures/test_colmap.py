@@ -11,7 +11,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from splatpilot.training.captures.capture import Capture, SfmPoints
 from splatpilot.training.captures.capture_config import CaptureConfig, ScaleConfig
 from splatpilot.training.captures.capture_registry import read_capture
-from splatpilot.training.captures.colmap import read_photographs
+from splatpilot.training.captures.photographs import read_photographs
 from splatpilot.training.captures.up_and_scale import camera_height
 
 SHRINK = 0.25
@@ -307,7 +307,7 @@ def test_registered_photographs_are_not_registered_again(tmp_path, K, room_views
     (path / "images/empty.jpg").write_bytes(b"")
     capture = read_photographs(path, CaptureConfig(cache=str(tmp_path / "cache")))
     assert len(capture) == 10 and not capture.metric
-    assert "empty.jpg: the file is empty" in capture.dropped[0]
+    assert "empty.jpg: not a readable image" in capture.dropped[0]
     assert "blank.png: not registered" in capture.dropped[1]
 
 

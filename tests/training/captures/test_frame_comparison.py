@@ -4,7 +4,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from scipy.spatial.transform import Rotation
 
 from splatpilot.training.captures.capture import CaptureFrame
-from splatpilot.training.captures.frame_comparison import ComparedFrame, compare_frames
+from splatpilot.training.captures.refine_poses import ComparedFrame, compare_frames
 
 K = np.array([[300.0, 0, 162.0], [0, 304.0, 118.0], [0, 0, 1]])
 
@@ -16,7 +16,7 @@ def seen(room_views):
     def view(X_WC: RigidTransform, exposure: float = 1.0) -> ComparedFrame:
         (room,) = room_views(K, 320, 240, [X_WC], finer=8.0)
         image = np.clip(room.image * exposure, 0, 255).astype(np.uint8)
-        return ComparedFrame.of(CaptureFrame(image, room.depth.astype(np.float32), X_WC, K))
+        return ComparedFrame.prepare(CaptureFrame(image, room.depth.astype(np.float32), X_WC, K))
 
     return view
 
@@ -62,7 +62,7 @@ def test_edges_and_holes_are_not_compared():
     depth[20, 10] = 0
     depth[:10] = np.inf
     image = np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8)
-    frame = ComparedFrame.of(CaptureFrame(image, depth, RigidTransform(), K))
+    frame = ComparedFrame.prepare(CaptureFrame(image, depth, RigidTransform(), K))
     known = frame.inverse_depth > 0
     assert not known[:12].any()
     assert not known[:, 38:42].any()

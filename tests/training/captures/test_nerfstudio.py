@@ -175,7 +175,7 @@ def test_frame_with_a_mask_of_another_size_is_left_out(write):
     path = write()
     cv2.imwrite(str(path / "mask.png"), np.ones((24, 32), np.uint8))
     capture = read_capture(change(path, frame_0={"mask_path": "mask.png"}))
-    assert len(capture) == 9 and "mask.png: must be of 64x48 pixels" in capture.dropped[0]
+    assert len(capture) == 9 and "mask.png must be of 64x48 pixels" in capture.dropped[0]
 
 
 @pytest.mark.parametrize(

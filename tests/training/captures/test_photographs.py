@@ -2,11 +2,11 @@ import cv2
 import numpy as np
 import pytest
 
-from splatpilot.training.captures import colmap as video
 from splatpilot.training.captures import frames as image_files
+from splatpilot.training.captures import photographs as video
 from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.capture_registry import read_capture
-from splatpilot.training.captures.colmap import (
+from splatpilot.training.captures.photographs import (
     import_pycolmap,
     likely_pairs,
     similarity,

@@ -12,8 +12,8 @@ from splatpilot.training.captures import refine_poses as module
 from splatpilot.training.captures.capture import CaptureFrame
 from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.capture_registry import read_capture
-from splatpilot.training.captures.frame_comparison import ComparedFrame, fit_color_camera
-from splatpilot.training.captures.refine_poses import refine_poses
+from splatpilot.training.captures.check import fit_color_camera
+from splatpilot.training.captures.refine_poses import ComparedFrame, refine_poses
 
 K = np.array([[300.0, 0, 162.0], [0, 304.0, 118.0], [0, 0, 1]])
 
@@ -25,7 +25,7 @@ def frames(room_views):
     def views(poses: list[RigidTransform], noise: float = 0.0) -> list[ComparedFrame]:
         rng = np.random.default_rng(5)
         return [
-            ComparedFrame.of(
+            ComparedFrame.prepare(
                 CaptureFrame(
                     view.image,
                     (view.depth * (1 + noise * rng.standard_normal(view.depth.shape))).astype(
@@ -93,7 +93,7 @@ def test_who_sees_nothing_goes_with_its_neighbors(frames, room_poses):
     blind = CaptureFrame(
         np.zeros((240, 320, 3), np.uint8), np.zeros((240, 320), np.float32), given[5], K
     )
-    seen[5] = ComparedFrame.of(blind)
+    seen[5] = ComparedFrame.prepare(blind)
     refined = refine_poses(seen, given).X_WCs
     before, own, after = (refined[i].translation() - given[i].translation() for i in (4, 5, 6))
     np.testing.assert_allclose(own, (before + after) / 2, atol=1e-3)

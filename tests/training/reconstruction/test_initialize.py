@@ -6,7 +6,7 @@ from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from splatpilot.training.captures.capture import Capture, CaptureFrame
-from splatpilot.training.captures.tartanair import read_tartanair_v1
+from splatpilot.training.captures.capture_registry import read_capture
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.initialize import (
     BlockMeans,
@@ -57,7 +57,7 @@ def test_steps_follow_the_images_that_are_fitted(count, has_depth, asked, expect
 
 
 def test_no_gaussian_stands_infinitely_far(write_room, tmp_path):
-    capture = read_tartanair_v1(write_room(tmp_path / "room"))
+    capture = read_capture(write_room(tmp_path / "room"))
 
     def with_sky(frame):
         depth = frame.depth.copy()
@@ -75,7 +75,7 @@ def test_no_gaussian_stands_infinitely_far(write_room, tmp_path):
 
 
 def test_too_many_surfaces_to_optimize_are_thinned_out(write_room, tmp_path, capsys):
-    capture = read_tartanair_v1(write_room(tmp_path / "room"))
+    capture = read_capture(write_room(tmp_path / "room"))
     frames = list(capture.frames())
     photometry = estimate_photometry([ThinnedFrame.of(frame) for frame in frames], 0)
     detail = Detail(max_gaussians=100_000, optimized=True, **COARSE)
@@ -92,7 +92,7 @@ def test_too_many_surfaces_to_optimize_are_thinned_out(write_room, tmp_path, cap
 
 
 def test_masked_blob_has_no_part_in_gaussians(write_room, tmp_path):
-    capture = read_tartanair_v1(write_room(tmp_path / "room"))
+    capture = read_capture(write_room(tmp_path / "room"))
     valid = np.ones((capture.height, capture.width), bool)
     valid[15:33, 20:44] = False
     masked = replace(
@@ -138,7 +138,7 @@ def test_points_become_gaussians_of_their_spacing():
 
 
 def test_random_points_lie_in_view(write_room, tmp_path):
-    frame = read_tartanair_v1(write_room(tmp_path / "room")).frame(2)
+    frame = read_capture(write_room(tmp_path / "room")).frame(2)
     p_WQ, colors = random_points([frame], 500, 0.5, 8.0, seed=1)
     assert p_WQ.shape == (500, 3)
     x, y, z = frame.X_WC.inverse().multiply(p_WQ.T)

@@ -3,7 +3,7 @@ import pytest
 from pydrake.math import RigidTransform
 
 from splatpilot.training.captures.capture import CaptureFrame
-from splatpilot.training.captures.tartanair import read_tartanair_v1
+from splatpilot.training.captures.capture_registry import read_capture
 from splatpilot.training.reconstruction.photometry import (
     STRIDE,
     Photometry,
@@ -25,7 +25,7 @@ def test_recovers_gains_and_vignetting(tmp_path, write_room):
         height=120,
         brightness=lambda i, rho: truth.gains[i] * np.exp(truth.vignetting * rho),
     )
-    views = [ThinnedFrame.of(frame) for frame in read_tartanair_v1(room).frames()]
+    views = [ThinnedFrame.of(frame) for frame in read_capture(room).frames()]
     found = estimate_photometry(views, seed=0)
     np.testing.assert_allclose(found.gains, truth.gains, rtol=0.02)
     assert found.vignetting == pytest.approx(truth.vignetting, abs=0.03)
@@ -35,8 +35,7 @@ def test_recovers_gains_and_vignetting(tmp_path, write_room):
 
 def test_views_that_share_nothing_have_gain_one(tmp_path, write_room):
     views = [
-        ThinnedFrame.of(frame)
-        for frame in read_tartanair_v1(write_room(tmp_path / "room")).frames()
+        ThinnedFrame.of(frame) for frame in read_capture(write_room(tmp_path / "room")).frames()
     ][:1]
     found = estimate_photometry(views, seed=0)
     assert (found.gains.tolist(), found.vignetting) == ([1.0], 0.0)
@@ -52,8 +51,7 @@ def test_factor_is_gain_in_the_center_and_darker_in_the_corners():
 @pytest.fixture
 def views(tmp_path, write_room) -> list[ThinnedFrame]:
     return [
-        ThinnedFrame.of(frame)
-        for frame in read_tartanair_v1(write_room(tmp_path / "room")).frames()
+        ThinnedFrame.of(frame) for frame in read_capture(write_room(tmp_path / "room")).frames()
     ]
 
 
@@ -137,7 +135,7 @@ def test_slow_walk_keeps_little_more_than_one_view(tmp_path, write_room):
     poses = [((2 + 0.05 * i, 0.0, -1.2), 1.2, -0.3) for i in range(10)]
     views = [
         ThinnedFrame.of(frame)
-        for frame in read_tartanair_v1(write_room(tmp_path / "walk", poses=poses)).frames()
+        for frame in read_capture(write_room(tmp_path / "walk", poses=poses)).frames()
     ]
     new = find_new_pixels(views)
     assert 1 <= sum(mask.mean() for mask in new) < 2

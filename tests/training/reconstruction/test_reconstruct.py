@@ -15,7 +15,6 @@ from splatpilot.systems.splats.splat_files import read_ply
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 from splatpilot.training.captures.capture import Capture
 from splatpilot.training.captures.capture_registry import read_capture
-from splatpilot.training.captures.tartanair import read_tartanair_v1
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.photometry import Photometry
 from splatpilot.training.reconstruction.reconstruct import reconstruct
@@ -59,7 +58,7 @@ def test_room_end_to_end(tmp_path, write_room, room_in_W):
     assert (world.esdf.conservative().distance(ends) > VEHICLE_RADIUS).all()
 
     # It looks like the room.
-    capture = read_tartanair_v1(room)
+    capture = read_capture(room)
     baked = world.baked
     photometry = Photometry(np.array(metadata.gains), metadata.vignetting)
     for i in range(len(capture)):
@@ -214,7 +213,7 @@ def test_hospital(tmp_path):
     summary = reconstruct(read_capture(part), tmp_path / "scene", config)
     assert summary.geodesic > 6
     assert -0.4 < summary.vignetting < -0.2
-    world, sequence = read_scene(tmp_path / "scene"), read_tartanair_v1(part)
+    world, sequence = read_scene(tmp_path / "scene"), read_capture(part)
     baked = world.baked
     photometry = Photometry(
         np.array(read_scene_metadata(tmp_path / "scene").gains), summary.vignetting
