@@ -31,7 +31,7 @@ from splatpilot.systems.sensing.time_of_flight import (
 from splatpilot.systems.splats.baked_scene import BakedScene
 from splatpilot.systems.splats.splat_files import read_splats, write_ply
 from splatpilot.training.captures.capture_registry import read_capture
-from splatpilot.training.captures.render import mesh_distance
+from splatpilot.training.captures.mesh_renderer import mesh_distance
 
 
 def finite(*arrays: Any) -> bool:

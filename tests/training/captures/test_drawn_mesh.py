@@ -7,7 +7,8 @@ import pytest
 from PIL import Image
 
 from splatpilot.systems.collision.field_mesh import add_primitive, data_uri
-from splatpilot.training.captures.render import MeshRenderer, look_along, mesh_distance
+from splatpilot.training.captures.camera_path import look_along
+from splatpilot.training.captures.mesh_renderer import MeshRenderer, mesh_distance
 
 K = np.array([[16.0, 0, 16], [0, 16, 12], [0, 0, 1]])
 X_WC = look_along(np.zeros(3), 0.0, 0.0)  # along x

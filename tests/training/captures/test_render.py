@@ -21,18 +21,19 @@ from splatpilot.systems.collision.esdf_build import esdf_from_distance_field
 from splatpilot.systems.collision.shapes import AnalyticDistanceField, Box
 from splatpilot.systems.common.config import load_config
 from splatpilot.training.captures import render as render_capture
-from splatpilot.training.captures.capture_registry import read_capture
-from splatpilot.training.captures.render import (
-    RenderConfig,
+from splatpilot.training.captures.camera_path import (
     look_along,
-    mesh_digests,
-    mesh_distance,
     move_left,
     poses_along,
+    visiting_path,
+)
+from splatpilot.training.captures.capture_registry import read_capture
+from splatpilot.training.captures.mesh_renderer import mesh_digests, mesh_distance
+from splatpilot.training.captures.render import (
+    RenderConfig,
     rendered_world,
     run,
     true_camera,
-    visiting_path,
 )
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.reconstruct import reconstruct
