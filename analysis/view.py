@@ -40,9 +40,9 @@ from splatpilot.systems.visualization.meshcat_drawing import (
 from splatpilot.systems.visualization.pages import CapturedImages, ShownPlace, place_page
 from splatpilot.training.captures.capture import Capture
 from splatpilot.training.captures.capture_config import CaptureConfig
+from splatpilot.training.captures.capture_gaussians import capture_gaussians
 from splatpilot.training.captures.capture_registry import read_capture, read_scene_capture
 from splatpilot.training.captures.photographs import is_video
-from splatpilot.training.captures.render import capture_gaussians
 
 _SCENARIOS = {".yaml", ".yml"}
 _MAX_IMAGES = 60

@@ -24,7 +24,7 @@ from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.octomap import Octomap
 from splatpilot.systems.common.config import load_config
 from splatpilot.systems.splats.splat_files import write_ply
-from splatpilot.training.captures.render import capture_gaussians
+from splatpilot.training.captures.capture_gaussians import capture_gaussians
 
 
 def data_of(page) -> dict:

@@ -1,5 +1,6 @@
 """A capture: posed images of a scene, with the cameras that took them."""
 
+from bisect import bisect_left
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -33,10 +34,8 @@ class Lens:
     project: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None
     """Takes rays (N, 2), x/z and y/z, to image coordinates (N, 2) [px], NaN where the lens folds
     them; None for a pinhole."""
-    radius: float = np.inf
-    """[px], distance from the center of the image within which it is used."""
-    source: str = "the files"
-    """Origin of the intrinsics, for messages."""
+    radius: float = np.inf  # [px], distance from the image's center within which it is used
+    source: str = "the files"  # of the intrinsics, for messages
 
     def __post_init__(self) -> None:
         focal, center = np.diag(self.K)[:2], self.K[:2, 2]
@@ -143,19 +142,15 @@ def common_pinhole(lenses: Sequence[Lens]) -> Lens:
                 return False
         return True
 
-    low, high = 1.0, 1.0
-    while not covers(high):
-        low, high = high, 1.25 * high
-        if high > _MAX_ZOOM:
-            raise ValueError(
-                "the cameras of this capture share too little of their view: no pinhole camera "
-                "sees through all of them; give the frames of one camera alone"
-            )
-    while high - low > 1e-3:
-        middle = (low + high) / 2
-        low, high = (low, middle) if covers(middle) else (middle, high)
+    zooms = np.geomspace(1, _MAX_ZOOM, 1400)
+    index = bisect_left(zooms, True, key=covers)
+    if index == len(zooms):
+        raise ValueError(
+            "the cameras of this capture share too little of their view: no pinhole camera "
+            "sees through all of them; give the frames of one camera alone"
+        )
     K = first.K.copy()
-    K[:2, :2] *= high
+    K[:2, :2] *= zooms[index]
     return Lens(K, first.width, first.height)
 
 
@@ -173,13 +168,8 @@ def resampling_maps(lens: Lens, target: Lens) -> tuple[NDArray, NDArray] | None:
 def back_project(
     K: NDArray[np.float64], u: NDArray, v: NDArray, depth: NDArray
 ) -> NDArray[np.float64]:
-    """Returns the points p_CQ (..., 3) [m] that a pinhole camera sees.
-
-    Args:
-        K: (3, 3) [px].
-        u, v: (...) [px], image coordinates.
-        depth: (...) [m], along the optical axis.
-    """
+    """Returns the points p_CQ (..., 3) [m] that a pinhole camera K (3, 3) [px] sees at image
+    coordinates u, v (...) [px] and depths (...) [m] along the optical axis."""
     x = (u - K[0, 2]) / K[0, 0] * depth
     y = (v - K[1, 2]) / K[1, 1] * depth
     return np.stack([x, y, depth], axis=-1)
@@ -194,12 +184,8 @@ def pixel_rays(K: NDArray[np.float64], width: int, height: int) -> NDArray[np.fl
 def depth_points(
     K: NDArray[np.float64], depth: NDArray, step: int = 1, start: int = 0
 ) -> tuple[NDArray[np.float64], NDArray[np.intp], NDArray[np.intp]]:
-    """Returns the points p_CQ (N, 3) [m] of pixels of known, finite depth, their rows and columns.
-
-    Args:
-        depth: (H, W) [m].
-        step, start: of the rows and columns that are used.
-    """
+    """Returns the points p_CQ (N, 3) [m] of pixels of known, finite depth (H, W) [m], and their
+    rows and columns, which begin at `start`."""
     part = depth[start::step, start::step]
     rows, columns = np.nonzero((part > 0) & np.isfinite(part))
     rows, columns = start + step * rows, start + step * columns
@@ -219,39 +205,37 @@ def project_points(
     return inside, v[inside].astype(np.intp), u[inside].astype(np.intp)
 
 
+@dataclass(frozen=True, eq=False)
+class DepthCamera:
+    """A depth camera apart from the color camera."""
+
+    K: NDArray[np.float64]  # (3, 3) [px]
+    width: int  # [px]
+    height: int  # [px]
+    X_CD: RigidTransform  # pose of the depth camera D in the color camera C
+
+
 def register_depth(
     depth: NDArray[np.floating],
-    K_D: NDArray[np.float64],
-    X_CD: RigidTransform,
-    K_C: NDArray[np.float64],
+    camera: DepthCamera,
+    K: NDArray[np.float64],
     width: int,
     height: int,
 ) -> NDArray[np.float32]:
-    """Carries a depth image into the pixels of another camera, in which the nearest point wins.
-
-    Args:
-        depth: (h, w) [m] along the optical axis of D; 0 unknown, inf beyond range.
-        K_D: (3, 3) [px], intrinsics of D.
-        X_CD: pose of D in C.
-        K_C: (3, 3) [px], intrinsics of C.
-        width, height: [px], of C's image.
-
-    Returns:
-        (height, width) [m] along the optical axis of C; 0 unknown, inf beyond range.
-    """
+    """Carries a depth image (h, w) [m] into the pixels of the color camera, in which the nearest
+    point wins; 0 unknown, inf beyond range."""
     # At least one point per pixel of C, so that surfaces behind do not shine through.
-    finer = max(1, int(np.ceil(1.05 * K_C[0, 0] / K_D[0, 0])))
+    finer = max(1, int(np.ceil(1.05 * K[0, 0] / camera.K[0, 0])))
     z = np.where(np.isinf(depth), _FAR, depth).repeat(finer, axis=0).repeat(finer, axis=1)
-    p_DQ, _, _ = depth_points(np.diag([finer, finer, 1]) @ K_D, z)
-    p_CQ = X_CD.multiply(p_DQ.T).T
-    inside, rows, columns = project_points(K_C, p_CQ, width, height)
-    pixels = rows * width + columns
-    nearest = np.full(height * width, np.inf)
-    np.minimum.at(nearest, pixels, p_CQ[inside, 2])
-    hit = np.zeros(height * width, dtype=bool)
-    hit[pixels] = True
+    p_DQ, _, _ = depth_points(np.diag([finer, finer, 1]) @ camera.K, z)
+    p_CQ = camera.X_CD.multiply(p_DQ.T).T
+    inside, rows, columns = project_points(K, p_CQ, width, height)
+    nearest = np.full((height, width), np.inf)
+    np.minimum.at(nearest, (rows, columns), p_CQ[inside, 2])
+    hit = np.zeros((height, width), dtype=bool)
+    hit[rows, columns] = True
     nearest[nearest > _FAR / 2] = np.inf
-    return np.where(hit, nearest, 0).astype(np.float32).reshape(height, width)
+    return np.where(hit, nearest, 0).astype(np.float32)
 
 
 _EVERYWHERE = np.ones((1, 1), dtype=bool)
@@ -277,16 +261,6 @@ class CaptureFrame:
     def back_project(self, u: NDArray, v: NDArray, depth: NDArray) -> NDArray[np.float64]:
         """Returns the points p_CQ (..., 3) [m] at image coordinates [px] and depths [m]."""
         return back_project(self.K, u, v, depth)
-
-
-@dataclass(frozen=True, eq=False)
-class DepthCamera:
-    """A depth camera apart from the color camera."""
-
-    K: NDArray[np.float64]  # (3, 3) [px]
-    width: int  # [px]
-    height: int  # [px]
-    X_CD: RigidTransform  # pose of the depth camera D in the color camera C
 
 
 @dataclass(frozen=True, eq=False)
@@ -332,8 +306,7 @@ class Capture:
     """
 
     name: str
-    source: str
-    """Format and path, for messages."""
+    source: str  # format and path, for messages
     K: NDArray[np.float64]  # (3, 3) [px], of the color camera
     width: int  # [px]
     height: int  # [px]
@@ -345,27 +318,19 @@ class Capture:
     frame has none, or raises an error that names the file. 0 is unknown, inf is beyond range."""
     load_valid: Callable[[int], NDArray[np.bool_]] = all_valid
     """Returns the pixels of the image of frame i that are used, (height, width) or (1, 1)."""
-    depth_camera: DepthCamera | None = None
-    """The camera that measured depth; None if depth has the pixels of the images."""
+    depth_camera: DepthCamera | None = None  # None if depth has the pixels of the images
     points: SfmPoints | None = None
-    metric: bool = True
-    """True if lengths are in meters; otherwise nothing can fly in the scene."""
-    frame_names: Sequence[str] = ()
-    """Path of each image as the files give it; empty if unknown."""
-    dropped: Sequence[str] = ()
-    """Reasons why frames were left out, one message each that names the file."""
+    metric: bool = True  # if lengths are in meters; otherwise nothing can fly in the scene
+    frame_names: Sequence[str] = ()  # path of each image as the files give it; empty if unknown
+    dropped: Sequence[str] = ()  # reasons why frames were left out, each names its file
     held_out: Sequence[int] | None = None
     """The frames that the files hold out from training; None if they do not say."""
-    notes: Sequence[str] = ()
-    """Assumptions of the reader and what it ignored, one sentence each."""
+    notes: Sequence[str] = ()  # assumptions of the reader and what it ignored
     origin: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
     """(3,) [m], position of W's origin in the world of the files, upright and in meters."""
     axes: FileAxes = OPTICAL_AXES
-    folder: str = ""
-    """The absolute path from which `read_capture` opens it again, with `config`; empty if it
-    cannot."""
-    config: CaptureConfig = field(default_factory=CaptureConfig)
-    """The configuration that it was read with."""
+    folder: str = ""  # absolute path from which `read_capture` opens it again, if any
+    config: CaptureConfig = field(default_factory=CaptureConfig)  # that it was read with
 
     def __len__(self) -> int:
         return len(self.X_WCs)
@@ -384,13 +349,13 @@ class Capture:
 
     def registered_depth(self, i: int) -> NDArray[np.float32]:
         """Returns the depth (height, width) [m] of frame i in the pixels of its image; 0 in invalid
-        pixels and where it is unknown."""
+        pixels and if unknown."""
         depth, camera = self.measured_depth(i), self.depth_camera
         if depth is None:
             return np.zeros((self.height, self.width), np.float32)
         if camera is None:
             return depth
-        depth = register_depth(depth, camera.K, camera.X_CD, self.K, self.width, self.height)
+        depth = register_depth(depth, camera, self.K, self.width, self.height)
         return np.where(self.load_valid(i), depth, np.float32(0))
 
     def frame(self, i: int) -> CaptureFrame:

@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
-from scipy.spatial import KDTree
 
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.scenarios import benchmark_scenarios
@@ -22,14 +21,13 @@ from splatpilot.systems.common.files import held_folder, require_writable_folder
 from splatpilot.systems.common.progress import Progress, resumable
 from splatpilot.systems.common.seeds import TRAINING_SEEDS, VALIDATION_SEEDS
 from splatpilot.systems.common.validation import Config, bounded, require, require_field
-from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.training.captures.camera_path import (
     move_left,
     poses_along,
     resample,
     visiting_path,
 )
-from splatpilot.training.captures.capture import Capture, CaptureFrame, depth_points, pinhole
+from splatpilot.training.captures.capture import CaptureFrame, pinhole
 from splatpilot.training.captures.frames import pose_row
 from splatpilot.training.captures.mesh_renderer import (
     MeshRenderer,
@@ -42,7 +40,7 @@ from splatpilot.training.captures.tartanair import AXES
 
 @dataclass(kw_only=True)
 class RenderConfig(Config):
-    """How a world is captured."""
+    """Options of a rendered capture."""
 
     width: int = bounded(640, "[8, 4096] px")  # of the images
     height: int = bounded(480, "[8, 4096] px")  # of the images
@@ -77,26 +75,19 @@ class RenderConfig(Config):
 
 
 RECIPE = "world.yaml"
-_VERSION = 2
-"""Of how meshes are drawn."""
+_VERSION = 2  # of the drawing of meshes
 
 
 @dataclass
 class RenderedWorld:
     """The content of `world.yaml`, from which more of a captured world can be rendered."""
 
-    # The mesh, absolute or relative to the capture.
-    mesh: str = ""
-    # The file or scenario that it was made from.
-    origin: str = ""
-    # How the capture was rendered.
+    mesh: str = ""  # absolute or relative to the capture
+    origin: str = ""  # file or scenario that it was made from
     config: RenderConfig = field(default_factory=RenderConfig)
-    # Split of scenes of the capture: train, validation or test.
-    split: str = ""
-    # Digest of the mesh's triangles, or of the generated world, see `splits.source_digest`.
-    source_digest: list[str] = field(default_factory=list)
-    # Of the way meshes were drawn.
-    version: int = 1
+    split: str = ""  # of scenes of the capture: train, validation or test
+    source_digest: list[str] = field(default_factory=list)  # see `splits.source_digest`
+    version: int = 1  # of the drawing of meshes
 
 
 def run(*, world: str | Path, out: str | Path, config: RenderConfig, seed: int = 0) -> None:
@@ -109,10 +100,6 @@ def run(*, world: str | Path, out: str | Path, config: RenderConfig, seed: int =
         world: a mesh (.gltf, .glb or .obj), or a scenario whose world is procedural, one of the
             benchmark's ("P02") or a file (.yaml): that world, drawn from `seed`, is exported as
             `world.gltf` into the capture.
-
-    Raises:
-        ValueError, OSError: for a world or settings that cannot be rendered, a path through walls,
-            something else in `out`, or a full disk.
     """
     config.validate()
     out = Path(out).absolute()
@@ -188,11 +175,7 @@ def _render(world: Path, out: Path, partial: Path, config: RenderConfig, seed: i
 
 def true_camera(capture: Path) -> Callable[[RigidTransform], CaptureFrame] | None:
     """Returns a function that renders the world of a rendered capture at any pose X_WC, in the
-    capture's camera; None if the capture was not rendered.
-
-    Raises:
-        ValueError, OSError: if its world is missing, damaged or cannot be rendered.
-    """
+    capture's camera; None if the capture was not rendered."""
     recipe = rendered_world(capture)
     if recipe is None:
         return None
@@ -278,63 +261,3 @@ def _write_frames(
             file.write_bytes(content.tobytes())
     with written_atomically(folder / "pose_left.txt") as file:
         file.write_text("".join(rows))
-
-
-_MAX_POINTS = 2_000_000
-_MAX_GAUSSIANS = 200_000
-_SPREAD = 0.6
-"""Standard deviation of a Gaussian over the distance to its neighbors."""
-
-
-def capture_gaussians(capture: Capture, frames: Sequence[int]) -> GaussianScene | None:
-    """Returns round Gaussians at the measured depth of some frames or, without depth, at the points
-    of the registration; None without either."""
-    if capture.has_depth:
-        points, colors = _points_from_depth(capture, frames)
-    elif capture.points is not None:
-        points, colors = capture.points.p_WQ, capture.points.colors
-    else:
-        return None
-    if len(points) < 2:
-        return None
-    kept = _thinned(points, _MAX_GAUSSIANS)
-    points, colors = points[kept], colors[kept]
-    distances, _ = KDTree(points).query(points, k=2)
-    # A point far from others is not larger than they are.
-    size = np.minimum(distances[:, 1], 4 * np.median(distances[:, 1])) + 1e-6
-    return GaussianScene.from_colors(
-        points,
-        np.tile([1.0, 0.0, 0.0, 0.0], (len(points), 1)),
-        _SPREAD * size[:, None].repeat(3, axis=1),
-        np.full(len(points), 0.95),
-        colors,
-    )
-
-
-def _points_from_depth(
-    capture: Capture, frames: Sequence[int]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Returns points p_WQ (N, 3) [m] and colors (N, 3), 0 to 1, of a grid of pixels."""
-    pixels = len(frames) * capture.width * capture.height
-    step = max(1, int(np.ceil(np.sqrt(pixels / _MAX_POINTS))))
-    points, colors = [], []
-    for i in Progress(frames, "reading depth", unit="frame", delay=2.0):
-        frame = capture.frame(i)
-        p_CQ, rows, columns = depth_points(frame.K, frame.depth, step)
-        points.append(frame.X_WC.multiply(p_CQ.T).T)
-        colors.append(frame.image[rows, columns] / 255)
-    return np.concatenate(points), np.concatenate(colors)
-
-
-def _thinned(points: NDArray[np.float64], count: int) -> NDArray[np.intp]:
-    """Returns the first point in each cell of the finest grid of at most `count` occupied cells."""
-    lower = points.min(axis=0)
-    # Few points far away must not make the cells large.
-    extent = float(np.percentile(np.ptp(points, axis=0), 50)) or 1.0
-    edge = extent / 4096
-    while True:
-        cells = np.floor((points - lower) / edge).astype(np.int64)
-        _, first = np.unique((cells[:, 0] << 42) ^ (cells[:, 1] << 21) ^ cells[:, 2], True)
-        if len(first) <= count:
-            return np.sort(first)
-        edge *= 1.3

@@ -7,19 +7,22 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from splatpilot.training.captures.capture import (
     CaptureFrame,
+    DepthCamera,
     Lens,
-    cache_folder,
-    cache_key,
     common_pinhole,
     fisheye_lens,
     opencv_lens,
     pinhole,
-    prepare_cache,
     register_depth,
     shrink,
     shrink_factor,
 )
-from splatpilot.training.captures.capture_config import CaptureConfig
+from splatpilot.training.captures.capture_config import (
+    CaptureConfig,
+    cache_folder,
+    cache_key,
+    prepare_cache,
+)
 
 K = pinhole(46.0, 46.0, 32.0, 24.0)
 RAYS = np.random.default_rng(0).uniform(-0.7, 0.7, (50, 2))
@@ -83,7 +86,7 @@ def test_plane(finer):
     n_C = X_CD.rotation().multiply(n)
     d_C = d + n_C @ X_CD.translation()
     depth = plane_depth(n, d, K_D, 64, 48).astype(np.float32)
-    got = register_depth(depth, K_D, X_CD, K, 64 * finer, 48 * finer)
+    got = register_depth(depth, DepthCamera(K_D, 64, 48, X_CD), K, 64 * finer, 48 * finer)
     want = plane_depth(n_C, d_C, K, 64 * finer, 48 * finer)
     inner = np.s_[8 * finer : -8 * finer, 8 * finer : -8 * finer]
     # Half a pixel of the coarser camera on this slope.
@@ -93,14 +96,14 @@ def test_plane(finer):
 def test_same_camera_changes_nothing():
     depth = np.random.default_rng(0).uniform(1, 5, (48, 64)).astype(np.float32)
     depth[3, 4], depth[5, 6] = 0, np.inf
-    got = register_depth(depth, K_D, RigidTransform(), K_D, 64, 48)
+    got = register_depth(depth, DepthCamera(K_D, 64, 48, RigidTransform()), K_D, 64, 48)
     np.testing.assert_allclose(got, depth, rtol=1e-6)
 
 
 def test_nearer_surface_hides_the_farther():
     depth = np.full((48, 64), 4.0, np.float32)
     depth[:, 20:30] = 1.0
-    got = register_depth(depth, K_D, RigidTransform([0.3, 0, 0]), K_D, 64, 48)
+    got = register_depth(depth, DepthCamera(K_D, 64, 48, RigidTransform([0.3, 0, 0])), K_D, 64, 48)
     shift = 0.3 * 58.5
     covered = got[:, int(np.ceil(20 + shift)) : int(30 + shift)]
     np.testing.assert_array_equal(covered, 1.0)
