@@ -50,7 +50,7 @@ class ScaleConfig(Config):
 
 @dataclass(kw_only=True)
 class CaptureConfig(Config):
-    """What the files of a capture leave open; empty and zero fields take the format's defaults."""
+    """Settings of a capture; empty and zero fields take the format's defaults."""
 
     kind: str = ""
     """Capture format: a name in `splatpilot.training.captures.capture_registry.CAPTURES`, or
@@ -92,20 +92,19 @@ class CaptureConfig(Config):
             if size == 4 and values:
                 require_field(self, name, min(values[:2]) > 0, "of focal lengths > 0")
         require_field(self, "up", self.up in ("", *_UPS), f"one of {', '.join(_UPS)}")
-        require_field(
-            self, "topics", len(self.topics) in (0, 3), "three names, of color, depth and poses"
-        )
+        valid = len(self.topics) in (0, 3)
+        require_field(self, "topics", valid, "three names, of color, depth and poses")
 
     def settings(self) -> list[str]:
         """Returns the fields other than the defaults, as `--set` takes them:
         "depth_unit=5000.0", "scale.camera_height=1.6"."""
         default = CaptureConfig()
         return [
-            f"{prefix}{field.name}={json.dumps(value)}"
+            f"{prefix}{each.name}={json.dumps(value)}"
             for prefix, part, usual in (("", self, default), ("scale.", self.scale, default.scale))
-            for field in fields(usual)
-            if field.name != "scale"
-            and (value := getattr(part, field.name)) != getattr(usual, field.name)
+            for each in fields(usual)
+            if each.name != "scale"
+            and (value := getattr(part, each.name)) != getattr(usual, each.name)
         ]
 
 

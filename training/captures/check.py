@@ -87,8 +87,7 @@ class ReadingFit:
     error: float
     """Median of |z' / z - 1|, depth z carried into another frame and z' found there; infinite if
     the frames hardly overlap."""
-    inside: float
-    """Fraction of points that fall onto measured depth in the other frame."""
+    inside: float  # fraction of points that fall onto measured depth in the other frame
 
 
 @dataclass(frozen=True)
@@ -120,13 +119,10 @@ class CheckReport:
     notes: tuple[str, ...]
     metric: bool
     pairs: int = 0
-    agreement: ReadingFit | None = None
-    """None if there is no depth to compare."""
-    others: tuple[ReadingFit, ...] = ()
-    """Other readings, the best first."""
+    agreement: ReadingFit | None = None  # none if there is no depth to compare
+    others: tuple[ReadingFit, ...] = ()  # other readings, the best first
     color: ColorFit | None = None
-    problem: str = ""
-    """The most likely error in one sentence; empty if none was found."""
+    problem: str = ""  # the most likely error in one sentence; empty if none was found
 
     @property
     def agrees(self) -> bool:
@@ -159,8 +155,7 @@ class CheckReport:
 class CheckConfig(Config):
     """Options of a check."""
 
-    pairs: int = bounded(12, "[1, 1000]")
-    """Number of pairs of frames that are compared."""
+    pairs: int = bounded(12, "[1, 1000]")  # number of pairs of frames that are compared
     capture: CaptureConfig = field(default_factory=CaptureConfig)
 
 

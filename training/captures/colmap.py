@@ -42,10 +42,8 @@ _MODEL_FOLDERS = ("", "sparse/0", "sparse", "colmap/sparse/0", "0")
 _IMAGE_FOLDERS = ("images", "../images", "../../images", "")
 _MIN_RECORD = {"cameras": 48, "images": 73, "points3D": 51, "rigs": 8, "frames": 68}
 """[bytes] of one entry of the binary files of a model."""
-_MAX_PIXEL_DISTANCE = 20.0
-"""[px] between a pixel and the registered point that it refers to."""
-_MAX_COORDINATE = 1e12
-"""Points beyond are damaged and left out."""
+_MAX_PIXEL_DISTANCE = 20.0  # [px] between a pixel and the registered point that it refers to
+_MAX_COORDINATE = 1e12  # points beyond are damaged and left out
 
 
 def import_pycolmap() -> ModuleType:

@@ -51,14 +51,10 @@ _NO_DEPTH = {"1", "L", "P", "LA", "PA", "RGB", "CMYK", "YCbCr"}
 _ALPHA = {"RGBA", "LA", "PA"}
 _ENDS = {"PNG": b"IEND", "JPEG": b"\xff\xd9"}
 _MAX_POSITION = 1e8  # [m]
-_MAX_DROPPED = 0.2
-"""Fraction of frames that may be left out."""
-_MAPS = 8
-"""Cameras whose resampling is kept at a time."""
-_VALID = 0.999
-"""Fraction of a resampled pixel that must come from valid ones."""
-_SAME_SHAPE = 0.02
-"""Relative difference of aspect ratios below which depth shows the same view."""
+_MAX_DROPPED = 0.2  # fraction of frames that may be left out
+_MAPS = 8  # cameras whose resampling is kept at a time
+_VALID = 0.999  # fraction of a resampled pixel that must come from valid ones
+_SAME_SHAPE = 0.02  # relative difference of aspect ratios below which depth shows the same view
 
 
 def image_size(file: Path) -> tuple[int, int]:
@@ -269,14 +265,10 @@ class FrameFiles:
     """Returns the pose as the file gives it, or raises ValueError that names the file: that of a
     body B, the camera with the file's axes, in the file's world F."""
     depth: Path | None = None
-    lens: Lens | None = None
-    """The camera of this frame; None takes that of the capture."""
-    mask: Path | None = None
-    """An image that is black where this one is not to be used."""
-    name: str = ""
-    """Path of the image as the files give it; empty for the name of the file."""
-    held_out: bool = False
-    """True if the files hold this frame out from training."""
+    lens: Lens | None = None  # the camera of this frame; None takes that of the capture
+    mask: Path | None = None  # an image that is black where this one is not to be used
+    name: str = ""  # path of the image as the files give it; empty for the name of the file
+    held_out: bool = False  # true if the files hold this frame out from training
 
 
 @dataclass(frozen=True, eq=False)

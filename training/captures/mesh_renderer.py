@@ -49,8 +49,7 @@ from splatpilot.systems.common.readers import readable, require_file, require_re
 from splatpilot.systems.common.validation import require
 from splatpilot.training.captures.capture import CaptureFrame, pixel_rays
 
-MIN_DEPTH, MAX_DEPTH = 0.05, 150.0
-"""[m], range of the depth images; nearer is 0, farther is inf."""
+MIN_DEPTH, MAX_DEPTH = 0.05, 150.0  # [m], range of the depth images; nearer is 0, farther is inf
 
 # Lamps at infinity: direction and intensity of one overhead, four from the sides so that no wall is
 # dark or like its neighbor, one from below for undersides.

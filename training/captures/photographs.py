@@ -31,22 +31,16 @@ if TYPE_CHECKING:
     import pycolmap
 
 _WORDS = 32
-_SAMPLE = 50_000
-"""Descriptors that the words are found from."""
-_MAX_SIZE = 1600
-"""[px], longer side of the images in which features are extracted."""
-_SMALL = 1200
-"""[px], longer side below which photographs are enlarged for it."""
-_MAX_EXHAUSTIVE = 60
-"""Photographs up to which, by default, each is matched with all others."""
-_PARTNERS = 20
-"""Number of photographs that each of more is matched with."""
+_SAMPLE = 50_000  # descriptors that the words are found from
+_MAX_SIZE = 1600  # [px], longer side of the images in which features are extracted
+_SMALL = 1200  # [px], longer side below which photographs are enlarged for it
+_MAX_EXHAUSTIVE = 60  # photographs up to which, by default, each is matched with all others
+_PARTNERS = 20  # number of photographs that each of more is matched with
 _SEED = 0
 _EXIF_MODEL, _EXIF_IFD, _EXIF_FOCAL_LENGTH = 0x0110, 0x8769, 0x920A
 _VIDEO_SUFFIXES = {".avi", ".m4v", ".mkv", ".mov", ".mp4", ".webm"}
 _MIN_PHOTOGRAPHS = 3
-_SHARPNESS_WIDTH = 480
-"""[px], at which frames are compared."""
+_SHARPNESS_WIDTH = 480  # [px], at which frames are compared
 _QUALITY = 97
 
 

@@ -34,26 +34,21 @@ from splatpilot.training.captures.capture_config import (
     prepare_cache,
 )
 
-_WIDTH = 320
-"""[px] Approximate width of compared images, to which lengths in pixels below refer."""
+_WIDTH = 320  # [px] Approximate width of compared images, to which lengths in pixels below refer
 _REACH = 0.08
 """[-] Relative difference of depth up to which two frames can show the same surface, and maximum
 change of its inverse depth from one pixel to the next."""
-_NUM_POINTS, _MIN_POINTS = 1000, 50
-"""Maximum compared points per frame, and minimum per pair."""
+_NUM_POINTS, _MIN_POINTS = 1000, 50  # maximum compared points per frame, and minimum per pair
 _FINE, _COARSE = 1.5, 10.0
 """[px] Brightness is blurred by the first, to be smooth over steps, and divided by what the second
 leaves: exposure and vignetting cancel in the ratio."""
-_BLACK = 0.05
-"""Added to the divisor of brightness (0 to 1)."""
+_BLACK = 0.05  # added to the divisor of brightness (0 to 1)
 _AROUND = np.ones((5, 5), np.uint8)
 _PARTNERS, _OVERLAP, _PROBES = 16, 0.2, 64
 """Maximum number of frames that each is compared with, and the fraction of so many of its points
 that these must see."""
-_REACHES = _REACH, 0.06, 0.05, 0.04
-"""Reach in the first rounds; the last holds for all later ones."""
-_ROUNDS, _SETTLED = 30, 1e-3
-"""Maximum number of rounds, and steps [m], [rad] below which they end."""
+_REACHES = _REACH, 0.06, 0.05, 0.04  # reach in the first rounds; the last holds for all later ones
+_ROUNDS, _SETTLED = 30, 1e-3  # maximum number of rounds, and steps [m], [rad] below which they end
 _SPREADS = np.array([0.01, 0.03])
 """Standard deviations of residuals in the first round; later ones measure them."""
 _INDEPENDENT = 10
@@ -61,8 +56,7 @@ _INDEPENDENT = 10
 _DRIFT, _BELIEF = 0.005, 0.1
 """[m], [rad] Standard deviations of the drift from one frame to the next, and of poses: poses that
 no other frame constrains move as the frames before and after."""
-_VERSION = 1
-"""Version of the result for the same frames."""
+_VERSION = 1  # version of the result for the same frames
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,8 +165,7 @@ class RefinedPoses:
     rotated: float  # [rad], mean over frames
     depth: tuple[float, float]
     """Median relative difference of depth between frames, before and after."""
-    contrast: tuple[float, float]
-    """Median difference of contrast, before and after."""
+    contrast: tuple[float, float]  # median difference of contrast, before and after
 
     def __str__(self) -> str:
         rotated = np.rad2deg(self.rotated)

@@ -41,8 +41,7 @@ from splatpilot.training.captures.tum import MAX_GAP, open_sequence
 _COLORS = {"rgb8": -1, "bgr8": cv2.COLOR_BGR2RGB, "rgba8": cv2.COLOR_RGBA2RGB}
 _COLORS |= {"bgra8": cv2.COLOR_BGRA2RGB, "mono8": cv2.COLOR_GRAY2RGB}
 _DEPTHS = {"16UC1": np.uint16, "mono16": np.uint16, "32FC1": np.float32}
-_DEPTH_UNIT = 1000.0
-"""Units per meter of the depth that is written."""
+_DEPTH_UNIT = 1000.0  # units per meter of the depth that is written
 _METADATA = "metadata.yaml"
 _IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _INFO = "sensor_msgs/msg/CameraInfo"
@@ -55,8 +54,7 @@ _POSES = {
 }
 _TRANSPORTS = ("/compressed", "/compressedDepth", "/theora")
 _CAMERA = "camera.json"
-_VERSION = 2
-"""Version of the cache's content; others are written again."""
+_VERSION = 2  # version of the cache's content; others are written again
 _MODELS = {"": opencv_lens, "plumb_bob": opencv_lens, "rational_polynomial": opencv_lens}
 _MODELS |= {"equidistant": fisheye_lens, "fisheye": fisheye_lens}
 

@@ -28,12 +28,9 @@ from splatpilot.training.captures.frames import (
     read_rows,
 )
 
-MAX_GAP = 0.12
-"""[s] between two poses that one is interpolated from."""
-_MAX_APART = 0.02
-"""[s] between a color image and its depth, as in the data set's own tools."""
-_SAME_TIME = 0.005
-"""[s] between an image and the pose of its keyframe."""
+MAX_GAP = 0.12  # [s] between two poses that one is interpolated from
+_MAX_APART = 0.02  # [s] between a color image and its depth, as in the data set's own tools
+_SAME_TIME = 0.005  # [s] between an image and the pose of its keyframe
 
 # fx, fy, cx, cy [px], counted from the first pixel's center, and distortion k1 k2 p1 p2 k3, for
 # images of 640x480 px, by the name of the folder or of the bag that its lists name. Published with

@@ -7,6 +7,7 @@ from pathlib import PurePath
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
+from scipy.spatial.transform import Rotation
 
 from splatpilot.systems.splats.scene import choose_origin
 from splatpilot.training.captures.capture import (
@@ -18,17 +19,13 @@ from splatpilot.training.captures.capture import (
 )
 from splatpilot.training.captures.capture_config import ScaleConfig
 
-_LEVEL_GAZE = 0.01
-"""Weight of cameras that look level against images that are level."""
+_LEVEL_GAZE = 0.01  # weight of cameras that look level against images that are level
 _TRIALS = 2000
 _GROUND_SHARE = 0.02
 _MAX_TILT = np.deg2rad(35)
-_MIN_POINTS = 20
-"""Points whose depth must be known for a scale."""
-_MAX_SCALE_TILT = 10.0
-"""[deg] of a ground against what level cameras call level."""
-_MAX_SPREAD = 0.25
-"""Of the cameras' heights over a ground, 10 to 90 %, relative to their median."""
+_MIN_POINTS = 20  # points whose depth must be known for a scale
+_MAX_SCALE_TILT = 10.0  # [deg] of a ground against what level cameras call level
+_MAX_SPREAD = 0.25  # of the cameras' heights over a ground, 10 to 90 %, relative to their median
 
 
 def up_of_cameras(X_WCs: Sequence[RigidTransform]) -> NDArray[np.float64]:
@@ -55,19 +52,11 @@ def up_of_cameras(X_WCs: Sequence[RigidTransform]) -> NDArray[np.float64]:
 def fit_ground(
     p_WQ: NDArray[np.float64], p_WCs: NDArray[np.float64], up: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], float]:
-    """Fits the ground plane n.p = d.
+    """Fits the ground plane n.p = d to points (N, 3), and returns n (3,), upward, and d.
 
     Of planes through three random points, within 35 degrees of `up` and below the median camera,
     the one with the most points near it wins; a point below it counts against it. Near is 2 % of
     the cameras' median distance from the points. The winner is refined by least squares.
-
-    Args:
-        p_WQ: (N, 3), points of the scene.
-        p_WCs: (M, 3), cameras.
-        up: (3,), roughly.
-
-    Returns:
-        n (3,), upward unit normal, and d.
     """
     rng = np.random.default_rng(0)
     camera = np.median(p_WCs, axis=0)
@@ -92,8 +81,8 @@ def fit_ground(
             best, best_count = (n, n @ a), count
     if best is None or best_count < _GROUND_SHARE * len(p_WQ):
         raise ValueError(
-            "no ground was found: no plane below the cameras holds a fiftieth of the points; give "
-            "the scale or the up direction in another way"
+            "no ground was found: no plane below the cameras holds a fiftieth of the points; set "
+            "capture.scale or capture.up by another field"
         )
     n, d = best
     for width in near * np.array([1, 0.5, 0.25, 0.125]):
@@ -152,19 +141,17 @@ def _known_points(capture: Capture) -> NDArray[np.float64]:
     if not sum(len(part) for part in parts):
         raise ValueError(
             f"{capture.source}: has neither points nor depth to find the ground; set capture.up or "
-            "capture.scale in another way"
+            "capture.scale by another field"
         )
     return np.concatenate(parts)
 
 
 def _rotation_to_z(up: NDArray[np.float64]) -> RotationMatrix:
     """Returns the smallest rotation that takes the unit vector `up` to z."""
-    z = np.array([0.0, 0.0, 1.0])
-    if up @ z < -1 + 1e-12:
-        return RotationMatrix(np.diag([1.0, -1.0, -1.0]))
-    v = np.cross(up, z)
-    V = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
-    return RotationMatrix.ProjectToRotationMatrix(np.eye(3) + V + V @ V / (1 + up @ z))
+    axis = np.cross(up, [0.0, 0.0, 1.0])
+    axis = axis / np.linalg.norm(axis) if axis.any() else np.array([1.0, 0.0, 0.0])
+    angle = np.arccos(np.clip(up[2], -1, 1))
+    return RotationMatrix(Rotation.from_rotvec(angle * axis).as_matrix())
 
 
 def make_metric(
@@ -225,11 +212,8 @@ def _locate(
 
 
 def camera_height(capture: Capture) -> float:
-    """Returns the median height of the cameras above the ground, in the capture's units.
-
-    Raises:
-        ValueError: if no ground is found above which the cameras were carried level at one height.
-    """
+    """Returns the median height of the cameras above the ground, in the capture's units, if they
+    were carried level at one height."""
     cameras = np.array([X_WC.translation() for X_WC in capture.X_WCs])
     up = up_of_cameras(capture.X_WCs)
     n, d = fit_ground(_known_points(capture), cameras, up)

@@ -72,7 +72,6 @@ K_C = np.array([[52.0, 0, 32], [0, 52.0, 24], [0, 0, 1.0]])
 
 
 def plane_depth(n, d, K, width, height):
-    """Depth (H, W) of the plane n.Q = d seen by a pinhole at the origin."""
     v, u = np.mgrid[0:height, 0:width] + 0.5
     rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], axis=-1)
     return d / (rays @ n)

@@ -22,7 +22,6 @@ NED = RotationMatrix(np.array([[0, 0, 1.0], [1, 0, 0], [0, 1, 0]]))
 
 @pytest.fixture
 def room(room_views):
-    """The room as a capture, with the depth and images of an ideal camera."""
     views = room_views(K, WIDTH, HEIGHT)
 
     def room(**changes) -> Capture:
@@ -44,7 +43,6 @@ def room(room_views):
 
 @pytest.fixture
 def masked_room(room) -> Capture:
-    """The room with a thing in every image that moves with the camera, red and at 1 m, masked."""
     valid = np.ones((HEIGHT, WIDTH), bool)
     valid[40:90, 50:120] = False
     plain = room()
@@ -59,13 +57,11 @@ def masked_room(room) -> Capture:
 
 
 def as_files(capture, change):
-    """The poses X_WC that result when the files' X_FB are not what the reader takes them for."""
     R_WF, R_BC = RigidTransform(capture.axes.R_WF), RigidTransform(capture.axes.R_BC)
     return [R_WF @ change(R_WF.inverse() @ X @ R_BC.inverse()) @ R_BC for X in capture.X_WCs]
 
 
 def misread_quaternion(X: RigidTransform) -> RigidTransform:
-    """What a reader of x y z w makes of a file with w x y z."""
     x, y, z, w = X.rotation().ToQuaternion().wxyz()
     return RigidTransform(Quaternion(np.array([w, x, y, z])), X.translation())
 

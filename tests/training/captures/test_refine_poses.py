@@ -39,7 +39,6 @@ def moved(X_WC: RigidTransform, step: np.ndarray) -> RigidTransform:
 
 
 def drifting(poses: list[RigidTransform], rotation: float, shift: float) -> list[RigidTransform]:
-    """Adds a random walk that ends about so far off [rad], [m]."""
     walk = np.random.default_rng(1).standard_normal((len(poses), 6)).cumsum(axis=0)
     walk *= np.repeat([rotation, shift], 3) / np.sqrt(len(poses))
     return [moved(X_WC, step) for step, X_WC in zip(walk, poses, strict=True)]
@@ -143,8 +142,6 @@ K_REFINED_CAPTURE = np.array([[300.0, 0, 160.0], [0, 300.0, 120.0], [0, 0, 1]])
 
 @pytest.fixture
 def folder(tmp_path, room_views, room_poses) -> Path:
-    """The room as a folder of the 7-Scenes kind, whose poses are off by a centimeter and more
-    along its length."""
     path = tmp_path / "capture"
     path.mkdir()
     for i, view in enumerate(room_views(K_REFINED_CAPTURE, 320, 240, finer=8.0)):

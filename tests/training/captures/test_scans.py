@@ -16,8 +16,6 @@ K_D = np.array([[55.0, 0, 32], [0, 55.0, 24], [0, 0, 1]])
 
 @pytest.fixture
 def write(tmp_path, K, room_views, room_poses):
-    """Writes the room as two cameras see it, color at P_DC in the depth camera."""
-
     def write() -> Path:
         X_DC = RigidTransform(np.array(P_DC))
         colors = room_views(K, 64, 48)
@@ -165,7 +163,6 @@ K_D_SCANNET = np.array([[24.0, 0, 16], [0, 24.0, 12], [0, 0, 1]])
 
 @pytest.fixture
 def write_scannet(tmp_path, K, room_views):
-    """Writes the room as ScanNet's reader does: depth of another camera, at the same place."""
     for name in ("color", "depth", "pose", "intrinsic"):
         (tmp_path / name).mkdir()
     colors, depths = room_views(K, 64, 48), room_views(K_D_SCANNET, 32, 24)

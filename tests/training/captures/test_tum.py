@@ -9,7 +9,6 @@ FX, CX = 525.0, 320.0
 
 @pytest.fixture
 def write(tmp_path, room_views, room_poses):
-    """Writes the room as TUM does, at 80x60: depth 10 ms and poses 5 ms off the color images."""
     K = np.array([[FX, 0, CX], [0, FX, 240.0], [0, 0, 1]]) * [[1 / 8], [1 / 8], [1]]
     (tmp_path / "rgb").mkdir()
     (tmp_path / "depth").mkdir()
@@ -112,7 +111,6 @@ def test_bad_lists(write, name, text, message):
 
 
 def keep_keyframes(folder, every: int, offset: float = 0.0) -> None:
-    """Leaves of the poses those of every so manieth image, at its own time."""
     rows = [line.split() for line in (folder / "groundtruth.txt").read_text().splitlines()[1:]]
     kept = []
     for i in range(0, 10, every):

@@ -26,7 +26,6 @@ def moved_by(capture: Capture, offset: np.ndarray) -> Capture:
 
 
 def write_far(write_room, path, offset=FAR):
-    """Writes the room as a capture whose world has its origin elsewhere."""
     room = write_room(path)
     rows = np.loadtxt(room / "pose_left.txt")
     rows[:, :3] += offset * [1, -1, -1]  # north, east, down
