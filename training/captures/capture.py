@@ -85,6 +85,11 @@ def pinhole(fx: float, fy: float, cx: float, cy: float) -> NDArray[np.float64]:
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
 
 
+def centered_pinhole(fx: float, fy: float, cx: float, cy: float) -> NDArray[np.float64]:
+    """Returns the intrinsics (3, 3) [px] if cx and cy count from the first pixel's center."""
+    return pinhole(fx, fy, cx + 0.5, cy + 0.5)
+
+
 def opencv_lens(
     K: NDArray[np.float64], width: int, height: int, distortion: Sequence[float], k4: float = 0.0
 ) -> Lens:

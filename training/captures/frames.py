@@ -115,13 +115,11 @@ def _read_alpha(file: Path) -> NDArray[np.bool_]:
 
 
 def read_depth(file: Path, unit: float) -> NDArray[np.float32]:
-    """Returns depth (H, W) [m] from `.npy`, `.exr`, or an image of integers or floats.
+    """Returns depth (H, W) [m] from `.npy`, `.exr`, or an image of integers or floats, in `unit`
+    per meter.
 
     NaN, negative depth and the largest 16-bit number, which sensors write where they see nothing,
     become 0, unknown.
-
-    Args:
-        unit: units of the file per meter.
     """
     if file.suffix == ".npy":
         raw = read_array(file)
@@ -167,11 +165,8 @@ def _open_exr(file: Path, **options: bool) -> Any:
 
 
 def numbered_files(folder: Path, pattern: str) -> dict[int, Path]:
-    """Returns the files of a folder by the number in their name, in its order.
-
-    Args:
-        pattern: regular expression of the whole name, whose group is the number.
-    """
+    """Returns the files of a folder by the number that is the group of `pattern`, a regular
+    expression of the whole name, in its order."""
     if not folder.is_dir():
         raise FileNotFoundError(f"No such folder: {folder}")
     found = ((re.fullmatch(pattern, file.name), file) for file in folder.iterdir())
@@ -182,12 +177,9 @@ def numbered_files(folder: Path, pattern: str) -> dict[int, Path]:
 
 
 def read_rows(file: Path, columns: int, what: str) -> list[NDArray[np.float64]]:
-    """Returns the rows of numbers of a text file, each (columns,); NaN is read as such.
+    """Returns the rows of numbers of a text file, each (columns,), called `what` in messages.
 
-    Lines that start with # and empty lines at the end are left out.
-
-    Args:
-        what: a row is, for messages.
+    NaN is read as such; lines that start with # and empty lines at the end are left out.
     """
     rows = []
     for number, line in enumerate(read_text(file, "replace").rstrip().splitlines(), start=1):
@@ -226,8 +218,7 @@ def pose_row(X: RigidTransform) -> str:
 
 
 def pose_from_matrix(matrix: NDArray[np.float64], source: str) -> RigidTransform:
-    """Returns the pose of a matrix (4, 4) or (3, 4), whose rotation may be off by rounding; errors
-    start with `source`."""
+    """Returns the pose of a matrix (4, 4) or (3, 4), rounded; errors start with `source`."""
     R, p = matrix[:3, :3], matrix[:3, 3]
     _require_position(matrix, p, source)
     last = (0.0, 0.0, 0.0, 1.0)
@@ -320,17 +311,15 @@ def open_frames(
         ValueError: if fewer than two frames, or less than four fifths of them, can be used.
     """
     config = config or CaptureConfig()
-    messages = list(dropped)
-    complete = []
+    messages, complete = list(dropped), []
     for files in frames:
         try:
             complete.append(_inspect(files))
         except (ValueError, OSError) as error:
             messages.append(str(error))
-    usable = _drop_other_sizes(
-        complete, messages, not (depth_camera or stretch_depth), stretch_depth
-    )
-    usable = _drop_distant(usable, messages)
+    registered = depth_camera is None and not stretch_depth
+    same_size = _drop_other_sizes(complete, messages, registered, stretch_depth)
+    usable = _drop_distant(same_size, messages)
     if len(usable) < max(2, (1 - _MAX_DROPPED) * len(frames)):
         first = f"; the first that cannot: {messages[0]}" if messages else ""
         raise ValueError(
@@ -448,12 +437,8 @@ def _inspect(frame: FrameFiles) -> _Frame:
 def _drop_other_sizes(
     frames: Sequence[_Frame], messages: list[str], registered: bool, same_view: bool
 ) -> list[_Frame]:
-    """Returns the frames in the most frequent sizes of images and depth.
-
-    Args:
-        messages: to which those about other frames are appended.
-        registered: True if depth must have the size of its image.
-        same_view: True if it must have the aspect ratio of its image.
+    """Returns the frames in the most frequent sizes of images and depth, and appends messages about
+    others. Depth must have the size of its image if `registered`, its aspect ratio if `same_view`.
     """
     sizes = [frame.size for frame in frames if frame.files.lens is None]
     depth_sizes = [frame.depth_size for frame in frames if frame.depth_size]
@@ -479,10 +464,8 @@ def _drop_other_sizes(
 
 
 def _drop_distant(frames: list[_Frame], messages: list[str]) -> list[_Frame]:
-    """Returns the frames that are not far from all others.
-
-    Those are farther from the median position than 10 m and 20 times what four in five are.
-    """
+    """Returns the frames that are not farther from the median position than 10 m and 20 times the
+    distance of four in five."""
     if not frames:
         return frames
     p = np.array([frame.X_FB.translation() for frame in frames])

@@ -89,13 +89,8 @@ class MeshRenderer:
         check_mesh(mesh, up)
         require_opengl()
         lights = [
-            LightParameter(
-                type="directional",
-                frame="world",
-                direction=np.array(direction),
-                intensity=intensity,
-            )
-            for direction, intensity in _LAMPS
+            LightParameter(type="directional", frame="world", direction=d, intensity=intensity)
+            for d, intensity in _LAMPS
         ]
         self._engine = MakeRenderEngineVtk(
             RenderEngineVtkParams(
@@ -413,7 +408,7 @@ def _base_color(material: dict[str, Any]) -> list[float]:
 
 
 def _opaque(material: PBRMaterial, number: int) -> PBRMaterial:
-    """Returns a material without alpha in its textures, whose name is its number."""
+    """Returns a material, named by its number, without alpha in its textures."""
     opaque = material.copy()
     opaque.name, opaque.alphaMode, opaque.doubleSided = str(number), None, True
     for key in ("baseColorTexture", "emissiveTexture", "occlusionTexture"):

@@ -1,13 +1,15 @@
 """Photographs alone and videos, which pycolmap registers: SIFT, matching, incremental mapping."""
 
 import shutil
+from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import cv2  # Before pycolmap, whose libpng it would otherwise use.
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import ExifTags, Image
 from scipy.cluster.vq import kmeans2, vq
 
 from splatpilot.systems.common.processes import available_cores, run_apart
@@ -37,7 +39,6 @@ _SMALL = 1200  # [px], longer side below which photographs are enlarged for it
 _MAX_EXHAUSTIVE = 60  # photographs up to which, by default, each is matched with all others
 _PARTNERS = 20  # number of photographs that each of more is matched with
 _SEED = 0
-_EXIF_MODEL, _EXIF_IFD, _EXIF_FOCAL_LENGTH = 0x0110, 0x8769, 0x920A
 _VIDEO_SUFFIXES = {".avi", ".m4v", ".mkv", ".mov", ".mp4", ".webm"}
 _MIN_PHOTOGRAPHS = 3
 _SHARPNESS_WIDTH = 480  # [px], at which frames are compared
@@ -102,8 +103,8 @@ def _one_camera(files: list[Path]) -> bool:
     for file in files:
         with Image.open(file) as image:
             exif = image.getexif()
-            focal_length = exif.get_ifd(_EXIF_IFD).get(_EXIF_FOCAL_LENGTH)
-            cameras.add((image.size, exif.get(_EXIF_MODEL), focal_length))
+            focal_length = exif.get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.FocalLength)
+            cameras.add((image.size, exif.get(ExifTags.Base.Model), focal_length))
     return len(cameras) == 1
 
 
@@ -129,30 +130,21 @@ def _register(work: tuple[Path, list[str], bool, int, Path]) -> None:
     reader = pycolmap.ImageReaderOptions()
     if (masks := mask_folder(folder)).is_dir():
         reader.mask_path = masks
-    threads = available_cores()
-    with Progress(total=len(names), desc="extracting features", unit="photo") as progress:
-        for start in range(0, len(names), threads):
-            some = names[start : start + threads]
-            pycolmap.extract_features(
-                database, folder, some, reader_options=reader, extraction_options=extraction
-            )
-            progress.update(len(some))
+    for some in _batches(names, available_cores(), "extracting features", "photo"):
+        pycolmap.extract_features(
+            database, folder, some, reader_options=reader, extraction_options=extraction
+        )
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = _SEED
-    pairs = _pairs(database, names, partners)
-    block = max(1, len(pairs) // 20)
-    with Progress(total=len(pairs), desc="matching pairs", unit="pair") as progress:
-        for start in range(0, len(pairs), block):
-            some = pairs[start : start + block]
-            listed = temporary / "pairs.txt"
-            listed.write_text("".join(f"{names[a]} {names[b]}\n" for a, b in some))
-            pycolmap.match_image_pairs(
-                database,
-                matching_options=pycolmap.FeatureMatchingOptions(use_gpu=False),
-                pairing_options=pycolmap.ImportedPairingOptions(match_list_path=listed),
-                verification_options=verification,
-            )
-            progress.update(len(some))
+    pairs, listed = _pairs(database, names, partners), temporary / "pairs.txt"
+    for some in _batches(pairs, max(1, len(pairs) // 20), "matching pairs", "pair"):
+        listed.write_text("".join(f"{names[a]} {names[b]}\n" for a, b in some))
+        pycolmap.match_image_pairs(
+            database,
+            matching_options=pycolmap.FeatureMatchingOptions(use_gpu=False),
+            pairing_options=pycolmap.ImportedPairingOptions(match_list_path=listed),
+            verification_options=verification,
+        )
     options = pycolmap.IncrementalPipelineOptions(random_seed=_SEED, num_threads=1)
     options.mapper.random_seed = options.triangulation.random_seed = _SEED
     options.mapper.num_threads = 1
@@ -175,28 +167,25 @@ def _register(work: tuple[Path, list[str], bool, int, Path]) -> None:
     shutil.rmtree(temporary)
 
 
+def _batches[Item](items: list[Item], size: int, what: str, unit: str) -> Iterator[list[Item]]:
+    with Progress(total=len(items), desc=what, unit=unit) as progress:
+        for start in range(0, len(items), size):
+            yield items[start : start + size]
+            progress.update(len(items[start : start + size]))
+
+
 def _pairs(database: Path, names: list[str], partners: int) -> list[tuple[int, int]]:
     if partners == 0:
         partners = len(names) if len(names) <= _MAX_EXHAUSTIVE else _PARTNERS
     if partners >= len(names) - 1:
         return [(a, b) for a in range(len(names)) for b in range(a + 1, len(names))]
-    opened = import_pycolmap().Database.open(database)
-    try:
+    with closing(import_pycolmap().Database.open(database)) as opened:
         return likely_pairs(similarity(opened, names), partners)
-    finally:
-        opened.close()
 
 
 def likely_pairs(similarity: NDArray[np.float64], partners: int) -> list[tuple[int, int]]:
-    """Returns pairs of each image with `partners` / 2 neighbors and the most similar others.
-
-    Args:
-        similarity: (N, N), of every two images.
-        partners: about how many others an image is matched with.
-
-    Returns:
-        Pairs of indices, the smaller first, in order.
-    """
+    """Returns pairs of each image with `partners` / 2 neighbors and those others whose `similarity`
+    (N, N) is largest, as indices, the smaller first, in order."""
     count, near = len(similarity), max(1, partners // 4)  # on either side
     pairs = {(a, b) for a in range(count) for b in range(a + 1, min(a + near + 1, count))}
     others = similarity.copy()

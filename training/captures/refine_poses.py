@@ -177,15 +177,12 @@ class RefinedPoses:
 
 
 def refine_poses(frames: Sequence[ComparedFrame], X_WCs: Iterable[RigidTransform]) -> RefinedPoses:
-    """Returns the poses of the smallest squared residuals over their spreads, see `Comparison`.
+    """Returns the poses of frames in sequence with the smallest squared residuals over their
+    spreads, see `Comparison`.
 
     This removes drift of centimeters and of a degree or two, not lost tracking: points whose depths
     differ by more than 8 % are not compared. Robust weights as narrow as the noise of a sensor
     would keep frames where they are.
-
-    Args:
-        frames: in the order in which they were taken.
-        X_WCs: their poses.
     """
     poses = given = list(X_WCs)
     pairs = _pairs(frames, poses)
@@ -214,15 +211,11 @@ def refine_poses(frames: Sequence[ComparedFrame], X_WCs: Iterable[RigidTransform
             rounds.set_postfix_str(f"largest step {largest:.4f}")
             if number >= len(_REACHES) and largest < _SETTLED:
                 break
-    rotated, moved = np.split(_corrections(poses, given), 2, axis=1)
-    (depth, contrast), (depth_after, contrast_after) = history[0].tolist(), history[-1].tolist()
-    return RefinedPoses(
-        poses,
-        float(np.linalg.norm(moved, axis=1).mean()),
-        float(np.linalg.norm(rotated, axis=1).mean()),
-        (depth, depth_after),
-        (contrast, contrast_after),
+    rotated, moved = np.linalg.norm(_corrections(poses, given).reshape(-1, 2, 3), axis=2).mean(
+        axis=0
     )
+    depth, contrast = zip(history[0].tolist(), history[-1].tolist(), strict=True)
+    return RefinedPoses(poses, float(moved), float(rotated), depth, contrast)
 
 
 def _pairs(

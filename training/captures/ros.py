@@ -28,7 +28,13 @@ from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.common.readers import readable
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.vehicle.state import pose_between
-from splatpilot.training.captures.capture import Capture, Lens, fisheye_lens, opencv_lens, pinhole
+from splatpilot.training.captures.capture import (
+    Capture,
+    Lens,
+    centered_pinhole,
+    fisheye_lens,
+    opencv_lens,
+)
 from splatpilot.training.captures.capture_config import (
     CaptureConfig,
     cache_folder,
@@ -88,9 +94,7 @@ def read(path: Path, config: CaptureConfig) -> Capture:
                 f"{path}: {camera['problem']}; set capture.intrinsics to [fx, fy, cx, cy] of "
                 "images without distortion"
             )
-        fx, fy, cx, cy = camera["intrinsics"]
-        K = pinhole(fx, fy, cx + 0.5, cy + 0.5)  # ROS counts from the first pixel's center.
-        make = _MODELS[camera["model"]]
+        K, make = centered_pinhole(*camera["intrinsics"]), _MODELS[camera["model"]]
         own = make(K, camera["width"], camera["height"], camera["distortion"])
         return replace(own, source=camera["source"]).scale_to(width, height)
 
@@ -214,7 +218,7 @@ class _Bag:
         return times
 
     def _calibration(self, frame: str) -> dict[str, Any]:
-        """Returns that of the camera of the color images, which are in `frame`, or the problem.
+        """Returns the calibration of the color images, which are in `frame`, or the problem.
 
         It is in the namespace of the images or, without one there, has their frame. K and D
         describe images as the camera took them, P those that are rectified (CameraInfo).
@@ -223,8 +227,9 @@ class _Bag:
         for transport in _TRANSPORTS:
             images = images.removesuffix(transport)
         namespace, _, image = images.rpartition("/")
-        infos = {topic: self._first(topic) for topic in self._topics(_INFO)}
-        infos = {topic: info for topic, info in infos.items() if info is not None}
+        infos = {
+            topic: info for topic in self._topics(_INFO) if (info := self._first(topic)) is not None
+        }
         near = [topic for topic in infos if topic.rpartition("/")[0] == namespace]
         found = near or [topic for topic, info in infos.items() if _frame(info) == frame]
         if not found:

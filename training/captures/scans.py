@@ -7,7 +7,14 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
-from splatpilot.training.captures.capture import OPTICAL_AXES, Capture, DepthCamera, Lens, pinhole
+from splatpilot.training.captures.capture import (
+    OPTICAL_AXES,
+    Capture,
+    DepthCamera,
+    Lens,
+    centered_pinhole,
+    pinhole,
+)
 from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.frames import (
     FrameFiles,
@@ -35,7 +42,7 @@ def read_scannet(path: Path, config: CaptureConfig) -> Capture:
     from the first pixel's center. The axes of both cameras are the same.
     """
     colors = numbered_files(path / "color", r"(\d+)\.(?:jpg|jpeg|png)")
-    lost = [number for number in colors if _is_lost(path / "pose" / f"{number}.txt")]
+    lost = {number for number in colors if _is_lost(path / "pose" / f"{number}.txt")}
     K_C = K_D = _intrinsics(path / SCANNET_COLOR)
     if config.depth_intrinsics:
         K_D = pinhole(*config.depth_intrinsics)
@@ -73,7 +80,7 @@ def _is_lost(pose: Path) -> bool:
 
 def _intrinsics(file: Path) -> NDArray[np.float64]:
     K = read_matrix(file)
-    return pinhole(K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5)
+    return centered_pinhole(K[0, 0], K[1, 1], K[0, 2], K[1, 2])
 
 
 def read_seven_scenes(path: Path, config: CaptureConfig) -> Capture:

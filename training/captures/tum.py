@@ -19,7 +19,13 @@ from pydrake.math import RigidTransform
 from splatpilot.systems.common.readers import read_text
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.vehicle.state import pose_between
-from splatpilot.training.captures.capture import OPTICAL_AXES, Capture, Lens, opencv_lens, pinhole
+from splatpilot.training.captures.capture import (
+    OPTICAL_AXES,
+    Capture,
+    Lens,
+    centered_pinhole,
+    opencv_lens,
+)
 from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.frames import (
     FrameFiles,
@@ -42,12 +48,11 @@ _CAMERAS = {
     "3": ((535.4, 539.2, 320.1, 247.6), ()),
     "bonn": (
         (542.822841, 542.57687, 315.59352, 237.756098),
-        (0.039903, -0.099343, -0.00073, -0.000144),
+        (0.039903, -0.099343, -7.3e-4, -1.44e-4),
     ),
 }
 _DEFAULT = (525.0, 525.0, 319.5, 239.5)
-_CALIBRATION = "calibration.txt"
-"""Holds fx, fy, cx, cy and distortion of the images themselves, as in ETH3D's sequences."""
+_CALIBRATION = "calibration.txt"  # of the images themselves, as in ETH3D's sequences
 
 
 def recognizes(path: Path) -> bool:
@@ -62,15 +67,15 @@ def read(path: Path, config: CaptureConfig) -> Capture:
         file = path / _CALIBRATION
         if file.is_file():
             numbers = _read_calibration(file)
-            own = opencv_lens(_intrinsics(*numbers[:4]), width, height, numbers[4:].tolist())
+            own = opencv_lens(centered_pinhole(*numbers[:4]), width, height, numbers[4:].tolist())
             return replace(own, source=file.name)
         text = f"{path.resolve().name}\n{read_text(path / 'rgb.txt', 'replace')[:1000]}"
         if found := re.search(_NAMES, text):
             focal, distortion = _CAMERAS[found[1] or found[2]]
-            own = opencv_lens(_intrinsics(*focal), 640, 480, distortion)
+            own = opencv_lens(centered_pinhole(*focal), 640, 480, distortion)
             return replace(own, source=f"the name {found[0]}").scale_to(width, height)
         assumed = "what TUM's driver assumes: set capture.intrinsics of another camera"
-        return Lens(_intrinsics(*_DEFAULT), 640, 480, source=assumed).scale_to(width, height)
+        return Lens(centered_pinhole(*_DEFAULT), 640, 480, source=assumed).scale_to(width, height)
 
     return open_sequence(path, "TUM RGB-D sequence", config, lens, 5000.0)
 
@@ -90,10 +95,6 @@ def _read_calibration(file: Path) -> NDArray[np.float64]:
         "correct it, or set capture.intrinsics",
     )
     return numbers
-
-
-def _intrinsics(fx: float, fy: float, cx: float, cy: float) -> NDArray[np.float64]:
-    return pinhole(fx, fy, cx + 0.5, cy + 0.5)
 
 
 def open_sequence(

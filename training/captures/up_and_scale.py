@@ -159,11 +159,9 @@ def make_metric(
     scale: ScaleConfig,
     locate: Callable[[str, NDArray[np.float64]], NDArray[np.float64]] | None = None,
 ) -> Capture:
-    """Scales a capture in unknown units to meters, or marks it as not metric without a scale.
+    """Scales poses and points in unknown units to meters, or marks the capture as not metric.
 
     Args:
-        capture: its depth, if any, is in meters already; its poses and points are not.
-        scale: the source of the scale.
         locate: returns the point (3,) that is seen in the image of a name at a pixel (2,), or
             raises ValueError; None if pixels cannot be located.
     """
@@ -252,10 +250,10 @@ def _factor_from_depth(capture: Capture) -> float:
 
 
 def move_origin(capture: Capture, origin: Sequence[float]) -> Capture:
-    """Returns the capture in a world whose origin is at `origin` (3,) of its present one.
+    """Returns the capture in a world whose origin is at `origin` (3,) of its present one; if empty,
+    in the middle of cameras that are far away.
 
-    Gaussians are in single precision, in which a step is 0.06 m at 800 km. If `origin` is empty, it
-    is the middle of the cameras if they are far away, else 0.
+    Gaussians are in single precision, in which a step is 0.06 m at 800 km.
     """
     p_WCs = np.array([X_WC.translation() for X_WC in capture.X_WCs])
     p = np.array(origin, dtype=np.float64) if origin else choose_origin(p_WCs)
