@@ -31,13 +31,13 @@ from splatpilot.systems.common.files import (
 )
 from splatpilot.systems.splats.splat_files import read_ply, read_splats
 from splatpilot.systems.visualization.meshcat_drawing import (
-    BALL,
     GOAL_COLOR,
+    MARKER_RADIUS,
     START_COLOR,
     draw_box,
     draw_goal,
 )
-from splatpilot.systems.visualization.pages import CapturedImages, ShownPlace, place_page
+from splatpilot.systems.visualization.pages import CapturedImages, ViewerScene, scene_page
 from splatpilot.training.captures.capture import Capture
 from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.capture_gaussians import capture_gaussians
@@ -51,7 +51,7 @@ _HEADROOM = 0.15  # of the place's height, left above what is of interest
 _BOUNDS = "#fff", "bounds"
 
 
-def shown_place(what: str, seed: int | None, overrides: Sequence[str]) -> ShownPlace:
+def shown_place(what: str, seed: int | None, overrides: Sequence[str]) -> ViewerScene:
     """What is shown of a place.
 
     Args:
@@ -99,7 +99,7 @@ def _may_hold_gaussians(path: Path) -> bool:
     return path.is_file() and suffix not in _SCENARIOS | {OCTOMAP} and not is_video(path)
 
 
-def _generated(scenario: Scenario) -> ShownPlace:
+def _generated(scenario: Scenario) -> ViewerScene:
     scenario.validate()
     world = make_world(scenario.world, scenario.seed)
     start = world.p_WS if scenario.start is None else np.asarray(scenario.start, dtype=float)
@@ -107,7 +107,7 @@ def _generated(scenario: Scenario) -> ShownPlace:
     return _place_of(world, f"{world.name}, seed {scenario.seed}", ends)
 
 
-def _scene(path: Path) -> ShownPlace:
+def _scene(path: Path) -> ViewerScene:
     metadata = read_scene_metadata(path)
     world = read_scene_folder(path, metric=False)
     notes, images = [], None
@@ -123,7 +123,7 @@ def _scene(path: Path) -> ShownPlace:
     target = shlex.quote(f"{path}-scaled")
     return replace(
         _place_of(world, world.name, ends, images),
-        num_unknown=len(read_ply(path / FRONTIER)) if metadata.frontier else 0,
+        num_frontier=len(read_ply(path / FRONTIER)) if metadata.frontier else 0,
         beyond=False,
         metric=metadata.metric,
         notes=notes,
@@ -131,7 +131,7 @@ def _scene(path: Path) -> ShownPlace:
     )
 
 
-def _gaussians(path: Path) -> ShownPlace:
+def _gaussians(path: Path) -> ViewerScene:
     try:
         world = read_scene(path)
     except ValueError as error:
@@ -140,7 +140,7 @@ def _gaussians(path: Path) -> ShownPlace:
         notes = [f"Without distances, start and goal: {error}."]
         if any(gaussians.origin):
             notes.append(_relative(gaussians.origin))
-        return ShownPlace(
+        return ViewerScene(
             path.stem,
             gaussians,
             (0.0, 0.0, 0.0),
@@ -160,7 +160,7 @@ def _relative(origin: Sequence[float]) -> str:
     return f"Positions are relative to {', '.join(f'{x:.10g}' for x in origin)} of the files."
 
 
-def _capture(path: Path, overrides: Sequence[str]) -> ShownPlace:
+def _capture(path: Path, overrides: Sequence[str]) -> ViewerScene:
     capture = read_capture(path, load_config(CaptureConfig(), overrides=list(overrides)))
     gaussians = capture_gaussians(capture, _some(capture))
     if gaussians is None:
@@ -174,7 +174,7 @@ def _capture(path: Path, overrides: Sequence[str]) -> ShownPlace:
     notes += [f"{note[0].upper()}{note[1:]}." for note in capture.notes]
     if not capture.metric:
         notes.append("Its unit of length is unknown; it is told by capture.scale.")
-    return ShownPlace(
+    return ViewerScene(
         name=capture.name,
         gaussians=gaussians,
         background=(0.1, 0.1, 0.1),
@@ -193,13 +193,13 @@ def _place_of(
     name: str,
     ends: tuple[NDArray[np.float64], NDArray[np.float64]] | None,
     images: CapturedImages | None = None,
-) -> ShownPlace:
+) -> ViewerScene:
     lower_W, upper_W = world.esdf.lower_W, world.esdf.upper_W
     seen = images.p_WCs if images else np.array([world.p_WS, world.p_WG])
     legend = [_BOUNDS]
     if ends is not None:
         legend += [(_css(START_COLOR), "start"), (_css(GOAL_COLOR), "goal")]
-    return ShownPlace(
+    return ViewerScene(
         name=name,
         gaussians=world.gaussians,
         background=world.background,
@@ -289,8 +289,8 @@ def run(
     for p, name, color in zip(
         place.ends or (), ("start", "goal"), (START_COLOR, GOAL_COLOR), strict=False
     ):
-        draw_goal(meshcat, f"/splatpilot/{name}", p, BALL, color)
+        draw_goal(meshcat, f"/splatpilot/{name}", p, MARKER_RADIUS, color)
     with written_atomically(out) as partial:
-        partial.write_text(place_page(meshcat.StaticHtml(), place))
+        partial.write_text(scene_page(meshcat.StaticHtml(), place))
     print(f"Wrote {out}, a page for any browser")
     return out

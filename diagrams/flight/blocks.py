@@ -36,15 +36,10 @@ class Autonomy(NamedTuple):
 
 
 def make_policy(scenario: Scenario, world: World) -> System:
-    """Builds the scenario's policy.
-
-    Raises:
-        ValueError: for a configuration that is not of a policy.
-    """
-    policy = POLICIES.kind_of(scenario.policy).build(scenario.policy, world, scenario.vehicle)
-    what = (
-        f"the result of building the policy {POLICIES.name_of(POLICIES.kind_of(scenario.policy))!r}"
-    )
+    """Builds the scenario's policy."""
+    kind = POLICIES.kind_of(scenario.policy)
+    policy = kind.build(scenario.policy, world, scenario.vehicle)
+    what = f"the result of building the policy {POLICIES.name_of(kind)!r}"
     require(isinstance(policy, System), what, "a Drake system", type(policy).__name__)
     return policy
 
@@ -59,20 +54,17 @@ def AddPolicyAndController(
     *,
     guarded: bool = False,
 ) -> Autonomy:
-    """
-    Adds the systems `pose`, `collision`, `goal`, `policy`, `controller`, `selector` for hypotheses,
-    and `velocity_tracker` for velocities; exports `command`, `hypotheses`, `clearance`,
-    `gradient`, `in_collision` and `field_state`. `ConnectObservation` must follow.
+    """Adds the systems `pose`, `collision`, `goal`, `policy`, `controller`, `selector` for
+    hypotheses, and `velocity_tracker` for velocities.
+
+    Exports `command`, `hypotheses`, `clearance`, `gradient`, `in_collision` and `field_state`.
+    `ConnectObservation` must follow.
 
     Args:
         state: (13) of the vehicle.
         policy, controller: see `BuildFlightDiagram`.
         guarded: if a failsafe follows. `finite_target` replaces targets that are not finite by
             zeros, and `finite_heading` such headings by NaN; `command` is not exported.
-
-    Raises:
-        ValueError: for a configuration that is not of a policy, and a system without a required
-            port or with one of another size.
     """
     # Pose, distances and goal.
     spheres = world.moving.balls if world.moving else None
@@ -155,12 +147,7 @@ def _connect_controller(
 def ConnectObservation(
     builder: DiagramBuilder, observed: dict[str, OutputPort], policy: System
 ) -> None:
-    """
-    Connects each input of the policy to the port of its name.
-
-    Raises:
-        ValueError: if there is none, or it has another size.
-    """
+    """Connects each input of the policy to the port of its name."""
     observed = observed | {"goal": builder.GetSubsystemByName("goal").get_output_port(0)}
     for index in range(policy.num_input_ports()):
         port = policy.get_input_port(index)
@@ -231,9 +218,7 @@ def AddObservation(
     pose: OutputPort,
     policy: System,
 ) -> dict[str, OutputPort]:
-    """
-    Adds `policy_camera` if the policy has images as inputs. The camera renders when the policy
-    updates.
+    """Adds `policy_camera` if the policy has images as inputs; it renders when the policy updates.
 
     `delayed_pose`, `depth_noise` and `color_noise` apply the scenario's `observation`, and
     `time_of_flight_grid` makes grids of depth. `policy_camera_start_pose` is for a rolling shutter.
@@ -300,7 +285,7 @@ _RESERVED = {
     *("selector", "velocity_tracker"),
     *("policy_camera", "policy_camera_start_pose", "delayed_pose"),
     *("depth_noise", "color_noise", "time_of_flight_grid"),
-    *("flight_visualizer", "camera_visualizer", "balls_visualizer"),
+    *("flight_visualizer", "camera_visualizer", "spheres_visualizer"),
     *("state_log", "command_log", "hypotheses_log"),
 }
 """Names of the other systems of a flight."""
@@ -313,15 +298,7 @@ def AddSensors(
     state: OutputPort,
     pose: OutputPort,
 ) -> dict[str, OutputPort]:
-    """
-    Adds sensors under their names.
-
-    Returns:
-        Their outputs: `p` of the sensor `s` as `s_p`.
-
-    Raises:
-        ValueError: for a configuration that is not of a sensor, and a reserved name.
-    """
+    """Adds sensors under their names; returns their outputs, `p` of the sensor `s` as `s_p`."""
     measured = {}
     for name, config in sensors.items():
         if name in _RESERVED:

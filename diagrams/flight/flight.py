@@ -26,23 +26,22 @@ from splatpilot.systems.vehicle.state import QuadrotorState
 
 
 def sample_initial_state(scenario: Scenario, world: World) -> np.ndarray:
-    """
-    Samples the initial state (13,): level, at rest, with the heading to the goal.
+    """Samples the initial state (13,): level, at rest, with the heading to the goal.
 
     By the scenario's seed the position is uniform in the sphere of `start_radius` about the start.
 
     Raises:
-        InfeasibleFlightError: if the start or the goal is outside known space, or nearer to a
-            surface than the vehicle's radius; or if the flight would start at its goal.
+        InfeasibleFlightError: if a vehicle at start or goal would collide or be in unknown space,
+            or if the start is at the goal.
     """
     p_WG, p_WS = goal_position(scenario, world), start_position(scenario, world)
     _check_free(world, "start", p_WS)
     _check_free(world, "goal", p_WG)
-    apart = float(np.linalg.norm(p_WG - p_WS))
-    if apart <= scenario.goal_radius:
+    distance = float(np.linalg.norm(p_WG - p_WS))
+    if distance <= scenario.goal_radius:
         raise InfeasibleFlightError(
-            f"{world.name} cannot be flown: start and goal are {apart:.2f} m apart, no farther "
-            f"than goal_radius, {scenario.goal_radius} m; name others with start and goal"
+            f"the distance from start to goal must be > goal_radius, {scenario.goal_radius} m, got "
+            f"{distance:.2f} m in {world.name}; set start and goal"
         )
 
     generator = np.random.default_rng(scenario.seed)
@@ -75,7 +74,7 @@ def _check_free(world: World, what: str, p_WQ: np.ndarray) -> None:
     if sample.distance <= VEHICLE_RADIUS:
         raise InfeasibleFlightError(
             f"{where} is {float(sample.distance):.3f} m from the nearest surface, but the "
-            f"vehicle's radius is {VEHICLE_RADIUS} m; choose a point with more room"
+            f"vehicle's radius is {VEHICLE_RADIUS} m; choose a point with more clearance"
         )
 
 
@@ -144,11 +143,9 @@ def fly(
     progress: Callable[[float], object] | None = None,
     realtime_rate: float = 0.0,
 ) -> Flight:
-    """
-    Simulates a diagram made by `BuildFlightDiagram` until the flight ends.
+    """Simulates a diagram made by `BuildFlightDiagram` until the flight ends.
 
     Args:
-        diagram, scenario, world: as built.
         progress: called with the simulated time [s].
         realtime_rate: max simulated over real time; 0 for as fast as possible.
 
@@ -189,13 +186,7 @@ def flight_simulator(
     world: World,
     progress: Callable[[float], object] | None = None,
 ) -> Simulator:
-    """
-    Makes a simulator, of a diagram made by `BuildFlightDiagram`, that ends with the flight.
-
-    Args:
-        diagram, scenario, world: as built.
-        progress: called with the simulated time [s].
-    """
+    """Makes a simulator of a diagram made by `BuildFlightDiagram` that ends with the flight."""
     scenario.validate()
     simulator = Simulator(diagram)
     ApplySimulatorConfig(scenario.simulator, simulator)
@@ -216,9 +207,9 @@ def flight_simulator(
 def decision_times(
     diagram: Diagram, scenario: Scenario, flight: Flight, count: int = 10
 ) -> tuple[float, float]:
-    """
-    Measures the mean wall time [s] of a render for the policy, 0 without images, and of the
-    policy's update without it, at `count` states evenly spaced along a flight.
+    """Measures mean wall times [s] of rendering for the policy, and of its update without that.
+
+    They are averaged over `count` states evenly spaced along a flight.
     """
     root = Simulator(diagram).get_mutable_context()
     plant = diagram.GetSubsystemByName("plant").GetMyMutableContextFromRoot(root)
@@ -271,8 +262,7 @@ def has_landed(diagram: Diagram, context: Context) -> bool:
 def record_flight(
     diagram: Diagram, root: Context, world: World, outcome: Outcome, wall_time: float
 ) -> Flight:
-    """Collects the logs of a flight, which took `wall_time` [s]. After an error it evaluates no
-    port, which could raise it again."""
+    """Collects the logs of a flight; after an error no port is evaluated, as it may raise again."""
     logs = {
         name: cast(VectorLogSink, diagram.GetSubsystemByName(f"{name}_log")).FindLog(root)
         for name in ("state", "command")
@@ -324,8 +314,7 @@ FLIGHT_FILES = "trajectory.npz", "scenario.yaml", "summary.json"
 
 
 def write_flight(out: Path, scenario: Scenario, flight: Flight) -> None:
-    """Writes `trajectory.npz`, the arrays of `Flight`, and `scenario.yaml`, the scenario with all
-    fields, into the folder `out`."""
+    """Writes the arrays of `Flight` to `trajectory.npz`, and `scenario.yaml`, into `out`."""
     with written_atomically(out / "trajectory.npz") as path:
         flight.save(path)
     with written_atomically(out / "scenario.yaml") as path:

@@ -24,13 +24,14 @@ from splatpilot.diagrams.flight.flight import sample_initial_state
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.worlds.appearance import seen_otherwise
 from splatpilot.diagrams.worlds.world import World
+from splatpilot.systems.common.validation import require
 from splatpilot.systems.splats.background import Background, mean_color
 from splatpilot.systems.splats.splat_camera import SplatCamera
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS, QuadrotorPlant
 from splatpilot.systems.visualization.meshcat_drawing import (
-    BallsVisualizer,
     CameraVisualizer,
     FlightVisualizer,
+    MovingSpheresVisualizer,
     draw_distance_slice,
     draw_gaussians,
     draw_goal,
@@ -50,8 +51,7 @@ def empty_meshcat(background: Background) -> Meshcat:
 
 
 def open_meshcat(scenario: Scenario, world: World) -> Meshcat:
-    """Returns a Meshcat with goal, distance field and background; its camera shows start and goal
-    from behind and above the start."""
+    """Returns a Meshcat with goal, distance field and background, seen from above the start."""
     meshcat = empty_meshcat(world.background)
     p_WG = goal_position(scenario, world)
     draw_goal(meshcat, "/splatpilot/goal", p_WG, scenario.goal_radius)
@@ -67,14 +67,7 @@ def open_meshcat(scenario: Scenario, world: World) -> Meshcat:
 
 
 def AddMeshcat(builder: DiagramBuilder, scenario: Scenario, world: World, meshcat: Meshcat) -> None:
-    """
-    Draws the world's Gaussians and the vehicle, and adds visualizers.
-
-    Args:
-        builder: with `plant`, `policy` and `camera`.
-        scenario, world: of the flight.
-        meshcat: of `open_meshcat`.
-    """
+    """Draws the Gaussians and the vehicle; adds visualizers of `plant`, `policy` and `camera`."""
     field = world.distance_field
     margin = np.array([5.0, 5.0, 3.0])  # [m] of surroundings
     draw_gaussians(
@@ -95,7 +88,7 @@ def AddMeshcat(builder: DiagramBuilder, scenario: Scenario, world: World, meshca
         policy.GetOutputPort("hypotheses") if plans else None,
     )
     if world.moving:
-        BallsVisualizer.AddToBuilder(builder, world.moving.balls, meshcat)
+        MovingSpheresVisualizer.AddToBuilder(builder, world.moving.balls, meshcat)
     camera = cast(SplatCamera, builder.GetSubsystemByName("camera"))
     CameraVisualizer.AddToBuilder(builder, camera, meshcat, period=1 / scenario.camera.fps)
 
@@ -114,10 +107,11 @@ def BuildFlightDiagram(
     plant: System | None = None,
     controller: System | None = None,
 ) -> Diagram:
-    """
-    Builds the diagram of one flight. Its default Context is the scenario's start, see
-    `sample_initial_state`; so is the one of SetRandomContext, since Drake does not let systems in
-    Python sample their states. See `random_flights`.
+    """Builds the diagram of one flight.
+
+    Its default Context is the scenario's start, see `sample_initial_state`; so is the one of
+    SetRandomContext, since Drake does not let systems in Python sample their states. For random
+    flights see `random_flights`.
 
     Systems, by name: `plant`, those of `AddPolicyAndController` and `AddObservation`, the sensors
     under their names, `camera`, and the loggers `state_log`, `command_log` and `hypotheses_log`;
@@ -133,8 +127,6 @@ def BuildFlightDiagram(
     output `p` of a sensor `s` is `s_p`.
 
     Args:
-        scenario: of the flight.
-        world: of the flight.
         meshcat: draws the flight; see `open_meshcat`.
         video: records the camera's images at its rate, for `VideoRecorder.save`.
         camera: adds the scenario's camera; Meshcat and videos need it, flights do not.
@@ -153,11 +145,8 @@ def BuildFlightDiagram(
         ValueError: for an invalid configuration, a system without the ports it needs, and Meshcat
             or video without the camera.
     """
-    if not camera and (video or meshcat is not None):
-        raise ValueError(
-            f"camera is False, but {'video' if video else 'meshcat'} shows its images; leave "
-            "camera out"
-        )
+    valid = camera or not (video or meshcat is not None)
+    require(valid, "camera", "True with meshcat or video, which show its images", camera)
     scenario.validate()
     world = seen_otherwise(world, scenario.appearance, scenario.seed)
     builder = DiagramBuilder()

@@ -67,14 +67,7 @@ def recorded_frames(recorder: VideoRecorder, scenario: Scenario) -> Frames:
 def write_flight_page(
     path: Path, scenario: Scenario, world: World, flights: Sequence[ReplayedFlight]
 ) -> None:
-    """
-    Writes a page that shows flights from one start to one goal, see `replay_page`.
-
-    Args:
-        path: the file, ending in .html.
-        scenario, world: of the flights.
-        flights: one or more.
-    """
+    """Writes a page that shows flights from one start to one goal, see `replay_page`."""
     world = seen_otherwise(world, scenario.appearance, scenario.seed)
     lower, upper = _heights(world)
     view = ReplayView(
@@ -96,14 +89,7 @@ def write_flight_page(
 
 
 def write_live_page(path: Path, meshcat: Meshcat, scenario: Scenario, world: World) -> None:
-    """
-    Writes a page that shows a running flight, see `live_page`, at first from above.
-
-    Args:
-        path: the file, ending in .html.
-        meshcat: draws the flight, see `open_meshcat`.
-        scenario, world: of the flight.
-    """
+    """Writes a page that shows a running flight, which `meshcat` draws, see `live_page`."""
     world = seen_otherwise(world, scenario.appearance, scenario.seed)
     lower, upper = _heights(world)
     highest = max(start_position(scenario, world)[2], goal_position(scenario, world)[2])
@@ -132,8 +118,7 @@ def run(
     graphviz: Path | None = None,
     overwrite: bool = False,
 ) -> dict[str, float | str]:
-    """
-    Flies a scenario and writes into `out`:
+    """Flies a scenario and writes into `out`:
 
     - `flight.html`, see `replay_page`;
     - `flight.mp4`: the images of the camera, color next to depth;
@@ -149,11 +134,6 @@ def run(
 
     Returns:
         `Flight.summary()` and `render_ms`, the mean time of a render along the flight [ms].
-
-    Raises:
-        ValueError: for a scenario that cannot be flown.
-        OSError: before the flight, if `out` is not empty and not to be overwritten, or cannot be
-            written.
     """
     scenario.validate()
     for path in (out, graphviz):

@@ -34,11 +34,10 @@ from splatpilot.systems.vehicle.quadrotor import QuadrotorParams
 
 
 class PolicyConfig(Protocol):
-    """
-    Configuration of a policy: a dataclass that imports without torch.
+    """Configuration of a policy: a dataclass that imports without torch.
 
-    It may also have `camera`, an `OnboardCamera` of the policy; `sensors`, a dictionary of
-    configurations (`diagrams/flight/sensors.py`); and `weights`, a file.
+    Optional fields: `camera`, an `OnboardCamera`; `sensors`, configurations by name (see
+    `diagrams/flight/sensors.py`); `weights`, a file.
     """
 
     __dataclass_fields__: ClassVar[dict[str, Any]]
@@ -55,14 +54,16 @@ class PolicyConfig(Protocol):
 
 @dataclass(frozen=True)
 class PolicyKind:
-    """Entry of the registry."""
+    """Entry of the registry.
 
-    config: type  # of its configurations
+    `build` makes a system, with ports as `BuildFlightDiagram` connects them, of a configuration,
+    the world (for privileged policies) and the vehicle's parameters. `speed_field` is the field of
+    the nominal speed [m/s], such as `lattice.speed`; empty for a fixed speed.
+    """
+
+    config: type
     build: Callable[[Any, World, QuadrotorParams], System]
-    """Makes a system with the ports that `BuildFlightDiagram` connects of a configuration, the
-    world (for privileged policies) and the vehicle's parameters."""
     speed_field: str
-    """Field of the nominal speed [m/s], as `speed` or `lattice.speed`; empty if it is fixed."""
 
 
 POLICIES = Registry("policy", "splatpilot.policies", PolicyKind)
@@ -76,14 +77,12 @@ def register_policy(
     name: str = "",
     speed_field: str = "speed",
 ) -> None:
-    """
-    Registers a policy for scenarios, studies and the command line.
+    """Registers a policy for scenarios, studies and the command line.
 
     Args:
         config: type of its configurations, see `PolicyConfig`; its name is their YAML tag.
-        build: see `PolicyKind.build`.
-        name: of the policy; by default that of the type without "Config", in lower case.
-        speed_field: see `PolicyKind.speed_field`; ignored if the configuration has no `speed`.
+        build, speed_field: see `PolicyKind`; a default field that is missing means a fixed speed.
+        name: by default that of the type without "Config", in lower case.
 
     Raises:
         ValueError: if another policy has the name, or the type is not a configuration.
@@ -103,27 +102,20 @@ register_policy(
     name="planner",
     speed_field="lattice.speed",
 )
-register_policy(StraightConfig, lambda config, world, vehicle: Straight(config))
-register_policy(ReactiveConfig, lambda config, world, vehicle: Reactive(config))
-register_policy(DiffAeroConfig, lambda config, world, vehicle: DiffAero(config))
-register_policy(DepthNavConfig, lambda config, world, vehicle: DepthNav(config))
-register_policy(
-    AgileAutonomyConfig,
-    lambda config, world, vehicle: AgileAutonomy(config),
-    name="agile_autonomy",
-)
-
-register_policy(
-    DiffAeroTofConfig, lambda config, world, vehicle: DiffAeroTof(config), name="diffaero_tof"
-)
-
-register_policy(
-    DiffAeroRgbConfig, lambda config, world, vehicle: DiffAeroRgb(config), name="diffaero_rgb"
-)
-
-for _config, _name in ((StudentRgbConfig, "student_rgb"), (StudentDepthConfig, "student_depth")):
-    register_policy(_config, lambda config, world, vehicle: Student(config), name=_name)
-
+for _name, _config, _system in (
+    ("straight", StraightConfig, Straight),
+    ("reactive", ReactiveConfig, Reactive),
+    ("diffaero", DiffAeroConfig, DiffAero),
+    ("depthnav", DepthNavConfig, DepthNav),
+    ("agile_autonomy", AgileAutonomyConfig, AgileAutonomy),
+    ("diffaero_tof", DiffAeroTofConfig, DiffAeroTof),
+    ("diffaero_rgb", DiffAeroRgbConfig, DiffAeroRgb),
+    ("student_rgb", StudentRgbConfig, Student),
+    ("student_depth", StudentDepthConfig, Student),
+):
+    register_policy(
+        _config, lambda config, world, vehicle, system=_system: system(config), name=_name
+    )
 
 BENCHMARK_POLICIES = "planner", "straight", "reactive", "diffaero", "depthnav", "agile_autonomy"
 """Default policies of a study."""
@@ -133,18 +125,10 @@ DEFAULT_SPEED, MAX_SPEED = 2.0, 20.0
 
 
 def policy_named(name: str, speed: float = DEFAULT_SPEED) -> Any:
-    """
-    Returns the configuration of a policy for a nominal speed.
+    """Returns the configuration of a policy for a nominal speed [m/s].
 
     Args:
-        name: of the policy, `module:attribute` of one that is not installed, or a file of its
-            trained weights (.npz).
-        speed: [m/s].
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if there is no such policy, the file has no weights of one, or the speed is
-            invalid.
+        name: a registered name, `module:attribute`, or a file of trained weights (.npz).
     """
     weights = name if name.endswith(".npz") else ""
     kind = POLICIES.find(policy_of(weights) if weights else name)
@@ -158,12 +142,7 @@ def policy_named(name: str, speed: float = DEFAULT_SPEED) -> Any:
 
 
 def at_speed(config: Any, speed: float) -> Any:
-    """
-    Changes the nominal speed [m/s] of a policy's configuration.
-
-    Raises:
-        ValueError: for a policy with a fixed speed.
-    """
+    """Changes the nominal speed [m/s] of a policy's configuration."""
     field = POLICIES.kind_of(config).speed_field
     if not field:
         raise ValueError(

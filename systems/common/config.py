@@ -76,14 +76,12 @@ def load_config[Configuration](
     """Reads a configuration file and applies overrides of single fields.
 
     Args:
-        defaults: configuration whose fields keep their values if nothing sets them.
+        defaults: configuration with the values of all other fields.
         path: YAML file, or None.
         overrides: "dotted.field=YAML value" each, applied in order after the file.
 
     Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: for text that is not YAML, unknown fields and values of another type. The
-            message names the file or override, the field and its likely spelling.
+        ValueError: naming the file or override, and the field with its likely spelling.
     """
     config = defaults if path is None else parse_config(defaults, read_text(path), str(path))
     for override in overrides or ():
@@ -96,14 +94,11 @@ def load_config[Configuration](
 def parse_config[Configuration](
     defaults: Configuration, text: str, source: str, prefix: str = ""
 ) -> Configuration:
-    """Reads a configuration from a YAML text.
+    """Reads a configuration from a YAML text; for errors see `load_config`.
 
     Args:
         source: name of the text, for messages.
         prefix: path of `defaults`, for messages, such as "policy.".
-
-    Raises:
-        ValueError: see `load_config`.
     """
     with yaml_errors(source):
         given = yaml_load_data(text, private=True)

@@ -36,7 +36,7 @@ def output_port(name: str) -> Callable[[System], OutputPort]:
 
 
 def vector_input(system: System, name: str, context: Context) -> np.ndarray:
-    """The vector at the input port of that name."""
+    """Returns the vector at an input port."""
     return np.asarray(system.GetInputPort(name).Eval(context))
 
 
@@ -47,11 +47,7 @@ def optional_input(system: System, name: str, context: Context) -> np.ndarray | 
 
 
 def connect(builder: DiagramBuilder, source: OutputPort, target: InputPort) -> None:
-    """Connects two ports.
-
-    Raises:
-        ValueError: if their types or sizes differ; the message names both.
-    """
+    """Connects two ports; raises ValueError, naming both, if their types or sizes differ."""
     if (source.get_data_type(), source.size()) != (target.get_data_type(), target.size()):
         raise ValueError(
             f"{_describe(target)} must be of the type and size of its source, {_describe(source)}"

@@ -37,13 +37,10 @@ class _UnwritableError(OSError):
 def written_atomically(path: Path, check: Callable[[Path], None] | None = None) -> Iterator[Path]:
     """Yields a temporary path next to `path` that is renamed to `path` when the block ends.
 
-    An exception in the block removes the temporary file and leaves `path` as it was.
+    An exception in the block removes the temporary file; `path` stays. An OSError names `path`.
 
     Args:
         check: raises OSError for a file that its writer has silently left incomplete.
-
-    Raises:
-        OSError: if it cannot be written; the message names `path`.
     """
     partial = _temporary(path, path.stem, path.suffix)  # Many writers choose the format by suffix.
     try:
@@ -61,13 +58,10 @@ def written_atomically(path: Path, check: Callable[[Path], None] | None = None) 
 def folder_written_atomically(path: Path, *, replace: bool = False) -> Iterator[Path]:
     """Yields a temporary folder next to `path` that is renamed to `path` when the block ends.
 
-    An exception in the block removes the temporary folder.
+    An exception in the block removes the temporary folder. An OSError names `path`.
 
     Args:
         replace: replaces a folder at `path`, which otherwise stays.
-
-    Raises:
-        OSError: if it cannot be written; the message names `path`.
     """
     partial, replaced = _temporary(path, path.name), _temporary(path, path.name, ".replaced")
     shutil.rmtree(partial, ignore_errors=True)
@@ -115,11 +109,7 @@ def require_unused(path: Path, overwrite: bool) -> None:
 
 
 def require_writable_folder(path: Path) -> None:
-    """Makes the folder `path` if it is missing, and removes leftovers of ended processes.
-
-    Raises:
-        OSError: if it cannot be made or written to.
-    """
+    """Makes the folder `path` if it is missing, and removes leftovers of ended processes."""
     try:
         path.mkdir(parents=True, exist_ok=True)
         probe = _temporary(path / "probe", "probe")
@@ -135,15 +125,8 @@ def require_writable_folder(path: Path) -> None:
 def claim_folder(file: Path, config: Any, overwrite: bool = False) -> str:
     """Writes `config` to `file`, whose folder belongs to that configuration from then on.
 
-    Args:
-        overwrite: takes a folder of another configuration or with other files.
-
-    Returns:
-        The configuration as YAML.
-
-    Raises:
-        ValueError: if the folder has another configuration, or files without one.
-        OSError: if it cannot be written.
+    Raises ValueError for a folder with another configuration, or with files but without one, unless
+    `overwrite` is true. Returns the configuration as YAML.
     """
     from splatpilot.systems.common.config import dump_config, load_config  # imports Drake
 
@@ -173,10 +156,8 @@ def claim_folder(file: Path, config: Any, overwrite: bool = False) -> str:
 def held_folder(path: Path) -> Iterator[None]:
     """Locks the folder `path`, made if it is missing, for this process while the block runs.
 
-    The lock ends with the process. A folder that was made here and stays empty is removed.
-
-    Raises:
-        OSError: if it cannot be made or written to, or another process has locked it.
+    The lock ends with the process. A folder that was made here and stays empty is removed. Raises
+    OSError if another process has locked it.
     """
     made = [folder for folder in (path, *path.parents) if not folder.exists()]
     require_writable_folder(path)
@@ -235,14 +216,7 @@ def cache_folder(*parts: str) -> Path:
 def find_data(path: Path, what: str, hint: str = "") -> Path:
     """Finds a capture or a mesh: here, in the folder of data or, by name, in a folder of that.
 
-    Prints the path unless it is here.
-
-    Args:
-        what: for the message.
-        hint: remedy if it is missing.
-
-    Raises:
-        FileNotFoundError: if it is missing.
+    Prints the path unless it is here. If it is missing, FileNotFoundError has `what` and `hint`.
     """
     if path.exists():
         return path
@@ -270,14 +244,7 @@ def require_corpus(folder: Path) -> None:
 
 
 def require_scene(path: str, source: str = "") -> Path:
-    """Finds a scene, here or in the folder of scenes.
-
-    Args:
-        source: how to get it, for the message.
-
-    Raises:
-        FileNotFoundError: if it is missing.
-    """
+    """Finds a scene, here or in the folder of scenes; `source` says how to get a missing one."""
     for found in (Path(path), scenes_folder() / path):
         if found.exists():
             return found

@@ -48,7 +48,7 @@ def map_processes[Work, Result](
             yield result
     except TerminatedWorkerError:
         raise WorkerEndedError(
-            "a worker process was killed, perhaps for lack of memory; finished work is kept: run "
+            "a worker process was killed, perhaps out of memory; finished work is kept: run "
             "the same command again, with fewer --jobs if it repeats"
         ) from None
     finally:
@@ -73,8 +73,8 @@ def run_apart[Work, Result](what: str, function: Callable[[Work], Result], work:
     except (WorkerEndedError, RuntimeError) as error:
         why = "its process was ended" if isinstance(error, WorkerEndedError) else f"{error}"
         raise OSError(
-            f"{what}: {why}, perhaps for lack of disk space or memory; make room and run the same "
-            "command again"
+            f"{what}: {why}, perhaps out of disk space or memory; free some and run the command "
+            "again"
         ) from error
     return result
 

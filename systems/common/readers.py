@@ -47,15 +47,7 @@ def require_file(path: Path) -> None:
 
 
 def read_text(path: Path, errors: str = "strict") -> str:
-    """Reads a text file in UTF-8.
-
-    Args:
-        errors: treatment of bytes that are not UTF-8, see `open`.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if it is not a text, or larger than `MAX_TEXT`.
-    """
+    """Reads a text file in UTF-8 of at most `MAX_TEXT` bytes; for `errors` see `open`."""
     require_file(path)
     if (size := path.stat().st_size) > MAX_TEXT:
         raise ValueError(
@@ -84,12 +76,7 @@ def yaml_errors(source: str) -> Iterator[None]:
 
 
 def read_archive(path: Path) -> dict[str, np.ndarray]:
-    """Reads the arrays of an `.npz` file by name.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if it is damaged, holds Python objects or is too large.
-    """
+    """Reads the arrays of an `.npz` file by name; it may hold no Python objects."""
     require_file(path)
     with readable(path, "numpy archive"), zipfile.ZipFile(path) as archive:
         size = sum(entry.file_size for entry in archive.infolist())
@@ -102,14 +89,14 @@ def read_archive(path: Path) -> dict[str, np.ndarray]:
 
 
 def read_array(path: Path) -> np.ndarray:
-    """Reads the array of an `.npy` file; for errors see `read_archive`."""
+    """Reads the array of an `.npy` file."""
     array = _mapped(path)
     require_readable_size(path, array.nbytes)
     return np.array(array)
 
 
 def array_layout(path: Path) -> tuple[tuple[int, ...], np.dtype]:
-    """Returns shape and type of the array of an `.npy` file; for errors see `read_archive`."""
+    """Returns shape and type of the array of an `.npy` file."""
     array = _mapped(path)
     return array.shape, array.dtype
 
@@ -121,7 +108,7 @@ def _mapped(path: Path) -> np.ndarray:
 
 
 def read_ply_file(path: Path) -> PlyData:
-    """Reads the elements of a PLY file; for errors see `read_archive`."""
+    """Reads the elements of a PLY file."""
     require_file(path)
     require_readable_size(path, path.stat().st_size)
     with readable(path, "PLY file"):

@@ -25,17 +25,10 @@ MONTE_CARLO_SEEDS = range(3_000_000, 4_000_000)
 
 
 def study_seeds(split: str, count: int) -> range:
-    """
-    Returns the first `count` seeds of a study's split.
-
-    Raises:
-        ValueError: for an unknown split, or if the split has fewer seeds.
-    """
-    if split not in STUDY_SEEDS:
-        raise ValueError(f"split must be one of {', '.join(STUDY_SEEDS)}, got {split!r}")
+    """Returns the first `count` seeds of a study's split."""
+    require(split in STUDY_SEEDS, "split", f"one of {', '.join(STUDY_SEEDS)}", repr(split))
     seeds = STUDY_SEEDS[split]
-    if not 1 <= count <= len(seeds):
-        raise ValueError(f"seeds of split {split} must be in [1, {len(seeds)}], got {count}")
+    require(1 <= count <= len(seeds), f"seeds of split {split}", f"in [1, {len(seeds)}]", count)
     return seeds[:count]
 
 
@@ -51,11 +44,7 @@ def check_seed(seed: int) -> None:
 
 
 def first_training_seed(run: int) -> int:
-    """Returns the first of the `SEEDS_PER_RUN` seeds of a training run, named by its own seed.
-
-    Raises:
-        ValueError: for a run whose seeds would reach into those of validation.
-    """
+    """Returns the first of the `SEEDS_PER_RUN` seeds of a training run, named by its own seed."""
     runs = (VALIDATION_SEEDS - TRAINING_SEEDS) // SEEDS_PER_RUN
     require(0 <= run < runs, "seed", f"in [0, {runs - 1}]", run)
     return TRAINING_SEEDS + run * SEEDS_PER_RUN

@@ -17,24 +17,19 @@ from collections.abc import Iterable, Iterator
 from typing import Any, cast
 
 TYPES = {float: "a number", int: "a whole number", bool: "true or false"}
-"""What plain values of these types are called."""
+"""Names of plain types in messages."""
 
-_MIN_LIKENESS, _NO_LESS, _MAX_NAMES = 0.6, 0.1, 3
-"""[-] Of names that are suggested: at least, less than the most alike at most, and how many."""
+# Suggested names are at least this similar, at most this less similar than the best, and so few.
+_MIN_SIMILARITY, _MARGIN, _MAX_NAMES = 0.6, 0.1, 3
 
 
 def require(valid: object, what: str, condition: str, value: object, remedy: str = "") -> None:
-    """
-    Checks a value that a user gave.
+    """Raises ValueError, "<what> must be <condition>, got <value>; <remedy>", unless `valid`.
 
     Args:
-        valid: whether it is as it must be.
-        what: the field or option.
-        condition: what must hold, as in "at least 1" or "in (0, 20] m/s".
-        remedy: what to do, if that is not obvious.
-
-    Raises:
-        ValueError: "<what> must be <condition>, got <value>", unless it is valid.
+        what: a field or option.
+        condition: such as "at least 1" or "in (0, 20] m/s".
+        remedy: left out if it is obvious.
     """
     if not valid:
         raise ValueError(
@@ -53,14 +48,13 @@ class FieldError(ValueError):
         return f"{type(self.config).__name__}.{self.name} {self.problem}"
 
     def within(self, whole: object) -> ValueError:
-        """The same error, naming the field as it is written in a file of the configuration `whole`,
-        for example `policy.lattice.speed`."""
+        """Returns the error with the field's path in `whole`, such as `policy.lattice.speed`."""
         path = _path(whole, self.config)
         return ValueError(f"{path}.{self.name} {self.problem}") if path else self
 
 
 def _path(whole: object, part: object) -> str:
-    """The names of the fields that lead from one configuration to another, empty if none do."""
+    """Returns the dotted path from one configuration to another in it; empty without one."""
     fields = whole if isinstance(whole, dict) else {}
     for name, value in (vars(whole) if dataclasses.is_dataclass(whole) else fields).items():
         if value is part:
@@ -71,34 +65,25 @@ def _path(whole: object, part: object) -> str:
 
 
 def require_field(config: object, name: str, valid: object, condition: str) -> None:
-    """Checks a field of a configuration, see `require`.
-
-    Raises:
-        FieldError: unless it is valid.
-    """
+    """Raises FieldError, see `require`, unless a field of a configuration is valid."""
     if not valid:
         raise FieldError(config, name, f"must be {condition}, got {getattr(config, name)}")
 
 
 def unknown(what: str, name: str, known: Iterable[str], others: str = "") -> str:
-    """Says that there is no `what` of a name, and which was meant or else which there are.
-
-    Args:
-        others: what else may be given.
-    """
+    """Returns a message for an unknown name, with similar names or else all, and `others`."""
     known = list(dict.fromkeys(known))
     listed = ", ".join([*known, *([others] if others else [])])
     return f"there is no {what} {name!r}; {did_you_mean(name, known) or f'there are {listed}'}"
 
 
 def did_you_mean(name: str, known: Iterable[str], prefix: str = "") -> str:
-    """Asks whether one of the known names that resemble `name` most was meant, with a prefix; empty
-    if none does, or too many do."""
-    likeness = {
+    """Returns a question with the names most similar to `name`; empty for none or many."""
+    ratios = {
         each: difflib.SequenceMatcher(None, name.lower(), each.lower()).ratio() for each in known
     }
-    enough = max(_MIN_LIKENESS, max(likeness.values(), default=0.0) - _NO_LESS)
-    close = [f"{prefix}{each}" for each, ratio in likeness.items() if ratio >= enough]
+    enough = max(_MIN_SIMILARITY, max(ratios.values(), default=0.0) - _MARGIN)
+    close = [f"{prefix}{each}" for each, ratio in ratios.items() if ratio >= enough]
     return f"did you mean {' or '.join(close)}?" if 0 < len(close) <= _MAX_NAMES else ""
 
 
@@ -107,13 +92,12 @@ _INTERVAL = re.compile(r"([\[(])(\S+), ([^\])]+)([\])])")
 
 
 def bounded(default: Any, domain: str) -> Any:
-    """
-    Declares a field of a configuration and the values that it may have.
+    """Declares a field of a configuration and its valid values.
 
     Args:
         default: value, or a function that makes it, such as `list`.
         domain: interval with its unit, as "(0, 3600] s", or set of words, as "{3dgs, 2dgs}". It
-            holds for each item of a list; None is always in it.
+            applies to each item of a list; None is always valid.
     """
     metadata = {_DOMAIN: domain}
     if callable(default):
@@ -125,12 +109,7 @@ class Config:
     """Base class of configurations, which are dataclasses."""
 
     def validate(self) -> None:
-        """
-        Checks all fields by their domains, the configurations in them, then `check`.
-
-        Raises:
-            ValueError: naming the field, the condition and the value.
-        """
+        """Raises ValueError unless all fields, the configurations in them and `check` are valid."""
         for field in dataclasses.fields(cast(Any, self)):
             value, domain = getattr(self, field.name), field.metadata.get(_DOMAIN)
             if domain:

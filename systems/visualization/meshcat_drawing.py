@@ -30,15 +30,9 @@ def draw_gaussians(
     upper_W: np.ndarray,
     max_points: int = 120_000,
 ) -> None:
-    """
-    Draws the centers of the Gaussians inside a box as colored points, evenly thinned.
+    """Draws the centers of the Gaussians in the box from lower_W to upper_W as colored points.
 
-    Points have the size of the median Gaussian, so that surfaces look closed.
-
-    Args:
-        path: Meshcat path of the point cloud.
-        lower_W, upper_W: corners of the box (3,) [m].
-        max_points: max number of points.
+    Points are thinned evenly, and have the size of the median Gaussian to close surfaces.
     """
     inside = np.flatnonzero(np.all((scene.means >= lower_W) & (scene.means <= upper_W), axis=1))
     if len(inside) > max_points:
@@ -52,14 +46,13 @@ def draw_gaussians(
 
 
 GOAL_COLOR, START_COLOR = Rgba(0.1, 0.9, 0.3, 0.4), Rgba(0.1, 0.5, 1.0, 0.4)
-BALL = 0.25  # [m], radius of what marks start and goal where nobody flies
+MARKER_RADIUS = 0.25  # [m] of start and goal in scenes without a flight
 
 
 def draw_goal(
     meshcat: Meshcat, path: str, p_WG: np.ndarray, radius: float, color: Rgba = GOAL_COLOR
 ) -> None:
-    """Draws the goal region, a translucent ball of `radius` [m] about p_WG (3,) [m], below a pole
-    of 3 m that is seen from afar."""
+    """Draws a goal region, a translucent sphere about p_WG (3,) [m], and a pole above it."""
     meshcat.SetObject(path, Sphere(radius), color)
     meshcat.SetObject(f"{path}/pole", Cylinder(0.04, 3.0), color)
     meshcat.SetTransform(f"{path}/pole", RigidTransform(np.array([0.0, 0.0, 1.5])))
@@ -67,7 +60,7 @@ def draw_goal(
 
 
 def box_edges(lower_W: np.ndarray, upper_W: np.ndarray) -> np.ndarray:
-    """The ends (12, 2, 3) [m] of the edges of the box from lower_W (3,) to upper_W (3,) [m]."""
+    """Returns the ends (12, 2, 3) [m] of the edges of a box from its corners (3,) [m]."""
     corners = np.array(list(np.ndindex(2, 2, 2)))
     starts, ends = np.nonzero(np.abs(corners[:, None] - corners).sum(axis=-1) == 1)
     once = starts < ends
@@ -103,31 +96,28 @@ def draw_vehicle(meshcat: Meshcat, path: str, radius: float) -> None:
 
 
 UNKNOWN_GRAY = 0.4
-"""Shade of space that nobody saw."""
+"""Shade of unobserved space."""
 
 
 def distance_colors(distances: np.ndarray) -> np.ndarray:
-    """Colors (N, 3), 0 to 1, of distances (N,) in units of that from which on all are alike: red
-    at or inside a surface, fading through yellow at one half to blue."""
+    """Returns colors (N, 3), 0 to 1, of distances (N,): red at 0, yellow at 0.5, blue from 1 on."""
     ramp = np.clip(distances, 0.0, 1.0)
     return np.stack([np.interp(ramp, (0.5, 1), (1, 0)), 1 - np.abs(2 * ramp - 1), ramp**2], -1)
 
 
 def distance_slice(
-    field: DistanceField, height: float, spacing: float, reach: float
+    field: DistanceField, height: float, spacing: float, max_distance: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """
-    The horizontal slice of a distance field at z = `height` [m], as a colored mesh.
+    """Makes a mesh of the slice of a field at z = `height` [m], see `distance_colors`.
 
-    Red is at or inside a surface, fading through yellow to blue at `reach` [m] and more; unknown
-    space is gray.
+    Unknown space is gray.
 
     Args:
-        spacing: distance between the samples [m].
+        spacing: [m] between samples.
+        max_distance: [m] of the last color.
 
     Returns:
-        Its vertices p_WQ (N, 3) [m], faces (M, 3), which are seen from above, and the colors of
-        the vertices (N, 3), 0 to 1.
+        Vertices p_WQ (N, 3) [m], faces (M, 3), visible from above, and colors (N, 3), 0 to 1.
     """
     lower_W, upper_W = np.asarray(field.lower_W), np.asarray(field.upper_W)
     counts = np.maximum(2, np.ceil((upper_W[:2] - lower_W[:2]) / spacing).astype(int))
@@ -138,7 +128,7 @@ def distance_slice(
     )
     p_WQ = np.stack(np.meshgrid(xs, ys, [height], indexing="ij"), axis=-1).reshape(-1, 3)
     sample = field.query(p_WQ)
-    colors = distance_colors(np.nan_to_num(sample.distance) / reach)
+    colors = distance_colors(np.nan_to_num(sample.distance) / max_distance)
     colors[sample.state >= FieldState.UNKNOWN] = UNKNOWN_GRAY
 
     i, j = np.meshgrid(np.arange(counts[0] - 1), np.arange(counts[1] - 1), indexing="ij")
@@ -155,15 +145,8 @@ def distance_slice(
 def draw_distance_slice(
     meshcat: Meshcat, path: str, field: DistanceField, height: float, spacing: float = 0.2
 ) -> None:
-    """
-    Draws the `distance_slice` of a field, blue from 2 m on.
-
-    Args:
-        path: Meshcat path of the colored mesh.
-        height: of the slice, z [m].
-        spacing: distance between the samples [m].
-    """
-    p_WQ, faces, colors = distance_slice(field, height, spacing, reach=2.0)
+    """Draws the `distance_slice` of a field at z = `height` [m], blue from 2 m on."""
+    p_WQ, faces, colors = distance_slice(field, height, spacing, max_distance=2.0)
     meshcat.SetTriangleColorMesh(path, p_WQ.T, faces.T, colors.T)
 
 
@@ -172,8 +155,7 @@ _TRAIL = 120
 
 
 class FlightVisualizer(LeafSystem):
-    """
-    Draws the vehicle, the trail it leaves and the fan of trajectory hypotheses in Meshcat.
+    """Draws the vehicle, its trail and the fan of trajectory hypotheses in Meshcat.
 
     .. pydrake_system::
 
@@ -191,11 +173,11 @@ class FlightVisualizer(LeafSystem):
         period: float = 1 / 15,
         path: str = "/splatpilot",
     ):
-        """
+        """Declares the ports.
+
         Args:
-            meshcat: where to draw.
-            num_hypotheses: number of trajectories; 0 for no port `hypotheses`.
-            period: time between images [s].
+            num_hypotheses: 0 for no port `hypotheses`.
+            period: [s] between images.
             path: Meshcat path of all objects.
         """
         super().__init__()
@@ -256,11 +238,10 @@ class FlightVisualizer(LeafSystem):
 
 
 def fan_mesh(plan: Hypotheses, width: float = 0.02) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """
-    Makes level ribbons along K hypotheses, from green (lowest cost) to red (highest).
+    """Makes horizontal ribbons along K hypotheses, from green (lowest cost) to red (highest).
 
     Args:
-        width: of a ribbon [m].
+        width: [m] of a ribbon.
 
     Returns:
         Vertices (3, V) [m], triangles (3, F) int32 seen from both sides, colors (3, V) in 0 to 1.
@@ -284,8 +265,7 @@ def fan_mesh(plan: Hypotheses, width: float = 0.02) -> tuple[np.ndarray, np.ndar
 
 
 class CameraVisualizer(LeafSystem):
-    """
-    Shows the camera's image in Meshcat, across its view frustum.
+    """Shows the camera's image in Meshcat, across its view frustum.
 
     .. pydrake_system::
 
@@ -306,13 +286,13 @@ class CameraVisualizer(LeafSystem):
         depth: float = 0.6,
         path: str = "/splatpilot/vehicle/camera",
     ):
-        """
+        """Declares the port.
+
         Args:
-            meshcat: where to draw.
-            camera_info, X_BC: intrinsics, and pose of the camera in the vehicle's body frame.
-            period: time between images [s], equal to that of other users of the camera.
+            X_BC: pose of the camera in the vehicle's body frame.
+            period: [s] between images, equal to that of other users of the camera.
             stride: number of images per shown one.
-            depth: distance from the camera to the image [m].
+            depth: [m] from the camera to the shown image.
             path: Meshcat path of the camera.
         """
         super().__init__()
@@ -354,12 +334,11 @@ class CameraVisualizer(LeafSystem):
 
 
 def picture_gltf(rgb: np.ndarray, corners: np.ndarray) -> str:
-    """
-    Makes a glTF 2.0 document of an image on a rectangle, unlit and visible from both sides.
+    """Makes a glTF 2.0 document of an image on a rectangle, unlit and visible from both sides.
 
     Args:
         rgb: (H, W, 3) uint8.
-        corners: (4, 3) [m], top left, top right, bottom right and bottom left corner.
+        corners: (4, 3) [m], top left, top right, bottom right and bottom left.
     """
     _, jpeg = cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 80])
     document = {
@@ -384,49 +363,37 @@ def picture_gltf(rgb: np.ndarray, corners: np.ndarray) -> str:
     return json.dumps(document)
 
 
-_FAR_BELOW = np.array([0.0, 0.0, -1000.0])  # [m], where balls are shown that are nowhere
+_HIDDEN = np.array([0.0, 0.0, -1000.0])  # [m], of spheres that are absent
 
 
-class BallsVisualizer(LeafSystem):
-    """
-    Draws balls in Meshcat where they are at the Context's time; it has no ports.
-
-    Publishes every `period` seconds, live and into a Meshcat recording alike, ball k at
-    `<path>/k`.
-    """
+class MovingSpheresVisualizer(LeafSystem):
+    """Draws moving spheres at the Context's time, sphere k at `<path>/k`; it has no ports."""
 
     def __init__(
         self,
         meshcat: Meshcat,
-        balls: MovingSpheres,
+        spheres: MovingSpheres,
         period: float = 1 / 15,
-        path: str = "/splatpilot/balls",
+        path: str = "/splatpilot/spheres",
     ):
-        """
-        Args:
-            meshcat: where to draw.
-            balls: what is drawn.
-            period: time between images [s].
-            path: Meshcat path of all objects.
-        """
         super().__init__()
-        self._meshcat, self._balls, self._path = meshcat, balls, path
-        for k, radius in enumerate(balls.radii):
+        self._meshcat, self._spheres, self._path = meshcat, spheres, path
+        for k, radius in enumerate(spheres.radii):
             meshcat.SetObject(f"{path}/{k}", Sphere(radius), Rgba(0.9, 0.75, 0.1))
         self.DeclarePeriodicPublishEvent(period, 0.0, self._publish)
 
     @staticmethod
     def AddToBuilder(
-        builder: DiagramBuilder, balls: MovingSpheres, meshcat: Meshcat
-    ) -> "BallsVisualizer":
-        """Adds a visualizer of balls, named `balls_visualizer`."""
-        visualizer = BallsVisualizer(meshcat, balls)
-        builder.AddNamedSystem("balls_visualizer", visualizer)
+        builder: DiagramBuilder, spheres: MovingSpheres, meshcat: Meshcat
+    ) -> "MovingSpheresVisualizer":
+        """Adds a visualizer, named `spheres_visualizer`."""
+        visualizer = MovingSpheresVisualizer(meshcat, spheres)
+        builder.AddNamedSystem("spheres_visualizer", visualizer)
         return visualizer
 
     def _publish(self, context: Context) -> EventStatus:
         time = context.get_time()
-        for k, center in enumerate(self._balls.centers(time)):
-            p_WO = center if np.isfinite(center).all() else _FAR_BELOW
+        for k, center in enumerate(self._spheres.centers(time)):
+            p_WO = center if np.isfinite(center).all() else _HIDDEN
             self._meshcat.SetTransform(f"{self._path}/{k}", RigidTransform(p_WO), time)
         return EventStatus.Succeeded()

@@ -17,6 +17,7 @@ from pydrake.math import RigidTransform
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.shapes import MovingSpheres
+from splatpilot.systems.common.validation import require
 from splatpilot.systems.policies.hypotheses import Hypotheses, num_hypotheses_in
 from splatpilot.systems.splats.background import Background, EnvironmentMap
 from splatpilot.systems.splats.scene import GaussianScene
@@ -28,8 +29,7 @@ _COVARIANCE_SCALE = 256.0
 
 
 def pack_gaussians(scene: GaussianScene) -> NDArray[np.uint32]:
-    """
-    Packs N Gaussians for the page's shader into (N, 8) words of 32 bits.
+    """Packs N Gaussians for the page's shader into (N, 8) words of 32 bits.
 
     They are the center as three floats [m]; RGB of degree 0 and opacity as bytes, lowest first; the
     covariance's xx, xy, xz, yy, yz, zz as half floats [m^2 / 256], lowest first; and 0.
@@ -58,12 +58,10 @@ def splat_page(
     scripts: Sequence[str],
     start: str,
 ) -> str:
-    """
-    Makes a self-contained HTML page.
+    """Makes a self-contained HTML page of a scene.
 
     Args:
         meshcat_page: `Meshcat.StaticHtml()`.
-        gaussians, background: of the scene.
         data: further content, as for JSON.
         scripts: names of files in `page`, in the order of their dependencies.
         start: JavaScript of `splats` and `data` that runs last.
@@ -106,9 +104,9 @@ def _source(name: str) -> str:
 
 
 _MAX_VOXELS = 3e6
-_SCRIPTS = "pick.js", "ruler.js", "distance_slice.js", "capture_cameras.js", "place_view.js"
-_REACH = 2.0  # [m], distance from which on all have one color
-_REACH_UNKNOWN = 40  # [-] the same in voxels, where the unit of length is unknown
+_SCRIPTS = "pick.js", "ruler.js", "distance_slice.js", "capture_cameras.js", "scene_view.js"
+_MAX_DISTANCE = 2.0  # [m] from which on all distances have one color
+_MAX_DISTANCE_VOXELS = 40  # the same in voxels, if the unit of length is unknown
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,10 +115,10 @@ class CapturedImages:
 
     X_WCs: Sequence[RigidTransform]
     names: Sequence[str]
-    images: Sequence[NDArray[np.uint8]]  # (H, W, 3) each, blue first
-    K: NDArray[np.float64]  # (3, 3) [px], of the camera before its images were made small
-    width: int  # [px]
-    height: int  # [px]
+    images: Sequence[NDArray[np.uint8]]  # (H, W, 3) each, BGR, reduced in size
+    K: NDArray[np.float64]  # (3, 3) [px] of the camera at full size
+    width: int  # [px] at full size
+    height: int  # [px] at full size
 
     @property
     def p_WCs(self) -> NDArray[np.float64]:
@@ -129,85 +127,77 @@ class CapturedImages:
 
 
 @dataclass(frozen=True, eq=False)
-class ShownPlace:
-    """A place and what is known of it; its lengths are meters unless `metric` is false."""
+class ViewerScene:
+    """A scene for the page `scene_page`; lengths are in meters if `metric`."""
 
     name: str
     gaussians: GaussianScene
     background: Background
-    lower_W: NDArray[np.float64]  # (3,) [m], corners of the box that is of interest
+    lower_W: NDArray[np.float64]  # (3,) [m], corners of the bounds
     upper_W: NDArray[np.float64]  # (3,) [m]
-    height: float  # [m], above which nothing is shown at first
+    height: float  # [m] above which nothing is shown at first
     field: Esdf | None = None
     ends: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None  # (3,) [m], start and goal
     images: CapturedImages | None = None
-    num_unknown: int = 0  # of the Gaussians, at their end: where nobody looked any further
-    beyond: bool = True  # whether Gaussians beyond the bounds are shown at first
+    num_frontier: int = 0  # last Gaussians, which close unseen space
+    beyond: bool = True  # shows Gaussians beyond the bounds at first
     metric: bool = True
-    legend: Sequence[tuple[str, str]] = ()  # colors, as in CSS, of what is drawn, and its names
-    notes: Sequence[str] = ()  # sentences about the place
-    scale_command: str = ""  # to which two points and the length between them need be added
+    legend: Sequence[tuple[str, str]] = ()  # CSS color and name of drawn objects
+    notes: Sequence[str] = ()
+    scale_command: str = ""  # without its two points and their distance
 
     @property
-    def reach(self) -> float:
-        """[m], the distance to surfaces from which on all have one color."""
+    def max_distance(self) -> float:
+        """[m] to surfaces, from which on all distances have one color."""
         if self.metric or self.field is None:
-            return _REACH
-        return _REACH_UNKNOWN * self.field.voxel_size
+            return _MAX_DISTANCE
+        return _MAX_DISTANCE_VOXELS * self.field.voxel_size
 
 
-def place_page(meshcat_page: str, place: ShownPlace) -> str:
-    """
-    Makes a self-contained HTML page of a scene.
+def scene_page(meshcat_page: str, scene: ViewerScene) -> str:
+    """Makes a self-contained HTML page of a scene.
 
     Args:
         meshcat_page: `Meshcat.StaticHtml()` with further objects.
-        place: the scene.
     """
-    size = place.upper_W - place.lower_W
-    unit = "m" if place.metric else "units"
+    size = scene.upper_W - scene.lower_W
+    unit = "m" if scene.metric else "units"
+    lengths = " x ".join(f"{length:.3g}" for length in size)
+    lengths += " m" if scene.metric else " in units of unknown length"
+    field, images = scene.field, scene.images
     data: dict[str, Any] = {
-        "name": place.name,
-        "size": " x ".join(f"{length:.3g}" for length in size)
-        + (" m" if place.metric else " in units of unknown length")
-        + f", {len(place.gaussians):,} Gaussians",
+        "name": scene.name,
+        "size": f"{lengths}, {len(scene.gaussians):,} Gaussians",
         "unit": unit,
-        "notes": list(place.notes),
-        "legend": [*place.legend, *([("#ff9020", "captured from")] if place.images else [])],
-        "lower": rounded(place.lower_W),
-        "upper": rounded(place.upper_W),
-        "height": place.height,
+        "notes": list(scene.notes),
+        "legend": [*scene.legend, *([("#ff9020", "captured from")] if images else [])],
+        "lower": rounded(scene.lower_W),
+        "upper": rounded(scene.upper_W),
+        "height": scene.height,
         # Seen from above across the shorter side.
         "toward": [0.0, -0.8, 1.0] if size[0] >= size[1] else [-0.8, 0.0, 1.0],
-        "beyond": place.beyond,
-        "unknown": place.num_unknown,
-        "scale_command": place.scale_command,
-        "grid": place.field and _grid(place.field, place.reach),
-        "cameras": place.images and _cameras(place.images, float(np.linalg.norm(size))),
+        "beyond": scene.beyond,
+        "unknown": scene.num_frontier,
+        "scale_command": scene.scale_command,
+        "grid": field and _grid(field, scene.max_distance),
+        "cameras": images and _cameras(images, float(np.linalg.norm(size))),
     }
-    return splat_page(
-        meshcat_page,
-        place.gaussians,
-        place.background,
-        data,
-        _SCRIPTS,
-        "PlaceView.open(viewer, splats, data).then((view) => { window.view = view; });",
-    )
+    start = "SceneView.open(viewer, splats, data).then((view) => { window.view = view; });"
+    return splat_page(meshcat_page, scene.gaussians, scene.background, data, _SCRIPTS, start)
 
 
-def _grid(field: Esdf, reach: float) -> dict[str, Any]:
-    """Converts distances to bytes, of a subsampled grid: 0 at a surface, 254 at `reach`, 255 in
-    unknown space."""
+def _grid(field: Esdf, max_distance: float) -> dict[str, Any]:
+    """Converts a subsampled grid to bytes: 0 at surfaces, 254 at `max_distance`, 255 if unknown."""
     stride = int(np.ceil(np.cbrt(field.distances.size / _MAX_VOXELS)))
     thin = (slice(stride // 2, None, stride),) * 3
-    values = np.round(254 * np.clip(field.distances[thin] / reach, 0, 1)).astype(np.uint8)
+    values = np.round(254 * np.clip(field.distances[thin] / max_distance, 0, 1)).astype(np.uint8)
     values[field.states[thin] == FieldState.UNKNOWN] = 255
     colors = np.append(distance_colors(np.arange(255) / 254), np.full((1, 3), UNKNOWN_GRAY), 0)
     return {
         "shape": list(values.shape),
         "lower": rounded(field.lower_W),
         "voxel_size": stride * field.voxel_size,
-        "reach": reach,
+        "reach": max_distance,
         "palette": np.round(255 * colors).astype(int).tolist(),
         "values": compressed(values.tobytes(order="F")),
     }
@@ -229,16 +219,16 @@ def _cameras(images: CapturedImages, extent: float) -> dict[str, Any]:
 
 _COLORS = ("#e8432e", "#2f8fe8", "#e8b52e", "#a05ce0", "#30b870", "#e060b0", "#50c8d0", "#b0b0b0")
 _RATE = 30.0  # [Hz], samples of a flight in the page
-_BALLS_PERIOD = 0.1  # [s], between which balls go straight
+_SPHERES_PERIOD = 0.1  # [s] between samples of moving spheres
 
 
 @dataclass(frozen=True, eq=False)
 class Frames:
-    """Images of the onboard camera, `period` seconds apart from the start on."""
+    """Images of the onboard camera from the start on."""
 
     period: float  # [s]
-    color: Sequence[NDArray[np.uint8]]  # (H, W, 3) each, blue first, as OpenCV has it
-    depth: Sequence[NDArray[np.uint8]]  # (H, W, 3) each, in colors
+    color: Sequence[NDArray[np.uint8]]  # (H, W, 3) each, BGR
+    depth: Sequence[NDArray[np.uint8]]  # (H, W, 3) each, BGR, see `colorize_depth`
 
 
 @dataclass(frozen=True, eq=False)
@@ -259,11 +249,11 @@ class ReplayView:
     """Vehicle, camera and heights of a page."""
 
     X_BC: RigidTransform  # pose of the onboard camera in the vehicle's body frame
-    fov_y: float  # [rad], of the onboard camera
-    radius: float  # [m], of the vehicle
-    lower: float  # [m], height of the place's floor
-    upper: float  # [m], and of its ceiling
-    margin: float = 0.2  # [m], clearance below which the vehicle is marked red
+    fov_y: float  # [rad] of the onboard camera
+    radius: float  # [m] of the vehicle
+    lower: float  # [m] height of the world's floor
+    upper: float  # [m] height of its ceiling
+    margin: float = 0.2  # [m] clearance below which the vehicle is red
 
 
 def replay_page(
@@ -272,24 +262,19 @@ def replay_page(
     background: Background,
     view: ReplayView,
     flights: Sequence[ReplayedFlight],
-    balls: MovingSpheres | None = None,
+    spheres: MovingSpheres | None = None,
 ) -> str:
-    """
-    Makes a self-contained HTML page of flights.
+    """Makes a self-contained HTML page of flights.
 
     Args:
         meshcat_page: `Meshcat.StaticHtml()` with static objects, and the vehicle of flight k at
             `/splatpilot/vehicles/k`.
-        gaussians, background: of the scene.
-        view: vehicle, camera and heights.
-        flights: one or more; the first is selected at first.
-        balls: what moves beside them.
-
-    Raises:
-        ValueError: if there is no flight.
+        flights: at least one; the first is selected at first.
+        spheres: moving obstacles.
     """
-    if not flights:
-        raise ValueError("flights is empty; a replay shows at least one flight")
+    require(flights, "flights", "at least one", 0)
+    duration = max(flight.times[-1] for flight in flights)
+    highest = max(QuadrotorState.of(flight.states).p_WB[:, 2].max() for flight in flights)
     data = {
         "X_BC": view.X_BC.GetAsMatrix4().ravel().tolist(),
         "fov_y": np.degrees(view.fov_y),
@@ -297,8 +282,8 @@ def replay_page(
         "margin": view.margin,
         "lower": view.lower,
         "upper": view.upper,
-        "cut": min(view.upper, _highest(flights) + 2 * view.radius),
-        "balls": balls and _balls_data(balls, max(flight.times[-1] for flight in flights)),
+        "cut": min(view.upper, highest + 2 * view.radius),
+        "spheres": spheres and _sphere_tracks(spheres, duration),
         "flights": [
             _flight_data(flight, _COLORS[k % len(_COLORS)]) for k, flight in enumerate(flights)
         ],
@@ -313,14 +298,10 @@ def replay_page(
     )
 
 
-def _highest(flights: Sequence[ReplayedFlight]) -> float:
-    return max(float(QuadrotorState.of(flight.states).p_WB[:, 2].max()) for flight in flights)
-
-
 def _flight_data(flight: ReplayedFlight, color: str) -> dict[str, Any]:
     # The samples nearest to the page's rate, and the last, at which a flight ends.
-    wanted = np.arange(flight.times[0], flight.times[-1], 1 / _RATE)
-    rows = np.unique(np.append(np.searchsorted(flight.times, wanted), len(flight.times) - 1))
+    samples = np.arange(flight.times[0], flight.times[-1], 1 / _RATE)
+    rows = np.unique(np.append(np.searchsorted(flight.times, samples), len(flight.times) - 1))
     state = QuadrotorState.of(flight.states[rows])
     return {
         "name": flight.name,
@@ -341,16 +322,13 @@ def _flight_data(flight: ReplayedFlight, color: str) -> dict[str, Any]:
     }
 
 
-def _balls_data(balls: MovingSpheres, duration: float) -> dict[str, Any]:
-    times = np.arange(0.0, duration + 2 * _BALLS_PERIOD, _BALLS_PERIOD)
-    centers = [np.round(balls.centers(time), 3).tolist() for time in times]
+def _sphere_tracks(spheres: MovingSpheres, duration: float) -> dict[str, Any]:
+    times = np.arange(0.0, duration + 2 * _SPHERES_PERIOD, _SPHERES_PERIOD)
+    centers = [np.round(spheres.centers(time), 3) for time in times]
     return {
-        "period": _BALLS_PERIOD,
-        "radii": rounded(balls.radii),
-        "centers": [
-            [center if np.isfinite(center).all() else [None] * 3 for center in row]
-            for row in centers
-        ],
+        "period": _SPHERES_PERIOD,
+        "radii": rounded(spheres.radii),
+        "centers": [np.where(np.isfinite(c), c, None).tolist() for c in centers],
     }
 
 
@@ -376,17 +354,14 @@ def live_page(
     heights: tuple[float, float],
     cut: float,
 ) -> str:
-    """
-    Makes an HTML page with the Gaussians that receives the rest from `meshcat`, on this machine.
+    """Makes an HTML page with the Gaussians that receives the rest from `meshcat`, on this machine.
 
-    It hides the points at `/splatpilot/scene`, and objects that Meshcat serves as files, as the
-    onboard camera's image.
+    It hides the points at `/splatpilot/scene`, and the image of the onboard camera, which Meshcat
+    serves as a file.
 
     Args:
-        meshcat: of the flight.
-        gaussians, background: of the scene.
-        heights: from floor to ceiling [m], between which `cut` may be moved.
-        cut: height above which Gaussians are left out at first [m].
+        heights: [m] of floor and ceiling.
+        cut: [m] height above which Gaussians are hidden at first.
     """
     return splat_page(
         meshcat.StaticHtml(),

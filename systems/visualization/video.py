@@ -32,11 +32,7 @@ class VideoRecorder(LeafSystem):
     """
 
     def __init__(self, width: int, height: int, fps: float):
-        """
-        Args:
-            width, height: size of the images [pixels].
-            fps: images per second of simulated time, and of the video.
-        """
+        """Declares the ports, for images of `width` x `height` px at `fps` in simulated time."""
         super().__init__()
         self._fps = fps
         self._frame = np.dtype(
@@ -95,13 +91,7 @@ class VideoRecorder(LeafSystem):
             yield frame["rgb"][..., ::-1], colorize_depth(frame["depth"] * 1e-3, max_depth)
 
     def save(self, path: Path, max_depth: float) -> None:
-        """
-        Writes the video (H.264 in MP4) atomically.
-
-        Args:
-            path: of the file, ending in .mp4.
-            max_depth: [m], see `colorize_depth`.
-        """
+        """Writes the video (H.264 in MP4) atomically; `max_depth` as in `frames`."""
         with written_atomically(path, self._check) as partial:
             self._encode(partial, max_depth)
 

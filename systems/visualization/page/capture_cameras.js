@@ -2,7 +2,7 @@
 "use strict";
 
 class CaptureCameras {
-  // `cameras`: {size, slope_x, slope_y, fov_y, poses, names, images}, see `place_page.py`.
+  // `cameras`: {size, slope_x, slope_y, fov_y, poses, names, images}, see `pages.scene_page`.
   constructor(viewer, cameras) {
     const THREE = MeshCat.THREE;
     Object.assign(this, cameras);

@@ -1,8 +1,8 @@
-// A level cut through the grid of a distance field, as a picture that lies in the place.
+// A level cut through the grid of a distance field, as a textured plane.
 "use strict";
 
 class DistanceSlice {
-  // `grid` as `place_page.py` gives it, and its values: x the fastest, then y, then z; 255 where
+  // `grid` of `pages.scene_page`, and its values: x the fastest, then y, then z; 255 where
   // nobody looked.
   constructor(grid, values) {
     const THREE = MeshCat.THREE, [nx, ny] = grid.shape, edge = grid.voxel_size;

@@ -1,7 +1,7 @@
-// Puts what a page holds (see `splat_page.py`) into Meshcat's viewer.
+// Puts the content of a page (see `pages.splat_page`) into Meshcat's viewer.
 "use strict";
 
-// The bytes of a compressed text, see `splat_page.compressed`.
+// The bytes of a compressed text, see `pages.compressed`.
 async function inflate(text) {
   const bytes = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
   const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));

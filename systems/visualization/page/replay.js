@@ -17,8 +17,8 @@ class Replay {
     this.depth = false;
     this.pictures = new Map();
     for (const flight of this.flights) viewer.scene.add(flight.group);
-    this.balls = data.balls && new ReplayBalls(data.balls);
-    if (this.balls) viewer.scene.add(this.balls.mesh);
+    this.spheres = data.spheres && new ReplaySpheres(data.spheres);
+    if (this.spheres) viewer.scene.add(this.spheres.mesh);
     this.build();
     this.choose(this.flights[0]);
     this.look("overview");
@@ -53,8 +53,8 @@ class Replay {
       <span class="mark" style="background:#6fb7ff"></span>speed
       <span class="mark" style="background:#ffc04d"></span>clearance, red below
       ${this.margin} m<br>
-      <span class="mark" style="background:#1aff1a"></span>cheapest plan
-      <span class="mark" style="background:#ff1a1a"></span>dearest plan
+      <span class="mark" style="background:#1aff1a"></span>plan of lowest cost
+      <span class="mark" style="background:#ff1a1a"></span>highest cost
       <span class="mark" style="background:#1ae64d"></span>goal`});
 
     const bar = addElement(document.body, "div", {id: "replay-bar", className: "bar"});
@@ -132,7 +132,7 @@ class Replay {
     this.slider.value = this.time;
     this.clock.textContent = `${this.time.toFixed(2)} s`;
     for (const flight of this.flights) flight.show(this.time, this);
-    this.balls?.show(this.time);
+    this.spheres?.show(this.time);
     this.drawPicture();
     this.drawPlot();
     this.viewer.set_dirty();

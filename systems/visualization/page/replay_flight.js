@@ -1,4 +1,4 @@
-// What a page shows of one flight, and of balls that move beside it, at a time.
+// Shows one flight, and moving spheres, at a time.
 "use strict";
 
 const lerp = (a, b, s) => a + (b - a) * s;
@@ -89,7 +89,7 @@ class ReplayFlight {
     }
   }
 
-  // All hypotheses of a plan as one mesh of level ribbons, from green (cheapest) to red (dearest),
+  // All hypotheses of a plan as one mesh of level ribbons, from green (lowest cost) to red (highest),
   // but for what is nearer than `nearest` [m] to `eye` and would cover the view.
   showPlan(index, eye, nearest) {
     const THREE = MeshCat.THREE;
@@ -98,10 +98,10 @@ class ReplayFlight {
     this.shownPlan = index;
     this.shownNearest = nearest;
     const {p_WB, waypoints_W, costs} = this.plans[index];
-    const least = Math.min(...costs), span = Math.max(Math.max(...costs) - least, 1e-9);
+    const lowest = Math.min(...costs), span = Math.max(Math.max(...costs) - lowest, 1e-9);
     const positions = [], colors = [], halfWidth = 0.012;
     waypoints_W.forEach((waypoints, k) => {
-      const dear = (costs[k] - least) / span;
+      const share = (costs[k] - lowest) / span;
       let a = p_WB;
       for (const b of waypoints) {
         if (eye.distanceTo(new THREE.Vector3(...a)) < nearest) {
@@ -117,7 +117,7 @@ class ReplayFlight {
         ];
         for (const corner of [0, 1, 2, 0, 2, 3]) {
           positions.push(...corners[corner]);
-          colors.push(Math.min(1, 2 * dear), Math.min(1, 2 * (1 - dear)), 0.1);
+          colors.push(Math.min(1, 2 * share), Math.min(1, 2 * (1 - share)), 0.1);
         }
         a = b;
       }
@@ -128,8 +128,8 @@ class ReplayFlight {
   }
 }
 
-// Balls that move; a center of nulls is nowhere.
-class ReplayBalls {
+// Moving spheres; those with centers of nulls are hidden.
+class ReplaySpheres {
   constructor({period, radii, centers}) {
     const THREE = MeshCat.THREE;
     Object.assign(this, {period, radii, centers});

@@ -171,7 +171,7 @@ def test_start_and_goal_need_room(post_world, field, point, message):
 def test_a_flight_that_starts_at_its_goal_is_refused(post_world):
     start = [float(x) for x in post_world.p_WS]
     near = [start[0] + 0.25, *start[1:]]
-    with pytest.raises(ValueError, match=r"cannot be flown: start and goal are 0\.25 m apart"):
+    with pytest.raises(ValueError, match=r"goal_radius, 0\.3 m, got 0\.25 m"):
         sample_initial_state(Scenario(goal=near), post_world)
     sample_initial_state(Scenario(goal=near, goal_radius=0.2), post_world)
 

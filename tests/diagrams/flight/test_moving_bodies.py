@@ -128,5 +128,5 @@ def test_meshcat_shows_the_ball_if_there_is_one(post_world):
     world = with_ball(post_world, falling(1.0, 0.0, 3.0))
     for flown, shown in ((post_world, False), (world, True)):
         diagram = BuildFlightDiagram(scenario, flown, meshcat=meshcat)
-        assert diagram.HasSubsystemNamed("balls_visualizer") == shown
-        assert meshcat.HasPath("/splatpilot/balls/0") == shown
+        assert diagram.HasSubsystemNamed("spheres_visualizer") == shown
+        assert meshcat.HasPath("/splatpilot/spheres/0") == shown

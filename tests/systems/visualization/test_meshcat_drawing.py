@@ -22,9 +22,9 @@ from splatpilot.systems.policies.hypotheses import Hypotheses
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.vehicle.quadrotor import hover_state
 from splatpilot.systems.visualization.meshcat_drawing import (
-    BallsVisualizer,
     CameraVisualizer,
     FlightVisualizer,
+    MovingSpheresVisualizer,
     draw_distance_slice,
     draw_gaussians,
     draw_goal,
@@ -84,18 +84,18 @@ def test_fan_is_ribbons_along_the_plans_in_the_colors_of_their_costs():
     assert (faces // 22 == faces[0] // 22).all()
 
 
-def test_balls_are_drawn_where_they_are(meshcat):
+def test_moving_spheres_are_drawn(meshcat):
     paths = [np.array([[1.0, 2, 3], [2, 2, 3], [4, 2, 3]]), np.array([[0.0, 0, 1], [np.inf] * 3])]
-    balls = MovingSpheres([0.5, 0.25], paths, period=0.1)
+    spheres = MovingSpheres([0.5, 0.25], paths, period=0.1)
     builder = DiagramBuilder()
-    builder.AddSystem(BallsVisualizer(meshcat, balls, period=0.1))
+    builder.AddSystem(MovingSpheresVisualizer(meshcat, spheres, period=0.1))
     simulator = Simulator(builder.Build())
-    for time, places in ((0.15, [[2, 2, 3], [0, 0, -1000]]), (0.25, [[4, 2, 3], [0, 0, 1]])):
+    for time, expected in ((0.15, [[2, 2, 3], [0, 0, -1000]]), (0.25, [[4, 2, 3], [0, 0, 1]])):
         simulator.AdvanceTo(time)
-        for k, place in enumerate(places):
-            packed = msgpack.unpackb(meshcat._GetPackedTransform(f"/splatpilot/balls/{k}"))
-            assert packed["matrix"][12:15] == place
-    assert drawn(meshcat, "/splatpilot/balls/1")["geometries"][0]["radius"] == 0.25
+        for k, p_WO in enumerate(expected):
+            packed = msgpack.unpackb(meshcat._GetPackedTransform(f"/splatpilot/spheres/{k}"))
+            assert packed["matrix"][12:15] == p_WO
+    assert drawn(meshcat, "/splatpilot/spheres/1")["geometries"][0]["radius"] == 0.25
 
 
 def drawn(meshcat, path: str) -> dict:

@@ -71,7 +71,7 @@ def straight(name: str, outcome: str, y: float = 0.0, roll: float = 0.0) -> Repl
 def open_page(open_in_browser):
     """Opens a page of flights; its window is as large as the onboard camera's image."""
 
-    def opened(gaussians, flights, background=(0.2, 0.4, 0.6), balls=None):
+    def opened(gaussians, flights, background=(0.2, 0.4, 0.6), spheres=None):
         meshcat = Meshcat()
         meshcat.SetCameraPose([-2, 0, 4], [4, 0, 1.5])
         color = background if isinstance(background, tuple) else (0.0, 0.0, 0.0)
@@ -81,7 +81,7 @@ def open_page(open_in_browser):
             meshcat.SetProperty(path, "visible", False)
         for k in range(len(flights)):
             draw_vehicle(meshcat, f"/splatpilot/vehicles/{k}", 0.35)
-        html = replay_page(meshcat.StaticHtml(), gaussians, background, VIEW, flights, balls)
+        html = replay_page(meshcat.StaticHtml(), gaussians, background, VIEW, flights, spheres)
         return open_in_browser(html, WIDTH, HEIGHT, SETTLED, "#replay-panel, #replay-bar")
 
     return opened
@@ -167,24 +167,24 @@ def test_controls_move_time_and_view(open_page):
 
 
 def test_flights_are_told_apart_and_crashes_start_before_their_end(open_page):
-    balls = MovingSpheres([0.5], [np.array([[3.0, 0, 1], [4.0, 0, 1], [np.inf] * 3])], period=2.0)
+    spheres = MovingSpheres([0.5], [np.array([[3.0, 0, 1], [4.0, 0, 1], [np.inf] * 3])], period=2.0)
     flights = [straight("a", "collision"), straight("b", "goal", y=1.0)]
-    page = open_page(cloud(np.random.default_rng(2)), flights, balls=balls)
+    page = open_page(cloud(np.random.default_rng(2)), flights, spheres=spheres)
     assert page.run("() => replay.time") == pytest.approx(2.0)
     colors = page.run("() => replay.flights.map((f) => f.trail.material.color.getHex())")
     assert len(set(colors)) == 2
-    places = page.run("() => replay.flights.map((f) => f.vehicle.matrix.elements.slice(12, 15))")
-    np.testing.assert_allclose(places, [[0.5, 0, 1.5], [0.5, 1, 1.5]], atol=1e-3)
+    positions = page.run("() => replay.flights.map((f) => f.vehicle.matrix.elements.slice(12, 15))")
+    np.testing.assert_allclose(positions, [[0.5, 0, 1.5], [0.5, 1, 1.5]], atol=1e-3)
     page.run("() => replay.choose(replay.flights[1])")
     assert page.run("() => replay.flights.map((f) => Boolean(f.fan.visible))") == [False, True]
     for time, x in ((1, 3.0), (2.5, 4.0)):
         page.run(f"() => replay.seek({time})")
-        ball = page.run("() => Array.from(replay.balls.mesh.instanceMatrix.array)")
+        sphere = page.run("() => Array.from(replay.spheres.mesh.instanceMatrix.array)")
         placed = np.array([[0.5, 0, 0, x], [0, 0.5, 0, 0], [0, 0, 0.5, 1]])
-        np.testing.assert_allclose(np.reshape(ball, (4, 4)).T[:3], placed, atol=1e-6)
+        np.testing.assert_allclose(np.reshape(sphere, (4, 4)).T[:3], placed, atol=1e-6)
     page.run("() => replay.seek(4)")
-    ball = page.run("() => Array.from(replay.balls.mesh.instanceMatrix.array)")
-    assert ball[0] == 0
+    sphere = page.run("() => Array.from(replay.spheres.mesh.instanceMatrix.array)")
+    assert sphere[0] == 0
     assert page.errors == []
 
 
@@ -199,5 +199,5 @@ def test_page_holds_its_gaussians_and_is_the_same_every_time():
 
 
 def test_page_without_flights_is_refused():
-    with pytest.raises(ValueError, match="flights is empty"):
+    with pytest.raises(ValueError, match="flights must be at least one"):
         replay_page("<body></body>", cloud(np.random.default_rng(3)), (0.0, 0.0, 0.0), VIEW, [])

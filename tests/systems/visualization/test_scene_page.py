@@ -1,4 +1,4 @@
-"""Pages of places, in a real browser where there is one."""
+"""Pages of scenes, in a real browser if there is one."""
 
 import cv2
 import numpy as np
@@ -10,7 +10,7 @@ from splatpilot.systems.collision.esdf_build import esdf_from_occupancy
 from splatpilot.systems.splats.baked_scene import BakedScene
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.visualization.meshcat_drawing import draw_box
-from splatpilot.systems.visualization.pages import CapturedImages, ShownPlace, place_page
+from splatpilot.systems.visualization.pages import CapturedImages, ViewerScene, scene_page
 
 WIDTH, HEIGHT = 480, 360
 UPPER = np.array([6.0, 4.0, 2.5])  # [m], of the room, whose lower corner is in the origin
@@ -43,7 +43,7 @@ def disks(step: float = 0.08) -> GaussianScene:
     )
 
 
-def room(**said) -> ShownPlace:
+def room(**said) -> ViewerScene:
     """The room; a block stands in its middle, and its far end was seen by nobody."""
     occupied, unknown = np.zeros((2, 60, 40, 25), bool)
     occupied[25:35, 15:25] = True
@@ -60,19 +60,19 @@ def room(**said) -> ShownPlace:
         "images": images,
         "scale_command": "splatpilot scene scale room --out room-scaled",
     } | said
-    return ShownPlace(name="room", **fields)
+    return ViewerScene(name="room", **fields)
 
 
 @pytest.fixture
 def open_page(open_in_browser):
-    def opened(place: ShownPlace, width: int = WIDTH):
+    def opened(scene: ViewerScene, width: int = WIDTH):
         meshcat = Meshcat()
         for path in ("/Grid", "/Axes"):
             meshcat.SetProperty(path, "visible", False)
         for end in ("top_color", "bottom_color"):
-            meshcat.SetProperty("/Background/<object>", end, list(place.background))
-        draw_box(meshcat, "/splatpilot/bounds", place.lower_W, place.upper_W)
-        html = place_page(meshcat.StaticHtml(), place)
+            meshcat.SetProperty("/Background/<object>", end, list(scene.background))
+        draw_box(meshcat, "/splatpilot/bounds", scene.lower_W, scene.upper_W)
+        html = scene_page(meshcat.StaticHtml(), scene)
         settled = "window.view && view.splats.settled"
         return open_in_browser(html, width, HEIGHT, settled, "#view-panel, #view-bar")
 
@@ -121,10 +121,10 @@ def test_ruler_measures_the_room(open_page):
 
 
 def test_surface_of_a_ray_is_where_the_camera_measures_it(open_page):
-    place = room()
-    page = open_page(place)
+    scene = room()
+    page = open_page(scene)
     page.run("() => { view.choose(0); view.lookFromCamera(); }")
-    depth = BakedScene(place.gaussians).render(K, 120, 90, X_WCS[0]).depth
+    depth = BakedScene(scene.gaussians).render(K, 120, 90, X_WCS[0]).depth
     for u, v in ((60, 45), (20, 20), (100, 80), (75, 70), (31, 8)):
         ray_C = np.array([(u + 0.5 - 60) / 60, (v + 0.5 - 45) / 60, 1.0])
         z = depth[v, u]
@@ -168,8 +168,8 @@ def test_slider_and_switches_change_the_picture(open_page):
 
 
 def test_frustum_shows_its_image_when_clicked(open_page):
-    place = room()
-    page = open_page(place)
+    scene = room()
+    page = open_page(scene)
     page.run("() => view.setHeight(1.5)")
     p_WQ = X_WCS[1].multiply([0.0, 0.0, 0.6 * page.run("() => view.cameras.size")])
     before = page.picture()
@@ -186,7 +186,7 @@ def test_frustum_shows_its_image_when_clicked(open_page):
     assert differ(before[y : y + 1, x : x + 1], picture[y : y + 1, x : x + 1]) > 20
 
     page.run("() => view.lookFromCamera()")
-    truth = BakedScene(place.gaussians).render(4 * K * [[1], [1], [0.25]], WIDTH, HEIGHT, X_WCS[1])
+    truth = BakedScene(scene.gaussians).render(4 * K * [[1], [1], [0.25]], WIDTH, HEIGHT, X_WCS[1])
     seen = np.round(255 * np.clip(truth.color[..., ::-1], 0, 1)).astype(np.uint8)
     assert differ(cv2.blur(page.picture(), (5, 5)), cv2.blur(seen, (5, 5))) < 3
     assert page.errors == []
@@ -201,7 +201,7 @@ def test_hatched_surfaces_and_surroundings_are_apart(open_page):
         [[3.0, 2, 1]], [[1, 0, 0, 0]], [[0.5] * 3], [0.95], [[1] * 3]
     )
     merged = gaussians.merged_with(beyond).merged_with(unknown)
-    page = open_page(room(gaussians=merged, num_unknown=1, beyond=False, images=None))
+    page = open_page(room(gaussians=merged, num_frontier=1, beyond=False, images=None))
 
     def below(x):
         return page.run(f"() => surfaceAlong(view.splats, [{x}, 2, 9], [0, 0, -1], [0, 0, -1])")

@@ -1,14 +1,14 @@
-// A place in a Meshcat page: what can be hidden, distances at a height, where it was captured from,
+// A scene in a Meshcat page: what can be hidden, distances at a height, where it was captured from,
 // and a ruler.
 //
-// Keys: 1 shows the place from above; r, f, b and u switch the ruler, the distances, what is beyond
+// Keys: 1 shows the scene from above; r, f, b and u switch the ruler, the distances, what is beyond
 // the bounds and the hatched surfaces where nobody looked any further.
 "use strict";
 
-class PlaceView {
+class SceneView {
   static async open(viewer, splats, data) {
     const values = data.grid && new Uint8Array(await inflate(data.grid.values));
-    return new PlaceView(viewer, splats, data, values);
+    return new SceneView(viewer, splats, data, values);
   }
 
   constructor(viewer, splats, data, values) {
@@ -177,7 +177,7 @@ class PlaceView {
     return surfaceAlong(this.splats, eye.toArray(), ray, ahead.normalize().toArray());
   }
 
-  // The whole place from above, as near as it fits into the window.
+  // The whole scene from above, as near as it fits into the window.
   look() {
     const THREE = MeshCat.THREE, {lower, upper} = this.data, {camera, scene} = this.viewer;
     const toward = new THREE.Vector3(...this.data.toward).normalize();
@@ -224,7 +224,7 @@ class PlaceView {
     this.turnAbout(ahead);
   }
 
-  // Whether what is no part of the place is shown: bounds, start and goal, frusta.
+  // Shows or hides bounds, start, goal and frusta.
   showDrawn(shown) {
     this.viewer.scene_tree.find(["splatpilot"]).object.visible = shown;
     this.cameras.group.visible = shown;
