@@ -28,7 +28,7 @@ from splatpilot.training.captures.up_and_scale import move_origin
 class CaptureFormat:
     """Recognizes and reads captures of one format."""
 
-    recognizes: Callable[[Path], bool]  # tells whether a folder or file looks like one
+    recognizes: Callable[[Path], object]  # tells whether a folder or file looks like one
     read: Callable[[Path, CaptureConfig], Capture]
     """Opens a capture; raises OSError or ValueError that names the damaged file."""
     description: str = ""
@@ -41,7 +41,7 @@ CAPTURES = Registry("capture format", "splatpilot.captures", CaptureFormat)
 
 def register_capture(
     name: str,
-    recognizes: Callable[[Path], bool],
+    recognizes: Callable[[Path], object],
     read: Callable[[Path, CaptureConfig], Capture],
     *,
     description: str = "",
@@ -52,58 +52,32 @@ def register_capture(
     return added
 
 
-def _tartanair(version: str) -> CaptureFormat:
-    camera = {"V1": "left", "V2": "lcam_front"}[version]
-    return CaptureFormat(
-        partial(tartanair.recognizes_tartanair, version=version),
-        partial(tartanair.read_tartanair, version=version),
-        f"TartanAir {version} (image_{camera}/, depth_{camera}/, pose_{camera}.txt)",
-    )
-
-
 # The first format that recognizes a path reads it.
 _BUILT_IN = {
-    "tartanair_v1": _tartanair("V1"),
-    "tartanair_v2": _tartanair("V2"),
-    "nerfstudio": CaptureFormat(
-        nerfstudio.recognizes, nerfstudio.read, "nerfstudio (transforms.json)"
-    ),
-    "tum": CaptureFormat(
-        tum.recognizes, tum.read, "TUM RGB-D (rgb.txt, depth.txt, groundtruth.txt)"
-    ),
-    "seven_scenes": CaptureFormat(
-        lambda path: next(path.glob("frame-*.color.*"), None) is not None,
-        scans.read_seven_scenes,
-        "7-Scenes (frame-000000.color.png, .depth.png, .pose.txt)",
-    ),
-    "scannet": CaptureFormat(
-        lambda path: (path / scans.SCANNET_COLOR).is_file() and (path / "pose").is_dir(),
-        scans.read_scannet,
-        "ScanNet (color/, depth/, pose/, intrinsic/)",
-    ),
-    "polycam": CaptureFormat(
-        lambda path: any(path.glob("keyframes/*cameras")),
-        phone.read_polycam,
-        "Polycam's raw data (keyframes/)",
-    ),
-    "record3d": CaptureFormat(
-        phone.recognizes_record3d, phone.read_record3d, "Record3D (metadata.json, rgb/, depth/)"
-    ),
-    "colmap": CaptureFormat(
-        lambda path: colmap.model_folder(path) is not None,
-        colmap.read_model,
-        "COLMAP (images/, sparse/0/)",
-    ),
-    "photographs": CaptureFormat(
-        lambda path: bool(photographs.image_files(path)),
-        photographs.read_photographs,
-        "photographs alone",
-    ),
-    "rosbag": CaptureFormat(ros.recognizes, ros.read, "a ROS bag"),
-    "video": CaptureFormat(
-        photographs.is_video, photographs.read_video, "a video (.mp4, .mov, ...)"
-    ),
-}
+    name: CaptureFormat(*entry)
+    for name, *entry in (
+        ("tartanair_v1", partial(tartanair.recognizes, version="V1"),
+         partial(tartanair.read, version="V1"),
+         "TartanAir V1 (image_left/, depth_left/, pose_left.txt)"),
+        ("tartanair_v2", partial(tartanair.recognizes, version="V2"),
+         partial(tartanair.read, version="V2"),
+         "TartanAir V2 (image_lcam_front/, depth_lcam_front/, pose_lcam_front.txt)"),
+        ("nerfstudio", nerfstudio.recognizes, nerfstudio.read, "nerfstudio (transforms.json)"),
+        ("tum", tum.recognizes, tum.read, "TUM RGB-D (rgb.txt, depth.txt, groundtruth.txt)"),
+        ("seven_scenes", lambda path: any(path.glob("frame-*.color.*")), scans.read_seven_scenes,
+         "7-Scenes (frame-000000.color.png, .depth.png, .pose.txt)"),
+        ("scannet", scans.recognizes_scannet, scans.read_scannet,
+         "ScanNet (color/, depth/, pose/, intrinsic/)"),
+        ("polycam", lambda path: any(path.glob("keyframes/*cameras")), phone.read_polycam,
+         "Polycam's raw data (keyframes/)"),
+        ("record3d", phone.recognizes_record3d, phone.read_record3d,
+         "Record3D (metadata.json, rgb/, depth/)"),
+        ("colmap", colmap.model_folder, colmap.read_model, "COLMAP (images/, sparse/0/)"),
+        ("photographs", photographs.image_files, photographs.read_photographs, "photographs alone"),
+        ("rosbag", ros.recognizes, ros.read, "a ROS bag"),
+        ("video", photographs.is_video, photographs.read_video, "a video (.mp4, .mov, ...)"),
+    )
+}  # fmt: skip
 for _name, _format in _BUILT_IN.items():
     CAPTURES.add(_name, _format)
 

@@ -24,7 +24,7 @@ from splatpilot.training.captures.frames import (
     read_matrix,
 )
 
-SCANNET_COLOR = Path("intrinsic", "intrinsic_color.txt")
+_SCANNET_COLOR = Path("intrinsic", "intrinsic_color.txt")
 _SCANNET_DEPTH = Path("intrinsic", "intrinsic_depth.txt")
 
 # fx, fy, cx, cy [px] of 7-Scenes at 640x480. Those of depth are published; the color camera and its
@@ -32,6 +32,11 @@ _SCANNET_DEPTH = Path("intrinsic", "intrinsic_depth.txt")
 _SEVEN_SCENES_DEPTH = (585.0, 585.0, 320.0, 240.0)
 _SEVEN_SCENES_COLOR = (523.0, 523.0, 320.0, 240.0)
 _P_DC = (0.024, 0.005, 0.0)
+
+
+def recognizes_scannet(path: Path) -> bool:
+    """Tells whether a folder looks like an exported scan of ScanNet."""
+    return (path / _SCANNET_COLOR).is_file() and (path / "pose").is_dir()
 
 
 def read_scannet(path: Path, config: CaptureConfig) -> Capture:
@@ -43,7 +48,7 @@ def read_scannet(path: Path, config: CaptureConfig) -> Capture:
     """
     colors = numbered_files(path / "color", r"(\d+)\.(?:jpg|jpeg|png)")
     lost = {number for number in colors if _is_lost(path / "pose" / f"{number}.txt")}
-    K_C = K_D = _intrinsics(path / SCANNET_COLOR)
+    K_C = K_D = _intrinsics(path / _SCANNET_COLOR)
     if config.depth_intrinsics:
         K_D = pinhole(*config.depth_intrinsics)
     elif (path / _SCANNET_DEPTH).is_file():
@@ -66,7 +71,7 @@ def read_scannet(path: Path, config: CaptureConfig) -> Capture:
         [frame(number, color) for number, color in colors.items() if number not in lost],
         axes=OPTICAL_AXES,
         config=config,
-        lens=lambda width, height: Lens(K_C, width, height, source=str(SCANNET_COLOR)),
+        lens=lambda width, height: Lens(K_C, width, height, source=str(_SCANNET_COLOR)),
         depth_camera=depth_camera,
         dropped=[f"{path / 'pose'}: tracking was lost in {len(lost)} frames"] if lost else (),
     )

@@ -35,13 +35,13 @@ AXES = FileAxes(
 _CAMERAS = {"V1": "left", "V2": "lcam_front"}
 
 
-def recognizes_tartanair(path: Path, version: str) -> bool:
+def recognizes(path: Path, version: str) -> bool:
     """Tells whether a folder looks like a TartanAir sequence of "V1" or "V2", complete or not."""
     camera = _CAMERAS[version]
     return (path / f"pose_{camera}.txt").exists() or (path / f"image_{camera}").is_dir()
 
 
-def read_tartanair(path: Path, config: CaptureConfig, version: str) -> Capture:
+def read(path: Path, config: CaptureConfig, version: str) -> Capture:
     """Opens a TartanAir sequence, of V2 its front left camera. Frame i has line i of the poses."""
     camera = _CAMERAS[version]
     suffix = "depth.npy" if version == "V1" else "depth.png"

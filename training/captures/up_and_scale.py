@@ -66,25 +66,24 @@ def fit_ground(
     p_WQ = p_WQ[reach < 3 * np.median(reach)]
     if len(p_WQ) > 20_000:
         p_WQ = p_WQ[rng.choice(len(p_WQ), 20_000, replace=False)]
-    best, best_count = None, 0.0
-    sample = rng.choice(len(p_WQ), (_TRIALS, 3)) if len(p_WQ) >= 3 else np.empty((0, 3), int)
-    for a, b, c in p_WQ[sample]:
-        n = np.cross(b - a, c - a)
-        if (length := np.linalg.norm(n)) == 0:
-            continue
-        n *= np.sign(n @ up) / length
-        height = p_WQ @ n - n @ a
-        if n @ up < np.cos(_MAX_TILT) or n @ camera <= n @ a:
-            continue
-        count = float((np.abs(height) < near).sum() - (height < -2 * near).sum())
-        if count > best_count:
-            best, best_count = (n, n @ a), count
-    if best is None or best_count < _GROUND_SHARE * len(p_WQ):
+    sample = p_WQ[rng.choice(len(p_WQ), (_TRIALS, 3))] if len(p_WQ) else np.zeros((0, 3, 3))
+    a, b, c = np.moveaxis(sample, 1, 0)
+    normals = np.cross(b - a, c - a)
+    normals *= np.sign(normals @ up[:, None]) / (np.linalg.norm(normals, axis=1)[:, None] + 1e-300)
+    offsets = (normals * a).sum(axis=1)
+    steep, below = normals @ up < np.cos(_MAX_TILT), normals @ camera > offsets
+
+    def score(plane: int) -> float:
+        height = p_WQ @ normals[plane] - offsets[plane]
+        return float((np.abs(height) < near).sum() - (height < -2 * near).sum())
+
+    best = max(np.flatnonzero(below & ~steep).tolist(), key=score, default=None)
+    if best is None or score(best) < max(_GROUND_SHARE * len(p_WQ), 1):
         raise ValueError(
             "no ground was found: no plane below the cameras holds a fiftieth of the points; set "
             "capture.scale or capture.up by another field"
         )
-    n, d = best
+    n, d = normals[best], offsets[best]
     for width in near * np.array([1, 0.5, 0.25, 0.125]):
         # Narrower each time, so that the feet of walls count less.
         inliers = p_WQ[np.abs(p_WQ @ n - d) < width]

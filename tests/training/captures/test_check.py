@@ -66,7 +66,7 @@ def misread_quaternion(X: RigidTransform) -> RigidTransform:
     return RigidTransform(Quaternion(np.array([w, x, y, z])), X.translation())
 
 
-def test_sound_capture_agrees(room):
+def test_ideal_capture_agrees(room):
     report = check_capture(room())
     assert report.agrees and report.agreement is not None
     assert report.agreement.error < 0.005 and report.agreement.inside > 0.5
@@ -78,7 +78,7 @@ FLU = RotationMatrix(np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]]))
 
 
 @pytest.mark.parametrize(
-    ("change", "mistake"),
+    ("change", "problem"),
     [
         (lambda X: X.inverse(), "poses are world to camera, read as camera to world"),
         (lambda X: X @ RigidTransform(NED @ FLU.inverse()),
@@ -95,11 +95,11 @@ FLU = RotationMatrix(np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]]))
          "depth is 1000 times too large, or positions too small"),
     ],
 )  # fmt: skip
-def test_wrong_poses_are_named(room, change, mistake):
+def test_wrong_poses_are_named(room, change, problem):
     capture = room()
     report = check_capture(room(X_WCs=as_files(capture, change)))
     assert not report.agrees
-    assert re.search(mistake, report.problem), str(report)
+    assert re.search(problem, report.problem), str(report)
 
 
 def scaled(factor):
@@ -116,8 +116,18 @@ def intrinsics(change):
     return lambda room: {"K": np.array(change) * K}
 
 
+def noisy_poses(room):
+    rng = np.random.default_rng(0)
+    return {"X_WCs": [X @ RigidTransform(rng.normal(0, 0.3, 3)) for X in room().X_WCs]}
+
+
+def noisy_colors(room):
+    noise = np.random.default_rng(0).integers(0, 256, (10, HEIGHT, WIDTH, 3), dtype=np.uint8)
+    return {"load_image": lambda i: noise[i]}
+
+
 @pytest.mark.parametrize(
-    ("change", "mistake"),
+    ("change", "problem"),
     [
         (ranged, "distance from the camera, read as depth along its axis"),
         (scaled(5), "depth is 5 times too large"),
@@ -128,12 +138,15 @@ def intrinsics(change):
             "the focal length is wrong: 1(09|10|11)",
         ),
         (intrinsics([[1, 0, 0.8], [0, 1, 1], [1, 1, 1]]), r"principal point is wrong: \(7[789]"),
+        (noisy_poses, "no other reading explains it"),
+        (noisy_colors, "colors do not follow depth"),
+        (lambda room: {"X_WCs": [room().X_WCs[0]] * 10}, "all 10 poses are the same"),
     ],
 )
-def test_wrong_depth_and_intrinsics_are_named(room, change, mistake):
+def test_other_errors_are_named(room, change, problem):
     report = check_capture(room(**change(room)))
     assert not report.agrees
-    assert re.search(mistake, report.problem), str(report)
+    assert re.search(problem, report.problem), str(report)
 
 
 def test_color_and_depth_that_are_not_registered(room, room_views, room_poses):
@@ -164,31 +177,11 @@ def test_color_and_depth_that_are_not_registered(room, room_views, room_poses):
     assert check_capture(told).agrees
 
 
-def test_colors_that_follow_no_depth_do_not_agree(room):
-    noise = np.random.default_rng(0).integers(0, 256, (10, HEIGHT, WIDTH, 3), dtype=np.uint8)
-    report = check_capture(room(load_image=lambda i: noise[i]))
-    assert not report.agrees and "colors do not follow depth" in report.problem
-
-
-def test_masked_pixels_have_no_part_in_the_comparison(room, masked_room):
+def test_masked_pixels_are_not_compared(room, masked_room):
     report = check_capture(masked_room)
     assert report.agrees
     assert report.color is not None and report.color.cost < 0.01
     assert report.agreement is not None and report.agreement.error < 0.005
-
-
-def test_inaccurate_poses(room):
-    rng = np.random.default_rng(0)
-    off = [X @ RigidTransform(rng.normal(0, 0.3, 3)) for X in room().X_WCs]
-    report = check_capture(room(X_WCs=off))
-    assert "no other reading explains it" in report.problem
-
-
-def test_poses_that_are_all_the_same(room):
-    capture = room()
-    report = check_capture(room(X_WCs=[capture.X_WCs[0]] * len(capture)))
-    assert not report.agrees
-    assert f"all {len(capture)} poses are the same" in report.problem
 
 
 def test_doubts(room):
@@ -199,17 +192,12 @@ def test_doubts(room):
     assert "not checked" in doubt and "too few pixels have depth" in doubt
 
 
-def test_without_depth_nothing_is_claimed(room):
+def test_without_depth_nothing_is_compared(room):
     report = check_capture(room(load_depth=no_depth, metric=False, notes=["11 of 11 images"]))
     assert not report.agrees and not report.problem
     lines = str(report).splitlines()
     assert "11 of 11 images" in lines and "not compared" in lines[-1]
     assert any("scale is unknown" in line for line in lines)
-
-
-def test_too_little_depth_is_refused(room):
-    with pytest.raises(ValueError, match="too few pixels have depth"):
-        check_capture(room(load_depth=lambda i: np.zeros((HEIGHT, WIDTH), np.float32)))
 
 
 def test_command(tmp_path, write_room, capsys):
@@ -230,7 +218,7 @@ def test_command(tmp_path, write_room, capsys):
 
 @pytest.mark.skipif("SPLATPILOT_DATA" not in os.environ, reason="SPLATPILOT_DATA is not set")
 @pytest.mark.parametrize(
-    ("name", "overrides", "error", "mistake"),
+    ("name", "overrides", "error", "problem"),
     [
         ("tartanair/hospital", [], (0.0005, 0.001), ""),
         ("redkitchen", [], (0.002, 0.01), ""),
@@ -238,8 +226,8 @@ def test_command(tmp_path, write_room, capsys):
          r"not registered: a color camera of focal length 52\d px at \(\+0\.0[12]"),
     ],
 )  # fmt: skip
-def test_real_captures(name, overrides, error, mistake):
+def test_real_captures(name, overrides, error, problem):
     config = load_config(CaptureConfig(), overrides=overrides)
     report = check_capture(read_capture(Path(os.environ["SPLATPILOT_DATA"]) / name, config))
     assert report.agreement is not None and error[0] < report.agreement.error < error[1]
-    assert re.search(mistake, report.problem) if mistake else report.agrees
+    assert re.search(problem, report.problem) if problem else report.agrees
