@@ -118,7 +118,7 @@ def test_intrinsics_of_each_frame(write_record3d, K, shows_room, room_poses):
     shows_room(capture, relative(capture, room_poses), color=0.5, depth=0.03)
 
 
-def test_what_is_not_an_export(write_record3d, tmp_path):
+def test_invalid_exports_are_refused(write_record3d, tmp_path):
     recording = tmp_path / "room.r3d"
     recording.write_bytes(b"PK")
     with pytest.raises(ValueError, match=r'own format.*export the recording as "EXR'):

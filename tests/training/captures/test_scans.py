@@ -87,42 +87,45 @@ def test_up_of_level_cameras(write, config):
     assert all(X_WC.rotation().matrix()[2, 1] < 0 for X_WC in capture.X_WCs)
 
 
+def replace(file: Path, content) -> None:
+    if content is None:
+        file.unlink()
+    elif isinstance(content, str):
+        file.write_text(content)
+    elif isinstance(content, bytes):
+        file.write_bytes(content)
+    elif file.suffix == ".txt":
+        np.savetxt(file, content)
+    else:
+        cv2.imwrite(str(file), content)
+
+
 @pytest.mark.parametrize(
-    ("spoil", "message"),
+    ("part", "content", "message"),
     [
-        (lambda p: (p / "frame-000040.pose.txt").write_text("nan " * 4 + "\n" + "0 0 0 1\n" * 3),
-         "000040.pose.txt: the pose is not finite"),
-        (lambda p: (p / "frame-000040.pose.txt").unlink(), "o such file"),
-        (lambda p: (p / "frame-000040.pose.txt").write_text("1 0 0\n"),
-         "000040.pose.txt, line 1 must be a row of a 4x4 matrix, got '1 0 0'"),
-        (lambda p: np.savetxt(p / "frame-000040.pose.txt", np.diag([2, 1, 1, 1])),
-         "000040.pose.txt: the rotation must be"),
-        (lambda p: np.savetxt(p / "frame-000040.pose.txt", np.diag([1, 1, -1, 1])),
-         "000040.pose.txt: the rotation must be .*determinant -1"),
-        (lambda p: np.savetxt(p / "frame-000040.pose.txt",
-                              RigidTransform([900, 0, 0]).GetAsMatrix4()),
-         "000040.color.png: its position .* is far from all others"),
-        (lambda p: (p / "frame-000040.depth.png").write_bytes(b""),
-         "000040.depth.png: not a readable image"),
-        (lambda p: (p / "frame-000040.depth.png").unlink(),
-         "No such file: .*000040.depth.png"),
-        (lambda p: (p / "frame-000040.color.png").write_bytes(b"no image"),
-         "000040.color.png: not a readable image"),
-        (lambda p: (f := p / "frame-000040.color.png").write_bytes(f.read_bytes()[:-500]),
-         "000040.color.png: not a readable image .its end"),
-        (lambda p: cv2.imwrite(str(p / "frame-000040.color.png"), np.zeros((24, 32, 3), np.uint8)),
-         "000040.color.png must be of 64x48 pixels, as the others, got 32x24"),
-        (lambda p: cv2.imwrite(str(p / "frame-000040.depth.png"), np.zeros((24, 32), np.uint16)),
-         "000040.depth.png must be of 64x48 pixels, as the others, got 32x24"),
+        ("pose.txt", 4 * "nan 0 0 1\n", "the pose is not finite"),
+        ("pose.txt", None, "No such file"),
+        ("pose.txt", "1 0 0\n", "line 1 must be a row of a 4x4 matrix, got '1 0 0'"),
+        ("pose.txt", np.diag([2, 1, 1, 1]), "the rotation must be"),
+        ("pose.txt", np.diag([1, 1, -1, 1]), "the rotation must be .*determinant -1"),
+        ("pose.txt", np.eye(4) + 900 * np.eye(4, k=3), "position .* is far from all others"),
+        ("depth.png", b"", "not a readable image"),
+        ("depth.png", None, "No such file"),
+        ("depth.png", np.zeros((24, 32), np.uint16), "must be of 64x48 pixels, .* got 32x24"),
+        ("depth.png", np.zeros((48, 64), np.uint8), "depth must be one number per pixel"),
+        ("depth.png", np.zeros((48, 64, 3), np.uint8), "depth must be one number per pixel"),
+        ("color.png", b"no image", "not a readable image"),
+        ("color.png", cv2.imencode(".png", np.zeros((48, 64, 3)))[1].tobytes()[:-9], "its end"),
+        ("color.png", np.zeros((24, 32, 3), np.uint8), "must be of 64x48 pixels, .* got 32x24"),
     ],
-)  # fmt: skip
-def test_one_bad_frame_is_left_out(write, config, spoil, message):
+)
+def test_one_bad_frame_is_left_out(write, config, part, content, message):
     path = write()
     whole = read_capture(path, config())
-    spoil(path)
+    replace(path / f"frame-000040.{part}", content)
     capture = read_capture(path, config())
     assert len(capture.dropped) == 1 and len(capture) == 9
-    assert re.search(message, capture.dropped[0])
+    assert re.search(f"frame-000040.*{message}", capture.dropped[0])
     assert "frame-000040.color.png" not in capture.frame_names
     np.testing.assert_array_equal(capture.frame(4).image, whole.frame(5).image)
     assert capture.X_WCs[4].IsNearlyEqualTo(whole.X_WCs[5], 0)
@@ -136,16 +139,6 @@ def test_too_many_bad_frames(write, config):
         ValueError, match=r"7 of 10 frames .* 80%.*No such file: .*000000\.depth\.png"
     ):
         read_capture(path, config())
-
-
-@pytest.mark.parametrize("shape", [(48, 64), (48, 64, 3)])
-def test_pictures_of_depth(write, config, shape):
-    path = write()
-    cv2.imwrite(str(path / "frame-000010.depth.png"), np.zeros(shape, np.uint8))
-    capture = read_capture(path, config())
-    assert len(capture) == 9 and "frame-000010.color.png" not in capture.frame_names
-    [message] = capture.dropped
-    assert re.search(r"000010\.depth\.png: depth must be one number per pixel", message)
 
 
 @pytest.mark.skipif("SPLATPILOT_DATA" not in os.environ, reason="SPLATPILOT_DATA is not set")
@@ -195,7 +188,7 @@ def test_intrinsics_of_larger_images_are_refused(write_scannet, K):
     np.testing.assert_allclose(read_capture(write_scannet, given).K, K)
 
 
-def test_lost_tracking_is_no_damage(write_scannet):
+def test_frames_of_lost_tracking_do_not_count(write_scannet):
     for i in (1, 4, 5):
         np.savetxt(write_scannet / f"pose/{i}.txt", np.full((4, 4), -np.inf))
     capture = read_capture(write_scannet)
