@@ -160,7 +160,7 @@ def _lens(
     config: CaptureConfig,
     lenses: dict[tuple, Lens],
 ) -> Lens | None:
-    """Returns the camera that `values` describe, None if the image's size is needed and unknown."""
+    """Returns the camera that `values` describe, None without the image's size."""
     model = str(values.get("camera_model", _FISHEYE if values.get("is_fisheye") else "OPENCV"))
     require(model in _MODELS, f"{file}: camera_model", f"one of {', '.join(_MODELS)}", model)
     try:

@@ -24,7 +24,7 @@ def write(tmp_path, room_views, room_poses):
         w, x, y, z = view.X_WC.rotation().ToQuaternion().wxyz()
         p = view.X_WC.translation()
         for offset in (-0.005, 0.005):
-            # The camera passes the frame's place half-way between the two stamps.
+            # The camera passes the position of the frame half-way between the two stamps.
             row = (time + offset, *(p + np.array([100 * offset, 0, 0])), x, y, z, w)
             lists["groundtruth"].append(" ".join(f"{value:.6f}" for value in row))
     for name, lines in lists.items():
