@@ -118,8 +118,10 @@ def _bent_lens(
     bend.validate()
 
     def project(rays: NDArray[np.float64]) -> NDArray[np.float64]:
-        r8 = (rays**2).sum(axis=1, keepdims=True) ** 4
-        return (bend.project(rays) + k4 * r8 * rays) @ K[:2, :2].T + K[:2, 2]
+        bent = bend.project(rays)
+        if k4:
+            bent += k4 * (rays**2).sum(axis=1, keepdims=True) ** 4 * rays
+        return bent * np.diag(K)[:2] + K[:2, 2]
 
     return Lens(K, width, height, project)
 
@@ -198,14 +200,20 @@ def depth_points(
     return back_project(K, columns + 0.5, rows + 0.5, z), rows, columns
 
 
+def project(
+    K: NDArray[np.float64], x: NDArray, y: NDArray, z: NDArray
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Returns the image coordinates u, v (...) [px] of points p_CQ."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
+
+
 def project_points(
     K: NDArray[np.float64], p_CQ: NDArray[np.float64], width: int, height: int
 ) -> tuple[NDArray[np.bool_], NDArray[np.intp], NDArray[np.intp]]:
     """Returns which of the points (N, 3) fall into an image, and the rows and columns (n,) of the
     pixels that these fall into."""
-    x, y, z = p_CQ.T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        u, v = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
+    (u, v), z = project(K, *p_CQ.T), p_CQ[:, 2]
     inside = (z > 0) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
     return inside, v[inside].astype(np.intp), u[inside].astype(np.intp)
 

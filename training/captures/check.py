@@ -21,6 +21,7 @@ from splatpilot.training.captures.capture import (
     Capture,
     back_project,
     depth_points,
+    project,
     project_points,
 )
 from splatpilot.training.captures.capture_config import CaptureConfig
@@ -119,7 +120,7 @@ class CheckReport:
     notes: tuple[str, ...]
     metric: bool
     pairs: int = 0
-    agreement: ReadingFit | None = None  # none if there is no depth to compare
+    agreement: ReadingFit | None = None  # None if there is no depth to compare
     others: tuple[ReadingFit, ...] = ()  # other readings, the best first
     color: ColorFit | None = None
     problem: str = ""  # the most likely error in one sentence; empty if none was found
@@ -484,8 +485,7 @@ def _correlation(
     samples = []
     for p_DQ, image in pair:
         x, y, z = X_DC.inverse().multiply(p_DQ)
-        u = (K[0, 0] * x / z + K[0, 2] - 0.5).astype(np.float32)
-        v = (K[1, 1] * y / z + K[1, 2] - 0.5).astype(np.float32)
+        u, v = ((each - 0.5).astype(np.float32) for each in project(K, x, y, z))
         sampled = cv2.remap(image, u[None], v[None], cv2.INTER_LINEAR, borderValue=-1.0)[0]
         height, width = image.shape
         inside = (z > 0) & (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1)

@@ -24,6 +24,7 @@ from splatpilot.training.captures.capture import (
     Capture,
     CaptureFrame,
     back_project,
+    project,
     shrink,
     shrink_factor,
 )
@@ -94,8 +95,8 @@ class ComparedFrame:
         """Returns which of the points (n, 3) are on surfaces that it sees, up to a relative
         difference of depth; the image coordinates (2, n) of all; and its inverse depth there with
         derivatives (3, n)."""
-        z = p_CQ[:, 2].clip(min=1e-3)
-        u = np.array([self.K[k, k] * p_CQ[:, k] / z + self.K[k, 2] for k in (0, 1)])
+        x, y, z = p_CQ.T
+        u = np.array(project(self.K, x, y, z.clip(min=1e-3)))
         inverse = _sample(self.inverse_depth, u)
         # Next to unknown depth it falls to zero.
         steep = np.abs(inverse[1:]).max(axis=0) > _REACH * inverse[0]

@@ -125,7 +125,7 @@ def test_one_bad_frame_is_left_out(write, config, part, content, message):
     replace(path / f"frame-000040.{part}", content)
     capture = read_capture(path, config())
     assert len(capture.dropped) == 1 and len(capture) == 9
-    assert re.search(f"frame-000040.*{message}", capture.dropped[0])
+    assert "frame-000040" in capture.dropped[0] and re.search(message, capture.dropped[0])
     assert "frame-000040.color.png" not in capture.frame_names
     np.testing.assert_array_equal(capture.frame(4).image, whole.frame(5).image)
     assert capture.X_WCs[4].IsNearlyEqualTo(whole.X_WCs[5], 0)
