@@ -78,7 +78,8 @@ def read_photographs(path: Path, config: CaptureConfig) -> Capture:
 
     def register(written: Path) -> None:
         work = folder, names, _one_camera(files), config.partners, written
-        with resumable(lambda: "nothing is kept of the registration"):
+        kept = "nothing is kept of the registration; the same command starts again"
+        with resumable(lambda: kept):
             run_apart(f"{path}: registration", _register, work)
 
     model = cached_folder(cache_folder(config, "photographs", key) / "model", register)
