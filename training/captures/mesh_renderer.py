@@ -10,7 +10,6 @@ import struct
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cached_property
 from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -154,7 +153,7 @@ def mesh_distance(mesh: Path, up: str, voxel_size: float) -> Esdf:
     """Returns the distance to the surface of a mesh, from points sampled on it outside of holes."""
     density = _SAMPLES_PER_VOXEL_FACE / voxel_size**2
     with _opened(mesh, up, export=False) as parts:
-        points = [_sample_surface(mesh, parts.triangles, density)[0]]
+        points = [_sample_surface(mesh, parts.surface, density)[0]]
         if parts.cut_outs is not None:
             points.append(parts.cut_outs.sample(mesh, density))
     p_WQ = np.concatenate(points)
@@ -170,12 +169,9 @@ def mesh_distance(mesh: Path, up: str, voxel_size: float) -> Esdf:
 
 
 def _sample_surface(
-    path: Path, triangles: NDArray[np.float64], density: float
+    path: Path, surface: trimesh.Trimesh, density: float
 ) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
-    """Returns points (N, 3) [m] on triangles (T, 3, 3), with a density [1/m^2], and the triangle
-    (N,) of each."""
-    faces = np.arange(3 * len(triangles)).reshape(-1, 3)
-    surface = trimesh.Trimesh(triangles.reshape(-1, 3), faces, process=False)
+    """Returns points (N, 3) [m] on a surface, with a density [1/m^2], and the triangle of each."""
     if not 0 < surface.area < np.inf:
         return np.zeros((0, 3)), np.zeros(0, dtype=np.intp)
     count = int(density * surface.area) + 1
@@ -234,37 +230,16 @@ def _shade(albedo: NDArray[np.float64], normal: NDArray[np.float64]) -> NDArray[
 class CutOuts:
     """Triangles with holes."""
 
-    triangles: NDArray[np.float64]  # (T, 3, 3) [m], corners in W
+    surface: trimesh.Trimesh  # T triangles [m], in W
     uv: NDArray[np.float64]  # (T, 3, 2)
     material: NDArray[np.intp]  # (T,)
     materials: Sequence[CutMaterial]
-
-    @cached_property
-    def _scene(self) -> Any:
-        try:
-            from embreex.mesh_construction import TriangleMesh
-            from embreex.rtcore_scene import EmbreeScene
-        except ModuleNotFoundError:
-            raise ModuleNotFoundError(
-                "textures with holes need embreex, which has no wheel for this processor; render "
-                "the capture on another machine",
-                name="embreex",
-            ) from None
-        scene = EmbreeScene()
-        TriangleMesh(scene, self.triangles.astype(np.float32))
-        return scene
-
-    @cached_property
-    def _normals(self) -> NDArray[np.float64]:
-        a, b, c = np.moveaxis(self.triangles, 1, 0)
-        normals = np.cross(b - a, c - a)
-        return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
 
     def _sample_at(
         self, triangle: NDArray[np.intp], p_WQ: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Returns colors (n, 3) and alphas (n,) of points (n, 3) on triangles (n,)."""
-        weights = trimesh.triangles.points_to_barycentric(self.triangles[triangle], p_WQ)
+        weights = trimesh.triangles.points_to_barycentric(self.surface.triangles[triangle], p_WQ)
         uv = (weights[..., None] * self.uv[triangle]).sum(axis=1)
         color, alpha = np.zeros((len(uv), 3)), np.zeros(len(uv))
         for i, material in enumerate(self.materials):
@@ -274,7 +249,7 @@ class CutOuts:
 
     def sample(self, path: Path, density: float) -> NDArray[np.float64]:
         """Returns points (N, 3) [m] outside of holes; see `_sample_surface`."""
-        points, triangle = _sample_surface(path, self.triangles, density)
+        points, triangle = _sample_surface(path, self.surface, density)
         return points[self._sample_at(triangle, points)[1] > 0]
 
     def draw(self, frame: CaptureFrame) -> CaptureFrame:
@@ -282,6 +257,12 @@ class CutOuts:
 
         Depth is that of the first surface, opaque or not.
         """
+        if not trimesh.ray.has_embree:
+            raise ModuleNotFoundError(
+                "textures with holes need embreex, which has no wheel for this processor; render "
+                "the capture on another machine",
+                name="embreex",
+            )
         height, width = frame.depth.shape
         # Rays have depth 1, so that distances along them are depths.
         rays = pixel_rays(frame.K, width, height).reshape(-1, 3)
@@ -292,14 +273,13 @@ class CutOuts:
         behind, reached = np.ones(len(rays)), np.full(len(rays), MIN_DEPTH)
         active = np.flatnonzero(limit > MIN_DEPTH)
         while len(active):
-            origins = (p_WC + reached[active, None] * rays[active]).astype(np.float32)
-            hits = self._scene.run(origins, rays[active].astype(np.float32), query="INTERSECT")
-            triangle = np.asarray(hits, dtype=np.intp)  # the first on each ray, -1 for none
+            origins = p_WC + reached[active, None] * rays[active]
+            triangle = self.surface.ray.intersects_first(origins, rays[active])  # -1 for none
             active, triangle = active[triangle >= 0], triangle[triangle >= 0]
             # Intersect again in double precision.
-            normal, ray = self._normals[triangle], rays[active]
+            normal, ray = self.surface.face_normals[triangle], rays[active]
             slope = (ray * normal).sum(axis=1)
-            offset = ((self.triangles[triangle, 0] - p_WC) * normal).sum(axis=1)
+            offset = ((self.surface.triangles[triangle, 0] - p_WC) * normal).sum(axis=1)
             z = np.maximum(offset / np.where(slope == 0, 1, slope), reached[active])
             seen = z < limit[active]
             active, triangle, z, ray = active[seen], triangle[seen], z[seen], ray[seen]
@@ -326,7 +306,7 @@ class _Parts:
     """A mesh in two parts; one may be missing."""
 
     solid: Path | None  # .gltf without holes
-    triangles: NDArray[np.float64]  # (T, 3, 3) [m] of the same, corners in W
+    surface: trimesh.Trimesh  # [m] of the same, in W
     cut_outs: CutOuts | None  # in W
 
 
@@ -363,10 +343,10 @@ def _split(path: Path, folder: Path | None, R_WM: NDArray[np.float64]) -> _Parts
         ):
             mesh.visual.material = _opaque(mesh.visual.material, number)
             solid.append(name)
-    corners, _, _ = _triangles(scene, solid, R_WM)
+    surface, _, _ = _surface(scene, solid, R_WM)
     cut_outs = None
     if cut:
-        holed, uv, names = _triangles(scene, cut, R_WM)
+        holed, uv, names = _surface(scene, cut, R_WM)
         order = sorted(set(cut.values()))
         found = [each for number in order if (each := cut_materials[number]) is not None]
         material = np.array([order.index(cut[name]) for name in names], dtype=np.intp)
@@ -375,13 +355,13 @@ def _split(path: Path, folder: Path | None, R_WM: NDArray[np.float64]) -> _Parts
         raise ValueError("it holds no triangles")
     scene.delete_geometry([name for name in scene.geometry if name not in solid])
     if not solid or folder is None:
-        return _Parts(None, corners, cut_outs)
+        return _Parts(None, surface, cut_outs)
     files = export_gltf(
         scene, merge_buffers=True, tree_postprocessor=lambda tree: _restore(tree, document)
     )
     for name, content in files.items():
         (folder / name).write_bytes(content)
-    return _Parts(folder / "model.gltf", corners, cut_outs)
+    return _Parts(folder / "model.gltf", surface, cut_outs)
 
 
 def _read(path: Path) -> tuple[Any, dict[str, Any]]:
@@ -473,11 +453,11 @@ def _cut_material(
     )
 
 
-def _triangles(
+def _surface(
     scene: Any, names: Collection[str], R_WM: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], list[str]]:
-    """Returns the corners (T, 3, 3) [m] in W of the triangles of geometries by name, their texture
-    coordinates (T, 3, 2), 0 without any, and the name of each."""
+) -> tuple[trimesh.Trimesh, NDArray[np.float64], list[str]]:
+    """Returns the T triangles in W of geometries by name, their texture coordinates (T, 3, 2), 0
+    without any, and the name of each."""
     corners, uv, found = [np.zeros((0, 3, 3))], [np.zeros((0, 3, 2))], []
     for node in scene.graph.nodes_geometry:
         X_MN, name = scene.graph[node]
@@ -489,6 +469,8 @@ def _triangles(
         own = np.zeros((len(mesh.vertices), 2)) if own is None else own * [1, -1] + [0, 1]
         uv.append(own[mesh.faces])
         found += len(mesh.faces) * [name]
-    if not (np.abs(np.concatenate(corners)) <= _MAX_POSITION).all():
+    p_WQ = np.concatenate(corners).reshape(-1, 3)
+    if not (np.abs(p_WQ) <= _MAX_POSITION).all():
         raise ValueError(f"positions must be finite and within {_MAX_POSITION:g} m")
-    return np.concatenate(corners), np.concatenate(uv), found
+    faces = np.arange(len(p_WQ)).reshape(-1, 3)
+    return trimesh.Trimesh(p_WQ, faces, process=False), np.concatenate(uv), found
