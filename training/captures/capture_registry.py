@@ -54,8 +54,8 @@ def register_capture(
 
 # The first format that recognizes a path reads it.
 _BUILT_IN = {
-    name: CaptureFormat(*entry)
-    for name, *entry in (
+    name: CaptureFormat(recognizes, read, description)
+    for name, recognizes, read, description in (
         ("tartanair_v1", partial(tartanair.recognizes, version="V1"),
          partial(tartanair.read, version="V1"),
          "TartanAir V1 (image_left/, depth_left/, pose_left.txt)"),

@@ -141,7 +141,8 @@ def read_packed_depth(file: Path, unit: float) -> NDArray[np.float32]:
     valid = raw.ndim == 3 and raw.shape[2] == 4 and raw.dtype == np.uint8
     found = f"an array of {raw.dtype} of shape {raw.shape}"
     require(valid, f"{file}: depth", "four channels of 8 bits", found)
-    return _drop_invalid(np.ascontiguousarray(raw).view("<f4")[..., 0] / np.float32(unit))
+    depth = np.ascontiguousarray(raw).view("<f4")[..., 0].astype(np.float32)
+    return _drop_invalid(np.divide(depth, np.float32(unit), dtype=np.float32))
 
 
 def _drop_invalid(depth: NDArray[np.float32]) -> NDArray[np.float32]:

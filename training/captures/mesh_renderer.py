@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import trimesh
@@ -326,22 +326,23 @@ def _split(path: Path, folder: Path | None, R_WM: NDArray[np.float64]) -> _Parts
     solid, cut = [], {}
     primitives = [p for mesh in document.get("meshes", []) for p in mesh["primitives"]]
     for primitive, (name, mesh) in zip(primitives, scene.geometry.items(), strict=True):
-        number = primitive.get("material", -1)
-        if not isinstance(mesh, trimesh.Trimesh) or number < 0:
-            if isinstance(mesh, trimesh.Trimesh):
-                mesh.visual = TextureVisuals(material=PBRMaterial(doubleSided=True))
-                solid.append(name)
+        if not isinstance(mesh, trimesh.Trimesh):
+            continue
+        number, visual = primitive.get("material", -1), cast(Any, mesh.visual)
+        if number < 0:
+            mesh.visual = TextureVisuals(material=PBRMaterial(doubleSided=True))
+            solid.append(name)
             continue
         material = materials[number]
         if number not in cut_materials:
-            cut_materials[number] = _cut_material(document, material, mesh.visual.material)
+            cut_materials[number] = _cut_material(document, material, visual.material)
         if cut_materials[number] is not None:
             cut[name] = number
         # A mask without a texture is visible or not as a whole.
         elif material.get("alphaMode") != "MASK" or (
             _base_color(material)[3] >= material.get("alphaCutoff", _CUTOFF)
         ):
-            mesh.visual.material = _opaque(mesh.visual.material, number)
+            visual.material = _opaque(visual.material, number)
             solid.append(name)
     surface, _, _ = _surface(scene, solid, R_WM)
     cut_outs = None
