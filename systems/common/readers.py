@@ -117,10 +117,10 @@ def read_ply_file(path: Path) -> PlyData:
 
 @contextmanager
 def readable(path: Path, what: str) -> Iterator[None]:
-    """Converts errors of a library that reads a file to "`path`: not a readable `what` (...)"."""
+    """Converts any error of a reader to "`path`: not a readable `what`"."""
     try:
         yield
-    except Exception as error:  # Libraries raise any type for damaged files.
+    except Exception as error:  # zipfile, numpy and plyfile raise any type for damaged files.
         raise ValueError(
             f"{path}: not a readable {what} ({reason_of(error)}); it is truncated or damaged, "
             "copy it again"

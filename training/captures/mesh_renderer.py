@@ -41,8 +41,7 @@ from trimesh.visual.material import PBRMaterial
 
 from splatpilot.diagrams.worlds.splits import part_digests
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.collision.esdf_build import esdf_from_occupancy
-from splatpilot.systems.collision.occupancy import grid_shape
+from splatpilot.systems.collision.esdf_build import esdf_from_occupancy, grid_shape
 from splatpilot.systems.common.extras import require_opengl
 from splatpilot.systems.common.readers import readable, require_file, require_readable_size
 from splatpilot.systems.common.validation import require
