@@ -41,9 +41,9 @@ from splatpilot.systems.visualization.meshcat_drawing import (
 from splatpilot.systems.visualization.pages import CapturedImages, ViewerScene, scene_page
 from splatpilot.training.captures.capture import Capture
 from splatpilot.training.captures.capture_config import CaptureConfig
-from splatpilot.training.captures.capture_registry import read_capture, read_capture_of
-from splatpilot.training.captures.colmap import is_video
-from splatpilot.training.captures.render import capture_gaussians
+from splatpilot.training.captures.capture_gaussians import capture_gaussians
+from splatpilot.training.captures.capture_registry import read_capture, read_scene_capture
+from splatpilot.training.captures.photographs import is_video
 
 _SCENARIOS = {".yaml", ".yml"}
 _MAX_IMAGES = 60
@@ -135,7 +135,7 @@ def _scene(path: Path) -> ViewerScene:
     world = read_scene_folder(path, metric=False)
     notes, images = [], None
     try:
-        images = _captured_images(read_capture_of(path, metadata))
+        images = _captured_images(read_scene_capture(path, metadata))
     except (ValueError, OSError, ModuleNotFoundError) as error:
         notes.append(f"Captured images are not shown: {error}.")
     notes += _origin_notes(metadata.origin)

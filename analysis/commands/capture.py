@@ -91,8 +91,8 @@ def check(options: argparse.Namespace) -> Any:
     from splatpilot.training.captures import check
 
     report = check.run(capture=Path(options.capture), config=cli.read_config(options))
-    if report.mistake:
-        raise cli.FailureWithResultError(f"{options.capture}: {report.mistake}", report)
+    if report.problem:
+        raise cli.FailureWithResultError(f"{options.capture}: {report.problem}", report)
     return report
 
 

@@ -21,7 +21,7 @@ from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.octomap import Octomap
 from splatpilot.systems.common.config import load_config
 from splatpilot.systems.splats.splat_files import write_ply
-from splatpilot.training.captures.render import capture_gaussians
+from splatpilot.training.captures.capture_gaussians import capture_gaussians
 
 
 def data_of(page) -> dict:
@@ -72,7 +72,7 @@ def test_scene_without_scale_or_capture_is_shown(place, monkeypatch):
     def lost(path, metadata):
         raise FileNotFoundError("room: no such folder")
 
-    monkeypatch.setattr(view, "read_capture_of", lost)
+    monkeypatch.setattr(view, "read_scene_capture", lost)
     scene = place.scene("scene")
     write_scene_metadata(scene, replace(read_scene_metadata(scene), metric=False))
     data = data_of(view.run(what=str(scene), out=place.folder / "page.html"))
