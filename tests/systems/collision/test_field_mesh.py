@@ -4,13 +4,12 @@ import numpy as np
 import pytest
 import trimesh
 from pydrake.geometry import GeometryInstance, Mesh, ProximityProperties, SceneGraph
-from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.math import RigidTransform
 
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.field_mesh import (
     add_primitive,
-    data_uri,
     field_mesh,
     write_mesh,
     y_up,
@@ -128,12 +127,6 @@ def _read(document: dict, number: int) -> np.ndarray:
     return array.reshape(accessor["count"], COLUMNS[accessor["type"]])
 
 
-def test_turned_by_a_right_angle_about_x_points_are_back():
-    p = np.random.default_rng(0).normal(size=(20, 3))
-    back = RotationMatrix.MakeXRotation(np.pi / 2).multiply(y_up(p).T).T
-    np.testing.assert_allclose(back, p, atol=1e-12)
-
-
 def test_every_primitive_of_a_document_reads_as_written():
     rng, document, written = np.random.default_rng(0), {}, []
     for count in (4, 7):
@@ -148,8 +141,3 @@ def test_every_primitive_of_a_document_reads_as_written():
             _read(document, primitive["indices"]).reshape(-1, 3), triangles
         )
         np.testing.assert_allclose(document["accessors"][position]["max"], y_up(p).max(0), 1e-6)
-
-
-def test_data_uri_holds_its_content():
-    head, _, content = data_uri("image/png", b"\x00\xff splat").partition(",")
-    assert head == "data:image/png;base64" and base64.b64decode(content) == b"\x00\xff splat"
