@@ -10,12 +10,7 @@ from splatpilot.diagrams.worlds.building_blocks import CLEARING, INSET, PASSAGE
 from splatpilot.diagrams.worlds.forest.layout import ForestConfig, lay_out
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import make_world
-from splatpilot.systems.collision.shapes import (
-    AnalyticDistanceField,
-    Capsule,
-    ShapeUnion,
-    Sphere,
-)
+from splatpilot.systems.collision.shapes import AnalyticDistanceField, Capsule, ShapeUnion, Sphere
 from splatpilot.systems.splats.background import mean_color
 
 SMALL = ForestConfig(length=9.0, width=7.0, height=4.0, voxel_size=0.25)
