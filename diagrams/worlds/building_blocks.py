@@ -14,22 +14,15 @@ from splatpilot.diagrams.worlds.solids.surfaces import FloorPlan
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.esdf_build import grid_shape
 from splatpilot.systems.collision.shapes import Box, HalfSpace, Shape, ShapeUnion
-from splatpilot.systems.common.validation import (
-    Config,
-    FieldError,
-    bounded,
-    require,
-    require_field,
-)
+from splatpilot.systems.common.validation import Config, bounded, require, require_field
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
 WALL = 0.3  # [m], thickness of walls
 INSET = 1.5  # [m], distance of start and goal from the ends of the volume
 
+# [m], obstacle-free radius about start and goal, also among thin or reconstructed obstacles.
 CLEARING, TIGHT_CLEARING = 1.0, 0.9
-"""[m], obstacle-free radius about start and goal in the open, and among thin or reconstructed
-obstacles; above `CLEARANCE`."""
 
 MAX_GROUND, MAX_HEIGHT = 20_000.0, 100.0  # [m²] and [m], of generated worlds: 20 million Gaussians
 PASSAGE = 2 * VEHICLE_RADIUS + 0.1  # [m], minimum width of gaps for the vehicle
@@ -83,8 +76,7 @@ def signs_in(walls: list[Solid], aside: int, ahead: int, rng: np.random.Generato
 
 
 def signs_on(wall: Solid, face: int, count: int, rng: np.random.Generator) -> list[Solid]:
-    """Draws up to `count` signs, 2 cm thick, 1 to 3.4 m high, on an upright box's face: -x, +x, -y
-    or +y, by index."""
+    """Draws up to `count` signs on an upright box's face: -x, +x, -y or +y, by index."""
     assert isinstance(wall.shape, Box)
     half, p = np.asarray(wall.shape.size) / 2, wall.shape.X_WO.translation()
     k, sign = face // 2, 2 * (face % 2) - 1
@@ -156,10 +148,7 @@ class VolumeConfig(Config):
     def check(self) -> None:
         area = self.length * self.width
         require(area <= MAX_GROUND, "length * width", f"at most {MAX_GROUND:g} m^2", f"{area:.3g}")
-        try:
-            grid_shape(self.plan.lower, self.plan.upper, self.voxel_size)
-        except ValueError as error:
-            raise FieldError(self, "voxel_size", f"must fit the volume: {error}") from None
+        grid_shape(self.plan.lower, self.plan.upper, self.voxel_size)
 
 
 def require_order(config: object, low: str, high: str) -> None:

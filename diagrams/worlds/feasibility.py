@@ -126,8 +126,7 @@ def choose_start_and_goal(
     """Returns p_WS (3,), p_WG (3,) and the length of the shortest path between them, all in [m].
 
     They are the ends of (nearly) the longest of all shortest paths, `SHORTEST` to `longest` [m], of
-    a sphere of `radius` through known free space, with `margin` [m] to spare or half of that, see
-    `_longest_part`.
+    a sphere of `radius` through known free space, with `margin` [m] to spare or half of that.
     """
     part = _longest_part(esdf, radius, margin, longest, SHORTEST)
     goal, length = _farthest(part.graph, part.end, longest)

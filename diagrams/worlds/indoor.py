@@ -38,13 +38,8 @@ def furnish(
     free: list[NDArray],
     rng: np.random.Generator,
 ) -> list[Solid]:
-    """Draws furniture of a room, none within `CLEARANCE` of `free` points (3,) [m].
-
-    Args:
-        items: number of pieces; those that do not fit in 50 draws are left out.
-        lower, upper: (2,) [m], bounds of the centers of pieces.
-        height: [m], of the room.
-    """
+    """Draws furniture with centers in [lower, upper] (2,) of a room of a height [m], none within
+    `CLEARANCE` of `free` points (3,) [m]; pieces that do not fit in 50 draws are left out."""
     furniture: list[Solid] = []
     for _ in range(items):
         make = FURNITURE[rng.integers(len(FURNITURE))]

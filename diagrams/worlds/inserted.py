@@ -16,13 +16,7 @@ from splatpilot.diagrams.worlds.solids.surfels import draw
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.collision.shapes import (
-    AnalyticDistanceField,
-    Box,
-    Capsule,
-    Shape,
-    Sphere,
-)
+from splatpilot.systems.collision.shapes import AnalyticDistanceField, Box, Capsule, Shape, Sphere
 from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.common.validation import bounded
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS

@@ -52,14 +52,8 @@ def check_split(split: str) -> None:
 
 
 def choose_split(what: str, digests: Collection[str], asked: str, found: str = "train") -> str:
-    """Returns the split of a source; raises ValueError if a test source shall have another.
-
-    Args:
-        what: the source, for messages.
-        digests: of its parts.
-        asked: the split that the user gives it; empty for none.
-        found: its split by default, unless it is a test source.
-    """
+    """Returns the split of the source `what` with digests of parts: the one that the user `asked`
+    for, if any, or `found`; test sources are always of the test split."""
     name = find_test_source(digests)
     if name is not None:
         found = "test"

@@ -57,17 +57,12 @@ def register_world(
     make: Callable[[Any, int], World] | None = None,
     make_spec: Callable[[Any, int], WorldSpec] | None = None,
 ) -> None:
-    """
-    Registers a world, so that scenarios can name it by its configuration's type.
+    """Registers a world, so that scenarios can name it by its configuration's type.
 
     Args:
         config: the type of its configurations, see `WorldConfig`; its name is their YAML tag.
         make: from a configuration and a seed to a world; by default draws the spec.
         make_spec: from a configuration and a seed to a spec, to train and render captures in it.
-
-    Raises:
-        ValueError: if another world has the name, the type is not one of configurations, or
-            neither function is given.
     """
     if make is None:
         if make_spec is None:
@@ -79,16 +74,9 @@ def register_world(
 
 
 def make_world(config: WorldConfig, seed: int) -> World:
-    """
-    Generates or reads the world that `config` describes.
+    """Generates or reads the world of a registered configuration.
 
-    Args:
-        config: of a registered world.
-        seed: of generated worlds, inserted obstacles, and start and goal if they are drawn.
-
-    Raises:
-        ValueError: for an unknown or infeasible configuration, and damaged scenes.
-        FileNotFoundError: for a missing scene.
+    The seed is of generated worlds, inserted obstacles, and start and goal if they are drawn.
     """
     world = WORLDS.kind_of(config).make(config, seed)
     if not isinstance(world, World):

@@ -210,7 +210,7 @@ def bounds_of_depth_images(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns the corners (3,) [m] of the box of all cameras and points seen, and a margin [m].
 
-    Takes every fourth pixel along both axes; arguments as for `esdf_from_depth_images`.
+    Takes every fourth pixel along both axes; see `esdf_from_depth_images`.
     """
     lower, upper = np.full(3, np.inf), np.full(3, -np.inf)
     for depth, X_WC in _pair(depths, K, X_WCs, max_range, "bounding depth"):

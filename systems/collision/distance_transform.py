@@ -20,15 +20,8 @@ def neighbor_slices(axis: int) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
 
 
 def distance_to_voxels(voxels: np.ndarray, voxel_size: float) -> np.ndarray:
-    """Computes the distance from every voxel's center to the nearest center of marked voxels.
-
-    Args:
-        voxels: (nx, ny, nz) bool.
-        voxel_size: [m].
-
-    Returns:
-        (nx, ny, nz) float32 [m]; the diagonal of the grid if no voxel is marked.
-    """
+    """Computes distances [m] of all voxel centers to the nearest center of marked voxels, at most
+    the diagonal of the grid."""
     if not voxels.any():
         return np.full(voxels.shape, _diagonal(voxels.shape, voxel_size), dtype=np.float32)
     return edt.edt(~voxels, anisotropy=(voxel_size,) * 3, parallel=1)
@@ -39,13 +32,7 @@ def occupancy_distances(occupied: np.ndarray, voxel_size: float) -> np.ndarray:
 
     At voxel centers it is the exact distance, less the excess of the trilinear interpolant in the
     half voxels around: distances to an edge or corner are convex, and a chord is above them.
-
-    Args:
-        occupied: (nx, ny, nz) bool.
-        voxel_size: [m].
-
-    Returns:
-        (nx, ny, nz) float32 [m], negative in occupied voxels.
+    Negative in occupied voxels, [m].
     """
     if not occupied.any() or occupied.all():
         far = np.float32(_diagonal(occupied.shape, voxel_size))
@@ -95,14 +82,8 @@ def distances_from_band(occupied: np.ndarray, band: np.ndarray, voxel_size: floa
     lie on different sides. The nearest s gives the first bound; passing the s of the six face
     neighbors along, twice, finds tighter ones.
 
-    Args:
-        occupied: (nx, ny, nz) bool.
-        band: (nx, ny, nz) float32 [m], NaN where unknown; not positive in occupied voxels and not
-            negative in the others.
-        voxel_size: [m].
-
-    Returns:
-        (nx, ny, nz) float32 [m]; plus or minus the diagonal of the grid if the band is empty.
+    The band (nx, ny, nz) float32 [m] is NaN where unknown, not positive in occupied voxels and not
+    negative in others; if it is empty, the result is plus or minus the diagonal of the grid.
     """
     sites = np.isfinite(band)
     if not sites.any():
@@ -140,14 +121,8 @@ def conservative_distances(
 ) -> np.ndarray:
     """Computes distances with unknown voxels and all outside the grid taken as occupied.
 
-    Args:
-        distances: (nx, ny, nz) float32 [m], signed, to the occupied surfaces.
-        states: (nx, ny, nz) uint8 `FieldState`.
-        voxel_size: [m].
-
-    Returns:
-        (nx, ny, nz) float32 [m]: in free voxels the distance to the nearest occupied surface, face
-        of an unknown voxel or face of the grid; in the others minus the distance to free space.
+    In free voxels it is the distance [m] to the nearest occupied surface, face of an unknown voxel
+    or face of the grid; in the others minus the distance to free space.
     """
     unknown = states == FieldState.UNKNOWN
     result = np.minimum(distances, _distance_to_faces(distances.shape, voxel_size))

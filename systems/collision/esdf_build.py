@@ -112,10 +112,7 @@ def esdf_from_gaussians(
     Sheets are then trimmed to 0.6 voxel on both sides of their middle: a thin opaque one is seen
     half a voxel too near, the safe side. Space in a hollow shell of Gaussians counts as free.
 
-    Args:
-        scene: the Gaussians.
-        voxel_size: [m].
-        lower_W, upper_W: (3,) [m], corners of the field.
+    The field fills the box [lower_W, upper_W], (3,) [m].
     """
     shape = grid_shape(lower_W, upper_W, voxel_size)
     density = density_on_grid(scene, np.asarray(lower_W, dtype=float), shape, voxel_size)

@@ -18,10 +18,8 @@ from splatpilot.systems.splats.background import FAR
 
 
 def reachable_space(esdf: Esdf, radius: float) -> NDArray[np.bool_]:
-    """Returns the free voxels (nx, ny, nz) connected by faces to one in which a sphere fits.
-
-    A camera anywhere in the reach of a sphere of `radius` [m] looks through these voxels only.
-    """
+    """Returns the free voxels (nx, ny, nz) connected by faces to one in which a sphere of `radius`
+    [m] fits: its camera looks through these only."""
     free = esdf.states == FieldState.FREE
     parts = np.asarray(label(free)[0], dtype=np.intp)  # pyright: ignore[reportIndexIssue]
     clearance = distance_to_voxels(~free, esdf.voxel_size) - 0.5 * esdf.voxel_size
@@ -31,12 +29,8 @@ def reachable_space(esdf: Esdf, radius: float) -> NDArray[np.bool_]:
 def frontier_faces(
     before: NDArray[np.bool_], hidden: NDArray[np.bool_]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Finds the faces between voxels `before` the frontier (nx, ny, nz) and `hidden` ones.
-
-    Returns:
-        Their centers (F, 3) in voxels from the lower corner of the grid, and their unit normals
-        (F, 3), out of hidden space.
-    """
+    """Returns centers (F, 3) [voxels] and unit normals (F, 3), out of hidden space, of the faces
+    between voxels `before` the frontier (nx, ny, nz) and `hidden` ones."""
     centers, normals = [], []
     for axis in range(3):
         normal = np.where(np.arange(3) == axis, 1.0, 0.0)

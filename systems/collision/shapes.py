@@ -170,11 +170,8 @@ class ShapeUnion:
 class AnalyticDistanceField:
     """The distance field of a `ShapeUnion` within bounds.
 
-    Every point inside the bounds is FREE or OCCUPIED. Outside: NaN, zero, OUTSIDE.
-
-    Args:
-        shapes: if empty, the distance is infinite.
-        lower_W, upper_W: (3,) [m], the bounds.
+    Every point inside the bounds [lower_W, upper_W] is FREE or OCCUPIED. Outside: NaN, zero,
+    OUTSIDE.
     """
 
     def __init__(self, shapes: Sequence[Shape], lower_W: ArrayLike, upper_W: ArrayLike) -> None:
@@ -249,12 +246,7 @@ class MovingSpheres:
 
 
 class FieldWithSpheres:
-    """The union of a distance field and spheres, within the bounds of the field.
-
-    Args:
-        centers: (M, 3) [m], infinite for absent spheres.
-        radii: (M,) [m].
-    """
+    """The union of a distance field and spheres, whose centers are infinite if absent."""
 
     def __init__(self, field: DistanceField, centers: NDArray, radii: NDArray) -> None:
         present = np.isfinite(centers).all(axis=1)

@@ -262,14 +262,7 @@ def paint_leaves(
     distance: ArrayLike,
     opacity: ArrayLike,
 ) -> GaussianScene:
-    """Draws patches that let light through.
-
-    Args:
-        albedo: (N, 3), sRGB.
-        sunlit: (N,) in [0, 1], fraction of the sun that reaches them.
-        distance: (N,) [m], through the haze.
-        opacity: a number or (N,).
-    """
+    """Draws patches that let light through, see `Daylight.irradiance` and `shade`."""
     irradiance = light.irradiance(surfels.n, sunlit, leafy=True)
     return to_gaussians(surfels, shade(albedo, irradiance, light.haze, distance), opacity)
 
@@ -413,7 +406,7 @@ def crowns(layout: ForestLayout, light: Daylight, rng: np.random.Generator) -> G
             extent = np.array([0.22, 0.15])
         q[:, :2] += trees.base[i] + q[:, 2:] * trees.lean[i]
         spread = rng.uniform(0.7, 1.3, (len(q), 1)) * extent * coarse
-        keep = q[:, 2] - 3 * spread.max(axis=1) > ceiling  # out of the volume to the last percent
+        keep = q[:, 2] - 3 * spread.max(axis=1) > ceiling  # outside the volume
         values = q, normal, spread, np.full(len(q), kind), inner
         leaves.append([value[keep] for value in values])
     p, n, size, species, depth = map(np.concatenate, zip(*leaves, strict=True))
@@ -436,11 +429,9 @@ def forest_spec(config: ForestConfig, seed: int) -> WorldSpec:
     Gaussians and distance field come from the same layout; leaves are above the flyable volume or
     flat on the ground.
 
-    A path from start to goal exists by construction: any two trunks are farther apart, at every
-    height, than the vehicle is wide, and one trunk alone leaves space beside it
-    (`TrunksConfig.check`). So trunks grown by the vehicle's radius are disjoint and cannot close a
-    line from side to side; rocks and logs end below the flight height, and no trunk is near start
-    and goal.
+    A path from start to goal exists by construction: trunks grown by the vehicle's radius are
+    disjoint and leave space at the sides (`TrunksConfig.check`), so they cannot close a line from
+    side to side; rocks and logs end below the flight height, and no trunk is near start and goal.
     """
     return Forest(config, seed).spec()
 

@@ -40,13 +40,8 @@ class Daylight:
     def irradiance(
         self, normal: ArrayLike, sunlit: ArrayLike, leafy: bool = False
     ) -> NDArray[np.float64]:
-        """Computes the light on surfaces, linear RGB (N, 3).
-
-        Args:
-            normal: (N, 3), unit, in W.
-            sunlit: (N,) in [0, 1], fraction of the sun that reaches the surface.
-            leafy: for leaves, which let light through.
-        """
+        """Computes light, linear (N, 3), on surfaces of unit normals (N, 3) in the fraction
+        `sunlit` (N,) of the sun; leaves (`leafy`) let light through."""
         normal = np.asarray(normal)
         facing = normal @ self.direction
         facing = 0.35 + 0.65 * np.abs(facing) if leafy else np.clip(facing, 0, None)
@@ -68,13 +63,8 @@ class Daylight:
     def past_trunks(
         self, p: ArrayLike, trunks: ArrayLike, radii: ArrayLike, height: float
     ) -> NDArray[np.float32]:
-        """Computes the fraction of the sun (N,) past upright trunks to the points p (N, 3) [m].
-
-        Args:
-            trunks: (M, 2) [m], their positions.
-            radii: (M,) [m].
-            height: [m], of the trunks.
-        """
+        """Computes the fraction of the sun (N,) at p (N, 3) [m] past upright trunks at (M, 2) [m]
+        with `radii` (M,) [m] and a height [m]."""
         p = np.asarray(p, dtype=np.float32)
         flat = self.direction[:2] / np.linalg.norm(self.direction[:2])
         reach = (height - p[:, 2]) * np.float32(np.hypot(*self.direction[:2]) / self.direction[2])
@@ -95,14 +85,8 @@ class Daylight:
 def shade(
     albedo: NDArray, irradiance: ArrayLike, haze: ArrayLike, distance: ArrayLike
 ) -> NDArray[np.float64]:
-    """Computes colors (N, 3), sRGB, of surfaces in light and haze.
-
-    Args:
-        albedo: (N, 3), sRGB, not negative.
-        irradiance: (N, 3), linear.
-        haze: (3,), sRGB.
-        distance: (N,) [m], through the haze.
-    """
+    """Computes colors (N, 3), sRGB, of surfaces of an albedo (N, 3), sRGB, in linear light (N, 3)
+    and haze (3,), sRGB, at distances (N,) [m]."""
     return fade(develop(albedo**GAMMA * np.asarray(irradiance)), haze, distance)
 
 

@@ -38,16 +38,13 @@ class FloorPlan:
         return np.einsum("nk,nk->n", n, corner - p) > 1e-9
 
 
+# Standard deviation over spacing at which a layer of splats has no holes.
 COVERAGE = 0.62
-"""Standard deviation over spacing at which a layer of splats has no holes: midway between four
-neighbors each is still half opaque."""
-
 THICKNESS = 0.001  # [m], standard deviation of a splat across its surface
 
+# [standard deviations] from the centers of the outermost patches to the edge of a layer, where two
+# layers that meet are half opaque.
 RIM = 1.9
-"""[standard deviations] from the centers of the outermost patches to the edge of a layer. One layer
-is half opaque at 1.4, two that meet at an edge a little farther out."""
-
 _BULGE = 2.0  # the same of flat patches around a curved surface, which overlap along its outline
 _RINGS = 0.5, 4.0, 9.0, 16.0, 28.0  # [m], from the volume to the outer edges of rings of ground
 GROUND_REACH = _RINGS[-1]  # [m], width of the ground around the volume
@@ -135,14 +132,8 @@ def ground_rings(
 
 
 def on_ground(p: ArrayLike, angle: ArrayLike, extent: ArrayLike, height: ArrayLike) -> Surfels:
-    """Lays patches flat on a horizontal plane.
-
-    Args:
-        p: (N, 2) [m].
-        angle: (N,) [rad], direction of the first extent, from x toward y.
-        extent: (N, 2) or (2,) [m], standard deviations.
-        height: [m], a number or (N,).
-    """
+    """Lays patches flat at p (N, 2) and `height` [m], with the first extent at `angle` (N,) [rad]
+    from x toward y; extents are (N, 2) or (2,) [m]."""
     p, angle = np.asarray(p, dtype=np.float64), np.asarray(angle, dtype=np.float64)
     N, zeros = len(p), np.zeros(len(p))
     return Surfels(
@@ -160,12 +151,8 @@ def widest(radius: float, inset: float) -> float:
 
 
 def inset(surfels: Surfels, across: NDArray[np.float64], radius: ArrayLike) -> Surfels:
-    """Moves flat patches on a curved surface inwards so that they do not widen its outline.
-
-    Args:
-        across: (N,) [m], their standard deviations in the direction of the curvature.
-        radius: [m], of curvature, a number or (N,).
-    """
+    """Moves flat patches on a surface of a radius [m] of curvature inwards so that they do not
+    widen its outline; `across` (N,) [m] are their standard deviations along the curvature."""
     radius = np.asarray(radius, dtype=np.float64)
     bulge = np.minimum(_BULGE * across, 0.8 * radius)
     depth = radius - np.sqrt(radius**2 - bulge**2)
@@ -180,13 +167,8 @@ def tube(
     rng: np.random.Generator,
     taper: float = 1.0,
 ) -> Surfels:
-    """Covers the side of the cylinder from p_A (3,) to p_B (3,) with staggered columns of patches,
-    first extent along the axis.
-
-    Args:
-        radius: [m].
-        spacing: [m], around and along the axis.
-        taper: radius at p_B over radius at p_A.
+    """Covers the side of the cylinder from p_A to p_B (3,) with staggered columns of patches, first
+    extent along the axis; spacing [m] around and along it, radius at p_B over that at p_A `taper`.
     """
     p_A, p_B = np.asarray(p_A, dtype=np.float64), np.asarray(p_B, dtype=np.float64)
     length = float(np.linalg.norm(p_B - p_A))

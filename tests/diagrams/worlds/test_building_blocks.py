@@ -61,9 +61,3 @@ def test_the_rectangle_is_filled():
     distance, _ = KDTree(points).query(places)
     assert distance.max() < 1.5 * 1.3
     assert np.mean(distance < 1.3) > 0.99
-
-
-def test_the_points_follow_from_the_generator():
-    a, b, c = (poisson_disk(LOWER, UPPER, 2.0, np.random.default_rng(s)) for s in (7, 7, 8))
-    np.testing.assert_array_equal(a, b)
-    assert a.shape != c.shape or (a != c).any()

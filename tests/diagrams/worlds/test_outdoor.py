@@ -5,10 +5,7 @@ from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.scenarios import scenario_file
 from splatpilot.diagrams.worlds import feasibility, outdoor
 from splatpilot.diagrams.worlds.indoor import RoomConfig
-from splatpilot.diagrams.worlds.outdoor import (
-    BranchesConfig,
-    ClutterConfig,
-)
+from splatpilot.diagrams.worlds.outdoor import BranchesConfig, ClutterConfig
 from splatpilot.diagrams.worlds.solids.solid import WorldSpec
 from splatpilot.diagrams.worlds.world_registry import make_spec
 from splatpilot.systems.collision.shapes import Box, Capsule

@@ -9,11 +9,7 @@ from splatpilot.diagrams.worlds.feasibility import CLEARANCE, connects
 from splatpilot.diagrams.worlds.indoor import OfficeConfig, RoomConfig
 from splatpilot.diagrams.worlds.inserted import InsertedConfig
 from splatpilot.diagrams.worlds.octomap_world import OctomapConfig
-from splatpilot.diagrams.worlds.outdoor import (
-    ClutterConfig,
-    OverUnderConfig,
-    WallsConfig,
-)
+from splatpilot.diagrams.worlds.outdoor import ClutterConfig, OverUnderConfig, WallsConfig
 from splatpilot.diagrams.worlds.world_registry import make_spec, make_world
 from splatpilot.systems.common.config import load_config
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS

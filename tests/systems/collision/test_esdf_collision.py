@@ -1,6 +1,3 @@
-import gc
-import weakref
-
 import numpy as np
 import pytest
 
@@ -88,12 +85,3 @@ def test_all_outputs_share_one_query_and_follow_the_state():
 def test_bad_parameters_are_refused(name, value):
     with pytest.raises(ValueError, match=f"{name} must be .* got {value}"):
         EsdfCollision(CountingField(), **{name: value})
-
-
-def test_is_freed():
-    system = EsdfCollision(CountingField())
-    outputs_at(system, [2.5, 0.0, 0.0])
-    held = weakref.ref(system)
-    del system
-    gc.collect()
-    assert held() is None

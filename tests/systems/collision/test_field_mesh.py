@@ -1,20 +1,12 @@
-import base64
-
 import numpy as np
 import pytest
 import trimesh
 from pydrake.geometry import GeometryInstance, Mesh, ProximityProperties, SceneGraph
-from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.math import RigidTransform
 
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.collision.field_mesh import (
-    add_primitive,
-    data_uri,
-    field_mesh,
-    write_mesh,
-    y_up,
-)
+from splatpilot.systems.collision.field_mesh import field_mesh, write_mesh
 
 LOWER, VOXEL, SHAPE = np.array([-1.0, -2.0, 0.5]), 0.1, (30, 36, 24)
 CENTER, RADIUS = np.array([0.4, -0.3, 1.95]), 0.7
@@ -111,45 +103,3 @@ def test_files_are_read_by_others(tmp_path):
 def test_without_anything_solid_there_is_no_mesh():
     with pytest.raises(ValueError, match="no surface in this field"):
         field_mesh(field(lambda p: ball(p) + 10.0))
-
-
-TYPES = {5126: "<f4", 5125: "<u4"}
-COLUMNS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3}
-
-
-def _read(document: dict, number: int) -> np.ndarray:
-    """The array of an accessor, as the specification says."""
-    accessor = document["accessors"][number]
-    view = document["bufferViews"][accessor["bufferView"]]
-    buffer = document["buffers"][view["buffer"]]
-    content = base64.b64decode(buffer["uri"].split(",")[1])
-    assert len(content) == buffer["byteLength"] == view["byteLength"]
-    array = np.frombuffer(content, TYPES[accessor["componentType"]])
-    return array.reshape(accessor["count"], COLUMNS[accessor["type"]])
-
-
-def test_turned_by_a_right_angle_about_x_points_are_back():
-    p = np.random.default_rng(0).normal(size=(20, 3))
-    back = RotationMatrix.MakeXRotation(np.pi / 2).multiply(y_up(p).T).T
-    np.testing.assert_allclose(back, p, atol=1e-12)
-
-
-def test_every_primitive_of_a_document_reads_as_written():
-    rng, document, written = np.random.default_rng(0), {}, []
-    for count in (4, 7):
-        p, uv = rng.normal(size=(count, 3)), rng.uniform(size=(count, 2))
-        triangles = rng.integers(0, count, (5, 3))
-        written.append((p, uv, triangles, add_primitive(document, p, uv, triangles)))
-    for p, uv, triangles, primitive in written:
-        position = primitive["attributes"]["POSITION"]
-        np.testing.assert_allclose(_read(document, position), y_up(p), atol=1e-6)
-        np.testing.assert_allclose(_read(document, primitive["attributes"]["TEXCOORD_0"]), uv, 1e-6)
-        np.testing.assert_array_equal(
-            _read(document, primitive["indices"]).reshape(-1, 3), triangles
-        )
-        np.testing.assert_allclose(document["accessors"][position]["max"], y_up(p).max(0), 1e-6)
-
-
-def test_data_uri_holds_its_content():
-    head, _, content = data_uri("image/png", b"\x00\xff splat").partition(",")
-    assert head == "data:image/png;base64" and base64.b64decode(content) == b"\x00\xff splat"

@@ -142,13 +142,3 @@ def test_real_maps(maps, name, resolution, extent):
     octomap = read_octomap(maps / f"{name}.bt")
     assert octomap.resolution == resolution
     np.testing.assert_allclose(octomap.upper_W - octomap.lower_W, extent, atol=1e-6)
-
-
-def test_the_field_of_a_real_forest(maps):
-    field = read_octomap(maps / "forest0.bt").esdf()
-    assert field.shape == (100, 100, 50)
-    assert field.volume(UNKNOWN) == 0.0
-    assert 0.7 < field.volume(FREE) / 500.0 < 0.9
-    x, y, _ = (c.ravel() for c in np.meshgrid(*field.voxel_centers()[:2], [0.0]))
-    flying = field.distance(np.stack([x, y, np.full(x.shape, 1.5)], -1))
-    assert (flying < 0.0).any() and np.quantile(flying, 0.9) > 0.4

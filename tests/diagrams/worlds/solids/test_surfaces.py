@@ -106,12 +106,6 @@ def test_surfaces_face_the_volume_if_they_face_one_of_its_corners():
     assert 0.1 < ahead.mean() < 0.9
 
 
-def test_the_bounds_of_the_volume_face_it_from_outside_only():
-    wall, inwards = np.array([[0.0, 0.0, 1.0]]), np.array([[1.0, 0.0, 0.0]])
-    assert PLOT.is_faced(wall, inwards).all()
-    assert not PLOT.is_faced(wall, -inwards).any()
-
-
 def test_outside_is_the_distance_in_plan():
     p = np.array([[3.0, 0.0, 9.0], [3.0, 5.0, 1.0], [-3.0, -6.0, 1.0]])
     np.testing.assert_allclose(PLOT.outside(p), [0, 3, 5])

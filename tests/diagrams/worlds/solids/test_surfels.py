@@ -7,14 +7,7 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from splatpilot.diagrams.worlds.solids.solid import Solid, WorldSpec
 from splatpilot.diagrams.worlds.solids.surfels import draw
-from splatpilot.systems.collision.shapes import (
-    Box,
-    Capsule,
-    Cylinder,
-    Shape,
-    ShapeUnion,
-    Sphere,
-)
+from splatpilot.systems.collision.shapes import Box, Capsule, Cylinder, Shape, ShapeUnion, Sphere
 from splatpilot.systems.splats.baked_scene import BakedScene
 
 SIZE, FOCAL, AWAY = 200, 400.0, 5.0  # [px], [px], [m]

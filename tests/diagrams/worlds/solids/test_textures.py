@@ -1,11 +1,7 @@
 import numpy as np
 import pytest
 
-from splatpilot.diagrams.worlds.solids import textures
 from splatpilot.diagrams.worlds.solids.textures import (
-    BIRCH,
-    OAK,
-    PINE,
     fbm,
     hash_unit,
     mix,
@@ -66,23 +62,3 @@ def test_mix_and_ramp_are_linear():
     a, b = np.array([0.0, 0.2, 1.0]), np.array([1.0, 0.4, 0.0])
     for blend in (mix(a, b, [0, 0.5, 1]), ramp([a, b], [0, 0.5, 1])):
         np.testing.assert_allclose(blend, [a, (a + b) / 2, b], atol=1e-6)
-
-
-@pytest.mark.parametrize(
-    "material",
-    [
-        *(lambda p, s=s: textures.bark(s, p) for s in (OAK, PINE, BIRCH)),
-        *(lambda p, s=s: textures.fissure(s, p) for s in (OAK, PINE)),
-        *(lambda p, s=s: textures.leaf(s, p) for s in (OAK, PINE, BIRCH)),
-        textures.moss,
-        textures.stone,
-        lambda p: textures.forest_floor(p[:, :2])[0],
-        lambda p: textures.fallen_leaf(p[:, :2]),
-    ],
-)
-def test_materials_are_varied_colors(material, points):
-    colors = material(points)
-    assert colors.shape == (len(points), 3)
-    assert colors.min() >= 0 and colors.max() <= 1
-    assert colors.std(axis=0).min() > 0.01
-    np.testing.assert_array_equal(material(points), colors)
