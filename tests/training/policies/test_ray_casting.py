@@ -320,9 +320,9 @@ def test_bad_input_is_refused():
     p, R = cameras(0, 2)
     for world in ([0, 1], [-1, 0]):
         for g in (geometry, field):
-            with pytest.raises(ValueError, match=r"world -?1 of 1"):
+            with pytest.raises(ValueError, match=r"world must be in \[0, 1\), got -?1"):
                 g.nearest(p, torch.tensor(world), 1)
-            with pytest.raises(ValueError, match=r"world -?1 of 1"):
+            with pytest.raises(ValueError, match=r"world must be in \[0, 1\), got -?1"):
                 g.depth(p, R, RAYS, torch.tensor(world))
     world = numbers(2) * 0
     with pytest.raises(ValueError, match="differ in length"):
