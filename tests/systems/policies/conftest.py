@@ -1,12 +1,9 @@
-"""Small worlds of analytic shapes, shared by the tests of the policies."""
-
 import numpy as np
 import pytest
 from pydrake.math import RigidTransform
 
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.collision.esdf_build import esdf_from_distance_field
-from splatpilot.systems.collision.occupancy import esdf_from_occupancy
+from splatpilot.systems.collision.esdf_build import esdf_from_distance_field, esdf_from_occupancy
 from splatpilot.systems.collision.shapes import AnalyticDistanceField, Box, Cylinder, HalfSpace
 
 VOXEL_SIZE = 0.2
