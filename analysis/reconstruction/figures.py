@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from splatpilot.analysis.output import write_png
-from splatpilot.systems.splats.baked_scene import RenderedView
+from splatpilot.systems.splats.background import RenderedView
 from splatpilot.training.captures.capture import CaptureFrame
 from splatpilot.training.reconstruction.metrics import has_true_depth
 

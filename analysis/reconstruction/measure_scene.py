@@ -30,8 +30,7 @@ from splatpilot.systems.common.files import require_unused, written_atomically
 from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.policies.time_of_arrival import time_of_arrival
-from splatpilot.systems.splats.background import put_behind
-from splatpilot.systems.splats.baked_scene import RenderedView
+from splatpilot.systems.splats.background import RenderedView, put_behind
 from splatpilot.systems.splats.scene import color_to_sh
 from splatpilot.systems.splats.splat_files import read_ply
 from splatpilot.training.captures.capture import Capture, CaptureFrame, shrink, shrink_factor

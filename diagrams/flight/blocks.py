@@ -67,7 +67,7 @@ def AddPolicyAndController(
             zeros, and `finite_heading` such headings by NaN; `command` is not exported.
     """
     # Pose, distances and goal.
-    spheres = world.moving.balls if world.moving else None
+    spheres = world.moving.spheres if world.moving else None
     pose, collision = StateToPose(), EsdfCollision(world.distance_field, spheres)
     for name, system in (("pose", pose), ("collision", collision)):
         builder.AddNamedSystem(name, system)

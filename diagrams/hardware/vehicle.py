@@ -42,7 +42,7 @@ from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.hardware.bridge import HardwareConfig, image_codecs, require_messages_for
 from splatpilot.diagrams.hardware.message_ports import MessagePorts
 from splatpilot.diagrams.hardware.real_time import run_in_real_time
-from splatpilot.diagrams.worlds.appearance import seen_otherwise
+from splatpilot.diagrams.worlds.appearance import randomize_appearance
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.collision.esdf_collision import EsdfCollision
@@ -219,7 +219,7 @@ def run(*, scenario: Scenario, config: HardwareConfig, out: Path) -> dict[str, f
     config.validate()
     lcm = open_lcm(config.url)
     world = make_world(scenario.world, scenario.seed)
-    world = seen_otherwise(world, scenario.appearance, scenario.seed)
+    world = randomize_appearance(world, scenario.appearance, scenario.seed)
     start = sample_initial_state(scenario, world)
     require_writable_folder(out)
     diagram = BuildVehicleDiagram(scenario, world, lcm, config)

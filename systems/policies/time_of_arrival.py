@@ -94,7 +94,7 @@ class TimeOfArrival:
             p_WQ=np.ascontiguousarray(p_WQ, dtype=float),
             step=step,
             length=longest,
-            way=rows,
+            path=rows,
         )
         *way, covered = rows[:count].T  # 3 of (m,), (m,)
 

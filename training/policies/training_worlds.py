@@ -22,7 +22,7 @@ from splatpilot.diagrams.worlds.world_registry import (
     WorldConfig,
     make_spec,
     make_world,
-    place_config,
+    scene_config,
 )
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.esdf_build import esdf_from_distance_field
@@ -398,7 +398,7 @@ class _Place(NamedTuple):
 
     @classmethod
     def read(cls, scene: str) -> "_Place":
-        esdf = make_world(place_config(place_to_learn_in(scene)), seed=0).esdf
+        esdf = make_world(scene_config(place_to_learn_in(scene)), seed=0).esdf
         return cls(esdf, esdf.conservative())
 
     def world(self, seed: int) -> TrainingWorld:

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
+from splatpilot.systems.collision.depth_fusion import bounds_of_depth_images, esdf_from_depth_images
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.collision.esdf_build import bounds_of_depth_images, esdf_from_depth_images
 from splatpilot.systems.splats.background import FAR
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.training.captures.capture import Capture, shrink_mask

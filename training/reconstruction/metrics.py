@@ -7,8 +7,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from splatpilot.systems.splats.background import FAR, Background, put_behind
-from splatpilot.systems.splats.baked_scene import RenderedView
+from splatpilot.systems.splats.background import FAR, Background, RenderedView, put_behind
 from splatpilot.training.captures.capture import CaptureFrame
 from splatpilot.training.reconstruction.losses import ssim_map
 from splatpilot.training.reconstruction.lpips import Lpips

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform
 
-from splatpilot.systems.splats.baked_scene import RenderedView
+from splatpilot.systems.splats.background import RenderedView
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.training.captures.capture import CaptureFrame
 from splatpilot.training.reconstruction.metrics import (

@@ -111,8 +111,3 @@ def test_file_is_whole_and_the_same_twice(spec, tmp_path):
     ]
     np.testing.assert_allclose(position["min"], [-28, 0, -30.5], atol=1e-6)
     assert position["max"][1] == pytest.approx(3.8, abs=0.02)
-
-
-def test_a_folder_that_does_not_exist_is_an_error(spec, tmp_path):
-    with pytest.raises(OSError, match="nowhere"):
-        write_gltf(spec, tmp_path / "nowhere" / "world.gltf", texel=0.2)

@@ -1,15 +1,20 @@
+from functools import partial
+
 import numpy as np
 import pytest
 
 from splatpilot.diagrams.worlds.feasibility import (
     choose_start_and_goal,
+    connects,
     draw_start_and_goal,
     short_route_warning,
 )
 from splatpilot.systems.collision.esdf_build import esdf_from_occupancy
+from splatpilot.systems.collision.shapes import AnalyticDistanceField, Capsule
 from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.policies.lattice import LatticeConfig
 from splatpilot.systems.policies.time_of_arrival import time_of_arrival
+from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
 RADIUS = 0.354
 
@@ -47,28 +52,19 @@ def test_length_is_measured_around_the_corner():
     assert ends[0, 0] < 1 and ends[1, 1] > 5
 
 
-def test_longest_path_is_bounded():
-    esdf = corridors(ALONG_X)
-    p_WS, p_WG, length = choose_start_and_goal(esdf, RADIUS, margin=0.1, longest=3.0)
-    assert 2.7 < length <= 3.0
-    assert np.linalg.norm(p_WS - p_WG) <= length + 1e-9
-
-
 def test_unknown_space_is_not_flown_through():
     esdf = corridors(ALONG_X, unknown=[((1.5, 0.2, 0.2), (2.0, 1.8, 1.8))])
     p_WS, p_WG, _ = choose_start_and_goal(esdf, RADIUS, margin=0.1)
     assert min(p_WS[0], p_WG[0]) > 2.0 + RADIUS
 
 
-def test_narrow_places_get_less_margin():
+def test_narrow_corridors_get_less_margin():
     esdf = corridors(((0.2, 0.2, 0.2), (5.8, 1.3, 1.3)))
     p_WS, p_WG, length = choose_start_and_goal(esdf, RADIUS, margin=0.2)
     assert length > 3
     assert (esdf.conservative().distance(np.array([p_WS, p_WG])) > RADIUS + 0.1).all()
-    way = time_of_arrival(esdf.conservative(), p_WG, LatticeConfig().margin)
-    assert way.is_reachable(p_WS)
-    with pytest.raises(ValueError, match="no free space"):
-        choose_start_and_goal(corridors(((0.2, 0.2, 0.2), (5.8, 0.95, 0.95))), RADIUS)
+    times = time_of_arrival(esdf.conservative(), p_WG, LatticeConfig().margin)
+    assert times.is_reachable(p_WS)
 
 
 def test_the_longer_route_is_chosen_not_the_larger_part():
@@ -93,36 +89,29 @@ def test_half_of_the_margin_is_taken_for_a_much_longer_route():
     assert "5.0 m" in short_route_warning(5.0)
 
 
-def test_no_room_at_all():
+@pytest.mark.parametrize("upper", [(5.8, 0.7, 0.7), (1.8, 1.4, 1.4)])
+@pytest.mark.parametrize("choose", [choose_start_and_goal, partial(draw_start_and_goal, seed=0)])
+def test_space_too_narrow_for_a_route_is_refused(upper, choose):
     with pytest.raises(
         InfeasibleFlightError,
-        match=r"radius 0\.354 m with 0\.1 m to spare: the largest clearance is 0\.\d\d m",
+        match=r"radius 0\.354 m .* at least 1 m, got 0\.\d\d m; the largest clearance is 0\.\d\d m",
     ):
-        choose_start_and_goal(corridors(((0.2, 0.2, 0.2), (5.8, 0.7, 0.7))), RADIUS)
+        choose(corridors(((0.2, 0.2, 0.2), upper)), RADIUS)
 
 
-def test_no_way_worth_a_flight():
-    cell = corridors(((0.2, 0.2, 0.2), (1.8, 1.4, 1.4)))
-    for choose in (choose_start_and_goal, lambda *given: draw_start_and_goal(*given, seed=0)):
-        with pytest.raises(
-            InfeasibleFlightError, match=r"longest route .* at least 1 m, got 0\.\d\d m"
-        ):
-            choose(cell, RADIUS)
-
-
-def test_same_field_same_choice():
-    esdf = corridors(ALONG_X, ALONG_Y)
-    first, second = (choose_start_and_goal(esdf, RADIUS) for _ in range(2))
-    np.testing.assert_array_equal(first[0], second[0])
-    np.testing.assert_array_equal(first[1], second[1])
-
-
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(3))
 def test_drawn_ends_are_as_far_apart_as_asked(seed):
     esdf = corridors(ALONG_X, ALONG_Y)
     _, _, longest = choose_start_and_goal(esdf, RADIUS)
     _, _, length = draw_start_and_goal(esdf, RADIUS, seed, least=0.8 * longest)
     assert 0.8 * longest <= length <= longest + 1e-9
-    message = r"longest route .* at least 50 m, got \d\.\d+ m"
-    with pytest.raises(InfeasibleFlightError, match=message):
+    with pytest.raises(InfeasibleFlightError, match=r"at least 50 m, got \d\.\d+ m"):
         draw_start_and_goal(esdf, RADIUS, seed, least=50.0)
+
+
+def test_a_wire_between_grid_points_closes_the_way():
+    lower, upper = np.array([0.0, -1.5, 0]), np.array([8.0, 1.5, 3])
+    ends = np.array([1.5, 0, 1.5]), np.array([6.5, 0, 1.5])
+    net = [Capsule([4.0, y, -1], [4.0, y, 4], 0.01) for y in np.arange(-1.3, 1.5, 0.52)]
+    assert connects(AnalyticDistanceField([], lower, upper), *ends, VEHICLE_RADIUS, 0.15)
+    assert not connects(AnalyticDistanceField(net, lower, upper), *ends, VEHICLE_RADIUS, 0.15)
