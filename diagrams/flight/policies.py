@@ -13,7 +13,7 @@ from splatpilot.systems.common.config import require_configuration
 from splatpilot.systems.common.registry import Registry
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.policies.agile_autonomy import AgileAutonomy, AgileAutonomyConfig
-from splatpilot.systems.policies.checkpoint import policy_of, shipped_weights
+from splatpilot.systems.policies.checkpoint import checkpoint_policy, shipped_weights
 from splatpilot.systems.policies.depthnav import DepthNav, DepthNavConfig
 from splatpilot.systems.policies.diffaero import (
     DiffAero,
@@ -131,7 +131,7 @@ def policy_named(name: str, speed: float = DEFAULT_SPEED) -> Any:
         name: a registered name, `module:attribute`, or a file of trained weights (.npz).
     """
     weights = name if name.endswith(".npz") else ""
-    kind = POLICIES.find(policy_of(weights) if weights else name)
+    kind = POLICIES.find(checkpoint_policy(weights) if weights else name)
     config = kind.config()
     if kind.speed_field:
         config = at_speed(config, speed)

@@ -212,10 +212,10 @@ class Esdf:
             kind = f"an array of {ndim} dimensions, of kind {' or '.join(kinds)}"
             found = "nothing" if array is None else f"{array.dtype} of {array.shape}"
             require(valid, f"{path}: {name}", kind, found)
-        version, *arrays, voxel_size, outside = (archive[name] for name in _ENTRIES)
+        version, distances, states, lower_W, voxel_size, outside = (archive[n] for n in _ENTRIES)
         require(version == FORMAT_VERSION, f"{path}: version", str(FORMAT_VERSION), version)
         try:
-            return cls(*arrays, float(voxel_size), bool(outside))
+            return cls(distances, states, lower_W, float(voxel_size), bool(outside))
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from error
 

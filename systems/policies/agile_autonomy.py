@@ -7,14 +7,21 @@ import numpy as np
 
 from splatpilot.systems.common.drake import input_port, output_port
 from splatpilot.systems.policies.base import LearnedPolicyConfig, Observation, Policy
-from splatpilot.systems.policies.checkpoint import PolicyCheckpoint, check_weights
+from splatpilot.systems.policies.checkpoint import (
+    PolicyCheckpoint,
+    check_weights,
+    linear,
+    linear_shapes,
+    require_shape,
+)
+from splatpilot.systems.policies.convolutions import convolution_shapes
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS, Hypotheses, no_plan
 from splatpilot.systems.policies.observations import pool_depth, target_velocity
 from splatpilot.systems.policies.recurrent_network import (
-    Convolutions,
-    Layer,
-    convolution_shapes,
-    layer_sizes,
+    DepthEncoder,
+    DepthLayer,
+    DepthSpec,
+    depth_layers,
     leaky_relu,
 )
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
@@ -51,86 +58,64 @@ class AgileAutonomyConfig(LearnedPolicyConfig):
 
 
 @dataclass(frozen=True)
-class TrajectoryNetworkSpec:
-    """The architecture: convolutions of the image and layers of the state, joined; one layer to
-    the features of each mode; and one head for all modes."""
+class TrajectoryNetworkSpec(DepthSpec):
+    """Architecture: convolutions of the image and layers of the state, joined; one layer to the
+    features of each mode; and one head for all modes."""
 
     image_height: int = 24
     image_width: int = 32
-    convolutions: tuple[Layer, ...] = ((16, 5, 2, 2), (32, 3, 2, 1), (64, 3, 2, 1), (32, 3, 1, 1))
+    convolutions: tuple[DepthLayer, ...] = (
+        (16, 5, 2, 2),
+        (32, 3, 2, 1),
+        (64, 3, 2, 1),
+        (32, 3, 1, 1),
+    )
     image_features: int = 128
     state_features: int = 64
     mode_features: int = 64
     head_features: int = 128
 
-    def flat_features(self) -> int:
-        """Numbers after the last convolution."""
-        image = (1, self.image_height, self.image_width)
-        return int(np.prod(layer_sizes(image, self.convolutions)[-1]))
-
     def weight_shapes(self) -> dict[str, tuple[int, ...]]:
-        """The name and shape of every array of weights."""
-        shapes = convolution_shapes(self.convolutions)
+        """Returns the shapes of all arrays of weights by name."""
         joined = self.image_features + self.state_features
-        for name, inputs, outputs in (
-            ("image_layer", self.flat_features(), self.image_features),
+        return convolution_shapes(depth_layers(self.convolutions)) | linear_shapes(
+            ("image_layer", self.image_outputs(), self.image_features),
             ("state_layer", STATE_SIZE, self.state_features),
             ("state_layer_2", self.state_features, self.state_features),
             ("modes", joined, MODES * self.mode_features),
             ("head", self.mode_features, self.head_features),
             ("output", self.head_features, 3 * NUM_WAYPOINTS + 1),
-        ):
-            shapes[f"{name}.weight"], shapes[f"{name}.bias"] = (outputs, inputs), (outputs,)
-        return shapes
+        )
 
 
 AGILE_NETWORK = TrajectoryNetworkSpec()
 
 
 class TrajectoryNetwork:
-    """The network with its weights, in numpy.
-
-    Raises:
-        ValueError: if weights are missing, of another shape or not finite.
-    """
+    """The network with its weights, by the names of `weight_shapes`, in numpy."""
 
     def __init__(self, spec: TrajectoryNetworkSpec, weights: dict[str, np.ndarray]) -> None:
         self.spec = spec
         self._weights = check_weights(weights, spec.weight_shapes())
-        image = (1, spec.image_height, spec.image_width)
-        self._convolutions = Convolutions(image, spec.convolutions, self._weights)
+        self._encoder = DepthEncoder(spec, self._weights)
 
     def __call__(self, image: np.ndarray, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Waypoints (3, 10, 3) [m] in the body frame and costs (3,).
+        """Computes waypoints (3, 10, 3) [m] in the body frame and costs (3,).
 
         Args:
             image: (24, 32), encoded depth.
-            state: (18,).
-
-        Raises:
-            ValueError: if an argument has the wrong shape.
+            state: (18,), see `state_observation`.
         """
-        spec = self.spec
-        for name, array, shape in (
-            ("image", image, (spec.image_height, spec.image_width)),
-            ("state", state, (STATE_SIZE,)),
-        ):
-            if np.shape(array) != shape:
-                raise ValueError(
-                    f"the policy's {name} has shape {np.shape(array)}, but its network takes "
-                    f"{shape}"
-                )
-        x = leaky_relu(self._linear("image_layer", self._convolutions(image)))
-        y = leaky_relu(self._linear("state_layer", np.asarray(state, np.float32)))
-        y = leaky_relu(self._linear("state_layer_2", y))
-        modes = leaky_relu(self._linear("modes", np.concatenate([x, y])))
-        hidden = leaky_relu(self._linear("head", modes.reshape(MODES, -1)))
-        output = self._linear("output", hidden)
+        require_shape("state", state, (STATE_SIZE,))
+        x = self._layer("image_layer", self._encoder(image))
+        y = self._layer("state_layer_2", self._layer("state_layer", np.asarray(state, np.float32)))
+        modes = self._layer("modes", np.concatenate([x, y]))
+        output = linear(self._weights, "output", self._layer("head", modes.reshape(MODES, -1)))
         waypoints = WAYPOINT_SCALE * output[:, :-1].reshape(MODES, NUM_WAYPOINTS, 3)
         return waypoints, output[:, -1]
 
-    def _linear(self, name: str, x: np.ndarray) -> np.ndarray:
-        return x @ self._weights[f"{name}.weight"].T + self._weights[f"{name}.bias"]
+    def _layer(self, name: str, x: np.ndarray) -> np.ndarray:
+        return leaky_relu(linear(self._weights, name, x))
 
 
 def load_network(path: str | None) -> TrajectoryNetwork:
@@ -156,7 +141,6 @@ def plan(
     ties the hypothesis that continues `last` gets the lowest cost.
 
     Args:
-        network: of the architecture `AGILE_NETWORK`.
         seen: with depth (H, W), multiples of 24 and 32 pixels.
         speed: nominal [m/s].
         last: the plan of the update before.

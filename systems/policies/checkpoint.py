@@ -1,8 +1,7 @@
-"""Files of trained policies: weights, architecture and how they were made, in one .npz."""
+"""Files of trained policies, `.npz`: weights, architecture and provenance."""
 
 import json
-import struct
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -11,18 +10,19 @@ import numpy as np
 
 from splatpilot.systems.common.files import written_atomically
 from splatpilot.systems.common.readers import read_archive, reason_of
+from splatpilot.systems.common.validation import require
 
 FORMAT = 1
-"""Of the file; observations and commands that mean something else make another number."""
+"""Version of files; it changes with the meaning of observations and commands."""
 
-_LARGEST = 1e6  # A sum of products with what is seen does not leave single precision.
+_MAX_WEIGHT = 1e6  # Sums of products with observations stay in single precision.
 
 _SHIPPED = Path(__file__).parent / "weights"
 
 
 @dataclass(frozen=True, eq=False)
 class PolicyCheckpoint:
-    """What a file holds."""
+    """Content of a file of weights."""
 
     policy: str
     """Name of the policy, as in the benchmark."""
@@ -30,25 +30,18 @@ class PolicyCheckpoint:
     """Architecture of the network, a dataclass."""
     weights: Mapping[str, np.ndarray]
     provenance: dict[str, Any]
-    """How it was made: command, config, seed, revision and success, as what JSON can hold."""
+    """Command, configuration, revision and success, in types of JSON."""
     path: Path | None = None
-    """The file, if it was read from one."""
 
     def build[Network](self, make: Callable[[Any, dict[str, np.ndarray]], Network]) -> Network:
-        """The network that `make` makes of the architecture and the weights.
-
-        Raises:
-            ValueError: for weights that it refuses; the message names the file.
-        """
+        """Makes the network from the architecture and the weights; errors name the file."""
         try:
             return make(self.spec, dict(self.weights))
         except ValueError as error:
-            raise ValueError(
-                f"{self.path}: {error}; train them with: splatpilot train {self.policy} --out DIR"
-            ) from None
+            raise ValueError(f"{self.path}: {error}; {_remedy(self.policy)}") from None
 
     def save(self, path: Path) -> None:
-        """Writes `path`, whole or not at all."""
+        """Writes `path` atomically."""
         about = {
             "format": FORMAT,
             "policy": self.policy,
@@ -61,219 +54,100 @@ class PolicyCheckpoint:
 
     @classmethod
     def load(cls, path: str | Path | None, policy: str, spec: Any) -> "PolicyCheckpoint":
-        """Reads the weights of `policy` from a file, those that ship if `path` is None or empty.
+        """Reads the weights of `policy` from a file, the shipped ones if `path` is None or empty.
 
         Args:
-            spec: the architecture that the file must be of, or the type of those it may be of.
+            path: the file.
+            policy: name of the policy.
+            spec: the required architecture, or a function that makes one from its fields.
 
         Raises:
             FileNotFoundError: if there is no such file.
             ValueError: if it is damaged, or of another policy, version or architecture.
         """
         path = Path(path) if path else shipped_weights(policy)
-        remedy = f"train them with: splatpilot train {policy} --out DIR"
-        about, weights = _read(path, remedy)
-        found_format, found_policy = about["format"], about["policy"]
-        found_spec, provenance = about["spec"], about["provenance"]
-        if (found_format, found_policy) != (FORMAT, policy):
-            raise ValueError(
-                f"{path} holds weights of the policy {found_policy!r} in format {found_format}, "
-                f"but needed is {policy!r} in format {FORMAT}; {remedy}"
-            )
-        if isinstance(spec, type):
+        about, weights = _read(path, policy)
+        found = f"{about['policy']!r} in format {about['format']}"
+        needed = f"{policy!r} in format {FORMAT}"
+        require(found == needed, f"the policy of {path}", needed, found, _remedy(policy))
+        fields, differing = about["spec"], ""
+        if callable(spec):
             try:
-                return cls(policy, spec(**found_spec), weights, provenance, path)
+                spec = spec(**fields)
             except (TypeError, ValueError) as error:
-                raise ValueError(
-                    f"{path} holds weights of another architecture ({error}); {remedy}"
-                ) from None
-        expected = json.loads(json.dumps(asdict(spec)))
-        if found_spec != expected:
-            differing = [
-                f"{name} {found_spec.get(name)} instead of {value}"
-                for name, value in expected.items()
-                if found_spec.get(name) != value
-            ]
-            raise ValueError(
-                f"{path} holds weights of another architecture ({', '.join(differing)}); {remedy}"
+                differing = str(error)
+        else:
+            expected = json.loads(json.dumps(asdict(spec)))
+            differing = ", ".join(
+                f"{name} must be {expected.get(name)}, got {fields.get(name)}"
+                for name in expected | fields
+                if fields.get(name) != expected.get(name)
             )
-        return cls(policy, spec, weights, provenance, path)
+        if differing:
+            raise ValueError(f"architecture of {path}: {differing}; {_remedy(policy)}")
+        return cls(policy, spec, weights, about["provenance"], path)
 
 
-def shipped_weights(name: str) -> Path:
-    """The file of weights that ships under the name of a policy."""
-    return _SHIPPED / f"{name}.npz"
+def shipped_weights(policy: str) -> Path:
+    """Returns the shipped file of weights of a policy."""
+    return _SHIPPED / f"{policy}.npz"
 
 
-def policy_of(path: str | Path) -> str:
-    """The name of the policy that a file holds weights of.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if it holds no weights.
-    """
-    return _read(Path(path), "train some with: splatpilot train POLICY --out DIR")[0]["policy"]
+def checkpoint_policy(path: str | Path) -> str:
+    """Reads the name of the policy from a file of weights."""
+    return _read(Path(path), "POLICY")[0]["policy"]
 
 
-def _read(path: Path, remedy: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """What a file says of itself, and its weights."""
+def _remedy(policy: str) -> str:
+    return f"train them with: splatpilot train {policy} --out DIR"
+
+
+def _read(path: Path, policy: str) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Reads the description and the weights."""
     if not path.is_file():
-        raise FileNotFoundError(f"there are no weights at {path}; {remedy}")
+        raise FileNotFoundError(f"No such file of weights: {path}; {_remedy(policy)}")
     try:
         weights = read_archive(path)
         about = json.loads(str(weights.pop("about")))
-    except (OSError, ValueError, KeyError, RecursionError) as error:
+        for name, kind in (("format", int), ("policy", str), ("spec", dict), ("provenance", dict)):
+            require(isinstance(about[name], kind), name, f"of type {kind.__name__}", about[name])
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         reason = reason_of(error)
-        raise ValueError(f"{path} holds no weights of a policy ({reason}); {remedy}") from None
-    about = about if isinstance(about, dict) else {}
-    for name, kind in (("format", int), ("policy", str), ("spec", dict), ("provenance", dict)):
-        if not isinstance(about.get(name), kind):
-            raise ValueError(f"{path} holds no weights of a policy (no {name}); {remedy}")
+        raise ValueError(
+            f"{path} must hold weights of a policy ({reason}); {_remedy(policy)}"
+        ) from None
     return about, weights
 
 
 def check_weights(
     weights: Mapping[str, np.ndarray], shapes: Mapping[str, tuple[int, ...]]
 ) -> dict[str, np.ndarray]:
-    """The arrays that `shapes` names, in single precision.
-
-    Raises:
-        ValueError: if one is missing, of another shape or not finite.
-    """
+    """Returns the arrays in `shapes`, in single precision; raises ValueError if one is missing, of
+    another shape or not finite."""
     for name, shape in shapes.items():
-        if name not in weights or weights[name].shape != shape:
-            found = weights[name].shape if name in weights else "missing"
-            raise ValueError(f"the weights {name} are {found}, but must be of shape {shape}")
+        found = weights[name].shape if name in weights else "none"
+        require(found == shape, f"the weights {name}", f"of shape {shape}", found)
         values = weights[name]
-        if values.dtype.kind != "f" or not (np.abs(values.astype(float)) <= _LARGEST).all():
-            raise ValueError(f"the weights {name} are not all finite numbers up to {_LARGEST:g}")
+        finite = values.dtype.kind == "f" and (np.abs(values.astype(float)) <= _MAX_WEIGHT).all()
+        limit = f"finite numbers up to {_MAX_WEIGHT:g}"
+        require(finite, f"the weights {name}", limit, "others")
     return {name: np.asarray(weights[name], np.float32) for name in shapes}
 
 
-# Convolutional networks as ONNX models, which OpenCV runs: written by hand, so that neither
-# training nor flying needs the onnx package.
-#
-# A model is a protocol buffer (https://onnx.ai/onnx/repo-docs/IR.html); the numbers of its fields
-# below are those of onnx.proto.
+def linear_shapes(*layers: tuple[str, int, int]) -> dict[str, tuple[int, ...]]:
+    """Returns the shapes of weights by name of linear layers: name, inputs and outputs."""
+    shapes: dict[str, tuple[int, ...]] = {}
+    for name, inputs, outputs in layers:
+        shapes[f"{name}.weight"], shapes[f"{name}.bias"] = (outputs, inputs), (outputs,)
+    return shapes
 
 
-_IR_VERSION, _OPSET = 5, 10
-"""Of the format and of the operators; in these Clip has its limits as attributes."""
-
-_FLOAT, _INTS = 1, 7  # AttributeProto.type; TensorProto.DataType FLOAT is 1 too
-
-
-class OnnxModel:
-    """A graph from one image to its features, to which operators are added from first to last.
-
-    Args:
-        image: channels, height and width of the input.
-    """
-
-    def __init__(self, image: tuple[int, int, int]) -> None:
-        self._image = image
-        self._nodes: list[bytes] = []
-        self._tensors: list[bytes] = []
-        self.output = "image"
-        """The name of what the last operator gives."""
-
-    def convolution(
-        self,
-        weight: np.ndarray,
-        bias: np.ndarray,
-        *,
-        stride: int = 1,
-        groups: int = 1,
-        dilation: int = 1,
-    ) -> None:
-        """Convolves (N, C, H, W) by `weight` (outputs, C / groups, k, k), k odd, padded by k // 2
-        times the dilation, and adds `bias` (outputs,)."""
-        name, kernel = f"convolution{len(self._nodes)}", weight.shape[2]
-        for part, values in (("weight", weight), ("bias", bias)):
-            self._tensors.append(_tensor(f"{name}.{part}", values))
-        attributes = {
-            "kernel_shape": [kernel] * 2,
-            "strides": [stride] * 2,
-            "pads": [dilation * (kernel // 2)] * 4,
-            "dilations": [dilation] * 2,
-            "group": groups,
-        }
-        self._add("Conv", [self.output, f"{name}.weight", f"{name}.bias"], attributes)
-
-    def clip(self, least: float, most: float) -> None:
-        """Limits all numbers."""
-        self._add("Clip", [self.output], {"min": least, "max": most})
-
-    def leaky_relu(self, slope: float) -> None:
-        """Multiplies negative numbers by `slope`."""
-        self._add("LeakyRelu", [self.output], {"alpha": slope})
-
-    def add(self, other: str) -> None:
-        """Adds what an earlier operator gave, by its name."""
-        self._add("Add", [self.output, other], {})
-
-    def serialize(self, features: tuple[int, int, int]) -> np.ndarray:
-        """The model as bytes (uint8), as `cv2.dnn.readNetFromONNX` takes them.
-
-        Args:
-            features: channels, height and width of what the last operator gives.
-        """
-        graph = [
-            *(_field(1, node) for node in self._nodes),
-            _field(2, b"features"),
-            *(_field(5, tensor) for tensor in self._tensors),
-            _field(11, _value("image", (1, *self._image))),
-            _field(12, _value(self.output, (1, *features))),
-        ]
-        opset = _field(1, b"") + _field(2, _OPSET)
-        model = _field(1, _IR_VERSION) + _field(7, b"".join(graph)) + _field(8, opset)
-        return np.frombuffer(model, np.uint8)
-
-    def _add(self, operator: str, inputs: Sequence[str], attributes: dict) -> None:
-        self.output = f"{operator.lower()}{len(self._nodes)}"
-        node = [_field(1, name.encode()) for name in inputs]
-        node += [_field(2, self.output.encode()), _field(4, operator.encode())]
-        node += [_field(5, _attribute(name, value)) for name, value in attributes.items()]
-        self._nodes.append(b"".join(node))
+def linear(weights: Mapping[str, np.ndarray], name: str, x: np.ndarray) -> np.ndarray:
+    """Applies the linear layer `name` to x (..., inputs)."""
+    return x @ weights[f"{name}.weight"].T + weights[f"{name}.bias"]
 
 
-def _varint(number: int) -> bytes:
-    """Seven bits a byte, the lowest first; the top bit says that more follow."""
-    low = bytearray()
-    while number > 127:
-        low.append(number & 127 | 128)
-        number >>= 7
-    return bytes([*low, number])
-
-
-def _field(number: int, value: int | float | bytes) -> bytes:
-    """A field of a message: a number, a single-precision number, or text or a message."""
-    if isinstance(value, int):
-        return _varint(number << 3) + _varint(value)
-    if isinstance(value, float):
-        return _varint(number << 3 | 5) + struct.pack("<f", value)
-    return _varint(number << 3 | 2) + _varint(len(value)) + value
-
-
-def _attribute(name: str, value: int | float | list[int]) -> bytes:
-    """An AttributeProto."""
-    message = _field(1, name.encode())
-    if isinstance(value, list):
-        return message + b"".join(_field(8, number) for number in value) + _field(20, _INTS)
-    if isinstance(value, float):
-        return message + _field(2, value) + _field(20, _FLOAT)
-    return message + _field(3, value) + _field(20, 2)
-
-
-def _tensor(name: str, values: np.ndarray) -> bytes:
-    """A TensorProto."""
-    shape = b"".join(_field(1, size) for size in values.shape)
-    data = np.ascontiguousarray(values, "<f4").tobytes()
-    return shape + _field(2, _FLOAT) + _field(8, name.encode()) + _field(9, data)
-
-
-def _value(name: str, shape: Sequence[int]) -> bytes:
-    """A ValueInfoProto."""
-    sizes = b"".join(_field(1, _field(1, size)) for size in shape)
-    tensor = _field(1, _FLOAT) + _field(2, sizes)
-    return _field(1, name.encode()) + _field(2, _field(1, tensor))
+def require_shape(name: str, array: np.ndarray, shape: tuple[int, ...], remedy: str = "") -> None:
+    """Checks the shape of an input of a network."""
+    found = np.shape(array)
+    require(found == shape, f"shape of the policy's {name}", str(shape), found, remedy)

@@ -66,21 +66,10 @@ class Decision(NamedTuple):
 
 
 def decide(
-    network: RecurrentNetwork,
-    seen: Observation,
-    speed: float,
-    start_yaw: float,
-    memory: np.ndarray,
+    network: RecurrentNetwork, seen: Observation, speed: float, start_yaw: float, memory: np.ndarray
 ) -> Decision:
-    """Computes the commands and the next hidden state.
-
-    Args:
-        network: of the architecture `DEPTHNAV_NETWORK`.
-        seen: with depth (H, W), multiples of 12 and 16 pixels.
-        speed: nominal [m/s].
-        start_yaw: of the start frame [rad].
-        memory: (H,), the hidden state.
-    """
+    """Computes the commands and the next hidden state, from depth (H, W), the nominal speed [m/s],
+    the yaw of the start frame [rad] and the hidden state (H,)."""
     R_WS = heading_frame(np.array(start_yaw))
     image = 1.0 / np.clip(pool_depth(seen.image, *IMAGE_SIZE), MIN_DEPTH, MAX_DEPTH)
     R_SB = RotationMatrix.MakeZRotation(-start_yaw) @ seen.X_WB.rotation()

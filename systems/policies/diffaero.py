@@ -85,7 +85,6 @@ def decide(
     """Computes the command (3,) in the world and the next hidden state (H,).
 
     Args:
-        network: of the architecture `DIFFAERO_NETWORK`.
         grid: (9, 16), of `depth_grid` or proximities.
         speed: nominal [m/s].
         memory: (H,), the hidden state.

@@ -3,17 +3,21 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-import cv2
 import numpy as np
 
 from splatpilot.systems.common.drake import input_port, output_port
 from splatpilot.systems.common.validation import require, require_field
 from splatpilot.systems.policies.base import LearnedPolicyConfig, Observation, Policy
-from splatpilot.systems.policies.checkpoint import OnnxModel, PolicyCheckpoint, check_weights
+from splatpilot.systems.policies.checkpoint import PolicyCheckpoint, check_weights
+from splatpilot.systems.policies.convolutions import (
+    Convolution,
+    convolution_shapes,
+    opencv_net,
+)
 from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK, RATE
 from splatpilot.systems.policies.diffaero import decide as decide_by_grid
 from splatpilot.systems.policies.observations import heading_frame
-from splatpilot.systems.policies.recurrent_network import LEAK, NetworkSpec, RecurrentNetwork
+from splatpilot.systems.policies.recurrent_network import NetworkSpec, RecurrentNetwork
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 
 WIDTH, HEIGHT = 160, 90  # [px] of the view, the middle of the image
@@ -38,9 +42,9 @@ class DiffAeroRgbConfig(LearnedPolicyConfig):
 
 @dataclass(frozen=True)
 class MonocularSpec:
-    """The architecture: residual blocks at a fifth and at a tenth of the image's size.
+    """Architecture: residual blocks at a fifth and at a tenth of the image's size.
 
-    A block adds to its input a convolution of 3x3, dilated, and one of 1x1.
+    A block adds to its input a dilated convolution of 3x3, followed by one of 1x1.
     """
 
     fine_channels: int = 32
@@ -48,69 +52,39 @@ class MonocularSpec:
     coarse_channels: int = 64
     coarse_dilations: tuple[int, ...] = (1, 2, 4, 1, 2, 4)
 
-    def layers(self) -> "list[Layer]":
-        """First to last."""
+    def layers(self) -> list[Convolution]:
+        """Lists the convolutions, first to last."""
         fine, coarse = self.fine_channels, self.coarse_channels
-        layers = [Layer("stem", CHANNELS, fine, 7, stride=5)]
+        layers = [_convolution("stem", CHANNELS, fine, 7, stride=5)]
         for i, dilation in enumerate(self.fine_dilations):
             layers += _block(f"fine.{i}", fine, dilation)
-        layers.append(Layer("halving", fine, coarse, 3, stride=2))
+        layers.append(_convolution("halving", fine, coarse, 3, stride=2))
         for i, dilation in enumerate(self.coarse_dilations):
             layers += _block(f"coarse.{i}", coarse, dilation)
-        return [*layers, Layer("head", coarse, 2, 1, rectified=False)]
+        return [*layers, _convolution("head", coarse, 2, 1, activation="")]
 
     def weight_shapes(self) -> dict[str, tuple[int, ...]]:
-        """The name and shape of every array of weights."""
-        shapes: dict[str, tuple[int, ...]] = {}
-        for layer in self.layers():
-            shape = (layer.outputs, layer.inputs, layer.kernel, layer.kernel)
-            shapes[f"{layer.name}.weight"] = shape
-            shapes[f"{layer.name}.bias"] = (layer.outputs,)
-        return shapes
+        """Returns the shapes of all arrays of weights by name."""
+        return convolution_shapes(self.layers())
 
 
-@dataclass(frozen=True)
-class Layer:
-    """A convolution with bias, padded by half its kernel times its dilation."""
-
-    name: str
-    inputs: int
-    outputs: int
-    kernel: int
-    stride: int = 1
-    dilation: int = 1
-    rectified: bool = True
-    """Whether a leaky rectifier follows."""
-    adds_to_block: bool = False
-    """Whether what the layer before the last one took is added."""
+def _convolution(name: str, *sizes: int, activation="leaky_relu", **options: int) -> Convolution:
+    weight, bias = f"{name}.weight", f"{name}.bias"
+    return Convolution(weight, bias, *sizes, activation=activation, **options)
 
 
-def _block(name: str, channels: int, dilation: int) -> list[Layer]:
+def _block(name: str, channels: int, dilation: int) -> list[Convolution]:
     return [
-        Layer(f"{name}.0", channels, channels, 3, dilation=dilation),
-        Layer(f"{name}.1", channels, channels, 1, rectified=False, adds_to_block=True),
+        _convolution(f"{name}.0", channels, channels, 3, dilation=dilation),
+        _convolution(f"{name}.1", channels, channels, 1, activation="", skip=2),
     ]
 
 
 class MonocularDepth:
-    """The network with its weights, run by OpenCV: the same bits on any number of its threads.
-
-    Args:
-        spec: the architecture.
-        weights: arrays by the names of `MonocularSpec.weight_shapes`, single precision.
-    """
+    """The network with its weights, by the names of `weight_shapes`, in OpenCV."""
 
     def __init__(self, spec: MonocularSpec, weights: Mapping[str, np.ndarray]) -> None:
-        model, before = OnnxModel((CHANNELS, HEIGHT, WIDTH)), []
-        for layer in spec.layers():
-            before.append(model.output)
-            weight, bias = weights[f"{layer.name}.weight"], weights[f"{layer.name}.bias"]
-            model.convolution(weight, bias, stride=layer.stride, dilation=layer.dilation)
-            if layer.rectified:
-                model.leaky_relu(LEAK)
-            if layer.adds_to_block:
-                model.add(before[-2])
-        self._net = cv2.dnn.readNetFromONNX(model.serialize((2, 9, 16)))
+        self._net = opencv_net((CHANNELS, HEIGHT, WIDTH), spec.layers(), weights)
 
     def __call__(self, view: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Predicts inverse depths (9, 16) and the logarithms of their expected absolute errors
@@ -122,7 +96,7 @@ class MonocularDepth:
 
 @dataclass(frozen=True)
 class DiffAeroRgbSpec:
-    """The architecture: what sees, and what decides."""
+    """Architecture of both networks."""
 
     monocular: MonocularSpec = field(default_factory=MonocularSpec)
     policy: NetworkSpec = DIFFAERO_NETWORK
@@ -132,25 +106,20 @@ DIFFAERO_RGB_NETWORK = DiffAeroRgbSpec()
 
 
 class DiffAeroRgbNetwork:
-    """Both networks with their weights, whose names begin with `monocular.` and `policy.`.
-
-    Raises:
-        ValueError: if an array is missing, of another shape or not finite.
-    """
+    """Both networks with their weights, whose names begin with `monocular.` and `policy.`."""
 
     def __init__(self, spec: DiffAeroRgbSpec, weights: dict[str, np.ndarray]) -> None:
         def part(name: str, shapes: dict[str, tuple[int, ...]]) -> dict[str, np.ndarray]:
             checked = check_weights(weights, {f"{name}.{key}": shapes[key] for key in shapes})
             return {key.removeprefix(f"{name}."): value for key, value in checked.items()}
 
-        self.monocular = MonocularDepth(
-            spec.monocular, part("monocular", spec.monocular.weight_shapes())
-        )
+        monocular = part("monocular", spec.monocular.weight_shapes())
+        self.monocular = MonocularDepth(spec.monocular, monocular)
         self.policy = RecurrentNetwork(spec.policy, part("policy", spec.policy.weight_shapes()))
 
 
 def load_network(path: str | None) -> DiffAeroRgbNetwork:
-    """The networks from a file of weights; see `PolicyCheckpoint.load`."""
+    """Loads the networks from a file of weights, see `PolicyCheckpoint.load`."""
     checkpoint = PolicyCheckpoint.load(path, "diffaero_rgb", DIFFAERO_RGB_NETWORK)
     return checkpoint.build(DiffAeroRgbNetwork)
 
@@ -194,14 +163,8 @@ def rays_B() -> np.ndarray:
 def decide(
     network: DiffAeroRgbNetwork, seen: Observation, speed: float, memory: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Computes a_WB (3,) [m/s^2], gravity excluded, and the next hidden state (H,).
-
-    Args:
-        network: of the architecture `DIFFAERO_RGB_NETWORK`.
-        seen: with RGB (H, 160, 3), see `encode_view`.
-        speed: nominal [m/s].
-        memory: (H,), the hidden state.
-    """
+    """Computes a_WB (3,) [m/s^2], gravity excluded, and the next hidden state (H,), from RGB
+    (H, 160, 3), the nominal speed [m/s] and the hidden state (H,)."""
     grid, _ = network.monocular(encode_view(seen.image, seen.X_WB.rotation().matrix()))
     return decide_by_grid(network.policy, grid, seen, speed, memory)
 

@@ -85,15 +85,9 @@ class Hypotheses:
 
     def to_vector(self) -> np.ndarray:
         """Returns the vector (8 + 31 K,) described at the top of this file."""
-        return np.concatenate(
-            [
-                [self.plan_time],
-                self.X_WB.translation(),
-                self.X_WB.rotation().ToQuaternion().wxyz(),
-                np.ravel(self.waypoints_B),
-                self.costs,
-            ]
-        )
+        q_WB = self.X_WB.rotation().ToQuaternion().wxyz()
+        header = [self.plan_time, *self.X_WB.translation(), *q_WB]
+        return np.concatenate([header, np.ravel(self.waypoints_B), self.costs])
 
     @classmethod
     def from_vector(cls, vector: np.ndarray, num_hypotheses: int) -> Hypotheses | None:
@@ -145,16 +139,14 @@ class HypothesisSelector(LeafSystem):
         require(0.0 < lookahead <= span, "lookahead", f"in (0, {span:g}] s", lookahead)
         self._num_hypotheses = num_hypotheses
         self._lookahead = lookahead
-        self._hypotheses_port = self.DeclareVectorInputPort(
-            "hypotheses", hypotheses_size(num_hypotheses)
-        )
+        size = hypotheses_size(num_hypotheses)
+        self._hypotheses_port = self.DeclareVectorInputPort("hypotheses", size)
         self._state_port = self.DeclareVectorInputPort("state", 13)
         self.DeclareVectorOutputPort("waypoint", 3, self._calc_waypoint)
 
     def _calc_waypoint(self, context: Context, output: BasicVector) -> None:
-        plan = Hypotheses.from_vector(
-            np.asarray(self._hypotheses_port.Eval(context)), self._num_hypotheses
-        )
+        vector = np.asarray(self._hypotheses_port.Eval(context))
+        plan = Hypotheses.from_vector(vector, self._num_hypotheses)
         if plan is None:
             state = np.asarray(self._state_port.Eval(context))
             output.SetFromVector(QuadrotorState.of(state).p_WB)

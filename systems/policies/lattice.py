@@ -1,8 +1,7 @@
 """A lattice of quintic point-mass trajectories, their costs and the K best distinct ones.
 
-Quintics, the minimum-jerk curves between boundary states, lead from the present state to a fan of
-final velocities and to points of the path to the goal. Positions and jerks are linear in the
-boundary states: one matrix product evaluates all, one batched query their clearances.
+Quintics, minimum-jerk curves, lead from the present state to a fan of final velocities and to
+points of the path to the goal.
 """
 
 from dataclasses import dataclass
@@ -42,8 +41,7 @@ class LatticeConfig(Config):
         + speed_weight mean max(0, |v_i| - speed)² + jerk_weight mean |j_i|²
 
     with the time of arrival T, the slowness S, the distances d_i and the radius r. T and S must
-    match: then a trajectory along the path to the goal costs T at its start minus its length, and
-    always beats waiting. A barrier missing in T would stop the vehicle before narrow passages.
+    match, so that a trajectory along the path to the goal always costs less than waiting.
     """
 
     # [m/s] Nominal speed.
@@ -76,8 +74,7 @@ class LatticeConfig(Config):
     def check(self) -> None:
         samples = self.horizon / WAYPOINT_PERIOD
         whole = samples > NUM_WAYPOINTS - 0.5 and abs(samples - round(samples)) < 1e-6
-        least = NUM_WAYPOINTS * WAYPOINT_PERIOD
-        require_field(self, "horizon", whole, f"a multiple of 0.1 s and at least {least} s")
+        require_field(self, "horizon", whole, "a multiple of 0.1 s and at least 1.0 s")
         require_field(self, "speed_fractions", self.speed_fractions, "one or more values in (0, 1]")
         count = self.num_yaws * self.num_pitches * len(self.speed_fractions)
         require_field(self, "num_yaws", count <= 10**5, "at most 1e5 trajectories in all")
@@ -86,7 +83,7 @@ class LatticeConfig(Config):
 
 
 class Trajectories(NamedTuple):
-    """Trajectories as samples every 0.1 s, from 0.1 s after now to the horizon, in the world."""
+    """Samples of trajectories in the world, every 0.1 s from 0.1 s to the horizon."""
 
     positions: np.ndarray  # (N, S, 3) [m]
     jerks: np.ndarray  # (N, S, 3) [m/s^3]
@@ -114,12 +111,11 @@ class TrajectoryLattice:
         toa: TimeOfArrival,
         pace: float = 1.0,
     ) -> Trajectories:
-        """Returns N trajectories from a position, velocity and acceleration, (3,) each.
+        """Computes N trajectories from a position, velocity and acceleration, (3,) each.
 
         They end without acceleration at the horizon H: those of the lattice, along the negative
         gradient of T, at p_WB + H v_1 with velocity v_1; one more per speed on the path to the
-        goal, or at rest in the goal. Speeds are multiplied by `pace`, and fall in proportion to T
-        within half the horizon of the goal.
+        goal, or at rest in it. Speeds are multiplied by `pace`, and fall within H / 2 of the goal.
         """
         config = self.config
         slowing = float(toa.value(p_WB)) / self._stopping_distance
@@ -197,7 +193,7 @@ def final_velocities(config: LatticeConfig) -> np.ndarray:
 
 HORIZON = LatticeConfig.horizon  # [s]
 
-MARGIN = 1e-3
+_ARRIVAL_MARGIN = 1e-3
 """Fraction of the reach by which a goal must be nearer for the trajectory to stop in it. Observed
 goals are clipped to the reach, and rounding must not decide between stopping and flying on."""
 
@@ -205,14 +201,12 @@ BASIS = quintic_basis(WAYPOINT_PERIOD * np.arange(1, NUM_WAYPOINTS + 1), HORIZON
 """(10, 6), the quintic basis at the waypoints."""
 
 
-def unobstructed_way(
-    v_B: Any, goal_B: Any, up_B: Any, speed: float, basis: Any = BASIS, margin: float = MARGIN
-) -> Any:
-    """Returns the obstacle-free reference trajectory of the lattice: waypoints (..., 10, 3) [m] in
-    the body frame B.
+def reference_trajectory(v_B: Any, goal_B: Any, up_B: Any, speed: float, basis: Any = BASIS) -> Any:
+    """Computes the obstacle-free reference trajectory: waypoints (..., 10, 3) [m] in B.
 
-    One quintic, from the present velocity and the acceleration of level flight, to the point that
-    the nominal speed reaches at the horizon, or to rest in the goal. Arrays are numpy or torch.
+    One quintic of the lattice, from the present velocity and the acceleration of level flight, to
+    the point that the nominal speed reaches at the horizon, or to rest in the goal. Arrays are
+    numpy or torch.
 
     Args:
         v_B: (..., 3) [m/s], velocity.
@@ -220,26 +214,21 @@ def unobstructed_way(
         up_B: (..., 3), the unit vector upwards.
         speed: nominal [m/s].
         basis: `BASIS`, as an array of the same type.
-        margin: see `MARGIN`.
     """
     distance = ((goal_B * goal_B).sum(-1) ** 0.5)[..., None]
     direction = goal_B / distance.clip(min=1e-6)
     slowed = speed * (2.0 * distance / (HORIZON * speed)).clip(MIN_SPEED_FRACTION, 1.0)
     reach = HORIZON * slowed
-    arrives = distance <= (1.0 - margin) * reach
+    arrives = distance <= (1.0 - _ARRIVAL_MARGIN) * reach
     p_end = direction * (distance * arrives + reach * ~arrives)
     v_end = direction * (slowed * ~arrives)
-    boundary = v_B, _level_acceleration(v_B, up_B), p_end, v_end
-    return sum(
-        basis[:, column, None] * values[..., None, :] for column, values in enumerate(boundary, 1)
-    )
-
-
-def _level_acceleration(v_B: Any, up_B: Any) -> Any:
-    """Computes `motion_primitives.level_acceleration` in the body frame."""
-    upright = up_B[..., 2:]  # the cosine of the tilt
+    # The acceleration is `level_acceleration` in the body frame.
+    params, upright = QuadrotorParams(), up_B[..., 2:]  # cosine of the tilt
     tilt = -up_B * upright
     tilt[..., 2] += 1.0
     level = v_B - up_B * (v_B * up_B).sum(-1)[..., None]
-    params = QuadrotorParams()
-    return params.gravity * tilt / upright.clip(min=MIN_UPRIGHT) - params.drag * level
+    a_B = params.gravity * tilt / upright.clip(min=MIN_UPRIGHT) - params.drag * level
+    boundary = v_B, a_B, p_end, v_end
+    return sum(
+        basis[:, column, None] * values[..., None, :] for column, values in enumerate(boundary, 1)
+    )

@@ -17,8 +17,7 @@ def quintic_basis(times: np.ndarray, horizon: float, derivative: int = 0) -> np.
     is that `derivative` of the quintic between them.
     """
 
-    def monomials(t: np.ndarray, order: int) -> np.ndarray:
-        """Derivatives (n, 6) of the given order of 1, t, ..., t^5."""
+    def monomials(t: np.ndarray, order: int) -> np.ndarray:  # (n, 6), of 1, t, ..., t^5
         powers = np.arange(6)
         factors = np.array([math.perm(k, order) for k in range(6)])
         return factors * t[:, None] ** np.maximum(powers - order, 0)

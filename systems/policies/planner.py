@@ -45,43 +45,36 @@ def plan(
 
     Args:
         time: of the state [s].
-        state: (13,) [p_WB, v_WB, q_WB, w_WB_B].
+        state: (13,).
         field: a conservative distance field.
         toa: the time of arrival at the goal, over the same grid.
         lattice: the trajectories to choose from.
-        params: of the vehicle; its acceleration follows from drag, gravity and attitude.
+        params: of the vehicle.
         obstacles: distances for the costs, `field` by default; may include moving obstacles.
 
     Raises:
         InfeasibleFlightError: if no path leads from the free space around p_WB to the goal.
     """
-    state = np.asarray(state, dtype=float)
-    valid = state.shape == (13,) and bool(np.isfinite(state).all())
+    valid = np.shape(state) == (13,) and bool(np.isfinite(state).all())
     remedy = "check the plant or estimator it comes from"
-    require(valid, "the state", "13 finite numbers", state.tolist(), remedy)
+    require(valid, "the state", "13 finite numbers", np.asarray(state).tolist(), remedy)
     X_WB = pose_from_state(state)
     R_WB = X_WB.rotation().matrix()
     p_WB, v_WB, _, _ = QuadrotorState.of(state)
-    _check_path_exists(p_WB, field, toa)
-    a_WB = level_acceleration(R_WB, v_WB, params or QuadrotorParams())
-    positions_W, costs = lattice.best(p_WB, v_WB, a_WB, obstacles or field, toa)
-    waypoints_B = (positions_W[:, :NUM_WAYPOINTS] - p_WB) @ R_WB
-    return Hypotheses(time, X_WB, waypoints_B, costs)
-
-
-def _check_path_exists(p_WB: np.ndarray, field: Esdf, toa: TimeOfArrival) -> None:
-    # A vehicle that drifts into the margin is in a blocked voxel, but free ones are near; a wall
-    # is at least as thick as the vehicle. Contact is detected elsewhere.
-    if toa.is_reachable(p_WB, within=VEHICLE_RADIUS):
-        return
     clearance = float(field.distance(p_WB)) - VEHICLE_RADIUS
-    if clearance > field.voxel_size:
+    # A vehicle that drifts into the margin is in a blocked voxel near free ones; walls are at least
+    # as thick as the vehicle. Contact is detected elsewhere.
+    if clearance > field.voxel_size and not toa.is_reachable(p_WB, within=VEHICLE_RADIUS):
         raise InfeasibleFlightError(
             f"no path leads from p_WB = {np.round(p_WB, 2).tolist()} m, clearance "
             f"{clearance:.2f} m, to the goal p_WG = {np.round(toa.p_WG, 2).tolist()} m: every "
             f"passage is unknown or narrower than the vehicle, {2.0 * VEHICLE_RADIUS:.2f} m, and "
             "its margin; choose start and goal in the same free space, or smaller voxels"
         )
+    a_WB = level_acceleration(R_WB, v_WB, params or QuadrotorParams())
+    positions_W, costs = lattice.best(p_WB, v_WB, a_WB, obstacles or field, toa)
+    waypoints_B = (positions_W[:, :NUM_WAYPOINTS] - p_WB) @ R_WB
+    return Hypotheses(time, X_WB, waypoints_B, costs)
 
 
 class PrivilegedPlanner(Policy):
@@ -99,10 +92,10 @@ class PrivilegedPlanner(Policy):
     - ``hypotheses`` (8 + 31 K): as `Hypotheses.to_vector`, cheapest first, in the body frame B at
       the time of planning; NaN before the first update.
 
-    The time of arrival is computed once per goal (0.1 s for 400,000 voxels, 1 s for 3 million) and
-    cached in the Context. It ignores moving obstacles; the costs of trajectories know where these
-    will be at each waypoint. Updates raise InfeasibleFlightError if the goal is outside the known
-    volume, too close to an obstacle or cut off from the vehicle.
+    The time of arrival is computed once per goal and cached in the Context. It ignores moving
+    obstacles; the costs of trajectories know their future positions. Updates raise
+    InfeasibleFlightError if the goal is outside the known volume, too close to an obstacle or cut
+    off from the vehicle.
 
     Args:
         esdf: the scene; unknown space and all outside its box count as occupied.

@@ -1,8 +1,7 @@
 """Reactive: a classical policy that avoids the points seen in recent depth images.
 
-Candidate velocities form a fan around the direction to the goal. Each is followed by a first-order
-response; its cost is the distance left at its end, the proximity of seen points and the length
-through space that no image has shown to be free.
+Candidate velocities form a fan around the direction to the goal, each with a first-order response.
+Its cost is the remaining distance, the proximity of seen points and the length in unseen space.
 """
 
 import math
@@ -17,11 +16,7 @@ from splatpilot.systems.common.validation import Config, bounded, require_field
 from splatpilot.systems.policies.base import Observation, Policy
 from splatpilot.systems.policies.motion_primitives import rotation_to, velocity_fan
 from splatpilot.systems.policies.observations import target_velocity
-from splatpilot.systems.policies.velocity import (
-    RESPONSE_TIME,
-    SLOWING_TIME,
-    tracking_acceleration,
-)
+from splatpilot.systems.policies.velocity import RESPONSE_TIME, SLOWING_TIME, tracking_acceleration
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
@@ -109,18 +104,14 @@ def nearest_points(depth: np.ndarray, config: ReactiveConfig) -> np.ndarray:
 
 def candidate_velocities(to_goal: np.ndarray, config: ReactiveConfig) -> np.ndarray:
     """Returns a fan of velocities (N, 3) [m/s] around the goal's direction, and zero."""
-    fan = velocity_fan(
-        _even_angles(config.max_yaw, config.num_yaws),
-        _even_angles(config.max_pitch, config.num_pitches),
-        config.speed_fractions,
-    )
+
+    def angles(largest: float, count: int) -> np.ndarray:
+        degrees = math.degrees(largest)  # Exact for whole degrees.
+        return np.deg2rad(np.linspace(-degrees, degrees, count))
+
+    yaws, pitches = angles(config.max_yaw, config.num_yaws), (config.max_pitch, config.num_pitches)
+    fan = velocity_fan(yaws, angles(*pitches), config.speed_fractions)
     return np.vstack([config.speed * fan @ rotation_to(to_goal).T, np.zeros(3)])
-
-
-def _even_angles(largest: float, count: int) -> np.ndarray:
-    """Returns `count` angles [rad] from -largest to largest, exact for whole degrees."""
-    degrees = math.degrees(largest)
-    return np.deg2rad(np.linspace(-degrees, degrees, count))
 
 
 def responses(
@@ -156,15 +147,8 @@ def candidate_costs(
     seen: np.ndarray,
     config: ReactiveConfig,
 ) -> np.ndarray:
-    """Computes the costs (N,) [m] of candidates, see `ReactiveConfig`.
-
-    Args:
-        positions: (N, S, 3) [m] along each.
-        velocities: (N, 3) [m/s] of the candidates.
-        p_WB, v_WB: position and velocity of the vehicle.
-        p_WG: (3,) [m] the goal.
-        points_W: (M, 3) [m] seen points.
-        seen: (N, S) bool, positions that are seen to be free.
+    """Computes the costs (N,) [m] of candidates, see `ReactiveConfig`, by their positions
+    (N, S, 3), velocities (N, 3), the seen points_W (M, 3) and positions `seen` to be free (N, S).
     """
     distances = np.full(positions.shape[:2], np.inf)
     farthest = np.linalg.norm(positions - p_WB, axis=2).max() + _MAX_DISTANCE
@@ -175,8 +159,7 @@ def candidate_costs(
     steps = np.linalg.norm(np.diff(positions, axis=1, prepend=starts), axis=2)  # (N, S) [m]
     barrier = soft_barrier(distances, VEHICLE_RADIUS, margin=config.barrier_margin)
     contact = np.maximum(VEHICLE_RADIUS + config.margin - distances, 0.0)
-    away = np.linalg.norm(positions - p_WB, axis=2) > _FREE_RADIUS
-    unseen = ~seen & away
+    unseen = ~seen & (np.linalg.norm(positions - p_WB, axis=2) > _FREE_RADIUS)
     to_goal = p_WG - positions[:, -1]
     along = (
         config.barrier_weight * barrier
@@ -194,13 +177,8 @@ def candidate_costs(
 def decide(
     seen: Observation, points_W: np.ndarray, config: ReactiveConfig
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Computes a_WB (3,) [m/s^2], gravity excluded, and the points (M, 3) [m] to remember.
-
-    Args:
-        seen: with depth (H, W) [m].
-        points_W: (M, 3) [m], those of earlier images, NaN where there are none.
-        config: see `ReactiveConfig`.
-    """
+    """Computes a_WB (3,) [m/s^2], gravity excluded, and the points (M, 3) [m] to remember, from
+    depth and the points_W of earlier images, whose missing ones are NaN."""
     depth = seen.image.astype(float)
     p_WB, v_WB, _, _ = seen.state
     X_WC = seen.X_WB @ config.camera.X_BC()
@@ -209,12 +187,8 @@ def decide(
     points_W = np.concatenate([points, points_W[: -len(points)]])
     known = points_W[np.isfinite(points_W[:, 0])]
 
-    velocities = np.vstack(
-        [
-            candidate_velocities(seen.p_WG - p_WB, config),
-            target_velocity(p_WB, seen.p_WG, config.speed, SLOWING_TIME),
-        ]
-    )
+    straight = target_velocity(p_WB, seen.p_WG, config.speed, SLOWING_TIME)
+    velocities = np.vstack([candidate_velocities(seen.p_WG - p_WB, config), straight])
     positions = responses(p_WB, v_WB, velocities, config.horizon)
     free = is_seen((positions - p_WC) @ R_WC, depth, config.camera)
     costs = candidate_costs(positions, velocities, p_WB, v_WB, seen.p_WG, known, free, config)
@@ -237,7 +211,7 @@ class Reactive(Policy):
     - ``acceleration`` (3): a_WB [m/s^2], W frame, gravity excluded.
 
     The second group of the discrete state holds the points of the last ``memory`` images in the
-    world frame, NaN where there are none.
+    world frame; missing ones are NaN.
     """
 
     depth_image_32f_input_port = input_port("depth_image_32f")

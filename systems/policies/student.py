@@ -5,35 +5,27 @@ runs without torch: the encoder in OpenCV, the rest in numpy.
 """
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar
 
-import cv2
 import numpy as np
-from pydrake.common.value import Value
-from pydrake.math import RigidTransform
-from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
-from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
-from splatpilot.systems.common.drake import input_port, output_port
-from splatpilot.systems.common.validation import Config, bounded, require
+from splatpilot.systems.common.drake import output_port
+from splatpilot.systems.common.validation import require
+from splatpilot.systems.policies.base import LearnedPolicyConfig, Observation, Policy
 from splatpilot.systems.policies.checkpoint import (
-    OnnxModel,
     PolicyCheckpoint,
     check_weights,
-    shipped_weights,
+    linear,
+    linear_shapes,
+    require_shape,
 )
+from splatpilot.systems.policies.convolutions import Convolution, convolution_shapes, opencv_net
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS, Hypotheses, no_plan
-from splatpilot.systems.policies.lattice import BASIS, HORIZON, unobstructed_way
+from splatpilot.systems.policies.lattice import HORIZON, reference_trajectory
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
-from splatpilot.systems.vehicle.state import (
-    QuadrotorState,
-    array_namespace,
-    lengths,
-    pose_from_state,
-)
+from splatpilot.systems.vehicle.state import array_namespace, lengths
 
 RATE = 15.0  # [Hz]
 MIN_DEPTH, MAX_DEPTH = 0.3, 20.0  # [m]
@@ -88,30 +80,11 @@ _STAGES = (
 """Expansion, channels, blocks and first stride of each stage between the first and last."""
 
 
-@dataclass(frozen=True)
-class Convolution:
-    """A convolution with bias."""
-
-    weight: str  # name of its weights (outputs, inputs / groups, kernel, kernel)
-    bias: str  # name of its biases (outputs,)
-    inputs: int
-    outputs: int
-    kernel: int = 1
-    stride: int = 1
-    groups: int = 1
-    rectified: bool = True  # output limited to 0 to 6
-
-    def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Returns the shapes of its arrays of weights by name."""
-        shape = (self.outputs, self.inputs // self.groups, self.kernel, self.kernel)
-        return {self.weight: shape, self.bias: (self.outputs,)}
-
-
 def mobilenet_blocks() -> list[list[Convolution]]:
-    """Lists the convolutions of each of the `BLOCKS` modules; see `adds_input` for skips."""
+    """Lists the convolutions of each of the `BLOCKS` modules."""
 
-    def convolution(prefix: str, *numbers) -> Convolution:
-        return Convolution(f"{prefix}.0.weight", f"{prefix}.1.bias", *numbers)
+    def convolution(prefix: str, *sizes: int) -> Convolution:
+        return Convolution(f"{prefix}.0.weight", f"{prefix}.1.bias", *sizes, activation="relu6")
 
     blocks = [[convolution("features.0", 3, 32, 3, 2)]]
     inputs = 32
@@ -123,43 +96,22 @@ def mobilenet_blocks() -> list[list[Convolution]]:
             n = len(block)
             block.append(convolution(f"{name}.{n}", hidden, hidden, 3, stride, hidden))
             weight, bias = f"{name}.{n + 1}.weight", f"{name}.{n + 2}.bias"
-            block.append(Convolution(weight, bias, hidden, outputs, rectified=False))
+            skip = n + 2 if stride == 1 and inputs == outputs else 0
+            block.append(Convolution(weight, bias, hidden, outputs, skip=skip))
             blocks.append(block)
             inputs = outputs
     return [*blocks, [convolution("features.18", inputs, CHANNELS)]]
 
 
-def adds_input(block: list[Convolution]) -> bool:
-    """Tells whether a module adds its input to its output."""
-    same = block[0].inputs == block[-1].outputs and all(c.stride == 1 for c in block)
-    return len(block) > 1 and same
-
-
 def mobilenet_shapes() -> dict[str, tuple[int, ...]]:
     """Returns the shapes of all arrays of weights by name."""
-    return {k: v for block in mobilenet_blocks() for c in block for k, v in c.shapes().items()}
-
-
-def _mobilenet(height: int, width: int, weights: Mapping[str, np.ndarray]) -> cv2.dnn.Net:
-    """Builds the encoder for images of a size [px] from float32 weights by name."""
-    model = OnnxModel((3, height, width))
-    for block in mobilenet_blocks():
-        before = model.output
-        for layer in block:
-            weight, bias = weights[layer.weight], weights[layer.bias]
-            model.convolution(weight, bias, stride=layer.stride, groups=layer.groups)
-            if layer.rectified:
-                model.clip(0.0, 6.0)
-        if adds_input(block):
-            model.add(before)
-    features = CHANNELS, -(-height // 32), -(-width // 32)
-    return cv2.dnn.readNetFromONNX(model.serialize(features))
+    return convolution_shapes([layer for block in mobilenet_blocks() for layer in block])
 
 
 HYPOTHESES = 3
 PIXELS = {"rgb": "color", "depth": "depth"}
 """Field of a corpus's samples that each kind of observation sees."""
-WAYPOINT_SCALE = 2.0  # [m] deviation that an output of 1 means
+WAYPOINT_SCALE = 2.0  # [m] deviation for an output of 1
 FADING_DISTANCE = 1.0  # [m] from the goal
 
 
@@ -178,29 +130,21 @@ class StudentSpec:
     width: int = 160
     height: int = 120
     fov_x: float = 90.0
-    # Number of features of each cell of the encoder's output. Cells are not averaged, because
-    # averages do not tell where things are.
+    # Number of features of each cell of the encoder's output.
     cell_features: int = 64
     state_features: int = 64
     # Width of the hidden layer of the head.
     head_features: int = 256
     # [m/s] of the expert.
     nominal_speed: float = 2.0
-    # Version of the reference trajectory. Files without it were trained with the first.
-    way_version: int = 1
+    # Version of the reference trajectory.
+    way_version: int = 2
 
     def __post_init__(self) -> None:
-        """Raises ValueError for fields that no network can be made with."""
         words = ", ".join(PIXELS)
         require(self.observation in PIXELS, "observation", f"one of {words}", self.observation)
         require(self.way_version == 2, "way_version", "2", self.way_version)
-        for name in ("width", "height", "cell_features", "state_features", "head_features"):
-            value = getattr(self, name)
-            require(isinstance(value, int) and 1 <= value <= 4096, name, "in [1, 4096]", value)
-        for name, lower, upper in (("fov_x", 1.0, 179.0), ("nominal_speed", 0.1, 20.0)):
-            value = getattr(self, name)
-            valid = isinstance(value, int | float) and lower <= value <= upper
-            require(valid, name, f"in [{lower:g}, {upper:g}]", value)
+        require(self.nominal_speed > 0.0, "nominal_speed", "> 0", self.nominal_speed)
 
     @property
     def pixels(self) -> str:
@@ -219,23 +163,21 @@ class StudentSpec:
 
     def weight_shapes(self) -> dict[str, tuple[int, ...]]:
         """Returns the shapes of all arrays of weights by name."""
-        shapes = mobilenet_shapes()
-        for name, inputs, outputs in (
+        joined = self.image_features + self.state_features
+        return mobilenet_shapes() | linear_shapes(
             ("cell_layer", CHANNELS, self.cell_features),
             ("state_layer", STATE_SIZE, self.state_features),
             ("state_layer_2", self.state_features, self.state_features),
-            ("hidden_layer", self.image_features + self.state_features, self.head_features),
+            ("hidden_layer", joined, self.head_features),
             ("head", self.head_features, HYPOTHESES * (3 * NUM_WAYPOINTS + 1)),
-        ):
-            shapes[f"{name}.weight"], shapes[f"{name}.bias"] = (outputs, inputs), (outputs,)
-        return shapes
+        )
 
 
 def deviations(output: Any, goal_B: Any) -> Any:
     """Computes deviations (..., M, T, 3) [m] from the reference trajectory.
 
-    Near the goal the reference is slow, and a constant deviation would make the vehicle hover
-    beside it. So deviations fade with the squared distance there.
+    They fade with the squared distance to the goal, where the reference is slow. A constant
+    deviation would make the vehicle hover beside the goal.
 
     Args:
         output: (..., M, T, 3), of the network.
@@ -248,16 +190,13 @@ def deviations(output: Any, goal_B: Any) -> Any:
 class StudentNetwork:
     """The network with its weights, in OpenCV and numpy.
 
-    At a speed other than its expert's, the reference trajectory is flown at that speed, deviations
-    are scaled by the ratio of the two (`pace`), and the observed velocity by its inverse.
+    At a speed other than its expert's, the reference trajectory has that speed, deviations are
+    scaled by the ratio of the two (`pace`), and the observed velocity by its inverse.
 
     Args:
         spec: architecture.
         weights: arrays by the names of `StudentSpec.weight_shapes`.
         speed: nominal speed [m/s]; the expert's if None.
-
-    Raises:
-        ValueError: if weights are missing, of another shape or not finite.
     """
 
     def __init__(
@@ -268,7 +207,8 @@ class StudentNetwork:
         self.pace = self.speed / spec.nominal_speed
         self.reach = HORIZON * self.speed  # [m], see `StudentSpec.reach`
         self._weights = check_weights(weights, spec.weight_shapes())
-        self._encoder = _mobilenet(spec.height, spec.width, self._weights)
+        layers = [layer for block in mobilenet_blocks() for layer in block]
+        self._encoder = opencv_net((3, spec.height, spec.width), layers, self._weights)
 
     def __call__(self, image: np.ndarray, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Computes waypoints (3, 10, 3) [m] in the body frame and costs (3,).
@@ -276,79 +216,60 @@ class StudentNetwork:
         Args:
             image: (3, height, width), see `encode_color` and `encode_depth`.
             state: (9,), see `encode_state`, with the velocity divided by `pace`.
-
-        Raises:
-            ValueError: if the image has another shape.
         """
         spec = self.spec
-        shape = 3, spec.height, spec.width
         remedy = f"give it a camera of {spec.width}x{spec.height}"
-        require(np.shape(image) == shape, "shape of the image", str(shape), np.shape(image), remedy)
+        require_shape("image", image, (3, spec.height, spec.width), remedy)
         self._encoder.setInput(np.ascontiguousarray(image[None], np.float32))
         features = self._encoder.forward().reshape(CHANNELS, -1)
-        cells = self._relu("cell_layer", features.T)
-        y = self._relu("state_layer_2", self._relu("state_layer", np.asarray(state, np.float32)))
-        hidden = self._relu("hidden_layer", np.concatenate([cells.ravel(), y]))
-        output = self._linear("head", hidden).reshape(HYPOTHESES, -1)
+        cells = self._layer("cell_layer", features.T)
+        y = self._layer("state_layer_2", self._layer("state_layer", np.asarray(state, np.float32)))
+        hidden = self._layer("hidden_layer", np.concatenate([cells.ravel(), y]))
+        output = linear(self._weights, "head", hidden).reshape(HYPOTHESES, -1)
         v_B, direction, up_B = np.reshape(state, (3, 3))
         goal_B = self.reach * direction
-        reference = unobstructed_way(self.pace * v_B, goal_B, up_B, self.speed, BASIS)
+        reference = reference_trajectory(self.pace * v_B, goal_B, up_B, self.speed)
         waypoints = output[:, :-1].reshape(HYPOTHESES, NUM_WAYPOINTS, 3)
         return reference + self.pace * deviations(waypoints, goal_B), output[:, -1]
 
-    def _linear(self, name: str, x: np.ndarray) -> np.ndarray:
-        return x @ self._weights[f"{name}.weight"].T + self._weights[f"{name}.bias"]
+    def _layer(self, name: str, x: np.ndarray) -> np.ndarray:
+        return np.maximum(linear(self._weights, name, x), np.float32(0.0))
 
-    def _relu(self, name: str, x: np.ndarray) -> np.ndarray:
-        return np.maximum(self._linear(name, x), np.float32(0.0))
+
+def load_checkpoint(path: str, observation: str) -> PolicyCheckpoint:
+    """Reads a file of a student's weights; the shipped one if `path` is empty."""
+
+    def spec(way_version: int = 1, **fields: Any) -> StudentSpec:  # Old files are without it.
+        return StudentSpec(**fields, way_version=way_version)
+
+    return PolicyCheckpoint.load(path, f"student_{observation}", spec)
 
 
 def load_network(path: str, observation: str, speed: float | None = None) -> StudentNetwork:
-    """Loads the network from a file, see `PolicyCheckpoint.load`, for a nominal speed [m/s]."""
-    checkpoint = PolicyCheckpoint.load(path, f"student_{observation}", StudentSpec)
-    return checkpoint.build(partial(StudentNetwork, speed=speed))
+    """Loads the network from a file for a nominal speed [m/s], see `load_checkpoint`."""
+    return load_checkpoint(path, observation).build(partial(StudentNetwork, speed=speed))
 
 
-def plan(
-    network: StudentNetwork,
-    time: float,
-    image: np.ndarray,
-    X_WB: RigidTransform,
-    v_WB: np.ndarray,
-    p_WG: np.ndarray,
-) -> Hypotheses:
-    """Computes the hypotheses of one observation.
-
-    Args:
-        time: [s].
-        image: RGB (H, W, 3) uint8 or planar depth (H, W) [m], by `network.spec.observation`.
-        X_WB, v_WB: pose and velocity [m/s].
-        p_WG: goal [m].
-
-    Raises:
-        ValueError: for an image of another size.
-    """
-    R_WB = X_WB.rotation().matrix()
-    v_B, goal_B = R_WB.T @ v_WB / network.pace, R_WB.T @ (p_WG - X_WB.translation())
+def plan(network: StudentNetwork, seen: Observation) -> Hypotheses:
+    """Computes the hypotheses from RGB (H, W, 3) uint8 or planar depth (H, W) [m], by
+    `network.spec.observation`."""
+    R_WB = seen.X_WB.rotation().matrix()
+    v_B = R_WB.T @ seen.state.v_WB / network.pace
+    goal_B = R_WB.T @ (seen.p_WG - seen.X_WB.translation())
     state = encode_state(R_WB[None], v_B[None], goal_B[None], network.reach)[0]
     encode = encode_color if network.spec.pixels == "color" else encode_depth
-    waypoints_B, costs = network(encode(image.astype(np.float32)), state)
-    return Hypotheses(time, X_WB, waypoints_B.astype(float), costs.astype(float))
+    waypoints_B, costs = network(encode(seen.image.astype(np.float32)), state)
+    return Hypotheses(seen.time, seen.X_WB, waypoints_B.astype(float), costs.astype(float))
 
 
 @dataclass
-class StudentConfig(Config):
-    """Weights, speed and camera of a student."""
+class StudentConfig(LearnedPolicyConfig):
+    """Weights, speed and camera of a student, with the size and field of view of training."""
 
+    rate = RATE
     observation: ClassVar[str]
     """One of `PIXELS`."""
-    rate: ClassVar[float] = RATE
 
-    # [m/s] Nominal speed; the model card of the weights states the expert's.
-    speed: float = bounded(2.0, "[0.1, 10] m/s")
-    # File of weights from `splatpilot train`; the shipped ones if empty.
-    weights: str = ""
-    # Camera with the size and field of view of the training.
     camera: OnboardCamera = field(default_factory=lambda: OnboardCamera(width=160, height=120))
 
 
@@ -366,8 +287,8 @@ class StudentDepthConfig(StudentConfig):
     observation = "depth"
 
 
-class Student(LeafSystem):
-    """Plans three trajectories with costs from an RGB or depth image, by `plan` at 15 Hz.
+class Student(Policy):
+    """Plans three trajectories with costs from an RGB or depth image.
 
     .. pydrake_system::
 
@@ -379,51 +300,21 @@ class Student(LeafSystem):
         output_ports:
         - hypotheses
 
-    - ``state`` (13): ``[p_WB (3) [m], v_WB (3) [m/s], q_WB (4, wxyz), w_WB_B (3) [rad/s]]``.
-    - ``goal`` (3): p_WG [m], W frame.
-    - ``color_image`` (RGBA) or ``depth_image_32f`` (planar [m]) of the camera ``config.camera``, by
-      ``config.observation``.
     - ``hypotheses`` (8 + 31 * 3): as `Hypotheses.to_vector`, in the body frame B at the time of
-      planning; a discrete state, NaN before the first update.
-
-    Raises:
-        ValueError, FileNotFoundError: from the constructor on a config out of range, on weights
-            that are missing, damaged, or of another policy, version or architecture, and for a
-            camera other than that of the training.
+      planning; NaN before the first update.
     """
 
-    state_input_port = input_port("state")
-    goal_input_port = input_port("goal")
     hypotheses_output_port = output_port("hypotheses")
 
     def __init__(self, config: StudentConfig) -> None:
-        super().__init__()
-        config.validate()
-        weights = config.weights or str(shipped_weights(f"student_{config.observation}"))
-        self._network = load_network(weights, config.observation, config.speed)
+        rgb = config.observation == "rgb"
+        super().__init__(config, "color_image" if rgb else "depth_image_32f")
+        self._network = load_network(config.weights, config.observation, config.speed)
         for name in ("width", "height", "fov_x"):
             given, trained = getattr(config.camera, name), getattr(self._network.spec, name)
-            what = f"camera.{name} of the student"
             remedy = f"its weights were trained with {trained}"
-            require(given == trained, what, trained, given, remedy)
-        self._state_port = self.DeclareVectorInputPort("state", 13)
-        self._goal_port = self.DeclareVectorInputPort("goal", 3)
-        rgb = config.observation == "rgb"
-        name, image = ("color_image", ImageRgba8U) if rgb else ("depth_image_32f", ImageDepth32F)
-        size = config.camera.width, config.camera.height
-        self._image_port = self.DeclareAbstractInputPort(name, Value(image(*size)))
-        self.DeclareStateOutputPort("hypotheses", self.DeclareDiscreteState(no_plan(HYPOTHESES)))
-        self.DeclarePeriodicDiscreteUpdateEvent(1.0 / config.rate, 0.0, self._update)
+            require(given == trained, f"camera.{name} of the student", trained, given, remedy)
+        self.declare_state(no_plan(HYPOTHESES), "hypotheses")
 
-    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        state = np.asarray(self._state_port.Eval(context))
-        pixels = np.asarray(cast(Any, self._image_port.Eval(context)).data)  # (H, W, 4 or 1)
-        hypotheses = plan(
-            self._network,
-            context.get_time(),
-            pixels[..., :3] if self._network.spec.observation == "rgb" else pixels[..., 0],
-            pose_from_state(state),
-            QuadrotorState.of(state).v_WB,
-            np.asarray(self._goal_port.Eval(context)),
-        )
-        discrete_state.set_value(hypotheses.to_vector())
+    def decide(self, seen: Observation, *state: np.ndarray) -> list[np.ndarray]:
+        return [plan(self._network, seen).to_vector()]

@@ -44,8 +44,8 @@ class TimeOfArrival:
     """Time of arrival at a goal over a voxel grid, interpolated trilinearly.
 
     The unit is seconds at 1 m/s in open space. Voxels without a path to the goal have the value of
-    the nearest one with a path, plus the distance to it at the contact speed. Outside the box the
-    value is that of the nearest grid point. Immutable, shared by reference.
+    the nearest one with a path, plus the distance to it at the contact speed. Values are constant
+    outside the box. Immutable, shared by reference.
     """
 
     p_WG: np.ndarray  # (3,) [m], the goal
@@ -68,7 +68,7 @@ class TimeOfArrival:
     def is_reachable(self, p_WQ: np.ndarray, within: float = 0.0) -> bool:
         """Checks that a path leads to the goal from the voxel of p_WQ (3,) [m], or from one that
         the cube of half edge `within` [m] around it touches."""
-        from_corner = np.asarray(p_WQ) - self.lower_W
+        from_corner = p_WQ - self.lower_W
         first = np.floor((from_corner - within) / self.voxel_size)
         last = np.floor((from_corner + within) / self.voxel_size)
         if np.any(last < 0) or np.any(first >= self.reachable.shape):
@@ -78,33 +78,24 @@ class TimeOfArrival:
         return bool(self.reachable[cube].any())
 
     def path(self, p_WQ: np.ndarray, lengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns points (n, 3) [m] and directions (n, 3) of the path from p_WQ (3,) [m].
-
-        Each is after a length (n,) [m], with the direction of its last quarter; or at the goal if
-        that is nearer, with direction zero.
-        """
+        """Returns points (n, 3) [m] of the path from p_WQ (3,) [m] after lengths (n,) [m], and the
+        directions (n, 3) of their last quarters; beyond the goal, the goal and zero."""
         step = max(self.voxel_size, 0.1)  # [m] Shorter steps do not resolve more.
         longest = float(np.max(lengths))
         rows = np.empty((ceil(longest / step) + 3, 4))  # both ends, and one for rounding
-        count = _native.descend(
-            times=self.times,
-            lower_W=self.lower_W,
-            voxel_size=self.voxel_size,
-            p_WG=self.p_WG,
-            p_WQ=np.ascontiguousarray(p_WQ, dtype=float),
-            step=step,
-            length=longest,
-            path=rows,
-        )
-        *way, covered = rows[:count].T  # 3 of (m,), (m,)
+        grid = {name: getattr(self, name) for name in ("times", "lower_W", "voxel_size", "p_WG")}
+        p_WQ = np.ascontiguousarray(p_WQ, dtype=float)
+        count = _native.descend(**grid, p_WQ=p_WQ, step=step, length=longest, path=rows)
+        *path, covered = rows[:count].T  # 3 of (m,), (m,)
 
         def point_at(length: np.ndarray) -> np.ndarray:
-            return np.stack([np.interp(length, covered, along) for along in way], -1)
+            return np.stack([np.interp(length, covered, along) for along in path], -1)
 
         ends = point_at(lengths)
         chords = ends - point_at(0.75 * lengths)
         chords[lengths > covered[-1]] = 0.0
-        return ends, np.array([_unit(chord) for chord in chords])
+        sizes = np.sqrt([chord.dot(chord) for chord in chords])[:, None]
+        return ends, np.divide(chords, sizes, out=np.zeros_like(chords), where=sizes > 0.0)
 
     def _interpolate(self, p_WQ: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns values and gradients at the points, brought between the voxel centers."""
@@ -137,13 +128,8 @@ def time_of_arrival(
     Raises:
         InfeasibleFlightError: if the goal is outside the box, or its clearance below `margin`.
     """
-    require(
-        field.occupied_outside,
-        "the distance field",
-        "conservative",
-        "unknown space as free",
-        "pass esdf.conservative()",
-    )
+    what, remedy = "the distance field", "pass esdf.conservative()"
+    require(field.occupied_outside, what, "conservative", "unknown space as free", remedy)
     p_WG = np.array(p_WG, dtype=float)
     valid = p_WG.shape == (3,) and bool(np.isfinite(p_WG).all())
     require(valid, "the goal", "3 finite coordinates [m]", p_WG)
@@ -155,10 +141,10 @@ def time_of_arrival(
     clearance = float(goal_distance) - VEHICLE_RADIUS
     if clearance < margin:
         raise InfeasibleFlightError(
-            f"the clearance of {goal} must be at least {margin:.2f} m beyond the vehicle's radius "
-            f"of {VEHICLE_RADIUS} m, got {clearance:.2f} m: an obstacle, unknown space or the "
-            f"boundary of the known volume {box} is too close; choose a goal "
-            f"{margin - clearance:.2f} m further into free space"
+            f"the clearance of {goal} beyond the vehicle's radius must be at least {margin:.2f} m, "
+            f"got {clearance:.2f} m: an obstacle, unknown space or the boundary of the known "
+            f"volume {box} is too close; choose a goal {margin - clearance:.2f} m further into "
+            "free space"
         )
     # Starts from a sphere of known times that contains a voxel center; a point start would have
     # the largest error of the grid.
@@ -182,12 +168,6 @@ def time_of_arrival(
     times = times.astype(np.float32)
     times.flags.writeable = reachable.flags.writeable = p_WG.flags.writeable = False
     return TimeOfArrival(p_WG, times, reachable, field.lower_W, field.voxel_size)
-
-
-def _unit(vector: np.ndarray) -> np.ndarray:
-    """Scales `vector` (3,) to unit length; zero stays zero."""
-    length = np.sqrt(vector.dot(vector))
-    return vector / length if length > 0.0 else vector
 
 
 def _text(p_W: np.ndarray) -> str:

@@ -108,11 +108,9 @@ class VelocitySetpoint(LeafSystem):
     def __init__(self, controller: FlatnessControllerConfig):
         super().__init__()
         self._lookahead, self._yaw_speed = controller.lookahead, controller.yaw_speed
-        self.DeclareVectorInputPort("state", 13)
-        self.DeclareVectorInputPort("waypoint", 3)
-        self.DeclareVectorInputPort("acceleration", 3)
-        self.DeclareVectorInputPort("velocity", 3)
-        self.DeclareVectorInputPort("heading", 1)
+        sizes = {"state": 13, "waypoint": 3, "acceleration": 3, "velocity": 3, "heading": 1}
+        for name, size in sizes.items():
+            self.DeclareVectorInputPort(name, size)
         self.DeclareVectorOutputPort("velocity_setpoint", 4, self._calc)
 
     def _calc(self, context: Context, output: BasicVector) -> None:

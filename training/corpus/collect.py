@@ -5,12 +5,11 @@ from collections.abc import Iterable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from pydrake.math import RollPitchYaw
 
-from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.flight.sensors import make_camera
 from splatpilot.diagrams.worlds.appearance import draw_appearance, with_appearance
 from splatpilot.diagrams.worlds.world import World
@@ -24,19 +23,12 @@ from splatpilot.systems.common.validation import FieldError, require
 from splatpilot.systems.splats.splat_camera import color_pixels, ranged_depth
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 from splatpilot.systems.vehicle.state import QuadrotorState, pose_from_state
-from splatpilot.training.corpus.corpus import CONFIG, Corpus, CorpusConfig, entries, write_ledger
-from splatpilot.training.corpus.expert import (
-    PLANNER,
-    ExpertFlight,
-    Label,
-    Labeler,
-    fly_planner,
-    fly_policy,
-)
+from splatpilot.training.corpus.corpus import CONFIG, Corpus, CorpusConfig, subfolders, write_ledger
+from splatpilot.training.corpus.expert import PLANNER, Label, Labeler, fly_planner, fly_policy
 from splatpilot.training.corpus.library import (
     WorldRecord,
     WorldSource,
-    perturbed,
+    perturb_pose,
     record_world,
     world_source,
 )
@@ -53,14 +45,14 @@ from splatpilot.training.corpus.samples import (
 
 
 class Demonstration(NamedTuple):
-    """A state and what to imitate there."""
+    """A state and the trajectories to imitate there."""
 
     state: np.ndarray  # (13,)
-    waypoints_W: np.ndarray  # (K, 10, 3) [m], cheapest first; NaN for those that touch something
+    waypoints_W: np.ndarray  # (K, 10, 3) [m], cheapest first; NaN for those in contact
 
 
 def keep_clear(labels: Iterable[Label], field: Esdf) -> list[Demonstration]:
-    """Drops trajectories that touch something, and states that have no others."""
+    """Drops trajectories in contact, and states without others."""
     kept = []
     for state, plan in labels:
         waypoints_W = plan.waypoints_W
@@ -71,7 +63,7 @@ def keep_clear(labels: Iterable[Label], field: Esdf) -> list[Demonstration]:
     return kept
 
 
-def see_states(
+def render_samples(
     demonstrations: list[Demonstration],
     world: World,
     labeler: Labeler,
@@ -79,33 +71,31 @@ def see_states(
     bound: float,
     rng: np.random.Generator,
 ) -> Samples:
-    """
-    Renders demonstrations, each from its own pose and from perturbed ones.
+    """Renders demonstrations, each from its own pose and from perturbed ones.
 
     Args:
         demonstrations: n of them.
-        world: where; its look is drawn anew.
+        world: in which they are; its appearance is drawn.
         labeler: that of the labels.
         config: of the corpus.
-        bound: how far poses may be perturbed in this world [m].
-        rng: draws look and perturbations.
+        bound: maximum perturbation in this world [m].
+        rng: source of appearance and perturbations.
 
     Returns:
-        n (1 + copies) samples, `world` and `source` left open.
+        n (1 + copies) samples without `world` and `source`.
     """
     copies = config.perturbation.copies
     samples = Samples.zeros(len(demonstrations) * (1 + copies), config.size)
     if not demonstrations:
         return samples
-    look = draw_appearance(rng, config.appearance)
-    camera, optics = make_camera(config.camera, with_appearance(world, look)), config.camera
+    appearance = draw_appearance(rng, config.appearance)
+    camera, optics = make_camera(config.camera, with_appearance(world, appearance)), config.camera
     row = 0
     for state, waypoints_W in demonstrations:
         p_WB, v_WB, _, _ = QuadrotorState.of(state)
         X_WB = pose_from_state(state)
-        clearance = float(labeler.field.distance(p_WB)) - VEHICLE_RADIUS
-        reach = min(bound, clearance)
-        around = [perturbed(X_WB, config.perturbation, reach, rng) for _ in range(copies)]
+        reach = min(bound, float(labeler.field.distance(p_WB)) - VEHICLE_RADIUS)
+        around = [perturb_pose(X_WB, config.perturbation, reach, rng) for _ in range(copies)]
         for X_WP in [X_WB, *around]:
             R_PW, p_WP = X_WP.rotation().matrix().T, X_WP.translation()
             view = camera.render(X_WP)
@@ -119,59 +109,52 @@ def see_states(
     return samples
 
 
-# States off the expert's paths: anywhere in free space, half of them before a surface. An expert
-# keeps clear of everything, so no image of its flights shows an obstacle near and straight ahead.
-# Nor does it stop near its goal; students of its flights alone do, and stay.
+# States off the expert's paths, anywhere in free space. An expert keeps clear of everything, so no
+# image of its flights shows a near obstacle straight ahead; and it does not stop near its goal.
 
+STATES_PER_APPEARANCE = 60
 
-STATES_A_LOOK = 60
-"""Number of states with the same appearance of the world."""
-
-_CLEARANCE = 0.05  # [m], least clearance
-_BEFORE = 1.0  # [m], greatest clearance before a surface
-_UPRIGHT = 0.5  # [-], least horizontal part of its normal
-_ARRIVING = 4.0  # [m], greatest distance from the goal of those that are near it
+_CLEARANCE = 0.05  # [m], minimum clearance
+_BEFORE = 1.0  # [m], maximum clearance before a surface
+_UPRIGHT = 0.5  # [-], minimum horizontal part of its normal
+_ARRIVING = 4.0  # [m], maximum distance from the goal of those that are near it
 _CANDIDATES = 8  # for each state
-_TURN = 0.6  # [rad], standard deviation of the yaw about the way, or about the nearest surface
+_TURN = 0.6  # [rad], standard deviation of the yaw about the path, or about the nearest surface
 _LEAN = 0.12  # [rad], standard deviation of roll and pitch
-_BRAKING = 3.0  # [m/s^2], with which none is too fast to stop before the nearest surface
+_BRAKING = 3.0  # [m/s^2], which limits speeds by the distance to the nearest surface
 _SIDEWAYS = 0.3  # [m/s], standard deviation
 
 
 def draw_off_path(
     labeler: Labeler, count: int, speed: float, rng: np.random.Generator
 ) -> np.ndarray:
-    """
-    Draws states (count, 13) from which a path leads to the goal.
+    """Draws states (count, 13) from which a path leads to the goal.
 
-    Half are within a meter of a surface other than the ground and look at it.
-    Of the others half are within 4 m of the goal, uniform in distance, and look anywhere; half are
-    uniform in space and look along the path. All deviate from that, and fly where they look, at up
-    to `speed` [m/s] and no faster than they can stop.
+    Half are within a meter of a surface other than the ground and look at it. A quarter are within
+    4 m of the goal, uniform in distance, and look anywhere. The others are uniform in space and
+    look along the path. All deviate from that, and fly where they look, at up to `speed` [m/s] and
+    no faster than they can stop.
 
     Raises:
         InfeasibleFlightError: if there is no free position.
     """
     field, toa = labeler.field, labeler.toa
-    cells = np.argwhere(toa.reachable & (field.distances > VEHICLE_RADIUS + _CLEARANCE))
-    if len(cells) == 0:
-        raise InfeasibleFlightError("no position from which a path leads to the goal is free")
-    centers = field.lower_W + field.voxel_size * (cells + 0.5)
+    centers = _free_positions(labeler, _CLEARANCE)
     candidates = centers[rng.integers(len(centers), size=_CANDIDATES * count)]
     to_goal = np.linalg.norm(centers - toa.p_WG, axis=1)
     share = np.where(to_goal < _ARRIVING, 1.0 / np.maximum(to_goal, field.voxel_size) ** 2, 0.0)
     near = count // 4 if share.any() else 0
     arriving = centers[rng.choice(len(centers), near, p=share / share.sum())] if near else []
     candidates = np.concatenate([np.reshape(arriving, (-1, 3)), candidates])
-    seen = field.query(candidates)
-    before = np.linalg.norm(seen.gradient[:, :2], axis=1) > _UPRIGHT
-    before &= seen.distance < VEHICLE_RADIUS + _BEFORE
+    nearest = field.query(candidates)
+    before = np.linalg.norm(nearest.gradient[:, :2], axis=1) > _UPRIGHT
+    before &= nearest.distance < VEHICLE_RADIUS + _BEFORE
     before[:near] = False
     before = np.flatnonzero(before)[: count // 2]
     chosen = np.concatenate([before, np.arange(count - len(before))])
-    p_WB, distance = candidates[chosen], seen.distance[chosen]
+    p_WB, distance = candidates[chosen], nearest.distance[chosen]
     toward = toa.gradient(p_WB)
-    toward[: len(before)] = seen.gradient[before]
+    toward[: len(before)] = nearest.gradient[before]
     yaw = np.arctan2(-toward[:, 1], -toward[:, 0]) + _TURN * rng.normal(size=count)
     yaw[len(before) : len(before) + near] = rng.uniform(-np.pi, np.pi, near)
     roll, pitch = _LEAN * rng.normal(size=(2, count))
@@ -180,25 +163,29 @@ def draw_off_path(
     aside, up = _SIDEWAYS * rng.normal(size=(2, count))
     cos, sin = np.cos(yaw), np.sin(yaw)
     v_WB = np.stack([cos * ahead - sin * aside, sin * ahead + cos * aside, up], axis=1)
-    return np.stack(
-        [
-            QuadrotorState(
-                p_WB[n],
-                v_WB[n],
-                RollPitchYaw(roll[n], pitch[n], yaw[n]).ToQuaternion().wxyz(),
-                np.zeros(3),
-            ).to_vector()
-            for n in range(count)
-        ]
-    )
+    angles = np.stack([roll, pitch, yaw], axis=1)
+    q_WB = np.array([RollPitchYaw(rpy).ToQuaternion().wxyz() for rpy in angles])
+    return np.concatenate([p_WB, v_WB, q_WB, np.zeros((count, 3))], axis=1)
+
+
+def _free_positions(labeler: Labeler, clearance: float, min_time: Any = -1.0) -> np.ndarray:
+    """Lists the voxel centers (n, 3) [m] with a clearance [m], from which a path of more than
+    `min_time` [s] leads to the goal."""
+    field, toa = labeler.field, labeler.toa
+    free = toa.reachable & (field.distances > VEHICLE_RADIUS + clearance)
+    cells = np.argwhere(free & (toa.times > min_time))
+    if len(cells) == 0:
+        raise InfeasibleFlightError(
+            "no free position with a path to the goal is far enough from it"
+        )
+    return field.lower_W + field.voxel_size * (cells + 0.5)
 
 
 _START_CLEARANCE = 0.3  # [m]
 
 
 def collect_world(folder: Path, config: CorpusConfig, index: int, revision: str) -> None:
-    """
-    Collects the world `index` of the library: its record, then its shards.
+    """Collects the world `index` of the library: its record, then its shards.
 
     Args:
         folder: of the corpus.
@@ -207,108 +194,68 @@ def collect_world(folder: Path, config: CorpusConfig, index: int, revision: str)
         revision: of the program.
 
     Raises:
-        InfeasibleFlightError: if there is no such world, or its goal cannot be flown to.
-        OSError: if it cannot be written.
+        InfeasibleFlightError: if there is no such world, or no path to its goal.
     """
     source = world_source(config.worlds, config.seed, index)
     world = make_world(source.world, source.seed)
     labeler = Labeler(world.esdf, world.p_WG, config.expert)
+    bound = source.perturbation_bound
     record_world(folder / "worlds" / source.name, source, world.esdf)
-    _collect_off_path(folder, config, source, world, labeler, revision)
+
+    def write(kind: int, parts: list[Samples], flights: list[dict]) -> None:
+        about = {"world": source.name, "source": kind, "flights": flights, "revision": revision}
+        write_shard(shard_folder(folder, source.name, kind), parts, config.size, **about)
+
+    parts = []
+    own_pose = replace(config, perturbation=replace(config.perturbation, copies=0))
+    for first in range(0, config.off_path, STATES_PER_APPEARANCE):
+        # The expert's flights use the numbers from 0.
+        rng = np.random.default_rng([config.seed, source.seed, config.flights + first])
+        count = min(STATES_PER_APPEARANCE, config.off_path - first)
+        states = draw_off_path(labeler, count, config.expert.speed, rng)
+        shown = keep_clear(labeler.labels(states), labeler.field)
+        parts.append(render_samples(shown, world, labeler, own_pose, bound, rng))
+    if config.off_path:
+        write(OFF_PATH, parts, [{"states": sum(map(len, parts))}])
+
     rngs = [np.random.default_rng([config.seed, source.seed, k]) for k in range(config.flights)]
-    starts = np.stack([world.p_WS, *(_draw_start(labeler, world.p_WS, rng) for rng in rngs[1:])])
+    min_time = 0.5 * labeler.toa.value(world.p_WS)
+    starts = [world.p_WS]
+    for rng in rngs[1:]:
+        free = _free_positions(labeler, _START_CLEARANCE, min_time)
+        starts.append(free[rng.integers(len(free))])
+    if config.expert.policy == PLANNER:
+        flights = fly_planner(np.stack(starts), world, config.expert, labeler)
+    else:
+        flights = [fly_policy(start, world, config.expert, labeler) for start in starts]
     parts, entries = [], []
-    for number, (flight, rng) in enumerate(
-        zip(_fly(starts, world, config, labeler), rngs, strict=True)
-    ):
+    for number, (start, flight, rng) in enumerate(zip(starts, flights, rngs, strict=True)):
         labels = flight.labels if flight.is_demonstration else []
-        demonstrations = keep_clear(labels, labeler.field)
-        bound = source.perturbation_bound
-        parts.append(see_states(demonstrations, world, labeler, config, bound, rng))
+        shown = keep_clear(labels, labeler.field)
+        parts.append(render_samples(shown, world, labeler, config, bound, rng))
         entries.append(
             {
                 "flight": number,
                 "seed": source.seed,
-                "start": starts[number].tolist(),
+                "start": start.tolist(),
                 "goal": world.p_WG.tolist(),
                 "outcome": str(flight.outcome),
                 "time_s": flight.time,
-                "least_clearance_m": flight.least_clearance,
-                "states": len(demonstrations),
+                "least_clearance_m": flight.min_clearance,
+                "states": len(shown),
             }
         )
-    write_shard(
-        shard_folder(folder, source.name),
-        parts,
-        config.size,
-        world=source.name,
-        source=EXPERT,
-        flights=entries,
-        revision=revision,
-    )
+    write(EXPERT, parts, entries)
 
 
 def shard_folder(folder: Path, world: str, source: int = EXPERT) -> Path:
-    """Names the folder of a world's samples of a source."""
+    """Returns the folder of a world's samples of a source."""
     return folder / "shards" / f"{SOURCES[source]}-{world}"
-
-
-def _collect_off_path(
-    folder: Path,
-    config: CorpusConfig,
-    source: WorldSource,
-    world: World,
-    labeler: Labeler,
-    revision: str,
-) -> None:
-    """Writes the shard of states off the expert's paths, if the corpus has any."""
-    if not config.off_path:
-        return
-    alone = replace(config, perturbation=replace(config.perturbation, copies=0))
-    parts = []
-    for first in range(0, config.off_path, STATES_A_LOOK):
-        # The expert's flights have the numbers from 0 on.
-        rng = np.random.default_rng([config.seed, source.seed, config.flights + first])
-        count = min(STATES_A_LOOK, config.off_path - first)
-        states = draw_off_path(labeler, count, config.expert.speed, rng)
-        demonstrations = keep_clear(labeler.labels(states), labeler.field)
-        bound = source.perturbation_bound
-        parts.append(see_states(demonstrations, world, labeler, alone, bound, rng))
-    write_shard(
-        shard_folder(folder, source.name, OFF_PATH),
-        parts,
-        config.size,
-        world=source.name,
-        source=OFF_PATH,
-        flights=[{"states": sum(map(len, parts))}],
-        revision=revision,
-    )
-
-
-def _fly(
-    starts: np.ndarray, world: World, config: CorpusConfig, labeler: Labeler
-) -> Iterable[ExpertFlight]:
-    """Flies the expert from each of the starts (N, 3) [m] to the goal of the world."""
-    if config.expert.policy == PLANNER:
-        return fly_planner(starts, world, config.expert, labeler)
-    scenarios = (Scenario(start=start, start_radius=0.0) for start in starts.tolist())
-    return (fly_policy(scenario, world, config.expert, labeler) for scenario in scenarios)
-
-
-def _draw_start(labeler: Labeler, p_WS: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Draws a free position (3,) [m], at least half as far from the goal as p_WS (3,) [m]."""
-    field, toa = labeler.field, labeler.toa
-    roomy = toa.reachable & (field.distances > VEHICLE_RADIUS + _START_CLEARANCE)
-    cells = np.argwhere(roomy & (toa.times > 0.5 * toa.value(p_WS)))
-    if len(cells) == 0:
-        raise InfeasibleFlightError("no position half as far from the goal as the start is free")
-    return field.lower_W + field.voxel_size * (cells[rng.integers(len(cells))] + 0.5)
 
 
 @holds_folder("out")
 def run(*, config: CorpusConfig, out: Path, worlds: int, jobs: int | None = None) -> Corpus:
-    """
-    Collects the first `worlds` worlds of a corpus in `out`, except those that it has already.
+    """Collects the first `worlds` worlds of a corpus in `out`, except those that it has already.
 
     An interrupted run is resumed by the same call, with bitwise identical results. Damaged shards
     are collected again.
@@ -321,11 +268,6 @@ def run(*, config: CorpusConfig, out: Path, worlds: int, jobs: int | None = None
 
     Returns:
         The corpus.
-
-    Raises:
-        FileNotFoundError, ValueError: on a config out of range, another corpus in `out`, a shard
-            of another version, or if nothing was collected.
-        OSError: if `out` cannot be written, or a worker process dies.
     """
     try:
         config.validate()
@@ -346,9 +288,14 @@ def run(*, config: CorpusConfig, out: Path, worlds: int, jobs: int | None = None
     if missing:
         _require_same_program(out, program)
     for k in missing:
+        name = sources[k].name
         if k in damage:
-            say(f"{damage[k]}: {sources[k].name} is collected again")
-        _remove(out, sources[k].name)
+            say(f"{damage[k]}: {name} is collected again")
+        for path in (
+            out / "worlds" / name,
+            *(shard_folder(out, name, s) for s in (OFF_PATH, EXPERT)),
+        ):
+            shutil.rmtree(path, ignore_errors=True)
     collect = partial(_collect, out, config, program)
     bar = Progress(total=worlds, initial=worlds - len(missing), desc="collecting", unit="world")
 
@@ -361,22 +308,21 @@ def run(*, config: CorpusConfig, out: Path, worlds: int, jobs: int | None = None
                 say(reason)
             bar.update()
     corpus = Corpus(out)
-    write_ledger(out, corpus)
+    write_ledger(corpus)
     return corpus
 
 
 def _damage(out: Path, source: WorldSource, config: CorpusConfig) -> str:
-    """Describes the damage of a collected world; empty if there is none.
+    """Describes the damage of a collected world, "" if there is none.
 
     Raises:
         ValueError: if it is of another version or definition.
     """
     try:
         record = WorldRecord(out / "worlds" / source.name)
-        record.esdf()
-        Shard(shard_folder(out, source.name)).verify()
-        if config.off_path:
-            Shard(shard_folder(out, source.name, OFF_PATH)).verify()
+        _ = record.esdf
+        for kind in (EXPERT, OFF_PATH) if config.off_path else (EXPERT,):
+            Shard(shard_folder(out, source.name, kind)).verify()
     except OtherVersionError:
         raise
     except (ValueError, FileNotFoundError) as error:
@@ -390,25 +336,18 @@ def _damage(out: Path, source: WorldSource, config: CorpusConfig) -> str:
 
 
 def _require_same_program(out: Path, program: str) -> None:
-    """Raises ValueError if another program collected what is there, except for recovery."""
-    for path in entries(out / "shards"):
+    """Raises ValueError if another program collected the samples, except those of recovery."""
+    for path in subfolders(out / "shards"):
         try:
             shard = Shard(path)
-        except ValueError:  # it is damaged
+        except ValueError:  # It is damaged.
             continue
         if shard.source != RECOVERY and shard.revision != program:
             raise ValueError(
-                f"{shard.path} was collected by revision {shard.revision} of the program, this is "
-                f"{program}, and one corpus is collected by one program; go back to that revision, "
-                "or collect more worlds with another seed in another --out"
+                f"revision of {shard.path} must be that of the program, {program}, got "
+                f"{shard.revision}; go back to that revision, or collect more worlds with another "
+                "seed in another --out"
             )
-
-
-def _remove(out: Path, world: str) -> None:
-    """Removes the incomplete or damaged folders of a world."""
-    shutil.rmtree(out / "worlds" / world, ignore_errors=True)
-    for source in (OFF_PATH, EXPERT):
-        shutil.rmtree(shard_folder(out, world, source), ignore_errors=True)
 
 
 def _collect(out: Path, config: CorpusConfig, revision: str, index: int) -> str:

@@ -24,11 +24,16 @@ from splatpilot.systems.common.files import (
     written_atomically,
 )
 from splatpilot.systems.common.seeds import first_training_seed
-from splatpilot.systems.common.validation import Config, bounded
+from splatpilot.systems.common.validation import Config, bounded, require
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.training.corpus.expert import ExpertConfig
-from splatpilot.training.corpus.library import LibraryConfig, PerturbationConfig, WorldRecord
-from splatpilot.training.corpus.samples import OFF_PATH, SOURCES, Samples, SampleSize, Shard
+from splatpilot.training.corpus.library import WORLD, LibraryConfig, PerturbationConfig, WorldRecord
+from splatpilot.training.corpus.samples import OFF_PATH, SHARD, SOURCES, Samples, SampleSize, Shard
+
+CONFIG = "corpus.yaml"
+LEDGER = "ledger.csv"
+
+_REMEDY = "run `splatpilot corpus make` again"
 
 
 @dataclass
@@ -60,40 +65,27 @@ class CorpusConfig(Config):
         return SampleSize(self.camera.height, self.camera.width, self.expert.num_hypotheses)
 
 
-CONFIG = "corpus.yaml"
-LEDGER = "ledger.csv"
-
-
 class Corpus:
-    """The samples of a folder, numbered through its shards in order of their names.
+    """The samples of a folder, indexed through its shards in order of their names.
 
-    Images are mapped into memory and read when they are used.
+    Images are mapped into memory and read as they are used.
 
     Raises:
         FileNotFoundError: if there is no corpus.
-        ValueError: if a shard or a world is damaged or of another version, naming it and the
-            remedy; or if there is not a single sample.
+        ValueError: if a shard or a world is damaged or of another version, or without samples.
     """
 
     def __init__(self, folder: Path) -> None:
         require_corpus(folder)
         self.folder = folder
         self.config = load_config(CorpusConfig(), folder / CONFIG)
-        self.shards = [Shard(path) for path in entries(folder / "shards")]
-        self.worlds: Sequence[WorldRecord] = [
-            WorldRecord(path) for path in entries(folder / "worlds")
-        ]
-        number = {world.name: k for k, world in enumerate(self.worlds)}
-        missing = {shard.world for shard in self.shards} - number.keys()
-        if missing:
-            raise ValueError(
-                f"{folder / 'worlds'} lacks {min(missing)}, of which there are samples; run "
-                "`splatpilot corpus make` again"
-            )
+        self.shards = [Shard(path) for path in subfolders(folder / "shards")]
+        self.worlds = [WorldRecord(path) for path in subfolders(folder / "worlds")]
+        index = {world.name: k for k, world in enumerate(self.worlds)}
+        _require_all(folder / "worlds", {shard.world for shard in self.shards}, index)
         self._filled = [shard for shard in self.shards if len(shard)]
-        if not self._filled:
-            raise ValueError(f"{folder} holds no samples yet; run `splatpilot corpus make` again")
-        self._world = [number[shard.world] for shard in self._filled]
+        require(self._filled, f"{folder}", "a corpus with samples", "none", _REMEDY)
+        self._world = [index[shard.world] for shard in self._filled]
         self._first = np.cumsum([0, *map(len, self._filled)])
 
     def __len__(self) -> int:
@@ -110,41 +102,27 @@ class Corpus:
         )
 
     def verify(self) -> None:
-        """Reads all of it.
-
-        Raises:
-            FileNotFoundError, ValueError: if what is there is not what was written, or the ledger
-                names a shard that is not there.
-        """
+        """Reads everything; raises an error for content that differs from what was written."""
+        types = self.config.size.image_types()
         for shard in self.shards:
             shard.verify()
-            for name, dtype in self.config.size.image_types().items():
-                if len(shard) and shard.arrays[name].shape[1:] != dtype.shape:
-                    raise ValueError(
-                        f"{shard.path} has images of {shard.arrays[name].shape[1:]} pixels, but "
-                        f"{self.folder / CONFIG} says {dtype.shape}; restore that file"
-                    )
+            for name in types if len(shard) else ():
+                size, given = types[name].shape, shard.arrays[name].shape[1:]
+                what = f"images of {shard.path}"
+                require(given == size, what, f"{size} as in {self.folder / CONFIG}", given)
         for world in self.worlds:
-            world.esdf()
+            _ = world.esdf
         ledger = self.folder / LEDGER
         if ledger.is_file():
             with ledger.open(newline="") as file:
-                told = {row["shard"] for row in csv.DictReader(file)}
-            if lacking := sorted(told - {shard.path.name for shard in self.shards}):
-                raise ValueError(
-                    f"{self.folder / 'shards'} lacks {lacking[0]}, of which {LEDGER} tells; run "
-                    "the command that gathered it again"
-                )
+                listed = {row["shard"] for row in csv.DictReader(file)}
+            _require_all(self.folder / "shards", listed, {s.path.name for s in self.shards})
 
     def samples(self, indices: np.ndarray) -> Samples:
-        """Copies samples (N,), in the order of `indices`.
-
-        Raises:
-            IndexError: if one is not from 0 to less than the length.
-        """
+        """Copies samples (N,), in the order of `indices`."""
         indices = np.asarray(indices)
         if len(indices) and not (indices.min() >= 0 and indices.max() < len(self)):
-            raise IndexError(f"samples are numbered 0 to {len(self) - 1}")
+            raise IndexError(f"indices of samples must be in [0, {len(self)})")
         found = Samples.zeros(len(indices), self.config.size)
         within = np.searchsorted(self._first, indices, side="right") - 1
         for k in np.unique(within):
@@ -156,7 +134,15 @@ class Corpus:
         return found
 
 
-def entries(folder: Path) -> list[Path]:
+def _require_all(folder: Path, needed: set[str], present: Any) -> None:
+    """Raises ValueError if one of the needed folders is missing."""
+    if missing := sorted(needed.difference(present)):
+        raise ValueError(
+            f"No such folder: {folder / missing[0]}, of which {LEDGER} or shards tell; {_REMEDY}"
+        )
+
+
+def subfolders(folder: Path) -> list[Path]:
     """Lists the folders in a folder by name, without those that are being written."""
     return sorted(path for path in folder.iterdir() if not path.name.startswith("."))
 
@@ -179,28 +165,24 @@ def distinct_worlds(corpora: Sequence[Corpus]) -> dict[str, WorldRecord]:
 
 
 def distinct_shards(corpora: Sequence[Corpus]) -> list[list[Shard]]:
-    """Lists the shards of each corpus that none before it has.
+    """Lists the shards of each corpus that are not in those before it.
 
-    Two are the same if their names and their descriptions, with checksums of all files, are.
+    Shards are equal if their names and descriptions are, which have checksums of all files.
     """
     seen: set[tuple[str, bytes]] = set()
     kept: list[list[Shard]] = []
     for corpus in corpora:
         kept.append([])
         for shard in corpus.shards:
-            what = shard.path.name, (shard.path / "shard.json").read_bytes()
-            if what not in seen:
-                seen.add(what)
+            key = shard.path.name, (shard.path / SHARD).read_bytes()
+            if key not in seen:
+                seen.add(key)
                 kept[-1].append(shard)
     return kept
 
 
-def write_ledger(folder: Path, corpus: Corpus) -> None:
-    """Writes `ledger.csv` from the descriptions of the shards.
-
-    Raises:
-        OSError: if it cannot be written.
-    """
+def write_ledger(corpus: Corpus) -> None:
+    """Writes `ledger.csv` from the descriptions of the shards."""
     rows: list[dict[str, Any]] = []
     for shard in corpus.shards:
         same = {
@@ -211,13 +193,10 @@ def write_ledger(folder: Path, corpus: Corpus) -> None:
         }
         rows += [same | flight for flight in shard.flights]
     columns = list(dict.fromkeys(name for row in rows for name in row))
-    with written_atomically(folder / LEDGER) as path, path.open("w", newline="") as file:
+    with written_atomically(corpus.folder / LEDGER) as path, path.open("w", newline="") as file:
         table = csv.DictWriter(file, columns, lineterminator="\n")
         table.writeheader()
         table.writerows(rows)
-
-
-_PARTS = ("worlds", "world.yaml"), ("shards", "shard.json")  # folders and their descriptions
 
 
 def link_corpus(source: Path, folder: Path) -> None:
@@ -225,31 +204,25 @@ def link_corpus(source: Path, folder: Path) -> None:
 
     Raises:
         ValueError: if `folder` has other content of the same name.
-        OSError: if it cannot be written.
     """
-    for kind, about in _PARTS:
-        for entry in entries(source / kind):
+    for kind, about in (("worlds", WORLD), ("shards", SHARD)):
+        (folder / kind).mkdir(parents=True, exist_ok=True)
+        for entry in subfolders(source / kind):
             target = folder / kind / entry.name
             if not target.exists():
-                _link_folder(entry, target)
+                with folder_written_atomically(target) as linked:
+                    shutil.copytree(entry, linked, copy_function=_link, dirs_exist_ok=True)
             elif (target / about).read_bytes() != (entry / about).read_bytes():
                 raise ValueError(
-                    f"{entry} is another than when {target} was made of it; choose another --out"
+                    f"{entry} has changed since {target} was made of it; choose another --out"
                 )
     if not (folder / CONFIG).exists():
-        _link(source / CONFIG, folder / CONFIG)
+        with written_atomically(folder / CONFIG) as path:
+            shutil.copyfile(source / CONFIG, path)
 
 
-def _link_folder(source: Path, target: Path) -> None:
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with folder_written_atomically(target) as partial_folder:
-        for file in source.iterdir():
-            _link(file, partial_folder / file.name)
-
-
-def _link(source: Path, target: Path) -> None:
+def _link(source: str, target: str) -> None:
     try:
         os.link(source, target)
     except OSError:  # on another disk
-        with written_atomically(target) as path:
-            shutil.copyfile(source, path)
+        shutil.copyfile(source, target)

@@ -1,7 +1,7 @@
 """The expert to imitate: its flights, and the best trajectories from any state."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import ceil
 from typing import NamedTuple
 
@@ -34,7 +34,8 @@ from splatpilot.systems.vehicle.state import QuadrotorState, lengths
 
 PLANNER = "planner"
 
-_LONGEST = NUM_WAYPOINTS * WAYPOINT_PERIOD - FlatnessControllerConfig.lookahead  # [s]
+_MAX_PERIOD = NUM_WAYPOINTS * WAYPOINT_PERIOD - FlatnessControllerConfig.lookahead  # [s]
+_STEP = 0.02  # [s], at most, between two commands
 
 
 class Label(NamedTuple):
@@ -55,7 +56,7 @@ class ExpertConfig(Config):
     speed: float = 2.0
     # [s] Time between labeled states, and between plans of a planner that flies. Plans last 1 s, of
     # which the controller looks 0.4 s ahead.
-    period: float = bounded(0.4, f"[0.02, {_LONGEST:g}] s")
+    period: float = bounded(0.4, f"[0.02, {_MAX_PERIOD:g}] s")
     # [-] Trajectories of each label, K.
     num_hypotheses: int = 3
 
@@ -64,59 +65,49 @@ class ExpertConfig(Config):
         self.lattice().validate()
 
     def lattice(self) -> LatticeConfig:
-        """Of the planner, which labels, and flies if it is the expert."""
+        """Returns the lattice of the planner that labels, and that flies if it is the expert."""
         return LatticeConfig(speed=self.speed, num_hypotheses=self.num_hypotheses)
 
 
 @dataclass(frozen=True, eq=False)
 class ExpertFlight:
-    """A flight of the expert, and what it would do from states along it."""
+    """A flight of the expert, and labels of states along it."""
 
     outcome: Outcome
-    time: float  # [s] that it took
-    least_clearance: float  # [m]
-    labels: list[Label]  # of states along it, one every `period`
+    time: float  # [s], duration
+    min_clearance: float  # [m]
+    labels: list[Label]  # one every `ExpertConfig.period`
 
     @property
     def is_demonstration(self) -> bool:
-        """Whether it reached its goal and touched nothing."""
-        return self.outcome is Outcome.GOAL and self.least_clearance > 0.0
+        """Tells whether it reached its goal without contact."""
+        return self.outcome is Outcome.GOAL and self.min_clearance > 0.0
 
 
 class Labeler:
-    """What the best trajectories are from any state of a place: the planner with its global hint.
+    """Plans the best trajectories from any state of a scene to a goal.
 
     Args:
-        esdf: the place; unknown space counts as occupied.
+        esdf: the scene; unknown space counts as occupied.
         p_WG: the goal (3,) [m].
         config: speed and number of trajectories.
-        params: the vehicle's.
 
     Raises:
-        ValueError: if the goal is not in free space.
+        InfeasibleFlightError: if the goal is not in free space.
     """
 
-    def __init__(
-        self,
-        esdf: Esdf,
-        p_WG: np.ndarray,
-        config: ExpertConfig,
-        params: QuadrotorParams | None = None,
-    ) -> None:
-        self._lattice, self._params = TrajectoryLattice(config.lattice()), params
+    def __init__(self, esdf: Esdf, p_WG: np.ndarray, config: ExpertConfig) -> None:
+        self._lattice = TrajectoryLattice(config.lattice())
         self.field = esdf if esdf.occupied_outside else esdf.conservative()
         self.toa = time_of_arrival(self.field, p_WG, config.lattice().margin)
 
     def label(self, time: float, state: np.ndarray) -> Hypotheses:
-        """The K best distinct trajectories from a state (13,), cheapest first.
-
-        Raises:
-            ValueError: if no way leads to the goal from there.
-        """
-        return plan(time, state, self.field, self.toa, self._lattice, self._params)
+        """Plans the K best distinct trajectories from a state (13,), cheapest first; raises
+        InfeasibleFlightError if no path leads to the goal."""
+        return plan(time, state, self.field, self.toa, self._lattice)
 
     def labels(self, states: Iterable[np.ndarray]) -> list[Label]:
-        """States (13,) with their trajectories, less those that no way leads on from."""
+        """Labels the states (13,) from which a path leads to the goal."""
         labels = []
         for state in states:
             try:
@@ -127,14 +118,11 @@ class Labeler:
 
 
 def fly_policy(
-    scenario: Scenario, world: World, config: ExpertConfig, labeler: Labeler
+    p_WS: np.ndarray, world: World, config: ExpertConfig, labeler: Labeler
 ) -> ExpertFlight:
-    """Flies `scenario` in `world` by the expert's policy, as in the benchmark.
-
-    Raises:
-        ValueError: on a scenario that cannot be flown.
-    """
-    scenario = replace(scenario, policy=policy_named(config.policy, config.speed))
+    """Flies the expert's policy from p_WS (3,) [m] to the world's goal, as in the benchmark."""
+    policy = policy_named(config.policy, config.speed)
+    scenario = Scenario(start=p_WS.tolist(), start_radius=0.0, policy=policy)
     scenario.validate()
     flight = fly(BuildFlightDiagram(scenario, world, camera=False), scenario, world)
     times = np.arange(0.0, flight.times[-1], config.period)
@@ -146,23 +134,13 @@ def fly_policy(
     )
 
 
-GOAL_RADIUS = 0.3  # [m]
-TIMEOUT = 60.0  # [s]
-
-_STEP = 0.02  # [s], at most, between two commands
-
-
 def fly_planner(
     p_WS: np.ndarray, world: World, config: ExpertConfig, labeler: Labeler
 ) -> list[ExpertFlight]:
-    """Flies from each of the starts p_WS (N, 3) [m] to the labeler's goal.
+    """Flies the planner from each of the starts p_WS (N, 3) [m] to the labeler's goal, all at once.
 
-    The vehicles have the equations of the simulated plant and the law of its controller; a step of
-    many costs as much as one of one. They look along their way, and fly by their labels: a plan
-    every 0.4 s leads to the goal as safely as one every 0.07 s.
-
-    Raises:
-        ValueError: if no way leads to the goal from a state along a flight.
+    The vehicles have the equations of the simulated plant and its controller. They look along
+    their path and follow their labels.
     """
     control, params, p_WG = FlatnessControllerConfig(), QuadrotorParams(), labeler.toa.p_WG
     substeps = ceil(config.period / _STEP - 1e-9)
@@ -173,17 +151,17 @@ def fly_planner(
     outcomes = [Outcome.TIMEOUT] * len(p_WS)
     traces: list[list[np.ndarray]] = [[p] for p in p_WS]
     labels: list[list[Label]] = [[] for _ in p_WS]
-    for number in range(ceil(TIMEOUT / config.period)):
+    for number in range(ceil(Scenario.timeout / config.period)):
         if not len(flying):
             break
-        ways = np.empty((len(flying), NUM_WAYPOINTS + 1, 3))
+        paths = np.empty((len(flying), NUM_WAYPOINTS + 1, 3))
         for row, (n, state) in enumerate(zip(flying, states, strict=True)):
             plan = labeler.label(number * config.period, state)
             labels[n].append(Label(state, plan))
-            ways[row] = np.vstack([state[:3], plan.waypoints_W[plan.best]])
+            paths[row] = np.vstack([state[:3], plan.waypoints_W[plan.best]])
         for step in range(substeps):
             p_WB, v_WB, _, _ = QuadrotorState.of(states)
-            p_WR = _along(ways, step * dt + control.lookahead)
+            p_WR = _interpolate(paths, step * dt + control.lookahead)
             a_WB = reaching_acceleration(p_WR, p_WB, v_WB, control.lookahead)
             heading = np.arctan2(p_WR[:, 1] - p_WB[:, 1], p_WR[:, 0] - p_WB[:, 0])
             command = flatness_command(states, a_WB, v_WB, heading, control, params)
@@ -191,28 +169,23 @@ def fly_planner(
             p_WB = QuadrotorState.of(states).p_WB
             for n, p in zip(flying, p_WB, strict=True):
                 traces[n].append(p)
-            arrived = lengths(p_WB - p_WG)[:, 0] <= GOAL_RADIUS
-            touched = labeler.field.distance(p_WB) < VEHICLE_RADIUS
-            for n in flying[arrived]:
-                outcomes[n] = Outcome.GOAL
-            for n in flying[touched]:
-                outcomes[n] = Outcome.COLLISION
-            going = ~(arrived | touched)
-            flying, ways, states = flying[going], ways[going], states[going]
-    return [
-        ExpertFlight(outcome, dt * (len(trace) - 1), _least_clearance(np.stack(trace), world), own)
-        for outcome, trace, own in zip(outcomes, traces, labels, strict=True)
-    ]
+            arrived = lengths(p_WB - p_WG)[:, 0] <= Scenario.goal_radius
+            collided = labeler.field.distance(p_WB) < VEHICLE_RADIUS
+            for ended, outcome in ((arrived, Outcome.GOAL), (collided, Outcome.COLLISION)):
+                for n in flying[ended]:
+                    outcomes[n] = outcome
+            keep = ~(arrived | collided)
+            flying, paths, states = flying[keep], paths[keep], states[keep]
+    flights = []
+    for outcome, trace, labeled in zip(outcomes, traces, labels, strict=True):
+        distances = world.distance_field.distance(np.stack(trace))
+        clearance = float(np.nanmin(distances)) - VEHICLE_RADIUS
+        flights.append(ExpertFlight(outcome, dt * (len(trace) - 1), clearance, labeled))
+    return flights
 
 
-def _least_clearance(p_WB: np.ndarray, world: World) -> float:
-    """[m], of a path (n, 3) [m]."""
-    return float(np.nanmin(world.distance_field.distance(p_WB))) - VEHICLE_RADIUS
-
-
-def _along(ways: np.ndarray, time: float) -> np.ndarray:
-    """Points (n, 3) [m] of ways (n, 11, 3) at a time [s] since they began, then their ends."""
-    last = ways.shape[1] - 2
-    i = min(int(time / WAYPOINT_PERIOD), last)
+def _interpolate(paths: np.ndarray, time: float) -> np.ndarray:
+    """Interpolates paths (n, 11, 3) [m] at a time [s] since their beginning; then their ends."""
+    i = min(int(time / WAYPOINT_PERIOD), paths.shape[1] - 2)
     part = min(time / WAYPOINT_PERIOD - i, 1.0)
-    return ways[:, i] + part * (ways[:, i + 1] - ways[:, i])
+    return paths[:, i] + part * (paths[:, i + 1] - paths[:, i])

@@ -1,4 +1,4 @@
-"""The worlds that a corpus is gathered in: generated ones, and scenes with obstacles put in."""
+"""Worlds of a corpus: generated ones, and scenes with inserted obstacles."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
@@ -26,20 +26,28 @@ from splatpilot.diagrams.worlds.world_registry import WORLDS, WorldConfig, is_pr
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.common.config import dump_config, load_config, open_field
 from splatpilot.systems.common.files import folder_written_atomically
+from splatpilot.systems.common.readers import require_file
 from splatpilot.systems.common.seeds import SEEDS_PER_RUN, VALIDATION_SEEDS, first_training_seed
-from splatpilot.systems.common.validation import Config, bounded
+from splatpilot.systems.common.validation import Config, bounded, require
 
-_ABOUT, _ESDF = "world.yaml", "esdf.npz"
+WORLD = "world.yaml"
+_ESDF = "esdf.npz"
+
+PROCEDURAL = tuple(name for name in benchmark_scenarios() if name.startswith("P"))
+"""Scenarios whose worlds are generated from seeds."""
+
+ROUNDABOUT = ("P06", "P07", "P08", "P09", "P10", "P12")
+"""Those with paths that are far from straight: learned slowest, so they have twice the share."""
 
 
 @dataclass
 class WorldSource:
-    """What makes a world."""
+    """Content of `world.yaml`, from which a world is made."""
 
     name: str = ""
     world: WorldConfig = open_field(WORLDS, ForestConfig)
     seed: int = 0
-    # [m] How far from recorded poses its images can be trusted; infinite where they are exact.
+    # [m] Distance from recorded poses within which images can be trusted; infinite if exact.
     perturbation_bound: float = inf
     # Of a scene, that of `scene.yaml`; empty for generated worlds.
     source_digest: list[str] = field(default_factory=list)
@@ -54,139 +62,99 @@ class WorldRecord:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.source = load_config(WorldSource(), path / _ABOUT)
-        if not (path / _ESDF).is_file():
-            raise FileNotFoundError(f"{path / _ESDF}: there is no such file; gather it again")
+        self.source = load_config(WorldSource(), path / WORLD)
+        require_file(path / _ESDF)
 
     @property
     def name(self) -> str:
-        """Of the world."""
+        """Name of the world."""
         return self.source.name
 
+    @cached_property
     def esdf(self) -> Esdf:
-        """The distances, read from disk.
-
-        Raises:
-            FileNotFoundError, ValueError: see `Esdf.load`.
-        """
-        return self._esdf
+        """The distance field, read from disk."""
+        return Esdf.load(self.path / _ESDF)
 
     def has_distances_of(self, other: "WorldRecord") -> bool:
         """Tells whether another record has the same distances."""
-        if (self.path / _ESDF).samefile(other.path / _ESDF):
-            return True
-        own, others = Esdf.load(self.path / _ESDF), Esdf.load(other.path / _ESDF)
-        return _are_same(own, others)
+        files = self.path / _ESDF, other.path / _ESDF
+        return files[0].samefile(files[1]) or _equal(*map(Esdf.load, files))
 
     def make(self) -> World:
-        """Makes the world again, to see and fly in.
+        """Makes the world again, to render and fly in.
 
         Raises:
-            FileNotFoundError, ValueError: see `make_world`; or if it is not what it was.
+            ValueError: if it differs from the recorded one.
         """
         world = make_world(self.source.world, self.source.seed)
-        if not _are_same(world.esdf, self.esdf()):
+        if not _equal(world.esdf, self.esdf):
             raise ValueError(
                 f"the world {self.name} is no longer what {self.path} recorded: its scene or the "
-                "program has changed; restore it, or gather anew in another folder"
+                "program has changed; restore it, or collect into another folder"
             )
         return world
 
-    @cached_property
-    def _esdf(self) -> Esdf:
-        return Esdf.load(self.path / _ESDF)
+
+def _equal(a: Esdf, b: Esdf) -> bool:
+    names = "lower_W", "distances", "states"
+    same = all(np.array_equal(getattr(a, name), getattr(b, name)) for name in names)
+    return same and a.voxel_size == b.voxel_size
 
 
-def _are_same(a: Esdf, b: Esdf) -> bool:
-    return (
-        a.voxel_size == b.voxel_size
-        and np.array_equal(a.lower_W, b.lower_W)
-        and np.array_equal(a.distances, b.distances)
-        and np.array_equal(a.states, b.states)
-    )
-
-
-def record_world(path: Path, source: WorldSource, esdf: Esdf) -> WorldRecord:
-    """Writes the folder of a world, whole or not at all; one that is there stays.
-
-    Raises:
-        OSError: if it cannot be written.
-    """
+def record_world(path: Path, source: WorldSource, esdf: Esdf) -> None:
+    """Writes the folder of a world atomically; an existing one stays."""
     with folder_written_atomically(path) as folder:
-        (folder / _ABOUT).write_text(dump_config(source))
+        (folder / WORLD).write_text(dump_config(source))
         esdf.save(folder / _ESDF)
-    return WorldRecord(path)
 
 
-# Where policies train: in generated worlds of the benchmark's kinds, of seeds it never uses, and
-# in scenes that it does not test in.
-
-
-PROCEDURAL = tuple(name for name in benchmark_scenarios() if name.startswith("P"))
-"""The scenarios whose worlds are made from seeds."""
-
-ROUNDABOUT = ("P06", "P07", "P08", "P09", "P10", "P12")
-"""Those of them whose ways are far from straight: learned slowest, so trained in twice as often."""
-
-
-def world_of(kind: str) -> WorldConfig:
-    """The configuration of the world of a scenario: the benchmark's, or a file.
-
-    Raises:
-        FileNotFoundError, ValueError: if there is no such scenario.
-    """
+def scenario_world(kind: str) -> WorldConfig:
+    """Returns the configuration of the world of a scenario, the benchmark's or a file."""
     return load_config(Scenario(), scenario_file(kind)).world
 
 
 def check_library(kinds: Sequence[str], scenes: Sequence[str]) -> None:
     """Checks that there are kinds or scenes, and that the worlds of the kinds are generated."""
-    if not kinds and not scenes:
-        raise ValueError("worlds must have kinds or scenes, got neither")
+    require(kinds or scenes, "worlds.kinds", "one kind or more without worlds.scenes", kinds)
     for kind in kinds:
-        if not is_procedural(world_of(kind)):
-            raise ValueError(
-                f"worlds.kinds must be of generated worlds, got {kind}; choose from "
-                f"{', '.join(PROCEDURAL)} and files, and put captured scenes into worlds.scenes"
-            )
+        remedy = (
+            f"choose from {', '.join(PROCEDURAL)} and files, and put captured scenes into "
+            "worlds.scenes"
+        )
+        generated = is_procedural(scenario_world(kind))
+        require(generated, "worlds.kinds", "of generated worlds", kind, remedy)
 
 
-def place_to_learn_in(scene: str, split: str = "train") -> Path:
-    """Finds a scene that may be learned from: a scene folder, or an OctoMap.
+def training_scene(scene: str, split: str = "train") -> Path:
+    """Finds a scene folder or an OctoMap, and checks that it may be learned from.
 
     Args:
-        scene: path of it.
-        split: that it must be of; an OctoMap states none and counts as "train".
+        scene: its path.
+        split: required split; an OctoMap states none and counts as "train".
 
     Raises:
         FileNotFoundError: if there is no such scene.
-        ValueError: if it is neither, shows what the benchmark tests in, whatever it is called, or
-            is of another split.
+        ValueError: if it shows what the benchmark tests in, under any name, or is of another split.
     """
-    place = find_scene(SceneConfig(path=scene))
-    if place.suffix.lower() == OCTOMAP:
-        require_untested(part_digests([place.read_bytes()]), str(place))
-        return place
-    if not place.is_dir():
-        raise ValueError(f"{place} is no scene folder; `splatpilot reconstruct` makes one")
-    metadata = read_scene_metadata(place)
-    require_untested(metadata.source_digest, str(place))
-    if metadata.split != split:
-        raise ValueError(
-            f"split of {place} must be {split}, got {metadata.split!r}; use another scene, or "
-            f"reconstruct one with --set split={split}"
-        )
-    return place
+    found = find_scene(SceneConfig(path=scene))
+    if found.suffix.lower() == OCTOMAP:
+        require_untested(part_digests([found.read_bytes()]), str(found))
+        return found
+    remedy = "`splatpilot reconstruct` makes one"
+    require(found.is_dir(), "scenes", "scene folders or OctoMaps", found, remedy)
+    metadata = read_scene_metadata(found)
+    require_untested(metadata.source_digest, str(found))
+    remedy = f"use another scene, or reconstruct one with --set split={split}"
+    require(metadata.split == split, f"split of {found}", split, repr(metadata.split), remedy)
+    return found
 
 
 def require_untested(digests: Collection[str], what: str) -> None:
-    """
-    Raises:
-        ValueError: if the benchmark tests in a source with these digests of its parts, by the
-            committed table or as a test scene on this machine; or if there are none.
-    """
+    """Raises ValueError if the benchmark tests in a source with one of these digests, by the
+    committed table or as a test scene on this machine; or if there are no digests."""
     if not digests:
         raise ValueError(
-            f"{what} is missing source_digest, which tells what it shows; reconstruct the scene "
+            f"{what} is missing source_digest, which identifies its source; reconstruct the scene "
             "again"
         )
     name = find_test_source(digests)
@@ -196,7 +164,7 @@ def require_untested(digests: Collection[str], what: str) -> None:
             continue
         try:
             scene = read_scene_metadata(find_scene(world))
-        except (OSError, ValueError):  # a scene that is not there, or cannot be flown in
+        except (OSError, ValueError):  # a scene that is missing or cannot be flown in
             continue
         if scene.split == "test" and not set(scene.source_digest).isdisjoint(digests):
             name = world.path
@@ -217,30 +185,38 @@ class LibraryConfig(Config):
     # Scene folders, each with other obstacles, start and goal every time its turn comes. Of split
     # train, or validation if held out; each with its fidelity bound (`splatpilot scene fidelity`).
     scenes: list[str] = field(default_factory=list)
-    # Whether the seeds are those of validation instead of training.
+    # Uses the seeds of validation instead of training.
     held_out: bool = False
 
     def check(self) -> None:
         check_library(self.kinds, self.scenes)
         for scene in self.scenes:
-            _measured_scene(self, scene)
+            self.measured_scene(scene)
+
+    def measured_scene(self, scene: str) -> tuple[float, list[str]]:
+        """Returns the perturbation bound [m] of a scene folder, and its `source_digest`."""
+        folder = training_scene(scene, "validation" if self.held_out else "train")
+        metadata = read_scene_metadata(folder)
+        if metadata.perturbation_bound is None:
+            raise ValueError(
+                f"{folder / 'scene.yaml'} is missing perturbation_bound, the distance from the "
+                f"capture within which images can be trusted; measure it with `splatpilot scene "
+                f"fidelity {folder}`"
+            )
+        return metadata.perturbation_bound, metadata.source_digest
 
 
 def world_source(library: LibraryConfig, seed: int, index: int) -> WorldSource:
-    """
-    The world `index` of a library, whose kinds come in turn and whose seeds count on.
+    """Returns the world `index` of a library, whose kinds take turns and whose seeds count up.
 
     Args:
-        seed: of the corpus: two of different seeds have no generated world in common.
+        library: the kinds and scenes.
+        seed: of the corpus; corpora of different seeds have no generated world in common.
         index: 0 to 999.
-
-    Raises:
-        FileNotFoundError, ValueError: see `LibraryConfig.validate`; or if the seed or the index is
-            out of range.
     """
     if not 0 <= index < SEEDS_PER_RUN:
         raise ValueError(
-            f"a corpus has at most {SEEDS_PER_RUN} worlds; gather more with another seed"
+            f"a corpus has at most {SEEDS_PER_RUN} worlds; collect more with another seed"
         )
     first = VALIDATION_SEEDS if library.held_out else first_training_seed(seed)
     kinds = [*library.kinds, *library.scenes]
@@ -248,27 +224,8 @@ def world_source(library: LibraryConfig, seed: int, index: int) -> WorldSource:
     name = f"{Path(kind).stem}-{seed}"
     if kind in library.scenes:
         world = InsertedConfig(path=kind, draw_ends=True)
-        bound, digest = _measured_scene(library, kind)
-        return WorldSource(name, world, seed, bound, digest)
-    return WorldSource(name, world_of(kind), seed, inf)
-
-
-def _measured_scene(library: LibraryConfig, scene: str) -> tuple[float, list[str]]:
-    """Returns how far from its capture's poses the images of a scene folder can be trusted [m], and
-    its `source_digest`.
-
-    Raises:
-        FileNotFoundError: if there is no such scene.
-        ValueError: if it was not measured, or is not of the library's split.
-    """
-    folder = place_to_learn_in(scene, "validation" if library.held_out else "train")
-    metadata = read_scene_metadata(folder)
-    if metadata.perturbation_bound is None:
-        raise ValueError(
-            f"{folder / 'scene.yaml'} does not say how far from the capture its images can be "
-            f"trusted (perturbation_bound); measure it with `splatpilot scene fidelity {folder}`"
-        )
-    return metadata.perturbation_bound, metadata.source_digest
+        return WorldSource(name, world, seed, *library.measured_scene(kind))
+    return WorldSource(name, scenario_world(kind), seed)
 
 
 @dataclass
@@ -285,13 +242,13 @@ class PerturbationConfig(Config):
     tilt: float = bounded(0.1, "[0, 1] rad")
 
 
-def perturbed(
+def perturb_pose(
     X_WB: RigidTransform, config: PerturbationConfig, reach: float, rng: np.random.Generator
 ) -> RigidTransform:
-    """A pose near X_WB, displaced by at most `config.distance` and at most `reach` [m].
+    """Draws a pose near X_WB, displaced by at most `config.distance` and at most `reach` [m].
 
-    The displacement is uniform in that ball. With the clearance at X_WB within `reach`, the
-    vehicle touches nothing there either: distances change by no more than one moves.
+    The displacement is uniform in that sphere. If `reach` is at most the clearance at X_WB, the
+    pose is free too.
     """
     direction = rng.normal(size=3)
     radius = max(0.0, min(config.distance, reach)) * rng.uniform() ** (1 / 3)

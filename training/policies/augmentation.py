@@ -1,6 +1,6 @@
-"""Random changes of training images: noise of the sensor, and another look of RGB images.
+"""Random changes of training images: sensor noise, and the appearance of RGB images.
 
-Each image gets changes of its own. The formulas are those of flights, `systems/sensing/noise.py`.
+Each image is changed independently, by the formulas of flights, `systems/sensing/noise.py`.
 """
 
 import math
@@ -8,14 +8,15 @@ from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
+from torchvision.transforms.functional import gaussian_blur
 
-from splatpilot.systems.common.validation import Config, FieldError, bounded
+from splatpilot.systems.common.validation import Config, bounded, require_field
 from splatpilot.systems.sensing.noise import (
     ObservationNoise,
     corrupt_color,
     corrupt_depth,
     expose,
-    turned_hue,
+    rotate_hue,
 )
 
 _DEPTH = "depth_multiplicative", "depth_additive", "depth_dropout"
@@ -26,7 +27,7 @@ _COLOR = tuple(f.name for f in fields(ObservationNoise) if f.name not in _DEPTH 
 
 @dataclass
 class Appearance(Config):
-    """Maximum changes of the look of RGB images; uniform, in both directions."""
+    """Maximum changes of the appearance of RGB images; uniform, in both directions."""
 
     # [stops] Exposure; each doubles the brightness.
     exposure: float = bounded(0.5, "[0, 5] stops")
@@ -42,25 +43,11 @@ def depth_noise() -> ObservationNoise:
 def check_noise(
     noise: ObservationNoise, *, depth: bool = False, color: bool = False, time: bool
 ) -> None:
-    """Checks that training has all the noise of its configuration.
-
-    Args:
-        noise: to check.
-        depth, color, time: kinds of noise that the trainer's images have; `time` is of late and
-            lost images.
-
-    Raises:
-        FieldError: if a value would have no effect.
-    """
-    for has, names, images in (
-        (depth, _DEPTH, "of colors alone"),
-        (color, _COLOR, "of depth alone"),
-        (time, _TIME, "of the moment"),
-    ):
+    """Raises FieldError for noise of a kind that the trainer's images do not have: of depth, of
+    color, or of time, as late and lost images."""
+    for has, names in ((depth, _DEPTH), (color, _COLOR), (time, _TIME)):
         for name in () if has else names:
-            if value := getattr(noise, name):
-                problem = f"must be left out, got {value}: training has images {images}"
-                raise FieldError(noise, name, problem)
+            require_field(noise, name, not getattr(noise, name), "left out")
 
 
 def noisy_depth(depth: Tensor, noise: ObservationNoise, generator: torch.Generator) -> Tensor:
@@ -80,7 +67,7 @@ def noisy_color(color: Tensor, noise: ObservationNoise, generator: torch.Generat
     brighter, grain = uniform(), torch.empty_like(color).normal_(generator=generator)
     if noise.hue_jitter > 0.0:
         angle = math.radians(noise.hue_jitter) * uniform()
-        color = turned_hue(color, angle.cos(), angle.sin())
+        color = rotate_hue(color, angle.cos(), angle.sin())
     if noise.blur > 0.0:
         color = blur(color, noise.blur)
     if noise.changes_light:
@@ -92,18 +79,12 @@ def noisy_color(color: Tensor, noise: ObservationNoise, generator: torch.Generat
 def blur(color: Tensor, sigma: float) -> Tensor:
     """Blurs colors (N, H, W, 3) by a Gaussian of a standard deviation [px], as `cv2.GaussianBlur`
     does floats: it ends after 4 sigma, and images are reflected at their borders."""
-    reach = (round(8 * sigma + 1) | 1) // 2
-    x = torch.arange(-reach, reach + 1, dtype=color.dtype, device=color.device)
-    weights = torch.exp(-0.5 * (x / sigma) ** 2)
-    across = (weights / weights.sum()).expand(3, 1, 1, -1)
-    images = torch.nn.functional.pad(color.movedim(-1, 1), [reach] * 4, mode="reflect")
-    images = torch.nn.functional.conv2d(images, across, groups=3)
-    return torch.nn.functional.conv2d(images, across.mT, groups=3).movedim(1, -1)
+    return gaussian_blur(color.movedim(-1, 1), round(8 * sigma + 1) | 1, sigma).movedim(1, -1)
 
 
-def relit(color: Tensor, appearance: Appearance, generator: torch.Generator) -> Tensor:
+def change_appearance(color: Tensor, appearance: Appearance, generator: torch.Generator) -> Tensor:
     """Changes exposure and hue of colors (N, H, W, 3), 0 to 255."""
     draws = torch.rand(2, len(color), 1, 1, 1, generator=generator, device=color.device)
     exposure, hue = 2.0 * draws - 1.0
     angle = (appearance.hue * hue).deg2rad()
-    return turned_hue(2.0 ** (appearance.exposure * exposure) * color, angle.cos(), angle.sin())
+    return rotate_hue(2.0 ** (appearance.exposure * exposure) * color, angle.cos(), angle.sin())

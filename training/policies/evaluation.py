@@ -29,8 +29,7 @@ from splatpilot.training.policies.vehicles import (
     take_rows,
 )
 
-CAMERA_AHEAD = 0.1
-"""Offset [m] of the camera from the vehicle's center along body x."""
+CAMERA_AHEAD = 0.1  # [m] offset of the camera from the vehicle's center along body x
 
 
 class Agent(Protocol):
@@ -63,14 +62,14 @@ class Outcomes(NamedTuple):
     reached: Tensor  # (N,) bool
     collided: Tensor  # (N,) bool
     left: Tensor  # (N,) bool, the volume
-    least_clearance: Tensor  # (N,) [m]
+    min_clearance: Tensor  # (N,) [m]
     mean_speed: Tensor  # (N,) [m/s]
     nominal_speed: Tensor  # (N,) [m/s]
 
     def metrics(self, kinds: Sequence[str] = ()) -> dict[str, float]:
         """Computes fractions of flights that reached the goal, collided and left, means of minimum
         clearance [m] and speed [m/s], and the success at each nominal speed and in each of the
-        `kinds` of worlds, flight n being of kind n modulo their number."""
+        `kinds` of worlds, which take turns."""
         flown: dict[str, list[bool]] = {}
         flights = zip(self.reached.tolist(), self.nominal_speed.tolist(), strict=True)
         for n, (reached, speed) in enumerate(flights):
@@ -80,7 +79,7 @@ class Outcomes(NamedTuple):
             "success": float(self.reached.float().mean()),
             "collisions": float(self.collided.float().mean()),
             "left": float(self.left.float().mean()),
-            "least_clearance": float(self.least_clearance.mean()),
+            "least_clearance": float(self.min_clearance.mean()),
             "speed": float(self.mean_speed.mean()),
             **{name: sum(flown[name]) / len(flown[name]) for name in sorted(flown)},
         }
@@ -121,11 +120,10 @@ def evaluate_agent(
     p_WG, to_goal = worlds.p_WG, worlds.p_WG - worlds.p_WS
     yaw = torch.atan2(to_goal[:, 1], to_goal[:, 0])
     zero = torch.zeros_like(p_WG)
+    lag = torch.full((count, 1), conditions.lag, device=device)
+    vehicle: Vehicle = PointMass(worlds.p_WS, zero, zero, yaw, lag)
     if conditions.body_rate:
-        vehicle: Vehicle = BodyRate.hovering(worlds.p_WS, yaw)
-    else:
-        lag = torch.full((count, 1), conditions.lag, device=device)
-        vehicle = PointMass(worlds.p_WS, zero, zero, yaw, lag)
+        vehicle = BodyRate.hovering(worlds.p_WS, yaw)
     memory, control = agent.initial_memory(count), FlatnessControllerConfig()
     shuffled = torch.randperm(count, generator=generator, device=device)
     speed = torch.tensor(conditions.speeds, device=device)[shuffled % len(conditions.speeds)]
@@ -177,12 +175,7 @@ class FlightTraining(TrainingConfig):
 
 class FlightTrainer(Trainer):
     """Base class of trainers that fly in training worlds, evaluated by flights in held-out ones.
-
-    Args:
-        config: configuration.
-        agent: the policy, with its network.
-        noise: of images.
-    """
+    The agent has a `network`; `noise` is of images."""
 
     def __init__(self, config: FlightTraining, agent: Any, noise: ObservationNoise) -> None:
         self.network, self.spec = agent.network, agent.network.spec

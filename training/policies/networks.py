@@ -1,6 +1,4 @@
-"""The networks of depth policies, for torch; `systems.policies` flies them in numpy."""
-
-from collections.abc import Sequence
+"""Networks of depth policies in torch, with the names of weights of those in numpy that fly."""
 
 import torch
 from torch import Tensor, nn
@@ -11,47 +9,46 @@ from splatpilot.systems.policies.agile_autonomy import (
     WAYPOINT_SCALE,
     TrajectoryNetworkSpec,
 )
+from splatpilot.systems.policies.checkpoint import PolicyCheckpoint
+from splatpilot.systems.policies.convolutions import LEAK, Convolution
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS
-from splatpilot.systems.policies.recurrent_network import LEAK, Layer, NetworkSpec
+from splatpilot.systems.policies.recurrent_network import DepthSpec, NetworkSpec, depth_layers
 
 
 class TrainableNetwork(nn.Module):
-    """The network of `spec`, with the names and shapes of weights that `RecurrentNetwork` takes.
-
-    `head_scale` multiplies the head's first weights: small ones begin with about hovering.
-    """
+    """The network of a `NetworkSpec`; `head_scale` multiplies the head's initial weights."""
 
     def __init__(self, spec: NetworkSpec, head_scale: float = 0.1) -> None:
         super().__init__()
         self.spec = spec
-        self.convolutions = _convolutions(spec.convolutions)
+        self.convolutions = _convolutions(spec)
         self.state_layer = nn.Linear(spec.state_size, spec.state_features)
-        self.memory = nn.GRUCell(spec.image_features() + spec.state_features, spec.hidden_size)
+        self.memory = nn.GRUCell(spec.image_outputs() + spec.state_features, spec.hidden_size)
         self.head = nn.Linear(spec.hidden_size, spec.output_size)
         with torch.no_grad():
             self.head.weight.mul_(head_scale)
             self.head.bias.zero_()
 
     def forward(self, image: Tensor, state: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
-        """Output (N, O) and memory (N, H) of images (N, height, width), states and memories."""
+        """Computes outputs (N, O) and hidden states (N, H) from images (N, height, width), states
+        (N, S) and hidden states."""
         x = image[:, None]
         for layer in self.convolutions:
-            x = nn.functional.leaky_relu(layer(x), LEAK)
-        features = nn.functional.leaky_relu(self.state_layer(state), LEAK)
+            x = _leaky(layer(x))
+        features = _leaky(self.state_layer(state))
         hidden = self.memory(torch.cat([x.flatten(1), features], 1), hidden)
         return self.head(hidden), hidden
 
 
 class TrajectoryModule(nn.Module):
-    """The network of a `TrajectoryNetworkSpec`, with the names of weights that
-    `systems.policies.agile_autonomy.TrajectoryNetwork` takes."""
+    """The network of a `TrajectoryNetworkSpec`."""
 
     def __init__(self, spec: TrajectoryNetworkSpec) -> None:
         super().__init__()
         self.spec = spec
-        self.convolutions = _convolutions(spec.convolutions)
+        self.convolutions = _convolutions(spec)
         joined = spec.image_features + spec.state_features
-        self.image_layer = nn.Linear(spec.flat_features(), spec.image_features)
+        self.image_layer = nn.Linear(spec.image_outputs(), spec.image_features)
         self.state_layer = nn.Linear(STATE_SIZE, spec.state_features)
         self.state_layer_2 = nn.Linear(spec.state_features, spec.state_features)
         self.modes = nn.Linear(joined, MODES * spec.mode_features)
@@ -59,23 +56,37 @@ class TrajectoryModule(nn.Module):
         self.output = nn.Linear(spec.head_features, 3 * NUM_WAYPOINTS + 1)
 
     def forward(self, image: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Waypoints (N, 3, 10, 3) [m] and costs (N, 3) of images (N, H, W) and states (N, 18)."""
+        """Computes waypoints (N, 3, 10, 3) [m] and costs (N, 3) from images (N, H, W) and states
+        (N, 18)."""
         x = image[:, None]
         for layer in self.convolutions:
-            x = nn.functional.leaky_relu(layer(x), LEAK)
-        x = nn.functional.leaky_relu(self.image_layer(x.flatten(1)), LEAK)
-        y = nn.functional.leaky_relu(self.state_layer(state), LEAK)
-        y = nn.functional.leaky_relu(self.state_layer_2(y), LEAK)
-        modes = nn.functional.leaky_relu(self.modes(torch.cat([x, y], 1)), LEAK)
-        modes = modes.reshape(len(image), MODES, -1)
-        output = self.output(nn.functional.leaky_relu(self.head(modes), LEAK))
+            x = _leaky(layer(x))
+        x = _leaky(self.image_layer(x.flatten(1)))
+        y = _leaky(self.state_layer_2(_leaky(self.state_layer(state))))
+        modes = _leaky(self.modes(torch.cat([x, y], 1))).reshape(len(image), MODES, -1)
+        output = self.output(_leaky(self.head(modes)))
         waypoints = WAYPOINT_SCALE * output[..., :-1].unflatten(2, (NUM_WAYPOINTS, 3))
         return waypoints, output[..., -1]
 
 
-def _convolutions(layers: Sequence[Layer]) -> nn.ModuleList:
-    inputs = [1, *(layer[0] for layer in layers)]
-    return nn.ModuleList(
-        nn.Conv2d(size, channels, kernel, stride, padding)
-        for size, (channels, kernel, stride, padding) in zip(inputs, layers, strict=False)
-    )
+def load_weights(module: nn.Module, checkpoint: PolicyCheckpoint, prefix: str = "") -> None:
+    """Loads the weights whose names begin with `prefix`."""
+    weights = checkpoint.weights.items()
+    state = {
+        k.removeprefix(prefix): torch.from_numpy(v) for k, v in weights if k.startswith(prefix)
+    }
+    module.load_state_dict(state)
+
+
+def _leaky(x: Tensor) -> Tensor:
+    return nn.functional.leaky_relu(x, LEAK)
+
+
+def _convolutions(spec: DepthSpec) -> nn.ModuleList:
+    return nn.ModuleList(map(make_convolution, depth_layers(spec.convolutions)))
+
+
+def make_convolution(layer: Convolution) -> nn.Conv2d:
+    """Makes the module of a layer, without activation and skip."""
+    sizes = layer.inputs, layer.outputs, layer.kernel, layer.stride, layer.padding
+    return nn.Conv2d(*sizes, layer.dilation, layer.groups)

@@ -1,7 +1,7 @@
-"""What cameras see of many worlds and how near points are to them, by native code.
+"""Depth images of many worlds, and distances to their surfaces, by native code.
 
-Nothing here is differentiable: images carry no gradient, and the gradient of a distance is the
-normal that is returned with it. Tensors may be on any device; what is asked is computed on the CPU.
+Not differentiable: images have no gradient, and the gradients of distances are returned with them.
+Tensors may be on any device; the native code runs on the CPU.
 """
 
 import math
@@ -21,14 +21,12 @@ class PixelRays(NamedTuple):
     """The rays of a small depth camera that looks along body x."""
 
     directions_C: np.ndarray  # (R, 3) float32, camera frame, z = 1, row by row
-    half_pixel: float  # half the width of a pixel at depth 1; of oblong ones, of their mean width
+    half_pixel: float  # half of the mean of a pixel's width and height at depth 1
 
     @classmethod
     def of(cls, width: int, height: int, fov_x: float, cell_aspect: float = 1.0) -> "PixelRays":
-        """The camera of `width` x `height` pixels, `cell_aspect` times as high as wide.
-
-        `fov_x` is the horizontal field of view [deg].
-        """
+        """Returns the rays of `width` x `height` pixels, `cell_aspect` times as high as wide, with
+        the horizontal field of view `fov_x` [deg]."""
         half = math.tan(math.radians(0.5 * fov_x)) / width
         x = half * (2 * np.arange(width) + 1 - width)
         y = half * cell_aspect * (2 * np.arange(height) + 1 - height)
@@ -41,32 +39,45 @@ class Geometry(Protocol):
     """The surfaces of several worlds. Row n of each query is about world `world[n]`, (N,) int64."""
 
     def depth(self, p_WC: Tensor, R_WC: Tensor, rays: PixelRays, world: Tensor) -> Tensor:
-        """Planar depth (N, R) [m] from cameras at p_WC (N, 3) [m], infinite where nothing is.
+        """Renders planar depth (N, R) [m] from p_WC (N, 3) [m]; infinite without a surface.
 
-        A pixel sees what any part of it sees, as in the least of a finer image: surfaces are hit by
-        rays that pass within half a pixel, at the depth where the widened surface begins plus what
-        it was widened by.
+        A pixel has the minimum depth of all its parts: rays hit surfaces within half a pixel, at
+        the depth of the widened surface plus half a pixel's width there.
         """
         ...
 
     def nearest(self, p_WQ: Tensor, world: Tensor, count: int) -> tuple[Tensor, Tensor]:
-        """Signed distances (N, K) [m] at p_WQ (N, 3) [m] of the K <= `count` nearest obstacles,
-        nearest first, and their gradients (N, K, 3); infinite and 0 for those that there are not.
+        """Computes signed distances (N, K) [m] at p_WQ (N, 3) [m] to the K <= `count` nearest
+        obstacles, nearest first, and their gradients (N, K, 3); infinite and 0 if there are fewer.
         """
         ...
 
 
-class ShapeGeometry:
-    """Worlds of analytic shapes, exactly those that the benchmark's worlds are made of.
+class _Casting:
+    """Renders depth by native worlds."""
+
+    _native: _native.ShapeWorlds | _native.GridWorlds
+
+    def depth(self, p_WC: Tensor, R_WC: Tensor, rays: PixelRays, world: Tensor) -> Tensor:
+        depth = torch.empty(len(p_WC), len(rays.directions_C))
+        self._native.depth(
+            p_WC=_array(p_WC),
+            R_WC=_array(R_WC),
+            world=_array(world),
+            directions_C=rays.directions_C,
+            half_pixel=rays.half_pixel,
+            depth=depth.numpy(),
+        )
+        return depth.to(p_WC.device)
+
+
+class ShapeGeometry(_Casting):
+    """Worlds of analytic shapes, those of the benchmark's worlds.
 
     Args:
       worlds: the shapes of each.
-      threads: cores that images are cast on; the images are the same for any number.
-      simd: the instructions used, of `_native.simd_levels()`, which all give the same; by default
-        the widest.
-
-    Raises:
-      ValueError: on a shape out of range, or a query about a world that there is not.
+      threads: for images, which are the same for any number.
+      simd: instructions, of `_native.simd_levels()`, with equal results; the widest by default.
     """
 
     def __init__(self, worlds: Sequence[Sequence[Shape]], threads: int = 1, simd: str = "") -> None:
@@ -78,9 +89,6 @@ class ShapeGeometry:
             threads=threads,
             simd=simd,
         )
-
-    def depth(self, p_WC: Tensor, R_WC: Tensor, rays: PixelRays, world: Tensor) -> Tensor:
-        return _depth(self._native, p_WC, R_WC, rays, world)
 
     def nearest(self, p_WQ: Tensor, world: Tensor, count: int) -> tuple[Tensor, Tensor]:
         return _query(self._native.nearest, p_WQ, world, count)
@@ -94,9 +102,6 @@ class Grids:
       lower_W: (W, 3) [m], lower corners.
       voxel_sizes: (W,) [m].
       threads, simd: see `ShapeGeometry`.
-
-    Raises:
-      ValueError: on grids out of range, or a query about a world that there is not.
     """
 
     def __init__(
@@ -117,32 +122,18 @@ class Grids:
         )
 
     def interpolate(self, p_WQ: Tensor, world: Tensor) -> tuple[Tensor, Tensor]:
-        """Values (N,) and gradients (N, 3) [1/m] at p_WQ (N, 3) [m]; beyond the outermost centers
-        of voxels those at the nearest point between them."""
+        """Interpolates values (N,) and gradients (N, 3) [1/m] at p_WQ (N, 3) [m]; constant beyond
+        the outermost centers."""
         return _query(self._native.interpolate, p_WQ, world)
 
 
-class EsdfGeometry(Grids):
-    """Worlds known by their distance fields, as captured ones are; each is one obstacle.
-
-    Where a field counts unknown space and its bounds as occupied, cameras see them so too.
-
-    Args:
-      fields: one for each world.
-      threads, simd: see `ShapeGeometry`.
-    """
+class EsdfGeometry(_Casting, Grids):
+    """Worlds given by distance fields; each is one obstacle. Occupied unknown space is visible."""
 
     def __init__(self, fields: Sequence[Esdf], threads: int = 1, simd: str = "") -> None:
-        super().__init__(
-            [field.distances for field in fields],
-            [field.lower_W for field in fields],
-            [field.voxel_size for field in fields],
-            threads,
-            simd,
-        )
-
-    def depth(self, p_WC: Tensor, R_WC: Tensor, rays: PixelRays, world: Tensor) -> Tensor:
-        return _depth(self._native, p_WC, R_WC, rays, world)
+        values = [field.distances for field in fields]
+        lower_W = [field.lower_W for field in fields]
+        super().__init__(values, lower_W, [field.voxel_size for field in fields], threads, simd)
 
     def nearest(self, p_WQ: Tensor, world: Tensor, count: int) -> tuple[Tensor, Tensor]:
         distances, gradients = self.interpolate(p_WQ, world)
@@ -150,80 +141,54 @@ class EsdfGeometry(Grids):
 
 
 class MixedGeometry:
-    """Worlds of shapes beside worlds of distance fields; those that share a field hold it once.
+    """Worlds of shapes and worlds of distance fields; a field that worlds share is stored once.
 
     Args:
       worlds: the shapes of each, or its distance field.
-      threads, simd: see `ShapeGeometry`.
     """
 
-    def __init__(
-        self, worlds: Sequence[Sequence[Shape] | Esdf], threads: int = 1, simd: str = ""
-    ) -> None:
+    def __init__(self, worlds: Sequence[Sequence[Shape] | Esdf]) -> None:
         shapes = [world for world in worlds if not isinstance(world, Esdf)]
         fields = list({id(world): world for world in worlds if isinstance(world, Esdf)}.values())
-        self._parts: list[Geometry] = [ShapeGeometry(shapes, threads, simd)]
+        self._parts: list[Geometry] = [ShapeGeometry(shapes)]
         if fields:
-            self._parts.append(EsdfGeometry(fields, threads, simd))
+            self._parts.append(EsdfGeometry(fields))
         self._part = torch.tensor([isinstance(world, Esdf) for world in worlds], dtype=torch.long)
         of_shapes, of_field = iter(range(len(shapes))), {id(f): n for n, f in enumerate(fields)}
-        self._number = torch.tensor(
+        self._index = torch.tensor(
             [of_field[id(w)] if isinstance(w, Esdf) else next(of_shapes) for w in worlds]
         )
 
     def depth(self, p_WC: Tensor, R_WC: Tensor, rays: PixelRays, world: Tensor) -> Tensor:
         depth = p_WC.new_empty(len(p_WC), len(rays.directions_C))
-        for part, rows, number in self._rows(world):
-            depth[rows] = part.depth(p_WC[rows], R_WC[rows], rays, number)
+        for part, rows, index in self._rows(world):
+            depth[rows] = part.depth(p_WC[rows], R_WC[rows], rays, index)
         return depth
 
     def nearest(self, p_WQ: Tensor, world: Tensor, count: int) -> tuple[Tensor, Tensor]:
         distances = p_WQ.new_full((len(p_WQ), count), torch.inf)
         gradients = p_WQ.new_zeros(len(p_WQ), count, 3)
-        for part, rows, number in self._rows(world):
-            d, gradient = part.nearest(p_WQ[rows], number, count)
+        for part, rows, index in self._rows(world):
+            d, gradient = part.nearest(p_WQ[rows], index, count)
             distances[rows, : d.shape[1]], gradients[rows, : d.shape[1]] = d, gradient
         return distances, gradients
 
     def _rows(self, world: Tensor) -> Iterator[tuple[Geometry, Tensor, Tensor]]:
-        """Of each part that is asked, the rows of a query and the numbers of their worlds there."""
-        asked = self._part.to(world.device)[world]
+        """Yields each part of a query, its rows and the indices of their worlds in the part."""
+        queried = self._part.to(world.device)[world]
         for number, part in enumerate(self._parts):
-            rows = (asked == number).nonzero()[:, 0]
+            rows = (queried == number).nonzero()[:, 0]
             if len(rows):
-                yield part, rows, self._number.to(world.device)[world[rows]]
-
-
-def _depth(
-    worlds: _native.ShapeWorlds | _native.GridWorlds,
-    p_WC: Tensor,
-    R_WC: Tensor,
-    rays: PixelRays,
-    world: Tensor,
-) -> Tensor:
-    depth = torch.empty(len(p_WC), len(rays.directions_C))
-    worlds.depth(
-        p_WC=_array(p_WC),
-        R_WC=_array(R_WC),
-        world=_array(world),
-        directions_C=rays.directions_C,
-        half_pixel=rays.half_pixel,
-        depth=depth.numpy(),
-    )
-    return depth.to(p_WC.device)
+                yield part, rows, self._index.to(world.device)[world[rows]]
 
 
 def _query(
-    answer: Callable[..., None], p_WQ: Tensor, world: Tensor, *shape: int
+    function: Callable[..., None], p_WQ: Tensor, world: Tensor, *shape: int
 ) -> tuple[Tensor, Tensor]:
-    """Values (N, *shape) and their gradients (N, *shape, 3) at p_WQ, as `answer` writes them."""
+    """Calls native code for values (N, *shape) and their gradients (N, *shape, 3) at p_WQ."""
     values, gradients = torch.empty(len(p_WQ), *shape), torch.empty(len(p_WQ), *shape, 3)
-    answer(
-        p_WQ=_array(p_WQ),
-        world=_array(world),
-        values=values.numpy(),
-        gradients=gradients.numpy(),
-    )
+    outputs = {"values": values.numpy(), "gradients": gradients.numpy()}
+    function(p_WQ=_array(p_WQ), world=_array(world), **outputs)
     return values.to(p_WQ.device), gradients.to(p_WQ.device)
 
 

@@ -1,10 +1,8 @@
-"""Trains in two stages: on what an expert shows, then also on what it would have done where the
-student came too close to something.
+"""Trains in two stages: by an expert's flights, then also by its labels of a student's near-misses.
 
 After the paper, Sec. III-B. The student of the first stage flies the expert's paths in its training
-worlds, without a guard; the second is trained on all samples. Flights of another policy may replace
-the first stage, as those of the round before. `diffaero_rgb` recovers too: it learns from the same
-corpora.
+worlds; the second stage trains on all samples. Another policy may fly instead of a first stage.
+`diffaero_rgb` learns from the same corpora.
 """
 
 import json
@@ -65,13 +63,11 @@ def list_tasks(shards: Sequence[Shard], flights: int) -> dict[str, list[Task]]:
     """Lists, by world, the expert's first `flights` in shards."""
     tasks: dict[str, list[Task]] = {}
     for shard in shards:
-        if shard.source == EXPERT:
-            tasks.setdefault(shard.world, []).extend(
-                Task(flight["start"], flight["goal"], _PATIENCE * flight["time_s"])
-                for flight in shard.flights
-                if flight["states"]
-            )
-    return {world: paths[:flights] for world, paths in tasks.items() if paths}
+        for flight in shard.flights if shard.source == EXPERT else ():
+            if flight["states"]:
+                task = Task(flight["start"], flight["goal"], _PATIENCE * flight["time_s"])
+                tasks.setdefault(shard.world, []).append(task)
+    return {world: paths[:flights] for world, paths in tasks.items()}
 
 
 def fly_worlds(
@@ -85,7 +81,7 @@ def fly_worlds(
         for record in corpus.worlds
         if record.name in tasks
     ]
-    missing = [piece for piece in work if not _is_whole(piece[2])]
+    missing = [piece for piece in work if not _is_intact(piece[2])]
     fly_world = partial(_fly_world, policy, corpus.config)
     bar = Progress(total=len(work), initial=len(work) - len(missing), desc="flying", unit="world")
 
@@ -97,20 +93,19 @@ def fly_worlds(
             bar.update()
     flown, outcomes = [], Counter()
     for record, _, file in work:
-        with np.load(file) as arrays:
-            outcomes.update(str(outcome) for outcome in arrays["outcomes"])
-            for n in range(len(arrays["outcomes"])):
-                parts = {name: arrays[f"{name}_{n}"] for name in _ARRAYS}
-                flown.append(StudentFlight(record.name, **parts))
+        arrays = read_archive(file)
+        outcomes.update(map(str, arrays["outcomes"]))
+        for n in range(len(arrays["outcomes"])):
+            flown.append(StudentFlight(record.name, *(arrays[f"{name}_{n}"] for name in _ARRAYS)))
     return flown, outcomes
 
 
-def _is_whole(file: Path) -> bool:
+def _is_intact(file: Path) -> bool:
     """Tells whether a file of flights exists; removes it if damaged."""
-    if not file.exists():
-        return False
     try:
         read_archive(file)
+    except FileNotFoundError:
+        return False
     except ValueError as error:
         say(f"{error}: it is flown again")
         file.unlink()
@@ -159,7 +154,7 @@ class RecoveryFlights:
     flown_by: str = ""
     # Digest of that file.
     flown_by_digest: str = ""
-    # Folders of the corpora, and the fraction of their worlds that is not trained with.
+    # Folders of the corpora, and the fraction of their worlds that is held out.
     corpora: list[str] = field(default_factory=list)
     held_out: float = 0.0
 
@@ -174,15 +169,13 @@ def run[Config: CorpusTraining](
     jobs: int,
     flown_by: str = "",
 ) -> dict[str, Any]:
-    """
-    Trains a student, flies it, labels its near-misses, and trains another on all samples.
+    """Trains a student, flies it, labels its near-misses, and trains another on all samples.
 
     An interrupted run is resumed by the same call. The corpora of `config` are not changed.
 
     Writes to `out`: `stage_1`, unless another policy flies, and `stage_2`, see `train.run`;
-    `corpora`, links to those of `config` with the recovery samples beside them; `flights`, a file
-    per world; `recovery.yaml`, see `RecoveryFlights`; `recovery.json`, counts of flights and
-    samples.
+    `corpora`, links to those of `config`, with the recovery samples; `flights`, a file per world;
+    `recovery.yaml`, see `RecoveryFlights`; `recovery.json`, counts of flights and samples.
 
     Args:
         config: configuration of both stages.
@@ -195,11 +188,6 @@ def run[Config: CorpusTraining](
 
     Returns:
         The content of `recovery.json`.
-
-    Raises:
-        FileNotFoundError, ValueError: see `train.run`, `add_recovery` and `policy_named`; or if
-            `out` holds something else.
-        OSError: if `out` cannot be written, or a process was killed.
     """
     for name, value in (("flights", flights), ("jobs", jobs)):
         require(value >= 1, f"--{name}", "at least 1", value)
@@ -208,7 +196,8 @@ def run[Config: CorpusTraining](
     if flown_by:
         policy_named(flown_by)
     worlds = distinct_worlds([Corpus(Path(source)) for source in config.corpora])
-    digest = _digest(Path(flown_by)) if flown_by.endswith(".npz") else ""
+    weights = Path(flown_by).read_bytes() if flown_by.endswith(".npz") else b""
+    digest = blake2b(weights, digest_size=16).hexdigest() if weights else ""
     decisive = RecoveryFlights(flights, flown_by, digest, list(config.corpora), config.held_out)
     claim_folder(out / "recovery.yaml", decisive)
     policy, first = flown_by, {}
@@ -224,7 +213,7 @@ def run[Config: CorpusTraining](
     if others:
         say(
             f"samples of the corpora were labeled by revision {', '.join(sorted(others))} of the "
-            f"program, recovery by {revision()}; ledger.csv lists which"
+            f"program, recovery by {revision()}; see ledger.csv"
         )
     held_out = {name for name in worlds if is_held_out(name, config.held_out)}
     outcomes: Counter[str] = Counter()
@@ -236,19 +225,15 @@ def run[Config: CorpusTraining](
     both = replace(config, corpora=[str(folder) for folder in folders])
     say(f"second stage, in {out / 'stage_2'}")
     second = train.run(config=both, out=out / "stage_2", make=make)
-    ledger = _ledger([Corpus(folder) for folder in folders], outcomes)
-    ledger |= {"flown_by": flown_by} if flown_by else {"stage_1": first}
-    ledger["stage_2"] = second
+    summary = _count([Corpus(folder) for folder in folders], outcomes)
+    summary |= {"flown_by": flown_by} if flown_by else {"stage_1": first}
+    summary["stage_2"] = second
     with written_atomically(out / "recovery.json") as path:
-        path.write_text(json.dumps(ledger, indent=2) + "\n")
-    return ledger
+        path.write_text(json.dumps(summary, indent=2) + "\n")
+    return summary
 
 
-def _digest(file: Path) -> str:
-    return blake2b(file.read_bytes(), digest_size=16).hexdigest()
-
-
-def _ledger(corpora: Sequence[Corpus], outcomes: Counter[str]) -> dict[str, Any]:
+def _count(corpora: Sequence[Corpus], outcomes: Counter[str]) -> dict[str, Any]:
     """Counts outcomes of flights, near-misses, and samples by source."""
     shards = list(chain.from_iterable(distinct_shards(corpora)))
     recovered = [shard for shard in shards if shard.source == RECOVERY]

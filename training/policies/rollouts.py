@@ -29,8 +29,7 @@ from splatpilot.training.policies.vehicles import (
     map_tensors,
 )
 
-NUM_OBSTACLES = 4
-"""Number of nearest obstacles in the loss of each step."""
+NUM_OBSTACLES = 4  # number of nearest obstacles in the loss of each step
 
 
 class Transitions(NamedTuple):

@@ -20,18 +20,13 @@ from splatpilot.systems.policies.student import encode_color, encode_depth
 from splatpilot.systems.vehicle.state import rotation_matrices
 from splatpilot.training.corpus.corpus import Corpus, distinct_shards, distinct_worlds
 from splatpilot.training.corpus.library import require_untested
-from splatpilot.training.corpus.samples import RECOVERY, Shard
+from splatpilot.training.corpus.samples import RECOVERY, SHARD, Shard
 from splatpilot.training.policies.ray_casting import EsdfGeometry
 from splatpilot.training.policies.student_network import StudentModule
 
-_CHANCES = 1 << 20
-"""Resolution of random choices."""
-
-_DIGESTS = 1 << 64
-"""Number of possible digests of a name."""
-
-_BATCH = 8
-"""Images that are encoded at once; their activations fit a processor's caches."""
+_CHANCES = 1 << 20  # resolution of random choices
+_DIGESTS = 1 << 64  # number of possible digests of a name
+_BATCH = 8  # Images encoded at once, whose activations fit a processor's caches.
 
 
 class Labels(NamedTuple):
@@ -45,82 +40,71 @@ class Labels(NamedTuple):
 
 
 class StudentData:
-    """The distinct samples of several corpora, numbered through, some of their worlds held out.
+    """The distinct samples of several corpora, some of whose worlds are held out.
 
     Args:
         corpora: may share worlds and shards.
-        held_out: fraction of the worlds whose samples are not trained with, see `is_held_out`.
+        held_out: fraction of the worlds that validate, see `is_held_out`.
         device: device of the labels; images stay on disk.
 
     Raises:
-        ValueError: if the samples differ in kind, two worlds of one name differ, or there are no
-            samples to train or to validate with.
+        ValueError: if corpora do not match, or there are no samples to train or to validate with.
     """
 
     def __init__(self, corpora: Sequence[Corpus], held_out: float, device: str = "cpu") -> None:
         configs = [corpus.config for corpus in corpora]
         self.camera, self.speed = configs[0].camera, configs[0].expert.speed
         """Camera of the samples; the expert's nominal speed [m/s]."""
-        for config in configs:
-            if (config.camera, config.size) != (self.camera, configs[0].size):
+        for what, values in (
+            ("cameras", [config.camera for config in configs]),
+            ("numbers of trajectories", [config.size.trajectories for config in configs]),
+            ("speeds of the expert", [config.expert.speed for config in configs]),
+        ):
+            if other := [value for value in values if value != values[0]]:
                 raise ValueError(
-                    f"the corpora have different cameras or numbers of trajectories, "
-                    f"{configs[0].size} by {self.camera} and {config.size} by {config.camera}; "
-                    "collect them with the same"
+                    f"{what} of the corpora must be equal, got {values[0]} and {other[0]}; collect "
+                    "them with the same"
                 )
-            if config.expert.speed != self.speed:
-                raise ValueError(
-                    f"the corpora's experts flew at {self.speed} and {config.expert.speed} m/s; "
-                    "collect them at the same speed"
-                )
-        records = distinct_worlds(corpora)
-        for record in records.values():
+        self._records = distinct_worlds(corpora)
+        for record in self._records.values():
             if isinstance(record.source.world, SceneSource):
                 require_untested(record.source.source_digest, str(record.path))
-        self.worlds = sorted(records)
+        self.worlds = sorted(self._records)
         """Names."""
         self.held_out_worlds = [name for name in self.worlds if is_held_out(name, held_out)]
-        shards = chain.from_iterable(distinct_shards(corpora))
-        self.shards = [shard for shard in shards if len(shard)]
+        self.shards = [shard for shard in chain(*distinct_shards(corpora)) if len(shard)]
         counts = [len(shard) for shard in self.shards]
         self.first = np.cumsum([0, *counts])
         """Index of the first sample of each shard."""
-        number = {name: k for k, name in enumerate(self.worlds)}
-        world = np.repeat([number[shard.world] for shard in self.shards], counts)
-        outside = np.isin(world, [number[name] for name in self.held_out_worlds])
+        index = {name: k for k, name in enumerate(self.worlds)}
+        world = np.repeat([index[shard.world] for shard in self.shards], counts)
+        outside = np.isin(world, [index[name] for name in self.held_out_worlds])
+        recovered = np.repeat([shard.source == RECOVERY for shard in self.shards], counts)
         self.training, self.held_out = np.flatnonzero(~outside), np.flatnonzero(outside)
         """Indices of samples."""
-        recovered = np.repeat([shard.source == RECOVERY for shard in self.shards], counts)
         self.recovered = np.flatnonzero(~outside & recovered)
         """Indices of training samples from flights of students."""
         self._shown = np.flatnonzero(~outside & ~recovered)
         if not (len(self.training) and len(self.held_out)):
-            smallest = ceil(100 * min(map(_digest, records)) / _DIGESTS) / 100
+            smallest = ceil(100 * min(map(_digest, self.worlds)) / _DIGESTS) / 100
             raise ValueError(
-                f"of {len(self.worlds)} worlds {len(self.held_out_worlds)} are held out, which "
+                f"{len(self.held_out_worlds)} of {len(self.worlds)} worlds are held out, which "
                 f"leaves {len(self.training)} samples to train with and {len(self.held_out)} to "
-                "validate with; collect in more worlds, or change held_out: from "
-                f"{smallest} on it holds out one of these"
+                f"validate with; collect in more worlds, or set held_out to {smallest} or more"
             )
 
         def joined(name: str) -> Tensor:
             arrays = [shard.arrays[name] for shard in self.shards]
             return torch.from_numpy(np.concatenate(arrays)).float().to(device)
 
-        self._labels = Labels(
-            X_WB=joined("X_WB"),
-            v_B=joined("v_B"),
-            goal_B=joined("goal_B"),
-            trajectories_B=joined("trajectories_B"),
-            world=torch.from_numpy(world).to(device),
-        )
-        self._records = records
+        labels = (joined(name) for name in ("X_WB", "v_B", "goal_B", "trajectories_B"))
+        self._labels = Labels(*labels, world=torch.from_numpy(world).to(device))
 
     def digest(self, *files: str) -> str:
         """Computes a digest of the samples, their split and the content of files."""
         digest = blake2b(digest_size=16)
         for shard in self.shards:
-            digest.update(shard.path.name.encode() + _identity(shard))
+            digest.update(shard.path.name.encode() + (shard.path / SHARD).read_bytes())
         digest.update(" ".join(self.held_out_worlds).encode())
         for file in filter(None, files):
             digest.update(Path(file).read_bytes())
@@ -147,11 +131,7 @@ class StudentData:
 
     def pixels(self, indices: np.ndarray, name: str) -> np.ndarray:
         """Reads the images `color` or `depth` of samples (N,), see `Samples`."""
-        arrays = [shard.arrays[name] for shard in self.shards]
-        found = np.empty((len(indices), *arrays[0].shape[1:]), arrays[0].dtype)
-        for row, (k, within) in enumerate(self.locate(indices)):
-            found[row] = arrays[k][within]
-        return found
+        return np.stack([self.shards[k].arrays[name][row] for k, row in self.locate(indices)])
 
     def locate(self, indices: np.ndarray) -> Iterator[tuple[int, int]]:
         """Yields the shard of each sample (N,) and its index there."""
@@ -172,27 +152,22 @@ class StudentData:
     @cached_property
     def _fields(self) -> EsdfGeometry:
         """Distances in all worlds; unknown space is occupied, as for the expert."""
-        fields = [self._records[name].esdf() for name in self.worlds]
+        fields = [self._records[name].esdf for name in self.worlds]
         return EsdfGeometry([f if f.occupied_outside else f.conservative() for f in fields])
 
 
 def is_held_out(name: str, fraction: float) -> bool:
-    """Tells whether a world validates, as about `fraction` of all worlds do.
+    """Tells whether a world is among the `fraction` of all worlds that validate.
 
-    Its name alone decides, so it stays on its side when corpora grow. The worlds of a smaller
+    Only its name counts, so that it stays on its side when corpora grow. The worlds of a smaller
     fraction are among those of a larger one.
     """
     return _digest(name) < fraction * _DIGESTS
 
 
 def _digest(name: str) -> int:
-    """Returns a number in [0, `_DIGESTS`) that depends on the name alone."""
+    """Computes a number in [0, `_DIGESTS`) from a name."""
     return int.from_bytes(blake2b(name.encode()).digest()[:8])
-
-
-def _identity(shard: Shard) -> bytes:
-    """Returns the description of a shard, which has the checksums of its files."""
-    return (shard.path / "shard.json").read_bytes()
 
 
 def encode_images(pixels: np.ndarray, device: str | torch.device = "cpu") -> Tensor:
@@ -204,7 +179,7 @@ def encode_images(pixels: np.ndarray, device: str | torch.device = "cpu") -> Ten
 class FrozenFeatures:
     """Outputs of the network's first modules for all samples, computed once and kept in files.
 
-    A file of a shard is named by a digest of the images and of the modules' weights, so that runs
+    The file of a shard is named by a digest of its images and the modules' weights, so that runs
     share files and corpora may grow.
 
     Args:
@@ -212,9 +187,6 @@ class FrozenFeatures:
         data: the samples.
         network: network with these modules.
         frozen: number of modules, of `IMAGE_MODULES`.
-
-    Raises:
-        OSError: if `folder` cannot be written.
     """
 
     def __init__(
@@ -225,11 +197,10 @@ class FrozenFeatures:
         key = blake2b(network.spec.observation.encode(), digest_size=16)
         for values in network.image_modules(frozen).parameters():
             key.update(values.detach().cpu().numpy().tobytes())
-        shards = Progress(data.shards, f"encoding images by {frozen} frozen modules", unit="shard")
         self._files = []
-        for shard in shards:
+        for shard in Progress(data.shards, f"encoding by {frozen} frozen modules", unit="shard"):
             digest = key.copy()
-            digest.update(_identity(shard))
+            digest.update((shard.path / SHARD).read_bytes())
             self._files.append(self._open(folder / f"{digest.hexdigest()}.npy", shard))
 
     def __call__(self, indices: np.ndarray) -> Tensor:
@@ -245,16 +216,12 @@ class FrozenFeatures:
         except (ValueError, EOFError) as error:
             say(f"{file} is damaged ({reason_of(error)}): it is computed again")
             file.unlink()
-        with written_atomically(file) as path:
-            np.save(path, self._encode(shard.arrays[self._network.spec.pixels]))
+        pixels, features = shard.arrays[self._network.spec.pixels], []
+        device = next(self._network.parameters()).device
+        with torch.no_grad(), written_atomically(file) as path:
+            for first in range(0, len(pixels), _BATCH):
+                images = encode_images(np.array(pixels[first : first + _BATCH]), device)
+                encoded = self._network.encode_image(images, 0, self._frozen)
+                features.append(encoded.half().cpu().numpy())
+            np.save(path, np.concatenate(features))
         return np.load(file, mmap_mode="r")
-
-    @torch.no_grad()
-    def _encode(self, pixels: np.ndarray) -> np.ndarray:
-        """Computes features (n, ...) float16."""
-        device, features = next(self._network.parameters()).device, []
-        for first in range(0, len(pixels), _BATCH):
-            images = encode_images(np.array(pixels[first : first + _BATCH]), device)
-            encoded = self._network.encode_image(images, 0, self._frozen)
-            features.append(encoded.half().cpu().numpy())
-        return np.concatenate(features)

@@ -1,4 +1,4 @@
-"""The student's network in torch, and the weights that its encoder begins with."""
+"""The student's network in torch, and ImageNet's weights of its encoder."""
 
 import os
 from pathlib import Path
@@ -8,14 +8,13 @@ from torch import Tensor, nn
 from torchvision.models import mobilenet_v2
 
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS
-from splatpilot.systems.policies.lattice import BASIS, unobstructed_way
+from splatpilot.systems.policies.lattice import BASIS, reference_trajectory
 from splatpilot.systems.policies.student import (
     BLOCKS,
     CHANNELS,
     HYPOTHESES,
     STATE_SIZE,
     StudentSpec,
-    adds_input,
     deviations,
     mobilenet_blocks,
 )
@@ -25,10 +24,9 @@ IMAGE_MODULES = BLOCKS + 1
 
 
 class StudentModule(nn.Module):
-    """The network of a `StudentSpec`, with the names of weights that `StudentNetwork` takes.
+    """The network of a `StudentSpec`, with the names of weights of `StudentNetwork`.
 
-    The encoder is torchvision's with a bias instead of each batch norm. So training, at any batch
-    size, and flight compute the same.
+    The encoder is torchvision's with a bias instead of each batch norm.
     """
 
     _basis: Tensor
@@ -47,18 +45,16 @@ class StudentModule(nn.Module):
         self.register_buffer("_basis", torch.from_numpy(BASIS).float(), persistent=False)
 
     def _initialize_encoder(self) -> None:
-        """Keeps the variance of activations through the encoder, which has no batch norms.
-
-        Modules that add their input begin with adding zero to it.
-        """
+        """Initializes the encoder such that the variance of activations is kept without batch
+        norms, and that modules with a skip add zero."""
         weights = self.state_dict()
         for block in mobilenet_blocks():
             rectified = False
             for layer in block:
                 kind = "relu" if rectified else "linear"
                 nn.init.kaiming_normal_(weights[layer.weight], nonlinearity=kind)
-                rectified = layer.rectified
-            if adds_input(block):
+                rectified = bool(layer.activation)
+            if block[-1].skip:
                 nn.init.zeros_(weights[block[-1].weight])
 
     def image_modules(self, count: int) -> nn.ModuleList:
@@ -82,7 +78,6 @@ class StudentModule(nn.Module):
             state: (N, 9), see `systems.policies.student.encode_state`.
             first: the module that takes `image`.
         """
-        # On a GPU convolutions of half the bits take half the time.
         with torch.autocast(image.device.type, torch.bfloat16, enabled=image.is_cuda):
             cells = self.encode_image(image, first)
         y = self.state_layer_2(self.state_layer(state).relu()).relu()
@@ -91,7 +86,7 @@ class StudentModule(nn.Module):
         waypoints = output[..., :-1].unflatten(2, (NUM_WAYPOINTS, 3))
         v_B, direction, up_B = state.unflatten(1, (3, 3)).unbind(1)
         goal_B = self.spec.reach * direction
-        reference = unobstructed_way(v_B, goal_B, up_B, self.spec.nominal_speed, self._basis)
+        reference = reference_trajectory(v_B, goal_B, up_B, self.spec.nominal_speed, self._basis)
         return reference[:, None] + deviations(waypoints, goal_B), output[..., -1]
 
 
@@ -112,21 +107,15 @@ IN_DATA = Path("weights") / "mobilenet_v2_imagenet.pt"
 _DOWNLOADED = Path("checkpoints") / "mobilenet_v2-7ebf99e0.pth"
 """In torch's folder, by torchvision's `mobilenet_v2(weights="DEFAULT")`."""
 
-_MEAN, _STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-"""[-] of the images that torchvision's weights were trained with, 0 to 1."""
+_MEAN, _STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # [-] of torchvision's images, 0 to 1
 
 
 def imagenet_weights() -> dict[str, Tensor]:
-    """
-    Reads the encoder's weights by the names of `mobilenet_shapes`, for images of -1 to 1.
+    """Reads the encoder's weights by the names of `mobilenet_shapes`, for images of -1 to 1.
 
     The file is a state dictionary of torchvision's `mobilenet_v2`: `IN_DATA`, or else torchvision's
     download. Batch norms and torchvision's input scaling, (x - mean) / std, are folded into the
-    convolutions. A file whose batch norms are folded already is of images of -1 to 1.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if it holds something else.
+    convolutions. A file with trivial batch norms is for images of -1 to 1.
     """
     data = os.environ.get("SPLATPILOT_DATA")
     paths = [Path(data) / IN_DATA] if data else []

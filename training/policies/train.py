@@ -27,10 +27,6 @@ from splatpilot.training.policies.trainer import Trainer, TrainingConfig
 from splatpilot.training.reconstruction.checkpoint import event_log, load_tensors, save_tensors
 
 
-class NotFiniteError(ValueError):
-    """A term of the loss, or the gradient, is infinite or not a number."""
-
-
 def validate(config: Any) -> None:
     """Checks a configuration; errors name fields as in its file."""
     try:
@@ -43,27 +39,19 @@ def validate(config: Any) -> None:
 def run[Config: TrainingConfig](
     *, config: Config, out: Path, make: Callable[[Config], Trainer]
 ) -> dict[str, Any]:
-    """
-    Trains a policy on one thread; resumes an interrupted run of the same configuration in `out`.
+    """Trains a policy on one thread; resumes an interrupted run of the same configuration.
 
     Writes to `out`: `POLICY.npz`, the weights with the best success in held-out worlds, see
     `PolicyCheckpoint`; `config.yaml`; `curves.csv`, the terms of the loss and the success over the
     updates; `POLICY.md`, a model card; `summary.json`; `checkpoint.pt`, for resuming.
 
     Args:
-        config: configuration. On a CPU it determines the weights bitwise, however often the run was
-            interrupted.
+        config: configuration. On a CPU it determines the weights bitwise, with interruptions too.
         out: folder.
         make: makes the trainer of a configuration.
 
     Returns:
         The content of `summary.json`.
-
-    Raises:
-        ValueError: on a config out of range; if `out` holds a run of another configuration, one
-            that learned from other files, or a damaged checkpoint; if a term of the loss is not
-            finite: the best weights so far stay in `out`.
-        OSError: if `out` cannot be written.
     """
     validate(config)
     require_device(config.device)
@@ -113,10 +101,8 @@ class _Run:
 
     def train(self) -> dict[str, Any]:
         progress, schedule, trainer = self.progress, self.schedule, self.trainer
-        bar = Progress(
-            total=schedule.updates, initial=progress.update, unit="update",
-            desc=f"training {trainer.policy}, seed {self.config.seed}",
-        )  # fmt: skip
+        what = f"training {trainer.policy}, seed {self.config.seed}"
+        bar = Progress(None, what, schedule.updates, initial=progress.update, unit="update")
         logs = str(self.out) if schedule.tensorboard else ""
         with event_log(logs) as log, resumable(self._kept), bar:
             while progress.update < schedule.updates:
@@ -159,7 +145,7 @@ class _Run:
         trainer.begin_update(progress.update)
         try:
             terms = step_optimizer(trainer.losses, trainer.network, self.optimizer, schedule.clip)
-        except NotFiniteError as error:
+        except FloatingPointError as error:
             best = f"the best weights so far are kept in {self.out}; " if progress.best else ""
             raise ValueError(
                 f"training stopped at update {progress.update}: {error}; {best}lower "
@@ -287,20 +273,16 @@ def step_optimizer(
     clip: float,
 ) -> dict[str, float]:
     """Takes a step down the sum of the terms from `losses` that have a gradient; returns the terms
-    and that sum, `loss`.
-
-    Raises:
-        NotFiniteError: naming the term, or the gradient; the weights are then as before.
-    """
+    and that sum, `loss`. Raises FloatingPointError before the step if one is not finite."""
     terms = losses()
     for name, term in terms.items():
         if not torch.isfinite(term):
-            raise NotFiniteError(f"the term {name!r} of the loss became {term.item()}")
+            raise FloatingPointError(f"the term {name!r} of the loss became {term.item()}")
     optimizer.zero_grad(set_to_none=True)
     loss = torch.stack([term for term in terms.values() if term.requires_grad]).sum()
     loss.backward()
     norm = torch.nn.utils.clip_grad_norm_(network.parameters(), clip)
     if not torch.isfinite(norm):
-        raise NotFiniteError(f"the gradient of the loss became {norm.item()}")
+        raise FloatingPointError(f"the gradient of the loss became {norm.item()}")
     optimizer.step()
     return {name: float(term.detach()) for name, term in (terms | {"loss": loss}).items()}

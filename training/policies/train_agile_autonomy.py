@@ -60,8 +60,7 @@ from splatpilot.training.policies.vehicles import (
     reaching_acceleration,
 )
 
-LOOKAHEAD = 3
-"""Index of the tracked waypoint: at 0.4 s, the controller's lookahead."""
+LOOKAHEAD = 3  # index of the tracked waypoint, at 0.4 s, the controller's lookahead
 
 
 class AgileAutonomyAgent:
@@ -81,11 +80,9 @@ class AgileAutonomyAgent:
     def observe(self, seen: Observation) -> tuple[Tensor, Tensor]:
         """Computes images (N, 24, 32) and states (N, 18)."""
         vehicle, R_WB = seen.vehicle, seen.vehicle.attitude()
-        rates = (
-            QuadrotorState.of(vehicle.state).w_WB_B
-            if isinstance(vehicle, BodyRate)
-            else 0.0 * vehicle.v
-        )
+        rates = 0.0 * vehicle.v
+        if isinstance(vehicle, BodyRate):
+            rates = QuadrotorState.of(vehicle.state).w_WB_B
         v_target = target_velocity(vehicle.p, seen.p_WG, seen.speed)
         state = state_observation(R_WB, vehicle.v, rates, v_target)
         return self.encode_depth(seen.depth), state
@@ -109,8 +106,7 @@ class AgileAutonomyAgent:
         return reaching_acceleration(p_WR, seen.vehicle), None, memory
 
 
-EPSILON = 0.05
-"""Fraction of an expert's pull on the hypotheses that are not the closest to it."""
+EPSILON = 0.05  # fraction of an expert's pull on the hypotheses that are not the closest to it
 
 _MAX_EXCESS = 1.5  # [s] of cost over the expert's best, of trajectories that are imitated
 
@@ -211,13 +207,8 @@ class AgileAutonomyTrainer(FlightTrainer):
 
     @torch.no_grad()
     def _collect(self, student: float, first_world: int, steps: Iterable[int]) -> dict[str, Tensor]:
-        """Collects observations and labels while the student and the expert fly.
-
-        Args:
-            student: fraction of the vehicles that the student flies.
-            first_world: index of the first vehicle's world.
-            steps: indices of the steps.
-        """
+        """Collects observations and labels over steps, while the student flies a fraction of the
+        vehicles and the expert the others, in the worlds from `first_world`."""
         config, worlds = self._config, self.worlds
         N, device = config.environments, config.device
         world = (first_world + torch.arange(N, device=device)) % len(worlds)

@@ -28,11 +28,7 @@ from splatpilot.systems.policies.depthnav import (
     MIN_DEPTH,
     RATE,
 )
-from splatpilot.systems.policies.observations import (
-    heading_frame,
-    limit_smoothly,
-    target_velocity,
-)
+from splatpilot.systems.policies.observations import heading_frame, limit_smoothly, target_velocity
 from splatpilot.systems.vehicle.quadrotor import GRAVITY
 from splatpilot.training.policies.networks import TrainableNetwork
 from splatpilot.training.policies.ray_casting import PixelRays
@@ -49,8 +45,7 @@ class DepthNavLoss:
     velocity: float = 4.0
     # [-] Velocity toward the nearest obstacle times max(0, 1 - d)², d [m], and its proximity.
     collision: float = 6.0
-    # [m/s] Weight of ln(1 + exp(-6 d)) in that, at any velocity. With the 2.5 of the publication
-    # vehicles do not fly through slits.
+    # [m/s] Weight of ln(1 + exp(-6 d)) in that, at any velocity; 2.5 as published.
     nearness: float = 0.5
     # [s^4/m^2] Square of the acceleration.
     acceleration: float = 0.01
@@ -81,12 +76,8 @@ class DepthNavLearner:
 
     def __init__(self, loss: DepthNavLoss, device: torch.device | str = "cpu") -> None:
         spec = DEPTHNAV_NETWORK
-        self.rays = PixelRays.of(
-            spec.image_width,
-            spec.image_height,
-            FOV_X,
-            cell_aspect=(CAMERA_SIZE[1] / spec.image_height) / (CAMERA_SIZE[0] / spec.image_width),
-        )
+        aspect = (CAMERA_SIZE[1] / spec.image_height) / (CAMERA_SIZE[0] / spec.image_width)
+        self.rays = PixelRays.of(spec.image_width, spec.image_height, FOV_X, aspect)
         self.network = TrainableNetwork(spec, head_scale=1.0).to(device)
         self._loss = loss
         self._limits = torch.tensor(ACCELERATION_LIMITS, dtype=torch.float32, device=device)
@@ -111,11 +102,8 @@ class DepthNavLearner:
         a_S = limit_smoothly(output[:, :3], self._limits)
         to_goal = torch.atan2(v_target[:, 1], v_target[:, 0]).detach()
         heading = to_goal + torch.pi * torch.tanh(output[:, 3] / torch.pi)
-        return (
-            (R_WS @ a_S[:, :, None])[:, :, 0],
-            heading,
-            torch.cat([hidden, start_yaw[:, None]], 1),
-        )
+        a_WB = (R_WS @ a_S[:, :, None])[:, :, 0]
+        return a_WB, heading, torch.cat([hidden, start_yaw[:, None]], 1)
 
     def losses(self, transitions: Transitions) -> dict[str, Tensor]:
         weights = self._loss
@@ -139,10 +127,8 @@ class DepthNavLearner:
 
 
 def quaternion_from_rotation(R: Tensor) -> Tensor:
-    """Computes the quaternions (N, 4) wxyz, w >= 0, of rotations (N, 3, 3), differentiable.
-
-    Each is computed from its largest component.
-    """
+    """Computes the quaternions (N, 4) wxyz, w >= 0, of rotations (N, 3, 3), differentiable, each
+    from its largest component."""
     m00, m11, m22 = R[:, 0, 0], R[:, 1, 1], R[:, 2, 2]
     yz, zx, xy = R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]
     sxy, szx, syz = R[:, 1, 0] + R[:, 0, 1], R[:, 0, 2] + R[:, 2, 0], R[:, 2, 1] + R[:, 1, 2]

@@ -37,7 +37,11 @@ from splatpilot.systems.policies.observations import (
 )
 from splatpilot.systems.policies.velocity import tracking_acceleration
 from splatpilot.systems.sensing.noise import ObservationNoise
-from splatpilot.systems.sensing.time_of_flight import LEAST_DEPTH, range_of_depth, sensor_of
+from splatpilot.systems.sensing.time_of_flight import (
+    UNMEASURED_DEPTH,
+    equivalent_sensor,
+    range_of_depth,
+)
 from splatpilot.training.policies.networks import TrainableNetwork
 from splatpilot.training.policies.ray_casting import PixelRays
 from splatpilot.training.policies.rollouts import RolloutConfig, RolloutTraining, Transitions
@@ -123,25 +127,20 @@ def _state_observation(seen: Observation, R_WH: Tensor) -> Tensor:
 def proximity_grid(
     depth: Tensor, range_of_depth: Tensor, max_range: float, height: int, width: int
 ) -> Tensor:
-    """The proximities (N, height, width) in images of depth (N, R) [m], the lowest row first.
+    """Computes the proximities (N, height, width) of depth (N, R) [m], the lowest row first.
 
-    See `splatpilot.systems.sensing.time_of_flight`, also for `range_of_depth` (H, W); H and W must
-    be multiples of height and width.
+    See `splatpilot.systems.sensing.time_of_flight`, also for `range_of_depth` (H, W), whose size is
+    a multiple of height and width.
     """
     H, W = range_of_depth.shape
-    measured = torch.where(depth > LEAST_DEPTH, depth, max_range).reshape(-1, H, W)
+    measured = torch.where(depth > UNMEASURED_DEPTH, depth, max_range).reshape(-1, H, W)
     blocks = (measured * range_of_depth).reshape(-1, height, H // height, width, W // width)
     return (1.0 - blocks.amin((2, 4)).clamp(0.0, max_range) / max_range).flip(1)
 
 
-# DiffAero on the grid of a time-of-flight sensor: ranges to 5 m as 1 - range / 5 m, of 86 x 48.4
-# degrees; as such a sensor streams, 64x36 pixels pooled to 16x9, 10 to 30 images a second, some
-# late and some lost. The network commands velocities, which the vehicle tracks as
-# `VelocityTracker` does.
-
-
 def streaming_noise() -> ObservationNoise:
-    """Returns the default noise of such a sensor."""
+    """Returns the default noise of a time-of-flight sensor: 10 to 30 images per second, some late
+    and some lost."""
     return ObservationNoise(
         depth_multiplicative=0.03,
         depth_additive=0.02,
@@ -155,14 +154,14 @@ def streaming_noise() -> ObservationNoise:
 
 @dataclass
 class DiffAeroTofTraining(DiffAeroTraining):
-    """A training run of DiffAero by time of flight."""
+    """A training run of DiffAero by the grid of a time-of-flight sensor."""
 
     schedule: Schedule = field(default_factory=lambda: Schedule(updates=6000, validate_every=500))
     rollout: RolloutConfig = field(default_factory=lambda: RolloutConfig(noise=streaming_noise()))
 
 
 class DiffAeroTofLearner(DiffAeroLearner):
-    """Flies by the network of DiffAeroTof."""
+    """Flies by the network of DiffAeroTof, tracking its velocities as `VelocityTracker` does."""
 
     def __init__(self, loss: DiffAeroLoss, device: torch.device | str = "cpu") -> None:
         super().__init__(loss, device)
@@ -170,7 +169,7 @@ class DiffAeroTofLearner(DiffAeroLearner):
         self.rays = PixelRays.of(
             camera.width, camera.height, camera.fov_x, camera.focal_x / camera.focal_y
         )
-        self._sensor = sensor = sensor_of(camera)
+        self._sensor = sensor = equivalent_sensor(camera)
         to_range = range_of_depth(sensor.height, sensor.width, sensor.fov_x, sensor.fov_y)
         self._range_of_depth = torch.tensor(to_range, dtype=torch.float32, device=device)
         self._limits = torch.tensor(VELOCITY_LIMITS, dtype=torch.float32, device=device)

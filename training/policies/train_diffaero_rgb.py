@@ -16,26 +16,34 @@ from torch import Tensor, nn
 from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.common.validation import bounded
 from splatpilot.systems.policies.checkpoint import PolicyCheckpoint
+from splatpilot.systems.policies.convolutions import LEAK
 from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK, MAX_DEPTH, MIN_DEPTH
 from splatpilot.systems.policies.diffaero_rgb import (
     DIFFAERO_RGB_NETWORK,
     HEIGHT,
     WIDTH,
-    Layer,
     MonocularSpec,
     rays_B,
     require_view,
 )
 from splatpilot.systems.policies.observations import heading_frame, inverse_depth
-from splatpilot.systems.policies.recurrent_network import LEAK
 from splatpilot.systems.policies.student import encode_color
 from splatpilot.systems.sensing.noise import ObservationNoise
 from splatpilot.systems.vehicle.state import rotation_matrices
 from splatpilot.training.corpus.corpus import Corpus
-from splatpilot.training.policies.augmentation import check_noise, noisy_color, relit
-from splatpilot.training.policies.networks import TrainableNetwork
+from splatpilot.training.policies.augmentation import change_appearance, check_noise, noisy_color
+from splatpilot.training.policies.networks import (
+    TrainableNetwork,
+    load_weights,
+    make_convolution,
+)
 from splatpilot.training.policies.student_data import StudentData
-from splatpilot.training.policies.trainer import CorpusTraining, Schedule, Trainer, spread
+from splatpilot.training.policies.trainer import (
+    CorpusTraining,
+    Schedule,
+    Trainer,
+    validation_batches,
+)
 
 
 class MonocularModule(nn.Module):
@@ -43,7 +51,9 @@ class MonocularModule(nn.Module):
 
     def __init__(self, spec: MonocularSpec) -> None:
         super().__init__()
-        made = {layer.name: _convolution(layer) for layer in spec.layers()}
+        made = {
+            layer.weight.removesuffix(".weight"): make_convolution(layer) for layer in spec.layers()
+        }
 
         def blocks(name: str, count: int) -> nn.Sequential:
             return nn.Sequential(
@@ -84,39 +94,16 @@ class DiffAeroRgbModule(nn.Module):
 
     def load_policy(self, weights: str) -> None:
         """Loads DiffAero from a file of weights, the shipped ones if empty."""
-        checkpoint = PolicyCheckpoint.load(weights, "diffaero", DIFFAERO_NETWORK)
-        self.policy.load_state_dict(
-            {name: torch.from_numpy(values) for name, values in checkpoint.weights.items()}
-        )
+        load_weights(self.policy, PolicyCheckpoint.load(weights, "diffaero", DIFFAERO_NETWORK))
 
     def load_monocular(self, weights: str) -> None:
         """Loads the monocular network from a file of weights of `diffaero_rgb`."""
         checkpoint = PolicyCheckpoint.load(weights, "diffaero_rgb", DIFFAERO_RGB_NETWORK)
-        self.monocular.load_state_dict(
-            {
-                name.removeprefix("monocular."): torch.from_numpy(values)
-                for name, values in checkpoint.weights.items()
-                if name.startswith("monocular.")
-            }
-        )
+        load_weights(self.monocular, checkpoint, "monocular.")
 
 
-def _convolution(layer: Layer) -> nn.Conv2d:
-    return nn.Conv2d(
-        layer.inputs,
-        layer.outputs,
-        layer.kernel,
-        layer.stride,
-        layer.dilation * (layer.kernel // 2),
-        layer.dilation,
-    )
-
-
-_NEAR = 6.0
-"""Maximum depth [m] of cells that are evaluated."""
-
-_CLOSE = 0.25
-"""Relative error [-] of a successful prediction of depth."""
+_NEAR = 6.0  # [m] maximum depth of cells that are evaluated
+_CLOSE = 0.25  # [-] maximum relative error of a successful prediction
 
 
 @dataclass
@@ -167,7 +154,7 @@ beyond 5; `error` the mean absolute error of all cells' inverse depths, 3 m / z.
         self._rays_B = torch.from_numpy(rays_B()).flatten(0, 1).to(config.device)
         self._targets = torch.from_numpy(self._min_depths()).to(config.device)
         self.generator = torch.Generator(config.device).manual_seed(config.seed)
-        self._validation = spread(self._data.held_out)
+        self._validation = validation_batches(self._data.held_out, config.batch)
 
     def losses(self) -> dict[str, Tensor]:
         config, training, generator = self._config, self._data.training, self.generator
@@ -175,7 +162,8 @@ beyond 5; `error` the mean absolute error of all cells' inverse depths, 3 m / z.
             len(training), (config.batch,), generator=generator, device=config.device
         )
         color, rays, target = self._samples(training[drawn.cpu().numpy()])
-        color = noisy_color(relit(color, config.appearance, generator), config.noise, generator)
+        color = change_appearance(color, config.appearance, generator)
+        color = noisy_color(color, config.noise, generator)
         flipped = torch.rand(config.batch, generator=generator, device=config.device) < 0.5
         view = flip(torch.cat([encode_color(color), rays], 1), flipped)
         target = torch.where(flipped[:, None, None], target.flip(2), target)
@@ -187,8 +175,7 @@ beyond 5; `error` the mean absolute error of all cells' inverse depths, 3 m / z.
     def evaluate(self) -> dict[str, float]:
         """Measures `metrics` on images without noise of held-out worlds."""
         rows = []
-        for first in range(0, len(self._validation), self._config.batch):
-            indices = self._validation[first : first + self._config.batch]
+        for indices in self._validation:
             color, rays, target = self._samples(indices)
             rows.append((self._predict(torch.cat([encode_color(color), rays], 1))[0], target))
         predicted, target = (torch.cat(part) for part in zip(*rows, strict=True))

@@ -16,13 +16,14 @@ from torch import Tensor
 
 from splatpilot.systems.collision.distance_field import soft_barrier
 from splatpilot.systems.common.validation import bounded, require_field
-from splatpilot.systems.policies.checkpoint import PolicyCheckpoint, check_weights
+from splatpilot.systems.policies.checkpoint import check_weights
 from splatpilot.systems.policies.hypotheses import WAYPOINT_PERIOD
 from splatpilot.systems.policies.student import (
     StudentSpec,
     encode_color,
     encode_depth,
     encode_state,
+    load_checkpoint,
 )
 from splatpilot.systems.sensing.noise import ObservationNoise
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
@@ -30,31 +31,28 @@ from splatpilot.systems.vehicle.state import rotation_matrices
 from splatpilot.training.corpus.corpus import Corpus
 from splatpilot.training.policies.augmentation import (
     Appearance,
+    change_appearance,
     check_noise,
     noisy_color,
     noisy_depth,
-    relit,
 )
-from splatpilot.training.policies.student_data import FrozenFeatures, StudentData, encode_images
+from splatpilot.training.policies.student_data import FrozenFeatures, StudentData
 from splatpilot.training.policies.student_network import (
     IMAGE_MODULES,
     StudentModule,
     imagenet_weights,
 )
-from splatpilot.training.policies.trainer import CorpusTraining, Schedule, Trainer, spread
+from splatpilot.training.policies.trainer import (
+    CorpusTraining,
+    Schedule,
+    Trainer,
+    validation_batches,
+)
 
-GEOMETRIC_WEIGHT = 1.0
-"""Weight of the barrier in equation 4 [1/(m s)]: grazing an obstacle for a second costs as much as
-flying half a meter beside the expert."""
-
-COST_WEIGHT = 0.1
-"""Weight of the costs' error [-]. Costs are about 1 where errors are tenths of a square meter."""
-
-CLEARANCE_CAP = 0.8
-"""Clearance of the vehicle's center [m] beyond which hypotheses need no more."""
-
-CLOSE = 0.25
-"""Root mean square distance to the expert's trajectory [m] of a successful imitation."""
+GEOMETRIC_WEIGHT = 1.0  # [1/(m s)] weight of the barrier in equation 4
+COST_WEIGHT = 0.1  # [-] weight of the costs' error
+CLEARANCE_CAP = 0.8  # [m] of the vehicle's center, beyond which more is not rewarded
+CLOSE = 0.25  # [m] root mean square distance to the expert's trajectory, for success
 
 
 @dataclass
@@ -72,8 +70,7 @@ class StudentTraining(CorpusTraining):
     # Begins with ImageNet's weights of the encoder, instead of from scratch.
     pretrained: bool = True
     # [-] Number of first modules that keep their weights, of the 19 of the encoder and the layer of
-    # its cells. Their outputs are computed once. The first 7 see edges, which depth has too; with
-    # all 20, of a student that was trained before (`begin`), the head alone is trained.
+    # its cells. Their outputs are computed once.
     frozen: int = bounded(7, f"[0, {IMAGE_MODULES}]")
     # Folder of the outputs of frozen modules, which runs share.
     features: str = "out/features"
@@ -116,12 +113,8 @@ class StudentDepthTraining(StudentTraining):
 
 
 def hypothesis_errors(expert: Tensor, waypoints: Tensor) -> Tensor:
-    """Computes L_m (N, M) = 10 / (3 T) sum_t |T*_t - T_mt|^2 [m^2].
-
-    Args:
-        expert: (N, T, 3) [m].
-        waypoints: (N, M, T, 3) [m].
-    """
+    """Computes L_m (N, M) = 10 / (3 T) sum_t |T*_t - T_mt|^2 [m^2] of T* (N, T, 3) [m], the
+    expert's, and T_m (N, M, T, 3) [m]."""
     return 10.0 / (3 * expert.shape[1]) * (expert[:, None] - waypoints).square().sum((2, 3))
 
 
@@ -133,11 +126,7 @@ def root_mean_square(errors: Tensor) -> Tensor:
 def imitation_terms(errors: Tensor, epsilon: float) -> tuple[Tensor, Tensor]:
     """Computes the relaxed winner-takes-all loss: the terms of the closest and of the others.
 
-        mean_n (1 - epsilon) min_m L_m  and  mean_n epsilon / (M - 1) (sum_m L_m - min_m L_m)
-
-    Args:
-        errors: L (N, M).
-        epsilon: fraction of the pull that the others share.
+    mean_n (1 - epsilon) min_m L_m  and  mean_n epsilon / (M - 1) (sum_m L_m - min_m L_m)
     """
     closest = errors.min(1).values
     others = (errors.sum(1) - closest) / max(errors.shape[1] - 1, 1)
@@ -146,12 +135,7 @@ def imitation_terms(errors: Tensor, epsilon: float) -> tuple[Tensor, Tensor]:
 
 def penalties(errors: Tensor, distances: Tensor) -> Tensor:
     """Computes u_m (N, M) = L_m + GEOMETRIC_WEIGHT g_m of equation 4; g is the soft barrier of
-    equation 3 integrated over the trajectory.
-
-    Args:
-        errors: L (N, M).
-        distances: (N, M, T) [m], signed, at the waypoints.
-    """
+    equation 3, integrated over the trajectory by signed distances (N, M, T) [m]."""
     barrier = WAYPOINT_PERIOD * soft_barrier(distances, VEHICLE_RADIUS).sum(2)
     return errors + GEOMETRIC_WEIGHT * barrier
 
@@ -162,12 +146,8 @@ def cost_targets(penalties: Tensor) -> Tensor:
 
 
 def missing_clearances(distances: Tensor, expert: Tensor) -> Tensor:
-    """Computes C_m (N, M) = 10 / (3 T) sum_t max(0, min(d*_t, CLEARANCE_CAP) - d_mt)^2 [m^2].
-
-    Args:
-        distances: d (N, M, T) [m], signed, at the waypoints.
-        expert: d* (N, T) [m] at the expert's.
-    """
+    """Computes C_m (N, M) = 10 / (3 T) sum_t max(0, min(d*_t, CLEARANCE_CAP) - d_mt)^2 [m^2] of
+    signed distances d (N, M, T) [m] and the expert's, d* (N, T) [m]."""
     missing = (expert.clamp(max=CLEARANCE_CAP)[:, None] - distances).clamp(min=0.0)
     return 10.0 / (3 * distances.shape[2]) * missing.square().sum(2)
 
@@ -198,14 +178,8 @@ of error and clearance."""
         corpora = [Corpus(Path(path)) for path in config.corpora]
         self._data = StudentData(corpora, config.held_out, config.device)
         camera = self._data.camera
-        self.spec = StudentSpec(
-            config.observation,
-            camera.width,
-            camera.height,
-            camera.fov_x,
-            nominal_speed=self._data.speed,
-            way_version=2,
-        )
+        size = camera.width, camera.height, camera.fov_x
+        self.spec = StudentSpec(config.observation, *size, nominal_speed=self._data.speed)
         self.network = StudentModule(self.spec)
         if config.begin:
             self._load(config.begin)
@@ -220,10 +194,10 @@ of error and clearance."""
             folder = Path(config.features)
             self._features = FrozenFeatures(folder, self._data, self.network, config.frozen)
         self.generator = torch.Generator(config.device).manual_seed(config.seed)
-        self._validation = spread(self._data.held_out)
+        self._validation = validation_batches(self._data.held_out, config.batch)
 
     def _load(self, file: str) -> None:
-        checkpoint = PolicyCheckpoint.load(file, self.policy, StudentSpec)
+        checkpoint = load_checkpoint(file, self._config.observation)
         shapes = self.spec.weight_shapes()
         weights = checkpoint.build(lambda _, weights: check_weights(weights, shapes))
         self.network.load_state_dict({k: torch.from_numpy(v) for k, v in weights.items()})
@@ -231,7 +205,7 @@ of error and clearance."""
     def losses(self) -> dict[str, Tensor]:
         config = self._config
         indices = self._data.draw(self._integers, config.recovery_share)
-        predicted = self._predict(indices, self._features or self._augmented)
+        predicted = self._predict(indices, augmented=True)
         closest, others = imitation_terms(predicted.errors, config.epsilon)
         wins = torch.bincount(predicted.errors.argmin(1), minlength=predicted.errors.shape[1])
         error = (predicted.costs - cost_targets(predicted.penalties)).square().mean()
@@ -251,10 +225,9 @@ of error and clearance."""
     @torch.no_grad()
     def evaluate(self) -> dict[str, float]:
         """Measures `metrics` on images without noise of held-out worlds."""
-        batch, rows = self._config.batch, []
-        for first in range(0, len(self._validation), batch):
-            indices = self._validation[first : first + batch]
-            predicted = self._predict(indices, self._features or self._encoded)
+        rows = []
+        for indices in self._validation:
+            predicted = self._predict(indices, augmented=False)
             chosen = predicted.costs.argmin(1)
             each = torch.arange(len(chosen), device=chosen.device)
             clear = (predicted.distances[each, chosen] > VEHICLE_RADIUS).all(1)
@@ -270,29 +243,27 @@ of error and clearance."""
         size, device = (config.batch,), config.device
         return torch.randint(count, size, generator=self.generator, device=device).cpu().numpy()
 
-    def _encoded(self, indices: np.ndarray) -> Tensor:
-        return encode_images(self._data.pixels(indices, self.spec.pixels), self._config.device)
-
-    def _augmented(self, indices: np.ndarray) -> Tensor:
-        """Encodes images with noise and another appearance, if the configuration has any."""
+    def _images(self, indices: np.ndarray, augmented: bool) -> Tensor:
+        """Encodes images, with noise and another appearance if augmented."""
         config, generator = self._config, self.generator
-        noisy = config.noise != ObservationNoise()
+        if self._features:
+            return self._features(indices).to(config.device)
         images = torch.from_numpy(self._data.pixels(indices, self.spec.pixels))
         images = images.to(config.device).float()
+        noisy = augmented and config.noise != ObservationNoise()
         if config.observation == "depth":
-            images = noisy_depth(images, config.noise, generator) if noisy else images
-            return encode_depth(images)
-        if config.appearance != Appearance(0.0, 0.0):
-            images = relit(images, config.appearance, generator)
+            return encode_depth(noisy_depth(images, config.noise, generator) if noisy else images)
+        if augmented and config.appearance != Appearance(0.0, 0.0):
+            images = change_appearance(images, config.appearance, generator)
         return encode_color(noisy_color(images, config.noise, generator) if noisy else images)
 
-    def _predict(self, indices: np.ndarray, images) -> _Prediction:
+    def _predict(self, indices: np.ndarray, augmented: bool) -> _Prediction:
         labels = self._data.labels(indices)
         R_WB = rotation_matrices(labels.X_WB[:, :4])
         state = encode_state(R_WB, labels.v_B, labels.goal_B, self.spec.reach)
-        image = images(indices).to(self._config.device)
+        image = self._images(indices, augmented)
         waypoints, costs = self.network(image, state, self._config.frozen)
-        # The first trajectory is the cheapest, and always there.
+        # The first trajectory is the cheapest, and always valid.
         errors = hypothesis_errors(labels.trajectories_B[:, 0], waypoints)
         distances = self._data.distance_along(waypoints, labels)
         return _Prediction(costs, errors, distances, penalties(errors.detach(), distances.detach()))

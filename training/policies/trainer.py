@@ -35,10 +35,8 @@ class Schedule(Config):
     tensorboard: bool = False
 
     def due(self, update: int) -> tuple[bool, bool]:
-        """Tells whether to write a checkpoint and whether to evaluate after an update.
-
-        The first checkpoint is evaluated too, so that weights exist early.
-        """
+        """Tells whether to write a checkpoint and whether to evaluate after an update. The first
+        checkpoint is evaluated too, so that weights exist early."""
         last = update == self.updates
         evaluate = update % self.validate_every == 0 or update == self.checkpoint_every
         return last or update % self.checkpoint_every == 0, last or evaluate
@@ -91,19 +89,14 @@ success in worlds of its kind."""
 class Trainer:
     """Base class of trainers: the network of a policy, the terms of its loss and its evaluation."""
 
-    policy: str
-    """Name of the policy, and of its file of weights."""
-    spec: Any
-    """Architecture of the network, a dataclass, see `PolicyCheckpoint`."""
+    policy: str  # name of the policy, and of its file of weights
+    spec: Any  # architecture of the network, a dataclass, see `PolicyCheckpoint`
     network: Any  # torch.nn.Module
-    generator: torch.Generator
-    """Source of all random numbers of the losses."""
+    generator: torch.Generator  # source of all random numbers of the losses
+    # Digest of the files that it reads. A run is not resumed if they have changed.
     learns_from: str = ""
-    """Digest of the files that it reads. A run is not resumed if they have changed."""
-    evaluated: str = "flights"
-    """What `success` is a fraction of."""
-    metrics: str = FLIGHTS
-    """Description of the results of `evaluate` for the model card."""
+    evaluated: str = "flights"  # of which `success` is a fraction
+    metrics: str = FLIGHTS  # description of the results of `evaluate` for the model card
 
     def begin_update(self, update: int) -> None:
         """Prepares an update; called with its number."""
@@ -126,6 +119,7 @@ class Trainer:
         self.generator.set_state(state["generator"])
 
 
-def spread(indices: np.ndarray, count: int = 2000) -> np.ndarray:
-    """Selects `count` of the indices (N,), evenly spaced, or all if there are fewer."""
-    return indices[np.linspace(0, len(indices) - 1, min(count, len(indices))).astype(int)]
+def validation_batches(indices: np.ndarray, size: int, count: int = 2000) -> list[np.ndarray]:
+    """Selects `count` of the indices (N,), evenly spaced, or all, in batches of `size`."""
+    spaced = indices[np.linspace(0, len(indices) - 1, min(count, len(indices))).astype(int)]
+    return [spaced[first : first + size] for first in range(0, len(spaced), size)]

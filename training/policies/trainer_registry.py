@@ -1,8 +1,8 @@
 """Trainers by the names of their policies."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 from splatpilot.systems.common.registry import Registry
 from splatpilot.training.policies.rollouts import RolloutTrainer
@@ -26,22 +26,18 @@ from splatpilot.training.policies.train_student import (
 from splatpilot.training.policies.trainer import Trainer
 
 
-@dataclass(frozen=True)
-class TrainerKind:
+class TrainerEntry(NamedTuple):
     """A registered trainer."""
 
-    config: type
-    """Type of its configurations, a dataclass with the fields of `TrainingConfig`."""
-    make: Callable[[Any], Trainer]
-    """Makes the trainer of a configuration."""
+    config: type  # of its configurations, a dataclass with the fields of `TrainingConfig`
+    make: Callable[[Any], Trainer]  # makes the trainer of a configuration
 
 
-TRAINERS = Registry("trainer", "splatpilot.trainers", TrainerKind)
+TRAINERS = Registry("trainer", "splatpilot.trainers", TrainerEntry)
 
 
 def register_trainer(name: str, config: type, make: Callable[[Any], Trainer]) -> None:
-    """
-    Registers a trainer for `splatpilot train`.
+    """Registers a trainer for `splatpilot train`.
 
     Args:
         name: name of the policy.
@@ -51,7 +47,11 @@ def register_trainer(name: str, config: type, make: Callable[[Any], Trainer]) ->
     Raises:
         ValueError: if another trainer has the name.
     """
-    TRAINERS.add(name, TrainerKind(config, make))
+    TRAINERS.add(name, TrainerEntry(config, make))
+
+
+def _rollout_trainer(name: str, learner: Any, config: Any) -> Trainer:
+    return RolloutTrainer(name, learner(config.loss, config.device), config)
 
 
 for _name, _config, _learner in (
@@ -59,11 +59,7 @@ for _name, _config, _learner in (
     ("depthnav", DepthNavTraining, DepthNavLearner),
     ("diffaero_tof", DiffAeroTofTraining, DiffAeroTofLearner),
 ):
-
-    def _make(config: Any, name: str = _name, learner: Any = _learner) -> Trainer:
-        return RolloutTrainer(name, learner(config.loss, config.device), config)
-
-    register_trainer(_name, _config, _make)
+    register_trainer(_name, _config, partial(_rollout_trainer, _name, _learner))
 register_trainer("agile_autonomy", AgileAutonomyTraining, AgileAutonomyTrainer)
 register_trainer("diffaero_rgb", DiffAeroRgbTraining, DiffAeroRgbTrainer)
 register_trainer("student_rgb", StudentRgbTraining, StudentTrainer)

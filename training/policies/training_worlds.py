@@ -1,5 +1,5 @@
-"""The worlds that policies train in: of the benchmark's kinds, of seeds that it never uses, and
-captured places in which it never flies."""
+"""Worlds to train in: of the benchmark's kinds, by seeds that it does not use, and captured scenes
+in which it does not fly."""
 
 import contextlib
 import json
@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, fields
 from hashlib import blake2b
 from itertools import cycle
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -52,32 +52,26 @@ from splatpilot.training.corpus.library import (
     PROCEDURAL,
     ROUNDABOUT,
     check_library,
-    place_to_learn_in,
-    world_of,
+    scenario_world,
+    training_scene,
 )
 from splatpilot.training.policies.ray_casting import Geometry, Grids, MixedGeometry, ShapeGeometry
 
-# Training worlds and the times of arrival in them, kept in the user's cache: making them again
-# would delay every start and every resumption of a training run.
-
-
-_LIMIT = 1 << 30
-"""[bytes] that files of the cache may take; those that were used last stay."""
+_LIMIT = 1 << 30  # [bytes] of the cache; the files that were used last stay.
 
 _SHAPES = {shape.__name__: shape for shape in (Sphere, Capsule, Cylinder, Box, HalfSpace)}
-"""Shapes that can be kept."""
+"""Shapes that the cache can store."""
 
 _POINTS = "lower_W", "upper_W", "p_WS", "p_WG"
-"""Of a `WorldSpec`, each (3,) [m]."""
+"""Points of a `WorldSpec`, (3,) [m] each."""
 
 ShapesAndPoints = tuple[list[Shape], *tuple[np.ndarray, ...]]
 
 
 class WorldCache:
-    """Makes, or reads again, what training needs of worlds.
+    """Cache of training worlds and their times of arrival in the user's folder.
 
-    What this program would make is the same to the last bit. Where the cache cannot be written
-    nothing is kept.
+    It depends on the version of the program. A folder that cannot be written stays empty.
     """
 
     def __init__(self) -> None:
@@ -87,51 +81,42 @@ class WorldCache:
             require_writable_folder(self._folder)
 
     def spec(self, config: WorldConfig, seed: int) -> ShapesAndPoints:
-        """Returns the shapes of a generated world, and its `lower_W`, `upper_W`, `p_WS` and `p_WG`.
-
-        Raises:
-            ValueError: see `make_spec`.
-        """
+        """Returns the shapes of a generated world, and its `lower_W`, `upper_W`, `p_WS`, `p_WG`."""
         file = self._file("json", f"{dump_config(config)}{seed}".encode())
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
             kept = json.loads(file.read_text())
             os.utime(file)
-            return [_shape(one) for one in kept["shapes"]], *(np.array(kept[p]) for p in _POINTS)
-        plan = make_spec(config, seed)
-        shapes = [solid.shape for solid in plan.solids]
+            return [_shape(*one) for one in kept["shapes"]], *(np.array(kept[p]) for p in _POINTS)
+        spec = make_spec(config, seed)
+        shapes = [solid.shape for solid in spec.solids]
+        points = {name: getattr(spec, name) for name in _POINTS}
         if all(type(shape) in _SHAPES.values() for shape in shapes):
-            content = {"shapes": [_described(shape) for shape in shapes]}
-            content |= {name: getattr(plan, name).tolist() for name in _POINTS}
+            content = {name: point.tolist() for name, point in points.items()}
+            content["shapes"] = [_fields(shape) for shape in shapes]
             with contextlib.suppress(OSError), written_atomically(file) as path:
                 path.write_text(json.dumps(content))
-        return shapes, *(getattr(plan, name) for name in _POINTS)
+        return shapes, *points.values()
 
-    def arrival(
-        self,
-        surfaces: Sequence[Shape] | Esdf,
-        lower_W: np.ndarray,
-        upper_W: np.ndarray,
-        p_WG: np.ndarray,
-        voxel_size: float,
-    ) -> tuple[Esdf, TimeOfArrival]:
-        """Returns the conservative distances and the times of arrival in a world.
-
-        Args:
-            surfaces: shapes, or the distances of a captured environment.
-            lower_W, upper_W: (3,) [m], the volume.
-            p_WG: (3,) [m], the goal.
-            voxel_size: [m], of both grids.
-
-        Raises:
-            InfeasibleFlightError: see `time_of_arrival`.
-        """
-        parts = lower_W, upper_W, p_WG, voxel_size, *_content(surfaces)
+    def arrival(self, world: "TrainingWorld", voxel_size: float) -> tuple[Esdf, TimeOfArrival]:
+        """Returns the conservative distances and the times of arrival in a world, on grids of
+        `voxel_size` [m]."""
+        surfaces, p_WG = world.surfaces, world.p_WG
+        if isinstance(surfaces, Esdf):
+            parts = [surfaces.distances, surfaces.states, surfaces.lower_W, surfaces.voxel_size]
+        else:
+            named = ((type(shape).__name__.encode(), *shape.parameters()) for shape in surfaces)
+            parts = [part for parts in named for part in parts]
+        parts = world.lower_W, world.upper_W, p_WG, voxel_size, *parts
         file = self._file("npz", *(np.ascontiguousarray(part).tobytes() for part in parts))
-        if (kept := _read(file, p_WG, voxel_size)) is not None:
-            return kept
+        with contextlib.suppress(OSError, ValueError, KeyError):
+            kept = read_archive(file)
+            os.utime(file)
+            grid = kept["distances"], kept["states"], kept["lower_W"], voxel_size
+            toa = TimeOfArrival(p_WG, kept["times"], kept["reachable"], *grid[2:])
+            return Esdf(*grid, occupied_outside=True), toa
         field = surfaces
         if not isinstance(field, Esdf):
-            field = AnalyticDistanceField(field, lower_W, upper_W)
+            field = AnalyticDistanceField(field, world.lower_W, world.upper_W)
         esdf = esdf_from_distance_field(field, voxel_size).conservative()
         toa = time_of_arrival(esdf, p_WG)
         arrays = {name: getattr(esdf, name) for name in ("distances", "states", "lower_W")}
@@ -140,7 +125,7 @@ class WorldCache:
         return esdf, toa
 
     def prune(self) -> None:
-        """Removes the files that were not used for longest, beyond the limit."""
+        """Removes the files that were used least recently, beyond the limit."""
         with contextlib.suppress(OSError):
             files = [(file.stat(), file) for file in self._folder.glob("[!.]*")]
             left = _LIMIT
@@ -156,7 +141,7 @@ class WorldCache:
         return self._folder / f"{key.hexdigest()}.{suffix}"
 
 
-def _described(shape: Shape) -> tuple[str, dict[str, Any]]:
+def _fields(shape: Shape) -> tuple[str, dict[str, Any]]:
     values = {field.name: getattr(shape, field.name) for field in fields(shape)}  # type: ignore
     return type(shape).__name__, {
         name: (v.GetAsMatrix34() if isinstance(v, RigidTransform) else np.asarray(v)).tolist()
@@ -164,47 +149,24 @@ def _described(shape: Shape) -> tuple[str, dict[str, Any]]:
     }
 
 
-def _shape(described: tuple[str, dict[str, Any]]) -> Shape:
-    name, values = described
+def _shape(name: str, values: dict[str, Any]) -> Shape:
     if "X_WO" in values:
         values["X_WO"] = RigidTransform(np.array(values["X_WO"]))
     return _SHAPES[name](**values)
 
 
-def _content(surfaces: Sequence[Shape] | Esdf) -> list[np.ndarray | float | bytes]:
-    if isinstance(surfaces, Esdf):
-        return [surfaces.distances, surfaces.states, surfaces.lower_W, surfaces.voxel_size]
-    return [
-        part for shape in surfaces for part in (type(shape).__name__.encode(), *shape.parameters())
-    ]
-
-
-def _read(file: Path, p_WG: np.ndarray, voxel_size: float) -> tuple[Esdf, TimeOfArrival] | None:
-    """Reads a file; returns None if it is missing or damaged."""
-    try:
-        kept = read_archive(file)
-        os.utime(file)
-        esdf = Esdf(
-            kept["distances"], kept["states"], kept["lower_W"], voxel_size, occupied_outside=True
-        )
-        return esdf, TimeOfArrival(p_WG, kept["times"], kept["reachable"], esdf.lower_W, voxel_size)
-    except (OSError, ValueError, KeyError):
-        return None
-
-
 STARTS = 256
-"""Places that flights of training start from, in each world."""
+"""Number of positions in each world from which flights of training start."""
 
 _START_CLEARANCE = 0.3  # [m]
-_NEAR_GOAL = 1.0  # [m], within which the way is straight
+_NEAR_GOAL = 1.0  # [m], within which paths are straight
 
 
 @dataclass(frozen=True, eq=False)
 class TrainingWorld:
-    """One world: what stands in its volume, and where to fly."""
+    """The surfaces, volume, start and goal of a world."""
 
-    # Its shapes, or of a captured place the distance field in which all that is unknown counts as
-    # occupied (`Esdf.conservative`); worlds of the same place share it.
+    # Shapes, or the conservative distance field of a captured scene, which its worlds share.
     surfaces: Sequence[Shape] | Esdf
     lower_W: np.ndarray  # (3,) [m]
     upper_W: np.ndarray  # (3,) [m]
@@ -213,13 +175,12 @@ class TrainingWorld:
 
 
 class WorldBatch:
-    """W worlds as tensors: surfaces, volumes, starts, goals, and the way to each goal.
+    """W worlds as tensors: surfaces, volumes, starts, goals, and the path to each goal.
 
     Args:
       worlds: W of them.
-      voxel_size: [m] of the grids of the time of arrival; None for none of them, which evaluation
-        does not need.
-      device: where the tensors live.
+      voxel_size: [m] of the grids of the time of arrival; None for evaluation, without grids.
+      device: of the tensors.
     """
 
     def __init__(
@@ -231,9 +192,8 @@ class WorldBatch:
         def tensor(values: Any) -> Tensor:
             return torch.tensor(np.asarray(values), dtype=torch.float32, device=device)
 
-        self.lower_W, self.upper_W = (
-            tensor([getattr(world, name) for world in worlds]) for name in ("lower_W", "upper_W")
-        )
+        lower_W = [world.lower_W for world in worlds]
+        self.lower_W, self.upper_W = tensor(lower_W), tensor([world.upper_W for world in worlds])
         self.p_WS, self.p_WG = (
             tensor([getattr(world, name) for world in worlds]) for name in ("p_WS", "p_WG")
         )
@@ -243,33 +203,34 @@ class WorldBatch:
         if voxel_size is not None:
             cache = WorldCache()
             shown = Progress(worlds, "finding paths to the goals", unit="world")
-            grids = [_march(world, voxel_size, n, cache) for n, world in enumerate(shown)]
+            self.maps = [cache.arrival(world, voxel_size) for world in shown]
             cache.prune()
-            self.maps = [(grid.esdf, grid.toa) for grid in grids]
-
-            def on_grids(values: list[np.ndarray]) -> Grids:
-                lower_W = [world.lower_W for world in worlds]
-                return Grids(values, lower_W, [voxel_size] * len(worlds))
-
-            self._distances = on_grids([grid.esdf.distances for grid in grids])
-            self._times = on_grids([grid.toa.times for grid in grids])
-            self.starts_W = tensor([grid.starts_W for grid in grids])  # (W, STARTS, 3) [m]
+            sizes = [voxel_size] * len(worlds)
+            self._distances = Grids([esdf.distances for esdf, _ in self.maps], lower_W, sizes)
+            self._times = Grids([toa.times for _, toa in self.maps], lower_W, sizes)
+            self.starts_W = tensor([_starts(*m, seed) for seed, m in enumerate(self.maps)])
 
     def __len__(self) -> int:
         return len(self.p_WG)
 
     def without_obstacles(self) -> "WorldBatch":
-        """The same volumes, starts and goals with nothing but ground, and straight ways."""
+        """Returns the same worlds with nothing but ground, and straight paths."""
         empty = copy(self)
-        empty.geometry = ShapeGeometry([_ground(surfaces) for surfaces in self._surfaces])
+        grounds = [
+            [HalfSpace([0.0, 0.0, 1.0], float(surfaces.lower_W[2]))]
+            if isinstance(surfaces, Esdf)
+            else [shape for shape in surfaces if isinstance(shape, HalfSpace)]
+            for surfaces in self._surfaces
+        ]
+        empty.geometry = ShapeGeometry(grounds)
         empty._times = None
         return empty
 
     def direction(self, p_WQ: Tensor, world: Tensor) -> Tensor:
         """Computes directions (N, 3) of the paths to the goals at p_WQ (N, 3) [m] in `world` (N,).
 
-        They are down the gradient of the time of arrival, and straight within a meter of the goal
-        and where there is no gradient.
+        They follow the negative gradient of the time of arrival, and are straight near the goal and
+        without a gradient.
         """
         to_goal = self.p_WG[world] - p_WQ
         if self._times is None:
@@ -287,42 +248,26 @@ class WorldBatch:
         return distances[:, 0] - VEHICLE_RADIUS, inside.all(1)
 
     def distance(self, p_WQ: Tensor, world: Tensor) -> Tensor:
-        """Signed distance (N,) [m] at p_WQ (N, 3) [m] in `world` (N,), from the grid: the bounds of
-        the volume count as surfaces, and it costs the same however many shapes there are."""
+        """Interpolates signed distances (N,) [m] at p_WQ (N, 3) [m] in `world` (N,); the bounds of
+        the volume count as surfaces."""
         return self._distances.interpolate(p_WQ, world)[0]
 
 
-def _ground(surfaces: Sequence[Shape] | Esdf) -> list[Shape]:
-    if isinstance(surfaces, Esdf):
-        return [HalfSpace([0.0, 0.0, 1.0], float(surfaces.lower_W[2]))]
-    return [shape for shape in surfaces if isinstance(shape, HalfSpace)]
-
-
-class _Arrival(NamedTuple):
-    esdf: Esdf  # conservative
-    toa: TimeOfArrival
-    starts_W: np.ndarray  # (STARTS, 3) [m]
-
-
-def _march(world: TrainingWorld, voxel_size: float, seed: int, cache: WorldCache) -> _Arrival:
-    """The time of arrival at the goal of a world, and free places from which it can be reached."""
-    volume = world.lower_W, world.upper_W
-    esdf, toa = cache.arrival(world.surfaces, *volume, world.p_WG, voxel_size)
-    roomy = toa.reachable & (esdf.distances > VEHICLE_RADIUS + _START_CLEARANCE)
-    cells = np.argwhere(roomy)
+def _starts(esdf: Esdf, toa: TimeOfArrival, seed: int) -> np.ndarray:
+    """Draws positions (STARTS, 3) [m] with clearance from which the goal can be reached."""
+    free = toa.reachable & (esdf.distances > VEHICLE_RADIUS + _START_CLEARANCE)
+    cells = np.argwhere(free)
     if len(cells) == 0:
-        raise ValueError("no place in the world has room to start from; make it less dense")
-    rng = np.random.default_rng(seed)
-    starts = cells[rng.integers(len(cells), size=STARTS)] + 0.5
-    return _Arrival(esdf, toa, world.lower_W + voxel_size * starts)
+        raise ValueError("no position in the world has room to start from; make it less dense")
+    chosen = np.random.default_rng(seed).integers(len(cells), size=STARTS)
+    return esdf.lower_W + esdf.voxel_size * (cells[chosen] + 0.5)
 
 
-PLACE_MARGIN = 0.3
-"""[m] that starts, goals and ways in captured places keep beyond the vehicle's radius; half of it
-where no way has as much."""
+SCENE_MARGIN = 0.3
+"""[m] Clearance of starts, goals and paths in captured scenes, beyond the vehicle's radius; half of
+it if no path has as much."""
 
-PLACE_LONGEST = 25.0
-"""[m], of the ways that are drawn there."""
+MAX_SCENE_PATH = 25.0  # [m] maximum length of the paths that are drawn there
 
 
 @dataclass
@@ -345,35 +290,30 @@ class WorldSelection(Config):
     def check(self) -> None:
         check_library(self.kinds, self.scenes)
         for scene in self.scenes:
-            place_to_learn_in(scene)
+            training_scene(scene)
 
     @property
     def turns(self) -> list[str]:
-        """Of what kind or place worlds are, in turn."""
+        """Kinds and scenes in the order in which they take turns."""
         return [*self.kinds, *self.scenes]
 
 
 def make_training_world(kind: str, seed: int, cache: WorldCache) -> TrainingWorld:
-    """Makes the world of a scenario and seed as the benchmark flies it, without what cameras
-    see."""
-    return TrainingWorld(*cache.spec(world_of(kind), seed))
+    """Makes the world of a scenario and seed as in the benchmark, without its appearance."""
+    return TrainingWorld(*cache.spec(scenario_world(kind), seed))
 
 
 def training_worlds(
     selection: WorldSelection, seed: int, device: torch.device | str = "cpu"
 ) -> WorldBatch:
-    """The worlds that a training run of `seed` learns in; those of different seeds differ.
-
-    Raises:
-        ValueError: if the seed is not 0 to 999.
-    """
+    """Makes the training worlds of a run of `seed`, 0 to 999; those of two seeds differ."""
     first = first_training_seed(seed)
     worlds = _make_worlds(selection, selection.count, first, "training worlds")
     return WorldBatch(worlds, selection.voxel_size, device)
 
 
 def validation_worlds(selection: WorldSelection, device: torch.device | str = "cpu") -> WorldBatch:
-    """The held-out worlds, the same for every run."""
+    """Makes the held-out worlds, the same for every run."""
     worlds = _make_worlds(selection, selection.held_out, VALIDATION_SEEDS, "held-out worlds")
     return WorldBatch(worlds, None, device)
 
@@ -381,28 +321,19 @@ def validation_worlds(selection: WorldSelection, device: torch.device | str = "c
 def _make_worlds(
     selection: WorldSelection, count: int, first: int, what: str
 ) -> list[TrainingWorld]:
-    places = {scene: _Place.read(scene) for scene in selection.scenes}
+    scenes = {}
+    for scene in selection.scenes:
+        esdf = make_world(scene_config(training_scene(scene)), seed=0).esdf
+        scenes[scene] = esdf, esdf.conservative()
+    cache, worlds = WorldCache(), []
     seeds = Progress(range(first, first + count), f"making {what}", unit="world")
-    cache = WorldCache()
-    return [
-        places[turn].world(seed) if turn in places else make_training_world(turn, seed, cache)
-        for seed, turn in zip(seeds, cycle(selection.turns), strict=False)
-    ]
-
-
-class _Place(NamedTuple):
-    """A captured place, which its worlds share."""
-
-    esdf: Esdf
-    conservative: Esdf
-
-    @classmethod
-    def read(cls, scene: str) -> "_Place":
-        esdf = make_world(scene_config(place_to_learn_in(scene)), seed=0).esdf
-        return cls(esdf, esdf.conservative())
-
-    def world(self, seed: int) -> TrainingWorld:
+    for seed, turn in zip(seeds, cycle(selection.turns), strict=False):
+        if turn not in scenes:
+            worlds.append(make_training_world(turn, seed, cache))
+            continue
+        esdf, conservative = scenes[turn]
         p_WS, p_WG, _ = draw_start_and_goal(
-            self.esdf, VEHICLE_RADIUS, seed, PLACE_MARGIN, PLACE_LONGEST
+            esdf, VEHICLE_RADIUS, seed, SCENE_MARGIN, MAX_SCENE_PATH
         )
-        return TrainingWorld(self.conservative, self.esdf.lower_W, self.esdf.upper_W, p_WS, p_WG)
+        worlds.append(TrainingWorld(conservative, esdf.lower_W, esdf.upper_W, p_WS, p_WG))
+    return worlds

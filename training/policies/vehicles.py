@@ -1,8 +1,7 @@
-"""Batches of vehicles for training: their dynamics, differentiable, and their late images.
+"""Batches of vehicles for training: differentiable dynamics, and delayed images.
 
-`PointMass` follows accelerations with a lag and turns its heading along its motion, as
-`FlatnessController` makes the quadrotor do: cheap enough to train through. `BodyRate` has the
-equations of `QuadrotorPlant` under the law of `FlatnessController`.
+`PointMass` follows accelerations with a lag, and its heading the motion. `BodyRate` has the
+equations of `QuadrotorPlant` with `FlatnessController`.
 """
 
 import math
@@ -36,17 +35,17 @@ class PointMass(NamedTuple):
     lag: Tensor  # (N, 1) [s], time constant of the acceleration
 
     def attitude(self) -> Tensor:
-        """R_WB (N, 3, 3): z along the thrust that this acceleration takes, x where yaw points."""
+        """Computes R_WB (N, 3, 3): z along the thrust of this acceleration, x along the yaw."""
         return attitude_from_thrust(self._thrust(), self.yaw)
 
     def body_z(self) -> Tensor:
-        """The z axes (N, 3) of the body in W."""
+        """Computes the z axes (N, 3) of the body in W."""
         return unit_vectors(self._thrust())
 
     def _thrust(self) -> Tensor:
         params = QuadrotorParams()
         thrust = torch.add(self.a, self.v, alpha=params.drag)
-        return thrust + _up(thrust, params.gravity)
+        return thrust + torch.tensor([0.0, 0.0, params.gravity], device=thrust.device)
 
     def step(
         self,
@@ -62,7 +61,7 @@ class PointMass(NamedTuple):
         """
         decay = torch.exp(-dt / self.lag)
         behind = self.a - a_cmd
-        # Sums with a factor are one operation: for so few vehicles their number is what costs.
+        # Fused operations: with few vehicles, their number determines the time.
         coasting = self.lag * (1.0 - decay)  # (N, 1) [s]
         v = torch.addcmul(torch.add(self.v, a_cmd, alpha=dt), coasting, behind)
         p = torch.add(torch.add(self.p, self.v, alpha=dt), a_cmd, alpha=0.5 * dt**2)
@@ -73,14 +72,8 @@ class PointMass(NamedTuple):
 
     def decay_gradient(self, factor: float) -> "PointMass":
         """Multiplies the gradient of the state by `factor` in the backward pass."""
-        return self._replace(
-            p=_decay_gradient(self.p, factor),
-            v=_decay_gradient(self.v, factor),
-            a=_decay_gradient(self.a, factor),
-        )
-
-    def detach(self) -> "PointMass":
-        return PointMass(*(x.detach() for x in self))
+        decayed = (torch.lerp(x.detach(), x, factor) for x in (self.p, self.v, self.a))
+        return PointMass(*decayed, self.yaw, self.lag)
 
 
 class BodyRate(NamedTuple):
@@ -111,11 +104,11 @@ class BodyRate(NamedTuple):
         return torch.atan2(R_WB[:, 1, 0], R_WB[:, 0, 0])
 
     def attitude(self) -> Tensor:
-        """R_WB (N, 3, 3)."""
+        """Computes R_WB (N, 3, 3)."""
         return rotation_matrices(QuadrotorState.of(self.state).q_WB)
 
     def body_z(self) -> Tensor:
-        """The z axes (N, 3) of the body in W."""
+        """Computes the z axes (N, 3) of the body in W."""
         return self.attitude()[:, :, 2]
 
     def step(
@@ -167,14 +160,6 @@ def yaw_rate(
     return (control.yaw_gain * strength * error).clamp(-control.max_yaw_rate, control.max_yaw_rate)
 
 
-def _up(like: Tensor, size: float) -> Tensor:
-    return torch.tensor([0.0, 0.0, size], device=like.device)
-
-
-def _decay_gradient(x: Tensor, factor: float) -> Tensor:
-    return torch.lerp(x.detach(), x, factor)
-
-
 def map_tensors(function: Callable[..., Tensor], first: Any, *others: Any) -> Any:
     """Applies a function to the tensors of nested tuples of one type."""
     if isinstance(first, Tensor):
@@ -198,11 +183,8 @@ def take_rows(rows: Tensor, tensors: Any) -> Any:
 
 
 class History(NamedTuple):
-    """The last states of N vehicles, and when their images are taken and come.
-
-    Images are as late as by `systems.sensing.latency.DelayedPose`, whose samples are here the steps
-    of the policy.
-    """
+    """The last states of N vehicles, and the times of their images, as by
+    `systems.sensing.latency.DelayedPose` with the steps of the policy as samples."""
 
     past: Any  # vehicles with tensors (N, K, ...), oldest first, without gradient
     delays: Tensor  # (N, CYCLE) [s], or (N, 1) of images that are taken at each step
@@ -213,7 +195,7 @@ class History(NamedTuple):
     def start(
         cls, vehicle: Vehicle, noise: ObservationNoise, rate: float, generator: torch.Generator
     ) -> Self:
-        """Begins flights at `rate` [Hz], with as many states as images are old."""
+        """Begins flights at `rate` [Hz], with states for the maximum age of images."""
         count, device = len(vehicle.p), generator.device
 
         def uniform(*size: int) -> Tensor:
@@ -240,14 +222,13 @@ class History(NamedTuple):
         return self._replace(past=map_tensors(push, self.past, vehicle))
 
     def ages(self, noise: ObservationNoise, time: Tensor) -> Tensor:
-        """Computes the ages (N,) [s], at times (N,) [s], of the last images that have come."""
+        """Computes the ages (N,) [s], at times (N,) [s], of the last images that arrived."""
         if not noise.frame_rate:
             return self.delays[:, 0]
         return frame_ages(self.delays, self.frame_rate, self.phase, lookback(noise), time)
 
     def seen(self, noise: ObservationNoise, rate: float, time: Tensor) -> Any:
-        """Interpolates the vehicles linearly when the images that they see at times (N,) [s] were
-        taken."""
+        """Interpolates the vehicles at the exposure of the last images at times (N,) [s]."""
         ages = self.ages(noise, time)
         rows, last = torch.arange(len(ages), device=ages.device), self.past[0].shape[1] - 1
         at = (last - ages * rate).clamp(min=0.0)

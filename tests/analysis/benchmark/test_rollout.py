@@ -126,7 +126,7 @@ def test_fault_in_a_worker_process_stops_the_study(short_scenario, tmp_path):
     flown = list(fly_all(flights, jobs=2))
     faults = [fault for fault in flown if isinstance(fault, Fault)]
     assert {fault.id for fault in faults} == {f"short-mine-2-00{seed}" for seed in range(3)}
-    assert all("FileNotFoundError: there are no weights at" in fault.reason for fault in faults)
+    assert all("FileNotFoundError: No such file of weights:" in fault.reason for fault in faults)
     assert len(flown) == 6
 
 

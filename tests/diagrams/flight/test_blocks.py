@@ -15,7 +15,7 @@ from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.flight.sensors import make_camera
 from splatpilot.systems.sensing.noise import ObservationNoise
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
-from splatpilot.systems.sensing.time_of_flight import sensor_of, time_of_flight_grid
+from splatpilot.systems.sensing.time_of_flight import equivalent_sensor, time_of_flight_grid
 from splatpilot.systems.vehicle.state import pose_from_state
 
 
@@ -71,7 +71,9 @@ def test_grid_of_a_policy_is_that_of_its_cameras_images(post_world):
     context = camera.CreateDefaultContext()
     camera.GetInputPort("body_pose").FixValue(context, Value(pose_from_state(state)))
     image = camera.GetOutputPort("depth_image_32f").Eval(context)
-    expected = time_of_flight_grid(np.asarray(image.data)[..., 0], sensor_of(Watcher.camera))
+    expected = time_of_flight_grid(
+        np.asarray(image.data)[..., 0], equivalent_sensor(Watcher.camera)
+    )
     np.testing.assert_allclose(grid, expected, atol=1e-12)
     assert 0.0 < grid.max() < 1.0
 

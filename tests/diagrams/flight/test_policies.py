@@ -105,10 +105,10 @@ def test_file_of_weights_is_a_policy(tmp_path):
     PolicyCheckpoint("depthnav", DEPTHNAV_NETWORK, {}, {}).save(tmp_path / "mine.npz")
     config = policy_named(str(tmp_path / "mine.npz"), 1.5)
     assert config == DepthNavConfig(speed=1.5, weights=str(tmp_path / "mine.npz"))
-    with pytest.raises(FileNotFoundError, match=r"no weights at .*absent.npz"):
+    with pytest.raises(FileNotFoundError, match=r"No such file of weights: .*absent.npz"):
         policy_named(str(tmp_path / "absent.npz"))
     (tmp_path / "text.npz").write_text("nothing")
-    with pytest.raises(ValueError, match=r"text.npz holds no weights"):
+    with pytest.raises(ValueError, match=r"text.npz must hold weights"):
         policy_named(str(tmp_path / "text.npz"))
 
 

@@ -1,5 +1,3 @@
-"""Small worlds of analytic shapes, shared by the tests of the policies."""
-
 import numpy as np
 import pytest
 from pydrake.math import RigidTransform

@@ -24,11 +24,11 @@ def test_vector_round_trip(count):
     vector = plan.to_vector()
     assert vector.shape == (hypotheses_size(count),)
     again = Hypotheses.from_vector(vector, count)
-    assert again is not None
-    assert again.plan_time == plan.plan_time
+    assert again is not None and again.plan_time == plan.plan_time
     np.testing.assert_array_equal(again.waypoints_B, plan.waypoints_B)
     np.testing.assert_array_equal(again.costs, plan.costs)
     assert again.X_WB.IsNearlyEqualTo(plan.X_WB, 1e-15)
+    assert Hypotheses.from_vector(no_plan(count), count) is None
 
 
 def test_layout_of_the_vector():
@@ -41,37 +41,22 @@ def test_layout_of_the_vector():
     np.testing.assert_array_equal(vector[-3:], plan.costs)
 
 
-def test_before_the_first_plan_there_is_none():
-    assert Hypotheses.from_vector(no_plan(3), 3) is None
-
-
-def test_waypoints_in_the_world():
-    plan = some_hypotheses()
-    np.testing.assert_allclose(
-        plan.waypoints_W[2, 7], plan.X_WB @ plan.waypoints_B[2, 7], atol=1e-14
-    )
-
-
-def test_best_is_the_cheapest():
-    plan = Hypotheses(0.0, RigidTransform(), np.zeros((3, 10, 3)), np.array([3.0, 1.0, 2.0]))
-    assert plan.best == 1
-
-
 def test_position_interpolates_between_waypoints():
     plan = some_hypotheses()
-    way_W = np.vstack([plan.X_WB.translation(), plan.waypoints_W[1]])
+    path_W = np.vstack([plan.X_WB.translation(), plan.waypoints_W[1]])
+    np.testing.assert_allclose(path_W[8], plan.X_WB @ plan.waypoints_B[1, 7], atol=1e-14)
     for time, expected in [
-        (2.0, way_W[0]),
-        (2.1, way_W[1]),
-        (2.35, 0.5 * (way_W[3] + way_W[4])),
-        (3.0, way_W[10]),
-        (9.0, way_W[10]),
-        (1.0, way_W[0]),
+        (2.0, path_W[0]),
+        (2.1, path_W[1]),
+        (2.35, 0.5 * (path_W[3] + path_W[4])),
+        (3.0, path_W[10]),
+        (9.0, path_W[10]),
+        (1.0, path_W[0]),
     ]:
         np.testing.assert_allclose(plan.position_W(time, 1), expected, atol=1e-12)
 
 
-def test_errors_name_sizes_and_remedy():
+def test_invalid_shapes_are_refused():
     with pytest.raises(ValueError, match=r"2 hypotheses must be \(70,\), got \(101,\)"):
         Hypotheses.from_vector(no_plan(3), 2)
     with pytest.raises(ValueError, match=r"\(K, 10, 3\).* got \(3, 9, 3\)"):
@@ -80,9 +65,6 @@ def test_errors_name_sizes_and_remedy():
         Hypotheses(0.0, RigidTransform(), np.zeros((3, 10, 3)), np.zeros(2))
     with pytest.raises(ValueError, match="at least 1, got 0"):
         hypotheses_size(0)
-
-
-def test_size_tells_the_number_of_hypotheses():
     assert [num_hypotheses_in(hypotheses_size(k)) for k in (1, 3, 7)] == [1, 3, 7]
     for size in (8, 13, 40):
         with pytest.raises(ValueError, match=f"hypotheses, got {size}"):
@@ -97,26 +79,21 @@ def waypoint(selector, vector, time):
     return np.asarray(selector.GetOutputPort("waypoint").Eval(context))
 
 
-def test_hovers_before_the_first_plan():
-    np.testing.assert_array_equal(waypoint(HypothesisSelector(3), no_plan(3), 0.5), [7, 8, 9])
-
-
-def test_follows_the_cheapest_a_lookahead_ahead():
+def test_selector_follows_the_cheapest_a_lookahead_ahead():
     X_WB = RigidTransform(RollPitchYaw(0.1, 0.2, 1.5), np.array([1.0, 2.0, 3.0]))
     velocities_B = np.array([[1.0, 0, 0], [0, 2.0, 0.5], [0, 0, 3.0]])
-    times = 0.1 * np.arange(1, 11)
-    plan = Hypotheses(
-        4.0, X_WB, velocities_B[:, None] * times[:, None], costs=np.array([5.0, 1.0, 9.0])
-    )
-    got = waypoint(HypothesisSelector(3, lookahead=0.4), plan.to_vector(), 4.03)
-    np.testing.assert_allclose(got, X_WB @ (0.43 * velocities_B[1]), atol=1e-12)
+    waypoints_B = velocities_B[:, None] * (0.1 * np.arange(1, 11))[:, None]
+    plan = Hypotheses(4.0, X_WB, waypoints_B, costs=np.array([5.0, 1.0, 9.0]))
+    found = waypoint(HypothesisSelector(3, lookahead=0.4), plan.to_vector(), 4.03)
+    np.testing.assert_allclose(found, X_WB @ (0.43 * velocities_B[1]), atol=1e-12)
+    np.testing.assert_array_equal(waypoint(HypothesisSelector(3), no_plan(3), 0.5), [7, 8, 9])
 
 
 @pytest.mark.parametrize("costs", [[1.0, np.nan], [np.nan, 1.0], [np.inf, np.inf], [0.0, -np.inf]])
 def test_without_a_cheapest_hypothesis_there_is_no_waypoint(costs):
     plan = Hypotheses(0.0, RigidTransform(), np.ones((2, 10, 3)), np.array(costs))
-    got = waypoint(HypothesisSelector(2), plan.to_vector(), 0.1)
-    np.testing.assert_array_equal(got, np.full(3, np.nan))
+    found = waypoint(HypothesisSelector(2), plan.to_vector(), 0.1)
+    np.testing.assert_array_equal(found, np.full(3, np.nan))
 
 
 @pytest.mark.parametrize("lookahead", [0.0, -0.1, 1.01, np.nan])

@@ -9,7 +9,7 @@ from splatpilot.systems.policies.lattice import (
     Trajectories,
     TrajectoryLattice,
     final_velocities,
-    unobstructed_way,
+    reference_trajectory,
 )
 from splatpilot.systems.policies.motion_primitives import level_acceleration, rotation_to
 from splatpilot.systems.policies.time_of_arrival import time_of_arrival
@@ -130,7 +130,7 @@ def test_is_the_lattices_own(distance):
     p_WG = p_WB + distance * direction
     a_WB = level_acceleration(R_WB, v_WB, QuadrotorParams())
     ways_W = lattice.trajectories(p_WB, v_WB, a_WB, _Open(p_WG)).positions[-1, :10]
-    found = unobstructed_way(R_WB.T @ v_WB, R_WB.T @ (p_WG - p_WB), R_WB[2], 2.6)
+    found = reference_trajectory(R_WB.T @ v_WB, R_WB.T @ (p_WG - p_WB), R_WB[2], 2.6)
     np.testing.assert_allclose(found @ R_WB.T + p_WB, ways_W, atol=1e-9)
 
 
@@ -140,7 +140,7 @@ def test_goals_told_as_at_the_reach_are_flown_on_to(dtype):
     directions = directions / directions.norm(dim=1, keepdim=True)
     up_B, basis = torch.tensor([0.0, 0.0, 1.0], dtype=dtype), torch.from_numpy(BASIS).to(dtype)
     at, beyond, within = (
-        unobstructed_way(2.6 * directions, distance * directions, up_B, 2.6, basis)
+        reference_trajectory(2.6 * directions, distance * directions, up_B, 2.6, basis)
         for distance in (5.2, 20.0, 5.15)
     )
     assert (at - beyond).abs().max() < 1e-5
@@ -153,8 +153,8 @@ def test_tensors_and_arrays_alike():
     goal_B[0] = v_B[0] = 0.0
     up_B /= np.linalg.norm(up_B, axis=1, keepdims=True)
     up_B[0] = 0.0, 0.0, 1.0
-    expected = unobstructed_way(v_B, goal_B, up_B, 2.0)
+    expected = reference_trajectory(v_B, goal_B, up_B, 2.0)
     tensors = [torch.from_numpy(x) for x in (v_B, goal_B, up_B)]
-    found = unobstructed_way(*tensors, 2.0, torch.from_numpy(BASIS))
+    found = reference_trajectory(*tensors, 2.0, torch.from_numpy(BASIS))
     np.testing.assert_allclose(found.numpy(), expected, atol=1e-12)
     assert np.abs(expected[0]).max() < 1e-9 < np.abs(expected[1:]).max()

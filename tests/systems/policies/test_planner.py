@@ -1,11 +1,7 @@
-import gc
-import weakref
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed
 from pydrake.math import RollPitchYaw
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, EventStatus
@@ -89,16 +85,6 @@ def test_flies_straight_at_nominal_speed(empty):
     np.testing.assert_allclose(way_W[:, 1:], [[4.0, 3.0]] * 10, atol=0.03)
 
 
-def test_waypoints_are_in_the_body_frame(empty):
-    toa = time_of_arrival(empty, np.array([14.0, 4.0, 3.0]))
-    lattice = TrajectoryLattice()
-    plans = [plan(0.0, hover_state([3, 3, 3], yaw), empty, toa, lattice) for yaw in (0.0, 2.0)]
-    np.testing.assert_allclose(plans[0].waypoints_W, plans[1].waypoints_W, atol=1e-9)
-    assert not np.allclose(plans[0].waypoints_B, plans[1].waypoints_B, atol=0.1)
-    expected = plans[1].X_WB.inverse() @ plans[1].waypoints_W[0, 9]
-    np.testing.assert_allclose(plans[1].waypoints_B[0, 9], expected, atol=1e-12)
-
-
 @pytest.mark.parametrize("y", [3.6, 4.0, 4.3])
 def test_all_hypotheses_avoid_an_obstacle(pillar, y):
     toa = time_of_arrival(pillar, np.array([14.0, 4.0, 3.0]), MARGIN)
@@ -175,13 +161,6 @@ def test_flies_through_a_forest(make_forest, seed):
     assert all(h is not None and np.isfinite(h.costs).all() for h in later)
 
 
-def test_same_flight_bit_for_bit(make_forest):
-    _, esdf = make_forest(7)
-    flights = [fly(esdf, [1.5, 5.0, 1.5], [18.5, 5.0, 1.5], 2.0) for _ in range(2)]
-    np.testing.assert_array_equal(flights[0][0], flights[1][0])
-    np.testing.assert_array_equal(flights[0][1], flights[1][1])
-
-
 @given(
     p=st.tuples(*[st.floats(-100, 100)] * 3),
     v=st.tuples(*[st.floats(-30, 30)] * 3),
@@ -217,19 +196,6 @@ def test_time_of_arrival_is_computed_once_per_goal(empty, monkeypatch):
         planner.GetInputPort("goal").FixValue(context, p_WG)
         simulator.AdvanceTo(until)
     assert goals == [[9.0, 4.0, 3.0], [9.0, 6.0, 3.0]]
-
-
-def test_is_freed(empty):
-    planner = PrivilegedPlanner(empty)
-    simulator = Simulator(planner)
-    context = simulator.get_mutable_context()
-    planner.GetInputPort("state").FixValue(context, hover_state([3.0, 4.0, 3.0]))
-    planner.GetInputPort("goal").FixValue(context, [9.0, 4.0, 3.0])
-    simulator.AdvanceTo(0.1)
-    held, copied = weakref.ref(planner), context.Clone()
-    del planner, simulator, context, copied
-    gc.collect()
-    assert held() is None
 
 
 def test_plans_at_its_rate(empty):
@@ -269,14 +235,6 @@ def test_a_state_that_is_not_finite_is_refused(pillar_plan):
     state[4] = np.nan
     with pytest.raises(ValueError, match="must be 13 finite numbers"):
         pillar_plan(state)
-
-
-def test_config_in_yaml():
-    config = PrivilegedPlannerConfig(rate=5.0, lattice=LatticeConfig(speed=3.0))
-    text = yaml_dump_typed(config)
-    assert yaml_load_typed(schema=PrivilegedPlannerConfig, data=text) == config
-    with pytest.raises(RuntimeError, match="sped"):
-        yaml_load_typed(schema=PrivilegedPlannerConfig, data="lattice: {sped: 3.0}")
 
 
 @pytest.mark.parametrize(

@@ -66,11 +66,6 @@ def cost_of(points_W, velocities, seen=True):
     ), positions
 
 
-def test_cost_in_the_open_is_the_way_left():
-    (cost,), positions = cost_of([], [[2.0, 0, 0]])
-    assert cost == pytest.approx(10.0 - positions[0, -1, 0], abs=0.01)
-
-
 def test_contact_and_the_unseen_cost():
     ahead = [2.0, 0, 0]
     (through, beside), _ = cost_of([[2.0, 0, 0]], [ahead, [1.2, 1.2, 0]])

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from splatpilot.systems.policies.velocity import (
+    RESPONSE_TIME,
     VelocitySetpoint,
     VelocityTracker,
     tracking_acceleration,
@@ -19,6 +20,13 @@ def test_velocities_are_approached_in_four_tenths_of_a_second():
         system.velocity_input_port().FixValue(context, np.array(wanted, dtype=float))
         found = system.acceleration_output_port().Eval(context)
         np.testing.assert_allclose(found, expected, atol=1e-12)
+
+
+def test_tracking_is_exponential_and_limited():
+    v, desired, step = np.zeros(3), np.array([0.5, 0.0, 0.2]), 1e-4
+    for _ in range(round(RESPONSE_TIME / step)):
+        v = v + step * tracking_acceleration(v, desired)
+    np.testing.assert_allclose(v, desired * (1 - np.exp(-1)), rtol=1e-3)
 
 
 CONTROLLER = FlatnessControllerConfig(lookahead=0.5)

@@ -8,7 +8,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.sensors import CameraInfo
 
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
-from splatpilot.systems.sensing.time_of_flight import sensor_of
+from splatpilot.systems.sensing.time_of_flight import equivalent_sensor
 from splatpilot.systems.splats.background import EnvironmentMap
 from splatpilot.systems.splats.baked_scene import BakedScene
 from splatpilot.systems.splats.lens import Distortion, pixel_slopes
@@ -120,7 +120,7 @@ def test_onboard_cameras_have_lenses():
     ):
         OnboardCamera(fov_x=170.0, distortion=FISHEYE).validate()
     with pytest.raises(ValueError, match="distortion must be left out"):
-        sensor_of(camera)
+        equivalent_sensor(camera)
 
 
 @pytest.mark.parametrize(

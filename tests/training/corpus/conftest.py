@@ -1,5 +1,3 @@
-"""A corpus of two small forests."""
-
 import pytest
 
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera

@@ -1,5 +1,3 @@
-"""Corpora as they are read."""
-
 import shutil
 from dataclasses import fields
 
@@ -17,7 +15,6 @@ def folder(gathered, tmp_path):
 
 
 def test_samples_come_in_the_order_asked_for(gathered):
-    """Any indices, repeated and across shards, give the rows of the shards' files."""
     first, second = gathered.shards
     assert len(gathered) == len(first) + len(second)
     indices = np.array([len(first) + 1, 0, len(first) - 1, 0, len(first)])
@@ -34,13 +31,11 @@ def test_samples_come_in_the_order_asked_for(gathered):
 
 @pytest.mark.parametrize("index", [-1, 10**6])
 def test_indices_out_of_range_are_refused(gathered, index):
-    """There is no sample before the first or after the last."""
-    with pytest.raises(IndexError, match="numbered 0 to"):
+    with pytest.raises(IndexError, match=r"in \[0, "):
         gathered.samples(np.array([0, index]))
 
 
 def test_sizes_and_types_are_as_documented(gathered):
-    """Each field has the shape and type that `Samples` states, and images show something."""
     samples = gathered.samples(np.arange(len(gathered)))
     shapes = {f.name: getattr(samples, f.name).shape[1:] for f in fields(samples)}
     assert shapes["color"] == (24, 32, 3)
@@ -54,15 +49,13 @@ def test_sizes_and_types_are_as_documented(gathered):
 
 
 def test_worlds_have_their_distances_and_can_be_made_again(gathered):
-    """A world's record gives its distance field, and the very world that has it."""
     record = gathered.worlds[1]
     world = record.make()
-    np.testing.assert_array_equal(world.esdf.distances, record.esdf().distances)
-    assert record.esdf().distances.dtype == np.float32
+    np.testing.assert_array_equal(world.esdf.distances, record.esdf.distances)
+    assert record.esdf.distances.dtype == np.float32
 
 
 def test_a_world_that_changed_is_refused(folder):
-    """If the program or scene no longer makes the recorded world, that is said."""
     record = Corpus(folder).worlds[0]
     record.source.seed += 1
     with pytest.raises(ValueError, match="no longer what"):
@@ -70,7 +63,6 @@ def test_a_world_that_changed_is_refused(folder):
 
 
 def test_what_is_missing_is_named(folder, tmp_path):
-    """No corpus, no samples, and a world whose record is gone: each with the remedy."""
     with pytest.raises(FileNotFoundError, match=r"no corpus.*splatpilot corpus make"):
         Corpus(tmp_path)
     name = Corpus(folder).worlds[0].name
@@ -78,11 +70,11 @@ def test_what_is_missing_is_named(folder, tmp_path):
     with pytest.raises(FileNotFoundError, match=f"{name}/esdf.npz"):
         Corpus(folder)
     shutil.rmtree(folder / "worlds" / name)
-    with pytest.raises(ValueError, match=f"lacks {name}"):
+    with pytest.raises(ValueError, match=f"No such folder: .*{name}"):
         Corpus(folder)
     for shard in (folder / "shards").iterdir():
         shutil.rmtree(shard)
-    with pytest.raises(ValueError, match="no samples yet"):
+    with pytest.raises(ValueError, match="corpus with samples, got none"):
         Corpus(folder)
 
 
@@ -90,10 +82,10 @@ def test_every_byte_is_checked(folder):
     Corpus(folder).verify()
     config = (folder / "corpus.yaml").read_text()
     (folder / "corpus.yaml").write_text(config.replace("width: 32", "width: 80"))
-    with pytest.raises(ValueError, match=r"images of \(24, 32, 3\) pixels, but .*corpus"):
+    with pytest.raises(ValueError, match=r"images of .* must be \(24, 80, 3\) as in .*corpus"):
         Corpus(folder).verify()
     (folder / "corpus.yaml").write_text(config)
     [first, *_] = sorted((folder / "shards").iterdir())
     shutil.rmtree(first)
-    with pytest.raises(ValueError, match=rf"lacks {first.name}, of which ledger.csv tells"):
+    with pytest.raises(ValueError, match=rf"No such folder: .*{first.name}"):
         Corpus(folder).verify()

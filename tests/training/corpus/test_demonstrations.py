@@ -1,5 +1,3 @@
-"""What is imitated and how it looks: frames, poses and images agree."""
-
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +11,7 @@ from splatpilot.systems.policies.hypotheses import Hypotheses
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.vehicle.state import QuadrotorState, pose_from_state
-from splatpilot.training.corpus.collect import Demonstration, keep_clear, see_states
+from splatpilot.training.corpus.collect import Demonstration, keep_clear, render_samples
 from splatpilot.training.corpus.corpus import CorpusConfig
 from splatpilot.training.corpus.expert import ExpertConfig, Label, Labeler
 from splatpilot.training.corpus.library import PerturbationConfig
@@ -61,7 +59,7 @@ STATES = [tilted_state(p) for p in ([1.5, 0.2, 2.0], [2.0, -0.5, 1.5])]
 def see(world, labeler, bound=np.inf, config=CONFIG):
     demonstrations = keep_clear(labeler.labels(STATES), labeler.field)
     rng = np.random.default_rng(3)
-    return demonstrations, see_states(demonstrations, world, labeler, config, bound, rng)
+    return demonstrations, render_samples(demonstrations, world, labeler, config, bound, rng)
 
 
 def poses(samples) -> list[RigidTransform]:
@@ -69,8 +67,6 @@ def poses(samples) -> list[RigidTransform]:
 
 
 def test_labels_are_the_same_in_the_world_from_every_pose(world, labeler):
-    """Brought back to the world by the pose rendered from, waypoints, velocity and goal of a state
-    are those of the state itself, for its own pose and the perturbed ones."""
     demonstrations, samples = see(world, labeler)
     assert len(samples) == 6
     for k, X_WP in enumerate(poses(samples)):
@@ -86,8 +82,6 @@ def test_labels_are_the_same_in_the_world_from_every_pose(world, labeler):
 
 
 def test_images_are_taken_from_the_pose_that_is_recorded(world, labeler):
-    """The ball stands in color and depth where a pinhole at the recorded pose projects it: left is
-    left, up is up, and depth is along the optical axis."""
     _, samples = see(world, labeler)
     camera = CONFIG.camera
     for k, X_WP in enumerate(poses(samples)):
@@ -106,7 +100,6 @@ def test_images_are_taken_from_the_pose_that_is_recorded(world, labeler):
 
 @pytest.mark.parametrize(("bound", "farthest"), [(np.inf, 0.3), (0.1, 0.1), (0.0, 0.0)])
 def test_perturbations_keep_the_bound_of_the_world(world, labeler, bound, farthest):
-    """No pose is farther from its state than the fidelity bound, nor than the configuration's."""
     _, samples = see(world, labeler, bound)
     moved = [
         np.linalg.norm(X.translation() - STATES[k // 3][:3]) for k, X in enumerate(poses(samples))
@@ -116,19 +109,16 @@ def test_perturbations_keep_the_bound_of_the_world(world, labeler, bound, farthe
 
 
 def test_perturbations_keep_clear_of_obstacles(world, labeler):
-    """Beside the hall's edge, poses move no farther than there is room."""
     config = replace(CONFIG, perturbation=PerturbationConfig(copies=50, distance=1.0))
     state = tilted_state([5.0, 0.0, 0.5])  # 0.15 m of clearance above the floor of the hall
     demonstration = Demonstration(state, np.zeros((3, 10, 3)))
     rng = np.random.default_rng(0)
-    samples = see_states([demonstration], world, labeler, config, np.inf, rng)
+    samples = render_samples([demonstration], world, labeler, config, np.inf, rng)
     moved = np.linalg.norm(samples.X_WB[:, 4:] - state[:3], axis=1)
     assert 0.05 < moved.max() <= 0.5 - 0.354 + 1e-9
 
 
 def test_trajectories_that_touch_something_are_no_demonstrations(labeler):
-    """Of three trajectories the first leaves the hall: the others move up, NaN stands last; a state
-    all of whose trajectories do is left out."""
     X_WB = RigidTransform([5.0, 0.0, 2.0])
     ahead = np.linspace(0.1, 1.0, 10)[:, None] * [1.0, 0.0, 0.0]
     out = 3.0 * ahead[:, [1, 0, 2]]  # 3 m to the left, to the hall's edge

@@ -1,5 +1,3 @@
-"""Which worlds a corpus is gathered in."""
-
 from dataclasses import replace
 from math import inf
 
@@ -17,7 +15,7 @@ from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.esdf_build import esdf_from_occupancy
 from splatpilot.systems.common.seeds import SEEDS_PER_RUN, TRAINING_SEEDS, VALIDATION_SEEDS
 from splatpilot.systems.splats.scene import GaussianScene
-from splatpilot.training.corpus.library import LibraryConfig, world_of, world_source
+from splatpilot.training.corpus.library import LibraryConfig, scenario_world, world_source
 
 
 def write_scene(path, bound, name="attic", split="train", digest=("0123456789abcdef",)):
@@ -39,9 +37,6 @@ def write_scene(path, bound, name="attic", split="train", digest=("0123456789abc
 
 
 def test_seeds_are_those_of_training_or_validation_and_never_shared():
-    """Worlds of two corpora, and of training and validation, have no seed in common, and none has
-    one of the benchmark's."""
-
     def seeds(seed, **changes):
         library = LibraryConfig(**changes)
         return {world_source(library, seed, k).seed for k in (0, 1, SEEDS_PER_RUN - 1)}
@@ -53,7 +48,6 @@ def test_seeds_are_those_of_training_or_validation_and_never_shared():
 
 
 def test_kinds_and_scenes_come_in_turn(tmp_path):
-    """Generated worlds are the scenarios' own, exact; scenes get obstacles, and their bound."""
     scene = write_scene(tmp_path / "attic", 0.25)
     library = LibraryConfig(kinds=["P02", "P06"], scenes=[scene])
     library.validate()
@@ -62,20 +56,18 @@ def test_kinds_and_scenes_come_in_turn(tmp_path):
         f"{kind}-{TRAINING_SEEDS + k}" for k, kind in enumerate(["P02", "P06", "attic", "P02"])
     ]
     assert [s.perturbation_bound for s in sources] == [inf, inf, 0.25, inf]
-    assert sources[1].world == world_of("P06")
+    assert sources[1].world == scenario_world("P06")
     assert sources[2].world == InsertedConfig(path=scene, draw_ends=True)
     assert sources[2].source_digest == ["0123456789abcdef"]
 
 
 def test_scenes_without_a_bound_are_refused(tmp_path):
-    """A scene whose fidelity nobody measured is named with the command that measures it; a scene
-    that is not there, and a file of Gaussians, are named too."""
     scene = write_scene(tmp_path / "attic", None)
     with pytest.raises(ValueError, match=r"attic/scene.yaml .* scene fidelity .*attic`"):
         LibraryConfig(scenes=[scene]).validate()
     with pytest.raises(FileNotFoundError, match=r"No such file .* expected a scene"):
         LibraryConfig(scenes=["nowhere"]).validate()
-    with pytest.raises(ValueError, match="is no scene folder"):
+    with pytest.raises(ValueError, match="must be scene folders or OctoMaps"):
         LibraryConfig(scenes=[f"{scene}/gaussians.ply"]).validate()
 
 
@@ -100,8 +92,7 @@ def test_own_scene_of_a_benchmark_name_is_learned_in(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("split", "held_out"),
-    [("test", False), ("validation", False), ("", False), ("train", True)],
+    ("split", "held_out"), [("test", False), ("validation", False), ("", False), ("train", True)]
 )
 def test_scene_of_another_split_is_refused(tmp_path, split, held_out):
     scene = write_scene(tmp_path / "attic", 0.2, split=split)
@@ -118,7 +109,6 @@ def test_scene_of_unknown_source_is_refused(tmp_path):
 
 @pytest.mark.parametrize("index", [-1, SEEDS_PER_RUN])
 def test_there_are_as_many_worlds_as_seeds(index):
-    """A corpus has a thousand worlds at most: those after them belong to another seed."""
     with pytest.raises(ValueError, match="at most 1000 worlds"):
         world_source(LibraryConfig(), 0, index)
 
@@ -126,7 +116,7 @@ def test_there_are_as_many_worlds_as_seeds(index):
 def test_some_kind_or_scene_is_needed(tmp_path):
     LibraryConfig(kinds=[], scenes=[write_scene(tmp_path / "attic", 0.1)]).validate()
     for kinds, message in (
-        ([], "must have kinds or scenes"),
+        ([], "must be one kind or more"),
         (["R13"], "must be of generated worlds, got R13"),
         (["P99"], "there is no scenario 'P99'"),
     ):

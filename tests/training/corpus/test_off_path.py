@@ -1,5 +1,3 @@
-"""States that lie on no flight."""
-
 from dataclasses import replace
 
 import numpy as np
@@ -29,8 +27,6 @@ def labeler_of(radius: float = RADIUS) -> Labeler:
 
 
 def test_half_stand_before_a_pillar_and_none_in_one():
-    """All have room, can stop before what is nearest, and lean a little; those of the first half
-    look at what is near."""
     labeler, count = labeler_of(), 400
     states = draw_off_path(labeler, count, 2.5, np.random.default_rng(0))
     assert states.shape == (count, 13)
@@ -64,7 +60,6 @@ def test_half_stand_before_a_pillar_and_none_in_one():
 
 
 def test_same_seed_draws_the_same_states():
-    """Bit for bit; another seed draws others."""
     labeler = labeler_of()
     one, same, other = (
         draw_off_path(labeler, 20, 2.0, np.random.default_rng(seed)) for seed in (1, 1, 2)
@@ -76,5 +71,5 @@ def test_same_seed_draws_the_same_states():
 def test_a_place_without_room_is_named():
     labeler = labeler_of()
     labeler.toa = replace(labeler.toa, reachable=np.zeros_like(labeler.toa.reachable))
-    with pytest.raises(InfeasibleFlightError, match="no position from which a path leads"):
+    with pytest.raises(InfeasibleFlightError, match="no free position with a path"):
         draw_off_path(labeler, 5, 2.0, np.random.default_rng(0))

@@ -1,5 +1,3 @@
-"""A corpus of three small worlds with pillars, gathered in a second: what students learn from."""
-
 from pathlib import Path
 
 import numpy as np

@@ -1,5 +1,3 @@
-"""Random changes of training images, with the formulas of flights."""
-
 import cv2
 import numpy as np
 import pytest
@@ -11,15 +9,15 @@ from splatpilot.systems.sensing.noise import (
     corrupt_color,
     corrupt_depth,
     expose,
-    turned_hue,
+    rotate_hue,
 )
 from splatpilot.training.policies.augmentation import (
     Appearance,
     blur,
+    change_appearance,
     depth_noise,
     noisy_color,
     noisy_depth,
-    relit,
 )
 from splatpilot.training.policies.train import validate
 from splatpilot.training.policies.train_agile_autonomy import AgileAutonomyTraining
@@ -71,19 +69,19 @@ def test_depth_noise_has_its_sizes():
 def test_appearance_has_its_sizes():
     color = torch.full((500, 1, 1, 3), 20.0)
     generator = torch.Generator().manual_seed(0)
-    stops = (relit(color, Appearance(2.0, 0.0), generator)[:, 0, 0, 0] / 20.0).log2()
+    stops = (change_appearance(color, Appearance(2.0, 0.0), generator)[:, 0, 0, 0] / 20.0).log2()
     assert stops.min() == pytest.approx(-2.0, abs=0.02)
     assert stops.max() == pytest.approx(2.0, abs=0.02)
-    gray = relit(color, Appearance(0.0, 180.0), generator)
+    gray = change_appearance(color, Appearance(0.0, 180.0), generator)
     torch.testing.assert_close(gray, color, atol=1e-4, rtol=0)
     red = torch.tensor([90.0, 0.0, 0.0]).expand(500, 1, 1, 3)
-    turned = relit(red, Appearance(0.0, 60.0), generator)
+    turned = change_appearance(red, Appearance(0.0, 60.0), generator)
     torch.testing.assert_close(turned.sum(3).clamp(max=90.0), torch.full((500, 1, 1), 90.0))
     assert 40.0 < turned[..., 1].max() <= 60.001
     third = torch.tensor(2.0 * np.pi / 3.0)
     expected = torch.tensor([0.0, 90.0, 0.0]).expand(500, 1, 1, 3)
     torch.testing.assert_close(
-        turned_hue(red, third.cos(), third.sin()), expected, atol=1e-4, rtol=0
+        rotate_hue(red, third.cos(), third.sin()), expected, atol=1e-4, rtol=0
     )
 
 
@@ -92,7 +90,7 @@ def test_appearance_has_its_sizes():
     [
         lambda x, g: noisy_color(x, NOISE, g),
         lambda x, g: noisy_depth(x, depth_noise(), g),
-        lambda x, g: relit(x, Appearance(), g),
+        lambda x, g: change_appearance(x, Appearance(), g),
     ],
 )
 def test_each_image_has_changes_of_its_own_and_seeds_repeat_them(change):

@@ -1,5 +1,3 @@
-"""Training DiffAero in colors, from a corpus to weights that fly."""
-
 import csv
 from pathlib import Path
 
@@ -53,7 +51,6 @@ def trained(wide_corpus, tmp_path_factory) -> Path:
 
 
 def test_what_flies_is_what_was_trained():
-    """OpenCV's output is torch's, and what the trainer shows its network is what flight does."""
     torch.manual_seed(0)
     spec = MonocularSpec()
     module = MonocularModule(spec)
@@ -68,7 +65,6 @@ def test_what_flies_is_what_was_trained():
 
 
 def test_trainer_shows_what_flight_shows(wide_corpus):
-    """Colors, rays and nearest depths of a sample are those of `encode_view` and of its depth."""
     trainer = DiffAeroRgbTrainer(training(wide_corpus))
     numbers = np.array([3, 20])
     color, rays, target = trainer._samples(numbers)
@@ -94,8 +90,6 @@ def test_trainer_shows_what_flight_shows(wide_corpus):
 
 
 def test_flipped_views_have_flipped_rays():
-    """The view of a vehicle that rolls and pitches is, mirrored, the view of the mirrored world by
-    the vehicle that rolls the other way."""
     rng = np.random.default_rng(4)
     color = rng.integers(0, 256, (90, 160, 3)).astype(np.uint8)
     mirror = np.diag([1.0, -1.0, 1.0])
@@ -110,8 +104,6 @@ def test_flipped_views_have_flipped_rays():
 
 
 def test_it_learns_what_it_is_shown_and_flies(trained):
-    """Depths, which the corpus paints, are judged better and better; what decides stays DiffAero;
-    and the weights fly through a generated world."""
     rows = list(csv.DictReader((trained / "curves.csv").open()))
     curve = [{name: float(value) for name, value in row.items() if value} for row in rows]
     assert curve[-1]["likelihood"] < curve[0]["likelihood"] - 0.3
@@ -129,8 +121,6 @@ def test_it_learns_what_it_is_shown_and_flies(trained):
 
 
 def test_sight_is_trained_further(trained, wide_corpus, tmp_path):
-    """A run that begins with weights sees as they do at first, and decides by the DiffAero that it
-    is given; a file of another policy is refused."""
     file = trained / "diffaero_rgb.npz"
     trainer = DiffAeroRgbTrainer(training(wide_corpus, f"begin={file}"))
     with np.load(file) as weights:
@@ -141,38 +131,8 @@ def test_sight_is_trained_further(trained, wide_corpus, tmp_path):
     assert trainer.evaluate()["success"] == pytest.approx(best, abs=1e-6)
     other = tmp_path / "diffaero.npz"
     PolicyCheckpoint.load(None, "diffaero", DIFFAERO_NETWORK).save(other)
-    with pytest.raises(ValueError, match="holds weights of the policy 'diffaero'"):
+    with pytest.raises(ValueError, match="got 'diffaero'"):
         DiffAeroRgbTrainer(training(wide_corpus, f"begin={other}"))
-
-
-def test_interrupted_training_ends_as_whole(wide_corpus, tmp_path):
-    """A run that was interrupted between two checkpoints ends with the same weights and curves, bit
-    for bit."""
-    overrides = ["schedule.updates=4", "schedule.validate_every=4", "schedule.checkpoint_every=2"]
-    config, make = training(wide_corpus, *overrides), TRAINERS.find("diffaero_rgb").make
-
-    def make_interrupted(config):
-        trainer = make(config)
-
-        def interrupt(update: int) -> None:
-            if update == 3:
-                raise KeyboardInterrupt
-
-        trainer.begin_update = interrupt
-        return trainer
-
-    run(config=config, out=tmp_path / "whole", make=make)
-    with pytest.raises(KeyboardInterrupt):
-        run(config=config, out=tmp_path / "again", make=make_interrupted)
-    run(config=config, out=tmp_path / "again", make=make)
-    with (
-        np.load(tmp_path / "whole" / "diffaero_rgb.npz") as whole,
-        np.load(tmp_path / "again" / "diffaero_rgb.npz") as again,
-    ):
-        for name in whole.files:
-            np.testing.assert_array_equal(whole[name], again[name])
-    curves = [(tmp_path / name / "curves.csv").read_text() for name in ("whole", "again")]
-    assert curves[0] == curves[1]
 
 
 @pytest.mark.parametrize(
@@ -185,7 +145,6 @@ def test_interrupted_training_ends_as_whole(wide_corpus, tmp_path):
     ],
 )
 def test_bad_configurations_are_named(wide_corpus, overrides, message):
-    """The message names the field and its value."""
     with pytest.raises(ValueError, match=message):
         training(wide_corpus, *overrides).validate()
 

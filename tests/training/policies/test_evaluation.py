@@ -1,5 +1,3 @@
-"""Flights that measure a policy while it learns."""
-
 import pytest
 import torch
 
@@ -18,8 +16,6 @@ WORLDS = WorldSelection(kinds=["P01"], held_out=7)
 
 
 class Straight:
-    """Flies to the goal at the speed that is asked."""
-
     rate = 15.0
     rays = PixelRays.of(4, 3, 90.0)
 
@@ -36,8 +32,6 @@ class Straight:
 
 
 def test_each_speed_is_flown_in_as_many_worlds():
-    """Of seven worlds and three speeds, none has less than two nor more than three; each flight
-    goes at its own, and the same seed draws the same."""
     agent = Straight()
     worlds = validation_worlds(WORLDS)
     outcomes = evaluate_agent(agent, worlds, FlightConditions(), depth_noise())
@@ -52,7 +46,6 @@ def test_each_speed_is_flown_in_as_many_worlds():
 
 
 def test_success_is_told_apart_by_speed_and_kind():
-    """Four flights of two kinds and speeds, of which three arrive."""
     reached = torch.tensor([True, True, True, False])
     zero, speed = torch.zeros(4), torch.tensor([2.0, 2.0, 4.0, 4.0])
     metrics = Outcomes(reached, ~reached, zero, zero, zero, speed).metrics(["P01", "P02"])

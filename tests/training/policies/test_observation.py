@@ -1,26 +1,20 @@
-"""What policies in training are told, against what those in flight are."""
-
 import numpy as np
 import pytest
 import torch
 
-from splatpilot.diagrams.flight.scenario import Scenario
-from splatpilot.systems.common.config import load_config
 from splatpilot.systems.policies.diffaero import DiffAeroTofConfig
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.sensing.time_of_flight import (
+    equivalent_sensor,
     range_of_depth,
-    sensor_of,
     time_of_flight_grid,
 )
-from splatpilot.training.policies.train_diffaero import DiffAeroTraining, proximity_grid
+from splatpilot.training.policies.train_diffaero import proximity_grid
 
 
 @pytest.mark.parametrize("camera", [DiffAeroTofConfig().camera, OnboardCamera(32, 18, 100.0)])
 def test_training_has_the_grid_of_the_sensor(camera):
-    """In images of any depth, not measured and infinite too, torch finds the proximities that
-    frames of that sensor become."""
-    sensor = sensor_of(camera)
+    sensor = equivalent_sensor(camera)
     depth = np.random.default_rng(0).uniform(0.0, 9.0, (5, camera.height, camera.width))
     depth[depth < 1.0], depth[depth > 8.0] = 0.0, np.inf
     depth[0] = np.inf
@@ -31,10 +25,3 @@ def test_training_has_the_grid_of_the_sensor(camera):
     flown = np.stack([time_of_flight_grid(image, sensor) for image in depth])
     np.testing.assert_allclose(trained, flown, atol=1e-12)
     assert flown[1:].max() > 0.7 and not flown[0].any()
-
-
-def test_noise_that_does_not_exist_is_named():
-    for config, field in (Scenario(), "observation"), (DiffAeroTraining(), "rollout.noise"):
-        known = rf"there is no field {field}\.fog; the fields are .*{field}\.depth_dropout"
-        with pytest.raises(ValueError, match=known):
-            load_config(config, overrides=[f"{field}.fog=0.1"])

@@ -1,5 +1,3 @@
-"""Native casting against the exact shapes: marched rays, and distances one shape at a time."""
-
 from dataclasses import replace
 from itertools import product
 
@@ -122,7 +120,6 @@ def wide_depth(shape: Shape, p_WC: np.ndarray, R_WC: np.ndarray, rays: PixelRays
 
 
 def test_depth_is_where_marched_rays_end(worlds):
-    """With pixels of no width, depth is what marching along the rays finds."""
     shapes, geometry = worlds
     p, R = cameras(1, 4)
     depth = geometry.depth(p, R, THIN, numbers(4)).numpy()
@@ -138,7 +135,6 @@ def test_depth_is_where_marched_rays_end(worlds):
 
 @pytest.mark.parametrize("kind", [Sphere, Box, Cylinder, Capsule, HalfSpace])
 def test_wide_pixels_see_shapes_widened_by_half_of_them(kind):
-    """Depth is that of the shape grown by half a pixel at its place, plus that half."""
     p, R = cameras(2, 6)
     compared = 0
     for shape in some_world(7):
@@ -155,7 +151,6 @@ def test_wide_pixels_see_shapes_widened_by_half_of_them(kind):
 
 
 def test_wide_pixels_see_what_the_pooled_image_of_a_finer_camera_sees():
-    """A coarse image is the least of a finer one, to a few percent where a trunk is."""
     trunk = [Capsule([6.0, 0.4, -1.0], [6.0, 0.4, 9.0], 0.15), HalfSpace([0, 0, 1], 0.0)]
     geometry, p_WC = ShapeGeometry([trunk]), [0.0, 0.0, 2.0]
     coarse = one_image(geometry, PixelRays.of(16, 9, 90.0), p_WC).reshape(9, 16)
@@ -168,7 +163,6 @@ def test_wide_pixels_see_what_the_pooled_image_of_a_finer_camera_sees():
 
 
 def test_nothing_is_left_out_among_many_shapes():
-    """The image of a crowded world is, bit for bit, the least of the images of its shapes."""
     shapes = some_world(3, 60)
     p, R = cameras(3, 8)
     world = ShapeGeometry([shapes]).depth(p, R, RAYS, numbers(8) * 0)
@@ -180,7 +174,6 @@ def test_nothing_is_left_out_among_many_shapes():
 
 
 def test_level_camera_beside_an_upright_trunk_gives_numbers():
-    """Rays exactly across a cylinder's axis, along it, or along a box's face give no NaN."""
     shapes = [
         Cylinder([5, 0, 0], [5, 0, 6], 0.3),
         Box(RigidTransform([8.0, 2.0, 3.0]), [1.0, 1.0, 2.0]),
@@ -195,7 +188,6 @@ def test_level_camera_beside_an_upright_trunk_gives_numbers():
 
 
 def test_distances_and_normals(worlds):
-    """The nearest shape's distance and normal are those of the exact field, inside shapes too."""
     shapes, geometry = worlds
     inside = 0
     for w in range(4):
@@ -209,7 +201,6 @@ def test_distances_and_normals(worlds):
 
 
 def test_the_nearest_of_many_are_the_first_when_all_are_sorted():
-    """Four shapes of a crowded world, nearest first, as exact distances one by one have it."""
     shapes = some_world(4, 60)
     p_WQ = np.random.default_rng(40).uniform(LOWER, UPPER, (50, 3))
     distances, normals = ShapeGeometry([shapes]).nearest(floats(p_WQ), numbers(50) * 0, 4)
@@ -223,7 +214,6 @@ def test_the_nearest_of_many_are_the_first_when_all_are_sorted():
 
 
 def test_fewer_shapes_than_asked_for_are_infinitely_far():
-    """Where there is nothing more, distances are infinite and normals zero."""
     distances, normals = ShapeGeometry([[Sphere([3, 0, 0], 1.0)]]).nearest(
         floats([[0, 0, 0]]), numbers(1), 3
     )
@@ -232,7 +222,6 @@ def test_fewer_shapes_than_asked_for_are_infinitely_far():
 
 
 def test_normals_are_unit_vectors_where_distances_have_a_ridge():
-    """At centers and on axes, where many ways out are equally long, one of them is the normal."""
     ball, log, post = Sphere([1, 1, 1], 0.5), Capsule([0] * 3, [2, 0, 0], 0.5), [0.0, 0.0, 3.0]
     geometry = ShapeGeometry([[ball], [log], [Cylinder([0, 0, 0], [0, 0, 6], 0.5)]])
     _, normals = geometry.nearest(floats([[1, 1, 1], [1, 0, 0], post]), numbers(3), 1)
@@ -246,7 +235,6 @@ def field_of(shapes: list[Shape]) -> Esdf:
 
 
 def test_distance_fields_show_what_their_shapes_do():
-    """A field's image is that of the shapes that it was made of, to a voxel and a pixel's width."""
     shapes = [
         HalfSpace([0, 0, 1], 0.0),
         Sphere([6, 1, 3], 0.8),
@@ -266,7 +254,6 @@ def test_distance_fields_show_what_their_shapes_do():
 
 
 def test_cameras_outside_a_field_see_into_it_and_nothing_beyond():
-    """A ball is seen from before the box, and nothing by a camera that looks away."""
     geometry = EsdfGeometry([field_of([Sphere([4, 0, 3], 1.0)])])
     rays = PixelRays.of(5, 3, 60.0)._replace(half_pixel=0.0)
     assert one_image(geometry, rays, [-5.0, 0.0, 3.0])[7] == pytest.approx(8.0, abs=0.05)
@@ -274,7 +261,6 @@ def test_cameras_outside_a_field_see_into_it_and_nothing_beyond():
 
 
 def test_grids_are_interpolated_as_the_distance_field_is():
-    """Values and gradients are those of `Esdf.query`, and beyond the centers those at the edge."""
     fields = [field_of(some_world(seed)) for seed in range(2)]
     geometry = EsdfGeometry(fields)
     p_WQ = np.random.default_rng(0).uniform(LOWER + 0.06, UPPER - 0.06, (300, 3))
@@ -292,7 +278,6 @@ def test_grids_are_interpolated_as_the_distance_field_is():
 
 
 def test_threads_and_instructions_change_no_bit():
-    """Images are equal in every bit for one to three threads and every SIMD level."""
     shapes, fields = some_world(5, 30), [field_of(some_world(5))]
     p, R = cameras(5, 13)
     world = numbers(13) * 0

@@ -1,5 +1,3 @@
-"""Trainers by name, of our own and of other packages."""
-
 import sys
 
 import numpy as np
@@ -50,8 +48,6 @@ register_trainer("mean", MeanTraining, MeanTrainer)
 
 @pytest.mark.parametrize("installed", [True, False])
 def test_a_trainer_of_another_package_trains_by_the_same_verb(installed, tmp_path, monkeypatch):
-    """Its name, once it is installed, and its module:attribute train it, with fields of its own
-    configuration; weights lie where those of our own policies do."""
     name = "mean_package" if installed else "mean_module"
     (tmp_path / f"{name}.py").write_text(PACKAGE.replace("mean", name).replace("Mean", name))
     if installed:

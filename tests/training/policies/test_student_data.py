@@ -1,5 +1,3 @@
-"""Samples of several corpora as one, split by world, and features of their images."""
-
 import copy
 import shutil
 from dataclasses import replace
@@ -65,7 +63,7 @@ def test_distances_along_trajectories_are_those_of_the_world(two):
     data = StudentData(two, HELD_OUT)
     labels = data.labels(np.arange(0, 72, 5))
     found = data.distance_along(labels.trajectories_B, labels)
-    fields = {world.name: world.esdf().conservative() for world in two[0].worlds}
+    fields = {world.name: world.esdf.conservative() for world in two[0].worlds}
     for n, world in enumerate(labels.world):
         q_WB, p_WB = labels.X_WB[n, :4].double().numpy(), labels.X_WB[n, 4:].double().numpy()
         points_B = labels.trajectories_B[n].double().numpy()
@@ -119,7 +117,7 @@ def test_different_worlds_of_one_name_are_refused(two, tmp_path):
     shutil.copytree(two[0].folder, other)
     assert StudentData([two[0], Corpus(other)], HELD_OUT).worlds == [w.name for w in two[0].worlds]
     record = Corpus(other).worlds[1]
-    esdf = record.esdf()
+    esdf = record.esdf
     replace(esdf, distances=esdf.distances + 0.5).save(record.path / "esdf.npz")
     with pytest.raises(ValueError, match=r"pillars-1 and .*pillars-1 are different worlds of one"):
         StudentData([two[0], Corpus(other)], HELD_OUT)
@@ -132,11 +130,11 @@ def test_corpora_that_do_not_fit_are_refused(two, tmp_path):
     wider = replace(config, camera=replace(config.camera, fov_x=100.0))
     assert isinstance(wider, CorpusConfig)
     (other / CONFIG).write_text(dump_config(wider))
-    with pytest.raises(ValueError, match="different cameras or numbers of trajectories"):
+    with pytest.raises(ValueError, match="cameras of the corpora must be equal"):
         StudentData([two[0], Corpus(other)], HELD_OUT)
-    with pytest.raises(ValueError, match=r"of 3 worlds 0 are held out, .* from 0\.17 on"):
+    with pytest.raises(ValueError, match=r"0 of 3 worlds are held out, .* set held_out to 0\.17"):
         StudentData(two[:1], 0.16)
-    with pytest.raises(ValueError, match="of 3 worlds 3 are held out, which leaves 0 samples"):
+    with pytest.raises(ValueError, match="3 of 3 worlds are held out, which leaves 0 samples"):
         StudentData(two[:1], 1.0)
 
 
@@ -146,7 +144,7 @@ FROZEN = 7
 @pytest.fixture(scope="module")
 def network() -> StudentModule:
     torch.manual_seed(0)
-    return StudentModule(StudentSpec("depth", 32, 24, way_version=2))
+    return StudentModule(StudentSpec("depth", 32, 24))
 
 
 @pytest.fixture

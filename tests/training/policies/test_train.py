@@ -1,5 +1,3 @@
-"""Training runs: they learn, go on where they were killed, and stop at nonsense."""
-
 import csv
 import json
 import os
@@ -24,7 +22,7 @@ from splatpilot.systems.common.files import claim_folder
 from splatpilot.systems.common.progress import CheckpointClock
 from splatpilot.systems.common.seeds import TRAINING_SEEDS
 from splatpilot.systems.policies import checkpoint as policy_checkpoint
-from splatpilot.systems.policies.checkpoint import PolicyCheckpoint, policy_of
+from splatpilot.systems.policies.checkpoint import PolicyCheckpoint, checkpoint_policy
 from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK
 from splatpilot.training.policies import train, training_worlds
 from splatpilot.training.policies.evaluation import evaluate_agent
@@ -74,7 +72,6 @@ def finished(tmp_path_factory) -> Path:
 
 
 def test_run_leaves_what_it_says(finished):
-    """Weights that fly, the configuration, curves and a summary lie in the folder."""
     checkpoint = PolicyCheckpoint.load(finished / "diffaero.npz", "diffaero", DIFFAERO_NETWORK)
     assert "updates: 6" in checkpoint.provenance["config"]
     assert checkpoint.provenance["revision"]
@@ -88,7 +85,6 @@ def test_run_leaves_what_it_says(finished):
 
 
 def test_killed_run_ends_as_one_that_was_not(finished, tmp_path):
-    """After kill -9 between two checkpoints the same command ends with the same weights."""
     program = "from splatpilot.analysis.commands.main import main; raise SystemExit(main())"
     command = [sys.executable, "-c", program, "train", "diffaero", "--out", str(tmp_path)]
     for override in TINY:
@@ -114,8 +110,6 @@ def test_a_command_trains_seeds_one_after_the_other(finished, tmp_path):
 
 @pytest.mark.parametrize("policy", ["depthnav", "agile_autonomy"])
 def test_interrupted_training_ends_as_whole(policy, tmp_path):
-    """A run of each kind of trainer that was interrupted between two checkpoints ends with the same
-    weights, which its policy flies by."""
     trainer_kind = TRAINERS.find(policy)
     config = load_config(trainer_kind.config(), overrides=[*SMALL, *OF_POLICY[policy]])
 
@@ -141,11 +135,9 @@ def test_interrupted_training_ends_as_whole(policy, tmp_path):
 
 @pytest.mark.parametrize("card", CARDS, ids=lambda card: card.stem)
 def test_model_cards_hold_configurations_that_train(card, tmp_path, monkeypatch):
-    """What a shipped card says the weights were made with is a configuration of `train`, in the
-    folder of the data where captured places were trained in."""
     config = tmp_path / "config.yaml"
     config.write_text(re.search("```yaml\n(.*?)```", card.read_text(), re.DOTALL)[1])
-    trainer = TRAINERS.find(policy_of(card.with_suffix(".npz")))
+    trainer = TRAINERS.find(checkpoint_policy(card.with_suffix(".npz")))
     made_with = load_config(trainer.config(), config)
     if getattr(getattr(made_with, "worlds", None), "scenes", ()):
         if "SPLATPILOT_DATA" not in os.environ:
@@ -155,7 +147,6 @@ def test_model_cards_hold_configurations_that_train(card, tmp_path, monkeypatch)
 
 
 def test_run_leaves_the_threads_of_torch_as_they_were(tmp_path):
-    """A run takes one thread and gives back what was set, when it fails too."""
     threads, used = torch.get_num_threads(), []
     torch.set_num_threads(2)
     try:
@@ -171,7 +162,6 @@ def test_run_leaves_the_threads_of_torch_as_they_were(tmp_path):
 
 
 def test_curves_for_tensorboard_are_whole_when_a_run_ends(tmp_path, monkeypatch):
-    """Curves go to TensorBoard too where asked for, and its log is closed, by a failure too."""
     rows, is_open = [], []
 
     @contextmanager
@@ -192,7 +182,6 @@ def test_curves_for_tensorboard_are_whole_when_a_run_ends(tmp_path, monkeypatch)
 
 
 def test_other_configuration_or_broken_checkpoint_is_refused(finished, tmp_path):
-    """A folder of another run, and a checkpoint that is none, are named with the remedy."""
     with pytest.raises(ValueError, match="another configuration"):
         run(config=tiny("seed=1"), out=finished, make=TRAINERS.find("diffaero").make)
     claim_folder(tmp_path / "config.yaml", tiny())
@@ -208,15 +197,12 @@ def test_other_configuration_or_broken_checkpoint_is_refused(finished, tmp_path)
 
 
 class FragileTrainer(TinyTrainer):
-    """Its term `second` is not a number from the fifth update on."""
-
     def losses(self) -> dict[str, torch.Tensor]:
         size = super().losses()["size"]
         return {"first": size, "second": size * (torch.nan if self.update >= 5 else 1.0)}
 
 
 def test_loss_that_is_not_a_number_stops_with_its_name_and_keeps_the_weights(tmp_path):
-    """The error names the term; the last good weights and checkpoint stay and are finite."""
     with pytest.raises(ValueError, match="update 5: the term 'second' of the loss became nan"):
         run(config=TinyTraining(), out=tmp_path, make=FragileTrainer)
     checkpoint = PolicyCheckpoint.load(tmp_path / "diffaero.npz", "diffaero", DIFFAERO_NETWORK)
@@ -226,8 +212,6 @@ def test_loss_that_is_not_a_number_stops_with_its_name_and_keeps_the_weights(tmp
 
 
 def test_training_seeds_are_not_the_benchmarks(monkeypatch):
-    """Every world of training and validation is of a seed the benchmark leaves to training, and
-    training, its other seeds and validation share none."""
     asked: list[int] = []
     monkeypatch.setattr(
         training_worlds, "make_training_world", lambda kind, seed, cache: asked.append(seed)
@@ -244,20 +228,14 @@ def test_training_seeds_are_not_the_benchmarks(monkeypatch):
 
 
 class Reader(TinyTrainer):
-    """Says that it learns from a corpus."""
-
     learns_from = "one corpus"
 
 
 class OtherReader(Reader):
-    """Learns from something else."""
-
     learns_from = "another"
 
 
 class Interrupted(TinyTrainer):
-    """Is ended from outside in its sixth update, and tells with which it begins."""
-
     first: int | None = None
 
     def begin_update(self, update: int) -> None:
@@ -296,9 +274,6 @@ def test_a_run_that_kept_nothing_says_so(tmp_path):
 
 
 def test_a_run_goes_on_with_what_it_began_with_alone(tmp_path):
-    """Files that the trainer learns from and that have changed since are refused, as are a flipped
-    byte in the checkpoint and weights that are gone; curves that a kill left behind are mended."""
-
     config = TinyTraining()
     summary = run(config=config, out=tmp_path, make=Reader)
     curves = (tmp_path / "curves.csv").read_text()
@@ -322,7 +297,6 @@ def test_a_run_goes_on_with_what_it_began_with_alone(tmp_path):
 
 
 def test_a_mistake_in_what_a_run_names_leaves_its_folder_free(student_corpus, tmp_path):
-    """Put right, the same command works in the same folder."""
     trainer = TRAINERS.find("student_depth")
     tiny_student = ["pretrained=false", "frozen=0", "batch=2", "held_out=0.2"]
     tiny_student += ["schedule.updates=1", "schedule.checkpoint_every=1"]

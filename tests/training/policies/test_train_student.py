@@ -1,5 +1,3 @@
-"""The student's loss, and its training from a corpus to a flight."""
-
 import csv
 import math
 from dataclasses import replace
@@ -133,8 +131,7 @@ def test_student_learns(trained):
 
 def test_student_flies_by_its_weights(trained):
     config = replace(
-        policy_named(str(trained / "student_depth.npz")),
-        camera=OnboardCamera(width=32, height=24),
+        policy_named(str(trained / "student_depth.npz")), camera=OnboardCamera(width=32, height=24)
     )
     world = make_world(ForestConfig(length=12.0, width=8.0, height=4.0), 1_000_000)
     scenario = Scenario(seed=1_000_000, policy=config, timeout=1.0)
@@ -145,49 +142,6 @@ def test_student_flies_by_its_weights(trained):
     ahead = first.waypoints_W[first.best, -1] - flight.states[0, :3]
     assert ahead @ to_goal > 0.5 * np.linalg.norm(ahead) * np.linalg.norm(to_goal) > 0.0
     assert np.linalg.norm(flight.states[-1, :3] - flight.states[0, :3]) > 0.1
-
-
-def test_interrupted_training_ends_as_an_uninterrupted_one(student_corpus, tmp_path):
-    kind = TRAINERS.find("student_rgb")
-    steps = ["schedule.updates=3", "schedule.validate_every=3", "schedule.checkpoint_every=2"]
-    augmented = ["noise.color_noise=0.1", "appearance.hue=20"]
-    config = configure(student_corpus, "rgb", "batch=2", *steps, *augmented)
-
-    def make_interrupted(config):
-        trainer = kind.make(config)
-
-        def interrupt(update: int) -> None:
-            if update == 2:
-                raise KeyboardInterrupt
-
-        trainer.begin_update = interrupt
-        return trainer
-
-    with pytest.raises(KeyboardInterrupt):
-        run(config=config, out=tmp_path / "again", make=make_interrupted)
-    again, expected = (train(config, tmp_path / name) for name in ("again", "whole"))
-    for name, values in expected.items():
-        np.testing.assert_array_equal(again[name], values)
-    assert curves(tmp_path / "again") == curves(tmp_path / "whole")
-
-
-def test_training_continues_from_given_weights(trained, student_corpus, tmp_path):
-    began = trained / "student_depth.npz"
-    small_step = "schedule.learning_rate=1e-9"
-    config = configure(student_corpus, "depth", *ONE_STEP, small_step, f"begin={began}")
-    after = train(config, tmp_path)
-    with np.load(began) as before:
-        for name, values in after.items():
-            np.testing.assert_allclose(values, before[name], atol=1e-3)
-
-
-def test_students_learn_to_keep_clear(trained, student_corpus, tmp_path):
-    began = f"begin={trained / 'student_depth.npz'}"
-    head = ["frozen=20", f"features={tmp_path / 'features'}", "clearance_weight=50.0"]
-    steps = ["schedule.updates=200", "schedule.validate_every=100"]
-    train(configure(student_corpus, "depth", began, *head, *steps), tmp_path / "run")
-    curve = curves(tmp_path / "run")
-    assert curve[-1]["clearance"] < 0.8 * curve[0]["clearance"]
 
 
 @pytest.mark.parametrize("frozen", [18, 20])
@@ -203,7 +157,6 @@ def test_frozen_modules_keep_their_weights(frozen, trained, student_corpus, tmp_
 
 
 def test_features_of_frozen_modules_train_as_images_do(trained, student_corpus, tmp_path):
-    """A step with cached features has the loss of a step whose encoder is not updated."""
     losses, began = [], f"begin={trained / 'student_depth.npz'}"
     for frozen in (0, 20):
         overrides = [began, f"frozen={frozen}", f"features={tmp_path / 'features'}"]

@@ -1,5 +1,3 @@
-"""Which worlds policies train in, and that captured places are worlds among the others."""
-
 from pathlib import Path
 
 import numpy as np
@@ -63,8 +61,6 @@ def field_of(yard: str) -> Esdf:
 
 
 def test_kinds_and_places_come_in_turn(yard):
-    """Every other world is the scenario's own of its seed, the rest are flights through the place:
-    each from another start to another goal, clear of everything, also those held out."""
     worlds = training_worlds(selection(yard, voxel_size=0.5), seed=3)
     held_out = validation_worlds(selection(yard))
     for batch, number, seed in ((worlds, 2, 1_003_002), (held_out, 0, 2_000_000)):
@@ -81,8 +77,6 @@ def test_kinds_and_places_come_in_turn(yard):
 
 
 def test_what_is_seen_in_places_is_their_distance_field(yard):
-    """Images and distances are those of the place's field alone, where all unknown is full, bit for
-    bit, in a batch with generated worlds."""
     worlds = training_worlds(selection(yard, voxel_size=0.5), seed=0)
     alone = EsdfGeometry([field_of(yard).conservative()])
     rays = PixelRays.of(16, 9, 90.0)
@@ -102,7 +96,6 @@ def test_what_is_seen_in_places_is_their_distance_field(yard):
 
 
 def test_ways_in_places_lead_around_what_stands_there(yard):
-    """Steps down the time of arrival reach the goal behind the post, and never the post."""
     worlds = training_worlds(selection(yard), seed=0)
     p, world = torch.tensor([[3.0, 3.5, 1.5]]), torch.tensor([1])
     field = field_of(yard)
@@ -113,15 +106,11 @@ def test_ways_in_places_lead_around_what_stands_there(yard):
 
 
 def test_policies_learn_in_places(yard):
-    """Gradients of rollouts through a place are finite, and those of an empty one."""
     worlds = training_worlds(WorldSelection(kinds=[], scenes=[yard], count=2), seed=0)
     for batch in (worlds, worlds.without_obstacles()):
         learner = DiffAeroLearner(DiffAeroLoss())
         rollout = DifferentiableRollout(
-            learner,
-            batch,
-            RolloutConfig(environments=8, steps=6),
-            torch.Generator().manual_seed(0),
+            learner, batch, RolloutConfig(environments=8, steps=6), torch.Generator().manual_seed(0)
         )
         torch.stack(list(rollout.losses().values())).sum().backward()
         gradients = [weight.grad for weight in learner.network.parameters()]
@@ -132,10 +121,10 @@ def test_bad_selections_are_refused(yard, tmp_path):
     WorldSelection(kinds=["office"]).validate()  # other scenarios than the benchmark's are kinds
     tested = write_place(tmp_path / "warehouse", "test")
     for fields, message in (
-        ({"kinds": []}, "worlds must have kinds or scenes"),
+        ({"kinds": []}, "must be one kind or more"),
         ({"kinds": ["R13"]}, "worlds.kinds must be of generated worlds, got R13"),
         ({"scenes": [tested]}, "split of .*warehouse must be train, got 'test'"),
-        ({"scenes": [f"{yard}/gaussians.ply"]}, "is no scene folder"),
+        ({"scenes": [f"{yard}/gaussians.ply"]}, "must be scene folders or OctoMaps"),
         ({"count": 1001}, r"count must be in \[1, 1000\], got 1001"),
     ):
         with pytest.raises(ValueError, match=message):

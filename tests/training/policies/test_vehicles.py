@@ -1,5 +1,3 @@
-"""Batched vehicles against exact solutions and against the controller and plant that fly."""
-
 import numpy as np
 import pytest
 import torch
@@ -28,7 +26,6 @@ def point_masses(count: int) -> PointMass:
 
 
 def test_point_mass_solves_its_equation_exactly():
-    """One step equals a thousand small ones, to rounding."""
     start, a_cmd = point_masses(5), torch.tensor([[3.0, -2.0, 1.0]], dtype=torch.float64)
     once = start.step(a_cmd, 0.2, CONTROL)
     many = start
@@ -42,7 +39,6 @@ def test_point_mass_solves_its_equation_exactly():
 
 
 def test_gradient_decay_scales_gradients_alone():
-    """`decay_gradient` leaves the state as it is and multiplies its gradient."""
     a = torch.ones(1, 3, requires_grad=True)
     zero = torch.zeros(1, 3)
     vehicle = PointMass(zero, zero, a, torch.zeros(1), torch.full((1, 1), 0.1))
@@ -53,7 +49,6 @@ def test_gradient_decay_scales_gradients_alone():
 
 
 def test_point_mass_turns_its_nose_along_its_motion():
-    """The yaw approaches the direction of flight at the controller's gain."""
     zero = torch.zeros(1, 3)
     v, lag = torch.tensor([[0.0, 2.0, 0.0]]), torch.ones(1, 1)
     vehicle = PointMass(zero, v, zero, torch.zeros(1), lag)
@@ -65,7 +60,6 @@ def test_point_mass_turns_its_nose_along_its_motion():
 
 
 def test_body_rate_vehicle_flies_as_plant_and_controller_do():
-    """Two seconds of a turn end within 5 cm of where the Drake diagram ends."""
     a_WB = np.array([1.0, 0.8, 0.2])
     builder = DiagramBuilder()
     plant = builder.AddSystem(QuadrotorPlant())

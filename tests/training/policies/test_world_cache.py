@@ -1,5 +1,3 @@
-"""Training worlds and the times of arrival in them, made once."""
-
 import os
 from pathlib import Path
 
@@ -8,9 +6,9 @@ import pytest
 
 from splatpilot.systems.collision.shapes import Capsule, HalfSpace
 from splatpilot.systems.common.files import cache_folder
-from splatpilot.training.corpus.library import world_of
+from splatpilot.training.corpus.library import scenario_world
 from splatpilot.training.policies import training_worlds as world_cache
-from splatpilot.training.policies.training_worlds import WorldCache
+from splatpilot.training.policies.training_worlds import TrainingWorld, WorldCache
 
 GROUND = HalfSpace([0, 0, 1], 0.0)
 VOLUME = np.zeros(3), np.array([6.0, 4.0, 3.0])
@@ -24,7 +22,8 @@ def folder(tmp_path, monkeypatch) -> Path:
 
 def arrival(goal: float = 1.5, radius: float = 0.3):
     post = Capsule([3.0, 2.0, 0.0], [3.0, 2.0, 3.0], radius)
-    return WorldCache().arrival([GROUND, post], *VOLUME, np.array([5.0, 2.0, goal]), 0.25)
+    world = TrainingWorld([GROUND, post], *VOLUME, np.ones(3), np.array([5.0, 2.0, goal]))
+    return WorldCache().arrival(world, 0.25)
 
 
 def assert_same(a, b) -> None:
@@ -76,13 +75,13 @@ def test_what_was_not_used_for_longest_goes_first(folder, monkeypatch):
 
 @pytest.mark.parametrize("kind", ["P02", "P05", "P10", "P11"])
 def test_generated_worlds_are_read_again(folder, monkeypatch, kind):
-    made = WorldCache().spec(world_of(kind), 7)
+    made = WorldCache().spec(scenario_world(kind), 7)
     monkeypatch.setattr(world_cache, "make_spec", None)
-    shapes, *points = WorldCache().spec(world_of(kind), 7)
+    shapes, *points = WorldCache().spec(scenario_world(kind), 7)
     for a, b in zip(shapes, made[0], strict=True):
         assert type(a) is type(b)
         for x, y in zip(a.parameters(), b.parameters(), strict=True):
             np.testing.assert_array_equal(x, y)
     np.testing.assert_array_equal(points, made[1:])
     with pytest.raises(TypeError):
-        WorldCache().spec(world_of(kind), 8)
+        WorldCache().spec(scenario_world(kind), 8)

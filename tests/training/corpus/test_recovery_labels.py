@@ -1,5 +1,3 @@
-"""States before near-misses, labeled and added."""
-
 import shutil
 
 import numpy as np
@@ -39,7 +37,6 @@ def clearances(*dips: tuple[float, float]) -> np.ndarray:
     ],
 )
 def test_near_misses_are_the_least_clearances(dips, expected):
-    """The times at which a flight came nearest, below the limit and a second apart."""
     np.testing.assert_allclose(near_misses(TIMES, clearances(*dips)), expected, atol=1e-9)
 
 
@@ -59,8 +56,6 @@ def test_ground_and_ceiling_are_no_obstacles():
 
 
 def test_states_are_taken_before_them():
-    """Every 0.4 s from 0.5 to 2.5 s before each near-miss, none before the flight began, none
-    twice."""
     rows = rows_before(TIMES, np.array([2.0, 8.0]), 0.4)
     expected = [0.3, 0.7, 1.1, 1.5, 5.5, 5.9, 6.3, 6.7, 7.1, 7.5]
     np.testing.assert_allclose(TIMES[rows], expected, atol=0.02 + 1e-9)
@@ -69,9 +64,6 @@ def test_states_are_taken_before_them():
 
 
 def test_flights_that_do_not_arrive_are_taken_all_along():
-    """Those that arrive before their near-misses alone; those that end 0.31 m or farther away every
-    0.8 s too, but not where they touch something."""
-
     def rows(end: float, clear: np.ndarray) -> list[float]:
         p_WB = np.linspace([0.0, 0.0, 1.5], [end, 0.0, 1.5], len(TIMES))
         states = np.stack([hover_state(p) for p in p_WB])
@@ -107,9 +99,6 @@ def straight_flight(record) -> StudentFlight:
 
 
 def test_what_the_expert_would_have_done_is_added(folder, gathered):
-    """The samples that come new are of source RECOVERY, of the flight's world and poses, half of
-    them exactly and half perturbed, 0.5 to 2.5 s before a near-miss, with a first trajectory that
-    keeps clear; those that were there stay."""
     record = gathered.worlds[1]
     flight = straight_flight(record)
     field = record.make().distance_field
@@ -127,14 +116,12 @@ def test_what_the_expert_would_have_done_is_added(folder, gathered):
         np.testing.assert_allclose(flight.states[row, :3], p_WB, atol=1e-9)
         ahead = events - flight.times[row]
         assert ((ahead > 0.5 - 0.03) & (ahead < 2.5 + 0.03)).any()
-    field = record.esdf().conservative()
+    field = record.esdf.conservative()
     first_W = samples.trajectories_B[new][::2, 0] + exact[:, None]  # hovering level: B as W
     assert (field.distance(first_W.astype(float)) > VEHICLE_RADIUS - 1e-3).all()
 
 
 def test_the_same_flights_add_nothing_twice(folder, gathered):
-    """Called again with the same flights, after a kill say, nothing changes; another flight adds a
-    shard; the ledger has a row for each flight."""
     flight = straight_flight(gathered.worlds[0])
     once = add_recovery(folder, [flight], jobs=1)
     shard = once.shards[-1].path
@@ -156,5 +143,5 @@ def test_the_same_flights_add_nothing_twice(folder, gathered):
 def test_flights_elsewhere_are_refused(folder, gathered):
     flight = straight_flight(gathered.worlds[0])
     stray = StudentFlight("P99-7", flight.p_WG, flight.times, flight.states, flight.clearances)
-    with pytest.raises(ValueError, match="not gathered in the world 'P99-7'"):
+    with pytest.raises(ValueError, match="not collected in the world 'P99-7'"):
         add_recovery(folder, [stray])

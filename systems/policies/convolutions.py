@@ -1,0 +1,153 @@
+"""Convolutional networks that OpenCV runs, from lists of layers and their weights.
+
+The ONNX model, a protocol buffer (https://onnx.ai/onnx/repo-docs/IR.html), is written here, which
+keeps the onnx package out of training and flight. Field numbers are those of onnx.proto.
+"""
+
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+
+LEAK = 0.05
+"""Slope of the leaky ReLU for negative numbers."""
+
+_ACTIVATIONS: dict[str, tuple[str, dict[str, Any]]] = {
+    "relu6": ("Clip", {"min": 0.0, "max": 6.0}),
+    "leaky_relu": ("LeakyRelu", {"alpha": LEAK}),
+}
+
+_IR_VERSION, _OPSET = 5, 10  # In this version of operators, Clip has its limits as attributes.
+_FLOAT, _INT, _INTS = 1, 2, 7  # AttributeProto.type; TensorProto.DataType FLOAT is 1 too.
+
+
+@dataclass(frozen=True)
+class Convolution:
+    """A convolution with bias."""
+
+    weight: str  # name of its weights (outputs, inputs / groups, kernel, kernel)
+    bias: str  # name of its biases (outputs,)
+    inputs: int
+    outputs: int
+    kernel: int = 1
+    stride: int = 1
+    groups: int = 1
+    dilation: int = 1
+    activation: str = ""  # relu6 or leaky_relu
+    skip: int = 0  # If > 0, adds the input of the layer `skip` - 1 before this one.
+    pad: int | None = None  # by default half the kernel times the dilation
+
+    @property
+    def padding(self) -> int:
+        """Width [px] of the border of zeros."""
+        return self.dilation * (self.kernel // 2) if self.pad is None else self.pad
+
+
+def convolution_shapes(layers: Sequence[Convolution]) -> dict[str, tuple[int, ...]]:
+    """Returns the shapes of all arrays of weights by name."""
+    shapes: dict[str, tuple[int, ...]] = {}
+    for layer in layers:
+        kernel = layer.kernel, layer.kernel
+        shapes[layer.weight] = layer.outputs, layer.inputs // layer.groups, *kernel
+        shapes[layer.bias] = (layer.outputs,)
+    return shapes
+
+
+def output_size(image: tuple[int, int, int], layers: Sequence[Convolution]) -> tuple[int, int, int]:
+    """Computes channels, height and width of the output for those of the image."""
+    channels, *sizes = image
+    for layer in layers:
+        margin = 2 * layer.padding - layer.dilation * (layer.kernel - 1) - 1
+        channels, sizes = layer.outputs, [(size + margin) // layer.stride + 1 for size in sizes]
+    return channels, *sizes
+
+
+def opencv_net(
+    image: tuple[int, int, int],
+    layers: Sequence[Convolution],
+    weights: Mapping[str, np.ndarray],
+) -> cv2.dnn.Net:
+    """Makes the network of `layers`, first to last.
+
+    Args:
+        image: channels, height and width of the input.
+        layers: the convolutions.
+        weights: arrays by the names of `convolution_shapes`.
+    """
+    nodes, tensors, inputs, output = [], [], [], "image"
+
+    def add(operator: str, *names: str, **attributes: Any) -> str:
+        result = f"{operator.lower()}{len(nodes)}"
+        node = [_field(1, name.encode()) for name in names]
+        node += [_field(2, result.encode()), _field(4, operator.encode())]
+        node += [_field(5, _attribute(name, value)) for name, value in attributes.items()]
+        nodes.append(_field(1, b"".join(node)))
+        return result
+
+    for layer in layers:
+        inputs.append(output)
+        for name in (layer.weight, layer.bias):
+            values = np.ascontiguousarray(weights[name], "<f4")
+            shape = b"".join(_field(1, size) for size in values.shape)
+            tensor = _field(2, _FLOAT) + _field(8, name.encode()) + _field(9, values.tobytes())
+            tensors.append(_field(5, shape + tensor))
+        output = add(
+            "Conv",
+            *(output, layer.weight, layer.bias),
+            kernel_shape=[layer.kernel] * 2,
+            strides=[layer.stride] * 2,
+            pads=[layer.padding] * 4,
+            dilations=[layer.dilation] * 2,
+            group=layer.groups,
+        )
+        if layer.activation:
+            operator, attributes = _ACTIVATIONS[layer.activation]
+            output = add(operator, output, **attributes)
+        if layer.skip:
+            output = add("Add", output, inputs[-layer.skip])
+    ends = (
+        _field(11, _value("image", image)),
+        _field(12, _value(output, output_size(image, layers))),
+    )
+    graph = b"".join([*nodes, _field(2, b"features"), *tensors, *ends])
+    opset = _field(1, b"") + _field(2, _OPSET)
+    model = _field(1, _IR_VERSION) + _field(7, graph) + _field(8, opset)
+    return cv2.dnn.readNetFromONNX(np.frombuffer(model, np.uint8))
+
+
+def _varint(number: int) -> bytes:
+    """Encodes seven bits per byte, lowest first; the top bit marks that more follow."""
+    low = bytearray()
+    while number > 127:
+        low.append(number & 127 | 128)
+        number >>= 7
+    return bytes([*low, number])
+
+
+def _field(number: int, value: int | float | bytes) -> bytes:
+    """Encodes a field of a message: an integer, a single-precision number, or bytes."""
+    if isinstance(value, int):
+        return _varint(number << 3) + _varint(value)
+    if isinstance(value, float):
+        return _varint(number << 3 | 5) + struct.pack("<f", value)
+    return _varint(number << 3 | 2) + _varint(len(value)) + value
+
+
+def _attribute(name: str, value: int | float | list[int]) -> bytes:
+    """Encodes an AttributeProto."""
+    message = _field(1, name.encode())
+    if isinstance(value, list):
+        return message + b"".join(_field(8, number) for number in value) + _field(20, _INTS)
+    if isinstance(value, float):
+        return message + _field(2, value) + _field(20, _FLOAT)
+    return message + _field(3, value) + _field(20, _INT)
+
+
+def _value(name: str, size: tuple[int, int, int]) -> bytes:
+    """Encodes the ValueInfoProto of one image."""
+    sizes = b"".join(_field(1, _field(1, length)) for length in (1, *size))
+    tensor = _field(1, _FLOAT) + _field(2, sizes)
+    return _field(1, name.encode()) + _field(2, _field(1, tensor))
