@@ -28,7 +28,6 @@ from splatpilot.diagrams.worlds.world_registry import make_spec, make_world
 from splatpilot.systems.common.config import load_config
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.splats.baked_scene import BakedScene
-from splatpilot.systems.splats.splat_camera import render_view
 from splatpilot.systems.vehicle.state import pose_from_state
 from splatpilot.training.policies.ray_casting import PixelRays, ShapeGeometry
 from splatpilot.training.reconstruction.losses import depth_edge_weights
@@ -106,7 +105,7 @@ class TrueDepth:
             unknown = np.isfinite(depth) & (p_WQ[..., 2] > self._upper_W[2])
         if self._scenery is not None:
             K, size = camera.camera_info().intrinsic_matrix(), (camera.width, camera.height)
-            view = render_view(self._scenery, K, *size, X_WC, near=0.01, far=camera.max_depth)
+            view = self._scenery.render(K, *size, X_WC, near=0.01, far=camera.max_depth)
             unknown |= outside & (view.alpha > _MIN_ALPHA)
         return np.where(unknown, np.nan, depth)
 

@@ -108,7 +108,7 @@ def main() -> None:
         print_rows(
             "log depth",
             noisy,
-            lambda x, d=depth, w=weights: log_depth_loss(x, d, w, epsilon=EPSILON, far=FAR),
+            lambda x, d=depth, w=weights: log_depth_loss(x, d, w),
             lambda x, d=depth, w=weights: log_depth_by_torch(x, d.to(x.dtype), w.to(x.dtype)),
         )
 

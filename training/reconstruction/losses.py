@@ -23,6 +23,8 @@ WINDOW = 11  # [px] of SSIM
 SIGMA = 1.5  # [px]
 C1, C2 = 0.01**2, 0.03**2
 
+_EPSILON = 1e-3  # [m], minimum depth
+_EDGE_RADIUS, _EDGE_GAIN = 2, 4.0  # [px], and additional weight
 _REACH = 0.05  # distance of a point from its surface, as a fraction of the depth
 _NEAR = 0.05  # [m], minimum depth of a point
 
@@ -73,65 +75,42 @@ def log_depth_loss(
     rendered: Tensor,
     depth: Tensor,
     weights: Tensor | None = None,
-    *,
-    epsilon: float = 1e-3,
-    far: float = FAR,
 ) -> Tensor:
     """Computes 1 / |V| sum over V of weight |log max(rendered, epsilon) - log depth|, where
-    V = {pixels: epsilon < depth < far}; 0 if V is empty.
+    V = {pixels: epsilon < depth < far}, from 1 mm to 150 m; 0 if V is empty.
 
     The same relative error costs the same at any range.
 
     Args:
         rendered, depth: (...) [m], expected or accumulated depth, and the truth.
         weights: (...), for example from `depth_edge_weights`; 1 by default.
-        epsilon, far: range of depths that count [m].
     """
     _check_pair("rendered", rendered, "depth", depth)
     if weights is not None:
         _check_pair("rendered", rendered, "weights", weights)
-    require(0 < epsilon < far, "epsilon, far", "0 < epsilon < far", f"{epsilon}, {far}")
     if _is_native(rendered):
         native = _native.log_depth_loss
-        truth = {"depth": depth, "weights": weights, "epsilon": epsilon, "far": far}
+        truth = {"depth": depth, "weights": weights, "epsilon": _EPSILON, "far": FAR}
         return _Fused.apply(rendered, native, (-1,), truth)  # pyright: ignore[reportReturnType]
-    valid = (depth > epsilon) & (depth < far)
+    valid = (depth > _EPSILON) & (depth < FAR)
     rendered, depth = rendered[valid], depth[valid]
-    loss = (rendered.clamp(min=epsilon).log() - depth.log()).abs()
+    loss = (rendered.clamp(min=_EPSILON).log() - depth.log()).abs()
     if weights is not None:
         loss = weights[valid] * loss
     # x - x is NaN for NaN and for infinity, which the clamp would hide.
     return (loss + (rendered - rendered).detach()).sum() / max(depth.numel(), 1)
 
 
-def depth_edge_weights(
-    depth: Tensor,
-    *,
-    jump: float = 0.1,
-    radius: int = 2,
-    gain: float = 4.0,
-    epsilon: float = 1e-3,
-    far: float = FAR,
-) -> Tensor:
-    """Returns weights for `log_depth_loss` that keep thin structures: 1 + gain within `radius`
-    pixels of a discontinuity of the true depth, 1 elsewhere.
+def depth_edge_weights(depth: Tensor, jump: float = 0.1, far: float = FAR) -> Tensor:
+    """Returns weights for `log_depth_loss` that keep thin structures: 5 within 2 pixels of a
+    discontinuity of the true depth (..., H, W) [m], 1 elsewhere.
 
     The inverse depth of planes is linear in the pixel coordinates. So a pixel is at a discontinuity
     if the second difference of inverse depth, along a row or a column, exceeds `jump` times the
-    largest of the three. Depth beyond `far` counts as `far`, so that a branch before the sky has
-    edges; unknown depth (NaN, or at most epsilon) makes none.
-
-    Args:
-        depth: (..., H, W) the true depth [m].
-        jump: minimum relative jump.
-        radius: range of the weights [px].
-        gain: added to the weight of 1.
+    largest of the three. Depth beyond `far` [m] counts as `far`, so that a branch before the sky
+    has edges; unknown depth (NaN, or at most 1 mm) makes none.
     """
-    valid = depth.ndim >= 2 and depth.is_floating_point() and depth.numel() > 0
-    require(valid, "depth", "floating-point (..., H, W)", f"{depth.dtype} {tuple(depth.shape)}")
-    options = f"{jump}, {radius}, {gain}"
-    require(min(jump, radius, gain) >= 0, "jump, radius, gain", "at least 0", options)
-    inverse = torch.where(depth > epsilon, 1.0 / depth.clamp(max=far), torch.nan)
+    inverse = torch.where(depth > _EPSILON, 1.0 / depth.clamp(max=far), torch.nan)
     edge = torch.zeros_like(depth, dtype=torch.bool)
     for axis in (-2, -1):
         length = depth.shape[axis] - 2
@@ -143,8 +122,8 @@ def depth_edge_weights(
             second > jump * torch.maximum(torch.maximum(a, b), c)
         )
     image = edge.to(depth.dtype).reshape(-1, 1, *depth.shape[-2:])
-    near = max_pool2d(image, 2 * radius + 1, stride=1, padding=radius)
-    return 1 + gain * near.reshape(depth.shape)
+    near = max_pool2d(image, 2 * _EDGE_RADIUS + 1, stride=1, padding=_EDGE_RADIUS)
+    return 1 + _EDGE_GAIN * near.reshape(depth.shape)
 
 
 def surface_loss(

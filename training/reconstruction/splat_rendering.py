@@ -9,7 +9,8 @@ from pydrake.math import RigidTransform
 from torch import Tensor
 
 from splatpilot._native import Renderer
-from splatpilot.systems.splats.baked_scene import BakedScene, RenderedView, create_renderer
+from splatpilot.systems.splats.background import RenderedView
+from splatpilot.systems.splats.baked_scene import BakedScene, create_renderer
 from splatpilot.systems.splats.rasterization import EPS2D, rasterize
 from splatpilot.systems.splats.scene import GaussianScene, harmonic_degree
 from splatpilot.systems.splats.surfel_rasterization import rasterize_surfels

@@ -151,7 +151,7 @@ def test_renamed_copy_of_a_test_capture_is_of_split_test(tmp_path, write_room, m
     monkeypatch.setattr(splits, "load_test_sources", lambda: tested)
     reconstruct(room, tmp_path / "scene", CONFIG)
     assert read_scene_metadata(tmp_path / "scene").split == "test"
-    with pytest.raises(ValueError, match="must be test, got train: it shows hospital"):
+    with pytest.raises(ValueError, match="must be test, got train; it shows hospital"):
         reconstruct(room, tmp_path / "scene", replace(CONFIG, split="train"))
 
 
