@@ -194,7 +194,8 @@ def test_a_policy_flies_by_the_grid_of_a_sensor(post_world, tmp_path, streamed):
         halves.advance_to(0.28)  # Just after an image: the vehicle moves.
         sent = halves.vehicle.GetSubsystemByName("time_of_flight_grid")
         expected = sent.get_output_port().Eval(sent.GetMyContextFromRoot(halves.vehicle_root))
-        np.testing.assert_allclose(halves.out("depth_grid"), expected, atol=0.05)
+        differs = np.abs(halves.out("depth_grid") - expected) > 0.02
+        assert differs.mean() < 0.02  # The outline of the post moves over cells.
         assert expected.max() > 0.1
     assert halves.mode()[0] == status.FLYING
     policy = halves.hardware.GetSubsystemByName("policy")
