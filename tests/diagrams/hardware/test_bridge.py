@@ -191,10 +191,11 @@ def test_a_policy_flies_by_the_grid_of_a_sensor(post_world, tmp_path, streamed):
         halves.advance_to(0.3)
         np.testing.assert_array_equal(halves.out("depth_grid"), np.full(144, 0.25))
     else:
-        halves.advance_to(0.3)
+        halves.advance_to(0.28)  # Just after an image: the vehicle moves.
         sent = halves.vehicle.GetSubsystemByName("time_of_flight_grid")
         expected = sent.get_output_port().Eval(sent.GetMyContextFromRoot(halves.vehicle_root))
-        np.testing.assert_allclose(halves.out("depth_grid"), expected, atol=0.02)
+        differs = np.abs(halves.out("depth_grid") - expected) > 0.02
+        assert differs.mean() < 0.02  # The outline of the post moves over cells.
         assert expected.max() > 0.1
     assert halves.mode()[0] == status.FLYING
     policy = halves.hardware.GetSubsystemByName("policy")
