@@ -148,7 +148,7 @@ def test_renamed_copy_of_a_test_mesh_is_of_split_test(opengl, room, tmp_path, mo
     monkeypatch.setattr(splits, "load_test_sources", lambda: tested)
     copy = shutil.copyfile(room, tmp_path / "capture.obj")
     config = replace(small(), yaws=[0.0])
-    with pytest.raises(ValueError, match=r"capture.obj must be test, got train: it shows ware"):
+    with pytest.raises(ValueError, match=r"capture.obj must be test, got train; it shows ware"):
         run(world=copy, out=tmp_path / "out", config=replace(config, split="train"))
     run(world=copy, out=tmp_path / "out", config=config)
     scene = replace(ReconstructConfig(), iterations=0, voxel_size=0.1)
