@@ -22,8 +22,8 @@ from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.scenarios import benchmark_scenarios, scenario_file
 from splatpilot.diagrams.worlds.feasibility import (
     are_connected,
-    cell_of,
     conservative_distance,
+    grid_cell,
     grid_distances,
 )
 from splatpilot.diagrams.worlds.world import World
@@ -46,14 +46,14 @@ def shortest_path(field: DistanceField, grid: NDArray, p_WS: NDArray, p_WG: NDAr
     Raises:
         InfeasibleFlightError: if there is none on the grid.
     """
-    shape, goal = grid.shape, cell_of(field, grid, SPACING, p_WG)
+    shape, goal = grid.shape, grid_cell(field, grid, SPACING, p_WG)
     front = np.ones(shape)
     front[goal] = -1.0
     blocked = grid < VEHICLE_RADIUS + 0.02
     blocked[goal] = False
     marched = skfmm.distance(np.ma.MaskedArray(front, mask=blocked), dx=SPACING)
     length = np.where(np.ma.getmaskarray(marched), np.inf, np.ma.getdata(marched))
-    cell = cell_of(field, grid, SPACING, p_WS)
+    cell = grid_cell(field, grid, SPACING, p_WS)
     if not np.isfinite(length[cell]):
         raise InfeasibleFlightError("no path from start to goal was found on a grid of 0.2 m")
     offsets = np.array([o for o in np.ndindex(3, 3, 3) if o != (1, 1, 1)]) - 1
@@ -286,7 +286,7 @@ def angle_over_length(path: NDArray) -> float:
 def bottleneck(field: DistanceField, grid: NDArray, p_WS: NDArray, p_WG: NDArray) -> float:
     """Largest clearance [m], beyond the vehicle's radius, that some way on the grid keeps
     everywhere; found by bisection to 1 cm. The grid may miss the middle of a gap by half a cell."""
-    ends = [cell_of(field, grid, SPACING, p) for p in (p_WS, p_WG)]
+    ends = [grid_cell(field, grid, SPACING, p) for p in (p_WS, p_WG)]
     low, high = 0.0, float(min(grid[end] for end in ends))
     while high - low > 0.01:
         middle = (low + high) / 2

@@ -22,7 +22,7 @@ from splatpilot.diagrams.worlds.scene_folder import (
     read_scene_metadata,
 )
 from splatpilot.diagrams.worlds.world import World
-from splatpilot.diagrams.worlds.world_registry import make_world, place_config
+from splatpilot.diagrams.worlds.world_registry import make_world, scene_config
 from splatpilot.systems.common.config import load_config
 from splatpilot.systems.common.files import (
     require_unused,
@@ -87,7 +87,7 @@ def generated_scenario(path: Path, seed: int | None, overrides: Sequence[str]) -
     if path.is_dir() or _may_hold_gaussians(path) or is_video(path):
         return None
     if path.suffix.lower() == OCTOMAP:
-        scenario = load_config(Scenario(world=place_config(path)), None, list(overrides))
+        scenario = load_config(Scenario(world=scene_config(path)), None, list(overrides))
     else:
         scenario = load_config(Scenario(), scenario_file(str(path)), list(overrides))
     return scenario if seed is None else replace(scenario, seed=seed)

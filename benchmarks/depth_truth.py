@@ -1,90 +1,151 @@
-"""The depth that policies are handed against the truth: run by hand.
+"""Compares the depth that policies get in generated worlds with rays cast at the solids.
 
-    python benchmarks/depth_truth.py [--scenarios P01 P08] [--seeds 0 1] [--frames 24]
-    python benchmarks/depth_truth.py --scenes FOLDER...
-    python benchmarks/depth_truth.py --ghosts [R13 R14]
+    python benchmarks/depth_truth.py [--scenarios P01 P08] [--frames 24]
 
-Of generated worlds the truth are rays cast at their solids along the flight of the privileged
-planner; of captured scenes, named by their folders, the depth of the frames that were withheld from
-them. Errors are wrong beyond 0.1 m or 5 %, the larger. Pixels whose truth nobody knows are left
-out: scenery beyond the volume has no solid. Relative errors are those of depths below 4 m. Ghosts
-are pixels along the planner's flights through captured places whose depth ends where the distance
-field is free, more than 0.3 m from all that it knows.
+The cameras follow flights of the privileged planner. A pixel is wrong if it is off by more than
+0.1 m or 5 %, the larger. Pixels of unknown truth are left out: scenery has no solids.
 """
 
 import argparse
-from pathlib import Path
+from collections.abc import Iterable
+from typing import NamedTuple, cast
 
-from depth_errors import DepthFrame, depth_errors
+import numpy as np
+import torch
 from harness import header, row
-from true_depth import (
-    frames_along_flight,
-    frames_of_capture,
-    ghosts_along_flight,
-)
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform
+from pydrake.systems.sensors import ImageDepth32F
 
+from splatpilot.diagrams.flight.flight import fly
+from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
 from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.flight.sensors import make_camera
 from splatpilot.diagrams.scenarios import benchmark_scenarios, scenario_file
+from splatpilot.diagrams.worlds.solids.solid import WorldSpec
+from splatpilot.diagrams.worlds.solids.surfaces import merge
+from splatpilot.diagrams.worlds.world_registry import make_spec, make_world
 from splatpilot.systems.common.config import load_config
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
+from splatpilot.systems.splats.baked_scene import BakedScene
+from splatpilot.systems.splats.splat_camera import render_view
+from splatpilot.systems.vehicle.state import pose_from_state
+from splatpilot.training.policies.ray_casting import PixelRays, ShapeGeometry
+from splatpilot.training.reconstruction.losses import depth_edge_weights
 
 CAMERAS = [OnboardCamera(64, 36), OnboardCamera(320, 240)]
-COLUMNS = (
-    "pixels",
-    "left out",
-    "bias < 4 m",
-    "p5",
-    "p95",
-    "too near",
-    "too far",
-    "> 0.5 m too near",
-    "holes",
-)
+_NEAR = 4.0  # [m], true depths below which relative errors are compared
+_TOLERANCE, _RELATIVE_TOLERANCE = 0.1, 0.05  # [m], and as a fraction of the true depth
+_BEYOND = 0.1  # [m], distance from the volume at which scenery begins
+_MIN_ALPHA = 0.01  # of scenery that a pixel may show
 
 
-def show(name: str, frames: list[list[DepthFrame]]) -> None:
-    """Prints the rows of a scenario or scene."""
-    for camera, seen in zip(CAMERAS, frames, strict=True):
-        for where, errors in depth_errors(seen, camera.max_depth).items():
-            pixels, *shares = vars(errors).values()
-            cells = [f"{100 * share:.2f} %" for share in shares]
-            row(name, f"{camera.width}x{camera.height}", where, pixels, *cells)
+class DepthFrame(NamedTuple):
+    """Planar depth and truth (H, W) [m]; the truth is NaN if unknown."""
+
+    depth: NDArray[np.floating]
+    truth: NDArray[np.floating]
 
 
-def scenario_of(name: str, seed: int) -> Scenario:
-    scenario = load_config(Scenario(), scenario_file(name))
-    scenario.seed = seed
-    return scenario
+class DepthErrors(NamedTuple):
+    """Errors of pixels."""
+
+    pixels: int  # with known truth
+    wrong: float  # fraction of pixels beyond the tolerance
+    bias: float  # median relative error below 4 m
+
+
+def depth_errors(frames: Iterable[DepthFrame], reach: float, edges: bool = True) -> DepthErrors:
+    """Compares depth with the truth.
+
+    Args:
+        reach: [m], maximum depth of the camera; greater depths count as `reach`.
+        edges: includes pixels within 2 px of a discontinuity of the truth.
+    """
+    pairs = []
+    for depth, truth in frames:
+        used = ~np.isnan(truth)
+        if not edges:
+            weights = depth_edge_weights(torch.from_numpy(truth), jump=0.05, far=reach)
+            used &= (weights == 1).numpy()
+        pairs.append((depth[used], truth[used]))
+    depth, truth = (np.concatenate(column) for column in zip(*pairs, strict=True))
+    truth = np.minimum(truth, reach)
+    error = np.minimum(depth, reach) - truth
+    tolerance = np.maximum(_TOLERANCE, _RELATIVE_TOLERANCE * truth)
+    near = (truth < _NEAR) & np.isfinite(depth)
+    bias = np.median(error[near] / truth[near])
+    return DepthErrors(len(truth), float((np.abs(error) > tolerance).mean()), float(bias))
+
+
+class TrueDepth:
+    """Renders exact depth of the solids of a generated world.
+
+    Scenery beyond the volume has no solids, nor have the crowns of forests above it.
+    """
+
+    def __init__(self, spec: WorldSpec) -> None:
+        self._lower_W, self._upper_W = spec.lower_W - _BEYOND, spec.upper_W + _BEYOND
+        shapes = [solid.shape for solid in (*spec.solids, *spec.scenery)]
+        self._geometry = ShapeGeometry([shapes])
+        scenery = spec.surroundings()
+        self._scenery = BakedScene(merge(scenery)) if scenery else None
+
+    def image(self, camera: OnboardCamera, X_WC: RigidTransform) -> NDArray[np.floating]:
+        """Returns planar depth (H, W) [m] at the centers of the pixels, exact to 3 mm; infinite
+        without a surface, NaN if unknown."""
+        slopes_C = camera.ray_slopes()
+        R_WC, p_WC = X_WC.rotation().matrix(), X_WC.translation()
+        centers = PixelRays(slopes_C.reshape(-1, 3).astype(np.float32), half_pixel=0.0)
+        p, R = (torch.tensor(x, dtype=torch.float32)[None] for x in (p_WC, R_WC))
+        depth = self._geometry.depth(p, R, centers, torch.zeros(1).long()).numpy()
+        depth = depth.reshape(slopes_C.shape[:2])
+        with np.errstate(invalid="ignore"):
+            p_WQ = p_WC + depth[..., None] * (slopes_C @ R_WC.T)
+            outside = ~((p_WQ >= self._lower_W) & (p_WQ <= self._upper_W)).all(axis=-1)
+            unknown = np.isfinite(depth) & (p_WQ[..., 2] > self._upper_W[2])
+        if self._scenery is not None:
+            K, size = camera.camera_info().intrinsic_matrix(), (camera.width, camera.height)
+            view = render_view(self._scenery, K, *size, X_WC, near=0.01, far=camera.max_depth)
+            unknown |= outside & (view.alpha > _MIN_ALPHA)
+        return np.where(unknown, np.nan, depth)
+
+
+def frames_along_flight(
+    scenario: Scenario, cameras: list[OnboardCamera], count: int
+) -> list[list[DepthFrame]]:
+    """Flies a scenario in a generated world, and returns `count` frames of each camera, evenly in
+    time."""
+    truth = TrueDepth(make_spec(scenario.world, scenario.seed))
+    world = make_world(scenario.world, scenario.seed)
+    flight = fly(BuildFlightDiagram(scenario, world, camera=False), scenario, world)
+    rows = np.linspace(0, len(flight.states) - 1, count).astype(int)
+    frames: list[list[DepthFrame]] = [[] for _ in cameras]
+    for config, found in zip(cameras, frames, strict=True):
+        camera = make_camera(config, world)
+        context = camera.CreateDefaultContext()
+        for X_WB in map(pose_from_state, flight.states[rows]):
+            camera.GetInputPort("body_pose").FixValue(context, X_WB)
+            image = cast(ImageDepth32F, camera.GetOutputPort("depth_image_32f").Eval(context))
+            depth = np.array(image.data)[..., 0]
+            found.append(DepthFrame(depth, truth.image(config, X_WB @ config.X_BC())))
+    return frames
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Compare the depth of cameras with the truth.")
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     generated = [name for name in benchmark_scenarios() if name.startswith("P")]
     parser.add_argument("--scenarios", nargs="*", default=generated, help="generated, by name")
-    parser.add_argument("--seeds", nargs="*", type=int, default=[0])
     parser.add_argument("--frames", type=int, default=24, help="along each flight")
-    parser.add_argument("--scenes", nargs="*", type=Path, help="captured ones instead: folders")
-    captured = [name for name in benchmark_scenarios() if name.startswith("R")]
-    parser.add_argument("--ghosts", nargs="*", help="in captured places, by name; all if none is")
-    arguments = parser.parse_args()
-    if arguments.ghosts is not None:
-        header("", "ghosts", "worst frame")
-        for name in arguments.ghosts or captured:
-            for seed in arguments.seeds:
-                scenario = scenario_of(name, seed)
-                shares = ghosts_along_flight(scenario, CAMERAS[0], arguments.frames)
-                cells = (f"{100 * share:.2f} %" for share in (shares.mean(), shares.max()))
-                row(f"{name}, seed {seed}", *cells)
-        return
-    header("", "size", "where", *COLUMNS)
-    if arguments.scenes is not None:
-        for folder in arguments.scenes:
-            show(folder.name, frames_of_capture(folder, CAMERAS))
-        return
-    for name in arguments.scenarios:
-        for seed in arguments.seeds:
-            frames = frames_along_flight(scenario_of(name, seed), CAMERAS, arguments.frames)
-            show(f"{name}, seed {seed}", frames)
+    options = parser.parse_args()
+    header("scenario", "size", "wrong pixels", "median relative error below 4 m")
+    for name in options.scenarios:
+        scenario = load_config(Scenario(), scenario_file(name))
+        frames = frames_along_flight(scenario, CAMERAS, options.frames)
+        for camera, seen in zip(CAMERAS, frames, strict=True):
+            errors = depth_errors(seen, camera.max_depth)
+            cells = (f"{100 * share:.2f} %" for share in (errors.wrong, errors.bias))
+            row(name, f"{camera.width}x{camera.height}", *cells)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What benchmarks share: timing, memory, and the machine's description."""
+"""Timing, tables and scenes that the benchmarks share."""
 
 import os
 import platform
@@ -8,17 +8,19 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from pydrake.math import RigidTransform, RotationMatrix
+from torch import Tensor
 
 from splatpilot import _native
+from splatpilot.systems.common.files import DATA, data_folder
+from splatpilot.systems.splats.scene import GaussianScene
+from splatpilot.training.captures.capture_registry import read_capture
 
-REPEATS = 30
 
+def milliseconds(call: Callable[[], object], repeats: int = 30) -> float:
+    """Returns the minimum CPU time of the process [ms] over `repeats` calls, after a first one.
 
-def milliseconds(call: Callable[[], object], repeats: int = REPEATS) -> tuple[float, float]:
-    """Minimum and median CPU time of the process, after one call that does not count.
-
-    With one thread that is what the wall clock shows on an idle machine; on a busy one it does not
-    count the waiting.
+    CPU time does not count the waiting on a busy machine.
     """
     durations = []
     call()
@@ -26,39 +28,28 @@ def milliseconds(call: Callable[[], object], repeats: int = REPEATS) -> tuple[fl
         start = time.process_time()
         call()
         durations.append(1e3 * (time.process_time() - start))
-    return min(durations), float(np.median(durations))
-
-
-def seconds(call: Callable[[], object], repeats: int) -> float:
-    """Minimum CPU time of the process [s], after one call that does not count."""
-    return 1e-3 * milliseconds(call, repeats)[0]
+    return min(durations)
 
 
 def machine() -> str:
-    model = platform.processor() or platform.machine()
-    info = Path("/proc/cpuinfo")
-    if info.exists():
-        names = [line.split(":")[1].strip() for line in info.read_text().splitlines()
-                 if line.startswith("model name")]  # fmt: skip
-        model = names[0] if names else model
-    levels = ", ".join(_native.simd_levels())
+    """Describes the machine and the software."""
+    lines = Path("/proc/cpuinfo").read_text().splitlines()
+    models = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
     return (
-        f"{model}, {os.cpu_count()} cores, {platform.platform()}, SIMD levels {levels}, Python "
+        f"{models[0] if models else platform.machine()}, {os.cpu_count()} cores, "
+        f"{platform.platform()}, SIMD levels {', '.join(_native.simd_levels())}, Python "
         f"{platform.python_version()}, torch {torch.__version__}, load {os.getloadavg()[0]:.1f}"
     )
 
 
 def peak_growth(call: Callable[[], object]) -> float:
-    """MiB by which the resident memory peaks during a first call; NaN without Linux's /proc."""
-    status, reset = Path("/proc/self/status"), Path("/proc/self/clear_refs")
-    if not reset.exists():
-        return float("nan")
+    """Returns the MiB by which the resident memory peaks during a first call."""
 
     def value(key: str) -> float:
-        line = next(x for x in status.read_text().splitlines() if x.startswith(key))
-        return int(line.split()[1]) / 1024
+        lines = Path("/proc/self/status").read_text().splitlines()
+        return int(next(line for line in lines if line.startswith(key)).split()[1]) / 1024
 
-    reset.write_text("5")  # the peak starts again from here
+    Path("/proc/self/clear_refs").write_text("5")  # resets the peak
     before = value("VmRSS")
     call()
     return value("VmHWM") - before
@@ -70,6 +61,73 @@ def row(*cells: object) -> None:
 
 
 def header(*cells: str) -> None:
+    """Prints the first rows of a Markdown table."""
     print()
     row(*cells)
     print("|---" * len(cells) + "|", flush=True)
+
+
+def scene_name() -> str:
+    return "TartanAir hospital" if DATA in os.environ else "synthetic room"
+
+
+def load_scene(count: int) -> tuple[GaussianScene, RigidTransform]:
+    """Returns a scene of `count` Gaussians and a camera's pose X_WC in it: TartanAir's hospital if
+    SPLATPILOT_DATA is set, else a synthetic room."""
+    data = data_folder()
+    return hospital(data / "tartanair" / "hospital", count) if data else synthetic_room(count)
+
+
+def hospital(folder: Path, count: int) -> tuple[GaussianScene, RigidTransform]:
+    """Back-projects a regular grid of pixels of every tenth frame."""
+    capture = read_capture(folder)
+    step = 4 if count <= 150_000 else 2
+    means, scales, colors = [], [], []
+    for i in range(0, len(capture), 10):
+        frame = capture.frame(i)
+        v, u = np.mgrid[0 : capture.height : step, 0 : capture.width : step]
+        near = frame.depth[v, u] < 30.0
+        u, v = u[near], v[near]
+        z = frame.depth[v, u].astype(np.float64)
+        means.append(frame.X_WC.multiply(frame.back_project(u + 0.5, v + 0.5, z).T).T)
+        scales.append(1.2 * z / 160)  # 1.2 pixels of the 320x240 images that are rendered
+        colors.append(frame.image[v, u] / 255)
+    chosen = np.random.default_rng(0).permutation(sum(map(len, scales)))[:count]
+    arrays = (np.concatenate(values)[chosen] for values in (means, scales, colors))
+    return round_gaussians(*arrays), capture.X_WCs[len(capture) // 2]
+
+
+def synthetic_room(count: int) -> tuple[GaussianScene, RigidTransform]:
+    """Draws points on the walls of a room, seen from inside."""
+    rng = np.random.default_rng(0)
+    means = rng.uniform(-1, 1, (count, 3))
+    means[np.arange(count), rng.integers(0, 3, count)] = rng.choice([-1.0, 1.0], count)
+    means *= [4.0, 3.0, 1.5]
+    scene = round_gaussians(means, np.full(count, 0.02), rng.uniform(0, 1, (count, 3)))
+    R_WC = RotationMatrix(np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]))
+    return scene, RigidTransform(R_WC, np.array([-2.0, 0.5, 0.0]))
+
+
+def round_gaussians(means: np.ndarray, scales: np.ndarray, colors: np.ndarray) -> GaussianScene:
+    count = len(means)
+    quats = np.tile([1.0, 0, 0, 0], (count, 1))
+    opacities = np.random.default_rng(1).uniform(0.8, 0.95, count)
+    scales = np.repeat(scales[:, None], 3, axis=1)
+    return GaussianScene.from_colors(means, quats, scales, opacities, colors)
+
+
+def intrinsics(width: int, height: int) -> np.ndarray:
+    return np.array([[width / 2, 0, width / 2], [0, width / 2, height / 2], [0, 0, 1.0]])
+
+
+def scene_tensors(scene: GaussianScene) -> dict[str, Tensor]:
+    arrays = {name: getattr(scene, name) for name in ("means", "quats", "scales", "opacities")}
+    arrays["colors"] = scene.base_colors
+    return {name: torch.from_numpy(array) for name, array in arrays.items()}
+
+
+def camera_tensors(X_WC: RigidTransform, width: int, height: int) -> tuple[Tensor, Tensor]:
+    """Returns viewmats (1, 4, 4) and Ks (1, 3, 3)."""
+    matrices = X_WC.inverse().GetAsMatrix4(), intrinsics(width, height)
+    viewmat, K = (torch.tensor(matrix, dtype=torch.float32)[None] for matrix in matrices)
+    return viewmat, K

@@ -4,8 +4,8 @@
 
 With SPLATPILOT_DATA set, the scenes are 100,000 and 500,000 points of TartanAir's hospital
 corridor; otherwise a synthetic room of the same size. "forward" is the whole call on torch tensors;
-"+ backward" adds the gradients of all scene tensors and "+ Adam" torch's fused optimizer. Times are
-CPU milliseconds of the process, the minimum of many calls, with one thread.
+"+ backward" adds the gradients of all scene tensors. Times are CPU milliseconds of the process, the
+minimum of many calls, with one thread.
 """
 
 from collections.abc import Callable
@@ -13,9 +13,19 @@ from typing import Any
 
 import numpy as np
 import torch
-from harness import header, machine, milliseconds, peak_growth, row
+from harness import (
+    camera_tensors,
+    header,
+    intrinsics,
+    load_scene,
+    machine,
+    milliseconds,
+    peak_growth,
+    row,
+    scene_name,
+    scene_tensors,
+)
 from pydrake.math import RigidTransform
-from scenes import camera_tensors, intrinsics, load_scene, scene_name, scene_tensors
 
 from splatpilot import _native
 from splatpilot.diagrams.flight.flight import sample_initial_state
@@ -41,7 +51,7 @@ def step_calls(
     sh_degree: int | None = None,
     draw: Callable[..., Any] = rasterize,
 ) -> dict[str, Callable[[], object]]:
-    """Returns forward, forward + backward, and these with an optimizer's step, of RGB images."""
+    """Returns forward, and forward with backward, of RGB images."""
     width, height = size
     renderer = create_renderer(1, simd)
     leaves = {name: t.clone().requires_grad_() for name, t in scene_tensors(scene).items()}
@@ -50,7 +60,6 @@ def step_calls(
         coefficients[:, 0] = color_to_sh(scene.base_colors)
         leaves["colors"] = torch.from_numpy(coefficients).requires_grad_()
     viewmats, Ks = camera_tensors(X_WC, width, height)
-    optimizer = torch.optim.Adam(leaves.values(), lr=0.0, fused=True)
     upstream = torch.randn(1, height, width, 3)
     view = {"viewmats": viewmats, "Ks": Ks, "width": width, "height": height}
 
@@ -62,44 +71,37 @@ def step_calls(
             forward()
 
     def backward() -> None:
-        optimizer.zero_grad()
+        for leaf in leaves.values():
+            leaf.grad = None
         forward().backward(upstream)
 
-    def step() -> None:
-        backward()
-        optimizer.step()
-
-    return {"forward": forward_only, "+ backward": backward, "+ Adam": step}
+    return {"forward": forward_only, "+ backward": backward}
 
 
 def print_steps(scene: GaussianScene, X_WC: RigidTransform) -> None:
     levels = _native.simd_levels()
-    cases: list[tuple] = [(size, levels[0], None, rasterize) for size in SIZES]
+    cases: list[tuple] = [("RGB", size, levels[0], None, rasterize) for size in SIZES]
     if len(scene) == COUNTS[0]:
-        cases += [((320, 240), level, None, rasterize) for level in levels[1:]]
-        cases += [((320, 240), levels[0], degree, rasterize) for degree in (0, 1, 2, 3)]
-        cases += [(size, levels[0], None, rasterize_surfels) for size in SIZES]
-    for size, simd, degree, draw in cases:
+        cases += [("RGB", (320, 240), level, None, rasterize) for level in levels[1:]]
+        cases += [("SH 3", (320, 240), levels[0], 3, rasterize)]
+        cases += [("surfels", (320, 240), levels[0], None, rasterize_surfels)]
+    for name, size, simd, degree, draw in cases:
         calls = step_calls(scene, X_WC, size, simd, degree, draw)
-        times = [f"{milliseconds(call)[0]:.2f}" for call in calls.values()]
-        what = (
-            "surfels" if draw is rasterize_surfels else "RGB" if degree is None else f"SH {degree}"
-        )
-        row(f"{len(scene):,}", f"{size[0]}x{size[1]}", what, simd, *times)
+        times = [f"{milliseconds(call):.2f}" for call in calls.values()]
+        row(f"{len(scene):,}", f"{size[0]}x{size[1]}", name, simd, *times)
 
 
 def print_baked(scene: GaussianScene, X_WC: RigidTransform) -> None:
-    header("RGB+MD without gradients", "rasterize", "baked", "gain")
+    header("RGB and median depth, no gradients", "rasterize", "baked")
     baked, renderer = BakedScene(scene), create_renderer()
     for width, height in SIZES:
         viewmats, Ks = camera_tensors(X_WC, width, height)
         arguments: dict[str, Any] = scene_tensors(scene) | {"viewmats": viewmats, "Ks": Ks}
         arguments |= {"width": width, "height": height, "render_mode": "RGB+MD"}
         arguments["renderer"] = renderer
-        K = intrinsics(width, height)
-        plain, _ = milliseconds(lambda arguments=arguments: rasterize(**arguments))
-        fast, _ = milliseconds(lambda K=K, w=width, h=height: baked.render(K, w, h, X_WC))
-        row(f"{width}x{height}", f"{plain:.2f}", f"{fast:.2f}", f"{plain / fast:.2f}")
+        camera = intrinsics(width, height), width, height, X_WC
+        calls = (lambda a=arguments: rasterize(**a)), (lambda c=camera: baked.render(*c))
+        row(f"{width}x{height}", *(f"{milliseconds(call):.2f}" for call in calls))
 
 
 def print_depth() -> None:
@@ -118,7 +120,7 @@ def print_depth() -> None:
                 calls.append(
                     lambda c=camera, w=world, m=limit: w.baked.render_depth(*c, max_depth=m)
                 )
-            row(name, f"{width}x{height}", *(f"{milliseconds(call)[0]:.2f}" for call in calls))
+            row(name, f"{width}x{height}", *(f"{milliseconds(call):.2f}" for call in calls))
 
 
 def print_lenses(scene: GaussianScene, X_WC: RigidTransform) -> None:
@@ -130,7 +132,7 @@ def print_lenses(scene: GaussianScene, X_WC: RigidTransform) -> None:
         "fisheye": Distortion("fisheye", [0.04, -0.01]),
     }
     for name, lens in lenses.items():
-        ms, _ = milliseconds(lambda lens=lens: baked.render(K, 320, 240, X_WC, distortion=lens))
+        ms = milliseconds(lambda lens=lens: baked.render(K, 320, 240, X_WC, distortion=lens))
         row(name, f"{ms:.2f}")
 
 
@@ -142,7 +144,7 @@ def main() -> None:
     calls = step_calls(scene, X_WC, (320, 240))
     peaks = ", ".join(f"{label} {peak_growth(call):.0f} MiB" for label, call in calls.items())
     print(f"{scene_name()}; peak growth of resident memory in first calls at 320x240: {peaks}")
-    header("Gaussians", "size", "color", "SIMD", "forward", "+ backward", "+ Adam")
+    header("Gaussians", "size", "color", "SIMD", "forward", "+ backward")
     for count in COUNTS:
         print_steps(*load_scene(count))
     print_baked(scene, X_WC)

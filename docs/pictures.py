@@ -26,7 +26,7 @@ from splatpilot.diagrams.flight.sensors import make_camera
 from splatpilot.diagrams.scenarios import benchmark_scenarios
 from splatpilot.diagrams.worlds.world_registry import is_procedural, make_world
 from splatpilot.systems.common.config import load_config
-from splatpilot.systems.sensing.noise import ObservationNoise, expose, image_generator
+from splatpilot.systems.sensing.noise import ObservationNoise, expose
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.splats.splat_camera import color_pixels
 from splatpilot.systems.vehicle.state import pose_from_state
@@ -87,7 +87,7 @@ def sensor(out: Path) -> None:
     views = [camera.render(X_WB), camera.render(X_WB, 0.0, turned)]
     still, rolled = (color_pixels(view.color) for view in views)
     night = ObservationNoise(exposure_error=4.0, full_well=8000.0, read_noise=8.0)
-    grain = image_generator(0, 0).standard_normal(still.shape)
+    grain = np.random.default_rng([0, 0]).standard_normal(still.shape)
     dim = expose(still.astype(float), night, -1.0, grain).astype(np.uint8)
     save(np.hstack([still, rolled, dim]), out)
 

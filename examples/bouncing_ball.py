@@ -27,13 +27,13 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import LogVectorOutput
 
 import splatpilot as sp
-from splatpilot.diagrams.worlds.world_registry import place_config
+from splatpilot.diagrams.worlds.world_registry import scene_config
 
 RADIUS = 0.15  # [m]
 
 
 def main(place: Path | None, seconds: float, out: Path) -> None:
-    world = sp.make_world(sp.Scenario().world if place is None else place_config(place), seed=0)
+    world = sp.make_world(sp.Scenario().world if place is None else scene_config(place), seed=0)
     builder = DiagramBuilder()
     plant, _ = AddMultibodyPlantSceneGraph(builder, time_step=1e-3)
     rigid, elastic = ProximityProperties(), ProximityProperties()

@@ -391,7 +391,7 @@ def read_scenario(options: argparse.Namespace) -> "Scenario":
     from splatpilot.diagrams.flight.policies import DEFAULT_SPEED, at_speed
     from splatpilot.diagrams.flight.scenario import Scenario
     from splatpilot.diagrams.scenarios import scenario_file
-    from splatpilot.diagrams.worlds.world_registry import place_config
+    from splatpilot.diagrams.worlds.world_registry import scene_config
     from splatpilot.systems.common.config import load_config
 
     file = None if options.scenario is None else scenario_file(options.scenario)
@@ -401,7 +401,7 @@ def read_scenario(options: argparse.Namespace) -> "Scenario":
     if options.speed is not None:
         scenario.policy = at_speed(scenario.policy, options.speed)
     if options.scene is not None:
-        scenario.world = place_config(require_scene(str(options.scene)).absolute())
+        scenario.world = scene_config(require_scene(str(options.scene)).absolute())
     if options.seed is not None:
         scenario.seed = options.seed
     return load_config(scenario, overrides=options.overrides)

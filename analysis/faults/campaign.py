@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -46,24 +47,19 @@ def run(*, config: FaultsConfig, out: Path) -> dict[str, Any]:
     Flies the trials, or resumes an interrupted campaign of the same configuration.
 
     Writes into `out`: `trials.jsonl`, results of `fly_trial`; `config.yaml`; `summary.json`, the
-    number of safe trials and the outcomes by the type of fault.
-
-    Returns:
-        The content of `summary.json`.
+    number of safe trials and the outcomes by the type of fault, which is also returned.
     """
     config.validate()
     claim_folder(out / "config.yaml", config)
     lines = out / "trials.jsonl"
     rows = [json.loads(line) for line in lines.read_text().splitlines()] if lines.exists() else []
-    worlds: dict[int, Any] = {}
+    world_of_seed = cache(lambda seed: make_world(config.scenario.world, seed))
     for number in Progress(range(len(rows), config.trials), "flying trials", unit="trial"):
-        world_seed = config.seed + number % config.worlds
-        if world_seed not in worlds:
-            worlds[world_seed] = make_world(config.scenario.world, world_seed)
+        world = world_of_seed(config.seed + number % config.worlds)
         trial = Trial.sample(number, np.random.default_rng([config.seed, number]))
         seed, policy = config.seed + number, policy_named(trial.policy, config.speed)
         scenario = replace(config.scenario, seed=seed, policy=policy)
-        rows.append(fly_trial(scenario, worlds[world_seed], trial, config.limits, seed))
+        rows.append(fly_trial(scenario, world, trial, config.limits, seed))
         with written_atomically(lines) as path:
             path.write_text("".join(json.dumps(row) + "\n" for row in rows))
     summary = summarize(rows)

@@ -4,7 +4,9 @@ import heapq
 import math
 import socket
 import struct
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import Any, cast
 
 import numpy as np
@@ -21,59 +23,50 @@ from splatpilot.diagrams.flight.flight import (
 )
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.hardware.bridge import BuildHardwareDiagram, HardwareConfig, image_codecs
+from splatpilot.diagrams.hardware.real_time import output
 from splatpilot.diagrams.hardware.vehicle import BuildVehicleDiagram
 from splatpilot.diagrams.worlds.world import World
-from splatpilot.systems.common.drake import weakly
+from splatpilot.systems.common.drake import vector_input, weakly
+from splatpilot.systems.messaging import codecs
 from splatpilot.systems.messaging.bridge_status import UnixClock
-from splatpilot.systems.messaging.codecs import (
-    Codec,
-    CommandCodec,
-    MotionCaptureCodec,
-    StateCodec,
-    VehicleStatusCodec,
-    VelocitySetpointCodec,
-)
 from splatpilot.systems.messaging.failsafe import FailsafeConfig
 from splatpilot.systems.messaging.flight_limits import FlightLimits
 from splatpilot.systems.messaging.generated import lcmt_bridge_status as status
 from splatpilot.systems.messaging.lcm_ports import PUBLISH_OFFSET
-from splatpilot.systems.messaging.receiver import UdpConfig
-from splatpilot.systems.messaging.tof_receiver import TimeOfFlightReceiver, TimeOfFlightStream
+from splatpilot.systems.messaging.receiver import TimeOfFlightStream, UdpConfig
 from splatpilot.systems.sensing.time_of_flight import GRID_MAGIC
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 from splatpilot.systems.vehicle.state import QuadrotorState
 
 KINDS = (
-    "dropped",
-    "delayed",
-    "duplicated",
-    "reordered",
-    "clock_jump",
-    "state_frozen",
-    "state_jumped",
-    "body_lost",
-    "body_dropped",
-    "grid_dropped",
-    "grid_corrupt",
-    "policy_nonsense",
-    "policy_raises",
-    "policy_stalled",
-    "policy_killed",
-    "not_finite",
-    "corrupt",
+    *("dropped", "delayed", "duplicated", "reordered", "clock_jump"),
+    *("state_frozen", "state_jumped", "body_lost", "body_dropped", "grid_dropped", "grid_corrupt"),
+    *("policy_nonsense", "policy_raises", "policy_stalled", "policy_killed"),
+    *("not_finite", "corrupt"),
 )
-"""Types of faults: messages are dropped, 300 ms late, sent twice, or overtake each other; the
-vehicle's clock jumps; its state is constant, or meters off; motion capture loses the vehicle, or
-its messages are dropped; packets of the time-of-flight sensor are dropped, or have flipped bits;
-the policy outputs nonsense or raises exceptions, its process stalls or ends; messages contain NaN,
-or have flipped bits.
+"""Types of faults. Clocks, states and grids are the vehicle's. Messages that are "not_finite"
+contain NaN, those that are "corrupt" are truncated and have flipped bits.
 
 Of two faults, the earlier one here is applied first: messages are decoded before corruption."""
 
-DELAY = 0.3
-"""[s] of delayed messages."""
+DELAY = 0.3  # [s] of delayed messages.
+TICK = 0.01  # [s] of both diagrams.
+
+_PORTS = {
+    **{"body_lost": "motion_capture_pose", "body_dropped": "motion_capture_pose"},
+    **{"grid_dropped": "depth_grid", "grid_corrupt": "depth_grid"},
+    **{"state_frozen": "state", "state_jumped": "state"},
+}
+"""Faults of one signal."""
 
 _FOREVER = 1e6  # [s]
+_SETTLING = 4.0  # [s] after the fault, until the vehicle is at rest or continues.
+_LATEST = 12.0  # [s], the end of a trial.
+_RESTING = 0.35  # [m/s]
+_SLACK = 1.1  # [-] tolerance of speed and tilt, and
+_TOLERANCE = 0.01  # [m] of distances.
+_BODY = "vehicle"
+_SAFE = "goal", "hover", "landing", "landed", "flies on"  # outcomes
 
 
 @dataclass(frozen=True)
@@ -124,18 +117,6 @@ class Trial:
         return cls(faults, policy, ("velocity", "body_rates")[turn % 2])
 
 
-class GridStream:
-    """Sends a sensor's packets by UDP to a port of this host."""
-
-    def __init__(self, port: int) -> None:
-        self._port = port
-
-    def publish(self, _: str, data: bytes) -> None:
-        """Sends a packet."""
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
-            out.sendto(data, ("127.0.0.1", self._port))
-
-
 class Relay:
     """
     Carries messages between two LCMs, with faults.
@@ -143,28 +124,27 @@ class Relay:
     Args:
         vehicle, bridge: transports of either.
         from_vehicle, from_bridge: codecs of their messages.
-        faults: of the trial.
-        random: source of randomness.
-        grids: replaces the LCM for grids of the vehicle.
+        grid_port: of UDP, to which grids are sent as packets of the sensor, instead of to LCM.
     """
 
     def __init__(
         self,
         vehicle: LCM,
         bridge: LCM,
-        from_vehicle: list[Codec],
-        from_bridge: list[Codec],
+        from_vehicle: list[codecs.Codec],
+        from_bridge: list[codecs.Codec],
         faults: tuple[Fault, ...],
         random: np.random.Generator,
-        grids: GridStream | None = None,
+        grid_port: int | None = None,
     ) -> None:
-        self._faults, self._random, self._grids = faults, random, grids
+        self._faults, self._random, self._grid_port = faults, random, grid_port
         self._ends, self._count, self._now = (vehicle, bridge), 0, 0.0
-        self._waiting: list[tuple[float, int, LCM | GridStream, str, bytes]] = []
-        self._state: Any = None
-        for sender, codecs in ((vehicle, from_vehicle), (bridge, from_bridge)):
-            for codec in codecs:
-                sender.subscribe(codec.channel, self._taker(codec, sender is vehicle))
+        self._waiting: list[tuple[float, int, Callable[[bytes], None], bytes]] = []
+        self._state: bytes | None = None  # that is frozen
+        take = weakly(self._take)  # The relay owns LCM, which owns its callbacks.
+        for sender, signals in ((vehicle, from_vehicle), (bridge, from_bridge)):
+            for codec in signals:
+                sender.subscribe(codec.channel, partial(take, codec, sender is vehicle))
 
     def step(self, now: float) -> None:
         """Receives messages, and delivers those that are due at a time [s]."""
@@ -173,18 +153,17 @@ class Relay:
             while end.handle_timeout(0):
                 pass
         while self._waiting and self._waiting[0][0] <= now:
-            _, _, receiver, channel, data = heapq.heappop(self._waiting)
-            receiver.publish(channel, data)
+            _, _, send, data = heapq.heappop(self._waiting)
+            send(data)
 
-    def _taker(self, codec: Codec, from_vehicle: bool):
-        # The relay owns LCM, which owns its callbacks.
-        take = weakly(self._take)
-        return lambda channel, data: take(codec, from_vehicle, channel, data)
+    def _send_grid(self, packet: bytes) -> None:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
+            out.sendto(packet, ("127.0.0.1", self._grid_port))
 
-    def _take(self, codec: Codec, from_vehicle: bool, channel: str, data: bytes) -> None:
-        receiver: LCM | GridStream = self._ends[1 if from_vehicle else 0]
-        if codec.port == "depth_grid" and self._grids is not None:
-            receiver, message = self._grids, codec.message.decode(data)
+    def _take(self, codec: codecs.Codec, from_vehicle: bool, channel: str, data: bytes) -> None:
+        send = partial(self._ends[1 if from_vehicle else 0].publish, channel)
+        if codec.port == "depth_grid" and self._grid_port is not None:
+            send, message = self._send_grid, codec.message.decode(data)
             head = GRID_MAGIC, message.header.seq, message.header.utime * 1000
             data = struct.pack(f"<IIQ{message.num_values}f", *head, *message.values)
         copies = [(0.0, data)]
@@ -192,38 +171,39 @@ class Relay:
             copies = [
                 (delay + later, changed)
                 for delay, sent in copies
-                for later, changed in self._treat(fault, codec, sent, from_vehicle)
+                for later, changed in self._apply(fault, codec, sent, from_vehicle)
             ]
         for delay, sent in copies:
             self._count += 1
-            due = self._now + delay
-            heapq.heappush(self._waiting, (due, self._count, receiver, channel, sent))
+            heapq.heappush(self._waiting, (self._now + delay, self._count, send, sent))
 
-    def _treat(
-        self, fault: Fault, codec: Codec, data: bytes, from_vehicle: bool
+    def _apply(
+        self, fault: Fault, codec: codecs.Codec, data: bytes, from_vehicle: bool
     ) -> list[tuple[float, bytes]]:
         """Applies a fault to a message; returns delays [s] and contents of its copies."""
         random, is_on, unchanged = self._random, fault.is_on(self._now), [(0.0, data)]
+        is_affected = codec.port == _PORTS.get(fault.kind, codec.port)
+
+        def edited(edit: Callable[[Any], object]) -> list[tuple[float, bytes]]:
+            message = codec.message.decode(data)
+            edit(message)
+            return [(0.0, message.encode())]
+
         if fault.kind == "clock_jump" and from_vehicle and codec.port != "depth_grid":
-            jump = round(fault.size * 1e6) if self._now >= fault.begin else 0
-            return [(0.0, self._changed(codec, data, utime=jump))]
-        if fault.kind == "state_frozen" and codec.port == "state":
-            self._state = (self._state or codec.message.decode(data)) if is_on else None
-            return [(0.0, self._changed(codec, data, like=self._state))]
+            jump = round(fault.size * 1e6) if self._now >= fault.begin else 0  # [us]
+            return edited(lambda m: setattr(m.header, "utime", m.header.utime + jump))
+        if fault.kind == "state_frozen" and is_affected:
+            message = codec.message.decode(data)
+            self._state = (self._state or data) if is_on else None
+            frozen = codec.message.decode(self._state or data)
+            frozen.header = message.header
+            return [(0.0, frozen.encode())]
         if not is_on:
             return unchanged
-        if fault.kind == "state_jumped" and codec.port == "state":
-            moved = math.copysign(1.0 + 2.0 * fault.fraction, fault.size)  # [m]
-            return [(0.0, self._changed(codec, data, moved=moved))]
-        if random.random() > fault.fraction:
-            return unchanged
-        affected_port = {
-            "body_lost": "motion_capture_pose",
-            "body_dropped": "motion_capture_pose",
-            "grid_dropped": "depth_grid",
-            "grid_corrupt": "depth_grid",
-        }.get(fault.kind, codec.port)
-        if codec.port != affected_port:
+        if fault.kind == "state_jumped" and is_affected:
+            jump = math.copysign(1.0 + 2.0 * fault.fraction, fault.size)  # [m]
+            return edited(lambda m: setattr(m, "p_WB", np.add(m.p_WB, [0.0, jump, 0.0])))
+        if random.random() > fault.fraction or not is_affected:
             return unchanged
         match fault.kind:
             case "dropped" | "body_dropped" | "grid_dropped":
@@ -235,49 +215,16 @@ class Relay:
             case "reordered":
                 return [(float(random.uniform(0.0, DELAY)), data)]
             case "body_lost":
-                return [(0.0, self._changed(codec, data, tracked=False))]
+                return edited(lambda m: setattr(m, "tracked", False))
             case "corrupt" | "grid_corrupt":
                 broken = bytearray(data[: random.integers(0, len(data) + 1)])
                 for index in random.integers(0, max(len(broken), 1), 8) if broken else ():
                     broken[index] ^= 1 << int(random.integers(8))
                 return [(0.0, bytes(broken))]
-            case "not_finite":
-                # Any number becomes NaN.
-                place = 8 * int(random.integers(1, max(len(data) // 8, 2)))
-                spoilt = data[: place - 4] + struct.pack(">d", math.nan) + data[place + 4 :]
-                return [(0.0, spoilt)]
+            case "not_finite":  # Any number becomes NaN.
+                at = 8 * int(random.integers(1, max(len(data) // 8, 2))) - 4
+                return [(0.0, data[:at] + struct.pack(">d", math.nan) + data[at + 8 :])]
         return unchanged
-
-    def _changed(
-        self,
-        codec: Codec,
-        data: bytes,
-        utime: int = 0,
-        like: Any = None,
-        moved: float = 0.0,
-        tracked: bool = True,
-    ) -> bytes:
-        """Shifts the time of a message [us], copies another, moves it [m] or loses track."""
-        message = codec.message.decode(data)
-        message.header.utime += utime
-        if like is not None:
-            header = message.header
-            message = codec.message.decode(like.encode())
-            message.header = header
-        if moved:
-            message.p_WB = np.add(message.p_WB, [0.0, moved, 0.0])
-        if not tracked:
-            message.tracked = False
-        return message.encode()
-
-
-TICK = 0.01  # [s]
-_SETTLING = 4.0  # [s] after the fault, until the vehicle is at rest or continues.
-_LATEST = 12.0  # [s], the end of a trial.
-_RESTING = 0.35  # [m/s]
-_SLACK = 1.1  # [-] tolerance of speed and tilt, and
-_TOLERANCE = 0.01  # [m] of distances.
-_BODY = "vehicle"
 
 
 class Nonsense(LeafSystem):
@@ -290,15 +237,16 @@ class Nonsense(LeafSystem):
         self.DeclareVectorOutputPort("decision", 3, self._calc)
 
     def _calc(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(np.asarray(self.get_input_port().Eval(context)))
+        target = vector_input(self, "sense", context)
         for fault in self._faults:
             if fault.kind == "policy_raises" and fault.is_on(context.get_time()):
                 raise RuntimeError("the policy fails")
             if fault.kind == "policy_nonsense" and fault.is_on(context.get_time()):
-                output.SetFromVector(np.full(3, 1e6 if fault.fraction > 0.65 else np.nan))
+                target = np.full(3, 1e6 if fault.fraction > 0.65 else np.nan)
+        output.SetFromVector(target)
 
 
-def spoilt_policy(scenario: Scenario, world: World, faults: tuple[Fault, ...]) -> Diagram:
+def _spoilt_policy(scenario: Scenario, world: World, faults: tuple[Fault, ...]) -> Diagram:
     """Builds the scenario's policy of accelerations or velocities with `Nonsense` after it."""
     builder = DiagramBuilder()
     policy = builder.AddNamedSystem("policy", make_policy(scenario, world))
@@ -325,7 +273,7 @@ def fly_trial(
         [m] and `min_inside` [m], the distance of the collision sphere from the fence; `outcome`;
         the bridge's `reasons`; and `safe`.
     """
-    faults = trial.faults
+    # Vehicle, bridge and relay.
     config = HardwareConfig(
         tick=TICK,
         setpoints=trial.setpoints,
@@ -333,89 +281,82 @@ def fly_trial(
         time_of_flight=TimeOfFlightStream(UdpConfig(port=0)),
         failsafe=FailsafeConfig(limits=limits),
     )
-    lcm, far = LCM("memq://"), LCM("memq://")
-    policy = spoilt_policy(scenario, world, faults)
-    vehicle = BuildVehicleDiagram(scenario, world, lcm, config)
+    near, far, faults = LCM("memq://"), LCM("memq://"), trial.faults
+    policy = _spoilt_policy(scenario, world, faults)
+    vehicle = BuildVehicleDiagram(scenario, world, near, config)
     bridge = BuildHardwareDiagram(scenario, world, far, config, policy=policy)
-    images = image_codecs(scenario, policy)
-    grids = None
+    grid_port = None
     if bridge.HasSubsystemNamed("depth_grid_receiver"):
-        receiver = bridge.GetSubsystemByName("depth_grid_receiver")
-        grids = GridStream(cast(TimeOfFlightReceiver, receiver).port)
-    relay = Relay(
-        lcm,
-        far,
-        [StateCodec(), VehicleStatusCodec(), MotionCaptureCodec(_BODY), *images],
-        [CommandCodec(), VelocitySetpointCodec()],
-        faults,
-        np.random.default_rng(seed),
-        grids,
+        grid_port = cast(Any, bridge.GetSubsystemByName("depth_grid_receiver")).port
+    sent = [codecs.StateCodec(), codecs.VehicleStatusCodec(), codecs.MotionCaptureCodec(_BODY)]
+    sent += image_codecs(scenario, policy)
+    commands = [codecs.CommandCodec(), codecs.VelocitySetpointCodec()]
+    relay = Relay(near, far, sent, commands, faults, np.random.default_rng(seed), grid_port)
+    vehicle_simulator, bridge_simulator = Simulator(vehicle), Simulator(bridge)
+    ApplySimulatorConfig(scenario.simulator, vehicle_simulator)
+    root, bridge_root = (
+        simulator.get_mutable_context() for simulator in (vehicle_simulator, bridge_simulator)
     )
-    simulators = {"vehicle": Simulator(vehicle), "bridge": Simulator(bridge)}
-    ApplySimulatorConfig(scenario.simulator, simulators["vehicle"])
-    root = simulators["vehicle"].get_mutable_context()
     plant = vehicle.GetSubsystemByName("plant").GetMyMutableContextFromRoot(root)
     plant.SetContinuousState(sample_initial_state(scenario, world))
     autopilot = vehicle.GetSubsystemByName("failsafe")
-    autopilot_context = autopilot.GetMyContextFromRoot(root)
+    clock = cast(UnixClock, bridge.GetSubsystemByName("clock"))
+
+    # Flight.
     p_WG, field = goal_position(scenario, world), world.distance_field
-    measured = {"max_speed": 0.0, "max_tilt": 0.0, "min_clearance": np.inf, "min_inside": np.inf}
-    reasons: set[int] = set()
+    max_speed, max_tilt, min_clearance, min_inside = 0.0, 0.0, math.inf, math.inf
+    reasons, outcome, mode, stalled = set[int](), None, status.WAITING, 0.0
     last = max(fault.begin + min(fault.duration, 4.0) for fault in faults)
     end = min(last + _SETTLING, _LATEST)
-    ended, mode, stalled = "", status.WAITING, 0.0
     for tick in range(round(end / TICK)):
         now = tick * TICK
-        simulators["vehicle"].AdvanceTo(now + 2 * PUBLISH_OFFSET)
+        vehicle_simulator.AdvanceTo(now + 2 * PUBLISH_OFFSET)
         relay.step(now)
         # A stalled process loses time.
         if any(f.kind in ("policy_killed", "policy_stalled") and f.is_on(now) for f in faults):
             stalled += TICK
         else:
-            simulators["bridge"].AdvanceTo(now - stalled + 2 * PUBLISH_OFFSET)
-            clock = cast(UnixClock, bridge.GetSubsystemByName("clock"))
-            bridge_root = simulators["bridge"].get_mutable_context()
-            clock.set_epoch(clock.GetMyMutableContextFromRoot(bridge_root), stalled)
-            mode, reason = np.asarray(bridge.GetOutputPort("status").Eval(bridge_root))[:2]
+            bridge_simulator.AdvanceTo(now - stalled + 2 * PUBLISH_OFFSET)
+            clock.set_epoch(bridge_root, stalled)
+            mode, reason = output(bridge, "status", bridge_root)[:2]
             reasons.add(int(reason))
-        state = QuadrotorState.of(np.asarray(vehicle.GetOutputPort("state").Eval(root)))
-        measured["max_speed"] = max(measured["max_speed"], float(np.linalg.norm(state.v_WB)))
-        measured["max_tilt"] = max(measured["max_tilt"], float(state.tilt))
+        state = QuadrotorState.of(output(vehicle, "state", root))
+        max_speed = max(max_speed, float(np.linalg.norm(state.v_WB)))
+        max_tilt = max(max_tilt, float(state.tilt))
         if has_landed(vehicle, root):
-            ended = Outcome.LANDED
+            outcome = Outcome.LANDED
             break
-        by_itself = np.asarray(autopilot.GetOutputPort("mode").Eval(autopilot_context))[0]
-        if status.LANDING not in (mode, by_itself):
-            clearance = float(np.asarray(vehicle.GetOutputPort("clearance").Eval(root))[0])
+        autopilot_context = autopilot.GetMyContextFromRoot(root)
+        own_mode = np.asarray(autopilot.GetOutputPort("mode").Eval(autopilot_context))[0]
+        if status.LANDING not in (mode, own_mode):
+            min_clearance = min(min_clearance, float(output(vehicle, "clearance", root)[0]))
             to_fence = np.min([state.p_WB - field.lower_W, field.upper_W - state.p_WB])
-            for name, value in (
-                ("min_clearance", clearance),
-                ("min_inside", float(to_fence) - VEHICLE_RADIUS),
-            ):
-                measured[name] = min(measured[name], value)
+            min_inside = min(min_inside, float(to_fence) - VEHICLE_RADIUS)
         outcome = flight_outcome(vehicle, root, p_WG, scenario.goal_radius)
         if outcome is not None:
-            ended = outcome
             break
-    if not ended:
-        v_WB = QuadrotorState.of(np.asarray(vehicle.GetOutputPort("state").Eval(root))).v_WB
-        if np.linalg.norm(v_WB[:2]) < _RESTING and v_WB[2] < _RESTING:
-            ended = "hover" if abs(v_WB[2]) < _RESTING else "landing"
-        else:
-            is_on = any(fault.is_on(end) for fault in faults)
-            ended = "flies on" if mode == status.FLYING and not is_on else "adrift"
+
+    # Result.
+    v_WB = QuadrotorState.of(output(vehicle, "state", root)).v_WB
+    if outcome is not None:
+        ended = str(outcome)
+    elif np.linalg.norm(v_WB[:2]) < _RESTING and v_WB[2] < _RESTING:
+        ended = "hover" if abs(v_WB[2]) < _RESTING else "landing"
+    else:
+        is_on = any(fault.is_on(end) for fault in faults)
+        ended = "flies on" if mode == status.FLYING and not is_on else "adrift"
     kept = (
-        measured["max_speed"] <= _SLACK * limits.max_speed
-        and measured["max_tilt"] <= _SLACK * limits.max_tilt
-        and measured["min_clearance"] >= limits.min_clearance - _TOLERANCE
-        and measured["min_inside"] >= -_TOLERANCE
+        max_speed <= _SLACK * limits.max_speed
+        and max_tilt <= _SLACK * limits.max_tilt
+        and min_clearance >= limits.min_clearance - _TOLERANCE
+        and min_inside >= -_TOLERANCE
     )
-    safe = ("goal", "hover", "landing", "landed", "flies on")
     return {
         **asdict(trial),
         "seed": seed,
-        **measured,
+        **{"max_speed": max_speed, "max_tilt": max_tilt},
+        **{"min_clearance": min_clearance, "min_inside": min_inside},
         "reasons": sorted(reasons - {status.NONE}),
-        "outcome": str(ended),
-        "safe": bool(kept and ended in safe),
+        "outcome": ended,
+        "safe": bool(kept and ended in _SAFE),
     }

@@ -1,4 +1,4 @@
-"""Fidelity of scenes off the path of their capture: the study of the paper's Fig. 7.
+"""Fidelity of scenes off the path of their capture, the study of the paper's Fig. 7.
 
 Compares views beside the path with the truth: rendered, if the capture was rendered from a world,
 or stretches of frames that a reconstruction for this study leaves out. The result bounds how far
@@ -25,13 +25,7 @@ from splatpilot.analysis.fidelity.study import (
     first_crossing,
 )
 from splatpilot.analysis.output import write_csv, write_png
-from splatpilot.analysis.reconstruction.figures import (
-    Panel,
-    depth_panels,
-    depth_scale,
-    error_scale,
-    write_grid,
-)
+from splatpilot.analysis.reconstruction.figures import depth_scale, error_scale, write_grid
 from splatpilot.analysis.reconstruction.measure_scene import SceneViews
 from splatpilot.diagrams.worlds.scene_folder import (
     SceneMetadata,
@@ -43,30 +37,31 @@ from splatpilot.systems.common.config import dump_config
 from splatpilot.systems.common.files import claim_folder, holds_folder, written_atomically
 from splatpilot.systems.common.progress import Progress, resumable
 from splatpilot.systems.common.validation import Config, bounded, require_field
-from splatpilot.training.captures.capture import CaptureFrame
+from splatpilot.training.captures.capture import CaptureFrame, shrink
 from splatpilot.training.captures.render import true_camera
 from splatpilot.training.reconstruction.checkpoint import kept_work
 from splatpilot.training.reconstruction.config import ReconstructConfig
-from splatpilot.training.reconstruction.metrics import fit_exposure, mean_metric
+from splatpilot.training.reconstruction.metrics import mean_metric
 from splatpilot.training.reconstruction.reconstruct import reconstruct
 
 TrueCamera = Callable[[RigidTransform], CaptureFrame]
 """Renders the true frame of a capture's camera at another pose."""
 
 _RECIPE = "reconstruct.yaml"
-_STEP = 0.1  # [m], between displacements of a pose that are tried
+_METRICS = ("psnr_db", "depth_mae_m", "depth_relative", "floater_fraction")
+_STEP = 0.1  # [m], between displacements of a pose
 _MAX_COLUMNS = 6  # of the image grid
 _ERROR_LIMIT = 0.2  # [m], brightest color of depth errors
 
 
 @dataclass(kw_only=True)
 class FidelityConfig(Config):
-    """What a study tries, and the limits of trusted views."""
+    """Views of a study, and the limits of trusted ones."""
 
     offsets: list[float] = bounded(
         lambda: [0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0], "[0, inf) m"
     )
-    """[m], to the left and right of the path, if the truth can be rendered."""
+    """[m], left and right of the path, if the truth can be rendered."""
     clearance: float = bounded(0.2, "(0, inf) m")
     """[m], minimum distance of displaced cameras from obstacles."""
     stretches: list[int] = bounded(lambda: [1, 3, 7, 13], "[1, inf)")
@@ -78,7 +73,7 @@ class FidelityConfig(Config):
     max_psnr_drop: float = bounded(6.0, "(0, inf) dB")
     """[dB] below the held-out frames on the path; 6 dB are twice the error."""
     reconstruct: ReconstructConfig = field(default_factory=ReconstructConfig)
-    """How to reconstruct without the held-out frames."""
+    """Reconstruction without the held-out frames."""
 
     def check(self) -> None:
         rising = self.offsets and sorted(set(self.offsets)) == self.offsets
@@ -107,18 +102,8 @@ def run(
 
     `out` gets `fidelity.png`, `fidelity.csv`, an image grid of each scene, and `fidelity.yaml` with
     the study. Reconstructions without held-out frames are in `out/SCENE`, and used again.
-
-    Args:
-        scenes: folders.
-        out: folder of the study.
-        config: of the study.
-        find_camera: returns the camera that renders the truth of a capture's folder, or None.
-        overwrite: whether to replace another study in `out` and in the scenes.
-
-    Raises:
-        FileNotFoundError, ValueError, OSError: for a scene that is damaged, has no capture with
-            depth, bounds of another study, or the name of another one; something else in `out`, or
-            a folder that cannot be written.
+    `find_camera` returns the camera that renders the truth of a capture's folder, or None.
+    `overwrite` replaces another study in `out` and in the scenes.
     """
     config.validate()
     names = [scene.resolve().name for scene in scenes]
@@ -176,13 +161,14 @@ def study_scene(
     support = _support(views)
     samples, shown = [], []
     for i, offset, frame in frames:
-        frame = views.shrink(frame)
-        found = views.measure(frame)
-        if found.depth_mae_m is None:
+        frame = shrink(frame, views.factor)
+        found = vars(views.measure(frame))
+        if found["depth_mae_m"] is None:
             continue
         if offset is None:
             offset = support.distance(frame.X_WC.translation())
-        samples.append(Sample.of(i, offset, 1 - support.of(frame.X_WC), found))
+        metrics = {name: found[name] for name in _METRICS}
+        samples.append(Sample(i, offset, 1 - support.fraction(frame.X_WC), **metrics))
         shown.append(frame)
     if len(samples) < 2:
         raise ValueError(
@@ -192,7 +178,7 @@ def study_scene(
     write_views(out.with_name(f"{out.name}_views.png"), views, samples, shown)
     return FidelityStudy(
         name=out.name,
-        kind="withheld" if camera is None else "rendered",
+        kind="held-out" if camera is None else "rendered",
         on_path_psnr_db=on_path_psnr_db,
         samples=samples,
         max_depth_error=config.max_depth_error,
@@ -200,35 +186,23 @@ def study_scene(
     )
 
 
-def pose_bounds(views: SceneViews, study: FidelityStudy) -> list[float]:
-    """Returns the maximum displacement [m] of each pose of the capture.
+def store_bounds(scene: Path, study: FidelityStudy) -> SceneMetadata:
+    """Writes the maximum displacement [m] of each pose of the capture, and of all poses, into
+    `scene.yaml`.
 
     A pose may move left, right, up and down while its view keeps within the study's limit of unseen
-    pixels, at most as far as was measured.
+    pixels, at most as far as was measured. The bound of all poses is the study's reach if the truth
+    was rendered, and otherwise the median over the poses: holding frames out removes views, too.
     """
-    support = _support(views)
+    views = SceneViews(scene)
+    support, X_WCs = _support(views), views.capture.X_WCs
     farthest = study.column("offset").max()
     grid = np.append(np.arange(0, farthest - 1e-9, _STEP), farthest)
     bounds = []
-    X_WCs = views.capture.X_WCs
     for i in Progress(range(len(X_WCs)), "finding bounds", unit="pose"):
         sides = zip(*(displace_pose(X_WCs, i, offset) for offset in grid), strict=True)
-        bounds.append(
-            min(
-                first_crossing(grid, (1 - support.of(X_WC) for X_WC in side), study.unseen_limit)
-                for side in sides
-            )
-        )
-    return bounds
-
-
-def store_bounds(scene: Path, study: FidelityStudy) -> SceneMetadata:
-    """Writes the perturbation bounds of each pose, and of all poses, into `scene.yaml`.
-
-    The latter is the study's reach if the truth was rendered. Held-out frames give no such reach,
-    because leaving them out removes views; then it is the median over the poses.
-    """
-    bounds = pose_bounds(SceneViews(scene), study)
+        unseen = ((1 - support.fraction(X_WC) for X_WC in side) for side in sides)
+        bounds.append(min(first_crossing(grid, values, study.unseen_limit) for values in unseen))
     metadata = replace(
         read_scene_metadata(scene),
         perturbation_bound=study.reach if study.kind == "rendered" else float(np.median(bounds)),
@@ -240,7 +214,8 @@ def store_bounds(scene: Path, study: FidelityStudy) -> SceneMetadata:
 
 def _support(views: SceneViews) -> ViewSupport:
     capture = views.capture
-    return ViewSupport(views.renderer, capture.K, capture.width, capture.height, views.fitted_poses)
+    camera = capture.K, capture.width, capture.height
+    return ViewSupport(views.renderer, camera, [capture.X_WCs[i] for i in views.fitted])
 
 
 def _rendered_frames(
@@ -289,11 +264,6 @@ def write_curves(path: Path, studies: Sequence[FidelityStudy]) -> None:
         ("depth_mae_m", "depth MAE [m]", 1.0),
         ("depth_relative", "relative depth error [%]", 100.0),
     )
-    kinds = {study.kind for study in studies}
-    label = "offset from the capture path [m]"
-    if len(kinds) == 1:
-        rendered = kinds == {"rendered"}
-        label = "lateral offset [m]" if rendered else "distance to the nearest camera kept [m]"
     for axis, (name, title, factor) in zip(axes, panels, strict=True):
         for k, study in enumerate(studies):
             color = colormaps["tab10"](k)
@@ -303,13 +273,13 @@ def write_curves(path: Path, studies: Sequence[FidelityStudy]) -> None:
             axis.fill_between(found.at, found.low, found.high, color=color, alpha=0.2, linewidth=0)
             axis.plot(found.at, found.middle, "o-", color=color, markersize=4, label=study.name)
             axis.axvline(study.reach, color=color, linestyle="--", linewidth=1)
-        axis.set_xlabel(label)
+        axis.set_xlabel("offset from the capture path [m]")
         axis.set_ylabel(title)
         axis.grid(alpha=0.3)
         axis.set_xlim(left=0)
         if name != "psnr_db":
             top = max(np.percentile(factor * study.column(name), 92) for study in studies)
-            axis.set_ylim(0, 1.1 * top)
+            axis.set_ylim(0, 1.1 * top or None)
     limit = {"color": "black", "linestyle": ":", "linewidth": 1}
     if len(studies) == 1:
         axes[0].axhline(studies[0].on_path_psnr_db - studies[0].max_psnr_drop, **limit)
@@ -324,16 +294,13 @@ def write_views(
     """Writes an image grid of views at growing offset: truth, scene, its depth and depth error."""
     order = np.argsort([sample.offset for sample in samples], kind="stable")
     picked = order[np.linspace(0, len(order) - 1, min(_MAX_COLUMNS, len(order))).astype(int)]
-    depths = depth_scale([frames[k].depth for k in picked])
-    errors = error_scale(_ERROR_LIMIT)
+    depths, errors = depth_scale([frames[k].depth for k in picked]), error_scale(_ERROR_LIMIT)
     columns = []
     for k in picked:
-        frame, sample, view = frames[k], samples[k], views.render(frames[k])
-        truth = frame.image / 255
-        image, _ = fit_exposure(view.color, truth, views.metadata.vignetting, frame.valid)
-        mae = f"{100 * sample.depth_mae_m:.1f} cm"
-        _, depth, error = depth_panels(frame, view, depths, errors, mae)
-        columns.append([Panel(truth), Panel(image, f"{sample.psnr_db:.1f} dB"), depth, error])
+        sample = samples[k]
+        labels = f"{sample.psnr_db:.1f} dB", f"{100 * sample.depth_mae_m:.1f} cm"
+        truth, image, _, *depth = views.panels(frames[k], depths, errors, labels)
+        columns.append([truth, image, *depth])
     write_grid(
         path,
         list(zip(*columns, strict=True)),

@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 from pydrake.math import RigidTransform
 from scipy.optimize import isotonic_regression
 
-from splatpilot.training.captures.capture import Capture, back_project, no_depth
-from splatpilot.training.reconstruction.metrics import SceneRenderer, ViewMetrics
+from splatpilot.training.captures.capture import Capture, back_project, no_depth, project_points
+from splatpilot.training.reconstruction.splat_rendering import SceneRenderer
 
 _MAX_GROUPS, _PER_GROUP = 16, 5  # of samples; minimum number of samples in a group
 # Views of `ViewSupport`: width [px], closest cameras that are compared, relative difference of
@@ -33,8 +33,8 @@ class Band:
 
 
 def band(x: ArrayLike, y: ArrayLike) -> Band:
-    """Groups samples by x: a group for each value or, for more than 16, up to 16 groups of as many
-    samples, at least 5 each."""
+    """Groups samples by x: a group for each value or, for more than 16, up to 16 groups of equal
+    numbers of samples, at least 5 each."""
     x, y = np.asarray(x, np.float64), np.asarray(y, np.float64)
     values, which = np.unique(np.round(x, 6), return_inverse=True)
     if len(values) <= _MAX_GROUPS:
@@ -49,10 +49,7 @@ def band(x: ArrayLike, y: ArrayLike) -> Band:
 
 def monotone_fit(x: ArrayLike, y: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Returns mean x of the groups of `band`, and the non-decreasing least-squares fit to their
-    medians of y (pool adjacent violators).
-
-    Errors grow with distance, up to noise; medians ignore views of what no camera saw.
-    """
+    medians of y; medians ignore views of space that no camera saw."""
     found = band(x, y)
     return found.at, isotonic_regression(found.middle, weights=found.counts).x
 
@@ -60,15 +57,7 @@ def monotone_fit(x: ArrayLike, y: ArrayLike) -> tuple[NDArray[np.float64], NDArr
 def reach(x: ArrayLike, y: ArrayLike, limit: float) -> float:
     """Returns the largest x up to which the monotone fit of y, linear in between, is within
     `limit`: at most the largest measured x, and 0 if the fit starts above."""
-    at, fit = monotone_fit(x, y)
-    beyond = np.flatnonzero(fit > limit)
-    if not len(beyond):
-        return float(at[-1])
-    first = beyond[0]
-    if first == 0:
-        return 0.0
-    (x0, x1), (y0, y1) = at[first - 1 : first + 1], fit[first - 1 : first + 1]
-    return float(x0 + (x1 - x0) * (limit - y0) / (y1 - y0))
+    return first_crossing(*monotone_fit(x, y), limit)
 
 
 def first_crossing(x: ArrayLike, y: Iterable[float], limit: float) -> float:
@@ -96,12 +85,6 @@ class Sample:
     depth_relative: float
     floater_fraction: float
 
-    @classmethod
-    def of(cls, frame: int, offset: float, unseen: float, found: ViewMetrics) -> "Sample":
-        """Returns the sample of a measured view with true depth."""
-        names = ("psnr_db", "depth_mae_m", "depth_relative", "floater_fraction")
-        return cls(frame, offset, unseen, **{name: getattr(found, name) for name in names})
-
 
 @dataclass(frozen=True)
 class FidelityStudy:
@@ -109,14 +92,13 @@ class FidelityStudy:
 
     name: str
     kind: str
-    """Source of the truth: "rendered", or "withheld" frames."""
-    on_path_psnr_db: float
-    """[dB] of the held-out frames on the path."""
+    """Source of the truth: "rendered", or "held-out" frames."""
+    on_path_psnr_db: float  # of the held-out frames on the path
     samples: list[Sample]
     max_depth_error: float
     max_psnr_drop: float
 
-    def column(self, name: str) -> np.ndarray:
+    def column(self, name: str) -> NDArray:
         """Returns a field of all samples."""
         return np.array([getattr(sample, name) for sample in self.samples])
 
@@ -130,18 +112,6 @@ class FidelityStudy:
         """The largest unseen fraction at which the median view is within the limits."""
         return self._reach("unseen")
 
-    def at(self, offset: float) -> dict[str, float]:
-        """Returns the metrics of the median view at an offset [m], from the monotone fits; NaN
-        outside the measured range."""
-        x = self.column("offset")
-        if not x.min() - 1e-9 <= offset <= x.max() + 1e-9:
-            return dict.fromkeys(("psnr_db", "depth_mae_m", "depth_relative"), float("nan"))
-        found = {}
-        for name, sign in (("psnr_db", -1), ("depth_mae_m", 1), ("depth_relative", 1)):
-            at, fit = monotone_fit(x, sign * self.column(name))
-            found[name] = sign * float(np.interp(offset, at, fit))
-        return found
-
     def _reach(self, name: str) -> float:
         x = self.column(name)
         return min(
@@ -150,7 +120,7 @@ class FidelityStudy:
         )
 
     @property
-    def _psnr_drop(self) -> np.ndarray:
+    def _psnr_drop(self) -> NDArray:
         return self.on_path_psnr_db - self.column("psnr_db")
 
     def agreement(self) -> tuple[float, float]:
@@ -193,8 +163,8 @@ class FidelityStudy:
 
 
 def choose_held_out(frames: int, stretches: Sequence[int], kept: int) -> list[int]:
-    """Returns the indices of held-out frames: stretches of these lengths, repeated in turn, with
-    `kept` frames before, between and after them."""
+    """Returns the indices of held-out frames: stretches of these lengths in turn, between `kept`
+    frames each."""
     held_out: list[int] = []
     start = kept
     for length in cycle(stretches):
@@ -251,68 +221,57 @@ class ViewSupport:
 
     A camera did if the point is in its image at the depth of the scene there (within 5 %: it is not
     occluded), from a direction within 45 degrees and from at most twice the distance. Only the 16
-    closest cameras count. Pixels without a surface are unseen.
-
-    Args:
-        renderer: of the scene.
-        K, width, height: of the camera [px].
-        X_WCs: poses of the fitted cameras.
+    closest cameras count. Pixels without a surface are unseen. `camera` is K (3, 3), width and
+    height [px].
     """
 
     def __init__(
         self,
         renderer: SceneRenderer,
-        K: NDArray,
-        width: int,
-        height: int,
+        camera: tuple[NDArray, int, int],
         X_WCs: Sequence[RigidTransform],
     ):
+        K, width, height = camera
         shrunk = _WIDTH / width
         self._K = K.copy()
         self._K[:2] *= shrunk
-        self._width, self._height = _WIDTH, max(1, round(height * shrunk))
+        self._height = max(1, round(height * shrunk))
         self._renderer = renderer
         self._X_WCs = list(X_WCs)
         self._p_WCs = np.array([X_WC.translation() for X_WC in X_WCs])  # (n, 3)
         self._depths: dict[int, NDArray] = {}
 
-    def of(self, X_WC: RigidTransform) -> float:
+    def fraction(self, X_WC: RigidTransform) -> float:
         """Returns the fraction, 0 to 1, for the camera at `X_WC`."""
         depth = self._render(X_WC)
         rows, columns = np.nonzero(depth > 0)
         z = depth[rows, columns].astype(np.float64)
         p_WQ = X_WC.multiply(back_project(self._K, columns + 0.5, rows + 0.5, z).T)  # (3, m)
         ray = p_WQ - X_WC.translation()[:, None]
-        distance = np.linalg.norm(ray, axis=0)
         unseen = np.arange(len(z))
         distances = np.linalg.norm(self._p_WCs - X_WC.translation(), axis=1)
         for i in np.argsort(distances, kind="stable")[:_CAMERAS]:
-            sees = self._sees(i, p_WQ[:, unseen], ray[:, unseen], distance[unseen])
-            unseen = unseen[~sees]
+            unseen = unseen[~self._sees(i, p_WQ[:, unseen], ray[:, unseen])]
         return float((len(z) - len(unseen)) / depth.size)
 
     def distance(self, p_WC: ArrayLike) -> float:
         """Returns the distance to the closest camera [m]."""
         return float(np.linalg.norm(self._p_WCs - np.asarray(p_WC), axis=1).min())
 
-    def _sees(self, i: int, p_WQ: NDArray, ray: NDArray, distance: NDArray) -> NDArray[np.bool_]:
+    def _sees(self, i: int, p_WQ: NDArray, ray: NDArray) -> NDArray[np.bool_]:
         """Returns which of the points (3, m) camera i saw like a camera with these rays to them."""
-        x, y, z = self._X_WCs[i].inverse().multiply(p_WQ)
-        in_front = np.maximum(z, 1e-6)
-        column = np.floor(self._K[0, 0] * x / in_front + self._K[0, 2])
-        row = np.floor(self._K[1, 1] * y / in_front + self._K[1, 2])
-        inside = (
-            (z > 0) & (column >= 0) & (column < self._width) & (row >= 0) & (row < self._height)
-        )
+        p_CQ = self._X_WCs[i].inverse().multiply(p_WQ).T
+        inside, rows, columns = project_points(self._K, p_CQ, _WIDTH, self._height)
         if i not in self._depths:
             self._depths[i] = self._render(self._X_WCs[i])
-        column, row = (np.where(inside, index, 0).astype(int) for index in (column, row))
-        same = np.abs(self._depths[i][row, column] - z) <= _DEPTH_TOLERANCE * np.maximum(z, 0)
-        own_ray = p_WQ - self._p_WCs[i][:, None]
-        own_distance = np.linalg.norm(own_ray, axis=0)
-        cosine = (ray * own_ray).sum(axis=0) / np.maximum(distance * own_distance, 1e-12)
-        near = own_distance <= _MAX_RATIO * distance
-        return inside & same & near & (cosine >= _MIN_COSINE)
+        z, ray = p_CQ[inside, 2], ray[:, inside]
+        other_ray = p_WQ[:, inside] - self._p_WCs[i][:, None]
+        distance, other_distance = (np.linalg.norm(r, axis=0) for r in (ray, other_ray))
+        cosine = (ray * other_ray).sum(axis=0) / np.maximum(distance * other_distance, 1e-12)
+        same = np.abs(self._depths[i][rows, columns] - z) <= _DEPTH_TOLERANCE * z
+        near = other_distance <= _MAX_RATIO * distance
+        inside[inside] = same & near & (cosine >= _MIN_COSINE)
+        return inside
 
     def _render(self, X_WC: RigidTransform) -> NDArray[np.float32]:
-        return self._renderer.render(self._K, self._width, self._height, X_WC).depth
+        return self._renderer.render(self._K, _WIDTH, self._height, X_WC).depth

@@ -1,18 +1,17 @@
-"""Ablation of depth in reconstruction, for two representations: the paper's Table II, with steps
-between its first and last arm."""
+"""Ablation of depth in reconstruction, the paper's Table II, with steps between its arms."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from splatpilot.analysis.output import write_csv
 from splatpilot.analysis.reconstruction.figures import (
     Panel,
-    depth_panels,
     depth_scale,
     error_scale,
     mark_floaters,
@@ -33,12 +32,11 @@ from splatpilot.systems.common.progress import resumable
 from splatpilot.systems.common.torch_device import require_renderer
 from splatpilot.systems.common.validation import require
 from splatpilot.training.captures.capture import Capture
-from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.capture_registry import read_capture, read_capture_of
 from splatpilot.training.reconstruction.checkpoint import kept_work
 from splatpilot.training.reconstruction.config import HOLD_OUT, ReconstructConfig
 from splatpilot.training.reconstruction.initialize import MAX_STEPS, held_out_frames, triangulate
-from splatpilot.training.reconstruction.metrics import fit_exposure, floaters
+from splatpilot.training.reconstruction.metrics import floaters
 from splatpilot.training.reconstruction.reconstruct import reconstruct
 
 COLUMNS = (
@@ -50,56 +48,51 @@ COLUMNS = (
     "hole_fraction",
     "psnr_on_black_db",
 )
-STEPS = {
-    "points": "from points, photometric",
-    "depth_start": "from depth, photometric",
-    "surfaces": "+ surface and outline losses",
-    "depth_term": "+ depth term",
+_NO_DEPTH_LOSSES = {"depth_weight": 0.0, "surface_weight": 0.0, "outline_weight": 0.0}
+_STEPS: dict[str, tuple[str, dict[str, Any]]] = {
+    "points": (
+        "from points, photometric",
+        {"initialization": "points", "strategy": "default", **_NO_DEPTH_LOSSES},
+    ),
+    "depth_start": ("from depth, photometric", {"initialization": "depth", **_NO_DEPTH_LOSSES}),
+    "surfaces": (
+        "+ surface and outline losses",
+        {"initialization": "depth", "depth_weight": 0.0},
+    ),
+    "depth_term": ("+ depth term", {"initialization": "depth"}),
 }
-"""Titles of the steps from one arm of a representation to the next."""
-_PAPER = {
-    "3dgs_points": (29.35, 0.8706, 0.215, 0.974, 0.115),
-    "2dgs_points": (29.07, 0.8656, 0.228, 1.466, 0.130),
-    "2dgs_depth_term": (28.26, 0.8518, 0.213, 0.212, 0.015),
-    "3dgs_depth_term": (28.89, 0.8676, 0.184, 0.085, 0.004),
-}
-"""The paper's vanilla and "+ depth" results, in the order of COLUMNS; it does not state their
-initialization."""
+"""Titles of the steps from one arm of a representation to the next, and the settings of the arm
+that differ from the study's."""
 _RECIPE = "reconstruct.yaml"
 _ERROR_LIMIT = 0.5  # [m], brightest color of depth errors
-_NO_DEPTH_LOSSES = {"depth_weight": 0.0, "surface_weight": 0.0, "outline_weight": 0.0}
-_SETTINGS = {
-    "points": {"initialization": "points", "strategy": "default", **_NO_DEPTH_LOSSES},
-    "depth_start": {"initialization": "depth", **_NO_DEPTH_LOSSES},
-    "surfaces": {"initialization": "depth", "depth_weight": 0.0},
-    "depth_term": {"initialization": "depth"},
-}
-"""Settings of each step that differ from the study's."""
 
 
 @dataclass(frozen=True)
 class Arm:
-    """A representation and the last of the `STEPS` that it takes."""
+    """A representation and the last of the `_STEPS` that it takes."""
 
     representation: str
     step: str
 
     @property
     def key(self) -> str:
-        """The name of its folder."""
+        """Name of the folder."""
         return f"{self.representation}_{self.step}"
 
     @property
     def title(self) -> str:
-        """Its name in tables."""
-        return f"{self.representation.upper()} {STEPS[self.step]}"
+        """Name in tables."""
+        return f"{self.representation.upper()} {_STEPS[self.step][0]}"
 
 
-ARMS = tuple(Arm(representation, step) for representation in ("3dgs", "2dgs") for step in STEPS)
+ARMS = tuple(Arm(representation, step) for representation in ("3dgs", "2dgs") for step in _STEPS)
 PAPER = {
-    arm: dict(zip(COLUMNS, _PAPER[arm.key], strict=False)) for arm in ARMS if arm.key in _PAPER
+    Arm("3dgs", "points"): (29.35, 0.8706, 0.215, 0.974, 0.115, None, None),
+    Arm("3dgs", "depth_term"): (28.89, 0.8676, 0.184, 0.085, 0.004, None, None),
+    Arm("2dgs", "points"): (29.07, 0.8656, 0.228, 1.466, 0.130, None, None),
+    Arm("2dgs", "depth_term"): (28.26, 0.8518, 0.213, 0.212, 0.015, None, None),
 }
-"""The paper's metrics, by arm and column."""
+"""The paper's vanilla and "+ depth" results by `COLUMNS`; their initialization is not stated."""
 
 
 @dataclass(frozen=True)
@@ -127,16 +120,19 @@ class AblationResult:
     def table(self) -> list[list[str]]:
         """Returns the header and the rows of each capture, of their mean, and of the paper."""
         rows = [["capture", "arm", *(NAMES[name][0] for name in COLUMNS)]]
+
+        def add(source: str, arm: Arm, values: Sequence[float | None]) -> None:
+            pairs = zip(values, COLUMNS, strict=True)
+            rows.append([source, arm.title, *(format_metric(v, NAMES[n][1]) for v, n in pairs)])
+
         for capture, arms in self.captures.items():
             for arm in ARMS:
-                means = [(arms[arm.key].mean(name), NAMES[name][1]) for name in COLUMNS]
-                rows.append([capture, arm.title, *(format_metric(*mean) for mean in means)])
+                add(capture, arm, [arms[arm.key].mean(name) for name in COLUMNS])
         if len(self.captures) > 1:
             for arm in ARMS:
                 rows.append(["mean ± spread", arm.title, *(self._spread(arm, n) for n in COLUMNS)])
-        for arm, known in PAPER.items():
-            cells = [format_metric(known.get(name), NAMES[name][1]) for name in COLUMNS]
-            rows.append(["paper", arm.title, *cells])
+        for arm, values in PAPER.items():
+            add("paper", arm, values)
         return rows
 
     def _spread(self, arm: Arm, name: str) -> str:
@@ -165,27 +161,25 @@ def _ratio(before: SceneMetrics, after: SceneMetrics, name: str) -> str:
 class AblationStudy:
     """The content of `ablation.yaml`."""
 
-    # Folders of the captures.
-    captures: list[str] = field(default_factory=list)
-    # How the arms are reconstructed, apart from their own settings.
+    captures: list[str] = field(default_factory=list)  # folders
+    # Settings of the arms, apart from their own.
     reconstruct: ReconstructConfig = field(default_factory=ReconstructConfig)
 
 
 def arm_config(arm: Arm, config: ReconstructConfig) -> ReconstructConfig:
-    """Returns how an arm is reconstructed.
+    """Returns the settings of an arm.
 
-    The last arm of each representation follows `config`; the one before differs in `depth_weight`
-    alone, and so isolates the paper's equation 2. The first uses no metric depth: it starts from
-    points triangulated between the images, and densifies. The second starts from depth, with the
-    strategy, learning rates and scale limits that follow from it. Steps, images, color losses,
-    maximum number of Gaussians and photometry are the same in all arms, and so is the distance
-    field, which is not measured.
+    The last arm of each representation follows `config`; the one before differs only in
+    `depth_weight`, the paper's equation 2. The first uses no metric depth: it starts from points
+    triangulated between the images, and densifies. The second starts from depth, with the strategy,
+    learning rates and scale limits that follow from it. All arms have the same steps, images, color
+    losses, maximum number of Gaussians, photometry and distance field, which is not measured.
     """
     return replace(
         config,
         representation=arm.representation,
         distance_field="captured",
-        **_SETTINGS[arm.step],
+        **_STEPS[arm.step][1],
     )
 
 
@@ -198,11 +192,6 @@ def run(
     Every arm is a scene folder `out/CAPTURE/ARM`; an existing one of the same capture and settings
     is used again. `ablation.md` and `ablation.csv` have the table, `CAPTURE.png` an image grid of
     the arms, `ablation.yaml` the study. With `overwrite` it replaces another study in `out`.
-
-    Raises:
-        FileNotFoundError, ValueError, OSError: for a damaged capture or one without depth, two of
-            one name, settings without held-out frames, something else in `out`, or a folder that
-            cannot be written.
     """
     config.validate()
     require_renderer(config.device)
@@ -210,31 +199,28 @@ def run(
     require(config.iterations != 0, "iterations", "not 0, to compare losses", config.iterations)
     if config.iterations < 0:  # all arms take the same
         config = replace(config, iterations=MAX_STEPS)
-    opened = [(path, _open(path, config.capture)) for path in captures]
-    names = [capture.name for _, capture in opened]
-    for path, capture in opened:
+    opened: list[Capture] = []
+    for path in captures:
+        if (path / "scene.yaml").is_file():
+            capture = read_capture_of(path, read_scene_metadata(path))
+        else:
+            capture = read_capture(path, config.capture)
         if not capture.has_depth:
             raise ValueError(f"{path}: has no depth, which losses and metrics need")
-        if names.count(capture.name) > 1:
+        if capture.name in {other.name for other in opened}:
             raise ValueError(f"{path}: two captures are called {capture.name}; rename one folder")
+        opened.append(capture)
     study = AblationStudy([str(path.resolve()) for path in captures], config)
     claim_folder(out / "ablation.yaml", study, overwrite)
     with resumable(lambda: f"arms that are finished are in {out}; the same command resumes"):
         result = AblationResult(
-            {capture.name: _ablate(capture, out / capture.name, config) for _, capture in opened}
+            {capture.name: _ablate(capture, out / capture.name, config) for capture in opened}
         )
-    for _, capture in opened:
+    for capture in opened:
         _write_grid(out / f"{capture.name}.png", capture, out / capture.name, result)
     _write_tables(out, result, config)
     print(result)
     return result
-
-
-def _open(path: Path, config: CaptureConfig) -> Capture:
-    """Opens a capture, or the capture of a scene folder."""
-    if (path / "scene.yaml").is_file():
-        return read_capture_of(path, read_scene_metadata(path))
-    return read_capture(path, config)
 
 
 def _ablate(capture: Capture, out: Path, config: ReconstructConfig) -> dict[str, SceneMetrics]:
@@ -287,7 +273,9 @@ def _write_tables(out: Path, result: AblationResult, config: ReconstructConfig) 
         for name, arms in result.captures.items()
         for arm in ARMS
     ]
-    table += [{"capture": "paper", "arm": arm.key, **known} for arm, known in PAPER.items()]
+    for arm, values in PAPER.items():
+        known = {n: v for n, v in zip(COLUMNS, values, strict=True) if v is not None}
+        table.append({"capture": "paper", "arm": arm.key, **known})
     write_csv(out / "ablation.csv", table)
 
 
@@ -304,19 +292,13 @@ def _write_grid(path: Path, capture: Capture, out: Path, result: AblationResult)
     for arm in drawn:
         views = SceneViews(out / arm.key, capture)
         frame, found = views.frame(i), arms[arm.key].frames[i]
-        view, truth = views.render(frame), frame.image / 255
         depths = depths or depth_scale([frame.depth])
-        mae = f"{found.depth_mae_m or 0.0:.2f} m"
-        true_depth, *depth = depth_panels(frame, view, depths, errors, mae)
+        labels = format_metric(found.psnr_db, "{:.1f} dB"), f"{found.depth_mae_m or 0.0:.2f} m"
+        truth, image, true_depth, *depth = views.panels(frame, depths, errors, labels)
         if not rows[0]:
-            rows = [[Panel(truth)], [None], [true_depth], [None]]
-        image, _ = fit_exposure(view.color, truth, views.metadata.vignetting, frame.valid)
-        marked = mark_floaters(image, floaters(view.depth, frame.depth))
-        panels = (
-            Panel(image, format_metric(found.psnr_db, "{:.1f} dB")),
-            Panel(marked, f"{found.floater_fraction or 0.0:.1%}"),
-            *depth,
-        )
+            rows = [[truth], [None], [true_depth], [None]]
+        marked = mark_floaters(image.image, floaters(views.render(frame).depth, frame.depth))
+        panels = image, Panel(marked, f"{found.floater_fraction or 0.0:.1%}"), *depth
         for row, panel in zip(rows, panels, strict=True):
             row.append(panel)
     columns = ["captured", *(arm.title.partition(",")[0] for arm in drawn)]

@@ -3,18 +3,18 @@
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
-from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from splatpilot.analysis.reconstruction.figures import (
     Panel,
-    depth_panels,
+    Scale,
     depth_scale,
     error_scale,
+    view_panels,
     write_grid,
 )
 from splatpilot.diagrams.flight.flight_diagram import MakeCamera
@@ -30,15 +30,13 @@ from splatpilot.systems.common.files import require_unused, written_atomically
 from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.policies.time_of_arrival import time_of_arrival
-from splatpilot.systems.splats.background import put_behind
-from splatpilot.systems.splats.baked_scene import RenderedView
-from splatpilot.systems.splats.scene import GaussianScene, color_to_sh
+from splatpilot.systems.splats.background import RenderedView, put_behind
+from splatpilot.systems.splats.scene import color_to_sh
 from splatpilot.systems.splats.splat_files import read_ply
 from splatpilot.training.captures.capture import Capture, CaptureFrame, shrink, shrink_factor
 from splatpilot.training.captures.capture_registry import read_capture_of
 from splatpilot.training.reconstruction.lpips import Lpips
 from splatpilot.training.reconstruction.metrics import (
-    SceneRenderer,
     ViewMetrics,
     fit_exposure,
     has_true_depth,
@@ -46,6 +44,7 @@ from splatpilot.training.reconstruction.metrics import (
     measure_view,
 )
 from splatpilot.training.reconstruction.photometry import ThinnedFrame, seen_pixels
+from splatpilot.training.reconstruction.splat_rendering import SceneRenderer
 
 METRICS = "metrics.json"
 VIEWS = "views.png"
@@ -71,40 +70,26 @@ _POSES = 36  # along the default flight
 class SceneMetrics:
     """Metrics of a scene on frames of its capture."""
 
-    held_out: bool
-    """Whether the frames are held-out."""
+    held_out: bool  # the frames were not fitted
     width: int  # [px], of the frames, shrunk as for reconstruction
     height: int
-    frames: dict[int, ViewMetrics]
-    """Over pixels that a fitted frame saw, with fitted exposure."""
-    strict_frames: dict[int, ViewMetrics]
-    """Over all pixels, with a gain of 1."""
-    lpips_missing: str
-    """Why there is no LPIPS; empty if there is."""
-    flight_unseen_fraction: float | None
-    """See `unseen_fraction`; None if the scene cannot be flown in."""
+    frames: dict[int, ViewMetrics]  # over pixels that a fitted frame saw, with fitted exposure
+    strict_frames: dict[int, ViewMetrics]  # over all pixels, with a gain of 1
+    lpips_missing: str  # reason for missing LPIPS
+    flight_unseen_fraction: float | None  # see `unseen_fraction`
 
     def mean(self, name: str) -> float | None:
         """Returns the mean of a metric over the frames that have it, or None."""
         return mean_metric(self.frames.values(), name)[0]
 
-    def strict_mean(self, name: str) -> float | None:
-        """Returns the same over all pixels, with a gain of 1."""
-        return mean_metric(self.strict_frames.values(), name)[0]
-
-    @property
-    def worst_hole_fraction(self) -> float | None:
-        """The largest hole fraction of a frame; None if no frame has true depth."""
-        found = (frame.hole_fraction for frame in self.frames.values())
-        return max((fraction for fraction in found if fraction is not None), default=None)
-
     def as_json(self) -> dict:
         """Returns the content of `metrics.json`."""
+        holes = (frame.hole_fraction for frame in self.frames.values())
         return {
             **{name: self.mean(name) for name in NAMES},
             "counts": {name: mean_metric(self.frames.values(), name)[1] for name in NAMES},
-            "strict": {name: self.strict_mean(name) for name in NAMES},
-            "worst_hole_fraction": self.worst_hole_fraction,
+            "strict": {name: mean_metric(self.strict_frames.values(), name)[0] for name in NAMES},
+            "worst_hole_fraction": max((f for f in holes if f is not None), default=None),
             "held_out": self.held_out,
             "width": self.width,
             "height": self.height,
@@ -116,18 +101,18 @@ class SceneMetrics:
 
     def __str__(self) -> str:
         kind = "held-out frames" if self.held_out else "frames the scene was made from"
+        content = self.as_json()
         lines = [
             f"{'measured on':<22} {len(self.frames)} {kind}, {self.width} x {self.height}",
             f"{'':<22} {'seen pixels, gain fitted':<26} all pixels, no gain",
         ]
         for name, (title, form) in NAMES.items():
-            mean, count = mean_metric(self.frames.values(), name)
-            cell = format_metric(mean, form)
+            cell, count = format_metric(content[name], form), content["counts"][name]
             if 0 < count < len(self.frames):
                 cell += f" ({count} of {len(self.frames)} frames)"
-            strict = format_metric(self.strict_mean(name), form)
+            strict = format_metric(content["strict"][name], form)
             lines.append(f"{title:<22} {cell:<26} {strict}")
-        worst = format_metric(self.worst_hole_fraction, NAMES["hole_fraction"][1])
+        worst = format_metric(content["worst_hole_fraction"], NAMES["hole_fraction"][1])
         lines.append(f"{'holes, worst frame':<22} {worst}")
         unseen = self.flight_unseen_fraction
         lines.append(f"{'unseen in flight':<22} {format_metric(unseen, '{:.1%}')}")
@@ -142,16 +127,11 @@ class SceneMetrics:
 
 
 def format_metric(value: float | None, form: str) -> str:
-    """Returns a metric as text, a dash for None."""
     return "-" if value is None else form.format(value)
 
 
 def read_metrics(scene: Path) -> SceneMetrics | None:
-    """Reads `metrics.json` of a scene folder; None if there is none.
-
-    Raises:
-        ValueError: if the file is damaged.
-    """
+    """Reads `metrics.json` of a scene folder; None without the file."""
     file = scene / METRICS
     if not file.is_file():
         return None
@@ -166,15 +146,7 @@ def read_metrics(scene: Path) -> SceneMetrics | None:
 
 
 class SceneViews:
-    """A scene folder and its capture.
-
-    Args:
-        scene: the scene folder.
-        capture: which it was made from; by default, that of `scene.yaml`.
-
-    Raises:
-        FileNotFoundError, ValueError: for a damaged scene, or without its capture.
-    """
+    """A scene folder and its capture, by default that of `scene.yaml`."""
 
     def __init__(self, scene: Path, capture: Capture | None = None):
         self.metadata: SceneMetadata = read_scene_metadata(scene)
@@ -187,7 +159,7 @@ class SceneViews:
                 f"only {len(capture)} frames; the capture has changed, reconstruct the scene again"
             )
         held_out = set(self.metadata.held_out)
-        self._fitted = [i for i in range(len(capture)) if i not in held_out]
+        self.fitted = [i for i in range(len(capture)) if i not in held_out]
         self.factor = shrink_factor(capture.width, self.metadata.image_width)
         self.renderer = SceneRenderer(
             read_ply(scene / "gaussians.ply"), self.metadata.representation
@@ -200,42 +172,24 @@ class SceneViews:
 
     def frame(self, i: int) -> CaptureFrame:
         """Returns frame i of the capture in the size of the reconstruction."""
-        return self.shrink(self.capture.frame(i))
+        return shrink(self.capture.frame(i), self.factor)
 
-    def shrink(self, frame: CaptureFrame) -> CaptureFrame:
-        """Returns a frame of the capture's camera in the size of the reconstruction."""
-        return shrink(frame, self.factor)
-
-    @property
-    def fitted_poses(self) -> list[RigidTransform]:
-        """The poses of the fitted frames."""
-        return [self.capture.X_WCs[i] for i in self._fitted]
+    def panels(
+        self, frame: CaptureFrame, depths: Scale, errors: Scale, labels: tuple[str, str]
+    ) -> list[Panel]:
+        """Renders a frame and returns its `view_panels`."""
+        view, truth = self.render(frame), frame.image / 255
+        image, _ = fit_exposure(view.color, truth, self.metadata.vignetting, frame.valid)
+        return view_panels(frame, view, image, depths, errors, labels)
 
     def render(self, frame: CaptureFrame) -> RenderedView:
-        """Renders what the camera of `frame` sees in the scene."""
+        """Renders the scene from the camera of `frame`."""
         return put_behind(self._render_on_black(frame), self.background, frame.K, frame.X_WC)
 
-    @cached_property
-    def _fitted_frames(self) -> list[ThinnedFrame]:
-        return [ThinnedFrame.of(self.frame(i)) for i in self._fitted]
-
-    def seen(self, frame: CaptureFrame) -> NDArray[np.bool_]:
-        """Returns the pixels (H, W) of `frame` that a fitted frame saw."""
-        return seen_pixels(frame, self._fitted_frames)
-
-    def measure(
-        self,
-        frame: CaptureFrame,
-        seen: NDArray[np.bool_] | None = None,
-        lpips: Lpips | None = None,
-        *,
-        fit_gain: bool = True,
-    ) -> ViewMetrics:
-        """Compares frame and scene over the pixels `seen` or all, see `measure_view`."""
+    def measure(self, frame: CaptureFrame, **options: Any) -> ViewMetrics:
+        """Compares frame and scene, see `measure_view` for the options."""
         on_black, vignetting = self._render_on_black(frame), self.metadata.vignetting
-        return measure_view(
-            on_black, self.background, frame, vignetting, seen, lpips, fit_gain=fit_gain
-        )
+        return measure_view(on_black, self.background, frame, vignetting, **options)
 
     def _render_on_black(self, frame: CaptureFrame) -> RenderedView:
         height, width = frame.depth.shape
@@ -243,25 +197,20 @@ class SceneViews:
 
 
 def measure_scene(scene: Path, capture: Capture | None = None) -> SceneMetrics:
-    """Measures a scene folder, and writes `metrics.json` and `views.png` into it.
-
-    Measures on the held-out frames or, without any, on every eighth frame.
-
-    Raises:
-        FileNotFoundError, ValueError, OSError: for a damaged scene or capture, or a folder that
-            cannot be written.
-    """
+    """Measures a scene folder on its held-out frames or, without any, on every eighth frame, and
+    writes `metrics.json` and `views.png` into it."""
     views = SceneViews(scene, capture)
     lpips, missing = None, ""
     try:
         lpips = Lpips()
     except (OSError, ValueError) as error:
         missing = str(error)
+    fitted = [ThinnedFrame.of(views.frame(i)) for i in views.fitted]
     frames, strict, size = {}, {}, (0, 0)
     for i in Progress(views.measured, "measuring frames", unit="frame"):
         frame = views.frame(i)
         size = frame.depth.shape
-        frames[i] = views.measure(frame, views.seen(frame), lpips)
+        frames[i] = views.measure(frame, seen=seen_pixels(frame, fitted), lpips=lpips)
         strict[i] = views.measure(frame, lpips=lpips, fit_gain=False)
     height, width = size
     held_out, unseen = bool(views.metadata.held_out), unseen_fraction(scene)
@@ -273,12 +222,7 @@ def measure_scene(scene: Path, capture: Capture | None = None) -> SceneMetrics:
 
 
 def run(scene: Path, overwrite: bool = False) -> SceneMetrics:
-    """Measures a scene folder, see `measure_scene`, and prints its origin and the table.
-
-    Raises:
-        FileExistsError: if it has been measured, and not `overwrite`.
-        FileNotFoundError, ValueError, OSError: see `measure_scene`.
-    """
+    """Measures a scene folder, see `measure_scene`, and prints its origin and the table."""
     require_unused(scene / METRICS, overwrite)
     metadata = read_scene_metadata(scene)
     metrics = measure_scene(scene)
@@ -297,19 +241,16 @@ def _write_views(path: Path, views: SceneViews, metrics: SceneMetrics) -> None:
     indices = list(metrics.frames)
     picked = sorted({indices[k] for k in np.linspace(0, len(indices) - 1, _MAX_ROWS).astype(int)})
     frames = [views.frame(i) for i in picked]
-    rendered = [views.render(frame) for frame in frames]
     true = [frame.depth for frame in frames if has_true_depth(frame.depth).any()]
-    depths = depth_scale(true or [view.depth for view in rendered])
+    depths = depth_scale(true or [views.render(frame).depth for frame in frames])
     middle = np.median([np.median(frame.depth) for frame in frames])
     errors = error_scale(_ERROR_LIMIT * float(middle) if 0 < middle < np.inf else 0.1)
     rows = []
-    for i, frame, view in zip(picked, frames, rendered, strict=True):
-        found, truth = metrics.frames[i], frame.image / 255
-        image, _ = fit_exposure(view.color, truth, views.metadata.vignetting, frame.valid)
-        psnr = format_metric(found.psnr_db, "{:.1f} dB")
+    for i, frame in zip(picked, frames, strict=True):
+        found = metrics.frames[i]
         mae = "" if found.depth_mae_m is None else f"{100 * found.depth_mae_m:.1f} cm"
-        depth = depth_panels(frame, view, depths, errors, mae)
-        rows.append([Panel(truth), Panel(image, psnr), *depth])
+        labels = format_metric(found.psnr_db, "{:.1f} dB"), mae
+        rows.append(views.panels(frame, depths, errors, labels))
     columns = ["captured", "scene", "captured depth", "depth of the scene", "depth error"]
     scales = [depths] + [errors] * (len(rows) - 1)
     if not true:
@@ -321,11 +262,7 @@ def _write_views(path: Path, views: SceneViews, metrics: SceneMetrics) -> None:
 
 def unseen_fraction(scene: Path) -> float | None:
     """Returns the mean fraction of the onboard camera's pixels that show the frontier, looking
-    ahead along the route from start to goal; None without a route.
-
-    Raises:
-        FileNotFoundError, ValueError: for a damaged scene.
-    """
+    ahead along the route from start to goal; None without a route."""
     metadata = read_scene_metadata(scene)
     if not metadata.metric:
         return None
@@ -338,9 +275,15 @@ def unseen_fraction(scene: Path) -> float | None:
         return None
     if not metadata.frontier:
         return 0.0
-    frontier = _painted(read_ply(scene / FRONTIER), 1.0)
-    seen = _painted(read_ply(scene / "gaussians.ply"), 0.0).merged_with(frontier)
-    camera = MakeCamera(Scenario(), replace(world, gaussians=seen, background=(0.0, 0.0, 0.0)))
+    seen, frontier = (
+        replace(gaussians, sh=np.full((len(gaussians), 1, 3), color_to_sh(gray), np.float32))
+        for gaussians, gray in (
+            (read_ply(scene / "gaussians.ply"), 0.0),
+            (read_ply(scene / FRONTIER), 1.0),
+        )
+    )
+    painted = seen.merged_with(frontier)
+    camera = MakeCamera(Scenario(), replace(world, gaussians=painted, background=(0.0, 0.0, 0.0)))
     # Points beyond the goal are the goal, without direction.
     reach = float(toa.value(world.p_WS))  # [m] at 1 m/s, at least the length of the route
     points, directions = toa.path(world.p_WS, np.linspace(0.0, reach, 8 * _POSES))
@@ -352,9 +295,3 @@ def unseen_fraction(scene: Path) -> float | None:
         view = camera.render(RigidTransform(RollPitchYaw(0.0, 0.0, yaw), p_WB))
         fractions.append((view.color[..., 0] > 0.5).mean())
     return float(np.mean(fractions))
-
-
-def _painted(gaussians: GaussianScene, level: float) -> GaussianScene:
-    """Returns the Gaussians in one gray, 0 to 1."""
-    sh = np.full((len(gaussians), 1, 3), color_to_sh(level), dtype=np.float32)
-    return replace(gaussians, sh=sh)

@@ -32,16 +32,7 @@ from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.distance_field import render_depth
 from splatpilot.training.reconstruction.reconstruct import start_and_goal
 
-# Rows are W's axes in the file's frame F, by the axis that is up; x is kept if possible.
-_R_WF = {
-    "z": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
-    "-z": [[1, 0, 0], [0, -1, 0], [0, 0, -1]],
-    "y": [[1, 0, 0], [0, 0, -1], [0, 1, 0]],
-    "-y": [[1, 0, 0], [0, 0, 1], [0, -1, 0]],
-    "x": [[0, 1, 0], [0, 0, 1], [1, 0, 0]],
-    "-x": [[0, -1, 0], [0, 0, 1], [-1, 0, 0]],
-}
-UP_AXES = tuple(_R_WF)
+UP_AXES = ("z", "-z", "y", "-y", "x", "-x")
 """Axes that may be up in a file."""
 
 _MIN_AREA = 0.05  # twice the area of a triangle on the floor, over its longest side squared
@@ -49,38 +40,29 @@ _MIN_COSINE = 0.5  # between a floor's normal and the axis that is up
 
 
 @dataclass(frozen=True)
-class FileSummary:
-    """A written file of Gaussians."""
+class RescaleSummary:
+    """A scaled scene folder, or a written file of Gaussians."""
 
-    file: Path
-    gaussians: int
+    out: Path
     factor: float
-    size: NDArray[np.float64]  # (3,) [m], between 1st and 99th percentiles
-    origin: tuple[float, float, float]  # [m], of the written frame in the scaled one
+    size: NDArray[np.float64]  # (3,) [m], of the distance field, or of 98 % of the Gaussians
+    details: dict[str, str]
+    warnings: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         rows = {
-            "file": self.file,
-            "Gaussians": self.gaussians,
+            "file" if self.out.suffix else "scene": self.out,
             "factor": f"{self.factor:.6g}",
             "size": " x ".join(f"{length:.3g}" for length in self.size) + " m",
+            **self.details,
         }
-        if any(self.origin):
-            rows["relative to [m]"] = ", ".join(f"{x:.10g}" for x in self.origin)
-        return _format_rows(rows)
-
-
-def _format_rows(rows: dict[str, object]) -> str:
-    return "\n".join(f"{name:<18} {value}" for name, value in rows.items())
+        lines = [f"{name:<18} {value}" for name, value in rows.items()]
+        return "\n".join([*lines, *(f"warning: {warning}" for warning in self.warnings)])
 
 
 def rescale_file(
-    file: Path,
-    out: Path,
-    factor: float = 1.0,
-    up: str = "z",
-    floor: Sequence[ArrayLike] = (),
-) -> FileSummary:
+    file: Path, out: Path, factor: float, up: str, floor: Sequence[ArrayLike]
+) -> RescaleSummary:
     """Writes the Gaussians of a file as PLY, scaled and rotated so that z is up.
 
     Args:
@@ -90,10 +72,6 @@ def rescale_file(
         up: the file's axis that points up, one of `UP_AXES`; mostly -y in PLYs of 3DGS.
         floor: three points (3,) of the file's floor: it becomes level, at z = 0, and `up` tells
             its upper side.
-
-    Raises:
-        FileNotFoundError, ValueError, OSError: for a damaged file, three points that are not on a
-            floor, or `out` that is not a PLY, exists or cannot be written.
     """
     if out.suffix.lower() != ".ply":
         raise ValueError(f"{out}: Gaussians are written as PLY; name it so, {out.stem}.ply")
@@ -104,54 +82,39 @@ def rescale_file(
     gaussians = read_splats(file).transformed_by(X_WF).scaled_by(factor)
     write_ply(gaussians, out)
     lower_W, upper_W = np.percentile(gaussians.means.astype(float), [1, 99], axis=0)
-    return FileSummary(out, len(gaussians), factor, upper_W - lower_W, gaussians.origin)
+    details = {"Gaussians": str(len(gaussians))}
+    if any(gaussians.origin):
+        details["relative to [m]"] = ", ".join(f"{x:.10g}" for x in gaussians.origin)
+    return RescaleSummary(out, factor, upper_W - lower_W, details)
 
 
 def _upright(up: str, floor: Sequence[ArrayLike]) -> RigidTransform:
     """Returns X_WF, given the axis that points up and optionally three points of the floor."""
-    R_WF = np.array(_R_WF[up], dtype=float)
-    if not len(floor):
-        return RigidTransform(RotationMatrix(R_WF))
-    a, b, c = (np.asarray(point, dtype=float) for point in floor)
-    normal = np.cross(b - a, c - a)
-    area, longest = np.linalg.norm(normal), max(np.linalg.norm(b - a), np.linalg.norm(c - a))
-    if not area > _MIN_AREA * longest**2:
-        raise ValueError(
-            f"the points {a.tolist()}, {b.tolist()} and {c.tolist()} lie in a line; give three "
-            "corners of a floor"
-        )
-    z_F = normal / area
-    cosine = float(z_F @ R_WF[2])
-    if abs(cosine) < _MIN_COSINE:
-        raise ValueError(
-            f"the plane of these points is at {np.rad2deg(np.arccos(abs(cosine))):.0f} degrees to "
-            f"a floor that has {up} up; give the axis that points up, or choose other points"
-        )
-    z_F *= np.sign(cosine)
-    x_F = R_WF[0] - (R_WF[0] @ z_F) * z_F
-    x_F /= np.linalg.norm(x_F)
-    R = RotationMatrix(np.stack([x_F, np.cross(z_F, x_F), z_F]))
-    return RigidTransform(R, np.array([0.0, 0.0, -(z_F @ a)]))
-
-
-@dataclass(frozen=True)
-class RescaleSummary:
-    """A scaled scene."""
-
-    scene: Path
-    factor: float
-    size: NDArray[np.float64]  # (3,) [m], of the distance field
-    geodesic: float  # [m], shortest path from start to goal
-    warnings: tuple[str, ...] = ()
-
-    def __str__(self) -> str:
-        rows = {
-            "scene": self.scene,
-            "factor": f"{self.factor:.6g}",
-            "size": " x ".join(f"{length:.3g}" for length in self.size) + " m",
-            "shortest path [m]": f"{self.geodesic:.1f}",
-        }
-        return "\n".join([_format_rows(rows), *(f"warning: {w}" for w in self.warnings)])
+    sign, k = -1.0 if up.startswith("-") else 1.0, "xyz".index(up[-1])
+    z_F = sign * np.eye(3)[k]
+    x_F = np.eye(3)[0] if k else np.roll(z_F, 1)  # x is kept if possible
+    origin = 0.0
+    if len(floor):
+        a, b, c = (np.asarray(point, dtype=float) for point in floor)
+        normal = np.cross(b - a, c - a)
+        area, longest = np.linalg.norm(normal), max(np.linalg.norm(b - a), np.linalg.norm(c - a))
+        if not area > _MIN_AREA * longest**2:
+            raise ValueError(
+                f"the points {a.tolist()}, {b.tolist()} and {c.tolist()} lie in a line; give three "
+                "corners of a floor"
+            )
+        cosine = float(normal @ z_F / area)
+        if abs(cosine) < _MIN_COSINE:
+            raise ValueError(
+                f"the plane of these points is at {np.rad2deg(np.arccos(abs(cosine))):.0f} degrees "
+                f"to a floor that has {up} up; give the axis that points up, or other points"
+            )
+        z_F = np.sign(cosine) * normal / area
+        x_F = x_F - (x_F @ z_F) * z_F
+        x_F /= np.linalg.norm(x_F)
+        origin = -float(z_F @ a)
+    R_WF = RotationMatrix(np.stack([x_F, np.cross(z_F, x_F), z_F]))
+    return RigidTransform(R_WF, np.array([0.0, 0.0, origin]))
 
 
 def run(
@@ -164,20 +127,15 @@ def run(
     height: float | None = None,
     up: str | None = None,
     floor: Sequence[ArrayLike] = (),
-) -> RescaleSummary | FileSummary:
-    """Scales a scene folder by `rescale`, or a file of Gaussians by `rescale_file`, and prints the
-    result.
+) -> RescaleSummary:
+    """Scales a scene folder by `rescale`, or a file of Gaussians by `rescale_file`.
 
     Args:
-        scene: folder or file.
-        out: folder or PLY to be written.
+        scene, out: folders, or files.
         factor: of all lengths; or
         between, distance: two points (3,) of the scene, and the distance between them [m]; or
         height: [m], median height of the capture's cameras above the ground.
         up, floor: for files, see `rescale_file`.
-
-    Raises:
-        FileNotFoundError, ValueError, OSError: see `rescale` and `rescale_file`.
     """
     if scene.is_file() and height is not None:
         raise ValueError(f"{scene}: a file has no cameras; give a factor, or points and a distance")
@@ -207,13 +165,8 @@ def run(
 def rescale(scene: Path, out: Path, factor: float) -> RescaleSummary:
     """Writes the scene folder `scene` as `out`, all lengths times `factor`, in meters.
 
-    As reconstruction in that scale would, it chooses start and goal for the vehicle, and closes the
-    frontier of a scene whose scale was unknown (`close_frontier`). Voxels of the distance field are
-    scaled. Metrics are not copied.
-
-    Raises:
-        FileNotFoundError, ValueError, OSError: for a damaged scene, a factor that is not positive,
-            or `out` that exists or cannot be written.
+    As reconstruction in that scale, it chooses start and goal for the vehicle, and closes the
+    frontier of a scene whose scale was unknown. Voxels are scaled. Metrics are not copied.
     """
     _positive("factor", factor)
     if out.exists():
@@ -255,8 +208,9 @@ def rescale(scene: Path, out: Path, factor: float) -> RescaleSummary:
         split=metadata.split,
         source_digest=metadata.source_digest,
     )
+    details = {"shortest path [m]": f"{geodesic:.1f}"}
     size = field.upper_W - field.lower_W
-    return RescaleSummary(out, factor, size, geodesic, (*warnings, *unflyable))
+    return RescaleSummary(out, factor, size, details, (*warnings, *unflyable))
 
 
 def _about_capture(metadata: SceneMetadata, factor: float) -> tuple[SceneMetadata, tuple[str, ...]]:

@@ -21,7 +21,7 @@ from splatpilot.training.reconstruction.reconstruct import ReconstructSummary, r
 
 @dataclass
 class RenderedSceneConfig(ReconstructConfig):
-    """How a mesh or a generated world is captured and reconstructed."""
+    """Settings of a mesh or a generated world: its capture and reconstruction."""
 
     render: RenderConfig = field(default_factory=lambda: RenderConfig(spacing=0.8, apart=4.0))
     voxel_size: float = bounded(0.1, "[0, inf) m")
@@ -29,9 +29,8 @@ class RenderedSceneConfig(ReconstructConfig):
 
     def reconstruct(self) -> ReconstructConfig:
         """Returns the part of the reconstruction."""
-        return ReconstructConfig(
-            **{each.name: getattr(self, each.name) for each in fields(ReconstructConfig)}
-        )
+        names = (each.name for each in fields(ReconstructConfig))
+        return ReconstructConfig(**{name: getattr(self, name) for name in names})
 
 
 def run_rendered(
@@ -48,13 +47,8 @@ def run_rendered(
     check_scene_target(out)
     capture = Path(out) / CAPTURE
     render_capture.run(world=world, out=capture, config=config.render, seed=seed)
-    return run(
-        capture=capture,
-        out=out,
-        config=config.reconstruct(),
-        restart=restart,
-        overwrite=overwrite,
-    )
+    settings = config.reconstruct()
+    return run(capture=capture, out=out, config=settings, restart=restart, overwrite=overwrite)
 
 
 def run(
@@ -66,11 +60,7 @@ def run(
     overwrite: bool = False,
 ) -> tuple[ReconstructSummary, SceneMetrics]:
     """Reconstructs the capture in a folder as the scene folder `out`, measures it and prints the
-    results; see `reconstruct` and `measure_scene`. With `overwrite` it replaces another scene.
-
-    Raises:
-        FileNotFoundError, ValueError, OSError: as `reconstruct`.
-    """
+    results; see `reconstruct` and `measure_scene`. With `overwrite` it replaces another scene."""
     out = Path(out)
     # Before photographs are registered, which takes minutes.
     config.validate()
@@ -96,7 +86,7 @@ def run(
 
 
 def _is_unmeasured(scene: Path, capture: Capture) -> bool:
-    """Tells whether an interrupted run left this scene of the capture without metrics."""
+    """Returns True if an interrupted run left this scene of the capture without metrics."""
     if (scene / VIEWS).exists():
         return False
     metadata = read_scene_metadata(scene)

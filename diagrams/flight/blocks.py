@@ -21,7 +21,7 @@ from splatpilot.systems.policies.velocity import VelocityTracker
 from splatpilot.systems.sensing.latency import DelayedPose, FrameTimes
 from splatpilot.systems.sensing.noise import ColorNoise, DepthNoise
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
-from splatpilot.systems.sensing.time_of_flight import TimeOfFlightGrid, sensor_of
+from splatpilot.systems.sensing.time_of_flight import TimeOfFlightGrid, equivalent_sensor
 from splatpilot.systems.vehicle.flatness import FlatnessController
 from splatpilot.systems.vehicle.state import StateToPose
 
@@ -67,7 +67,7 @@ def AddPolicyAndController(
             zeros, and `finite_heading` such headings by NaN; `command` is not exported.
     """
     # Pose, distances and goal.
-    spheres = world.moving.balls if world.moving else None
+    spheres = world.moving.spheres if world.moving else None
     pose, collision = StateToPose(), EsdfCollision(world.distance_field, spheres)
     for name, system in (("pose", pose), ("collision", collision)):
         builder.AddNamedSystem(name, system)
@@ -256,7 +256,9 @@ def AddObservation(
 
     # Time of flight.
     if "depth_grid" in names:
-        grid = builder.AddNamedSystem("time_of_flight_grid", TimeOfFlightGrid(sensor_of(config)))
+        grid = builder.AddNamedSystem(
+            "time_of_flight_grid", TimeOfFlightGrid(equivalent_sensor(config))
+        )
         builder.Connect(images["depth_image_32f"], grid.GetInputPort("depth_image_32f"))
         images["depth_grid"] = grid.GetOutputPort("depth_grid")
     return images

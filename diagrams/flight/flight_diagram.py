@@ -22,7 +22,7 @@ from splatpilot.diagrams.flight.blocks import (
 )
 from splatpilot.diagrams.flight.flight import sample_initial_state
 from splatpilot.diagrams.flight.scenario import Scenario
-from splatpilot.diagrams.worlds.appearance import seen_otherwise
+from splatpilot.diagrams.worlds.appearance import randomize_appearance
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.splats.background import Background, mean_color
@@ -88,7 +88,7 @@ def AddMeshcat(builder: DiagramBuilder, scenario: Scenario, world: World, meshca
         policy.GetOutputPort("hypotheses") if plans else None,
     )
     if world.moving:
-        MovingSpheresVisualizer.AddToBuilder(builder, world.moving.balls, meshcat)
+        MovingSpheresVisualizer.AddToBuilder(builder, world.moving.spheres, meshcat)
     camera = cast(SplatCamera, builder.GetSubsystemByName("camera"))
     CameraVisualizer.AddToBuilder(builder, camera, meshcat, period=1 / scenario.camera.fps)
 
@@ -148,7 +148,7 @@ def BuildFlightDiagram(
     valid = camera or not (video or meshcat is not None)
     require(valid, "camera", "True with meshcat or video, which show its images", camera)
     scenario.validate()
-    world = seen_otherwise(world, scenario.appearance, scenario.seed)
+    world = randomize_appearance(world, scenario.appearance, scenario.seed)
     builder = DiagramBuilder()
 
     # Vehicle.

@@ -28,7 +28,7 @@ from splatpilot.diagrams.flight.flight_diagram import (
     open_meshcat,
 )
 from splatpilot.diagrams.flight.scenario import Scenario
-from splatpilot.diagrams.worlds.appearance import seen_otherwise
+from splatpilot.diagrams.worlds.appearance import randomize_appearance
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.common.files import (
@@ -68,7 +68,7 @@ def write_flight_page(
     path: Path, scenario: Scenario, world: World, flights: Sequence[ReplayedFlight]
 ) -> None:
     """Writes a page that shows flights from one start to one goal, see `replay_page`."""
-    world = seen_otherwise(world, scenario.appearance, scenario.seed)
+    world = randomize_appearance(world, scenario.appearance, scenario.seed)
     lower, upper = _heights(world)
     view = ReplayView(
         X_BC=camera_mount(scenario.camera),
@@ -80,7 +80,7 @@ def write_flight_page(
     meshcat = open_meshcat(scenario, world)
     for k in range(len(flights)):
         draw_vehicle(meshcat, f"/splatpilot/vehicles/{k}", VEHICLE_RADIUS)
-    balls = world.moving.balls if world.moving else None
+    balls = world.moving.spheres if world.moving else None
     page = replay_page(
         meshcat.StaticHtml(), world.gaussians, world.background, view, flights, balls
     )
@@ -90,7 +90,7 @@ def write_flight_page(
 
 def write_live_page(path: Path, meshcat: Meshcat, scenario: Scenario, world: World) -> None:
     """Writes a page that shows a running flight, which `meshcat` draws, see `live_page`."""
-    world = seen_otherwise(world, scenario.appearance, scenario.seed)
+    world = randomize_appearance(world, scenario.appearance, scenario.seed)
     lower, upper = _heights(world)
     highest = max(start_position(scenario, world)[2], goal_position(scenario, world)[2])
     cut = min(highest + 2 * VEHICLE_RADIUS, upper)

@@ -97,7 +97,7 @@ def register_policy(
 register_policy(
     PrivilegedPlannerConfig,
     lambda config, world, vehicle: PrivilegedPlanner(
-        world.esdf, config, vehicle, world.moving.balls if world.moving else None
+        world.esdf, config, vehicle, world.moving.spheres if world.moving else None
     ),
     name="planner",
     speed_field="lattice.speed",

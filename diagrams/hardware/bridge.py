@@ -10,42 +10,20 @@ from pathlib import Path
 import numpy as np
 from lcm import LCM
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort, System
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder, System
 from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
-from splatpilot.diagrams.flight.blocks import (
-    AddPolicyAndController,
-    Autonomy,
-    ConnectInputs,
-    ConnectObservation,
-    decision_period,
-    goal_position,
-    make_policy,
-    policy_camera,
-    policy_images,
-)
+from splatpilot.diagrams.flight import blocks
 from splatpilot.diagrams.flight.flight import Outcome, flight_outcome, has_landed
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.hardware.message_ports import MessagePorts
-from splatpilot.diagrams.hardware.real_time import run_in_real_time
+from splatpilot.diagrams.hardware.real_time import output, run_in_real_time
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.common.validation import Config, bounded
+from splatpilot.systems.messaging import codecs
 from splatpilot.systems.messaging.arrival_triggered import ArrivalTriggered, can_be_triggered
 from splatpilot.systems.messaging.bridge_status import BridgeStatus
-from splatpilot.systems.messaging.codecs import (
-    Codec,
-    ColorImageCodec,
-    CommandCodec,
-    DepthGridCodec,
-    DepthImageCodec,
-    HypothesesCodec,
-    MotionCaptureCodec,
-    StateCodec,
-    StatusCodec,
-    VehicleStatusCodec,
-    VelocitySetpointCodec,
-)
 from splatpilot.systems.messaging.failsafe import Failsafe, FailsafeConfig
 from splatpilot.systems.messaging.generated import lcmt_bridge_status
 from splatpilot.systems.messaging.lcm_ports import (
@@ -54,13 +32,14 @@ from splatpilot.systems.messaging.lcm_ports import (
     open_lcm,
     recorded,
 )
-from splatpilot.systems.messaging.receiver import Receiver
-from splatpilot.systems.messaging.tof_receiver import TimeOfFlightReceiver, TimeOfFlightStream
+from splatpilot.systems.messaging.receiver import TimeOfFlightReceiver, TimeOfFlightStream
 from splatpilot.systems.policies.hypotheses import num_hypotheses_in
 from splatpilot.systems.policies.velocity import VelocitySetpoint
-from splatpilot.systems.sensing.time_of_flight import sensor_of
+from splatpilot.systems.sensing.time_of_flight import equivalent_sensor
 from splatpilot.systems.vehicle.quadrotor import hover_state
 from splatpilot.systems.vehicle.state import StatePredictor
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass
@@ -100,12 +79,9 @@ def BuildHardwareDiagram(
     Builds the diagram that flies a vehicle by messages: that of `BuildFlightDiagram` with
     subscribers instead of plant and camera. It runs with the wall clock, see `run_in_real_time`.
 
-    Systems, by name: those of `AddPolicyAndController` and of `MessagePorts`; `state_predictor`,
-    which predicts the state for now; `velocity_setpoint`; `failsafe`, which all commands pass;
-    `status`; and `depth_grid_receiver` if `config` has a stream. There are subscribers of the
-    state, the policy's images, `vehicle_status` and `motion_capture_pose`, and publishers of
-    `command`, `velocity_setpoint`, `status` and `hypotheses`. Before the first message, states and
-    images are arbitrary but finite.
+    Systems, by name: those of `AddPolicyAndController` and `MessagePorts`; `state_predictor`;
+    `velocity_setpoint`; `failsafe`, which all commands pass; `status`; and `depth_grid_receiver` if
+    `config` has a stream. Before the first message, states and images are arbitrary but finite.
 
     .. pydrake_system::
 
@@ -114,20 +90,13 @@ def BuildHardwareDiagram(
         output_ports: [state, command, hypotheses, color_image, depth_image_32f, clearance,
             gradient, in_collision, field_state, velocity_setpoint, status, in_charge]
 
-    The ports are those of `BuildFlightDiagram`, with the policy's images; `status` and `overruns`
-    those of `BridgeStatus`; `command`, `velocity_setpoint`, `in_charge` and `lag` those of
-    `Failsafe`.
+    `status` and `overruns` are those of `BridgeStatus`; `command`, `velocity_setpoint`, `in_charge`
+    and `lag` those of `Failsafe`; the others those of `BuildFlightDiagram`.
 
     Args:
         scenario: policy and goal. Its vehicle is the model of the real one.
         world: its map, as far as known.
-        lcm: transport of the messages.
-        config: rates, timeouts and limits.
         policy, controller: see `BuildFlightDiagram`.
-
-    Raises:
-        ValueError: for an invalid configuration, a system without the ports it needs, sensors, and
-            worlds with moving obstacles.
     """
     config = config or HardwareConfig()
     config.validate()
@@ -136,82 +105,75 @@ def BuildHardwareDiagram(
     ports = MessagePorts(builder, lcm, config.tick)
 
     # State: received, and predicted for now, up to the age at which it is still used.
-    received: dict[str, Receiver] = {
-        "state": ports.subscribe(StateCodec(), hover_state(np.zeros(3)))
-    }
-    measured, state_age = (received["state"].GetOutputPort(name) for name in ("state", "age"))
-    predictor = builder.AddNamedSystem("state_predictor", StatePredictor(config.failsafe.max_age))
-    ConnectInputs(builder, predictor, {"measured_state": measured, "age": state_age})
+    receivers: dict[str, System] = {}
+    receivers["state"] = ports.subscribe(codecs.StateCodec(), hover_state(np.zeros(3)))
+    measured, state_age = (receivers["state"].GetOutputPort(name) for name in ("state", "age"))
+    predictor = StatePredictor(config.failsafe.max_age)
+    ports.add("state_predictor", predictor, measured_state=measured, age=state_age)
     state = predictor.GetOutputPort("state")
 
     # Policy, which updates when images arrive, and controller.
-    policy = policy or make_policy(scenario, world)
-    period, codecs, decided = (
-        decision_period(scenario, policy),
-        image_codecs(scenario, policy),
-        None,
-    )
+    policy = policy or blocks.make_policy(scenario, world)
+    cameras, period = image_codecs(scenario, policy), blocks.decision_period(scenario, policy)
     if can_be_triggered(policy):
         policy = ArrivalTriggered(policy, config.tick)
-        decided = policy.GetOutputPort("decided")
-    autonomy = AddPolicyAndController(
+    decided, failed, heading, plans = (
+        policy.GetOutputPort(name) if policy.HasOutputPort(name) else None
+        for name in ("decided", "failed", "heading", "hypotheses")
+    )
+    autonomy = blocks.AddPolicyAndController(
         builder, scenario, world, state, policy, controller, guarded=True
     )
 
     # Images.
-    for codec in codecs:
+    for codec in cameras:
         if codec.port == "depth_grid" and config.time_of_flight is not None:
-            received[codec.port] = TimeOfFlightReceiver(config.time_of_flight, config.tick)
-            builder.AddNamedSystem("depth_grid_receiver", received[codec.port])
+            receiver = TimeOfFlightReceiver(config.time_of_flight, config.tick)
+            receivers[codec.port] = ports.add("depth_grid_receiver", receiver)
         else:
             initial = np.zeros(codec.size) if codec.port == "depth_grid" else None
-            received[codec.port] = ports.subscribe(codec, initial)
-    images = list(received)[1:]
-    observed = {"state": state} | {name: received[name].GetOutputPort(name) for name in images}
+            receivers[codec.port] = ports.subscribe(codec, initial)
+    observed = {name: receiver.GetOutputPort(name) for name, receiver in receivers.items()}
+    observed["state"] = state
 
     # Status. A policy without images updates by states.
-    status = builder.AddNamedSystem("status", BridgeStatus(images))
-    for signal, receiver in received.items():
-        sources = {
-            f"{signal}_{suffix}": receiver.GetOutputPort(suffix)
-            for suffix in ("age", "gaps", "rejected")
-        }
-        ConnectInputs(builder, status, sources)
+    images = list(receivers)[1:]
+    signals = {
+        f"{name}_{signal}": receiver.GetOutputPort(signal)
+        for name, receiver in receivers.items()
+        for signal in ("age", "gaps", "rejected")
+    }
+    status = ports.add("status", BridgeStatus(images), **signals)
     builder.ExportInput(status.GetInputPort("overruns"), "overruns")
     observation_age = status.GetOutputPort("observation_age")
-    age = {"observation_age": observation_age if images else state_age}
-    ConnectObservation(builder, observed | age, autonomy.policy)
+    age = observation_age if images else state_age
+    blocks.ConnectObservation(builder, observed | {"observation_age": age}, autonomy.policy)
 
     # Failsafe.
-    field = world.distance_field
-    failsafe = builder.AddNamedSystem(
-        "failsafe",
-        Failsafe(
-            *(config.failsafe, scenario.controller, scenario.vehicle),
-            *(field.lower_W, field.upper_W, field),
-        ),
-    )
-    setpoint = _AddVelocitySetpoint(builder, scenario, state, autonomy)
+    target = {autonomy.target.get_name(): autonomy.target}
+    setpoint = VelocitySetpoint(scenario.controller)
+    ports.add("velocity_setpoint", setpoint, state=state, heading=heading, **target)
     collision = builder.GetSubsystemByName("collision")
-    vehicle_status = ports.subscribe(VehicleStatusCodec())
-    sources = {
-        "state": state,
-        "measured_state": measured,
-        "state_age": state_age,
-        "observation_age": observation_age,
-        "velocity_setpoint": setpoint,
-        "command": autonomy.controller.GetOutputPort("command"),
-        "clearance": collision.GetOutputPort("clearance"),
-        "gradient": collision.GetOutputPort("gradient"),
-        "vehicle_status": vehicle_status.GetOutputPort("vehicle_status"),
-        "vehicle_status_age": vehicle_status.GetOutputPort("age"),
-    }
-    if autonomy.policy.HasOutputPort("failed"):
-        sources["policy_failed"] = autonomy.policy.GetOutputPort("failed")
-    if config.body:
-        body = ports.subscribe(MotionCaptureCodec(config.body))
-        sources["body_age"] = body.GetOutputPort("age")
-    ConnectInputs(builder, failsafe, sources)
+    vehicle_status = ports.subscribe(codecs.VehicleStatusCodec())
+    body = ports.subscribe(codecs.MotionCaptureCodec(config.body)) if config.body else None
+    field = world.distance_field
+    limits = config.failsafe, scenario.controller, scenario.vehicle
+    failsafe = ports.add(
+        "failsafe",
+        Failsafe(*limits, field.lower_W, field.upper_W, field),
+        state=state,
+        measured_state=measured,
+        state_age=state_age,
+        observation_age=observation_age,
+        velocity_setpoint=setpoint.GetOutputPort("velocity_setpoint"),
+        command=autonomy.controller.GetOutputPort("command"),
+        clearance=collision.GetOutputPort("clearance"),
+        gradient=collision.GetOutputPort("gradient"),
+        vehicle_status=vehicle_status.GetOutputPort("vehicle_status"),
+        vehicle_status_age=vehicle_status.GetOutputPort("age"),
+        policy_failed=failed,
+        body_age=None if body is None else body.GetOutputPort("age"),
+    )
     builder.ExportInput(failsafe.GetInputPort("lag"), "lag")
     builder.Connect(failsafe.GetOutputPort("mode"), status.GetInputPort("mode"))
 
@@ -220,13 +182,12 @@ def BuildHardwareDiagram(
         failsafe.GetOutputPort(name)
         for name in ("command", "velocity_setpoint", "state_is_known", "is_ready")
     )
-    ports.publish(CommandCodec(), command, scenario.controller.period, is_known)
-    codec = VelocitySetpointCodec()
+    ports.publish(codecs.CommandCodec(), command, scenario.controller.period, is_known)
+    codec = codecs.VelocitySetpointCodec()
     ports.publish(codec, setpoint, scenario.controller.period, is_ready, decided)
-    ports.publish(StatusCodec(), status.GetOutputPort("status"), 1 / config.status_rate)
-    if autonomy.policy.HasOutputPort("hypotheses"):
-        plans = autonomy.policy.GetOutputPort("hypotheses")
-        codec = HypothesesCodec(num_hypotheses_in(plans.size()))
+    ports.publish(codecs.StatusCodec(), status.GetOutputPort("status"), 1 / config.status_rate)
+    if plans is not None:
+        codec = codecs.HypothesesCodec(num_hypotheses_in(plans.size()))
         ports.publish(codec, plans, period, decided=decided)
 
     for name, port in observed.items():
@@ -239,28 +200,16 @@ def BuildHardwareDiagram(
     return diagram
 
 
-def _AddVelocitySetpoint(
-    builder: DiagramBuilder, scenario: Scenario, state: OutputPort, autonomy: Autonomy
-) -> OutputPort:
-    setpoint = VelocitySetpoint(scenario.controller)
-    builder.AddNamedSystem("velocity_setpoint", setpoint)
-    sources = {"state": state, autonomy.target.get_name(): autonomy.target}
-    if autonomy.policy.HasOutputPort("heading"):
-        sources["heading"] = autonomy.policy.GetOutputPort("heading")
-    ConnectInputs(builder, setpoint, sources)
-    return setpoint.GetOutputPort("velocity_setpoint")
-
-
-def image_codecs(scenario: Scenario, policy: System) -> list[Codec]:
+def image_codecs(scenario: Scenario, policy: System) -> list[codecs.Codec]:
     """Returns the codecs of a policy's images."""
-    camera, frame = policy_camera(scenario, policy), "policy_camera"
-    size, tof = (camera.width, camera.height), sensor_of(camera)
-    codecs = {
-        "depth_image_32f": DepthImageCodec(ImageDepth32F(*size), frame),
-        "color_image": ColorImageCodec(ImageRgba8U(*size), frame),
-        "depth_grid": DepthGridCodec(tof.columns, tof.rows, tof.max_range, frame),
+    camera, frame = blocks.policy_camera(scenario, policy), "policy_camera"
+    size, tof = (camera.width, camera.height), equivalent_sensor(camera)
+    images = {
+        "depth_image_32f": codecs.DepthImageCodec(ImageDepth32F(*size), frame),
+        "color_image": codecs.ColorImageCodec(ImageRgba8U(*size), frame),
+        "depth_grid": codecs.DepthGridCodec(tof.columns, tof.rows, tof.max_range, frame),
     }
-    return [codecs[name] for name in policy_images(policy)]
+    return [images[name] for name in blocks.policy_images(policy)]
 
 
 def require_messages_for(scenario: Scenario, world: World) -> None:
@@ -274,15 +223,8 @@ def require_messages_for(scenario: Scenario, world: World) -> None:
         )
 
 
-_log = logging.getLogger(__name__)
-
-
 def run(
-    *,
-    scenario: Scenario,
-    config: HardwareConfig,
-    log: Path | None = None,
-    overwrite: bool = False,
+    *, scenario: Scenario, config: HardwareConfig, log: Path | None = None, overwrite: bool = False
 ) -> dict[str, float | str]:
     """
     Waits for a vehicle's messages and flies it to the scenario's goal.
@@ -293,18 +235,11 @@ def run(
     `config.patience` (meanwhile see `Failsafe`). Then messages cease, and autopilots hold.
 
     Args:
-        scenario: policy and goal.
-        config: of messages.
         log: file for all messages, as LCM's logger writes it.
-        overwrite: replaces that file.
 
     Returns:
         `outcome` (of `Outcome`, "timeout" or "silence"), `flight_time_s`, and of `BridgeStatus`
         `gaps`, `rejected` and `overruns`.
-
-    Raises:
-        ValueError: for a scenario that cannot be flown by messages.
-        OSError: if LCM does not work, nothing comes, or the log cannot be written.
     """
     scenario.validate()
     config.validate()
@@ -316,7 +251,8 @@ def run(
         wait_for_messages(diagram, config.patience)
         simulator = Simulator(diagram)
         root = simulator.get_context()
-        flight = BridgeFlight(diagram, root, scenario, goal_position(scenario, world), config)
+        p_WG = blocks.goal_position(scenario, world)
+        flight = BridgeFlight(diagram, root, scenario, p_WG, config)
         # Waits again, so that policies update just after images of the same rate.
         run_in_real_time(
             simulator,
@@ -325,46 +261,35 @@ def run(
             flight.is_over,
             ready=lambda: wait_for_messages(diagram, config.patience),
         )
-    counts = np.asarray(diagram.GetOutputPort("status").Eval(root))[4:]
+    counts = output(diagram, "status", root)[4:]
     summary = {"outcome": flight.outcome, "flight_time_s": flight.duration}
     summary |= dict(zip(("gaps", "rejected", "overruns"), counts, strict=True))
     print(*(f"{name:<14} {value}" for name, value in summary.items()), sep="\n")
     return summary
 
 
+@dataclass
 class BridgeFlight:
-    """
-    Detects begin and end of a flight.
+    """Detects begin and end of a flight of `BuildHardwareDiagram`."""
 
-    Args:
-        diagram, root: of `BuildHardwareDiagram`, and its Context.
-        p_WG: (3,) [m] the goal.
-        config: timeouts.
-    """
-
-    def __init__(
-        self,
-        diagram: Diagram,
-        root: Context,
-        scenario: Scenario,
-        p_WG: np.ndarray,
-        config: HardwareConfig,
-    ) -> None:
-        self._diagram, self._root = diagram, root
-        self._scenario, self._p_WG, self._config = scenario, p_WG, config
-        self._in_charge, self._began, self._fresh = False, math.inf, -math.inf
-        self.outcome = ""
-        """Of `Outcome`, "timeout" or "silence"; empty until the flight is over."""
-        self.duration = 0.0
-        """[s]"""
+    diagram: Diagram
+    root: Context
+    scenario: Scenario
+    p_WG: np.ndarray  # (3,) [m]
+    config: HardwareConfig
+    outcome: str = ""  # Of `Outcome`, "timeout" or "silence"; empty until the flight is over.
+    duration: float = 0.0  # [s]
+    _in_charge: bool = False
+    _began: float = math.inf  # [s]
+    _fresh: float = -math.inf  # [s] when state and images were last fresh.
 
     def is_over(self, now: float) -> bool:
         """Checks at a time [s] if the flight is over, and how it ended."""
         status, charge, collision = (
-            np.asarray(self._diagram.GetOutputPort(name).Eval(self._root))
+            output(self.diagram, name, self.root)
             for name in ("status", "in_charge", "in_collision")
         )
-        in_charge, landed = bool(charge[0]), has_landed(self._diagram, self._root)
+        in_charge, landed = bool(charge[0]), has_landed(self.diagram, self.root)
         if in_charge != self._in_charge:
             # Not printed: a closed pipe would end the flight.
             _log.warning("%.2f s: the bridge is %sin charge", now, "" if in_charge else "not ")
@@ -373,33 +298,25 @@ class BridgeFlight:
             self._began = min(self._began, now)
         if now < self._began:
             return False
-        is_fresh = status[2:4].max() <= self._config.failsafe.max_age
+        is_fresh = status[2:4].max() <= self.config.failsafe.max_age
         self._fresh = now if is_fresh else max(self._fresh, self._began)
         outcome = None
         if landed and (status[0] == lcmt_bridge_status.LANDING or not in_charge):
             outcome = Outcome.LANDED
         elif not is_fresh:
-            outcome = "silence" if now > self._fresh + self._config.patience else None
+            outcome = "silence" if now > self._fresh + self.config.patience else None
         elif in_charge:
-            radius = self._scenario.goal_radius
-            outcome = flight_outcome(self._diagram, self._root, self._p_WG, radius)
-        if now >= self._began + self._scenario.timeout:
+            radius = self.scenario.goal_radius
+            outcome = flight_outcome(self.diagram, self.root, self.p_WG, radius)
+        if now >= self._began + self.scenario.timeout:
             outcome = outcome or Outcome.TIMEOUT
         self.outcome, self.duration = str(outcome or ""), now - self._began
         return outcome is not None
 
 
 def wait_for_messages(diagram: Diagram, patience: float) -> None:
-    """
-    Waits for a message for each subscriber of a diagram.
-
-    Args:
-        diagram: of `BuildHardwareDiagram`.
-        patience: [s], at most.
-
-    Raises:
-        TimeoutError: without a message; the error names the channel.
-    """
+    """Waits at most `patience` [s] for a message for each subscriber of a diagram; then raises
+    TimeoutError."""
     deadline = time.monotonic() + patience
     for system in diagram.GetSystems():
         if not isinstance(system, MessageSubscriber | TimeOfFlightReceiver):

@@ -1,4 +1,6 @@
-"""MessagePorts: adds publishers and subscribers to a diagram."""
+"""MessagePorts: adds publishers, subscribers and other systems to a diagram."""
+
+from typing import Any
 
 from lcm import LCM
 from pydrake.systems.framework import DiagramBuilder, OutputPort, System
@@ -15,23 +17,29 @@ from splatpilot.systems.messaging.lcm_ports import (
 
 class MessagePorts:
     """
-    Adds `clock`, and publishers and subscribers that are connected to it.
+    Adds `clock`, and systems whose inputs are connected by their names, `unix_time` to the clock.
 
     Args:
-        builder: of the diagram.
-        lcm: transport of the messages.
         tick: [s] between looks for messages.
     """
 
     def __init__(self, builder: DiagramBuilder, lcm: LCM, tick: float) -> None:
         self._builder, self._lcm, self._tick = builder, lcm, tick
-        self.unix_time = builder.AddNamedSystem("clock", UnixClock()).get_output_port()
+        self._unix_time = builder.AddNamedSystem("clock", UnixClock()).get_output_port()
 
-    def subscribe(self, codec: Codec, initial=None, name: str = "") -> MessageSubscriber:
+    def add[S: System](self, name: str, system: S, **sources: OutputPort | None) -> S:
+        """Adds a system; sources of None are left out."""
+        self._builder.AddNamedSystem(name, system)
+        if system.HasInputPort("unix_time"):
+            sources["unix_time"] = self._unix_time
+        connected = {name: port for name, port in sources.items() if port is not None}
+        ConnectInputs(self._builder, system, connected)
+        return system
+
+    def subscribe(self, codec: Codec, initial: Any = None, name: str = "") -> MessageSubscriber:
         """Adds `{name}_subscriber`, by default of the name of the codec's port."""
         subscriber = MessageSubscriber(self._lcm, codec, self._tick, initial)
-        self.add(f"{name or codec.port}_subscriber", subscriber)
-        return subscriber
+        return self.add(f"{name or codec.port}_subscriber", subscriber)
 
     def publish(
         self,
@@ -44,18 +52,12 @@ class MessagePorts:
         """Adds `{port}_publisher`, see `MessagePublisher`."""
         tick = None if decided is None else self._tick
         publisher = MessagePublisher(self._lcm, codec, period, tick)
-        optional = {"enabled": enabled, "decided": decided}
-        sources = {name: port for name, port in optional.items() if port is not None}
-        self.add(f"{codec.port}_publisher", publisher, {codec.port: source} | sources)
+        sources = {codec.port: source, "enabled": enabled, "decided": decided}
+        self.add(f"{codec.port}_publisher", publisher, **sources)
 
     def publish_measurement(
         self, name: str, codec: Codec, source: OutputPort, age: OutputPort
     ) -> None:
         """Adds `{name}_publisher`, see `MeasurementPublisher`."""
         publisher = MeasurementPublisher(self._lcm, codec, self._tick)
-        self.add(f"{name}_publisher", publisher, {codec.port: source, "age": age})
-
-    def add(self, name: str, system: System, sources: dict[str, OutputPort] | None = None) -> None:
-        """Adds a system with the input `unix_time`, and connects it and its `sources` by name."""
-        self._builder.AddNamedSystem(name, system)
-        ConnectInputs(self._builder, system, {"unix_time": self.unix_time} | (sources or {}))
+        self.add(f"{name}_publisher", publisher, **{codec.port: source, "age": age})

@@ -1,5 +1,6 @@
 """Vehicle of PX4, with the messages of the simulated one."""
 
+import contextlib
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -11,17 +12,10 @@ from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import Demultiplexer
 
 from splatpilot.diagrams.hardware.message_ports import MessagePorts
-from splatpilot.diagrams.hardware.real_time import run_in_real_time
+from splatpilot.diagrams.hardware.real_time import output, run_in_real_time
 from splatpilot.diagrams.hardware.vehicle import STATUS_PERIOD
 from splatpilot.systems.common.validation import Config, bounded, require_field
-from splatpilot.systems.messaging.codecs import (
-    CommandCodec,
-    MotionCaptureCodec,
-    StateCodec,
-    StatusCodec,
-    VehicleStatusCodec,
-    VelocitySetpointCodec,
-)
+from splatpilot.systems.messaging import codecs
 from splatpilot.systems.messaging.lcm_ports import DEFAULT_URL, open_lcm
 from splatpilot.systems.messaging.receiver import UdpConfig, UdpInbox
 from splatpilot.systems.px4.commander import Px4Commander, Px4CommanderConfig
@@ -29,6 +23,8 @@ from splatpilot.systems.px4.mavlink import OFFBOARD, Mavlink
 from splatpilot.systems.px4.motion_capture import MotionCaptureConfig, MotionCaptureReceiver
 from splatpilot.systems.px4.telemetry import HEARTBEAT_TIMEOUT, Px4Telemetry
 from splatpilot.systems.vehicle.quadrotor import GRAVITY
+
+REMINDER = 10.0  # [s] of silence between messages that there is no heartbeat.
 
 
 @dataclass
@@ -66,9 +62,7 @@ def BuildPx4Diagram(
     Builds the diagram between the bridge's messages and PX4. It replaces `BuildVehicleDiagram`,
     except for images, which sensors send themselves.
 
-    Systems, by name: `telemetry`, `commander`, those of `MessagePorts`: `state_publisher`,
-    `vehicle_status_publisher`, `setpoint_subscriber`, `status_subscriber`; and with motion capture
-    `motion_capture_subscriber`, or `motion_capture_receiver` and `motion_capture_publisher`.
+    Systems, by name: those of `MessagePorts`, `telemetry` and `commander`.
 
     .. pydrake_system::
 
@@ -78,8 +72,6 @@ def BuildPx4Diagram(
     The ports are those of `Px4Telemetry`.
 
     Args:
-        config: of messages and requests.
-        lcm: transport of the bridge's messages.
         inbox: socket of PX4's packets.
         now: see `Receiver`.
     """
@@ -92,38 +84,43 @@ def BuildPx4Diagram(
     telemetry = Px4Telemetry(inbox, mavlink, address, config.tick, now)
     ports.add("telemetry", telemetry)
     state, age = telemetry.GetOutputPort("state"), telemetry.GetOutputPort("age")
-    ports.publish_measurement("state", StateCodec(), state, age)
+    ports.publish_measurement("state", codecs.StateCodec(), state, age)
     vehicle_status = telemetry.GetOutputPort("vehicle_status")
-    ports.publish(VehicleStatusCodec(), vehicle_status, STATUS_PERIOD)
+    ports.publish(codecs.VehicleStatusCodec(), vehicle_status, STATUS_PERIOD)
 
     # Setpoints and mode, from the bridge to PX4.
     by_velocity = config.commander.setpoints == "velocity"
-    codec = VelocitySetpointCodec() if by_velocity else CommandCodec()
+    codec = codecs.VelocitySetpointCodec() if by_velocity else codecs.CommandCodec()
     setpoint = ports.subscribe(codec, name="setpoint")
-    status = ports.subscribe(StatusCodec())
-    mode = builder.AddNamedSystem("status_mode", Demultiplexer([1, StatusCodec.size - 1]))
-    builder.Connect(status.GetOutputPort("status"), mode.get_input_port())
-    commander = Px4Commander(config.commander, inbox, mavlink, address, GRAVITY, tick=config.tick)
-    names = ("heartbeat_age", "armed", "mode", "granted")
-    sources = {name: telemetry.GetOutputPort(name) for name in names} | {
-        "setpoint": setpoint.GetOutputPort(codec.port),
-        "setpoint_age": setpoint.GetOutputPort("age"),
-        "bridge_mode": mode.get_output_port(0),
-    }
+    status = ports.subscribe(codecs.StatusCodec()).GetOutputPort("status")
+    mode = ports.add("status_mode", Demultiplexer([1, codecs.StatusCodec.size - 1]), u0=status)
 
     # Motion capture, to PX4 and, if it is not from there, to the bridge.
+    pose = pose_age = None
     if config.body:
-        codec = MotionCaptureCodec(config.body)
+        body = codecs.MotionCaptureCodec(config.body)
         if config.motion_capture is None:
-            camera = ports.subscribe(codec, name="motion_capture")
+            camera = ports.subscribe(body, name="motion_capture")
         else:
             camera = MotionCaptureReceiver(config.motion_capture, config.tick, now)
             ports.add("motion_capture_receiver", camera)
-        pose, age = camera.GetOutputPort(codec.port), camera.GetOutputPort("age")
+        pose, pose_age = camera.GetOutputPort(body.port), camera.GetOutputPort("age")
         if config.motion_capture is not None:
-            ports.publish_measurement("motion_capture", codec, pose, age)
-        sources |= {"motion_capture_pose": pose, "motion_capture_age": age}
-    ports.add("commander", commander, sources)
+            ports.publish_measurement("motion_capture", body, pose, pose_age)
+
+    ports.add(
+        "commander",
+        Px4Commander(config.commander, inbox, mavlink, address, GRAVITY, tick=config.tick),
+        setpoint=setpoint.GetOutputPort(codec.port),
+        setpoint_age=setpoint.GetOutputPort("age"),
+        bridge_mode=mode.get_output_port(0),
+        heartbeat_age=telemetry.GetOutputPort("heartbeat_age"),
+        armed=telemetry.GetOutputPort("armed"),
+        mode=telemetry.GetOutputPort("mode"),
+        granted=telemetry.GetOutputPort("granted"),
+        motion_capture_pose=pose,
+        motion_capture_age=pose_age,
+    )
 
     for name in ("state", "age", "heartbeat_age", "armed", "mode"):
         builder.ExportOutput(telemetry.GetOutputPort(name), "state_age" if name == "age" else name)
@@ -132,24 +129,15 @@ def BuildPx4Diagram(
     return diagram
 
 
-REMINDER = 10.0
-"""[s] of silence between messages that there is no heartbeat."""
-
-
 def run(*, config: Px4Config, duration: float = np.inf) -> None:
     """
     Connects the bridge and PX4, for `duration` [s], or until it is interrupted.
 
     Prints changes of PX4's mode, and every ten seconds how long there has been no heartbeat.
-
-    Raises:
-        ValueError: for an invalid configuration.
-        OSError: if LCM does not work or the port is in use.
-        ModuleNotFoundError: without pymavlink.
     """
     config.validate()
     lcm, inbox = open_lcm(config.url), UdpInbox(config.udp)
-    try:
+    with contextlib.closing(inbox):
         epoch = time.time() - time.monotonic()
         diagram = BuildPx4Diagram(config, lcm, inbox, now=lambda: epoch + time.monotonic())
         simulator = Simulator(diagram)
@@ -161,23 +149,20 @@ def run(*, config: Px4Config, duration: float = np.inf) -> None:
             ("Arming", config.commander.arm),
         ):
             print(f"{name} is {'requested' if requested else 'left to the pilot'}.", flush=True)
-        before, reminders = (False, False, False), 0
+        before, reminders = "not heard", 0
 
         def over(now: float) -> bool:
             nonlocal before, reminders
             age, armed, mode = (
-                np.asarray(diagram.GetOutputPort(name).Eval(root))
-                for name in ("heartbeat_age", "armed", "mode")
+                output(diagram, name, root) for name in ("heartbeat_age", "armed", "mode")
             )
-            is_heard, is_armed = bool(age[0] <= HEARTBEAT_TIMEOUT), bool(armed[0])
-            current = is_heard, is_armed, mode[0] == OFFBOARD[0]
-            if current != before:
-                report = (
-                    f"heard, {'armed' if is_armed else 'disarmed'}, "
-                    f"{'in' if current[2] else 'not in'} offboard mode"
-                )
-                print(f"{now:8.2f} s: PX4 is {report if is_heard else 'not heard'}", flush=True)
-                before = current
+            report = "not heard"
+            if age[0] <= HEARTBEAT_TIMEOUT:
+                offboard = "in" if mode[0] == OFFBOARD[0] else "not in"
+                report = f"heard, {'armed' if armed[0] else 'disarmed'}, {offboard} offboard mode"
+            if report != before:
+                print(f"{now:8.2f} s: PX4 is {report}", flush=True)
+                before = report
             silences = int(min(age[0], now) / REMINDER)
             if silences > reminders:
                 silence = f"{silences * REMINDER:g} s at {address}"
@@ -186,5 +171,3 @@ def run(*, config: Px4Config, duration: float = np.inf) -> None:
             return now >= duration
 
         run_in_real_time(simulator, diagram, config.tick, over)
-    finally:
-        inbox.close()

@@ -3,18 +3,22 @@
 import math
 import time
 from collections.abc import Callable
+from typing import cast
 
 import numpy as np
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import Diagram
+from pydrake.systems.framework import Context, Diagram
 
 from splatpilot.systems.messaging.bridge_status import UnixClock
 from splatpilot.systems.messaging.lcm_ports import PUBLISH_OFFSET
 
-MAX_LAG = 0.05
-"""[s] Max lag of a diagram behind the wall clock."""
-
+MAX_LAG = 0.05  # [s] Max lag of a diagram behind the wall clock.
 _WATCH_PERIOD = 0.02  # [s] between calls of `over`, which is slower than most ticks.
+
+
+def output(diagram: Diagram, name: str, root: Context) -> np.ndarray:
+    """Returns the vector at an output port of a diagram."""
+    return np.asarray(diagram.GetOutputPort(name).Eval(root))
 
 
 def run_in_real_time(
@@ -28,31 +32,24 @@ def run_in_real_time(
     Advances a diagram, which has a `UnixClock` named `clock`, tick by tick. No tick is updated
     before its time on the wall clock.
 
-    A tick that ends after the begin of the next is an overrun; the diagram's inputs `overruns` and
-    `lag` [s], if any, tell their number and the delay. The next tick is then longer, to catch up
-    without leaving anything out. A lag above `MAX_LAG` is not caught up with: the diagram's time
-    stops meanwhile, and its `UnixClock` is set.
+    A tick that ends after the begin of the next is an overrun; their number is returned. The
+    diagram's inputs `overruns` and `lag` [s], if any, tell number and delay. The next tick is then
+    longer, to catch up without leaving anything out. A lag above `MAX_LAG` is not caught up
+    with: the diagram's time stops meanwhile, and its `UnixClock` is set.
 
     Args:
-        simulator, diagram: at time 0.
-        tick: [s].
         over: called with the time [s] fifty times a second, after a tick; returns True to end.
         ready: called after the first tick, which may be long; then time begins to pass.
-
-    Returns:
-        The number of overruns.
     """
     root = simulator.get_mutable_context()
-    clock = diagram.GetSubsystemByName("clock")
-    assert isinstance(clock, UnixClock)
-    clock_context = clock.GetMyMutableContextFromRoot(root)
+    clock = cast(UnixClock, diagram.GetSubsystemByName("clock"))
     simulator.Initialize()  # This and the first tick fill caches.
-    clock.set_epoch(clock_context, time.time())
+    clock.set_epoch(root, time.time())
     simulator.AdvanceTo(2 * PUBLISH_OFFSET)
     ready()
     # The wall clock is read once, since it may be set.
     epoch, started, number, overruns, told = time.time(), time.monotonic(), 0, 0, 0.0
-    clock.set_epoch(clock_context, epoch)
+    clock.set_epoch(root, epoch)
     looked = -0.5 * _WATCH_PERIOD  # Between messages, which are sent at multiples of it.
     while True:
         # Messages of a tick are sent just after it.
@@ -77,5 +74,5 @@ def run_in_real_time(
         if late > MAX_LAG:
             started += late - MAX_LAG
             epoch += late - MAX_LAG
-            clock.set_epoch(clock_context, epoch)
+            clock.set_epoch(root, epoch)
         number += math.floor(min(late, MAX_LAG) / tick)

@@ -7,26 +7,11 @@ from pathlib import Path
 
 import numpy as np
 from lcm import LCM
+from pydrake.systems import primitives
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
 from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort
-from pydrake.systems.primitives import (
-    Adder,
-    ConstantVectorSource,
-    Demultiplexer,
-    LogVectorOutput,
-    MatrixGain,
-    Multiplexer,
-    Sine,
-    ZeroOrderHold,
-)
 
-from splatpilot.diagrams.flight.blocks import (
-    AddObservation,
-    ConnectInputs,
-    decision_period,
-    goal_position,
-    make_policy,
-)
+from splatpilot.diagrams.flight import blocks
 from splatpilot.diagrams.flight.flight import (
     Flight,
     Outcome,
@@ -41,19 +26,13 @@ from splatpilot.diagrams.flight.flight_diagram import LOG_PERIOD
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.hardware.bridge import HardwareConfig, image_codecs, require_messages_for
 from splatpilot.diagrams.hardware.message_ports import MessagePorts
-from splatpilot.diagrams.hardware.real_time import run_in_real_time
-from splatpilot.diagrams.worlds.appearance import seen_otherwise
+from splatpilot.diagrams.hardware.real_time import output, run_in_real_time
+from splatpilot.diagrams.worlds.appearance import randomize_appearance
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.collision.esdf_collision import EsdfCollision
 from splatpilot.systems.common.files import holds_folder, require_writable_folder
-from splatpilot.systems.messaging.codecs import (
-    CommandCodec,
-    MotionCaptureCodec,
-    StateCodec,
-    VehicleStatusCodec,
-    VelocitySetpointCodec,
-)
+from splatpilot.systems.messaging import codecs
 from splatpilot.systems.messaging.failsafe import Failsafe, FailsafeConfig
 from splatpilot.systems.messaging.flight_limits import FlightLimits
 from splatpilot.systems.messaging.lcm_ports import open_lcm
@@ -65,24 +44,20 @@ from splatpilot.systems.vehicle.state import StateToPose
 SILENCE = 0.1
 """[s] without commands after which the vehicle holds its position, until they come again."""
 
-STATUS_PERIOD = 0.1
-"""[s] between messages of the vehicle's status."""
-
-_NOISE = 1e-6
-"""[m] in published positions: a failsafe takes a constant state for frozen."""
+STATUS_PERIOD = 0.1  # [s] between messages of the vehicle's status.
+_NOISE = 1e-6  # [m] in published positions: a failsafe takes a constant state for frozen.
 
 
 def BuildVehicleDiagram(
     scenario: Scenario, world: World, lcm: LCM, config: HardwareConfig | None = None
 ) -> Diagram:
     """
-    Builds the diagram of a simulated vehicle with the messages of a real one.
+    Builds the diagram of a simulated vehicle, in a world, with the messages of a real one.
 
     Systems, by name: those of `MessagePorts` and `AddObservation`; `plant`, `pose`, `collision`;
     `failsafe`, which hovers and then lands if commands cease, as autopilots do; `held_command`;
     and the loggers `state_log`, `command_log`. A vehicle that is commanded by velocities has
-    `setpoint`, `velocity_tracker` and `controller`. There are `command_subscriber` and publishers
-    of `state`, `vehicle_status`, `motion_capture_pose` and the policy's images.
+    `setpoint`, `velocity_tracker` and `controller`.
 
     .. pydrake_system::
 
@@ -91,15 +66,6 @@ def BuildVehicleDiagram(
 
     The ports are those of `BuildFlightDiagram`; `command_age` [s] is infinite before the first
     command.
-
-    Args:
-        scenario: the vehicle, and the policy's images.
-        world: that it flies in.
-        lcm: transport of the messages.
-        config: rates, and the commands.
-
-    Raises:
-        ValueError: for an invalid configuration, sensors, and worlds with moving obstacles.
     """
     config = config or HardwareConfig()
     config.validate()
@@ -109,70 +75,62 @@ def BuildVehicleDiagram(
 
     # Vehicle.
     plant = builder.AddNamedSystem("plant", QuadrotorPlant(scenario.vehicle))
-    pose = builder.AddNamedSystem("pose", StateToPose())
-    collision = builder.AddNamedSystem("collision", EsdfCollision(world.distance_field))
     state = plant.GetOutputPort("state")
-    for system in (pose, collision):
-        builder.Connect(state, system.GetInputPort("state"))
+    pose = ports.add("pose", StateToPose(), state=state).GetOutputPort("pose")
+    collision = ports.add("collision", EsdfCollision(world.distance_field), state=state)
 
     # Commands, by a failsafe that knows no map and limits speed as MPC_XY_VEL_MAX of PX4.
     by_velocity = config.setpoints == "velocity"
-    codec = VelocitySetpointCodec() if by_velocity else CommandCodec()
+    codec = codecs.VelocitySetpointCodec() if by_velocity else codecs.CommandCodec()
     hover = [0.0, 0.0, 0.0, np.nan] if by_velocity else [scenario.vehicle.gravity, 0.0, 0.0, 0.0]
     subscriber = ports.subscribe(codec, np.array(hover), "command")
-    setpoint = subscriber.GetOutputPort(codec.port)
+    received, command_age = subscriber.GetOutputPort(codec.port), subscriber.GetOutputPort("age")
+    command = _AddVelocityControl(ports, scenario, state, received) if by_velocity else received
     limits = FlightLimits(max_speed=config.failsafe.limits.max_speed)
-    failsafe = builder.AddNamedSystem(
+    autopilot = FailsafeConfig(max_age=SILENCE, recovery=config.tick, limits=limits)
+    model, box = (scenario.controller, scenario.vehicle), np.full(3, np.inf)
+    no_age = ports.add("no_age", primitives.ConstantVectorSource(np.zeros(1)))
+    failsafe = ports.add(
         "failsafe",
-        Failsafe(
-            FailsafeConfig(max_age=SILENCE, recovery=config.tick, limits=limits),
-            *(scenario.controller, scenario.vehicle),
-            *(np.full(3, -np.inf), np.full(3, np.inf)),
-        ),
+        Failsafe(autopilot, *model, -box, box),
+        state=state,
+        state_age=no_age.get_output_port(),
+        observation_age=command_age,
+        velocity_setpoint=received if by_velocity else None,
+        command=command,
     )
-    no_age = builder.AddNamedSystem("no_age", ConstantVectorSource(np.zeros(1)))
-    sources = {
-        "state": state,
-        "state_age": no_age.get_output_port(),
-        "observation_age": subscriber.GetOutputPort("age"),
-    }
-    if by_velocity:
-        sources["velocity_setpoint"] = setpoint
-        setpoint = _AddVelocityControl(builder, scenario, state, setpoint)
-    ConnectInputs(builder, failsafe, sources | {"command": setpoint})
-    held = builder.AddNamedSystem("held_command", ZeroOrderHold(config.tick, 4))
-    command = held.get_output_port()
+    held = builder.AddNamedSystem("held_command", primitives.ZeroOrderHold(config.tick, 4))
     builder.Connect(failsafe.GetOutputPort("command"), held.get_input_port())
-    builder.Connect(command, plant.GetInputPort("command"))
+    builder.Connect(held.get_output_port(), plant.GetInputPort("command"))
 
     # Status, state and motion capture.
-    armed = builder.AddSystem(ConstantVectorSource(np.ones(1)))
-    status = builder.AddSystem(Multiplexer(2))
+    armed = builder.AddSystem(primitives.ConstantVectorSource(np.ones(1)))
+    status = builder.AddSystem(primitives.Multiplexer(2))
     builder.Connect(armed.get_output_port(), status.get_input_port(0))
     builder.Connect(failsafe.GetOutputPort("is_ready"), status.get_input_port(1))
-    ports.publish(VehicleStatusCodec(), status.get_output_port(0), STATUS_PERIOD)
-    noise = builder.AddSystem(Sine(np.repeat([_NOISE, 0.0], [3, 10]), np.ones(13), np.zeros(13)))
-    estimate = builder.AddSystem(Adder(2, 13))
+    ports.publish(codecs.VehicleStatusCodec(), status.get_output_port(0), STATUS_PERIOD)
+    sizes = np.repeat([_NOISE, 0.0], [3, 10])
+    noise = builder.AddSystem(primitives.Sine(sizes, np.ones(13), np.zeros(13)))
+    estimate = builder.AddSystem(primitives.Adder(2, 13))
     builder.Connect(state, estimate.get_input_port(0))
     builder.Connect(noise.get_output_port(0), estimate.get_input_port(1))
-    ports.publish(StateCodec(), estimate.get_output_port(), 1 / config.state_rate)
+    ports.publish(codecs.StateCodec(), estimate.get_output_port(), 1 / config.state_rate)
     if config.body:
-        tracked = builder.AddSystem(MatrixGain(np.eye(13)[[0, 1, 2, 6, 7, 8, 9]]))
+        tracked = builder.AddSystem(primitives.MatrixGain(np.eye(13)[[0, 1, 2, 6, 7, 8, 9]]))
         builder.Connect(state, tracked.get_input_port())
-        codec = MotionCaptureCodec(config.body)
+        codec = codecs.MotionCaptureCodec(config.body)
         ports.publish(codec, tracked.get_output_port(), 1 / config.state_rate)
 
-    # Images, of which the policy tells size and rate.
-    policy = make_policy(scenario, world)
-    body_pose = pose.GetOutputPort("pose")
-    images = AddObservation(builder, scenario, world, state, body_pose, policy)
+    # Images, whose size and rate are the policy's.
+    policy = blocks.make_policy(scenario, world)
+    images = blocks.AddObservation(builder, scenario, world, state, pose, policy)
     for codec in image_codecs(scenario, policy):
-        ports.publish(codec, images[codec.port], decision_period(scenario, policy))
+        ports.publish(codec, images[codec.port], blocks.decision_period(scenario, policy))
 
-    for name, port in (("state", state), ("command", command)):
-        LogVectorOutput(port, builder, LOG_PERIOD).set_name(f"{name}_log")
+    for name, port in (("state", state), ("command", held.get_output_port())):
+        primitives.LogVectorOutput(port, builder, LOG_PERIOD).set_name(f"{name}_log")
         builder.ExportOutput(port, name)
-    builder.ExportOutput(subscriber.GetOutputPort("age"), "command_age")
+    builder.ExportOutput(command_age, "command_age")
     for name in ("clearance", "gradient", "in_collision", "field_state"):
         builder.ExportOutput(collision.GetOutputPort(name), name)
     diagram = builder.Build()
@@ -181,19 +139,19 @@ def BuildVehicleDiagram(
 
 
 def _AddVelocityControl(
-    builder: DiagramBuilder, scenario: Scenario, state: OutputPort, setpoint: OutputPort
+    ports: MessagePorts, scenario: Scenario, state: OutputPort, setpoint: OutputPort
 ) -> OutputPort:
     """Adds the control of velocity setpoints; returns its commands."""
-    parts = builder.AddNamedSystem("setpoint", Demultiplexer([3, 1]))
-    tracker = builder.AddNamedSystem("velocity_tracker", VelocityTracker())
-    law = FlatnessController(scenario.controller, scenario.vehicle)
-    controller = builder.AddNamedSystem("controller", law)
-    builder.Connect(setpoint, parts.get_input_port())
+    parts = ports.add("setpoint", primitives.Demultiplexer([3, 1]), u0=setpoint)
     velocity, heading = parts.get_output_port(0), parts.get_output_port(1)
-    ConnectInputs(builder, tracker, {"state": state, "velocity": velocity})
-    acceleration = tracker.GetOutputPort("acceleration")
-    sources = {"state": state, "acceleration": acceleration, "heading": heading}
-    ConnectInputs(builder, controller, sources)
+    tracker = ports.add("velocity_tracker", VelocityTracker(), state=state, velocity=velocity)
+    controller = ports.add(
+        "controller",
+        FlatnessController(scenario.controller, scenario.vehicle),
+        state=state,
+        acceleration=tracker.GetOutputPort("acceleration"),
+        heading=heading,
+    )
     return controller.GetOutputPort("command")
 
 
@@ -203,23 +161,13 @@ def run(*, scenario: Scenario, config: HardwareConfig, out: Path) -> dict[str, f
     Hovers at the scenario's start and flies by commands until the flight ends; writes the files of
     `write_flight` and `write_summary` into `out`. Time is counted from the first command.
 
-    Args:
-        scenario: the vehicle, its world, its start, and the policy's images.
-        config: of messages.
-
-    Returns:
-        `Flight.summary()` and `overruns`, of ticks.
-
-    Raises:
-        ValueError: for a scenario that cannot be flown by messages.
-        OSError: if LCM does not work, no command comes within `config.patience`, or `out` cannot be
-            written.
+    Returns `Flight.summary()` and `overruns`, of ticks.
     """
     scenario.validate()
     config.validate()
     lcm = open_lcm(config.url)
     world = make_world(scenario.world, scenario.seed)
-    world = seen_otherwise(world, scenario.appearance, scenario.seed)
+    world = randomize_appearance(world, scenario.appearance, scenario.seed)
     start = sample_initial_state(scenario, world)
     require_writable_folder(out)
     diagram = BuildVehicleDiagram(scenario, world, lcm, config)
@@ -228,7 +176,7 @@ def run(*, scenario: Scenario, config: HardwareConfig, out: Path) -> dict[str, f
     root = simulator.get_mutable_context()
     plant = diagram.GetSubsystemByName("plant").GetMyMutableContextFromRoot(root)
     plant.SetContinuousState(start)
-    p_WG = goal_position(scenario, world)
+    p_WG = blocks.goal_position(scenario, world)
     took_off = math.inf
 
     def outcome() -> Outcome | None:
@@ -238,7 +186,7 @@ def run(*, scenario: Scenario, config: HardwareConfig, out: Path) -> dict[str, f
 
     def over(now: float) -> bool:
         nonlocal took_off
-        if math.isinf(np.asarray(diagram.GetOutputPort("command_age").Eval(root))[0]):
+        if math.isinf(output(diagram, "command_age", root)[0]):
             if now > config.patience:
                 raise TimeoutError(
                     f"no command has come for {config.patience:g} s; start the bridge, with the "

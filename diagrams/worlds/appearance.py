@@ -1,7 +1,4 @@
-"""How else a world might look: other paint, light, exposure and sky, as functions of its colors.
-
-Of the geometry nothing changes: means, shapes and opacities of the Gaussians stay.
-"""
+"""Random changes of a world's colors: paint, light, exposure and sky; the geometry stays."""
 
 from dataclasses import dataclass, replace
 
@@ -14,19 +11,19 @@ from splatpilot.systems.collision.esdf import interpolate_grid
 from splatpilot.systems.splats.background import Background, EnvironmentMap
 from splatpilot.systems.splats.scene import GaussianScene, color_to_sh
 
-_PAINT = 0.35  # sRGB, largest change of a color of paint
+_PAINT = 0.35  # sRGB, largest change of a color
 _PAINTS = 4  # along each axis of the color cube
 _TINT = 0.25  # natural logarithm of the light's red, green and blue, over the mean
-_EXPOSURE = -1.0, 0.5  # [EV], least and greatest: brighter ones would burn out
+_EXPOSURE = -1.0, 0.5  # [EV], brighter images would saturate
 _HUE = 1.0  # [rad]
 _SATURATION = 0.6  # natural logarithm
-_RELIEF = 0.6  # part of the light that comes from one direction
+_RELIEF = 0.6  # fraction of the light that comes from one direction
 _MOTTLE = 0.15  # relative, of brightness over space
-_SHORTEST, _LONGEST = 0.5, 5.0  # [m], wavelengths of the mottling
+_WAVELENGTHS = 0.5, 5.0  # [m], of the mottling
 _WAVES = 5
-_SKY = 0.7  # part of another color in the background
-_AT_ONCE = 16384  # Gaussians: what they take meanwhile stays in the cache
-_LOOKS = 7  # tells the looks of flights from what else a flight's seed draws
+_SKY = 0.7  # fraction of another color in the background
+_BATCH = 16384  # Gaussians, so that intermediate values stay in the cache
+_STREAM = 7  # of a flight's seed
 
 _GRAY = np.full((3, 3), 1 / 3)
 _TURN = np.array([[0, -1, 1], [1, 0, -1], [-1, 1, 0]]) / np.sqrt(3)  # about the axis of grays
@@ -36,24 +33,24 @@ Array = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class Appearance:
-    """One look, drawn by `draw_appearance`."""
+    """Parameters of one appearance."""
 
     paint: Array  # (4, 4, 4, 3) added to sRGB colors, a grid over their cube
     exposure: float  # factor of linear light
     mixing: Array  # (3, 3) of linear red, green, blue: tint, hue and saturation
     light_W: Array  # (3,) unit vector to the light
-    relief: float  # in 0 to 1, part of the light that comes from there
+    relief: float  # in [0, 1], fraction of the light from there
     waves: Array  # (5, 4) wave vectors [rad/m] and phases [rad] of the mottling
     mottle: float
     sky: Array  # (3,) sRGB
-    sky_part: float  # in 0 to 1, of it in the background
+    sky_part: float  # in [0, 1], fraction of the sky in the background
 
 
 def draw_appearance(rng: np.random.Generator, strength: float) -> Appearance:
-    """Draws a look. A `strength` of 0 leaves the world as it is, 1 changes it as much as may be."""
+    """Draws an appearance; `strength` is 0 (no change) to 1 (full range)."""
 
-    def uniform(most: float, shape: tuple[int, ...] = ()) -> NDArray:
-        return strength * rng.uniform(-most, most, shape)
+    def uniform(limit: float, shape: tuple[int, ...] = ()) -> NDArray:
+        return strength * rng.uniform(-limit, limit, shape)
 
     paint = uniform(_PAINT, (*[_PAINTS] * 3, 3))
     tint = np.exp(uniform(_TINT, (3,)))
@@ -63,9 +60,8 @@ def draw_appearance(rng: np.random.Generator, strength: float) -> Appearance:
     light = rng.normal(size=3)
     waves = rng.normal(size=(_WAVES, 4))
     waves[:, :3] /= np.linalg.norm(waves[:, :3], axis=1, keepdims=True)
-    waves[:, :3] *= (
-        2 * np.pi / np.exp(rng.uniform(np.log(_SHORTEST), np.log(_LONGEST), (_WAVES, 1)))
-    )
+    shortest, longest = np.log(_WAVELENGTHS)
+    waves[:, :3] *= 2 * np.pi / np.exp(rng.uniform(shortest, longest, (_WAVES, 1)))
     return Appearance(
         paint=paint.astype(np.float32),
         exposure=float(2 ** (strength * rng.uniform(*_EXPOSURE))),
@@ -79,34 +75,34 @@ def draw_appearance(rng: np.random.Generator, strength: float) -> Appearance:
     )
 
 
-def seen_otherwise(world: World, strength: float, seed: int) -> World:
-    """The world in a look of that strength, 0 to 1, drawn from the seed; itself where it is 0."""
+def randomize_appearance(world: World, strength: float, seed: int) -> World:
+    """Returns the world in an appearance drawn from the seed."""
     if strength == 0.0:
         return world
-    return with_appearance(world, draw_appearance(np.random.default_rng([seed, _LOOKS]), strength))
+    rng = np.random.default_rng([seed, _STREAM])
+    return with_appearance(world, draw_appearance(rng, strength))
 
 
 def with_appearance(world: World, look: Appearance) -> World:
-    """The same world, seen otherwise. What moves in it keeps its colors."""
+    """Returns the world in an appearance; moving obstacles keep their colors."""
     return world.recolored(
         recolored(world.gaussians, look), recolored_background(world.background, look)
     )
 
 
 def recolored(scene: GaussianScene, look: Appearance) -> GaussianScene:
-    """The same Gaussians in other colors.
+    """Returns the Gaussians in other colors.
 
-    Each is one piece of paint: its color without view dependence is repainted and relit, and the
-    view dependence grows or shrinks with its brightness.
+    The base color is painted and lit again; the view dependence scales with its brightness.
     """
     before, normals = scene.base_colors, scene.normals  # (N, 3)
     after = np.empty_like(before)
-    for first in range(0, len(before), _AT_ONCE):
-        some = slice(first, first + _AT_ONCE)
+    for first in range(0, len(before), _BATCH):
+        some = slice(first, first + _BATCH)
         painted = np.clip(before[some] + _paint(before[some], look), 0, 1)
         light = _light(scene.means[some], normals[some], look)
         linear = painted**GAMMA * (look.exposure * light)[:, None]
-        after[some] = _developed(linear @ look.mixing.T)
+        after[some] = _to_srgb(linear @ look.mixing.T)
     sh = scene.sh.copy()
     sh[:, 0] = color_to_sh(after)
     if scene.sh_degree > 0:
@@ -116,20 +112,20 @@ def recolored(scene: GaussianScene, look: Appearance) -> GaussianScene:
 
 
 def recolored_background(background: Background, look: Appearance) -> Background:
-    """What is seen behind everything, under the same light, with another sky mixed in."""
+    """Returns the background under the same light, mixed with another sky."""
 
-    def seen(color: NDArray) -> Array:
+    def recolor(color: NDArray) -> Array:
         mixed = (1 - look.sky_part) * color + look.sky_part * look.sky
-        return _developed(look.exposure * mixed**GAMMA @ look.mixing.T)
+        return _to_srgb(look.exposure * mixed**GAMMA @ look.mixing.T)
 
     if isinstance(background, EnvironmentMap):
-        return EnvironmentMap(seen(background.texels))
-    red, green, blue = seen(np.asarray(background, np.float32)).tolist()
+        return EnvironmentMap(recolor(background.texels))
+    red, green, blue = recolor(np.asarray(background, np.float32)).tolist()
     return red, green, blue
 
 
 def _paint(colors: Array, look: Appearance) -> Array:
-    """What is added to sRGB colors (N, 3): alike for alike ones, so that a material stays one."""
+    """Returns the change of sRGB colors (N, 3), equal for equal colors: materials stay uniform."""
     spacing = 1 / (_PAINTS - 1)
     lower = np.full(3, -0.5 * spacing)
     grids = np.moveaxis(look.paint, -1, 0).copy()
@@ -138,15 +134,13 @@ def _paint(colors: Array, look: Appearance) -> Array:
 
 
 def _light(means: Array, normals: Array, look: Appearance) -> Array:
-    """The light (N,) on Gaussians at `means` (N, 3) [m], 1 in the mean over all directions and
-    places."""
-    # A Gaussian has no outside: it is lit alike from both sides. |cos| is 1/2 in the mean.
+    """Computes the relative light (N,) on Gaussians at `means` (N, 3) [m], 1 on average."""
+    # A Gaussian is lit alike from both sides. |cos| is 1/2 on average.
     facing = 2 * np.abs(normals @ look.light_W)
     phases = look.waves[:, :3] @ means.T + look.waves[:, 3:]  # (5, N)
     mottled = np.cos(phases).sum(axis=0)
     return (1 - look.relief + look.relief * facing) * (1 + look.mottle * mottled / np.sqrt(_WAVES))
 
 
-def _developed(linear: NDArray) -> Array:
-    """The sRGB colors of linear light."""
+def _to_srgb(linear: NDArray) -> Array:
     return (np.clip(linear, 0, 1) ** (1 / GAMMA)).astype(np.float32)

@@ -1,7 +1,7 @@
 """Building blocks of procedural worlds: volumes, boxes, halls, signs, daylight, lamps."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,7 +12,7 @@ from splatpilot.diagrams.worlds.solids.shading import Daylight, Illumination, La
 from splatpilot.diagrams.worlds.solids.solid import Solid, WorldSpec
 from splatpilot.diagrams.worlds.solids.surfaces import FloorPlan
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.collision.occupancy import grid_shape
+from splatpilot.systems.collision.esdf_build import grid_shape
 from splatpilot.systems.collision.shapes import Box, HalfSpace, Shape, ShapeUnion
 from splatpilot.systems.common.validation import (
     Config,
@@ -24,21 +24,15 @@ from splatpilot.systems.common.validation import (
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
-WALL = 0.3
-"""[m], thickness of walls."""
-
-INSET = 1.5
-"""[m], distance of start and goal from the ends of the volume."""
+WALL = 0.3  # [m], thickness of walls
+INSET = 1.5  # [m], distance of start and goal from the ends of the volume
 
 CLEARING, TIGHT_CLEARING = 1.0, 0.9
 """[m], obstacle-free radius about start and goal in the open, and among thin or reconstructed
-things; above the `CLEARANCE` that worlds are checked for."""
+obstacles; above `CLEARANCE`."""
 
-MAX_GROUND, MAX_HEIGHT = 20_000.0, 100.0
-"""[m²] and [m], of generated worlds: 35 times the default forest, 20 million Gaussians."""
-
-PASSAGE = 2 * VEHICLE_RADIUS + 0.1
-"""[m], minimum width of gaps for the vehicle."""
+MAX_GROUND, MAX_HEIGHT = 20_000.0, 100.0  # [m²] and [m], of generated worlds: 20 million Gaussians
+PASSAGE = 2 * VEHICLE_RADIUS + 0.1  # [m], minimum width of gaps for the vehicle
 
 
 def box(lower: ArrayLike, upper: ArrayLike, material: str, seed: int) -> Solid:
@@ -79,49 +73,47 @@ def roof(plan: FloorPlan) -> Solid:
 
 
 def signs_in(walls: list[Solid], aside: int, ahead: int, rng: np.random.Generator) -> list[Solid]:
-    """Signs on the inner faces of the `walls` of a hall: up to `aside` on each of those along it,
-    up to `ahead` on each of those at its ends."""
-    faces, numbers = (3, 2, 1, 0), (aside, aside, ahead, ahead)
+    """Draws signs on the inner faces of a hall: up to `aside` on each side, `ahead` at each end."""
+    faces, counts = (3, 2, 1, 0), (aside, aside, ahead, ahead)
     return [
         sign
-        for wall, face, number in zip(walls, faces, numbers, strict=True)
-        for sign in signs_on(wall, face, number, rng)
+        for wall, face, count in zip(walls, faces, counts, strict=True)
+        for sign in signs_on(wall, face, count, rng)
     ]
 
 
-def signs_on(wall: Solid, face: int, number: int, rng: np.random.Generator) -> list[Solid]:
-    """Draws up to `number` signs, 2 cm thick, 1 to 3.4 m high, on an upright box's face: -x, +x, -y
+def signs_on(wall: Solid, face: int, count: int, rng: np.random.Generator) -> list[Solid]:
+    """Draws up to `count` signs, 2 cm thick, 1 to 3.4 m high, on an upright box's face: -x, +x, -y
     or +y, by index."""
     assert isinstance(wall.shape, Box)
     half, p = np.asarray(wall.shape.size) / 2, wall.shape.X_WO.translation()
     k, sign = face // 2, 2 * (face % 2) - 1
     along = 1 - k
-    room = half[along] - SIGN[0] / 2 - 0.1
+    reach = half[along] - SIGN[0] / 2 - 0.1
     bottom, top = p[2] - half[2], p[2] + half[2]
     lowest, highest = max(bottom + 0.2, 1.0), min(top - 0.2, 4.0) - SIGN[1]
-    if room <= 0 or highest < lowest:
+    if reach <= 0 or highest < lowest:
         return []
-    places = (np.arange(number) + rng.uniform(0.2, 0.8, number)) / number * 2 * room - room
+    offsets = (np.arange(count) + rng.uniform(0.2, 0.8, count)) / count * 2 * reach - reach
     signs = []
-    for place in places:
-        low = rng.uniform(lowest, highest)
+    for offset in offsets:
         center, size = p.copy(), np.full(3, 0.02)
         center[k] += sign * (half[k] + 0.01)
-        center[along] += place
-        center[2] = low + SIGN[1] / 2
+        center[along] += offset
+        center[2] = rng.uniform(lowest, highest) + SIGN[1] / 2
         size[along], size[2] = SIGN
         signs.append(box(center - size / 2, center + size / 2, "signage", int(rng.integers(1000))))
     return signs
 
 
 def daylight(rng: np.random.Generator) -> tuple[Daylight, Callable[[Esdf], Illumination]]:
-    """Draws an hour of the day; returns it and its light, shadowed by a distance field."""
+    """Draws an hour of the day; returns it and a function from an ESDF to its light."""
     hour = Daylight.sample(rng)
     return hour, lambda esdf: Sunlight(hour, esdf)
 
 
 def lamplight(plan: FloorPlan, rng: np.random.Generator) -> Callable[[Esdf], Illumination]:
-    """Draws lamps under the roof, about 4 m apart."""
+    """Draws lamps under the roof, about 4 m apart; returns a function from an ESDF to the light."""
     lower, upper = plan.lower, plan.upper
     n = np.maximum(np.round((upper - lower)[:2] / 4.0).astype(int), 1)
     i, j = np.meshgrid(np.arange(n[0]), np.arange(n[1]), indexing="ij")
@@ -135,20 +127,17 @@ def lamplight(plan: FloorPlan, rng: np.random.Generator) -> Callable[[Esdf], Ill
 def start_and_goal(
     plan: FloorPlan, rng: np.random.Generator, heights: tuple[float, float] = (1.2, 2.4)
 ) -> tuple[NDArray, NDArray]:
-    """Draws a start (3,) and a goal (3,) [m] at the ends of the volume along x, within `heights`
-    [m]."""
+    """Draws a start (3,) and a goal (3,) [m] at the ends along x, within `heights` [m]."""
     lower, upper = plan.lower, plan.upper
     aside = min(0.3 * (upper - lower)[1], (upper - lower)[1] / 2 - INSET)
     y, z = (lower + upper)[1] / 2 + rng.uniform(-aside, aside, 2), rng.uniform(*heights, 2)
-    return (
-        np.array([lower[0] + INSET, y[0], z[0]]),
-        np.array([upper[0] - INSET, y[1], z[1]]),
-    )
+    x = lower[0] + INSET, upper[0] - INSET
+    return np.array([x[0], y[0], z[0]]), np.array([x[1], y[1], z[1]])
 
 
-def clear_of(shape: Shape, points: list[NDArray], clearance: float) -> bool:
-    """Checks that all `points` (3,) [m] are at least `clearance` [m] from a shape."""
-    return bool((ShapeUnion.of([shape]).distance(points) >= clearance).all())
+def has_clearance(shape: Shape, p_W: ArrayLike, clearance: float) -> bool:
+    """Checks that all points (N, 3) [m] are at least `clearance` [m] from a shape."""
+    return bool((ShapeUnion.of([shape]).distance(p_W) >= clearance).all())
 
 
 @dataclass
@@ -186,42 +175,24 @@ def volume_spec(
     solids: list[Solid],
     ends: tuple[NDArray, NDArray],
     light: Callable[[Esdf], Illumination],
-    surroundings: Callable[[], list[GaussianScene]] | None = None,
+    surroundings: Callable[[], list[GaussianScene]] = list,
 ) -> WorldSpec:
     """Returns the specification of a world that fills the volume of `config`."""
     plan = config.plan
-    return WorldSpec(
-        name=name,
-        lower_W=plan.lower,
-        upper_W=plan.upper,
-        solids=solids,
-        p_WS=ends[0],
-        p_WG=ends[1],
-        light=light,
-        surroundings=surroundings or list,
-        seed=seed,
-        voxel_size=config.voxel_size,
-    )
+    spec = WorldSpec(name, plan.lower, plan.upper, solids, *ends, light, seed, config.voxel_size)
+    return replace(spec, surroundings=surroundings)
 
 
-_TRIES = 24
-"""Candidates around each point, after Bridson (2007)."""
+_TRIES = 24  # candidates around each point
 
 
 def poisson_disk(
     lower: ArrayLike, upper: ArrayLike, spacing: float, rng: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Fills the rectangle [lower, upper] with points no two of which are closer than `spacing`.
+    """Fills the rectangle [lower, upper], (2,) [m], with points (N, 2) at least `spacing` apart.
 
-    Bridson's algorithm: draws points from rings of 1 to 2 spacings about old ones and keeps those
-    that are not too close, looked up on a grid of cells that hold at most one point.
-
-    Args:
-        lower, upper: (2,) [m].
-        spacing: [m].
-
-    Returns:
-        Points (N, 2) [m].
+    Bridson's algorithm (2007): draws points from rings of 1 to 2 spacings about old ones and keeps
+    those that are not too close, by a grid of cells that hold at most one point.
     """
     lower, upper = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
     cell = spacing / np.sqrt(2)

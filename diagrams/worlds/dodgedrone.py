@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatpilot.diagrams.worlds.building_blocks import daylight, ground
-from splatpilot.diagrams.worlds.forest.scenery import trees_around
+from splatpilot.diagrams.worlds.forest.forest import trees_around
 from splatpilot.diagrams.worlds.solids.shading import Illumination
 from splatpilot.diagrams.worlds.solids.solid import Solid, WorldSpec
 from splatpilot.diagrams.worlds.solids.surfaces import FloorPlan
@@ -20,17 +20,11 @@ from splatpilot.systems.splats.scene import GaussianScene
 Array = NDArray[np.float64]
 type Triple = tuple[float, float, float]
 
-SEED = 20220301
-"""Of the generator, as it was published."""
-
-PERIOD = 0.02
-"""[s] between the rows of a path."""
-
-_ROWS = 1500
-"""Rows of a path that never leaves its region: 30 s."""
-
+SEED = 20220301  # Published seed of the generator
+PERIOD = 0.02  # [s] between the rows of a path
+_ROWS = 1500  # of a path that never leaves its region: 30 s
+# [m] Corners of the boxes about start and target in which obstacles vanish.
 _KEPT_FREE = ((-3.0, -3.0, 0.0), (3.0, 3.0, 5.0)), ((57.0, -3.0, 0.0), (61.0, 3.0, 5.0))
-"""[m] Corners of the boxes about start and target; obstacles vanish in them."""
 
 
 @dataclass(frozen=True)
@@ -40,9 +34,9 @@ class Group:
     count: int
     lower: Triple  # [m], corners of the region of their centers
     upper: Triple
-    diameters: tuple[float, float]  # [m], least and largest
-    speed: Triple = (0.0, 0.0, 0.0)  # [m/s], largest along each axis at first; zero: static
-    acceleration: float = 0.0  # [m/s^2], largest along each axis, another one every row
+    diameters: tuple[float, float]  # [m], minimum and maximum
+    speed: Triple = (0.0, 0.0, 0.0)  # [m/s], maximum initial one along each axis; zero: static
+    acceleration: float = 0.0  # [m/s^2], maximum along each axis, drawn per row
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,10 +53,7 @@ _FROM_40 = (40.0, -10.0, 0.0), (60.0, 10.0, 10.0)
 _ANY, _MIDDLE, _SMALL = (0.1, 3.0), (0.5, 2.0), (0.5, 1.5)
 
 LEVELS: dict[str, tuple[Group, ...]] = {
-    "easy": (
-        Group(76, *_ALL, _ANY),
-        Group(9, *_FROM_20, _MIDDLE, (5.0, 5.0, 2.0)),
-    ),
+    "easy": (Group(76, *_ALL, _ANY), Group(9, *_FROM_20, _MIDDLE, (5.0, 5.0, 2.0))),
     "medium": (
         Group(384, *_ALL, _ANY),
         Group(88, *_FROM_20, _MIDDLE, (1.0, 1.0, 1.0)),
@@ -76,12 +67,11 @@ LEVELS: dict[str, tuple[Group, ...]] = {
         Group(50, (40.0, -4.0, 0.0), (60.0, 4.0, 10.0), _SMALL, (1.0, 1.0, 1.0), 10.0),
     ),
 }
-"""The challenge's levels: medium as in its published configuration, easy and hard as in the lists
-of obstacles that came with it."""
+"""The levels: medium of the published configuration, easy and hard of the published lists."""
 
 
 def draw_obstacles(groups: tuple[Group, ...], seed: int) -> list[Obstacle]:
-    """Draws the obstacles of all groups in order, deterministic by seed."""
+    """Draws the obstacles of all groups in order."""
     rng = np.random.RandomState(seed)
     return [_draw(group, rng) for group in groups for _ in range(group.count)]
 
@@ -102,7 +92,6 @@ def _draw(group: Group, rng: np.random.RandomState) -> Obstacle:
     start = rng.rand(3) * (upper - lower) + lower
     velocities = velocity + np.cumsum(acceleration, axis=0) * PERIOD
     path = start + np.cumsum(velocities, axis=0) * PERIOD
-    # It ends where it leaves the region.
     outside = ((path > upper) | (path < lower)).any(axis=1)
     if outside.any():
         path = path[: max(1, int(np.argmax(outside)))]
@@ -111,11 +100,10 @@ def _draw(group: Group, rng: np.random.RandomState) -> Obstacle:
     return Obstacle(diameter / 2, path)
 
 
-_PLOT = FloorPlan(np.array([-5.0, -10.0, 0.0]), np.array([65.0, 10.0, 10.0]))
-"""The volume of the rules."""
+_VOLUME = FloorPlan(np.array([-5.0, -10.0, 0.0]), np.array([65.0, 10.0, 10.0]))
 
-# The vehicle takes off to 1 m and flies 60 m along x. The goal lies 3 m behind, in the middle of
-# the height that is kept free; within 3 m of it the vehicle has arrived.
+# By the rules, the vehicle takes off to 1 m and flies 60 m along x. The goal is 3 m farther, its
+# radius 3 m.
 _P_WS = np.array([0.0, 0.0, 1.0])
 _P_WG = np.array([63.0, 0.0, 2.5])
 
@@ -128,32 +116,32 @@ class DodgeDroneConfig(Config):
 
     # Density and speed of the obstacles.
     level: str = bounded("medium", f"{{{', '.join(LEVELS)}}}")
-    # Seed of the challenge's generator for the course of seed 0; the next one for that of seed 1.
+    # Seed of the challenge's generator for the course of seed 0, plus 1 for that of seed 1.
     first_seed: int = bounded(SEED, f"[0, {2**31 - 1}]")
     voxel_size: float = bounded(0.2, "[0.05, 1] m")  # [m] of the distance grid
 
 
 def dodgedrone_world(config: DodgeDroneConfig, seed: int) -> World:
-    """Returns the course of `config` and `seed`, also if no route is wide enough."""
+    """Returns the course of `config` and `seed`, feasible or not."""
     config.validate()
     rng = np.random.default_rng([seed, 0])
     obstacles = draw_obstacles(LEVELS[config.level], config.first_seed + seed)
     static = [o for o in obstacles if len(o.path) == 1 and np.isfinite(o.path).all()]
     moving = [o for o in obstacles if len(o.path) > 1]
     hour, light = daylight(rng)
+    solids = [
+        Solid(Sphere(o.path[0], o.radius), _STATIC[rng.integers(3)], int(rng.integers(1000)))
+        for o in static
+    ]
     spec = WorldSpec(
         name=f"dodgedrone_{config.level}",
-        lower_W=_PLOT.lower,
-        upper_W=_PLOT.upper,
-        solids=[ground("concrete")]
-        + [
-            Solid(Sphere(o.path[0], o.radius), _STATIC[rng.integers(3)], int(rng.integers(1000)))
-            for o in static
-        ],
+        lower_W=_VOLUME.lower,
+        upper_W=_VOLUME.upper,
+        solids=[ground("concrete"), *solids],
         p_WS=_P_WS,
         p_WG=_P_WG,
         light=light,
-        surroundings=trees_around(_PLOT, hour, seed),
+        surroundings=trees_around(_VOLUME, hour, seed),
         seed=seed,
         voxel_size=config.voxel_size,
     )
@@ -169,9 +157,8 @@ def _draw_body(obstacle: Obstacle, course: WorldSpec, light: Illumination) -> Ga
     present = obstacle.path[np.isfinite(obstacle.path).all(axis=1)]
     center = present[0] if len(present) else course.p_WS
     solid = Solid(Sphere(center, obstacle.radius), _MOVING)
-    # It is seen from all sides.
-    alone = replace(
-        course, solids=[solid], lower_W=course.lower_W - 100.0, upper_W=course.upper_W + 100.0
-    )
+    # A large volume, since it is seen from all sides.
+    lower_W, upper_W = course.lower_W - 100.0, course.upper_W + 100.0
+    alone = replace(course, solids=[solid], lower_W=lower_W, upper_W=upper_W)
     body = draw(alone, [solid], light)
     return replace(body, means=body.means - center.astype(np.float32))

@@ -1,5 +1,6 @@
-"""Checks by grid search that a collision-free path from start to goal exists; chooses ends."""
+"""Checks by grid search that a path from start to goal exists; chooses starts and goals."""
 
+import functools
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
@@ -15,31 +16,37 @@ from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.esdf_build import cubes_of_points
 from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.common.seeds import check_seed
+from splatpilot.systems.common.validation import Config
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
-CLEARANCE = 0.8
-"""[m], minimum distance of start and goal from obstacles and bounds."""
-
-TRIES = 60
-"""Draws of an instance before its parameters are refused."""
+CLEARANCE = 0.8  # [m], minimum distance of start and goal from obstacles and bounds
+TRIES = 60  # Maximum number of draws of an instance
 
 
 def draw_feasible(draw: Callable[[np.random.Generator], WorldSpec], seed: int) -> WorldSpec:
-    """Draws instances of a world from `seed` until one is feasible, deterministically.
-
-    Raises InfeasibleFlightError if none of `TRIES` instances is.
-    """
+    """Draws instances of a world from `seed` until one is feasible, up to `TRIES`."""
     check_seed(seed)
-    name = "world"
     for attempt in range(TRIES):
         spec = draw(np.random.default_rng([seed, attempt]))
-        name = spec.name
         if is_feasible(spec):
             return spec
     raise InfeasibleFlightError(
-        f"{name}: none of {TRIES} instances drawn from seed {seed} leaves a vehicle of radius "
+        f"none of {TRIES} instances of the world drawn from seed {seed} leaves a vehicle of radius "
         f"{VEHICLE_RADIUS} m a route from start to goal; use fewer or smaller obstacles"
     )
+
+
+def until_feasible[C: Config](
+    draw: Callable[[C, int, np.random.Generator], WorldSpec],
+) -> Callable[[C, int], WorldSpec]:
+    """Decorates a generator of instances: validates the configuration, draws a feasible one."""
+
+    @functools.wraps(draw)
+    def make(config: C, seed: int) -> WorldSpec:
+        config.validate()
+        return draw_feasible(lambda rng: draw(config, seed, rng), seed)
+
+    return make
 
 
 def is_feasible(spec: WorldSpec) -> bool:
@@ -47,18 +54,14 @@ def is_feasible(spec: WorldSpec) -> bool:
 
     A coarse grid finds most paths; the finest finds those through gaps of 1 m.
     """
-    field = spec.distance_field
-    ends = np.stack([spec.p_WS, spec.p_WG])
-    if not (conservative_distance(field, ends) >= CLEARANCE).all():
+    field, ends = spec.distance_field, (spec.p_WS, spec.p_WG)
+    if not (conservative_distance(field, np.stack(ends)) >= CLEARANCE).all():
         return False
-    return any(
-        connects(field, spec.p_WS, spec.p_WG, VEHICLE_RADIUS, spacing)
-        for spacing in (0.3, 0.15, 0.12)
-    )
+    return any(connects(field, *ends, VEHICLE_RADIUS, spacing) for spacing in (0.3, 0.15, 0.12))
 
 
 def conservative_distance(field: DistanceField, p_WQ: NDArray) -> NDArray[np.float64]:
-    """Computes distances (...,) [m] of p_WQ (..., 3) in the bounds to surfaces and bounds."""
+    """Computes distances (...,) [m] of points (..., 3) in the bounds to surfaces and bounds."""
     to_bounds = np.minimum(p_WQ - field.lower_W, field.upper_W - p_WQ).min(axis=-1)
     return np.minimum(field.distance(p_WQ), to_bounds)
 
@@ -68,18 +71,16 @@ def connects(
 ) -> bool:
     """Checks by a grid that a sphere of `radius` [m] can fly from p_WS to p_WG (3,) [m].
 
-    Neighbors along an axis, `spacing` h [m] apart, both further than radius + h / 2 from every
-    obstacle, are joined by a free segment: no point of it is further than h / 2 from one of them,
-    and distances change no faster than the position. The field is exact, so that no branch or wire
-    falls between the points of the grid.
+    Neighbors along an axis, `spacing` h [m] apart, both farther than radius + h / 2 from every
+    obstacle, are joined by a free segment, since distances change no faster than the position.
     """
     grid = grid_distances(field, spacing)
     free = grid > radius + spacing / 2
-    return are_connected(free, *(cell_of(field, grid, spacing, p) for p in (p_WS, p_WG)))
+    return are_connected(free, *(grid_cell(field, grid, spacing, p) for p in (p_WS, p_WG)))
 
 
-def cell_of(field: DistanceField, grid: NDArray, spacing: float, p_W: NDArray) -> tuple[int, ...]:
-    """Returns the cell of `grid_distances` around p_W (3,) [m]."""
+def grid_cell(field: DistanceField, grid: NDArray, spacing: float, p_W: NDArray) -> tuple[int, ...]:
+    """Returns the cell of `grid_distances` that holds p_W (3,) [m]."""
     cell = np.clip(((p_W - field.lower_W) / spacing).astype(int), 0, np.array(grid.shape) - 1)
     return tuple(int(c) for c in cell)
 
@@ -102,15 +103,9 @@ def grid_distances(field: DistanceField, spacing: float) -> NDArray[np.float64]:
     return grid
 
 
-SHORTEST = 1.0
-"""[m], minimum length of a route."""
-
-LONG_ENOUGH = 8.0
-"""[m], length from which a route is representative; the benchmark's own minimum."""
-
-_GAIN = 1.5
-"""[-] How many times as long a path with half of the margin must be to be preferred."""
-
+SHORTEST = 1.0  # [m], minimum length of a route
+LONG_ENOUGH = 8.0  # [m], minimum length of a representative route, as in the benchmark
+_GAIN = 1.5  # minimum ratio of route lengths for which half of the margin is preferred
 _MAX_NODES = 250_000
 _DRAWS = 20
 
@@ -118,16 +113,11 @@ _DRAWS = 20
 class _Part(NamedTuple):
     """A connected part of the free space."""
 
-    graph: csr_array
-    """Of all free space; the other parts are not reached from this one."""
-    p_WN: NDArray[np.float64]
-    """(N, 3) [m], the nodes of the graph."""
-    nodes: NDArray[np.intp]
-    """Of the part."""
-    end: int
-    """The node that begins (nearly) the longest of all shortest paths in the part."""
-    length: float
-    """[m], of that path."""
+    graph: csr_array  # of all free space
+    p_WN: NDArray[np.float64]  # (N, 3) [m], the nodes of the graph
+    nodes: NDArray[np.intp]  # of the part
+    end: int  # the node that begins (nearly) the longest of all shortest paths in the part
+    length: float  # [m], of that path
 
 
 def choose_start_and_goal(
@@ -135,9 +125,9 @@ def choose_start_and_goal(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
     """Returns p_WS (3,), p_WG (3,) and the length of the shortest path between them, all in [m].
 
-    The ends of (nearly) the longest of all shortest paths, `SHORTEST` to `longest` [m], of a sphere
-    of `radius` through known free space, with `margin` [m] to spare or half of that, see
-    `_longest_part`; planners do not trust narrower gaps.
+    They are the ends of (nearly) the longest of all shortest paths, `SHORTEST` to `longest` [m], of
+    a sphere of `radius` through known free space, with `margin` [m] to spare or half of that, see
+    `_longest_part`.
     """
     part = _longest_part(esdf, radius, margin, longest, SHORTEST)
     goal, length = _farthest(part.graph, part.end, longest)
@@ -154,10 +144,10 @@ def draw_start_and_goal(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
     """Returns p_WS (3,), p_WG (3,) and the length of the shortest path between them, all in [m].
 
-    As `choose_start_and_goal`, but drawn from `seed`: the start from the part of free space with
-    the longest path, the goal from those nodes whose shortest path is at least 60 % of that, up to
-    `longest` [m], and at least `least` [m]. After `_DRAWS` starts without such a goal, the start is
-    an end of the longest path.
+    As `choose_start_and_goal`, but drawn: the start from the part of free space with the longest
+    path, the goal from the nodes whose shortest path is at least 60 % of that, up to `longest` [m],
+    and at least `least` [m]. After `_DRAWS` starts without such a goal, the start is an end of the
+    longest path.
     """
     rng = np.random.default_rng(seed)
     part = _longest_part(esdf, radius, margin, longest, least)
@@ -169,7 +159,7 @@ def draw_start_and_goal(
         if len(far):
             goal = int(rng.choice(far))
             return part.p_WN[start], part.p_WN[goal], float(lengths[goal])
-    raise _no_room(esdf, radius, margin, part.length, least)
+    raise _infeasible(esdf, radius, margin, part.length, least)
 
 
 def short_route_warning(length: float) -> str:
@@ -177,17 +167,16 @@ def short_route_warning(length: float) -> str:
     if length >= LONG_ENOUGH:
         return ""
     return (
-        f"the longest route from a start to a goal is {length:.1f} m, and flights shorter than "
-        f"{LONG_ENOUGH:g} m show little; free space is narrow or cut up, and unknown space counts "
-        "as occupied"
+        f"the longest route from a start to a goal is {length:.1f} m, too short to be "
+        f"representative (at least {LONG_ENOUGH:g} m); unknown space counts as occupied"
     )
 
 
 def _longest_part(esdf: Esdf, radius: float, margin: float, longest: float, least: float) -> _Part:
     """Returns the connected part of the free space with the longest path, up to `longest` [m].
 
-    It has all of `margin` [m] if that path is `LONG_ENOUGH`, and else half of it if that makes the
-    path `_GAIN` times as long. Raises InfeasibleFlightError if it is shorter than `least` [m].
+    It keeps `margin` [m] if that path is `LONG_ENOUGH`, otherwise half of it if that makes the path
+    `_GAIN` times as long.
     """
     best, reach = None, 0.0
     for graph, p_WN, spacing in _free_graphs(esdf, radius, margin):
@@ -195,28 +184,26 @@ def _longest_part(esdf: Esdf, radius: float, margin: float, longest: float, leas
             break
         _, label = connected_components(graph, directed=False)
         sizes = np.bincount(label)
-        for number in np.argsort(-sizes, kind="stable"):
+        for index in np.argsort(-sizes, kind="stable"):
             # No path is longer than one along the diagonals through all nodes of a part.
-            if min(np.sqrt(3.0) * spacing * (sizes[number] - 1), longest) <= reach:
+            if min(np.sqrt(3.0) * spacing * (sizes[index] - 1), longest) <= reach:
                 break
-            nodes = np.flatnonzero(label == number)
+            nodes = np.flatnonzero(label == index)
             end, _ = _farthest(graph, int(nodes[0]))
             _, length = _farthest(graph, end)
             if length > reach:
                 best, reach = _Part(graph, p_WN, nodes, end, length), length
         reach *= _GAIN
     if best is None or best.length < least:
-        raise _no_room(esdf, radius, margin, 0.0 if best is None else best.length, least)
+        raise _infeasible(esdf, radius, margin, 0.0 if best is None else best.length, least)
     return best
 
 
 def _free_graphs(
     esdf: Esdf, radius: float, margin: float
 ) -> Iterator[tuple[csr_array, NDArray[np.float64], float]]:
-    """Yields graphs of the space free for a sphere, with all and half of `margin`.
-
-    With each come its nodes (N, 3) [m] and their spacing [m].
-    """
+    """Yields graphs of the space free for a sphere, with all and half of `margin`: graph, nodes
+    (N, 3) [m] and their spacing [m]."""
     field = esdf.conservative()
     extent = esdf.upper_W - esdf.lower_W
     spacing = max(esdf.voxel_size, 0.15, float(np.cbrt(np.prod(extent) / _MAX_NODES)))
@@ -232,50 +219,43 @@ def _free_graphs(
             yield graph, p_WN.reshape(-1, 3)[nodes], spacing
 
 
-def _no_room(
+def _infeasible(
     esdf: Esdf, radius: float, margin: float, reach: float, least: float
 ) -> InfeasibleFlightError:
-    room = f"a vehicle of radius {radius} m with {margin / 2:g} m to spare"
-    if reach > 0:
-        return InfeasibleFlightError(
-            f"the longest route of {room} through free space must be at least {least:g} m, got "
-            f"{reach:.2f} m; unknown space counts as occupied: capture more of the scene"
-        )
     largest = float(esdf.conservative().distances.max())
     return InfeasibleFlightError(
-        f"no free space for {room}: the largest clearance is {largest:.2f} m, and unknown space "
-        "counts as occupied; capture more of the scene"
+        f"the longest route of a vehicle of radius {radius} m with {margin / 2:g} m to spare must "
+        f"be at least {least:g} m, got {reach:.2f} m; the largest clearance is {largest:.2f} m, "
+        "and unknown space counts as occupied: capture more of the scene"
     )
 
 
 def grid_graph(free: NDArray[np.bool_], spacing: float) -> tuple[csr_array, NDArray[np.intp]]:
-    """Returns the graph that joins each free node to its free neighbors among the 26 around it,
-    weighted by distance [m], and the flat index of each of its nodes."""
+    """Returns the graph that joins free nodes to their free neighbors, 26 at most, with weights
+    [m], and the flat index of each of its nodes."""
     nodes = np.flatnonzero(free)
-    number = np.full(free.shape, -1)
-    number.flat[nodes] = np.arange(len(nodes))
+    index = np.full(free.shape, -1)
+    index.flat[nodes] = np.arange(len(nodes))
     rows, columns, weights = [], [], []
     for offset in np.ndindex(3, 3, 3):
         step = np.array(offset) - 1
         if tuple(step) <= (0, 0, 0):
             continue  # the other half of the neighbors follows by symmetry
-        here = tuple(
-            slice(max(-s, 0), n - max(s, 0)) for s, n in zip(step, free.shape, strict=True)
-        )
-        there = tuple(
-            slice(max(s, 0), n - max(-s, 0)) for s, n in zip(step, free.shape, strict=True)
+        here, there = (
+            tuple(slice(max(-s, 0), n - max(s, 0)) for s, n in zip(shift, free.shape, strict=True))
+            for shift in (step, -step)
         )
         both = free[here] & free[there]
-        rows.append(number[here][both])
-        columns.append(number[there][both])
+        rows.append(index[here][both])
+        columns.append(index[there][both])
         weights.append(np.full(len(rows[-1]), spacing * np.linalg.norm(step)))
     entries = np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns))
     return csr_array(coo_array(entries, shape=(len(nodes), len(nodes)))), nodes
 
 
 def _farthest(graph: csr_array, node: int, longest: float = np.inf) -> tuple[int, float]:
-    """Returns the node with the longest shortest path from `node` of at most `longest` [m], and the
-    length of that [m]."""
+    """Returns the node with the longest shortest path from `node`, up to `longest` [m], and that
+    length [m]."""
     lengths = dijkstra(graph, directed=False, indices=node, limit=longest)
     lengths[np.isinf(lengths)] = -1
     farthest = int(np.argmax(lengths))

@@ -1,4 +1,4 @@
-"""Furnished rooms: one, or the floor of an office."""
+"""Furnished worlds: a room, and the floor of an office."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,9 +12,9 @@ from splatpilot.diagrams.worlds.building_blocks import (
     PASSAGE,
     VolumeConfig,
     box,
-    clear_of,
     ground,
     hall,
+    has_clearance,
     lamplight,
     require_order,
     roof,
@@ -24,7 +24,7 @@ from splatpilot.diagrams.worlds.building_blocks import (
     start_and_goal,
     volume_spec,
 )
-from splatpilot.diagrams.worlds.feasibility import CLEARANCE, draw_feasible
+from splatpilot.diagrams.worlds.feasibility import CLEARANCE, until_feasible
 from splatpilot.diagrams.worlds.solids.solid import Solid, WorldSpec
 from splatpilot.systems.collision.shapes import Capsule, Cylinder, Sphere
 from splatpilot.systems.common.validation import bounded, require_field
@@ -38,13 +38,12 @@ def furnish(
     free: list[NDArray],
     rng: np.random.Generator,
 ) -> list[Solid]:
-    """Draws furniture of a room, none within `CLEARANCE` of `free` points.
+    """Draws furniture of a room, none within `CLEARANCE` of `free` points (3,) [m].
 
     Args:
         items: number of pieces; those that do not fit in 50 draws are left out.
         lower, upper: (2,) [m], bounds of the centers of pieces.
-        height: [m], of the ceiling above the floor z = 0.
-        free: (3,) [m] each.
+        height: [m], of the room.
     """
     furniture: list[Solid] = []
     for _ in range(items):
@@ -53,19 +52,14 @@ def furnish(
             p = rng.uniform(lower, upper)
             angle = rng.choice(4) * np.pi / 2 + rng.normal(0, 0.12)
             item = make(p, angle, height, int(rng.integers(1000)), rng)
-            if all(clear_of(solid.shape, free, CLEARANCE) for solid in item):
+            if all(has_clearance(solid.shape, free, CLEARANCE) for solid in item):
                 furniture += item
                 break
     return furniture
 
 
-type Item = Callable[[NDArray, float, float, int, np.random.Generator], list[Solid]]
-"""Builds a piece of furniture from its position (2,) [m], its direction [rad], the height of the
-room [m], a seed for its appearance and random numbers for its size."""
-
-
 def _parts(p: NDArray, angle: float, parts: list[tuple], seed: int) -> list[Solid]:
-    """Returns boxes (center (3,), size (3,), material) of a piece at p (2,), rotated about z."""
+    """Builds boxes from (center (3,), size (3,), material) in the frame of a piece at p (2,)."""
     R = RotationMatrix.MakeZRotation(angle)
     at = np.array([*p, 0.0])
     return [
@@ -74,19 +68,19 @@ def _parts(p: NDArray, angle: float, parts: list[tuple], seed: int) -> list[Soli
     ]
 
 
+# Each `Item` builds a piece of furniture at p (2,) [m], rotated by `angle` [rad] about z, in a room
+# of a height [m]; the seed is of its appearance, the random numbers of its size.
+type Item = Callable[[NDArray, float, float, int, np.random.Generator], list[Solid]]
+
+
 def _shelf(p, angle, height, seed, rng) -> list[Solid]:
     w, d, h = rng.uniform(1.2, 2.0), 0.4, rng.uniform(1.6, min(2.4, height - 0.2))
     boards = [((0, 0, z), (w, d, 0.05), "wood") for z in np.linspace(0.1, h - 0.03, 5)]
     sides = [((x, 0, h / 2), (0.05, d, h), "wood") for x in (-w / 2, w / 2)]
-    boxes = [
-        (
-            (rng.uniform(-0.4, 0.4) * w, 0, z + 0.02 + s / 2),
-            (rng.uniform(0.3, 0.6), 0.3, s),
-            "crate",
-        )
-        for z in np.linspace(0.1, h - 0.03, 5)[:4]
-        for s in [rng.uniform(0.12, 0.25)]
-    ]
+    boxes = []
+    for z in np.linspace(0.1, h - 0.03, 5)[:4]:
+        s, x = rng.uniform(0.12, 0.25), rng.uniform(-0.4, 0.4) * w
+        boxes.append(((x, 0, z + 0.02 + s / 2), (rng.uniform(0.3, 0.6), 0.3, s), "crate"))
     return _parts(p, angle, [*boards, *sides, *boxes], seed)
 
 
@@ -152,7 +146,7 @@ FURNITURE: tuple[Item, ...] = (_shelf, _cabinet, _table, _sofa, _crates, _column
 
 @dataclass
 class RoomConfig(VolumeConfig):
-    """A room with furniture, flown from end to end."""
+    """A room with furniture."""
 
     length: float = bounded(12.0, "[6, 200] m")  # [m] along x: from 0 to length
     width: float = bounded(10.0, "[4, 200] m")  # [m] along y, centered on 0
@@ -161,37 +155,30 @@ class RoomConfig(VolumeConfig):
     voxel_size: float = bounded(0.1, "(0, 200] m")  # [m] of the distance grid
 
 
-def room_spec(config: RoomConfig, seed: int) -> WorldSpec:
+@until_feasible
+def room_spec(config: RoomConfig, seed: int, rng: np.random.Generator) -> WorldSpec:
     """Furnishes the room of `config`."""
-    config.validate()
     plan = config.plan
-
-    def draw(rng: np.random.Generator) -> WorldSpec:
-        ends = start_and_goal(plan, rng, (1.0, min(1.9, config.height - 0.9)))
-        inner = plan.lower[:2] + 0.7, plan.upper[:2] - 0.7
-        furniture = furnish(config.items, *inner, config.height, list(ends), rng)
-        sides = hall(plan, ["plaster", "plaster", "wood", "brick"], rng)
-        signs = signs_in(sides, 2, 2, rng)
-        floor = ground(("tiles", "wood", "concrete")[rng.integers(3)], int(rng.integers(10)))
-        solids = [floor, roof(plan), *sides, *signs, *furniture]
-        return volume_spec("room", config, seed, solids, ends, lamplight(plan, rng))
-
-    return draw_feasible(draw, seed)
+    ends = start_and_goal(plan, rng, (1.0, min(1.9, config.height - 0.9)))
+    inner = plan.lower[:2] + 0.7, plan.upper[:2] - 0.7
+    furniture = furnish(config.items, *inner, config.height, list(ends), rng)
+    sides = hall(plan, ["plaster", "plaster", "wood", "brick"], rng)
+    signs = signs_in(sides, 2, 2, rng)
+    floor = ground(("tiles", "wood", "concrete")[rng.integers(3)], int(rng.integers(10)))
+    solids = [floor, roof(plan), *sides, *signs, *furniture]
+    return volume_spec("room", config, seed, solids, ends, lamplight(plan, rng))
 
 
-PARTITION = 0.15
-"""[m], thickness of the walls between rooms."""
-
-JAMB = 0.25
-"""[m], minimum length of wall between a door and a corner."""
+PARTITION = 0.15  # [m], thickness of the walls between rooms
+JAMB = 0.25  # [m], minimum length of wall between a door and a corner
 
 
 @dataclass
 class OfficeConfig(VolumeConfig):
-    """A floor divided into rooms, flown from a room at one end to a room at the other.
+    """A floor divided into rooms, with start and goal in rooms at opposite ends.
 
-    Walls divide it until no side is twice `room`. Every wall has a door, so all rooms are
-    connected; some have two, so that there are detours.
+    Walls divide it until no side is twice `room`. Every wall has one or two doors, so all rooms are
+    connected.
     """
 
     length: float = bounded(22.0, "[6, 200] m")  # [m] along x: from 0 to length
@@ -223,7 +210,7 @@ class _Room(NamedTuple):
     upper: NDArray  # (2,) [m]
 
     def inside(self, margin: float) -> tuple[NDArray, NDArray]:
-        """Its corners (2,), `margin` [m] inwards."""
+        """Returns the corners (2,), `margin` [m] inwards."""
         return self.lower + margin, self.upper - margin
 
 
@@ -236,58 +223,54 @@ class _Door(NamedTuple):
 
 
 class _Partition(NamedTuple):
-    """A wall between rooms, its middle at `at` [m] along an axis, across which it stands."""
+    """A wall between rooms, normal to an axis."""
 
     axis: int  # 0 for x, 1 for y
-    at: float
-    low: float  # [m], where it begins and ends along the other axis
+    at: float  # [m], its middle along the axis
+    low: float  # [m], its ends along the other axis
     high: float
     doors: list[_Door]
 
     def point(self, across: float, along: float, z: float) -> NDArray:
-        """The point (3,) `across` [m] from the middle of the wall and at `along` and z [m]."""
+        """Returns the point (3,) `across` [m] from the middle of the wall, at `along` and z [m]."""
         p = np.array([along, along, z])
         p[self.axis] = self.at + across
         return p
 
 
-def office_spec(config: OfficeConfig, seed: int) -> WorldSpec:
+@until_feasible
+def office_spec(config: OfficeConfig, seed: int, rng: np.random.Generator) -> WorldSpec:
     """Divides and furnishes the floor of `config`."""
-    config.validate()
     plan = config.plan
-
-    def draw(rng: np.random.Generator) -> WorldSpec:
-        partitions: list[_Partition] = []
-        rooms = _divide(_Room(plan.lower[:2], plan.upper[:2]), config, partitions, rng)
-        p_WS = _point_in([r for r in rooms if r.lower[0] == plan.lower[0]], config, rng)
-        p_WG = _point_in([r for r in rooms if r.upper[0] == plan.upper[0]], config, rng)
-        free = [p_WS, p_WG]
-        free += [wall.point(0, door.middle, 1.1) for wall in partitions for door in wall.doors]
-        areas = np.array([np.prod(room.upper - room.lower) for room in rooms])
-        counts = rng.multinomial(config.items, areas / areas.sum())
-        furniture: list[Solid] = []
-        for room, items in zip(rooms, counts, strict=True):
-            furniture += furnish(int(items), *room.inside(0.9), config.height, free, rng)
-        sides = hall(plan, ["plaster", "plaster", "concrete"], rng)
-        signs = signs_in(sides, 3, 2, rng)
-        walls: list[Solid] = []
-        for partition in partitions:
-            pieces = _build(partition, config.height, rng)
-            walls += pieces
-            for piece in pieces:
-                for face in (2 * partition.axis, 2 * partition.axis + 1):
-                    signs += signs_on(piece, face, int(rng.integers(2)), rng)
-        floor = ground(("tiles", "wood", "concrete")[rng.integers(3)], int(rng.integers(10)))
-        solids = [floor, roof(plan), *sides, *walls, *signs, *furniture]
-        return volume_spec("office", config, seed, solids, (p_WS, p_WG), lamplight(plan, rng))
-
-    return draw_feasible(draw, seed)
+    partitions: list[_Partition] = []
+    rooms = _divide(_Room(plan.lower[:2], plan.upper[:2]), config, partitions, rng)
+    p_WS = _point_in([r for r in rooms if r.lower[0] == plan.lower[0]], config, rng)
+    p_WG = _point_in([r for r in rooms if r.upper[0] == plan.upper[0]], config, rng)
+    free = [p_WS, p_WG]
+    free += [wall.point(0, door.middle, 1.1) for wall in partitions for door in wall.doors]
+    areas = np.array([np.prod(room.upper - room.lower) for room in rooms])
+    counts = rng.multinomial(config.items, areas / areas.sum())
+    furniture: list[Solid] = []
+    for room, items in zip(rooms, counts, strict=True):
+        furniture += furnish(int(items), *room.inside(0.9), config.height, free, rng)
+    sides = hall(plan, ["plaster", "plaster", "concrete"], rng)
+    signs = signs_in(sides, 3, 2, rng)
+    walls: list[Solid] = []
+    for partition in partitions:
+        pieces = _build(partition, config.height, rng)
+        walls += pieces
+        for piece in pieces:
+            for face in (2 * partition.axis, 2 * partition.axis + 1):
+                signs += signs_on(piece, face, int(rng.integers(2)), rng)
+    floor = ground(("tiles", "wood", "concrete")[rng.integers(3)], int(rng.integers(10)))
+    solids = [floor, roof(plan), *sides, *walls, *signs, *furniture]
+    return volume_spec("office", config, seed, solids, (p_WS, p_WG), lamplight(plan, rng))
 
 
 def _divide(
     whole: _Room, config: OfficeConfig, partitions: list[_Partition], rng: np.random.Generator
 ) -> list[_Room]:
-    """Divides a rectangle into rooms by walls across its longer side, which it appends."""
+    """Divides a rectangle into rooms by walls across its longer side; appends these."""
     axis = int(np.argmax(whole.upper - whole.lower))
     low, high = whole.inside(config.room)
     if high[axis] < low[axis]:
@@ -309,7 +292,7 @@ def _divide(
 
 
 def _ends_in_door(wall: _Partition, axis: int, at: float, whole: _Room) -> bool:
-    """Checks if a new wall across `whole` would end in, or at, a door of another one."""
+    """Checks if a new wall across `whole` would end at a door of another one."""
     bounds = whole.lower[wall.axis], whole.upper[wall.axis]
     return (
         wall.axis != axis
@@ -320,8 +303,7 @@ def _ends_in_door(wall: _Partition, axis: int, at: float, whole: _Room) -> bool:
 
 def _doors(low: float, high: float, config: OfficeConfig, rng: np.random.Generator) -> list[_Door]:
     """Draws one door of a wall from `low` to `high` [m], or two in different halves of it."""
-    least = config.door_max + 2 * JAMB
-    two = rng.random() < config.second_doors and high - low >= 2 * least
+    two = rng.random() < config.second_doors and high - low >= 2 * (config.door_max + 2 * JAMB)
     stretches = [(low, (low + high) / 2), ((low + high) / 2, high)] if two else [(low, high)]
     doors = []
     for a, b in stretches:
@@ -341,16 +323,11 @@ def _build(wall: _Partition, height: float, rng: np.random.Generator) -> list[So
     """Returns the pieces of a wall between its doors and above them, as boxes."""
     material = ("plaster", "plaster", "wood", "brick")[rng.integers(4)]
     seed, half = int(rng.integers(1000)), PARTITION / 2
-    edges = [wall.low]
-    for door in wall.doors:
-        edges += [door.middle - door.width / 2, door.middle + door.width / 2]
-    edges.append(wall.high)
+    doors = [(door.middle - door.width / 2, door.middle + door.width / 2) for door in wall.doors]
+    edges = [wall.low, *(edge for door in doors for edge in door), wall.high]
     pieces = [(a, b, 0.0) for a, b in zip(edges[::2], edges[1::2], strict=True)]
-    pieces += [
-        (door.middle - door.width / 2, door.middle + door.width / 2, door.height)
-        for door in wall.doors
-        if door.height < height
-    ]
+    tops = zip(doors, wall.doors, strict=True)
+    pieces += [(*edges, door.height) for edges, door in tops if door.height < height]
     return [
         box(wall.point(-half, a, bottom), wall.point(half, b, height), material, seed)
         for a, b, bottom in pieces

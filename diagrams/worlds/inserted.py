@@ -1,4 +1,4 @@
-"""Reconstructed scenes with obstacles put in, visible and solid."""
+"""Reconstructed scenes with inserted obstacles."""
 
 from dataclasses import dataclass, replace
 
@@ -7,11 +7,11 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw
 from scipy.ndimage import label
 
-from splatpilot.diagrams.worlds.building_blocks import TIGHT_CLEARING, require_order
+from splatpilot.diagrams.worlds.building_blocks import TIGHT_CLEARING, has_clearance, require_order
 from splatpilot.diagrams.worlds.feasibility import TRIES, draw_start_and_goal
 from splatpilot.diagrams.worlds.scene_folder import SceneSource, read_scene_world
 from splatpilot.diagrams.worlds.solids.shading import Lamplight
-from splatpilot.diagrams.worlds.solids.solid import Solid, WorldSpec, faces_of
+from splatpilot.diagrams.worlds.solids.solid import Solid, WorldSpec, cut_faces
 from splatpilot.diagrams.worlds.solids.surfels import draw
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.distance_field import FieldState
@@ -21,15 +21,13 @@ from splatpilot.systems.collision.shapes import (
     Box,
     Capsule,
     Shape,
-    ShapeUnion,
     Sphere,
 )
 from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.common.validation import bounded
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
-GAP = 1.3 * 2 * VEHICLE_RADIUS
-"""[m], minimum width of gaps."""
+GAP = 1.3 * 2 * VEHICLE_RADIUS  # [m], minimum width of gaps
 
 _MATERIALS = ["hazard", "crate", "metal", "foliage", "brick", "wood"]
 
@@ -52,29 +50,27 @@ class InsertedConfig(SceneSource):
 
 
 def inserted_world(config: InsertedConfig, seed: int) -> World:
-    """Reads the scene and puts solids into it.
+    """Reads the scene and inserts solids drawn from the seed near the line from start to goal.
 
-    They are drawn from the seed, near the straight line from start to goal. Any two are at least
-    `gap` apart, start and goal keep 0.9 m, and a route from start to goal is left that is `gap`
-    wide everywhere. Other draws are repeated; start and goal too, if they are drawn.
+    Any two are at least `gap` apart, start and goal keep 0.9 m, and a route remains that is `gap`
+    wide everywhere.
     """
     config.validate()
     scene = read_scene_world(config, seed)
     for attempt in range(TRIES):
         rng = np.random.default_rng([seed, attempt])
-        world = scene
         if config.draw_ends and attempt % 10 == 9:
             again = int(rng.integers(2**31))
             p_WS, p_WG, _ = draw_start_and_goal(
                 scene.esdf, VEHICLE_RADIUS, again, least=config.least_way
             )
-            scene = world = replace(scene, p_WS=p_WS, p_WG=p_WG)
-        solids = _draw_solids(config, world, rng)
+            scene = replace(scene, p_WS=p_WS, p_WG=p_WG)
+        solids = _draw_solids(config, scene, rng)
         if len(solids) < config.least:
             continue
-        esdf = _compose(world.esdf, solids)
-        if _leaves_route(esdf, world.p_WS, world.p_WG, config.gap):
-            return _with(world, solids, esdf, seed)
+        esdf = _merge(scene.esdf, solids)
+        if _leaves_route(esdf, scene.p_WS, scene.p_WG, config.gap):
+            return _insert(scene, solids, esdf, seed)
     raise InfeasibleFlightError(
         f"{config.path}: none of {TRIES} draws of {config.least} to {config.most} solids leaves a "
         f"route of {config.gap:.2f} m width from start to goal; use a smaller gap or fewer solids"
@@ -94,11 +90,10 @@ def _draw_solids(config: InsertedConfig, world: World, rng: np.random.Generator)
         if sample.state != FieldState.FREE or sample.distance < config.half_min:
             continue
         shape = _shape(config, p, rng)
-        ends = np.stack([world.p_WS, world.p_WG])
-        if _distances(shape, ends).min() < TIGHT_CLEARING:
+        if not has_clearance(shape, [world.p_WS, world.p_WG], TIGHT_CLEARING):
             continue
         surface = _surface(shape)
-        if any(_distances(other.shape, surface).min() < config.gap for other in solids):
+        if not all(has_clearance(other.shape, surface, config.gap) for other in solids):
             continue
         material = _MATERIALS[rng.integers(len(_MATERIALS))]
         solids.append(Solid(shape, material, int(rng.integers(1000))))
@@ -116,21 +111,15 @@ def _shape(config: InsertedConfig, p: NDArray, rng: np.random.Generator) -> Shap
     return Capsule(p - up, p + up, float(half.min()))
 
 
-def _distances(shape: Shape, p_W: NDArray) -> NDArray:
-    return ShapeUnion.of([shape]).distance(p_W)
-
-
 def _surface(shape: Shape) -> NDArray:
-    """Samples points (N, 3) all over a shape."""
+    """Samples points (N, 3) on a shape."""
     s = np.stack(np.meshgrid(*2 * [np.linspace(0, 1, 9)]), axis=-1).reshape(-1, 2)
     zero = np.zeros(3)
-    return np.concatenate([face.at(s * face.size)[0] for face in faces_of(shape, zero, zero)])
+    return np.concatenate([face.at(s * face.size)[0] for face in cut_faces(shape, zero, zero)])
 
 
-def _compose(esdf: Esdf, solids: list[Solid]) -> Esdf:
-    """Returns the union of a scene and solids, exact at voxel centers for solids.
-
-    Solids are known, also where the scene is not."""
+def _merge(esdf: Esdf, solids: list[Solid]) -> Esdf:
+    """Returns the union of a scene and solids, which are known space."""
     field = AnalyticDistanceField(
         [solid.shape for solid in solids], esdf.lower_W, esdf.upper_W + esdf.voxel_size
     )
@@ -149,7 +138,7 @@ def _leaves_route(esdf: Esdf, p_WS: NDArray, p_WG: NDArray, gap: float) -> bool:
     part = np.asarray(label(free)[0])  # pyright: ignore[reportIndexIssue]
     parts = []
     for p in (p_WS, p_WG):
-        # The ends themselves may be narrower: the route starts within a radius of them.
+        # The route starts within a radius of the ends, which may be narrower.
         cell = ((p - esdf.lower_W) / esdf.voxel_size).astype(int)
         reach = int(VEHICLE_RADIUS / esdf.voxel_size)
         box = tuple(slice(max(c - reach, 0), c + reach + 1) for c in cell)
@@ -157,28 +146,13 @@ def _leaves_route(esdf: Esdf, p_WS: NDArray, p_WG: NDArray, gap: float) -> bool:
     return bool(parts[0] & parts[1])
 
 
-def _with(world: World, solids: list[Solid], esdf: Esdf, seed: int) -> World:
+def _insert(world: World, solids: list[Solid], esdf: Esdf, seed: int) -> World:
     """Returns the world with solids in it, lit from above."""
-    lower, upper = esdf.lower_W, esdf.upper_W
     middle = (world.p_WS + world.p_WG) / 2
     lamps = np.stack([world.p_WS, middle, world.p_WG]) + np.array([0, 0, 1.5])
     light = Lamplight(lamps, np.ones(3), esdf)
-    spec = WorldSpec(
-        name=f"{world.name}_inserted",
-        lower_W=lower,
-        upper_W=upper,
-        solids=solids,
-        p_WS=world.p_WS,
-        p_WG=world.p_WG,
-        light=lambda _: light,
-        seed=seed,
-    )
-    return World(
-        name=spec.name,
-        gaussians=world.gaussians.merged_with(draw(spec, solids, light)),
-        distance_field=esdf,
-        esdf=esdf,
-        background=world.background,
-        p_WS=world.p_WS,
-        p_WG=world.p_WG,
-    )
+    name, ends = f"{world.name}_inserted", (world.p_WS, world.p_WG)
+    box = esdf.lower_W, esdf.upper_W
+    spec = WorldSpec(name, *box, solids, *ends, light=lambda _: light, seed=seed)
+    gaussians = world.gaussians.merged_with(draw(spec, solids, light))
+    return World(name, gaussians, esdf, esdf, world.background, *ends)

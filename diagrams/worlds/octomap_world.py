@@ -31,11 +31,8 @@ from splatpilot.systems.common.validation import require, require_field
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
-OCTOMAP = ".bt"
-"""Suffix of binary OctoMaps."""
-
-_MOST_VOXELS = 2e7
-"""Of a map that is used whole: some 90 bytes each."""
+OCTOMAP = ".bt"  # Suffix of binary OctoMaps
+_MAX_VOXELS = 2e7  # of a map that is used whole: some 90 bytes each
 
 _log = logging.getLogger(__name__)
 
@@ -44,20 +41,18 @@ _log = logging.getLogger(__name__)
 class OctomapConfig(SceneSource):
     """A binary OctoMap (.bt) on disk; `path` is found like that of a scene."""
 
-    # [m] Lower corner of the part that is flown in; without corners all of the map, or at most 20
-    # million voxels about the middle of its free space.
+    # [m] Lower corner of the part to fly in; by default all of the map, or at most 20 million
+    # voxels about the middle of its free space.
     lower: list[float] | None = None
-    # [m] Upper corner of that part.
-    upper: list[float] | None = None
+    upper: list[float] | None = None  # [m] Upper corner of that part.
 
     def check(self) -> None:
         super().check()
         both = (self.lower is None) == (self.upper is None)
         require(both, "lower and upper", "given both, or neither", f"{self.lower}, {self.upper}")
         if self.lower is not None and self.upper is not None:
-            valid = (
-                len(self.lower) == len(self.upper) == 3 and np.less(self.lower, self.upper).all()
-            )
+            sizes = {len(self.lower), len(self.upper)}
+            valid = sizes == {3} and np.less(self.lower, self.upper).all()
             require_field(self, "upper", valid, f"above lower = {self.lower} along each axis")
 
 
@@ -73,36 +68,29 @@ def octomap_world(config: OctomapConfig, seed: int) -> World:
         raise ValueError(f"{path}: {error}") from None
     if not (esdf.states == FieldState.FREE).any():
         raise InfeasibleFlightError(
-            f"{path}: no space from {lower_W} to {upper_W} m is known to be free; there is nowhere "
-            "to fly: choose another map, or another part of it by world.lower and world.upper"
+            f"{path}: no space from {lower_W} to {upper_W} m is known to be free; choose another "
+            "map, or another part of it by world.lower and world.upper"
         )
     if config.draw_ends:
-        p_WS, p_WG, _ = draw_start_and_goal(esdf, VEHICLE_RADIUS, seed, least=config.least_way)
+        ends = draw_start_and_goal(esdf, VEHICLE_RADIUS, seed, least=config.least_way)
     else:
-        p_WS, p_WG, length = choose_start_and_goal(esdf, VEHICLE_RADIUS)
-        if warning := short_route_warning(length):
+        ends = choose_start_and_goal(esdf, VEHICLE_RADIUS)
+        if warning := short_route_warning(ends[2]):
             _log.warning("%s: %s", config.path, warning)
     hour = Daylight.sample(np.random.default_rng([seed, 1]))
-    return World(
-        name=Path(config.path).stem,
-        gaussians=voxel_gaussians(esdf, hour),
-        distance_field=esdf,
-        esdf=esdf,
-        background=(float(hour.haze[0]), float(hour.haze[1]), float(hour.haze[2])),
-        p_WS=p_WS,
-        p_WG=p_WG,
-    )
+    gaussians, (red, green, blue) = voxel_gaussians(esdf, hour), hour.haze.tolist()
+    return World(Path(config.path).stem, gaussians, esdf, esdf, (red, green, blue), *ends[:2])
 
 
 def _flown_part(config: OctomapConfig, octomap: Octomap) -> tuple[NDArray, NDArray]:
-    """Returns the corners (3,) [m] of the part that is flown in; logs if it is not all."""
+    """Returns the corners (3,) [m] of the part to fly in; warns if it is not all."""
     if config.lower is not None and config.upper is not None:
         return np.array(config.lower, float), np.array(config.upper, float)
-    lower_W, upper_W = octomap.part(_MOST_VOXELS)
+    lower_W, upper_W = octomap.part(_MAX_VOXELS)
     if (upper_W - lower_W < octomap.upper_W - octomap.lower_W).any():
         _log.warning(
-            "%s is large: flown in is the part from %s to %s of %s to %s m; world.lower and "
-            "world.upper choose another",
+            "%s is large: using the part from %s to %s of %s to %s m; world.lower and world.upper "
+            "choose another",
             config.path,
             *(c.round(1).tolist() for c in (lower_W, upper_W, octomap.lower_W, octomap.upper_W)),
         )
@@ -110,12 +98,11 @@ def _flown_part(config: OctomapConfig, octomap: Octomap) -> tuple[NDArray, NDArr
 
 
 def voxel_gaussians(esdf: Esdf, hour: Daylight) -> GaussianScene:
-    """Returns a Gaussian for each occupied voxel that touches a free one, facing free space."""
+    """Draws a Gaussian in each occupied voxel that touches a free one, facing free space."""
     occupied = esdf.states == FieldState.OCCUPIED
     shell = occupied & binary_dilation(esdf.states == FieldState.FREE)
     index = np.argwhere(shell)
-    if not len(index):
-        raise ValueError("the map has no occupied voxel beside a free one: there is nothing to see")
+    require(len(index), "number of occupied voxels next to free ones", "at least 1", 0)
     p = np.asarray(esdf.lower_W + (index + 0.5) * esdf.voxel_size, dtype=np.float64)
     free = gaussian_filter((~occupied).astype(np.float32), 1.0)
     n = np.stack([map_coordinates(g, index.T, order=0) for g in np.gradient(free)], axis=-1)

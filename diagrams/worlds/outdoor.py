@@ -1,7 +1,6 @@
 """Obstacle fields and halls: clutter, branches and wires, walls, barriers."""
 
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,10 +15,10 @@ from splatpilot.diagrams.worlds.building_blocks import (
     WALL,
     VolumeConfig,
     box,
-    clear_of,
     daylight,
     ground,
     hall,
+    has_clearance,
     lamplight,
     require_order,
     roof,
@@ -29,18 +28,15 @@ from splatpilot.diagrams.worlds.building_blocks import (
     start_and_goal,
     volume_spec,
 )
-from splatpilot.diagrams.worlds.feasibility import TRIES, draw_feasible, is_feasible
-from splatpilot.diagrams.worlds.forest.forest import Forest
+from splatpilot.diagrams.worlds.feasibility import TRIES, is_feasible, until_feasible
+from splatpilot.diagrams.worlds.forest.forest import Forest, trees_around
 from splatpilot.diagrams.worlds.forest.layout import BARK, TrunksConfig
-from splatpilot.diagrams.worlds.forest.scenery import trees_around
-from splatpilot.diagrams.worlds.solids.shading import Illumination
 from splatpilot.diagrams.worlds.solids.solid import Solid, WorldSpec
 from splatpilot.diagrams.worlds.solids.surfaces import FloorPlan, merge
 from splatpilot.diagrams.worlds.solids.surfels import draw
 from splatpilot.systems.collision.shapes import Capsule, Sphere
 from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.common.validation import bounded, require_field
-from splatpilot.systems.splats.scene import GaussianScene
 
 _SPHERES = ["stone", "concrete", "foliage", "hazard", "metal"]
 _BOXES = ["crate", "wood", "metal", "hazard", "brick", "concrete", "signage", "fabric"]
@@ -70,27 +66,23 @@ class ClutterConfig(VolumeConfig):
         require_order(self, "half_min", "half_max")
 
 
-def clutter_spec(config: ClutterConfig, seed: int) -> WorldSpec:
-    """Draws the field of `config`; obstacles may overlap, and keep off start and goal."""
-    config.validate()
+@until_feasible
+def clutter_spec(config: ClutterConfig, seed: int, rng: np.random.Generator) -> WorldSpec:
+    """Draws the field of `config`: obstacles may overlap, but not near start and goal."""
     plan = config.plan
-
-    def draw(rng: np.random.Generator) -> WorldSpec:
-        ends = start_and_goal(plan, rng)
-        obstacles: list[Solid] = []
-        for make, number in ((_sphere, config.spheres), (_box, config.boxes)):
-            for _ in range(number):
-                for _ in range(50):  # again, if it is too near the start or goal
-                    solid = make(config, plan, rng)
-                    if clear_of(solid.shape, list(ends), CLEARING):
-                        obstacles.append(solid)
-                        break
-        hour, light = daylight(rng)
-        solids = [ground(("grass", "paving", "concrete")[rng.integers(3)]), *obstacles]
-        trees = trees_around(plan, hour, seed)
-        return volume_spec("clutter", config, seed, solids, ends, light, trees)
-
-    return draw_feasible(draw, seed)
+    ends = start_and_goal(plan, rng)
+    obstacles: list[Solid] = []
+    for make, number in ((_sphere, config.spheres), (_box, config.boxes)):
+        for _ in range(number):
+            for _ in range(50):  # again, if it is too near the start or goal
+                solid = make(config, plan, rng)
+                if has_clearance(solid.shape, list(ends), CLEARING):
+                    obstacles.append(solid)
+                    break
+    hour, light = daylight(rng)
+    solids = [ground(("grass", "paving", "concrete")[rng.integers(3)]), *obstacles]
+    trees = trees_around(plan, hour, seed)
+    return volume_spec("clutter", config, seed, solids, ends, light, trees)
 
 
 def _sphere(config: ClutterConfig, plan: FloorPlan, rng: np.random.Generator) -> Solid:
@@ -127,8 +119,7 @@ class BranchesConfig(TrunksConfig):
     limbs: int = bounded(5, "[0, 1000]")  # [-] on each trunk
     limb_length: float = bounded(1.6, "[0.2, 5] m")  # [m] of the longest
     wires: int = bounded(8, "[0, 1000]")  # [-] from side to side
-    # [m] Diameter of the thinnest limb or wire.
-    thickness_min: float = bounded(0.02, "(0, 100] m")
+    thickness_min: float = bounded(0.02, "(0, 100] m")  # [m] of the thinnest limb or wire
     thickness_max: float = bounded(0.04, "(0, 100] m")  # [m] of the thickest
 
     def check(self) -> None:
@@ -137,24 +128,19 @@ class BranchesConfig(TrunksConfig):
 
 
 def branches_spec(config: BranchesConfig, seed: int) -> WorldSpec:
-    """Grows the forest of `config` with limbs and wires in it."""
+    """Grows the forest of `config` with limbs and wires."""
     forest = Forest(config, seed)
     bare = forest.spec()
     for attempt in range(TRIES):
         thin = _limbs_and_wires(forest, config, np.random.default_rng([seed, 20, attempt]))
         spec = replace(bare, name="branches", solids=[*bare.solids, *thin])
         if is_feasible(spec):
-            return replace(spec, gaussians=partial(_gaussians, forest, spec, thin))
+            seen = lambda light, s=spec, t=thin: merge([forest.gaussians(), draw(s, t, light)])  # noqa: E731
+            return replace(spec, gaussians=seen)
     raise InfeasibleFlightError(
         f"branches: limbs = {config.limbs} and wires = {config.wires} leave no route in {TRIES} "
         f"draws from seed {seed}; use fewer of them or a wider spacing"
     )
-
-
-def _gaussians(
-    forest: Forest, spec: WorldSpec, thin: list[Solid], light: Illumination
-) -> GaussianScene:
-    return merge([forest.gaussians(), draw(spec, thin, light)])
 
 
 def _limbs_and_wires(
@@ -178,7 +164,7 @@ def _limbs_and_wires(
         ends[:, [0, 2]] += rng.uniform(-0.8, 0.8, (2, 2))
         radius = rng.uniform(config.thickness_min, config.thickness_max) / 2
         thin.append(Solid(Capsule(ends[0], ends[1], float(radius)), "cable", k))
-    return [s for s in thin if clear_of(s.shape, [forest.p_WS, forest.p_WG], TIGHT_CLEARING)]
+    return [s for s in thin if has_clearance(s.shape, [forest.p_WS, forest.p_WG], TIGHT_CLEARING)]
 
 
 PATTERNS = "big_wall", "u_trap", "slits", "slalom"
@@ -216,37 +202,32 @@ class WallsConfig(VolumeConfig):
         require_field(self, "length", self.length >= shortest, condition)
 
 
-def walls_spec(config: WallsConfig, seed: int) -> WorldSpec:
+@until_feasible
+def walls_spec(config: WallsConfig, seed: int, rng: np.random.Generator) -> WorldSpec:
     """Builds the hall of `config`.
 
-    `big_wall` leaves a gap at either side of one wall, one of them wider; `u_trap` opens a
-    cul-de-sac toward the start; the walls of `slits` have one slit each, well aside of the last;
-    those of `slalom` leave a gap at one side and the other in turn.
+    `big_wall` leaves a gap at either side of one wall; `u_trap` opens a cul-de-sac toward the
+    start; the walls of `slits` have one slit each, away from the last; those of `slalom` leave gaps
+    at alternating sides.
     """
-    config.validate()
     plan = config.plan
     across = {"big_wall": _big_wall, "u_trap": _u_trap, "slits": _slits, "slalom": _slalom}
-
-    def draw(rng: np.random.Generator) -> WorldSpec:
-        p_WS, p_WG = start_and_goal(plan, rng)
-        if config.pattern in ("big_wall", "u_trap"):  # both block the straight line
-            p_WS[1], p_WG[1] = 0.3 * p_WS[1], 0.3 * p_WG[1]
-        obstacles = across[config.pattern](config, rng)
-        sides = hall(plan, _FACADES, rng)
-        signs = signs_in(sides, 3, 1, rng)
-        for wall in obstacles:
-            signs += signs_on(wall, 0, 1, rng)
-        hour, light = daylight(rng)
-        floor = ground(("paving", "grass", "concrete")[rng.integers(3)])
-        solids = [floor, *sides, *obstacles, *signs]
-        trees = trees_around(plan, hour, seed)
-        return volume_spec(config.pattern, config, seed, solids, (p_WS, p_WG), light, trees)
-
-    return draw_feasible(draw, seed)
+    p_WS, p_WG = start_and_goal(plan, rng)
+    if config.pattern in ("big_wall", "u_trap"):  # both block the straight line
+        p_WS[1], p_WG[1] = 0.3 * p_WS[1], 0.3 * p_WG[1]
+    obstacles = across[config.pattern](config, rng)
+    sides = hall(plan, _FACADES, rng)
+    signs = signs_in(sides, 3, 1, rng)
+    signs += [sign for wall in obstacles for sign in signs_on(wall, 0, 1, rng)]
+    hour, light = daylight(rng)
+    floor = ground(("paving", "grass", "concrete")[rng.integers(3)])
+    solids = [floor, *sides, *obstacles, *signs]
+    trees = trees_around(plan, hour, seed)
+    return volume_spec(config.pattern, config, seed, solids, (p_WS, p_WG), light, trees)
 
 
 def _across(config: WallsConfig, x: float, y0: float, y1: float, material: str, seed: int) -> Solid:
-    """Returns a wall across the hall, its middle at x, from y0 to y1 [m]."""
+    """Builds a wall across the hall, its middle at x, from y0 to y1 [m]."""
     return box((x - WALL / 2, y0, 0), (x + WALL / 2, y1, config.height), material, seed)
 
 
@@ -266,14 +247,12 @@ def _u_trap(config: WallsConfig, rng: np.random.Generator) -> list[Solid]:
     x = rng.uniform(0.58, 0.66) * config.length
     y = rng.uniform(-0.4, 0.4) * spare
     low, high = y - config.wall / 2, y + config.wall / 2
-    material, seed = _material(rng)
-    return [
-        _across(config, x, low, high, material, seed),
-        *(
-            box((x - config.depth, a, 0), (x - WALL / 2, a + WALL, config.height), material, seed)
-            for a in (low, high - WALL)
-        ),
+    paint = _material(rng)
+    sides = [
+        box((x - config.depth, a, 0), (x - WALL / 2, a + WALL, config.height), *paint)
+        for a in (low, high - WALL)
     ]
+    return [_across(config, x, low, high, *paint), *sides]
 
 
 def _stations(config: WallsConfig, number: int, rng: np.random.Generator) -> NDArray:
@@ -286,14 +265,12 @@ def _slits(config: WallsConfig, rng: np.random.Generator) -> list[Solid]:
     half = config.width / 2
     walls, last = [], rng.uniform(-half, half)
     for x, slit in zip(_stations(config, len(config.slits), rng), config.slits, strict=True):
-        room = half - slit / 2 - 0.5
-        draws = rng.uniform(-room, room, 50)
+        reach = half - slit / 2 - 0.5
+        draws = rng.uniform(-reach, reach, 50)
         y = draws[np.argmax(np.abs(draws - last) > 0.25 * config.width)]
-        material, seed = _material(rng)
-        walls += [
-            _across(config, x, -half, y - slit / 2, material, seed),
-            _across(config, x, y + slit / 2, half, material, seed),
-        ]
+        paint = _material(rng)
+        walls.append(_across(config, x, -half, y - slit / 2, *paint))
+        walls.append(_across(config, x, y + slit / 2, half, *paint))
         last = y
     return walls
 
@@ -314,8 +291,8 @@ _MATERIALS = ["brick", "concrete", "hazard", "wood", "metal"]
 class OverUnderConfig(VolumeConfig):
     """A roofed hall with barriers from wall to wall."""
 
-    barriers: int = bounded(5, "[1, 50]")  # [-] over and under in turn; the first is drawn
-    over: float = bounded(2.8, "(0, 200] m")  # [m] height of barriers that stand on the floor
+    barriers: int = bounded(5, "[1, 50]")  # [-] over and under in turn; the first is random
+    over: float = bounded(2.8, "(0, 200] m")  # [m] height of barriers on the floor
     # [m] Height of the lower edge of barriers that hang from the roof.
     under: float = bounded(1.9, f"[{PASSAGE:.3f}, 200] m")
 
@@ -329,28 +306,24 @@ class OverUnderConfig(VolumeConfig):
         require_field(self, "length", self.length >= shortest, condition)
 
 
-def over_under_spec(config: OverUnderConfig, seed: int) -> WorldSpec:
+@until_feasible
+def over_under_spec(config: OverUnderConfig, seed: int, rng: np.random.Generator) -> WorldSpec:
     """Builds the hall of `config`."""
-    config.validate()
     plan = config.plan
-
-    def draw(rng: np.random.Generator) -> WorldSpec:
-        ends = start_and_goal(plan, rng)
-        half = config.width / 2
-        first = int(rng.integers(2))
-        barriers = []
-        step = (config.length - 2 * INSET) / (config.barriers + 1)
-        for k in range(config.barriers):
-            x = INSET + step * (k + 1 + rng.uniform(-0.08, 0.08))
-            low, high = (0.0, config.over) if (k + first) % 2 else (config.under, config.height)
-            corners = (x - WALL / 2, -half, low), (x + WALL / 2, half, high)
-            material = _MATERIALS[rng.integers(len(_MATERIALS))]
-            barriers.append(box(*corners, material, int(rng.integers(1000))))
-        sides = hall(plan, ["plaster", "brick", "concrete", "metal"], rng)
-        signs = [s for wall in barriers for s in signs_on(wall, 0, 2, rng)]
-        signs += signs_in(sides, 3, 0, rng)
-        floor = ground(("tiles", "concrete")[rng.integers(2)], int(rng.integers(10)))
-        solids = [floor, roof(plan), *sides, *barriers, *signs]
-        return volume_spec("over_under", config, seed, solids, ends, lamplight(plan, rng))
-
-    return draw_feasible(draw, seed)
+    ends = start_and_goal(plan, rng)
+    half = config.width / 2
+    first = int(rng.integers(2))
+    barriers = []
+    step = (config.length - 2 * INSET) / (config.barriers + 1)
+    for k in range(config.barriers):
+        x = INSET + step * (k + 1 + rng.uniform(-0.08, 0.08))
+        low, high = (0.0, config.over) if (k + first) % 2 else (config.under, config.height)
+        corners = (x - WALL / 2, -half, low), (x + WALL / 2, half, high)
+        material = _MATERIALS[rng.integers(len(_MATERIALS))]
+        barriers.append(box(*corners, material, int(rng.integers(1000))))
+    sides = hall(plan, ["plaster", "brick", "concrete", "metal"], rng)
+    signs = [s for wall in barriers for s in signs_on(wall, 0, 2, rng)]
+    signs += signs_in(sides, 3, 0, rng)
+    floor = ground(("tiles", "concrete")[rng.integers(2)], int(rng.integers(10)))
+    solids = [floor, roof(plan), *sides, *barriers, *signs]
+    return volume_spec("over_under", config, seed, solids, ends, lamplight(plan, rng))

@@ -1,9 +1,8 @@
 """Scene folders: a reconstructed environment on disk.
 
-`gaussians.ply` is what cameras see, `esdf.npz` what collides, and `scene.yaml` (`SceneMetadata`)
-where it comes from and how it is to be used. `environment.png`, if present, has the colors of the
-background (`EnvironmentMap`). `frontier.ply`, if present, closes the scene at unobserved space:
-cameras of flights see it, metrics of the scene do not.
+`gaussians.ply` is for cameras, `esdf.npz` for collisions, and `scene.yaml` is `SceneMetadata`.
+`environment.png`, if present, is the background (`EnvironmentMap`). `frontier.ply`, if present,
+closes the scene at unobserved space: cameras of flights see it, metrics of the scene do not.
 """
 
 import functools
@@ -29,13 +28,10 @@ from splatpilot.diagrams.worlds.feasibility import (
 from splatpilot.diagrams.worlds.solids.surfaces import Surfels, to_gaussians
 from splatpilot.diagrams.worlds.splits import check_split
 from splatpilot.diagrams.worlds.world import World
+from splatpilot.systems.collision.depth_fusion import bounds_of_depth_images, esdf_from_depth_images
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.collision.esdf_build import (
-    bounds_of_depth_images,
-    esdf_from_depth_images,
-    esdf_from_gaussians,
-)
+from splatpilot.systems.collision.esdf_build import esdf_from_gaussians
 from splatpilot.systems.collision.frontier import (
     frontier_faces,
     hidden_frontier,
@@ -69,57 +65,52 @@ class SceneMetadata(Config):
 
     format_version: int = FORMAT_VERSION
     name: str = ""
+    # Description of the source and the method.
     provenance: str = ""
-    """Describes what the scene was made from, and how."""
+    # "train", "validation" or "test"; empty if unknown.
     split: str = ""
-    """"train", "validation" or "test"; empty if unknown."""
+    # Digest of the images that the scene was fitted to, or of the mesh or generated world that they
+    # were rendered from, see `splits.source_digest`; empty if unknown.
     source_digest: list[str] = field(default_factory=list)
-    """Digest of the source, see `splits.source_digest`: of the images that the scene was fitted to,
-    or of the mesh or generated world that they were rendered from. Empty if unknown."""
     world_frame: str = bounded(WORLD_FRAME, f"{{{WORLD_FRAME}}}")
+    # True if the unit of length is the meter.
     metric: bool = True
-    """True if the unit of length is the meter."""
+    # [m], position of the scene's origin in the world of the capture's files, upright and in
+    # meters; all positions of the scene are relative to it.
     origin: list[float] = bounded(lambda: [0.0] * 3, "(-inf, inf) m")
-    """[m], position of the scene's origin in the world of the capture's files, upright and in
-    meters; all positions of the scene are relative to it."""
-    lower_W: list[float] = bounded(list, "(-inf, inf) m")
-    """[m], lower corner of the distance field."""
+    lower_W: list[float] = bounded(list, "(-inf, inf) m")  # [m], corners of the distance field
     upper_W: list[float] = bounded(list, "(-inf, inf) m")
-    """[m], upper corner of the distance field."""
-    observed_free_volume: float = 0.0
-    """[m^3], volume of observed free space."""
+    observed_free_volume: float = 0.0  # [m^3]
+    # Brightness of each image of the capture relative to the scene, in frame order.
     gains: list[float] = field(default_factory=list)
-    """Brightness of each image of the capture relative to the scene, in frame order."""
+    # Logarithm of the brightness of the capture's image corners relative to their centers; it falls
+    # with the square of the distance from the center. The scene is free of it.
     vignetting: float = 0.0
-    """Logarithm of the brightness of the capture's image corners relative to their centers; it
-    falls with the square of the distance from the center. The scene is free of it."""
+    # Color of pixels without Gaussians: red, green, blue.
     background: list[float] = bounded(lambda: [0.0] * 3, "[0, 1]")
-    """Color of pixels without Gaussians: red, green, blue."""
+    # True if `environment.png` has that color for each direction; `background` is its mean.
     environment: bool = False
-    """True if `environment.png` has that color for each direction; `background` is its mean."""
+    # True if `frontier.ply` draws the obstacles of the distance field at unobserved space.
     frontier: bool = False
-    """True if `frontier.ply` draws the obstacles of the distance field at unobserved space."""
-    p_WS: list[float] = bounded(list, "(-inf, inf) m")
-    """[m], default start."""
-    p_WG: list[float] = bounded(list, "(-inf, inf) m")
-    """[m], default goal."""
+    p_WS: list[float] = bounded(list, "(-inf, inf) m")  # [m], default start
+    p_WG: list[float] = bounded(list, "(-inf, inf) m")  # [m], default goal
+    # "3dgs": Gaussians; "2dgs": surfels, kept as Gaussians that are as flat as allowed.
     representation: str = bounded("3dgs", f"{{{', '.join(REPRESENTATIONS)}}}")
-    """"3dgs": Gaussians; "2dgs": surfels, kept as Gaussians that are as flat as allowed."""
+    # Folder of the capture that the scene was made from; empty if unknown.
     capture: str = ""
-    """Folder of the capture that the scene was made from; empty if unknown."""
+    # Settings with which the capture was read, for example "depth_unit=5000.0".
     capture_settings: list[str] = field(default_factory=list)
-    """Settings with which the capture was read, for example "depth_unit=5000.0"."""
+    # Assumptions and unused parts when the capture was read, and the source of intrinsics.
     capture_notes: list[str] = field(default_factory=list)
-    """Assumptions and unused parts when the capture was read, and the source of intrinsics."""
+    # Frames of the capture that were not used to make the scene.
     held_out: list[int] = bounded(list, "[0, inf)")
-    """Frames of the capture that were not used to make the scene."""
+    # [px], to which images were scaled down; 0 if they were not.
     image_width: int = bounded(0, "[0, inf) px")
-    """[px], to which images were scaled down; 0 if they were not."""
+    # [m], distance from the poses of the capture up to which images of the scene can be trusted, as
+    # measured by `splatpilot scene fidelity`; None before.
     perturbation_bound: float | None = bounded(None, "[0, inf) m")
-    """[m], distance from the poses of the capture up to which images of the scene can be trusted,
-    as measured by `splatpilot scene fidelity`; None before."""
+    # [m], the same for each pose of the capture, in frame order; empty before.
     pose_perturbation_bounds: list[float] = bounded(list, "[0, inf) m")
-    """[m], the same for each pose of the capture, in frame order; empty before."""
 
     def check(self) -> None:
         for name in ("origin", "lower_W", "upper_W", "background", "p_WS", "p_WG"):
@@ -134,18 +125,14 @@ def read_scene_metadata(path: str | Path) -> SceneMetadata:
     try:
         with yaml_errors("the text"):
             metadata = yaml_load_typed(schema=SceneMetadata, data=text)
-    except Exception as error:  # Drake's reader raises any type.
-        remedy = "reconstruct the scene again or repair it"
-        raise ValueError(f"{file}: {reason_of(error)}; {remedy}") from None
-    version = metadata.format_version
-    old = version < FORMAT_VERSION
-    remedy = "reconstruct the scene again" if old else "use a newer version of the program"
-    what = f"{file}: format_version"
-    require(version == FORMAT_VERSION, what, str(FORMAT_VERSION), version, remedy)
-    try:
+        version = metadata.format_version
+        old = version < FORMAT_VERSION
+        remedy = "reconstruct the scene again" if old else "use a newer version of the program"
+        valid = version == FORMAT_VERSION
+        require(valid, "format_version", str(FORMAT_VERSION), version, remedy)
         metadata.validate()
-    except ValueError as error:
-        raise ValueError(f"{file}: {error}") from None
+    except Exception as error:  # Drake's reader raises any type.
+        raise ValueError(f"{file}: {reason_of(error)}") from None
     return metadata
 
 
@@ -167,7 +154,7 @@ def read_scene(path: str | Path) -> World:
 
 
 def read_scene_folder(path: str | Path, *, metric: bool = True) -> World:
-    """Reads a scene folder; if `metric` is false also without scale, to be viewed and measured."""
+    """Reads a scene folder; accepts one without scale unless `metric`."""
     path = Path(path)
     for file in (path, path / "scene.yaml", path / "gaussians.ply", path / "esdf.npz"):
         if not file.exists():
@@ -185,21 +172,13 @@ def read_scene_folder(path: str | Path, *, metric: bool = True) -> World:
     if metadata.frontier:
         gaussians = gaussians.merged_with(read_ply(path / FRONTIER))
     esdf = Esdf.load(path / "esdf.npz")
-    for name in ("lower_W", "upper_W"):
-        stated, found = getattr(metadata, name), getattr(esdf, name)
-        condition = f"that of esdf.npz, {found.tolist()}"
-        remedy = "the files are of different scenes"
-        valid = np.allclose(stated, found, atol=1e-6)
-        require(valid, f"{path / 'scene.yaml'}: {name}", condition, stated, remedy)
-    return World(
-        name=metadata.name,
-        gaussians=gaussians,
-        distance_field=esdf,
-        esdf=esdf,
-        background=read_background(path, metadata),
-        p_WS=np.array(metadata.p_WS),
-        p_WG=np.array(metadata.p_WG),
-    )
+    stated, found = [*metadata.lower_W, *metadata.upper_W], [*esdf.lower_W, *esdf.upper_W]
+    what = f"{path / 'scene.yaml'}: lower_W and upper_W"
+    condition = f"those of esdf.npz, {np.array(found)}"
+    valid = np.allclose(stated, found, atol=1e-6)
+    require(valid, what, condition, stated, "the files are of different scenes")
+    background, ends = read_background(path, metadata), np.array([metadata.p_WS, metadata.p_WG])
+    return World(metadata.name, gaussians, esdf, esdf, background, *ends)
 
 
 def read_background(path: Path, metadata: SceneMetadata) -> Background:
@@ -211,10 +190,7 @@ def read_background(path: Path, metadata: SceneMetadata) -> Background:
 
 
 def check_scene_target(path: str | Path) -> None:
-    """Checks that a scene may be written to `path`.
-
-    It must be absent, an empty folder, a scene, or a folder with the scene's own `CAPTURE`.
-    """
+    """Checks that `path` is new, an empty folder, a scene, or a folder with its own `CAPTURE`."""
     path = Path(path).absolute()
     if path.exists() and not (path / "scene.yaml").is_file():
         own = {CAPTURE, f".{CAPTURE}.partial"}
@@ -229,17 +205,13 @@ def check_scene_target(path: str | Path) -> None:
 def write_scene_folder(
     path: str | Path, world: World, frontier: GaussianScene | None = None, **fields: Any
 ) -> SceneMetadata:
-    """Writes `world` as a scene folder atomically, replacing a scene there.
-
-    Only the grid of the distance field is kept.
+    """Writes `world` as a scene folder atomically, replacing a scene there; returns its metadata.
 
     Args:
         path: of the folder, see `check_scene_target`.
+        world: with `esdf` as its distance field.
         frontier: see `close_frontier`; not part of the world's Gaussians.
-        fields: of `SceneMetadata` that do not follow from the world; numpy arrays become lists.
-
-    Returns:
-        The metadata written.
+        fields: further ones of `SceneMetadata`; numpy arrays become lists.
     """
     path = Path(path).absolute()
     check_scene_target(path)
@@ -272,7 +244,7 @@ def write_scene_folder(
 def _read_bare_gaussians(path: Path) -> World:
     """Builds a world from Gaussians alone: space without Gaussians counts as free."""
     gaussians = read_splats(path)
-    # A few outliers far away must not stretch the grid; beyond it all counts as occupied.
+    # Outliers must not stretch the grid; beyond it all counts as occupied.
     lower_W, upper_W = np.percentile(gaussians.means.astype(float), [1, 99], axis=0)
     lower_W, upper_W = lower_W - 0.1, upper_W + 0.1
     voxel_size = max(0.1, float(np.cbrt(np.prod(upper_W - lower_W) / _MAX_VOXELS)))
@@ -284,15 +256,7 @@ def _read_bare_gaussians(path: Path) -> World:
     p_WS, p_WG, length = choose_start_and_goal(esdf, VEHICLE_RADIUS)
     if warning := short_route_warning(length):
         _log.warning("%s: %s", path, warning)
-    return World(
-        name=path.stem,
-        gaussians=gaussians,
-        distance_field=esdf,
-        esdf=esdf,
-        background=(0.0, 0.0, 0.0),
-        p_WS=p_WS,
-        p_WG=p_WG,
-    )
+    return World(path.stem, gaussians, esdf, esdf, (0.0, 0.0, 0.0), p_WS, p_WG)
 
 
 @dataclass
@@ -319,42 +283,31 @@ class SceneConfig(SceneSource):
 
 
 def find_scene(config: SceneSource) -> Path:
-    """Returns the path of a scene; the error of a missing one says how to get it."""
+    """Returns the path of a scene."""
     config.validate()
     return require_scene(config.path, config.source)
 
 
 def read_scene_world(config: SceneSource, seed: int) -> World:
     """Reads the scene of `config`."""
-    world = read_scene(find_scene(config))
-    if not config.draw_ends:
-        return world
-    p_WS, p_WG, _ = draw_start_and_goal(world.esdf, VEHICLE_RADIUS, seed, least=config.least_way)
-    return replace(world, p_WS=p_WS, p_WG=p_WG)
+    world, least = read_scene(find_scene(config)), config.least_way
+    if config.draw_ends:
+        p_WS, p_WG, _ = draw_start_and_goal(world.esdf, VEHICLE_RADIUS, seed, least=least)
+        world = replace(world, p_WS=p_WS, p_WG=p_WG)
+    return world
 
 
-_CELL = 2
-"""[-] Voxels along the edge of the cells whose faces one surfel covers."""
-
-_SUNK = 0.5
-"""[-] Voxels from the faces into hidden space, so that no edge of a surfel sticks out."""
-
+_CELL = 2  # [voxels] edge of the cells whose faces one surfel covers
+_SUNK = 0.5  # [voxels] from the faces into hidden space, so that no edge of a surfel sticks out
+# Standard deviation of a surfel over the edge of its square; less than in generated worlds, so that
+# no surfel hides captured surfaces.
 _COVERAGE = 0.55
-"""Standard deviation of a surfel over the edge of its square; less than in generated worlds, so
-that no surfel hides captured surfaces."""
-
-_WIDTH = 160
-"""[px], approximate width to which depth images are thinned."""
-
+_WIDTH = 160  # [px] approximate width to which depth images are subsampled
+# Edge of the voxels of the frontier beyond the field's range, in voxels of the field, and their
+# maximum number.
 _FAR_VOXEL, _FAR_VOXELS = 2, 2e6
-"""[-] Edge of the voxels in which the frontier beyond the field's range is found, in voxels of the
-field, and how many there may be."""
-
-_STRIPE = 0.4
-"""[m], period of the hatching along each axis."""
-
-_SHADES = np.array([0.62, 0.42])
-"""Gray of its two tones, 0 to 1."""
+_STRIPE = 0.4  # [m] period of the hatching along each axis
+_SHADES = np.array([0.62, 0.42])  # gray of its two tones, 0 to 1
 
 
 def close_frontier(
@@ -362,17 +315,17 @@ def close_frontier(
 ) -> tuple[Esdf, GaussianScene | None]:
     """Closes a captured scene where reachable space ends in unknown space.
 
-    Unknown space begins with obstacles, on which hatched surfels are drawn. Space before the sky,
-    and before surfaces beyond the field's range, stays open. There the surfels begin where the
-    images saw no farther, on a coarse grid of its own: none hides captured surfaces.
+    Unknown space begins with obstacles, drawn as hatched surfels. Space before the sky, and before
+    surfaces beyond the field's range, has no obstacles; its surfels begin behind all that the
+    images saw, on a coarser grid.
 
     Args:
         esdf: the distance field of the scene.
         depths, K, X_WCs: its images, see `esdf_from_depth_images`.
 
     Returns:
-        The distance field with these obstacles, and the surfels; `esdf` and None if there is
-        nothing to close.
+        The distance field with these obstacles, and the surfels; `esdf` and None if the scene is
+        closed.
     """
     images = []
     for depth in depths:
@@ -406,9 +359,8 @@ def _far_frontier(
 
 
 def _draw(esdf: Esdf, centers: NDArray[np.float64], normals: NDArray[np.float64]) -> GaussianScene:
-    """Draws faces of voxels (F, 3), (F, 3), see `frontier_faces`, as one surfel per cell.
-
-    It has their mean and spread, so that it lies across the steps of a slanted frontier."""
+    """Draws faces (F, 3), (F, 3) of `frontier_faces` as one surfel per cell, of the same mean and
+    spread, so that it lies across the steps of a slanted frontier."""
     _, cell = np.unique((centers // _CELL).astype(int), axis=0, return_inverse=True)
     count = np.bincount(cell)
 
@@ -418,9 +370,9 @@ def _draw(esdf: Esdf, centers: NDArray[np.float64], normals: NDArray[np.float64]
     middle, normal = (np.stack([mean(x) for x in v.T], axis=-1) for v in (centers, normals))
     offset = centers - middle[cell]
     covariance = np.empty((len(count), 3, 3))
+    for i, j in np.ndindex(3, 3):
+        covariance[:, i, j] = mean(offset[:, i] * offset[:, j])
     for i in range(3):
-        for j in range(3):
-            covariance[:, i, j] = mean(offset[:, i] * offset[:, j])
         covariance[:, i, i] += mean(normals[:, i] == 0.0) / 12.0  # of faces along axis i
     variance, R_WP = np.linalg.eigh(covariance)  # ascending
     p = esdf.lower_W + esdf.voxel_size * (middle - _SUNK * normal)

@@ -1,8 +1,7 @@
-"""
-What scenes are for: to train in, to validate in, or to test in.
+"""Splits of scenes: training, validation or test.
 
-A split belongs to what a scene shows, whatever its files are called. So a scene states digests of
-its source, and `test_sources.yaml` has those of the sources that are only tested in.
+A split belongs to what a scene shows, not to its files. So a scene states digests of its source,
+and `test_sources.yaml` has those of the sources reserved for tests.
 """
 
 from collections.abc import Collection, Iterable
@@ -12,10 +11,11 @@ from pathlib import Path
 
 import yaml
 
+from splatpilot.systems.common.validation import require
+
 SPLITS = "train", "validation", "test"
 
 TABLE = Path(__file__).parent / "test_sources.yaml"
-_KEPT = 8
 
 
 def part_digests(parts: Iterable[bytes]) -> set[str]:
@@ -24,24 +24,22 @@ def part_digests(parts: Iterable[bytes]) -> set[str]:
 
 
 def source_digest(digests: Collection[str]) -> list[str]:
-    """
-    Returns the digest of a source: the eight smallest of its parts' digests.
+    """Returns the digest of a source: the eight smallest of its parts' digests.
 
-    It depends neither on names nor on order. Two sources are taken for one if a part of either is
-    among the eight of the other, so copies with parts missing or added are recognized.
+    Two sources count as one if a part of either is among the eight of the other, so copies with
+    parts missing or added are recognized.
     """
-    return sorted(digests)[:_KEPT]
+    return sorted(digests)[:8]
 
 
 @cache
 def load_test_sources() -> dict[str, list[str]]:
-    """Returns the digests of the sources that are only tested in, by name;
-    `benchmarks/test_sources.py` writes their file."""
+    """Returns the digests of test sources by name, see `benchmarks/test_sources.py`."""
     return yaml.safe_load(TABLE.read_text())
 
 
 def find_test_source(digests: Collection[str]) -> str | None:
-    """Returns the name of the test source that has a part of these digests; None if none has."""
+    """Returns the name of the test source that has a part of these digests, if any."""
     for name, kept in load_test_sources().items():
         if not set(kept).isdisjoint(digests):
             return name
@@ -49,28 +47,22 @@ def find_test_source(digests: Collection[str]) -> str | None:
 
 
 def check_split(split: str) -> None:
-    """Raises ValueError for an unknown split; empty is known."""
-    if split and split not in SPLITS:
-        raise ValueError(f"split must be one of {', '.join(SPLITS)}, got {split!r}")
+    """Checks that a split is known, or empty."""
+    require(not split or split in SPLITS, "split", f"one of {', '.join(SPLITS)}", repr(split))
 
 
 def choose_split(what: str, digests: Collection[str], asked: str, found: str = "train") -> str:
-    """
-    Returns the split of a source.
+    """Returns the split of a source; raises ValueError if a test source shall have another.
 
     Args:
         what: the source, for messages.
         digests: of its parts.
         asked: the split that the user gives it; empty for none.
-        found: the split that it has otherwise, unless it is a test source.
-
-    Raises:
-        ValueError: if `asked` is another split than test for what is only tested in.
+        found: its split by default, unless it is a test source.
     """
     name = find_test_source(digests)
     if name is not None:
         found = "test"
-    if found == "test" and asked not in ("", "test"):
-        shown = f"it shows {name}" if name else "it says so"
-        raise ValueError(f"split of {what} must be test, got {asked}: {shown}")
+    remedy = f"it shows {name}" if name else "the source is of this split"
+    require(found != "test" or asked in ("", "test"), f"split of {what}", "test", asked, remedy)
     return asked or found

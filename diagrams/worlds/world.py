@@ -18,18 +18,17 @@ from splatpilot.systems.splats.scene import GaussianScene
 class MovingBodies:
     """Moving obstacles, as functions of time alone."""
 
-    balls: MovingSpheres  # for collisions
+    spheres: MovingSpheres  # for collisions
     gaussians: MovingGaussians  # for cameras
 
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """A world to fly in, in frame W (z up, meters); all fields but `moving` are static."""
+    """A world to fly in, in frame W (z up, meters); all but `moving` is static."""
 
     name: str
     gaussians: GaussianScene  # for cameras
-    # For collisions: analytic in procedural worlds, the same object as `esdf` in others.
-    distance_field: DistanceField
+    distance_field: DistanceField  # for collisions: analytic, or the same object as `esdf`
     esdf: Esdf  # grid for planners and training
     background: Background  # color of pixels without Gaussians
     p_WS: NDArray[np.float64]  # (3,) [m], default start
@@ -40,7 +39,7 @@ class World:
         """Returns the distance field for collisions at a time [s] of a flight."""
         if self.moving is None:
             return self.distance_field
-        return self.moving.balls.among(self.distance_field, time)
+        return self.moving.spheres.among(self.distance_field, time)
 
     def distances(self, times: NDArray, p_WQ: NDArray) -> NDArray[np.float64]:
         """Computes distances (N,) [m] of points p_WQ (N, 3) [m], each at its time, (N,) [s]."""
@@ -51,11 +50,11 @@ class World:
 
     @cached_property
     def baked(self) -> BakedScene:
-        """The Gaussians as cameras render them, made on first use and shared."""
+        """The Gaussians as cameras render them."""
         return BakedScene(self.gaussians)
 
     def recolored(self, gaussians: GaussianScene, background: Background) -> "World":
         """Returns this world with the colors of `gaussians`; shares the baked geometry."""
-        seen = replace(self, gaussians=gaussians, background=background)
-        vars(seen)["baked"] = self.baked.recolored(gaussians.sh)
-        return seen
+        world = replace(self, gaussians=gaussians, background=background)
+        vars(world)["baked"] = self.baked.recolored(gaussians.sh)
+        return world

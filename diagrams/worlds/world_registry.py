@@ -1,4 +1,4 @@
-"""All worlds: their configurations, and how each becomes a world."""
+"""All worlds: their configurations and generators."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -8,12 +8,7 @@ from typing import Any, ClassVar, Protocol
 from splatpilot.diagrams.worlds.dodgedrone import DodgeDroneConfig, dodgedrone_world
 from splatpilot.diagrams.worlds.forest.forest import forest_spec
 from splatpilot.diagrams.worlds.forest.layout import ForestConfig
-from splatpilot.diagrams.worlds.indoor import (
-    OfficeConfig,
-    RoomConfig,
-    office_spec,
-    room_spec,
-)
+from splatpilot.diagrams.worlds.indoor import OfficeConfig, RoomConfig, office_spec, room_spec
 from splatpilot.diagrams.worlds.inserted import InsertedConfig, inserted_world
 from splatpilot.diagrams.worlds.octomap_world import OCTOMAP, OctomapConfig, octomap_world
 from splatpilot.diagrams.worlds.outdoor import (
@@ -40,23 +35,21 @@ class WorldConfig(Protocol):
     __dataclass_fields__: ClassVar[dict[str, Any]]
 
     def validate(self) -> None:
-        """Raises ValueError on a value out of range, naming it, its limit and the remedy."""
+        """Raises ValueError on an invalid field."""
         ...
 
 
 @dataclass(frozen=True)
 class WorldKind:
-    """How a world is configured and made."""
+    """A registered type of world."""
 
     config: type  # the type of its configurations
-    # From a configuration and a seed to a world: the same arguments, the same bits.
-    make: Callable[[Any, int], World]
-    # The same world as solids, start and goal, if it is generated: cheap.
-    make_spec: Callable[[Any, int], WorldSpec] | None = None
+    make: Callable[[Any, int], World]  # from a configuration and a seed, deterministic
+    make_spec: Callable[[Any, int], WorldSpec] | None = None  # the same as solids, if generated
 
 
+# All worlds, by the names of their configurations' types
 WORLDS = Registry("world", "splatpilot.worlds", WorldKind)
-"""All worlds, by the names of their configurations' types."""
 
 
 def register_world(
@@ -65,16 +58,16 @@ def register_world(
     make_spec: Callable[[Any, int], WorldSpec] | None = None,
 ) -> None:
     """
-    Makes a kind of world known, so that scenarios can name it by its configuration's type.
+    Registers a world, so that scenarios can name it by its configuration's type.
 
     Args:
         config: the type of its configurations, see `WorldConfig`; its name is their YAML tag.
-        make: see `WorldKind.make`; draws and samples the spec if None.
-        make_spec: see `WorldKind.make_spec`; needed to train and render captures in it.
+        make: from a configuration and a seed to a world; by default draws the spec.
+        make_spec: from a configuration and a seed to a spec, to train and render captures in it.
 
     Raises:
-        ValueError: if another world has the name, the type is none of configurations, or neither
-            function is given.
+        ValueError: if another world has the name, the type is not one of configurations, or
+            neither function is given.
     """
     if make is None:
         if make_spec is None:
@@ -90,44 +83,36 @@ def make_world(config: WorldConfig, seed: int) -> World:
     Generates or reads the world that `config` describes.
 
     Args:
-        config: which kind of world, and its parameters.
-        seed: of what is random: generated worlds, what is put into scenes, and start and goal where
-            they are drawn.
+        config: of a registered world.
+        seed: of generated worlds, inserted obstacles, and start and goal if they are drawn.
 
     Raises:
-        ValueError: for a configuration that no kind of world has, parameters no world can be made
-            of, and damaged scenes.
-        FileNotFoundError: for a scene that is not there.
+        ValueError: for an unknown or infeasible configuration, and damaged scenes.
+        FileNotFoundError: for a missing scene.
     """
     world = WORLDS.kind_of(config).make(config, seed)
     if not isinstance(world, World):
-        made = type(world).__name__
-        raise ValueError(f"what makes {type(config).__name__} gave {made}; it must return a World")
+        name, made = type(config).__name__, type(world).__name__
+        raise ValueError(f"result of make for {name} must be a World, got {made}")
     return world
 
 
-def place_config(path: Path) -> SceneConfig | OctomapConfig:
-    """The world of a place on disk: an OctoMap by its suffix, or else a scene."""
+def scene_config(path: Path) -> SceneConfig | OctomapConfig:
+    """Returns the configuration of a scene or, by its suffix, of an OctoMap on disk."""
     kind = OctomapConfig if path.suffix.lower() == OCTOMAP else SceneConfig
     return kind(path=str(path))
 
 
 def is_procedural(config: WorldConfig) -> bool:
-    """Whether the world is generated, so that `make_spec` makes it too."""
+    """Checks that the world is generated, so that `make_spec` makes it too."""
     return WORLDS.kind_of(config).make_spec is not None
 
 
 def make_spec(config: WorldConfig, seed: int) -> WorldSpec:
-    """
-    Generates a procedural world as solids, start and goal, without Gaussians and grids: cheap.
-    `write_gltf` exports it as a mesh, `make_world` of the same arguments gives the same world.
-
-    Raises:
-        ValueError: for a world that is not generated, and parameters no world can be made of.
-    """
+    """Generates the solids, start and goal of a procedural world, without Gaussians and grids."""
     plan = WORLDS.kind_of(config).make_spec
     if plan is None:
-        raise ValueError(f"{type(config).__name__} is no generated world: it has no spec")
+        raise ValueError(f"{type(config).__name__} is not a generated world: it has no spec")
     return plan(config, seed)
 
 

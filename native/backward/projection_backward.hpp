@@ -1,12 +1,39 @@
-// The derivative of projection.hpp and project_arrays.hpp, 16 Gaussians at a time.
+// The derivatives of project_gaussians.hpp, 16 Gaussians at a time.
 #pragma once
 
-#include "backward/color_backward.hpp"
-#include "project/project_arrays.hpp"
+#include "project/project_gaussians.hpp"
 
 namespace splatpilot::SIMD_LEVEL {
 
-SP_INLINE Vector16 broadcast(const float v[3]) { return {F16(v[0]), F16(v[1]), F16(v[2])}; }
+// Adds to rows of dL/dcolors and returns dL/d(p_W - center), which is zero without spherical
+// harmonics. `color_gradient` is zero where a color is clamped at 0.
+SP_INLINE Vector16 colors_backward(const GaussianArrays& g, const uint32_t* indices, int lanes,
+                                   const Vector16& d_W, const F16 color_gradient[3],
+                                   float* gradients) {
+  alignas(64) float soa[48][kLanes];
+  if (g.sh_degree < 0) {
+    for (int c = 0; c < 3; ++c) store(soa[c], color_gradient[c]);
+    for (int lane = 0; lane < lanes; ++lane) {
+      float* row = gradients + 3 * static_cast<size_t>(indices[lane]);
+      for (int c = 0; c < 3; ++c) row[c] += soa[c][lane];
+    }
+    return {F16(0.0f), F16(0.0f), F16(0.0f)};
+  }
+  const int used = 3 * (g.sh_degree + 1) * (g.sh_degree + 1);
+  const size_t stride = 3 * static_cast<size_t>(g.sh_coefficients);
+  prefetch_rows(gradients, static_cast<int>(stride), used, indices, (1u << lanes) - 1);
+  for (int lane = 0; lane < kLanes; ++lane) {
+    const float* row = g.colors + stride * indices[lane];
+    for (int k = 0; k < used; ++k) soa[k][lane] = row[k];
+  }
+  F16 direction[3] = {F16(0.0f), F16(0.0f), F16(0.0f)};
+  evaluate_sh_backward(g.sh_degree, soa[0], d_W.x, d_W.y, d_W.z, color_gradient, direction);
+  for (int lane = 0; lane < lanes; ++lane) {
+    float* row = gradients + stride * indices[lane];
+    for (int k = 0; k < used; ++k) row[k] += soa[k][lane];
+  }
+  return {direction[0], direction[1], direction[2]};
+}
 
 // From a gradient in the camera frame to the same in the world.
 SP_INLINE Vector16 to_world(const Camera& camera, const Vector16& c) {
@@ -21,8 +48,8 @@ struct SplatGradientPack {
 };
 
 // dL/dP from the sums over pixels. With W = (ux uy; 0 vy) and A = W P, the covariance's gradient is
-// 2 ln^2 2 W^T (sums of h (u, v)^T (u, v)) W; nothing here is inverted, so needles and giants keep
-// their digits.
+// 2 ln^2 2 W^T (sums of h (u, v)^T (u, v)) W. Without an inverse, needles and giants keep their
+// digits.
 SP_INLINE void factor_gradient(const Camera& camera, const SplatGradientPack& s, const Vector16& p0,
                                const Vector16& p1, Vector16 dp[2]) {
   const float ln2 = 0.69314718056f;
@@ -45,26 +72,6 @@ SP_INLINE void factor_gradient(const Camera& camera, const SplatGradientPack& s,
   const F16 x01 = dot(q0, q1);
   dp[0] = dp[0] + factor * (dot(q1, q1) * t0 - x01 * t1);
   dp[1] = dp[1] + factor * (dot(q0, q0) * t1 - x01 * t0);
-}
-
-// From the gradients of the columns of R(q), q of any length, to that of q.
-SP_INLINE void quaternion_gradient(const F16 q[4], const Vector16& c0, const Vector16& c1,
-                                   const Vector16& c2, F16 dq[4]) {
-  const F16 inverse_length =
-      F16(1.0f) / sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
-  const F16 w = q[0] * inverse_length, x = q[1] * inverse_length, y = q[2] * inverse_length,
-            z = q[3] * inverse_length;
-  const F16 two = F16(2.0f);
-  const F16 d[4] = {
-      two * (x * (c1.z - c2.y) + y * (c2.x - c0.z) + z * (c0.y - c1.x)),
-      two * (y * (c1.x + c0.y) + z * (c2.x + c0.z) + w * (c1.z - c2.y) - two * x * (c1.y + c2.z)),
-      two * (x * (c1.x + c0.y) + z * (c2.y + c1.z) + w * (c2.x - c0.z) - two * y * (c0.x + c2.z)),
-      two * (x * (c2.x + c0.z) + y * (c2.y + c1.z) + w * (c0.y - c1.x) - two * z * (c0.x + c1.y))};
-  const F16 radial = d[0] * w + d[1] * x + d[2] * y + d[3] * z;
-  dq[0] = (d[0] - radial * w) * inverse_length;
-  dq[1] = (d[1] - radial * x) * inverse_length;
-  dq[2] = (d[2] - radial * y) * inverse_length;
-  dq[3] = (d[3] - radial * z) * inverse_length;
 }
 
 // From dL/dm (rows of J R_CW), dL/dmean and dL/ddepth to dL/dp_C; adds to dL/dR_CW's rows.
@@ -126,7 +133,7 @@ struct PoseGradientPack {
     R[0] = R[1] = R[2] = p_C = direction = zero;
   }
 
-  // From the gradients of p_C and, by way of colors, of d_W = p_W - center.
+  // From the gradients of p_C and, through colors, of d_W = p_W - center.
   SP_INLINE void add(const Vector16& by_p_C, const Vector16& d_W, const Vector16& by_direction) {
     R[0] = R[0] + by_p_C.x * d_W;
     R[1] = R[1] + by_p_C.y * d_W;
@@ -147,10 +154,10 @@ struct PoseGradientPack {
   }
 };
 
-// Gathers 16 splats and their gradients; lanes from `lanes` on repeat the first, without gradient.
-SP_INLINE void gather_splats(const Splat* splats, const SplatGradient* gradients,
-                             const float* means2d, int lanes, bool colors_cut_off,
-                             uint32_t* indices, SplatGradientPack& s) {
+// Packs 16 splats and their gradients; lanes from `lanes` on repeat the first, without gradient.
+SP_INLINE void load_splats(const Splat* splats, const SplatGradient* gradients,
+                           const float* means2d, int lanes, bool colors_cut_off, uint32_t* indices,
+                           SplatGradientPack& s) {
   alignas(64) float soa[13][kLanes];
   for (int lane = 0; lane < kLanes; ++lane) {
     const int i = lane < lanes ? lane : 0;
@@ -168,18 +175,15 @@ SP_INLINE void gather_splats(const Splat* splats, const SplatGradient* gradients
     soa[7][lane] = keep * g.uv;
     soa[8][lane] = keep * g.vv;
     for (int c = 0; c < 3; ++c) {
-      // A color that was cut off at 0 does not change with its coefficients.
+      // A color clamped at 0 does not change with its coefficients.
       const bool constant = colors_cut_off && !(splat.color[c] > 0.0f);
       soa[9 + c][lane] = constant ? 0.0f : keep * g.color[c];
     }
     soa[12][lane] = keep * g.depth;
   }
-  s = {load(soa[0]), load(soa[1]),
-       load(soa[2]), load(soa[3]),
-       load(soa[4]), load(soa[5]),
-       load(soa[6]), load(soa[7]),
-       load(soa[8]), {load(soa[9]), load(soa[10]), load(soa[11])},
-       load(soa[12])};
+  F16* fields[13] = {&s.ux, &s.uy, &s.vy,   &s.mean_x,   &s.mean_y,   &s.log_opacity, &s.uu,
+                     &s.uv, &s.vv, s.color, s.color + 1, s.color + 2, &s.depth};
+  for (int f = 0; f < 13; ++f) *fields[f] = load(soa[f]);
 }
 
 inline void project_backward(const GaussianArrays& g, const Camera& camera, const Splat* splats,
@@ -190,15 +194,14 @@ inline void project_backward(const GaussianArrays& g, const Camera& camera, cons
     const int lanes = count - first < kLanes ? static_cast<int>(count - first) : kLanes;
     uint32_t indices[kLanes];
     SplatGradientPack s;
-    gather_splats(splats + first, gradients + first, means2d + 2 * first, lanes, g.sh_degree >= 0,
-                  indices, s);
-    const GatheredGaussians in = gather_gaussians(g, indices);
+    load_splats(splats + first, gradients + first, means2d + 2 * first, lanes, g.sh_degree >= 0,
+                indices, s);
+    const PackedGaussians in = load_gaussians(g, indices);
     const Vector16 d_W = from_center(camera, in.mean.x, in.mean.y, in.mean.z);
     const Vector16 p_C = to_camera(camera, d_W);
     const F16 inverse_z = F16(1.0f) / p_C.z;
-    const F16 unit[3] = {F16(1.0f), F16(1.0f), F16(1.0f)};
     Vector16 rotation[3], columns[3], m[2];
-    covariance_factor(in.quat, unit, rotation);
+    rotation_columns(in.quat, rotation);
     for (int k = 0; k < 3; ++k) columns[k] = in.scale[k] * rotation[k];
     projection_rows(camera, p_C, inverse_z, m);
     const Vector16 p0 = {dot(m[0], columns[0]), dot(m[0], columns[1]), dot(m[0], columns[2])};

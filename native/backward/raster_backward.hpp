@@ -1,17 +1,15 @@
 // The derivative of raster.hpp: one tile, back to front, 16 pixels at a time.
 //
-// With w_i = T_i alpha_i and s_i = dL/d(color, depth, alpha) . (color_i, depth_i, 1), the loss
-// changes with alpha_i by T_i (s_i - B_i), where B_i = alpha_{i+1} s_{i+1} + (1 - alpha_{i+1})
-// B_{i+1} is what shows behind splat i. Accumulated from the back, nothing is subtracted that would
-// lose digits.
+// With w_i = T_i alpha_i and s_i = dL/d(color, depth, alpha) . (color_i, depth_i, 1), dL/dalpha_i
+// is T_i (s_i - B_i), where B_i = alpha_{i+1} s_{i+1} + (1 - alpha_{i+1}) B_{i+1} shows behind
+// splat i.
 #pragma once
 
-#include "core/reduction.hpp"
 #include "raster/raster.hpp"
 
 namespace splatpilot::SIMD_LEVEL {
 
-// What one splat did to one block; zero where a pixel was finished.
+// The effect of one splat on one block; zero where a pixel was finished.
 struct BlockRecord {
   F16 alpha, weight;
 };
@@ -27,7 +25,7 @@ struct alignas(64) BackwardScratch {
   BlockBackward blocks[kBlocksPerTile];
   BlockRecord records[kStageSize * kBlocksPerTile];
   StagedSplat splats[kStageSize];
-  uint32_t touched[kStageSize];  // blocks of which there is a record
+  uint32_t touched[kStageSize];  // blocks with a record
 };
 static_assert(sizeof(BackwardScratch) <= kBackwardScratchBytes);
 
@@ -56,7 +54,7 @@ SP_INLINE void load_block(const RasterInput& in, const ImageGradient& g, int lef
   if constexpr (kDepth) {
     block.depth = load_pixels(g.depth, g.stride, in, left, top);
     if (g.expected_depth) {
-      // Alpha is 0 or at least 1/255; where it is 0 no splat takes up the gradient.
+      // Alpha is 0 or at least 1/255; where it is 0 no splat takes the gradient.
       const F16 alpha = load_pixels(g.rendered_alpha, 1, in, left, top);
       block.depth = block.depth / max(alpha, F16(0.5f * kAlphaCut));
       block.alpha =
@@ -66,8 +64,8 @@ SP_INLINE void load_block(const RasterInput& in, const ImageGradient& g, int lef
   block.behind = F16(0.0f);
 }
 
-// Composites `count` staged splats again from block.transmittance on and records what they did;
-// returns one past the last record.
+// Composites `count` staged splats again from block.transmittance on and records them; returns one
+// past the last record.
 SP_INLINE BlockRecord* replay(BackwardScratch& s, const Pair* pairs, int count, uint32_t live) {
   BlockRecord* record = s.records;
   for (int i = 0; i < count; ++i) {
@@ -138,9 +136,9 @@ SP_INLINE void backward_pair(const StagedSplat& splat, uint32_t touched, const B
 }
 
 template <bool kColor, bool kDepth>
-size_t raster_tile_backward_channels(const RasterInput& in, const StageReader& record,
-                                     const ImageGradient& g, int tile, BackwardScratch& s,
-                                     PairGradient* gradients) {
+void raster_tile_backward_channels(const RasterInput& in, const StageReader& record,
+                                   const ImageGradient& g, int tile, BackwardScratch& s,
+                                   PairGradient* gradients) {
   const int left = tile % in.tiles_x * kTileSize, top = tile / in.tiles_x * kTileSize;
   const size_t first = in.tile_offsets[tile], last = in.tile_offsets[tile + 1];
   const size_t stages = record.stages_done[tile];
@@ -155,7 +153,6 @@ size_t raster_tile_backward_channels(const RasterInput& in, const StageReader& r
 
   const size_t reached = first + stages * kStageSize < last ? first + stages * kStageSize : last;
   for (size_t slot = reached; slot < last; ++slot) gradients[slot] = {};
-  size_t records = 0;
   for (size_t stage = stages; stage-- > 0;) {
     const size_t begin = first + stage * kStageSize;
     const int count = static_cast<int>(last - begin < kStageSize ? last - begin : kStageSize);
@@ -173,31 +170,28 @@ size_t raster_tile_backward_channels(const RasterInput& in, const StageReader& r
       if (any(s.blocks[b].transmittance > F16(kMinTransmittance))) live |= 1u << b;
     }
     const BlockRecord* block_record = replay(s, in.pairs + begin, count, live);
-    records += static_cast<size_t>(block_record - s.records);
     for (int i = count; i-- > 0;) {
       block_record -= __builtin_popcount(s.touched[i]);
       backward_pair<kColor, kDepth>(s.splats[i], s.touched[i], block_record, s.blocks,
                                     gradients[begin + i]);
     }
   }
-  return records;
 }
 
-inline size_t raster_tile_backward(const RasterInput& in, const StageReader& record,
-                                   const ImageGradient& g, int tile, void* scratch,
-                                   PairGradient* gradients) {
+inline void raster_tile_backward(const RasterInput& in, const StageReader& record,
+                                 const ImageGradient& g, int tile, void* scratch,
+                                 PairGradient* gradients) {
   BackwardScratch& s = *static_cast<BackwardScratch*>(scratch);
-  if (g.color && g.depth) {
-    return raster_tile_backward_channels<true, true>(in, record, g, tile, s, gradients);
-  }
-  if (g.color) return raster_tile_backward_channels<true, false>(in, record, g, tile, s, gradients);
-  return raster_tile_backward_channels<false, true>(in, record, g, tile, s, gradients);
+  if (!g.depth)
+    return raster_tile_backward_channels<true, false>(in, record, g, tile, s, gradients);
+  if (!g.color)
+    return raster_tile_backward_channels<false, true>(in, record, g, tile, s, gradients);
+  raster_tile_backward_channels<true, true>(in, record, g, tile, s, gradients);
 }
 
 // Adds up each splat's pairs, tile after tile, and turns sums over u and v into gradients.
-inline void gather_gradients(const Splat* splats, size_t count, const PairRange* ranges,
-                             const uint32_t* slots, const PairGradient* pairs,
-                             SplatGradient* gradients) {
+inline void sum_pairs(const Splat* splats, size_t count, const PairRange* ranges,
+                      const uint32_t* slots, const PairGradient* pairs, SplatGradient* gradients) {
   const float two_ln2 = 1.3862943611f;  // the exponent is in base 2
   for (size_t i = 0; i < count; ++i) {
     if (i + 3 * kPrefetchAhead < count) {

@@ -1,4 +1,4 @@
-// What the Python bindings of worlds that rays are cast in share.
+// Types that the Python bindings of worlds for ray casting share.
 #pragma once
 
 #include <nanobind/stl/string.h>
@@ -14,21 +14,23 @@
 
 namespace splatpilot {
 
-using Points = Floats<nb::shape<-1, 3>>;
+using Points = Rows3;
 using Rotations = Floats<nb::shape<-1, 3, 3>>;
-using Numbers = nb::ndarray<const int64_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 using DepthRows = Writable<nb::ndim<2>>;
+using QueryPoints = Doubles<nb::shape<-1, 3>>;
+using Distances = Array<double, nb::ndim<1>>;
+using Gradients = Array<double, nb::shape<-1, 3>>;
 
 constexpr size_t kPack = 16;
 constexpr size_t kCameras = 4;  // to a task
 
-inline void require_worlds(const Numbers& world, size_t queries, size_t worlds) {
-  require(world.size() == queries, "the numbers of worlds differ in length from the points");
+inline void require_worlds(const Indices& world, size_t queries, size_t worlds) {
+  require_rows(queries, "worlds and points differ in number", world);
   for (size_t n = 0; n < queries; ++n) {
     const int64_t w = world.data()[n];
     if (w < 0 || static_cast<size_t>(w) >= worlds) {
-      throw std::invalid_argument("world " + std::to_string(w) + " of " + std::to_string(worlds) +
-                                  " worlds, which count from 0");
+      throw std::invalid_argument("world must be in [0, " + std::to_string(worlds) + "), got " +
+                                  std::to_string(w));
     }
   }
 }
@@ -41,8 +43,8 @@ struct OwnRays {
 
   OwnRays(const Points& directions, float half_pixel) {
     const size_t count = directions.shape(0), size = (count + kPack - 1) / kPack * kPack;
-    require(count > 0 && count <= 0xffffffff / 3, "the camera has no pixels, or too many");
-    require(half_pixel >= 0.0f, "the width of a pixel must not be negative");
+    require(count > 0 && count <= 0xffffffff / 3, "a camera has no pixels, or too many");
+    require(half_pixel >= 0.0f, "half_pixel must be >= 0");
     const auto direction = [&](uint32_t pixel) { return directions.data() + 3 * pixel; };
     for (uint32_t pixel = 0; pixel < count; ++pixel) {
       const float* d = direction(pixel);
@@ -73,18 +75,18 @@ struct OwnRays {
   }
 };
 
-// What worlds of both kinds have: kernels, and threads that one caller uses at a time.
+// The kernels and threads of worlds, for one caller at a time.
 class Casting {
  public:
   Casting(int threads, const std::string& simd)
-      : kernels_(*kernels(simd).casting), pool_(checked(threads)) {}
+      : kernels_(*kernels(simd).casting), pool_(checked_threads(threads)) {}
 
  protected:
   // Calls cast(camera, world, rays, pose, scratch, depth) for each camera.
   template <typename Cast>
-  void for_each_camera(const Points& p, const Rotations& R, const Numbers& world, size_t worlds,
+  void for_each_camera(const Points& p, const Rotations& R, const Indices& world, size_t worlds,
                        const Points& directions, float half_pixel, const DepthRows& depth,
-                       size_t most_bodies, const Cast& cast) {
+                       size_t max_bodies, const Cast& cast) {
     const size_t count = p.shape(0);
     require(R.shape(0) == count && depth.shape(0) == count && depth.shape(1) == directions.shape(0),
             "positions, rotations and images of cameras differ in shape");
@@ -92,7 +94,7 @@ class Casting {
     const OwnRays own(directions, half_pixel);
     const nb::gil_scoped_release release;
     const std::scoped_lock lock(mutex_);
-    const size_t size = kernels_.scratch(own.rays.count, most_bodies);
+    const size_t size = kernels_.scratch(own.rays.count, max_bodies);
     pool_.for_each((count + kCameras - 1) / kCameras, [&](size_t task) {
       thread_local std::vector<float> scratch;
       if (scratch.size() < size) scratch.resize(size);
@@ -109,11 +111,6 @@ class Casting {
   const CastingKernels& kernels_;
 
  private:
-  static int checked(int threads) {
-    require(threads >= 1 && threads <= 1024, "threads must lie between 1 and 1024");
-    return threads;
-  }
-
   ThreadPool pool_;
   std::mutex mutex_;
 };

@@ -1,5 +1,5 @@
-// Python bindings of what fits Gaussians to images: losses, shapes, and the distance of
-// Gaussians from the surface that a depth image shows.
+// Python bindings of losses, of the parameters of Gaussians, and of the distance of Gaussians from
+// the surface in a depth image.
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/string.h>
 
@@ -10,19 +10,18 @@
 
 #include "bindings/bindings.hpp"
 #include "core/dispatch.hpp"
-#include "losses/fitting.hpp"
 #include "losses/losses.hpp"
+
+#define SIMD_LEVEL baseline
+#include "core/vectors.hpp"
 
 namespace splatpilot {
 namespace {
 
-using namespace nb::literals;
 using Images = Floats<nb::ndim<4>>;
 using ImagesOut = Writable<nb::ndim<4>>;
-using Values = Floats<nb::ndim<1>>;
-using ValuesOut = Writable<nb::ndim<1>>;
 using DepthImage = Floats<nb::ndim<2>>;
-using Indices = nb::ndarray<const int64_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+using Vector = SIMD_LEVEL::Vector3<float>;
 
 double photometric_loss(const Images& rendered, const Images& target, float ssim_weight,
                         const std::optional<ImagesOut>& gradient, const std::string& simd) {
@@ -74,34 +73,29 @@ double log_depth_loss(const Values& rendered, const Values& depth,
   return kernels.log_depth(in);
 }
 
-const FittingKernels& fitting(const std::string& simd) { return *kernels(simd).fitting; }
-
-void splat_shapes(const Means& log_scales, const Opacities& logit_opacities, const Values& smallest,
-                  const Rows3& scales, const ValuesOut& opacities, const std::string& simd) {
+void splat_shapes(const Rows3& log_scales, const Values& logit_opacities, const Values& smallest,
+                  const Rows3Out& scales, const ValuesOut& opacities, const std::string& simd) {
   const size_t n = log_scales.shape(0);
-  require(logit_opacities.size() == n && smallest.size() == n && scales.shape(0) == n &&
-              opacities.size() == n,
-          "arrays of Gaussians differ in length");
+  require_rows(n, "arrays of Gaussians differ in length", logit_opacities, smallest, scales,
+               opacities);
   const ShapeInput in{n,
                       log_scales.data(),
                       logit_opacities.data(),
                       smallest.data(),
                       scales.data(),
                       opacities.data()};
-  const FittingKernels& kernels = fitting(simd);
+  const LossKernels& kernels = *splatpilot::kernels(simd).losses;
   const nb::gil_scoped_release release;
   kernels.shapes(in);
 }
 
-void splat_shapes_backward(const Means& scales, const Opacities& opacities, const Values& smallest,
-                           const Means& v_scales, const Opacities& v_opacities,
-                           const Rows3& v_log_scales, const ValuesOut& v_logit_opacities,
+void splat_shapes_backward(const Rows3& scales, const Values& opacities, const Values& smallest,
+                           const Rows3& v_scales, const Values& v_opacities,
+                           const Rows3Out& v_log_scales, const ValuesOut& v_logit_opacities,
                            const std::string& simd) {
   const size_t n = scales.shape(0);
-  require(opacities.size() == n && smallest.size() == n && v_scales.shape(0) == n &&
-              v_opacities.size() == n && v_log_scales.shape(0) == n &&
-              v_logit_opacities.size() == n,
-          "arrays of Gaussians differ in length");
+  require_rows(n, "arrays of Gaussians differ in length", opacities, smallest, v_scales,
+               v_opacities, v_log_scales, v_logit_opacities);
   const ShapeGradientInput in{n,
                               scales.data(),
                               opacities.data(),
@@ -110,90 +104,51 @@ void splat_shapes_backward(const Means& scales, const Opacities& opacities, cons
                               v_opacities.data(),
                               v_log_scales.data(),
                               v_logit_opacities.data()};
-  const FittingKernels& kernels = fitting(simd);
+  const LossKernels& kernels = *splatpilot::kernels(simd).losses;
   const nb::gil_scoped_release release;
   kernels.shapes_backward(in);
 }
 
-// A point of a Gaussian that belongs to what is seen.
+// A point of a Gaussian at a valid depth.
 struct SurfacePoint {
   size_t gaussian, draw;
   float z, truth;  // [m]
 };
 
-// The vector v turned by the unit quaternion (w, q), or with w negated turned back.
-void turn(float w, const float* q, const float* v, float* turned) {
-  const float c[3] = {2 * (q[1] * v[2] - q[2] * v[1]), 2 * (q[2] * v[0] - q[0] * v[2]),
-                      2 * (q[0] * v[1] - q[1] * v[0])};
-  turned[0] = v[0] + w * c[0] + q[1] * c[2] - q[2] * c[1];
-  turned[1] = v[1] + w * c[1] + q[2] * c[0] - q[0] * c[2];
-  turned[2] = v[2] + w * c[2] + q[0] * c[1] - q[1] * c[0];
-}
-
-// The gradient by an unnormalized quaternion of v . R(q) u, added to `gradient`.
-void add_quaternion_gradient(const float* quat, float inverse_norm, const float* u, const float* v,
-                             float* gradient) {
-  const float w = quat[0] * inverse_norm, x = quat[1] * inverse_norm, y = quat[2] * inverse_norm,
-              z = quat[3] * inverse_norm;
-  // R u = (w^2 - q.q) u + 2 (q.u) q + 2 w (q x u) for a unit quaternion.
-  const float uv = u[0] * v[0] + u[1] * v[1] + u[2] * v[2];
-  const float qu = x * u[0] + y * u[1] + z * u[2], qv = x * v[0] + y * v[1] + z * v[2];
-  const float across[3] = {u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2],
-                           u[0] * v[1] - u[1] * v[0]};  // q . (u x v) = v . (q x u)
-  const float g[4] = {2 * (w * uv + x * across[0] + y * across[1] + z * across[2]),
-                      2 * (-x * uv + qu * v[0] + qv * u[0] + w * across[0]),
-                      2 * (-y * uv + qu * v[1] + qv * u[1] + w * across[1]),
-                      2 * (-z * uv + qu * v[2] + qv * u[2] + w * across[2])};
-  const float along = w * g[0] + x * g[1] + y * g[2] + z * g[3];
-  gradient[0] += (g[0] - along * w) * inverse_norm;
-  gradient[1] += (g[1] - along * x) * inverse_norm;
-  gradient[2] += (g[2] - along * y) * inverse_norm;
-  gradient[3] += (g[3] - along * z) * inverse_norm;
-}
-
-double surface_loss(const Means& means, const Quats& quats, const Means& scales,
-                    const Indices& seen, const Means& draws, const Floats<nb::shape<4, 4>>& X_CW,
+double surface_loss(const Rows3& means, const Rows4& quats, const Rows3& scales,
+                    const Indices& seen, const Rows3& draws, const Floats<nb::shape<4, 4>>& X_CW,
                     const Floats<nb::shape<3, 3>>& K, const DepthImage& depth, float reach,
-                    float nearest, float far, const Rows3& v_means, const Rows4& v_quats,
-                    const Rows3& v_scales) {
+                    float nearest, float far, const Rows3Out& v_means, const Rows4Out& v_quats,
+                    const Rows3Out& v_scales) {
   const size_t n = means.shape(0), count = seen.size();
-  require(quats.shape(0) == n && scales.shape(0) == n && v_means.shape(0) == n &&
-              v_quats.shape(0) == n && v_scales.shape(0) == n,
-          "arrays of Gaussians differ in length");
-  require(draws.shape(0) == count, "there must be a draw for each Gaussian that is seen");
+  require_rows(n, "arrays of Gaussians differ in length", quats, scales, v_means, v_quats,
+               v_scales);
+  require_rows(count, "visible Gaussians and draws differ in number", draws);
   for (size_t i = 0; i < count; ++i) {
-    require(seen(i) >= 0 && static_cast<size_t>(seen(i)) < n, "a Gaussian is seen that is not");
+    require(seen(i) >= 0 && static_cast<size_t>(seen(i)) < n, "no such Gaussian");
   }
   const nb::gil_scoped_release release;
-  const float* X = X_CW.data();
-  const float *k = K.data(), *truths = depth.data();
+  const float *X = X_CW.data(), *k = K.data(), *truths = depth.data();
   const auto height = static_cast<float>(depth.shape(0));
   const auto width = static_cast<float>(depth.shape(1));
-  const auto inverse_norm = [&](size_t g) {
-    const float* q = quats.data() + 4 * g;
-    const float norm = std::sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
-    return 1.0f / std::max(norm, 1e-12f);
+  const auto vector = [](const float* p, size_t row) -> Vector {
+    return {p[3 * row], p[3 * row + 1], p[3 * row + 2]};
   };
-  const auto offset_of = [&](size_t g, size_t i, float* offset) {
-    for (int a = 0; a < 3; ++a) offset[a] = draws.data()[3 * i + a] * scales.data()[3 * g + a];
+  const auto offset = [&](size_t g, size_t i) -> Vector {
+    const Vector draw = vector(draws.data(), i), scale = vector(scales.data(), g);
+    return {draw.x * scale.x, draw.y * scale.y, draw.z * scale.z};
   };
   thread_local std::vector<SurfacePoint> near;
   near.clear();
   double sum = 0.0;
   for (size_t i = 0; i < count; ++i) {
     const auto g = static_cast<size_t>(seen(i));
-    const float* quat = quats.data() + 4 * g;
-    const float s = inverse_norm(g);
-    const float axis[3] = {quat[1] * s, quat[2] * s, quat[3] * s};
-    float offset[3], p_C[3];
-    offset_of(g, i, offset);
-    float p_W[3];
-    turn(quat[0] * s, axis, offset, p_W);
-    for (int a = 0; a < 3; ++a) p_W[a] += means.data()[3 * g + a];
-    for (int a = 0; a < 3; ++a) {
-      const float* row = X + 4 * a;
-      p_C[a] = row[0] * p_W[0] + row[1] * p_W[1] + row[2] * p_W[2] + row[3];
-    }
+    Vector axes[3];
+    SIMD_LEVEL::rotation_columns(quats.data() + 4 * g, axes);
+    const Vector a = offset(g, i);
+    const Vector p_W = vector(means.data(), g) + (a.x * axes[0] + (a.y * axes[1] + a.z * axes[2]));
+    float p_C[3];
+    for (int row = 0; row < 3; ++row) p_C[row] = dot(X + 4 * row, p_W) + X[4 * row + 3];
     if (!(p_C[2] > nearest)) continue;
     const float x = p_C[0] / p_C[2], y = p_C[1] / p_C[2];
     const float u = std::floor(k[0] * x + k[1] * y + k[2]);
@@ -208,19 +163,20 @@ double surface_loss(const Means& means, const Quats& quats, const Means& scales,
   const float share = 1.0f / static_cast<float>(near.size());
   for (const SurfacePoint& point : near) {
     if (point.z == point.truth) continue;
+    const size_t g = point.gaussian;
     const float slope = (point.z > point.truth ? share : -share) / point.z;
-    const float v_p[3] = {slope * X[8], slope * X[9], slope * X[10]};
-    const float* quat = quats.data() + 4 * point.gaussian;
-    const float s = inverse_norm(point.gaussian);
-    const float axis[3] = {quat[1] * s, quat[2] * s, quat[3] * s};
-    float offset[3], v_offset[3];
-    offset_of(point.gaussian, point.draw, offset);
-    turn(-quat[0] * s, axis, v_p, v_offset);
+    const Vector v_p = {slope * X[8], slope * X[9], slope * X[10]};
+    const float v_mean[3] = {v_p.x, v_p.y, v_p.z};
+    Vector axes[3];
+    SIMD_LEVEL::rotation_columns(quats.data() + 4 * g, axes);
     for (int a = 0; a < 3; ++a) {
-      v_means.data()[3 * point.gaussian + a] += v_p[a];
-      v_scales.data()[3 * point.gaussian + a] += draws.data()[3 * point.draw + a] * v_offset[a];
+      v_means.data()[3 * g + a] += v_mean[a];
+      v_scales.data()[3 * g + a] += draws.data()[3 * point.draw + a] * dot(axes[a], v_p);
     }
-    add_quaternion_gradient(quat, s, offset, v_p, v_quats.data() + 4 * point.gaussian);
+    const Vector a = offset(g, point.draw);
+    float v_quat[4];
+    SIMD_LEVEL::quaternion_gradient(quats.data() + 4 * g, a.x * v_p, a.y * v_p, a.z * v_p, v_quat);
+    for (int c = 0; c < 4; ++c) v_quats.data()[4 * g + c] += v_quat[c];
   }
   return sum / static_cast<double>(near.size());
 }
@@ -237,7 +193,7 @@ void bind_fitting(nb::module_& m) {
   m.def("surface_loss", &surface_loss, nb::kw_only(), "means"_a, "quats"_a, "scales"_a, "seen"_a,
         "draws"_a, "X_CW"_a, "K"_a, "depth"_a, "reach"_a, "nearest"_a, "far"_a, "v_means"_a,
         "v_quats"_a, "v_scales"_a,
-        "Mean |log(z / depth)| of points drawn from the Gaussians that are seen; adds gradients.");
+        "Mean |log(z / depth)| of points drawn from visible Gaussians; adds gradients.");
   m.def("photometric_loss", &photometric_loss, nb::kw_only(), "rendered"_a, "target"_a,
         "ssim_weight"_a, "gradient"_a.none(), "simd"_a = "",
         "(1 - w) L1 + w (1 - SSIM) of images (N, H, W, C); writes the gradient unless None.");

@@ -1,5 +1,4 @@
-// Python bindings of worlds of regular grids, of distances in one of them, and of descent along
-// the gradient of another.
+// Python bindings of worlds of regular grids, and of distances in and descent along one grid.
 #include <nanobind/stl/optional.h>
 
 #include <limits>
@@ -8,36 +7,36 @@
 #include "bindings/casting_bindings.hpp"
 #include "fields/grid_interpolation.hpp"
 
+#define SIMD_LEVEL baseline
+#include "core/vectors.hpp"
+
 namespace splatpilot {
 namespace {
 
-using namespace nb::literals;
 using Grid = Floats<nb::ndim<3>>;
 using Point = Doubles<nb::shape<3>>;
-using QueryPoints = Doubles<nb::shape<-1, 3>>;
-using Distances = nb::ndarray<double, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
-using Gradients = nb::ndarray<double, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
-using WayPoints = nb::ndarray<double, nb::shape<-1, 4>, nb::c_contig, nb::device::cpu>;
-using GridShapes = nb::ndarray<const int64_t, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
+using PathRows = Array<double, nb::shape<-1, 4>>;
+using GridShapes = Array<const int64_t, nb::shape<-1, 3>>;
+using Vector = SIMD_LEVEL::Vector3<double>;
 
 class GridWorlds : Casting {
  public:
-  GridWorlds(const Floats<nb::ndim<1>>& values, const GridShapes& shapes, const Points& lower_W,
-             const Floats<nb::ndim<1>>& voxel_sizes, int threads, const std::string& simd)
+  GridWorlds(const Values& values, const GridShapes& shapes, const Points& lower_W,
+             const Values& voxel_sizes, int threads, const std::string& simd)
       : Casting(threads, simd), values_(values.data(), values.data() + values.size()) {
     const size_t count = shapes.shape(0);
-    require(lower_W.shape(0) == count && voxel_sizes.size() == count,
-            "shapes, lower corners and voxel sizes of grids differ in number");
+    require_rows(count, "shapes, lower corners and voxel sizes of grids differ in number", lower_W,
+                 voxel_sizes);
     size_t begin = 0;
     for (size_t w = 0; w < count; ++w) {
       GridWorld grid{};
       size_t size = 1;
       grid.voxel_size = voxel_sizes.data()[w];
       require(grid.voxel_size > 0.0f && std::isfinite(grid.voxel_size),
-              "a voxel's size must be positive");
+              "voxel sizes must be finite and > 0");
       for (int k = 0; k < 3; ++k) {
         const int64_t length = shapes.data()[3 * w + k];
-        require(length >= 2 && length <= 32768, "a grid needs 2 to 32768 voxels along each axis");
+        require(length >= 2 && length <= 32768, "a grid has 2 to 32768 voxels along each axis");
         grid.shape[k] = static_cast<int32_t>(length);
         grid.first_center[k] = lower_W.data()[3 * w + k] + 0.5f * grid.voxel_size;
         require(std::isfinite(grid.first_center[k]), "a grid's lower corner must be finite");
@@ -54,17 +53,16 @@ class GridWorlds : Casting {
 
   size_t size() const { return grids_.size(); }
 
-  void depth(const Points& p, const Rotations& R, const Numbers& world, const Points& directions,
+  void depth(const Points& p, const Rotations& R, const Indices& world, const Points& directions,
              float half_pixel, const DepthRows& depth) {
     for_each_camera(p, R, world, size(), directions, half_pixel, depth, 0,
                     [this](size_t w, auto&&... rest) { kernels_.cast_grid(grids_[w], rest...); });
   }
 
-  void interpolate(const Points& p, const Numbers& world, const Writable<nb::ndim<1>>& values,
-                   const Rows3& gradients) {
+  void interpolate(const Points& p, const Indices& world, const ValuesOut& values,
+                   const Rows3Out& gradients) {
     const size_t n = p.shape(0);
-    require(values.size() == n && gradients.shape(0) == n,
-            "points, values and gradients differ in number");
+    require_rows(n, "points, values and gradients differ in number", values, gradients);
     require_worlds(world, n, size());
     const nb::gil_scoped_release release;
     for (size_t i = 0; i < n; ++i) {
@@ -78,19 +76,24 @@ class GridWorlds : Casting {
   std::vector<GridWorld> grids_;
 };
 
+VoxelGrid voxel_grid(const Grid& values, const Point& lower_W, double voxel_size) {
+  require(voxel_size > 0.0, "voxel_size must be > 0");
+  VoxelGrid grid{values.data(), {}, {}, voxel_size};
+  for (int k = 0; k < 3; ++k) {
+    grid.shape[k] = static_cast<int64_t>(values.shape(k));
+    require(grid.shape[k] >= 2, "a grid has at least 2 voxels along each axis");
+    grid.lower_W[k] = lower_W.data()[k];
+  }
+  return grid;
+}
+
 void grid_distances(const Grid& grid, const Point& lower_W, const Point& upper_W, double voxel_size,
                     bool occupied_outside, const QueryPoints& p_WQ, const Distances& distances,
                     const std::optional<Gradients>& gradients) {
   const size_t count = p_WQ.shape(0);
   require(distances.size() == count && (!gradients || gradients->shape(0) == count),
           "points, distances and gradients differ in number");
-  require(voxel_size > 0.0, "voxels need a size");
-  VoxelGrid voxels{grid.data(), {}, {}, voxel_size};
-  for (int k = 0; k < 3; ++k) {
-    voxels.shape[k] = static_cast<int64_t>(grid.shape(k));
-    require(voxels.shape[k] >= 2, "a grid needs at least 2 voxels along each axis");
-    voxels.lower_W[k] = lower_W.data()[k];
-  }
+  const VoxelGrid voxels = voxel_grid(grid, lower_W, voxel_size);
   const double *lower = lower_W.data(), *upper = upper_W.data();
   for (size_t i = 0; i < count; ++i) {
     const double* p = p_WQ.data() + 3 * i;
@@ -121,19 +124,13 @@ void grid_distances(const Grid& grid, const Point& lower_W, const Point& upper_W
   }
 }
 
-struct Vector {
-  double x, y, z;
-
-  Vector operator-(const Vector& other) const { return {x - other.x, y - other.y, z - other.z}; }
-  Vector operator/(double s) const { return {x / s, y / s, z / s}; }
-  double length() const { return std::sqrt(x * x + y * y + z * z); }
-  // Zero stays zero.
-  Vector unit() const { return length() > 0.0 ? *this / length() : *this; }
-};
-
+double length(const Vector& a) { return std::sqrt(dot(a, a)); }
+Vector divided(const Vector& a, double s) { return {a.x / s, a.y / s, a.z / s}; }
+// Zero stays zero.
+Vector unit(const Vector& a) { return length(a) > 0.0 ? divided(a, length(a)) : a; }
 Vector vector(const Point& p) { return {p.data()[0], p.data()[1], p.data()[2]}; }
 
-// The gradient at a point brought between the outermost voxel centers.
+// The gradient at a point clamped to the outermost voxel centers.
 Vector gradient(const VoxelGrid& grid, const Vector& p_WQ) {
   double p[3] = {p_WQ.x, p_WQ.y, p_WQ.z};
   for (int k = 0; k < 3; ++k) {
@@ -146,39 +143,34 @@ Vector gradient(const VoxelGrid& grid, const Vector& p_WQ) {
 }
 
 size_t descend(const Grid& times, const Point& lower_W, double voxel_size, const Point& p_WG,
-               const Point& p_WQ, double step, double length, const WayPoints& way) {
-  require(voxel_size > 0.0 && step > 0.0, "voxels and steps need a size");
-  VoxelGrid grid{times.data(), {}, {}, voxel_size};
-  for (int k = 0; k < 3; ++k) {
-    grid.shape[k] = static_cast<int64_t>(times.shape(k));
-    require(grid.shape[k] >= 2, "a grid needs at least 2 voxels along each axis");
-    grid.lower_W[k] = lower_W.data()[k];
-  }
+               const Point& p_WQ, double step, double max_length, const PathRows& path) {
+  require(step > 0.0, "step must be > 0");
+  const VoxelGrid grid = voxel_grid(times, lower_W, voxel_size);
   const Vector goal = vector(p_WG);
   Vector p = vector(p_WQ), direction = {0.0, 0.0, 0.0};
   double covered = 0.0;
-  for (size_t count = 0; count < way.shape(0); ++count) {
+  for (size_t count = 0; count < path.shape(0); ++count) {
     const double row[4] = {p.x, p.y, p.z, covered};
-    std::copy_n(row, 4, way.data() + 4 * count);
+    std::copy_n(row, 4, path.data() + 4 * count);
     const Vector to_goal = goal - p;
-    const double distance = to_goal.length();
-    if (!(covered < length) || distance < 1e-9) return count + 1;
+    const double distance = length(to_goal);
+    if (!(covered < max_length) || distance < 1e-9) return count + 1;
     // The mean with the last direction: plain steepest descent zigzags in a valley.
-    direction =
-        distance < 2.0 * step ? to_goal / distance : (direction - gradient(grid, p).unit()).unit();
+    direction = distance < 2.0 * step ? divided(to_goal, distance)
+                                      : unit(direction - unit(gradient(grid, p)));
     const double stride = std::min(step, distance);
-    p = {p.x + stride * direction.x, p.y + stride * direction.y, p.z + stride * direction.z};
+    p = p + stride * direction;
     covered += stride;
   }
-  return way.shape(0);
+  return path.shape(0);
 }
 
 }  // namespace
 
 void bind_grids(nb::module_& m) {
-  nb::class_<GridWorlds>(m, "GridWorlds", "Regular grids of several worlds, one of each.")
-      .def(nb::init<const Floats<nb::ndim<1>>&, const GridShapes&, const Points&,
-                    const Floats<nb::ndim<1>>&, int, const std::string&>(),
+  nb::class_<GridWorlds>(m, "GridWorlds", "Regular grids, one per world.")
+      .def(nb::init<const Values&, const GridShapes&, const Points&, const Values&, int,
+                    const std::string&>(),
            nb::kw_only(), "values"_a, "shapes"_a, "lower_W"_a, "voxel_sizes"_a, "threads"_a = 1,
            "simd"_a = "", "The values of all grids, one after another.")
       .def("__len__", &GridWorlds::size)
@@ -193,9 +185,9 @@ void bind_grids(nb::module_& m) {
         "voxels the trilinear interpolant of the grid; outside, minus the distance to the box, or\n"
         "NaN with a gradient of zero.");
   m.def("descend", &descend, nb::kw_only(), "times"_a, "lower_W"_a, "voxel_size"_a, "p_WG"_a,
-        "p_WQ"_a, "step"_a, "length"_a, "way"_a,
+        "p_WQ"_a, "step"_a, "length"_a, "path"_a,
         "Writes points and the length up to them, rows (4,), down the gradient of `times` from\n"
-        "p_WQ to p_WG or until `length` is covered; returns how many.");
+        "p_WQ to p_WG or until `length` is covered; returns their number.");
 }
 
 }  // namespace splatpilot

@@ -1,5 +1,5 @@
-// Python bindings. Arguments are checked in Python, where errors can name tensors; here only what
-// memory safety needs is checked again.
+// Python bindings of the renderer of Gaussians. Python checks arguments and names tensors in
+// errors; the checks here only keep memory safe.
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/tuple.h>
@@ -11,17 +11,55 @@
 
 #include "bindings/bindings.hpp"
 #include "core/dispatch.hpp"
+#include "project/baked_scene.hpp"
 
 namespace splatpilot {
-
 namespace {
 
-using namespace nb::literals;
+// A frame as Python holds it, immutable.
+struct RenderedFrame {
+  std::shared_ptr<const Frame> frame;
+  size_t splat_count;
 
-// What gsplat calls meta, for the splats of a frame, in the order of the input. Opacities are the
-// rows of `given`, or without it those that the splats had.
+  explicit RenderedFrame(std::shared_ptr<const Frame> rendered)
+      : frame(std::move(rendered)), splat_count(frame->splat_count()) {}
+};
+
+void init_camera(CameraParameters* self, const Doubles<nb::shape<3, 3>>& K,
+                 const Doubles<nb::shape<4, 4>>& X_CW, int width, int height, double near_plane,
+                 double far_plane, double radius_clip, double eps2d, bool antialiased,
+                 double max_depth, int distortion,
+                 const std::optional<Doubles<nb::shape<13>>>& lens) {
+  require(width > 0 && height > 0 && width <= 32768 && height <= 32768,
+          "the image size must be in [1, 32768] px");
+  CameraParameters p{};
+  p.width = width;
+  p.height = height;
+  p.near_plane = near_plane;
+  p.far_plane = far_plane;
+  p.radius_clip = radius_clip;
+  p.eps2d = eps2d;
+  p.antialiased = antialiased;
+  p.max_depth = max_depth;
+  std::copy_n(K.data(), 9, p.K);
+  std::copy_n(X_CW.data(), 16, p.X_CW);
+  if (lens) {
+    require(distortion >= 0 && distortion <= 2, "no such distortion");
+    const double* n = lens->data();
+    p.distortion.model = static_cast<DistortionModel>(distortion);
+    std::copy_n(n, 6, p.distortion.radial);
+    std::copy_n(n + 6, 2, p.distortion.tangential);
+    p.distortion.max_squared_slope = static_cast<float>(n[8]);
+    std::copy_n(n + 9, 2, p.min_slope);
+    std::copy_n(n + 11, 2, p.max_slope);
+  }
+  new (self) CameraParameters(p);
+}
+
+// gsplat's meta, for the splats of a frame, in the order of the input. Opacities are rows of
+// `given`, or those of the splats.
 auto projected(Renderer& renderer, const RenderedFrame& rendered,
-               const std::optional<Opacities>& given) {
+               const std::optional<Values>& given) {
   require(!given || given->size() == rendered.frame->gaussians,
           "these are not the Gaussians of the frame");
   const size_t n = rendered.splat_count;
@@ -33,8 +71,8 @@ auto projected(Renderer& renderer, const RenderedFrame& rendered,
   const auto opacities = new_array<float, -1>(n);
   const auto write = [&](size_t i, const Splat& s) {
     ids.data()[i] = s.index;
-    radii.data()[2 * i] = radius_of(s.extent_x);
-    radii.data()[2 * i + 1] = radius_of(s.extent_y);
+    radii.data()[2 * i] = radius(s.extent_x);
+    radii.data()[2 * i + 1] = radius(s.extent_y);
     means.data()[2 * i] = s.mean_x;
     means.data()[2 * i + 1] = s.mean_y;
     depths.data()[i] = s.depth;
@@ -51,38 +89,66 @@ auto projected(Renderer& renderer, const RenderedFrame& rendered,
   return std::make_tuple(ids, radii, means, depths, conics, opacities);
 }
 
-RenderedFrame render(Renderer& renderer, const Means& means, const Quats& quats,
-                     const Means& scales, const Opacities& opacities, const Colors& colors,
-                     int sh_degree, const Intrinsics& K, const Pose& X_CW, int width, int height,
-                     double near_plane, double far_plane, double radius_clip, double eps2d,
-                     bool antialiased, DepthMode depth_mode, const Floats<nb::shape<3>>& background,
-                     const Output& image, const Output& alpha, bool keep) {
-  const GaussianArrays gaussians =
-      gaussian_arrays(means, quats, scales, opacities, colors, sh_degree);
-  CameraParameters parameters =
-      camera_parameters(K, X_CW, width, height, near_plane, far_plane, radius_clip, eps2d);
-  parameters.antialiased = antialiased;
-  const Camera camera = make_camera(parameters);
-  const Image out = output_image(image, alpha, camera, depth_mode, background);
-  const Exclusive use(renderer);
-  return RenderedFrame(renderer.render(gaussians, camera, out, keep));
+// Checks images of color (3 channels), depth (1) or both (4) and their alpha; returns the channels.
+template <typename Image>
+size_t check_images(const Image& image, const Image& alpha, int height, int width) {
+  const size_t channels = image.shape(2);
+  require(channels == 1 || channels == 3 || channels == 4, "an image has 1, 3 or 4 channels");
+  check_size(image, height, width, channels);
+  check_size(alpha, height, width, 1);
+  return channels;
 }
 
-size_t raster_backward(Renderer& renderer, const RenderedFrame& rendered, const Pixels& v_image,
-                       const Pixels& v_alpha, const Pixels& image, const Pixels& alpha,
-                       const Floats<nb::shape<3>>& background, bool expected_depth,
-                       const Writable<nb::shape<-1, 16>>& v_splats,
-                       const Writable<nb::shape<-1, 2>>& v_means2d) {
+RenderedFrame render(Renderer& renderer, const Gaussians& gaussians,
+                     const CameraParameters& parameters, DepthMode depth_mode,
+                     const Background& background, const Output& image, const Output& alpha,
+                     bool keep) {
+  const size_t channels = check_images(image, alpha, parameters.height, parameters.width);
+  Image out{};
+  if (channels >= 3) out.color = image.data();
+  if (channels != 3) out.depth = image.data() + channels - 1;
+  out.color_stride = out.depth_stride = static_cast<int>(channels);
+  out.depth_mode = depth_mode;
+  out.alpha = alpha.data();
+  std::copy_n(background.data(), 3, out.background);
+  const Exclusive use(renderer);
+  return RenderedFrame(renderer.render(gaussians.arrays(), make_camera(parameters), out, keep));
+}
+
+void render_baked(const BakedScene& scene, Renderer& renderer, const Gaussians& moving,
+                  const CameraParameters& given, const Background& background,
+                  const std::optional<Output>& color, const Output& depth,
+                  const std::optional<Output>& alpha) {
+  require(color.has_value() == alpha.has_value(), "color and alpha are rendered together");
+  CameraParameters parameters = given;
+  const int height = parameters.height, width = parameters.width;
+  if (!color) parameters.eps2d = kDepthBlur;
+  Camera camera = make_camera(parameters);
+  camera.depth_alone = !color;
+  check_size(depth, height, width, 1);
+  Image out{nullptr, 3, depth.data(), 1, DepthMode::kMedian, nullptr, {}};
+  if (color) {
+    check_size(*color, height, width, 3);
+    check_size(*alpha, height, width, 1);
+    out.color = color->data();
+    out.alpha = alpha->data();
+    std::copy_n(background.data(), 3, out.background);
+  }
+  const Exclusive use(renderer);
+  renderer.render(scene.arrays(), moving.arrays(), camera, out);
+}
+
+void raster_backward(Renderer& renderer, const RenderedFrame& rendered, const Pixels& v_image,
+                     const Pixels& v_alpha, const Pixels& image, const Pixels& alpha,
+                     const Background& background, bool expected_depth,
+                     const Writable<nb::shape<-1, 16>>& v_splats,
+                     const Writable<nb::shape<-1, 2>>& v_means2d) {
   const Frame& frame = *rendered.frame;
   require(frame.kept, "the frame was not kept for a backward pass");
-  const size_t channels = v_image.shape(2);
-  require(channels == 1 || channels == 3 || channels == 4, "an image has 1, 3 or 4 channels");
-  check_size(v_image, frame.camera, channels);
-  check_size(image, frame.camera, channels);
-  check_size(v_alpha, frame.camera, 1);
-  check_size(alpha, frame.camera, 1);
-  require(v_splats.shape(0) == rendered.splat_count && v_means2d.shape(0) == rendered.splat_count,
-          "one row of gradients a splat is needed");
+  const size_t channels = check_images(v_image, v_alpha, frame.camera.height, frame.camera.width);
+  check_size(image, frame.camera.height, frame.camera.width, channels);
+  check_size(alpha, frame.camera.height, frame.camera.width, 1);
+  require_rows(rendered.splat_count, "splats and gradients differ in number", v_splats, v_means2d);
   ImageGradient g{};
   if (channels >= 3) g.color = v_image.data();
   if (channels != 3) g.depth = v_image.data() + channels - 1;
@@ -91,36 +157,24 @@ size_t raster_backward(Renderer& renderer, const RenderedFrame& rendered, const 
   g.alpha = v_alpha.data();
   g.rendered_alpha = alpha.data();
   std::copy_n(background.data(), 3, g.background);
-
-  const nb::gil_scoped_release release;
-  const std::scoped_lock lock(renderer.mutex());
-  return renderer.raster_backward(frame, g, reinterpret_cast<SplatGradient*>(v_splats.data()),
-                                  v_means2d.data());
+  const Exclusive use(renderer);
+  renderer.raster_backward(frame, g, reinterpret_cast<SplatGradient*>(v_splats.data()),
+                           v_means2d.data());
 }
 
-OwnedArray<double, 5, 3> project_backward(
-    Renderer& renderer, const RenderedFrame& rendered, const Means& means, const Quats& quats,
-    const Means& scales, const Opacities& opacities, const Colors& colors, int sh_degree,
-    const Floats<nb::shape<-1, 16>>& v_splats, const Floats<nb::shape<-1, 2>>& v_means2d,
-    const Rows3& v_means, const Rows4& v_quats, const Rows3& v_scales,
-    const Writable<nb::ndim<1>>& v_opacities, const ColorRows& v_colors, bool overwrite,
-    bool overwrite_colors) {
-  const Frame& frame = *rendered.frame;
-  require(frame.kept, "the frame was not kept for a backward pass");
-  const GaussianArrays gaussians =
-      gaussian_arrays(means, quats, scales, opacities, colors, sh_degree);
-  require(gaussians.count == frame.gaussians, "these are not the Gaussians of the frame");
-  require(v_splats.shape(0) == rendered.splat_count && v_means2d.shape(0) == rendered.splat_count,
-          "one row of gradients a splat is needed");
-  require_rows(gaussians, v_means, v_quats, v_scales, v_opacities, v_colors);
+OwnedArray<double, 5, 3> project_backward(Renderer& renderer, const RenderedFrame& rendered,
+                                          const Gaussians& gaussians, const GradientRows& gradients,
+                                          const Floats<nb::shape<-1, 16>>& v_splats,
+                                          const Floats<nb::shape<-1, 2>>& v_means2d) {
+  check_frame(*rendered.frame, gaussians.arrays());
+  require_rows(rendered.splat_count, "splats and gradients differ in number", v_splats, v_means2d);
+  const GaussianGradients out = gradients.arrays(gaussians.arrays());
   PoseSums sums;
   {
-    const nb::gil_scoped_release release;
-    const std::scoped_lock lock(renderer.mutex());
-    sums = renderer.project_backward(
-        frame, gaussians, reinterpret_cast<const SplatGradient*>(v_splats.data()), v_means2d.data(),
-        {v_means.data(), v_quats.data(), v_scales.data(), v_opacities.data(), v_colors.data(),
-         overwrite, overwrite_colors});
+    const Exclusive use(renderer);
+    sums = renderer.project_backward(*rendered.frame, gaussians.arrays(),
+                                     reinterpret_cast<const SplatGradient*>(v_splats.data()),
+                                     v_means2d.data(), out);
   }
   return pose_rows(sums);
 }
@@ -131,88 +185,83 @@ NB_MODULE(_native, m) {
   m.doc() = "Splat kernels for CPUs.";
   // Autograd graphs may hold frames until the interpreter ends, which is no leak.
   nb::set_leak_warnings(false);
-  m.def("simd_levels", &simd_levels,
-        "Names of the SIMD levels this machine can run, widest first.");
-  m.def(
-      "first_nonfinite",
-      [](const Renderer& renderer, const Floats<nb::ndim<1>>& values) -> int64_t {
-        const size_t i = renderer.kernels().first_nonfinite(values.data(), values.size());
-        return i < values.size() ? static_cast<int64_t>(i) : -1;
-      },
-      "renderer"_a, "values"_a, "Index of the first NaN or infinity, or -1.");
+  m.def("simd_levels", &simd_levels, "SIMD levels that this machine can run, widest first.");
 
-  m.def(
-      "scene_is_valid",
-      [](Renderer& renderer, const Means& means, const Quats& quats, const Means& scales,
-         const Opacities& opacities, const Floats<nb::ndim<1>>& colors) {
-        const size_t n = means.shape(0);
-        require(quats.shape(0) == n && scales.shape(0) == n && opacities.shape(0) == n,
-                "arrays of Gaussians differ in length");
-        const GaussianArrays gaussians{
-            n, means.data(), quats.data(), scales.data(), opacities.data(), colors.data(), -1, 1};
-        const Exclusive use(renderer);
-        return renderer.are_valid(gaussians, colors.size());
-      },
-      "renderer"_a, nb::kw_only(), "means"_a, "quats"_a, "scales"_a, "opacities"_a, "colors"_a,
-      "Whether every number can be rendered; may be false for scales below 1.2e-38.");
-
-  m.def(
-      "first_zero_quaternion",
-      [](const Quats& quats) -> int64_t {
-        for (size_t i = 0; i < quats.shape(0); ++i) {
-          const float* q = quats.data() + 4 * i;
-          const float squared = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3];
-          if (!(squared >= kMinSquaredNorm && squared <= kMaxSquaredNorm)) {
-            return static_cast<int64_t>(i);
-          }
-        }
-        return -1;
-      },
-      "quats"_a, "Index of the first quaternion too short or too long to be normalized, or -1.");
-
-  nb::enum_<DepthMode>(m, "DepthMode", "What the depth of a pixel is.")
+  nb::enum_<DepthMode>(m, "DepthMode", "Depth of a pixel.")
       .value("ACCUMULATED", DepthMode::kAccumulated, "sum w z")
       .value("EXPECTED", DepthMode::kExpected, "sum w z / sum w")
       .value("MEDIAN", DepthMode::kMedian,
-             "z where what footprints without blur let through falls below one half, else 0");
-  nb::class_<RenderedFrame>(m, "Frame", "What remains of a rendered image.")
-      .def_ro("splat_count", &RenderedFrame::splat_count, "Gaussians that were visible.")
-      .def_prop_ro(
-          "pair_count", [](const RenderedFrame& r) { return r.frame->pairs.size(); },
-          "Pairs of a Gaussian and a tile that it touches.");
-
-  nb::class_<Renderer>(m, "Renderer",
-                       "Threads and scratch memory, which have no influence on what is rendered.")
+             "z where the transmittance of footprints without blur falls below one half, else 0");
+  nb::class_<Renderer>(m, "Renderer", "Threads and scratch memory without influence on images.")
       .def(
           "__init__",
           [](Renderer* self, int threads, const std::string& simd) {
-            require(threads >= 1 && threads <= 1024, "threads must lie between 1 and 1024");
-            new (self) Renderer(threads, simd);
+            new (self) Renderer(checked_threads(threads), simd);
           },
           "threads"_a, "simd"_a = "")
       .def_prop_ro("simd", [](const Renderer& r) { return std::string(r.kernels().name); });
+  nb::class_<Gaussians>(m, "Gaussians", "Gaussians or surfels; colors are (N, K, 3).")
+      .def(nb::init<Rows3, Rows4, Rows3, Values, Colors, int>(), nb::kw_only(), "means"_a,
+           "quats"_a, "scales"_a, "opacities"_a, "colors"_a, "sh_degree"_a,
+           "sh_degree -1: colors are given, K = 1.")
+      .def(
+          "are_valid",
+          [](const Gaussians& gaussians, Renderer& renderer) {
+            const Exclusive use(renderer);
+            return renderer.are_valid(gaussians.arrays());
+          },
+          "renderer"_a, "Checks that every number can be rendered; subnormal scales may fail.");
+  nb::class_<GradientRows>(m, "GaussianGradients", "Gradients of `Gaussians`, to be added to.")
+      .def(nb::init<Rows3Out, Rows4Out, Rows3Out, ValuesOut, ColorsOut, bool, bool>(),
+           nb::kw_only(), "means"_a, "quats"_a, "scales"_a, "opacities"_a, "colors"_a,
+           "overwrite"_a, "overwrite_colors"_a, "Those to overwrite need no values.");
+  nb::class_<CameraParameters>(m, "Camera", "A pinhole camera or one with a lens.")
+      .def("__init__", &init_camera, nb::kw_only(), "K"_a, "X_CW"_a, "width"_a, "height"_a,
+           "near_plane"_a, "far_plane"_a, "radius_clip"_a = 0.0, "eps2d"_a = 0.0,
+           "antialiased"_a = false, "max_depth"_a = std::numeric_limits<double>::infinity(),
+           "distortion"_a = 0, "lens"_a = nb::none());
+  nb::class_<RenderedFrame>(m, "Frame", "A rendered image, for its backward pass.")
+      .def_ro("splat_count", &RenderedFrame::splat_count, "Number of visible Gaussians.");
   m.def("projected", &projected, "renderer"_a, "frame"_a, "opacities"_a.none(),
         "ids (n,), radii (n, 2), means (n, 2), depths (n,), conics (n, 3) and opacities (n,) of\n"
         "a frame's splats.");
-  m.def("render", &render, "renderer"_a, nb::kw_only(), "means"_a, "quats"_a, "scales"_a,
-        "opacities"_a, "colors"_a, "sh_degree"_a, "K"_a, "X_CW"_a, "width"_a, "height"_a,
-        "near_plane"_a, "far_plane"_a, "radius_clip"_a, "eps2d"_a, "antialiased"_a, "depth_mode"_a,
+  m.def("render", &render, "renderer"_a, "gaussians"_a, "camera"_a, nb::kw_only(), "depth_mode"_a,
         "background"_a, "image"_a, "alpha"_a, "keep"_a,
         "Writes color (3 channels), depth (1) or both (4) by the shape of image, and alpha. With\n"
         "keep, a backward pass can start from the frame.");
   m.def("raster_backward", &raster_backward, "renderer"_a, "frame"_a, nb::kw_only(), "v_image"_a,
         "v_alpha"_a, "image"_a, "alpha"_a, "background"_a, "expected_depth"_a, "v_splats"_a,
         "v_means2d"_a,
-        "Writes the gradients of a frame's splats; returns how many (Gaussian, 4x4 block) were\n"
-        "composited. v_image etc. are derivatives of the loss by image etc.");
-  m.def("project_backward", &project_backward, "renderer"_a, "frame"_a, nb::kw_only(), "means"_a,
-        "quats"_a, "scales"_a, "opacities"_a, "colors"_a, "sh_degree"_a, "v_splats"_a,
-        "v_means2d"_a, "v_means"_a, "v_quats"_a, "v_scales"_a, "v_opacities"_a, "v_colors"_a,
-        "overwrite"_a, "overwrite_colors"_a,
-        "Adds to, or overwrites, the gradients of the frame's Gaussians. Returns (5, 3) those by\n"
-        "R_CW with the camera's center held, by p_C and by p_W - center, summed over Gaussians.");
+        "Writes the gradients of a frame's splats. v_image etc. are derivatives of the loss by\n"
+        "image etc.");
+  m.def("project_backward", &project_backward, "renderer"_a, "frame"_a, "gaussians"_a,
+        "gradients"_a, nb::kw_only(), "v_splats"_a, "v_means2d"_a,
+        "Writes the gradients of the frame's Gaussians. Returns (5, 3) those by R_CW with the\n"
+        "camera's center fixed, by p_C and by p_W - center, summed over Gaussians.");
 
-  bind_baked(m);
+  nb::class_<BakedScene>(m, "BakedScene", "A static scene in the order and form of frames.")
+      .def(
+          "__init__",
+          [](BakedScene* self, const Gaussians& gaussians) {
+            require(gaussians.arrays().sh_degree >= 0, "a baked scene has spherical harmonics");
+            new (self) BakedScene(gaussians.arrays());
+          },
+          "gaussians"_a)
+      .def_prop_ro("count", &BakedScene::count)
+      .def(
+          "recolored",
+          [](const BakedScene& scene, const Colors& sh, int sh_degree) {
+            require_rows(scene.count(), "colors and Gaussians differ in number", sh);
+            require(sh_degree >= 0, "a baked scene has spherical harmonics");
+            require_degree(sh_degree, sh.shape(1));
+            return BakedScene(scene, sh.data(), static_cast<int>(sh.shape(1)), sh_degree);
+          },
+          "sh"_a, "sh_degree"_a, "The same Gaussians in other colors.");
+  m.def("render_baked", &render_baked, "scene"_a, "renderer"_a, "moving"_a, "camera"_a,
+        nb::kw_only(), "background"_a, "color"_a.none(), "depth"_a, "alpha"_a.none(),
+        "Writes the median depth, and unless they are None color and alpha, of the scene and of\n"
+        "moving Gaussians among it.");
+
   bind_surfels(m);
   bind_fitting(m);
   bind_shapes(m);

@@ -1,4 +1,4 @@
-// Python bindings of worlds of analytic shapes, and of one in double precision.
+// Python bindings of worlds of analytic shapes, and of their distance field in double precision.
 #include <nanobind/stl/optional.h>
 
 #include <cstdint>
@@ -14,15 +14,11 @@
 namespace splatpilot {
 namespace {
 
-using namespace nb::literals;
 using Rows = Floats<nb::shape<-1, kShapeSize>>;
 using DoubleRows = Doubles<nb::shape<-1, kShapeSize>>;
-using QueryPoints = Doubles<nb::shape<-1, 3>>;
-using Distances = nb::ndarray<double, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
-using Gradients = nb::ndarray<double, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
-using Kinds = nb::ndarray<const uint8_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+using Kinds = Array<const uint8_t, nb::ndim<1>>;
 
-// Center and half size along each axis of what encloses a body, a little more than needed.
+// Center and half size along each axis of a body's bounding box, enlarged for rounding.
 void bound(uint8_t kind, const float* s, float* center, float* half) {
   for (int k = 0; k < 3; ++k) {
     const float axis = s[3 + k];
@@ -45,11 +41,11 @@ void bound(uint8_t kind, const float* s, float* center, float* half) {
 
 class ShapeWorlds : Casting {
  public:
-  ShapeWorlds(const Rows& shapes, const Kinds& kinds, const Numbers& first, int threads,
+  ShapeWorlds(const Rows& shapes, const Kinds& kinds, const Indices& first, int threads,
               const std::string& simd)
       : Casting(threads, simd) {
     const size_t count = shapes.shape(0);
-    require(kinds.size() == count, "the kinds of shapes differ in number from the shapes");
+    require_rows(count, "shapes and kinds differ in number", kinds);
     require(first.size() > 0 && first.data()[0] == 0 &&
                 first.data()[first.size() - 1] == static_cast<int64_t>(count),
             "the first shapes of worlds must begin with 0 and end with the number of shapes");
@@ -63,19 +59,19 @@ class ShapeWorlds : Casting {
 
   size_t size() const { return worlds_.size(); }
 
-  void depth(const Points& p, const Rotations& R, const Numbers& world, const Points& directions,
+  void depth(const Points& p, const Rotations& R, const Indices& world, const Points& directions,
              float half_pixel, const DepthRows& depth) {
-    for_each_camera(p, R, world, size(), directions, half_pixel, depth, most_bodies_,
+    for_each_camera(p, R, world, size(), directions, half_pixel, depth, max_bodies_,
                     [this](size_t w, auto&&... rest) { kernels_.cast_shapes(view(w), rest...); });
   }
 
-  void nearest(const Points& p, const Numbers& world, const DepthRows& values,
+  void nearest(const Points& p, const Indices& world, const DepthRows& values,
                const Output& gradients) {
     const size_t n = p.shape(0), count = values.shape(1);
     require(values.shape(0) == n && gradients.shape(0) == n && gradients.shape(1) == count &&
                 gradients.shape(2) == 3,
             "points, values and gradients differ in shape");
-    require(count >= 1 && count <= kMostNearest, "1 to 16 nearest shapes can be asked for");
+    require(count >= 1 && count <= kMaxNearest, "the number of nearest shapes must be in [1, 16]");
     require_worlds(world, n, size());
     const nb::gil_scoped_release release;
     for (size_t i = 0; i < n; ++i) {
@@ -94,7 +90,7 @@ class ShapeWorlds : Casting {
     for (size_t i = begin; i < end; ++i) {
       const float* s = shapes.data() + i * kShapeSize;
       const uint8_t kind = kinds.data()[i];
-      require(kind < kShapeKinds, "a shape is of no known kind");
+      require(kind < kShapeKinds, "unknown kind of shape");
       require(std::all_of(s, s + kShapeSize, [](float x) { return std::isfinite(x); }),
               "the numbers of a shape must be finite");
       std::vector<float>& rows = kind == kHalfSpace ? half_spaces_ : bodies_;
@@ -116,7 +112,7 @@ class ShapeWorlds : Casting {
         bounds_[r.bounds + (k + 3) * r.stride + i] = half[k];
       }
     }
-    most_bodies_ = std::max(most_bodies_, r.body_count);
+    max_bodies_ = std::max(max_bodies_, r.body_count);
     worlds_.push_back(r);
   }
 
@@ -134,19 +130,19 @@ class ShapeWorlds : Casting {
   std::vector<float> bodies_, half_spaces_, bounds_;
   std::vector<uint8_t> kinds_;
   std::vector<Range> worlds_;
-  size_t most_bodies_ = 0;
+  size_t max_bodies_ = 0;
 };
 
-constexpr size_t kNone = SIZE_MAX;  // in place of a shape
-constexpr size_t kBatch = 512;      // of points, which share their candidates for the nearest shape
+constexpr size_t kNone = SIZE_MAX;  // no shape
+constexpr size_t kBatch = 512;      // of points that share candidates for the nearest shape
 
 class ShapeField {
  public:
   ShapeField(const DoubleRows& shapes, const Kinds& kinds)
       : rows_(shapes.data(), shapes.data() + shapes.size()),
         kinds_(kinds.data(), kinds.data() + kinds.size()) {
-    require(kinds.size() == shapes.shape(0), "the kinds of shapes differ in number from them");
-    for (const uint8_t kind : kinds_) require(kind < kShapeKinds, "a shape is of no known kind");
+    require_rows(shapes.shape(0), "shapes and kinds differ in number", kinds);
+    for (const uint8_t kind : kinds_) require(kind < kShapeKinds, "unknown kind of shape");
   }
 
   void nearest(const QueryPoints& p, const Distances& distances,
@@ -181,7 +177,7 @@ class ShapeField {
   }
 
   // Distances are 1-Lipschitz: within R of a center c the nearest shape is at most min d(c) + R
-  // away, so a shape with d(c) > min d(c) + 2 R is nowhere the nearest.
+  // away, so a shape with d(c) > min d(c) + 2 R is never the nearest.
   void nearest_of_batch(const double* p, size_t count, double* distances, size_t* shapes,
                         std::vector<double>& at_center) const {
     double lower[3], upper[3], center[3], span[3];
@@ -194,12 +190,12 @@ class ShapeField {
       center[k] = 0.5 * (lower[k] + upper[k]);
       span[k] = upper[k] - lower[k];
     }
-    double least = std::numeric_limits<double>::infinity();
+    double min_distance = std::numeric_limits<double>::infinity();
     for (size_t shape = 0; shape < kinds_.size(); ++shape) {
       at_center[shape] = distance(shape, center);
-      least = std::min(least, at_center[shape]);
+      min_distance = std::min(min_distance, at_center[shape]);
     }
-    const double limit = least + SIMD_LEVEL::length(span) + 1e-9;
+    const double limit = min_distance + SIMD_LEVEL::length(span) + 1e-9;
     std::fill_n(distances, count, std::numeric_limits<double>::infinity());
     std::fill_n(shapes, count, kNone);
     for (size_t shape = 0; shape < kinds_.size(); ++shape) {
@@ -222,7 +218,7 @@ class ShapeField {
 
 void bind_shapes(nb::module_& m) {
   nb::class_<ShapeWorlds>(m, "ShapeWorlds", "The analytic shapes of several worlds.")
-      .def(nb::init<const Rows&, const Kinds&, const Numbers&, int, const std::string&>(),
+      .def(nb::init<const Rows&, const Kinds&, const Indices&, int, const std::string&>(),
            nb::kw_only(), "shapes"_a, "kinds"_a, "first"_a, "threads"_a = 1, "simd"_a = "",
            "World w has the rows first[w] to first[w + 1]. A row holds, by its kind: 0 center and\n"
            "radius of a sphere; 1 end, axis, length and radius of a capsule; 2 center, axis, half\n"
@@ -240,7 +236,7 @@ void bind_shapes(nb::module_& m) {
       .def("nearest", &ShapeField::nearest, nb::kw_only(), "p_WQ"_a, "distances"_a,
            "gradients"_a = nb::none(),
            "Writes the signed distances (N,) of N points to the nearest shape and their gradients\n"
-           "(N, 3); infinite and zero where there is no shape.");
+           "(N, 3); infinite and zero without shapes.");
 }
 
 }  // namespace splatpilot

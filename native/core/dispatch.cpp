@@ -2,10 +2,6 @@
 
 #include <stdexcept>
 
-#if defined(__x86_64__)
-#include <cpuid.h>
-#endif
-
 namespace splatpilot {
 #if defined(__x86_64__)
 namespace v2 {
@@ -25,31 +21,13 @@ extern const Kernels kKernels;
 
 namespace {
 
-#if defined(__x86_64__)
-// Of leaves 1 and 0x80000001, in ECX: LZCNT, MOVBE, F16C, which not every compiler's
-// __builtin_cpu_supports knows by name.
-bool has_v3_extras() {
-  unsigned a, b, c, d;
-  const bool basic = __get_cpuid(1, &a, &b, &c, &d) && (c & bit_MOVBE) && (c & bit_F16C);
-  return basic && __get_cpuid(0x80000001, &a, &b, &c, &d) && (c & (1u << 5));
-}
-#endif
-
-// A level needs every extension that its -march lets the compiler use.
 std::vector<const Kernels*> usable_kernels() {
   std::vector<const Kernels*> usable;
 #if defined(__x86_64__)
   __builtin_cpu_init();
-  const bool v2 = __builtin_cpu_supports("sse4.2") && __builtin_cpu_supports("popcnt");
-  const bool v3 = v2 && has_v3_extras() && __builtin_cpu_supports("avx2") &&
-                  __builtin_cpu_supports("fma") && __builtin_cpu_supports("bmi") &&
-                  __builtin_cpu_supports("bmi2");
-  const bool v4 = v3 && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
-                  __builtin_cpu_supports("avx512cd") && __builtin_cpu_supports("avx512dq") &&
-                  __builtin_cpu_supports("avx512vl");
-  if (v4) usable.push_back(&v4::kKernels);
-  if (v3) usable.push_back(&v3::kKernels);
-  if (v2) usable.push_back(&v2::kKernels);
+  if (__builtin_cpu_supports("x86-64-v4")) usable.push_back(&v4::kKernels);
+  if (__builtin_cpu_supports("x86-64-v3")) usable.push_back(&v3::kKernels);
+  if (__builtin_cpu_supports("x86-64-v2")) usable.push_back(&v2::kKernels);
 #else
   usable.push_back(&generic::kKernels);
 #endif

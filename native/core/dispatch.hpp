@@ -1,4 +1,4 @@
-// Which SIMD level runs on this machine.
+// The SIMD levels of this machine.
 #pragma once
 
 #include <string>
@@ -11,8 +11,7 @@ namespace splatpilot {
 // Names of the levels that this machine can run, widest first.
 std::vector<std::string> simd_levels();
 
-// The kernels of a level; the widest when the name is empty. Throws std::invalid_argument for a
-// level that is unknown or that this machine cannot run.
+// The kernels of a level; the widest if the name is empty. Throws std::invalid_argument for others.
 const Kernels& kernels(const std::string& level);
 
 }  // namespace splatpilot

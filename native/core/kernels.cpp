@@ -1,26 +1,10 @@
 // The kernels of one SIMD level; compiled once per level with SIMD_LEVEL set to its name.
 #include "backward/projection_backward.hpp"
 #include "backward/raster_backward.hpp"
-#include "project/project_arrays.hpp"
-#include "project/project_baked.hpp"
+#include "project/project_gaussians.hpp"
 #include "raster/tiles.hpp"
 
 namespace splatpilot::SIMD_LEVEL {
-
-static size_t first_nonfinite(const float* values, size_t count) {
-  size_t i = 0;
-  constexpr size_t kStride = 64 * kLanes;
-  for (; i + kStride <= count; i += kStride) {
-    // v * 0 is 0 for finite v and NaN otherwise, and NaN stays in a sum.
-    F16 sum = F16(0.0f);
-    for (size_t k = 0; k < kStride; k += kLanes) sum += load(values + i + k) * F16(0.0f);
-    if (lane_bits(sum >= F16(0.0f)) != 0xffff) break;
-  }
-  for (; i < count; ++i) {
-    if (!__builtin_isfinite(values[i])) return i;
-  }
-  return count;
-}
 
 static bool all_within(const float* values, size_t count, float low, float high) {
   uint32_t bits = 0xffff;
@@ -48,15 +32,22 @@ static bool all_normalizable(const float* quats, size_t count) {
 extern const SurfelKernels kSurfelKernels;
 extern const LossKernels kLossKernels;
 extern const CastingKernels kCastingKernels;
-extern const FittingKernels kFittingKernels;
 
 #define SP_STRING_OF(name) #name
 #define SP_STRING(name) SP_STRING_OF(name)
 extern const Kernels kKernels;
-const Kernels kKernels = {
-    SP_STRING(SIMD_LEVEL), &kSurfelKernels,      &kLossKernels,    &kCastingKernels,
-    &kFittingKernels,      project_arrays,       project_baked,    bin_footprints<SplatFootprint>,
-    raster_tile,           raster_tile_backward, gather_gradients, project_backward,
-    first_nonfinite,       all_within,           all_normalizable};
+const Kernels kKernels = {SP_STRING(SIMD_LEVEL),
+                          &kSurfelKernels,
+                          &kLossKernels,
+                          &kCastingKernels,
+                          project_arrays,
+                          project_baked,
+                          bin_footprints<SplatFootprint>,
+                          raster_tile,
+                          raster_tile_backward,
+                          sum_pairs,
+                          project_backward,
+                          all_within,
+                          all_normalizable};
 
 }  // namespace splatpilot::SIMD_LEVEL

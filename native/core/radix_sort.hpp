@@ -15,7 +15,7 @@ struct KeyValue {
   uint32_t value;
 };
 
-// Sorts `items` by key, keeping the order of equal keys; `scratch` is resized as needed.
+// Sorts `items` by key, stably; `scratch` is resized as needed.
 template <typename Key>
 void radix_sort(std::vector<KeyValue<Key>>& items, std::vector<KeyValue<Key>>& scratch) {
   if (items.empty()) return;

@@ -18,7 +18,7 @@ void pause() {
 #endif
 }
 
-// Waits until `value` is no longer `old`; returns what it is.
+// Waits until `value` differs from `old`; returns it.
 uint32_t wait_for_change(const std::atomic<uint32_t>& value, uint32_t old) {
   for (int spin = 0; spin < kSpins; ++spin) {
     const uint32_t now = value.load(std::memory_order_acquire);
@@ -51,9 +51,9 @@ void ThreadPool::stop() {
   for (std::thread& worker : workers_) worker.join();
 }
 
-// A worker first announces itself in active_ and then looks at open_; the caller first closes open_
-// and then looks at active_. In the single order of these operations one of the two sees the other,
-// so the caller neither leaves a worker behind nor waits for one that never came.
+// A worker increments active_ and then reads open_; the caller clears open_ and then reads active_.
+// In the single order of these operations one of the two sees the other, so the caller waits for
+// exactly the workers inside the loop.
 void ThreadPool::run(size_t tasks, Call call, const void* body) {
   call_ = call;
   body_ = body;

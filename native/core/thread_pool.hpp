@@ -11,9 +11,8 @@
 namespace splatpilot {
 
 // Workers spin for some microseconds after a loop, since the next stage of a frame follows at once,
-// then sleep until called: an idle pool costs nothing, and one that shares its cores does not
-// starve its neighbors. A loop does not wait for workers that have yet to wake. A pool of one
-// thread runs everything in the caller.
+// then sleep until called: an idle pool costs nothing. A loop does not wait for workers that have
+// yet to wake. A pool of one thread runs everything in the caller.
 class ThreadPool {
  public:
   explicit ThreadPool(int threads);
@@ -23,9 +22,9 @@ class ThreadPool {
 
   int threads() const { return static_cast<int>(workers_.size()) + 1; }
 
-  // Calls body(task) once for each task in [0, tasks), in any order on any thread, and returns when
-  // all are done. If a body throws, tasks that have not begun are left out, and the first exception
-  // is thrown here when no thread is inside the loop any more.
+  // Calls body(task) once for each task in [0, tasks), in any order on any thread. After an
+  // exception, tasks that have not begun are left out; it is rethrown when no thread is in the
+  // loop.
   template <typename Body>
   void for_each(size_t tasks, const Body& body) {
     if (workers_.empty() || tasks < 2) {

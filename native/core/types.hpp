@@ -1,42 +1,41 @@
-// What the stages of a frame hand to one another, and the table of kernels that exists once per
-// SIMD level. Plain data only: this header is shared by objects built for different machines.
+// Plain data that the stages of a frame pass on, and the table of kernels, one per SIMD level. Code
+// for different machines shares this header.
 #pragma once
 
 #include <cstddef>
 #include <cstdint>
 
-#include "backward/backward_types.hpp"
-
 namespace splatpilot {
 
 constexpr int kTileSize = 16;       // [px]
-constexpr int kBlockSize = 4;       // [px]; one block is 16 pixels, the width of a pack
+constexpr int kBlockSize = 4;       // [px]; a block is 16 pixels, the width of a pack
 constexpr int kBlocksPerTile = 16;  // 4 x 4, one bit each of Pair::blocks
 constexpr int kStageSize = 256;     // splats of a tile held at a time
 constexpr int kChunkSize = 2048;    // Gaussians projected by one task
 constexpr int kPrefetchAhead = 8;   // splats are read in an order that caches cannot guess
 constexpr float kMinSquaredNorm = 1e-30f, kMaxSquaredNorm = 1e30f;  // of quaternions
 constexpr int kBoundSize = 64;  // baked Gaussians that share one bounding box
+constexpr size_t kBackwardScratchBytes = 576 * 1024;
 
 constexpr float kAlphaCut = 1.0f / 255.0f;
 constexpr float kLog2AlphaCut = -7.994353437f;  // log2(1/255)
 constexpr float kMaxAlpha = 0.99f;
 constexpr float kMinTransmittance = 1e-4f;
-// How far the inverse depth of a Gaussian may fall toward its rim, of that of its center.
-constexpr float kMostFall = 0.9f;
+// The largest fall of a Gaussian's inverse depth toward its rim, relative to that of its center.
+constexpr float kMaxFall = 0.9f;
 // sqrt(2 ln 255) = 3.3291: beyond so many sigmas no opacity <= 1 is above the alpha cut.
 constexpr float kMaxExtent = 3.33f;
-// The exponent is kept in base 2 and in Cholesky form: alpha = exp2(log2 o - u^2 - v^2) with
-// u^2 + v^2 = kExponentScale^2 * (squared Mahalanobis distance); this is sqrt(log2(e) / 2).
+// alpha = exp2(log2 o - u^2 - v^2) with u^2 + v^2 = kExponentScale^2 * (squared Mahalanobis
+// distance); this is sqrt(log2(e) / 2).
 constexpr float kExponentScale = 0.849321800288f;
 
 enum class DistortionModel : int { kNone, kOpenCv, kFisheye };
 
-// How a lens bends rays, see systems/splats/lens.py.
+// A lens, see systems/splats/lens.py.
 struct Distortion {
   DistortionModel model;
   float radial[6], tangential[2];
-  float most_squared_slope;  // x^2 + y^2 of x/z, y/z beyond which rays have no place
+  float max_squared_slope;  // of x^2 + y^2, of rays x/z, y/z that meet the image plane
 };
 
 // A camera, prepared for projection.
@@ -46,12 +45,12 @@ struct Camera {
   float near_plane, far_plane;  // [m]
   float radius_clip, eps2d;     // [px], [px^2]
   bool antialiased;             // opacities fall as the blur spreads small Gaussians
-  float max_depth;              // [m]; what lies beyond has no part in the median depth
-  bool depth_alone;             // Gaussians that hold no pixel's center are left out, and colors
+  float max_depth;              // [m], of the median depth
+  bool depth_alone;             // no colors; Gaussians that hold no pixel's center are left out
   float R_CW[9];                // row-major
   // The center in two parts, so that p_W - center keeps its digits far from the world's origin.
   float center_high[3], center_low[3];
-  float min_slope_x, max_slope_x, min_slope_y, max_slope_y;  // where x/z, y/z are held in J
+  float min_slope_x, max_slope_x, min_slope_y, max_slope_y;  // bounds of x/z, y/z in J
   // A Gaussian at p_C with largest scale s can touch the image only if for each of the four sides
   // side_normal . p_C + side_reach s > 0 (left, right, top, bottom).
   float side_normal[4][3];
@@ -73,11 +72,10 @@ struct alignas(64) Splat {
 };
 static_assert(sizeof(Splat) == 64);
 
-// How a Gaussian enters the median depth: the inverse depth of the point of greatest density along
-// a pixel's ray, W = w + w_x dx + w_y dy, which is the plane n . p = n . mean with
-// n = covariance^-1 mean, in the camera frame; and its footprint without blur, as in Splat but for
-// a division: u = (ux dx + uy dy) / min(W, w), v = vy dy / min(W, w). So the half that lies farther
-// from the camera has the perspective of what is flat; where large, it would be haze without.
+// A Gaussian in the median depth. The point of greatest density along a pixel's ray has the inverse
+// depth W = w + w_x dx + w_y dy: the plane n . p = n . mean with n = covariance^-1 mean, in the
+// camera frame. The footprint is without blur, with u = (ux dx + uy dy) / min(W, w) and
+// v = vy dy / min(W, w): the far half has the perspective of a flat Gaussian.
 struct alignas(32) DepthPlane {
   float ux, uy, vy;
   float w_x, w_y, w;  // [1/(m px)], [1/m]
@@ -91,7 +89,7 @@ struct Pair {
   uint32_t blocks;
 };
 
-// Input tensors as they come: row-major, one row per Gaussian.
+// Input tensors: row-major, one row per Gaussian.
 struct GaussianArrays {
   size_t count;
   const float* means;      // (N, 3)
@@ -115,11 +113,11 @@ struct BakedArrays {
                           // largest scale; one box per kBoundSize Gaussians
 };
 
-// sum w z; that divided by alpha; z where what is let through, of footprints without blur, falls
-// below one half, 0 where it never does.
+// sum w z; that divided by alpha; or z where the transmittance of footprints without blur falls
+// below one half, 0 without one.
 enum class DepthMode { kAccumulated, kExpected, kMedian };
 
-// Where tiles write. Strides are in floats; a null pointer means "not wanted".
+// Images that tiles write. Strides are in floats; a null pointer leaves an image out.
 struct Image {
   float* color;
   int color_stride;
@@ -144,8 +142,66 @@ struct TilePair {
   Pair pair;
 };
 
-// Appends the tile pairs of splats order[begin..end) and counts them per tile; returns where it
-// stopped because fewer than one splat's pairs might have fitted, or end.
+// The start of a backward pass: transmittance (16 blocks of 16 pixels) at the start of the second
+// and later stages of a tile, from entry later_stages[tile] on; and the number of stages composited
+// before every pixel was finished. The backward pass reads it as constant Float and Count.
+template <typename Float, typename Count>
+struct StageRecord {
+  const size_t* later_stages;  // (tiles + 1,)
+  Float* transmittance;
+  Count* stages_done;  // (tiles,)
+};
+using StageWriter = StageRecord<float, uint32_t>;
+using StageReader = StageRecord<const float, const uint32_t>;
+
+// The loss's derivatives by the images; strides as in Image.
+struct ImageGradient {
+  const float* color;
+  const float* depth;
+  int stride;  // of color and depth
+  const float* alpha;
+  const float* expected_depth;  // the rendered depth, if it was divided by alpha, else null
+  const float* rendered_alpha;
+  float background[3];
+};
+
+// Sums over pixels for one (splat, tile), h = alpha dL/dalpha: h, h u, h v, h u^2, h u v, h v^2,
+// dL/dcolor (3), dL/ddepth.
+struct alignas(64) PairGradient {
+  float sums[16];
+};
+
+// dL/d: mean (2) [1/px]; ln of the opacity; h u^2, h u v, h v^2; color (3); depth.
+struct SplatGradient {
+  float mean[2], log_opacity, uu, uv, vv, color[3], depth;
+  float unused[6];
+};
+static_assert(sizeof(SplatGradient) == 64);
+
+// The pairs of a splat: those at slots[begin], ..., slots[end - 1].
+struct PairRange {
+  uint32_t begin, end;
+};
+
+// The arrays to which dL/d(inputs) of one camera are added; shapes as in GaussianArrays.
+struct GaussianGradients {
+  float* means;
+  float* quats;
+  float* scales;
+  float* opacities;
+  float* colors;
+  // Rows, or those of colors, are overwritten instead, with zeros for invisible Gaussians.
+  bool overwrite, overwrite_colors;
+};
+
+// dL/dR_CW with the center fixed (9, row-major), dL/dp_C (3) and the part of dL/d(p_W - center)
+// from spherical harmonics (3), summed over Gaussians.
+struct PoseSums {
+  double values[15];
+};
+
+// Appends the tile pairs of splats order[begin..end) and counts them per tile. Returns the first
+// splat whose pairs might not have fitted, or end.
 using BinKernel = size_t (*)(const Splat*, const uint32_t* order, size_t begin, size_t end,
                              int tiles_x, int tiles_y, TilePair*, size_t capacity,
                              size_t* pair_count, uint32_t* tile_counts);
@@ -153,40 +209,36 @@ using BinKernel = size_t (*)(const Splat*, const uint32_t* order, size_t begin, 
 struct SurfelKernels;
 struct LossKernels;
 struct CastingKernels;
-struct FittingKernels;
 
-// Of one SIMD level.
+// The kernels of one SIMD level.
 struct Kernels {
   const char* name;
   const SurfelKernels* surfels;
   const LossKernels* losses;
   const CastingKernels* casting;
-  const FittingKernels* fitting;
-  // Projects Gaussians [begin, end); writes visible ones, their planes if these are not null, and
-  // the bits of their depths in input order; returns how many.
+  // Projects Gaussians [begin, end). Writes visible ones, their planes unless null, and the bits of
+  // their depths in input order; returns their number.
   size_t (*project)(const GaussianArrays&, const Camera&, size_t begin, size_t end, Splat*,
                     DepthPlane*, uint32_t* depth_bits);
+  // begin and end are multiples of the chunk size, or the scene's end.
   size_t (*project_baked)(const BakedArrays&, const Camera&, size_t begin, size_t end, Splat*,
                           DepthPlane*, uint32_t* depth_bits);
   BinKernel bin;
-  // With `record`, a backward pass can follow.
+  // `record` is null when no backward pass follows.
   void (*raster_tile)(const RasterInput&, const Image&, const StageWriter* record, int tile);
-  // Writes the gradients of a tile's pairs and returns how many (splat, block) it composited;
-  // `scratch` has kBackwardScratchBytes, aligned to 64.
-  size_t (*raster_tile_backward)(const RasterInput&, const StageReader&, const ImageGradient&,
-                                 int tile, void* scratch, PairGradient*);
+  // Writes the gradients of a tile's pairs; `scratch` has kBackwardScratchBytes, aligned to 64.
+  void (*raster_tile_backward)(const RasterInput&, const StageReader&, const ImageGradient&,
+                               int tile, void* scratch, PairGradient*);
   // Adds up the pairs of `count` splats.
-  void (*gather_gradients)(const Splat*, size_t count, const PairRange*, const uint32_t* slots,
-                           const PairGradient*, SplatGradient*);
-  // From `count` splats to the Gaussians they came from; `means2d` (count, 2) replaces mean. Adds.
+  void (*sum_pairs)(const Splat*, size_t count, const PairRange*, const uint32_t* slots,
+                    const PairGradient*, SplatGradient*);
+  // From `count` splats to their Gaussians; `means2d` (count, 2) replaces mean. Adds.
   void (*project_backward)(const GaussianArrays&, const Camera&, const Splat*, size_t count,
                            const SplatGradient*, const float* means2d, const GaussianGradients&,
                            PoseSums*);
-  // Index of the first value that is NaN or infinite, or count.
-  size_t (*first_nonfinite)(const float*, size_t count);
-  // Whether low <= value <= high for all; NaN is not.
+  // Checks low <= value <= high for all; NaN fails.
   bool (*all_within)(const float*, size_t count, float low, float high);
-  // Whether all quaternions (count, 4) are long and short enough to be normalized.
+  // Checks that all quaternions (count, 4) can be normalized.
   bool (*all_normalizable)(const float* quats, size_t count);
 };
 

@@ -1,5 +1,5 @@
-// Signed distances to shapes, as `splatpilot.systems.collision.shapes` defines them: in double
-// precision operation by operation. A gradient is written unless it is null.
+// Signed distances to the shapes of `splatpilot.systems.collision.shapes`. A gradient is written
+// unless it is null.
 #pragma once
 
 #include "casting/ray_casting.hpp"
@@ -10,17 +10,17 @@ namespace splatpilot::SIMD_LEVEL {
 SP_INLINE float hypotenuse(float a, float b) { return __builtin_sqrtf(a * a + b * b); }
 SP_INLINE double hypotenuse(double a, double b) { return __builtin_hypot(a, b); }
 
-// Writes a at unit length; of no length, a perpendicular to the unit vector `axis`.
+// Normalizes a; a zero becomes a perpendicular to the unit vector `axis`.
 template <typename Real>
 SP_INLINE void write_direction(Real* a, const Real* axis, Real* gradient) {
   if (!gradient) return;
   Real size = length(a);
   if (size == Real(0)) {
-    int least = 0;
+    int smallest = 0;
     for (int k = 1; k < 3; ++k) {
-      if (magnitude(axis[k]) < magnitude(axis[least])) least = k;
+      if (magnitude(axis[k]) < magnitude(axis[smallest])) smallest = k;
     }
-    const int next = (least + 1) % 3, last = (least + 2) % 3;
+    const int next = (smallest + 1) % 3, last = (smallest + 2) % 3;
     a[next] = axis[last];
     a[last] = -axis[next];
     size = length(a);
@@ -76,26 +76,27 @@ SP_INLINE Real cylinder_distance(const Real* s, const Real* p, Real* gradient) {
 template <typename Real>
 SP_INLINE Real box_distance(const Real* s, const Real* p, Real* gradient) {
   const Real *R = s + 3, *half = s + 12;
-  Real m[3], local[3], beyond[3], way[3];
+  Real m[3], local[3], beyond[3], excess[3];
   subtract(p, s, m);
   int deepest = 0;
   for (int k = 0; k < 3; ++k) {
     local[k] = m[0] * R[k] + m[1] * R[3 + k] + m[2] * R[6 + k];
     beyond[k] = magnitude(local[k]) - half[k];
-    way[k] = maximum(beyond[k], Real(0));
+    excess[k] = maximum(beyond[k], Real(0));
     if (beyond[k] > beyond[deepest]) deepest = k;
   }
   const bool outside = beyond[deepest] > Real(0);
   const Real distance =
-      outside ? root(way[0] * way[0] + way[1] * way[1] + way[2] * way[2]) : beyond[deepest];
+      outside ? sqrt(excess[0] * excess[0] + excess[1] * excess[1] + excess[2] * excess[2])
+              : beyond[deepest];
   if (gradient) {
     for (int k = 0; k < 3; ++k) {
-      const Real w = outside ? way[k] / distance : Real(k == deepest);
-      way[k] = with_sign(w, local[k]);
+      const Real w = outside ? excess[k] / distance : Real(k == deepest);
+      excess[k] = with_sign(w, local[k]);
     }
     for (int k = 0; k < 3; ++k) {
       const Real* row = R + 3 * k;
-      gradient[k] = row[0] * way[0] + row[1] * way[1] + row[2] * way[2];
+      gradient[k] = row[0] * excess[0] + row[1] * excess[1] + row[2] * excess[2];
     }
   }
   return distance;

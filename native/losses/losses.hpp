@@ -1,5 +1,5 @@
-// Losses between a rendered image and the true one, value and gradient at once; the table of their
-// kernels exists once per SIMD level. Plain data only, as in types.hpp.
+// Losses between rendered images and true ones, with gradients, and the parameters of Gaussians
+// that minimize them. Plain data, as in types.hpp.
 #pragma once
 
 #include <cstddef>
@@ -29,7 +29,24 @@ struct LogDepthInput {
   const float* weights;  // null: all 1
   size_t count;
   float epsilon, far;
-  float* gradient;  // of the mean over valid pixels; null: not wanted
+  float* gradient;  // of the mean over valid pixels; or null
+};
+
+// Shapes of n Gaussians; scales sqrt(exp(2 log_scale) + smallest^2) and opacities sigmoid(logit).
+struct ShapeInput {
+  size_t n;
+  const float* log_scales;       // 3 n
+  const float* logit_opacities;  // n
+  const float* smallest;         // n
+  float* scales;                 // 3 n
+  float* opacities;              // n
+};
+
+struct ShapeGradientInput {
+  size_t n;
+  const float *scales, *opacities, *smallest;
+  const float *v_scales, *v_opacities;
+  float *v_log_scales, *v_logit_opacities;
 };
 
 struct LossKernels {
@@ -37,6 +54,8 @@ struct LossKernels {
   PhotometricSums (*photometric)(const PhotometricInput&);
   // The mean over valid pixels of weight * |log(max(rendered, epsilon) / depth)|; 0 without any.
   double (*log_depth)(const LogDepthInput&);
+  void (*shapes)(const ShapeInput&);
+  void (*shapes_backward)(const ShapeGradientInput&);
 };
 
 }  // namespace splatpilot

@@ -4,15 +4,19 @@
 #include <array>
 #include <cmath>
 #include <limits>
+#include <utility>
 
 #include "core/radix_sort.hpp"
+
+#define SIMD_LEVEL baseline
+#include "core/vectors.hpp"
 
 namespace splatpilot {
 namespace {
 
 constexpr size_t kPack = 16;
 
-size_t groups_of(size_t count) { return (count + kPack - 1) / kPack; }
+size_t num_groups(size_t count) { return (count + kPack - 1) / kPack; }
 
 // Spreads the low 21 bits of x to every third bit.
 uint64_t spread(uint64_t x) {
@@ -24,26 +28,32 @@ uint64_t spread(uint64_t x) {
   return x;
 }
 
-std::vector<uint32_t> morton_order(const GaussianArrays& g) {
-  std::array<float, 3> low, high;
-  low.fill(std::numeric_limits<float>::infinity());
-  high.fill(-std::numeric_limits<float>::infinity());
-  for (size_t i = 0; i < g.count; ++i) {
-    for (size_t axis = 0; axis < 3; ++axis) {
-      low[axis] = std::min(low[axis], g.means[3 * i + axis]);
-      high[axis] = std::max(high[axis], g.means[3 * i + axis]);
-    }
+// The bounds of an axis of the centers of Gaussians index(begin), ..., index(end - 1).
+template <typename Index>
+std::pair<double, double> range(const GaussianArrays& g, size_t axis, size_t begin, size_t end,
+                                const Index& index) {
+  double low = std::numeric_limits<double>::infinity(), high = -low;
+  for (size_t slot = begin; slot < end; ++slot) {
+    const double value = g.means[3 * static_cast<size_t>(index(slot)) + axis];
+    low = std::min(low, value);
+    high = std::max(high, value);
   }
-  double size = 0.0;
+  return {low, high};
+}
+
+std::vector<uint32_t> morton_order(const GaussianArrays& g) {
+  double low[3], size = 0.0;
   for (size_t axis = 0; axis < 3; ++axis) {
-    size = std::max(size, static_cast<double>(high[axis]) - low[axis]);
+    const auto [min, max] = range(g, axis, 0, g.count, [](size_t slot) { return slot; });
+    low[axis] = min;
+    size = std::max(size, max - min);
   }
   const double scale = size > 0.0 ? ((1 << 21) - 1) / size : 0.0;
   std::vector<KeyValue<uint64_t>> codes(g.count), scratch;
   for (size_t i = 0; i < g.count; ++i) {
     codes[i].value = static_cast<uint32_t>(i);
     for (size_t axis = 0; axis < 3; ++axis) {
-      const double cell = (static_cast<double>(g.means[3 * i + axis]) - low[axis]) * scale;
+      const double cell = (g.means[3 * i + axis] - low[axis]) * scale;
       codes[i].key |= spread(static_cast<uint64_t>(cell)) << axis;
     }
   }
@@ -56,18 +66,19 @@ std::vector<uint32_t> morton_order(const GaussianArrays& g) {
 
 // The rows of A = R(q) diag(scale), orthogonalized: A = L Q, so L L^T = A A^T.
 std::array<double, 6> lower_factor(const float* quat, const float* scale) {
-  const double w = quat[0], x = quat[1], y = quat[2], z = quat[3];
-  const double two = 2.0 / (w * w + x * x + y * y + z * z);
-  double a[3][3] = {{1 - two * (y * y + z * z), two * (x * y - w * z), two * (x * z + w * y)},
-                    {two * (x * y + w * z), 1 - two * (x * x + z * z), two * (y * z - w * x)},
-                    {two * (x * z - w * y), two * (y * z + w * x), 1 - two * (x * x + y * y)}};
-  for (auto& row : a) {
-    for (int j = 0; j < 3; ++j) row[j] *= scale[j];
+  const double q[4] = {quat[0], quat[1], quat[2], quat[3]};
+  SIMD_LEVEL::Vector3<double> R[3];
+  SIMD_LEVEL::rotation_columns(q, R);
+  double a[3][3];
+  for (int j = 0; j < 3; ++j) {
+    a[0][j] = R[j].x * scale[j];
+    a[1][j] = R[j].y * scale[j];
+    a[2][j] = R[j].z * scale[j];
   }
   std::array<double, 6> L{};
   size_t entry = 0;
   for (int i = 0; i < 3; ++i) {
-    for (int k = 0; k < i; ++k) {  // rows k < i hold unit vectors by now, or zero
+    for (int k = 0; k < i; ++k) {  // rows k < i are unit vectors or zero
       double along = 0.0;
       for (int j = 0; j < 3; ++j) along += a[i][j] * a[k][j];
       for (int j = 0; j < 3; ++j) a[i][j] -= along * a[k][j];
@@ -80,8 +91,8 @@ std::array<double, 6> lower_factor(const float* quat, const float* scale) {
   return L;
 }
 
-std::vector<float> geometry_of(const GaussianArrays& g, const std::vector<uint32_t>& order) {
-  const size_t groups = groups_of(g.count);
+std::vector<float> pack_geometry(const GaussianArrays& g, const std::vector<uint32_t>& order) {
+  const size_t groups = num_groups(g.count);
   std::vector<float> geometry(groups * 10 * kPack, 0.0f);
   for (size_t slot = 0; slot < groups * kPack; ++slot) {
     float* pack = geometry.data() + slot / kPack * 10 * kPack + slot % kPack;
@@ -96,10 +107,10 @@ std::vector<float> geometry_of(const GaussianArrays& g, const std::vector<uint32
   return geometry;
 }
 
-std::vector<float> bounds_of(const GaussianArrays& g, const std::vector<uint32_t>& order) {
-  const size_t boxes = (groups_of(g.count) * kPack + kBoundSize - 1) / kBoundSize;
-  const size_t box_groups = groups_of(boxes);
-  // A box that does not exist is NaN, which passes no comparison.
+std::vector<float> box_bounds(const GaussianArrays& g, const std::vector<uint32_t>& order) {
+  const size_t boxes = (num_groups(g.count) * kPack + kBoundSize - 1) / kBoundSize;
+  const size_t box_groups = num_groups(boxes);
+  // A missing box is NaN, which passes no comparison.
   std::vector<float> bounds(box_groups * 7 * kPack, std::numeric_limits<float>::quiet_NaN());
   for (size_t box = 0; box < boxes; ++box) {
     const size_t begin = box * kBoundSize, end = std::min(g.count, begin + kBoundSize);
@@ -111,12 +122,7 @@ std::vector<float> bounds_of(const GaussianArrays& g, const std::vector<uint32_t
     }
     pack[6 * kPack] = largest_scale;
     for (size_t axis = 0; axis < 3; ++axis) {
-      double low = std::numeric_limits<double>::infinity(), high = -low;
-      for (size_t slot = begin; slot < end; ++slot) {
-        const double value = g.means[3 * static_cast<size_t>(order[slot]) + axis];
-        low = std::min(low, value);
-        high = std::max(high, value);
-      }
+      const auto [low, high] = range(g, axis, begin, end, [&](size_t slot) { return order[slot]; });
       const double center = 0.5 * (low + high), half = 0.5 * (high - low);
       pack[axis * kPack] = static_cast<float>(center);
       // Widened so that rounding never leaves a Gaussian outside its box.
@@ -130,7 +136,7 @@ std::vector<float> bounds_of(const GaussianArrays& g, const std::vector<uint32_t
 }  // namespace
 
 BakedScene::BakedScene(const GaussianArrays& g)
-    : shape_(std::make_shared<const Shape>(shape_of(g))) {
+    : shape_(std::make_shared<const Shape>(pack_shape(g))) {
   store_colors(g.colors, g.sh_coefficients, g.sh_degree);
 }
 
@@ -140,15 +146,15 @@ BakedScene::BakedScene(const BakedScene& other, const float* colors, int sh_coef
   store_colors(colors, sh_coefficients, sh_degree);
 }
 
-BakedScene::Shape BakedScene::shape_of(const GaussianArrays& g) {
+BakedScene::Shape BakedScene::pack_shape(const GaussianArrays& g) {
   std::vector<uint32_t> order = morton_order(g);
-  std::vector<float> geometry = geometry_of(g, order), bounds = bounds_of(g, order);
+  std::vector<float> geometry = pack_geometry(g, order), bounds = box_bounds(g, order);
   return {std::move(order), std::move(geometry), std::move(bounds)};
 }
 
 void BakedScene::store_colors(const float* colors, int sh_coefficients, int sh_degree) {
   const size_t values = 3 * static_cast<size_t>((sh_degree + 1) * (sh_degree + 1));
-  const size_t groups = groups_of(count());
+  const size_t groups = num_groups(count());
   colors_.assign(groups * values * kPack, 0.0f);
   for (size_t slot = 0; slot < count(); ++slot) {
     float* pack = colors_.data() + slot / kPack * values * kPack + slot % kPack;

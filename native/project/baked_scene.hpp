@@ -1,4 +1,4 @@
-// A static scene, prepared once so that each frame has less to do.
+// A static scene, prepared once for fast frames.
 #pragma once
 
 #include <cstdint>
@@ -15,21 +15,19 @@ class BakedScene {
  public:
   explicit BakedScene(const GaussianArrays& gaussians);
 
-  // The Gaussians of another scene in other colors (count, sh_coefficients, 3); what does not
-  // depend on colors is shared.
+  // The Gaussians of another scene, shared, in other colors (count, sh_coefficients, 3).
   BakedScene(const BakedScene& other, const float* colors, int sh_coefficients, int sh_degree);
 
   size_t count() const { return shape_->order.size(); }
   const BakedArrays& arrays() const { return arrays_; }
 
  private:
-  // All but colors.
   struct Shape {
-    std::vector<uint32_t> order;  // (count), of the Gaussians as they were given
+    std::vector<uint32_t> order;  // (count), indices in the input
     std::vector<float> geometry, bounds;
   };
 
-  static Shape shape_of(const GaussianArrays& g);
+  static Shape pack_shape(const GaussianArrays& g);
   void store_colors(const float* colors, int sh_coefficients, int sh_degree);
 
   std::shared_ptr<const Shape> shape_;

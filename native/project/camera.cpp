@@ -2,33 +2,18 @@
 
 #include <algorithm>
 #include <cmath>
-#include <limits>
 
 namespace splatpilot {
 
 namespace {
 
-void hold_in_pinhole(const CameraParameters& p, Camera& c) {
-  const double fx = p.K[0], cx = p.K[2], fy = p.K[4], cy = p.K[5];
-  // The slopes x/z and y/z that enter the Jacobian stay within the image plus 15 % of its size.
-  const double margin_x = 0.15 * p.width / fx, margin_y = 0.15 * p.height / fy;
-  const double min_x = -cx / fx - margin_x, max_x = (p.width - cx) / fx + margin_x;
-  const double min_y = -cy / fy - margin_y, max_y = (p.height - cy) / fy + margin_y;
-  c.min_slope_x = static_cast<float>(min_x);
-  c.max_slope_x = static_cast<float>(max_x);
-  c.min_slope_y = static_cast<float>(min_y);
-  c.max_slope_y = static_cast<float>(max_y);
-
-  // |J_x| <= fx / z sqrt(1 + slope^2), so the extent is at most kMaxExtent (|J_x| s + sqrt(eps2d)):
-  // left of the image means fx x / z + cx + extent <= 0, which times z is linear. A pixel and 1 %
-  // are added for rounding.
-  const double steep_x = std::sqrt(1.0 + std::max(min_x * min_x, max_x * max_x));
-  const double steep_y = std::sqrt(1.0 + std::max(min_y * min_y, max_y * max_y));
-  const double blur = kMaxExtent * std::sqrt(p.eps2d) + 1.0;
-  const double sides[4][4] = {{fx, 0, cx + blur, fx * steep_x},
-                              {-fx, 0, p.width - cx + blur, fx * steep_x},
-                              {0, fy, cy + blur, fy * steep_y},
-                              {0, -fy, p.height - cy + blur, fy * steep_y}};
+// Clamps slopes and bounds the sides of the image, of rows n (3) and reach (1).
+void bound(Camera& c, const double min_slope[2], const double max_slope[2],
+           const double sides[4][4]) {
+  c.min_slope_x = static_cast<float>(min_slope[0]);
+  c.max_slope_x = static_cast<float>(max_slope[0]);
+  c.min_slope_y = static_cast<float>(min_slope[1]);
+  c.max_slope_y = static_cast<float>(max_slope[1]);
   for (int side = 0; side < 4; ++side) {
     for (int axis = 0; axis < 3; ++axis) {
       c.side_normal[side][axis] = static_cast<float>(sides[side][axis]);
@@ -37,23 +22,36 @@ void hold_in_pinhole(const CameraParameters& p, Camera& c) {
   }
 }
 
-// What a lens shows lies in a frustum too, and so do Gaussians, but for their extent.
-void hold_in_frustum(const CameraParameters& p, Camera& c) {
-  c.min_slope_x = static_cast<float>(p.min_slope[0]);
-  c.max_slope_x = static_cast<float>(p.max_slope[0]);
-  c.min_slope_y = static_cast<float>(p.min_slope[1]);
-  c.max_slope_y = static_cast<float>(p.max_slope[1]);
-  const double sides[4][3] = {{1, 0, -p.min_slope[0]},
-                              {-1, 0, p.max_slope[0]},
-                              {0, 1, -p.min_slope[1]},
-                              {0, -1, p.max_slope[1]}};
-  for (int side = 0; side < 4; ++side) {
-    const double length = std::hypot(sides[side][0], sides[side][1], sides[side][2]);
-    for (int axis = 0; axis < 3; ++axis) {
-      c.side_normal[side][axis] = static_cast<float>(sides[side][axis] / length);
-    }
-    c.side_reach[side] = static_cast<float>(1.01 * kMaxExtent);
+void bound_by_pinhole(const CameraParameters& p, Camera& c) {
+  const double fx = p.K[0], cx = p.K[2], fy = p.K[4], cy = p.K[5];
+  // The slopes x/z and y/z that enter the Jacobian stay within the image plus 15 % of its size.
+  const double margin_x = 0.15 * p.width / fx, margin_y = 0.15 * p.height / fy;
+  const double low[2] = {-cx / fx - margin_x, -cy / fy - margin_y};
+  const double high[2] = {(p.width - cx) / fx + margin_x, (p.height - cy) / fy + margin_y};
+  // |J_x| <= fx / z sqrt(1 + slope^2), so the extent is at most kMaxExtent (|J_x| s + sqrt(eps2d)):
+  // left of the image means fx x / z + cx + extent <= 0, which times z is linear. A pixel and 1 %
+  // are added for rounding.
+  const double reach_x = fx * std::sqrt(1.0 + std::max(low[0] * low[0], high[0] * high[0]));
+  const double reach_y = fy * std::sqrt(1.0 + std::max(low[1] * low[1], high[1] * high[1]));
+  const double blur = kMaxExtent * std::sqrt(p.eps2d) + 1.0;
+  const double sides[4][4] = {{fx, 0, cx + blur, reach_x},
+                              {-fx, 0, p.width - cx + blur, reach_x},
+                              {0, fy, cy + blur, reach_y},
+                              {0, -fy, p.height - cy + blur, reach_y}};
+  bound(c, low, high, sides);
+}
+
+// The rays of a lens lie in a frustum, and Gaussians up to their extent.
+void bound_by_frustum(const CameraParameters& p, Camera& c) {
+  double sides[4][4] = {{1, 0, -p.min_slope[0], 1},
+                        {-1, 0, p.max_slope[0], 1},
+                        {0, 1, -p.min_slope[1], 1},
+                        {0, -1, p.max_slope[1], 1}};
+  for (auto& n : sides) {
+    const double length = std::hypot(n[0], n[1], n[2]);
+    for (int axis = 0; axis < 3; ++axis) n[axis] /= length;
   }
+  bound(c, p.min_slope, p.max_slope, sides);
 }
 
 }  // namespace
@@ -62,18 +60,17 @@ Camera make_camera(const CameraParameters& p) {
   Camera c{};
   c.width = p.width;
   c.height = p.height;
-  const double fx = p.K[0], cx = p.K[2], fy = p.K[4], cy = p.K[5];
-  c.fx = static_cast<float>(fx);
-  c.fy = static_cast<float>(fy);
-  c.cx = static_cast<float>(cx);
-  c.cy = static_cast<float>(cy);
+  c.fx = static_cast<float>(p.K[0]);
+  c.fy = static_cast<float>(p.K[4]);
+  c.cx = static_cast<float>(p.K[2]);
+  c.cy = static_cast<float>(p.K[5]);
   c.near_plane = static_cast<float>(p.near_plane);
   c.far_plane = static_cast<float>(p.far_plane);
   // A splat is clipped when its radius, rounded up, does not exceed the limit.
   c.radius_clip = static_cast<float>(std::floor(p.radius_clip));
   c.eps2d = static_cast<float>(p.eps2d);
   c.antialiased = p.antialiased;
-  c.max_depth = std::numeric_limits<float>::infinity();
+  c.max_depth = static_cast<float>(p.max_depth);
 
   // center = -R^-1 t by cofactors: R may be a rotation only to single precision.
   double R[3][3], t[3];
@@ -101,9 +98,9 @@ Camera make_camera(const CameraParameters& p) {
 
   c.distortion = p.distortion;
   if (p.distortion.model == DistortionModel::kNone) {
-    hold_in_pinhole(p, c);
+    bound_by_pinhole(p, c);
   } else {
-    hold_in_frustum(p, c);
+    bound_by_frustum(p, c);
   }
   return c;
 }

@@ -1,12 +1,12 @@
-// From what users know of a camera to what the kernels need.
+// Cameras of users, and their preparation for the kernels.
 #pragma once
 
 #include "core/types.hpp"
 
 namespace splatpilot {
 
-// Where there is no color, what is left of the blur [px^2]: so little that it hides no pixel from
-// a footprint without any, and enough that needles are found in float32.
+// [px^2] blur of depth images without color: hides no pixel from a footprint without blur, and
+// suffices for needles in float32.
 constexpr float kDepthBlur = 1e-4f;
 
 struct CameraParameters {
@@ -14,11 +14,11 @@ struct CameraParameters {
   double K[9];                   // row-major, [px]; skew is ignored
   double X_CW[16];               // world to camera, row-major
   double near_plane, far_plane;  // [m]
+  double max_depth;              // [m], of the median depth
   double radius_clip, eps2d;     // [px], [px^2]
   bool antialiased;
   Distortion distortion;
-  // Between which the slopes x/z, y/z of rays lie that meet the image or what is near it, where
-  // the lens distorts.
+  // Bounds of the slopes x/z, y/z of rays that meet the image or its surroundings through a lens.
   double min_slope[2], max_slope[2];
 };
 

@@ -1,4 +1,4 @@
-// How many (Gaussian, tile) pairs a frame may have.
+// The limit on (Gaussian, tile) pairs of a frame.
 #pragma once
 
 #include <cstdint>
@@ -7,10 +7,9 @@
 
 namespace splatpilot {
 
-// The places of pairs are kept in 32 bits.
+// Indices of pairs have 32 bits.
 constexpr uint64_t kMaxPairs = UINT32_MAX;
 
-// Throws std::length_error for more than a frame may have.
 inline void check_pair_count(uint64_t pairs) {
   if (pairs <= kMaxPairs) return;
   throw std::length_error("the image has " + std::to_string(pairs) +

@@ -1,35 +1,67 @@
-// From Gaussians in the world to splats on the image plane (EWA projection; Zwicker et al. 2001,
-// Kerbl et al. 2023), 16 at a time.
+// Projection of Gaussians to splats on the image plane (EWA; Zwicker et al. 2001, Kerbl et al.
+// 2023) and to planes of the median depth, 16 at a time, through a pinhole or OpenCV's rational and
+// fisheye lenses.
 #pragma once
 
 #include "core/mathematics.hpp"
 #include "core/types.hpp"
-#include "project/distortion.hpp"
-#include "project/spherical_harmonics.hpp"
+#include "core/vectors.hpp"
 
 namespace splatpilot::SIMD_LEVEL {
 
-struct Vector16 {
-  F16 x, y, z;
+// The image point of a ray at focal length 1, and the Jacobian by the slopes (x/z, y/z), which is
+// symmetric in both models.
+struct DistortedPoint {
+  F16 x, y, xx, xy, yy;
 };
 
-SP_INLINE Vector16 operator*(const F16& s, const Vector16& a) {
-  return {s * a.x, s * a.y, s * a.z};
-}
-SP_INLINE Vector16 operator+(const Vector16& a, const Vector16& b) {
-  return {a.x + b.x, a.y + b.y, a.z + b.z};
-}
-SP_INLINE Vector16 operator-(const Vector16& a, const Vector16& b) {
-  return {a.x - b.x, a.y - b.y, a.z - b.z};
+SP_INLINE F16 polynomial3(const float k[3], const F16& s) {
+  return F16(1.0f) + s * (F16(k[0]) + s * (F16(k[1]) + s * F16(k[2])));
 }
 
-template <typename Vector>
-SP_INLINE Vector cross(const Vector& a, const Vector& b) {
-  return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
+// The derivative of polynomial3.
+SP_INLINE F16 slope3(const float k[3], const F16& s) {
+  return F16(k[0]) + s * (F16(2.0f * k[1]) + s * F16(3.0f * k[2]));
 }
 
-SP_INLINE F16 dot(const float n[3], const Vector16& p) {
-  return F16(n[0]) * p.x + (F16(n[1]) * p.y + F16(n[2]) * p.z);
+SP_INLINE DistortedPoint distort(const Distortion& lens, const F16& x, const F16& y) {
+  const F16 s = x * x + y * y;
+  F16 g, slope;  // (x', y') = g(s) (x, y) + tangential part; dg/ds
+  if (lens.model == DistortionModel::kFisheye) {
+    // Avoids 0 / 0 on the axis; the quotients are exact enough so near it.
+    const F16 safe = max(s, F16(1e-12f));
+    const F16 r = sqrt(safe);
+    const F16 angle = arctangent(r);
+    const F16 a = angle * angle;
+    const float* k = lens.radial;
+    const F16 inverse_r = F16(1.0f) / r;
+    g = angle * inverse_r *
+        (F16(1.0f) + a * (F16(k[0]) + a * (F16(k[1]) + a * (F16(k[2]) + a * F16(k[3])))));
+    const F16 growth =
+        F16(1.0f) + a * (F16(3.0f * k[0]) +
+                         a * (F16(5.0f * k[1]) + a * (F16(7.0f * k[2]) + a * F16(9.0f * k[3]))));
+    slope = F16(0.5f) * inverse_r * inverse_r * (growth / (F16(1.0f) + safe) - g);
+  } else {
+    const F16 inverse = F16(1.0f) / polynomial3(lens.radial + 3, s);
+    g = polynomial3(lens.radial, s) * inverse;
+    slope = (slope3(lens.radial, s) - g * slope3(lens.radial + 3, s)) * inverse;
+  }
+  const F16 p1 = F16(lens.tangential[0]), p2 = F16(lens.tangential[1]);
+  const F16 two = F16(2.0f), six = F16(6.0f);
+  DistortedPoint out;
+  out.x = g * x + (two * p1 * x * y + p2 * (s + two * x * x));
+  out.y = g * y + (p1 * (s + two * y * y) + two * p2 * x * y);
+  out.xx = g + two * x * x * slope + (two * p1 * y + six * p2 * x);
+  out.xy = two * x * y * slope + (two * p1 * x + two * p2 * y);
+  out.yy = g + two * y * y * slope + (six * p1 * y + two * p2 * x);
+  return out;
+}
+
+// Rays that meet the image where the lens does not fold it back.
+SP_INLINE Mask16 is_on_image(const Distortion& lens, const F16& x, const F16& y,
+                             const DistortedPoint& p) {
+  return (F16(lens.max_squared_slope) > x * x + y * y) & (p.xx + p.yy > F16(0.0f)) &
+         (p.xx * p.yy - p.xy * p.xy > F16(0.0f));
 }
 
 // p_W relative to the camera center, still in world axes.
@@ -39,16 +71,19 @@ SP_INLINE Vector16 from_center(const Camera& camera, const F16& x, const F16& y,
           (z - F16(camera.center_high[2])) - F16(camera.center_low[2])};
 }
 
-SP_INLINE Vector16 to_camera(const Camera& camera, const Vector16& d_W) {
+template <typename T>
+SP_INLINE Vector3<T> to_camera(const Camera& camera, const Vector3<T>& d_W) {
   return {dot(camera.R_CW, d_W), dot(camera.R_CW + 3, d_W), dot(camera.R_CW + 6, d_W)};
 }
+
+SP_INLINE Vector16 broadcast(const float v[3]) { return {F16(v[0]), F16(v[1]), F16(v[2])}; }
 
 SP_INLINE Mask16 in_depth_range(const Camera& camera, const F16& z) {
   return (z >= F16(camera.near_plane)) & (z <= F16(camera.far_plane));
 }
 
-// The image of the world axes under the projection's Jacobian at p_C: m[i] = J_i R_CW, with the
-// slopes x/z and y/z held within 1.3 times the field of view as in the original method.
+// The projection's Jacobian at p_C by world axes, m[i] = J_i R_CW, with the slopes x/z and y/z
+// clamped to 1.3 times the field of view as in the original method.
 template <bool kDistorted = false>
 SP_INLINE void projection_rows(const Camera& camera, const Vector16& p_C, const F16& inverse_z,
                                Vector16 m[2]) {
@@ -56,21 +91,17 @@ SP_INLINE void projection_rows(const Camera& camera, const Vector16& p_C, const 
   const F16 slope_y = clamp(p_C.y * inverse_z, F16(camera.min_slope_y), F16(camera.max_slope_y));
   const F16 scale_x = F16(camera.fx) * inverse_z;
   const F16 scale_y = F16(camera.fy) * inverse_z;
-  const float* R = camera.R_CW;
+  const Vector16 forward = broadcast(camera.R_CW + 6);
+  const Vector16 by_x = broadcast(camera.R_CW) - slope_x * forward;
+  const Vector16 by_y = broadcast(camera.R_CW + 3) - slope_y * forward;
   if constexpr (kDistorted) {
     const DistortedPoint p = distort(camera.distortion, slope_x, slope_y);
-    const Vector16 by_x = {F16(R[0]) - slope_x * F16(R[6]), F16(R[1]) - slope_x * F16(R[7]),
-                           F16(R[2]) - slope_x * F16(R[8])};
-    const Vector16 by_y = {F16(R[3]) - slope_y * F16(R[6]), F16(R[4]) - slope_y * F16(R[7]),
-                           F16(R[5]) - slope_y * F16(R[8])};
     m[0] = scale_x * (p.xx * by_x + p.xy * by_y);
     m[1] = scale_y * (p.xy * by_x + p.yy * by_y);
     return;
   }
-  m[0] = {scale_x * (F16(R[0]) - slope_x * F16(R[6])), scale_x * (F16(R[1]) - slope_x * F16(R[7])),
-          scale_x * (F16(R[2]) - slope_x * F16(R[8]))};
-  m[1] = {scale_y * (F16(R[3]) - slope_y * F16(R[6])), scale_y * (F16(R[4]) - slope_y * F16(R[7])),
-          scale_y * (F16(R[5]) - slope_y * F16(R[8]))};
+  m[0] = scale_x * by_x;
+  m[1] = scale_y * by_y;
 }
 
 // Sixteen projected Gaussians, one pack per field of Splat.
@@ -90,9 +121,8 @@ SP_INLINE Mask16 hold_center(const F16& mean, const F16& extent) {
   return (away <= extent) & (-away <= extent);
 }
 
-// Finishes the projection from P (2x3), where P P^T is the 2D covariance before blurring. Working
-// from the factor keeps needles accurate: det(P P^T) = |p0 x p1|^2 needs no difference of products
-// of large entries. Returns the lanes that are visible.
+// Projects from P (2x3), where P P^T is the 2D covariance before blurring; returns the visible
+// lanes. The factor keeps needles accurate: det(P P^T) = |p0 x p1|^2 subtracts no large products.
 template <bool kDistorted = false>
 SP_INLINE Mask16 finish_projection(const Camera& camera, const Vector16& p_C, const F16& inverse_z,
                                    Vector16 p0, Vector16 p1, F16 log2_opacity, SplatPack& out) {
@@ -102,16 +132,15 @@ SP_INLINE Mask16 finish_projection(const Camera& camera, const Vector16& p_C, co
   p0 = g * p0;
   p1 = g * p1;
   const F16 blur = F16(camera.eps2d) * g * g;
-  const F16 raw00 = p0.x * p0.x + p0.y * p0.y + p0.z * p0.z;
-  const F16 raw11 = p1.x * p1.x + p1.y * p1.y + p1.z * p1.z;
+  const F16 raw00 = dot(p0, p0), raw11 = dot(p1, p1);
   const F16 s00 = raw00 + blur;
   const F16 s11 = raw11 + blur;
-  const F16 s01 = p0.x * p1.x + p0.y * p1.y + p0.z * p1.z;
+  const F16 s01 = dot(p0, p1);
   const Vector16 c = cross(p0, p1);
-  const F16 raw_det = c.x * c.x + c.y * c.y + c.z * c.z;
+  const F16 raw_det = dot(c, c);
   const F16 det = raw_det + blur * (raw00 + raw11 + blur);
   if (camera.antialiased) {
-    // What the blur adds to the area is taken from the opacity (Yu et al. 2024).
+    // The opacity falls by as much as the blur adds to the area (Yu et al. 2024).
     log2_opacity += F16(0.5f) * log2(max(raw_det / det, F16(1e-30f)));
   }
 
@@ -129,7 +158,7 @@ SP_INLINE Mask16 finish_projection(const Camera& camera, const Vector16& p_C, co
     const DistortedPoint p = distort(camera.distortion, slope_x, slope_y);
     out.mean_x = F16(camera.fx) * p.x + F16(camera.cx);
     out.mean_y = F16(camera.fy) * p.y + F16(camera.cy);
-    visible = visible & has_place(camera.distortion, slope_x, slope_y, p);
+    visible = visible & is_on_image(camera.distortion, slope_x, slope_y, p);
   }
   out.log2_opacity = log2_opacity;
   out.depth = p_C.z;
@@ -167,7 +196,7 @@ SP_INLINE size_t append_splats(const SplatPack& p, const F16 color[3], uint32_t 
   size_t count = 0;
   for (; bits; bits &= bits - 1) {
     const int lane = __builtin_ctz(bits);
-    // Field by field: a whole row would wait for its parts.
+    // Field by field: storing a whole row would wait for its parts.
     float* row = reinterpret_cast<float*>(splats + count);
     for (int f = 0; f < 14; ++f) row[f] = fields[f][lane];
     splats[count].index = indices[lane];
@@ -175,6 +204,85 @@ SP_INLINE size_t append_splats(const SplatPack& p, const F16 color[3], uint32_t 
     ++count;
   }
   return count;
+}
+
+// One pack per field of DepthPlane.
+struct PlanePack {
+  F16 ux, uy, vy, w_x, w_y, w;
+};
+
+// From P of `finish_projection` and n_C, the inverse covariance times p_C up to scale.
+template <bool kDistorted>
+SP_INLINE PlanePack depth_plane(const Camera& camera, const Vector16& p_C, const F16& inverse_z,
+                                const Vector16& p0, const Vector16& p1, const Vector16& n_C) {
+  // Keeps a Gaussian seen edge-on invertible [px^2].
+  const F16 margin = F16(1e-8f), one = F16(1.0f);
+  PlanePack out;
+  const F16 s00 = dot(p0, p0), s11 = dot(p1, p1) + margin, s01 = dot(p0, p1);
+  const Vector16 c = cross(p0, p1);
+  const F16 det = dot(c, c) + margin * (s00 + s11);
+  const F16 inverse = one / (s11 * det);
+  const F16 root = F16(kExponentScale) * sqrt(inverse);
+  out.ux = min(root * s11, F16(1e6f)) * inverse_z;
+  out.uy = -(out.ux * s01 * (inverse * det));
+  out.vy = root * sqrt(det) * inverse_z;
+
+  const F16 facing = n_C.x * p_C.x + (n_C.y * p_C.y + n_C.z * p_C.z);
+  const Mask16 known = (facing > F16(1e-30f)) & (facing < F16(1e30f));
+  const F16 inverse_facing = zero_unless(known, one / facing);
+  out.w_x = n_C.x * inverse_facing * F16(1.0f / camera.fx);
+  out.w_y = n_C.y * inverse_facing * F16(1.0f / camera.fy);
+  if constexpr (kDistorted) {
+    // By the pixel instead of the slope: the inverse of the lens's Jacobian.
+    const DistortedPoint p = distort(camera.distortion, p_C.x * inverse_z, p_C.y * inverse_z);
+    const F16 share = inverse_facing / (p.xx * p.yy - p.xy * p.xy);
+    out.w_x = (n_C.x * p.yy - n_C.y * p.xy) * share * F16(1.0f / camera.fx);
+    out.w_y = (n_C.y * p.xx - n_C.x * p.xy) * share * F16(1.0f / camera.fy);
+  }
+  out.w = inverse_z;
+  // Rotates a Gaussian that reaches the camera's plane, so that it has depth everywhere.
+  const F16 fall =
+      F16(kMaxExtent * kMaxExtent) *
+      (out.w_x * out.w_x * s00 + (out.w_y * out.w_y * s11 + F16(2.0f) * out.w_x * out.w_y * s01));
+  const F16 max_fall = F16(kMaxFall) * inverse_z;
+  if (any(fall > max_fall * max_fall)) {
+    const F16 turn = min(max_fall / sqrt(max(fall, F16(1e-30f))), one);
+    out.w_x = turn * out.w_x;
+    out.w_y = turn * out.w_y;
+  }
+  return out;
+}
+
+// Lanes that may show a surface within the camera's max_depth. For a center at depth z and a
+// standard deviation sigma along the optical axis, the plane is at least z^2 / (z + kMaxExtent
+// sigma) deep where alpha is above the cut: toward the rim the inverse depth rises by at most
+// kMaxExtent sigma / z^2. `slack` allows for rounding of boxes of Gaussians.
+SP_INLINE Mask16 within_max_depth(const Camera& camera, const F16& z, const F16& sigma,
+                                  float slack = 1.0f) {
+  return z * z <= F16(slack * camera.max_depth) * (z + F16(kMaxExtent) * sigma);
+}
+
+SP_INLINE F16 norm(const Vector16& a) { return sqrt(a.x * a.x + (a.y * a.y + a.z * a.z)); }
+
+// Makes planes outside the mask transparent: NaN is above no cut.
+SP_INLINE void hide_unless(const Mask16& shown, PlanePack& plane) {
+  plane.ux = select(shown, plane.ux, F16(__builtin_nanf("")));
+}
+
+SP_INLINE void append_planes(const PlanePack& p, uint32_t bits, DepthPlane* planes) {
+  alignas(64) float fields[6][kLanes];
+  const F16* packs[6] = {&p.ux, &p.uy, &p.vy, &p.w_x, &p.w_y, &p.w};
+  for (int f = 0; f < 6; ++f) store(fields[f], *packs[f]);
+  for (; bits; bits &= bits - 1, ++planes) {
+    const int lane = __builtin_ctz(bits);
+    *planes = {fields[0][lane],
+               fields[1][lane],
+               fields[2][lane],
+               fields[3][lane],
+               fields[4][lane],
+               fields[5][lane],
+               {}};
+  }
 }
 
 }  // namespace splatpilot::SIMD_LEVEL

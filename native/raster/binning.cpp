@@ -1,15 +1,10 @@
-// The stages of a frame that Gaussians and surfels share: from the input to lists of tiles.
+// The stages of a frame that Gaussians and surfels share, up to the pairs of tiles.
 #include <algorithm>
 
 #include "project/pair_count.hpp"
 #include "raster/renderer.hpp"
 
 namespace splatpilot {
-
-void Renderer::start(Frame& frame, const Camera& camera, bool keep) {
-  frame.camera = camera;
-  frame.kept = keep;
-}
 
 void Renderer::project(Frame& frame, size_t count, bool median_depth, const ProjectChunk& project) {
   const size_t chunks = (count + kChunkSize - 1) / kChunkSize;
@@ -40,8 +35,8 @@ void Renderer::sort(const Frame& frame) {
   for (size_t i = 0; i < items_.size(); ++i) order_[i] = items_[i].value;
 }
 
-// Counts the pairs of each tile and each task, then puts every pair where the counts say. Tasks are
-// consecutive ranges of the depth order, so the lists do not depend on how many there are.
+// Counts the pairs of each tile and each task, then stores them by the counts. Tasks are
+// consecutive ranges of the depth order, so the lists do not depend on their number.
 void Renderer::bin(Frame& frame, BinKernel kernel) {
   const size_t tiles = frame.tiles();
   const size_t tasks = pool_.threads() == 1 ? 1 : 2 * static_cast<size_t>(pool_.threads());

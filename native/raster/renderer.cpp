@@ -3,11 +3,25 @@
 #include <algorithm>
 #include <atomic>
 #include <limits>
+#include <memory>
 #include <numeric>
 
 #include "core/dispatch.hpp"
 
 namespace splatpilot {
+namespace {
+
+struct alignas(64) Scratch {
+  unsigned char bytes[kBackwardScratchBytes];
+};
+
+// On the heap: threads of some systems have small stacks.
+Scratch* thread_scratch() {
+  thread_local const std::unique_ptr<Scratch> scratch(new Scratch);
+  return scratch.get();
+}
+
+}  // namespace
 
 size_t Frame::splat_count() const {
   return std::accumulate(chunk_counts.begin(), chunk_counts.end(), size_t{0});
@@ -53,7 +67,8 @@ std::shared_ptr<const Frame> Renderer::render(const BakedArrays& scene,
 std::shared_ptr<const Frame> Renderer::draw(const Camera& camera, const Image& image, bool keep,
                                             size_t count, const ProjectChunk& project) {
   const std::shared_ptr<Frame> frame = frames_.take();
-  start(*frame, camera, keep);
+  frame->camera = camera;
+  frame->kept = keep;
   this->project(*frame, count, image.depth_mode == DepthMode::kMedian, project);
   sort(*frame);
   bin(*frame, kernels_.bin);
@@ -84,25 +99,87 @@ void Renderer::composite(Frame& frame, const Image& image) {
   });
 }
 
-bool Renderer::are_valid(const GaussianArrays& g, size_t color_floats) {
-  constexpr float kMost = std::numeric_limits<float>::max();
-  constexpr float kLeast = std::numeric_limits<float>::min();
+bool Renderer::are_valid(const GaussianArrays& g) {
+  constexpr float kLargest = std::numeric_limits<float>::max();
+  constexpr float kSmallest = std::numeric_limits<float>::min();
   const size_t chunks = (g.count + kChunkSize - 1) / kChunkSize;
   std::atomic<bool> valid{true};
   pool_.for_each(chunks, [&](size_t chunk) {
     const size_t begin = chunk * kChunkSize;
     const size_t count = std::min(g.count - begin, size_t{kChunkSize});
-    const size_t color_begin = color_floats * chunk / chunks;
-    const size_t color_count = color_floats * (chunk + 1) / chunks - color_begin;
-    if (!kernels_.all_within(g.means + 3 * begin, 3 * count, -kMost, kMost) ||
+    const size_t colors = 3 * static_cast<size_t>(g.sh_coefficients);
+    if (!kernels_.all_within(g.means + 3 * begin, 3 * count, -kLargest, kLargest) ||
         !kernels_.all_normalizable(g.quats + 4 * begin, count) ||
-        !kernels_.all_within(g.scales + 3 * begin, 3 * count, kLeast, kMost) ||
+        !kernels_.all_within(g.scales + 3 * begin, 3 * count, kSmallest, kLargest) ||
         !kernels_.all_within(g.opacities + begin, count, 0.0f, 1.0f) ||
-        !kernels_.all_within(g.colors + color_begin, color_count, -kMost, kMost)) {
+        !kernels_.all_within(g.colors + colors * begin, colors * count, -kLargest, kLargest)) {
       valid.store(false, std::memory_order_relaxed);
     }
   });
   return valid;
+}
+
+// Every pair is written separately, and a splat's pairs are added in the order of the tiles: the
+// sums do not depend on the threads.
+void Renderer::raster_backward(const Frame& frame, const ImageGradient& image,
+                               SplatGradient* gradients, float* means2d) {
+  const RasterInput input = raster_input(frame);
+  const StageReader record{frame.later_stages.data(), frame.transmittance.data(),
+                           frame.stages_done.data()};
+  if (pair_gradients_.size() < frame.pairs.size()) pair_gradients_.resize(frame.pairs.size());
+  pool_.for_each(frame.stages_done.size(), [&](size_t tile) {
+    kernels_.raster_tile_backward(input, record, image, static_cast<int>(tile), thread_scratch(),
+                                  pair_gradients_.data());
+  });
+  const std::vector<size_t> starts = frame.chunk_starts();
+  pool_.for_each(starts.size(), [&](size_t chunk) {
+    const size_t first = chunk * kChunkSize;
+    kernels_.sum_pairs(frame.splats.data() + first, frame.chunk_counts[chunk],
+                       frame.ranges.data() + first, frame.slots.data(), pair_gradients_.data(),
+                       gradients + starts[chunk]);
+    for (size_t i = starts[chunk]; i < starts[chunk] + frame.chunk_counts[chunk]; ++i) {
+      std::copy_n(gradients[i].mean, 2, means2d + 2 * i);
+    }
+  });
+}
+
+void Renderer::clear_chunk(const GaussianArrays& gaussians, size_t chunk,
+                           const GaussianGradients& out) {
+  const size_t begin = chunk * kChunkSize;
+  const size_t end = std::min(gaussians.count, begin + kChunkSize);
+  const auto clear = [&](float* values, size_t columns) {
+    std::fill(values + columns * begin, values + columns * end, 0.0f);
+  };
+  if (out.overwrite) {
+    clear(out.means, 3);
+    clear(out.quats, 4);
+    clear(out.scales, 3);
+    clear(out.opacities, 1);
+  }
+  if (out.overwrite_colors) clear(out.colors, 3 * static_cast<size_t>(gaussians.sh_coefficients));
+}
+
+PoseSums Renderer::total(const std::vector<PoseSums>& parts) {
+  PoseSums sums{};
+  for (const PoseSums& part : parts) {
+    for (size_t i = 0; i < std::size(sums.values); ++i) sums.values[i] += part.values[i];
+  }
+  return sums;
+}
+
+// A chunk's splats come from the chunk's Gaussians, so each task owns the rows it writes.
+PoseSums Renderer::project_backward(const Frame& frame, const GaussianArrays& gaussians,
+                                    const SplatGradient* gradients, const float* means2d,
+                                    const GaussianGradients& out) {
+  const std::vector<size_t> starts = frame.chunk_starts();
+  std::vector<PoseSums> sums(starts.size());
+  pool_.for_each(starts.size(), [&](size_t chunk) {
+    clear_chunk(gaussians, chunk, out);
+    kernels_.project_backward(gaussians, frame.camera, frame.splats.data() + chunk * kChunkSize,
+                              frame.chunk_counts[chunk], gradients + starts[chunk],
+                              means2d + 2 * starts[chunk], out, &sums[chunk]);
+  });
+  return total(sums);
 }
 
 }  // namespace splatpilot

@@ -1,39 +1,95 @@
-// Frames: project, sort by depth, bin into tiles, composite; and the way back.
+// Frames: project, sort by depth, bin into tiles, composite; and the backward passes.
 #pragma once
 
+#include <atomic>
 #include <functional>
 #include <memory>
 #include <mutex>
 #include <string>
 #include <vector>
 
-#include "core/frame.hpp"
 #include "core/radix_sort.hpp"
 #include "core/thread_pool.hpp"
 #include "core/types.hpp"
 #include "project/camera.hpp"
+#include "surfels/surfel_types.hpp"
 
 namespace splatpilot {
 
-// Holds threads and scratch memory, which is reused by the next frame and never influences it. Not
-// for use by two threads at a time: hold mutex(). Frames do not change any more once they are
-// returned, and with `keep` a backward pass can start from them at any later time.
+struct Frame {
+  Camera camera;
+  size_t gaussians = 0;  // in the input
+  // Chunk c uses the first chunk_counts[c] of splats[c * kChunkSize ...].
+  std::vector<Splat> splats;
+  std::vector<DepthPlane> planes;  // of the splats, for the median depth alone
+  std::vector<size_t> chunk_counts;
+  std::vector<size_t> tile_offsets;
+  std::vector<Pair> pairs;
+
+  // For the backward pass, if `kept`. Splat i is in pairs[slots[k]] for k in ranges[i], by
+  // increasing tile.
+  bool kept = false;
+  std::vector<PairRange> ranges;
+  std::vector<uint32_t> slots;
+  std::vector<size_t> later_stages;
+  std::vector<uint32_t> stages_done;
+  std::vector<float> transmittance;
+
+  int tiles_x() const { return (camera.width + kTileSize - 1) / kTileSize; }
+  int tiles_y() const { return (camera.height + kTileSize - 1) / kTileSize; }
+  size_t tiles() const { return static_cast<size_t>(tiles_x()) * static_cast<size_t>(tiles_y()); }
+  size_t splat_count() const;
+  // The start of each chunk's splats in the order of the input.
+  std::vector<size_t> chunk_starts() const;
+};
+
+inline RasterInput raster_input(const Frame& frame) {
+  return {frame.splats.data(), frame.planes.data(), frame.pairs.data(), frame.tile_offsets.data(),
+          frame.camera.width,  frame.camera.height, frame.tiles_x()};
+}
+
+// Surfels are binned by the splats that bound them: surfels[i] belongs to bounds.splats[i].
+struct SurfelFrame {
+  Frame bounds;
+  std::vector<Surfel> surfels;
+  std::vector<SurfelBlockRecord> records;  // if bounds.kept
+};
+
+// Frames whose memory is reused once no other owner refers to them.
+template <typename T>
+class FramePool {
+ public:
+  std::shared_ptr<T> take() {
+    for (const std::shared_ptr<T>& frame : frames_) {
+      if (frame.use_count() > 1) continue;
+      // The last reader released it on a thread of its own.
+      std::atomic_thread_fence(std::memory_order_acquire);
+      return frame;
+    }
+    return frames_.emplace_back(std::make_shared<T>());
+  }
+
+ private:
+  std::vector<std::shared_ptr<T>> frames_;
+};
+
+// Threads and scratch memory, which is reused by the next frame and never influences it. One thread
+// at a time: hold mutex(). Frames do not change once returned; with `keep` a backward pass can
+// start from them at any later time.
 class Renderer {
  public:
   Renderer(int threads, const std::string& simd_level);
 
   std::shared_ptr<const Frame> render(const GaussianArrays& gaussians, const Camera& camera,
                                       const Image& image, bool keep);
-  // A baked scene, and among it Gaussians that are not: those that move.
+  // A baked scene, with moving Gaussians among it.
   std::shared_ptr<const Frame> render(const BakedArrays& scene, const GaussianArrays& moving,
                                       const Camera& camera, const Image& image);
   // From the image to the frame's splats, in the order of the input; `gradients` and
-  // `means2d` (n, 2), a copy of SplatGradient::mean, hold frame.splat_count(). Returns how many
-  // (splat, 4x4 block) were composited.
-  size_t raster_backward(const Frame& frame, const ImageGradient& image, SplatGradient* gradients,
-                         float* means2d);
-  // From the splats to the Gaussians, which must be those of the frame; `means2d` (n, 2) stands in
-  // for SplatGradient::mean.
+  // `means2d` (n, 2), a copy of SplatGradient::mean, hold frame.splat_count().
+  void raster_backward(const Frame& frame, const ImageGradient& image, SplatGradient* gradients,
+                       float* means2d);
+  // From the splats to the Gaussians of the frame; `means2d` (n, 2) replaces SplatGradient::mean.
   PoseSums project_backward(const Frame& frame, const GaussianArrays& gaussians,
                             const SplatGradient* gradients, const float* means2d,
                             const GaussianGradients& out);
@@ -41,14 +97,13 @@ class Renderer {
   std::shared_ptr<const SurfelFrame> render_surfels(const GaussianArrays& surfels,
                                                     const Camera& camera,
                                                     const SurfelImages<float>& images, bool keep);
-  // From the images to the surfels, which must be those of the kept frame.
+  // From the images to the surfels of the kept frame.
   PoseSums surfels_backward(const SurfelFrame& frame, const GaussianArrays& surfels,
                             const SurfelImages<const float>& gradients,
                             const GaussianGradients& out);
 
-  // Whether every number of the Gaussians can be rendered; `colors` are `color_floats` in all. May
-  // be false for scales of less than the least normal number.
-  bool are_valid(const GaussianArrays& gaussians, size_t color_floats);
+  // Checks that every number of the Gaussians can be rendered. Subnormal scales may fail.
+  bool are_valid(const GaussianArrays& gaussians);
 
   const Kernels& kernels() const { return kernels_; }
   std::mutex& mutex() { return mutex_; }
@@ -66,9 +121,8 @@ class Renderer {
  private:
   using ProjectChunk = std::function<size_t(size_t begin, size_t end, Splat* splats,
                                             DepthPlane* planes, uint32_t* depth_bits)>;
-  void start(Frame& frame, const Camera& camera, bool keep);
-  // Splats of Gaussians [0, count), chunk by chunk, and their planes for `median_depth`: project()
-  // returns how many.
+  // Projects Gaussians [0, count), chunk by chunk, and their planes for `median_depth`. project()
+  // returns the number of splats.
   void project(Frame& frame, size_t count, bool median_depth, const ProjectChunk& project);
   void sort(const Frame& frame);
   void bin(Frame& frame, BinKernel kernel);
@@ -92,7 +146,7 @@ class Renderer {
     std::vector<TilePair> pairs;
     size_t count = 0;
     size_t first_slot = 0;
-    std::vector<uint32_t> tile_counts;  // then: where this task's pairs of a tile go
+    std::vector<uint32_t> tile_counts;  // then: the slots of this task's pairs of a tile
   };
   std::vector<BinTask> bin_tasks_;
   std::vector<PairGradient> pair_gradients_;

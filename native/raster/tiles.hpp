@@ -1,4 +1,4 @@
-// Which 4x4-pixel blocks of which tiles a splat touches.
+// The blocks of 4x4 pixels, of all tiles, that a splat touches.
 #pragma once
 
 #include "core/simd.hpp"
@@ -8,8 +8,8 @@ namespace splatpilot::SIMD_LEVEL {
 
 constexpr int kTileBlocks = kTileSize / kBlockSize;  // on a side
 
-// The blocks of the image, from left to right and from top to bottom, that may hold a pixel of each
-// of 16 splats; none if right < left or bottom < top.
+// The blocks of the image that may hold a pixel of each of 16 splats; none if right < left or
+// bottom < top.
 struct BlockBoxes {
   alignas(64) int32_t left[kLanes], top[kLanes], right[kLanes], bottom[kLanes];
 };
@@ -20,9 +20,9 @@ SP_INLINE void block_range(const F16& low, const F16& high, int tiles, int32_t* 
                            int32_t* last) {
   constexpr float kPerPixel = 1.0f / kBlockSize;
   // Clamped as floats: a box may exceed any integer.
-  const F16 zero = F16(0.0f), most = F16(static_cast<float>(tiles * kTileBlocks - 1));
-  store(first, to_int(clamp((low + F16(0.5f)) * F16(kPerPixel), zero, most)));
-  store(last, to_int(clamp((high - F16(0.5f)) * F16(kPerPixel), zero, most)));
+  const F16 zero = F16(0.0f), end = F16(static_cast<float>(tiles * kTileBlocks - 1));
+  store(first, to_int(clamp((low + F16(0.5f)) * F16(kPerPixel), zero, end)));
+  store(last, to_int(clamp((high - F16(0.5f)) * F16(kPerPixel), zero, end)));
 }
 
 // The 16 blocks of a tile: pixel centers of block b span [left, left + 3] x [top, top + 3].
@@ -40,8 +40,8 @@ SP_INLINE BlockGrid block_grid() {
 }
 
 // The blocks that hold a point with alpha >= 1/255, one bit each. The squared norm u^2 + v^2 is a
-// convex quadratic with its minimum 0 at the mean, so over a rectangle it is least on the line
-// x = (nearest x to the mean) or on y = (nearest y); on either line the minimum is a clamp.
+// convex quadratic with its minimum 0 at the mean, so its minimum over a rectangle lies on the line
+// x = (nearest x to the mean) or on y = (nearest y); on either line it is a clamp.
 SP_INLINE uint32_t touched_blocks(const Splat& s, const BlockGrid& grid, float tile_left,
                                   float tile_top, float budget) {
   const F16 span = F16(static_cast<float>(kBlockSize - 1));
@@ -64,7 +64,7 @@ SP_INLINE uint32_t blocks_of_box(int left, int top, int right, int bottom) {
          (row << (kTileBlocks * (bottom % kTileBlocks)));
 }
 
-// Which blocks splats touch; a little more, so that rounding here never hides a pixel.
+// The blocks that splats touch, enlarged so that rounding never hides a pixel.
 struct SplatFootprint {
   static SP_INLINE BlockBoxes boxes(const Splat* const* splats, int tiles_x, int tiles_y) {
     alignas(64) float fields[4][kLanes];
@@ -109,9 +109,9 @@ size_t bin_footprints(const Splat* splats, const uint32_t* order, size_t begin, 
       if (right < left || bottom < top) continue;
       const int first_column = left / kTileBlocks, last_column = right / kTileBlocks;
       const int first_row = top / kTileBlocks, last_row = bottom / kTileBlocks;
-      const size_t most = static_cast<size_t>(last_column - first_column + 1) *
-                          static_cast<size_t>(last_row - first_row + 1);
-      if (count + most > capacity) {
+      const size_t tiles = static_cast<size_t>(last_column - first_column + 1) *
+                           static_cast<size_t>(last_row - first_row + 1);
+      if (count + tiles > capacity) {
         *pair_count = count;
         return i;
       }
@@ -121,9 +121,9 @@ size_t bin_footprints(const Splat* splats, const uint32_t* order, size_t begin, 
         count += blocks != 0;
         tile_counts[tile] += blocks != 0;
       };
-      // What is small touches nearly all blocks of its box: to take them all costs less than to
-      // ask.
-      if (most == 1 && right - left <= 1 && bottom - top <= 1) {
+      // A small splat touches nearly all blocks of its box; taking them all costs less than
+      // testing.
+      if (tiles == 1 && right - left <= 1 && bottom - top <= 1) {
         append(first_column, first_row, blocks_of_box(left, top, right, bottom));
         continue;
       }

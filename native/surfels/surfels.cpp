@@ -1,4 +1,4 @@
-// Frames of surfels, and the way back.
+// Frames of surfels, and their backward pass.
 #include <algorithm>
 #include <cstring>
 
@@ -23,7 +23,8 @@ std::shared_ptr<const SurfelFrame> Renderer::render_surfels(const GaussianArrays
   const SurfelKernels& kernels = *kernels_.surfels;
   const std::shared_ptr<SurfelFrame> frame = surfel_frames_.take();
   Frame& bounds = frame->bounds;
-  start(bounds, camera, keep);
+  bounds.camera = camera;
+  bounds.kept = keep;
   if (frame->surfels.size() < surfels.count) frame->surfels.resize(surfels.count);
   project(bounds, surfels.count, false,
           [&](size_t begin, size_t end, Splat* splats, DepthPlane*, uint32_t* depth_bits) {

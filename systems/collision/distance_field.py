@@ -11,10 +11,7 @@ from splatpilot.systems.vehicle.state import array_namespace
 
 
 class FieldState(IntEnum):
-    """State of a point of space.
-
-    The numbers are part of the `esdf.npz` format.
-    """
+    """State of a point of space; the numbers are part of the `esdf.npz` format."""
 
     FREE = 0
     OCCUPIED = 1
@@ -41,7 +38,7 @@ class Distances(Protocol):
         ...
 
 
-class DistanceField(Protocol):
+class DistanceField(Distances, Protocol):
     """A signed distance field over the box [lower_W, upper_W] of the world."""
 
     @property
@@ -58,17 +55,11 @@ class DistanceField(Protocol):
         """Returns distance, gradient and state at the points p_WQ (..., 3) [m]."""
         ...
 
-    def distance(self, p_WQ: ArrayLike) -> np.ndarray:
-        """Returns distances (...,) [m], faster than `query`."""
-        ...
-
 
 def soft_barrier(distance: Any, radius: float, beta: float = 4.0, margin: float = 1.0) -> Any:
     """Computes a differentiable collision penalty, near zero in free space (equation 3).
 
         soft(d) = softplus(beta (radius + margin - d)) / beta
-
-    Stable for any finite distance.
 
     Args:
         distance: (...,) [m], signed distance; numpy array, float or torch tensor.
@@ -88,8 +79,5 @@ def soft_barrier(distance: Any, radius: float, beta: float = 4.0, margin: float 
 
 
 def in_collision(distance: Any, radius: float) -> Any:
-    """Checks if a vehicle of this radius [m] touches an obstacle at signed distances (...,) [m].
-
-    False where the distance is NaN.
-    """
+    """Checks if a vehicle of this radius [m] collides at signed distances (...,) [m]; NaN: no."""
     return distance < radius

@@ -8,19 +8,26 @@ from scipy.ndimage import distance_transform_edt, maximum_filter
 
 from splatpilot.systems.collision.distance_field import FieldState
 
-_SLAB = 32  # [voxels] along x that are looked at at a time, for the sake of memory.
+_SLAB = 32  # [voxels] along x per batch, to save memory
+
+
+def neighbor_slices(axis: int) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
+    """Returns the slices of all voxels but the last, and but the first, along an axis."""
+    parts = slice(None, -1), slice(1, None)
+    return tuple(  # pyright: ignore[reportReturnType]
+        tuple(part if a == axis else slice(None) for a in range(3)) for part in parts
+    )
 
 
 def distance_to_voxels(voxels: np.ndarray, voxel_size: float) -> np.ndarray:
-    """Distance from every voxel's center to the nearest center of the marked voxels.
+    """Computes the distance from every voxel's center to the nearest center of marked voxels.
 
     Args:
         voxels: (nx, ny, nz) bool.
         voxel_size: [m].
 
     Returns:
-        (nx, ny, nz) float32 [m], zero at the marked voxels; where none is marked, the diagonal of
-        the grid, which is more than any distance in it.
+        (nx, ny, nz) float32 [m]; the diagonal of the grid if no voxel is marked.
     """
     if not voxels.any():
         return np.full(voxels.shape, _diagonal(voxels.shape, voxel_size), dtype=np.float32)
@@ -28,13 +35,10 @@ def distance_to_voxels(voxels: np.ndarray, voxel_size: float) -> np.ndarray:
 
 
 def occupancy_distances(occupied: np.ndarray, voxel_size: float) -> np.ndarray:
-    """Signed distance to occupied voxels whose surface is the faces of the voxels, never farther
-    than it is, where it is interpolated trilinearly.
+    """Computes signed distances to the faces of occupied voxels, never too large if interpolated.
 
-    At voxel centers the exact distance, less what the interpolant is too large by in the half
-    voxels around: distances to an edge or corner are convex, and a chord is above them. Beside
-    flat walls that is nothing. Against the faces of random voxels the interpolant is 0.1 to 0.4
-    voxel near on average, up to 1 at worst, and never far; in occupied voxels it is not positive.
+    At voxel centers it is the exact distance, less the excess of the trilinear interpolant in the
+    half voxels around: distances to an edge or corner are convex, and a chord is above them.
 
     Args:
         occupied: (nx, ny, nz) bool.
@@ -64,7 +68,7 @@ def occupancy_distances(occupied: np.ndarray, voxel_size: float) -> np.ndarray:
 
 
 def _with_faces(voxels: np.ndarray) -> np.ndarray:
-    """Which samples, half a voxel apart, lie in or on marked voxels: (2nx + 1, ...) bool."""
+    """Marks the samples, half a voxel apart, in or on marked voxels: (2nx + 1, ...) bool."""
     marked = np.zeros([2 * n + 1 for n in voxels.shape], bool)
     for corner in itertools.product(range(3), repeat=3):
         part = tuple(slice(i, i + 2 * n, 2) for i, n in zip(corner, voxels.shape, strict=True))
@@ -73,7 +77,7 @@ def _with_faces(voxels: np.ndarray) -> np.ndarray:
 
 
 def _between(values: np.ndarray) -> np.ndarray:
-    """Values (n, ...) and what lies halfway between neighbors: (2n - 1, ...)."""
+    """Inserts the means of neighbors into values (n, ...): (2n - 1, ...)."""
     for axis in range(values.ndim):
         values = np.moveaxis(values, axis, 0)
         finer = np.empty((2 * len(values) - 1, *values.shape[1:]), values.dtype)
@@ -83,25 +87,22 @@ def _between(values: np.ndarray) -> np.ndarray:
     return values
 
 
-def distances_from_band(
-    occupied: np.ndarray, band: np.ndarray, voxel_size: float, sweeps: int = 2
-) -> np.ndarray:
-    """Signed distance continued from a band of known values around the surface.
+def distances_from_band(occupied: np.ndarray, band: np.ndarray, voxel_size: float) -> np.ndarray:
+    """Continues signed distances from a band of known values around the surface.
 
     A distance field cannot grow faster than the distance traveled, so every voxel s of the band
-    bounds that of a voxel x by |x - s| + |band(s)|, with the sign of band(s) turned where s and x
-    lie on different sides. The nearest s (by the exact transform) gives the first bound; passing
-    the s of the six face neighbors along, `sweeps` times, finds others that bound x tighter.
+    bounds that of a voxel x by |x - s| + |band(s)|, with the opposite sign of band(s) if s and x
+    lie on different sides. The nearest s gives the first bound; passing the s of the six face
+    neighbors along, twice, finds tighter ones.
 
     Args:
         occupied: (nx, ny, nz) bool.
-        band: (nx, ny, nz) float32 [m], signed distance to the surface where it is known, NaN
-            elsewhere; not positive in occupied voxels and not negative in the others.
+        band: (nx, ny, nz) float32 [m], NaN where unknown; not positive in occupied voxels and not
+            negative in the others.
         voxel_size: [m].
-        sweeps: rounds of passing sites to neighbors.
 
     Returns:
-        (nx, ny, nz) float32 [m]; plus or minus the diagonal of the grid when the band is empty.
+        (nx, ny, nz) float32 [m]; plus or minus the diagonal of the grid if the band is empty.
     """
     sites = np.isfinite(band)
     if not sites.any():
@@ -112,36 +113,32 @@ def distances_from_band(
     offset = band[tuple(nearest)] / np.float32(voxel_size)  # band(s), in voxels
     site = nearest.astype(np.float32)  # (3, nx, ny, nz), the index of s
     sign = np.where(occupied, np.float32(-1.0), np.float32(1.0))
-    index = np.ogrid[tuple(slice(0, n) for n in occupied.shape)]
-    index = [axis.astype(np.float32) for axis in index]
+    axes = (np.arange(n, dtype=np.float32) for n in occupied.shape)
+    index = [
+        np.broadcast_to(x, occupied.shape) for x in np.meshgrid(*axes, indexing="ij", sparse=True)
+    ]
 
     def bound(where: tuple[slice, ...], site: np.ndarray, offset: np.ndarray) -> np.ndarray:
-        squared = np.float32(0.0)
-        for axis in range(3):
-            x = index[axis][tuple(w if a == axis else slice(None) for a, w in enumerate(where))]
-            squared = squared + np.square(x - site[axis])
-        return np.sqrt(squared) + sign[where] * offset
+        x, y, z = (np.square(i[where] - s) for i, s in zip(index, site, strict=True))
+        return np.sqrt(x + y + z) + sign[where] * offset
 
     best = bound((slice(None),) * 3, site, offset)
-    for _ in range(sweeps):
-        for axis, step in itertools.product(range(3), (1, -1)):
-            ahead = tuple(slice(1, None) if a == axis else slice(None) for a in range(3))
-            behind = tuple(slice(None, -1) if a == axis else slice(None) for a in range(3))
-            here, there = (ahead, behind) if step == 1 else (behind, ahead)
-            # Copies: the neighbors' sites are read as they were before this pass.
-            candidate, candidate_offset = site[:, *there].copy(), offset[there].copy()
-            tighter = bound(here, candidate, candidate_offset)
-            closer = tighter < best[here]
-            np.copyto(best[here], tighter, where=closer)
-            np.copyto(site[:, *here], candidate, where=closer)
-            np.copyto(offset[here], candidate_offset, where=closer)
+    for _, axis, step in itertools.product(range(2), range(3), (1, -1)):
+        there, here = neighbor_slices(axis)[::step]
+        # Copies: the neighbors' sites are read as they were before this pass.
+        candidate, candidate_offset = site[:, *there].copy(), offset[there].copy()
+        tighter = bound(here, candidate, candidate_offset)
+        closer = tighter < best[here]
+        np.copyto(best[here], tighter, where=closer)
+        np.copyto(site[:, *here], candidate, where=closer)
+        np.copyto(offset[here], candidate_offset, where=closer)
     return sign * best * np.float32(voxel_size)
 
 
 def conservative_distances(
     distances: np.ndarray, states: np.ndarray, voxel_size: float
 ) -> np.ndarray:
-    """Distances with unknown voxels and everything outside the grid taken as occupied.
+    """Computes distances with unknown voxels and all outside the grid taken as occupied.
 
     Args:
         distances: (nx, ny, nz) float32 [m], signed, to the occupied surfaces.
@@ -149,9 +146,8 @@ def conservative_distances(
         voxel_size: [m].
 
     Returns:
-        (nx, ny, nz) float32 [m]: in free voxels the smallest of the distance to an occupied
-        surface, to the faces of unknown voxels and to the faces of the grid; in the others minus
-        the distance to free space.
+        (nx, ny, nz) float32 [m]: in free voxels the distance to the nearest occupied surface, face
+        of an unknown voxel or face of the grid; in the others minus the distance to free space.
     """
     unknown = states == FieldState.UNKNOWN
     result = np.minimum(distances, _distance_to_faces(distances.shape, voxel_size))
@@ -159,15 +155,15 @@ def conservative_distances(
         return result
     free = states == FieldState.FREE
     result = np.minimum(result, distance_to_voxels(unknown, voxel_size) - 0.5 * voxel_size)
-    # A wall seen from one side has free space before it and unknown space behind it: depth in the
-    # two together is measured to free space, or a ridge would run along the back of the wall.
+    # Depth in occupied and unknown space together: otherwise a ridge would run along the back of a
+    # wall that was seen from one side.
     band = np.where(free & (result < 2.0 * voxel_size), np.maximum(result, 0.0), np.nan)
     depth = distances_from_band(~free, band, voxel_size)
     return np.where(free, result, np.minimum(distances, depth))
 
 
 def _distance_to_faces(shape: tuple[int, ...], voxel_size: float) -> np.ndarray:
-    """Distance of the voxel centers to the nearest face of the grid, (nx, ny, nz) float32 [m]."""
+    """Returns the distance of voxel centers to the nearest face of the grid, (nx, ny, nz) [m]."""
     x, y, z = (
         voxel_size * np.minimum(np.arange(n) + 0.5, n - np.arange(n) - 0.5).astype(np.float32)
         for n in shape

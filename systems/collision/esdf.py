@@ -35,9 +35,7 @@ def interpolate_grid(
     occupied_outside: bool = False,
     with_gradient: bool = True,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Interpolates a grid trilinearly between its voxel centers.
-
-    In the outermost half voxels the interpolant is extrapolated.
+    """Interpolates a grid trilinearly, extrapolated in the outermost half voxels.
 
     Args:
         grid: (nx, ny, nz) float32.
@@ -47,10 +45,10 @@ def interpolate_grid(
             distance to that point; otherwise NaN, with a gradient of zero.
 
     Returns:
-        values (...,) and their exact gradients (..., 3) [1/m], zero without `with_gradient`.
+        values (...,) and their exact gradients (..., 3) [1/m], undefined without `with_gradient`.
     """
     points = np.ascontiguousarray(p_WQ, dtype=float).reshape(-1, 3)
-    values, gradients = np.empty(len(points)), np.zeros(points.shape)
+    values, gradients = np.empty(len(points)), np.empty(points.shape)
     _native.grid_distances(
         grid=grid,
         lower_W=lower_W,
@@ -68,19 +66,17 @@ def interpolate_grid(
 class Esdf:
     """A signed distance field sampled at voxel centers and interpolated trilinearly.
 
-    Voxel (i, j, k) covers lower_W + [i, i+1] x [j, j+1] x [k, k+1] * voxel_size. The field is
-    continuous; its gradient is the exact derivative of the interpolant and jumps at the planes
-    through voxel centers. The arrays are read-only, so a field is shared by reference.
+    Voxel (i, j, k) covers lower_W + [i, i+1] x [j, j+1] x [k, k+1] * voxel_size. The gradient is
+    the exact derivative of the interpolant and jumps at the planes through voxel centers. The
+    arrays are read-only, so a field is shared by reference.
 
     Points p_WQ (..., 3) [m] are numpy arrays or torch tensors; results are of the same type, and
     distances of tensors are differentiable.
     """
 
-    distances: np.ndarray  # (nx, ny, nz) float32 [m], at least two voxels an axis, all finite
-    # (nx, ny, nz) uint8, `FieldState` FREE, OCCUPIED or UNKNOWN; the state of a point is that of
-    # the voxel it lies in.
-    states: np.ndarray
-    lower_W: np.ndarray  # (3,) float64 [m] lower corner of the box, the corner of a voxel
+    distances: np.ndarray  # (nx, ny, nz) float32 [m]
+    states: np.ndarray  # (nx, ny, nz) uint8 `FieldState`, of points in the voxel
+    lower_W: np.ndarray  # (3,) float64 [m], lower corner of the box
     voxel_size: float  # [m] edge length of a voxel
     # All outside the box counts as occupied: there the distance is the value at the nearest point
     # of the box minus the distance to it. Otherwise it is NaN and its gradient zero.
@@ -92,12 +88,12 @@ class Esdf:
         states = np.ascontiguousarray(self.states).view()
         lower_W = np.array(self.lower_W, dtype=float)
         voxel_size = float(self.voxel_size)
-        grid = distances.ndim == 3 and min(distances.shape) >= 2
-        what = "shape of distances"
-        require(grid, what, "(nx, ny, nz) with at least 2 voxels an axis", distances.shape)
-        condition = f"uint8 of the distances' shape {distances.shape}"
-        valid = states.shape == distances.shape and states.dtype == np.uint8
-        require(valid, "states", condition, f"{states.dtype} of {states.shape}")
+        shape = distances.shape
+        valid = distances.ndim == 3 and min(shape) >= 2
+        require(valid, "shape of distances", "(nx, ny, nz) with at least 2 voxels an axis", shape)
+        valid = states.shape == shape and states.dtype == np.uint8
+        found = f"{states.dtype} of {states.shape}"
+        require(valid, "states", f"uint8 of the distances' shape {shape}", found)
         highest = states.max()
         require(highest <= FieldState.UNKNOWN, "states", "at most UNKNOWN (2)", highest)
         missing = np.count_nonzero(~np.isfinite(distances))
@@ -105,15 +101,20 @@ class Esdf:
         require(0.0 < voxel_size < np.inf, "voxel_size", "in (0, inf) m", voxel_size)
         valid = lower_W.shape == (3,) and np.isfinite(lower_W).all()
         require(valid, "lower_W", "3 finite coordinates [m]", lower_W)
-        upper_W = lower_W + voxel_size * np.array(distances.shape)
+        upper_W = lower_W + voxel_size * np.array(shape)
         # A grid whose voxels vanish next to its coordinates is empty.
         valid = (upper_W - lower_W > voxel_size).all() and np.isfinite(upper_W).all()
         require(valid, "voxel_size", f"a distance that changes lower_W {lower_W} m", voxel_size)
-        values = (distances, states, lower_W, upper_W)
-        for name, array in zip(("distances", "states", "lower_W", "upper_W"), values, strict=True):
+        for array in (distances, states, lower_W, upper_W):
             array.flags.writeable = False
-            object.__setattr__(self, name, array)  # The class is frozen.
-        object.__setattr__(self, "voxel_size", voxel_size)
+        # The class is frozen.
+        vars(self).update(
+            distances=distances,
+            states=states,
+            lower_W=lower_W,
+            upper_W=upper_W,
+            voxel_size=voxel_size,
+        )
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -134,10 +135,7 @@ class Esdf:
         return x, y, z
 
     def distance(self, p_WQ: Any) -> Any:
-        """Returns signed distances (...,) [m] at the points, NaN outside the bounds.
-
-        A point that is not finite is outside.
-        """
+        """Returns signed distances (...,) [m] at the points, NaN outside the bounds."""
         if _is_tensor(p_WQ):
             return self.query(p_WQ).distance
         return self._interpolate(_points(p_WQ), with_gradient=False)[0]
@@ -158,14 +156,8 @@ class Esdf:
     def _interpolate(
         self, p_WQ: np.ndarray, with_gradient: bool = True
     ) -> tuple[np.ndarray, np.ndarray]:
-        return interpolate_grid(
-            self.distances,
-            self.lower_W,
-            self.voxel_size,
-            p_WQ,
-            self.occupied_outside,
-            with_gradient,
-        )
+        box = self.lower_W, self.voxel_size
+        return interpolate_grid(self.distances, *box, p_WQ, self.occupied_outside, with_gradient)
 
     def _query_tensor(self, p_WQ: Any) -> FieldSample:
         sample = self.query(p_WQ.detach().cpu().numpy())
@@ -178,12 +170,10 @@ class Esdf:
     def conservative(self) -> "Esdf":
         """Returns the field a planner may trust: unknown space and all outside count as occupied.
 
-        Free voxels hold the distance to the nearest of: an occupied surface, an unknown voxel, the
-        faces of the box. Occupied and unknown voxels hold minus the distance to free space, so that
-        the gradient leads out of them. Outside the box the field is at most minus the true distance
-        to free space, and 1-Lipschitz wherever the box's boundary is free (elsewhere up to sqrt 2).
-        At corners where two surfaces meet the interpolant is up to 0.75 voxel too large. The states
-        are kept.
+        Occupied and unknown voxels hold minus the distance to free space, so that the gradient
+        leads out of them. Outside the box the field is at most minus the true distance to free
+        space, and 1-Lipschitz wherever the box's boundary is free (elsewhere up to sqrt 2). At
+        corners where two surfaces meet the interpolant is up to 0.75 voxel too large.
         """
         distances = conservative_distances(self.distances, self.states, self.voxel_size)
         return Esdf(distances, self.states, self.lower_W, self.voxel_size, occupied_outside=True)
@@ -222,16 +212,10 @@ class Esdf:
             kind = f"an array of {ndim} dimensions, of kind {' or '.join(kinds)}"
             found = "nothing" if array is None else f"{array.dtype} of {array.shape}"
             require(valid, f"{path}: {name}", kind, found)
-        version = int(archive["version"])
+        version, distances, states, lower_W, voxel_size, outside = (archive[n] for n in _ENTRIES)
         require(version == FORMAT_VERSION, f"{path}: version", str(FORMAT_VERSION), version)
         try:
-            return cls(
-                archive["distances"],
-                archive["states"],
-                archive["lower_W"],
-                float(archive["voxel_size"]),
-                bool(archive["occupied_outside"]),
-            )
+            return cls(distances, states, lower_W, float(voxel_size), bool(outside))
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from error
 

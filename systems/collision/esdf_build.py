@@ -1,71 +1,129 @@
-"""Builds an `Esdf` from Gaussians or another distance field; imports the other builders."""
+"""Builds an `Esdf` from occupancy, Gaussians or another distance field."""
 
+import itertools
 from collections.abc import Iterator
 
 import numpy as np
 from scipy.ndimage import binary_dilation
 
-from splatpilot.systems.collision.depth_fusion import bounds_of_depth_images, esdf_from_depth_images
-from splatpilot.systems.collision.distance_field import DistanceField
+from splatpilot.systems.collision.distance_field import DistanceField, FieldState
+from splatpilot.systems.collision.distance_transform import (
+    distances_from_band,
+    neighbor_slices,
+    occupancy_distances,
+)
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.collision.occupancy import esdf_from_occupancy, grid_shape
-from splatpilot.systems.collision.octomap import esdf_from_octomap
 from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.splats.scene import GaussianScene
 
-# Standard deviations beyond which a Gaussian counts as zero.
-_SUPPORT = 3.5
-# Standard deviation of the filter that keeps thin Gaussians from falling between voxels, in voxels.
-_FILTER = 0.5
-# Half the thickness left to a thin sheet, in voxels.
-_TRIM = 0.6
-# Evaluations of a Gaussian at a voxel per batch.
-_CHUNK = 2_000_000
+MAX_VOXELS = 250_000_000  # of a field: its construction stays below about 8 GB
+
+_SUPPORT = 3.5  # [standard deviations] beyond which a Gaussian counts as zero
+_FILTER = 0.5  # [voxels] standard deviation of the filter that keeps thin Gaussians visible
+_TRIM = 0.6  # [voxels] half the thickness left to a thin sheet; 0.5 is the least without holes
+_CHUNK = 2_000_000  # evaluations of a Gaussian at a voxel per batch
+# [voxels] to which extents are rounded up: 0 to 8, then rising by a quarter.
+_SIZES = np.unique(np.r_[0:9, np.ceil(8 * 1.25 ** np.arange(60))].astype(int))
+
+
+def grid_shape(lower_W: np.ndarray, upper_W: np.ndarray, voxel_size: float) -> tuple[int, int, int]:
+    """Returns the number of voxels along each axis that cover the box [lower_W, upper_W].
+
+    The last may reach beyond it. Grids have at least 2 voxels an axis and at most `MAX_VOXELS`.
+    """
+    extent = np.asarray(upper_W, dtype=float) - np.asarray(lower_W, dtype=float)
+    valid = extent.shape == (3,) and np.isfinite(extent).all() and (extent > 0.0).all()
+    require(valid, "upper_W", f"finite and above lower_W = {lower_W} m", upper_W)
+    require(0.0 < voxel_size < np.inf, "voxel_size", "in (0, inf) m", voxel_size)
+    # The slack keeps 36 m / 0.1 m at 360 voxels in spite of rounding.
+    count = np.ceil(extent / voxel_size - 1e-6)
+    box = f"a box of {extent} m with voxels of {voxel_size} m"
+    require(count.min() >= 2, box, "at least 2 voxels along each axis", count)
+    limit = f"at most {MAX_VOXELS:.3g} voxels"
+    require(count.prod() <= MAX_VOXELS, box, limit, f"{count.prod():.3g}", "use larger voxels")
+    nx, ny, nz = count.astype(int)
+    return int(nx), int(ny), int(nz)
+
+
+def esdf_from_occupancy(
+    occupied: np.ndarray,
+    unknown: np.ndarray | None,
+    lower_W: np.ndarray,
+    voxel_size: float,
+    surface_offset: np.ndarray | None = None,
+) -> Esdf:
+    """Computes the signed distance field of an occupancy grid.
+
+    Args:
+        occupied: (nx, ny, nz) bool.
+        unknown: (nx, ny, nz) bool, voxels never observed, none of them occupied; None for none.
+        lower_W: (3,) [m], lower corner of the grid.
+        voxel_size: [m].
+        surface_offset: (nx, ny, nz) [m], signed distance of a voxel's center from the surface, not
+            positive in occupied voxels and not negative in others; NaN where it is unknown. Values
+            beyond one voxel are not used. Without values on either side the surface is the faces of
+            its voxels; if all are missing, distances are never too large, see
+            `occupancy_distances`.
+    """
+    occupied = np.asarray(occupied, dtype=bool)
+    unknown = np.zeros_like(occupied) if unknown is None else np.asarray(unknown, dtype=bool)
+    valid = unknown.shape == occupied.shape
+    require(valid, "shape of unknown", f"that of occupied, {occupied.shape}", unknown.shape)
+    both = np.count_nonzero(occupied & unknown)
+    require(not both, "number of voxels both occupied and unknown", "0", both)
+    if surface_offset is None:
+        distances = occupancy_distances(occupied, voxel_size)
+    else:
+        band = _band(occupied, np.asarray(surface_offset, dtype=np.float32), voxel_size)
+        distances = distances_from_band(occupied, band, voxel_size)
+    states = occupied.astype(np.uint8) * np.uint8(FieldState.OCCUPIED)
+    states[unknown] = FieldState.UNKNOWN
+    return Esdf(distances, states, lower_W, voxel_size)
+
+
+def _band(occupied: np.ndarray, offset: np.ndarray, voxel_size: float) -> np.ndarray:
+    """Returns the known signed distances within one voxel of the surface, NaN elsewhere."""
+    valid = offset.shape == occupied.shape
+    require(valid, "shape of surface_offset", f"that of occupied, {occupied.shape}", offset.shape)
+    wrong = np.count_nonzero(np.where(occupied, offset > 0.0, offset < 0.0))
+    condition = "<= 0 in occupied voxels and >= 0 in others"
+    require(not wrong, "surface_offset", condition, f"{wrong} voxels of the wrong sign")
+    with np.errstate(invalid="ignore"):
+        band = np.where(np.abs(offset) < voxel_size, offset, np.float32(np.nan))
+    # A face between occupied and other voxels where neither side knows its offset.
+    known = np.isfinite(band)
+    half = np.float32(0.5 * voxel_size)
+    for axis in range(3):
+        a, b = neighbor_slices(axis)
+        bare = (occupied[a] != occupied[b]) & ~known[a] & ~known[b]
+        for side in (a, b):
+            np.copyto(band[side], np.where(occupied[side], -half, half), where=bare)
+    return band
 
 
 def esdf_from_gaussians(
-    scene: GaussianScene,
-    voxel_size: float = 0.1,
-    lower_W: np.ndarray | None = None,
-    upper_W: np.ndarray | None = None,
-    threshold: float = 0.5,
-    observed: np.ndarray | None = None,
+    scene: GaussianScene, voxel_size: float, lower_W: np.ndarray, upper_W: np.ndarray
 ) -> Esdf:
-    """Computes the distance field of the solid where the Gaussians' density reaches a threshold.
+    """Computes the distance field of the solid where the Gaussians' density reaches 0.5.
 
     The density is sum_i o_i exp(-m_i^2 / 2) with m_i the Mahalanobis distance to Gaussian i, whose
-    variances are enlarged by (voxel_size / 2)^2: a sheet thinner than a voxel would otherwise fall
-    between the voxels. What this adds to a sheet's thickness is cut back to 0.6 voxel on both sides
-    of its middle; half a voxel is the least that leaves no holes. So a thin opaque sheet is seen
-    half a voxel too near (spheres of flat Gaussians: bias -0.48 to -0.56, spread 0.08 voxel), the
-    safe side; one with a thickness of its own reaches about as far as its density does. Inside a
-    hollow shell of Gaussians space counts as free unless `observed` says otherwise.
+    variances are enlarged by (voxel_size / 2)^2 so that thin sheets do not fall between voxels.
+    Sheets are then trimmed to 0.6 voxel on both sides of their middle: a thin opaque one is seen
+    half a voxel too near, the safe side. Space in a hollow shell of Gaussians counts as free.
 
     Args:
         scene: the Gaussians.
         voxel_size: [m].
-        lower_W, upper_W: (3,) [m], by default the box of all centers and half a meter.
-        threshold: density of the surface, more than 0 and less than 1.
-        observed: (nx, ny, nz) bool, observed voxels, of the shape
-            `grid_shape` gives for the box; by default all. Others that are not occupied are
-            UNKNOWN.
+        lower_W, upper_W: (3,) [m], corners of the field.
     """
-    require(0.0 < threshold < 1.0, "threshold", "in (0, 1)", threshold)
-    bounds = lower_W is not None and upper_W is not None
-    require(len(scene) or bounds, "scene", "not empty", 0, "or give lower_W and upper_W")
-    lower_W = scene.means.min(axis=0) - 0.5 if lower_W is None else lower_W
-    upper_W = scene.means.max(axis=0) + 0.5 if upper_W is None else upper_W
     shape = grid_shape(lower_W, upper_W, voxel_size)
-    valid = observed is None or observed.shape == shape
-    require(valid, "shape of observed", f"{shape}", None if observed is None else observed.shape)
     density = density_on_grid(scene, np.asarray(lower_W, dtype=float), shape, voxel_size)
-    offset = _surface_offset(density, threshold, voxel_size)
+    offset = _surface_offset(density, voxel_size)
     occupied = offset <= 0.0
     # Farther out the slope may reach over the rim of the Gaussians' support.
     offset[~np.asarray(binary_dilation(occupied), dtype=bool)] = np.nan
-    unknown = None if observed is None else ~observed & ~occupied
-    return esdf_from_occupancy(occupied, unknown, lower_W, voxel_size, offset)
+    return esdf_from_occupancy(occupied, None, lower_W, voxel_size, offset)
 
 
 def density_on_grid(
@@ -80,8 +138,7 @@ def density_on_grid(
     first = np.maximum(np.ceil(mean - reach), 0.0)
     last = np.minimum(np.floor(mean + reach), np.array(shape) - 1.0)
     extent = np.where(first <= last, last - first + 1.0, 0.0).astype(int)  # (N, 3) voxels
-    # Gaussians of the same extent are evaluated together on the same box of voxels; extents are
-    # rounded up to few values, in steps of a quarter at most.
+    # Gaussians of the same extent are evaluated together on the same box of voxels.
     extent = _SIZES[np.searchsorted(_SIZES, extent)]
     # M maps a vector to the principal axes in standard deviations.
     M = R.transpose(0, 2, 1) / np.sqrt(variance)[:, :, None]
@@ -124,17 +181,17 @@ def _splat(
     np.add.at(density, flat, value[used])
 
 
-def _surface_offset(density: np.ndarray, threshold: float, voxel_size: float) -> np.ndarray:
-    """First-order signed distance of the voxel centers to the solid's surface, (nx, ny, nz) [m].
+def _surface_offset(density: np.ndarray, voxel_size: float) -> np.ndarray:
+    """Computes the signed distance of voxel centers to the surface to first order [m].
 
-    With L = log(density / threshold), the solid is the part of L >= 0 that lies within _TRIM voxels
-    of the middle of a sheet. To first order the surface L = 0 is -L / |grad L| away. At x from the
-    middle of a sheet of standard deviation s, enlarged to S^2 = s^2 + f^2 by the filter f, |grad L|
-    is x / S^2; so f^2 |grad L| = x f^2 / S^2 is the distance to the middle of a thin sheet, and
-    less than that in one thick enough to need no trimming. NaN where there is no density.
+    With L = log(density / 0.5), the solid is the part of L >= 0 within _TRIM voxels of the
+    middle of a sheet. The surface L = 0 is -L / |grad L| away. At x from the middle of a sheet of
+    standard deviation s, enlarged to S^2 = s^2 + f^2 by the filter f, |grad L| is x / S^2; so
+    f^2 |grad L| = x f^2 / S^2 is the distance to the middle of a thin sheet, and less in a thick
+    one, which needs no trimming. NaN without density.
     """
     some = density > 0.0
-    level = np.log(np.where(some, density, np.float32(1e-6)) / np.float32(threshold))
+    level = np.log(np.where(some, density, np.float32(1e-6)) / np.float32(0.5))
     slope = np.sqrt(sum(np.square(g) for g in np.gradient(level, np.float32(voxel_size))))
     with np.errstate(divide="ignore", invalid="ignore"):
         to_level = np.where(level == 0.0, np.float32(0.0), -level / slope)
@@ -143,16 +200,10 @@ def _surface_offset(density: np.ndarray, threshold: float, voxel_size: float) ->
     return np.where(some, offset, np.float32(np.nan))
 
 
-# 0, 1, ... 8, then rising by about a quarter, up to the largest grid.
-_SIZES = np.unique(np.r_[0:9, np.ceil(8 * 1.25 ** np.arange(60))].astype(int))
-
-
 def esdf_from_distance_field(field: DistanceField, voxel_size: float) -> Esdf:
     """Samples a distance field at the voxel centers of a grid over its bounds.
 
-    The values are the field's own, so exact at the centers for an analytic field. The grid covers
-    the bounds with whole voxels; centers beyond the field's bounds take the value of the nearest
-    point inside. States are the field's own.
+    Centers beyond the bounds, if these are not whole voxels apart, take the nearest value inside.
     """
     lower_W, upper_W = np.asarray(field.lower_W, float), np.asarray(field.upper_W, float)
     shape = grid_shape(lower_W, upper_W, voxel_size)
@@ -175,19 +226,7 @@ def cubes_of_points(
 
     Fields find the nearest of many shapes faster for points that lie close together.
     """
-    for i in range(0, len(x), edge):
-        for j in range(0, len(y), edge):
-            for k in range(0, len(z), edge):
-                part = np.s_[i : i + edge, j : j + edge, k : k + edge]
-                axes = np.meshgrid(x[part[0]], y[part[1]], z[part[2]], indexing="ij")
-                yield part, np.stack(axes, axis=-1)
-
-
-__all__ = [
-    "bounds_of_depth_images",
-    "esdf_from_depth_images",
-    "esdf_from_distance_field",
-    "esdf_from_gaussians",
-    "esdf_from_occupancy",
-    "esdf_from_octomap",
-]
+    for i, j, k in itertools.product(*(range(0, len(axis), edge) for axis in (x, y, z))):
+        part = np.s_[i : i + edge, j : j + edge, k : k + edge]
+        axes = np.meshgrid(x[part[0]], y[part[1]], z[part[2]], indexing="ij")
+        yield part, np.stack(axes, axis=-1)

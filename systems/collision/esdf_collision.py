@@ -9,7 +9,6 @@ from pydrake.systems.framework import LeafSystem, ValueProducer
 
 from splatpilot.systems.collision.distance_field import DistanceField, in_collision, soft_barrier
 from splatpilot.systems.collision.shapes import MovingSpheres
-from splatpilot.systems.common.drake import input_port, output_port
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 from splatpilot.systems.vehicle.state import QuadrotorState
@@ -40,7 +39,7 @@ class EsdfCollision(LeafSystem):
     - ``field_state`` (1): the `FieldState` as a number. Outside the field's bounds (3) distance,
       clearance and barrier are NaN, the gradient is zero and there is no collision.
 
-    Stateless; all outputs share one query of the field, which is held by reference.
+    All outputs share one query of the field.
 
     Args:
         field: of static obstacles.
@@ -49,14 +48,6 @@ class EsdfCollision(LeafSystem):
         beta: sharpness of the barrier [1/m].
         margin: of the barrier [m].
     """
-
-    state_input_port = input_port("state")
-    distance_output_port = output_port("distance")
-    gradient_output_port = output_port("gradient")
-    clearance_output_port = output_port("clearance")
-    in_collision_output_port = output_port("in_collision")
-    barrier_output_port = output_port("barrier")
-    field_state_output_port = output_port("field_state")
 
     def __init__(
         self,

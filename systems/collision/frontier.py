@@ -1,4 +1,4 @@
-"""The frontier of a distance field: where seen, free space ends in space nobody looked into."""
+"""The frontier of a distance field, where observed free space ends in unobserved space."""
 
 from collections.abc import Iterable, Sequence
 
@@ -8,35 +8,39 @@ from pydrake.math import RigidTransform
 from scipy.ndimage import binary_dilation, label, maximum_filter
 
 from splatpilot.systems.collision.distance_field import FieldState
-from splatpilot.systems.collision.distance_transform import distance_to_voxels, occupancy_distances
+from splatpilot.systems.collision.distance_transform import (
+    distance_to_voxels,
+    neighbor_slices,
+    occupancy_distances,
+)
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.splats.background import FAR
 
 
 def reachable_space(esdf: Esdf, radius: float) -> NDArray[np.bool_]:
-    """The free voxels (nx, ny, nz) that are connected, by faces, to one in which a sphere of
-    `radius` [m] fits: whatever is seen from where the sphere can be, is seen through them."""
+    """Returns the free voxels (nx, ny, nz) connected by faces to one in which a sphere fits.
+
+    A camera anywhere in the reach of a sphere of `radius` [m] looks through these voxels only.
+    """
     free = esdf.states == FieldState.FREE
     parts = np.asarray(label(free)[0], dtype=np.intp)  # pyright: ignore[reportIndexIssue]
-    room = distance_to_voxels(~free, esdf.voxel_size) - 0.5 * esdf.voxel_size
-    roomy = np.unique(parts[free & (room > radius)])
-    return np.isin(parts, roomy)
+    clearance = distance_to_voxels(~free, esdf.voxel_size) - 0.5 * esdf.voxel_size
+    return np.isin(parts, np.unique(parts[free & (clearance > radius)]))
 
 
 def frontier_faces(
     before: NDArray[np.bool_], hidden: NDArray[np.bool_]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The faces that voxels `before` the frontier (nx, ny, nz) share with those `hidden` behind it.
+    """Finds the faces between voxels `before` the frontier (nx, ny, nz) and `hidden` ones.
 
     Returns:
         Their centers (F, 3) in voxels from the lower corner of the grid, and their unit normals
-        (F, 3), out of what is hidden.
+        (F, 3), out of hidden space.
     """
     centers, normals = [], []
     for axis in range(3):
         normal = np.where(np.arange(3) == axis, 1.0, 0.0)
-        lower = tuple(slice(None, -1) if a == axis else slice(None) for a in range(3))
-        upper = tuple(slice(1, None) if a == axis else slice(None) for a in range(3))
+        lower, upper = neighbor_slices(axis)
         for sign, (low, high) in ((-1.0, (before, hidden)), (1.0, (hidden, before))):
             index = np.argwhere(low[lower] & high[upper])
             centers.append(index + 0.5 + 0.5 * normal)
@@ -51,41 +55,42 @@ def hidden_frontier(
     K: np.ndarray,
     X_WCs: Sequence[RigidTransform],
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], bool]:
-    """Finds the unknown space at the edge of the voxels `reachable` (nx, ny, nz), but for space
-    that an image saw through.
+    """Finds the unknown space at the edge of `reachable` voxels (nx, ny, nz) that no image crossed.
 
-    It begins two voxels behind the last one that was seen to be free: an obstacle there hides
-    nothing of what the images saw. Before the sky, and before surfaces beyond the field's range,
-    space is unknown only because it is far away: an obstacle there would hide them.
+    It begins two voxels behind the last one seen free, where an obstacle hides nothing captured.
+    Before the sky, and before surfaces beyond the field's range, space is unknown only because it
+    is far away: an obstacle there would hide them.
 
     Args:
-        depths, K, X_WCs: what the field was made of, see `esdf_from_depth_images`.
+        depths, K, X_WCs: images of the field, see `esdf_from_depth_images`.
 
     Returns:
-        The first of its voxels (nx, ny, nz), the voxels (nx, ny, nz) before them, and whether it
-        was left open before a surface.
+        The first hidden voxels (nx, ny, nz), the voxels (nx, ny, nz) before them, and True if the
+        frontier was left open before a surface.
     """
     unknown = esdf.states == FieldState.UNKNOWN
-    before = _grown(reachable) & (esdf.states != FieldState.OCCUPIED)
-    first = binary_dilation(before) & unknown & ~_grown(esdf.states == FieldState.FREE)
-    index = np.argwhere(_grown(first) & unknown)
+    before = _dilated(reachable) & (esdf.states != FieldState.OCCUPIED)
+    first = binary_dilation(before) & unknown & ~_dilated(esdf.states == FieldState.FREE)
+    index = np.argwhere(_dilated(first) & unknown)
     p_WV = esdf.lower_W + esdf.voxel_size * (index + 0.5)
-    deepest = np.zeros(len(index))  # [m] of what is seen through each voxel
+    deepest = np.zeros(len(index))  # [m] seen through each voxel
     for depth, X_WC in zip(depths, X_WCs, strict=True):
         z = (p_WV - X_WC.translation()) @ X_WC.rotation().matrix()[:, 2]
-        seen = _values_at(p_WV, depth, K, X_WC)
+        seen = _pixel_values(p_WV, depth, K, X_WC)
         deepest = np.fmax(deepest, np.where(seen > z + esdf.voxel_size, seen, 0.0))
     open_ = np.zeros_like(first)
     open_[tuple(index[deepest > 0.0].T)] = True
     before_surface = bool(((deepest > 0.0) & (deepest < FAR)).any())
-    return first & ~_grown(open_), before, before_surface
+    return first & ~_dilated(open_), before, before_surface
 
 
-def _values_at(
+def _pixel_values(
     p_WQ: np.ndarray, image: np.ndarray, K: np.ndarray, X_WC: RigidTransform
 ) -> NDArray[np.float64]:
-    """Returns the pixels (N,) of an image (H, W) that see the points (N, 3) [m]; NaN beside it and
-    at its border, where rounding decides."""
+    """Returns the pixels (N,) of an image (H, W) that see points (N, 3) [m]; NaN beyond its inside.
+
+    At the border rounding would decide.
+    """
     p_CQ = (p_WQ - X_WC.translation()) @ X_WC.rotation().matrix()
     ahead = np.flatnonzero(p_CQ[:, 2] > 0.0)
     x, y, _ = (p_CQ[ahead] / p_CQ[ahead, 2:]).T
@@ -97,13 +102,13 @@ def _values_at(
     return values
 
 
-def _grown(voxels: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The voxels (nx, ny, nz) and all that touch them, by a corner at least."""
+def _dilated(voxels: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Adds all voxels that share a corner."""
     return np.asarray(maximum_filter(voxels, size=3), dtype=bool)
 
 
 def with_obstacles(esdf: Esdf, voxels: NDArray[np.bool_]) -> Esdf:
-    """The field in which the `voxels` (nx, ny, nz) are occupied too, their faces its surfaces."""
+    """Returns the field in which `voxels` (nx, ny, nz) are occupied too."""
     return Esdf(
         np.minimum(esdf.distances, occupancy_distances(voxels, esdf.voxel_size)),
         np.where(voxels, np.uint8(FieldState.OCCUPIED), esdf.states),

@@ -1,4 +1,4 @@
-"""Reads OctoMap's binary trees (.bt) and turns them into distance fields.
+"""Reads OctoMap's binary trees (.bt) and computes their distance fields.
 
 The format: header lines `id OcTree`, `size` (nodes), `res` (edge of the smallest voxel [m]), then
 `data` and the tree. Each inner node is 16 bits, two for each of its eight children, lowest child in
@@ -14,9 +14,8 @@ import numpy as np
 
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.collision.occupancy import MAX_VOXELS, esdf_from_occupancy
-from splatpilot.systems.common import readers as git_lfs
-from splatpilot.systems.common.readers import reason_of
+from splatpilot.systems.collision.esdf_build import MAX_VOXELS, esdf_from_occupancy
+from splatpilot.systems.common.readers import POINTER, REFUSAL, require_file
 from splatpilot.systems.common.validation import require
 
 _DEPTH = 16  # levels of children below the root
@@ -42,17 +41,14 @@ class Octomap:
         """Upper corner of the known space (3,) [m]."""
         return self.resolution * (self.corners + self.sizes[:, None]).max(axis=0)
 
-    def part(self, most_voxels: float) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the known space, or a box of `most_voxels` about the middle of free space.
+    def part(self, max_voxels: float) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the corners (3,) [m] of a box of at most `max_voxels` about the free space.
 
-        The box has the height of the map and its proportions.
-
-        Returns:
-            lower_W, upper_W: (3,) each [m].
+        It is all of the map, or as high as the map and of its proportions.
         """
         lower, upper = self.corners.min(axis=0), (self.corners + self.sizes[:, None]).max(axis=0)
         shape = (upper - lower).astype(float)
-        shrunk = np.sqrt(min(1.0, most_voxels / shape.prod())) * shape[:2]
+        shrunk = np.sqrt(min(1.0, max_voxels / shape.prod())) * shape[:2]
         free = ~self.occupied if not self.occupied.all() else self.occupied
         volume = self.sizes[free].astype(float) ** 3
         centers = self.corners[free] + 0.5 * self.sizes[free, None]
@@ -66,24 +62,8 @@ class Octomap:
         return self.resolution * lower, self.resolution * upper
 
     def esdf(self, lower_W: np.ndarray | None = None, upper_W: np.ndarray | None = None) -> Esdf:
-        """Computes the distance field of a part of the map, at its resolution, see `states`.
-
-        The surface is the faces of occupied voxels, see `esdf_from_occupancy`.
-        """
-        states, lower_W = self.states(lower_W, upper_W)
-        return esdf_from_occupancy(
-            states == FieldState.OCCUPIED, states == FieldState.UNKNOWN, lower_W, self.resolution
-        )
-
-    def states(
-        self, lower_W: np.ndarray | None = None, upper_W: np.ndarray | None = None
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Returns a grid of the map's smallest voxels over a box, by default all the known space.
-
-        Returns:
-            states (nx, ny, nz) uint8 `FieldState`, and the grid's lower corner (3,) [m], the box's
-            rounded outwards to a voxel.
-        """
+        """Computes the distance field of a box, by default all the known space, at the map's
+        resolution; its corners are rounded outwards to a voxel."""
         lower_W = self.lower_W if lower_W is None else np.asarray(lower_W, dtype=float)
         upper_W = self.upper_W if upper_W is None else np.asarray(upper_W, dtype=float)
         lower = np.floor(lower_W / self.resolution + 1e-6).astype(int)
@@ -98,31 +78,28 @@ class Octomap:
             start = np.maximum(self.corners[of_size] - lower, 0)
             stop = np.minimum(self.corners[of_size] - lower + size, shape)
             inside = (start < stop).all(axis=1)
-            start, stop, of_size = start[inside], stop[inside], value[of_size][inside]
+            start, stop, leaves = start[inside], stop[inside], value[of_size][inside]
             if size == 1:
-                states[tuple(start.T)] = of_size
+                states[tuple(start.T)] = leaves
                 continue
-            for (i0, j0, k0), (i1, j1, k1), leaf in zip(
-                start.tolist(), stop.tolist(), of_size.tolist(), strict=True
-            ):
-                states[i0:i1, j0:j1, k0:k1] = leaf
-        return states, self.resolution * lower
+            for a, b, leaf in zip(start.tolist(), stop.tolist(), leaves.tolist(), strict=True):
+                states[a[0] : b[0], a[1] : b[1], a[2] : b[2]] = leaf
+        occupied, unknown = states == FieldState.OCCUPIED, states == FieldState.UNKNOWN
+        return esdf_from_occupancy(occupied, unknown, self.resolution * lower, self.resolution)
 
 
 def read_octomap(path: str | Path) -> Octomap:
     """Reads a binary OctoMap (.bt) file; raises ValueError for other, damaged or empty files."""
     path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"No such file: {path}")
+    require_file(path)
     content = path.read_bytes()
     header, separator, tree = content.partition(b"\ndata\n")
     lines = header.split(b"\n")
-    if content.startswith(git_lfs.POINTER):
-        raise ValueError(f"{path}: {git_lfs.REFUSAL}")
-    if not separator or not lines[0].startswith(b"# Octomap OcTree binary file"):
-        raise ValueError(
-            f"{path}: not a binary OctoMap; a .bt file starts with '# Octomap OcTree binary file'."
-        )
+    start = b"# Octomap OcTree binary file"
+    if content.startswith(POINTER):
+        raise ValueError(f"{path}: {REFUSAL}")
+    valid = separator and lines[0].startswith(start)
+    require(valid, f"{path}: start", f"{start.decode()!r} of a binary OctoMap", content[:20])
     entries = dict(
         line.decode("ascii", "replace").split(maxsplit=1)
         for line in lines
@@ -130,66 +107,36 @@ def read_octomap(path: str | Path) -> Octomap:
     )
     try:
         kind, count, resolution = entries["id"], int(entries["size"]), float(entries["res"])
-    except (KeyError, ValueError) as error:
-        raise ValueError(
-            f"{path}: the header needs id, size and res; {reason_of(error)} is wrong."
-        ) from None
-    if kind.strip() != "OcTree" or not (np.isfinite(resolution) and resolution > 0.0):
-        raise ValueError(
-            f"{path}: an octree of kind '{reason_of(kind)}' and resolution {resolution} m; "
-            "readable are trees of kind 'OcTree' with a positive resolution."
-        )
-    if not tree:
-        raise ValueError(f"{path}: the octree is empty.")
+    except (KeyError, ValueError):
+        raise ValueError(f"{path}: header must have id, size and res, got {entries}") from None
+    require(kind.strip() == "OcTree", f"{path}: id", "OcTree", kind)
+    require(0.0 < resolution < np.inf, f"{path}: res", "in (0, inf) m", resolution)
     masks = np.frombuffer(tree, dtype="<u2", count=len(tree) // 2)
-    links = _links(path, masks, len(tree))
+    links = _links(masks)
+    size = f"{path}: size of the octree"
+    require(2 * len(links) == len(tree) > 0, size, f"{2 * len(links)} bytes", len(tree))
     corners, sizes, occupied = _leaves(masks, links)
     nodes = len(masks) + len(sizes)
-    if nodes != count:
-        raise ValueError(
-            f"{path}: the header promises {count} nodes, the tree has {nodes}; the file is damaged."
-        )
+    require(nodes == count, f"{path}: number of nodes", f"size = {count}", nodes)
     return Octomap(resolution, corners, sizes, occupied)
 
 
-def esdf_from_octomap(
-    path: str | Path,
-    lower_W: np.ndarray | None = None,
-    upper_W: np.ndarray | None = None,
-) -> Esdf:
-    """Computes the distance field of a binary OctoMap, by default of all known space."""
-    octomap = read_octomap(path)
-    try:
-        return octomap.esdf(lower_W, upper_W)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
+def _links(masks: np.ndarray) -> np.ndarray:
+    """Returns 8 * parent + number as a child of each inner node in file order; -1 for the root.
 
-
-def _links(path: Path, masks: np.ndarray, num_bytes: int) -> np.ndarray:
-    """Returns 8 * parent + number as a child of each inner node in file order; -1 for the root."""
-    children_of = {}
-    for mask in np.unique(masks).tolist():
-        # Last child first: the stack gives them back in order.
-        children_of[mask] = tuple(c for c in range(7, -1, -1) if mask >> 2 * c & 3 == _INNER)
-    links = []
-    stack = [-1]
+    A tree with missing nodes has links for them too, one with further ones has fewer than masks.
+    """
+    children = {  # last child first: the stack returns them in order
+        mask: [c for c in range(7, -1, -1) if mask >> 2 * c & 3 == _INNER]
+        for mask in np.unique(masks).tolist()
+    }
+    links, stack = [], [-1]
     for index, mask in enumerate(masks.tolist()):
         if not stack:
             break
         links.append(stack.pop())
-        for child in children_of[mask]:
-            stack.append(8 * index + child)
-    if stack:
-        raise ValueError(
-            f"{path}: the octree is truncated after {num_bytes} bytes; {len(stack)} inner nodes "
-            "are missing at least."
-        )
-    if 2 * len(links) != num_bytes:
-        raise ValueError(
-            f"{path}: the octree ends after {2 * len(links)} of {num_bytes} bytes; the file is "
-            "damaged."
-        )
-    return np.array(links)
+        stack += [8 * index + child for child in children[mask]]
+    return np.array(links + stack)
 
 
 def _leaves(masks: np.ndarray, links: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

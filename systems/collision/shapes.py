@@ -29,7 +29,7 @@ class Sphere:
 
     def parameters(self) -> tuple[Any, ...]:
         """Returns center (3,) and radius [m]."""
-        return as_point(self.p_WO, "Sphere.p_WO"), _positive(self.radius, "Sphere.radius")
+        return _point(self.p_WO, "Sphere.p_WO"), _radius(self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,8 +42,7 @@ class Capsule:
 
     def parameters(self) -> tuple[Any, ...]:
         """Returns end (3,) [m], unit axis (3,), length and radius [m]."""
-        p_WA, axis, length = _segment(self.p_WA, self.p_WB, "Capsule")
-        return p_WA, axis, length, _positive(self.radius, "Capsule.radius")
+        return *_segment(self), _radius(self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,9 +55,8 @@ class Cylinder:
 
     def parameters(self) -> tuple[Any, ...]:
         """Returns center (3,) [m], unit axis (3,), half length and radius [m]."""
-        p_WA, axis, length = _segment(self.p_WA, self.p_WB, "Cylinder")
-        half = 0.5 * length
-        return p_WA + half * axis, axis, half, _positive(self.radius, "Cylinder.radius")
+        p_WA, axis, length = _segment(self)
+        return p_WA + 0.5 * length * axis, axis, 0.5 * length, _radius(self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +68,7 @@ class Box:
 
     def parameters(self) -> tuple[Any, ...]:
         """Returns center (3,) [m], rotation R_WO (3, 3) and half sizes (3,) [m]."""
-        size = as_point(self.size, "Box.size")
+        size = _point(self.size, "Box.size")
         require((size > 0.0).all(), "Box.size", "> 0 m along each axis", size)
         return self.X_WO.translation(), self.X_WO.rotation().matrix(), 0.5 * size
 
@@ -87,7 +85,7 @@ class HalfSpace:
 
     def parameters(self) -> tuple[Any, ...]:
         """Returns unit normal (3,) and offset [m]."""
-        normal = as_point(self.normal, "HalfSpace.normal")
+        normal = _point(self.normal, "HalfSpace.normal")
         length = np.linalg.norm(normal)
         require(length > 0.0, "HalfSpace.normal", "a direction", normal)
         return normal / length, float(self.offset)
@@ -96,8 +94,7 @@ class HalfSpace:
 Shape = Sphere | Capsule | Cylinder | Box | HalfSpace
 
 _KINDS = {kind: number for number, kind in enumerate(get_args(Shape))}
-_ROW = 15
-"""Numbers that describe a shape, those of a box; others have zeros after their own."""
+_ROW = 15  # parameters of a box; other shapes have fewer
 
 
 def shape_rows(shapes: Sequence[Shape]) -> tuple[np.ndarray, np.ndarray]:
@@ -107,6 +104,29 @@ def shape_rows(shapes: Sequence[Shape]) -> tuple[np.ndarray, np.ndarray]:
         numbers = np.concatenate([np.ravel(number) for number in shape.parameters()])
         row[: len(numbers)] = numbers
     return rows, np.array([_KINDS[type(shape)] for shape in shapes], np.uint8)
+
+
+def _point(value: Any, name: str) -> np.ndarray:
+    point = np.asarray(value, dtype=float)
+    valid = point.shape == (3,) and np.isfinite(point).all()
+    require(valid, name, "3 finite coordinates [m]", value)
+    return point
+
+
+def _radius(shape: Sphere | Capsule | Cylinder) -> float:
+    radius = float(shape.radius)
+    valid = np.isfinite(radius) and radius > 0.0
+    require(valid, f"{type(shape).__name__}.radius", "in (0, inf) m", radius)
+    return radius
+
+
+def _segment(shape: Capsule | Cylinder) -> tuple[np.ndarray, np.ndarray, float]:
+    """Returns end, unit axis and length of a segment."""
+    name = type(shape).__name__
+    p_WA, p_WB = _point(shape.p_WA, f"{name}.p_WA"), _point(shape.p_WB, f"{name}.p_WB")
+    length = float(np.linalg.norm(p_WB - p_WA))
+    require(length > 0.0, f"{name}.p_WB", f"apart from p_WA = {p_WA}", p_WB, "use a Sphere")
+    return p_WA, (p_WB - p_WA) / length, length
 
 
 class ShapeUnion:
@@ -147,40 +167,19 @@ class ShapeUnion:
         return distances, gradients
 
 
-def as_point(value: Any, name: str) -> np.ndarray:
-    """Returns `value`, called `name` in errors, as an array (3,)."""
-    point = np.asarray(value, dtype=float)
-    valid = point.shape == (3,) and np.isfinite(point).all()
-    require(valid, name, "3 finite coordinates [m]", value)
-    return point
-
-
-def _positive(value: float, name: str) -> float:
-    require(np.isfinite(value) and value > 0.0, name, "in (0, inf) m", value)
-    return float(value)
-
-
-def _segment(p_WA: Any, p_WB: Any, name: str) -> tuple[np.ndarray, np.ndarray, float]:
-    """Returns end, unit axis and length of a segment."""
-    p_WA, p_WB = as_point(p_WA, f"{name}.p_WA"), as_point(p_WB, f"{name}.p_WB")
-    length = float(np.linalg.norm(p_WB - p_WA))
-    require(length > 0.0, f"{name}.p_WB", f"apart from p_WA = {p_WA}", p_WB, "use a Sphere")
-    return p_WA, (p_WB - p_WA) / length, length
-
-
 class AnalyticDistanceField:
     """The distance field of a `ShapeUnion` within bounds.
 
     Every point inside the bounds is FREE or OCCUPIED. Outside: NaN, zero, OUTSIDE.
 
     Args:
-        shapes: in any order; if empty, the distance is infinite.
+        shapes: if empty, the distance is infinite.
         lower_W, upper_W: (3,) [m], the bounds.
     """
 
     def __init__(self, shapes: Sequence[Shape], lower_W: ArrayLike, upper_W: ArrayLike) -> None:
-        self.lower_W = as_point(lower_W, "lower_W").copy()
-        self.upper_W = as_point(upper_W, "upper_W").copy()
+        self.lower_W = _point(lower_W, "lower_W").copy()
+        self.upper_W = _point(upper_W, "upper_W").copy()
         valid = (self.lower_W < self.upper_W).all()
         require(valid, "upper_W", f"above lower_W = {self.lower_W} along each axis", self.upper_W)
         self.shapes = tuple(shapes)
@@ -208,10 +207,10 @@ class AnalyticDistanceField:
 
 
 class MovingSpheres:
-    """M spheres that follow given paths.
+    """M spheres that follow given paths back and forth.
 
-    Each has a row of its path per `period` and rests in between. At the end of its path it turns
-    back, and at the beginning again. A row of infinities means that the sphere is absent.
+    Each has a row of its path per `period` and rests in between. A row of infinities means that
+    the sphere is absent.
 
     Args:
         radii: (M,) [m].

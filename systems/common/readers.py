@@ -78,10 +78,10 @@ def yaml_errors(source: str) -> Iterator[None]:
 def read_archive(path: Path) -> dict[str, np.ndarray]:
     """Reads the arrays of an `.npz` file by name; it may hold no Python objects."""
     require_file(path)
-    with _readable(path, "numpy archive"), zipfile.ZipFile(path) as archive:
+    with readable(path, "numpy archive"), zipfile.ZipFile(path) as archive:
         size = sum(entry.file_size for entry in archive.infolist())
     require_readable_size(path, size)
-    with _readable(path, "numpy archive"), np.load(path, allow_pickle=False) as arrays:
+    with readable(path, "numpy archive"), np.load(path, allow_pickle=False) as arrays:
         read = dict(arrays)
         if other := [name for name, array in read.items() if not isinstance(array, np.ndarray)]:
             raise ValueError(f"{other[0]} is not an array")
@@ -103,7 +103,7 @@ def array_layout(path: Path) -> tuple[tuple[int, ...], np.dtype]:
 
 def _mapped(path: Path) -> np.ndarray:
     require_file(path)
-    with _readable(path, "array"):
+    with readable(path, "array"):
         return np.lib.format.open_memmap(path, mode="r")
 
 
@@ -111,12 +111,13 @@ def read_ply_file(path: Path) -> PlyData:
     """Reads the elements of a PLY file."""
     require_file(path)
     require_readable_size(path, path.stat().st_size)
-    with _readable(path, "PLY file"):
+    with readable(path, "PLY file"):
         return PlyData.read(str(path))
 
 
 @contextmanager
-def _readable(path: Path, what: str) -> Iterator[None]:
+def readable(path: Path, what: str) -> Iterator[None]:
+    """Converts any error of a reader to "`path`: not a readable `what`"."""
     try:
         yield
     except Exception as error:  # zipfile, numpy and plyfile raise any type for damaged files.

@@ -20,9 +20,7 @@ from splatpilot.systems.common.validation import require
 
 _log = logging.getLogger(__name__)
 
-MAX_WAIT = 1.6
-"""[periods] Max time between updates; then no observation is waited for."""
-
+_MAX_WAIT = 1.6  # [periods] max time between updates; then no observation is waited for.
 _SAVED = 0.5  # [periods] of rest that may be saved up for observations that come early.
 _MIN_MEAN = 0.95  # [periods] between updates, min average: clocks differ.
 _NOISE = 1e-4  # [s] error of the time of an observation, computed from its age.
@@ -41,13 +39,11 @@ class _Last(NamedTuple):
 class ArrivalTriggered(LeafSystem):
     """Runs the periodic update of a system when an observation comes, instead of at its own times.
 
-    A policy that runs at 15 Hz on images at 15 Hz would see each up to a fifteenth of a second
-    late, by the phase between them. This one runs as an image comes, but no more often than at its
-    rate: it skips some of faster images, by the rule of virtual scheduling (ITU-T I.371, the
-    generic cell rate algorithm). Without a timely image it runs 1.6 periods after the last update.
-
-    An exception of the system is logged, once until the system succeeds again. Then the state is
-    kept, and ``failed`` tells a failsafe not to use the outputs.
+    At its own times, a policy would see images up to a period late. This one runs as an image
+    comes, but no more often than at its rate: it skips some of faster images, by the rule of
+    virtual scheduling (ITU-T I.371, the generic cell rate algorithm). Without a timely image it
+    runs 1.6 periods after the last update. An exception of the system is logged, once until the
+    system succeeds again, and its state is kept.
 
     .. pydrake_system::
 
@@ -55,23 +51,16 @@ class ArrivalTriggered(LeafSystem):
         input_ports: [(ports of the system), observation_age]
         output_ports: [(ports of the system), decided, failed]
 
-    - The ports of the system, by their names.
+    - The ports of the system, by their names; outputs that raise an exception are NaN.
     - ``observation_age`` (1): [s] since the system's observation was sent; infinite before the
       first.
     - ``decided`` (1): [s], the time of the last update.
     - ``failed`` (1): 1 if the last update, or an output after it, raised an exception, else 0.
-      Outputs that raise one are NaN.
 
-    Looks every ``tick`` seconds from time 0; the first update is by the first observation.
+    Looks every ``tick`` [s] from time 0; the first update is by the first observation.
     """
 
     def __init__(self, system: System, tick: float):
-        """Constructs the system.
-
-        Args:
-            system: whose update it runs, see `can_be_triggered`.
-            tick: [s] between looks.
-        """
         super().__init__()
         condition = "a system with discrete state of one period and vectors as outputs"
         name = type(system).__name__
@@ -93,16 +82,20 @@ class ArrivalTriggered(LeafSystem):
         self._last = int(self.DeclareDiscreteState(np.array(_Last())))
         for index in range(system.num_output_ports()):
             self._declare_output(system.get_output_port(index))
-        self.DeclareVectorOutputPort("decided", 1, self._calc_decided, {self.xd_ticket()})
-        self.DeclareVectorOutputPort("failed", 1, self._calc_failed, {self.xd_ticket()})
+        self._declare_last("decided", "time")
+        self._declare_last("failed", "failed")
         self.DeclarePeriodicDiscreteUpdateEvent(tick, 0.0, self._update)
 
+    def _declare_last(self, name: str, field: str) -> None:
+        def calc(context: Context, output: BasicVector) -> None:
+            output[0] = getattr(self._get_last(context), field)
+
+        self.DeclareVectorOutputPort(name, 1, calc, {self.xd_ticket()})
+
     def _declare_output(self, port: OutputPort) -> None:
-        index = int(port.get_index())
+        system, index = self._system, int(port.get_index())
         inputs = [
-            k
-            for k in range(self._system.num_input_ports())
-            if self._system.HasDirectFeedthrough(k, index)
+            k for k in range(system.num_input_ports()) if system.HasDirectFeedthrough(k, index)
         ]
         tickets = {self.xd_ticket(), *(self.get_input_port(k).ticket() for k in inputs)}
 
@@ -131,7 +124,7 @@ class ArrivalTriggered(LeafSystem):
         last, now = self._get_last(context), context.get_time()
         observed = now - float(vector_input(self, "observation_age", context)[0])
         comes, is_new = (observed > seen + _NOISE for seen in (last.looked, last.observed))
-        is_late = now >= last.time + MAX_WAIT * self._period - 1e-6
+        is_late = now >= last.time + _MAX_WAIT * self._period - 1e-6
         discrete_state.set_value(self._last, np.array(last._replace(looked=observed)))
         if math.isinf(observed) or not ((comes and now >= last.due) or is_late):
             return
@@ -161,12 +154,6 @@ class ArrivalTriggered(LeafSystem):
 
     def _get_last(self, context: Context) -> _Last:
         return _Last(*np.asarray(context.get_discrete_state(self._last).value()))
-
-    def _calc_decided(self, context: Context, output: BasicVector) -> None:
-        output[0] = self._get_last(context).time
-
-    def _calc_failed(self, context: Context, output: BasicVector) -> None:
-        output[0] = self._get_last(context).failed
 
 
 def can_be_triggered(system: System) -> bool:

@@ -3,7 +3,7 @@
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
-from splatpilot.systems.common.drake import optional_input, vector_input
+from splatpilot.systems.common.drake import vector_input
 
 
 class BridgeStatus(LeafSystem):
@@ -16,8 +16,8 @@ class BridgeStatus(LeafSystem):
             mode]
         output_ports: [status, observation_age]
 
-    - ``s_age``, ``s_gaps``, ``s_rejected`` (1 each) of each signal ``s``: see
-      :class:`MessageSubscriber`.
+    - ``s_age``, ``s_gaps``, ``s_rejected`` (1 each) of each input ``s``: see
+      :class:`~splatpilot.systems.messaging.lcm_ports.MessageSubscriber`.
     - ``overruns`` (1), optional: number of ticks that ended too late.
     - ``mode`` (2): see :class:`~splatpilot.systems.messaging.failsafe.Failsafe`.
     - ``status`` (7): mode and reason; ages of the state and of the oldest image [s]; sums of gaps
@@ -28,10 +28,10 @@ class BridgeStatus(LeafSystem):
     def __init__(self, images: list[str]):
         """Constructs the system; `images` are the names of the policy's inputs."""
         super().__init__()
-        self._signals = ["state", *images]
-        for signal in self._signals:
-            for suffix in ("age", "gaps", "rejected"):
-                self.DeclareVectorInputPort(f"{signal}_{suffix}", 1)
+        self._inputs = ["state", *images]
+        for name in self._inputs:
+            for signal in ("age", "gaps", "rejected"):
+                self.DeclareVectorInputPort(f"{name}_{signal}", 1)
         self.DeclareVectorInputPort("overruns", 1)
         self.DeclareVectorInputPort("mode", 2)
         self.DeclareVectorOutputPort("status", 7, self._calc_status)
@@ -39,40 +39,35 @@ class BridgeStatus(LeafSystem):
         tickets = tickets or {self.nothing_ticket()}
         self.DeclareVectorOutputPort("observation_age", 1, self._calc_observation_age, tickets)
 
-    def _read(self, context: Context, suffix: str) -> np.ndarray:
-        names = (f"{signal}_{suffix}" for signal in self._signals)
-        return np.concatenate([vector_input(self, name, context) for name in names])
+    def _read(self, context: Context, signal: str, first: int = 0) -> list[float]:
+        names = [f"{name}_{signal}" for name in self._inputs[first:]]
+        return [vector_input(self, name, context)[0] for name in names]
 
     def _calc_status(self, context: Context, output: BasicVector) -> None:
-        ages, mode = self._read(context, "age"), vector_input(self, "mode", context)
-        overruns = optional_input(self, "overruns", context)
-        counts = [self._read(context, suffix).sum() for suffix in ("gaps", "rejected")]
-        late = 0.0 if overruns is None else overruns[0]
-        output.SetFromVector(np.array([*mode, ages[0], max(ages[1:], default=0.0), *counts, late]))
+        mode, overruns = vector_input(self, "mode", context), 0.0
+        if self.GetInputPort("overruns").HasValue(context):
+            overruns = vector_input(self, "overruns", context)[0]
+        ages = self._read(context, "age")
+        gaps, rejected = (sum(self._read(context, signal)) for signal in ("gaps", "rejected"))
+        oldest = max(ages[1:], default=0.0)
+        output.SetFromVector(np.array([*mode, ages[0], oldest, gaps, rejected, overruns]))
 
     def _calc_observation_age(self, context: Context, output: BasicVector) -> None:
-        output[0] = max(self._read(context, "age")[1:], default=0.0)
+        output[0] = max(self._read(context, "age", first=1), default=0.0)
 
 
 class UnixClock(LeafSystem):
-    """Outputs the Unix time of the Context's time, to stamp messages and to compute their ages.
-
-    .. pydrake_system::
-
-        name: UnixClock
-        output_ports: [unix_time]
-
-    - ``unix_time`` (1): [s], the epoch plus the Context's time.
-    - Numeric parameter 0 (1): the epoch [s], the Unix time of the Context's time 0.
-    """
+    """Outputs ``unix_time`` (1) [s], which stamps messages: the epoch, numeric parameter 0, plus
+    the Context's time."""
 
     def __init__(self):
         super().__init__()
         self.DeclareNumericParameter(BasicVector(np.zeros(1)))
         self.DeclareVectorOutputPort("unix_time", 1, self._calc)
 
-    def set_epoch(self, context: Context, epoch: float) -> None:
-        """Sets the Unix time [s] of the Context's time 0."""
+    def set_epoch(self, root: Context, epoch: float) -> None:
+        """Sets the Unix time [s] of the time 0 of a root Context."""
+        context = self.GetMyMutableContextFromRoot(root)
         context.get_mutable_numeric_parameter(0).SetFromVector(np.array([epoch]))
 
     def _calc(self, context: Context, output: BasicVector) -> None:

@@ -10,34 +10,29 @@ from drake import lcmt_header, lcmt_image, lcmt_image_array
 from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
 from splatpilot.systems.common.validation import require
-from splatpilot.systems.messaging.generated import (
-    lcmt_body_rate_command,
-    lcmt_bridge_status,
-    lcmt_depth_grid,
-    lcmt_motion_capture_pose,
-    lcmt_quadrotor_state,
-    lcmt_trajectory_hypotheses,
-    lcmt_vehicle_status,
-    lcmt_velocity_setpoint,
-)
+from splatpilot.systems.messaging import generated
 from splatpilot.systems.policies.hypotheses import (
     NUM_WAYPOINTS,
     WAYPOINT_PERIOD,
     Hypotheses,
     hypotheses_size,
 )
-from splatpilot.systems.vehicle.state import QuadrotorState
-
-WORLD, BODY = "world", "body"  # Names of frames in headers.
 
 
 class Codec:
-    """Converts a signal to messages of one channel and back."""
+    """
+    Converts a signal to messages of one channel and back.
+
+    By default the signal is a vector of the message's `fields`, in their order. Quaternions, whose
+    names begin with q, have length 1, and all numbers are finite but those of `unbounded` fields.
+    """
 
     channel: ClassVar[str]
     port: ClassVar[str]  # Name of the ports of the signal.
     message: ClassVar[Any]  # Type of the messages.
-    frame: str = WORLD  # `header.frame_name` of the messages.
+    fields: ClassVar[tuple[str, ...]] = ()
+    unbounded: ClassVar[tuple[str, ...]] = ()
+    frame: str = "world"  # `header.frame_name` of the messages.
     size: int = 0  # of the vector; 0 of images.
     image: ImageDepth32F | ImageRgba8U | None = None  # Example of the image; None of vectors.
 
@@ -57,69 +52,105 @@ class Codec:
     def pack(self, value: np.ndarray, header: lcmt_header, epoch: float) -> Any:
         """Returns the message, or None without a value yet; `epoch` is the Unix time [s] of the
         Context's time 0."""
-        raise NotImplementedError
+        message, numbers = self.stamped(header), value.tolist()
+        for name in self.fields:
+            default = getattr(message, name)
+            if isinstance(default, list):
+                part, numbers = numbers[: len(default)], numbers[len(default) :]
+            else:
+                part, *numbers = numbers
+                part = type(default)(part)
+            setattr(message, name, part)
+        return message
 
     def unpack(self, message: Any, epoch: float) -> np.ndarray:
-        """Returns the array of a message of the right type and frame.
-
-        Raises:
-            ValueError: for invalid content.
-        """
-        raise NotImplementedError
+        """Returns the array of a message of the right type and frame; raises ValueError for invalid
+        content."""
+        numbers, bounded = [], []
+        for name in self.fields:
+            part = getattr(message, name)
+            if name.startswith("q_"):
+                require_unit_quaternion(part)
+            part = part if isinstance(part, tuple | list) else (part,)
+            numbers += part
+            bounded += part if name not in self.unbounded else ()
+        finite(bounded)
+        return np.array(numbers, dtype=float)
 
 
 class StateCodec(Codec):
     """State (13): p_WB [m], v_WB [m/s], q_WB (wxyz), w_WB_B [rad/s]."""
 
-    channel, port, message, size = "QUADROTOR_STATE", "state", lcmt_quadrotor_state, 13
-
-    def pack(self, value, header, epoch):
-        message = self.stamped(header)
-        message.p_WB, message.v_WB, message.q_WB, message.w_WB_B = QuadrotorState.of(value)
-        return message
-
-    def unpack(self, message, epoch):
-        require_unit_quaternion(message.q_WB)
-        return finite([*message.p_WB, *message.v_WB, *message.q_WB, *message.w_WB_B])
+    channel, port, message, size = "QUADROTOR_STATE", "state", generated.lcmt_quadrotor_state, 13
+    fields = "p_WB", "v_WB", "q_WB", "w_WB_B"
 
 
 class CommandCodec(Codec):
     """Command (4): thrust over mass [m/s^2] and body rates w_cmd_B [rad/s]."""
 
-    channel, port, message, size = "BODY_RATE_COMMAND", "command", lcmt_body_rate_command, 4
-    frame = BODY
-
-    def pack(self, value, header, epoch):
-        message = self.stamped(header)
-        message.thrust, message.w_cmd_B = value[0], value[1:]
-        return message
-
-    def unpack(self, message, epoch):
-        return finite([message.thrust, *message.w_cmd_B])
+    channel, port, size, frame = "BODY_RATE_COMMAND", "command", 4, "body"
+    message, fields = generated.lcmt_body_rate_command, ("thrust", "w_cmd_B")
 
 
 class VelocitySetpointCodec(Codec):
     """Velocity setpoint (4): v_WB [m/s] and heading [rad], NaN if it is free."""
 
     channel, port, size = "VELOCITY_SETPOINT", "velocity_setpoint", 4
-    message = lcmt_velocity_setpoint
+    message, fields, unbounded = generated.lcmt_velocity_setpoint, ("v_WB", "heading"), ("heading",)
+
+    def unpack(self, message, epoch):
+        valid = not np.isinf(message.heading)
+        require(valid, "the heading", "finite or NaN", message.heading)
+        return super().unpack(message, epoch)
+
+
+class MotionCaptureCodec(Codec):
+    """Pose (7) of a body in motion capture: p_WB [m] and q_WB (wxyz)."""
+
+    channel, port, size = "MOTION_CAPTURE_POSE", "motion_capture_pose", 7
+    message, fields = generated.lcmt_motion_capture_pose, ("p_WB", "q_WB")
+
+    def __init__(self, body: str):
+        self.body = body
 
     def pack(self, value, header, epoch):
-        message = self.stamped(header)
-        message.v_WB, message.heading = value[:3], value[3]
+        message = super().pack(value, header, epoch)
+        message.body, message.tracked = self.body, bool(np.isfinite(value).all())
         return message
 
     def unpack(self, message, epoch):
-        heading = message.heading
-        require(not np.isinf(heading), "the heading", "finite or NaN", heading)
-        return np.append(finite(message.v_WB), heading)
+        _require_equal("the body", message.body, self.body)
+        require(message.tracked, f"body {self.body!r}", "tracked", "an untracked pose")
+        return super().unpack(message, epoch)
+
+
+class StatusCodec(Codec):
+    """Status (7): mode, reason, ages of state and observation [s], gaps, rejected, overruns."""
+
+    channel, port, message, size = "BRIDGE_STATUS", "status", generated.lcmt_bridge_status, 7
+    fields = (
+        *("mode", "reason", "state_age", "observation_age"),
+        *("num_gaps", "num_rejected", "num_overruns"),
+    )
+    unbounded, frame = ("state_age", "observation_age"), ""
+
+
+class VehicleStatusCodec(Codec):
+    """Vehicle status (2): 1 if it is armed, and 1 if it obeys the bridge; NaN, which is not sent,
+    if unknown."""
+
+    channel, port, size, frame = "VEHICLE_STATUS", "vehicle_status", 2, ""
+    message, fields = generated.lcmt_vehicle_status, ("armed", "offboard")
+
+    def pack(self, value, header, epoch):
+        return None if np.isnan(value).any() else super().pack(value, header, epoch)
 
 
 class HypothesesCodec(Codec):
     """Plan of K trajectories, see `splatpilot.systems.policies.hypotheses`."""
 
     channel, port = "TRAJECTORY_HYPOTHESES", "hypotheses"
-    message = lcmt_trajectory_hypotheses
+    message = generated.lcmt_trajectory_hypotheses
 
     def __init__(self, num_hypotheses: int):
         self.num_hypotheses, self.size = num_hypotheses, hypotheses_size(num_hypotheses)
@@ -146,139 +177,45 @@ class HypothesesCodec(Codec):
         return finite([plan_time, *message.p_WP, *message.q_WP, *waypoints, *message.costs])
 
 
-class MotionCaptureCodec(Codec):
-    """Pose (7) of a body in motion capture: p_WB [m] and q_WB (wxyz)."""
-
-    channel, port, size = "MOTION_CAPTURE_POSE", "motion_capture_pose", 7
-    message = lcmt_motion_capture_pose
-
-    def __init__(self, body: str):
-        self.body = body
-
-    def pack(self, value, header, epoch):
-        message = self.stamped(header)
-        message.body = self.body
-        message.tracked = bool(np.isfinite(value).all())
-        message.p_WB, message.q_WB = value[:3], value[3:]
-        return message
-
-    def unpack(self, message, epoch):
-        _require_equal("the body", message.body, self.body)
-        require(message.tracked, f"body {self.body!r}", "tracked", "an untracked pose")
-        require_unit_quaternion(message.q_WB)
-        return finite([*message.p_WB, *message.q_WB])
-
-
 class DepthGridCodec(Codec):
-    """Proximity 1 - range / max_range (height * width), row by row from the lowest."""
+    """Proximity 1 - range / max_range (height * width) of a sensor, `frame`, row by row from the
+    lowest."""
 
-    channel, port, message = "DEPTH_GRID", "depth_grid", lcmt_depth_grid
+    channel, port, message = "DEPTH_GRID", "depth_grid", generated.lcmt_depth_grid
 
     def __init__(self, width: int, height: int, max_range: float, frame: str):
-        """
-        Args:
-            width, height: of the grid.
-            max_range: [m] of proximity 0.
-            frame: name of the sensor.
-        """
-        self.width, self.height, self.max_range, self.frame = width, height, max_range, frame
-        self.size = width * height
+        self.size, self.frame = width * height, frame
+        max_range, encoding = float(np.float32(max_range)), self.message.PROXIMITY
+        self._content = {
+            **{"width": width, "height": height, "num_values": self.size},
+            **{"encoding": encoding, "max_range": max_range},
+        }
 
     def pack(self, value, header, epoch):
         message = self.stamped(header)
-        message.width, message.height = self.width, self.height
-        message.max_range, message.encoding = self.max_range, lcmt_depth_grid.PROXIMITY
-        message.num_values, message.values = self.size, value
+        message.values = value
+        for name, content in self._content.items():
+            setattr(message, name, content)
         return message
 
     def unpack(self, message, epoch):
-        _require_equal(
-            "(width, height, num_values, encoding, max_range)",
-            (
-                message.width,
-                message.height,
-                message.num_values,
-                message.encoding,
-                message.max_range,
-            ),
-            (
-                *(self.width, self.height, self.size, lcmt_depth_grid.PROXIMITY),
-                float(np.float32(self.max_range)),
-            ),
-        )
+        for name, content in self._content.items():
+            _require_equal(name, getattr(message, name), content)
         values = finite(message.values)
         low, high = values.min(), values.max()
         require(low >= 0.0 and high <= 1.0, "values", "in [0, 1]", f"{low} to {high}")
         return values
 
 
-class StatusCodec(Codec):
-    """Status (7): mode, reason, ages of state and observation [s], gaps, rejected, overruns."""
-
-    channel, port, message, size = "BRIDGE_STATUS", "status", lcmt_bridge_status, 7
-    frame = ""
-
-    def pack(self, value, header, epoch):
-        message = self.stamped(header)
-        message.mode, message.reason = map(int, value[:2])
-        message.state_age, message.observation_age = value[2:4]
-        message.num_gaps, message.num_rejected, message.num_overruns = map(int, value[4:])
-        return message
-
-    def unpack(self, message, epoch):
-        ages = message.state_age, message.observation_age
-        counts = message.num_gaps, message.num_rejected, message.num_overruns
-        return np.array([message.mode, message.reason, *ages, *counts], dtype=float)
-
-
-class VehicleStatusCodec(Codec):
-    """Vehicle status (2): 1 if it is armed, and 1 if it obeys the bridge; NaN, which is not sent,
-    if unknown."""
-
-    channel, port, message, size = "VEHICLE_STATUS", "vehicle_status", lcmt_vehicle_status, 2
-    frame = ""
-
-    def pack(self, value, header, epoch):
-        if np.isnan(value).any():
-            return None
-        message = self.stamped(header)
-        message.armed, message.offboard = map(bool, value)
-        return message
-
-    def unpack(self, message, epoch):
-        return np.array([message.armed, message.offboard], dtype=float)
-
-
-def finite(values: Any) -> np.ndarray:
-    """Converts values to an array; raises ValueError if one is not finite."""
-    array = np.asarray(values, dtype=float)
-    require(np.isfinite(array).all(), "values", "finite", array.tolist())
-    return array
-
-
-def require_unit_quaternion(q: Any) -> None:
-    """Raises ValueError unless the quaternion has length 1, within 0.01."""
-    is_unit = abs(np.linalg.norm(q) - 1.0) < 0.01
-    require(is_unit, "the attitude", "a unit quaternion", np.asarray(q).tolist())
-
-
-def _require_equal(name: str, value: Any, expected: Any) -> None:
-    require(value == expected, name, repr(expected), repr(value))
-
-
 class ImageCodec(Codec):
-    """Image (height, width, channels), sent with zlib, received with or without it."""
+    """Image (height, width, channels) as an example, of a camera, `frame`; sent with zlib, received
+    with or without it."""
 
     message = lcmt_image_array
     _format: int
     _type: int
 
     def __init__(self, image: ImageDepth32F | ImageRgba8U, frame: str):
-        """
-        Args:
-            image: example.
-            frame: name of the camera.
-        """
         self.image, self.frame = image, frame
 
     def pack(self, value, header, epoch):
@@ -335,3 +272,20 @@ class ColorImageCodec(ImageCodec):
 
     channel, port = "COLOR_IMAGE", "color_image"
     _format, _type = lcmt_image.PIXEL_FORMAT_RGBA, lcmt_image.CHANNEL_TYPE_UINT8
+
+
+def finite(values: Any) -> np.ndarray:
+    """Converts values to an array; raises ValueError if one is not finite."""
+    array = np.asarray(values, dtype=float)
+    require(np.isfinite(array).all(), "values", "finite", array.tolist())
+    return array
+
+
+def require_unit_quaternion(q: Any) -> None:
+    """Raises ValueError unless the quaternion has length 1, within 0.01."""
+    is_unit = abs(np.linalg.norm(q) - 1.0) < 0.01
+    require(is_unit, "the attitude", "a unit quaternion", np.asarray(q).tolist())
+
+
+def _require_equal(name: str, value: Any, expected: Any) -> None:
+    require(value == expected, name, repr(expected), repr(value))

@@ -13,14 +13,10 @@ from splatpilot.systems.policies.velocity import RESPONSE_TIME
 from splatpilot.systems.vehicle.flatness import FlatnessControllerConfig
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
-LEVEL = 0.7
-"""[-] Min z of the normal of surfaces that can be landed on."""
-
-RETURN_SPEED = 1.0
-"""[m/s] Max speed back into the allowed volume."""
-
-_STEP = 0.05  # [m] between checked points of a path; more on paths
-_MAX_STEPS = 1000  # [-] that would need more, which only invalid states cause.
+LEVEL = 0.7  # [-] Min z of the normal of surfaces that can be landed on.
+RETURN_SPEED = 1.0  # [m/s] Max speed back into the allowed volume.
+_STEP = 0.05  # [m] between checked points of a path.
+_MAX_STEPS = 1000  # Only invalid states need more.
 
 
 @dataclass
@@ -45,10 +41,7 @@ class FlightLimits(Config):
         fence = np.array(self.geofence, dtype=float)
         min_side = 2.0 * (VEHICLE_RADIUS + self.min_clearance)
         valid = fence.shape == (2, 3) and bool((fence[1] - fence[0] >= min_side).all())
-        condition = (
-            "two corners of a box, the lower one first, with sides of at least "
-            f"{min_side:.2f} m: the collision sphere and min_clearance"
-        )
+        condition = f"two corners of a box, the lower one first, at least {min_side:.2f} m apart"
         require_field(self, "geofence", valid, condition)
 
 
@@ -85,18 +78,10 @@ class Motion(NamedTuple):
         deceleration: float,
         law: FlatnessControllerConfig,
     ) -> "Motion":
-        """
-        Predicts where a vehicle that is controlled by a delayed state comes to rest.
+        """Predicts where a vehicle that is controlled by a delayed state comes to rest.
 
-        A command takes effect after a dead time: the age of the state, the lag of the attitude, and
-        the period for which commands are held. See `limit_approach`.
-
-        Args:
-            p_WB, v_WB: (3,) [m], [m/s].
-            age: [s] since the measurement, compensated by prediction.
-            unpredicted: [s] further age without prediction.
-            deceleration: [m/s^2].
-            law: that flies the velocities.
+        A command takes effect after a dead time: the `age` of the state [s], for which it is
+        predicted, `unpredicted` age [s], the lag of the attitude, and the period of commands.
         """
         stop = stopping_displacement(v_WB, RESPONSE_TIME, deceleration)
         dead_time = max(age, 0.0) + unpredicted + 1.0 / law.tilt_gain + law.period
@@ -106,16 +91,9 @@ class Motion(NamedTuple):
 def limit_velocity(
     desired: np.ndarray, motion: Motion, near: Surroundings, limits: FlightLimits, landing: bool
 ) -> tuple[np.ndarray, int]:
-    """
-    Limits a velocity (3,) [m/s], W frame.
-
-    Args:
-        desired: (3,) [m/s].
-        landing: allows leaving the box downwards, and touching level surfaces.
-
-    Returns:
-        The velocity, and the last limit that changed it: a reason of `lcmt_bridge_status` or NONE.
-    """
+    """Limits a velocity (3,) [m/s]. Also returns the last limit that changed it, a reason of
+    `lcmt_bridge_status`, or NONE. `landing` allows leaving the box downwards, and touching level
+    surfaces."""
     velocity, reason = desired, status.NONE
 
     def apply(limited: np.ndarray, limit: int) -> None:
@@ -142,9 +120,7 @@ def limit_velocity(
 
     # The path, last: velocities along a fence or an obstacle may lead into another.
     if near.field is not None and not landing:
-        limited = limit_ahead(
-            velocity, *motion[:2], near.field, limits.min_clearance, motion.reaction_time
-        )
+        limited = limit_ahead(velocity, motion, near.field, limits.min_clearance)
         apply(limited, status.LIMITED_CLEARANCE)
     return velocity, reason
 
@@ -158,18 +134,12 @@ def limit_speed(velocity: np.ndarray, max_speed: float) -> np.ndarray:
 def stopping_displacement(
     velocity: np.ndarray, response_time: float, deceleration: float
 ) -> np.ndarray:
-    """
-    Predicts the displacement (3,) [m] of a vehicle from a command to stop until rest.
+    """Predicts the displacement (3,) [m] of a vehicle from a command to stop until rest.
 
     Its velocity v follows a commanded velocity u as v' = (u - v) / T, with T the response time,
     but brakes with at most a: over the distance T v, or (v² + (a T)²) / (2 a) from v = a T. The
     point p + T v at which it would rest then moves with exactly the commanded velocity, since
     (p + T v)' = v + (u - v) = u.
-
-    Args:
-        velocity: (3,) [m/s].
-        response_time: T [s].
-        deceleration: a [m/s^2].
     """
     speed, exponential = float(np.linalg.norm(velocity)), deceleration * response_time
     if speed <= exponential:
@@ -180,41 +150,24 @@ def stopping_displacement(
 def limit_approach(
     velocity: np.ndarray, away: np.ndarray, room: float, reaction_time: float
 ) -> np.ndarray:
-    """
-    Limits a commanded velocity (3,) [m/s] so that the point of rest stays off an obstacle.
+    """Limits a commanded velocity (3,) [m/s] so that the point of rest stays off an obstacle, which
+    is `room` [m] away against the unit vector `away` (3,).
 
     Only the part toward the obstacle is reduced, to at most room / reaction_time; if the room is
     negative it leads away, by at most `RETURN_SPEED`. A point that obeys after a dead time t
     approaches without overshoot if reaction_time >= e t.
-
-    Args:
-        away: (3,) unit vector that leads away from the obstacle.
-        room: [m] from the point of rest to the obstacle, see `stopping_displacement`.
-        reaction_time: [s].
     """
     fastest = max(room / reaction_time, -RETURN_SPEED)
     return velocity + away * max(0.0, -float(velocity.dot(away)) - fastest)
 
 
 def limit_ahead(
-    velocity: np.ndarray,
-    p: np.ndarray,
-    stop: np.ndarray,
-    field: Distances,
-    min_clearance: float,
-    reaction_time: float,
+    velocity: np.ndarray, motion: Motion, field: Distances, min_clearance: float
 ) -> np.ndarray:
-    """
-    Limits a commanded velocity (3,) [m/s] by obstacles on the path: straight to the point of rest,
-    and from there along the velocity.
-
-    Args:
-        p: (3,) [m] position of the vehicle.
-        stop: (3,) [m] from there to the point of rest.
-        field: distances to known obstacles. Outside of it, where they are NaN, the path is free.
-        min_clearance: [m]. A vehicle that is nearer than that may leave.
-        reaction_time: [s].
-    """
+    """Limits a commanded velocity (3,) [m/s] by obstacles on the path: straight to the point of
+    rest, and from there along the velocity. Outside of the field, where distances are NaN, the path
+    is free. A vehicle that is nearer than `min_clearance` [m] may leave."""
+    p, stop, reaction_time = motion
     nearest = min(min_clearance, float(field.distance(p)) - VEHICLE_RADIUS)
     for start, path in ((p, stop), (p + stop, velocity * reaction_time)):
         length = float(np.linalg.norm(path))

@@ -30,7 +30,14 @@ from splatpilot.systems.messaging.receiver import RESTART, Received, Receiver
 DEFAULT_URL = "udpm://239.255.76.67:7667?ttl=0&recv_buf_size=4000000"
 """LCM's own group and port, limited to this host (ttl=0); a buffer for images."""
 
+PUBLISH_OFFSET = 1e-6
+"""[s] from the updates of an instant to publishing their results: publish events of the same
+instant would see the state before the updates."""
+
+SAME_TIME = 1e-4  # [s] Max difference of equal times of measurement, computed from ages.
+MAX_AHEAD = 0.2  # [s] Max lead of a sender's clock; ours is behind while the process is busy.
 _PROBE = "SPLATPILOT_PROBE"
+_QUEUE = 1000  # Max number of waiting messages. LCM's 30 are half a second of states.
 
 # LCM waits by select(), which overwrites its stack for files numbered from 1024; it opens several.
 _MAX_FILES = 1000
@@ -39,16 +46,8 @@ _log = logging.getLogger(__name__)
 
 
 def open_lcm(url: str = DEFAULT_URL) -> LCM:
-    """
-    Opens LCM and checks that it delivers.
-
-    Args:
-        url: as LCM has it, `udpm://GROUP:PORT?ttl=HOPS` or, within this process, `memq://`.
-
-    Raises:
-        OSError: if there is no such provider, the port is in use, or there is no route for
-            multicast.
-    """
+    """Opens LCM at `udpm://GROUP:PORT?ttl=HOPS` or, within this process, `memq://`; raises OSError
+    unless it delivers."""
     if not url.startswith(("udpm://", "memq://")):
         raise OSError(f"the LCM URL must begin with udpm:// or memq://, got {url!r}")
     with open(os.devnull) as file:
@@ -76,14 +75,6 @@ def open_lcm(url: str = DEFAULT_URL) -> LCM:
         raise OSError(f"LCM at {url} does not deliver its own messages; {remedy}")
     lcm.unsubscribe(probe)
     return lcm
-
-
-PUBLISH_OFFSET = 1e-6
-"""[s] from the updates of an instant to publishing their results: publish events of the same
-instant would see the state before the updates."""
-
-SAME_TIME = 1e-4
-"""[s] Max difference of equal times of measurement, computed from ages."""
 
 
 class _Publisher(LeafSystem):
@@ -120,29 +111,17 @@ class MessagePublisher(_Publisher):
         name: MessagePublisher
         input_ports: [(port of the codec), unix_time, enabled, decided]
 
-    - The port of the codec: a vector or an image.
-    - ``unix_time`` (1): [s], see :class:`UnixClock`.
+    - ``unix_time`` (1): [s], see :class:`~splatpilot.systems.messaging.bridge_status.UnixClock`.
     - ``enabled`` (1), optional: 0 sends no messages.
-    - ``decided`` (1), optional: [s], when the signal was computed last. With a ``tick`` it is sent
-      then too, between two periods.
+    - ``decided`` (1), optional: [s], when the signal was computed last. With a ``tick`` [s], it is
+      sent then too, between two periods.
 
-    Publishes every ``period`` seconds from time 0, a microsecond later, and when forced. Stateless:
-    the sequence number is the Context's time in whole periods, so that subscribers count messages
-    that were not sent as missing.
+    Publishes every ``period`` [s] from time 0, a microsecond later, and when forced. The sequence
+    number is the Context's time in whole periods: subscribers count messages that were not sent as
+    missing.
     """
 
     def __init__(self, lcm: LCM, codec: Codec, period: float, tick: float | None = None):
-        """Constructs the system.
-
-        Args:
-            lcm: to send on.
-            codec: of the signal.
-            period: [s] between messages.
-            tick: [s] between looks at `decided`; never if None.
-        """
-        for name, value in (("period", period), ("tick", tick)):
-            valid = value is None or 0.0 < value < math.inf
-            require(valid, f"the {name} of {codec.channel}", "in (0, inf) s", value)
         super().__init__(lcm, codec, "enabled", "decided")
         self._period = period
         self.DeclarePeriodicPublishEvent(period, PUBLISH_OFFSET, self._publish)
@@ -170,6 +149,10 @@ class _Sent(NamedTuple):
     seq: float = -1.0  # of its message.
     came: float = -math.inf  # [s] of its arrival.
 
+    @classmethod
+    def read(cls, context: Context) -> "_Sent":
+        return cls(*np.asarray(context.get_discrete_state_vector().value()))
+
 
 class MeasurementPublisher(_Publisher):
     """Sends each measurement once, when it comes.
@@ -179,22 +162,14 @@ class MeasurementPublisher(_Publisher):
         name: MeasurementPublisher
         input_ports: [(port of the codec), age, unix_time]
 
-    - The port of the codec: the last measured vector.
-    - ``age`` (1): [s] since its measurement; infinite before the first.
-    - ``unix_time`` (1): [s], see :class:`UnixClock`.
+    - ``age`` (1): [s] since the measurement; infinite before the first.
+    - ``unix_time`` (1): [s], see :class:`~splatpilot.systems.messaging.bridge_status.UnixClock`.
 
-    Looks every ``period`` seconds from time 0 and sends a microsecond later, with the time of the
+    Looks every ``period`` [s] from time 0 and sends a microsecond later, with the time of the
     measurement, which must be later than that of the one before.
     """
 
     def __init__(self, lcm: LCM, codec: Codec, period: float):
-        """Constructs the system.
-
-        Args:
-            lcm: to send on.
-            codec: of the signal.
-            period: [s] between looks at the age.
-        """
         super().__init__(lcm, codec, "age")
         self.DeclareDiscreteState(np.array(_Sent()))
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
@@ -202,43 +177,29 @@ class MeasurementPublisher(_Publisher):
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         age, unix_time = (vector_input(self, name, context)[0] for name in ("age", "unix_time"))
-        last = _sent(context)
+        last = _Sent.read(context)
         if unix_time - age > last.measured + SAME_TIME:
             last = _Sent(unix_time - age, last.seq + 1.0, context.get_time())
         discrete_state.set_value(np.array(last))
 
     def _publish(self, context: Context) -> None:
-        last = _sent(context)
+        last = _Sent.read(context)
         if context.get_time() - last.came < 2.0 * PUBLISH_OFFSET:
             self._send(context, int(last.seq), last.measured)
-
-
-def _sent(context: Context) -> _Sent:
-    return _Sent(*np.asarray(context.get_discrete_state_vector().value()))
-
-
-MAX_AHEAD = 0.2
-"""[s] Max lead of a sender's clock; ours is behind while the process is busy."""
-
-_QUEUE = 1000
-"""Max number of waiting messages. LCM's 30 are half a second of states."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Received(Received):
     value: np.ndarray  # of the last valid message
-    utime: int | None = None  # [us] of the last message; None before the first.
+    utime: float = -math.inf  # [us] of the last message.
     seq: int = 0
     session: int = 0
     gaps: int = 0
 
 
 def decode_message(codec: Codec, data: bytes) -> Any:
-    """Decodes a packet to a message for `codec.unpack`.
-
-    Raises:
-        ValueError, struct.error: for another type or frame, and for surplus bytes.
-    """
+    """Decodes a packet for `codec.unpack`; raises ValueError or struct.error for another type or
+    frame, and for surplus bytes."""
     rest = BytesIO(data)
     message: Any = codec.message.decode(rest)
     surplus = len(rest.read())
@@ -249,8 +210,7 @@ def decode_message(codec: Codec, data: bytes) -> Any:
 
 
 class MessageSubscriber(Receiver[_Received]):
-    """Outputs the signal of the last LCM message, its age, and the numbers of lost and rejected
-    ones.
+    """Outputs the signal of the last LCM message, its age, and numbers of lost and rejected ones.
 
     .. pydrake_system::
 
@@ -258,30 +218,19 @@ class MessageSubscriber(Receiver[_Received]):
         input_ports: [unix_time]
         output_ports: [(port of the codec), age, gaps, rejected]
 
-    - ``unix_time`` (1): [s], see :class:`UnixClock`.
-    - The port of the codec: the vector or image of the last message; ``initial`` before the first.
-    - ``age`` (1): [s] since the last message was sent, by the sender's clock, which must be ours or
-      synchronized with it; infinity before the first.
-    - ``gaps`` (1): number of messages that were sent between those that came. A restart of the
-      sender leaves no gap.
+    - ``unix_time`` (1): [s], see :class:`~splatpilot.systems.messaging.bridge_status.UnixClock`.
+    - The port of the codec: the vector or image of the last message; before the first ``initial``,
+      by default NaN or a black image.
+    - ``age`` (1): [s] since the last message was sent, by the sender's clock, which must be
+      synchronized with ours; infinity before the first.
+    - ``gaps`` (1): number of messages that did not come; a restart of the sender leaves no gap.
     - ``rejected`` (1): number of messages of another type or frame, malformed, not finite, no newer
-      than the one before, sent more than 0.2 s ahead of our clock, or by a second sender, which is
-      not heard while the first sends.
+      than the one before, sent more than 0.2 s ahead of our clock, or by a second sender.
 
     The ``lcm.LCM``, outside the Context, keeps 1000 messages between updates.
     """
 
     def __init__(self, lcm: LCM, codec: Codec, period: float, initial: np.ndarray | None = None):
-        """Constructs the system.
-
-        Args:
-            lcm: to receive from.
-            codec: of the signal.
-            period: [s] between updates.
-            initial: the value before the first message; NaN, or black images, if None.
-        """
-        valid = 0.0 < period < math.inf
-        require(valid, f"the period of {codec.channel}", "in (0, inf) s", period)
         image = codec.image
         if initial is None:
             initial = np.full(codec.size, np.nan) if image is None else np.asarray(image.data)
@@ -298,7 +247,7 @@ class MessageSubscriber(Receiver[_Received]):
                 codec.port, lambda: Value(image), weakly(self._calc_image), self._state
             )
         self._declare("gaps", 1, lambda received, _: received.gaps)
-        self._declare_age(lambda got: -math.inf if got.utime is None else got.utime * 1e-6)
+        self._declare_age(lambda received: received.utime * 1e-6)
 
     def has_message(self) -> bool:
         """Checks if the next update will see a message."""
@@ -323,22 +272,20 @@ class MessageSubscriber(Receiver[_Received]):
         ahead = header.utime * 1e-6 - unix_time
         limit, remedy = f"at most {MAX_AHEAD} s ahead", "synchronize the clocks"
         require(ahead <= MAX_AHEAD, "the time of the message", limit, f"{ahead:.3f} s", remedy)
+        later = header.utime - last.utime  # [us]
+        require(later > 0, "the message", "newer than the one before", f"{later} us")
         session = getattr(message, "session", 0)  # Images, whose type is Drake's, have none.
-        lost = 0
-        if last.utime is not None:
-            later = header.utime - last.utime
-            require(later > 0, "the message", "newer than the one before", f"{later} us")
-            is_other = session != last.session or header.seq < last.seq
-            if later < RESTART * 1e6 and is_other:
-                raise ValueError("there are two senders on this channel; end one of them")
-            lost = header.seq - last.seq - 1
+        is_other = session != last.session or header.seq < last.seq
+        if later < RESTART * 1e6 and is_other:
+            raise ValueError("there are two senders on this channel; end one of them")
+        lost = 0 if math.isinf(later) else max(header.seq - last.seq - 1, 0)
         return replace(
             last,
             value=self._codec.unpack(message, epoch),
             utime=header.utime,
             seq=header.seq,
             session=session,
-            gaps=last.gaps + max(lost, 0),
+            gaps=last.gaps + lost,
         )
 
     def _calc_image(self, context: Context, output) -> None:
@@ -347,14 +294,8 @@ class MessageSubscriber(Receiver[_Received]):
 
 @contextmanager
 def recorded(lcm: LCM, path: Path, overwrite: bool = False) -> Iterator[None]:
-    """
-    Writes the messages of all channels into a log, with the times of their arrival.
-
-    A full disk ends the log, with one warning, but not the flight.
-
-    Raises:
-        OSError: if the file exists, unless with `overwrite`, or cannot be written.
-    """
+    """Writes the messages of all channels into a log, with the times of their arrival. A full disk
+    ends the log, with one warning, but not the flight."""
     require_unused(path, overwrite)
     log, is_writable = EventLog(path, "w", overwrite=overwrite), True
 
@@ -381,17 +322,8 @@ def replay(path: Path, lcm: LCM, simulator: Simulator, clock: UnixClock) -> None
     """
     Simulates a diagram while it receives the messages of a log at the times of their arrival.
 
-    The same log gives a bitwise identical simulation.
-
-    Args:
-        path: of the log.
-        lcm: of the diagram's systems, of `memq://`.
-        simulator: of the diagram, at time 0, which is the time of the first message.
-        clock: of the diagram.
-
-    Raises:
-        OSError: if the log cannot be read.
-        ValueError: if it has no messages.
+    The same log gives a bitwise identical simulation. The diagram, with its `clock`, has an LCM of
+    `memq://`; its time is 0, the time of the first message.
     """
     if not path.is_file():
         raise FileNotFoundError(f"No such file: {path}")
@@ -399,7 +331,7 @@ def replay(path: Path, lcm: LCM, simulator: Simulator, clock: UnixClock) -> None
     require(events, str(path), "a log of LCM with messages", "none")
     root = simulator.get_mutable_context()
     first = events[0][0]
-    clock.set_epoch(clock.GetMyMutableContextFromRoot(root), first * 1e-6)
+    clock.set_epoch(root, first * 1e-6)
     for timestamp, channel, data in events:
         simulator.AdvanceTo(max((timestamp - first) * 1e-6, root.get_time()))
         lcm.publish(channel, data)

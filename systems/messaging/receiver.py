@@ -1,8 +1,11 @@
-"""Receiver: base of systems that receive messages; UdpInbox: a source of such messages."""
+"""Receiver: base of systems that receive messages; UDP packets, and a sensor that sends them."""
 
+import contextlib
 import logging
+import math
 import socket
 import struct
+import weakref
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, Self, cast
@@ -13,9 +16,9 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
 from splatpilot.systems.common.drake import vector_input
 from splatpilot.systems.common.validation import Config, bounded, require_field
+from splatpilot.systems.sensing.time_of_flight import Stream, TimeOfFlight, after_packet
 
-RESTART = 1.0
-"""[s] Silence after which a stream may be another."""
+RESTART = 1.0  # [s] Silence after which a stream may be another.
 
 _log = logging.getLogger(__name__)
 
@@ -24,8 +27,7 @@ _log = logging.getLogger(__name__)
 class Received:
     """State of a `Receiver`. It is immutable, and Contexts share it."""
 
-    rejected: int = 0
-    """Number of messages that could not be used."""
+    rejected: int = 0  # Number of messages that could not be used.
 
     def __deepcopy__(self, memo: dict) -> Self:
         return self
@@ -33,24 +35,17 @@ class Received:
 
 class Receiver[R: Received](LeafSystem):
     """
-    Base of systems that take all messages every `period` seconds from time 0.
+    Base of systems that take all messages of a `source` every `period` [s] from time 0.
 
     The update is unrestricted, so that discrete updates of the same instant see it. All systems
     have the output ``rejected`` (1): the number of messages that could not be used. The reason is
-    logged at the first, second, fourth, eighth... rejection.
+    logged at the first, second, fourth, eighth... rejection. `now` is the Unix time [s] of a
+    process that runs with the wall clock; by default it is the input `unix_time`.
     """
 
     def __init__(
         self, initial: R, source: str, period: float, now: Callable[[], float] | None = None
     ):
-        """
-        Args:
-            initial: before the first message.
-            source: name of the sender in the log.
-            period: [s] between updates.
-            now: tells the Unix time [s] of a process that runs with the wall clock; by default it
-                is the input `unix_time`.
-        """
         super().__init__()
         self.source, self._now = source, now
         self._state = {self.abstract_state_ticket(self.DeclareAbstractState(Value(initial)))}
@@ -67,8 +62,7 @@ class Receiver[R: Received](LeafSystem):
         """Declares an output: `value` of the state and, if `timed`, the time [s]."""
 
         def calc(context: Context, output: BasicVector) -> None:
-            received = cast(R, context.get_abstract_state(0).get_value())
-            numbers = np.atleast_1d(value(received, context.get_time()))
+            numbers = np.ravel(value(self._received(context), context.get_time()))
             output.SetFromVector(numbers.astype(float))
 
         tickets = {self.all_sources_ticket()} if timed else self._state
@@ -76,13 +70,13 @@ class Receiver[R: Received](LeafSystem):
 
     def _declare_age(self, stamp: Callable[[R], float]) -> None:
         """Declares the input `unix_time` and the output `age` since a Unix time `stamp` [s]."""
-        self._stamp = stamp
-        self.DeclareVectorInputPort("unix_time", 1)
-        self.DeclareVectorOutputPort("age", 1, self._calc_age)
 
-    def _calc_age(self, context: Context, output: BasicVector) -> None:
-        unix_time = vector_input(self, "unix_time", context)[0]
-        output[0] = unix_time - self._stamp(self._received(context))
+        def calc(context: Context, output: BasicVector) -> None:
+            unix_time = vector_input(self, "unix_time", context)[0]
+            output[0] = unix_time - stamp(self._received(context))
+
+        self.DeclareVectorInputPort("unix_time", 1)
+        self.DeclareVectorOutputPort("age", 1, calc)
 
     def _received(self, context: Context) -> R:
         return cast(R, context.get_abstract_state(0).get_value())
@@ -92,24 +86,15 @@ class Receiver[R: Received](LeafSystem):
         state.get_mutable_abstract_state(0).set_value(received)
 
     def _time_of_reading(self, context: Context) -> float:
-        """
-        Returns the Unix time [s] at which messages have been read; call it after that.
-
-        A process may be behind the wall clock, also within an update. By the Context's time,
-        messages would seem to have come before they were sent.
-        """
+        """Returns the Unix time [s] after messages have been read. By the Context's time, which may
+        be behind the wall clock, messages would seem to have come before they were sent."""
         return self._now() if self._now else float(vector_input(self, "unix_time", context)[0])
 
     def _take(
         self, received: R, messages: Iterable[bytes], strangers: int, read: Callable[[R, bytes], R]
     ) -> R:
-        """
-        Reads messages.
-
-        Args:
-            strangers: number of messages of other senders, which are rejected.
-            read: returns the state after a message; ValueError and struct.error reject it.
-        """
+        """Reads messages by `read`, which returns the state after one; rejects those for which it
+        raises ValueError or struct.error, and a number of messages of strangers."""
         if strangers:
             received = self._reject(received, "its sender is not in `senders`", strangers)
         for message in messages:
@@ -144,13 +129,13 @@ class UdpConfig(Config):
     group: str = ""
 
     def check(self) -> None:
-        for name in ("host", "senders", "group"):
-            value = getattr(self, name)
-            for address in value if isinstance(value, list) else [value] if value else []:
-                require_field(self, name, _is_address(address), "an IPv4 address, as 127.0.0.1")
+        groups = [self.group] if self.group else []
+        given = {"host": [self.host], "senders": self.senders, "group": groups}
+        for name, addresses in given.items():
+            valid = all(map(_is_address, addresses))
+            require_field(self, name, valid, "an IPv4 address, as 127.0.0.1")
         multicast = not self.group or 224 <= int(self.group.partition(".")[0]) <= 239
         require_field(self, "group", multicast, "in 224.0.0.0 to 239.255.255.255")
-        require_field(self, "host", self.host, "an IPv4 address, as 127.0.0.1")
         require_field(self, "senders", self.senders, "a list of at least one address")
 
 
@@ -170,12 +155,7 @@ class Datagrams(NamedTuple):
 
 
 class UdpInbox:
-    """
-    A socket that is read without waiting.
-
-    Raises:
-        OSError: if the port is in use or the address is not this host's.
-    """
+    """A socket that is read without waiting; OSError if the port is in use."""
 
     def __init__(self, config: UdpConfig) -> None:
         self._senders = frozenset(config.senders)
@@ -203,13 +183,10 @@ class UdpInbox:
         """Closes the socket."""
         self._socket.close()
 
-    def send(self, packet: bytes, address: tuple[str, int]) -> bool:
-        """Sends a packet from this port; returns False if there is no route to the host."""
-        try:
+    def send(self, packet: bytes, address: tuple[str, int]) -> None:
+        """Sends a packet from this port, if there is a route to the host."""
+        with contextlib.suppress(OSError):
             self._socket.sendto(packet, address)
-        except OSError:
-            return False
-        return True
 
     def receive(self) -> Datagrams:
         """Returns the packets that have come, oldest first."""
@@ -225,3 +202,78 @@ class UdpInbox:
                 packets.append(packet)
             else:
                 strangers += 1
+
+
+@dataclass
+class TimeOfFlightStream(Config):
+    """The stream of a time-of-flight sensor."""
+
+    udp: UdpConfig = field(default_factory=UdpConfig)
+    sensor: TimeOfFlight = field(default_factory=TimeOfFlight)
+    # [s] Age of images on arrival; the sensor's clock is another.
+    latency: float = bounded(0.03, "[0, 1] s")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Grid(Received):
+    stream: Stream = field(default_factory=Stream)
+    time: float = -math.inf  # [s] of the Context, when the last grid came.
+
+
+class TimeOfFlightReceiver(Receiver[_Grid]):
+    """Outputs the last grid of a stream, its age, and the numbers of lost and rejected packets.
+
+    .. pydrake_system::
+
+        name: TimeOfFlightReceiver
+        output_ports: [depth_grid, age, gaps, rejected]
+
+    - ``depth_grid`` (rows * columns): see
+      :class:`~splatpilot.systems.sensing.time_of_flight.TimeOfFlightGrid`; zeros before the first.
+    - ``age`` (1): [s] since the exposure of the last; infinity before the first.
+    - ``gaps`` (1): number of images that were sent between those that came.
+    - ``rejected`` (1): number of packets of another length, type or size, of other senders, or no
+      newer than the one before.
+    """
+
+    def __init__(self, config: TimeOfFlightStream, period: float):
+        """Constructs the system, which updates every `period` [s]."""
+        config.validate()
+        inbox = UdpInbox(config.udp)
+        super().__init__(_Grid(), f"UDP port {inbox.port}", period)
+        weakref.finalize(self, inbox.close)
+        self._sensor, self._inbox, self._waiting = config.sensor, inbox, list[Datagrams]()
+        shape, latency = (config.sensor.rows, config.sensor.columns), config.latency
+        self._declare(
+            "depth_grid",
+            math.prod(shape),
+            lambda got, _: np.zeros(shape) if got.stream.grid is None else got.stream.grid,
+        )
+        self._declare("age", 1, lambda got, now: now - got.time + latency, timed=True)
+        self._declare("gaps", 1, lambda got, _: got.stream.gaps)
+
+    @property
+    def port(self) -> int:
+        """The UDP port at which the stream arrives."""
+        return self._inbox.port
+
+    def has_message(self) -> bool:
+        """Checks if the next update will see a packet."""
+        self._waiting.append(self._inbox.receive())
+        return any(datagrams.packets for datagrams in self._waiting)
+
+    def _receive(self, context: Context, received: _Grid) -> _Grid:
+        now = context.get_time()
+
+        def read(received: _Grid, packet: bytes) -> _Grid:
+            last = received.stream
+            if now - received.time > RESTART:  # Its clock may have started again.
+                last = last.restarted()
+            stream = after_packet(last, packet, self._sensor)
+            time = now if stream.time_ns > last.time_ns else received.time
+            return replace(received, stream=stream, time=time)
+
+        for datagrams in (*self._waiting, self._inbox.receive()):
+            received = self._take(received, *datagrams, read)
+        self._waiting.clear()
+        return received

@@ -85,7 +85,7 @@ class TimeOfArrival:
         rows = np.empty((ceil(longest / step) + 3, 4))  # both ends, and one for rounding
         grid = {name: getattr(self, name) for name in ("times", "lower_W", "voxel_size", "p_WG")}
         p_WQ = np.ascontiguousarray(p_WQ, dtype=float)
-        count = _native.descend(**grid, p_WQ=p_WQ, step=step, length=longest, way=rows)
+        count = _native.descend(**grid, p_WQ=p_WQ, step=step, length=longest, path=rows)
         *path, covered = rows[:count].T  # 3 of (m,), (m,)
 
         def point_at(length: np.ndarray) -> np.ndarray:

@@ -16,11 +16,8 @@ from splatpilot.systems.px4.mavlink import HOLD, LAND, OFFBOARD, Mavlink
 from splatpilot.systems.px4.telemetry import HEARTBEAT_TIMEOUT
 
 _HEARTBEAT_PERIOD = 1.0  # [s], also between repeated commands.
-
 _BRAKING = 2.0  # [s] of stopping PX4 after the last setpoint: two of its heartbeats.
-
 _STOP = np.array([0.0, 0.0, 0.0, math.nan])  # A velocity setpoint.
-
 _TAKEN = -1.0  # Someone else flies: nothing is requested any more.
 
 _INPUTS = {
@@ -60,6 +57,10 @@ class _Memory(NamedTuple):
     left: float = 0.0  # 0, the sub mode that replaces offboard mode, or `_TAKEN`.
     asked: float = -math.inf  # [s] of the last request.
 
+    @classmethod
+    def read(cls, context: Context) -> "_Memory":
+        return cls(*np.asarray(context.get_discrete_state(0).value()))
+
 
 class _Arrival(NamedTuple):
     """Time of the last setpoint or pose, in the discrete state too."""
@@ -77,19 +78,15 @@ class Px4Commander(LeafSystem):
         input_ports: [setpoint, setpoint_age, bridge_mode, heartbeat_age, armed, mode, granted,
             motion_capture_pose, motion_capture_age, unix_time]
 
-    - ``setpoint`` (4), ``setpoint_age`` (1) [s]: a velocity setpoint or a command of body rates, as
-      configured, and its age.
+    - ``setpoint`` (4), ``setpoint_age`` (1) [s]: velocities or body rates, as configured.
     - ``bridge_mode`` (1), optional: the mode in the bridge's status, see ``lcmt_bridge_status``.
-    - ``heartbeat_age`` (1) [s], ``armed`` (1), ``mode`` (2), ``granted`` (2): of
-      :class:`~splatpilot.systems.px4.telemetry.Px4Telemetry`.
-    - ``motion_capture_pose`` (7), ``motion_capture_age`` (1) [s], optional: p_WB [m] and q_WB of
-      the vehicle.
-    - ``unix_time`` (1): [s].
+    - ``heartbeat_age`` (1) [s], ``armed`` (1), ``mode`` (2), ``granted`` (2): of `Px4Telemetry`.
+    - ``motion_capture_pose`` (7), ``motion_capture_age`` (1) [s], optional: p_WB [m] and q_WB.
 
-    Every ``period`` from time 0 it sends the setpoint, if it is fresh, and also as it comes, for
-    which it looks every ``tick``; every second a heartbeat. It sends poses on as ODOMETRY when they
-    come, each once, unless they follow another within 0.9 ``period`` or are older than a setpoint
-    may be.
+    Every ``period`` [s] from time 0 it sends the setpoint, if it is fresh, and also as it comes,
+    for which it looks every ``tick`` [s]; every second a heartbeat. It sends poses on as ODOMETRY
+    when they come, each once, unless they follow another within 0.9 ``period`` or are older than a
+    setpoint may be.
 
     After ``streaming`` seconds of setpoints it requests offboard mode, and in it arming, each if
     configured and if the bridge flies, once a second until PX4 grants it.
@@ -99,8 +96,7 @@ class Px4Commander(LeafSystem):
     offboard mode again. Nor does it if someone else has left it.
 
     A pilot may have taken over since PX4's last heartbeat. Therefore it requests nothing until a
-    heartbeat has come since the reason for it arose, and since its last request. Setpoints need no
-    such care: PX4 flies by them in offboard mode only.
+    heartbeat has come since the reason for it arose, and since its last request.
     """
 
     def __init__(
@@ -113,28 +109,21 @@ class Px4Commander(LeafSystem):
         period: float = 0.02,
         tick: float = 0.002,
     ):
-        """Constructs the system.
-
-        Args:
-            config: of setpoints and requests.
-            inbox: socket to send from.
-            mavlink: writes messages.
-            address: host and port of PX4.
-            gravity: [m/s^2].
-            period: [s] between setpoints, in whole ticks.
-            tick: [s] between looks for arrivals.
-        """
+        """Constructs the system, which sends from `inbox` to PX4 at `address`."""
         super().__init__()
         config.validate()
-        self._config, self._inbox, self._mavlink = config, inbox, mavlink
-        self._address, self._gravity, self._period = address, gravity, period
+        self._config, self._mavlink, self._gravity, self._period = config, mavlink, gravity, period
+        self._send = lambda packet: inbox.send(packet, address)
         for name, size in _INPUTS.items():
             self.DeclareVectorInputPort(name, size)
         self.DeclareDiscreteState(np.array(_Memory()))
         # By the ages of arrivals: the min time between two that are sent on [s], and the state.
         self._arrivals = {
-            name: (apart, int(self.DeclareDiscreteState(np.array(_Arrival()))))
-            for name, apart in (("setpoint_age", SAME_TIME), ("motion_capture_age", 0.9 * period))
+            name: (interval, int(self.DeclareDiscreteState(np.array(_Arrival()))))
+            for name, interval in (
+                ("setpoint_age", SAME_TIME),
+                ("motion_capture_age", 0.9 * period),
+            )
         }
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
         self.DeclarePeriodicDiscreteUpdateEvent(tick, 0.0, self._look)
@@ -149,17 +138,20 @@ class Px4Commander(LeafSystem):
         now = vector_input(self, "mode", context)
         return now[0] == mode[0] and (mode == OFFBOARD or now[1] == mode[1])
 
+    def _bridge_is(self, context: Context, mode: int, unknown: bool) -> bool:
+        bridge = optional_input(self, "bridge_mode", context)
+        return unknown if bridge is None else bool(bridge[0] == mode)
+
     def _request(self, context: Context) -> bytes | None:
-        """Returns the pending request; None if there is none."""
-        memory, config = _memory(context), self._config
+        """Returns the pending request, if any."""
+        memory, config = _Memory.read(context), self._config
         armed = bool(vector_input(self, "armed", context)[0])
         if memory.left:
             mode = (HOLD[0], int(memory.left))
             taken = memory.left == _TAKEN or self._is_in(context, mode) or not armed
             return None if taken else self._mavlink.set_mode(mode)
         streamed = context.get_time() - memory.streaming >= config.streaming
-        bridge = optional_input(self, "bridge_mode", context)
-        flies = bridge is None or bridge[0] == status.FLYING
+        flies = self._bridge_is(context, status.FLYING, unknown=True)
         if not (config.engage and streamed and flies):
             return None
         if not self._is_in(context, OFFBOARD):
@@ -168,12 +160,11 @@ class Px4Commander(LeafSystem):
         return self._mavlink.arm() if may_arm and not armed else None
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        now, memory = context.get_time(), _memory(context)
+        now, memory = context.get_time(), _Memory.read(context)
         age = vector_input(self, "heartbeat_age", context)[0]
         heard, is_known = now - age, age <= HEARTBEAT_TIMEOUT
         fresh, offboard = self._is_fresh(context, "setpoint_age"), self._is_in(context, OFFBOARD)
-        bridge = optional_input(self, "bridge_mode", context)
-        landing = bridge is not None and bridge[0] == status.LANDING
+        landing = self._bridge_is(context, status.LANDING, unknown=False)
         if not fresh:
             memory = memory._replace(streaming=math.nan)
         elif math.isnan(memory.streaming):
@@ -197,10 +188,10 @@ class Px4Commander(LeafSystem):
 
     def _look(self, context: Context, discrete_state: DiscreteValues) -> None:
         unix_time = vector_input(self, "unix_time", context)[0]
-        for name, (apart, index) in self._arrivals.items():
+        for name, (interval, index) in self._arrivals.items():
             age = optional_input(self, name, context)
             last = _Arrival(*np.asarray(context.get_discrete_state(index).value()))
-            if age is not None and unix_time - age[0] > last.sent + apart:
+            if age is not None and unix_time - age[0] > last.sent + interval:
                 arrival = _Arrival(unix_time - age[0], context.get_time())
                 discrete_state.set_value(index, np.array(arrival))
 
@@ -221,10 +212,11 @@ class Px4Commander(LeafSystem):
             self._send(self._mavlink.odometry(pose, round(exposed * 1e6)))
 
     def _publish_setpoint(self, context: Context) -> None:
-        now, memory = context.get_time() - PUBLISH_OFFSET, _memory(context)
+        now, memory = context.get_time() - PUBLISH_OFFSET, _Memory.read(context)
+        is_fresh = self._is_fresh(context, "setpoint_age")
         if memory.left:
             return
-        if not self._is_fresh(context, "setpoint_age"):
+        if not is_fresh:
             if memory.flown and now - memory.ceased <= _BRAKING:
                 self._send(self._mavlink.velocity_setpoint(_STOP, now))
             return
@@ -236,17 +228,10 @@ class Px4Commander(LeafSystem):
             self._send(self._mavlink.body_rates(setpoint, thrust, self._gravity, now))
 
     def _publish(self, context: Context) -> None:
-        now, memory = context.get_time() - PUBLISH_OFFSET, _memory(context)
+        now, memory = context.get_time() - PUBLISH_OFFSET, _Memory.read(context)
         tick = round(now / self._period)
         if tick % round(_HEARTBEAT_PERIOD / self._period) == 0:
             self._send(self._mavlink.heartbeat())
         self._publish_setpoint(context)
         if abs(now - memory.asked) < 0.5 * self._period and (request := self._request(context)):
             self._send(request)
-
-    def _send(self, packet: bytes) -> None:
-        self._inbox.send(packet, self._address)
-
-
-def _memory(context: Context) -> _Memory:
-    return _Memory(*np.asarray(context.get_discrete_state(0).value()))

@@ -7,20 +7,16 @@ import numpy as np
 
 from splatpilot.systems.common.extras import import_extra
 from splatpilot.systems.messaging.codecs import finite, require_unit_quaternion
-from splatpilot.systems.px4.frames import swap_px4, swap_px4_attitude, thrust_to_px4
+from splatpilot.systems.px4.frames import swap_px4, thrust_to_px4
 
 _ONBOARD_COMPUTER = 191  # MAV_COMP_ID_ONBOARD_COMPUTER
 _CUSTOM_MODE, _ARMED = 1, 128  # MAV_MODE_FLAGs
 _ACCEPTED = 0  # MAV_RESULT_ACCEPTED
-
-SET_MODE, ARM = 176, 400
-"""Commands: MAV_CMD_DO_SET_MODE and MAV_CMD_COMPONENT_ARM_DISARM."""
-
+SET_MODE, ARM = 176, 400  # Commands: MAV_CMD_DO_SET_MODE and MAV_CMD_COMPONENT_ARM_DISARM.
 VELOCITY_AND_YAW_RATE, VELOCITY_AND_YAW, BODY_RATES = 1479, 2503, 128
 """Type masks of setpoints: fields that PX4 ignores."""
 
-OFFBOARD, HOLD, LAND = (6, 0), (4, 3), (4, 6)
-"""PX4's main and sub modes."""
+OFFBOARD, HOLD, LAND = (6, 0), (4, 3), (4, 6)  # PX4's main and sub modes.
 
 
 class Heartbeat(NamedTuple):
@@ -71,72 +67,49 @@ class Mavlink:
         self._out = self._dialect.MAVLink(None, system, _ONBOARD_COMPUTER)
 
     def velocity_setpoint(self, setpoint: np.ndarray, time: float) -> bytes:
-        """
-        Writes a velocity setpoint.
-
-        Args:
-            setpoint: (4,) v_WB [m/s] and heading [rad], NaN to keep it.
-            time: [s] since the start.
-        """
-        d, velocity, heading = self._dialect, swap_px4(setpoint[:3]), float(setpoint[3])
+        """Writes a velocity setpoint (4,): v_WB [m/s] and heading [rad], NaN to keep it; `time` [s]
+        is since the start."""
+        velocity, heading = swap_px4(setpoint[:3]), float(setpoint[3])
         free = math.isnan(heading)
         return self._packed(
-            d.MAVLink_set_position_target_local_ned_message(
-                *(_milliseconds(time), self._system, 1, d.MAV_FRAME_LOCAL_NED),
-                VELOCITY_AND_YAW_RATE if free else VELOCITY_AND_YAW,
-                *(0.0, 0.0, 0.0, *map(float, velocity), 0.0, 0.0, 0.0),
-                0.0 if free else -heading,  # Yaw is clockwise.
-                0.0,
-            )
+            "set_position_target_local_ned",
+            *(_milliseconds(time), self._system, 1, self._dialect.MAV_FRAME_LOCAL_NED),
+            VELOCITY_AND_YAW_RATE if free else VELOCITY_AND_YAW,
+            *(0.0, 0.0, 0.0, *map(float, velocity), 0.0, 0.0, 0.0),
+            0.0 if free else -heading,  # Yaw is clockwise.
+            0.0,
         )
 
     def body_rates(
         self, command: np.ndarray, hover_thrust: float, gravity: float, time: float
     ) -> bytes:
-        """
-        Writes body rates.
-
-        Args:
-            command: (4,) thrust over mass [m/s^2], w_cmd_B [rad/s].
-            hover_thrust, gravity: see `thrust_to_px4`.
-            time: [s] since the start.
-        """
-        thrust = thrust_to_px4(float(command[0]), hover_thrust, gravity)
+        """Writes a command (4,): thrust over mass [m/s^2] and w_cmd_B [rad/s], see `thrust_to_px4`;
+        `time` [s] is since the start."""
         return self._packed(
-            self._dialect.MAVLink_set_attitude_target_message(
-                *(_milliseconds(time), self._system, 1, BODY_RATES, [1.0, 0.0, 0.0, 0.0]),
-                *map(float, swap_px4(command[1:])),
-                thrust,
-            )
+            "set_attitude_target",
+            *(_milliseconds(time), self._system, 1, BODY_RATES, [1.0, 0.0, 0.0, 0.0]),
+            *map(float, swap_px4(command[1:])),
+            thrust_to_px4(float(command[0]), hover_thrust, gravity),
         )
 
     def odometry(self, pose: np.ndarray, utime: int) -> bytes:
-        """
-        Writes the pose of the vehicle in motion capture.
-
-        Args:
-            pose: (7,) p_WB [m] and q_WB (wxyz).
-            utime: [us].
-        """
+        """Writes the pose (7,) of the vehicle in motion capture, p_WB [m] and q_WB (wxyz), at a
+        Unix time [us]."""
         d, unknown = self._dialect, [math.nan] + [0.0] * 20
         return self._packed(
-            d.MAVLink_odometry_message(
-                *(utime, d.MAV_FRAME_LOCAL_FRD, d.MAV_FRAME_BODY_FRD),
-                *map(float, swap_px4(pose[:3])),
-                [float(x) for x in swap_px4_attitude(pose[3:])],
-                *[math.nan] * 6,
-                *(unknown, unknown, 0, d.MAV_ESTIMATOR_TYPE_MOCAP, 0),
-            )
+            "odometry",
+            *(utime, d.MAV_FRAME_LOCAL_FRD, d.MAV_FRAME_BODY_FRD),
+            *map(float, swap_px4(pose[:3])),
+            [float(x) for x in swap_px4(pose[3:])],
+            *[math.nan] * 6,
+            *(unknown, unknown, 0, d.MAV_ESTIMATOR_TYPE_MOCAP, 0),
         )
 
     def heartbeat(self) -> bytes:
         """Writes the heartbeat of an onboard computer."""
         d = self._dialect
-        return self._packed(
-            d.MAVLink_heartbeat_message(
-                d.MAV_TYPE_ONBOARD_CONTROLLER, d.MAV_AUTOPILOT_INVALID, 0, 0, d.MAV_STATE_ACTIVE, 3
-            )
-        )
+        types = d.MAV_TYPE_ONBOARD_CONTROLLER, d.MAV_AUTOPILOT_INVALID
+        return self._packed("heartbeat", *types, 0, 0, d.MAV_STATE_ACTIVE, 3)
 
     def set_mode(self, mode: tuple[int, int]) -> bytes:
         """Writes a command for a mode."""
@@ -148,7 +121,15 @@ class Mavlink:
 
     def timesync(self, timesync: Timesync) -> bytes:
         """Writes a request for the time, or an answer."""
-        return self._packed(self._dialect.MAVLink_timesync_message(*timesync))
+        return self._packed("timesync", *timesync)
+
+    def _command(self, command: int, *parameters: float) -> bytes:
+        padded = [*map(float, parameters), *[0.0] * (7 - len(parameters))]
+        return self._packed("command_long", self._system, 1, command, 0, *padded)
+
+    def _packed(self, name: str, *values: Any) -> bytes:
+        message = getattr(self._dialect, f"MAVLink_{name}_message")(*values)
+        return bytes(message.pack(self._out))
 
     def read(self, packet: bytes) -> tuple[list[Message], list[str]]:
         """Reads the messages of a packet, and the reasons for rejecting others; ignores messages of
@@ -169,15 +150,6 @@ class Mavlink:
                     refused.append(f"{m.get_type()}: {error}")
         return messages, refused
 
-    def _command(self, command: int, *parameters: float) -> bytes:
-        padded = [*map(float, parameters), *[0.0] * (7 - len(parameters))]
-        return self._packed(
-            self._dialect.MAVLink_command_long_message(self._system, 1, command, 0, *padded)
-        )
-
-    def _packed(self, message: Any) -> bytes:
-        return bytes(message.pack(self._out))
-
 
 def _milliseconds(time: float) -> int:
     return round(time * 1e3) & 0xFFFFFFFF
@@ -186,19 +158,21 @@ def _milliseconds(time: float) -> int:
 def _message(m: Any) -> list[Message]:
     """Converts a message, those of other types to an empty list; raises ValueError for invalid
     numbers."""
-    kind = m.get_type()
-    if kind == "HEARTBEAT":
-        mode = (m.custom_mode >> 16) & 0xFF, (m.custom_mode >> 24) & 0xFF
-        return [Heartbeat(bool(m.base_mode & _ARMED), mode)]
-    if kind == "LOCAL_POSITION_NED":
-        p, v = finite([m.x, m.y, m.z]), finite([m.vx, m.vy, m.vz])
-        return [Position(1e-3 * m.time_boot_ms, swap_px4(p), swap_px4(v))]
-    if kind == "ATTITUDE_QUATERNION":
-        q = finite([m.q1, m.q2, m.q3, m.q4])
-        w = finite([m.rollspeed, m.pitchspeed, m.yawspeed])
-        require_unit_quaternion(q)
-        return [Attitude(1e-3 * m.time_boot_ms, swap_px4_attitude(q), swap_px4(w))]
-    if kind == "TIMESYNC":
-        return [Timesync(m.tc1, m.ts1)]
-    is_ours = kind == "COMMAND_ACK" and m.target_component in (0, _ONBOARD_COMPUTER)
-    return [Granted(m.command)] if is_ours and m.result == _ACCEPTED else []
+    match m.get_type():
+        case "HEARTBEAT":
+            mode = (m.custom_mode >> 16) & 0xFF, (m.custom_mode >> 24) & 0xFF
+            return [Heartbeat(bool(m.base_mode & _ARMED), mode)]
+        case "LOCAL_POSITION_NED":
+            p, v = finite([m.x, m.y, m.z]), finite([m.vx, m.vy, m.vz])
+            return [Position(1e-3 * m.time_boot_ms, swap_px4(p), swap_px4(v))]
+        case "ATTITUDE_QUATERNION":
+            q = finite([m.q1, m.q2, m.q3, m.q4])
+            w = finite([m.rollspeed, m.pitchspeed, m.yawspeed])
+            require_unit_quaternion(q)
+            return [Attitude(1e-3 * m.time_boot_ms, swap_px4(q), swap_px4(w))]
+        case "TIMESYNC":
+            return [Timesync(m.tc1, m.ts1)]
+        case "COMMAND_ACK":
+            is_ours = m.target_component in (0, _ONBOARD_COMPUTER)
+            return [Granted(m.command)] if is_ours and m.result == _ACCEPTED else []
+    return []

@@ -4,7 +4,7 @@ import math
 import weakref
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from pydrake.systems.framework import Context
@@ -12,7 +12,7 @@ from pydrake.systems.framework import Context
 from splatpilot.systems.common.extras import import_extra
 from splatpilot.systems.common.validation import Config, bounded, require_field
 from splatpilot.systems.messaging.receiver import RESTART, Received, Receiver, UdpConfig, UdpInbox
-from splatpilot.systems.px4.frames import attitude_from_optitrack, from_optitrack
+from splatpilot.systems.px4.frames import pose_from_optitrack
 
 _FRAME_OF_DATA = 7  # NatNet's number of the messages that carry poses.
 
@@ -41,23 +41,6 @@ class _Pose(Received):
     number: int = -1  # of the last frame.
     came: float = -math.inf  # [s] Unix time of its arrival.
 
-    def after(self, number: int, pose: np.ndarray | None, now: float, latency: float) -> Self:
-        """Returns the state after a frame.
-
-        Args:
-            number: of the frame.
-            pose: (7,), or None if the frame does not show the body.
-            now: [s] Unix time.
-            latency: [s] of the frame.
-
-        Raises:
-            ValueError: if the frame is no newer than the one before.
-        """
-        if number <= self.number and now - self.came <= RESTART:
-            raise ValueError(f"frame must be newer than {self.number}, got {number}")
-        received = replace(self, number=number, came=now)
-        return received if pose is None else replace(received, pose=pose, time=now - latency)
-
 
 class MotionCaptureReceiver(Receiver[_Pose]):
     """Outputs the pose of a rigid body in OptiTrack's stream, in our frames.
@@ -68,7 +51,6 @@ class MotionCaptureReceiver(Receiver[_Pose]):
         input_ports: [unix_time]
         output_ports: [motion_capture_pose, age, rejected]
 
-    - ``unix_time`` (1): [s].
     - ``motion_capture_pose`` (7): last p_WB [m] and q_WB (wxyz) of the tracked body; NaN before.
     - ``age`` (1): [s] since the exposure of that; infinity before. It grows without frames, and
       while frames do not track the body.
@@ -79,13 +61,7 @@ class MotionCaptureReceiver(Receiver[_Pose]):
     def __init__(
         self, config: MotionCaptureConfig, period: float, now: Callable[[], float] | None = None
     ):
-        """Constructs the system.
-
-        Args:
-            config: of the stream.
-            period: [s] between updates.
-            now: see `Receiver`.
-        """
+        """Constructs the system; `period` and `now` are those of `Receiver`."""
         config.validate()
         natnet: Any = import_extra("natnet", "mocap")
         super().__init__(_Pose(), "motion capture", period, now)
@@ -103,15 +79,19 @@ class MotionCaptureReceiver(Receiver[_Pose]):
     def _receive(self, context: Context, received: _Pose) -> _Pose:
         datagrams, now = self._inbox.receive(), self._time_of_reading(context)
 
-        def read(received: _Pose, packet: bytes) -> _Pose:
+        def read(last: _Pose, packet: bytes) -> _Pose:
             try:
                 frame = self._frame(packet)
                 pose = None if frame is None else self._pose(frame)
             except Exception as error:  # natnet raises any type for bytes that are not a frame.
                 raise ValueError(f"it is not a frame of data ({error})") from None
             if frame is None:
-                return received
-            return received.after(frame.prefix.frame_number, pose, now, self._latency)
+                return last
+            number = frame.prefix.frame_number
+            if number <= last.number and now - last.came <= RESTART:
+                raise ValueError(f"frame must be newer than {last.number}, got {number}")
+            last = replace(last, number=number, came=now)
+            return last if pose is None else replace(last, pose=pose, time=now - self._latency)
 
         return self._take(received, *datagrams, read)
 
@@ -129,8 +109,7 @@ class MotionCaptureReceiver(Receiver[_Pose]):
         """Returns the body's pose (7,); None if it is not in a frame or not tracked."""
         for body in frame.rigid_bodies:
             if body.id_num == self._body:
-                q = np.array(body.rot)
-                pose = np.append(from_optitrack(np.array(body.pos)), attitude_from_optitrack(q))
-                is_unit = abs(np.linalg.norm(q) - 1.0) < 0.01
+                pose = pose_from_optitrack(np.array(body.pos), np.array(body.rot))
+                is_unit = abs(np.linalg.norm(pose[3:]) - 1.0) < 0.01
                 return pose if body.tracking_valid and is_unit and np.isfinite(pose).all() else None
         return None

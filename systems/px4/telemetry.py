@@ -10,18 +10,7 @@ from pydrake.systems.framework import Context
 
 from splatpilot.systems.messaging.lcm_ports import PUBLISH_OFFSET
 from splatpilot.systems.messaging.receiver import RESTART, Received, Receiver, UdpInbox
-from splatpilot.systems.px4.mavlink import (
-    ARM,
-    OFFBOARD,
-    SET_MODE,
-    Attitude,
-    Granted,
-    Heartbeat,
-    Mavlink,
-    Message,
-    Position,
-    Timesync,
-)
+from splatpilot.systems.px4 import mavlink
 from splatpilot.systems.vehicle.quadrotor import hover_state
 from splatpilot.systems.vehicle.state import QuadrotorState, predict_state
 
@@ -42,9 +31,8 @@ class _Offset(NamedTuple):
     def heard(self, sent: float, now: float) -> Self:
         """Returns the bounds after a message arrived `now` [s] that PX4 sent at `sent` [s]."""
         drift = _MAX_DRIFT * (now - self.time)
-        return self._replace(
-            latest=min(self.latest + drift, now - sent), earliest=self.earliest - drift, time=now
-        )
+        latest = min(self.latest + drift, now - sent)
+        return self._replace(latest=latest, earliest=self.earliest - drift, time=now)
 
     def answered(self, question: float, answer: float) -> Self:
         """Returns the bounds after PX4 answered at `answer` [s] a question of `question` [s]."""
@@ -59,31 +47,28 @@ class _Offset(NamedTuple):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Telemetry(Received):
-    heartbeat: Heartbeat = field(default_factory=lambda: Heartbeat(False, (0, 0)))
+    heartbeat: mavlink.Heartbeat = field(default_factory=lambda: mavlink.Heartbeat(False, (0, 0)))
     heard: float = -math.inf  # [s] of the Context, of the heartbeat.
     granted: frozenset[int] = frozenset()  # accepted commands.
     offset: _Offset = field(default_factory=_Offset)
-    position: Position | None = None
+    position: mavlink.Position | None = None
     position_time: float = -math.inf  # [s] Unix time.
-    attitude: Attitude | None = None
+    attitude: mavlink.Attitude | None = None
     attitude_time: float = -math.inf  # [s] Unix time.
     came: float = -math.inf  # [s] Unix time of the last position or attitude.
     question: int = 0  # [ns] PX4's last time request, and
     asked: float = -math.inf  # [s] of the Context, of its arrival.
 
-    def after(self, message: Message, now: float, unix_time: float) -> Self:
-        """Returns the state after a message came `now` [s] in the Context, at `unix_time` [s].
-
-        Raises:
-            ValueError: if it is no newer than the one before.
-        """
-        if isinstance(message, Heartbeat):
+    def after(self, message: mavlink.Message, now: float, unix_time: float) -> Self:
+        """Returns the state after a message came `now` [s] in the Context, at `unix_time` [s];
+        raises ValueError if it is no newer than the one before."""
+        if isinstance(message, mavlink.Heartbeat):
             return replace(self, heartbeat=message, heard=now)
-        if isinstance(message, Granted):
+        if isinstance(message, mavlink.Granted):
             return replace(self, granted=self.granted | {message.command})
-        if isinstance(message, Timesync):
+        if isinstance(message, mavlink.Timesync):
             return self._after_timesync(message, now, unix_time)
-        last = self.position if isinstance(message, Position) else self.attitude
+        last = self.position if isinstance(message, mavlink.Position) else self.attitude
         received = self
         if last is not None and message.time <= last.time:
             has_restarted = message.time < last.time - RESTART and unix_time - self.came > RESTART
@@ -96,11 +81,11 @@ class _Telemetry(Received):
         offset = received.offset.heard(message.time, unix_time)
         received = replace(received, offset=offset, came=unix_time)
         measured = message.time + offset.estimate
-        if isinstance(message, Position):
+        if isinstance(message, mavlink.Position):
             return replace(received, position=message, position_time=measured)
         return replace(received, attitude=message, attitude_time=measured)
 
-    def _after_timesync(self, message: Timesync, now: float, unix_time: float) -> Self:
+    def _after_timesync(self, message: mavlink.Timesync, now: float, unix_time: float) -> Self:
         answer, question = 1e-9 * message.answer, 1e-9 * message.question
         if message.answer == 0:
             offset = self.offset.heard(question, unix_time)
@@ -124,20 +109,22 @@ class _Telemetry(Received):
             return hover_state(np.zeros(3))
         state = QuadrotorState(p.p_WB, p.v_WB, a.q_WB, a.w_WB_B).to_vector()
         time = min(p.time, a.time)
-        p_WB, v_WB, _, _ = QuadrotorState.of(predict_state(state, time - p.time))
-        _, _, q_WB, w_WB_B = QuadrotorState.of(predict_state(state, time - a.time))
-        return QuadrotorState(p_WB, v_WB, q_WB, w_WB_B).to_vector()
+        moved, rotated = (predict_state(state, time - each.time) for each in (p, a))
+        return np.append(moved[:6], rotated[6:])
 
-    def mode(self, now: float) -> tuple[bool, bool, int, int]:
-        """Returns if the mode is known at `now` [s], if the vehicle is armed, and its mode."""
+    def mode(self, now: float) -> tuple[bool, int, int] | None:
+        """Returns if PX4 is armed, and its mode; None if they are unknown at `now` [s]."""
         is_known = now - self.heard <= HEARTBEAT_TIMEOUT
-        armed, mode = self.heartbeat if is_known else (False, (0, 0))
-        return is_known, armed, *mode
+        return (self.heartbeat.armed, *self.heartbeat.mode) if is_known else None
 
-    def vehicle_status(self, now: float) -> list[float]:
-        """Returns the signal of `VehicleStatusCodec` at `now` [s]."""
-        is_known, armed, main, _ = self.mode(now)
-        return [armed, main == OFFBOARD[0]] if is_known else [math.nan, math.nan]
+
+_UNKNOWN = False, 0, 0
+
+
+def _vehicle_status(received: _Telemetry, now: float) -> list[float]:
+    """Returns the signal of `VehicleStatusCodec` at `now` [s]."""
+    mode = received.mode(now)
+    return [math.nan, math.nan] if mode is None else [mode[0], mode[1] == mavlink.OFFBOARD[0]]
 
 
 class Px4Telemetry(Receiver[_Telemetry]):
@@ -149,11 +136,9 @@ class Px4Telemetry(Receiver[_Telemetry]):
         input_ports: [unix_time]
         output_ports: [state, age, heartbeat_age, armed, mode, granted, vehicle_status, rejected]
 
-    - ``unix_time`` (1): [s].
-    - ``state`` (13): p_WB [m], v_WB [m/s], q_WB (wxyz), w_WB_B [rad/s], of LOCAL_POSITION_NED and
-      ATTITUDE_QUATERNION; at rest in the origin before both have come. Its time is that of the
-      older of the two; the other is brought back to it by its velocity or its rates.
-    - ``age`` (1): [s] since then; infinity before both have come.
+    - ``state`` (13), ``age`` (1) [s]: of LOCAL_POSITION_NED and ATTITUDE_QUATERNION, at the time of
+      the older; the other is brought back to it by its velocity or its rates. At rest in the
+      origin, and infinite, before both have come.
     - ``heartbeat_age`` (1): [s] since the last HEARTBEAT; infinity before the first.
     - ``armed`` (1), ``mode`` (2): of that; main and sub mode. 0 if it is older than 3 s.
     - ``vehicle_status`` (2): 1 if armed, and 1 in offboard mode; NaN if the last HEARTBEAT is older
@@ -162,10 +147,9 @@ class Px4Telemetry(Receiver[_Telemetry]):
     - ``rejected`` (1): number of packets and messages that were not MAVLink, not finite, of other
       senders, or no newer than the one before.
 
-    Requests PX4's time every second, and answers PX4's requests (TIMESYNC).
-
-    Ages are by PX4's own stamps, to include the delay of the link. The Unix time at which PX4's
-    clock was 0 is bounded by its fastest message and by its fastest answer::
+    Requests PX4's time every second, and answers PX4's requests (TIMESYNC). Ages are by PX4's own
+    stamps, to include the delay of the link. The Unix time at which PX4's clock was 0 is bounded by
+    its fastest message and by its fastest answer::
 
         question - answer <= zero <= arrival - stamp
 
@@ -176,29 +160,23 @@ class Px4Telemetry(Receiver[_Telemetry]):
     def __init__(
         self,
         inbox: UdpInbox,
-        mavlink: Mavlink,
+        link: mavlink.Mavlink,
         address: tuple[str, int],
         period: float,
         now: Callable[[], float] | None = None,
     ):
-        """Constructs the system.
-
-        Args:
-            inbox: socket to receive and send.
-            mavlink: reads and writes messages.
-            address: host and port of PX4.
-            period: [s] between updates.
-            now: see `Receiver`.
-        """
+        """Constructs the system, which exchanges messages with PX4 at `address` through `inbox`;
+        `period` and `now` are those of `Receiver`."""
         super().__init__(_Telemetry(), "PX4", period, now)
-        self._inbox, self._mavlink, self._address = inbox, mavlink, address
+        self._inbox, self._link, self._address = inbox, link, address
         self._declare_age(lambda received: received.measured)
         self._declare("state", 13, lambda received, _: received.state)
-        self._declare("granted", 2, lambda got, _: [SET_MODE in got.granted, ARM in got.granted])
+        commands = mavlink.SET_MODE, mavlink.ARM
+        self._declare("granted", 2, lambda got, _: [each in got.granted for each in commands])
         self._declare("heartbeat_age", 1, lambda got, now: now - got.heard, timed=True)
-        self._declare("armed", 1, lambda got, now: got.mode(now)[1], timed=True)
-        self._declare("mode", 2, lambda got, now: got.mode(now)[2:], timed=True)
-        self._declare("vehicle_status", 2, lambda got, now: got.vehicle_status(now), timed=True)
+        self._declare("armed", 1, lambda got, now: (got.mode(now) or _UNKNOWN)[0], timed=True)
+        self._declare("mode", 2, lambda got, now: (got.mode(now) or _UNKNOWN)[1:], timed=True)
+        self._declare("vehicle_status", 2, _vehicle_status, timed=True)
         self.DeclarePeriodicPublishEvent(period, PUBLISH_OFFSET, self._answer)
         self.DeclarePeriodicPublishEvent(_QUESTION_PERIOD, PUBLISH_OFFSET, self._ask)
 
@@ -207,7 +185,7 @@ class Px4Telemetry(Receiver[_Telemetry]):
         now, unix_time = context.get_time(), self._time_of_reading(context)
 
         def read(received: _Telemetry, packet: bytes) -> _Telemetry:
-            messages, refused = self._mavlink.read(packet)
+            messages, refused = self._link.read(packet)
             for message in messages:
                 try:
                     received = received.after(message, now, unix_time)
@@ -220,13 +198,13 @@ class Px4Telemetry(Receiver[_Telemetry]):
         return self._take(received, *datagrams, read)
 
     def _ask(self, context: Context) -> None:
-        self._send(context, lambda now: Timesync(0, now))
+        self._send(context, lambda now: mavlink.Timesync(0, now))
 
     def _answer(self, context: Context) -> None:
         received = self._received(context)
         if context.get_time() - received.asked < 2.0 * PUBLISH_OFFSET:
-            self._send(context, lambda now: Timesync(now, received.question))
+            self._send(context, lambda now: mavlink.Timesync(now, received.question))
 
-    def _send(self, context: Context, timesync: Callable[[int], Timesync]) -> None:
+    def _send(self, context: Context, timesync: Callable[[int], mavlink.Timesync]) -> None:
         message = timesync(round(1e9 * self._time_of_reading(context)))
-        self._inbox.send(self._mavlink.timesync(message), self._address)
+        self._inbox.send(self._link.timesync(message), self._address)

@@ -9,14 +9,12 @@ from pydrake.common.value import Value
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from splatpilot.systems.common.drake import input_port, output_port, weakly
+from splatpilot.systems.common.drake import weakly
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.sensing.noise import ObservationNoise
 from splatpilot.systems.vehicle.state import array_namespace, pose_from_state
 
-CYCLE = 64
-"""Number of frames after which their delays repeat."""
-
+CYCLE = 64  # Number of frames after which their delays repeat.
 _SPARE = 8  # Consecutive frames that may be lost; if more are, the last of them is seen.
 
 
@@ -65,25 +63,16 @@ class FrameTimes:
 
 
 def frame_delays(noise: ObservationNoise, late: Any, lost: Any) -> Any:
-    """Computes delays of frames [s], infinite if they never come.
-
-    Args:
-        late, lost: arrays or tensors of one shape, drawn from U(0, 1).
-    """
+    """Computes delays of frames [s], infinite if they never come, from arrays or tensors `late` and
+    `lost` of one shape that are drawn from U(0, 1)."""
     delays = noise.latency + noise.jitter * late
     return array_namespace(lost).where(lost < noise.frame_dropout, math.inf, delays)
 
 
 def frame_ages(delays: Any, rate: Any, phase: Any, lookback: int, time: Any) -> Any:
-    """Computes the ages (N,) [s] at a time of the last frames that have come, of N streams.
-
-    Args:
-        delays: (N, CYCLE) [s], see `FrameTimes`; arrays or tensors.
-        rate: (N,) [Hz].
-        phase: (N,) [-].
-        lookback: number of frames to look through; if none of them has come, the last is seen.
-        time: (N,) [s].
-    """
+    """Computes the ages (N,) [s] at a `time` (N,) [s] of the last frames that have come, of N
+    streams, see `FrameTimes`. If none of `lookback` frames has come, the last of them is seen.
+    `delays` are (N, CYCLE), the others (N,)."""
     xp = array_namespace(time)
     streams = xp.arange(len(time), device=time.device)
     back = xp.arange(lookback, device=time.device)
@@ -95,7 +84,7 @@ def frame_ages(delays: Any, rate: Any, phase: Any, lookback: int, time: Any) -> 
 
 
 def lookback(noise: ObservationNoise) -> int:
-    """How many frames there may be between the newest that was taken and the newest that came."""
+    """Returns the max number of frames between the newest taken and the newest that came."""
     return math.ceil((noise.latency + noise.jitter) * max(noise.frame_rate)) + _SPARE
 
 
@@ -105,34 +94,22 @@ class DelayedPose(LeafSystem):
     .. pydrake_system::
 
         name: DelayedPose
-        input_ports:
-        - state
-        output_ports:
-        - pose
+        input_ports: [state]
+        output_ports: [pose]
 
-    - ``state`` (13): ``[p_WB (3) [m], v_WB (3) [m/s], q_WB (4, wxyz), w_WB_B (3) [rad/s]]``.
+    - ``state`` (13): that of :class:`~splatpilot.systems.vehicle.quadrotor.QuadrotorPlant`.
     - ``pose`` (abstract, RigidTransform): X_WB at ``now - age``, with the age of the last frame,
       or the earliest known.
 
-    The discrete state holds samples of time and state every ``period`` (0.02 s); between them
-    the state is interpolated linearly, and its quaternion normalized.
+    The discrete state holds samples of time and state every ``period`` [s]; between them the state
+    is interpolated linearly, and its quaternion normalized.
     """
 
-    state_input_port = input_port("state")
-    pose_output_port = output_port("pose")
-
     def __init__(self, frames: FrameTimes, period: float = 0.02) -> None:
-        """Constructs the system.
-
-        Args:
-            frames: times and delays.
-            period: time between samples [s].
-        """
         super().__init__()
         late = frames.delays.min()
         valid = late >= 0.0 and math.isfinite(frames.oldest)
         require(valid, "delays of frames", "in [0, inf) s", late)
-        require(period > 0.0, "period", "> 0 s", period)
         self._frames = frames
         samples = math.ceil(frames.oldest / period) + 1
         self._state_port = self.DeclareVectorInputPort("state", 13)

@@ -1,13 +1,13 @@
 """Imperfections of real cameras: noise, missing depth, changing brightness, delay.
 
 The noise of an image follows from a seed and the image's number alone, so that flights are
-deterministic. The formulas take arrays and
-tensors; `training/policies/augmentation.py` draws the noise of training.
+deterministic. The formulas take arrays and tensors of floats; training draws its own noise for
+them, in `training/policies/augmentation.py`.
 """
 
 import math
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any, ClassVar, cast
 
 import cv2
 import numpy as np
@@ -15,7 +15,7 @@ from pydrake.common.value import AbstractValue, Value
 from pydrake.systems.framework import Context, LeafSystem
 from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
-from splatpilot.systems.common.drake import input_port, output_port, weakly
+from splatpilot.systems.common.drake import weakly
 from splatpilot.systems.common.validation import Config, bounded, require_field
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.vehicle.state import array_namespace
@@ -38,7 +38,7 @@ class ObservationNoise(Config):
     color_noise: float = bounded(0.0, "[0, 1]")
     # [-] Maximum change in brightness of a whole image; uniform up to it, up and down.
     brightness_jitter: float = bounded(0.0, "[0, 1]")
-    # [deg] Maximum rotation of an image's colors about gray; uniform up to it, both ways.
+    # [deg] Maximum rotation of an image's colors about gray; uniform up to it, in both directions.
     hue_jitter: float = bounded(0.0, "[0, 180] deg")
     # [px] Blur of color images, as of a lens out of focus.
     blur: float = bounded(0.0, "[0, 50] px")
@@ -92,20 +92,6 @@ class ObservationNoise(Config):
         return max(self.exposure_error, self.full_well) > 0.0
 
 
-def noisy_depth(
-    depth: np.ndarray,
-    noise: ObservationNoise,
-    generator: np.random.Generator,
-    min_depth: float,
-    max_depth: float,
-) -> np.ndarray:
-    """Adds errors and holes to a depth image (H, W) float32 [m]; see `corrupt_depth`."""
-    relative, absolute = generator.standard_normal((2, *depth.shape))
-    drop = generator.random(depth.shape)
-    z = corrupt_depth(depth, noise, relative, absolute, drop, min_depth, max_depth)
-    return z.astype(np.float32)
-
-
 def corrupt_depth(
     depth: Any,
     noise: ObservationNoise,
@@ -116,17 +102,14 @@ def corrupt_depth(
     max_depth: float = math.inf,
 ) -> Any:
     """
-    Adds errors and holes to planar depth [m]; arrays or tensors, of floats.
+    Adds errors and holes to planar depth [m]: `relative` n_1 and `absolute` n_2 are drawn from
+    N(0, 1), `drop` u from U(0, 1), each of the depth's shape.
 
         z' = z (1 + depth_multiplicative n_1) + depth_additive n_2
 
     Pixels of 0 or infinity keep that. Beyond the range of the camera the result is as of Drake's
-    cameras: 0 below `min_depth`, infinity above `max_depth` [m]. Where u < depth_dropout it is
-    infinity.
-
-    Args:
-        relative, absolute: n_1 and n_2, of the depth's shape, drawn from N(0, 1).
-        drop: u, of the depth's shape, drawn from U(0, 1).
+    cameras: 0 below `min_depth`, infinity above `max_depth` [m]. It is infinity if
+    u < depth_dropout.
     """
     xp = array_namespace(depth)
     measured = xp.isfinite(depth) & (depth > 0.0)
@@ -137,36 +120,13 @@ def corrupt_depth(
     return xp.where(drop < noise.depth_dropout, math.inf, z)
 
 
-def noisy_color(
-    color: np.ndarray, noise: ObservationNoise, generator: np.random.Generator
-) -> np.ndarray:
-    """Changes hue, blur, exposure and brightness of an RGB image (H, W, 3) uint8, and adds noise to
-    each pixel; see `turned_hue`, `expose` and `corrupt_color`."""
-    brighter = generator.uniform(-1.0, 1.0)
-    grain = generator.standard_normal(color.shape, dtype=np.float32)
-    color = color.astype(np.float32)
-    if noise.hue_jitter > 0.0:
-        turn = math.radians(noise.hue_jitter * generator.uniform(-1.0, 1.0))
-        color = turned_hue(color, math.cos(turn), math.sin(turn))
-    if noise.blur > 0.0:
-        color = cv2.GaussianBlur(color, (0, 0), noise.blur)
-    if noise.changes_light:
-        error = np.float32(generator.uniform(-1.0, 1.0))
-        photons = generator.standard_normal(color.shape, dtype=np.float32)
-        color = expose(color, noise, error, photons)
-    return (corrupt_color(color, noise, brighter, grain) + np.float32(0.5)).astype(np.uint8)
-
-
-def turned_hue(color: Any, cos: Any, sin: Any) -> Any:
+def rotate_hue(color: Any, cos: Any, sin: Any) -> Any:
     """
-    Rotates colors (..., 3), 0 to 255, about gray: red toward green, green toward blue; clips.
+    Rotates colors (..., 3), 0 to 255, about gray by an angle: red toward green, green toward blue.
 
-    Arrays or tensors, of floats. Rodrigues' formula with the axis k = (1, 1, 1) / sqrt(3).
+    Rodrigues' formula with the axis k = (1, 1, 1) / sqrt(3).
 
         c' = clip(cos c + (1 - cos) (k · c) k + sin k x c)
-
-    Args:
-        cos, sin: of the angle, of shapes that broadcast.
     """
     gray = color.sum(-1)[..., None] / 3.0
     across = (color[..., [2, 0, 1]] - color[..., [1, 2, 0]]) / math.sqrt(3.0)
@@ -175,14 +135,11 @@ def turned_hue(color: Any, cos: Any, sin: Any) -> Any:
 
 def expose(color: Any, noise: ObservationNoise, error: Any, photons: Any) -> Any:
     """
-    Exposes colors (..., 3), 0 to 255, with shot and read noise; arrays or tensors, of floats.
+    Exposes colors (..., 3), 0 to 255, with shot and read noise; `error` u is drawn from U(-1, 1)
+    for each image, `photons` n from N(0, 1), of the colors' shape.
 
         light' = 2^(exposure_error u) (c / 255)^2.2
         c' = 255 clip(light' + n sqrt(light' / full_well + (read_noise / full_well)^2))^(1 / 2.2)
-
-    Args:
-        error: u, drawn from U(-1, 1) for each image, of a shape that broadcasts.
-        photons: n, of the colors' shape, drawn from N(0, 1).
     """
     light = (color / 255.0) ** _GAMMA * 2.0 ** (noise.exposure_error * error)
     if noise.full_well > 0.0:
@@ -193,107 +150,74 @@ def expose(color: Any, noise: ObservationNoise, error: Any, photons: Any) -> Any
 
 def corrupt_color(color: Any, noise: ObservationNoise, brighter: Any, grain: Any) -> Any:
     """
-    Changes the brightness of colors (..., 3), 0 to 255, and adds noise; arrays or tensors.
+    Changes the brightness of colors (..., 3), 0 to 255, and adds noise; `brighter` u is drawn from
+    U(-1, 1) for each image, `grain` n from N(0, 1), of the colors' shape.
 
         c' = clip(c (1 + brightness_jitter u) + 255 color_noise n)
-
-    Args:
-        brighter: u, drawn from U(-1, 1) for each image, of a shape that broadcasts.
-        grain: n, of the colors' shape, drawn from N(0, 1).
     """
     gain = 1.0 + noise.brightness_jitter * brighter
     return (gain * color + 255.0 * noise.color_noise * grain).clip(0.0, 255.0)
 
 
-def image_generator(seed: int, number: int) -> np.random.Generator:
-    """Returns the random generator of image `number` of a flight."""
-    return np.random.default_rng([seed, number])
-
-
 class _ImageNoise(LeafSystem):
-    """Base of systems that change images.
+    """Base of systems that change images of a `camera`.
 
     Stateless: the noise follows from the seed and the image's number, the time in units of 1 /
-    `rate`, so that evaluations at one time agree.
+    `rate` [Hz], so that evaluations at one time agree.
     """
 
-    def __init__(
-        self, noise: ObservationNoise, camera: OnboardCamera, rate: float, seed: int, image: type
-    ) -> None:
-        """Constructs the system.
+    port: ClassVar[str]
+    image: ClassVar[type]
 
-        Args:
-            camera: of the images.
-            rate: of the images [Hz].
-            seed: of the flight.
-            image: type of the images.
-        """
+    def __init__(
+        self, noise: ObservationNoise, camera: OnboardCamera, rate: float, seed: int
+    ) -> None:
         super().__init__()
         noise.validate()
         self._noise, self._camera, self._rate, self._seed = noise, camera, rate, seed
-        name = "depth_image_32f" if image is ImageDepth32F else "color_image"
-        blank = image(camera.width, camera.height)
-        self.DeclareAbstractInputPort(name, Value(blank))
-        self.DeclareAbstractOutputPort(name, lambda: Value(blank), weakly(self._calc))
+        blank = self.image(camera.width, camera.height)
+        self.DeclareAbstractInputPort(self.port, Value(blank))
+        self.DeclareAbstractOutputPort(self.port, lambda: Value(blank), weakly(self._calc))
 
     def _calc(self, context: Context, output: AbstractValue) -> None:
         image = np.asarray(cast(Any, self.get_input_port().Eval(context)).data)
-        generator = image_generator(self._seed, round(context.get_time() * self._rate))
+        random = np.random.default_rng([self._seed, round(context.get_time() * self._rate)])
         pixels = cast(Any, output.get_mutable_value()).mutable_data
-        pixels[:] = self._noisy(image, generator)
+        pixels[:] = self._noisy(image, random)
 
-    def _noisy(self, image: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+    def _noisy(self, image: np.ndarray, random: np.random.Generator) -> np.ndarray:
         raise NotImplementedError
 
 
 class DepthNoise(_ImageNoise):
-    """Adds errors and holes to depth images, see `noisy_depth`.
+    """Adds errors and holes to ``depth_image_32f`` of planar depth [m], see `corrupt_depth`."""
 
-    .. pydrake_system::
+    port, image = "depth_image_32f", ImageDepth32F
 
-        name: DepthNoise
-        input_ports:
-        - depth_image_32f
-        output_ports:
-        - depth_image_32f
-
-    Both are planar depth [m].
-    """
-
-    depth_image_32f_input_port = input_port("depth_image_32f")
-    depth_image_32f_output_port = output_port("depth_image_32f")
-
-    def __init__(
-        self, noise: ObservationNoise, camera: OnboardCamera, rate: float, seed: int
-    ) -> None:
-        super().__init__(noise, camera, rate, seed, ImageDepth32F)
-
-    def _noisy(self, image: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-        limits = self._camera.min_depth, self._camera.max_depth
-        return noisy_depth(image[..., 0], self._noise, generator, *limits)[..., None]
+    def _noisy(self, image: np.ndarray, random: np.random.Generator) -> np.ndarray:
+        relative, absolute = random.standard_normal((2, *image.shape))
+        drop, limits = random.random(image.shape), (self._camera.min_depth, self._camera.max_depth)
+        return corrupt_depth(image, self._noise, relative, absolute, drop, *limits)
 
 
 class ColorNoise(_ImageNoise):
-    """Changes hue, blur, exposure and brightness of color images, see `noisy_color`.
+    """Changes hue, blur, exposure and brightness of ``color_image``, and adds noise to each pixel;
+    see `rotate_hue`, `expose` and `corrupt_color`. Alpha is kept."""
 
-    .. pydrake_system::
+    port, image = "color_image", ImageRgba8U
 
-        name: ColorNoise
-        input_ports:
-        - color_image
-        output_ports:
-        - color_image
-
-    Alpha is kept.
-    """
-
-    color_image_input_port = input_port("color_image")
-    color_image_output_port = output_port("color_image")
-
-    def __init__(
-        self, noise: ObservationNoise, camera: OnboardCamera, rate: float, seed: int
-    ) -> None:
-        super().__init__(noise, camera, rate, seed, ImageRgba8U)
-
-    def _noisy(self, image: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-        return np.dstack([noisy_color(image[..., :3], self._noise, generator), image[..., 3]])
+    def _noisy(self, image: np.ndarray, random: np.random.Generator) -> np.ndarray:
+        noise, color = self._noise, image[..., :3].astype(np.float32)
+        brighter = random.uniform(-1.0, 1.0)
+        grain = random.standard_normal(color.shape, dtype=np.float32)
+        if noise.hue_jitter > 0.0:
+            angle = math.radians(noise.hue_jitter * random.uniform(-1.0, 1.0))
+            color = rotate_hue(color, math.cos(angle), math.sin(angle))
+        if noise.blur > 0.0:
+            color = cv2.GaussianBlur(color, (0, 0), noise.blur)
+        if noise.changes_light:
+            error = np.float32(random.uniform(-1.0, 1.0))
+            photons = random.standard_normal(color.shape, dtype=np.float32)
+            color = expose(color, noise, error, photons)
+        color = corrupt_color(color, noise, brighter, grain) + np.float32(0.5)
+        return np.dstack([color.astype(np.uint8), image[..., 3]])

@@ -70,14 +70,8 @@ class OnboardCamera(Config):
 
     def camera_info(self) -> CameraInfo:
         """Returns the intrinsics, with the principal point in the middle."""
-        return CameraInfo(
-            width=self.width,
-            height=self.height,
-            focal_x=self.focal_x,
-            focal_y=self.focal_y,
-            center_x=0.5 * self.width,
-            center_y=0.5 * self.height,
-        )
+        size, middle = (self.width, self.height), (0.5 * self.width, 0.5 * self.height)
+        return CameraInfo(*size, self.focal_x, self.focal_y, *middle)
 
     def X_BC(self) -> RigidTransform:
         """Returns the pose of the camera (x right, y down, z forward) in the body."""

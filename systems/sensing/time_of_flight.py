@@ -15,14 +15,10 @@ from pydrake.common.value import Value
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 from pydrake.systems.sensors import ImageDepth32F
 
-from splatpilot.systems.common.drake import input_port, output_port
 from splatpilot.systems.common.validation import Config, bounded, require, require_field
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera, focal_length
 
-LEAST_DEPTH = 1e-3
-"""[m], up to which depth counts as unmeasured."""
-
-_ANCHORS = ("top", "center", "bottom")
+UNMEASURED_DEPTH = 1e-3  # [m], up to which depth counts as unmeasured.
 
 
 @dataclass
@@ -40,7 +36,7 @@ class TimeOfFlight(Config):
     # [deg] Field of view after the crop, in both directions.
     fov: float = bounded(86.0, "[1, 180) deg")
     # Part of the height that the crop keeps.
-    anchor: str = bounded("bottom", f"{{{', '.join(_ANCHORS)}}}")
+    anchor: str = bounded("bottom", "{top, center, bottom}")
     # [px] By which that part then moves down; what leaves the frame is lost.
     shift: int = -100
     # [m] Range from which proximity is 0.
@@ -59,10 +55,8 @@ class TimeOfFlight(Config):
 
     def crop(self, height: int, width: int, fov_x: float, fov_y: float) -> tuple[slice, slice]:
         """Returns the rows and columns kept of an upright frame with these fields of view."""
-        half_x, half_y = (
-            focal_length(size, fov) * math.tan(math.radians(0.5 * self.fov))
-            for size, fov in ((width, fov_x), (height, fov_y))
-        )
+        slope = math.tan(math.radians(0.5 * self.fov))
+        half_x, half_y = focal_length(width, fov_x) * slope, focal_length(height, fov_y) * slope
         left, right = math.floor(0.5 * width - half_x), math.ceil(0.5 * width + half_x)
         tall = min(math.ceil(2.0 * half_y), height)
         top, bottom = {
@@ -76,7 +70,7 @@ class TimeOfFlight(Config):
         return slice(top, bottom), slice(max(0, left), min(width, right))
 
 
-def sensor_of(camera: OnboardCamera) -> TimeOfFlight:
+def equivalent_sensor(camera: OnboardCamera) -> TimeOfFlight:
     """Returns the sensor that equals a policy's camera, without a crop.
 
     Its lens must not distort: frames of such sensors come rectified.
@@ -95,15 +89,12 @@ def sensor_of(camera: OnboardCamera) -> TimeOfFlight:
 
 
 def time_of_flight_grid(depth: np.ndarray, sensor: TimeOfFlight) -> np.ndarray:
-    """
-    Computes the proximities (rows, columns) of a frame: 1 - range / max_range, at least 0.
-
-    Row 0 is the lowest: the grid is upside down.
+    """Computes the proximities (rows, columns) of a frame: 1 - range / max_range, at least 0; row 0
+    is the lowest.
 
     Args:
         depth: (H, W) [m] along the optical axis; not finite, or at most 1 mm, if unmeasured. A
             frame that lies on its side is rotated by 90 degrees, counterclockwise.
-        sensor: a valid configuration.
     """
     H, W = sensor.height, sensor.width
     found = f"{depth.shape[1]}x{depth.shape[0]}"
@@ -115,7 +106,7 @@ def time_of_flight_grid(depth: np.ndarray, sensor: TimeOfFlight) -> np.ndarray:
     fov_x, fov_y = (sensor.fov_y, sensor.fov_x) if lying else (sensor.fov_x, sensor.fov_y)
     rows, columns = sensor.crop(H, W, fov_x, fov_y)
     cropped = upright[rows, columns]
-    measured = np.isfinite(cropped) & (cropped > LEAST_DEPTH)
+    measured = np.isfinite(cropped) & (cropped > UNMEASURED_DEPTH)
     cropped = np.where(measured, cropped, sensor.max_range)
     ranges = cropped * range_of_depth(H, W, fov_x, fov_y)[rows, columns]
     for axis, count in ((0, sensor.rows), (1, sensor.columns)):
@@ -132,34 +123,17 @@ def range_of_depth(height: int, width: int, fov_x: float, fov_y: float) -> np.nd
 
 
 class TimeOfFlightGrid(LeafSystem):
-    """Converts raw frames to grids of proximities, see `time_of_flight_grid`.
-
-    .. pydrake_system::
-
-        name: TimeOfFlightGrid
-        input_ports:
-        - depth_image_32f
-        output_ports:
-        - depth_grid
-
-    - ``depth_image_32f``: planar depth [m], of the sensor's size.
-    - ``depth_grid`` (rows * columns): 1 - range / max_range, row by row from the lowest.
-
-    Stateless.
-    """
-
-    depth_image_32f_input_port = input_port("depth_image_32f")
-    depth_grid_output_port = output_port("depth_grid")
+    """Converts frames ``depth_image_32f`` to proximities ``depth_grid`` (rows * columns), row by
+    row from the lowest, see `time_of_flight_grid`."""
 
     def __init__(self, sensor: TimeOfFlight | None = None):
         super().__init__()
         self._sensor = sensor = sensor or TimeOfFlight()
         sensor.validate()
-        image = self.DeclareAbstractInputPort(
-            "depth_image_32f", Value(ImageDepth32F(sensor.width, sensor.height))
-        )
+        image = Value(ImageDepth32F(sensor.width, sensor.height))
+        ticket = self.DeclareAbstractInputPort("depth_image_32f", image).ticket()
         size = sensor.rows * sensor.columns
-        self.DeclareVectorOutputPort("depth_grid", size, self._calc, {image.ticket()})
+        self.DeclareVectorOutputPort("depth_grid", size, self._calc, {ticket})
 
     def _calc(self, context: Context, output: BasicVector) -> None:
         image = cast(ImageDepth32F, self.get_input_port().Eval(context))
@@ -172,27 +146,21 @@ class TimeOfFlightGrid(LeafSystem):
 
 GRID_MAGIC, FRAME_MAGIC = 0x544F4632, 0x544F4633
 _GRID_HEADER = struct.Struct("<IIQ")  # magic, sequence, time [ns]
+# Magic, sequence, number of the frame, of the chunk, of chunks, time [ns], width, height.
 _FRAME_HEADER = struct.Struct("<IIIHHQHH")
-"""Magic, sequence, number of the frame, of the chunk, of chunks, time [ns], width, height."""
-
-_MAX_PIXELS = 4096 * 4096
 
 
 @dataclass(frozen=True, eq=False)
 class Stream:
     """State of a stream, immutable: Contexts may share it."""
 
-    grid: np.ndarray | None = None
-    """(rows, columns), the newest."""
-    time_ns: int = -1
-    """Time of the grid, by the sensor's clock."""
+    grid: np.ndarray | None = None  # (rows, columns), the newest.
+    time_ns: int = -1  # of the grid, by the sensor's clock.
     seq: int = -1
-    gaps: int = 0
-    """Number of packets that were missed."""
+    gaps: int = 0  # Number of packets that were missed.
+    # Incomplete raw frame: number, chunks, time, width, height; and its received chunks.
     frame: tuple[int, ...] = ()
-    """Incomplete raw frame: number, chunks, time, width, height."""
     chunks: dict[int, bytes] = field(default_factory=dict)
-    """Its received chunks."""
 
     def restarted(self) -> "Stream":
         """Returns the state for a new stream: clock and numbers are not compared."""
@@ -203,16 +171,8 @@ class Stream:
 
 
 def after_packet(stream: Stream, packet: bytes, sensor: TimeOfFlight) -> Stream:
-    """
-    Returns the stream after another packet.
-
-    Args:
-        sensor: of raw frames, and of the grids made of them.
-
-    Raises:
-        ValueError: for an unusable packet: of another kind or length, with invalid values, or not
-            newer than the last.
-    """
+    """Returns the stream of a sensor after another packet; raises ValueError for one of another
+    kind or length, with invalid values, or not newer than the last."""
     require(len(packet) >= 4, "packet", "at least 4 bytes", len(packet))
     (magic,) = struct.unpack_from("<I", packet)
     kinds = {GRID_MAGIC: _after_grid, FRAME_MAGIC: _after_chunk}
@@ -226,8 +186,8 @@ def _after_grid(stream: Stream, packet: bytes, sensor: TimeOfFlight) -> Stream:
     require(len(packet) == length, "packet of a grid", f"{length} bytes", len(packet))
     _, seq, time_ns = _GRID_HEADER.unpack_from(packet)
     values = np.frombuffer(packet, "<f4", offset=_GRID_HEADER.size).astype(float)
-    valid = ((values >= 0.0) & (values <= 1.0)).all()
-    require(valid, "proximities", "in [0, 1]", values[~((values >= 0.0) & (values <= 1.0))][:1])
+    valid = (values >= 0.0) & (values <= 1.0)
+    require(valid.all(), "proximities", "in [0, 1]", values[~valid][:1])
     return _after_image(stream, values.reshape(sensor.rows, sensor.columns), seq, time_ns)
 
 
@@ -235,11 +195,10 @@ def _after_chunk(stream: Stream, packet: bytes, sensor: TimeOfFlight) -> Stream:
     header = _FRAME_HEADER.size
     require(len(packet) > header, "packet of a chunk", f"over {header} bytes", len(packet))
     _, seq, number, index, count, time_ns, width, height = _FRAME_HEADER.unpack_from(packet)
-    size = f"{width}x{height}"
     require(index < count, "chunk", f"below {count}", index)
-    require(0 < width * height <= _MAX_PIXELS, "frame", f"at most {_MAX_PIXELS} pixels", size)
     same = sorted((width, height)) == sorted((sensor.width, sensor.height))
-    require(same, "frame", f"{sensor.width}x{sensor.height} pixels", size)
+    size = f"{sensor.width}x{sensor.height} pixels"
+    require(same, "frame", size, f"{width}x{height}")
     require(time_ns > stream.time_ns, "time of the frame", f"after {stream.time_ns} ns", time_ns)
     frame = (number, count, time_ns, width, height)
     chunks = {index: packet[header:]} | (stream.chunks if frame == stream.frame else {})

@@ -1,15 +1,14 @@
-"""Backgrounds infinitely far behind all Gaussians: one color, or one for each direction."""
+"""Backgrounds behind all Gaussians: one color, or one for each direction."""
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import cv2
 import numpy as np
 
 from splatpilot.systems.common.files import written_atomically
-from splatpilot.systems.common.readers import require_readable_size
-from splatpilot.systems.splats.baked_scene import RenderedView
+from splatpilot.systems.common.readers import readable, require_file, require_readable_size
 from splatpilot.systems.splats.lens import Distortion, pixel_slopes
 
 if TYPE_CHECKING:
@@ -20,6 +19,14 @@ FAR = 150.0
 """[m], depth from which on a pixel shows the background; some renderers give it a number."""
 
 _MIN_LIGHT = 1e-3  # 1 - alpha below which the background is not looked up
+
+
+class RenderedView(NamedTuple):
+    """Images of one camera, float32."""
+
+    color: "NDArray[np.float32]"  # (H, W, 3), over the background
+    depth: "NDArray[np.float32]"  # (H, W) [m] median z, see `rasterize`; 0: no surface
+    alpha: "NDArray[np.float32]"  # (H, W) in [0, 1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,21 +41,17 @@ class EnvironmentMap:
 
     @classmethod
     def load(cls, file: Path) -> "EnvironmentMap":
-        """Reads an image; raises FileNotFoundError or ValueError if that is impossible."""
-        if not file.is_file():
-            raise FileNotFoundError(f"No such file: {file}; reconstruct the scene again")
+        """Reads an image file."""
+        require_file(file)
         require_readable_size(file, file.stat().st_size)
-        content = file.read_bytes()
-        try:
-            image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
-        except cv2.error:  # more pixels than OpenCV decodes
-            image = None
-        if image is None:
-            raise ValueError(f"{file}: cannot be read as an image; reconstruct the scene again")
-        return cls((image[..., ::-1] / 255).astype(np.float32))
+        with readable(file, "image"):
+            image = cv2.imdecode(np.fromfile(file, np.uint8), cv2.IMREAD_COLOR)
+            if image is None:
+                raise ValueError("unknown format")
+            return cls((image[..., ::-1] / 255).astype(np.float32))
 
     def save(self, file: Path) -> None:
-        """Writes the texels as `png`, atomically."""
+        """Writes `png` atomically."""
         with written_atomically(file) as partial:
             partial.write_bytes(self.png())
 
@@ -79,8 +82,7 @@ BLACK = (0.0, 0.0, 0.0)
 def texel_position(
     v_W: "ArrayLike", height: int, width: int
 ) -> "tuple[NDArray[np.float64], NDArray[np.float64]]":
-    """Returns row and column (n,) of directions v_W (n, 3) in an `EnvironmentMap`, in texels from
-    its upper left corner."""
+    """Returns row and column (n,) of directions v_W (n, 3) in an `EnvironmentMap` [texels]."""
     x, y, z = np.moveaxis(np.asarray(v_W, dtype=np.float64), -1, 0)
     row = np.arctan2(np.hypot(x, y), z) / np.pi * height
     return row, (np.arctan2(y, x) / (2 * np.pi) + 0.5) * width
@@ -101,15 +103,13 @@ def put_behind(
     X_WC: "RigidTransform",
     distortion: Distortion | None = None,
 ) -> RenderedView:
-    """Puts a background behind a view that was rendered on black; K (3, 3) [px]. Pixels without a
-    ray stay black."""
+    """Adds a background to a view on black; pixels without a ray stay black. K is (3, 3) [px]."""
     color = view.color.copy()
     rows, columns = np.nonzero(view.alpha < 1 - _MIN_LIGHT)
     if distortion is None:
         v_W = pixel_rays(K, rows, columns, X_WC)
     else:
-        height, width = view.alpha.shape
-        slopes = pixel_slopes(distortion, K, width, height)[rows, columns]
+        slopes = pixel_slopes(distortion, K, *view.alpha.shape[::-1])[rows, columns]
         shown = np.isfinite(slopes[:, 0])
         rows, columns = rows[shown], columns[shown]
         v_C = np.column_stack([slopes[shown], np.ones(len(rows))])

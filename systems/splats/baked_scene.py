@@ -2,14 +2,21 @@
 
 import os
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from splatpilot import _native
 from splatpilot.systems.common.validation import require
-from splatpilot.systems.splats.lens import PINHOLE, Distortion, hidden_pixels, native_lens
+from splatpilot.systems.splats.background import (
+    BLACK,
+    Background,
+    EnvironmentMap,
+    RenderedView,
+    put_behind,
+)
+from splatpilot.systems.splats.lens import Distortion, hidden_pixels, native_lens
 from splatpilot.systems.splats.scene import GaussianScene, harmonic_degree
 
 if TYPE_CHECKING:
@@ -44,12 +51,11 @@ class MovingGaussians:
     def __init__(
         self, bodies: Sequence[GaussianScene], centers: Callable[[float], NDArray]
     ) -> None:
-        self._about_centers = PlacedGaussians(
-            *(
-                np.concatenate([getattr(body, name) for body in bodies] or [none])
-                for name, none in NO_GAUSSIANS._asdict().items()
-            )
+        arrays = (
+            np.concatenate([getattr(body, name) for body in bodies] or [none])
+            for name, none in NO_GAUSSIANS._asdict().items()
         )
+        self._about_centers = PlacedGaussians(*arrays)
         self._body = np.repeat(np.arange(len(bodies)), [len(body) for body in bodies])
         self._centers = centers
 
@@ -65,14 +71,6 @@ class MovingGaussians:
         return placed._replace(opacities=own.opacities * present[self._body])
 
 
-class RenderedView(NamedTuple):
-    """Images of one camera, float32."""
-
-    color: NDArray[np.float32]  # (H, W, 3), over the background
-    depth: NDArray[np.float32]  # (H, W) [m] median z, see `rasterize`; 0: no surface
-    alpha: NDArray[np.float32]  # (H, W) in [0, 1]
-
-
 def create_renderer(threads: int = 1, simd: str = "") -> _native.Renderer:
     """Creates CPU threads and scratch memory, to be shared by the renderings of several images.
 
@@ -80,13 +78,9 @@ def create_renderer(threads: int = 1, simd: str = "") -> _native.Renderer:
     earlier images.
 
     Args:
-        threads: 1 to 1024.
+        threads: 1 to 1024; an OSError if the system refuses to start them.
         simd: one of `splatpilot._native.simd_levels()`; by default the environment variable
             SPLATPILOT_SIMD, else the widest of this machine.
-
-    Raises:
-        ValueError: `threads` or `simd` is invalid here.
-        OSError: the system does not let this process start so many threads.
     """
     require(1 <= int(threads) <= 1024, "threads", "in [1, 1024]", threads)
     try:
@@ -108,6 +102,21 @@ def check_camera(K: ArrayLike, width: int, height: int, near: float, far: float)
     return K
 
 
+def _native_gaussians(gaussians: "GaussianScene | PlacedGaussians") -> _native.Gaussians:
+    means, quats, scales, opacities, sh = (
+        np.ascontiguousarray(getattr(gaussians, name), dtype=np.float32)
+        for name in PlacedGaussians._fields
+    )
+    return _native.Gaussians(
+        means=means,
+        quats=quats,
+        scales=scales,
+        opacities=opacities,
+        colors=sh,
+        sh_degree=harmonic_degree(sh.shape[1]),
+    )
+
+
 class BakedScene:
     """A Gaussian scene prepared for fast repeated rendering.
 
@@ -120,16 +129,10 @@ class BakedScene:
     def __init__(self, scene: GaussianScene, threads: int = 1, simd: str = ""):
         """Bakes a scene without keeping a reference to it; see `create_renderer`."""
         self._renderer = create_renderer(threads, simd)
-        names = PlacedGaussians._fields
-        arrays = {n: np.ascontiguousarray(getattr(scene, n), dtype=np.float32) for n in names}
-        self._scene = _native.BakedScene(**arrays, sh_degree=harmonic_degree(scene.sh.shape[1]))
+        self._scene = _native.BakedScene(_native_gaussians(scene))
 
     def recolored(self, sh: np.ndarray) -> "BakedScene":
-        """Returns the same Gaussians in other colors without baking again.
-
-        Args:
-            sh: (N, K, 3), see `GaussianScene`, in the order of the baked scene.
-        """
+        """Returns the same Gaussians in other colors, `sh` (N, K, 3), without baking again."""
         sh = np.ascontiguousarray(sh, dtype=np.float32)
         count = self._scene.count
         valid = sh.ndim == 3 and len(sh) == count and sh.shape[2] == 3
@@ -147,7 +150,7 @@ class BakedScene:
         X_WC: "RigidTransform",
         near: float = 0.01,
         far: float = 1e10,
-        background: ArrayLike = (0.0, 0.0, 0.0),
+        background: Background = BLACK,
         moving: PlacedGaussians = NO_GAUSSIANS,
         distortion: Distortion | None = None,
         max_depth: float = np.inf,
@@ -162,17 +165,22 @@ class BakedScene:
             X_WC: Pose of the camera (x right, y down, z forward) in the world.
             near: Gaussians whose center is nearer than this along z are left out [m].
             far: The same for those farther away [m].
-            background: (3,) color behind everything.
+            background: color or environment behind everything.
             moving: Gaussians added to those of the scene for this image; not checked.
             distortion: Lens; a pinhole if None. Pixels without a ray are black, with alpha and
                 depth 0.
             max_depth: Gaussians beyond this depth [m] are left out of the depth image.
         """
-        background = np.ascontiguousarray(background, dtype=np.float32)
-        valid = background.shape == (3,) and np.isfinite(background).all()
-        require(valid, "background", "3 finite numbers", background.tolist())
+        environment = background if isinstance(background, EnvironmentMap) else None
+        color = np.array(BLACK if environment else background, dtype=np.float32)
+        valid = color.shape == (3,) and np.isfinite(color).all()
+        require(valid, "background", "3 finite numbers", color.tolist())
         camera = (K, width, height, X_WC, near, far)
-        return self._render(camera, background, moving, distortion, max_depth, depth_alone=False)
+        depth, seen, alpha = self._render(*camera, moving, distortion, max_depth, color)
+        view = RenderedView(seen, depth[..., 0], alpha[..., 0])
+        if environment is None:
+            return view
+        return put_behind(view, environment, np.asarray(K), X_WC, distortion)
 
     def render_depth(
         self,
@@ -187,28 +195,27 @@ class BakedScene:
         distortion: Distortion | None = None,
     ) -> NDArray[np.float32]:
         """Renders the median depth (H, W) [m], bitwise identical to that of `render` but faster."""
-        camera, black = (K, width, height, X_WC, near, far), np.zeros(3, np.float32)
-        return self._render(camera, black, moving, distortion, max_depth, depth_alone=True).depth
+        camera = (K, width, height, X_WC, near, far)
+        return self._render(*camera, moving, distortion, max_depth)[0][..., 0]
 
     def _render(
         self,
-        camera: tuple[Any, int, int, Any, float, float],
-        background: NDArray[np.float32],
+        K: ArrayLike,
+        width: int,
+        height: int,
+        X_WC: "RigidTransform",
+        near: float,
+        far: float,
         moving: PlacedGaussians,
         distortion: Distortion | None,
         max_depth: float,
-        depth_alone: bool,
-    ) -> RenderedView:
-        K, width, height, X_WC, near, far = camera
+        background: NDArray[np.float32] | None = None,
+    ) -> list[NDArray[np.float32]]:
+        """Returns depth (H, W, 1) and, with a background, color (H, W, 3) and alpha (H, W, 1)."""
         K = check_camera(K, width, height, near, far)
         require(max_depth > 0, "max_depth", "> 0 m", max_depth)
-        lens = PINHOLE if distortion is None else native_lens(distortion, K, width, height)
-        color, depth, alpha = (np.empty((height, width, n), np.float32) for n in (3, 1, 1))
-        _native.render_baked(
-            self._scene,
-            self._renderer,
-            **moving._asdict(),
-            sh_degree=harmonic_degree(moving.sh.shape[1]),
+        lens = {} if distortion is None else native_lens(distortion, K, width, height)._asdict()
+        camera = _native.Camera(
             K=K,
             X_CW=np.ascontiguousarray(X_WC.inverse().GetAsMatrix4()),
             width=width,
@@ -216,15 +223,24 @@ class BakedScene:
             near_plane=near,
             far_plane=far,
             eps2d=EPS2D,
-            background=background,
-            color=None if depth_alone else color,
-            depth=depth,
-            alpha=None if depth_alone else alpha,
             max_depth=max_depth,
-            **lens._asdict(),
+            **lens,
         )
+        depth, color, alpha = (np.empty((height, width, n), np.float32) for n in (1, 3, 1))
+        whole = background is not None
+        _native.render_baked(
+            self._scene,
+            self._renderer,
+            _native_gaussians(moving),
+            camera,
+            background=background if whole else np.zeros(3, np.float32),
+            color=color if whole else None,
+            depth=depth,
+            alpha=alpha if whole else None,
+        )
+        images = [depth, color, alpha] if whole else [depth]
         if distortion is not None:
             hidden = hidden_pixels(distortion, K, width, height)
-            for image in (depth,) if depth_alone else (color, depth, alpha):
+            for image in images:
                 image.reshape(-1, image.shape[2])[hidden] = 0.0
-        return RenderedView(color, depth[..., 0], alpha[..., 0])
+        return images

@@ -1,6 +1,6 @@
 """Lenses that bend the rays of a pinhole camera: OpenCV's rational and fisheye models.
 
-All is on the image plane of focal length 1; see "Camera Calibration and 3D Reconstruction" and
+Points are on the image plane of focal length 1; see "Camera Calibration and 3D Reconstruction" and
 "Fisheye camera model" of OpenCV, and Kannala and Brandt, PAMI 2006.
 """
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
 NUM_RADIAL = {"opencv": 6, "fisheye": 4}
-"""Largest number of radial coefficients of each model."""
+"""Maximum number of radial coefficients of each model."""
 
 _MARGIN = 0.15  # fraction of the image around it in which rays are still projected as if inside
 _SAMPLES, _STEPS = 4097, 6  # of the radial table and of its refinement, to rounding
@@ -51,6 +51,9 @@ class Distortion(Config):
         count = 2 if self.model == "opencv" else 0
         valid = len(self.tangential) in (0, count)
         require_field(self, "tangential", valid, f"{count} numbers of {self.model}, or none")
+
+    def __hash__(self) -> int:
+        return hash((self.model, *self.radial, *self.tangential, self.max_angle))
 
     @property
     def limit(self) -> float:
@@ -126,8 +129,6 @@ class NativeLens(NamedTuple):
     lens: "NDArray[np.float64]"  # (13,): radial 6, tangential 2, limit^2, min and max slopes
 
 
-PINHOLE = NativeLens(0, np.zeros(13))
-
 type _Intrinsics = tuple[float, float, float, float]  # fx, fy, cx, cy
 
 
@@ -135,18 +136,13 @@ def _cached[T](maxsize: int) -> Callable[[Callable[..., T]], Callable[..., T]]:
     """Caches a function of a lens, intrinsics, width and height by their values."""
 
     def decorate(compute: Callable[..., T]) -> Callable[..., T]:
-        @lru_cache(maxsize)
-        def cached(model, radial, tangential, max_angle, intrinsics, width, height) -> T:
-            lens = Distortion(model, list(radial), list(tangential), max_angle)
-            return compute(lens, intrinsics, width, height)
+        cached = lru_cache(maxsize)(compute)
 
-        @wraps(compute)
         def call(distortion: Distortion, K: "NDArray", width: int, height: int) -> T:
-            d, intrinsics = distortion, tuple(map(float, K[[0, 1, 0, 1], [0, 1, 2, 2]]))
-            lens = d.model, tuple(d.radial), tuple(d.tangential), d.max_angle
-            return cached(*lens, intrinsics, width, height)
+            intrinsics = tuple(map(float, K[[0, 1, 0, 1], [0, 1, 2, 2]]))
+            return cached(distortion, intrinsics, width, height)
 
-        return call
+        return wraps(compute)(call)
 
     return decorate
 
@@ -162,7 +158,7 @@ def native_lens(
     border = np.concatenate([np.stack(pair, -1) for a, b in edges for pair in ((a, b), (b, a))])
     points = (border * [width, height] - [cx, cy]) / [fx, fy]
     slopes = distortion.slopes(points)
-    # The limit of the lens takes the place of a border beyond it.
+    # The limit of the lens replaces a border beyond it.
     outward = distortion.limit * points / np.maximum(_lengths(points), 1e-12)[:, None]
     slopes = np.where(np.isnan(slopes), outward, slopes)
     numbers = [

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,30 +15,27 @@ from splatpilot import _native
 from splatpilot.systems.common.extras import import_extra
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.splats.baked_scene import EPS2D, check_camera, create_renderer
+from splatpilot.systems.splats.scene import require_valid
 
 TILE_SIZE = 16  # [px]
 CHANNELS = {"RGB": 3, "D": 1, "ED": 1, "MD": 1, "RGB+D": 4, "RGB+ED": 4, "RGB+MD": 4}
-RASTERIZE_MODES = ("classic", "antialiased")
 SCENE = ("means", "quats", "scales", "opacities", "colors")
 TENSORS = (*SCENE, "viewmats", "Ks", "backgrounds")
+SPLAT_GRADIENT = 16
+"""Floats of a splat's gradient: mean 2, ln opacity, shape 3, color 3, depth; 6 unused."""
 
 type Arrays = dict[str, NDArray[Any]]
 
 
-def by_name(*tensors: Tensor | None) -> dict[str, Tensor]:
-    """Names the first of `TENSORS`, without those that are None."""
-    given = zip(TENSORS, tensors, strict=False)
-    return {name: tensor for name, tensor in given if tensor is not None}
-
-
-def require_one_of(name: str, value: str, values: Iterable[str]) -> None:
+def require_choice(name: str, value: str, values: Iterable[str]) -> None:
     require(value in values, name, f"one of {', '.join(values)}", repr(value))
 
 
-def check_shapes(tensors: dict[str, Tensor], sh_degree: int | None) -> None:
-    """Raises ValueError for a tensor of a shape, dtype or device that cannot be rendered."""
+def named_tensors(*tensors: Tensor | None, sh_degree: int | None) -> dict[str, Tensor]:
+    """Names tensors by `TENSORS`, without None, and checks their shapes, dtypes and devices."""
+    given = {name: t for name, t in zip(TENSORS, tensors, strict=True) if t is not None}
     require(sh_degree in (None, 0, 1, 2, 3), "sh_degree", "0, 1, 2, 3 or None", sh_degree)
-    N, C = (tensors[n].shape[0] if tensors[n].ndim else 0 for n in ("means", "viewmats"))
+    N, C = (given[n].shape[0] if given[n].ndim else 0 for n in ("means", "viewmats"))
     color = (3,) if sh_degree is None else ("K", 3)
     allowed: dict[str, tuple[tuple[int | str, ...], ...]] = {
         "means": ((N, 3),),
@@ -50,100 +47,69 @@ def check_shapes(tensors: dict[str, Tensor], sh_degree: int | None) -> None:
         "Ks": ((C, 3, 3),),
         "backgrounds": ((C, 3),),
     }
-    for name, tensor in tensors.items():
+    device = given["means"].device
+    for name, tensor in given.items():
         fits = any(
             len(shape) == tensor.ndim
-            and all(want in (have, "K") for want, have in zip(shape, tensor.shape, strict=True))
+            and all(n in (have, "K") for n, have in zip(shape, tensor.shape, strict=True))
             for shape in allowed[name]
         )
         shapes = " or ".join("(" + ", ".join(map(str, s)) + ")" for s in allowed[name])
         require(fits, name, f"of shape {shapes}", tuple(tensor.shape))
         require(tensor.dtype == torch.float32, name, "torch.float32", tensor.dtype, "use .float()")
-        device = tensors["means"].device
         require(tensor.device == device, name, f"on {device} like means", tensor.device)
     require(C > 0, "viewmats", "of at least one camera", "none")
     if sh_degree is not None:
-        coefficients, needed = tensors["colors"].shape[-2], (sh_degree + 1) ** 2
+        count, minimum = given["colors"].shape[-2], (sh_degree + 1) ** 2
         what = f"the number of coefficients in colors for sh_degree={sh_degree}"
-        require(coefficients >= needed, what, f">= {needed}", coefficients)
+        require(count >= minimum, what, f">= {minimum}", count)
+    return given
 
 
-def check_values(arrays: Arrays, renderer: _native.Renderer, scale_axes: int = 3) -> None:
-    """Raises ValueError for values that cannot be rendered; the first `scale_axes` scales count."""
-    scene = {name: arrays[name] for name in SCENE}
-    scene["colors"] = scene["colors"].reshape(-1)
-    fine = _native.scene_is_valid(renderer, **scene)
-    if not fine:
-        arrays = arrays | {"scales": np.ascontiguousarray(arrays["scales"][:, :scale_axes])}
+def _check_values(arrays: Arrays, scene_is_valid: bool, scale_axes: int) -> None:
+    """Checks that values can be rendered; the first `scale_axes` scales count."""
     for name, array in arrays.items():
-        if fine and name in SCENE:
-            continue
-        first = _native.first_nonfinite(renderer, array.reshape(-1))
-        require_element(first, name, array, "finite")
-    if not fine:
-        scales, opacities, quats = (arrays[n] for n in ("scales", "opacities", "quats"))
-        require_element(_first(scales <= 0), "scales", scales, "> 0 m")
-        require_element(
-            _first((opacities < 0) | (opacities > 1)), "opacities", opacities, "in [0, 1]"
-        )
-        row = _native.first_zero_quaternion(quats)
+        if name not in SCENE:
+            require_valid(np.isfinite(array), name, array, "finite")
+    if not scene_is_valid:
+        scene = {name: arrays[name] for name in SCENE}
+        scene["scales"] = scene["scales"][:, :scale_axes]
+        for name, array in scene.items():
+            require_valid(np.isfinite(array), name, array, "finite")
+        scales, opacities, quats = (scene[n] for n in ("scales", "opacities", "quats"))
+        require_valid(scales > 0, "scales", scales, "> 0 m")
+        require_valid((opacities >= 0) & (opacities <= 1), "opacities", opacities, "in [0, 1]")
+        squared = (quats * quats).sum(axis=1)
         remedy = "use (1, 0, 0, 0) for no rotation"
-        require(row < 0, f"quats[{row}]", "of a length > 0", quats[row].tolist(), remedy)
+        valid = (squared >= 1e-30) & (squared <= 1e30)
+        require_valid(valid, "quats", quats, "of a length > 0", remedy)
     for c, X_CW in enumerate(arrays["viewmats"].astype(np.float64)):
         R = X_CW[:3, :3]
         error = max(np.abs(R @ R.T - np.eye(3)).max(), np.abs(X_CW[3] - (0, 0, 0, 1)).max())
-        require(
-            error <= 1e-3, f"viewmats[{c}]", "a rigid transform", f"one that is off by {error:.3g}"
-        )
-
-
-def _first(bad: NDArray[np.bool_]) -> int:
-    """Returns the index of the first true value in the flat array, -1 without one."""
-    return int(bad.argmax()) if bad.any() else -1
-
-
-def require_element(flat_index: int, name: str, array: NDArray, condition: str) -> None:
-    if flat_index >= 0:
-        index = np.unravel_index(flat_index, array.shape)
-        where = ", ".join(str(int(i)) for i in index)
-        require(False, f"{name}[{where}]", condition, f"{array[index]:g}")
+        got = f"one that is off by {error:.3g}"
+        require(error <= 1e-3, f"viewmats[{c}]", "a rigid transform", got)
 
 
 @dataclass(frozen=True)
-class Cameras:
-    """C pinhole cameras and the renderer of their images."""
+class Views:
+    """C cameras and the renderer of their images."""
 
     renderer: _native.Renderer
-    intrinsics: list[NDArray[np.float64]]  # C x (3, 3) [px]
+    cameras: list[_native.Camera]
     poses: NDArray[np.float64]  # (C, 4, 4) X_CW
-    width: int
-    height: int
-    near_plane: float
-    far_plane: float
-    radius_clip: float
     sh_degree: int | None
     per_camera_colors: bool
 
-    def arguments(self, c: int) -> dict[str, Any]:
-        """Returns camera c as native renderers take it."""
-        return {
-            "K": self.intrinsics[c],
-            "X_CW": self.poses[c],
-            "width": self.width,
-            "height": self.height,
-            "near_plane": self.near_plane,
-            "far_plane": self.far_plane,
-            "radius_clip": self.radius_clip,
-        }
-
-    def scene(self, arrays: Arrays, c: int) -> dict[str, Any]:
-        """Returns Gaussians or surfels as native functions take them for camera c."""
+    def _colors(self, arrays: Arrays, c: int) -> NDArray[np.float32]:
         colors = arrays["colors"] if self.sh_degree is not None else arrays["colors"][..., None, :]
-        return {
-            **{name: arrays[name] for name in SCENE},
-            "colors": colors[c] if colors.ndim == 4 else colors,  # (N, K, 3), a view
-            "sh_degree": -1 if self.sh_degree is None else self.sh_degree,
-        }
+        return colors[c] if self.per_camera_colors else colors  # (N, K, 3), a view
+
+    def gaussians(self, arrays: Arrays, c: int) -> _native.Gaussians:
+        """Returns Gaussians or surfels as camera c sees them."""
+        scene = {name: arrays[name] for name in SCENE} | {"colors": self._colors(arrays, c)}
+        return _native.Gaussians(
+            **scene, sh_degree=-1 if self.sh_degree is None else self.sh_degree
+        )
 
     def project_backward(
         self, inputs: Sequence[Tensor], backward: Callable[..., NDArray[np.float64]]
@@ -152,30 +118,28 @@ class Cameras:
 
         Args:
             inputs: these six.
-            backward: native function of a camera's index and the arguments of its scene and
-                gradients; see `_native.project_backward`.
+            backward: native function of a camera's index, its Gaussians and their gradients; see
+                `_native.project_backward`.
         """
         results = [torch.empty_like(t, memory_format=torch.contiguous_format) for t in inputs]
         results[-1].zero_()
         scene, gradients = (
-            {name: to_numpy(tensor) for name, tensor in zip(SCENE, tensors, strict=False)}
+            {name: _to_numpy(tensor) for name, tensor in zip(SCENE, tensors, strict=False)}
             for tensors in (inputs, results)
         )
         for c, X_CW in enumerate(self.poses):
-            outputs = self.scene(gradients, c)
-            sums = backward(
-                c,
-                **self.scene(scene, c),
-                **{f"v_{name}": outputs[name] for name in SCENE},
+            rows = _native.GaussianGradients(
+                **gradients | {"colors": self._colors(gradients, c)},
                 overwrite=c == 0,
                 overwrite_colors=c == 0 or self.per_camera_colors,
             )
+            sums = backward(c, self.gaussians(scene, c), rows)
             results[-1][c, :3] = torch.from_numpy(_pose_gradient(sums, X_CW))
         return results
 
 
 def _pose_gradient(sums: NDArray[np.float64], X_CW: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns dL/d[R | t] (3, 4) from dL/dR with the center held, dL/dp_C and dL/d(p_W - center).
+    """Returns dL/d[R | t] (3, 4) from dL/dR with the center fixed, dL/dp_C and dL/d(p_W - center).
 
     p_C = R p_W + t, with p_W = d + center; spherical harmonics look from center = -R^-1 t.
     """
@@ -188,56 +152,75 @@ def _pose_gradient(sums: NDArray[np.float64], X_CW: NDArray[np.float64]) -> NDAr
 
 def prepare(
     tensors: dict[str, Tensor],
-    width: int,
-    height: int,
-    near_plane: float,
-    far_plane: float,
-    radius_clip: float,
+    size: tuple[int, int],
+    clipping: tuple[float, float, float],
     sh_degree: int | None,
     renderer: _native.Renderer | None,
     scale_axes: int = 3,
-) -> tuple[Cameras, Arrays]:
-    """Checks CPU tensors that have passed `check_shapes`; returns cameras and arrays."""
+    **optics: Any,
+) -> tuple[Views, Arrays]:
+    """Checks the values of `named_tensors` on the CPU; returns cameras and arrays.
+
+    Args:
+        size: width and height [px].
+        clipping: near and far plane [m], radius_clip [px].
+        scale_axes: number of scales of a Gaussian that matter.
+        optics: further arguments of `_native.Camera`.
+    """
+    (width, height), (near, far, radius_clip) = size, clipping
     device = tensors["means"].device
     require(device.type == "cpu", "the device", "'cpu' or 'cuda'", device, "move the tensors")
     if torch.is_grad_enabled() and tensors["Ks"].requires_grad:
         raise ValueError("Ks must be without a gradient; use Ks.detach()")
     require(0 <= radius_clip < np.inf, "radius_clip", "finite and >= 0 px", radius_clip)
-    renderer = create_renderer() if renderer is None else renderer
-    arrays = {name: to_numpy(tensor) for name, tensor in tensors.items()}
-    check_values(arrays, renderer, scale_axes)
-    cameras = Cameras(
-        renderer=renderer,
-        intrinsics=[check_camera(K, width, height, near_plane, far_plane) for K in arrays["Ks"]],
-        poses=arrays["viewmats"].astype(np.float64),
-        width=width,
-        height=height,
-        near_plane=near_plane,
-        far_plane=far_plane,
-        radius_clip=radius_clip,
-        sh_degree=sh_degree,
+    arrays = {name: _to_numpy(tensor) for name, tensor in tensors.items()}
+    poses = arrays["viewmats"].astype(np.float64)
+    views = Views(
+        create_renderer() if renderer is None else renderer,
+        [],
+        poses,
+        sh_degree,
         per_camera_colors=tensors["colors"].ndim == (3 if sh_degree is None else 4),
     )
-    return cameras, arrays
+    colors = range(len(poses) if views.per_camera_colors else 1)
+    valid = all(views.gaussians(arrays, c).are_valid(views.renderer) for c in colors)
+    _check_values(arrays, valid, scale_axes)
+    for K, X_CW in zip(arrays["Ks"], poses, strict=True):
+        K = check_camera(K, width, height, near, far)
+        camera = _native.Camera(
+            K=K,
+            X_CW=X_CW,
+            width=width,
+            height=height,
+            near_plane=near,
+            far_plane=far,
+            radius_clip=radius_clip,
+            **optics,
+        )
+        views.cameras.append(camera)
+    return views, arrays
 
 
 def requires_gradients(tensors: dict[str, Tensor]) -> bool:
     return torch.is_grad_enabled() and any(t.requires_grad for t in tensors.values())
 
 
-def to_numpy(tensor: Tensor) -> NDArray[Any]:
+def _to_numpy(tensor: Tensor) -> NDArray[Any]:
     return np.ascontiguousarray(tensor.detach().numpy())
 
 
-def joined(parts: Sequence[NDArray]) -> Tensor:
-    return torch.from_numpy(parts[0] if len(parts) == 1 else np.concatenate(parts))
+def joined(parts: Sequence[tuple[NDArray, ...]]) -> list[Tensor]:
+    """Concatenates the arrays of each camera."""
+    return [
+        torch.from_numpy(arrays[0] if len(arrays) == 1 else np.concatenate(arrays))
+        for arrays in zip(*parts, strict=True)
+    ]
 
 
 def pair_meta(counts: list[int], width: int, height: int) -> dict[str, Any]:
     """Returns gsplat's meta of both rasterizers for `counts` visible Gaussians of each camera."""
-    cameras = torch.arange(len(counts))
     return {
-        "camera_ids": torch.repeat_interleave(cameras, torch.tensor(counts)),
+        "camera_ids": torch.repeat_interleave(torch.arange(len(counts)), torch.tensor(counts)),
         "width": width,
         "height": height,
         "tile_size": TILE_SIZE,
@@ -257,59 +240,10 @@ def over_backgrounds(
     return torch.cat([color, image[..., 3:]], dim=-1)
 
 
-# The native renderer draws the whole image at once. `Project` then takes the scene to `means2d`,
-# and `Composite` takes `means2d` to the image. So the screen-space gradients that densification
-# needs are the gradient of an ordinary intermediate tensor.
-
-SPLAT_GRADIENT = 16
-"""Floats of a splat's gradient: mean 2, ln opacity, shape 3, color 3, depth; 6 unused."""
-
-
-@dataclass(frozen=True)
-class Style:
-    """What is drawn of Gaussians."""
-
-    eps2d: float
-    antialiased: bool
-    backgrounds: NDArray[np.float32]  # (C, 3)
-    channels: int
-    depth_mode: _native.DepthMode
-
-
-class Drawing(NamedTuple):
-    """Images of C cameras with M visible (camera, Gaussian) pairs, and their frames."""
-
-    image: Tensor  # (C, H, W, X)
-    alpha: Tensor  # (C, H, W, 1)
-    frames: list[_native.Frame]
-    projected: list[tuple[NDArray[Any], ...]]  # of each camera, see `_native.projected`
-
-    def means2d(self) -> Tensor:
-        """Returns (M, 2) [px]."""
-        return joined([of_camera[2] for of_camera in self.projected])
-
-
-def draw(cameras: Cameras, style: Style, arrays: Arrays, keep: bool) -> Drawing:
-    """Renders; with `keep`, a backward pass can start from the frames."""
-    size = (len(cameras.poses), cameras.height, cameras.width)
-    drawing = Drawing(torch.empty((*size, style.channels)), torch.empty((*size, 1)), [], [])
-    for c in range(len(cameras.poses)):
-        frame = _native.render(
-            cameras.renderer,
-            **cameras.scene(arrays, c),
-            **cameras.arguments(c),
-            eps2d=style.eps2d,
-            antialiased=style.antialiased,
-            depth_mode=style.depth_mode,
-            background=style.backgrounds[c],
-            image=drawing.image[c].numpy(),
-            alpha=drawing.alpha[c].numpy(),
-            keep=keep,
-        )
-        given = None if style.antialiased else arrays["opacities"]
-        drawing.projected.append(_native.projected(cameras.renderer, frame, given))
-        drawing.frames.append(frame)
-    return drawing
+# The native renderer draws the whole image at once. `Project` then maps the scene to `means2d`, and
+# `Composite` maps `means2d` to the image, so that screen-space gradients, by which scenes are
+# densified, are those of an ordinary intermediate tensor. Results come in tuples: autograd would
+# alias tensors that are inputs.
 
 
 def _pair_rows(frames: Sequence[_native.Frame]) -> list[slice]:
@@ -321,16 +255,17 @@ def _pair_rows(frames: Sequence[_native.Frame]) -> list[slice]:
 class Project(torch.autograd.Function):
     """(means, quats, scales, opacities, colors, viewmats) -> means2d (M, 2), splats (M, 16).
 
-    `splats` has no values: it stands for the rest of the splats in the backward pass.
+    `splats` has no values: it represents the rest of the splats in the backward pass.
     """
 
     @staticmethod
-    def forward(ctx, cameras: Cameras, drawing: Drawing, *inputs: Tensor) -> tuple[Tensor, Tensor]:
-        ctx.cameras, ctx.frames = cameras, drawing.frames
+    def forward(
+        ctx, views: Views, frames: list[_native.Frame], results: tuple[Tensor], *inputs: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        ctx.views, ctx.frames = views, frames
         ctx.save_for_backward(*inputs)
         ctx.set_materialize_grads(False)
-        means2d = drawing.means2d()
-        return means2d, torch.full((1, 1), torch.nan).expand(len(means2d), SPLAT_GRADIENT)
+        return results[0], torch.full((1, 1), torch.nan).expand(len(results[0]), SPLAT_GRADIENT)
 
     @staticmethod
     @once_differentiable
@@ -340,17 +275,17 @@ class Project(torch.autograd.Function):
             (torch.zeros(rows[-1].stop, n) if v is None else v.contiguous()).numpy()
             for v, n in ((v_means2d, 2), (v_splats, SPLAT_GRADIENT))
         )
-        gradients = ctx.cameras.project_backward(
+        gradients = ctx.views.project_backward(
             ctx.saved_tensors,
-            lambda c, **arguments: _native.project_backward(
-                ctx.cameras.renderer,
+            lambda c, *scene: _native.project_backward(
+                ctx.views.renderer,
                 ctx.frames[c],
+                *scene,
                 v_splats=splats[rows[c]],
                 v_means2d=means2d[rows[c]],
-                **arguments,
             ),
         )
-        return None, None, *gradients
+        return None, None, None, *gradients
 
 
 class Composite(torch.autograd.Function):
@@ -359,29 +294,29 @@ class Composite(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx,
-        cameras: Cameras,
-        style: Style,
-        drawing: Drawing,
+        renderer: _native.Renderer,
+        frames: list[_native.Frame],
+        depth_mode: _native.DepthMode,
+        behind: NDArray[np.float32],
+        results: tuple[Tensor, Tensor],
         means2d: Tensor,
         splats: Tensor,
         backgrounds: Tensor | None,
     ) -> tuple[Tensor, Tensor]:
-        # The frames alone: an output that its own node refers to is never freed.
-        ctx.renderer, ctx.style, ctx.frames = cameras.renderer, style, drawing.frames
-        ctx.save_for_backward(drawing.image, drawing.alpha)
-        return drawing.image, drawing.alpha
+        ctx.renderer, ctx.frames, ctx.depth_mode, ctx.behind = renderer, frames, depth_mode, behind
+        ctx.save_for_backward(*results)
+        return results
 
     @staticmethod
     @once_differentiable
     def backward(ctx, v_image: Tensor, v_alpha: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
-        style: Style = ctx.style
         image, alpha = ctx.saved_tensors
         v_image, v_alpha = v_image.contiguous(), v_alpha.contiguous()
-        if style.depth_mode == _native.DepthMode.MEDIAN:
+        if ctx.depth_mode == _native.DepthMode.MEDIAN:
             v_image = v_image.clone()
             v_image[..., -1] = 0
         v_means2d = v_splats = v_backgrounds = None
-        if ctx.needs_input_grad[3]:
+        if ctx.needs_input_grad[5]:
             all_rows = _pair_rows(ctx.frames)
             v_splats = torch.empty(all_rows[-1].stop, SPLAT_GRADIENT)
             v_means2d = torch.empty(len(v_splats), 2)
@@ -393,14 +328,14 @@ class Composite(torch.autograd.Function):
                     v_alpha=v_alpha[c].numpy(),
                     image=image[c].numpy(),
                     alpha=alpha[c].numpy(),
-                    background=style.backgrounds[c],
-                    expected_depth=style.depth_mode == _native.DepthMode.EXPECTED,
+                    background=ctx.behind[c],
+                    expected_depth=ctx.depth_mode == _native.DepthMode.EXPECTED,
                     v_splats=v_splats[rows].numpy(),
                     v_means2d=v_means2d[rows].numpy(),
                 )
-        if ctx.needs_input_grad[5] and style.channels > 1:
+        if ctx.needs_input_grad[7] and image.shape[-1] > 1:
             v_backgrounds = (v_image[..., :3] * (1 - alpha)).sum((1, 2))
-        return None, None, None, v_means2d, v_splats, v_backgrounds
+        return None, None, None, None, None, v_means2d, v_splats, v_backgrounds
 
 
 def rasterize(
@@ -471,20 +406,14 @@ def rasterize(
         camera_ids, gaussian_ids, depths, opacities (M,), radii, means2d (M, 2), conics (M, 3), and
         width, height, tile_size, tile_width, tile_height, n_cameras. After
         ``meta["means2d"].retain_grad()``, its ``.grad`` holds screen-space gradients [1/px].
-
-    Raises:
-        ValueError: a tensor has the wrong shape, dtype, device or values, or Ks a gradient.
-        NotImplementedError: median depth of tensors on a GPU.
-        ModuleNotFoundError: tensors are on a GPU and gsplat is not installed.
     """
     scene = (means, quats, scales, opacities, colors, viewmats)
-    tensors = by_name(*scene, Ks, backgrounds)
-    require_one_of("render_mode", render_mode, CHANNELS)
-    require_one_of("rasterize_mode", rasterize_mode, RASTERIZE_MODES)
+    require_choice("render_mode", render_mode, CHANNELS)
+    require_choice("rasterize_mode", rasterize_mode, ("classic", "antialiased"))
     median, antialiased = "MD" in render_mode, rasterize_mode == "antialiased"
     what = f"rasterize_mode of render_mode {render_mode!r}"
     require(not (median and antialiased), what, "'classic'", repr(rasterize_mode))
-    check_shapes(tensors, sh_degree)
+    tensors = named_tensors(*scene, Ks, backgrounds, sh_degree=sh_degree)
     if means.device.type == "cuda":
         if median:
             raise NotImplementedError(f"render_mode {render_mode!r} needs CPU tensors; use .cpu()")
@@ -504,34 +433,43 @@ def rasterize(
         )
         return over_backgrounds(backgrounds, image, alpha, render_mode), alpha, meta
     require(0 <= eps2d < np.inf, "eps2d", "finite and >= 0 px^2", eps2d)
-    size = (width, height, near_plane, far_plane, radius_clip)
-    cameras, arrays = prepare(tensors, *size, sh_degree, renderer)
-    mode = _native.DepthMode
-    depth_mode = mode.EXPECTED if "ED" in render_mode else mode.ACCUMULATED
-    style = Style(
-        eps2d=eps2d,
-        antialiased=antialiased,
-        backgrounds=arrays.get("backgrounds", np.zeros((len(viewmats), 3), dtype=np.float32)),
-        channels=CHANNELS[render_mode],
-        depth_mode=mode.MEDIAN if median else depth_mode,
-    )
+    clipping = near_plane, far_plane, radius_clip
+    optics = {"eps2d": eps2d, "antialiased": antialiased}
+    views, arrays = prepare(tensors, (width, height), clipping, sh_degree, renderer, **optics)
+    modes = _native.DepthMode
+    depth_mode = modes.MEDIAN if median else modes.EXPECTED if "ED" in render_mode else None
+    depth_mode = depth_mode or modes.ACCUMULATED
+    behind = arrays.get("backgrounds", np.zeros((len(viewmats), 3), dtype=np.float32))
+    shape = len(viewmats), height, width
+    image, alpha = torch.empty((*shape, CHANNELS[render_mode])), torch.empty((*shape, 1))
     keep = requires_gradients(tensors)
-    drawing = draw(cameras, style, arrays, keep)
-    if not keep:
-        return drawing.image, drawing.alpha, _meta(drawing, drawing.means2d())
-    splats = Project.apply(cameras, drawing, *scene)
-    image, alpha = Composite.apply(cameras, style, drawing, *splats, backgrounds)  # pyright: ignore[reportGeneralTypeIssues]
-    return image, alpha, _meta(drawing, splats[0])
-
-
-def _meta(drawing: Drawing, means2d: Tensor) -> dict[str, Any]:
-    ids, radii, _, depths, conics, opacities = map(joined, zip(*drawing.projected, strict=True))
-    counts = [len(p[0]) for p in drawing.projected]
-    return pair_meta(counts, *drawing.image.shape[2:0:-1]) | {
+    frames, projected = [], []
+    for c, camera in enumerate(views.cameras):
+        frame = _native.render(
+            views.renderer,
+            views.gaussians(arrays, c),
+            camera,
+            depth_mode=depth_mode,
+            background=behind[c],
+            image=image[c].numpy(),
+            alpha=alpha[c].numpy(),
+            keep=keep,
+        )
+        given = None if antialiased else arrays["opacities"]
+        projected.append(_native.projected(views.renderer, frame, given))
+        frames.append(frame)
+    ids, radii, means2d, depths, conics, splat_opacities = joined(projected)
+    if keep:
+        splats = Project.apply(views, frames, (means2d,), *scene)
+        style = views.renderer, frames, depth_mode, behind, (image, alpha)
+        image, alpha = Composite.apply(*style, *splats, backgrounds)  # pyright: ignore[reportGeneralTypeIssues]
+        means2d = splats[0]  # pyright: ignore[reportOptionalSubscript]
+    meta = pair_meta([frame.splat_count for frame in frames], width, height) | {
         "gaussian_ids": ids,
         "radii": radii,
         "means2d": means2d,
         "depths": depths,
         "conics": conics,
-        "opacities": opacities,
+        "opacities": splat_opacities,
     }
+    return image, alpha, meta

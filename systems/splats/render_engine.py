@@ -30,12 +30,17 @@ from pydrake.systems.sensors import ImageDepth32F, ImageLabel16I, ImageRgba8U
 
 from splatpilot.systems.common.extras import load_triton
 from splatpilot.systems.common.validation import require
-from splatpilot.systems.splats.background import BLACK, Background, EnvironmentMap, pixel_rays
-from splatpilot.systems.splats.baked_scene import BakedScene, RenderedView
+from splatpilot.systems.splats.background import (
+    BLACK,
+    Background,
+    EnvironmentMap,
+    RenderedView,
+    pixel_rays,
+)
+from splatpilot.systems.splats.baked_scene import BakedScene
 from splatpilot.systems.splats.splat_camera import (
     color_pixels,
     ranged_depth,
-    render_view,
     surface_labels,
 )
 
@@ -49,8 +54,7 @@ _LIGHTS = [
 
 
 class SplatRenderEngine(RenderEngine):
-    """
-    Renders a Gaussian scene together with the shapes of a SceneGraph, the nearer in each pixel.
+    """Renders a Gaussian scene together with the shapes of a SceneGraph, the nearer in each pixel.
 
     Add it with `scene_graph.AddRenderer("splats", SplatRenderEngine(scene))` and name "splats" in
     the cameras of `RgbdSensor`. The frame of the Gaussians is SceneGraph's world frame.
@@ -72,12 +76,10 @@ class SplatRenderEngine(RenderEngine):
     """
 
     def __init__(
-        self,
-        scene: BakedScene,
-        shapes: RenderEngine | None = None,
-        background: Background = BLACK,
+        self, scene: BakedScene, shapes: RenderEngine | None = None, background: Background = BLACK
     ):
-        """
+        """Creates the engine of the shapes, and a SceneGraph for it.
+
         Args:
             scene: Gaussians, held by reference.
             shapes: engine of the shapes and the background, copied; RenderEngineVtk if None, which
@@ -86,19 +88,15 @@ class SplatRenderEngine(RenderEngine):
             background: color in [0, 1], of the default `shapes`; or an environment, of any.
         """
         super().__init__()
-        environment, color = None, np.asarray(BLACK)
-        if isinstance(background, EnvironmentMap):
-            environment = background
-        else:
-            color = np.asarray(background)
+        environment = background if isinstance(background, EnvironmentMap) else None
+        color = np.asarray(BLACK if isinstance(background, EnvironmentMap) else background)
         valid = color.shape == (3,) and np.all((color >= 0) & (color <= 1))
         require(valid, "background", "three numbers in [0, 1]", background)
         load_triton()
         if shapes is None:
-            shapes = MakeRenderEngineVtk(
-                RenderEngineVtkParams(default_clear_color=color, lights=_LIGHTS)
-            )
-        # A SceneGraph of our own: only SceneGraph moves the geometries of an engine.
+            params = RenderEngineVtkParams(default_clear_color=color, lights=_LIGHTS)
+            shapes = MakeRenderEngineVtk(params)
+        # A separate SceneGraph: only SceneGraph moves the geometries of an engine.
         scene_graph = SceneGraph()
         scene_graph.AddRenderer(_SHAPES, shapes)
         self._share(scene, environment, scene_graph)
@@ -147,11 +145,7 @@ class SplatRenderEngine(RenderEngine):
         self._X_WC = RigidTransform(X_WR)
 
     def DoRegisterVisual(
-        self,
-        id: GeometryId,
-        shape: Shape,
-        properties: PerceptionProperties,
-        X_WG: RigidTransform,
+        self, id: GeometryId, shape: Shape, properties: PerceptionProperties, X_WG: RigidTransform
     ) -> bool:
         if id in self._geometries:
             return True
@@ -215,35 +209,28 @@ class SplatRenderEngine(RenderEngine):
         np.asarray(label_image_out.mutable_data)[..., 0] = labels
 
     def _view(self, core: RenderCameraCore) -> RenderedView:
-        key = self._key(core)
+        camera, key = self._camera(core)
         if self._last_view is None or self._last_view[0] != key:
-            info, clipping = core.intrinsics(), core.clipping()
-            view = render_view(
-                self._scene,
-                info.intrinsic_matrix(),
-                info.width(),
-                info.height(),
-                self._X_WC,
-                clipping.near(),
-                clipping.far(),
-            )
-            self._last_view = key, view
+            self._last_view = key, self._scene.render(*camera)
         return self._last_view[1]
 
     def _depth(self, core: RenderCameraCore) -> NDArray[np.float32]:
         """Returns the depth (H, W) [m] of the cached view, else renders it alone."""
-        if self._last_view is not None and self._last_view[0] == self._key(core):
+        camera, key = self._camera(core)
+        if self._last_view is not None and self._last_view[0] == key:
             return self._last_view[1].depth
-        info, clipping = core.intrinsics(), core.clipping()
-        K, size = info.intrinsic_matrix(), (info.width(), info.height())
-        return self._scene.render_depth(K, *size, self._X_WC, clipping.near(), clipping.far())
+        return self._scene.render_depth(*camera)
 
-    def _key(self, core: RenderCameraCore) -> bytes:
-        """Returns camera and pose as bytes."""
+    def _camera(self, core: RenderCameraCore) -> tuple[tuple[Any, ...], bytes]:
+        """Returns K, width, height, X_WC, near and far, and these as bytes."""
         info, clipping = core.intrinsics(), core.clipping()
-        camera = [info.width(), info.height(), clipping.near(), clipping.far()]
-        numbers = [camera, info.intrinsic_matrix().ravel(), self._X_WC.GetAsMatrix34().ravel()]
-        return np.concatenate(numbers).tobytes()
+        K, size, planes = (
+            info.intrinsic_matrix(),
+            (info.width(), info.height()),
+            (clipping.near(), clipping.far()),
+        )
+        numbers = [K.ravel(), self._X_WC.GetAsMatrix34().ravel(), size, planes]
+        return (K, *size, self._X_WC, *planes), np.concatenate(numbers).tobytes()
 
     def _shapes(self) -> QueryObject:
         if self._context is None:

@@ -14,14 +14,6 @@ from scipy.spatial.transform import Rotation
 
 from splatpilot.systems.common.validation import require
 
-# Real spherical harmonics up to degree 3, in the order and signs of 3D Gaussian splatting.
-#
-# The basis is the real part (order m >= 0) and the imaginary part (m < 0) of the complex harmonics
-# with Condon-Shortley phase, times sqrt(2) where m is not 0 (Sloan, "Efficient Spherical Harmonic
-# Evaluation", JCGT 2013), listed by degree and then by order from -l to l. A color is
-# ``max(0, 0.5 + sum_k basis_k(direction) sh_k)``, with the direction from the camera to the
-# Gaussian.
-
 C0 = 1.0 / (2.0 * math.sqrt(math.pi))
 """The constant basis function of degree 0."""
 
@@ -34,9 +26,14 @@ def color_to_sh(color: ArrayLike) -> NDArray[Any]:
 
 
 def sh_basis(directions: ArrayLike, degree: int) -> NDArray[np.float64]:
-    """Returns the basis functions of degrees 0 to `degree`, shape (..., (degree + 1)^2).
+    """Evaluates the real spherical harmonics of degrees 0 to `degree`, (..., (degree + 1)^2).
 
-    `directions`, shape (..., 3), are unit vectors in the frame of the coefficients.
+    In the order and signs of 3D Gaussian splatting: the real part (order m >= 0) and the imaginary
+    part (m < 0) of the complex harmonics with Condon-Shortley phase, times sqrt(2) where m is not 0
+    (Sloan, "Efficient Spherical Harmonic Evaluation", JCGT 2013).
+
+    Args:
+        directions: (..., 3) unit vectors in the frame of the coefficients.
     """
     require(degree in range(MAX_DEGREE + 1), "the degree of spherical harmonics", "0 to 3", degree)
     x, y, z = np.moveaxis(np.asarray(directions, dtype=np.float64), -1, 0)
@@ -76,8 +73,8 @@ def sh_rotations(R: ArrayLike, degree: int) -> list[NDArray[np.float64]]:
     """Returns, for l = 0 to `degree`, the (2l+1, 2l+1) matrix that rotates degree-l coefficients.
 
     With `R` = R_WO, shape (3, 3), and coefficients c of a function f of directions in frame O,
-    ``M @ c`` are those of the same function in W: f_W(d_W) = f_O(R^T d_W). Each degree is closed
-    under rotation, so samples of the basis in 2l + 1 or more directions determine M exactly.
+    ``M @ c`` are those of the same function in W: f_W(d_W) = f_O(R^T d_W). Samples of the basis in
+    2l + 1 or more directions determine M exactly.
     """
     R = np.asarray(R, dtype=np.float64)
     count = 32  # spread directions; 7 would do, more condition the solve
@@ -91,6 +88,17 @@ def sh_rotations(R: ArrayLike, degree: int) -> list[NDArray[np.float64]]:
     return [np.linalg.lstsq(basis_W[:, b], basis_O[:, b], rcond=None)[0] for b in bands]
 
 
+def require_valid(
+    valid: NDArray[np.bool_], name: str, array: NDArray, condition: str, remedy: str = ""
+) -> None:
+    """Checks the entries, or rows, of an array; names the first invalid one."""
+    if not valid.all():
+        first = tuple(int(i) for i in np.argwhere(~valid)[0])
+        count = (~valid).reshape(len(valid), -1).any(axis=1).sum()
+        got = f"{array[first]} ({count} of {len(valid)} rows are invalid)"
+        require(False, f"{name}[{', '.join(map(str, first))}]", condition, got, remedy)
+
+
 _SHAPES = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh": (-1, 3)}
 
 
@@ -102,10 +110,7 @@ class GaussianScene:
     along the unit direction d (from camera to Gaussian) the color
     ``max(0, 0.5 + sum_k basis_k(d) sh[i, k])``, see `sh_basis`. Arrays become float32 and
     contiguous; those that already are, are shared, so do not write into them. Quaternions are
-    normalized on construction.
-
-    Raises:
-        ValueError: for arrays of invalid shape, lengths or values; names the first invalid entry.
+    normalized.
     """
 
     means: NDArray[np.float32]  # (N, 3) [m], centers
@@ -128,28 +133,20 @@ class GaussianScene:
         lengths = {name: len(getattr(self, name)) for name in _SHAPES}
         require(len(set(lengths.values())) == 1, "arrays", "of one length", lengths)
         harmonic_degree(self.sh.shape[1])
+        remedy = "remove this Gaussian or repair its file"
         for name in _SHAPES:
-            remedy = "remove this Gaussian or repair its file"
-            self._require(name, np.isfinite(getattr(self, name)), "finite", remedy)
+            array = getattr(self, name)
+            require_valid(np.isfinite(array), name, array, "finite", remedy)
         remedy = "take the exponential of stored logarithms"
-        self._require("scales", self.scales > 0, "> 0 m", remedy)
+        require_valid(self.scales > 0, "scales", self.scales, "> 0 m", remedy)
         valid = (self.opacities > 0) & (self.opacities <= 1)
-        self._require("opacities", valid, "in (0, 1]", "take the sigmoid of stored logits")
+        remedy = "take the sigmoid of stored logits"
+        require_valid(valid, "opacities", self.opacities, "in (0, 1]", remedy)
         norms = np.linalg.norm(self.quats.astype(np.float64), axis=1, keepdims=True)
         remedy = "use (1, 0, 0, 0) for no rotation"
-        self._require("quats", norms[:, 0] >= 1e-12, "of a length > 0", remedy)
+        require_valid(norms[:, 0] >= 1e-12, "quats", self.quats, "of a length > 0", remedy)
         if np.any(np.abs(norms - 1) > 1e-6):
             object.__setattr__(self, "quats", (self.quats / norms).astype(np.float32))
-
-    def _require(self, name: str, valid: NDArray[np.bool_], condition: str, remedy: str) -> None:
-        """Raises ValueError for the first entry of an array that is not valid."""
-        if valid.all():
-            return
-        first = tuple(int(i) for i in np.argwhere(~valid)[0])
-        count = (~valid).reshape(len(valid), -1).any(axis=1).sum()
-        what = f"{name}[{', '.join(map(str, first))}]"
-        got = f"{getattr(self, name)[first]} ({count} of {len(self)} Gaussians are invalid)"
-        require(False, what, condition, got, remedy)
 
     @classmethod
     def from_colors(
@@ -169,7 +166,6 @@ class GaussianScene:
 
     @property
     def sh_degree(self) -> int:
-        """Degree of the spherical harmonics, 0 to 3."""
         return harmonic_degree(self.sh.shape[1])
 
     @property
@@ -245,16 +241,15 @@ def _vector(p: NDArray[np.float64]) -> tuple[float, float, float]:
     return x, y, z
 
 
-_FAR = 1000.0
-"""Distance from 0, in meters and in times the extent, at which a float has steps of 6e-5."""
-
-
 def choose_origin(positions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns a new origin (3,) near positions (N, 3) that are far from 0, and 0 for others."""
+    """Returns a new origin (3,) near positions (N, 3) that are far from 0, and 0 for others.
+
+    Far is 1000 m and 1000 times their extent, where a float has steps of 6e-5.
+    """
     middle = np.median(positions, axis=0)
     distance = float(np.linalg.norm(middle))
     extent = float(np.median(np.linalg.norm(positions - middle, axis=1)))
-    if not distance > _FAR * (min(1.0, extent) or 1.0):
+    if not distance > 1000.0 * (min(1.0, extent) or 1.0):
         return np.zeros(3)
-    # Whole numbers are easily read, if they are near enough.
+    # Whole numbers are easy to read, if they are near enough.
     return np.round(middle) if extent > 1 else middle

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterator
 from itertools import pairwise
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,38 +21,16 @@ from pydrake.systems.sensors import (
 
 from splatpilot.systems.common.drake import input_port, output_port, weakly
 from splatpilot.systems.common.validation import require
-from splatpilot.systems.splats.background import BLACK, Background, EnvironmentMap, put_behind
+from splatpilot.systems.splats.background import BLACK, Background, RenderedView
 from splatpilot.systems.splats.baked_scene import (
     NO_GAUSSIANS,
     BakedScene,
     MovingGaussians,
     PlacedGaussians,
-    RenderedView,
 )
 from splatpilot.systems.splats.lens import Distortion
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.vehicle.state import pose_between
-
-
-def render_view(
-    scene: BakedScene,
-    K: NDArray[np.float64],
-    width: int,
-    height: int,
-    X_WC: RigidTransform,
-    near: float,
-    far: float,
-    background: Background = BLACK,
-    moving: PlacedGaussians = NO_GAUSSIANS,
-    distortion: Distortion | None = None,
-    max_depth: float = np.inf,
-) -> RenderedView:
-    """Renders the view of a camera before any background; see `BakedScene.render`."""
-    camera = (K, width, height, X_WC, near, far)
-    if not isinstance(background, EnvironmentMap):
-        return scene.render(*camera, background, moving, distortion, max_depth)
-    view = scene.render(*camera, BLACK, moving, distortion, max_depth)
-    return put_behind(view, background, K, X_WC, distortion)
 
 
 def color_pixels(color: NDArray) -> NDArray[np.uint8]:
@@ -77,47 +55,34 @@ def surface_labels(view: RenderedView) -> NDArray[np.int16]:
     return np.where(view.depth > 0, unspecified, empty).astype(np.int16)
 
 
-# Rolling shutters: rows are read one after the other at even times, the first at the pose X_WC0 and
-# the last at X_WC1, those between at `pose_between`. Rows between which an image hardly moves are
-# rendered together, as a band, from the pose of their middle.
-
-_MAX_STEP = 0.5
-"""[px] by which the image of a point at `_NEAR` [m] may move from one band to the next."""
-_NEAR = 1.0
-_MIN_BANDS = 8
-"""Bands of an image with a rolling shutter if Gaussians move."""
+_MAX_STEP = 0.5  # [px] that a point at 1 m may move on the image from one band to the next
+_MIN_BANDS = 8  # of an image with a rolling shutter if Gaussians move
 
 
 def row_bands(
     X_WC0: RigidTransform, X_WC1: RigidTransform, focal: float, height: int, min_count: int = 1
 ) -> list[tuple[int, int]]:
-    """Divides an image into bands, from a first row to a row after the last.
+    """Divides an image of a rolling shutter into bands of rows that render from one pose.
 
     Args:
         X_WC0, X_WC1: poses of the camera at the first and the last row.
         focal: [px]
         height: [px]
-        min_count: number of bands at least.
+        min_count: minimum number of bands.
+
+    Returns:
+        The first row of each band, and the row after its last.
     """
     angle = (X_WC0.rotation().inverse() @ X_WC1.rotation()).ToAngleAxis().angle()
     distance = np.linalg.norm(X_WC1.translation() - X_WC0.translation())
-    shift = focal * (abs(angle) + float(distance) / _NEAR)
+    shift = focal * (abs(angle) + float(distance))
     count = min(height, max(min_count, math.ceil(shift / _MAX_STEP)))
     edges = np.linspace(0, height, count + 1).round().astype(int).tolist()
     return list(pairwise(edges))
 
 
-class _Band(NamedTuple):
-    """Rows that are rendered from one pose."""
-
-    camera: tuple[np.ndarray, int, int, RigidTransform]  # K (3, 3) [px], width, height, X_WC
-    moving: PlacedGaussians
-
-
 class SplatCamera(LeafSystem):
-    """
-    Renders color, depth and label images of a Gaussian scene, with the output ports of Drake's
-    `RgbdSensor`.
+    """Renders color, depth and label images of a Gaussian scene, with the ports of `RgbdSensor`.
 
     .. pydrake_system::
 
@@ -135,9 +100,10 @@ class SplatCamera(LeafSystem):
 
     `body_pose` is the pose X_WB of the body that carries the camera; the camera has the pose X_WC =
     X_WB X_BC with x right, y down and z forward for all images. With a `readout`, a rolling
-    shutter, that is the pose at the last row, and `start_pose` X_WB at the first.
+    shutter, that is the pose at the last row, and `start_pose` X_WB at the first. Rows between
+    which an image hardly moves render together, from the pose at the middle of their readout.
 
-    Images are rendered when a port is evaluated, and again if the pose has changed, or the time if
+    Images render when a port is evaluated, and again if the pose has changed, or the time if
     Gaussians move. Depth alone renders faster and is bitwise identical.
 
     Depth is planar z of the surface, the median depth of `rasterize`, in meters
@@ -173,7 +139,8 @@ class SplatCamera(LeafSystem):
         distortion: Distortion | None = None,
         readout: float = 0.0,
     ):
-        """
+        """Bakes the scene unless it is baked.
+
         Args:
             scene: a `BakedScene` is held by reference, and many cameras may share it; a
                 `GaussianScene` is baked for this camera.
@@ -183,8 +150,8 @@ class SplatCamera(LeafSystem):
             near, far: Gaussians with a center outside these planes are not drawn [m].
             background: color in [0, 1] or environment behind everything.
             moving: Gaussians that move among the scene's.
-            latency: age of the images [s], by which moving Gaussians are late. The pose that the
-                camera is given must be as old.
+            latency: age of the images [s], by which moving Gaussians are late; the pose at the
+                input port must be as old.
             distortion: lens; a pinhole if None. Pixels without a ray have no surface.
             readout: time between reading the first row and the last [s]; 0 reads all at once.
         """
@@ -203,7 +170,7 @@ class SplatCamera(LeafSystem):
         self._moving, self._latency, self._readout = moving, latency, readout
         if distortion is not None:
             distortion.validate()
-        self._distortion = distortion
+        self._options: dict[str, Any] = {"distortion": distortion, "max_depth": max_depth}
 
         pose_port = self.DeclareAbstractInputPort("body_pose", Value(RigidTransform()))
         pose_ticket = self.input_port_ticket(pose_port.get_index())
@@ -258,19 +225,11 @@ class SplatCamera(LeafSystem):
     ) -> RenderedView:
         """Renders the view from body pose X_WB at a time [s], before it becomes Drake images.
 
-        The first row is read from X_WB_start, unless that is None, `readout` before.
+        With X_WB_start, the first row is read at that pose, `readout` earlier.
         """
         views = [
-            render_view(
-                self._scene,
-                *band.camera,
-                *self._clipping,
-                background=self._background,
-                moving=band.moving,
-                distortion=self._distortion,
-                max_depth=self._depth_range[1],
-            )
-            for band in self._bands(X_WB, time, X_WB_start)
+            self._scene.render(*camera, background=self._background, moving=moving, **self._options)
+            for camera, moving in self._bands(X_WB, time, X_WB_start)
         ]
         if len(views) == 1:
             return views[0]
@@ -278,12 +237,13 @@ class SplatCamera(LeafSystem):
 
     def _bands(
         self, X_WB: RigidTransform, time: float, X_WB_start: RigidTransform | None
-    ) -> Iterator[_Band]:
+    ) -> Iterator[tuple[tuple[Any, ...], PlacedGaussians]]:
+        """Yields K (3, 3) [px], width, height, X_WC, near and far of each band, and its bodies."""
         info, time = self._camera_info, time - self._latency
         K, width, height = info.intrinsic_matrix(), info.width(), info.height()
         X_WC1 = X_WB @ self._X_BC
         if X_WB_start is None:
-            yield _Band((K, width, height, X_WC1), self._moved(time))
+            yield (K, width, height, X_WC1, *self._clipping), self._moved(time)
             return
         X_WC0, min_count = X_WB_start @ self._X_BC, 1 if self._moving is None else _MIN_BANDS
         focal = float(max(K[0, 0], K[1, 1]))
@@ -291,19 +251,18 @@ class SplatCamera(LeafSystem):
             s = 0.5 * (first + last) / height  # of the time from the first row to the last
             K_band = K.copy()
             K_band[1, 2] -= first
-            camera = (K_band, width, last - first, pose_between(X_WC0, X_WC1, s))
-            yield _Band(camera, self._moved(time - (1.0 - s) * self._readout))
+            X_WC = pose_between(X_WC0, X_WC1, s)
+            moved = self._moved(time - (1.0 - s) * self._readout)
+            yield (K_band, width, last - first, X_WC, *self._clipping), moved
 
     def _moved(self, time: float) -> PlacedGaussians:
         return NO_GAUSSIANS if self._moving is None else self._moving.at(max(0.0, time))
 
     def _poses(self, context) -> tuple[RigidTransform, float, RigidTransform | None]:
-        """Returns X_WB at the last row, the time, and X_WB at the first row if it differs."""
-        X_WB = cast(RigidTransform, self.GetInputPort("body_pose").Eval(context))
-        start = None
-        if self._readout > 0.0:
-            start = cast(RigidTransform, self.GetInputPort("start_pose").Eval(context))
-        return X_WB, context.get_time(), start
+        """Returns X_WB at the last row, the time, and X_WB at the first row of a readout."""
+        names = ["body_pose", "start_pose"] if self._readout > 0.0 else ["body_pose"]
+        X_WB, *start = (cast(RigidTransform, self.GetInputPort(n).Eval(context)) for n in names)
+        return X_WB, context.get_time(), start[0] if start else None
 
     def _calc_view(self, context, value) -> None:
         value.set_value(self.render(*self._poses(context)))
@@ -314,14 +273,8 @@ class SplatCamera(LeafSystem):
             depth = self._view(context).depth
         else:
             depths = [
-                self._scene.render_depth(
-                    *band.camera,
-                    *self._clipping,
-                    max_depth=self._depth_range[1],
-                    moving=band.moving,
-                    distortion=self._distortion,
-                )
-                for band in self._bands(*self._poses(context))
+                self._scene.render_depth(*camera, moving=moving, **self._options)
+                for camera, moving in self._bands(*self._poses(context))
             ]
             depth = depths[0] if len(depths) == 1 else np.concatenate(depths)
         value.set_value(ranged_depth(depth, *self._depth_range))

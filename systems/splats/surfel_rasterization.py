@@ -1,6 +1,6 @@
 """2D Gaussian splatting (surfels; Huang et al. 2024): native on the CPU, gsplat on CUDA."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -10,68 +10,41 @@ from splatpilot import _native
 from splatpilot.systems.common.extras import import_extra
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.splats.rasterization import (
-    Arrays,
-    Cameras,
-    by_name,
-    check_shapes,
+    Views,
     joined,
+    named_tensors,
     over_backgrounds,
     pair_meta,
     prepare,
-    require_one_of,
+    require_choice,
     requires_gradients,
 )
 
 IMAGES = {"color": 3, "normal": 3, "depth": 1, "alpha": 1, "median": 1, "distort": 1}  # channels
-DEPTH_MODES = ("expected", "median")
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 
 
-class SurfelDrawing(NamedTuple):
-    """Images of C cameras, and their frames."""
-
-    images: tuple[Tensor, ...]  # (C, H, W, channels) in the order of IMAGES
-    frames: list[_native.SurfelFrame]
-    projected: list[tuple]  # of each camera, see `_native.projected_surfels`
-
-
-def draw_surfels(cameras: Cameras, distort: bool, arrays: Arrays, keep: bool) -> SurfelDrawing:
-    """Renders; with `keep`, a backward pass can start from the frames."""
-    size = (len(cameras.poses), cameras.height, cameras.width)
-    images = {name: torch.empty((*size, channels)) for name, channels in IMAGES.items()}
-    if not distort:
-        images["distort"].zero_()
-    drawing = SurfelDrawing(tuple(images.values()), [], [])
-    for c in range(len(cameras.poses)):
-        outputs: dict[str, Any] = {name: image[c].numpy() for name, image in images.items()}
-        if not distort:
-            outputs["distort"] = None
-        frame = _native.render_surfels(
-            cameras.renderer,
-            **cameras.scene(arrays, c),
-            **cameras.arguments(c),
-            **outputs,
-            keep=keep,
-        )
-        drawing.frames.append(frame)
-        drawing.projected.append(_native.projected_surfels(cameras.renderer, frame))
-    return drawing
-
-
 class RasterizeSurfels(torch.autograd.Function):
-    """(means, quats, scales, opacities, colors, viewmats) -> images in the order of IMAGES."""
+    """(means, quats, scales, opacities, colors, viewmats) -> images in the order of `IMAGES`.
+
+    The results come in a tuple: autograd would alias tensors that are inputs.
+    """
 
     @staticmethod
     def forward(
-        ctx, cameras: Cameras, distort: bool, drawing: SurfelDrawing, *inputs: Tensor
+        ctx,
+        views: Views,
+        frames: list[_native.SurfelFrame],
+        distort: bool,
+        results: tuple[Tensor, ...],
+        *inputs: Tensor,
     ) -> tuple[Tensor, ...]:
-        # The frames alone: an output that its own node refers to is never freed.
-        ctx.cameras, ctx.distort, ctx.frames = cameras, distort, drawing.frames
+        ctx.views, ctx.frames, ctx.distort = views, frames, distort
         ctx.save_for_backward(*inputs)
         ctx.set_materialize_grads(False)
         if not distort:
-            ctx.mark_non_differentiable(drawing.images[-1])
-        return drawing.images
+            ctx.mark_non_differentiable(results[-1])
+        return results
 
     @staticmethod
     @once_differentiable
@@ -82,16 +55,16 @@ class RasterizeSurfels(torch.autograd.Function):
         }
         if not ctx.distort:
             given["v_distort"] = None
-        gradients = ctx.cameras.project_backward(
+        gradients = ctx.views.project_backward(
             ctx.saved_tensors,
-            lambda c, **arguments: _native.surfels_backward(
-                ctx.cameras.renderer,
+            lambda c, *scene: _native.surfels_backward(
+                ctx.views.renderer,
                 ctx.frames[c],
+                *scene,
                 **{name: None if v is None else v[c] for name, v in given.items()},
-                **arguments,
             ),
         )
-        return None, None, None, *gradients
+        return None, None, None, None, *gradients
 
 
 def depth_to_normals(depths: Tensor, viewmats: Tensor, Ks: Tensor) -> Tensor:
@@ -108,12 +81,8 @@ def depth_to_normals(depths: Tensor, viewmats: Tensor, Ks: Tensor) -> Tensor:
     Returns:
         (C, H, W, 3) in the world; zero at the border and if the depth is zero all around.
     """
-    require(
-        depths.ndim == 4 and depths.shape[-1] == 1,
-        "depths",
-        "of shape (C, H, W, 1)",
-        tuple(depths.shape),
-    )
+    valid = depths.ndim == 4 and depths.shape[-1] == 1
+    require(valid, "depths", "of shape (C, H, W, 1)", tuple(depths.shape))
     C, H, W, _ = depths.shape
     for name, tensor, size in (("viewmats", viewmats, 4), ("Ks", Ks, 3)):
         shape = (C, size, size)
@@ -162,7 +131,7 @@ def rasterize_surfels(
 
     A surfel is a Gaussian on the plane through its mean spanned by the first two columns of its
     rotation. The ray through a pixel meets that plane at (u, v) standard deviations and depth z;
-    then ``a = min(.99, o exp(-r2 / 2))``, with r2 the lesser of u^2 + v^2 and 2 |d|^2, d the
+    then ``a = min(.99, o exp(-r2 / 2))``, with r2 the minimum of u^2 + v^2 and 2 |d|^2, d the
     pixels to the projected mean. So a surfel smaller than a pixel or seen edge-on is a blob of
     sqrt(1/2) px at the depth of the mean. Blending is that of `rasterize`, in the order of the
     means' depths.
@@ -192,35 +161,50 @@ def rasterize_surfels(
         meta: dict on the M visible (camera, surfel) pairs: camera_ids, gaussian_ids, depths,
             opacities (M,), radii, means2d (M, 2), normals (M, 3) in the world, and width, height,
             tile_size, tile_width, tile_height, n_cameras, render_distort.
-
-    Raises:
-        ValueError: a tensor has the wrong shape, dtype, device or values.
-        ModuleNotFoundError: tensors are on a GPU and gsplat is not installed.
     """
     scene = (means, quats, scales, opacities, colors, viewmats)
-    tensors = by_name(*scene, Ks, backgrounds)
-    require_one_of("render_mode", render_mode, RENDER_MODES)
-    require_one_of("depth_mode", depth_mode, DEPTH_MODES)
+    require_choice("render_mode", render_mode, RENDER_MODES)
+    require_choice("depth_mode", depth_mode, ("expected", "median"))
     with_depth = "D" in render_mode
     require(not distloss or with_depth, "render_mode", "one with depth for distloss", render_mode)
-    check_shapes(tensors, sh_degree)
-    size = (width, height, near_plane, far_plane, radius_clip)
+    tensors = named_tensors(*scene, Ks, backgrounds, sh_degree=sh_degree)
     if means.device.type == "cuda":
-        options = {
-            "sh_degree": sh_degree,
-            "render_mode": render_mode,
-            "distloss": distloss,
-            "depth_mode": depth_mode,
-        }
-        return _rasterize_by_gsplat(scene, Ks, size, backgrounds, options)
-    # The third scale is not read and may have any value.
-    cameras, arrays = prepare(tensors, *size, sh_degree, renderer, scale_axes=2)
+        image, alpha, *others = _rasterize_by_gsplat(
+            *scene,
+            Ks,
+            width,
+            height,
+            near_plane=near_plane,
+            far_plane=far_plane,
+            radius_clip=radius_clip,
+            sh_degree=sh_degree,
+            render_mode=render_mode,
+            distloss=distloss,
+            depth_mode=depth_mode,
+        )
+        image = over_backgrounds(backgrounds, image, alpha, render_mode)
+        return image, alpha, *others  # pyright: ignore[reportReturnType]
+    clipping = near_plane, far_plane, radius_clip
+    views, arrays = prepare(tensors, (width, height), clipping, sh_degree, renderer, scale_axes=2)
     keep = requires_gradients(tensors)
-    drawing = draw_surfels(cameras, distloss, arrays, keep)
-    images = drawing.images
+    shape = len(viewmats), height, width
+    images = tuple(torch.empty((*shape, channels)) for channels in IMAGES.values())
+    if not distloss:
+        images[-1].zero_()
+    frames, projected = [], []
+    for c, camera in enumerate(views.cameras):
+        outputs: dict[str, Any] = {
+            name: image[c].numpy() for name, image in zip(IMAGES, images, strict=True)
+        }
+        if not distloss:
+            outputs["distort"] = None
+        surfels = views.gaussians(arrays, c)
+        frame = _native.render_surfels(views.renderer, surfels, camera, **outputs, keep=keep)
+        projected.append(_native.projected_surfels(views.renderer, frame))
+        frames.append(frame)
     if keep:
-        images = RasterizeSurfels.apply(cameras, distloss, drawing, *scene)
-    color, normal, depth, alpha, median, distort = images
+        images = RasterizeSurfels.apply(views, frames, distloss, images, *scene)
+    color, normal, depth, alpha, median, distort = images  # pyright: ignore[reportGeneralTypeIssues]
 
     expected = depth / alpha.clamp(min=1e-10)
     surface = None
@@ -230,8 +214,8 @@ def rasterize_surfels(
     if with_depth:
         parts.append(expected if "ED" in render_mode else depth)
     image = over_backgrounds(backgrounds, torch.cat(parts, -1), alpha, render_mode)
-    ids, radii, means2d, depths, normals = map(joined, zip(*drawing.projected, strict=True))
-    meta = pair_meta([len(p[0]) for p in drawing.projected], width, height) | {
+    ids, radii, means2d, depths, normals = joined(projected)
+    meta = pair_meta([len(of_camera[0]) for of_camera in projected], width, height) | {
         "gaussian_ids": ids,
         "radii": radii,
         "means2d": means2d,
@@ -244,34 +228,25 @@ def rasterize_surfels(
 
 
 def _rasterize_by_gsplat(
-    scene: tuple[Tensor, ...],
-    Ks: Tensor,
-    size: tuple[int, int, float, float, float],
-    backgrounds: Tensor | None,
-    options: dict[str, Any],
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    *arguments: Any,
+    **options: Any,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Tensor, Tensor, dict[str, Any]]:
-    """Returns what `rasterize_surfels` does.
+    """Returns the results of `rasterize_surfels` without backgrounds.
 
-    Written for gsplat 1.5.3, which fails on backgrounds of colors with depth, gives meta of every
-    pair of camera and surfel, visible or not, and surface normals of one camera without the
-    camera's dimension.
+    gsplat 1.5.3 fails on backgrounds of colors with depth, gives meta of invisible pairs too, and
+    surface normals of one camera without the camera's dimension.
     """
     gsplat = import_extra("gsplat", "cuda")
-    *splats, colors, viewmats = scene
     if options["sh_degree"] is None:
-        colors = colors.expand(len(viewmats), len(splats[0]), -1)
-    width, height, near_plane, far_plane, radius_clip = size
+        colors = colors.expand(len(viewmats), len(means), -1)
     image, alpha, normals, surface, distort, median, dense = gsplat.rasterization_2dgs(
-        *splats,
-        colors,
-        viewmats,
-        Ks,
-        width,
-        height,
-        near_plane=near_plane,
-        far_plane=far_plane,
-        radius_clip=radius_clip,
-        **options,
+        means, quats, scales, opacities, colors, viewmats, *arguments, **options
     )
     if surface is not None:
         surface = surface.reshape(normals.shape)
@@ -282,5 +257,4 @@ def _rasterize_by_gsplat(
     R_WC = torch.linalg.inv(viewmats)[camera_ids, :3, :3]
     meta["normals"] = (R_WC @ meta["normals"][..., None])[..., 0]
     meta |= {"camera_ids": camera_ids, "gaussian_ids": gaussian_ids}
-    image = over_backgrounds(backgrounds, image, alpha, options["render_mode"])
     return image, alpha, normals, surface, distort, median, meta

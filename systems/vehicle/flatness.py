@@ -1,12 +1,11 @@
 """Differential flatness of the quadrotor: from an acceleration to thrust and body rates.
 
-A quadrotor's position and yaw determine its attitude. The specific thrust supplies the desired
-acceleration, carries the weight and overcomes drag; its direction is the body z axis, and yaw
-fixes the rest (D. Mellinger and V. Kumar, "Minimum snap trajectory generation and control for
-quadrotors", ICRA 2011; with drag: M. Faessler, A. Franchi and D. Scaramuzza, "Differential flatness
-of quadrotor dynamics subject to rotor drag", RA-L 2018). Rates tilt the body z axis by the shortest
-rotation and yaw slower, since only tilt moves the vehicle (D. Brescianini and R. D'Andrea,
-"Tilt-prioritized quadrocopter attitude control", T-CST 2018).
+The specific thrust supplies the desired acceleration, carries the weight and overcomes drag; its
+direction is the body z axis, and yaw fixes the rest (Mellinger and Kumar, "Minimum snap trajectory
+generation and control for quadrotors", ICRA 2011; with drag: Faessler, Franchi and Scaramuzza,
+RA-L 2018). Rates tilt the body z axis by the shortest rotation and yaw slower, since only tilt
+moves the vehicle (Brescianini and D'Andrea, "Tilt-prioritized quadrocopter attitude control",
+T-CST 2018).
 
 Frames: W world, B body, D the desired body. The functions take numpy arrays or torch tensors of one
 vehicle or of N, and are differentiable. Thrust is over mass [m/s^2], angles are in rad.
@@ -19,7 +18,7 @@ from typing import Any
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from splatpilot.systems.common.drake import input_port, optional_input, output_port
+from splatpilot.systems.common.drake import optional_input, vector_input
 from splatpilot.systems.common.validation import Config, bounded, require, require_field
 from splatpilot.systems.vehicle.quadrotor import QuadrotorParams
 from splatpilot.systems.vehicle.state import (
@@ -38,20 +37,16 @@ _TINY = 1e-12  # Keeps directions and gradients finite where a length is zero.
 def reaching_acceleration(p_WR: Any, p_WB: Any, v_WB: Any, lookahead: float) -> Any:
     """Returns the constant acceleration (..., 3) [m/s^2] that reaches p_WR [m] in `lookahead` [s].
 
-    a = 2 (p_WR - p_WB - T v_WB) / T². Applied continually with p_WR(t) = r(t + T), it makes p_WB
-    follow r with the transfer function e^x / (1 + x + x²/2), x = sT: an error of third order in T,
-    damped at 1/√2. A lag of T/3 between commanded and actual acceleration removes the third order
-    too.
+    Applied continually with p_WR(t) = r(t + T), it makes p_WB follow r with the transfer function
+    e^x / (1 + x + x²/2), x = sT: an error of third order in T, damped at 1/√2. A lag of T/3 between
+    commanded and actual acceleration removes the third order too.
     """
     return 2.0 * (p_WR - p_WB - lookahead * v_WB) / lookahead**2
 
 
 def attitude_from_thrust(f_W: Any, yaw: Any) -> Any:
-    """Returns R_WD (..., 3, 3): z along the upward `f_W` (..., 3), x along `yaw` (...) from above.
-
-    Seen from above, body x points exactly along yaw: it is perpendicular to the horizontal
-    left-hand direction.
-    """
+    """Returns R_WD (..., 3, 3): z along the upward `f_W` (..., 3), and x, seen from above, exactly
+    along `yaw` (...)."""
     xp = array_namespace(f_W)
     zx, zy, zz = _components(unit_vectors(f_W))
     cos, sin = xp.cos(yaw), xp.sin(yaw)
@@ -62,14 +57,11 @@ def attitude_from_thrust(f_W: Any, yaw: Any) -> Any:
 
 
 def heading_along_motion(motion_W: Any, full_speed: float) -> tuple[Any, Any]:
-    """Returns the heading (...) [rad] of a motion (..., 3) [m/s] and how strongly to follow it.
-
-    The strength, 0 to 1, falls as the square of the horizontal speed below `full_speed` [m/s], so
-    that noise does not rotate a hovering vehicle.
-    """
-    xp = array_namespace(motion_W)
+    """Returns the heading (...) [rad] of a motion (..., 3) [m/s] and how strongly to follow it: 1,
+    or less below a horizontal speed of `full_speed` [m/s], so that noise has no effect."""
     x, y = motion_W[..., 0], motion_W[..., 1]
-    return xp.arctan2(y, x), clip((x * x + y * y) / full_speed**2, high=1.0)
+    heading = array_namespace(motion_W).arctan2(y, x)
+    return heading, clip((x * x + y * y) / full_speed**2, high=1.0)
 
 
 @dataclass
@@ -121,7 +113,7 @@ def flatness_command(
         state: (..., 13).
         a_WB: (..., 3) [m/s^2], gravity excluded.
         motion_W: (..., 3) [m/s], gives the heading where `heading` does not.
-        heading: (...) [rad], NaN where there is none; or None.
+        heading: (...) [rad], NaN if free; or None.
     """
     xp = array_namespace(state)
     _, v_WB, q_WB, _ = QuadrotorState.of(state)
@@ -173,24 +165,18 @@ class FlatnessController(LeafSystem):
     .. pydrake_system::
 
         name: FlatnessController
-        input_ports:
-        - state
-        - waypoint
-        - acceleration
-        - heading
-        output_ports:
-        - command
+        input_ports: [state, waypoint, acceleration, heading]
+        output_ports: [command]
 
     - ``state`` (13): ``[p_WB (3) [m], v_WB (3) [m/s], q_WB (4, wxyz), w_WB_B (3) [rad/s]]``.
-    - ``waypoint`` (3): p_WR [m], where the vehicle should be ``lookahead`` seconds from now.
-    - ``acceleration`` (3): a_WB [m/s^2], the desired acceleration, gravity excluded.
-    - ``heading`` (1), optional: where body x should point, seen from above, [rad] from world x;
-      along the motion if it is not connected or NaN.
+    - ``waypoint`` (3): p_WR [m], where the vehicle should be ``lookahead`` seconds from now; or
+      ``acceleration`` (3): a_WB [m/s^2], gravity excluded. Connect exactly one.
+    - ``heading`` (1), optional: of body x, seen from above, [rad] from world x; along the motion if
+      it is not connected or NaN.
     - ``command`` (4): ``[c [m/s^2], w_cmd_B (3) [rad/s]]``, held between updates; hover thrust
       before the first.
 
-    Connect exactly one of ``waypoint`` and ``acceleration``. Updates every ``period`` seconds from
-    time 0. With z_B the body z axis and limits applied to every step::
+    Updates every ``period`` [s] from time 0. With z_B the body z axis and limits at every step::
 
         a_WB    = 2 (p_WR - p_WB - T v_WB) / T²
         f_W     = a_WB + g e_z + drag v_WB
@@ -198,20 +184,11 @@ class FlatnessController(LeafSystem):
         w_cmd_B = [tilt_gain · tilt, yaw_gain · yaw]
 
     where tilt and yaw rotate the body so that z lies along f_W and x along the heading or the
-    motion: toward the waypoint, or along v_WB if an acceleration is given. See
-    :mod:`~splatpilot.systems.vehicle.flatness`.
+    motion: toward the waypoint, or along v_WB if an acceleration is given.
     """
 
-    state_input_port = input_port("state")
-    waypoint_input_port = input_port("waypoint")
-    acceleration_input_port = input_port("acceleration")
-    heading_input_port = input_port("heading")
-    command_output_port = output_port("command")
-
     def __init__(
-        self,
-        config: FlatnessControllerConfig | None = None,
-        params: QuadrotorParams | None = None,
+        self, config: FlatnessControllerConfig | None = None, params: QuadrotorParams | None = None
     ):
         super().__init__()
         self._config = replace(config or FlatnessControllerConfig())
@@ -231,11 +208,9 @@ class FlatnessController(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(self._config.period, 0.0, self._update)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        config = self._config
-        state = self._eval_finite("state", context)
+        config, state = self._config, self._eval_finite("state", context)
         p_WB, v_WB, q_WB, _ = QuadrotorState.of(state)
         require_rotation(q_WB)
-
         use_waypoint = self.GetInputPort("waypoint").HasValue(context)
         if use_waypoint == self.GetInputPort("acceleration").HasValue(context):
             raise ValueError(
@@ -247,16 +222,14 @@ class FlatnessController(LeafSystem):
             a_WB = reaching_acceleration(p_WR, p_WB, v_WB, config.lookahead)
             motion_W = (p_WR - p_WB) / config.lookahead
         else:
-            a_WB = self._eval_finite("acceleration", context)
-            motion_W = v_WB
+            a_WB, motion_W = self._eval_finite("acceleration", context), v_WB
         heading = optional_input(self, "heading", context)
         heading = None if heading is None else heading[0]
-        discrete_state.set_value(
-            flatness_command(state, a_WB, motion_W, heading, config, self._params)
-        )
+        command = flatness_command(state, a_WB, motion_W, heading, config, self._params)
+        discrete_state.set_value(command)
 
     def _eval_finite(self, name: str, context: Context) -> np.ndarray:
-        value = np.asarray(self.GetInputPort(name).Eval(context))
+        value = vector_input(self, name, context)
         what = f"input '{name}' of '{self.get_name()}' at t = {context.get_time()} s"
         require(np.isfinite(value).all(), what, "finite", value.tolist())
         return value

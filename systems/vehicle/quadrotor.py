@@ -3,8 +3,8 @@
 State (13): ``[p_WB (3) [m], v_WB (3) [m/s], q_WB (4, wxyz), w_WB_B (3) [rad/s]]``.
 Command (4): ``[c [m/s^2], w_cmd_B (3) [rad/s]]``, with c the thrust over mass along body +z.
 
-The same formula serves single floats, numpy batches, arrays of Drake's AutoDiffXd or symbolic
-Expression, and torch batches, so that the simulated plant and the training loop share one model.
+The same formula serves floats, torch and numpy batches, and Drake's AutoDiffXd and Expression, so
+that the simulated plant and the training loop share one model.
 """
 
 import math
@@ -19,15 +19,13 @@ from pydrake.systems.framework import (
 )
 from pydrake.systems.scalar_conversion import TemplateSystem
 
-from splatpilot.systems.common.drake import input_port, output_port
 from splatpilot.systems.common.validation import Config, bounded
 from splatpilot.systems.vehicle.state import QuadrotorState, array_namespace
 
 VEHICLE_RADIUS = 0.354
 """Propeller-tip radius of the vehicle [m]: closer than this to a surface is a collision."""
 
-GRAVITY = 9.81
-"""Standard gravity [m/s^2], along -z of the world."""
+GRAVITY = 9.81  # Standard gravity [m/s^2], along -z of the world.
 
 _NORM_GAIN = 5.0  # [1/s] pull of the quaternion toward unit length; errors decay as exp(-10 t).
 
@@ -54,16 +52,14 @@ def hover_state(p_WB: Sequence[float] | np.ndarray, yaw: float = 0.0) -> np.ndar
 def quadrotor_derivatives(state: Any, command: Any, params: QuadrotorParams) -> Any:
     """Returns the time derivative (..., 13) of ``state`` (..., 13) under ``command`` (..., 4).
 
-    Both are numpy arrays (of float, AutoDiffXd or Expression) or both torch tensors; their
-    leading shapes broadcast. The equations, with z_B the body z axis and ⊗ the Hamilton product::
+    Their leading shapes broadcast. With z_B the body z axis and ⊗ the Hamilton product::
 
         d/dt p_WB   = v_WB
         d/dt v_WB   = c z_B - g e_z - drag v_WB
         d/dt q_WB   = 1/2 q_WB ⊗ (0, w_WB_B) + 5 (1 - |q_WB|²) q_WB
         d/dt w_WB_B = (w_cmd_B - w_WB_B) / rate_time_constant
 
-    The last term of the quaternion rate holds its length at one against integration error. The
-    attitude is that of the normalized quaternion, which must not be zero.
+    The last term of the quaternion rate holds its length at one against integration error.
     """
     rates = component_derivatives(
         [state[..., i] for i in range(13)], [command[..., i] for i in range(4)], *astuple(params)
@@ -81,20 +77,15 @@ def quadrotor_derivatives(state: Any, command: Any, params: QuadrotorParams) -> 
 def component_derivatives(
     state: Any, command: Any, drag: Any, rate_time_constant: Any, gravity: Any
 ) -> tuple[Any, ...]:
-    """Returns the 13 components of :func:`quadrotor_derivatives` from 13 + 4 components.
-
-    Plain Python floats are by far the fastest for a single vehicle.
-    """
+    """Returns the 13 components of :func:`quadrotor_derivatives` from 13 + 4 components; plain
+    Python floats are by far the fastest for a single vehicle."""
     _, _, _, vx, vy, vz, qw, qx, qy, qz, wx, wy, wz = state
     c, wx_cmd, wy_cmd, wz_cmd = command
-
     norm2 = qw * qw + qx * qx + qy * qy + qz * qz
     thrust = c / norm2
     pull = _NORM_GAIN * (1.0 - norm2)
     return (
-        vx,
-        vy,
-        vz,
+        *(vx, vy, vz),
         thrust * (2.0 * (qx * qz + qw * qy)) - drag * vx,
         thrust * (2.0 * (qy * qz - qw * qx)) - drag * vy,
         thrust * (qw * qw - qx * qx - qy * qy + qz * qz) - drag * vz - gravity,
@@ -109,11 +100,8 @@ def component_derivatives(
 
 
 def rk4_step(state: Any, command: Any, params: QuadrotorParams, dt: Any) -> Any:
-    """Returns the state (..., 13) after ``dt`` [s] of constant ``command`` (..., 4).
-
-    One step of the classical fourth-order Runge-Kutta method, for the array types of
-    :func:`quadrotor_derivatives` and differentiable as they are.
-    """
+    """Returns the state (..., 13) after ``dt`` [s] of constant ``command`` (..., 4), by one step of
+    the classical Runge-Kutta method, for the array types of :func:`quadrotor_derivatives`."""
     k1 = quadrotor_derivatives(state, command, params)
     k2 = quadrotor_derivatives(state + 0.5 * dt * k1, command, params)
     k3 = quadrotor_derivatives(state + 0.5 * dt * k2, command, params)
@@ -129,27 +117,19 @@ def QuadrotorPlant_(T):
         .. pydrake_system::
 
             name: QuadrotorPlant
-            input_ports:
-            - command
-            output_ports:
-            - state
+            input_ports: [command]
+            output_ports: [state]
 
         - ``command`` (4): ``[c [m/s^2], w_cmd_B (3) [rad/s]]``, c the thrust over mass along
           body +z.
         - ``state`` (13): ``[p_WB (3) [m], v_WB (3) [m/s], q_WB (4, wxyz), w_WB_B (3) [rad/s]]``,
-          continuous; at the default Context ``initial_state``, a level hover at the world's
-          origin where none is given.
+          continuous; by default ``initial_state``, a level hover at the world's origin.
         - Numeric parameter 0 (3): ``[drag [1/s], rate_time_constant [s], gravity [m/s^2]]``.
 
-        The equations are those of
-        :func:`~splatpilot.systems.vehicle.quadrotor.quadrotor_derivatives`. Supports the
-        scalars float, AutoDiffXd and Expression. Integrate in steps of at most 0.02 s without error
-        control: after 5 s of new random commands every 0.02 s, ``runge_kutta3`` is within 2 cm of
-        the solution and ``runge_kutta5``, at twice the cost, within 0.2 mm.
+        See :func:`~splatpilot.systems.vehicle.quadrotor.quadrotor_derivatives`. Supports the
+        scalars float, AutoDiffXd and Expression. Integrate in steps of at most 0.02 s: after 5 s of
+        random commands at 50 Hz, ``runge_kutta3`` is within 2 cm of the solution.
         """
-
-        command_input_port = input_port("command")
-        state_output_port = output_port("state")
 
         def _construct(
             self,
@@ -176,13 +156,13 @@ def QuadrotorPlant_(T):
             # Lists, because arithmetic on Python floats is several times faster than on numpy's.
             state = context.get_continuous_state_vector().CopyToVector().tolist()
             command = self.get_input_port(0).Eval(context).tolist()
-            drag, tau, gravity = context.get_numeric_parameter(0).CopyToVector().tolist()
+            parameters = context.get_numeric_parameter(0).CopyToVector().tolist()
             try:
-                rates = component_derivatives(state, command, drag, tau, gravity)
+                rates = component_derivatives(state, command, *parameters)
             except ZeroDivisionError:
                 raise ValueError(
                     f"q_WB and rate_time_constant of {self.get_name()} must not be zero, got "
-                    f"{state[6:10]} and {tau} s at t = {context.get_time()} s"
+                    f"{state[6:10]} and {parameters[1]} s at t = {context.get_time()} s"
                 ) from None
             derivatives.get_mutable_vector().SetFromVector(np.array(rates))
 

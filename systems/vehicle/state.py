@@ -12,21 +12,19 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 from scipy.spatial.transform import Rotation
 
-from splatpilot.systems.common.drake import input_port, output_port, weakly
+from splatpilot.systems.common.drake import vector_input, weakly
 from splatpilot.systems.common.validation import require
+
+LONGEST_PREDICTION = 0.1  # [s], maximum age of states that are predicted to the present.
 
 
 class QuadrotorState(NamedTuple):
     """Parts of states (..., 13): numpy arrays (float, AutoDiffXd, Expression) or torch tensors."""
 
-    p_WB: Any
-    """(..., 3) [m], position in the world."""
-    v_WB: Any
-    """(..., 3) [m/s], velocity in the world."""
-    q_WB: Any
-    """(..., 4), attitude as a quaternion w x y z."""
-    w_WB_B: Any
-    """(..., 3) [rad/s], angular velocity in the body frame."""
+    p_WB: Any  # (..., 3) [m]
+    v_WB: Any  # (..., 3) [m/s]
+    q_WB: Any  # (..., 4), attitude as a quaternion w x y z.
+    w_WB_B: Any  # (..., 3) [rad/s]
 
     @classmethod
     def of(cls, x: Any) -> Self:
@@ -63,6 +61,22 @@ def require_rotation(q_WB: np.ndarray) -> float:
     condition = "a rotation (w, x, y, z), entries 6 to 9 of the state,"
     require(1e-9 < norm < math.inf, "q_WB", condition, q_WB.tolist())
     return norm
+
+
+def predict_state(state: np.ndarray, duration: float) -> np.ndarray:
+    """Returns the state (13,) `duration` [s] later, at constant velocity and body rates."""
+    p_WB, v_WB, q_WB, w_WB_B = QuadrotorState.of(state)
+    R_WB = Rotation.from_quat(q_WB, scalar_first=True) * Rotation.from_rotvec(duration * w_WB_B)
+    q = R_WB.as_quat(scalar_first=True)
+    return QuadrotorState(p_WB + duration * v_WB, v_WB, q, w_WB_B).to_vector()
+
+
+def pose_between(X_WC0: RigidTransform, X_WC1: RigidTransform, s: float) -> RigidTransform:
+    """Returns the pose at the fraction s from X_WC0 to X_WC1: straight, about one axis."""
+    rotation = (X_WC0.rotation().inverse() @ X_WC1.rotation()).ToAngleAxis()
+    rotation.set_angle(s * rotation.angle())
+    p_WC = (1.0 - s) * X_WC0.translation() + s * X_WC1.translation()
+    return RigidTransform(X_WC0.rotation() @ RotationMatrix(rotation), p_WC)
 
 
 def array_namespace(array: Any) -> ModuleType:
@@ -116,23 +130,7 @@ def rotation_matrices(q: Any) -> Any:
 
 
 class StateToPose(LeafSystem):
-    """Extracts the pose X_WB from a quadrotor's state.
-
-    .. pydrake_system::
-
-        name: StateToPose
-        input_ports:
-        - state
-        output_ports:
-        - pose
-
-    - ``state`` (13): ``[p_WB (3) [m], v_WB (3) [m/s], q_WB (4, wxyz), w_WB_B (3) [rad/s]]``.
-    - ``pose`` (abstract, RigidTransform): X_WB; the quaternion is normalized first. A zero or
-      non-finite quaternion is an error.
-    """
-
-    state_input_port = input_port("state")
-    pose_output_port = output_port("pose")
+    """Outputs the ``pose`` X_WB (RigidTransform) of a ``state`` (13), see `pose_from_state`."""
 
     def __init__(self):
         super().__init__()
@@ -142,20 +140,7 @@ class StateToPose(LeafSystem):
         )
 
     def _calc_pose(self, context, output):
-        state = np.asarray(self.get_input_port().Eval(context))
-        output.set_value(pose_from_state(state))
-
-
-LONGEST_PREDICTION = 0.1
-"""[s], maximum age of states that are predicted to the present."""
-
-
-def predict_state(state: np.ndarray, duration: float) -> np.ndarray:
-    """Returns the state (13,) `duration` [s] later, at constant velocity and body rates."""
-    p_WB, v_WB, q_WB, w_WB_B = QuadrotorState.of(state)
-    R_WB = Rotation.from_quat(q_WB, scalar_first=True) * Rotation.from_rotvec(duration * w_WB_B)
-    q = R_WB.as_quat(scalar_first=True)
-    return QuadrotorState(p_WB + duration * v_WB, v_WB, q, w_WB_B).to_vector()
+        output.set_value(pose_from_state(vector_input(self, "state", context)))
 
 
 class StatePredictor(LeafSystem):
@@ -164,23 +149,14 @@ class StatePredictor(LeafSystem):
     .. pydrake_system::
 
         name: StatePredictor
-        input_ports:
-        - measured_state
-        - age
-        output_ports:
-        - state
+        input_ports: [measured_state, age]
+        output_ports: [state]
 
     - ``measured_state`` (13), ``state`` (13): as those of
       :class:`~splatpilot.systems.vehicle.quadrotor.QuadrotorPlant`.
     - ``age`` (1): [s] since it was measured, clipped to [0, ``longest``] against clocks that
       disagree and vehicles that fell silent.
-
-    Stateless.
     """
-
-    measured_state_input_port = input_port("measured_state")
-    age_input_port = input_port("age")
-    state_output_port = output_port("state")
 
     def __init__(self, longest: float = LONGEST_PREDICTION):
         """Constructs the system, which predicts at most `longest` [s] ahead."""
@@ -191,14 +167,6 @@ class StatePredictor(LeafSystem):
         self.DeclareVectorOutputPort("state", 13, self._calc)
 
     def _calc(self, context: Context, output: BasicVector) -> None:
-        state = np.asarray(self.GetInputPort("measured_state").Eval(context))
-        age = float(np.asarray(self.GetInputPort("age").Eval(context))[0])
+        state = vector_input(self, "measured_state", context)
+        age = float(vector_input(self, "age", context)[0])
         output.SetFromVector(predict_state(state, min(max(age, 0.0), self._longest)))
-
-
-def pose_between(X_WC0: RigidTransform, X_WC1: RigidTransform, s: float) -> RigidTransform:
-    """Returns the pose at the fraction s from X_WC0 to X_WC1: straight, about one axis."""
-    rotation = (X_WC0.rotation().inverse() @ X_WC1.rotation()).ToAngleAxis()
-    rotation.set_angle(s * rotation.angle())
-    p_WC = (1.0 - s) * X_WC0.translation() + s * X_WC1.translation()
-    return RigidTransform(X_WC0.rotation() @ RotationMatrix(rotation), p_WC)

@@ -328,7 +328,10 @@ def _sphere_tracks(spheres: MovingSpheres, duration: float) -> dict[str, Any]:
     return {
         "period": _SPHERES_PERIOD,
         "radii": rounded(spheres.radii),
-        "centers": [np.where(np.isfinite(c), c, None).tolist() for c in centers],
+        "centers": [
+            [row.tolist() if np.isfinite(row).all() else [None] * 3 for row in rows]
+            for rows in centers
+        ],
     }
 
 

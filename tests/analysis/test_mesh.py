@@ -46,7 +46,7 @@ def test_a_place_becomes_a_mesh(kind, world, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["P02", "--out", "a.stl"], r"a.stl: a mesh is written as .gltf or .obj"),
+        (["P02", "--out", "a.stl"], r"a.stl: suffix must be .gltf or .obj, got .stl"),
         (["nowhere", "--out", "a.obj"], "No such file or folder: nowhere"),
         (["capture", "--out", "a.obj"], "capture: what is no scene folder"),
         (["scene", "--seed", "1", "--out", "a.obj"], "neither a seed nor settings"),

@@ -2,18 +2,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import true_depth
-from depth_errors import DepthErrors, depth_errors
+from depth_truth import DepthFrame, TrueDepth, depth_errors, frames_along_flight
 from pydrake.math import RigidTransform
-from true_depth import TrueDepth, frames_along_flight, ghosts_along_flight
 
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.scenarios import scenario_file
-from splatpilot.diagrams.worlds.world_registry import make_spec, make_world
+from splatpilot.diagrams.worlds.world_registry import make_spec
 from splatpilot.systems.collision.shapes import AnalyticDistanceField
 from splatpilot.systems.common.config import load_config
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
-from splatpilot.systems.splats.scene import GaussianScene
 
 CAMERA = OnboardCamera(64, 36)
 
@@ -48,44 +45,24 @@ def test_scenery_has_no_truth():
     np.testing.assert_array_equal(truth[~unknown], bare[~unknown])
 
 
-def test_depth_that_ends_in_free_space_is_a_ghost(monkeypatch):
-    config = load_config(Scenario(), scenario_file("P04"))
-    assert ghosts_along_flight(config, CAMERA, 4).max() == 0.0
-    world = make_world(config.world, config.seed)
-    wall = GaussianScene.from_colors(
-        means=[world.p_WS + np.array([6.0, 0.0, 0.0])],
-        quats=[[1.0, 0, 0, 0]],
-        scales=[[0.02, 40.0, 40.0]],
-        opacities=[0.99],
-        colors=[[0.5, 0.5, 0.5]],
-    )
-    haunted = replace(world, gaussians=world.gaussians.merged_with(wall))
-    monkeypatch.setattr(true_depth, "make_world", lambda *_: haunted)
-    shares = ghosts_along_flight(config, CAMERA, 4)
-    assert shares[0] > 0.3
-    assert shares[-1] == 0.0  # It lies behind.
-
-
-def test_a_camera_in_a_furnished_room_sees_what_is_there():
+def test_camera_in_a_furnished_room_measures_the_truth():
     config = load_config(Scenario(), scenario_file("P10"))
     frames = frames_along_flight(config, [CAMERA], 12)[0]
     errors = depth_errors(frames, CAMERA.max_depth)
-    assert errors["all"].pixels == 12 * 64 * 36
-    assert errors["all"].too_near + errors["all"].too_far <= 0.005
-    assert abs(errors["all"].bias) <= 0.005
-    assert errors["elsewhere"].too_near + errors["elsewhere"].too_far <= 0.001
+    assert errors.pixels == 12 * 64 * 36
+    assert errors.wrong <= 0.005 and abs(errors.bias) <= 0.005
+    assert depth_errors(frames, CAMERA.max_depth, edges=False).wrong <= 0.001
 
 
 def test_each_error_is_counted():
-    truth = np.full(120, 2.0)
-    truth[100:] = np.nan
+    truth = np.full((4, 30), 2.0)
+    truth[:, 25:] = np.nan
     depth = 1.01 * truth
-    depth[100:] = 0.3
-    depth[:10] = 1.8  # too near
-    depth[10:13] = 0.0  # nearer than the camera sees
-    depth[15:18] = 2.3  # too far
-    depth[18:20] = np.inf  # a hole
-    errors = DepthErrors.of(depth, truth, 20.0)
-    assert errors.pixels == 100 and errors.left_out == pytest.approx(20 / 120)
-    shares = errors.too_near, errors.far_too_near, errors.too_far, errors.holes
-    assert shares == pytest.approx((0.13, 0.03, 0.05, 0.02))
+    depth[:, 25:] = 0.3
+    depth[0, :10] = 1.8  # too near
+    depth[1, :3] = 0.0  # below the camera's minimum
+    depth[2, :5] = 2.3, 2.3, 2.3, np.inf, np.inf  # too far, and holes
+    errors = depth_errors([DepthFrame(depth, truth)], 20.0)
+    assert errors == pytest.approx((100, 0.18, 0.01))
+    truth[:, :15] = 4.0
+    assert depth_errors([DepthFrame(depth, truth)], 20.0, edges=False).pixels == 4 * (12 + 7)

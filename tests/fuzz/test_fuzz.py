@@ -18,7 +18,7 @@ from fuzz import samples
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.worlds.scene_folder import read_scene
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.collision.octomap import esdf_from_octomap
+from splatpilot.systems.collision.octomap import read_octomap
 from splatpilot.systems.common.config import dump_config, load_config
 from splatpilot.systems.messaging import codecs
 from splatpilot.systems.messaging.lcm_ports import decode_message
@@ -107,7 +107,7 @@ READERS = {
     ),
     "OctoMap": (
         samples.write_octomap,
-        lambda folder: esdf_from_octomap(folder / "map.bt", np.full(3, -2.0), np.full(3, 3.0)),
+        lambda folder: read_octomap(folder / "map.bt").esdf(np.full(3, -2.0), np.full(3, 3.0)),
         use_esdf,
     ),
     "mesh": (

@@ -1,5 +1,3 @@
-"""What becomes of a frame that the system has no memory or threads for."""
-
 import subprocess
 import sys
 

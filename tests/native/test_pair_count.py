@@ -1,5 +1,3 @@
-"""The limit on pairs of Gaussian and tile, which no scene that fits into this machine reaches."""
-
 import shutil
 import subprocess
 from pathlib import Path

@@ -1,5 +1,3 @@
-"""splatpilot/_native.pyi."""
-
 from pathlib import Path
 
 from nanobind.stubgen import StubGen

@@ -35,8 +35,11 @@ from splatpilot.diagrams.worlds.splits import check_split, choose_split, part_di
 from splatpilot.diagrams.worlds.world_gltf import write_gltf
 from splatpilot.diagrams.worlds.world_registry import WorldConfig, is_procedural, make_spec
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.collision.esdf_build import esdf_from_distance_field, esdf_from_occupancy
-from splatpilot.systems.collision.occupancy import grid_shape
+from splatpilot.systems.collision.esdf_build import (
+    esdf_from_distance_field,
+    esdf_from_occupancy,
+    grid_shape,
+)
 from splatpilot.systems.common.config import dump_config, load_config
 from splatpilot.systems.common.extras import require_opengl
 from splatpilot.systems.common.files import held_folder, require_writable_folder, written_atomically

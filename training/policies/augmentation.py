@@ -16,7 +16,7 @@ from splatpilot.systems.sensing.noise import (
     corrupt_color,
     corrupt_depth,
     expose,
-    turned_hue,
+    rotate_hue,
 )
 
 _DEPTH = "depth_multiplicative", "depth_additive", "depth_dropout"
@@ -67,7 +67,7 @@ def noisy_color(color: Tensor, noise: ObservationNoise, generator: torch.Generat
     brighter, grain = uniform(), torch.empty_like(color).normal_(generator=generator)
     if noise.hue_jitter > 0.0:
         angle = math.radians(noise.hue_jitter) * uniform()
-        color = turned_hue(color, angle.cos(), angle.sin())
+        color = rotate_hue(color, angle.cos(), angle.sin())
     if noise.blur > 0.0:
         color = blur(color, noise.blur)
     if noise.changes_light:
@@ -88,4 +88,4 @@ def change_appearance(color: Tensor, appearance: Appearance, generator: torch.Ge
     draws = torch.rand(2, len(color), 1, 1, 1, generator=generator, device=color.device)
     exposure, hue = 2.0 * draws - 1.0
     angle = (appearance.hue * hue).deg2rad()
-    return turned_hue(2.0 ** (appearance.exposure * exposure) * color, angle.cos(), angle.sin())
+    return rotate_hue(2.0 ** (appearance.exposure * exposure) * color, angle.cos(), angle.sin())

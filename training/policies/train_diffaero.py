@@ -37,7 +37,11 @@ from splatpilot.systems.policies.observations import (
 )
 from splatpilot.systems.policies.velocity import tracking_acceleration
 from splatpilot.systems.sensing.noise import ObservationNoise
-from splatpilot.systems.sensing.time_of_flight import LEAST_DEPTH, range_of_depth, sensor_of
+from splatpilot.systems.sensing.time_of_flight import (
+    UNMEASURED_DEPTH,
+    equivalent_sensor,
+    range_of_depth,
+)
 from splatpilot.training.policies.networks import TrainableNetwork
 from splatpilot.training.policies.ray_casting import PixelRays
 from splatpilot.training.policies.rollouts import RolloutConfig, RolloutTraining, Transitions
@@ -129,7 +133,7 @@ def proximity_grid(
     a multiple of height and width.
     """
     H, W = range_of_depth.shape
-    measured = torch.where(depth > LEAST_DEPTH, depth, max_range).reshape(-1, H, W)
+    measured = torch.where(depth > UNMEASURED_DEPTH, depth, max_range).reshape(-1, H, W)
     blocks = (measured * range_of_depth).reshape(-1, height, H // height, width, W // width)
     return (1.0 - blocks.amin((2, 4)).clamp(0.0, max_range) / max_range).flip(1)
 
@@ -165,7 +169,7 @@ class DiffAeroTofLearner(DiffAeroLearner):
         self.rays = PixelRays.of(
             camera.width, camera.height, camera.fov_x, camera.focal_x / camera.focal_y
         )
-        self._sensor = sensor = sensor_of(camera)
+        self._sensor = sensor = equivalent_sensor(camera)
         to_range = range_of_depth(sensor.height, sensor.width, sensor.fov_x, sensor.fov_y)
         self._range_of_depth = torch.tensor(to_range, dtype=torch.float32, device=device)
         self._limits = torch.tensor(VELOCITY_LIMITS, dtype=torch.float32, device=device)

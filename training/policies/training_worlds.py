@@ -22,7 +22,7 @@ from splatpilot.diagrams.worlds.world_registry import (
     WorldConfig,
     make_spec,
     make_world,
-    place_config,
+    scene_config,
 )
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.esdf_build import esdf_from_distance_field
@@ -323,7 +323,7 @@ def _make_worlds(
 ) -> list[TrainingWorld]:
     scenes = {}
     for scene in selection.scenes:
-        esdf = make_world(place_config(training_scene(scene)), seed=0).esdf
+        esdf = make_world(scene_config(training_scene(scene)), seed=0).esdf
         scenes[scene] = esdf, esdf.conservative()
     cache, worlds = WorldCache(), []
     seeds = Progress(range(first, first + count), f"making {what}", unit="world")

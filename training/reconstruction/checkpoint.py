@@ -1,6 +1,5 @@
 """Checkpoints of an optimization, and its log for tensorboard."""
 
-import hashlib
 import shutil
 import zipfile
 from collections.abc import Callable, Iterator
@@ -19,24 +18,15 @@ from splatpilot.training.reconstruction.views import ReconstructionViews
 
 _VERSION = 3
 _REMEDY = "start again with --restart, which discards it"
+# Fields that may differ when a run resumes: they do not change the optimization.
 _UNCOMPARED = {
-    "threads",
-    "checkpoint_every",
-    "tensorboard",
-    "voxel_size",
-    "max_range",
-    "distance_field",
-    "split",
+    *("threads", "checkpoint_every", "tensorboard"),
+    *("voxel_size", "max_range", "distance_field", "split"),
 }
-"""Fields that a run may be resumed with other values of: they do not change the optimization."""
 
 
 def save_tensors(content: dict[str, Any], path: Path) -> None:
-    """Writes a file for `load_tensors`, atomically.
-
-    Raises:
-        OSError: if it cannot be written; an existing file is kept.
-    """
+    """Writes a file for `load_tensors`, atomically."""
     with written_atomically(path) as partial:
         try:
             torch.save(content, partial)
@@ -45,13 +35,9 @@ def save_tensors(content: dict[str, Any], path: Path) -> None:
 
 
 def load_tensors(path: Path) -> Any:
-    """Reads a file of `save_tensors`.
-
-    Raises:
-        OSError, ValueError: if it cannot be read or is damaged; torch itself ignores checksums.
-    """
+    """Reads a file of `save_tensors`; raises OSError or ValueError for a damaged one."""
     try:
-        with zipfile.ZipFile(path) as archive:
+        with zipfile.ZipFile(path) as archive:  # torch ignores checksums
             damaged = archive.testzip()
         if damaged is not None:
             raise ValueError(f"its part {damaged} is damaged")
@@ -68,104 +54,71 @@ def work_folder(out: Path) -> Path:
     return out.with_name(f".{out.name}.partial")
 
 
-def _checkpoint_file(out: Path) -> Path:
-    return work_folder(out) / "checkpoint.pt"
-
-
 def kept_work(out: Path) -> str:
     """Tells how to resume an unfinished scene folder `out`."""
-    if _checkpoint_file(out).exists():
-        return f"the last checkpoint is in {work_folder(out)}; the same command resumes from it"
+    folder = work_folder(out)
+    if (folder / "checkpoint.pt").exists():
+        return f"the last checkpoint is in {folder}; the same command resumes from it"
     return "nothing is kept yet; the same command starts again"
 
 
 class Checkpoint:
-    """The file with the state of an optimization, in `work_folder(out)`.
+    """The file with the state of an optimization of the scene folder `out`, in `work_folder(out)`.
 
-    Args:
-        out: scene folder to be written.
-        config: of the run.
-        views: fitted views.
+    Without the fitted `views`, it compares only the config with that of the checkpoint.
     """
 
-    def __init__(self, out: Path, config: ReconstructConfig, views: ReconstructionViews):
-        self.folder, self.file = work_folder(out), _checkpoint_file(out)
-        self._config = _compared_fields(config)
-        digest = hashlib.sha256()
-        for name in ("images", "depths", "valid", "viewmats", "K", "gains"):
-            digest.update(getattr(views, name).numpy().tobytes())
-        self._capture = digest.hexdigest()
+    def __init__(
+        self, out: Path, config: ReconstructConfig, views: ReconstructionViews | None = None
+    ):
+        self.folder = work_folder(out)
+        self._file = self.folder / "checkpoint.pt"
+        fields = asdict(config).items()
+        self._config = {name: value for name, value in fields if name not in _UNCOMPARED}
+        self._capture = None if views is None else views.digest()
 
     def save(self, content: dict[str, Any]) -> None:
-        """Replaces the checkpoint.
-
-        Raises:
-            OSError: if it cannot be written; the last checkpoint is kept.
-        """
+        """Replaces the checkpoint; if it cannot be written, the last one is kept."""
         header = {"version": _VERSION, "config": self._config, "capture": self._capture}
         self.folder.mkdir(parents=True, exist_ok=True)
-        save_tensors(header | content, self.file)
+        save_tensors(header | content, self._file)
 
     def load(self) -> dict[str, Any] | None:
-        """Returns the last checkpoint, or None.
+        """Returns the last checkpoint, or None without one.
 
         Raises:
             ValueError: if it is damaged, or of another configuration or capture.
         """
-        content = _read(self.file, self._config)
-        if content is not None and content["capture"] != self._capture:
+        file = self._file
+        if not file.exists():
+            return None
+        try:
+            content = load_tensors(file)
+        except ValueError as error:
+            raise ValueError(f"{file}: not a readable checkpoint ({error}); {_REMEDY}") from None
+        if content.get("version") != _VERSION:
+            raise ValueError(f"{file}: written by another version of the program; {_REMEDY}")
+        for name, value in self._config.items():
+            if (saved := content["config"].get(name)) != value:
+                raise ValueError(
+                    f"{file}: an interrupted run with {name} {saved}, not {value}; set "
+                    f"{name}={saved} to resume, or {_REMEDY}"
+                )
+        if self._capture not in (None, content["capture"]):
             raise ValueError(
-                f"{self.file}: an interrupted run on another capture, or its files have changed; "
+                f"{file}: an interrupted run on another capture, or its files have changed; "
                 f"{_REMEDY}"
             )
         return content
 
     def remove(self) -> None:
-        """Removes the work folder."""
         shutil.rmtree(self.folder, ignore_errors=True)
-
-
-def require_same_run(out: Path, config: ReconstructConfig) -> None:
-    """Checks a checkpoint of `out` before anything slow is prepared.
-
-    Raises:
-        ValueError: if it is damaged, or of another configuration.
-    """
-    _read(_checkpoint_file(out), _compared_fields(config))
-
-
-def _compared_fields(config: ReconstructConfig) -> dict[str, Any]:
-    return {name: value for name, value in asdict(config).items() if name not in _UNCOMPARED}
-
-
-def _read(file: Path, config: dict[str, Any]) -> dict[str, Any] | None:
-    """Returns the content of a checkpoint of a run with `config`; None if there is no file."""
-    if not file.exists():
-        return None
-    try:
-        content = load_tensors(file)
-    except ValueError as error:
-        raise ValueError(f"{file}: not a readable checkpoint ({error}); {_REMEDY}") from None
-    if content.get("version") != _VERSION:
-        raise ValueError(f"{file}: written by another version of the program; {_REMEDY}")
-    for name, value in config.items():
-        saved = content["config"].get(name)
-        if saved != value:
-            raise ValueError(
-                f"{file}: an interrupted run with {name} {saved}, not {value}; set {name}={saved} "
-                f"to resume, or {_REMEDY}"
-            )
-    return content
 
 
 @contextmanager
 def event_log(folder: str) -> Iterator[Callable[[int, dict[str, float]], None]]:
     """Yields a function that logs metrics of a step for tensorboard; without a folder, it does
-    nothing.
-
-    Raises:
-        ModuleNotFoundError: if tensorboard is required and not installed.
-    """
+    nothing."""
     if not folder:
         yield lambda step, metrics: None
         return

@@ -14,10 +14,10 @@ _MIN_VOXEL_SIZE = 0.005  # [m]
 
 @dataclass(kw_only=True)
 class ReconstructConfig(Config):
-    """How a capture becomes a scene. The defaults suit a room or a corridor of some 100 frames."""
+    """Settings of a reconstruction; the defaults suit a room or a corridor of some 100 frames."""
 
     capture: CaptureConfig = field(default_factory=CaptureConfig)
-    """What the capture's files leave open."""
+    """Settings that the capture's files do not have."""
     iterations: int = bounded(-1, "[-1, inf)")
     """Optimization steps, one image each; 0 takes depth and colors as they are. -1 takes 32 for
     each fitted image, in [2000, 7000], if Gaussians start from depth, and 7000 otherwise."""
@@ -31,25 +31,25 @@ class ReconstructConfig(Config):
     max_gaussians: int = bounded(180_000, "[1, inf)")
     """Maximum number of Gaussians. Without iterations, it sets how finely texture is resolved."""
     split: str = bounded("", "{, train, validation, test}")
-    """Use of the scene. Empty: the capture's split, or "train". Scenes of the benchmark are always
-    "test"."""
+    """Use of the scene; empty takes the capture's, or "train". Scenes of the benchmark are "test".
+    """
     image_width: int = bounded(320, "[0, inf) px")
-    """[px] to which images are shrunk, by the closest whole factor. 0 keeps their size, and so do 0
+    """[px], to which images are shrunk, by the closest integer factor. 0 keeps their size, as do 0
     iterations."""
     hold_out: int = bounded(-1, "[-1, inf)")
-    """Interval of frames, from the first, that are not fitted but measure the scene. 0 holds out
-    none, and so do 0 iterations. -1 takes the frames that the capture's files hold out or, if they
-    name none, every eighth."""
+    """Interval of frames, from the first, that are not fitted but measure the scene. 0 holds out no
+    frame, as do 0 iterations. -1 takes those that the capture's files hold out, or every eighth.
+    """
 
     depth_weight: float = bounded(0.2, "[0, inf)")
-    """lambda_d, weight of the depth term; 0 fits colors alone."""
+    """lambda_d, weight of the depth term; 0 fits only colors."""
     depth_mode: str = bounded("ED", "{D, ED}")
     """Depth in this term: "ED", expected, or "D", accumulated, the paper's equation 2."""
     surface_weight: float = bounded(1.5, "[0, inf)")
     """Weight of the distance between Gaussians and their surface, see `surface_loss`."""
     outline_weight: float = bounded(1.0, "[0, inf)")
     """Weight of the outlines of objects before the sky, see `outline_loss`. Every other step of a
-    view with such outlines fits them instead of colors. 0 for none."""
+    view with such outlines fits them instead of colors."""
     lpips_weight: float = bounded(0.0, "[0, inf)")
     """Weight of LPIPS in the last tenth of the steps."""
     sh_degree: int = bounded(0, "[0, 3]")
@@ -65,7 +65,7 @@ class ReconstructConfig(Config):
     refine_fraction: float = bounded(0.5, "[0, 1]")
     """Fraction of all steps after which there are no more changes."""
     reset_every: int = bounded(3000, "[0, inf)")
-    """Steps between resets of all opacities, while there are changes; 0 for never."""
+    """Steps between resets of all opacities, while there are changes; 0 never resets them."""
     means_rate: float = bounded(1.6e-4, "[0, inf)")
     """Learning rate of the means relative to the extent of the scene; falls to a hundredth."""
 
@@ -73,8 +73,8 @@ class ReconstructConfig(Config):
     """Standard deviation of color (0 to 1) that one initial Gaussian may average."""
 
     distance_field: str = bounded("rendered", "{rendered, captured}")
-    """Depth that is fused: "rendered" from the Gaussians, or "captured". Captures without depth
-    have only the former; without iterations there is only the latter."""
+    """Depth that is fused: "rendered" from the Gaussians, the only one without captured depth, or
+    "captured", the only one without iterations."""
     voxel_size: float = bounded(0.0, "[0, inf) m")
     """[m], of the distance field. If the scale is unknown, the median depth counts as 2 m. 0 for
     0.05, or coarser if that takes more than 20 million voxels."""

@@ -7,26 +7,20 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
-from splatpilot.systems.collision.distance_field import FieldState
+from splatpilot.systems.collision.depth_fusion import bounds_of_depth_images, esdf_from_depth_images
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.collision.esdf_build import bounds_of_depth_images, esdf_from_depth_images
 from splatpilot.systems.splats.background import FAR
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.training.captures.capture import Capture, shrink_mask
 from splatpilot.training.reconstruction.config import ReconstructConfig
-from splatpilot.training.reconstruction.metrics import SceneRenderer
+from splatpilot.training.reconstruction.splat_rendering import SceneRenderer
 from splatpilot.training.reconstruction.views import ShrunkFrames
 
-# Fields are compared up to this distance from true surfaces [m].
-_NEAR = 0.5
-# If the scale is unknown, the median depth counts as this [m].
-_MEDIAN_DEPTH = 2.0
-# Defaults: range and voxels of rooms [m]; range of larger scenes in median depths, and their number
-# of voxels, which a flight loads in seconds.
-_RANGE, _VOXEL_SIZE = 8.0, 0.05
-_RANGE_OF_MEDIAN = 1.5
-_VOXELS = 20e6
-_MEDIAN_IMAGES = 100  # whose depths give the median
+_MEDIAN_DEPTH = 2.0  # [m], median depth of a capture without scale
+_RANGE, _VOXEL_SIZE = 8.0, 0.05  # [m], minimum range, and voxels of rooms
+_RANGE_OF_MEDIAN = 1.5  # range relative to the median depth
+_VOXELS = 20e6  # maximum number, which a flight loads in seconds
+_MEDIAN_IMAGES = 100  # maximum number of images that give the median
 
 
 @dataclass(frozen=True)
@@ -48,11 +42,17 @@ class DepthSource:
         return float(np.median(depth)) if len(depth) else 0.0
 
 
+def captured_depth(capture: Capture, indices: Sequence[int]) -> DepthSource:
+    """Returns the depth of some frames of a capture."""
+    X_WCs = [capture.X_WCs[i] for i in indices]
+    return DepthSource(lambda k: capture.registered_depth(indices[k]), capture.K, X_WCs)
+
+
 def render_depth(
     capture: Capture, factor: int, gaussians: GaussianScene, representation: str, threads: int
 ) -> DepthSource:
-    """Returns the median depth that the cameras of a capture measure in the scene, 0 without a
-    surface and in invalid pixels, in images shrunk by a whole `factor`."""
+    """Renders the median depth that the cameras of a capture measure in the scene, 0 without a
+    surface and in invalid pixels, in images shrunk by an integer `factor`."""
     K = capture.K.copy()
     K[:2] /= factor
     width, height = capture.width // factor, capture.height // factor
@@ -105,86 +105,30 @@ def choose_grid(source: DepthSource, metric: bool, config: ReconstructConfig) ->
 
 def fuse(source: DepthSource, grid: FieldGrid) -> Esdf:
     """Fuses depth images into a distance field; space that no image saw is unknown."""
-    return esdf_from_depth_images(
-        source.images(),
-        source.K,
-        source.X_WCs,
-        grid.lower_W,
-        grid.upper_W,
-        grid.voxel_size,
-        grid.max_range,
-    )
-
-
-@dataclass(frozen=True)
-class FieldDifference:
-    """Errors of a distance field near true surfaces, where both fields are known."""
-
-    mean: float  # [m], positive: surfaces seem too far
-    median_absolute: float  # [m]
-    p95_absolute: float  # [m]
-    blocked: float  # fraction of space free by a voxel or more that is occupied in the field
-    opened: float  # fraction of occupied space that is free by a voxel or more in the field
-
-    def __str__(self) -> str:
-        return (
-            f"{self.mean:+.3f} m mean, {self.median_absolute:.3f} m median, "
-            f"{self.p95_absolute:.3f} m 95th percentile; free taken as occupied "
-            f"{100 * self.blocked:.2f} %, occupied as free {100 * self.opened:.2f} %"
-        )
-
-
-def compare_fields(field: Esdf, truth: Esdf) -> FieldDifference | None:
-    """Compares two fields on the same grid; None if they share nothing near a surface."""
-    d, d_true = field.distances, truth.distances
-    known = (field.states != FieldState.UNKNOWN) & (truth.states != FieldState.UNKNOWN)
-    free = known & (d_true > truth.voxel_size)
-    occupied = known & (truth.states == FieldState.OCCUPIED)
-    near = known & (np.abs(d_true) < _NEAR)
-    if not near.any():
-        return None
-    error = (d - d_true)[near]
-    return FieldDifference(
-        mean=float(error.mean()),
-        median_absolute=float(np.median(np.abs(error))),
-        p95_absolute=float(np.percentile(np.abs(error), 95)),
-        blocked=float((field.states == FieldState.OCCUPIED)[free].mean()),
-        opened=float((d[occupied] > field.voxel_size).mean()),
-    )
+    return esdf_from_depth_images(source.images(), source.K, source.X_WCs, **vars(grid))
 
 
 def make_distance_field(
     capture: Capture, frames: ShrunkFrames, gaussians: GaussianScene, config: ReconstructConfig
-) -> tuple[Esdf, FieldDifference | None, DepthSource]:
-    """Makes the distance field of a reconstruction.
-
-    Args:
-        capture: source of captured depth.
-        frames: fitted frames, as they were fitted.
-        gaussians: reconstructed.
-        config: how to reconstruct.
+) -> tuple[Esdf, DepthSource]:
+    """Makes the distance field of a reconstruction from its fitted frames and Gaussians.
 
     Returns:
-        The field; the difference between rendered and captured field, if the capture has depth and
-        was optimized; the captured depth or, if there is none, the rendered depth.
+        The field, and the captured depth, or the rendered depth of a capture without any.
     """
-    captured = DepthSource(capture.registered_depth, capture.K, capture.X_WCs)
+    captured = captured_depth(capture, range(len(capture)))
+
+    def fuse_within(source: DepthSource, bounds: DepthSource) -> Esdf:
+        return fuse(source, choose_grid(bounds, capture.metric, config))
+
     if config.iterations == 0:
-        return fuse(captured, choose_grid(captured, capture.metric, config)), None, captured
+        return fuse_within(captured, captured), captured
+    if capture.has_depth and config.distance_field == "captured":
+        fitted = captured_depth(capture, frames.numbers)
+        return fuse_within(fitted, fitted), captured
     rendered = render_depth(
         capture, frames.factor, gaussians, config.representation, config.renderer_threads
     )
     if not capture.has_depth:
-        return fuse(rendered, choose_grid(rendered, capture.metric, config)), None, rendered
-    grid = choose_grid(captured, capture.metric, config)
-    truth = fuse(captured, grid)
-    field = fuse(add_sky(rendered, frames), grid)
-    difference = compare_fields(field, truth)
-    if config.distance_field == "rendered":
-        return field, difference, captured
-    fitted = DepthSource(
-        lambda k: capture.registered_depth(frames.numbers[k]),
-        capture.K,
-        [capture.X_WCs[i] for i in frames.numbers],
-    )
-    return fuse(fitted, choose_grid(fitted, capture.metric, config)), difference, captured
+        return fuse_within(rendered, rendered), rendered
+    return fuse_within(add_sky(rendered, frames), captured), captured

@@ -2,9 +2,8 @@
 
 import tempfile
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -14,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from splatpilot.systems.common.processes import run_apart
 from splatpilot.systems.common.progress import Progress, say
+from splatpilot.systems.common.validation import require
 from splatpilot.systems.splats.background import FAR
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.training.captures.capture import Capture, CaptureFrame, SfmPoints
@@ -25,10 +25,6 @@ from splatpilot.training.reconstruction.photometry import (
     ThinnedFrame,
     find_new_pixels,
 )
-from splatpilot.training.reconstruction.views import ReconstructionViews
-
-if TYPE_CHECKING:
-    import pycolmap
 
 MAX_STEPS = 7000
 """Default maximum of the steps."""
@@ -47,20 +43,19 @@ _THICKNESS = 0.1  # relative to the other standard deviations
 _UNDERLAY_SETBACK, _MAX_SETBACK, _UNDERLAY_SIZE = 0.03, 0.2, 4
 _MAX_ODDITY = 0.05  # of the logarithm of a gain, beyond which other images are preferred
 _SUBSET = 4  # one in so many frames is tried first
+_LARGEST_CELL = 64  # [px]
 _MIN_COVERED = 0.8  # fraction of the surfaces, below which optimization leaves holes
 _OPACITY, _OPACITY_ALONE = 0.9, 0.99  # on surfaces, with and without optimization
-# Of points: opacity, and size in distances to the three closest others.
-_POINT_OPACITY, _POINT_SIZE = 0.1, 0.5
+_POINT_OPACITY, _POINT_SIZE = 0.1, 0.5  # size relative to the distance of the three closest others
 _RANDOM_DEPTH = (0.1, 10.0)  # in extents of the cameras
 _OVERLAP, _FEATURES = 10, 2048  # of images to be matched, and maximum of an image
+_MIN_POINTS = 100  # that are triangulated
 
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """Square cells of an image, each of which becomes one Gaussian.
-
-    Inverse depth in a cell is w + w_u (u - u_c) + w_v (v - v_c) about its center (u_c, v_c) [px].
-    """
+    """Square cells of an image. Inverse depth in a cell is w + w_u (u - u_c) + w_v (v - v_c) about
+    its center (u_c, v_c) [px]."""
 
     u: NDArray[np.float64]  # (n,) [px], center
     v: NDArray[np.float64]  # (n,) [px]
@@ -71,32 +66,14 @@ class Cells:
     color: NDArray[np.float64]  # (n, 3)
 
     def select(self, mask: NDArray[np.bool_]) -> "Cells":
-        """Returns some of the cells."""
-        return Cells(**{field.name: getattr(self, field.name)[mask] for field in fields(self)})
-
-    def move_back(self, factor: NDArray[np.float64]) -> "Cells":
-        """Returns the same cells on surfaces `factor` (n,) times as far away."""
-        w, w_u, w_v = (slope / factor for slope in (self.w, self.w_u, self.w_v))
-        return replace(self, w=w, w_u=w_u, w_v=w_v)
+        return Cells(**{name: values[mask] for name, values in vars(self).items()})
 
 
 class BlockMeans:
-    """Means over the square blocks of an image, for every power of two as their edge [px].
+    """Means over the square blocks of a frame, for powers of two up to `max_size` as edge [px]:
+    depth, colors of `image` (H, W, 3) in [0, 1], and `mask` (H, W), the pixels to cover."""
 
-    Args:
-        frame: the depth.
-        image: (H, W, 3), the colors to use, in 0 to 1.
-        mask: (H, W), pixels to cover.
-        max_size: maximum edge [px], a power of two.
-    """
-
-    def __init__(
-        self,
-        frame: CaptureFrame,
-        image: NDArray[np.float32],
-        mask: NDArray[np.bool_],
-        max_size: int,
-    ):
+    def __init__(self, frame: CaptureFrame, image: NDArray, mask: NDArray, max_size: int):
         pad = [(0, -n % max_size) for n in frame.depth.shape]
         depth = np.pad(frame.depth, pad).astype(np.float64)
         valid = (depth > 0) & (depth < FAR)
@@ -107,11 +84,9 @@ class BlockMeans:
         means = np.stack(channels)  # (12, H, W), float64
         self._focal_length = frame.K[0, 0]
         self._means = {1: means}
-        size = 1
-        while size < max_size:
+        while (size := 2 * max(self._means)) <= max_size:
             means = means[:, ::2] + means[:, 1::2]
             means = (means[..., ::2] + means[..., 1::2]) / 4
-            size *= 2
             self._means[size] = means
 
     def split(self, contrast: float, max_size: int, fraction: float, max_extent: float) -> Cells:
@@ -132,7 +107,7 @@ class BlockMeans:
             # Least-squares plane through the inverse depths of the block.
             spread = (size**2 - 1) / 12  # variance of the pixel coordinates
             w_u, w_v = (
-                ((wu - w * u) / spread, (wv - w * v) / spread) if size > 1 else (0 * w, 0 * w)
+                (moment / spread if size > 1 else 0 * w) for moment in (wu - w * u, wv - w * v)
             )
             residual = ww - w**2 - spread * (w_u**2 + w_v**2)
             leaf = undecided & (valid == 1) & (masked >= fraction)
@@ -154,8 +129,8 @@ class BlockMeans:
 
 def frame_gaussians(
     frame: CaptureFrame,
-    image: NDArray[np.float32],
-    mask: NDArray[np.bool_],
+    image: NDArray,
+    mask: NDArray,
     contrast: float,
     max_size: int,
     max_extent: float,
@@ -165,7 +140,7 @@ def frame_gaussians(
 
     Narrow Gaussians keep texture sharp. The underlay, wide Gaussians of larger cells a little
     behind, fills the gaps between them. Without it they are wider, for optimization to sharpen.
-    For the arguments, see `BlockMeans` and `BlockMeans.split`.
+    For the arguments, see `BlockMeans` and its `split`.
     """
     means = BlockMeans(frame, image, mask, 2 * max_size)
     surface = means.split(contrast, max_size, 0.75, max_extent)
@@ -176,13 +151,18 @@ def frame_gaussians(
     # Gaussians are drawn in order of the depths of their centers, so an underlay must be farther
     # than the surface of the neighboring cells.
     across = under.size * np.hypot(under.w_u, under.w_v) / under.w
-    under = under.move_back(1 + _UNDERLAY_SETBACK + np.minimum(0.75 * across, _MAX_SETBACK))
-    layers = (
-        (*cell_gaussians(frame, surface, _SPREAD), surface.color),
-        (*cell_gaussians(frame, under, _UNDERLAY_SPREAD), under.color),
+    factor = 1 + _UNDERLAY_SETBACK + np.minimum(0.75 * across, _MAX_SETBACK)
+    under = replace(under, w=under.w / factor, w_u=under.w_u / factor, w_v=under.w_v / factor)
+    return _concatenate(
+        [
+            (*cell_gaussians(frame, surface, _SPREAD), surface.color),
+            (*cell_gaussians(frame, under, _UNDERLAY_SPREAD), under.color),
+        ]
     )
-    p_WQ, covariances, colors = (np.concatenate(column) for column in zip(*layers, strict=True))
-    return p_WQ, covariances, colors
+
+
+def _concatenate(parts: Iterable[tuple[NDArray, NDArray, NDArray]]) -> tuple:
+    return tuple(np.concatenate(column) for column in zip(*parts, strict=True))
 
 
 def cell_gaussians(
@@ -225,25 +205,6 @@ def principal_axes(
     return quats, np.sqrt(np.maximum(variances, smallest))
 
 
-@dataclass(frozen=True, kw_only=True)
-class Detail:
-    """How finely `gaussians_from_depth` covers surfaces; see `frame_gaussians`."""
-
-    max_gaussians: int
-    contrast: float
-    max_cell: int = 16  # [px]
-    max_extent: float = 0.06
-    optimized: bool = False
-    """Whether they will be optimized: then they are wider, without an underlay."""
-
-
-def surface_detail(config: ReconstructConfig) -> Detail:
-    """Returns how finely Gaussians from depth cover surfaces."""
-    optimized = config.iterations > 0
-    count = config.initial_gaussians if optimized else config.max_gaussians
-    return Detail(max_gaussians=count, contrast=config.contrast, optimized=optimized)
-
-
 def _available(capture: Capture) -> dict[str, bool]:
     """Returns which initializations the capture has, the best first."""
     return {"depth": capture.has_depth, "points": capture.points is not None, "random": True}
@@ -274,41 +235,45 @@ def held_out_frames(capture: Capture, config: ReconstructConfig) -> list[int]:
 
 def make_initial_gaussians(
     capture: Capture,
-    frames: Sequence,
+    frames: Sequence[CaptureFrame],
     photometry: Photometry,
-    views: ReconstructionViews,
+    extent: float,
     config: ReconstructConfig,
 ) -> GaussianScene:
-    """Makes the Gaussians that `config` starts from."""
+    """Makes the Gaussians that `config` starts from; `extent` [m] is that of the cameras."""
     kind, available = config.initialization, _available(capture)
-    if not available[kind]:
-        raise ValueError(
-            f"initialization is {kind!r}, but {capture.name} has none; choose "
-            + " or ".join(repr(name) for name, exists in available.items() if exists)
-        )
+    possible = " or ".join(name for name, exists in available.items() if exists)
+    require(available[kind], "initialization", f"{possible} for {capture.name}", kind)
+    count = config.initial_gaussians
     if kind == "depth":
-        return gaussians_from_depth(frames, photometry, surface_detail(config))
+        return gaussians_from_depth(frames, photometry, count, config.contrast, optimized=True)
     if capture.points is not None and kind == "points":
         return gaussians_from_points(capture.points.p_WQ, capture.points.colors)
-    _, extent = views.extent()
     near, far = (extent * depth for depth in _RANDOM_DEPTH)
-    count = config.initial_gaussians
     return gaussians_from_points(*random_points(frames, count, near, far, config.seed))
 
 
 def gaussians_from_depth(
-    frames: Sequence[CaptureFrame], photometry: Photometry, detail: Detail
+    frames: Sequence[CaptureFrame],
+    photometry: Photometry,
+    max_gaussians: int,
+    contrast: float,
+    *,
+    optimized: bool,
+    max_cell: int = 16,
+    max_extent: float = 0.06,
 ) -> GaussianScene:
     """Covers all surfaces of the frames with Gaussians, each surface once.
+
+    Cells become coarser until the Gaussians fit: first by more contrast, then by size.
 
     Args:
         frames: loaded one by one, and more than once.
         photometry: of the frames, in their order.
-        detail: how finely.
-
-    Raises:
-        ValueError: if no frame has depth, or even the largest cells are too many and will not be
-            optimized.
+        max_gaussians: maximum number.
+        contrast, max_cell, max_extent: of the finest cells, see `BlockMeans.split`.
+        optimized: makes Gaussians that will be optimized: wider and without an underlay; if even
+            the coarsest are too many, they are sampled.
     """
     views = [ThinnedFrame.of(frame) for frame in frames]
     if not any(view.depth.any() for view in views):
@@ -323,7 +288,7 @@ def gaussians_from_depth(
     progress = Progress(desc="placing Gaussians", unit="frame")
     parts: dict[int, tuple[NDArray, NDArray, NDArray]] = {}
 
-    def place(indices: Iterable[int]) -> int:
+    def cover(indices: Iterable[int]) -> int:
         for k in indices:
             frame = frames[k]
             height, width = frame.depth.shape
@@ -331,38 +296,35 @@ def gaussians_from_depth(
             image = (frame.image / (255 * factor[..., None])).astype(np.float32)
             mask = new[k].repeat(STRIDE, axis=0).repeat(STRIDE, axis=1)[:height, :width]
             parts[k] = frame_gaussians(
-                frame, image, mask, contrast, max_cell, max_extent, underlay=not detail.optimized
+                frame, image, mask, contrast, max_cell, max_extent, underlay=not optimized
             )
             progress.update()
         return sum(len(p_WQ) for p_WQ, _, _ in parts.values())
 
-    # Coarser cells until the Gaussians fit: first with more contrast, then larger. A subset of the
-    # frames tells early if they are far too many.
-    contrast, max_cell, max_extent = detail.contrast, detail.max_cell, detail.max_extent
+    # A subset of the frames tells early if the Gaussians are far too many.
     subset = range(0, len(frames), _SUBSET)
     rest = [k for k in range(len(frames)) if k not in subset]
     while True:
         parts.clear()
-        estimate = place(subset) * len(frames) / len(subset)
-        if estimate <= 1.1 * detail.max_gaussians and place(rest) <= detail.max_gaussians:
+        estimate = cover(subset) * len(frames) / len(subset)
+        if estimate <= 1.1 * max_gaussians and cover(rest) <= max_gaussians:
             break
         if contrast < 1:
-            contrast *= 1.3 if estimate < 2 * detail.max_gaussians else 2.0
-        elif detail.optimized:
-            place(k for k in rest if k not in parts)
+            contrast *= 1.3 if estimate < 2 * max_gaussians else 2.0
+        elif optimized:
+            cover(k for k in rest if k not in parts)
             break
-        elif max_cell < 64:
+        elif max_cell < _LARGEST_CELL:
             max_cell, max_extent = 2 * max_cell, 2 * max_extent
         else:
             raise ValueError(
-                f"{detail.max_gaussians} Gaussians are too few for {len(frames)} frames, even with "
+                f"{max_gaussians} Gaussians are too few for {len(frames)} frames, even with "
                 f"cells of {max_cell} pixels; allow more, or use fewer frames"
             )
     progress.close()
-    in_order = [parts[k] for k in range(len(frames))]
-    p_WQ, covariances, colors = (np.concatenate(column) for column in zip(*in_order, strict=True))
-    if len(p_WQ) > detail.max_gaussians:
-        kept = _sample_by_radius(covariances, detail.max_gaussians)
+    p_WQ, covariances, colors = _concatenate(parts[k] for k in range(len(frames)))
+    if len(p_WQ) > max_gaussians:
+        kept = _sample_by_radius(covariances, max_gaussians)
         areas = np.trace(covariances, axis1=1, axis2=2)
         covered = areas[kept].sum() / areas.sum()
         if covered < _MIN_COVERED:
@@ -373,7 +335,7 @@ def gaussians_from_depth(
             )
         p_WQ, covariances, colors = p_WQ[kept], covariances[kept], colors[kept]
     quats, scales = principal_axes(covariances)
-    opacities = np.full(len(p_WQ), _OPACITY if detail.optimized else _OPACITY_ALONE)
+    opacities = np.full(len(p_WQ), _OPACITY if optimized else _OPACITY_ALONE)
     return GaussianScene.from_colors(p_WQ, quats, scales, opacities, colors)
 
 
@@ -387,11 +349,7 @@ def _sample_by_radius(covariances: NDArray, count: int) -> NDArray[np.intp]:
 
 def gaussians_from_points(p_WQ: NDArray, colors: NDArray) -> GaussianScene:
     """Returns round Gaussians at the points (N, 3) [m] with colors (N, 3), as large as the mean
-    distance to the three closest others.
-
-    Raises:
-        ValueError: if there are fewer than four points.
-    """
+    distance to the three closest others."""
     if len(p_WQ) < 4:
         raise ValueError(f"{len(p_WQ)} points are too few to start from, at least 4 are required")
     distances, _ = KDTree(p_WQ).query(p_WQ, k=4)
@@ -425,10 +383,6 @@ def triangulate(capture: Capture, numbers: Sequence[int]) -> SfmPoints:
     """Triangulates points between frames of a capture by pycolmap, with the capture's poses.
 
     SIFT features of each frame are matched with those of the next ten in order.
-
-    Raises:
-        ValueError: if fewer than 100 points are found.
-        OSError: if images cannot be read, or copied into the system's temporary folder.
     """
     with tempfile.TemporaryDirectory(prefix="splatpilot-") as folder:
         images, masks = Path(folder) / "images", Path(folder) / "masks"
@@ -448,63 +402,46 @@ def triangulate(capture: Capture, numbers: Sequence[int]) -> SfmPoints:
             poses[name] = capture.X_WCs[i].inverse().GetAsMatrix34()
         say(f"triangulating points between {len(poses)} images")
         work = Path(folder), capture.K, poses
-        p_WQ, colors = run_apart(f"{folder}: triangulation", _triangulated, work)
-    if len(p_WQ) < 100:
-        raise ValueError(
-            f"{capture.source}: only {len(p_WQ)} points can be triangulated between its images, "
-            "at least 100 are required; it has too little texture or overlap"
-        )
+        p_WQ, colors = run_apart(f"{folder}: triangulation", _triangulate, work)
+    require(
+        len(p_WQ) >= _MIN_POINTS,
+        f"{capture.source}: the number of points between its images",
+        f"at least {_MIN_POINTS}",
+        len(p_WQ),
+        "it has too little texture or overlap",
+    )
     # Threads process images in any order, and points are numbered by it.
     order = np.lexsort(p_WQ.T)
     return SfmPoints(p_WQ[order], colors[order])
 
 
-def _triangulated(
+def _triangulate(
     work: tuple[Path, NDArray[np.float64], dict[str, NDArray[np.float64]]],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Returns points (n, 3) and their colors (n, 3), 0 to 1.
 
-    Args:
-        work: folder with `images` and `masks`, intrinsics (3, 3) [px], and poses X_CW (3, 4) by
-            name.
+    `work` is the folder of `images` and `masks`, K (3, 3) [px], and poses X_CW (3, 4) by name.
     """
     folder, K, poses = work
     pycolmap = import_pycolmap()
     pycolmap.logging.minloglevel = max(pycolmap.logging.minloglevel, 2)
     pycolmap.set_random_seed(0)
     database, images = folder / "database.db", folder / "images"
-    model = _make_posed_model(K, poses, database, images)
-    pairing = pycolmap.SequentialPairingOptions(overlap=_OVERLAP, quadratic_overlap=False)
     # One thread each, for deterministic points.
-    matching = pycolmap.FeatureMatchingOptions(num_threads=1)
-    pycolmap.match_sequential(database, matching, pairing)
-    (folder / "model").mkdir()
-    options = pycolmap.IncrementalPipelineOptions(extract_colors=True, num_threads=1, random_seed=0)
-    model = pycolmap.triangulate_points(model, database, images, folder / "model", options=options)
-    points = list(model.points3D.values())
-    p_WQ = np.array([point.xyz for point in points]).reshape(-1, 3)
-    return p_WQ, np.array([point.color for point in points]).reshape(-1, 3) / 255
-
-
-def _make_posed_model(
-    K: NDArray[np.float64], poses: dict[str, NDArray[np.float64]], database: Path, images: Path
-) -> "pycolmap.Reconstruction":
-    """Extracts features into the database, and returns a model of the cameras without points."""
-    pycolmap = import_pycolmap()
-    parameters = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
-    extraction = pycolmap.FeatureExtractionOptions()
+    extraction = pycolmap.FeatureExtractionOptions(num_threads=1)
     extraction.sift.max_num_features = _FEATURES
-    extraction.num_threads = 1
+    parameters = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
+    reader = pycolmap.ImageReaderOptions(
+        camera_model="PINHOLE",
+        camera_params=",".join(f"{x:.17g}" for x in parameters),
+        mask_path=folder / "masks",
+    )
     pycolmap.extract_features(
         database,
         images,
         list(poses),
         camera_mode=pycolmap.CameraMode.SINGLE,
-        reader_options=pycolmap.ImageReaderOptions(
-            camera_model="PINHOLE",
-            camera_params=",".join(f"{x:.17g}" for x in parameters),
-            mask_path=images.parent / "masks",
-        ),
+        reader_options=reader,
         extraction_options=extraction,
         device=pycolmap.Device.cpu,
     )
@@ -513,10 +450,14 @@ def _make_posed_model(
         (camera,) = content.read_all_cameras()
         model.add_camera_with_trivial_rig(camera)
         for image in content.read_all_images():
-            model.add_image_with_trivial_frame(
-                pycolmap.Image(
-                    name=image.name, camera_id=camera.camera_id, image_id=image.image_id
-                ),
-                pycolmap.Rigid3d(poses[image.name]),
-            )
-    return model
+            posed = pycolmap.Image(image.name, camera_id=camera.camera_id, image_id=image.image_id)
+            model.add_image_with_trivial_frame(posed, pycolmap.Rigid3d(poses[image.name]))
+    matching = pycolmap.FeatureMatchingOptions(num_threads=1)
+    pairing = pycolmap.SequentialPairingOptions(overlap=_OVERLAP, quadratic_overlap=False)
+    pycolmap.match_sequential(database, matching, pairing)
+    (folder / "model").mkdir()
+    options = pycolmap.IncrementalPipelineOptions(extract_colors=True, num_threads=1, random_seed=0)
+    model = pycolmap.triangulate_points(model, database, images, folder / "model", options=options)
+    points = list(model.points3D.values())
+    p_WQ = np.array([point.xyz for point in points]).reshape(-1, 3)
+    return p_WQ, np.array([point.color for point in points]).reshape(-1, 3) / 255

@@ -28,33 +28,23 @@ _NEAR = 0.05  # [m], minimum depth of a point
 
 
 def photometric_loss(rendered: Tensor, target: Tensor, ssim_weight: float = 0.2) -> Tensor:
-    """
-    (1 - w) L1 + w (1 - SSIM): the loss of 3D Gaussian splatting (Kerbl et al. 2023).
+    """Computes (1 - w) L1 + w (1 - SSIM), the loss of 3D Gaussian splatting (Kerbl et al. 2023).
 
     L1 is the mean absolute difference. SSIM is the mean, over pixels and channels, of Wang et al.
     2004 with a Gaussian window of 11 x 11 pixels and sigma 1.5, K1 = 0.01, K2 = 0.03, a dynamic
     range of 1 and zeros outside the image.
 
     Args:
-        rendered: (..., H, W, C), values about [0, 1].
-        target: as `rendered`; the truth.
+        rendered, target: (..., H, W, C), values about [0, 1].
         ssim_weight: w, in [0, 1].
-
-    Returns:
-        A scalar; NaN if an image holds one.
     """
     _check_pair("rendered", rendered, "target", target)
     require(rendered.ndim >= 3, "rendered", "(..., H, W, C)", tuple(rendered.shape))
     require(0 <= ssim_weight <= 1, "ssim_weight", "in [0, 1]", ssim_weight)
     if _is_native(rendered):
         shape, native = (-1, *rendered.shape[-3:]), _native.photometric_loss
-        loss = _Fused.apply(rendered, native, shape, {"target": target, "ssim_weight": ssim_weight})
-        return loss  # pyright: ignore[reportReturnType]
-    return photometric_loss_torch(rendered, target, ssim_weight)
-
-
-def photometric_loss_torch(rendered: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
-    """Computes `photometric_loss` by torch, on any device and dtype, without checks."""
+        truth = {"target": target, "ssim_weight": ssim_weight}
+        return _Fused.apply(rendered, native, shape, truth)  # pyright: ignore[reportReturnType]
     l1 = (rendered - target).abs().mean()
     return (1 - ssim_weight) * l1 + ssim_weight * (1 - ssim_map(rendered, target).mean())
 
@@ -87,21 +77,15 @@ def log_depth_loss(
     epsilon: float = 1e-3,
     far: float = FAR,
 ) -> Tensor:
-    """
-    1 / |V| sum over V of weight |log max(rendered, epsilon) - log max(depth, epsilon)|, where
-    V = {pixels: epsilon < depth < far}.
+    """Computes 1 / |V| sum over V of weight |log max(rendered, epsilon) - log depth|, where
+    V = {pixels: epsilon < depth < far}; 0 if V is empty.
 
-    The same relative error costs the same at any range. Unknown (NaN), zero and infinite depths are
-    not compared. The loss of an empty V is 0.
+    The same relative error costs the same at any range.
 
     Args:
-        rendered: (...) expected or accumulated depth [m].
-        depth: as `rendered`; the truth.
-        weights: as `rendered`; for example from `depth_edge_weights`. 1 by default.
+        rendered, depth: (...) [m], expected or accumulated depth, and the truth.
+        weights: (...), for example from `depth_edge_weights`; 1 by default.
         epsilon, far: range of depths that count [m].
-
-    Returns:
-        A scalar; NaN if `rendered` is NaN or infinite in V.
     """
     _check_pair("rendered", rendered, "depth", depth)
     if weights is not None:
@@ -110,15 +94,7 @@ def log_depth_loss(
     if _is_native(rendered):
         native = _native.log_depth_loss
         truth = {"depth": depth, "weights": weights, "epsilon": epsilon, "far": far}
-        loss = _Fused.apply(rendered, native, (-1,), truth)
-        return loss  # pyright: ignore[reportReturnType]
-    return log_depth_loss_torch(rendered, depth, weights, epsilon, far)
-
-
-def log_depth_loss_torch(
-    rendered: Tensor, depth: Tensor, weights: Tensor | None, epsilon: float, far: float
-) -> Tensor:
-    """Computes `log_depth_loss` by torch, on any device and dtype, without checks."""
+        return _Fused.apply(rendered, native, (-1,), truth)  # pyright: ignore[reportReturnType]
     valid = (depth > epsilon) & (depth < far)
     rendered, depth = rendered[valid], depth[valid]
     loss = (rendered.clamp(min=epsilon).log() - depth.log()).abs()
@@ -137,9 +113,8 @@ def depth_edge_weights(
     epsilon: float = 1e-3,
     far: float = FAR,
 ) -> Tensor:
-    """
-    Returns weights for `log_depth_loss` that keep thin structures: 1 + gain within `radius` pixels
-    of a discontinuity of the true depth, 1 elsewhere.
+    """Returns weights for `log_depth_loss` that keep thin structures: 1 + gain within `radius`
+    pixels of a discontinuity of the true depth, 1 elsewhere.
 
     The inverse depth of planes is linear in the pixel coordinates. So a pixel is at a discontinuity
     if the second difference of inverse depth, along a row or a column, exceeds `jump` times the
@@ -151,9 +126,6 @@ def depth_edge_weights(
         jump: minimum relative jump.
         radius: range of the weights [px].
         gain: added to the weight of 1.
-
-    Returns:
-        As `depth`.
     """
     valid = depth.ndim >= 2 and depth.is_floating_point() and depth.numel() > 0
     require(valid, "depth", "floating-point (..., H, W)", f"{depth.dtype} {tuple(depth.shape)}")
@@ -188,9 +160,8 @@ def surface_loss(
     """Returns the mean of |log z - log depth| over a point drawn from each Gaussian of `seen`, for
     points within 5 % of the true depth at their pixel.
 
-    Expected depth can be right while the layers of a surface, or a thick or tilted Gaussian, are
-    on both sides of it; then the median is wrong. This loss moves centers to the surface, flattens
-    Gaussians and aligns them with it, and does not act across edges.
+    It moves centers to the surface, flattens Gaussians and aligns them with it, so that the median
+    depth is right, and does not act across edges.
 
     Args:
         means, quats, scales: (N, 3) [m], (N, 4) and (N, 3) [m], of all Gaussians.
@@ -202,26 +173,8 @@ def surface_loss(
     """
     draws = torch.from_numpy(rng.standard_normal((len(seen), 3), np.float32))
     if _is_native(means):
-        found = _NativeSurfaceLoss.apply(means, quats, scales, seen, draws, viewmat, K, depth)
-        return found  # pyright: ignore[reportReturnType]
-    return surface_loss_torch(means, quats, scales, seen, draws, viewmat, K, depth)
-
-
-def surface_loss_torch(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    seen: Tensor,
-    draws: Tensor,
-    viewmat: Tensor,
-    K: Tensor,
-    depth: Tensor,
-) -> Tensor:
-    """Computes `surface_loss` by torch, on any device and dtype.
-
-    Args:
-        draws: (M, 3), standard normal: the points in standard deviations.
-    """
+        arguments = means, quats, scales, seen, draws, viewmat, K, depth
+        return _NativeSurfaceLoss.apply(*arguments)  # pyright: ignore[reportReturnType]
     means, quats, scales = (values.index_select(0, seen) for values in (means, quats, scales))
     offsets = rotation_matrices(quats) @ (draws.to(means) * scales)[..., None]
     p_CQ = (means + offsets[..., 0]) @ viewmat[:3, :3].T + viewmat[:3, 3]
@@ -238,14 +191,7 @@ def surface_loss_torch(
 
 def outline_loss(alpha: Tensor, depth: Tensor, weights: Tensor) -> Tensor:
     """Returns the mean of weight |alpha - 1| on surfaces and of weight alpha in the sky, over the
-    pixels whose depth is known.
-
-    Colors alone leave the last pixel of an object before the sky half transparent.
-
-    Args:
-        alpha: (H, W), rendered.
-        depth: (H, W) [m], the truth.
-        weights: (H, W), for example from `depth_edge_weights`.
+    pixels (H, W) whose depth is known; color leaves the last pixel before the sky half transparent.
     """
     solid = ((depth > 0) & (depth < FAR)).to(alpha.dtype)
     known = depth > 0
@@ -253,7 +199,7 @@ def outline_loss(alpha: Tensor, depth: Tensor, weights: Tensor) -> Tensor:
 
 
 class _Fused(torch.autograd.Function):
-    """A loss of native code, with its gradient by the first tensor."""
+    """A native loss, with its gradient by the first tensor."""
 
     @staticmethod
     def forward(
@@ -280,22 +226,27 @@ class _Fused(torch.autograd.Function):
 
 
 class _NativeSurfaceLoss(torch.autograd.Function):
-    """`surface_loss_torch`, with its gradients by the Gaussians."""
+    """The native `surface_loss`, with its gradients by the Gaussians."""
 
     @staticmethod
     def forward(ctx: Any, *arguments: Tensor) -> Tensor:
-        means, quats, scales, seen, draws, viewmat, K, depth = arguments
-        gaussians = [values.detach().contiguous() for values in (means, quats, scales)]
-        ctx.gradients = [torch.zeros_like(values) for values in gaussians]
-        arrays = [values.numpy() for values in (*gaussians, *ctx.gradients)]
-        names = ("means", "quats", "scales", "v_means", "v_quats", "v_scales")
+        means, quats, scales, seen, draws, viewmat, K, depth = (
+            tensor.detach().contiguous() for tensor in arguments
+        )
+        ctx.gradients = [torch.zeros_like(values) for values in (means, quats, scales)]
+        v_means, v_quats, v_scales = (gradient.numpy() for gradient in ctx.gradients)
         loss = _native.surface_loss(
-            **dict(zip(names, arrays, strict=True)),
-            seen=seen.long().contiguous().numpy(),
+            means=means.numpy(),
+            quats=quats.numpy(),
+            scales=scales.numpy(),
+            v_means=v_means,
+            v_quats=v_quats,
+            v_scales=v_scales,
+            seen=seen.long().numpy(),
             draws=draws.numpy(),
-            X_CW=viewmat.contiguous().numpy(),
-            K=K.contiguous().numpy(),
-            depth=depth.contiguous().numpy(),
+            X_CW=viewmat.numpy(),
+            K=K.numpy(),
+            depth=depth.numpy(),
             reach=_REACH,
             nearest=_NEAR,
             far=FAR,

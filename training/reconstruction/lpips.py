@@ -1,7 +1,6 @@
 """LPIPS, the learned perceptual distance between images, on the SqueezeNet backbone."""
 
 import importlib.util
-import os
 from functools import cache
 from pathlib import Path
 
@@ -9,6 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import adaptive_avg_pool2d, conv2d
 
+from splatpilot.systems.common.files import data_folder
 from splatpilot.systems.common.validation import require
 
 _FILE = Path("weights") / "lpips_squeeze.pt"
@@ -61,23 +61,20 @@ class Lpips:
     is the sum over seven layers of the mean over pixels of w_l . (f_l(a) - f_l(b))^2. It is not
     comparable with that of the AlexNet or VGG backbones. A process loads the network once.
 
-    Args:
-        weights: a file `{"squeezenet1_1": state dict, "lin": state dict}` of torch. By default,
-            `$SPLATPILOT_DATA/weights/lpips_squeeze.pt` or else torchvision's downloaded SqueezeNet
-            with the linear layers of the installed package `lpips`.
+    Weights are `{"squeezenet1_1": state dict, "lin": state dict}` in
+    `$SPLATPILOT_DATA/weights/lpips_squeeze.pt`, or else torchvision's downloaded SqueezeNet with
+    the linear layers of the installed package `lpips`.
 
     Raises:
-        FileNotFoundError: if there are no weights; the message says how to get them.
-        ValueError: if the file holds something else.
+        FileNotFoundError, ValueError: without such weights.
     """
 
-    def __init__(self, weights: Path | None = None):
-        self._source = _find(weights)
+    def __init__(self):
+        self._source = _find_weights()
         _load(self._source, torch.device("cpu"))
 
     def __call__(self, a: Tensor, b: Tensor, weights: Tensor | None = None) -> Tensor:
-        """
-        Returns the distance of two images, a scalar at least 0, differentiable in `a`.
+        """Returns the distance of two images, a scalar at least 0, differentiable in `a`.
 
         Args:
             a, b: (..., H, W, 3) float32, RGB in [0, 1]; the distance of several is their mean.
@@ -96,13 +93,13 @@ class Lpips:
         with torch.no_grad():
             other_features = _features(layers, b)
         distances = [
-            _mean(conv2d((x - y).square(), w), weights)
+            _weighted_mean(conv2d((x - y).square(), w), weights)
             for x, y, w in zip(features, other_features, linear, strict=True)
         ]
         return torch.stack(distances).sum()
 
 
-def _mean(distances: Tensor, weights: Tensor | None) -> Tensor:
+def _weighted_mean(distances: Tensor, weights: Tensor | None) -> Tensor:
     """Returns the mean of a layer's distances (N, 1, h, w), weighted by pixels (..., H, W)."""
     if weights is None:
         return distances.mean()
@@ -124,15 +121,11 @@ def _features(layers: nn.Sequential, images: Tensor) -> list[Tensor]:
     return features
 
 
-def _find(weights: Path | None) -> tuple[Path, ...]:
+def _find_weights() -> tuple[Path, ...]:
     """Returns one file with all weights, or torchvision's backbone and the package's layers."""
-    if weights is not None:
-        if not weights.is_file():
-            raise FileNotFoundError(f"No such file: {weights}")
-        return (weights,)
-    in_data = Path(os.environ.get("SPLATPILOT_DATA", "")) / _FILE
-    if "SPLATPILOT_DATA" in os.environ and in_data.is_file():
-        return (in_data,)
+    data = data_folder()
+    if data is not None and (data / _FILE).is_file():
+        return (data / _FILE,)
     backbone = Path(torch.hub.get_dir()) / "checkpoints" / _BACKBONE
     package = importlib.util.find_spec("lpips")
     if backbone.is_file() and package is not None and package.origin is not None:
@@ -153,13 +146,8 @@ def _load(source: tuple[Path, ...], device: torch.device) -> tuple[nn.Sequential
             (files[0]["squeezenet1_1"], files[0]["lin"]) if len(files) == 1 else files
         )
         layers = squeezenet_features()
-        layers.load_state_dict(
-            {
-                name.removeprefix("features."): tensor.float()
-                for name, tensor in backbone.items()
-                if name.startswith("features.")
-            }
-        )
+        names = (name for name in backbone if name.startswith("features."))
+        layers.load_state_dict({n.removeprefix("features."): backbone[n].float() for n in names})
         weights = [linear[f"lin{i}.model.1.weight"].float() for i in range(len(_TAPS))]
         if [w.shape for w in weights] != [(1, channels, 1, 1) for channels in _CHANNELS]:
             raise ValueError("linear layers have other sizes")

@@ -6,18 +6,14 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from pydrake.math import RigidTransform
 
-from splatpilot.systems.splats.background import FAR, Background, put_behind
-from splatpilot.systems.splats.baked_scene import BakedScene, RenderedView, create_renderer
-from splatpilot.systems.splats.scene import GaussianScene
+from splatpilot.systems.splats.background import FAR, Background, RenderedView, put_behind
 from splatpilot.training.captures.capture import CaptureFrame
 from splatpilot.training.reconstruction.losses import ssim_map
 from splatpilot.training.reconstruction.lpips import Lpips
 from splatpilot.training.reconstruction.photometry import vignette
-from splatpilot.training.reconstruction.splat_rendering import render
 
-_MIN_DEPTH = 1e-3  # [m], with `FAR` the range of true depths that count, as in `log_depth_loss`
+_MIN_DEPTH = 1e-3  # [m], minimum true depth that counts, as in `log_depth_loss`
 _FLOATER_MARGIN = 0.1  # [m], and as a fraction of the true depth
 _SHOWN = {
     "psnr_db": "{:.2f} dB",
@@ -28,15 +24,15 @@ _SHOWN = {
 
 @dataclass(frozen=True)
 class ViewMetrics:
-    """Metrics of one view, over its valid pixels that a camera saw. Those of depth are over pixels
-    with true depth. A metric without any pixel is None."""
+    """Metrics of one view, over its valid pixels that a camera saw; see `depth_metrics` for those
+    of depth. A metric without any pixel is None."""
 
     psnr_db: float | None  # [dB], before the scene's background
     psnr_on_black_db: float | None  # [dB], before black, except in the sky
     ssim: float | None
     lpips: float | None  # LPIPS-squeeze; None without its weights, too
     depth_mae_m: float | None  # [m]
-    depth_relative: float | None  # mean of |error| / true depth
+    depth_relative: float | None
     floater_fraction: float | None
     hole_fraction: float | None
     unseen_fraction: float  # of all pixels, those left out
@@ -74,14 +70,14 @@ def psnr_db(image: NDArray, truth: NDArray) -> float | None:
         return float(-10 * np.log10(np.mean(difference**2)))
 
 
-def ssim(image: NDArray, truth: NDArray, seen: NDArray[np.bool_] | None = None) -> float | None:
+def ssim(image: NDArray, truth: NDArray, seen: NDArray[np.bool_]) -> float | None:
     """Returns the mean structural similarity of images (H, W, 3) in [0, 1], as in
-    `photometric_loss`, over the pixels `seen` (H, W), or all; None without pixels."""
-    if seen is not None and not seen.any():
+    `photometric_loss`, over the pixels `seen` (H, W); None without pixels."""
+    if not seen.any():
         return None
     a, b = (torch.from_numpy(np.ascontiguousarray(x, np.float32)) for x in (image, truth))
     values = ssim_map(a, b)[0].mean(0).numpy()
-    return float((values if seen is None else values[seen]).mean(dtype=np.float64))
+    return float(values[seen].mean(dtype=np.float64))
 
 
 def has_true_depth(truth: NDArray) -> NDArray[np.bool_]:
@@ -89,26 +85,26 @@ def has_true_depth(truth: NDArray) -> NDArray[np.bool_]:
     return (truth > _MIN_DEPTH) & (truth < FAR)
 
 
-def _mean_with_depth(values: NDArray, truth: NDArray) -> float | None:
-    """Returns the mean of values (H, W) over pixels with true depth; None without any."""
-    known = values[has_true_depth(truth)]
-    return float(known.mean(dtype=np.float64)) if len(known) else None
+def depth_metrics(depth: NDArray, truth: NDArray) -> dict[str, float | None]:
+    """Compares the depth (H, W) [m] of cameras of unlimited range, 0 in a hole, with the truth.
 
-
-def depth_mae_m(depth: NDArray, truth: NDArray) -> float | None:
-    """Returns the mean absolute error [m] over the pixels with true depth; None without any.
-
-    `depth` (H, W) [m] is that of depth cameras of unlimited range. It is 0 in a hole, whose error
-    is the true depth.
+    Returns:
+        Over pixels with true depth: the mean absolute error [m], which is the true depth in a hole;
+        the mean of |error| / true depth; the fraction of `floaters`; and the fraction of holes,
+        which policies take for free space. None without any.
     """
-    with np.errstate(invalid="ignore"):
-        return _mean_with_depth(np.abs(depth - truth), truth)
-
-
-def depth_relative(depth: NDArray, truth: NDArray) -> float | None:
-    """Returns the mean of |error| / true depth over the same pixels as `depth_mae_m`."""
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return _mean_with_depth(np.abs(depth - truth) / truth, truth)
+    known = has_true_depth(truth)
+    error = np.abs(depth[known] - truth[known])
+    metrics = {
+        "depth_mae_m": error,
+        "depth_relative": error / truth[known],
+        "floater_fraction": floaters(depth, truth)[known],
+        "hole_fraction": depth[known] == 0,
+    }
+    return {
+        name: float(values.mean(dtype=np.float64)) if len(values) else None
+        for name, values in metrics.items()
+    }
 
 
 def floaters(depth: NDArray, truth: NDArray) -> NDArray[np.bool_]:
@@ -124,35 +120,24 @@ def floaters(depth: NDArray, truth: NDArray) -> NDArray[np.bool_]:
     return has_true_depth(truth) & in_front & (depth > 0)
 
 
-def floater_fraction(depth: NDArray, truth: NDArray) -> float | None:
-    """Returns the fraction of `floaters` among pixels with true depth; None without any."""
-    return _mean_with_depth(floaters(depth, truth), truth)
-
-
-def hole_fraction(depth: NDArray, truth: NDArray) -> float | None:
-    """Returns the fraction of pixels with true depth in which depth cameras see nothing, which a
-    policy takes for free space; None without any."""
-    return _mean_with_depth(depth == 0, truth)
-
-
 def fit_exposure(
-    color: NDArray, truth: NDArray, vignetting: float, seen: NDArray[np.bool_] | None = None
+    color: NDArray,
+    truth: NDArray,
+    vignetting: float,
+    seen: NDArray[np.bool_],
+    fit_gain: bool = True,
 ) -> tuple[NDArray, float]:
     """Returns a rendered image (H, W, 3) with vignetting and exposure of the camera, and its gain.
 
-    The gain is the least-squares fit to the true image over the pixels `seen` (H, W), or all: that
-    of a held-out frame is unknown, and does not depend on the scene.
+    The gain is the least-squares fit to the true image over the pixels `seen` (H, W): that of a
+    held-out frame is unknown, and does not depend on the scene. Without `fit_gain` it is 1.
     """
-    image = _darken_corners(color, vignetting)
-    x, y = (image, truth) if seen is None else (image[seen], truth[seen])
-    energy = float((x * x).sum())
-    gain = float((x * y).sum()) / energy if energy > 0 else 1.0
-    return np.clip(gain * image, 0, 1), gain
-
-
-def _darken_corners(color: NDArray, vignetting: float) -> NDArray:
     height, width = color.shape[:2]
-    return np.clip(color, 0, None) * vignette(vignetting, width, height)[..., None]
+    image = np.clip(color, 0, None) * vignette(vignetting, width, height)[..., None]
+    gain, x, y = 1.0, image[seen], truth[seen]
+    if fit_gain and (energy := float((x * x).sum())) > 0:
+        gain = float((x * y).sum()) / energy
+    return np.clip(gain * image, 0, 1), gain
 
 
 def measure_view(
@@ -177,18 +162,13 @@ def measure_view(
         lpips: the perceptual distance; None leaves it out.
         fit_gain: compares colors after `fit_exposure`; otherwise the gain is 1.
     """
-
-    def expose(color: NDArray) -> tuple[NDArray, float]:
-        if fit_gain:
-            return fit_exposure(color, truth, vignetting, seen)
-        return _darken_corners(color, vignetting).clip(max=1), 1.0
-
     truth, sky = frame.image / 255, frame.depth >= FAR
     seen = frame.valid if seen is None else seen & frame.valid
-    true_depth = np.where(seen, frame.depth, 0)
+    camera = truth, vignetting, seen, fit_gain
     view = put_behind(on_black, background, frame.K, frame.X_WC)
-    exposed, gain = expose(view.color)
-    exposed_before_black, _ = expose(np.where(sky[..., None], view.color, on_black.color))
+    exposed, gain = fit_exposure(view.color, *camera)
+    before_black = np.where(sky[..., None], view.color, on_black.color)
+    exposed_before_black, _ = fit_exposure(before_black, *camera)
     distance = None
     if lpips is not None and seen.any():
         with torch.no_grad():
@@ -199,39 +179,7 @@ def measure_view(
         psnr_on_black_db=psnr_db(exposed_before_black[seen], truth[seen]),
         ssim=ssim(exposed, truth, seen),
         lpips=distance,
-        depth_mae_m=depth_mae_m(view.depth, true_depth),
-        depth_relative=depth_relative(view.depth, true_depth),
-        floater_fraction=floater_fraction(view.depth, true_depth),
-        hole_fraction=hole_fraction(view.depth, true_depth),
+        **depth_metrics(view.depth, np.where(seen, frame.depth, 0)),
         unseen_fraction=float(1 - seen.mean()),
         gain=gain,
     )
-
-
-class SceneRenderer:
-    """Renders a scene of Gaussians ("3dgs") or surfels ("2dgs")."""
-
-    def __init__(self, scene: GaussianScene, representation: str, threads: int = 1):
-        self._renderer = create_renderer(threads)
-        self._baked = BakedScene(scene, threads) if representation == "3dgs" else None
-        arrays = (scene.means, scene.quats, scene.scales, scene.opacities, scene.sh)
-        means, quats, scales, opacities, sh = map(torch.from_numpy, arrays)
-        self._tensors = (means, quats, scales, opacities, sh)
-
-    def render(self, K: NDArray, width: int, height: int, X_WC: RigidTransform) -> RenderedView:
-        """Renders color on black, median depth and alpha; see `BakedScene.render`."""
-        if self._baked is not None:
-            return self._baked.render(K, width, height, X_WC)
-        with torch.no_grad():
-            rendering = render(
-                "2dgs",
-                self._tensors,
-                torch.tensor(X_WC.inverse().GetAsMatrix4(), dtype=torch.float32)[None],
-                torch.tensor(K, dtype=torch.float32)[None],
-                width,
-                height,
-                depth_mode="MD",
-                renderer=self._renderer,
-            )
-        images = (rendering.color, rendering.depth, rendering.alpha)
-        return RenderedView(*(image.numpy() for image in images))

@@ -6,9 +6,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from splatpilot.systems.common.progress import CheckpointClock, Progress, resumable
+from splatpilot.systems.common.progress import CheckpointClock, Progress
 from splatpilot.systems.splats.background import FAR, Background
-from splatpilot.systems.splats.baked_scene import RenderedView, create_renderer
+from splatpilot.systems.splats.baked_scene import create_renderer
 from splatpilot.systems.splats.rasterization import EPS2D
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.vehicle.state import rotation_matrices
@@ -30,17 +30,16 @@ from splatpilot.training.reconstruction.photometry import ThinnedFrame, fit_gain
 from splatpilot.training.reconstruction.splat_rendering import Rendering, render
 from splatpilot.training.reconstruction.views import ReconstructionViews
 
-# Densification, as in 3DGS: gradient in half widths of the image above which a Gaussian is cloned
-# or split, opacity below which it is removed, and sizes relative to the extent of the scene.
+# As published for 3DGS: gradient in half widths of the image above which a Gaussian is cloned or
+# split, opacity below which it is removed, and sizes relative to the extent of the scene.
 _GROW_GRADIENT, _PRUNE_OPACITY = 2e-4, 0.005
 _LARGE, _HUGE = 0.01, 0.1
 _SPLIT_SHRINK = 1.6
-# 2DGS: weights of the distortion along rays and of the angle between normals, and the fractions of
-# all steps after which they start.
+# As published for 2DGS: weights of the distortion along rays and of the angle between normals, and
+# the fractions of all steps after which they start.
 _DISTORTION_WEIGHT, _DISTORTION_START = 0.01, 0.1
 _NORMAL_WEIGHT, _NORMAL_START = 0.05, 7 / 30
-# LPIPS: fraction of the last steps, and one in so many of them computes it, for it is slow.
-_LPIPS_FRACTION, _LPIPS_EVERY = 0.1, 4
+_LPIPS_FRACTION, _LPIPS_EVERY = 0.1, 4  # of the last steps, one in four computes LPIPS
 _SURFACE_FRACTION = 1 / 4  # of the Gaussians in view, drawn in each step for the surface loss
 _GAIN_FITS = (0.1, 0.2, 0.4)  # fractions of all steps after which unknown gains are fitted
 _LIMIT_EVERY = 500  # steps between updates of the scale limits
@@ -51,18 +50,13 @@ class DefaultStrategy:
     """Densification of 3D Gaussian splatting (Kerbl et al. 2023, section 5.2).
 
     Clones small and splits large Gaussians with a large gradient on the image, removes faint and
-    huge ones, and resets opacities periodically.
-
-    Args:
-        config: when to change Gaussians.
-        center: (3,) [m], mean position of the cameras.
-        extent: [m], radius of the cameras.
-        count: number of Gaussians.
+    huge ones, and resets opacities periodically. The cameras are within `extent` [m] of `center`
+    (3,) [m].
     """
 
     def __init__(self, config: ReconstructConfig, center: Tensor, extent: float, count: int):
         self._config, self._center, self._extent = config, center, extent
-        self._clear(count, center.device)
+        self._clear(count)
 
     def watch(self, rendering: Rendering) -> None:
         """Makes the next backward pass keep the gradients of positions on the image."""
@@ -73,7 +67,7 @@ class DefaultStrategy:
     def observe(
         self, rendering: Rendering, splats: SplatParameters, viewmat: Tensor, K: Tensor
     ) -> None:
-        """Adds up the gradients of a backward pass, in half widths and heights of the image."""
+        """Sums the gradients of a backward pass, in half widths and heights of the image."""
         meta = rendering.meta
         rows = meta["gaussian_ids"]
         if self._config.representation == "3dgs":
@@ -100,14 +94,14 @@ class DefaultStrategy:
             if 0 < config.reset_every < step:
                 bad |= splats.scales.max(dim=1).values > _HUGE * self._reach(splats["means"])
             splats.rebuild(torch.nonzero(~bad)[:, 0])
-            self._clear(len(splats), splats["means"].device)
+            self._clear(len(splats))
         if config.reset_every and step % config.reset_every == 0:
             faint = torch.logit(torch.tensor(2 * _PRUNE_OPACITY)).item()
             splats.overwrite("logit_opacities", splats["logit_opacities"].clamp(max=faint))
 
-    def _clear(self, count: int, device: torch.device) -> None:
-        self.gradients = torch.zeros(count, device=device)
-        self.counts = torch.zeros(count, device=device)
+    def _clear(self, count: int) -> None:
+        self.gradients = self._center.new_zeros(count)
+        self.counts = self._center.new_zeros(count)
 
     def _reach(self, means: Tensor) -> Tensor:
         """Returns the size (N,) [m] to which those of Gaussians are compared."""
@@ -127,105 +121,79 @@ class DefaultStrategy:
         added = {n: splats[n][torch.cat([clone, split])].clone() for n in splats.names}
         parts = slice(len(clone), None)
         random = torch.randn((len(split), 3), generator=generator).to(splats["means"].device)
-        offsets = (
-            rotation_matrices(splats["quats"][split]) @ (random * splats.scales[split])[..., None]
-        )
-        added["means"][parts] += offsets[..., 0]
+        R = rotation_matrices(splats["quats"][split])
+        added["means"][parts] += (R @ (random * splats.scales[split])[..., None])[..., 0]
         added["log_scales"][parts] -= np.log(_SPLIT_SHRINK)
         splats.rebuild(torch.nonzero(~(grow & large))[:, 0], added)
 
 
-class Objective:
-    """The loss of one view.
+def needs_distortion(config: ReconstructConfig, step: int) -> bool:
+    return config.representation == "2dgs" and step >= _DISTORTION_START * config.iterations
 
-    Args:
-        config: with the weights.
-        views: true images and depth.
-        perceptual: LPIPS of two images (H, W, 3), or None.
-    """
 
-    def __init__(
-        self,
-        config: ReconstructConfig,
-        views: ReconstructionViews,
-        perceptual: Callable[[Tensor, Tensor], Tensor] | None,
-    ):
-        self._config, self._views, self._perceptual = config, views, perceptual
-
-    def needs_distortion(self, step: int) -> bool:
-        """Returns whether surfels must render the distortion along their rays."""
-        config = self._config
-        return config.representation == "2dgs" and step >= _DISTORTION_START * config.iterations
-
-    def loss(
-        self,
-        rendering: Rendering,
-        gaussians: tuple[Tensor, Tensor, Tensor, Tensor, Tensor],
-        k: int,
-        gain: Tensor,
-        step: int,
-        background: Tensor,
-        outlines: bool,
-    ) -> Tensor:
-        """Returns a scalar.
-
-        Args:
-            rendering: of view `k`, before `background`.
-            gaussians: means, quats, scales, opacities and spherical harmonics rendered.
-            k: index of the view.
-            gain: brightness of its image.
-            step: index of the step, which seeds random numbers.
-            background: (1, 3), a color.
-            outlines: whether to fit outlines instead of colors.
-        """
-        config, device = self._config, self._config.device
-        depth = self._views.depths[k].to(device)
-        edges = self._views.edges[k].to(device).float()
-        if outlines:
-            loss = config.outline_weight * outline_loss(rendering.alpha, depth, edges)
-        else:
-            target = self._views.target(k, gain, background.cpu()[0]).to(device)
-            valid = self._views.valid[k].to(device)[..., None]
-            color, invalid = rendering.color, rendering.color.detach()
-            # Invalid pixels are equal in both, so that no window compares them.
-            color, target = (torch.where(valid, image, invalid) for image in (color, target))
-            loss = photometric_loss(color, target)
-            late = step >= (1 - _LPIPS_FRACTION) * config.iterations
-            if self._perceptual is not None and late and step % _LPIPS_EVERY == 0:
-                distance = self._perceptual(color.clamp(0, 1), target.clamp(0, 1))
-                loss = loss + config.lpips_weight * _LPIPS_EVERY * distance
-        if config.depth_weight > 0:
-            loss = loss + config.depth_weight * log_depth_loss(rendering.depth, depth, edges)
-        if config.surface_weight > 0:
-            rng = np.random.default_rng([config.seed, step, 2])
-            seen = rendering.meta["gaussian_ids"]
-            seen = seen[torch.from_numpy(rng.random(len(seen)) < _SURFACE_FRACTION).to(device)]
-            viewmat, K = self._views.camera(k, device)
-            on_surface = surface_loss(*gaussians[:3], seen, viewmat[0], K[0], depth, rng)
-            loss = loss + config.surface_weight * on_surface
-        if rendering.normals is None or rendering.surface_normals is None:
-            return loss
-        if self.needs_distortion(step) and rendering.distortion is not None:
-            loss = loss + _DISTORTION_WEIGHT * rendering.distortion.mean()
-        if step >= _NORMAL_START * config.iterations:
-            surface = rendering.surface_normals * rendering.alpha.detach()[..., None]
-            cosine = (rendering.normals * surface).sum(dim=-1)
-            loss = loss + _NORMAL_WEIGHT * (1 - cosine).mean()
+def view_loss(
+    config: ReconstructConfig,
+    views: ReconstructionViews,
+    k: int,
+    rendering: Rendering,
+    gaussians: tuple[Tensor, Tensor, Tensor, Tensor, Tensor],
+    *,
+    gain: Tensor,
+    step: int,
+    background: Tensor,
+    outlines: bool,
+    perceptual: Callable[[Tensor, Tensor], Tensor] | None = None,
+) -> Tensor:
+    """Returns the loss of the rendering of view `k` before `background` (1, 3), in an image of this
+    gain; `outlines` are fitted instead of colors. `perceptual` is LPIPS of two images (H, W, 3)."""
+    device = config.device
+    depth = views.depths[k].to(device)
+    edges = views.edges[k].to(device).float()
+    if outlines:
+        loss = config.outline_weight * outline_loss(rendering.alpha, depth, edges)
+    else:
+        target = views.target(k, gain, background.cpu()[0]).to(device)
+        valid = views.valid[k].to(device)[..., None]
+        color, invalid = rendering.color, rendering.color.detach()
+        # Invalid pixels are equal in both, so that no window compares them.
+        color, target = (torch.where(valid, image, invalid) for image in (color, target))
+        loss = photometric_loss(color, target)
+        late = step >= (1 - _LPIPS_FRACTION) * config.iterations
+        if perceptual is not None and late and step % _LPIPS_EVERY == 0:
+            distance = perceptual(color.clamp(0, 1), target.clamp(0, 1))
+            loss = loss + config.lpips_weight * _LPIPS_EVERY * distance
+    if config.depth_weight > 0:
+        loss = loss + config.depth_weight * log_depth_loss(rendering.depth, depth, edges)
+    if config.surface_weight > 0:
+        rng = np.random.default_rng([config.seed, step, 2])
+        seen = rendering.meta["gaussian_ids"]
+        seen = seen[torch.from_numpy(rng.random(len(seen)) < _SURFACE_FRACTION).to(device)]
+        viewmat, K = views.camera(k, device)
+        on_surface = surface_loss(*gaussians[:3], seen, viewmat[0], K[0], depth, rng)
+        loss = loss + config.surface_weight * on_surface
+    if rendering.normals is None or rendering.surface_normals is None:
         return loss
+    if needs_distortion(config, step) and rendering.distortion is not None:
+        loss = loss + _DISTORTION_WEIGHT * rendering.distortion.mean()
+    if step >= _NORMAL_START * config.iterations:
+        surface = rendering.surface_normals * rendering.alpha.detach()[..., None]
+        cosine = (rendering.normals * surface).sum(dim=-1)
+        loss = loss + _NORMAL_WEIGHT * (1 - cosine).mean()
+    return loss
 
 
 class Optimization:
     """One run, from its first step or from a checkpoint.
 
     Args:
-        config: how to reconstruct.
+        config: of the reconstruction.
         views: fitted views.
-        held_out: views that measure the scene, or None.
+        held_out: views that measure the scene.
         background: of the scene.
-        initial: makes the initial Gaussians; not called if there is a checkpoint.
+        initial: makes the Gaussians of a first step, given the extent of the cameras [m].
         checkpoint: of this run.
-        perceptual: LPIPS of two images (H, W, 3), or None.
-        fit_gains: whether the gains of `views` are unknown.
+        perceptual: LPIPS of two images (H, W, 3).
+        fit_gains: fits the gains of `views`.
     """
 
     def __init__(
@@ -234,7 +202,7 @@ class Optimization:
         views: ReconstructionViews,
         held_out: ReconstructionViews | None,
         background: Background,
-        initial: Callable[[], GaussianScene],
+        initial: Callable[[float], GaussianScene],
         checkpoint: Checkpoint,
         perceptual: Callable[[Tensor, Tensor], Tensor] | None = None,
         fit_gains: bool = False,
@@ -251,12 +219,14 @@ class Optimization:
         solid = (views.depths > 0) & ~sky
         both = sky.flatten(1).any(dim=1) & solid.flatten(1).any(dim=1)
         self._has_outlines = (both & (config.outline_weight > 0)).tolist()
-        self._objective = Objective(config, views, perceptual)
+        self._perceptual = perceptual
         center, self.extent = views.extent()
         state = checkpoint.load()
         if state is None:
             self.step, self.gains = 0, views.gains
-            self.splats = SplatParameters.of_scene(initial(), config.sh_degree, config.device)
+            self.splats = SplatParameters.of_scene(
+                initial(self.extent), config.sh_degree, config.device
+            )
             self._limit_scales()
         else:
             self.step, self.gains = state["step"], state["gains"]
@@ -269,26 +239,12 @@ class Optimization:
                 self._strategy.gradients, self._strategy.counts = state["strategy"]
 
     def run(self) -> None:
-        """Takes all remaining steps and shows progress.
-
-        Raises:
-            OSError: if a checkpoint cannot be written.
-        """
-        config, splats = self._config, self.splats
-        clock, saved_step = CheckpointClock(), self.step
-
-        def saved() -> str:
-            if not saved_step:
-                return "no step is kept yet; the same command starts again"
-            folder = self._checkpoint.folder
-            return (
-                f"step {saved_step} of {config.iterations} is in {folder}; the same command resumes"
-            )
-
+        """Takes all remaining steps and shows progress."""
+        config, splats, clock = self._config, self.splats, CheckpointClock()
         progress = Progress(
             total=config.iterations, initial=self.step, desc="optimizing", unit="step"
         )
-        with progress, event_log(config.tensorboard) as log, resumable(saved):
+        with progress, event_log(config.tensorboard) as log:
             while self.step < config.iterations:
                 self.take_step()
                 progress.update()
@@ -301,16 +257,12 @@ class Optimization:
                 if every or self.step == config.iterations or clock.is_due:
                     with clock.writing():
                         self._save()
-                    saved_step = self.step
 
     def take_step(self) -> None:
-        """Fits one image.
-
-        If it shows objects before the sky, every other step fits their outlines, as depth cameras
-        see them: without the blur of color cameras.
-        """
+        """Fits one image or, in every other step of a view with objects before the sky, their
+        outlines as depth cameras see them: without the blur of color cameras."""
         config, splats, count = self._config, self.splats, len(self.splats)
-        # Image and background color are random, but depend on seed and step alone.
+        # Image and background color are random, but depend only on seed and step.
         n = len(self._views)
         order = np.random.default_rng([config.seed, self.step // n]).permutation(n)
         k = int(order[self.step % n])
@@ -329,11 +281,20 @@ class Optimization:
             background=background,
             depth_mode=config.depth_mode,
             eps2d=0.0 if outlines else EPS2D,
-            distortion=self._objective.needs_distortion(self.step),
+            distortion=needs_distortion(config, self.step),
             renderer=self._renderer,
         )
-        loss = self._objective.loss(
-            rendering, gaussians, k, self.gains[k], self.step, background, outlines
+        loss = view_loss(
+            config,
+            self._views,
+            k,
+            rendering,
+            gaussians,
+            gain=self.gains[k],
+            step=self.step,
+            background=background,
+            outlines=outlines,
+            perceptual=self._perceptual,
         )
         if self._strategy is not None:
             self._strategy.watch(rendering)
@@ -357,10 +318,8 @@ class Optimization:
             return None
         found = []
         for k, rendering in enumerate(self._renderings(views)):
-            images = (rendering.color, rendering.depth, rendering.alpha)
-            view = RenderedView(*(image.numpy() for image in images))
-            args = view, self._background, views.frame(k), views.vignetting, self._seen[k]
-            found.append(measure_view(*args))
+            scene = rendering.view(), self._background
+            found.append(measure_view(*scene, views.frame(k), views.vignetting, self._seen[k]))
         return HeldOutMetrics(tuple(found))
 
     def _limit_scales(self) -> None:

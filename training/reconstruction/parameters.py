@@ -3,7 +3,7 @@
 import math
 import os
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,16 +15,16 @@ from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.views import ReconstructionViews
 
-_EPSILON = 1e-15  # of Adam; as 3D Gaussian splatting, for gradients of single Gaussians are tiny
+_EPSILON = 1e-15  # of Adam, as published, for gradients of single Gaussians are tiny
 _OPACITIES = (1e-4, 1 - 1e-4)  # 0 and 1 have infinite logits
 _INVISIBLE = 1 / 255  # opacity that adds to no pixel
 _FLAT = 1e-6  # [m], standard deviation of a surfel along its normal
 
-# Of `scale_limits`: variance [px^2] in the closest camera, standard deviation relative to the depth
-# from it, and depth relative to that which a view shows beyond which a point is hidden.
-_MIN_VARIANCE, _MAX_DEVIATION, _HIDDEN = 0.2, 0.05, 1.1
+_MIN_VARIANCE = 0.2  # [px^2], in the closest camera
+_MAX_DEVIATION = 0.05  # relative to the depth in the closest camera
+_HIDDEN = 1.1  # ratio of a point's depth to that of its pixel, above which it is hidden
 
-# Rates as published for Gaussians that start anywhere; the rate of the means falls to a fraction.
+# As published for Gaussians that start anywhere; the rate of the means falls to a fraction.
 _RATES = {
     "quats": 1e-3,
     "log_scales": 5e-3,
@@ -41,13 +41,9 @@ _FINAL_ON_SURFACE = 0.1
 def learning_rates(config: ReconstructConfig, extent: float, progress: float) -> dict[str, float]:
     """Returns the learning rate of each parameter of `SplatParameters`.
 
-    Gaussians that start from depth are in place already: their means move slower, their other
-    parameters faster at first.
-
-    Args:
-        config: how to reconstruct.
-        extent: [m] of the scene, by which the means' rate is scaled.
-        progress: fraction of all steps, 0 to 1.
+    Gaussians that start from depth are on surfaces already: their means move slower, their other
+    parameters faster at first. `progress` is the fraction of all steps, `extent` [m] scales the
+    rate of the means.
     """
     rates = {"means": config.means_rate * extent * _FINAL_MEANS**progress} | _RATES
     if config.initialization != "depth":
@@ -63,15 +59,10 @@ def learning_rates(config: ReconstructConfig, extent: float, progress: float) ->
 def splat_shapes(
     log_scales: Tensor, logit_opacities: Tensor, smallest: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Returns scales (N, 3) = sqrt(exp(2 log_scales) + smallest^2) [m] and opacities (N,), the
-    sigmoid of their logits.
+    """Returns scales (N, 3) = sqrt(exp(2 log_scales) + smallest^2) [m], with `smallest` (N,)
+    without gradient, and opacities (N,), the sigmoid of their logits.
 
     float32 tensors on the CPU take native code.
-
-    Args:
-        log_scales: (N, 3).
-        logit_opacities: (N,).
-        smallest: (N,) [m], without gradient.
     """
     if log_scales.device.type == "cpu" and log_scales.dtype == torch.float32:
         return _Shapes.apply(log_scales, logit_opacities, smallest)  # pyright: ignore[reportReturnType]
@@ -114,38 +105,15 @@ class _Shapes(torch.autograd.Function):
         return v_log_scales, v_logits, None
 
 
-class ScaleLimits(NamedTuple):
-    """Limits of the standard deviations of N Gaussians."""
-
-    smallest: Tensor  # (N,) [m], added in squares; 0 if no view sees the center
-    largest: Tensor  # (N,) [m]
-
-    @classmethod
-    def none(cls, like: Tensor) -> "ScaleLimits":
-        """Returns no limits for as many Gaussians as `like` (N,) has numbers."""
-        return cls(torch.zeros_like(like), torch.full_like(like, torch.inf))
-
-    def rebuild(self, rows: Tensor, added: int) -> "ScaleLimits":
-        """Returns the limits of the Gaussians `rows`, and of `added` ones, which have none."""
-        new = ScaleLimits.none(self.smallest.new_empty(added))
-        pairs = zip(self, new, strict=True)
-        return ScaleLimits(*(torch.cat([old[rows], more]) for old, more in pairs))
-
-
 @torch.no_grad()
-def scale_limits(means: Tensor, views: ReconstructionViews, bounded: bool) -> ScaleLimits:
-    """Returns how small and large Gaussians may be.
+def scale_limits(means: Tensor, views: ReconstructionViews, bounded: bool) -> list[Tensor]:
+    """Returns the smallest and largest scales (N,) [m] of Gaussians at `means` (N, 3) [m].
 
     The smallest is the 3D smoothing filter of Mip-Splatting (Yu et al. 2024), 0.2 square pixels in
     the closest view: depth images, which have no blur, and closer cameras would look through the
-    gaps between smaller Gaussians. The largest is a twentieth of the depth in the closest view or,
-    if no view sees the center, of the distance to the closest camera: large Gaussians, each drawn
-    by one affine approximation of perspective, would appear as haze or walls.
-
-    Args:
-        means: (N, 3) [m].
-        views: fitted views.
-        bounded: whether to limit the largest; Gaussians that do not start on surfaces must grow.
+    gaps between smaller Gaussians. The largest, if `bounded`, is a twentieth of the depth in the
+    closest view or, if no view sees the center, of the distance to the closest camera: large
+    Gaussians, each drawn by one affine approximation of perspective, would appear as haze or walls.
     """
     K, viewmats = views.K[0].to(means.device), views.viewmats.to(means.device)
     depth = torch.full_like(means[:, 0], torch.inf)  # [m] in the closest view that sees the center
@@ -163,8 +131,8 @@ def scale_limits(means: Tensor, views: ReconstructionViews, bounded: bool) -> Sc
     seen = depth.isfinite()
     smallest = torch.where(seen, _MIN_VARIANCE**0.5 / K[0, 0] * depth, 0)
     if not bounded:
-        return ScaleLimits(smallest, torch.full_like(depth, torch.inf))
-    return ScaleLimits(smallest, _MAX_DEVIATION * torch.where(seen, depth, distance))
+        return [smallest, torch.full_like(depth, torch.inf)]
+    return [smallest, _MAX_DEVIATION * torch.where(seen, depth, distance)]
 
 
 class SplatParameters:
@@ -176,7 +144,8 @@ class SplatParameters:
     Args:
         tensors: these, by name.
         optimizer: state of Adam, see `state`.
-        limits: of the scales; none by default.
+        limits: smallest and largest scale (N,) [m]; 0 and infinity by default. The smallest is
+            added in squares.
     """
 
     def __init__(
@@ -185,18 +154,14 @@ class SplatParameters:
         optimizer: dict[str, Any] | None = None,
         limits: Sequence[Tensor] | None = None,
     ):
-        self._adam = torch.optim.Adam(
-            [
-                {"name": name, "params": [tensor.detach().clone().requires_grad_()]}
-                for name, tensor in tensors.items()
-            ],
-            eps=_EPSILON,
-            fused=True,
-        )
+        groups = [
+            {"name": name, "params": [tensor.detach().clone().requires_grad_()]}
+            for name, tensor in tensors.items()
+        ]
+        self._adam = torch.optim.Adam(groups, eps=_EPSILON, fused=True)
         if optimizer is not None:
             self._adam.load_state_dict(optimizer)
-        none = ScaleLimits.none(tensors["logit_opacities"])
-        self.limit_scales(none if limits is None else ScaleLimits(*limits))
+        self.limit_scales(limits or _no_limits(tensors["logit_opacities"]))
 
     @classmethod
     def of_scene(cls, scene: GaussianScene, sh_degree: int, device: str) -> "SplatParameters":
@@ -233,13 +198,14 @@ class SplatParameters:
     @property
     def sh(self) -> Tensor:
         """(N, K, 3)."""
-        parts = [self[name] for name in ("sh_0", "sh_rest") if name in self._groups]
-        return torch.cat(parts, dim=1) if len(parts) > 1 else parts[0]
+        if "sh_rest" not in self._groups:
+            return self["sh_0"]
+        return torch.cat([self["sh_0"], self["sh_rest"]], dim=1)
 
     def shapes(self) -> tuple[Tensor, Tensor]:
         """Returns scales (N, 3) [m] and opacities (N,) in (0, 1)."""
-        smallest = self._limits.smallest
-        return splat_shapes(self["log_scales"], self["logit_opacities"], smallest)
+        logits = self["logit_opacities"]
+        return splat_shapes(self["log_scales"], logits, self._limits[0])
 
     @property
     def scales(self) -> Tensor:
@@ -251,10 +217,10 @@ class SplatParameters:
         """(N,)."""
         return self.shapes()[1]
 
-    def limit_scales(self, limits: ScaleLimits) -> None:
-        """Sets the limits and clamps scales to the largest, now and after each step."""
+    def limit_scales(self, limits: Sequence[Tensor]) -> None:
+        """Clamps scales to these limits, now and after each step."""
         self._limits = limits
-        self._max_log_scales = torch.log(limits.largest)[:, None]
+        self._max_log_scales = torch.log(limits[1])[:, None]
         self._clamp_scales()
 
     def step(self, rates: Mapping[str, float]) -> None:
@@ -279,7 +245,8 @@ class SplatParameters:
                 if average in state:
                     state[average] = torch.cat([state[average][rows], torch.zeros_like(extra)])
             self._adam.state[new] = state
-        self.limit_scales(self._limits.rebuild(rows, 0 if added is None else len(added["means"])))
+        limits = zip(self._limits, _no_limits(self["logit_opacities"][len(rows) :]), strict=True)
+        self.limit_scales([torch.cat([old[rows], new]) for old, new in limits])
 
     @torch.no_grad()
     def overwrite(self, name: str, values: Tensor) -> None:
@@ -311,3 +278,7 @@ class SplatParameters:
     def _clamp_scales(self) -> None:
         # The parameters, not a function of them: its gradient would vanish at the limit.
         self["log_scales"].clamp_(max=self._max_log_scales)
+
+
+def _no_limits(like: Tensor) -> list[Tensor]:
+    return [torch.zeros_like(like), torch.full_like(like, torch.inf)]

@@ -13,7 +13,15 @@ from torch import Tensor
 
 from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.splats.background import FAR
-from splatpilot.training.captures.capture import CaptureFrame, back_project
+from splatpilot.training.captures.capture import CaptureFrame, back_project, project_points
+
+STRIDE = 2
+"""Thinned frames keep every second pixel along each axis."""
+
+_DEPTH_TOLERANCE = 0.01  # relative, of depth on the same surface, without its slope
+_COARSER = 1.5  # size of pixels that count as finest, relative to the finest
+_SAMPLES_PER_PAIR = 100
+_BRIGHTNESS = (0.1, 0.98)  # outside, noise or saturation spoils the ratio
 
 
 def radius_squared(width: int, height: int) -> NDArray[np.float64]:
@@ -24,22 +32,9 @@ def radius_squared(width: int, height: int) -> NDArray[np.float64]:
 
 
 def vignette(vignetting: float, width: int, height: int) -> NDArray[np.float64]:
-    """Returns the brightness (height, width) of each pixel relative to the image's center.
-
-    Args:
-        vignetting: logarithm of the relative brightness of the corners.
-        width, height: [px].
-    """
+    """Returns the brightness (height, width) of each pixel relative to the image's center, given
+    the logarithm of that of the corners."""
     return np.exp(vignetting * radius_squared(width, height))
-
-
-STRIDE = 2
-"""Thinned frames keep every second pixel along each axis."""
-
-_DEPTH_TOLERANCE = 0.01  # relative, of depth on the same surface, without its slope
-_COARSER = 1.5  # size of pixels that count as finest, relative to the finest
-_SAMPLES_PER_PAIR = 100
-_BRIGHTNESS = (0.1, 0.98)  # outside, noise or saturation spoils the ratio
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,12 +51,10 @@ class ThinnedFrame:
 
     @classmethod
     def of(cls, frame: CaptureFrame) -> "ThinnedFrame":
-        """Thins `frame`."""
         thin = (slice(None, None, STRIDE), slice(None, None, STRIDE))
         height, width = frame.depth.shape
         depth = np.where(frame.depth < FAR, frame.depth, 0).astype(np.float32)
-        with np.errstate(divide="ignore"):
-            w = np.where(depth > 0, 1 / depth, 0)
+        w = np.divide(1, depth, out=np.zeros_like(depth), where=depth > 0)
         w_v, w_u = (_smaller_difference(w, axis)[thin] for axis in (0, 1))
         depth = depth[thin]
         # A plane is linear in inverse depth w: z changes by z^2 dw over one pixel, and the slope
@@ -92,13 +85,11 @@ class ThinnedFrame:
         """Returns the indices of the points (3, n) that this view sees, and the flat index of the
         pixel of each."""
         h, w = self.depth.shape
-        x, y, z = self.X_WC.inverse().multiply(p_WQ)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            u = (self.K[0, 0] * x / z + self.K[0, 2]) / STRIDE
-            v = (self.K[1, 1] * y / z + self.K[1, 2]) / STRIDE
-        number = np.flatnonzero((z > 0) & (u >= 0) & (u < w) & (v >= 0) & (v < h))
-        index = v[number].astype(np.intp) * w + u[number].astype(np.intp)
-        same = np.abs(self.depth.flat[index] - z[number]) < self.tolerance.flat[index]
+        p_CQ = self.X_WC.inverse().multiply(p_WQ).T
+        K = self.K / [[STRIDE], [STRIDE], [1]]
+        inside, rows, columns = project_points(K, p_CQ, w, h)
+        number, index = np.flatnonzero(inside), rows * w + columns
+        same = np.abs(self.depth.flat[index] - p_CQ[number, 2]) < self.tolerance.flat[index]
         return number[same], index[same]
 
 
@@ -111,7 +102,10 @@ def find_new_pixels(
     are visited from the closest to the farthest, those with an index in `last` after the others.
     """
     points = [view.points() for view in views]
-    overlapping = [_overlapping(view, views) for view in views]
+    overlapping = []  # views that see some points
+    for view in views:
+        p_WQ, _ = view.points(step=8)
+        overlapping.append([j for j, other in enumerate(views) if len(other.find(p_WQ)[0])])
 
     fine = []  # pixels that are nearly the finest
     for i, view in enumerate(Progress(views, "comparing frames", unit="frame")):
@@ -159,20 +153,11 @@ def seen_pixels(frame: CaptureFrame, views: Sequence[ThinnedFrame]) -> NDArray[n
     return image.repeat(STRIDE, axis=0).repeat(STRIDE, axis=1)[:height, :width] > 0
 
 
-def _overlapping(view: ThinnedFrame, views: Sequence[ThinnedFrame]) -> list[int]:
-    """Returns the indices of the views that see some points of `view`."""
-    p_WQ, _ = view.points(step=8)
-    return [j for j, other in enumerate(views) if len(other.find(p_WQ)[0])]
-
-
 def _smaller_difference(values: NDArray, axis: int) -> NDArray:
     """Returns the smaller of forward and backward difference, which ignores edges."""
     step = np.diff(values, axis=axis)
-    ends = [(0, 0), (0, 0)]
-    ends[axis] = (0, 1)
-    forward = np.pad(step, ends, mode="edge")
-    ends[axis] = (1, 0)
-    backward = np.pad(step, ends, mode="edge")
+    forward = np.concatenate([step, step.take([-1], axis)], axis)
+    backward = np.concatenate([step.take([0], axis), step], axis)
     return np.where(np.abs(forward) < np.abs(backward), forward, backward)
 
 
@@ -200,7 +185,7 @@ def estimate_photometry(views: Sequence[ThinnedFrame], seed: int) -> Photometry:
     """
     rng = np.random.default_rng(seed)
     n = len(views)
-    first, second, log_ratio, radius_difference = [], [], [], []
+    samples = []
     for i, view in enumerate(views):
         p_WQ, pixel_i = view.points(step=4)
         for j, other in enumerate(views):
@@ -213,16 +198,13 @@ def estimate_photometry(views: Sequence[ThinnedFrame], seed: int) -> Photometry:
             if len(usable) < _SAMPLES_PER_PAIR:
                 continue
             usable = rng.choice(usable, _SAMPLES_PER_PAIR, replace=False)
-            first.append(np.full(_SAMPLES_PER_PAIR, i))
-            second.append(np.full(_SAMPLES_PER_PAIR, j))
-            log_ratio.append(np.log(I_i[usable] / I_j[usable]))
-            radius_difference.append(
-                view.radius_squared.flat[pixel_i[index[usable]]]
-                - other.radius_squared.flat[pixel_j[usable]]
-            )
-    if not first:
+            rho_i = view.radius_squared.flat[pixel_i[index[usable]]]
+            rho_j = other.radius_squared.flat[pixel_j[usable]]
+            pair = np.full(_SAMPLES_PER_PAIR, i), np.full(_SAMPLES_PER_PAIR, j)
+            samples.append((*pair, np.log(I_i[usable] / I_j[usable]), rho_i - rho_j))
+    if not samples:
         return Photometry(np.ones(n), 0.0)
-    i, j, b, r = map(np.concatenate, (first, second, log_ratio, radius_difference))
+    i, j, b, r = (np.concatenate(column) for column in zip(*samples, strict=True))
     equation = np.arange(len(b))
     A = coo_array(
         (

@@ -23,15 +23,14 @@ from splatpilot.systems.common.torch_device import one_torch_thread
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 from splatpilot.training.captures.capture import Capture, shrink_factor
 from splatpilot.training.captures.render import RECIPE, rendered_world
-from splatpilot.training.reconstruction.checkpoint import Checkpoint, require_same_run
+from splatpilot.training.reconstruction.checkpoint import Checkpoint
 from splatpilot.training.reconstruction.config import ReconstructConfig
-from splatpilot.training.reconstruction.distance_field import FieldDifference, make_distance_field
+from splatpilot.training.reconstruction.distance_field import make_distance_field
 from splatpilot.training.reconstruction.initialize import (
     gaussians_from_depth,
     held_out_frames,
     make_initial_gaussians,
     resolve_config,
-    surface_detail,
 )
 from splatpilot.training.reconstruction.lpips import Lpips
 from splatpilot.training.reconstruction.metrics import HeldOutMetrics
@@ -47,8 +46,7 @@ from splatpilot.training.reconstruction.views import (
     learn_background,
 )
 
-_MAX_NAMED = 10
-"""Maximum number of frames in a warning."""
+_MAX_NAMED = 10  # frames in a warning
 
 
 @dataclass(frozen=True)
@@ -60,16 +58,12 @@ class ReconstructSummary:
     gaussians: int
     vignetting: float
     gain_range: tuple[float, float]
-    metric: bool  # whether lengths are in meters
-    lower_W: NDArray[np.float64]  # (3,) [m]
-    upper_W: NDArray[np.float64]  # (3,) [m]
-    voxel_size: float  # [m]
-    observed_free_volume: float  # [m^3]
+    metric: bool  # lengths are in meters
+    field: Esdf
     p_WS: NDArray[np.float64]  # (3,) [m]
     p_WG: NDArray[np.float64]  # (3,) [m]
     geodesic: float  # [m], shortest path from start to goal
     held_out: HeldOutMetrics | None = None
-    field_difference: FieldDifference | None = None
     notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
 
@@ -78,27 +72,26 @@ class ReconstructSummary:
             return "(" + ", ".join(f"{x:.2f}" for x in p) + ")"
 
         unit = "m" if self.metric else "units of an unknown length"
-        size = " x ".join(f"{length:.3g}" for length in self.upper_W - self.lower_W)
+        lower_W, upper_W = self.field.lower_W, self.field.upper_W
+        size = " x ".join(f"{length:.3g}" for length in upper_W - lower_W)
         rows = {
             "scene": self.scene,
             "frames": self.frames,
             "Gaussians": self.gaussians,
-            "size": f"{size} {unit}, from {vector(self.lower_W)} to {vector(self.upper_W)}",
-            "distance field": f"voxels of {self.voxel_size:.2g} {unit}",
+            "size": f"{size} {unit}, from {vector(lower_W)} to {vector(upper_W)}",
+            "distance field": f"voxels of {self.field.voxel_size:.2g} {unit}",
             "image gains": f"{self.gain_range[0]:.3f} to {self.gain_range[1]:.3f}",
             "corner brightness": f"{np.exp(self.vignetting):.3f}",
         }
         if self.metric:
             rows |= {
-                "seen free [m^3]": f"{self.observed_free_volume:.1f}",
+                "seen free [m^3]": f"{self.field.volume(FieldState.FREE):.1f}",
                 "default start [m]": vector(self.p_WS),
                 "default goal [m]": vector(self.p_WG),
                 "shortest path [m]": f"{self.geodesic:.1f}",
             }
         if self.held_out is not None:
             rows["held-out frames"] = self.held_out
-        if self.field_difference is not None:
-            rows["rendered field"] = f"{self.field_difference} (against captured depth)"
         lines = [f"{name:<18} {value}" for name, value in rows.items()]
         lines += [f"note: {note}" for note in self.notes]
         return "\n".join(lines + [f"warning: {warning}" for warning in self.warnings])
@@ -115,14 +108,14 @@ def reconstruct(
 
     Raises:
         ValueError, OSError: for a damaged capture, an invalid config, a checkpoint of another run,
-            or a folder `out` that cannot be written or holds something else. No scene is written.
+            or a folder `out` that cannot be written or holds something else.
     """
     out = Path(out)
     config.validate()
     check_scene_target(out)
     config = resolve_config(config, capture)
     if not restart and config.iterations:
-        require_same_run(out, config)
+        Checkpoint(out, config).load()  # raises ValueError before anything slow is prepared
     held_out = held_out_frames(capture, config)
     fitted = [i for i in range(len(capture)) if i not in held_out]
     factor = shrink_factor(capture.width, config.image_width if config.iterations else 0)
@@ -138,7 +131,9 @@ def reconstruct(
     checkpoint = metrics = None
     if config.iterations == 0:
         gains[fitted] = photometry.gains
-        gaussians = gaussians_from_depth(frames, photometry, surface_detail(config))
+        gaussians = gaussians_from_depth(
+            frames, photometry, config.max_gaussians, config.contrast, optimized=False
+        )
         how = "depth back-projected"
     else:
         views = ReconstructionViews(frames, photometry)
@@ -154,7 +149,7 @@ def reconstruct(
             views,
             test_views,
             background,
-            lambda: make_initial_gaussians(capture, frames, photometry, views, config),
+            lambda extent: make_initial_gaussians(capture, frames, photometry, extent, config),
             checkpoint,
             Lpips() if config.lpips_weight > 0 else None,
             fit_gains=not capture.has_depth,
@@ -167,7 +162,7 @@ def reconstruct(
             gains[held_out] = [view.gain for view in metrics.views]
         how = f"{config.representation}, {config.iterations} steps"
 
-    field, difference, depth = make_distance_field(capture, frames, gaussians, config)
+    field, depth = make_distance_field(capture, frames, gaussians, config)
     frontier = None
     if capture.metric:
         field, frontier = close_frontier(field, depth.images(), depth.K, depth.X_WCs)
@@ -200,22 +195,18 @@ def reconstruct(
         vignetting=photometry.vignetting,
         gain_range=(float(gains[fitted].min()), float(gains[fitted].max())),
         metric=capture.metric,
-        lower_W=field.lower_W,
-        upper_W=field.upper_W,
-        voxel_size=field.voxel_size,
-        observed_free_volume=field.volume(FieldState.FREE),
+        field=field,
         p_WS=p_WS,
         p_WG=p_WG,
         geodesic=geodesic,
         held_out=metrics,
-        field_difference=difference,
         notes=tuple(capture.notes),
         warnings=(*capture.dropped, *without_depth, *warnings),
     )
 
 
 def _digested(capture: Capture, digests: set[str]) -> Capture:
-    """Returns the capture, which adds a digest of the pixels of each loaded image to `digests`."""
+    """Returns the capture, whose loaded images add digests of their pixels to `digests`."""
 
     def load_image(i: int) -> NDArray[np.uint8]:
         image = capture.load_image(i)
@@ -227,13 +218,7 @@ def _digested(capture: Capture, digests: set[str]) -> Capture:
 
 def _source_and_split(capture: Capture, images: set[str], split: str) -> tuple[list[str], str]:
     """Returns the source digest of a scene and its split: those of the world that the capture was
-    rendered of, or else of its images.
-
-    Args:
-        capture: of the scene.
-        images: digests of the fitted images.
-        split: given by the user; empty for none.
-    """
+    rendered of, or else of its fitted `images`, by digest. `split` is the user's, or empty."""
     name = capture.folder or capture.name
     folder = Path(capture.folder)
     rendered = None
@@ -264,7 +249,7 @@ def start_and_goal(
     field: Esdf, metric: bool, default: tuple[NDArray[np.float64], NDArray[np.float64]]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float, tuple[str, ...]]:
     """Returns p_WS, p_WG, the length of the shortest path [m] and warnings; the points `default` if
-    nothing can fly in the scene."""
+    the scene cannot be flown in."""
     try:
         if metric:
             p_WS, p_WG, length = choose_start_and_goal(field, VEHICLE_RADIUS)

@@ -1,14 +1,17 @@
-"""Rendering of Gaussians or surfels for reconstruction."""
+"""Rendering of Gaussians ("3dgs") or surfels ("2dgs") for reconstruction."""
 
 from dataclasses import dataclass
 from typing import Any
 
 import torch
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform
 from torch import Tensor
 
 from splatpilot._native import Renderer
+from splatpilot.systems.splats.baked_scene import BakedScene, RenderedView, create_renderer
 from splatpilot.systems.splats.rasterization import EPS2D, rasterize
-from splatpilot.systems.splats.scene import harmonic_degree
+from splatpilot.systems.splats.scene import GaussianScene, harmonic_degree
 from splatpilot.systems.splats.surfel_rasterization import rasterize_surfels
 
 
@@ -23,6 +26,9 @@ class Rendering:
     normals: Tensor | None = None  # (H, W, 3) sum of weight and normal; surfels only
     surface_normals: Tensor | None = None  # (H, W, 3) from depth; surfels only
     distortion: Tensor | None = None  # (H, W) [m]; surfels only, if requested
+
+    def view(self) -> RenderedView:
+        return RenderedView(*(image.numpy() for image in (self.color, self.depth, self.alpha)))
 
 
 def render(
@@ -39,20 +45,14 @@ def render(
     distortion: bool = False,
     renderer: Renderer | None = None,
 ) -> Rendering:
-    """Renders color and depth.
+    """Renders color and depth of one camera, see `rasterize` for the arguments.
 
     Args:
-        representation: "3dgs" or "2dgs".
-        gaussians: means, quats, scales, opacities and spherical harmonics, as for `rasterize`.
-        viewmat: (1, 4, 4) world to camera.
-        K: (1, 3, 3) [px].
-        width, height: [px].
-        background: (1, 3), black by default.
+        gaussians: means, quats, scales, opacities and spherical harmonics.
         depth_mode: "D", accumulated, "ED", expected, or "MD", median, which has no gradient and
             is 0 without a surface.
-        eps2d: blur of Gaussians, see `rasterize`; surfels have their own.
-        distortion: whether surfels render the distortion along their rays.
-        renderer: see `rasterize`.
+        eps2d: blur of Gaussians; surfels have their own.
+        distortion: renders the distortion of surfels along their rays.
     """
     scene = *gaussians, viewmat, K, width, height
     options: dict[str, Any] = {
@@ -83,3 +83,24 @@ def render(
         None if surface_normals is None else surface_normals[0],
         distort[0, ..., 0],
     )
+
+
+class SceneRenderer:
+    """Renders a static scene."""
+
+    def __init__(self, scene: GaussianScene, representation: str, threads: int = 1):
+        self._renderer = create_renderer(threads)
+        self._baked = BakedScene(scene, threads) if representation == "3dgs" else None
+        arrays = (scene.means, scene.quats, scene.scales, scene.opacities, scene.sh)
+        means, quats, scales, opacities, sh = map(torch.from_numpy, arrays)
+        self._tensors = (means, quats, scales, opacities, sh)
+
+    @torch.no_grad()
+    def render(self, K: NDArray, width: int, height: int, X_WC: RigidTransform) -> RenderedView:
+        """Renders color on black, median depth and alpha; see `BakedScene.render`."""
+        if self._baked is not None:
+            return self._baked.render(K, width, height, X_WC)
+        viewmat = torch.tensor(X_WC.inverse().GetAsMatrix4(), dtype=torch.float32)[None]
+        camera = viewmat, torch.tensor(K, dtype=torch.float32)[None], width, height
+        rendering = render("2dgs", self._tensors, *camera, depth_mode="MD", renderer=self._renderer)
+        return rendering.view()

@@ -1,8 +1,8 @@
 """Frames of a capture for reconstruction, shrunk and as tensors, and the learned background."""
 
+import hashlib
 from collections.abc import Sequence
 from functools import cache
-from typing import overload
 
 import cv2
 import numpy as np
@@ -29,13 +29,8 @@ _HEIGHT, _WIDTH = 128, 256  # texels of the background, powers of two
 
 
 class ShrunkFrames(Sequence[CaptureFrame]):
-    """Some frames of a capture, loaded on first use and kept if all of them take at most 1 GB.
-
-    Args:
-        capture: source of the frames.
-        numbers: indices of the frames.
-        factor: whole factor by which they are shrunk.
-    """
+    """The frames `numbers` of a capture, shrunk by an integer `factor`, loaded on first use and
+    kept if all of them take at most 1 GB."""
 
     def __init__(self, capture: Capture, numbers: Sequence[int], factor: int):
         self._capture, self.numbers, self.factor = capture, list(numbers), factor
@@ -46,13 +41,7 @@ class ShrunkFrames(Sequence[CaptureFrame]):
     def __len__(self) -> int:
         return len(self.numbers)
 
-    @overload
-    def __getitem__(self, k: int) -> CaptureFrame: ...
-    @overload
-    def __getitem__(self, k: slice) -> "ShrunkFrames": ...
-    def __getitem__(self, k):
-        if isinstance(k, slice):
-            return ShrunkFrames(self._capture, self.numbers[k], self.factor)
+    def __getitem__(self, k: int) -> CaptureFrame:  # pyright: ignore[reportIncompatibleMethodOverride]
         return self._load(range(len(self))[k])
 
     def _load_and_shrink(self, k: int) -> CaptureFrame:
@@ -60,12 +49,7 @@ class ShrunkFrames(Sequence[CaptureFrame]):
 
 
 class ReconstructionViews:
-    """Frames as tensors on the CPU.
-
-    Args:
-        frames: all of one size and with one K.
-        photometry: their gains, in their order, and their vignetting.
-    """
+    """Frames of one size and K, with their photometry, as tensors on the CPU."""
 
     def __init__(self, frames: Sequence[CaptureFrame], photometry: Photometry):
         images, depths, edges, valid, viewmats = [], [], [], [], []
@@ -89,6 +73,14 @@ class ReconstructionViews:
 
     def __len__(self) -> int:
         return len(self.images)
+
+    def digest(self) -> str:
+        """Returns a digest of images, depths and cameras."""
+        tensors = (self.images, self.depths, self.valid, self.viewmats, self.K, self.gains)
+        digest = hashlib.sha256()
+        for tensor in tensors:
+            digest.update(tensor.numpy().tobytes())
+        return digest.hexdigest()
 
     def camera(self, k: int, device: str) -> tuple[Tensor, Tensor]:
         """Returns X_CW (1, 4, 4) and K (1, 3, 3) [px] of view k on a device."""
@@ -123,10 +115,6 @@ def learn_background(frames: Sequence[CaptureFrame], photometry: Photometry) -> 
 
     Each texel has the mean color, without gains and vignetting, of the pixels that look into it, or
     else is interpolated.
-
-    Args:
-        frames: with true depth; loaded one by one.
-        photometry: of the frames, in their order.
     """
     sums, counts = np.zeros((_HEIGHT * _WIDTH, 3)), np.zeros(_HEIGHT * _WIDTH)
     for k, frame in enumerate(frames):

@@ -1,4 +1,4 @@
-"""Where things stand in a procedural forest: the one description that is both seen and hit."""
+"""Layout of a generated forest, for both Gaussians and distances."""
 
 from dataclasses import dataclass
 
@@ -11,19 +11,20 @@ from splatpilot.diagrams.worlds.building_blocks import (
     INSET,
     PASSAGE,
     VolumeConfig,
+    ground,
     poisson_disk,
     require_order,
 )
 from splatpilot.diagrams.worlds.solids.solid import Solid
 from splatpilot.diagrams.worlds.solids.surfaces import FloorPlan
 from splatpilot.diagrams.worlds.solids.textures import BIRCH, OAK, PINE
-from splatpilot.systems.collision.shapes import Capsule, HalfSpace, Sphere
+from splatpilot.systems.collision.shapes import Capsule, Sphere
 from splatpilot.systems.common.validation import bounded, require_field
 
 
 @dataclass
 class TrunksConfig(VolumeConfig):
-    """Common to all forests."""
+    """Volume and trunks of a forest."""
 
     length: float = bounded(36.0, f"[{2 * (INSET + CLEARING):g}, inf) m")  # [m] along x, from 0
     width: float = bounded(16.0, "(0, inf) m")  # [m] along y, centered on 0
@@ -39,7 +40,7 @@ class TrunksConfig(VolumeConfig):
 
     @property
     def narrowest(self) -> float:
-        """Narrowest gap between two trunks that the other values allow [m]."""
+        """The narrowest possible gap between two trunks [m]."""
         tilt = self.height * np.tan(np.deg2rad(self.lean_max))
         return float(self.spacing - 2 * self.radius_max - 2 * tilt)
 
@@ -59,19 +60,11 @@ class TrunksConfig(VolumeConfig):
 
 @dataclass
 class ForestConfig(TrunksConfig):
-    """A forest.
-
-    Not a base of others: Drake would write them to YAML as plain forests, since it takes the first
-    type of a union that a value is an instance of.
-    """
+    """A forest. Not a base of others: Drake would write these to YAML as plain forests."""
 
 
-MARGIN = 14.0
-"""[m], width of the belt of trees around the flyable volume."""
-
-BURIED = 1.0
-"""[m], how deep trunks reach into the ground."""
-
+MARGIN = 14.0  # [m], width of the belt of trees around the flyable volume
+BURIED = 1.0  # [m], depth of trunks in the ground
 
 BARK = {OAK: "oak", PINE: "pine", BIRCH: "birch"}
 
@@ -81,7 +74,7 @@ class Trees:
     """N trees with round, straight trunks."""
 
     base: NDArray[np.float64]  # (N, 2) [m], where the axis meets the ground
-    lean: NDArray[np.float64]  # (N, 2), way of the axis in x and y per meter of height
+    lean: NDArray[np.float64]  # (N, 2), shift of the axis in x and y per meter of height
     radius: NDArray[np.float64]  # (N,) [m]
     height: NDArray[np.float64]  # (N,) [m], of the tip
     species: NDArray[np.int64]  # (N,), OAK, PINE or BIRCH
@@ -90,7 +83,7 @@ class Trees:
         return len(self.base)
 
     def at(self, z: float) -> NDArray[np.float64]:
-        """Returns where the axes are at height z: points (N, 3)."""
+        """Returns the points (N, 3) of the axes at height z."""
         return np.column_stack([self.base + z * self.lean, np.full(len(self), z)])
 
 
@@ -102,32 +95,29 @@ class ForestLayout(FloorPlan):
     rocks: NDArray[np.float64]  # (M, 4) [m], spheres: center and radius
     logs: NDArray[np.float64]  # (L, 7) [m], capsules: two ends and radius
 
-    def room(self, p: ArrayLike) -> NDArray[np.float64]:
-        """Returns how far p (N, 2 or more) [m] are, in plan, from what stands or lies on the
-        ground, (N,), negative where it is covered."""
+    def clearance(self, p: ArrayLike) -> NDArray[np.float64]:
+        """Computes horizontal distances (N,) [m] of p (N, 2 or more) to trees, rocks and logs."""
         p = np.asarray(p)[:, :2]
         gap, nearest = KDTree(self.trees.base).query(p)
-        room = gap - self.trees.radius[nearest]
+        clearance = gap - self.trees.radius[nearest]
         for rock in self.rocks:  # cut by the ground in a smaller circle
             foot = np.sqrt(rock[3] ** 2 - rock[2] ** 2)
-            room = np.minimum(room, np.linalg.norm(p - rock[:2], axis=1) - foot)
+            clearance = np.minimum(clearance, np.linalg.norm(p - rock[:2], axis=1) - foot)
         for log in self.logs:
-            way = log[3:5] - log[:2]
-            along = np.clip((p - log[:2]) @ way / (way @ way), 0, 1)
+            axis = log[3:5] - log[:2]
+            along = np.clip((p - log[:2]) @ axis / (axis @ axis), 0, 1)
             foot = np.sqrt(log[6] ** 2 - log[2] ** 2)
-            gap = np.linalg.norm(p - log[:2] - along[:, None] * way, axis=1)
-            room = np.minimum(room, gap - foot)
-        return room
+            gap = np.linalg.norm(p - log[:2] - along[:, None] * axis, axis=1)
+            clearance = np.minimum(clearance, gap - foot)
+        return clearance
 
     def solids(self) -> tuple[list[Solid], list[Solid]]:
-        """Returns everything that can be the nearest surface to a point of the volume; and the
-        trees that cannot, and what of trunks is further up.
+        """Returns the solids that can be nearest to a point of the volume, and the other solids.
 
-        The ground is never further from such a point than the volume is high, so the distances are
-        exact without what stands further from the volume than that.
+        The ground is never farther from such a point than the volume is high, so distances are
+        exact without solids farther from the volume than that.
         """
-        ceiling = self.upper[2]
-        trees = self.trees
+        ceiling, trees = self.upper[2], self.trees
         near = self.outside(trees.base) - trees.radius - ceiling * np.hypot(*trees.lean.T) < ceiling
         foot, top = trees.at(-BURIED), trees.at(ceiling + 2)
         trunks = [
@@ -136,11 +126,10 @@ class ForestLayout(FloorPlan):
                 zip(foot, top, trees.radius, trees.species, strict=True)
             )
         ]
-        ground = Solid(HalfSpace(np.array([0.0, 0.0, 1.0]), 0.0), "forest_floor")
         logs = (Capsule(log[:3], log[3:6], float(log[6])) for log in self.logs)
         rocks = (Sphere(rock[:3], float(rock[3])) for rock in self.rocks)
         solids = [
-            ground,
+            ground("forest_floor"),
             *(trunk for trunk, is_near in zip(trunks, near, strict=True) if is_near),
             *(Solid(log, "oak", k) for k, log in enumerate(logs)),
             *(Solid(rock, "stone", k) for k, rock in enumerate(rocks)),
@@ -160,7 +149,7 @@ class ForestLayout(FloorPlan):
 def lay_out(
     config: TrunksConfig, rng: np.random.Generator, clear: ArrayLike, clearance: float
 ) -> ForestLayout:
-    """Places everything, leaving discs of radius `clearance` [m] about `clear` (K, 2) open."""
+    """Draws a layout that leaves discs of radius `clearance` [m] about `clear` (K, 2) open."""
     clear = np.asarray(clear)
     plan = FloorPlan.of_size(config.length, config.width, config.height)
     lower, upper = plan.lower, plan.upper
@@ -181,7 +170,7 @@ def lay_out(
     open_ = (gap > blocked[:, None]).all(axis=1)
     trees = Trees(*(getattr(trees, name)[open_] for name in Trees.__dataclass_fields__))
 
-    # Rocks and logs: apart from everything else, and so low that nobody has to fly around them.
+    # Rocks and logs: apart from everything else, and below the flight height.
     taken = [*np.column_stack([trees.base, trees.radius]), *([*p, clearance] for p in clear)]
     rocks, logs = [], []
     for _ in range(config.rocks):
@@ -203,7 +192,7 @@ def lay_out(
 def _free_spot(
     rng: np.random.Generator, lower: NDArray, upper: NDArray, taken: NDArray, radius: float
 ) -> NDArray[np.float64] | None:
-    """Draws the center (2,) of a disc that meets none of the discs `taken` (K, 3): x, y, radius."""
+    """Draws the center (2,) of a disc that overlaps no disc of `taken` (K, 3): x, y, radius."""
     draws = rng.uniform(lower[:2], upper[:2], (100, 2))
     gap = np.linalg.norm(draws[:, None] - taken[:, :2], axis=-1) - taken[:, 2] - radius
     free = (gap > 0.15).all(axis=1)

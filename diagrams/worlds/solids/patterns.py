@@ -27,13 +27,13 @@ solid's own frame and the solid's seed to colors (N, 3), sRGB in 0 to 1."""
 
 
 def _tone(seed: int, strength: float = 0.35) -> Array:
-    """One factor (3,) a solid: brightness, and a little warmth."""
+    """Returns a factor (3,) of brightness and warmth for a solid."""
     bright, warm = (float(hash_unit([[seed]], k)[0]) - 0.5 for k in (71, 72))
     return (1 + strength * bright) * (1 + warm * np.array([0.16, 0.0, -0.18]))
 
 
 def _cells(uv: Array, width: float, height: float, shift: float) -> tuple[Array, Array]:
-    """Cell (N, 2) of a bond of courses, and distance (N,) [m] to the nearest edge of the cell."""
+    """Returns cells (N, 2) of a bond of courses, and distances (N,) [m] to their nearest edge."""
     row = np.floor(uv[:, 1] / height)
     u = uv[:, 0] / width + shift * (row % 2)
     column = np.floor(u)
@@ -48,8 +48,7 @@ _BRICKS = (
     [(0.33, 0.32, 0.32), (0.48, 0.46, 0.44), (0.60, 0.58, 0.54)],
     [(0.78, 0.75, 0.68), (0.86, 0.84, 0.79), (0.62, 0.38, 0.28)],
 )
-BRICK = 0.30, 0.15
-"""[m], width and height of a brick with its mortar."""
+BRICK = 0.30, 0.15  # [m], width and height of a brick with its mortar
 
 
 def brick(uv: Array, p: Array, seed: int) -> Array:
@@ -71,7 +70,6 @@ def concrete(uv: Array, p: Array, seed: int) -> Array:
     )
     panel, joint = _cells(uv, 2.4, 1.2, 0.0)
     gray = gray * (0.9 + 0.2 * hash_unit(panel, seed))[:, None]
-    # Rain leaves dark streaks under the joints.
     streak = smoothstep(0.15, 0.5, fbm(np.stack([uv[:, 0] * 5, uv[:, 1] * 0.4], -1), 2, seed=113))
     gray = mix(gray, (0.29, 0.28, 0.25), 0.55 * streak)
     return mix((0.25, 0.24, 0.23), gray, smoothstep(0.01, 0.05, joint)) * _tone(seed)
@@ -92,20 +90,14 @@ def wood(uv: Array, p: Array, seed: int) -> Array:
 
 _PAINTS = np.array(
     [
-        (0.70, 0.16, 0.12),
-        (0.13, 0.33, 0.55),
-        (0.84, 0.60, 0.10),
-        (0.19, 0.42, 0.24),
-        (0.78, 0.77, 0.73),
-        (0.86, 0.40, 0.10),
-        (0.30, 0.32, 0.35),
-        (0.10, 0.48, 0.50),
+        *((0.70, 0.16, 0.12), (0.13, 0.33, 0.55), (0.84, 0.60, 0.10), (0.19, 0.42, 0.24)),
+        *((0.78, 0.77, 0.73), (0.86, 0.40, 0.10), (0.30, 0.32, 0.35), (0.10, 0.48, 0.50)),
     ]
 )
 
 
 def metal(uv: Array, p: Array, seed: int) -> Array:
-    """`Pattern` of painted sheet, corrugated every 0.4 m, rusting in places."""
+    """`Pattern` of painted sheet, corrugated every 0.4 m, partly rusty."""
     paint = _PAINTS[seed % len(_PAINTS)]
     wave = 0.82 + 0.18 * np.sin(uv[:, 0] * (2 * np.pi / 0.4))
     sheet = paint * wave[:, None] * (1 + 0.1 * fbm(p * 1.5, 3, seed=131))[:, None]
@@ -124,14 +116,13 @@ def hazard(uv: Array, p: Array, seed: int) -> Array:
     return mix(color, (0.46, 0.45, 0.43), 0.7 * worn)
 
 
-SIGN = 1.2, 0.6
-"""[m], width and height of one sign; larger faces repeat it."""
+SIGN = 1.2, 0.6  # [m], width and height of one sign; larger faces repeat it
 _WORDS = "EXIT", "GATE 7", "SPLATPILOT", "BAY 12", "SLOW", "NO ENTRY", "ROW C", "CAFE", "LEVEL 2"
 
 
 @cache
 def _sign_board(seed: int) -> Array:
-    """A drawn sign, (96, 192, 3) in 0 to 1, first row at the top."""
+    """Draws a sign, (96, 192, 3) in 0 to 1, first row at the top."""
     ground = _PAINTS[seed % len(_PAINTS)]
     ink = (255, 250, 240) if ground.mean() < 0.6 else (20, 26, 41)
     board = np.full((96, 192, 3), np.round(255 * ground), dtype=np.uint8)
@@ -140,8 +131,8 @@ def _sign_board(seed: int) -> Array:
     (width, height), _ = cv2.getTextSize(word, cv2.FONT_HERSHEY_DUPLEX, 1.0, 4)
     scale = min(160 / width, 34 / height)
     size = round(width * scale), round(height * scale)
-    place = 96 - size[0] // 2, 44 + size[1] // 2 - 8
-    cv2.putText(board, word, place, cv2.FONT_HERSHEY_DUPLEX, scale, ink, 4, cv2.LINE_AA)
+    origin = 96 - size[0] // 2, 44 + size[1] // 2 - 8
+    cv2.putText(board, word, origin, cv2.FONT_HERSHEY_DUPLEX, scale, ink, 4, cv2.LINE_AA)
     cv2.arrowedLine(board, (40, 74), (152, 74), ink, 5, cv2.LINE_AA, 0, 0.16)
     return board / 255.0
 
@@ -157,11 +148,8 @@ def signage(uv: Array, p: Array, seed: int) -> Array:
 
 def plaster(uv: Array, p: Array, seed: int) -> Array:
     """`Pattern` of painted plaster with a darker dado up to 1 m above the foot of the face."""
-    walls = np.array(
-        [(0.86, 0.83, 0.75), (0.74, 0.80, 0.80), (0.83, 0.74, 0.66), (0.80, 0.82, 0.70)]
-    )
-    color = walls[seed % len(walls)] * (1 + 0.08 * fbm(p * 1.1, 4, seed=151))[:, None]
-    # A darker dado up to 1 m, with a line on top.
+    walls = (0.86, 0.83, 0.75), (0.74, 0.80, 0.80), (0.83, 0.74, 0.66), (0.80, 0.82, 0.70)
+    color = np.array(walls[seed % len(walls)]) * (1 + 0.08 * fbm(p * 1.1, 4, seed=151))[:, None]
     low = smoothstep(1.02, 0.98, uv[:, 1])
     color = mix(color, color * (0.55, 0.62, 0.66), low)
     line = smoothstep(0.04, 0.02, np.abs(uv[:, 1] - 1.0))
@@ -183,7 +171,7 @@ def tiles(uv: Array, p: Array, seed: int) -> Array:
 
 
 def ceiling(uv: Array, p: Array, seed: int) -> Array:
-    """`Pattern` of ceiling panels of 1.2 m by 0.6 m, stained in places."""
+    """`Pattern` of ceiling panels of 1.2 m by 0.6 m, partly stained."""
     cell, edge = _cells(uv, 1.2, 0.6, 0.0)
     panel = (0.80 + 0.12 * hash_unit(cell, seed))[:, None] * np.array([1.0, 0.99, 0.95])
     stain = smoothstep(0.3, 0.6, fbm(p * 0.9, 3, seed=162))
@@ -199,12 +187,11 @@ def foliage(uv: Array, p: Array, seed: int) -> Array:
 
 
 def grass(uv: Array, p: Array, seed: int) -> Array:
-    """`Pattern` of a lawn, bare in places; it depends on the plan (x, y) of the points alone."""
-    blade = (
-        0.5 + 0.45 * fbm(p[:, :2] * 0.6, 4, seed=181) + 0.22 * value_noise(p[:, :2] * 8, seed=182)
-    )
+    """`Pattern` of a lawn, partly bare; depends on x and y of the points only."""
+    q = p[:, :2]
+    blade = 0.5 + 0.45 * fbm(q * 0.6, 4, seed=181) + 0.22 * value_noise(q * 8, seed=182)
     green = ramp([(0.22, 0.29, 0.10), (0.38, 0.44, 0.16), (0.58, 0.58, 0.28)], blade)
-    bare = smoothstep(0.16, 0.36, fbm(p[:, :2] * 0.33, 4, seed=183))
+    bare = smoothstep(0.16, 0.36, fbm(q * 0.33, 4, seed=183))
     return mix(green, ramp([(0.36, 0.28, 0.19), (0.56, 0.46, 0.33)], blade), 0.9 * bare)
 
 
@@ -247,7 +234,7 @@ def crate(uv: Array, p: Array, seed: int) -> Array:
 
 
 def bark(species: int, uv: Array, p: Array, seed: int) -> Array:
-    """`Pattern`, of a species OAK, PINE or BIRCH, of bark; z runs along the trunk."""
+    """`Pattern` of the bark of a species OAK, PINE or BIRCH; z is along the trunk."""
     plates = textures.bark(species, p)
     cracks = value_noise(p * (34, 34, 6), seed=15) + 0.5 * value_noise(p * (60, 60, 14), seed=16)
     dark = plates * (0.80 if species == BIRCH else 0.52)

@@ -1,8 +1,5 @@
-"""Solids: shapes that can be hit, made of a material that can be seen.
-
-A solid's surface is cut into faces, each with coordinates (u, v) in meters. Gaussians and meshes
-are both drawn from these faces and ask the same material for colors, so they look alike.
-"""
+"""Solids: shapes of a material. Gaussians and meshes are drawn from faces of their surface, each
+with coordinates (u, v) in meters."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -25,6 +22,7 @@ from splatpilot.systems.collision.shapes import (
     Shape,
     Sphere,
 )
+from splatpilot.systems.common.validation import require
 from splatpilot.systems.splats.scene import GaussianScene
 
 
@@ -34,7 +32,7 @@ class Marks:
 
     cell: tuple[float, float]  # [m], spacing along u and v
     fill: tuple[float, float]  # standard deviation along u and v, over the spacing
-    first: tuple[float, float] = (0.5, 0.5)  # place of the first, over the spacing
+    first: tuple[float, float] = (0.5, 0.5)  # position of the first, over the spacing
     jitter: float = 0.0  # largest displacement, over the spacing
 
 
@@ -43,13 +41,13 @@ class Material:
     """A surface's colors and the spacing of the Gaussians that show them."""
 
     albedo: patterns.Pattern
-    spacing: float  # [m], of the closed layer, which has the mean colors of the pattern
+    spacing: float  # [m], of the closed layer, in mean colors of the pattern
     marks: tuple[Marks, ...] = ()  # in front of it, in the pattern's own colors
 
 
 def _joints(width: float, height: float, line: float, bond: bool = False) -> tuple[Marks, ...]:
-    """The lines, of standard deviation `line` [m], between cells of a pattern; `bond` shifts every
-    other course by half a cell."""
+    """Returns lines of standard deviation `line` [m] between the cells of a pattern; `bond` shifts
+    every other course by half a cell."""
     n = max(1, round(width / 0.25)), max(1, round(height / 0.25))
     beds = Marks((width / n[0], height), (0.55, line / height), (0.5, 1.0))
     if not bond:
@@ -85,31 +83,27 @@ MATERIALS: dict[str, Material] = {
     "birch": Material(partial(patterns.bark, BIRCH), 0.10),
 }
 
-
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class Solid:
-    """A shape in W and what it is made of."""
+    """A shape in W and its material."""
 
     shape: Shape
     material: str  # a key of `MATERIALS`
-    seed: int = 0  # another one shows another part and tone of the material
+    seed: int = 0  # of the part and tone of the material
 
     def __post_init__(self) -> None:
-        if self.material not in MATERIALS:
-            raise ValueError(
-                f"material is {self.material!r}; it must be one of {', '.join(MATERIALS)}"
-            )
+        known = self.material in MATERIALS
+        require(known, "material", f"one of {', '.join(MATERIALS)}", repr(self.material))
 
     def albedo(self, uv: Array, p_W: Array) -> NDArray[np.floating]:
-        """Colors (N, 3), sRGB, of the points p_W (N, 3) [m] with face coordinates uv (N, 2)."""
-        return MATERIALS[self.material].albedo(uv, self._own(p_W), self.seed)
+        """Returns colors (N, 3), sRGB, of points p_W (N, 3) [m] with face coordinates uv (N, 2)."""
+        return MATERIALS[self.material].albedo(uv, self._in_own_frame(p_W), self.seed)
 
-    def _own(self, p_W: Array) -> Array:
-        """Points p_W (N, 3) in the solid's own frame: z along what is long, anywhere else in the
-        pattern for another seed."""
+    def _in_own_frame(self, p_W: Array) -> Array:
+        """Converts points (N, 3) to the solid's frame, z along its axis, shifted by its seed."""
         shape = self.shape
         shift = 7.3 * np.array([self.seed % 61, self.seed % 53, 0.0])
         match shape:
@@ -131,48 +125,39 @@ class Face:
 
     size: tuple[float, float]
     # Maps uv (N, 2) to points (N, 3), unit normals (N, 3) and unit directions of u (N, 3), in W;
-    # coordinates beyond the face are continued or brought back to its edge.
+    # coordinates beyond the face are extrapolated or clipped.
     at: Callable[[Array], tuple[Array, Array, Array]]
-    # Radii of curvature [m] along u and v: how finely a mesh must follow.
-    curved: tuple[float, float] = (np.inf, np.inf)
-    # Whether lines of constant u meet at poles, or the face is a disc: not for lattices.
-    round: bool = False
+    curved: tuple[float, float] = (np.inf, np.inf)  # [m], radii of curvature along u and v
+    round: bool = False  # a disc or part of a sphere, on which lines of constant u meet
 
 
-def faces_of(shape: Shape, lower: Array, upper: Array) -> list[Face]:
+def cut_faces(shape: Shape, lower: Array, upper: Array) -> list[Face]:
     """Cuts the surface of `shape` into faces.
 
     A half space must be horizontal; its face ends `GROUND_REACH` beyond [lower, upper] (3,).
-
-    Raises:
-        ValueError: for a half space that is not horizontal.
     """
+    x, y, z = np.eye(3)
     match shape:
         case Sphere():
-            up = np.array([0.0, 0.0, 1.0])
-            return [_dome(np.asarray(shape.p_WO, float), np.eye(3)[0], up, shape.radius, -1.0)]
+            return [_dome(np.asarray(shape.p_WO, float), x, z, shape.radius, -1.0)]
         case Box():
             return _box_faces(shape)
         case Capsule() | Cylinder():
             e_1, _, axis, length = _axes(shape)
             p_WA, p_WB = np.asarray(shape.p_WA, float), np.asarray(shape.p_WB, float)
-            side = _side(p_WA, e_1, axis, shape.radius, length)
             end = _dome if isinstance(shape, Capsule) else _disc
             return [
-                side,
+                _side(p_WA, e_1, axis, shape.radius, length),
                 end(p_WA, e_1, -axis, shape.radius, 0.0),
                 end(p_WB, e_1, axis, shape.radius, 0.0),
             ]
         case HalfSpace():
-            if not np.allclose(np.asarray(shape.normal)[:2], 0):
-                raise ValueError(
-                    f"HalfSpace.normal is {shape.normal}; only horizontal ones can be seen"
-                )
-            up = float(np.sign(np.asarray(shape.normal)[2]))
+            normal = np.asarray(shape.normal)
+            require(np.allclose(normal[:2], 0), "HalfSpace.normal", "vertical to be drawn", normal)
+            up = float(np.sign(normal[2]))
             low, high = np.asarray(lower)[:2] - GROUND_REACH, np.asarray(upper)[:2] + GROUND_REACH
             corner = np.array([*low, up * shape.offset])
-            x, y = np.eye(3)[0], np.eye(3)[1]
-            return [_flat(corner, x, y, np.array([0, 0, up]), high[0] - low[0], high[1] - low[1])]
+            return [_flat(corner, x, y, up * z, *(high - low))]
 
 
 def _flat(corner: Array, e_u: Array, e_v: Array, n: Array, width: float, height: float) -> Face:
@@ -189,7 +174,7 @@ def _box_faces(box: Box) -> list[Face]:
     faces = []
     for k in range(3):
         for sign in (-1.0, 1.0):
-            # Seen from outside u runs to the right and, on upright faces, v upwards.
+            # Seen from outside u points right and, on upright faces, v upwards.
             u, v = ((1, 2), (0, 2), (0, 1))[k]
             flip = -sign if k == 1 else sign
             e_u, e_v, n = flip * R[:, u], R[:, v], sign * R[:, k]
@@ -199,73 +184,68 @@ def _box_faces(box: Box) -> list[Face]:
 
 
 def _axes(shape: Capsule | Cylinder) -> tuple[Array, Array, Array, float]:
-    """Two unit vectors across the axis, the unit axis and the length [m]."""
-    way = np.asarray(shape.p_WB, float) - np.asarray(shape.p_WA, float)
-    length = float(np.linalg.norm(way))
-    e_1 = perpendicular(way / length)
-    return e_1, np.cross(way / length, e_1), way / length, length
+    """Returns two unit vectors across the axis, the unit axis and the length [m]."""
+    p_AB = np.asarray(shape.p_WB, float) - np.asarray(shape.p_WA, float)
+    length = float(np.linalg.norm(p_AB))
+    e_1 = perpendicular(p_AB / length)
+    return e_1, np.cross(p_AB / length, e_1), p_AB / length, length
+
+
+def _ring(uv: Array, radius: float, e_1: Array, axis: Array) -> tuple[Array, Array]:
+    """Returns unit vectors (N, 3) from an axis to the points of a face, and around the axis."""
+    angle, e_2 = uv[:, :1] / radius, np.cross(axis, e_1)
+    return np.cos(angle) * e_1 + np.sin(angle) * e_2, -np.sin(angle) * e_1 + np.cos(angle) * e_2
 
 
 def _side(p_WA: Array, e_1: Array, axis: Array, radius: float, length: float) -> Face:
-    e_2 = np.cross(axis, e_1)
-
     def at(uv):
-        angle = uv[:, :1] / radius
-        n = np.cos(angle) * e_1 + np.sin(angle) * e_2
-        p = p_WA + uv[:, 1:] * axis + radius * n
-        return p, n, -np.sin(angle) * e_1 + np.cos(angle) * e_2
+        n, around = _ring(uv, radius, e_1, axis)
+        return p_WA + uv[:, 1:] * axis + radius * n, n, around
 
     return Face((2 * np.pi * radius, length), at, curved=(radius, np.inf))
 
 
 def _dome(center: Array, e_1: Array, axis: Array, radius: float, low: float) -> Face:
-    """The part of a sphere that is more than `low` radii along the axis: -1 for all, 0 for half."""
-    e_2 = np.cross(axis, e_1)
+    """The part of a sphere above `low` radii along the axis: -1 for all, 0 for half."""
     first = float(np.arcsin(low))
 
     def at(uv):
-        longitude = uv[:, :1] / radius
         latitude = np.clip(first + uv[:, 1:] / radius, first, np.pi / 2)
-        around = np.cos(longitude) * e_1 + np.sin(longitude) * e_2
-        n = np.cos(latitude) * around + np.sin(latitude) * axis
-        return center + radius * n, n, -np.sin(longitude) * e_1 + np.cos(longitude) * e_2
+        out, around = _ring(uv, radius, e_1, axis)
+        n = np.cos(latitude) * out + np.sin(latitude) * axis
+        return center + radius * n, n, around
 
     size = (2 * np.pi * radius, (np.pi / 2 - first) * radius)
     return Face(size, at, curved=(radius, radius), round=True)
 
 
 def _disc(center: Array, e_1: Array, axis: Array, radius: float, _: float) -> Face:
-    """A flat end: u runs around, v outwards from the middle."""
-    e_2 = np.cross(axis, e_1)
+    """A flat end: u around, v outwards from the middle."""
 
     def at(uv):
-        angle = uv[:, :1] / radius
-        out = np.clip(uv[:, 1:], 0, radius) * (np.cos(angle) * e_1 + np.sin(angle) * e_2)
-        along = -np.sin(angle) * e_1 + np.cos(angle) * e_2
-        return center + out, np.tile(axis, (len(uv), 1)), along
+        out, around = _ring(uv, radius, e_1, axis)
+        p = center + np.clip(uv[:, 1:], 0, radius) * out
+        return p, np.tile(axis, (len(uv), 1)), around
 
     return Face((2 * np.pi * radius, radius), at, curved=(radius, np.inf), round=True)
 
 
-_FloatArray = NDArray[np.float64]
-
-
 @dataclass(frozen=True, eq=False)
 class WorldSpec:
-    """Everything of a procedural world, in W, from which Gaussians, distances and meshes come."""
+    """A procedural world, in W, from which Gaussians, distances and meshes are made."""
 
     name: str
-    lower_W: _FloatArray  # (3,) [m], flyable volume
-    upper_W: _FloatArray  # (3,) [m]
-    solids: list[Solid]  # what can be hit, and is seen
-    p_WS: _FloatArray  # (3,) [m], start
-    p_WG: _FloatArray  # (3,) [m], goal
-    light: Callable[[Esdf], Illumination]  # the light, given a grid of the distances
+    lower_W: Array  # (3,) [m], flyable volume
+    upper_W: Array  # (3,) [m]
+    solids: list[Solid]  # for cameras and collisions
+    p_WS: Array  # (3,) [m], start
+    p_WG: Array  # (3,) [m], goal
+    light: Callable[[Esdf], Illumination]  # given a grid of the distances
     seed: int = 0
     voxel_size: float = 0.15  # [m], of the distance grid
     # Solids so far outside the volume that its ground or walls are always nearer.
     scenery: list[Solid] = field(default_factory=list)
-    # Draws what else is out of reach: leaves overhead, bushes and trees around the volume.
+    # Draws all else out of reach: leaves overhead, bushes and trees around the volume.
     surroundings: Callable[[], list[GaussianScene]] = list
     # Draws all that cameras see; by default the solids in their materials, and the surroundings.
     gaussians: Callable[[Illumination], GaussianScene] | None = None
@@ -279,5 +259,4 @@ class WorldSpec:
 
     @property
     def plan(self) -> FloorPlan:
-        """The volume, seen from above."""
         return FloorPlan(self.lower_W, self.upper_W)

@@ -1,4 +1,4 @@
-"""Shapes turned into flat Gaussians that lie on their surface."""
+"""Surfels: flat Gaussians on surfaces."""
 
 from __future__ import annotations
 
@@ -16,50 +16,46 @@ from splatpilot.systems.splats.scene import GaussianScene
 
 @dataclass(frozen=True, eq=False)
 class FloorPlan:
-    """A flyable volume, seen from above."""
+    """A flyable volume above the ground z = 0."""
 
     lower: NDArray[np.float64]  # (3,) [m], in W
     upper: NDArray[np.float64]  # (3,) [m]
 
     @classmethod
     def of_size(cls, length: float, width: float, height: float) -> FloorPlan:
-        """The volume from x = 0 to length, centered on y = 0, on the ground z = 0, all in [m]."""
+        """Returns the volume from x = 0 to length, centered on y = 0, all in [m]."""
         return cls(np.array([0.0, -width / 2, 0.0]), np.array([length, width / 2, height]))
 
     def outside(self, p: ArrayLike) -> NDArray[np.float64]:
-        """How far p (N, 2 or more) [m] are from the volume in plan, (N,), 0 inside."""
+        """Computes horizontal distances (N,) [m] of p (N, 2 or more) from the volume, 0 inside."""
         p = np.asarray(p)[:, :2]
         beyond = np.maximum(self.lower[:2] - p, p - self.upper[:2])
         return np.linalg.norm(np.clip(beyond, 0, None), axis=1)
 
     def is_faced(self, p: NDArray, n: NDArray) -> NDArray[np.bool_]:
-        """Whether surfaces at p (N, 3) [m] with normals n (N, 3) face any point of the volume."""
+        """Marks surfaces at p (N, 3) [m] with normals n (N, 3) that face a point of the volume."""
         corner = np.where(n > 0, self.upper, self.lower)
         return np.einsum("nk,nk->n", n, corner - p) > 1e-9
 
 
 COVERAGE = 0.62
-"""Standard deviation over spacing at which a single layer of splats leaves no holes: midway between
-four neighbors, 0.71 spacings away, each still covers half of what lies behind it."""
+"""Standard deviation over spacing at which a layer of splats has no holes: midway between four
+neighbors each is still half opaque."""
 
-THICKNESS = 0.001
-"""[m], standard deviation of a splat across its surface."""
+THICKNESS = 0.001  # [m], standard deviation of a splat across its surface
 
 RIM = 1.9
-"""How many standard deviations beyond the centers of its outermost patches a closed layer ends. One
-layer lets half of the light through at 1.4, the two that meet at an edge a little farther out."""
+"""[standard deviations] from the centers of the outermost patches to the edge of a layer. One layer
+is half opaque at 1.4, two that meet at an edge a little farther out."""
 
-_BULGE = 2.0
-"""The same of flat patches around a curved surface, of which many overlap along its outline."""
-
+_BULGE = 2.0  # the same of flat patches around a curved surface, which overlap along its outline
 _RINGS = 0.5, 4.0, 9.0, 16.0, 28.0  # [m], from the volume to the outer edges of rings of ground
-GROUND_REACH = _RINGS[-1]
-"""[m], how far the ground goes on around the volume."""
+GROUND_REACH = _RINGS[-1]  # [m], width of the ground around the volume
 
 
 @dataclass(frozen=True, eq=False)
 class Surfels:
-    """N elliptic patches of surface in W, not colored yet."""
+    """N elliptic patches of surface in W, without color."""
 
     p: NDArray[np.float64]  # (N, 3) [m], centers
     n: NDArray[np.float64]  # (N, 3), unit normals, outwards
@@ -70,17 +66,17 @@ class Surfels:
         return len(self.p)
 
     def __getitem__(self, rows: ArrayLike) -> Self:
-        """The patches of a mask or of indices."""
+        """Selects patches by a mask or indices."""
         return type(self)(*(getattr(self, f.name)[rows] for f in fields(self)))
 
     @classmethod
     def concatenate(cls, parts: list[Surfels]) -> Surfels:
-        """All patches of `parts` in order."""
+        """Joins the patches of `parts`."""
         return cls(*(np.concatenate([getattr(s, f.name) for s in parts]) for f in fields(cls)))
 
 
 def to_gaussians(surfels: Surfels, colors: ArrayLike, opacity: ArrayLike) -> GaussianScene:
-    """The patches as Gaussians of `colors` (N, 3), sRGB, and `opacity`, a number or (N,)."""
+    """Converts patches to Gaussians of `colors` (N, 3), sRGB, and `opacity`, a number or (N,)."""
     N = len(surfels)
     R_WP = np.stack([surfels.t, np.cross(surfels.n, surfels.t), surfels.n], axis=-1)
     return GaussianScene.from_colors(
@@ -93,13 +89,13 @@ def to_gaussians(surfels: Surfels, colors: ArrayLike, opacity: ArrayLike) -> Gau
 
 
 def merge(scenes: list[GaussianScene]) -> GaussianScene:
-    """The Gaussians of all `scenes`, which share one degree of harmonics, in order."""
+    """Joins scenes of one degree of spherical harmonics."""
     names = ("means", "quats", "scales", "opacities", "sh")
     return GaussianScene(*(np.concatenate([getattr(s, n) for s in scenes]) for n in names))
 
 
 def perpendicular(d: ArrayLike) -> NDArray[np.float64]:
-    """A unit vector (..., 3) perpendicular to each d (..., 3)."""
+    """Returns a unit vector (..., 3) perpendicular to each d (..., 3)."""
     d = np.asarray(d, dtype=np.float64)
     helper = np.where(np.abs(d[..., 2:]) < 0.9, (0.0, 0.0, 1.0), (1.0, 0.0, 0.0))
     v = np.cross(helper, d)
@@ -107,7 +103,7 @@ def perpendicular(d: ArrayLike) -> NDArray[np.float64]:
 
 
 def _perpendicular_to_one(d: NDArray[np.float64]) -> NDArray[np.float64]:
-    """`perpendicular` of a single vector (3,), a tenth of the time."""
+    """Computes `perpendicular` of a single vector (3,), ten times as fast."""
     v = np.cross(np.array((0.0, 0.0, 1.0) if abs(d[2]) < 0.9 else (1.0, 0.0, 0.0)), d)
     x, y, z = v.tolist()
     return v / math.sqrt(x * x + y * y + z * z)
@@ -128,8 +124,8 @@ def rectangle(
 def ground_rings(
     plan: FloorPlan, spacings: Sequence[float], rng: np.random.Generator
 ) -> Iterator[NDArray[np.float64]]:
-    """Samples the ground in and around a volume ring by ring: points (N, 2) of each, from the
-    volume to `GROUND_REACH`, at the `spacings` [m] of the five rings."""
+    """Samples the ground of a volume and of five rings around it: points (N, 2) of each, at its
+    spacing [m]."""
     lower, upper = plan.lower[:2], plan.upper[:2]
     inner = 0.0
     for outer, spacing in zip(_RINGS, spacings, strict=True):
@@ -142,10 +138,10 @@ def on_ground(p: ArrayLike, angle: ArrayLike, extent: ArrayLike, height: ArrayLi
     """Lays patches flat on a horizontal plane.
 
     Args:
-        p: (N, 2) [m], where.
+        p: (N, 2) [m].
         angle: (N,) [rad], direction of the first extent, from x toward y.
         extent: (N, 2) or (2,) [m], standard deviations.
-        height: [m], a number or (N,), z of the patches.
+        height: [m], a number or (N,).
     """
     p, angle = np.asarray(p, dtype=np.float64), np.asarray(angle, dtype=np.float64)
     N, zeros = len(p), np.zeros(len(p))
@@ -158,13 +154,13 @@ def on_ground(p: ArrayLike, angle: ArrayLike, extent: ArrayLike, height: ArrayLi
 
 
 def widest(radius: float, inset: float) -> float:
-    """Spacing [m] of patches that lie `inset` [m] inside a surface of a radius [m] of curvature for
-    its outline to be where they let half of the light through; more than 0.3 radii are too many."""
+    """Computes the maximum spacing [m] of flat patches at most `inset` [m] inside a curved surface
+    for which they are half opaque at its outline; radius [m] of curvature."""
     return float(np.sqrt(2 * radius * min(inset, 0.3 * radius)) / (_BULGE * COVERAGE))
 
 
 def inset(surfels: Surfels, across: NDArray[np.float64], radius: ArrayLike) -> Surfels:
-    """Moves flat patches on a curved surface so far inwards that they do not widen its outline.
+    """Moves flat patches on a curved surface inwards so that they do not widen its outline.
 
     Args:
         across: (N,) [m], their standard deviations in the direction of the curvature.
@@ -184,15 +180,13 @@ def tube(
     rng: np.random.Generator,
     taper: float = 1.0,
 ) -> Surfels:
-    """Covers the side of the cylinder from p_A (3,) to p_B (3,) with staggered columns of patches.
+    """Covers the side of the cylinder from p_A (3,) to p_B (3,) with staggered columns of patches,
+    first extent along the axis.
 
     Args:
         radius: [m].
         spacing: [m], around and along the axis.
-        taper: radius at p_B over radius at p_A; other than 1 makes a slender cone.
-
-    Returns:
-        The patches, first extent along the axis.
+        taper: radius at p_B over radius at p_A.
     """
     p_A, p_B = np.asarray(p_A, dtype=np.float64), np.asarray(p_B, dtype=np.float64)
     length = float(np.linalg.norm(p_B - p_A))
@@ -201,7 +195,7 @@ def tube(
     rows = max(1, round(length / spacing[1]))
     i, j = np.meshgrid(np.arange(columns), np.arange(rows), indexing="ij")
     jitter = rng.uniform(-0.25, 0.25, (2, columns, rows))
-    offset = rng.uniform(-0.5, 0.5, (columns, 1))  # no rings: every column starts elsewhere
+    offset = rng.uniform(-0.5, 0.5, (columns, 1))  # of columns, to avoid rings
     angle = ((i + jitter[0]) * (2 * np.pi / columns)).ravel()
     s = np.clip((j + 0.5 + offset + jitter[1]) / rows, 0, 1).ravel()
     width = 1 + (taper - 1) * s

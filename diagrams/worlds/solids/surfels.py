@@ -1,4 +1,4 @@
-"""Solids as Gaussians: flat patches on their faces, in the colors of their materials."""
+"""Draws solids as Gaussians: flat patches on their faces, in the colors of their materials."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +10,7 @@ from splatpilot.diagrams.worlds.solids.solid import (
     Marks,
     Solid,
     WorldSpec,
-    faces_of,
+    cut_faces,
 )
 from splatpilot.diagrams.worlds.solids.surfaces import (
     COVERAGE,
@@ -30,14 +30,10 @@ from splatpilot.systems.splats.scene import GaussianScene
 
 Array = NDArray[np.float64]
 
-RAISED = 0.004
-"""[m], height of marks over the closed layer."""
-
-INSET = 0.006
-"""[m], how deep the closed layer of a curved surface may lie inside it."""
-
-_BURIED = 0.05
-"""[m], depth inside another solid at which a patch cannot be seen any more."""
+_RAISED = 0.004  # [m], height of marks over the closed layer
+_INSET = 0.006  # [m], maximum depth of the closed layer of a curved surface inside it
+_BURIED = 0.05  # [m], depth inside another solid at which a patch is hidden
+_CORNERS = (0.4, 0.7), (-0.4, -0.7)  # [standard deviations], samples of a patch about its middle
 
 
 def draw(spec: WorldSpec, solids: list[Solid], light: Illumination) -> GaussianScene:
@@ -57,43 +53,37 @@ def draw(spec: WorldSpec, solids: list[Solid], light: Illumination) -> GaussianS
 def _patches(
     solid: Solid, spec: WorldSpec, rng: np.random.Generator
 ) -> tuple[Surfels, Array, Array]:
-    """Surfels of one solid with their albedo (N, 3) and opacity (N,)."""
+    """Returns patches of one solid, their albedo (N, 3) and opacity (N,)."""
     material = MATERIALS[solid.material]
     is_ground = isinstance(solid.shape, HalfSpace)
-    layers = []  # of patches, opacity, and the points at which the pattern is asked
-    for face in faces_of(solid.shape, spec.lower_W, spec.upper_W):
+    layers = []  # of patches, opacity, face and coordinates at which the pattern is sampled
+    for face in cut_faces(solid.shape, spec.lower_W, spec.upper_W):
         if is_ground:
             uv, extent = _ground(face, material.spacing, spec, rng)
-        elif face.round:
-            uv, extent = _spiral(face, material.spacing, rng)
         else:
-            uv, extent = _lattice(face, material.spacing, rng)
+            uv, extent = (_spiral if face.round else _lattice)(face, material.spacing, rng)
         facing = spec.plan.is_faced(*face.at(uv)[:2])
         if not facing.any():
             continue
         uv, extent = uv[facing], extent[facing]
-        p, n, t = face.at(uv)
-        # Means of the pattern at two places: thin lines tint all the patches they cross instead of
-        # dotting some.
-        near = [uv + corner * extent for corner in _CORNERS]
-        layer = Surfels(p, n, t, extent)
+        layer = Surfels(*face.at(uv), extent)
         if _bulges(face):
             layer = inset(layer, extent[:, 0], face.curved[0])
-        layers.append((layer, 0.99, face, near))
+        # Means of the pattern at two points: thin lines tint all the patches they cross.
+        layers.append((layer, 0.99, face, [uv + corner * extent for corner in _CORNERS]))
         for marks in () if face.round else material.marks:
             low, high = np.zeros(2), np.array(face.size)
             if is_ground:
                 low, high = np.full(2, GROUND_REACH - 0.5), high - (GROUND_REACH - 0.5)
             uv, extent = _place_marks(marks, low, high, rng)
             p, n, t = face.at(uv)
-            raised = Surfels(p + RAISED * n, n, t, extent)
-            layers.append((raised, 0.93, face, [uv]))
+            layers.append((Surfels(p + _RAISED * n, n, t, extent), 0.93, face, [uv]))
     if not layers:
         zero = np.zeros((0, 3))
         return Surfels(zero, zero, zero, zero[:, :2]), zero, zero[:, 0]
     uv = np.concatenate([q for *_, samples in layers for q in samples])
     p = np.concatenate([face.at(q)[0] for *_, face, samples in layers for q in samples])
-    colors = solid.albedo(uv, p)  # all at once: patterns cost more by the call than by the point
+    colors = solid.albedo(uv, p)  # all at once: calls of patterns are expensive
     albedo, start = [], 0
     for patches, _, _, samples in layers:
         stop = start + len(patches) * len(samples)
@@ -105,63 +95,54 @@ def _patches(
     return Surfels.concatenate([patches for patches, *_ in layers]), tinted, opacity
 
 
-_CORNERS = ((0.4, 0.7), (-0.4, -0.7))
-"""Places about the middle of a patch, in standard deviations."""
-
-
 def _lattice(face: Face, spacing: float, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Coordinates uv (N, 2) [m] of a jittered lattice that divides the face evenly, and standard
-    deviations (N, 2) [m] with which it leaves no holes and ends where the face does."""
+    """Returns coordinates uv (N, 2) [m] of a jittered lattice on the face, and standard deviations
+    (N, 2) [m] with which it has no holes and ends at the edge."""
     size, spacings = np.array(face.size), np.full(2, spacing)
     if _bulges(face):
-        spacings[0] = _finest(face, spacing)
+        spacings[0] = min(spacing, widest(face.curved[0], _INSET))
     n = np.maximum(np.ceil(size / spacings - 1e-6).astype(int), 1)
     step = size / n
     i, j = np.meshgrid(np.arange(n[0]), np.arange(n[1]), indexing="ij")
     uv = np.stack([i + 0.5, j + 0.5], axis=-1).reshape(-1, 2)
     uv = (uv + rng.uniform(-0.2, 0.2, uv.shape)) * step
     extent = np.minimum(COVERAGE * step, np.minimum(uv, size - uv) / RIM)
-    if _bulges(face):  # it closes upon itself
+    if _bulges(face):  # no edge around
         extent[:, 0] = COVERAGE * step[0]
     return uv, extent
 
 
 def _bulges(face: Face) -> bool:
-    """Whether a face is curved, and so no disc."""
+    """Checks that a face is curved, not flat or a disc."""
     return np.isfinite(face.curved[0]) and not (face.round and np.isinf(face.curved[1]))
-
-
-def _finest(face: Face, spacing: float) -> float:
-    """The spacing [m] of patches around a curved face."""
-    return min(spacing, widest(face.curved[0], INSET))
 
 
 def _place_marks(
     marks: Marks, low: Array, high: Array, rng: np.random.Generator
 ) -> tuple[Array, Array]:
-    """Coordinates uv (N, 2) [m] of the marks between the corners `low` and `high` (2,) of a face,
-    and their standard deviations (N, 2) [m]; they stand where the pattern has them."""
+    """Returns coordinates uv (N, 2) [m] of the marks of a pattern between the corners `low` and
+    `high` (2,) of a face, and their standard deviations (N, 2) [m]."""
     cell = np.array(marks.cell)
     first, last = np.floor(low / cell).astype(int), np.ceil(high / cell).astype(int)
     i, j = (np.arange(a, b) for a, b in zip(first, last, strict=True))
-    places = np.stack(np.meshgrid(i, j, indexing="ij"), axis=-1).reshape(-1, 2) + marks.first
-    extent = np.tile(cell * marks.fill, (len(places), 1))
+    cells = np.stack(np.meshgrid(i, j, indexing="ij"), axis=-1).reshape(-1, 2) + marks.first
+    extent = np.tile(cell * marks.fill, (len(cells), 1))
     if marks.jitter:
-        places = places + rng.uniform(-marks.jitter, marks.jitter, places.shape)
+        cells = cells + rng.uniform(-marks.jitter, marks.jitter, cells.shape)
         extent = extent * rng.uniform(0.6, 1.25, extent.shape)
-    uv = places * cell
-    room = np.minimum(uv - low, high - uv)  # to the edge
-    on_it = (room > 0.5 * extent).all(axis=1)
-    return uv[on_it], np.minimum(extent, room / 2)[on_it]
+    uv = cells * cell
+    to_edge = np.minimum(uv - low, high - uv)
+    inside = (to_edge > 0.5 * extent).all(axis=1)
+    return uv[inside], np.minimum(extent, to_edge / 2)[inside]
 
 
 def _spiral(face: Face, spacing: float, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Coordinates (N, 2) and standard deviations (N, 2) that cover a round face evenly, along a
-    spiral of golden angles: equal steps in area from the rim to the pole."""
+    """Returns coordinates (N, 2) and standard deviations (N, 2) that cover a round face evenly:
+    a spiral of golden angles with equal steps in area from the rim to the pole."""
     radius, (around, height) = face.curved[0], face.size
     flat = not _bulges(face)
     if not flat:
-        spacing = _finest(face, spacing)
+        spacing = min(spacing, widest(radius, _INSET))
     whole = height > 0.4 * around  # a full sphere, not half
     area = np.pi * radius**2 * (1 if flat else 4 if whole else 2)
     N = max(6, round(area / spacing**2))
@@ -182,7 +163,7 @@ def _spiral(face: Face, spacing: float, rng: np.random.Generator) -> tuple[Array
 def _ground(
     face: Face, spacing: float, spec: WorldSpec, rng: np.random.Generator
 ) -> tuple[Array, Array]:
-    """Covers a horizontal plane: finely in the volume, coarsely far out."""
+    """Covers a horizontal plane, coarser outside the volume."""
     corner = spec.lower_W[:2] - GROUND_REACH
     uv, extent = [], []
     coarser = 1.0, 2.0, 4.0, 7.0, 12.0
@@ -194,13 +175,10 @@ def _ground(
 
 
 def _is_seen(spec: WorldSpec, surfels: Surfels) -> NDArray[np.bool_]:
-    """Whether a patch faces the volume and lies in no other solid."""
+    """Marks patches that face the volume and are in no other solid."""
     seen = spec.plan.is_faced(surfels.p, surfels.n)
-    field = AnalyticDistanceField(
-        [solid.shape for solid in spec.solids],
-        spec.lower_W - 40.0,
-        spec.upper_W + 40.0,
-    )
+    shapes = [solid.shape for solid in spec.solids]
+    field = AnalyticDistanceField(shapes, spec.lower_W - 40.0, spec.upper_W + 40.0)
     rows = np.flatnonzero(seen)
     seen[rows] = field.distance(surfels.p[rows]) > -_BURIED
     return seen
@@ -214,14 +192,6 @@ def build(spec: WorldSpec) -> World:
     if spec.gaussians is not None:
         gaussians = spec.gaussians(light)
     else:
-        solids = draw(spec, spec.solids, light)
-        gaussians = merge([solids, *spec.surroundings()])
-    return World(
-        name=spec.name,
-        gaussians=gaussians,
-        distance_field=field,
-        esdf=esdf,
-        background=(float(light.haze[0]), float(light.haze[1]), float(light.haze[2])),
-        p_WS=spec.p_WS,
-        p_WG=spec.p_WG,
-    )
+        gaussians = merge([draw(spec, spec.solids, light), *spec.surroundings()])
+    red, green, blue = light.haze.tolist()
+    return World(spec.name, gaussians, field, esdf, (red, green, blue), spec.p_WS, spec.p_WG)

@@ -1,8 +1,6 @@
-"""Procedural textures: colors as pure functions of position, seeded, without image files.
+"""Procedural textures: colors as pure functions of position.
 
-Every function is vectorized over leading axes, written (...), and gives the same bits for the same
-input. Colors are sRGB in 0 to 1. Positions are in meters; scale them before the call to stretch a
-pattern.
+Colors are sRGB in 0 to 1. Positions are in meters; scale them before the call to stretch a pattern.
 """
 
 import numpy as np
@@ -14,24 +12,22 @@ _PRIMES = np.array([0x9E3779B1, 0x85EBCA77, 0xC2B2AE3D], dtype=np.uint32)
 
 
 def hash_unit(cell: ArrayLike, seed: int = 0) -> Array:
-    """Returns one pseudo-random number in [0, 1) for every lattice cell (..., d), d = 1 to 3.
+    """Returns a pseudo-random number in [0, 1) for every lattice cell (..., d), d = 1 to 3.
 
-    The coordinates, each times a large odd number, are folded into 32 bits, then mixed by
-    multiplications and xor-shifts until every input bit reaches every output bit (the constants are
-    those of the `lowbias32` mixer).
+    The coordinates, each times a large odd number, are mixed by the `lowbias32` hash.
     """
     cell = np.asarray(cell).astype(np.int64).astype(np.uint32)  # wraps negative cells
     h = np.full(cell.shape[:-1], _seeded(seed), dtype=np.uint32)
     for axis in range(cell.shape[-1]):
         h = _mix_bits(h ^ (cell[..., axis] * _PRIMES[axis]))
-    return _unit_of(h)
+    return _unit(h)
 
 
 def _seeded(seed: int) -> int:
     return (seed * 0x27D4EB2F + 0x165667B1) & 0xFFFFFFFF
 
 
-def _unit_of(h: NDArray[np.uint32]) -> Array:
+def _unit(h: NDArray[np.uint32]) -> Array:
     return (h >> np.uint32(8)).astype(np.float32) * np.float32(2**-24)
 
 
@@ -42,14 +38,13 @@ def _mix_bits(h: NDArray[np.uint32]) -> NDArray[np.uint32]:
 
 
 def value_noise(p: ArrayLike, seed: int = 0) -> Array:
-    """Smooth noise in [-1, 1] with a period of about two units, at the points (..., d), d = 1 to 3.
+    """Computes smooth noise in [-1, 1] with a period of about two units at (..., d), d = 1 to 3.
 
-    Random values on the integer lattice, blended with the fade 6 t^5 - 15 t^4 + 10 t^3, whose first
-    and second derivatives vanish at the lattice.
+    Random values on the integer lattice are blended with 6 t^5 - 15 t^4 + 10 t^3, whose first and
+    second derivatives vanish at the lattice.
     """
     p = np.asarray(p, dtype=np.float64)
-    # Of each corner of a cell `hash_unit` and the product of its fades, axis by axis, so that
-    # corners share what they have in common.
+    # Weight and hash of each corner of a cell, axis by axis.
     corners = [(np.float32(1.0), np.uint32(_seeded(seed)))]
     for along, prime in zip(p.reshape(-1, p.shape[-1]).T, _PRIMES, strict=False):
         cell = np.floor(along)
@@ -58,14 +53,14 @@ def value_noise(p: ArrayLike, seed: int = 0) -> Array:
         near = cell.astype(np.int64).astype(np.uint32) * prime
         ends = (1 - fade, near), (fade, near + prime)
         corners = [
-            (weight * part, _mix_bits(h ^ place)) for weight, h in corners for part, place in ends
+            (weight * part, _mix_bits(h ^ end)) for weight, h in corners for part, end in ends
         ]
-    total = sum(weight * _unit_of(h) for weight, h in corners)
+    total = sum(weight * _unit(h) for weight, h in corners)
     return (2 * total - 1).reshape(p.shape[:-1])
 
 
 def fbm(p: ArrayLike, octaves: int, seed: int = 0) -> Array:
-    """Sum of octaves of `value_noise`, (...,) in [-1, 1], each twice as fine and half as strong."""
+    """Sums octaves of `value_noise`, (...,) in [-1, 1], each twice as fine and half as strong."""
     p = np.asarray(p, dtype=np.float64)
     total = np.zeros(p.shape[:-1], dtype=np.float32)
     for octave in range(octaves):
@@ -86,7 +81,7 @@ def mix(a: ArrayLike, b: ArrayLike, t: ArrayLike) -> Array:
 
 
 def ramp(colors: ArrayLike, t: ArrayLike) -> Array:
-    """Piecewise linear palette: t (...,) in [0, 1] runs through `colors` (M, 3)."""
+    """Interpolates a palette: t (...,) in [0, 1] runs through `colors` (M, 3)."""
     colors = np.asarray(colors, dtype=np.float32)
     t, position = np.asarray(t, dtype=np.float32), np.linspace(0, 1, len(colors))
     return np.stack([np.interp(t, position, c) for c in colors.T], axis=-1).astype(np.float32)
@@ -98,7 +93,7 @@ OAK, PINE, BIRCH = range(3)
 
 
 def bark(species: int, p: ArrayLike) -> Array:
-    """Color of bare bark at p (..., 3) of the species OAK, PINE or BIRCH."""
+    """Returns the color of bare bark at p (..., 3) of the species OAK, PINE or BIRCH."""
     p = np.asarray(p, dtype=np.float64)
     patches = fbm(p * (1.6, 1.6, 0.9), 3, seed=11)
     grain = fbm(p * (24, 24, 5), 2, seed=12)
@@ -120,7 +115,7 @@ def bark(species: int, p: ArrayLike) -> Array:
 
 
 def fissure(species: int, p: ArrayLike) -> Array:
-    """Color of the bottom of the cracks between the plates of the bark, at p (..., 3)."""
+    """Returns the color in the cracks between the plates of the bark at p (..., 3)."""
     if species == BIRCH:
         return bark(BIRCH, p)
     tint = (0.60, 0.53, 0.48) if species == PINE else (0.50, 0.47, 0.44)
@@ -128,7 +123,7 @@ def fissure(species: int, p: ArrayLike) -> Array:
 
 
 def moss(p: ArrayLike) -> Array:
-    """Color of moss at p (..., 3)."""
+    """Returns the color of moss at p (..., 3)."""
     p = np.asarray(p, dtype=np.float64)
     return ramp(
         [(0.19, 0.24, 0.10), (0.31, 0.36, 0.15), (0.45, 0.46, 0.22)],
@@ -137,7 +132,7 @@ def moss(p: ArrayLike) -> Array:
 
 
 def stone(p: ArrayLike) -> Array:
-    """Color of weathered rock at p (..., 3)."""
+    """Returns the color of weathered rock at p (..., 3)."""
     p = np.asarray(p, dtype=np.float64)
     gray = ramp(
         [(0.24, 0.24, 0.23), (0.36, 0.35, 0.33), (0.48, 0.46, 0.43)],
@@ -147,7 +142,7 @@ def stone(p: ArrayLike) -> Array:
 
 
 def forest_floor(p: ArrayLike) -> tuple[Array, Array]:
-    """Color of soil, needles and moss at p (..., 2), and how mossy it is, (...,) in [0, 1]."""
+    """Returns the color of soil, needles and moss at p (..., 2), and the weight of moss (...,)."""
     p = np.asarray(p, dtype=np.float64)
     litter = ramp(
         [(0.25, 0.18, 0.12), (0.40, 0.29, 0.19), (0.53, 0.40, 0.26)],
@@ -159,23 +154,16 @@ def forest_floor(p: ArrayLike) -> tuple[Array, Array]:
 
 
 def fallen_leaf(p: ArrayLike) -> Array:
-    """Color of the dead leaf at p (..., 2): one color per cell of 5 mm, so one per leaf."""
-    pick = hash_unit(np.floor(np.asarray(p) / 0.005), seed=51)
-    return ramp(
-        [
-            (0.30, 0.19, 0.11),
-            (0.47, 0.30, 0.16),
-            (0.62, 0.42, 0.21),
-            (0.70, 0.52, 0.27),
-            (0.55, 0.25, 0.11),
-            (0.74, 0.61, 0.26),
-        ],
-        pick,
-    )
+    """Returns the color of the dead leaf at p (..., 2), one per cell of 5 mm."""
+    palette = [
+        *((0.30, 0.19, 0.11), (0.47, 0.30, 0.16), (0.62, 0.42, 0.21)),
+        *((0.70, 0.52, 0.27), (0.55, 0.25, 0.11), (0.74, 0.61, 0.26)),
+    ]
+    return ramp(palette, hash_unit(np.floor(np.asarray(p) / 0.005), seed=51))
 
 
 def leaf(species: int, p: ArrayLike) -> Array:
-    """Color of living leaves or needles at p (..., 3)."""
+    """Returns the color of living leaves or needles at p (..., 3)."""
     p = np.asarray(p, dtype=np.float64)
     palettes = {
         OAK: [(0.20, 0.32, 0.09), (0.34, 0.46, 0.14), (0.50, 0.58, 0.20)],

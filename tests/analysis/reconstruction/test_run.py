@@ -1,5 +1,3 @@
-"""From the folder of a capture to a measured scene."""
-
 import json
 from dataclasses import replace
 
@@ -24,8 +22,8 @@ SMALL = ReconstructConfig(
 
 @pytest.fixture
 def folder(seen_room, tmp_path):
-    """The room in nerfstudio's format, overexposed, with a focal length that is twice the right
-    one and depth in units of which there are 500 a meter, which the file does not say."""
+    """The room in nerfstudio's format, overexposed, with twice the right focal length and depth in
+    units of 1 / 500 m, which the file does not state."""
     _, capture = seen_room
     path = tmp_path / "capture"
     path.mkdir()
@@ -37,13 +35,8 @@ def folder(seen_room, tmp_path):
         depth = np.round(500 * frame.depth).astype(np.uint16)
         cv2.imwrite(str(path / f"{i}.depth.png"), depth)
         matrix = frame.X_WC.GetAsMatrix4() @ np.diag([1.0, -1, -1, 1])
-        frames.append(
-            {
-                "file_path": f"{i}.png",
-                "depth_file_path": f"{i}.depth.png",
-                "transform_matrix": matrix.tolist(),
-            }
-        )
+        files = {"file_path": f"{i}.png", "depth_file_path": f"{i}.depth.png"}
+        frames.append(files | {"transform_matrix": matrix.tolist()})
     content = {"w": 64, "h": 48, "fl_x": 64.0, "cx": 32.0, "cy": 24.0, "frames": frames}
     (path / "transforms.json").write_text(json.dumps(content))
     return path
@@ -51,17 +44,19 @@ def folder(seen_room, tmp_path):
 
 @pytest.fixture
 def config() -> ReconstructConfig:
-    """What makes the capture right."""
-    said = CaptureConfig(intrinsics=[32.0, 32.0, 32.0, 24.0], depth_unit=500.0)
-    return replace(SMALL, capture=said)
+    """The settings that the capture needs."""
+    settings = CaptureConfig(intrinsics=[32.0, 32.0, 32.0, 24.0], depth_unit=500.0)
+    return replace(SMALL, capture=settings)
 
 
-def test_what_was_said_of_a_capture_stays_with_its_scene(folder, config, tmp_path, capsys):
+def test_settings_of_a_capture_stay_with_its_scene(folder, config, tmp_path, capsys):
     scene = tmp_path / "scene"
-    _, measures = run(capture=folder, out=scene, config=config)
+    summary, metrics = run(capture=folder, out=scene, config=config)
+    assert summary.held_out is not None
+    assert summary.held_out.means()["psnr_db"] == pytest.approx(metrics.mean("psnr_db"), abs=0.01)
     written = (scene / "metrics.json").read_bytes()
-    assert json.loads(written) == measures.as_json()
-    assert (measures.mean("depth_relative") or 1) < 0.15
+    assert json.loads(written) == metrics.as_json()
+    assert (metrics.mean("depth_relative") or 1) < 0.15
     metadata = read_scene_metadata(scene)
     assert metadata.capture_settings == ["intrinsics=[32.0, 32.0, 32.0, 24.0]", "depth_unit=500.0"]
     assert read_capture_of(scene, metadata).K[0, 0] == 32
@@ -79,23 +74,14 @@ def test_what_was_said_of_a_capture_stays_with_its_scene(folder, config, tmp_pat
     assert f"made from              nerfstudio capture {folder}, 16 frames" in printed
     assert "image gains" in printed and "seen free [m^3]" in printed
 
-    (scene / "scene.yaml").write_text(
-        (scene / "scene.yaml").read_text().replace("depth_unit", "depth_units")
-    )
+    text = (scene / "scene.yaml").read_text()
+    (scene / "scene.yaml").write_text(text.replace("depth_unit", "depth_units"))
     assert main(["scene", "measure", str(scene), "--overwrite"]) == 1
     message = capsys.readouterr().err
     assert "scene.yaml: capture_settings: " in message and "did you mean depth_unit" in message
 
 
-def test_there_is_one_held_out_psnr(folder, config, tmp_path):
-    summary, measures = run(capture=folder, out=tmp_path / "scene", config=config)
-    assert summary.held_out is not None
-    assert summary.held_out.means()["psnr_db"] == pytest.approx(measures.mean("psnr_db"), abs=0.01)
-
-
-def test_what_is_doubtful_about_a_capture_is_said_at_once_and_in_the_end(
-    folder, config, tmp_path, capsys
-):
+def test_doubts_about_a_capture_are_printed_first_and_last(folder, config, tmp_path, capsys):
     config.capture.depth_unit = 2500.0
     summary, _ = run(capture=folder, out=tmp_path / "scene", config=replace(config, iterations=2))
     doubt = summary.warnings[0]
@@ -104,7 +90,7 @@ def test_what_is_doubtful_about_a_capture_is_said_at_once_and_in_the_end(
     assert printed.startswith(f"warning: {doubt}\n") and printed.count(doubt) == 2
 
 
-def test_refusals(tmp_path, config, capsys):
+def test_invalid_captures_are_refused(tmp_path, config, capsys):
     (tmp_path / "file").write_text("")
     with pytest.raises(ValueError, match="must be new, empty or a scene"):
         run(capture=tmp_path / "nowhere", out=tmp_path, config=config)
@@ -127,8 +113,8 @@ def test_a_mesh_is_rendered_and_reconstructed(opengl, tmp_path, capsys):
         "render.width=64",
         "render.height=48",
         "render.path=[[-2, 0, 0], [2, 0, 0]]",
-        "render.yaws=[0, 90, 180, -90]",
-        "iterations=20",
+        "render.yaws=[0, 180]",
+        "iterations=5",
         "image_width=0",
         "initial_gaussians=2000",
     ):

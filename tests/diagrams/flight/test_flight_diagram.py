@@ -146,7 +146,7 @@ def test_scenarios_out_of_range_are_refused(post_world):
             {"sensors": {"down": OnboardCamera()}},
             "the sensor 'down' must be a Drake system",
         ),
-        (WORLDS, {}, "what makes ForestConfig gave NoneType; it must return a World"),
+        (WORLDS, {}, "make for ForestConfig must be a World, got NoneType"),
     ],
 )
 def test_what_makes_nothing_is_named(post_world, monkeypatch, registry, field, message):

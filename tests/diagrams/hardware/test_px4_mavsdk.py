@@ -1,6 +1,7 @@
-"""The bridge flies a vehicle that is not ours: MAVSDK's server plugins, which answer commands, keep
-modes and read setpoints as MAVSDK's authors understand MAVLink."""
+"""The bridge flies a vehicle of MAVSDK's server plugins, which answer commands, keep modes and read
+setpoints as MAVSDK's authors understand MAVLink."""
 
+import contextlib
 import json
 import socket
 import time
@@ -8,7 +9,6 @@ from collections.abc import Callable
 
 import lcm
 import numpy as np
-import pytest
 from mavsdk import ComponentType, Configuration, Mavsdk
 from mavsdk.connection_result import ConnectionResult
 from mavsdk.plugins.action_server.action_server import (
@@ -40,7 +40,7 @@ START, GOAL = [1.0, 2.0, 2.0], [9.0, 6.0, 2.0]
 
 
 class MavsdkVehicle:
-    """A vehicle that hovers at START, nose to the north, whatever it is told."""
+    """A vehicle that hovers at START, heading north."""
 
     def __init__(self):
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
@@ -69,36 +69,28 @@ class MavsdkVehicle:
     def tell(self) -> None:
         x, y, z = START
         z += 1e-4 * np.sin(time.monotonic())  # An estimate is never the same for long.
-        place = PositionVelocityNed(PositionNed(x, -y, -z), VelocityNed(0.0, 0.0, 0.0))
-        self._telemetry.publish_position_velocity_ned(place)
+        position = PositionVelocityNed(PositionNed(x, -y, -z), VelocityNed(0.0, 0.0, 0.0))
+        self._telemetry.publish_position_velocity_ned(position)
         fields = dict.fromkeys(("q2", "q3", "q4", "rollspeed", "pitchspeed", "yawspeed"), 0.0)
         fields |= {"q1": 1.0, "time_boot_ms": round(1e3 * (time.monotonic() - self._began))}
         self._direct.send_message(
             MavlinkMessage("ATTITUDE_QUATERNION", 1, 1, 0, 0, json.dumps(fields))
         )
 
-    def destroy(self) -> None:
+    def close(self) -> None:
         self._mavsdk.destroy()
 
 
-@pytest.fixture
-def inbox():
-    made = UdpInbox(UdpConfig(port=0))
-    yield made
-    made.close()
+def test_mavsdks_vehicle_is_engaged_armed_flown_and_landed(post_world):
+    vehicle, inbox = MavsdkVehicle(), UdpInbox(UdpConfig(port=0))
+    with contextlib.closing(inbox), contextlib.closing(vehicle):
+        fly(post_world, inbox, vehicle)
 
 
-@pytest.fixture
-def vehicle():
-    made = MavsdkVehicle()
-    yield made
-    made.destroy()
-
-
-def test_mavsdks_vehicle_is_engaged_armed_flown_and_landed(post_world, inbox, vehicle):
+def fly(post_world, inbox, vehicle) -> None:
     memory = lcm.LCM("memq://")
     scenario = Scenario(policy=policy_named("straight", 1.0), start=START, goal=GOAL)
-    hardware = HardwareConfig(failsafe=FailsafeConfig(patience=2.0))
+    hardware = HardwareConfig(failsafe=FailsafeConfig(patience=1.0))
     commander = Px4CommanderConfig(engage=True, arm=True)
     config = Px4Config(vehicle_port=vehicle.port, commander=commander)
     bridge = Simulator(BuildHardwareDiagram(scenario, post_world, memory, hardware))
@@ -117,8 +109,8 @@ def test_mavsdks_vehicle_is_engaged_armed_flown_and_landed(post_world, inbox, ve
             time.sleep(0.01)
 
     run_until(lambda: len(vehicle.armed) > 0, tells=True)
-    asked = time.monotonic()
-    run_until(lambda: time.monotonic() > asked + 2.0, tells=True)
+    armed = time.monotonic()
+    run_until(lambda: time.monotonic() > armed + 2.0, tells=True)
     assert (vehicle.modes, vehicle.armed) == ([FlightMode.OFFBOARD], [True])
     sent = np.array([[s["vx"], s["vy"], s["vz"]] for s in vehicle.setpoints[-50:]])
     toward = np.subtract(GOAL, START) * [1, -1, -1]

@@ -1,5 +1,3 @@
-"""Diagrams that keep up with the wall clock, and some that do not."""
-
 import time
 
 import numpy as np
@@ -28,8 +26,7 @@ class Worker(LeafSystem):
 
 
 def ran(needs: float, until: float = 0.2):
-    """Updates that are missing, overruns as returned and as the diagram was told, how long it took,
-    and by how much its clock is off at the end."""
+    """Missing updates, overruns as returned and as input, duration, and the clock's final error."""
     builder = DiagramBuilder()
     clock, worker = UnixClock(), Worker(needs)
     builder.AddNamedSystem("clock", clock)
@@ -45,13 +42,10 @@ def ran(needs: float, until: float = 0.2):
         looked.append(now)
         return now >= until - 1e-9
 
-    overruns = run_in_real_time(
-        simulator,
-        diagram,
-        0.01,
-        over,
-        ready=lambda: started.append(time.monotonic()),
-    )
+    def ready() -> None:
+        started.append(time.monotonic())
+
+    overruns = run_in_real_time(simulator, diagram, 0.01, over, ready)
     took = time.monotonic() - started[0]
     unix = clock.get_output_port().Eval(clock.GetMyContextFromRoot(root))[0]
     told = worker.get_input_port().Eval(worker.GetMyContextFromRoot(root))[0]
@@ -74,5 +68,5 @@ def test_overruns_are_counted_and_leave_nothing_out(needs):
     assert overruns == told >= 1
     assert took >= max(0.2, needs + 0.15 - MAX_LAG)
     assert behind >= -1e-3
-    # All that was lost beyond what is allowed has been left behind: only waiting remains.
+    # Lag beyond the limit has been left behind: only waiting remains.
     assert behind <= MAX_LAG + 0.1

@@ -1,7 +1,9 @@
 import numpy as np
+from scipy.spatial import KDTree
 
 from splatpilot.diagrams.worlds.building_blocks import (
     hall,
+    poisson_disk,
     roof,
     signs_in,
     start_and_goal,
@@ -10,6 +12,7 @@ from splatpilot.diagrams.worlds.solids.surfaces import FloorPlan
 from splatpilot.systems.collision.shapes import AnalyticDistanceField
 
 PLOT = FloorPlan.of_size(12.0, 8.0, 4.0)
+LOWER, UPPER = np.array([-3.0, 2.0]), np.array([27.0, 14.0])
 
 
 def _distance(solids, p_W: np.ndarray) -> np.ndarray:
@@ -42,3 +45,25 @@ def test_start_and_goal_are_at_the_ends_and_at_the_heights_asked_for():
     np.testing.assert_allclose(ends[..., 0], np.tile((1.5, 10.5), (50, 1)))
     assert np.abs(ends[..., 1]).max() < 4 and np.ptp(ends[..., 1]) > 2
     assert ends[..., 2].min() >= 0.5 and ends[..., 2].max() <= 0.7
+
+
+def test_no_two_points_are_closer_than_the_spacing():
+    for seed in range(5):
+        points = poisson_disk(LOWER, UPPER, 1.3, np.random.default_rng(seed))
+        distance, _ = KDTree(points).query(points, k=2)
+        assert distance[:, 1].min() >= 1.3
+        assert (points >= LOWER).all() and (points <= UPPER).all()
+
+
+def test_the_rectangle_is_filled():
+    points = poisson_disk(LOWER, UPPER, 1.3, np.random.default_rng(0))
+    places = np.random.default_rng(1).uniform(LOWER, UPPER, (5000, 2))
+    distance, _ = KDTree(points).query(places)
+    assert distance.max() < 1.5 * 1.3
+    assert np.mean(distance < 1.3) > 0.99
+
+
+def test_the_points_follow_from_the_generator():
+    a, b, c = (poisson_disk(LOWER, UPPER, 2.0, np.random.default_rng(s)) for s in (7, 7, 8))
+    np.testing.assert_array_equal(a, b)
+    assert a.shape != c.shape or (a != c).any()

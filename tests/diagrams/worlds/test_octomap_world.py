@@ -2,9 +2,11 @@ import numpy as np
 import pytest
 
 from splatpilot.diagrams.worlds import octomap_world as module
-from splatpilot.diagrams.worlds.octomap_world import OctomapConfig, octomap_world
+from splatpilot.diagrams.worlds.octomap_world import OctomapConfig, octomap_world, voxel_gaussians
 from splatpilot.diagrams.worlds.scene_folder import SceneConfig
-from splatpilot.diagrams.worlds.world_registry import place_config
+from splatpilot.diagrams.worlds.solids.shading import Daylight
+from splatpilot.diagrams.worlds.world_registry import scene_config
+from splatpilot.systems.collision.esdf_build import esdf_from_occupancy
 from splatpilot.systems.collision.octomap import Octomap
 from splatpilot.systems.common.provenance import InfeasibleFlightError
 
@@ -34,12 +36,12 @@ def test_large_maps_are_cropped_about_free_space(in_map, monkeypatch, caplog):
     whole = in_map(octomap)
     np.testing.assert_allclose(whole.esdf.upper_W - whole.esdf.lower_W, [20, 10, 4])
     assert not caplog.text
-    monkeypatch.setattr(module, "_MOST_VOXELS", 80 * 40 * 16 / 4)
+    monkeypatch.setattr(module, "_MAX_VOXELS", 80 * 40 * 16 / 4)
     world = in_map(octomap)
     np.testing.assert_allclose(world.esdf.upper_W - world.esdf.lower_W, [10, 5, 4], atol=0.5)
     middle = 0.5 * (world.esdf.lower_W + world.esdf.upper_W)
     np.testing.assert_allclose(middle, [10, 5, 2], atol=0.3)
-    assert "map.bt is large: flown in is the part from [5." in caplog.text
+    assert "map.bt is large: using the part from [5." in caplog.text
     named = in_map(octomap, lower=[0, 0, 0], upper=[10, 10, 4])
     np.testing.assert_allclose(named.esdf.upper_W, [10, 10, 4])
 
@@ -65,5 +67,15 @@ def test_maps_without_free_space_are_refused(in_map):
 
 
 def test_places_are_told_apart_by_suffix(tmp_path):
-    assert place_config(tmp_path / "a.bt") == OctomapConfig(path=str(tmp_path / "a.bt"))
-    assert place_config(tmp_path / "a.spz") == SceneConfig(path=str(tmp_path / "a.spz"))
+    assert scene_config(tmp_path / "a.bt") == OctomapConfig(path=str(tmp_path / "a.bt"))
+    assert scene_config(tmp_path / "a.spz") == SceneConfig(path=str(tmp_path / "a.spz"))
+
+
+def test_octomap_is_seen_where_it_is_occupied():
+
+    occupied = np.zeros((12, 12, 12), bool)
+    occupied[4:8, 4:8, :] = True
+    esdf = esdf_from_occupancy(occupied, np.zeros_like(occupied), np.zeros(3), 0.5)
+    scene = voxel_gaussians(esdf, Daylight.sample(np.random.default_rng(0)))
+    assert len(scene) == 12 * (16 - 4)  # the column's outer voxels
+    assert (np.abs(esdf.distance(scene.means.astype(float))) <= 0.5).all()

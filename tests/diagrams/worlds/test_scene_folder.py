@@ -2,10 +2,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from pydrake.math import RigidTransform, RollPitchYaw
 
+from splatpilot.diagrams.flight.flight import Outcome, flight_outcome
+from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
+from splatpilot.diagrams.flight.policies import policy_named
+from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.worlds import scene_folder
 from splatpilot.diagrams.worlds.scene_folder import (
     check_scene_target,
+    close_frontier,
     read_scene,
     read_scene_folder,
     read_scene_metadata,
@@ -13,11 +19,15 @@ from splatpilot.diagrams.worlds.scene_folder import (
     write_scene_metadata,
 )
 from splatpilot.diagrams.worlds.world import World
+from splatpilot.systems.collision.depth_fusion import esdf_from_depth_images
+from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.esdf_build import esdf_from_occupancy
-from splatpilot.systems.policies.time_of_arrival import time_of_arrival
 from splatpilot.systems.splats.background import EnvironmentMap, mean_color
+from splatpilot.systems.splats.baked_scene import BakedScene
 from splatpilot.systems.splats.scene import GaussianScene
+from splatpilot.systems.splats.splat_camera import ranged_depth
 from splatpilot.systems.splats.splat_files import read_ply, write_ply
+from splatpilot.systems.vehicle.quadrotor import hover_state
 
 
 def box_of_gaussians(size=(6.0, 3.0, 3.0), step=0.1) -> GaussianScene:
@@ -59,9 +69,7 @@ def world() -> World:
 
 def test_round_trip(tmp_path, world):
     folder = tmp_path / "scene"
-    written = write_scene_folder(
-        folder, world, provenance="a test", gains=[1.0, 1.25], vignetting=-0.5
-    )
+    written = write_scene_folder(folder, world, gains=np.array([1.0, 1.25]), representation="2dgs")
     assert {file.name for file in folder.iterdir()} == {"gaussians.ply", "esdf.npz", "scene.yaml"}
     back = read_scene(folder)
     assert (back.name, back.background) == ("box", (0.1, 0.2, 0.3))
@@ -73,11 +81,21 @@ def test_round_trip(tmp_path, world):
     assert back.distance_field is back.esdf
     metadata = read_scene_metadata(folder)
     assert metadata == written
-    assert (metadata.provenance, metadata.metric) == ("a test", True)
-    assert (metadata.gains, metadata.vignetting) == ([1.0, 1.25], -0.5)
+    assert (metadata.gains, metadata.representation) == ([1.0, 1.25], "2dgs")
     np.testing.assert_allclose(metadata.lower_W, [1, 2, 3])
     np.testing.assert_allclose(metadata.upper_W, [5, 4, 5])
     assert metadata.observed_free_volume == pytest.approx(14 * 10 * 10 * 0.2**3)
+    measured = replace(written, perturbation_bound=0.4, pose_perturbation_bounds=[0.3, 0.5])
+    write_scene_metadata(folder, measured)
+    assert read_scene_metadata(folder) == measured
+
+
+def test_missing_fields_have_defaults(tmp_path, world):
+    write_scene_folder(tmp_path / "scene", world, image_width=320)
+    file = tmp_path / "scene" / "scene.yaml"
+    lines = file.read_text().splitlines(keepends=True)
+    file.write_text("".join(line for line in lines if not line.startswith("image_width")))
+    assert read_scene_metadata(tmp_path / "scene").image_width == 0
 
 
 def test_frontier_is_seen_in_flight_and_kept_apart(tmp_path, world):
@@ -89,29 +107,6 @@ def test_frontier_is_seen_in_flight_and_kept_apart(tmp_path, world):
     (folder / "frontier.ply").unlink()
     with pytest.raises(FileNotFoundError, match=r"frontier\.ply"):
         read_scene(folder)
-
-
-def test_how_it_was_made_is_kept(tmp_path, world):
-    folder = tmp_path / "scene"
-    written = write_scene_folder(
-        folder,
-        world,
-        provenance="",
-        representation="2dgs",
-        capture="/captures/hall",
-        capture_settings=["depth_unit=500.0"],
-        held_out=[0, 8],
-        image_width=320,
-    )
-    assert (written.representation, written.capture) == ("2dgs", "/captures/hall")
-    assert written.capture_settings == ["depth_unit=500.0"]
-    assert (written.held_out, written.image_width) == ([0, 8], 320)
-    assert (written.perturbation_bound, written.pose_perturbation_bounds) == (None, [])
-    assert read_scene_metadata(folder) == written
-    measured = replace(written, perturbation_bound=0.4, pose_perturbation_bounds=[0.3, 0.5])
-    write_scene_metadata(folder, measured)
-    assert read_scene_metadata(folder) == measured
-    assert read_scene(folder).name == world.name
 
 
 def test_an_environment_is_kept(tmp_path, world):
@@ -128,20 +123,6 @@ def test_an_environment_is_kept(tmp_path, world):
         read_scene(folder)
     write_scene_folder(folder, world, provenance="")
     assert read_scene(folder).background == world.background
-
-
-def test_scene_from_before_these_fields(tmp_path, world):
-    folder = tmp_path / "scene"
-    write_scene_folder(folder, world, provenance="")
-    later = ("representation", "capture", "held_out", "image_width", "perturb", "pose_perturb")
-    lines = (folder / "scene.yaml").read_text().splitlines(keepends=True)
-    kept = [line for line in lines if not line.startswith(later)]
-    assert len(kept) < len(lines) - 3
-    (folder / "scene.yaml").write_text("".join(kept))
-    metadata = read_scene_metadata(folder)
-    assert (metadata.representation, metadata.capture, metadata.held_out) == ("3dgs", "", [])
-    assert (metadata.image_width, metadata.perturbation_bound) == (0, None)
-    assert metadata.capture_settings == []
 
 
 def test_a_scene_is_replaced_whole(tmp_path, world):
@@ -199,13 +180,9 @@ def test_missing_file(tmp_path, world, missing):
     (folder / missing).unlink()
     with pytest.raises(FileNotFoundError, match=rf"No such file: .*{missing}"):
         read_scene(folder)
-
-
-def test_missing_scene(tmp_path):
-    with pytest.raises(FileNotFoundError, match="nowhere"):
-        read_scene(tmp_path / "nowhere")
-    with pytest.raises(FileNotFoundError, match=r"No such file: .*nowhere"):
-        read_scene_folder(tmp_path / "nowhere")
+    for read in (read_scene, read_scene_folder):
+        with pytest.raises(FileNotFoundError, match=r"nowhere"):
+            read(tmp_path / "nowhere")
 
 
 @pytest.mark.parametrize(
@@ -213,11 +190,13 @@ def test_missing_scene(tmp_path):
     [
         ("metric: true", "metric: false", "metric must be true to fly, got false"),
         ("metric: true", "metrik: true", "metrik"),
+        ("world_frame: z up", "world_frame: y up", "world_frame must be in {z up}, got y up"),
+        ("background: [", "background: [7.0, -1.0, 0.5] #", "background must be in .* got"),
+        ("lower_W: [", "lower_W: [-99.0, -99.0, -99.0] #", "files are of different scenes"),
         ("format_version: 2", "format_version: 3", "format_version must be 2, got 3"),
         ("format_version: 2", "format_version: 1", "format_version must be 2, got 1; reconstruct"),
         ("p_WS: [2.0, 3.0, 4.0]", "p_WS: [2.0, 3.0]", "p_WS must be three finite numbers, got"),
         ("p_WG: [3.0, 3.0, 4.0]", "p_WG: [3.0, .nan, 4.0]", "p_WG must be in .* got .*nan"),
-        ("p_WS: [2.0, 3.0, 4.0]", "", r"p_WS must be .* got \[\]"),
         ("vignetting: 0.0", "vignetting: dark", "dark"),
         ("metric: true", "metric: [", r"line 9: expected"),
         ("representation: 3dgs", "representation: nerf", "representation must be .* got nerf"),
@@ -259,39 +238,105 @@ def test_stray_gaussians_do_not_stretch_a_bare_ply(tmp_path):
     assert (read_scene(tmp_path / "hall.ply").esdf.upper_W < 10).all()
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        ("world_frame: z up", "world_frame: y up", "world_frame must be in {z up}, got y up"),
-        ("background: [", "background: [7.0, -1.0, 0.5] #", "background must be in .* got"),
-        ("lower_W: [", "lower_W: [-99.0, -99.0, -99.0] #", "files are of different scenes"),
-    ],
-)
-def test_metadata_is_believed_or_refused(tmp_path, world, old, new, message):
-    folder = tmp_path / "scene"
-    write_scene_folder(folder, world, provenance="")
-    file = folder / "scene.yaml"
-    text = file.read_text()
-    assert old in text
-    file.write_text(text.replace(old, new))
-    with pytest.raises(ValueError, match=message):
-        read_scene(folder)
+SIZE = np.array([6.0, 4.0, 3.0])  # [m]
+K = np.array([[80.0, 0.0, 80.0], [0.0, 80.0, 60.0], [0.0, 0.0, 1.0]])
+VOXEL = 0.1  # [m]
 
 
-def test_space_beside_a_bare_ply_is_not_flown_through(tmp_path):
-    y, z = (grid.ravel() for grid in np.meshgrid(np.arange(0, 10, 0.1), np.arange(0, 8, 0.1)))
-    walls = [np.column_stack([np.full(y.size, x), y, z]) for x in (0.0, 3.0, 6.0)]
-    means = np.concatenate(walls)
-    count = len(means)
-    scene = GaussianScene.from_colors(
-        means,
-        np.tile([1.0, 0, 0, 0], (count, 1)),
-        np.full((count, 3), 0.08),
-        np.full(count, 0.95),
-        np.full((count, 3), 0.5),
-    )
-    write_ply(scene, tmp_path / "walls.ply")
-    walled = read_scene(tmp_path / "walls.ply")
-    times = time_of_arrival(walled.esdf.conservative(), np.array([1.5, 5.0, 4.0]))
-    assert times.is_reachable(np.array([1.5, 2.0, 2.0]))
-    assert not times.is_reachable(np.array([4.5, 5.0, 4.0]))
+def looking(yaw: float, p_WC: list[float]) -> RigidTransform:
+    """A level camera (x right, y down, z forward) that looks along `yaw` from p_WC."""
+    R_BC = RollPitchYaw(-np.pi / 2, 0.0, -np.pi / 2).ToRotationMatrix()
+    return RigidTransform(RollPitchYaw(0.0, 0.0, yaw).ToRotationMatrix() @ R_BC, p_WC)
+
+
+def rays(X_WC: RigidTransform) -> np.ndarray:
+    """(120, 160, 3) of depth 1, in W."""
+    x, y = np.meshgrid((np.arange(160) - 79.5) / 80.0, (np.arange(120) - 59.5) / 80.0)
+    return np.stack([x, y, np.ones_like(x)], -1) @ X_WC.rotation().matrix().T
+
+
+def room_depth(X_WC: RigidTransform) -> np.ndarray:
+    """(120, 160) [m] to the walls of an empty room between the origin and SIZE."""
+    with np.errstate(divide="ignore"):
+        ways = np.stack([(end - X_WC.translation()) / rays(X_WC) for end in (np.zeros(3), SIZE)])
+    return ways.max(axis=0).min(axis=-1).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def captured() -> tuple[Esdf, list[np.ndarray], list[RigidTransform]]:
+    """The room from two poses at its near end that look along it, one of them askew."""
+    X_WCs = [looking(0.0, [0.3, 2.0, 1.5]), looking(0.5, [0.3, 1.0, 1.5])]
+    depths = [room_depth(X_WC) for X_WC in X_WCs]
+    field = esdf_from_depth_images(depths, K, X_WCs, np.full(3, -0.4), SIZE + 0.4, VOXEL)
+    return field, depths, X_WCs
+
+
+@pytest.fixture(scope="module")
+def closed(captured) -> tuple[Esdf, GaussianScene]:
+    field, depths, X_WCs = captured
+    closed, frontier = close_frontier(field, depths, K, X_WCs)
+    assert frontier is not None
+    return closed, frontier
+
+
+def seen_depth(frontier: GaussianScene, X_WC: RigidTransform) -> np.ndarray:
+    """(120, 160) [m], what a depth camera sees of the frontier."""
+    return ranged_depth(BakedScene(frontier).render(K, 160, 120, X_WC).depth, 0.0, 50.0)
+
+
+def test_frontier_hides_nothing_that_was_captured(captured, closed):
+    _, depths, X_WCs = captured
+    for depth, X_WC in zip(depths, X_WCs, strict=True):
+        assert np.mean(seen_depth(closed[1], X_WC) < depth - 0.1) < 0.005
+
+
+def test_what_was_captured_beyond_the_range_of_the_field_is_not_hidden(captured):
+    _, depths, X_WCs = captured
+    box = np.full(3, -0.4), SIZE + 0.4
+    field = esdf_from_depth_images(depths, K, X_WCs, *box, VOXEL, max_range=3.0)
+    _, frontier = close_frontier(field, depths, K, X_WCs)
+    assert frontier is not None
+    for depth, X_WC in zip(depths, X_WCs, strict=True):
+        assert np.mean(seen_depth(frontier, X_WC) < depth - 0.1) < 0.005
+    aside = looking(np.pi, [2.8, 2.0, 1.5])  # back into the corners beside the cameras
+    assert np.mean(np.isfinite(seen_depth(frontier, aside))) > 0.5
+
+
+def test_frontier_is_seen_where_it_is_hit(captured, closed):
+    field, (distances, frontier) = captured[0], closed
+    missed, ends = 0, 0
+    for yaw in np.arange(4) * np.pi / 2:
+        X_WC = looking(yaw, [2.8, 2.0, 1.5])
+        way, depth = rays(X_WC), np.zeros((120, 160))
+        p_WQ = np.tile(X_WC.translation(), (120, 160, 1))
+        for _ in range(60):
+            depth += 0.7 * np.clip(np.nan_to_num(distances.distance(p_WQ)), 0.0, None)
+            p_WQ = X_WC.translation() + depth[..., None] * way
+        at_frontier = (np.abs(distances.distance(p_WQ)) < 0.02) & (field.distance(p_WQ) > 0.1)
+        ends += at_frontier.sum()
+        missed += (at_frontier & (seen_depth(frontier, X_WC) > depth + 2 * VOXEL)).sum()
+    assert ends > 5000
+    assert missed < 0.01 * ends
+    assert len(frontier) < 1000
+
+
+def test_touching_the_frontier_is_a_collision(captured, closed):
+    scenario = Scenario(policy=policy_named("straight"))
+    p_WS, p_WG = np.array([2.8, 2.0, 1.5]), np.array([4.0, 2.0, 1.5])
+    hidden_W = [0.7, 2.0, 0.3]  # beside the near camera, below all it saw
+    ended = []
+    for field in (captured[0], closed[0]):
+        world = World("room", closed[1], field, field, (0.0, 0.0, 0.0), p_WS, p_WG)
+        diagram = BuildFlightDiagram(scenario, world, camera=False)
+        context = diagram.CreateDefaultContext()
+        plant = diagram.GetSubsystemByName("plant")
+        for p_WB in (hidden_W, p_WS):
+            plant.GetMyMutableContextFromRoot(context).SetContinuousState(hover_state(p_WB))
+            ended.append(flight_outcome(diagram, context, p_WG, 0.3))
+    assert ended == [Outcome.LEFT_VOLUME, None, Outcome.COLLISION, None]
+
+
+def test_closed_place_is_left_as_it_is(captured):
+    field = captured[0]
+    known = Esdf(np.abs(field.distances) + 0.4, 0 * field.states, field.lower_W, VOXEL)
+    assert close_frontier(known, [], K, []) == (known, None)

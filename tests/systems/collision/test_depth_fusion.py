@@ -112,9 +112,8 @@ def test_space_behind_surfaces_and_out_of_view_stays_unknown(capture):
     assert (field.states[room().distance(p) < -0.35] == UNKNOWN).all()
 
 
-@pytest.mark.parametrize("voxel_size", [0.1, 0.037])
-def test_skipping_unseen_blocks_changes_nothing(capture, monkeypatch, voxel_size):
-    depths, X_WCs = capture
+def test_skipping_unseen_blocks_changes_nothing(capture, monkeypatch):
+    (depths, X_WCs), voxel_size = capture, 0.037
     box = np.array([0.3, 0.2, -0.1]), np.array([2.9, 2.6, 1.6])
     skipping = esdf_from_depth_images(depths[:5], K, X_WCs[:5], *box, voxel_size)
     monkeypatch.setattr(
@@ -178,14 +177,6 @@ def test_the_sky_clears_the_space_before_it():
     )
 
 
-def test_a_wall_out_of_range_clears_the_space_before_it():
-    box = np.array([-0.3, -0.3, 0.2]), np.array([0.3, 0.3, 3.0])
-    field = esdf_from_depth_images([wall(2.5)], K, [RigidTransform()], *box, 0.1, max_range=1.6)
-    assert not (field.states == OCCUPIED).any()
-    sample = field.query([[0.0, 0.0, 1.3], [0.0, 0.0, 1.9], [0.0, 0.0, 2.8]])
-    np.testing.assert_array_equal(sample.state, [FREE, UNKNOWN, UNKNOWN])
-
-
 def test_bounds_hold_all_seen_points_and_cameras(capture):
     depths, X_WCs = capture
     lower_W, upper_W = bounds_of_depth_images(depths, K, X_WCs, margin=0.2)
@@ -205,10 +196,10 @@ def test_bounds_hold_all_seen_points_and_cameras(capture):
         ({"depths": [wall(1.0)] * 3}, "one per pose, 1, got 3"),
         ({"X_WCs": [RigidTransform()] * 4}, "one per pose, 4, got 1"),
         ({"depths": [np.zeros((4, 4, 3))]}, r"depth image 0 must be .* got \(4, 4, 3\)"),
+        ({"depths": [wall(1.0), np.ones((4, 4))]}, r"depth image 1 must be .* got \(4, 4\)"),
         ({"K": np.diag([0.0, 60.0, 1.0])}, "positive focal lengths"),
         ({"K": np.eye(2)}, r"a finite \(3, 3\) matrix"),
         ({"max_range": 0.0}, r"max_range must be .* got 0.0"),
-        ({"truncation": 0.1}, "truncation must be at least 2 voxels, 0.2 m, got 0.1"),
         ({"upper_W": np.zeros(3)}, "upper_W must be finite and above"),
     ],
 )
@@ -224,11 +215,6 @@ def test_bad_arguments_are_refused(change, message):
     esdf_from_depth_images(**good)
     with pytest.raises(ValueError, match=message):
         esdf_from_depth_images(**good | change)
-
-
-def test_images_of_different_shapes_are_refused():
-    with pytest.raises(ValueError, match=r"depth image 1 must be .* got \(4, 4\)"):
-        bounds_of_depth_images([wall(1.0), np.ones((4, 4))], K, [RigidTransform()] * 2)
 
 
 def test_the_hospital():

@@ -102,23 +102,3 @@ def test_the_surface_within_the_voxels_makes_the_field_accurate(solid):
     # A voxel of the band keeps its own value.
     assert np.abs(error[np.isfinite(band)]).max() < 1e-4
     np.testing.assert_array_equal(distances < 0.0, phi < 0.0)
-
-
-@pytest.mark.parametrize("solid", SOLIDS)
-def test_passing_sites_to_neighbors_only_tightens_the_bounds(solid):
-    phi = SOLIDS[solid].astype(np.float32)
-    band = np.where(np.abs(phi) < 1.0, phi, np.float32(np.nan))
-    loose, tight = (distances_from_band(phi < 0.0, band, 1.0, sweeps=n) for n in (0, 2))
-    assert (np.abs(tight) <= np.abs(loose) + 1e-5).all()
-    assert (np.abs(tight) >= np.abs(phi) - 1e-4).all()
-    assert np.mean(np.abs(tight - phi)) < 0.85 * np.mean(np.abs(loose - phi))
-
-
-def test_distances_scale_with_the_voxel():
-    phi = SOLIDS["union"].astype(np.float32)
-    band = np.where(np.abs(phi) < 1.0, phi, np.float32(np.nan))
-    np.testing.assert_allclose(
-        distances_from_band(phi < 0.0, 0.05 * band, 0.05) / 0.05,
-        distances_from_band(phi < 0.0, band, 1.0),
-        atol=1e-4,
-    )

@@ -50,14 +50,6 @@ def test_trilinear_functions_are_reproduced_everywhere_inside_the_bounds():
     np.testing.assert_allclose(field.distance(p), function(*p.T), atol=3e-6)
 
 
-def test_voxel_centers_hold_the_stored_values():
-    field = random_field()
-    x, y, z = field.voxel_centers()
-    sample = field.query([x[3], y[15], z[7]])
-    assert sample.distance == pytest.approx(field.distances[3, 15, 7], abs=1e-6)
-    np.testing.assert_allclose(field.upper_W, [1.0, 3.6, 1.7])
-
-
 def test_gradient_is_the_derivative_of_the_interpolant():
     field = random_field()
     p = points_in(field)
@@ -71,17 +63,6 @@ def test_gradient_is_the_derivative_of_the_interpolant():
         for axis in np.eye(3)
     ]
     np.testing.assert_allclose(field.query(p).gradient, np.stack(differences, -1), atol=1e-6)
-
-
-def test_query_and_distance_agree_bit_for_bit():
-    field = sphere_field()
-    p = points_in(field, 24).reshape(2, 3, 4, 3)
-    sample = field.query(p)
-    assert sample.gradient.shape == (2, 3, 4, 3)
-    np.testing.assert_array_equal(sample.distance, field.distance(p))
-    np.testing.assert_array_equal(sample.distance[1, 2, 3], field.distance(p[1, 2, 3]))
-    assert field.distance(np.zeros((0, 3))).shape == (0,)
-    assert field.query(p[0, 0, 0]).state.shape == ()
 
 
 @pytest.mark.parametrize("occupied_outside", [False, True])
@@ -135,23 +116,6 @@ def test_scaled_field_is_that_of_the_scaled_place():
     np.testing.assert_allclose(sample.gradient, expected.gradient, atol=1e-6)
     np.testing.assert_array_equal(sample.state, expected.state)
     np.testing.assert_allclose(scaled.upper_W, 3.0 * field.upper_W)
-
-
-def test_volume_counts_the_voxels_of_a_state():
-    states = np.zeros((20, 16, 12), np.uint8)
-    states[:5], states[5:7] = OCCUPIED, UNKNOWN
-    field = grid_of(lambda x, y, z: x, states=states)
-    assert field.volume(UNKNOWN) == pytest.approx(2 * 16 * 12 * 1e-3)
-    assert field.volume(FREE) == pytest.approx(13 * 16 * 12 * 1e-3)
-
-
-def test_fields_are_read_only():
-    distances = np.ones((2, 2, 2), np.float32)
-    field = Esdf(distances, np.zeros((2, 2, 2), np.uint8), np.zeros(3), 1.0)
-    for array in (field.distances, field.states, field.lower_W, field.upper_W):
-        with pytest.raises(ValueError, match="read-only"):
-            array[...] = 0
-    distances[0, 0, 0] = 2.0
 
 
 # A box of free space with an obstacle, and unknown space behind x = 0.6.
@@ -210,19 +174,6 @@ def test_conservative_field_goes_on_outside_the_box():
     np.testing.assert_array_equal(sample.distance, field.distance(p))
 
 
-def test_conservative_field_is_continuous_through_the_faces():
-    field = half_known_field().conservative()
-    random = np.random.default_rng(4)
-    p = random.uniform(field.lower_W, field.upper_W, (600, 3))
-    axis, side = random.integers(0, 3, 600), random.integers(0, 2, 600)
-    rows = np.arange(600)
-    p[rows, axis] = np.where(side, field.upper_W[axis], field.lower_W[axis])
-    outwards = np.zeros_like(p)
-    outwards[rows, axis] = 2.0 * side - 1.0
-    jump = field.distance(p + 1e-9 * outwards) - field.distance(p - 1e-9 * outwards)
-    assert np.abs(jump).max() < 1e-7
-
-
 @settings(deadline=None, max_examples=200)
 @given(st.integers(0, 2**32 - 1))
 def test_conservative_field_is_lipschitz(seed):
@@ -269,23 +220,11 @@ def test_bad_grids_are_refused(change, message):
         Esdf(**good | change)
 
 
-def test_points_must_have_three_coordinates():
-    with pytest.raises(ValueError, match=r"\(5, 2\)"):
-        sphere_field().distance(np.zeros((5, 2)))
-    with pytest.raises(ValueError, match=r"\(5, 2\)"):
-        sphere_field().distance(torch.zeros(5, 2))
-
-
 @pytest.fixture
 def field() -> Esdf:
     random = np.random.default_rng(0)
-    return Esdf(
-        random.normal(size=(5, 4, 3)).astype(np.float32),
-        random.integers(0, 3, (5, 4, 3)).astype(np.uint8),
-        np.array([1.0, -2.0, 0.1]),
-        0.05,
-        occupied_outside=True,
-    )
+    states = random.integers(0, 3, (5, 4, 3)).astype(np.uint8)
+    return Esdf(random.normal(size=(5, 4, 3)).astype(np.float32), states, LOWER_W, 0.05, True)
 
 
 def test_a_saved_field_comes_back_the_same(field, tmp_path):
@@ -299,65 +238,6 @@ def test_a_saved_field_comes_back_the_same(field, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["esdf.npz"]
 
 
-def test_a_failed_save_leaves_the_old_file_and_nothing_else(field, tmp_path, monkeypatch):
-    path = tmp_path / "esdf.npz"
-    field.save(path)
-    before = path.read_bytes()
-
-    def breaks_off(file, **arrays):
-        file.write(b"half a field")
-        raise OSError("no space left on device")
-
-    monkeypatch.setattr(np, "savez_compressed", breaks_off)
-    with pytest.raises(OSError, match="no space left"):
-        field.save(path)
-    assert path.read_bytes() == before
-    assert list(tmp_path.iterdir()) == [path]
-
-
-def test_a_reader_of_the_old_file_is_not_disturbed(field, tmp_path):
-    path = tmp_path / "esdf.npz"
-    path.write_bytes(b"the old field")
-    with path.open("rb") as reader:
-        field.save(path)
-        assert reader.read() == b"the old field"
-    assert Esdf.load(path).shape == field.shape
-
-
-def test_a_missing_folder_is_reported(field, tmp_path):
-    with pytest.raises(OSError, match=r"esdf\.npz: cannot be written \(No such file"):
-        field.save(tmp_path / "nowhere" / "esdf.npz")
-
-
-def test_a_missing_file_is_reported(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"esdf\.npz"):
-        Esdf.load(tmp_path / "esdf.npz")
-
-
-@pytest.mark.parametrize("content", [b"", b"not an archive", b"PK\x03\x04 broken"])
-def test_foreign_files_are_refused(tmp_path, content):
-    path = tmp_path / "esdf.npz"
-    path.write_bytes(content)
-    with pytest.raises(ValueError, match=r"esdf\.npz: not a readable numpy archive"):
-        Esdf.load(path)
-
-
-def test_truncated_and_damaged_files_are_refused(field, tmp_path):
-    path = tmp_path / "esdf.npz"
-    field.save(path)
-    content = path.read_bytes()
-    path.write_bytes(content[: len(content) // 2])
-    with pytest.raises(ValueError, match="not a readable numpy archive"):
-        Esdf.load(path)
-    damaged = bytearray(content)
-    # Within the compressed bytes of the distances.
-    for i in range(content.index(b"distances.npy") + 60, content.index(b"states.npy") - 60):
-        damaged[i] ^= 0xFF
-    path.write_bytes(damaged)
-    with pytest.raises(ValueError, match=r"esdf\.npz"):
-        Esdf.load(path)
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -365,11 +245,7 @@ def test_truncated_and_damaged_files_are_refused(field, tmp_path):
         ({"version": np.int64(99)}, "version must be 1, got 99"),
         ({"distances": np.zeros((5, 4), np.float32)}, "distances must be .* got float32 of"),
         ({"distances": np.zeros((5, 4, 3), int)}, "distances must be .* got int64"),
-        ({"distances": np.full((5, 4, 3), np.nan, np.float32)}, "60 of 60 NaN"),
-        ({"states": np.zeros((5, 4, 2), np.uint8)}, r"\(5, 4, 2\)"),
-        ({"states": np.array([[["free"]]])}, "states must be .* got <U4"),
         ({"voxel_size": np.float64(-0.05)}, "voxel_size must be .* got -0.05"),
-        ({"lower_W": np.zeros(2)}, "3 finite coordinates"),
         ({"states": np.array([[[{}]]], dtype=object)}, "not a readable numpy archive"),
     ],
 )
@@ -384,14 +260,26 @@ def test_wrong_entries_are_refused(field, tmp_path, change, message):
     assert str(path) in str(error.value)
 
 
+@pytest.mark.parametrize(
+    ("content", "error"),
+    [
+        (None, FileNotFoundError),
+        (b"", ValueError),
+        (b"not an archive", ValueError),
+        (b"PK\x03\x04 broken", ValueError),
+    ],
+)
+def test_missing_and_foreign_files_are_refused(tmp_path, content, error):
+    if content is not None:
+        (tmp_path / "esdf.npz").write_bytes(content)
+    with pytest.raises(error, match=r"esdf\.npz"):
+        Esdf.load(tmp_path / "esdf.npz")
+
+
 def stateful_field() -> Esdf:
     random = np.random.default_rng(0)
-    return Esdf(
-        random.normal(size=(9, 8, 7)).astype(np.float32),
-        random.integers(0, 3, (9, 8, 7)).astype(np.uint8),
-        np.array([-1.0, 2.0, 0.5]),
-        0.1,
-    )
+    states = random.integers(0, 3, (9, 8, 7)).astype(np.uint8)
+    return Esdf(random.normal(size=(9, 8, 7)).astype(np.float32), states, LOWER_W, 0.1)
 
 
 @pytest.mark.parametrize("field", [stateful_field(), stateful_field().conservative()])
@@ -417,13 +305,3 @@ def test_autograd_gives_the_exact_gradient(field):
     field.distance(p).nansum().backward()
     assert p.grad is not None
     np.testing.assert_allclose(p.grad, field.query(p.detach()).gradient, atol=1e-9)
-    cell = random.integers(0, 6, (10, 3)) + random.uniform(0.1, 0.9, (10, 3))
-    inside = torch.from_numpy(field.lower_W + 0.1 * (cell + 0.5)).requires_grad_()
-    assert torch.autograd.gradcheck(field.distance, inside)
-
-
-def test_gradient_stays_finite_on_the_box():
-    field = stateful_field().conservative()
-    p = torch.tensor(np.stack([field.lower_W, field.upper_W]), requires_grad=True)
-    field.distance(p).sum().backward()
-    assert p.grad is not None and torch.isfinite(p.grad).all()

@@ -6,9 +6,12 @@ from scipy.spatial.transform import Rotation
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.esdf_build import (
+    MAX_VOXELS,
     density_on_grid,
     esdf_from_distance_field,
     esdf_from_gaussians,
+    esdf_from_occupancy,
+    grid_shape,
 )
 from splatpilot.systems.collision.shapes import AnalyticDistanceField, Cylinder, HalfSpace
 from splatpilot.systems.splats.scene import GaussianScene
@@ -59,7 +62,7 @@ def test_density_is_the_sum_of_all_gaussians():
 
 @pytest.mark.parametrize(("spacing", "opacity"), [(0.06, 0.9), (0.04, 0.5), (0.1, 0.95)])
 def test_a_shell_of_flat_gaussians_is_seen_a_little_too_near(spacing, opacity):
-    field = esdf_from_gaussians(shell(1.2, spacing, opacity), VOXEL)
+    field = in_its_box(shell(1.2, spacing, opacity))
     p = np.stack(np.meshgrid(*field.voxel_centers(), indexing="ij"), -1)
     height = np.linalg.norm(p, axis=-1) - 1.2
     error = (field.distances - np.abs(height)) / VOXEL
@@ -70,7 +73,7 @@ def test_a_shell_of_flat_gaussians_is_seen_a_little_too_near(spacing, opacity):
 
 
 def test_a_shell_has_no_holes():
-    field = esdf_from_gaussians(shell(), VOXEL)
+    field = in_its_box(shell())
     components = np.zeros(field.shape, int)
     label(field.states == FieldState.FREE, output=components)
     middle = tuple(n // 2 for n in field.shape)
@@ -78,46 +81,24 @@ def test_a_shell_has_no_holes():
     assert components[middle] > 0 and components[0, 0, 0] > 0
 
 
-@pytest.mark.parametrize("threshold", [0.5, 0.1, 0.01])
-def test_a_cloud_thicker_than_a_voxel_reaches_to_its_threshold(threshold):
+def in_its_box(scene: GaussianScene):
+    return esdf_from_gaussians(
+        scene, VOXEL, scene.means.min(axis=0) - 0.5, scene.means.max(axis=0) + 0.5
+    )
+
+
+def test_a_cloud_thicker_than_a_voxel_reaches_to_half_of_its_density():
     scene = gaussians(np.zeros((1, 3)), [[1.0, 0.0, 0.0, 0.0]], [[0.3, 0.3, 0.3]], [1.0])
     box = np.full(3, 1.6)
-    field = esdf_from_gaussians(scene, 0.05, -box, box, threshold)
-    expected = np.sqrt(-2.0 * np.log(threshold) * (0.3**2 + 0.025**2))
+    field = esdf_from_gaussians(scene, 0.05, -box, box)
+    expected = np.sqrt(-2.0 * np.log(0.5) * (0.3**2 + 0.025**2))
     assert field.distance([1.4, 0.0, 0.0]) == pytest.approx(1.4 - expected, abs=0.01)
     assert field.query([0.0, 0.0, 0.0]).state == FieldState.OCCUPIED
 
 
 def test_transparent_gaussians_are_no_obstacle():
     scene = gaussians(np.zeros((1, 3)), [[1.0, 0.0, 0.0, 0.0]], [[0.3, 0.3, 0.3]], [0.3])
-    field = esdf_from_gaussians(scene, VOXEL)
-    assert (field.states == FieldState.FREE).all()
-
-
-def test_what_was_not_observed_is_unknown_unless_occupied():
-    scene = shell()
-    free = esdf_from_gaussians(scene, VOXEL)
-    observed = np.zeros(free.shape, bool)
-    observed[: free.shape[0] // 2] = True
-    field = esdf_from_gaussians(scene, VOXEL, observed=observed)
-    occupied = free.states == FieldState.OCCUPIED
-    np.testing.assert_array_equal(field.states == FieldState.OCCUPIED, occupied)
-    np.testing.assert_array_equal(field.states == FieldState.UNKNOWN, ~observed & ~occupied)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"threshold": 0.0}, r"threshold must be .* got 0.0"),
-        ({"threshold": 1.0}, r"threshold must be .* got 1.0"),
-        ({"observed": np.ones((2, 2, 2), bool)}, r"shape of observed must be .* got \(2, 2, 2\)"),
-        ({"voxel_size": -0.1}, r"voxel_size must be .* got -0.1"),
-        ({"upper_W": np.full(3, 1e4)}, "use larger voxels"),
-    ],
-)
-def test_bad_arguments_are_refused(change, message):
-    with pytest.raises(ValueError, match=message):
-        esdf_from_gaussians(shell(), **{"voxel_size": VOXEL} | change)
+    assert (in_its_box(scene).states == FieldState.FREE).all()
 
 
 def test_values_at_the_voxel_centers_are_the_fields_own():
@@ -143,3 +124,89 @@ def test_unknown_space_stays_unknown():
     fine = esdf_from_distance_field(coarse, 0.1)
     assert fine.shape == (16, 16, 16)
     assert fine.volume(FieldState.UNKNOWN) == coarse.volume(FieldState.UNKNOWN)
+
+
+FREE, OCCUPIED, UNKNOWN, _ = FieldState
+
+
+def slab() -> np.ndarray:
+    """Occupied for x index 10 to 14 of 30."""
+    occupied = np.zeros((30, 4, 4), bool)
+    occupied[10:15] = True
+    return occupied
+
+
+def test_a_slab_has_its_faces_on_the_voxel_faces():
+    field = esdf_from_occupancy(slab(), None, np.array([1.0, 0.0, 0.0]), 0.1)
+    x = np.linspace(1.06, 3.94, 50)
+    p = np.stack([x, np.full(50, 0.2), np.full(50, 0.2)], -1)
+    exact = np.maximum(2.0 - x, x - 2.5)
+    # The interpolant rounds off the middle plane of the slab.
+    middle = np.abs(x - 2.25) < 0.11
+    np.testing.assert_allclose(field.distance(p)[~middle], exact[~middle], atol=1e-6)
+    np.testing.assert_array_equal(field.states == OCCUPIED, slab())
+
+
+def test_offsets_move_the_surface_within_the_voxels():
+    x = 1.0 + 0.1 * (np.arange(30) + 0.5)
+    offset = np.maximum(2.03 - x, x - 2.46)[:, None, None] + np.zeros((30, 4, 4))
+    offset[np.abs(offset) > 0.1] = np.nan
+    field = esdf_from_occupancy(offset <= 0.0, None, np.array([1.0, 0.0, 0.0]), 0.1, offset)
+    p = np.array([[2.03, 0.2, 0.2], [2.46, 0.2, 0.2], [1.2, 0.2, 0.2], [3.5, 0.2, 0.2]])
+    np.testing.assert_allclose(field.distance(p), [0.0, 0.0, 0.83, 1.04], atol=1e-6)
+
+
+def test_faces_without_offsets_stay_on_the_voxel_faces():
+    x = 1.0 + 0.1 * (np.arange(30) + 0.5)
+    offset = (2.03 - x)[:, None, None] + np.zeros((30, 4, 4))
+    offset[x > 2.1] = np.nan
+    occupied = slab()
+    field = esdf_from_occupancy(occupied, None, np.array([1.0, 0.0, 0.0]), 0.1, offset)
+    p = np.array([[1.2, 0.2, 0.2], [3.5, 0.2, 0.2]])
+    np.testing.assert_allclose(field.distance(p), [0.83, 1.0], atol=1e-6)
+
+
+def test_unknown_voxels_are_marked_and_measured_to_what_was_seen():
+    unknown = np.zeros((30, 4, 4), bool)
+    unknown[20:] = True
+    field = esdf_from_occupancy(slab(), unknown, np.array([1.0, 0.0, 0.0]), 0.1)
+    sample = field.query([[3.5, 0.2, 0.2], [1.5, 0.2, 0.2]])
+    np.testing.assert_array_equal(sample.state, [UNKNOWN, FREE])
+    np.testing.assert_allclose(sample.distance, [1.0, 0.5], atol=1e-6)
+
+
+def test_a_world_without_obstacles_is_finite():
+    field = esdf_from_occupancy(np.zeros((4, 4, 4), bool), None, np.zeros(3), 0.1)
+    assert 0.6 < field.distance([0.2, 0.2, 0.2]) < 0.7
+
+
+def test_contradictions_are_refused():
+    occupied, zero = slab(), np.zeros(3)
+    for unknown, offset, message in (
+        (np.zeros((2, 2, 2), bool), None, r"shape of unknown .* got \(2, 2, 2\)"),
+        (occupied, None, "both occupied and unknown must be 0, got 80"),
+        (None, np.zeros(3), r"shape of surface_offset .* got \(3,\)"),
+        (None, np.full(occupied.shape, 0.05), "surface_offset must be .* got 80 voxels"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            esdf_from_occupancy(occupied, unknown, zero, 0.1, offset)
+
+
+def test_grid_shape_covers_the_box_with_whole_voxels():
+    assert grid_shape(np.zeros(3), np.array([36.0, 16.0, 6.0]), 0.1) == (360, 160, 60)
+    assert grid_shape(np.full(3, -1.0), np.array([0.01, 0.1, 1.0]), 0.25) == (5, 5, 8)
+
+
+@pytest.mark.parametrize(
+    ("upper", "voxel_size", "message"),
+    [
+        ([1.0, 0.0, 1.0], 0.1, "upper_W must be finite and above"),
+        ([1.0, np.inf, 1.0], 0.1, "upper_W must be finite and above"),
+        ([1.0, 1.0, 1.0], 0.0, r"voxel_size must be .* got 0.0"),
+        ([1.0, 1.0, 0.05], 0.1, "at least 2 voxels"),
+        ([1e3, 1e3, 1e3], 0.1, f"at most {MAX_VOXELS:.3g} voxels".replace("+", r"\+")),
+    ],
+)
+def test_impossible_grids_are_refused(upper, voxel_size, message):
+    with pytest.raises(ValueError, match=message):
+        grid_shape(np.zeros(3), np.array(upper), voxel_size)

@@ -3,8 +3,6 @@ import weakref
 
 import numpy as np
 import pytest
-from pydrake.systems.framework import DiagramBuilder
-from pydrake.systems.primitives import ConstantVectorSource
 
 from splatpilot.systems.collision.distance_field import FieldState, soft_barrier
 from splatpilot.systems.collision.esdf_collision import EsdfCollision
@@ -84,27 +82,6 @@ def test_all_outputs_share_one_query_and_follow_the_state():
     port.FixValue(context, np.r_[0.0, 0.0, 3.0, np.zeros(10)])
     assert value_of(system, "distance", context)[0] == pytest.approx(2.0)
     assert field.queries == 2
-
-
-def test_works_in_a_diagram_and_in_several_contexts():
-    builder = DiagramBuilder()
-    source = ConstantVectorSource(np.r_[0.0, 0.0, 2.0, np.zeros(10)])
-    builder.AddSystem(source)
-    system = builder.AddNamedSystem("collision", EsdfCollision(CountingField()))
-    builder.Connect(source.get_output_port(), system.GetInputPort("state"))
-    builder.ExportOutput(system.GetOutputPort("distance"), "distance")
-    diagram = builder.Build()
-    first, second = diagram.CreateDefaultContext(), diagram.CreateDefaultContext()
-    source.get_mutable_source_value(source.GetMyMutableContextFromRoot(second)).set_value(
-        np.r_[0.0, 3.0, 0.0, np.zeros(10)]
-    )
-    distances = [value_of(diagram, "distance", c)[0] for c in (first, second, first)]
-    assert distances == pytest.approx([1.0, 2.0, 1.0])
-    assert value_of(diagram, "distance", second.Clone())[0] == pytest.approx(2.0)
-
-
-def test_no_direct_feedthrough_is_hidden():
-    assert EsdfCollision(CountingField()).HasAnyDirectFeedthrough()
 
 
 @pytest.mark.parametrize(("name", "value"), [("radius", -0.1), ("beta", 0.0)])

@@ -1,14 +1,20 @@
-"""Surfaces of distance fields as meshes, against shapes and against Drake's distances to meshes."""
+import base64
 
 import numpy as np
 import pytest
 import trimesh
 from pydrake.geometry import GeometryInstance, Mesh, ProximityProperties, SceneGraph
-from pydrake.math import RigidTransform
+from pydrake.math import RigidTransform, RotationMatrix
 
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.collision.field_mesh import field_mesh, write_mesh
+from splatpilot.systems.collision.field_mesh import (
+    add_primitive,
+    data_uri,
+    field_mesh,
+    write_mesh,
+    y_up,
+)
 
 LOWER, VOXEL, SHAPE = np.array([-1.0, -2.0, 0.5]), 0.1, (30, 36, 24)
 CENTER, RADIUS = np.array([0.4, -0.3, 1.95]), 0.7
@@ -34,7 +40,6 @@ def floor(p_WQ):
 
 
 def drakes_distances(path, p_WQ) -> np.ndarray:
-    """Signed distances to a mesh in a file, as SceneGraph knows them."""
     scene_graph = SceneGraph()
     source = scene_graph.RegisterSource("test")
     instance = GeometryInstance(RigidTransform(), Mesh(path), "mesh")
@@ -45,8 +50,6 @@ def drakes_distances(path, p_WQ) -> np.ndarray:
 
 
 def test_a_ball_is_a_ball():
-    """Closed, turned outwards, of the ball's volume, in fewer triangles than voxels on it have, and
-    the same every time."""
     mesh = field_mesh(field(ball))
     assert mesh.is_watertight and mesh.is_winding_consistent
     assert mesh.volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.02)
@@ -59,9 +62,6 @@ def test_a_ball_is_a_ball():
 
 @pytest.mark.parametrize(("conservative", "within"), [(False, 0.5), (True, 0.85)])
 def test_drakes_distances_are_the_fields(tmp_path, conservative, within):
-    """SceneGraph measures within half a voxel what the field says, near its surfaces, on either
-    side of them; a little more where unknown space and the box have edges, which the conservative
-    field says are farther than they are."""
     esdf = field(
         lambda p: np.minimum(ball(p), floor(p)),
         unknown=lambda p: (p[..., 0] > 1.5) & (p[..., 2] > 1.3),
@@ -79,8 +79,6 @@ def test_drakes_distances_are_the_fields(tmp_path, conservative, within):
 
 
 def test_what_is_solid_ends_at_the_box():
-    """A floor is closed at the faces of the box and does not go on; conservatively it is part of a
-    shell around what is free, a voxel thick."""
     esdf = field(floor)
     mesh = field_mesh(esdf)
     assert mesh.is_watertight
@@ -95,8 +93,6 @@ def test_what_is_solid_ends_at_the_box():
 
 
 def test_files_are_read_by_others(tmp_path):
-    """OBJ has world coordinates, glTF is y up, and both have all of the mesh; a name of another
-    kind is refused."""
     mesh = field_mesh(field(ball))
     for name in ("ball.obj", "ball.gltf"):
         write_mesh(tmp_path / name, mesh)
@@ -108,11 +104,52 @@ def test_files_are_read_by_others(tmp_path):
         assert len(read.faces) == len(mesh.faces)
         assert read.volume == pytest.approx(mesh.volume, rel=1e-3)
     assert sorted(file.name for file in tmp_path.iterdir()) == ["ball.gltf", "ball.obj"]
-    with pytest.raises(ValueError, match=r"ball\.stl: a mesh is written as \.gltf or \.obj"):
+    with pytest.raises(ValueError, match=r"ball\.stl: suffix must be .* got .stl"):
         write_mesh(tmp_path / "ball.stl", mesh)
 
 
 def test_without_anything_solid_there_is_no_mesh():
-    """Nothing to touch is said so."""
     with pytest.raises(ValueError, match="no surface in this field"):
         field_mesh(field(lambda p: ball(p) + 10.0))
+
+
+TYPES = {5126: "<f4", 5125: "<u4"}
+COLUMNS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3}
+
+
+def _read(document: dict, number: int) -> np.ndarray:
+    """The array of an accessor, as the specification says."""
+    accessor = document["accessors"][number]
+    view = document["bufferViews"][accessor["bufferView"]]
+    buffer = document["buffers"][view["buffer"]]
+    content = base64.b64decode(buffer["uri"].split(",")[1])
+    assert len(content) == buffer["byteLength"] == view["byteLength"]
+    array = np.frombuffer(content, TYPES[accessor["componentType"]])
+    return array.reshape(accessor["count"], COLUMNS[accessor["type"]])
+
+
+def test_turned_by_a_right_angle_about_x_points_are_back():
+    p = np.random.default_rng(0).normal(size=(20, 3))
+    back = RotationMatrix.MakeXRotation(np.pi / 2).multiply(y_up(p).T).T
+    np.testing.assert_allclose(back, p, atol=1e-12)
+
+
+def test_every_primitive_of_a_document_reads_as_written():
+    rng, document, written = np.random.default_rng(0), {}, []
+    for count in (4, 7):
+        p, uv = rng.normal(size=(count, 3)), rng.uniform(size=(count, 2))
+        triangles = rng.integers(0, count, (5, 3))
+        written.append((p, uv, triangles, add_primitive(document, p, uv, triangles)))
+    for p, uv, triangles, primitive in written:
+        position = primitive["attributes"]["POSITION"]
+        np.testing.assert_allclose(_read(document, position), y_up(p), atol=1e-6)
+        np.testing.assert_allclose(_read(document, primitive["attributes"]["TEXCOORD_0"]), uv, 1e-6)
+        np.testing.assert_array_equal(
+            _read(document, primitive["indices"]).reshape(-1, 3), triangles
+        )
+        np.testing.assert_allclose(document["accessors"][position]["max"], y_up(p).max(0), 1e-6)
+
+
+def test_data_uri_holds_its_content():
+    head, _, content = data_uri("image/png", b"\x00\xff splat").partition(",")
+    assert head == "data:image/png;base64" and base64.b64decode(content) == b"\x00\xff splat"

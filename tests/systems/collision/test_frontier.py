@@ -4,13 +4,13 @@ from pydrake.math import RigidTransform, RollPitchYaw
 
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.collision.esdf_build import esdf_from_occupancy
 from splatpilot.systems.collision.frontier import (
     frontier_faces,
     hidden_frontier,
     reachable_space,
     with_obstacles,
 )
-from splatpilot.systems.collision.occupancy import esdf_from_occupancy
 
 K = np.array([[40.0, 0.0, 40.0], [0.0, 40.0, 30.0], [0.0, 0.0, 1.0]])
 

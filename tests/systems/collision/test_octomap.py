@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from splatpilot.systems.collision.distance_field import FieldState
-from splatpilot.systems.collision.octomap import esdf_from_octomap, read_octomap
+from splatpilot.systems.collision.octomap import read_octomap
 
 FREE, OCCUPIED, UNKNOWN, _ = FieldState
 FREE_LEAF, OCCUPIED_LEAF, INNER = 1, 2, 3
@@ -73,12 +73,10 @@ def test_grid_and_distance_field(tmp_path):
     path = tmp_path / "map.bt"
     path.write_bytes(deep_tree())
     lower, upper = np.array([-0.5, 0.0, 0.0]), np.array([2.0, 1.0, 1.0])
-    states, corner = read_octomap(path).states(lower, upper)
-    np.testing.assert_array_equal(corner, lower)
     expected = np.full((5, 2, 2), UNKNOWN)
     expected[1, 0, 0], expected[2, 0, 0], expected[3:] = OCCUPIED, FREE, FREE
-    np.testing.assert_array_equal(states, expected)
-    field = esdf_from_octomap(path, lower, upper)
+    field = read_octomap(path).esdf(lower, upper)
+    np.testing.assert_array_equal(field.lower_W, lower)
     np.testing.assert_array_equal(field.states, expected)
     assert -0.5 < field.distance([0.25, 0.25, 0.25]) <= -0.25  # so that its corners are solid
     assert field.distance([1.75, 0.25, 0.25]) == pytest.approx(1.25, abs=0.05)
@@ -88,27 +86,26 @@ def test_boxes_too_large_or_empty_are_refused(tmp_path):
     path = tmp_path / "map.bt"
     path.write_bytes(deep_tree())
     with pytest.raises(ValueError, match=r"at most 2\.5e\+08, .*give smaller bounds"):
-        esdf_from_octomap(path)
+        read_octomap(path).esdf()
     with pytest.raises(ValueError, match="upper_W of the box"):
-        esdf_from_octomap(path, np.ones(3), np.zeros(3))
+        read_octomap(path).esdf(np.ones(3), np.zeros(3))
 
 
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (lambda c: c[:-2], "truncated after 30 bytes; 1 inner nodes are missing"),
-        (lambda c: c[:-1], "truncated after 31 bytes"),
-        (lambda c: c[:-20], "truncated"),
-        (lambda c: c + b"\0\0", "ends after 32 of 34 bytes"),
-        (lambda c: c.replace(b"size 20", b"size 21"), "promises 21 nodes, the tree has 20"),
-        (lambda c: c.replace(b"size 20", b"size many"), "header needs id, size and res"),
-        (lambda c: c.replace(b"res 0.5\n", b""), "header needs id, size and res"),
-        (lambda c: c.replace(b"res 0.5", b"res -1"), "resolution -1.0 m"),
-        (lambda c: c.replace(b"OcTree\n", b"ColorOcTree\n"), "kind 'ColorOcTree'"),
-        (lambda c: c.replace(b"# Octomap", b"# Octopus"), "not a binary OctoMap"),
-        (lambda c: c[: c.index(b"data\n") + 5], "the octree is empty"),
-        (lambda c: b"PK\x03\x04" + c, "not a binary OctoMap"),
-        (lambda c: b"", "not a binary OctoMap"),
+        (lambda c: c[:-2], "octree must be 32 bytes, got 30"),
+        (lambda c: c[:-1], "octree must be 32 bytes, got 31"),
+        (lambda c: c[:-20], "octree must be .* got 12"),
+        (lambda c: c + b"\0\0", "octree must be 32 bytes, got 34"),
+        (lambda c: c[: c.index(b"data\n") + 5], "octree must be .* got 0"),
+        (lambda c: c.replace(b"size 20", b"size 21"), "number of nodes must be .* 21, got 20"),
+        (lambda c: c.replace(b"size 20", b"size many"), "header must have id, size and res"),
+        (lambda c: c.replace(b"res 0.5\n", b""), "header must have id, size and res"),
+        (lambda c: c.replace(b"res 0.5", b"res -1"), "res must be .* got -1.0"),
+        (lambda c: c.replace(b"OcTree\n", b"ColorOcTree\n"), "id must be OcTree, got Color"),
+        (lambda c: c.replace(b"# Octomap", b"# Octopus"), "start must be .* OctoMap"),
+        (lambda c: b"", "start must be .* OctoMap"),
         (lambda c: b"version https://git-lfs\n", "the pointer of git-LFS to a file"),
     ],
 )
@@ -148,7 +145,7 @@ def test_real_maps(maps, name, resolution, extent):
 
 
 def test_the_field_of_a_real_forest(maps):
-    field = esdf_from_octomap(maps / "forest0.bt")
+    field = read_octomap(maps / "forest0.bt").esdf()
     assert field.shape == (100, 100, 50)
     assert field.volume(UNKNOWN) == 0.0
     assert 0.7 < field.volume(FREE) / 500.0 < 0.9

@@ -27,8 +27,8 @@ PERIOD = LAW.period
 class Bench:
     """A failsafe and a vehicle that it flies by velocities or by body rates.
 
-    The test gives what the failsafe is told; the state, which is `age` [s] old, comes by itself,
-    unless the test gives a state of its own.
+    The test gives inputs; the state, which is `age` [s] old, comes by itself, unless the test gives
+    one.
     """
 
     def __init__(
@@ -44,12 +44,12 @@ class Bench:
         self.failsafe = Failsafe(config or FailsafeConfig(), LAW, VEHICLE, *box, field)
         self.simulator = Simulator(self.failsafe)
         self.context = self.simulator.get_mutable_context()
-        self.age, self.by, self.field = age, by, field
+        self.age, self.by, self.box, self.field = age, by, box, field
         self.state = hover_state(p_WB)
         self.state[3:6] = v_WB
         moved = np.append(PERIOD * self.state[3:6], np.zeros(10))
         self.states = [self.state - k * moved for k in range(round(age / PERIOD), -1, -1)]
-        self.tick = 0
+        self.tick, self.min_room = 0, math.inf
         self.give(velocity_setpoint=[0.0, 0.0, 0.0, 0.5], command=HOVER)
         self.give_state()
 
@@ -67,26 +67,22 @@ class Bench:
             sample = self.field.query(state[:3])
             self.give(clearance=sample.distance - VEHICLE_RADIUS, gradient=sample.gradient)
 
-    def want(self, v_WB) -> None:
-        """Gives the setpoint and the command of a policy that wants a velocity."""
-        state = np.asarray(self.failsafe.GetInputPort("state").Eval(self.context))
-        self.accelerate(tracking_acceleration(state[3:6], np.asarray(v_WB)), v_WB)
-
     def accelerate(self, a_WB, v_WB=None) -> None:
-        """Gives the setpoint and the command of a policy that wants an acceleration."""
+        """Gives setpoint and command of a policy that desires an acceleration."""
         state = np.asarray(self.failsafe.GetInputPort("state").Eval(self.context))
         command = flatness_command(state, a_WB, state[3:6], math.nan, LAW, VEHICLE)
         setpoint = state[3:6] + RESPONSE_TIME * a_WB if v_WB is None else v_WB
         self.give(velocity_setpoint=[*setpoint, math.nan], command=command)
 
-    def advance(self, duration: float, measured=None, want=None) -> None:
-        """Flies on; `measured` gives the state that the failsafe is told at a time, the vehicle's
-        own by default; `want` is the velocity that the policy wants."""
+    def advance(self, duration: float, measured=None, desired=None) -> None:
+        """Flies on; `measured` is the state that the failsafe gets at a time, by default the
+        vehicle's; `desired` is the velocity of the policy."""
         for _ in range(round(duration / PERIOD)):
             now = self.tick * PERIOD
             self.give_state(None if measured is None else measured(now))
-            if want is not None:
-                self.want(want)
+            if desired is not None:
+                state = np.asarray(self.failsafe.GetInputPort("state").Eval(self.context))
+                self.accelerate(tracking_acceleration(state[3:6], np.asarray(desired)), desired)
             self.simulator.AdvanceTo(now + 1e-6)
             command = self.out("command")
             if self.by == "velocity":
@@ -98,7 +94,19 @@ class Bench:
             for _ in range(2):
                 self.state = rk4_step(self.state, command, VEHICLE, PERIOD / 2)
             self.states.append(self.state)
+            self.min_room = min(self.min_room, self._room())
             self.tick += 1
+
+    def _room(self) -> float:
+        """The distance [m] by which limits are kept: min_clearance, and the sphere in the box."""
+        p_WB, (lower, upper) = self.state[:3], self.box
+        room = float(np.min([p_WB - lower, upper - p_WB])) - VEHICLE_RADIUS
+        if self.field is not None:
+            room = min(room, float(self.field.distance(p_WB)) - VEHICLE_RADIUS - 0.1)
+        return room
 
     def out(self, name: str) -> np.ndarray:
         return self.failsafe.GetOutputPort(name).Eval(self.context)
+
+    def mode(self) -> tuple[float, float]:
+        return tuple(self.out("mode"))

@@ -3,8 +3,7 @@ import pytest
 from pydrake.math import RigidTransform
 
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.collision.esdf_build import esdf_from_distance_field
-from splatpilot.systems.collision.occupancy import esdf_from_occupancy
+from splatpilot.systems.collision.esdf_build import esdf_from_distance_field, esdf_from_occupancy
 from splatpilot.systems.collision.shapes import AnalyticDistanceField, Box, Cylinder, HalfSpace
 
 VOXEL_SIZE = 0.2

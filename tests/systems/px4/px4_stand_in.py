@@ -1,8 +1,5 @@
-"""A STAND-IN for PX4, which is in no package registry: real MAVLink over UDP, a quadrotor that
-takes velocities up, and what PX4's documentation of v1.16 and v1.18 says of offboard mode.
-
-It is no proof of what PX4 does.
-"""
+"""A STAND-IN for PX4, which is in no package registry: real MAVLink over UDP, a quadrotor, and the
+rules of offboard mode in PX4's documentation of v1.16 and v1.18. It proves nothing about PX4."""
 
 import socket
 
@@ -49,7 +46,7 @@ class Px4StandIn:
         self.muted: set[str] = set()  # Types of messages that it does not send.
 
     def step(self, now: float) -> None:
-        """What happens until `now` [s]."""
+        """Simulates until `now` [s]."""
         while self.tick * STEP <= now + 1e-9:
             self._receive(self.tick * STEP)
             self._fly(self.tick * STEP)
@@ -124,12 +121,11 @@ class Px4StandIn:
             self.mode = LOITER  # COM_OBL_RC_ACT
         if not self.armed:
             return
-        wanted = {OFFBOARD: self.velocity, LAND: np.array([0.0, 0.0, -0.5])}.get(
-            self.mode, np.zeros(3)
-        )
+        velocities = {OFFBOARD: self.velocity, LAND: np.array([0.0, 0.0, -0.5])}
+        desired = velocities.get(self.mode, np.zeros(3))
         command = self.rates if self.mode == OFFBOARD else None
         if command is None:
-            acceleration = tracking_acceleration(self.state[3:6], wanted)
+            acceleration = tracking_acceleration(self.state[3:6], desired)
             law, vehicle = FlatnessControllerConfig(), QuadrotorParams()
             heading = self.heading if self.mode == OFFBOARD else np.nan
             command = flatness_command(self.state, acceleration, np.zeros(3), heading, law, vehicle)
@@ -144,13 +140,10 @@ class Px4StandIn:
             x, y, z, w = (HALF_TURN * R_WB * HALF_TURN.inv()).as_quat()
             rates = HALF_TURN.apply(self.state[10:13])
             due = now + self.delay
-            self.delayed += [
-                (due, dialect.MAVLink_local_position_ned_message(milliseconds, *p, *v)),
-                (
-                    due,
-                    dialect.MAVLink_attitude_quaternion_message(milliseconds, w, x, y, z, *rates),
-                ),
-            ]
+            position = dialect.MAVLink_local_position_ned_message(milliseconds, *p, *v)
+            q = (w, x, y, z)
+            attitude = dialect.MAVLink_attitude_quaternion_message(milliseconds, *q, *rates)
+            self.delayed += [(due, position), (due, attitude)]
         while self.delayed and self.delayed[0][0] <= now + 1e-9:
             self._send(self.delayed.pop(0)[1])
         if self.tick % 10 == 0:

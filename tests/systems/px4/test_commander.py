@@ -1,5 +1,4 @@
-"""What PX4 is told, and what it is not asked for."""
-
+import contextlib
 import socket
 from typing import Any
 
@@ -17,12 +16,12 @@ TICK, UNIX_TIME = 0.002, 1_800_000_000.0  # [s] The latter is that of time 0.
 
 
 class Told:
-    """A commander, and what it sends. A setpoint of age 0 is one of a stream at 50 Hz."""
+    """A commander, and the messages that it sends. A setpoint of age 0 is one of a 50 Hz stream."""
 
     def __init__(self, config: Px4CommanderConfig, **inputs):
         self.px4 = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.px4.bind(("127.0.0.1", 0))
-        self.px4.settimeout(0.0)
+        self.px4.setblocking(False)
         self.inbox = UdpInbox(UdpConfig(port=0))
         self.system = Px4Commander(config, self.inbox, Mavlink(), self.px4.getsockname(), 9.81)
         self.simulator = Simulator(self.system)
@@ -43,7 +42,7 @@ class Told:
             self.is_stream = self.sent == self.now
 
     def advance(self, duration: float) -> list:
-        """What is sent meanwhile, heartbeats left out."""
+        """Returns the messages that are sent meanwhile, without heartbeats."""
         context = self.simulator.get_mutable_context()
         for tick in range(round(self.now / TICK), round((self.now + duration) / TICK)):
             if self.is_stream and tick % 10 == 0:
@@ -52,30 +51,36 @@ class Told:
             self.system.GetInputPort("unix_time").FixValue(context, [UNIX_TIME + tick * TICK])
             self.simulator.AdvanceTo((tick + 1) * TICK)
         messages: list[Any] = []
-        while True:
-            try:
-                packet = self.px4.recv(4096)
-            except BlockingIOError:
-                break
-            messages += dialect.MAVLink(None).parse_buffer(packet) or []
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                messages += dialect.MAVLink(None).parse_buffer(self.px4.recv(4096)) or []
         return [message for message in messages if message.get_type() != "HEARTBEAT"]
 
-    def close(self) -> None:
-        self.px4.close()
-        self.inbox.close()
+    def advance_without_heartbeats(self, first_age: float, until: float) -> list:
+        """Returns the messages that are sent while the last heartbeat ages."""
+        messages = []
+        for age in np.arange(first_age, until, 0.02):
+            self.give(heartbeat_age=[age])
+            messages += self.advance(0.02)
+        return messages
 
 
 @pytest.fixture
 def told():
     made = []
 
-    def make(config: Px4CommanderConfig, **inputs) -> Told:
-        made.append(Told(config, **inputs))
+    def make(config: Px4CommanderConfig | None = None, **inputs) -> Told:
+        made.append(Told(config or Px4CommanderConfig(), **inputs))
         return made[-1]
 
     yield make
     for each in made:
-        each.close()
+        each.px4.close()
+        each.inbox.close()
+
+
+def requests(messages: list) -> list[int]:
+    return [m.command for m in messages if m.get_type() == "COMMAND_LONG"]
 
 
 def modes(messages: list) -> list[tuple[float, float]]:
@@ -87,14 +92,14 @@ def modes(messages: list) -> list[tuple[float, float]]:
 
 
 def test_setpoints_are_sent_at_50_hz_while_they_are_fresh(told):
-    vehicle = told(Px4CommanderConfig())
+    vehicle = told()
     assert len(vehicle.advance(1.0)) == pytest.approx(50, abs=1)
     vehicle.give(setpoint_age=[0.31])
     assert vehicle.advance(1.0) == []
 
 
 def test_setpoints_are_sent_as_they_come(told):
-    vehicle = told(Px4CommanderConfig())
+    vehicle = told()
     vehicle.advance(0.105)
     vehicle.give(setpoint_age=[0.012])
     assert vehicle.advance(0.002) == []
@@ -108,7 +113,7 @@ def test_setpoints_are_sent_as_they_come(told):
 
 
 @pytest.mark.parametrize("mode", [status.WAITING, status.HOLDING, status.LANDING])
-def test_offboard_mode_is_not_asked_for_unless_the_bridge_flies(told, mode):
+def test_offboard_mode_is_requested_only_while_the_bridge_flies(told, mode):
     config = Px4CommanderConfig(engage=True, arm=True)
     vehicle = told(config, bridge_mode=[float(mode)])
     assert modes(vehicle.advance(4.0)) == []
@@ -117,17 +122,16 @@ def test_offboard_mode_is_not_asked_for_unless_the_bridge_flies(told, mode):
     assert len(asked) == 3 and set(asked) == {OFFBOARD}
 
 
-def test_arming_is_asked_for_in_offboard_mode_alone(told):
+def test_arming_is_requested_only_in_offboard_mode(told):
     vehicle = told(Px4CommanderConfig(engage=True, arm=True))
     vehicle.advance(2.0)
     vehicle.give(mode=[6.0, 0.0])
-    armed = [m.command for m in vehicle.advance(2.0) if m.get_type() == "COMMAND_LONG"]
-    assert armed == [dialect.MAV_CMD_COMPONENT_ARM_DISARM] * 2
+    assert requests(vehicle.advance(2.0)) == [dialect.MAV_CMD_COMPONENT_ARM_DISARM] * 2
     vehicle.give(armed=[1.0])
-    assert not [m for m in vehicle.advance(3.0) if m.get_type() == "COMMAND_LONG"]
+    assert requests(vehicle.advance(3.0)) == []
 
 
-def test_where_the_bridge_lands_px4_does(told):
+def test_px4_lands_if_the_bridge_does(told):
     vehicle = told(Px4CommanderConfig(engage=True), bridge_mode=[float(status.FLYING)])
     vehicle.advance(2.0)
     vehicle.give(mode=[6.0, 0.0], armed=[1.0])
@@ -151,21 +155,15 @@ def setpoints(messages: list) -> list[tuple[float, float, float]]:
     return [(m.vx, m.vy, m.vz) for m in messages if m.get_type() == kind]
 
 
-@pytest.mark.parametrize(("loss", "asked"), [(LOST, HOLD), (LANDS, LAND)])
-def test_a_mode_is_requested_after_a_heartbeat_that_is_newer_than_the_loss(told, loss, asked):
-    vehicle = told(Px4CommanderConfig(), **FLYING)
+@pytest.mark.parametrize(("loss", "mode"), [(LOST, HOLD), (LANDS, LAND)])
+def test_a_mode_is_requested_after_a_heartbeat_that_is_newer_than_the_loss(told, loss, mode):
+    vehicle = told(**FLYING)
     vehicle.advance(1.0)
     vehicle.give(**loss)
-    for age in np.arange(0.02, 0.9, 0.02):
-        vehicle.give(heartbeat_age=[age])
-        assert modes(vehicle.advance(0.02)) == []
-    vehicle.give(heartbeat_age=[0.0])
-    assert modes(vehicle.advance(0.04)) == [asked]
-    for age in np.arange(0.02, 1.5, 0.02):
-        vehicle.give(heartbeat_age=[age])
-        assert modes(vehicle.advance(0.02)) == []
-    vehicle.give(heartbeat_age=[0.0])
-    assert modes(vehicle.advance(0.04)) == [asked]
+    for silence in (0.9, 1.5):
+        assert modes(vehicle.advance_without_heartbeats(0.02, silence)) == []
+        vehicle.give(heartbeat_age=[0.0])
+        assert modes(vehicle.advance(0.04)) == [mode]
 
 
 @pytest.mark.parametrize("interface", ["velocity", "body_rates"])
@@ -173,16 +171,13 @@ def test_until_then_the_vehicle_is_told_to_stop(told, interface):
     vehicle = told(Px4CommanderConfig(setpoints=interface), **FLYING)
     vehicle.advance(1.0)
     vehicle.give(**LOST)
-    sent = []
-    for age in np.arange(0.02, 3.0, 0.02):
-        vehicle.give(heartbeat_age=[age])
-        sent += vehicle.advance(0.02)
+    sent = vehicle.advance_without_heartbeats(0.02, 3.0)
     assert set(setpoints(sent)) == {(0.0, 0.0, 0.0)}
     assert len(sent) == pytest.approx(100, abs=2)
 
 
 def test_a_bridge_that_comes_back_in_time_flies_on(told):
-    vehicle = told(Px4CommanderConfig(), **FLYING)
+    vehicle = told(**FLYING)
     vehicle.advance(1.0)
     vehicle.give(heartbeat_age=[0.5], **LOST)
     vehicle.advance(0.1)
@@ -199,23 +194,23 @@ def test_without_heartbeats_nothing_is_requested(told, loss):
     vehicle.advance(2.0)
     vehicle.give(heartbeat_age=[3.1], mode=[0.0, 0.0], armed=[0.0], **loss)
     sent = vehicle.advance(3.0)
-    assert not [m for m in sent if m.get_type() == "COMMAND_LONG"]
+    assert requests(sent) == []
     assert len(setpoints(sent)) >= 100
 
 
 @pytest.mark.parametrize(
     ("mode", "granted", "command"), [(3.0, [1.0, 0.0], 176), (6.0, [1.0, 1.0], 400)]
 )
-def test_what_was_granted_is_not_requested_again(told, mode, granted, command):
+def test_a_granted_request_is_not_repeated(told, mode, granted, command):
     vehicle = told(Px4CommanderConfig(engage=True, arm=True), mode=[mode, 0.0])
-    assert [m.command for m in vehicle.advance(1.6) if m.get_type() == "COMMAND_LONG"] == [command]
+    assert requests(vehicle.advance(1.6)) == [command]
     vehicle.give(granted=granted)
-    assert not [m for m in vehicle.advance(3.0) if m.get_type() == "COMMAND_LONG"]
+    assert requests(vehicle.advance(3.0)) == []
 
 
 @pytest.mark.parametrize(("interval", "sent"), [(0.005, 50), (1 / 120, 40), (0.02, 50), (0.1, 10)])
 def test_poses_are_sent_once_as_they_come_at_50_hz_at_most(told, interval, sent):
-    vehicle = told(Px4CommanderConfig(), motion_capture_age=[np.inf])
+    vehicle = told(motion_capture_age=[np.inf])
     vehicle.give(motion_capture_pose=[np.nan] * 7)
     messages = []
     for tick in range(500):
@@ -231,7 +226,7 @@ def test_poses_are_sent_once_as_they_come_at_50_hz_at_most(told, interval, sent)
 
 
 def test_an_old_pose_is_not_sent(told):
-    vehicle = told(Px4CommanderConfig(), motion_capture_age=[0.31])
+    vehicle = told(motion_capture_age=[0.31])
     vehicle.give(motion_capture_pose=[1.0, 2, 3, 1, 0, 0, 0])
     assert not [m for m in vehicle.advance(0.1) if m.get_type() == "ODOMETRY"]
 
@@ -245,6 +240,6 @@ def test_an_old_pose_is_not_sent(told):
         (Px4CommanderConfig(arm=True), r"arm must be false without engage"),
     ],
 )
-def test_bad_config_is_named(config, why):
+def test_invalid_config_is_named(config, why):
     with pytest.raises(ValueError, match=why):
         config.validate()

@@ -1,5 +1,4 @@
-"""What PX4 says, and what others do."""
-
+import contextlib
 import socket
 from collections.abc import Callable
 
@@ -33,7 +32,7 @@ class Link:
     def __init__(self, now: Callable[[], float] | None = None):
         self.px4 = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.px4.bind(("127.0.0.1", 0))
-        self.px4.settimeout(0.0)
+        self.px4.setblocking(False)
         self.inbox = UdpInbox(UdpConfig(port=0))
         self.mavlink = dialect.MAVLink(None, 1, 1)
         self.system = Px4Telemetry(self.inbox, Mavlink(), self.px4.getsockname(), 0.01, now)
@@ -55,10 +54,16 @@ class Link:
         self.system.GetInputPort("unix_time").FixValue(context, [EPOCH + context.get_time()])
 
     def send(self, *messages, raw: bytes = b"", sender: str = "127.0.0.1") -> None:
+        """Sends messages in one packet."""
         packet = b"".join(bytes(message.pack(self.mavlink)) for message in messages) + raw
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
             out.bind((sender, 0))
             out.sendto(packet, ("127.0.0.1", self.inbox.port))
+
+    def send_state(self, late: float = 0.0, **values) -> None:
+        """Sends position and attitude of `late` [s] ago."""
+        time = self.boot_time - late
+        self.send(position(time, **values), attitude(time))
 
     def advance(self, duration: float) -> list:
         """The TIMESYNC messages that are sent meanwhile."""
@@ -66,11 +71,10 @@ class Link:
             self.simulator.AdvanceTo(round(self.now + 0.01, 6))
             self.tell_time()
         messages = []
-        while True:
-            try:
+        with contextlib.suppress(BlockingIOError):
+            while True:
                 messages += dialect.MAVLink(None).parse_buffer(self.px4.recv(4096)) or []
-            except BlockingIOError:
-                return messages
+        return messages
 
     def out(self, name: str):
         value = self.system.GetOutputPort(name).Eval(self.simulator.get_context()).copy()
@@ -131,11 +135,11 @@ def test_position_and_attitude_are_brought_to_the_time_of_the_older(link, late):
 
 
 @pytest.mark.parametrize("back", [0.0, 0.5, 20.0])
-def test_what_is_no_newer_is_counted_and_changes_nothing(link, back):
+def test_older_states_are_counted_and_change_nothing(link, back):
     link.advance(0.5)
-    link.send(position(link.boot_time), attitude(link.boot_time), HEARTBEAT)
+    link.send_state()
     link.advance(0.1)
-    link.send(position(link.boot_time - 0.1 - back, x=9.0), attitude(link.boot_time - 0.1 - back))
+    link.send_state(0.1 + back, x=9.0)
     link.advance(0.01)
     assert link.out("state")[0] == 1.0
     assert link.out("age") == pytest.approx(0.11, abs=1e-3)
@@ -143,7 +147,7 @@ def test_what_is_no_newer_is_counted_and_changes_nothing(link, back):
 
 
 def test_px4_may_start_again(link):
-    link.send(position(link.boot_time), attitude(link.boot_time))
+    link.send_state()
     link.advance(1.5)
     link.send(position(2.0, x=9.0))
     link.advance(0.02)
@@ -158,11 +162,11 @@ def test_px4_may_start_again(link):
 @pytest.mark.parametrize("silence", [0.0, 1.5])
 def test_a_link_that_buffers_is_seen_in_the_age(link, silence):
     for _ in range(20):
-        link.send(position(link.boot_time), attitude(link.boot_time))
+        link.send_state()
         link.advance(0.02)
     link.advance(silence)
     for _ in range(20):
-        link.send(position(link.boot_time - 0.1), attitude(link.boot_time - 0.1))
+        link.send_state(0.1)
         link.advance(0.02)
     assert link.out("age") == pytest.approx(0.12, abs=2e-3)
 
@@ -175,7 +179,7 @@ def test_a_link_that_is_slow_from_the_start_is_seen_by_answers(link):
             for message in link.advance(0.01)
             for at in [link.boot_time + 0.03]
         ]
-        link.send(position(link.boot_time - 0.04), attitude(link.boot_time - 0.04))
+        link.send_state(0.04)
         while waiting and waiting[0][0] <= link.now + 1e-6:
             link.send(waiting.pop(0)[1])
     assert link.out("age") == pytest.approx(0.05, abs=2e-3)
@@ -185,13 +189,12 @@ def test_a_process_that_is_behind_takes_no_message_for_faster(make):
     late = 0.0
     link = make(lambda: EPOCH + link.now + late)
     for late in (0.0, 0.05, 0.0):
-        stamp = link.boot_time + late
-        link.send(position(stamp), attitude(stamp))
+        link.send_state(-late)
         link.advance(0.1)
     assert link.out("age") == pytest.approx(0.1, abs=1e-3)
 
 
-def test_px4s_questions_what_time_it_is_are_answered(link):
+def test_px4s_requests_for_the_time_are_answered(link):
     link.advance(0.5)
     link.send(dialect.MAVLink_timesync_message(0, 12345))
     (answer,) = link.advance(0.05)
@@ -214,7 +217,7 @@ def test_a_value_that_is_not_finite_hides_no_heartbeat(link):
     assert link.out("armed") == 1 and link.out("rejected") == 1
 
 
-def test_what_px4_grants_is_remembered(link):
+def test_granted_commands_are_remembered(link):
     link.advance(0.02)
     assert link.out("granted").tolist() == [0, 0]
     link.send(dialect.MAVLink_command_ack_message(176, dialect.MAV_RESULT_ACCEPTED))

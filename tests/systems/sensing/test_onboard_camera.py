@@ -34,6 +34,6 @@ def test_mount_looks_ahead_and_up():
         ("readout", 0.3),
     ],
 )
-def test_bad_config_is_named(field, value):
+def test_invalid_config_is_named(field, value):
     with pytest.raises(ValueError, match=rf"OnboardCamera.{field} must"):
         OnboardCamera(**{field: value}).validate()

@@ -1,7 +1,6 @@
-"""gsplat's test scene: points of the garden, dressed at random as gsplat's tests do."""
+"""gsplat's test scene: points of the garden as random Gaussians, as in gsplat's tests."""
 
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -12,22 +11,13 @@ HALF = 2.0  # [m] of the cube about the origin that is kept
 SCALES = (1e-4, 0.02)  # [m]
 
 
-class Garden(NamedTuple):
-    scene: dict[str, Tensor]  # means, quats, scales, opacities, colors of N Gaussians
-    viewmats: Tensor  # (3, 4, 4)
-    Ks: Tensor  # (3, 3, 3)
-    width: int
-    height: int
-
-
-def load_garden(data: Path, count: int | None = None) -> Garden:
-    """The garden of `data`/test_garden.npz; `count` takes so many Gaussians at random."""
+def load_garden(data: Path, count: int) -> tuple[dict[str, Tensor], Tensor, Tensor, int, int]:
+    """Returns `count` Gaussians, viewmats (3, 4, 4), Ks (3, 3, 3), width and height."""
     arrays = np.load(data / "test_garden.npz")
     g = torch.Generator().manual_seed(42)
     means, colors = torch.from_numpy(arrays["means3d"]), torch.from_numpy(arrays["colors"]) / 255
     inside = torch.nonzero((means.abs() <= HALF).all(1))[:, 0]
-    if count is not None:
-        inside = inside[torch.randperm(len(inside), generator=g)[:count]]
+    inside = inside[torch.randperm(len(inside), generator=g)[:count]]
     N = len(inside)
     scene = {
         "means": means[inside],
@@ -36,5 +26,5 @@ def load_garden(data: Path, count: int | None = None) -> Garden:
         "opacities": torch.rand(N, generator=g),
         "colors": colors[inside].float(),
     }
-    cameras = (torch.from_numpy(arrays[name]).float() for name in ("viewmats", "Ks"))
-    return Garden(scene, *cameras, int(arrays["width"]), int(arrays["height"]))
+    viewmats, Ks = (torch.from_numpy(arrays[name]).float() for name in ("viewmats", "Ks"))
+    return scene, viewmats, Ks, int(arrays["width"]), int(arrays["height"])

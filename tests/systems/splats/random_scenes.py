@@ -1,4 +1,4 @@
-"""Random scenes with the same bits on every machine.
+"""Random scenes that are bitwise identical on every machine.
 
 Only uniform numbers and operations that IEEE 754 rounds correctly (+, -, *, /, square roots and
 powers of two), one at a time in float64, and one rounding to float32 at the end: exponentials,

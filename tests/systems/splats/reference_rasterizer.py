@@ -1,8 +1,4 @@
-"""Gaussian splatting in float64 torch, straight from the published equations, to test against.
-
-Written for clarity, not speed: covariances are multiplied out, every pixel sees every Gaussian
-whose generous bounding circle meets its tile, and everything is differentiable.
-"""
+"""Gaussian splatting in float64 torch, differentiable, from the published equations."""
 
 import math
 from typing import Any, NamedTuple
@@ -83,27 +79,33 @@ def sh_basis(degree: int, directions: Tensor) -> Tensor:
     return torch.stack(columns, 1)
 
 
+def seen_colors(means: Tensor, colors: Tensor, viewmat: Tensor, sh_degree: int | None) -> Tensor:
+    if sh_degree is None:
+        return colors
+    direction = means + torch.linalg.inv(viewmat[:3, :3]) @ viewmat[:3, 3]
+    basis = sh_basis(sh_degree, direction / direction.norm(dim=1, keepdim=True))
+    coefficients = colors[:, : (sh_degree + 1) ** 2]
+    return torch.clamp(0.5 + torch.einsum("nk,nkc->nc", basis, coefficients), min=0)
+
+
 def project(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    viewmat: Tensor,
-    K: Tensor,
-    width: int,
-    height: int,
-    near: float = 0.01,
-    far: float = 1e10,
-    radius_clip: float = 0.0,
-    eps2d: float = 0.3,
-    antialiased: bool = False,
-    blend_order: Tensor | None = None,
+    means,
+    quats,
+    scales,
+    opacities,
+    viewmat,
+    K,
+    width,
+    height,
+    near=0.01,
+    far=1e10,
+    eps2d=0.3,
+    antialiased=False,
 ) -> Projection:
     """EWA projection: J R Sigma R^T J^T + eps2d I (Zwicker et al. 2001; Kerbl et al. 2023).
 
     `antialiased` multiplies opacities by the square root of the ratio of the determinants without
-    and with eps2d (Yu et al. 2024). Gaussians blend by rising `blend_order` (N,), their depth if
-    None.
+    and with eps2d (Yu et al. 2024).
     """
     R, t = viewmat[:3, :3], viewmat[:3, 3]
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
@@ -131,10 +133,8 @@ def project(
     radius = extent[:, None] * torch.sqrt(torch.diagonal(covariance, dim1=1, dim2=2))
     size = torch.tensor([width, height])
     on_image = ((mean + radius > 0) & (mean - radius < size)).all(1)
-    large = (torch.ceil(radius) > radius_clip).any(1)
-    index = torch.nonzero(inside & visible_opacity & on_image & large)[:, 0]
-    key = z if blend_order is None else blend_order
-    index = index[torch.argsort(key[index], stable=True)]
+    index = torch.nonzero(inside & visible_opacity & on_image)[:, 0]
+    index = index[torch.argsort(z[index], stable=True)]
     return Projection(mean[index], covariance[index], z[index], index, opacities[index])
 
 
@@ -181,33 +181,69 @@ def composite(projection: Projection, colors: Tensor, width: int, height: int) -
 
 
 def render(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    viewmat: Tensor,
-    K: Tensor,
-    width: int,
-    height: int,
-    sh_degree: int | None = None,
-    background: Tensor | tuple[float, float, float] = (0.0, 0.0, 0.0),
-    dtype: torch.dtype = torch.float64,
+    means,
+    quats,
+    scales,
+    opacities,
+    colors,
+    viewmat,
+    K,
+    width,
+    height,
+    sh_degree=None,
+    background=(0.0, 0.0, 0.0),
+    dtype=torch.float64,
     **projection_options,
 ) -> Reference:
-    """One camera; `colors` (N, 3), or (N, K, 3) with `sh_degree`."""
     means, quats, scales, opacities, colors, viewmat, K = (
         a.to(dtype) for a in (means, quats, scales, opacities, colors, viewmat, K)
     )
     p = project(means, quats, scales, opacities, viewmat, K, width, height, **projection_options)
-    if sh_degree is None:
-        seen = colors[p.ids]
-    else:
-        center = -torch.linalg.inv(viewmat[:3, :3]) @ viewmat[:3, 3]
-        direction = means[p.ids] - center
-        basis = sh_basis(sh_degree, direction / direction.norm(dim=1, keepdim=True))
-        coefficients = colors[p.ids, : (sh_degree + 1) ** 2]
-        seen = torch.clamp(0.5 + torch.einsum("nk,nkc->nc", basis, coefficients), min=0)
+    seen = seen_colors(means[p.ids], colors[p.ids], viewmat, sh_degree)
     result = composite(p, seen, width, height)
     behind = (1 - result.alpha)[..., None] * torch.as_tensor(background, dtype=dtype)
     return result._replace(color=result.color + behind)
+
+
+BLUR = 0.3  # [px^2]
+MARGIN = 1e-8  # [px^2]
+REACH = 3.33  # standard deviations
+
+
+def median_depth(
+    means, quats, scales, opacities, viewmat, K, width, height
+) -> tuple[Tensor, Tensor]:
+    """Returns the depth (H, W) [m] where transmittance without blur falls to one half, else 0.
+
+    On a Gaussian with the covariance S about c, in the camera frame, the depth is where the ray d
+    (of unit depth) meets the plane n . p = n . c with n = S^-1 c, rotated until no part within
+    `REACH` standard deviations is nearer or farther by more than 0.9 of the inverse depth. Where
+    that is farther than the center, a distance on the image counts as much longer. Also returns
+    the relative distance (H, W) of alpha or transmittance to a threshold.
+    """
+    arguments = (a.double() for a in (means, quats, scales, opacities, viewmat, K))
+    means, quats, scales, opacities, viewmat, K = arguments
+    visible = project(means, quats, scales, opacities, viewmat, K, width, height, eps2d=BLUR)
+    sharp = visible.covariance + (MARGIN - BLUR) * torch.eye(2, dtype=torch.float64)
+    conic = torch.linalg.inv(sharp)
+
+    R, t = viewmat[:3, :3], viewmat[:3, 3]
+    p_C = means[visible.ids] @ R.T + t
+    factor = R @ rotation_matrices(quats[visible.ids]) * scales[visible.ids][:, None, :]
+    covariance = factor @ factor.transpose(1, 2)
+    n = torch.linalg.solve(covariance, p_C[..., None])[..., 0]
+    v, u = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    pixels = torch.stack([u, v], -1).reshape(-1, 1, 2).double()
+    slope = n[:, :2] / torch.stack([K[0, 0], K[1, 1]]) / (n * p_C).sum(1, keepdim=True)  # (M, 2)
+    spread = torch.einsum("gi,gij,gj->g", slope, sharp, slope).sqrt()
+    turn = (0.9 / p_C[:, 2] / (REACH * spread)).clamp(max=1)
+    inverse = 1 / p_C[:, 2] + turn * ((pixels - visible.mean) * slope).sum(-1)  # (P, M)
+    d = (pixels - visible.mean) / (p_C[:, 2] * inverse).clamp(max=1)[..., None]
+    raw = visible.opacity * torch.exp(-0.5 * torch.einsum("pgi,gij,pgj->pg", d, conic, d))
+    alpha = torch.where(raw >= ALPHA_CUT, raw, 0.0)
+    left = torch.cumprod(1 - alpha, 1)
+    passed = left <= 0.5
+    first = passed.double().argmax(1)
+    depth = torch.where(passed.any(1), 1 / inverse.gather(1, first[:, None])[:, 0], 0.0)
+    margin = torch.minimum((raw / ALPHA_CUT - 1).abs().amin(1), (left / 0.5 - 1).abs().amin(1))
+    return depth.reshape(height, width), margin.reshape(height, width)

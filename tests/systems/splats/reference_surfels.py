@@ -1,9 +1,6 @@
-"""2D Gaussian splatting in float64 torch, straight from the paper's equations, to test against.
-
-Huang et al. 2024, equations 4 to 11: the homography H from a surfel's plane to the image, the ray
-as the intersection of two planes carried back by H^T, and the larger of the two Gaussians. Every
-pixel sees every surfel and everything is differentiable.
-"""
+"""2D Gaussian splatting in float64 torch, differentiable, from Huang et al. 2024, eq. 4 to 11:
+the homography H from a surfel's plane to the image, the ray as the intersection of two planes
+mapped back by H^T, and the larger of the two Gaussians."""
 
 from typing import NamedTuple
 
@@ -13,7 +10,7 @@ from reference_rasterizer import (
     MAX_ALPHA,
     MIN_TRANSMITTANCE,
     rotation_matrices,
-    sh_basis,
+    seen_colors,
 )
 from torch import Tensor
 
@@ -32,22 +29,21 @@ class Reference(NamedTuple):
 
 
 def render(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    viewmat: Tensor,
-    K: Tensor,
-    width: int,
-    height: int,
-    near: float = 0.01,
-    far: float = 1e10,
-    sh_degree: int | None = None,
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    dtype: torch.dtype = torch.float64,
+    means,
+    quats,
+    scales,
+    opacities,
+    colors,
+    viewmat,
+    K,
+    width,
+    height,
+    near=0.01,
+    far=1e10,
+    sh_degree=None,
+    background=(0.0, 0.0, 0.0),
+    dtype=torch.float64,
 ) -> Reference:
-    """One camera; tensors are cast to `dtype`."""
     means, quats, scales, opacities, colors, viewmat, K = (
         a.to(dtype) for a in (means, quats, scales, opacities, colors, viewmat, K)
     )
@@ -66,14 +62,7 @@ def render(
     edge_on = facing.abs() <= EDGE_ON * p_C.norm(dim=1)
     center = (p_C @ K.T)[:, :2] / p_C[:, 2:]
 
-    if sh_degree is None:
-        seen = colors[index]
-    else:
-        direction = means[index] + torch.linalg.inv(R) @ t
-        basis = sh_basis(sh_degree, direction / direction.norm(dim=1, keepdim=True))
-        coefficients = colors[index, : (sh_degree + 1) ** 2]
-        seen = torch.clamp(0.5 + torch.einsum("mk,mkc->mc", basis, coefficients), min=0)
-
+    seen = seen_colors(means[index], colors[index], viewmat, sh_degree)
     y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     x, y = x.reshape(-1, 1).to(dtype), y.reshape(-1, 1).to(dtype)  # (P, 1)
     # The planes of the pixel's column and row, in the surfel's coordinates; a ray lies in both.
@@ -98,10 +87,10 @@ def render(
     front_weight = weight.cumsum(1) - weight
     front_depth = (weight * depth).cumsum(1) - weight * depth
     distort = 2 * (weight * (depth * front_weight - front_depth)).sum(1)
-    places = torch.arange(1, len(index) + 1)
+    ranks = torch.arange(1, len(index) + 1)
     is_median = (weight > 0) & (before > 0.5)
-    last = (is_median * places).amax(1, keepdim=True) if len(index) else torch.zeros_like(x).long()
-    median = torch.where((places == last) & is_median, depth, 0.0).sum(1)
+    last = (is_median * ranks).amax(1, keepdim=True) if len(index) else torch.zeros_like(x).long()
+    median = torch.where((ranks == last) & is_median, depth, 0.0).sum(1)
 
     drawn = (before > MIN_TRANSMITTANCE) & (raw >= 0.9 * ALPHA_CUT)
     thresholds = [

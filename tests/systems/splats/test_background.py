@@ -2,8 +2,12 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 
-from splatpilot.systems.splats.background import EnvironmentMap, mean_color, put_behind
-from splatpilot.systems.splats.baked_scene import RenderedView
+from splatpilot.systems.splats.background import (
+    EnvironmentMap,
+    RenderedView,
+    mean_color,
+    put_behind,
+)
 
 AXES = np.array([[1, 0, 0], [0, 1, 0], [-1, 1e-9, 0], [-1, -1e-9, 0], [0, -1, 0], [0, 0, 1.0]])
 K = np.array([[20.0, 0, 16], [0, 20.0, 12], [0, 0, 1]])
@@ -57,7 +61,7 @@ def test_files(tmp_path):
     back = EnvironmentMap.load(tmp_path / "map.png")
     np.testing.assert_allclose(back.texels, gradient().texels, atol=0.5 / 255 + 1e-6)
     (tmp_path / "bad.png").write_text("no image")
-    with pytest.raises(ValueError, match=r"bad\.png: cannot be read as an image"):
+    with pytest.raises(ValueError, match=r"bad\.png: not a readable image"):
         EnvironmentMap.load(tmp_path / "bad.png")
     with pytest.raises(FileNotFoundError, match=r"No such file: .*none\.png"):
         EnvironmentMap.load(tmp_path / "none.png")

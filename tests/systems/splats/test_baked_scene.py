@@ -1,8 +1,6 @@
-"""Tests of the baked renderer."""
-
 import subprocess
 import sys
-import threading
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -12,10 +10,9 @@ from baked_scenes import HEIGHT, LEVELS, WIDTH, X_WC, K, random_scene
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.sensors import CameraInfo
 from random_scenes import random_scene as random_gaussians
-from reference_median_depth import median_depth
-from reference_rasterizer import single_gaussian
+from reference_rasterizer import median_depth, single_gaussian
 
-from splatpilot.systems.splats import rasterize, rasterize_surfels
+from splatpilot.systems.splats import rasterize
 from splatpilot.systems.splats.baked_scene import (
     BakedScene,
     MovingGaussians,
@@ -28,11 +25,9 @@ from splatpilot.systems.splats.splat_camera import SplatCamera
 
 
 def rasterized(scene, background=(0.0, 0.0, 0.0), X=X_WC, **options):
+    names = ("means", "quats", "scales", "opacities")
     image, alpha, _ = rasterize(
-        means=torch.from_numpy(scene.means),
-        quats=torch.from_numpy(scene.quats),
-        scales=torch.from_numpy(scene.scales),
-        opacities=torch.from_numpy(scene.opacities),
+        **{name: torch.from_numpy(getattr(scene, name)) for name in names},
         colors=torch.from_numpy(scene.sh),
         viewmats=torch.from_numpy(X.inverse().GetAsMatrix4().astype(np.float32))[None],
         Ks=torch.from_numpy(K.astype(np.float32))[None],
@@ -64,7 +59,7 @@ def test_agrees_with_rasterize(simd, degree):
         assert np.median(error) < 2e-6 and np.quantile(error, 0.999) < 2e-2
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_culling_by_boxes_loses_nothing(seed):
     rng = np.random.default_rng(seed)
     scene = random_scene(count=4000, seed=seed, sh_degree=0)
@@ -89,18 +84,10 @@ def test_other_colors_equal_a_new_scene(degree):
     np.testing.assert_array_equal(baked.render(K, WIDTH, HEIGHT, X_WC).color, before.color)
 
 
-@pytest.mark.parametrize(
-    ("shape", "message"),
-    [
-        ((300, 3), r"sh must be of shape \(300, K, 3\), got \(300, 3\)"),
-        ((299, 1, 3), r"sh must be of shape \(300, K, 3\), got \(299, 1, 3\)"),
-        ((300, 2, 3), "1, 4, 9 or 16"),
-    ],
-)
-def test_colors_of_other_gaussians_are_refused(shape, message):
-    baked = BakedScene(random_scene(count=300))
-    with pytest.raises(ValueError, match=message):
-        baked.recolored(np.zeros(shape, np.float32))
+@pytest.mark.parametrize("shape", [(300, 3), (299, 1, 3), (300, 2, 3)])
+def test_colors_of_other_gaussians_are_refused(shape):
+    with pytest.raises(ValueError, match="must be"):
+        BakedScene(random_scene(count=300)).recolored(np.zeros(shape, np.float32))
 
 
 @pytest.mark.parametrize("simd", LEVELS)
@@ -108,43 +95,24 @@ def test_threads_and_repeats_give_identical_views(simd):
     scene = random_scene(count=5000)
     first = BakedScene(scene, simd=simd).render(K, WIDTH, HEIGHT, X_WC)
     shared = BakedScene(scene, threads=3, simd=simd)
-    views = []
 
-    def fly():
-        views.append(shared.render(K, WIDTH, HEIGHT, X_WC))
-        shared.render(K, 20, 90, RigidTransform(np.array([0, 0, -5.0])))
-        views.append(shared.render(K, WIDTH, HEIGHT, X_WC))
+    def render(repeat):
+        shared.render(K, 20, 90 + repeat, RigidTransform(np.array([0, 0, -5.0])))
+        return shared.render(K, WIDTH, HEIGHT, X_WC)
 
-    workers = [threading.Thread(target=fly) for _ in range(3)]
-    for worker in workers:
-        worker.start()
-    for worker in workers:
-        worker.join()
-    assert len(views) == 6
-    for view in views:
-        for got, want in zip(view, first, strict=True):
-            np.testing.assert_array_equal(got, want)
+    with ThreadPoolExecutor(3) as pool:
+        for view in pool.map(render, range(6)):
+            for got, want in zip(view, first, strict=True):
+                np.testing.assert_array_equal(got, want)
 
 
-@pytest.mark.parametrize("count", [0, 15, 17, 65])
+@pytest.mark.parametrize("count", [0, 17])
 def test_counts_that_do_not_fill_groups(count):
     scene = random_scene(count=count, sh_degree=1)
     view = BakedScene(scene).render(K, WIDTH, HEIGHT, X_WC)
     image, alpha = rasterized(scene)
     np.testing.assert_allclose(view.alpha, alpha, atol=1e-4)
     np.testing.assert_allclose(view.color, image[..., :3], atol=1e-4)
-
-
-def test_flat_and_needle_gaussians_keep_their_shape():
-    rng = np.random.default_rng(1)
-    scene = random_scene(count=200, sh_degree=0)
-    scales = scene.scales.copy()
-    scales[:100, rng.integers(0, 3)] = 1e-9
-    scales[50:150, :2] = 1e-12
-    scene = GaussianScene(scene.means, scene.quats, scales, scene.opacities, scene.sh)
-    view = BakedScene(scene).render(K, WIDTH, HEIGHT, X_WC)
-    image, _ = rasterized(scene)
-    assert np.quantile(np.abs(view.color - image[..., :3]), 0.99) < 1e-4
 
 
 def test_near_and_far_cut_by_depth_of_center():
@@ -165,9 +133,7 @@ def test_near_and_far_cut_by_depth_of_center():
     ("change", "message"),
     [
         ({"K": np.eye(4)}, r"K must be of shape \(3, 3\), got \(4, 4\)"),
-        ({"K": np.diag([0.0, 1.0, 1.0])}, r"focal lengths of K must be > 0 px, got 0, 1"),
         ({"K": np.diag([1.0, np.nan, 1.0])}, "K must be finite"),
-        ({"width": 0}, "image size must be .* got 0 x 61"),
         ({"height": -1}, "image size must be .* got 83 x -1"),
         ({"near": 0.0}, "0 < near < far"),
         ({"near": 5.0, "far": 4.0}, "depth range must be .* got 5 to 4 m"),
@@ -185,33 +151,22 @@ def test_bad_cameras_are_named(change, message):
             baked.render_depth(**arguments)
 
 
-def test_environment_selects_the_simd_level():
-    code = (
-        "import sys; from splatpilot.systems.splats.baked_scene import create_renderer;"
-        "print(create_renderer(1).simd, 'torch' in sys.modules)"
-    )
+def test_environment_selects_the_simd_level(monkeypatch):
     for level in LEVELS:
-        done = subprocess.run(
-            [sys.executable, "-c", code],
-            env={"SPLATPILOT_SIMD": level},
-            capture_output=True,
-            text=True,
-            check=True,
-        )
-        assert done.stdout.split() == [level, "False"]
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        env={"SPLATPILOT_SIMD": "v9"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode != 0 and "'v9' is not available" in done.stderr
+        monkeypatch.setenv("SPLATPILOT_SIMD", level)
+        assert create_renderer().simd == level
+    with pytest.raises(ValueError, match="'v9' is not available"):
+        create_renderer(simd="v9")
+
+
+def test_rendering_does_not_load_torch():
+    code = "import sys, splatpilot.systems.splats.baked_scene; assert 'torch' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 @pytest.mark.parametrize("simd", LEVELS)
 @pytest.mark.parametrize("lens", [None, Distortion(model="fisheye", radial=[0.05, 0.0, 0.0, 0.0])])
-@pytest.mark.parametrize("size", [0.02, 0.3, 1.0, 6.0])
+@pytest.mark.parametrize("size", [0.02, 1.0, 6.0])
 def test_depth_alone_is_identical(simd, lens, size):
     bodies = random_scene(count=200, seed=1, sh_degree=0)
     moving = PlacedGaussians(
@@ -229,42 +184,7 @@ def test_depth_alone_is_identical(simd, lens, size):
 
 
 @pytest.mark.parametrize("simd", LEVELS)
-def test_needles_seen_edge_on_have_the_same_depth_alone(simd):
-    rng = np.random.default_rng(4)
-    scene = random_scene(count=2000, sh_degree=0)
-    toward = scene.means - np.array([0.0, 0.0, -3.0])
-    normals = np.cross(toward, rng.normal(size=toward.shape))
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    normals += 1e-3 * rng.normal(size=normals.shape)
-    x, y, z = normals.T / np.linalg.norm(normals, axis=1)
-    quats = np.stack([1.0 + z, -y, x, np.zeros_like(z)], axis=1)  # turns the z axis to the normal
-    scales = np.tile([0.5, 0.5, 1e-5], (len(quats), 1))
-    sheets = replace(scene, quats=quats.astype(np.float32), scales=scales.astype(np.float32))
-    baked = BakedScene(replace(sheets, opacities=np.ones_like(scene.opacities)), simd=simd)
-    X = RigidTransform([0.0, 0.0, -3.0])
-    whole = baked.render(K, WIDTH, HEIGHT, X).depth
-    assert (whole > 0).mean() > 0.1
-    np.testing.assert_array_equal(baked.render_depth(K, WIDTH, HEIGHT, X), whole)
-
-
-@pytest.mark.parametrize("simd", LEVELS)
-def test_a_disc_seen_exactly_edge_on_has_depth_alone(simd):
-    disc = GaussianScene(
-        means=np.array([[0.0, 0.0, 2.0]], np.float32),
-        quats=np.array([[1.0, 0.0, 0.0, 0.0]], np.float32),
-        scales=np.array([[1e-30, 0.3, 0.3]], np.float32),
-        opacities=np.ones(1, np.float32),
-        sh=np.zeros((1, 1, 3), np.float32),
-    )
-    through_centers = np.array([[70.0, 0, 41.5], [0, 75.0, 30.5], [0, 0, 1]])
-    camera = (through_centers, WIDTH, HEIGHT, RigidTransform())
-    depth = BakedScene(disc, simd=simd).render_depth(*camera)
-    assert depth[30, 41] == pytest.approx(2.0)
-    np.testing.assert_array_equal(np.unique(np.nonzero(depth)[1]), [41])
-
-
-@pytest.mark.parametrize("simd", LEVELS)
-def test_what_is_too_far_hides_nothing(simd):
+def test_gaussians_beyond_max_depth_hide_nothing(simd):
     half = 0.5**0.5
     scene = GaussianScene(
         means=np.array([[0.0, 0.0, 6.0], [0.0, 2.0, 6.5]], np.float32),
@@ -285,7 +205,6 @@ K_WALL = np.array([[40.0, 0, 32.0], [0, 40.0, 18.0], [0, 0, 1]])
 
 
 def wall(X_CP, half_width, half_height, step=0.05):
-    """Flat opaque Gaussians (N) on the plane z = 0 of P, in a frame C."""
     x, y = np.meshgrid(
         np.arange(-half_width + step / 2, half_width, step),
         np.arange(-half_height + step / 2, half_height, step),
@@ -306,7 +225,6 @@ def wall_scene(*walls):
 
 
 def plane_depth(X_CP, width, height):
-    """(H, W) [m] where the pixels' rays meet the plane z = 0 of P."""
     u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     rays = np.stack(
         [(u - K_WALL[0, 2]) / K_WALL[0, 0], (v - K_WALL[1, 2]) / K_WALL[1, 1], np.ones_like(u)], -1
@@ -361,7 +279,7 @@ def test_large_gaussians_close_to_the_camera_are_no_haze(simd):
         assert np.median(np.abs(depth / truth - 1)[near]) < limit
 
 
-def test_a_pixel_beside_an_edge_shows_what_is_behind():
+def test_a_pixel_next_to_an_edge_shows_the_background_surface():
     near, far = RigidTransform([-2.0, 0, 1.0]), RigidTransform([0, 0, 6.0])
     scene = wall_scene(wall(near, 2.0, 2.0), wall(far, 8.0, 8.0, step=0.1))  # near ends at x = 0
     depth = BakedScene(scene).render(K_WALL, **SIZE, X_WC=RigidTransform()).depth
@@ -369,17 +287,6 @@ def test_a_pixel_beside_an_edge_shows_what_is_behind():
     assert error.max() < 1e-3
     x = (np.arange(SIZE["width"]) + 0.5 - K_WALL[0, 2]) / K_WALL[0, 0]  # [m] on the near wall
     assert (depth[:, x < 0.0] < 2.0).all() and (depth[:, x > 0.07] > 5.0).all()
-    tensors = {n: torch.from_numpy(getattr(scene, n)) for n in ("means", "quats", "scales")}
-    expected = rasterize(
-        **tensors,
-        opacities=torch.from_numpy(scene.opacities),
-        colors=torch.from_numpy(scene.base_colors),
-        viewmats=torch.eye(4)[None],
-        Ks=torch.from_numpy(K_WALL).float()[None],
-        **SIZE,
-        render_mode="ED",
-    )[0][0, ..., 0]
-    assert ((expected > 1.2) & (expected < 5.5)).any()
 
 
 def test_half_of_the_light_decides():
@@ -395,7 +302,7 @@ def test_half_of_the_light_decides():
     assert abs(depth[16, 16].item() - 3.0) < 1e-5 and depth[0, 0] == 0
 
 
-def test_it_is_constant_in_gradients():
+def test_median_depth_has_no_gradient():
     scene = random_gaussians(count=200)
     gradients = []
     for mode in ("RGB", "RGB+MD"):
@@ -406,32 +313,19 @@ def test_it_is_constant_in_gradients():
     assert torch.equal(*gradients)
 
 
-def test_antialiased_images_and_surfels_have_no_median_depth():
-    scene = random_gaussians(count=10)
-    with pytest.raises(
-        ValueError, match=r"rasterize_mode of render_mode 'RGB\+MD' must be 'classic'"
-    ):
-        rasterize(**scene, **SIZE, render_mode="RGB+MD", rasterize_mode="antialiased")
-    with pytest.raises(ValueError, match=r"render_mode must be one of RGB, D, ED, .* got 'MD'"):
-        rasterize_surfels(**scene, **SIZE, render_mode="MD")
-
-
 def disc(color: tuple[float, float, float]) -> GaussianScene:
-    """A flat, opaque patch that faces along z, about the origin."""
     size = np.array([[0.5, 0.5, 0.001]])
     return GaussianScene.from_colors(
         np.zeros((1, 3)), [[1.0, 0, 0, 0]], size, [0.99], np.array([color])
     )
 
 
-def along(*places: float):
-    """From a time to a center at that place on the z axis."""
-    return lambda time: np.array([[0.0, 0.0, places[int(time)]]])
+def along(*depths: float):
+    return lambda time: np.array([[0.0, 0.0, depths[int(time)]]])
 
 
-@pytest.mark.parametrize("count", [40, 2048, 5000])
-def test_a_body_is_drawn_like_what_stands(count):
-    scene, body = random_scene(count, seed=1, sh_degree=1), random_scene(300, seed=2, sh_degree=0)
+def test_a_moving_body_is_drawn_like_a_static_one():
+    scene, body = random_scene(2048, seed=1, sh_degree=1), random_scene(300, seed=2, sh_degree=0)
     center = np.array([0.3, 0.2, 0.5])
     moving = MovingGaussians([body], lambda time: time * center[None])
     whole = scene.merged_with(body, RigidTransform(center))
@@ -446,19 +340,12 @@ def test_a_body_is_drawn_like_what_stands(count):
     assert far_off.mean() < 2e-3
 
 
-@pytest.mark.parametrize("simd", LEVELS)
-def test_moving_views_are_identical_for_any_number_of_threads(simd):
-    scene, body = random_scene(5000, seed=1), random_scene(3000, seed=2, sh_degree=0)
-    moving = MovingGaussians([body], lambda time: np.array([[0.0, 0.0, 0.5]]))
-    nowhere = MovingGaussians([body], lambda time: np.full((1, 3), np.inf))
-    baked = [BakedScene(scene, threads, simd) for threads in (1, 3)]
-    one, three = (b.render(K, WIDTH, HEIGHT, X_WC, moving=moving.at(0.0)) for b in baked)
-    alone = baked[0].render(K, WIDTH, HEIGHT, X_WC)
-    without = baked[0].render(K, WIDTH, HEIGHT, X_WC, moving=nowhere.at(0.0))
-    for first, second in ((one, three), (alone, without)):
-        for a, b in zip(first, second, strict=True):
-            np.testing.assert_array_equal(a, b)
-    assert not np.array_equal(one.color, alone.color)
+def test_an_absent_body_is_not_drawn():
+    scene, body = BakedScene(random_scene(500, seed=1)), random_scene(300, seed=2, sh_degree=0)
+    absent = MovingGaussians([body], lambda time: np.full((1, 3), np.inf)).at(0.0)
+    alone = scene.render(K, WIDTH, HEIGHT, X_WC)
+    for a, b in zip(alone, scene.render(K, WIDTH, HEIGHT, X_WC, moving=absent), strict=True):
+        np.testing.assert_array_equal(a, b)
 
 
 def test_a_body_hides_and_is_hidden():
@@ -490,7 +377,3 @@ def test_late_images_show_bodies_where_they_were():
             camera.render(X_WB, time).color, prompt.render(X_WB, then).color
         )
     assert not np.array_equal(prompt.render(X_WB, 0.0).color, prompt.render(X_WB, 1.0).color)
-
-
-def test_no_bodies_are_no_gaussians():
-    assert len(MovingGaussians([], lambda time: np.zeros((0, 3))).at(0.0).means) == 0

@@ -1,15 +1,14 @@
-"""Tests of lenses in the flying camera."""
-
 import math
 
 import cv2
 import numpy as np
 import pytest
+from baked_scenes import random_scene
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.sensors import CameraInfo
 
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
-from splatpilot.systems.sensing.time_of_flight import sensor_of
+from splatpilot.systems.sensing.time_of_flight import equivalent_sensor
 from splatpilot.systems.splats.background import EnvironmentMap
 from splatpilot.systems.splats.baked_scene import BakedScene
 from splatpilot.systems.splats.lens import Distortion, pixel_slopes
@@ -22,12 +21,11 @@ BARREL = Distortion("opencv", [-0.28, 0.09, -0.012, 0.03, 0.01, 0.002], [0.003, 
 FEW = Distortion("opencv", [-0.2, 0.05])
 LENSES = (FISHEYE, BARREL, FEW)
 K = np.array([[110.0, 0, 78.0], [0, 105.0, 61.0], [0, 0, 1]])
-# Of a fisheye whose image circle lies in the image.
+# A fisheye whose image circle lies in the image.
 K_CIRCLE = np.array([[45.0, 0, 78.0], [0, 45.0, 61.0], [0, 0, 1]])
 
 
 def opencv_pixels(lens: Distortion, p_C: np.ndarray) -> np.ndarray:
-    """OpenCV's pixels (N, 2) of points, with centers at +1/2 as ours."""
     none = np.zeros(3)
     if lens.model == "fisheye":
         return cv2.fisheye.projectPoints(p_C[None], none, none, K, np.array(lens.radial))[0][0]
@@ -37,22 +35,7 @@ def opencv_pixels(lens: Distortion, p_C: np.ndarray) -> np.ndarray:
     return cv2.projectPoints(p_C, none, none, K, coefficients)[0][:, 0]
 
 
-def blobs(count: int, size: float, seed: int = 0) -> GaussianScene:
-    """Gaussians of `size` times their depth at slopes of up to 0.7."""
-    random = np.random.default_rng(seed)
-    z = random.uniform(2.0, 4.0, (count, 1))
-    arrays = (
-        np.hstack([random.uniform(-0.7, 0.7, (count, 2)) * z, z]),
-        random.normal(size=(count, 4)),
-        size * z * random.uniform(0.5, 1.5, (count, 3)),
-        random.uniform(0.3, 0.9, count),
-        random.uniform(-1.5, 1.5, (count, 1, 3)),
-    )
-    return GaussianScene(*(a.astype(np.float32) for a in arrays))
-
-
 def wall(n_W: np.ndarray, offset: float) -> GaussianScene:
-    """Flat Gaussians side by side on the plane n_W . p = offset [m], in front of the origin."""
     u, v = np.meshgrid(np.arange(-4.0, 4.0, 0.04), np.arange(-4.0, 4.0, 0.04))
     x, y = u.ravel(), v.ravel()
     z = (offset - n_W[0] * x - n_W[1] * y) / n_W[2]
@@ -103,7 +86,8 @@ def test_depth_of_a_plane_is_that_of_the_rays(lens):
 
 
 def test_only_what_the_lens_shows_is_drawn():
-    scene = blobs(2000, 0.2, seed=1)
+    scene = random_scene(2000, seed=1, sh_degree=0)
+    scene = scene.transformed_by(RigidTransform([0, 0, 4.0]))
     images = []
     for threads in (1, 3):
         camera = SplatCamera(
@@ -136,7 +120,7 @@ def test_onboard_cameras_have_lenses():
     ):
         OnboardCamera(fov_x=170.0, distortion=FISHEYE).validate()
     with pytest.raises(ValueError, match="distortion must be left out"):
-        sensor_of(camera)
+        equivalent_sensor(camera)
 
 
 @pytest.mark.parametrize(

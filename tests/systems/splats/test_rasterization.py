@@ -1,5 +1,3 @@
-"""Gaussians against the float64 reference, its autograd, and analytic results."""
-
 import gc
 import math
 import os
@@ -12,7 +10,7 @@ import numpy as np
 import pytest
 import reference_rasterizer as reference
 import torch
-from garden import Garden, load_garden
+from garden import load_garden
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_scenes import normal_tensor, random_scene
@@ -21,7 +19,7 @@ from torch import Tensor
 from torch.testing import assert_close
 
 from splatpilot import _native
-from splatpilot.systems.splats import rasterization, rasterize
+from splatpilot.systems.splats import rasterization, rasterize, rasterize_surfels
 from splatpilot.systems.splats.baked_scene import create_renderer
 
 LEVELS = _native.simd_levels()
@@ -31,10 +29,10 @@ SIZE = (67, 45)
 IMAGE: dict[str, Any] = {"width": 67, "height": 45}
 SMALL: dict[str, Any] = {"width": 33, "height": 33}
 MODES = ["RGB", "D", "ED", "RGB+D", "RGB+ED"]
+DRAWS = [rasterize, rasterize_surfels]
 
 
 def leaves(scene: dict[str, Any], dtype=torch.float32) -> dict[str, Any]:
-    """Copies a scene's tensors, which require gradients where they can."""
     return {
         name: tensor.detach().to(dtype, copy=True).requires_grad_(name != "Ks")
         for name, tensor in scene.items()
@@ -54,7 +52,6 @@ def with_backgrounds(scene) -> dict[str, Any]:
 
 
 def reference_views(scene, size, mode, sh_degree=None, **options) -> tuple[Tensor, Tensor, Tensor]:
-    """Image (C, H, W, X), alpha (C, H, W, 1) and margin (C, H, W) of every camera."""
     images, alphas, margins = [], [], []
     for c in range(len(scene["viewmats"])):
         per_camera = scene["colors"].ndim == (3 if sh_degree is None else 4)
@@ -85,7 +82,7 @@ def reference_projection(scene: dict[str, Any], size=SIZE, **options) -> referen
     return reference.project(*s, X_CW, K, *size, **options)
 
 
-def check(
+def check(  # images against the reference, and the gradients of a random linear function of them
     scene,
     size=SIZE,
     mode="RGB+ED",
@@ -95,12 +92,9 @@ def check(
     p99=2e-4,
     **options,
 ) -> dict[str, tuple[Tensor, Tensor]]:
-    """Compares images with the reference, and the gradients of a random linear function of them.
-
-    Pixels within 1e-3 of a threshold, where rounding may decide, are left out. Tolerances are
-    gsplat's for its own kernels for all but one number in 500, 1e-4 relative for all. Gradients of
-    poses are sums that cancel: their errors are relative to the largest entry.
-    """
+    # Pixels within 1e-3 of a threshold, where rounding may decide, are left out. Tolerances are
+    # gsplat's for its own kernels for all but one number in 500, 1e-4 relative for all. Gradients
+    # of poses are sums that cancel: their errors are relative to the largest entry.
     wide = leaves(scene, torch.float64)
     image, alpha, margin = reference_views(wide, size, mode, sh_degree, antialiased=antialiased)
     clear = (margin > 1e-3)[..., None]
@@ -202,13 +196,6 @@ def test_odd_sizes_agree_with_reference(size):
     raise AssertionError("too many pixels at thresholds in every scene")
 
 
-def test_given_colors_may_be_negative():
-    scene = random_scene(seed=30)
-    scene["colors"] = torch.round(3 * scene["colors"] - 1)
-    assert (scene["colors"] == 0).any() and (scene["colors"] < 0).any()
-    check(scene)
-
-
 def test_accuracy_does_not_depend_on_distance_from_the_origin():
     scene = random_scene(seed=10)
     shift = torch.tensor([1024.0, -2048.0, 512.0])
@@ -220,28 +207,6 @@ def test_accuracy_does_not_depend_on_distance_from_the_origin():
     image, _, _ = rasterize(**scene, **IMAGE)
     error = (image.double() - expected).abs()
     assert error.median() < 1e-6 and error[margin > 1e-4].max() < 2e-4
-
-
-def test_gradients_agree_with_finite_differences():
-    scene = random_scene(count=12, seed=13, size=(19, 14))
-    scene["opacities"] = 0.2 + 0.5 * scene["opacities"]
-    v = normal_tensor(1, 1, 14, 19, 4)
-    clear = (reference_views(scene, (19, 14), "RGB+D")[2] > 1e-2)[..., None]
-
-    def loss(name, moved):
-        image, _, _ = reference_views(scene | {name: moved}, (19, 14), "RGB+D")
-        return (image * v.double() * clear).sum()
-
-    narrow = leaves(scene)
-    image, _, _ = rasterize(**narrow, width=19, height=14, render_mode="RGB+D")
-    (image * v * clear).sum().backward()
-    for seed, name in enumerate((*SCENE, "viewmats")):
-        direction = normal_tensor(seed, *scene[name].shape).double()
-        if name == "viewmats":
-            direction[:, 3] = 0
-        low, high = (loss(name, scene[name].double() + s * 1e-6 * direction) for s in (-1, 1))
-        got = (narrow[name].grad.double() * direction).sum()
-        assert got == pytest.approx(((high - low) / 2e-6).item(), rel=2e-5, abs=2e-5), name
 
 
 def test_meta_describes_the_projection():
@@ -286,43 +251,41 @@ def test_loss_on_means2d_alone_reaches_the_scene():
         assert_close(narrow[name].grad.double(), wide[name].grad, rtol=1e-5, atol=1e-3)
 
 
-def test_batch_of_cameras_equals_single_calls():
-    scene = random_scene(seed=3, cameras=3)
-    scene["colors"] = torch.rand(3, 300, 3, generator=torch.Generator().manual_seed(9))
-    scene["backgrounds"] = torch.tensor([[0.0, 0, 0], [1, 1, 1], [0.2, 0.3, 0.4]])
-    images, alphas, meta = rasterize(**scene, width=40, height=30)
-    assert images.shape == (3, 30, 40, 3) and alphas.shape == (3, 30, 40, 1)
-    for c in range(3):
-        one = scene | {n: scene[n][c : c + 1] for n in ("viewmats", "Ks", "colors", "backgrounds")}
-        image, alpha, single = rasterize(**one, width=40, height=30)
-        assert torch.equal(image[0], images[c]) and torch.equal(alpha[0], alphas[c])
-        assert torch.equal(meta["gaussian_ids"][meta["camera_ids"] == c], single["gaussian_ids"])
-
-
 @pytest.mark.parametrize("simd", LEVELS)
-def test_results_are_identical_for_any_number_of_threads(simd):
+@pytest.mark.parametrize("draw", DRAWS)
+def test_results_are_identical_for_any_number_of_threads(draw, simd):
     scene = with_backgrounds(random_scene(count=6000, seed=14, size=(131, 77), sh_degree=1))
+    size: dict[str, Any] = {"width": 131, "height": 77, "sh_degree": 1, "render_mode": "RGB+ED"}
     first: list[Any] = []
     for threads in (1, 2, 4, 1):
         narrow = leaves(scene)
-        image, alpha, meta = rasterize(
-            **narrow,
-            width=131,
-            height=77,
-            sh_degree=1,
-            render_mode="RGB+ED",
-            renderer=create_renderer(threads, simd),
-        )
-        meta["means2d"].retain_grad()
-        (image.square().sum() + alpha.sin().sum()).backward()
-        got = [image, alpha, meta["means2d"].grad, *(narrow[name].grad for name in INPUTS)]
+        images = draw(**narrow, **size, renderer=create_renderer(threads, simd))[:-1]
+        torch.stack([image.square().sum() for image in images]).sum().backward()
+        got = [*images, *(narrow[name].grad for name in INPUTS)]
         first = first or got
         assert all(torch.equal(a, b) for a, b in zip(got, first, strict=True))
 
 
-@pytest.mark.parametrize("threads", [None, 2])
-def test_graphs_may_overlap_and_be_used_again(threads):
-    renderer = None if threads is None else create_renderer(threads)
+@pytest.mark.parametrize("draw", DRAWS)
+def test_batch_of_cameras_equals_single_calls(draw):
+    scene = random_scene(seed=3, cameras=3)
+    scene["colors"] = torch.rand(3, 300, 3, generator=torch.Generator().manual_seed(9))
+    batch, single = leaves(scene), leaves(scene)
+    images, *_, meta = draw(**batch, width=40, height=30)
+    images.square().sum().backward()
+    for c in range(3):
+        one = single | {k: single[k][c : c + 1] for k in ("viewmats", "Ks", "colors")}
+        image, *_, own = draw(**one, width=40, height=30)
+        assert torch.equal(image[0], images[c])
+        assert torch.equal(meta["means2d"][meta["camera_ids"] == c], own["means2d"])
+        assert torch.equal(meta["gaussian_ids"][meta["camera_ids"] == c], own["gaussian_ids"])
+        image.square().sum().backward()
+    for name in (*SCENE, "viewmats"):
+        assert_close(batch[name].grad, single[name].grad, rtol=1e-4, atol=1e-4)
+
+
+def test_graphs_may_overlap_and_be_used_again():
+    renderer = create_renderer(2)
     scenes = [random_scene(count=n, seed=17 + n) for n in (200, 3000, 400)]
     alone = []
     for scene in scenes:
@@ -358,13 +321,8 @@ def test_rendered_tensors_are_freed():
         gc.enable()
 
 
-def test_zero_upstream_and_invisible_gaussians_give_zeros():
-    scene = random_scene(seed=20)
-    narrow = leaves(scene)
-    image, alpha, _ = rasterize(**narrow, **IMAGE, render_mode="RGB+ED")
-    (0 * image.sum() + 0 * alpha.sum()).backward()
-    assert all(not narrow[name].grad.any() for name in (*SCENE, "viewmats"))
-    narrow = leaves(scene)
+def test_invisible_gaussians_have_zero_gradients():
+    narrow = leaves(random_scene(seed=20))
     image, _, meta = rasterize(**narrow, **IMAGE)
     image.sum().backward()
     invisible = torch.ones(300, dtype=torch.bool)
@@ -372,28 +330,19 @@ def test_zero_upstream_and_invisible_gaussians_give_zeros():
     assert invisible.any() and all(not narrow[name].grad[invisible].any() for name in SCENE)
 
 
+@pytest.mark.parametrize("draw", DRAWS)
 @pytest.mark.parametrize("count", [0, 5])
-def test_nothing_visible_shows_the_background(count):
+def test_nothing_visible_shows_the_background(count, draw):
     scene = with_backgrounds(random_scene(count=count))
     scene["means"][:, 2] = -50.0
     narrow = leaves(scene)
-    image, alpha, meta = rasterize(**narrow, width=20, height=10, render_mode="RGB+ED")
+    image, *others, meta = draw(**narrow, width=20, height=10, render_mode="RGB+ED")
     assert torch.equal(image[0, ..., :3], scene["backgrounds"].expand(10, 20, 3))
-    assert not image[0, ..., 3].any() and not alpha.any() and len(meta["means2d"]) == 0
+    assert not image[0, ..., 3].any() and not any(o.any() for o in others)
+    assert len(meta["means2d"]) == 0
     image[..., :3].sum().backward()
     assert all(not narrow[n].grad.any() for n in SCENE)
     assert_close(narrow["backgrounds"].grad, torch.full((1, 3), 200.0))
-
-
-def test_only_tensors_that_require_gradients_get_them():
-    scene = with_backgrounds(random_scene(seed=21))
-    everything = leaves(scene)
-    rasterize(**everything, **IMAGE)[0].square().sum().backward()
-    for name in INPUTS:
-        one = scene | {name: scene[name].clone().requires_grad_()}
-        rasterize(**one, **IMAGE)[0].square().sum().backward()
-        assert torch.equal(one[name].grad, everything[name].grad)
-        assert all(t.grad is None for other, t in one.items() if other != name)
 
 
 @pytest.mark.parametrize("simd", LEVELS)
@@ -445,30 +394,25 @@ def test_alpha_is_capped_and_a_saturated_pixel_stops():
 
 
 @pytest.mark.parametrize(
-    ("depth", "visible"), [(-2.0, False), (0.0, False), (0.0099, False), (0.01, True), (5.0, True)]
+    ("change", "options", "visible"),
+    [
+        ({"depth": -2.0}, {}, False),
+        ({"depth": 0.0}, {}, False),
+        ({"depth": 0.0099}, {}, False),
+        ({"depth": 0.01}, {}, True),
+        ({"depth": 5.0}, {"far_plane": 4.9}, False),
+        ({"depth": 5.0}, {"far_plane": 5.0}, True),
+        ({"scale": 0.1}, {"radius_clip": 18.0}, False),
+        ({"scale": 0.1}, {"radius_clip": 10.0}, True),
+        ({"opacity": 0.0}, {}, False),
+        ({"opacity": 1e-30}, {}, False),
+        ({"opacity": 0.99 / 255}, {}, False),
+    ],
 )
-def test_near_plane_is_the_limit(depth, visible):
-    _, alpha, meta = rasterize(**single_gaussian(depth=depth, scale=0.001), **SMALL)
+def test_planes_radius_and_opacity_limit_what_is_visible(change, options, visible):
+    scene = single_gaussian(**{"scale": 0.001} | change)
+    _, alpha, meta = rasterize(**scene, **SMALL, **options)
     assert bool(alpha.any()) == visible and len(meta["depths"]) == visible
-
-
-def test_far_plane_and_radius_clip_leave_gaussians_out():
-    scene = single_gaussian(depth=5.0)
-    radius = float(rasterize(**scene, **SMALL)[2]["radii"].max())
-    for name, value, visible in (
-        ("far_plane", 4.9, False),
-        ("far_plane", 5.0, True),
-        ("radius_clip", radius, False),
-        ("radius_clip", radius - 1.0, True),
-    ):
-        _, alpha, _ = rasterize(**scene, **SMALL, **{name: value})
-        assert bool(alpha.any()) == visible, (name, value)
-
-
-@pytest.mark.parametrize("opacity", [0.0, 1e-30, 0.99 / 255])
-def test_small_opacities_are_invisible(opacity):
-    _, alpha, meta = rasterize(**single_gaussian(opacity), **SMALL)
-    assert not alpha.any() and len(meta["depths"]) == 0
 
 
 @pytest.mark.parametrize("simd", LEVELS)
@@ -489,94 +433,37 @@ def test_extreme_scales_stay_finite(scale, mode, simd):
         assert all(torch.isfinite(narrow[n].grad).all() for n in (*SCENE, "viewmats"))
 
 
-@settings(max_examples=40, deadline=None)
+@pytest.mark.parametrize("draw", DRAWS)
+@settings(max_examples=30, deadline=None)
 @given(
     seed=st.integers(0, 2**31),
     count=st.integers(0, 60),
     size=st.tuples(st.integers(1, 40), st.integers(1, 40)),
     spread=st.floats(-3, 3),
     log_scale=st.floats(-8, 4),
-    mode=st.sampled_from(MODES),
     sh_degree=st.sampled_from([None, 0, 2]),
-    rasterize_mode=st.sampled_from(rasterization.RASTERIZE_MODES),
-    eps2d=st.sampled_from([0.0, 0.3]),
     simd=st.sampled_from(LEVELS),
     threads=st.integers(1, 2),
 )
 def test_fuzz_finite_and_bounded(
-    seed, count, size, spread, log_scale, mode, sh_degree, rasterize_mode, eps2d, simd, threads
+    draw, seed, count, size, spread, log_scale, sh_degree, simd, threads
 ):
     scene = random_scene(count=count, seed=seed, size=size, sh_degree=sh_degree)
     scene["means"] *= 10.0**spread
     scene["scales"] = 10.0 ** (log_scale + normal_tensor(seed, count, 3))
     narrow = leaves(scene)
-    image, alpha, _ = rasterize(
-        **narrow,
-        width=size[0],
-        height=size[1],
-        render_mode=mode,
-        sh_degree=sh_degree,
-        rasterize_mode=rasterize_mode,
-        eps2d=eps2d,
-        renderer=create_renderer(threads, simd),
-    )
-    assert torch.isfinite(image).all() and (alpha >= 0).all() and (alpha <= 1 + 1e-6).all()
-    if mode.startswith("RGB") and sh_degree is None:
+    options = {"width": size[0], "height": size[1], "render_mode": "RGB+ED"}
+    renderer = create_renderer(threads, simd)
+    image, alpha, *others, _ = draw(**narrow, **options, sh_degree=sh_degree, renderer=renderer)
+    assert (alpha >= 0).all() and (alpha <= 1 + 1e-6).all()
+    if sh_degree is None:
         assert (image[..., :3] >= 0).all() and (image[..., :3] <= 1 + 1e-5).all()
-    upstream = [normal_tensor(seed, *image.shape), normal_tensor(seed, *alpha.shape)]
-    torch.autograd.backward([image, alpha], upstream)
+    images = [image, alpha, *others]
+    assert all(torch.isfinite(each).all() for each in images)
+    torch.stack(
+        [(each * normal_tensor(seed, *each.shape)).sum() for each in images]
+    ).sum().backward()
     assert all(torch.isfinite(narrow[n].grad).all() for n in (*SCENE, "viewmats"))
-
-
-@settings(max_examples=20, deadline=None)
-@given(seed=st.integers(0, 2**31), spread=st.floats(-1, 1), log_scale=st.floats(-3, 0))
-def test_fuzz_agrees_with_reference(seed, spread, log_scale):
-    scene = random_scene(count=80, seed=seed, size=(29, 23))
-    scene["means"] *= 10.0**spread
-    scene["scales"] = scene["scales"] * 10.0**log_scale
-    expected, _, margin = reference_views(scene, (29, 23), "RGB")
-    image, _, _ = rasterize(**scene, width=29, height=23)
-    error, clear = (image.double() - expected).abs().amax(-1), margin > 1e-2
-    assert not clear.any() or error[clear].max() < 2e-3
-
-
-def test_simd_levels_agree_up_to_rounding():
-    scene = random_scene(count=2000, seed=11, size=(131, 77))
-    images = [
-        rasterize(**scene, width=131, height=77, renderer=create_renderer(1, level))[0]
-        for level in LEVELS
-    ]
-    for image in images[1:]:
-        error = (image - images[0]).abs()
-        assert error.median() < 1e-6 and (error > 1e-3).float().mean() < 1e-3
-
-
-def test_unavailable_simd_level_is_an_error():
-    with pytest.raises(ValueError, match=f"'avx3' is not available.*{LEVELS[0]}"):
-        create_renderer(simd="avx3")
-
-
-def test_fitting_recovers_an_image():
-    truth = random_scene(count=8, seed=22, size=(40, 30))
-    truth["means"] *= 0.4
-    truth["scales"] = truth["scales"].clamp(0.1, 0.4)
-    truth["opacities"] = 0.5 + 0.4 * truth["opacities"]
-    size: dict[str, Any] = {"width": 40, "height": 30}
-    target = rasterize(**truth, **size)[0]
-    means = (truth["means"] + 0.05 * normal_tensor(3, 8, 3)).requires_grad_()
-    log_scales = (truth["scales"].log() + 0.2 * normal_tensor(4, 8, 3)).requires_grad_()
-    quats = (truth["quats"] + 0.3 * normal_tensor(5, 8, 4)).requires_grad_()
-    colors = (0.5 * torch.ones(8, 3)).requires_grad_()
-    optimizer = torch.optim.Adam([means, log_scales, quats, colors], lr=0.01)
-    losses = []
-    for _ in range(250):
-        optimizer.zero_grad()
-        moved = {"means": means, "scales": log_scales.exp(), "quats": quats, "colors": colors}
-        loss = (rasterize(**truth | moved, **size)[0] - target).square().mean()
-        loss.backward()
-        optimizer.step()
-        losses.append(loss.item())
-    assert losses[0] > 2e-3 and losses[-1] < 0.01 * losses[0], losses[-1]
 
 
 def change(name, value):
@@ -592,56 +479,64 @@ def put(name, index, value):
     return changed
 
 
+def options(**changed):
+    return lambda scene: scene | changed
+
+
+def to_meta(scene):
+    return {k: v.to("meta") if torch.is_tensor(v) else v for k, v in scene.items()}
+
+
+@pytest.mark.parametrize("draw", DRAWS)
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        (change("means", lambda t: t[:, :2]), r"means must be of shape \(300, 3\), got \(300, 2\)"),
+        (change("means", lambda t: t[:, :2]), r"means must .*\(300, 3\), got \(300, 2\)"),
         (change("quats", lambda t: t[:-1]), r"quats must .* got \(299, 4\)"),
         (change("opacities", lambda t: t[:, None]), r"opacities must .* got \(300, 1\)"),
         (change("colors", lambda t: t[:, :1]), r"colors must .* got \(300, 1\)"),
         (change("viewmats", lambda t: t[0]), r"viewmats must .* got \(4, 4\)"),
         (change("viewmats", lambda t: t[:0]), r"(viewmats|Ks) must"),
-        (
-            change("scales", lambda t: t.double()),
-            r"scales must be torch.float32, got .*\.float\(\)",
-        ),
+        (change("scales", lambda t: t.double()), r"scales must be torch.float32, got"),
+        (change("quats", lambda t: t.to("meta")), "quats must be on cpu like means, got meta"),
+        (to_meta, "the device must be 'cpu' or 'cuda', got meta"),
         (put("means", (7, 1), math.nan), r"means\[7, 1\] must be finite, got nan"),
         (put("colors", (9, 2), math.inf), r"colors\[9, 2\] must be finite, got inf"),
         (put("scales", (3, 0), 0.0), r"scales\[3, 0\] must be > 0 m, got 0"),
-        (put("scales", (3, 2), -1.0), r"scales\[3, 2\] must be > 0 m, got -1"),
+        (put("scales", (3, 1), -1.0), r"scales\[3, 1\] must be > 0 m, got -1"),
         (put("opacities", 4, 1.5), r"opacities\[4\] must be in \[0, 1\], got 1.5"),
-        (put("quats", 5, 0.0), r"quats\[5\] must be .* got \[0.0, 0.0, 0.0, 0.0\]"),
+        (put("quats", 5, 0.0), r"quats\[5\] must be of a length > 0, got \[0. 0. 0. 0.\]"),
         (put("Ks", (0, 0, 0), 0.0), r"focal lengths of K must be > 0 px, got 0"),
         (change("viewmats", lambda t: 2 * t), r"viewmats\[0\] must be a rigid transform"),
         (change("Ks", lambda t: t.clone().requires_grad_()), r"Ks must be without a gradient"),
-        (lambda s: s | {"rasterize_mode": "smooth"}, r"rasterize_mode must .* got 'smooth'"),
-        (lambda s: s | {"width": 0}, r"image size must .* got 0 x 45"),
-        (lambda s: s | {"height": -3}, r"image size must .* got 67 x -3"),
-        (lambda s: s | {"near_plane": 0.0}, r"0 < near < far"),
-        (lambda s: s | {"far_plane": 0.001}, r"0 < near < far"),
-        (
-            lambda s: s | {"render_mode": "RGBD"},
-            r"render_mode must be one of RGB, D, .* got 'RGBD'",
-        ),
-        (lambda s: s | {"sh_degree": 4}, r"sh_degree must .* got 4"),
-        (lambda s: s | {"sh_degree": 1}, r"colors must be of shape \(300, K, 3\)"),
-        (
-            lambda s: s | {"colors": torch.zeros(300, 4, 3), "sh_degree": 2},
-            "colors for sh_degree=2 must be >= 9, got 4",
-        ),
-        (lambda s: s | {"eps2d": -0.1}, r"eps2d must .* got -0.1"),
-        (lambda s: s | {"radius_clip": -1.0}, r"radius_clip must .* got -1"),
-        (lambda s: s | {"backgrounds": torch.zeros(3)}, r"backgrounds must .* got \(3,\)"),
-        (change("quats", lambda t: t.to("meta")), "quats must be on cpu like means, got meta"),
-        (
-            lambda s: {k: v.to("meta") if torch.is_tensor(v) else v for k, v in s.items()},
-            "the device must be 'cpu' or 'cuda', got meta",
-        ),
+        (options(width=0), r"image size must .* got 0 x 45"),
+        (options(height=-3), r"image size must .* got 67 x -3"),
+        (options(near_plane=0.0), r"0 < near < far"),
+        (options(far_plane=0.001), r"0 < near < far"),
+        (options(render_mode="RGBD"), r"render_mode must .* got 'RGBD'"),
+        (options(sh_degree=4), r"sh_degree must .* got 4"),
+        (options(sh_degree=1), r"colors must be of shape \(300, K, 3\)"),
+        (options(colors=torch.zeros(300, 4, 3), sh_degree=2), "sh_degree=2 must be >= 9, got 4"),
+        (options(radius_clip=-1.0), r"radius_clip must .* got -1"),
+        (options(backgrounds=torch.zeros(3)), r"backgrounds must .* got \(3,\)"),
     ],
 )
-def test_invalid_input_is_named(changed, message):
+def test_invalid_input_is_named(draw, changed, message):
     with pytest.raises(ValueError, match=message):
-        rasterize(**changed(random_scene() | IMAGE))
+        draw(**changed(random_scene() | IMAGE))
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"rasterize_mode": "smooth"}, r"rasterize_mode must .* got 'smooth'"),
+        ({"rasterize_mode": "antialiased", "render_mode": "MD"}, r"must be 'classic'"),
+        ({"eps2d": -0.1}, r"eps2d must .* got -0.1"),
+    ],
+)
+def test_invalid_options_of_gaussians_are_named(changed, message):
+    with pytest.raises(ValueError, match=message):
+        rasterize(**random_scene(), **IMAGE, **changed)
 
 
 def test_backgrounds_never_reach_gsplat(monkeypatch):
@@ -654,7 +549,7 @@ def test_backgrounds_never_reach_gsplat(monkeypatch):
 
     stand_in = types.SimpleNamespace(rasterization=rasterization_)
     monkeypatch.setattr(rasterization, "import_extra", lambda *_: stand_in)
-    monkeypatch.setattr(rasterization, "check_shapes", lambda *_: None)
+    monkeypatch.setattr(rasterization, "named_tensors", lambda *_, **__: None)
     scene = random_scene(count=5) | {"means": types.SimpleNamespace(device=torch.device("cuda"))}
     backgrounds = torch.tensor([[0.1, 0.2, 0.3]])
     image, _, _ = rasterize(**scene, **IMAGE, backgrounds=backgrounds, render_mode="RGB+ED")
@@ -671,35 +566,8 @@ needs_data = pytest.mark.skipif(
 @needs_data
 @pytest.mark.parametrize("camera", [0, 1])
 def test_garden_is_within_gsplats_tolerances(camera):
-    garden: Garden = load_garden(Path(os.environ["SPLATPILOT_DATA"]), 1500)
-    K = garden.Ks[camera].clone()
-    K[:2] /= 8
+    scene, viewmats, Ks, width, height = load_garden(Path(os.environ["SPLATPILOT_DATA"]), 1500)
     # Fewer Gaussians, as much wider: the images stay as full.
-    scene = garden.scene | {"scales": 6 * garden.scene["scales"]}
-    width, height = garden.width // 8, garden.height // 8
-    size: dict[str, Any] = {"width": width, "height": height}
-    wide = {n: t.double().requires_grad_() for n, t in scene.items()}
-    expected = reference.render(**wide, viewmat=garden.viewmats[camera], K=K, **size)
-    clear = expected.margin > 1e-3
-    assert clear.double().mean() > 0.9
-    narrow = {n: t.clone().requires_grad_() for n, t in scene.items()}
-    views = {"viewmats": garden.viewmats[camera, None], "Ks": K[None]}
-    image, alpha, _ = rasterize(**narrow, **views, **size, render_mode="RGB+D")
-    depth_error = (image[0, ..., 3].double() - expected.depth).abs()
-    assert (depth_error[clear] <= 1e-4 + 1e-5 * expected.depth[clear]).all()
-    for got, want in ((image[0, ..., :3], expected.color), (alpha[0, ..., 0], expected.alpha)):
-        assert_close(got[clear].double(), want[clear], rtol=1e-5, atol=1e-5)
-        off = (got.double() - want).abs()
-        assert off.max() < 1.01 / 255 and (off > 1e-4).double().mean() <= 1e-3
-
-    upstream = normal_tensor(camera, *image[0].shape) * clear[..., None]
-    shown = torch.cat([expected.color, expected.depth[..., None]], -1)
-    shown.backward(upstream.double())
-    image[0].backward(upstream)
-    for name, leaf in narrow.items():
-        got, want = leaf.grad, wide[name].grad
-        assert got is not None and want is not None
-        error = (got.double() - want).abs()
-        beyond = error > 1e-3 + 1e-5 * want.abs()
-        assert beyond.sum() <= beyond.numel() / 500, (name, int(beyond.sum()), float(error.max()))
-        assert not (error > 1e-2 + 1e-4 * want.abs()).any(), (name, float(error.max()))
+    scene |= {"scales": 6 * scene["scales"], "viewmats": viewmats[camera, None]}
+    scene["Ks"] = torch.diag(torch.tensor([0.125, 0.125, 1.0])) @ Ks[camera, None]
+    check(scene, size=(width // 8, height // 8), mode="RGB+D", min_clear=0.9, p99=1e-3)

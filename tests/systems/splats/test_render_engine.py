@@ -1,5 +1,3 @@
-"""SplatRenderEngine."""
-
 import copy
 
 import numpy as np
@@ -53,8 +51,6 @@ CORNER = 1, 1
 
 
 class CountingScene(BakedScene):
-    """A scene that counts how often it is rendered."""
-
     renders = 0
 
     def render(self, *args, **kwargs):
@@ -63,20 +59,16 @@ class CountingScene(BakedScene):
 
 
 def wall(z: float, opacity: float = 0.99) -> CountingScene:
-    """An orange wall across the camera's axis at depth `z` [m]; the camera is at the world's origin
-    and looks along the world's z axis.
-    """
+    # Orange, at depth `z` [m] of a camera at the origin that looks along z.
     x, y = (grid.ravel() for grid in np.meshgrid(*[np.arange(-30, 30.1, 0.5)] * 2))
-    count = len(x)
-    return CountingScene(
-        GaussianScene.from_colors(
-            means=np.column_stack([x, y, np.full(count, z)]),
-            quats=np.tile([1.0, 0, 0, 0], (count, 1)),
-            scales=np.tile([0.5, 0.5, 1e-3], (count, 1)),
-            opacities=np.full(count, opacity),
-            colors=np.tile([1.0, 0.5, 0.0], (count, 1)),
-        )
+    scene = GaussianScene.from_colors(
+        means=np.column_stack([x, y, np.full(x.size, z)]),
+        quats=np.tile([1.0, 0, 0, 0], (x.size, 1)),
+        scales=np.tile([0.5, 0.5, 1e-3], (x.size, 1)),
+        opacities=np.full(x.size, opacity),
+        colors=np.tile([1.0, 0.5, 0.0], (x.size, 1)),
     )
+    return CountingScene(scene)
 
 
 def core(near: float = 0.01, far: float = 100.0, name: str = "splats") -> RenderCameraCore:
@@ -98,7 +90,6 @@ def green() -> PerceptionProperties:
 
 
 def add_box(engine: RenderEngine, z: float) -> GeometryId:
-    """A green box, 1 m wide and high, whose near face is at depth `z` [m]."""
     id = GeometryId.get_new_id()
     X_WG = RigidTransform([0, 0, z + 0.5])
     assert engine.RegisterVisual(id, Box(1, 1, 1), green(), X_WG, True)
@@ -144,10 +135,9 @@ def test_box_behind_the_wall_is_not_seen():
     engine = SplatRenderEngine(wall(4.0), background=BACKGROUND)
     images = color, depth, label
     before = [image(engine) for image in images]
-    id = add_box(engine, 5.0)
+    add_box(engine, 5.0)
     for image, without in zip(images, before, strict=True):
-        np.testing.assert_allclose(image(engine), without, atol=3)  # 1 % of the wall shines through
-    assert engine.RemoveGeometry(id)
+        np.testing.assert_allclose(image(engine), without, atol=3)  # the box shines through by 1 %
 
 
 def test_depth_is_the_minimum():
@@ -155,7 +145,7 @@ def test_depth_is_the_minimum():
     alone = MakeRenderEngineVtk(RenderEngineVtkParams())
     for target in (engine, alone):
         id = GeometryId.get_new_id()
-        # Turned about y, this box pierces the wall.
+        # This rotated box pierces the wall.
         X_WG = RigidTransform(RotationMatrix.MakeYRotation(0.6), [0.3, 0, 4.5])
         target.RegisterVisual(id, Box(2, 2, 2), green(), X_WG, True)
     camera = SplatCamera(wall(4.0), INFO, min_depth=0.1, max_depth=50.0)
@@ -178,6 +168,9 @@ def test_out_of_range_reads_as_in_drake():
 
 
 def test_nothing_in_view_is_background():
+    params = RenderEngineVtkParams(default_clear_color=[1, 0, 1])
+    engine = SplatRenderEngine(wall(-4.0), MakeRenderEngineVtk(params))
+    assert np.all(color(engine) == [255, 0, 255, 255])
     engine = SplatRenderEngine(wall(-4.0), background=BACKGROUND)
     assert np.all(color(engine) == [51, 102, 153, 255])
     assert np.all(depth(engine) == np.inf) and np.all(label(engine) == EMPTY)
@@ -224,12 +217,6 @@ def test_copies_share_the_scene_and_nothing_else(duplicate):
     assert depth(engine)[CENTER] == pytest.approx(2.0, abs=1e-4)
     assert engine.RemoveGeometry(id)
     assert depth(engine)[CENTER] == pytest.approx(4.0, rel=2e-3)
-
-
-def test_a_given_engine_renders_the_shapes():
-    params = RenderEngineVtkParams(default_clear_color=[1, 0, 1])
-    engine = SplatRenderEngine(wall(-4.0), MakeRenderEngineVtk(params))
-    assert np.all(color(engine) == [255, 0, 255, 255])
 
 
 def test_an_environment_is_behind_everything():

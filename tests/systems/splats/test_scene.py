@@ -2,8 +2,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from scipy.special import sph_harm_y
@@ -19,7 +17,6 @@ from splatpilot.systems.splats.scene import (
 
 
 def evaluate_sh(sh: Any, directions: Any) -> np.ndarray:
-    """Returns the sum over the basis (..., 3) of coefficients (..., K, 3)."""
     sh = np.asarray(sh, dtype=np.float64)
     basis = sh_basis(directions, harmonic_degree(sh.shape[-2]))
     return np.einsum("...k,...kc->...c", basis, sh)
@@ -37,7 +34,6 @@ def random_arrays(N: int = 6, K: int = 4, seed: int = 0) -> dict[str, Any]:
 
 
 def covariances(scene: GaussianScene) -> np.ndarray:
-    """R diag(s)^2 R^T through Drake, apart from the code under test."""
     result = []
     for quat, scale in zip(scene.quats, scene.scales, strict=True):
         wxyz = quat.astype(float) / np.linalg.norm(quat.astype(float))
@@ -55,13 +51,9 @@ def test_arrays_are_float32_contiguous_with_unit_quaternions():
         assert array.dtype == np.float32 and array.flags.c_contiguous
     quats = arrays["quats"] / np.linalg.norm(arrays["quats"], axis=1, keepdims=True)
     np.testing.assert_allclose(scene.quats, quats, atol=1e-7)
+    tiny = GaussianScene(**arrays | {"quats": (arrays["quats"] * 1e-6).astype(np.float32)})
+    np.testing.assert_allclose(tiny.quats, quats, atol=1e-6)
     assert (len(scene), scene.sh_degree) == (6, 1)
-
-
-def test_tiny_quaternions_are_normalized():
-    arrays = random_arrays()
-    scene = GaussianScene(**arrays | {"quats": (arrays["quats"] * 1e-6).astype(np.float32)})
-    np.testing.assert_allclose(scene.quats, GaussianScene(**arrays).quats, atol=1e-6)
 
 
 def test_from_colors_gives_those_colors_from_everywhere():
@@ -80,30 +72,31 @@ def test_from_colors_gives_those_colors_from_everywhere():
         ("means", (3, 1), np.nan, r"means\[3, 1\] must be finite, got nan \(1 of 6"),
         ("sh", (2, 0, 1), np.inf, r"sh\[2, 0, 1\] must be finite, got inf"),
         ("scales", (1, 2), 0.0, r"scales\[1, 2\] must be > 0 m, got 0\.0"),
-        ("scales", (1, 2), -0.5, r"scales\[1, 2\] must be > 0 m, got -0\.5.*exponential"),
         ("scales", (4, 0), np.inf, r"scales\[4, 0\] must be finite, got inf"),
-        ("opacities", (5,), 0.0, r"opacities\[5\] must be in \(0, 1\], got 0\.0.*sigmoid"),
+        ("opacities", (5,), 0.0, r"opacities\[5\] must be in \(0, 1\], got 0\.0"),
         ("opacities", (0,), 1.5, r"opacities\[0\] must be in \(0, 1\], got 1\.5"),
-        ("quats", (2,), 0.0, r"quats\[2\] must be of a length > 0.*\(1, 0, 0, 0\)"),
+        ("quats", (2,), 0.0, r"quats\[2\] must be of a length > 0, got \[0"),
     ],
 )
-def test_bad_values_are_named(name, index, value, message):
+def test_invalid_values_are_named(name, index, value, message):
     arrays = random_arrays()
     arrays[name][index] = value
     with pytest.raises(ValueError, match=message):
         GaussianScene(**arrays)
 
 
-def test_wrong_shapes_and_lengths_are_refused():
-    arrays = random_arrays()
-    with pytest.raises(ValueError, match=r"quats must be of shape \(N, 4\), got \(6, 3\)"):
-        GaussianScene(**arrays | {"quats": arrays["means"]})
-    with pytest.raises(ValueError, match=r"sh must be of shape \(N, K, 3\), got \(6, 4\)"):
-        GaussianScene(**arrays | {"sh": np.zeros((6, 4), np.float32)})
-    with pytest.raises(ValueError, match=r"of one length.*'means': 6.*'scales': 5"):
-        GaussianScene(**arrays | {"scales": arrays["scales"][:5]})
-    with pytest.raises(ValueError, match="1, 4, 9 or 16, got 5"):
-        GaussianScene(**arrays | {"sh": np.zeros((6, 5, 3), np.float32)})
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"quats": np.ones((6, 3))}, r"quats must be of shape \(N, 4\), got \(6, 3\)"),
+        ({"sh": np.zeros((6, 4))}, r"sh must be of shape \(N, K, 3\), got \(6, 4\)"),
+        ({"scales": np.ones((5, 3))}, r"of one length.*'means': 6.*'scales': 5"),
+        ({"sh": np.zeros((6, 5, 3))}, "1, 4, 9 or 16, got 5"),
+    ],
+)
+def test_wrong_shapes_and_lengths_are_refused(changed, message):
+    with pytest.raises(ValueError, match=message):
+        GaussianScene(**random_arrays() | changed)
 
 
 def test_transform_moves_points_shapes_and_view_dependence():
@@ -122,15 +115,6 @@ def test_transform_moves_points_shapes_and_view_dependence():
     )
 
 
-def test_transform_there_and_back_is_the_identity():
-    scene = GaussianScene(**random_arrays(K=9))
-    X = RigidTransform(RollPitchYaw(1, 2, 3), np.array([0.5, 0.25, -1.0]))
-    back = scene.transformed_by(X).transformed_by(X.inverse())
-    for name in ("means", "scales", "opacities", "sh"):
-        np.testing.assert_allclose(getattr(back, name), getattr(scene, name), atol=1e-5)
-    np.testing.assert_allclose(covariances(back), covariances(scene), rtol=1e-4, atol=1e-4)
-
-
 def test_scaled_scene_has_all_lengths_times_the_factor():
     scene = GaussianScene(**random_arrays(K=9))
     scaled = scene.scaled_by(2.5)
@@ -144,18 +128,14 @@ def test_merge_places_the_other_scene_and_pads_the_lower_degree():
     first = GaussianScene(**random_arrays(N=3, K=9))
     other = GaussianScene(**random_arrays(N=2, K=4, seed=5))
     X_WO = RigidTransform(RollPitchYaw(0.1, 0.2, 0.3), np.array([10.0, 0.0, 0.0]))
-    merged = first.merged_with(other, X_WO)
-    placed = other.transformed_by(X_WO)
-    assert (len(merged), merged.sh_degree) == (5, 2)
+    merged, placed = first.merged_with(other, X_WO), other.transformed_by(X_WO)
     for name in ("means", "quats", "scales", "opacities"):
         expected = np.concatenate([getattr(first, name), getattr(placed, name)])
         np.testing.assert_array_equal(getattr(merged, name), expected)
     np.testing.assert_array_equal(merged.sh[:3], first.sh)
     np.testing.assert_array_equal(merged.sh[3:, :4], placed.sh)
     assert not merged.sh[3:, 4:].any()
-    reverse = other.merged_with(first)
-    np.testing.assert_array_equal(reverse.means, np.concatenate([other.means, first.means]))
-    assert reverse.sh_degree == 2
+    assert other.merged_with(first).sh_degree == 2
 
 
 def random_directions(count: int, seed: int = 0) -> np.ndarray:
@@ -174,27 +154,12 @@ def test_basis_is_the_real_part_of_the_complex_harmonics():
     np.testing.assert_allclose(sh_basis(d, 3), np.stack(columns, axis=-1), atol=1e-14)
 
 
-def test_basis_keeps_the_published_signs():
-    x, y, z = random_directions(1)[0]
-    expected = [0.28209479, -0.48860251 * y, 0.48860251 * z, -0.48860251 * x, 1.09254843 * x * y]
-    np.testing.assert_allclose(sh_basis([x, y, z], 3)[:5], expected, rtol=1e-7)
-
-
-def test_constant_coefficient_is_direction_independent():
-    np.testing.assert_allclose(
-        evaluate_sh([[[1.0, 2.0, 3.0]]], random_directions(9)), C0 * np.tile([1, 2, 3], (9, 1))
-    )
-
-
-@settings(max_examples=30, deadline=None)
-@given(
-    rpy=st.tuples(*[st.floats(-7, 7)] * 3),
-    degree=st.integers(0, 3),
-    seed=st.integers(0, 2**16),
-)
-def test_rotated_coefficients_describe_the_rotated_function(rpy, degree, seed):
-    R_WO = RollPitchYaw(*rpy).ToRotationMatrix().matrix()
-    sh_O = np.random.default_rng(seed).normal(size=((degree + 1) ** 2, 3))
+@pytest.mark.parametrize("degree", range(4))
+@pytest.mark.parametrize("seed", range(3))
+def test_rotated_coefficients_describe_the_rotated_function(degree, seed):
+    rng = np.random.default_rng(seed)
+    R_WO = RollPitchYaw(*rng.uniform(-7, 7, 3)).ToRotationMatrix().matrix()
+    sh_O = rng.normal(size=((degree + 1) ** 2, 3))
     matrices = sh_rotations(R_WO, degree)
     sh_W = np.concatenate(
         [M @ sh_O[k * k : (k + 1) ** 2] for k, M in zip(range(degree + 1), matrices, strict=True)]
@@ -235,8 +200,5 @@ def test_origin_moves_to_what_is_far(scale, offset, moves):
     assert origin.any() == moves
     if moves:
         assert np.linalg.norm(np.median(positions - origin, axis=0)) <= 1
-
-
-def test_origin_is_in_whole_meters():
-    origin = choose_origin(5 * NEAR + [456789.3, 812345.6, -283.1])
-    np.testing.assert_array_equal(origin, np.round(origin))
+    far = choose_origin(5 * NEAR + [456789.3, 812345.6, -283.1])
+    np.testing.assert_array_equal(far, np.round(far))

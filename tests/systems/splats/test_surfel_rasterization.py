@@ -1,5 +1,3 @@
-"""Tests of the surfel renderer against an independent reference and analytic oracles."""
-
 import math
 import types
 from functools import partial
@@ -9,8 +7,6 @@ import numpy as np
 import pytest
 import reference_surfels as reference
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from random_scenes import normal, normal_tensor, rotation_matrix
 from random_scenes import random_scene as random_gaussians
 from reference_rasterizer import rotation_matrices
@@ -27,12 +23,11 @@ OUTPUTS = ("color", "alpha", "normal", "depth", "median", "distort")
 
 
 def random_scene(**options) -> dict[str, Any]:
-    """Surfels of many sizes in front of, around and behind cameras that look at the origin."""
     return random_gaussians(log2_scale=(-3.3, 1.0), **options)
 
 
 def edge_on_scene(sine: float, count: int = 60) -> dict[str, Any]:
-    """Surfels whose planes meet the rays through their centers at `sine`, all on the image."""
+    # Surfels whose planes meet the rays through their centers at `sine`, all on the image.
     scene = random_scene(count=8 * count)
     generator = np.random.default_rng(0)
     X_CW = scene["viewmats"][0].double().numpy()
@@ -70,7 +65,6 @@ def single_surfel(opacity=0.5, scale=0.1, depth=2.0, quat=(1.0, 0, 0, 0)) -> dic
 
 
 def render(scene, width=WIDTH, height=HEIGHT, **options) -> dict[str, torch.Tensor]:
-    """The images of the first camera, by name."""
     options = {"render_mode": "RGB+D", "distloss": True} | options
     image, alpha, normal, surface, distort, median, _ = rasterize_surfels(
         **scene, width=width, height=height, **options
@@ -103,14 +97,13 @@ def test_images_agree_with_reference(simd, seed):
         scene, backgrounds=torch.tensor([[0.1, 0.7, 0.3]]), renderer=create_renderer(1, simd)
     )
     for name in OUTPUTS:
-        wanted = getattr(expected, name)
-        error = (images[name].double() - wanted).abs()
+        want = getattr(expected, name)
+        error = (images[name].double() - want).abs()
         assert error.median() < 5e-7, name
-        assert (error / wanted.abs().clamp(min=1))[clear].max() < 1e-4, name
+        assert (error / want.abs().clamp(min=1))[clear].max() < 1e-4, name
 
 
 def loss_gradients(call, scene, clear, dtype) -> dict[str, torch.Tensor]:
-    """The gradients, by all that is learned, of a random linear function of the clear pixels."""
     leaves = {
         k: v.detach().clone().to(dtype).requires_grad_(k in LEARNED) for k, v in scene.items()
     }
@@ -131,7 +124,6 @@ def reference_gradients(scene, clear, dtype=torch.float64, **options) -> dict[st
 
 
 def lengths(gradient: torch.Tensor) -> torch.Tensor:
-    """Of a surfel's part of a gradient, or of the camera's."""
     return gradient.reshape(len(gradient), -1).norm(dim=1)
 
 
@@ -140,15 +132,13 @@ def test_gradients_agree_with_reference(sh_degree):
     scene = random_scene(seed=3, sh_degree=sh_degree)
     clear = call_reference(scene, sh_degree=sh_degree).margin > 1e-4
     exact = reference_gradients(scene, clear, sh_degree=sh_degree)
-    # The change of float64 by half a last place of the inputs, the largest of three.
-    moved = {name: torch.zeros(len(exact[name]), dtype=torch.float64) for name in LEARNED}
-    for seed in range(3):
-        ends = {
-            k: scene[k].double() * (1 + 2.0**-24 * normal_tensor(seed, *scene[k].shape).sign())
-            for k in LEARNED
-        }
-        other = reference_gradients(scene | ends, clear, sh_degree=sh_degree)
-        moved = {k: torch.maximum(m, lengths(other[k] - exact[k])) for k, m in moved.items()}
+    # The change of float64 by half a unit in the last digit of the inputs.
+    ends = {
+        k: scene[k].double() * (1 + 2.0**-24 * normal_tensor(0, *scene[k].shape).sign())
+        for k in LEARNED
+    }
+    other = reference_gradients(scene | ends, clear, sh_degree=sh_degree)
+    moved = {k: 3 * lengths(other[k] - exact[k]) for k in LEARNED}
     for simd in LEVELS:
         call = partial(render, sh_degree=sh_degree, renderer=create_renderer(1, simd))
         ours = loss_gradients(call, scene, clear, torch.float32)
@@ -196,9 +186,7 @@ def test_third_scale_does_not_matter():
 
 def test_surfel_facing_the_camera_is_a_gaussian_disc():
     images = render(single_surfel(opacity=0.8), width=33, height=33)
-    y, x = torch.meshgrid(torch.arange(33.0) - 16, torch.arange(33.0) - 16, indexing="ij")
-    expected = 0.8 * torch.exp(-(x**2 + y**2) / (2 * 5.0**2))  # 100 px * 0.1 m / 2 m
-    expected[expected < 1 / 255] = 0
+    expected = bell(0.8, 5.0**2)  # 100 px * 0.1 m / 2 m
     torch.testing.assert_close(images["alpha"], expected, rtol=1e-5, atol=1e-6)
     torch.testing.assert_close(images["depth"], 2 * expected, rtol=1e-5, atol=1e-6)
     toward = torch.tensor([0.0, 0.0, -1.0])
@@ -207,16 +195,18 @@ def test_surfel_facing_the_camera_is_a_gaussian_disc():
     assert not images["distort"].abs().max() > 1e-6
 
 
+def bell(opacity: float, variance: float) -> torch.Tensor:
+    y, x = torch.meshgrid(torch.arange(33.0) - 16, torch.arange(33.0) - 16, indexing="ij")
+    alpha = opacity * torch.exp(-(x**2 + y**2) / (2 * variance))
+    return torch.where(alpha < 1 / 255, 0.0, alpha)
+
+
 def test_small_surfel_is_the_blob():
     images = render(single_surfel(scale=1e-6), width=33, height=33)
-    y, x = torch.meshgrid(torch.arange(33.0) - 16, torch.arange(33.0) - 16, indexing="ij")
-    expected = 0.5 * torch.exp(-(x**2 + y**2))
-    expected[expected < 1 / 255] = 0
-    torch.testing.assert_close(images["alpha"], expected, rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(images["alpha"], bell(0.5, 0.5), rtol=1e-5, atol=1e-6)
 
 
 def tilted_plane(tilt=1.1) -> tuple[dict[str, Any], torch.Tensor, torch.Tensor]:
-    """Surfels on the plane through (0, 0, 2) with a normal turned about x; its normal and depth."""
     g = torch.Generator().manual_seed(0)
     normal = torch.tensor([0.0, math.sin(tilt), -math.cos(tilt)])
     in_plane = torch.tensor([[1.0, 0, 0], [0.0, math.cos(tilt), math.sin(tilt)]])
@@ -315,14 +305,6 @@ def test_edge_on_surfel_is_its_blob(quat):
     assert all(torch.isfinite(scene[name].grad).all() for name in LEARNED)
 
 
-@pytest.mark.parametrize(
-    ("depth", "visible"), [(-2.0, False), (0.0, False), (0.0099, False), (0.01, True), (5.0, True)]
-)
-def test_near_plane_is_the_limit(depth, visible):
-    images = render(single_surfel(depth=depth, scale=0.001), width=33, height=33)
-    assert bool(images["alpha"].any()) == visible
-
-
 def test_surfel_through_the_camera_plane_is_drawn_in_front_only():
     quat = (math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0)  # normal along -y
     scene = single_surfel(opacity=0.9, scale=3.0, depth=1.0, quat=quat)
@@ -332,67 +314,6 @@ def test_surfel_through_the_camera_plane_is_drawn_in_front_only():
     assert not images["alpha"][:16].any() and images["alpha"][24:].min() > 0.01
     assert (images["alpha"].double() - expected.alpha).abs().max() < 1e-5
     assert (images["depth"].double() - expected.depth).abs().max() < 1e-4
-
-
-def test_empty_scene_is_background():
-    scene = random_scene(count=0)
-    for name in LEARNED:
-        scene[name] = scene[name].requires_grad_()
-    background = torch.tensor([[0.1, 0.2, 0.3]])
-    images = render(scene, width=20, height=10, backgrounds=background, render_mode="RGB+ED")
-    assert torch.equal(images["color"], background.expand(10, 20, 3))
-    assert not any(images[name].any() for name in ("alpha", "depth", "normal", "median"))
-    images["color"].sum().backward()
-    assert not scene["viewmats"].grad.any()
-
-
-@pytest.mark.parametrize("size", [(1, 1), (17, 33), (97, 1)])
-def test_odd_sizes_agree_with_reference(size):
-    width, height = size
-    scene = random_scene(seed=8, size=size)
-    expected = call_reference(scene, width, height)
-    images = render(scene, width=width, height=height)
-    clear = expected.margin > 1e-4
-    assert (images["color"].double() - expected.color).abs()[clear].max() < 1e-4
-
-
-def all_bits(scene, **options):
-    leaves = {k: v.clone().requires_grad_(k in LEARNED) for k, v in scene.items()}
-    images = render(leaves, **options)
-    total(images).backward()
-    return [images[name] for name in OUTPUTS] + [leaves[name].grad for name in LEARNED]
-
-
-@pytest.mark.parametrize("simd", LEVELS)
-def test_same_bits_for_any_number_of_threads(simd):
-    scene = random_scene(count=6000, seed=6, size=(150, 110), sh_degree=1)
-    options = {"width": 150, "height": 110, "sh_degree": 1}
-    renderer = create_renderer(1, simd)
-    single = all_bits(scene, renderer=renderer, **options)
-    render(random_scene(seed=7), renderer=renderer)
-    for used in (renderer, create_renderer(2, simd), create_renderer(4, simd)):
-        bits = all_bits(scene, renderer=used, **options)
-        assert all(torch.equal(a, b) for a, b in zip(single, bits, strict=True))
-
-
-def test_batch_of_cameras_equals_single_calls():
-    scene = random_scene(seed=3, cameras=3)
-    scene["colors"] = torch.rand(3, 300, 3, generator=torch.Generator().manual_seed(9))
-    leaves = {k: v.clone().requires_grad_(k in LEARNED) for k, v in scene.items()}
-    options: dict[str, Any] = {"width": 40, "height": 30}
-    images, _, _, _, _, _, meta = rasterize_surfels(**leaves, **options)
-    (images**2).sum().backward()
-    losses = []
-    again = {k: v.clone().requires_grad_(k in LEARNED) for k, v in scene.items()}
-    for c in range(3):
-        one = again | {k: again[k][c : c + 1] for k in ("viewmats", "Ks", "colors")}
-        image, _, _, _, _, _, single = rasterize_surfels(**one, **options)
-        assert torch.equal(image[0], images[c])
-        assert torch.equal(meta["means2d"][meta["camera_ids"] == c], single["means2d"])
-        losses.append((image**2).sum())
-    torch.stack(losses[::-1]).sum().backward()
-    for name in LEARNED:
-        torch.testing.assert_close(leaves[name].grad, again[name].grad, rtol=1e-4, atol=1e-4)
 
 
 def test_modes_and_meta():
@@ -418,86 +339,17 @@ def test_modes_and_meta():
     assert (meta["radii"] >= 1).all() and 0 < len(ids) < 300
 
 
-@settings(max_examples=30, deadline=None)
-@given(
-    seed=st.integers(0, 2**31),
-    count=st.integers(0, 60),
-    width=st.integers(1, 40),
-    height=st.integers(1, 40),
-    spread=st.floats(-3, 3),
-    log_scale=st.floats(-30, 15),
-    simd=st.sampled_from(LEVELS),
-    threads=st.integers(1, 2),
-)
-def test_fuzz_finite_and_bounded(seed, count, width, height, spread, log_scale, simd, threads):
-    scene = random_scene(count=count, seed=seed, size=(width, height))
-    scene["means"] *= 10.0**spread
-    scene["scales"] = 10.0 ** (log_scale + normal_tensor(seed, count, 3))
-    for name in LEARNED:
-        scene[name] = scene[name].requires_grad_()
-    images = render(scene, width=width, height=height, renderer=create_renderer(threads, simd))
-    assert all(torch.isfinite(image).all() for image in images.values())
-    assert (images["alpha"] >= 0).all() and (images["alpha"] <= 1 + 1e-6).all()
-    assert (images["color"] >= 0).all() and (images["color"] <= 1 + 1e-5).all()
-    total({name: images[name] for name in OUTPUTS}).backward()
-    assert all(torch.isfinite(scene[name].grad).all() for name in LEARNED)
-
-
-@settings(max_examples=15, deadline=None)
-@given(seed=st.integers(0, 2**31), spread=st.floats(-1, 1), log_scale=st.floats(-3, 1))
-def test_fuzz_agrees_with_reference(seed, spread, log_scale):
-    scene = random_scene(count=80, seed=seed, size=(29, 23))
-    scene["means"] *= 10.0**spread
-    scene["scales"] = scene["scales"] * 10.0**log_scale
-    expected = call_reference(scene, 29, 23)
-    images = render(scene, width=29, height=23)
-    clear = expected.margin > 1e-2
-    error = (images["alpha"].double() - expected.alpha).abs()
-    assert not clear.any() or error[clear].max() < 2e-3
-
-
-def _set(name, index, value):
-    def change(scene):
-        tensor = scene[name].clone()
-        tensor[index] = value
-        return scene | {name: tensor}
-
-    return change
-
-
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("options", "message"),
     [
-        (lambda s: s | {"quats": s["quats"][:-1]}, r"quats must .* got \(299, 4\)"),
-        (lambda s: s | {"scales": s["scales"][:, :2]}, r"scales must .* got \(300, 2\)"),
-        (
-            lambda s: s | {"means": s["means"].double()},
-            r"means must be torch.float32, got torch.float64",
-        ),
-        (_set("means", (7, 1), math.nan), r"means\[7, 1\] must be finite, got nan"),
-        (_set("scales", (3, 1), 0.0), r"scales\[3, 1\] must be > 0 m, got 0"),
-        (_set("opacities", 4, 1.5), r"opacities\[4\] must be in \[0, 1\], got 1.5"),
-        (_set("quats", 5, 0.0), r"quats\[5\] must .* got \[0.0, 0.0, 0.0, 0.0\]"),
-        (_set("viewmats", 0, 2 * torch.eye(4)), r"viewmats\[0\] must be a rigid transform"),
-        (_set("Ks", (0, 0, 0), 0.0), r"focal lengths of K must be > 0 px, got 0"),
-        (lambda s: s | {"render_mode": "RGBD"}, r"render_mode must .* got 'RGBD'"),
-        (lambda s: s | {"depth_mode": "mean"}, r"depth_mode must .* got 'mean'"),
-        (
-            lambda s: s | {"distloss": True},
-            r"render_mode must be one with depth for distloss, got RGB",
-        ),
-        (lambda s: s | {"radius_clip": -1.0}, r"radius_clip must .* got -1"),
-        (lambda s: s | {"width": 0}, r"image size must .* got 0 x 45"),
-        (lambda s: s | {"near_plane": 0.0}, r"0 < near < far"),
-        (lambda s: s | {"sh_degree": 1}, r"colors must be of shape \(300, K, 3\)"),
-        (lambda s: s | {"Ks": s["Ks"].requires_grad_()}, r"Ks must be without a gradient"),
-        (lambda s: {k: v.to("meta") if torch.is_tensor(v) else v for k, v in s.items()}, r"meta"),
+        ({"depth_mode": "mean"}, r"depth_mode must .* got 'mean'"),
+        ({"distloss": True}, r"render_mode must be one with depth for distloss, got RGB"),
+        ({"render_mode": "MD"}, r"render_mode must be one of RGB, D, ED, .* got 'MD'"),
     ],
 )
-def test_bad_input_is_named(change, message):
-    scene = change(random_scene() | {"width": WIDTH, "height": HEIGHT})
+def test_invalid_options_are_named(options, message):
     with pytest.raises(ValueError, match=message):
-        rasterize_surfels(**scene)
+        rasterize_surfels(**random_scene(), width=WIDTH, height=HEIGHT, **options)
 
 
 def test_gsplat_gives_pairs_with_normals_in_the_world(monkeypatch):
@@ -514,7 +366,7 @@ def test_gsplat_gives_pairs_with_normals_in_the_world(monkeypatch):
 
     stand_in = types.SimpleNamespace(rasterization_2dgs=rasterization_2dgs)
     monkeypatch.setattr(surfel_rasterization, "import_extra", lambda *_: stand_in)
-    monkeypatch.setattr(surfel_rasterization, "check_shapes", lambda *_: None)
+    monkeypatch.setattr(surfel_rasterization, "named_tensors", lambda *_, **__: None)
     scene = random_scene(count=N) | {"means": FakeCuda(N)}
     scene["viewmats"][0, :3, :3] = R = torch.tensor([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
     options = {"width": WIDTH, "height": HEIGHT, "render_mode": "RGB+ED"}
@@ -526,8 +378,6 @@ def test_gsplat_gives_pairs_with_normals_in_the_world(monkeypatch):
 
 
 class FakeCuda(types.SimpleNamespace):
-    """Stands for a tensor on a GPU."""
-
     def __init__(self, count: int):
         super().__init__(device=torch.device("cuda"), count=count)
 

@@ -47,7 +47,6 @@ def test_reaching_acceleration_arrives(p_WR, p_WB, v_WB, lookahead):
 
 @given(R_WB=rotations, a_WB=vectors, v_WB=vectors, heading=angles)
 def test_rates_lead_to_the_attitude_of_the_acceleration(R_WB, a_WB, v_WB, heading):
-    """By the shortest tilt, then yaw; the thrust there accelerates as desired."""
     assume(a_WB[2] + PARAMS.drag * v_WB[2] > -9.0)
     q_WB = R_WB.as_quat(scalar_first=True)
     state = np.concatenate([np.zeros(3), v_WB, q_WB, np.zeros(3)])
@@ -126,10 +125,8 @@ class Signal(LeafSystem):
 
 
 def fly(state, duration, *, config=None, params=None, **inputs):
-    """Times (N,), states (N, 13) and commands (N, 4) every 20 ms of plant and controller.
-
-    `inputs` are functions of time for the controller's `waypoint` or `acceleration`.
-    """
+    """Times (N,), states (N, 13) and commands (N, 4) every 20 ms, for functions of time as inputs
+    of the controller."""
     builder = DiagramBuilder()
     plant = builder.AddSystem(QuadrotorPlant(params))
     controller = builder.AddSystem(FlatnessController(config, params))
@@ -153,7 +150,7 @@ def fly(state, duration, *, config=None, params=None, **inputs):
 
 
 def command_for(state, config=None, time=0.0, **inputs):
-    """The command (4,) that one update computes, and the hover command it replaces."""
+    """The command (4,) that one update computes."""
     controller = FlatnessController(config)
     context = controller.CreateDefaultContext()
     context.SetTime(time)
@@ -167,7 +164,6 @@ def yaw_of(states):
 
 
 def test_hover_thrust_is_published_before_the_first_update():
-    """A fresh Context commands the weight and no rotation, without needing any input."""
     controller = FlatnessController(params=QuadrotorParams(gravity=3.7))
     context = controller.CreateDefaultContext()
     command = controller.GetOutputPort("command").Eval(context)
@@ -175,7 +171,6 @@ def test_hover_thrust_is_published_before_the_first_update():
 
 
 def test_the_command_is_held_between_updates():
-    """With a period of 0.1 s the command changes only at its multiples."""
     config = FlatnessControllerConfig(period=0.1)
     _, _, commands = fly(
         hover_state([0.0, 0.0, 0.0]), 1.0, config=config, waypoint=lambda t: [t, -t, 1.0]
@@ -186,15 +181,13 @@ def test_the_command_is_held_between_updates():
 
 
 def test_hover_holds():
-    """At the waypoint, at rest, the vehicle stays, whatever way it faces."""
     state = hover_state([1.0, 2.0, 3.0], yaw=2.5)
     _, states, _ = fly(state, 5.0, waypoint=lambda t: [1.0, 2.0, 3.0])
     np.testing.assert_allclose(states, np.tile(state, (len(states), 1)), atol=1e-9)
 
 
-@pytest.mark.parametrize("step", [[3.0, 0.0, 0.0], [-2.0, 2.0, 4.0], [0.0, 0.0, -3.0], [30, 40, 5]])
+@pytest.mark.parametrize("step", [[-2.0, 2.0, 4.0], [0.0, 0.0, -3.0], [30, 40, 5]])
 def test_a_step_of_the_waypoint_converges(step):
-    """A waypoint that jumps, even by 50 m, is reached and held to a millimeter."""
     _, states, _ = fly(hover_state([0.0, 0.0, 0.0]), 20.0, waypoint=lambda t: step)
     assert np.isfinite(states).all()
     np.testing.assert_allclose(states[-1, 0:3], step, atol=1e-3)
@@ -202,10 +195,8 @@ def test_a_step_of_the_waypoint_converges(step):
 
 
 def test_recovers_from_upside_down():
-    """Released inverted and spinning, it rights itself and returns to the waypoint."""
     state = hover_state([0.0, 0.0, 10.0])
-    state[6:10] = [0.0, 1.0, 0.0, 0.0]
-    state[10:13] = [3.0, -2.0, 5.0]
+    state[6:10], state[10:13] = [0.0, 1.0, 0.0, 0.0], [3.0, -2.0, 5.0]
     _, states, _ = fly(state, 8.0, waypoint=lambda t: [0.0, 0.0, 10.0])
     assert states[:, 2].min() > 5.0
     np.testing.assert_allclose(states[-1, 0:3], [0.0, 0.0, 10.0], atol=1e-3)
@@ -217,7 +208,6 @@ def circle(t, radius=3.0, speed=2.0):
 
 
 def test_tracks_a_circle_to_a_centimeter():
-    """On a circle of 3 m at 2 m/s the steady error is under 1 cm and yaw is within 6 degrees."""
     state = hover_state(circle(0.0), yaw=math.pi / 2)
     state[3:6] = [0.0, 2.0, 0.0]
     times, states, _ = fly(state, 20.0, waypoint=lambda t: circle(t + CONFIG.lookahead))
@@ -230,7 +220,6 @@ def test_tracks_a_circle_to_a_centimeter():
 
 
 def test_an_acceleration_is_reproduced():
-    """Without drag a constant acceleration is flown exactly; with drag within 1 percent of g."""
     a_WB = np.array([1.0, -2.0, 0.5])
     for drag, tolerance in ((0.0, 1e-5), (0.375, 0.1)):
         params = QuadrotorParams(drag=drag)
@@ -241,9 +230,8 @@ def test_an_acceleration_is_reproduced():
         np.testing.assert_allclose(v_dot, a_WB, atol=tolerance)
 
 
-@pytest.mark.parametrize("direction", [-3.0, -1.0, 0.5, 2.0])
-def test_yaw_turns_toward_motion(direction):
-    """Flying straight in any direction ends facing that way, having turned at a limited rate."""
+@pytest.mark.parametrize("direction", [-3.0, 2.0])
+def test_yaw_rotates_toward_motion(direction):
     heading = np.array([math.cos(direction), math.sin(direction), 0.0])
     _, states, commands = fly(
         hover_state([0.0, 0.0, 0.0]), 6.0, waypoint=lambda t: 1.5 * (t + CONFIG.lookahead) * heading
@@ -253,7 +241,6 @@ def test_yaw_turns_toward_motion(direction):
 
 
 def test_yaw_follows_the_velocity_when_an_acceleration_is_flown():
-    """While braking, the vehicle faces where it still flies, not where it is pushed."""
     state = hover_state([0.0, 0.0, 0.0], yaw=0.8)
     state[3:6] = [4.0, 0.0, 0.0]
     _, states, _ = fly(state, 2.5, acceleration=lambda t: [-1.0, 0.0, 0.0])
@@ -261,15 +248,11 @@ def test_yaw_follows_the_velocity_when_an_acceleration_is_flown():
     assert yaw_of(states)[-1] == pytest.approx(0.0, abs=math.radians(1.0))
 
 
-def test_yaw_rests_when_slow():
-    """Creeping sideways at 1 cm/s, or rising straight up, does not turn the vehicle."""
-    for velocity in ([0.0, 0.01, 0.0], [0.0, 0.0, 1.0]):
-        _, states, _ = fly(
-            hover_state([0.0, 0.0, 0.0]),
-            5.0,
-            waypoint=lambda t, v=velocity: (t + CONFIG.lookahead) * np.array(v),
-        )
-        assert np.abs(yaw_of(states)).max() < math.radians(1.0)
+@pytest.mark.parametrize("velocity", [[0.0, 0.01, 0.0], [0.0, 0.0, 1.0]])
+def test_yaw_rests_when_slow(velocity):
+    start, v_WR = hover_state([0.0, 0.0, 0.0]), np.array(velocity)
+    _, states, _ = fly(start, 5.0, waypoint=lambda t: (t + CONFIG.lookahead) * v_WR)
+    assert np.abs(yaw_of(states)).max() < math.radians(1.0)
 
 
 finite = st.floats(-1e6, 1e6) | st.floats(-3, 3)
@@ -282,7 +265,6 @@ finite = st.floats(-1e6, 1e6) | st.floats(-3, 3)
     value=st.lists(finite, min_size=3, max_size=3),
 )
 def test_commands_are_limited_for_any_input(state, port, value):
-    """Whatever the finite inputs, the command is finite and within every limit."""
     state = np.array(state)
     if np.linalg.norm(state[6:10]) < 1e-6:
         state[6] = 1.0
@@ -293,7 +275,6 @@ def test_commands_are_limited_for_any_input(state, port, value):
 
 
 def test_the_attitude_stays_within_the_tilt_limit():
-    """Chasing a waypoint that jumps about, the tilt exceeds its limit by under 5 degrees."""
     corners = np.random.default_rng(0).uniform(-20, 20, size=(10, 3))
     _, states, _ = fly(hover_state([0.0, 0.0, 0.0]), 10.0, waypoint=lambda t: corners[int(t) % 10])
     z_W = Rotation.from_quat(states[:, 6:10], scalar_first=True).apply([0.0, 0.0, 1.0])
@@ -302,7 +283,6 @@ def test_the_attitude_stays_within_the_tilt_limit():
 
 
 def test_one_of_the_two_targets_must_be_connected():
-    """Neither or both of waypoint and acceleration is an error at the first update."""
     state = hover_state([0.0, 0.0, 0.0])
     with pytest.raises(ValueError, match="got neither"):
         fly(state, 0.1)
@@ -312,7 +292,6 @@ def test_one_of_the_two_targets_must_be_connected():
 
 @pytest.mark.parametrize("port", ["state", "waypoint", "acceleration"])
 def test_an_input_that_is_not_finite_is_an_error(port):
-    """A NaN at any input is refused by the port's name and the time."""
     inputs = {"state": hover_state([0.0, 0.0, 0.0]), "waypoint": np.zeros(3)}
     if port == "acceleration":
         inputs[port] = inputs.pop("waypoint")
@@ -324,7 +303,7 @@ def test_an_input_that_is_not_finite_is_an_error(port):
 
 
 @pytest.mark.parametrize("field", [field.name for field in fields(FlatnessControllerConfig)])
-@pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf])
+@pytest.mark.parametrize("value", [0.0, math.inf])
 def test_every_field_must_be_positive_and_finite(field, value):
     with pytest.raises(ValueError, match=f"{field} must be in .*, got {value}"):
         FlatnessController(FlatnessControllerConfig(**{field: value}))

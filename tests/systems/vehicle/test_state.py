@@ -23,27 +23,24 @@ from splatpilot.systems.vehicle.state import (
 )
 
 
-def test_parts_are_where_the_plant_has_them():
-    """The parts of one state and of many are entries 0-2, 3-5, 6-9 and 10-12, and give it back."""
-    for x in (np.arange(13.0), np.arange(2 * 3 * 13.0).reshape(2, 3, 13)):
-        state = QuadrotorState.of(x)
-        np.testing.assert_array_equal(state.p_WB, x[..., [0, 1, 2]])
-        np.testing.assert_array_equal(state.v_WB, x[..., [3, 4, 5]])
-        np.testing.assert_array_equal(state.q_WB, x[..., [6, 7, 8, 9]])
-        np.testing.assert_array_equal(state.w_WB_B, x[..., [10, 11, 12]])
-        np.testing.assert_array_equal(state.to_vector(), x)
+@pytest.mark.parametrize("x", [np.arange(13.0), np.arange(2 * 3 * 13.0).reshape(2, 3, 13)])
+def test_parts_are_where_the_plant_has_them(x):
+    state = QuadrotorState.of(x)
+    np.testing.assert_array_equal(state.p_WB, x[..., [0, 1, 2]])
+    np.testing.assert_array_equal(state.v_WB, x[..., [3, 4, 5]])
+    np.testing.assert_array_equal(state.q_WB, x[..., [6, 7, 8, 9]])
+    np.testing.assert_array_equal(state.w_WB_B, x[..., [10, 11, 12]])
+    np.testing.assert_array_equal(state.to_vector(), x)
 
 
 @pytest.mark.parametrize("zeros", [np.zeros, torch.zeros])
 def test_parts_are_views(zeros):
-    """What is written to a part is written to the states."""
     x = zeros((2, 13))
     QuadrotorState.of(x).v_WB[:, 1] = 3.0
     assert x[:, 4].tolist() == [3.0, 3.0] and x.sum() == 6.0
 
 
 def test_parts_of_derivatives_and_expressions():
-    """Arrays of AutoDiffXd and of Expression have parts, and those pack, as floats do."""
     x = InitializeAutoDiff(np.arange(13.0)).ravel()
     packed = QuadrotorState.of(x).to_vector()
     assert [component.value() for component in packed] == list(range(13))
@@ -53,17 +50,16 @@ def test_parts_of_derivatives_and_expressions():
     assert [str(component) for component in q_WB] == ["x(6)", "x(7)", "x(8)", "x(9)"]
 
 
-def test_heading_is_that_of_body_x_seen_from_above():
-    rotations = Rotation.random(20, random_state=0)
-    states = np.zeros((20, 13))
+def test_heading_and_tilt_are_those_of_the_body_axes():
+    rotations, states = Rotation.random(20, random_state=0), np.zeros((20, 13))
     states[:, 6:10] = rotations.as_quat(scalar_first=True)
-    x_W = rotations.apply([1.0, 0.0, 0.0])
-    expected = np.arctan2(x_W[:, 1], x_W[:, 0])
-    np.testing.assert_allclose(QuadrotorState.of(states).heading, expected, atol=1e-12)
+    x_W, z_W = rotations.apply([1.0, 0.0, 0.0]), rotations.apply([0.0, 0.0, 1.0])
+    state = QuadrotorState.of(states)
+    np.testing.assert_allclose(state.heading, np.arctan2(x_W[:, 1], x_W[:, 0]), atol=1e-12)
+    np.testing.assert_allclose(state.tilt, np.arccos(z_W[:, 2]), atol=1e-7)
 
 
 def test_other_shapes_are_refused():
-    """What has not 13 numbers is no state."""
     with pytest.raises(ValueError, match=r"got \(13, 2\)"):
         QuadrotorState.of(np.zeros((13, 2)))
 
@@ -79,7 +75,6 @@ def pose_of(state):
 
 @given(q=st.lists(st.floats(-2, 2), min_size=4, max_size=4))
 def test_pose_has_the_position_and_the_attitude_of_the_normalized_quaternion(q):
-    """Any nonzero quaternion gives the rotation scipy gives it, beside the position."""
     assume(np.linalg.norm(q) > 1e-6)
     state = np.arange(13.0)
     state[6:10] = q
@@ -90,8 +85,7 @@ def test_pose_has_the_position_and_the_attitude_of_the_normalized_quaternion(q):
 
 
 @pytest.mark.parametrize("w", [0.0, math.nan, math.inf])
-def test_a_quaternion_that_is_no_rotation_is_an_error(w):
-    """Zero and non-finite quaternions are refused with their value and the remedy."""
+def test_an_invalid_quaternion_is_an_error(w):
     state = hover_state([0.0, 0.0, 0.0])
     state[6] = w
     with pytest.raises(ValueError, match=f"q_WB must be .* got \\[{w}, "):
@@ -103,9 +97,7 @@ VECTORS = st.tuples(NUMBERS, NUMBERS, NUMBERS).map(np.array)
 
 
 @given(p=VECTORS, v=VECTORS, axis=VECTORS, w=VECTORS, duration=st.floats(0, 0.5))
-def test_turns_and_moves_as_drakes_rotations_say(p, v, axis, w, duration):
-    """The position moves on by velocity and the attitude turns about the body rates by their size
-    times the duration; velocities stay."""
+def test_predicted_motion_is_that_of_drakes_rotations(p, v, axis, w, duration):
     q_WB = Quaternion(np.append(1.0, axis) / np.linalg.norm(np.append(1.0, axis)))
     state = np.concatenate([p, v, q_WB.wxyz(), w])
     later = QuadrotorState.of(predict_state(state, duration))
@@ -114,31 +106,30 @@ def test_turns_and_moves_as_drakes_rotations_say(p, v, axis, w, duration):
     np.testing.assert_array_equal(later.w_WB_B, w)
     rate = np.linalg.norm(w)
     axis = w / rate if rate > 1e-9 else np.array([1.0, 0.0, 0.0])
-    turned = q_WB.multiply(AngleAxis(rate * duration, axis).quaternion()).wxyz()
-    np.testing.assert_allclose(later.q_WB, turned, atol=1e-8)
+    rotated = q_WB.multiply(AngleAxis(rate * duration, axis).quaternion()).wxyz()
+    np.testing.assert_allclose(later.q_WB, rotated, atol=1e-8)
 
 
 @pytest.mark.parametrize(
     ("age", "moved"), [(0.0, 0.0), (0.05, 0.1), (0.5, 0.2), (-1.0, 0.0), (np.inf, 0.2)]
 )
-def test_ages_of_no_use_lead_nowhere(age, moved):
-    """Negative ages count for nothing, long and infinite ones for the longest."""
+def test_ages_of_predictions_are_clipped(age, moved):
     system = StatePredictor(longest=0.1)
     context = system.CreateDefaultContext()
     state = np.array([1.0, 0, 0, 2, 0, 0, 1, 0, 0, 0, 0, 0, 0])
-    system.measured_state_input_port().FixValue(context, state)
-    system.age_input_port().FixValue(context, [age])
-    assert system.state_output_port().Eval(context)[0] == pytest.approx(1.0 + moved)
+    system.GetInputPort("measured_state").FixValue(context, state)
+    system.GetInputPort("age").FixValue(context, [age])
+    assert system.GetOutputPort("state").Eval(context)[0] == pytest.approx(1.0 + moved)
 
 
-def test_poses_between():
+@pytest.mark.parametrize(("s", "yaw", "p"), [(0, 0.4, [1, 0, 0]), (0.5, 0.7, [2, 1, 0])])
+def test_poses_between(s, yaw, p):
     X_0 = RigidTransform(RotationMatrix.MakeZRotation(0.4), [1.0, 0, 0])
     X_1 = RigidTransform(RotationMatrix.MakeZRotation(1.0), [3.0, 2, 0])
-    expected = RigidTransform(RotationMatrix.MakeZRotation(0.7), [2.0, 1, 0])
-    assert pose_between(X_0, X_1, 0.5).IsNearlyEqualTo(expected, 1e-12)
-    assert pose_between(X_0, X_1, 0.0).IsNearlyEqualTo(X_0, 1e-12)
-    assert pose_between(X_0, X_1, 1.0).IsNearlyEqualTo(X_1, 1e-12)
-    assert pose_between(X_0, X_0, 0.3).IsNearlyEqualTo(X_0, 1e-12)
+    expected = RigidTransform(RotationMatrix.MakeZRotation(yaw), p)
+    assert pose_between(X_0, X_1, s).IsNearlyEqualTo(expected, 1e-12)
+    assert pose_between(X_1, X_0, 1.0 - s).IsNearlyEqualTo(expected, 1e-12)
+    assert pose_between(X_0, X_0, s).IsNearlyEqualTo(X_0, 1e-12)
 
 
 @pytest.mark.parametrize("make", [np.asarray, torch.as_tensor], ids=["numpy", "torch"])

@@ -16,7 +16,6 @@ from splatpilot.systems.policies.hypotheses import Hypotheses
 from splatpilot.systems.splats.background import EnvironmentMap
 from splatpilot.systems.splats.baked_scene import BakedScene
 from splatpilot.systems.splats.scene import GaussianScene
-from splatpilot.systems.splats.splat_camera import render_view
 from splatpilot.systems.vehicle.quadrotor import hover_state
 from splatpilot.systems.visualization.meshcat_drawing import draw_vehicle
 from splatpilot.systems.visualization.pages import (
@@ -90,8 +89,7 @@ def open_page(open_in_browser):
 def seen(gaussians, background, X_WB: RigidTransform) -> np.ndarray:
     """What the onboard camera sees, as `Page.picture` has it."""
     info = CameraInfo(WIDTH, HEIGHT, FOV_Y)
-    view = render_view(
-        BakedScene(gaussians),
+    view = BakedScene(gaussians).render(
         info.intrinsic_matrix(),
         info.width(),
         info.height(),

@@ -9,7 +9,7 @@ from splatpilot.systems.sensing.noise import (
     corrupt_color,
     corrupt_depth,
     expose,
-    turned_hue,
+    rotate_hue,
 )
 from splatpilot.training.policies.augmentation import (
     Appearance,
@@ -81,7 +81,7 @@ def test_appearance_has_its_sizes():
     third = torch.tensor(2.0 * np.pi / 3.0)
     expected = torch.tensor([0.0, 90.0, 0.0]).expand(500, 1, 1, 3)
     torch.testing.assert_close(
-        turned_hue(red, third.cos(), third.sin()), expected, atol=1e-4, rtol=0
+        rotate_hue(red, third.cos(), third.sin()), expected, atol=1e-4, rtol=0
     )
 
 

@@ -6,7 +6,7 @@ from pydrake.math import RollPitchYaw
 from splatpilot.systems.policies import agile_autonomy, base, depthnav, diffaero
 from splatpilot.systems.policies.recurrent_network import RecurrentNetwork
 from splatpilot.systems.policies.velocity import tracking_acceleration
-from splatpilot.systems.sensing.time_of_flight import sensor_of, time_of_flight_grid
+from splatpilot.systems.sensing.time_of_flight import equivalent_sensor, time_of_flight_grid
 from splatpilot.systems.vehicle.state import QuadrotorState, pose_from_state
 from splatpilot.training.policies.networks import TrajectoryModule
 from splatpilot.training.policies.train_agile_autonomy import AgileAutonomyAgent
@@ -49,7 +49,7 @@ def fly_diffaero(network, depth, hidden):
 
 
 def fly_diffaero_tof(network, depth, hidden):
-    seen = flown(time_of_flight_grid(depth, sensor_of(diffaero.DiffAeroTofConfig().camera)))
+    seen = flown(time_of_flight_grid(depth, equivalent_sensor(diffaero.DiffAeroTofConfig().camera)))
     limits = diffaero.VELOCITY_LIMITS
     v_WB, hidden = diffaero.decide(network, seen.image, seen, 2.0, hidden, limits)
     return tracking_acceleration(seen.state.v_WB, v_WB), None, hidden

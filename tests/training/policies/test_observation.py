@@ -4,13 +4,17 @@ import torch
 
 from splatpilot.systems.policies.diffaero import DiffAeroTofConfig
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
-from splatpilot.systems.sensing.time_of_flight import range_of_depth, sensor_of, time_of_flight_grid
+from splatpilot.systems.sensing.time_of_flight import (
+    equivalent_sensor,
+    range_of_depth,
+    time_of_flight_grid,
+)
 from splatpilot.training.policies.train_diffaero import proximity_grid
 
 
 @pytest.mark.parametrize("camera", [DiffAeroTofConfig().camera, OnboardCamera(32, 18, 100.0)])
 def test_training_has_the_grid_of_the_sensor(camera):
-    sensor = sensor_of(camera)
+    sensor = equivalent_sensor(camera)
     depth = np.random.default_rng(0).uniform(0.0, 9.0, (5, camera.height, camera.width))
     depth[depth < 1.0], depth[depth > 8.0] = 0.0, np.inf
     depth[0] = np.inf

@@ -1,5 +1,3 @@
-"""Interrupted reconstructions."""
-
 import resource
 import signal
 import subprocess
@@ -10,66 +8,47 @@ import numpy as np
 import pytest
 
 from splatpilot.training.captures.capture_registry import read_capture
+from splatpilot.training.reconstruction.checkpoint import event_log
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.optimize import Optimization
 from splatpilot.training.reconstruction.reconstruct import reconstruct
 
 CONFIG = ReconstructConfig(
-    iterations=24,
+    iterations=12,
     image_width=0,
     hold_out=6,
+    initial_gaussians=1000,
     voxel_size=0.2,
     threads=1,
-    checkpoint_every=8,
+    checkpoint_every=4,
     strategy="default",
     refine_start=2,
-    refine_every=5,
-    reset_every=11,
+    refine_every=3,
+    reset_every=5,
     refine_fraction=1.0,
 )
 
-# A process that kills itself, as `kill -9` would, in its 20th step or halfway through its second
-# checkpoint.
+# A process that kills itself, as `kill -9` would, halfway through its second checkpoint.
 _CHILD = """
 import os, signal, sys, torch
 from pathlib import Path
 from splatpilot.training.captures.capture_registry import read_capture
-from splatpilot.training.reconstruction.optimize import Optimization
+from splatpilot.training.captures.capture_config import CaptureConfig, ScaleConfig
+from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.reconstruct import reconstruct
-from tests_config import CONFIG
 
-room, out, when = sys.argv[1:]
-take_step, save = Optimization.take_step, torch.save
-
-def step(self):
-    if self.step == 19:
-        os.kill(os.getpid(), signal.SIGKILL)
-    take_step(self)
+room, out, config = sys.argv[1:]
+save = torch.save
 
 def save_half(content, path):
-    if content["step"] == 16:
+    if content["step"] == 8:
         Path(path).write_bytes(b"half of it")
         os.kill(os.getpid(), signal.SIGKILL)
     save(content, path)
 
-if when == "step":
-    Optimization.take_step = step
-else:
-    torch.save = save_half
-reconstruct(read_capture(room), out, CONFIG)
+torch.save = save_half
+reconstruct(read_capture(room), out, eval(config))
 """
-
-
-def kill_a_run(tmp_path, room, out, when: str) -> None:
-    (tmp_path / "tests_config.py").write_text(
-        "from splatpilot.training.captures.capture_config import CaptureConfig, ScaleConfig\n"
-        "from splatpilot.training.reconstruction.config import ReconstructConfig\n"
-        f"CONFIG = {CONFIG!r}\n"
-    )
-    child = subprocess.run(
-        [sys.executable, "-c", _CHILD, room, out, when], cwd=tmp_path, capture_output=True
-    )
-    assert child.returncode == -signal.SIGKILL, child.stderr.decode()
 
 
 @pytest.fixture
@@ -77,15 +56,11 @@ def room(tmp_path, write_room):
     return write_room(tmp_path / "room")
 
 
-def assert_same_scene(tmp_path, room, out) -> None:
-    reconstruct(read_capture(room), tmp_path / "whole", CONFIG)
-    for file in ("gaussians.ply", "scene.yaml", "esdf.npz"):
-        assert (out / file).read_bytes() == (tmp_path / "whole" / file).read_bytes()
-
-
-def test_a_killed_run_goes_on_and_ends_in_the_same_scene(tmp_path, room, write_room, monkeypatch):
-    out = tmp_path / "scene"
-    kill_a_run(tmp_path, room, out, "step")
+def test_killed_run_resumes_and_ends_in_the_same_scene(tmp_path, room, write_room, monkeypatch):
+    out, whole = tmp_path / "scene", tmp_path / "whole"
+    command = [sys.executable, "-c", _CHILD, str(room), str(out), repr(CONFIG)]
+    child = subprocess.run(command, capture_output=True)
+    assert child.returncode == -signal.SIGKILL, child.stderr.decode()
     unread = replace(read_capture(room), load_image=lambda i: pytest.fail("an image was read"))
     with pytest.raises(ValueError, match=r"with depth_weight 0\.2, not 0\.3; .* --restart"):
         reconstruct(unread, out, replace(CONFIG, depth_weight=0.3))
@@ -94,34 +69,28 @@ def test_a_killed_run_goes_on_and_ends_in_the_same_scene(tmp_path, room, write_r
         reconstruct(read_capture(other), out, CONFIG)
     assert not out.exists()
 
-    steps = []
-    take_step = Optimization.take_step
+    steps, take_step = [], Optimization.take_step
     monkeypatch.setattr(
         Optimization, "take_step", lambda self: (steps.append(self.step), take_step(self))
     )
     reconstruct(read_capture(room), out, CONFIG)
-    assert steps == list(range(16, 24))
-    assert not (tmp_path / ".scene.partial").exists()
-    assert_same_scene(tmp_path, room, out)
+    assert steps == list(range(4, 12))
+    work = tmp_path / ".scene.partial"
+    assert not work.exists()
 
-
-def test_a_run_killed_while_it_wrote_a_checkpoint(tmp_path, room):
-    out = tmp_path / "scene"
-    kill_a_run(tmp_path, room, out, "checkpoint")
-    reconstruct(read_capture(room), out, CONFIG)
-    assert_same_scene(tmp_path, room, out)
-
-    file = tmp_path / ".scene.partial" / "checkpoint.pt"
-    file.parent.mkdir()
-    file.write_bytes(b"half of it")
+    work.mkdir()
+    (work / "checkpoint.pt").write_bytes(b"half of it")
     with pytest.raises(ValueError, match=r"checkpoint\.pt: not a readable checkpoint"):
         reconstruct(read_capture(room), out, CONFIG)
+    resumed = {file.name: file.read_bytes() for file in out.iterdir()}
     reconstruct(read_capture(room), out, CONFIG, restart=True)
-    assert_same_scene(tmp_path, room, out)
-    assert not file.exists()
+    assert not work.exists()
+    reconstruct(read_capture(room), whole, CONFIG)
+    for name in ("gaussians.ply", "scene.yaml", "esdf.npz"):
+        assert (whole / name).read_bytes() == (out / name).read_bytes() == resumed[name]
 
 
-def test_a_full_disk_is_one_message_and_leaves_the_last_checkpoint(tmp_path, room):
+def test_full_disk_leaves_no_half_checkpoint(tmp_path, room):
     out = tmp_path / "scene"
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
@@ -134,3 +103,15 @@ def test_a_full_disk_is_one_message_and_leaves_the_last_checkpoint(tmp_path, roo
         signal.signal(signal.SIGXFSZ, handler)
     assert not out.exists()
     assert list((tmp_path / ".scene.partial").iterdir()) == []
+
+
+def test_tensorboard_reads_logged_metrics(tmp_path):
+    with event_log("") as log:
+        log(1, {"psnr_db": 30.0})
+    accumulator = pytest.importorskip(
+        "tensorboard.backend.event_processing.event_accumulator", reason="no tensorboard"
+    )
+    with event_log(str(tmp_path / "events")) as log:
+        log(500, {"psnr_db": 30.0})
+    events = accumulator.EventAccumulator(str(tmp_path / "events")).Reload()
+    assert [(e.step, e.value) for e in events.Scalars("psnr_db")] == [(500, 30.0)]

@@ -1,5 +1,3 @@
-"""The distance field of a reconstruction."""
-
 import numpy as np
 from pydrake.math import RigidTransform
 
@@ -11,6 +9,7 @@ from splatpilot.training.reconstruction.distance_field import (
     DepthSource,
     FieldGrid,
     add_sky,
+    captured_depth,
     choose_grid,
     fuse,
     render_depth,
@@ -20,61 +19,57 @@ from splatpilot.training.reconstruction.views import ShrunkFrames
 K = np.array([[40.0, 0, 40], [0, 40, 30], [0, 0, 1]])
 
 
-def test_space_before_the_sky_is_free_only_where_a_fitted_frame_measured_it():
-    measured = np.full((60, 80), np.inf, dtype=np.float32)
-    measured[:, 40:] = 0.0
-    capture = Capture(
-        name="sky",
+GRID = FieldGrid(np.array([-1.0, -1.0, 0.5]), np.array([1.0, 1.0, 2.5]), 0.1, 8.0)
+
+
+def make_capture(depth: np.ndarray, valid: np.ndarray) -> Capture:
+    return Capture(
+        name="half",
         source="a test",
         K=K,
         width=80,
         height=60,
         X_WCs=[RigidTransform()] * 2,
         load_image=lambda i: np.zeros((60, 80, 3), np.uint8),
-        load_depth=lambda i: measured,
+        load_depth=lambda i: depth,
+        load_valid=lambda i: valid,
     )
+
+
+def assert_right_half_is_unknown(source: DepthSource) -> None:
+    states = fuse(source, GRID).query([[-0.4, 0.4, 1.5], [0.4, 0.4, 1.5]]).state
+    np.testing.assert_array_equal(states, [FieldState.FREE, FieldState.UNKNOWN])
+
+
+def test_space_before_the_sky_is_free_only_if_a_fitted_frame_measured_it():
+    measured = np.full((60, 80), np.inf, dtype=np.float32)
+    measured[:, 40:] = 0.0
+    capture = make_capture(measured, np.ones((60, 80), bool))
     rendered = np.zeros((30, 40), dtype=np.float32)
     rendered[:15] = 2.0
-    half = np.diag([0.5, 0.5, 1.0]) @ K
-    source = DepthSource(lambda i: rendered, half, capture.X_WCs)
+    source = DepthSource(lambda i: rendered, np.diag([0.5, 0.5, 1.0]) @ K, capture.X_WCs)
     sky = add_sky(source, ShrunkFrames(capture, [1], 2))
     np.testing.assert_array_equal(sky.load(0), rendered)
     expected = rendered.copy()
     expected[15:, :20] = np.inf
     np.testing.assert_array_equal(sky.load(1), expected)
-    grid = FieldGrid(np.array([-1.0, -1.0, 0.5]), np.array([1.0, 1.0, 2.5]), 0.1, 8.0)
-    states = fuse(sky, grid).query([[-0.4, 0.4, 1.5], [0.4, 0.4, 1.5]]).state
-    np.testing.assert_array_equal(states, [FieldState.FREE, FieldState.UNKNOWN])
+    assert_right_half_is_unknown(sky)
 
 
 def test_masked_pixels_leave_space_unknown():
     valid = np.ones((60, 80), bool)
     valid[:, 40:] = False
-    capture = Capture(
-        name="half",
-        source="a test",
-        K=K,
-        width=80,
-        height=60,
-        X_WCs=[RigidTransform()],
-        load_image=lambda i: np.zeros((60, 80, 3), np.uint8),
-        load_depth=lambda i: np.full((60, 80), 2.0, np.float32),
-        load_valid=lambda i: valid,
-    )
-    measured = DepthSource(capture.registered_depth, K, capture.X_WCs)
-    points = np.stack(np.meshgrid(np.linspace(-3, 3, 61), np.linspace(-3, 3, 61)), axis=-1)
+    capture = make_capture(np.full((60, 80), 2.0, np.float32), valid)
+    x, y = (g.ravel() for g in np.meshgrid(*[np.linspace(-3, 3, 61)] * 2))
     wall = GaussianScene.from_colors(
-        np.dstack([points, np.full((61, 61), 2.0)]).reshape(-1, 3),
-        np.tile([1.0, 0, 0, 0], (61**2, 1)),
-        np.tile([0.1, 0.1, 1e-3], (61**2, 1)),
-        np.full(61**2, 0.99),
-        np.zeros((61**2, 3)),
+        np.column_stack([x, y, np.full(len(x), 2.0)]),
+        np.tile([1.0, 0, 0, 0], (len(x), 1)),
+        np.tile([0.1, 0.1, 1e-3], (len(x), 1)),
+        np.full(len(x), 0.99),
+        np.zeros((len(x), 3)),
     )
-    rendered = render_depth(capture, 2, wall, "3dgs", 1)
-    grid = FieldGrid(np.array([-1.0, -1.0, 0.5]), np.array([1.0, 1.0, 2.5]), 0.1, 8.0)
-    for source in (measured, rendered):
-        states = fuse(source, grid).query([[-0.4, 0.4, 1.5], [0.4, 0.4, 1.5]]).state
-        np.testing.assert_array_equal(states, [FieldState.FREE, FieldState.UNKNOWN])
+    assert_right_half_is_unknown(captured_depth(capture, [0]))
+    assert_right_half_is_unknown(render_depth(capture, 2, wall, "3dgs", 1))
 
 
 def _wall(depth: float) -> DepthSource:
@@ -84,27 +79,18 @@ def _wall(depth: float) -> DepthSource:
     return DepthSource(lambda i: image, K, [RigidTransform()] * 3)
 
 
-def test_rooms_have_the_grid_of_rooms():
-    grid = choose_grid(_wall(3.0), True, ReconstructConfig())
-    assert (grid.voxel_size, grid.max_range) == (0.05, 8.0)
+def test_grid_follows_the_config_or_the_size_of_the_scene():
+    room = choose_grid(_wall(3.0), True, ReconstructConfig())
+    assert (room.voxel_size, room.max_range) == (0.05, 8.0)
+    large = choose_grid(_wall(40.0), True, ReconstructConfig())
+    assert large.max_range == 60.0 and large.upper_W[2] >= 40.0
+    voxels = np.prod((large.upper_W - large.lower_W) / large.voxel_size)
+    assert large.voxel_size > 0.05 and abs(voxels - 20e6) < 0.01 * 20e6
+    given = choose_grid(_wall(40.0), True, ReconstructConfig(voxel_size=0.1, max_range=8.0))
+    assert (given.voxel_size, given.max_range) == (0.1, 8.0) and given.upper_W[2] < 9.0
 
 
-def test_large_places_are_seen_as_a_whole_in_few_voxels():
-    grid = choose_grid(_wall(40.0), True, ReconstructConfig())
-    assert grid.max_range == 60.0
-    assert grid.upper_W[2] >= 40.0
-    voxels = np.prod((grid.upper_W - grid.lower_W) / grid.voxel_size)
-    assert grid.voxel_size > 0.05 and abs(voxels - 20e6) < 0.01 * 20e6
-
-
-def test_what_is_given_is_taken():
-    config = ReconstructConfig(voxel_size=0.1, max_range=8.0)
-    grid = choose_grid(_wall(40.0), True, config)
-    assert (grid.voxel_size, grid.max_range) == (0.1, 8.0)
-    assert grid.upper_W[2] < 9.0
-
-
-def test_the_grid_of_a_place_without_scale_does_not_change_with_its_unit():
+def test_grid_without_scale_is_relative_to_the_median_depth():
     small, large = (choose_grid(_wall(depth), False, ReconstructConfig()) for depth in (3.0, 300.0))
     np.testing.assert_allclose(large.max_range, 100 * small.max_range)
     np.testing.assert_allclose(small.max_range, 8.0 * 3.0 / 2.0)

@@ -3,8 +3,6 @@ import math
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from pydrake.math import RigidTransform, RollPitchYaw
 from random_scenes import normal_tensor
 from scipy.ndimage import correlate1d
@@ -13,10 +11,8 @@ from splatpilot import _native
 from splatpilot.training.reconstruction.losses import (
     depth_edge_weights,
     log_depth_loss,
-    log_depth_loss_torch,
     outline_loss,
     photometric_loss,
-    photometric_loss_torch,
     surface_loss,
 )
 
@@ -74,7 +70,7 @@ def ssim_by_scipy(x: np.ndarray, y: np.ndarray) -> float:
     return float(np.mean(luminance * structure))
 
 
-SHAPES = [(1, 1, 1), (1, 40, 3), (40, 1, 3), (5, 7, 1), (11, 11, 4), (17, 16, 1), (3, 2, 19, 23, 3)]
+SHAPES = [(1, 1, 1), (1, 40, 3), (40, 1, 3), (5, 7, 1), (13, 33, 2), (11, 11, 4), (3, 2, 19, 23, 3)]
 
 
 @pytest.mark.parametrize("simd", _native.simd_levels())
@@ -85,7 +81,7 @@ def test_photometric_agrees_with_autograd_in_float64(shape, weight, simd, monkey
     x, y = image_pair(shape)
     value, gradient = value_and_gradient(photometric_loss, x, y, weight)
     expected, expected_gradient = value_and_gradient(
-        photometric_loss_torch, x.double(), y.double(), weight
+        photometric_loss, x.double(), y.double(), weight
     )
     assert value == pytest.approx(expected, rel=1e-5)
     error = (gradient - expected_gradient).abs().max()
@@ -107,35 +103,6 @@ def test_equal_images_have_no_loss_and_no_gradient():
     assert value == 0.0 and not gradient.any()
 
 
-def test_constant_images():
-    a, b = 0.6, 0.5
-    x, y = torch.full((24, 24, 1), a), torch.full((24, 24, 1), b)
-    value, gradient = value_and_gradient(photometric_loss, x, y, 0.0)
-    assert value == pytest.approx(0.1, rel=1e-5)
-    torch.testing.assert_close(gradient, torch.full_like(x, 1 / x.numel()))
-    # The sum of the gradients is the derivative for moving all pixels together.
-    moved = photometric_loss(x.double() + 1e-6, y.double(), 1.0)
-    still = photometric_loss(x.double() - 1e-6, y.double(), 1.0)
-    _, gradient = value_and_gradient(photometric_loss, x, y, 1.0)
-    assert gradient.sum().item() == pytest.approx((moved - still).item() / 2e-6, rel=1e-3)
-    luminance = (2 * a * b + 1e-4) / (a * a + b * b + 1e-4)
-    large = torch.full((200, 200, 1), a), torch.full((200, 200, 1), b)
-    assert photometric_loss(*large, 1.0).item() == pytest.approx(1 - luminance, rel=0.1)
-
-
-@pytest.mark.parametrize("loss", ["photometric", "depth"])
-def test_gradient_is_that_of_finite_differences(loss):
-    if loss == "photometric":
-        x, y = image_pair((6, 7, 2))
-        y = y.double()
-        x = (x.double() + 0.003).requires_grad_()  # nowhere equal: the L1 has a kink there
-        assert torch.autograd.gradcheck(lambda x: photometric_loss(x, y, 0.3), x, fast_mode=True)
-    else:
-        x, d = depth_pair((6, 7))
-        x = x.double().requires_grad_()
-        assert torch.autograd.gradcheck(lambda x: log_depth_loss(x, d.double()), x)
-
-
 @pytest.mark.parametrize("simd", _native.simd_levels())
 @pytest.mark.parametrize("shape", [(1,), (15,), (16,), (2, 31, 33)])
 @pytest.mark.parametrize("weighted", [False, True])
@@ -146,9 +113,7 @@ def test_log_depth_agrees_with_autograd_in_float64(shape, weighted, simd, monkey
     w = torch.rand(shape, generator=torch.Generator().manual_seed(1)) if weighted else None
     value, gradient = value_and_gradient(log_depth_loss, x, d, w)
     w = None if w is None else w.double()
-    expected, expected_gradient = value_and_gradient(
-        log_depth_loss_torch, x.double(), d.double(), w, 1e-3, 150.0
-    )
+    expected, expected_gradient = value_and_gradient(log_depth_loss, x.double(), d.double(), w)
     assert value == pytest.approx(expected, rel=1e-5)
     torch.testing.assert_close(gradient.double(), expected_gradient, rtol=1e-5, atol=1e-12)
     unknown = ~((d > 1e-3) & (d < 150))
@@ -168,15 +133,11 @@ def test_log_depth_of_a_constant_factor():
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_depth_below_epsilon_counts_as_epsilon(dtype):
+def test_depth_outside_the_range(dtype):
     rendered, depth = torch.tensor([0.0, 2.0], dtype=dtype), torch.tensor([1.0, 2.0], dtype=dtype)
-    value, gradient = value_and_gradient(log_depth_loss, rendered, depth)
+    value, gradient = value_and_gradient(log_depth_loss, rendered, depth)  # 0 counts as epsilon
     assert value == pytest.approx(math.log(1e3) / 2, rel=1e-6)
     assert gradient.tolist() == [0.0, 0.0]
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_nothing_to_compare_costs_nothing(dtype):
     depth = torch.tensor([math.nan, 0.0, -1.0, math.inf, 150.0, 1e-3], dtype=dtype)
     rendered = torch.tensor([1.0, math.nan, 2.0, math.inf, 3.0, 0.0], dtype=dtype)
     value, gradient = value_and_gradient(log_depth_loss, rendered, depth)
@@ -184,37 +145,22 @@ def test_nothing_to_compare_costs_nothing(dtype):
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("mistake", [math.nan, math.inf])
-def test_mistakes_in_a_render_are_not_hidden(dtype, mistake):
+@pytest.mark.parametrize("invalid", [math.nan, math.inf])
+def test_invalid_values_of_a_render_are_not_hidden(dtype, invalid):
     rendered, depth = torch.ones(20, dtype=dtype), torch.ones(20, dtype=dtype)
-    rendered[3] = mistake
+    rendered[3] = invalid
     assert math.isnan(log_depth_loss(rendered, depth).item())
     x, y = (t.to(dtype) for t in image_pair((20, 20, 3)))
-    x[3, 4, 1] = mistake
+    x[3, 4, 1] = invalid
     assert math.isnan(photometric_loss(x, y).item())
-
-
-@settings(max_examples=40)
-@given(
-    shape=st.tuples(st.integers(1, 14), st.integers(1, 40), st.integers(1, 5)),
-    seed=st.integers(0, 999),
-)
-def test_any_size(shape, seed):
-    x, y = image_pair(shape, seed)
-    first, second = (value_and_gradient(photometric_loss, x, y, 0.5) for _ in range(2))
-    assert first[0] == second[0] and torch.equal(first[1], second[1])
-    _, expected = value_and_gradient(photometric_loss_torch, x.double(), y.double(), 0.5)
-    assert (first[1] - expected).abs().max() <= 1e-5 * expected.abs().max()
 
 
 def test_number_of_threads_changes_nothing():
     x, y = image_pair((48, 64, 3))
-    results = []
-    for count in (1, 2, 4):
-        torch.set_num_threads(count)
-        results.append(value_and_gradient(photometric_loss, x, y))
-    for value, gradient in results[1:]:
-        assert value == results[0][0] and torch.equal(gradient, results[0][1])
+    value, gradient = value_and_gradient(photometric_loss, x, y)
+    torch.set_num_threads(2)
+    other, other_gradient = value_and_gradient(photometric_loss, x, y)
+    assert value == other and torch.equal(gradient, other_gradient)
 
 
 def test_layout_in_memory_does_not_matter():
@@ -222,44 +168,32 @@ def test_layout_in_memory_does_not_matter():
     planar = x.permute(2, 0, 1).contiguous().permute(1, 2, 0)
     value, gradient = value_and_gradient(photometric_loss, x, y)
     other = value_and_gradient(
-        lambda t, y: photometric_loss(t.permute(1, 2, 0), y), planar.permute(2, 0, 1), y
+        lambda t, y: 0.5 * photometric_loss(t.permute(1, 2, 0), y), planar.permute(2, 0, 1), y
     )
-    assert value == other[0] and torch.equal(gradient, other[1].permute(1, 2, 0))
+    assert 0.5 * value == other[0]
+    assert torch.equal(0.5 * gradient, other[1].permute(1, 2, 0))
     image = image_pair((9, 12, 4))[0].clamp(0.1, 0.9).requires_grad_()
     log_depth_loss(image[..., 3], torch.ones(9, 12)).backward()
     assert image.grad is not None
     assert image.grad[..., 3].all() and not image.grad[..., :3].any()
 
 
-def test_gradient_is_scaled_by_what_follows():
-    x, y = image_pair((9, 12, 3))
-    _, whole = value_and_gradient(photometric_loss, x, y)
-    _, half = value_and_gradient(lambda *a: 0.5 * photometric_loss(*a), x, y)
-    torch.testing.assert_close(half, 0.5 * whole)
-
-
-def test_slanted_planes_have_no_edges():
+def test_depth_edges():
     v, u = torch.meshgrid(torch.arange(30.0), torch.arange(40.0), indexing="ij")
-    plane = 1 / (0.002 + 0.01 * v + 0.001 * u)  # 2.9 m to 150 m and beyond, as a floor
-    assert torch.equal(depth_edge_weights(plane, far=1e6), torch.ones(30, 40))
-
-
-def test_thin_structures_weigh_more():
-    depth = torch.full((2, 20, 30), math.inf)
-    depth[0, :, 12] = 5.0
-    depth[1, 10, 12] = math.nan
-    weights = depth_edge_weights(depth, radius=2, gain=4.0)
+    floor = 1 / (0.002 + 0.01 * v + 0.001 * u)  # 2.9 m to 150 m and beyond
+    assert torch.equal(depth_edge_weights(floor, far=1e6), torch.ones(30, 40))
+    for factor, edge in ((1.05, False), (1.25, True)):
+        step = torch.full((10, 20), 4.0)
+        step[:, 10:] *= factor
+        assert bool((depth_edge_weights(step, jump=0.1) > 1).any()) == edge
+    thin = torch.full((2, 20, 30), math.inf)
+    thin[0, :, 12] = 5.0
+    thin[1, 10, 12] = math.nan
+    weights = depth_edge_weights(thin, radius=2, gain=4.0)
     columns = torch.arange(30)
     expected = torch.where((columns >= 9) & (columns <= 15), 5.0, 1.0).expand(20, 30)
     torch.testing.assert_close(weights[0], expected)
     assert torch.equal(weights[1], torch.ones(20, 30))
-
-
-@pytest.mark.parametrize("factor, edge", [(1.05, False), (1.25, True)])
-def test_jump_is_the_least_step(factor, edge):
-    depth = torch.full((10, 20), 4.0)
-    depth[:, 10:] *= factor
-    assert bool((depth_edge_weights(depth, jump=0.1) > 1).any()) == edge
 
 
 IMAGE = torch.full((4, 5, 3), 0.5)
@@ -282,16 +216,15 @@ IMAGE = torch.full((4, 5, 3), 0.5)
         (lambda: depth_edge_weights(IMAGE, radius=-1), "radius.* must be .* got 0.1, -1"),
     ],
 )
-def test_mistakes_are_named(call, message):
+def test_invalid_arguments(call, message):
     with pytest.raises(ValueError, match=message):
         call()
 
 
 HEIGHT, WIDTH, F = 40, 60, 20.0
 K = torch.tensor([[F, 0, WIDTH / 2], [0, F, HEIGHT / 2], [0, 0, 1]])
-# The camera stands half a meter behind the origin.
 VIEWMAT = torch.eye(4)
-VIEWMAT[2, 3] = 0.5
+VIEWMAT[2, 3] = 0.5  # half a meter behind the origin
 UPRIGHT = torch.tensor([1.0, 0.0, 0.0, 0.0])
 
 
@@ -315,49 +248,34 @@ def test_gaussians_are_drawn_to_the_surface_they_belong_to():
     np.testing.assert_allclose(means.grad, expected, rtol=1e-4)
 
 
-def test_thick_gaussians_flatten_and_those_askew_turn():
+def test_thick_gaussians_flatten_and_tilted_ones_rotate():
     n = 2000
     depth = torch.full((HEIGHT, WIDTH), 2.0)
     means = torch.tensor([0.0, 0.0, 1.5]).expand(n, 3)
 
-    def thick(scales):
-        return loss_of(means, UPRIGHT.expand(n, 4), scales.expand(n, 3), depth)
-
     scales = torch.tensor([0.03, 0.03, 0.02], requires_grad=True)
-    thick(scales).backward()
+    loss_of(means, UPRIGHT.expand(n, 4), scales.expand(n, 3), depth).backward()
     assert scales.grad is not None
     across = np.sqrt(2 / np.pi) / 2.0  # of |log z - log 2| about its mean, by the deviation of z
     np.testing.assert_allclose(scales.grad, [0.0, 0.0, across], atol=0.02)
 
-    def tilted(angle):
-        quats = torch.stack([torch.cos(angle / 2), torch.sin(angle / 2), 0 * angle, 0 * angle])
-        return loss_of(
-            means, quats.expand(n, 4), torch.tensor([0.1, 0.1, 1e-4]).expand(n, 3), depth
-        )
-
     angle = torch.tensor(0.1, requires_grad=True)
-    tilted(angle).backward()
-    assert angle.grad is not None
-    step = 1e-3
-    slope = (tilted(angle.detach() + step) - tilted(angle.detach() - step)) / (2 * step)
-    assert angle.grad.item() == pytest.approx(slope.item(), rel=0.02)
-    assert slope > 0.02
+    quats = torch.stack([torch.cos(angle / 2), torch.sin(angle / 2), 0 * angle, 0 * angle])
+    flat = torch.tensor([0.1, 0.1, 1e-4]).expand(n, 3)
+    loss_of(means, quats.expand(n, 4), flat, depth).backward()
+    assert angle.grad is not None and angle.grad > 0.02
 
 
-def test_points_are_drawn_by_the_generator_alone():
+def test_points_depend_only_on_the_generator():
     depth = torch.full((HEIGHT, WIDTH), 2.0)
-    scene = torch.tensor([[0.0, 0.0, 1.51]]), UPRIGHT[None], torch.full((1, 3), 0.02), depth
-    assert loss_of(*scene, seed=1).item() == loss_of(*scene, seed=1).item()
-    assert loss_of(*scene, seed=1).item() != loss_of(*scene, seed=2).item()
-
-
-def test_without_true_depth_there_is_no_loss():
-    means = torch.ones((1, 3), requires_grad=True)
-    nothing = torch.zeros(HEIGHT, WIDTH)
-    loss = loss_of(means, UPRIGHT[None], torch.full((1, 3), 0.02), nothing)
-    loss.backward()
+    means = torch.tensor([[0.0, 0.0, 1.51]], requires_grad=True)
+    scene = means, UPRIGHT[None], torch.full((1, 3), 0.02)
+    a, b, c = (loss_of(*scene, depth, seed).item() for seed in (1, 1, 2))
+    assert a == b != c
+    unknown = loss_of(*scene, torch.zeros(HEIGHT, WIDTH))
+    unknown.backward()
     assert means.grad is not None
-    assert loss.item() == 0 and not means.grad.any()
+    assert unknown.item() == 0 and not means.grad.any()
 
 
 def test_outlines_are_those_of_what_is_solid():

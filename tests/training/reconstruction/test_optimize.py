@@ -13,13 +13,13 @@ from splatpilot.training.captures.capture_registry import read_capture
 from splatpilot.training.reconstruction.checkpoint import Checkpoint
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.initialize import (
-    Detail,
     gaussians_from_depth,
     gaussians_from_points,
     random_points,
 )
 from splatpilot.training.reconstruction.losses import photometric_loss
-from splatpilot.training.reconstruction.optimize import DefaultStrategy, Objective, Optimization
+from splatpilot.training.reconstruction.metrics import HeldOutMetrics
+from splatpilot.training.reconstruction.optimize import DefaultStrategy, Optimization, view_loss
 from splatpilot.training.reconstruction.parameters import SplatParameters
 from splatpilot.training.reconstruction.photometry import Photometry
 from splatpilot.training.reconstruction.reconstruct import reconstruct
@@ -36,7 +36,7 @@ CONFIG = ReconstructConfig(
 )
 
 
-# A walk in small steps, with the frames 0 and 6, which will be withheld, in the midst of it.
+# A walk in small steps, with the held-out frames 0 and 6 in the middle of it.
 POSES = [
     ((1.0 + 0.1 * i, 0.2 * np.sin(i), -1.2), -0.5 + 0.1 * i, -0.1)
     for i in (4, 0, 1, 2, 3, 5, 7, 6, 8, 9, 10, 11)
@@ -48,16 +48,28 @@ def room(tmp_path, write_room):
     return write_room(tmp_path / "room", poses=POSES)
 
 
-@pytest.mark.parametrize("representation", ["3dgs", "2dgs"])
-def test_held_out_frames_come_out(tmp_path, room, representation):
-    # A surfel is blurred by no pixel, so more are needed.
-    count = {"3dgs": 3000, "2dgs": 8000}[representation]
-    config = replace(CONFIG, representation=representation, initial_gaussians=count, iterations=300)
-    start = reconstruct(read_capture(room), tmp_path / "start", replace(config, iterations=1))
-    summary = reconstruct(read_capture(room), tmp_path / "scene", config)
-    assert start.held_out is not None and summary.held_out is not None
-    assert summary.held_out.means()["psnr_db"] > max(30, start.held_out.means()["psnr_db"] + 2)
-    assert summary.held_out.means()["depth_mae_m"] < 0.1
+def fit(capture, out, **changes) -> HeldOutMetrics:
+    """Reconstructs and returns the metrics of the held-out frames."""
+    held_out = reconstruct(capture, out, replace(CONFIG, **changes)).held_out
+    assert held_out is not None
+    return held_out
+
+
+@pytest.mark.parametrize(("representation", "count"), [("3dgs", 3000), ("2dgs", 8000)])
+def test_held_out_frames_are_reconstructed(tmp_path, room, representation, count):
+    # Surfels have no blur of pixels, so more are required.
+    changes = {"representation": representation, "initial_gaussians": count}
+    start = fit(read_capture(room), tmp_path / "start", **changes, iterations=1).means()
+    found = fit(read_capture(room), tmp_path / "scene", **changes, iterations=250)
+    assert found.means()["psnr_db"] > max(30, start["psnr_db"] + 2)
+    assert found.means()["depth_mae_m"] < 0.1
+    if representation == "3dgs":
+        for view in found.views:
+            assert view.hole_fraction is not None and view.hole_fraction < 0.005
+        baked = read_scene(tmp_path / "scene").baked
+        for frame in read_capture(room).frames():
+            alpha = baked.render(frame.K, 64, 48, frame.X_WC).alpha
+            assert np.median(alpha) > 0.97 and np.mean(alpha < 0.5) < 0.02
     metadata = read_scene_metadata(tmp_path / "scene")
     assert (metadata.held_out, metadata.representation) == ([0, 6], representation)
     assert (metadata.capture, metadata.image_width) == (str(room), 0)
@@ -65,7 +77,7 @@ def test_held_out_frames_come_out(tmp_path, room, representation):
     assert (scales[:, 2] < 2e-6).all() == (representation == "2dgs")
 
 
-def test_same_seed_same_scene_whatever_the_threads(tmp_path, room):
+def test_scene_depends_only_on_the_seed(tmp_path, room):
     for name, threads in (("a", 1), ("b", 2)):
         config = replace(CONFIG, iterations=20, threads=threads)
         reconstruct(read_capture(room), tmp_path / name, config)
@@ -73,31 +85,18 @@ def test_same_seed_same_scene_whatever_the_threads(tmp_path, room):
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
 
 
-def test_what_is_solid_is_opaque(tmp_path, room):
-    summary = reconstruct(read_capture(room), tmp_path / "scene", replace(CONFIG, iterations=300))
-    assert summary.held_out is not None
-    for view in summary.held_out.views:
-        assert view.hole_fraction is not None and view.hole_fraction < 0.005
-    scene = read_scene(tmp_path / "scene")
-    for frame in read_capture(room).frames():
-        height, width = frame.depth.shape
-        alpha = scene.baked.render(frame.K, width, height, frame.X_WC).alpha
-        assert np.median(alpha) > 0.97 and np.mean(alpha < 0.5) < 0.02
+def test_depth_term_moves_gaussians_to_surfaces(tmp_path, room):
+    changes = {"initialization": "random", "surface_weight": 0.0, "iterations": 200}
+    errors = [
+        fit(read_capture(room), tmp_path / "scene", **changes, depth_weight=weight)
+        for weight in (0.0, 0.2)
+    ]
+    without, found = (metrics.means()["depth_mae_m"] for metrics in errors)
+    assert 0 < found < 0.5 * without
 
 
-def test_metric_depth_is_what_places_surfaces(tmp_path, room):
-    config = replace(CONFIG, initialization="random", initial_gaussians=3000, iterations=300)
-    errors = []
-    for weight in (0.0, 0.2):
-        weighted = replace(config, depth_weight=weight, surface_weight=0.0)
-        summary = reconstruct(read_capture(room), tmp_path / "scene", weighted)
-        assert summary.held_out is not None
-        errors.append(summary.held_out.means()["depth_mae_m"])
-    assert 0 < errors[1] < 0.5 * errors[0]
-
-
-def test_gaussians_are_added_where_depth_puts_none(tmp_path, room):
-    config = replace(CONFIG, initial_gaussians=300, iterations=80, refine_start=5, refine_every=10)
+def test_gaussians_are_added_only_without_depth(tmp_path, room):
+    config = replace(CONFIG, initial_gaussians=300, iterations=30, refine_start=5, refine_every=10)
 
     def count(**changes) -> int:
         return reconstruct(
@@ -106,16 +105,13 @@ def test_gaussians_are_added_where_depth_puts_none(tmp_path, room):
 
     assert count(initialization="random") > 300
     assert count(initialization="random", strategy="none") == 300
-    config = replace(config, initial_gaussians=3000)
     assert count() == count(strategy="none")
 
 
 def test_without_depth_from_points(tmp_path, write_room):
     factors = np.where(np.arange(12) % 3 == 1, 0.8, 1.0)
-    dim = write_room(
-        tmp_path / "dim", poses=POSES, brightness=lambda i, rho: np.full(1, factors[i])
-    )
-    capture = read_capture(dim)
+    brightness = {"brightness": lambda i, rho: np.full(1, factors[i])}
+    capture = read_capture(write_room(tmp_path / "dim", poses=POSES, **brightness))
     rows, columns = np.mgrid[2:48:4, 2:64:4]
     p_WQ, colors = [], []
     for frame in capture.frames():
@@ -124,29 +120,31 @@ def test_without_depth_from_points(tmp_path, write_room):
         colors.append(frame.image[rows, columns].reshape(-1, 3) / 255)
     points = SfmPoints(np.concatenate(p_WQ), np.concatenate(colors))
     capture = replace(capture, load_depth=no_depth, points=points)
-    summary = reconstruct(capture, tmp_path / "scene", replace(CONFIG, iterations=250))
-    assert summary.held_out is not None
-    assert list(summary.held_out.means()) == ["psnr_db"]
-    assert summary.held_out.means()["psnr_db"] > 32
+    found = fit(capture, tmp_path / "scene", iterations=250).means()
+    assert list(found) == ["psnr_db"] and found["psnr_db"] > 32
     gains = np.array(read_scene_metadata(tmp_path / "scene").gains)
     np.testing.assert_allclose(gains / gains[0], factors / factors[0], rtol=0.03)
 
 
-def test_gains_that_are_fitted_leave_the_images_as_they_were(tmp_path, room):
+def optimization(out, views, initial, fit_gains=False, **changes) -> Optimization:
+    config = replace(CONFIG, **{"iterations": 200, "strategy": "none"} | changes)
+    checkpoint, black = Checkpoint(out, config, views), (0.0, 0.0, 0.0)
+    return Optimization(
+        config, views, views, black, lambda _: initial, checkpoint, fit_gains=fit_gains
+    )
+
+
+def test_fitted_gains_leave_the_views_unchanged(tmp_path, room):
     frames = list(read_capture(room).frames())
     views = ReconstructionViews(frames, Photometry(np.ones(len(frames)), 0.0))
-    config = replace(CONFIG, iterations=10, strategy="none", depth_weight=0.0)
     points = gaussians_from_points(*random_points(frames, 500, 0.5, 4.0, seed=0))
-    checkpoint = Checkpoint(tmp_path / "scene", config, views)
-    optimization = Optimization(
-        config, views, None, (0.0, 0.0, 0.0), lambda: points, checkpoint, fit_gains=True
-    )
-    optimization.run()
+    run = optimization(tmp_path / "scene", views, points, True, iterations=10, depth_weight=0.0)
+    run.run()
     assert (views.gains == 1).all()
-    assert np.ptp(optimization.gains.numpy()) > 1e-3
+    assert np.ptp(run.gains.numpy()) > 1e-3
 
 
-def test_what_stands_before_the_sky_is_kept_to_its_outline(tmp_path):
+def test_outline_weight_closes_holes_at_outlines(tmp_path):
     K = np.array([[40.0, 0, 32], [0, 40.0, 24], [0, 0, 1]])
     v, u = np.mgrid[:48, :64] + 0.5
     frames = []
@@ -155,23 +153,21 @@ def test_what_stands_before_the_sky_is_kept_to_its_outline(tmp_path):
         image = np.where(on_plate[..., None], 150, 200).repeat(3, axis=2).astype(np.uint8)
         depth = np.where(on_plate, 2.0, np.inf).astype(np.float32)
         frames.append(CaptureFrame(image, depth, RigidTransform([x, 0, 0]), K))
-    views = ReconstructionViews(frames, Photometry(np.ones(5), 0.0))
-    cells = {"contrast": 1.0, "max_cell": 4, "max_extent": 0.2}
-    detail = Detail(max_gaussians=300, optimized=True, **cells)
-    start = gaussians_from_depth(frames, Photometry(np.ones(5), 0.0), detail)
+    one = Photometry(np.ones(5), 0.0)
+    views = ReconstructionViews(frames, one)
+    cells = {"max_cell": 4, "max_extent": 0.2}
+    start = gaussians_from_depth(frames, one, 300, 1.0, optimized=True, **cells)
     holes = []
     for weight in (0.0, 1.0):
-        config = replace(CONFIG, iterations=200, strategy="none", outline_weight=weight)
-        checkpoint = Checkpoint(tmp_path / f"{weight}", config, views)
-        run = Optimization(config, views, views, (0.0, 0.0, 0.0), lambda: start, checkpoint)
+        run = optimization(tmp_path / f"{weight}", views, start, outline_weight=weight)
         run.run()
-        measured = run.measure()
-        assert measured is not None
-        holes.append(measured.means()["hole_fraction"])
+        metrics = run.measure()
+        assert metrics is not None
+        holes.append(metrics.means()["hole_fraction"])
     assert holes[1] < holes[0]
 
 
-def test_unknown_scale_is_never_flown_in(tmp_path, room):
+def test_scene_of_unknown_scale_cannot_be_flown_in(tmp_path, room):
     capture = replace(read_capture(room), metric=False)
     summary = reconstruct(capture, tmp_path / "scene", replace(CONFIG, iterations=5))
     assert "cannot be flown in: its scale is unknown" in str(summary)
@@ -180,11 +176,9 @@ def test_unknown_scale_is_never_flown_in(tmp_path, room):
         read_scene(tmp_path / "scene")
 
 
-def test_what_a_capture_lacks_is_said(tmp_path, room):
-    with pytest.raises(ValueError, match="initialization is 'points', but room has none; choose"):
-        reconstruct(
-            read_capture(room), tmp_path / "scene", replace(CONFIG, initialization="points")
-        )
+def test_initialization_that_the_capture_does_not_have(tmp_path, room):
+    with pytest.raises(ValueError, match="must be depth or random for room, got points"):
+        fit(read_capture(room), tmp_path / "scene", initialization="points")
     assert not (tmp_path / "scene").exists()
 
 
@@ -233,10 +227,9 @@ def test_only_the_strongest_grow_up_to_the_limit():
     splats = three_gaussians(scales=(0.005, 0.005, 0.005))
     strategy = strategy_for(splats, max_gaussians=4)
     strategy.gradients, strategy.counts = torch.tensor([1.0, 3.0, 2.0]), torch.ones(3)
-    strongest = splats["means"][1].detach().clone()
     strategy.refine(1, splats)
-    assert len(splats) == 4
-    assert (splats["means"] == strongest).all(dim=1).sum() == 2
+    counts = (splats["means"][:, None] == three_gaussians()["means"]).all(dim=2).sum(dim=0)
+    assert counts.tolist() == [1, 2, 1]
 
 
 def test_faint_and_huge_gaussians_are_removed_and_opacities_reset():
@@ -251,7 +244,7 @@ def test_faint_and_huge_gaussians_are_removed_and_opacities_reset():
 
 
 @pytest.mark.parametrize("representation", ["3dgs", "2dgs"])
-def test_gradients_are_those_of_places_on_the_image(representation):
+def test_gradients_are_by_position_on_the_image(representation):
     splats = three_gaussians(scales=(0.1, 0.1, 0.1))
     strategy = strategy_for(splats, representation=representation)
     torch.manual_seed(0)
@@ -284,37 +277,26 @@ LOSS_K = np.array([[30.0, 0, 16], [0, 30.0, 12], [0, 0, 1]])
 def loss_and_gradient(color: np.ndarray, image: np.ndarray, valid: np.ndarray):
     """The loss of a rendered color (H, W, 3) against an image, and its gradient."""
     depth = np.where(valid, np.float32(2), np.float32(0))
-    views = ReconstructionViews(
-        [CaptureFrame(image, depth, RigidTransform(), LOSS_K, valid)], Photometry(np.ones(1), 0.0)
-    )
+    frame = CaptureFrame(image, depth, RigidTransform(), LOSS_K, valid)
+    views = ReconstructionViews([frame], Photometry(np.ones(1), 0.0))
     rendered = torch.tensor(color, dtype=torch.float32, requires_grad=True)
     ones = torch.ones(HEIGHT, WIDTH)
-    objective = Objective(ReconstructConfig(surface_weight=0, depth_weight=0), views, None)
-    loss = objective.loss(
-        Rendering(rendered, 2 * ones, ones, {}),
-        (ones,) * 5,
-        0,
-        torch.tensor(1.0),
-        0,
-        torch.zeros(1, 3),
-        outlines=False,
-    )
+    config = ReconstructConfig(surface_weight=0, depth_weight=0)
+    rendering = Rendering(rendered, 2 * ones, ones, {})
+    options = {"gain": torch.tensor(1.0), "background": torch.zeros(1, 3), "outlines": False}
+    loss = view_loss(config, views, 0, rendering, (ones,) * 5, step=0, **options)
     loss.backward()
     assert rendered.grad is not None
     return loss.item(), rendered.grad.numpy()
 
 
-@pytest.fixture
-def images():
-    """A rendered color and an image that differs from it everywhere."""
+def test_loss_is_photometric_over_valid_pixels():
     rng = np.random.default_rng(0)
     image = rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
-    return rng.uniform(size=(HEIGHT, WIDTH, 3)), image
-
-
-def test_masked_pixels_have_no_part_in_the_loss(images):
-    color, image = images
-    valid = np.ones((HEIGHT, WIDTH), bool)
+    color, valid = rng.uniform(size=(HEIGHT, WIDTH, 3)), np.ones((HEIGHT, WIDTH), bool)
+    loss, _ = loss_and_gradient(color, image, valid)
+    pair = torch.tensor(color, dtype=torch.float32), torch.tensor(image).float() / 255
+    assert loss == pytest.approx(photometric_loss(*pair).item(), rel=1e-6)
     valid[5:15, 8:20] = False
     blob = np.where(valid[..., None], image, np.uint8([255, 0, 0]))
     loss, gradient = loss_and_gradient(color, image, valid)
@@ -322,12 +304,3 @@ def test_masked_pixels_have_no_part_in_the_loss(images):
     assert loss == other_loss
     np.testing.assert_array_equal(gradient, other_gradient)
     assert not gradient[~valid].any() and gradient[valid].all()
-
-
-def test_without_a_mask_the_loss_is_photometric(images):
-    color, image = images
-    loss, _ = loss_and_gradient(color, image, np.ones((HEIGHT, WIDTH), bool))
-    expected = photometric_loss(
-        torch.tensor(color, dtype=torch.float32), torch.tensor(image).float() / 255
-    )
-    assert loss == pytest.approx(expected.item(), rel=1e-6)

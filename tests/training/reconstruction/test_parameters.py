@@ -8,7 +8,6 @@ from pydrake.math import RigidTransform
 from splatpilot.training.captures.capture import CaptureFrame
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.parameters import (
-    ScaleLimits,
     SplatParameters,
     learning_rates,
     scale_limits,
@@ -23,28 +22,24 @@ MEANS = torch.tensor([[0.0, 0.0, 4.0], [0.0, 0.0, 6.0], [9.0, 0.0, 4.0], [0.0, 0
 N = 45  # not a multiple of any register
 
 
-def test_published_rates_without_depth():
-    config = ReconstructConfig(initialization="points")
-    first, last = (learning_rates(config, 3.0, progress) for progress in (0.0, 1.0))
-    assert first["means"] == pytest.approx(3.0 * 1.6e-4)
+@pytest.mark.parametrize("start", ["points", "depth"])
+def test_learning_rates(start):
+    first, middle, last = (
+        learning_rates(ReconstructConfig(initialization=start), 3.0, progress)
+        for progress in (0.0, 0.5, 1.0)
+    )
+    published = {"means": 3.0 * 1.6e-4, "quats": 1e-3, "log_scales": 5e-3}
+    published |= {"logit_opacities": 5e-2, "sh_0": 2.5e-3, "sh_rest": 1.25e-4}
+    factor = 0.25 if start == "depth" else 1.0
+    assert first["means"] == pytest.approx(factor * published.pop("means"))
     assert last["means"] == pytest.approx(first["means"] / 100)
-    others = {name: rate for name, rate in first.items() if name != "means"}
-    assert others == {
-        "quats": 1e-3, "log_scales": 5e-3, "logit_opacities": 5e-2, "sh_0": 2.5e-3,
-        "sh_rest": 1.25e-4,
-    }  # fmt: skip
-    assert others.items() <= last.items()
-
-
-def test_rates_on_surfaces_are_fast_at_first_and_slow_at_last():
-    anywhere = learning_rates(ReconstructConfig(initialization="points"), 1.0, 0.0)
-    config = ReconstructConfig(initialization="depth")
-    first, middle, last = (learning_rates(config, 1.0, progress) for progress in (0.0, 0.5, 1.0))
-    assert first["means"] == pytest.approx(anywhere["means"] / 4)
-    for name in first.keys() - {"means"}:
-        assert first[name] >= anywhere[name]
-        assert middle[name] == pytest.approx(0.55 * first[name])
-        assert last[name] == pytest.approx(0.1 * first[name])
+    for name, rate in published.items():
+        if start == "points":
+            assert first[name] == last[name] == rate
+        else:  # fast at first and slow at last
+            assert first[name] >= rate
+            assert middle[name] == pytest.approx(0.55 * first[name])
+            assert last[name] == pytest.approx(0.1 * first[name])
 
 
 def shapes_and_gradients(dtype):
@@ -67,13 +62,12 @@ def test_native_shapes_agree_with_torch_in_float64():
         np.testing.assert_allclose(found, expected, rtol=2e-5, atol=2e-7)
 
 
-def test_smallest_scale_is_added_in_squares():
-    log_scales = torch.tensor([[-50.0, np.log(0.3), -np.inf]])
-    scales, opacities = splat_shapes(log_scales, torch.tensor([0.0]), torch.tensor([0.4]))
-    np.testing.assert_allclose(scales, [[0.4, 0.5, 0.4]], rtol=1e-6)
-    assert opacities.item() == 0.5
-    _, extreme = splat_shapes(torch.zeros(2, 3), torch.tensor([-200.0, 200.0]), torch.zeros(2))
-    np.testing.assert_allclose(extreme, [0.0, 1.0], atol=1e-30)
+def test_extreme_logits_and_scales():
+    log_scales = torch.tensor([[-50.0, np.log(0.3), -np.inf]]).expand(2, 3)
+    logits, smallest = torch.tensor([-200.0, 200.0]), torch.full((2,), 0.4)
+    scales, opacities = splat_shapes(log_scales, logits, smallest)
+    np.testing.assert_allclose(scales, [[0.4, 0.5, 0.4]] * 2, rtol=1e-6)
+    np.testing.assert_allclose(opacities, [0.0, 1.0], atol=1e-30)
 
 
 def views(wall: float) -> ReconstructionViews:
@@ -96,13 +90,13 @@ def views(wall: float) -> ReconstructionViews:
 )
 def test_closest_camera_that_sees_a_gaussian_limits_its_size(wall, depths):
     limits = scale_limits(MEANS, views(wall), bounded=True)
-    np.testing.assert_allclose(limits.smallest, PIXEL * np.array(depths), rtol=1e-5)
+    np.testing.assert_allclose(limits[0], PIXEL * np.array(depths), rtol=1e-5)
 
 
 def test_largest_scale_is_a_twentieth_of_the_distance():
-    bounded = scale_limits(MEANS, views(np.inf), bounded=True)
-    np.testing.assert_allclose(bounded.largest, [0.15, 0.25, 0.05 * 90**0.5, 0.15], rtol=1e-6)
-    assert scale_limits(MEANS, views(np.inf), bounded=False).largest.isinf().all()
+    _, largest = scale_limits(MEANS, views(np.inf), bounded=True)
+    np.testing.assert_allclose(largest, [0.15, 0.25, 0.05 * 90**0.5, 0.15], rtol=1e-6)
+    assert scale_limits(MEANS, views(np.inf), bounded=False)[1].isinf().all()
 
 
 def parameters(count: int, scale: float) -> dict[str, torch.Tensor]:
@@ -119,8 +113,7 @@ def test_scales_keep_their_limits():
     tensors = parameters(3, 3e-3)
     splats = SplatParameters(tensors)
     assert splats.scales.flatten().tolist() == pytest.approx([3e-3] * 9)
-    limits = ScaleLimits(torch.tensor([0.0, 4e-3, 0.0]), torch.tensor([torch.inf, 1.0, 2e-3]))
-    splats.limit_scales(limits)
+    splats.limit_scales([torch.tensor([0.0, 4e-3, 0.0]), torch.tensor([torch.inf, 1.0, 2e-3])])
     assert splats.scales[:, 0].tolist() == pytest.approx([3e-3, 5e-3, 2e-3])
     assert splats["log_scales"][2].exp().tolist() == pytest.approx([2e-3] * 3)
     again = SplatParameters(**splats.state())
@@ -132,7 +125,7 @@ def test_scales_keep_their_limits():
 def test_gaussians_at_their_largest_can_shrink_again():
     splats = SplatParameters(parameters(1, 0.5))
     rates = dict.fromkeys(splats.names, 0.1)
-    splats.limit_scales(ScaleLimits(torch.zeros(1), torch.tensor([0.2])))
+    splats.limit_scales([torch.zeros(1), torch.tensor([0.2])])
     for sign, expected in ((-1, 0.2), (-1, 0.2), (1, 0.19)):
         (sign * splats.scales.sum()).backward()
         splats.step(rates)

@@ -23,10 +23,6 @@ from splatpilot.training.reconstruction.reconstruct import reconstruct
 CONFIG = ReconstructConfig(iterations=0, voxel_size=0.1)
 
 
-def psnr(a: np.ndarray, b: np.ndarray) -> float:
-    return float(-10 * np.log10(np.mean((a - b) ** 2)))
-
-
 def image_digests(capture: Capture) -> set[str]:
     return part_digests(capture.load_image(i).tobytes() for i in range(len(capture)))
 
@@ -35,7 +31,7 @@ def test_room_end_to_end(tmp_path, write_room, room_in_W):
     room = write_room(tmp_path / "room", width=128, height=96)
     summary = reconstruct(read_capture(room), tmp_path / "scene", CONFIG)
     assert f"Gaussians          {summary.gaussians}\n" in str(summary)
-    size = " x ".join(f"{length:.3g}" for length in summary.upper_W - summary.lower_W)
+    size = " x ".join(f"{length:.3g}" for length in summary.field.upper_W - summary.field.lower_W)
     assert f"size               {size} m, from (" in str(summary)
     world = read_scene(tmp_path / "scene")
     metadata = read_scene_metadata(tmp_path / "scene")
@@ -58,59 +54,45 @@ def test_room_end_to_end(tmp_path, write_room, room_in_W):
     assert (np.minimum(ends - lower, upper - ends) > VEHICLE_RADIUS).all()
     assert (world.esdf.conservative().distance(ends) > VEHICLE_RADIUS).all()
 
-    # It looks like the room.
-    capture = read_tartanair_v1(room)
-    baked = world.baked
-    photometry = Photometry(np.array(metadata.gains), metadata.vignetting)
-    for i in range(len(capture)):
-        frame = capture.frame(i)
-        view = baked.render(frame.K, 128, 96, frame.X_WC, background=world.background)
-        assert psnr(view.color * photometry.factor(i, 96, 128)[..., None], frame.image / 255) > 28
-        assert np.median(np.abs(view.depth / frame.depth - 1)) < 0.04
-        assert view.alpha.mean() > 0.98
+    assert_renders_like(tmp_path / "scene", room, range(12), min_psnr=28, max_error=0.04)
 
 
-def test_same_capture_same_scene(tmp_path, write_room):
-    room = write_room(tmp_path / "room")
-    for name in ("a", "b"):
-        reconstruct(read_capture(room), tmp_path / name, CONFIG)
-    for file in ("gaussians.ply", "scene.yaml"):
-        assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
-
-
-def test_torch_computes_on_one_thread(tmp_path, write_room):
+@pytest.mark.parametrize("iterations", [0, 2])
+def test_images_are_read_once_on_one_thread(tmp_path, write_room, iterations):
     capture = read_capture(write_room(tmp_path / "room"))
-    threads, used = torch.get_num_threads(), set()
+    threads, read = torch.get_num_threads(), []
 
     def load_image(i: int) -> np.ndarray:
-        used.add(torch.get_num_threads())
+        read.append((i, torch.get_num_threads()))
         return capture.load_image(i)
 
     torch.set_num_threads(2)
     try:
-        reconstruct(replace(capture, load_image=load_image), tmp_path / "scene", CONFIG)
-        assert (used, torch.get_num_threads()) == ({1}, 2)
+        config = replace(CONFIG, iterations=iterations)
+        reconstruct(replace(capture, load_image=load_image), tmp_path / "scene", config)
+        assert torch.get_num_threads() == 2
     finally:
         torch.set_num_threads(threads)
+    assert sorted(read) == [(i, 1) for i in range(len(capture))]
 
 
-def test_number_of_gaussians_is_kept(tmp_path, write_room):
-    room = write_room(tmp_path / "room")
-    free = reconstruct(read_capture(room), tmp_path / "a", CONFIG).gaussians
-    limited = reconstruct(
-        read_capture(room), tmp_path / "b", replace(CONFIG, max_gaussians=free // 3)
-    ).gaussians
-    assert 0 < limited <= free // 3
-    with pytest.raises(ValueError, match="10 Gaussians are too few for 12 frames"):
-        reconstruct(read_capture(room), tmp_path / "c", replace(CONFIG, max_gaussians=10))
-    assert not (tmp_path / "c").exists()
+def test_number_of_gaussians_is_limited(tmp_path, write_room):
+    capture = read_capture(write_room(tmp_path / "room"))
+    free = reconstruct(capture, tmp_path / "a", CONFIG).gaussians
+    limit = replace(CONFIG, max_gaussians=free // 3)
+    assert 0 < reconstruct(capture, tmp_path / "b", limit).gaussians <= free // 3
+
+
+def remove_depth(room, indices) -> None:
+    files = sorted((room / "depth_left").iterdir())
+    for i in indices:
+        np.save(files[i], np.zeros_like(np.load(files[i])))
 
 
 @pytest.mark.parametrize("iterations", [0, 2])
 def test_a_capture_without_any_depth_leaves_nothing(tmp_path, write_room, iterations):
     room = write_room(tmp_path / "room")
-    for file in (room / "depth_left").iterdir():
-        np.save(file, np.zeros_like(np.load(file)))
+    remove_depth(room, range(12))
     config = replace(CONFIG, iterations=iterations)
     with pytest.raises(ValueError, match=r"no pixel of \d+ frames has a depth that a"):
         reconstruct(read_capture(room), tmp_path / "scene", config)
@@ -119,42 +101,22 @@ def test_a_capture_without_any_depth_leaves_nothing(tmp_path, write_room, iterat
 
 def test_frames_without_depth_are_named(tmp_path, write_room):
     room = write_room(tmp_path / "room")
-    files = sorted((room / "depth_left").iterdir())
-    for file in files[3:5]:
-        np.save(file, np.zeros_like(np.load(file)))
+    remove_depth(room, (3, 4))
     summary = reconstruct(read_capture(room), tmp_path / "scene", CONFIG)
     names = "000003_left.png, 000004_left.png"
     assert f"2 of 12 frames have no pixel with depth: {names}" in summary.warnings
-
-
-@pytest.mark.parametrize("iterations", [0, 2])
-def test_images_are_read_once(tmp_path, write_room, iterations):
-    capture = read_capture(write_room(tmp_path / "room"))
-    read: list[int] = []
-
-    def load_image(i: int) -> np.ndarray:
-        read.append(i)
-        return capture.load_image(i)
-
-    counted = replace(capture, load_image=load_image)
-    reconstruct(counted, tmp_path / "scene", replace(CONFIG, iterations=iterations))
-    assert sorted(read) == list(range(len(capture)))
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         ({"iterations": -2}, "iterations must be .* got -2"),
-        ({"max_gaussians": 0}, "max_gaussians must be .* got 0"),
-        ({"representation": "nerf"}, "representation must be .* got nerf"),
         ({"hold_out": 1}, "hold_out must be 0 or at least 2, got 1"),
         ({"voxel_size": 0.001}, r"voxel_size must be 0 or at least 0\.005 m, got 0\.001"),
-        ({"voxel_size": float("nan")}, "voxel_size must be .* got nan"),
         ({"max_range": 0.2, "voxel_size": 0.2}, r"max_range must be above voxel_size 0\.2 m"),
-        ({"contrast": -1.0}, r"contrast must be .* got -1\.0"),
     ],
 )
-def test_bad_config(tmp_path, write_room, change, message):
+def test_invalid_config(tmp_path, write_room, change, message):
     room = write_room(tmp_path / "room")
     with pytest.raises(ValueError, match=message):
         reconstruct(read_capture(room), tmp_path / "scene", replace(CONFIG, **change))
@@ -170,12 +132,12 @@ def test_bad_capture_leaves_nothing(tmp_path, write_room):
     assert list(tmp_path.iterdir()) == [room]
 
 
-@pytest.mark.parametrize("asked", ["", "train", "validation"])
-def test_scene_has_the_split_and_digest_of_its_capture(tmp_path, write_room, asked):
+@pytest.mark.parametrize("split", ["", "validation"])
+def test_scene_has_the_split_and_digest_of_its_capture(tmp_path, write_room, split):
     room = write_room(tmp_path / "hospital")
-    reconstruct(read_capture(room), tmp_path / "scene", replace(CONFIG, split=asked))
+    reconstruct(read_capture(room), tmp_path / "scene", replace(CONFIG, split=split))
     metadata = read_scene_metadata(tmp_path / "scene")
-    assert metadata.split == (asked or "train") and len(metadata.source_digest) == 8
+    assert metadata.split == (split or "train") and len(metadata.source_digest) == 8
     for image in (room / "image_left").iterdir():  # the same pixels in another file format
         pixels = cv2.imread(str(image))
         image.unlink()
@@ -214,14 +176,18 @@ def test_hospital(tmp_path):
     summary = reconstruct(read_capture(part), tmp_path / "scene", config)
     assert summary.geodesic > 6
     assert -0.4 < summary.vignetting < -0.2
-    world, sequence = read_scene(tmp_path / "scene"), read_tartanair_v1(part)
-    baked = world.baked
-    photometry = Photometry(
-        np.array(read_scene_metadata(tmp_path / "scene").gains), summary.vignetting
-    )
-    for i in (0, 5, 10):
-        frame = sequence.frame(i)
-        view = baked.render(frame.K, 640, 480, frame.X_WC, background=world.background)
-        color = view.color * photometry.factor(i, 480, 640)[..., None]
-        assert psnr(np.clip(color, 0, 1), frame.image / 255) > 23
-        assert np.median(np.abs(view.depth / frame.depth - 1)) < 0.01
+    assert_renders_like(tmp_path / "scene", part, (0, 5, 10), min_psnr=23, max_error=0.01)
+
+
+def assert_renders_like(scene, capture, frames, min_psnr: float, max_error: float) -> None:
+    world, metadata = read_scene(scene), read_scene_metadata(scene)
+    photometry = Photometry(np.array(metadata.gains), metadata.vignetting)
+    for i in frames:
+        frame = read_tartanair_v1(capture).frame(i)
+        height, width = frame.depth.shape
+        view = world.baked.render(frame.K, width, height, frame.X_WC, background=world.background)
+        color = view.color * photometry.factor(i, height, width)[..., None]
+        psnr = -10 * np.log10(np.mean((color.clip(0, 1) - frame.image / 255) ** 2))
+        assert psnr > min_psnr
+        assert np.median(np.abs(view.depth / frame.depth - 1)) < max_error
+        assert view.alpha.mean() > 0.98

@@ -20,7 +20,7 @@ def sky(v_W: np.ndarray) -> np.ndarray:
 
 
 def frame(yaw: float, gain: float = 1.0, ground: bool = True) -> CaptureFrame:
-    """The sky above black ground 2 m below, turned to the left by `yaw` [rad]."""
+    """The sky above black ground 2 m below, rotated to the left by `yaw` [rad]."""
     X_WC = RigidTransform(RotationMatrix.MakeZRotation(yaw) @ R_LEVEL, np.zeros(3))
     rows, columns = np.mgrid[:HEIGHT, :WIDTH]
     rays = np.stack([(columns + 0.5 - 32) / 32, (rows + 0.5 - 24) / 32, np.ones((HEIGHT, WIDTH))])
@@ -40,19 +40,14 @@ def test_the_sky_is_learned_and_the_ground_is_not():
     assert isinstance(background, EnvironmentMap)
     rng = np.random.default_rng(0)
     azimuth, elevation = rng.uniform(-np.pi, np.pi, 500), rng.uniform(0.1, 0.4, 500)
-    v_W = np.column_stack(
-        [
-            np.cos(elevation) * np.cos(azimuth),
-            np.cos(elevation) * np.sin(azimuth),
-            np.sin(elevation),
-        ]
-    )
+    level = np.column_stack([np.cos(azimuth), np.sin(azimuth)]) * np.cos(elevation)[:, None]
+    v_W = np.column_stack([level, np.sin(elevation)])
     np.testing.assert_allclose(background.color(v_W), sky(v_W), atol=0.02)
     assert np.abs(np.diff(background.texels, axis=0)).max() < 0.1
     assert background.texels.min() > 0.15
 
 
-def test_beyond_the_far_limit_is_infinitely_far():
+def test_depth_beyond_the_far_limit_is_sky():
     distant = frame(0.0, ground=False)
     depth = np.where(np.isinf(distant.depth), np.float32(151), distant.depth)
     one = Photometry(np.ones(1), 0.0)

@@ -4,7 +4,6 @@ import sys
 
 import numpy as np
 import pytest
-from pydrake.common.yaml import yaml_load_typed
 from pydrake.math import RigidTransform, RotationMatrix
 from scipy.ndimage import label
 from scipy.spatial.distance import pdist
@@ -20,7 +19,6 @@ from splatpilot.systems.collision.shapes import (
     Sphere,
 )
 from splatpilot.systems.splats.background import mean_color
-from splatpilot.systems.splats.baked_scene import BakedScene
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
 SMALL = ForestConfig(length=9.0, width=7.0, height=4.0, voxel_size=0.25)
@@ -70,7 +68,7 @@ def _digest(world: World) -> str:
     return digest.hexdigest()
 
 
-def test_the_same_seed_gives_the_same_bits_in_another_process():
+def test_the_same_seed_gives_identical_worlds_in_another_process():
     code = (
         f"import sys; sys.path.insert(0, {str(__file__.rsplit('/', 1)[0])!r})\n"
         "from test_forest import SMALL, _digest, make_world\n"
@@ -80,18 +78,10 @@ def test_the_same_seed_gives_the_same_bits_in_another_process():
     assert other.stdout.strip() == _digest(make_world(SMALL, seed=5))
 
 
-def test_another_seed_gives_another_forest():
-    a, b = make_world(SMALL, seed=0), make_world(SMALL, seed=1)
-    places = np.random.default_rng(0).uniform((0, -3.5, 1), (9, 3.5, 3), (200, 3))
-    difference = a.distance_field.distance(places) - b.distance_field.distance(places)
-    assert np.abs(difference).mean() > 0.1
-    assert a.background != b.background
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_trunks_are_as_far_apart_and_as_thick_as_configured(kind):
     config = KINDS[kind]
-    for seed in range(4):
+    for seed in range(2):
         trees = _layout(config, seed)[0].trees
         assert pdist(trees.base).min() >= config.spacing
         assert config.radius_min <= trees.radius.min() < config.radius_min + 0.03
@@ -104,7 +94,7 @@ def test_trunks_are_as_far_apart_and_as_thick_as_configured(kind):
 def test_a_vehicle_can_fly_from_start_to_goal(kind):
     config = KINDS[kind]
     spacing = 0.1
-    for seed in range(4):
+    for seed in range(2):
         _, field, p_WS, p_WG = _layout(config, seed)
         assert field.distance(np.stack([p_WS, p_WG])).min() >= CLEARING
         r = VEHICLE_RADIUS
@@ -129,7 +119,7 @@ def test_gaps_between_trunks_let_the_vehicle_through_at_every_height(kind):
         assert gap.min() >= config.narrowest
 
 
-def test_everything_seen_in_the_volume_is_there_to_be_hit(world):
+def test_everything_drawn_in_the_volume_is_solid(world):
     distance = np.abs(world.distance_field.distance(_inside(world)))
     assert distance.max() < 0.07
     assert np.quantile(distance, 0.95) < 0.04
@@ -149,7 +139,7 @@ def test_leaves_around_the_volume_stay_out_of_it(world):
     assert (reach <= beyond + 0.1)[leaves].all()
 
 
-def test_every_shape_to_hit_is_seen(world):
+def test_every_solid_is_drawn(world):
     p = world.gaussians.means.astype(float)
     field = world.distance_field
     seen = 0
@@ -183,25 +173,20 @@ def test_trees_left_out_of_the_field_are_never_the_nearest():
 
 VIEWS = [  # p_WC [m], yaw and pitch [rad]
     ((1.5, 0.0, 1.8), 0.0, 0.0),
-    ((6.0, 0.5, 1.8), 0.2, -0.1),
     ((18.0, 1.5, 1.5), 0.1, -0.15),
-    ((30.0, 1.0, 2.4), 3.1, 0.0),
 ]
 
 
-@pytest.fixture(scope="module")
-def baked(world) -> BakedScene:
-    return world.baked
-
-
 @pytest.mark.parametrize("p_WC, yaw, pitch", VIEWS)
-def test_rendered_depth_is_the_distance_to_what_is_hit(world, baked, p_WC, yaw, pitch):
+def test_rendered_depth_is_the_distance_to_solids(world, p_WC, yaw, pitch):
     width, height = 160, 120
     K = np.array([[80.0, 0, 80], [0, 80, 60], [0, 0, 1]])
     forward = np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)])
     right = np.array([np.sin(yaw), -np.cos(yaw), 0])
     R_WC = RotationMatrix(np.column_stack([right, np.cross(forward, right), forward]))
-    view = baked.render(K, width, height, RigidTransform(R_WC, p_WC), background=world.background)
+    view = world.baked.render(
+        K, width, height, RigidTransform(R_WC, p_WC), background=world.background
+    )
     truth, on_ground = _march(world, K, width, height, R_WC, np.array(p_WC))
     hit = np.isfinite(truth)
     assert hit.mean() > 0.5
@@ -232,13 +217,6 @@ def _march(world, K, width, height, R_WC, p_WC):
     return depth.reshape(height, width), (p[:, 2] < 0.005).reshape(height, width)
 
 
-def test_start_and_goal_face_each_other_with_room_around(world):
-    np.testing.assert_allclose(world.p_WS, (1.5, 0, 1.8))
-    np.testing.assert_allclose(world.p_WG, (34.5, 0, 1.8))
-    ends = np.stack([world.p_WS, world.p_WG])
-    assert world.distance_field.distance(ends).min() >= CLEARING
-
-
 def test_the_grid_for_planning_agrees_with_the_truth(world):
     p = np.random.default_rng(0).uniform((0.5, -7.5, 1), (35.5, 7.5, 3), (2000, 3))
     error = world.esdf.distance(p) - world.distance_field.distance(p)
@@ -246,50 +224,20 @@ def test_the_grid_for_planning_agrees_with_the_truth(world):
     np.testing.assert_allclose(world.esdf.lower_W, world.distance_field.lower_W)
 
 
-def test_a_forest_without_rocks_and_logs_grows():
-    config = ForestConfig(**{**vars(SMALL), "rocks": 0, "logs": 0})
-    kinds = [type(shape) for shape in _shapes(make_world(config, seed=0))]
-    assert Sphere not in kinds and kinds.count(Capsule) == len(kinds) - 1
-
-
-def test_the_config_loads_from_yaml():
-    config = yaml_load_typed(schema=ForestConfig, data="{spacing: 5.0, rocks: 0}")
-    assert config == ForestConfig(spacing=5.0, rocks=0)
-    with pytest.raises(RuntimeError, match="spacin"):
-        yaml_load_typed(schema=ForestConfig, data="{spacin: 5.0}")
-
-
 @pytest.mark.parametrize(
     "values, message",
     [
-        ({"length": 0.0}, r"length must be .* got 0.0"),
-        ({"width": -16.0}, r"width must be .* got -16.0"),
         ({"height": float("nan")}, r"height must be .* got nan"),
-        ({"voxel_size": 0.0}, r"voxel_size must be .* got 0.0"),
-        ({"radius_max": float("nan")}, r"radius_max must be .* got nan"),
-        ({"radius_min": -0.1}, r"radius_min must be .* got -0.1"),
-        ({"rocks": -1}, r"rocks must be .* got -1"),
+        ({"voxel_size": 1e-4}, r"voxel_size must fit the volume: .* use larger voxels"),
+        ({"width": 150.0, "length": 190.0}, r"length \* width must be at most 20000 m\^2"),
         ({"lean_max": 40.0}, r"lean_max must be .* got 40.0"),
         ({"length": 4.0}, r"length must be in \[5, .* got 4.0"),
         ({"width": 2.0}, r"width must be at least 2.5.* got 2.0"),
         ({"flight_height": 5.5}, r"flight_height must be at most .* = 5 m, got 5.5"),
         ({"radius_min": 0.6}, r"radius_min must be at most radius_max = 0.45, got 0.6"),
-        ({"spacing": 0.8}, r"spacing must be at least 2.02 m, got 0.8"),
         ({"spacing": 1.9}, r"spacing must be at least 2.02 m, got 1.9"),
     ],
 )
 def test_a_forest_that_cannot_be_grown_is_refused(values, message):
     with pytest.raises(ValueError, match=message):
         make_world(ForestConfig(**values), seed=0)
-
-
-def test_the_spacing_the_error_asks_for_is_enough():
-    with pytest.raises(ValueError) as error:
-        ForestConfig(spacing=1.9).validate()
-    needed = float(str(error.value).rsplit("at least ", 1)[1].partition(" m")[0])
-    ForestConfig(spacing=needed + 0.005).validate()
-
-
-def test_a_negative_seed_is_refused():
-    with pytest.raises(ValueError, match=r"seed must be .*, got -1"):
-        make_world(SMALL, seed=-1)

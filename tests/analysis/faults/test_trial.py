@@ -1,0 +1,170 @@
+import os
+import socket
+import struct
+
+import lcm
+import numpy as np
+import pytest
+from drake import lcmt_header
+
+from splatpilot.analysis.faults.trial import DELAY, KINDS, Fault, Relay, Trial, fly_trial
+from splatpilot.diagrams.flight.policies import policy_named
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.worlds.forest.forest import ForestConfig
+from splatpilot.diagrams.worlds.world_registry import make_world
+from splatpilot.systems.messaging.codecs import (
+    CommandCodec,
+    DepthGridCodec,
+    MotionCaptureCodec,
+    StateCodec,
+)
+from splatpilot.systems.messaging.flight_limits import FlightLimits
+from splatpilot.systems.vehicle.quadrotor import hover_state
+
+
+def encoded(codec, value, number: int = 0, utime: int = 0) -> bytes:
+    header = lcmt_header()
+    header.seq, header.utime, header.frame_name = number, utime, codec.frame
+    return codec.pack(np.asarray(value), header, 0.0).encode()
+
+
+class Line:
+    """States sent through a relay every 20 ms, of which those from 1 s to 2 s have faults."""
+
+    def __init__(self, *kinds: str, size: float = 2.0):
+        near, far, codec = lcm.LCM("memq://"), lcm.LCM("memq://"), StateCodec()
+        faults = tuple(Fault(kind, 1.0, duration=1.0, fraction=1.0, size=size) for kind in kinds)
+        random = np.random.default_rng(0)
+        relay = Relay(near, far, [codec], [CommandCodec()], faults, random)
+        self.heard, self.sent = [], []
+        far.subscribe(codec.channel, lambda _, data: self.heard.append((now, data)))
+        for number in range(150):
+            now = 0.02 * number
+            state = hover_state([number * 0.1, 0.0, 2.0])
+            self.sent.append(encoded(codec, state, number, round(now * 1e6)))
+            near.publish(codec.channel, self.sent[-1])
+            relay.step(now)
+            while far.handle_timeout(0):
+                pass
+        self.during = [data for when, data in self.heard if 1.0 <= when < 2.0]
+
+    def messages(self, data=None) -> list:
+        data = [data for _, data in self.heard] if data is None else data
+        return [StateCodec.message.decode(each) for each in data]
+
+    def numbers(self) -> list[int]:
+        return [message.header.seq for message in self.messages()]
+
+    def delays(self) -> dict[int, float]:
+        return {n: now - 0.02 * n for n, (now, _) in zip(self.numbers(), self.heard, strict=True)}
+
+
+def test_without_a_fault_everything_arrives_at_once():
+    line = Line("policy_killed")
+    assert [data for _, data in line.heard] == line.sent
+    assert max(map(abs, line.delays().values())) < 1e-9
+
+
+def test_a_relay_ends_with_its_transports():
+    Line("dropped")
+    before = len(os.listdir("/proc/self/fd"))
+    for _ in range(3):
+        Line("dropped")
+    assert len(os.listdir("/proc/self/fd")) == before
+
+
+def test_messages_are_dropped_delayed_duplicated_and_reordered():
+    assert Line("dropped").numbers() == [*range(50), *range(100, 150)]
+    delays = Line("delayed").delays()
+    assert delays[70] == pytest.approx(DELAY, abs=0.021) and delays[20] == pytest.approx(0.0)
+    assert sorted(Line("duplicated").numbers()) == sorted([*range(150), *range(50, 100)])
+    mixed = Line("reordered").numbers()
+    assert mixed != sorted(mixed) and sorted(mixed) == list(range(150))
+
+
+def test_contents_are_corrupted():
+    for kind in ("corrupt", "not_finite"):
+        line = Line(kind)
+        assert not set(line.during) & set(line.sent[50:100])
+    assert all(len(data) == len(line.sent[0]) for data in line.during)
+
+
+def test_states_freeze_and_jump_and_clocks_too():
+    line = Line("state_frozen")
+    frozen = line.messages(line.during)
+    assert {message.p_WB for message in frozen} == {(5.0, 0.0, 2.0)}
+    assert len({message.header.utime for message in frozen}) == 50
+    line = Line("state_jumped")
+    assert {message.p_WB[1] for message in line.messages(line.during)} == {3.0}
+    last = Line("clock_jump").messages()[-1]
+    assert last.header.utime == round((149 * 0.02 + 2.0) * 1e6)
+
+
+def test_two_faults_both_happen():
+    line = Line("delayed", "state_frozen")
+    hit = [message for message in line.messages() if 50 <= message.header.seq < 100]
+    assert {message.p_WB for message in hit} == {(5.0, 0.0, 2.0)}
+    late = [line.delays()[message.header.seq] for message in hit]
+    np.testing.assert_allclose(late, DELAY, atol=0.021)
+
+
+@pytest.mark.parametrize(
+    ("kind", "tracked"), [("body_lost", [False]), ("body_dropped", []), ("grid_dropped", [True])]
+)
+def test_motion_capture_loses_the_body_or_messages(kind, tracked):
+    near, far, heard, codec = lcm.LCM("memq://"), lcm.LCM("memq://"), [], MotionCaptureCodec("a")
+    fault = Fault(kind, begin=0.0, duration=1.0, fraction=1.0, size=1.0)
+    relay = Relay(near, far, [codec], [], (fault,), np.random.default_rng(0))
+    far.subscribe(codec.channel, lambda _, data: heard.append(codec.message.decode(data).tracked))
+    near.publish(codec.channel, encoded(codec, [1.0, 2, 3, 1, 0, 0, 0]))
+    relay.step(0.5)
+    while far.handle_timeout(0):
+        pass
+    assert heard == tracked
+
+
+@pytest.mark.parametrize(("kind", "came"), [("body_lost", True), ("grid_dropped", False)])
+def test_grids_travel_as_packets_of_the_sensor(kind, came):
+    codec, near = DepthGridCodec(16, 9, 5.0, "policy_camera"), lcm.LCM("memq://")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as inbox:
+        inbox.bind(("127.0.0.1", 0))
+        inbox.settimeout(2.0 if came else 0.1)
+        fault = Fault(kind, begin=0.0, duration=1.0, fraction=1.0, size=1.0)
+        random, port = np.random.default_rng(0), inbox.getsockname()[1]
+        relay = Relay(near, lcm.LCM("memq://"), [codec], [], (fault,), random, port)
+        near.publish(codec.channel, encoded(codec, np.full(144, 0.25), 3, 7))
+        relay.step(0.5)
+        try:
+            packet = inbox.recv(65536)
+        except TimeoutError:
+            packet = b""
+    expected = struct.pack("<IIQ144f", 0x544F4632, 3, 7000, *[0.25] * 144)
+    assert packet == (expected if came else b"")
+
+
+def test_faults_interfaces_and_policies_alternate_and_repeat():
+    count = 4 * len(KINDS)
+    trials = [Trial.sample(n, np.random.default_rng([0, n])) for n in range(count)]
+    for number, trial in enumerate(trials):
+        kinds = [fault.kind for fault in trial.faults]
+        assert KINDS[number % len(KINDS)] in kinds and len(set(kinds)) == len(kinds)
+        grids = any(kind.startswith("grid") for kind in kinds)
+        assert (trial.policy == "diffaero_tof") == grids
+    assert {trial.setpoints for trial in trials} == {"velocity", "body_rates"}
+    assert {trial.policy for trial in trials} == {"straight", "reactive", "diffaero_tof"}
+    pairs = sum(len(trial.faults) == 2 for trial in trials)
+    assert 0.3 * count < pairs < 0.7 * count
+    assert trials[3] == Trial.sample(3, np.random.default_rng([0, 3])) != trials[3 + len(KINDS)]
+
+
+@pytest.mark.parametrize("setpoints", ["velocity", "body_rates"])
+def test_a_state_that_freezes_while_images_are_lost_ends_safely(setpoints):
+    scenario = Scenario(
+        world=ForestConfig(length=10.0, width=6.0), policy=policy_named("straight", 2.0)
+    )
+    world = make_world(scenario.world, 0)
+    faults = tuple(Fault(kind, 1.0, 1.0, 1.0, 1.0) for kind in ("dropped", "state_frozen"))
+    trial = Trial(faults, "straight", setpoints)
+    row = fly_trial(scenario, world, trial, FlightLimits(max_speed=2.5), 0)
+    assert row["safe"]
+    assert row["min_clearance"] >= 0.09
