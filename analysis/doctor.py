@@ -1,9 +1,8 @@
-"""What this machine can do, and what to install or set for the rest."""
+"""`splatpilot doctor`: what works on this machine, and what to install or set for the rest."""
 
 import importlib.util
 import platform
 import shutil
-from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -15,7 +14,7 @@ from splatpilot.systems.common.processes import available_cores
 
 _DRIVER = Path("/proc/driver/nvidia")
 
-_SERVED = {
+_USES = {
     "cluster": "`splatpilot benchmark --cluster`",
     "exr": "depth of Record3D's exports",
     "mesh": "`splatpilot scene mesh`",
@@ -23,45 +22,31 @@ _SERVED = {
     "photos": "photographs without poses, and COLMAP models",
     "px4": "`splatpilot hardware px4`",
     "tensorboard": "curves in TensorBoard",
-    "train": "training, reconstruction and measures of scenes",
+    "train": "training, reconstruction and metrics of scenes",
     "ros": "captures in ROS bags",
     "spz": "Gaussians in SPZ of version 4",
 }
-"""What each extra is for."""
+"""The use of each extra."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that this machine has or lacks."""
+    """A part of this machine."""
 
     what: str
     found: str
-    """In words."""
-    remedy: str = ""
-    """The one thing to install or set; empty where nothing lacks."""
-    serves: str = ""
-    """What cannot be done without it."""
+    remedy: str = ""  # what to install or set; empty if nothing is missing
+    serves: str = ""  # what is impossible without it
 
 
 def examine() -> list[Finding]:
-    """Looks for all that some part of splatpilot needs."""
-    checks: tuple[Callable[[], list[Finding]], ...] = (
-        _program,
-        _processor,
-        _gpu,
-        _opengl,
-        _messages,
-        _video,
-        _browser,
-        _extras,
-        _data,
-        _scenes,
-    )
-    return [finding for check in checks for finding in check()]
+    """Checks everything that some part of splatpilot needs."""
+    checks = _program, _processor, _gpu, _opengl, _messages, _video, _browser, _extras, _data
+    return [finding for check in (*checks, _scenes) for finding in check()]
 
 
 def format_findings(findings: list[Finding]) -> str:
-    """A line for each, and one more for the remedy of what lacks."""
+    """Formats a line for each finding, and one for each remedy."""
     width = max(len(finding.what) for finding in findings)
     lines = []
     for finding in findings:
@@ -89,11 +74,11 @@ def _gpu() -> list[Finding]:
     try:
         import torch
     except ModuleNotFoundError:
-        return []  # What `extra train` says comes first.
+        return []  # The finding of the extra "train" comes first.
     if not torch.cuda.is_available():
         if not _DRIVER.exists():
             return [Finding("GPU", "no driver", "an NVIDIA GPU and its driver", serves)]
-        found = f"PyTorch {torch.__version__} cannot use the one that there is"
+        found = f"not usable by PyTorch {torch.__version__}"
         remedy = "a PyTorch for this driver, see https://pytorch.org/get-started/locally"
         return [Finding("GPU", found, remedy, serves)]
     name = torch.cuda.get_device_name()
@@ -108,7 +93,7 @@ def _opengl() -> list[Finding]:
     try:
         require_opengl()
     except OSError as error:
-        return [_lacking("EGL", error, "captures rendered of meshes")]
+        return [_failure("EGL", error, "captures rendered of meshes")]
     return [Finding("EGL", "Drake's RenderEngineVtk renders")]
 
 
@@ -118,12 +103,12 @@ def _messages() -> list[Finding]:
     try:
         open_lcm()
     except OSError as error:
-        return [_lacking("messages", error, "`splatpilot hardware vehicle`, `bridge` and `px4`")]
+        return [_failure("messages", error, "`splatpilot hardware vehicle`, `bridge` and `px4`")]
     return [Finding("messages", f"LCM delivers at {DEFAULT_URL}")]
 
 
-def _lacking(what: str, error: OSError, serves: str) -> Finding:
-    """What an error says, whose remedy stands behind its semicolon."""
+def _failure(what: str, error: OSError, serves: str) -> Finding:
+    """Splits the message of an error into the problem and, after a semicolon, the remedy."""
     found, _, remedy = str(error).partition("; ")
     return Finding(what, found, remedy, serves)
 
@@ -149,12 +134,12 @@ def _browser() -> list[Finding]:
 def _extras() -> list[Finding]:
     findings = []
     for extra, packages in packages_of_extras().items():
-        lacking = [name for name in packages if not _is_installed(name)]
-        if extra == "cuda" or not packages:  # The GPU's finding has it.
+        if extra == "cuda":  # covered by the GPU
             continue
-        found = f"no {', '.join(lacking)}" if lacking else ", ".join(packages)
-        remedy = f"pip install 'splatpilot[{extra}]'" if lacking else ""
-        findings.append(Finding(f"extra {extra}", found, remedy, _SERVED[extra]))
+        missing = [name for name in packages if not _is_installed(name)]
+        found = f"no {', '.join(missing)}" if missing else ", ".join(packages)
+        remedy = f"pip install 'splatpilot[{extra}]'" if missing else ""
+        findings.append(Finding(f"extra {extra}", found, remedy, _USES[extra]))
     return findings
 
 
@@ -167,12 +152,14 @@ def _is_installed(package: str) -> bool:
 
 
 def _data() -> list[Finding]:
-    folder, serves = data_folder(), "`splatpilot scene fetch`, and tests on real captures"
-    if folder is None or not folder.is_dir():
-        found = f"{DATA} is not set" if folder is None else f"{folder} is no folder"
-        return [Finding("data", found, f"export {DATA}=FOLDER of captures and meshes", serves)]
-    held = ", ".join(sorted(path.name for path in folder.iterdir() if path.is_dir()))
-    return [Finding("data", f"{folder}: {held or 'empty'}")]
+    folder = data_folder()
+    if folder is not None and folder.is_dir():
+        names = ", ".join(sorted(path.name for path in folder.iterdir() if path.is_dir()))
+        return [Finding("data", f"{folder}: {names or 'empty'}")]
+    found = f"{DATA} is not set" if folder is None else f"No such folder: {folder}"
+    remedy = f"export {DATA}=FOLDER of captures and meshes"
+    serves = "`splatpilot scene fetch`, and tests on real captures"
+    return [Finding("data", found, remedy, serves)]
 
 
 def _scenes() -> list[Finding]:
@@ -181,14 +168,11 @@ def _scenes() -> list[Finding]:
     from splatpilot.diagrams.worlds.scene_folder import SceneSource
     from splatpilot.systems.common.config import load_config
 
-    scenarios = {
-        name: scenario
-        for name, file in benchmark_scenarios().items()
-        if isinstance((scenario := load_config(Scenario(), file)).world, SceneSource)
-    }
+    loaded = {name: load_config(Scenario(), file) for name, file in benchmark_scenarios().items()}
+    scenarios = {name: s for name, s in loaded.items() if isinstance(s.world, SceneSource)}
     absent = absent_scenes(scenarios)
-    there = ", ".join(name for name in scenarios if name not in absent)
-    found = f"{scenes_folder()} has those of {there or 'no scenario'}"
+    present = ", ".join(name for name in scenarios if name not in absent)
+    found = f"{scenes_folder()} has those of {present or 'no scenario'}"
     if not absent:
         return [Finding("scenes", found)]
     remedy = f"splatpilot scene fetch, or export {SCENES}=FOLDER of scenes"

@@ -1,4 +1,4 @@
-"""`splatpilot scene mesh`: a place as a mesh that bodies collide with."""
+"""`splatpilot scene mesh`: surfaces of environments as meshes for collisions."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -6,7 +6,6 @@ from pathlib import Path
 from splatpilot.analysis.view import generated_scenario
 from splatpilot.diagrams.worlds.scene_folder import read_scene_folder
 from splatpilot.diagrams.worlds.world_registry import make_world
-from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.field_mesh import field_mesh, require_mesh_name, write_mesh
 
 
@@ -14,7 +13,7 @@ def run(
     *, what: str, out: Path, conservative: bool, seed: int | None, overrides: Sequence[str]
 ) -> None:
     """
-    Writes the surfaces of a place and prints how many triangles they take.
+    Writes the surfaces of an environment and prints their number of triangles.
 
     Args:
         what: a scene folder, an OctoMap or a scenario.
@@ -22,32 +21,22 @@ def run(
         conservative: see `field_mesh`.
         seed: of a generated world; that of its scenario if None.
         overrides: FIELD=VALUE of the scenario.
-
-    Raises:
-        ValueError: for another kind of file or place, or a place without surfaces.
-        OSError: if the place cannot be read or the mesh not be written.
     """
     require_mesh_name(out)
-    esdf = _field(what, seed, overrides)
+    scenario = generated_scenario(Path(what), seed, overrides)
+    if scenario is not None:
+        scenario.validate()
+        esdf = make_world(scenario.world, scenario.seed).esdf
+    elif not (Path(what) / "scene.yaml").is_file():
+        raise ValueError(
+            f"{what} must be a scene folder, OctoMap or scenario, which have distances; "
+            "reconstruct it first"
+        )
+    elif overrides:
+        raise ValueError(f"--set must be of a scenario, got {overrides[0]}; leave it out")
+    else:
+        esdf = read_scene_folder(Path(what)).esdf
     mesh = field_mesh(esdf, conservative)
     write_mesh(out, mesh)
     size = " x ".join(f"{extent:.1f}" for extent in mesh.extents)
     print(f"Wrote {out}: {len(mesh.faces)} triangles, {size} m, within {esdf.voxel_size / 2:g} m")
-
-
-def _field(what: str, seed: int | None, overrides: Sequence[str]) -> Esdf:
-    path = Path(what)
-    if not (path / "scene.yaml").is_file():
-        scenario = None if path.is_dir() else generated_scenario(path, seed, overrides)
-        if scenario is None:
-            raise ValueError(
-                f"{what}: what is no scene folder, OctoMap or scenario has no distances; "
-                "reconstruct it first"
-            )
-        scenario.validate()
-        return make_world(scenario.world, scenario.seed).esdf
-    if seed is not None or overrides:
-        raise ValueError(
-            f"{what}: a finished scene has neither a seed nor settings; leave them out"
-        )
-    return read_scene_folder(path).esdf

@@ -1,8 +1,9 @@
-"""The scenes of the photorealistic scenarios, made from captures, meshes and generated worlds."""
+"""`splatpilot scene fetch`: makes the scenes of the photorealistic scenarios."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 from splatpilot.analysis.reconstruction import run as reconstruction
 from splatpilot.analysis.reconstruction.measure_scene import METRICS, measure_scene
@@ -15,9 +16,8 @@ from splatpilot.training.captures import render as render_capture
 from splatpilot.training.reconstruction.config import ReconstructConfig
 
 
-@dataclass(frozen=True)
-class Recipe:
-    """The source of a scene, and how it is made."""
+class Recipe(NamedTuple):
+    """The source of a scene, and the settings of its reconstruction."""
 
     source: str  # a capture or a mesh, below the folder of data, or a scenario
     settings: tuple[str, ...] = ()  # of `RenderedSceneConfig`, as --set takes them
@@ -60,10 +60,10 @@ def default_config() -> RenderedSceneConfig:
 def run(
     *, names: Sequence[str], data: Path | None, scenes: Path, overrides: Sequence[str] = ()
 ) -> None:
-    """Makes the scene folders `scenes/NAME`, one after the other.
+    """
+    Makes the scene folders `scenes/NAME`, one after the other; the same call resumes.
 
-    Rendered captures are kept in `scenes/captures/NAME`. Results of an earlier run are used again,
-    so an interrupted run resumes and ends in the same scenes.
+    Rendered captures are kept in `scenes/captures/NAME`.
 
     Args:
         names: keys of `RECIPES`; the benchmark's if empty.
@@ -82,10 +82,10 @@ def run(
     ]
     for name, source, config in zip(names, sources, configs, strict=True):
         print(f"== {name}, from {source}", flush=True)
+        capture = scenes / "captures" / name
         if isinstance(source, Path) and source.is_dir():
             capture = source
         else:
-            capture = scenes / "captures" / name
             render_capture.run(world=source, out=capture, config=config.render)
         _make_scene(capture, scenes / name, config.reconstruct())
 
@@ -95,9 +95,7 @@ def _find_source(source: str, data: Path | None) -> str | Path:
     if "/" not in source:
         return source
     if data is None:
-        raise ValueError(
-            f"No folder with {source}; name it with --data or the environment variable {DATA}"
-        )
+        raise ValueError(f"No folder with {source}; give --data or set {DATA}")
     require_existing(data / source, "a capture or a mesh")
     return data / source
 

@@ -10,7 +10,7 @@ import yaml
 
 from splatpilot.diagrams.worlds import splits
 from splatpilot.training.captures.capture_registry import read_capture
-from splatpilot.training.captures.render import mesh_digests
+from splatpilot.training.captures.mesh_renderer import mesh_digests
 
 SOURCES = {
     "hospital": "tartanair/hospital",

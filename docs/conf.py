@@ -1,4 +1,4 @@
-"""How the documentation is built: `make docs`, without a network, warnings being errors."""
+"""Configures Sphinx for `make docs`, which needs no network; warnings are errors."""
 
 import sys
 from pathlib import Path
@@ -17,9 +17,9 @@ extensions = [
 ]
 exclude_patterns = ["_ext"]
 myst_heading_anchors = 4
-# What stands in a code block without a language are commands.
+# Code blocks without a language are commands.
 highlight_language = "bash"
-# Single backticks in docstrings: a link where there is something of that name, code elsewhere.
+# Single backticks in docstrings link to objects of that name, and are code otherwise.
 default_role = "py:obj"
 toc_object_entries = False
 autodoc_member_order = "bysource"

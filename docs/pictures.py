@@ -1,8 +1,8 @@
-"""Makes the pictures of the documentation of what the program leaves; `pictures.md` has commands.
+"""Makes the pictures of the documentation; `pictures.md` has the commands.
 
 python docs/pictures.py moving out/fly/flight.mp4 docs/flight.webp
 
-Pages need a Chromium on the PATH, without a display.
+Pages need Chromium on the PATH, but no display.
 """
 
 import argparse
@@ -35,33 +35,34 @@ Picture = np.ndarray  # (H, W, 3) uint8, red first
 
 
 def frames(video: Path) -> list[Picture]:
-    """All frames of a flight's video, color beside depth."""
+    """Returns all frames of the video of a flight, color next to depth."""
     stream, found = cv2.VideoCapture(str(video)), []
     while (read := stream.read())[0]:
         found.append(read[1][..., ::-1])
     if not found:
-        raise OSError(f"{video}: there is no video")
+        raise OSError(f"{video}: no frames")
     return found
 
 
 def moments(video: Path, out: Path) -> None:
-    """Three moments of a flight, color above depth."""
-    shown = frames(video)
+    """Saves three frames of a flight, color above depth."""
+    images = frames(video)
     columns = [
-        np.vstack(np.hsplit(shown[round(part * (len(shown) - 1))], 2)) for part in (0.25, 0.5, 0.75)
+        np.vstack(np.hsplit(images[round(fraction * (len(images) - 1))], 2))
+        for fraction in (0.25, 0.5, 0.75)
     ]
     save(np.hstack(columns), out)
 
 
 def moving(video: Path, out: Path) -> None:
-    """A whole flight, color beside depth, in every third of its pictures."""
+    """Saves every third frame of a flight, color next to depth, as an animation."""
     rate = cv2.VideoCapture(str(video)).get(cv2.CAP_PROP_FPS) / 3
-    first, *others = [Image.fromarray(shrunk(frame, 800)) for frame in frames(video)[::3]]
+    first, *others = [Image.fromarray(shrink_to(frame, 800)) for frame in frames(video)[::3]]
     first.save(out, save_all=True, append_images=others, duration=1000 / rate, loop=0, quality=50)
 
 
 def worlds(out: Path) -> None:
-    """The benchmark's generated worlds, each from where its flights start."""
+    """Saves a view of each generated world of the benchmark, from the start of its flights."""
     views = []
     for file in benchmark_scenarios().values():
         scenario = load_config(Scenario(), file)
@@ -78,13 +79,13 @@ def worlds(out: Path) -> None:
 
 
 def sensor(out: Path) -> None:
-    """A room as it is; while the vehicle turns, through a rolling shutter; and at night."""
+    """Saves three views of a room: plain, through a rolling shutter in a turn, and at night."""
     scenario = load_config(Scenario(), benchmark_scenarios()["P10"])
     world = make_world(scenario.world, scenario.seed)
     X_WB = pose_from_state(sample_initial_state(scenario, world))
     camera = make_camera(OnboardCamera(420, 280, readout=0.03), world)
-    turned = X_WB @ RigidTransform(RollPitchYaw(-0.12, 0.0, 0.12), [-0.1, 0.0, 0.0])
-    views = [camera.render(X_WB), camera.render(X_WB, 0.0, turned)]
+    X_WB_start = X_WB @ RigidTransform(RollPitchYaw(-0.12, 0.0, 0.12), [-0.1, 0.0, 0.0])
+    views = [camera.render(X_WB), camera.render(X_WB, 0.0, X_WB_start)]
     still, rolled = (color_pixels(view.color) for view in views)
     night = ObservationNoise(exposure_error=4.0, full_well=8000.0, read_noise=8.0)
     grain = np.random.default_rng([0, 0]).standard_normal(still.shape)
@@ -93,12 +94,12 @@ def sensor(out: Path) -> None:
 
 
 def row(left: Path, right: Path, out: Path) -> None:
-    """Two pictures side by side."""
-    save(shrunk(np.hstack([load(left), load(right)]), 1280), out)
+    """Saves two pictures next to each other."""
+    save(shrink_to(np.hstack([load(left), load(right)]), 1280), out)
 
 
 def column(upper: Path, lower: Path, out: Path) -> None:
-    """Two pictures, one above the other."""
+    """Saves two pictures, one above the other."""
     pictures = [load(upper), load(lower)]
     width = max(picture.shape[1] for picture in pictures)
     padding = [((0, 0), (0, width - picture.shape[1]), (0, 0)) for picture in pictures]
@@ -106,39 +107,39 @@ def column(upper: Path, lower: Path, out: Path) -> None:
     save(np.vstack(padded), out)
 
 
-def sheet(picture: Path, out: Path) -> None:
-    """A picture that the program has drawn, no wider than a page."""
-    save(shrunk(load(picture), 1500), out)
+def shrink(picture: Path, out: Path) -> None:
+    """Saves a picture with at most the width of a page."""
+    save(shrink_to(load(picture), 1500), out)
 
 
 def flight(html: Path, out: Path) -> None:
-    """The page of a flight 6 s after its start, from above and following the vehicle."""
+    """Saves the page of a flight at 6 s, from above and following the vehicle."""
     scripts = [f"replay.look('{view}'); replay.seek(6)" for view in ("overview", "chase")]
     save(splat_page(html, scripts), out)
 
 
-def place(html: Path, out: Path) -> None:
-    """The page of a place, with a captured image, and with distances."""
+def scene(html: Path, out: Path) -> None:
+    """Saves the page of a scene, with a captured image and with the distance field."""
     save(splat_page(html, ["view.choose(27)", "view.switches.slice(true)"]), out)
 
 
 def splat_page(html: Path, scripts: list[str]) -> Picture:
-    """A page of Gaussians after each of the scripts, side by side."""
+    """Returns views of a page after each of the scripts, next to each other."""
     settled = "(window.replay || window.view)?.splats.settled && !viewer.needs_render"
     views = []
-    with opened(html, 1000, 620) as tab:
+    with open_page(html, 1000, 620) as tab:
         tab.wait_for_function(settled)
         for script in scripts:
             tab.evaluate(f"() => {{ {script}; }}")
             tab.wait_for_timeout(1000)
             tab.wait_for_function(settled)
             views.append(load(BytesIO(tab.screenshot())))
-    return shrunk(np.hstack(views), 1600)
+    return shrink_to(np.hstack(views), 1600)
 
 
 @contextmanager
-def opened(html: Path, width: int, height: int) -> Iterator[Page]:
-    """A page in a browser of that size [px]."""
+def open_page(html: Path, width: int, height: int) -> Iterator[Page]:
+    """Opens a page in a browser of this size [px]."""
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(
             executable_path=shutil.which("chromium"),
@@ -155,8 +156,8 @@ def load(path: Path | BytesIO) -> Picture:
     return np.array(Image.open(path).convert("RGB"))
 
 
-def shrunk(picture: Picture, width: int) -> Picture:
-    """A picture no wider than `width` [px]."""
+def shrink_to(picture: Picture, width: int) -> Picture:
+    """Returns a picture with a width of at most `width` [px]."""
     scale = min(1.0, width / picture.shape[1])
     return cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
 
@@ -172,11 +173,11 @@ KINDS: dict[str, tuple[Callable[..., None], list[str]]] = {
     "sensor": (sensor, []),
     "row": (row, ["left", "right"]),
     "column": (column, ["upper", "lower"]),
-    "sheet": (sheet, ["picture"]),
+    "shrink": (shrink, ["picture"]),
     "flight": (flight, ["html"]),
-    "place": (place, ["html"]),
+    "scene": (scene, ["html"]),
 }
-"""What is made, and of which files."""
+"""Functions by command, with the names of their input files."""
 
 
 def make_parser() -> argparse.ArgumentParser:

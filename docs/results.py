@@ -1,11 +1,11 @@
-"""Keeps the results of studies, and writes the tables of pages from them.
+"""Stores the results of studies, and renders the tables of pages from them.
 
 python docs/results.py keep out/study development
 python docs/results.py write
 
-`docs/results/NAME.csv` has a row for each policy, speed and scenario, and `NAME.yaml` how it was
-flown. A page has a table between `<!-- table KIND NAME -->` and `<!-- end of table -->`, KIND being
-one of policies, scenarios, pairs and paper.
+`docs/results/NAME.csv` has a row for each policy, speed and scenario. `NAME.yaml` has the command,
+the date, the machine and the program. A table of a page is between `<!-- table KIND NAME -->` and
+`<!-- end of table -->`, where KIND is policies, scenarios, pairs or paper.
 """
 
 import argparse
@@ -42,11 +42,11 @@ TABLE = re.compile(r"(<!-- table (\w+) (\w+) -->\n).*?(<!-- end of table -->)", 
 
 _OUTCOMES = "collision", "timeout", "left_volume", "infeasible"
 _SUMS = {"clearance_sum_m": "min_clearance_m", "speed_sum_m_s": "mean_speed_m_s"}
-"""Columns with the sums, over flights that were flown, of columns of `rollouts.csv`."""
+"""Columns with sums over feasible flights, by column of `rollouts.csv`."""
 
 
 def keep(study: Path, name: str) -> None:
-    """Keeps the results of a study's folder as `name`."""
+    """Stores the results of a study as `name`."""
     folder = StudyFolder(study)
     config = folder.config()
     groups: dict[tuple[str, str, str], list[dict[str, str]]] = {}
@@ -94,7 +94,7 @@ def _command(config: StudyConfig) -> str:
 
 
 class Results(NamedTuple):
-    """What is kept of a study."""
+    """Stored results of a study."""
 
     rows: list[dict[str, str]]
     about: dict[str, Any]
@@ -111,11 +111,11 @@ class Results(NamedTuple):
 
     @property
     def entries(self) -> list[tuple[str, str]]:
-        """Policies, each at one speed."""
+        """Pairs of policy and speed."""
         return list(dict.fromkeys((row["policy"], row["speed"]) for row in self.rows))
 
     def select(self, entry: tuple[str, str], scenarios: Sequence[str] = ()) -> list[dict[str, str]]:
-        """The rows of a policy at a speed."""
+        """Returns the rows of a policy and speed."""
         return [
             row
             for row in self.rows
@@ -124,7 +124,7 @@ class Results(NamedTuple):
         ]
 
     def description(self) -> str:
-        """How it was flown, as lines of a page."""
+        """Describes seeds, date, program, machine and command in Markdown."""
         about = self.about
         seeds = describe_seeds(about["split"], about["seeds"]).capitalize()
         program = about["program"]["splatpilot"]
@@ -141,7 +141,7 @@ def total(rows: list[dict[str, str]], column: str) -> int:
 
 
 def mean(rows: list[dict[str, str]], column: str) -> float:
-    """The mean over flights of which the column has the sums."""
+    """Returns the mean over feasible flights from a column of sums."""
     flown = total(rows, "flights") - total(rows, "infeasible")
     return sum(float(row[column]) for row in rows) / flown if flown else float("nan")
 
@@ -219,8 +219,8 @@ def paper(results: Results) -> str:
     missing = sorted(set(benchmark_scenarios()) - set(results.scenarios))
     if missing:
         return (
-            f"This study did not fly {', '.join(missing)}, so it is not set beside the paper's "
-            "Table I."
+            f"This study did not fly {', '.join(missing)}, so there is no comparison with the "
+            "paper's Table I."
         )
     header = ["policy", "method in the paper", "paper: passed, clearance, velocity"]
     header += ["here: passed, clearance, velocity"]
@@ -252,27 +252,27 @@ KINDS: dict[str, Callable[[Results], str]] = {
 
 
 def with_tables(text: str) -> str:
-    """The text of a page, its tables as the results have them."""
+    """Renders the tables in the text of a page."""
 
-    def written(found: re.Match) -> str:
+    def render(found: re.Match) -> str:
         begin, kind, name, end = found.groups()
         return f"{begin}\n{KINDS[kind](Results.read(name))}\n\n{end}"
 
-    return TABLE.sub(written, text)
+    return TABLE.sub(render, text)
 
 
 def write() -> None:
-    """Writes the tables of all pages."""
+    """Renders the tables of all pages."""
     for page in PAGES:
         page.write_text(with_tables(page.read_text()))
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    verbs = parser.add_subparsers(dest="verb", required=True)
-    verbs.add_parser("write", help=write.__doc__)
-    kept = verbs.add_parser("keep", help=keep.__doc__)
-    kept.add_argument("study", type=Path)
-    kept.add_argument("name")
+    commands = parser.add_subparsers(dest="command", required=True)
+    commands.add_parser("write", help=write.__doc__)
+    keep_parser = commands.add_parser("keep", help=keep.__doc__)
+    keep_parser.add_argument("study", type=Path)
+    keep_parser.add_argument("name")
     options = vars(parser.parse_args())
-    {"keep": keep, "write": write}[options.pop("verb")](**options)
+    {"keep": keep, "write": write}[options.pop("command")](**options)

@@ -1,9 +1,9 @@
-"""A crash replayed: the same flight again, bit for bit, and a look at what was hit.
+"""A crash, flown again bitwise identically, and a view of the obstacle.
 
     python examples/crash_replayed.py --out out/crash
 
-By command, once a study is flown: `splatpilot replay out/crash P02-straight-2-000 --meshcat`. It
-leaves a page that starts two seconds before the crash.
+Once a study is flown, `splatpilot replay out/crash P02-straight-2-000 --meshcat` does the same. It
+writes a page that starts two seconds before the crash.
 """
 
 import argparse
@@ -26,11 +26,11 @@ def main(out: Path, scenario: str, before: float) -> None:
     with (out / "rollouts.csv").open() as file:
         crash = next(row for row in csv.DictReader(file) if row["outcome"] == "collision")
 
-    # From the study's folder alone, and compared with what was recorded.
+    # From the study's folder alone, and compared with the record.
     agreement = replay.run(study=out, id=crash["id"])
-    assert agreement.exact, "on this machine and with these libraries it is the same flight"
+    assert agreement.exact, "the same machine and libraries repeat the flight"
 
-    # What a camera sees `before` seconds before the end, from the recorded states.
+    # The view of a camera `before` seconds before the end, from the recorded states.
     config = sp.load_config(sp.Scenario(), out / "scenarios" / f"{crash['scenario']}.yaml")
     world = sp.make_world(config.world, int(crash["seed"]))
     with np.load(out / "rollouts" / f"{crash['id']}.npz") as flight:
@@ -39,12 +39,12 @@ def main(out: Path, scenario: str, before: float) -> None:
     view = sp.MakeCamera(config, world).render(pose_from_state(states[row]))
     Image.fromarray((255 * view.color.clip(0, 1)).astype(np.uint8)).save(out / "before.png")
 
-    # The gradient of the distance points away from what was hit.
+    # The gradient of the distance points away from the obstacle.
     gradient = world.distance_field.query(states[-1, :3]).gradient
     closing = -gradient @ states[-1, 3:6]
     print(
-        f"{crash['id']} hit what lies along {np.round(-gradient, 2).tolist()} after "
-        f"{times[-1]:.2f} s, at {closing:.2f} m/s. {before} s before, the nearest thing in its "
+        f"{crash['id']} hit an obstacle along {np.round(-gradient, 2).tolist()} after "
+        f"{times[-1]:.2f} s, at {closing:.2f} m/s. {before} s before, the nearest surface in its "
         f"view was {view.depth[view.depth > 0].min():.2f} m away: {out / 'before.png'}."
     )
 

@@ -1,9 +1,9 @@
-"""Drake's own quadrotor with our camera: splats need none of our vehicles.
+"""Drake's own quadrotor with a splat camera.
 
     python examples/drakes_quadrotor.py --out out/drakes_quadrotor.mp4
 
-`pydrake.examples.QuadrotorPlant`, whose four inputs are forces of propellers, hovers by Drake's LQR
-through a forest and is filmed on the way. `SplatCamera` asks for a pose, X_WB, and nothing else.
+`pydrake.examples.QuadrotorPlant`, whose four inputs are forces of propellers, flies to a hover by
+Drake's LQR and is filmed. The only input of `SplatCamera` is a pose, X_WB.
 """
 
 import argparse
@@ -21,7 +21,7 @@ from splatpilot.systems.visualization.video import VideoRecorder
 
 
 class PoseOfDrakesQuadrotor(LeafSystem):
-    """X_WB of a state (12): position, roll, pitch, yaw, and their derivatives."""
+    """Converts a state (12), position, roll, pitch, yaw and their derivatives, to X_WB."""
 
     def __init__(self):
         super().__init__()

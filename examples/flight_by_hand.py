@@ -1,9 +1,9 @@
-"""A flight diagram wired by hand: every system is added and connected by its ports' names.
+"""A flight diagram wired by hand: every system is added and connected by its port names.
 
     python examples/flight_by_hand.py
 
 The vehicle flies through a forest to its goal. `sp.BuildFlightDiagram` wires the same loop from a
-scenario; by hand, any of the systems can be another one, as long as it has the ports.
+scenario; by hand, any system can be replaced by another one with the same ports.
 """
 
 import argparse
@@ -51,10 +51,10 @@ def main(length: float, timeout: float) -> None:
 
     simulator.set_monitor(arrived)
     simulator.AdvanceTo(timeout)
-    ended = "at the goal" if root.get_time() < timeout else "on its way"
+    ended = "at the goal" if root.get_time() < timeout else "in flight"
     clearance = log.FindLog(root).data().min()
-    print(f"After {root.get_time():.1f} s {ended}; least clearance {clearance:.2f} m.")
-    # Nothing has been rendered until now: images are made when a port is evaluated.
+    print(f"After {root.get_time():.1f} s {ended}; minimum clearance {clearance:.2f} m.")
+    # This renders the first image: cameras render when a port is evaluated.
     image = camera.GetOutputPort("color_image").Eval(camera.GetMyContextFromRoot(root)).data
     print(f"The camera sees {image.shape[1]}x{image.shape[0]} pixels, mean {image.mean():.0f}.")
 

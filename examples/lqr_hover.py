@@ -2,9 +2,9 @@
 
     python examples/lqr_hover.py
 
-`LinearQuadraticRegulator` takes the plant and a Context at rest, differentiates it by AutoDiffXd,
-and returns a system to put in the place of `FlatnessController`. The quaternion needs no special
-care: the plant draws it to unit length, so that the direction that no command reaches is stable.
+`LinearQuadraticRegulator` differentiates the plant at rest by AutoDiffXd, and returns a controller
+that replaces `FlatnessController`. The plant pulls its quaternion to unit length, so that the
+uncontrollable direction is stable.
 """
 
 import argparse
@@ -39,7 +39,7 @@ def main(seconds: float) -> None:
     log = LogVectorOutput(plant.get_output_port(), builder, 0.02)
     simulator = Simulator(builder.Build())
 
-    # A meter away, moving, tilted by 30 degrees and turned by 40: the rest is linear control.
+    # A meter away, moving, tilted by 30 degrees, with a heading of 40 degrees.
     state = sp.hover_state(p_WG + np.array([1.0, -0.5, 0.3]))
     state[3:6] = [0.0, 1.0, 0.0]
     state[6:10] = RollPitchYaw(np.deg2rad([30.0, 0.0, 40.0])).ToQuaternion().wxyz()

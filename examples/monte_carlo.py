@@ -3,9 +3,8 @@
     pip install pandas
     python examples/monte_carlo.py --out out/monte_carlo
 
-Flies two policies through the same worlds with and without noise, and asks of `rollouts.csv`, a row
-a flight, what the report does not say: how often each arrives, how near to obstacles, and whether
-noise makes the difference. Run again, it flies what is missing.
+Flies two policies through the same worlds with and without noise. From `rollouts.csv`, with a row
+per flight, it computes success, clearance and the effect of noise. The same command resumes.
 """
 
 import argparse
@@ -41,7 +40,7 @@ def main(out: Path, scenarios: list[str], seeds: int, jobs: int | None) -> None:
     )
     print(summary.round(2).to_string())
 
-    # The same seed is the same world and start: pairs tell more than means.
+    # The same seed is the same world and start: pairs are more precise than means.
     pairs = flights.pivot_table(index=["scenario", "policy", "seed"], columns="observation",
                                 values="arrived", aggfunc="first")  # fmt: skip
     lost = pairs[pairs.clean.astype(bool) & ~pairs.noisy.astype(bool)]

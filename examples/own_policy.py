@@ -1,4 +1,4 @@
-"""An own policy in the benchmark, from a folder outside: one file, and nothing is installed.
+"""An own policy in the benchmark: one file, without installation.
 
     cd examples && splatpilot --import own_policy fly --policy own_policy:SidestepConfig
     splatpilot --import own_policy benchmark --policies own_policy:SidestepConfig,straight \\
@@ -6,8 +6,8 @@
 
 A policy is a LeafSystem with any of the inputs `state`, `goal` and images of a camera of its own,
 and one of the outputs `hypotheses`, `acceleration`, `velocity` and `waypoint`; and a dataclass that
-configures it. This one flies straight to the goal and sidesteps what is near in its depth image.
-A package of its own, with worlds and sensors too, is in `examples/hedgehop`.
+configures it. This one flies straight to the goal and avoids obstacles in its depth image.
+`examples/hedgehop` is a package of its own, with worlds and sensors too.
 """
 
 from dataclasses import dataclass, field
@@ -21,21 +21,13 @@ import splatpilot as sp
 
 
 @dataclass
-class SidestepConfig:
+class SidestepConfig(sp.Config):
     """Fields of `--set policy.X=` and of scenario files."""
 
-    # [m/s]
-    speed: float = 2.0
-    # [Hz] Decisions per second.
-    rate: float = 15.0
-    # [m] What is nearer than this is avoided.
-    reach: float = 4.0
+    speed: float = sp.bounded(2.0, "(0, 20] m/s")
+    rate: float = sp.bounded(15.0, "(0, 100] Hz")  # of updates
+    reach: float = sp.bounded(4.0, "(0, 20] m")  # depth below which obstacles are avoided
     camera: sp.OnboardCamera = field(default_factory=sp.OnboardCamera)
-
-    def validate(self) -> None:
-        """Raises ValueError on a value out of range."""
-        if not 0 < self.reach <= self.camera.max_depth:
-            raise ValueError(f"reach is {self.reach} m; it must be 0 to {self.camera.max_depth} m")
 
 
 class Sidestep(LeafSystem):
@@ -47,18 +39,18 @@ class Sidestep(LeafSystem):
         self.DeclareVectorInputPort("state", 13)
         self.DeclareVectorInputPort("goal", 3)
         self.DeclareAbstractInputPort("depth_image_32f", Value(ImageDepth32F()))
-        # What is decided is state of the Context: the output keeps it until the next decision.
+        # The velocity is state of the Context: the output keeps it until the next update.
         self.DeclareStateOutputPort("velocity", self.DeclareDiscreteState(3))
-        self.DeclarePeriodicDiscreteUpdateEvent(1 / config.rate, 0.0, self._decide)
+        self.DeclarePeriodicDiscreteUpdateEvent(1 / config.rate, 0.0, self._update)
 
-    def _decide(self, context: Context, discrete_state: DiscreteValues) -> None:
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         state = sp.QuadrotorState.of(self.GetInputPort("state").Eval(context))
-        way = self.GetInputPort("goal").Eval(context) - state.p_WB
+        offset = self.GetInputPort("goal").Eval(context) - state.p_WB
         depth = self.GetInputPort("depth_image_32f").Eval(context).data[..., 0]  # (H, W) [m]
         depth = depth[depth.shape[0] // 4 : 3 * depth.shape[0] // 4]  # neither sky nor ground
         near = np.clip(1 - depth / self._config.reach, 0, 1).max(axis=0)  # (W,) in [0, 1]
         left, right = np.split(near, 2)
-        ahead = way / max(np.linalg.norm(way), 1.0)
+        ahead = offset / max(np.linalg.norm(offset), 1.0)
         to_left = np.array([-ahead[1], ahead[0], 0.0])
         step = to_left * (right.mean() - left.mean()) * 4
         discrete_state.set_value(self._config.speed * (ahead * (1 - near.mean()) + step))

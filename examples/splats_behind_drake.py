@@ -1,10 +1,10 @@
-"""Splats behind an existing Drake simulation: one line adds a place to what its cameras see.
+"""Splats behind an existing Drake simulation: one line adds a scene to its camera images.
 
-    python examples/splats_behind_drake.py --out out/ball.png
+    python examples/splats_behind_drake.py --out out/sphere.png
 
-A ball of Drake's MultibodyPlant is thrown through a forest of Gaussians, and an RgbdSensor looks at
-both: trunks hide the ball, and the ball hides trunks. What is particular to splats is the line
-`AddRenderer`. Shapes are drawn by RenderEngineVtk, which needs OpenGL (see the README).
+A sphere of Drake's MultibodyPlant flies through a forest of Gaussians, and an RgbdSensor sees both:
+trunks hide the sphere, and the sphere hides trunks. Only the line `AddRenderer` is about splats.
+RenderEngineVtk draws shapes and needs OpenGL (see the README).
 """
 
 import argparse
@@ -37,9 +37,9 @@ def main(out: Path, width: int, seconds: float) -> None:
 
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=1e-3)
-    ball = plant.AddRigidBody("ball", SpatialInertia.SolidSphereWithMass(1.0, 0.2))
+    body = plant.AddRigidBody("sphere", SpatialInertia.SolidSphereWithMass(1.0, 0.2))
     red = np.array([0.8, 0.1, 0.1, 1.0])
-    plant.RegisterVisualGeometry(ball, RigidTransform(), Sphere(0.2), "ball", red)
+    plant.RegisterVisualGeometry(body, RigidTransform(), Sphere(0.2), "sphere", red)
     plant.Finalize()
 
     splats = sp.SplatRenderEngine(world.baked, background=world.background)
@@ -57,19 +57,19 @@ def main(out: Path, width: int, seconds: float) -> None:
 
     context = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
     p_WB, v_WB = world.p_WS + np.array([4.0, 2.5, -0.5]), [0.0, -3.0, 4.0]
-    plant.SetFloatingBaseBodyPoseInWorldFrame(context, ball, RigidTransform(p_WB))
-    plant.SetFreeBodySpatialVelocity(context, ball, SpatialVelocity(np.zeros(3), v_WB))
+    plant.SetFloatingBaseBodyPoseInWorldFrame(context, body, RigidTransform(p_WB))
+    plant.SetFreeBodySpatialVelocity(context, body, SpatialVelocity(np.zeros(3), v_WB))
     simulator.AdvanceTo(seconds)
     context = camera.GetMyContextFromRoot(simulator.get_context())
     image = camera.color_image_output_port().Eval(context).data
     depth = camera.depth_image_32F_output_port().Eval(context).data
     Image.fromarray(image[..., :3]).save(out)
-    print(f"Wrote {out}; the nearest thing in it is {depth.min():.2f} m away.")
+    print(f"Wrote {out}; the nearest surface in it is {depth.min():.2f} m away.")
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--out", type=Path, default=Path("ball.png"))
+    parser.add_argument("--out", type=Path, default=Path("sphere.png"))
     parser.add_argument("--width", type=int, default=640, help="of the image [px]")
     parser.add_argument("--seconds", type=float, default=0.5, help="until it is taken")
     main(**vars(parser.parse_args()))

@@ -1,5 +1,3 @@
-"""A small place, ray-traced in TartanAir's north-east-down convention by formulas of its own."""
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,5 +1,3 @@
-"""The public names of the package."""
-
 import subprocess
 import sys
 
@@ -14,14 +12,12 @@ def run(program: str) -> str:
 
 
 def test_every_public_name_is_there():
-    """Each name of the interface file loads, and is listed by dir()."""
     for name in sp.__all__:
         assert getattr(sp, name) is not None
         assert name in dir(sp) or name == "__version__"
 
 
 def test_importing_loads_nothing_heavy():
-    """`import splatpilot` loads neither Drake nor numpy nor torch; flying's names load no torch."""
     heavy = "{'pydrake', 'numpy', 'torch', 'scipy', 'cv2', 'matplotlib', 'pycolmap'}"
     assert run(f"import sys, splatpilot; print({heavy} & set(sys.modules))") == "set()"
     names = "sp.Scenario, sp.make_world, sp.BuildFlightDiagram, sp.fly, sp.SplatCamera, sp.Esdf"
@@ -29,7 +25,6 @@ def test_importing_loads_nothing_heavy():
 
 
 def test_version_is_the_distributions():
-    """`__version__` is what the installer knows."""
     from importlib.metadata import version
 
     assert sp.__version__ == version("splatpilot")

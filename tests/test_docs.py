@@ -1,7 +1,4 @@
-"""The documentation: the site builds, and what its pages say can be done."""
-
 import importlib
-import importlib.util
 import re
 import runpy
 import shlex
@@ -14,11 +11,9 @@ from typing import Any
 
 import pytest
 
+from splatpilot.analysis.commands.checks import SCENARIOS
 from splatpilot.analysis.commands.main import main
-from splatpilot.analysis.commands.options import SCENARIOS
-from splatpilot.analysis.faults.campaign import FaultsConfig
-from splatpilot.analysis.fidelity.fidelity import FidelityConfig
-from splatpilot.analysis.reconstruction.run import RenderedSceneConfig
+from splatpilot.analysis.commands.options import read_scenario
 from splatpilot.diagrams.flight.policies import POLICIES, policy_named
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.flight.sensors import SENSORS
@@ -28,38 +23,20 @@ from splatpilot.diagrams.worlds.world_registry import WORLDS
 from splatpilot.systems.common.config import load_config
 from splatpilot.systems.common.field_help import describe_fields
 from splatpilot.training.captures.capture_config import CaptureConfig
-from splatpilot.training.captures.check import CheckConfig
-from splatpilot.training.captures.render import RenderConfig
-from splatpilot.training.corpus.corpus import CorpusConfig
-from splatpilot.training.policies.trainer_registry import TRAINERS
-from splatpilot.training.reconstruction.config import ReconstructConfig
 
 ROOT = Path(__file__).parents[1]
 PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").glob("*.md"))]
 IMAGE = re.compile(r"!\[[^]]*\]\(([^)]+)\)")
 
-CONFIGS: dict[str, Any] = {
-    "reconstruct": ReconstructConfig,
-    "scene ablate": ReconstructConfig,
-    "scene fetch": RenderedSceneConfig,
-    "scene fidelity": FidelityConfig,
-    "hardware px4": Px4Config,
-    "hardware faults": FaultsConfig,
-    "capture check": CheckConfig,
-    "capture render": RenderConfig,
-    "corpus make": CorpusConfig,
-}
-"""What `--set` sets; the other verbs set a scenario or a policy's training."""
-
 
 def blocks(page: Path, *languages: str) -> list[str]:
-    """The code blocks of a page in these languages."""
+    """Returns the code blocks of a page in these languages."""
     found = re.findall(r"^```(\S*)\n(.*?)^```$", page.read_text(), re.DOTALL | re.MULTILINE)
     return [code for language, code in found if language in languages]
 
 
 def commands(page: Path) -> list[list[str]]:
-    """The commands in a page's code blocks, as words; variables of the shell are 1."""
+    """Returns the commands in the code blocks of a page, as words; shell variables are 1."""
     text = "\n".join(blocks(page, "", "bash")).replace("\\\n", " ").replace("&&", "\n")
     text = re.sub(r"\$\w+", "1", text)
     lines = [shlex.split(line, comments=True) for line in text.splitlines()]
@@ -67,12 +44,12 @@ def commands(page: Path) -> list[list[str]]:
 
 
 class ParsedError(BaseException):
-    """Raised in the place of running what was parsed; `main` reports all others."""
+    """Raised instead of running a parsed command; `main` reports all others."""
 
 
 @pytest.fixture
 def parse(monkeypatch):
-    """What the command line understands of words, which ends the test where it does not."""
+    """Parses a command line without running it."""
     whole, parsed = ArgumentParser.parse_args, []
 
     def parse_only(parser: ArgumentParser, *words: Any) -> None:
@@ -80,7 +57,7 @@ def parse(monkeypatch):
         raise ParsedError
 
     monkeypatch.setattr(ArgumentParser, "parse_args", parse_only)
-    # Modules that pages name for the reader to write are not there.
+    # Readers write the modules that pages name.
     monkeypatch.setattr("splatpilot.systems.common.registry.import_modules", lambda names: None)
 
     def parse(words: list[str]) -> Namespace:
@@ -91,27 +68,21 @@ def parse(monkeypatch):
     return parse
 
 
-def defaults(words: list[str], options: Namespace) -> Any:
-    """The configuration that a command's `--set` changes."""
-    for verb, config in CONFIGS.items():
-        if words[: len(verb.split())] == verb.split():
-            return config()
-    if words[0] == "train":
-        return TRAINERS.find(options.policies[0]).config()
-    if words[0] == "view" and options.what not in SCENARIOS:
+def default_config(options: Namespace) -> Any:
+    """Makes the configuration that a command's `--set` changes, without reading files."""
+    if options.command.name == "view" and options.what not in SCENARIOS:
         return CaptureConfig()
-    if words[0] == "recover":
-        return TRAINERS.find(options.policy).config()
+    if options.default_config is not read_scenario:
+        return options.default_config(options)
     scenario = Scenario()
-    policy = getattr(options, "policy", None)
-    if policy in POLICIES.names():
-        scenario.policy = policy_named(policy)
+    if options.policy in POLICIES.names():
+        scenario.policy = policy_named(options.policy)
     return scenario
 
 
 @pytest.fixture
 def hedgehop(monkeypatch):
-    """What the example package adds is known, as it is where that is installed."""
+    """Registers the entries of the example package."""
     for registry in (POLICIES, SENSORS, WORLDS):
         monkeypatch.setattr(registry, "_entries", dict(registry._entries))
     monkeypatch.syspath_prepend(str(ROOT / "examples" / "hedgehop"))
@@ -123,9 +94,7 @@ def hedgehop(monkeypatch):
 
 
 @pytest.mark.parametrize("page", PAGES, ids=[page.stem for page in PAGES])
-def test_commands_are_understood(page, parse, hedgehop):
-    """Every command of ours in a code block parses, and the fields that it sets are there and take
-    these values."""
+def test_commands_parse_and_their_fields_can_be_set(page, parse, hedgehop):
     pictures = runpy.run_path(str(ROOT / "docs" / "pictures.py"))["make_parser"]()
     for words in commands(page):
         words = words[1:] if words[0] == "srun" else words
@@ -135,18 +104,14 @@ def test_commands_are_understood(page, parse, hedgehop):
         if words[0] != "splatpilot":
             continue
         options = parse(words[1:])
-        verb = words[1:]
-        while verb[0] == "--import":
-            verb = verb[2:]
-        overrides = getattr(options, "overrides", [])
-        load_config(defaults(verb, options), overrides=overrides)
+        if hasattr(options, "overrides"):
+            load_config(default_config(options), overrides=options.overrides)
 
 
 @pytest.mark.parametrize(
     "page", [p for p in PAGES if blocks(p, "yaml")], ids=lambda page: page.stem
 )
-def test_files_are_understood(page, tmp_path):
-    """Every YAML file that is shown is one of the configurations, with values that they take."""
+def test_files_are_configurations(page, tmp_path):
     for text in blocks(page, "yaml"):
         if text.startswith("apiVersion:"):
             continue
@@ -167,7 +132,6 @@ def test_files_are_understood(page, tmp_path):
     ids=lambda page: page.stem,
 )
 def test_python_runs(page):
-    """Every Python block runs, those of a page one after the other, and what they fly ends."""
     names: dict[str, Any] = {}
     for code in blocks(page, "python"):
         exec(code, names)
@@ -176,7 +140,7 @@ def test_python_runs(page):
 
 
 def _anchors(page: Path) -> set[str]:
-    """What headings of a page can be linked by."""
+    """Returns the link targets of the headings of a page."""
     headings = re.findall(r"^#+ (.*)$", page.read_text(), re.MULTILINE)
     kept = [re.sub(r"[^\w\- ]", "", heading.lower()) for heading in headings]
     return {heading.strip().replace(" ", "-") for heading in kept}
@@ -184,7 +148,6 @@ def _anchors(page: Path) -> set[str]:
 
 @pytest.mark.parametrize("page", PAGES, ids=[page.stem for page in PAGES])
 def test_links_lead_somewhere(page):
-    """Files that a page links are there, and headings too."""
     text = re.sub(r"^```.*?^```$", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
     for link in re.findall(r"\]\(([^)\s]+)\)", text):
         path, _, anchor = link.partition("#")
@@ -196,7 +159,6 @@ def test_links_lead_somewhere(page):
 
 
 def test_every_picture_has_its_command():
-    """Each picture that a page shows is what a command of `pictures.md` ends with."""
     shown = {
         f"docs/{Path(image).name}" for page in PAGES for image in IMAGE.findall(page.read_text())
     }
@@ -205,36 +167,29 @@ def test_every_picture_has_its_command():
     assert shown <= made
 
 
-def load_results() -> Any:
-    """The script that writes the tables of pages."""
-    spec = importlib.util.spec_from_file_location("results", ROOT / "docs" / "results.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+RESULTS = runpy.run_path(str(ROOT / "docs" / "results.py"))
 
 
 @pytest.mark.parametrize("page", PAGES, ids=[page.stem for page in PAGES])
 def test_tables_of_pages_are_those_of_the_results(page):
-    assert load_results().with_tables(page.read_text()) == page.read_text()
+    assert RESULTS["with_tables"](page.read_text()) == page.read_text()
 
 
 @pytest.mark.parametrize("page", [p for p in PAGES if p.stem != "CHANGELOG"], ids=lambda p: p.stem)
 def test_success_of_flights_stands_in_tables_of_results_alone(page):
-    text = load_results().TABLE.sub("", page.read_text())
+    text = RESULTS["TABLE"].sub("", page.read_text())
     success = r"\d+/\d+ \(\d+ ?%\)|\d+ of (its )?\d+ (flights|goals)|arrives? in \d+|\d+/\d\d+ at"
     assert not re.findall(success, text)
 
 
 @pytest.fixture(scope="module")
 def configurations() -> list[Any]:
-    """Those that the page of configurations has sections of."""
+    """The configurations on their page."""
     page = runpy.run_path(str(ROOT / "docs" / "_ext" / "configuration_page.py"))
     return [config for _, _, group in page["configurations"]() for config in group]
 
 
 def test_every_field_has_a_description(configurations):
-    """Each field of ours says what it is, in more than a unit."""
     for config in configurations:
         if not type(config).__module__.startswith("splatpilot."):
             continue  # Drake's, and those that other tests have registered.
@@ -243,18 +198,15 @@ def test_every_field_has_a_description(configurations):
             assert len(said) > 3, f"{type(config).__name__}.{field.name}: {field.text!r}"
 
 
-def test_every_configuration_of_a_verb_is_there(configurations):
-    """What the command line loads a file or overrides into has a section."""
+def test_every_configuration_of_a_command_has_a_section(configurations):
     loaded = set()
     for module in (ROOT / "analysis" / "commands").glob("*.py"):
-        loaded |= set(re.findall(r"\b(\w+Config|Scenario)\(\)", module.read_text()))
+        loaded |= set(re.findall(r"\b(\w+Config|Scenario)(?:\(\)|\")", module.read_text()))
     assert len(loaded) >= 8
     assert loaded <= {type(config).__name__ for config in configurations}
 
 
 def test_site_builds(tmp_path):
-    """Without a warning; every public name and every system is in its index, and every field of a
-    scenario on the page of configurations."""
     command = [sys.executable, "-m", "sphinx", "--fail-on-warning", "--keep-going", "--quiet"]
     done = subprocess.run(
         [*command, str(ROOT / "docs"), str(tmp_path)], capture_output=True, text=True

@@ -1,5 +1,3 @@
-"""The package as others get it: a wheel in an environment of its own, outside the checkout."""
-
 import csv
 import os
 import subprocess
@@ -58,7 +56,6 @@ def run(environment, tmp_path):
 
 
 def test_distributions_are_complete(distributions):
-    """Both hold every file at its import name, and the wheel the native module."""
     sdist, wheel = distributions
     files = {
         f"splatpilot/{path.relative_to(PACKAGE).as_posix()}"
@@ -78,7 +75,6 @@ def test_distributions_are_complete(distributions):
 
 
 def test_installation_is_light(environment, run):
-    """What flies needs less than 1.2 GB of disk, and neither torch nor pycolmap."""
     sizes = {f.stat().st_ino: f.stat().st_size for f in environment.rglob("*") if f.is_file()}
     print(f"{sum(sizes.values()) / 1e6:.0f} MB")
     assert sum(sizes.values()) < MAX_SIZE
@@ -87,7 +83,6 @@ def test_installation_is_light(environment, run):
 
 
 def test_flies(run, tmp_path):
-    """`splatpilot fly` of the installed package leaves a flight."""
     (tmp_path / "short.yaml").write_text(SHORT)
     flown = run("splatpilot", "fly", "--scenario", "short.yaml", "--out", "flight")
     assert flown.returncode == 0, flown.stderr
@@ -96,7 +91,6 @@ def test_flies(run, tmp_path):
 
 
 def test_benchmarks(run, tmp_path):
-    """Every policy flies in a study of the installed package, which ends in a report."""
     (tmp_path / "short.yaml").write_text(SHORT)
     study = run(
         "splatpilot", "benchmark", "--scenarios", "short.yaml", "--seeds", "1", "--out", "study"
@@ -120,8 +114,7 @@ def test_benchmarks(run, tmp_path):
         (["capture", "check", "photographs"], "pycolmap", "photos"),
     ],
 )
-def test_verb_without_its_extra_says_which(run, tmp_path, words, missing, extra):
-    """A verb that needs more than is installed ends with one line that says what to install."""
+def test_a_command_names_its_missing_extra(run, tmp_path, words, missing, extra):
     (tmp_path / "photographs").mkdir()
     for number in range(3):
         picture = tmp_path / "photographs" / f"{number}.jpg"

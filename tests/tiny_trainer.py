@@ -1,5 +1,3 @@
-"""A trainer without worlds, for tests of the training loop."""
-
 from dataclasses import dataclass, field
 
 import torch

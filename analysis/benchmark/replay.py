@@ -3,14 +3,14 @@
 import platform
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple, cast
 
 import numpy as np
 
 from splatpilot.analysis.benchmark.rollout import digest, study_world
 from splatpilot.analysis.benchmark.study import RolloutSpec
-from splatpilot.analysis.benchmark.study_folder import StudyFolder, foreign_code, kept_flights
-from splatpilot.diagrams.flight.flight import Flight
+from splatpilot.analysis.benchmark.study_folder import StudyFolder, kept_flights, plugin_digests
+from splatpilot.analysis.benchmark.tables import Row
 from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
 from splatpilot.diagrams.flight.fly import (
     fly_with_bar,
@@ -29,12 +29,8 @@ from splatpilot.systems.visualization.video import VideoRecorder
 class Agreement(NamedTuple):
     """Agreement of a flight with its record."""
 
-    exact: bool
-    """True if both are bitwise identical."""
-    deviation: float
-    """[m], maximum distance at the same time."""
-    outcome: str
-    """Outcome of the flight, not of its record."""
+    exact: bool  # bitwise identical
+    deviation: float  # [m], maximum distance at the same time
 
 
 def run(
@@ -57,17 +53,9 @@ def run(
         meshcat: writes `flight.html`, a page with the flight.
         video: writes `flight.mp4` of the onboard camera.
         overwrite: replaces an earlier replay in `out`.
-
-    Raises:
-        FileExistsError: if there is an earlier replay, and not `overwrite`.
-        FileNotFoundError: if there is no study, or the flight is missing.
-        ValueError: if the study has no such flight, or its file is damaged.
     """
     folder = StudyFolder(study)
-    spec = find_flight(folder, id)
-    row, recorded = _record(folder, spec)
-    if not recorded:
-        raise ValueError(f"{id} could not be flown and cannot be compared: {row['reason']}")
+    spec, row, recorded = _read_flight(folder, id)
     _, scenario = next(kept_flights(folder, [spec]))
     world = study_world(scenario)
     out = out or study / "replays" / id
@@ -77,28 +65,29 @@ def run(
         require_writable_folder(out)
     diagram = BuildFlightDiagram(scenario, world, video=filmed, camera=filmed)
     flight = fly_with_bar(diagram, scenario, world)
-    if filmed:
-        recorder = cast(VideoRecorder, diagram.GetSubsystemByName("video"))
-        if meshcat:
-            frames = recorded_frames(recorder, scenario)
-            shown = replayed_flight(id, flight, frames)
-            write_flight_page(out / "flight.html", scenario, world, [shown])
-        if video:
-            recorder.save(out / "flight.mp4", scenario.camera.z_far)
-    result = compare(flight, recorded, row["digest"])
-    print(f"{id}: {result.outcome} after {flight.times[-1]:.2f} s")
-    if result.exact:
+    recorder = cast(VideoRecorder, diagram.GetSubsystemByName("video")) if filmed else None
+    if recorder is not None and meshcat:
+        shown = replayed_flight(id, flight, recorded_frames(recorder, scenario))
+        write_flight_page(out / "flight.html", scenario, world, [shown])
+    if recorder is not None and video:
+        recorder.save(out / "flight.mp4", scenario.camera.z_far)
+    common = min(len(flight.times), len(recorded["times"]))
+    states = flight.states[:common], recorded["states"][:common]
+    flown, before = (QuadrotorState.of(each).p_WB for each in states)
+    deviation = float(np.linalg.norm(flown - before, axis=1).max())
+    agreement = Agreement(digest(flight) == row["digest"], deviation)
+    print(f"{id}: {flight.outcome} after {flight.times[-1]:.2f} s")
+    if agreement.exact:
         print("The replay is bitwise identical to the recorded flight.")
     else:
         print(
             f"THE REPLAY DIFFERS from the recorded flight ({row['outcome']}) by up to "
-            f"{result.deviation:.3g} m. {_likely_reason(folder, spec, scenario)}."
+            f"{deviation:.3g} m. {_likely_reason(folder, spec, scenario)}."
         )
     if filmed:
         files = {"flight.html": meshcat, "flight.mp4": video}
-        written = [name for name, write in files.items() if write]
-        print(f"Wrote {' and '.join(written)} in {out}")
-    return result
+        print(f"Wrote {' and '.join(name for name, write in files.items() if write)} in {out}")
+    return agreement
 
 
 def overlay(
@@ -116,25 +105,16 @@ def overlay(
 
     Returns:
         The page.
-
-    Raises:
-        FileExistsError, FileNotFoundError, ValueError: as `run`, or for flights of different
-            scenarios or seeds.
     """
     folder = StudyFolder(study)
-    specs = [find_flight(folder, id) for id in ids]
-    first = specs[0]
-    for spec in specs:
+    records = [_read_flight(folder, id) for id in ids]
+    first, flights = records[0][0], []
+    for spec, row, arrays in records:
         if (spec.scenario, spec.seed) != (first.scenario, first.seed):
             raise ValueError(
                 f"{spec.id} flew another world than {first.id}; name flights of one scenario and "
                 "seed"
             )
-    flights = []
-    for spec in specs:
-        row, arrays = _record(folder, spec)
-        if not arrays:
-            raise ValueError(f"{spec.id} could not be flown and cannot be shown: {row['reason']}")
         times, states, clearances = (
             arrays[name].astype(float) for name in ("times", "states", "clearances")
         )
@@ -150,31 +130,29 @@ def overlay(
     return page
 
 
-def find_flight(folder: StudyFolder, id: str) -> RolloutSpec:
-    """Finds a flight of a study by its name."""
+def _read_flight(folder: StudyFolder, id: str) -> tuple[RolloutSpec, Row, dict[str, np.ndarray]]:
+    """Reads a flight of a study by its name."""
     specs = {spec.id: spec for spec in folder.config().rollouts()}
     if id not in specs:
         raise ValueError(
             f"{folder.path} has no flight {id!r}; its flights are named like {next(iter(specs))}, "
             "see rollouts.csv"
         )
-    return specs[id]
-
-
-def _record(folder: StudyFolder, spec: RolloutSpec) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Reads a flight; the error of a missing one has a remedy."""
     try:
-        return folder.read(spec)
+        row, arrays = folder.read(specs[id])
     except FileNotFoundError:
         raise FileNotFoundError(
-            f"{spec.id} has not been flown yet in {folder.path}; run the study again, it resumes"
+            f"{id} has not been flown yet in {folder.path}; run the study again, it resumes"
         ) from None
+    if not arrays:
+        raise ValueError(f"{id} could not be flown and has no record: {row['reason']}")
+    return specs[id], row, arrays
 
 
 def _likely_reason(folder: StudyFolder, spec: RolloutSpec, scenario: Scenario) -> str:
     """Returns the likely reason of a difference: program, machine or policy."""
     recorded = folder.program()
-    for name, version in (program() | foreign_code([scenario])).items():
+    for name, version in (program() | plugin_digests([scenario])).items():
         if recorded.get(name) != version:
             return f"It was flown by {name} {recorded.get(name, 'unknown')}, this is {version}"
     host = folder.read_timing(spec.id).get("host", "an unknown machine")
@@ -187,13 +165,3 @@ def _likely_reason(folder: StudyFolder, spec: RolloutSpec, scenario: Scenario) -
         f"It was flown by this program and machine: {spec.policy} keeps state outside of the "
         "Context, or draws random numbers without the seed"
     )
-
-
-def compare(flight: Flight, recorded: dict[str, np.ndarray], recorded_digest: str) -> Agreement:
-    """Compares a flight with the arrays and the digest in a study."""
-    common = min(len(flight.times), len(recorded["times"]))
-    flown, before = (
-        QuadrotorState.of(states[:common]).p_WB for states in (flight.states, recorded["states"])
-    )
-    deviation = float(np.linalg.norm(flown - before, axis=1).max())
-    return Agreement(digest(flight) == recorded_digest, deviation, str(flight.outcome))

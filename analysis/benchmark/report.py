@@ -2,25 +2,23 @@
 
 import base64
 import math
-from collections.abc import Callable
 from html import escape
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from splatpilot.analysis.benchmark.external import SOURCES, external_table
 from splatpilot.analysis.benchmark.study import RolloutSpec, StudyConfig
 from splatpilot.analysis.benchmark.study_folder import StudyFolder, kept_flights, kept_scenario
 from splatpilot.analysis.benchmark.tables import (
     FAILURES,
     IN_DISTRIBUTION,
     PAPER_FLIGHTS,
+    SOURCES,
     PaperRow,
     Row,
     compare,
-    mean_of,
+    mean_column,
     paper_rows,
     select,
     success_summary,
@@ -28,7 +26,6 @@ from splatpilot.analysis.benchmark.tables import (
 from splatpilot.analysis.output import write_png
 from splatpilot.diagrams.flight.blocks import goal_position
 from splatpilot.diagrams.worlds.scene_folder import SceneSource
-from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.common.files import written_atomically
 from splatpilot.systems.common.seeds import SPLIT_NAMES, describe_seeds
@@ -62,6 +59,7 @@ def write_report(
     rows: list[Row],
     timings: list[Row],
     table: list[Row],
+    external: list[Row],
     absent: dict[str, str],
     damaged: list[str],
 ) -> None:
@@ -70,22 +68,21 @@ def write_report(
 
     Args:
         folder, config: the study.
-        rows: of its flights.
-        timings: of the same flights.
-        table: `policy_table` of them.
+        rows, timings: of its flights.
+        table, external: `policy_table` and `external_table` of them.
         absent: reasons of the scenarios that were not flown.
-        damaged: files that were flown again in this run.
+        damaged: errors of files that were flown again in this run.
     """
     paper = paper_rows(config, absent)
-    figure = draw_success_against_speed(table, config.policy_names, paper)
-    success = write_png(figure, folder.path / "success_against_speed.png")
     seeds = SPLIT_NAMES[config.split] + " seeds"
     title = f"Navigation benchmark, {seeds}"
     sections = {
         f"Policies, {seeds}": _policies(table) + _timing(config, rows, timings),
         f"Comparison with the paper's Table I, {seeds}": _paper(table, paper),
-        f"Comparison with published results, {seeds}": external_section(rows, config),
-        f"Success against speed, {seeds}": _image(success, "Success rate against velocity"),
+        f"Comparison with published results, {seeds}": external_section(external),
+        f"Success against speed, {seeds}": _success_against_speed(
+            folder, table, config.policy_names, paper
+        ),
         "Trajectories through one field": _trajectories(folder, config, rows),
         f"Pairs of policies on the same flights, {seeds}": _pairs(config, rows),
         f"Scenarios, {seeds}": _scenarios(folder, config, rows, absent),
@@ -123,13 +120,13 @@ def _note(text: str) -> str:
     return f'<p class="note">{text}</p>'
 
 
-def _number(form: str) -> Callable[[float], str]:
-    """Returns the format of a column, a dash for what is not finite."""
-    return lambda value: format(value, form) if math.isfinite(value) else "–"
+def _number(value: float, form: str) -> str:
+    return format(value, form) if math.isfinite(value) else "–"
 
 
-def _interval(row: Row, kind: str) -> str:
-    return f"<span class=note>[{row[f'{kind}_lower']:.0%}, {row[f'{kind}_upper']:.0%}]</span>"
+def _interval(row: Row, kind: str) -> _Html:
+    lower, upper = row[f"{kind}_lower"], row[f"{kind}_upper"]
+    return _Html(f"<span class=note>[{lower:.0%}, {upper:.0%}]</span>")
 
 
 def _rate(row: Row) -> _Html:
@@ -138,12 +135,13 @@ def _rate(row: Row) -> _Html:
     return _Html(f"{row['successes'] / row['flights']:.0%} {_interval(row, 'wilson')}")
 
 
-def _clusters(row: Row) -> _Html:
-    return _Html(_interval(row, "cluster"))
+def _success_cells(row: Row) -> list[str]:
+    """Returns the cells of the columns `_SUCCESS`."""
+    passed = f"{row['scenarios_passed']}/{row['scenarios']}"
+    return [_rate(row), _interval(row, "cluster"), passed]
 
 
-def _passed(row: Row) -> str:
-    return f"{row['scenarios_passed']}/{row['scenarios']}"
+_SUCCESS = ["success", "new scenarios", "scenarios passed"]
 
 
 def _scope(config: StudyConfig, rows: list[Row]) -> str:
@@ -181,14 +179,12 @@ _MEANS = {
 
 
 def _policies(table: list[Row]) -> str:
-    header = ["policy", "speed [m/s]", "flights", "success", "new scenarios"]
-    header += [outcome.replace("_", " ") for outcome in FAILURES]
-    header += ["not run", "scenarios passed", *_MEANS]
+    outcomes = [outcome.replace("_", " ") for outcome in FAILURES]
+    header = ["policy", "speed [m/s]", "flights", *_SUCCESS, *outcomes, "not run", *_MEANS]
     rows = [
-        [row["policy"], f"{row['speed']:g}", row["flights"], _rate(row), _clusters(row)]
-        + [row[outcome] for outcome in FAILURES]
-        + [row["not_run"], _passed(row)]
-        + [_number(form)(row[name]) for name, form in _MEANS.values()]
+        [row["policy"], f"{row['speed']:g}", row["flights"], *_success_cells(row)]
+        + [row[outcome] for outcome in (*FAILURES, "not_run")]
+        + [_number(row[name], form) for name, form in _MEANS.values()]
         for row in table
     ]
     return _table(header, rows)
@@ -200,16 +196,15 @@ def _timing(config: StudyConfig, rows: list[Row], timings: list[Row]) -> str:
     lines = []
     for policy in config.policy_names:
         times = [t for r, t in zip(rows, timings, strict=True) if r["policy"] == policy]
-        lines.append([policy, *(_number(".1f")(mean_of(times, name)) for name in names)])
+        lines.append([policy, *(_number(mean_column(times, name), ".1f") for name in names)])
     return "<p>Mean times, of this machine and its load:</p>" + _table(header, lines)
 
 
 def _paper(table: list[Row], paper: dict[str, PaperRow]) -> str:
     if not paper:
         return ""
-    header = ["policy", "method in the paper", "success, paper", "success, here", "new scenarios"]
-    header += ["scenarios passed", "clearance, paper [m]", "here [m]"]
-    header += ["velocity, paper [m/s]", "here [m/s]"]
+    header = ["policy", "method in the paper", "success, paper", *_SUCCESS]
+    header += ["clearance, paper [m]", "here [m]", "velocity, paper [m/s]", "here [m/s]"]
     rows = []
     for row in table:
         if row["policy"] not in paper:
@@ -217,9 +212,9 @@ def _paper(table: list[Row], paper: dict[str, PaperRow]) -> str:
         theirs = paper[row["policy"]]
         name = f"{row['policy']} at {row['speed']:g} m/s"
         rate = f"{theirs.successes}/{PAPER_FLIGHTS} ({theirs.successes / PAPER_FLIGHTS:.0%})"
-        cells = [name, theirs.method, rate, _rate(row), _clusters(row), _passed(row)]
+        cells = [name, theirs.method, rate, *_success_cells(row)]
         for metric, form in (("min_clearance_m", "+.2f"), ("mean_speed_m_s", ".2f")):
-            cells += [f"{getattr(theirs, metric):{form}}", _number(form)(row[metric])]
+            cells += [f"{getattr(theirs, metric):{form}}", _number(row[metric], form)]
         rows.append(cells)
     return _table(header, rows) + _note(
         "The paper flew one flight in each of its own 17 scenarios, in Isaac Sim; the scenarios "
@@ -230,36 +225,26 @@ def _paper(table: list[Row], paper: dict[str, PaperRow]) -> str:
     )
 
 
-def external_section(rows: list[Row], config: StudyConfig) -> str:
-    """Formats the external table in HTML; empty if there is none."""
-    table = external_table(rows, config)
+def external_section(table: list[Row]) -> str:
+    """Formats the external table in HTML; empty if it is."""
     if not table:
         return ""
     header = ["scenario", "policy", "speed [m/s]", "velocity [m/s]", "success"]
-    lines = [
-        [
-            row["scenario"],
-            row["policy"],
-            "published" if row["speed"] is None else f"{row['speed']:g}",
-            _number(".2f")(row["mean_speed_m_s"]),
-            _Html(f"{row['successes']}/{row['flights']} {_interval(row, 'wilson')}"),
-        ]
-        for row in table
-    ]
+    lines = []
+    for row in table:
+        speed = "published" if row["speed"] is None else f"{row['speed']:g}"
+        rate = _Html(f"{row['successes']}/{row['flights']} {_interval(row, 'wilson')}")
+        velocity = _number(row["mean_speed_m_s"], ".2f")
+        lines.append([row["scenario"], row["policy"], speed, velocity, rate])
     return _table(header, lines) + _note(escape(SOURCES))
 
 
 def _pairs(config: StudyConfig, rows: list[Row]) -> str:
-    lines = [
-        [
-            f"{pair.first} and {pair.second}",
-            f"{pair.speed:g}",
-            pair.only_first,
-            pair.only_second,
-            *(f"{p:.3f}" if p >= 0.001 else f"{p:.0e}" for p in (pair.p_seeds, pair.p_scenarios)),
-        ]
-        for pair in compare(rows, config)
-    ]
+    lines = []
+    for pair in compare(rows, config):
+        names = f"{pair.first} and {pair.second}"
+        p_values = (f"{p:.3f}" if p >= 0.001 else f"{p:.0e}" for p in pair[-2:])
+        lines.append([names, f"{pair.speed:g}", pair.only_first, pair.only_second, *p_values])
     if not lines:
         return "<p>One policy: nothing to compare.</p>"
     header = ["policies", "speed [m/s]", "only the first succeeds", "only the second"]
@@ -299,7 +284,7 @@ def _flights(rows: list[Row]) -> str:
     for name in dict.fromkeys(row["scenario"] for row in rows):
         lines = [
             [row["id"], row["outcome"]]
-            + [_number(form)(row.get(column, math.nan)) for column, form in columns.items()]
+            + [_number(row.get(column, math.nan), form) for column, form in columns.items()]
             + [_Html(f"<code>splatpilot replay . {escape(row['id'])} --meshcat</code>")]
             for row in select(rows, scenario=name)
         ]
@@ -313,17 +298,15 @@ def _color(policy: str, policies: list[str]) -> str:
     return _COLORS[policies.index(policy) % len(_COLORS)]
 
 
-def draw_success_against_speed(
-    table: list[Row], policies: list[str], paper: dict[str, PaperRow]
-) -> Figure:
-    """Draws Fig. 5: success rate with its 95 % interval against mean velocity, a line for each
-    policy through its nominal speeds, with the paper's points."""
+def _success_against_speed(
+    folder: StudyFolder, table: list[Row], policies: list[str], paper: dict[str, PaperRow]
+) -> str:
+    """Draws Fig. 5 as `success_against_speed.png`: success rate with its 95 % interval against mean
+    velocity, a line for each policy, with the paper's points; returns its HTML."""
     figure = Figure(figsize=(7.2, 4.6), layout="constrained")
     axes = figure.subplots()
     for policy in policies:
         rows = [row for row in table if row["policy"] == policy and row["flights"]]
-        if not rows:
-            continue
         rows.sort(key=lambda row: row["speed"])
         names = "mean_speed_m_s", "success_rate", "wilson_lower", "wilson_upper"
         speeds, rates, lower, upper = (np.array([row[name] for row in rows]) for name in names)
@@ -339,95 +322,62 @@ def draw_success_against_speed(
     axes.set(xlabel="mean flight velocity [m/s]", ylabel="success rate [%]", ylim=(-3, 103))
     axes.grid(alpha=0.3)
     axes.legend(frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
-    return figure
+    png = write_png(figure, folder.path / "success_against_speed.png")
+    return _image(png, "Success rate against velocity")
 
 
-def _draw_field(axes: Axes, world: World, height: float) -> None:
-    """Draws obstacles at a height [m] from above, and where the vehicle's center cannot be."""
-    field = world.distance_field
+def _trajectories(folder: StudyFolder, config: StudyConfig, rows: list[Row]) -> str:
+    """Draws Fig. 6, flights through one field, as `trajectories.png`; returns its HTML."""
+    spec = _telling_flight(rows)
+    _, scenario = next(kept_flights(folder, [spec]))
+    world = make_world(scenario.world, scenario.seed)
+    field, p_WG = world.distance_field, goal_position(scenario, world)
+    extent = field.upper_W - field.lower_W
+    legend_rows = math.ceil(len(config.policies) / _LEGEND_COLUMNS)
+    height = float(np.clip(9.0 * extent[1] / extent[0], 2.5, 9.0)) + 0.8 + 0.25 * legend_rows
+    figure = Figure(figsize=(9.0, height), layout="constrained")
+    axes = figure.subplots()
     x, y = (
         np.arange(low + _SPACING / 2, high, _SPACING)
         for low, high in zip(field.lower_W[:2], field.upper_W[:2], strict=True)
     )
-    points = np.stack([*np.meshgrid(x, y), np.full((len(y), len(x)), height)], axis=-1)
+    points = np.stack([*np.meshgrid(x, y), np.full((len(y), len(x)), p_WG[2])], axis=-1)
     distance = np.minimum(np.nan_to_num(field.distance(points), nan=np.inf), 10.0)
     levels = [-1e3, 0.0, VEHICLE_RADIUS]
     axes.contourf(x, y, distance, levels=levels, colors=[_OBSTACLE, _BLOCKED])
-    axes.set_aspect("equal")
-    axes.set_xlim(field.lower_W[0], field.upper_W[0])
-    axes.set_ylim(field.lower_W[1], field.upper_W[1])
-
-
-def draw_trajectories(
-    world: World,
-    flights: dict[str, tuple[np.ndarray, str]],
-    p_WS: np.ndarray,
-    p_WG: np.ndarray,
-    policies: list[str],
-    title: str,
-) -> Figure:
-    """Draws Fig. 6: flights through one field from above.
-
-    Args:
-        world: the field.
-        flights: positions p_WB (N, 3) [m] and outcome, by policy.
-        p_WS, p_WG: start and goal (3,) [m].
-        policies: of the study, for their colors.
-        title: of the figure.
-    """
-    extent = world.distance_field.upper_W - world.distance_field.lower_W
-    legend_rows = math.ceil(len(flights) / _LEGEND_COLUMNS)
-    height = float(np.clip(9.0 * extent[1] / extent[0], 2.5, 9.0)) + 0.8 + 0.25 * legend_rows
-    figure = Figure(figsize=(9.0, height), layout="constrained")
-    axes = figure.subplots()
-    _draw_field(axes, world, float(p_WG[2]))
-    for policy, (p_WB, outcome) in flights.items():
-        color = _color(policy, policies)
-        axes.plot(p_WB[:, 0], p_WB[:, 1], color=color, lw=1.8, label=f"{policy}: {outcome}")
-        if outcome != "goal" and len(p_WB):
+    p_WS = world.p_WS
+    for policy in config.policy_names:
+        row, arrays = folder.read(spec._replace(policy=policy))
+        if not arrays:
+            continue
+        p_WB = QuadrotorState.of(arrays["states"]).p_WB
+        p_WS, color = p_WB[0], _color(policy, config.policy_names)
+        label = f"{policy}: {row['outcome']}"
+        axes.plot(p_WB[:, 0], p_WB[:, 1], color=color, lw=1.8, label=label)
+        if row["outcome"] != "goal":
             axes.plot(*p_WB[-1, :2], "X", color=color, ms=10, mec="white", zorder=5)
     axes.plot(*p_WS[:2], "o", color="black", ms=7, zorder=5)
     axes.plot(*p_WG[:2], "*", color="black", ms=13, zorder=5)
-    axes.set(xlabel="x [m]", ylabel="y [m]", title=title)
-    if flights:
-        figure.legend(frameon=False, loc="outside lower center", ncols=_LEGEND_COLUMNS)
-    return figure
-
-
-def _trajectories(folder: StudyFolder, config: StudyConfig, rows: list[Row]) -> str:
-    """Writes `trajectories.png` of the most telling field, and returns its HTML."""
-    spec = _telling_flight(rows)
-    if spec is None:
-        return "<p>Nothing was flown.</p>"
-    _, scenario = next(kept_flights(folder, [spec]))
-    world = make_world(scenario.world, scenario.seed)
-    flights = {}
-    for policy in config.policy_names:
-        row, arrays = folder.read(spec._replace(policy=policy))
-        if arrays:
-            flights[policy] = QuadrotorState.of(arrays["states"]).p_WB, row["outcome"]
-    p_WS = next((p_WB[0] for p_WB, _ in flights.values()), world.p_WS)
     title = f"{spec.scenario}, seed {spec.seed}, {spec.speed:g} m/s"
-    p_WG = goal_position(scenario, world)
-    figure = draw_trajectories(world, flights, p_WS, p_WG, config.policy_names, title)
+    axes.set(xlabel="x [m]", ylabel="y [m]", title=title, aspect="equal")
+    axes.set(xlim=(x[0], x[-1]), ylim=(y[0], y[-1]))
+    if axes.get_legend_handles_labels()[0]:
+        figure.legend(frameon=False, loc="outside lower center", ncols=_LEGEND_COLUMNS)
     return _image(write_png(figure, folder.path / "trajectories.png"), title) + _note(
         "Dark: obstacles at the height of the goal, from the distance field; light: where the "
         "vehicle's center would collide."
     )
 
 
-def _telling_flight(rows: list[Row]) -> RolloutSpec | None:
-    """Returns a flight of the field whose flights differ most in success, or None."""
+def _telling_flight(rows: list[Row]) -> RolloutSpec:
+    """Returns a flight of the field whose flights differ most in success."""
     fields: dict[tuple, list[Row]] = {}
     for row in rows:
         fields.setdefault((row["scenario"], row["speed"], row["seed"]), []).append(row)
 
     def variety(flown: list[Row]) -> tuple[int, int, float]:
         wins = sum(row["success"] for row in flown)
-        length = sum(row.get("path_length_m", 0.0) for row in flown)
-        return min(wins, len(flown) - wins), wins, length
+        return min(wins, len(flown) - wins), wins, sum(r.get("path_length_m", 0.0) for r in flown)
 
-    if not fields:
-        return None
     row = max(fields.values(), key=variety)[0]
-    return RolloutSpec(row["scenario"], row["policy"], row["speed"], row["seed"])
+    return RolloutSpec(*(row[name] for name in RolloutSpec._fields))

@@ -3,13 +3,12 @@
 import functools
 import hashlib
 import io
-import itertools
 import json
 import math
 import platform
 import time
 import traceback
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -30,13 +29,38 @@ from splatpilot.systems.common.registry import import_modules
 from splatpilot.systems.policies.time_of_arrival import TimeOfArrival, path_lengths
 from splatpilot.systems.vehicle.state import QuadrotorState
 
+ARRAYS = "times", "states", "commands", "clearances"
+"""The arrays of `Flight` in a study."""
+
+INFEASIBLE = "infeasible"
+"""The outcome of a flight that cannot start (`InfeasibleFlightError`), a failure with a reason. One
+that becomes infeasible in flight has `Outcome.ERROR`."""
+
 _JERK_STRIDE = 5
 """Samples between differentiated velocities: 0.1 s, beyond the controller's steps of 0.02 s."""
+_MAX_WORLDS = 2  # in the cache of a process
+
+
+class Rollout(NamedTuple):
+    """A flight in a study."""
+
+    row: dict[str, Any]  # specification and metrics, deterministic
+    trajectory: bytes
+    """An .npz with `row` (JSON) and `ARRAYS` in single precision, deterministic."""
+    timing: dict[str, Any]  # times and machine
+
+
+class Fault(NamedTuple):
+    """An exception that is not a failure of its flight."""
+
+    id: str  # of the flight
+    reason: str  # the exception in one line
+    traceback: str
 
 
 def flight_metrics(flight: Flight, shortest: float) -> dict[str, float | str | bool]:
     """
-    Returns the metrics of a flight, by their columns.
+    Computes the metrics of a flight, by their columns.
 
     - `success`: reached the goal, with a clearance at the vehicle's radius that is never negative;
     - `outcome`: `goal`, `collision`, `left_volume`, `timeout` or `error`;
@@ -54,12 +78,12 @@ def flight_metrics(flight: Flight, shortest: float) -> dict[str, float | str | b
     summary = flight.summary()
     arrived = flight.outcome == Outcome.GOAL
     clearance = float(np.nanmin(flight.clearances))
-    length, duration = float(summary["path_length_m"]), float(summary["flight_time_s"])
+    length = float(summary["path_length_m"])
     jerk, smoothness = jerk_metrics(QuadrotorState.of(flight.states).v_WB, flight.times)
     return {
         "success": arrived and clearance >= 0.0,
         "outcome": str(flight.outcome),
-        "flight_time_s": duration,
+        "flight_time_s": float(summary["flight_time_s"]),
         "path_length_m": length,
         "mean_speed_m_s": float(summary["mean_speed_m_s"]),
         "min_clearance_m": clearance,
@@ -71,7 +95,7 @@ def flight_metrics(flight: Flight, shortest: float) -> dict[str, float | str | b
 
 
 def jerk_metrics(velocities: np.ndarray, times: np.ndarray) -> tuple[float, float]:
-    """Returns root mean square jerk [m/s^3] and smoothness [-] of velocities (N, 3) [m/s] at times
+    """Computes root mean square jerk [m/s^3] and smoothness [-] of velocities (N, 3) [m/s] at times
     (N,) [s], `LOG_PERIOD` apart, see `flight_metrics`; NaN of short flights."""
     sampled = velocities[np.isclose(np.arange(len(times)) * LOG_PERIOD, times)][::_JERK_STRIDE]
     if len(sampled) < 4:
@@ -86,46 +110,11 @@ def jerk_metrics(velocities: np.ndarray, times: np.ndarray) -> tuple[float, floa
 
 
 def shortest_length(lengths: TimeOfArrival, p_WS: np.ndarray, goal_radius: float) -> float:
-    """Returns the length [m] of the shortest path from p_WS (3,) to the goal's sphere; NaN without
-    a path.
-
-    Args:
-        lengths: of the paths to the goal, `path_lengths`.
-        p_WS: start.
-        goal_radius: [m].
-    """
+    """Returns the length [m] of the shortest path from p_WS (3,) [m] to the goal's sphere of
+    `goal_radius` [m], by `path_lengths` to the goal; NaN without a path."""
     if not lengths.is_reachable(p_WS):
         return math.nan
     return max(float(lengths.value(p_WS)) - goal_radius, 0.0)
-
-
-ARRAYS = "times", "states", "commands", "clearances"
-"""The arrays of `Flight` in a study."""
-
-INFEASIBLE = "infeasible"
-"""The outcome of a flight that cannot start (`InfeasibleFlightError`), a failure with a reason. One
-that becomes infeasible in flight has `Outcome.ERROR`."""
-
-
-class Rollout(NamedTuple):
-    """A flight in a study."""
-
-    row: dict[str, Any]
-    """Its specification and metrics, deterministic."""
-    trajectory: bytes
-    """An .npz with `row` (JSON) and `ARRAYS` in single precision, deterministic."""
-    timing: dict[str, Any]
-    """Times and machine."""
-
-
-class Fault(NamedTuple):
-    """An exception that is not a failure of its flight."""
-
-    id: str
-    """Name of the flight."""
-    reason: str
-    """The exception in one line."""
-    traceback: str
 
 
 def fly_rollouts(
@@ -133,7 +122,8 @@ def fly_rollouts(
     modules: Sequence[str] = (),
     policies: Sequence[str] = (),
 ) -> list[Rollout | Fault]:
-    """Flies flights in this process, up to the first fault.
+    """
+    Flies flights in this process, up to the first fault.
 
     Args:
         flights: with their scenarios as YAML; Drake's configurations and some exceptions cannot be
@@ -147,43 +137,34 @@ def fly_rollouts(
     flown: list[Rollout | Fault] = []
     for spec, text in flights:
         try:
-            flown.append(fly_rollout(spec, parse_config(Scenario(), text, f"flight {spec.id}")))
+            flown.append(_fly_rollout(spec, parse_config(Scenario(), text, f"flight {spec.id}")))
         except Exception as error:
             reason = f"{type(error).__name__}: {error}".partition("\n")[0]
             return [*flown, Fault(spec.id, reason, traceback.format_exc())]
     return flown
 
 
-def fly_rollout(spec: RolloutSpec, scenario: Scenario) -> Rollout:
-    """
-    Flies one flight of a study.
-
-    Flights fail by their outcome, or if they are or become infeasible. Other exceptions, as of a
-    bug or a missing scene, must stop the study, and are raised.
-
-    Args:
-        spec: the flight.
-        scenario: with the policy and seed of `spec`.
-    """
+def _fly_rollout(spec: RolloutSpec, scenario: Scenario) -> Rollout:
+    """Flies one flight; only exceptions other than `InfeasibleFlightError`, as of a bug or a
+    missing scene, are raised and stop the study."""
     started, cpu_started = time.perf_counter(), time.process_time()
     timing: dict[str, Any] = {"id": spec.id}
+    arrays = {}
     try:
         world = study_world(scenario)
         timing["world_s"] = time.perf_counter() - started
         diagram = BuildFlightDiagram(scenario, world, camera=False)
         flight = fly(diagram, scenario, world)
-        shortest = shortest_length(
-            _way_lengths(world, scenario),
-            QuadrotorState.of(flight.states[0]).p_WB,
-            scenario.goal_radius,
-        )
+        lengths = _lengths_to(world, tuple(goal_position(scenario, world)))
+        p_WS = QuadrotorState.of(flight.states[0]).p_WB
+        shortest = shortest_length(lengths, p_WS, scenario.goal_radius)
         metrics = flight_metrics(flight, shortest) | {"digest": digest(flight)}
         if flight.reason:  # timing the policy could raise again
             metrics["reason"] = flight.reason
         else:
             timing |= _flight_timing(diagram, scenario, flight)
+        arrays = {name: getattr(flight, name).astype(np.float32) for name in ARRAYS}
     except InfeasibleFlightError as error:
-        flight = None
         metrics = {"success": False, "outcome": INFEASIBLE, "reason": str(error)}
     timing |= {
         "total_s": time.perf_counter() - started,
@@ -192,31 +173,15 @@ def fly_rollout(spec: RolloutSpec, scenario: Scenario) -> Rollout:
         "simd": _native.simd_levels()[0],
     }
     row = spec._asdict() | metrics
-    return Rollout({"id": spec.id} | row, encode(row, flight), timing)
-
-
-def encode(row: dict[str, Any], flight: Flight | None) -> bytes:
-    """Returns the .npz of a flight; without arrays if it could not be flown."""
-    arrays = {"row": np.array(json.dumps(row))}
-    if flight is not None:
-        arrays |= {name: getattr(flight, name).astype(np.float32) for name in ARRAYS}
     file = io.BytesIO()
-    np.savez_compressed(file, **arrays)  # pyright: ignore[reportArgumentType]
-    return file.getvalue()
+    np.savez_compressed(file, row=np.array(json.dumps(row)), **arrays)
+    return Rollout({"id": spec.id} | row, file.getvalue(), timing)
 
 
 def digest(flight: Flight) -> str:
     """Returns a digest, equal for bitwise identical flights."""
     arrays = (np.ascontiguousarray(getattr(flight, name)).tobytes() for name in ARRAYS)
     return hashlib.sha256(b"".join(arrays)).hexdigest()[:16]
-
-
-def chunks[Payload](
-    flights: Iterable[tuple[RolloutSpec, Payload]], size: int
-) -> Iterator[list[tuple[RolloutSpec, Payload]]]:
-    """Yields chunks of at most `size` neighbors through the same world."""
-    for _, neighbors in itertools.groupby(flights, lambda f: (f[0].scenario, f[0].seed)):
-        yield from map(list, itertools.batched(neighbors, size))
 
 
 def _flight_timing(diagram: Diagram, scenario: Scenario, flight: Flight) -> dict[str, float]:
@@ -229,35 +194,20 @@ def _flight_timing(diagram: Diagram, scenario: Scenario, flight: Flight) -> dict
     }
 
 
+_worlds: dict[tuple[type, str, int], World] = {}
+
+
 def study_world(scenario: Scenario) -> World:
-    """Makes the world of a flight; caches the last two of a process."""
-    world = scenario.world
-    return _world(_Described(f"{type(world)} {dump_config(world)}", world), scenario.seed)
-
-
-class _Described(NamedTuple):
-    """A configuration, compared by its type and YAML."""
-
-    text: str
-    config: Any
-
-    def __hash__(self) -> int:
-        return hash(self.text)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Described) and self.text == other.text
-
-
-@functools.lru_cache(maxsize=2)
-def _world(described: _Described, seed: int) -> World:
-    return make_world(described.config, seed)
+    """Makes the world of a flight, or returns it from the cache of the last `_MAX_WORLDS`."""
+    key = type(scenario.world), dump_config(scenario.world), scenario.seed
+    if key not in _worlds:
+        while len(_worlds) >= _MAX_WORLDS:
+            _worlds.pop(next(iter(_worlds)))
+        _worlds[key] = make_world(scenario.world, scenario.seed)
+    return _worlds[key]
 
 
 @functools.lru_cache(maxsize=2)
 def _lengths_to(world: World, p_WG: tuple[float, ...]) -> TimeOfArrival:
     field = world.esdf if world.esdf.occupied_outside else world.esdf.conservative()
     return path_lengths(field, np.array(p_WG))
-
-
-def _way_lengths(world: World, scenario: Scenario) -> TimeOfArrival:
-    return _lengths_to(world, tuple(goal_position(scenario, world)))

@@ -1,25 +1,30 @@
 """`splatpilot benchmark`: flies or resumes a study, and writes its report."""
 
 import functools
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Generator, Iterable, Iterator
 from contextlib import closing
 from dataclasses import replace
-from itertools import chain
+from itertools import batched, chain, groupby, product
 from pathlib import Path
 
-from splatpilot.analysis.benchmark.external import external_table, format_external
 from splatpilot.analysis.benchmark.report import write_report
-from splatpilot.analysis.benchmark.rollout import Fault, Rollout, chunks, fly_rollouts
+from splatpilot.analysis.benchmark.rollout import Fault, Rollout, fly_rollouts
 from splatpilot.analysis.benchmark.study import RolloutSpec, StudyConfig
 from splatpilot.analysis.benchmark.study_folder import (
     StudyFolder,
-    foreign_code,
     input_digests,
     keep_inputs,
     kept_flights,
+    plugin_digests,
     require_test_scenes,
 )
-from splatpilot.analysis.benchmark.tables import Row, format_table, policy_table
+from splatpilot.analysis.benchmark.tables import (
+    Row,
+    external_table,
+    format_external,
+    format_table,
+    policy_table,
+)
 from splatpilot.analysis.benchmark.variants import SCENARIO
 from splatpilot.analysis.output import write_csv
 from splatpilot.diagrams.flight.policies import POLICIES
@@ -35,14 +40,8 @@ from splatpilot.systems.common.progress import Progress, resumable
 from splatpilot.systems.common.provenance import program
 from splatpilot.systems.common.validation import require
 
-CONNECT_TIMEOUT = 10.0
-"""[s], to a scheduler."""
-
+CONNECT_TIMEOUT = 10.0  # [s], to a scheduler
 _CHUNK = 6  # maximum number of flights through one world that a worker takes together
-
-_Chunk = list[tuple[RolloutSpec, str]]
-_Work = Iterator[_Chunk]
-_Fly = Callable[[_Chunk], list[Rollout | Fault]]
 
 
 def fly_all(
@@ -55,29 +54,20 @@ def fly_all(
         flights: to fly; one worker flies neighbors through the same world.
         jobs: number of worker processes on this machine.
         cluster: address of a dask scheduler to use instead.
-
-    Raises:
-        ModuleNotFoundError: if a cluster needs dask.distributed, which is not installed.
-        OSError: if a worker process dies, or the cluster cannot be reached; yielded rollouts are
-            valid.
     """
     modules = sorted(POLICIES.modules() | WORLDS.modules() | SENSORS.modules())
     found = [name for name in POLICIES.registered() if ":" in name]
     fly = functools.partial(fly_rollouts, modules=modules, policies=found)
     work = chunks(((spec, dump_config(scenario)) for spec, scenario in flights), _CHUNK)
-    if cluster is not None:
-        yield from _on_cluster(fly, work, cluster)
+    if cluster is None:
+        yield from chain.from_iterable(map_processes(fly, work, jobs))
         return
-    yield from chain.from_iterable(map_processes(fly, work, jobs))
-
-
-def _on_cluster(fly: _Fly, work: _Work, address: str) -> Iterator[Rollout | Fault]:
     distributed = import_extra("distributed", "cluster")
     try:
-        client = distributed.Client(address, timeout=CONNECT_TIMEOUT)
+        client = distributed.Client(cluster, timeout=CONNECT_TIMEOUT)
     except (OSError, TimeoutError, ValueError) as error:
         raise OSError(
-            f"no dask scheduler answers at {address} ({error}); start one with `dask scheduler` "
+            f"no dask scheduler answers at {cluster} ({error}); start one with `dask scheduler` "
             "and workers with `dask worker ADDRESS --nthreads 1`"
         ) from None
     with client:
@@ -90,6 +80,14 @@ def _on_cluster(fly: _Fly, work: _Work, address: str) -> Iterator[Rollout | Faul
                 f"the cluster's workers die of the same flights ({error}); finished flights are "
                 "kept: give the workers more memory and run the same command again"
             ) from None
+
+
+def chunks[Payload](
+    flights: Iterable[tuple[RolloutSpec, Payload]], size: int
+) -> Iterator[list[tuple[RolloutSpec, Payload]]]:
+    """Yields chunks of at most `size` neighbors through the same world."""
+    for _, neighbors in groupby(flights, lambda flight: (flight[0].scenario, flight[0].seed)):
+        yield from map(list, batched(neighbors, size))
 
 
 @holds_folder("out")
@@ -116,24 +114,23 @@ def run(
 
     Returns:
         The rows of `table.csv`.
-
-    Raises:
-        ValueError: for an invalid study, another one in `out`, or a `Fault`.
-        OSError: if `out` cannot be written, workers fail, or all scenes are missing.
     """
     require(jobs is None or jobs >= 1, "--jobs", "at least 1", jobs)
     scenarios = config.load_scenarios()
-    names = {spec.scenario for spec in config.rollouts()}
-    absent = absent_scenes({name: scenarios[name] for name in scenarios if name in names})
+    absent = absent_scenes(scenarios)
     specs = [spec for spec in config.rollouts() if spec.scenario not in absent]
     if not specs:
         raise FileNotFoundError("nothing can be flown: " + "; ".join(absent.values()))
-    flyable = {name: scenarios[name] for name in dict.fromkeys(spec.scenario for spec in specs)}
+    flyable = {name: scenario for name, scenario in scenarios.items() if name not in absent}
     if config.split == "test":
         require_test_scenes(flyable)
-    folder, flown_by = StudyFolder(out), program() | foreign_code(_complete(config, scenarios))
-    flown_by |= input_digests(config, scenarios)
-    folder.claim(config, flown_by)
+    complete = (
+        replace(scenario, policy=variant.config(speed, scenario.policy))
+        for scenario, variant, speed in product(scenarios.values(), config.variants, config.speeds)
+    )
+    flown_by = program() | plugin_digests(complete) | input_digests(config, scenarios)
+    folder = StudyFolder(out)
+    folder.begin(config, flown_by)
     keep_inputs(folder, config, flyable)
     for name, reason in absent.items():
         print(f"{name} is not flown: {reason}")
@@ -143,9 +140,7 @@ def run(
             "them to fly it."
         )
 
-    rows, damaged = flights_there(folder, specs)
-    for problem in damaged:
-        print(f"{problem}; this flight is flown again")
+    rows, damaged = _read_flights(folder, specs)
     missing = [spec for spec in specs if spec.id not in rows]
     if rows and missing:
         for name, version in folder.program().items():
@@ -159,45 +154,8 @@ def run(
         folder.keep_program(flown_by)
     flights = fly_all(kept_flights(folder, missing), jobs or available_cores(), cluster)
     with closing(flights):
-        _keep(folder, flights, rows, len(specs))
-    return conclude(folder, config, [rows[spec.id] for spec in specs], absent, damaged)
-
-
-def conclude(
-    folder: StudyFolder,
-    config: StudyConfig,
-    rows: list[Row],
-    absent: dict[str, str],
-    damaged: list[str],
-) -> list[Row]:
-    """
-    Writes and prints the tables of a study, and writes its report.
-
-    Args:
-        folder, config: the study.
-        rows: of all its flights.
-        absent: reasons of the scenarios that were not flown.
-        damaged: files that were flown again.
-
-    Returns:
-        The rows of `table.csv`.
-    """
-    timings = [folder.read_timing(row["id"]) for row in rows]
-    table = policy_table(rows, config, len(absent))
-    tables = {"rollouts.csv": rows, "timings.csv": timings, "table.csv": table}
-    if external := external_table(rows, config):
-        tables["external.csv"] = external
-    for name, content in tables.items():
-        write_csv(folder.path / name, content)
-    write_report(folder, config, rows, timings, table, absent, damaged)
-    print(format_table(table, config))
-    if external:
-        print(format_external(external))
-    for row in rows:
-        if "reason" in row:
-            print(f"{row['id']}, {row['outcome']}: {row['reason']}")
-    print(f"Wrote {', '.join(tables)} and report.html in {folder.path}")
-    return table
+        _keep_flights(folder, flights, rows, len(specs))
+    return _conclude(folder, config, [rows[spec.id] for spec in specs], absent, damaged)
 
 
 def absent_scenes(scenarios: dict[str, Scenario]) -> dict[str, str]:
@@ -212,7 +170,7 @@ def absent_scenes(scenarios: dict[str, Scenario]) -> dict[str, str]:
     return absent
 
 
-def flights_there(
+def _read_flights(
     folder: StudyFolder, specs: list[RolloutSpec]
 ) -> tuple[dict[str, Row], list[str]]:
     """Returns the rows of existing flights by id, and the errors of damaged files."""
@@ -224,30 +182,18 @@ def flights_there(
             continue
         except ValueError as error:
             damaged.append(str(error))
+            print(f"{error}; this flight is flown again")
     return rows, damaged
 
 
-def _complete(config: StudyConfig, scenarios: dict[str, Scenario]) -> Iterator[Scenario]:
-    """Yields the scenarios with each of their policies."""
-    for scenario in scenarios.values():
-        for variant in config.variants:
-            for speed in config.speeds:
-                yield replace(scenario, policy=variant.config(speed, scenario.policy))
-
-
-def _keep(
+def _keep_flights(
     folder: StudyFolder, flights: Iterator[Rollout | Fault], rows: dict[str, Row], total: int
 ) -> None:
     """Writes flights as they end, and adds them to `rows`. Raises ValueError at a fault."""
     successes = sum(row["success"] for row in rows.values())
     bar = Progress(total=total, initial=len(rows), desc="flying", unit="flight")
-
-    def kept() -> str:
-        return (
-            f"{len(rows)} of {total} flights are in {folder.path}; the same command resumes there"
-        )
-
-    with bar, resumable(kept):
+    where = f"flights are in {folder.path}; the same command resumes there"
+    with bar, resumable(lambda: f"{len(rows)} of {total} {where}"):
         for flown in flights:
             if isinstance(flown, Fault):
                 raise ValueError(
@@ -260,3 +206,29 @@ def _keep(
             successes += flown.row["success"]
             bar.set_postfix_str(f"{successes / len(rows):.0%} success", refresh=False)
             bar.update()
+
+
+def _conclude(
+    folder: StudyFolder,
+    config: StudyConfig,
+    rows: list[Row],
+    absent: dict[str, str],
+    damaged: list[str],
+) -> list[Row]:
+    """Writes and prints the tables of a study, and writes its report; returns the policies'."""
+    timings = [folder.read_timing(row["id"]) for row in rows]
+    table = policy_table(rows, config, len(absent))
+    tables = {"rollouts.csv": rows, "timings.csv": timings, "table.csv": table}
+    if external := external_table(rows, config):
+        tables["external.csv"] = external
+    for name, content in tables.items():
+        write_csv(folder.path / name, content)
+    write_report(folder, config, rows, timings, table, external, absent, damaged)
+    print(format_table(table, config))
+    if external:
+        print(format_external(external))
+    for row in rows:
+        if "reason" in row:
+            print(f"{row['id']}, {row['outcome']}: {row['reason']}")
+    print(f"Wrote {', '.join(tables)} and report.html in {folder.path}")
+    return table

@@ -83,12 +83,7 @@ class StudyConfig:
         ]
 
     def load_scenarios(self) -> dict[str, Scenario]:
-        """
-        Loads the scenarios, by name, with the overrides.
-
-        Raises:
-            ValueError: for an invalid study or scenario, or an unknown policy.
-        """
+        """Loads the scenarios, by name, with the overrides, and checks that the study can fly."""
         self.validate()
         for override in self.overrides:
             _check_override(override)
@@ -107,7 +102,7 @@ class StudyConfig:
         return scenarios
 
     def validate(self) -> None:
-        """Raises ValueError for numbers out of range, and missing or repeated names."""
+        """Checks seeds and speeds, and that names are neither missing nor repeated."""
         study_seeds(self.split, self.seeds)
         for speed in self.speeds:
             require(0.0 < speed <= MAX_SPEED, "speeds", f"in (0, {MAX_SPEED:g}] m/s", f"{speed:g}")
@@ -128,11 +123,10 @@ class StudyConfig:
                 )
 
     def _check_own_policy(self, file: Path, policy: Any) -> None:
-        """Raises ValueError if a scenario's own policy should fly and cannot."""
-        own = [variant for variant in self.variants if variant.policy == SCENARIO]
-        if not own:
+        """Checks that a scenario's own policy can fly, if it should."""
+        if not self.flies_own_policies:
             return
-        if not has_own_policy(file):
+        if not _has_own_policy(file):
             raise ValueError(f"{file} has no `policy`, which --policies {SCENARIO} would fly")
         speed = speed_of(policy)
         if speed is not None and self.speeds != [speed]:
@@ -140,18 +134,18 @@ class StudyConfig:
                 f"the policy of {file} flies at {speed:g} m/s, its own speed; give --speeds "
                 f"{speed:g}"
             )
-        for variant in own:
+        for variant in self.variants:
             variant.config(self.speeds[0], policy)
 
     def unflown_policies(self) -> list[Path]:
         """Returns the files of scenarios with a policy of their own that the study does not fly."""
         if self.flies_own_policies:
             return []
-        return [file for file in map(scenario_file, self.scenarios) if has_own_policy(file)]
+        return [file for file in map(scenario_file, self.scenarios) if _has_own_policy(file)]
 
 
-def has_own_policy(file: Path) -> bool:
-    """Tells whether a file is a scenario with a `policy`."""
+def _has_own_policy(file: Path) -> bool:
+    """Checks that a file is a scenario with a `policy`."""
     try:
         root = yaml.compose(file.read_text(), yaml.SafeLoader)
     except (OSError, UnicodeDecodeError, yaml.YAMLError):
@@ -162,22 +156,20 @@ def has_own_policy(file: Path) -> bool:
 
 def default_policies(scenarios: list[str]) -> list[str]:
     """Returns the default policies: the scenarios' own, if all have one, or the benchmark's."""
-    own = all(has_own_policy(scenario_file(scenario)) for scenario in scenarios)
+    own = all(_has_own_policy(scenario_file(scenario)) for scenario in scenarios)
     return [SCENARIO] if own else list(BENCHMARK_POLICIES)
 
 
 def _check_override(override: str) -> None:
-    """Raises ValueError for fields that differ between the flights of a study."""
+    """Checks that a field does not differ between the flights of a study."""
     field, _, value = override.partition("=")
     section, _, inner = field.partition(".")
-    if section == "policy":
-        example = f"NAME:{inner}={value}" if inner else "NAME"
+    remedy = {
+        "policy": f"policies, write --policies {f'NAME:{inner}={value}' if inner else 'NAME'}",
+        "seed": "seeds, give their number with --seeds",
+    }.get(section)
+    if remedy:
         raise ValueError(
             f"a study must not override {field}, got {override!r}; its flights have their own "
-            f"policies, write --policies {example}"
-        )
-    if section == "seed":
-        raise ValueError(
-            f"a study must not override {field}, got {override!r}; its flights have their own "
-            "seeds, give their number with --seeds"
+            f"{remedy}"
         )

@@ -19,7 +19,6 @@ import shutil
 import sys
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields, replace
-from hashlib import blake2b
 from pathlib import Path
 from typing import Any
 
@@ -49,12 +48,20 @@ from splatpilot.systems.common.files import (
     require_writable_folder,
     written_atomically,
 )
-from splatpilot.systems.common.readers import read_archive, read_text, reason_of
+from splatpilot.systems.common.readers import read_archive, read_text, reason_of, yaml_errors
+from splatpilot.systems.common.validation import require
 
 FORMAT_VERSION = 1
 _SHAPES = {"times": (), "states": (13,), "commands": (4,), "clearances": ()}
 """Shapes of a sample of each array."""
-_METRICS = "flight_time_s", "path_length_m", "mean_speed_m_s", "min_clearance_m", "jerk_m_s3"
+_REQUIRED = {
+    *("success", "outcome", "digest", "flight_time_s", "path_length_m", "mean_speed_m_s"),
+    *("min_clearance_m", "jerk_m_s3"),
+}
+"""Columns of all flights that were flown."""
+_SCENE_FILES = "gaussians.ply", "esdf.npz", FRONTIER, ENVIRONMENT
+"""The files of a scene folder that flights depend on."""
+_KNOWN = {"splatpilot", "__main__"} | sys.stdlib_module_names
 
 
 @dataclass(frozen=True)
@@ -71,90 +78,43 @@ class StudyFolder:
         """Returns the file of a flight."""
         return self.path / "rollouts" / f"{id}.npz"
 
-    def claim(self, config: StudyConfig, program: dict[str, str]) -> None:
+    def begin(self, config: StudyConfig, program: dict[str, str]) -> None:
         """
-        Creates the folder, or checks that it is of the same study.
+        Creates the folder, or checks that it has the same study.
 
         Args:
             config: of the study.
-            program: `provenance.program()` and `foreign_code`.
-
-        Raises:
-            ValueError: if the folder holds something else.
-            OSError: if it cannot be written.
+            program: `provenance.program()`, `plugin_digests` and `input_digests`.
         """
-        described = {
-            "format_version": FORMAT_VERSION,
-            "study": yaml.safe_load(dump_config(config)),
-            "program": program,
-        }
+        study = yaml.safe_load(dump_config(config))
+        require_writable_folder(self.path)
         if (self.path / "study.yaml").is_file():
-            self._check_same(described)
+            begun = yaml.safe_load(dump_config(StudyConfig())) | self._read()["study"]
+            for name, value in study.items():
+                if begun[name] != value:
+                    raise ValueError(
+                        f"{self.path} holds a study with {name} {begun[name]}, not {value}; choose "
+                        "another folder, or the same study"
+                    )
         else:
-            require_writable_folder(self.path)
             if any(self.path.iterdir()):
                 raise ValueError(
                     f"{self.path} is not empty and holds no study; choose another folder"
                 )
-            self._describe(described)
-        require_writable_folder(self.path)
+            self._write({"format_version": FORMAT_VERSION, "study": study, "program": program})
         for folder in ("scenarios", "scenes", "weights", "rollouts", "timings"):
             require_writable_folder(self.path / folder)
         shutil.rmtree(self.path / "errors", ignore_errors=True)
 
     def keep_program(self, program: dict[str, str]) -> None:
-        """Replaces the program of `claim`."""
+        """Replaces the program of `begin`."""
         if self.program() != program:
-            self._describe(self._described() | {"program": program})
-
-    def _describe(self, described: dict[str, Any]) -> None:
-        with written_atomically(self.path / "study.yaml") as path:
-            path.write_text(yaml.safe_dump(described, sort_keys=False))
-
-    def _check_same(self, described: dict[str, Any]) -> None:
-        there = self._described()
-        begun = yaml.safe_load(dump_config(StudyConfig())) | there["study"]
-        for name, value in described["study"].items():
-            if begun[name] != value:
-                raise ValueError(
-                    f"{self.path} holds a study with {name} {begun[name]}, not {value}; choose "
-                    "another folder, or the same study"
-                )
-
-    def _described(self) -> dict[str, Any]:
-        file = self.path / "study.yaml"
-        if not file.is_file():
-            raise FileNotFoundError(
-                f"No such file: {file}; a study is a folder of `splatpilot benchmark`"
-            )
-        text = read_text(file)
-        try:
-            described = yaml.safe_load(text)
-            version = described["format_version"]
-        except (yaml.YAMLError, KeyError, TypeError, RecursionError) as error:
-            raise ValueError(f"{file} is not a study: {reason_of(error)}") from None
-        if version != FORMAT_VERSION:
-            raise ValueError(
-                f"{file}: format version {version}, this program knows {FORMAT_VERSION}; use the "
-                "version of the program that made the study"
-            )
-        for name, kind in (("study", dict), ("program", dict)):
-            if not isinstance(described.get(name), kind):
-                raise ValueError(
-                    f"{file} is not a study: {name} is {described.get(name)!r:.80}; restore the "
-                    "file, or fly the study again in another folder"
-                )
-        return described
+            self._write(self._read() | {"program": program})
 
     def config(self) -> StudyConfig:
-        """Reads the study.
-
-        Raises:
-            FileNotFoundError, ValueError: if the folder holds none.
-        """
+        """Reads the study."""
         file = self.path / "study.yaml"
-        text = yaml.safe_dump(self._described()["study"])
-        config = parse_config(StudyConfig(), text, str(file))
+        config = parse_config(StudyConfig(), yaml.safe_dump(self._read()["study"]), str(file))
         try:
             config.validate()
         except ValueError as error:
@@ -162,8 +122,30 @@ class StudyFolder:
         return config
 
     def program(self) -> dict[str, str]:
-        """Reads the program of `claim` or `keep_program`."""
-        return self._described()["program"]
+        """Reads the program of `begin` or `keep_program`."""
+        return self._read()["program"]
+
+    def _write(self, described: dict[str, Any]) -> None:
+        with written_atomically(self.path / "study.yaml") as path:
+            path.write_text(yaml.safe_dump(described, sort_keys=False))
+
+    def _read(self) -> dict[str, Any]:
+        file = self.path / "study.yaml"
+        if not file.is_file():
+            raise FileNotFoundError(
+                f"No such file: {file}; a study is a folder of `splatpilot benchmark`"
+            )
+        with yaml_errors(str(file)):
+            described = yaml.safe_load(read_text(file))
+        described = described if isinstance(described, dict) else {}
+        what, version = f"format_version of {file}", described.get("format_version")
+        remedy = "use the version of the program that made the study"
+        require(version == FORMAT_VERSION, what, str(FORMAT_VERSION), version, remedy)
+        for name in ("study", "program"):
+            value = described.get(name)
+            remedy = "restore the file, or fly the study again in another folder"
+            require(isinstance(value, dict), f"{name} of {file}", "a mapping", value, remedy)
+        return described
 
     def write(self, rollout: Rollout) -> None:
         """Writes a flight."""
@@ -192,18 +174,22 @@ class StudyFolder:
         file = self.trajectory(spec.id)
         try:
             arrays = read_archive(file)
-            row = json.loads(str(arrays["row"]))
-            flown = {name: arrays[name] for name in ARRAYS if name in arrays}
+            row = json.loads(str(arrays.pop("row")))
+            if row["outcome"] == INFEASIBLE:
+                missing = {"reason"} - row.keys()
+            else:
+                missing = _REQUIRED - row.keys()
+                shapes = {n: (len(arrays["times"]), *shape) for n, shape in _SHAPES.items()}
+                missing |= {name for name in ARRAYS if arrays[name].shape != shapes[name]}
+            if missing:
+                raise ValueError(f"{min(missing)} is missing or invalid")
         except FileNotFoundError:
             raise
-        except (OSError, ValueError, KeyError, RecursionError) as error:
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise ValueError(f"{file} is damaged: {reason_of(error)}") from None
-        if not isinstance(row, dict):
-            raise ValueError(f"{file} is damaged: its row is {row!r:.80}")
-        _check_flight(file, row, flown)
         if {name: row.get(name) for name in spec._fields} != spec._asdict():
             raise ValueError(f"{file} is of another flight, {row}")
-        return {"id": spec.id} | row, flown
+        return {"id": spec.id} | row, arrays
 
     def read_timing(self, id: str) -> dict[str, Any]:
         """Reads times and machine of a flight; empty if unknown."""
@@ -214,39 +200,8 @@ class StudyFolder:
         return timing if isinstance(timing, dict) else {}
 
 
-def _check_flight(file: Path, row: Row, flown: dict[str, np.ndarray]) -> None:
-    """Raises ValueError unless row and arrays are complete."""
-    names = ("reason",) if row.get("outcome") == INFEASIBLE else ("outcome", "digest")
-    wrong = [name for name in names if not isinstance(row.get(name), str)]
-    if not isinstance(row.get("success"), bool):
-        wrong.append("success")
-    if row.get("outcome") != INFEASIBLE:
-        count = flown["times"].shape[:1] if "times" in flown else ()
-        wrong += [name for name in _METRICS if type(row.get(name)) not in (int, float)]
-        wrong += [
-            name
-            for name, shape in _SHAPES.items()
-            if name not in flown
-            or flown[name].dtype.kind != "f"
-            or flown[name].shape != (*count, *shape)
-            or not flown[name].size
-            or not (name == "clearances" or np.isfinite(flown[name]).all())
-        ]
-    if wrong:
-        raise ValueError(f"{file} is damaged: {wrong[0]} is missing or invalid")
-
-
-_FLOWN_FILES = "gaussians.ply", "esdf.npz", FRONTIER, ENVIRONMENT
-"""The files of a scene folder that flights depend on."""
-
-
 def require_test_scenes(scenarios: dict[str, Scenario]) -> None:
-    """
-    Checks that a test study flies only in test scenes.
-
-    Raises:
-        ValueError: for a scene of another split, or without one as a file of Gaussians.
-    """
+    """Checks that a test study flies only in scenes of the test split, or Gaussians of one."""
     for name, scenario in scenarios.items():
         if not isinstance(scenario.world, SceneSource):
             continue
@@ -255,26 +210,13 @@ def require_test_scenes(scenarios: dict[str, Scenario]) -> None:
             split = read_scene_metadata(scene).split
         else:
             split = "test" if find_test_source(part_digests([scene.read_bytes()])) else ""
-        if split != "test":
-            raise ValueError(
-                f"split of {scene}, in which {name} flies, must be test in a test study, got "
-                f"{split!r}; fly it with --split dev"
-            )
+        what = f"split of {scene}, in which {name} flies,"
+        require(split == "test", what, "test in a test study", repr(split), "or use --split dev")
 
 
 def keep_inputs(folder: StudyFolder, config: StudyConfig, scenarios: dict[str, Scenario]) -> None:
-    """
-    Copies scenarios, scenes and weights into the folder, from which flights can be replayed.
-
-    Args:
-        folder: of the study.
-        config: of the study.
-        scenarios: to be flown, by name.
-
-    Raises:
-        ValueError: if the folder holds others.
-        OSError: if they cannot be read or written.
-    """
+    """Copies scenarios, by name, their scenes, and weights into the folder, from which flights can
+    be replayed."""
     for variant in config.variants:
         if variant.weights is not None:
             _keep_weights(folder, variant.weights, variant.label)
@@ -284,103 +226,16 @@ def keep_inputs(folder: StudyFolder, config: StudyConfig, scenarios: dict[str, S
             scenario = replace(scenario, world=world)
         weights = getattr(scenario.policy, "weights", "")
         if config.flies_own_policies and weights:
-            kept = _keep_weights(folder, Path(weights), _own(name))
+            kept = _keep_weights(folder, Path(weights), _own_label(name))
             scenario = replace(scenario, policy=replace(scenario.policy, weights=kept))
-        _keep_scenario(folder, name, scenario)
-
-
-def input_digests(config: StudyConfig, scenarios: dict[str, Scenario]) -> dict[str, str]:
-    """Returns digests of weights and existing scenes, to be added to `provenance.program()`: by
-    "weights of LABEL", "weights of LABEL in SCENARIO" and "scene of SCENARIO"."""
-    digests = {}
-    for name, scenario in scenarios.items():
-        for variant in config.variants:
-            key = f"weights of {variant.label}"
-            if variant.policy == SCENARIO:
-                key += f" in {name}"
-            if key not in digests:
-                file = weights_file(variant.config(config.speeds[0], scenario.policy))
-                if file is not None:
-                    digests[key] = _digest([file])
-        if isinstance(scenario.world, SceneSource):
-            try:
-                scene = find_scene(scenario.world)
-            except FileNotFoundError:
-                continue
-            files = [scene / flown for flown in _FLOWN_FILES] if scene.is_dir() else [scene]
-            digests[f"scene of {name}"] = _digest([file for file in files if file.is_file()])
-    return digests
-
-
-def _digest(files: list[Path]) -> str:
-    digest = hashlib.sha256()
-    for file in files:
-        digest.update(hashlib.sha256(file.read_bytes()).digest())
-    return digest.hexdigest()[:16]
-
-
-def kept_scenario(folder: StudyFolder, name: str) -> Scenario:
-    """Reads a scenario of a study, with scene and weights in the study's folder.
-
-    Raises:
-        FileNotFoundError, ValueError: if it is missing or damaged.
-    """
-    file = folder.path / "scenarios" / f"{name}.yaml"
-    scenario = load_config(Scenario(), file)
-    try:
-        scenario.validate()
-    except ValueError as error:
-        raise ValueError(f"{file}: {error}") from None
-    if isinstance(scenario.world, SceneSource):
-        scenario.world.path = str((folder.path / scenario.world.path).absolute())
-    weights = folder.weights(_own(name))
-    if weights.is_file():
-        policy = replace(scenario.policy, weights=str(weights.absolute()))  # pyright: ignore
-        scenario = replace(scenario, policy=policy)
-    return scenario
-
-
-def kept_flights(
-    folder: StudyFolder, specs: Iterable[RolloutSpec]
-) -> Iterator[tuple[RolloutSpec, Scenario]]:
-    """
-    Yields flights with their scenario, policy and seed, from the study's folder alone.
-
-    Raises:
-        FileNotFoundError, ValueError: if the folder is damaged, or names a module that is not
-            imported; files never import modules.
-    """
-    variants = {}
-    for variant in folder.config().variants:
-        module, colon, _ = variant.policy.partition(":")
-        if colon and module not in sys.modules:
+        file, text = folder.path / "scenarios" / f"{name}.yaml", dump_config(scenario)
+        if file.is_file() and file.read_text() != text:
             raise ValueError(
-                f"{folder.path} flies {variant.policy}, whose module is not imported; if you trust "
-                f"it, add --import {module} in front of the command"
+                f"{file} differs from the scenario {name} of this program; choose another folder "
+                "with --out, or finish the study with the program that started it"
             )
-        if variant.weights is not None:
-            kept = str(folder.weights(variant.label).absolute())
-            variant = variant._replace(policy=kept)
-        variants[variant.label] = variant
-    scenarios: dict[str, Scenario] = {}
-    for spec in specs:
-        if spec.scenario not in scenarios:
-            scenarios[spec.scenario] = kept_scenario(folder, spec.scenario)
-        scenario = scenarios[spec.scenario]
-        policy = variants[spec.policy].config(spec.speed, scenario.policy)
-        yield spec, replace(scenario, policy=policy, seed=spec.seed)
-
-
-def _keep_scenario(folder: StudyFolder, name: str, scenario: Scenario) -> None:
-    file = folder.path / "scenarios" / f"{name}.yaml"
-    text = dump_config(scenario)
-    if file.is_file() and file.read_text() != text:
-        raise ValueError(
-            f"{file} differs from the scenario {name} of this program; choose another folder with "
-            "--out, or finish the study with the program that started it"
-        )
-    with written_atomically(file) as path:
-        path.write_text(text)
+        with written_atomically(file) as path:
+            path.write_text(text)
 
 
 def _keep_scene(folder: StudyFolder, world: SceneSource) -> str:
@@ -390,8 +245,8 @@ def _keep_scene(folder: StudyFolder, world: SceneSource) -> str:
     if not kept.exists():
         if scene.is_dir():
             with folder_written_atomically(kept) as partial:
-                own = shutil.ignore_patterns(CAPTURE)
-                shutil.copytree(scene, partial, dirs_exist_ok=True, ignore=own)
+                ignored = shutil.ignore_patterns(CAPTURE)
+                shutil.copytree(scene, partial, dirs_exist_ok=True, ignore=ignored)
         else:
             with written_atomically(kept) as partial:
                 shutil.copyfile(scene, partial)
@@ -411,40 +266,106 @@ def _keep_weights(folder: StudyFolder, file: Path, label: str) -> str:
     return str(kept.relative_to(folder.path))
 
 
-def _own(scenario: str) -> str:
+def _own_label(scenario: str) -> str:
     """Returns the label of the weights of a scenario's own policy; no other label has a slash."""
     return f"scenarios/{scenario}"
 
 
-_KNOWN = {"splatpilot", "__main__"} | sys.stdlib_module_names
+def kept_scenario(folder: StudyFolder, name: str) -> Scenario:
+    """Reads a scenario of a study, with scene and weights in the study's folder."""
+    file = folder.path / "scenarios" / f"{name}.yaml"
+    scenario = load_config(Scenario(), file)
+    try:
+        scenario.validate()
+    except ValueError as error:
+        raise ValueError(f"{file}: {error}") from None
+    if isinstance(scenario.world, SceneSource):
+        scenario.world.path = str((folder.path / scenario.world.path).absolute())
+    weights = folder.weights(_own_label(name))
+    if weights.is_file():
+        policy = replace(scenario.policy, weights=str(weights.absolute()))  # pyright: ignore
+        scenario = replace(scenario, policy=policy)
+    return scenario
 
 
-def foreign_code(scenarios: Iterable[Scenario]) -> dict[str, str]:
-    """Returns a digest of the source of each plugin package that scenarios and their policies use,
-    to be added to `provenance.program()`: by "source of PACKAGE"."""
+def kept_flights(
+    folder: StudyFolder, specs: Iterable[RolloutSpec]
+) -> Iterator[tuple[RolloutSpec, Scenario]]:
+    """Yields flights with their scenario, policy and seed, from the study's folder alone.
+
+    Raises ValueError for a policy whose module is not imported; files never import modules.
+    """
+    variants = {}
+    for variant in folder.config().variants:
+        module, colon, _ = variant.policy.partition(":")
+        if colon and module not in sys.modules:
+            raise ValueError(
+                f"{folder.path} flies {variant.policy}, whose module is not imported; if you trust "
+                f"it, add --import {module} in front of the command"
+            )
+        if variant.weights is not None:
+            variant = variant._replace(policy=str(folder.weights(variant.label).absolute()))
+        variants[variant.label] = variant
+    scenarios: dict[str, Scenario] = {}
+    for spec in specs:
+        if spec.scenario not in scenarios:
+            scenarios[spec.scenario] = kept_scenario(folder, spec.scenario)
+        scenario = scenarios[spec.scenario]
+        policy = variants[spec.policy].config(spec.speed, scenario.policy)
+        yield spec, replace(scenario, policy=policy, seed=spec.seed)
+
+
+def input_digests(config: StudyConfig, scenarios: dict[str, Scenario]) -> dict[str, str]:
+    """Returns digests of weights and existing scenes: by "weights of LABEL", "weights of LABEL in
+    SCENARIO" and "scene of SCENARIO"."""
+    digests = {}
+    for name, scenario in scenarios.items():
+        for variant in config.variants:
+            key = f"weights of {variant.label}"
+            if variant.policy == SCENARIO:
+                key += f" in {name}"
+            if key not in digests:
+                file = weights_file(variant.config(config.speeds[0], scenario.policy))
+                if file is not None:
+                    digests[key] = _digest([file])
+        if isinstance(scenario.world, SceneSource):
+            try:
+                scene = find_scene(scenario.world)
+            except FileNotFoundError:
+                continue
+            files = [scene / file for file in _SCENE_FILES] if scene.is_dir() else [scene]
+            digests[f"scene of {name}"] = _digest([file for file in files if file.is_file()])
+    return digests
+
+
+def plugin_digests(scenarios: Iterable[Scenario]) -> dict[str, str]:
+    """Returns digests of the source of plugin packages that scenarios and their policies use, by
+    "source of PACKAGE"."""
     packages = set()
     for scenario in scenarios:
-        packages |= _packages_of(scenario.policy, POLICIES.kind_of(scenario.policy))
-        packages |= _packages_of(scenario.world, WORLDS.kind_of(scenario.world))
-        for sensor in scenario.sensors.values():
-            packages |= _packages_of(sensor, SENSORS.kind_of(sensor))
-    return {f"source of {name}": _code_digest(name) for name in sorted(packages - _KNOWN)}
+        for registry, config in (
+            (POLICIES, scenario.policy),
+            (WORLDS, scenario.world),
+            *((SENSORS, sensor) for sensor in scenario.sensors.values()),
+        ):
+            entry: Any = registry.kind_of(config)
+            parts = (getattr(entry, field.name) for field in fields(entry))
+            modules = [getattr(part, "__module__", None) for part in (type(config), *parts)]
+            packages |= {module.partition(".")[0] for module in modules if module}
+    return {f"source of {name}": _source_digest(name) for name in sorted(packages - _KNOWN)}
 
 
-def _packages_of(config: Any, kind: Any) -> set[str]:
-    """Returns the packages of a configuration and of its registry entry."""
-    made_by = (getattr(kind, field.name) for field in fields(kind))
-    modules = [getattr(made, "__module__", None) for made in (type(config), *made_by)]
-    return {module.partition(".")[0] for module in modules if module}
-
-
-def _code_digest(package: str) -> str:
+def _source_digest(package: str) -> str:
     module = sys.modules[package]
     folders = [Path(folder) for folder in getattr(module, "__path__", ())]
     files = [file for folder in folders for file in sorted(folder.rglob("*.py"))]
     if not folders and getattr(module, "__file__", None):
         files = [Path(str(module.__file__))]
-    digest = blake2b(digest_size=8)
+    return _digest(files)
+
+
+def _digest(files: list[Path]) -> str:
+    digest = hashlib.sha256()
     for file in files:
-        digest.update(file.name.encode() + b"\0" + file.read_bytes())
-    return digest.hexdigest()
+        digest.update(hashlib.sha256(file.read_bytes()).digest())
+    return digest.hexdigest()[:16]

@@ -1,4 +1,4 @@
-"""The tables of a study."""
+"""The tables of a study, with intervals and tests."""
 
 import math
 from collections import Counter
@@ -25,7 +25,7 @@ Row = dict[str, Any]
 """The specification and metrics of a flight, or a row of a table."""
 
 _RESAMPLES = 9999
-_MAX_EXACT = 17  # scenarios with all 2^n signs; of more scenarios, as many random ones
+_MAX_EXACT = 17  # scenarios with all 2^n signs; for more, as many random ones
 
 
 class Interval(NamedTuple):
@@ -54,6 +54,7 @@ def cluster_interval(
 
     Args:
         successes, flights: of each scenario, (S,).
+        confidence: of the interval.
     """
     k, n = np.asarray(successes, float), np.asarray(flights, float)
     if len(k) < 2:
@@ -66,39 +67,25 @@ def cluster_interval(
     return Interval(float(lower), float(upper))
 
 
-class PairedCounts(NamedTuple):
-    """Two policies on the same flights."""
+def mcnemar(first: np.ndarray, second: np.ndarray) -> tuple[int, int, float]:
+    """
+    Computes the exact test of McNemar (Psychometrika 12, 1947).
 
-    only_first: int
-    """Flights in which only the first succeeded."""
-    only_second: int
-    """Flights in which only the second succeeded."""
-    p_value: float
-    """Probability of a difference as large if the policies were equally good."""
+    Args:
+        first, second: successes of two policies in the same flights, (n,) bool.
 
-
-def mcnemar(first: np.ndarray, second: np.ndarray) -> PairedCounts:
-    """Computes the exact test of McNemar (Psychometrika 12, 1947) on paired successes (n,) bool.
-
-    Of equally good policies, the count of flights in which only the first succeeds is binomial with
-    probability one half among those in which one of them does.
+    Returns:
+        How often only the first succeeds, how often only the second, and the p-value.
     """
     only_first = int(np.count_nonzero(first & ~second))
     only_second = int(np.count_nonzero(second & ~first))
     unequal = only_first + only_second
-    p_value = float(binomtest(only_first, unequal).pvalue) if unequal else 1.0
-    return PairedCounts(only_first, only_second, p_value)
+    return only_first, only_second, float(binomtest(only_first, unequal).pvalue) if unequal else 1.0
 
 
 def sign_flip(differences: ArrayLike) -> float:
-    """
-    Returns the two-sided p-value of a paired sign-flip permutation test over scenarios.
-
-    Of equally good policies, the difference in a scenario has either sign with probability 0.5.
-
-    Args:
-        differences: of the success rates of two policies, by scenario (S,).
-    """
+    """Computes the two-sided p-value of a paired sign-flip permutation test over scenarios, from
+    the differences (S,) between success rates of two policies."""
     d = np.asarray(differences, float)
     d = d[d != 0]
     if len(d) <= _MAX_EXACT:
@@ -111,7 +98,7 @@ def sign_flip(differences: ArrayLike) -> float:
 
 
 def holm(p_values: ArrayLike) -> NDArray[np.float64]:
-    """Returns p-values (m,) corrected for multiple tests (S. Holm, Scand. J. Stat. 6, 1979)."""
+    """Corrects p-values (m,) for multiple tests (S. Holm, Scand. J. Stat. 6, 1979)."""
     p = np.asarray(p_values, float)
     order = np.argsort(p)
     steps = (len(p) - np.arange(len(p))) * p[order]
@@ -123,13 +110,7 @@ def holm(p_values: ArrayLike) -> NDArray[np.float64]:
 FAILURES = Outcome.COLLISION, Outcome.TIMEOUT, Outcome.LEFT_VOLUME, Outcome.ERROR, INFEASIBLE
 """The outcomes that tables count, besides successes."""
 
-METRICS = (
-    "min_clearance_m",
-    "mean_speed_m_s",
-    "path_excess",
-    "jerk_m_s3",
-    "smoothness",
-)
+METRICS = "min_clearance_m", "mean_speed_m_s", "path_excess", "jerk_m_s3", "smoothness"
 """Columns whose means are in the table, over the flights that have them."""
 
 
@@ -156,6 +137,32 @@ PAPER_FLIGHTS = 17
 IN_DISTRIBUTION = (*PROCEDURAL, "R17")
 """Scenarios of the generators in which the shipped weights were trained, with other seeds."""
 
+PUBLISHED = {
+    "dodgedrone_easy": [],
+    "dodgedrone_medium": [
+        ("NMPC, knows the obstacles [1]", 2.9, 187, 303),
+        ("PPO, knows the obstacles [1]", 2.8, 130, 303),
+    ],
+    "dodgedrone_hard": [
+        ("NMPC, knows the obstacles [1]", 2.9, 35, 303),
+        ("PPO, knows the obstacles [1]", 2.8, 22, 303),
+        ("FlightEvo, sees depth [2]", 3.0, 0, 20),
+    ],
+}
+"""Published results: method, mean speed [m/s], successes, flights, by levels of the DodgeDrone
+challenge."""
+
+DODGEDRONE_SPEEDS = 2.0, 3.0, 5.0, 7.0  # [m/s]
+
+SOURCES = (
+    "[1] github.com/arseniid/agile_flight, final_evaluation: courses 0 to 100 of the challenge, "
+    "three flights each, in at most 70 s; NMPC with a horizon of 12, PPO 39. "
+    "[2] github.com/ykeuter/flightevo, analysis, the winner of the challenge by vision: member 4, "
+    "courses 20 to 39; 28.4 m on average until the first hit. "
+    "Brackets are Wilson's 95 % intervals, of this scenario with other courses. Their vehicles "
+    "collide if their center is in a sphere, ours if a sphere of 0.354 m about its center does."
+)
+
 
 def paper_rows(config: StudyConfig, absent: Collection[str] = ()) -> dict[str, PaperRow]:
     """Returns the rows of the paper's table for unchanged policies, if the study flies all of the
@@ -170,34 +177,44 @@ def select(rows: list[Row], **values: object) -> list[Row]:
     return [row for row in rows if all(row[name] == value for name, value in values.items())]
 
 
-def success_summary(rows: list[Row]) -> Row:
-    """Counts flights by outcome, and returns the success rate with 95 % intervals: Wilson's for
-    these scenarios, and by clusters for new ones of the same kinds."""
-    successes = sum(row["success"] for row in rows)
-    interval = wilson_interval(successes, len(rows))
-    flights = Counter(row["scenario"] for row in rows)
-    wins = Counter(row["scenario"] for row in rows if row["success"])
-    clusters = cluster_interval([wins[name] for name in flights], list(flights.values()))
-    return {
-        "flights": len(rows),
-        "successes": successes,
-        "success_rate": successes / len(rows) if rows else math.nan,
-        "wilson_lower": interval.lower,
-        "wilson_upper": interval.upper,
-        "cluster_lower": clusters.lower,
-        "cluster_upper": clusters.upper,
-    } | {str(outcome): sum(row["outcome"] == outcome for row in rows) for outcome in FAILURES}
-
-
-def mean_of(rows: list[Row], name: str) -> float:
-    """Returns the mean of a column over the rows with a number; NaN without any."""
+def mean_column(rows: list[Row], name: str) -> float:
+    """Computes the mean of a column over the rows with a number; NaN without any."""
     values = [row[name] for row in rows if math.isfinite(row.get(name, math.nan))]
     return float(np.mean(values)) if values else math.nan
 
 
+def _success(successes: int, flights: int) -> Row:
+    interval = wilson_interval(successes, flights)
+    return {
+        "flights": flights,
+        "successes": successes,
+        "success_rate": successes / flights if flights else math.nan,
+        "wilson_lower": interval.lower,
+        "wilson_upper": interval.upper,
+    }
+
+
+def success_summary(rows: list[Row]) -> Row:
+    """Counts flights by outcome, and scenarios, which are passed if most of their flights succeed.
+
+    The success rate has 95 % intervals: Wilson's for these scenarios, and by clusters for new ones
+    of the same kinds.
+    """
+    flights = Counter(row["scenario"] for row in rows)
+    wins = Counter(row["scenario"] for row in rows if row["success"])
+    clusters = cluster_interval([wins[name] for name in flights], list(flights.values()))
+    return (
+        _success(wins.total(), len(rows))
+        | {"cluster_lower": clusters.lower, "cluster_upper": clusters.upper}
+        | {str(outcome): sum(row["outcome"] == outcome for row in rows) for outcome in FAILURES}
+        | {"scenarios": len(flights)}
+        | {"scenarios_passed": sum(2 * wins[name] > count for name, count in flights.items())}
+    )
+
+
 def policy_table(rows: list[Row], config: StudyConfig, absent: int = 0) -> list[Row]:
-    """Returns a row for each policy and speed: `success_summary`, `scenarios_passed`, the number of
-    flights not run in `absent` scenarios, and the means of `METRICS`."""
+    """Returns a row for each policy and speed: `success_summary`, the number of flights not run in
+    `absent` scenarios, and the means of `METRICS`."""
     table = []
     for policy in config.policy_names:
         for speed in config.speeds:
@@ -205,20 +222,30 @@ def policy_table(rows: list[Row], config: StudyConfig, absent: int = 0) -> list[
             table.append(
                 {"policy": policy, "speed": speed}
                 | success_summary(flown)
-                | scenarios_passed(flown)
                 | {"not_run": absent * config.seeds}
-                | {name: mean_of(flown, name) for name in METRICS}
+                | {name: mean_column(flown, name) for name in METRICS}
             )
     return table
 
 
-def scenarios_passed(rows: list[Row]) -> dict[str, int]:
-    """Counts scenarios, and those in which more than half of the flights succeed."""
-    successes: dict[str, list[bool]] = {}
-    for row in rows:
-        successes.setdefault(row["scenario"], []).append(row["success"])
-    passed = sum(2 * sum(flights) > len(flights) for flights in successes.values())
-    return {"scenarios": len(successes), "scenarios_passed": passed}
+def external_table(rows: list[Row], config: StudyConfig) -> list[Row]:
+    """Returns, for each published scenario that a study flies unchanged, a row for each published
+    result, and then for each of the study's policies and speeds."""
+    table = []
+    for scenario in config.scenarios if not config.overrides else ():
+        if scenario not in PUBLISHED:
+            continue
+        entries: list[tuple] = [(method, None, *rest) for method, *rest in PUBLISHED[scenario]]
+        for policy in config.policy_names:
+            for speed in config.speeds:
+                flown = select(rows, scenario=scenario, policy=policy, speed=speed)
+                successes = sum(row["success"] for row in flown)
+                mean_speed = mean_column(flown, "mean_speed_m_s")
+                entries.append((policy, speed, mean_speed, successes, len(flown)))
+        for policy, speed, mean_speed, successes, flights in entries:
+            row = {"scenario": scenario, "policy": policy, "speed": speed}
+            table.append(row | {"mean_speed_m_s": mean_speed} | _success(successes, flights))
+    return table
 
 
 class Comparison(NamedTuple):
@@ -274,3 +301,15 @@ def format_table(table: list[Row], config: StudyConfig) -> str:
             f"{row['min_clearance_m']:>+9.2f} m{row['mean_speed_m_s']:>6.2f} m/s{row['not_run']:>9}"
         )
     return "\n".join(lines)
+
+
+def format_external(table: list[Row]) -> str:
+    """Formats the external table for a terminal."""
+    lines = [f"{'scenario':<20}{'policy':<32}{'speed':>6}{'velocity':>10}{'success':>10}"]
+    for row in table:
+        speed = "-" if row["speed"] is None else f"{row['speed']:g}"
+        lines.append(
+            f"{row['scenario']:<20}{row['policy']:<32}{speed:>6}{row['mean_speed_m_s']:>6.2f} m/s"
+            f"{row['successes']:>6}/{row['flights']}"
+        )
+    return "\n".join([*lines, SOURCES])

@@ -1,5 +1,4 @@
-"""Policies of a study: registered names, files of weights and classes of other packages, each with
-overrides of some fields, and a label that names its flights."""
+"""Policies of a study, with changed fields and a label that names their flights."""
 
 import re
 from collections.abc import Iterator
@@ -20,12 +19,9 @@ _OUTSIDE_BRACKETS = r"(?![^\[{(]*[\]})])"
 class Variant(NamedTuple):
     """A policy, with a label and changed fields of its configuration."""
 
-    label: str
-    """Names its flights, and files."""
-    policy: str
-    """A registered name, a file of weights (.npz), "module:Class", or `SCENARIO`."""
-    overrides: tuple[str, ...] = ()
-    """"dotted.field=YAML value" of its configuration."""
+    label: str  # names its flights, and files
+    policy: str  # registered name, file of weights (.npz), "module:Class", or `SCENARIO`
+    overrides: tuple[str, ...] = ()  # "dotted.field=YAML value" of its configuration
 
     @property
     def weights(self) -> Path | None:
@@ -33,17 +29,8 @@ class Variant(NamedTuple):
         return Path(self.policy) if self.policy.endswith(".npz") else None
 
     def config(self, speed: float, own: Any) -> Any:
-        """
-        Returns the configuration of the policy.
-
-        Args:
-            speed: nominal [m/s].
-            own: the scenario's policy, for `SCENARIO`.
-
-        Raises:
-            FileNotFoundError, ValueError: see `policy_named`; or for invalid overrides.
-        """
-        # Here, because the command line reads policies before anything slow is imported.
+        """Returns the configuration for a nominal speed [m/s]; `own` is the scenario's policy."""
+        # The command line parses variants before slow imports.
         from splatpilot.diagrams.flight.policies import policy_named
         from splatpilot.systems.common.config import load_config
 
@@ -59,14 +46,10 @@ class Variant(NamedTuple):
 
 
 def parse_variant(text: str) -> Variant:
-    """
-    Reads `[LABEL=]POLICY[:FIELD=VALUE[:FIELD=VALUE...]]`.
+    """Parses `[LABEL=]POLICY[:FIELD=VALUE[:FIELD=VALUE...]]`.
 
     The default label is the name of the policy, class or file with the fields that are set:
     `reactive:margin=0.2` is labeled `reactive-margin-0.2`.
-
-    Raises:
-        ValueError: if the label cannot name a file, or the study sets the field.
     """
     label, _, rest = text.partition("=")
     if text.startswith("="):
@@ -107,13 +90,7 @@ def split_policies(text: str) -> list[str]:
 
 
 def sweep(text: str) -> Iterator[str]:
-    """
-    Yields the variants of a sweep, `POLICY:FIELD=VALUE,VALUE,...[:FIELD=VALUE,...]`, one for each
-    combination of values.
-
-    Raises:
-        ValueError: if no field is swept.
-    """
+    """Yields a variant for each combination of values of `POLICY:FIELD=A,B,...[:FIELD=...]`."""
     policy, *fields = re.split(f":(?={_FIELD})", text)
     if not fields:
         raise ValueError(f"the sweep {text!r} has no field; write POLICY:FIELD=VALUE,VALUE")

@@ -1,40 +1,23 @@
-"""The commands, one module each.
+"""The commands of `splatpilot`. They import torch and pydrake when they run: that takes seconds."""
 
-A module's `add_to(verbs)` adds the parser of its command and the function that runs it. That
-function imports what it needs when it runs, as torch and pydrake take seconds to import.
-"""
-
-from splatpilot.analysis.commands import (
-    benchmark,
-    capture,
-    corpus,
-    difficulty,
-    doctor,
-    fly,
-    hardware,
-    reconstruct,
-    recover,
-    replay,
-    scene,
-    train,
-    view,
-)
+from splatpilot.analysis.commands import benchmark, capture, doctor, flight, hardware, scene, train
+from splatpilot.analysis.commands.options import Command
 
 COMMANDS = (
-    fly,
-    view,
-    benchmark,
-    replay,
-    difficulty,
-    reconstruct,
-    capture,
-    scene,
-    train,
-    recover,
-    corpus,
-    hardware,
-    doctor,
+    *(flight.fly, flight.view, benchmark.benchmark, benchmark.replay, benchmark.difficulty),
+    capture.reconstruct,
+    Command("capture", "render a capture, or check one"),
+    *(capture.check, capture.render),
+    Command("scene", "scale, measure, export, compare or fetch scenes"),
+    *(scene.scale, scene.measure, scene.mesh, scene.ablate, scene.fidelity, scene.fetch),
+    *(train.train, train.recover),
+    Command("corpus", "collect samples for students, or inspect them"),
+    *(train.make_corpus, train.inspect_corpus),
+    Command("hardware", "fly vehicles, real or simulated, by messages"),
+    *(hardware.vehicle, hardware.bridge, hardware.px4, hardware.faults),
+    doctor.doctor,
 )
+"""In the order of the help; subcommands follow their command."""
 
 MOVED = {
     "tour": "reconstruct",
@@ -43,4 +26,4 @@ MOVED = {
     **{name: f"scene {name}" for name in ("scale", "measure", "mesh", "ablate", "fidelity")},
     **{name: f"hardware {name}" for name in ("vehicle", "bridge", "px4", "faults")},
 }
-"""Names of commands that have moved."""
+"""New names of commands that have moved."""

@@ -1,146 +1,23 @@
-"""`splatpilot benchmark`."""
+"""`splatpilot benchmark`, `replay` and `difficulty`."""
 
 import argparse
-from pathlib import Path
 from typing import Any
 
-from splatpilot.analysis.benchmark.variants import parse_variant, split_policies, sweep
-from splatpilot.analysis.commands.options import (
-    FailureWithResultError,
-    add_json,
-    add_overrides,
-    add_verb,
-    check_policy,
-    check_scenario,
-)
+from splatpilot.analysis.benchmark.variants import split_policies, sweep
+from splatpilot.analysis.commands import options as cli
+from splatpilot.analysis.commands.checks import SCENARIOS, check_policy, check_scenario
+from splatpilot.systems.common.validation import require
 
-QUICK_SCENARIOS = "P02", "P06", "P08"
-QUICK_POLICIES = "planner", "straight", "reactive"
-QUICK_SEEDS = 5
-
-
-def add_to(verbs: argparse._SubParsersAction) -> None:
-    benchmark = add_verb(
-        verbs,
-        "benchmark",
-        _benchmark,
-        help="fly policies through scenarios, many times, and report",
-        description="Flies scenarios x policies x speeds x seeds, and leaves rollouts.csv, "
-        "table.csv and report.html. Run again, it flies what is missing. Ends with status 1 if no "
-        "flight could be flown.",
-        examples=(
-            "benchmark --out out/quick --quick",
-            "benchmark --out out/study --scenarios P02,P03 --policies planner,reactive:margin=0.2",
-            "benchmark --out out/mine --policies mine=out/forests/diffaero.npz --speeds 2,3 --json",
-        ),
-    )
-    benchmark.add_argument("--out", type=Path, required=True, help="folder of the study")
-    benchmark.add_argument(
-        "--quick",
-        action="store_true",
-        help=f"a few minutes: {', '.join(QUICK_SCENARIOS)}, {', '.join(QUICK_POLICIES)}, "
-        f"{QUICK_SEEDS} seeds, unless other ones are named",
-    )
-    benchmark.add_argument(
-        "--dodgedrone",
-        action="store_true",
-        help="the DodgeDrone challenge, easy, medium and hard, at 2, 3, 5 and 7 m/s, beside "
-        "published figures, unless other scenarios and speeds are named",
-    )
-    benchmark.add_argument(
-        "--policies",
-        metavar="A,B.npz,C:FIELD=VALUE,...",
-        help="names, files of weights or module:Class, with LABEL= before and fields behind; "
-        "scenario: each scenario's own; default: that, where all have one, or else all",
-    )
-    benchmark.add_argument(
-        "--sweep",
-        action="append",
-        default=[],
-        metavar="A:FIELD=1,2,3",
-        help="a policy with each of these values of a field, and all combinations of the values "
-        "of several (repeatable)",
-    )
-    benchmark.add_argument(
-        "--scenarios", type=_names, metavar="P02,FILE.yaml", help="default: all of the benchmark"
-    )
-    benchmark.add_argument("--speeds", type=_names, metavar="2,3", help="nominal, m/s; default: 2")
-    benchmark.add_argument("--seeds", type=int, metavar="N", help="flights of each; default: 20")
-    benchmark.add_argument(
-        "--split",
-        help="whose seeds: dev (default), to develop by, or test, to report what is final",
-    )
-    benchmark.add_argument("--jobs", type=int, metavar="N", help="worker processes; default: cores")
-    benchmark.add_argument(
-        "--cluster", metavar="ADDRESS", help="fly on the workers of this dask scheduler instead"
-    )
-    add_overrides(
-        benchmark, ("observation.depth_multiplicative=0.03", "timeout=90"), _scenario_defaults
-    )
-    add_json(benchmark, "the rows of table.csv")
+QUICK = {
+    "scenarios": ["P02", "P06", "P08"],
+    "policies": ["planner", "straight", "reactive"],
+    "seeds": 5,
+}
+"""The study of `--quick`."""
 
 
 def _names(text: str) -> list[str]:
     return [name.strip() for name in text.split(",") if name.strip()]
-
-
-def _scenario_defaults(options: argparse.Namespace) -> Any:
-    from splatpilot.diagrams.flight.scenario import Scenario
-
-    return Scenario()
-
-
-def _benchmark(options: argparse.Namespace) -> Any:
-    for scenario in options.scenarios or ():
-        check_scenario(scenario)
-    named = None
-    if options.policies is not None or options.sweep:
-        swept = [variant for text in options.sweep for variant in sweep(text)]
-        named = [*split_policies(options.policies or ""), *swept]
-        for policy in named:
-            check_policy(parse_variant(policy))
-    from splatpilot.systems.common.progress import say
-
-    say(f"flying a study in {options.out}")
-    from splatpilot.analysis.benchmark import run_study as benchmark
-    from splatpilot.analysis.benchmark.external import DODGEDRONE, DODGEDRONE_SPEEDS
-    from splatpilot.analysis.benchmark.study import StudyConfig, default_policies
-
-    config = StudyConfig(overrides=options.overrides)
-    if options.quick:
-        config.scenarios, config.policies = list(QUICK_SCENARIOS), list(QUICK_POLICIES)
-        config.seeds = QUICK_SEEDS
-    if options.dodgedrone:
-        config.scenarios, config.speeds = list(DODGEDRONE), list(DODGEDRONE_SPEEDS)
-    for name in ("scenarios", "seeds", "split"):
-        value = getattr(options, name)
-        if value is not None:
-            setattr(config, name, value)
-    if named is not None:
-        config.policies = named
-    elif not options.quick:
-        config.policies = default_policies(config.scenarios)
-    if options.speeds is not None:
-        config.speeds = [_speed(text) for text in options.speeds]
-    table = benchmark.run(
-        config=config,
-        out=options.out,
-        jobs=options.jobs,
-        cluster=options.cluster,
-    )
-    require_flown(table)
-    return table
-
-
-def require_flown(table: list[dict[str, Any]]) -> None:
-    """
-    Raises:
-        FailureWithResultError: if a study has flights, and none of them could be flown.
-    """
-    if table and all(row["infeasible"] == row["flights"] for row in table):
-        raise FailureWithResultError(
-            "none of the flights could be flown; rollouts.csv has the reasons", table
-        )
 
 
 def _speed(text: str) -> float:
@@ -148,3 +25,128 @@ def _speed(text: str) -> float:
         return float(text)
     except ValueError:
         raise ValueError(f"--speeds must be numbers in m/s, got {text!r}") from None
+
+
+@cli.command(
+    "benchmark",
+    "fly policies through scenarios many times, and report",
+    cli.out_option("folder of the study"),
+    cli.flag(
+        "--quick",
+        f"a study of a few minutes: {', '.join(QUICK['scenarios'])}, "
+        f"{', '.join(QUICK['policies'])}, {QUICK['seeds']} seeds, unless others are given",
+    ),
+    cli.flag(
+        "--dodgedrone",
+        "the DodgeDrone challenge, easy, medium and hard, at 2, 3, 5 and 7 m/s, next to published "
+        "results, unless other scenarios and speeds are given",
+    ),
+    cli.Option(
+        "--policies A,B.npz,C:FIELD=VALUE,...",
+        "names, files of weights or module:Class, with LABEL= before and fields after; scenario: "
+        "each scenario's own; default: that, if all have one, or all policies",
+        split_policies,
+        resolve=check_policy,
+    ),
+    cli.Option(
+        "--sweep A:FIELD=1,2,3",
+        "a policy with each of these values of a field, and all combinations of the values of "
+        "several (repeatable)",
+        action="append",
+        default=[],
+        resolve=lambda text: [check_policy(policy) for policy in sweep(text)],
+    ),
+    cli.Option("--scenarios P02,FILE.yaml", "default: all", _names, resolve=check_scenario),
+    cli.Option("--speeds 2,3", "nominal, m/s; default: 2", _names, resolve=_speed),
+    cli.Option("--seeds N", "flights of each; default: 20", int),
+    cli.Option("--split", "seeds to fly: dev (default) for development, test for final results"),
+    cli.JOBS,
+    cli.Option("--cluster ADDRESS", "fly on the workers of this dask scheduler"),
+    cli.set_option(
+        *("observation.depth_multiplicative=0.03", "timeout=90"),
+        configuration="splatpilot.diagrams.flight.scenario:Scenario",
+    ),
+    cli.json_option("the rows of table.csv"),
+    examples=(
+        "benchmark --out out/quick --quick",
+        "benchmark --out out/study --scenarios P02,P03 --policies planner,reactive:margin=0.2",
+        "benchmark --out out/mine --policies mine=out/forests/diffaero.npz --speeds 2,3 --json",
+    ),
+)
+def benchmark(options: argparse.Namespace) -> Any:
+    """Flies scenarios x policies x speeds x seeds, and writes rollouts.csv, table.csv and
+    report.html. The same command resumes an interrupted study. Exits with status 1 if no flight
+    could be flown."""
+    cli.announce(f"flying a study in {options.out}")
+    from splatpilot.analysis.benchmark import run_study
+    from splatpilot.analysis.benchmark.study import StudyConfig, default_policies
+    from splatpilot.analysis.benchmark.tables import DODGEDRONE_SPEEDS, PUBLISHED
+
+    fields: dict[str, Any] = {"overrides": options.overrides}
+    if options.quick:
+        fields |= QUICK
+    if options.dodgedrone:
+        fields |= {"scenarios": list(PUBLISHED), "speeds": list(DODGEDRONE_SPEEDS)}
+    for name in ("scenarios", "seeds", "split", "speeds"):
+        if getattr(options, name) is not None:
+            fields[name] = getattr(options, name)
+    if options.policies is not None or options.sweep:
+        fields["policies"] = sum(options.sweep, options.policies or [])
+    config = StudyConfig(**fields)
+    if "policies" not in fields:
+        config.policies = default_policies(config.scenarios)
+    table = cli.call(run_study.run, options, config=config)
+    if table and all(row["infeasible"] == row["flights"] for row in table):
+        raise cli.FailureWithResultError(
+            "none of the flights could be flown; rollouts.csv has the reasons", table
+        )
+    return table
+
+
+@cli.command(
+    "replay",
+    "fly one flight of a study again, and check it",
+    cli.path_option("study", "the folder of a study"),
+    cli.Option("ids", "of flights through one world, see rollouts.csv", nargs="+", metavar="id"),
+    cli.flag("--meshcat", "write flight.html, to watch the flight"),
+    cli.flag("--video", "write flight.mp4, the onboard video"),
+    cli.out_option("folder for these (STUDY/replays/ID)", required=False),
+    cli.OVERWRITE,
+    examples=(
+        "replay out/study P08-reactive-2-003 --meshcat --video",
+        "replay out/study P08-planner-2-003 P08-reactive-2-003 --overwrite",
+    ),
+)
+def replay(options: argparse.Namespace) -> None:
+    """Flies one flight of a study again, from the study's folder alone, and compares it with its
+    record. Exits with status 1 if they differ. Of several flights it writes a page."""
+    from splatpilot.analysis.benchmark import replay
+
+    first, *others = options.ids
+    if others:
+        cli.call(replay.overlay, options)
+    elif not cli.call(replay.run, options, id=first).exact:
+        raise ValueError(f"{first}: the replay differs from the recorded flight")
+
+
+@cli.command(
+    "difficulty",
+    "print how hard scenarios are, and how many seeds are feasible",
+    cli.Option(
+        "scenarios",
+        "P01 to R17 or YAML files (default: all)",
+        nargs="*",
+        metavar="SCENARIO",
+        resolve=check_scenario,
+        completions=SCENARIOS,
+    ),
+    cli.Option("--seeds", "seeds of each (%(default)s)", int, default=5),
+    examples=("difficulty", "difficulty P06 P07 --seeds 10"),
+)
+def difficulty(options: argparse.Namespace) -> None:
+    """Measures worlds before a flight: how far obstacles force it off the straight line, how narrow
+    and how cluttered its path is."""
+    require(options.seeds >= 1, "--seeds", "at least 1", options.seeds)
+    from splatpilot.analysis import difficulty
+
+    cli.call(difficulty.run, options)

@@ -1,125 +1,131 @@
-"""`splatpilot capture`: work on captures before they become scenes."""
+"""`splatpilot reconstruct` and `splatpilot capture`."""
 
 import argparse
 from pathlib import Path
 from typing import Any
 
-from splatpilot.analysis.commands.options import (
-    FailureWithResultError,
-    add_json,
-    add_overrides,
-    add_verb,
-    find_place,
+from splatpilot.analysis.commands import options as cli
+from splatpilot.analysis.commands.checks import SCENARIOS
+
+_RENDERED = {".gltf", ".glb", ".obj", ".yaml", ".yml"}
+
+
+def _is_rendered(source: str) -> bool:
+    """Returns True for meshes and scenarios, which are rendered to captures."""
+    return Path(source).suffix.lower() in _RENDERED or source in SCENARIOS
+
+
+def _defaults(options: argparse.Namespace) -> Any:
+    from splatpilot.analysis.reconstruction.run import RenderedSceneConfig
+    from splatpilot.training.reconstruction.config import ReconstructConfig
+
+    rendered = options.source and _is_rendered(options.source)
+    return RenderedSceneConfig() if rendered else ReconstructConfig()
+
+
+@cli.command(
+    "reconstruct",
+    "make a scene to fly in from a capture, a mesh or a generated world",
+    cli.input_option("source", "capture", "mesh", "scenario"),
+    cli.out_option("scene folder to write"),
+    cli.Option("--iterations", "optimization steps", int),
+    cli.UP,
+    cli.SEED,
+    cli.flag("--restart", "discard an interrupted run"),
+    cli.OVERWRITE,
+    cli.set_option(
+        *("voxel_size=0.1", "image_width=640", "max_gaussians=200000", "device=cuda"),
+        configuration=_defaults,
+    ),
+    examples=(
+        "reconstruct data/hospital --out scenes/hospital",
+        "reconstruct photos --out scenes/room --set capture.scale.camera_height=1.5",
+        "reconstruct warehouse.gltf --up z --out scenes/warehouse",
+    ),
 )
+def reconstruct(options: argparse.Namespace) -> None:
+    """Renders a mesh or a generated world to OUT/capture first. Then fits Gaussians to the images
+    and depth of a capture, measures them on held-out frames, and writes a scene folder with its
+    distance field. If interrupted, the same command resumes."""
+    source, rendered = options.source, _is_rendered(options.source)
+    for name in ("up", "seed"):
+        if getattr(options, name) is not None and not rendered:
+            raise ValueError(f"--{name} must be of a mesh or a scenario, got a capture, {source}")
+    cli.announce(f"reconstructing {source} as {options.out}")
+    from splatpilot.analysis.reconstruction import run
+
+    overrides = []
+    if options.iterations is not None:
+        if any(override.startswith("iterations=") for override in options.overrides):
+            raise ValueError("iterations are given by --iterations and by --set; keep one of them")
+        overrides = [f"iterations={options.iterations}"]
+    config: Any = cli.read_config(options, *overrides)
+    if not rendered:
+        cli.call(run.run, options, capture=Path(source), config=config)
+        return
+    if options.up is not None:
+        config.render.up = options.up
+    seed = options.seed or 0
+    cli.call(run.run_rendered, options, world=Path(source), config=config, seed=seed)
 
 
-def add_to(verbs: argparse._SubParsersAction) -> None:
-    capture = add_verb(
-        verbs,
-        "capture",
-        None,
-        help="render a capture, or check one",
-        description="Work on captures before they become scenes.",
-        examples=(
-            "capture check data/hospital",
-            "capture render warehouse.gltf --up z --out out/capture",
-        ),
-    )
-    actions = capture.add_subparsers(required=True, metavar="ACTION")
-    _add_check(actions)
-    _add_render(actions)
-
-
-def _add_check(actions: argparse._SubParsersAction) -> None:
-    check = add_verb(
-        actions,
-        "check",
-        _check,
-        help="tell whether poses, intrinsics and depth of a capture agree",
-        description="Carries depth from frame to frame and compares. If it does not agree, tries "
-        "the usual mistakes, names the most likely one, and ends with status 1. Without depth, "
-        "tells what was read or registered.",
-        examples=(
-            "capture check data/hospital",
-            "capture check data/office --set capture.depth_unit=5000 --json",
-        ),
-    )
-    check.add_argument("capture", type=Path, help="folder of a capture")
-    add_overrides(check, ("pairs=30", "capture.depth_unit=5000"), _check_defaults)
-    add_json(check, "what was found")
-
-
-def _check_defaults(options: argparse.Namespace) -> Any:
-    from splatpilot.training.captures.check import CheckConfig
-
-    return CheckConfig()
-
-
-def _check(options: argparse.Namespace) -> Any:
-    options.capture = find_place(options.capture, "capture")
-    from splatpilot.systems.common.progress import say
-
-    say(f"checking {options.capture}")
-    from splatpilot.systems.common.config import load_config
+@cli.command(
+    "capture check",
+    "check that poses, intrinsics and depth of a capture agree",
+    cli.input_option("capture", "capture"),
+    cli.set_option(
+        *("pairs=30", "capture.depth_unit=5000"),
+        configuration="splatpilot.training.captures.check:CheckConfig",
+    ),
+    cli.json_option("the report"),
+    examples=(
+        "capture check data/hospital",
+        "capture check data/office --set capture.depth_unit=5000 --json",
+    ),
+)
+def check(options: argparse.Namespace) -> Any:
+    """Projects depth from frame to frame and compares. If it disagrees, tests the usual errors,
+    names the most likely one, and exits with status 1. Without depth, it reports what was read or
+    registered."""
+    cli.announce(f"checking {options.capture}")
     from splatpilot.training.captures import check
 
-    config = load_config(_check_defaults(options), overrides=options.overrides)
-    report = check.run(capture=options.capture, config=config)
-    if report.mistake:
-        raise FailureWithResultError(f"{options.capture}: {report.mistake}", report)
+    report = check.run(capture=Path(options.capture), config=cli.read_config(options))
+    if report.problem:
+        raise cli.FailureWithResultError(f"{options.capture}: {report.problem}", report)
     return report
 
 
-def _add_render(actions: argparse._SubParsersAction) -> None:
-    render = add_verb(
-        actions,
-        "render",
-        _render,
-        help="render a capture of a mesh or a generated world, with exact depth",
-        description="Writes a TartanAir V1 sequence. Without --path the camera visits all the "
-        "free space between the heights.",
-        examples=(
-            "capture render warehouse.gltf --up z --out out/capture",
-            'capture render P09 --seed 3 --out out/alley --path "0,0,1.5 8,0,1.5 8,6,1.5"',
-        ),
-    )
-    render.add_argument(
-        "world",
-        type=Path,
-        help=".glb, .gltf or .obj, or a scenario of a generated world: P01 or a file",
-    )
-    render.add_argument("--out", type=Path, required=True, help="capture folder to write")
-    render.add_argument(
-        "--path", metavar='"X,Y,Z X,Y,Z ..."', help="points the camera goes through [m]"
-    )
-    render.add_argument("--up", choices=("y", "z"), help="axis of the mesh file that points up")
-    render.add_argument("--seed", type=int, default=0, help="seed of a generated world")
-    add_overrides(render, ("spacing=0.8", "highest=2.0", "offsets=[-0.5,0.5]"), _render_defaults)
+def _points(text: str) -> list[list[float]]:
+    try:
+        return [[float(x) for x in point.split(",")] for point in text.split()]
+    except ValueError:
+        raise ValueError(f"--path must be points X,Y,Z with spaces between, got {text!r}") from None
 
 
-def _render_defaults(options: argparse.Namespace) -> Any:
-    from splatpilot.training.captures.render import RenderConfig
+@cli.command(
+    "capture render",
+    "render a capture of a mesh or a generated world, with exact depth",
+    cli.input_option("world", "mesh", "scenario"),
+    cli.out_option("capture folder to write"),
+    cli.Option('--path "X,Y,Z X,Y,Z ..."', "points on the camera's path [m]", resolve=_points),
+    cli.UP,
+    cli.SEED,
+    cli.set_option(
+        *("spacing=0.8", "highest=2.0", "offsets=[-0.5,0.5]"),
+        configuration="splatpilot.training.captures.render:RenderConfig",
+    ),
+    examples=(
+        "capture render warehouse.gltf --up z --out out/capture",
+        'capture render P09 --seed 3 --out out/alley --path "0,0,1.5 8,0,1.5 8,6,1.5"',
+    ),
+)
+def render(options: argparse.Namespace) -> None:
+    """Writes a TartanAir V1 sequence. Without --path the camera visits all free space between the
+    heights."""
+    cli.announce(f"rendering {options.world} to {options.out}")
+    from splatpilot.training.captures import render
 
-    return RenderConfig()
-
-
-def _render(options: argparse.Namespace) -> None:
-    options.world = find_place(options.world, "mesh", "scenario")
-    from splatpilot.systems.common.progress import say
-
-    say(f"rendering {options.world} to {options.out}")
-    from splatpilot.systems.common.config import load_config
-    from splatpilot.training.captures import render as render_capture
-
-    config = _render_defaults(options)
-    if options.up is not None:
-        config.up = options.up
-    if options.path is not None:
-        try:
-            config.path = [[float(x) for x in p.split(",")] for p in options.path.split()]
-        except ValueError:
-            raise ValueError(
-                f"--path {options.path!r}: points X,Y,Z separated by spaces are needed"
-            ) from None
-    config = load_config(config, overrides=options.overrides)
-    render_capture.run(world=options.world, out=options.out, config=config, seed=options.seed)
+    config = cli.read_config(options, up=options.up, path=options.path)
+    world, seed = Path(options.world), options.seed or 0
+    cli.call(render.run, options, world=world, config=config, seed=seed)

@@ -3,23 +3,18 @@
 import argparse
 from typing import Any
 
-from splatpilot.analysis.commands.options import add_json, add_verb
+from splatpilot.analysis.commands import options as cli
 
 
-def add_to(verbs: argparse._SubParsersAction) -> None:
-    doctor = add_verb(
-        verbs,
-        "doctor",
-        _doctor,
-        help="say what this machine can do, and what to install or set for the rest",
-        description="Looks at processor, GPU, EGL, the route for LCM's messages, the video "
-        "encoder, the packages of each extra, data and scenes. What lacks has one remedy.",
-        examples=("doctor", "doctor --json"),
-    )
-    add_json(doctor, "what was found")
-
-
-def _doctor(options: argparse.Namespace) -> Any:
+@cli.command(
+    "doctor",
+    "list what works on this machine, and what to install or set for the rest",
+    cli.json_option("the findings"),
+    examples=("doctor", "doctor --json"),
+)
+def doctor(options: argparse.Namespace) -> Any:
+    """Checks processor, GPU, EGL, the route of LCM messages, the video encoder, the packages of
+    each extra, data and scenes. Each missing part has one remedy."""
     from splatpilot.analysis.doctor import examine, format_findings
 
     findings = examine()

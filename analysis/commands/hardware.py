@@ -6,134 +6,19 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from splatpilot.analysis.commands.options import (
-    add_overrides,
-    add_overwrite,
-    add_scenario,
-    add_verb,
-    check_config,
-    read_scenario,
+from splatpilot.analysis.commands import options as cli
+
+_LCM_URL = cli.Option("--lcm-url URL", "LCM's multicast group and port")
+_MESSAGING = (
+    cli.path_option("--hardware FILE", "a YAML file of a HardwareConfig"),
+    _LCM_URL,
+    cli.Option("--patience S", "maximum wait for messages [s]", float),
+    cli.OVERWRITE,
+    *cli.SCENARIO_OPTIONS,
 )
-from splatpilot.systems.common.files import require_unused
 
 
-def add_to(verbs: argparse._SubParsersAction) -> None:
-    hardware = add_verb(
-        verbs,
-        "hardware",
-        None,
-        help="fly vehicles, real or simulated, by messages",
-        description="Flies a real or simulated vehicle by LCM messages or PX4, or tests the "
-        "failsafe by faults.",
-        examples=("hardware vehicle --scenario P02", "hardware bridge --scenario P02"),
-    )
-    actions = hardware.add_subparsers(required=True, metavar="ACTION")
-    _add_hardware(actions)
-    _add_faults(actions)
-
-
-def _add_hardware(verbs: argparse._SubParsersAction) -> None:
-    vehicle = add_verb(
-        verbs,
-        "vehicle",
-        _vehicle,
-        help="simulate a vehicle that is flown by LCM messages",
-        description="Hovers at the scenario's start until commands come, and flies by them, in "
-        "real time: what `splatpilot hardware bridge` flies where there is no real vehicle.",
-        examples=(
-            "hardware vehicle --scenario P02 --policy diffaero",
-            "hardware vehicle --scenario P02 --seed 3 --patience 60 --out out/vehicle_3",
-        ),
-    )
-    vehicle.add_argument(
-        "--out", type=Path, default=Path("out/vehicle"), help="output folder (%(default)s)"
-    )
-    bridge = add_verb(
-        verbs,
-        "bridge",
-        _bridge,
-        help="fly a vehicle, real or simulated, by LCM messages",
-        description="Runs policy, controller and failsafe against a vehicle that sends its state "
-        "and what it sees, and takes commands.",
-        examples=(
-            "hardware bridge --scenario P02 --policy diffaero",
-            "hardware bridge --scenario room.yaml --hardware room_hardware.yaml --log flight.lcm",
-        ),
-    )
-    bridge.add_argument("--log", type=Path, help="write all messages to this file, as lcm-logger")
-    px4 = add_verb(
-        verbs,
-        "px4",
-        _px4,
-        help="let the bridge fly a vehicle that PX4 flies, by MAVLink",
-        description="Stands where the simulated vehicle stands: sends PX4's estimate on to the "
-        "bridge, and the bridge's commands on to PX4. Arms nothing unless told to.",
-        examples=(
-            "hardware px4 --set vehicle_host=192.168.8.1",
-            "hardware px4 --config px4.yaml --engage",
-        ),
-    )
-    px4.add_argument("--config", type=Path, metavar="FILE", help="YAML with fields of Px4Config")
-    px4.add_argument("--lcm-url", metavar="URL", help="where the bridge is")
-    px4.add_argument("--engage", action="store_true", help="ask for offboard mode")
-    px4.add_argument("--arm", action="store_true", help="arm the motors, in offboard mode")
-    add_overrides(px4, ("vehicle_host=192.168.8.1", "udp.host=0.0.0.0"), _px4_defaults)
-    for parser in (vehicle, bridge):
-        parser.add_argument(
-            "--hardware", type=Path, metavar="FILE", help="YAML with fields of HardwareConfig"
-        )
-        parser.add_argument("--lcm-url", metavar="URL", help="where messages travel")
-        parser.add_argument(
-            "--patience", type=float, metavar="S", help="how long to wait for messages [s]"
-        )
-        add_overwrite(parser)
-        add_scenario(parser)
-
-
-def _vehicle(options: argparse.Namespace) -> None:
-    require_unused(options.out, options.overwrite)
-    check_config(options.hardware)
-    scenario = read_scenario(options)
-    from splatpilot.diagrams.hardware import vehicle
-
-    vehicle.run(scenario=scenario, config=_config(options), out=options.out)
-
-
-def _bridge(options: argparse.Namespace) -> None:
-    if options.log is not None:
-        require_unused(options.log, options.overwrite)
-    check_config(options.hardware)
-    scenario = read_scenario(options)
-    from splatpilot.diagrams.hardware import bridge
-
-    bridge.run(
-        scenario=scenario,
-        config=_config(options),
-        log=options.log,
-        overwrite=options.overwrite,
-    )
-
-
-def _px4_defaults(options: argparse.Namespace) -> Any:
-    from splatpilot.diagrams.hardware.px4 import Px4Config
-
-    return Px4Config()
-
-
-def _px4(options: argparse.Namespace) -> None:
-    check_config(options.config)
-    from splatpilot.diagrams.hardware import px4
-    from splatpilot.systems.common.config import load_config
-
-    config = load_config(_px4_defaults(options), options.config, options.overrides)
-    if options.lcm_url is not None:
-        config.url = options.lcm_url
-    config.commander.engage |= options.engage
-    config.commander.arm |= options.arm
-    px4.run(config=config)
-
-
-def _config(options: argparse.Namespace):
+def _hardware_config(options: argparse.Namespace) -> Any:
     from splatpilot.diagrams.hardware.bridge import HardwareConfig
     from splatpilot.systems.common.config import load_config
 
@@ -142,46 +27,99 @@ def _config(options: argparse.Namespace):
     return replace(load_config(HardwareConfig(), options.hardware), **given)
 
 
-def _add_faults(verbs: argparse._SubParsersAction) -> None:
-    faults = add_verb(
-        verbs,
-        "faults",
-        _faults,
-        help="fly while messages, clocks and policies fail",
-        description="Flies hundreds of short flights through the bridge while messages are lost, "
-        "late or false, clocks jump or policies fail, and counts which ended safely. Interrupted, "
-        "the same command goes on.",
-        examples=(
-            "hardware faults --set trials=30",
-            "hardware faults --out out/faults_1 --set seed=1",
-        ),
-    )
-    faults.add_argument(
-        "--out", type=Path, default=Path("out/faults"), help="output folder (%(default)s)"
-    )
-    faults.add_argument("--config", type=Path, help="YAML file with fields of the configuration")
-    add_overrides(faults, ("trials=30", "seed=1", "scenario.timeout=20"), _faults_defaults)
+@cli.command(
+    "hardware vehicle",
+    "simulate a vehicle that is flown by LCM messages",
+    cli.out_option("output folder", "out/vehicle", unused=True),
+    *_MESSAGING,
+    examples=(
+        "hardware vehicle --scenario P02 --policy diffaero",
+        "hardware vehicle --scenario P02 --seed 3 --patience 60 --out out/vehicle_3",
+    ),
+)
+def vehicle(options: argparse.Namespace) -> None:
+    """Hovers at the scenario's start until it receives commands, and follows them in real time.
+    `splatpilot hardware bridge` flies it instead of a real vehicle."""
+    scenario = cli.read_scenario(options)
+    from splatpilot.diagrams.hardware import vehicle
+
+    cli.call(vehicle.run, options, scenario=scenario, config=_hardware_config(options))
 
 
-def _faults_defaults(options: argparse.Namespace) -> Any:
-    from splatpilot.analysis.faults.campaign import FaultsConfig
+@cli.command(
+    "hardware bridge",
+    "fly a vehicle, real or simulated, by LCM messages",
+    cli.Option("--log", "write all messages to this file, as lcm-logger does", Path, unused=True),
+    *_MESSAGING,
+    examples=(
+        "hardware bridge --scenario P02 --policy diffaero",
+        "hardware bridge --scenario room.yaml --hardware room_hardware.yaml --log flight.lcm",
+    ),
+)
+def bridge(options: argparse.Namespace) -> None:
+    """Runs policy, controller and failsafe for a vehicle that sends its state and its images, and
+    follows commands."""
+    scenario = cli.read_scenario(options)
+    from splatpilot.diagrams.hardware import bridge
 
-    return FaultsConfig()
+    cli.call(bridge.run, options, scenario=scenario, config=_hardware_config(options))
 
 
-def _faults(options: argparse.Namespace) -> None:
-    check_config(options.config)
+@cli.command(
+    "hardware px4",
+    "connect the bridge to PX4 by MAVLink",
+    cli.CONFIG,
+    _LCM_URL,
+    cli.flag("--engage", "request offboard mode"),
+    cli.flag("--arm", "arm the motors, in offboard mode"),
+    cli.set_option(
+        *("vehicle_host=192.168.8.1", "udp.host=0.0.0.0"),
+        configuration="splatpilot.diagrams.hardware.px4:Px4Config",
+    ),
+    examples=(
+        "hardware px4 --set vehicle_host=192.168.8.1",
+        "hardware px4 --config px4.yaml --engage",
+    ),
+)
+def px4(options: argparse.Namespace) -> None:
+    """Sends the estimate of PX4 to the bridge, and its commands to PX4. Arms only with --arm."""
+    from splatpilot.diagrams.hardware import px4
+
+    config = cli.read_config(options)
+    if options.lcm_url is not None:
+        config.url = options.lcm_url
+    config.commander.engage |= options.engage
+    config.commander.arm |= options.arm
+    px4.run(config=config)
+
+
+@cli.command(
+    "hardware faults",
+    "fly with faults of messages, clocks and policies",
+    cli.out_option("output folder", "out/faults"),
+    cli.CONFIG,
+    cli.set_option(
+        *("trials=30", "seed=1", "scenario.timeout=20"),
+        configuration="splatpilot.analysis.faults.campaign:FaultsConfig",
+    ),
+    examples=(
+        "hardware faults --set trials=30",
+        "hardware faults --out out/faults_1 --set seed=1",
+    ),
+)
+def faults(options: argparse.Namespace) -> None:
+    """Flies hundreds of short flights through the bridge with lost, late or false messages, clock
+    jumps or failing policies, and counts those that end safely. If interrupted, the same command
+    resumes."""
     from splatpilot.analysis.faults.campaign import run
-    from splatpilot.systems.common.config import load_config
 
-    config = load_config(_faults_defaults(options), options.config, options.overrides)
     # Thousands of packets are refused, and policies raise, on purpose.
     loggers = [logging.getLogger(name) for name in ("drake", "splatpilot")]
     levels = [logger.level for logger in loggers]
     try:
         for logger in loggers:
             logger.setLevel(logging.CRITICAL)
-        run(config=config, out=options.out)
+        run(config=cli.read_config(options), out=options.out)
     finally:
         for logger, level in zip(loggers, levels, strict=True):
             logger.setLevel(level)

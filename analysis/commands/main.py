@@ -13,7 +13,7 @@ import sys
 import tempfile
 import threading
 import traceback
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from types import FrameType
 from typing import Any, NoReturn
 
@@ -22,37 +22,12 @@ from splatpilot.analysis.commands.options import FailureWithResultError, as_json
 from splatpilot.systems.common.extras import missing_extra
 from splatpilot.systems.common.validation import TYPES, did_you_mean, unknown
 
-
-def raised_by(error: BaseException, packages: Collection[str]) -> str:
-    """Returns the file and line in one of `packages` that raised an exception, if not our code."""
-    raised = ""
-    for frame, line in traceback.walk_tb(error.__traceback__):
-        package = frame.f_globals.get("__name__", "").partition(".")[0]
-        if package in packages:
-            raised = f"{frame.f_code.co_filename}, line {line}"
-        elif package == "splatpilot":
-            raised = ""
-    return raised
-
-
-def write_report(error: BaseException, arguments: Sequence[str]) -> str:
-    """Writes the command and the traceback to a temporary file; returns its path, or the text."""
-    from importlib.metadata import version
-
-    command = f"splatpilot {version('splatpilot')}: {shlex.join(arguments)}"
-    text = f"{command}\n\n{''.join(traceback.format_exception(error))}"
-    try:
-        with tempfile.NamedTemporaryFile(
-            "w", prefix="splatpilot-", suffix=".txt", delete=False
-        ) as file:
-            file.write(text)
-    except OSError:
-        return text
-    return file.name
+_SIGNALS = {signal.SIGTERM: ("terminated", 143), signal.SIGINT: ("interrupted", 130)}
+"""Message and exit status of signals that end a command."""
 
 
 class _PrintVersion(argparse.Action):
-    """Prints the version, which takes as long to find as all else to import."""
+    """Prints the version, which is slow to find."""
 
     def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
         from splatpilot import __version__
@@ -70,11 +45,15 @@ class _ImportModule(argparse.Action):
         from splatpilot.systems.common.registry import import_modules
 
         import_modules([value])
-        setattr(namespace, self.dest, [*getattr(namespace, self.dest), value])
 
 
 class _Parser(argparse.ArgumentParser):
     """Parser that suggests similar words for unknown ones."""
+
+    def __init__(self, *args: Any, **keywords: Any) -> None:
+        super().__init__(*args, **keywords)
+        # Points and axes may begin with a minus sign; argparse takes only numbers for values.
+        self._negative_number_matcher = re.compile(r"-([\d.]|[xyz]$)")
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         if action.option_strings or action.choices is None or value in action.choices:
@@ -112,29 +91,17 @@ class _Parser(argparse.ArgumentParser):
         self.exit(2, f"{self.prog}: {message}{remedy}\n")
 
 
-_ENDED = {signal.SIGTERM: ("terminated", 143), signal.SIGINT: ("interrupted", 130)}
-
-
-class _EndedError(KeyboardInterrupt):
-    """A signal that ends the command."""
-
-    def __init__(self, number: int):
-        super().__init__(number)
-        self.number = signal.Signals(number)
-
-
 def build_parser() -> argparse.ArgumentParser:
     """Builds the parser of `splatpilot` with all commands."""
     parser = _Parser(
         prog="splatpilot",
         description="Fly drones by camera inside Gaussian-splat worlds.",
         epilog="exit status: 0 done, 1 an error that one message explains, 2 invalid command line, "
-        "70 an internal error, which leaves a report, 130 and 143 ended by Ctrl-C and SIGTERM",
+        "70 an internal error, which writes a report, 130 and 143 ended by Ctrl-C and SIGTERM",
     )
     parser.add_argument(
         "--import",
         action=_ImportModule,
-        default=[],
         dest="modules",
         metavar="MODULE",
         help="import a module that registers policies, worlds, sensors, ... (repeatable)",
@@ -142,19 +109,21 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--version", action=_PrintVersion, nargs=0, help="show the version and exit"
     )
-    verbs = parser.add_subparsers(required=True, metavar="COMMAND", dest="verb_name")
+    groups: dict[str, Any] = {"": parser.add_subparsers(required=True, metavar="COMMAND")}
     for command in COMMANDS:
-        command.add_to(verbs)
+        added = command.add_to(groups[command.name.rpartition(" ")[0]])
+        if command.function is None:
+            groups[command.name] = added.add_subparsers(required=True, metavar="SUBCOMMAND")
     return parser
 
 
 def run() -> NoReturn:
-    """Runs `main`; signals before and after it end the process at once, in the same way."""
-    heeded = _heeded()
+    """Runs `main`; signals before and after it end the process at once, alike."""
+    heeded = _heeded_signals()
     for number in heeded:
-        signal.signal(number, _leave)
+        signal.signal(number, _exit_at_once)
     # Registered first, it runs last: Python then unloads modules and must not handle signals.
-    atexit.register(_ignore, heeded)
+    atexit.register(lambda: [signal.signal(number, signal.SIG_IGN) for number in heeded])
     sys.exit(main())
 
 
@@ -174,17 +143,17 @@ def main(arguments: list[str] | None = None) -> int:
 
         argcomplete.autocomplete(parser)
     logging.getLogger("drake").addFilter(_is_warning)
-    verb, options = "splatpilot", argparse.Namespace(modules=[])
+    name = "splatpilot"
     try:
-        with _ended_by_signals():
+        with _interrupted_by_signals():
             options = parser.parse_args(arguments)
-            verb = options.verb_name
+            name = options.command.name.partition(" ")[0]
             if not getattr(options, "json", False):
-                options.verb(options)
+                options.command.run(options)
                 return 0
             try:
                 with contextlib.redirect_stdout(sys.stderr):
-                    result = options.verb(options)
+                    result = options.command.run(options)
             except FailureWithResultError as failure:
                 print(json.dumps(as_json(failure.result), indent=2))
                 raise
@@ -193,73 +162,69 @@ def main(arguments: list[str] | None = None) -> int:
     except BrokenPipeError:
         with contextlib.suppress(OSError, ValueError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return _say("its output was not read to the end", 1)
+        return _report("its output was not read to the end", 1)
     except (ValueError, OSError) as error:
-        place = _place_of(error)
-        return _say(f"{error} ({place})" if place else str(error), 1)
+        line = _plugin_line(error)
+        return _report(f"{error} ({line})" if line else str(error), 1)
     except MemoryError as error:
-        needed = f" ({error})" if str(error) else ""
-        return _say(
-            f"{verb} needs more memory than there is{needed}; make the world, the images or the "
+        size = f" ({error})" if str(error) else ""
+        return _report(
+            f"{name} needs more memory than there is{size}; make the world, the images or the "
             "voxels of a smaller size, or use fewer --jobs",
             1,
         )
     except OverflowError as error:
-        return _say(f"a number given to {verb} is too large ({error}); give a smaller one", 1)
-    except KeyboardInterrupt as ended:
-        message, status = _ENDED[getattr(ended, "number", signal.SIGINT)]
-        return _say("; ".join([message, *getattr(ended, "__notes__", ())]), status)
+        return _report(f"a number given to {name} is too large ({error}); give a smaller one", 1)
+    except KeyboardInterrupt as interruption:
+        message, status = _SIGNALS[getattr(interruption, "number", signal.SIGINT)]
+        notes = getattr(interruption, "__notes__", ())
+        return _report("; ".join([message, *notes]), status)
     except Exception as error:
-        if isinstance(error, ModuleNotFoundError) and (missing := missing_extra(error, verb)):
-            return _say(missing, 1)
-        report = write_report(error, sys.argv[1:] if arguments is None else arguments)
+        if isinstance(error, ModuleNotFoundError) and (missing := missing_extra(error, name)):
+            return _report(missing, 1)
+        file = _write_report(error, sys.argv[1:] if arguments is None else arguments)
         kind = type(error).__name__
-        if place := _place_of(error):
-            return _say(f"{place}: {kind}: {error}; the traceback is in {report}", 1)
-        return _say(f"internal error in {verb} ({kind}); the report is {report}", 70)
+        if line := _plugin_line(error):
+            return _report(f"{line}: {kind}: {error}; the traceback is in {file}", 1)
+        return _report(f"internal error in {name} ({kind}); the report is {file}", 70)
 
 
-def _place_of(error: Exception) -> str:
-    """Returns the file and line in a plugin that raised an exception, if not our code."""
-    registry = sys.modules.get("splatpilot.systems.common.registry")
-    return raised_by(error, registry.plugin_packages()) if registry is not None else ""
-
-
-def _heeded() -> list[int]:
-    """Returns the signals that end this process; shells let background processes ignore some."""
-    return [number for number in _ENDED if signal.getsignal(number) is not signal.SIG_IGN]
-
-
-def _ignore(numbers: list[int]) -> None:
-    for number in numbers:
-        signal.signal(number, signal.SIG_IGN)
-
-
-def _imports(frame: FrameType | None) -> bool:
-    """Returns True while a module is imported: an exception in a native one may abort."""
-    while frame is not None:
-        if frame.f_code.co_filename == "<frozen importlib._bootstrap>":
-            return True
-        frame = frame.f_back
-    return False
-
-
-def _leave(number: int, frame: FrameType | None) -> NoReturn:
-    """Ends the process at once; the next run in the folder removes its leftovers."""
-    message, status = _ENDED[signal.Signals(number)]
-    with contextlib.suppress(RuntimeError, OSError):  # it may be printing
-        sys.stdout.flush()
-    line = "\n" if _progress_bars() else ""
-    os.write(2, f"{line}splatpilot: {message}\n".encode())
-    os._exit(status)
-
-
-def _say(message: str, status: int) -> int:
+def _report(message: str, status: int) -> int:
     """Prints a message as one line, the last; returns the status."""
     for bar in _progress_bars():
         bar.close()
     print(f"splatpilot: {' '.join(message.split())}", file=sys.stderr)
     return status
+
+
+def _write_report(error: BaseException, arguments: Sequence[str]) -> str:
+    """Writes the command and the traceback to a temporary file; returns its path, or the text."""
+    from importlib.metadata import version
+
+    command = f"splatpilot {version('splatpilot')}: {shlex.join(arguments)}"
+    text = f"{command}\n\n{''.join(traceback.format_exception(error))}"
+    try:
+        with tempfile.NamedTemporaryFile(
+            "w", prefix="splatpilot-", suffix=".txt", delete=False
+        ) as file:
+            file.write(text)
+    except OSError:
+        return text
+    return file.name
+
+
+def _plugin_line(error: BaseException) -> str:
+    """Returns the file and line in a plugin that raised an exception, empty for our code."""
+    registry = sys.modules.get("splatpilot.systems.common.registry")
+    plugins = registry.plugin_packages() if registry is not None else ()
+    found = ""
+    for frame, line in traceback.walk_tb(error.__traceback__):
+        package = frame.f_globals.get("__name__", "").partition(".")[0]
+        if package in plugins:
+            found = f"{frame.f_code.co_filename}, line {line}"
+        elif package == "splatpilot":
+            found = ""
+    return found
 
 
 def _progress_bars() -> list[Any]:
@@ -272,21 +237,53 @@ def _is_warning(record: logging.LogRecord) -> bool:
     return record.levelno >= logging.WARNING
 
 
+class _SignalError(KeyboardInterrupt):
+    """A signal that ends the command."""
+
+    def __init__(self, number: int):
+        super().__init__(number)
+        self.number = signal.Signals(number)
+
+
 @contextlib.contextmanager
-def _ended_by_signals() -> Iterator[None]:
-    """Lets SIGTERM and Ctrl-C raise `_EndedError` in the block, if this is the main thread."""
+def _interrupted_by_signals() -> Iterator[None]:
+    """Lets SIGTERM and Ctrl-C raise `_SignalError` in the block, if this is the main thread."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
 
-    def end(number: int, frame: FrameType | None) -> None:
-        if _imports(frame):
-            _leave(number, frame)
-        raise _EndedError(number)
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        if _is_importing(frame):
+            _exit_at_once(number, frame)
+        raise _SignalError(number)
 
-    before = {number: signal.signal(number, end) for number in _heeded()}
+    before = {number: signal.signal(number, interrupt) for number in _heeded_signals()}
     try:
         yield
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def _heeded_signals() -> list[int]:
+    """Returns the signals that end this process; shells let background processes ignore some."""
+    return [number for number in _SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
+
+
+def _is_importing(frame: FrameType | None) -> bool:
+    """Returns True while a module is imported: an exception in a native one may abort."""
+    while frame is not None:
+        if frame.f_code.co_filename == "<frozen importlib._bootstrap>":
+            return True
+        frame = frame.f_back
+    return False
+
+
+def _exit_at_once(number: int, frame: FrameType | None) -> NoReturn:
+    """Ends the process at once; the next run in the folder removes its leftovers."""
+    message, status = _SIGNALS[signal.Signals(number)]
+    with contextlib.suppress(RuntimeError, OSError):  # it may be printing
+        sys.stdout.flush()
+    line = "\n" if _progress_bars() else ""
+    os.write(2, f"{line}splatpilot: {message}\n".encode())
+    os._exit(status)

@@ -15,36 +15,29 @@ from splatpilot.systems.common.field_help import FieldDescription, describe_fiel
 
 
 def format_settings(config: Any) -> str:
-    """All fields that `--set` takes for a configuration: their names, types, values, and what they
-    are."""
+    """Lists the fields of a configuration with types, values and descriptions."""
     width = max(shutil.get_terminal_size().columns - 2, 40)
     lines = []
-    for name, type_, value, text in _settings(config, ""):
-        lines.append(f"{name}={value}  ({type_})" if value else f"{name}  ({type_})")
+    for heading, text in _settings(config, ""):
+        lines.append(heading)
         lines += textwrap.wrap(text, width, initial_indent="    ", subsequent_indent="    ")
     return "\n".join(lines)
 
 
-def _settings(config: Any, prefix: str) -> Iterator[tuple[str, str, str, str]]:
-    """Name, type, value and text of each field, those of what a field holds behind it."""
+def _settings(config: Any, prefix: str) -> Iterator[tuple[str, str]]:
+    """Yields heading and description of each field; nested fields follow their parent."""
     for field in describe_fields(config):
         name = prefix + field.name
         if is_configuration(field.value):
-            yield name, _kinds(field), "", field.text
+            configs = field.registry.configs() if field.registry is not None else []
+            tags = [f"!{config.__name__}" for config in (type(field.value), *configs)]
+            yield f"{name}  ({' or '.join(dict.fromkeys(tags))})", field.text
             yield from _settings(field.value, f"{name}.")
         else:
-            yield name, _type_of(config, field), _as_yaml(field.value), field.text
+            yield f"{name}={_as_yaml(field.value)}  ({_type_name(config, field)})", field.text
 
 
-def _kinds(field: FieldDescription) -> str:
-    """The tags of what may stand in a field, that of what stands there first."""
-    own = f"!{type(field.value).__name__}"
-    others = field.registry.configs() if field.registry is not None else []
-    tags = [own, *(f"!{config.__name__}" for config in others)]
-    return " or ".join(dict.fromkeys(tags))
-
-
-def _type_of(config: Any, field: FieldDescription) -> str:
+def _type_name(config: Any, field: FieldDescription) -> str:
     if field.registry is not None:
         return f"dictionary of {field.registry.what}s"
     if dataclasses.is_dataclass(config):
@@ -55,7 +48,6 @@ def _type_of(config: Any, field: FieldDescription) -> str:
 
 
 def _as_yaml(value: Any) -> str:
-    """A plain value as `--set` takes it."""
     plain = value.tolist() if isinstance(value, np.ndarray) else value
     text = yaml.safe_dump(plain, default_flow_style=True, width=math.inf)
     return text.removesuffix("...\n").strip()

@@ -32,7 +32,7 @@ from splatpilot.systems.common.progress import resumable
 from splatpilot.systems.common.torch_device import require_renderer
 from splatpilot.systems.common.validation import require
 from splatpilot.training.captures.capture import Capture
-from splatpilot.training.captures.capture_registry import read_capture, read_capture_of
+from splatpilot.training.captures.capture_registry import read_capture, read_scene_capture
 from splatpilot.training.reconstruction.checkpoint import kept_work
 from splatpilot.training.reconstruction.config import HOLD_OUT, ReconstructConfig
 from splatpilot.training.reconstruction.initialize import MAX_STEPS, held_out_frames, triangulate
@@ -202,7 +202,7 @@ def run(
     opened: list[Capture] = []
     for path in captures:
         if (path / "scene.yaml").is_file():
-            capture = read_capture_of(path, read_scene_metadata(path))
+            capture = read_scene_capture(path, read_scene_metadata(path))
         else:
             capture = read_capture(path, config.capture)
         if not capture.has_depth:

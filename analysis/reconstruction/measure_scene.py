@@ -34,7 +34,7 @@ from splatpilot.systems.splats.background import RenderedView, put_behind
 from splatpilot.systems.splats.scene import color_to_sh
 from splatpilot.systems.splats.splat_files import read_ply
 from splatpilot.training.captures.capture import Capture, CaptureFrame, shrink, shrink_factor
-from splatpilot.training.captures.capture_registry import read_capture_of
+from splatpilot.training.captures.capture_registry import read_scene_capture
 from splatpilot.training.reconstruction.lpips import Lpips
 from splatpilot.training.reconstruction.metrics import (
     ViewMetrics,
@@ -151,7 +151,7 @@ class SceneViews:
     def __init__(self, scene: Path, capture: Capture | None = None):
         self.metadata: SceneMetadata = read_scene_metadata(scene)
         self.background = read_background(scene, self.metadata)
-        self.capture = capture = capture or read_capture_of(scene, self.metadata)
+        self.capture = capture = capture or read_scene_capture(scene, self.metadata)
         missing = [i for i in self.metadata.held_out if i >= len(capture)]
         if missing:
             raise ValueError(

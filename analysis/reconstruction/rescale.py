@@ -26,7 +26,7 @@ from splatpilot.systems.common.validation import require
 from splatpilot.systems.splats.splat_files import read_ply, read_splats, write_ply
 from splatpilot.training.captures.capture import shrink_factor
 from splatpilot.training.captures.capture_config import CaptureConfig, complete_config
-from splatpilot.training.captures.capture_registry import read_capture_of
+from splatpilot.training.captures.capture_registry import read_scene_capture
 from splatpilot.training.captures.up_and_scale import camera_height
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.distance_field import render_depth
@@ -148,7 +148,7 @@ def run(
         factor = _positive("distance", distance) / length
     elif height is not None:
         factor = _positive("height", height) / camera_height(
-            read_capture_of(scene, read_scene_metadata(scene))
+            read_scene_capture(scene, read_scene_metadata(scene))
         )
     elif factor is None and (up is not None or len(floor)):
         factor = 1.0
@@ -181,7 +181,7 @@ def rescale(scene: Path, out: Path, factor: float) -> RescaleSummary:
         frontier = read_ply(scene / FRONTIER).scaled_by(factor)
     elif not metadata.metric:
         try:
-            capture = read_capture_of(scene, about)
+            capture = read_scene_capture(scene, about)
             shrunk = shrink_factor(capture.width, about.image_width)
             threads = ReconstructConfig().renderer_threads
             depth = render_depth(capture, shrunk, gaussians, about.representation, threads)

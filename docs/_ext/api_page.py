@@ -13,12 +13,12 @@ import splatpilot.systems
 
 
 def public_names() -> list[str]:
-    """What `import splatpilot as sp` has as `sp.NAME`."""
+    """Returns the public names, `sp.NAME` after `import splatpilot as sp`."""
     return [name for name in splatpilot.__all__ if name != "__version__"]
 
 
 def leaf_systems() -> Iterator[str]:
-    """The LeafSystems of `systems/` that have no public name, by where they stand."""
+    """Yields the paths of the LeafSystems of `systems/` without a public name."""
     public = {getattr(splatpilot, name) for name in public_names()}
     for module in pkgutil.walk_packages(splatpilot.systems.__path__, "splatpilot.systems."):
         for name, member in inspect.getmembers(importlib.import_module(module.name)):
@@ -29,7 +29,7 @@ def leaf_systems() -> Iterator[str]:
 
 
 def page() -> str:
-    """The page's sections, in Markdown."""
+    """Returns the sections of the page in Markdown."""
     parts = ["## Public names\n"]
     for name in public_names():
         member = getattr(splatpilot, name)
@@ -44,8 +44,10 @@ def page() -> str:
 
 
 def _template_entry(name: str, system: Any) -> str:
-    """Of a system for several scalar types, which bears the type in its name, so that autodoc would
-    show an alias, and is constructed by `_construct`."""
+    """Returns the section of a template system, of the signature of `_construct`.
+
+    Its name includes the scalar type, so autodoc would show an alias.
+    """
     system.__name__ = name
     parameters = inspect.signature(system._construct).parameters.items()
     shown = ", ".join(str(p) for key, p in parameters if key not in ("self", "converter"))

@@ -1,4 +1,4 @@
-"""Writes the page `configuration`: every field of every configuration, as its class has it."""
+"""Writes the page `configuration`: every field of every configuration class."""
 
 import inspect
 import typing
@@ -28,49 +28,51 @@ from splatpilot.training.reconstruction.config import ReconstructConfig
 GROUPS: list[tuple[str, str, list[type] | Registry]] = [
     (
         "Flights",
-        "Of `splatpilot fly`, `vehicle`, `bridge` and `benchmark`: `--set timeout=20`, and the "
-        "fields of a scenario's file.",
+        "For `splatpilot fly`, `benchmark`, `hardware vehicle` and `hardware bridge`: fields of a "
+        "scenario file, or `--set timeout=20`.",
         [Scenario],
     ),
-    ("Sensors", "What may be among the `sensors` of a scenario or of a policy.", SENSORS),
+    ("Sensors", "Entries of `sensors` in a scenario or a policy.", SENSORS),
     (
         "Policies",
-        "What may be a scenario's `policy`: `policy: !ReactiveConfig {margin: 0.2}` in its file, "
+        "Types of `policy` in a scenario: `policy: !ReactiveConfig {margin: 0.2}` in a file, "
         "`--policy reactive --set policy.margin=0.2`, `--policies reactive:margin=0.2`.",
         POLICIES,
     ),
     (
         "Worlds",
-        "What may be a scenario's `world`: `world: !RoomConfig {items: 8}` in its file, "
+        "Types of `world` in a scenario: `world: !RoomConfig {items: 8}` in a file, "
         "`--set 'world=!RoomConfig {items: 8}'`.",
         WORLDS,
     ),
     (
         "Captures",
-        "Of `splatpilot capture check` and `capture render`.",
+        "For `splatpilot capture check` and `capture render`.",
         [CheckConfig, RenderConfig],
     ),
     (
         "Reconstruction",
-        "Of `splatpilot reconstruct` and `scene ablate`; of meshes and generated worlds, for "
-        "`reconstruct` and `scene fetch`; and of `scene fidelity`.",
+        "For `splatpilot reconstruct` and `scene ablate`; for meshes and generated worlds in "
+        "`reconstruct` and `scene fetch`; and for `scene fidelity`.",
         [ReconstructConfig, RenderedSceneConfig, FidelityConfig],
     ),
-    ("Training", "Of `splatpilot train` and `recover`, for each policy.", TRAINERS),
-    ("Corpora", "Of `splatpilot corpus make`.", [CorpusConfig]),
+    ("Training", "For `splatpilot train` and `recover`, by policy.", TRAINERS),
+    ("Corpora", "For `splatpilot corpus make`.", [CorpusConfig]),
     (
         "Hardware",
-        "Of `splatpilot hardware`: of `bridge` and `vehicle` (`--hardware FILE`), `px4` and "
+        "For `splatpilot hardware`: `bridge` and `vehicle` (`--hardware FILE`), `px4` and "
         "`faults`.",
         [HardwareConfig, Px4Config, FaultsConfig],
     ),
 ]
-"""Heading, introduction, and the configurations that begin there."""
+"""Heading, introduction, and root configurations of each group."""
 
 
 def configurations() -> Iterator[tuple[str, str, list[Any]]]:
-    """Each group's heading and introduction, and its configurations with those that they hold:
-    each once, where it is met first, and Drake's own in a group at the end."""
+    """Yields heading, introduction and configurations of each group, with nested configurations.
+
+    Each configuration appears once, in the first group. Drake's are in a group at the end.
+    """
     seen: set[type] = set()
     drakes: list[Any] = []
 
@@ -90,14 +92,14 @@ def configurations() -> Iterator[tuple[str, str, list[Any]]]:
         types = roots.configs() if isinstance(roots, Registry) else roots
         yield heading, introduction, [config for root in types for config in met(root())]
     yield (
-        "Drake's own",
-        "As Drake documents them; what flights have no use for is left out.",
+        "Drake",
+        "Configurations of Drake, without fields that flights ignore.",
         drakes,
     )
 
 
 def _held(config: Any, field: FieldDescription) -> list[Any]:
-    """The configurations that a field has, or may have where it has none by default."""
+    """Returns the configuration of a field, or its possible types if it is None by default."""
     if field.registry is not None:
         return []
     if field.value is None:
@@ -107,7 +109,7 @@ def _held(config: Any, field: FieldDescription) -> list[Any]:
 
 
 def page() -> str:
-    """The page's sections, in Markdown."""
+    """Returns the sections of the page in Markdown."""
     parts = []
     for heading, introduction, configs in configurations():
         parts.append(f"## {heading}\n\n{introduction}\n")
@@ -125,7 +127,7 @@ def _section(config: Any) -> str:
         for field in describe_fields(config)
         if not (name == "CameraConfig" and field.name in WITHOUT_EFFECT)
     ]
-    table = ["| field | default | what it is |", "|---|---|---|", *rows]
+    table = ["| field | default | description |", "|---|---|---|", *rows]
     return f"(config-{name})=\n### {name}\n\n{about}\n\n" + "\n".join(table) + "\n"
 
 
@@ -139,7 +141,7 @@ def _text(config: Any, field: FieldDescription) -> str:
 
 
 def _default(field: FieldDescription) -> str:
-    """A default as YAML; of a configuration its section, and where it differs from that."""
+    """Returns a default as YAML; for a configuration, a link and the changed defaults."""
     value = field.value
     if not is_configuration(value):
         return f"`{_yaml(value)}`"

@@ -1,4 +1,4 @@
-"""Writes the page `examples`: each file of `examples/`, whole."""
+"""Writes the page `examples`: each file of `examples/`."""
 
 from pathlib import Path
 
@@ -6,7 +6,7 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
 def page() -> str:
-    """The page's sections, in Markdown."""
+    """Returns the sections of the page in Markdown."""
     parts = []
     for file in sorted(EXAMPLES.glob("*.py")):
         heading = file.read_text().removeprefix('"""').partition("\n")[0]

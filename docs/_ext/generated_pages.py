@@ -1,4 +1,4 @@
-"""The pages whose content is read from the source when the site is built."""
+"""Generates pages from the source when the site is built."""
 
 import api_page
 import configuration_page
@@ -10,7 +10,7 @@ PAGES = {
     "configuration": configuration_page.page,
     "examples": examples_page.page,
 }
-"""Behind what stands in the page of this name comes what the function returns."""
+"""Functions whose result is appended to the page of this name."""
 
 
 def _add(app: Sphinx, docname: str, source: list[str]) -> None:

@@ -1,4 +1,4 @@
-"""The directive `pydrake_system` of Drake's docstrings: a system with its ports on either side."""
+"""Defines the directive `pydrake_system` of Drake's docstrings, a table of ports."""
 
 from html import escape
 
@@ -9,7 +9,7 @@ from sphinx.application import Sphinx
 
 
 class PydrakeSystem(Directive):
-    """YAML with `name`, `input_ports` and `output_ports`, as a table of three columns."""
+    """Renders YAML with `name`, `input_ports` and `output_ports` as a table of three columns."""
 
     has_content = True
 

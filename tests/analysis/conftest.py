@@ -1,5 +1,3 @@
-"""A room of Gaussians and a capture rendered of it; a study. Small enough for tests."""
-
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -7,7 +5,6 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 
-from splatpilot.analysis.benchmark.study import StudyConfig
 from splatpilot.analysis.reconstruction import ablation
 from splatpilot.diagrams.worlds.scene_folder import write_scene_folder
 from splatpilot.diagrams.worlds.world import World
@@ -111,22 +108,3 @@ def place(seen_room, tmp_path, monkeypatch) -> Place:
     (tmp_path / "captures" / "room").mkdir(parents=True)
     monkeypatch.chdir(tmp_path / "captures")
     return Place(gaussians, capture, tmp_path)
-
-
-@pytest.fixture
-def short_scenario(tmp_path) -> Path:
-    """A forest of a few trees, flown for at most 1.5 s."""
-    path = tmp_path / "short.yaml"
-    path.write_text(
-        "world: {length: 8, width: 5, height: 3, rocks: 0, logs: 0, voxel_size: 0.25}\n"
-        "timeout: 1.5\n"
-    )
-    return path
-
-
-@pytest.fixture
-def short_study(short_scenario) -> StudyConfig:
-    """Six flights in three places."""
-    return StudyConfig(
-        scenarios=[str(short_scenario)], policies=["straight", "planner"], speeds=[2.0], seeds=3
-    )

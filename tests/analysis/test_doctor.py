@@ -1,5 +1,3 @@
-"""What a machine is said to have and to lack."""
-
 import shutil
 from importlib.metadata import PackageNotFoundError
 
@@ -17,8 +15,7 @@ def only(findings: list[doctor.Finding]) -> doctor.Finding:
     return finding
 
 
-def test_what_is_there_needs_no_remedy(monkeypatch):
-    """Where drivers and routes answer, they are listed as found."""
+def test_working_parts_need_no_remedy(monkeypatch):
     monkeypatch.setattr(opengl, "require_opengl", lambda: None)
     monkeypatch.setattr(open_lcm, "open_lcm", lambda: None)
     for check in (doctor._program, doctor._processor, doctor._opengl, doctor._messages):
@@ -27,8 +24,7 @@ def test_what_is_there_needs_no_remedy(monkeypatch):
     assert only(doctor._video()).found.startswith("H.264")
 
 
-def test_what_lacks_has_one_remedy(monkeypatch):
-    """Each error's remedy, and the extra or package to install, is said with what it is for."""
+def test_missing_parts_have_one_remedy(monkeypatch):
 
     def fails() -> None:
         raise OSError("there is no route; ip route add 224.0.0.0/4 dev lo")
@@ -54,7 +50,6 @@ def test_what_lacks_has_one_remedy(monkeypatch):
 
 
 def test_folders_are_found_through_their_variables(tmp_path, monkeypatch):
-    """Scenes are told by the scenarios that they serve; data by what lies in their folder."""
     (tmp_path / "hospital").mkdir()
     monkeypatch.setenv("SPLATPILOT_SCENES", str(tmp_path))
     scenes = only(doctor._scenes())
@@ -64,14 +59,13 @@ def test_folders_are_found_through_their_variables(tmp_path, monkeypatch):
     monkeypatch.setenv("SPLATPILOT_DATA", str(tmp_path))
     assert only(doctor._data()) == doctor.Finding("data", f"{tmp_path}: hospital")
     monkeypatch.setenv("SPLATPILOT_DATA", str(tmp_path / "nowhere"))
-    assert "is no folder" in only(doctor._data()).found
+    assert "No such folder" in only(doctor._data()).found
     monkeypatch.delenv("SPLATPILOT_DATA")
     assert "is not set" in only(doctor._data()).found
 
 
 @pytest.mark.parametrize("driver", [False, True])
-def test_a_gpu_that_pytorch_cannot_use_is_told_from_none(driver, monkeypatch, tmp_path):
-    """With a driver another PyTorch is needed, without one the driver is."""
+def test_an_unusable_gpu_differs_from_a_missing_one(driver, monkeypatch, tmp_path):
     torch = pytest.importorskip("torch")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(doctor, "_DRIVER", tmp_path if driver else tmp_path / "nowhere")
@@ -79,7 +73,6 @@ def test_a_gpu_that_pytorch_cannot_use_is_told_from_none(driver, monkeypatch, tm
 
 
 def test_each_finding_is_a_line_and_each_remedy_another():
-    """What is there begins with a plus, what lacks with a minus."""
     findings = [doctor.Finding("a", "there"), doctor.Finding("long", "no", "do this", "that")]
     lines = doctor.format_findings(findings).splitlines()
     assert lines == ["+ a     there", "- long  no", "        for that: do this"]

@@ -1,5 +1,3 @@
-"""`splatpilot scene mesh`: places as meshes."""
-
 import numpy as np
 import pytest
 import trimesh
@@ -20,10 +18,8 @@ def world():
 
 
 @pytest.mark.parametrize("kind", ["scene", "scenario"])
-def test_a_place_becomes_a_mesh(kind, world, tmp_path, capsys):
-    """A scene folder and the scenario that it came from give the trunks of the world, closed and in
-    world coordinates, and the command says how many triangles they take."""
-    out = tmp_path / "out" / "place.obj"
+def test_a_scene_and_its_scenario_become_closed_meshes(kind, world, tmp_path, capsys):
+    out = tmp_path / "out" / "world.obj"
     if kind == "scene":
         write_scene_folder(tmp_path / "scene", world, provenance="")
         words = [str(tmp_path / "scene")]
@@ -41,24 +37,3 @@ def test_a_place_becomes_a_mesh(kind, world, tmp_path, capsys):
     off = world.distance_field.distance(mesh.vertices[inside])
     assert inside.sum() > 100
     assert np.abs(off).max() < 0.5 * world.esdf.voxel_size
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["P02", "--out", "a.stl"], r"a.stl: suffix must be .gltf or .obj, got .stl"),
-        (["nowhere", "--out", "a.obj"], "No such file or folder: nowhere"),
-        (["capture", "--out", "a.obj"], "capture: what is no scene folder"),
-        (["scene", "--seed", "1", "--out", "a.obj"], "neither a seed nor settings"),
-        (["P02", "--out", "there.obj"], "there.obj"),
-    ],
-)
-def test_what_cannot_be_a_mesh_is_said(words, message, world, tmp_path, capsys, monkeypatch):
-    """One line, and nothing is written."""
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "capture").mkdir()
-    (tmp_path / "there.obj").write_text("mine")
-    write_scene_folder(tmp_path / "scene", world, provenance="")
-    assert main(["scene", "mesh", *words]) == 1
-    assert message in capsys.readouterr().err
-    assert not (tmp_path / "a.obj").exists() and (tmp_path / "there.obj").read_text() == "mine"

@@ -66,7 +66,7 @@ def test_missing_inputs_are_reported_first(tmp_path):
     out = tmp_path / "scenes"
     for names, data, error, words in (
         (["nowhere"], tmp_path, ValueError, "no scene 'nowhere'; there are hospital"),
-        (["forest_splat", "hospital"], None, ValueError, "No folder with tartanair/hospital; name"),
+        (["forest_splat", "hospital"], None, ValueError, "No folder with tartanair/hospital; give"),
         (["bookstore"], tmp_path, FileNotFoundError, "No such file.*worlds/bookstore.gltf"),
     ):
         with pytest.raises(error, match=words):

@@ -1,5 +1,3 @@
-"""The example package: what it adds is there once it is installed, without a change here."""
-
 import os
 import shutil
 import subprocess
@@ -42,8 +40,6 @@ def splatpilot(*words: str, path: Path, cwd: Path, status: int = 0) -> str:
 
 
 def test_its_world_sensor_and_policy_fly_in_a_study(installed, tmp_path):
-    """A study in worker processes names the policy, flies it by its sensors through the world,
-    reports on it, and its flights replay to the last bit."""
     scenario = tmp_path / "hedges.yaml"
     scenario.write_text("world: !HedgesConfig {hedges: 2, length: 16}\n")
     words = ["--scenarios", "hedges.yaml", "--policies", "climber,straight", "--seeds", "2"]
@@ -58,8 +54,6 @@ def test_its_world_sensor_and_policy_fly_in_a_study(installed, tmp_path):
 
 
 def test_its_captures_are_read(installed, tmp_path):
-    """A capture of its kind is told from its files, and has the poses and the camera that it
-    says: the camera looks where the body does."""
     log = tmp_path / "log"
     log.mkdir()
     (log / "capture.yaml").write_text("intrinsics: [20, 20, 16, 12]\n")
@@ -85,7 +79,6 @@ def test_its_captures_are_read(installed, tmp_path):
 
 
 def test_it_flies_uninstalled(tmp_path):
-    """Modules that nobody installed are named on the command line; worker processes find them."""
     (tmp_path / "hedges.yaml").write_text("world: !HedgesConfig {hedges: 2, length: 16}\n")
     imports = ["--import", "hedgehop.hedges", "--import", "hedgehop.climber"]
     words = ["--scenarios", "hedges.yaml", "--policies", "mine=hedgehop.climber:ClimberConfig"]

@@ -1,21 +1,20 @@
 """A capture: posed images of a scene, with the cameras that took them."""
 
-import hashlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from bisect import bisect_left
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
-from splatpilot.systems.common import files
 from splatpilot.systems.common.validation import require
+from splatpilot.systems.splats.lens import Distortion
 from splatpilot.training.captures.capture_config import CaptureConfig
 
 _MAX_SIZE = 1 << 16  # [px]
-_MAX_FOCAL_LENGTH = 1e6  # [px]
+_MAX_FOCAL = 1e6  # [px]
 _MAX_ZOOM = 4.0
 _FAR = 1e9  # [m], depth beyond range while points are moved: no baseline matters there
 _ONE_SURFACE = 0.1
@@ -33,34 +32,22 @@ class Lens:
     width: int  # [px]
     height: int  # [px]
     project: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None
-    """Takes rays (N, 2), x/z and y/z, to image coordinates (N, 2) [px]; None for a pinhole."""
-    radius: float = np.inf
-    """[px], distance from the center of the image within which it is used."""
-    source: str = "the files"
-    """Where the intrinsics come from, for messages."""
+    """Takes rays (N, 2), x/z and y/z, to image coordinates (N, 2) [px], NaN where the lens folds
+    them; None for a pinhole."""
+    radius: float = np.inf  # [px], distance from the image's center within which it is used
+    source: str = "the files"  # of the intrinsics, for messages
 
     def __post_init__(self) -> None:
         focal, center = np.diag(self.K)[:2], self.K[:2, 2]
         size = np.array([self.width, self.height])
-        require(
-            ((size >= 1) & (size <= _MAX_SIZE)).all(),
-            "the image size",
-            f"in [1, {_MAX_SIZE}] px",
-            f"{self.width}x{self.height}",
-        )
-        require(
-            ((focal > 0) & (focal <= _MAX_FOCAL_LENGTH)).all(),
-            "focal lengths",
-            f"in (0, {_MAX_FOCAL_LENGTH:g}] px",
-            focal.tolist(),
-        )
-        require(
-            ((center > 0) & (center < size)).all(),
-            "the principal point",
-            f"in the image of {self.width}x{self.height} px",
-            f"{center.tolist()} px",
-            "intrinsics may be those of images of another size: set capture.intrinsics",
-        )
+        shape = f"{self.width}x{self.height}"
+        remedy = "intrinsics may be those of images of another size: set capture.intrinsics"
+        inside, valid = (size >= 1) & (size <= _MAX_SIZE), (focal > 0) & (focal <= _MAX_FOCAL)
+        centered = (center > 0) & (center < size)
+        require(inside.all(), "the image size", f"in [1, {_MAX_SIZE}] px", shape)
+        require(valid.all(), "focal lengths", f"in (0, {_MAX_FOCAL:g}] px", focal.tolist())
+        condition = f"in the image of {shape} px"
+        require(centered.all(), "the principal point", condition, f"{center.tolist()} px", remedy)
 
     def __str__(self) -> str:
         fx, fy, cx, cy = np.round([*np.diag(self.K)[:2], *self.K[:2, 2]], 2).tolist()
@@ -69,7 +56,7 @@ class Lens:
 
     @property
     def is_eccentric(self) -> bool:
-        """Whether the principal point is farther from the center than a quarter of the image."""
+        """True if the principal point is farther from the center than a quarter of the image."""
         size = np.array([self.width, self.height])
         return bool((np.abs(self.K[:2, 2] - size / 2) > size / 4).any())
 
@@ -98,38 +85,43 @@ def pinhole(fx: float, fy: float, cx: float, cy: float) -> NDArray[np.float64]:
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
 
 
+def centered_pinhole(fx: float, fy: float, cx: float, cy: float) -> NDArray[np.float64]:
+    """Returns the intrinsics (3, 3) [px] if cx and cy count from the first pixel's center."""
+    return pinhole(fx, fy, cx + 0.5, cy + 0.5)
+
+
 def opencv_lens(
     K: NDArray[np.float64], width: int, height: int, distortion: Sequence[float], k4: float = 0.0
 ) -> Lens:
-    """Returns a lens of OpenCV's model.
+    """Returns a lens of OpenCV's rational model.
 
     Args:
-        distortion: k1, k2, p1, p2, k3, ... as `cv2.projectPoints` takes them.
-        k4: radial term of r^8, which OpenCV's model leaves out.
+        distortion: k1, k2, p1, p2, k3, ... in OpenCV's order.
+        k4: radial term of r^8, which OpenCV's model is without.
     """
     if not np.any(distortion) and not k4:
         return Lens(K, width, height)
-    coefficients = np.array(distortion, dtype=np.float64)
-
-    def project(rays: NDArray[np.float64]) -> NDArray[np.float64]:
-        points = np.column_stack([rays, np.ones(len(rays))])
-        pixels = cv2.projectPoints(points, np.zeros(3), np.zeros(3), K, coefficients)[0][:, 0]
-        r8 = (rays**2).sum(axis=1, keepdims=True) ** 4
-        return np.asarray(pixels + k4 * r8 * rays * np.diag(K)[:2], dtype=np.float64)
-
-    return Lens(K, width, height, project)
+    radial = [*distortion[:2], *distortion[4:]]
+    return _bent_lens(K, width, height, Distortion("opencv", radial, [*distortion[2:4]]), k4)
 
 
 def fisheye_lens(
     K: NDArray[np.float64], width: int, height: int, distortion: Sequence[float]
 ) -> Lens:
     """Returns a lens of OpenCV's fisheye model (Kannala and Brandt 2006) with k1 to k4."""
-    coefficients = np.array(distortion, dtype=np.float64)
+    return _bent_lens(K, width, height, Distortion("fisheye", [*distortion]))
+
+
+def _bent_lens(
+    K: NDArray[np.float64], width: int, height: int, bend: Distortion, k4: float = 0.0
+) -> Lens:
+    bend.validate()
 
     def project(rays: NDArray[np.float64]) -> NDArray[np.float64]:
-        points = np.column_stack([rays, np.ones(len(rays))])[:, None]
-        pixels = cv2.fisheye.projectPoints(points, np.zeros(3), np.zeros(3), K, coefficients)[0]
-        return np.asarray(pixels, dtype=np.float64)[:, 0]
+        bent = bend.project(rays)
+        if k4:
+            bent += k4 * (rays**2).sum(axis=1, keepdims=True) ** 4 * rays
+        return bent * np.diag(K)[:2] + K[:2, 2]
 
     return Lens(K, width, height, project)
 
@@ -157,19 +149,15 @@ def common_pinhole(lenses: Sequence[Lens]) -> Lens:
                 return False
         return True
 
-    low, high = 1.0, 1.0
-    while not covers(high):
-        low, high = high, 1.25 * high
-        if high > _MAX_ZOOM:
-            raise ValueError(
-                "the cameras of this capture share too little of their view: no pinhole camera "
-                "sees through all of them; give the frames of one camera alone"
-            )
-    while high - low > 1e-3:
-        middle = (low + high) / 2
-        low, high = (low, middle) if covers(middle) else (middle, high)
+    zooms = np.geomspace(1, _MAX_ZOOM, 1400)
+    index = bisect_left(zooms, True, key=covers)
+    if index == len(zooms):
+        raise ValueError(
+            "the cameras of this capture share too little of their view: no pinhole camera "
+            "sees through all of them; give the frames of one camera alone"
+        )
     K = first.K.copy()
-    K[:2, :2] *= high
+    K[:2, :2] *= zooms[index]
     return Lens(K, first.width, first.height)
 
 
@@ -187,13 +175,8 @@ def resampling_maps(lens: Lens, target: Lens) -> tuple[NDArray, NDArray] | None:
 def back_project(
     K: NDArray[np.float64], u: NDArray, v: NDArray, depth: NDArray
 ) -> NDArray[np.float64]:
-    """Returns the points p_CQ (..., 3) [m] that a pinhole camera sees.
-
-    Args:
-        K: (3, 3) [px].
-        u, v: (...) [px], image coordinates.
-        depth: (...) [m], along the optical axis.
-    """
+    """Returns the points p_CQ (..., 3) [m] that a pinhole camera K (3, 3) [px] sees at image
+    coordinates u, v (...) [px] and depths (...) [m] along the optical axis."""
     x = (u - K[0, 2]) / K[0, 0] * depth
     y = (v - K[1, 2]) / K[1, 1] * depth
     return np.stack([x, y, depth], axis=-1)
@@ -208,12 +191,8 @@ def pixel_rays(K: NDArray[np.float64], width: int, height: int) -> NDArray[np.fl
 def depth_points(
     K: NDArray[np.float64], depth: NDArray, step: int = 1, start: int = 0
 ) -> tuple[NDArray[np.float64], NDArray[np.intp], NDArray[np.intp]]:
-    """Returns the points p_CQ (N, 3) [m] of pixels of known, finite depth, their rows and columns.
-
-    Args:
-        depth: (H, W) [m].
-        step, start: of the rows and columns that are used.
-    """
+    """Returns the points p_CQ (N, 3) [m] of pixels of known, finite depth (H, W) [m], and their
+    rows and columns, which begin at `start`."""
     part = depth[start::step, start::step]
     rows, columns = np.nonzero((part > 0) & np.isfinite(part))
     rows, columns = start + step * rows, start + step * columns
@@ -221,51 +200,55 @@ def depth_points(
     return back_project(K, columns + 0.5, rows + 0.5, z), rows, columns
 
 
+def project(
+    K: NDArray[np.float64], x: NDArray, y: NDArray, z: NDArray
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Returns the image coordinates u, v (...) [px] of points p_CQ."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
+
+
 def project_points(
     K: NDArray[np.float64], p_CQ: NDArray[np.float64], width: int, height: int
 ) -> tuple[NDArray[np.bool_], NDArray[np.intp], NDArray[np.intp]]:
     """Returns which of the points (N, 3) fall into an image, and the rows and columns (n,) of the
     pixels that these fall into."""
-    x, y, z = p_CQ.T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        u, v = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
+    (u, v), z = project(K, *p_CQ.T), p_CQ[:, 2]
     inside = (z > 0) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
     return inside, v[inside].astype(np.intp), u[inside].astype(np.intp)
 
 
+@dataclass(frozen=True, eq=False)
+class DepthCamera:
+    """A depth camera apart from the color camera."""
+
+    K: NDArray[np.float64]  # (3, 3) [px]
+    width: int  # [px]
+    height: int  # [px]
+    X_CD: RigidTransform  # pose of the depth camera D in the color camera C
+
+
 def register_depth(
     depth: NDArray[np.floating],
-    K_D: NDArray[np.float64],
-    X_CD: RigidTransform,
-    K_C: NDArray[np.float64],
+    camera: DepthCamera,
+    K: NDArray[np.float64],
     width: int,
     height: int,
 ) -> NDArray[np.float32]:
-    """Carries a depth image into the pixels of another camera, in which the nearest point wins.
-
-    Args:
-        depth: (h, w) [m] along the optical axis of D; 0 unknown, inf beyond range.
-        K_D: (3, 3) [px], intrinsics of D.
-        X_CD: pose of D in C.
-        K_C: (3, 3) [px], intrinsics of C.
-        width, height: [px], of C's image.
-
-    Returns:
-        (height, width) [m] along the optical axis of C; 0 unknown, inf beyond range.
-    """
+    """Carries a depth image (h, w) [m] into the pixels of the color camera, in which the nearest
+    point wins; 0 unknown, inf beyond range."""
     # At least one point per pixel of C, so that surfaces behind do not shine through.
-    finer = max(1, int(np.ceil(1.05 * K_C[0, 0] / K_D[0, 0])))
+    finer = max(1, int(np.ceil(1.05 * K[0, 0] / camera.K[0, 0])))
     z = np.where(np.isinf(depth), _FAR, depth).repeat(finer, axis=0).repeat(finer, axis=1)
-    p_DQ, _, _ = depth_points(np.diag([finer, finer, 1]) @ K_D, z)
-    p_CQ = X_CD.multiply(p_DQ.T).T
-    inside, rows, columns = project_points(K_C, p_CQ, width, height)
-    pixels = rows * width + columns
-    nearest = np.full(height * width, np.inf)
-    np.minimum.at(nearest, pixels, p_CQ[inside, 2])
-    hit = np.zeros(height * width, dtype=bool)
-    hit[pixels] = True
+    p_DQ, _, _ = depth_points(np.diag([finer, finer, 1]) @ camera.K, z)
+    p_CQ = camera.X_CD.multiply(p_DQ.T).T
+    inside, rows, columns = project_points(K, p_CQ, width, height)
+    nearest = np.full((height, width), np.inf)
+    np.minimum.at(nearest, (rows, columns), p_CQ[inside, 2])
+    hit = np.zeros((height, width), dtype=bool)
+    hit[rows, columns] = True
     nearest[nearest > _FAR / 2] = np.inf
-    return np.where(hit, nearest, 0).astype(np.float32).reshape(height, width)
+    return np.where(hit, nearest, 0).astype(np.float32)
 
 
 _EVERYWHERE = np.ones((1, 1), dtype=bool)
@@ -283,7 +266,7 @@ class CaptureFrame:
     X_WC: RigidTransform  # pose of the camera (x right, y down, z forward) in the world
     K: NDArray[np.float64]  # (3, 3) [px], pinhole intrinsics
     valid: NDArray[np.bool_] = field(default_factory=lambda: _EVERYWHERE)
-    """(H, W), the pixels that are used: no other has depth, is fitted or is measured."""
+    """(H, W), the pixels that are used; no other has depth."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "valid", np.broadcast_to(self.valid, self.depth.shape))
@@ -291,16 +274,6 @@ class CaptureFrame:
     def back_project(self, u: NDArray, v: NDArray, depth: NDArray) -> NDArray[np.float64]:
         """Returns the points p_CQ (..., 3) [m] at image coordinates [px] and depths [m]."""
         return back_project(self.K, u, v, depth)
-
-
-@dataclass(frozen=True, eq=False)
-class DepthCamera:
-    """A depth camera apart from the color camera."""
-
-    K: NDArray[np.float64]  # (3, 3) [px]
-    width: int  # [px]
-    height: int  # [px]
-    X_CD: RigidTransform  # pose of the depth camera D in the color camera C
 
 
 @dataclass(frozen=True, eq=False)
@@ -346,8 +319,7 @@ class Capture:
     """
 
     name: str
-    source: str
-    """Where it was read from, for messages."""
+    source: str  # format and path, for messages
     K: NDArray[np.float64]  # (3, 3) [px], of the color camera
     width: int  # [px]
     height: int  # [px]
@@ -359,34 +331,26 @@ class Capture:
     frame has none, or raises an error that names the file. 0 is unknown, inf is beyond range."""
     load_valid: Callable[[int], NDArray[np.bool_]] = all_valid
     """Returns the pixels of the image of frame i that are used, (height, width) or (1, 1)."""
-    depth_camera: DepthCamera | None = None
-    """The camera that measured depth; None if depth has the pixels of the images."""
+    depth_camera: DepthCamera | None = None  # None if depth has the pixels of the images
     points: SfmPoints | None = None
-    metric: bool = True
-    """Whether lengths are in meters; if not, nothing can fly there."""
-    frame_names: Sequence[str] = ()
-    """Path of each image as the files give it; empty if unknown."""
-    dropped: Sequence[str] = ()
-    """Why frames were left out, one message each that names the file."""
+    metric: bool = True  # if lengths are in meters; otherwise nothing can fly in the scene
+    frame_names: Sequence[str] = ()  # path of each image as the files give it; empty if unknown
+    dropped: Sequence[str] = ()  # reasons why frames were left out, each names its file
     held_out: Sequence[int] | None = None
     """The frames that the files hold out from training; None if they do not say."""
-    notes: Sequence[str] = ()
-    """What was assumed or ignored when the files were read, one sentence each."""
+    notes: Sequence[str] = ()  # assumptions of the reader and what it ignored
     origin: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
     """(3,) [m], position of W's origin in the world of the files, upright and in meters."""
-    axes: FileAxes | None = None
-    folder: str = ""
-    """The absolute path from which `read_capture` opens it again, with `config`; empty if it
-    cannot."""
-    config: CaptureConfig = field(default_factory=CaptureConfig)
-    """The configuration that it was read with."""
+    axes: FileAxes = OPTICAL_AXES
+    folder: str = ""  # absolute path from which `read_capture` opens it again, if any
+    config: CaptureConfig = field(default_factory=CaptureConfig)  # that it was read with
 
     def __len__(self) -> int:
         return len(self.X_WCs)
 
     @property
     def has_depth(self) -> bool:
-        """Whether any frame has depth."""
+        """True if any frame has depth."""
         return self.load_depth is not no_depth
 
     def measured_depth(self, i: int) -> NDArray[np.float32] | None:
@@ -398,21 +362,17 @@ class Capture:
 
     def registered_depth(self, i: int) -> NDArray[np.float32]:
         """Returns the depth (height, width) [m] of frame i in the pixels of its image; 0 in invalid
-        pixels and where it is unknown."""
+        pixels and if unknown."""
         depth, camera = self.measured_depth(i), self.depth_camera
         if depth is None:
             return np.zeros((self.height, self.width), np.float32)
         if camera is None:
             return depth
-        depth = register_depth(depth, camera.K, camera.X_CD, self.K, self.width, self.height)
+        depth = register_depth(depth, camera, self.K, self.width, self.height)
         return np.where(self.load_valid(i), depth, np.float32(0))
 
     def frame(self, i: int) -> CaptureFrame:
-        """Loads frame i, 0 <= i < len(self), with its registered depth.
-
-        Raises:
-            OSError, ValueError: if its files cannot be read or have changed their size.
-        """
+        """Loads frame i, 0 <= i < len(self), with its registered depth."""
         if not 0 <= i < len(self):
             raise IndexError(f"frame {i} of {self.name}: it has the frames 0 to {len(self) - 1}")
         return CaptureFrame(
@@ -471,28 +431,3 @@ def shrink(frame: CaptureFrame, factor: int) -> CaptureFrame:
     K = frame.K.copy()
     K[:2] /= factor
     return CaptureFrame(np.asarray(image, dtype=np.uint8), depth, frame.X_WC, K, valid)
-
-
-def cache_folder(config: CaptureConfig, *parts: str) -> Path:
-    """Returns `config.cache` or, without it, a folder in the user's cache."""
-    return Path(config.cache) if config.cache else files.cache_folder(*parts)
-
-
-def cache_key(paths: Iterable[Path], *others: object) -> str:
-    """Returns a key of files, by their paths, sizes and times, and of all else that decides."""
-    key = hashlib.sha256(repr(others).encode())
-    for path in paths:
-        status = path.stat()
-        key.update(f"{path.resolve()} {status.st_size} {status.st_mtime_ns}".encode())
-    return key.hexdigest()[:16]
-
-
-def prepare_cache(folder: Path) -> None:
-    """Makes a cache folder and removes leftovers of interrupted writers."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OSError(
-            f"{folder}: cannot be written ({error.strerror}); set capture.cache to another folder"
-        ) from None
-    files.remove_leftovers(folder)

@@ -1,9 +1,12 @@
-"""Configuration of what the files of a capture leave open."""
+"""Configuration of captures, and the cache of what is computed from them."""
 
+import hashlib
 import json
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 
+from splatpilot.systems.common import files
 from splatpilot.systems.common.config import load_config
 from splatpilot.systems.common.validation import Config, bounded, require, require_field
 
@@ -47,7 +50,7 @@ class ScaleConfig(Config):
 
 @dataclass(kw_only=True)
 class CaptureConfig(Config):
-    """What the files of a capture leave open; empty and zero fields take the format's defaults."""
+    """Settings of a capture; empty and zero fields take the format's defaults."""
 
     kind: str = ""
     """Capture format: a name in `splatpilot.training.captures.capture_registry.CAPTURES`, or
@@ -89,18 +92,19 @@ class CaptureConfig(Config):
             if size == 4 and values:
                 require_field(self, name, min(values[:2]) > 0, "of focal lengths > 0")
         require_field(self, "up", self.up in ("", *_UPS), f"one of {', '.join(_UPS)}")
-        require_field(
-            self, "topics", len(self.topics) in (0, 3), "three names, of color, depth and poses"
-        )
+        valid = len(self.topics) in (0, 3)
+        require_field(self, "topics", valid, "three names, of color, depth and poses")
 
     def settings(self) -> list[str]:
         """Returns the fields other than the defaults, as `--set` takes them:
         "depth_unit=5000.0", "scale.camera_height=1.6"."""
-        parts = (("", self, CaptureConfig()), ("scale.", self.scale, ScaleConfig()))
+        default = CaptureConfig()
         return [
-            f"{prefix}{name}={json.dumps(value)}"
-            for prefix, config, default in parts
-            for name, value in _changes(config, default).items()
+            f"{prefix}{each.name}={json.dumps(value)}"
+            for prefix, part, usual in (("", self, default), ("scale.", self.scale, default.scale))
+            for each in fields(usual)
+            if each.name != "scale"
+            and (value := getattr(part, each.name)) != getattr(usual, each.name)
         ]
 
 
@@ -115,23 +119,40 @@ def complete_config(path: Path, config: CaptureConfig | None) -> CaptureConfig:
         except ValueError as error:
             raise ValueError(f"{file}: {error}") from None
     if config is not None:
-        completed = _merge(completed, config)
+        completed = load_config(completed, overrides=config.settings())
     completed.validate()
     return completed
 
 
-def _merge(completed: CaptureConfig, config: CaptureConfig) -> CaptureConfig:
-    for into, given, default in (
-        (completed, config, CaptureConfig()),
-        (completed.scale, config.scale, ScaleConfig()),
-    ):
-        for name, value in _changes(given, default).items():
-            setattr(into, name, value)
-    return completed
+def cache_folder(config: CaptureConfig, *parts: str) -> Path:
+    """Returns `config.cache` or, without it, a folder in the user's cache."""
+    return Path(config.cache) if config.cache else files.cache_folder(*parts)
 
 
-def _changes[C: Config](config: C, default: C) -> dict[str, object]:
-    """Returns the fields that differ from the defaults, other than `scale`."""
-    names = [each.name for each in fields(default) if each.name != "scale"]  # pyright: ignore
-    values = {name: getattr(config, name) for name in names}
-    return {name: value for name, value in values.items() if value != getattr(default, name)}
+def cache_key(paths: Iterable[Path], *others: object) -> str:
+    """Returns a key of files, by their paths, sizes and times, and of all else that decides."""
+    key = hashlib.sha256(repr(others).encode())
+    for path in paths:
+        status = path.stat()
+        key.update(f"{path.resolve()} {status.st_size} {status.st_mtime_ns}".encode())
+    return key.hexdigest()[:16]
+
+
+def prepare_cache(folder: Path) -> None:
+    """Makes a cache folder and removes leftovers of interrupted writers."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OSError(
+            f"{folder}: cannot be written ({error.strerror}); set capture.cache to another folder"
+        ) from None
+    files.remove_leftovers(folder)
+
+
+def cached_folder(folder: Path, write: Callable[[Path], None]) -> Path:
+    """Returns a folder of the cache, written atomically by `write` if it is missing."""
+    if not folder.is_dir():
+        prepare_cache(folder.parent)
+        with files.folder_written_atomically(folder) as written:
+            write(written)
+    return folder

@@ -2,12 +2,22 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 from splatpilot.diagrams.worlds.scene_folder import SceneMetadata
 from splatpilot.systems.common.config import load_config
 from splatpilot.systems.common.registry import Registry
-from splatpilot.training.captures import colmap, nerfstudio, phone, ros, scans, tartanair, tum
+from splatpilot.training.captures import (
+    colmap,
+    nerfstudio,
+    phone,
+    photographs,
+    ros,
+    scans,
+    tartanair,
+    tum,
+)
 from splatpilot.training.captures.capture import Capture
 from splatpilot.training.captures.capture_config import CaptureConfig, complete_config
 from splatpilot.training.captures.refine_poses import refined_capture
@@ -18,8 +28,7 @@ from splatpilot.training.captures.up_and_scale import move_origin
 class CaptureFormat:
     """Recognizes and reads captures of one format."""
 
-    recognizes: Callable[[Path], bool]
-    """Tells whether a folder or file looks like one, complete or not."""
+    recognizes: Callable[[Path], object]  # tells whether a folder or file looks like one
     read: Callable[[Path, CaptureConfig], Capture]
     """Opens a capture; raises OSError or ValueError that names the damaged file."""
     description: str = ""
@@ -32,17 +41,12 @@ CAPTURES = Registry("capture format", "splatpilot.captures", CaptureFormat)
 
 def register_capture(
     name: str,
-    recognizes: Callable[[Path], bool],
+    recognizes: Callable[[Path], object],
     read: Callable[[Path, CaptureConfig], Capture],
     *,
     description: str = "",
 ) -> CaptureFormat:
-    """Registers a capture format, so that `read_capture` opens it, and returns it.
-
-    Args:
-        name: value of `capture.kind`.
-        recognizes, read, description: see `CaptureFormat`.
-    """
+    """Registers a `CaptureFormat`, the value `name` of `capture.kind`, and returns it."""
     added = CaptureFormat(recognizes, read, description)
     CAPTURES.add(name, added)
     return added
@@ -50,47 +54,30 @@ def register_capture(
 
 # The first format that recognizes a path reads it.
 _BUILT_IN = {
-    "tartanair_v1": CaptureFormat(
-        tartanair.recognizes_tartanair_v1,
-        tartanair.read_tartanair_v1,
-        "TartanAir V1 (image_left/, depth_left/, pose_left.txt)",
-    ),
-    "tartanair_v2": CaptureFormat(
-        tartanair.recognizes_tartanair_v2,
-        tartanair.read_tartanair_v2,
-        "TartanAir V2 (image_lcam_front/, depth_lcam_front/, pose_lcam_front.txt)",
-    ),
-    "nerfstudio": CaptureFormat(
-        nerfstudio.recognizes, nerfstudio.read, "nerfstudio (transforms.json)"
-    ),
-    "tum": CaptureFormat(
-        tum.recognizes, tum.read, "TUM RGB-D (rgb.txt, depth.txt, groundtruth.txt)"
-    ),
-    "seven_scenes": CaptureFormat(
-        scans.recognizes_seven_scenes,
-        scans.read_seven_scenes,
-        "7-Scenes (frame-000000.color.png, .depth.png, .pose.txt)",
-    ),
-    "scannet": CaptureFormat(
-        scans.recognizes_scannet,
-        scans.read_scannet,
-        "ScanNet (color/, depth/, pose/, intrinsic/)",
-    ),
-    "polycam": CaptureFormat(
-        phone.recognizes_polycam, phone.read_polycam, "Polycam's raw data (keyframes/)"
-    ),
-    "record3d": CaptureFormat(
-        phone.recognizes_record3d, phone.read_record3d, "Record3D (metadata.json, rgb/, depth/)"
-    ),
-    "colmap": CaptureFormat(
-        colmap.recognizes_model, colmap.read_model, "COLMAP (images/, sparse/0/)"
-    ),
-    "photographs": CaptureFormat(
-        colmap.recognizes_photographs, colmap.read_photographs, "photographs alone"
-    ),
-    "rosbag": CaptureFormat(ros.recognizes, ros.read, "a ROS bag"),
-    "video": CaptureFormat(colmap.is_video, colmap.read_video, "a video (.mp4, .mov, ...)"),
-}
+    name: CaptureFormat(recognizes, read, description)
+    for name, recognizes, read, description in (
+        ("tartanair_v1", partial(tartanair.recognizes, version="V1"),
+         partial(tartanair.read, version="V1"),
+         "TartanAir V1 (image_left/, depth_left/, pose_left.txt)"),
+        ("tartanair_v2", partial(tartanair.recognizes, version="V2"),
+         partial(tartanair.read, version="V2"),
+         "TartanAir V2 (image_lcam_front/, depth_lcam_front/, pose_lcam_front.txt)"),
+        ("nerfstudio", nerfstudio.recognizes, nerfstudio.read, "nerfstudio (transforms.json)"),
+        ("tum", tum.recognizes, tum.read, "TUM RGB-D (rgb.txt, depth.txt, groundtruth.txt)"),
+        ("seven_scenes", lambda path: any(path.glob("frame-*.color.*")), scans.read_seven_scenes,
+         "7-Scenes (frame-000000.color.png, .depth.png, .pose.txt)"),
+        ("scannet", scans.recognizes_scannet, scans.read_scannet,
+         "ScanNet (color/, depth/, pose/, intrinsic/)"),
+        ("polycam", lambda path: any(path.glob("keyframes/*cameras")), phone.read_polycam,
+         "Polycam's raw data (keyframes/)"),
+        ("record3d", phone.recognizes_record3d, phone.read_record3d,
+         "Record3D (metadata.json, rgb/, depth/)"),
+        ("colmap", colmap.model_folder, colmap.read_model, "COLMAP (images/, sparse/0/)"),
+        ("photographs", photographs.image_files, photographs.read_photographs, "photographs alone"),
+        ("rosbag", ros.recognizes, ros.read, "a ROS bag"),
+        ("video", photographs.is_video, photographs.read_video, "a video (.mp4, .mov, ...)"),
+    )
+}  # fmt: skip
 for _name, _format in _BUILT_IN.items():
     CAPTURES.add(_name, _format)
 
@@ -101,12 +88,8 @@ def read_capture(path: str | Path, config: CaptureConfig | None = None) -> Captu
     Formats of other packages are tried first, because any folder of images passes for photographs.
 
     Args:
-        path: a folder or a video.
-        config: what the files leave open; `capture.yaml` in the folder completes it.
-
-    Raises:
-        ValueError, OSError: if it is missing, damaged or of an unknown format, or its poses cannot
-            be refined.
+        path: a folder or a file.
+        config: settings that the files leave open; `capture.yaml` in the folder completes them.
     """
     path = Path(path)
     if not path.exists():
@@ -135,12 +118,8 @@ def _recognize(path: Path) -> CaptureFormat:
     raise ValueError(f"{path}: unknown capture format; known are {known}")
 
 
-def read_capture_of(scene: Path, metadata: SceneMetadata) -> Capture:
-    """Opens the capture that a scene folder was made from, with its settings.
-
-    Raises:
-        ValueError, OSError: if `metadata` names none, or it cannot be opened.
-    """
+def read_scene_capture(scene: Path, metadata: SceneMetadata) -> Capture:
+    """Opens the capture that a scene folder was made from, with its settings."""
     file = scene / "scene.yaml"
     if not metadata.capture:
         raise ValueError(

@@ -9,7 +9,6 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from os.path import isfile
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +24,8 @@ from splatpilot.systems.common.readers import (
     array_layout,
     read_array,
     read_text,
-    reason_of,
+    readable,
+    require_file,
     require_readable_size,
 )
 from splatpilot.systems.common.validation import require
@@ -40,6 +40,8 @@ from splatpilot.training.captures.capture import (
     pinhole,
     resampling_maps,
 )
+from splatpilot.training.captures.capture_config import CaptureConfig
+from splatpilot.training.captures.up_and_scale import turn_upright
 
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp"}
 
@@ -49,63 +51,62 @@ _NO_DEPTH = {"1", "L", "P", "LA", "PA", "RGB", "CMYK", "YCbCr"}
 _ALPHA = {"RGBA", "LA", "PA"}
 _ENDS = {"PNG": b"IEND", "JPEG": b"\xff\xd9"}
 _MAX_POSITION = 1e8  # [m]
+_MAX_DROPPED = 0.2  # fraction of frames that may be left out
+_MAPS = 8  # cameras whose resampling is kept at a time
+_VALID = 0.999  # fraction of a resampled pixel that must come from valid ones
+_SAME_SHAPE = 0.02  # relative difference of aspect ratios below which depth shows the same view
 
 
 def image_size(file: Path) -> tuple[int, int]:
-    """Returns width and height [px] of an image without decoding it.
-
-    Raises:
-        ValueError, OSError: if it is missing, not an image or truncated.
-    """
+    """Returns width and height [px] of an image without decoding it."""
     return _image_header(file)[0]
 
 
 def _image_header(file: Path) -> tuple[tuple[int, int], str]:
     """Returns width and height [px], and Pillow's mode of the pixels."""
-    _require_content(file)
-    try:
+    require_file(file)
+    with readable(file, "image"):
         with Image.open(file) as image:
-            size, kind, mode = image.size, image.format, image.mode
+            size, form, mode = image.size, image.format, image.mode
             if "transparency" in image.info:  # of one color, or of those of a palette
                 mode = "RGBA"
-    except Exception as error:  # Pillow raises anything of damaged files
-        reason = reason_of(error).partition(" '")[0]
-        raise ValueError(f"{file}: not a readable image ({reason}); copy it again") from None
+        with file.open("rb") as stream:
+            # Cameras append previews and padding to JPEGs, so the end is searched.
+            stream.seek(max(0, file.stat().st_size - 65536))
+            if _ENDS.get(form or "", b"") not in stream.read():
+                raise ValueError("its end is missing")
     require_readable_size(file, 4 * size[0] * size[1])
-    with file.open("rb") as stream:
-        # Cameras append previews and padding to JPEGs, so the end is searched.
-        stream.seek(max(0, file.stat().st_size - 65536))
-        if _ENDS.get(kind or "", b"") not in stream.read():
-            raise ValueError(f"{file}: not a readable image (truncated); copy it again")
     return size, mode
 
 
-def depth_size(file: Path) -> tuple[int, int]:
+def _depth_size(file: Path) -> tuple[int, int]:
     """Returns width and height [px] of a depth image or array without reading its pixels."""
-    _require_content(file)
     if file.suffix == ".exr":
         (left, top), (right, bottom) = _open_exr(file, header_only=True).header()["dataWindow"]
         return int(right - left + 1), int(bottom - top + 1)
     if file.suffix == ".npy":
         shape, dtype = array_layout(file)
-        valid = len(shape) == 2 and dtype.kind in "iuf" and dtype.itemsize > 1
-        require(valid, f"{file}: depth", _DEPTH, f"an array of {dtype} of shape {shape}")
+        _require_depth(file, shape, dtype)
         return shape[1], shape[0]
     size, mode = _image_header(file)
     require(mode not in _NO_DEPTH, f"{file}: depth", _DEPTH, f"an image of mode {mode}")
     return size
 
 
+def _require_depth(file: Path, shape: tuple[int, ...], dtype: np.dtype) -> None:
+    valid = len(shape) == 2 and dtype.kind in "iuf" and dtype.itemsize > 1
+    require(valid, f"{file}: depth", _DEPTH, f"an array of {dtype} of shape {shape}")
+
+
 def read_image(file: Path) -> NDArray[np.uint8]:
     """Returns an image as (H, W, 3) red, green, blue."""
-    # The pixels as stored: poses and intrinsics belong to them, not to the rotated
-    # picture.
+    # The pixels as stored: poses and intrinsics belong to them, not to the rotated picture.
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
     return cv2.cvtColor(_decode(file, flags), cv2.COLOR_BGR2RGB)  # pyright: ignore[reportReturnType]
 
 
-def read_alpha(file: Path) -> NDArray[np.bool_]:
-    """Returns where the alpha (H, W) of an image is at least a half; everywhere without any."""
+def _read_alpha(file: Path) -> NDArray[np.bool_]:
+    """Returns the pixels (H, W) whose alpha is at least a half; all without any."""
     pixels = _decode(file, cv2.IMREAD_UNCHANGED)
     if pixels.ndim < 3 or pixels.shape[2] not in (2, 4):
         return np.ones(pixels.shape[:2], dtype=bool)
@@ -113,19 +114,12 @@ def read_alpha(file: Path) -> NDArray[np.bool_]:
     return 2 * pixels[..., -1].astype(float) >= largest
 
 
-def read_mask(file: Path) -> NDArray[np.bool_]:
-    """Returns where a mask (H, W) is not black."""
-    return _decode(file, cv2.IMREAD_ANYDEPTH) > 0
-
-
 def read_depth(file: Path, unit: float) -> NDArray[np.float32]:
-    """Returns depth (H, W) [m] from `.npy`, `.exr`, or an image of integers or floats.
+    """Returns depth (H, W) [m] from `.npy`, `.exr`, or an image of integers or floats, in `unit`
+    per meter.
 
     NaN, negative depth and the largest 16-bit number, which sensors write where they see nothing,
     become 0, unknown.
-
-    Args:
-        unit: units of the file per meter.
     """
     if file.suffix == ".npy":
         raw = read_array(file)
@@ -134,60 +128,46 @@ def read_depth(file: Path, unit: float) -> NDArray[np.float32]:
         raw = np.asarray(next(iter(channels.values())).pixels, dtype=np.float32)
     else:
         raw = _decode(file, cv2.IMREAD_UNCHANGED)
-    valid = raw.ndim == 2 and raw.dtype.kind in "iuf" and raw.dtype.itemsize > 1
-    require(valid, f"{file}: depth", _DEPTH, f"an array of {raw.dtype} of shape {raw.shape}")
+    _require_depth(file, raw.shape, raw.dtype)
     depth = raw.astype(np.float32) / np.float32(unit)
     if raw.dtype == np.uint16:
         depth[raw == 65535] = 0
-    return _clean(depth)
+    return _drop_invalid(depth)
 
 
-def read_packed_depth(file: Path) -> NDArray[np.float32]:
+def read_packed_depth(file: Path, unit: float) -> NDArray[np.float32]:
     """Returns depth (H, W) [m] from a PNG whose four channels hold the bytes of a float32."""
     raw = _decode(file, cv2.IMREAD_UNCHANGED)
     valid = raw.ndim == 3 and raw.shape[2] == 4 and raw.dtype == np.uint8
     found = f"an array of {raw.dtype} of shape {raw.shape}"
     require(valid, f"{file}: depth", "four channels of 8 bits", found)
-    return _clean(np.ascontiguousarray(raw).view("<f4")[..., 0].copy())
+    depth = np.ascontiguousarray(raw).view("<f4")[..., 0].astype(np.float32)
+    return _drop_invalid(np.divide(depth, np.float32(unit), dtype=np.float32))
 
 
-def _clean(depth: NDArray[np.float32]) -> NDArray[np.float32]:
+def _drop_invalid(depth: NDArray[np.float32]) -> NDArray[np.float32]:
     depth[np.isnan(depth) | (depth < 0)] = 0
     return depth
 
 
 def _decode(file: Path, flags: int) -> NDArray:
-    raw = np.frombuffer(file.read_bytes(), np.uint8)
-    try:
-        image = cv2.imdecode(raw, flags) if len(raw) else None
-    except cv2.error:  # more pixels than OpenCV decodes
-        image = None
-    if image is None:
-        raise ValueError(f"{file}: not a readable image; copy it again")
+    with readable(file, "image"):
+        image = cv2.imdecode(np.frombuffer(file.read_bytes(), np.uint8), flags)
+        if image is None:
+            raise ValueError("OpenCV cannot decode it")
     return image
 
 
 def _open_exr(file: Path, **options: bool) -> Any:
     OpenEXR: Any = import_extra("OpenEXR", "exr")
-    try:
+    require_file(file)
+    with readable(file, "EXR file"):
         return OpenEXR.File(str(file), **options)
-    except Exception as error:  # OpenEXR raises anything of damaged files
-        raise ValueError(f"{file}: not a readable EXR file ({error}); copy it again") from None
-
-
-def _require_content(file: Path) -> None:
-    if not isfile(file):
-        raise FileNotFoundError(f"No such file: {file}")
-    if file.stat().st_size == 0:
-        raise ValueError(f"{file}: the file is empty; copy it again")
 
 
 def numbered_files(folder: Path, pattern: str) -> dict[int, Path]:
-    """Returns the files of a folder by the number in their name, in its order.
-
-    Args:
-        pattern: regular expression of the whole name, whose group is the number.
-    """
+    """Returns the files of a folder by the number that is the group of `pattern`, a regular
+    expression of the whole name, in its order."""
     if not folder.is_dir():
         raise FileNotFoundError(f"No such folder: {folder}")
     found = ((re.fullmatch(pattern, file.name), file) for file in folder.iterdir())
@@ -198,12 +178,9 @@ def numbered_files(folder: Path, pattern: str) -> dict[int, Path]:
 
 
 def read_rows(file: Path, columns: int, what: str) -> list[NDArray[np.float64]]:
-    """Returns the rows of numbers of a text file, each (columns,); NaN is read as such.
+    """Returns the rows of numbers of a text file, each (columns,), called `what` in messages.
 
-    Lines that start with # and empty lines at the end are left out.
-
-    Args:
-        what: a row is, for messages.
+    NaN is read as such; lines that start with # and empty lines at the end are left out.
     """
     rows = []
     for number, line in enumerate(read_text(file, "replace").rstrip().splitlines(), start=1):
@@ -242,8 +219,7 @@ def pose_row(X: RigidTransform) -> str:
 
 
 def pose_from_matrix(matrix: NDArray[np.float64], source: str) -> RigidTransform:
-    """Returns the pose of a matrix (4, 4) or (3, 4), whose rotation may be off by rounding; errors
-    start with `source`."""
+    """Returns the pose of a matrix (4, 4) or (3, 4), rounded; errors start with `source`."""
     R, p = matrix[:3, :3], matrix[:3, 3]
     _require_position(matrix, p, source)
     last = (0.0, 0.0, 0.0, 1.0)
@@ -272,25 +248,6 @@ def _require_position(pose: NDArray[np.float64], p: NDArray[np.float64], source:
     require(inside, f"{source}: the position", f"within {_MAX_POSITION:g} m", p)
 
 
-def outlier_frames(positions: NDArray[np.float64]) -> NDArray[np.intp]:
-    """Returns the indices of positions (N, 3) that are invalid, far from all others.
-
-    Those are farther from the median position than 10 m and 20 times what four in five are.
-    """
-    distance = np.linalg.norm(positions - np.median(positions, axis=0), axis=1)
-    return np.flatnonzero(distance > max(10.0, 20 * np.quantile(distance, 0.8)))
-
-
-_MAX_DROPPED = 0.2
-"""The fraction of frames that may be left out."""
-_MAPS = 8
-"""Cameras whose resampling is kept at a time."""
-_VALID = 0.999
-"""Fraction of a resampled pixel that must come from valid ones."""
-_SAME_SHAPE = 0.02
-"""Relative difference of aspect ratios below which depth shows the same view."""
-
-
 @dataclass(frozen=True, eq=False)
 class FrameFiles:
     """One frame of a capture, not yet inspected."""
@@ -300,14 +257,10 @@ class FrameFiles:
     """Returns the pose as the file gives it, or raises ValueError that names the file: that of a
     body B, the camera with the file's axes, in the file's world F."""
     depth: Path | None = None
-    lens: Lens | None = None
-    """The camera of this frame; None takes that of the capture."""
-    mask: Path | None = None
-    """An image that is black where this one is not to be used."""
-    name: str = ""
-    """Path of the image as the files give it; empty for the name of the file."""
-    held_out: bool = False
-    """Whether the files hold this frame out from training."""
+    lens: Lens | None = None  # the camera of this frame; None takes that of the capture
+    mask: Path | None = None  # an image that is black where this one is not to be used
+    name: str = ""  # path of the image as the files give it; empty for the name of the file
+    held_out: bool = False  # true if the files hold this frame out from training
 
 
 @dataclass(frozen=True, eq=False)
@@ -327,11 +280,13 @@ def open_frames(
     frames: Sequence[FrameFiles],
     *,
     axes: FileAxes,
+    config: CaptureConfig | None = None,
     lens: Callable[[int, int], Lens] | None = None,
-    intrinsics: Sequence[float] = (),
-    read_depth: Callable[[Path], NDArray[np.float32]] | None = None,
+    depth_unit: float = 1000.0,
+    read_depth: Callable[[Path, float], NDArray[np.float32]] = read_depth,
     depth_camera: Callable[[int, int], DepthCamera] | None = None,
     stretch_depth: bool = False,
+    up: str = "z",
     dropped: Sequence[str] = (),
     notes: Sequence[str] = (),
 ) -> Capture:
@@ -341,77 +296,81 @@ def open_frames(
         path: the capture's folder or file.
         source: the format's name in `Capture.source`.
         axes: the axes of the files' poses.
+        config: its `intrinsics`, `depth_unit` and `up`, if given, replace those of the format.
         lens: returns the camera of images of a width and height [px], for frames without their own.
-        intrinsics: fx, fy, cx, cy [px] that replace those of `lens`; or empty.
-        read_depth: reads the depth [m] in a file; None if there is none.
+        depth_unit: units of the stored depth per meter.
+        read_depth: reads the depth [m] in a file of a unit.
         depth_camera: returns the camera of depth images of a width and height [px]; None if depth
             has the pixels of the images before they are undistorted.
-        stretch_depth: whether depth, without a camera of its own, may have another resolution than
+        stretch_depth: True if depth, without a camera of its own, may have another resolution than
             the image.
+        up: up direction of the files' world, see `turn_upright`; empty leaves that to the caller.
         dropped: messages about frames that were left out already, which do not count further.
         notes: the first of `Capture.notes`.
 
     Raises:
         ValueError: if fewer than two frames, or less than four fifths of them, can be used.
     """
-    messages = list(dropped)
-    valid = _usable_frames(frames, messages, not (depth_camera or stretch_depth), stretch_depth)
-    if valid:
-        outliers = set(outlier_frames(np.array([f.X_FB.translation() for f in valid])).tolist())
-        for i in sorted(outliers):
-            p = valid[i].X_FB.translation().round(1)
-            messages.append(f"{valid[i].files.image}: its position {p} is far from all others")
-        valid = [frame for i, frame in enumerate(valid) if i not in outliers]
-    if len(valid) < max(2, (1 - _MAX_DROPPED) * len(frames)):
+    config = config or CaptureConfig()
+    messages, complete = list(dropped), []
+    for files in frames:
+        try:
+            complete.append(_inspect(files))
+        except (ValueError, OSError) as error:
+            messages.append(str(error))
+    registered = depth_camera is None and not stretch_depth
+    same_size = _drop_other_sizes(complete, messages, registered, stretch_depth)
+    usable = _drop_distant(same_size, messages)
+    if len(usable) < max(2, (1 - _MAX_DROPPED) * len(frames)):
         first = f"; the first that cannot: {messages[0]}" if messages else ""
         raise ValueError(
-            f"{path}: {len(valid)} of {len(frames)} frames can be used, at least 2 and "
+            f"{path}: {len(usable)} of {len(frames)} frames can be used, at least 2 and "
             f"{1 - _MAX_DROPPED:.0%} must be{first}"
         )
 
     def shared_lens() -> Lens:
-        width, height = next(frame.size for frame in valid if frame.files.lens is None)
-        if intrinsics:
-            return Lens(pinhole(*intrinsics), width, height, source="capture.intrinsics")
+        width, height = next(frame.size for frame in usable if frame.files.lens is None)
+        if config.intrinsics:
+            return Lens(pinhole(*config.intrinsics), width, height, source="capture.intrinsics")
         if lens is None:
             raise ValueError("unknown intrinsics; set capture.intrinsics to [fx, fy, cx, cy]")
         return lens(width, height)
 
     try:
-        shared = shared_lens() if any(frame.files.lens is None for frame in valid) else None
-        lenses = [frame.files.lens or shared for frame in valid]
+        shared = shared_lens() if any(frame.files.lens is None for frame in usable) else None
+        lenses = [frame.files.lens or shared for frame in usable]
         distinct = [each for each in dict.fromkeys(lenses) if each is not None]
         camera = common_pinhole(distinct)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     # Some cameras focus every frame again: the maps of all would fill the memory.
     cached_maps = lru_cache(_MAPS)(lambda lens: resampling_maps(lens, camera))
-    has_depth = read_depth is not None and any(frame.files.depth for frame in valid)
 
     def load_image(i: int) -> NDArray[np.uint8]:
-        file = valid[i].files.image
-        return resample(_require_size(read_image(file), file, valid[i].size), i, cv2.INTER_LINEAR)
+        file = usable[i].files.image
+        return resample(_require_size(read_image(file), file, usable[i].size), i, cv2.INTER_LINEAR)
 
     def load_valid(i: int) -> NDArray[np.bool_]:
-        files, size = valid[i].files, valid[i].size
+        files, size = usable[i].files, usable[i].size
         mask = np.ones(size[::-1], dtype=bool)
         if files.mask is not None:
-            mask &= _require_size(read_mask(files.mask), files.mask, size)
-        if valid[i].has_alpha:
-            mask &= _require_size(read_alpha(files.image), files.image, size)
+            shown = _decode(files.mask, cv2.IMREAD_ANYDEPTH) > 0
+            mask &= _require_size(shown, files.mask, size)
+        if usable[i].has_alpha:
+            mask &= _require_size(_read_alpha(files.image), files.image, size)
         # A pixel interpolated from an invalid one is invalid.
         return resample(mask.astype(np.float32), i, cv2.INTER_LINEAR) > _VALID
 
     def load_depth(i: int) -> NDArray[np.float32] | None:
-        file, size = valid[i].files.depth, valid[i].depth_size
-        if file is None or size is None or read_depth is None:
+        file, size = usable[i].files.depth, usable[i].depth_size
+        if file is None or size is None:
             return None
-        depth = _require_size(read_depth(file), file, size)
+        depth = _require_size(read_depth(file, config.depth_unit or depth_unit), file, size)
         if depth_camera:
             return depth
         # An average between two surfaces would lie on neither.
-        if size != valid[i].size:
-            depth = cv2.resize(depth, valid[i].size, interpolation=cv2.INTER_NEAREST_EXACT)
+        if size != usable[i].size:
+            depth = cv2.resize(depth, usable[i].size, interpolation=cv2.INTER_NEAREST_EXACT)
         return resample(depth, i, cv2.INTER_NEAREST)
 
     def resample(image: NDArray, i: int, interpolation: int) -> NDArray:
@@ -422,27 +381,28 @@ def open_frames(
         return cv2.remap(image, *maps, interpolation, borderMode=cv2.BORDER_REPLICATE)
 
     R_WF, R_BC = RigidTransform(axes.R_WF), RigidTransform(axes.R_BC)
-    depth_sizes = [frame.depth_size for frame in valid if frame.depth_size]
-    held_out = [i for i, frame in enumerate(valid) if frame.files.held_out]
-    masked = sum(frame.files.mask is not None for frame in valid)
-    transparent = sum(frame.has_alpha for frame in valid)
-    return Capture(
+    depth_size = next((frame.depth_size for frame in usable if frame.depth_size), None)
+    held_out = [i for i, frame in enumerate(usable) if frame.files.held_out]
+    masked = sum(frame.files.mask is not None for frame in usable)
+    transparent = sum(frame.has_alpha for frame in usable)
+    capture = Capture(
         name=path.resolve().name,
         source=f"{source} {path.resolve()}",
         K=camera.K,
         width=camera.width,
         height=camera.height,
-        X_WCs=[R_WF @ frame.X_FB @ R_BC for frame in valid],
+        X_WCs=[R_WF @ frame.X_FB @ R_BC for frame in usable],
         load_image=load_image,
-        load_depth=load_depth if has_depth else no_depth,
+        load_depth=load_depth if depth_size else no_depth,
         load_valid=load_valid if masked or transparent else all_valid,
-        depth_camera=depth_camera(*depth_sizes[0]) if depth_camera and has_depth else None,
-        frame_names=[frame.files.name or frame.files.image.name for frame in valid],
+        depth_camera=depth_camera(*depth_size) if depth_camera and depth_size else None,
+        frame_names=[frame.files.name or frame.files.image.name for frame in usable],
         dropped=messages,
         held_out=held_out if any(frame.held_out for frame in frames) else None,
-        notes=[*notes, *_notes(distinct, masked, transparent, len(valid))],
+        notes=[*notes, *_notes(distinct, masked, transparent, len(usable))],
         axes=axes,
     )
+    return turn_upright(capture, config.up or up) if up else capture
 
 
 def _notes(lenses: Sequence[Lens], masked: int, transparent: int, total: int) -> list[str]:
@@ -456,72 +416,73 @@ def _notes(lenses: Sequence[Lens], masked: int, transparent: int, total: int) ->
             f"the principal point ({cx}, {cy}) px is far from the center of the images; are "
             "intrinsics those of images of this size?"
         )
-    if masked:
-        notes.append(f"{masked} of {total} images have a mask; black pixels are not used")
-    if transparent:
-        notes.append(
-            f"{transparent} of {total} images have an alpha channel; pixels of less than a half "
-            "are not used"
-        )
+    for count, what, pixels in (
+        (masked, "a mask", "black pixels"),
+        (transparent, "an alpha channel", "pixels of less than a half"),
+    ):
+        if count:
+            notes.append(f"{count} of {total} images have {what}; {pixels} are not used")
     return notes
-
-
-def _usable_frames(
-    frames: Sequence[FrameFiles], messages: list[str], registered: bool, same_view: bool
-) -> list[_Frame]:
-    """Returns the frames whose files are complete, in the most frequent sizes of images and depth.
-
-    Args:
-        messages: to which those about other frames are appended.
-        registered: whether depth must have the size of its image.
-        same_view: whether it must have the aspect ratio of its image.
-    """
-    complete = []
-    for frame in frames:
-        try:
-            complete.append(_inspect(frame))
-        except (ValueError, OSError) as error:
-            messages.append(str(error))
-    sizes = [frame.size for frame in complete if frame.files.lens is None]
-    usual = max(sizes, key=sizes.count, default=None)
-    depth_sizes = [frame.depth_size for frame in complete if frame.depth_size]
-    usual_depth = max(depth_sizes, key=depth_sizes.count, default=None)
-    kept = []
-    for frame in complete:
-        files, expected = frame.files, frame.size if registered else usual_depth
-        (width, height), (w, h) = frame.size, frame.depth_size or frame.size
-        if files.lens is None and usual is not None and frame.size != usual:
-            messages.append(_size_message(files.image, frame.size, usual))
-        elif files.depth and frame.depth_size and expected and frame.depth_size != expected:
-            messages.append(_size_message(files.depth, frame.depth_size, expected))
-        elif same_view and abs(w * height - h * width) > _SAME_SHAPE * w * height:
-            messages.append(
-                f"{files.depth}: {w}x{h} pixels of depth do not show what {width}x{height} pixels "
-                "of an image do; width and height must have one ratio"
-            )
-        else:
-            kept.append(frame)
-    return kept
 
 
 def _inspect(frame: FrameFiles) -> _Frame:
     size, mode = _image_header(frame.image)
-    if frame.lens is not None and size != (frame.lens.width, frame.lens.height):
-        raise ValueError(_size_message(frame.image, size, (frame.lens.width, frame.lens.height)))
-    if frame.mask is not None and (found := image_size(frame.mask)) != size:
-        raise ValueError(_size_message(frame.mask, found, size))
-    found = depth_size(frame.depth) if frame.depth is not None else None
-    return _Frame(frame, size, found, mode in _ALPHA, frame.X_FB())
+    if frame.lens is not None:
+        _check_size(frame.image, size, (frame.lens.width, frame.lens.height))
+    if frame.mask is not None:
+        _check_size(frame.mask, image_size(frame.mask), size)
+    depth_size = _depth_size(frame.depth) if frame.depth is not None else None
+    return _Frame(frame, size, depth_size, mode in _ALPHA, frame.X_FB())
 
 
-def _size_message(file: Path, size: tuple[int, int], expected: tuple[int, int]) -> str:
-    return (
-        f"{file}: must be of {expected[0]}x{expected[1]} pixels, as the others, got "
-        f"{size[0]}x{size[1]}"
-    )
+def _drop_other_sizes(
+    frames: Sequence[_Frame], messages: list[str], registered: bool, same_view: bool
+) -> list[_Frame]:
+    """Returns the frames in the most frequent sizes of images and depth, and appends messages about
+    others. Depth must have the size of its image if `registered`, its aspect ratio if `same_view`.
+    """
+    sizes = [frame.size for frame in frames if frame.files.lens is None]
+    depth_sizes = [frame.depth_size for frame in frames if frame.depth_size]
+    usual, usual_depth = (max(each, key=each.count, default=None) for each in (sizes, depth_sizes))
+    kept = []
+    for frame in frames:
+        (width, height), (w, h) = frame.size, frame.depth_size or frame.size
+        try:
+            if frame.files.lens is None and usual is not None:
+                _check_size(frame.files.image, frame.size, usual)
+            expected = frame.size if registered else usual_depth
+            if frame.files.depth and frame.depth_size and expected:
+                _check_size(frame.files.depth, frame.depth_size, expected)
+            if same_view and abs(w * height - h * width) > _SAME_SHAPE * w * height:
+                raise ValueError(
+                    f"{frame.files.depth}: {w}x{h} pixels of depth do not show what "
+                    f"{width}x{height} pixels of an image do; width and height must have one ratio"
+                )
+            kept.append(frame)
+        except ValueError as error:
+            messages.append(str(error))
+    return kept
+
+
+def _drop_distant(frames: list[_Frame], messages: list[str]) -> list[_Frame]:
+    """Returns the frames that are not farther from the median position than 10 m and 20 times the
+    distance of four in five."""
+    if not frames:
+        return frames
+    p = np.array([frame.X_FB.translation() for frame in frames])
+    distance = np.linalg.norm(p - np.median(p, axis=0), axis=1)
+    distant = distance > max(10.0, 20 * np.quantile(distance, 0.8))
+    for i in np.flatnonzero(distant):
+        image = frames[i].files.image
+        messages.append(f"{image}: its position {p[i].round(1)} is far from all others")
+    return [frame for frame, far in zip(frames, distant, strict=True) if not far]
+
+
+def _check_size(file: Path, size: tuple[int, int], expected: tuple[int, int]) -> None:
+    condition = f"of {expected[0]}x{expected[1]} pixels, as the others"
+    require(size == expected, f"{file}", condition, f"{size[0]}x{size[1]}")
 
 
 def _require_size(array: NDArray, file: Path, size: tuple[int, int]) -> NDArray:
-    if array.shape[1::-1] != size:
-        raise ValueError(_size_message(file, array.shape[1::-1], size))
+    _check_size(file, array.shape[1::-1], size)
     return array

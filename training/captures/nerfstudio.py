@@ -10,7 +10,6 @@ and `test_frames`. Lengths are taken to be in meters if there is depth.
 
 import dataclasses
 import json
-from collections.abc import Callable
 from os.path import isfile
 from pathlib import Path, PurePath
 from typing import Any
@@ -18,7 +17,7 @@ from typing import Any
 import numpy as np
 from pydrake.math import RigidTransform
 
-from splatpilot.systems.common.readers import read_ply_file, read_text, reason_of
+from splatpilot.systems.common.readers import read_ply_file, read_text, readable, reason_of
 from splatpilot.systems.common.validation import require
 from splatpilot.training.captures.capture import (
     OPENGL_AXES,
@@ -35,7 +34,6 @@ from splatpilot.training.captures.frames import (
     image_size,
     open_frames,
     pose_from_matrix,
-    read_depth,
 )
 from splatpilot.training.captures.up_and_scale import make_metric, turn_upright
 
@@ -51,8 +49,8 @@ _CAMERA |= {*_DISTORTION, "distortion_params", "fisheye_crop_radius"}
 # Including keys that tell only how the file was made.
 _KNOWN = _CAMERA | {*_SPLIT.values(), "frames", "test_frames", "depth_unit_scale_factor"}
 _KNOWN |= {"ply_file_path", "applied_transform", "applied_scale"}
-_KNOWN_OF_FRAME = _CAMERA | {"file_path", "transform_matrix", "depth_file_path", "mask_path"}
-_KNOWN_OF_FRAME |= {"is_bad", "colmap_im_id"}
+_KNOWN_IN_FRAMES = _CAMERA | {"file_path", "transform_matrix", "depth_file_path", "mask_path"}
+_KNOWN_IN_FRAMES |= {"is_bad", "colmap_im_id"}
 
 
 def recognizes(path: Path) -> bool:
@@ -61,28 +59,20 @@ def recognizes(path: Path) -> bool:
 
 
 def read(path: Path, config: CaptureConfig) -> Capture:
-    """Opens a capture in nerfstudio's format.
-
-    Raises:
-        ValueError, OSError: if it is missing or invalid, too many frames cannot be used, or the
-            scale cannot be determined as `config` says.
-    """
+    """Opens a capture in nerfstudio's format."""
     file = path / _TRANSFORMS
-    try:
-        content = json.loads(read_text(file))
+    text = read_text(file)
+    with readable(file, "file of nerfstudio's format with `frames`"):
+        content = json.loads(text)
         entries, held_out = _split(content)
         named = [(str(entry["file_path"]), entry["transform_matrix"], entry) for entry in entries]
-        unit = config.depth_unit or _depth_unit(content)
+        meters = float(content.get("depth_unit_scale_factor", 1e-3))
+        require(1e-9 < meters < 1e9, "depth_unit_scale_factor", "in (1e-9, 1e9) m", meters)
         points = path / (content.get("ply_file_path") or "")
         depths, masks = (
             [path / entry[key] if entry.get(key) else None for entry in entries]
             for key in ("depth_file_path", "mask_path")
         )
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise ValueError(
-            f"{file}: not nerfstudio's format ({reason_of(error)}); it must have `frames` with "
-            "`file_path` and `transform_matrix`"
-        ) from None
     lenses: dict[tuple, Lens] = {}  # Equal cameras share one, and one resampling.
     frames, bad = [], []
     for i, (name, matrix, entry) in enumerate(named):
@@ -93,7 +83,7 @@ def read(path: Path, config: CaptureConfig) -> Capture:
         frames.append(
             FrameFiles(
                 image,
-                _pose(matrix, f"{file}, frame {i} ({name})"),
+                lambda matrix=matrix, source=f"{file}, frame {i} ({name})": _pose(matrix, source),
                 depths[i],
                 _lens(file, {**content, **entry}, image, config, lenses),
                 masks[i],
@@ -101,17 +91,20 @@ def read(path: Path, config: CaptureConfig) -> Capture:
                 held_out=bool(held_out[i]),
             )
         )
-    unused = content.keys() - _KNOWN | {key for entry in entries for key in entry} - _KNOWN_OF_FRAME
-    listed = ", ".join(sorted(unused))
+    unused = content.keys() - _KNOWN | {key for entry in entries for key in entry}.difference(
+        _KNOWN_IN_FRAMES
+    )
     capture = open_frames(
         path,
         "nerfstudio capture",
         frames,
         axes=OPENGL_AXES,
-        read_depth=lambda file: read_depth(file, unit),
+        config=config,
+        depth_unit=1 / meters,
         stretch_depth=True,
+        up="",
         dropped=bad,
-        notes=[f"{file.name}: {listed} is not used"] if unused else (),
+        notes=[f"{file.name}: {', '.join(sorted(unused))} is not used"] if unused else (),
     )
     if points != path:
         capture = dataclasses.replace(capture, points=_read_points(points))
@@ -143,24 +136,14 @@ def _name(path: Any) -> str:
     return str(PurePath(str(path)))
 
 
-def _depth_unit(content: dict[str, Any]) -> float:
-    """Returns the units of the stored depth per meter."""
-    meters = float(content.get("depth_unit_scale_factor", 1e-3))
-    require(1e-9 < meters < 1e9, "depth_unit_scale_factor", "in (1e-9, 1e9) m", meters)
-    return 1 / meters
-
-
-def _pose(matrix: Any, source: str) -> Callable[[], RigidTransform]:
-    def X_FB() -> RigidTransform:
-        try:
-            array = np.array(matrix, dtype=np.float64)
-        except (TypeError, ValueError, OverflowError):
-            array = np.zeros(0)
-        valid = array.shape in ((4, 4), (3, 4))
-        require(valid, f"{source}: transform_matrix", "a 4x4 matrix", f"{matrix!r:.40}")
-        return pose_from_matrix(array, source)
-
-    return X_FB
+def _pose(matrix: Any, source: str) -> RigidTransform:
+    try:
+        array = np.array(matrix, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        array = np.zeros(0)
+    valid = array.shape in ((4, 4), (3, 4))
+    require(valid, f"{source}: transform_matrix", "a 4x4 matrix", f"{matrix!r:.40}")
+    return pose_from_matrix(array, source)
 
 
 def _image_file(file: Path) -> Path:
@@ -177,7 +160,7 @@ def _lens(
     config: CaptureConfig,
     lenses: dict[tuple, Lens],
 ) -> Lens | None:
-    """Returns the camera that `values` describe, None if the image's size is needed and unknown."""
+    """Returns the camera that `values` describe, None without the image's size."""
     model = str(values.get("camera_model", _FISHEYE if values.get("is_fisheye") else "OPENCV"))
     require(model in _MODELS, f"{file}: camera_model", f"one of {', '.join(_MODELS)}", model)
     try:
@@ -220,12 +203,11 @@ def _lens(
 
 
 def _read_points(file: Path) -> SfmPoints:
-    try:
-        vertices = read_ply_file(file)["vertex"]
+    content = read_ply_file(file)
+    with readable(file, "PLY file of colored points"):
+        vertices = content["vertex"]
         p_WQ = np.column_stack([vertices[axis] for axis in "xyz"]).astype(np.float64)
         colors = np.column_stack([vertices[name] for name in ("red", "green", "blue")])
-    except (OSError, LookupError, TypeError, ValueError) as error:
-        raise ValueError(f"{file}: not a PLY of colored points ({reason_of(error)})") from None
-    if not (np.isfinite(p_WQ).all() and np.isfinite(colors).all()):
-        raise ValueError(f"{file}: points or colors are not finite; export it again")
+        if not (np.isfinite(p_WQ).all() and np.isfinite(colors).all()):
+            raise ValueError("points or colors are not finite")
     return SfmPoints(p_WQ, colors.astype(np.float64) / 255)

@@ -1,14 +1,14 @@
 """LiDAR captures of phones: Polycam's raw data and exports of Record3D."""
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
-from splatpilot.systems.common.readers import read_text, reason_of
+from splatpilot.systems.common.readers import read_text, readable
 from splatpilot.systems.common.validation import require
 from splatpilot.training.captures.capture import OPENGL_AXES, Capture, Lens, pinhole
 from splatpilot.training.captures.capture_config import CaptureConfig
@@ -18,17 +18,9 @@ from splatpilot.training.captures.frames import (
     open_frames,
     pose_from_matrix,
     pose_from_quaternion,
-    read_depth,
 )
-from splatpilot.training.captures.up_and_scale import turn_upright
 
-_KEYFRAMES = "keyframes"
 _METADATA = "metadata.json"
-
-
-def recognizes_polycam(path: Path) -> bool:
-    """Tells whether a folder looks like Polycam's raw data."""
-    return (path / _KEYFRAMES / "cameras").is_dir() or _is_corrected(path)
 
 
 def read_polycam(path: Path, config: CaptureConfig) -> Capture:
@@ -38,51 +30,51 @@ def read_polycam(path: Path, config: CaptureConfig) -> Capture:
     `cx`, `cy`, `width`, `height` [px] and the entries `t_00` to `t_23` of the pose, from camera
     axes of OpenGL to a world with y up; depth is in millimeters, in fewer pixels than the image.
     `corrected_cameras/` and `corrected_images/` hold optimized poses and undistorted images.
-
-    Raises:
-        ValueError, OSError: if there is no keyframe, or too many frames cannot be used.
     """
-    folder, prefix = path / _KEYFRAMES, "corrected_" if _is_corrected(path) else ""
-    unit = config.depth_unit or 1000.0
+    folder = path / "keyframes"
+    prefix = "corrected_" if (folder / "corrected_cameras").is_dir() else ""
 
     def frame(camera: Path) -> FrameFiles:
         def X_FB() -> RigidTransform:
-            if problem:
-                raise ValueError(problem)
-            return pose_from_matrix(np.array(matrix).reshape(3, 4), str(camera))
+            if isinstance(read, ValueError):
+                raise read
+            return pose_from_matrix(read[1], str(camera))
 
-        lens, matrix, problem = None, [], ""
         try:
-            values = json.loads(read_text(camera))
-            focal = config.intrinsics or [float(values[name]) for name in ("fx", "fy", "cx", "cy")]
-            source = "capture.intrinsics" if config.intrinsics else f"{camera.parent.name}/"
-            size = int(values["width"]), int(values["height"])
-            lens = Lens(pinhole(*focal), *size, source=source)
-            matrix = [float(values[f"t_{row}{column}"]) for row in range(3) for column in range(4)]
-        except (LookupError, TypeError, ValueError, OverflowError, RecursionError) as error:
-            problem = f"{camera}: not the camera of a keyframe ({reason_of(error)}); copy it again"
+            read = _read_keyframe(camera, config.intrinsics)
+        except ValueError as error:
+            read = error
         image = folder / f"{prefix}images" / f"{camera.stem}.jpg"
         depth = folder / "depth" / f"{camera.stem}.png"
+        lens = None if isinstance(read, ValueError) else read[0]
         return FrameFiles(image, X_FB, depth if depth.is_file() else None, lens)
 
     cameras = numbered_files(folder / f"{prefix}cameras", r"(\d+)\.json")
-    capture = open_frames(
+    return open_frames(
         path,
         "Polycam capture",
         [frame(camera) for camera in cameras.values()],
         axes=OPENGL_AXES,
-        read_depth=lambda file: read_depth(file, unit),
+        config=config,
         stretch_depth=True,
+        up="y",
     )
-    return turn_upright(capture, config.up or "y")
 
 
-def _is_corrected(path: Path) -> bool:
-    return (path / _KEYFRAMES / "corrected_cameras").is_dir()
+def _read_keyframe(camera: Path, intrinsics: Sequence[float]) -> tuple[Lens, NDArray[np.float64]]:
+    """Returns the camera and the pose (3, 4) of a keyframe."""
+    text = read_text(camera)
+    with readable(camera, "camera of a keyframe"):
+        values = json.loads(text)
+        focal = intrinsics or [float(values[name]) for name in ("fx", "fy", "cx", "cy")]
+        source = "capture.intrinsics" if intrinsics else f"{camera.parent.name}/"
+        lens = Lens(pinhole(*focal), int(values["width"]), int(values["height"]), source=source)
+        matrix = [float(values[f"t_{row}{column}"]) for row in range(3) for column in range(4)]
+    return lens, np.array(matrix).reshape(3, 4)
 
 
 def recognizes_record3d(path: Path) -> bool:
-    """Tells whether a path looks like an export of Record3D, readable or not."""
+    """Tells whether a path looks like an export of Record3D."""
     return path.suffix == ".r3d" or ((path / _METADATA).is_file() and (path / "rgb").is_dir())
 
 
@@ -93,10 +85,6 @@ def read_record3d(path: Path, config: CaptureConfig) -> Capture:
     from camera axes of OpenGL to the first camera's, so that up is unknown; `K` holds the
     intrinsics column by column for images of `w` x `h`, and `perFrameIntrinsicCoeffs`, in newer
     exports, fx fy cx cy of each frame; depth is in meters, in fewer pixels than the image.
-
-    Raises:
-        ValueError, OSError: if there is no image, the metadata are invalid, too many frames cannot
-            be used, or it is the application's own `.r3d`.
     """
     if path.suffix == ".r3d":
         raise ValueError(
@@ -104,10 +92,16 @@ def read_record3d(path: Path, config: CaptureConfig) -> Capture:
             '"EXR + RGB" and name that folder'
         )
     file = path / _METADATA
-    try:
-        poses, intrinsics, size = _read_metadata(json.loads(read_text(file)))
-    except (LookupError, TypeError, ValueError, RecursionError) as error:
-        raise ValueError(f"{file}: invalid metadata of Record3D ({reason_of(error)})") from None
+    text = read_text(file)
+    with readable(file, "file of Record3D's metadata"):
+        content = json.loads(text)
+        poses = np.array(content["poses"], dtype=np.float64)
+        require(poses.ndim == 2 and poses.shape[1] == 7, "poses", "of shape (N, 7)", poses.shape)
+        K = np.array(content["K"], dtype=np.float64).reshape(3, 3).T
+        intrinsics = np.tile([K[0, 0], K[1, 1], K[0, 2], K[1, 2]], (len(poses), 1))
+        own = np.array(content.get("perFrameIntrinsicCoeffs") or [], dtype=np.float64)
+        intrinsics = own if own.shape == intrinsics.shape else intrinsics  # fx fy cx cy
+        size = int(content["w"]), int(content["h"])
     images = numbered_files(path / "rgb", r"(\d+)\.(?:jpg|jpeg|png)")
     if max(images) >= len(poses):
         raise ValueError(
@@ -128,27 +122,13 @@ def read_record3d(path: Path, config: CaptureConfig) -> Capture:
             lenses.setdefault(values.tobytes(), lens),
         )
 
-    unit = config.depth_unit or 1.0
-    capture = open_frames(
+    return open_frames(
         path,
         "Record3D export",
         [frame(i, image) for i, image in images.items()],
         axes=OPENGL_AXES,
-        read_depth=lambda file: read_depth(file, unit),
+        config=config,
+        depth_unit=1.0,
         stretch_depth=True,
+        up="cameras",
     )
-    return turn_upright(capture, config.up or "cameras")
-
-
-def _read_metadata(
-    content: dict[str, Any],
-) -> tuple[NDArray[np.float64], NDArray[np.float64], tuple[int, int]]:
-    """Returns the poses (N, 7), the intrinsics (N, 4) fx fy cx cy, and width and height [px]."""
-    poses = np.array(content["poses"], dtype=np.float64)
-    require(poses.ndim == 2 and poses.shape[1] == 7, "poses", "of shape (N, 7)", poses.shape)
-    K = np.array(content["K"], dtype=np.float64).reshape(3, 3).T
-    intrinsics = np.tile([K[0, 0], K[1, 1], K[0, 2], K[1, 2]], (len(poses), 1))
-    own = np.array(content.get("perFrameIntrinsicCoeffs") or [], dtype=np.float64)
-    if own.shape == intrinsics.shape:
-        intrinsics = own
-    return poses, intrinsics, (int(content["w"]), int(content["h"]))

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
@@ -21,37 +22,139 @@ from splatpilot.systems.common.files import written_atomically
 from splatpilot.systems.common.progress import Progress, say
 from splatpilot.training.captures.capture import (
     Capture,
-    cache_folder,
-    cache_key,
-    prepare_cache,
+    CaptureFrame,
+    back_project,
+    project,
     shrink,
     shrink_factor,
 )
-from splatpilot.training.captures.capture_config import CaptureConfig
-from splatpilot.training.captures.frame_comparison import (
-    REACH,
-    WIDTH,
-    ComparedFrame,
-    Comparison,
-    compare_frames,
+from splatpilot.training.captures.capture_config import (
+    CaptureConfig,
+    cache_folder,
+    cache_key,
+    prepare_cache,
 )
 
+_WIDTH = 320  # [px] Approximate width of compared images, to which lengths in pixels below refer
+_REACH = 0.08
+"""[-] Relative difference of depth up to which two frames can show the same surface, and maximum
+change of its inverse depth from one pixel to the next."""
+_NUM_POINTS, _MIN_POINTS = 1000, 50  # maximum compared points per frame, and minimum per pair
+_FINE, _COARSE = 1.5, 10.0
+"""[px] Brightness is blurred by the first, to be smooth over steps, and divided by what the second
+leaves: exposure and vignetting cancel in the ratio."""
+_BLACK = 0.05  # added to the divisor of brightness (0 to 1)
+_AROUND = np.ones((5, 5), np.uint8)
 _PARTNERS, _OVERLAP, _PROBES = 16, 0.2, 64
 """Maximum number of frames that each is compared with, and the fraction of so many of its points
 that these must see."""
-_REACHES = REACH, 0.06, 0.05, 0.04
-"""Of the first rounds; the last of all later ones."""
-_ROUNDS, _SETTLED = 30, 1e-3
-"""Maximum number of rounds, and steps [m], [rad] below which they end."""
+_REACHES = _REACH, 0.06, 0.05, 0.04  # reach in the first rounds; the last holds for all later ones
+_ROUNDS, _SETTLED = 30, 1e-3  # maximum number of rounds, and steps [m], [rad] below which they end
 _SPREADS = np.array([0.01, 0.03])
-"""Of residuals in the first round; later ones measure them."""
+"""Standard deviations of residuals in the first round; later ones measure them."""
 _INDEPENDENT = 10
 """Number of independent points that the points of a pair count for: neighbors share errors."""
 _DRIFT, _BELIEF = 0.005, 0.1
-"""[m], [rad] Standard deviations of the drift from one frame to the next, and of poses: what no
-other frame constrains moves as the frames before and after it."""
-_VERSION = 1
-"""Of the result for the same frames."""
+"""[m], [rad] Standard deviations of the drift from one frame to the next, and of poses: poses that
+no other frame constrains move as the frames before and after."""
+_VERSION = 1  # version of the result for the same frames
+
+
+@dataclass(frozen=True, eq=False)
+class ComparedFrame:
+    """Depth and contrast of a frame."""
+
+    K: NDArray[np.float64]  # (3, 3) [px]
+    inverse_depth: NDArray[np.float32]
+    """(H, W) [1/m]; 0 where it is unknown or not of one surface all around."""
+    contrast: NDArray[np.float32]  # (H, W), brightness relative to its neighborhood
+    p_CQ: NDArray[np.float64]  # (n, 3) [m], points that it sees
+    point_contrast: NDArray[np.float64]  # (n,), of these
+
+    @classmethod
+    def prepare(cls, frame: CaptureFrame) -> "ComparedFrame":
+        """Prepares a frame that is about `_WIDTH` wide."""
+        depth = np.where(np.isfinite(frame.depth), frame.depth, 0).astype(np.float32)
+        lower, upper = cv2.erode(depth, _AROUND), cv2.dilate(depth, _AROUND)
+        surface = (lower > 0) & (upper < (1 + _REACH) * lower)
+        # On a plane it is linear in the pixel coordinates, and a blur preserves it.
+        inverse = cv2.GaussianBlur(1 / np.where(depth > 0, depth, 1), _AROUND.shape, 0)
+        inverse = np.where(surface, inverse, 0).astype(np.float32)
+        gray = cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY).astype(np.float32) / 255
+        fine, coarse = (cv2.GaussianBlur(gray, (0, 0), sigma) for sigma in (_FINE, _COARSE))
+        contrast = (fine / (coarse + _BLACK)).astype(np.float32)
+        chosen = np.random.default_rng(0).permutation(np.flatnonzero(surface))[:_NUM_POINTS]
+        rows, columns = np.divmod(chosen, depth.shape[1])
+        z = 1 / inverse.flat[chosen].astype(np.float64)
+        p_CQ = back_project(frame.K, columns + 0.5, rows + 0.5, z)
+        return cls(frame.K, inverse, contrast, p_CQ, contrast.flat[chosen].astype(np.float64))
+
+    def sees(
+        self, p_CQ: NDArray[np.float64], reach: float = _REACH
+    ) -> tuple[NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]]:
+        """Returns which of the points (n, 3) are on surfaces that it sees, up to a relative
+        difference of depth; the image coordinates (2, n) of all; and its inverse depth there with
+        derivatives (3, n)."""
+        x, y, z = p_CQ.T
+        u = np.array(project(self.K, x, y, z.clip(min=1e-3)))
+        inverse = _sample(self.inverse_depth, u)
+        # Next to unknown depth it falls to zero.
+        steep = np.abs(inverse[1:]).max(axis=0) > _REACH * inverse[0]
+        same = np.abs(inverse[0] * p_CQ[:, 2] - 1) < reach
+        return (inverse[0] > 0) & ~steep & same, u, inverse
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Differences of two frames at points that both see."""
+
+    residuals: NDArray[np.float64]
+    """(2, n): e = w(u) q_z - 1, the relative difference of depth of a point that one frame sees and
+    that is at q in the other, in the pixel u, of inverse depth w(u); and c(u) - c, of contrast."""
+    derivatives: NDArray[np.float64]
+    """(2, n, 12), by small rotations [rad] of one frame about its center, its translation [m], and
+    those of the other, all in the axes of the world."""
+
+
+def compare_frames(
+    one: ComparedFrame,
+    other: ComparedFrame,
+    X_WC: RigidTransform,
+    X_WC_other: RigidTransform,
+    reach: float,
+) -> Comparison | None:
+    """Compares the points of one frame with what another sees there, see `ComparedFrame.sees`; None
+    if fewer than fifty are on surfaces that it sees."""
+    R, p = X_WC_other.rotation().matrix(), X_WC_other.translation()
+    p_WQ = one.p_CQ @ X_WC.rotation().matrix().T + X_WC.translation()
+    q = (p_WQ - p) @ R
+    same, u, inverse = other.sees(q, reach)
+    if same.sum() < _MIN_POINTS:
+        return None
+    p_WQ, q, u, inverse = p_WQ[same], q[same], u[:, same], inverse[:, same]
+    contrast = _sample(other.contrast, u)
+    residuals = np.array([inverse[0] * q[:, 2] - 1, contrast[0] - one.point_contrast[same]])
+    # A plane has w = m . ray, so that e = m . q - 1.
+    f, c = np.diag(other.K)[:2, None], other.K[:2, 2, None]
+    w_x, w_y = inverse[1:] * f
+    x, y = (u - c) / f
+    c_x, c_y = contrast[1:] * f / q[:, 2]
+    by_q = np.array([[w_x, w_y, inverse[0] - x * w_x - y * w_y], [c_x, c_y, -x * c_x - y * c_y]])
+    by_p_WQ = by_q.transpose(0, 2, 1) @ R.T  # (2, n, 3)
+    turn, turn_other = (np.cross(p_WQ - center, by_p_WQ) for center in (X_WC.translation(), p))
+    return Comparison(residuals, np.concatenate([turn, by_p_WQ, -turn_other, -by_p_WQ], axis=2))
+
+
+def _sample(image: NDArray[np.float32], u: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns an image and its derivatives [1/px] along rows and columns, (3, n), at the image
+    coordinates u (2, n); zero outside."""
+    x, y = (u - 0.5).clip(-9, 1e4).astype(np.float32)[:, None]
+    values = [
+        cv2.remap(image, x + a, y + b, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)[0]
+        for a, b in ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1))
+    ]
+    center, right, left, below, above = np.array(values, dtype=np.float64)
+    return np.array([center, (right - left) / 2, (below - above) / 2])
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,8 +166,7 @@ class RefinedPoses:
     rotated: float  # [rad], mean over frames
     depth: tuple[float, float]
     """Median relative difference of depth between frames, before and after."""
-    contrast: tuple[float, float]
-    """Median difference of contrast, before and after."""
+    contrast: tuple[float, float]  # median difference of contrast, before and after
 
     def __str__(self) -> str:
         rotated = np.rad2deg(self.rotated)
@@ -76,18 +178,12 @@ class RefinedPoses:
 
 
 def refine_poses(frames: Sequence[ComparedFrame], X_WCs: Iterable[RigidTransform]) -> RefinedPoses:
-    """Returns the poses of the smallest squared residuals over their spreads, see `Comparison`.
+    """Returns the poses of frames in sequence with the smallest squared residuals over their
+    spreads, see `Comparison`.
 
     This removes drift of centimeters and of a degree or two, not lost tracking: points whose depths
     differ by more than 8 % are not compared. Robust weights as narrow as the noise of a sensor
     would keep frames where they are.
-
-    Args:
-        frames: in the order in which they were taken.
-        X_WCs: their poses.
-
-    Raises:
-        ValueError: if no two frames see the same.
     """
     poses = given = list(X_WCs)
     pairs = _pairs(frames, poses)
@@ -96,19 +192,19 @@ def refine_poses(frames: Sequence[ComparedFrame], X_WCs: Iterable[RigidTransform
     with Progress(range(_ROUNDS), "refining poses", unit="round") as rounds:
         for number in rounds:
             reach = _REACHES[min(number, len(_REACHES) - 1)]
-            terms, differences = [], []
-            for i, j in pairs:
-                found = compare_frames(frames[i], frames[j], poses[i], poses[j], reach)
-                if found is not None:
-                    terms.append(_Term.of(i, j, found, spreads))
-                    differences.append(np.median(np.abs(found.residuals), axis=1))
-            if not terms:
+            compared = [
+                (i, j, found)
+                for i, j in pairs
+                if (found := compare_frames(frames[i], frames[j], poses[i], poses[j], reach))
+            ]
+            if not compared:
                 raise ValueError(
                     "no two frames see the same surfaces, so poses cannot be refined; look at what "
                     "`splatpilot capture check` says of them"
                 )
+            differences = [np.median(np.abs(found.residuals), axis=1) for _, _, found in compared]
             history.append(np.median(differences, axis=0))
-            step = _step(terms, _corrections(poses, given))
+            step = _step(compared, spreads, _corrections(poses, given))
             poses = [_moved(X_WC, by) for X_WC, by in zip(poses, step, strict=True)]
             # A median of absolute values is that of a normal distribution times 0.6745.
             spreads = np.maximum(history[-1] / 0.6745, 1e-4)
@@ -116,15 +212,11 @@ def refine_poses(frames: Sequence[ComparedFrame], X_WCs: Iterable[RigidTransform
             rounds.set_postfix_str(f"largest step {largest:.4f}")
             if number >= len(_REACHES) and largest < _SETTLED:
                 break
-    rotated, moved = np.split(_corrections(poses, given), 2, axis=1)
-    (depth, contrast), (depth_after, contrast_after) = history[0].tolist(), history[-1].tolist()
-    return RefinedPoses(
-        poses,
-        float(np.linalg.norm(moved, axis=1).mean()),
-        float(np.linalg.norm(rotated, axis=1).mean()),
-        (depth, depth_after),
-        (contrast, contrast_after),
+    rotated, moved = np.linalg.norm(_corrections(poses, given).reshape(-1, 2, 3), axis=2).mean(
+        axis=0
     )
+    depth, contrast = zip(history[0].tolist(), history[-1].tolist(), strict=True)
+    return RefinedPoses(poses, float(moved), float(rotated), depth, contrast)
 
 
 def _pairs(
@@ -157,32 +249,24 @@ def _inside(frame: ComparedFrame, p_CQs: NDArray[np.float64]) -> NDArray[np.bool
     return (z > 0) & (x > 0) & (x < width * z) & (y > 0) & (y < height * z)
 
 
-@dataclass(frozen=True, eq=False)
-class _Term:
-    """The part of one pair in the normal equations of all frames, six unknowns each."""
-
-    unknowns: NDArray[np.intp]  # (12,), their indices
-    hessian: NDArray[np.float64]  # (12, 12), of Gauss-Newton
-    gradient: NDArray[np.float64]  # (12,)
-
-    @classmethod
-    def of(cls, i: int, j: int, found: Comparison, spreads: NDArray[np.float64]) -> "_Term":
-        weight = np.sqrt(_INDEPENDENT / found.residuals.shape[1]) / spreads
-        J = (found.derivatives * weight[:, None, None]).reshape(-1, 12)
-        unknowns = np.add.outer([6 * i, 6 * j], np.arange(6)).ravel()
-        return cls(unknowns, J.T @ J, J.T @ (found.residuals * weight[:, None]).ravel())
-
-
-def _step(terms: Sequence[_Term], corrections: NDArray[np.float64]) -> NDArray[np.float64]:
+def _step(
+    pairs: Sequence[tuple[int, int, Comparison]],
+    spreads: NDArray[np.float64],
+    corrections: NDArray[np.float64],
+) -> NDArray[np.float64]:
     """Returns the step (N, 6) of Gauss-Newton from poses with `corrections` (N, 6) so far."""
     count = len(corrections)
-    unknowns = np.array([term.unknowns for term in terms])
-    hessians = np.array([term.hessian for term in terms])
+    unknowns, hessians = np.zeros((len(pairs), 12), int), np.zeros((len(pairs), 12, 12))
+    gradient = np.zeros(6 * count)
+    for k, (i, j, found) in enumerate(pairs):
+        weight = np.sqrt(_INDEPENDENT / found.residuals.shape[1]) / spreads
+        J = (found.derivatives * weight[:, None, None]).reshape(-1, 12)
+        unknowns[k] = np.add.outer([6 * i, 6 * j], np.arange(6)).ravel()
+        hessians[k] = J.T @ J
+        gradient[unknowns[k]] += J.T @ (found.residuals * weight[:, None]).ravel()
     rows, columns = unknowns[:, :, None], unknowns[:, None, :]
     rows, columns = (np.broadcast_to(each, hessians.shape).ravel() for each in (rows, columns))
     H = coo_matrix((hessians.ravel(), (rows, columns)), shape=(6 * count, 6 * count))
-    gradient = np.zeros(6 * count)
-    np.add.at(gradient, unknowns, np.array([term.gradient for term in terms]))
     change = eye(count - 1, count) - eye(count - 1, count, k=1)
     believed = kron(change.T @ change / _DRIFT**2 + eye(count) / _BELIEF**2, eye(6))
     step = splu(csc_matrix(H + believed)).solve(-gradient - believed @ corrections.ravel())
@@ -200,37 +284,23 @@ def _corrections(
     X_WCs: Sequence[RigidTransform], given: Sequence[RigidTransform]
 ) -> NDArray[np.float64]:
     """Returns the rotations [rad] and translations [m] of poses from those given, (N, 6)."""
-    turns = [
-        (X_WC.rotation() @ X_WG.rotation().inverse()).matrix()
-        for X_WC, X_WG in zip(X_WCs, given, strict=True)
-    ]
-    moves = [
-        X_WC.translation() - X_WG.translation() for X_WC, X_WG in zip(X_WCs, given, strict=True)
-    ]
+    pairs = list(zip(X_WCs, given, strict=True))
+    turns = [(X_WC.rotation() @ X_WG.rotation().inverse()).matrix() for X_WC, X_WG in pairs]
+    moves = [X_WC.translation() - X_WG.translation() for X_WC, X_WG in pairs]
     return np.concatenate([Rotation.from_matrix(turns).as_rotvec(), moves], axis=1)
 
 
 def refined_capture(capture: Capture, path: Path, config: CaptureConfig) -> Capture:
-    """Returns a capture with refined poses of all its frames, held-out ones too; the cache keeps
-    them.
-
-    Args:
-        capture: as read from `path`.
-
-    Raises:
-        ValueError, OSError: if it has no depth, no two frames see the same, or the cache cannot be
-            written.
-    """
+    """Returns a capture, as read from `path`, with refined poses of all its frames; the cache
+    keeps them."""
     if not capture.has_depth:
-        raise ValueError(
-            f"{path}: capture.refine_poses needs depth, which this capture is without; omit it"
-        )
+        raise ValueError(f"{path}: capture.refine_poses needs depth, and it has none; omit it")
     file = cache_folder(config, "poses") / f"poses-{_key(capture, path)}.npy"
     if not file.is_file():
         prepare_cache(file.parent)
-        factor = shrink_factor(capture.width, WIDTH)
+        factor = shrink_factor(capture.width, _WIDTH)
         numbers = Progress(range(len(capture)), "loading frames", unit="frame")
-        frames = [ComparedFrame.of(shrink(capture.frame(i), factor)) for i in numbers]
+        frames = [ComparedFrame.prepare(shrink(capture.frame(i), factor)) for i in numbers]
         try:
             refined = refine_poses(frames, capture.X_WCs)
         except ValueError as error:

@@ -10,9 +10,11 @@ cache once, in TUM's format.
 
 import json
 import struct
-from collections.abc import Callable, Iterator
+from bisect import bisect_left, insort
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -22,28 +24,30 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
 from splatpilot.systems.common.extras import import_extra
-from splatpilot.systems.common.files import folder_written_atomically
 from splatpilot.systems.common.progress import Progress
+from splatpilot.systems.common.readers import readable
+from splatpilot.systems.common.validation import require
 from splatpilot.systems.vehicle.state import pose_between
 from splatpilot.training.captures.capture import (
     Capture,
     Lens,
-    cache_folder,
-    cache_key,
+    centered_pinhole,
     fisheye_lens,
     opencv_lens,
-    pinhole,
-    prepare_cache,
 )
-from splatpilot.training.captures.capture_config import CaptureConfig
+from splatpilot.training.captures.capture_config import (
+    CaptureConfig,
+    cache_folder,
+    cache_key,
+    cached_folder,
+)
 from splatpilot.training.captures.frames import pose_from_quaternion, pose_row
 from splatpilot.training.captures.tum import MAX_GAP, open_sequence
 
 _COLORS = {"rgb8": -1, "bgr8": cv2.COLOR_BGR2RGB, "rgba8": cv2.COLOR_RGBA2RGB}
 _COLORS |= {"bgra8": cv2.COLOR_BGRA2RGB, "mono8": cv2.COLOR_GRAY2RGB}
 _DEPTHS = {"16UC1": np.uint16, "mono16": np.uint16, "32FC1": np.float32}
-_DEPTH_UNIT = 1000.0
-"""Units per meter of the depth that is written."""
+_DEPTH_UNIT = 1000.0  # units per meter of the depth that is written
 _METADATA = "metadata.yaml"
 _IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 _INFO = "sensor_msgs/msg/CameraInfo"
@@ -56,14 +60,13 @@ _POSES = {
 }
 _TRANSPORTS = ("/compressed", "/compressedDepth", "/theora")
 _CAMERA = "camera.json"
-_VERSION = 2
-"""Of the cache's content; other versions are written again."""
+_VERSION = 2  # version of the cache's content; others are written again
 _MODELS = {"": opencv_lens, "plumb_bob": opencv_lens, "rational_polynomial": opencv_lens}
 _MODELS |= {"equidistant": fisheye_lens, "fisheye": fisheye_lens}
 
 
 def recognizes(path: Path) -> bool:
-    """Tells whether a path looks like a bag, readable or not."""
+    """Tells whether a path looks like a bag."""
     if path.suffix in {".bag", ".db3", ".mcap"}:
         return True
     file = path / _METADATA
@@ -72,21 +75,17 @@ def recognizes(path: Path) -> bool:
 
 def read(path: Path, config: CaptureConfig) -> Capture:
     """Opens a bag. `config.topics` chooses among several topics; `config.intrinsics` replace the
-    bag's calibration.
-
-    Raises:
-        ValueError, OSError: if it is not readable, a topic is missing or ambiguous, or the cache
-            cannot be written.
-        ModuleNotFoundError: if the extra `ros` is not installed.
-    """
+    bag's calibration."""
     if path.suffix in {".db3", ".mcap"}:
         raise ValueError(f"{path}: a part of a bag; name its folder, which holds {_METADATA}")
     files = sorted(path.iterdir()) if path.is_dir() else [path]
-    folder = cache_folder(config, "bags", cache_key(files, config.topics, _VERSION)) / path.stem
-    if not folder.is_dir():
-        prepare_cache(folder.parent)
-        with folder_written_atomically(folder) as written, _opened(path) as reader:
+    key = cache_key(files, config.topics, _VERSION)
+
+    def write(written: Path) -> None:
+        with _opened(path) as reader:
             _Bag(path, reader, config.topics).write(written)
+
+    folder = cached_folder(cache_folder(config, "bags", key) / path.stem, write)
     camera = json.loads((folder / _CAMERA).read_text())
 
     def lens(width: int, height: int) -> Lens:
@@ -95,9 +94,7 @@ def read(path: Path, config: CaptureConfig) -> Capture:
                 f"{path}: {camera['problem']}; set capture.intrinsics to [fx, fy, cx, cy] of "
                 "images without distortion"
             )
-        fx, fy, cx, cy = camera["intrinsics"]
-        K = pinhole(fx, fy, cx + 0.5, cy + 0.5)  # ROS counts from the first pixel's center.
-        make = _MODELS[camera["model"]]
+        K, make = centered_pinhole(*camera["intrinsics"]), _MODELS[camera["model"]]
         own = make(K, camera["width"], camera["height"], camera["distortion"])
         return replace(own, source=camera["source"]).scale_to(width, height)
 
@@ -108,12 +105,10 @@ def read(path: Path, config: CaptureConfig) -> Capture:
 def _opened(path: Path) -> Iterator[Any]:
     highlevel: Any = import_extra("rosbags.highlevel", "ros")
     typesys: Any = import_extra("rosbags.typesys", "ros")
-    try:
+    with readable(path, "ROS bag"):
         types = typesys.get_typestore(typesys.Stores.LATEST)
         reader = highlevel.AnyReader([path], default_typestore=types)
         reader.open()
-    except Exception as error:  # rosbags raises anything of damaged files
-        raise ValueError(f"{path}: not a readable ROS bag ({error}); copy it again") from None
     try:
         yield reader
     finally:
@@ -121,7 +116,7 @@ def _opened(path: Path) -> Iterator[Any]:
 
 
 class _Bag:
-    """An open bag, with the topics of color, depth and poses."""
+    """Topics of color, depth and poses in an open bag."""
 
     def __init__(self, path: Path, reader: Any, topics: list[str]):
         self._path, self._reader = path, reader
@@ -140,8 +135,8 @@ class _Bag:
     def write(self, folder: Path) -> None:
         """Writes images, lists of times and poses, and the calibration."""
         tree, frame = self._transforms(), _frame(self._first(self._color))
-        colors, poses = self._write_images(folder, "rgb", self._color, _write_color), []
-        self._write_images(folder, "depth", self._depth, _write_depth)
+        colors, poses = self._write_images(folder, "rgb", self._color, _encode_color), []
+        self._write_images(folder, "depth", self._depth, _encode_depth)
         if self._types[self._pose] == _TF:
             found = ((time, tree.pose(frame, time)) for time in colors)
             poses = [(time, X_WC) for time, X_WC in found if X_WC is not None]
@@ -151,11 +146,8 @@ class _Bag:
                 body = getattr(message, "child_frame_id", "").lstrip("/")
                 X_BC = tree.fixed_pose(body, frame) or RigidTransform()
                 poses.append((_time(message), _pose(pose_field(message), self._pose) @ X_BC))
-        if len(poses) < 2:
-            raise ValueError(
-                f"{self._path}: {self._pose} gives {len(poses)} poses of {frame!r}, the frame of "
-                f"{self._color}; at least 2 are needed"
-            )
+        what = f"{self._path}: poses of {frame!r}, the frame of {self._color}, in {self._pose}"
+        require(len(poses) >= 2, what, "at least 2", len(poses))
         lines = [f"{time:.9f} {pose_row(X_WC)}\n" for time, X_WC in poses]
         (folder / "groundtruth.txt").write_text("".join(lines))
         (folder / _CAMERA).write_text(json.dumps(self._calibration(frame)))
@@ -164,13 +156,12 @@ class _Bag:
         return sorted(topic for topic, each in self._types.items() if each in types)
 
     def _choose(self, what: str, topics: list[str], given: str) -> str:
-        known = ", ".join(sorted(self._types))
-        if given:
-            if given not in self._types:
-                raise ValueError(f"{self._path}: has no topic {given}; it has {known}")
+        if given in self._types:
             return given
-        if not topics:
-            raise ValueError(f"{self._path}: has no topic of {what}; it has {known}")
+        if given or not topics:
+            missing = given or f"of {what}"
+            known = ", ".join(sorted(self._types))
+            raise ValueError(f"{self._path}: has no topic {missing}; it has {known}")
         if len(topics) > 1:
             raise ValueError(
                 f"{self._path}: {what} are in {', '.join(topics)}; set capture.topics to the names "
@@ -179,7 +170,7 @@ class _Bag:
         return topics[0]
 
     def _content(self, topic: str) -> str:
-        """Returns whether images show color, depth or neither."""
+        """Returns "color", "depth" or, for other images, ""."""
         message = self._first(topic)
         if message is None:
             return ""
@@ -210,7 +201,7 @@ class _Bag:
         return tree
 
     def _write_images(
-        self, folder: Path, name: str, topic: str, write: Callable[[Any, Path], Path]
+        self, folder: Path, name: str, topic: str, encode: Callable[[Any], tuple[str, bytes]]
     ) -> list[float]:
         """Writes the images of a topic and the list of their times, which it returns [s]."""
         (folder / name).mkdir()
@@ -219,18 +210,15 @@ class _Bag:
         with (folder / f"{name}.txt").open("w") as file:
             for message in Progress(self._messages(topic), topic, count, unit="image"):
                 times.append(_time(message))
-                try:
-                    image = write(message, folder / name / f"{times[-1]:.9f}")
-                except (cv2.error, LookupError, ValueError, TypeError, struct.error) as error:
-                    raise ValueError(
-                        f"{self._path}: the image of {topic} at {times[-1]:.3f} s is unreadable "
-                        f"({error})"
-                    ) from None
-                file.write(f"{times[-1]:.9f} {image.relative_to(folder)}\n")
+                with readable(self._path, f"bag at {times[-1]:.3f} s of {topic}"):
+                    suffix, content = encode(message)
+                image = f"{name}/{times[-1]:.9f}.{suffix}"
+                (folder / image).write_bytes(content)
+                file.write(f"{times[-1]:.9f} {image}\n")
         return times
 
     def _calibration(self, frame: str) -> dict[str, Any]:
-        """Returns that of the camera of the color images, which are in `frame`, or the problem.
+        """Returns the calibration of the color images, which are in `frame`, or the problem.
 
         It is in the namespace of the images or, without one there, has their frame. K and D
         describe images as the camera took them, P those that are rectified (CameraInfo).
@@ -239,8 +227,9 @@ class _Bag:
         for transport in _TRANSPORTS:
             images = images.removesuffix(transport)
         namespace, _, image = images.rpartition("/")
-        infos = {topic: self._first(topic) for topic in self._topics(_INFO)}
-        infos = {topic: info for topic, info in infos.items() if info is not None}
+        infos = {
+            topic: info for topic in self._topics(_INFO) if (info := self._first(topic)) is not None
+        }
         near = [topic for topic in infos if topic.rpartition("/")[0] == namespace]
         found = near or [topic for topic, info in infos.items() if _frame(info) == frame]
         if not found:
@@ -273,7 +262,6 @@ class TransformTree:
         self._parents: dict[str, str] = {}
         self._fixed: dict[str, RigidTransform] = {}
         self._moving: dict[str, list[tuple[float, RigidTransform]]] = {}
-        self._times: dict[str, NDArray[np.float64]] = {}  # of sorted poses
 
     def fix(self, parent: str, child: str, X_PC: RigidTransform) -> None:
         """Adds a fixed frame."""
@@ -282,32 +270,22 @@ class TransformTree:
     def move(self, parent: str, child: str, time: float, X_PC: RigidTransform) -> None:
         """Adds the pose of a moving frame at a time [s]."""
         self._parents[child] = parent
-        self._moving.setdefault(child, []).append((time, X_PC))
-        self._times.pop(child, None)
+        insort(self._moving.setdefault(child, []), (time, X_PC), key=itemgetter(0))
 
     def fixed_pose(self, ancestor: str, frame: str) -> RigidTransform | None:
         """Returns the pose of a frame in an ancestor, None unless all between them is fixed."""
-        X = RigidTransform()
-        for name in self._upwards(frame):
-            if name == ancestor:
-                return X
-            if name not in self._fixed:
-                return None
-            X = self._fixed[name] @ X
-        return None
+        names = self._upwards(frame)
+        between = names[: names.index(ancestor)] if ancestor in names else names
+        fixed = [self._fixed.get(name) for name in between]
+        return _compose(fixed) if ancestor in names else None
 
     def pose(self, frame: str, time: float) -> RigidTransform | None:
         """Returns the pose of a frame in its root at a time [s], None if the poses around it are
         missing or too far apart."""
-        X = RigidTransform()
-        for name in self._upwards(frame):
-            if name not in self._parents:
-                return X
-            here = self._fixed.get(name) or self._interpolate(name, time)
-            if here is None:
-                return None
-            X = here @ X
-        return None
+        *names, root = self._upwards(frame)
+        if root in self._parents:
+            return None
+        return _compose([self._fixed.get(name) or self._interpolate(name, time) for name in names])
 
     def _upwards(self, frame: str) -> list[str]:
         """Returns the frame, its parent, and so on, up to the root or a repetition."""
@@ -317,35 +295,38 @@ class TransformTree:
         return names
 
     def _interpolate(self, child: str, time: float) -> RigidTransform | None:
-        poses = self._moving.get(child, [])
-        if child not in self._times:
-            poses.sort(key=lambda pose: pose[0])
-            self._times[child] = np.array([t for t, _ in poses])
-        times = self._times[child]
-        after = int(np.searchsorted(times, time))
-        if after < len(times) and times[after] == time:
+        poses = self._moving[child]
+        after = bisect_left(poses, time, key=itemgetter(0))
+        if after < len(poses) and poses[after][0] == time:
             return poses[after][1]
-        if not 0 < after < len(times) or times[after] - times[after - 1] > MAX_GAP:
+        if not 0 < after < len(poses) or poses[after][0] - poses[after - 1][0] > MAX_GAP:
             return None
         (t0, a), (t1, b) = poses[after - 1], poses[after]
         return pose_between(a, b, (time - t0) / (t1 - t0))
 
 
-def _write_color(message: Any, file: Path) -> Path:
-    """Writes the colors of an `Image` or `CompressedImage` to `file` with the suffix of its
-    format, which it returns."""
+def _compose(upwards: Sequence[RigidTransform | None]) -> RigidTransform | None:
+    """Returns the pose of a frame from those of it and its ancestors, None if one is unknown."""
+    X = RigidTransform()
+    for each in upwards:
+        if each is None:
+            return None
+        X = each @ X
+    return X
+
+
+def _encode_color(message: Any) -> tuple[str, bytes]:
+    """Returns the suffix and content of a file of an `Image` or `CompressedImage`."""
     if hasattr(message, "format"):
-        file = file.parent / f"{file.name}.{'png' if 'png' in message.format else 'jpg'}"
-        file.write_bytes(bytes(message.data))
-        return file
+        return "png" if "png" in message.format else "jpg", bytes(message.data)
     pixels = _pixels(message, np.uint8)
     if (code := _COLORS[message.encoding]) >= 0:
         pixels = cv2.cvtColor(pixels, code)
-    return _write_png(file, pixels[..., ::-1])
+    return _encode_png(pixels[..., ::-1])
 
 
-def _write_depth(message: Any, file: Path) -> Path:
-    """Writes planar depth as a PNG of 16 bits in millimeters, 0 if unknown."""
+def _encode_depth(message: Any) -> tuple[str, bytes]:
+    """Returns planar depth as a PNG of 16 bits in millimeters, 0 if unknown."""
     if hasattr(message, "format"):
         # A header of an enumeration and two floats, then a PNG, which holds floats as 1 / depth.
         _, a, b = struct.unpack("<iff", bytes(message.data[:12]))
@@ -360,7 +341,12 @@ def _write_depth(message: Any, file: Path) -> Path:
     if depth.dtype != np.uint16:
         known = np.isfinite(depth) & (depth > 0) & (depth < 65.5)
         depth = np.round(_DEPTH_UNIT * np.where(known, depth, 0)).astype(np.uint16)
-    return _write_png(file, depth)
+    return _encode_png(depth)
+
+
+def _encode_png(pixels: NDArray) -> tuple[str, bytes]:
+    options = [cv2.IMWRITE_PNG_COMPRESSION, 1]
+    return "png", cv2.imencode(".png", np.ascontiguousarray(pixels), options)[1].tobytes()
 
 
 def _pixels(message: Any, dtype: type) -> NDArray:
@@ -370,13 +356,6 @@ def _pixels(message: Any, dtype: type) -> NDArray:
     channels = rows.shape[1] // message.width // item.itemsize
     rows = np.ascontiguousarray(rows[:, : message.width * channels * item.itemsize])
     return rows.view(item).reshape(message.height, message.width, channels).astype(dtype)
-
-
-def _write_png(file: Path, pixels: NDArray) -> Path:
-    file = file.parent / f"{file.name}.png"
-    if not cv2.imwrite(str(file), np.ascontiguousarray(pixels), [cv2.IMWRITE_PNG_COMPRESSION, 1]):
-        raise OSError(f"{file}: cannot be written; is the disk full?")
-    return file
 
 
 def _info_field(info: Any, name: str) -> Any:

@@ -1,22 +1,28 @@
 """ScanNet and 7-Scenes: RGB-D scans with a color camera apart from the depth camera."""
 
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
-from splatpilot.training.captures.capture import OPTICAL_AXES, Capture, DepthCamera, Lens, pinhole
+from splatpilot.training.captures.capture import (
+    OPTICAL_AXES,
+    Capture,
+    DepthCamera,
+    Lens,
+    centered_pinhole,
+    pinhole,
+)
 from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.frames import (
     FrameFiles,
     numbered_files,
     open_frames,
     pose_from_matrix,
-    read_depth,
     read_matrix,
 )
-from splatpilot.training.captures.up_and_scale import turn_upright
 
 _SCANNET_COLOR = Path("intrinsic", "intrinsic_color.txt")
 _SCANNET_DEPTH = Path("intrinsic", "intrinsic_depth.txt")
@@ -29,7 +35,7 @@ _P_DC = (0.024, 0.005, 0.0)
 
 
 def recognizes_scannet(path: Path) -> bool:
-    """Tells whether a folder looks like an exported scan of ScanNet, complete or not."""
+    """Tells whether a folder looks like an exported scan of ScanNet."""
     return (path / _SCANNET_COLOR).is_file() and (path / "pose").is_dir()
 
 
@@ -39,14 +45,9 @@ def read_scannet(path: Path, config: CaptureConfig) -> Capture:
     `color/0.jpg`, `depth/0.png` in millimeters, `pose/0.txt` 4x4, camera to world with z up, -inf
     where tracking was lost, `intrinsic/intrinsic_color.txt` and `intrinsic_depth.txt` 4x4, counted
     from the first pixel's center. The axes of both cameras are the same.
-
-    Raises:
-        ValueError, OSError: if there is no image, the intrinsics are invalid, or too many frames
-            cannot be used.
     """
     colors = numbered_files(path / "color", r"(\d+)\.(?:jpg|jpeg|png)")
-    lost = [number for number in colors if _is_lost(path / "pose" / f"{number}.txt")]
-    unit = config.depth_unit or 1000.0
+    lost = {number for number in colors if _is_lost(path / "pose" / f"{number}.txt")}
     K_C = K_D = _intrinsics(path / _SCANNET_COLOR)
     if config.depth_intrinsics:
         K_D = pinhole(*config.depth_intrinsics)
@@ -64,35 +65,27 @@ def read_scannet(path: Path, config: CaptureConfig) -> Capture:
     def depth_camera(width: int, height: int) -> DepthCamera:
         return DepthCamera(Lens(K_D, width, height).K, width, height, RigidTransform())
 
-    capture = open_frames(
+    return open_frames(
         path,
         "ScanNet folder",
         [frame(number, color) for number, color in colors.items() if number not in lost],
         axes=OPTICAL_AXES,
+        config=config,
         lens=lambda width, height: Lens(K_C, width, height, source=str(_SCANNET_COLOR)),
-        intrinsics=config.intrinsics,
-        read_depth=lambda file: read_depth(file, unit),
         depth_camera=depth_camera,
         dropped=[f"{path / 'pose'}: tracking was lost in {len(lost)} frames"] if lost else (),
     )
-    return turn_upright(capture, config.up or "z")
 
 
 def _is_lost(pose: Path) -> bool:
-    try:
+    with suppress(OSError, ValueError):
         return not np.isfinite(read_matrix(pose)).all()
-    except (OSError, ValueError):
-        return False
+    return False
 
 
 def _intrinsics(file: Path) -> NDArray[np.float64]:
     K = read_matrix(file)
-    return pinhole(K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5)
-
-
-def recognizes_seven_scenes(path: Path) -> bool:
-    """Tells whether a folder holds frames named as in 7-Scenes."""
-    return next(path.glob("frame-*.color.*"), None) is not None
+    return centered_pinhole(K[0, 0], K[1, 1], K[0, 2], K[1, 2])
 
 
 def read_seven_scenes(path: Path, config: CaptureConfig) -> Capture:
@@ -101,12 +94,8 @@ def read_seven_scenes(path: Path, config: CaptureConfig) -> Capture:
 
     `config.intrinsics` and `depth_intrinsics`, if equal and with `p_DC` zero, describe depth that
     is registered to color.
-
-    Raises:
-        ValueError, OSError: if there is no image, or too many frames cannot be used.
     """
     colors = numbered_files(path, r"frame-(\d+)\.color\.(?:jpg|jpeg|png)")
-    unit = config.depth_unit or 1000.0
     X_DC = RigidTransform(np.array(config.p_DC or _P_DC))
 
     def frame(color: Path) -> FrameFiles:
@@ -129,14 +118,13 @@ def read_seven_scenes(path: Path, config: CaptureConfig) -> Capture:
             K = Lens(pinhole(*_SEVEN_SCENES_DEPTH), 640, 480).scale_to(width, height).K
         return DepthCamera(K, width, height, X_DC.inverse())
 
-    capture = open_frames(
+    return open_frames(
         path,
         "7-Scenes folder",
         [frame(color) for color in colors.values()],
         axes=OPTICAL_AXES,
+        config=config,
         lens=lens,
-        intrinsics=config.intrinsics,
-        read_depth=lambda file: read_depth(file, unit),
         depth_camera=depth_camera,
+        up="cameras",
     )
-    return turn_upright(capture, config.up or "cameras")

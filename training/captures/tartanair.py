@@ -8,12 +8,9 @@ optical axis, in V1 an array of float32, in V2 a PNG whose four channels are the
 """
 
 import re
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RotationMatrix
 
 from splatpilot.training.captures.capture import Capture, FileAxes, Lens, pinhole
@@ -35,60 +32,23 @@ AXES = FileAxes(
     # Optical axes (x right, y down, z forward) in the north-east-down body.
     R_BC=RotationMatrix(np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])),
 )
+_CAMERAS = {"V1": "left", "V2": "lcam_front"}
 
 
-@dataclass(frozen=True)
-class _Layout:
-    name: str
-    camera: str
-    depth_suffix: str
-    read_depth: Callable[[Path], NDArray[np.float32]]
-
-    def parts(self, path: Path) -> tuple[Path, Path, Path]:
-        """Returns the image folder, the depth folder and the pose file."""
-        camera = self.camera
-        return path / f"image_{camera}", path / f"depth_{camera}", path / f"pose_{camera}.txt"
+def recognizes(path: Path, version: str) -> bool:
+    """Tells whether a folder looks like a TartanAir sequence of "V1" or "V2", complete or not."""
+    camera = _CAMERAS[version]
+    return (path / f"pose_{camera}.txt").exists() or (path / f"image_{camera}").is_dir()
 
 
-_V1 = _Layout("TartanAir V1 sequence", "left", "depth.npy", lambda file: read_depth(file, unit=1))
-_V2 = _Layout("TartanAir V2 sequence", "lcam_front", "depth.png", read_packed_depth)
-
-
-def recognizes_tartanair_v1(path: Path) -> bool:
-    """Tells whether a folder looks like a TartanAir V1 sequence, complete or not."""
-    return _recognizes(_V1, path)
-
-
-def recognizes_tartanair_v2(path: Path) -> bool:
-    """Tells whether a folder looks like a TartanAir V2 sequence, complete or not."""
-    return _recognizes(_V2, path)
-
-
-def read_tartanair_v1(path: Path, config: CaptureConfig | None = None) -> Capture:
-    """Opens a TartanAir V1 sequence, whose frame i has line i of the poses.
-
-    Raises:
-        ValueError, OSError: if a part is missing, the numbers of frames and poses differ, or too
-            many frames cannot be used.
-    """
-    return _read(_V1, path, config or CaptureConfig())
-
-
-def read_tartanair_v2(path: Path, config: CaptureConfig | None = None) -> Capture:
-    """Opens the front left camera of a TartanAir V2 sequence; see `read_tartanair_v1`."""
-    return _read(_V2, path, config or CaptureConfig())
-
-
-def _recognizes(layout: _Layout, path: Path) -> bool:
-    images, _, poses = layout.parts(path)
-    return poses.exists() or images.is_dir()
-
-
-def _read(layout: _Layout, path: Path, config: CaptureConfig) -> Capture:
-    image_folder, depth_folder, pose_file = layout.parts(path)
-    depth_pattern = rf"(\d+)_{layout.camera}_{re.escape(layout.depth_suffix)}"
-    images = numbered_files(image_folder, rf"(\d+)_{layout.camera}\.png")
-    depths = numbered_files(depth_folder, depth_pattern)
+def read(path: Path, config: CaptureConfig, version: str) -> Capture:
+    """Opens a TartanAir sequence, of V2 its front left camera. Frame i has line i of the poses."""
+    camera = _CAMERAS[version]
+    suffix = "depth.npy" if version == "V1" else "depth.png"
+    image_folder, depth_folder = path / f"image_{camera}", path / f"depth_{camera}"
+    pose_file = path / f"pose_{camera}.txt"
+    images = numbered_files(image_folder, rf"(\d+)_{camera}\.png")
+    depths = numbered_files(depth_folder, rf"(\d+)_{camera}_{re.escape(suffix)}")
     rows = read_rows(pose_file, 7, "a pose tx ty tz qx qy qz qw")
     numbers = sorted(images.keys() | depths.keys())
     extra: list[str] = []
@@ -102,11 +62,11 @@ def _read(layout: _Layout, path: Path, config: CaptureConfig) -> Capture:
         )
 
     def frame(number: int, i: int) -> FrameFiles:
-        name = f"{number:06d}_{layout.camera}"
+        name = f"{number:06d}_{camera}"
         return FrameFiles(
             images.get(number, image_folder / f"{name}.png"),
             lambda: pose_from_quaternion(rows[i], f"{pose_file}, line {i + 1}"),
-            depths.get(number, depth_folder / f"{name}_{layout.depth_suffix}"),
+            depths.get(number, depth_folder / f"{name}_{suffix}"),
         )
 
     def lens(width: int, height: int) -> Lens:
@@ -115,11 +75,12 @@ def _read(layout: _Layout, path: Path, config: CaptureConfig) -> Capture:
 
     return open_frames(
         path,
-        layout.name,
+        f"TartanAir {version} sequence",
         [frame(number, i) for i, number in enumerate(numbers)],
         axes=AXES,
+        config=config,
         lens=lens,
-        intrinsics=config.intrinsics,
-        read_depth=layout.read_depth,
+        depth_unit=1.0,
+        read_depth=read_depth if version == "V1" else read_packed_depth,
         dropped=extra,
     )

@@ -19,23 +19,24 @@ from pydrake.math import RigidTransform
 from splatpilot.systems.common.readers import read_text
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.vehicle.state import pose_between
-from splatpilot.training.captures.capture import OPTICAL_AXES, Capture, Lens, opencv_lens, pinhole
+from splatpilot.training.captures.capture import (
+    OPTICAL_AXES,
+    Capture,
+    Lens,
+    centered_pinhole,
+    opencv_lens,
+)
 from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.frames import (
     FrameFiles,
     open_frames,
     pose_from_quaternion,
-    read_depth,
     read_rows,
 )
-from splatpilot.training.captures.up_and_scale import turn_upright
 
-MAX_GAP = 0.12
-"""[s] between two poses that one is interpolated from."""
-_MAX_APART = 0.02
-"""[s] between a color image and its depth, as in the data set's own tools."""
-_SAME_TIME = 0.005
-"""[s] between an image and the pose of its keyframe."""
+MAX_GAP = 0.12  # [s] between two poses that one is interpolated from
+_MAX_APART = 0.02  # [s] between a color image and its depth, as in the data set's own tools
+_SAME_TIME = 0.005  # [s] between an image and the pose of its keyframe
 
 # fx, fy, cx, cy [px], counted from the first pixel's center, and distortion k1 k2 p1 p2 k3, for
 # images of 640x480 px, by the name of the folder or of the bag that its lists name. Published with
@@ -47,39 +48,34 @@ _CAMERAS = {
     "3": ((535.4, 539.2, 320.1, 247.6), ()),
     "bonn": (
         (542.822841, 542.57687, 315.59352, 237.756098),
-        (0.039903, -0.099343, -0.00073, -0.000144),
+        (0.039903, -0.099343, -7.3e-4, -1.44e-4),
     ),
 }
 _DEFAULT = (525.0, 525.0, 319.5, 239.5)
-_CALIBRATION = "calibration.txt"
-"""Holds fx, fy, cx, cy and distortion of the images themselves, as in ETH3D's sequences."""
+_CALIBRATION = "calibration.txt"  # of the images themselves, as in ETH3D's sequences
 
 
 def recognizes(path: Path) -> bool:
-    """Tells whether a folder looks like a TUM RGB-D sequence, complete or not."""
+    """Tells whether a folder looks like a TUM RGB-D sequence."""
     return (path / "rgb.txt").exists() and (path / "groundtruth.txt").exists()
 
 
 def read(path: Path, config: CaptureConfig) -> Capture:
-    """Opens a TUM RGB-D sequence, without the color images that have no depth or pose in time.
-
-    Raises:
-        ValueError, OSError: if a list is missing or invalid, or too many frames cannot be used.
-    """
+    """Opens a TUM RGB-D sequence, without the color images that have no depth or pose in time."""
 
     def lens(width: int, height: int) -> Lens:
         file = path / _CALIBRATION
         if file.is_file():
             numbers = _read_calibration(file)
-            own = opencv_lens(_intrinsics(*numbers[:4]), width, height, numbers[4:].tolist())
+            own = opencv_lens(centered_pinhole(*numbers[:4]), width, height, numbers[4:].tolist())
             return replace(own, source=file.name)
         text = f"{path.resolve().name}\n{read_text(path / 'rgb.txt', 'replace')[:1000]}"
         if found := re.search(_NAMES, text):
             focal, distortion = _CAMERAS[found[1] or found[2]]
-            own = opencv_lens(_intrinsics(*focal), 640, 480, distortion)
+            own = opencv_lens(centered_pinhole(*focal), 640, 480, distortion)
             return replace(own, source=f"the name {found[0]}").scale_to(width, height)
         assumed = "what TUM's driver assumes: set capture.intrinsics of another camera"
-        return Lens(_intrinsics(*_DEFAULT), 640, 480, source=assumed).scale_to(width, height)
+        return Lens(centered_pinhole(*_DEFAULT), 640, 480, source=assumed).scale_to(width, height)
 
     return open_sequence(path, "TUM RGB-D sequence", config, lens, 5000.0)
 
@@ -101,21 +97,10 @@ def _read_calibration(file: Path) -> NDArray[np.float64]:
     return numbers
 
 
-def _intrinsics(fx: float, fy: float, cx: float, cy: float) -> NDArray[np.float64]:
-    return pinhole(fx, fy, cx + 0.5, cy + 0.5)
-
-
 def open_sequence(
     path: Path, source: str, config: CaptureConfig, lens: Callable[[int, int], Lens], unit: float
 ) -> Capture:
-    """Opens lists and images in TUM's format, of any camera.
-
-    Args:
-        path: the folder of the lists.
-        source: the format's name in `Capture.source`.
-        lens: returns the camera of images of a width and height [px].
-        unit: units of the stored depth per meter, unless `config` has them.
-    """
+    """Opens lists and images in TUM's format, of any camera; see `open_frames`."""
     color_times, colors = _read_list(path / "rgb.txt")
     depth_times, depths = _read_list(path / "depth.txt")
     pose_file = path / "groundtruth.txt"
@@ -123,8 +108,13 @@ def open_sequence(
     rows = np.array([row for row in rows if np.isfinite(row).all()]).reshape(-1, 8)
     require(len(rows) >= 2, f"{pose_file}: finite poses", "at least 2", len(rows))
     rows = rows[np.argsort(rows[:, 0], kind="stable")]
-    _require_overlap(path / "rgb.txt", color_times, pose_file, rows[:, 0])
-    _require_overlap(path / "rgb.txt", color_times, path / "depth.txt", depth_times)
+    for file, times in ((pose_file, rows[:, 0]), (path / "depth.txt", depth_times)):
+        begin, end = color_times.min(), color_times.max()
+        if end < times.min() - _MAX_APART or times.max() < begin - _MAX_APART:
+            raise ValueError(
+                f"{file}: runs from {times.min():.3f} to {times.max():.3f} s, but "
+                f"{path / 'rgb.txt'} from {begin:.3f} to {end:.3f} s; write both by one clock"
+            )
 
     def frame(color: str, depth: str, around: NDArray[np.float64], time: float) -> FrameFiles:
         def X_FC() -> RigidTransform:
@@ -148,28 +138,16 @@ def open_sequence(
         f"{_MAX_APART} s, or neither two poses within {MAX_GAP} s around them nor one within "
         f"{_SAME_TIME} s"
     ]
-    unit = config.depth_unit or unit
-    capture = open_frames(
+    return open_frames(
         path,
         source,
         frames,
         axes=OPTICAL_AXES,
+        config=config,
         lens=lens,
-        intrinsics=config.intrinsics,
-        read_depth=lambda file: read_depth(file, unit),
+        depth_unit=unit,
         dropped=dropped if alone else (),
     )
-    return turn_upright(capture, config.up or "z")
-
-
-def _require_overlap(
-    images: Path, times: NDArray[np.float64], other: Path, others: NDArray[np.float64]
-) -> None:
-    if times.max() < others.min() - _MAX_APART or others.max() < times.min() - _MAX_APART:
-        raise ValueError(
-            f"{other}: runs from {others.min():.3f} to {others.max():.3f} s, but {images} from "
-            f"{times.min():.3f} to {times.max():.3f} s; write both by one clock"
-        )
 
 
 def _poses_around(rows: NDArray[np.float64], time: float) -> NDArray[np.float64]:

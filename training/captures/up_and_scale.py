@@ -7,6 +7,7 @@ from pathlib import PurePath
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
+from scipy.spatial.transform import Rotation
 
 from splatpilot.systems.splats.scene import choose_origin
 from splatpilot.training.captures.capture import (
@@ -18,17 +19,13 @@ from splatpilot.training.captures.capture import (
 )
 from splatpilot.training.captures.capture_config import ScaleConfig
 
-_LEVEL_GAZE = 0.01
-"""Weight of cameras that look level against images that are level."""
+_LEVEL_GAZE = 0.01  # weight of cameras that look level against images that are level
 _TRIALS = 2000
 _GROUND_SHARE = 0.02
 _MAX_TILT = np.deg2rad(35)
-_MIN_POINTS = 20
-"""Points whose depth must be known for a scale."""
-_MAX_SCALE_TILT = 10.0
-"""[deg] of a ground against what level cameras call level."""
-_MAX_SPREAD = 0.25
-"""Of the cameras' heights over a ground, 10 to 90 %, relative to their median."""
+_MIN_POINTS = 20  # points whose depth must be known for a scale
+_MAX_SCALE_TILT = 10.0  # [deg] of a ground against what level cameras call level
+_MAX_SPREAD = 0.25  # of the cameras' heights over a ground, 10 to 90 %, relative to their median
 
 
 def up_of_cameras(X_WCs: Sequence[RigidTransform]) -> NDArray[np.float64]:
@@ -55,19 +52,11 @@ def up_of_cameras(X_WCs: Sequence[RigidTransform]) -> NDArray[np.float64]:
 def fit_ground(
     p_WQ: NDArray[np.float64], p_WCs: NDArray[np.float64], up: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], float]:
-    """Fits the ground plane n.p = d.
+    """Fits the ground plane n.p = d to points (N, 3), and returns n (3,), upward, and d.
 
     Of planes through three random points, within 35 degrees of `up` and below the median camera,
     the one with the most points near it wins; a point below it counts against it. Near is 2 % of
     the cameras' median distance from the points. The winner is refined by least squares.
-
-    Args:
-        p_WQ: (N, 3), points of the scene.
-        p_WCs: (M, 3), cameras.
-        up: (3,), roughly.
-
-    Returns:
-        n (3,), upward unit normal, and d.
     """
     rng = np.random.default_rng(0)
     camera = np.median(p_WCs, axis=0)
@@ -77,25 +66,24 @@ def fit_ground(
     p_WQ = p_WQ[reach < 3 * np.median(reach)]
     if len(p_WQ) > 20_000:
         p_WQ = p_WQ[rng.choice(len(p_WQ), 20_000, replace=False)]
-    best, best_count = None, 0.0
-    sample = rng.choice(len(p_WQ), (_TRIALS, 3)) if len(p_WQ) >= 3 else np.empty((0, 3), int)
-    for a, b, c in p_WQ[sample]:
-        n = np.cross(b - a, c - a)
-        if (length := np.linalg.norm(n)) == 0:
-            continue
-        n *= np.sign(n @ up) / length
-        height = p_WQ @ n - n @ a
-        if n @ up < np.cos(_MAX_TILT) or n @ camera <= n @ a:
-            continue
-        count = float((np.abs(height) < near).sum() - (height < -2 * near).sum())
-        if count > best_count:
-            best, best_count = (n, n @ a), count
-    if best is None or best_count < _GROUND_SHARE * len(p_WQ):
+    sample = p_WQ[rng.choice(len(p_WQ), (_TRIALS, 3))] if len(p_WQ) else np.zeros((0, 3, 3))
+    a, b, c = np.moveaxis(sample, 1, 0)
+    normals = np.cross(b - a, c - a)
+    normals *= np.sign(normals @ up[:, None]) / (np.linalg.norm(normals, axis=1)[:, None] + 1e-300)
+    offsets = (normals * a).sum(axis=1)
+    steep, below = normals @ up < np.cos(_MAX_TILT), normals @ camera > offsets
+
+    def score(plane: int) -> float:
+        height = p_WQ @ normals[plane] - offsets[plane]
+        return float((np.abs(height) < near).sum() - (height < -2 * near).sum())
+
+    best = max(np.flatnonzero(below & ~steep).tolist(), key=score, default=None)
+    if best is None or score(best) < max(_GROUND_SHARE * len(p_WQ), 1):
         raise ValueError(
-            "no ground was found: no plane below the cameras holds a fiftieth of the points; give "
-            "the scale or the up direction in another way"
+            "no ground was found: no plane below the cameras holds a fiftieth of the points; set "
+            "capture.scale or capture.up by another field"
         )
-    n, d = best
+    n, d = normals[best], offsets[best]
     for width in near * np.array([1, 0.5, 0.25, 0.125]):
         # Narrower each time, so that the feet of walls count less.
         inliers = p_WQ[np.abs(p_WQ @ n - d) < width]
@@ -137,7 +125,7 @@ def _rotate_and_scale(capture: Capture, R_NW: RotationMatrix, scale: float = 1.0
             for X in capture.X_WCs
         ],
         points=points and SfmPoints(scale * points.p_WQ @ R_NW.matrix().T, points.colors),
-        axes=axes and FileAxes(axes.name, R_NW @ axes.R_WF, axes.R_BC),
+        axes=FileAxes(axes.name, R_NW @ axes.R_WF, axes.R_BC),
     )
 
 
@@ -152,19 +140,17 @@ def _known_points(capture: Capture) -> NDArray[np.float64]:
     if not sum(len(part) for part in parts):
         raise ValueError(
             f"{capture.source}: has neither points nor depth to find the ground; set capture.up or "
-            "capture.scale in another way"
+            "capture.scale by another field"
         )
     return np.concatenate(parts)
 
 
 def _rotation_to_z(up: NDArray[np.float64]) -> RotationMatrix:
     """Returns the smallest rotation that takes the unit vector `up` to z."""
-    z = np.array([0.0, 0.0, 1.0])
-    if up @ z < -1 + 1e-12:
-        return RotationMatrix(np.diag([1.0, -1.0, -1.0]))
-    v = np.cross(up, z)
-    V = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
-    return RotationMatrix.ProjectToRotationMatrix(np.eye(3) + V + V @ V / (1 + up @ z))
+    axis = np.cross(up, [0.0, 0.0, 1.0])
+    axis = axis / np.linalg.norm(axis) if axis.any() else np.array([1.0, 0.0, 0.0])
+    angle = np.arccos(np.clip(up[2], -1, 1))
+    return RotationMatrix(Rotation.from_rotvec(angle * axis).as_matrix())
 
 
 def make_metric(
@@ -172,11 +158,9 @@ def make_metric(
     scale: ScaleConfig,
     locate: Callable[[str, NDArray[np.float64]], NDArray[np.float64]] | None = None,
 ) -> Capture:
-    """Scales a capture in unknown units to meters, or marks it as not metric without a scale.
+    """Scales poses and points in unknown units to meters, or marks the capture as not metric.
 
     Args:
-        capture: its depth, if any, is in meters already; its poses and points are not.
-        scale: the source of the scale.
         locate: returns the point (3,) that is seen in the image of a name at a pixel (2,), or
             raises ValueError; None if pixels cannot be located.
     """
@@ -225,11 +209,8 @@ def _locate(
 
 
 def camera_height(capture: Capture) -> float:
-    """Returns the median height of the cameras above the ground, in the capture's units.
-
-    Raises:
-        ValueError: if no ground is found above which the cameras were carried level at one height.
-    """
+    """Returns the median height of the cameras above the ground, in the capture's units, if they
+    were carried level at one height."""
     cameras = np.array([X_WC.translation() for X_WC in capture.X_WCs])
     up = up_of_cameras(capture.X_WCs)
     n, d = fit_ground(_known_points(capture), cameras, up)
@@ -268,10 +249,10 @@ def _factor_from_depth(capture: Capture) -> float:
 
 
 def move_origin(capture: Capture, origin: Sequence[float]) -> Capture:
-    """Returns the capture in a world whose origin is at `origin` (3,) of its present one.
+    """Returns the capture in a world whose origin is at `origin` (3,) of its present one; if empty,
+    in the middle of cameras that are far away.
 
-    Gaussians are in single precision, in which a step is 0.06 m at 800 km. If `origin` is empty, it
-    is the middle of the cameras if they are far away, else 0.
+    Gaussians are in single precision, in which a step is 0.06 m at 800 km.
     """
     p_WCs = np.array([X_WC.translation() for X_WC in capture.X_WCs])
     p = np.array(origin, dtype=np.float64) if origin else choose_origin(p_WCs)

@@ -3,7 +3,7 @@
 After the paper, Sec. III-B: MobileNetV2 from ImageNet encodes an RGB or depth image; layers encode
 velocity and direction to the goal in the body frame; a head predicts three hypotheses of ten
 waypoints at 0.1 s with a cost each. The loss is relaxed winner-takes-all, and costs of error and
-clearance (equation 4). `docs/student.md` lists what differs from the paper.
+clearance (equation 4). `docs/reproduction.md` lists the differences from the paper.
 """
 
 from dataclasses import dataclass, field

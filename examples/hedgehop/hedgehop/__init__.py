@@ -1,1 +1,1 @@
-"""Hedges to hop over, a rangefinder, and a policy that hops."""
+"""A world with hedges, a rangefinder, a policy that climbs over them, and a capture format."""

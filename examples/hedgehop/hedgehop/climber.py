@@ -1,4 +1,4 @@
-"""A policy: ahead while the way is clear, up where it is not."""
+"""A policy: flies ahead if the route is clear, up if it is not."""
 
 from dataclasses import dataclass, field
 
@@ -6,43 +6,33 @@ import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from hedgehop.rangefinder import RangefinderConfig
-from splatpilot import QuadrotorState, register_policy
+from splatpilot import Config, QuadrotorState, bounded, register_policy
 
 
 def _rangefinders() -> dict[str, RangefinderConfig]:
     return {
-        # Tilted, so that it still sees the edge that the vehicle itself would not clear.
+        # Tilted, to see edges that the vehicle itself would not clear.
         "ahead": RangefinderConfig(direction=[1.0, 0.0, -0.3]),
         "below": RangefinderConfig(direction=[0.0, 0.0, -1.0]),
     }
 
 
 @dataclass
-class ClimberConfig:
-    """How the climber flies."""
+class ClimberConfig(Config):
+    """The flight of the climber."""
 
-    # [m/s]
-    speed: float = 2.0
-    # [Hz] Decisions per second.
-    rate: float = 15.0
-    # [m] What is nearer ahead is climbed over.
-    margin: float = 3.0
-    # [m] Least height above what is below.
-    height: float = 1.0
+    speed: float = bounded(2.0, "(0, 100] m/s")
+    rate: float = bounded(15.0, "(0, 100] Hz")  # of updates
+    margin: float = bounded(3.0, "(0, 100] m")  # distance ahead at which it begins to climb
+    height: float = bounded(1.0, "(0, 100] m")  # minimum, above obstacles and ground
     sensors: dict[str, RangefinderConfig] = field(default_factory=_rangefinders)
 
-    def validate(self) -> None:
-        """Raises ValueError on a value out of range."""
-        for name in ("speed", "rate", "margin", "height"):
-            if not 0 < getattr(self, name) <= 100:
-                raise ValueError(f"{name} is {getattr(self, name)}; it must be 0 to 100")
 
-
-def decide(
+def desired_velocity(
     p_WB: np.ndarray, p_WG: np.ndarray, ahead: float, below: float, config: ClimberConfig
 ) -> np.ndarray:
-    """The velocity v_WB (3,) [m/s]: to the goal, the slower ahead and the faster up the nearer what
-    is in the way."""
+    """Computes v_WB (3,) [m/s] to the goal: the nearer an obstacle ahead, the slower and the faster
+    up."""
     offset = p_WG - p_WB
     plan = np.hypot(offset[0], offset[1])
     clear = np.clip((ahead - 1.0) / config.margin, 0.0, 1.0) if ahead < plan else 1.0
@@ -70,7 +60,7 @@ class Climber(LeafSystem):
         output_ports:
         - acceleration
 
-    Updates at `rate` from time 0 with the acceleration that leads to the velocity of `decide`.
+    Updates at `rate` from time 0 with the acceleration to `desired_velocity`.
     """
 
     def __init__(self, config: ClimberConfig | None = None):
@@ -78,12 +68,8 @@ class Climber(LeafSystem):
         self._config = config or ClimberConfig()
         self._config.validate()
         self.sensors = self._config.sensors
-        for name, size in (
-            ("state", 13),
-            ("goal", 3),
-            ("ahead_distance", 1),
-            ("below_distance", 1),
-        ):
+        ports = {"state": 13, "goal": 3, "ahead_distance": 1, "below_distance": 1}
+        for name, size in ports.items():
             self.DeclareVectorInputPort(name, size)
         self.DeclareStateOutputPort("acceleration", self.DeclareDiscreteState(3))
         self.DeclarePeriodicDiscreteUpdateEvent(1 / self._config.rate, 0.0, self._update)
@@ -93,8 +79,8 @@ class Climber(LeafSystem):
             self.get_input_port(index).Eval(context) for index in range(self.num_input_ports())
         )
         p_WB, v_WB, _, _ = QuadrotorState.of(state)
-        v_wanted = decide(p_WB, p_WG, float(ahead[0]), float(below[0]), self._config)
-        discrete_state.set_value(2.0 * (v_wanted - v_WB))
+        v_desired = desired_velocity(p_WB, p_WG, float(ahead[0]), float(below[0]), self._config)
+        discrete_state.set_value(2.0 * (v_desired - v_WB))
 
 
 register_policy(ClimberConfig, lambda config, world, vehicle: Climber(config))

@@ -1,4 +1,4 @@
-"""A capture format: the log of a drone that takes photographs where it flies."""
+"""A capture format: the log of a drone that takes photographs in flight."""
 
 import csv
 from pathlib import Path
@@ -23,17 +23,12 @@ _AXES = FileAxes(
 
 
 def is_flight_log(path: Path) -> bool:
-    """Tells whether the folder holds a `flight_log.csv`."""
+    """Recognizes a folder with `flight_log.csv`."""
     return (path / LOG).exists()
 
 
 def read_flight_log(path: Path, config: CaptureConfig) -> Capture:
-    """
-    Opens a log: lines `image, x, y, z, qx, qy, qz, qw`, meters, with a heading of these names.
-
-    Raises:
-        ValueError: for a line that is none, or without `capture.intrinsics`.
-    """
+    """Opens a log with columns `image, x, y, z, qx, qy, qz, qw` [m], named in its first line."""
     file = path / LOG
     if not config.intrinsics:
         raise ValueError(f"{path}: its intrinsics are unknown; set capture.intrinsics")

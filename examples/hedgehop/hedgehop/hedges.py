@@ -1,41 +1,39 @@
-"""A world: a field with hedges across the way."""
+"""A world: a field with hedges across the route."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from splatpilot import register_world
+from splatpilot import Config, bounded, register_world
 from splatpilot.diagrams.worlds.building_blocks import box, daylight, ground, start_and_goal
 from splatpilot.diagrams.worlds.feasibility import draw_feasible
 from splatpilot.diagrams.worlds.solids.solid import WorldSpec
 from splatpilot.diagrams.worlds.solids.surfaces import FloorPlan
+from splatpilot.systems.common.validation import require_field
 
 
 @dataclass
-class HedgesConfig:
+class HedgesConfig(Config):
     """Hedges from side to side, one behind the other."""
 
-    length: float = 24.0  # [m] flyable volume along x: from 0 to length
-    width: float = 10.0  # [m] along y, centered on 0
-    height: float = 5.0  # [m] along z, from the ground
-    hedges: int = 3  # [-]
+    length: float = bounded(24.0, "[5, 200] m")  # of the volume along x, from 0
+    width: float = bounded(10.0, "[3, 200] m")  # along y, centered on 0
+    height: float = bounded(5.0, "[2, 50] m")  # along z, from the ground
+    hedges: int = 3  # number, at least 5 m apart
     tallest: float = 2.5  # [m] height of the tallest hedge; others reach at least half of it
 
-    def validate(self) -> None:
-        """Raises ValueError for the first value with which no field can be laid out."""
-        if not 1 <= self.hedges <= self.length / 5:
-            raise ValueError(f"hedges = {self.hedges} must be 1 to {self.length / 5:.0f}, 5 m each")
-        if not 0.5 <= self.tallest <= self.height - 1.5:
-            raise ValueError(f"tallest = {self.tallest} m must be 0.5 to {self.height - 1.5} m")
+    def check(self) -> None:
+        """Checks that the field can be laid out."""
+        most, top = int(self.length / 5), self.height - 1.5
+        require_field(self, "hedges", 1 <= self.hedges <= most, f"in [1, {most}]")
+        require_field(self, "tallest", 0.5 <= self.tallest <= top, f"in [0.5, {top:g}] m")
 
 
 def hedges_spec(config: HedgesConfig, seed: int) -> WorldSpec:
-    """The field that `config` and `seed` determine, as solids, start and goal."""
+    """Draws the field as solids, start and goal."""
     config.validate()
-    plan, half = (
-        FloorPlan.of_size(config.length, config.width, config.height),
-        config.width / 2,
-    )
+    plan = FloorPlan.of_size(config.length, config.width, config.height)
+    half = config.width / 2
 
     def draw(rng: np.random.Generator) -> WorldSpec:
         p_WS, p_WG = start_and_goal(plan, rng)

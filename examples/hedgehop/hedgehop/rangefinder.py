@@ -7,46 +7,40 @@ from pydrake.common.value import Value
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
-from splatpilot import World, register_sensor
+from splatpilot import Config, World, bounded, register_sensor
 from splatpilot.systems.collision.distance_field import DistanceField
+from splatpilot.systems.common.validation import require_field
 
 
 @dataclass
-class RangefinderConfig:
-    """Where a rangefinder on a gimbal looks, and how far."""
+class RangefinderConfig(Config):
+    """A rangefinder on a gimbal that keeps it level."""
 
     # Direction in the vehicle's level frame: x ahead, y left, z up.
     direction: list[float] = field(default_factory=lambda: [1.0, 0.0, 0.0])
-    # [m] What is farther reads this.
-    max_range: float = 8.0
+    max_range: float = bounded(8.0, "(0, 100] m")
 
-    def validate(self) -> None:
-        """Raises ValueError on a value out of range."""
-        if len(self.direction) != 3 or not np.linalg.norm(self.direction) > 0:
-            raise ValueError(f"direction is {self.direction}; it must be three numbers, not all 0")
-        if not 0 < self.max_range <= 100:
-            raise ValueError(
-                f"max_range is {self.max_range} m; it must be more than 0, at most 100"
-            )
+    def check(self) -> None:
+        """Checks the direction."""
+        valid = len(self.direction) == 3 and np.linalg.norm(self.direction) > 0
+        require_field(self, "direction", valid, "three numbers, not all 0")
 
 
 def cast_ray(distance_field: DistanceField, p_WQ: np.ndarray, e_W: np.ndarray, far: float) -> float:
-    """Distance [m] from p_WQ (3,) along the unit vector e_W (3,) to the first surface, or `far`.
-
-    Sphere tracing (Hart 1996): no surface is nearer than the signed distance, so that is a step.
-    """
-    way = 0.0
-    while way < far:
-        step = float(distance_field.distance(p_WQ + way * e_W))
-        if not step > 1e-3:  # A surface; NaN beyond the world.
-            return far if np.isnan(step) else way
-        way += step
+    """Computes by sphere tracing (Hart 1996) the distance [m] from p_WQ (3,) along the unit vector
+    e_W (3,) to the first surface, at most `far`."""
+    distance = 0.0
+    while distance < far:
+        step = float(distance_field.distance(p_WQ + distance * e_W))
+        if not step > 1e-3:  # a surface, or NaN beyond the world
+            return far if np.isnan(step) else distance
+        distance += step
     return far
 
 
 class Rangefinder(LeafSystem):
     """
-    Measures the distance along a ray that stays level whatever the vehicle's attitude.
+    Measures the distance along a ray that stays level at any attitude of the vehicle.
 
     .. pydrake_system::
 

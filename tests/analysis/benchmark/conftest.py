@@ -1,5 +1,3 @@
-"""A study of six short flights, and how studies are read and compared."""
-
 import csv
 import re
 from collections.abc import Callable
@@ -7,8 +5,26 @@ from pathlib import Path
 
 import pytest
 
-from splatpilot.analysis.benchmark import run_study as benchmark
+from splatpilot.analysis.benchmark import run_study
 from splatpilot.analysis.benchmark.study import StudyConfig
+
+SHORT = (
+    "world: {length: 8, width: 5, height: 3, rocks: 0, logs: 0, voxel_size: 0.25}\ntimeout: 1.5\n"
+)
+
+
+@pytest.fixture
+def short_scenario(tmp_path) -> Path:
+    """A forest of a few trees, flown for at most 1.5 s."""
+    path = tmp_path / "short.yaml"
+    path.write_text(SHORT)
+    return path
+
+
+@pytest.fixture
+def short_study(short_scenario) -> StudyConfig:
+    """Six flights in three forests."""
+    return StudyConfig([str(short_scenario)], ["straight", "planner"], [2.0], seeds=3)
 
 
 @pytest.fixture(scope="session")
@@ -16,18 +32,15 @@ def study(tmp_path_factory) -> tuple[StudyConfig, Path]:
     """A study flown without interruption in this process, and its folder; not to be changed."""
     folder = tmp_path_factory.mktemp("study")
     scenario = folder / "short.yaml"
-    scenario.write_text(
-        "world: {length: 8, width: 5, height: 3, rocks: 0, logs: 0, voxel_size: 0.25}\n"
-        "timeout: 1.5\n"
-    )
+    scenario.write_text(SHORT)
     config = StudyConfig([str(scenario)], ["straight", "planner"], [2.0], seeds=3)
-    benchmark.run(config=config, out=folder / "out", jobs=1)
+    run_study.run(config=config, out=folder / "out", jobs=1)
     return config, folder / "out"
 
 
 @pytest.fixture(scope="session")
 def contents() -> Callable[[Path], dict[str, bytes]]:
-    """All files of a folder that must be the same in two runs of a study, by name."""
+    """Reads all files of a folder that are identical in two runs of a study, by name."""
 
     def read(folder: Path) -> dict[str, bytes]:
         files = (path for path in sorted(folder.rglob("*")) if path.is_file())
@@ -43,7 +56,7 @@ def contents() -> Callable[[Path], dict[str, bytes]]:
 
 @pytest.fixture(scope="session")
 def rows_of() -> Callable[[Path], list[dict[str, str]]]:
-    """The rows of a CSV file."""
+    """Reads the rows of a CSV file."""
 
     def read(file: Path) -> list[dict[str, str]]:
         with file.open() as lines:

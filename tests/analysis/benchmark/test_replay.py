@@ -1,5 +1,3 @@
-"""Flights flown again."""
-
 import json
 import shutil
 

@@ -1,5 +1,3 @@
-"""Results that pages are rendered from, kept from the folder of a study."""
-
 import importlib.util
 from pathlib import Path
 

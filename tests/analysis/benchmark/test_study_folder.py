@@ -1,20 +1,32 @@
-"""The files of studies: what is damaged, and what a kill leaves."""
-
 import json
-import subprocess
 import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import yaml
 
-from splatpilot.analysis.benchmark import run_study as benchmark
-from splatpilot.analysis.benchmark.study_folder import StudyFolder
+from splatpilot.analysis.benchmark import replay, run_study
+from splatpilot.analysis.benchmark.study import StudyConfig
+from splatpilot.analysis.benchmark.study_folder import (
+    StudyFolder,
+    input_digests,
+    keep_inputs,
+    kept_flights,
+    kept_scenario,
+    plugin_digests,
+)
+from splatpilot.analysis.commands.main import main
+from splatpilot.diagrams.flight.policies import POLICIES
+from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.systems.common.provenance import program
+from splatpilot.systems.policies import checkpoint as policy_checkpoint
+from splatpilot.systems.policies.checkpoint import PolicyCheckpoint
+from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK
 
 
 @pytest.mark.parametrize("row", [[1, 2], 3, {}, {"success": True, "outcome": "goal"}])
-def test_rows_that_are_none_are_damage(study, tmp_path, row):
+def test_invalid_rows_are_damage(study, tmp_path, row):
     config, whole = study
     spec = config.rollouts()[0]
     folder = StudyFolder(tmp_path)
@@ -30,50 +42,210 @@ def test_rows_that_are_none_are_damage(study, tmp_path, row):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "is not a study"),
-        ("[1", "is not a study"),
-        ("format_version: 1", "is not a study: study is None"),
-        ("format_version: 1\nstudy: {}\nprogram: null", "is not a study: program is None"),
+        ("", "must be 1, got None"),
+        ("[1", "is not YAML"),
+        ("format_version: 9\nstudy: {}\nprogram: {}", "must be 1, got 9; use the version"),
+        ("format_version: 1", "must be a mapping, got None"),
+        ("format_version: 1\nstudy: {}\nprogram: null", "must be a mapping, got None"),
         ("format_version: 1\nstudy: {sedes: 3}\nprogram: {}", "there is no field sedes"),
         ("format_version: 1\nstudy: {seeds: many}\nprogram: {}", ".*many"),
         ("format_version: 1\nstudy: {seeds: 1000000000}\nprogram: {}", "got 1000000000"),
         ("format_version: 1\nstudy: {speeds: [.nan]}\nprogram: {}", "speeds must be .* got nan"),
-        ("format_version: 9\nstudy: {}\nprogram: {}", "format version 9"),
     ],
 )
-def test_descriptions_that_are_none_name_the_file(tmp_path, text, message):
+def test_invalid_descriptions_name_the_file(tmp_path, text, message):
     (tmp_path / "study.yaml").write_text(text)
     with pytest.raises(ValueError, match=rf"study\.yaml:? .*{message}"):
         StudyFolder(tmp_path).config()
 
 
-def test_study_that_was_killed_before_it_began_is_begun(study, tmp_path, contents):
-    config, whole = study
-    out = tmp_path / "killed"
-    begun = (
-        "import os, signal, sys; from pathlib import Path\n"
-        "from splatpilot.systems.common.files import written_atomically\n"
-        "with written_atomically(Path(sys.argv[1])) as file:\n"
-        "    file.write_text('half'); os.kill(os.getpid(), signal.SIGKILL)\n"
-    )
-    out.mkdir()
-    for file in ("study.yaml", "scenarios/short.yaml"):
-        (out / file).parent.mkdir(exist_ok=True)
-        subprocess.run([sys.executable, "-c", begun, str(out / file)], check=False)
-        StudyFolder(out).claim(config, program())
-    assert not list(out.rglob("*.partial*"))
-    benchmark.run(config=config, out=out, jobs=1)
-    assert contents(out) == contents(whole)
-
-
-def test_fields_that_came_later_are_as_they_are_by_default(study, tmp_path):
+def test_missing_fields_have_their_defaults(study, tmp_path):
     config, _ = study
     folder = StudyFolder(tmp_path / "out")
-    folder.claim(config, program())
+    folder.begin(config, program())
     file = tmp_path / "out/study.yaml"
     begun = file.read_text()
     assert "  split: dev\n" in begun
     file.write_text(begun.replace("  split: dev\n", ""))
-    folder.claim(config, program())
+    folder.begin(config, program())
     with pytest.raises(ValueError, match="holds a study with split dev, not test; choose"):
-        folder.claim(replace(config, split="test"), program())
+        folder.begin(replace(config, split="test"), program())
+
+
+@pytest.fixture
+def save_weights(tmp_path):
+    """Saves DiffAero's weights, with other ones for some layers, and returns the file."""
+    shipped = PolicyCheckpoint.load("", "diffaero", DIFFAERO_NETWORK)
+
+    def save(name="mine.npz", **changed):
+        weights = dict(shipped.weights) | changed
+        PolicyCheckpoint("diffaero", shipped.spec, weights, {}).save(tmp_path / name)
+        return tmp_path / name
+
+    return save
+
+
+def thrust_weights(thrust: float) -> dict[str, np.ndarray]:
+    """Weights of a head that only pulls up."""
+    head = PolicyCheckpoint.load("", "diffaero", DIFFAERO_NETWORK).weights["head.weight"]
+    return {"head.weight": 0.0 * head, "head.bias": np.array([0.0, 0.0, thrust], np.float32)}
+
+
+def test_weights_from_a_file_fly_and_are_kept(short_scenario, tmp_path, rows_of, save_weights):
+    mine = save_weights(**thrust_weights(2.0))
+    policies = ["diffaero", str(mine), f"diffaero.1={mine}"]
+    config = StudyConfig([str(short_scenario)], policies, seeds=1)
+    folder = StudyFolder(tmp_path / "out")
+    run_study.run(config=config, out=folder.path, jobs=1)
+    rows = rows_of(folder.path / "rollouts.csv")
+    assert [row["policy"] for row in rows] == ["diffaero", "mine", "diffaero.1"]
+    assert rows[0]["digest"] != rows[1]["digest"] == rows[2]["digest"]
+    states = folder.read(config.rollouts()[1])[1]["states"]
+    assert states[-1, 2] - states[0, 2] > 1.0 and states[-1, 5] > 2.0  # straight up
+
+    save_weights(**thrust_weights(-2.0))
+    with pytest.raises(ValueError, match=r"mine.npz has changed since"):
+        run_study.run(config=config, out=folder.path, jobs=1)
+    mine.unlink()
+    assert replay.run(study=folder.path, id="short-mine-2-000").exact
+
+
+def test_variants_of_a_policy_fly_side_by_side(short_scenario, tmp_path, rows_of):
+    out = tmp_path / "out"
+    words = ["--scenarios", str(short_scenario), "--seeds", "1", "--jobs", "1"]
+    words += ["--policies", "slow=planner:rate=2,planner", "--sweep", "straight:rate=5,10"]
+    assert main(["benchmark", "--out", str(out), *words]) == 0
+    folder = StudyFolder(out)
+    labels = ["slow", "planner", "straight-rate-5", "straight-rate-10"]
+    assert folder.config().policy_names == labels
+    specs = folder.config().rollouts()
+    rates = [scenario.policy.rate for _, scenario in kept_flights(folder, specs)]
+    assert rates == [2.0, 15.0, 5.0, 10.0]
+    rows = rows_of(out / "rollouts.csv")
+    assert [row["policy"] for row in rows] == labels
+    assert len({row["digest"] for row in rows}) == 4
+    assert replay.run(study=out, id="short-slow-2-000").exact
+
+
+def test_own_policy_of_a_scenario_flies_and_is_kept(short_scenario, tmp_path, capsys, save_weights):
+    mine = save_weights(**thrust_weights(0.0))
+    text = short_scenario.read_text() + f"policy: !DiffAeroConfig {{weights: {mine}}}\n"
+    short_scenario.write_text(text)
+    words = ["benchmark", "--scenarios", str(short_scenario), "--seeds", "1", "--jobs", "1"]
+    assert main([*words, "--out", str(tmp_path / "out")]) == 0
+    assert "is not flown" not in capsys.readouterr().out
+    assert short_scenario.read_text() == text
+    mine.unlink()
+    moved = (tmp_path / "out").rename(tmp_path / "moved")
+    assert replay.run(study=moved, id="short-scenario-2-000").exact
+
+    assert main([*words, "--out", str(tmp_path / "other"), "--policies", "straight"]) == 0
+    assert f"The policy of {short_scenario} is not flown" in capsys.readouterr().out
+
+
+def test_study_is_not_continued_with_other_shipped_weights(
+    short_scenario, tmp_path, monkeypatch, save_weights
+):
+    save_weights("diffaero.npz")
+    monkeypatch.setattr(policy_checkpoint, "_SHIPPED", tmp_path)
+    config = StudyConfig([str(short_scenario)], ["diffaero"], seeds=2)
+    folder = StudyFolder(tmp_path / "out")
+    run_study.run(config=config, out=folder.path, jobs=1)
+    assert len(folder.program()["weights of diffaero"]) == 16
+
+    save_weights("diffaero.npz", **thrust_weights(0.0))
+    folder.trajectory("short-diffaero-2-001").unlink()
+    with pytest.raises(ValueError, match="was started with weights of diffaero"):
+        run_study.run(config=config, out=folder.path, jobs=1)
+
+
+def test_digest_of_a_scene_is_that_of_its_flown_files(place, tmp_path):
+    file = tmp_path / "hall.yaml"
+
+    def digest(scene) -> str:
+        file.write_text(f"world: !SceneConfig {{path: {scene}}}\n")
+        config = StudyConfig([str(file)], ["straight"], seeds=1)
+        return input_digests(config, config.load_scenarios())["scene of hall"]
+
+    scene = place.scene("hall")
+    first = digest(scene)
+    assert digest(scene.rename(tmp_path / "renamed")) == first
+    moved = replace(place.gaussians, means=place.gaussians.means + 0.1)
+    assert digest(place.scene("moved", moved)) != first
+
+
+def test_keeping_inputs_does_not_change_the_scenarios(place, tmp_path):
+    scene = place.scene("hall")
+    file = tmp_path / "hall.yaml"
+    file.write_text(f"world: !SceneConfig {{path: {scene}}}\n")
+    config = StudyConfig([str(file)], ["straight"], seeds=1)
+    scenarios = config.load_scenarios()
+    folder = StudyFolder(tmp_path / "out")
+    folder.begin(config, {})
+    keep_inputs(folder, config, scenarios)
+    assert scenarios["hall"].world.path == str(scene)
+    assert kept_scenario(folder, "hall").world.path == str(tmp_path / "out" / "scenes" / "hall")
+
+
+POLICY = """
+from dataclasses import dataclass
+
+from pydrake.systems.framework import LeafSystem
+
+import splatpilot
+from straying.speed import SPEED
+
+
+class Straying(LeafSystem):
+    def __init__(self):
+        super().__init__()
+        self.DeclareVectorOutputPort("velocity", 3, lambda _, y: y.SetFromVector([SPEED, 0, 0]))
+
+
+@dataclass
+class StrayingConfig:
+    rate: float = 10.0
+
+    def validate(self):
+        pass
+
+
+splatpilot.register_policy(StrayingConfig, lambda config, world, vehicle: Straying())
+"""
+
+
+def test_a_study_is_flown_by_one_version_of_a_plugin(short_scenario, tmp_path, capsys, monkeypatch):
+    package = tmp_path / "straying"
+    package.mkdir()
+    (package / "__init__.py").touch()
+    (package / "speed.py").write_text("SPEED = 0.5\n")
+    (package / "policy.py").write_text(POLICY)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.setattr(POLICIES, "_entries", dict(POLICIES._entries))
+
+    words = ["--import", "straying.policy", "benchmark", "--scenarios", "short.yaml", "--policies"]
+    words += ["straying", "--seeds", "2", "--jobs", "1", "--out", "study"]
+    assert main(words) == 0
+    versions = yaml.safe_load((tmp_path / "study/study.yaml").read_text())["program"]
+    assert len(versions["source of straying"]) == 16
+    assert main(words) == 0  # nothing is missing
+
+    (package / "speed.py").write_text("SPEED = 0.6\n")
+    first, second = sorted((tmp_path / "study/rollouts").iterdir())
+    first.unlink()
+    capsys.readouterr()
+    assert main(words) == 1
+    assert "was started with source of straying" in capsys.readouterr().err
+    # This process has imported the version that flew.
+    assert main(["--import", "straying.policy", "replay", "study", second.stem]) == 0
+
+    second.unlink()
+    assert main(words) == 0  # no flight of the other version is left
+    changed = yaml.safe_load((tmp_path / "study/study.yaml").read_text())["program"]
+    assert changed["source of straying"] != versions["source of straying"]
+    assert changed.keys() == versions.keys()
+
+
+def test_our_own_code_is_no_plugin():
+    assert plugin_digests([Scenario()]) == {}

@@ -1,14 +1,111 @@
-"""Tables of flights made up by hand."""
+import numpy as np
+import pytest
+from scipy.stats import norm
 
+from splatpilot.analysis.benchmark.report import external_section
 from splatpilot.analysis.benchmark.study import StudyConfig
 from splatpilot.analysis.benchmark.tables import (
+    cluster_interval,
     compare,
+    external_table,
+    format_external,
     format_table,
+    holm,
+    mcnemar,
     paper_rows,
     policy_table,
-    scenarios_passed,
+    sign_flip,
+    success_summary,
+    wilson_interval,
 )
 from splatpilot.diagrams.scenarios import benchmark_scenarios
+
+
+@pytest.mark.parametrize(
+    ("successes", "flights", "lower", "upper"),
+    [
+        # R. G. Newcombe, Statistics in Medicine 17 (1998), table I, method 3.
+        (81, 263, 0.2553, 0.3662),
+        (15, 148, 0.0624, 0.1605),
+        (0, 20, 0.0000, 0.1611),
+        (1, 29, 0.0061, 0.1718),
+        (0, 0, 0.0, 1.0),
+    ],
+)
+def test_wilson_interval_is_the_published_one(successes, flights, lower, upper):
+    assert wilson_interval(successes, flights) == pytest.approx((lower, upper), abs=5e-5)
+
+
+def paired(only_first: int, only_second: int, both: int, neither: int):
+    first = [True] * only_first + [False] * only_second + [True] * both + [False] * neither
+    second = [False] * only_first + [True] * only_second + [True] * both + [False] * neither
+    return np.array(first), np.array(second)
+
+
+def test_mcnemar_is_the_binomial_of_unequal_pairs():
+    first, second = paired(6, 16, 80, 59)
+    p_value = pytest.approx(2 * 110056 / 2**22)
+    assert mcnemar(first, second) == (6, 16, p_value)
+    assert mcnemar(second, first) == (16, 6, p_value)
+    assert mcnemar(*paired(0, 0, 5, 3)) == (0, 0, 1.0)
+
+
+def test_cluster_interval_covers_at_its_confidence():
+    rng = np.random.default_rng(0)
+    covered = 0
+    for _ in range(200):
+        rates = rng.beta(2.0, 1.0, size=30)  # of scenarios; the mean is 2/3
+        interval = cluster_interval(rng.binomial(10, rates), np.full(30, 10))
+        covered += interval.lower <= 2 / 3 <= interval.upper
+    assert 0.9 * 200 <= covered <= 0.99 * 200
+
+
+def test_cluster_interval_without_correlation_is_that_of_flights():
+    successes = np.random.default_rng(0).binomial(20, 0.5, size=100)
+    clusters = cluster_interval(successes, np.full(100, 20))
+    flights = wilson_interval(int(successes.sum()), 2000)
+    np.testing.assert_allclose(clusters, flights, atol=0.006)
+
+
+@pytest.mark.parametrize(
+    ("successes", "flights", "expected"),
+    [
+        ([], [], (0.0, 1.0)),
+        ([20], [20], (0.0, 1.0)),
+        ([20, 20, 20], [20, 20, 20], wilson_interval(3, 3)),
+        ([0, 0], [5, 5], wilson_interval(0, 2)),
+    ],
+)
+def test_cluster_interval_of_equal_or_single_scenarios_is_wide(successes, flights, expected):
+    assert cluster_interval(successes, flights) == expected
+
+
+@pytest.mark.parametrize(
+    ("differences", "p_value"),
+    [
+        ([], 1.0),
+        ([0.0, 0.0], 1.0),
+        ([0.5], 1.0),
+        ([0.5, 0.5, 0.5, 0.5], 2 / 16),
+        ([0.5, 0.5, 0.5, -0.5], 10 / 16),
+        ([0.1, 0.2, 0.3, 0.0], 2 / 8),
+    ],
+)
+def test_sign_flip_counts_the_signs_of_the_scenarios(differences, p_value):
+    assert sign_flip(differences) == p_value
+
+
+def test_sign_flip_of_many_scenarios_agrees_with_the_normal_distribution():
+    differences = np.random.default_rng(1).normal(0.3, 1.0, size=60)
+    z = differences.sum() / np.sqrt((differences**2).sum())
+    assert sign_flip(differences) == pytest.approx(2 * norm.sf(abs(z)), rel=0.1)
+
+
+def test_holm_steps_down():
+    # By hand: 4 x 0.01, 3 x 0.02, 2 x 0.03 and 0.04, never falling.
+    np.testing.assert_allclose(holm([0.04, 0.01, 0.03, 0.02]), [0.06, 0.04, 0.06, 0.06])
+    np.testing.assert_allclose(holm([0.9, 0.5]), [1.0, 1.0])
+    assert holm([]).shape == (0,)
 
 
 def flights(policy: str, scenario: str, successes: list[bool]) -> list[dict]:
@@ -26,10 +123,10 @@ def flights(policy: str, scenario: str, successes: list[bool]) -> list[dict]:
     ]
 
 
-def test_scenario_is_passed_where_most_flights_succeed():
+def test_scenario_is_passed_if_most_flights_succeed():
     rows = flights("a", "P01", [True, True, False]) + flights("a", "P02", [True, False])
-    rows += flights("a", "P03", [False])
-    assert scenarios_passed(rows) == {"scenarios": 3, "scenarios_passed": 1}
+    summary = success_summary(rows + flights("a", "P03", [False]))
+    assert (summary["scenarios"], summary["scenarios_passed"]) == (3, 1)
 
 
 def test_table_has_a_row_for_each_policy():
@@ -37,14 +134,13 @@ def test_table_has_a_row_for_each_policy():
     config = StudyConfig(["P01"], ["planner", "straight"], [2.0], seeds=2)
     table = policy_table(rows, config)
     assert [row["successes"] for row in table] == [2, 1]
-    assert [row["scenarios_passed"] for row in table] == [1, 0]
     assert [row["timeout"] for row in table] == [0, 1]
     assert [round(row["min_clearance_m"], 6) for row in table] == [0.5, 0.3]
     planner, straight = format_table(table, config).splitlines()[2:]
     assert "2/2" in planner and "1/1" in planner and "0/1" in straight
 
 
-def test_paper_stands_beside_what_it_is_about():
+def test_paper_is_compared_with_unchanged_policies_in_all_scenarios():
     seventeen = list(benchmark_scenarios())
     assert len(seventeen) == 17
     policies = ["planner", "diffaero", "depthnav:camera.width=128"]
@@ -75,3 +171,28 @@ def test_all_pairs_are_compared_by_flights_and_by_scenarios():
     # Twelve flights in six scenarios: 2 / 2^12 and 2 / 2^6, times three tests.
     assert [pair.p_seeds for pair in pairs] == [6 / 2**12, 6 / 2**12, 1.0]
     assert [pair.p_scenarios for pair in pairs] == [6 / 2**6, 6 / 2**6, 1.0]
+
+
+def test_published_results_are_compared_with_unchanged_scenarios():
+    scenarios = ["P01", "dodgedrone_medium"]
+    config = StudyConfig(scenarios, ["straight"], [2.0, 3.0], seeds=2)
+    rows = [
+        spec._asdict() | {"success": spec[2:] == (2.0, 0), "mean_speed_m_s": spec.speed - 0.5}
+        for spec in config.rollouts()
+    ]
+    table = external_table(rows, config)
+    *published, slow, fast = table
+    assert {row["scenario"] for row in table} == {"dodgedrone_medium"}
+    assert [(row["successes"], row["flights"]) for row in published] == [(187, 303), (130, 303)]
+    assert all(row["speed"] is None for row in published)
+    assert (slow["policy"], slow["speed"], slow["successes"], slow["flights"]) == (
+        ("straight", 2.0, 1, 2)
+    )
+    assert (fast["successes"], fast["mean_speed_m_s"]) == (0, 2.5)
+    assert fast["wilson_lower"] == pytest.approx(0.0) and 0 < fast["wilson_upper"] < 1
+    for text in (format_external(table), external_section(table)):
+        assert text.index("187/303") < text.index("1/2") and "arseniid/agile_flight" in text
+
+    assert external_table(rows, StudyConfig(["P01"], ["straight"])) == []
+    config.overrides = ["timeout=100"]
+    assert external_table(rows, config) == [] and external_section([]) == ""

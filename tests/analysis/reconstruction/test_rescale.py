@@ -21,7 +21,7 @@ from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf_build import esdf_from_occupancy
 from splatpilot.systems.splats.baked_scene import BakedScene
 from splatpilot.systems.splats.splat_files import read_ply, write_ply
-from splatpilot.training.captures.capture_registry import read_capture_of
+from splatpilot.training.captures.capture_registry import read_scene_capture
 
 SHRUNK = 0.25  # units of files per meter
 
@@ -100,7 +100,7 @@ def test_scene_of_photographs_can_be_flown_in_at_its_scale(unscaled, seen_room, 
     assert (metadata.split, metadata.source_digest) == ("validation", ["0123456789abcdef"])
     assert (metadata.held_out, metadata.gains) == ([0, 8], [1.0] * 16)
     assert "scaled by 4" in metadata.provenance
-    again = read_capture_of(out, metadata)
+    again = read_scene_capture(out, metadata)
     assert again.metric
     for i in (0, 15):
         assert again.X_WCs[i].IsNearlyEqualTo(capture.X_WCs[i], 1e-9)
@@ -116,7 +116,7 @@ def test_scene_of_photographs_can_be_flown_in_at_its_scale(unscaled, seen_room, 
 def test_factors_multiply(unscaled, tmp_path):
     origin = [100.0, 200.0, -30.0]
     write_scene_metadata(unscaled, replace(read_scene_metadata(unscaled), origin=origin))
-    poses = read_capture_of(unscaled, read_scene_metadata(unscaled)).X_WCs
+    poses = read_scene_capture(unscaled, read_scene_metadata(unscaled)).X_WCs
     rescale(unscaled, tmp_path / "once", 4.0)
     summary = rescale(tmp_path / "once", tmp_path / "twice", 0.5)
     once, twice = (read_scene(tmp_path / name) for name in ("once", "twice"))
@@ -127,7 +127,7 @@ def test_factors_multiply(unscaled, tmp_path):
     metadata = read_scene_metadata(tmp_path / "twice")
     assert metadata.capture_settings == ["scale.factor=2.0"]
     assert metadata.origin == [200.0, 400.0, -60.0]
-    for X, Y in zip(poses, read_capture_of(tmp_path / "twice", metadata).X_WCs, strict=True):
+    for X, Y in zip(poses, read_scene_capture(tmp_path / "twice", metadata).X_WCs, strict=True):
         np.testing.assert_allclose(Y.translation(), 2 * X.translation(), atol=1e-9)
 
 

@@ -11,7 +11,7 @@ from splatpilot.analysis.commands.main import main
 from splatpilot.analysis.reconstruction.run import run
 from splatpilot.diagrams.worlds.scene_folder import read_scene_metadata
 from splatpilot.training.captures.capture_config import CaptureConfig
-from splatpilot.training.captures.capture_registry import read_capture_of
+from splatpilot.training.captures.capture_registry import read_scene_capture
 from splatpilot.training.captures.render import true_camera
 from splatpilot.training.reconstruction.config import ReconstructConfig
 
@@ -59,7 +59,7 @@ def test_settings_of_a_capture_stay_with_its_scene(folder, config, tmp_path, cap
     assert (metrics.mean("depth_relative") or 1) < 0.15
     metadata = read_scene_metadata(scene)
     assert metadata.capture_settings == ["intrinsics=[32.0, 32.0, 32.0, 24.0]", "depth_unit=500.0"]
-    assert read_capture_of(scene, metadata).K[0, 0] == 32
+    assert read_scene_capture(scene, metadata).K[0, 0] == 32
 
     with pytest.raises(FileExistsError, match=f"{scene} is there already"):
         run(capture=folder, out=scene, config=config)

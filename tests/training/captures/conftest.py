@@ -12,7 +12,6 @@ LOWER, UPPER = np.array([0.0, -1.5, 0.0]), np.array([6.0, 1.5, 2.5])
 
 
 def color_at(p_W: np.ndarray) -> np.ndarray:
-    """Color (..., 3), 0 to 255, of the points (..., 3) on the walls."""
     x, y, z = np.moveaxis(p_W, -1, 0)
     waves = [
         np.sin(3.1 * x) * np.cos(4 * z + 1),
@@ -23,7 +22,6 @@ def color_at(p_W: np.ndarray) -> np.ndarray:
 
 
 def level_camera(p: tuple, yaw: float, pitch: float, roll: float = 0.0) -> RigidTransform:
-    """X_WC of a camera that looks `yaw` left of x and `pitch` up [rad]."""
     R_WC = (
         RotationMatrix.MakeZRotation(yaw)
         @ RotationMatrix.MakeYRotation(-pitch)
@@ -50,7 +48,6 @@ POSES = [
 
 
 def trace(X_WC: RigidTransform, rays: np.ndarray, finer: float = 1.0) -> RoomView:
-    """What a camera sees along rays (H, W, 2), x/z and y/z, colors changing so much faster."""
     d_C = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], axis=-1)
     d_W = d_C @ X_WC.rotation().matrix().T
     p_W = X_WC.translation()
@@ -66,10 +63,6 @@ def pinhole_rays(K: np.ndarray, width: int, height: int) -> np.ndarray:
 
 
 def assert_shows_room(capture, X_RW=None, color=6.0, depth: float | None = 1e-5) -> None:
-    """Every pixel's depth leads to a wall, and its color is that of the wall seen there.
-
-    X_RW takes the capture's world to the room's; colors may be off by `color` on average.
-    """
     X_RW = X_RW or RigidTransform()
     for i in range(len(capture)):
         frame = capture.frame(i)
@@ -85,8 +78,6 @@ def assert_shows_room(capture, X_RW=None, color=6.0, depth: float | None = 1e-5)
 
 @pytest.fixture
 def room_views() -> Callable[..., list[RoomView]]:
-    """Returns the views of the room by a pinhole K with width and height, see `trace`."""
-
     def views(
         K: np.ndarray, width: int, height: int, poses=POSES, finer: float = 1.0
     ) -> list[RoomView]:
@@ -97,23 +88,19 @@ def room_views() -> Callable[..., list[RoomView]]:
 
 @pytest.fixture
 def trace_rays() -> Callable[..., RoomView]:
-    """See `trace`."""
     return trace
 
 
 @pytest.fixture
 def room_poses() -> list[RigidTransform]:
-    """The poses of `room_views`."""
     return POSES
 
 
 @pytest.fixture
 def shows_room() -> Callable[..., None]:
-    """See `assert_shows_room`."""
     return assert_shows_room
 
 
 @pytest.fixture
 def K() -> np.ndarray:
-    """A pinhole for images of 64x48."""
     return np.array([[50.0, 0, 31.0], [0, 52.0, 25.0], [0, 0, 1]])

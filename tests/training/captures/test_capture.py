@@ -7,19 +7,22 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from splatpilot.training.captures.capture import (
     CaptureFrame,
+    DepthCamera,
     Lens,
-    cache_folder,
-    cache_key,
     common_pinhole,
     fisheye_lens,
     opencv_lens,
     pinhole,
-    prepare_cache,
     register_depth,
     shrink,
     shrink_factor,
 )
-from splatpilot.training.captures.capture_config import CaptureConfig
+from splatpilot.training.captures.capture_config import (
+    CaptureConfig,
+    cache_folder,
+    cache_key,
+    prepare_cache,
+)
 
 K = pinhole(46.0, 46.0, 32.0, 24.0)
 RAYS = np.random.default_rng(0).uniform(-0.7, 0.7, (50, 2))
@@ -69,7 +72,6 @@ K_C = np.array([[52.0, 0, 32], [0, 52.0, 24], [0, 0, 1.0]])
 
 
 def plane_depth(n, d, K, width, height):
-    """Depth (H, W) of the plane n.Q = d seen by a pinhole at the origin."""
     v, u = np.mgrid[0:height, 0:width] + 0.5
     rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], axis=-1)
     return d / (rays @ n)
@@ -83,7 +85,7 @@ def test_plane(finer):
     n_C = X_CD.rotation().multiply(n)
     d_C = d + n_C @ X_CD.translation()
     depth = plane_depth(n, d, K_D, 64, 48).astype(np.float32)
-    got = register_depth(depth, K_D, X_CD, K, 64 * finer, 48 * finer)
+    got = register_depth(depth, DepthCamera(K_D, 64, 48, X_CD), K, 64 * finer, 48 * finer)
     want = plane_depth(n_C, d_C, K, 64 * finer, 48 * finer)
     inner = np.s_[8 * finer : -8 * finer, 8 * finer : -8 * finer]
     # Half a pixel of the coarser camera on this slope.
@@ -93,20 +95,20 @@ def test_plane(finer):
 def test_same_camera_changes_nothing():
     depth = np.random.default_rng(0).uniform(1, 5, (48, 64)).astype(np.float32)
     depth[3, 4], depth[5, 6] = 0, np.inf
-    got = register_depth(depth, K_D, RigidTransform(), K_D, 64, 48)
+    got = register_depth(depth, DepthCamera(K_D, 64, 48, RigidTransform()), K_D, 64, 48)
     np.testing.assert_allclose(got, depth, rtol=1e-6)
 
 
 def test_nearer_surface_hides_the_farther():
     depth = np.full((48, 64), 4.0, np.float32)
     depth[:, 20:30] = 1.0
-    got = register_depth(depth, K_D, RigidTransform([0.3, 0, 0]), K_D, 64, 48)
+    got = register_depth(depth, DepthCamera(K_D, 64, 48, RigidTransform([0.3, 0, 0])), K_D, 64, 48)
     shift = 0.3 * 58.5
     covered = got[:, int(np.ceil(20 + shift)) : int(30 + shift)]
     np.testing.assert_array_equal(covered, 1.0)
 
 
-def frame_of(depth: np.ndarray) -> CaptureFrame:
+def make_frame(depth: np.ndarray) -> CaptureFrame:
     height, width = depth.shape
     K = np.array([[30.0, 0, width / 2], [0, 30.0, height / 2], [0, 0, 1]])
     image = np.arange(height * width * 3, dtype=np.uint8).reshape(height, width, 3)
@@ -114,24 +116,19 @@ def frame_of(depth: np.ndarray) -> CaptureFrame:
 
 
 @pytest.mark.parametrize(
-    ("width", "wanted", "factor"), [(640, 320, 2), (640, 0, 1), (100, 320, 1), (2832, 320, 9)]
+    ("width", "desired", "factor"), [(640, 320, 2), (640, 0, 1), (100, 320, 1), (2832, 320, 9)]
 )
-def test_factors_are_whole_and_never_enlarge(width, wanted, factor):
-    assert shrink_factor(width, wanted) == factor
+def test_factors_are_whole_and_never_enlarge(width, desired, factor):
+    assert shrink_factor(width, desired) == factor
 
 
 @pytest.mark.parametrize("factor", [2, 3])
 def test_a_slanted_plane_keeps_its_depth(factor):
-    normal = np.array([0.3, -0.2, 1.0])
-
     def plane(K, width, height):
-        v, u = np.mgrid[0:height, 0:width] + 0.5
-        ray = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], -1)
-        return 2 / (ray @ normal)
+        return plane_depth(np.array([0.3, -0.2, 1.0]), 2, K, width, height)
 
-    frame = frame_of(np.ones((25, 32)))
-    frame = frame_of(plane(frame.K, 32, 25))
-    small = shrink(frame, factor)
+    frame = make_frame(np.ones((25, 32)))
+    small = shrink(make_frame(plane(frame.K, 32, 25)), factor)
     assert small.depth.shape == small.image.shape[:2] == (25 // factor, 32 // factor)
     np.testing.assert_allclose(small.depth, plane(small.K, 32 // factor, 25 // factor), rtol=1e-6)
 
@@ -147,11 +144,11 @@ def test_edges_holes_and_sky():
         ]
     )
     expected = [[1, 0, inf, 4], [1, 2, 0, 2 / (1 + 1 / 1.02)]]
-    np.testing.assert_allclose(shrink(frame_of(depth), 2).depth, expected, rtol=1e-6)
+    np.testing.assert_allclose(shrink(make_frame(depth), 2).depth, expected, rtol=1e-6)
 
 
 def test_pixels_are_valid_that_replace_valid_ones_alone():
-    frame = frame_of(np.ones((5, 8)))
+    frame = make_frame(np.ones((5, 8)))
     valid = np.ones((5, 8), bool)
     valid[1, 2] = valid[3, 6:] = valid[4] = False
     small = shrink(dataclasses.replace(frame, valid=valid), 2)
@@ -161,12 +158,12 @@ def test_pixels_are_valid_that_replace_valid_ones_alone():
 
 
 def test_colors_are_averaged():
-    frame = frame_of(np.ones((4, 6)))
+    frame = make_frame(np.ones((4, 6)))
     mean = frame.image.reshape(2, 2, 3, 2, 3).mean(axis=(1, 3))
     assert np.abs(shrink(frame, 2).image - mean).max() <= 0.5
 
 
-def test_where(monkeypatch, tmp_path):
+def test_cache_folder(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     assert cache_folder(CaptureConfig(cache="here"), "bags", "a") == Path("here")
     assert cache_folder(CaptureConfig(), "bags", "a") == tmp_path / "splatpilot/bags/a"
@@ -174,7 +171,7 @@ def test_where(monkeypatch, tmp_path):
     assert cache_folder(CaptureConfig(), "bags") == Path.home() / ".cache/splatpilot/bags"
 
 
-def test_keys(tmp_path):
+def test_cache_keys(tmp_path):
     one, other = tmp_path / "a", tmp_path / "b"
     one.write_text("1")
     other.write_text("1")
@@ -185,7 +182,7 @@ def test_keys(tmp_path):
     assert len(set(names)) == 4
 
 
-def test_no_place(tmp_path):
+def test_cache_that_cannot_be_written_is_refused(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(OSError, match=r"file/deep: cannot be written .*; set capture\.cache to"):
         prepare_cache(tmp_path / "file/deep")

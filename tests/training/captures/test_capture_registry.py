@@ -40,8 +40,6 @@ NUMBER = 3
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """A capture of a kind of which splatpilot knows nothing, in a folder of images, and the package
-    that reads it, which can be imported but is not installed."""
     packages = tmp_path / "packages"
     packages.mkdir()
     (packages / "pairs.py").write_text(_PACKAGE)

@@ -22,7 +22,6 @@ NED = RotationMatrix(np.array([[0, 0, 1.0], [1, 0, 0], [0, 1, 0]]))
 
 @pytest.fixture
 def room(room_views):
-    """The room as a capture, with the depth and images of an ideal camera."""
     views = room_views(K, WIDTH, HEIGHT)
 
     def room(**changes) -> Capture:
@@ -44,7 +43,6 @@ def room(room_views):
 
 @pytest.fixture
 def masked_room(room) -> Capture:
-    """The room with a thing in every image that moves with the camera, red and at 1 m, masked."""
     valid = np.ones((HEIGHT, WIDTH), bool)
     valid[40:90, 50:120] = False
     plain = room()
@@ -59,18 +57,16 @@ def masked_room(room) -> Capture:
 
 
 def as_files(capture, change):
-    """The poses X_WC that result when the files' X_FB are not what the reader takes them for."""
     R_WF, R_BC = RigidTransform(capture.axes.R_WF), RigidTransform(capture.axes.R_BC)
     return [R_WF @ change(R_WF.inverse() @ X @ R_BC.inverse()) @ R_BC for X in capture.X_WCs]
 
 
 def misread_quaternion(X: RigidTransform) -> RigidTransform:
-    """What a reader of x y z w makes of a file with w x y z."""
     x, y, z, w = X.rotation().ToQuaternion().wxyz()
     return RigidTransform(Quaternion(np.array([w, x, y, z])), X.translation())
 
 
-def test_sound_capture_agrees(room):
+def test_ideal_capture_agrees(room):
     report = check_capture(room())
     assert report.agrees and report.agreement is not None
     assert report.agreement.error < 0.005 and report.agreement.inside > 0.5
@@ -82,7 +78,7 @@ FLU = RotationMatrix(np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]]))
 
 
 @pytest.mark.parametrize(
-    ("change", "mistake"),
+    ("change", "problem"),
     [
         (lambda X: X.inverse(), "poses are world to camera, read as camera to world"),
         (lambda X: X @ RigidTransform(NED @ FLU.inverse()),
@@ -99,11 +95,11 @@ FLU = RotationMatrix(np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]]))
          "depth is 1000 times too large, or positions too small"),
     ],
 )  # fmt: skip
-def test_wrong_poses_are_named(room, change, mistake):
+def test_wrong_poses_are_named(room, change, problem):
     capture = room()
     report = check_capture(room(X_WCs=as_files(capture, change)))
     assert not report.agrees
-    assert re.search(mistake, report.mistake), str(report)
+    assert re.search(problem, report.problem), str(report)
 
 
 def scaled(factor):
@@ -120,8 +116,18 @@ def intrinsics(change):
     return lambda room: {"K": np.array(change) * K}
 
 
+def noisy_poses(room):
+    rng = np.random.default_rng(0)
+    return {"X_WCs": [X @ RigidTransform(rng.normal(0, 0.3, 3)) for X in room().X_WCs]}
+
+
+def noisy_colors(room):
+    noise = np.random.default_rng(0).integers(0, 256, (10, HEIGHT, WIDTH, 3), dtype=np.uint8)
+    return {"load_image": lambda i: noise[i]}
+
+
 @pytest.mark.parametrize(
-    ("change", "mistake"),
+    ("change", "problem"),
     [
         (ranged, "distance from the camera, read as depth along its axis"),
         (scaled(5), "depth is 5 times too large"),
@@ -132,12 +138,15 @@ def intrinsics(change):
             "the focal length is wrong: 1(09|10|11)",
         ),
         (intrinsics([[1, 0, 0.8], [0, 1, 1], [1, 1, 1]]), r"principal point is wrong: \(7[789]"),
+        (noisy_poses, "no other reading explains it"),
+        (noisy_colors, "colors do not follow depth"),
+        (lambda room: {"X_WCs": [room().X_WCs[0]] * 10}, "all 10 poses are the same"),
     ],
 )
-def test_wrong_depth_and_intrinsics_are_named(room, change, mistake):
+def test_other_errors_are_named(room, change, problem):
     report = check_capture(room(**change(room)))
     assert not report.agrees
-    assert re.search(mistake, report.mistake), str(report)
+    assert re.search(problem, report.problem), str(report)
 
 
 def test_color_and_depth_that_are_not_registered(room, room_views, room_poses):
@@ -154,7 +163,7 @@ def test_color_and_depth_that_are_not_registered(room, room_views, room_poses):
         load_depth=lambda i: depths[i].depth.astype(np.float32),
     )
     report = check_capture(capture)
-    assert "color and depth are not registered" in report.mistake
+    assert "color and depth are not registered" in report.problem
     assert report.color is not None
     assert report.color.focal_length == pytest.approx(110, rel=0.02)
     np.testing.assert_allclose(report.color.p_DC, p_DC[:2], atol=0.015)
@@ -168,31 +177,11 @@ def test_color_and_depth_that_are_not_registered(room, room_views, room_poses):
     assert check_capture(told).agrees
 
 
-def test_colors_that_follow_no_depth_do_not_agree(room):
-    noise = np.random.default_rng(0).integers(0, 256, (10, HEIGHT, WIDTH, 3), dtype=np.uint8)
-    report = check_capture(room(load_image=lambda i: noise[i]))
-    assert not report.agrees and "colors do not follow depth" in report.mistake
-
-
-def test_masked_pixels_have_no_part_in_the_comparison(room, masked_room):
+def test_masked_pixels_are_not_compared(room, masked_room):
     report = check_capture(masked_room)
     assert report.agrees
     assert report.color is not None and report.color.cost < 0.01
     assert report.agreement is not None and report.agreement.error < 0.005
-
-
-def test_inaccurate_poses(room):
-    rng = np.random.default_rng(0)
-    off = [X @ RigidTransform(rng.normal(0, 0.3, 3)) for X in room().X_WCs]
-    report = check_capture(room(X_WCs=off))
-    assert "no known mistake explains it" in report.mistake
-
-
-def test_poses_that_are_all_the_same(room):
-    capture = room()
-    report = check_capture(room(X_WCs=[capture.X_WCs[0]] * len(capture)))
-    assert not report.agrees
-    assert f"all {len(capture)} poses are the same" in report.mistake
 
 
 def test_doubts(room):
@@ -203,17 +192,12 @@ def test_doubts(room):
     assert "not checked" in doubt and "too few pixels have depth" in doubt
 
 
-def test_without_depth_nothing_is_claimed(room):
+def test_without_depth_nothing_is_compared(room):
     report = check_capture(room(load_depth=no_depth, metric=False, notes=["11 of 11 images"]))
-    assert not report.agrees and not report.mistake
+    assert not report.agrees and not report.problem
     lines = str(report).splitlines()
     assert "11 of 11 images" in lines and "not compared" in lines[-1]
     assert any("scale is unknown" in line for line in lines)
-
-
-def test_too_little_depth_is_refused(room):
-    with pytest.raises(ValueError, match="too few pixels have depth"):
-        check_capture(room(load_depth=lambda i: np.zeros((HEIGHT, WIDTH), np.float32)))
 
 
 def test_command(tmp_path, write_room, capsys):
@@ -234,7 +218,7 @@ def test_command(tmp_path, write_room, capsys):
 
 @pytest.mark.skipif("SPLATPILOT_DATA" not in os.environ, reason="SPLATPILOT_DATA is not set")
 @pytest.mark.parametrize(
-    ("name", "overrides", "error", "mistake"),
+    ("name", "overrides", "error", "problem"),
     [
         ("tartanair/hospital", [], (0.0005, 0.001), ""),
         ("redkitchen", [], (0.002, 0.01), ""),
@@ -242,8 +226,8 @@ def test_command(tmp_path, write_room, capsys):
          r"not registered: a color camera of focal length 52\d px at \(\+0\.0[12]"),
     ],
 )  # fmt: skip
-def test_real_captures(name, overrides, error, mistake):
+def test_real_captures(name, overrides, error, problem):
     config = load_config(CaptureConfig(), overrides=overrides)
     report = check_capture(read_capture(Path(os.environ["SPLATPILOT_DATA"]) / name, config))
     assert report.agreement is not None and error[0] < report.agreement.error < error[1]
-    assert re.search(mistake, report.mistake) if mistake else report.agrees
+    assert re.search(problem, report.problem) if problem else report.agrees

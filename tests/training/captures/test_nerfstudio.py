@@ -11,25 +11,36 @@ from splatpilot.training.captures.capture_registry import read_capture
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-def pinhole_rays(K, width, height):
-    """The rays (H, W, 2), x/z and y/z, of the pixels of a pinhole."""
-    v, u = np.mgrid[0:height, 0:width] + 0.5
+def pinhole_rays(K):
+    v, u = np.mgrid[0:48, 0:64] + 0.5
     return np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]], axis=-1)
+
+
+def change(path, **keys):
+    file = path / "transforms.json"
+    content = json.loads(file.read_text())
+    for key, value in keys.items():
+        if key.startswith("frame_"):
+            content["frames"][int(key[6:])] |= value
+        else:
+            content[key] = value
+    file.write_text(json.dumps(content))
+    return path
+
+
+def write_images(path, image):
+    for i in range(10):
+        cv2.imwrite(str(path / f"{i:02d}.png"), image)
 
 
 DISTORTION = {"k1": -0.15, "k2": 0.03, "p1": 0.002, "p2": -0.001}
 
 
 @pytest.fixture
-def write(tmp_path, K, room_views, room_poses, trace_rays):
-    """Writes the room for nerfstudio, with any camera and keys of its own."""
-
+def write(tmp_path, K, room_poses, trace_rays):
     def write(rays=None, depth=True, **extra):
-        views = (
-            room_views(K, 64, 48)
-            if rays is None
-            else [trace_rays(X_WC, rays) for X_WC in room_poses]
-        )
+        rays = pinhole_rays(K) if rays is None else rays
+        views = [trace_rays(X_WC, rays) for X_WC in room_poses]
         frames = []
         for i, view in enumerate(views):
             cv2.imwrite(str(tmp_path / f"{i:02d}.png"), view.image[..., ::-1])
@@ -66,38 +77,32 @@ def test_distortion_is_taken_out(write, K, shows_room):
     assert capture.K[0, 0] == K[0, 0]
     shows_room(capture, color=3.0, depth=0.02)
     # Taken for a pinhole, the same files show another room.
-    content = json.loads((path / "transforms.json").read_text()) | dict.fromkeys(DISTORTION, 0)
-    (path / "transforms.json").write_text(json.dumps(content))
+    change(path, **dict.fromkeys(DISTORTION, 0))
     with pytest.raises(AssertionError):
         shows_room(read_capture(path), color=3.0, depth=0.02)
 
 
 def test_edges_of_undistorted_images_are_not_dark(write, K):
     path = write(camera_model="OPENCV", k1=0.02)
-    for i in range(10):
-        cv2.imwrite(str(path / f"{i:02d}.png"), np.full((48, 64, 3), 200, np.uint8))
+    write_images(path, np.full((48, 64, 3), 200, np.uint8))
     assert (read_capture(path).frame(0).image == 200).all()
 
 
 def test_fisheye(write, K, shows_room):
-    v, u = np.mgrid[0:48, 0:64] + 0.5
-    bent = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]], axis=-1)
+    bent = pinhole_rays(K)
     theta = np.linalg.norm(bent, axis=-1, keepdims=True)
     path = write(bent * np.tan(theta) / theta, camera_model="OPENCV_FISHEYE")
     shows_room(read_capture(path), color=3.0, depth=0.02)
 
 
-def test_each_frame_may_have_its_camera(write, shows_room):
+def test_each_frame_may_have_its_camera(write, K, shows_room):
     path = write()
-    content = json.loads((path / "transforms.json").read_text())
-    for name in ("cx", "cy"):
-        content["frames"][3][name] = content[name] + 4
+    change(path, frame_3={"cx": K[0, 2] + 4, "cy": K[1, 2] + 4})
     image = cv2.imread(str(path / "03.png"))
     shift = np.float32([[1, 0, 4], [0, 1, 4]])
     cv2.imwrite(str(path / "03.png"), cv2.warpAffine(image, shift, (64, 48)))
     depth = np.load(path / "03.npy")
     np.save(path / "03.npy", cv2.warpAffine(depth, shift, (64, 48)))
-    (path / "transforms.json").write_text(json.dumps(content))
     capture = read_capture(path)
     assert not capture.dropped and capture.K[0, 0] > 50
     shows_room(capture, color=4.0, depth=0.02)
@@ -118,18 +123,6 @@ def test_depth_of_another_view_is_refused(write, room_views, K):
         np.save(path / f"{i:02d}.npy", np.ones((24, 24), np.float32))
     with pytest.raises(ValueError, match="24x24 pixels of depth do not show what 64x48 pixels"):
         read_capture(path)
-
-
-def change(path, **keys):
-    """Adds keys to the file or, of the frame i, as `frame_i`."""
-    content = json.loads((path / "transforms.json").read_text())
-    for key, value in keys.items():
-        if key.startswith("frame_"):
-            content["frames"][int(key[6:])] |= value
-        else:
-            content[key] = value
-    (path / "transforms.json").write_text(json.dumps(content))
-    return path
 
 
 def test_pixels_are_valid_where_the_mask_is_not_black(write):
@@ -162,20 +155,12 @@ def test_pixels_interpolated_from_masked_ones_are_invalid(write):
     path = write(camera_model="OPENCV", k1=-0.2)
     image = np.full((48, 64, 3), 100, np.uint8)
     image[20:28, 24:40] = 255
-    for i in range(10):
-        cv2.imwrite(str(path / f"{i:02d}.png"), image)
+    write_images(path, image)
     cv2.imwrite(str(path / "mask.png"), np.uint8(image[..., 0] == 100))
     masks = {f"frame_{i}": {"mask_path": "mask.png"} for i in range(10)}
     frame = read_capture(change(path, **masks)).frame(0)
     assert 0.8 < frame.valid.mean() < 1
     assert (frame.image[frame.valid] == 100).all()
-
-
-def test_frame_with_a_mask_of_another_size_is_left_out(write):
-    path = write()
-    cv2.imwrite(str(path / "mask.png"), np.ones((24, 32), np.uint8))
-    capture = read_capture(change(path, frame_0={"mask_path": "mask.png"}))
-    assert len(capture) == 9 and "mask.png: must be of 64x48 pixels" in capture.dropped[0]
 
 
 @pytest.mark.parametrize(
@@ -186,27 +171,21 @@ def test_frame_with_a_mask_of_another_size_is_left_out(write):
         ({"train_filenames": [f"{i:02d}.png" for i in range(7)], "test_filenames": ["08.png"]},
          [7], 8),
         ({"test_frames": ["09.png"]}, [9], 10),
+        ({f"frame_{i}": {"is_bad": True} for i in (1, 2, 5, 6)}, None, 6),
     ],
 )  # fmt: skip
-def test_the_files_own_split_is_kept(write, keys, held_out, frames):
+def test_split_and_flags_of_the_files_are_kept(write, keys, held_out, frames):
     capture = read_capture(change(write(), **keys))
     assert capture.held_out == held_out and len(capture) == frames
     assert len(capture.dropped) == 10 - frames
 
 
-def test_frames_of_their_own_for_tests_are_held_out(write):
+def test_additional_test_frames_are_held_out(write):
     path = write()
     content = json.loads((path / "transforms.json").read_text())
     frames = content["frames"]
     capture = read_capture(change(path, frames=frames[:6], test_frames=frames[6:]))
     assert len(capture) == 10 and capture.held_out == [6, 7, 8, 9]
-
-
-def test_frames_that_are_flagged_as_bad_are_left_out_however_many(write):
-    path = write()
-    bad = {f"frame_{i}": {"is_bad": True} for i in (1, 2, 5, 6)}
-    capture = read_capture(change(path, **bad))
-    assert len(capture) == 6 and "02.png is_bad" in capture.dropped[1]
 
 
 def test_keys_that_are_not_used_are_named(write):
@@ -217,8 +196,7 @@ def test_keys_that_are_not_used_are_named(write):
 @pytest.mark.parametrize("model", ["OPENCV", "PINHOLE", "SIMPLE_RADIAL"])
 def test_distortion_to_the_eighth_power_is_taken_out(write, K, shows_room, trace_rays, model):
     k = [0.02, -0.01, 0.005, 0.4]
-    v, u = np.mgrid[0:48, 0:64] + 0.5
-    bent = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]], axis=-1)
+    bent = pinhole_rays(K)
     rays = bent.copy()
     for _ in range(50):
         r2 = (rays**2).sum(axis=-1, keepdims=True)
@@ -228,36 +206,29 @@ def test_distortion_to_the_eighth_power_is_taken_out(write, K, shows_room, trace
     listed = change(path, k1=0, k2=0, k3=0, k4=0, distortion_params=[*k, 0, 0])
     for capture in (*captures, read_capture(listed)):
         shows_room(capture, color=2.0, depth=0.01)
-        corner = pinhole_rays(capture.K, 64, 48)[:6, :6]
+        corner = pinhole_rays(capture.K)[:6, :6]
         frame = capture.frame(0)
         seen = trace_rays(frame.X_WC, corner)
         np.testing.assert_allclose(frame.depth[:6, :6], seen.depth, rtol=0.03)
 
 
-def test_fisheye_is_cropped_to_its_radius(write, K):
+def test_fisheye_is_cropped_to_its_radius(write):
     path = write(camera_model="OPENCV_FISHEYE", fisheye_crop_radius=20.0)
-    for i in range(10):
-        image = np.zeros((48, 64, 3), np.uint8)
-        image[np.hypot(*(np.mgrid[0:48, 0:64] + 0.5 - np.array([24, 32])[:, None, None])) < 21] = 90
-        cv2.imwrite(str(path / f"{i:02d}.png"), image)
+    image = np.zeros((48, 64, 3), np.uint8)
+    v, u = np.mgrid[0:48, 0:64] + 0.5
+    image[np.hypot(u - 32, v - 24) < 21] = 90
+    write_images(path, image)
     assert (read_capture(path).frame(0).image == 90).all()
 
 
-def test_intrinsics_and_where_they_come_from_are_noted(write):
-    path = write()
-    assert (
-        "fx 50.0, fy 52.0, cx 31.0, cy 25.0 px for 64x48 px, from transforms.json"
-        in (read_capture(path).notes[0])
-    )
-    given = read_capture(path, CaptureConfig(intrinsics=[40, 41, 32, 24]))
-    assert given.notes[0].endswith("fx 40.0, fy 41.0, cx 32.0, cy 24.0 px for 64x48 px, from "
-                                   "capture.intrinsics")  # fmt: skip
-
-
-def test_eccentric_principal_point_is_noted(write):
-    assert any(
-        "(10.0, 25.0) px is far from the center" in n for n in read_capture(write(cx=10)).notes
-    )
+def test_intrinsics_and_their_source_are_noted(write):
+    path = write(cx=10)
+    notes = read_capture(path).notes
+    assert "fx 50.0, fy 52.0, cx 10.0, cy 25.0 px for 64x48 px, from transforms.json" in notes[0]
+    assert any("(10.0, 25.0) px is far from the center" in note for note in notes)
+    [note] = read_capture(path, CaptureConfig(intrinsics=[40, 41, 32, 24])).notes
+    assert note.endswith("fx 40.0, fy 41.0, cx 32.0, cy 24.0 px for 64x48 px, from "
+                         "capture.intrinsics")  # fmt: skip
 
 
 def test_scale(write, room_poses):
@@ -286,61 +257,40 @@ def test_points(write):
     np.testing.assert_allclose(points.colors, [[1, 0, 0.2]])
 
 
+_CAMERA = "invalid camera of 00.png .*"
+
+
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("keys", "message"),
     [
         ({"camera_model": "EQUIRECTANGULAR"}, "camera_model must be .*, got EQUIRECTANGULAR"),
-        ({"fl_x": "wide"}, r"transforms\.json: invalid camera of 00\.png"),
-        ({"frames": 3}, r"transforms\.json: not nerfstudio's format"),
-        ({"frames": [{"file_path": "00.png"}]}, r"transforms\.json: .*transform_matrix"),
-        ({"ply_file_path": "00.png"}, r"00\.png: not a PLY of colored points"),
-        ({"ply_file_path": 3}, r"transforms\.json: not nerfstudio's format"),
-        (
-            {"depth_unit_scale_factor": 0},
-            r"transforms\.json: .*depth_unit_scale_factor must be .* got 0",
-        ),
-        ({"depth_unit_scale_factor": None}, r"transforms\.json: not nerfstudio's format"),
-        (
-            {"depth_unit_scale_factor": -1},
-            r"transforms\.json: .*depth_unit_scale_factor must be .* got -1",
-        ),
-        (
-            {"depth_unit_scale_factor": np.nan},
-            r"transforms\.json: .*scale_factor must be .* got nan",
-        ),
-        ({"w": np.inf}, r"transforms\.json: invalid camera of 00\.png .*infinity"),
-        (
-            {"w": 10**9},
-            r"transforms\.json: invalid camera of .*image size must be .* got 1000000000x48",
-        ),
-        (
-            {"fl_x": -40},
-            r"transforms\.json: invalid camera of 00\.png .*focal lengths must be .* got \[-40",
-        ),
-        (
-            {"fl_x": 1e300},
-            r"transforms\.json: invalid camera of 00\.png .*focal lengths must be .* got \[1e\+300",
-        ),
-        (
-            {"fl_x": np.nan},
-            r"transforms\.json: invalid camera of 00\.png .*focal lengths must be .* got \[nan",
-        ),
-        ({"cx": 64.5}, r"principal point must be in the image of 64x48 px, got \[64\.5"),
+        ({"frames": 3}, "not a readable file of nerfstudio's format"),
+        ({"frames": [{"file_path": "00.png"}]}, "transform_matrix"),
+        ({"ply_file_path": 3}, "not a readable file of nerfstudio's format"),
+        ({"depth_unit_scale_factor": None}, "not a readable file of nerfstudio's format"),
+        ({"depth_unit_scale_factor": 0}, "depth_unit_scale_factor must be .* got 0"),
+        ({"depth_unit_scale_factor": np.nan}, "depth_unit_scale_factor must be .* got nan"),
+        ({"fl_x": "wide"}, _CAMERA),
+        ({"w": np.inf}, f"{_CAMERA}infinity"),
+        ({"w": 10**9}, f"{_CAMERA}image size must be .* got 1000000000x48"),
+        ({"fl_x": -40}, rf"{_CAMERA}focal lengths must be .* got \[-40"),
+        ({"fl_x": 1e300}, rf"{_CAMERA}focal lengths must be .* got \[1e\+300"),
+        ({"fl_x": np.nan}, rf"{_CAMERA}focal lengths must be .* got \[nan"),
+        ({"cx": 64.5}, rf"{_CAMERA}principal point must be in the image of 64x48 px, got \[64\.5"),
+        ({"cx": np.nan}, rf"{_CAMERA}principal point .* got \[nan"),
+        ({"k1": np.nan}, f"{_CAMERA}distortion"),
         ({"test_filenames": ["99.png"]}, r"its split names 99\.png"),
         ({"train_filenames": []}, "its split leaves no frame"),
-        (
-            {"cx": np.nan},
-            r"transforms\.json: invalid camera of 00\.png .*principal point .* got \[nan",
-        ),
-        ({"k1": np.nan}, r"transforms\.json: invalid camera of 00\.png .*distortion"),
     ],
 )
-def test_bad_transforms(write, change, message):
-    path = write()
-    content = json.loads((path / "transforms.json").read_text()) | change
-    (path / "transforms.json").write_text(json.dumps(content))
-    with pytest.raises(ValueError, match=message):
-        read_capture(path)
+def test_invalid_transforms_are_refused(write, keys, message):
+    with pytest.raises(ValueError, match=rf"transforms\.json: .*{message}"):
+        read_capture(change(write(), **keys))
+
+
+def test_points_of_another_format_are_refused(write):
+    with pytest.raises(ValueError, match=r"00\.png: not a readable PLY file"):
+        read_capture(change(write(), ply_file_path="00.png"))
 
 
 @pytest.mark.parametrize(
@@ -353,7 +303,7 @@ def test_bad_transforms(write, change, message):
         b"\x93NUMPY\x01\x00\xff\xff nonsense",
     ],
 )
-def test_bad_depth_drops_its_frame(write, depth):
+def test_frame_of_damaged_depth_is_left_out(write, depth):
     path = write()
     if isinstance(depth, bytes):
         (path / "03.npy").write_bytes(depth)
@@ -363,10 +313,15 @@ def test_bad_depth_drops_its_frame(write, depth):
     assert len(capture) == 9 and "03.npy" in capture.dropped[0]
 
 
-def test_bad_matrix_is_left_out(write):
-    path = write()
-    content = json.loads((path / "transforms.json").read_text())
-    content["frames"][2]["transform_matrix"] = [[1, 2], [3, 4]]
-    (path / "transforms.json").write_text(json.dumps(content))
+@pytest.mark.parametrize(
+    ("frame", "message"),
+    [
+        ({"transform_matrix": [[1, 2], [3, 4]]}, "frame 2 (./02.png): transform_matrix"),
+        ({"mask_path": "small.png"}, "small.png must be of 64x48 pixels"),
+    ],
+)
+def test_invalid_frame_is_left_out(write, frame, message):
+    path = change(write(), frame_2=frame)
+    cv2.imwrite(str(path / "small.png"), np.ones((24, 32), np.uint8))
     capture = read_capture(path)
-    assert len(capture) == 9 and "frame 2 (./02.png): transform_matrix" in capture.dropped[0]
+    assert len(capture) == 9 and message in capture.dropped[0]

@@ -15,8 +15,6 @@ X_RF = RigidTransform(RotationMatrix.MakeXRotation(np.pi / 2))
 
 @pytest.fixture
 def write(tmp_path, K, room_views):
-    """Writes the room as Polycam does: y up, each keyframe focused by itself, small depth."""
-
     def write(prefix: str = ""):
         folder = tmp_path / "keyframes"
         for name in (f"{prefix}images", f"{prefix}cameras", "depth"):
@@ -64,15 +62,12 @@ def test_damaged_keyframes_are_named(write):
     (path / "keyframes/depth" / f"{cameras[4].stem}.png").unlink()
     capture = read_capture(path)
     assert len(capture) == 9
-    assert "638443504.json: not the camera of a keyframe" in capture.dropped[0]
+    assert "638443504.json: not a readable camera of a keyframe" in capture.dropped[0]
     assert not capture.registered_depth(3).any() and capture.registered_depth(2).any()
     for camera in cameras[3:6]:
         camera.write_text('{"fx": "wide"}')
     with pytest.raises(ValueError, match="6 of 10 frames can be used"):
         read_capture(path)
-
-
-OPENGL_RECORD3D = np.diag([1.0, -1.0, -1.0])
 
 
 def write_exr(file, depth) -> None:
@@ -83,8 +78,6 @@ def write_exr(file, depth) -> None:
 
 @pytest.fixture
 def write_record3d(tmp_path, K, room_views):
-    """Writes the room as Record3D exports it: the world is that of the first camera."""
-
     def write_record3d(intrinsics=None, **extra):
         (tmp_path / "rgb").mkdir()
         (tmp_path / "depth").mkdir()
@@ -97,7 +90,7 @@ def write_record3d(tmp_path, K, room_views):
             X = views[0].X_WC.inverse() @ view.X_WC
             w, x, y, z = X.rotation().ToQuaternion().wxyz()
             # From optical axes to OpenGL's at both ends.
-            poses.append([x, -y, -z, w, *(OPENGL_RECORD3D @ X.translation())])
+            poses.append([x, -y, -z, w, *(OPENGL[:3, :3] @ X.translation())])
         content = {"w": 64, "h": 48, "K": K.T.ravel().tolist(), "poses": poses, "fps": 60}
         (tmp_path / "metadata.json").write_text(json.dumps(content | extra))
         return tmp_path
@@ -106,7 +99,6 @@ def write_record3d(tmp_path, K, room_views):
 
 
 def relative(capture, room_poses):
-    """The pose of the capture's world in the room, from the first camera."""
     return room_poses[0] @ capture.X_WCs[0].inverse()
 
 
@@ -126,7 +118,7 @@ def test_intrinsics_of_each_frame(write_record3d, K, shows_room, room_poses):
     shows_room(capture, relative(capture, room_poses), color=0.5, depth=0.03)
 
 
-def test_what_is_not_an_export(write_record3d, tmp_path):
+def test_invalid_exports_are_refused(write_record3d, tmp_path):
     recording = tmp_path / "room.r3d"
     recording.write_bytes(b"PK")
     with pytest.raises(ValueError, match=r'own format.*export the recording as "EXR'):
@@ -138,7 +130,7 @@ def test_what_is_not_an_export(write_record3d, tmp_path):
         read_capture(path)
     (path / "metadata.json").write_text(json.dumps(content | {"poses": [[1, 2]]}))
     with pytest.raises(
-        ValueError, match=r"invalid metadata of Record3D \(poses must be .* got \(1, 2\)"
+        ValueError, match=r"file of Record3D's metadata \(poses must be .* got \(1, 2\)"
     ):
         read_capture(path)
 

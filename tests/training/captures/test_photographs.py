@@ -2,11 +2,11 @@ import cv2
 import numpy as np
 import pytest
 
-from splatpilot.training.captures import colmap as video
 from splatpilot.training.captures import frames as image_files
+from splatpilot.training.captures import photographs as video
 from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.capture_registry import read_capture
-from splatpilot.training.captures.colmap import (
+from splatpilot.training.captures.photographs import (
     import_pycolmap,
     likely_pairs,
     similarity,
@@ -19,7 +19,7 @@ def test_likely_pairs(partners):
     rng = np.random.default_rng(0)
     noise = rng.uniform(0, 0.1, (40, 40))
     similarity = noise + noise.T
-    for a in range(20):  # The second half goes the way of the first again.
+    for a in range(20):  # The second half repeats the path of the first.
         similarity[a, a + 20] = similarity[a + 20, a] = 1.0
     pairs = likely_pairs(similarity, partners)
     assert pairs == sorted(set(pairs)) and all(a < b for a, b in pairs)
@@ -28,12 +28,12 @@ def test_likely_pairs(partners):
     assert 40 * partners / 2 - partners**2 <= len(pairs) <= 40 * partners
 
 
-def test_images_of_one_place_look_alike():
+def test_images_of_one_scene_are_similar():
     rng = np.random.default_rng(1)
-    places = [rng.normal(size=(400, 16)).astype(np.float32) for _ in range(3)]
+    scenes = [rng.normal(size=(400, 16)).astype(np.float32) for _ in range(3)]
     features = [
-        place[rng.choice(400, 250, replace=False)] + rng.normal(0, 0.05, (250, 16))
-        for place in places
+        scene[rng.choice(400, 250, replace=False)] + rng.normal(0, 0.05, (250, 16))
+        for scene in scenes
         for _ in range(2)
     ]
     features = [each.astype(np.float32) for each in features] + [np.zeros((0, 16), np.float32)]
@@ -49,12 +49,12 @@ def test_images_of_one_place_look_alike():
 def test_features_of_a_database(tmp_path):
     pycolmap = import_pycolmap()
     rng = np.random.default_rng(2)
-    places = [
+    scenes = [
         cv2.resize(rng.integers(0, 255, (60, 80), dtype=np.uint8), (320, 240)) for _ in range(2)
     ]
     names = [f"{i}.png" for i in range(4)]
     for name, image in zip(
-        names, [p[:, s : s + 280] for p in places for s in (0, 40)], strict=True
+        names, [p[:, s : s + 280] for p in scenes for s in (0, 40)], strict=True
     ):
         cv2.imwrite(str(tmp_path / name), image)
     file = tmp_path / "features.db"
@@ -81,7 +81,6 @@ def write_video(path, frames) -> None:
 
 
 def frames(count: int, sharp: set[int]) -> list[np.ndarray]:
-    """Frames whose brightness tells their number, with a pattern that is blurred in most."""
     rng = np.random.default_rng(0)
     pattern = cv2.resize(rng.integers(0, 80, (30, 40), dtype=np.uint8), (160, 120), interpolation=0)
     made = []
@@ -93,7 +92,6 @@ def frames(count: int, sharp: set[int]) -> list[np.ndarray]:
 
 @pytest.fixture
 def registered(monkeypatch):
-    """The folders of frames that were to be registered, and their brightness."""
     seen = {}
 
     def read(path, config):
@@ -128,7 +126,7 @@ def test_rate(tmp_path, registered):
     assert len(registered["names"]) == 20
 
 
-def test_what_is_no_video(tmp_path):
+def test_invalid_videos_are_refused(tmp_path):
     config = CaptureConfig(cache=str(tmp_path / "cache"))
     (tmp_path / "a.mp4").write_bytes(b"something else")
     with pytest.raises(ValueError, match=r"a\.mp4: not a readable video"):
@@ -144,3 +142,13 @@ def test_what_is_no_video(tmp_path):
     (tmp_path / "c.txt").write_text("a text")
     with pytest.raises(ValueError, match=r"c\.txt: unknown capture format.*a video"):
         read_capture(tmp_path / "c.txt")
+
+
+def test_photographs_that_show_nothing(tmp_path):
+    path = tmp_path / "photos"
+    path.mkdir()
+    for i in range(3):
+        cv2.imwrite(str(path / f"{i}.png"), np.full((48, 64, 3), 100, np.uint8))
+    with pytest.raises(ValueError, match="3 photographs could not be registered"):
+        read_capture(path, CaptureConfig(cache=str(tmp_path / "cache")))
+    assert not list((tmp_path / "cache").iterdir())

@@ -1,12 +1,9 @@
-import os
 import shutil
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
-from pydrake.math import RigidTransform, RotationMatrix
 
 from splatpilot.analysis.commands.main import main
 from splatpilot.diagrams.flight.scenario import Scenario
@@ -14,25 +11,17 @@ from splatpilot.diagrams.scenarios import benchmark_scenarios
 from splatpilot.diagrams.worlds import splits
 from splatpilot.diagrams.worlds.indoor import RoomConfig
 from splatpilot.diagrams.worlds.scene_folder import read_scene_metadata
-from splatpilot.diagrams.worlds.splits import find_test_source, source_digest
+from splatpilot.diagrams.worlds.splits import source_digest
 from splatpilot.diagrams.worlds.world_registry import make_spec
-from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.collision.esdf_build import esdf_from_distance_field
-from splatpilot.systems.collision.shapes import AnalyticDistanceField, Box
 from splatpilot.systems.common.config import load_config
 from splatpilot.training.captures import render as render_capture
 from splatpilot.training.captures.capture_registry import read_capture
+from splatpilot.training.captures.mesh_renderer import mesh_digests
 from splatpilot.training.captures.render import (
     RenderConfig,
-    look_along,
-    mesh_digests,
-    mesh_distance,
-    move_left,
-    poses_along,
     rendered_world,
     run,
     true_camera,
-    visiting_path,
 )
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.reconstruct import reconstruct
@@ -42,7 +31,6 @@ SIZE = np.array([6.0, 4.0, 3.0])  # [m] of a room about the origin, seen from in
 
 @pytest.fixture(scope="module")
 def room(tmp_path_factory):
-    """A room in a file whose z is up, as OBJ has it."""
     path = tmp_path_factory.mktemp("room") / "room.obj"
     mesh = trimesh.creation.box(SIZE)
     mesh.invert()
@@ -62,7 +50,6 @@ def small(**fields) -> RenderConfig:
 
 
 def depth_of_room(frame) -> np.ndarray:
-    """Depth (H, W) [m] of the room by intersecting rays with its walls."""
     height, width = frame.depth.shape
     v, u = np.mgrid[:height, :width] + 0.5
     rays = frame.back_project(u, v, np.ones_like(u)) @ frame.X_WC.rotation().matrix().T
@@ -103,7 +90,7 @@ def test_capture_has_exact_depth_where_its_poses_say(opengl, room, tmp_path):
     np.testing.assert_array_equal(again.K, capture.K)
 
 
-def test_offset_captures_stand_beside(opengl, room, tmp_path):
+def test_offset_captures_are_lateral(opengl, room, tmp_path):
     config = small(yaws=[0.0], offsets=[0.5], clearance=0.3)
     run(world=room, out=tmp_path / "capture", config=config)
     middle, beside = (read_capture(tmp_path / p) for p in ("capture", "capture/offset_+0.50"))
@@ -115,7 +102,7 @@ def test_offset_captures_stand_beside(opengl, room, tmp_path):
         np.testing.assert_allclose(frame.depth, depth_of_room(frame), rtol=1e-4)
 
 
-def test_interrupted_rendering_goes_on(opengl, room, tmp_path):
+def test_interrupted_rendering_resumes(opengl, room, tmp_path):
     run(world=room, out=tmp_path / "whole", config=small())
     partial = tmp_path / ".part.partial"
     shutil.copytree(tmp_path / "whole", partial)
@@ -133,43 +120,27 @@ def test_interrupted_rendering_goes_on(opengl, room, tmp_path):
         assert twin.read_bytes() == file.read_bytes()
 
 
-def test_generated_world_is_rendered_where_it_is(opengl, tmp_path):
+@pytest.mark.parametrize(
+    ("seed", "split"), [(4, "test"), (1_000_004, "train"), (2_000_004, "validation")]
+)
+def test_generated_world_has_its_shapes_and_the_split_of_its_seed(
+    opengl, tmp_path, monkeypatch, seed, split
+):
     scenario = tmp_path / "room.yaml"
     scenario.write_text("world: !RoomConfig {length: 6, width: 4, height: 2.6, items: 1}\n")
+    monkeypatch.setattr(render_capture, "benchmark_scenarios", lambda: {"P13": scenario})
     config = RenderConfig(width=64, height=48, path=[[1.5, 0.4, 1.5]], yaws=[0.0, 120.0])
-    run(world=scenario, out=tmp_path / "capture", config=config, seed=4)
-    capture = read_capture(tmp_path / "capture")
-    spec = make_spec(RoomConfig(length=6, width=4, height=2.6, items=1), 4)
-    for frame in capture.frames():
+    run(world="P13", out=tmp_path / "capture", config=config, seed=seed)
+    recipe = rendered_world(tmp_path / "capture")
+    assert recipe is not None and recipe.split == split
+    spec = make_spec(RoomConfig(length=6, width=4, height=2.6, items=1), seed)
+    for frame in read_capture(tmp_path / "capture").frames():
         v, u = np.mgrid[:48, :64] + 0.5
         p_CQ = frame.back_project(u, v, frame.depth)[np.isfinite(frame.depth)]
         distance = spec.distance_field.distance(frame.X_WC.multiply(p_CQ.T).T)
         inside = np.isfinite(distance)
         assert inside.sum() > 500
         assert np.abs(distance[inside]).max() < 0.01
-
-
-@pytest.mark.parametrize(
-    ("seed", "split"), [(4, "test"), (1_000_004, "train"), (2_000_004, "validation")]
-)
-def test_benchmark_world_has_the_split_of_its_seed(opengl, tmp_path, monkeypatch, seed, split):
-    scenario = tmp_path / "room.yaml"
-    scenario.write_text("world: !RoomConfig {length: 6, width: 4, height: 2.6, items: 1}\n")
-    monkeypatch.setattr(render_capture, "benchmark_scenarios", lambda: {"P13": scenario})
-    config = RenderConfig(width=16, height=12, path=[[1.5, 0.4, 1.5]], yaws=[0.0])
-    run(world="P13", out=tmp_path / "capture", config=config, seed=seed)
-    recipe = rendered_world(tmp_path / "capture")
-    assert recipe is not None and recipe.split == split
-
-
-@pytest.mark.parametrize("name", ["copy.glb", "copy.obj", "copy.ply"])
-def test_mesh_digests_do_not_depend_on_the_file(room, tmp_path, name):
-    mesh = trimesh.load(room, force="mesh")
-    mesh.faces = mesh.faces[::-1, [1, 2, 0]]
-    mesh.export(tmp_path / name)
-    assert mesh_digests(tmp_path / name) == mesh_digests(room)
-    mesh.apply_translation([0.01, 0, 0]).export(tmp_path / name)
-    assert mesh_digests(tmp_path / name).isdisjoint(mesh_digests(room))
 
 
 def test_renamed_copy_of_a_test_mesh_is_of_split_test(opengl, room, tmp_path, monkeypatch):
@@ -183,23 +154,6 @@ def test_renamed_copy_of_a_test_mesh_is_of_split_test(opengl, room, tmp_path, mo
     scene = replace(ReconstructConfig(), iterations=0, voxel_size=0.1)
     reconstruct(read_capture(tmp_path / "out"), tmp_path / "scene", scene)
     assert read_scene_metadata(tmp_path / "scene").split == "test"
-
-
-@pytest.mark.skipif("SPLATPILOT_DATA" not in os.environ, reason="SPLATPILOT_DATA is not set")
-@pytest.mark.parametrize(
-    ("file", "source"),
-    [("warehouse.gltf", "warehouse"), ("edgar_mine.glb", "edgar_mine"), ("cave.glb", None)],
-)
-def test_real_meshes_are_those_of_the_table(file, source):
-    mesh = Path(os.environ["SPLATPILOT_DATA"]) / "worlds" / file
-    assert find_test_source(mesh_digests(mesh)) == source
-
-
-def test_distance_to_a_mesh(room):
-    esdf = mesh_distance(room, "z", 0.1)
-    p_WQ = np.random.default_rng(0).uniform(-0.4, 0.4, (200, 3)) * SIZE
-    truth = (SIZE / 2 - np.abs(p_WQ)).min(axis=1)
-    assert np.abs(esdf.distance(p_WQ) - truth).max() < 0.15
 
 
 def test_bad_input_is_named(room, tmp_path, capsys):
@@ -238,76 +192,5 @@ def test_captures_of_meshes_drawn_otherwise_are_refused(tmp_path):
         true_camera(tmp_path)
 
 
-def test_captures_of_other_kinds_have_no_true_camera(tmp_path):
+def test_captures_that_were_not_rendered_have_no_true_camera(tmp_path):
     assert true_camera(tmp_path) is None
-
-
-LOWER_W, UPPER_W = np.array([0.0, 0.0, 0.0]), np.array([12.0, 8.0, 3.0])
-
-
-@pytest.fixture(scope="module")
-def divided_hall() -> Esdf:
-    """A hall that a wall divides but for a gap at its upper end."""
-    wall = Box(RigidTransform([6.0, 3.0, 1.5]), [0.4, 6.0, 3.0])
-    return esdf_from_distance_field(AnalyticDistanceField([wall], LOWER_W, UPPER_W), 0.1)
-
-
-def test_path_visits_all_free_space_and_keeps_clear(divided_hall):
-    clearance, apart = 0.5, 2.5
-    lower_W, upper_W = np.array([0, 0, 1.0]), np.array([12, 8, 2.0])
-    path = visiting_path(divided_hall, lower_W, upper_W, clearance, apart)
-    assert divided_hall.conservative().distance(path).min() > clearance
-    # Neighbors on a grid of 0.2 m: nothing is jumped over.
-    assert np.linalg.norm(np.diff(path, axis=0), axis=1).max() < 0.2 * np.sqrt(3) + 1e-9
-    x, y = np.meshgrid(np.arange(1.0, 11.1, 0.5), np.arange(1.0, 7.1, 0.5))
-    places = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 1.5)])
-    places = places[divided_hall.distance(places) > 0.8]
-    nearest = np.linalg.norm(places[:, None] - path[None], axis=2).min(axis=1)
-    assert nearest.max() < apart
-    assert np.linalg.norm(path[0] - [6.0, 7.0, 1.5]) < apart
-
-
-def test_path_names_the_room_there_is(divided_hall):
-    with pytest.raises(ValueError, match=r"largest clearance .* 9.0 m is required"):
-        visiting_path(divided_hall, LOWER_W, UPPER_W, 9.0, 2.0)
-
-
-def test_poses_stop_evenly_and_look_ahead_and_aside():
-    path = np.array([[1.0, 2, 1.5], [1, 8, 1.5]])
-    X_WCs = poses_along(path, 0.5, [0.0, 90.0, -90.0], -10.0)
-    assert len(X_WCs) == 3 * 13
-    p_WC = np.array([X.translation() for X in X_WCs]).reshape(13, 3, 3)
-    assert np.ptp(p_WC, axis=1).max() == 0
-    steps = np.linalg.norm(np.diff(p_WC[:, 0], axis=0), axis=1)
-    np.testing.assert_allclose(steps, steps.mean(), rtol=1e-9)
-    c, s = np.cos(np.deg2rad(10)), np.sin(np.deg2rad(10))
-    for X_WC, ahead in zip(X_WCs, 13 * [[0, c, -s], [-c, 0, -s], [c, 0, -s]], strict=True):
-        R_WC = X_WC.rotation().matrix()
-        np.testing.assert_allclose(R_WC[:, 2], ahead, atol=1e-12)
-        assert abs(R_WC[2, 0]) < 1e-12  # x is level,
-        assert R_WC[2, 1] < 0  # and y points down.
-
-
-def test_heading_outlasts_a_climb():
-    path = np.array([[0.0, 0, 1], [3, 3, 1], [3, 3, 6]])
-    ahead = np.array([X.rotation().matrix()[:, 2] for X in poses_along(path, 0.5, [0.0], 0.0)])
-    np.testing.assert_allclose(ahead, np.tile([0.5**0.5, 0.5**0.5, 0], (len(ahead), 1)), atol=1e-6)
-
-
-def test_one_point_is_one_stop():
-    (X_WC,) = poses_along(np.array([[1.0, 2, 3]]), 0.5, [0.0], 0.0)
-    np.testing.assert_array_equal(X_WC.translation(), [1, 2, 3])
-
-
-def test_beside_is_exactly_lateral():
-    X_WC = look_along(np.array([1.0, 2, 3]), 0.7, -0.2)
-    X_WD = move_left(X_WC, 0.5)
-    moved = X_WC.inverse() @ X_WD
-    np.testing.assert_allclose(moved.translation(), [-0.5, 0, 0], atol=1e-12)
-    assert moved.rotation().IsNearlyEqualTo(RotationMatrix(), 1e-12)
-
-
-@pytest.mark.parametrize("path", [[[0.0, 1.0]], [], [[0, np.nan, 1]]])
-def test_bad_paths_are_named(path):
-    with pytest.raises(ValueError, match="shape"):
-        poses_along(np.array(path), 0.5, [0.0], 0.0)

@@ -20,8 +20,6 @@ X_BC = RigidTransform(RotationMatrix(np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 
 
 
 class Bag:
-    """Writes the room as a robot records it, with what each test asks for."""
-
     def __init__(self, folder, version: int, K, views):
         self.path = folder / ("room.bag" if version == 1 else "room")
         self._one = version == 1
@@ -99,8 +97,6 @@ class Bag:
         scale: float = 1.0,
         rectified: bool = False,
     ) -> None:
-        """That of the room's camera, with focal lengths `scale` times as long; of `rectified`
-        images P is right, and K and D are others."""
         matrix = np.array(self.K)
         matrix[:2, 2] -= 0.5
         matrix[[0, 1], [0, 1]] *= scale
@@ -138,39 +134,41 @@ class Bag:
         )  # fmt: skip
         self.write(topic, "tf2_msgs/msg/TFMessage", time, transforms=[stamped])
 
-    def odometry(self, topic: str = "/odom") -> None:
-        """Of the body, at its own times around those of the images."""
+    def moving(self):
         for i, view in enumerate(self.views):
             X_WB = view.X_WC @ X_BC.inverse()
             for offset in (-0.005, 0.005):
-                time, ahead = START + i / 30 + offset, np.array([100 * offset, 0, 0])
-                pose = self.message(
-                    "geometry_msgs/msg/Pose",
-                    position=self._vector("Point", X_WB.translation() + ahead),
-                    orientation=self._quaternion(X_WB),
-                )  # fmt: skip
-                still = self._vector("Vector3", np.zeros(3))
-                twist = self.message("geometry_msgs/msg/Twist", linear=still, angular=still)
-                self.write(
-                    topic, "nav_msgs/msg/Odometry", time,
-                    header=self.header(time, "odom"), child_frame_id="base_link",
-                    pose=self.message("geometry_msgs/msg/PoseWithCovariance", pose=pose,
-                                      covariance=np.zeros(36)),
-                    twist=self.message("geometry_msgs/msg/TwistWithCovariance", twist=twist,
-                                       covariance=np.zeros(36)),
-                )  # fmt: skip
+                ahead = np.array([100 * offset, 0, 0])
+                X = RigidTransform(X_WB.rotation(), X_WB.translation() + ahead)
+                yield START + i / 30 + offset, X
+
+    def odometry(self, topic: str = "/odom") -> None:
+        still = self._vector("Vector3", np.zeros(3))
+        twist = self.message("geometry_msgs/msg/Twist", linear=still, angular=still)
+        zero = {"covariance": np.zeros(36)}
+        for time, X in self.moving():
+            pose = self.message(
+                "geometry_msgs/msg/Pose",
+                position=self._vector("Point", X.translation()), orientation=self._quaternion(X),
+            )  # fmt: skip
+            self.write(
+                topic, "nav_msgs/msg/Odometry", time,
+                header=self.header(time, "odom"), child_frame_id="base_link",
+                pose=self.message("geometry_msgs/msg/PoseWithCovariance", pose=pose, **zero),
+                twist=self.message("geometry_msgs/msg/TwistWithCovariance", twist=twist, **zero),
+            )  # fmt: skip
 
     def transforms(self) -> None:
-        """Of the body in the map, by way of odometry at rest in it."""
-        for i, view in enumerate(self.views):
-            X_WB = view.X_WC @ X_BC.inverse()
-            for offset in (-0.005, 0.005):
-                time, ahead = START + i / 30 + offset, np.array([100 * offset, 0, 0])
-                X = RigidTransform(X_WB.rotation(), X_WB.translation() + ahead)
-                self.transform("/tf", time, "odom", "base_link", X)
+        for time, X in self.moving():
+            self.transform("/tf", time, "odom", "base_link", X)
 
-    def mount(self) -> None:
+    def room(self, calibrations=({},), poses: str = "odometry", **images):
+        self.images(**images)
+        for calibration in calibrations:
+            self.calibration(**calibration)
         self.transform("/tf_static", START, "base_link", FRAME, X_BC)
+        getattr(self, poses)()
+        return self.close()
 
     def close(self):
         self._writer.close()
@@ -194,36 +192,25 @@ def config(tmp_path):
 
 
 @pytest.mark.parametrize("version", [1, 2])
-@pytest.mark.parametrize("moved", ["odometry", "transforms"])
-def test_room(bag, config, shows_room, version, moved):
-    recorded = bag(version)
-    recorded.images()
-    recorded.calibration()
-    recorded.mount()
-    getattr(recorded, moved)()
-    capture = read_capture(recorded.close(), config())
+@pytest.mark.parametrize("poses", ["odometry", "transforms"])
+def test_room(bag, config, shows_room, version, poses):
+    capture = read_capture(bag(version).room(poses=poses), config())
     assert capture.source.startswith("ROS bag") and len(capture) == 10 and not capture.dropped
     shows_room(capture, color=0.5, depth=0.002)
 
 
 @pytest.mark.parametrize("depth32", [False, True])
 def test_compressed_images(bag, config, shows_room, depth32):
-    recorded = bag(1)
-    recorded.images(compressed=True, depth32=depth32)
-    recorded.calibration()
-    recorded.mount()
-    recorded.odometry()
-    shows_room(read_capture(recorded.close(), config()), color=0.5, depth=0.01)
+    path = bag(1).room(compressed=True, depth32=depth32)
+    shows_room(read_capture(path, config()), color=0.5, depth=0.01)
 
 
 @pytest.mark.parametrize("compressed", [False, True])
 def test_rectified_images_are_described_by_the_projection(bag, config, shows_room, compressed):
     recorded = bag(1)
-    recorded.images(compressed, color="/camera/image_rect_color")
-    recorded.calibration(topic="/camera/camera_info", rectified=True)
-    recorded.mount()
-    recorded.odometry()
-    capture = read_capture(recorded.close(), config())
+    calibration = {"topic": "/camera/camera_info", "rectified": True}
+    path = recorded.room([calibration], compressed=compressed, color="/camera/image_rect_color")
+    capture = read_capture(path, config())
     np.testing.assert_allclose(capture.K, recorded.K)
     assert capture.notes[0].endswith("from /camera/camera_info, P without distortion")
     shows_room(capture, color=0.5, depth=0.01)
@@ -232,12 +219,12 @@ def test_rectified_images_are_described_by_the_projection(bag, config, shows_roo
 @pytest.mark.parametrize("compressed", [False, True])
 def test_calibration_is_in_the_namespace_of_the_images(bag, config, compressed):
     recorded = bag(1)
-    recorded.images(compressed, color="/camera/color/image_raw")
-    recorded.calibration(topic="/camera/aligned/camera_info", scale=1.3)
-    recorded.calibration(topic="/camera/color/camera_info")
-    recorded.mount()
-    recorded.odometry()
-    np.testing.assert_allclose(read_capture(recorded.close(), config()).K, recorded.K)
+    calibrations = (
+        {"topic": "/camera/aligned/camera_info", "scale": 1.3},
+        {"topic": "/camera/color/camera_info"},
+    )
+    path = recorded.room(calibrations, compressed=compressed, color="/camera/color/image_raw")
+    np.testing.assert_allclose(read_capture(path, config()).K, recorded.K)
 
 
 @pytest.mark.parametrize(
@@ -248,16 +235,8 @@ def test_calibration_is_in_the_namespace_of_the_images(bag, config, compressed):
         ([{"model": "omnidirectional"}], "/info has the distortion 'omnidirectional'"),
     ],
 )  # fmt: skip
-def test_calibration_that_cannot_be_used_is_not_needed_if_intrinsics_are_given(
-    bag, config, calibrations, problem
-):
-    recorded = bag(1)
-    recorded.images(color="/camera/color")
-    for calibration in calibrations:
-        recorded.calibration(**calibration)
-    recorded.mount()
-    recorded.odometry()
-    path = recorded.close()
+def test_intrinsics_replace_an_ambiguous_or_unknown_calibration(bag, config, calibrations, problem):
+    path = bag(1).room(calibrations, color="/camera/color")
     with pytest.raises(ValueError, match=f"{problem}.*; set capture.intrinsics"):
         read_capture(path, config())
     assert read_capture(path, config(intrinsics=[50, 52, 31, 25])).K[0, 0] == 50
@@ -265,10 +244,7 @@ def test_calibration_that_cannot_be_used_is_not_needed_if_intrinsics_are_given(
 
 def test_the_bag_is_read_once(bag, config, shows_room):
     recorded = bag(2)
-    recorded.images(depth32=True)
-    recorded.odometry()
-    recorded.mount()
-    path = recorded.close()
+    path = recorded.room((), depth32=True)
     with pytest.raises(ValueError, match=r"has no calibration of the color camera.*intrinsics"):
         read_capture(path, config())
     database = next(path.glob("*.db3"))
@@ -308,7 +284,7 @@ def test_no_pose_of_the_camera(bag, config):
     recorded.transform("/tf", START + 9.0, "odom", FRAME, X_BC)
     path = recorded.close()
     for _ in range(2):
-        with pytest.raises(ValueError, match=rf"/tf gives 0 poses of '{FRAME}', the frame of /col"):
+        with pytest.raises(ValueError, match=rf"poses of '{FRAME}', the frame of /color, in /tf"):
             read_capture(path, config())
 
 
@@ -319,20 +295,20 @@ def test_damaged_bag(tmp_path, config):
         read_capture(path, config())
 
 
-def turned(angle: float, x: float = 0.0) -> RigidTransform:
+def rotated(angle: float, x: float = 0.0) -> RigidTransform:
     return RigidTransform(RotationMatrix.MakeZRotation(angle), [x, 0, 0])
 
 
 def test_poses_are_composed_and_interpolated():
     tree = TransformTree()
-    tree.fix("body", "camera", turned(0.0, 1.0))
-    tree.move("map", "body", 10.1, turned(0.4, 4.0))
-    tree.move("map", "body", 10.0, turned(0.2, 2.0))
+    tree.fix("body", "camera", rotated(0.0, 1.0))
+    tree.move("map", "body", 10.1, rotated(0.4, 4.0))
+    tree.move("map", "body", 10.0, rotated(0.2, 2.0))
     pose = tree.pose("camera", 10.05)
-    assert pose is not None and pose.IsNearlyEqualTo(turned(0.3, 3.0) @ turned(0.0, 1.0), 1e-9)
+    assert pose is not None and pose.IsNearlyEqualTo(rotated(0.3, 3.0) @ rotated(0.0, 1.0), 1e-9)
     exact = tree.pose("camera", 10.1)
-    assert exact is not None and exact.IsNearlyEqualTo(turned(0.4, 4.0) @ turned(0.0, 1.0), 1e-12)
-    tree.move("map", "body", 10.2, turned(0.4, 5.0))
+    assert exact is not None and exact.IsNearlyEqualTo(rotated(0.4, 4.0) @ rotated(0.0, 1.0), 1e-12)
+    tree.move("map", "body", 10.2, rotated(0.4, 5.0))
     later = tree.pose("body", 10.15)
     assert later is not None and np.isclose(later.translation()[0], 4.5)
 
@@ -340,22 +316,22 @@ def test_poses_are_composed_and_interpolated():
 def test_what_is_not_known():
     tree = TransformTree()
     for time in (1.0, 2.0):
-        tree.move("map", "body", time, turned(0.0))
+        tree.move("map", "body", time, rotated(0.0))
     assert tree.pose("body", 0.5) is None and tree.pose("body", 1.5) is None
     alone = tree.pose("lamp", 1.0)
     assert alone is not None and alone.IsNearlyEqualTo(RigidTransform(), 0)
-    tree.fix("b", "a", turned(0.0))
-    tree.fix("a", "b", turned(0.0))
+    tree.fix("b", "a", rotated(0.0))
+    tree.fix("a", "b", rotated(0.0))
     assert tree.pose("a", 1.0) is None
 
 
 def test_fixed_poses():
     tree = TransformTree()
-    tree.fix("body", "mast", turned(0.1, 1.0))
-    tree.fix("mast", "camera", turned(0.1, 1.0))
-    tree.move("map", "body", 1.0, turned(0.0))
+    tree.fix("body", "mast", rotated(0.1, 1.0))
+    tree.fix("mast", "camera", rotated(0.1, 1.0))
+    tree.move("map", "body", 1.0, rotated(0.0))
     found = tree.fixed_pose("body", "camera")
-    assert found is not None and found.IsNearlyEqualTo(turned(0.1, 1.0) @ turned(0.1, 1.0), 1e-12)
+    assert found is not None and found.IsNearlyEqualTo(rotated(0.1, 1.0) @ rotated(0.1, 1.0), 1e-12)
     assert tree.fixed_pose("map", "camera") is None and tree.fixed_pose("lamp", "camera") is None
     own = tree.fixed_pose("camera", "camera")
     assert own is not None and own.IsNearlyEqualTo(RigidTransform(), 0)

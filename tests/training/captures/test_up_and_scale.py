@@ -7,7 +7,7 @@ from pydrake.math import RigidTransform
 from splatpilot.diagrams.worlds.scene_folder import read_scene_metadata
 from splatpilot.training.captures.capture import Capture, SfmPoints
 from splatpilot.training.captures.capture_config import CaptureConfig
-from splatpilot.training.captures.capture_registry import read_capture, read_capture_of
+from splatpilot.training.captures.capture_registry import read_capture, read_scene_capture
 from splatpilot.training.captures.check import check_capture
 from splatpilot.training.captures.up_and_scale import move_origin
 from splatpilot.training.reconstruction.config import ReconstructConfig
@@ -26,7 +26,6 @@ def moved_by(capture: Capture, offset: np.ndarray) -> Capture:
 
 
 def write_far(write_room, path, offset=FAR):
-    """Writes the room as a capture whose world has its origin elsewhere."""
     room = write_room(path)
     rows = np.loadtxt(room / "pose_left.txt")
     rows[:, :3] += offset * [1, -1, -1]  # north, east, down
@@ -76,7 +75,7 @@ def test_far_poses_are_checked_where_the_files_have_them(write_room, tmp_path):
     inverse = [R_WF @ (R_BC @ X.inverse() @ R_WF) @ R_BC for X in capture.X_WCs]
     moved = move_origin(replace(capture, X_WCs=inverse), [])
     assert moved.origin.any()
-    assert "poses are world to camera" in check_capture(moved).mistake
+    assert "poses are world to camera" in check_capture(moved).problem
 
 
 def test_scene_of_a_far_capture_keeps_its_origin(write_room, tmp_path):
@@ -88,6 +87,6 @@ def test_scene_of_a_far_capture_keeps_its_origin(write_room, tmp_path):
     metadata = read_scene_metadata(tmp_path / "scene")
     np.testing.assert_allclose(metadata.origin, FAR, atol=10)
     assert np.abs(metadata.p_WS).max() < 10
-    again = read_capture_of(tmp_path / "scene", metadata)
+    again = read_scene_capture(tmp_path / "scene", metadata)
     np.testing.assert_array_equal(again.origin, metadata.origin)
     assert metadata.capture_notes[0].startswith("intrinsics: fx ")

@@ -12,7 +12,7 @@ from splatpilot.training.captures.capture import (
     pixel_rays,
     project_points,
 )
-from splatpilot.training.captures.tartanair import read_tartanair_v1
+from splatpilot.training.captures.capture_registry import read_capture
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.initialize import (
     BlockMeans,
@@ -67,7 +67,7 @@ def from_depth(frames, **changes):
 
 @pytest.fixture
 def capture(write_room, tmp_path):
-    return read_tartanair_v1(write_room(tmp_path / "room"))
+    return read_capture(write_room(tmp_path / "room"))
 
 
 def test_the_sky_has_no_gaussians(capture):

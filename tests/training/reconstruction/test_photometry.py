@@ -3,7 +3,7 @@ import pytest
 from pydrake.math import RigidTransform
 
 from splatpilot.training.captures.capture import CaptureFrame
-from splatpilot.training.captures.tartanair import read_tartanair_v1
+from splatpilot.training.captures.capture_registry import read_capture
 from splatpilot.training.reconstruction.photometry import (
     STRIDE,
     Photometry,
@@ -17,7 +17,7 @@ from splatpilot.training.reconstruction.photometry import (
 
 
 def thin(folder) -> list[ThinnedFrame]:
-    return [ThinnedFrame.of(frame) for frame in read_tartanair_v1(folder).frames()]
+    return [ThinnedFrame.of(frame) for frame in read_capture(folder).frames()]
 
 
 @pytest.fixture

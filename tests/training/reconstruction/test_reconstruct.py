@@ -15,7 +15,6 @@ from splatpilot.systems.splats.splat_files import read_ply
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 from splatpilot.training.captures.capture import Capture
 from splatpilot.training.captures.capture_registry import read_capture
-from splatpilot.training.captures.tartanair import read_tartanair_v1
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.photometry import Photometry
 from splatpilot.training.reconstruction.reconstruct import reconstruct
@@ -183,7 +182,7 @@ def assert_renders_like(scene, capture, frames, min_psnr: float, max_error: floa
     world, metadata = read_scene(scene), read_scene_metadata(scene)
     photometry = Photometry(np.array(metadata.gains), metadata.vignetting)
     for i in frames:
-        frame = read_tartanair_v1(capture).frame(i)
+        frame = read_capture(capture).frame(i)
         height, width = frame.depth.shape
         view = world.baked.render(frame.K, width, height, frame.X_WC, background=world.background)
         color = view.color * photometry.factor(i, height, width)[..., None]

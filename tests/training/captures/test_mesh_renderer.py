@@ -1,13 +1,17 @@
 import json
-import struct
+import os
 from io import BytesIO
+from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from PIL import Image
 
+from splatpilot.diagrams.worlds.splits import find_test_source
 from splatpilot.systems.collision.field_mesh import add_primitive, data_uri
-from splatpilot.training.captures.render import MeshRenderer, look_along, mesh_distance
+from splatpilot.training.captures.camera_path import look_along
+from splatpilot.training.captures.mesh_renderer import MeshRenderer, mesh_digests, mesh_distance
 
 K = np.array([[16.0, 0, 16], [0, 16, 12], [0, 0, 1]])
 X_WC = look_along(np.zeros(3), 0.0, 0.0)  # along x
@@ -17,7 +21,6 @@ RED, GREEN = [0.8, 0.0, 0.0, 1.0], [0.0, 0.8, 0.0, 1.0]
 
 
 def square(x: float, half: float, back: bool = False):
-    """Corners, texture coordinates and triangles of a square across the x axis."""
     p = np.array([[x, half, half], [x, -half, half], [x, -half, -half], [x, half, -half]])
     uv = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
     triangles = np.array([[0, 3, 2], [0, 2, 1]])
@@ -25,7 +28,6 @@ def square(x: float, half: float, back: bool = False):
 
 
 def png(alpha: np.ndarray, color=(255, 255, 255)) -> str:
-    """A picture of one color with an alpha (H, W), 0 to 255."""
     pixels = np.dstack([np.full((*alpha.shape, 3), color, np.uint8), alpha.astype(np.uint8)])
     stream = BytesIO()
     Image.fromarray(pixels).save(stream, "PNG")
@@ -34,8 +36,6 @@ def png(alpha: np.ndarray, color=(255, 255, 255)) -> str:
 
 @pytest.fixture
 def scene(tmp_path):
-    """Writes a red wall, and before it a square of a material and texture; returns the file."""
-
     def scene(material: dict, picture: str | None = None, back: bool = False, binary: bool = False):
         document: dict = {"asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0, 1]}]}
         base = {"metallicFactor": 0, "roughnessFactor": 1}
@@ -50,29 +50,13 @@ def scene(tmp_path):
             for i, shape in enumerate((square(WALL, 4.0), square(QUAD, 1.0, back)))
         ]
         document["nodes"] = [{"mesh": 0}, {"mesh": 1}]
-        file = tmp_path / ("scene.glb" if binary else "scene.gltf")
-        file.write_bytes(_glb(document) if binary else json.dumps(document).encode())
-        return file
+        file = tmp_path / "scene.gltf"
+        file.write_text(json.dumps(document))
+        if binary:
+            trimesh.load(file, force="scene").export(file.with_suffix(".glb"))
+        return file.with_suffix(".glb") if binary else file
 
     return scene
-
-
-def _glb(document: dict) -> bytes:
-    """The document in binary, its buffers as one."""
-    import base64
-
-    content, start = b"", []
-    for buffer in document["buffers"]:
-        start.append(len(content))
-        content += base64.b64decode(buffer["uri"].partition(",")[2])
-    for view in document["bufferViews"]:
-        view["byteOffset"], view["buffer"] = start[view["buffer"]], 0
-    document["buffers"] = [{"byteLength": len(content)}]
-    text = json.dumps(document).encode()
-    text += b" " * (-len(text) % 4)
-    chunks = struct.pack("<I4s", len(text), b"JSON") + text
-    chunks += struct.pack("<I4s", len(content), b"BIN\0") + content
-    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
 
 
 def view(file):
@@ -83,7 +67,6 @@ HALVES = np.repeat(np.r_[np.zeros(16), np.full(16, 255)][None], 32, axis=0)  # r
 
 
 def sides(frame):
-    """The pixels (row 12) of the left and the right half of the square."""
     return [(frame.image[12, column].tolist(), frame.depth[12, column]) for column in (12, 19)]
 
 
@@ -105,8 +88,8 @@ def test_holes_show_what_is_behind_in_color_and_depth(opengl, scene, mode, binar
     assert is_green(right) and surface == pytest.approx(QUAD, abs=1e-4)
 
 
-@pytest.mark.parametrize(("alpha", "there"), [(100, False), (127, False), (128, True), (200, True)])
-def test_masks_are_there_or_not_by_their_cutoff(opengl, scene, alpha, there):
+@pytest.mark.parametrize(("alpha", "visible"), [(127, False), (128, True)])
+def test_masks_are_visible_or_not_by_their_cutoff(opengl, scene, alpha, visible):
     masked = {"alphaMode": "MASK", "alphaCutoff": 0.5}
     for material, picture in (
         (masked, png(np.full((4, 4), alpha))),
@@ -114,8 +97,8 @@ def test_masks_are_there_or_not_by_their_cutoff(opengl, scene, alpha, there):
     ):
         frame = view(scene(dict(material), picture))
         for color, depth in sides(frame):
-            assert is_green(color) == there and is_red(color) != there
-            assert depth == pytest.approx(QUAD if there else WALL, abs=1e-4)
+            assert is_green(color) == visible and is_red(color) != visible
+            assert depth == pytest.approx(QUAD if visible else WALL, abs=1e-4)
 
 
 def test_alpha_of_opaque_materials_is_ignored(opengl, scene):
@@ -149,7 +132,7 @@ def test_cut_out_looks_like_what_is_opaque(opengl, scene):
 
 
 @pytest.mark.parametrize(("mode", "expected"), [("MASK", 0.5), ("OPAQUE", 0.0)])
-def test_there_is_room_in_holes(scene, mode, expected):
+def test_holes_are_free(scene, mode, expected):
     esdf = mesh_distance(scene({"alphaMode": mode}, png(HALVES)), "y", 0.05)
     left, right = esdf.distance(np.array([[QUAD, 0.5, 0.0], [QUAD, -0.5, 0.0]]))
     assert left == pytest.approx(expected, abs=0.1) and right == pytest.approx(0, abs=0.1)
@@ -166,3 +149,41 @@ def test_nothing_is_cut_behind_what_is_opaque(opengl, scene):
 def test_missing_texture_is_named(scene):
     with pytest.raises(ValueError, match=r"scene\.gltf: not a readable mesh \(.*nowhere\.png"):
         mesh_distance(scene({"alphaMode": "MASK"}, "nowhere.png"), "y", 0.1)
+
+
+ROOM = np.array([6.0, 4.0, 3.0])  # [m]
+
+
+@pytest.fixture
+def room_mesh(tmp_path) -> Path:
+    mesh = trimesh.creation.box(ROOM)
+    mesh.invert()
+    mesh.export(tmp_path / "room.obj", include_normals=True)
+    return tmp_path / "room.obj"
+
+
+def test_distance_to_a_mesh(room_mesh):
+    esdf = mesh_distance(room_mesh, "z", 0.1)
+    p_WQ = np.random.default_rng(0).uniform(-0.4, 0.4, (200, 3)) * ROOM
+    truth = (ROOM / 2 - np.abs(p_WQ)).min(axis=1)
+    assert np.abs(esdf.distance(p_WQ) - truth).max() < 0.15
+
+
+@pytest.mark.parametrize("name", ["copy.glb", "copy.obj", "copy.ply"])
+def test_mesh_digests_do_not_depend_on_the_file(room_mesh, tmp_path, name):
+    mesh = trimesh.load(room_mesh, force="mesh")
+    mesh.faces = mesh.faces[::-1, [1, 2, 0]]
+    mesh.export(tmp_path / name)
+    assert mesh_digests(tmp_path / name) == mesh_digests(room_mesh)
+    mesh.apply_translation([0.01, 0, 0]).export(tmp_path / name)
+    assert mesh_digests(tmp_path / name).isdisjoint(mesh_digests(room_mesh))
+
+
+@pytest.mark.skipif("SPLATPILOT_DATA" not in os.environ, reason="SPLATPILOT_DATA is not set")
+@pytest.mark.parametrize(
+    ("file", "source"),
+    [("warehouse.gltf", "warehouse"), ("edgar_mine.glb", "edgar_mine"), ("cave.glb", None)],
+)
+def test_real_meshes_are_those_of_the_table(file, source):
+    mesh = Path(os.environ["SPLATPILOT_DATA"]) / "worlds" / file
+    assert find_test_source(mesh_digests(mesh)) == source

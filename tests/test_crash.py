@@ -1,6 +1,3 @@
-"""Commands ended while they run answer in one line and leave neither processes nor partial files;
-the same command again leaves what an undisturbed one does."""
-
 import hashlib
 import multiprocessing
 import os

@@ -1,0 +1,153 @@
+"""Checks of names and paths that the command line makes before slow imports."""
+
+import sys
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from splatpilot.analysis.benchmark.variants import SCENARIO, parse_variant
+from splatpilot.diagrams.scenarios import benchmark_scenarios, other_scenarios, scenario_file
+from splatpilot.systems.common.files import find_data, require_corpus, require_existing
+from splatpilot.systems.common.registry import check_name
+from splatpilot.systems.common.validation import did_you_mean, require
+
+SCENARIOS = tuple(benchmark_scenarios() | other_scenarios())
+"""The names of the scenarios of this package."""
+
+LEARN_FROM_CORPORA = "student_rgb", "student_depth", "diffaero_rgb"
+"""Trainers that learn from corpora."""
+
+TRAINERS = "diffaero", "depthnav", "diffaero_tof", "agile_autonomy", *LEARN_FROM_CORPORA
+"""The names of the trainers of this package; importing their registry takes seconds."""
+
+POLICIES = "planner", "straight", "reactive", *TRAINERS
+"""The names of the policies of this package."""
+
+_SUFFIXES = {
+    **dict.fromkeys((".gltf", ".glb", ".obj"), "mesh"),
+    **dict.fromkeys((".ply", ".spz", ".splat"), "gaussians"),
+    **dict.fromkeys((".yaml", ".yml"), "scenario"),
+    ".bt": "map",
+}
+_FLY = "fly in it with `splatpilot fly --scene {path}`"
+_KINDS = {
+    "mesh": (
+        "a mesh",
+        "render a capture of it with `splatpilot capture render {path} --out out/capture` (--up z "
+        "if z points up in it), then `splatpilot reconstruct out/capture --out out/scene`",
+    ),
+    "capture": ("a capture", "make a scene of it with `splatpilot reconstruct {path} --out SCENE`"),
+    "scene": ("a scene folder", _FLY),
+    "gaussians": ("a file of Gaussians", _FLY),
+    "map": ("an OctoMap", _FLY),
+    "scenario": ("a scenario", "fly it with `splatpilot fly --scenario {path}`"),
+}
+"""Kinds of environments: their name, and the command that uses one."""
+
+
+def check_policy(text: str) -> str:
+    """Checks the name of a policy, or its file of weights; returns the text."""
+    variant = parse_variant(text)
+    name, colon, field = variant.policy.partition(":")
+    if variant.weights is not None:
+        require_existing(variant.weights, "a file of weights")
+    elif colon and name in POLICIES:
+        raise ValueError(
+            f"the policy {variant.policy!r} names a field of {name} without a value; write "
+            f"{name}:{field}=VALUE"
+        )
+    elif variant.policy != SCENARIO:
+        registry = "splatpilot.diagrams.flight.policies"
+        _check_name("policy", "splatpilot.policies", variant.policy, POLICIES, registry)
+    return text
+
+
+def check_trainer(name: str) -> str:
+    """Checks the name of a trainer, and returns it."""
+    registry = "splatpilot.training.policies.trainer_registry"
+    _check_name("trainer", "splatpilot.trainers", name, TRAINERS, registry)
+    return name
+
+
+def _check_name(what: str, group: str, name: str, ours: Sequence[str], registry: str) -> None:
+    # A registry that --import has loaded may have more names.
+    if registry not in sys.modules:
+        check_name(what, group, name, ours)
+
+
+def check_scenario(name: str) -> str:
+    """Checks the name or the file of a scenario, and returns it."""
+    require_existing(scenario_file(name), "a scenario")
+    return name
+
+
+def check_corpora(policies: Sequence[str], overrides: Sequence[str], config: Path | None) -> None:
+    """Checks that the corpora of `--set` exist, if one of the policies learns from corpora.
+
+    Those in the file `config` are checked by the training.
+    """
+    given = [text.partition("=")[2] for text in overrides if text.startswith("corpora=")]
+    if (config is not None and not given) or not set(LEARN_FROM_CORPORA) & set(policies):
+        return
+    corpora = ["out/corpus"]
+    if given:
+        import yaml
+
+        corpora = yaml.safe_load(given[-1])
+    for corpus in corpora if isinstance(corpora, list) else ():
+        require_corpus(Path(str(corpus)))
+
+
+def check_kind(path: Path, *accepted: str) -> None:
+    """Checks that an existing path is one of the `accepted` keys of `_KINDS`.
+
+    The message names its kind and the command that uses it.
+    """
+    kind = _SUFFIXES.get(path.suffix.lower(), "")
+    if path.is_dir():
+        kind = "scene" if (path / "scene.yaml").is_file() else ""
+        if not kind and "capture" not in accepted and _is_capture(path):
+            kind = "capture"
+    if kind and kind not in accepted:
+        what, remedy = _KINDS[kind]
+        require(False, str(path), _list_kinds(accepted), what, remedy.format(path=path))
+
+
+def _list_kinds(kinds: Sequence[str]) -> str:
+    return _join(_KINDS[kind][0] for kind in kinds)
+
+
+def _join(words: Iterable[str]) -> str:
+    *first, last = words
+    return f"{', '.join(first)} or {last}" if first else last
+
+
+def describe_kinds(kinds: Sequence[str]) -> str:
+    """Lists kinds of environments with their suffixes, for the help of a command."""
+    described = []
+    for kind in kinds:
+        forms = ["P02"] if kind == "scenario" else []
+        forms += [suffix for suffix, other in _SUFFIXES.items() if other == kind]
+        described.append(_KINDS[kind][0] + (f" ({', '.join(forms)})" if forms else ""))
+    return _join(described)
+
+
+def _is_capture(path: Path) -> bool:
+    # Takes seconds to import, only for a message.
+    from splatpilot.training.captures.capture_registry import CAPTURES
+
+    return any(CAPTURES.find(name).recognizes(path) for name in CAPTURES.names())
+
+
+def find_input(path: str, *accepted: str) -> str:
+    """Finds an environment: the name of a scenario, or a path as `find_data` does.
+
+    Args:
+        accepted: keys of `_KINDS`.
+    """
+    scenarios = SCENARIOS if "scenario" in accepted else ()
+    if path in scenarios:
+        return path
+    hint = did_you_mean(path, scenarios)
+    found = find_data(Path(path), _list_kinds(accepted), hint)
+    check_kind(found, *accepted)
+    return str(found)

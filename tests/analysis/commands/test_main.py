@@ -1,0 +1,370 @@
+import os
+import shlex
+import signal
+import subprocess
+import sys
+import tempfile
+from importlib.metadata import version
+
+import pytest
+
+from splatpilot.analysis import scenes
+from splatpilot.analysis.commands import MOVED
+from splatpilot.analysis.commands import main as cli
+from splatpilot.analysis.commands.main import main
+from splatpilot.analysis.commands.options import Command
+from splatpilot.systems.common.progress import resumable
+from splatpilot.systems.common.registry import import_modules
+
+MAIN = "import sys; from splatpilot.analysis.commands.main import main, run\n"
+INTERRUPTIBLE = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+HEAVY = {"numpy", "pydrake", "scipy", "torch", "matplotlib", "cv2", "yaml", "tqdm"}
+
+
+def execute(script, cwd=None, words=(), **environment):
+    """Runs a script in a process of its own; returns its exit status, output and errors."""
+    ended = subprocess.run(
+        [sys.executable, "-c", MAIN + script, *words],
+        capture_output=True,
+        text=True,
+        cwd=cwd,
+        env=os.environ | environment,
+    )
+    return ended.returncode, ended.stdout, ended.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        *((old, f"`splatpilot {old}` is now `splatpilot {new}`") for old, new in MOVED.items()),
+        ("fli", "splatpilot: there is no command 'fli'; did you mean fly?"),
+        ("capture chek room", "capture: there is no subcommand 'chek'; did you mean check?"),
+        ("view P02 --sede 3", "view: unrecognized arguments: --sede 3; did you mean --seed?"),
+        ("fly timeout=3", "unrecognized arguments: timeout=3; did you mean --set timeout=3?"),
+        ("fly --set timeout", "--set must be FIELD=VALUE, got 'timeout'; see `splatpilot fly --he"),
+        ("fly --seed 1.5", "splatpilot fly: --seed must be a whole number, got '1.5'"),
+        ("fly --speed fast", "splatpilot fly: --speed must be a number, got 'fast'"),
+        ("scene scale a --out b --factor 2 --height 1", "not allowed with argument"),
+    ],
+)
+def test_an_invalid_command_line_has_status_2_and_one_sentence(words, message, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(words.split())
+    error = capsys.readouterr().err
+    assert (ended.value.code, error.count("\n")) == (2, 1)
+    assert message in error
+
+
+RENDER = "got a mesh; render a capture of it with `splatpilot capture render room.gltf"
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("fly --set goal=[100,0,2]", "goal [100.0, 0.0, 2.0] is outside the world"),
+        ("fly --set start=[1.5,0,-1]", "start [1.5, 0.0, -1.0] is"),
+        ("fly --set start=[1.5,0,0.2]", "0.200 m from the nearest surface"),
+        ("fly --set 'camera.focal=!FocalLength {x: 0}'", "camera.focal must be positive"),
+        ("fly --set worl.length=3", "did you mean world"),
+        ("fly --set world.spacing=0.5", "spacing"),
+        ("fly --scenario nowhere.yaml", "No such file or folder: nowhere.yaml"),
+        ("fly --scenario P99", "there is no scenario 'P99'"),
+        ("fly --scene nowhere", "nowhere"),
+        ("fly --scene images", "got a capture; make a scene of it with `splatpilot reconstruct im"),
+        ("fly --scene room.gltf", RENDER),
+        ("fly --scene fast.yaml", "got a scenario; fly it with `splatpilot fly --scenario fast.y"),
+        ("fly --scene damaged.ply", "damaged.ply"),
+        ("fly --policy nobody", "there is no policy 'nobody'"),
+        ("fly --policy reactive:margin", "without a value; write reactive:margin=VALUE"),
+        ("fly --seed -1", "seed"),
+        ("fly --speed -2", "the speed must be in (0, 20] m/s, got -2"),
+        ("fly --policy diffaero --speed 15", "policy.speed must be in [0.1, 10] m/s"),
+        ("fly --out fast.yaml/out", "cannot write to the output folder fast.yaml/out"),
+        ("fly --graphviz fast.yaml", "fast.yaml is there already"),
+        ("view nowhere", "No such file or folder: nowhere"),
+        ("view room.gltf", RENDER),
+        ("view room.ksplat", "room.ksplat: a KSPLAT; convert it to PLY"),
+        ("view scene --seed 1", "--seed must be of a generated world"),
+        ("view scene --set world.length=3", "--set must be of a scenario or a capture"),
+        ("view fast.yaml --out fast.yaml", "fast.yaml is there already; choose another, or repl"),
+        ("scene mesh nowhere --out a.obj", "No such file or folder: nowhere"),
+        ("scene mesh room.gltf --out a.obj", RENDER),
+        ("scene mesh P02 --out a.stl", "a.stl: suffix must be .gltf or .obj, got .stl"),
+        ("scene mesh folder --out a.obj", "folder must be a scene folder, OctoMap or scenario"),
+        ("scene mesh scene --seed 1 --out a.obj", "--seed must be of a generated world"),
+        ("scene mesh scene --out room.gltf", "room.gltf is there already"),
+        ("scene measure nowhere", "No such file or folder: nowhere"),
+        ("scene scale scene --out a", "what is its size? Give --factor"),
+        ("scene scale scene --out a --distance 2", "--between and --distance belong together"),
+        ("scene scale scene --out a --between 0,0 1,1,1 --distance 2", "X,Y,Z, got '0,0'"),
+        ("reconstruct nowhere --out a", "No such file or folder: nowhere"),
+        ("reconstruct scene --out a", "got a scene folder; fly in it with `splatpilot fly --sce"),
+        ("reconstruct images --out a --up z", "--up must be of a mesh or a scenario"),
+        ("capture render P02 --out a --path 1,2", "path"),
+        ("capture render P02 --out a --path 1,b,2", "--path must be points X,Y,Z"),
+        ("benchmark --out a --scenarios P99", "there is no scenario 'P99'"),
+        ("benchmark --out a --speeds fast", "--speeds must be numbers in m/s, got 'fast'"),
+        ("benchmark --out a --scenarios P02 --policies nobody", "there is no policy 'nobody'"),
+        ("benchmark --out a --scenarios P02 --jobs 0", "--jobs must be at least 1, got 0"),
+        ("replay folder id", "No such file: folder/study.yaml"),
+        ("difficulty P10 --seeds 0", "--seeds must be at least 1, got 0"),
+        ("train depthnav --out a --seeds 0 1 0", "the seed 0 is given twice"),
+        ("train depthnav diffaero depthnav --out a", "the policy depthnav is given twice"),
+        ("train nobody --out a", "there is no trainer 'nobody'"),
+        ("train student_rgb --out a", "out/corpus holds no corpus; collect one with `splatpilot "),
+        ("recover student_depth --out a --set corpora=[b]", "b holds no corpus"),
+        ("corpus inspect folder --out a.png", "holds no corpus"),
+        ("corpus inspect folder --out a.jpg", "--out must be a PNG file"),
+        ("corpus inspect folder --out a.png --samples 0", "--samples must be at least 1, got 0"),
+        ("corpus inspect folder --out fast.yaml", "fast.yaml is there already"),
+        ("hardware bridge --hardware nowhere.yaml", "No such file or folder: nowhere.yaml"),
+        ("hardware bridge --log fast.yaml", "fast.yaml is there already"),
+        ("hardware vehicle --out scene", "scene is there already"),
+    ],
+)
+def test_an_error_has_status_1_and_one_sentence_and_writes_nothing(
+    words, message, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("SPLATPILOT_DATA", raising=False)
+    (tmp_path / "folder").mkdir()
+    for name in ("room.gltf", "fast.yaml", "scene/scene.yaml", "images/transforms.json"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("{}")
+    (tmp_path / "room.ksplat").write_bytes(bytes(64))
+    (tmp_path / "damaged.ply").write_bytes(b"\x00\x01 this is not a PLY")
+    before = {path: path.is_file() and path.read_bytes() for path in tmp_path.rglob("*")}
+    assert main(shlex.split(words)) == 1
+    *_, error = capsys.readouterr().err.splitlines()
+    assert error.startswith("splatpilot: ") and message in error
+    assert {path: path.is_file() and path.read_bytes() for path in tmp_path.rglob("*")} == before
+
+
+@pytest.mark.parametrize(
+    ("words", "status"),
+    [
+        ("--help", 0),
+        ("--version", 0),
+        ("fly --help", 0),
+        ("fly --nonsense", 2),
+        ("fly --policy nobody", 1),
+        ("fly --scene nowhere", 1),
+        ("benchmark --out study --policies planner,nobody", 1),
+        ("replay nowhere id", 1),
+        ("reconstruct nowhere --out scene", 1),
+        ("train nobody --out run", 1),
+        ("corpus inspect nowhere --out samples.png", 1),
+    ],
+)
+def test_help_and_refusals_import_nothing_heavy(words, status, tmp_path):
+    script = (
+        f"try: status = main({words.split()})\n"
+        "except SystemExit as ended: status = ended.code\n"
+        "print(status, *{name.partition('.')[0] for name in sys.modules})"
+    )
+    _, out, err = execute(script, tmp_path)
+    found, *loaded = out.splitlines()[-1].split()
+    assert int(found) == status
+    assert status == 0 or "splatpilot" in err.splitlines()[-1]
+    assert not list(tmp_path.iterdir())
+    assert "splatpilot" in loaded and not HEAVY & set(loaded)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "train diffaero --out run",
+        "recover student_rgb --out run",
+        "corpus make --out corpus --worlds 2",
+        "scene fetch forest_splat --out scenes",
+        "reconstruct . --out scene",
+        "scene ablate . --out study",
+        "scene fidelity . --out study",
+        "scene measure .",
+        "capture check .",
+        "capture render P02 --out capture",
+        "benchmark --out study --quick",
+    ],
+)
+def test_long_commands_announce_themselves_before_slow_imports(words, tmp_path):
+    (tmp_path / "out" / "corpus" / "shards").mkdir(parents=True)
+    script = (
+        "sys.modules |= dict.fromkeys(['numpy', 'pydrake', 'torch', 'yaml'])\n"  # import errors
+        f"main({words.split()})"
+    )
+    _, _, err = execute(script, tmp_path, TMPDIR=str(tmp_path))
+    announced, *failure = err.splitlines()
+    assert not announced.startswith("splatpilot") and "ing " in announced
+    assert failure and "\r" not in err
+
+
+def test_version(capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["--version"])
+    assert ended.value.code == 0
+    assert capsys.readouterr().out == f"splatpilot {version('splatpilot')}\n"
+
+
+SIGNALS = [(signal.SIGTERM, 143, "terminated"), (signal.SIGINT, 130, "interrupted")]
+
+
+@pytest.mark.parametrize(("number", "status", "word"), SIGNALS)
+def test_a_signal_during_a_flight_ends_with_one_line_and_no_output(number, status, word, tmp_path):
+    script = MAIN + INTERRUPTIBLE + "sys.exit(main(['fly', '--out', 'flight']))"
+    flying = subprocess.Popen(
+        [sys.executable, "-c", script],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=tmp_path,
+    )
+    assert flying.stdout is not None and flying.stderr is not None
+    assert flying.stdout.readline().startswith("Building the world")
+    flying.send_signal(number)
+    error = flying.stderr.read()
+    assert flying.wait(60) == status
+    assert error.splitlines()[-1] == f"splatpilot: {word}" and "Traceback" not in error
+    assert not list(tmp_path.rglob("flight/*"))
+
+
+@pytest.mark.parametrize(("number", "status", "word"), SIGNALS)
+def test_a_signal_during_an_import_or_after_the_end_ends_at_once(number, status, word, tmp_path):
+    (tmp_path / "interrupted.py").write_text(
+        "import signal\n"
+        "try:\n"
+        f"    signal.raise_signal({int(number)})\n"
+        "except KeyboardInterrupt:\n"
+        "    raise ImportError('a core of it failed to import')\n"
+    )
+    importing = (
+        "print('before', flush=False)\nsys.exit(main(['--import', 'interrupted', 'doctor']))"
+    )
+    after = (
+        "from splatpilot.analysis.commands import main as cli\nprint('before')\n"
+        f"cli.main = lambda: signal.raise_signal({int(number)})\nrun()"
+    )
+    for script in (importing, after):
+        ended = execute(INTERRUPTIBLE + script, tmp_path)
+        assert ended == (status, "before\n", f"splatpilot: {word}\n")
+
+
+def test_a_signal_while_modules_are_unloaded_is_ignored():
+    script = (
+        INTERRUPTIBLE + "import os, threading, time\n"
+        # Signals that the main thread does not take go to any other.
+        "threading.Thread(target=time.sleep, args=(60,), daemon=True).start()\n"
+        "class Late:\n"
+        "    def __del__(self, kill=os.kill, process=os.getpid(), sleep=time.sleep):\n"
+        f"        kill(process, {int(signal.SIGTERM)})\n"
+        "        sleep(0.1)\n"
+        "late = Late()\n"
+        "run()"
+    )
+    status, _, error = execute(script, words=["--version"])
+    assert (status, error) == (0, "")
+
+
+@pytest.mark.parametrize(
+    ("statement", "status", "message"),
+    [
+        (f"signal.raise_signal({int(signal.SIGTERM)})", 143, "terminated"),
+        ("raise ValueError('no')", 1, "no (FILE, line 4)"),
+    ],
+)
+def test_messages_are_below_progress_bars(statement, status, message, tmp_path):
+    (tmp_path / "working.py").write_text(
+        f"import signal; from tqdm import tqdm\nbar = tqdm(total=3)\nbar.update()\n{statement}\n"
+    )
+    ended, _, error = execute("sys.exit(main(['--import', 'working', 'doctor']))", tmp_path)
+    assert ended == status and "/3" in error
+    last = error.replace("\r", "\n").splitlines()[-1]
+    assert last == f"splatpilot: {message}".replace("FILE", str(tmp_path / "working.py"))
+
+
+def test_an_interruption_tells_what_is_kept(tmp_path, capsys, monkeypatch):
+    def interrupted(**_keywords):
+        with resumable(lambda: "one scene is in scenes; the same command resumes"):
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(scenes, "run", interrupted)
+    assert main(["scene", "fetch", "forest_splat", "--out", str(tmp_path)]) == 130
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last == "splatpilot: interrupted; one scene is in scenes; the same command resumes"
+
+
+def test_drake_prints_only_warnings():
+    script = "main(['view', 'nowhere'])\nfrom pydrake.geometry import Meshcat; Meshcat()"
+    status, _, error = execute(script)
+    assert status == 0
+    assert "folder: nowhere" in error and "Meshcat" not in error
+
+
+@pytest.fixture
+def failing(monkeypatch, tmp_path):
+    """Makes `splatpilot fly` raise."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+
+    def fail(error: BaseException) -> None:
+        def raise_error(options):
+            raise error
+
+        monkeypatch.setattr(cli, "COMMANDS", [Command("fly", "fail", function=raise_error)])
+
+    return fail
+
+
+def test_an_internal_error_writes_a_report(failing, tmp_path, capsys):
+    failing(KeyError("of our own"))
+    assert main(["fly"]) == 70
+    [report] = tmp_path.iterdir()
+    error = capsys.readouterr().err
+    assert error == f"splatpilot: internal error in fly (KeyError); the report is {report}\n"
+    text = report.read_text()
+    assert ": fly\n" in text and "Traceback" in text and "of our own" in text
+
+
+@pytest.mark.parametrize(
+    ("error", "message"),
+    [
+        (MemoryError("Unable to allocate 9 TiB"), r"more memory than there is (Unable to allocate"),
+        (MemoryError(), "needs more memory than there is; make"),
+        (OverflowError("too large for C long"), "a number given to fly is too large (too large"),
+        (ValueError("first\n  second"), "splatpilot: first second"),
+        (BrokenPipeError(), "was not read to the end"),
+        (KeyboardInterrupt(), "splatpilot: interrupted"),
+    ],
+)
+def test_errors_of_use_and_memory_are_one_line_without_a_report(
+    failing, error, message, tmp_path, capsys
+):
+    failing(error)
+    assert main(["fly"]) in (1, 130)
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_errors_of_plugins_name_their_file_and_line(failing, tmp_path, monkeypatch, capsys):
+    package = tmp_path / "faulty"
+    package.mkdir()
+    (package / "parts.py").write_text(
+        "import json, numpy as np\ndef parse():\n    json.loads(3)\n"
+        "def add():\n    np.ones(3) + np.ones(2)\n"
+    )
+    (package / "__init__.py").write_text("from faulty.parts import parse, add\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    import_modules(["faulty"])
+    for function, line, message in (
+        ("parse", 3, "FILE, line 3: TypeError: the JSON object"),
+        ("add", 5, "operands could not be broadcast"),
+    ):
+        with pytest.raises((TypeError, ValueError)) as raised:
+            getattr(sys.modules["faulty"], function)()
+        failing(raised.value)
+        assert main(["fly"]) == 1
+        error = capsys.readouterr().err
+        assert message.replace("FILE", str(package / "parts.py")) in error
+        assert f"parts.py, line {line}" in error
+    failing(KeyError("of our own"))
+    assert main(["fly"]) == 70

@@ -1,0 +1,104 @@
+import argparse
+import os
+import shlex
+import subprocess
+import sys
+
+import pytest
+
+from splatpilot.analysis.commands import COMMANDS
+from splatpilot.analysis.commands.checks import POLICIES, TRAINERS
+from splatpilot.analysis.commands.main import build_parser, main
+from splatpilot.diagrams.flight import policies
+from splatpilot.systems.common.config import load_config
+from splatpilot.training.policies import trainer_registry
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=[command.name for command in COMMANDS])
+def test_examples_parse_and_fields_in_the_help_can_be_set(command):
+    defaults = {option.name: option.keywords.get("default") for option in command.options}
+    defaults |= {"policies": ["diffaero"]}
+    if command.name == "recover":
+        defaults |= {"policy": "student_depth"}
+    for example in command.examples:
+        assert example.startswith(command.name)
+        assert build_parser().parse_args(shlex.split(example)).command is command
+    for option in command.options:
+        if option.name == "overrides":
+            fields = option.keywords["help"].partition("for example ")[2].partition(" (rep")[0]
+            for override in shlex.split(fields.replace(", ", " ")):
+                config = option.keywords["configuration"](argparse.Namespace(**defaults))
+                load_config(config, overrides=[override])
+
+
+def test_set_help_lists_the_fields_of_the_configuration(capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["fly", "--policy", "reactive", "--speed", "3", "--set", "help"])
+    assert ended.value.code == 0
+    printed = capsys.readouterr().out
+    assert "policy.speed=3.0  (float)\n" in printed
+    assert "timeout=60.0  (float)\n    [s] The flight ends after this time.\n" in printed
+    assert "policy  (!ReactiveConfig or !PrivilegedPlannerConfig or " in printed
+    assert "start=null  (list[float] | None)\n" in printed
+    with pytest.raises(SystemExit):
+        main(["reconstruct", "--set", "voxel_size=0.2", "--set", "help"])
+    assert "voxel_size=" in capsys.readouterr().out
+
+
+def test_names_that_are_checked_early_are_those_of_the_registries():
+    assert set(POLICIES) <= set(policies.POLICIES.registered())
+    assert set(TRAINERS) <= set(trainer_registry.TRAINERS.registered())
+    for registry, names in ((policies.POLICIES, POLICIES), (trainer_registry.TRAINERS, TRAINERS)):
+        ours = {n for n in registry.registered() if _is_ours(registry.find(n).config)}
+        assert ours == set(names)
+
+
+def _is_ours(config: type) -> bool:
+    return config.__module__.startswith("splatpilot.")
+
+
+@pytest.mark.parametrize(
+    ("line", "completions"),
+    [
+        ("splatpilot rep", {"replay "}),
+        ("splatpilot fly --ov", {"--overwrite "}),
+        ("splatpilot fly --policy diff", {"diffaero", "diffaero_tof", "diffaero_rgb"}),
+        ("splatpilot fly --scenario P0", {f"P0{n}" for n in range(1, 10)}),
+        ("splatpilot train dep", {"depthnav "}),
+    ],
+)
+def test_shells_complete_commands_options_and_names(line, completions, tmp_path):
+    out = tmp_path / "completions"
+    environment = os.environ | {
+        "_ARGCOMPLETE": "1",
+        "_ARGCOMPLETE_IFS": "\n",
+        "_ARGCOMPLETE_STDOUT_FILENAME": str(out),
+        "COMP_LINE": line,
+        "COMP_POINT": str(len(line)),
+    }
+    script = "from splatpilot.analysis.commands.main import main; main()"
+    subprocess.run([sys.executable, "-c", script], env=environment, check=False)
+    assert set(out.read_text().split("\n")) == completions
+
+
+@pytest.mark.parametrize(
+    ("words", "file"),
+    [
+        ("reconstruct capture --out scene", "scene/views.png"),
+        ("scene measure scene", "scene/metrics.json"),
+        ("view scene --out page.html", "page.html"),
+        ("view P02 --seed 3", "out/view/P02-003.html"),
+    ],
+)
+def test_existing_output_stays_unless_overwritten(words, file, place, monkeypatch, capsys):
+    monkeypatch.chdir(place.folder)
+    place.scene("scene")
+    (place.folder / "capture").mkdir()
+    (place.folder / file).parent.mkdir(parents=True, exist_ok=True)
+    (place.folder / file).write_text("old")
+    assert main(words.split()) == 1
+    assert "is there already; choose another, or replace it" in capsys.readouterr().err
+    assert (place.folder / file).read_text() == "old"
+    if "scene" in words.split()[:2] and "capture" not in words:
+        assert main([*words.split(), "--overwrite"]) == 0, capsys.readouterr().err
+        assert (place.folder / file).read_text() != "old"

@@ -1,0 +1,346 @@
+"""Damaged files and messages are refused in one line with their name, or read as valid values."""
+
+import gzip
+import json
+import shutil
+import struct
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+import trimesh
+import zstandard
+from drake import lcmt_header
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from plyfile import PlyData, PlyElement
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
+from room import write_room_capture
+
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.worlds.scene_folder import read_scene, write_scene_folder
+from splatpilot.diagrams.worlds.world import World
+from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.collision.octomap import read_octomap
+from splatpilot.systems.common.config import dump_config, load_config
+from splatpilot.systems.messaging import codecs
+from splatpilot.systems.messaging.lcm_ports import decode_message
+from splatpilot.systems.sensing.time_of_flight import (
+    FRAME_MAGIC,
+    Stream,
+    TimeOfFlight,
+    after_packet,
+)
+from splatpilot.systems.splats.background import EnvironmentMap
+from splatpilot.systems.splats.baked_scene import BakedScene
+from splatpilot.systems.splats.scene import GaussianScene
+from splatpilot.systems.splats.splat_files import read_splats, write_ply
+from splatpilot.training.captures.capture_registry import read_capture
+from splatpilot.training.captures.render import mesh_distance
+
+WIDTH, HEIGHT, FRAMES, COUNT = 16, 12, 6, 20
+R_WC = RotationMatrix(np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]]))
+POSES = [RigidTransform(R_WC, [0.2 * i, 0.05 * i**2, 1.0]) for i in range(FRAMES)]
+DEPTH = np.full((HEIGHT, WIDTH), 2.0, np.float32)
+RNG = np.random.default_rng(0)
+GAUSSIANS = GaussianScene(
+    means=RNG.uniform(0, 3, (COUNT, 3)).astype(np.float32),
+    quats=RNG.normal(size=(COUNT, 4)).astype(np.float32),
+    scales=RNG.uniform(0.05, 0.2, (COUNT, 3)).astype(np.float32),
+    opacities=RNG.uniform(0.1, 0.9, COUNT).astype(np.float32),
+    sh=RNG.normal(size=(COUNT, 4, 3)).astype(np.float32),
+)
+_STATES = RNG.integers(0, 3, (5, 4, 3), dtype=np.uint8)
+ESDF = Esdf(RNG.normal(size=(5, 4, 3)).astype(np.float32), _STATES, np.zeros(3), 0.5)
+
+
+def write_compressed_ply(folder: Path) -> None:
+    ends = [f"{end}_{part}{a}" for end in ("min", "max") for part in ("", "scale_") for a in "xyz"]
+    chunk = np.array([(0.0, 0, 0, -3, -3, -3, 3, 3, 3, -2, -2, -2)], [(n, "f4") for n in ends])
+    names = [f"packed_{what}" for what in ("position", "rotation", "scale", "color")]
+    packed = RNG.integers(0, 2**32, (COUNT, 4), dtype=np.uint32)
+    vertex = packed.view([(name, "u4") for name in names])[:, 0]
+    elements = [PlyElement.describe(chunk, "chunk"), PlyElement.describe(vertex, "vertex")]
+    PlyData(elements).write(str(folder / "scene.ply"))
+
+
+def write_spz(folder: Path, version: int) -> None:
+    widths = 9, 1, 3, 3, 4, 9  # [bytes] of a Gaussian in the sections of degree 1
+    sections = [RNG.integers(0, 256, COUNT * width, dtype=np.uint8) for width in widths]
+    sections[0].reshape(-1, 3)[:, 2] = 0  # positions of 0 to 16 m
+    sections = [section.tobytes() for section in sections]
+    if version == 3:
+        header = struct.pack("<4sII4B", b"NGSP", 3, COUNT, 1, 12, 0, 0)
+        (folder / "scene.spz").write_bytes(gzip.compress(header + b"".join(sections), 0))
+        return
+    streams = [zstandard.ZstdCompressor().compress(section) for section in sections]
+    header = struct.pack("<4sII4BI12x", b"NGSP", 4, COUNT, 1, 12, 0, len(streams), 32)
+    sizes = zip(streams, sections, strict=True)
+    table = b"".join(struct.pack("<QQ", len(stream), len(section)) for stream, section in sizes)
+    (folder / "scene.spz").write_bytes(header + table + b"".join(streams))
+
+
+def write_splat(folder: Path) -> None:
+    records = np.zeros(COUNT, [("p", "<f4", 3), ("s", "<f4", 3), ("bytes", "u1", 8)])
+    records["p"], records["s"] = RNG.uniform(0, 3, (2, COUNT, 3))
+    records["bytes"] = RNG.integers(0, 256, (COUNT, 8))
+    records.tofile(folder / "scene.splat")
+
+
+def write_scene(folder: Path) -> None:
+    sky = EnvironmentMap(np.full((4, 8, 3), 0.5, np.float32))
+    ends = np.array([0.5, 0.5, 0.5]), np.array([1.5, 1.0, 0.5])
+    world = World("a", GAUSSIANS, ESDF, ESDF, sky, *ends)
+    write_scene_folder(folder / "scene", world, GAUSSIANS, provenance="by hand")
+
+
+def write_octomap(folder: Path) -> None:
+    """Writes a tree with an occupied voxel, free ones next to it and a free cube."""
+    masks = [3 << 14] + [3] * 13 + [3 | 1 << 2] + [2 | 1 << 2 | 1 << 4 | 1 << 6]
+    head = f"# Octomap OcTree binary file\nid OcTree\nsize {len(masks) + 5}\nres 0.5\ndata\n"
+    (folder / "map.bt").write_bytes(head.encode() + np.array(masks, "<u2").tobytes())
+
+
+def write_image(file: Path, i: int) -> None:
+    pixels = np.random.default_rng(i).integers(0, 255, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+    cv2.imwrite(str(file), pixels)
+
+
+def pose_row(X: RigidTransform) -> str:
+    w, x, y, z = X.rotation().ToQuaternion().wxyz()
+    return " ".join(f"{value:.9f}" for value in (*X.translation(), x, y, z, w))
+
+
+def write_tum(folder: Path) -> None:
+    (folder / "rgb").mkdir()
+    (folder / "depth").mkdir()
+    lines: dict[str, list[str]] = {"rgb": [], "depth": [], "groundtruth": []}
+    for i, X_WC in enumerate(POSES):
+        write_image(folder / f"rgb/{i}.png", i)
+        cv2.imwrite(str(folder / f"depth/{i}.png"), (5000 * DEPTH).astype(np.uint16))
+        lines["rgb"].append(f"{100 + i / 30:.4f} rgb/{i}.png")
+        lines["depth"].append(f"{100 + i / 30:.4f} depth/{i}.png")
+        lines["groundtruth"].append(f"{100 + i / 30:.4f} {pose_row(X_WC)}")
+    for name, rows in lines.items():
+        (folder / f"{name}.txt").write_text("# a list\n" + "\n".join(rows) + "\n")
+
+
+def write_seven_scenes(folder: Path) -> None:
+    for i, X_WC in enumerate(POSES):
+        write_image(folder / f"frame-{i:06d}.color.png", i)
+        depth = (1000 * DEPTH).astype(np.uint16)
+        cv2.imwrite(str(folder / f"frame-{i:06d}.depth.png"), depth)
+        np.savetxt(folder / f"frame-{i:06d}.pose.txt", X_WC.GetAsMatrix4())
+
+
+def write_nerfstudio(folder: Path) -> None:
+    frames = []
+    for i, X_WC in enumerate(POSES):
+        write_image(folder / f"{i}.png", i)
+        np.save(folder / f"{i}.npy", 1000 * DEPTH)
+        matrix = (X_WC.GetAsMatrix4() @ np.diag([1, -1, -1, 1])).tolist()
+        frame = {"file_path": f"{i}.png", "transform_matrix": matrix}
+        frames.append(frame | {"depth_file_path": f"{i}.npy"})
+    content = {"w": WIDTH, "h": HEIGHT, "fl_x": 10.0, "cx": 8.0, "cy": 6.0, "k1": 0.01}
+    (folder / "transforms.json").write_text(json.dumps(content | {"frames": frames}))
+
+
+def write_colmap(folder: Path) -> None:
+    (folder / "images").mkdir()
+    model, params = pycolmap.Reconstruction(), [10.0, 10.0, 8.0, 6.0]
+    camera = pycolmap.Camera(
+        model="PINHOLE", width=WIDTH, height=HEIGHT, params=params, camera_id=1
+    )
+    model.add_camera_with_trivial_rig(camera)
+    for i, X_WC in enumerate(POSES):
+        write_image(folder / f"images/{i}.png", i)
+        points = [pycolmap.Point2D([5.0, 5.0]), pycolmap.Point2D([9.0, 3.0])]
+        image = pycolmap.Image(name=f"{i}.png", points2D=points, camera_id=1, image_id=i + 1)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(X_WC.inverse().GetAsMatrix34()))
+    for k in range(2):
+        track = pycolmap.Track([pycolmap.TrackElement(1, k), pycolmap.TrackElement(2, k)])
+        model.add_point3D([2.0, 0.1 * k, 1.0], track, [10, 20, 30])
+    (folder / "sparse/0").mkdir(parents=True)
+    model.write(folder / "sparse/0")
+
+
+def write_grids(folder: Path) -> None:
+    """Writes the packets of a time-of-flight sensor: a grid, and an image."""
+    grid = struct.pack("<IIQ", 0x544F4632, 1, 10**9)
+    grid += np.full(SENSOR.rows * SENSOR.columns, 0.5, "<f4").tobytes()
+    size = SENSOR.width, SENSOR.height
+    image = struct.pack("<IIIHHQHH", FRAME_MAGIC, 2, 7, 0, 1, 2 * 10**9, *size)
+    image += np.full(SENSOR.width * SENSOR.height, 1.5, "<f4").tobytes()
+    (folder / "1").write_bytes(grid)
+    (folder / "2").write_bytes(image)
+
+
+def read_grids(folder: Path) -> Any:
+    stream = Stream()
+    for file in sorted(folder.iterdir()):
+        stream = after_packet(stream, file.read_bytes(), SENSOR)
+    return stream.grid
+
+
+def is_finite(*arrays: Any) -> bool:
+    return all(np.isfinite(np.asarray(array, dtype=float)).all() for array in arrays)
+
+
+def use_gaussians(scene: Any) -> None:
+    assert is_finite(scene.means, scene.quats, scene.scales, scene.opacities, scene.sh)
+    K = np.array([[10.0, 0, 8], [0, 10, 6], [0, 0, 1]])
+    view = BakedScene(scene).render(K, 16, 12, RigidTransform([1.5, 1.5, -3.0]))
+    assert is_finite(view.color, view.alpha) and not np.isnan(view.depth).any()
+
+
+def use_esdf(esdf: Any) -> None:
+    sample = esdf.query(((esdf.lower_W + esdf.upper_W) / 2)[None])
+    assert is_finite(sample.distance, sample.gradient) and (esdf.upper_W > esdf.lower_W).all()
+
+
+def use_world(world: Any) -> None:
+    use_gaussians(world.gaussians)
+    use_esdf(world.esdf)
+    assert is_finite(world.p_WS, world.p_WG)
+
+
+def use_capture(capture: Any) -> None:
+    assert is_finite(capture.K, *(X_WC.GetAsMatrix4() for X_WC in capture.X_WCs))
+    assert capture.K[0, 0] > 0 and capture.K[1, 1] > 0 and len(capture) >= 2
+    for i in range(len(capture)):
+        try:
+            frame = capture.frame(i)
+        except (ValueError, OSError) as error:
+            assert capture.folder in str(error)
+            continue
+        assert frame.image.shape == (*frame.depth.shape, 3) and (frame.depth >= 0).all()
+    if capture.points is not None:
+        assert is_finite(capture.points.p_WQ, capture.points.colors)
+
+
+def use_grid(grid: Any) -> None:
+    assert grid is None or ((grid >= 0) & (grid <= 1)).all()
+
+
+def read_gaussians(folder: Path) -> Any:
+    return read_splats(next(folder.glob("scene.*")))
+
+
+def read_scenario(folder: Path) -> Scenario:
+    scenario = load_config(Scenario(), folder / "scenario.yaml")
+    scenario.validate()
+    return scenario
+
+
+def message_reader(codec: Any, value: np.ndarray) -> tuple[Any, Any, Any]:
+    header = lcmt_header()
+    header.seq, header.utime, header.frame_name = 1, 1_800_000_000_000_000, codec.frame
+    packet = codec.pack(value, header, 0.0).encode()
+
+    def read(folder: Path) -> Any:
+        return codec.unpack(decode_message(codec, (folder / "message").read_bytes()), 0.0)
+
+    def use(value: Any) -> None:
+        assert codec.image is not None or (value.shape == (codec.size,) and is_finite(value))
+
+    return lambda folder: (folder / "message").write_bytes(packet), read, use
+
+
+SENSOR = TimeOfFlight()
+STATE = np.array([1.0, 2, 3, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0])
+MESSAGES = {
+    "state": (codecs.StateCodec(), STATE),
+    "command": (codecs.CommandCodec(), np.array([9.0, 0, 0, 0])),
+    "motion capture": (codecs.MotionCaptureCodec("drone"), STATE[[0, 1, 2, 6, 7, 8, 9]]),
+    "depth grid": (codecs.DepthGridCodec(4, 3, 5.0, "tof"), np.full(12, 0.5)),
+    "depth": (codecs.DepthImageCodec(ImageDepth32F(8, 6), "c"), np.ones((6, 8, 1), np.float32)),
+    "color": (codecs.ColorImageCodec(ImageRgba8U(8, 6), "c"), np.ones((6, 8, 4), np.uint8)),
+}
+UNNAMED = {"scenario", "packets", *MESSAGES}  # errors name a field, or a caller adds the sender
+SPLATS = {
+    "PLY": lambda folder: write_ply(GAUSSIANS, folder / "scene.ply"),
+    "compressed PLY": write_compressed_ply,
+    "SPZ by gzip": lambda folder: write_spz(folder, 3),
+    "SPZ by zstd": lambda folder: write_spz(folder, 4),
+    "splat": write_splat,
+}
+CAPTURES = {
+    "TartanAir": lambda folder: write_room_capture(folder, width=16, height=12),
+    "TUM": write_tum,
+    "7-Scenes": write_seven_scenes,
+    "nerfstudio": write_nerfstudio,
+    "COLMAP": write_colmap,
+}
+READERS = {
+    **{name: (write, read_gaussians, use_gaussians) for name, write in SPLATS.items()},
+    **{name: (write, read_capture, use_capture) for name, write in CAPTURES.items()},
+    **{name: message_reader(*message) for name, message in MESSAGES.items()},
+    "packets": (write_grids, read_grids, use_grid),
+    "scene folder": (write_scene, lambda folder: read_scene(folder / "scene"), use_world),
+    "distance field": (
+        lambda folder: ESDF.save(folder / "esdf.npz"),
+        lambda folder: Esdf.load(folder / "esdf.npz"),
+        use_esdf,
+    ),
+    "OctoMap": (
+        write_octomap,
+        lambda folder: read_octomap(folder / "map.bt").esdf(np.full(3, -2.0), np.full(3, 3.0)),
+        use_esdf,
+    ),
+    "mesh": (
+        lambda folder: trimesh.Scene(trimesh.creation.box((2.0, 2.0, 2.0))).export(
+            folder / "m.glb"
+        ),
+        lambda folder: mesh_distance(folder / "m.glb", "y", 0.25),
+        use_esdf,
+    ),
+    "scenario": (
+        lambda folder: (folder / "scenario.yaml").write_text(dump_config(Scenario())),
+        read_scenario,
+        lambda scenario: None,
+    ),
+}
+"""By kind: writes valid files into a folder, reads them, uses the result."""
+
+
+@st.composite
+def damage(draw: st.DrawFn, content: bytes) -> bytes:
+    """Truncates the content, or overwrites up to eight bytes."""
+    if draw(st.booleans()):
+        return content[: draw(st.integers(0, len(content) - 1))]
+    start = draw(st.integers(0, len(content) - 1))
+    return content[:start] + draw(st.binary(min_size=1, max_size=8)) + content[start + 8 :]
+
+
+@pytest.mark.parametrize("kind", READERS)
+def test_damaged_files_are_refused_by_name_or_read_as_valid(kind, tmp_path, monkeypatch):
+    monkeypatch.setenv("SPLATPILOT_READ_LIMIT", "0.5")
+    write, read, use = READERS[kind]
+    valid, damaged = tmp_path / "valid", tmp_path / "damaged"
+    valid.mkdir()
+    write(valid)
+    use(read(valid))
+    files = [file for file in sorted(valid.rglob("*")) if file.is_file()]
+
+    @settings(max_examples=25, database=None, suppress_health_check=list(HealthCheck))
+    @given(st.data())
+    def check(data: st.DataObject) -> None:
+        file = data.draw(st.sampled_from(files))
+        content = data.draw(damage(file.read_bytes()))
+        shutil.rmtree(damaged, ignore_errors=True)
+        shutil.copytree(valid, damaged)
+        (damaged / file.relative_to(valid)).write_bytes(content)
+        try:
+            value = read(damaged)
+        except (ValueError, OSError, struct.error) as error:
+            message = str(error)
+            assert "\n" not in message and len(message) < 800
+            assert str(damaged) in message or kind in UNNAMED
+            return
+        use(value)
+
+    check()

@@ -1,0 +1,476 @@
+"""Renders meshes, and measures the distance to them.
+
+Faces have two sides, and alpha is what glTF says. Drake draws any alpha as translucent, and its
+depth ignores alpha. So it gets a mesh whose alpha is only that of panes, whose depth is that of the
+pane; `CutOuts` draws surfaces with holes in their textures.
+"""
+
+import json
+import struct
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from io import BytesIO
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, cast
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from pydrake.geometry import (
+    ClippingRange,
+    ColorRenderCamera,
+    DepthRange,
+    DepthRenderCamera,
+    GeometryId,
+    LightParameter,
+    MakeRenderEngineVtk,
+    Mesh,
+    PerceptionProperties,
+    RenderCameraCore,
+    RenderEngineVtkParams,
+    RenderLabel,
+)
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageRgba8U
+from scipy.ndimage import map_coordinates
+from trimesh.exchange.gltf import export_gltf
+from trimesh.visual import TextureVisuals
+from trimesh.visual.material import PBRMaterial
+
+from splatpilot.diagrams.worlds.splits import part_digests
+from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.collision.esdf_build import esdf_from_occupancy, grid_shape
+from splatpilot.systems.common.extras import require_opengl
+from splatpilot.systems.common.readers import readable, require_file, require_readable_size
+from splatpilot.systems.common.validation import require
+from splatpilot.training.captures.capture import CaptureFrame, pixel_rays
+
+MIN_DEPTH, MAX_DEPTH = 0.05, 150.0  # [m], range of the depth images; nearer is 0, farther is inf
+
+# Lamps at infinity: direction and intensity of one overhead, four from the sides so that no wall is
+# dark or like its neighbor, one from below for undersides.
+_LAMPS = (
+    ((0.15, 0.25, -1.0), 1.6),
+    ((1.0, 0.15, -0.5), 1.1),
+    ((-1.0, -0.15, -0.5), 1.3),
+    ((0.15, 1.0, -0.5), 0.9),
+    ((-0.15, -1.0, -0.5), 1.5),
+    ((0.2, 0.3, 1.0), 0.8),
+)
+_SUFFIXES = (".gltf", ".glb", ".obj")
+_GAMMA = 2.2  # of textures and images, as in VTK
+_GLOSS = 0.01  # fraction of white light that VTK's rough surfaces reflect, whatever their color
+_STEP = 1e-4  # [m], and fraction of depth, from a surface to the start of the search for the next
+_HIDDEN = 0.01  # fraction of the light from behind below which the search ends
+_MAX_POSITION = 1e6  # [m]
+_CUTOFF = 0.5  # glTF's default alpha from which a MASK is opaque
+_VISIBLE = 1 / 255  # alpha from which a BLEND is visible
+_SAMPLES_PER_VOXEL_FACE = 8
+_NEAREST = 9728
+_WRAPS = {33071: "clamp", 33648: "mirror"}
+# R_WM, of the axes of a file M by the one that points up.
+_UP = {"y": RotationMatrix.MakeXRotation(np.pi / 2).matrix().round(), "z": np.eye(3)}
+
+
+class MeshRenderer:
+    """Renders a mesh.
+
+    Args:
+        mesh: .gltf, .glb, or .obj with its materials.
+        up: the axis of the file's coordinates that points up, "y" (as glTF says) or "z".
+        background: red, green, blue in 0 to 1.
+    """
+
+    def __init__(self, mesh: Path, up: str, background: Sequence[float]):
+        check_mesh(mesh, up)
+        require_opengl()
+        lights = [
+            LightParameter(type="directional", frame="world", direction=d, intensity=intensity)
+            for d, intensity in _LAMPS
+        ]
+        self._engine = MakeRenderEngineVtk(
+            RenderEngineVtkParams(
+                lights=lights, default_clear_color=np.array(background), force_to_pbr=True
+            )
+        )
+        properties = PerceptionProperties()
+        properties.AddProperty("label", "id", RenderLabel(1))
+        # The engine rotates glTF's y up to z.
+        X_WM = RigidTransform(RotationMatrix.MakeXRotation(0.0 if up == "y" else -np.pi / 2))
+        with _opened(mesh, up, export=True) as parts:
+            self._cut_outs = parts.cut_outs
+            if parts.solid is not None:
+                solid = Mesh(str(parts.solid))
+                with readable(mesh, "mesh for Drake"):
+                    self._engine.RegisterVisual(
+                        GeometryId.get_new_id(), solid, properties, X_WM, False
+                    )
+
+    def frame(
+        self, X_WC: RigidTransform, K: NDArray[np.float64], width: int, height: int
+    ) -> CaptureFrame:
+        """Returns the view of a camera at X_WC with intrinsics K (3, 3) [px], with exact depth."""
+        # In OpenGL's image plane, too, the principal point of a symmetric view is width / 2.
+        info = CameraInfo(width, height, K[0, 0], K[1, 1], K[0, 2], K[1, 2])
+        core = RenderCameraCore("", info, ClippingRange(MIN_DEPTH, MAX_DEPTH), RigidTransform())
+        color, depth = ImageRgba8U(width, height), ImageDepth32F(width, height)
+        self._engine.UpdateViewpoint(X_WC)
+        self._engine.RenderColorImage(ColorRenderCamera(core), color)
+        self._engine.RenderDepthImage(
+            DepthRenderCamera(core, DepthRange(MIN_DEPTH, MAX_DEPTH)), depth
+        )
+        frame = CaptureFrame(
+            np.array(color.data)[..., :3], np.array(depth.data)[..., 0], X_WC, np.array(K)
+        )
+        return frame if self._cut_outs is None else self._cut_outs.draw(frame)
+
+
+def check_mesh(mesh: Path, up: str) -> None:
+    """Checks the arguments of `MeshRenderer`."""
+    require_file(mesh)
+    suffixes = ", ".join(_SUFFIXES)
+    require(mesh.suffix in _SUFFIXES, f"{mesh}: the suffix", f"one of {suffixes}", mesh.suffix)
+    require(up in _UP, "up", "y (as glTF says) or z", up)
+
+
+def mesh_digests(mesh: Path) -> set[str]:
+    """Returns a digest of each triangle of a mesh, by its corners to a millimeter, independent of
+    the file's format and materials."""
+    with readable(mesh, "mesh"):
+        surface: Any = trimesh.load(mesh, force="mesh")
+        if not 0 < surface.area < np.inf:
+            raise ValueError("it has no surface")
+    corners = np.round(surface.triangles * 1000).astype(np.int64)
+    packed = corners @ np.array([1 << 42, 1 << 21, 1])  # (N, 3): one number per corner
+    triangles = np.unique(np.sort(packed, axis=1), axis=0)
+    return part_digests(triangle.tobytes() for triangle in triangles)
+
+
+def mesh_distance(mesh: Path, up: str, voxel_size: float) -> Esdf:
+    """Returns the distance to the surface of a mesh, from points sampled on it outside of holes."""
+    density = _SAMPLES_PER_VOXEL_FACE / voxel_size**2
+    with _opened(mesh, up, export=False) as parts:
+        points = [_sample_surface(mesh, parts.surface, density)[0]]
+        if parts.cut_outs is not None:
+            points.append(parts.cut_outs.sample(mesh, density))
+    p_WQ = np.concatenate(points)
+    with readable(mesh, "mesh"):
+        if not len(p_WQ):
+            raise ValueError("it has no surface")
+        lower_W, upper_W = p_WQ.min(axis=0) - voxel_size, p_WQ.max(axis=0) + voxel_size
+        grid_shape(lower_W, upper_W, voxel_size)
+    shape = np.ceil((upper_W - lower_W) / voxel_size).astype(int)
+    occupied = np.zeros(shape, dtype=bool)
+    occupied[tuple(((p_WQ - lower_W) / voxel_size).astype(int).T)] = True
+    return esdf_from_occupancy(occupied, None, lower_W, voxel_size)
+
+
+def _sample_surface(
+    path: Path, surface: trimesh.Trimesh, density: float
+) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
+    """Returns points (N, 3) [m] on a surface, with a density [1/m^2], and the triangle of each."""
+    if not 0 < surface.area < np.inf:
+        return np.zeros((0, 3)), np.zeros(0, dtype=np.intp)
+    count = int(density * surface.area) + 1
+    require_readable_size(path, 64.0 * count)
+    points, triangle = trimesh.sample.sample_surface(surface, count, seed=0)[:2]
+    return np.asarray(points, dtype=np.float64), np.asarray(triangle)
+
+
+@dataclass(frozen=True, eq=False)
+class CutMaterial:
+    """The base color of a surface with holes."""
+
+    pixels: NDArray[np.float32]  # (H, W, 4), linear, colors times alpha
+    transform: NDArray[np.float64]  # (2, 3), of texture coordinates
+    wrap: Sequence[str]  # repeat, mirror or clamp, across and down
+    nearest: bool  # if texels are not interpolated
+    cutoff: float  # alpha from which the surface exists
+    translucent: bool  # or opaque
+
+    def sample(self, uv: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Returns linear colors (n, 3) and alphas (n,), 0 in holes.
+
+        Args:
+            uv: (n, 2), texture coordinates as in glTF, from the upper left corner.
+        """
+        size = self.pixels.shape[1::-1]
+        position = (uv @ self.transform[:, :2].T + self.transform[:, 2]) * size - 0.5
+        for x, n, wrap in zip(position.T, size, self.wrap, strict=True):
+            if wrap == "mirror":
+                x[:] = n - 0.5 - np.abs((x + 0.5) % (2 * n) - n)
+            if wrap != "repeat":
+                np.clip(x, 0, n - 1, out=x)
+        order = 0 if self.nearest else 1
+        channels = np.moveaxis(self.pixels, -1, 0)
+        texel = np.column_stack(
+            [
+                map_coordinates(each, position.T[::-1], order=order, mode="grid-wrap")
+                for each in channels
+            ]
+        ).astype(np.float64)
+        alpha = texel[:, 3]
+        color = texel[:, :3] / np.maximum(alpha, 1e-6)[:, None]
+        return color, np.where(alpha >= self.cutoff, alpha if self.translucent else 1.0, 0.0)
+
+
+def _shade(albedo: NDArray[np.float64], normal: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns colors (n, 3), 0 to 1, of rough dielectric surfaces as VTK lights them."""
+    light = np.zeros(len(normal))
+    for direction, intensity in _LAMPS:
+        toward = -np.asarray(direction) / np.linalg.norm(direction)
+        light += intensity / np.pi * np.maximum(normal @ toward, 0)
+    return np.clip((albedo + _GLOSS) * light[:, None], 0, 1) ** (1 / _GAMMA)
+
+
+@dataclass(frozen=True, eq=False)
+class CutOuts:
+    """Triangles with holes."""
+
+    surface: trimesh.Trimesh  # T triangles [m], in W
+    uv: NDArray[np.float64]  # (T, 3, 2)
+    material: NDArray[np.intp]  # (T,)
+    materials: Sequence[CutMaterial]
+
+    def _sample_at(
+        self, triangle: NDArray[np.intp], p_WQ: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Returns colors (n, 3) and alphas (n,) of points (n, 3) on triangles (n,)."""
+        weights = trimesh.triangles.points_to_barycentric(self.surface.triangles[triangle], p_WQ)
+        uv = (weights[..., None] * self.uv[triangle]).sum(axis=1)
+        color, alpha = np.zeros((len(uv), 3)), np.zeros(len(uv))
+        for i, material in enumerate(self.materials):
+            own = self.material[triangle] == i
+            color[own], alpha[own] = material.sample(uv[own])
+        return color, alpha
+
+    def sample(self, path: Path, density: float) -> NDArray[np.float64]:
+        """Returns points (N, 3) [m] outside of holes; see `_sample_surface`."""
+        points, triangle = _sample_surface(path, self.surface, density)
+        return points[self._sample_at(triangle, points)[1] > 0]
+
+    def draw(self, frame: CaptureFrame) -> CaptureFrame:
+        """Returns the frame with these surfaces drawn where nothing in it hides them.
+
+        Depth is that of the first surface, opaque or not.
+        """
+        if not trimesh.ray.has_embree:
+            raise ModuleNotFoundError(
+                "textures with holes need embreex, which has no wheel for this processor; render "
+                "the capture on another machine",
+                name="embreex",
+            )
+        height, width = frame.depth.shape
+        # Rays have depth 1, so that distances along them are depths.
+        rays = pixel_rays(frame.K, width, height).reshape(-1, 3)
+        rays = rays @ frame.X_WC.rotation().matrix().T
+        p_WC = frame.X_WC.translation()
+        depth, color = frame.depth.reshape(-1).astype(np.float64), np.zeros((len(rays), 3))
+        limit = depth.copy()
+        behind, reached = np.ones(len(rays)), np.full(len(rays), MIN_DEPTH)
+        active = np.flatnonzero(limit > MIN_DEPTH)
+        while len(active):
+            origins = p_WC + reached[active, None] * rays[active]
+            triangle = self.surface.ray.intersects_first(origins, rays[active])  # -1 for none
+            active, triangle = active[triangle >= 0], triangle[triangle >= 0]
+            # Intersect again in double precision.
+            normal, ray = self.surface.face_normals[triangle], rays[active]
+            slope = (ray * normal).sum(axis=1)
+            offset = ((self.surface.triangles[triangle, 0] - p_WC) * normal).sum(axis=1)
+            z = np.maximum(offset / np.where(slope == 0, 1, slope), reached[active])
+            seen = z < limit[active]
+            active, triangle, z, ray = active[seen], triangle[seen], z[seen], ray[seen]
+            albedo, alpha = self._sample_at(triangle, p_WC + z[:, None] * ray)
+            facing = -np.sign(slope[seen])[:, None] * normal[seen]
+            share = behind[active] * alpha
+            color[active] += share[:, None] * _shade(albedo, facing)
+            first = (behind[active] == 1) & (alpha > 0)
+            depth[active[first]] = z[first]
+            behind[active] -= share
+            reached[active] = z + _STEP * np.maximum(z, 1)
+            active = active[behind[active] > _HIDDEN]
+        image = 255 * color.reshape(height, width, 3)
+        image += behind.reshape(height, width, 1) * frame.image
+        return replace(
+            frame,
+            image=np.round(image).clip(0, 255).astype(np.uint8),
+            depth=depth.reshape(height, width).astype(np.float32),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Parts:
+    """A mesh in two parts; one may be missing."""
+
+    solid: Path | None  # .gltf without holes
+    surface: trimesh.Trimesh  # [m] of the same, in W
+    cut_outs: CutOuts | None  # in W
+
+
+@contextmanager
+def _opened(path: Path, up: str, export: bool) -> Iterator[_Parts]:
+    """Opens a mesh, and exports its solid part for Drake or not."""
+    with TemporaryDirectory(prefix="splatpilot-") as folder:
+        with readable(path, "mesh"):
+            parts = _split(path, Path(folder) if export else None, _UP[up])
+        yield parts
+
+
+def _split(path: Path, folder: Path | None, R_WM: NDArray[np.float64]) -> _Parts:
+    scene, document = _read(path)
+    materials = document.get("materials", [])
+    cut_materials: dict[int, CutMaterial | None] = {}
+    solid, cut = [], {}
+    primitives = [p for mesh in document.get("meshes", []) for p in mesh["primitives"]]
+    for primitive, (name, mesh) in zip(primitives, scene.geometry.items(), strict=True):
+        if not isinstance(mesh, trimesh.Trimesh):
+            continue
+        number, visual = primitive.get("material", -1), cast(Any, mesh.visual)
+        if number < 0:
+            mesh.visual = TextureVisuals(material=PBRMaterial(doubleSided=True))
+            solid.append(name)
+            continue
+        material = materials[number]
+        if number not in cut_materials:
+            cut_materials[number] = _cut_material(document, material, visual.material)
+        if cut_materials[number] is not None:
+            cut[name] = number
+        # A mask without a texture is visible or not as a whole.
+        elif material.get("alphaMode") != "MASK" or (
+            _base_color(material)[3] >= material.get("alphaCutoff", _CUTOFF)
+        ):
+            visual.material = _opaque(visual.material, number)
+            solid.append(name)
+    surface, _, _ = _surface(scene, solid, R_WM)
+    cut_outs = None
+    if cut:
+        holed, uv, names = _surface(scene, cut, R_WM)
+        order = sorted(set(cut.values()))
+        found = [each for number in order if (each := cut_materials[number]) is not None]
+        material = np.array([order.index(cut[name]) for name in names], dtype=np.intp)
+        cut_outs = CutOuts(holed, uv, material, found)
+    if not solid and not cut:
+        raise ValueError("it holds no triangles")
+    scene.delete_geometry([name for name in scene.geometry if name not in solid])
+    if not solid or folder is None:
+        return _Parts(None, surface, cut_outs)
+    files = export_gltf(
+        scene, merge_buffers=True, tree_postprocessor=lambda tree: _restore(tree, document)
+    )
+    for name, content in files.items():
+        (folder / name).write_bytes(content)
+    return _Parts(folder / "model.gltf", surface, cut_outs)
+
+
+def _read(path: Path) -> tuple[Any, dict[str, Any]]:
+    """Returns a mesh, and its description in glTF, whose primitives are in the mesh's order."""
+    require_readable_size(path, 4 * path.stat().st_size)
+    scene: Any = trimesh.load(path, force="scene", process=False)
+    content = path.read_bytes()
+    if path.suffix == ".obj":
+        for mesh in scene.geometry.values():
+            # Its materials are not metallic, as glTF's are by default.
+            mesh.visual = mesh.visual if mesh.visual.kind == "texture" else TextureVisuals()
+            mesh.visual.material = mesh.visual.material.to_pbr()
+            mesh.visual.material.metallicFactor, mesh.visual.material.roughnessFactor = 0.0, 1.0
+        content = scene.export(file_type="glb")
+        scene = trimesh.load(BytesIO(content), file_type="glb", force="scene", process=False)
+    if content.startswith(b"glTF"):  # binary: a header, then the description
+        (size,) = struct.unpack_from("<I", content, 12)
+        content = content[20 : 20 + size]
+    return scene, json.loads(content)
+
+
+def _base_color(material: dict[str, Any]) -> list[float]:
+    return material.get("pbrMetallicRoughness", {}).get("baseColorFactor", [1.0, 1.0, 1.0, 1.0])
+
+
+def _opaque(material: PBRMaterial, number: int) -> PBRMaterial:
+    """Returns a material, named by its number, without alpha in its textures."""
+    opaque = material.copy()
+    opaque.name, opaque.alphaMode, opaque.doubleSided = str(number), None, True
+    for key in ("baseColorTexture", "emissiveTexture", "occlusionTexture"):
+        if (image := getattr(opaque, key)) is not None:
+            setattr(opaque, key, image.convert("RGB"))
+    return opaque
+
+
+def _restore(tree: dict[str, Any], document: dict[str, Any]) -> None:
+    """Restores what trimesh does not keep of the materials of `document`: colors finer than 8 bits,
+    samplers and transforms of textures, and the translucence of panes."""
+    tree["samplers"] = document.get("samplers", [])
+    for exported in tree.get("materials", []):
+        if "name" not in exported:
+            continue
+        material = document["materials"][int(exported["name"])]
+        color = _base_color(material)
+        pbr = exported.setdefault("pbrMetallicRoughness", {})
+        if material.get("alphaMode") == "BLEND":
+            exported["alphaMode"], pbr["baseColorFactor"] = "BLEND", color
+        else:
+            pbr["baseColorFactor"] = [*color[:3], 1.0]
+        originals = {**material, **material.get("pbrMetallicRoughness", {})}
+        for key, info in [*exported.items(), *pbr.items()]:
+            if key.endswith("Texture"):
+                texture = document["textures"][originals[key]["index"]]
+                sampler = {"sampler": texture["sampler"]} if "sampler" in texture else {}
+                tree["textures"][info["index"]].update(sampler)
+                info.update(originals[key] | {"index": info["index"], "texCoord": 0})
+    if not tree["samplers"]:
+        del tree["samplers"]
+
+
+def _cut_material(
+    document: dict[str, Any], material: dict[str, Any], read: PBRMaterial
+) -> CutMaterial | None:
+    """Returns a material whose texture has holes, None for any other."""
+    pbr, mode = material.get("pbrMetallicRoughness", {}), material.get("alphaMode", "OPAQUE")
+    for key, info in [*material.items(), *pbr.items()]:
+        if key.endswith("Texture") and getattr(read, key, None) is None:
+            image = document["images"][document["textures"][info["index"]]["source"]]
+            raise ValueError(f"its image {image.get('uri', '')[:80]} cannot be read")
+    info, image = pbr.get("baseColorTexture", {}), read.baseColorTexture
+    if mode == "OPAQUE" or image is None or not image.has_transparency_data:
+        return None
+    require(info.get("texCoord", 0) == 0, "texCoord of a cut-out", "0", info.get("texCoord"))
+    pixels = np.asarray(image.convert("RGBA"), dtype=np.float32) / 255
+    pixels[..., :3] **= _GAMMA
+    pixels *= np.asarray(_base_color(material), dtype=np.float32)
+    pixels[..., :3] *= pixels[..., 3:]
+    sampler = document.get("samplers", [{}])[document["textures"][info["index"]].get("sampler", 0)]
+    transform = info.get("extensions", {}).get("KHR_texture_transform", {})
+    cos, sin = np.cos(transform.get("rotation", 0.0)), np.sin(transform.get("rotation", 0.0))
+    linear = np.array([[cos, -sin], [sin, cos]]) * transform.get("scale", [1.0, 1.0])
+    return CutMaterial(
+        pixels.astype(np.float32),
+        np.column_stack([linear, transform.get("offset", [0.0, 0.0])]),
+        wrap=[_WRAPS.get(sampler.get(key, 0), "repeat") for key in ("wrapS", "wrapT")],
+        nearest=sampler.get("magFilter") == _NEAREST,
+        cutoff=material.get("alphaCutoff", _CUTOFF) if mode == "MASK" else _VISIBLE,
+        translucent=mode == "BLEND",
+    )
+
+
+def _surface(
+    scene: Any, names: Collection[str], R_WM: NDArray[np.float64]
+) -> tuple[trimesh.Trimesh, NDArray[np.float64], list[str]]:
+    """Returns the T triangles in W of geometries by name, their texture coordinates (T, 3, 2), 0
+    without any, and the name of each."""
+    corners, uv, found = [np.zeros((0, 3, 3))], [np.zeros((0, 3, 2))], []
+    for node in scene.graph.nodes_geometry:
+        X_MN, name = scene.graph[node]
+        if name not in names:
+            continue
+        mesh = scene.geometry[name]
+        corners.append((trimesh.transform_points(mesh.vertices, X_MN) @ R_WM.T)[mesh.faces])
+        own = getattr(mesh.visual, "uv", None)
+        own = np.zeros((len(mesh.vertices), 2)) if own is None else own * [1, -1] + [0, 1]
+        uv.append(own[mesh.faces])
+        found += len(mesh.faces) * [name]
+    p_WQ = np.concatenate(corners).reshape(-1, 3)
+    if not (np.abs(p_WQ) <= _MAX_POSITION).all():
+        raise ValueError(f"positions must be finite and within {_MAX_POSITION:g} m")
+    faces = np.arange(len(p_WQ)).reshape(-1, 3)
+    return trimesh.Trimesh(p_WQ, faces, process=False), np.concatenate(uv), found
