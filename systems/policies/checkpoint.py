@@ -62,7 +62,7 @@ class PolicyCheckpoint:
             spec: the required architecture, or a function that makes one from its fields.
 
         Raises:
-            FileNotFoundError: if there is no such file.
+            FileNotFoundError: if the file is missing.
             ValueError: if it is damaged, or of another policy, version or architecture.
         """
         path = Path(path) if path else shipped_weights(policy)

@@ -58,11 +58,12 @@ def convolution_shapes(layers: Sequence[Convolution]) -> dict[str, tuple[int, ..
 
 def output_size(image: tuple[int, int, int], layers: Sequence[Convolution]) -> tuple[int, int, int]:
     """Computes channels, height and width of the output for those of the image."""
-    channels, *sizes = image
+    channels, height, width = image
     for layer in layers:
         margin = 2 * layer.padding - layer.dilation * (layer.kernel - 1) - 1
-        channels, sizes = layer.outputs, [(size + margin) // layer.stride + 1 for size in sizes]
-    return channels, *sizes
+        height, width = ((size + margin) // layer.stride + 1 for size in (height, width))
+        channels = layer.outputs
+    return channels, height, width
 
 
 def opencv_net(

@@ -69,7 +69,7 @@ def select_distinct(
     """Returns the indices (count,) of cheap distinct trajectories, cheapest first.
 
     Greedy: repeatedly the cheapest whose mean distance from all chosen ones exceeds `separation`;
-    if there is none, the most distant.
+    without one, the most distant.
 
     Args:
         positions: (N, S, 3) [m].

@@ -86,7 +86,7 @@ class ReactiveConfig(Config):
 
 
 def nearest_points(depth: np.ndarray, config: ReactiveConfig) -> np.ndarray:
-    """Returns the nearest point p_CQ (rows * columns, 3) [m] of each block, NaN if there is none.
+    """Returns the nearest point p_CQ (rows * columns, 3) [m] of each block, or NaN.
 
     Args:
         depth: (H, W) [m] planar; infinity: nothing in range, 0: no measurement.

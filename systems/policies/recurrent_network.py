@@ -91,11 +91,10 @@ class NetworkSpec(DepthSpec):
         """Returns the shapes of all arrays of weights by name."""
         H, inputs = self.hidden_size, self.image_outputs() + self.state_features
         shapes = convolution_shapes(depth_layers(self.convolutions))
-        shapes |= linear_shapes(
-            ("state_layer", self.state_size, self.state_features), ("head", H, self.output_size)
-        )
+        shapes |= linear_shapes(("state_layer", self.state_size, self.state_features))
         shapes |= {"memory.weight_ih": (3 * H, inputs), "memory.weight_hh": (3 * H, H)}
-        return shapes | {"memory.bias_ih": (3 * H,), "memory.bias_hh": (3 * H,)}
+        shapes |= {"memory.bias_ih": (3 * H,), "memory.bias_hh": (3 * H,)}
+        return shapes | linear_shapes(("head", H, self.output_size))
 
 
 class RecurrentNetwork:

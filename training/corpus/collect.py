@@ -313,7 +313,7 @@ def run(*, config: CorpusConfig, out: Path, worlds: int, jobs: int | None = None
 
 
 def _damage(out: Path, source: WorldSource, config: CorpusConfig) -> str:
-    """Describes the damage of a collected world, "" if there is none.
+    """Describes the damage of a collected world; empty without damage.
 
     Raises:
         ValueError: if it is of another version or definition.

@@ -138,7 +138,7 @@ def _require_all(folder: Path, needed: set[str], present: Any) -> None:
     """Raises ValueError if one of the needed folders is missing."""
     if missing := sorted(needed.difference(present)):
         raise ValueError(
-            f"No such folder: {folder / missing[0]}, of which {LEDGER} or shards tell; {_REMEDY}"
+            f"No such folder: {folder / missing[0]}, which {LEDGER} or shards name; {_REMEDY}"
         )
 
 
@@ -156,7 +156,7 @@ def distinct_worlds(corpora: Sequence[Corpus]) -> dict[str, WorldRecord]:
     records: dict[str, WorldRecord] = {}
     for world in chain.from_iterable(corpus.worlds for corpus in corpora):
         first = records.setdefault(world.name, world)
-        if not first.has_distances_of(world):
+        if not first.has_same_distances(world):
             raise ValueError(
                 f"{first.path} and {world.path} are different worlds of one name; collect one of "
                 "the corpora again, with another seed or another name of the file of its kind"

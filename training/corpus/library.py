@@ -57,7 +57,7 @@ class WorldRecord:
     """The folder of a world in a corpus.
 
     Raises:
-        FileNotFoundError, ValueError: if there is none, or a damaged one.
+        FileNotFoundError, ValueError: if it is missing or damaged.
     """
 
     def __init__(self, path: Path) -> None:
@@ -75,7 +75,7 @@ class WorldRecord:
         """The distance field, read from disk."""
         return Esdf.load(self.path / _ESDF)
 
-    def has_distances_of(self, other: "WorldRecord") -> bool:
+    def has_same_distances(self, other: "WorldRecord") -> bool:
         """Tells whether another record has the same distances."""
         files = self.path / _ESDF, other.path / _ESDF
         return files[0].samefile(files[1]) or _equal(*map(Esdf.load, files))

@@ -79,7 +79,8 @@ def noisy_color(color: Tensor, noise: ObservationNoise, generator: torch.Generat
 def blur(color: Tensor, sigma: float) -> Tensor:
     """Blurs colors (N, H, W, 3) by a Gaussian of a standard deviation [px], as `cv2.GaussianBlur`
     does floats: it ends after 4 sigma, and images are reflected at their borders."""
-    return gaussian_blur(color.movedim(-1, 1), round(8 * sigma + 1) | 1, sigma).movedim(1, -1)
+    size = [round(8 * sigma + 1) | 1] * 2
+    return gaussian_blur(color.movedim(-1, 1), size, [sigma, sigma]).movedim(1, -1)
 
 
 def change_appearance(color: Tensor, appearance: Appearance, generator: torch.Generator) -> Tensor:

@@ -6,7 +6,7 @@ Tensors may be on any device; the native code runs on the CPU.
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -56,7 +56,7 @@ class Geometry(Protocol):
 class _Casting:
     """Renders depth by native worlds."""
 
-    _native: _native.ShapeWorlds | _native.GridWorlds
+    _native: Any  # `_native.ShapeWorlds` or `_native.GridWorlds`
 
     def depth(self, p_WC: Tensor, R_WC: Tensor, rays: PixelRays, world: Tensor) -> Tensor:
         depth = torch.empty(len(p_WC), len(rays.directions_C))

@@ -60,7 +60,7 @@ class StudentTraining(CorpusTraining):
     """A training run of a student."""
 
     observation: ClassVar[str]
-    """What the student sees: rgb or depth."""
+    """Kind of images: rgb or depth."""
 
     schedule: Schedule = field(
         default_factory=lambda: Schedule(

@@ -95,7 +95,7 @@ class Trainer:
     generator: torch.Generator  # source of all random numbers of the losses
     # Digest of the files that it reads. A run is not resumed if they have changed.
     learns_from: str = ""
-    evaluated: str = "flights"  # of which `success` is a fraction
+    evaluated: str = "flights"  # counted by `success`
     metrics: str = FLIGHTS  # description of the results of `evaluate` for the model card
 
     def begin_update(self, update: int) -> None:

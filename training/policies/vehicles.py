@@ -72,8 +72,8 @@ class PointMass(NamedTuple):
 
     def decay_gradient(self, factor: float) -> "PointMass":
         """Multiplies the gradient of the state by `factor` in the backward pass."""
-        decayed = (torch.lerp(x.detach(), x, factor) for x in (self.p, self.v, self.a))
-        return PointMass(*decayed, self.yaw, self.lag)
+        p, v, a = (torch.lerp(x.detach(), x, factor) for x in (self.p, self.v, self.a))
+        return self._replace(p=p, v=v, a=a)
 
 
 class BodyRate(NamedTuple):
