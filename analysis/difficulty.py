@@ -271,8 +271,7 @@ def bottleneck(field: DistanceField, grid: NDArray, p_WS: NDArray, p_WG: NDArray
 
 
 def run(*, scenarios: Sequence[str], seeds: int) -> list[str]:
-    """
-    Prints for each scenario how many seeds are feasible, and the mean time of generation and the
+    """Prints for each scenario how many seeds are feasible, and the mean time of generation and the
     mean difficulty of these. Scenarios without their scene are not run.
 
     Args:

@@ -12,8 +12,7 @@ from splatpilot.systems.collision.field_mesh import field_mesh, require_mesh_nam
 def run(
     *, what: str, out: Path, conservative: bool, seed: int | None, overrides: Sequence[str]
 ) -> None:
-    """
-    Writes the surfaces of an environment and prints their number of triangles.
+    """Writes the surfaces of an environment and prints their number of triangles.
 
     Args:
         what: a scene folder, an OctoMap or a scenario.

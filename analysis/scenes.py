@@ -60,8 +60,7 @@ def default_config() -> RenderedSceneConfig:
 def run(
     *, names: Sequence[str], data: Path | None, scenes: Path, overrides: Sequence[str] = ()
 ) -> None:
-    """
-    Makes the scene folders `scenes/NAME`, one after the other; the same call resumes.
+    """Makes the scene folders `scenes/NAME`, one after the other; the same call resumes.
 
     Rendered captures are kept in `scenes/captures/NAME`.
 

@@ -60,8 +60,7 @@ def run(
     overrides: Sequence[str] = (),
     overwrite: bool = False,
 ) -> Path:
-    """
-    Writes a page.
+    """Writes a page.
 
     Args:
         what: a scene folder, a file of Gaussians, an OctoMap, the folder of a capture, a video, or

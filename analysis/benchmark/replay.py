@@ -42,8 +42,7 @@ def run(
     video: bool = False,
     overwrite: bool = False,
 ) -> Agreement:
-    """
-    Flies one flight of a study again, from the study's folder alone, and compares it with its
+    """Flies one flight of a study again, from the study's folder alone, and compares it with its
     record.
 
     Args:
@@ -93,8 +92,7 @@ def run(
 def overlay(
     *, study: Path, ids: Sequence[str], out: Path | None = None, overwrite: bool = False
 ) -> Path:
-    """
-    Writes a page with several recorded flights through one world, in different colors, without
+    """Writes a page with several recorded flights through one world, in different colors, without
     plans and camera images.
 
     Args:

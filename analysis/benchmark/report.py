@@ -63,8 +63,7 @@ def write_report(
     absent: dict[str, str],
     damaged: list[str],
 ) -> None:
-    """
-    Writes `report.html` and its figures, `success_against_speed.png` and `trajectories.png`.
+    """Writes `report.html` and its figures, `success_against_speed.png` and `trajectories.png`.
 
     Args:
         folder, config: the study.

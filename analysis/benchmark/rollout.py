@@ -59,8 +59,7 @@ class Fault(NamedTuple):
 
 
 def flight_metrics(flight: Flight, shortest: float) -> dict[str, float | str | bool]:
-    """
-    Computes the metrics of a flight, by their columns.
+    """Computes the metrics of a flight, by their columns.
 
     - `success`: reached the goal, with a clearance at the vehicle's radius that is never negative;
     - `outcome`: `goal`, `collision`, `left_volume`, `timeout` or `error`;
@@ -122,8 +121,7 @@ def fly_rollouts(
     modules: Sequence[str] = (),
     policies: Sequence[str] = (),
 ) -> list[Rollout | Fault]:
-    """
-    Flies flights in this process, up to the first fault.
+    """Flies flights in this process, up to the first fault.
 
     Args:
         flights: with their scenarios as YAML; Drake's configurations and some exceptions cannot be

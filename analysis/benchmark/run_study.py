@@ -34,7 +34,7 @@ from splatpilot.diagrams.worlds.scene_folder import SceneSource, find_scene
 from splatpilot.diagrams.worlds.world_registry import WORLDS
 from splatpilot.systems.common.config import dump_config
 from splatpilot.systems.common.extras import import_extra
-from splatpilot.systems.common.files import holds_folder
+from splatpilot.systems.common.files import locks_folder
 from splatpilot.systems.common.processes import available_cores, map_processes
 from splatpilot.systems.common.progress import Progress, resumable
 from splatpilot.systems.common.provenance import program
@@ -47,8 +47,7 @@ _CHUNK = 6  # maximum number of flights through one world that a worker takes to
 def fly_all(
     flights: Iterable[tuple[RolloutSpec, Scenario]], jobs: int, cluster: str | None = None
 ) -> Generator[Rollout | Fault, None, None]:
-    """
-    Flies rollouts in worker processes and yields them as they end, in any order.
+    """Flies rollouts in worker processes and yields them as they end, in any order.
 
     Args:
         flights: to fly; one worker flies neighbors through the same world.
@@ -90,7 +89,7 @@ def chunks[Payload](
         yield from map(list, batched(neighbors, size))
 
 
-@holds_folder("out")
+@locks_folder("out")
 def run(
     *,
     config: StudyConfig,
@@ -98,8 +97,7 @@ def run(
     jobs: int | None = None,
     cluster: str | None = None,
 ) -> list[Row]:
-    """
-    Flies the missing flights of a study, and writes tables and report; for the files, see
+    """Flies the missing flights of a study, and writes tables and report; for the files, see
     `splatpilot.analysis.benchmark.study_folder`.
 
     The same call resumes an interrupted study, whose files, except timings, are then bitwise

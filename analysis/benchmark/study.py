@@ -10,7 +10,7 @@ from splatpilot.analysis.benchmark.variants import SCENARIO, Variant, parse_vari
 from splatpilot.diagrams.flight.policies import (
     BENCHMARK_POLICIES,
     MAX_SPEED,
-    speed_of,
+    policy_speed,
 )
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.scenarios import benchmark_scenarios, scenario_file
@@ -128,7 +128,7 @@ class StudyConfig:
             return
         if not _has_own_policy(file):
             raise ValueError(f"{file} has no `policy`, which --policies {SCENARIO} would fly")
-        speed = speed_of(policy)
+        speed = policy_speed(policy)
         if speed is not None and self.speeds != [speed]:
             raise ValueError(
                 f"the policy of {file} flies at {speed:g} m/s, its own speed; give --speeds "

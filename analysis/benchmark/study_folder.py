@@ -48,7 +48,7 @@ from splatpilot.systems.common.files import (
     require_writable_folder,
     written_atomically,
 )
-from splatpilot.systems.common.readers import read_archive, read_text, reason_of, yaml_errors
+from splatpilot.systems.common.readers import error_summary, read_archive, read_text, yaml_errors
 from splatpilot.systems.common.validation import require
 
 FORMAT_VERSION = 1
@@ -79,8 +79,7 @@ class StudyFolder:
         return self.path / "rollouts" / f"{id}.npz"
 
     def begin(self, config: StudyConfig, program: dict[str, str]) -> None:
-        """
-        Creates the folder, or checks that it has the same study.
+        """Creates the folder, or checks that it has the same study.
 
         Args:
             config: of the study.
@@ -164,13 +163,7 @@ class StudyFolder:
         return file
 
     def read(self, spec: RolloutSpec) -> tuple[Row, dict[str, np.ndarray]]:
-        """
-        Reads the row and the arrays of a flight; no arrays if it could not be flown.
-
-        Raises:
-            FileNotFoundError: if it is missing.
-            ValueError: if its file is damaged or of another flight.
-        """
+        """Reads the row and the arrays of a flight; no arrays if it could not be flown."""
         file = self.trajectory(spec.id)
         try:
             arrays = read_archive(file)
@@ -186,7 +179,7 @@ class StudyFolder:
         except FileNotFoundError:
             raise
         except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-            raise ValueError(f"{file} is damaged: {reason_of(error)}") from None
+            raise ValueError(f"{file} is damaged: {error_summary(error)}") from None
         if {name: row.get(name) for name in spec._fields} != spec._asdict():
             raise ValueError(f"{file} is of another flight, {row}")
         return {"id": spec.id} | row, arrays
@@ -348,7 +341,7 @@ def plugin_digests(scenarios: Iterable[Scenario]) -> dict[str, str]:
             (WORLDS, scenario.world),
             *((SENSORS, sensor) for sensor in scenario.sensors.values()),
         ):
-            entry: Any = registry.kind_of(config)
+            entry: Any = registry.entry_for(config)
             parts = (getattr(entry, field.name) for field in fields(entry))
             modules = [getattr(part, "__module__", None) for part in (type(config), *parts)]
             packages |= {module.partition(".")[0] for module in modules if module}

@@ -46,8 +46,7 @@ def wilson_interval(successes: int, flights: int, confidence: float = 0.95) -> I
 def cluster_interval(
     successes: ArrayLike, flights: ArrayLike, confidence: float = 0.95
 ) -> Interval:
-    """
-    Returns the percentile interval of a success rate by a bootstrap over scenarios.
+    """Returns the percentile interval of a success rate by a bootstrap over scenarios.
 
     It is [0, 1] for fewer than two scenarios. If all have the same rate, it is Wilson's with each
     scenario counted as one flight.
@@ -68,8 +67,7 @@ def cluster_interval(
 
 
 def mcnemar(first: np.ndarray, second: np.ndarray) -> tuple[int, int, float]:
-    """
-    Computes the exact test of McNemar (Psychometrika 12, 1947).
+    """Computes the exact test of McNemar (Psychometrika 12, 1947).
 
     Args:
         first, second: successes of two policies in the same flights, (n,) bool.

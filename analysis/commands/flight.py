@@ -41,13 +41,13 @@ def fly(options: argparse.Namespace) -> Any:
 def _flight_name(options: argparse.Namespace, scenario: Any) -> str:
     """Names a flight by its scenario, scene or world, policy, speed and seed, as studies do."""
     from splatpilot.analysis.benchmark.study import flight_name
-    from splatpilot.diagrams.flight.policies import name_of, speed_of
+    from splatpilot.diagrams.flight.policies import policy_name, policy_speed
 
     world = options.scene or options.scenario
     if world is None:
         world = type(scenario.world).__name__.removesuffix("Config").lower()
-    policy = parse_variant(options.policy).label if options.policy else name_of(scenario.policy)
-    return flight_name(Path(world).stem, policy, speed_of(scenario.policy), scenario.seed)
+    policy = parse_variant(options.policy).label if options.policy else policy_name(scenario.policy)
+    return flight_name(Path(world).stem, policy, policy_speed(scenario.policy), scenario.seed)
 
 
 def _scenario_defaults(options: argparse.Namespace) -> Any:

@@ -128,8 +128,7 @@ def run() -> NoReturn:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """
-    Runs `splatpilot COMMAND ...`.
+    """Runs `splatpilot COMMAND ...`.
 
     Args:
         arguments: the words after `splatpilot`; those of the process if None.

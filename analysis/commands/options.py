@@ -31,8 +31,7 @@ EXAMPLES = "examples:"
 
 
 class Option:
-    """
-    An option or argument of commands.
+    """An option or argument of commands.
 
     Args:
         spec: flag, or name of an argument, and its metavar, such as "--seeds N".
@@ -188,8 +187,7 @@ class SetField(argparse.Action):
 
 
 def set_option(*examples: str, configuration: str | Callable[[argparse.Namespace], Any]) -> Option:
-    """
-    Declares `--set` of a command.
+    """Declares `--set` of a command.
 
     Args:
         examples: FIELD=VALUE of the most important fields.

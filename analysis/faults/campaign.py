@@ -13,7 +13,7 @@ from splatpilot.diagrams.flight.policies import policy_named
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.worlds.forest.forest import ForestConfig
 from splatpilot.diagrams.worlds.world_registry import make_world
-from splatpilot.systems.common.files import claim_folder, holds_folder, written_atomically
+from splatpilot.systems.common.files import claim_folder, locks_folder, written_atomically
 from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.common.validation import Config, bounded
 from splatpilot.systems.messaging.flight_limits import FlightLimits
@@ -41,10 +41,9 @@ class FaultsConfig(Config):
     scenario: Scenario = field(default_factory=_scenario)
 
 
-@holds_folder("out")
+@locks_folder("out")
 def run(*, config: FaultsConfig, out: Path) -> dict[str, Any]:
-    """
-    Flies the trials, or resumes an interrupted campaign of the same configuration.
+    """Flies the trials, or resumes an interrupted campaign of the same configuration.
 
     Writes into `out`: `trials.jsonl`, results of `fly_trial`; `config.yaml`; `summary.json`, the
     number of safe trials and the outcomes by the type of fault, which is also returned.

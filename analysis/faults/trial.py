@@ -26,7 +26,7 @@ from splatpilot.diagrams.hardware.bridge import BuildHardwareDiagram, HardwareCo
 from splatpilot.diagrams.hardware.real_time import output
 from splatpilot.diagrams.hardware.vehicle import BuildVehicleDiagram
 from splatpilot.diagrams.worlds.world import World
-from splatpilot.systems.common.drake import vector_input, weakly
+from splatpilot.systems.common.drake import vector_input, weak_callback
 from splatpilot.systems.messaging import codecs
 from splatpilot.systems.messaging.bridge_status import UnixClock
 from splatpilot.systems.messaging.failsafe import FailsafeConfig
@@ -118,8 +118,7 @@ class Trial:
 
 
 class Relay:
-    """
-    Carries messages between two LCMs, with faults.
+    """Carries messages between two LCMs, with faults.
 
     Args:
         vehicle, bridge: transports of either.
@@ -141,7 +140,7 @@ class Relay:
         self._ends, self._count, self._now = (vehicle, bridge), 0, 0.0
         self._waiting: list[tuple[float, int, Callable[[bytes], None], bytes]] = []
         self._state: bytes | None = None  # that is frozen
-        take = weakly(self._take)  # The relay owns LCM, which owns its callbacks.
+        take = weak_callback(self._take)  # The relay owns LCM, which owns its callbacks.
         for sender, signals in ((vehicle, from_vehicle), (bridge, from_bridge)):
             for codec in signals:
                 sender.subscribe(codec.channel, partial(take, codec, sender is vehicle))
@@ -263,8 +262,7 @@ def _spoilt_policy(scenario: Scenario, world: World, faults: tuple[Fault, ...]) 
 def fly_trial(
     scenario: Scenario, world: World, trial: Trial, limits: FlightLimits, seed: int
 ) -> dict[str, Any]:
-    """
-    Flies a scenario, whose policy returns accelerations or velocities, through faults.
+    """Flies a scenario, whose policy returns accelerations or velocities, through faults.
 
     The diagrams of vehicle and bridge exchange messages through a `Relay`.
 

@@ -34,7 +34,7 @@ from splatpilot.diagrams.worlds.scene_folder import (
 )
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.common.config import dump_config
-from splatpilot.systems.common.files import claim_folder, holds_folder, written_atomically
+from splatpilot.systems.common.files import claim_folder, locks_folder, written_atomically
 from splatpilot.systems.common.progress import Progress, resumable
 from splatpilot.systems.common.validation import Config, bounded, require_field
 from splatpilot.training.captures.capture import CaptureFrame, shrink
@@ -90,7 +90,7 @@ class StudiedScenes:
     config: FidelityConfig = field(default_factory=FidelityConfig)
 
 
-@holds_folder("out")
+@locks_folder("out")
 def run(
     scenes: Sequence[Path],
     out: Path,

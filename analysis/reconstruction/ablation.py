@@ -27,7 +27,7 @@ from splatpilot.analysis.reconstruction.measure_scene import (
 )
 from splatpilot.diagrams.worlds.scene_folder import read_scene_metadata
 from splatpilot.systems.common.config import dump_config
-from splatpilot.systems.common.files import claim_folder, holds_folder, written_atomically
+from splatpilot.systems.common.files import claim_folder, locks_folder, written_atomically
 from splatpilot.systems.common.progress import resumable
 from splatpilot.systems.common.torch_device import require_renderer
 from splatpilot.systems.common.validation import require
@@ -183,7 +183,7 @@ def arm_config(arm: Arm, config: ReconstructConfig) -> ReconstructConfig:
     )
 
 
-@holds_folder("out")
+@locks_folder("out")
 def run(
     captures: Sequence[Path], out: Path, config: ReconstructConfig, overwrite: bool = False
 ) -> AblationResult:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from splatpilot.analysis.reconstruction.measure_scene import VIEWS, SceneMetrics, measure_scene
 from splatpilot.diagrams.worlds.scene_folder import CAPTURE, check_scene_target, read_scene_metadata
-from splatpilot.systems.common.files import held_folder, require_unused
+from splatpilot.systems.common.files import locked_folder, require_unused
 from splatpilot.systems.common.progress import resumable
 from splatpilot.systems.common.torch_device import require_renderer
 from splatpilot.systems.common.validation import bounded
@@ -74,7 +74,7 @@ def run(
     doubted = doubts(opened)
     for doubt in doubted:  # at once, and again in the summary
         print(f"warning: {doubt}", flush=True)
-    with held_folder(work_folder(out)):
+    with locked_folder(work_folder(out)):
         with resumable(lambda: kept_work(out)):
             summary = reconstruct(opened, out, config, restart=restart)
         summary = replace(summary, warnings=(*doubted, *summary.warnings))

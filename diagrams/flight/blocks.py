@@ -37,9 +37,9 @@ class Autonomy(NamedTuple):
 
 def make_policy(scenario: Scenario, world: World) -> System:
     """Builds the scenario's policy."""
-    kind = POLICIES.kind_of(scenario.policy)
+    kind = POLICIES.entry_for(scenario.policy)
     policy = kind.build(scenario.policy, world, scenario.vehicle)
-    what = f"the result of building the policy {POLICIES.name_of(kind)!r}"
+    what = f"the result of building the policy {POLICIES.entry_name(kind)!r}"
     require(isinstance(policy, System), what, "a Drake system", type(policy).__name__)
     return policy
 
@@ -305,7 +305,7 @@ def AddSensors(
     for name, config in sensors.items():
         if name in _RESERVED:
             raise ValueError(f"a sensor is named {name!r}, as a part of the flight; rename it")
-        sensor = SENSORS.kind_of(config).build(config, world)
+        sensor = SENSORS.entry_for(config).build(config, world)
         what = f"the result of building the sensor {name!r}"
         require(isinstance(sensor, System), what, "a Drake system", type(sensor).__name__)
         builder.AddNamedSystem(name, sensor)

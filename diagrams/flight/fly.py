@@ -32,7 +32,7 @@ from splatpilot.diagrams.worlds.appearance import randomize_appearance
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.common.files import (
-    holds_folder,
+    locks_folder,
     require_unused,
     require_writable_folder,
     written_atomically,
@@ -108,7 +108,7 @@ def _heights(world: World) -> tuple[float, float]:
 _TRACEBACK = "traceback.txt"
 
 
-@holds_folder("out")
+@locks_folder("out")
 def run(
     *,
     scenario: Scenario,

@@ -53,7 +53,7 @@ class PolicyConfig(Protocol):
 
 
 @dataclass(frozen=True)
-class PolicyKind:
+class PolicyEntry:
     """Entry of the registry.
 
     `build` makes a system, with ports as `BuildFlightDiagram` connects them, of a configuration,
@@ -66,7 +66,7 @@ class PolicyKind:
     speed_field: str
 
 
-POLICIES = Registry("policy", "splatpilot.policies", PolicyKind)
+POLICIES = Registry("policy", "splatpilot.policies", PolicyEntry)
 """All policies by name."""
 
 
@@ -81,7 +81,7 @@ def register_policy(
 
     Args:
         config: type of its configurations, see `PolicyConfig`; its name is their YAML tag.
-        build, speed_field: see `PolicyKind`; a default field that is missing means a fixed speed.
+        build, speed_field: see `PolicyEntry`; a default field that is missing means a fixed speed.
         name: by default that of the type without "Config", in lower case.
 
     Raises:
@@ -90,7 +90,7 @@ def register_policy(
     require_configuration(config)
     if speed_field == "speed" and "speed" not in {field.name for field in fields(config)}:
         speed_field = ""
-    kind = PolicyKind(config, build, speed_field)
+    kind = PolicyEntry(config, build, speed_field)
     POLICIES.add(name or config.__name__.removesuffix("Config").lower(), kind)
 
 
@@ -143,31 +143,31 @@ def policy_named(name: str, speed: float = DEFAULT_SPEED) -> Any:
 
 def at_speed(config: Any, speed: float) -> Any:
     """Changes the nominal speed [m/s] of a policy's configuration."""
-    field = POLICIES.kind_of(config).speed_field
+    field = POLICIES.entry_for(config).speed_field
     if not field:
         raise ValueError(
-            f"the policy {name_of(config)} flies as fast as it has learned, not at {speed:g} m/s; "
-            "leave the speed out"
+            f"the policy {policy_name(config)} flies as fast as it has learned, not at {speed:g} "
+            "m/s; leave the speed out"
         )
     require(0.0 < speed <= MAX_SPEED, "the speed", f"in (0, {MAX_SPEED:g}] m/s", f"{speed:g}")
     return _with_field(config, field, speed)
 
 
-def speed_of(config: Any) -> float | None:
+def policy_speed(config: Any) -> float | None:
     """Returns the nominal speed [m/s] of a policy; None if it is fixed."""
-    field = POLICIES.kind_of(config).speed_field
+    field = POLICIES.entry_for(config).speed_field
     return operator.attrgetter(field)(config) if field else None
 
 
-def name_of(config: Any) -> str:
+def policy_name(config: Any) -> str:
     """Returns the name of a configuration's policy; raises ValueError if there is none."""
-    return POLICIES.name_of(POLICIES.kind_of(config))
+    return POLICIES.entry_name(POLICIES.entry_for(config))
 
 
 def weights_file(config: Any) -> Path | None:
     """Returns a policy's file of weights; None if it has none."""
     given = getattr(config, "weights", None)
-    file = Path(given) if given else shipped_weights(name_of(config))
+    file = Path(given) if given else shipped_weights(policy_name(config))
     return file if given is not None and file.is_file() else None
 
 

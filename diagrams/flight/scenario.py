@@ -12,7 +12,7 @@ from splatpilot.diagrams.flight.policies import POLICIES, PolicyConfig
 from splatpilot.diagrams.flight.sensors import SENSORS, SensorConfig
 from splatpilot.diagrams.worlds.forest.forest import ForestConfig
 from splatpilot.diagrams.worlds.world_registry import WORLDS, WorldConfig
-from splatpilot.systems.common.config import open_field
+from splatpilot.systems.common.config import registry_field
 from splatpilot.systems.common.seeds import check_seed
 from splatpilot.systems.common.validation import (
     Config,
@@ -69,7 +69,7 @@ class Scenario(Config):
     # Seed of everything random: generated world, start, noise.
     seed: int = 0
     # World: a generated one, (!SceneConfig) a reconstructed scene, or another of the registry.
-    world: WorldConfig = open_field(WORLDS, ForestConfig)
+    world: WorldConfig = registry_field(WORLDS, ForestConfig)
     # [-] Visual randomization of paint, light, exposure, hue and sky, from 0 (none) to 1. Surfaces
     # stay in place.
     appearance: float = bounded(0.0, "[0, 1]")
@@ -87,9 +87,9 @@ class Scenario(Config):
     # Camera of videos and viewers; policies have cameras of their own.
     camera: CameraConfig = field(default_factory=_default_camera)
     # Policy: the privileged planner, or (!ReactiveConfig, ...) another of the registry.
-    policy: PolicyConfig = open_field(POLICIES, PrivilegedPlannerConfig)
+    policy: PolicyConfig = registry_field(POLICIES, PrivilegedPlannerConfig)
     # Further onboard sensors, by name; see `sensors.py`.
-    sensors: dict[str, SensorConfig] = open_field(SENSORS, dict)
+    sensors: dict[str, SensorConfig] = registry_field(SENSORS, dict)
     # Noise and latency of the policy's camera; none by default.
     observation: ObservationNoise = field(default_factory=ObservationNoise)
     controller: FlatnessControllerConfig = field(default_factory=FlatnessControllerConfig)
@@ -98,7 +98,7 @@ class Scenario(Config):
     def validate(self) -> None:
         parts = [(WORLDS, self.world), (POLICIES, self.policy)]
         for registry, part in [*parts, *((SENSORS, sensor) for sensor in self.sensors.values())]:
-            registry.kind_of(part)
+            registry.entry_for(part)
         try:
             super().validate()
         except FieldError as error:

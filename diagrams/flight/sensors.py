@@ -24,7 +24,7 @@ class SensorConfig(Protocol):
 
 
 @dataclass(frozen=True)
-class SensorKind:
+class SensorEntry:
     """Entry of the registry."""
 
     config: type  # of its configurations
@@ -35,23 +35,22 @@ class SensorKind:
     name of the policy."""
 
 
-SENSORS = Registry("sensor", "splatpilot.sensors", SensorKind)
+SENSORS = Registry("sensor", "splatpilot.sensors", SensorEntry)
 """All sensors, by the names of their configurations' types."""
 
 
 def register_sensor(config: type, build: Callable[[Any, World], System]) -> None:
-    """
-    Registers a sensor.
+    """Registers a sensor.
 
     Args:
         config: type of its configurations, see `SensorConfig`; its name is their YAML tag.
-        build: see `SensorKind.build`.
+        build: see `SensorEntry.build`.
 
     Raises:
         ValueError: if another sensor has the name, or the type is not a configuration.
     """
     require_configuration(config)
-    SENSORS.add(config.__name__, SensorKind(config, build))
+    SENSORS.add(config.__name__, SensorEntry(config, build))
 
 
 def make_camera(config: OnboardCamera, world: World, latency: float = 0.0) -> SplatCamera:

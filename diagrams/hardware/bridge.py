@@ -75,8 +75,7 @@ def BuildHardwareDiagram(
     policy: System | None = None,
     controller: System | None = None,
 ) -> Diagram:
-    """
-    Builds the diagram that flies a vehicle by messages: that of `BuildFlightDiagram` with
+    """Builds the diagram that flies a vehicle by messages: that of `BuildFlightDiagram` with
     subscribers instead of plant and camera. It runs with the wall clock, see `run_in_real_time`.
 
     Systems, by name: those of `AddPolicyAndController` and `MessagePorts`; `state_predictor`;
@@ -226,8 +225,7 @@ def require_messages_for(scenario: Scenario, world: World) -> None:
 def run(
     *, scenario: Scenario, config: HardwareConfig, log: Path | None = None, overwrite: bool = False
 ) -> dict[str, float | str]:
-    """
-    Waits for a vehicle's messages and flies it to the scenario's goal.
+    """Waits for a vehicle's messages and flies it to the scenario's goal.
 
     The flight begins when the bridge is in charge of a vehicle in the air, by the vehicle's status
     and the world's map. It ends at the goal; after the scenario's timeout; at a collision or

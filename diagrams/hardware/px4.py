@@ -58,8 +58,7 @@ class Px4Config(Config):
 def BuildPx4Diagram(
     config: Px4Config, lcm: LCM, inbox: UdpInbox, now: Callable[[], float] | None = None
 ) -> Diagram:
-    """
-    Builds the diagram between the bridge's messages and PX4. It replaces `BuildVehicleDiagram`,
+    """Builds the diagram between the bridge's messages and PX4. It replaces `BuildVehicleDiagram`,
     except for images, which sensors send themselves.
 
     Systems, by name: those of `MessagePorts`, `telemetry` and `commander`.
@@ -130,8 +129,7 @@ def BuildPx4Diagram(
 
 
 def run(*, config: Px4Config, duration: float = np.inf) -> None:
-    """
-    Connects the bridge and PX4, for `duration` [s], or until it is interrupted.
+    """Connects the bridge and PX4, for `duration` [s], or until it is interrupted.
 
     Prints changes of PX4's mode, and every ten seconds how long there has been no heartbeat.
     """

@@ -28,8 +28,7 @@ def run_in_real_time(
     over: Callable[[float], bool],
     ready: Callable[[], object] = lambda: None,
 ) -> int:
-    """
-    Advances a diagram, which has a `UnixClock` named `clock`, tick by tick. No tick is updated
+    """Advances a diagram, which has a `UnixClock` named `clock`, tick by tick. No tick is updated
     before its time on the wall clock.
 
     A tick that ends after the begin of the next is an overrun; their number is returned. The

@@ -31,7 +31,7 @@ from splatpilot.diagrams.worlds.appearance import randomize_appearance
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.collision.esdf_collision import EsdfCollision
-from splatpilot.systems.common.files import holds_folder, require_writable_folder
+from splatpilot.systems.common.files import locks_folder, require_writable_folder
 from splatpilot.systems.messaging import codecs
 from splatpilot.systems.messaging.failsafe import Failsafe, FailsafeConfig
 from splatpilot.systems.messaging.flight_limits import FlightLimits
@@ -51,8 +51,7 @@ _NOISE = 1e-6  # [m] in published positions: a failsafe takes a constant state f
 def BuildVehicleDiagram(
     scenario: Scenario, world: World, lcm: LCM, config: HardwareConfig | None = None
 ) -> Diagram:
-    """
-    Builds the diagram of a simulated vehicle, in a world, with the messages of a real one.
+    """Builds the diagram of a simulated vehicle, in a world, with the messages of a real one.
 
     Systems, by name: those of `MessagePorts` and `AddObservation`; `plant`, `pose`, `collision`;
     `failsafe`, which hovers and then lands if commands cease, as autopilots do; `held_command`;
@@ -155,7 +154,7 @@ def _AddVelocityControl(
     return controller.GetOutputPort("command")
 
 
-@holds_folder("out")
+@locks_folder("out")
 def run(*, scenario: Scenario, config: HardwareConfig, out: Path) -> dict[str, float | str]:
     """
     Hovers at the scenario's start and flies by commands until the flight ends; writes the files of

@@ -18,11 +18,7 @@ def other_scenarios() -> dict[str, Path]:
 
 
 def scenario_file(scenario: str) -> Path:
-    """Returns the file of a scenario, given by its name or its path.
-
-    Raises:
-        ValueError: if it is neither.
-    """
+    """Returns the file of a scenario, given by its name or its path."""
     known = benchmark_scenarios() | other_scenarios()
     if scenario in known:
         return known[scenario]

@@ -44,7 +44,7 @@ from splatpilot.systems.common.files import (
     require_writable_folder,
     written_atomically,
 )
-from splatpilot.systems.common.readers import read_text, reason_of, yaml_errors
+from splatpilot.systems.common.readers import error_summary, read_text, yaml_errors
 from splatpilot.systems.common.validation import Config, bounded, require, require_field
 from splatpilot.systems.splats.background import FAR, Background, EnvironmentMap, mean_color
 from splatpilot.systems.splats.scene import GaussianScene
@@ -132,7 +132,7 @@ def read_scene_metadata(path: str | Path) -> SceneMetadata:
         require(valid, "format_version", str(FORMAT_VERSION), version, remedy)
         metadata.validate()
     except Exception as error:  # Drake's reader raises any type.
-        raise ValueError(f"{file}: {reason_of(error)}") from None
+        raise ValueError(f"{file}: {error_summary(error)}") from None
     return metadata
 
 

@@ -40,7 +40,7 @@ class WorldConfig(Protocol):
 
 
 @dataclass(frozen=True)
-class WorldKind:
+class WorldEntry:
     """A registered type of world."""
 
     config: type  # the type of its configurations
@@ -49,7 +49,7 @@ class WorldKind:
 
 
 # All worlds, by the names of their configurations' types
-WORLDS = Registry("world", "splatpilot.worlds", WorldKind)
+WORLDS = Registry("world", "splatpilot.worlds", WorldEntry)
 
 
 def register_world(
@@ -70,7 +70,7 @@ def register_world(
         plan = make_spec
         make = lambda config, seed: build(plan(config, seed))  # noqa: E731
     require_configuration(config)
-    WORLDS.add(config.__name__, WorldKind(config, make, make_spec))
+    WORLDS.add(config.__name__, WorldEntry(config, make, make_spec))
 
 
 def make_world(config: WorldConfig, seed: int) -> World:
@@ -78,7 +78,7 @@ def make_world(config: WorldConfig, seed: int) -> World:
 
     The seed is of generated worlds, inserted obstacles, and start and goal if they are drawn.
     """
-    world = WORLDS.kind_of(config).make(config, seed)
+    world = WORLDS.entry_for(config).make(config, seed)
     if not isinstance(world, World):
         name, made = type(config).__name__, type(world).__name__
         raise ValueError(f"result of make for {name} must be a World, got {made}")
@@ -93,12 +93,12 @@ def scene_config(path: Path) -> SceneConfig | OctomapConfig:
 
 def is_procedural(config: WorldConfig) -> bool:
     """Checks that the world is generated, so that `make_spec` makes it too."""
-    return WORLDS.kind_of(config).make_spec is not None
+    return WORLDS.entry_for(config).make_spec is not None
 
 
 def make_spec(config: WorldConfig, seed: int) -> WorldSpec:
     """Generates the solids, start and goal of a procedural world, without Gaussians and grids."""
-    plan = WORLDS.kind_of(config).make_spec
+    plan = WORLDS.entry_for(config).make_spec
     if plan is None:
         raise ValueError(f"{type(config).__name__} is not a generated world: it has no spec")
     return plan(config, seed)

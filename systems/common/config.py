@@ -15,7 +15,7 @@ from typing import Any, Union, cast, get_args, get_origin
 
 from pydrake.common.yaml import yaml_dump_typed, yaml_load_data, yaml_load_typed
 
-from splatpilot.systems.common.readers import read_text, reason_of, yaml_errors
+from splatpilot.systems.common.readers import error_summary, read_text, yaml_errors
 from splatpilot.systems.common.registry import Registry
 from splatpilot.systems.common.validation import TYPES, did_you_mean, require
 
@@ -61,7 +61,7 @@ class RegistryField(dataclasses.Field):
         """Ignores the annotation, which is for readers and type checkers."""
 
 
-def open_field(registry: Registry, default: Callable[[], Any]) -> Any:
+def registry_field(registry: Registry, default: Callable[[], Any]) -> Any:
     """Declares a field for any configuration of a registry, which a tag names in YAML.
 
     Args:
@@ -110,7 +110,7 @@ def parse_config[Configuration](
             raise
         except Exception as error:  # Drake's reader raises any type.
             unknown = _UNKNOWN_TAG.match(str(error))
-            reason = _unknown_tag(defaults, *unknown.groups()) if unknown else reason_of(error)
+            reason = _unknown_tag(defaults, *unknown.groups()) if unknown else error_summary(error)
             raise ValueError(f"{source}: {reason}") from None
 
 
@@ -135,8 +135,8 @@ def require_configuration(config: type) -> None:
         dump_config(config())
     except Exception as error:  # A missing default, or a type that Drake cannot write.
         raise ValueError(
-            f"{name} makes no YAML ({type(error).__name__}: {reason_of(error)}); give all fields "
-            "defaults, and types of bool, int, float, str, list, dict or other dataclasses"
+            f"{name} makes no YAML ({type(error).__name__}: {error_summary(error)}); give all "
+            "fields defaults, and types of bool, int, float, str, list, dict or other dataclasses"
         ) from None
 
 

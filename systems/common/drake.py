@@ -63,7 +63,7 @@ def _describe(port: InputPort | OutputPort) -> str:
     return f"the {kind} {port.get_name()!r} of {system} ({what})"
 
 
-def weakly(method: Callable[..., Any]) -> Callable[..., Any]:
+def weak_callback(method: Callable[..., Any]) -> Callable[..., Any]:
     """Returns a callback for a bound method that does not keep its system alive.
 
     Drake keeps callbacks of abstract output ports and cache entries as long as the system lives.

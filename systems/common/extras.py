@@ -61,11 +61,7 @@ def load_triton() -> None:
 
 @cache
 def require_opengl() -> None:
-    """Checks in another process that RenderEngineVtk can render, and loads Triton before it does.
-
-    Raises:
-        OSError: if it cannot; the message says what to install.
-    """
+    """Checks in another process that RenderEngineVtk can render; loads Triton before it does."""
     probe = subprocess.run([sys.executable, "-c", _PROBE], capture_output=True, text=True)
     if probe.returncode:
         reason = (probe.stderr.strip().splitlines() or [f"exit status {probe.returncode}"])[-1]

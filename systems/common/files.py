@@ -153,7 +153,7 @@ def claim_folder(file: Path, config: Any, overwrite: bool = False) -> str:
 
 
 @contextmanager
-def held_folder(path: Path) -> Iterator[None]:
+def locked_folder(path: Path) -> Iterator[None]:
     """Locks the folder `path`, made if it is missing, for this process while the block runs.
 
     The lock ends with the process. A folder that was made here and stays empty is removed. Raises
@@ -179,7 +179,7 @@ def held_folder(path: Path) -> Iterator[None]:
                 folder.rmdir()
 
 
-def holds_folder[**P, Result](
+def locks_folder[**P, Result](
     argument: str,
 ) -> Callable[[Callable[P, Result]], Callable[P, Result]]:
     """Decorates a function to lock the folder that its argument of this name gives."""
@@ -189,7 +189,7 @@ def holds_folder[**P, Result](
 
         @functools.wraps(function)
         def holding(*args: P.args, **keywords: P.kwargs) -> Result:
-            with held_folder(Path(signature.bind(*args, **keywords).arguments[argument])):
+            with locked_folder(Path(signature.bind(*args, **keywords).arguments[argument])):
                 return function(*args, **keywords)
 
         return holding

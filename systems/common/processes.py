@@ -31,9 +31,6 @@ def map_processes[Work, Result](
         function: at module level, as processes receive it by name.
         work: taken as processes become free, and one ahead.
         jobs: number of processes; with 1, all is done in this one.
-
-    Raises:
-        WorkerEndedError: if a process was killed. Results that were yielded before are valid.
     """
     from joblib import Parallel, delayed
     from joblib.externals.loky import get_reusable_executor
@@ -58,15 +55,14 @@ def map_processes[Work, Result](
             get_reusable_executor().shutdown(wait=True, kill_workers=True)
 
 
-def run_apart[Work, Result](what: str, function: Callable[[Work], Result], work: Work) -> Result:
+def run_in_subprocess[Work, Result](
+    what: str, function: Callable[[Work], Result], work: Work
+) -> Result:
     """Returns `function` of `work`, called in another process that native code may end.
 
     Args:
         what: the work and its files, for messages.
         function: at module level, as the process receives it by name.
-
-    Raises:
-        OSError: if the process ended or raised RuntimeError, as pycolmap does for a full disk.
     """
     try:
         [result] = map_processes(function, [work], 2)

@@ -68,9 +68,9 @@ def yaml_errors(source: str) -> Iterator[None]:
         yield
     except yaml.MarkedYAMLError as error:
         line = f"line {error.problem_mark.line + 1}: " if error.problem_mark else ""
-        raise ValueError(f"{source} is not YAML: {line}{reason_of(error.problem)}") from None
+        raise ValueError(f"{source} is not YAML: {line}{error_summary(error.problem)}") from None
     except yaml.YAMLError as error:
-        raise ValueError(f"{source} is not YAML: {reason_of(error)}") from None
+        raise ValueError(f"{source} is not YAML: {error_summary(error)}") from None
     except RecursionError:
         raise ValueError(f"{source} is not YAML: its fields are nested too deeply") from None
 
@@ -122,12 +122,12 @@ def readable(path: Path, what: str) -> Iterator[None]:
         yield
     except Exception as error:  # zipfile, numpy and plyfile raise any type for damaged files.
         raise ValueError(
-            f"{path}: not a readable {what} ({reason_of(error)}); it is truncated or damaged, "
+            f"{path}: not a readable {what} ({error_summary(error)}); it is truncated or damaged, "
             "copy it again"
         ) from None
 
 
-def reason_of(error: object) -> str:
+def error_summary(error: object) -> str:
     """Returns the message of an exception in one line of at most 300 characters."""
     words = str(error).split()
     short = (word if len(word) <= 80 else f"{word[:20]}...{word[-40:]}" for word in words)

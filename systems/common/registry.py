@@ -42,11 +42,7 @@ class Registry[Entry]:
         self._entries: dict[str, Entry] = {}
 
     def add(self, name: str, entry: Entry) -> None:
-        """Registers an entry.
-
-        Raises:
-            ValueError: if another entry has the name, or a configuration of the same type name.
-        """
+        """Registers an entry."""
         if self._entries.get(name, entry) != entry:
             raise ValueError(f"there is a {self.what} {name!r} already; choose another name")
         config = getattr(entry, "config", None)
@@ -67,11 +63,7 @@ class Registry[Entry]:
         return list(dict.fromkeys([*self._entries, *(point.name for point in self._announced())]))
 
     def find(self, name: str) -> Entry:
-        """Returns the entry of a name, or of `module:attribute`, whose module is imported.
-
-        Raises:
-            ValueError: if there is none; the message lists the names.
-        """
+        """Returns the entry of a name, or of `module:attribute`, whose module is imported."""
         if name in self._entries:
             return self._entries[name]
         for point in self._announced():
@@ -82,12 +74,8 @@ class Registry[Entry]:
         _search_working_directory()
         return self._load(EntryPoint(name=name, value=name, group=self.group))
 
-    def kind_of(self, config: Any) -> Entry:
-        """Returns the entry of a configuration's type, or of the nearest of its base classes.
-
-        Raises:
-            ValueError: if there is none; the message lists the types.
-        """
+    def entry_for(self, config: Any) -> Entry:
+        """Returns the entry of a configuration's type, or of the nearest of its base classes."""
         for base in type(config).__mro__:
             if entry := self._by_config(base):
                 return entry
@@ -97,7 +85,7 @@ class Registry[Entry]:
             f"those that register_{self.what} adds"
         )
 
-    def name_of(self, entry: Entry) -> str:
+    def entry_name(self, entry: Entry) -> str:
         """Returns the first name of an entry."""
         return next(name for name, known in self._entries.items() if known == entry)
 

@@ -15,7 +15,7 @@ from pydrake.systems.framework import (
 )
 
 from splatpilot.systems.collision.distance_field import Distances
-from splatpilot.systems.common.drake import optional_input, vector_input, weakly
+from splatpilot.systems.common.drake import optional_input, vector_input, weak_callback
 from splatpilot.systems.common.validation import Config, bounded
 from splatpilot.systems.messaging.fault_detection import Signals, Track, worst
 from splatpilot.systems.messaging.flight_limits import (
@@ -208,7 +208,7 @@ class Failsafe(LeafSystem):
         self.DeclareDiscreteState(np.hstack(Modes()))
         self.DeclareDiscreteState(np.hstack(Track()))
         producer = ValueProducer(
-            allocate=lambda: AbstractValue.Make(object()), calc=weakly(self._calc_flown)
+            allocate=lambda: AbstractValue.Make(object()), calc=weak_callback(self._calc_flown)
         )
         self._cache = self.DeclareCacheEntry(
             "velocity setpoint (4), mode and reason", producer, {self.all_sources_ticket()}

@@ -20,7 +20,7 @@ from pydrake.common.value import Value
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from splatpilot.systems.common.drake import optional_input, vector_input, weakly
+from splatpilot.systems.common.drake import optional_input, vector_input, weak_callback
 from splatpilot.systems.common.files import require_unused
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.messaging.bridge_status import UnixClock
@@ -244,7 +244,7 @@ class MessageSubscriber(Receiver[_Received]):
             self._declare(codec.port, codec.size, lambda received, _: received.value)
         else:
             self.DeclareAbstractOutputPort(
-                codec.port, lambda: Value(image), weakly(self._calc_image), self._state
+                codec.port, lambda: Value(image), weak_callback(self._calc_image), self._state
             )
         self._declare("gaps", 1, lambda received, _: received.gaps)
         self._declare_age(lambda received: received.utime * 1e-6)
@@ -319,8 +319,7 @@ def recorded(lcm: LCM, path: Path, overwrite: bool = False) -> Iterator[None]:
 
 
 def replay(path: Path, lcm: LCM, simulator: Simulator, clock: UnixClock) -> None:
-    """
-    Simulates a diagram while it receives the messages of a log at the times of their arrival.
+    """Simulates a diagram while it receives the messages of a log at the times of their arrival.
 
     The same log gives a bitwise identical simulation. The diagram, with its `clock`, has an LCM of
     `memq://`; its time is 0, the time of the first message.

@@ -34,8 +34,7 @@ class Received:
 
 
 class Receiver[R: Received](LeafSystem):
-    """
-    Base of systems that take all messages of a `source` every `period` [s] from time 0.
+    """Base of systems that take all messages of a `source` every `period` [s] from time 0.
 
     The update is unrestricted, so that discrete updates of the same instant see it. All systems
     have the output ``rejected`` (1): the number of messages that could not be used. The reason is

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from splatpilot.systems.common.files import written_atomically
-from splatpilot.systems.common.readers import read_archive, reason_of
+from splatpilot.systems.common.readers import error_summary, read_archive
 from splatpilot.systems.common.validation import require
 
 FORMAT = 1
@@ -60,10 +60,6 @@ class PolicyCheckpoint:
             path: the file.
             policy: name of the policy.
             spec: the required architecture, or a function that makes one from its fields.
-
-        Raises:
-            FileNotFoundError: if the file is missing.
-            ValueError: if it is damaged, or of another policy, version or architecture.
         """
         path = Path(path) if path else shipped_weights(policy)
         about, weights = _read(path, policy)
@@ -112,7 +108,7 @@ def _read(path: Path, policy: str) -> tuple[dict[str, Any], dict[str, np.ndarray
         for name, kind in (("format", int), ("policy", str), ("spec", dict), ("provenance", dict)):
             require(isinstance(about[name], kind), name, f"of type {kind.__name__}", about[name])
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        reason = reason_of(error)
+        reason = error_summary(error)
         raise ValueError(
             f"{path} must hold weights of a policy ({reason}); {_remedy(policy)}"
         ) from None

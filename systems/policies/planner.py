@@ -10,7 +10,7 @@ from pydrake.systems.framework import Context, DiscreteValues, ValueProducer
 from splatpilot.systems.collision.distance_field import Distances
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.shapes import MovingSpheres
-from splatpilot.systems.common.drake import output_port, weakly
+from splatpilot.systems.common.drake import output_port, weak_callback
 from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.common.validation import Config, bounded, require
 from splatpilot.systems.policies.base import Policy
@@ -51,9 +51,6 @@ def plan(
         lattice: the trajectories to choose from.
         params: of the vehicle.
         obstacles: distances for the costs, `field` by default; may include moving obstacles.
-
-    Raises:
-        InfeasibleFlightError: if no path leads from the free space around p_WB to the goal.
     """
     valid = np.shape(state) == (13,) and bool(np.isfinite(state).all())
     remedy = "check the plant or estimator it comes from"
@@ -124,7 +121,7 @@ class PrivilegedPlanner(Policy):
         self.DeclareInitializationPublishEvent(self._prepare)
         self._arrival = self.DeclareCacheEntry(
             "time of arrival",
-            ValueProducer(cast(Any, Value[object]), weakly(self._march)),
+            ValueProducer(cast(Any, Value[object]), weak_callback(self._march)),
             {self._goal_port.ticket()},
         ).cache_index()
 

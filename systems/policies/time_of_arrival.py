@@ -124,9 +124,6 @@ def time_of_arrival(
         p_WG: the goal [m].
         margin: minimum clearance of the path [m], beyond the vehicle's radius.
         slowness: S(d) [s/m].
-
-    Raises:
-        InfeasibleFlightError: if the goal is outside the box, or its clearance below `margin`.
     """
     what, remedy = "the distance field", "pass esdf.conservative()"
     require(field.occupied_outside, what, "conservative", "unknown space as free", remedy)

@@ -9,7 +9,7 @@ from pydrake.common.value import Value
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from splatpilot.systems.common.drake import weakly
+from splatpilot.systems.common.drake import weak_callback
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.sensing.noise import ObservationNoise
 from splatpilot.systems.vehicle.state import array_namespace, pose_from_state
@@ -114,7 +114,7 @@ class DelayedPose(LeafSystem):
         samples = math.ceil(frames.oldest / period) + 1
         self._state_port = self.DeclareVectorInputPort("state", 13)
         self.DeclareDiscreteState(np.full(samples * 14, np.nan))
-        calc = weakly(self._calc_pose)
+        calc = weak_callback(self._calc_pose)
         self.DeclareAbstractOutputPort("pose", lambda: Value(RigidTransform()), calc)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._sample)
 

@@ -15,7 +15,7 @@ from pydrake.common.value import AbstractValue, Value
 from pydrake.systems.framework import Context, LeafSystem
 from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
-from splatpilot.systems.common.drake import weakly
+from splatpilot.systems.common.drake import weak_callback
 from splatpilot.systems.common.validation import Config, bounded, require_field
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.vehicle.state import array_namespace
@@ -101,8 +101,7 @@ def corrupt_depth(
     min_depth: float = 0.0,
     max_depth: float = math.inf,
 ) -> Any:
-    """
-    Adds errors and holes to planar depth [m]: `relative` n_1 and `absolute` n_2 are drawn from
+    """Adds errors and holes to planar depth [m]: `relative` n_1 and `absolute` n_2 are drawn from
     N(0, 1), `drop` u from U(0, 1), each of the depth's shape.
 
         z' = z (1 + depth_multiplicative n_1) + depth_additive n_2
@@ -134,8 +133,7 @@ def rotate_hue(color: Any, cos: Any, sin: Any) -> Any:
 
 
 def expose(color: Any, noise: ObservationNoise, error: Any, photons: Any) -> Any:
-    """
-    Exposes colors (..., 3), 0 to 255, with shot and read noise; `error` u is drawn from U(-1, 1)
+    """Exposes colors (..., 3), 0 to 255, with shot and read noise; `error` u is drawn from U(-1, 1)
     for each image, `photons` n from N(0, 1), of the colors' shape.
 
         light' = 2^(exposure_error u) (c / 255)^2.2
@@ -177,7 +175,7 @@ class _ImageNoise(LeafSystem):
         self._noise, self._camera, self._rate, self._seed = noise, camera, rate, seed
         blank = self.image(camera.width, camera.height)
         self.DeclareAbstractInputPort(self.port, Value(blank))
-        self.DeclareAbstractOutputPort(self.port, lambda: Value(blank), weakly(self._calc))
+        self.DeclareAbstractOutputPort(self.port, lambda: Value(blank), weak_callback(self._calc))
 
     def _calc(self, context: Context, output: AbstractValue) -> None:
         image = np.asarray(cast(Any, self.get_input_port().Eval(context)).data)

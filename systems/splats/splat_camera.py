@@ -19,7 +19,7 @@ from pydrake.systems.sensors import (
     ImageRgba8U,
 )
 
-from splatpilot.systems.common.drake import input_port, output_port, weakly
+from splatpilot.systems.common.drake import input_port, output_port, weak_callback
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.splats.background import BLACK, Background, RenderedView
 from splatpilot.systems.splats.baked_scene import (
@@ -183,7 +183,7 @@ class SplatCamera(LeafSystem):
                 name,
                 ValueProducer(
                     Value[object],  # pyright: ignore[reportArgumentType]
-                    weakly(calc),
+                    weak_callback(calc),
                 ),
                 tickets,
             )
@@ -201,13 +201,13 @@ class SplatCamera(LeafSystem):
             self.DeclareAbstractOutputPort(
                 name,
                 alloc=lambda image=image: Value(image(width, height)),
-                calc=weakly(calc),
+                calc=weak_callback(calc),
                 prerequisites_of_calc={entry.ticket()},
             )
         self.DeclareAbstractOutputPort(
             "body_pose_in_world",
             alloc=lambda: Value(RigidTransform()),
-            calc=weakly(self._calc_body_pose),
+            calc=weak_callback(self._calc_body_pose),
             prerequisites_of_calc={pose_ticket},
         )
         self.DeclareVectorOutputPort(

@@ -12,7 +12,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 from scipy.spatial.transform import Rotation
 
-from splatpilot.systems.common.drake import vector_input, weakly
+from splatpilot.systems.common.drake import vector_input, weak_callback
 from splatpilot.systems.common.validation import require
 
 LONGEST_PREDICTION = 0.1  # [s], maximum age of states that are predicted to the present.
@@ -136,7 +136,10 @@ class StateToPose(LeafSystem):
         super().__init__()
         state = self.DeclareVectorInputPort("state", 13)
         self.DeclareAbstractOutputPort(
-            "pose", lambda: Value(RigidTransform()), weakly(self._calc_pose), {state.ticket()}
+            "pose",
+            lambda: Value(RigidTransform()),
+            weak_callback(self._calc_pose),
+            {state.ticket()},
         )
 
     def _calc_pose(self, context, output):

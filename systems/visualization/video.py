@@ -78,8 +78,7 @@ class VideoRecorder(LeafSystem):
         return EventStatus.Succeeded()
 
     def frames(self, max_depth: float) -> Iterator[tuple[NDArray[np.uint8], NDArray[np.uint8]]]:
-        """
-        Yields the images of color and of depth, (H, W, 3) each in OpenCV's channel order.
+        """Yields the images of color and of depth, (H, W, 3) each in OpenCV's channel order.
 
         Args:
             max_depth: [m], see `colorize_depth`.
@@ -117,8 +116,7 @@ class VideoRecorder(LeafSystem):
 
 
 def colorize_depth(depth: np.ndarray, max_depth: float) -> np.ndarray:
-    """
-    Converts depth (H, W) [m] to an image (H, W, 3) uint8 in OpenCV's channel order.
+    """Converts depth (H, W) [m] to an image (H, W, 3) uint8 in OpenCV's channel order.
 
     Near is bright and far dark, in inverse depth from 0.5 m to `max_depth`; out of range is black.
     """

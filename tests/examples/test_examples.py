@@ -84,8 +84,8 @@ def test_own_policy(tmp_path):
 
 def test_unregistered_own_policy_flies_in_worker_processes(tmp_path):
     own = (EXAMPLES / "own_policy.py").read_text().replace("sp.register_policy(", "build = (")
-    kind = 'PolicyKind(*build, speed_field="speed")'
-    own += f"\nfrom splatpilot.diagrams.flight.policies import PolicyKind\nKIND = {kind}\n"
+    kind = 'PolicyEntry(*build, speed_field="speed")'
+    own += f"\nfrom splatpilot.diagrams.flight.policies import PolicyEntry\nKIND = {kind}\n"
     (tmp_path / "loose_policy.py").write_text(own)
     (tmp_path / "short.yaml").write_text(SHORT)
     words = ["benchmark", "--policies", "mine=loose_policy:KIND", "--scenarios", "short.yaml"]

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatpilot.systems.common.extras import import_extra
-from splatpilot.systems.common.readers import readable, reason_of, require_readable_size
+from splatpilot.systems.common.readers import error_summary, readable, require_readable_size
 from splatpilot.training.captures.capture import (
     OPTICAL_AXES,
     Capture,
@@ -122,7 +122,7 @@ def open_model(
         try:
             lenses[number] = _lens(camera, config)
         except (ValueError, RuntimeError) as error:
-            raise ValueError(f"{path}, camera {number}: {reason_of(error)}") from None
+            raise ValueError(f"{path}, camera {number}: {error_summary(error)}") from None
     depths = path / config.scale.depth_folder if config.scale.depth_folder else None
     masks = mask_folder(images)
 

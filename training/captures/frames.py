@@ -307,9 +307,6 @@ def open_frames(
         up: up direction of the files' world, see `turn_upright`; empty leaves that to the caller.
         dropped: messages about frames that were left out already, which do not count further.
         notes: the first of `Capture.notes`.
-
-    Raises:
-        ValueError: if fewer than two frames, or less than four fifths of them, can be used.
     """
     config = config or CaptureConfig()
     messages, complete = list(dropped), []

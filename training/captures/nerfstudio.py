@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from pydrake.math import RigidTransform
 
-from splatpilot.systems.common.readers import read_ply_file, read_text, readable, reason_of
+from splatpilot.systems.common.readers import error_summary, read_ply_file, read_text, readable
 from splatpilot.systems.common.validation import require
 from splatpilot.training.captures.capture import (
     OPENGL_AXES,
@@ -197,7 +197,7 @@ def _lens(
         return None
     except (LookupError, TypeError, ValueError, OverflowError) as error:
         raise ValueError(
-            f"{file}: invalid camera of {image.name} ({reason_of(error)}); it must have w, h, "
+            f"{file}: invalid camera of {image.name} ({error_summary(error)}); it must have w, h, "
             "fl_x, fl_y, cx and cy, or camera_angle_x"
         ) from None
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import ExifTags, Image
 from scipy.cluster.vq import kmeans2, vq
 
-from splatpilot.systems.common.processes import available_cores, run_apart
+from splatpilot.systems.common.processes import available_cores, run_in_subprocess
 from splatpilot.systems.common.progress import Progress, resumable
 from splatpilot.training.captures.capture import Capture
 from splatpilot.training.captures.capture_config import (
@@ -80,7 +80,7 @@ def read_photographs(path: Path, config: CaptureConfig) -> Capture:
         work = folder, names, _one_camera(files), config.partners, written
         kept = "nothing is kept of the registration; the same command starts again"
         with resumable(lambda: kept):
-            run_apart(f"{path}: registration", _register, work)
+            run_in_subprocess(f"{path}: registration", _register, work)
 
     model = cached_folder(cache_folder(config, "photographs", key) / "model", register)
     reconstruction = load_model(model)

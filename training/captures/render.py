@@ -17,7 +17,11 @@ from splatpilot.diagrams.worlds.world_registry import WorldConfig, is_procedural
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.esdf_build import esdf_from_distance_field
 from splatpilot.systems.common.config import dump_config, load_config
-from splatpilot.systems.common.files import held_folder, require_writable_folder, written_atomically
+from splatpilot.systems.common.files import (
+    locked_folder,
+    require_writable_folder,
+    written_atomically,
+)
 from splatpilot.systems.common.progress import Progress, resumable
 from splatpilot.systems.common.seeds import TRAINING_SEEDS, VALIDATION_SEEDS
 from splatpilot.systems.common.validation import Config, bounded, require, require_field
@@ -111,7 +115,7 @@ def run(*, world: str | Path, out: str | Path, config: RenderConfig, seed: int =
         count = len(list(images.glob("*.png")))
         return f"{count} frames are in {partial}; the same command resumes there"
 
-    with held_folder(partial), resumable(kept):
+    with locked_folder(partial), resumable(kept):
         _render(world, out, partial, config, seed)
 
 

@@ -15,7 +15,7 @@ from splatpilot.diagrams.worlds.appearance import draw_appearance, with_appearan
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.common.files import claim_folder, holds_folder, require_writable_folder
+from splatpilot.systems.common.files import claim_folder, locks_folder, require_writable_folder
 from splatpilot.systems.common.processes import available_cores, map_processes
 from splatpilot.systems.common.progress import Progress, resumable, say
 from splatpilot.systems.common.provenance import InfeasibleFlightError, revision
@@ -134,9 +134,6 @@ def draw_off_path(
     4 m of the goal, uniform in distance, and look anywhere. The others are uniform in space and
     look along the path. All deviate from that, and fly where they look, at up to `speed` [m/s] and
     no faster than they can stop.
-
-    Raises:
-        InfeasibleFlightError: if there is no free position.
     """
     field, toa = labeler.field, labeler.toa
     centers = _free_positions(labeler, _CLEARANCE)
@@ -192,9 +189,6 @@ def collect_world(folder: Path, config: CorpusConfig, index: int, revision: str)
         config: of the corpus.
         index: see `world_source`.
         revision: of the program.
-
-    Raises:
-        InfeasibleFlightError: if there is no such world, or no path to its goal.
     """
     source = world_source(config.worlds, config.seed, index)
     world = make_world(source.world, source.seed)
@@ -253,7 +247,7 @@ def shard_folder(folder: Path, world: str, source: int = EXPERT) -> Path:
     return folder / "shards" / f"{SOURCES[source]}-{world}"
 
 
-@holds_folder("out")
+@locks_folder("out")
 def run(*, config: CorpusConfig, out: Path, worlds: int, jobs: int | None = None) -> Corpus:
     """Collects the first `worlds` worlds of a corpus in `out`, except those that it has already.
 
@@ -313,11 +307,7 @@ def run(*, config: CorpusConfig, out: Path, worlds: int, jobs: int | None = None
 
 
 def _damage(out: Path, source: WorldSource, config: CorpusConfig) -> str:
-    """Describes the damage of a collected world; empty without damage.
-
-    Raises:
-        ValueError: if it is of another version or definition.
-    """
+    """Describes the damage of a collected world; empty without damage."""
     try:
         record = WorldRecord(out / "worlds" / source.name)
         _ = record.esdf

@@ -69,10 +69,6 @@ class Corpus:
     """The samples of a folder, indexed through its shards in order of their names.
 
     Images are mapped into memory and read as they are used.
-
-    Raises:
-        FileNotFoundError: if there is no corpus.
-        ValueError: if a shard or a world is damaged or of another version, or without samples.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -148,11 +144,7 @@ def subfolders(folder: Path) -> list[Path]:
 
 
 def distinct_worlds(corpora: Sequence[Corpus]) -> dict[str, WorldRecord]:
-    """Returns the worlds of corpora by name, each once.
-
-    Raises:
-        ValueError: if two worlds of one name differ in their distances.
-    """
+    """Returns the worlds of corpora by name, each once."""
     records: dict[str, WorldRecord] = {}
     for world in chain.from_iterable(corpus.worlds for corpus in corpora):
         first = records.setdefault(world.name, world)
@@ -200,11 +192,7 @@ def write_ledger(corpus: Corpus) -> None:
 
 
 def link_corpus(source: Path, folder: Path) -> None:
-    """Links the content of the corpus `source` that is missing in `folder`.
-
-    Raises:
-        ValueError: if `folder` has other content of the same name.
-    """
+    """Links the content of the corpus `source` that is missing in `folder`."""
     for kind, about in (("worlds", WORLD), ("shards", SHARD)):
         (folder / kind).mkdir(parents=True, exist_ok=True)
         for entry in subfolders(source / kind):

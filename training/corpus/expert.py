@@ -91,9 +91,6 @@ class Labeler:
         esdf: the scene; unknown space counts as occupied.
         p_WG: the goal (3,) [m].
         config: speed and number of trajectories.
-
-    Raises:
-        InfeasibleFlightError: if the goal is not in free space.
     """
 
     def __init__(self, esdf: Esdf, p_WG: np.ndarray, config: ExpertConfig) -> None:

@@ -24,7 +24,7 @@ from splatpilot.diagrams.worlds.splits import find_test_source, part_digests
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import WORLDS, WorldConfig, is_procedural, make_world
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.common.config import dump_config, load_config, open_field
+from splatpilot.systems.common.config import dump_config, load_config, registry_field
 from splatpilot.systems.common.files import folder_written_atomically
 from splatpilot.systems.common.readers import require_file
 from splatpilot.systems.common.seeds import SEEDS_PER_RUN, VALIDATION_SEEDS, first_training_seed
@@ -45,7 +45,7 @@ class WorldSource:
     """Content of `world.yaml`, from which a world is made."""
 
     name: str = ""
-    world: WorldConfig = open_field(WORLDS, ForestConfig)
+    world: WorldConfig = registry_field(WORLDS, ForestConfig)
     seed: int = 0
     # [m] Distance from recorded poses within which images can be trusted; infinite if exact.
     perturbation_bound: float = inf
@@ -54,11 +54,7 @@ class WorldSource:
 
 
 class WorldRecord:
-    """The folder of a world in a corpus.
-
-    Raises:
-        FileNotFoundError, ValueError: if it is missing or damaged.
-    """
+    """The folder of a world in a corpus."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -81,11 +77,7 @@ class WorldRecord:
         return files[0].samefile(files[1]) or _equal(*map(Esdf.load, files))
 
     def make(self) -> World:
-        """Makes the world again, to render and fly in.
-
-        Raises:
-            ValueError: if it differs from the recorded one.
-        """
+        """Makes the world again, to render and fly in."""
         world = make_world(self.source.world, self.source.seed)
         if not _equal(world.esdf, self.esdf):
             raise ValueError(
@@ -131,10 +123,6 @@ def training_scene(scene: str, split: str = "train") -> Path:
     Args:
         scene: its path.
         split: required split; an OctoMap states none and counts as "train".
-
-    Raises:
-        FileNotFoundError: if there is no such scene.
-        ValueError: if it shows what the benchmark tests in, under any name, or is of another split.
     """
     found = find_scene(SceneConfig(path=scene))
     if found.suffix.lower() == OCTOMAP:

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 
 from splatpilot.systems.common.files import folder_written_atomically
-from splatpilot.systems.common.readers import reason_of
+from splatpilot.systems.common.readers import error_summary
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS
 
@@ -135,12 +135,7 @@ class OtherVersionError(ValueError):
 
 
 class Shard:
-    """A shard on disk. Its arrays are mapped into memory and read as they are used.
-
-    Raises:
-        OtherVersionError: if it is of another version.
-        ValueError: if a file is missing, damaged or truncated.
-    """
+    """A shard on disk. Its arrays are mapped into memory and read as they are used."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -150,7 +145,7 @@ class Shard:
             if version == FORMAT_VERSION:
                 self._read(about)
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-            reason = f"missing {error}" if isinstance(error, KeyError) else reason_of(error)
+            reason = f"missing {error}" if isinstance(error, KeyError) else error_summary(error)
             raise ValueError(f"{path / SHARD} describes no shard ({reason}); {_REMEDY}") from None
         if version != FORMAT_VERSION:
             raise OtherVersionError(

@@ -21,7 +21,7 @@ from splatpilot.diagrams.flight.flight import fly
 from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
 from splatpilot.diagrams.flight.policies import policy_named
 from splatpilot.diagrams.flight.scenario import Scenario
-from splatpilot.systems.common.files import claim_folder, holds_folder, written_atomically
+from splatpilot.systems.common.files import claim_folder, locks_folder, written_atomically
 from splatpilot.systems.common.processes import map_processes
 from splatpilot.systems.common.progress import Progress, resumable, say
 from splatpilot.systems.common.provenance import InfeasibleFlightError, revision
@@ -159,7 +159,7 @@ class RecoveryFlights:
     held_out: float = 0.0
 
 
-@holds_folder("out")
+@locks_folder("out")
 def run[Config: CorpusTraining](
     *,
     config: Config,

@@ -15,7 +15,7 @@ from torch import Tensor
 from splatpilot.diagrams.worlds.scene_folder import SceneSource
 from splatpilot.systems.common.files import require_writable_folder, written_atomically
 from splatpilot.systems.common.progress import Progress, say
-from splatpilot.systems.common.readers import reason_of
+from splatpilot.systems.common.readers import error_summary
 from splatpilot.systems.policies.student import encode_color, encode_depth
 from splatpilot.systems.vehicle.state import rotation_matrices
 from splatpilot.training.corpus.corpus import Corpus, distinct_shards, distinct_worlds
@@ -46,9 +46,6 @@ class StudentData:
         corpora: may share worlds and shards.
         held_out: fraction of the worlds that validate, see `is_held_out`.
         device: device of the labels; images stay on disk.
-
-    Raises:
-        ValueError: if corpora do not match, or there are no samples to train or to validate with.
     """
 
     def __init__(self, corpora: Sequence[Corpus], held_out: float, device: str = "cpu") -> None:
@@ -214,7 +211,7 @@ class FrozenFeatures:
         except FileNotFoundError:
             pass
         except (ValueError, EOFError) as error:
-            say(f"{file} is damaged ({reason_of(error)}): it is computed again")
+            say(f"{file} is damaged ({error_summary(error)}): it is computed again")
             file.unlink()
         pixels, features = shard.arrays[self._network.spec.pixels], []
         device = next(self._network.parameters()).device

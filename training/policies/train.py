@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from splatpilot.systems.common.files import claim_folder, held_folder, written_atomically
+from splatpilot.systems.common.files import claim_folder, locked_folder, written_atomically
 from splatpilot.systems.common.progress import CheckpointClock, Progress, resumable, say
 from splatpilot.systems.common.provenance import revision
-from splatpilot.systems.common.readers import reason_of
+from splatpilot.systems.common.readers import error_summary
 from splatpilot.systems.common.torch_device import (
     keep_freed_memory,
     one_torch_thread,
@@ -56,7 +56,7 @@ def run[Config: TrainingConfig](
     validate(config)
     require_device(config.device)
     keep_freed_memory()
-    with held_folder(out):
+    with locked_folder(out):
         return _Run(config, out, make).train()
 
 
@@ -199,7 +199,7 @@ class _Run:
             self.progress = _Progress(**saved["progress"])
         except Exception as error:
             raise ValueError(
-                f"{path} must be a checkpoint ({type(error).__name__}: {reason_of(error)}); "
+                f"{path} must be a checkpoint ({type(error).__name__}: {error_summary(error)}); "
                 f"{remedy}"
             ) from None
         if learns_from != trainer.learns_from:

@@ -12,7 +12,7 @@ import torch
 
 from splatpilot.systems.common.extras import import_extra
 from splatpilot.systems.common.files import written_atomically
-from splatpilot.systems.common.readers import reason_of
+from splatpilot.systems.common.readers import error_summary
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.views import ReconstructionViews
 
@@ -31,7 +31,7 @@ def save_tensors(content: dict[str, Any], path: Path) -> None:
         try:
             torch.save(content, partial)
         except RuntimeError as error:  # torch's error of a full disk
-            raise OSError(f"perhaps the disk is full: {reason_of(error)}") from error
+            raise OSError(f"perhaps the disk is full: {error_summary(error)}") from error
 
 
 def load_tensors(path: Path) -> Any:
@@ -45,7 +45,7 @@ def load_tensors(path: Path) -> Any:
     except (OSError, ValueError):
         raise
     except Exception as error:  # zipfile and the unpickler may raise anything
-        raise ValueError(reason_of(error)) from None
+        raise ValueError(error_summary(error)) from None
 
 
 def work_folder(out: Path) -> Path:
@@ -84,11 +84,7 @@ class Checkpoint:
         save_tensors(header | content, self._file)
 
     def load(self) -> dict[str, Any] | None:
-        """Returns the last checkpoint, or None without one.
-
-        Raises:
-            ValueError: if it is damaged, or of another configuration or capture.
-        """
+        """Returns the last checkpoint, or None without one."""
         file = self._file
         if not file.exists():
             return None

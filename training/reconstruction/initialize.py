@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from splatpilot.systems.common.processes import run_apart
+from splatpilot.systems.common.processes import run_in_subprocess
 from splatpilot.systems.common.progress import Progress, say
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.splats.background import FAR
@@ -402,7 +402,7 @@ def triangulate(capture: Capture, numbers: Sequence[int]) -> SfmPoints:
             poses[name] = capture.X_WCs[i].inverse().GetAsMatrix34()
         say(f"triangulating points between {len(poses)} images")
         work = Path(folder), capture.K, poses
-        p_WQ, colors = run_apart(f"{folder}: triangulation", _triangulate, work)
+        p_WQ, colors = run_in_subprocess(f"{folder}: triangulation", _triangulate, work)
     require(
         len(p_WQ) >= _MIN_POINTS,
         f"{capture.source}: the number of points between its images",

@@ -64,9 +64,6 @@ class Lpips:
     Weights are `{"squeezenet1_1": state dict, "lin": state dict}` in
     `$SPLATPILOT_DATA/weights/lpips_squeeze.pt`, or else torchvision's downloaded SqueezeNet with
     the linear layers of the installed package `lpips`.
-
-    Raises:
-        FileNotFoundError, ValueError: without such weights.
     """
 
     def __init__(self):

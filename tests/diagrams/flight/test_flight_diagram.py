@@ -153,7 +153,7 @@ def test_what_makes_nothing_is_named(post_world, monkeypatch, registry, field, m
     kind = registry.find(registry.registered()[0])
     function = "make" if registry is WORLDS else "build"
     kind = dataclasses.replace(kind, **{function: lambda *_: None})
-    monkeypatch.setattr(registry, "kind_of", lambda _: kind)
+    monkeypatch.setattr(registry, "entry_for", lambda _: kind)
     with pytest.raises(ValueError, match=message):
         if registry is WORLDS:
             make_world(Scenario().world, 0)
@@ -162,9 +162,9 @@ def test_what_makes_nothing_is_named(post_world, monkeypatch, registry, field, m
 
 def test_what_builds_no_policy_is_named(post_world, monkeypatch):
     config = policy_named("straight")
-    kind = dataclasses.replace(POLICIES.kind_of(config), build=lambda *_: None)
-    monkeypatch.setattr(POLICIES, "kind_of", lambda _: kind)
-    monkeypatch.setattr(POLICIES, "name_of", lambda _: "mine")
+    kind = dataclasses.replace(POLICIES.entry_for(config), build=lambda *_: None)
+    monkeypatch.setattr(POLICIES, "entry_for", lambda _: kind)
+    monkeypatch.setattr(POLICIES, "entry_name", lambda _: "mine")
     with pytest.raises(ValueError, match="the policy 'mine' must be a Drake system, got NoneType"):
         flown(Scenario(timeout=1.0, policy=config), post_world)
 

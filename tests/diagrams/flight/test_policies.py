@@ -13,12 +13,12 @@ from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
 from splatpilot.diagrams.flight.policies import (
     BENCHMARK_POLICIES,
     POLICIES,
-    PolicyKind,
+    PolicyEntry,
     at_speed,
-    name_of,
+    policy_name,
     policy_named,
+    policy_speed,
     register_policy,
-    speed_of,
 )
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.systems.common.registry import Registry
@@ -115,15 +115,15 @@ def test_file_of_weights_is_a_policy(tmp_path):
 @pytest.mark.parametrize("name", POLICIES.registered())
 def test_speed_is_set_where_the_configuration_keeps_it(name):
     config = policy_named(name)
-    assert name_of(config) == name
+    assert policy_name(config) == name
     faster = at_speed(config, 3.0)
-    assert (speed_of(config), speed_of(faster)) == (2.0, 3.0)
+    assert (policy_speed(config), policy_speed(faster)) == (2.0, 3.0)
     assert at_speed(faster, 2.0) == config
 
 
 def test_policy_that_knows_one_speed_refuses_others(monkeypatch):
-    monkeypatch.setattr(policies, "POLICIES", Registry("policy", "none", PolicyKind))
+    monkeypatch.setattr(policies, "POLICIES", Registry("policy", "none", PolicyEntry))
     register_policy(_OneSpeedConfig, lambda config, world, vehicle: ConstantVectorSource([0.0]))
-    assert speed_of(_OneSpeedConfig()) is None
+    assert policy_speed(_OneSpeedConfig()) is None
     with pytest.raises(ValueError, match="_onespeed flies as fast as it has learned"):
         at_speed(_OneSpeedConfig(), 3.0)

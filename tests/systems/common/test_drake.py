@@ -11,7 +11,7 @@ from splatpilot.systems.common.drake import (
     input_port,
     optional_input,
     output_port,
-    weakly,
+    weak_callback,
 )
 
 
@@ -24,7 +24,7 @@ class Doubler(LeafSystem):
         LeafSystem.__init__(self)
         self.DeclareVectorInputPort("value", 1)
         self.DeclareVectorOutputPort("double", 1, self._calc_double)
-        self.DeclareAbstractOutputPort("text", lambda: Value(""), weakly(self._calc_text))
+        self.DeclareAbstractOutputPort("text", lambda: Value(""), weak_callback(self._calc_text))
 
     def _calc_double(self, context, output):
         value = optional_input(self, "value", context)

@@ -3,7 +3,7 @@ from dataclasses import dataclass, field
 import pytest
 from pydrake.systems.sensors import CameraConfig
 
-from splatpilot.systems.common.config import open_field
+from splatpilot.systems.common.config import registry_field
 from splatpilot.systems.common.field_help import describe_fields
 from splatpilot.systems.common.registry import Registry
 
@@ -37,7 +37,7 @@ class Vehicle:
 
     bare: int = 0
     spare: Wheel = field(default_factory=Wheel)
-    engine: Wheel = open_field(ENGINES, Wheel)  # [-] Of any kind.
+    engine: Wheel = registry_field(ENGINES, Wheel)  # [-] Of any kind.
 
 
 @dataclass

@@ -12,8 +12,8 @@ from splatpilot.systems.common.files import (
     claim_folder,
     find_data,
     folder_written_atomically,
-    held_folder,
-    holds_folder,
+    locked_folder,
+    locks_folder,
     remove_leftovers,
     require_existing,
     require_unused,
@@ -151,25 +151,25 @@ def test_a_folder_belongs_to_one_configuration(tmp_path):
 def test_a_locked_folder_is_refused_until_its_process_ends(tmp_path):
     holding = (
         "import sys, time; from pathlib import Path\n"
-        "from splatpilot.systems.common.files import held_folder\n"
-        "with held_folder(Path(sys.argv[1])): print('held', flush=True); time.sleep(60)\n"
+        "from splatpilot.systems.common.files import locked_folder\n"
+        "with locked_folder(Path(sys.argv[1])): print('held', flush=True); time.sleep(60)\n"
     )
     folder = tmp_path / "out" / "folder"
     words = [sys.executable, "-c", holding, str(folder)]
     with subprocess.Popen(words, stdout=subprocess.PIPE) as other:
         assert other.stdout is not None and other.stdout.readline() == b"held\n"
         told = "folder is in use by another process; wait"
-        with pytest.raises(OSError, match=told), held_folder(folder):
+        with pytest.raises(OSError, match=told), locked_folder(folder):
             pass
         other.kill()
         other.wait()
-    with held_folder(folder):
+    with locked_folder(folder):
         (folder / "file").touch()
     assert folder.is_dir()
 
 
 def test_a_locked_folder_that_stays_empty_is_removed(tmp_path):
-    @holds_folder("out")
+    @locks_folder("out")
     def run(*, out, text):
         assert out.is_dir()
         if not text:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from splatpilot.systems.common.processes import available_cores, map_processes, run_apart
+from splatpilot.systems.common.processes import available_cores, map_processes, run_in_subprocess
 
 
 def _square(number: int) -> tuple[int, int]:
@@ -94,13 +94,13 @@ def _abort(work):
 
 
 def test_work_apart():
-    work, process = run_apart("a: counting", _abort, "count")
+    work, process = run_in_subprocess("a: counting", _abort, "count")
     assert work == "count" and process != os.getpid()
     with pytest.raises(ValueError, match="refuse: no"):
-        run_apart("a: counting", _abort, "refuse")
+        run_in_subprocess("a: counting", _abort, "refuse")
     for work, why in (("abort", "its process was ended"), ("fail", "no factory")):
         with pytest.raises(OSError, match=f"a: counting: {why}, perhaps for lack of disk space"):
-            run_apart("a: counting", _abort, work)
+            run_in_subprocess("a: counting", _abort, work)
 
 
 def test_cores_are_those_that_the_process_may_use(monkeypatch):

@@ -39,17 +39,17 @@ def package(folder, name: str, body: str, group: str = "", point: str = "") -> N
 def test_kinds_are_found_by_name_and_by_configuration(registry):
     """A name gives its kind; a configuration that of its type, or of the nearest base."""
     assert registry.find("one") == Kind(OneConfig)
-    assert registry.kind_of(OneConfig()) == Kind(OneConfig)
-    assert registry.kind_of(DerivedConfig()) == Kind(OneConfig)
+    assert registry.entry_for(OneConfig()) == Kind(OneConfig)
+    assert registry.entry_for(DerivedConfig()) == Kind(OneConfig)
     registry.add("derived", Kind(DerivedConfig))
-    assert registry.kind_of(DerivedConfig()) == Kind(DerivedConfig)
+    assert registry.entry_for(DerivedConfig()) == Kind(DerivedConfig)
 
 
 def test_what_nobody_knows_is_refused_with_what_there_is(registry):
     with pytest.raises(ValueError, match=r"no thing 'two'; there are one, and module:attribute"):
         registry.find("two")
     with pytest.raises(ValueError, match=r"no thing has the configuration int; known are OneCon"):
-        registry.kind_of(3)
+        registry.entry_for(3)
 
 
 def test_names_are_given_once(registry):
