@@ -118,11 +118,6 @@ class TrajectoryNetwork:
         return leaky_relu(linear(self._weights, name, x))
 
 
-def load_network(path: str | None) -> TrajectoryNetwork:
-    """Loads the network from a file of weights, see `PolicyCheckpoint.load`."""
-    return PolicyCheckpoint.load(path, "agile_autonomy", AGILE_NETWORK).build(TrajectoryNetwork)
-
-
 def state_observation(R_WB: Any, v_WB: Any, w_WB_B: Any, v_target: Any) -> Any:
     """Returns (..., 18): attitude R_WB (..., 3, 3) row by row, then in the body frame velocity
     [m/s], rates [rad/s] and target velocity [m/s]. Arrays are numpy or torch."""
@@ -192,7 +187,8 @@ class AgileAutonomy(Policy):
 
     def __init__(self, config: AgileAutonomyConfig | None = None) -> None:
         super().__init__(config or AgileAutonomyConfig(), "depth_image_32f")
-        self._network = load_network(self._config.weights)
+        checkpoint = PolicyCheckpoint.load(self._config.weights, "agile_autonomy", AGILE_NETWORK)
+        self._network = checkpoint.build(TrajectoryNetwork)
         self.declare_state(no_plan(MODES), "hypotheses")
 
     def decide(self, seen: Observation, *state: np.ndarray) -> list[np.ndarray]:

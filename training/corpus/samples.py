@@ -96,16 +96,8 @@ def write_shard(
     flights: list[dict[str, Any]],
     revision: str,
 ) -> None:
-    """Writes the folder `path` atomically; an existing one stays.
-
-    Args:
-        parts: the samples; their `world` and `source` are not written.
-        size: their size.
-        world: name of their world.
-        source: one of `SOURCES`.
-        flights: descriptions of the flights that they come from.
-        revision: of the program.
-    """
+    """Writes the samples of one world and source to the folder `path` atomically; an existing one
+    stays."""
     parts = [Samples.zeros(0, size), *parts]
     count = sum(map(len, parts))
     labels = np.empty(count, size.label_type())

@@ -1,20 +1,15 @@
 """Trains DiffAero: analytic gradients of a loss through the dynamics of flight.
 
 After "DiffAero: A GPU-Accelerated Differentiable Simulation Framework for Efficient Quadrotor
-Policy Learning" (2025). As published: a 16x9 depth image; nine numbers of state (target velocity,
-velocity and body z axis in the heading frame); commanded accelerations of a point mass with a lag;
-32 steps of flight per update; gradients that decay backward in time; a loss of velocity (smooth L1
-of a moving average), proximity of obstacles weighted with the velocity toward them, and jerk.
-
-Different here: the convolutional and recurrent variant instead of the perceptron; depth to 12 m as
-3 / z - 0.6 instead of 1 - range / 5 m; the nearest surface in each pixel instead of one ray; 15 Hz
-instead of 30; accelerations without gravity; 64 environments instead of 1024; in the loss, desired
-velocities along the path around obstacles (time of arrival) instead of straight to the goal; the
-clearance terms of "Back to Newton's Laws: Learning Vision-based Agile Flight via Differentiable
-Physics" (2024); the benchmark's kinds of worlds.
+Policy Learning" (2025). Different here: the convolutional and recurrent variant instead of the
+perceptron; depth to 12 m as 3 / z - 0.6 instead of 1 - range / 5 m; the nearest surface in each
+pixel instead of one ray; 15 Hz instead of 30; accelerations without gravity; 64 environments
+instead of 1024; in the loss, desired velocities along the path around obstacles (time of arrival)
+instead of straight to the goal; the clearance terms of "Back to Newton's Laws: Learning
+Vision-based Agile Flight via Differentiable Physics" (2024); the benchmark's kinds of worlds.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -36,12 +31,12 @@ from splatpilot.systems.policies.observations import (
     limit_smoothly,
 )
 from splatpilot.systems.policies.velocity import tracking_acceleration
-from splatpilot.systems.sensing.noise import ObservationNoise
 from splatpilot.systems.sensing.time_of_flight import (
     UNMEASURED_DEPTH,
     equivalent_sensor,
     range_of_depth,
 )
+from splatpilot.training.policies.augmentation import depth_noise
 from splatpilot.training.policies.networks import TrainableNetwork
 from splatpilot.training.policies.ray_casting import PixelRays
 from splatpilot.training.policies.rollouts import RolloutConfig, RolloutTraining, Transitions
@@ -138,26 +133,23 @@ def proximity_grid(
     return (1.0 - blocks.amin((2, 4)).clamp(0.0, max_range) / max_range).flip(1)
 
 
-def streaming_noise() -> ObservationNoise:
-    """Returns the default noise of a time-of-flight sensor: 10 to 30 images per second, some late
-    and some lost."""
-    return ObservationNoise(
-        depth_multiplicative=0.03,
-        depth_additive=0.02,
-        depth_dropout=0.01,
-        latency=0.03,
-        frame_rate=[10.0, 30.0],
-        jitter=0.03,
-        frame_dropout=0.05,
-    )
-
-
 @dataclass
 class DiffAeroTofTraining(DiffAeroTraining):
-    """A training run of DiffAero by the grid of a time-of-flight sensor."""
+    """A training run of DiffAero by the grid of a time-of-flight sensor, with 10 to 30 images per
+    second, some late and some lost."""
 
     schedule: Schedule = field(default_factory=lambda: Schedule(updates=6000, validate_every=500))
-    rollout: RolloutConfig = field(default_factory=lambda: RolloutConfig(noise=streaming_noise()))
+    rollout: RolloutConfig = field(
+        default_factory=lambda: RolloutConfig(
+            noise=replace(
+                depth_noise(),
+                latency=0.03,
+                frame_rate=[10.0, 30.0],
+                jitter=0.03,
+                frame_dropout=0.05,
+            )
+        )
+    )
 
 
 class DiffAeroTofLearner(DiffAeroLearner):

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from splatpilot.systems.common.config import load_config
 from splatpilot.systems.policies.checkpoint import checkpoint_policy
@@ -142,19 +143,15 @@ def test_what_was_lost_or_damaged_is_made_again(expert, tmp_path, capsys):
 def test_recovery_share_is_the_part_that_students_came_to(expert, tmp_path):
     both_stages(expert, tmp_path)
     data = StudentData([Corpus(tmp_path / "corpora" / "0")], 0.5)
-    rng = np.random.default_rng(0)
-
-    def draw(count: int) -> np.ndarray:
-        return rng.integers(count, size=4000)
-
+    generator = torch.Generator().manual_seed(0)
     natural = len(data.recovered) / len(data.training)
     assert 0.0 < natural < 1.0
     for share, part in ((0.0, natural), (0.25, 0.25), (0.8, 0.8), (1.0, 1.0)):
-        drawn = data.draw(draw, share)
+        drawn = data.draw(4000, generator, share)
         assert set(drawn) <= set(data.training)
         assert np.isin(drawn, data.recovered).mean() == pytest.approx(part, abs=0.03)
     plain = StudentData([Corpus(expert)], 0.5)
-    assert set(plain.draw(draw, 0.5)) == set(plain.training)
+    assert set(plain.draw(4000, generator, 0.5)) == set(plain.training)
 
 
 def test_what_sees_in_colors_recovers_too(tmp_path, monkeypatch):

@@ -29,6 +29,7 @@ from splatpilot.training.policies.evaluation import evaluate_agent
 from splatpilot.training.policies.train import run
 from splatpilot.training.policies.train_diffaero import DiffAeroLearner, DiffAeroTraining
 from splatpilot.training.policies.trainer_registry import TRAINERS
+from splatpilot.training.policies.training_worlds import WorldCache
 
 CARDS = sorted((Path(policy_checkpoint.__file__).parent / "weights").glob("*.md"))
 
@@ -213,9 +214,7 @@ def test_loss_that_is_not_a_number_stops_with_its_name_and_keeps_the_weights(tmp
 
 def test_training_seeds_are_not_the_benchmarks(monkeypatch):
     asked: list[int] = []
-    monkeypatch.setattr(
-        training_worlds, "make_training_world", lambda kind, seed, cache: asked.append(seed)
-    )
+    monkeypatch.setattr(WorldCache, "world", lambda self, config, seed: asked.append(seed))
     monkeypatch.setattr(training_worlds, "WorldBatch", lambda *_: None)
     selection = training_worlds.WorldSelection(count=1000, held_out=1000)
     for seed in (0, 1, 999):

@@ -14,13 +14,13 @@ from splatpilot.systems.collision.esdf_build import esdf_from_distance_field
 from splatpilot.systems.collision.shapes import AnalyticDistanceField, Capsule, HalfSpace
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
+from splatpilot.training.corpus.library import scenario_world
 from splatpilot.training.policies.ray_casting import EsdfGeometry, PixelRays
 from splatpilot.training.policies.rollouts import DifferentiableRollout, RolloutConfig
 from splatpilot.training.policies.train_diffaero import DiffAeroLearner, DiffAeroLoss
 from splatpilot.training.policies.training_worlds import (
     WorldCache,
     WorldSelection,
-    make_training_world,
     training_worlds,
     validation_worlds,
 )
@@ -64,7 +64,7 @@ def test_kinds_and_places_come_in_turn(yard):
     worlds = training_worlds(selection(yard, voxel_size=0.5), seed=3)
     held_out = validation_worlds(selection(yard))
     for batch, number, seed in ((worlds, 2, 1_003_002), (held_out, 0, 2_000_000)):
-        generated = make_training_world("P02", seed, WorldCache())
+        generated = WorldCache().world(scenario_world("P02"), seed)
         np.testing.assert_allclose(batch.p_WS[number], generated.p_WS, rtol=1e-6)
         np.testing.assert_allclose(batch.p_WG[number], generated.p_WG, rtol=1e-6)
     np.testing.assert_allclose(worlds.upper_W[1::2], [UPPER] * 2, atol=1e-5)

@@ -27,14 +27,14 @@ def point_masses(count: int) -> PointMass:
 
 def test_point_mass_solves_its_equation_exactly():
     start, a_cmd = point_masses(5), torch.tensor([[3.0, -2.0, 1.0]], dtype=torch.float64)
-    once = start.step(a_cmd, 0.2, CONTROL)
+    once = start.step(a_cmd, 0.2)
     many = start
     for _ in range(1000):
-        many = many.step(a_cmd, 0.0002, CONTROL)
+        many = many.step(a_cmd, 0.0002)
     for name in "pva":
         torch.testing.assert_close(getattr(once, name), getattr(many, name), rtol=0, atol=1e-10)
     # And the equation itself: the acceleration's rate is what it lacks over the lag.
-    rate = (start.step(a_cmd, 1e-6, CONTROL).a - start.a) / 1e-6
+    rate = (start.step(a_cmd, 1e-6).a - start.a) / 1e-6
     torch.testing.assert_close(rate, (a_cmd - start.a) / start.lag, rtol=1e-4, atol=1e-4)
 
 
@@ -52,10 +52,10 @@ def test_point_mass_turns_its_nose_along_its_motion():
     zero = torch.zeros(1, 3)
     v, lag = torch.tensor([[0.0, 2.0, 0.0]]), torch.ones(1, 1)
     vehicle = PointMass(zero, v, zero, torch.zeros(1), lag)
-    vehicle = vehicle.step(zero, 0.01, CONTROL)
+    vehicle = vehicle.step(zero, 0.01)
     assert float(vehicle.yaw) == pytest.approx(0.01 * CONTROL.max_yaw_rate, rel=1e-3)
     for _ in range(300):
-        vehicle = vehicle.step(zero, 0.01, CONTROL)
+        vehicle = vehicle.step(zero, 0.01)
     assert float(vehicle.yaw) == pytest.approx(np.pi / 2, abs=1e-2)
 
 
@@ -76,7 +76,7 @@ def test_body_rate_vehicle_flies_as_plant_and_controller_do():
 
     vehicle = BodyRate.hovering(torch.tensor([[0.0, 0.0, 2.0]]), torch.zeros(1))
     for _ in range(30):
-        vehicle = vehicle.step(torch.tensor(a_WB, dtype=torch.float32)[None], 1 / 15, CONTROL)
+        vehicle = vehicle.step(torch.tensor(a_WB, dtype=torch.float32)[None], 1 / 15)
     np.testing.assert_allclose(vehicle.p[0], expected[:3], atol=0.05)
     np.testing.assert_allclose(vehicle.v[0], expected[3:6], atol=0.05)
     R_WB = pose_from_state(vehicle.state[0].double().numpy()).rotation().matrix()
@@ -89,7 +89,7 @@ def test_gradients_flow_through_the_body_rate_vehicle():
         vehicle = BodyRate.hovering(torch.zeros(1, 3, dtype=torch.float64), torch.zeros(1))
         vehicle = vehicle._replace(state=vehicle.state.double())
         for _ in range(6):
-            vehicle = vehicle.step(a, 0.04, CONTROL)
+            vehicle = vehicle.step(a, 0.04)
         return vehicle.p[0, 0]
 
     a = torch.tensor([[1.0, 0.5, 0.3]], dtype=torch.float64, requires_grad=True)

@@ -75,13 +75,14 @@ def test_what_was_not_used_for_longest_goes_first(folder, monkeypatch):
 
 @pytest.mark.parametrize("kind", ["P02", "P05", "P10", "P11"])
 def test_generated_worlds_are_read_again(folder, monkeypatch, kind):
-    made = WorldCache().spec(scenario_world(kind), 7)
+    made = WorldCache().world(scenario_world(kind), 7)
     monkeypatch.setattr(world_cache, "make_spec", None)
-    shapes, *points = WorldCache().spec(scenario_world(kind), 7)
-    for a, b in zip(shapes, made[0], strict=True):
+    again = WorldCache().world(scenario_world(kind), 7)
+    for a, b in zip(again.surfaces, made.surfaces, strict=True):
         assert type(a) is type(b)
         for x, y in zip(a.parameters(), b.parameters(), strict=True):
             np.testing.assert_array_equal(x, y)
-    np.testing.assert_array_equal(points, made[1:])
+    for point in ("lower_W", "upper_W", "p_WS", "p_WG"):
+        np.testing.assert_array_equal(getattr(again, point), getattr(made, point))
     with pytest.raises(TypeError):
-        WorldCache().spec(scenario_world(kind), 8)
+        WorldCache().world(scenario_world(kind), 8)
