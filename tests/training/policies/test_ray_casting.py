@@ -173,33 +173,6 @@ def test_nothing_is_left_out_among_many_shapes():
         assert torch.equal(world[n], images.amin(0))
 
 
-def test_level_camera_beside_an_upright_trunk_gives_numbers():
-    shapes = [
-        Cylinder([5, 0, 0], [5, 0, 6], 0.3),
-        Box(RigidTransform([8.0, 2.0, 3.0]), [1.0, 1.0, 2.0]),
-    ]
-    rays = PixelRays.of(17, 9, 90.0)
-    middle = one_image(ShapeGeometry([shapes]), rays, [0.0, 0.0, 3.0]).reshape(9, 17)[4]
-    assert middle[8] == pytest.approx(4.7, abs=1e-5)  # straight ahead, the trunk
-    assert middle[6] == pytest.approx(7.5, abs=1e-5)  # y = 4 / 17 z, the box's face
-    assert np.nanmin(middle) == middle.min() == pytest.approx(4.7, abs=1e-5)
-    log = ShapeGeometry([[Capsule([5, 0, 3], [7, 0, 3], 0.3)]])
-    assert one_image(log, rays, [0.0, 0.0, 3.0]).reshape(9, 17)[4, 8] == pytest.approx(4.7, abs=0.2)
-
-
-def test_distances_and_normals(worlds):
-    shapes, geometry = worlds
-    inside = 0
-    for w in range(4):
-        p_WQ = np.random.default_rng(100 + w).uniform(LOWER, UPPER, (900, 3))
-        distances, normals = geometry.nearest(floats(p_WQ), numbers(900) * 0 + w, 1)
-        exact = AnalyticDistanceField(shapes[w], LOWER, UPPER).query(p_WQ)
-        np.testing.assert_allclose(distances[:, 0], exact.distance, atol=1e-5)
-        np.testing.assert_allclose(normals[:, 0], exact.gradient, atol=1e-3)
-        inside += (exact.distance < 0.0).sum()
-    assert inside > 20
-
-
 def test_the_nearest_of_many_are_the_first_when_all_are_sorted():
     shapes = some_world(4, 60)
     p_WQ = np.random.default_rng(40).uniform(LOWER, UPPER, (50, 3))

@@ -15,7 +15,6 @@ from splatpilot.training.corpus.expert import ExpertConfig
 from splatpilot.training.corpus.library import LibraryConfig
 from splatpilot.training.corpus.samples import EXPERT, RECOVERY
 from splatpilot.training.policies import recover as recovery
-from splatpilot.training.policies import recover as student_flights
 from splatpilot.training.policies.student_data import StudentData
 from splatpilot.training.policies.train_diffaero_rgb import DiffAeroRgbTrainer, DiffAeroRgbTraining
 from splatpilot.training.policies.train_student import StudentDepthTraining, StudentTrainer
@@ -75,7 +74,7 @@ def test_student_flies_and_is_trained_anew_with_what_it_lacked(expert, tmp_path,
     assert len(list((whole / "flights" / "0").iterdir())) == 1
     assert json.loads((whole / "recovery.json").read_text()) == ledger
 
-    for module, step in ((student_flights, "_fly_world"), (recovery, "_count")):
+    for module, step in ((recovery, "_fly_world"), (recovery, "_count")):
         with monkeypatch.context() as patch:
             patch.setattr(module, step, interrupt)
             with pytest.raises(KeyboardInterrupt):
@@ -83,7 +82,7 @@ def test_student_flies_and_is_trained_anew_with_what_it_lacked(expert, tmp_path,
     config = load_config(StudentDepthTraining(), overrides=[f"corpora=[{expert}]", *TINY])
     with pytest.raises(ValueError, match=r"recovery.yaml holds another configuration"):
         recovery.run(config=config, make=StudentTrainer, out=parts, flights=2, jobs=1)
-    monkeypatch.setattr(student_flights, "_fly_world", interrupt)  # which has been done
+    monkeypatch.setattr(recovery, "_fly_world", interrupt)  # which has been done
     assert both_stages(expert, parts)["flights"] == ledger["flights"]
     expected, found = weights(whole), weights(parts)
     assert all(np.array_equal(found[name], value) for name, value in expected.items())
@@ -91,13 +90,13 @@ def test_student_flies_and_is_trained_anew_with_what_it_lacked(expert, tmp_path,
 
 def test_another_round_is_flown_by_the_weights_of_the_one_before(expert, tmp_path, monkeypatch):
     both_stages(expert, tmp_path / "first")
-    flown, fly = [], student_flights.fly
+    flown, fly = [], recovery.fly
 
     def watched(diagram, scenario, world):
         flown.append(scenario.policy)
         return fly(diagram, scenario, world)
 
-    monkeypatch.setattr(student_flights, "fly", watched)
+    monkeypatch.setattr(recovery, "fly", watched)
     corpus, out = tmp_path / "first" / "corpora" / "0", tmp_path / "second"
     pilot = str(tmp_path / "first" / "stage_2" / "student_depth.npz")
     config = load_config(StudentDepthTraining(), overrides=[f"corpora=[{corpus}]", *TINY])
@@ -155,13 +154,13 @@ def test_recovery_share_is_the_part_that_students_came_to(expert, tmp_path):
 
 
 def test_what_sees_in_colors_recovers_too(tmp_path, monkeypatch):
-    speeds, fly = [], student_flights.fly
+    speeds, fly = [], recovery.fly
 
     def watched(diagram, scenario, world):
         speeds.append(scenario.policy.speed)
         return fly(diagram, scenario, world)
 
-    monkeypatch.setattr(student_flights, "fly", watched)
+    monkeypatch.setattr(recovery, "fly", watched)
     gather(tmp_path / "expert", tmp_path, OnboardCamera(width=160, height=90))
     tiny = [setting for setting in TINY if not setting.startswith(("pretrained", "frozen"))]
     overrides = [f"corpora=[{tmp_path / 'expert'}]", *tiny]

@@ -2,10 +2,6 @@ import csv
 import json
 import os
 import re
-import signal
-import subprocess
-import sys
-import time
 import zipfile
 from contextlib import contextmanager
 from pathlib import Path
@@ -45,6 +41,7 @@ SMALL = [
 ]
 TINY = [*SMALL, "rollout.environments=4", "rollout.steps=4"]
 OF_POLICY = {
+    "diffaero": TINY[-2:],
     "depthnav": [*TINY[-2:], "empty=0.5", "rollout.noise.latency=0.1"],
     "agile_autonomy": ["rounds=2", "round_updates=3", "environments=4", "steps=16", "batch=8"],
 }
@@ -85,22 +82,6 @@ def test_run_leaves_what_it_says(finished):
     assert summary["updates"] == 6 and summary["seed"] == 0
 
 
-def test_killed_run_ends_as_one_that_was_not(finished, tmp_path):
-    program = "from splatpilot.analysis.commands.main import main; raise SystemExit(main())"
-    command = [sys.executable, "-c", program, "train", "diffaero", "--out", str(tmp_path)]
-    for override in TINY:
-        command += ["--set", override]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    while not (tmp_path / "checkpoint.pt").exists() and process.poll() is None:
-        time.sleep(0.002)
-    os.kill(process.pid, signal.SIGKILL)
-    process.wait()
-    run(config=tiny(), out=tmp_path, make=TRAINERS.find("diffaero").make)
-    assert_same(tmp_path, finished)
-    rows = (tmp_path / "curves.csv").read_text()
-    assert rows == (finished / "curves.csv").read_text()
-
-
 def test_a_command_trains_seeds_one_after_the_other(finished, tmp_path):
     overrides = [argument for override in TINY for argument in ("--set", override)]
     command = ["train", "diffaero", "--seeds", "0", "1", "--out", str(tmp_path)]
@@ -109,7 +90,7 @@ def test_a_command_trains_seeds_one_after_the_other(finished, tmp_path):
     assert json.loads((tmp_path / "seed_1" / "summary.json").read_text())["seed"] == 1
 
 
-@pytest.mark.parametrize("policy", ["depthnav", "agile_autonomy"])
+@pytest.mark.parametrize("policy", ["diffaero", "depthnav", "agile_autonomy"])
 def test_interrupted_training_ends_as_whole(policy, tmp_path):
     trainer_kind = TRAINERS.find(policy)
     config = load_config(trainer_kind.config(), overrides=[*SMALL, *OF_POLICY[policy]])
@@ -131,6 +112,8 @@ def test_interrupted_training_ends_as_whole(policy, tmp_path):
         run(config=config, out=tmp_path / "again", make=make_interrupted)
     run(config=config, out=tmp_path / "again", make=trainer_kind.make)
     assert_same(tmp_path / "again", tmp_path / "whole")
+    curves = [(tmp_path / folder / "curves.csv").read_text() for folder in ("again", "whole")]
+    assert curves[0] == curves[1]
     assert policy_named(str(tmp_path / "whole" / f"{policy}.npz")).rate > 0.0
 
 
@@ -191,10 +174,6 @@ def test_other_configuration_or_broken_checkpoint_is_refused(finished, tmp_path)
         run(config=tiny(), out=tmp_path, make=TRAINERS.find("diffaero").make)
     with pytest.raises(ValueError, match=r"schedule\.updates must be in \[1, inf\), got 0"):
         run(config=tiny("schedule.updates=0"), out=tmp_path, make=TRAINERS.find("diffaero").make)
-    with pytest.raises(ValueError, match=r"seed must be in \[0, 999\], got 10{20}$"):
-        run(config=tiny(f"seed={10**20}"), out=tmp_path, make=TRAINERS.find("diffaero").make)
-    with pytest.raises(ValueError, match=r"there is no scenario 'P99'; did you mean P09"):
-        run(config=tiny("worlds.kinds=[P99]"), out=tmp_path, make=TRAINERS.find("diffaero").make)
 
 
 class FragileTrainer(TinyTrainer):
