@@ -124,12 +124,8 @@ def load_network(path: str | None) -> DiffAeroRgbNetwork:
 
 
 def encode_view(color: np.ndarray, R_WB: np.ndarray) -> np.ndarray:
-    """Returns the network's input (6, 90, 160): RGB in [-1, 1] and rays in the heading frame.
-
-    Args:
-        color: (H, 160, 3) uint8 of a camera of 90 degrees.
-        R_WB: (3, 3) attitude.
-    """
+    """Returns the network's input (6, 90, 160): RGB in [-1, 1] of images (H, 160, 3) uint8, and
+    rays in the heading frame at the attitude R_WB (3, 3)."""
     H, W = color.shape[:2]
     require_view(W, H)
     first = (H - HEIGHT) // 2

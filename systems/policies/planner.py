@@ -41,16 +41,10 @@ def plan(
     params: QuadrotorParams | None = None,
     obstacles: Distances | None = None,
 ) -> Hypotheses:
-    """Plans the K best distinct trajectories from a state, cheapest first.
+    """Plans the K best distinct trajectories of a lattice from a state (13,), cheapest first.
 
-    Args:
-        time: of the state [s].
-        state: (13,).
-        field: a conservative distance field.
-        toa: the time of arrival at the goal, over the same grid.
-        lattice: the trajectories to choose from.
-        params: of the vehicle.
-        obstacles: distances for the costs, `field` by default; may include moving obstacles.
+    `field` is conservative, and `toa` over the same grid. `obstacles` are the distances for the
+    costs, those of `field` by default; they may include moving obstacles.
     """
     valid = np.shape(state) == (13,) and bool(np.isfinite(state).all())
     remedy = "check the plant or estimator it comes from"

@@ -85,13 +85,8 @@ class ExpertFlight:
 
 
 class Labeler:
-    """Plans the best trajectories from any state of a scene to a goal.
-
-    Args:
-        esdf: the scene; unknown space counts as occupied.
-        p_WG: the goal (3,) [m].
-        config: speed and number of trajectories.
-    """
+    """Plans the best trajectories from any state of a scene, whose unknown space is occupied,
+    to the goal p_WG (3,) [m]."""
 
     def __init__(self, esdf: Esdf, p_WG: np.ndarray, config: ExpertConfig) -> None:
         self._lattice = TrajectoryLattice(config.lattice())

@@ -21,11 +21,9 @@ from splatpilot.systems.common.readers import error_summary
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS
 
+# Source of a sample: an expert's flight, the time before a student's near-miss, or free space.
 EXPERT, RECOVERY, OFF_PATH = 0, 1, 2
-"""Source of a sample: an expert's flight, the time before a student's near-miss, or free space."""
-
-SOURCES = {EXPERT: "expert", RECOVERY: "recovery", OFF_PATH: "off_path"}
-"""Names of the sources."""
+SOURCES = {EXPERT: "expert", RECOVERY: "recovery", OFF_PATH: "off_path"}  # names
 
 SHARD = "shard.json"
 FORMAT_VERSION = 2

@@ -65,13 +65,8 @@ class Geometry:
 
 
 class ShapeGeometry(Geometry):
-    """Worlds of analytic shapes, those of the benchmark's worlds.
-
-    Args:
-      worlds: the shapes of each.
-      threads: for images, which are the same for any number.
-      simd: instructions, of `_native.simd_levels()`, with equal results; the widest by default.
-    """
+    """Worlds of analytic shapes. Results are equal for any number of threads and any instructions
+    `simd` of `_native.simd_levels()`; the widest by default."""
 
     def __init__(self, worlds: Sequence[Sequence[Shape]], threads: int = 1, simd: str = "") -> None:
         rows, kinds = shape_rows([shape for world in worlds for shape in world])
@@ -88,14 +83,8 @@ class ShapeGeometry(Geometry):
 
 
 class Grids:
-    """Values over the voxels of several worlds, interpolated trilinearly.
-
-    Args:
-      values: (nx, ny, nz) of each, at the centers of voxels, at least two along each axis.
-      lower_W: (W, 3) [m], lower corners.
-      voxel_sizes: (W,) [m].
-      threads, simd: see `ShapeGeometry`.
-    """
+    """Values over the voxels of several worlds, interpolated trilinearly: (nx, ny, nz) of each, at
+    the centers of voxels, at least two along each axis."""
 
     def __init__(
         self,

@@ -41,13 +41,8 @@ class Labels(NamedTuple):
 
 
 class StudentData:
-    """The distinct samples of several corpora, some of whose worlds are held out.
-
-    Args:
-        corpora: may share worlds and shards.
-        held_out: fraction of the worlds that validate, see `is_held_out`.
-        device: device of the labels; images stay on disk.
-    """
+    """The distinct samples of several corpora, of which a fraction of the worlds is held out, see
+    `is_held_out`. Labels are on a device; images stay on disk."""
 
     def __init__(self, corpora: Sequence[Corpus], held_out: float, device: str = "cpu") -> None:
         configs = [corpus.config for corpus in corpora]

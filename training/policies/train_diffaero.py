@@ -85,16 +85,18 @@ class DiffAeroLearner:
     def initial_memory(self, count: int) -> Tensor:
         return torch.zeros(count, self.network.spec.hidden_size, device=self._limits.device)
 
+    def encode(self, depth: Tensor) -> Tensor:
+        """Encodes depth (N, R) [m] as images (N, 9, 16)."""
+        spec, image = self.network.spec, inverse_depth(depth, MIN_DEPTH, MAX_DEPTH)
+        return image.reshape(-1, spec.image_height, spec.image_width)
+
     def decide(self, seen: Observation, memory: Tensor) -> tuple[Tensor, None, Tensor]:
-        spec = self.network.spec
-        R_WH = heading_frame(seen.vehicle.yaw)
-        image = inverse_depth(seen.depth, MIN_DEPTH, MAX_DEPTH)
-        state = _state_observation(seen, R_WH)
-        output, memory = self.network(
-            image.reshape(-1, spec.image_height, spec.image_width), state, memory
-        )
-        a_H = limit_smoothly(output, self._limits)
-        return (R_WH @ a_H[:, :, None])[:, :, 0], None, memory
+        vehicle, R_WH = seen.vehicle, heading_frame(seen.vehicle.yaw)
+        p, v, z = vehicle.p, vehicle.v, vehicle.body_z()
+        state = heading_observation(p, v, z, seen.p_WG, seen.speed, R_WH)
+        output, memory = self.network(self.encode(seen.depth), state, memory)
+        command_H = limit_smoothly(output, self._limits)
+        return (R_WH @ command_H[:, :, None])[:, :, 0], None, memory
 
     def losses(self, transitions: Transitions) -> dict[str, Tensor]:
         weights = self._loss
@@ -112,25 +114,6 @@ class DiffAeroLearner:
             "acceleration": weights.acceleration * transitions.a.square().sum(1).mean(),
             "jerk": weights.jerk * transitions.jerk.square().sum(1).mean(),
         }
-
-
-def _state_observation(seen: Observation, R_WH: Tensor) -> Tensor:
-    p, v, z = seen.vehicle.p, seen.vehicle.v, seen.vehicle.body_z()
-    return heading_observation(p, v, z, seen.p_WG, seen.speed, R_WH)
-
-
-def proximity_grid(
-    depth: Tensor, range_of_depth: Tensor, max_range: float, height: int, width: int
-) -> Tensor:
-    """Computes the proximities (N, height, width) of depth (N, R) [m], the lowest row first.
-
-    See `splatpilot.systems.sensing.time_of_flight`, also for `range_of_depth` (H, W), whose size is
-    a multiple of height and width.
-    """
-    H, W = range_of_depth.shape
-    measured = torch.where(depth > UNMEASURED_DEPTH, depth, max_range).reshape(-1, H, W)
-    blocks = (measured * range_of_depth).reshape(-1, height, H // height, width, W // width)
-    return (1.0 - blocks.amin((2, 4)).clamp(0.0, max_range) / max_range).flip(1)
 
 
 @dataclass
@@ -166,13 +149,15 @@ class DiffAeroTofLearner(DiffAeroLearner):
         self._range_of_depth = torch.tensor(to_range, dtype=torch.float32, device=device)
         self._limits = torch.tensor(VELOCITY_LIMITS, dtype=torch.float32, device=device)
 
+    def encode(self, depth: Tensor) -> Tensor:
+        """Encodes depth (N, R) [m] as proximities (N, 9, 16), the lowest row first, see
+        `splatpilot.systems.sensing.time_of_flight`."""
+        sensor, (H, W) = self._sensor, self._range_of_depth.shape
+        depth = torch.where(depth > UNMEASURED_DEPTH, depth, sensor.max_range).reshape(-1, H, W)
+        blocks = (-1, sensor.rows, H // sensor.rows, sensor.columns, W // sensor.columns)
+        nearest = (depth * self._range_of_depth).reshape(blocks).amin((2, 4))
+        return (1.0 - nearest.clamp(0.0, sensor.max_range) / sensor.max_range).flip(1)
+
     def decide(self, seen: Observation, memory: Tensor) -> tuple[Tensor, None, Tensor]:
-        sensor, R_WH = self._sensor, heading_frame(seen.vehicle.yaw)
-        grid = proximity_grid(
-            seen.depth, self._range_of_depth, sensor.max_range, sensor.rows, sensor.columns
-        )
-        state = _state_observation(seen, R_WH)
-        output, memory = self.network(grid, state, memory)
-        v_H = limit_smoothly(output, self._limits)
-        v_desired = (R_WH @ v_H[:, :, None])[:, :, 0]
+        v_desired, _, memory = super().decide(seen, memory)
         return tracking_acceleration(seen.vehicle.v, v_desired), None, memory

@@ -112,11 +112,6 @@ def hypothesis_errors(expert: Tensor, waypoints: Tensor) -> Tensor:
     return 10.0 / (3 * expert.shape[1]) * (expert[:, None] - waypoints).square().sum((2, 3))
 
 
-def root_mean_square(errors: Tensor) -> Tensor:
-    """Computes the root mean square distance [m] of an error L (...)."""
-    return (0.3 * errors).sqrt()
-
-
 def imitation_terms(errors: Tensor, epsilon: float) -> tuple[Tensor, Tensor]:
     """Computes the relaxed winner-takes-all loss: the terms of the closest and of the others.
 
@@ -220,7 +215,7 @@ of error and clearance."""
             chosen = predicted.costs.argmin(1)
             each = torch.arange(len(chosen), device=chosen.device)
             clear = (predicted.distances[each, chosen] > VEHICLE_RADIUS).all(1)
-            error = root_mean_square(predicted.errors[each, chosen])
+            error = (0.3 * predicted.errors[each, chosen]).sqrt()  # root mean square
             best = predicted.penalties.argmin(1) == chosen
             rows.append(torch.stack([clear & (error < CLOSE), clear, error, best], 1).float())
         means = torch.cat(rows).mean(0).tolist()

@@ -59,11 +59,9 @@ from splatpilot.training.policies.ray_casting import Geometry, Grids, MixedGeome
 
 _LIMIT = 1 << 30  # [bytes] of the cache; the files that were used last stay.
 
+# Shapes that the cache can store, and points (3,) [m] of a `WorldSpec`.
 _SHAPES = {shape.__name__: shape for shape in (Sphere, Capsule, Cylinder, Box, HalfSpace)}
-"""Shapes that the cache can store."""
-
 _POINTS = "lower_W", "upper_W", "p_WS", "p_WG"
-"""Points of a `WorldSpec`, (3,) [m] each."""
 
 
 class WorldCache:
@@ -173,13 +171,8 @@ class TrainingWorld:
 
 
 class WorldBatch:
-    """W worlds as tensors: surfaces, volumes, starts, goals, and the path to each goal.
-
-    Args:
-      worlds: W of them.
-      voxel_size: [m] of the grids of the time of arrival; None for evaluation, without grids.
-      device: of the tensors.
-    """
+    """W worlds as tensors: surfaces, volumes, starts, goals, and the path to each goal by grids of
+    the time of arrival with `voxel_size` [m]; None for evaluation, without grids."""
 
     def __init__(
         self,
