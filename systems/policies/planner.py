@@ -83,16 +83,11 @@ class PrivilegedPlanner(Policy):
     - ``hypotheses`` (8 + 31 K): as `Hypotheses.to_vector`, cheapest first, in the body frame B at
       the time of planning; NaN before the first update.
 
-    The time of arrival is computed once per goal and cached in the Context. It ignores moving
+    Unknown space and all outside the box of `esdf` count as occupied. The time of arrival is
+    computed once per goal and cached in the Context. It ignores moving
     obstacles; the costs of trajectories know their future positions. Updates raise
     InfeasibleFlightError if the goal is outside the known volume, too close to an obstacle or cut
     off from the vehicle.
-
-    Args:
-        esdf: the scene; unknown space and all outside its box count as occupied.
-        config: see `PrivilegedPlannerConfig`.
-        params: of the vehicle, see `plan`.
-        moving: moving obstacles.
     """
 
     hypotheses_output_port = output_port("hypotheses")

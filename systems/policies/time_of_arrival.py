@@ -129,13 +129,8 @@ def time_of_arrival(
     margin: float = 0.0,
     slowness: Callable[[np.ndarray], np.ndarray] = slowness,
 ) -> TimeOfArrival:
-    """Computes the time of arrival at p_WG (3,) [m] from everywhere in a distance field.
-
-    Args:
-        field: conservative, `Esdf.conservative()`.
-        margin: minimum clearance of the path [m], beyond the vehicle's radius.
-        slowness: S(d) [s/m].
-    """
+    """Computes the time of arrival at p_WG (3,) [m] from everywhere in a conservative distance
+    field, by paths of a minimum clearance `margin` [m] beyond the vehicle's radius."""
     what, remedy = "the distance field", "pass esdf.conservative()"
     require(field.occupied_outside, what, "conservative", "unknown space as free", remedy)
     p_WG = np.array(p_WG, dtype=float)

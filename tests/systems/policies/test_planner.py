@@ -8,7 +8,7 @@ from pydrake.systems.framework import DiagramBuilder, EventStatus
 from pydrake.systems.primitives import LogVectorOutput
 
 from splatpilot.systems.policies import planner as privileged_planner
-from splatpilot.systems.policies.hypotheses import Hypotheses, HypothesisSelector, hypotheses_size
+from splatpilot.systems.policies.hypotheses import Hypotheses, HypothesisSelector
 from splatpilot.systems.policies.lattice import LatticeConfig, TrajectoryLattice
 from splatpilot.systems.policies.planner import PrivilegedPlanner, PrivilegedPlannerConfig, plan
 from splatpilot.systems.policies.time_of_arrival import time_of_arrival
@@ -188,21 +188,6 @@ def test_time_of_arrival_is_computed_once_per_goal(empty, monkeypatch):
         planner.GetInputPort("goal").FixValue(context, p_WG)
         simulator.AdvanceTo(until)
     assert goals == [[9.0, 4.0, 3.0], [9.0, 6.0, 3.0]]
-
-
-def test_plans_at_its_rate(empty):
-    planner = PrivilegedPlanner(empty, PrivilegedPlannerConfig(rate=10.0))
-    simulator = Simulator(planner)
-    context = simulator.get_mutable_context()
-    planner.GetInputPort("state").FixValue(context, hover_state([3.0, 4.0, 3.0]))
-    planner.GetInputPort("goal").FixValue(context, [9.0, 4.0, 3.0])
-    port = planner.GetOutputPort("hypotheses")
-    assert port.size() == hypotheses_size(3)
-    assert Hypotheses.from_vector(np.asarray(port.Eval(context)), 3) is None
-    for until, plan_time in [(0.05, 0.0), (0.15, 0.1), (0.27, 0.2)]:
-        simulator.AdvanceTo(until)
-        hypotheses = Hypotheses.from_vector(np.asarray(port.Eval(context)), 3)
-        assert hypotheses is not None and hypotheses.plan_time == pytest.approx(plan_time)
 
 
 def test_unknown_space_is_not_planned_through(make_forest):

@@ -80,14 +80,6 @@ def test_contact_and_the_unseen_cost():
     assert unseen - seen == pytest.approx(CONFIG.unseen_weight * steps[far].sum())
 
 
-def test_fan_is_about_the_goal_and_ends_with_rest():
-    v = candidate_velocities(np.array([0.0, 5.0, 0.0]), CONFIG)
-    speeds = np.linalg.norm(v, axis=1)
-    assert speeds.max() == pytest.approx(CONFIG.speed)
-    assert np.abs(v - [0, CONFIG.speed, 0]).max(axis=1).min() < 1e-9
-    np.testing.assert_array_equal(v[-1], np.zeros(3))
-
-
 def test_angles_mean_what_they_mean_to_the_planner():
     angles = {"max_yaw": 0.7, "max_pitch": 0.2, "num_yaws": 5, "num_pitches": 3}
     v = candidate_velocities(np.array([1.0, 0.0, 0.0]), ReactiveConfig(**angles))

@@ -229,15 +229,6 @@ def test_half_stand_before_a_pillar_and_none_in_one():
     assert np.ptp(p_WB[others], axis=0) == pytest.approx([11.0, 7.0, 2.2], abs=1.2)
 
 
-def test_same_seed_draws_the_same_states():
-    labeler = labeler_of()
-    one, same, other = (
-        draw_off_path(labeler, 20, 2.0, np.random.default_rng(seed)) for seed in (1, 1, 2)
-    )
-    np.testing.assert_array_equal(one, same)
-    assert not np.allclose(one, other)
-
-
 def test_a_place_without_room_is_named():
     labeler = labeler_of()
     labeler.toa = replace(labeler.toa, reachable=np.zeros_like(labeler.toa.reachable))

@@ -130,22 +130,7 @@ def test_model_cards_hold_configurations_that_train(card, tmp_path, monkeypatch)
     made_with.validate()
 
 
-def test_run_leaves_the_threads_of_torch_as_they_were(tmp_path):
-    threads, used = torch.get_num_threads(), []
-    torch.set_num_threads(2)
-    try:
-        with pytest.raises(ValueError, match="update 5"):
-            run(
-                config=TinyTraining(),
-                out=tmp_path,
-                make=lambda config: used.append(torch.get_num_threads()) or FragileTrainer(config),
-            )
-        assert (used, torch.get_num_threads()) == ([1], 2)
-    finally:
-        torch.set_num_threads(threads)
-
-
-def test_curves_for_tensorboard_are_whole_when_a_run_ends(tmp_path, monkeypatch):
+def test_loss_that_is_not_a_number_ends_a_run_which_keeps_weights_and_curves(tmp_path, monkeypatch):
     rows, is_open = [], []
 
     @contextmanager
@@ -160,9 +145,24 @@ def test_curves_for_tensorboard_are_whole_when_a_run_ends(tmp_path, monkeypatch)
     monkeypatch.setattr(train, "event_log", event_log)
     config = TinyTraining()
     config.schedule.tensorboard = True
-    with pytest.raises(ValueError, match="update 5"):
-        run(config=config, out=tmp_path, make=FragileTrainer)
+    threads, used = torch.get_num_threads(), []
+    torch.set_num_threads(2)
+
+    def make(config):
+        used.append(torch.get_num_threads())
+        return FragileTrainer(config)
+
+    try:
+        with pytest.raises(ValueError, match="update 5: the term 'second' of the loss became nan"):
+            run(config=config, out=tmp_path, make=make)
+        assert (used, torch.get_num_threads()) == ([1], 2)
+    finally:
+        torch.set_num_threads(threads)
     assert (rows, is_open) == ([(2, 0.5), (4, 0.5)], [])
+    checkpoint = PolicyCheckpoint.load(tmp_path / "diffaero.npz", "diffaero", DIFFAERO_NETWORK)
+    assert all(np.isfinite(value).all() for value in checkpoint.weights.values())
+    assert checkpoint.provenance["best"]["update"] == 4
+    assert torch.load(tmp_path / "checkpoint.pt", weights_only=True)["progress"]["update"] == 4
 
 
 def test_other_configuration_or_broken_checkpoint_is_refused(finished, tmp_path):
@@ -180,15 +180,6 @@ class FragileTrainer(TinyTrainer):
     def losses(self) -> dict[str, torch.Tensor]:
         size = super().losses()["size"]
         return {"first": size, "second": size * (torch.nan if self.update >= 5 else 1.0)}
-
-
-def test_loss_that_is_not_a_number_stops_with_its_name_and_keeps_the_weights(tmp_path):
-    with pytest.raises(ValueError, match="update 5: the term 'second' of the loss became nan"):
-        run(config=TinyTraining(), out=tmp_path, make=FragileTrainer)
-    checkpoint = PolicyCheckpoint.load(tmp_path / "diffaero.npz", "diffaero", DIFFAERO_NETWORK)
-    assert all(np.isfinite(value).all() for value in checkpoint.weights.values())
-    assert checkpoint.provenance["best"]["update"] == 4
-    assert torch.load(tmp_path / "checkpoint.pt", weights_only=True)["progress"]["update"] == 4
 
 
 def test_training_seeds_are_not_the_benchmarks(monkeypatch):
