@@ -84,10 +84,9 @@ class PrivilegedPlanner(Policy):
       the time of planning; NaN before the first update.
 
     Unknown space and all outside the box of `esdf` count as occupied. The time of arrival is
-    computed once per goal and cached in the Context. It ignores moving
-    obstacles; the costs of trajectories know their future positions. Updates raise
-    InfeasibleFlightError if the goal is outside the known volume, too close to an obstacle or cut
-    off from the vehicle.
+    computed once per goal and cached in the Context. It ignores moving obstacles; the costs of
+    trajectories know their future positions. Updates raise InfeasibleFlightError if the goal is
+    outside the known volume, too close to an obstacle or cut off from the vehicle.
     """
 
     hypotheses_output_port = output_port("hypotheses")
