@@ -37,9 +37,9 @@ WAYPOINT_SCALE = 2.0  # [m] per unit of the network's output
 PROGRESS = 0.1
 """[1/m] Reward for progress; by collision costs alone the cheapest trajectory is often to stay."""
 
-NEAR_TIE = 0.02
-"""Cost difference below which the hypothesis that continues the last plan is preferred."""
-
+NEAR_TIE = (
+    0.02  # Below this difference of costs, the one that continues the last plan is preferred.
+)
 IMAGE_SIZE = 24, 32  # [px] height and width
 
 
@@ -100,12 +100,8 @@ class TrajectoryNetwork:
         self._encoder = DepthEncoder(spec, self._weights)
 
     def __call__(self, image: np.ndarray, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Computes waypoints (3, 10, 3) [m] in the body frame and costs (3,).
-
-        Args:
-            image: (24, 32), encoded depth.
-            state: (18,), see `state_observation`.
-        """
+        """Computes waypoints (3, 10, 3) [m] in the body frame and costs (3,) from encoded depth
+        (24, 32) and `state_observation` (18,)."""
         require_shape("state", state, (STATE_SIZE,))
         x = self._layer("image_layer", self._encoder(image))
         y = self._layer("state_layer_2", self._layer("state_layer", np.asarray(state, np.float32)))
@@ -116,11 +112,6 @@ class TrajectoryNetwork:
 
     def _layer(self, name: str, x: np.ndarray) -> np.ndarray:
         return leaky_relu(linear(self._weights, name, x))
-
-
-def load_network(path: str | None) -> TrajectoryNetwork:
-    """Loads the network from a file of weights, see `PolicyCheckpoint.load`."""
-    return PolicyCheckpoint.load(path, "agile_autonomy", AGILE_NETWORK).build(TrajectoryNetwork)
 
 
 def state_observation(R_WB: Any, v_WB: Any, w_WB_B: Any, v_target: Any) -> Any:
@@ -135,15 +126,10 @@ def state_observation(R_WB: Any, v_WB: Any, w_WB_B: Any, v_target: Any) -> Any:
 def plan(
     network: TrajectoryNetwork, seen: Observation, speed: float, last: Hypotheses | None
 ) -> Hypotheses:
-    """Computes the hypotheses.
+    """Computes the hypotheses from depth (H, W) and the nominal speed [m/s].
 
     A cost is the network's collision cost minus `PROGRESS` per meter toward the goal. Among near
-    ties the hypothesis that continues `last` gets the lowest cost.
-
-    Args:
-        seen: with depth (H, W), multiples of 24 and 32 pixels.
-        speed: nominal [m/s].
-        last: the plan of the update before.
+    ties the hypothesis that continues the `last` plan gets the lowest cost.
     """
     image = 1.0 / np.clip(pool_depth(seen.image, *IMAGE_SIZE), MIN_DEPTH, MAX_DEPTH)
     p_WB, v_WB, _, w_WB_B = seen.state
@@ -192,7 +178,8 @@ class AgileAutonomy(Policy):
 
     def __init__(self, config: AgileAutonomyConfig | None = None) -> None:
         super().__init__(config or AgileAutonomyConfig(), "depth_image_32f")
-        self._network = load_network(self._config.weights)
+        checkpoint = PolicyCheckpoint.load(self._config.weights, "agile_autonomy", AGILE_NETWORK)
+        self._network = checkpoint.build(TrajectoryNetwork)
         self.declare_state(no_plan(MODES), "hypotheses")
 
     def decide(self, seen: Observation, *state: np.ndarray) -> list[np.ndarray]:

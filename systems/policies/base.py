@@ -12,8 +12,7 @@ from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
 from splatpilot.systems.common.drake import input_port
-from splatpilot.systems.common.validation import Config, bounded
-from splatpilot.systems.policies.observations import require_poolable
+from splatpilot.systems.common.validation import Config, bounded, require
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.vehicle.state import QuadrotorState, pose_from_state
 
@@ -50,7 +49,12 @@ class LearnedPolicyConfig(Config):
     camera: OnboardCamera = field(default_factory=OnboardCamera)
 
     def check(self) -> None:
-        require_poolable(self.camera.height, self.camera.width, *self.image_size)
+        height, width = self.image_size
+        valid = self.camera.height % height == 0 and self.camera.width % width == 0
+        condition = f"whole multiples of {width}x{height}"
+        remedy = f"give the camera for example {4 * width}x{4 * height}"
+        size = f"{self.camera.width}x{self.camera.height}"
+        require(valid, "the size of the depth image", condition, size, remedy)
 
 
 class Policy(LeafSystem):

@@ -12,8 +12,7 @@ from splatpilot.systems.common.files import written_atomically
 from splatpilot.systems.common.readers import error_summary, read_archive
 from splatpilot.systems.common.validation import require
 
-FORMAT = 1
-"""Version of files; it changes with the meaning of observations and commands."""
+FORMAT = 1  # It changes with the meaning of observations and commands.
 
 _MAX_WEIGHT = 1e6  # Sums of products with observations stay in single precision.
 
@@ -24,13 +23,10 @@ _SHIPPED = Path(__file__).parent / "weights"
 class PolicyCheckpoint:
     """Content of a file of weights."""
 
-    policy: str
-    """Name of the policy, as in the benchmark."""
-    spec: Any
-    """Architecture of the network, a dataclass."""
+    policy: str  # name, as in the benchmark
+    spec: Any  # architecture of the network, a dataclass
     weights: Mapping[str, np.ndarray]
-    provenance: dict[str, Any]
-    """Command, configuration, revision and success, in types of JSON."""
+    provenance: dict[str, Any]  # command, configuration, revision and success, in types of JSON
     path: Path | None = None
 
     def build[Network](self, make: Callable[[Any, dict[str, np.ndarray]], Network]) -> Network:
@@ -54,13 +50,8 @@ class PolicyCheckpoint:
 
     @classmethod
     def load(cls, path: str | Path | None, policy: str, spec: Any) -> "PolicyCheckpoint":
-        """Reads the weights of `policy` from a file, the shipped ones if `path` is None or empty.
-
-        Args:
-            path: the file.
-            policy: name of the policy.
-            spec: the required architecture, or a function that makes one from its fields.
-        """
+        """Reads the weights of `policy` from a file, the shipped ones if `path` is None or empty;
+        `spec` is the required architecture, or a function that makes one from its fields."""
         path = Path(path) if path else shipped_weights(policy)
         about, weights = _read(path, policy)
         found = f"{about['policy']!r} in format {about['format']}"

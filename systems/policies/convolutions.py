@@ -12,8 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-LEAK = 0.05
-"""Slope of the leaky ReLU for negative numbers."""
+LEAK = 0.05  # slope of the leaky ReLU for negative numbers
 
 _ACTIVATIONS: dict[str, tuple[str, dict[str, Any]]] = {
     "relu6": ("Clip", {"min": 0.0, "max": 6.0}),
@@ -71,13 +70,8 @@ def opencv_net(
     layers: Sequence[Convolution],
     weights: Mapping[str, np.ndarray],
 ) -> cv2.dnn.Net:
-    """Makes the network of `layers`, first to last.
-
-    Args:
-        image: channels, height and width of the input.
-        layers: the convolutions.
-        weights: arrays by the names of `convolution_shapes`.
-    """
+    """Makes the network of `layers`, first to last, for images of these channels, height and width;
+    `weights` are by the names of `convolution_shapes`."""
     nodes, tensors, inputs, output = [], [], [], "image"
 
     def add(operator: str, *names: str, **attributes: Any) -> str:

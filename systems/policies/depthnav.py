@@ -5,7 +5,6 @@ The start frame S has its z axis up and its x axis above the body's x axis at th
 
 from dataclasses import dataclass, field
 from math import atan2
-from typing import NamedTuple
 
 import numpy as np
 from pydrake.math import RotationMatrix
@@ -57,19 +56,13 @@ class DepthNavConfig(LearnedPolicyConfig):
     )
 
 
-class Decision(NamedTuple):
-    """Commands and the next hidden state."""
-
-    a_WB: np.ndarray  # (3,) [m/s^2] in W, gravity excluded
-    heading: float  # [rad]
-    memory: np.ndarray  # (H,)
-
-
 def decide(
     network: RecurrentNetwork, seen: Observation, speed: float, start_yaw: float, memory: np.ndarray
-) -> Decision:
-    """Computes the commands and the next hidden state, from depth (H, W), the nominal speed [m/s],
-    the yaw of the start frame [rad] and the hidden state (H,)."""
+) -> tuple[np.ndarray, float, np.ndarray]:
+    """Computes a_WB (3,) [m/s^2] without gravity, the heading [rad] and the next hidden state (H,).
+
+    From depth (H, W), nominal speed [m/s], yaw of the start frame [rad] and hidden state (H,).
+    """
     R_WS = heading_frame(np.array(start_yaw))
     image = 1.0 / np.clip(pool_depth(seen.image, *IMAGE_SIZE), MIN_DEPTH, MAX_DEPTH)
     R_SB = RotationMatrix.MakeZRotation(-start_yaw) @ seen.X_WB.rotation()
@@ -80,7 +73,7 @@ def decide(
     output, memory = network.step(image, state, memory)
     a_WB = R_WS @ limit_smoothly(output[:3], ACCELERATION_LIMITS)
     to_goal = atan2(v_target[1], v_target[0])
-    return Decision(a_WB, to_goal + np.pi * np.tanh(float(output[3]) / np.pi), memory)
+    return a_WB, to_goal + np.pi * np.tanh(float(output[3]) / np.pi), memory
 
 
 class DepthNav(Policy):

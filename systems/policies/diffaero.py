@@ -82,14 +82,8 @@ def decide(
     memory: np.ndarray,
     limits: np.ndarray = ACCELERATION_LIMITS,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Computes the command (3,) in the world and the next hidden state (H,).
-
-    Args:
-        grid: (9, 16), of `depth_grid` or proximities.
-        speed: nominal [m/s].
-        memory: (H,), the hidden state.
-        limits: (3,) of the command, `ACCELERATION_LIMITS` or `VELOCITY_LIMITS`.
-    """
+    """Computes the command (3,) in the world and the next hidden state (H,), from `depth_grid` or
+    proximities (9, 16), the nominal speed [m/s], the hidden state and the command's limits (3,)."""
     p_WB, v_WB, _, _ = seen.state
     R_WH, z_WB = heading_frame(seen.state.heading), seen.X_WB.rotation().matrix()[:, 2]
     state = heading_observation(p_WB, v_WB, z_WB, seen.p_WG, speed, R_WH)

@@ -14,8 +14,7 @@ from splatpilot.systems.policies.convolutions import (
     convolution_shapes,
     opencv_net,
 )
-from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK, RATE
-from splatpilot.systems.policies.diffaero import decide as decide_by_grid
+from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK, RATE, decide
 from splatpilot.systems.policies.observations import heading_frame
 from splatpilot.systems.policies.recurrent_network import NetworkSpec, RecurrentNetwork
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
@@ -125,12 +124,8 @@ def load_network(path: str | None) -> DiffAeroRgbNetwork:
 
 
 def encode_view(color: np.ndarray, R_WB: np.ndarray) -> np.ndarray:
-    """Returns the network's input (6, 90, 160): RGB in [-1, 1] and rays in the heading frame.
-
-    Args:
-        color: (H, 160, 3) uint8 of a camera of 90 degrees.
-        R_WB: (3, 3) attitude.
-    """
+    """Returns the network's input (6, 90, 160): RGB in [-1, 1] of images (H, 160, 3) uint8, and
+    rays in the heading frame at the attitude R_WB (3, 3)."""
     H, W = color.shape[:2]
     require_view(W, H)
     first = (H - HEIGHT) // 2
@@ -160,15 +155,6 @@ def rays_B() -> np.ndarray:
     return (rays / np.linalg.norm(rays, axis=2, keepdims=True)).astype(np.float32)
 
 
-def decide(
-    network: DiffAeroRgbNetwork, seen: Observation, speed: float, memory: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Computes a_WB (3,) [m/s^2], gravity excluded, and the next hidden state (H,), from RGB
-    (H, 160, 3), the nominal speed [m/s] and the hidden state (H,)."""
-    grid, _ = network.monocular(encode_view(seen.image, seen.X_WB.rotation().matrix()))
-    return decide_by_grid(network.policy, grid, seen, speed, memory)
-
-
 class DiffAeroRgb(Policy):
     """Flies to the goal by an RGB image and a hidden state.
 
@@ -195,4 +181,6 @@ class DiffAeroRgb(Policy):
         self.declare_state(self._network.policy.initial_hidden())
 
     def decide(self, seen: Observation, *state: np.ndarray) -> tuple[np.ndarray, ...]:
-        return decide(self._network, seen, self._config.speed, state[1])
+        network = self._network
+        grid, _ = network.monocular(encode_view(seen.image, seen.X_WB.rotation().matrix()))
+        return decide(network.policy, grid, seen, self._config.speed, state[1])

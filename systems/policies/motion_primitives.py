@@ -68,14 +68,8 @@ def select_distinct(
 ) -> np.ndarray:
     """Returns the indices (count,) of cheap distinct trajectories, cheapest first.
 
-    Greedy: repeatedly the cheapest whose mean distance from all chosen ones exceeds `separation`;
-    without one, the most distant.
-
-    Args:
-        positions: (N, S, 3) [m].
-        costs: (N,).
-        count: K <= N.
-        separation: [m].
+    Greedy: repeatedly the cheapest of positions (N, S, 3) [m] whose mean distance from all chosen
+    ones exceeds `separation` [m]; without one, the most distant.
     """
     chosen = [int(np.argmin(costs))]
     apart = np.full(len(costs), np.inf)

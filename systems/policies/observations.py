@@ -6,7 +6,6 @@ dimensions `...` are batches.
 
 from typing import Any
 
-from splatpilot.systems.common.validation import require
 from splatpilot.systems.vehicle.flatness import array_namespace
 
 
@@ -16,17 +15,8 @@ def pool_depth(depth: Any, height: int, width: int) -> Any:
     Obstacles thinner than a coarse pixel stay visible.
     """
     *batch, H, W = depth.shape
-    require_poolable(H, W, height, width)
     blocks = depth.reshape(*batch, height, H // height, width, W // width)
     return array_namespace(depth).amin(blocks, (-3, -1))
-
-
-def require_poolable(H: int, W: int, height: int, width: int) -> None:
-    """Checks that images of H x W pixels can be pooled to height x width."""
-    valid = H >= 1 and W >= 1 and H % height == 0 and W % width == 0
-    condition = f"whole multiples of {width}x{height}"
-    remedy = f"give the camera for example {4 * width}x{4 * height}"
-    require(valid, "the size of the depth image", condition, f"{W}x{H}", remedy)
 
 
 def inverse_depth(depth: Any, min_depth: float, max_depth: float) -> Any:

@@ -41,16 +41,10 @@ def plan(
     params: QuadrotorParams | None = None,
     obstacles: Distances | None = None,
 ) -> Hypotheses:
-    """Plans the K best distinct trajectories from a state, cheapest first.
+    """Plans the K best distinct trajectories of a lattice from a state (13,), cheapest first.
 
-    Args:
-        time: of the state [s].
-        state: (13,).
-        field: a conservative distance field.
-        toa: the time of arrival at the goal, over the same grid.
-        lattice: the trajectories to choose from.
-        params: of the vehicle.
-        obstacles: distances for the costs, `field` by default; may include moving obstacles.
+    `field` is conservative, and `toa` over the same grid. `obstacles` are the distances for the
+    costs, those of `field` by default; they may include moving obstacles.
     """
     valid = np.shape(state) == (13,) and bool(np.isfinite(state).all())
     remedy = "check the plant or estimator it comes from"
@@ -89,16 +83,10 @@ class PrivilegedPlanner(Policy):
     - ``hypotheses`` (8 + 31 K): as `Hypotheses.to_vector`, cheapest first, in the body frame B at
       the time of planning; NaN before the first update.
 
-    The time of arrival is computed once per goal and cached in the Context. It ignores moving
-    obstacles; the costs of trajectories know their future positions. Updates raise
-    InfeasibleFlightError if the goal is outside the known volume, too close to an obstacle or cut
-    off from the vehicle.
-
-    Args:
-        esdf: the scene; unknown space and all outside its box count as occupied.
-        config: see `PrivilegedPlannerConfig`.
-        params: of the vehicle, see `plan`.
-        moving: moving obstacles.
+    Unknown space and all outside the box of `esdf` count as occupied. The time of arrival is
+    computed once per goal and cached in the Context. It ignores moving obstacles; the costs of
+    trajectories know their future positions. Updates raise InfeasibleFlightError if the goal is
+    outside the known volume, too close to an obstacle or cut off from the vehicle.
     """
 
     hypotheses_output_port = output_port("hypotheses")

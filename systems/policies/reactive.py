@@ -86,11 +86,8 @@ class ReactiveConfig(Config):
 
 
 def nearest_points(depth: np.ndarray, config: ReactiveConfig) -> np.ndarray:
-    """Returns the nearest point p_CQ (rows * columns, 3) [m] of each block, or NaN.
-
-    Args:
-        depth: (H, W) [m] planar; infinity: nothing in range, 0: no measurement.
-    """
+    """Returns the nearest point p_CQ (rows * columns, 3) [m] of each block, or NaN, from planar
+    depth (H, W) [m]; infinity: nothing in range, 0: no measurement."""
     camera = config.camera
     shape = (config.rows, camera.height // config.rows, config.columns, -1)
     depth = np.where(depth > 0.0, depth, np.inf)

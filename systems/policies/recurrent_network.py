@@ -112,13 +112,8 @@ class RecurrentNetwork:
     def step(
         self, image: np.ndarray, state: np.ndarray, hidden: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Computes the output (O,) and the next hidden state (H,).
-
-        Args:
-            image: (height, width), encoded depth.
-            state: (S,).
-            hidden: (H,), the hidden state.
-        """
+        """Computes the output (O,) and the next hidden state (H,) from encoded depth (height,
+        width), a state (S,) and the hidden state (H,)."""
         spec, w, H = self.spec, self._weights, self.spec.hidden_size
         require_shape("state", state, (spec.state_size,))
         require_shape("hidden state", hidden, (H,))

@@ -51,14 +51,8 @@ def encode_depth(depth: Any) -> Any:
 
 
 def encode_state(R_WB: Any, v_B: Any, goal_B: Any, reach: float) -> Any:
-    """Encodes states (N, 9): velocity, direction to the goal and the unit vector upwards, all in B.
-
-    Args:
-        R_WB: attitudes (N, 3, 3).
-        v_B: velocities (N, 3) [m/s].
-        goal_B: vectors to the goal (N, 3) [m].
-        reach: distance [m] beyond which directions have length 1; nearer they are proportional.
-    """
+    """Encodes states (N, 9): velocity [m/s], direction to the goal and the unit vector upwards, all
+    (N, 3) in B. Directions have length 1 beyond `reach` [m]; nearer they are proportional."""
     direction = goal_B / lengths(goal_B).clip(min=reach)
     return array_namespace(v_B).concatenate([v_B, direction, R_WB[:, 2]], 1)
 
@@ -67,11 +61,8 @@ def encode_state(R_WB: Any, v_B: Any, goal_B: Any, reach: float) -> Any:
 # et al., CVPR 2018). Layers have torchvision's names; batch norms are folded into the convolutions,
 # which leaves a bias of each.
 
-BLOCKS = 19
-"""Number of modules of the encoder; the first and the last are a single convolution."""
-
-CHANNELS = 1280
-"""Number of output channels, each of 1/32 of the image's height and width, rounded up."""
+BLOCKS = 19  # modules of the encoder; the first and the last are a single convolution
+CHANNELS = 1280  # of the output, each of 1/32 of the image's height and width, rounded up
 
 _STAGES = (
     (1, 16, 1, 1), (6, 24, 2, 2), (6, 32, 3, 2), (6, 64, 4, 2), (6, 96, 3, 1), (6, 160, 3, 2),
@@ -148,7 +139,6 @@ class StudentSpec:
 
     @property
     def pixels(self) -> str:
-        """See `PIXELS`."""
         return PIXELS[self.observation]
 
     @property
@@ -176,12 +166,8 @@ class StudentSpec:
 def deviations(output: Any, goal_B: Any) -> Any:
     """Computes deviations (..., M, T, 3) [m] from the reference trajectory.
 
-    They fade with the squared distance to the goal, where the reference is slow. A constant
+    The network's output (..., M, T, 3) fades with the squared distance to the goal. A constant
     deviation would make the vehicle hover beside the goal.
-
-    Args:
-        output: (..., M, T, 3), of the network.
-        goal_B: (..., 3) [m], vector to the goal.
     """
     fading = ((goal_B * goal_B).sum(-1) / FADING_DISTANCE**2).clip(max=1.0)
     return WAYPOINT_SCALE * fading[..., None, None, None] * output
@@ -192,11 +178,6 @@ class StudentNetwork:
 
     At a speed other than its expert's, the reference trajectory has that speed, deviations are
     scaled by the ratio of the two (`pace`), and the observed velocity by its inverse.
-
-    Args:
-        spec: architecture.
-        weights: arrays by the names of `StudentSpec.weight_shapes`.
-        speed: nominal speed [m/s]; the expert's if None.
     """
 
     def __init__(
@@ -211,12 +192,8 @@ class StudentNetwork:
         self._encoder = opencv_net((3, spec.height, spec.width), layers, self._weights)
 
     def __call__(self, image: np.ndarray, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Computes waypoints (3, 10, 3) [m] in the body frame and costs (3,).
-
-        Args:
-            image: (3, height, width), see `encode_color` and `encode_depth`.
-            state: (9,), see `encode_state`, with the velocity divided by `pace`.
-        """
+        """Computes waypoints (3, 10, 3) [m] in the body frame and costs (3,) from an encoded image
+        (3, height, width) and state (9,), with the velocity divided by `pace`."""
         spec = self.spec
         remedy = f"give it a camera of {spec.width}x{spec.height}"
         require_shape("image", image, (3, spec.height, spec.width), remedy)

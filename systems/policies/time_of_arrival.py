@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import ceil
+from typing import Any
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt
@@ -77,6 +78,17 @@ class TimeOfArrival:
         cube = tuple(slice(a, b + 1) for a, b in zip(first, last, strict=True))
         return bool(self.reachable[cube].any())
 
+    def starts(self, field: Esdf, clearance: float, min_time: Any = -1.0) -> np.ndarray:
+        """Lists the voxel centers (n, 3) [m] with a clearance [m] in the field of this grid, from
+        which a path of more than `min_time` [s] leads to the goal."""
+        free = self.reachable & (field.distances > VEHICLE_RADIUS + clearance)
+        cells = np.argwhere(free & (self.times > min_time))
+        if len(cells) == 0:
+            raise InfeasibleFlightError(
+                "no free position with a path to the goal is far enough from it"
+            )
+        return field.lower_W + field.voxel_size * (cells + 0.5)
+
     def path(self, p_WQ: np.ndarray, lengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns points (n, 3) [m] of the path from p_WQ (3,) [m] after lengths (n,) [m], and the
         directions (n, 3) of their last quarters; beyond the goal, the goal and zero."""
@@ -117,14 +129,8 @@ def time_of_arrival(
     margin: float = 0.0,
     slowness: Callable[[np.ndarray], np.ndarray] = slowness,
 ) -> TimeOfArrival:
-    """Computes the time of arrival at p_WG (3,) [m] from everywhere in a distance field.
-
-    Args:
-        field: a conservative distance field, `Esdf.conservative()`.
-        p_WG: the goal [m].
-        margin: minimum clearance of the path [m], beyond the vehicle's radius.
-        slowness: S(d) [s/m].
-    """
+    """Computes the time of arrival at p_WG (3,) [m] from everywhere in a conservative distance
+    field, by paths of a minimum clearance `margin` [m] beyond the vehicle's radius."""
     what, remedy = "the distance field", "pass esdf.conservative()"
     require(field.occupied_outside, what, "conservative", "unknown space as free", remedy)
     p_WG = np.array(p_WG, dtype=float)

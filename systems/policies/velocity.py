@@ -14,14 +14,9 @@ from splatpilot.systems.vehicle.flatness import (
 )
 from splatpilot.systems.vehicle.state import QuadrotorState
 
-SLOWING_TIME = 0.75
-"""[s] For `target_velocity`, of classical policies."""
-
-RESPONSE_TIME = 0.4
-"""[s] Time constant of velocity tracking; that of the attitude is 0.1 s."""
-
-MAX_ACCELERATION = 6.0
-"""[m/s^2] Maximum of velocity tracking, a tilt of 31 degrees."""
+SLOWING_TIME = 0.75  # [s] for `target_velocity`, of classical policies
+RESPONSE_TIME = 0.4  # [s] time constant of velocity tracking; that of the attitude is 0.1 s
+MAX_ACCELERATION = 6.0  # [m/s^2] of velocity tracking, a tilt of 31 degrees
 
 
 def tracking_acceleration(v_WB: Any, v_desired: Any) -> Any:

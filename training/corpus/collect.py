@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from pydrake.math import RollPitchYaw
@@ -71,19 +71,8 @@ def render_samples(
     bound: float,
     rng: np.random.Generator,
 ) -> Samples:
-    """Renders demonstrations, each from its own pose and from perturbed ones.
-
-    Args:
-        demonstrations: n of them.
-        world: in which they are; its appearance is drawn.
-        labeler: that of the labels.
-        config: of the corpus.
-        bound: maximum perturbation in this world [m].
-        rng: source of appearance and perturbations.
-
-    Returns:
-        n (1 + copies) samples without `world` and `source`.
-    """
+    """Renders demonstrations in an appearance that is drawn, each from its own pose and from
+    perturbed ones, displaced by at most `bound` [m]; `world` and `source` stay zero."""
     copies = config.perturbation.copies
     samples = Samples.zeros(len(demonstrations) * (1 + copies), config.size)
     if not demonstrations:
@@ -136,7 +125,7 @@ def draw_off_path(
     no faster than they can stop.
     """
     field, toa = labeler.field, labeler.toa
-    centers = _free_positions(labeler, _CLEARANCE)
+    centers = toa.starts(field, _CLEARANCE)
     candidates = centers[rng.integers(len(centers), size=_CANDIDATES * count)]
     to_goal = np.linalg.norm(centers - toa.p_WG, axis=1)
     share = np.where(to_goal < _ARRIVING, 1.0 / np.maximum(to_goal, field.voxel_size) ** 2, 0.0)
@@ -165,31 +154,11 @@ def draw_off_path(
     return np.concatenate([p_WB, v_WB, q_WB, np.zeros((count, 3))], axis=1)
 
 
-def _free_positions(labeler: Labeler, clearance: float, min_time: Any = -1.0) -> np.ndarray:
-    """Lists the voxel centers (n, 3) [m] with a clearance [m], from which a path of more than
-    `min_time` [s] leads to the goal."""
-    field, toa = labeler.field, labeler.toa
-    free = toa.reachable & (field.distances > VEHICLE_RADIUS + clearance)
-    cells = np.argwhere(free & (toa.times > min_time))
-    if len(cells) == 0:
-        raise InfeasibleFlightError(
-            "no free position with a path to the goal is far enough from it"
-        )
-    return field.lower_W + field.voxel_size * (cells + 0.5)
-
-
 _START_CLEARANCE = 0.3  # [m]
 
 
 def collect_world(folder: Path, config: CorpusConfig, index: int, revision: str) -> None:
-    """Collects the world `index` of the library: its record, then its shards.
-
-    Args:
-        folder: of the corpus.
-        config: of the corpus.
-        index: see `world_source`.
-        revision: of the program.
-    """
+    """Collects the world `index` of the library: its record, then its shards."""
     source = world_source(config.worlds, config.seed, index)
     world = make_world(source.world, source.seed)
     labeler = Labeler(world.esdf, world.p_WG, config.expert)
@@ -216,7 +185,7 @@ def collect_world(folder: Path, config: CorpusConfig, index: int, revision: str)
     min_time = 0.5 * labeler.toa.value(world.p_WS)
     starts = [world.p_WS]
     for rng in rngs[1:]:
-        free = _free_positions(labeler, _START_CLEARANCE, min_time)
+        free = labeler.toa.starts(labeler.field, _START_CLEARANCE, min_time)
         starts.append(free[rng.integers(len(free))])
     if config.expert.policy == PLANNER:
         flights = fly_planner(np.stack(starts), world, config.expert, labeler)
@@ -252,16 +221,7 @@ def run(*, config: CorpusConfig, out: Path, worlds: int, jobs: int | None = None
     """Collects the first `worlds` worlds of a corpus in `out`, except those that it has already.
 
     An interrupted run is resumed by the same call, with bitwise identical results. Damaged shards
-    are collected again.
-
-    Args:
-        config: configuration, which determines every sample.
-        out: folder; see `splatpilot.training.corpus.corpus`.
-        worlds: number of worlds.
-        jobs: worker processes; one for each core by default.
-
-    Returns:
-        The corpus.
+    are collected again. `jobs` worker processes, one for each core by default.
     """
     try:
         config.validate()

@@ -61,7 +61,6 @@ class CorpusConfig(Config):
 
     @property
     def size(self) -> SampleSize:
-        """Size of the samples."""
         return SampleSize(self.camera.height, self.camera.width, self.expert.num_hypotheses)
 
 

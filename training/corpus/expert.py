@@ -85,13 +85,8 @@ class ExpertFlight:
 
 
 class Labeler:
-    """Plans the best trajectories from any state of a scene to a goal.
-
-    Args:
-        esdf: the scene; unknown space counts as occupied.
-        p_WG: the goal (3,) [m].
-        config: speed and number of trajectories.
-    """
+    """Plans the best trajectories from any state of a scene, whose unknown space is occupied,
+    to the goal p_WG (3,) [m]."""
 
     def __init__(self, esdf: Esdf, p_WG: np.ndarray, config: ExpertConfig) -> None:
         self._lattice = TrajectoryLattice(config.lattice())
@@ -158,7 +153,9 @@ def fly_planner(
             paths[row] = np.vstack([state[:3], plan.waypoints_W[plan.best]])
         for step in range(substeps):
             p_WB, v_WB, _, _ = QuadrotorState.of(states)
-            p_WR = _interpolate(paths, step * dt + control.lookahead)
+            along = (step * dt + control.lookahead) / WAYPOINT_PERIOD
+            i = min(int(along), NUM_WAYPOINTS - 1)
+            p_WR = paths[:, i] + min(along - i, 1.0) * (paths[:, i + 1] - paths[:, i])
             a_WB = reaching_acceleration(p_WR, p_WB, v_WB, control.lookahead)
             heading = np.arctan2(p_WR[:, 1] - p_WB[:, 1], p_WR[:, 0] - p_WB[:, 0])
             command = flatness_command(states, a_WB, v_WB, heading, control, params)
@@ -179,10 +176,3 @@ def fly_planner(
         clearance = float(np.nanmin(distances)) - VEHICLE_RADIUS
         flights.append(ExpertFlight(outcome, dt * (len(trace) - 1), clearance, labeled))
     return flights
-
-
-def _interpolate(paths: np.ndarray, time: float) -> np.ndarray:
-    """Interpolates paths (n, 11, 3) [m] at a time [s] since their beginning; then their ends."""
-    i = min(int(time / WAYPOINT_PERIOD), paths.shape[1] - 2)
-    part = min(time / WAYPOINT_PERIOD - i, 1.0)
-    return paths[:, i] + part * (paths[:, i + 1] - paths[:, i])

@@ -33,8 +33,8 @@ from splatpilot.systems.common.validation import Config, bounded, require
 WORLD = "world.yaml"
 _ESDF = "esdf.npz"
 
+# Scenarios whose worlds are generated from seeds.
 PROCEDURAL = tuple(name for name in benchmark_scenarios() if name.startswith("P"))
-"""Scenarios whose worlds are generated from seeds."""
 
 ROUNDABOUT = ("P06", "P07", "P08", "P09", "P10", "P12")
 """Those with paths that are far from straight: learned slowest, so they have twice the share."""
@@ -63,7 +63,6 @@ class WorldRecord:
 
     @property
     def name(self) -> str:
-        """Name of the world."""
         return self.source.name
 
     @cached_property
@@ -118,12 +117,8 @@ def check_library(kinds: Sequence[str], scenes: Sequence[str]) -> None:
 
 
 def training_scene(scene: str, split: str = "train") -> Path:
-    """Finds a scene folder or an OctoMap, and checks that it may be learned from.
-
-    Args:
-        scene: its path.
-        split: required split; an OctoMap states none and counts as "train".
-    """
+    """Finds a scene folder or an OctoMap, and checks that it may be learned from; an OctoMap states
+    no split and counts as "train"."""
     found = find_scene(SceneConfig(path=scene))
     if found.suffix.lower() == OCTOMAP:
         require_untested(part_digests([found.read_bytes()]), str(found))
@@ -195,13 +190,8 @@ class LibraryConfig(Config):
 
 
 def world_source(library: LibraryConfig, seed: int, index: int) -> WorldSource:
-    """Returns the world `index` of a library, whose kinds take turns and whose seeds count up.
-
-    Args:
-        library: the kinds and scenes.
-        seed: of the corpus; corpora of different seeds have no generated world in common.
-        index: 0 to 999.
-    """
+    """Returns the world `index`, 0 to 999, of a library whose kinds take turns and whose seeds
+    count up. Corpora of different seeds have no generated world in common."""
     if not 0 <= index < SEEDS_PER_RUN:
         raise ValueError(
             f"a corpus has at most {SEEDS_PER_RUN} worlds; collect more with another seed"

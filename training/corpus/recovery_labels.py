@@ -103,16 +103,7 @@ def rows_to_recover(flight: StudentFlight, events: np.ndarray, period: float) ->
 
 
 def add_recovery(folder: Path, flights: Sequence[StudentFlight], jobs: int | None = None) -> Corpus:
-    """Adds samples of recovery from flights to a corpus; flights that were added add nothing.
-
-    Args:
-        folder: of the corpus.
-        flights: of a student.
-        jobs: worker processes; one for each core by default.
-
-    Returns:
-        The corpus with them.
-    """
+    """Adds samples of recovery from flights to a corpus; flights that were added add nothing."""
     corpus = Corpus(folder)
     records = {record.name: record for record in corpus.worlds}
     by_world: dict[str, list[StudentFlight]] = {}

@@ -21,11 +21,9 @@ from splatpilot.systems.common.readers import error_summary
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS
 
+# Source of a sample: an expert's flight, the time before a student's near-miss, or free space.
 EXPERT, RECOVERY, OFF_PATH = 0, 1, 2
-"""Source of a sample: an expert's flight, the time before a student's near-miss, or free space."""
-
-SOURCES = {EXPERT: "expert", RECOVERY: "recovery", OFF_PATH: "off_path"}
-"""Names of the sources."""
+SOURCES = {EXPERT: "expert", RECOVERY: "recovery", OFF_PATH: "off_path"}  # names
 
 SHARD = "shard.json"
 FORMAT_VERSION = 2
@@ -96,16 +94,8 @@ def write_shard(
     flights: list[dict[str, Any]],
     revision: str,
 ) -> None:
-    """Writes the folder `path` atomically; an existing one stays.
-
-    Args:
-        parts: the samples; their `world` and `source` are not written.
-        size: their size.
-        world: name of their world.
-        source: one of `SOURCES`.
-        flights: descriptions of the flights that they come from.
-        revision: of the program.
-    """
+    """Writes the samples of one world and source to the folder `path` atomically; an existing one
+    stays."""
     parts = [Samples.zeros(0, size), *parts]
     count = sum(map(len, parts))
     labels = np.empty(count, size.label_type())

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from operator import itemgetter
 from typing import Any, NamedTuple, Protocol
 
 import torch
@@ -10,7 +11,6 @@ from torch import Tensor
 from splatpilot.systems.common.seeds import first_training_seed
 from splatpilot.systems.common.validation import Config, bounded, require_field
 from splatpilot.systems.sensing.noise import ObservationNoise
-from splatpilot.systems.vehicle.flatness import FlatnessControllerConfig
 from splatpilot.training.policies.augmentation import noisy_depth
 from splatpilot.training.policies.ray_casting import Geometry, PixelRays
 from splatpilot.training.policies.trainer import Trainer, TrainingConfig
@@ -26,7 +26,7 @@ from splatpilot.training.policies.vehicles import (
     Observation,
     PointMass,
     Vehicle,
-    take_rows,
+    map_tensors,
 )
 
 CAMERA_AHEAD = 0.1  # [m] offset of the camera from the vehicle's center along body x
@@ -124,7 +124,7 @@ def evaluate_agent(
     vehicle: Vehicle = PointMass(worlds.p_WS, zero, zero, yaw, lag)
     if conditions.body_rate:
         vehicle = BodyRate.hovering(worlds.p_WS, yaw)
-    memory, control = agent.initial_memory(count), FlatnessControllerConfig()
+    memory = agent.initial_memory(count)
     shuffled = torch.randperm(count, generator=generator, device=device)
     speed = torch.tensor(conditions.speeds, device=device)[shuffled % len(conditions.speeds)]
     history = History.start(vehicle, noise, agent.rate, generator)
@@ -146,7 +146,7 @@ def evaluate_agent(
         if ended.any():
             keep = (~ended).nonzero()[:, 0]
             flying, memory = flying[keep], memory[keep]
-            vehicle, history = take_rows(keep, (vehicle, history))
+            vehicle, history = map_tensors(itemgetter(keep), (vehicle, history))
             continue
         history = history.push(vehicle)
         past = history.seen(noise, agent.rate, time[flying])
@@ -155,7 +155,7 @@ def evaluate_agent(
         seen = Observation(depth, vehicle, p_WG[flying], speed[flying])
         a_cmd, heading, memory = agent.decide(seen, memory)
         before = vehicle.p
-        vehicle = vehicle.step(a_cmd, dt, control, heading)
+        vehicle = vehicle.step(a_cmd, dt, heading)
         path[flying] += (vehicle.p - before).norm(dim=1)
         time[flying] += dt
     return Outcomes(reached, collided, left, clearance, path / time.clamp(min=dt), speed)

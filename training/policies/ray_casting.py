@@ -6,7 +6,7 @@ Tensors may be on any device; the native code runs on the CPU.
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -35,8 +35,10 @@ class PixelRays(NamedTuple):
         return cls(directions.reshape(-1, 3), 0.5 * half * (1.0 + cell_aspect))
 
 
-class Geometry(Protocol):
+class Geometry:
     """The surfaces of several worlds. Row n of each query is about world `world[n]`, (N,) int64."""
+
+    _native: Any  # `_native.ShapeWorlds` or `_native.GridWorlds`
 
     def depth(self, p_WC: Tensor, R_WC: Tensor, rays: PixelRays, world: Tensor) -> Tensor:
         """Renders planar depth (N, R) [m] from p_WC (N, 3) [m]; infinite without a surface.
@@ -44,21 +46,6 @@ class Geometry(Protocol):
         A pixel has the minimum depth of all its parts: rays hit surfaces within half a pixel, at
         the depth of the widened surface plus half a pixel's width there.
         """
-        ...
-
-    def nearest(self, p_WQ: Tensor, world: Tensor, count: int) -> tuple[Tensor, Tensor]:
-        """Computes signed distances (N, K) [m] at p_WQ (N, 3) [m] to the K <= `count` nearest
-        obstacles, nearest first, and their gradients (N, K, 3); infinite and 0 if there are fewer.
-        """
-        ...
-
-
-class _Casting:
-    """Renders depth by native worlds."""
-
-    _native: Any  # `_native.ShapeWorlds` or `_native.GridWorlds`
-
-    def depth(self, p_WC: Tensor, R_WC: Tensor, rays: PixelRays, world: Tensor) -> Tensor:
         depth = torch.empty(len(p_WC), len(rays.directions_C))
         self._native.depth(
             p_WC=_array(p_WC),
@@ -70,15 +57,16 @@ class _Casting:
         )
         return depth.to(p_WC.device)
 
+    def nearest(self, p_WQ: Tensor, world: Tensor, count: int) -> tuple[Tensor, Tensor]:
+        """Computes signed distances (N, K) [m] at p_WQ (N, 3) [m] to the K <= `count` nearest
+        obstacles, nearest first, and their gradients (N, K, 3); infinite and 0 if there are fewer.
+        """
+        raise NotImplementedError
 
-class ShapeGeometry(_Casting):
-    """Worlds of analytic shapes, those of the benchmark's worlds.
 
-    Args:
-      worlds: the shapes of each.
-      threads: for images, which are the same for any number.
-      simd: instructions, of `_native.simd_levels()`, with equal results; the widest by default.
-    """
+class ShapeGeometry(Geometry):
+    """Worlds of analytic shapes. Results are equal for any number of threads and any instructions
+    `simd` of `_native.simd_levels()`; the widest by default."""
 
     def __init__(self, worlds: Sequence[Sequence[Shape]], threads: int = 1, simd: str = "") -> None:
         rows, kinds = shape_rows([shape for world in worlds for shape in world])
@@ -95,14 +83,8 @@ class ShapeGeometry(_Casting):
 
 
 class Grids:
-    """Values over the voxels of several worlds, interpolated trilinearly.
-
-    Args:
-      values: (nx, ny, nz) of each, at the centers of voxels, at least two along each axis.
-      lower_W: (W, 3) [m], lower corners.
-      voxel_sizes: (W,) [m].
-      threads, simd: see `ShapeGeometry`.
-    """
+    """Values over the voxels of several worlds, interpolated trilinearly: (nx, ny, nz) of each, at
+    the centers of voxels, at least two along each axis."""
 
     def __init__(
         self,
@@ -127,7 +109,7 @@ class Grids:
         return _query(self._native.interpolate, p_WQ, world)
 
 
-class EsdfGeometry(_Casting, Grids):
+class EsdfGeometry(Geometry, Grids):
     """Worlds given by distance fields; each is one obstacle. Occupied unknown space is visible."""
 
     def __init__(self, fields: Sequence[Esdf], threads: int = 1, simd: str = "") -> None:
@@ -140,12 +122,8 @@ class EsdfGeometry(_Casting, Grids):
         return distances[:, None], gradients[:, None]
 
 
-class MixedGeometry:
-    """Worlds of shapes and worlds of distance fields; a field that worlds share is stored once.
-
-    Args:
-      worlds: the shapes of each, or its distance field.
-    """
+class MixedGeometry(Geometry):
+    """Worlds of shapes or distance fields; a field that worlds share is stored once."""
 
     def __init__(self, worlds: Sequence[Sequence[Shape] | Esdf]) -> None:
         shapes = [world for world in worlds if not isinstance(world, Esdf)]

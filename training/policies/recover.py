@@ -43,11 +43,8 @@ from splatpilot.training.policies import train
 from splatpilot.training.policies.student_data import is_held_out
 from splatpilot.training.policies.trainer import CorpusTraining, Trainer
 
-_PATIENCE = 2.0
-"""Maximum time of a student's flight, in times of the expert's."""
-
-_ARRAYS = "p_WG", "times", "states", "clearances"
-"""Arrays of each flight in a file of flights, see `StudentFlight`."""
+_PATIENCE = 2.0  # maximum time of a student's flight, in times of the expert's
+_ARRAYS = "p_WG", "times", "states", "clearances"  # of a `StudentFlight`, in a file of flights
 
 
 @dataclass(frozen=True)
@@ -175,19 +172,16 @@ def run[Config: CorpusTraining](
 
     Writes to `out`: `stage_1`, unless another policy flies, and `stage_2`, see `train.run`;
     `corpora`, links to those of `config`, with the recovery samples; `flights`, a file per world;
-    `recovery.yaml`, see `RecoveryFlights`; `recovery.json`, counts of flights and samples.
+    `recovery.yaml`, see `RecoveryFlights`; `recovery.json`, counts of flights and samples, which is
+    returned.
 
     Args:
         config: configuration of both stages.
         make: makes the trainer of a configuration.
-        out: folder.
         flights: maximum number of flights in each world.
         jobs: processes that fly.
         flown_by: policy or file of weights that flies instead of a first stage. Students see
             through the corpora's camera, others through their own.
-
-    Returns:
-        The content of `recovery.json`.
     """
     for name, value in (("flights", flights), ("jobs", jobs)):
         require(value >= 1, f"--{name}", "at least 1", value)

@@ -9,7 +9,6 @@ from torch import Tensor
 
 from splatpilot.systems.common.validation import Config, bounded, require_field
 from splatpilot.systems.sensing.noise import ObservationNoise
-from splatpilot.systems.vehicle.flatness import FlatnessControllerConfig
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 from splatpilot.training.policies.augmentation import check_noise, depth_noise, noisy_depth
 from splatpilot.training.policies.evaluation import (
@@ -19,7 +18,6 @@ from splatpilot.training.policies.evaluation import (
     render_depth,
 )
 from splatpilot.training.policies.networks import TrainableNetwork
-from splatpilot.training.policies.ray_casting import Geometry
 from splatpilot.training.policies.training_worlds import STARTS, WorldBatch
 from splatpilot.training.policies.vehicles import (
     History,
@@ -108,7 +106,6 @@ class DifferentiableRollout:
     ) -> None:
         self.learner, self.worlds, self.config = learner, worlds, config
         self.generator = generator
-        self._control = FlatnessControllerConfig()
         self.episodes = self._new_episodes()
 
     def state_dict(self) -> dict[str, Any]:
@@ -180,7 +177,7 @@ class DifferentiableRollout:
             depth = noisy_depth(depth, config.noise, self.generator)
             seen = Observation(depth, vehicle, p_WG, speed)
             a_cmd, heading, memory = learner.decide(seen, memory)
-            vehicle = vehicle.decay_gradient(keep).step(a_cmd, dt, self._control, heading)
+            vehicle = vehicle.decay_gradient(keep).step(a_cmd, dt, heading)
             v_mean = torch.lerp(v_mean, vehicle.v, forget)
             vehicles.append(vehicle)
             v_means.append(v_mean)
@@ -193,7 +190,10 @@ class DifferentiableRollout:
         a = torch.stack([step.a for step in vehicles])  # (steps + 1, N, 3)
         everyone = torch.arange(len(world), device=world.device).repeat(config.steps)
         world, p_WG, speed = world[everyone], p_WG[everyone], speed[everyone]
-        clearance, approach = _obstacles(worlds.geometry, p, v, world)
+        distances, normals = worlds.geometry.nearest(p, world, NUM_OBSTACLES)
+        # The value is the distance, and the gradient its normal.
+        moved, approach = (normals @ torch.stack([p - p.detach(), -v], 2)).unbind(2)
+        clearance = distances + moved - VEHICLE_RADIUS
         # Images of an open world do not show the top of the volume.
         below_top = worlds.upper_W[world, 2] - VEHICLE_RADIUS - p[:, 2]
         clearance = torch.cat([clearance, below_top[:, None]], 1)
@@ -211,15 +211,6 @@ class DifferentiableRollout:
             torch.cat(headings) if headings else None,
         )
         return learner.losses(transitions)
-
-
-def _obstacles(geometry: Geometry, p: Tensor, v: Tensor, world: Tensor) -> tuple[Tensor, Tensor]:
-    """Computes clearances (M, K) [m] and velocities of approach (M, K) [m/s] of the nearest
-    obstacles of vehicles at p (M, 3) [m] with velocities v (M, 3) [m/s] in `world` (M,)."""
-    distances, normals = geometry.nearest(p, world, NUM_OBSTACLES)
-    # The value is the distance, and the gradient its normal.
-    moved, approach = (normals @ torch.stack([p - p.detach(), -v], 2)).unbind(2)
-    return distances + moved - VEHICLE_RADIUS, approach
 
 
 @dataclass

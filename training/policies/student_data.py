@@ -1,12 +1,12 @@
 """Samples of corpora for training: labels, images, distances in their worlds, cached features."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from hashlib import blake2b
 from itertools import chain
 from math import ceil
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -23,6 +23,7 @@ from splatpilot.training.corpus.library import require_untested
 from splatpilot.training.corpus.samples import RECOVERY, SHARD, Shard
 from splatpilot.training.policies.ray_casting import EsdfGeometry
 from splatpilot.training.policies.student_network import StudentModule
+from splatpilot.training.policies.trainer import Trainer
 
 _CHANCES = 1 << 20  # resolution of random choices
 _DIGESTS = 1 << 64  # number of possible digests of a name
@@ -40,18 +41,12 @@ class Labels(NamedTuple):
 
 
 class StudentData:
-    """The distinct samples of several corpora, some of whose worlds are held out.
-
-    Args:
-        corpora: may share worlds and shards.
-        held_out: fraction of the worlds that validate, see `is_held_out`.
-        device: device of the labels; images stay on disk.
-    """
+    """The distinct samples of several corpora, of which a fraction of the worlds is held out, see
+    `is_held_out`. Labels are on a device; images stay on disk."""
 
     def __init__(self, corpora: Sequence[Corpus], held_out: float, device: str = "cpu") -> None:
         configs = [corpus.config for corpus in corpora]
         self.camera, self.speed = configs[0].camera, configs[0].expert.speed
-        """Camera of the samples; the expert's nominal speed [m/s]."""
         for what, values in (
             ("cameras", [config.camera for config in configs]),
             ("numbers of trajectories", [config.size.trajectories for config in configs]),
@@ -66,21 +61,18 @@ class StudentData:
         for record in self._records.values():
             if isinstance(record.source.world, SceneSource):
                 require_untested(record.source.source_digest, str(record.path))
-        self.worlds = sorted(self._records)
-        """Names."""
+        self.worlds = sorted(self._records)  # names
         self.held_out_worlds = [name for name in self.worlds if is_held_out(name, held_out)]
         self.shards = [shard for shard in chain(*distinct_shards(corpora)) if len(shard)]
         counts = [len(shard) for shard in self.shards]
-        self.first = np.cumsum([0, *counts])
-        """Index of the first sample of each shard."""
+        self.first = np.cumsum([0, *counts])  # index of the first sample of each shard
         index = {name: k for k, name in enumerate(self.worlds)}
         world = np.repeat([index[shard.world] for shard in self.shards], counts)
         outside = np.isin(world, [index[name] for name in self.held_out_worlds])
         recovered = np.repeat([shard.source == RECOVERY for shard in self.shards], counts)
+        # Indices of samples; those recovered are from flights of students, those shown are not.
         self.training, self.held_out = np.flatnonzero(~outside), np.flatnonzero(outside)
-        """Indices of samples."""
         self.recovered = np.flatnonzero(~outside & recovered)
-        """Indices of training samples from flights of students."""
         self._shown = np.flatnonzero(~outside & ~recovered)
         if not (len(self.training) and len(self.held_out)):
             smallest = ceil(100 * min(map(_digest, self.worlds)) / _DIGESTS) / 100
@@ -90,12 +82,11 @@ class StudentData:
                 f"validate with; collect in more worlds, or set held_out to {smallest} or more"
             )
 
-        def joined(name: str) -> Tensor:
-            arrays = [shard.arrays[name] for shard in self.shards]
-            return torch.from_numpy(np.concatenate(arrays)).float().to(device)
-
-        labels = (joined(name) for name in ("X_WB", "v_B", "goal_B", "trajectories_B"))
-        self._labels = Labels(*labels, world=torch.from_numpy(world).to(device))
+        labels = [
+            torch.from_numpy(np.concatenate([s.arrays[name] for s in self.shards])).float()
+            for name in ("X_WB", "v_B", "goal_B", "trajectories_B")
+        ]
+        self._labels = Labels(*(part.to(device) for part in (*labels, torch.from_numpy(world))))
 
     def digest(self, *files: str) -> str:
         """Computes a digest of the samples, their split and the content of files."""
@@ -107,15 +98,14 @@ class StudentData:
             digest.update(Path(file).read_bytes())
         return digest.hexdigest()
 
-    def draw(
-        self, integers: Callable[[int], np.ndarray], recovery_share: float = 0.0
-    ) -> np.ndarray:
-        """Draws indices (N,) of training samples.
+    def draw(self, count: int, generator: torch.Generator, recovery_share: float = 0) -> np.ndarray:
+        """Draws indices (count,) of training samples, those of recovery with the probability
+        `recovery_share`; if it is 0, all samples are as likely."""
 
-        Args:
-            integers: draws N integers from [0, n) for an n.
-            recovery_share: probability of samples of recovery; if 0, all samples are as likely.
-        """
+        def integers(limit: int) -> np.ndarray:
+            drawn = torch.randint(limit, (count,), generator=generator, device=generator.device)
+            return drawn.cpu().numpy()
+
         if not (recovery_share and len(self.recovered)):
             return self.training[integers(len(self.training))]
         recovered, shown = (g[integers(len(g))] for g in (self.recovered, self._shown))
@@ -177,13 +167,7 @@ class FrozenFeatures:
     """Outputs of the network's first modules for all samples, computed once and kept in files.
 
     The file of a shard is named by a digest of its images and the modules' weights, so that runs
-    share files and corpora may grow.
-
-    Args:
-        folder: of the files.
-        data: the samples.
-        network: network with these modules.
-        frozen: number of modules, of `IMAGE_MODULES`.
+    share files and corpora may grow. `frozen` is the number of modules, of `IMAGE_MODULES`.
     """
 
     def __init__(
@@ -222,3 +206,20 @@ class FrozenFeatures:
                 features.append(encoded.half().cpu().numpy())
             np.save(path, np.concatenate(features))
         return np.load(file, mmap_mode="r")
+
+
+_VALIDATED = 2000  # held-out samples, evenly spaced, that are evaluated
+
+
+class CorpusTrainer(Trainer):
+    """Base class of trainers on the samples of corpora; `config` is a `CorpusTraining`."""
+
+    def __init__(self, config: Any) -> None:
+        self._config = config
+        corpora = [Corpus(Path(path)) for path in config.corpora]
+        self._data = StudentData(corpora, config.held_out, config.device)
+        self.generator = torch.Generator(config.device).manual_seed(config.seed)
+        indices = self._data.held_out
+        count = min(_VALIDATED, len(indices))
+        spaced = indices[np.linspace(0, len(indices) - 1, count).astype(int)]
+        self._validation = [spaced[n : n + config.batch] for n in range(0, count, config.batch)]

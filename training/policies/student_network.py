@@ -19,8 +19,7 @@ from splatpilot.systems.policies.student import (
     mobilenet_blocks,
 )
 
-IMAGE_MODULES = BLOCKS + 1
-"""Number of modules that an image passes: the encoder's, and the layer of its cells."""
+IMAGE_MODULES = BLOCKS + 1  # that an image passes: the encoder's, and the layer of its cells
 
 
 class StudentModule(nn.Module):
@@ -71,13 +70,8 @@ class StudentModule(nn.Module):
         return image
 
     def forward(self, image: Tensor, state: Tensor, first: int = 0) -> tuple[Tensor, Tensor]:
-        """Computes waypoints (N, 3, 10, 3) [m] and costs (N, 3).
-
-        Args:
-            image: (N, 3, height, width), or the output of the first of the `IMAGE_MODULES`.
-            state: (N, 9), see `systems.policies.student.encode_state`.
-            first: the module that takes `image`.
-        """
+        """Computes waypoints (N, 3, 10, 3) [m] and costs (N, 3) from `encode_state` (N, 9) and
+        images (N, 3, height, width), or the output of the `IMAGE_MODULES` before `first`."""
         with torch.autocast(image.device.type, torch.bfloat16, enabled=image.is_cuda):
             cells = self.encode_image(image, first)
         y = self.state_layer_2(self.state_layer(state).relu()).relu()
@@ -101,12 +95,9 @@ class _Bias(nn.Module):
         return x + self.bias[:, None, None]
 
 
+# In `$SPLATPILOT_DATA`; and in torch's folder, by torchvision's `mobilenet_v2(weights="DEFAULT")`.
 IN_DATA = Path("weights") / "mobilenet_v2_imagenet.pt"
-"""In the folder `$SPLATPILOT_DATA`."""
-
 _DOWNLOADED = Path("checkpoints") / "mobilenet_v2-7ebf99e0.pth"
-"""In torch's folder, by torchvision's `mobilenet_v2(weights="DEFAULT")`."""
-
 _MEAN, _STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # [-] of torchvision's images, 0 to 1
 
 

@@ -43,15 +43,8 @@ def run[Config: TrainingConfig](
 
     Writes to `out`: `POLICY.npz`, the weights with the best success in held-out worlds, see
     `PolicyCheckpoint`; `config.yaml`; `curves.csv`, the terms of the loss and the success over the
-    updates; `POLICY.md`, a model card; `summary.json`; `checkpoint.pt`, for resuming.
-
-    Args:
-        config: configuration. On a CPU it determines the weights bitwise, with interruptions too.
-        out: folder.
-        make: makes the trainer of a configuration.
-
-    Returns:
-        The content of `summary.json`.
+    updates; `POLICY.md`, a model card; `summary.json`, which is returned; `checkpoint.pt`, for
+    resuming. On a CPU `config` determines the weights bitwise, with interruptions too.
     """
     validate(config)
     require_device(config.device)

@@ -1,17 +1,11 @@
 """Trains Agile Autonomy: imitation of an expert that samples trajectories and knows the world.
 
-After "Learning High-Speed Flight in the Wild" (A. Loquercio et al., Science Robotics 2021). As
-published: depth to 20 m and 18 numbers of state give three trajectories of ten waypoints in one
-second with a cost each; relaxed winner-takes-all with epsilon 0.05 on the expert's three best; the
-cost is the collision cost of the predicted trajectory; data is aggregated in rounds in which the
-student flies and the expert labels; 15 Hz.
-
-Chosen here: the expert is the lattice of `systems.policies.lattice` instead of a
-Metropolis-Hastings sampler; a convolutional encoder of 32x24 pixels, trained with the rest, instead
-of a frozen MobileNet at 224; dense layers instead of convolutions of length one; trajectories of
-the expert that are much worse than its best are not imitated; contact costs 2, which the published
-cost has at 0.3 m, at the vehicle's own radius; a meter toward the goal reduces the cost by 0.1
-when a hypothesis is chosen.
+After "Learning High-Speed Flight in the Wild" (A. Loquercio et al., Science Robotics 2021). Chosen
+here: the expert is the lattice of `systems.policies.lattice` instead of a Metropolis-Hastings
+sampler; a convolutional encoder of 32x24 pixels, trained with the rest, instead of a frozen
+MobileNet at 224; dense layers instead of convolutions of length one; trajectories of the expert
+that are much worse than its best are not imitated; contact costs 2 at the vehicle's own radius
+instead of 0.3 m; a meter toward the goal reduces the cost by 0.1 when a hypothesis is chosen.
 """
 
 from collections.abc import Iterable
@@ -38,7 +32,7 @@ from splatpilot.systems.policies.lattice import LatticeConfig, TrajectoryLattice
 from splatpilot.systems.policies.observations import target_velocity
 from splatpilot.systems.policies.planner import plan
 from splatpilot.systems.sensing.noise import ObservationNoise
-from splatpilot.systems.vehicle.flatness import FlatnessControllerConfig
+from splatpilot.systems.vehicle.flatness import FlatnessControllerConfig, reaching_acceleration
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 from splatpilot.systems.vehicle.state import QuadrotorState
 from splatpilot.training.policies.augmentation import check_noise, depth_noise, noisy_depth
@@ -56,8 +50,8 @@ from splatpilot.training.policies.vehicles import (
     BodyRate,
     History,
     Observation,
+    Vehicle,
     choose_rows,
-    reaching_acceleration,
 )
 
 LOOKAHEAD = 3  # index of the tracked waypoint, at 0.4 s, the controller's lookahead
@@ -103,7 +97,11 @@ class AgileAutonomyAgent:
         waypoints, costs = self.hypotheses(seen)
         best = waypoints[torch.arange(len(costs), device=costs.device), costs.argmin(1)]
         p_WR = seen.vehicle.p + (seen.vehicle.attitude() @ best[:, LOOKAHEAD, :, None])[:, :, 0]
-        return reaching_acceleration(p_WR, seen.vehicle), None, memory
+        return _reach(p_WR, seen.vehicle), None, memory
+
+
+def _reach(p_WR: Tensor, vehicle: Vehicle) -> Tensor:
+    return reaching_acceleration(p_WR, vehicle.p, vehicle.v, FlatnessControllerConfig.lookahead)
 
 
 EPSILON = 0.05  # fraction of an expert's pull on the hypotheses that are not the closest to it
@@ -198,12 +196,16 @@ class AgileAutonomyTrainer(FlightTrainer):
 
     @torch.no_grad()
     def _collision_costs(self, waypoints_B: Tensor, sample: dict[str, Tensor]) -> Tensor:
-        """Computes mean collision costs (N, M) of trajectories (N, M, 10, 3) [m] in B."""
+        """Computes mean collision costs (N, M) of trajectories (N, M, 10, 3) [m] in B: 4 - 2 d² /
+        0.09 below d = 0.3 m and from there linearly from 2 to 0 at d = 0.8 m,
+        with d = clearance + 0.3 m."""
         N, M = waypoints_B.shape[:2]
         points = waypoints_B.flatten(1, 2) @ sample["R_WB"].mT + sample["p_WB"][:, None]
         world = sample["world"].repeat_interleave(points.shape[1])
         clearance = self.worlds.distance(points.flatten(0, 1), world) - VEHICLE_RADIUS
-        return collision_cost(clearance).reshape(N, M, -1).mean(2)
+        d = clearance + 0.3
+        inner, outer = 4.0 - 2.0 * d.clamp(min=0.0).square() / 0.09, 2.0 * (0.8 - d) / 0.5
+        return torch.where(d < 0.3, inner, outer.clamp(min=0.0)).reshape(N, M, -1).mean(2)
 
     @torch.no_grad()
     def _collect(self, student: float, first_world: int, steps: Iterable[int]) -> dict[str, Tensor]:
@@ -215,7 +217,6 @@ class AgileAutonomyTrainer(FlightTrainer):
         p_WG = worlds.p_WG[world]
         which = torch.randint(len(config.speeds), (N,), generator=self.generator, device=device)
         speed = torch.tensor(config.speeds, device=device)[which]
-        control = FlatnessControllerConfig()
         vehicle, by_student = self._start(world, student)
         history = History.start(vehicle, config.noise, RATE, self.generator)
         tracked = vehicle.p[:, None].repeat(1, NUM_WAYPOINTS + config.ask_every, 1)
@@ -258,9 +259,9 @@ class AgileAutonomyTrainer(FlightTrainer):
             p_WR = (1.0 - part) * tracked[:, i] + part * tracked[:, i + 1]
             noisy = seen._replace(depth=noisy_depth(depth, config.noise, self.generator))
             a_student, _, _ = self.agent.decide(noisy, self.agent.initial_memory(N))
-            a_expert = reaching_acceleration(p_WR, vehicle)
+            a_expert = _reach(p_WR, vehicle)
             a_cmd = torch.where(by_student[:, None], a_student, a_expert)
-            vehicle = vehicle.step(a_cmd.clamp(-12.0, 12.0), 1.0 / RATE, control)
+            vehicle = vehicle.step(a_cmd.clamp(-12.0, 12.0), 1.0 / RATE)
         return {name: torch.cat([row[name] for row in rows]) for name in rows[0]}
 
     def _start(self, world: Tensor, student: float) -> tuple[BodyRate, Tensor]:
@@ -290,12 +291,3 @@ class AgileAutonomyTrainer(FlightTrainer):
             experts[n] = torch.tensor(best.waypoints_B)
             costs[n] = torch.tensor(best.costs)
         return valid.to(device), experts.to(device), costs.to(device)
-
-
-def collision_cost(clearance: Tensor) -> Tensor:
-    """Computes the cost [-] of a clearance (...,) [m]: 4 - 2 d² / 0.09 below d = 0.3 m and from
-    there linearly from 2 to 0 at d = 0.8 m, with d = clearance + 0.3 m."""
-    d = clearance + 0.3
-    inner = 4.0 - 2.0 * d.clamp(min=0.0).square() / 0.09
-    outer = 2.0 * (0.8 - d) / 0.5
-    return torch.where(d < 0.3, inner, outer.clamp(min=0.0))

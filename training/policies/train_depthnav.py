@@ -1,17 +1,12 @@
 """Trains DepthNav: through the dynamics, down the time of arrival, heading along the path.
 
 After "Quadrotor Navigation using Reinforcement Learning with Privileged Information" (2025,
-arXiv:2509.08177). As published: depth of 128x72 pixels, 0.25 to 20 m, inverted and max-pooled to
-16x12; state and target in the frame of the start; convolutions of 32, 64 and 128 channels and a
-gated recurrent unit of 192; commanded acceleration and yaw; AdamW; worlds without obstacles first;
-the desired velocity down the gradient of the time of arrival, in the loss alone; and the weights of
-the loss: velocity 4, collision 6, acceleration 0.01, jerk 0.001, rates 0.3, yaw 4.
-
-Chosen here, because the publication is silent or a CPU too slow: 25 Hz instead of 50, 32 vehicles,
-40 steps per update instead of 150; the mean velocity of 0.5 s instead of 2 s and a gradient decay
-of 0.4 per second, without which vehicles learn to hover; velocity and attitude quaternion as the
-state, target velocity and speed as the target; yaw as an angle from the direction of the goal, with
-the loss 1 - cos of its angle to the path; rates from jerk over gravity.
+arXiv:2509.08177), with its weights of the loss. Chosen here, because the publication is silent or a
+CPU too slow: 25 Hz instead of 50, 32 vehicles, 40 steps per update instead of 150; the mean
+velocity of 0.5 s instead of 2 s and a gradient decay of 0.4 per second, without which vehicles
+learn to hover; velocity and attitude quaternion as the state, target velocity and speed as the
+target; yaw as an angle from the direction of the goal, with the loss 1 - cos of its angle to the
+path; rates from jerk over gravity.
 """
 
 from dataclasses import dataclass, field

@@ -1,20 +1,15 @@
 """Trains DiffAero: analytic gradients of a loss through the dynamics of flight.
 
 After "DiffAero: A GPU-Accelerated Differentiable Simulation Framework for Efficient Quadrotor
-Policy Learning" (2025). As published: a 16x9 depth image; nine numbers of state (target velocity,
-velocity and body z axis in the heading frame); commanded accelerations of a point mass with a lag;
-32 steps of flight per update; gradients that decay backward in time; a loss of velocity (smooth L1
-of a moving average), proximity of obstacles weighted with the velocity toward them, and jerk.
-
-Different here: the convolutional and recurrent variant instead of the perceptron; depth to 12 m as
-3 / z - 0.6 instead of 1 - range / 5 m; the nearest surface in each pixel instead of one ray; 15 Hz
-instead of 30; accelerations without gravity; 64 environments instead of 1024; in the loss, desired
-velocities along the path around obstacles (time of arrival) instead of straight to the goal; the
-clearance terms of "Back to Newton's Laws: Learning Vision-based Agile Flight via Differentiable
-Physics" (2024); the benchmark's kinds of worlds.
+Policy Learning" (2025). Different here: the convolutional and recurrent variant instead of the
+perceptron; depth to 12 m as 3 / z - 0.6 instead of 1 - range / 5 m; the nearest surface in each
+pixel instead of one ray; 15 Hz instead of 30; accelerations without gravity; 64 environments
+instead of 1024; in the loss, desired velocities along the path around obstacles (time of arrival)
+instead of straight to the goal; the clearance terms of "Back to Newton's Laws: Learning
+Vision-based Agile Flight via Differentiable Physics" (2024); the benchmark's kinds of worlds.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -36,12 +31,12 @@ from splatpilot.systems.policies.observations import (
     limit_smoothly,
 )
 from splatpilot.systems.policies.velocity import tracking_acceleration
-from splatpilot.systems.sensing.noise import ObservationNoise
 from splatpilot.systems.sensing.time_of_flight import (
     UNMEASURED_DEPTH,
     equivalent_sensor,
     range_of_depth,
 )
+from splatpilot.training.policies.augmentation import depth_noise
 from splatpilot.training.policies.networks import TrainableNetwork
 from splatpilot.training.policies.ray_casting import PixelRays
 from splatpilot.training.policies.rollouts import RolloutConfig, RolloutTraining, Transitions
@@ -90,16 +85,18 @@ class DiffAeroLearner:
     def initial_memory(self, count: int) -> Tensor:
         return torch.zeros(count, self.network.spec.hidden_size, device=self._limits.device)
 
+    def encode(self, depth: Tensor) -> Tensor:
+        """Encodes depth (N, R) [m] as images (N, 9, 16)."""
+        spec, image = self.network.spec, inverse_depth(depth, MIN_DEPTH, MAX_DEPTH)
+        return image.reshape(-1, spec.image_height, spec.image_width)
+
     def decide(self, seen: Observation, memory: Tensor) -> tuple[Tensor, None, Tensor]:
-        spec = self.network.spec
-        R_WH = heading_frame(seen.vehicle.yaw)
-        image = inverse_depth(seen.depth, MIN_DEPTH, MAX_DEPTH)
-        state = _state_observation(seen, R_WH)
-        output, memory = self.network(
-            image.reshape(-1, spec.image_height, spec.image_width), state, memory
-        )
-        a_H = limit_smoothly(output, self._limits)
-        return (R_WH @ a_H[:, :, None])[:, :, 0], None, memory
+        vehicle, R_WH = seen.vehicle, heading_frame(seen.vehicle.yaw)
+        p, v, z = vehicle.p, vehicle.v, vehicle.body_z()
+        state = heading_observation(p, v, z, seen.p_WG, seen.speed, R_WH)
+        output, memory = self.network(self.encode(seen.depth), state, memory)
+        command_H = limit_smoothly(output, self._limits)
+        return (R_WH @ command_H[:, :, None])[:, :, 0], None, memory
 
     def losses(self, transitions: Transitions) -> dict[str, Tensor]:
         weights = self._loss
@@ -119,45 +116,23 @@ class DiffAeroLearner:
         }
 
 
-def _state_observation(seen: Observation, R_WH: Tensor) -> Tensor:
-    p, v, z = seen.vehicle.p, seen.vehicle.v, seen.vehicle.body_z()
-    return heading_observation(p, v, z, seen.p_WG, seen.speed, R_WH)
-
-
-def proximity_grid(
-    depth: Tensor, range_of_depth: Tensor, max_range: float, height: int, width: int
-) -> Tensor:
-    """Computes the proximities (N, height, width) of depth (N, R) [m], the lowest row first.
-
-    See `splatpilot.systems.sensing.time_of_flight`, also for `range_of_depth` (H, W), whose size is
-    a multiple of height and width.
-    """
-    H, W = range_of_depth.shape
-    measured = torch.where(depth > UNMEASURED_DEPTH, depth, max_range).reshape(-1, H, W)
-    blocks = (measured * range_of_depth).reshape(-1, height, H // height, width, W // width)
-    return (1.0 - blocks.amin((2, 4)).clamp(0.0, max_range) / max_range).flip(1)
-
-
-def streaming_noise() -> ObservationNoise:
-    """Returns the default noise of a time-of-flight sensor: 10 to 30 images per second, some late
-    and some lost."""
-    return ObservationNoise(
-        depth_multiplicative=0.03,
-        depth_additive=0.02,
-        depth_dropout=0.01,
-        latency=0.03,
-        frame_rate=[10.0, 30.0],
-        jitter=0.03,
-        frame_dropout=0.05,
-    )
-
-
 @dataclass
 class DiffAeroTofTraining(DiffAeroTraining):
-    """A training run of DiffAero by the grid of a time-of-flight sensor."""
+    """A training run of DiffAero by the grid of a time-of-flight sensor, with 10 to 30 images per
+    second, some late and some lost."""
 
     schedule: Schedule = field(default_factory=lambda: Schedule(updates=6000, validate_every=500))
-    rollout: RolloutConfig = field(default_factory=lambda: RolloutConfig(noise=streaming_noise()))
+    rollout: RolloutConfig = field(
+        default_factory=lambda: RolloutConfig(
+            noise=replace(
+                depth_noise(),
+                latency=0.03,
+                frame_rate=[10.0, 30.0],
+                jitter=0.03,
+                frame_dropout=0.05,
+            )
+        )
+    )
 
 
 class DiffAeroTofLearner(DiffAeroLearner):
@@ -174,13 +149,15 @@ class DiffAeroTofLearner(DiffAeroLearner):
         self._range_of_depth = torch.tensor(to_range, dtype=torch.float32, device=device)
         self._limits = torch.tensor(VELOCITY_LIMITS, dtype=torch.float32, device=device)
 
+    def encode(self, depth: Tensor) -> Tensor:
+        """Encodes depth (N, R) [m] as proximities (N, 9, 16), the lowest row first, see
+        `splatpilot.systems.sensing.time_of_flight`."""
+        sensor, (H, W) = self._sensor, self._range_of_depth.shape
+        depth = torch.where(depth > UNMEASURED_DEPTH, depth, sensor.max_range).reshape(-1, H, W)
+        blocks = (-1, sensor.rows, H // sensor.rows, sensor.columns, W // sensor.columns)
+        nearest = (depth * self._range_of_depth).reshape(blocks).amin((2, 4))
+        return (1.0 - nearest.clamp(0.0, sensor.max_range) / sensor.max_range).flip(1)
+
     def decide(self, seen: Observation, memory: Tensor) -> tuple[Tensor, None, Tensor]:
-        sensor, R_WH = self._sensor, heading_frame(seen.vehicle.yaw)
-        grid = proximity_grid(
-            seen.depth, self._range_of_depth, sensor.max_range, sensor.rows, sensor.columns
-        )
-        state = _state_observation(seen, R_WH)
-        output, memory = self.network(grid, state, memory)
-        v_H = limit_smoothly(output, self._limits)
-        v_desired = (R_WH @ v_H[:, :, None])[:, :, 0]
+        v_desired, _, memory = super().decide(seen, memory)
         return tracking_acceleration(seen.vehicle.v, v_desired), None, memory

@@ -7,7 +7,6 @@ all are relit and noisy.
 """
 
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -30,20 +29,14 @@ from splatpilot.systems.policies.observations import heading_frame, inverse_dept
 from splatpilot.systems.policies.student import encode_color
 from splatpilot.systems.sensing.noise import ObservationNoise
 from splatpilot.systems.vehicle.state import rotation_matrices
-from splatpilot.training.corpus.corpus import Corpus
 from splatpilot.training.policies.augmentation import change_appearance, check_noise, noisy_color
 from splatpilot.training.policies.networks import (
     TrainableNetwork,
     load_weights,
     make_convolution,
 )
-from splatpilot.training.policies.student_data import StudentData
-from splatpilot.training.policies.trainer import (
-    CorpusTraining,
-    Schedule,
-    Trainer,
-    validation_batches,
-)
+from splatpilot.training.policies.student_data import CorpusTrainer
+from splatpilot.training.policies.trainer import CorpusTraining, Schedule
 
 
 class MonocularModule(nn.Module):
@@ -92,15 +85,6 @@ class DiffAeroRgbModule(nn.Module):
         self.monocular = self.monocular.to(memory_format=torch.channels_last)
         self.policy = TrainableNetwork(DIFFAERO_RGB_NETWORK.policy).requires_grad_(False)
 
-    def load_policy(self, weights: str) -> None:
-        """Loads DiffAero from a file of weights, the shipped ones if empty."""
-        load_weights(self.policy, PolicyCheckpoint.load(weights, "diffaero", DIFFAERO_NETWORK))
-
-    def load_monocular(self, weights: str) -> None:
-        """Loads the monocular network from a file of weights of `diffaero_rgb`."""
-        checkpoint = PolicyCheckpoint.load(weights, "diffaero_rgb", DIFFAERO_RGB_NETWORK)
-        load_weights(self.monocular, checkpoint, "monocular.")
-
 
 _NEAR = 6.0  # [m] maximum depth of cells that are evaluated
 _CLOSE = 0.25  # [-] maximum relative error of a successful prediction
@@ -129,7 +113,7 @@ class DiffAeroRgbTraining(CorpusTraining):
         check_noise(self.noise, color=True, time=False)
 
 
-class DiffAeroRgbTrainer(Trainer):
+class DiffAeroRgbTrainer(CorpusTrainer):
     """Trains DiffAero by RGB."""
 
     policy = "diffaero_rgb"
@@ -142,26 +126,21 @@ fraction predicted within {_CLOSE:.0%}; `missed` the fraction nearer than 3 m th
 beyond 5; `error` the mean absolute error of all cells' inverse depths, 3 m / z."""
 
     def __init__(self, config: DiffAeroRgbTraining) -> None:
-        self._config = config
-        corpora = [Corpus(Path(path)) for path in config.corpora]
-        self._data = StudentData(corpora, config.held_out, config.device)
+        super().__init__(config)
         require_view(self._data.camera.width, self._data.camera.height)
         self.network = DiffAeroRgbModule().to(config.device)
-        self.network.load_policy(config.policy)
+        policy = PolicyCheckpoint.load(config.policy, "diffaero", DIFFAERO_NETWORK)
+        load_weights(self.network.policy, policy)
         if config.begin:
-            self.network.load_monocular(config.begin)
+            checkpoint = PolicyCheckpoint.load(config.begin, self.policy, self.spec)
+            load_weights(self.network.monocular, checkpoint, "monocular.")
         self.learns_from = self._data.digest(config.policy, config.begin)
         self._rays_B = torch.from_numpy(rays_B()).flatten(0, 1).to(config.device)
         self._targets = torch.from_numpy(self._min_depths()).to(config.device)
-        self.generator = torch.Generator(config.device).manual_seed(config.seed)
-        self._validation = validation_batches(self._data.held_out, config.batch)
 
     def losses(self) -> dict[str, Tensor]:
-        config, training, generator = self._config, self._data.training, self.generator
-        drawn = torch.randint(
-            len(training), (config.batch,), generator=generator, device=config.device
-        )
-        color, rays, target = self._samples(training[drawn.cpu().numpy()])
+        config, generator = self._config, self.generator
+        color, rays, target = self._samples(self._data.draw(config.batch, generator))
         color = change_appearance(color, config.appearance, generator)
         color = noisy_color(color, config.noise, generator)
         flipped = torch.rand(config.batch, generator=generator, device=config.device) < 0.5

@@ -28,7 +28,6 @@ from splatpilot.systems.policies.student import (
 from splatpilot.systems.sensing.noise import ObservationNoise
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 from splatpilot.systems.vehicle.state import rotation_matrices
-from splatpilot.training.corpus.corpus import Corpus
 from splatpilot.training.policies.augmentation import (
     Appearance,
     change_appearance,
@@ -36,18 +35,13 @@ from splatpilot.training.policies.augmentation import (
     noisy_color,
     noisy_depth,
 )
-from splatpilot.training.policies.student_data import FrozenFeatures, StudentData
+from splatpilot.training.policies.student_data import CorpusTrainer, FrozenFeatures
 from splatpilot.training.policies.student_network import (
     IMAGE_MODULES,
     StudentModule,
     imagenet_weights,
 )
-from splatpilot.training.policies.trainer import (
-    CorpusTraining,
-    Schedule,
-    Trainer,
-    validation_batches,
-)
+from splatpilot.training.policies.trainer import CorpusTraining, Schedule
 
 GEOMETRIC_WEIGHT = 1.0  # [1/(m s)] weight of the barrier in equation 4
 COST_WEIGHT = 0.1  # [-] weight of the costs' error
@@ -118,11 +112,6 @@ def hypothesis_errors(expert: Tensor, waypoints: Tensor) -> Tensor:
     return 10.0 / (3 * expert.shape[1]) * (expert[:, None] - waypoints).square().sum((2, 3))
 
 
-def root_mean_square(errors: Tensor) -> Tensor:
-    """Computes the root mean square distance [m] of an error L (...)."""
-    return (0.3 * errors).sqrt()
-
-
 def imitation_terms(errors: Tensor, epsilon: float) -> tuple[Tensor, Tensor]:
     """Computes the relaxed winner-takes-all loss: the terms of the closest and of the others.
 
@@ -161,7 +150,7 @@ class _Prediction(NamedTuple):
     penalties: Tensor  # (N, M), without gradient
 
 
-class StudentTrainer(Trainer):
+class StudentTrainer(CorpusTrainer):
     """Trains a student on the samples of corpora."""
 
     evaluated = "samples"
@@ -173,16 +162,17 @@ from that trajectory; `best_chosen` the fraction in which no other hypothesis ha
 of error and clearance."""
 
     def __init__(self, config: StudentTraining) -> None:
-        self._config = config
+        super().__init__(config)
         self.policy = f"student_{config.observation}"
-        corpora = [Corpus(Path(path)) for path in config.corpora]
-        self._data = StudentData(corpora, config.held_out, config.device)
         camera = self._data.camera
         size = camera.width, camera.height, camera.fov_x
         self.spec = StudentSpec(config.observation, *size, nominal_speed=self._data.speed)
         self.network = StudentModule(self.spec)
         if config.begin:
-            self._load(config.begin)
+            checkpoint = load_checkpoint(config.begin, config.observation)
+            shapes = self.spec.weight_shapes()
+            weights = checkpoint.build(lambda _, weights: check_weights(weights, shapes))
+            self.network.load_state_dict({k: torch.from_numpy(v) for k, v in weights.items()})
         elif config.pretrained:
             self.network.load_state_dict(imagenet_weights(), strict=False)
         self.learns_from = self._data.digest(config.begin)
@@ -193,18 +183,10 @@ of error and clearance."""
         if config.frozen:
             folder = Path(config.features)
             self._features = FrozenFeatures(folder, self._data, self.network, config.frozen)
-        self.generator = torch.Generator(config.device).manual_seed(config.seed)
-        self._validation = validation_batches(self._data.held_out, config.batch)
-
-    def _load(self, file: str) -> None:
-        checkpoint = load_checkpoint(file, self._config.observation)
-        shapes = self.spec.weight_shapes()
-        weights = checkpoint.build(lambda _, weights: check_weights(weights, shapes))
-        self.network.load_state_dict({k: torch.from_numpy(v) for k, v in weights.items()})
 
     def losses(self) -> dict[str, Tensor]:
         config = self._config
-        indices = self._data.draw(self._integers, config.recovery_share)
+        indices = self._data.draw(config.batch, self.generator, config.recovery_share)
         predicted = self._predict(indices, augmented=True)
         closest, others = imitation_terms(predicted.errors, config.epsilon)
         wins = torch.bincount(predicted.errors.argmin(1), minlength=predicted.errors.shape[1])
@@ -231,17 +213,11 @@ of error and clearance."""
             chosen = predicted.costs.argmin(1)
             each = torch.arange(len(chosen), device=chosen.device)
             clear = (predicted.distances[each, chosen] > VEHICLE_RADIUS).all(1)
-            error = root_mean_square(predicted.errors[each, chosen])
+            error = (0.3 * predicted.errors[each, chosen]).sqrt()  # root mean square
             best = predicted.penalties.argmin(1) == chosen
             rows.append(torch.stack([clear & (error < CLOSE), clear, error, best], 1).float())
         means = torch.cat(rows).mean(0).tolist()
         return dict(zip(("success", "clear", "error", "best_chosen"), means, strict=True))
-
-    def _integers(self, count: int) -> np.ndarray:
-        """Draws an integer in [0, count) for each sample of a batch."""
-        config = self._config
-        size, device = (config.batch,), config.device
-        return torch.randint(count, size, generator=self.generator, device=device).cpu().numpy()
 
     def _images(self, indices: np.ndarray, augmented: bool) -> Tensor:
         """Encodes images, with noise and another appearance if augmented."""

@@ -3,7 +3,6 @@
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -117,9 +116,3 @@ class Trainer:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restores the result of `state_dict`."""
         self.generator.set_state(state["generator"])
-
-
-def validation_batches(indices: np.ndarray, size: int, count: int = 2000) -> list[np.ndarray]:
-    """Selects `count` of the indices (N,), evenly spaced, or all, in batches of `size`."""
-    spaced = indices[np.linspace(0, len(indices) - 1, min(count, len(indices))).astype(int)]
-    return [spaced[first : first + size] for first in range(0, len(spaced), size)]

@@ -37,16 +37,8 @@ TRAINERS = Registry("trainer", "splatpilot.trainers", TrainerEntry)
 
 
 def register_trainer(name: str, config: type, make: Callable[[Any], Trainer]) -> None:
-    """Registers a trainer for `splatpilot train`.
-
-    Args:
-        name: name of the policy.
-        config: type of its configurations, see `splatpilot.training.policies.trainer`.
-        make: makes the `Trainer` of a configuration.
-
-    Raises:
-        ValueError: if another trainer has the name.
-    """
+    """Registers the trainer of a policy for `splatpilot train`: the type of its configurations, see
+    `splatpilot.training.policies.trainer`, and what makes the `Trainer` of one."""
     TRAINERS.add(name, TrainerEntry(config, make))
 
 

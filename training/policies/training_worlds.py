@@ -59,13 +59,9 @@ from splatpilot.training.policies.ray_casting import Geometry, Grids, MixedGeome
 
 _LIMIT = 1 << 30  # [bytes] of the cache; the files that were used last stay.
 
+# Shapes that the cache can store, and points (3,) [m] of a `WorldSpec`.
 _SHAPES = {shape.__name__: shape for shape in (Sphere, Capsule, Cylinder, Box, HalfSpace)}
-"""Shapes that the cache can store."""
-
 _POINTS = "lower_W", "upper_W", "p_WS", "p_WG"
-"""Points of a `WorldSpec`, (3,) [m] each."""
-
-ShapesAndPoints = tuple[list[Shape], *tuple[np.ndarray, ...]]
 
 
 class WorldCache:
@@ -80,13 +76,14 @@ class WorldCache:
         with contextlib.suppress(OSError):
             require_writable_folder(self._folder)
 
-    def spec(self, config: WorldConfig, seed: int) -> ShapesAndPoints:
-        """Returns the shapes of a generated world, and its `lower_W`, `upper_W`, `p_WS`, `p_WG`."""
+    def world(self, config: WorldConfig, seed: int) -> "TrainingWorld":
+        """Makes the world of a configuration and seed, without its appearance."""
         file = self._file("json", f"{dump_config(config)}{seed}".encode())
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
             kept = json.loads(file.read_text())
             os.utime(file)
-            return [_shape(*one) for one in kept["shapes"]], *(np.array(kept[p]) for p in _POINTS)
+            points = (np.array(kept[name]) for name in _POINTS)
+            return TrainingWorld([_shape(*one) for one in kept["shapes"]], *points)
         spec = make_spec(config, seed)
         shapes = [solid.shape for solid in spec.solids]
         points = {name: getattr(spec, name) for name in _POINTS}
@@ -95,7 +92,7 @@ class WorldCache:
             content["shapes"] = [_fields(shape) for shape in shapes]
             with contextlib.suppress(OSError), written_atomically(file) as path:
                 path.write_text(json.dumps(content))
-        return shapes, *points.values()
+        return TrainingWorld(shapes, *points.values())
 
     def arrival(self, world: "TrainingWorld", voxel_size: float) -> tuple[Esdf, TimeOfArrival]:
         """Returns the conservative distances and the times of arrival in a world, on grids of
@@ -155,8 +152,7 @@ def _shape(name: str, values: dict[str, Any]) -> Shape:
     return _SHAPES[name](**values)
 
 
-STARTS = 256
-"""Number of positions in each world from which flights of training start."""
+STARTS = 256  # positions in each world from which flights of training start
 
 _START_CLEARANCE = 0.3  # [m]
 _NEAR_GOAL = 1.0  # [m], within which paths are straight
@@ -175,13 +171,8 @@ class TrainingWorld:
 
 
 class WorldBatch:
-    """W worlds as tensors: surfaces, volumes, starts, goals, and the path to each goal.
-
-    Args:
-      worlds: W of them.
-      voxel_size: [m] of the grids of the time of arrival; None for evaluation, without grids.
-      device: of the tensors.
-    """
+    """W worlds as tensors: surfaces, volumes, starts, goals, and the path to each goal by grids of
+    the time of arrival with `voxel_size` [m]; None for evaluation, without grids."""
 
     def __init__(
         self,
@@ -208,7 +199,11 @@ class WorldBatch:
             sizes = [voxel_size] * len(worlds)
             self._distances = Grids([esdf.distances for esdf, _ in self.maps], lower_W, sizes)
             self._times = Grids([toa.times for _, toa in self.maps], lower_W, sizes)
-            self.starts_W = tensor([_starts(*m, seed) for seed, m in enumerate(self.maps)])
+            starts = []
+            for seed, (esdf, toa) in enumerate(self.maps):
+                free = toa.starts(esdf, _START_CLEARANCE)
+                starts.append(free[np.random.default_rng(seed).integers(len(free), size=STARTS)])
+            self.starts_W = tensor(starts)
 
     def __len__(self) -> int:
         return len(self.p_WG)
@@ -253,21 +248,9 @@ class WorldBatch:
         return self._distances.interpolate(p_WQ, world)[0]
 
 
-def _starts(esdf: Esdf, toa: TimeOfArrival, seed: int) -> np.ndarray:
-    """Draws positions (STARTS, 3) [m] with clearance from which the goal can be reached."""
-    free = toa.reachable & (esdf.distances > VEHICLE_RADIUS + _START_CLEARANCE)
-    cells = np.argwhere(free)
-    if len(cells) == 0:
-        raise ValueError("no position in the world has room to start from; make it less dense")
-    chosen = np.random.default_rng(seed).integers(len(cells), size=STARTS)
-    return esdf.lower_W + esdf.voxel_size * (cells[chosen] + 0.5)
-
-
-SCENE_MARGIN = 0.3
-"""[m] Clearance of starts, goals and paths in captured scenes, beyond the vehicle's radius; half of
-it if no path has as much."""
-
-MAX_SCENE_PATH = 25.0  # [m] maximum length of the paths that are drawn there
+# Of starts, goals and paths in captured scenes.
+_SCENE_MARGIN = 0.3  # [m] clearance beyond the vehicle's radius; half of it if no path has as much
+_MAX_SCENE_PATH = 25.0  # [m]
 
 
 @dataclass
@@ -298,11 +281,6 @@ class WorldSelection(Config):
         return [*self.kinds, *self.scenes]
 
 
-def make_training_world(kind: str, seed: int, cache: WorldCache) -> TrainingWorld:
-    """Makes the world of a scenario and seed as in the benchmark, without its appearance."""
-    return TrainingWorld(*cache.spec(scenario_world(kind), seed))
-
-
 def training_worlds(
     selection: WorldSelection, seed: int, device: torch.device | str = "cpu"
 ) -> WorldBatch:
@@ -329,11 +307,9 @@ def _make_worlds(
     seeds = Progress(range(first, first + count), f"making {what}", unit="world")
     for seed, turn in zip(seeds, cycle(selection.turns), strict=False):
         if turn not in scenes:
-            worlds.append(make_training_world(turn, seed, cache))
+            worlds.append(cache.world(scenario_world(turn), seed))
             continue
         esdf, conservative = scenes[turn]
-        p_WS, p_WG, _ = draw_start_and_goal(
-            esdf, VEHICLE_RADIUS, seed, SCENE_MARGIN, MAX_SCENE_PATH
-        )
-        worlds.append(TrainingWorld(conservative, esdf.lower_W, esdf.upper_W, p_WS, p_WG))
+        ends = draw_start_and_goal(esdf, VEHICLE_RADIUS, seed, _SCENE_MARGIN, _MAX_SCENE_PATH)
+        worlds.append(TrainingWorld(conservative, esdf.lower_W, esdf.upper_W, *ends[:2]))
     return worlds

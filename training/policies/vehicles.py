@@ -22,6 +22,7 @@ from splatpilot.systems.vehicle.flatness import (
 from splatpilot.systems.vehicle.quadrotor import QuadrotorParams, rk4_step
 from splatpilot.systems.vehicle.state import QuadrotorState, rotation_matrices, unit_vectors
 
+_CONTROL = FlatnessControllerConfig()
 _SUBSTEP = 0.02  # [s], at most, of integration and control
 
 
@@ -47,13 +48,7 @@ class PointMass(NamedTuple):
         thrust = torch.add(self.a, self.v, alpha=params.drag)
         return thrust + torch.tensor([0.0, 0.0, params.gravity], device=thrust.device)
 
-    def step(
-        self,
-        a_cmd: Tensor,
-        dt: float,
-        control: FlatnessControllerConfig,
-        heading: Tensor | None = None,
-    ) -> "PointMass":
+    def step(self, a_cmd: Tensor, dt: float, heading: Tensor | None = None) -> "PointMass":
         """Computes the state after `dt` [s] of constant commanded accelerations (N, 3) [m/s^2].
 
         Exact for da/dt = (a_cmd - a) / lag. The vehicle turns toward `heading` (N,) [rad], or
@@ -67,7 +62,12 @@ class PointMass(NamedTuple):
         p = torch.add(torch.add(self.p, self.v, alpha=dt), a_cmd, alpha=0.5 * dt**2)
         p = torch.addcmul(p, self.lag * (dt - coasting), behind)
         with torch.no_grad():
-            yaw = self.yaw + dt * yaw_rate(self.yaw, v, control, heading)
+            along, strength = heading_along_motion(v, _CONTROL.yaw_speed)
+            if heading is not None:
+                along, strength = heading, torch.ones_like(strength)
+            error = torch.remainder(along - self.yaw + torch.pi, 2 * torch.pi) - torch.pi
+            rate, limit = _CONTROL.yaw_gain * strength * error, _CONTROL.max_yaw_rate
+            yaw = self.yaw + dt * rate.clamp(-limit, limit)
         return PointMass(p, v, torch.addcmul(a_cmd, decay, behind), yaw, self.lag)
 
     def decay_gradient(self, factor: float) -> "PointMass":
@@ -111,13 +111,7 @@ class BodyRate(NamedTuple):
         """Computes the z axes (N, 3) of the body in W."""
         return self.attitude()[:, :, 2]
 
-    def step(
-        self,
-        a_cmd: Tensor,
-        dt: float,
-        control: FlatnessControllerConfig,
-        heading: Tensor | None = None,
-    ) -> "BodyRate":
+    def step(self, a_cmd: Tensor, dt: float, heading: Tensor | None = None) -> "BodyRate":
         """Computes the state after `dt` [s]: RK4 and new commands every 0.02 s or less."""
         params = QuadrotorParams()
         count = int(-(-dt // _SUBSTEP))
@@ -125,7 +119,7 @@ class BodyRate(NamedTuple):
         for _ in range(count):
             before = state
             v_WB = QuadrotorState.of(state).v_WB
-            command = flatness_command(state, a_cmd, v_WB, heading, control, params)
+            command = flatness_command(state, a_cmd, v_WB, heading, _CONTROL, params)
             state = rk4_step(state, command, params, dt / count)
         change = QuadrotorState.of(state).v_WB - QuadrotorState.of(before).v_WB
         return BodyRate(state, change * (count / dt))
@@ -143,23 +137,6 @@ class Observation(NamedTuple):
     speed: Tensor  # (N,) [m/s], nominal
 
 
-def reaching_acceleration(p_WR: Tensor, vehicle: Vehicle) -> Tensor:
-    """Computes accelerations (N, 3) [m/s^2] that reach p_WR (N, 3) in the lookahead."""
-    T = FlatnessControllerConfig.lookahead
-    return 2.0 * (p_WR - vehicle.p - T * vehicle.v) / T**2
-
-
-def yaw_rate(
-    yaw: Tensor, v: Tensor, control: FlatnessControllerConfig, heading: Tensor | None
-) -> Tensor:
-    """Computes the controller's yaw rates (N,) [rad/s] of level vehicles at `yaw` (N,) [rad]."""
-    along, strength = heading_along_motion(v, control.yaw_speed)
-    if heading is not None:
-        along, strength = heading, torch.ones_like(strength)
-    error = torch.remainder(along - yaw + torch.pi, 2 * torch.pi) - torch.pi
-    return (control.yaw_gain * strength * error).clamp(-control.max_yaw_rate, control.max_yaw_rate)
-
-
 def map_tensors(function: Callable[..., Tensor], first: Any, *others: Any) -> Any:
     """Applies a function to the tensors of nested tuples of one type."""
     if isinstance(first, Tensor):
@@ -175,11 +152,6 @@ def choose_rows(chosen: Tensor, these: Any, others: Any) -> Any:
         return torch.where(chosen.reshape(-1, *[1] * (a.dim() - 1)), a, b)
 
     return map_tensors(choose, these, others)
-
-
-def take_rows(rows: Tensor, tensors: Any) -> Any:
-    """Takes rows (n,) of nested tuples of tensors (N, ...)."""
-    return map_tensors(lambda x: x[rows], tensors)
 
 
 class History(NamedTuple):

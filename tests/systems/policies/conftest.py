@@ -59,13 +59,6 @@ def u_trap() -> Esdf:
 
 
 @pytest.fixture(scope="session")
-def doorway() -> Esdf:
-    """12 x 8 x 4 m in two rooms, joined by a door 1.2 m wide at y = 4 in a wall at x = 6."""
-    walls = [box([6, -1, -1], [6.2, 3.4, 5]), box([6, 4.6, -1], [6.2, 9, 5])]
-    return field_of(walls, [12.0, 8.0, 4.0])
-
-
-@pytest.fixture(scope="session")
 def narrow_bend() -> Esdf:
     """6 x 4 x 1.6 m, voxels of 0.05 m: a duct 0.9 m wide from (1, 1) in an S to (4.2, 2.6)."""
     occupied = np.ones((120, 80, 32), dtype=bool)

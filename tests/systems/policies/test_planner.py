@@ -8,20 +8,18 @@ from pydrake.systems.framework import DiagramBuilder, EventStatus
 from pydrake.systems.primitives import LogVectorOutput
 
 from splatpilot.systems.policies import planner as privileged_planner
-from splatpilot.systems.policies.hypotheses import Hypotheses, HypothesisSelector, hypotheses_size
+from splatpilot.systems.policies.hypotheses import Hypotheses, HypothesisSelector
 from splatpilot.systems.policies.lattice import LatticeConfig, TrajectoryLattice
 from splatpilot.systems.policies.planner import PrivilegedPlanner, PrivilegedPlannerConfig, plan
 from splatpilot.systems.policies.time_of_arrival import time_of_arrival
 from splatpilot.systems.vehicle.flatness import FlatnessController, FlatnessControllerConfig
 from splatpilot.systems.vehicle.quadrotor import (
     VEHICLE_RADIUS,
-    QuadrotorParams,
     QuadrotorPlant,
     hover_state,
 )
 
 MARGIN = LatticeConfig().margin
-PARAMS = QuadrotorParams(drag=0.4, gravity=3.7)
 
 
 def flying(p_WB, v_WB, a_WB=(0.0, 0.0, 0.0)):
@@ -116,12 +114,6 @@ def test_escapes_a_u_trap(u_trap, p_WB):
     pytest.fail(f"After 12 s still at {p}.")
 
 
-def test_passes_a_narrow_door(doorway):
-    states, _ = fly(doorway, [2.0, 2.0, 1.5], [10.0, 6.0, 1.5], 9.0, arrival_distance=0.3)
-    assert np.linalg.norm(states[-1, :3] - [10.0, 6.0, 1.5]) < 0.3
-    assert doorway.distance(states[:, :3]).min() > VEHICLE_RADIUS
-
-
 def test_follows_a_narrow_bend(narrow_bend):
     p_WG = np.array([4.2, 2.6, 0.8])
     states, _ = fly(narrow_bend, [1.0, 1.0, 0.8], p_WG, 12.0, arrival_distance=0.3)
@@ -148,7 +140,7 @@ def test_arrives_and_stops_near_an_obstacle(pillar, clearance):
     assert pillar.distance(states[:, :3]).min() > VEHICLE_RADIUS
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_flies_through_a_forest(make_forest, seed):
     world, esdf = make_forest(seed)
     p_WB, p_WG = np.array([1.5, 5.0, 1.5]), np.array([18.5, 5.0, 1.5])
@@ -198,21 +190,6 @@ def test_time_of_arrival_is_computed_once_per_goal(empty, monkeypatch):
     assert goals == [[9.0, 4.0, 3.0], [9.0, 6.0, 3.0]]
 
 
-def test_plans_at_its_rate(empty):
-    planner = PrivilegedPlanner(empty, PrivilegedPlannerConfig(rate=10.0))
-    simulator = Simulator(planner)
-    context = simulator.get_mutable_context()
-    planner.GetInputPort("state").FixValue(context, hover_state([3.0, 4.0, 3.0]))
-    planner.GetInputPort("goal").FixValue(context, [9.0, 4.0, 3.0])
-    port = planner.GetOutputPort("hypotheses")
-    assert port.size() == hypotheses_size(3)
-    assert Hypotheses.from_vector(np.asarray(port.Eval(context)), 3) is None
-    for until, plan_time in [(0.05, 0.0), (0.15, 0.1), (0.27, 0.2)]:
-        simulator.AdvanceTo(until)
-        hypotheses = Hypotheses.from_vector(np.asarray(port.Eval(context)), 3)
-        assert hypotheses is not None and hypotheses.plan_time == pytest.approx(plan_time)
-
-
 def test_unknown_space_is_not_planned_through(make_forest):
     _, esdf = make_forest(0)
     planner = PrivilegedPlanner(esdf)
@@ -235,15 +212,3 @@ def test_a_state_that_is_not_finite_is_refused(pillar_plan):
     state[4] = np.nan
     with pytest.raises(ValueError, match="must be 13 finite numbers"):
         pillar_plan(state)
-
-
-@pytest.mark.parametrize(
-    ("config", "message"),
-    [
-        (PrivilegedPlannerConfig(rate=0.0), "rate .* got 0.0"),
-        (PrivilegedPlannerConfig(lattice=LatticeConfig(speed=-1.0)), "speed .* got -1.0"),
-    ],
-)
-def test_configs_out_of_range_are_refused(empty, config, message):
-    with pytest.raises(ValueError, match=message):
-        PrivilegedPlanner(empty, config)

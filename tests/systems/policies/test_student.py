@@ -3,7 +3,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pydrake.math import RollPitchYaw
 
 from splatpilot.systems.policies.base import Observation
 from splatpilot.systems.policies.checkpoint import PolicyCheckpoint
@@ -103,24 +102,6 @@ def test_deviations_fade_at_the_goal(distance, scale):
     found = plan(constant_network(0.1), seen).waypoints_B
     reference = reference_trajectory(v_WB, goal_B, np.array([0.0, 0.0, 1.0]), 2.6)
     np.testing.assert_allclose(found - reference, np.full((3, 10, 3), 0.1 * scale), atol=1e-5)
-
-
-def test_rounding_does_not_decide_the_reference():
-    network, v_B, direction = constant_network(0.0), np.array([2.0, 0, 0]), np.array([0.6, 0.8, 0])
-    ends = []
-    for yaw in np.linspace(0.0, 6.2, 40):
-        R_WB = RollPitchYaw(0.0, 0.0, yaw).ToRotationMatrix()
-        p_WB = np.array([1.0, 2.0, 1.5])
-        state = moving(p_WB, R_WB @ v_B, yaw)
-        found = plan(network, observe(state, DEPTH, p_WB + R_WB @ (9.0 * direction))).waypoints_B
-        ends.append(found[0, -1] @ direction)
-    stopping, continuing = (
-        reference_trajectory(v_B, reach * direction, np.array([0, 0, 1.0]), 2.6)[-1] @ direction
-        for reach in (0.998 * network.reach, network.reach)
-    )
-    assert abs(stopping - continuing) > 0.5
-    np.testing.assert_allclose(ends, continuing, atol=1e-2)
-    assert np.ptp(ends) < 1e-4
 
 
 def corridor(low: int, high: int, distance: float) -> np.ndarray:

@@ -1,5 +1,4 @@
 import shutil
-from dataclasses import fields
 
 import numpy as np
 import pytest
@@ -33,26 +32,6 @@ def test_samples_come_in_the_order_asked_for(gathered):
 def test_indices_out_of_range_are_refused(gathered, index):
     with pytest.raises(IndexError, match=r"in \[0, "):
         gathered.samples(np.array([0, index]))
-
-
-def test_sizes_and_types_are_as_documented(gathered):
-    samples = gathered.samples(np.arange(len(gathered)))
-    shapes = {f.name: getattr(samples, f.name).shape[1:] for f in fields(samples)}
-    assert shapes["color"] == (24, 32, 3)
-    assert shapes["depth"] == (24, 32)
-    assert shapes["trajectories_B"] == (3, 10, 3)
-    dtypes = {f.name: getattr(samples, f.name).dtype for f in fields(samples)}
-    assert dtypes["depth"] == np.float16
-    assert dtypes["X_WB"] == np.float64
-    assert samples.color.std() > 10
-    assert (np.linalg.norm(samples.goal_B, axis=1) > 0.1).all()
-
-
-def test_worlds_have_their_distances_and_can_be_made_again(gathered):
-    record = gathered.worlds[1]
-    world = record.make()
-    np.testing.assert_array_equal(world.esdf.distances, record.esdf.distances)
-    assert record.esdf.distances.dtype == np.float32
 
 
 def test_a_world_that_changed_is_refused(folder):

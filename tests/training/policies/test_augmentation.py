@@ -3,7 +3,6 @@ import numpy as np
 import pytest
 import torch
 
-from splatpilot.systems.common.config import load_config
 from splatpilot.systems.sensing.noise import (
     ObservationNoise,
     corrupt_color,
@@ -21,7 +20,6 @@ from splatpilot.training.policies.augmentation import (
 )
 from splatpilot.training.policies.train import validate
 from splatpilot.training.policies.train_agile_autonomy import AgileAutonomyTraining
-from splatpilot.training.policies.train_diffaero import DiffAeroTraining
 from splatpilot.training.policies.train_diffaero_rgb import DiffAeroRgbTraining
 from splatpilot.training.policies.train_student import StudentDepthTraining, StudentRgbTraining
 
@@ -105,20 +103,11 @@ def test_each_image_has_changes_of_its_own_and_seeds_repeat_them(change):
     [
         (StudentRgbTraining, ObservationNoise(depth_dropout=0.5), "depth_dropout"),
         (StudentRgbTraining, ObservationNoise(latency=0.1), "latency"),
-        (StudentRgbTraining, ObservationNoise(frame_rate=[5.0, 10.0]), "frame_rate"),
         (StudentDepthTraining, ObservationNoise(color_noise=0.5), "color_noise"),
-        (StudentDepthTraining, ObservationNoise(blur=3.0), "blur"),
         (DiffAeroRgbTraining, ObservationNoise(depth_additive=0.1), "depth_additive"),
         (AgileAutonomyTraining, ObservationNoise(brightness_jitter=0.2), "brightness_jitter"),
-        (AgileAutonomyTraining, ObservationNoise(full_well=8000, read_noise=5), "full_well"),
     ],
 )
 def test_noise_without_effect_is_refused(config, noise, field):
     with pytest.raises(ValueError, match=rf"noise\.{field} must be left out, got "):
         validate(config(noise=noise))
-
-
-def test_noise_out_of_range_is_refused():
-    config = load_config(DiffAeroTraining(), overrides=["rollout.noise.latency=2"])
-    with pytest.raises(ValueError, match=r"rollout\.noise\.latency must be in \[0, 1\] s, got 2"):
-        validate(config)

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from splatpilot.systems.common.config import load_config
 from splatpilot.systems.policies.checkpoint import checkpoint_policy
@@ -14,7 +15,6 @@ from splatpilot.training.corpus.expert import ExpertConfig
 from splatpilot.training.corpus.library import LibraryConfig
 from splatpilot.training.corpus.samples import EXPERT, RECOVERY
 from splatpilot.training.policies import recover as recovery
-from splatpilot.training.policies import recover as student_flights
 from splatpilot.training.policies.student_data import StudentData
 from splatpilot.training.policies.train_diffaero_rgb import DiffAeroRgbTrainer, DiffAeroRgbTraining
 from splatpilot.training.policies.train_student import StudentDepthTraining, StudentTrainer
@@ -74,7 +74,7 @@ def test_student_flies_and_is_trained_anew_with_what_it_lacked(expert, tmp_path,
     assert len(list((whole / "flights" / "0").iterdir())) == 1
     assert json.loads((whole / "recovery.json").read_text()) == ledger
 
-    for module, step in ((student_flights, "_fly_world"), (recovery, "_count")):
+    for module, step in ((recovery, "_fly_world"), (recovery, "_count")):
         with monkeypatch.context() as patch:
             patch.setattr(module, step, interrupt)
             with pytest.raises(KeyboardInterrupt):
@@ -82,7 +82,7 @@ def test_student_flies_and_is_trained_anew_with_what_it_lacked(expert, tmp_path,
     config = load_config(StudentDepthTraining(), overrides=[f"corpora=[{expert}]", *TINY])
     with pytest.raises(ValueError, match=r"recovery.yaml holds another configuration"):
         recovery.run(config=config, make=StudentTrainer, out=parts, flights=2, jobs=1)
-    monkeypatch.setattr(student_flights, "_fly_world", interrupt)  # which has been done
+    monkeypatch.setattr(recovery, "_fly_world", interrupt)  # which has been done
     assert both_stages(expert, parts)["flights"] == ledger["flights"]
     expected, found = weights(whole), weights(parts)
     assert all(np.array_equal(found[name], value) for name, value in expected.items())
@@ -90,13 +90,13 @@ def test_student_flies_and_is_trained_anew_with_what_it_lacked(expert, tmp_path,
 
 def test_another_round_is_flown_by_the_weights_of_the_one_before(expert, tmp_path, monkeypatch):
     both_stages(expert, tmp_path / "first")
-    flown, fly = [], student_flights.fly
+    flown, fly = [], recovery.fly
 
     def watched(diagram, scenario, world):
         flown.append(scenario.policy)
         return fly(diagram, scenario, world)
 
-    monkeypatch.setattr(student_flights, "fly", watched)
+    monkeypatch.setattr(recovery, "fly", watched)
     corpus, out = tmp_path / "first" / "corpora" / "0", tmp_path / "second"
     pilot = str(tmp_path / "first" / "stage_2" / "student_depth.npz")
     config = load_config(StudentDepthTraining(), overrides=[f"corpora=[{corpus}]", *TINY])
@@ -142,29 +142,25 @@ def test_what_was_lost_or_damaged_is_made_again(expert, tmp_path, capsys):
 def test_recovery_share_is_the_part_that_students_came_to(expert, tmp_path):
     both_stages(expert, tmp_path)
     data = StudentData([Corpus(tmp_path / "corpora" / "0")], 0.5)
-    rng = np.random.default_rng(0)
-
-    def draw(count: int) -> np.ndarray:
-        return rng.integers(count, size=4000)
-
+    generator = torch.Generator().manual_seed(0)
     natural = len(data.recovered) / len(data.training)
     assert 0.0 < natural < 1.0
     for share, part in ((0.0, natural), (0.25, 0.25), (0.8, 0.8), (1.0, 1.0)):
-        drawn = data.draw(draw, share)
+        drawn = data.draw(4000, generator, share)
         assert set(drawn) <= set(data.training)
         assert np.isin(drawn, data.recovered).mean() == pytest.approx(part, abs=0.03)
     plain = StudentData([Corpus(expert)], 0.5)
-    assert set(plain.draw(draw, 0.5)) == set(plain.training)
+    assert set(plain.draw(4000, generator, 0.5)) == set(plain.training)
 
 
 def test_what_sees_in_colors_recovers_too(tmp_path, monkeypatch):
-    speeds, fly = [], student_flights.fly
+    speeds, fly = [], recovery.fly
 
     def watched(diagram, scenario, world):
         speeds.append(scenario.policy.speed)
         return fly(diagram, scenario, world)
 
-    monkeypatch.setattr(student_flights, "fly", watched)
+    monkeypatch.setattr(recovery, "fly", watched)
     gather(tmp_path / "expert", tmp_path, OnboardCamera(width=160, height=90))
     tiny = [setting for setting in TINY if not setting.startswith(("pretrained", "frozen"))]
     overrides = [f"corpora=[{tmp_path / 'expert'}]", *tiny]

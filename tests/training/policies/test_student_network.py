@@ -89,13 +89,6 @@ def test_frozen_modules_and_modules_in_parts():
     assert all(frozen) and all(p.grad is not None for p in module.features[14:].parameters())
 
 
-def folded_features(weights: dict[str, torch.Tensor], image: torch.Tensor) -> torch.Tensor:
-    module = StudentModule(StudentSpec(way_version=2))
-    module.load_state_dict(weights, strict=False)
-    with torch.no_grad():
-        return module.features(image)
-
-
 @pytest.fixture
 def encoder_file(tmp_path, monkeypatch) -> Path:
     monkeypatch.setenv("SPLATPILOT_DATA", str(tmp_path))

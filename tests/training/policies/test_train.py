@@ -2,10 +2,6 @@ import csv
 import json
 import os
 import re
-import signal
-import subprocess
-import sys
-import time
 import zipfile
 from contextlib import contextmanager
 from pathlib import Path
@@ -29,6 +25,7 @@ from splatpilot.training.policies.evaluation import evaluate_agent
 from splatpilot.training.policies.train import run
 from splatpilot.training.policies.train_diffaero import DiffAeroLearner, DiffAeroTraining
 from splatpilot.training.policies.trainer_registry import TRAINERS
+from splatpilot.training.policies.training_worlds import WorldCache
 
 CARDS = sorted((Path(policy_checkpoint.__file__).parent / "weights").glob("*.md"))
 
@@ -44,6 +41,7 @@ SMALL = [
 ]
 TINY = [*SMALL, "rollout.environments=4", "rollout.steps=4"]
 OF_POLICY = {
+    "diffaero": TINY[-2:],
     "depthnav": [*TINY[-2:], "empty=0.5", "rollout.noise.latency=0.1"],
     "agile_autonomy": ["rounds=2", "round_updates=3", "environments=4", "steps=16", "batch=8"],
 }
@@ -84,22 +82,6 @@ def test_run_leaves_what_it_says(finished):
     assert summary["updates"] == 6 and summary["seed"] == 0
 
 
-def test_killed_run_ends_as_one_that_was_not(finished, tmp_path):
-    program = "from splatpilot.analysis.commands.main import main; raise SystemExit(main())"
-    command = [sys.executable, "-c", program, "train", "diffaero", "--out", str(tmp_path)]
-    for override in TINY:
-        command += ["--set", override]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    while not (tmp_path / "checkpoint.pt").exists() and process.poll() is None:
-        time.sleep(0.002)
-    os.kill(process.pid, signal.SIGKILL)
-    process.wait()
-    run(config=tiny(), out=tmp_path, make=TRAINERS.find("diffaero").make)
-    assert_same(tmp_path, finished)
-    rows = (tmp_path / "curves.csv").read_text()
-    assert rows == (finished / "curves.csv").read_text()
-
-
 def test_a_command_trains_seeds_one_after_the_other(finished, tmp_path):
     overrides = [argument for override in TINY for argument in ("--set", override)]
     command = ["train", "diffaero", "--seeds", "0", "1", "--out", str(tmp_path)]
@@ -108,7 +90,7 @@ def test_a_command_trains_seeds_one_after_the_other(finished, tmp_path):
     assert json.loads((tmp_path / "seed_1" / "summary.json").read_text())["seed"] == 1
 
 
-@pytest.mark.parametrize("policy", ["depthnav", "agile_autonomy"])
+@pytest.mark.parametrize("policy", ["diffaero", "depthnav", "agile_autonomy"])
 def test_interrupted_training_ends_as_whole(policy, tmp_path):
     trainer_kind = TRAINERS.find(policy)
     config = load_config(trainer_kind.config(), overrides=[*SMALL, *OF_POLICY[policy]])
@@ -130,6 +112,8 @@ def test_interrupted_training_ends_as_whole(policy, tmp_path):
         run(config=config, out=tmp_path / "again", make=make_interrupted)
     run(config=config, out=tmp_path / "again", make=trainer_kind.make)
     assert_same(tmp_path / "again", tmp_path / "whole")
+    curves = [(tmp_path / folder / "curves.csv").read_text() for folder in ("again", "whole")]
+    assert curves[0] == curves[1]
     assert policy_named(str(tmp_path / "whole" / f"{policy}.npz")).rate > 0.0
 
 
@@ -146,22 +130,7 @@ def test_model_cards_hold_configurations_that_train(card, tmp_path, monkeypatch)
     made_with.validate()
 
 
-def test_run_leaves_the_threads_of_torch_as_they_were(tmp_path):
-    threads, used = torch.get_num_threads(), []
-    torch.set_num_threads(2)
-    try:
-        with pytest.raises(ValueError, match="update 5"):
-            run(
-                config=TinyTraining(),
-                out=tmp_path,
-                make=lambda config: used.append(torch.get_num_threads()) or FragileTrainer(config),
-            )
-        assert (used, torch.get_num_threads()) == ([1], 2)
-    finally:
-        torch.set_num_threads(threads)
-
-
-def test_curves_for_tensorboard_are_whole_when_a_run_ends(tmp_path, monkeypatch):
+def test_loss_that_is_not_a_number_ends_a_run_which_keeps_weights_and_curves(tmp_path, monkeypatch):
     rows, is_open = [], []
 
     @contextmanager
@@ -176,9 +145,24 @@ def test_curves_for_tensorboard_are_whole_when_a_run_ends(tmp_path, monkeypatch)
     monkeypatch.setattr(train, "event_log", event_log)
     config = TinyTraining()
     config.schedule.tensorboard = True
-    with pytest.raises(ValueError, match="update 5"):
-        run(config=config, out=tmp_path, make=FragileTrainer)
+    threads, used = torch.get_num_threads(), []
+    torch.set_num_threads(2)
+
+    def make(config):
+        used.append(torch.get_num_threads())
+        return FragileTrainer(config)
+
+    try:
+        with pytest.raises(ValueError, match="update 5: the term 'second' of the loss became nan"):
+            run(config=config, out=tmp_path, make=make)
+        assert (used, torch.get_num_threads()) == ([1], 2)
+    finally:
+        torch.set_num_threads(threads)
     assert (rows, is_open) == ([(2, 0.5), (4, 0.5)], [])
+    checkpoint = PolicyCheckpoint.load(tmp_path / "diffaero.npz", "diffaero", DIFFAERO_NETWORK)
+    assert all(np.isfinite(value).all() for value in checkpoint.weights.values())
+    assert checkpoint.provenance["best"]["update"] == 4
+    assert torch.load(tmp_path / "checkpoint.pt", weights_only=True)["progress"]["update"] == 4
 
 
 def test_other_configuration_or_broken_checkpoint_is_refused(finished, tmp_path):
@@ -190,10 +174,6 @@ def test_other_configuration_or_broken_checkpoint_is_refused(finished, tmp_path)
         run(config=tiny(), out=tmp_path, make=TRAINERS.find("diffaero").make)
     with pytest.raises(ValueError, match=r"schedule\.updates must be in \[1, inf\), got 0"):
         run(config=tiny("schedule.updates=0"), out=tmp_path, make=TRAINERS.find("diffaero").make)
-    with pytest.raises(ValueError, match=r"seed must be in \[0, 999\], got 10{20}$"):
-        run(config=tiny(f"seed={10**20}"), out=tmp_path, make=TRAINERS.find("diffaero").make)
-    with pytest.raises(ValueError, match=r"there is no scenario 'P99'; did you mean P09"):
-        run(config=tiny("worlds.kinds=[P99]"), out=tmp_path, make=TRAINERS.find("diffaero").make)
 
 
 class FragileTrainer(TinyTrainer):
@@ -202,20 +182,10 @@ class FragileTrainer(TinyTrainer):
         return {"first": size, "second": size * (torch.nan if self.update >= 5 else 1.0)}
 
 
-def test_loss_that_is_not_a_number_stops_with_its_name_and_keeps_the_weights(tmp_path):
-    with pytest.raises(ValueError, match="update 5: the term 'second' of the loss became nan"):
-        run(config=TinyTraining(), out=tmp_path, make=FragileTrainer)
-    checkpoint = PolicyCheckpoint.load(tmp_path / "diffaero.npz", "diffaero", DIFFAERO_NETWORK)
-    assert all(np.isfinite(value).all() for value in checkpoint.weights.values())
-    assert checkpoint.provenance["best"]["update"] == 4
-    assert torch.load(tmp_path / "checkpoint.pt", weights_only=True)["progress"]["update"] == 4
-
-
 def test_training_seeds_are_not_the_benchmarks(monkeypatch):
     asked: list[int] = []
-    monkeypatch.setattr(
-        training_worlds, "make_training_world", lambda kind, seed, cache: asked.append(seed)
-    )
+    monkeypatch.setattr(training_worlds, "scenario_world", str)
+    monkeypatch.setattr(WorldCache, "world", lambda self, config, seed: asked.append(seed))
     monkeypatch.setattr(training_worlds, "WorldBatch", lambda *_: None)
     selection = training_worlds.WorldSelection(count=1000, held_out=1000)
     for seed in (0, 1, 999):

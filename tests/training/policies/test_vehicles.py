@@ -2,10 +2,13 @@ import numpy as np
 import pytest
 import torch
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantVectorSource
 from random_scenes import normal_tensor
 
+from splatpilot.systems.policies.agile_autonomy import FOV_X
+from splatpilot.systems.sensing.latency import DelayedPose, FrameTimes
+from splatpilot.systems.sensing.noise import ObservationNoise
 from splatpilot.systems.vehicle.flatness import (
     FlatnessController,
     FlatnessControllerConfig,
@@ -13,7 +16,20 @@ from splatpilot.systems.vehicle.flatness import (
 )
 from splatpilot.systems.vehicle.quadrotor import QuadrotorPlant, hover_state
 from splatpilot.systems.vehicle.state import pose_from_state
-from splatpilot.training.policies.vehicles import BodyRate, PointMass
+from splatpilot.training.policies.evaluation import (
+    CAMERA_AHEAD,
+    FlightConditions,
+    evaluate_agent,
+    render_depth,
+)
+from splatpilot.training.policies.ray_casting import PixelRays
+from splatpilot.training.policies.rollouts import DifferentiableRollout, RolloutConfig
+from splatpilot.training.policies.train_agile_autonomy import (
+    AgileAutonomyTrainer,
+    AgileAutonomyTraining,
+)
+from splatpilot.training.policies.training_worlds import WorldSelection, training_worlds
+from splatpilot.training.policies.vehicles import BodyRate, History, PointMass, map_tensors
 
 CONTROL = FlatnessControllerConfig()
 
@@ -27,14 +43,14 @@ def point_masses(count: int) -> PointMass:
 
 def test_point_mass_solves_its_equation_exactly():
     start, a_cmd = point_masses(5), torch.tensor([[3.0, -2.0, 1.0]], dtype=torch.float64)
-    once = start.step(a_cmd, 0.2, CONTROL)
+    once = start.step(a_cmd, 0.2)
     many = start
     for _ in range(1000):
-        many = many.step(a_cmd, 0.0002, CONTROL)
+        many = many.step(a_cmd, 0.0002)
     for name in "pva":
         torch.testing.assert_close(getattr(once, name), getattr(many, name), rtol=0, atol=1e-10)
     # And the equation itself: the acceleration's rate is what it lacks over the lag.
-    rate = (start.step(a_cmd, 1e-6, CONTROL).a - start.a) / 1e-6
+    rate = (start.step(a_cmd, 1e-6).a - start.a) / 1e-6
     torch.testing.assert_close(rate, (a_cmd - start.a) / start.lag, rtol=1e-4, atol=1e-4)
 
 
@@ -52,10 +68,10 @@ def test_point_mass_turns_its_nose_along_its_motion():
     zero = torch.zeros(1, 3)
     v, lag = torch.tensor([[0.0, 2.0, 0.0]]), torch.ones(1, 1)
     vehicle = PointMass(zero, v, zero, torch.zeros(1), lag)
-    vehicle = vehicle.step(zero, 0.01, CONTROL)
+    vehicle = vehicle.step(zero, 0.01)
     assert float(vehicle.yaw) == pytest.approx(0.01 * CONTROL.max_yaw_rate, rel=1e-3)
     for _ in range(300):
-        vehicle = vehicle.step(zero, 0.01, CONTROL)
+        vehicle = vehicle.step(zero, 0.01)
     assert float(vehicle.yaw) == pytest.approx(np.pi / 2, abs=1e-2)
 
 
@@ -76,26 +92,142 @@ def test_body_rate_vehicle_flies_as_plant_and_controller_do():
 
     vehicle = BodyRate.hovering(torch.tensor([[0.0, 0.0, 2.0]]), torch.zeros(1))
     for _ in range(30):
-        vehicle = vehicle.step(torch.tensor(a_WB, dtype=torch.float32)[None], 1 / 15, CONTROL)
+        vehicle = vehicle.step(torch.tensor(a_WB, dtype=torch.float32)[None], 1 / 15)
     np.testing.assert_allclose(vehicle.p[0], expected[:3], atol=0.05)
     np.testing.assert_allclose(vehicle.v[0], expected[3:6], atol=0.05)
     R_WB = pose_from_state(vehicle.state[0].double().numpy()).rotation().matrix()
     np.testing.assert_allclose(rotation_matrices(vehicle.state[:, 6:10])[0], R_WB, atol=1e-5)
 
 
-def test_gradients_flow_through_the_body_rate_vehicle():
+PERIOD = 1.0 / 15.0  # [s]
+SELECTION = WorldSelection(kinds=["P02"], count=1, voxel_size=0.5)
+TWO_STEPS = ObservationNoise(latency=2 * PERIOD)
 
-    def end(a: torch.Tensor) -> torch.Tensor:
-        vehicle = BodyRate.hovering(torch.zeros(1, 3, dtype=torch.float64), torch.zeros(1))
-        vehicle = vehicle._replace(state=vehicle.state.double())
-        for _ in range(6):
-            vehicle = vehicle.step(a, 0.04, CONTROL)
-        return vehicle.p[0, 0]
 
-    a = torch.tensor([[1.0, 0.5, 0.3]], dtype=torch.float64, requires_grad=True)
-    end(a).backward()
-    step = torch.tensor([[1e-5, 0.0, 0.0]], dtype=torch.float64)
-    with torch.no_grad():
-        difference = (end(a + step) - end(a - step)) / 2e-5
-    assert a.grad is not None
-    assert float(a.grad[0, 0]) == pytest.approx(float(difference), rel=1e-4)
+class Wandering(LeafSystem):
+    def __init__(self, states: np.ndarray) -> None:
+        super().__init__()
+        self._states = states
+        self.DeclareVectorOutputPort("state", 13, self._calc)
+
+    def _calc(self, context, output) -> None:
+        output.set_value(self._states[round(context.get_time() / PERIOD)])
+
+
+STREAM = ObservationNoise(latency=0.05, frame_rate=[10.0, 30.0], jitter=0.04, frame_dropout=0.2)
+
+
+@pytest.mark.parametrize(
+    "noise", [*(ObservationNoise(latency=x) for x in (0.0, 0.05, PERIOD, 3 * PERIOD, 0.18)), STREAM]
+)
+def test_past_is_what_delayed_pose_gives(noise):
+    times = FrameTimes.draw(noise, seed=3)
+    states = np.cumsum(np.random.default_rng(0).normal(scale=0.1, size=(8, 13)), axis=0)
+    states[:, 6] += 1.0
+    builder = DiagramBuilder()
+    source = builder.AddSystem(Wandering(states))
+    system = builder.AddSystem(DelayedPose(times, PERIOD))
+    builder.Connect(source.get_output_port(), system.GetInputPort("state"))
+    simulator = Simulator(builder.Build())
+    context = system.GetMyContextFromRoot(simulator.get_mutable_context())
+
+    vehicles = [BodyRate(torch.tensor(state)[None], torch.zeros(1, 3)) for state in states]
+    history = begin(vehicles[0], noise, times)
+    for step, vehicle in enumerate(vehicles):
+        simulator.AdvanceTo(step * PERIOD)
+        X_WB = system.GetOutputPort("pose").Eval(context)
+        history = history.push(vehicle)
+        now = torch.tensor([step * PERIOD], dtype=torch.float64)
+        then = history.seen(noise, 1.0 / PERIOD, now)
+        np.testing.assert_allclose(then.p[0], X_WB.translation(), atol=1e-9)
+        np.testing.assert_allclose(then.attitude()[0], X_WB.rotation().matrix(), atol=1e-9)
+
+
+def begin(vehicle: BodyRate, noise: ObservationNoise, times: FrameTimes) -> History:
+    """The history of a vehicle whose images have these times."""
+    numbers = times.delays, times.rate or 0.0, times.phase
+    tensors = (torch.tensor(np.array(x), dtype=torch.float64)[None] for x in numbers)
+    history = History.start(vehicle, noise, 1.0 / PERIOD, torch.Generator())
+    return History(history.past, *tensors)
+
+
+def test_frames_have_their_ranges():
+    hovering = BodyRate.hovering(torch.zeros(2000, 3), torch.zeros(2000))
+    history = History.start(hovering, STREAM, 15.0, torch.Generator().manual_seed(0))
+    rate, delays = history.frame_rate, history.delays
+    assert rate.min() >= 10.0 and rate.max() <= 30.0
+    assert float(rate.mean()) == pytest.approx(20.0, abs=0.5)
+    came = delays.isfinite()
+    assert float((~came).float().mean()) == pytest.approx(0.2, abs=0.005)
+    assert delays.min() >= 0.05 and delays[came].max() <= 0.0901
+    assert float(delays[came].mean()) == pytest.approx(0.07, abs=0.001)
+    ages = torch.stack([history.ages(STREAM, torch.full((2000,), t / 7)) for t in range(99)])
+    assert ages.min() >= 0.05
+    assert (ages.max() * 15).ceil() < history.past.state.shape[1]
+
+
+class Watcher:
+    rate = 1.0 / PERIOD
+    rays = PixelRays.of(16, 9, 90.0)
+
+    def __init__(self) -> None:
+        self.seen = []
+
+    def initial_memory(self, count):
+        return torch.zeros(count, 0)
+
+    def decide(self, seen, memory):
+        self.seen.append(seen)
+        return 2.0 * seen.vehicle.attitude()[:, :, 0], None, memory
+
+    def losses(self, transitions):
+        return {"none": transitions.a.sum()}
+
+
+def test_rollouts_see_late_images_and_know_their_state():
+    worlds, watcher = training_worlds(SELECTION, seed=0), Watcher()
+    config = RolloutConfig(environments=6, steps=3, noise=TWO_STEPS)
+    rollout = DifferentiableRollout(watcher, worlds, config, torch.Generator().manual_seed(0))
+    rollout.episodes = rollout.episodes._replace(age=torch.zeros(6))
+    rollout.losses()
+    rollout.episodes = rollout.episodes._replace(age=torch.tensor([99.0, 0, 0, 0, 0, 0]))
+    rollout.losses()
+    geometry, world = worlds.geometry, rollout.episodes.world
+    seen = [map_tensors(torch.Tensor.detach, step.vehicle) for step in watcher.seen]
+    went_on = (seen[3].p - seen[2].p).norm(dim=1) < 1.0
+    assert not went_on[0] and went_on.sum() >= 3
+    for now, then in enumerate([0, 0, 0, 1, 2, 3]):
+        rows = went_on if now > 2 else slice(None)
+        expected = render_depth(seen[then], geometry, watcher.rays, world)
+        torch.testing.assert_close(watcher.seen[now].depth[rows], expected[rows], rtol=0, atol=0)
+    fresh = render_depth(seen[3], geometry, watcher.rays, world)
+    for now in (3, 4, 5):
+        torch.testing.assert_close(watcher.seen[now].depth[0], fresh[0], rtol=0, atol=0)
+
+
+def test_measured_flights_see_late_images():
+    worlds, watcher = training_worlds(SELECTION, seed=0), Watcher()
+    evaluate_agent(watcher, worlds, FlightConditions(speeds=[2.0], patience=0.05), TWO_STEPS)
+    assert len(watcher.seen) > 4
+    world = torch.arange(len(worlds))
+    for now, then in enumerate([0, 0, 0, 1, 2]):
+        of = watcher.seen[then].vehicle
+        expected = render_depth(of, worlds.geometry, watcher.rays, world)
+        torch.testing.assert_close(watcher.seen[now].depth, expected, rtol=0, atol=0)
+
+
+def test_imitation_learns_from_late_images():
+    config = AgileAutonomyTraining(
+        worlds=SELECTION, environments=1, steps=6, ask_every=1, noise=TWO_STEPS
+    )
+    config.worlds.held_out = 1
+    trainer = AgileAutonomyTrainer(config)
+    trainer.begin_update(0)
+    data = trainer.state_dict()["data"]
+    geometry = training_worlds(config.worlds, 0).geometry
+    x, y, z = data["R_WB"].unbind(2)
+    p_WC, R_WC = data["p_WB"] + CAMERA_AHEAD * x, torch.stack([-y, -z, x], 2)
+    spec = trainer.spec
+    rays = PixelRays.of(spec.image_width, spec.image_height, FOV_X)
+    depth = geometry.depth(p_WC, R_WC, rays, torch.zeros(6).long())[[0, 0, 0, 1, 2, 3]]
+    torch.testing.assert_close(data["depth"], depth.half(), rtol=2e-3, atol=0)
