@@ -64,14 +64,8 @@ def row_bands(
 ) -> list[tuple[int, int]]:
     """Divides an image of a rolling shutter into bands of rows that render from one pose.
 
-    Args:
-        X_WC0, X_WC1: poses of the camera at the first and the last row.
-        focal: [px]
-        height: [px]
-        min_count: minimum number of bands.
-
-    Returns:
-        The first row of each band, and the row after its last.
+    Returns the first row of each of at least `min_count` bands, and the row after its last; the
+    camera has the poses X_WC0 and X_WC1 at the first and the last row.
     """
     angle = (X_WC0.rotation().inverse() @ X_WC1.rotation()).ToAngleAxis().angle()
     distance = np.linalg.norm(X_WC1.translation() - X_WC0.translation())
@@ -139,20 +133,13 @@ class SplatCamera(LeafSystem):
         distortion: Distortion | None = None,
         readout: float = 0.0,
     ):
-        """Bakes the scene unless it is baked.
+        """Bakes the scene unless it is baked; see `BakedScene.render`.
 
         Args:
-            scene: a `BakedScene` is held by reference, and many cameras may share it; a
-                `GaussianScene` is baked for this camera.
-            camera_info: intrinsics, width and height.
             X_BC: pose of the camera in the body that carries it; identity if None.
             min_depth, max_depth: range of the depth image [m].
-            near, far: Gaussians with a center outside these planes are not drawn [m].
-            background: color in [0, 1] or environment behind everything.
-            moving: Gaussians that move among the scene's.
             latency: age of the images [s], by which moving Gaussians are late; the pose at the
                 input port must be as old.
-            distortion: lens; a pinhole if None. Pixels without a ray have no surface.
             readout: time between reading the first row and the last [s]; 0 reads all at once.
         """
         super().__init__()

@@ -17,7 +17,7 @@ import torch
 from pydrake.math import RigidTransform
 from torch import Tensor
 
-from splatpilot.diagrams.worlds.feasibility import draw_start_and_goal
+from splatpilot.diagrams.worlds.feasibility import choose_start_and_goal
 from splatpilot.diagrams.worlds.world_registry import (
     WorldConfig,
     make_spec,
@@ -332,8 +332,8 @@ def _make_worlds(
             worlds.append(make_training_world(turn, seed, cache))
             continue
         esdf, conservative = scenes[turn]
-        p_WS, p_WG, _ = draw_start_and_goal(
-            esdf, VEHICLE_RADIUS, seed, SCENE_MARGIN, MAX_SCENE_PATH
+        p_WS, p_WG, _ = choose_start_and_goal(
+            esdf, VEHICLE_RADIUS, SCENE_MARGIN, MAX_SCENE_PATH, seed=seed
         )
         worlds.append(TrainingWorld(conservative, esdf.lower_W, esdf.upper_W, p_WS, p_WG))
     return worlds

@@ -224,15 +224,3 @@ def test_samples_of_trajectories_meet_the_balls_of_their_times():
     for s, time in enumerate(times):
         expected = SPHERES.among(field, time).distance(p_WQ[:, s])
         np.testing.assert_array_equal(along[:, s], expected)
-
-
-def test_balls_without_a_path_are_refused():
-    path = np.zeros((1, 3))
-    for radii, paths, period, match in (
-        ([1.0, 1.0], [path], 0.1, "paths must be 2"),
-        ([1.0], [path[:0]], 0.1, "at least one row"),
-        ([0.0], [path], 0.1, "radii must be > 0"),
-        ([1.0], [path], 0.0, "period must be > 0"),
-    ):
-        with pytest.raises(ValueError, match=match):
-            MovingSpheres(radii, paths, period)
