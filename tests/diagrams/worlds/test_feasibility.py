@@ -33,16 +33,6 @@ ALONG_X = ((0.2, 0.2, 0.2), (5.8, 1.8, 1.8))
 ALONG_Y = ((4.2, 0.2, 0.2), (5.8, 5.8, 1.8))
 
 
-def test_ends_of_a_corridor():
-    esdf = corridors(ALONG_X)
-    p_WS, p_WG, length = choose_start_and_goal(esdf, RADIUS, margin=0.2)
-    ends = sorted([p_WS[0], p_WG[0]])
-    reach = 0.2 + RADIUS + 0.2
-    assert ends[0] == pytest.approx(reach, abs=0.2) and ends[1] == pytest.approx(6 - reach, abs=0.2)
-    assert (esdf.conservative().distance(np.array([p_WS, p_WG])) > RADIUS + 0.2).all()
-    assert length >= np.linalg.norm(p_WS - p_WG) - 1e-9
-
-
 def test_length_is_measured_around_the_corner():
     p_WS, p_WG, length = choose_start_and_goal(corridors(ALONG_X, ALONG_Y), RADIUS, margin=0.1)
     straight = np.linalg.norm(p_WS - p_WG)

@@ -159,9 +159,7 @@ def test_an_empty_union_is_infinitely_far():
     ("make", "message"),
     [
         (lambda: Sphere(np.zeros(3), 0.0), "Sphere.radius must be .* got 0.0"),
-        (lambda: Capsule(A, B, -1.0), "Capsule.radius must be .* got -1.0"),
         (lambda: Cylinder(A, A, 1.0), "Cylinder.p_WB must be apart"),
-        (lambda: Cylinder(A, B, np.nan), "Cylinder.radius must be .* got nan"),
         (lambda: Box(X_WO, np.array([1.0, 0.0, 1.0])), "Box.size must be > 0"),
         (lambda: HalfSpace(np.zeros(3), 1.0), "normal must be a direction"),
         (lambda: Sphere(np.array([0.0, np.nan, 0.0]), 1.0), "Sphere.p_WO must be"),
