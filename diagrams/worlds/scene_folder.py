@@ -191,11 +191,8 @@ def write_scene_folder(
 ) -> SceneMetadata:
     """Writes `world` as a scene folder atomically, replacing a scene there; returns its metadata.
 
-    Args:
-        path: of the folder, see `check_scene_target`.
-        world: with `esdf` as its distance field.
-        frontier: see `close_frontier`; not part of the world's Gaussians.
-        fields: further ones of `SceneMetadata`; numpy arrays become lists.
+    `esdf` is its distance field, the frontier is that of `close_frontier`, and `fields` are further
+    ones of `SceneMetadata`; numpy arrays become lists.
     """
     path = Path(path).absolute()
     check_scene_target(path)

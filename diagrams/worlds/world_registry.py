@@ -49,10 +49,8 @@ def register_world(
 ) -> None:
     """Registers a world, so that scenarios can name it by its configuration's type.
 
-    Args:
-        config: the type of its configurations, see `WorldConfig`; its name is their YAML tag.
-        make: from a configuration and a seed to a world; by default draws the spec.
-        make_spec: from a configuration and a seed to a spec, to train and render captures in it.
+    `make` and `make_spec` map a configuration and a seed to a world and to a spec, to train and
+    render captures in it; by default `make` draws the spec.
     """
     if make is None and make_spec is None:
         raise ValueError(f"{config.__name__}: give make or make_spec")

@@ -30,9 +30,8 @@ def distance_to_voxels(voxels: np.ndarray, voxel_size: float) -> np.ndarray:
 def occupancy_distances(occupied: np.ndarray, voxel_size: float) -> np.ndarray:
     """Computes signed distances to the faces of occupied voxels, never too large if interpolated.
 
-    At voxel centers it is the exact distance, less the excess of the trilinear interpolant in the
-    half voxels around: distances to an edge or corner are convex, and a chord is above them.
-    Negative in occupied voxels, [m].
+    At voxel centers it is the exact distance [m], less the excess of the trilinear interpolant in
+    the half voxels around: distances to an edge or corner are convex. Negative in occupied voxels.
     """
     if not occupied.any() or occupied.all():
         far = np.float32(_diagonal(occupied.shape, voxel_size))

@@ -113,10 +113,8 @@ def esdf_from_gaussians(
 
     The density is sum_i o_i exp(-m_i^2 / 2) with m_i the Mahalanobis distance to Gaussian i, whose
     variances are enlarged by (voxel_size / 2)^2 so that thin sheets do not fall between voxels.
-    Sheets are then trimmed to 0.6 voxel on both sides of their middle: a thin opaque one is seen
-    half a voxel too near, the safe side. Space in a hollow shell of Gaussians counts as free.
-
-    The field fills the box [lower_W, upper_W], (3,) [m].
+    Sheets are then trimmed to 0.6 voxel on both sides of their middle, half a voxel on the safe
+    side. The field fills the box [lower_W, upper_W], (3,) [m].
     """
     shape = grid_shape(lower_W, upper_W, voxel_size)
     density = density_on_grid(scene, np.asarray(lower_W, dtype=float), shape, voxel_size)

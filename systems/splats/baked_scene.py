@@ -117,10 +117,9 @@ def _native_gaussians(gaussians: "GaussianScene | PlacedGaussians") -> _native.G
 class BakedScene:
     """A Gaussian scene prepared for fast repeated rendering.
 
-    Baking sorts the Gaussians in Morton order, factors their covariances and bounds groups of them
-    with boxes, by which each frame culls. Images agree with `rasterize` up to rounding, except that
-    Gaussians of exactly equal depth blend in Morton order. Rendering is deterministic for any
-    number of threads. Several Python threads may call `render` at once; they take turns.
+    Images agree with `rasterize` up to rounding, except that Gaussians of exactly equal depth blend
+    in Morton order. Rendering is deterministic for any number of threads. Several Python threads
+    may call `render` at once; they take turns.
     """
 
     def __init__(self, scene: GaussianScene, threads: int = 1, simd: str = ""):

@@ -94,11 +94,7 @@ class SplatCamera(LeafSystem):
 
     `body_pose` is the pose X_WB of the body that carries the camera; the camera has the pose X_WC =
     X_WB X_BC with x right, y down and z forward for all images. With a `readout`, a rolling
-    shutter, that is the pose at the last row, and `start_pose` X_WB at the first. Rows between
-    which an image hardly moves render together, from the pose at the middle of their readout.
-
-    Images render when a port is evaluated, and again if the pose has changed, or the time if
-    Gaussians move. Depth alone renders faster and is bitwise identical.
+    shutter, that is the pose at the last row, and `start_pose` X_WB at the first.
 
     Depth is planar z of the surface, the median depth of `rasterize`, in meters
     (`depth_image_32f`) or millimeters (`depth_image_16u`). As in Drake, nearer than `min_depth`
