@@ -120,8 +120,7 @@ def recolored_background(background: Background, look: Appearance) -> Background
 
     if isinstance(background, EnvironmentMap):
         return EnvironmentMap(recolor(background.texels))
-    red, green, blue = recolor(np.asarray(background, np.float32)).tolist()
-    return red, green, blue
+    return tuple(recolor(np.asarray(background, np.float32)).tolist())
 
 
 def _paint(colors: Array, look: Appearance) -> Array:

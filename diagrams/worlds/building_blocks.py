@@ -1,7 +1,7 @@
 """Building blocks of procedural worlds: volumes, boxes, halls, signs, daylight, lamps."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -167,9 +167,9 @@ def volume_spec(
     surroundings: Callable[[], list[GaussianScene]] = list,
 ) -> WorldSpec:
     """Returns the specification of a world that fills the volume of `config`."""
-    plan = config.plan
-    spec = WorldSpec(name, plan.lower, plan.upper, solids, *ends, light, seed, config.voxel_size)
-    return replace(spec, surroundings=surroundings)
+    box = config.plan.lower, config.plan.upper
+    options = {"voxel_size": config.voxel_size, "surroundings": surroundings}
+    return WorldSpec(name, *box, solids, *ends, light, seed, **options)
 
 
 _TRIES = 24  # candidates around each point
@@ -180,8 +180,7 @@ def poisson_disk(
 ) -> NDArray[np.float64]:
     """Fills the rectangle [lower, upper], (2,) [m], with points (N, 2) at least `spacing` apart.
 
-    Bridson's algorithm (2007): draws points from rings of 1 to 2 spacings about old ones and keeps
-    those that are not too close, by a grid of cells that hold at most one point.
+    Bridson's algorithm (2007), with a grid of cells that hold at most one point.
     """
     lower, upper = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
     cell = spacing / np.sqrt(2)

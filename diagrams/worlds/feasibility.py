@@ -1,6 +1,7 @@
 """Checks by grid search that a path from start to goal exists; chooses starts and goals."""
 
 import functools
+import logging
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
@@ -19,21 +20,10 @@ from splatpilot.systems.common.seeds import check_seed
 from splatpilot.systems.common.validation import Config
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
+_log = logging.getLogger(__name__)
+
 CLEARANCE = 0.8  # [m], minimum distance of start and goal from obstacles and bounds
 TRIES = 60  # Maximum number of draws of an instance
-
-
-def draw_feasible(draw: Callable[[np.random.Generator], WorldSpec], seed: int) -> WorldSpec:
-    """Draws instances of a world from `seed` until one is feasible, up to `TRIES`."""
-    check_seed(seed)
-    for attempt in range(TRIES):
-        spec = draw(np.random.default_rng([seed, attempt]))
-        if is_feasible(spec):
-            return spec
-    raise InfeasibleFlightError(
-        f"none of {TRIES} instances of the world drawn from seed {seed} leaves a vehicle of radius "
-        f"{VEHICLE_RADIUS} m a route from start to goal; use fewer or smaller obstacles"
-    )
 
 
 def until_feasible[C: Config](
@@ -44,7 +34,15 @@ def until_feasible[C: Config](
     @functools.wraps(draw)
     def make(config: C, seed: int) -> WorldSpec:
         config.validate()
-        return draw_feasible(lambda rng: draw(config, seed, rng), seed)
+        check_seed(seed)
+        for attempt in range(TRIES):
+            spec = draw(config, seed, np.random.default_rng([seed, attempt]))
+            if is_feasible(spec):
+                return spec
+        raise InfeasibleFlightError(
+            f"none of {TRIES} instances of the world drawn from seed {seed} leaves a vehicle of "
+            f"radius {VEHICLE_RADIUS} m a route from start to goal; use fewer or smaller obstacles"
+        )
 
     return make
 
@@ -116,40 +114,31 @@ class _Part(NamedTuple):
     graph: csr_array  # of all free space
     p_WN: NDArray[np.float64]  # (N, 3) [m], the nodes of the graph
     nodes: NDArray[np.intp]  # of the part
-    end: int  # the node that begins (nearly) the longest of all shortest paths in the part
+    end: int  # of (nearly) the longest of all shortest paths in the part
     length: float  # [m], of that path
 
 
 def choose_start_and_goal(
-    esdf: Esdf, radius: float, margin: float = 0.2, longest: float = 40.0
-) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """Returns p_WS (3,), p_WG (3,) and the length of the shortest path between them, all in [m].
-
-    They are the ends of (nearly) the longest of all shortest paths, `SHORTEST` to `longest` [m], of
-    a sphere of `radius` through known free space, with `margin` [m] to spare or half of that.
-    """
-    part = _longest_part(esdf, radius, margin, longest, SHORTEST)
-    goal, length = _farthest(part.graph, part.end, longest)
-    return part.p_WN[part.end], part.p_WN[goal], length
-
-
-def draw_start_and_goal(
     esdf: Esdf,
     radius: float,
-    seed: int,
     margin: float = 0.2,
     longest: float = 40.0,
     least: float = SHORTEST,
+    seed: int | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
     """Returns p_WS (3,), p_WG (3,) and the length of the shortest path between them, all in [m].
 
-    As `choose_start_and_goal`, but drawn: the start from the part of free space with the longest
-    path, the goal from the nodes whose shortest path is at least 60 % of that, up to `longest` [m],
-    and at least `least` [m]. After `_DRAWS` starts without such a goal, the start is an end of the
-    longest path.
+    They are the ends of (nearly) the longest of all shortest paths, `least` to `longest` [m], of a
+    sphere of `radius` through known free space, with `margin` [m] to spare or half of that. Given a
+    seed, they are drawn: the start from the same part of free space, the goal from the nodes whose
+    shortest path is at least 60 % of that. After `_DRAWS` starts without such a goal, the start is
+    an end of the longest path.
     """
-    rng = np.random.default_rng(seed)
     part = _longest_part(esdf, radius, margin, longest, least)
+    if seed is None:
+        goal, length = _farthest(part.graph, part.end, longest)
+        return part.p_WN[part.end], part.p_WN[goal], length
+    rng = np.random.default_rng(seed)
     for attempt in range(_DRAWS + 1):
         start = int(rng.choice(part.nodes)) if attempt < _DRAWS else part.end
         lengths = dijkstra(part.graph, directed=False, indices=start, limit=longest)
@@ -171,11 +160,20 @@ def short_route_warning(length: float) -> str:
     )
 
 
+def choose_ends(
+    esdf: Esdf, source: object, least: float = SHORTEST, seed: int | None = None
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Chooses p_WS and p_WG, or draws them; warns if the longest route of the `source` is short."""
+    p_WS, p_WG, length = choose_start_and_goal(esdf, VEHICLE_RADIUS, least=least, seed=seed)
+    if seed is None and (warning := short_route_warning(length)):
+        _log.warning("%s: %s", source, warning)
+    return p_WS, p_WG
+
+
 def _longest_part(esdf: Esdf, radius: float, margin: float, longest: float, least: float) -> _Part:
     """Returns the connected part of the free space with the longest path, up to `longest` [m].
 
-    It keeps `margin` [m] if that path is `LONG_ENOUGH`, otherwise half of it if that makes the path
-    `_GAIN` times as long.
+    Half of the margin is preferred for a path `_GAIN` times as long if one is not `LONG_ENOUGH`.
     """
     best, reach = None, 0.0
     for graph, p_WN, spacing in _free_graphs(esdf, radius, margin):

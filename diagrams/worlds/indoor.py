@@ -8,22 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RotationMatrix
 
-from splatpilot.diagrams.worlds.building_blocks import (
-    PASSAGE,
-    VolumeConfig,
-    box,
-    ground,
-    hall,
-    has_clearance,
-    lamplight,
-    require_order,
-    roof,
-    rotated_box,
-    signs_in,
-    signs_on,
-    start_and_goal,
-    volume_spec,
-)
+from splatpilot.diagrams.worlds import building_blocks as blocks
 from splatpilot.diagrams.worlds.feasibility import CLEARANCE, until_feasible
 from splatpilot.diagrams.worlds.solids.solid import Solid, WorldSpec
 from splatpilot.systems.collision.shapes import Capsule, Cylinder, Sphere
@@ -47,7 +32,7 @@ def furnish(
             p = rng.uniform(lower, upper)
             angle = rng.choice(4) * np.pi / 2 + rng.normal(0, 0.12)
             item = make(p, angle, height, int(rng.integers(1000)), rng)
-            if all(has_clearance(solid.shape, free, CLEARANCE) for solid in item):
+            if all(blocks.has_clearance(solid.shape, free, CLEARANCE) for solid in item):
                 furniture += item
                 break
     return furniture
@@ -58,7 +43,7 @@ def _parts(p: NDArray, angle: float, parts: list[tuple], seed: int) -> list[Soli
     R = RotationMatrix.MakeZRotation(angle)
     at = np.array([*p, 0.0])
     return [
-        rotated_box(at + R.multiply(np.array(center, float)), R, size, material, seed)
+        blocks.rotated_box(at + R.multiply(np.array(center, float)), R, size, material, seed)
         for center, size, material in parts
     ]
 
@@ -140,7 +125,7 @@ FURNITURE: tuple[Item, ...] = (_shelf, _cabinet, _table, _sofa, _crates, _column
 
 
 @dataclass
-class RoomConfig(VolumeConfig):
+class RoomConfig(blocks.VolumeConfig):
     """A room with furniture."""
 
     length: float = bounded(12.0, "[6, 200] m")  # [m] along x: from 0 to length
@@ -154,14 +139,14 @@ class RoomConfig(VolumeConfig):
 def room_spec(config: RoomConfig, seed: int, rng: np.random.Generator) -> WorldSpec:
     """Furnishes the room of `config`."""
     plan = config.plan
-    ends = start_and_goal(plan, rng, (1.0, min(1.9, config.height - 0.9)))
+    ends = blocks.start_and_goal(plan, rng, (1.0, min(1.9, config.height - 0.9)))
     inner = plan.lower[:2] + 0.7, plan.upper[:2] - 0.7
     furniture = furnish(config.items, *inner, config.height, list(ends), rng)
-    sides = hall(plan, ["plaster", "plaster", "wood", "brick"], rng)
-    signs = signs_in(sides, 2, 2, rng)
-    floor = ground(("tiles", "wood", "concrete")[rng.integers(3)], int(rng.integers(10)))
-    solids = [floor, roof(plan), *sides, *signs, *furniture]
-    return volume_spec("room", config, seed, solids, ends, lamplight(plan, rng))
+    sides = blocks.hall(plan, ["plaster", "plaster", "wood", "brick"], rng)
+    signs = blocks.signs_in(sides, 2, 2, rng)
+    floor = blocks.ground(("tiles", "wood", "concrete")[rng.integers(3)], int(rng.integers(10)))
+    solids = [floor, blocks.roof(plan), *sides, *signs, *furniture]
+    return blocks.volume_spec("room", config, seed, solids, ends, blocks.lamplight(plan, rng))
 
 
 PARTITION = 0.15  # [m], thickness of the walls between rooms
@@ -169,7 +154,7 @@ JAMB = 0.25  # [m], minimum length of wall between a door and a corner
 
 
 @dataclass
-class OfficeConfig(VolumeConfig):
+class OfficeConfig(blocks.VolumeConfig):
     """A floor divided into rooms, with start and goal in rooms at opposite ends.
 
     Walls divide it until no side is twice `room`. Every wall has one or two doors, so all rooms are
@@ -180,18 +165,18 @@ class OfficeConfig(VolumeConfig):
     width: float = bounded(14.0, "[4, 200] m")  # [m] along y, centered on 0
     height: float = bounded(3.0, "[2.4, 100] m")  # [m] along z
     room: float = bounded(3.2, "(0, 200] m")  # [m] minimum side of a room
-    door_min: float = bounded(1.0, f"[{PASSAGE:.3f}, 100] m")  # [m] minimum width of doors
+    door_min: float = bounded(1.0, f"[{blocks.PASSAGE:.3f}, 100] m")  # [m] minimum width of doors
     door_max: float = bounded(1.6, "(0, 100] m")  # [m] maximum width of doors
     # [m] Height of every other door; the rest reach the ceiling.
-    door_height: float = bounded(2.1, f"[{PASSAGE:.3f}, 200] m")
+    door_height: float = bounded(2.1, f"[{blocks.PASSAGE:.3f}, 200] m")
     second_doors: float = bounded(0.3, "[0, 1]")  # [-] fraction of the walls that have two
     items: int = bounded(20, "[0, 1000]")  # [-] pieces of furniture
     voxel_size: float = bounded(0.1, "(0, 200] m")  # [m] of the distance grid
 
     def check(self) -> None:
         super().check()
-        require_order(self, "door_min", "door_max")
-        require_order(self, "door_height", "height")
+        blocks.require_order(self, "door_min", "door_max")
+        blocks.require_order(self, "door_height", "height")
         # For a door, a start or a goal.
         low = max(self.door_max + 2 * JAMB, 2 * CLEARANCE + PARTITION)
         high = min(self.length, self.width)
@@ -248,18 +233,20 @@ def office_spec(config: OfficeConfig, seed: int, rng: np.random.Generator) -> Wo
     furniture: list[Solid] = []
     for room, items in zip(rooms, counts, strict=True):
         furniture += furnish(int(items), *room.inside(0.9), config.height, free, rng)
-    sides = hall(plan, ["plaster", "plaster", "concrete"], rng)
-    signs = signs_in(sides, 3, 2, rng)
+    sides = blocks.hall(plan, ["plaster", "plaster", "concrete"], rng)
+    signs = blocks.signs_in(sides, 3, 2, rng)
     walls: list[Solid] = []
     for partition in partitions:
         pieces = _build(partition, config.height, rng)
         walls += pieces
         for piece in pieces:
             for face in (2 * partition.axis, 2 * partition.axis + 1):
-                signs += signs_on(piece, face, int(rng.integers(2)), rng)
-    floor = ground(("tiles", "wood", "concrete")[rng.integers(3)], int(rng.integers(10)))
-    solids = [floor, roof(plan), *sides, *walls, *signs, *furniture]
-    return volume_spec("office", config, seed, solids, (p_WS, p_WG), lamplight(plan, rng))
+                signs += blocks.signs_on(piece, face, int(rng.integers(2)), rng)
+    floor = blocks.ground(("tiles", "wood", "concrete")[rng.integers(3)], int(rng.integers(10)))
+    solids = [floor, blocks.roof(plan), *sides, *walls, *signs, *furniture]
+    return blocks.volume_spec(
+        "office", config, seed, solids, (p_WS, p_WG), blocks.lamplight(plan, rng)
+    )
 
 
 def _divide(
@@ -324,6 +311,6 @@ def _build(wall: _Partition, height: float, rng: np.random.Generator) -> list[So
     tops = zip(doors, wall.doors, strict=True)
     pieces += [(*edges, door.height) for edges, door in tops if door.height < height]
     return [
-        box(wall.point(-half, a, bottom), wall.point(half, b, height), material, seed)
+        blocks.box(wall.point(-half, a, bottom), wall.point(half, b, height), material, seed)
         for a, b, bottom in pieces
     ]

@@ -8,7 +8,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from scipy.ndimage import label
 
 from splatpilot.diagrams.worlds.building_blocks import TIGHT_CLEARING, has_clearance, require_order
-from splatpilot.diagrams.worlds.feasibility import TRIES, draw_start_and_goal
+from splatpilot.diagrams.worlds.feasibility import TRIES, choose_ends
 from splatpilot.diagrams.worlds.scene_folder import SceneSource, read_scene_world
 from splatpilot.diagrams.worlds.solids.shading import Lamplight
 from splatpilot.diagrams.worlds.solids.solid import Solid, WorldSpec, cut_faces
@@ -55,9 +55,7 @@ def inserted_world(config: InsertedConfig, seed: int) -> World:
         rng = np.random.default_rng([seed, attempt])
         if config.draw_ends and attempt % 10 == 9:
             again = int(rng.integers(2**31))
-            p_WS, p_WG, _ = draw_start_and_goal(
-                scene.esdf, VEHICLE_RADIUS, again, least=config.least_way
-            )
+            p_WS, p_WG = choose_ends(scene.esdf, config.path, config.least_way, again)
             scene = replace(scene, p_WS=p_WS, p_WG=p_WG)
         solids = _draw_solids(config, scene, rng)
         if len(solids) < config.least:

@@ -8,19 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, gaussian_filter, map_coordinates
 
-from splatpilot.diagrams.worlds.feasibility import (
-    choose_start_and_goal,
-    draw_start_and_goal,
-    short_route_warning,
-)
+from splatpilot.diagrams.worlds.feasibility import choose_ends
 from splatpilot.diagrams.worlds.scene_folder import SceneSource, find_scene
+from splatpilot.diagrams.worlds.solids import surfaces
 from splatpilot.diagrams.worlds.solids.shading import GAMMA, Daylight, develop
-from splatpilot.diagrams.worlds.solids.surfaces import (
-    COVERAGE,
-    Surfels,
-    perpendicular,
-    to_gaussians,
-)
 from splatpilot.diagrams.worlds.solids.textures import fbm, hash_unit, ramp
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.distance_field import FieldState
@@ -29,7 +20,6 @@ from splatpilot.systems.collision.octomap import Octomap, read_octomap
 from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.common.validation import require, require_field
 from splatpilot.systems.splats.scene import GaussianScene
-from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
 OCTOMAP = ".bt"  # Suffix of binary OctoMaps
 _MAX_VOXELS = 2e7  # of a map that is used whole: some 90 bytes each
@@ -71,15 +61,11 @@ def octomap_world(config: OctomapConfig, seed: int) -> World:
             f"{path}: no space from {lower_W} to {upper_W} m is known to be free; choose another "
             "map, or another part of it by world.lower and world.upper"
         )
-    if config.draw_ends:
-        ends = draw_start_and_goal(esdf, VEHICLE_RADIUS, seed, least=config.least_way)
-    else:
-        ends = choose_start_and_goal(esdf, VEHICLE_RADIUS)
-        if warning := short_route_warning(ends[2]):
-            _log.warning("%s: %s", config.path, warning)
+    drawn = {"least": config.least_way, "seed": seed} if config.draw_ends else {}
+    ends = choose_ends(esdf, config.path, **drawn)
     hour = Daylight.sample(np.random.default_rng([seed, 1]))
-    gaussians, (red, green, blue) = voxel_gaussians(esdf, hour), hour.haze.tolist()
-    return World(Path(config.path).stem, gaussians, esdf, esdf, (red, green, blue), *ends[:2])
+    name, haze = Path(config.path).stem, tuple(hour.haze.tolist())
+    return World(name, voxel_gaussians(esdf, hour), esdf, esdf, haze, *ends)
 
 
 def _flown_part(config: OctomapConfig, octomap: Octomap) -> tuple[NDArray, NDArray]:
@@ -115,5 +101,6 @@ def voxel_gaussians(esdf: Esdf, hour: Daylight) -> GaussianScene:
     albedo = albedo * (0.75 + 0.5 * hash_unit(index, seed=302))[:, None]
     colors = develop(albedo**GAMMA * hour.irradiance(n, np.full(len(p), 0.7)))
     # Voxels of a slanted surface are up to sqrt 3 apart: 1.3 times the closed layer's size.
-    extent = np.full((len(p), 2), 1.3 * COVERAGE * esdf.voxel_size)
-    return to_gaussians(Surfels(p, n, perpendicular(n), extent), colors, 0.99)
+    extent = np.full((len(p), 2), 1.3 * surfaces.COVERAGE * esdf.voxel_size)
+    surfels = surfaces.Surfels(p, n, surfaces.perpendicular(n), extent)
+    return surfaces.to_gaussians(surfels, colors, 0.99)

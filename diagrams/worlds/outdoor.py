@@ -7,27 +7,7 @@ from numpy.typing import NDArray
 from pydrake.math import RollPitchYaw, RotationMatrix
 from scipy.spatial.transform import Rotation
 
-from splatpilot.diagrams.worlds.building_blocks import (
-    CLEARING,
-    INSET,
-    PASSAGE,
-    TIGHT_CLEARING,
-    WALL,
-    VolumeConfig,
-    box,
-    daylight,
-    ground,
-    hall,
-    has_clearance,
-    lamplight,
-    require_order,
-    roof,
-    rotated_box,
-    signs_in,
-    signs_on,
-    start_and_goal,
-    volume_spec,
-)
+from splatpilot.diagrams.worlds import building_blocks as blocks
 from splatpilot.diagrams.worlds.feasibility import TRIES, is_feasible, until_feasible
 from splatpilot.diagrams.worlds.forest.forest import Forest, trees_around
 from splatpilot.diagrams.worlds.forest.layout import BARK, TrunksConfig
@@ -43,7 +23,7 @@ _BOXES = ["crate", "wood", "metal", "hazard", "brick", "concrete", "signage", "f
 
 
 @dataclass
-class ClutterConfig(VolumeConfig):
+class ClutterConfig(blocks.VolumeConfig):
     """An open field with spheres and boxes: pillars, or floating boxes in any attitude."""
 
     length: float = bounded(36.0, "[6, 200] m")  # [m] along x: from 0 to length
@@ -62,27 +42,27 @@ class ClutterConfig(VolumeConfig):
 
     def check(self) -> None:
         super().check()
-        require_order(self, "sphere_min", "sphere_max")
-        require_order(self, "half_min", "half_max")
+        blocks.require_order(self, "sphere_min", "sphere_max")
+        blocks.require_order(self, "half_min", "half_max")
 
 
 @until_feasible
 def clutter_spec(config: ClutterConfig, seed: int, rng: np.random.Generator) -> WorldSpec:
     """Draws the field of `config`: obstacles may overlap, but not near start and goal."""
     plan = config.plan
-    ends = start_and_goal(plan, rng)
+    ends = blocks.start_and_goal(plan, rng)
     obstacles: list[Solid] = []
     for make, number in ((_sphere, config.spheres), (_box, config.boxes)):
         for _ in range(number):
             for _ in range(50):  # again, if it is too near the start or goal
                 solid = make(config, plan, rng)
-                if has_clearance(solid.shape, list(ends), CLEARING):
+                if blocks.has_clearance(solid.shape, list(ends), blocks.CLEARING):
                     obstacles.append(solid)
                     break
-    hour, light = daylight(rng)
-    solids = [ground(("grass", "paving", "concrete")[rng.integers(3)]), *obstacles]
+    hour, light = blocks.daylight(rng)
+    solids = [blocks.ground(("grass", "paving", "concrete")[rng.integers(3)]), *obstacles]
     trees = trees_around(plan, hour, seed)
-    return volume_spec("clutter", config, seed, solids, ends, light, trees)
+    return blocks.volume_spec("clutter", config, seed, solids, ends, light, trees)
 
 
 def _sphere(config: ClutterConfig, plan: FloorPlan, rng: np.random.Generator) -> Solid:
@@ -106,7 +86,7 @@ def _box(config: ClutterConfig, plan: FloorPlan, rng: np.random.Generator) -> So
         half[2] = top / 2 + 0.3
         p[2] = top / 2 - 0.3
     material = _BOXES[rng.integers(len(_BOXES))]
-    return rotated_box(p, R, 2 * half, material, int(rng.integers(1000)))
+    return blocks.rotated_box(p, R, 2 * half, material, int(rng.integers(1000)))
 
 
 @dataclass
@@ -124,7 +104,7 @@ class BranchesConfig(TrunksConfig):
 
     def check(self) -> None:
         super().check()
-        require_order(self, "thickness_min", "thickness_max")
+        blocks.require_order(self, "thickness_min", "thickness_max")
 
 
 def branches_spec(config: BranchesConfig, seed: int) -> WorldSpec:
@@ -164,7 +144,11 @@ def _limbs_and_wires(
         ends[:, [0, 2]] += rng.uniform(-0.8, 0.8, (2, 2))
         radius = rng.uniform(config.thickness_min, config.thickness_max) / 2
         thin.append(Solid(Capsule(ends[0], ends[1], float(radius)), "cable", k))
-    return [s for s in thin if has_clearance(s.shape, [forest.p_WS, forest.p_WG], TIGHT_CLEARING)]
+    return [
+        s
+        for s in thin
+        if blocks.has_clearance(s.shape, [forest.p_WS, forest.p_WG], blocks.TIGHT_CLEARING)
+    ]
 
 
 PATTERNS = "big_wall", "u_trap", "slits", "slalom"
@@ -174,7 +158,7 @@ _ACROSS = ["brick", "concrete", "metal", "wood", "foliage"]
 
 
 @dataclass
-class WallsConfig(VolumeConfig):
+class WallsConfig(blocks.VolumeConfig):
     """A roofless hall with walls as high as itself in between."""
 
     # Arrangement of the walls across.
@@ -185,7 +169,7 @@ class WallsConfig(VolumeConfig):
     depth: float = bounded(6.0, "(0, 200] m")  # [m] of the cul-de-sac of u_trap
     walls: int = bounded(4, "[1, 20]")  # [-] walls of slalom, from one side and the other in turn
     # [m] Width of the slit in each wall of slits, from start to goal.
-    slits: list[float] = bounded(lambda: [1.4, 1.25, 1.1, 1.0], f"[{PASSAGE:.3f}, 100] m")
+    slits: list[float] = bounded(lambda: [1.4, 1.25, 1.1, 1.0], f"[{blocks.PASSAGE:.3f}, 100] m")
 
     def check(self) -> None:
         super().check()
@@ -194,10 +178,10 @@ class WallsConfig(VolumeConfig):
             narrow = all(slit <= half for slit in self.slits)
             require_field(self, "slits", narrow, f"at most half the width, {half:g} m")
         else:
-            widest = self.width - PASSAGE
+            widest = self.width - blocks.PASSAGE
             require_field(self, "wall", self.wall <= widest, f"at most {widest:.2f} m, for a gap")
         crossed = {"slits": len(self.slits), "slalom": self.walls}.get(self.pattern, 1)
-        shortest = 2 * INSET + 2.0 * (crossed + 1) + self.depth * (self.pattern == "u_trap")
+        shortest = 2 * blocks.INSET + 2.0 * (crossed + 1) + self.depth * (self.pattern == "u_trap")
         condition = f"at least {shortest:g} m for the walls across"
         require_field(self, "length", self.length >= shortest, condition)
 
@@ -212,23 +196,25 @@ def walls_spec(config: WallsConfig, seed: int, rng: np.random.Generator) -> Worl
     """
     plan = config.plan
     across = {"big_wall": _big_wall, "u_trap": _u_trap, "slits": _slits, "slalom": _slalom}
-    p_WS, p_WG = start_and_goal(plan, rng)
+    p_WS, p_WG = blocks.start_and_goal(plan, rng)
     if config.pattern in ("big_wall", "u_trap"):  # both block the straight line
         p_WS[1], p_WG[1] = 0.3 * p_WS[1], 0.3 * p_WG[1]
     obstacles = across[config.pattern](config, rng)
-    sides = hall(plan, _FACADES, rng)
-    signs = signs_in(sides, 3, 1, rng)
-    signs += [sign for wall in obstacles for sign in signs_on(wall, 0, 1, rng)]
-    hour, light = daylight(rng)
-    floor = ground(("paving", "grass", "concrete")[rng.integers(3)])
+    sides = blocks.hall(plan, _FACADES, rng)
+    signs = blocks.signs_in(sides, 3, 1, rng)
+    signs += [sign for wall in obstacles for sign in blocks.signs_on(wall, 0, 1, rng)]
+    hour, light = blocks.daylight(rng)
+    floor = blocks.ground(("paving", "grass", "concrete")[rng.integers(3)])
     solids = [floor, *sides, *obstacles, *signs]
     trees = trees_around(plan, hour, seed)
-    return volume_spec(config.pattern, config, seed, solids, (p_WS, p_WG), light, trees)
+    return blocks.volume_spec(config.pattern, config, seed, solids, (p_WS, p_WG), light, trees)
 
 
 def _across(config: WallsConfig, x: float, y0: float, y1: float, material: str, seed: int) -> Solid:
     """Builds a wall across the hall, its middle at x, from y0 to y1 [m]."""
-    return box((x - WALL / 2, y0, 0), (x + WALL / 2, y1, config.height), material, seed)
+    return blocks.box(
+        (x - blocks.WALL / 2, y0, 0), (x + blocks.WALL / 2, y1, config.height), material, seed
+    )
 
 
 def _material(rng: np.random.Generator) -> tuple[str, int]:
@@ -249,16 +235,18 @@ def _u_trap(config: WallsConfig, rng: np.random.Generator) -> list[Solid]:
     low, high = y - config.wall / 2, y + config.wall / 2
     paint = _material(rng)
     sides = [
-        box((x - config.depth, a, 0), (x - WALL / 2, a + WALL, config.height), *paint)
-        for a in (low, high - WALL)
+        blocks.box(
+            (x - config.depth, a, 0), (x - blocks.WALL / 2, a + blocks.WALL, config.height), *paint
+        )
+        for a in (low, high - blocks.WALL)
     ]
     return [_across(config, x, low, high, *paint), *sides]
 
 
 def _stations(config: WallsConfig, number: int, rng: np.random.Generator) -> NDArray:
     """Draws positions (number,) [m] along x, about evenly between start and goal."""
-    step = (config.length - 2 * INSET) / (number + 1)
-    return INSET + step * (np.arange(1, number + 1) + rng.uniform(-0.1, 0.1, number))
+    step = (config.length - 2 * blocks.INSET) / (number + 1)
+    return blocks.INSET + step * (np.arange(1, number + 1) + rng.uniform(-0.1, 0.1, number))
 
 
 def _slits(config: WallsConfig, rng: np.random.Generator) -> list[Solid]:
@@ -288,20 +276,20 @@ _MATERIALS = ["brick", "concrete", "hazard", "wood", "metal"]
 
 
 @dataclass
-class OverUnderConfig(VolumeConfig):
+class OverUnderConfig(blocks.VolumeConfig):
     """A roofed hall with barriers from wall to wall."""
 
     barriers: int = bounded(5, "[1, 50]")  # [-] over and under in turn; the first is random
     over: float = bounded(2.8, "(0, 200] m")  # [m] height of barriers on the floor
     # [m] Height of the lower edge of barriers that hang from the roof.
-    under: float = bounded(1.9, f"[{PASSAGE:.3f}, 200] m")
+    under: float = bounded(1.9, f"[{blocks.PASSAGE:.3f}, 200] m")
 
     def check(self) -> None:
         super().check()
-        highest = self.height - PASSAGE
+        highest = self.height - blocks.PASSAGE
         require_field(self, "over", self.over <= highest, f"at most {highest:.2f} m, for a gap")
         require_field(self, "under", self.under < self.height, f"below height, {self.height:g} m")
-        shortest = 2 * INSET + 2.5 * (self.barriers + 1)
+        shortest = 2 * blocks.INSET + 2.5 * (self.barriers + 1)
         condition = f"at least {shortest:g} m for the barriers"
         require_field(self, "length", self.length >= shortest, condition)
 
@@ -310,20 +298,20 @@ class OverUnderConfig(VolumeConfig):
 def over_under_spec(config: OverUnderConfig, seed: int, rng: np.random.Generator) -> WorldSpec:
     """Builds the hall of `config`."""
     plan = config.plan
-    ends = start_and_goal(plan, rng)
+    ends = blocks.start_and_goal(plan, rng)
     half = config.width / 2
     first = int(rng.integers(2))
     barriers = []
-    step = (config.length - 2 * INSET) / (config.barriers + 1)
+    step = (config.length - 2 * blocks.INSET) / (config.barriers + 1)
     for k in range(config.barriers):
-        x = INSET + step * (k + 1 + rng.uniform(-0.08, 0.08))
+        x = blocks.INSET + step * (k + 1 + rng.uniform(-0.08, 0.08))
         low, high = (0.0, config.over) if (k + first) % 2 else (config.under, config.height)
-        corners = (x - WALL / 2, -half, low), (x + WALL / 2, half, high)
+        corners = (x - blocks.WALL / 2, -half, low), (x + blocks.WALL / 2, half, high)
         material = _MATERIALS[rng.integers(len(_MATERIALS))]
-        barriers.append(box(*corners, material, int(rng.integers(1000))))
-    sides = hall(plan, ["plaster", "brick", "concrete", "metal"], rng)
-    signs = [s for wall in barriers for s in signs_on(wall, 0, 2, rng)]
-    signs += signs_in(sides, 3, 0, rng)
-    floor = ground(("tiles", "concrete")[rng.integers(2)], int(rng.integers(10)))
-    solids = [floor, roof(plan), *sides, *barriers, *signs]
-    return volume_spec("over_under", config, seed, solids, ends, lamplight(plan, rng))
+        barriers.append(blocks.box(*corners, material, int(rng.integers(1000))))
+    sides = blocks.hall(plan, ["plaster", "brick", "concrete", "metal"], rng)
+    signs = [s for wall in barriers for s in blocks.signs_on(wall, 0, 2, rng)]
+    signs += blocks.signs_in(sides, 3, 0, rng)
+    floor = blocks.ground(("tiles", "concrete")[rng.integers(2)], int(rng.integers(10)))
+    solids = [floor, blocks.roof(plan), *sides, *barriers, *signs]
+    return blocks.volume_spec("over_under", config, seed, solids, ends, blocks.lamplight(plan, rng))

@@ -6,7 +6,6 @@ closes the scene at unobserved space: cameras of flights see it, metrics of the 
 """
 
 import functools
-import logging
 import os
 import shutil
 from collections.abc import Iterable, Sequence
@@ -19,12 +18,7 @@ from numpy.typing import NDArray
 from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed
 from pydrake.math import RigidTransform
 
-from splatpilot.diagrams.worlds.feasibility import (
-    SHORTEST,
-    choose_start_and_goal,
-    draw_start_and_goal,
-    short_route_warning,
-)
+from splatpilot.diagrams.worlds.feasibility import SHORTEST, choose_ends
 from splatpilot.diagrams.worlds.solids.surfaces import Surfels, to_gaussians
 from splatpilot.diagrams.worlds.splits import check_split
 from splatpilot.diagrams.worlds.world import World
@@ -69,22 +63,19 @@ class SceneMetadata(Config):
     provenance: str = ""
     # "train", "validation" or "test"; empty if unknown.
     split: str = ""
-    # Digest of the images that the scene was fitted to, or of the mesh or generated world that they
-    # were rendered from, see `splits.source_digest`; empty if unknown.
+    # Digest of the images, or of the mesh or world that they show, see `splits.source_digest`.
     source_digest: list[str] = field(default_factory=list)
     world_frame: str = bounded(WORLD_FRAME, f"{{{WORLD_FRAME}}}")
     # True if the unit of length is the meter.
     metric: bool = True
-    # [m], position of the scene's origin in the world of the capture's files, upright and in
-    # meters; all positions of the scene are relative to it.
+    # [m], position of the scene's origin in the world of the capture's files, upright.
     origin: list[float] = bounded(lambda: [0.0] * 3, "(-inf, inf) m")
     lower_W: list[float] = bounded(list, "(-inf, inf) m")  # [m], corners of the distance field
     upper_W: list[float] = bounded(list, "(-inf, inf) m")
     observed_free_volume: float = 0.0  # [m^3]
     # Brightness of each image of the capture relative to the scene, in frame order.
     gains: list[float] = field(default_factory=list)
-    # Logarithm of the brightness of the capture's image corners relative to their centers; it falls
-    # with the square of the distance from the center. The scene is free of it.
+    # Logarithm of the brightness of the capture's image corners relative to their centers.
     vignetting: float = 0.0
     # Color of pixels without Gaussians: red, green, blue.
     background: list[float] = bounded(lambda: [0.0] * 3, "[0, 1]")
@@ -98,16 +89,14 @@ class SceneMetadata(Config):
     representation: str = bounded("3dgs", f"{{{', '.join(REPRESENTATIONS)}}}")
     # Folder of the capture that the scene was made from; empty if unknown.
     capture: str = ""
-    # Settings with which the capture was read, for example "depth_unit=5000.0".
-    capture_settings: list[str] = field(default_factory=list)
-    # Assumptions and unused parts when the capture was read, and the source of intrinsics.
-    capture_notes: list[str] = field(default_factory=list)
+    capture_settings: list[str] = field(default_factory=list)  # such as "depth_unit=5000.0"
+    capture_notes: list[str] = field(default_factory=list)  # assumptions of the reader
     # Frames of the capture that were not used to make the scene.
     held_out: list[int] = bounded(list, "[0, inf)")
     # [px], to which images were scaled down; 0 if they were not.
     image_width: int = bounded(0, "[0, inf) px")
-    # [m], distance from the poses of the capture up to which images of the scene can be trusted, as
-    # measured by `splatpilot scene fidelity`; None before.
+    # [m], distance from the poses of the capture up to which images of the scene can be trusted;
+    # None before `splatpilot scene fidelity`.
     perturbation_bound: float | None = bounded(None, "[0, inf) m")
     # [m], the same for each pose of the capture, in frame order; empty before.
     pose_perturbation_bounds: list[float] = bounded(list, "[0, inf) m")
@@ -125,11 +114,10 @@ def read_scene_metadata(path: str | Path) -> SceneMetadata:
     try:
         with yaml_errors("the text"):
             metadata = yaml_load_typed(schema=SceneMetadata, data=text)
-        version = metadata.format_version
-        old = version < FORMAT_VERSION
-        remedy = "reconstruct the scene again" if old else "use a newer version of the program"
-        valid = version == FORMAT_VERSION
-        require(valid, "format_version", str(FORMAT_VERSION), version, remedy)
+        version, known = metadata.format_version, FORMAT_VERSION
+        remedies = "reconstruct the scene again", "use a newer version of the program"
+        remedy = remedies[version > known]
+        require(version == known, "format_version", str(known), version, remedy)
         metadata.validate()
     except Exception as error:  # Drake's reader raises any type.
         raise ValueError(f"{file}: {error_summary(error)}") from None
@@ -142,7 +130,6 @@ def write_scene_metadata(path: str | Path, metadata: SceneMetadata) -> None:
         yaml_dump_typed(metadata, filename=str(partial))
 
 
-_log = logging.getLogger(__name__)
 _MAX_VOXELS = 2e7
 _MAX_VOXEL = 0.25  # [m], at which a vehicle of 0.354 m radius still finds a route
 
@@ -163,18 +150,16 @@ def read_scene_folder(path: str | Path, *, metric: bool = True) -> World:
                 "scene.yaml, as written by `splatpilot reconstruct`"
             )
     metadata = read_scene_metadata(path)
-    remedy = (
-        f"measure a length in `splatpilot view {path}` and rescale with `splatpilot scene scale`"
-    )
     if metric:
+        remedy = f"measure a length in `splatpilot view {path}`, then use `splatpilot scene scale`"
         require(metadata.metric, f"{path / 'scene.yaml'}: metric", "true to fly", "false", remedy)
     gaussians = read_ply(path / "gaussians.ply")
     if metadata.frontier:
         gaussians = gaussians.merged_with(read_ply(path / FRONTIER))
     esdf = Esdf.load(path / "esdf.npz")
-    stated, found = [*metadata.lower_W, *metadata.upper_W], [*esdf.lower_W, *esdf.upper_W]
-    what = f"{path / 'scene.yaml'}: lower_W and upper_W"
-    condition = f"those of esdf.npz, {np.array(found)}"
+    stated = np.array([metadata.lower_W, metadata.upper_W])
+    found = np.array([esdf.lower_W, esdf.upper_W])
+    what, condition = f"{path / 'scene.yaml'}: lower_W and upper_W", f"those of esdf.npz, {found}"
     valid = np.allclose(stated, found, atol=1e-6)
     require(valid, what, condition, stated, "the files are of different scenes")
     background, ends = read_background(path, metadata), np.array([metadata.p_WS, metadata.p_WG])
@@ -185,8 +170,7 @@ def read_background(path: Path, metadata: SceneMetadata) -> Background:
     """Returns the background of the scene folder `path` with this metadata."""
     if metadata.environment:
         return EnvironmentMap.load(path / ENVIRONMENT)
-    red, green, blue = metadata.background
-    return red, green, blue
+    return tuple(metadata.background)
 
 
 def check_scene_target(path: str | Path) -> None:
@@ -207,11 +191,8 @@ def write_scene_folder(
 ) -> SceneMetadata:
     """Writes `world` as a scene folder atomically, replacing a scene there; returns its metadata.
 
-    Args:
-        path: of the folder, see `check_scene_target`.
-        world: with `esdf` as its distance field.
-        frontier: see `close_frontier`; not part of the world's Gaussians.
-        fields: further ones of `SceneMetadata`; numpy arrays become lists.
+    `esdf` is its distance field, the frontier is that of `close_frontier`, and `fields` are further
+    ones of `SceneMetadata`; numpy arrays become lists.
     """
     path = Path(path).absolute()
     check_scene_target(path)
@@ -253,10 +234,8 @@ def _read_bare_gaussians(path: Path) -> World:
     remedy = "crop far Gaussians away, or rescale with `splatpilot scene scale`"
     require(voxel_size <= _MAX_VOXEL, f"{path}: extent", condition, f"{extent} m", remedy)
     esdf = esdf_from_gaussians(gaussians, voxel_size, lower_W, upper_W)
-    p_WS, p_WG, length = choose_start_and_goal(esdf, VEHICLE_RADIUS)
-    if warning := short_route_warning(length):
-        _log.warning("%s: %s", path, warning)
-    return World(path.stem, gaussians, esdf, esdf, (0.0, 0.0, 0.0), p_WS, p_WG)
+    ends = choose_ends(esdf, path)
+    return World(path.stem, gaussians, esdf, esdf, (0.0, 0.0, 0.0), *ends)
 
 
 @dataclass
@@ -290,9 +269,9 @@ def find_scene(config: SceneSource) -> Path:
 
 def read_scene_world(config: SceneSource, seed: int) -> World:
     """Reads the scene of `config`."""
-    world, least = read_scene(find_scene(config)), config.least_way
+    world = read_scene(find_scene(config))
     if config.draw_ends:
-        p_WS, p_WG, _ = draw_start_and_goal(world.esdf, VEHICLE_RADIUS, seed, least=least)
+        p_WS, p_WG = choose_ends(world.esdf, config.path, config.least_way, seed)
         world = replace(world, p_WS=p_WS, p_WG=p_WG)
     return world
 
@@ -315,17 +294,10 @@ def close_frontier(
 ) -> tuple[Esdf, GaussianScene | None]:
     """Closes a captured scene where reachable space ends in unknown space.
 
-    Unknown space begins with obstacles, drawn as hatched surfels. Space before the sky, and before
-    surfaces beyond the field's range, has no obstacles; its surfels begin behind all that the
-    images saw, on a coarser grid.
-
-    Args:
-        esdf: the distance field of the scene.
-        depths, K, X_WCs: its images, see `esdf_from_depth_images`.
-
-    Returns:
-        The distance field with these obstacles, and the surfels; `esdf` and None if the scene is
-        closed.
+    Returns the distance field with obstacles where unknown space begins, and hatched surfels that
+    draw them; `esdf` and None if the scene is closed. Space before the sky, and before surfaces
+    beyond the field's range, has no obstacles; its surfels begin behind all that the images saw.
+    For depths, K and X_WCs see `esdf_from_depth_images`.
     """
     images = []
     for depth in depths:

@@ -24,11 +24,8 @@ def part_digests(parts: Iterable[bytes]) -> set[str]:
 
 
 def source_digest(digests: Collection[str]) -> list[str]:
-    """Returns the digest of a source: the eight smallest of its parts' digests.
-
-    Two sources count as one if a part of either is among the eight of the other, so copies with
-    parts missing or added are recognized.
-    """
+    """Returns the digest of a source: the eight smallest of its parts' digests, so that copies with
+    parts missing or added are recognized."""
     return sorted(digests)[:8]
 
 

@@ -5,22 +5,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
+from splatpilot.diagrams.worlds import indoor, outdoor
 from splatpilot.diagrams.worlds.dodgedrone import DodgeDroneConfig, dodgedrone_world
 from splatpilot.diagrams.worlds.forest.forest import forest_spec
 from splatpilot.diagrams.worlds.forest.layout import ForestConfig
-from splatpilot.diagrams.worlds.indoor import OfficeConfig, RoomConfig, office_spec, room_spec
 from splatpilot.diagrams.worlds.inserted import InsertedConfig, inserted_world
 from splatpilot.diagrams.worlds.octomap_world import OCTOMAP, OctomapConfig, octomap_world
-from splatpilot.diagrams.worlds.outdoor import (
-    BranchesConfig,
-    ClutterConfig,
-    OverUnderConfig,
-    WallsConfig,
-    branches_spec,
-    clutter_spec,
-    over_under_spec,
-    walls_spec,
-)
 from splatpilot.diagrams.worlds.scene_folder import SceneConfig, read_scene_world
 from splatpilot.diagrams.worlds.solids.solid import WorldSpec
 from splatpilot.diagrams.worlds.solids.surfels import build
@@ -59,18 +49,14 @@ def register_world(
 ) -> None:
     """Registers a world, so that scenarios can name it by its configuration's type.
 
-    Args:
-        config: the type of its configurations, see `WorldConfig`; its name is their YAML tag.
-        make: from a configuration and a seed to a world; by default draws the spec.
-        make_spec: from a configuration and a seed to a spec, to train and render captures in it.
+    `make` and `make_spec` map a configuration and a seed to a world and to a spec, to train and
+    render captures in it; by default `make` draws the spec.
     """
-    if make is None:
-        if make_spec is None:
-            raise ValueError(f"{config.__name__}: give make or make_spec")
-        plan = make_spec
-        make = lambda config, seed: build(plan(config, seed))  # noqa: E731
+    if make is None and make_spec is None:
+        raise ValueError(f"{config.__name__}: give make or make_spec")
     require_configuration(config)
-    WORLDS.add(config.__name__, WorldEntry(config, make, make_spec))
+    draw = make or (lambda config, seed: build(make_spec(config, seed)))  # pyright: ignore
+    WORLDS.add(config.__name__, WorldEntry(config, draw, make_spec))
 
 
 def make_world(config: WorldConfig, seed: int) -> World:
@@ -105,12 +91,12 @@ def make_spec(config: WorldConfig, seed: int) -> WorldSpec:
 
 
 register_world(ForestConfig, make_spec=forest_spec)
-register_world(BranchesConfig, make_spec=branches_spec)
-register_world(ClutterConfig, make_spec=clutter_spec)
-register_world(WallsConfig, make_spec=walls_spec)
-register_world(RoomConfig, make_spec=room_spec)
-register_world(OfficeConfig, make_spec=office_spec)
-register_world(OverUnderConfig, make_spec=over_under_spec)
+register_world(outdoor.BranchesConfig, make_spec=outdoor.branches_spec)
+register_world(outdoor.ClutterConfig, make_spec=outdoor.clutter_spec)
+register_world(outdoor.WallsConfig, make_spec=outdoor.walls_spec)
+register_world(indoor.RoomConfig, make_spec=indoor.room_spec)
+register_world(indoor.OfficeConfig, make_spec=indoor.office_spec)
+register_world(outdoor.OverUnderConfig, make_spec=outdoor.over_under_spec)
 register_world(SceneConfig, read_scene_world)
 register_world(InsertedConfig, inserted_world)
 register_world(OctomapConfig, octomap_world)

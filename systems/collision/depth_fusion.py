@@ -142,10 +142,7 @@ def _cosine_of_incidence(depth: np.ndarray, K: np.ndarray) -> np.ndarray:
 
     In normalized image coordinates (u, v) a plane n . X = c has the inverse depth
     w = n . (u, v, 1) / c, so n / c = (w_u, w_v, w - u w_u - v w_v). The smaller slope to a neighbor
-    along each axis stays on the pixel's own surface at a silhouette.
-
-    Returns:
-        (H, W) float32, at least _MIN_COSINE.
+    along each axis stays on the pixel's own surface at a silhouette. At least _MIN_COSINE.
     """
     valid = (depth > 0.0) & np.isfinite(depth)
     w = np.where(valid, 1.0 / np.where(valid, depth, 1.0), np.float32(np.nan)).astype(np.float32)
@@ -185,10 +182,9 @@ def esdf_from_depth_images(
     Args:
         depths: images (H, W) float [m], planar depth; 0, NaN and negative pixels are unknown,
             infinite ones free space, as before the sky. Held in memory one at a time.
-        K: (3, 3) intrinsics [px]; pixel (row i, column j) is centered at (j + 0.5, i + 0.5).
+        K: (3, 3) intrinsics [px]; pixel centers lie at +1/2.
         X_WCs: the camera's pose of each image (x right, y down, z forward).
         lower_W, upper_W: (3,) [m], the box to fill, see `bounds_of_depth_images`.
-        voxel_size: [m].
         max_range: distance from the camera up to which space is seen [m]; a surface beyond it still
             clears the space before it.
     """

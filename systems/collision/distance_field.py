@@ -57,18 +57,11 @@ class DistanceField(Distances, Protocol):
 
 
 def soft_barrier(distance: Any, radius: float, beta: float = 4.0, margin: float = 1.0) -> Any:
-    """Computes a differentiable collision penalty, near zero in free space (equation 3).
+    """Computes a differentiable collision penalty [m], near zero in free space (equation 3).
 
         soft(d) = softplus(beta (radius + margin - d)) / beta
 
-    Args:
-        distance: (...,) [m], signed distance; numpy array, float or torch tensor.
-        radius: of the vehicle [m].
-        beta: sharpness [1/m].
-        margin: distance kept beyond the radius [m].
-
-    Returns:
-        (...,) [m], of the distance's type; NaN where the distance is NaN.
+    The signed distance (...,) [m] is a numpy array, float or torch tensor; NaN in, NaN out.
     """
     require(beta > 0.0, "beta", "> 0 1/m", beta)
     exponent = beta * (radius + margin - distance)

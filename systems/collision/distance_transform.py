@@ -30,9 +30,8 @@ def distance_to_voxels(voxels: np.ndarray, voxel_size: float) -> np.ndarray:
 def occupancy_distances(occupied: np.ndarray, voxel_size: float) -> np.ndarray:
     """Computes signed distances to the faces of occupied voxels, never too large if interpolated.
 
-    At voxel centers it is the exact distance, less the excess of the trilinear interpolant in the
-    half voxels around: distances to an edge or corner are convex, and a chord is above them.
-    Negative in occupied voxels, [m].
+    At voxel centers it is the exact distance [m], less the excess of the trilinear interpolant in
+    the half voxels around: distances to an edge or corner are convex. Negative in occupied voxels.
     """
     if not occupied.any() or occupied.all():
         far = np.float32(_diagonal(occupied.shape, voxel_size))
@@ -77,13 +76,10 @@ def _between(values: np.ndarray) -> np.ndarray:
 def distances_from_band(occupied: np.ndarray, band: np.ndarray, voxel_size: float) -> np.ndarray:
     """Continues signed distances from a band of known values around the surface.
 
-    A distance field cannot grow faster than the distance traveled, so every voxel s of the band
-    bounds that of a voxel x by |x - s| + |band(s)|, with the opposite sign of band(s) if s and x
-    lie on different sides. The nearest s gives the first bound; passing the s of the six face
-    neighbors along, twice, finds tighter ones.
-
-    The band (nx, ny, nz) float32 [m] is NaN where unknown, not positive in occupied voxels and not
-    negative in others; if it is empty, the result is plus or minus the diagonal of the grid.
+    Every voxel s of the band bounds the distance of a voxel x by |x - s| + |band(s)|, with the
+    opposite sign of band(s) if s and x lie on different sides. The nearest s gives the first bound;
+    passing the s of the six face neighbors along, twice, finds tighter ones. The band (nx, ny, nz)
+    [m] is NaN where unknown; if it is empty, distances are the diagonal of the grid.
     """
     sites = np.isfinite(band)
     if not sites.any():

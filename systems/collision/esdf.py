@@ -35,17 +35,9 @@ def interpolate_grid(
     occupied_outside: bool = False,
     with_gradient: bool = True,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Interpolates a grid trilinearly, extrapolated in the outermost half voxels.
+    """Interpolates a grid (nx, ny, nz) float32 trilinearly, see `Esdf`.
 
-    Args:
-        grid: (nx, ny, nz) float32.
-        lower_W: (3,) [m], lower corner of the grid.
-        p_WQ: (..., 3) [m].
-        occupied_outside: outside the grid the value is that of the nearest point in it minus the
-            distance to that point; otherwise NaN, with a gradient of zero.
-
-    Returns:
-        values (...,) and their exact gradients (..., 3) [1/m], undefined without `with_gradient`.
+    Returns values (...,) and their gradients (..., 3) [1/m], undefined without `with_gradient`.
     """
     points = np.ascontiguousarray(p_WQ, dtype=float).reshape(-1, 3)
     values, gradients = np.empty(len(points)), np.empty(points.shape)
@@ -66,9 +58,8 @@ def interpolate_grid(
 class Esdf:
     """A signed distance field sampled at voxel centers and interpolated trilinearly.
 
-    Voxel (i, j, k) covers lower_W + [i, i+1] x [j, j+1] x [k, k+1] * voxel_size. The gradient is
-    the exact derivative of the interpolant and jumps at the planes through voxel centers. The
-    arrays are read-only, so a field is shared by reference.
+    Values are extrapolated in the outermost half voxels. The gradient is the exact derivative of
+    the interpolant and jumps at the planes through voxel centers. The arrays are read-only.
 
     Points p_WQ (..., 3) [m] are numpy arrays or torch tensors; results are of the same type, and
     distances of tensors are differentiable.
@@ -108,13 +99,8 @@ class Esdf:
         for array in (distances, states, lower_W, upper_W):
             array.flags.writeable = False
         # The class is frozen.
-        vars(self).update(
-            distances=distances,
-            states=states,
-            lower_W=lower_W,
-            upper_W=upper_W,
-            voxel_size=voxel_size,
-        )
+        vars(self).update(distances=distances, states=states, voxel_size=voxel_size)
+        vars(self).update(lower_W=lower_W, upper_W=upper_W)
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -171,9 +157,8 @@ class Esdf:
         """Returns the field a planner may trust: unknown space and all outside count as occupied.
 
         Occupied and unknown voxels hold minus the distance to free space, so that the gradient
-        leads out of them. Outside the box the field is at most minus the true distance to free
-        space, and 1-Lipschitz wherever the box's boundary is free (elsewhere up to sqrt 2). At
-        corners where two surfaces meet the interpolant is up to 0.75 voxel too large.
+        leads out of them. At corners where two surfaces meet the interpolant is up to 0.75 voxel
+        too large.
         """
         distances = conservative_distances(self.distances, self.states, self.voxel_size)
         return Esdf(distances, self.states, self.lower_W, self.voxel_size, occupied_outside=True)

@@ -41,7 +41,13 @@ def grid_shape(lower_W: np.ndarray, upper_W: np.ndarray, voxel_size: float) -> t
     box = f"a box of {extent} m with voxels of {voxel_size} m"
     require(count.min() >= 2, box, "at least 2 voxels along each axis", count)
     limit = f"at most {MAX_VOXELS:.3g} voxels"
-    require(count.prod() <= MAX_VOXELS, box, limit, f"{count.prod():.3g}", "use larger voxels")
+    require(
+        count.prod() <= MAX_VOXELS,
+        box,
+        limit,
+        f"{count.prod():.3g}",
+        "use larger voxels or a smaller box",
+    )
     nx, ny, nz = count.astype(int)
     return int(nx), int(ny), int(nz)
 
@@ -59,12 +65,10 @@ def esdf_from_occupancy(
         occupied: (nx, ny, nz) bool.
         unknown: (nx, ny, nz) bool, voxels never observed, none of them occupied; None for none.
         lower_W: (3,) [m], lower corner of the grid.
-        voxel_size: [m].
         surface_offset: (nx, ny, nz) [m], signed distance of a voxel's center from the surface, not
-            positive in occupied voxels and not negative in others; NaN where it is unknown. Values
-            beyond one voxel are not used. Without values on either side the surface is the faces of
-            its voxels; if all are missing, distances are never too large, see
-            `occupancy_distances`.
+            positive in occupied voxels and not negative in others; NaN where it is unknown. Only
+            values within one voxel are used. Without them the surface is the faces of voxels; see
+            `occupancy_distances` if all are missing.
     """
     occupied = np.asarray(occupied, dtype=bool)
     unknown = np.zeros_like(occupied) if unknown is None else np.asarray(unknown, dtype=bool)
@@ -109,10 +113,8 @@ def esdf_from_gaussians(
 
     The density is sum_i o_i exp(-m_i^2 / 2) with m_i the Mahalanobis distance to Gaussian i, whose
     variances are enlarged by (voxel_size / 2)^2 so that thin sheets do not fall between voxels.
-    Sheets are then trimmed to 0.6 voxel on both sides of their middle: a thin opaque one is seen
-    half a voxel too near, the safe side. Space in a hollow shell of Gaussians counts as free.
-
-    The field fills the box [lower_W, upper_W], (3,) [m].
+    Sheets are then trimmed to 0.6 voxel on both sides of their middle, half a voxel on the safe
+    side. The field fills the box [lower_W, upper_W], (3,) [m].
     """
     shape = grid_shape(lower_W, upper_W, voxel_size)
     density = density_on_grid(scene, np.asarray(lower_W, dtype=float), shape, voxel_size)

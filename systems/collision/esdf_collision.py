@@ -30,23 +30,12 @@ class EsdfCollision(LeafSystem):
         - barrier
         - field_state
 
-    - ``state`` (13): ``[p_WB (3) [m], v_WB (3) [m/s], q_WB (4, wxyz), w_WB_B (3) [rad/s]]``.
-    - ``distance`` (1): signed distance [m] of p_WB to occupied surfaces.
-    - ``gradient`` (3): its derivative by p_WB in W [-].
-    - ``clearance`` (1): distance - radius [m].
-    - ``in_collision`` (1): 1 if the clearance is negative, else 0.
-    - ``barrier`` (1): equation 3 [m], see `soft_barrier`.
-    - ``field_state`` (1): the `FieldState` as a number. Outside the field's bounds (3) distance,
-      clearance and barrier are NaN, the gradient is zero and there is no collision.
-
-    All outputs share one query of the field.
-
-    Args:
-        field: of static obstacles.
-        moving: obstacles that move with the Context's time.
-        radius: of the vehicle [m].
-        beta: sharpness of the barrier [1/m].
-        margin: of the barrier [m].
+    `state` is that of a `QuadrotorState`. `distance` [m] is that of p_WB to occupied surfaces,
+    `gradient` its derivative by p_WB in W, `clearance` [m] the distance less the radius of the
+    vehicle, `in_collision` 1 if that is negative, `barrier` [m] equation 3, see `soft_barrier`, and
+    `field_state` a `FieldState`. Outside the field's bounds distance, clearance and barrier are
+    NaN, the gradient is zero and there is no collision. All outputs share one query of the field,
+    with obstacles that are `moving` with the Context's time.
     """
 
     def __init__(

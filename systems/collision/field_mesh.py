@@ -25,12 +25,8 @@ def field_mesh(esdf: Esdf, conservative: bool = False) -> trimesh.Trimesh:
     """Returns the surface at which a field's distance is 0, normals outwards.
 
     The mesh is watertight: solids end at the faces of the box. Its surface is within half a voxel
-    of the field's, with few triangles where that is flat.
-
-    Args:
-        esdf: the distance field.
-        conservative: if true, unknown space and all outside the box are solid too, as for vehicles:
-            the mesh is a shell around free space, a voxel thick at the box's faces.
+    of the field's, with few triangles where that is flat. If `conservative`, unknown space and all
+    outside the box are solid too: a shell around free space, a voxel thick at the box's faces.
     """
     measure = import_extra("skimage.measure", "mesh")
     manifold = import_extra("manifold3d", "mesh")
@@ -103,15 +99,9 @@ _VERTICES, _INDICES = 34962, 34963  # targets of its buffer views
 def add_primitive(
     document: dict[str, Any], vertices: np.ndarray, uv: np.ndarray, triangles: np.ndarray
 ) -> dict[str, Any]:
-    """Adds textured triangles to the accessors, views and buffers of a glTF document.
+    """Adds textured triangles to a glTF document; returns their primitive, without a material.
 
-    Args:
-        vertices: (V, 3) [m], z up.
-        uv: (V, 2) in [0, 1], from the upper left corner of the picture.
-        triangles: (T, 3) int, counter-clockwise seen from outside.
-
-    Returns:
-        The primitive of a mesh, without a material.
+    Vertices (V, 3) [m] are z up, uv (V, 2) in [0, 1] from the picture's upper left corner.
     """
     return {
         "attributes": {

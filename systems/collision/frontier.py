@@ -55,12 +55,8 @@ def hidden_frontier(
     Before the sky, and before surfaces beyond the field's range, space is unknown only because it
     is far away: an obstacle there would hide them.
 
-    Args:
-        depths, K, X_WCs: images of the field, see `esdf_from_depth_images`.
-
-    Returns:
-        The first hidden voxels (nx, ny, nz), the voxels (nx, ny, nz) before them, and True if the
-        frontier was left open before a surface.
+    Returns the first hidden voxels (nx, ny, nz), the voxels (nx, ny, nz) before them, and True if
+    the frontier was left open before a surface.
     """
     unknown = esdf.states == FieldState.UNKNOWN
     before = _dilated(reachable) & (esdf.states != FieldState.OCCUPIED)

@@ -1,10 +1,9 @@
 """Reads OctoMap's binary trees (.bt) and computes their distance fields.
 
-The format: header lines `id OcTree`, `size` (nodes), `res` (edge of the smallest voxel [m]), then
-`data` and the tree. Each inner node is 16 bits, two for each of its eight children, lowest child in
-the lowest bits: 00 unknown, 01 a free leaf, 10 an occupied leaf, 11 an inner node. The inner nodes
-follow each other depth first. Child c of a cube is its half toward +x (c & 1), +y (c & 2), +z
-(c & 4); the root spans 2^16 voxels an edge about the origin.
+After the header, each inner node is 16 bits, depth first, two for each of its eight children,
+lowest child in the lowest bits: 00 unknown, 01 a free leaf, 10 an occupied leaf, 11 an inner node.
+Child c is the part toward +x (c & 1), +y (c & 2), +z (c & 4) of a cube; the root spans 2^16 voxels
+an edge about the origin.
 """
 
 from dataclasses import dataclass
@@ -14,7 +13,7 @@ import numpy as np
 
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.collision.esdf_build import MAX_VOXELS, esdf_from_occupancy
+from splatpilot.systems.collision.esdf_build import esdf_from_occupancy, grid_shape
 from splatpilot.systems.common.readers import POINTER, REFUSAL, require_file
 from splatpilot.systems.common.validation import require
 
@@ -67,10 +66,8 @@ class Octomap:
         lower_W = self.lower_W if lower_W is None else np.asarray(lower_W, dtype=float)
         upper_W = self.upper_W if upper_W is None else np.asarray(upper_W, dtype=float)
         lower = np.floor(lower_W / self.resolution + 1e-6).astype(int)
-        shape = np.ceil(upper_W / self.resolution - 1e-6).astype(int) - lower
-        require((shape > 0).all(), "upper_W of the box", f"above lower_W = {lower_W} m", upper_W)
-        count, limit = np.prod(shape.astype(float)), f"at most {MAX_VOXELS:.3g}"
-        require(count <= MAX_VOXELS, "voxels", limit, f"{count:.3g}", "give smaller bounds")
+        upper = np.ceil(upper_W / self.resolution - 1e-6).astype(int)
+        shape = grid_shape(lower * self.resolution, upper * self.resolution, self.resolution)
         states = np.full(shape, FieldState.UNKNOWN, dtype=np.uint8)
         value = np.where(self.occupied, FieldState.OCCUPIED, FieldState.FREE).astype(np.uint8)
         for size in np.unique(self.sizes):

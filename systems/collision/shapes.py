@@ -146,24 +146,17 @@ class ShapeUnion:
 
     def distance(self, p_WQ: ArrayLike) -> np.ndarray:
         """Returns signed distances (...,) [m] at p_WQ (..., 3) [m]; infinite without shapes."""
-        p_WQ = np.asarray(p_WQ, dtype=float)
-        distances = np.empty(p_WQ.shape[:-1])
-        points = np.ascontiguousarray(p_WQ).reshape(-1, 3)
-        self._native.nearest(p_WQ=points, distances=distances.reshape(-1))
-        return distances
+        return self.nearest(p_WQ, with_gradient=False)[0]
 
-    def nearest(self, p_WQ: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    def nearest(self, p_WQ: ArrayLike, with_gradient: bool = True) -> tuple[np.ndarray, np.ndarray]:
         """Returns signed distances (...,) [m] at p_WQ (..., 3) [m] and their gradients (..., 3).
 
         If the gradient is not unique, as on the axis of a cylinder, it is one of the candidates.
         """
-        p_WQ = np.asarray(p_WQ, dtype=float)
-        distances, gradients = np.empty(p_WQ.shape[:-1]), np.empty(p_WQ.shape)
-        self._native.nearest(
-            p_WQ=np.ascontiguousarray(p_WQ).reshape(-1, 3),
-            distances=distances.reshape(-1),
-            gradients=gradients.reshape(-1, 3),
-        )
+        points = np.ascontiguousarray(p_WQ, dtype=float)
+        distances, gradients = np.empty(points.shape[:-1]), np.empty(points.shape)
+        wanted = {"gradients": gradients.reshape(-1, 3)} if with_gradient else {}
+        self._native.nearest(p_WQ=points.reshape(-1, 3), distances=distances.reshape(-1), **wanted)
         return distances, gradients
 
 
@@ -204,25 +197,15 @@ class AnalyticDistanceField:
 
 
 class MovingSpheres:
-    """M spheres that follow given paths back and forth.
+    """M spheres of `radii` (M,) [m] that follow given paths back and forth.
 
-    Each has a row of its path per `period` and rests in between. A row of infinities means that
-    the sphere is absent.
-
-    Args:
-        radii: (M,) [m].
-        paths: M arrays (rows, 3) of centers p_WO [m], each of at least one row.
-        period: [s].
+    Each has a row (3,) [m] of its path, one at least, per `period` [s] and rests in between. A row
+    of infinities means that the sphere is absent.
     """
 
     def __init__(self, radii: ArrayLike, paths: Sequence[NDArray], period: float) -> None:
         self.radii = np.asarray(radii, dtype=float)
         self._last = np.array([len(path) - 1 for path in paths])
-        valid = len(self._last) == len(self.radii) and (self._last >= 0).all()
-        rows = (self._last + 1).tolist()
-        require(valid, "paths", f"{len(self.radii)}, of at least one row each, like radii", rows)
-        require((self.radii > 0).all(), "radii", "> 0 m", self.radii.tolist())
-        require(period > 0, "period", "> 0 s", period)
         self._rows = np.concatenate([np.zeros((0, 3)), *paths])
         self._first = np.cumsum(self._last + 1) - self._last - 1
         self._period = period

@@ -4,6 +4,7 @@
 nothing else here does.
 """
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -11,15 +12,10 @@ if TYPE_CHECKING:
     from splatpilot.systems.splats.surfel_rasterization import rasterize_surfels
 
 __all__ = ["rasterize", "rasterize_surfels"]
+_MODULES = {"rasterize": "rasterization", "rasterize_surfels": "surfel_rasterization"}
 
 
 def __getattr__(name: str) -> Any:
-    if name == "rasterize":
-        from splatpilot.systems.splats.rasterization import rasterize
-
-        return rasterize
-    if name == "rasterize_surfels":
-        from splatpilot.systems.splats.surfel_rasterization import rasterize_surfels
-
-        return rasterize_surfels
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)

@@ -74,7 +74,7 @@ class EnvironmentMap:
         return ((1 - down) * upper + down * lower).astype(np.float32)
 
 
-type Background = tuple[float, float, float] | EnvironmentMap
+type Background = tuple[float, ...] | EnvironmentMap
 
 BLACK = (0.0, 0.0, 0.0)
 
@@ -122,11 +122,10 @@ def put_behind(
     return view._replace(color=color)
 
 
-def mean_color(background: Background) -> tuple[float, float, float]:
+def mean_color(background: Background) -> tuple[float, ...]:
     """Returns the mean color of a background over the sphere."""
     if not isinstance(background, EnvironmentMap):
         return background
     height = len(background.texels)
     area = np.sin((np.arange(height) + 0.5) * np.pi / height)
-    red, green, blue = np.average(background.texels.mean(axis=1), axis=0, weights=area).tolist()
-    return red, green, blue
+    return tuple(np.average(background.texels.mean(axis=1), axis=0, weights=area).tolist())

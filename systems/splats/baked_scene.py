@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -72,10 +72,7 @@ class MovingGaussians:
 
 
 def create_renderer(threads: int = 1, simd: str = "") -> _native.Renderer:
-    """Creates CPU threads and scratch memory, to be shared by the renderings of several images.
-
-    Python threads that share one take turns. Images depend neither on the number of threads nor on
-    earlier images.
+    """Creates CPU threads and memory for several images, which do not depend on either.
 
     Args:
         threads: 1 to 1024; an OSError if the system refuses to start them.
@@ -120,10 +117,9 @@ def _native_gaussians(gaussians: "GaussianScene | PlacedGaussians") -> _native.G
 class BakedScene:
     """A Gaussian scene prepared for fast repeated rendering.
 
-    Baking sorts the Gaussians in Morton order, factors their covariances and bounds groups of them
-    with boxes, by which each frame culls. Images agree with `rasterize` up to rounding, except that
-    Gaussians of exactly equal depth blend in Morton order. Rendering is deterministic for any
-    number of threads. Several Python threads may call `render` at once; they take turns.
+    Images agree with `rasterize` up to rounding, except that Gaussians of exactly equal depth blend
+    in Morton order. Rendering is deterministic for any number of threads. Several Python threads
+    may call `render` at once; they take turns.
     """
 
     def __init__(self, scene: GaussianScene, threads: int = 1, simd: str = ""):
@@ -135,7 +131,7 @@ class BakedScene:
         """Returns the same Gaussians in other colors, `sh` (N, K, 3), without baking again."""
         sh = np.ascontiguousarray(sh, dtype=np.float32)
         count = self._scene.count
-        valid = sh.ndim == 3 and len(sh) == count and sh.shape[2] == 3
+        valid = sh.ndim == 3 and sh.shape[::2] == (count, 3)
         require(valid, "sh", f"of shape ({count}, K, 3)", sh.shape)
         recolored = object.__new__(BakedScene)
         recolored._scene = self._scene.recolored(sh, harmonic_degree(sh.shape[1]))
@@ -158,13 +154,10 @@ class BakedScene:
         """Renders color, median depth and alpha.
 
         Args:
-            K: (3, 3) pinhole intrinsics [px]; skew is ignored. Pixel (i, j) has its center at
-                (i + 1/2, j + 1/2).
-            width: Image width [px].
-            height: Image height [px].
+            K: (3, 3) pinhole intrinsics [px]; skew is ignored. Pixel centers lie at +1/2.
+            width, height: of the image [px].
             X_WC: Pose of the camera (x right, y down, z forward) in the world.
-            near: Gaussians whose center is nearer than this along z are left out [m].
-            far: The same for those farther away [m].
+            near, far: Gaussians with a center outside these depths are left out [m].
             background: color or environment behind everything.
             moving: Gaussians added to those of the scene for this image; not checked.
             distortion: Lens; a pinhole if None. Pixels without a ray are black, with alpha and
@@ -175,28 +168,19 @@ class BakedScene:
         color = np.array(BLACK if environment else background, dtype=np.float32)
         valid = color.shape == (3,) and np.isfinite(color).all()
         require(valid, "background", "3 finite numbers", color.tolist())
-        camera = (K, width, height, X_WC, near, far)
-        depth, seen, alpha = self._render(*camera, moving, distortion, max_depth, color)
+        options = {"moving": moving, "distortion": distortion, "max_depth": max_depth}
+        depth, seen, alpha = self._render(K, width, height, X_WC, near, far, color, **options)
         view = RenderedView(seen, depth[..., 0], alpha[..., 0])
         if environment is None:
             return view
         return put_behind(view, environment, np.asarray(K), X_WC, distortion)
 
-    def render_depth(
-        self,
-        K: ArrayLike,
-        width: int,
-        height: int,
-        X_WC: "RigidTransform",
-        near: float = 0.01,
-        far: float = 1e10,
-        max_depth: float = np.inf,
-        moving: PlacedGaussians = NO_GAUSSIANS,
-        distortion: Distortion | None = None,
-    ) -> NDArray[np.float32]:
-        """Renders the median depth (H, W) [m], bitwise identical to that of `render` but faster."""
-        camera = (K, width, height, X_WC, near, far)
-        return self._render(*camera, moving, distortion, max_depth)[0][..., 0]
+    def render_depth(self, *camera: Any, **options: Any) -> NDArray[np.float32]:
+        """Renders the median depth (H, W) [m], bitwise identical to that of `render` but faster.
+
+        The arguments are those of `render` but `background`; all beyond `far` by name.
+        """
+        return self._render(*camera, **options)[0][..., 0]
 
     def _render(
         self,
@@ -204,12 +188,12 @@ class BakedScene:
         width: int,
         height: int,
         X_WC: "RigidTransform",
-        near: float,
-        far: float,
-        moving: PlacedGaussians,
-        distortion: Distortion | None,
-        max_depth: float,
+        near: float = 0.01,
+        far: float = 1e10,
         background: NDArray[np.float32] | None = None,
+        moving: PlacedGaussians = NO_GAUSSIANS,
+        distortion: Distortion | None = None,
+        max_depth: float = np.inf,
     ) -> list[NDArray[np.float32]]:
         """Returns depth (H, W, 1) and, with a background, color (H, W, 3) and alpha (H, W, 1)."""
         K = check_camera(K, width, height, near, far)

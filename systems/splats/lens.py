@@ -1,7 +1,6 @@
 """Lenses that bend the rays of a pinhole camera: OpenCV's rational and fisheye models.
 
-Points are on the image plane of focal length 1; see "Camera Calibration and 3D Reconstruction" and
-"Fisheye camera model" of OpenCV, and Kannala and Brandt, PAMI 2006.
+Points are on the image plane of focal length 1; see OpenCV, and Kannala and Brandt, PAMI 2006.
 """
 
 import math

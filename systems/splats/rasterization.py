@@ -68,15 +68,12 @@ def named_tensors(*tensors: Tensor | None, sh_degree: int | None) -> dict[str, T
 
 def _check_values(arrays: Arrays, scene_is_valid: bool, scale_axes: int) -> None:
     """Checks that values can be rendered; the first `scale_axes` scales count."""
+    arrays = arrays | {"scales": arrays["scales"][:, :scale_axes]}
     for name, array in arrays.items():
-        if name not in SCENE:
+        if name not in SCENE or not scene_is_valid:
             require_valid(np.isfinite(array), name, array, "finite")
     if not scene_is_valid:
-        scene = {name: arrays[name] for name in SCENE}
-        scene["scales"] = scene["scales"][:, :scale_axes]
-        for name, array in scene.items():
-            require_valid(np.isfinite(array), name, array, "finite")
-        scales, opacities, quats = (scene[n] for n in ("scales", "opacities", "quats"))
+        scales, opacities, quats = (arrays[n] for n in ("scales", "opacities", "quats"))
         require_valid(scales > 0, "scales", scales, "> 0 m")
         require_valid((opacities >= 0) & (opacities <= 1), "opacities", opacities, "in [0, 1]")
         squared = (quats * quats).sum(axis=1)
@@ -99,6 +96,7 @@ class Views:
     poses: NDArray[np.float64]  # (C, 4, 4) X_CW
     sh_degree: int | None
     per_camera_colors: bool
+    with_gradients: bool
 
     def _colors(self, arrays: Arrays, c: int) -> NDArray[np.float32]:
         colors = arrays["colors"] if self.sh_degree is not None else arrays["colors"][..., None, :]
@@ -114,12 +112,9 @@ class Views:
     def project_backward(
         self, inputs: Sequence[Tensor], backward: Callable[..., NDArray[np.float64]]
     ) -> list[Tensor]:
-        """Returns the gradients of means, quats, scales, opacities, colors and viewmats.
+        """Returns the gradients of `inputs`: means, quats, scales, opacities, colors and viewmats.
 
-        Args:
-            inputs: these six.
-            backward: native function of a camera's index, its Gaussians and their gradients; see
-                `_native.project_backward`.
+        `backward` takes a camera's index, its Gaussians and their gradients.
         """
         results = [torch.empty_like(t, memory_format=torch.contiguous_format) for t in inputs]
         results[-1].zero_()
@@ -152,8 +147,6 @@ def _pose_gradient(sums: NDArray[np.float64], X_CW: NDArray[np.float64]) -> NDAr
 
 def prepare(
     tensors: dict[str, Tensor],
-    size: tuple[int, int],
-    clipping: tuple[float, float, float],
     sh_degree: int | None,
     renderer: _native.Renderer | None,
     scale_axes: int = 3,
@@ -162,13 +155,11 @@ def prepare(
     """Checks the values of `named_tensors` on the CPU; returns cameras and arrays.
 
     Args:
-        size: width and height [px].
-        clipping: near and far plane [m], radius_clip [px].
         scale_axes: number of scales of a Gaussian that matter.
-        optics: further arguments of `_native.Camera`.
+        optics: arguments of `_native.Camera` but K and X_CW.
     """
-    (width, height), (near, far, radius_clip) = size, clipping
-    device = tensors["means"].device
+    size = optics["width"], optics["height"], optics["near_plane"], optics["far_plane"]
+    radius_clip, device = optics["radius_clip"], tensors["means"].device
     require(device.type == "cpu", "the device", "'cpu' or 'cuda'", device, "move the tensors")
     if torch.is_grad_enabled() and tensors["Ks"].requires_grad:
         raise ValueError("Ks must be without a gradient; use Ks.detach()")
@@ -181,45 +172,27 @@ def prepare(
         poses,
         sh_degree,
         per_camera_colors=tensors["colors"].ndim == (3 if sh_degree is None else 4),
+        with_gradients=torch.is_grad_enabled() and any(t.requires_grad for t in tensors.values()),
     )
     colors = range(len(poses) if views.per_camera_colors else 1)
     valid = all(views.gaussians(arrays, c).are_valid(views.renderer) for c in colors)
     _check_values(arrays, valid, scale_axes)
     for K, X_CW in zip(arrays["Ks"], poses, strict=True):
-        K = check_camera(K, width, height, near, far)
-        camera = _native.Camera(
-            K=K,
-            X_CW=X_CW,
-            width=width,
-            height=height,
-            near_plane=near,
-            far_plane=far,
-            radius_clip=radius_clip,
-            **optics,
-        )
-        views.cameras.append(camera)
+        views.cameras.append(_native.Camera(K=check_camera(K, *size), X_CW=X_CW, **optics))
     return views, arrays
-
-
-def requires_gradients(tensors: dict[str, Tensor]) -> bool:
-    return torch.is_grad_enabled() and any(t.requires_grad for t in tensors.values())
 
 
 def _to_numpy(tensor: Tensor) -> NDArray[Any]:
     return np.ascontiguousarray(tensor.detach().numpy())
 
 
-def joined(parts: Sequence[tuple[NDArray, ...]]) -> list[Tensor]:
-    """Concatenates the arrays of each camera."""
-    return [
-        torch.from_numpy(arrays[0] if len(arrays) == 1 else np.concatenate(arrays))
-        for arrays in zip(*parts, strict=True)
-    ]
-
-
-def pair_meta(counts: list[int], width: int, height: int) -> dict[str, Any]:
-    """Returns gsplat's meta of both rasterizers for `counts` visible Gaussians of each camera."""
-    return {
+def pair_meta(
+    names: Sequence[str], projected: Sequence[tuple[NDArray, ...]], width: int, height: int
+) -> dict[str, Any]:
+    """Returns gsplat's meta of both rasterizers from the arrays, with `names`, of each camera."""
+    counts = [len(arrays[0]) for arrays in projected]
+    arrays = (a[0] if len(a) == 1 else np.concatenate(a) for a in zip(*projected, strict=True))
+    return dict(zip(names, map(torch.from_numpy, arrays), strict=True)) | {
         "camera_ids": torch.repeat_interleave(torch.arange(len(counts)), torch.tensor(counts)),
         "width": width,
         "height": height,
@@ -362,20 +335,16 @@ def rasterize(
     """Renders N Gaussians into C cameras (Kerbl et al. 2023, with gsplat's conventions).
 
     A Gaussian of color c adds ``T a c`` to a pixel, where ``a = min(.99, o exp(-d^T S^-1 d / 2))``
-    and T is the transmittance of those in front. S is its covariance projected by the Jacobian at
-    its center, plus eps2d on the diagonal. Contributions with a < 1/255 are skipped, and a pixel is
-    finished before T would fall to 1e-4. Gaussians of equal depth blend in the order of the input.
+    and T is the transmittance of those in front. Contributions with a < 1/255 are skipped, and a
+    pixel is finished before T would fall to 1e-4. Gaussians of equal depth blend in input order.
 
     z is the depth of the center for "D" and "ED". The median depth is that of a surface (Zhang et
     al. 2024, RaDe-GS): z of the point of greatest density along the pixel's ray, at the Gaussian
-    where the transmittance of footprints without eps2d falls to one half; 0 if it never does. A
-    flat Gaussian has the depth of its plane, n . p = n . c with n = covariance^-1 c for a center c
-    in the camera frame. Where z exceeds c_z, d counts z / c_z times.
+    where the transmittance of footprints without eps2d falls to one half; 0 if it never does.
 
     Color, depth and alpha are differentiable with respect to means, quats, scales, opacities,
-    colors, viewmats (all twelve numbers, taken as free) and backgrounds. A Gaussian that is skipped
-    or clamped at a = .99 has no derivative there, and a median depth is constant. Results are
-    deterministic and independent of the number of threads.
+    colors, viewmats and backgrounds; a median depth is constant. Results are deterministic and
+    independent of the number of threads.
 
     Args:
         means: (N, 3) centers [m].
@@ -386,10 +355,8 @@ def rasterize(
             (C, N, K, 3) of the colors ``max(0, 0.5 + sum_k Y_k c_k)``.
         viewmats: (C, 4, 4) world to camera (x right, y down, z forward).
         Ks: (C, 3, 3) intrinsics [px]; skew is ignored. Pixel centers lie at +1/2.
-        width: Image width [px].
-        height: Image height [px].
-        near_plane: Gaussians whose center is nearer along z are left out [m].
-        far_plane: The same for those farther away [m].
+        width, height: of the images [px].
+        near_plane, far_plane: centers outside these depths are left out [m].
         radius_clip: Gaussians of at most this radius on the image are left out [px].
         eps2d: Variance by which the pixel blurs every Gaussian [px^2].
         sh_degree: Degree to evaluate, 0 to 3; None if `colors` are colors.
@@ -414,35 +381,31 @@ def rasterize(
     what = f"rasterize_mode of render_mode {render_mode!r}"
     require(not (median and antialiased), what, "'classic'", repr(rasterize_mode))
     tensors = named_tensors(*scene, Ks, backgrounds, sh_degree=sh_degree)
+    optics: dict[str, Any] = {
+        "width": width,
+        "height": height,
+        "near_plane": near_plane,
+        "far_plane": far_plane,
+        "radius_clip": radius_clip,
+        "eps2d": eps2d,
+    }
     if means.device.type == "cuda":
         if median:
             raise NotImplementedError(f"render_mode {render_mode!r} needs CPU tensors; use .cpu()")
         gsplat = import_extra("gsplat", "cuda")  # 1.5.3 fails on backgrounds of packed Gaussians
+        modes = {"render_mode": render_mode, "rasterize_mode": rasterize_mode}
         image, alpha, meta = gsplat.rasterization(
-            *scene,
-            Ks,
-            width,
-            height,
-            near_plane=near_plane,
-            far_plane=far_plane,
-            radius_clip=radius_clip,
-            eps2d=eps2d,
-            sh_degree=sh_degree,
-            render_mode=render_mode,
-            rasterize_mode=rasterize_mode,
+            *scene, Ks, **optics, sh_degree=sh_degree, **modes
         )
         return over_backgrounds(backgrounds, image, alpha, render_mode), alpha, meta
     require(0 <= eps2d < np.inf, "eps2d", "finite and >= 0 px^2", eps2d)
-    clipping = near_plane, far_plane, radius_clip
-    optics = {"eps2d": eps2d, "antialiased": antialiased}
-    views, arrays = prepare(tensors, (width, height), clipping, sh_degree, renderer, **optics)
+    views, arrays = prepare(tensors, sh_degree, renderer, **optics, antialiased=antialiased)
     modes = _native.DepthMode
-    depth_mode = modes.MEDIAN if median else modes.EXPECTED if "ED" in render_mode else None
-    depth_mode = depth_mode or modes.ACCUMULATED
+    expected = modes.EXPECTED if "ED" in render_mode else modes.ACCUMULATED
+    depth_mode = modes.MEDIAN if median else expected
     behind = arrays.get("backgrounds", np.zeros((len(viewmats), 3), dtype=np.float32))
     shape = len(viewmats), height, width
     image, alpha = torch.empty((*shape, CHANNELS[render_mode])), torch.empty((*shape, 1))
-    keep = requires_gradients(tensors)
     frames, projected = [], []
     for c, camera in enumerate(views.cameras):
         frame = _native.render(
@@ -453,23 +416,16 @@ def rasterize(
             background=behind[c],
             image=image[c].numpy(),
             alpha=alpha[c].numpy(),
-            keep=keep,
+            keep=views.with_gradients,
         )
         given = None if antialiased else arrays["opacities"]
         projected.append(_native.projected(views.renderer, frame, given))
         frames.append(frame)
-    ids, radii, means2d, depths, conics, splat_opacities = joined(projected)
-    if keep:
-        splats = Project.apply(views, frames, (means2d,), *scene)
+    names = "gaussian_ids", "radii", "means2d", "depths", "conics", "opacities"
+    meta = pair_meta(names, projected, width, height)
+    if views.with_gradients:
+        splats = Project.apply(views, frames, (meta["means2d"],), *scene)
         style = views.renderer, frames, depth_mode, behind, (image, alpha)
         image, alpha = Composite.apply(*style, *splats, backgrounds)  # pyright: ignore[reportGeneralTypeIssues]
-        means2d = splats[0]  # pyright: ignore[reportOptionalSubscript]
-    meta = pair_meta([frame.splat_count for frame in frames], width, height) | {
-        "gaussian_ids": ids,
-        "radii": radii,
-        "means2d": means2d,
-        "depths": depths,
-        "conics": conics,
-        "opacities": splat_opacities,
-    }
+        meta["means2d"] = splats[0]  # pyright: ignore[reportOptionalSubscript]
     return image, alpha, meta

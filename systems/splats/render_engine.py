@@ -71,8 +71,8 @@ class SplatRenderEngine(RenderEngine):
     A pixel has one D: a shape between two translucent layers of Gaussians is drawn before or behind
     both. Gaussians cast no shadows on shapes, nor shapes on Gaussians.
 
-    Drake copies an engine for every SceneGraph, Context and sensor that holds it; copies share the
-    scene. The last view is cached, so that all images of one camera cost one rendering.
+    Drake copies engines; copies share the scene. The last view is cached, so that all images of one
+    camera cost one rendering.
     """
 
     def __init__(
@@ -224,11 +224,8 @@ class SplatRenderEngine(RenderEngine):
     def _camera(self, core: RenderCameraCore) -> tuple[tuple[Any, ...], bytes]:
         """Returns K, width, height, X_WC, near and far, and these as bytes."""
         info, clipping = core.intrinsics(), core.clipping()
-        K, size, planes = (
-            info.intrinsic_matrix(),
-            (info.width(), info.height()),
-            (clipping.near(), clipping.far()),
-        )
+        K, size = info.intrinsic_matrix(), (info.width(), info.height())
+        planes = clipping.near(), clipping.far()
         numbers = [K.ravel(), self._X_WC.GetAsMatrix34().ravel(), size, planes]
         return (K, *size, self._X_WC, *planes), np.concatenate(numbers).tobytes()
 

@@ -28,12 +28,8 @@ def color_to_sh(color: ArrayLike) -> NDArray[Any]:
 def sh_basis(directions: ArrayLike, degree: int) -> NDArray[np.float64]:
     """Evaluates the real spherical harmonics of degrees 0 to `degree`, (..., (degree + 1)^2).
 
-    In the order and signs of 3D Gaussian splatting: the real part (order m >= 0) and the imaginary
-    part (m < 0) of the complex harmonics with Condon-Shortley phase, times sqrt(2) where m is not 0
-    (Sloan, "Efficient Spherical Harmonic Evaluation", JCGT 2013).
-
-    Args:
-        directions: (..., 3) unit vectors in the frame of the coefficients.
+    At unit `directions` (..., 3), in the order and signs of 3D Gaussian splatting: with the
+    Condon-Shortley phase (Sloan, "Efficient Spherical Harmonic Evaluation", JCGT 2013).
     """
     require(degree in range(MAX_DEGREE + 1), "the degree of spherical harmonics", "0 to 3", degree)
     x, y, z = np.moveaxis(np.asarray(directions, dtype=np.float64), -1, 0)

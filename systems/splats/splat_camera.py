@@ -64,14 +64,8 @@ def row_bands(
 ) -> list[tuple[int, int]]:
     """Divides an image of a rolling shutter into bands of rows that render from one pose.
 
-    Args:
-        X_WC0, X_WC1: poses of the camera at the first and the last row.
-        focal: [px]
-        height: [px]
-        min_count: minimum number of bands.
-
-    Returns:
-        The first row of each band, and the row after its last.
+    Returns the first row of each of at least `min_count` bands, and the row after its last; the
+    camera has the poses X_WC0 and X_WC1 at the first and the last row.
     """
     angle = (X_WC0.rotation().inverse() @ X_WC1.rotation()).ToAngleAxis().angle()
     distance = np.linalg.norm(X_WC1.translation() - X_WC0.translation())
@@ -100,11 +94,7 @@ class SplatCamera(LeafSystem):
 
     `body_pose` is the pose X_WB of the body that carries the camera; the camera has the pose X_WC =
     X_WB X_BC with x right, y down and z forward for all images. With a `readout`, a rolling
-    shutter, that is the pose at the last row, and `start_pose` X_WB at the first. Rows between
-    which an image hardly moves render together, from the pose at the middle of their readout.
-
-    Images render when a port is evaluated, and again if the pose has changed, or the time if
-    Gaussians move. Depth alone renders faster and is bitwise identical.
+    shutter, that is the pose at the last row, and `start_pose` X_WB at the first.
 
     Depth is planar z of the surface, the median depth of `rasterize`, in meters
     (`depth_image_32f`) or millimeters (`depth_image_16u`). As in Drake, nearer than `min_depth`
@@ -139,20 +129,13 @@ class SplatCamera(LeafSystem):
         distortion: Distortion | None = None,
         readout: float = 0.0,
     ):
-        """Bakes the scene unless it is baked.
+        """Bakes the scene unless it is baked; see `BakedScene.render`.
 
         Args:
-            scene: a `BakedScene` is held by reference, and many cameras may share it; a
-                `GaussianScene` is baked for this camera.
-            camera_info: intrinsics, width and height.
             X_BC: pose of the camera in the body that carries it; identity if None.
             min_depth, max_depth: range of the depth image [m].
-            near, far: Gaussians with a center outside these planes are not drawn [m].
-            background: color in [0, 1] or environment behind everything.
-            moving: Gaussians that move among the scene's.
             latency: age of the images [s], by which moving Gaussians are late; the pose at the
                 input port must be as old.
-            distortion: lens; a pinhole if None. Pixels without a ray have no surface.
             readout: time between reading the first row and the last [s]; 0 reads all at once.
         """
         super().__init__()

@@ -33,11 +33,7 @@ type Arrays = dict[str, NDArray[Any]]  # of `GaussianScene`, in its order, not c
 
 
 def _drop_invalid(path: Path, arrays: Arrays, recenter: bool = True) -> GaussianScene:
-    """Makes a scene of the valid Gaussians of a file; logs dropped ones and a new origin.
-
-    Args:
-        recenter: whether the origin may move, see `choose_origin`.
-    """
+    """Makes a scene of the valid Gaussians of a file; logs dropped ones and a new origin."""
     means = arrays["means"]
     require(len(means) > 0, f"{path}: the number of Gaussians", ">= 1", 0, "export the scene again")
     origin = (0.0, 0.0, 0.0)
@@ -77,13 +73,11 @@ def _insert_largest(small: NDArray, which: NDArray) -> NDArray[np.float64]:
     return quats
 
 
-# PlayCanvas's compressed PLY, as SuperSplat writes it.
-#
-# Vertices are four words of 32 bits. Each 256 of them share a row of the element `chunk`, between
-# whose bounds they are interpolated: positions and logarithms of scales in 11, 10 and 11 bits,
-# colors and opacity in 8 each (colors between the chunk's bounds too, if it has any), rotations as
-# the three smaller components, in 10 bits each, and 2 bits for the index of the largest. Harmonics,
-# if any, are bytes in an element of their own.
+# PlayCanvas's compressed PLY: vertices are four words of 32 bits. Each 256 share a row of the
+# element `chunk`, between whose bounds they are interpolated: positions and logarithms of scales in
+# 11, 10 and 11 bits, colors and opacity in 8 each (colors only if it has such bounds), rotations as
+# the three smaller components in 10 bits each and 2 bits for the index of the largest. Harmonics
+# are bytes in an element of their own.
 
 _CHUNK = 256
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
@@ -148,11 +142,8 @@ def _unpack_harmonics(element: PlyElement, count: int) -> NDArray[np.float64]:
     return ((values - 0.5) * 8).reshape(count, 3, -1).transpose(0, 2, 1)
 
 
-# The PLY layout of the original 3D Gaussian splatting code.
-#
-# One element `vertex` with the float properties x y z (nx ny nz, unused and optional) f_dc_0..2
-# f_rest_0..3(K-1)-1 (channel-major: all of red, then green, then blue) opacity (logit) scale_0..2
-# (natural logarithm) rot_0..3 (wxyz).
+# The PLY layout of the original 3D Gaussian splatting code: f_rest is channel-major, opacity a
+# logit, scales are natural logarithms and rotations wxyz.
 
 _NORMALS = ["nx", "ny", "nz"]
 _MEANS = ["x", "y", "z"]
@@ -239,16 +230,13 @@ def write_ply(scene: GaussianScene, path: str | Path) -> None:
         PlyData([PlyElement.describe(vertex, "vertex")], byte_order="<").write(str(partial))
 
 
-# Niantic's SPZ, versions 2 to 4: fixed-point numbers, compressed.
-#
-# A header has the letters NGSP, version and count, then degree of the harmonics, fractional bits of
-# positions, flags and another byte. Six sections have of all Gaussians in turn: positions in 3 x 24
-# bits; opacities, colors and logarithms of scales in bytes; rotations (the imaginary part in three
-# bytes, from version 3 on the three smaller components in 10 bits each and 2 bits for the index of
-# the largest); harmonics in bytes. Versions 2 and 3 are one stream of gzip. From version 4 on the
-# header is not compressed; it continues with the offset of a table of the compressed and full sizes
-# of sections, each a stream of zstd, without empty ones. Axes are x right, y up and z back, those
-# of a PLY x right, y down and z forward.
+# Niantic's SPZ, versions 2 to 4: a header (NGSP, version, count, degree of harmonics, fractional
+# bits of positions, flags) and six sections: positions in 3 x 24 bits; opacities, colors and
+# logarithms of scales in bytes; rotations (the imaginary part in three bytes, from version 3 on the
+# three smaller components in 10 bits each and 2 bits for the index of the largest); harmonics in
+# bytes. Versions 2 and 3 are one stream of gzip. The header of version 4 is not compressed; it
+# continues with the offset of a table of the compressed and full sizes of the sections, each a
+# stream of zstd, without empty ones. Axes are x right, y up and z back.
 
 _GZIP, _MAGIC = b"\x1f\x8b", b"NGSP"
 _HEADER = struct.Struct("<4sIIBBBB")

@@ -9,16 +9,7 @@ from torch.autograd.function import once_differentiable
 from splatpilot import _native
 from splatpilot.systems.common.extras import import_extra
 from splatpilot.systems.common.validation import require
-from splatpilot.systems.splats.rasterization import (
-    Views,
-    joined,
-    named_tensors,
-    over_backgrounds,
-    pair_meta,
-    prepare,
-    require_choice,
-    requires_gradients,
-)
+from splatpilot.systems.splats import rasterization
 
 IMAGES = {"color": 3, "normal": 3, "depth": 1, "alpha": 1, "median": 1, "distort": 1}  # channels
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
@@ -33,7 +24,7 @@ class RasterizeSurfels(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx,
-        views: Views,
+        views: rasterization.Views,
         frames: list[_native.SurfelFrame],
         distort: bool,
         results: tuple[Tensor, ...],
@@ -68,25 +59,14 @@ class RasterizeSurfels(torch.autograd.Function):
 
 
 def depth_to_normals(depths: Tensor, viewmats: Tensor, Ks: Tensor) -> Tensor:
-    """Computes unit normals of the surface in depth images by central differences.
+    """Computes unit normals (C, H, W, 3) in the world, toward the camera, of depths (C, H, W, 1).
 
-    ``(p_below - p_above) x (p_right - p_left)`` of the neighbors' points, toward the camera (Huang
-    et al. 2024, equation 15). Differentiable with respect to depths and viewmats.
-
-    Args:
-        depths: (C, H, W, 1) depth along z [m].
-        viewmats: (C, 4, 4) world to camera (x right, y down, z forward).
-        Ks: (C, 3, 3) intrinsics [px]; pixel centers lie at +1/2.
-
-    Returns:
-        (C, H, W, 3) in the world; zero at the border and if the depth is zero all around.
+    By central differences (Huang et al. 2024, equation 15); zero at the border and if the depth is
+    zero all around. Differentiable with respect to depths [m] and viewmats (C, 4, 4).
     """
     valid = depths.ndim == 4 and depths.shape[-1] == 1
     require(valid, "depths", "of shape (C, H, W, 1)", tuple(depths.shape))
-    C, H, W, _ = depths.shape
-    for name, tensor, size in (("viewmats", viewmats, 4), ("Ks", Ks, 3)):
-        shape = (C, size, size)
-        require(tensor.shape == shape, name, f"of shape {shape}", tuple(tensor.shape))
+    H, W = depths.shape[1:3]
     # Component by component: images of vectors take torch several times as long.
     x = ((torch.arange(W) + 0.5 - Ks[:, None, 0, 2]) / Ks[:, None, 0, 0])[:, None, :]
     y = ((torch.arange(H) + 0.5 - Ks[:, None, 1, 2]) / Ks[:, None, 1, 1])[:, :, None]
@@ -130,23 +110,14 @@ def rasterize_surfels(
     """Renders N surfels into C pinhole cameras, with the interface of gsplat.rasterization_2dgs.
 
     A surfel is a Gaussian on the plane through its mean spanned by the first two columns of its
-    rotation. The ray through a pixel meets that plane at (u, v) standard deviations and depth z;
-    then ``a = min(.99, o exp(-r2 / 2))``, with r2 the minimum of u^2 + v^2 and 2 |d|^2, d the
-    pixels to the projected mean. So a surfel smaller than a pixel or seen edge-on is a blob of
-    sqrt(1/2) px at the depth of the mean. Blending is that of `rasterize`, in the order of the
-    means' depths.
+    rotation. One smaller than a pixel or seen edge-on is a blob of sqrt(1/2) px at the depth of the
+    mean. Blending is that of `rasterize`, in the order of the means' depths.
 
     Depths are those at which rays meet the surfels, as in the paper; gsplat blends the depths of
     the means. Rays that meet a surfel nearer than `near_plane` miss it.
 
-    Differentiable with respect to means, quats, scales (the first two), opacities, colors,
-    viewmats and backgrounds. The surfels that a pixel shows and the one of its median are constant.
-
-    Args:
-        means, quats, opacities, colors, viewmats, Ks, width, height, near_plane, far_plane,
-            radius_clip, sh_degree, backgrounds, render_mode, renderer: as for `rasterize`.
-        scales: (N, 3) standard deviations [m], positive; the third does not matter.
-        distloss: Whether to render the distortion; needs a `render_mode` with depth, as gsplat.
+    Args: as for `rasterize`; the third of the scales does not matter. Further:
+        distloss: if true, renders the distortion; needs a `render_mode` with depth, as gsplat.
         depth_mode: Depth of the surface normals: "expected" or "median".
 
     Returns:
@@ -163,31 +134,27 @@ def rasterize_surfels(
             tile_size, tile_width, tile_height, n_cameras, render_distort.
     """
     scene = (means, quats, scales, opacities, colors, viewmats)
-    require_choice("render_mode", render_mode, RENDER_MODES)
-    require_choice("depth_mode", depth_mode, ("expected", "median"))
+    rasterization.require_choice("render_mode", render_mode, RENDER_MODES)
+    rasterization.require_choice("depth_mode", depth_mode, ("expected", "median"))
     with_depth = "D" in render_mode
     require(not distloss or with_depth, "render_mode", "one with depth for distloss", render_mode)
-    tensors = named_tensors(*scene, Ks, backgrounds, sh_degree=sh_degree)
+    tensors = rasterization.named_tensors(*scene, Ks, backgrounds, sh_degree=sh_degree)
+    optics: dict[str, Any] = {
+        "width": width,
+        "height": height,
+        "near_plane": near_plane,
+        "far_plane": far_plane,
+        "radius_clip": radius_clip,
+    }
     if means.device.type == "cuda":
+        modes = {"render_mode": render_mode, "distloss": distloss, "depth_mode": depth_mode}
         image, alpha, *others = _rasterize_by_gsplat(
-            *scene,
-            Ks,
-            width,
-            height,
-            near_plane=near_plane,
-            far_plane=far_plane,
-            radius_clip=radius_clip,
-            sh_degree=sh_degree,
-            render_mode=render_mode,
-            distloss=distloss,
-            depth_mode=depth_mode,
+            *scene, Ks, **optics, sh_degree=sh_degree, **modes
         )
-        image = over_backgrounds(backgrounds, image, alpha, render_mode)
+        image = rasterization.over_backgrounds(backgrounds, image, alpha, render_mode)
         return image, alpha, *others  # pyright: ignore[reportReturnType]
-    clipping = near_plane, far_plane, radius_clip
-    views, arrays = prepare(tensors, (width, height), clipping, sh_degree, renderer, scale_axes=2)
-    keep = requires_gradients(tensors)
-    shape = len(viewmats), height, width
+    views, arrays = rasterization.prepare(tensors, sh_degree, renderer, scale_axes=2, **optics)
+    keep, shape = views.with_gradients, (len(viewmats), height, width)
     images = tuple(torch.empty((*shape, channels)) for channels in IMAGES.values())
     if not distloss:
         images[-1].zero_()
@@ -213,40 +180,26 @@ def rasterize_surfels(
     parts = [color] if "RGB" in render_mode else []
     if with_depth:
         parts.append(expected if "ED" in render_mode else depth)
-    image = over_backgrounds(backgrounds, torch.cat(parts, -1), alpha, render_mode)
-    ids, radii, means2d, depths, normals = joined(projected)
-    meta = pair_meta([len(of_camera[0]) for of_camera in projected], width, height) | {
-        "gaussian_ids": ids,
-        "radii": radii,
-        "means2d": means2d,
-        "depths": depths,
-        "normals": normals,
-        "opacities": torch.from_numpy(arrays["opacities"])[ids],
-        "render_distort": distort,
-    }
+    image = rasterization.over_backgrounds(backgrounds, torch.cat(parts, -1), alpha, render_mode)
+    names = "gaussian_ids", "radii", "means2d", "depths", "normals"
+    meta = rasterization.pair_meta(names, projected, width, height)
+    meta["opacities"] = torch.from_numpy(arrays["opacities"])[meta["gaussian_ids"]]
+    meta["render_distort"] = distort
     return image, alpha, normal, surface, distort, median, meta
 
 
-def _rasterize_by_gsplat(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    viewmats: Tensor,
-    *arguments: Any,
-    **options: Any,
-) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Tensor, Tensor, dict[str, Any]]:
+def _rasterize_by_gsplat(*scene: Tensor, **options: Any) -> tuple[Any, ...]:
     """Returns the results of `rasterize_surfels` without backgrounds.
 
     gsplat 1.5.3 fails on backgrounds of colors with depth, gives meta of invisible pairs too, and
     surface normals of one camera without the camera's dimension.
     """
     gsplat = import_extra("gsplat", "cuda")
+    *geometry, colors, viewmats, Ks = scene
     if options["sh_degree"] is None:
-        colors = colors.expand(len(viewmats), len(means), -1)
+        colors = colors.expand(len(viewmats), len(geometry[0]), -1)
     image, alpha, normals, surface, distort, median, dense = gsplat.rasterization_2dgs(
-        means, quats, scales, opacities, colors, viewmats, *arguments, **options
+        *geometry, colors, viewmats, Ks, **options
     )
     if surface is not None:
         surface = surface.reshape(normals.shape)

@@ -17,7 +17,7 @@ import torch
 from pydrake.math import RigidTransform
 from torch import Tensor
 
-from splatpilot.diagrams.worlds.feasibility import draw_start_and_goal
+from splatpilot.diagrams.worlds.feasibility import choose_start_and_goal
 from splatpilot.diagrams.worlds.world_registry import (
     WorldConfig,
     make_spec,
@@ -310,6 +310,8 @@ def _make_worlds(
             worlds.append(cache.world(scenario_world(turn), seed))
             continue
         esdf, conservative = scenes[turn]
-        ends = draw_start_and_goal(esdf, VEHICLE_RADIUS, seed, _SCENE_MARGIN, _MAX_SCENE_PATH)
-        worlds.append(TrainingWorld(conservative, esdf.lower_W, esdf.upper_W, *ends[:2]))
+        p_WS, p_WG, _ = choose_start_and_goal(
+            esdf, VEHICLE_RADIUS, _SCENE_MARGIN, _MAX_SCENE_PATH, seed=seed
+        )
+        worlds.append(TrainingWorld(conservative, esdf.lower_W, esdf.upper_W, p_WS, p_WG))
     return worlds

@@ -424,10 +424,7 @@ def crowns(layout: ForestLayout, light: Daylight, rng: np.random.Generator) -> G
 
 
 def forest_spec(config: ForestConfig, seed: int) -> WorldSpec:
-    """Grows the forest of `config`, bitwise identical for the same seed.
-
-    Gaussians and distance field come from the same layout; leaves are above the flyable volume or
-    flat on the ground.
+    """Grows the forest of `config`.
 
     A path from start to goal exists by construction: trunks grown by the vehicle's radius are
     disjoint and leave space at the sides (`TrunksConfig.check`), so they cannot close a line from

@@ -193,5 +193,5 @@ def build(spec: WorldSpec) -> World:
         gaussians = spec.gaussians(light)
     else:
         gaussians = merge([draw(spec, spec.solids, light), *spec.surroundings()])
-    red, green, blue = light.haze.tolist()
-    return World(spec.name, gaussians, field, esdf, (red, green, blue), spec.p_WS, spec.p_WG)
+    haze = tuple(light.haze.tolist())
+    return World(spec.name, gaussians, field, esdf, haze, spec.p_WS, spec.p_WG)

@@ -12,10 +12,8 @@ _PRIMES = np.array([0x9E3779B1, 0x85EBCA77, 0xC2B2AE3D], dtype=np.uint32)
 
 
 def hash_unit(cell: ArrayLike, seed: int = 0) -> Array:
-    """Returns a pseudo-random number in [0, 1) for every lattice cell (..., d), d = 1 to 3.
-
-    The coordinates, each times a large odd number, are mixed by the `lowbias32` hash.
-    """
+    """Returns a pseudo-random number in [0, 1) for every lattice cell (..., d), d = 1 to 3, by the
+    `lowbias32` hash."""
     cell = np.asarray(cell).astype(np.int64).astype(np.uint32)  # wraps negative cells
     h = np.full(cell.shape[:-1], _seeded(seed), dtype=np.uint32)
     for axis in range(cell.shape[-1]):
@@ -40,8 +38,7 @@ def _mix_bits(h: NDArray[np.uint32]) -> NDArray[np.uint32]:
 def value_noise(p: ArrayLike, seed: int = 0) -> Array:
     """Computes smooth noise in [-1, 1] with a period of about two units at (..., d), d = 1 to 3.
 
-    Random values on the integer lattice are blended with 6 t^5 - 15 t^4 + 10 t^3, whose first and
-    second derivatives vanish at the lattice.
+    Random values on the integer lattice are blended with 6 t^5 - 15 t^4 + 10 t^3.
     """
     p = np.asarray(p, dtype=np.float64)
     # Weight and hash of each corner of a cell, axis by axis.

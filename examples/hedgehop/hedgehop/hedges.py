@@ -6,7 +6,7 @@ import numpy as np
 
 from splatpilot import Config, bounded, register_world
 from splatpilot.diagrams.worlds.building_blocks import box, daylight, ground, start_and_goal
-from splatpilot.diagrams.worlds.feasibility import draw_feasible
+from splatpilot.diagrams.worlds.feasibility import until_feasible
 from splatpilot.diagrams.worlds.solids.solid import WorldSpec
 from splatpilot.diagrams.worlds.solids.surfaces import FloorPlan
 from splatpilot.systems.common.validation import require_field
@@ -29,23 +29,19 @@ class HedgesConfig(Config):
         require_field(self, "tallest", 0.5 <= self.tallest <= top, f"in [0.5, {top:g}] m")
 
 
-def hedges_spec(config: HedgesConfig, seed: int) -> WorldSpec:
+@until_feasible
+def hedges_spec(config: HedgesConfig, seed: int, rng: np.random.Generator) -> WorldSpec:
     """Draws the field as solids, start and goal."""
-    config.validate()
     plan = FloorPlan.of_size(config.length, config.width, config.height)
     half = config.width / 2
-
-    def draw(rng: np.random.Generator) -> WorldSpec:
-        p_WS, p_WG = start_and_goal(plan, rng)
-        hedges = []
-        for x in np.linspace(0, config.length, config.hedges + 2)[1:-1]:
-            top = config.tallest * rng.uniform(0.5, 1.0)
-            hedges.append(box([x, -half, 0], [x + 0.5, half, top], "foliage", int(x)))
-        _, light = daylight(rng)
-        solids = [ground("tiles"), *hedges]
-        return WorldSpec("hedges", plan.lower, plan.upper, solids, p_WS, p_WG, light, seed)
-
-    return draw_feasible(draw, seed)
+    p_WS, p_WG = start_and_goal(plan, rng)
+    hedges = []
+    for x in np.linspace(0, config.length, config.hedges + 2)[1:-1]:
+        top = config.tallest * rng.uniform(0.5, 1.0)
+        hedges.append(box([x, -half, 0], [x + 0.5, half, top], "foliage", int(x)))
+    _, light = daylight(rng)
+    solids = [ground("tiles"), *hedges]
+    return WorldSpec("hedges", plan.lower, plan.upper, solids, p_WS, p_WG, light, seed)
 
 
 register_world(HedgesConfig, make_spec=hedges_spec)

@@ -59,12 +59,6 @@ def test_spheres_are_seen_where_they_are_hit(course, time):
     centers, radii = centers[present], radii[present]
     moving = np.flatnonzero([len(o.path) > 1 for o in np.array(obstacles)[present]])
     assert len(moving) >= 5
-    rng = np.random.default_rng(0)
-    p_WQ = rng.uniform(course.distance_field.lower_W, course.distance_field.upper_W, (300, 3))
-    to_spheres = np.linalg.norm(p_WQ[:, None] - centers, axis=2) - radii
-    np.testing.assert_allclose(
-        course.field_at(time).distance(p_WQ), np.minimum(to_spheres.min(axis=1), p_WQ[:, 2])
-    )
     wrong, pixels = 0, 0
     for sphere in moving:
         p_WC = centers[sphere] - [radii[sphere] + 2.0, 0.0, 0.0]
@@ -101,19 +95,6 @@ def test_scenarios_have_the_rules(level, course):
     np.testing.assert_array_equal(course.distance_field.lower_W, [-5, -10, 0])
     np.testing.assert_array_equal(course.distance_field.upper_W, [65, 10, 10])
     np.testing.assert_allclose(sample_initial_state(scenario, course)[:3], [0, 0, 1], atol=0.1)
-
-
-@pytest.mark.parametrize(
-    ("changes", "match"),
-    [
-        ({"level": "medium!"}, "level must be in {easy, medium, hard}, got medium!"),
-        ({"first_seed": -1}, "first_seed must be .* got -1"),
-        ({"voxel_size": 0.0}, "voxel_size must be .* got 0.0"),
-    ],
-)
-def test_impossible_courses_are_refused(changes, match):
-    with pytest.raises(ValueError, match=match):
-        make_world(DodgeDroneConfig(**changes), 0)
 
 
 # Rows of obstacle lists that are stored with the challenge's simulator (uzh-rpg/flightmare) and

@@ -49,13 +49,6 @@ def test_outputs_beside_an_obstacle():
     assert out["field_state"][0] == FieldState.FREE
 
 
-def test_collision_begins_at_the_radius():
-    system = EsdfCollision(CountingField(), radius=0.5)
-    assert outputs_at(system, [1.49, 0.0, 0.0])["in_collision"][0] == 1.0
-    assert outputs_at(system, [1.51, 0.0, 0.0])["in_collision"][0] == 0.0
-    assert outputs_at(system, [0.2, 0.0, 0.0])["field_state"][0] == FieldState.OCCUPIED
-
-
 def test_outside_the_field_no_collision_is_claimed():
     out = outputs_at(EsdfCollision(CountingField()), [0.0, 0.0, 5.1])
     for name in ("distance", "clearance", "barrier"):

@@ -159,9 +159,7 @@ def test_an_empty_union_is_infinitely_far():
     ("make", "message"),
     [
         (lambda: Sphere(np.zeros(3), 0.0), "Sphere.radius must be .* got 0.0"),
-        (lambda: Capsule(A, B, -1.0), "Capsule.radius must be .* got -1.0"),
         (lambda: Cylinder(A, A, 1.0), "Cylinder.p_WB must be apart"),
-        (lambda: Cylinder(A, B, np.nan), "Cylinder.radius must be .* got nan"),
         (lambda: Box(X_WO, np.array([1.0, 0.0, 1.0])), "Box.size must be > 0"),
         (lambda: HalfSpace(np.zeros(3), 1.0), "normal must be a direction"),
         (lambda: Sphere(np.array([0.0, np.nan, 0.0]), 1.0), "Sphere.p_WO must be"),
@@ -224,15 +222,3 @@ def test_samples_of_trajectories_meet_the_balls_of_their_times():
     for s, time in enumerate(times):
         expected = SPHERES.among(field, time).distance(p_WQ[:, s])
         np.testing.assert_array_equal(along[:, s], expected)
-
-
-def test_balls_without_a_path_are_refused():
-    path = np.zeros((1, 3))
-    for radii, paths, period, match in (
-        ([1.0, 1.0], [path], 0.1, "paths must be 2"),
-        ([1.0], [path[:0]], 0.1, "at least one row"),
-        ([0.0], [path], 0.1, "radii must be > 0"),
-        ([1.0], [path], 0.0, "period must be > 0"),
-    ):
-        with pytest.raises(ValueError, match=match):
-            MovingSpheres(radii, paths, period)

@@ -10,7 +10,7 @@ from baked_scenes import HEIGHT, LEVELS, WIDTH, X_WC, K, random_scene
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.sensors import CameraInfo
 from random_scenes import random_scene as random_gaussians
-from reference_rasterizer import median_depth, single_gaussian
+from reference_rasterizer import median_depth
 
 from splatpilot.systems.splats import rasterize
 from splatpilot.systems.splats.baked_scene import (
@@ -133,10 +133,8 @@ def test_near_and_far_cut_by_depth_of_center():
     ("change", "message"),
     [
         ({"K": np.eye(4)}, r"K must be of shape \(3, 3\), got \(4, 4\)"),
-        ({"K": np.diag([1.0, np.nan, 1.0])}, "K must be finite"),
         ({"height": -1}, "image size must be .* got 83 x -1"),
         ({"near": 0.0}, "0 < near < far"),
-        ({"near": 5.0, "far": 4.0}, "depth range must be .* got 5 to 4 m"),
         ({"max_depth": -1.0}, "max_depth must be > 0 m, got -1"),
         ({"background": (1.0, 2.0)}, r"background must be 3 finite numbers, got \[1.0, 2.0\]"),
     ],
@@ -277,29 +275,6 @@ def test_large_gaussians_close_to_the_camera_are_no_haze(simd):
         depth = BakedScene(floor, simd=simd).render(K_WALL, **SIZE, X_WC=RigidTransform()).depth
         assert (depth[above] == 0).all()
         assert np.median(np.abs(depth / truth - 1)[near]) < limit
-
-
-def test_a_pixel_next_to_an_edge_shows_the_background_surface():
-    near, far = RigidTransform([-2.0, 0, 1.0]), RigidTransform([0, 0, 6.0])
-    scene = wall_scene(wall(near, 2.0, 2.0), wall(far, 8.0, 8.0, step=0.1))  # near ends at x = 0
-    depth = BakedScene(scene).render(K_WALL, **SIZE, X_WC=RigidTransform()).depth
-    error = np.minimum(np.abs(depth - 1.0), np.abs(depth - 6.0))
-    assert error.max() < 1e-3
-    x = (np.arange(SIZE["width"]) + 0.5 - K_WALL[0, 2]) / K_WALL[0, 0]  # [m] on the near wall
-    assert (depth[:, x < 0.0] < 2.0).all() and (depth[:, x > 0.07] > 5.0).all()
-
-
-def test_half_of_the_light_decides():
-    one = single_gaussian(opacity=0.4)
-    size = {"width": 33, "height": 33}
-    assert (rasterize(**one, **size, render_mode="MD")[0] == 0).all()
-    two = one | {
-        name: torch.cat([one[name], one[name]])
-        for name in ("means", "quats", "scales", "opacities", "colors")
-    }
-    two["means"][1, 2] = 3.0
-    depth = rasterize(**two, **size, render_mode="MD")[0][0, ..., 0]
-    assert abs(depth[16, 16].item() - 3.0) < 1e-5 and depth[0, 0] == 0
 
 
 def test_median_depth_has_no_gradient():

@@ -1,9 +1,7 @@
 import gc
 import math
-import os
 import types
 import weakref
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -143,12 +141,6 @@ def test_every_mode_agrees_with_reference(mode, simd):
     assert all(expected.any() for name, (_, expected) in pairs.items() if name != "colors")
 
 
-def test_modes_show_the_same_pixels():
-    images = {mode: rasterize(**random_scene(), **IMAGE, render_mode=mode)[0] for mode in MODES}
-    assert torch.equal(images["RGB"], images["RGB+D"][..., :3])
-    assert torch.equal(images["ED"][..., 0], images["RGB+ED"][..., 3])
-
-
 @pytest.mark.parametrize("simd", LEVELS)
 def test_antialiased_agrees_with_reference(simd):
     scene = random_scene(seed=3)
@@ -183,16 +175,6 @@ def test_long_tile_lists_agree_with_reference(simd):
     scene["means"] *= 0.3
     renderer = create_renderer(1, simd)
     check(scene, size=(21, 18), min_clear=0.9, p99=1e-3, renderer=renderer)
-
-
-@pytest.mark.parametrize("size", [(1, 1), (3, 5), (16, 16), (17, 33), (97, 1)])
-def test_odd_sizes_agree_with_reference(size):
-    for seed in range(7, 12):
-        scene = random_scene(seed=seed, size=size)
-        if (reference_views(scene, size, "RGB")[2] > 1e-3).double().mean() > 0.97:
-            check(scene, size=size)
-            return
-    raise AssertionError("too many pixels at thresholds in every scene")
 
 
 def test_accuracy_does_not_depend_on_distance_from_the_origin():
@@ -299,15 +281,6 @@ def test_graphs_may_overlap_and_be_used_again():
         assert all(torch.equal(a, b) for a, b in zip(gradients, alone[i], strict=True))
 
 
-def test_gradients_of_one_pass_do_not_enter_the_next():
-    scene = leaves(random_scene(count=50, seed=3))
-    image, _, meta = rasterize(**scene, **IMAGE)
-    torch.autograd.grad(image.sum(), meta["means2d"], retain_graph=True)
-    inputs = [scene["means"], scene["scales"]]
-    v_means, v_scales = torch.autograd.grad(meta["means2d"].sum(), inputs)
-    assert v_means.any() and not v_scales.any()
-
-
 def test_rendered_tensors_are_freed():
     gc.disable()
     try:
@@ -318,15 +291,6 @@ def test_rendered_tensors_are_freed():
         assert not any(ref() is not None for ref in watched)
     finally:
         gc.enable()
-
-
-def test_invisible_gaussians_have_zero_gradients():
-    narrow = leaves(random_scene(seed=20))
-    image, _, meta = rasterize(**narrow, **IMAGE)
-    image.sum().backward()
-    invisible = torch.ones(300, dtype=torch.bool)
-    invisible[meta["gaussian_ids"]] = False
-    assert invisible.any() and all(not narrow[name].grad[invisible].any() for name in SCENE)
 
 
 @pytest.mark.parametrize("draw", DRAWS)
@@ -491,10 +455,6 @@ def to_meta(scene):
     ("changed", "message"),
     [
         (change("means", lambda t: t[:, :2]), r"means must .*\(300, 3\), got \(300, 2\)"),
-        (change("quats", lambda t: t[:-1]), r"quats must .* got \(299, 4\)"),
-        (change("opacities", lambda t: t[:, None]), r"opacities must .* got \(300, 1\)"),
-        (change("colors", lambda t: t[:, :1]), r"colors must .* got \(300, 1\)"),
-        (change("viewmats", lambda t: t[0]), r"viewmats must .* got \(4, 4\)"),
         (change("viewmats", lambda t: t[:0]), r"(viewmats|Ks) must"),
         (change("scales", lambda t: t.double()), r"scales must be torch.float32, got"),
         (change("quats", lambda t: t.to("meta")), "quats must be on cpu like means, got meta"),
@@ -502,16 +462,13 @@ def to_meta(scene):
         (put("means", (7, 1), math.nan), r"means\[7, 1\] must be finite, got nan"),
         (put("colors", (9, 2), math.inf), r"colors\[9, 2\] must be finite, got inf"),
         (put("scales", (3, 0), 0.0), r"scales\[3, 0\] must be > 0 m, got 0"),
-        (put("scales", (3, 1), -1.0), r"scales\[3, 1\] must be > 0 m, got -1"),
         (put("opacities", 4, 1.5), r"opacities\[4\] must be in \[0, 1\], got 1.5"),
         (put("quats", 5, 0.0), r"quats\[5\] must be of a length > 0, got \[0. 0. 0. 0.\]"),
         (put("Ks", (0, 0, 0), 0.0), r"focal lengths of K must be > 0 px, got 0"),
         (change("viewmats", lambda t: 2 * t), r"viewmats\[0\] must be a rigid transform"),
         (change("Ks", lambda t: t.clone().requires_grad_()), r"Ks must be without a gradient"),
         (options(width=0), r"image size must .* got 0 x 45"),
-        (options(height=-3), r"image size must .* got 67 x -3"),
         (options(near_plane=0.0), r"0 < near < far"),
-        (options(far_plane=0.001), r"0 < near < far"),
         (options(render_mode="RGBD"), r"render_mode must .* got 'RGBD'"),
         (options(sh_degree=4), r"sh_degree must .* got 4"),
         (options(sh_degree=1), r"colors must be of shape \(300, K, 3\)"),
@@ -555,25 +512,3 @@ def test_backgrounds_never_reach_gsplat(monkeypatch):
     assert "backgrounds" not in options and options["render_mode"] == "RGB+ED"
     assert_close(image[..., :3], shown[..., :3] + (1 - alpha) * backgrounds[:, None, None])
     assert_close(image[..., 3], shown[..., 3])
-
-
-@pytest.mark.skipif("SPLATPILOT_DATA" not in os.environ, reason="SPLATPILOT_DATA is not set")
-@pytest.mark.parametrize("camera", [0, 1])
-def test_garden_is_within_gsplats_tolerances(camera):
-    # Points of the garden as random Gaussians, as in gsplat's tests, but fewer and wider.
-    garden = np.load(Path(os.environ["SPLATPILOT_DATA"]) / "test_garden.npz")
-    tensors = {name: torch.from_numpy(garden[name]).float() for name in garden.files}
-    g = torch.Generator().manual_seed(42)
-    inside = torch.nonzero((tensors["means3d"].abs() <= 2.0).all(1))[:, 0]
-    inside = inside[torch.randperm(len(inside), generator=g)[:1500]]
-    scene = {
-        "means": tensors["means3d"][inside],
-        "quats": normal_tensor(42, 1500, 4),
-        "scales": 6 * (1e-4 + 0.02 * torch.rand(1500, 3, generator=g)),
-        "opacities": torch.rand(1500, generator=g),
-        "colors": tensors["colors"][inside] / 255,
-        "viewmats": tensors["viewmats"][camera, None],
-        "Ks": torch.diag(torch.tensor([0.125, 0.125, 1.0])) @ tensors["Ks"][camera, None],
-    }
-    size = int(garden["width"]) // 8, int(garden["height"]) // 8
-    check(scene, size=size, mode="RGB+D", min_clear=0.9, p99=1e-3)

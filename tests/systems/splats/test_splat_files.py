@@ -1,6 +1,5 @@
 import dataclasses
 import gzip
-import os
 import struct
 
 import gsply
@@ -91,16 +90,13 @@ def test_records(tmp_path):
     [
         ("a.ply", b"version https://git-lfs.github.com/spec/v1\noid ", "the pointer of git-LFS"),
         ("a.ply", b"", "the size must be > 0 bytes"),
-        ("a.ply", b"<!DOCTYPE html>", "a web page"),
         ("a.dat", b"nothing that is known", "not PLY, SPZ or .splat"),
         ("a.glb", b"glTF\x02\x00\x00\x00", "a binary glTF; convert it to PLY"),
         ("a.sog", b"PK\x03\x04", "a SOG; convert it to PLY"),
         ("a.zip", b"PK\x03\x04", "an archive; if it is SOG"),
         ("a.ksplat", bytes(64), "a KSPLAT; convert it to PLY"),
         ("a.splat", bytes(63), "the size must be a multiple of 32 bytes, got 63"),
-        ("a.spz", b"NGSP\x04\x00\x00\x00", "not a readable SPZ file"),
         ("a.spz", spz(5, 9)[:16], r".*the version must be 4, got 5"),
-        ("a.spz", spz(2, 9), r".*the version must be 4, got 2"),
         ("a.spz", gzip.compress(spz(4, 9), mtime=0), r".*the version must be 2 or 3, got 4"),
         ("a.spz", spz(4, 9), "not a readable SPZ file"),
         ("a.spz", gzip.compress(spz(2, 9), mtime=0), r".*must be of 171 bytes, got 16"),
@@ -253,10 +249,8 @@ def test_odd_number_of_coefficients(tmp_path, without):
     ("column", "value", "message"),
     [
         ("y", np.nan, r"means\[4, .*finite"),
-        ("scale_1", np.inf, r"scales\[4, .*finite"),
         ("scale_1", -1e4, r"scales\[4, .*> 0"),
         ("opacity", np.nan, r"opacities\[4\] .*finite"),
-        ("f_rest_3", np.nan, r"sh\[4, .*finite"),
     ],
 )
 def test_damaged_gaussians(tmp_path, caplog, column, value, message):
@@ -279,25 +273,3 @@ def test_surfels(tmp_path):
     scene, flat = read_ply(tmp_path / "a.ply"), read_ply(tmp_path / "b.ply")
     np.testing.assert_array_equal(flat.scales[:, :2], scene.scales[:, :2])
     np.testing.assert_allclose(flat.scales[:, 2], 0.01 * scene.scales[:, :2].min(1), rtol=1e-6)
-
-
-def test_failed_write_leaves_the_old_file_alone(tmp_path, monkeypatch):
-    path = tmp_path / "scene.ply"
-    write_ply(small_scene(7, sh_degree=1), path)
-    before = path.read_bytes()
-
-    def write_half(self, stream):
-        with open(stream, "wb") as file:
-            file.write(b"ply\n")
-        raise OSError(28, os.strerror(28))
-
-    monkeypatch.setattr(PlyData, "write", write_half)
-    with pytest.raises(OSError, match=r"scene\.ply: cannot be written \(No space left"):
-        write_ply(small_scene(7, seed=1), path)
-    assert path.read_bytes() == before
-    assert list(tmp_path.iterdir()) == [path]
-
-
-def test_unwritable_folder(tmp_path):
-    with pytest.raises(OSError, match=r"scene\.ply: cannot be written .*the folder writable"):
-        write_ply(small_scene(7), tmp_path / "nowhere" / "scene.ply")
