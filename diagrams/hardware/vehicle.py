@@ -13,7 +13,6 @@ from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort
 
 from splatpilot.diagrams.flight import blocks
 from splatpilot.diagrams.flight.flight import (
-    Flight,
     Outcome,
     flight_outcome,
     has_landed,
@@ -25,8 +24,7 @@ from splatpilot.diagrams.flight.flight import (
 from splatpilot.diagrams.flight.flight_diagram import LOG_PERIOD
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.hardware.bridge import HardwareConfig, image_codecs, require_messages_for
-from splatpilot.diagrams.hardware.message_ports import MessagePorts
-from splatpilot.diagrams.hardware.real_time import output, run_in_real_time
+from splatpilot.diagrams.hardware.real_time import MessagePorts, output, run_in_real_time
 from splatpilot.diagrams.worlds.appearance import randomize_appearance
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import make_world
@@ -53,10 +51,7 @@ def BuildVehicleDiagram(
 ) -> Diagram:
     """Builds the diagram of a simulated vehicle, in a world, with the messages of a real one.
 
-    Systems, by name: those of `MessagePorts` and `AddObservation`; `plant`, `pose`, `collision`;
-    `failsafe`, which hovers and then lands if commands cease, as autopilots do; `held_command`;
-    and the loggers `state_log`, `command_log`. A vehicle that is commanded by velocities has
-    `setpoint`, `velocity_tracker` and `controller`.
+    Its failsafe hovers and then lands if commands cease, as autopilots do.
 
     .. pydrake_system::
 
@@ -144,14 +139,10 @@ def _AddVelocityControl(
     parts = ports.add("setpoint", primitives.Demultiplexer([3, 1]), u0=setpoint)
     velocity, heading = parts.get_output_port(0), parts.get_output_port(1)
     tracker = ports.add("velocity_tracker", VelocityTracker(), state=state, velocity=velocity)
-    controller = ports.add(
-        "controller",
-        FlatnessController(scenario.controller, scenario.vehicle),
-        state=state,
-        acceleration=tracker.GetOutputPort("acceleration"),
-        heading=heading,
-    )
-    return controller.GetOutputPort("command")
+    acceleration = tracker.GetOutputPort("acceleration")
+    controller = FlatnessController(scenario.controller, scenario.vehicle)
+    sources = {"state": state, "acceleration": acceleration, "heading": heading}
+    return ports.add("controller", controller, **sources).GetOutputPort("command")
 
 
 @locks_folder("out")
@@ -201,22 +192,18 @@ def run(*, scenario: Scenario, config: HardwareConfig, out: Path) -> dict[str, f
     wall_time = time.monotonic() - started
     diagram.ForcedPublish(root)  # The bridge needs the last state too.
     ended = outcome() or Outcome.TIMEOUT
-    flight = _since(took_off, record_flight(diagram, root, world, ended, wall_time))
+    flight = record_flight(diagram, root, world, ended, wall_time)
+    rows = flight.times >= took_off
+    flight = dataclasses.replace(
+        flight,
+        times=flight.times[rows] - took_off,
+        states=flight.states[rows],
+        commands=flight.commands[rows],
+        clearances=flight.clearances[rows],
+        wall_time=flight.wall_time - took_off,
+    )
     write_flight(out, scenario, flight)
     summary = flight.summary() | {"overruns": overruns}
     write_summary(out, summary)
     print(*(f"{name:<18} {value}" for name, value in summary.items()), sep="\n")
     return summary
-
-
-def _since(time: float, flight: Flight) -> Flight:
-    """Returns the part of a flight from `time` [s] on, which becomes 0."""
-    rows = flight.times >= time
-    return dataclasses.replace(
-        flight,
-        times=flight.times[rows] - time,
-        states=flight.states[rows],
-        commands=flight.commands[rows],
-        clearances=flight.clearances[rows],
-        wall_time=flight.wall_time - time,
-    )

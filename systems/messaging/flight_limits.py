@@ -115,7 +115,10 @@ def limit_velocity(
     lower, upper = near.box.lower_W + VEHICLE_RADIUS, near.box.upper_W - VEHICLE_RADIUS
     if landing:
         lower[2] = -math.inf
-    limited = limit_to_box(velocity, motion.p_WB + motion.stop, lower, upper, motion.reaction_time)
+    limited, rest = velocity, motion.p_WB + motion.stop
+    for axis, away in enumerate(np.eye(3)):
+        limited = limit_approach(limited, away, rest[axis] - lower[axis], motion.reaction_time)
+        limited = limit_approach(limited, -away, upper[axis] - rest[axis], motion.reaction_time)
     apply(limited, status.LIMITED_GEOFENCE)
 
     # The path, last: velocities along a fence or an obstacle may lead into another.
@@ -181,18 +184,4 @@ def limit_ahead(
             free = along[max(int(np.argmax(blocked)) - 1, 0)]
             room = free - length if path is stop else free
             return limit_approach(velocity, -path / length, room, reaction_time)
-    return velocity
-
-
-def limit_to_box(
-    velocity: np.ndarray,
-    rest: np.ndarray,
-    lower: np.ndarray,
-    upper: np.ndarray,
-    reaction_time: float,
-) -> np.ndarray:
-    """Limits a commanded velocity (3,) [m/s] so that the point of rest (3,) [m] stays in a box."""
-    for axis, away in enumerate(np.eye(3)):
-        velocity = limit_approach(velocity, away, rest[axis] - lower[axis], reaction_time)
-        velocity = limit_approach(velocity, -away, upper[axis] - rest[axis], reaction_time)
     return velocity

@@ -168,13 +168,12 @@ class FlatnessController(LeafSystem):
         input_ports: [state, waypoint, acceleration, heading]
         output_ports: [command]
 
-    - ``state`` (13): ``[p_WB (3) [m], v_WB (3) [m/s], q_WB (4, wxyz), w_WB_B (3) [rad/s]]``.
+    - ``state`` (13), ``command`` (4): see `QuadrotorPlant`; the command is held between updates,
+      and that of hovering before the first.
     - ``waypoint`` (3): p_WR [m], where the vehicle should be ``lookahead`` seconds from now; or
       ``acceleration`` (3): a_WB [m/s^2], gravity excluded. Connect exactly one.
     - ``heading`` (1), optional: of body x, seen from above, [rad] from world x; along the motion if
       it is not connected or NaN.
-    - ``command`` (4): ``[c [m/s^2], w_cmd_B (3) [rad/s]]``, held between updates; hover thrust
-      before the first.
 
     Updates every ``period`` [s] from time 0. With z_B the body z axis and limits at every step::
 
