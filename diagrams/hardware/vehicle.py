@@ -93,27 +93,23 @@ def BuildVehicleDiagram(
         velocity_setpoint=received if by_velocity else None,
         command=command,
     )
-    held = builder.AddNamedSystem("held_command", primitives.ZeroOrderHold(config.tick, 4))
-    builder.Connect(failsafe.GetOutputPort("command"), held.get_input_port())
-    builder.Connect(held.get_output_port(), plant.GetInputPort("command"))
+    hold = primitives.ZeroOrderHold(config.tick, 4)
+    held = ports.add("held_command", hold, u=failsafe.GetOutputPort("command")).get_output_port()
+    builder.Connect(held, plant.GetInputPort("command"))
 
     # Status, state and motion capture.
-    armed = builder.AddSystem(primitives.ConstantVectorSource(np.ones(1)))
-    status = builder.AddSystem(primitives.Multiplexer(2))
-    builder.Connect(armed.get_output_port(), status.get_input_port(0))
-    builder.Connect(failsafe.GetOutputPort("is_ready"), status.get_input_port(1))
+    armed = builder.AddSystem(primitives.ConstantVectorSource(np.ones(1))).get_output_port()
+    ready = failsafe.GetOutputPort("is_ready")
+    status = ports.add("status", primitives.Multiplexer(2), u0=armed, u1=ready)
     ports.publish(codecs.VehicleStatusCodec(), status.get_output_port(0), STATUS_PERIOD)
     sizes = np.repeat([_NOISE, 0.0], [3, 10])
-    noise = builder.AddSystem(primitives.Sine(sizes, np.ones(13), np.zeros(13)))
-    estimate = builder.AddSystem(primitives.Adder(2, 13))
-    builder.Connect(state, estimate.get_input_port(0))
-    builder.Connect(noise.get_output_port(0), estimate.get_input_port(1))
+    noise = builder.AddSystem(primitives.Sine(sizes, np.ones(13), np.zeros(13))).get_output_port(0)
+    estimate = ports.add("estimate", primitives.Adder(2, 13), u0=state, u1=noise)
     ports.publish(codecs.StateCodec(), estimate.get_output_port(), 1 / config.state_rate)
     if config.body:
-        tracked = builder.AddSystem(primitives.MatrixGain(np.eye(13)[[0, 1, 2, 6, 7, 8, 9]]))
-        builder.Connect(state, tracked.get_input_port())
-        codec = codecs.MotionCaptureCodec(config.body)
-        ports.publish(codec, tracked.get_output_port(), 1 / config.state_rate)
+        pick = primitives.MatrixGain(np.eye(13)[[0, 1, 2, 6, 7, 8, 9]])
+        tracked = ports.add("tracked", pick, u0=state).get_output_port()
+        ports.publish(codecs.MotionCaptureCodec(config.body), tracked, 1 / config.state_rate)
 
     # Images, whose size and rate are the policy's.
     policy = blocks.make_policy(scenario, world)
@@ -121,7 +117,7 @@ def BuildVehicleDiagram(
     for codec in image_codecs(scenario, policy):
         ports.publish(codec, images[codec.port], blocks.decision_period(scenario, policy))
 
-    for name, port in (("state", state), ("command", held.get_output_port())):
+    for name, port in (("state", state), ("command", held)):
         primitives.LogVectorOutput(port, builder, LOG_PERIOD).set_name(f"{name}_log")
         builder.ExportOutput(port, name)
     builder.ExportOutput(command_age, "command_age")

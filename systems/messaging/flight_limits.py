@@ -139,10 +139,9 @@ def stopping_displacement(
 ) -> np.ndarray:
     """Predicts the displacement (3,) [m] of a vehicle from a command to stop until rest.
 
-    Its velocity v follows a commanded velocity u as v' = (u - v) / T, with T the response time,
-    but brakes with at most a: over the distance T v, or (v² + (a T)²) / (2 a) from v = a T. The
-    point p + T v at which it would rest then moves with exactly the commanded velocity, since
-    (p + T v)' = v + (u - v) = u.
+    Its velocity v follows a commanded velocity u as v' = (u - v) / T, with T the response time, but
+    brakes with at most a: over the distance T v, or (v² + (a T)²) / (2 a) from v = a T. The point
+    of rest p + T v then moves with the commanded velocity: (p + T v)' = v + (u - v) = u.
     """
     speed, exponential = float(np.linalg.norm(velocity)), deceleration * response_time
     if speed <= exponential:

@@ -107,7 +107,15 @@ def flatness_command(
     config: FlatnessControllerConfig,
     params: QuadrotorParams,
 ) -> Any:
-    """Returns thrust over mass and body rates (..., 4) for an acceleration: `FlatnessController`.
+    """Returns thrust over mass and body rates (..., 4) for an acceleration.
+
+    With z_B the body z axis and limits at every step::
+
+        f_W     = a_WB + g e_z + drag v_WB
+        c       = f_W · z_B
+        w_cmd_B = [tilt_gain · tilt, yaw_gain · yaw]
+
+    Tilt and yaw rotate the body so that z lies along f_W and x along the heading or the motion.
 
     Args:
         state: (..., 13).
@@ -175,15 +183,8 @@ class FlatnessController(LeafSystem):
     - ``heading`` (1), optional: of body x, seen from above, [rad] from world x; along the motion if
       it is not connected or NaN.
 
-    Updates every ``period`` [s] from time 0. With z_B the body z axis and limits at every step::
-
-        a_WB    = 2 (p_WR - p_WB - T v_WB) / T²
-        f_W     = a_WB + g e_z + drag v_WB
-        c       = f_W · z_B
-        w_cmd_B = [tilt_gain · tilt, yaw_gain · yaw]
-
-    where tilt and yaw rotate the body so that z lies along f_W and x along the heading or the
-    motion: toward the waypoint, or along v_WB if an acceleration is given.
+    Updates every ``period`` [s] from time 0, see `reaching_acceleration` and `flatness_command`.
+    The motion is toward the waypoint, or along v_WB if an acceleration is given.
     """
 
     def __init__(

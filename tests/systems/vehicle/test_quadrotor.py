@@ -132,16 +132,6 @@ def test_hover_state_is_level_at_rest_and_faces_yaw(yaw, x):
     np.testing.assert_allclose(hover, 0.0, atol=1e-12)
 
 
-def test_the_flight_path_does_not_import_torch():
-    code = (
-        "import sys, splatpilot.systems.vehicle.flatness, numpy as np;"
-        "from splatpilot.systems.vehicle.quadrotor import *;"
-        "rk4_step(hover_state([0, 0, 0]), np.zeros(4), QuadrotorParams(), 0.02);"
-        "sys.exit('torch' in sys.modules)"
-    )
-    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
-
-
 def test_the_plant_agrees_with_rk4():
     plant, x = QuadrotorPlant(), hover_state([0.0, 0.0, 0.0])
     simulator = Simulator(plant)
