@@ -127,10 +127,6 @@ def test_messages_are_numbered_and_stamped():
     assert (messages[-1].thrust, messages[-1].w_cmd_B) == (9.0, (1.0, 2.0, 3.0))
 
 
-def test_a_decision_is_sent_at_its_instant():
-    assert [m.thrust for m in periodic(Counter(), 0.05)] == [1.0, 2.0, 3.0]
-
-
 @pytest.mark.parametrize(("enabled", "count"), [(0.0, 0), (1.0, 5)])
 def test_nothing_is_sent_while_disabled(enabled, count):
     source, switch = constant(9.0, 0.0, 0.0, 0.0), constant(enabled)

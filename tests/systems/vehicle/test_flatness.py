@@ -199,16 +199,6 @@ def test_tracks_a_circle_to_a_centimeter():
     assert np.abs(yaw_error[steady]).max() < math.radians(6.0)
 
 
-@pytest.mark.parametrize("direction", [-3.0, 2.0])
-def test_yaw_rotates_toward_motion(direction):
-    heading = np.array([math.cos(direction), math.sin(direction), 0.0])
-    _, states, commands = fly(
-        hover_state([0.0, 0.0, 0.0]), 6.0, waypoint=lambda t: 1.5 * (t + CONFIG.lookahead) * heading
-    )
-    assert yaw_of(states)[-1] == pytest.approx(direction, abs=math.radians(0.5))
-    assert np.abs(commands[:, 3]).max() <= CONFIG.max_yaw_rate
-
-
 def test_yaw_follows_the_velocity_when_an_acceleration_is_flown():
     state = hover_state([0.0, 0.0, 0.0], yaw=0.8)
     state[3:6] = [4.0, 0.0, 0.0]
