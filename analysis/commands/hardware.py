@@ -100,7 +100,7 @@ def px4(options: argparse.Namespace) -> None:
     cli.CONFIG,
     cli.set_option(
         *("trials=30", "seed=1", "scenario.timeout=20"),
-        configuration="splatpilot.analysis.faults.campaign:FaultsConfig",
+        configuration="splatpilot.analysis.faults:FaultsConfig",
     ),
     examples=(
         "hardware faults --set trials=30",
@@ -111,7 +111,7 @@ def faults(options: argparse.Namespace) -> None:
     """Flies hundreds of short flights through the bridge with lost, late or false messages, clock
     jumps or failing policies, and counts those that end safely. If interrupted, the same command
     resumes."""
-    from splatpilot.analysis.faults.campaign import run
+    from splatpilot.analysis.faults import run
 
     # Thousands of packets are refused, and policies raise, on purpose.
     loggers = [logging.getLogger(name) for name in ("drake", "splatpilot")]

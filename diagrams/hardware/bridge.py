@@ -1,6 +1,7 @@
 """Bridge: policy and controller that fly a vehicle by messages."""
 
 import contextlib
+import functools
 import logging
 import math
 import time
@@ -16,8 +17,7 @@ from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 from splatpilot.diagrams.flight import blocks
 from splatpilot.diagrams.flight.flight import Outcome, flight_outcome, has_landed
 from splatpilot.diagrams.flight.scenario import Scenario
-from splatpilot.diagrams.hardware.message_ports import MessagePorts
-from splatpilot.diagrams.hardware.real_time import output, run_in_real_time
+from splatpilot.diagrams.hardware.real_time import MessagePorts, output, run_in_real_time
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.common.validation import Config, bounded
@@ -78,10 +78,6 @@ def BuildHardwareDiagram(
     """Builds the diagram that flies a vehicle by messages: that of `BuildFlightDiagram` with
     subscribers instead of plant and camera. It runs with the wall clock, see `run_in_real_time`.
 
-    Systems, by name: those of `AddPolicyAndController` and `MessagePorts`; `state_predictor`;
-    `velocity_setpoint`; `failsafe`, which all commands pass; `status`; and `depth_grid_receiver` if
-    `config` has a stream. Before the first message, states and images are arbitrary but finite.
-
     .. pydrake_system::
 
         name: hardware
@@ -90,12 +86,8 @@ def BuildHardwareDiagram(
             gradient, in_collision, field_state, velocity_setpoint, status, in_charge]
 
     `status` and `overruns` are those of `BridgeStatus`; `command`, `velocity_setpoint`, `in_charge`
-    and `lag` those of `Failsafe`; the others those of `BuildFlightDiagram`.
-
-    Args:
-        scenario: policy and goal. Its vehicle is the model of the real one.
-        world: its map, as far as known.
-        policy, controller: see `BuildFlightDiagram`.
+    and `lag` those of `Failsafe`; the others those of `BuildFlightDiagram`. The scenario's vehicle
+    is the model of the real one; the world is its map, as far as known.
     """
     config = config or HardwareConfig()
     config.validate()
@@ -227,17 +219,12 @@ def run(
 ) -> dict[str, float | str]:
     """Waits for a vehicle's messages and flies it to the scenario's goal.
 
-    The flight begins when the bridge is in charge of a vehicle in the air, by the vehicle's status
-    and the world's map. It ends at the goal; after the scenario's timeout; at a collision or
-    outside of the map while in charge; after landing; and if state or images are too old for
-    `config.patience` (meanwhile see `Failsafe`). Then messages cease, and autopilots hold.
+    The flight begins when the bridge is in charge of a vehicle in the air. It ends at the goal;
+    after the scenario's timeout; at a collision or outside of the map while in charge; after
+    landing; and if state or images are too old for `config.patience`. Then messages cease.
 
-    Args:
-        log: file for all messages, as LCM's logger writes it.
-
-    Returns:
-        `outcome` (of `Outcome`, "timeout" or "silence"), `flight_time_s`, and of `BridgeStatus`
-        `gaps`, `rejected` and `overruns`.
+    Returns `outcome` (of `Outcome`, "timeout" or "silence"), `flight_time_s`, and of `BridgeStatus`
+    `gaps`, `rejected` and `overruns`; `log` gets all messages, as LCM's logger writes them.
     """
     scenario.validate()
     config.validate()
@@ -252,13 +239,8 @@ def run(
         p_WG = blocks.goal_position(scenario, world)
         flight = BridgeFlight(diagram, root, scenario, p_WG, config)
         # Waits again, so that policies update just after images of the same rate.
-        run_in_real_time(
-            simulator,
-            diagram,
-            config.tick,
-            flight.is_over,
-            ready=lambda: wait_for_messages(diagram, config.patience),
-        )
+        ready = functools.partial(wait_for_messages, diagram, config.patience)
+        run_in_real_time(simulator, diagram, config.tick, flight.is_over, ready)
     counts = output(diagram, "status", root)[4:]
     summary = {"outcome": flight.outcome, "flight_time_s": flight.duration}
     summary |= dict(zip(("gaps", "rejected", "overruns"), counts, strict=True))

@@ -11,8 +11,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import Demultiplexer
 
-from splatpilot.diagrams.hardware.message_ports import MessagePorts
-from splatpilot.diagrams.hardware.real_time import output, run_in_real_time
+from splatpilot.diagrams.hardware.real_time import MessagePorts, output, run_in_real_time
 from splatpilot.diagrams.hardware.vehicle import STATUS_PERIOD
 from splatpilot.systems.common.validation import Config, bounded, require_field
 from splatpilot.systems.messaging import codecs
@@ -61,18 +60,12 @@ def BuildPx4Diagram(
     """Builds the diagram between the bridge's messages and PX4. It replaces `BuildVehicleDiagram`,
     except for images, which sensors send themselves.
 
-    Systems, by name: those of `MessagePorts`, `telemetry` and `commander`.
-
     .. pydrake_system::
 
         name: px4
         output_ports: [state, state_age, heartbeat_age, armed, mode]
 
-    The ports are those of `Px4Telemetry`.
-
-    Args:
-        inbox: socket of PX4's packets.
-        now: see `Receiver`.
+    The ports are those of `Px4Telemetry`; for `now` see `Receiver`.
     """
     config.validate()
     builder = DiagramBuilder()
@@ -129,10 +122,8 @@ def BuildPx4Diagram(
 
 
 def run(*, config: Px4Config, duration: float = np.inf) -> None:
-    """Connects the bridge and PX4, for `duration` [s], or until it is interrupted.
-
-    Prints changes of PX4's mode, and every ten seconds how long there has been no heartbeat.
-    """
+    """Connects the bridge and PX4, for `duration` [s], or until it is interrupted; prints changes
+    of PX4's mode, and every ten seconds how long there has been no heartbeat."""
     config.validate()
     lcm, inbox = open_lcm(config.url), UdpInbox(config.udp)
     with contextlib.closing(inbox):
@@ -142,10 +133,8 @@ def run(*, config: Px4Config, duration: float = np.inf) -> None:
         root = simulator.get_context()
         address = f"{config.udp.host}:{inbox.port}"
         print(f"PX4's packets come to {address}.", flush=True)
-        for name, requested in (
-            ("Offboard mode", config.commander.engage),
-            ("Arming", config.commander.arm),
-        ):
+        requests = {"Offboard mode": config.commander.engage, "Arming": config.commander.arm}
+        for name, requested in requests.items():
             print(f"{name} is {'requested' if requested else 'left to the pilot'}.", flush=True)
         before, reminders = "not heard", 0
 

@@ -1,16 +1,24 @@
-"""Diagrams that run with the wall clock."""
+"""Diagrams that exchange messages and run with the wall clock."""
 
 import math
 import time
 from collections.abc import Callable
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
+from lcm import LCM
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import Context, Diagram
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort, System
 
+from splatpilot.diagrams.flight.blocks import ConnectInputs
 from splatpilot.systems.messaging.bridge_status import UnixClock
-from splatpilot.systems.messaging.lcm_ports import PUBLISH_OFFSET
+from splatpilot.systems.messaging.codecs import Codec
+from splatpilot.systems.messaging.lcm_ports import (
+    PUBLISH_OFFSET,
+    MeasurementPublisher,
+    MessagePublisher,
+    MessageSubscriber,
+)
 
 MAX_LAG = 0.05  # [s] Max lag of a diagram behind the wall clock.
 _WATCH_PERIOD = 0.02  # [s] between calls of `over`, which is slower than most ticks.
@@ -31,10 +39,9 @@ def run_in_real_time(
     """Advances a diagram, which has a `UnixClock` named `clock`, tick by tick. No tick is updated
     before its time on the wall clock.
 
-    A tick that ends after the begin of the next is an overrun; their number is returned. The
-    diagram's inputs `overruns` and `lag` [s], if any, tell number and delay. The next tick is then
-    longer, to catch up without leaving anything out. A lag above `MAX_LAG` is not caught up
-    with: the diagram's time stops meanwhile, and its `UnixClock` is set.
+    A tick that ends after the begin of the next is an overrun; their number is returned, and given
+    to the diagram's inputs `overruns` and `lag` [s], if any. The next tick is then longer. A lag
+    above `MAX_LAG` is not caught up with: the diagram's time stops meanwhile.
 
     Args:
         over: called with the time [s] fifty times a second, after a tick; returns True to end.
@@ -75,3 +82,47 @@ def run_in_real_time(
             epoch += late - MAX_LAG
             clock.set_epoch(root, epoch)
         number += math.floor(min(late, MAX_LAG) / tick)
+
+
+class MessagePorts:
+    """Adds `clock`, and systems whose inputs are connected by their names, `unix_time` to the
+    clock; systems look for messages every `tick` [s]."""
+
+    def __init__(self, builder: DiagramBuilder, lcm: LCM, tick: float) -> None:
+        self._builder, self._lcm, self._tick = builder, lcm, tick
+        self._unix_time = builder.AddNamedSystem("clock", UnixClock()).get_output_port()
+
+    def add[S: System](self, name: str, system: S, **sources: OutputPort | None) -> S:
+        """Adds a system; sources of None are left out."""
+        self._builder.AddNamedSystem(name, system)
+        if system.HasInputPort("unix_time"):
+            sources["unix_time"] = self._unix_time
+        connected = {name: port for name, port in sources.items() if port is not None}
+        ConnectInputs(self._builder, system, connected)
+        return system
+
+    def subscribe(self, codec: Codec, initial: Any = None, name: str = "") -> MessageSubscriber:
+        """Adds `{name}_subscriber`, by default of the name of the codec's port."""
+        subscriber = MessageSubscriber(self._lcm, codec, self._tick, initial)
+        return self.add(f"{name or codec.port}_subscriber", subscriber)
+
+    def publish(
+        self,
+        codec: Codec,
+        source: OutputPort,
+        period: float,
+        enabled: OutputPort | None = None,
+        decided: OutputPort | None = None,
+    ) -> None:
+        """Adds `{port}_publisher`, see `MessagePublisher`."""
+        tick = None if decided is None else self._tick
+        publisher = MessagePublisher(self._lcm, codec, period, tick)
+        sources = {codec.port: source, "enabled": enabled, "decided": decided}
+        self.add(f"{codec.port}_publisher", publisher, **sources)
+
+    def publish_measurement(
+        self, name: str, codec: Codec, source: OutputPort, age: OutputPort
+    ) -> None:
+        """Adds `{name}_publisher`, see `MeasurementPublisher`."""
+        publisher = MeasurementPublisher(self._lcm, codec, self._tick)
+        self.add(f"{name}_publisher", publisher, **{codec.port: source, "age": age})

@@ -13,7 +13,6 @@ from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort
 
 from splatpilot.diagrams.flight import blocks
 from splatpilot.diagrams.flight.flight import (
-    Flight,
     Outcome,
     flight_outcome,
     has_landed,
@@ -25,8 +24,7 @@ from splatpilot.diagrams.flight.flight import (
 from splatpilot.diagrams.flight.flight_diagram import LOG_PERIOD
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.hardware.bridge import HardwareConfig, image_codecs, require_messages_for
-from splatpilot.diagrams.hardware.message_ports import MessagePorts
-from splatpilot.diagrams.hardware.real_time import output, run_in_real_time
+from splatpilot.diagrams.hardware.real_time import MessagePorts, output, run_in_real_time
 from splatpilot.diagrams.worlds.appearance import randomize_appearance
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import make_world
@@ -53,10 +51,7 @@ def BuildVehicleDiagram(
 ) -> Diagram:
     """Builds the diagram of a simulated vehicle, in a world, with the messages of a real one.
 
-    Systems, by name: those of `MessagePorts` and `AddObservation`; `plant`, `pose`, `collision`;
-    `failsafe`, which hovers and then lands if commands cease, as autopilots do; `held_command`;
-    and the loggers `state_log`, `command_log`. A vehicle that is commanded by velocities has
-    `setpoint`, `velocity_tracker` and `controller`.
+    Its failsafe hovers and then lands if commands cease, as autopilots do.
 
     .. pydrake_system::
 
@@ -98,27 +93,23 @@ def BuildVehicleDiagram(
         velocity_setpoint=received if by_velocity else None,
         command=command,
     )
-    held = builder.AddNamedSystem("held_command", primitives.ZeroOrderHold(config.tick, 4))
-    builder.Connect(failsafe.GetOutputPort("command"), held.get_input_port())
-    builder.Connect(held.get_output_port(), plant.GetInputPort("command"))
+    hold = primitives.ZeroOrderHold(config.tick, 4)
+    held = ports.add("held_command", hold, u=failsafe.GetOutputPort("command")).get_output_port()
+    builder.Connect(held, plant.GetInputPort("command"))
 
     # Status, state and motion capture.
-    armed = builder.AddSystem(primitives.ConstantVectorSource(np.ones(1)))
-    status = builder.AddSystem(primitives.Multiplexer(2))
-    builder.Connect(armed.get_output_port(), status.get_input_port(0))
-    builder.Connect(failsafe.GetOutputPort("is_ready"), status.get_input_port(1))
+    armed = builder.AddSystem(primitives.ConstantVectorSource(np.ones(1))).get_output_port()
+    ready = failsafe.GetOutputPort("is_ready")
+    status = ports.add("status", primitives.Multiplexer(2), u0=armed, u1=ready)
     ports.publish(codecs.VehicleStatusCodec(), status.get_output_port(0), STATUS_PERIOD)
     sizes = np.repeat([_NOISE, 0.0], [3, 10])
-    noise = builder.AddSystem(primitives.Sine(sizes, np.ones(13), np.zeros(13)))
-    estimate = builder.AddSystem(primitives.Adder(2, 13))
-    builder.Connect(state, estimate.get_input_port(0))
-    builder.Connect(noise.get_output_port(0), estimate.get_input_port(1))
+    noise = builder.AddSystem(primitives.Sine(sizes, np.ones(13), np.zeros(13))).get_output_port(0)
+    estimate = ports.add("estimate", primitives.Adder(2, 13), u0=state, u1=noise)
     ports.publish(codecs.StateCodec(), estimate.get_output_port(), 1 / config.state_rate)
     if config.body:
-        tracked = builder.AddSystem(primitives.MatrixGain(np.eye(13)[[0, 1, 2, 6, 7, 8, 9]]))
-        builder.Connect(state, tracked.get_input_port())
-        codec = codecs.MotionCaptureCodec(config.body)
-        ports.publish(codec, tracked.get_output_port(), 1 / config.state_rate)
+        pick = primitives.MatrixGain(np.eye(13)[[0, 1, 2, 6, 7, 8, 9]])
+        tracked = ports.add("tracked", pick, u0=state).get_output_port()
+        ports.publish(codecs.MotionCaptureCodec(config.body), tracked, 1 / config.state_rate)
 
     # Images, whose size and rate are the policy's.
     policy = blocks.make_policy(scenario, world)
@@ -126,7 +117,7 @@ def BuildVehicleDiagram(
     for codec in image_codecs(scenario, policy):
         ports.publish(codec, images[codec.port], blocks.decision_period(scenario, policy))
 
-    for name, port in (("state", state), ("command", held.get_output_port())):
+    for name, port in (("state", state), ("command", held)):
         primitives.LogVectorOutput(port, builder, LOG_PERIOD).set_name(f"{name}_log")
         builder.ExportOutput(port, name)
     builder.ExportOutput(command_age, "command_age")
@@ -144,14 +135,10 @@ def _AddVelocityControl(
     parts = ports.add("setpoint", primitives.Demultiplexer([3, 1]), u0=setpoint)
     velocity, heading = parts.get_output_port(0), parts.get_output_port(1)
     tracker = ports.add("velocity_tracker", VelocityTracker(), state=state, velocity=velocity)
-    controller = ports.add(
-        "controller",
-        FlatnessController(scenario.controller, scenario.vehicle),
-        state=state,
-        acceleration=tracker.GetOutputPort("acceleration"),
-        heading=heading,
-    )
-    return controller.GetOutputPort("command")
+    acceleration = tracker.GetOutputPort("acceleration")
+    controller = FlatnessController(scenario.controller, scenario.vehicle)
+    sources = {"state": state, "acceleration": acceleration, "heading": heading}
+    return ports.add("controller", controller, **sources).GetOutputPort("command")
 
 
 @locks_folder("out")
@@ -201,22 +188,18 @@ def run(*, scenario: Scenario, config: HardwareConfig, out: Path) -> dict[str, f
     wall_time = time.monotonic() - started
     diagram.ForcedPublish(root)  # The bridge needs the last state too.
     ended = outcome() or Outcome.TIMEOUT
-    flight = _since(took_off, record_flight(diagram, root, world, ended, wall_time))
+    flight = record_flight(diagram, root, world, ended, wall_time)
+    rows = flight.times >= took_off
+    flight = dataclasses.replace(
+        flight,
+        times=flight.times[rows] - took_off,
+        states=flight.states[rows],
+        commands=flight.commands[rows],
+        clearances=flight.clearances[rows],
+        wall_time=flight.wall_time - took_off,
+    )
     write_flight(out, scenario, flight)
     summary = flight.summary() | {"overruns": overruns}
     write_summary(out, summary)
     print(*(f"{name:<18} {value}" for name, value in summary.items()), sep="\n")
     return summary
-
-
-def _since(time: float, flight: Flight) -> Flight:
-    """Returns the part of a flight from `time` [s] on, which becomes 0."""
-    rows = flight.times >= time
-    return dataclasses.replace(
-        flight,
-        times=flight.times[rows] - time,
-        states=flight.states[rows],
-        commands=flight.commands[rows],
-        clearances=flight.clearances[rows],
-        wall_time=flight.wall_time - time,
-    )

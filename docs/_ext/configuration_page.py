@@ -7,7 +7,7 @@ from typing import Any
 
 import yaml
 
-from splatpilot.analysis.faults.campaign import FaultsConfig
+from splatpilot.analysis.faults import FaultsConfig
 from splatpilot.analysis.fidelity.fidelity import FidelityConfig
 from splatpilot.analysis.reconstruction.run import RenderedSceneConfig
 from splatpilot.diagrams.flight.policies import POLICIES

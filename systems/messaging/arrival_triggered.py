@@ -16,7 +16,6 @@ from pydrake.systems.framework import (
 )
 
 from splatpilot.systems.common.drake import vector_input
-from splatpilot.systems.common.validation import require
 
 _log = logging.getLogger(__name__)
 
@@ -39,11 +38,10 @@ class _Last(NamedTuple):
 class ArrivalTriggered(LeafSystem):
     """Runs the periodic update of a system when an observation comes, instead of at its own times.
 
-    At its own times, a policy would see images up to a period late. This one runs as an image
-    comes, but no more often than at its rate: it skips some of faster images, by the rule of
-    virtual scheduling (ITU-T I.371, the generic cell rate algorithm). Without a timely image it
-    runs 1.6 periods after the last update. An exception of the system is logged, once until the
-    system succeeds again, and its state is kept.
+    It runs no more often than at the system's rate: it skips some of faster images, by virtual
+    scheduling (ITU-T I.371, the generic cell rate algorithm), and runs without an image 1.6
+    periods after the last update. An exception of the system is logged, once until the system
+    succeeds again, and its state is kept.
 
     .. pydrake_system::
 
@@ -52,19 +50,15 @@ class ArrivalTriggered(LeafSystem):
         output_ports: [(ports of the system), decided, failed]
 
     - The ports of the system, by their names; outputs that raise an exception are NaN.
-    - ``observation_age`` (1): [s] since the system's observation was sent; infinite before the
-      first.
-    - ``decided`` (1): [s], the time of the last update.
-    - ``failed`` (1): 1 if the last update, or an output after it, raised an exception, else 0.
+    - ``observation_age`` (1): [s] since the observation was sent; infinite before the first.
+    - ``decided`` (1), ``failed`` (1): [s] of the last update, and 1 if it, or an output after it,
+      raised an exception.
 
-    Looks every ``tick`` [s] from time 0; the first update is by the first observation.
+    The system must pass `can_be_triggered`. Looks every ``tick`` [s] from time 0.
     """
 
     def __init__(self, system: System, tick: float):
         super().__init__()
-        condition = "a system with discrete state of one period and vectors as outputs"
-        name = type(system).__name__
-        require(can_be_triggered(system), "what arrivals trigger", condition, name)
         self._system = system
         update = system.GetUniquePeriodicDiscreteUpdateAttribute()
         assert update is not None
@@ -82,15 +76,13 @@ class ArrivalTriggered(LeafSystem):
         self._last = int(self.DeclareDiscreteState(np.array(_Last())))
         for index in range(system.num_output_ports()):
             self._declare_output(system.get_output_port(index))
-        self._declare_last("decided", "time")
-        self._declare_last("failed", "failed")
+        for name, field in (("decided", "time"), ("failed", "failed")):
+
+            def calc(context: Context, output: BasicVector, field: str = field) -> None:
+                output[0] = getattr(self._get_last(context), field)
+
+            self.DeclareVectorOutputPort(name, 1, calc, {self.xd_ticket()})
         self.DeclarePeriodicDiscreteUpdateEvent(tick, 0.0, self._update)
-
-    def _declare_last(self, name: str, field: str) -> None:
-        def calc(context: Context, output: BasicVector) -> None:
-            output[0] = getattr(self._get_last(context), field)
-
-        self.DeclareVectorOutputPort(name, 1, calc, {self.xd_ticket()})
 
     def _declare_output(self, port: OutputPort) -> None:
         system, index = self._system, int(port.get_index())

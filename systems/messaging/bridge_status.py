@@ -16,17 +16,15 @@ class BridgeStatus(LeafSystem):
             mode]
         output_ports: [status, observation_age]
 
-    - ``s_age``, ``s_gaps``, ``s_rejected`` (1 each) of each input ``s``: see
-      :class:`~splatpilot.systems.messaging.lcm_ports.MessageSubscriber`.
+    - ``s_age``, ``s_gaps``, ``s_rejected`` (1 each) of each input ``s``: see `MessageSubscriber`.
     - ``overruns`` (1), optional: number of ticks that ended too late.
-    - ``mode`` (2): see :class:`~splatpilot.systems.messaging.failsafe.Failsafe`.
+    - ``mode`` (2): see `Failsafe`.
     - ``status`` (7): mode and reason; ages of the state and of the oldest image [s]; sums of gaps
       and of rejected messages; overruns.
     - ``observation_age`` (1): of the oldest image [s], 0 without images.
     """
 
     def __init__(self, images: list[str]):
-        """Constructs the system; `images` are the names of the policy's inputs."""
         super().__init__()
         self._inputs = ["state", *images]
         for name in self._inputs:

@@ -1,6 +1,7 @@
 """Failsafe: limits a policy's commands, and hovers and lands without a trustworthy policy."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, cast
 
@@ -162,20 +163,18 @@ class Failsafe(LeafSystem):
         output_ports: [velocity_setpoint, command, mode, state_is_known, is_ready, in_charge]
 
     - ``state``, ``measured_state`` (13 each): predicted for now, and as measured.
-    - ``velocity_setpoint`` (4): v [m/s], W frame, and heading [rad] or NaN; without it only the
-      limits of commands hold.
-    - ``command`` (4): thrust over mass [m/s^2], body rates [rad/s].
+    - ``velocity_setpoint`` (4): v_WB [m/s] and heading [rad] or NaN; without it only the limits of
+      commands hold. ``command`` (4): thrust over mass [m/s^2], body rates [rad/s].
     - ``state_age`` (1), and optionally ``observation_age``, ``body_age`` (1 each) [s]: since each
       was sent, the last by motion capture; infinite before the first.
-    - ``lag`` (1) [s], optional: of the process behind the wall clock.
-    - ``policy_failed`` (1), optional: 1 while the policy raises exceptions.
+    - Optionally ``lag`` (1) [s] of the process behind the wall clock, and ``policy_failed`` (1): 1
+      while the policy raises exceptions.
     - ``vehicle_status`` (2), ``vehicle_status_age`` (1) [s], optional: see ``lcmt_vehicle_status``;
       without them the failsafe is always in charge.
     - ``clearance`` (1) [m], ``gradient`` (3), optional: from the collision sphere to the nearest
       known obstacle, and the direction away from it; NaN and 0 if none is known.
     - ``mode`` (2): mode and reason, constants of ``lcmt_bridge_status``.
     - ``state_is_known`` (1): 1 if body rates can be flown by the state, which is at most 0.1 s old.
-      Velocity setpoints do not need it: without a valid state they are to stop, or to descend.
     - ``is_ready`` (1): 0 in the mode WAITING, else 1.
     - ``in_charge`` (1): 1 while an armed vehicle obeys, by a status of the last 1 s, else 0.
 
@@ -213,13 +212,19 @@ class Failsafe(LeafSystem):
         self._cache = self.DeclareCacheEntry(
             "velocity setpoint (4), mode and reason", producer, {self.all_sources_ticket()}
         ).cache_index()
-        self.DeclareVectorOutputPort("velocity_setpoint", 4, self._calc_velocity_setpoint)
-        self.DeclareVectorOutputPort("command", 4, self._calc_command)
-        self.DeclareVectorOutputPort("mode", 2, self._calc_mode)
-        self.DeclareVectorOutputPort("state_is_known", 1, self._calc_state_is_known)
-        self.DeclareVectorOutputPort("is_ready", 1, _calc_is_ready)
-        self.DeclareVectorOutputPort("in_charge", 1, self._calc_in_charge)
+        self._declare("velocity_setpoint", 4, lambda context: self._flown(context)[0])
+        self._declare("command", 4, self._command)
+        self._declare("mode", 2, self._mode)
+        self._declare("state_is_known", 1, self._state_is_known)
+        self._declare("is_ready", 1, _is_ready)
+        self._declare("in_charge", 1, lambda context: self._is_in_charge(context) or False)
         self.DeclarePeriodicDiscreteUpdateEvent(controller.period, 0.0, self._update)
+
+    def _declare(self, name: str, size: int, value: Callable[[Context], Any]) -> None:
+        def calc(context: Context, output: BasicVector) -> None:
+            output.SetFromVector(np.atleast_1d(value(context)).astype(float))
+
+        self.DeclareVectorOutputPort(name, size, calc)
 
     # Inputs.
 
@@ -304,42 +309,29 @@ class Failsafe(LeafSystem):
         """Returns the velocity setpoint (4,), mode and reason."""
         return cast(Any, self.get_cache_entry(self._cache).Eval(context))
 
-    def _calc_velocity_setpoint(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._flown(context)[0])
-
-    def _calc_command(self, context: Context, output: BasicVector) -> None:
+    def _command(self, context: Context) -> np.ndarray:
         setpoint, mode, reason = self._flown(context)
         state = vector_input(self, "state", context)
         if mode == status.FLYING and reason == status.NONE:
-            command = vector_input(self, "command", context)
-        elif not np.isfinite(state).all():
-            command = np.array([self._vehicle.gravity, 0.0, 0.0, 0.0])
-        else:
-            a_WB = tracking_acceleration(QuadrotorState.of(state).v_WB, setpoint[:3])
-            motion_W = setpoint[:3] if mode == status.FLYING else np.zeros(3)
-            law, vehicle = self._controller, self._vehicle
-            command = flatness_command(state, a_WB, motion_W, setpoint[3], law, vehicle)
-        output.SetFromVector(command)
+            return vector_input(self, "command", context)
+        if not np.isfinite(state).all():
+            return np.array([self._vehicle.gravity, 0.0, 0.0, 0.0])
+        a_WB = tracking_acceleration(QuadrotorState.of(state).v_WB, setpoint[:3])
+        motion_W = setpoint[:3] if mode == status.FLYING else np.zeros(3)
+        law, vehicle = self._controller, self._vehicle
+        return flatness_command(state, a_WB, motion_W, setpoint[3], law, vehicle)
 
-    def _calc_mode(self, context: Context, output: BasicVector) -> None:
+    def _mode(self, context: Context) -> tuple[int, int]:
         waiting = status.WAITING, status.NONE
-        mode = self._flown(context)[1:] if _is_ready(context) else waiting
-        output.SetFromVector(np.array(mode, dtype=float))
+        return self._flown(context)[1:] if _is_ready(context) else waiting
 
-    def _calc_in_charge(self, context: Context, output: BasicVector) -> None:
-        output[0] = float(self._is_in_charge(context) or False)
-
-    def _calc_state_is_known(self, context: Context, output: BasicVector) -> None:
+    def _state_is_known(self, context: Context) -> bool:
         max_age = min(LONGEST_PREDICTION, self._config.max_age)
-        output[0] = _is_ready(context) and self._signals(context).state_is_valid(max_age)
+        return _is_ready(context) and self._signals(context).state_is_valid(max_age)
 
 
 def _is_ready(context: Context) -> bool:
     return Modes.read(context).mode != status.WAITING
-
-
-def _calc_is_ready(context: Context, output: BasicVector) -> None:
-    output[0] = _is_ready(context)
 
 
 class FiniteVector(LeafSystem):

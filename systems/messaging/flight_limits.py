@@ -115,7 +115,10 @@ def limit_velocity(
     lower, upper = near.box.lower_W + VEHICLE_RADIUS, near.box.upper_W - VEHICLE_RADIUS
     if landing:
         lower[2] = -math.inf
-    limited = limit_to_box(velocity, motion.p_WB + motion.stop, lower, upper, motion.reaction_time)
+    limited, rest = velocity, motion.p_WB + motion.stop
+    for axis, away in enumerate(np.eye(3)):
+        limited = limit_approach(limited, away, rest[axis] - lower[axis], motion.reaction_time)
+        limited = limit_approach(limited, -away, upper[axis] - rest[axis], motion.reaction_time)
     apply(limited, status.LIMITED_GEOFENCE)
 
     # The path, last: velocities along a fence or an obstacle may lead into another.
@@ -136,10 +139,9 @@ def stopping_displacement(
 ) -> np.ndarray:
     """Predicts the displacement (3,) [m] of a vehicle from a command to stop until rest.
 
-    Its velocity v follows a commanded velocity u as v' = (u - v) / T, with T the response time,
-    but brakes with at most a: over the distance T v, or (v² + (a T)²) / (2 a) from v = a T. The
-    point p + T v at which it would rest then moves with exactly the commanded velocity, since
-    (p + T v)' = v + (u - v) = u.
+    Its velocity v follows a commanded velocity u as v' = (u - v) / T, with T the response time, but
+    brakes with at most a: over the distance T v, or (v² + (a T)²) / (2 a) from v = a T. The point
+    of rest p + T v then moves with the commanded velocity: (p + T v)' = v + (u - v) = u.
     """
     speed, exponential = float(np.linalg.norm(velocity)), deceleration * response_time
     if speed <= exponential:
@@ -181,18 +183,4 @@ def limit_ahead(
             free = along[max(int(np.argmax(blocked)) - 1, 0)]
             room = free - length if path is stop else free
             return limit_approach(velocity, -path / length, room, reaction_time)
-    return velocity
-
-
-def limit_to_box(
-    velocity: np.ndarray,
-    rest: np.ndarray,
-    lower: np.ndarray,
-    upper: np.ndarray,
-    reaction_time: float,
-) -> np.ndarray:
-    """Limits a commanded velocity (3,) [m/s] so that the point of rest (3,) [m] stays in a box."""
-    for axis, away in enumerate(np.eye(3)):
-        velocity = limit_approach(velocity, away, rest[axis] - lower[axis], reaction_time)
-        velocity = limit_approach(velocity, -away, upper[axis] - rest[axis], reaction_time)
     return velocity

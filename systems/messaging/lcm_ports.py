@@ -111,14 +111,13 @@ class MessagePublisher(_Publisher):
         name: MessagePublisher
         input_ports: [(port of the codec), unix_time, enabled, decided]
 
-    - ``unix_time`` (1): [s], see :class:`~splatpilot.systems.messaging.bridge_status.UnixClock`.
+    - ``unix_time`` (1): [s], see `UnixClock`.
     - ``enabled`` (1), optional: 0 sends no messages.
     - ``decided`` (1), optional: [s], when the signal was computed last. With a ``tick`` [s], it is
       sent then too, between two periods.
 
-    Publishes every ``period`` [s] from time 0, a microsecond later, and when forced. The sequence
-    number is the Context's time in whole periods: subscribers count messages that were not sent as
-    missing.
+    Publishes every ``period`` [s] from time 0, and when forced. The sequence number is the time in
+    whole periods: subscribers count messages that were not sent as missing.
     """
 
     def __init__(self, lcm: LCM, codec: Codec, period: float, tick: float | None = None):
@@ -163,10 +162,9 @@ class MeasurementPublisher(_Publisher):
         input_ports: [(port of the codec), age, unix_time]
 
     - ``age`` (1): [s] since the measurement; infinite before the first.
-    - ``unix_time`` (1): [s], see :class:`~splatpilot.systems.messaging.bridge_status.UnixClock`.
+    - ``unix_time`` (1): [s], see `UnixClock`.
 
-    Looks every ``period`` [s] from time 0 and sends a microsecond later, with the time of the
-    measurement, which must be later than that of the one before.
+    Looks every ``period`` [s] from time 0. Messages have the time of the measurement.
     """
 
     def __init__(self, lcm: LCM, codec: Codec, period: float):
@@ -218,16 +216,14 @@ class MessageSubscriber(Receiver[_Received]):
         input_ports: [unix_time]
         output_ports: [(port of the codec), age, gaps, rejected]
 
-    - ``unix_time`` (1): [s], see :class:`~splatpilot.systems.messaging.bridge_status.UnixClock`.
-    - The port of the codec: the vector or image of the last message; before the first ``initial``,
-      by default NaN or a black image.
+    - ``unix_time`` (1): [s], see `UnixClock`.
+    - The port of the codec: the last vector or image; before the first ``initial``, by default NaN
+      or a black image.
     - ``age`` (1): [s] since the last message was sent, by the sender's clock, which must be
       synchronized with ours; infinity before the first.
     - ``gaps`` (1): number of messages that did not come; a restart of the sender leaves no gap.
     - ``rejected`` (1): number of messages of another type or frame, malformed, not finite, no newer
       than the one before, sent more than 0.2 s ahead of our clock, or by a second sender.
-
-    The ``lcm.LCM``, outside the Context, keeps 1000 messages between updates.
     """
 
     def __init__(self, lcm: LCM, codec: Codec, period: float, initial: np.ndarray | None = None):
@@ -262,31 +258,23 @@ class MessageSubscriber(Receiver[_Received]):
         self._inbox.clear()
         unix_time = float(vector_input(self, "unix_time", context)[0])
         epoch = unix_time - context.get_time()
-        return self._take(
-            received, messages, 0, lambda last, data: self._read(last, data, unix_time, epoch)
-        )
 
-    def _read(self, last: _Received, data: bytes, unix_time: float, epoch: float) -> _Received:
-        message = decode_message(self._codec, data)
-        header = message.header
-        ahead = header.utime * 1e-6 - unix_time
-        limit, remedy = f"at most {MAX_AHEAD} s ahead", "synchronize the clocks"
-        require(ahead <= MAX_AHEAD, "the time of the message", limit, f"{ahead:.3f} s", remedy)
-        later = header.utime - last.utime  # [us]
-        require(later > 0, "the message", "newer than the one before", f"{later} us")
-        session = getattr(message, "session", 0)  # Images, whose type is Drake's, have none.
-        is_other = session != last.session or header.seq < last.seq
-        if later < RESTART * 1e6 and is_other:
-            raise ValueError("there are two senders on this channel; end one of them")
-        lost = 0 if math.isinf(later) else max(header.seq - last.seq - 1, 0)
-        return replace(
-            last,
-            value=self._codec.unpack(message, epoch),
-            utime=header.utime,
-            seq=header.seq,
-            session=session,
-            gaps=last.gaps + lost,
-        )
+        def read(last: _Received, data: bytes) -> _Received:
+            message = decode_message(self._codec, data)
+            seq, utime = message.header.seq, message.header.utime
+            ahead = utime * 1e-6 - unix_time
+            limit, remedy = f"at most {MAX_AHEAD} s ahead", "synchronize the clocks"
+            require(ahead <= MAX_AHEAD, "the time of the message", limit, f"{ahead:.3f} s", remedy)
+            later = utime - last.utime  # [us]
+            require(later > 0, "the message", "newer than the one before", f"{later} us")
+            session = getattr(message, "session", 0)  # Images, whose type is Drake's, have none.
+            if later < RESTART * 1e6 and (session != last.session or seq < last.seq):
+                raise ValueError("there are two senders on this channel; end one of them")
+            gaps = last.gaps + (0 if math.isinf(later) else max(seq - last.seq - 1, 0))
+            value = self._codec.unpack(message, epoch)
+            return replace(last, value=value, utime=utime, seq=seq, session=session, gaps=gaps)
+
+        return self._take(received, messages, 0, read)
 
     def _calc_image(self, context: Context, output) -> None:
         output.get_mutable_value().mutable_data[:] = self._received(context).value

@@ -8,7 +8,7 @@ import struct
 import weakref
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple, Self, cast
+from typing import Any, Self, cast
 
 import numpy as np
 from pydrake.common.value import Value
@@ -36,10 +36,10 @@ class Received:
 class Receiver[R: Received](LeafSystem):
     """Base of systems that take all messages of a `source` every `period` [s] from time 0.
 
-    The update is unrestricted, so that discrete updates of the same instant see it. All systems
-    have the output ``rejected`` (1): the number of messages that could not be used. The reason is
-    logged at the first, second, fourth, eighth... rejection. `now` is the Unix time [s] of a
-    process that runs with the wall clock; by default it is the input `unix_time`.
+    The update is unrestricted, so that discrete updates of the same instant see it. The output
+    ``rejected`` (1) counts messages that could not be used; reasons are logged at the first,
+    second, fourth, eighth... `now` is the Unix time [s] of a process that runs with the wall
+    clock; by default it is the input `unix_time`.
     """
 
     def __init__(
@@ -146,13 +146,6 @@ def _is_address(address: str) -> bool:
     return True
 
 
-class Datagrams(NamedTuple):
-    """Packets since the last look."""
-
-    packets: list[bytes]
-    strangers: int  # Number of dropped packets of other senders.
-
-
 class UdpInbox:
     """A socket that is read without waiting; OSError if the port is in use."""
 
@@ -173,28 +166,22 @@ class UdpInbox:
                 "another port, or an address of this host"
             ) from None
 
-    @property
-    def port(self) -> int:
-        """The port, chosen by the system if the configuration has 0."""
-        return self._socket.getsockname()[1]
-
-    def close(self) -> None:
-        """Closes the socket."""
-        self._socket.close()
+        self.port: int = self._socket.getsockname()[1]  # Chosen by the kernel if configured as 0.
+        self.close = self._socket.close
 
     def send(self, packet: bytes, address: tuple[str, int]) -> None:
         """Sends a packet from this port, if there is a route to the host."""
         with contextlib.suppress(OSError):
             self._socket.sendto(packet, address)
 
-    def receive(self) -> Datagrams:
-        """Returns the packets that have come, oldest first."""
+    def receive(self) -> tuple[list[bytes], int]:
+        """Returns the packets that have come, oldest first, and how many of strangers."""
         packets, strangers = [], 0
         while True:
             try:
                 packet, (sender, _) = self._socket.recvfrom(_MAX_PACKET)
             except BlockingIOError:
-                return Datagrams(packets, strangers)
+                return packets, strangers
             except ConnectionError:  # A packet that was sent from this port was not received.
                 continue
             if sender in self._senders:
@@ -227,21 +214,19 @@ class TimeOfFlightReceiver(Receiver[_Grid]):
         name: TimeOfFlightReceiver
         output_ports: [depth_grid, age, gaps, rejected]
 
-    - ``depth_grid`` (rows * columns): see
-      :class:`~splatpilot.systems.sensing.time_of_flight.TimeOfFlightGrid`; zeros before the first.
+    - ``depth_grid`` (rows * columns): see `TimeOfFlightGrid`; zeros before the first.
     - ``age`` (1): [s] since the exposure of the last; infinity before the first.
-    - ``gaps`` (1): number of images that were sent between those that came.
-    - ``rejected`` (1): number of packets of another length, type or size, of other senders, or no
-      newer than the one before.
+    - ``gaps`` (1), ``rejected`` (1): numbers of images that did not come, and of packets that were
+      invalid, of other senders, or no newer than the one before.
     """
 
     def __init__(self, config: TimeOfFlightStream, period: float):
-        """Constructs the system, which updates every `period` [s]."""
         config.validate()
         inbox = UdpInbox(config.udp)
         super().__init__(_Grid(), f"UDP port {inbox.port}", period)
         weakref.finalize(self, inbox.close)
-        self._sensor, self._inbox, self._waiting = config.sensor, inbox, list[Datagrams]()
+        self._sensor, self._inbox, self.port = config.sensor, inbox, inbox.port
+        self._waiting: list[tuple[list[bytes], int]] = []
         shape, latency = (config.sensor.rows, config.sensor.columns), config.latency
         self._declare(
             "depth_grid",
@@ -251,15 +236,10 @@ class TimeOfFlightReceiver(Receiver[_Grid]):
         self._declare("age", 1, lambda got, now: now - got.time + latency, timed=True)
         self._declare("gaps", 1, lambda got, _: got.stream.gaps)
 
-    @property
-    def port(self) -> int:
-        """The UDP port at which the stream arrives."""
-        return self._inbox.port
-
     def has_message(self) -> bool:
         """Checks if the next update will see a packet."""
         self._waiting.append(self._inbox.receive())
-        return any(datagrams.packets for datagrams in self._waiting)
+        return any(packets for packets, _ in self._waiting)
 
     def _receive(self, context: Context, received: _Grid) -> _Grid:
         now = context.get_time()
@@ -267,7 +247,7 @@ class TimeOfFlightReceiver(Receiver[_Grid]):
         def read(received: _Grid, packet: bytes) -> _Grid:
             last = received.stream
             if now - received.time > RESTART:  # Its clock may have started again.
-                last = last.restarted()
+                last = replace(last, time_ns=-1, seq=-1)
             stream = after_packet(last, packet, self._sensor)
             time = now if stream.time_ns > last.time_ns else received.time
             return replace(received, stream=stream, time=time)

@@ -83,20 +83,18 @@ class Px4Commander(LeafSystem):
     - ``heartbeat_age`` (1) [s], ``armed`` (1), ``mode`` (2), ``granted`` (2): of `Px4Telemetry`.
     - ``motion_capture_pose`` (7), ``motion_capture_age`` (1) [s], optional: p_WB [m] and q_WB.
 
-    Every ``period`` [s] from time 0 it sends the setpoint, if it is fresh, and also as it comes,
-    for which it looks every ``tick`` [s]; every second a heartbeat. It sends poses on as ODOMETRY
-    when they come, each once, unless they follow another within 0.9 ``period`` or are older than a
-    setpoint may be.
+    Sends setpoints, if fresh, every ``period`` [s] from time 0 and as they come, for which it looks
+    every ``tick`` [s]; every second a heartbeat; and poses as ODOMETRY, each once and at most every
+    0.9 ``period``, if they are as fresh.
 
     After ``streaming`` seconds of setpoints it requests offboard mode, and in it arming, each if
     configured and if the bridge flies, once a second until PX4 grants it.
 
     If setpoints cease in flight it has PX4 stop, by setpoints of its own, and requests hold. If the
-    bridge lands it requests PX4's own landing. Then it sends no more setpoints, and does not enter
-    offboard mode again. Nor does it if someone else has left it.
-
-    A pilot may have taken over since PX4's last heartbeat. Therefore it requests nothing until a
-    heartbeat has come since the reason for it arose, and since its last request.
+    bridge lands it requests PX4's own landing. Then, or if someone else leaves offboard mode, it
+    sends no more setpoints, and does not enter that mode again. A pilot may have taken over since
+    PX4's last heartbeat: it requests nothing until a heartbeat has come since the reason for it
+    arose, and since its last request.
     """
 
     def __init__(
@@ -109,7 +107,6 @@ class Px4Commander(LeafSystem):
         period: float = 0.02,
         tick: float = 0.002,
     ):
-        """Constructs the system, which sends from `inbox` to PX4 at `address`."""
         super().__init__()
         config.validate()
         self._config, self._mavlink, self._gravity, self._period = config, mavlink, gravity, period
@@ -117,13 +114,11 @@ class Px4Commander(LeafSystem):
         for name, size in _INPUTS.items():
             self.DeclareVectorInputPort(name, size)
         self.DeclareDiscreteState(np.array(_Memory()))
+        intervals = {"setpoint_age": SAME_TIME, "motion_capture_age": 0.9 * period}
         # By the ages of arrivals: the min time between two that are sent on [s], and the state.
         self._arrivals = {
             name: (interval, int(self.DeclareDiscreteState(np.array(_Arrival()))))
-            for name, interval in (
-                ("setpoint_age", SAME_TIME),
-                ("motion_capture_age", 0.9 * period),
-            )
+            for name, interval in intervals.items()
         }
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
         self.DeclarePeriodicDiscreteUpdateEvent(tick, 0.0, self._look)

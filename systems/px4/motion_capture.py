@@ -52,8 +52,7 @@ class MotionCaptureReceiver(Receiver[_Pose]):
         output_ports: [motion_capture_pose, age, rejected]
 
     - ``motion_capture_pose`` (7): last p_WB [m] and q_WB (wxyz) of the tracked body; NaN before.
-    - ``age`` (1): [s] since the exposure of that; infinity before. It grows without frames, and
-      while frames do not track the body.
+    - ``age`` (1): [s] since the exposure of that; infinity before.
     - ``rejected`` (1): number of packets that were not frames, of other senders, or no newer than
       the frame before.
     """
@@ -61,20 +60,15 @@ class MotionCaptureReceiver(Receiver[_Pose]):
     def __init__(
         self, config: MotionCaptureConfig, period: float, now: Callable[[], float] | None = None
     ):
-        """Constructs the system; `period` and `now` are those of `Receiver`."""
         config.validate()
         natnet: Any = import_extra("natnet", "mocap")
         super().__init__(_Pose(), "motion capture", period, now)
         self._body, self._version = config.body_id, natnet.Version(*config.version)
         self._natnet, self._inbox, self._latency = natnet, UdpInbox(config.udp), config.latency
+        self.port = self._inbox.port
         weakref.finalize(self, self._inbox.close)
         self._declare_age(lambda received: received.time)
         self._declare("motion_capture_pose", 7, lambda received, _: received.pose)
-
-    @property
-    def port(self) -> int:
-        """The UDP port at which the stream arrives."""
-        return self._inbox.port
 
     def _receive(self, context: Context, received: _Pose) -> _Pose:
         datagrams, now = self._inbox.receive(), self._time_of_reading(context)

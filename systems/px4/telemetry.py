@@ -112,19 +112,16 @@ class _Telemetry(Received):
         moved, rotated = (predict_state(state, time - each.time) for each in (p, a))
         return np.append(moved[:6], rotated[6:])
 
-    def mode(self, now: float) -> tuple[bool, int, int] | None:
-        """Returns if PX4 is armed, and its mode; None if they are unknown at `now` [s]."""
+    def mode(self, now: float) -> tuple[bool, int, int]:
+        """Returns if PX4 is armed, and its mode; zeros if they are unknown at `now` [s]."""
         is_known = now - self.heard <= HEARTBEAT_TIMEOUT
-        return (self.heartbeat.armed, *self.heartbeat.mode) if is_known else None
+        return (self.heartbeat.armed, *self.heartbeat.mode) if is_known else (False, 0, 0)
 
-
-_UNKNOWN = False, 0, 0
-
-
-def _vehicle_status(received: _Telemetry, now: float) -> list[float]:
-    """Returns the signal of `VehicleStatusCodec` at `now` [s]."""
-    mode = received.mode(now)
-    return [math.nan, math.nan] if mode is None else [mode[0], mode[1] == mavlink.OFFBOARD[0]]
+    def status(self, now: float) -> list[float]:
+        """Returns the signal of `VehicleStatusCodec` at `now` [s]."""
+        if now - self.heard > HEARTBEAT_TIMEOUT:
+            return [math.nan, math.nan]
+        return [self.heartbeat.armed, self.heartbeat.mode[0] == mavlink.OFFBOARD[0]]
 
 
 class Px4Telemetry(Receiver[_Telemetry]):
@@ -137,24 +134,21 @@ class Px4Telemetry(Receiver[_Telemetry]):
         output_ports: [state, age, heartbeat_age, armed, mode, granted, vehicle_status, rejected]
 
     - ``state`` (13), ``age`` (1) [s]: of LOCAL_POSITION_NED and ATTITUDE_QUATERNION, at the time of
-      the older; the other is brought back to it by its velocity or its rates. At rest in the
-      origin, and infinite, before both have come.
+      the older. At rest in the origin, and infinite, before both have come.
     - ``heartbeat_age`` (1): [s] since the last HEARTBEAT; infinity before the first.
     - ``armed`` (1), ``mode`` (2): of that; main and sub mode. 0 if it is older than 3 s.
-    - ``vehicle_status`` (2): 1 if armed, and 1 in offboard mode; NaN if the last HEARTBEAT is older
-      than 3 s. See ``lcmt_vehicle_status``.
+    - ``vehicle_status`` (2): see ``lcmt_vehicle_status``; NaN if the heartbeat is older than 3 s.
     - ``granted`` (2): 1 if PX4 has ever accepted a command for a mode, and one to arm.
     - ``rejected`` (1): number of packets and messages that were not MAVLink, not finite, of other
       senders, or no newer than the one before.
 
-    Requests PX4's time every second, and answers PX4's requests (TIMESYNC). Ages are by PX4's own
-    stamps, to include the delay of the link. The Unix time at which PX4's clock was 0 is bounded by
-    its fastest message and by its fastest answer::
+    Ages are by PX4's own stamps, to include the delay of the link. The Unix time at which PX4's
+    clock was 0 is the middle between bounds, by its fastest message and its fastest answer to
+    TIMESYNC, which widen by 0.1 ms/s, for clocks that drift::
 
         question - answer <= zero <= arrival - stamp
 
-    The estimate is the middle. The bounds widen by 0.1 ms/s, for clocks that drift. PX4 has
-    restarted if its stamps go back by more than a second after a second of silence.
+    PX4 has restarted if its stamps go back by more than a second after a second of silence.
     """
 
     def __init__(
@@ -165,8 +159,6 @@ class Px4Telemetry(Receiver[_Telemetry]):
         period: float,
         now: Callable[[], float] | None = None,
     ):
-        """Constructs the system, which exchanges messages with PX4 at `address` through `inbox`;
-        `period` and `now` are those of `Receiver`."""
         super().__init__(_Telemetry(), "PX4", period, now)
         self._inbox, self._link, self._address = inbox, link, address
         self._declare_age(lambda received: received.measured)
@@ -174,9 +166,9 @@ class Px4Telemetry(Receiver[_Telemetry]):
         commands = mavlink.SET_MODE, mavlink.ARM
         self._declare("granted", 2, lambda got, _: [each in got.granted for each in commands])
         self._declare("heartbeat_age", 1, lambda got, now: now - got.heard, timed=True)
-        self._declare("armed", 1, lambda got, now: (got.mode(now) or _UNKNOWN)[0], timed=True)
-        self._declare("mode", 2, lambda got, now: (got.mode(now) or _UNKNOWN)[1:], timed=True)
-        self._declare("vehicle_status", 2, _vehicle_status, timed=True)
+        self._declare("armed", 1, lambda got, now: got.mode(now)[0], timed=True)
+        self._declare("mode", 2, lambda got, now: got.mode(now)[1:], timed=True)
+        self._declare("vehicle_status", 2, _Telemetry.status, timed=True)
         self.DeclarePeriodicPublishEvent(period, PUBLISH_OFFSET, self._answer)
         self.DeclarePeriodicPublishEvent(_QUESTION_PERIOD, PUBLISH_OFFSET, self._ask)
 

@@ -97,12 +97,9 @@ class DelayedPose(LeafSystem):
         input_ports: [state]
         output_ports: [pose]
 
-    - ``state`` (13): that of :class:`~splatpilot.systems.vehicle.quadrotor.QuadrotorPlant`.
-    - ``pose`` (abstract, RigidTransform): X_WB at ``now - age``, with the age of the last frame,
-      or the earliest known.
-
-    The discrete state holds samples of time and state every ``period`` [s]; between them the state
-    is interpolated linearly, and its quaternion normalized.
+    - ``state`` (13): that of `QuadrotorPlant`.
+    - ``pose`` (RigidTransform): X_WB at ``now - age``, with the age of the last frame, or the
+      earliest known; interpolated linearly between samples every ``period`` [s].
     """
 
     def __init__(self, frames: FrameTimes, period: float = 0.02) -> None:

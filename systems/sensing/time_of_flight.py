@@ -1,8 +1,6 @@
 """Converts raw frames of a time-of-flight sensor to the grid that policies observe.
 
-The steps are those of the streamer on a Starling 2 Max: rotate the frame upright, crop it to the
-policy's field of view, replace unmeasured depth by the maximum, convert depth to range, take the
-minimum of each cell, encode it, and turn the grid upside down.
+The steps are those of the streamer on a Starling 2 Max.
 """
 
 import math
@@ -152,7 +150,7 @@ _FRAME_HEADER = struct.Struct("<IIIHHQHH")
 
 @dataclass(frozen=True, eq=False)
 class Stream:
-    """State of a stream, immutable: Contexts may share it."""
+    """State of a stream, immutable."""
 
     grid: np.ndarray | None = None  # (rows, columns), the newest.
     time_ns: int = -1  # of the grid, by the sensor's clock.
@@ -161,13 +159,6 @@ class Stream:
     # Incomplete raw frame: number, chunks, time, width, height; and its received chunks.
     frame: tuple[int, ...] = ()
     chunks: dict[int, bytes] = field(default_factory=dict)
-
-    def restarted(self) -> "Stream":
-        """Returns the state for a new stream: clock and numbers are not compared."""
-        return replace(self, time_ns=-1, seq=-1)
-
-    def __deepcopy__(self, memo: dict) -> "Stream":
-        return self
 
 
 def after_packet(stream: Stream, packet: bytes, sensor: TimeOfFlight) -> Stream:

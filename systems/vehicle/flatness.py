@@ -107,7 +107,15 @@ def flatness_command(
     config: FlatnessControllerConfig,
     params: QuadrotorParams,
 ) -> Any:
-    """Returns thrust over mass and body rates (..., 4) for an acceleration: `FlatnessController`.
+    """Returns thrust over mass and body rates (..., 4) for an acceleration.
+
+    With z_B the body z axis and limits at every step::
+
+        f_W     = a_WB + g e_z + drag v_WB
+        c       = f_W · z_B
+        w_cmd_B = [tilt_gain · tilt, yaw_gain · yaw]
+
+    Tilt and yaw rotate the body so that z lies along f_W and x along the heading or the motion.
 
     Args:
         state: (..., 13).
@@ -168,23 +176,15 @@ class FlatnessController(LeafSystem):
         input_ports: [state, waypoint, acceleration, heading]
         output_ports: [command]
 
-    - ``state`` (13): ``[p_WB (3) [m], v_WB (3) [m/s], q_WB (4, wxyz), w_WB_B (3) [rad/s]]``.
+    - ``state`` (13), ``command`` (4): see `QuadrotorPlant`; the command is held between updates,
+      and that of hovering before the first.
     - ``waypoint`` (3): p_WR [m], where the vehicle should be ``lookahead`` seconds from now; or
       ``acceleration`` (3): a_WB [m/s^2], gravity excluded. Connect exactly one.
     - ``heading`` (1), optional: of body x, seen from above, [rad] from world x; along the motion if
       it is not connected or NaN.
-    - ``command`` (4): ``[c [m/s^2], w_cmd_B (3) [rad/s]]``, held between updates; hover thrust
-      before the first.
 
-    Updates every ``period`` [s] from time 0. With z_B the body z axis and limits at every step::
-
-        a_WB    = 2 (p_WR - p_WB - T v_WB) / T²
-        f_W     = a_WB + g e_z + drag v_WB
-        c       = f_W · z_B
-        w_cmd_B = [tilt_gain · tilt, yaw_gain · yaw]
-
-    where tilt and yaw rotate the body so that z lies along f_W and x along the heading or the
-    motion: toward the waypoint, or along v_WB if an acceleration is given.
+    Updates every ``period`` [s] from time 0, see `reaching_acceleration` and `flatness_command`.
+    The motion is toward the waypoint, or along v_WB if an acceleration is given.
     """
 
     def __init__(

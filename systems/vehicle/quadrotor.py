@@ -120,15 +120,13 @@ def QuadrotorPlant_(T):
             input_ports: [command]
             output_ports: [state]
 
-        - ``command`` (4): ``[c [m/s^2], w_cmd_B (3) [rad/s]]``, c the thrust over mass along
-          body +z.
-        - ``state`` (13): ``[p_WB (3) [m], v_WB (3) [m/s], q_WB (4, wxyz), w_WB_B (3) [rad/s]]``,
-          continuous; by default ``initial_state``, a level hover at the world's origin.
+        - ``command`` (4), ``state`` (13): as at the top of this module; the state is continuous, by
+          default a level hover at the world's origin.
         - Numeric parameter 0 (3): ``[drag [1/s], rate_time_constant [s], gravity [m/s^2]]``.
 
-        See :func:`~splatpilot.systems.vehicle.quadrotor.quadrotor_derivatives`. Supports the
-        scalars float, AutoDiffXd and Expression. Integrate in steps of at most 0.02 s: after 5 s of
-        random commands at 50 Hz, ``runge_kutta3`` is within 2 cm of the solution.
+        See `quadrotor_derivatives`. Supports the scalars float, AutoDiffXd and Expression.
+        Integrate in steps of at most 0.02 s: after 5 s of random commands at 50 Hz,
+        ``runge_kutta3`` is within 2 cm of the solution.
         """
 
         def _construct(

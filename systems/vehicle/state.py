@@ -134,13 +134,9 @@ class StateToPose(LeafSystem):
 
     def __init__(self):
         super().__init__()
-        state = self.DeclareVectorInputPort("state", 13)
-        self.DeclareAbstractOutputPort(
-            "pose",
-            lambda: Value(RigidTransform()),
-            weak_callback(self._calc_pose),
-            {state.ticket()},
-        )
+        state, calc = self.DeclareVectorInputPort("state", 13), weak_callback(self._calc_pose)
+        tickets = {state.ticket()}
+        self.DeclareAbstractOutputPort("pose", lambda: Value(RigidTransform()), calc, tickets)
 
     def _calc_pose(self, context, output):
         output.set_value(pose_from_state(vector_input(self, "state", context)))
@@ -155,14 +151,12 @@ class StatePredictor(LeafSystem):
         input_ports: [measured_state, age]
         output_ports: [state]
 
-    - ``measured_state`` (13), ``state`` (13): as those of
-      :class:`~splatpilot.systems.vehicle.quadrotor.QuadrotorPlant`.
+    - ``measured_state`` (13), ``state`` (13): as those of `QuadrotorPlant`.
     - ``age`` (1): [s] since it was measured, clipped to [0, ``longest``] against clocks that
       disagree and vehicles that fell silent.
     """
 
     def __init__(self, longest: float = LONGEST_PREDICTION):
-        """Constructs the system, which predicts at most `longest` [s] ahead."""
         super().__init__()
         self._longest = longest
         self.DeclareVectorInputPort("measured_state", 13)

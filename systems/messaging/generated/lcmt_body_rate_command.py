@@ -10,7 +10,11 @@ import struct
 import drake
 
 class lcmt_body_rate_command(object):
-    """ What a quadrotor's rate controller is to do, until the next one comes. B is the body (x forward, y left, z up). """
+    """
+    What a quadrotor's rate controller is to do, until the next one comes: thrust over mass [m/s^2], along B's z, and the
+    angular velocity of B, expressed in B [rad/s]. B is the body (x forward, y left, z up).
+    header: utime is when it was decided, frame_name is "body". session: a random number of the sender.
+    """
 
     __slots__ = ["header", "session", "thrust", "w_cmd_B"]
 
@@ -20,29 +24,13 @@ class lcmt_body_rate_command(object):
 
     def __init__(self):
         self.header = drake.lcmt_header()
-        """
-        utime is when it was decided, frame_name is "body".
-        LCM Type: drake.lcmt_header
-        """
-
+        """ LCM Type: drake.lcmt_header """
         self.session = 0
-        """
-        Tells senders apart: a number that each draws when it starts.
-        LCM Type: int32_t
-        """
-
+        """ LCM Type: int32_t """
         self.thrust = 0.0
-        """
-        [m/s^2], thrust over mass, along B's z.
-        LCM Type: double
-        """
-
+        """ LCM Type: double """
         self.w_cmd_B = [ 0.0 for dim0 in range(3) ]
-        """
-        [rad/s], angular velocity of B, expressed in B.
-        LCM Type: double[3]
-        """
-
+        """ LCM Type: double[3] """
 
     def encode(self):
         buf = BytesIO()

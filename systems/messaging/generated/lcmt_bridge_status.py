@@ -10,7 +10,14 @@ import struct
 import drake
 
 class lcmt_bridge_status(object):
-    """ How the process is that flies a vehicle by messages. """
+    """
+    State of the process that flies a vehicle by messages. Modes: WAITING for the first state or observation; FLYING as the
+    policy decides, within limits; HOLDING, it brakes and hovers; LANDING until it is not in charge any more. Reasons: why it
+    does not fly as the policy decides. LIMITED_...: it flies as near to that as is allowed.
+    Ages [s]: since the state and the observation that are flown by; infinite before the first, 0 of policies without images.
+    Numbers since the start: of messages that never came, of rejected messages, of ticks that ended too late.
+    header: utime is when it was so, frame_name is empty. session: a random number of the sender.
+    """
 
     __slots__ = ["header", "session", "mode", "reason", "state_age", "observation_age", "num_gaps", "num_rejected", "num_overruns"]
 
@@ -19,96 +26,44 @@ class lcmt_bridge_status(object):
     __dimensions__ = [None, None, None, None, None, None, None, None, None]
 
     WAITING = 0
-    """ For the first state or observation. """
     FLYING = 1
-    """ As the policy decides, within limits. """
     HOLDING = 2
-    """ Brakes and hovers. """
     LANDING = 3
-    """ Descends, whatever comes, until it is not in charge any more. """
     NONE = 0
     STATE_OLD = 1
-    """ The state is older than allowed, or its content has not changed for as long. """
     STATE_FROZEN = 2
     OBSERVATION_OLD = 3
-    """ The observation is older than allowed. """
     BODY_LOST = 4
-    """ Motion capture has not seen the vehicle for longer than allowed. """
     NOT_FINITE = 5
-    """ What the policy or the controller decided is no number, or more than the vehicle may do. """
     OUT_OF_BOUNDS = 6
     OVERRUN = 7
-    """ The process was behind the wall clock by more than allowed. """
     TILTED = 8
-    """ The vehicle tilts more than allowed, or has left where it may fly. """
     OUTSIDE = 9
     LIMITED_SPEED = 10
-    """
-    The policy would fly too fast, out of where it may, or too near to what is known of the world; it is flown as near to
-    what it decided as is allowed.
-    """
     LIMITED_GEOFENCE = 11
     LIMITED_CLEARANCE = 12
     STATE_JUMPED = 13
-    """ The state does not follow from those before: position, velocity and attitude do not agree. """
     POLICY_FAILED = 14
-    """ The policy raised an exception instead of deciding; the log has it. """
 
     def __init__(self):
         self.header = drake.lcmt_header()
-        """
-        utime is when it was so, frame_name is empty.
-        LCM Type: drake.lcmt_header
-        """
-
+        """ LCM Type: drake.lcmt_header """
         self.session = 0
-        """
-        Tells senders apart: a number that each draws when it starts.
-        LCM Type: int32_t
-        """
-
+        """ LCM Type: int32_t """
         self.mode = 0
-        """
-        What it does: one of the modes below.
-        LCM Type: int8_t
-        """
-
+        """ LCM Type: int8_t """
         self.reason = 0
-        """
-        Why it does not fly as the policy decides: one of the reasons below.
-        LCM Type: int8_t
-        """
-
+        """ LCM Type: int8_t """
         self.state_age = 0.0
-        """
-        [s], since the state that is flown by; infinity where there has been none.
-        LCM Type: double
-        """
-
+        """ LCM Type: double """
         self.observation_age = 0.0
-        """
-        [s], since the observation that is flown by; 0 of policies that see nothing, infinity where there has been none.
-        LCM Type: double
-        """
-
+        """ LCM Type: double """
         self.num_gaps = 0
-        """
-        Messages since the start that were sent but never came.
-        LCM Type: int64_t
-        """
-
+        """ LCM Type: int64_t """
         self.num_rejected = 0
-        """
-        Messages since the start that were refused: of another type, malformed, not finite, repeated, late or from the future.
-        LCM Type: int64_t
-        """
-
+        """ LCM Type: int64_t """
         self.num_overruns = 0
-        """
-        Ticks since the start that ended later than they should have.
-        LCM Type: int64_t
-        """
-
+        """ LCM Type: int64_t """
 
     def encode(self):
         buf = BytesIO()

@@ -10,7 +10,13 @@ import struct
 import drake
 
 class lcmt_depth_grid(object):
-    """ A coarse picture of what is near, as policies see it: the nearest in each cell. """
+    """
+    The nearest depths in the cells of a coarse image. values: row by row, each from the left of the image, the lowest row
+    first. Encodings: DEPTH [m] along the optical axis, RANGE [m] along the ray, PROXIMITY, which is 1 - range / max_range.
+    min_range and max_range [m] are limits of the sensor; values farther or not measured are max_range. num_values is
+    width * height.
+    header: utime is when the sensor exposed, frame_name names the sensor. session: a random number of the sender.
+    """
 
     __slots__ = ["header", "session", "width", "height", "min_range", "max_range", "encoding", "num_values", "values"]
 
@@ -19,55 +25,28 @@ class lcmt_depth_grid(object):
     __dimensions__ = [None, None, None, None, None, None, None, None, ["num_values"]]
 
     DEPTH = 0
-    """ [m], along the optical axis. """
     RANGE = 1
-    """ [m], along the ray. """
     PROXIMITY = 2
-    """ 1 - range / max_range: 1 is touched, 0 is nothing near. """
 
     def __init__(self):
         self.header = drake.lcmt_header()
-        """
-        utime is when the sensor exposed, frame_name names the sensor.
-        LCM Type: drake.lcmt_header
-        """
-
+        """ LCM Type: drake.lcmt_header """
         self.session = 0
-        """
-        Tells senders apart: a number that each draws when it starts.
-        LCM Type: int32_t
-        """
-
+        """ LCM Type: int32_t """
         self.width = 0
         """ LCM Type: int32_t """
         self.height = 0
         """ LCM Type: int32_t """
         self.min_range = 0.0
-        """
-        [m], the least and the greatest that the sensor measures; what is farther, or was not measured, has the greatest.
-        LCM Type: float
-        """
-
+        """ LCM Type: float """
         self.max_range = 0.0
         """ LCM Type: float """
         self.encoding = 0
-        """
-        One of the constants below.
-        LCM Type: int8_t
-        """
-
+        """ LCM Type: int8_t """
         self.num_values = 0
-        """
-        width * height.
-        LCM Type: int32_t
-        """
-
+        """ LCM Type: int32_t """
         self.values = []
-        """
-        Row by row, each from the left of the image: the lowest row first, as policies for time of flight see it.
-        LCM Type: float[num_values]
-        """
-
+        """ LCM Type: float[num_values] """
 
     def encode(self):
         buf = BytesIO()

@@ -11,8 +11,9 @@ import drake
 
 class lcmt_motion_capture_pose(object):
     """
-    Where a motion-capture system sees a body, already in the world W (z up): who reads a system whose y is up has converted
-    it. B is the body (x forward, y left, z up).
+    Position [m] and attitude (a unit quaternion w x y z) of the named body B in W, by motion capture; without meaning unless
+    tracked. W is the world (z up), B the body (x forward, y left, z up).
+    header: utime is when the cameras exposed, frame_name is "world". session: a random number of the sender.
     """
 
     __slots__ = ["header", "session", "body", "tracked", "p_WB", "q_WB"]
@@ -23,41 +24,17 @@ class lcmt_motion_capture_pose(object):
 
     def __init__(self):
         self.header = drake.lcmt_header()
-        """
-        utime is when the cameras exposed, frame_name is "world".
-        LCM Type: drake.lcmt_header
-        """
-
+        """ LCM Type: drake.lcmt_header """
         self.session = 0
-        """
-        Tells senders apart: a number that each draws when it starts.
-        LCM Type: int32_t
-        """
-
+        """ LCM Type: int32_t """
         self.body = ""
-        """
-        The name of the body, as the system has it.
-        LCM Type: string
-        """
-
+        """ LCM Type: string """
         self.tracked = False
-        """
-        Whether the system saw the body; what follows means nothing if not.
-        LCM Type: boolean
-        """
-
+        """ LCM Type: boolean """
         self.p_WB = [ 0.0 for dim0 in range(3) ]
-        """
-        [m], position of B in W.
-        LCM Type: double[3]
-        """
-
+        """ LCM Type: double[3] """
         self.q_WB = [ 0.0 for dim0 in range(4) ]
-        """
-        Attitude of B in W, a unit quaternion w x y z.
-        LCM Type: double[4]
-        """
-
+        """ LCM Type: double[4] """
 
     def encode(self):
         buf = BytesIO()

@@ -11,8 +11,9 @@ import drake
 
 class lcmt_quadrotor_state(object):
     """
-    Where a quadrotor is and how it moves: what a state estimator says, or a simulated vehicle. W is the world (z up), B the
-    body (x forward, y left, z up).
+    State of a quadrotor: position [m] and velocity [m/s] of B in W, attitude of B in W (a unit quaternion w x y z) and angular
+    velocity of B in W, expressed in B [rad/s]. W is the world (z up), B the body (x forward, y left, z up).
+    header: utime is when the vehicle was in this state, frame_name is "world". session: a random number of the sender.
     """
 
     __slots__ = ["header", "session", "p_WB", "v_WB", "q_WB", "w_WB_B"]
@@ -23,41 +24,17 @@ class lcmt_quadrotor_state(object):
 
     def __init__(self):
         self.header = drake.lcmt_header()
-        """
-        utime is when the vehicle was in this state, frame_name is "world".
-        LCM Type: drake.lcmt_header
-        """
-
+        """ LCM Type: drake.lcmt_header """
         self.session = 0
-        """
-        Tells senders apart: a number that each draws when it starts.
-        LCM Type: int32_t
-        """
-
+        """ LCM Type: int32_t """
         self.p_WB = [ 0.0 for dim0 in range(3) ]
-        """
-        [m], position of B in W.
-        LCM Type: double[3]
-        """
-
+        """ LCM Type: double[3] """
         self.v_WB = [ 0.0 for dim0 in range(3) ]
-        """
-        [m/s], velocity of B in W.
-        LCM Type: double[3]
-        """
-
+        """ LCM Type: double[3] """
         self.q_WB = [ 0.0 for dim0 in range(4) ]
-        """
-        Attitude of B in W, a unit quaternion w x y z.
-        LCM Type: double[4]
-        """
-
+        """ LCM Type: double[4] """
         self.w_WB_B = [ 0.0 for dim0 in range(3) ]
-        """
-        [rad/s], angular velocity of B in W, expressed in B.
-        LCM Type: double[3]
-        """
-
+        """ LCM Type: double[3] """
 
     def encode(self):
         buf = BytesIO()

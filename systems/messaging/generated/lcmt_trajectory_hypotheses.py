@@ -11,8 +11,10 @@ import drake
 
 class lcmt_trajectory_hypotheses(object):
     """
-    The trajectories among which a policy chooses, each with its cost. W is the world (z up), P the body (x forward, y left, z
-    up) where it was when they were planned.
+    The trajectories among which a policy chooses that of the lowest cost. waypoints_P [m]: positions in P, the body (x forward,
+    y left, z up) at plan_utime [us]; waypoint t (from 0) is for (t + 1) * waypoint_period [s] later. p_WP [m] and q_WP (a unit
+    quaternion w x y z) are the pose of P in the world W (z up).
+    header: utime is when they were sent, frame_name is "world". session: a random number of the sender.
     """
 
     __slots__ = ["header", "session", "plan_utime", "waypoint_period", "p_WP", "q_WP", "num_hypotheses", "waypoints_P", "costs"]
@@ -23,55 +25,23 @@ class lcmt_trajectory_hypotheses(object):
 
     def __init__(self):
         self.header = drake.lcmt_header()
-        """
-        utime is when they were sent, frame_name is "world".
-        LCM Type: drake.lcmt_header
-        """
-
+        """ LCM Type: drake.lcmt_header """
         self.session = 0
-        """
-        Tells senders apart: a number that each draws when it starts.
-        LCM Type: int32_t
-        """
-
+        """ LCM Type: int32_t """
         self.plan_utime = 0
-        """
-        [us], Unix time of the plan; waypoint t (from 0) is for (t + 1) * waypoint_period later.
-        LCM Type: int64_t
-        """
-
+        """ LCM Type: int64_t """
         self.waypoint_period = 0.0
-        """
-        [s], time between waypoints.
-        LCM Type: double
-        """
-
+        """ LCM Type: double """
         self.p_WP = [ 0.0 for dim0 in range(3) ]
-        """
-        [m], position of P in W.
-        LCM Type: double[3]
-        """
-
+        """ LCM Type: double[3] """
         self.q_WP = [ 0.0 for dim0 in range(4) ]
-        """
-        Attitude of P in W, a unit quaternion w x y z.
-        LCM Type: double[4]
-        """
-
+        """ LCM Type: double[4] """
         self.num_hypotheses = 0
         """ LCM Type: int32_t """
         self.waypoints_P = []
-        """
-        [m], position in P of each hypothesis's waypoints.
-        LCM Type: double[num_hypotheses][10][3]
-        """
-
+        """ LCM Type: double[num_hypotheses][10][3] """
         self.costs = []
-        """
-        Lower is better, the lowest is flown; the unit is the policy's own.
-        LCM Type: double[num_hypotheses]
-        """
-
+        """ LCM Type: double[num_hypotheses] """
 
     def encode(self):
         buf = BytesIO()

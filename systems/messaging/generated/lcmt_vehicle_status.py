@@ -11,8 +11,10 @@ import drake
 
 class lcmt_vehicle_status(object):
     """
-    Who flies a vehicle, as the vehicle says, or the last heartbeat of its autopilot. It is not sent while that is unknown: before
-    the first heartbeat, and if the last one is too old to be true. Without this message the bridge is not in charge.
+    Who flies a vehicle: whether its motors may turn, and whether it flies by the bridge's messages, in its autopilot's offboard
+    mode; with both, the bridge is in charge. Not sent while that is unknown: before the autopilot's first heartbeat, and if the
+    last one is too old. Without this message the bridge is not in charge.
+    header: utime is when this was true, frame_name is empty. session: a random number of the sender.
     """
 
     __slots__ = ["header", "session", "armed", "offboard"]
@@ -23,29 +25,13 @@ class lcmt_vehicle_status(object):
 
     def __init__(self):
         self.header = drake.lcmt_header()
-        """
-        utime is when this was true, frame_name is empty.
-        LCM Type: drake.lcmt_header
-        """
-
+        """ LCM Type: drake.lcmt_header """
         self.session = 0
-        """
-        Tells senders apart: a number that each draws when it starts.
-        LCM Type: int32_t
-        """
-
+        """ LCM Type: int32_t """
         self.armed = False
-        """
-        Whether its motors may turn.
-        LCM Type: boolean
-        """
-
+        """ LCM Type: boolean """
         self.offboard = False
-        """
-        Whether it flies by what the bridge sends: an autopilot's offboard mode. With `armed` the bridge is in charge.
-        LCM Type: boolean
-        """
-
+        """ LCM Type: boolean """
 
     def encode(self):
         buf = BytesIO()

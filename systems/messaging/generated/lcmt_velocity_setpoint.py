@@ -10,7 +10,11 @@ import struct
 import drake
 
 class lcmt_velocity_setpoint(object):
-    """ What an autopilot's velocity controller is to do, until the next one comes. W is the world (z up), B the body (x forward). """
+    """
+    What an autopilot's velocity controller is to do, until the next one comes: velocity of B in W [m/s], and the heading of B's
+    x [rad], counterclockwise from W's x, or NaN to keep it. W is the world (z up), B the body (x forward).
+    header: utime is when it was decided, frame_name is "world". session: a random number of the sender.
+    """
 
     __slots__ = ["header", "session", "v_WB", "heading"]
 
@@ -20,29 +24,13 @@ class lcmt_velocity_setpoint(object):
 
     def __init__(self):
         self.header = drake.lcmt_header()
-        """
-        utime is when it was decided, frame_name is "world".
-        LCM Type: drake.lcmt_header
-        """
-
+        """ LCM Type: drake.lcmt_header """
         self.session = 0
-        """
-        Tells senders apart: a number that each draws when it starts.
-        LCM Type: int32_t
-        """
-
+        """ LCM Type: int32_t """
         self.v_WB = [ 0.0 for dim0 in range(3) ]
-        """
-        [m/s], velocity of B in W.
-        LCM Type: double[3]
-        """
-
+        """ LCM Type: double[3] """
         self.heading = 0.0
-        """
-        [rad] from W's x, seen from above, counterclockwise: where B's x should point. NaN: it may stay as it is.
-        LCM Type: double
-        """
-
+        """ LCM Type: double """
 
     def encode(self):
         buf = BytesIO()

@@ -91,8 +91,7 @@ class Bench:
                 command = flatness_command(
                     self.state, acceleration, np.zeros(3), setpoint[3], LAW, VEHICLE
                 )
-            for _ in range(2):
-                self.state = rk4_step(self.state, command, VEHICLE, PERIOD / 2)
+            self.state = rk4_step(self.state, command, VEHICLE, PERIOD)
             self.states.append(self.state)
             self.min_room = min(self.min_room, self._room())
             self.tick += 1

@@ -148,8 +148,3 @@ def test_an_exception_of_the_system_is_told_and_logged_once(caplog, broken, said
     assert [said in record.exc_text for record in caplog.records] == [True]
     policy.broken = ""
     assert after(1.2, 4.0) == [0.0, 4.0, 8.0]
-
-
-def test_a_system_without_updates_is_refused():
-    with pytest.raises(ValueError, match="got LeafSystem"):
-        ArrivalTriggered(LeafSystem(), TICK)

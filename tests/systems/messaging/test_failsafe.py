@@ -90,15 +90,6 @@ def test_a_vehicle_that_tips_over_is_leveled():
     assert bench.out("command")[1] < -3.0
 
 
-def test_outside_the_fence_the_vehicle_is_led_back():
-    limits = FlightLimits(geofence=[[0.0, -5, 0], [9.5, 5, 6]])
-    bench = Bench(replace(CONFIG, limits=limits))
-    bench.advance(0.06)
-    assert bench.mode() == (status.HOLDING, status.OUTSIDE)
-    bench.advance(1.9)
-    assert bench.state[0] < 9.6
-
-
 @pytest.mark.parametrize(
     ("gradient", "descends"), [([0.0, 0.0, 1.0], True), ([0.8, 0.0, 0.6], False)]
 )
@@ -200,7 +191,10 @@ def test_no_state_and_no_map_is_flown_faster_than_the_limit(
 
 def test_from_outside_the_fence_the_vehicle_returns_slowly():
     bench = Bench(p_WB=(25.0, 0.0, 3.0))
+    bench.advance(0.06)
+    assert bench.mode() == (status.HOLDING, status.OUTSIDE)
     bench.advance(4.0)
+    assert bench.state[0] < 22.0
     fastest = np.linalg.norm(np.array(bench.states)[:, 3:6], axis=1).max()
     assert 0.9 * RETURN_SPEED < fastest < 1.05 * RETURN_SPEED
 
@@ -282,12 +276,6 @@ def test_a_policy_that_desires_too_fast_flight_is_flown_at_the_limit():
     assert np.array(bench.states)[:, 3].max() < 1.05 * 4.0
     assert bench.state[3] > 3.9
     assert bench.mode() == (status.FLYING, status.LIMITED_SPEED)
-
-
-@pytest.mark.parametrize("name", ["max_age", "max_lag", "recovery", "patience", "descent"])
-def test_invalid_config_is_named(name):
-    with pytest.raises(ValueError, match=rf"{name} must be in .* got 0"):
-        FailsafeConfig(**{name: 0.0}).validate()
 
 
 @pytest.mark.parametrize(

@@ -5,12 +5,9 @@ from pydrake.math import RigidTransform
 from splatpilot.systems.collision.shapes import AnalyticDistanceField, Box, Sphere
 from splatpilot.systems.messaging.flight_limits import (
     RETURN_SPEED,
-    FlightLimits,
     Motion,
     limit_ahead,
     limit_approach,
-    limit_speed,
-    limit_to_box,
     stopping_displacement,
 )
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
@@ -61,19 +58,6 @@ def test_slow_approaches_and_flight_away_are_kept_and_the_return_is_slow(velocit
     np.testing.assert_allclose(limit_approach(np.array(velocity), away, room, 0.5), limited)
 
 
-def test_box_is_not_left():
-    lower, upper = np.array([0.0, -1, 0]), np.array([4.0, 1, 3])
-    random = np.random.default_rng(0)
-    p = np.array([2.0, 0.0, 1.0])
-    for _ in range(1000):
-        p = p + 0.02 * limit_to_box(random.normal(scale=20.0, size=3), p, lower, upper, 0.3)
-        assert (p >= lower).all() and (p <= upper).all()
-    p = np.array([5.0, 0.0, -1.0])
-    for _ in range(400):
-        p = p + 0.02 * limit_to_box(np.array([3.0, 0.0, -3.0]), p, lower, upper, 0.3)
-    np.testing.assert_allclose(p, [4.0, 0.0, 0.0], atol=0.01)
-
-
 POST = Sphere([4.0, 0.0, 0.0], 0.5)
 WALL = Box(RigidTransform([0.0, 2.0, 0.0]), [100.0, 2.0, 9.0])  # from y = 1 on
 FIELD = AnalyticDistanceField([WALL, POST], np.full(3, -50.0), np.full(3, 50.0))
@@ -98,31 +82,3 @@ def test_obstacles_ahead_limit_the_velocity(v, p, stop, limited):
     result = limit_ahead(np.array([v, 0.0, 0.0]), motion, FIELD, 0.1)
     np.testing.assert_allclose(result, [limited, 0.0, 0.0], atol=0.06)
     assert result[0] <= max(limited, 0.1)
-
-
-def test_speed_is_shortened():
-    np.testing.assert_allclose(limit_speed(np.array([6.0, 0, 8]), 5.0), [3, 0, 4])
-    np.testing.assert_array_equal(limit_speed(np.zeros(3), 5.0), np.zeros(3))
-
-
-@pytest.mark.parametrize(
-    ("field", "value"),
-    [
-        ("max_speed", 0.0),
-        ("max_tilt", 2.0),
-        ("deceleration", np.nan),
-        ("min_clearance", -0.1),
-        ("geofence", [[0.0, 0, 0], [1.0, 1, 0]]),
-        ("geofence", [[0.0, 0, 0]]),
-        ("geofence", [[0.0, -5.0, 0.5], [10.0, 5.0, 1.1]]),
-        ("geofence", [[0.0, 0.0, np.nan], [10.0, 5.0, 3.0]]),
-    ],
-)
-def test_invalid_limits_are_named(field, value):
-    with pytest.raises(ValueError, match=rf"{field} must be .*, got"):
-        FlightLimits(**{field: value}).validate()
-
-
-def test_a_geofence_may_be_as_narrow_as_the_vehicle_and_its_margins():
-    side = 2.0 * (VEHICLE_RADIUS + 0.1) + 1e-9
-    FlightLimits(geofence=[[0.0, 0.0, 0.0], [side, side, side]]).validate()

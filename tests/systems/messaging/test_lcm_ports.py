@@ -1,10 +1,7 @@
-import gc
 import os
 import resource
 import socket
-import subprocess
 import time
-import weakref
 from pathlib import Path
 
 import lcm
@@ -16,7 +13,7 @@ from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantVectorSource
 
 from splatpilot.systems.messaging.bridge_status import UnixClock
-from splatpilot.systems.messaging.codecs import CommandCodec, DepthGridCodec, StateCodec
+from splatpilot.systems.messaging.codecs import CommandCodec, DepthGridCodec
 from splatpilot.systems.messaging.lcm_ports import (
     MeasurementPublisher,
     MessagePublisher,
@@ -27,17 +24,14 @@ from splatpilot.systems.messaging.lcm_ports import (
 
 EPOCH = 1_800_000_000.25  # [s], also of the listener.
 CHANNEL = CommandCodec.channel
-TOOLS = Path(lcm.LCM_BIN_DIR)  # The programs themselves: scripts would not pass a signal on.
 
 
 @pytest.mark.parametrize(
     ("url", "reason"),
     [
         ("nonsense://", "must begin with udpm:// or memq://"),
-        ("", "must begin with"),
         ("file:///tmp/flight.lcm", "must begin with"),
         ("udpm://1.2.3.4:7667", "use a multicast group"),
-        ("udpm://not.an.address:7667", "use a multicast group"),
     ],
 )
 def test_unusable_urls_are_refused(url, reason):
@@ -133,10 +127,6 @@ def test_messages_are_numbered_and_stamped():
     assert (messages[-1].thrust, messages[-1].w_cmd_B) == (9.0, (1.0, 2.0, 3.0))
 
 
-def test_a_decision_is_sent_at_its_instant():
-    assert [m.thrust for m in periodic(Counter(), 0.05)] == [1.0, 2.0, 3.0]
-
-
 @pytest.mark.parametrize(("enabled", "count"), [(0.0, 0), (1.0, 5)])
 def test_nothing_is_sent_while_disabled(enabled, count):
     source, switch = constant(9.0, 0.0, 0.0, 0.0), constant(enabled)
@@ -199,19 +189,14 @@ def message(
     return command.encode()
 
 
-def test_before_the_first_message(listener):
+def test_last_message_and_its_age(listener):
     listener = listener(CommandCodec())
     listener.advance_to(0.5)
     assert np.isnan(listener.value).all()
     assert listener.output("age")[0] == np.inf
-    assert listener.counts == (0, 0)
-
-
-def test_last_message_and_its_age(listener):
-    listener = listener(CommandCodec())
-    listener.advance_to(0.0, message(0, -0.015, thrust=8.0), message(1, -0.005))
+    listener.advance_to(0.6, message(0, 0.485, thrust=8.0), message(1, 0.595))
     np.testing.assert_array_equal(listener.value, [9.0, 0.1, 0.2, 0.3])
-    listener.advance_to(0.3)
+    listener.advance_to(0.9)
     assert listener.output("age")[0] == pytest.approx(0.305001, abs=1e-6)
     assert listener.counts == (0, 0)
 
@@ -272,71 +257,20 @@ def test_invalid_messages_are_counted_and_logged(listener, data, reason, caplog)
     assert (listener.value[0], listener.counts) == (9.0, (0, 1))
 
 
-@pytest.mark.parametrize("codec", [CommandCodec(), StateCodec(), DepthGridCodec(4, 3, 5.0, "tof")])
-def test_damaged_messages_never_raise(listener, codec):
-    generator = np.random.default_rng(7)
-    listener = listener(codec)
-    values = {13: [0.0] * 6 + [1.0] + [0.0] * 6}.get(codec.size, np.full(codec.size, 0.5))
-    header = lcmt_header()
-    header.frame_name = codec.frame
-    for k in range(300):
-        header.seq, header.utime = k, round((EPOCH + k * 0.01) * 1e6)
-        data = bytearray(codec.pack(np.asarray(values), header, EPOCH).encode())
-        for _ in range(generator.integers(1, 4)):
-            data[generator.integers(len(data))] = generator.integers(256)
-        if k % 3 == 0:
-            data = data[: generator.integers(len(data))]
-        listener.advance_to(k * 0.01, bytes(data))
-        if np.isfinite(listener.output("age")[0]):
-            assert np.isfinite(listener.value).all()
-    assert listener.counts[1] >= 100
+def send(transport: lcm.LCM, messages: list[bytes]) -> None:
+    for data in messages:
+        transport.publish(CHANNEL, data)
+        assert transport.handle_timeout(2000)
 
 
-def test_received_messages_are_in_the_context(listener):
-    listener = listener(CommandCodec())
-    listener.advance_to(0.0, message(0, 0.0, thrust=8.0))
-    before = listener.root.Clone()
-    listener.advance_to(0.01, message(1, 0.01, thrust=9.0))
-    assert (listener.output("command", before)[0], listener.value[0]) == (8.0, 9.0)
-
-
-def test_subscribers_are_freed(listener):
-    listener = listener(CommandCodec())
-    transport, freed = listener.lcm, weakref.ref(listener.subscriber)
-    del listener
-    gc.collect()
-    assert freed() is None
-    transport.publish(CHANNEL, message(0, 0.0))
-    assert not transport.handle_timeout(0)
-
-
-def now_messages(count: int) -> list[bytes]:
-    """Messages that are sent 0.02 s apart from now on; the fourth is missing."""
-    now = time.time()
-    return [message(k, 0.02 * k, thrust=k, epoch=now) for k in range(count) if k != 3]
-
-
-def events(path: Path) -> list[tuple[str, bytes]]:
-    return [(event.channel, event.data) for event in lcm.EventLog(path)]
-
-
-def test_log_of_lcm_logger_replays(listener, udp_url, tmp_path):
-    path, messages, probes = tmp_path / "flight.lcm", now_messages(6), 0
-    out = open_lcm(udp_url)
-    words = [TOOLS / "lcm-logger", "--quiet", "--flush-interval=10", f"--lcm-url={udp_url}", path]
-    with subprocess.Popen(words) as logger:
-        try:
-            while not (path.exists() and path.stat().st_size):  # Until it has joined the group.
-                assert logger.poll() is None and probes < 500
-                probes += 1
-                out.publish("PROBE", b"")
-                time.sleep(0.02)
-            for data in messages:
-                out.publish(CHANNEL, data)
-                time.sleep(0.02)
-        finally:
-            logger.terminate()
-    assert [e for e in events(path) if e[0] == CHANNEL] == [(CHANNEL, data) for data in messages]
+def test_a_log_is_lcms_and_replays(listener, tmp_path):
+    now, path, transport = time.time(), tmp_path / "flight.lcm", lcm.LCM("memq://")
+    messages = [message(k, 0.02 * k, thrust=k, epoch=now) for k in (0, 1, 2, 4, 5)]
+    with recorded(transport, path):
+        send(transport, messages)
+    logged = list(lcm.EventLog(path))
+    assert [(e.channel, e.data) for e in logged] == [(CHANNEL, data) for data in messages]
+    assert abs(logged[0].timestamp * 1e-6 - now) < 60.0
     ages = []
     for _ in range(2):
         ours = listener(CommandCodec())
@@ -347,31 +281,11 @@ def test_log_of_lcm_logger_replays(listener, udp_url, tmp_path):
     assert ages[0] == ages[1]
 
 
-def test_lcms_own_programs_read_our_log(udp_url, tmp_path):
-    path, messages, heard = tmp_path / "flight.lcm", now_messages(4), []
-    transport = open_lcm(udp_url)
-    with recorded(transport, path):
-        for data in messages:
-            transport.publish(CHANNEL, data)
-            assert transport.handle_timeout(2000)
-    assert events(path) == [(CHANNEL, data) for data in messages]
-    assert abs(next(lcm.EventLog(path)).timestamp * 1e-6 - time.time()) < 60.0
-    transport.subscribe(CHANNEL, lambda _, data: heard.append(data))
-    player = [TOOLS / "lcm-logplayer", f"--lcm-url={udp_url}", path]
-    subprocess.run(player, check=True, capture_output=True)
-    while transport.handle_timeout(200):
-        pass
-    assert heard == messages
-
-
 def test_a_full_disk_only_ends_the_log(caplog):
     transport, heard = lcm.LCM("memq://"), []
     transport.subscribe(CHANNEL, lambda _, data: heard.append(data))
     with recorded(transport, Path("/dev/full"), overwrite=True):
-        for _ in range(100):
-            transport.publish(CHANNEL, bytes(1000))
-            while transport.handle_timeout(0):
-                pass
+        send(transport, [bytes(1000)] * 100)
     assert len(heard) == 100
     [record] = caplog.records
     assert "/dev/full cannot be written, the log ends here: No space left" in record.message
@@ -380,10 +294,9 @@ def test_a_full_disk_only_ends_the_log(caplog):
 def test_invalid_logs_are_errors(listener, tmp_path):
     (tmp_path / "junk").write_bytes(b"this is no log of LCM" * 10)
     ours = listener(CommandCodec())
-    with pytest.raises(FileNotFoundError, match=r"No such file: .*nowhere"):
-        replay(tmp_path / "nowhere", ours.lcm, ours.simulator, ours.clock)
-    with pytest.raises(ValueError, match="junk must be a log of LCM with messages"):
-        replay(tmp_path / "junk", ours.lcm, ours.simulator, ours.clock)
-    for path, error in (("junk", FileExistsError), ("no folder/log", OSError)):
-        with pytest.raises(error), recorded(ours.lcm, tmp_path / path):
+    for name, error in (("nowhere", FileNotFoundError), ("junk", ValueError)):
+        with pytest.raises(error, match=name):
+            replay(tmp_path / name, ours.lcm, ours.simulator, ours.clock)
+    for name, error in (("junk", FileExistsError), ("no folder/log", OSError)):
+        with pytest.raises(error), recorded(ours.lcm, tmp_path / name):
             pass

@@ -1,11 +1,9 @@
 """Frames, against other implementations of rotations."""
 
-import math
-
 import numpy as np
 import pytest
 from pymavlink.quaternion import Quaternion
-from pymavlink.rotmat import Matrix3, Vector3
+from pymavlink.rotmat import Vector3
 from scipy.spatial.transform import Rotation
 
 from splatpilot.systems.px4.frames import pose_from_optitrack, swap_px4, thrust_to_px4
@@ -41,22 +39,6 @@ def test_attitudes_are_those_of_scipy_and_of_pymavlink():
             pointed = dcm * axis
             found = [pointed.x, pointed.y, pointed.z]
             np.testing.assert_allclose(found, NED_FROM_W.apply(ours), atol=1e-6)
-
-
-@pytest.mark.parametrize(("roll", "pitch", "yaw"), [(0.3, 0, 0), (0, 0.3, 0), (0, 0, 0.3)])
-def test_euler_angles_have_the_signs_of_aviation(roll, pitch, yaw):
-    matrix = Matrix3()
-    matrix.from_euler(roll, pitch, yaw)
-    q = np.array(Quaternion(matrix).q)
-    rotation = Rotation.from_quat(swap_px4(q), scalar_first=True)
-    np.testing.assert_allclose(rotation.as_rotvec(), [roll, -pitch, -yaw], atol=1e-6)
-
-
-@pytest.mark.parametrize("heading", [-2.0, 0.0, 0.7, 3.0])
-def test_heading_is_the_yaw_of_the_attitude(heading):
-    q = swap_px4(wxyz(Rotation.from_euler("z", heading)))
-    _, _, yaw = Quaternion(q).dcm.to_euler()
-    assert math.remainder(-heading - yaw, math.tau) == pytest.approx(0, abs=1e-9)
 
 
 def test_optitracks_poses_are_those_of_scipy_and_px4s_recipe():

@@ -8,16 +8,12 @@ import pytest
 from pymavlink.dialects.v20 import common as dialect
 
 from splatpilot.systems.px4.mavlink import (
-    ARM,
     HOLD,
     OFFBOARD,
-    SET_MODE,
     Attitude,
-    Granted,
     Heartbeat,
     Mavlink,
     Position,
-    Timesync,
 )
 
 OURS = Mavlink()
@@ -98,23 +94,6 @@ def test_px4s_estimates_are_in_our_frames():
     np.testing.assert_array_equal(position.v_WB, [0.5, -0.25, 0.125])
     np.testing.assert_array_equal(attitude.q_WB, [0.5, 0.5, 0.5, -0.5])
     np.testing.assert_allclose(attitude.w_WB_B, [0.1, -0.2, -0.3], rtol=1e-6)
-
-
-def test_only_accepted_commands_of_ours_are_granted():
-    d, accepted, denied = dialect, dialect.MAV_RESULT_ACCEPTED, dialect.MAV_RESULT_DENIED
-    packet = sent(
-        d.MAVLink_command_ack_message(SET_MODE, accepted),
-        d.MAVLink_command_ack_message(ARM, denied),
-        d.MAVLink_command_ack_message(ARM, accepted, 0, 0, 1, 190),
-        d.MAVLink_command_ack_message(ARM, accepted, 0, 0, 1, 191),
-    )
-    assert OURS.read(packet)[0] == [Granted(SET_MODE), Granted(ARM)]
-
-
-def test_the_time_is_requested_and_answered():
-    message = received(OURS.timesync(Timesync(1_800_000_000_000_000_000, 5)))
-    assert (message.tc1, message.ts1) == (1_800_000_000_000_000_000, 5)
-    assert OURS.read(sent(dialect.MAVLink_timesync_message(0, 7)))[0] == [Timesync(0, 7)]
 
 
 HEARTBEAT = dialect.MAVLink_heartbeat_message(2, 12, 1, 3 << 16, 4, 3)

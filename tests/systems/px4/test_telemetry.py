@@ -14,7 +14,6 @@ from splatpilot.systems.px4.telemetry import Px4Telemetry
 
 EPOCH = 1_800_000_000.0  # [s] Unix time of the Context's time 0.
 BOOT = 1_799_999_000.0  # [s] Unix time when PX4 began.
-HEARTBEAT = dialect.MAVLink_heartbeat_message(2, 12, 129, 6 << 16, 4, 3)
 
 
 def position(time: float, x: float = 1.0):
@@ -201,39 +200,32 @@ def test_px4s_requests_for_the_time_are_answered(link):
     assert (answer.ts1, answer.tc1) == (12345, pytest.approx(1e9 * (EPOCH + 0.5), abs=2e4))
 
 
-def test_mode_and_arming_are_unknown_without_heartbeats(link):
-    assert link.out("heartbeat_age") == np.inf
-    link.send(HEARTBEAT)
-    link.advance(2.9)
-    assert link.out("armed") == 1 and link.out("mode").tolist() == [6.0, 0.0]
-    link.advance(0.2)
-    assert link.out("armed") == 0 and link.out("mode").tolist() == [0.0, 0.0]
-    assert link.out("heartbeat_age") == pytest.approx(3.1, abs=0.011)
-
-
-def test_a_value_that_is_not_finite_hides_no_heartbeat(link):
-    link.send(position(link.boot_time, x=np.nan), HEARTBEAT)
-    link.advance(0.02)
-    assert link.out("armed") == 1 and link.out("rejected") == 1
-
-
 def test_granted_commands_are_remembered(link):
     link.advance(0.02)
     assert link.out("granted").tolist() == [0, 0]
     link.send(dialect.MAVLink_command_ack_message(176, dialect.MAV_RESULT_ACCEPTED))
     link.send(dialect.MAVLink_command_ack_message(400, dialect.MAV_RESULT_DENIED))
+    accepted = 400, dialect.MAV_RESULT_ACCEPTED
+    link.send(dialect.MAVLink_command_ack_message(*accepted, 0, 0, 1, 190))  # Of another process.
     link.advance(0.02)
     assert link.out("granted").tolist() == [1, 0]
+    link.send(dialect.MAVLink_command_ack_message(*accepted, 0, 0, 1, 191))
+    link.advance(0.02)
+    assert link.out("granted").tolist() == [1, 1]
 
 
 @pytest.mark.parametrize(
     ("base", "mode", "told"), [(129, 6, [1, 1]), (129, 3, [1, 0]), (1, 6, [0, 1]), (1, 3, [0, 0])]
 )
-def test_vehicle_status_is_that_of_the_last_heartbeat_unless_it_is_old(link, base, mode, told):
+def test_modes_are_those_of_the_last_heartbeat_unless_it_is_old(link, base, mode, told):
     link.advance(0.1)
+    assert link.out("heartbeat_age") == np.inf
     assert np.isnan(link.out("vehicle_status")).all()
     link.send(dialect.MAVLink_heartbeat_message(2, 12, base, mode << 16, 4, 3))
     link.advance(2.9)
     assert link.out("vehicle_status").tolist() == told
+    assert link.out("armed") == told[0] and link.out("mode").tolist() == [mode, 0.0]
     link.advance(0.2)
+    assert link.out("armed") == 0 and link.out("mode").tolist() == [0.0, 0.0]
+    assert link.out("heartbeat_age") == pytest.approx(3.1, abs=0.011)
     assert np.isnan(link.out("vehicle_status")).all()

@@ -66,10 +66,7 @@ def test_depth_beyond_the_range_is_that_of_drakes_cameras(near, value):
     assert np.mean(seen == value) == pytest.approx(0.5, abs=0.02)
     measured = seen[np.isfinite(seen) & (seen > 0)]
     assert measured.min() >= 1.0 and measured.max() <= 9.0
-
-
-def test_unmeasured_depth_stays_unmeasured():
-    ends = np.array([[0.0, np.inf]], dtype=np.float32)
+    ends = np.array([[0.0, np.inf]], dtype=np.float32)  # Unmeasured.
     np.testing.assert_array_equal(noisy(ends, depth_multiplicative=0.5, depth_additive=0.5), ends)
 
 
@@ -91,9 +88,7 @@ def test_hue_rotates_about_gray():
     third = rotate_hue(red, math.cos(2 * math.pi / 3), math.sin(2 * math.pi / 3))
     np.testing.assert_allclose(third, [[60, 120, 60]], atol=1e-9)
     images = noisy(color(120, 60, 60, size=(4, 4)), 7, *NUMBERS, hue_jitter=30.0).astype(float)
-    assert (images == images[:, :1, :1]).all()
     r, g, b = images[:, 0, 0].T
-    assert (abs((r + g + b) / 3 - 80.0) < 1.0).all()
     angles = np.degrees(np.arctan2(math.sqrt(3.0) * (g - b), 2.0 * r - g - b))
     assert -31.0 < angles.min() < -27.0 and 27.0 < angles.max() < 31.0
     gray = color(100, 100, 100, size=(4, 4))
@@ -113,10 +108,6 @@ def test_exposure_scales_light_within_its_error():
     light = (expose(np.full(3, 100.0), noise, 0.5, np.zeros(3)) / 255) ** 2.2
     np.testing.assert_allclose(light, 2**0.5 * (100 / 255) ** 2.2, rtol=1e-9)
     assert (expose(np.full(3, 250.0), noise, 1.0, np.zeros(3)) == 255.0).all()
-    images = noisy(color(100, 100, 100, size=(4, 4)), 7, *NUMBERS, exposure_error=1.0)
-    assert (images == images[:, :1, :1, :1]).all()
-    factors = (images[:, 0, 0, 0] / 100) ** 2.2
-    assert 0.5 <= factors.min() < 0.55 and 1.85 < factors.max() < 2.03
 
 
 @pytest.mark.parametrize("electrons", [100.0, 225.0, 300.0])
@@ -154,24 +145,3 @@ def test_no_noise_changes_nothing_and_alpha_is_kept():
     system.get_input_port().FixValue(context, Value(image))
     seen = system.get_output_port().Eval(context).data
     np.testing.assert_array_equal(seen[..., 3], image.data[..., 3])
-
-
-@pytest.mark.parametrize(
-    ("field", "value"),
-    [
-        ("depth_dropout", 1.1),
-        ("depth_additive", np.inf),
-        ("latency", 1.5),
-        ("color_noise", -0.1),
-        ("exposure_error", 6.5),
-        ("read_noise", 3.0),  # of how many electrons?
-        ("frame_rate", [10.0]),
-        ("frame_rate", [30.0, 10.0]),
-        ("frame_rate", [0.0, 10.0]),
-        ("jitter", 0.1),  # of which rate?
-    ],
-)
-def test_invalid_noise_is_named(field, value):
-    with pytest.raises(ValueError, match=rf"ObservationNoise.{field} must be .*, got"):
-        ObservationNoise(**{field: value}).validate()
-    ObservationNoise(frame_rate=[10.0, 10.0], jitter=0.1, frame_dropout=0.5).validate()

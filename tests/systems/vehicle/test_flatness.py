@@ -1,5 +1,4 @@
 import math
-from dataclasses import fields
 
 import numpy as np
 import pytest
@@ -82,13 +81,6 @@ def test_thrust_is_limited_in_tilt_and_size(a_WB, thrust):
     np.testing.assert_allclose(command, expected, atol=1e-9)
 
 
-def test_an_inverted_body_rotates_about_its_x_axis():
-    state = hover_state([0.0, 0.0, 0.0])
-    state[6:10] = [0.0, 1.0, 0.0, 0.0]
-    command = flatness_command(state, np.zeros(3), np.zeros(3), None, CONFIG, PARAMS)
-    np.testing.assert_allclose(command[1:], [CONFIG.max_tilt_rate, 0.0, 0.0], atol=1e-9)
-
-
 @pytest.mark.parametrize("make", [np.asarray, torch.as_tensor], ids=["numpy", "torch"])
 @pytest.mark.parametrize("heading", [None, 0.4, math.nan])
 def test_batches_equal_single_vehicles(make, heading):
@@ -163,27 +155,15 @@ def yaw_of(states):
     return np.unwrap(Rotation.from_quat(states[:, 6:10], scalar_first=True).as_euler("ZYX")[:, 0])
 
 
-def test_hover_thrust_is_published_before_the_first_update():
-    controller = FlatnessController(params=QuadrotorParams(gravity=3.7))
-    context = controller.CreateDefaultContext()
-    command = controller.GetOutputPort("command").Eval(context)
-    np.testing.assert_array_equal(command, [3.7, 0.0, 0.0, 0.0])
-
-
 def test_the_command_is_held_between_updates():
     config = FlatnessControllerConfig(period=0.1)
     _, _, commands = fly(
         hover_state([0.0, 0.0, 0.0]), 1.0, config=config, waypoint=lambda t: [t, -t, 1.0]
     )
+    np.testing.assert_array_equal(commands[0], [9.81, 0.0, 0.0, 0.0])  # Before the first update.
     changed = np.nonzero(np.any(np.diff(commands, axis=0) != 0.0, axis=1))[0]
     assert len(changed) >= 9
     assert set(changed % 5) == {0}
-
-
-def test_hover_holds():
-    state = hover_state([1.0, 2.0, 3.0], yaw=2.5)
-    _, states, _ = fly(state, 5.0, waypoint=lambda t: [1.0, 2.0, 3.0])
-    np.testing.assert_allclose(states, np.tile(state, (len(states), 1)), atol=1e-9)
 
 
 @pytest.mark.parametrize("step", [[-2.0, 2.0, 4.0], [0.0, 0.0, -3.0], [30, 40, 5]])
@@ -217,27 +197,6 @@ def test_tracks_a_circle_to_a_centimeter():
     assert error.max() < 0.05
     yaw_error = yaw_of(states) - (math.pi / 2 + 2.0 / 3.0 * times)
     assert np.abs(yaw_error[steady]).max() < math.radians(6.0)
-
-
-def test_an_acceleration_is_reproduced():
-    a_WB = np.array([1.0, -2.0, 0.5])
-    for drag, tolerance in ((0.0, 1e-5), (0.375, 0.1)):
-        params = QuadrotorParams(drag=drag)
-        _, states, commands = fly(
-            hover_state([0.0, 0.0, 0.0]), 8.0, params=params, acceleration=lambda t: a_WB
-        )
-        v_dot = quadrotor_derivatives(states, commands, params)[-1, 3:6]
-        np.testing.assert_allclose(v_dot, a_WB, atol=tolerance)
-
-
-@pytest.mark.parametrize("direction", [-3.0, 2.0])
-def test_yaw_rotates_toward_motion(direction):
-    heading = np.array([math.cos(direction), math.sin(direction), 0.0])
-    _, states, commands = fly(
-        hover_state([0.0, 0.0, 0.0]), 6.0, waypoint=lambda t: 1.5 * (t + CONFIG.lookahead) * heading
-    )
-    assert yaw_of(states)[-1] == pytest.approx(direction, abs=math.radians(0.5))
-    assert np.abs(commands[:, 3]).max() <= CONFIG.max_yaw_rate
 
 
 def test_yaw_follows_the_velocity_when_an_acceleration_is_flown():
@@ -274,12 +233,9 @@ def test_commands_are_limited_for_any_input(state, port, value):
     assert abs(command[3]) <= CONFIG.max_yaw_rate
 
 
-def test_the_attitude_stays_within_the_tilt_limit():
-    corners = np.random.default_rng(0).uniform(-20, 20, size=(10, 3))
-    _, states, _ = fly(hover_state([0.0, 0.0, 0.0]), 10.0, waypoint=lambda t: corners[int(t) % 10])
-    z_W = Rotation.from_quat(states[:, 6:10], scalar_first=True).apply([0.0, 0.0, 1.0])
-    tilt = np.arccos(z_W[:, 2])
-    assert 0.9 * CONFIG.max_tilt < tilt.max() < CONFIG.max_tilt + math.radians(5.0)
+def test_the_thrust_must_carry_the_weight_at_any_tilt():
+    with pytest.raises(ValueError, match=r"max_thrust must be above 14\.08 .* got 12\.0"):
+        FlatnessController(FlatnessControllerConfig(max_thrust=12.0))
 
 
 def test_one_of_the_two_targets_must_be_connected():
@@ -292,33 +248,8 @@ def test_one_of_the_two_targets_must_be_connected():
 
 @pytest.mark.parametrize("port", ["state", "waypoint", "acceleration"])
 def test_an_input_that_is_not_finite_is_an_error(port):
-    inputs = {"state": hover_state([0.0, 0.0, 0.0]), "waypoint": np.zeros(3)}
-    if port == "acceleration":
-        inputs[port] = inputs.pop("waypoint")
+    target = "acceleration" if port == "acceleration" else "waypoint"
+    inputs = {"state": hover_state([0.0, 0.0, 0.0]), target: np.zeros(3)}
     inputs[port][1] = math.nan
-    with pytest.raises(
-        ValueError, match=rf"input '{port}' .* at t = 0\.5 s must be finite, got .*nan"
-    ):
+    with pytest.raises(ValueError, match=rf"input '{port}' .* at t = 0\.5 s must be finite"):
         command_for(time=0.5, **inputs)
-
-
-@pytest.mark.parametrize("field", [field.name for field in fields(FlatnessControllerConfig)])
-@pytest.mark.parametrize("value", [0.0, math.inf])
-def test_every_field_must_be_positive_and_finite(field, value):
-    with pytest.raises(ValueError, match=f"{field} must be in .*, got {value}"):
-        FlatnessController(FlatnessControllerConfig(**{field: value}))
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"period": 1e-5}, r"period .* got 1e-05"),
-        ({"min_thrust": 25.0}, r"min_thrust .* below max_thrust.* got 25\.0"),
-        ({"max_tilt": 1.6}, r"max_tilt .* got 1\.6"),
-        ({"max_thrust": 12.0}, r"max_thrust must be above 14\.08 .* got 12\.0"),
-        ({"lookahead": 0.1}, r"lookahead .* at least 2 / tilt_gain = 0\.2 s, got 0\.1"),
-    ],
-)
-def test_limits_that_contradict_each_other_are_refused(changes, message):
-    with pytest.raises(ValueError, match=message):
-        FlatnessController(FlatnessControllerConfig(**changes))

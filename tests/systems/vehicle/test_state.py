@@ -5,10 +5,8 @@ import pytest
 import torch
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from pydrake.autodiffutils import InitializeAutoDiff
 from pydrake.common.eigen_geometry import AngleAxis, Quaternion
 from pydrake.math import RigidTransform, RotationMatrix
-from pydrake.symbolic import MakeVectorContinuousVariable, Variable
 from scipy.spatial.transform import Rotation
 
 from splatpilot.systems.vehicle.quadrotor import hover_state
@@ -38,16 +36,8 @@ def test_parts_are_views(zeros):
     x = zeros((2, 13))
     QuadrotorState.of(x).v_WB[:, 1] = 3.0
     assert x[:, 4].tolist() == [3.0, 3.0] and x.sum() == 6.0
-
-
-def test_parts_of_derivatives_and_expressions():
-    x = InitializeAutoDiff(np.arange(13.0)).ravel()
-    packed = QuadrotorState.of(x).to_vector()
-    assert [component.value() for component in packed] == list(range(13))
-    np.testing.assert_array_equal(packed[7].derivatives(), np.eye(13)[7])
-    variables: list[Variable] = MakeVectorContinuousVariable(13, "x").tolist()
-    q_WB = QuadrotorState.of(np.array(variables)).q_WB
-    assert [str(component) for component in q_WB] == ["x(6)", "x(7)", "x(8)", "x(9)"]
+    with pytest.raises(ValueError, match=r"got \(13, 2\)"):
+        QuadrotorState.of(zeros((13, 2)))
 
 
 def test_heading_and_tilt_are_those_of_the_body_axes():
@@ -57,11 +47,6 @@ def test_heading_and_tilt_are_those_of_the_body_axes():
     state = QuadrotorState.of(states)
     np.testing.assert_allclose(state.heading, np.arctan2(x_W[:, 1], x_W[:, 0]), atol=1e-12)
     np.testing.assert_allclose(state.tilt, np.arccos(z_W[:, 2]), atol=1e-7)
-
-
-def test_other_shapes_are_refused():
-    with pytest.raises(ValueError, match=r"got \(13, 2\)"):
-        QuadrotorState.of(np.zeros((13, 2)))
 
 
 def pose_of(state):

@@ -1,12 +1,14 @@
-"""One flight with faults."""
+"""`splatpilot hardware faults`: many flights with random faults."""
 
 import heapq
+import json
 import math
 import socket
 import struct
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
-from functools import partial
+from dataclasses import asdict, dataclass, field, replace
+from functools import cache, partial
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -21,12 +23,18 @@ from splatpilot.diagrams.flight.flight import (
     has_landed,
     sample_initial_state,
 )
+from splatpilot.diagrams.flight.policies import policy_named
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.hardware.bridge import BuildHardwareDiagram, HardwareConfig, image_codecs
 from splatpilot.diagrams.hardware.real_time import output
 from splatpilot.diagrams.hardware.vehicle import BuildVehicleDiagram
+from splatpilot.diagrams.worlds.forest.forest import ForestConfig
 from splatpilot.diagrams.worlds.world import World
+from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.common.drake import vector_input, weak_callback
+from splatpilot.systems.common.files import claim_folder, locks_folder, written_atomically
+from splatpilot.systems.common.progress import Progress
+from splatpilot.systems.common.validation import Config, bounded
 from splatpilot.systems.messaging import codecs
 from splatpilot.systems.messaging.bridge_status import UnixClock
 from splatpilot.systems.messaging.failsafe import FailsafeConfig
@@ -44,10 +52,8 @@ KINDS = (
     *("policy_nonsense", "policy_raises", "policy_stalled", "policy_killed"),
     *("not_finite", "corrupt"),
 )
-"""Types of faults. Clocks, states and grids are the vehicle's. Messages that are "not_finite"
-contain NaN, those that are "corrupt" are truncated and have flipped bits.
-
-Of two faults, the earlier one here is applied first: messages are decoded before corruption."""
+"""Types of faults; of two, the earlier one here is applied first. Messages that are "not_finite"
+contain NaN, those that are "corrupt" are truncated and have flipped bits."""
 
 DELAY = 0.3  # [s] of delayed messages.
 TICK = 0.01  # [s] of both diagrams.
@@ -118,13 +124,8 @@ class Trial:
 
 
 class Relay:
-    """Carries messages between two LCMs, with faults.
-
-    Args:
-        vehicle, bridge: transports of either.
-        from_vehicle, from_bridge: codecs of their messages.
-        grid_port: of UDP, to which grids are sent as packets of the sensor, instead of to LCM.
-    """
+    """Carries messages between the LCMs of vehicle and bridge, with faults; grids go to a UDP port,
+    if given, as packets of the sensor."""
 
     def __init__(
         self,
@@ -264,12 +265,9 @@ def fly_trial(
 ) -> dict[str, Any]:
     """Flies a scenario, whose policy returns accelerations or velocities, through faults.
 
-    The diagrams of vehicle and bridge exchange messages through a `Relay`.
-
-    Returns:
-        The trial; `max_speed` [m/s], `max_tilt` [rad] and, except during landing, `min_clearance`
-        [m] and `min_inside` [m], the distance of the collision sphere from the fence; `outcome`;
-        the bridge's `reasons`; and `safe`.
+    Returns the trial; `max_speed` [m/s], `max_tilt` [rad] and, except during landing,
+    `min_clearance` [m] and `min_inside` [m], the distance of the collision sphere from the fence;
+    `outcome`; the bridge's `reasons`; and `safe`.
     """
     # Vehicle, bridge and relay.
     config = HardwareConfig(
@@ -301,7 +299,7 @@ def fly_trial(
     clock = cast(UnixClock, bridge.GetSubsystemByName("clock"))
 
     # Flight.
-    p_WG, field = goal_position(scenario, world), world.distance_field
+    p_WG, box = goal_position(scenario, world), world.distance_field
     max_speed, max_tilt, min_clearance, min_inside = 0.0, 0.0, math.inf, math.inf
     reasons, outcome, mode, stalled = set[int](), None, status.WAITING, 0.0
     last = max(fault.begin + min(fault.duration, 4.0) for fault in faults)
@@ -328,7 +326,7 @@ def fly_trial(
         own_mode = np.asarray(autopilot.GetOutputPort("mode").Eval(autopilot_context))[0]
         if status.LANDING not in (mode, own_mode):
             min_clearance = min(min_clearance, float(output(vehicle, "clearance", root)[0]))
-            to_fence = np.min([state.p_WB - field.lower_W, field.upper_W - state.p_WB])
+            to_fence = np.min([state.p_WB - box.lower_W, box.upper_W - state.p_WB])
             min_inside = min(min_inside, float(to_fence) - VEHICLE_RADIUS)
         outcome = flight_outcome(vehicle, root, p_WG, scenario.goal_radius)
         if outcome is not None:
@@ -358,3 +356,70 @@ def fly_trial(
         "outcome": ended,
         "safe": bool(kept and ended in _SAFE),
     }
+
+
+@dataclass
+class FaultsConfig(Config):
+    """A campaign."""
+
+    # [-] Number of flights, which alternate between faults, commands and policies.
+    trials: int = bounded(600, "[1, inf)")
+    # Seed of everything random.
+    seed: int = 0
+    # [-] Number of worlds, which trials alternate between.
+    worlds: int = bounded(10, "[1, inf)")
+    # [m/s] Speed of the policies; `straight` collides without a failsafe.
+    speed: float = 2.0
+    # Limits that safe trials keep.
+    limits: FlightLimits = field(default_factory=lambda: FlightLimits(max_speed=2.5))
+    # Scenario of the trials, but for its policy and seed.
+    scenario: Scenario = field(
+        default_factory=lambda: Scenario(
+            world=ForestConfig(length=14.0, width=8.0, rocks=2, logs=1)
+        )
+    )
+
+
+@locks_folder("out")
+def run(*, config: FaultsConfig, out: Path) -> dict[str, Any]:
+    """Flies the trials, or resumes an interrupted campaign of the same configuration.
+
+    Writes into `out`: `trials.jsonl`, results of `fly_trial`; `config.yaml`; `summary.json`, the
+    number of safe trials and the outcomes by the type of fault, which is also returned.
+    """
+    config.validate()
+    claim_folder(out / "config.yaml", config)
+    lines = out / "trials.jsonl"
+    rows = [json.loads(line) for line in lines.read_text().splitlines()] if lines.exists() else []
+    world_of_seed = cache(lambda seed: make_world(config.scenario.world, seed))
+    for number in Progress(range(len(rows), config.trials), "flying trials", unit="trial"):
+        world = world_of_seed(config.seed + number % config.worlds)
+        trial = Trial.sample(number, np.random.default_rng([config.seed, number]))
+        seed, policy = config.seed + number, policy_named(trial.policy, config.speed)
+        scenario = replace(config.scenario, seed=seed, policy=policy)
+        rows.append(fly_trial(scenario, world, trial, config.limits, seed))
+        with written_atomically(lines) as path:
+            path.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    summary = summarize(rows)
+    with written_atomically(out / "summary.json") as path:
+        path.write_text(json.dumps(summary, indent=2) + "\n")
+    print(f"{'fault':<16} {'safe':>9}  ended")
+    for kind, row in summary["kinds"].items():
+        ends = ", ".join(f"{name} {count}" for name, count in row["outcomes"].items())
+        print(f"{kind:<16} {row['safe']:>4}/{row['trials']:<4}  {ends}")
+    print(f"{summary['safe']} of {summary['trials']} trials were safe")
+    return summary
+
+
+def summarize(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Counts safe trials, and outcomes by the type of fault."""
+    kinds = {}
+    for kind in KINDS:
+        of_kind = [row for row in rows if kind in {fault["kind"] for fault in row["faults"]}]
+        ends = [row["outcome"] for row in of_kind]
+        kinds[kind] = {
+            "trials": len(of_kind),
+            "safe": sum(row["safe"] for row in of_kind),
+            "outcomes": {end: ends.count(end) for end in sorted(set(ends))},
+        }
+    return {"trials": len(rows), "safe": sum(row["safe"] for row in rows), "kinds": kinds}

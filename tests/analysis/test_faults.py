@@ -1,4 +1,6 @@
+import json
 import os
+import shutil
 import socket
 import struct
 
@@ -7,7 +9,9 @@ import numpy as np
 import pytest
 from drake import lcmt_header
 
-from splatpilot.analysis.faults.trial import DELAY, KINDS, Fault, Relay, Trial, fly_trial
+from splatpilot.analysis import faults
+from splatpilot.analysis.commands.main import main
+from splatpilot.analysis.faults import DELAY, KINDS, Fault, Relay, Trial, fly_trial
 from splatpilot.diagrams.flight.policies import policy_named
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.worlds.forest.forest import ForestConfig
@@ -33,9 +37,8 @@ class Line:
 
     def __init__(self, *kinds: str, size: float = 2.0):
         near, far, codec = lcm.LCM("memq://"), lcm.LCM("memq://"), StateCodec()
-        faults = tuple(Fault(kind, 1.0, duration=1.0, fraction=1.0, size=size) for kind in kinds)
-        random = np.random.default_rng(0)
-        relay = Relay(near, far, [codec], [CommandCodec()], faults, random)
+        hit = tuple(Fault(kind, 1.0, duration=1.0, fraction=1.0, size=size) for kind in kinds)
+        relay = Relay(near, far, [codec], [CommandCodec()], hit, np.random.default_rng(0))
         self.heard, self.sent = [], []
         far.subscribe(codec.channel, lambda _, data: self.heard.append((now, data)))
         for number in range(150):
@@ -157,14 +160,50 @@ def test_faults_interfaces_and_policies_alternate_and_repeat():
     assert trials[3] == Trial.sample(3, np.random.default_rng([0, 3])) != trials[3 + len(KINDS)]
 
 
-@pytest.mark.parametrize("setpoints", ["velocity", "body_rates"])
-def test_a_state_that_freezes_while_images_are_lost_ends_safely(setpoints):
-    scenario = Scenario(
-        world=ForestConfig(length=10.0, width=6.0), policy=policy_named("straight", 2.0)
-    )
-    world = make_world(scenario.world, 0)
-    faults = tuple(Fault(kind, 1.0, 1.0, 1.0, 1.0) for kind in ("dropped", "state_frozen"))
-    trial = Trial(faults, "straight", setpoints)
-    row = fly_trial(scenario, world, trial, FlightLimits(max_speed=2.5), 0)
+def test_a_state_that_freezes_while_images_are_lost_ends_safely():
+    world = ForestConfig(length=10.0, width=6.0)
+    scenario = Scenario(world=world, policy=policy_named("straight", 2.0))
+    hit = tuple(Fault(kind, 1.0, 1.0, 1.0, 1.0) for kind in ("dropped", "state_frozen"))
+    trial = Trial(hit, "straight", "body_rates")
+    row = fly_trial(scenario, make_world(world, 0), trial, FlightLimits(max_speed=2.5), 0)
     assert row["safe"]
     assert row["min_clearance"] >= 0.09
+
+
+SETTINGS = ["world.length=10.0", "world.width=6.0", "start_radius=0.05"]
+SETS = [word for setting in SETTINGS for word in ("--set", f"scenario.{setting}")]
+WORDS = ["hardware", "faults", "--set", "worlds=1", *SETS]
+
+
+def test_a_trial_of_a_campaign_is_safe(tmp_path):
+    assert main([*WORDS, "--set", "trials=1", "--out", str(tmp_path)]) == 0
+    [row] = map(json.loads, (tmp_path / "trials.jsonl").read_text().splitlines())
+    assert row["safe"] and row["faults"][0]["kind"] == "dropped"
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert (summary["trials"], summary["safe"]) == (1, 1)
+
+
+def test_a_campaign_resumes_and_repeats(tmp_path, monkeypatch):
+    def fly_trial(scenario, world, trial, limits, seed):
+        hit = [{"kind": fault.kind, "begin": fault.begin} for fault in trial.faults]
+        return {"faults": hit, "seed": seed, "safe": True, "outcome": "hover"}
+
+    monkeypatch.setattr(faults, "fly_trial", fly_trial)
+    words, again = [*WORDS, "--set", "trials=3"], tmp_path / "again"
+    assert main([*words, "--out", str(tmp_path / "whole")]) == 0
+    rows = (tmp_path / "whole" / "trials.jsonl").read_text().splitlines(keepends=True)
+    again.mkdir()
+    shutil.copy(tmp_path / "whole" / "config.yaml", again)
+    (again / "trials.jsonl").write_text(rows[0])
+    assert main([*words, "--out", str(again)]) == 0
+    assert (again / "trials.jsonl").read_text() == "".join(rows)
+    assert json.loads(rows[2])["seed"] == 2
+    for other in ("seed=1", "trials=0"):
+        assert main([*words, "--set", other, "--out", str(again)]) == 1
+
+
+def test_accidents_are_counted():
+    row = {"faults": [{"kind": "dropped"}], "safe": True, "outcome": "hover"}
+    summary = faults.summarize([row, {**row, "safe": False, "outcome": "collision"}])
+    assert (summary["trials"], summary["safe"]) == (2, 1)
+    assert summary["kinds"]["dropped"]["outcomes"] == {"collision": 1, "hover": 1}
