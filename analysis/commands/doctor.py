@@ -8,7 +8,6 @@ from splatpilot.analysis.commands import options as cli
 
 @cli.command(
     "doctor",
-    "list what works on this machine, and what to install or set for the rest",
     cli.json_option("the findings"),
     examples=("doctor", "doctor --json"),
 )

@@ -27,8 +27,6 @@ from splatpilot.systems.common.files import require_existing, require_scene, req
 if TYPE_CHECKING:
     from splatpilot.diagrams.flight.scenario import Scenario
 
-EXAMPLES = "examples:"
-
 
 class Option:
     """An option or argument of commands.
@@ -73,25 +71,19 @@ class Command:
     """A command, such as "fly", or a subcommand, such as "scene scale"."""
 
     name: str
-    help: str  # half a sentence, for the list of commands
-    examples: Sequence[str] = ()  # command lines without `splatpilot`
-    options: Sequence[Option] = ()
-    function: Callable[[argparse.Namespace], Any] | None = None
-    """Returns what `--json` prints; its docstring is the description. None for a command with
-    subcommands."""
+    examples: Sequence[str]  # command lines without `splatpilot`
+    options: Sequence[Option]
+    function: Callable[[argparse.Namespace], Any]
+    """Returns what `--json` prints; its docstring is the description."""
 
-    def add_to(self, commands: argparse._SubParsersAction) -> argparse.ArgumentParser:
-        """Adds the parser of the command."""
+    def fill(self, parser: argparse.ArgumentParser) -> None:
+        """Adds description, examples and options to the parser of the command."""
         width = max(shutil.get_terminal_size().columns - 2, 40)
-        text = inspect.getdoc(self.function) if self.function else None
-        examples = [EXAMPLES, *(f"  splatpilot {line}" for line in self.examples)]
-        parser = commands.add_parser(
-            self.name.rpartition(" ")[2],
-            help=self.help,
-            description=textwrap.fill(text or f"{self.help[0].upper()}{self.help[1:]}.", width),
-            epilog="\n".join(examples) if self.examples else None,
-            formatter_class=argparse.RawDescriptionHelpFormatter,
+        parser.description = textwrap.fill(inspect.getdoc(self.function) or "", width)
+        parser.epilog = "\n".join(
+            ["examples:", *(f"  splatpilot {line}" for line in self.examples)]
         )
+        parser.formatter_class = argparse.RawDescriptionHelpFormatter
         exclusive = any(each.exclusive for each in self.options)
         group = parser.add_mutually_exclusive_group() if exclusive else parser
         for each in self.options:
@@ -102,7 +94,6 @@ class Command:
             if isinstance(action, SetField):
                 parser.set_defaults(default_config=action.configuration)
         parser.set_defaults(command=self)
-        return parser
 
     def run(self, options: argparse.Namespace) -> Any:
         """Checks the options and runs the command."""
@@ -114,15 +105,14 @@ class Command:
                 several = isinstance(value, list)
                 resolved = [each.resolve(one) for one in (value if several else [value])]
                 setattr(options, each.name, resolved if several else resolved[0])
-        assert self.function is not None
         return self.function(options)
 
 
 def command(
-    name: str, help: str, *options: Option, examples: Sequence[str]
+    name: str, *options: Option, examples: Sequence[str]
 ) -> Callable[[Callable[[argparse.Namespace], Any]], Command]:
     """Decorates the function of a command; for the arguments see `Command`."""
-    return lambda function: Command(name, help, examples, options, function)
+    return lambda function: Command(name, examples, options, function)
 
 
 def announce(text: str) -> None:

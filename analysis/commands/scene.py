@@ -22,7 +22,6 @@ def _point(text: str) -> list[float]:
 
 @cli.command(
     "scene scale",
-    "scale a scene by a factor, a measured length, or the height of the cameras",
     cli.path_option("scene", "a scene folder or a file of Gaussians"),
     cli.out_option("scene folder, or PLY, to write"),
     cli.Option("--up", "axis of a file that points up (z)", choices=_AXES),
@@ -66,7 +65,6 @@ def scale(options: argparse.Namespace) -> None:
 
 @cli.command(
     "scene measure",
-    "compare a scene with the held-out frames of its capture",
     cli.path_option("scene", "a scene folder"),
     cli.OVERWRITE,
     examples=("scene measure scenes/room_metric", "scene measure scenes/hospital --overwrite"),
@@ -83,7 +81,6 @@ def measure(options: argparse.Namespace) -> None:
 
 @cli.command(
     "scene mesh",
-    "write the surfaces of a scene, a map or a generated world as a mesh for collisions",
     cli.input_option("what", "scene", "map", "scenario"),
     cli.out_option("file to write: .obj or .gltf", unused=True),
     cli.flag("--conservative", "unknown space and outside of the bounds are solid"),
@@ -106,7 +103,6 @@ def mesh(options: argparse.Namespace) -> None:
 
 @cli.command(
     "scene ablate",
-    "reconstruct captures with increasing use of depth, as 3DGS and 2DGS, and compare",
     cli.input_option("captures", "capture", "scene", nargs="+", metavar="CAPTURE"),
     cli.out_option("output folder", "out/ablation"),
     cli.OVERWRITE,
@@ -132,7 +128,6 @@ def ablate(options: argparse.Namespace) -> None:
 
 @cli.command(
     "scene fidelity",
-    "measure how far from its capture's path a scene can be trusted",
     cli.path_option("scenes", "a scene folder", nargs="+", metavar="SCENE"),
     cli.out_option("output folder", "out/fidelity"),
     cli.OVERWRITE,
@@ -157,7 +152,6 @@ def fidelity(options: argparse.Namespace) -> None:
 
 @cli.command(
     "scene fetch",
-    "make the scenes of the benchmark's photorealistic scenarios",
     cli.Option(
         "names", "hospital, bookstore, ... (default: R13 to R17)", nargs="*", metavar="NAME"
     ),

@@ -308,7 +308,8 @@ def failing(monkeypatch, tmp_path):
         def raise_error(options):
             raise error
 
-        monkeypatch.setattr(cli, "COMMANDS", [Command("fly", "fail", function=raise_error)])
+        command = Command("fly", ("fly",), (), raise_error)
+        monkeypatch.setattr(cli, "find_command", lambda name: command)
 
     return fail
 
