@@ -79,12 +79,7 @@ class StudyFolder:
         return self.path / "rollouts" / f"{id}.npz"
 
     def begin(self, config: StudyConfig, program: dict[str, str]) -> None:
-        """Creates the folder, or checks that it has the same study.
-
-        Args:
-            config: of the study.
-            program: `provenance.program()`, `plugin_digests` and `input_digests`.
-        """
+        """Creates the folder, or checks that it has the same study."""
         study = yaml.safe_load(dump_config(config))
         require_writable_folder(self.path)
         if (self.path / "study.yaml").is_file():

@@ -31,13 +31,8 @@ if TYPE_CHECKING:
 class Option:
     """An option or argument of commands.
 
-    Args:
-        spec: flag, or name of an argument, and its metavar, such as "--seeds N".
-        help, type, keywords: of `ArgumentParser.add_argument`.
-        resolve: checks a value, each of several, before slow imports; returns it or what it names.
-        unused: the path must not exist without --overwrite.
-        completions: for shells.
-        exclusive: at most one of these options may be given.
+    `resolve` checks a value before slow imports, and returns it or what it names; the path of an
+    `unused` option must not exist without --overwrite; of `exclusive` ones at most one is given.
     """
 
     def __init__(
@@ -177,13 +172,8 @@ class SetField(argparse.Action):
 
 
 def set_option(*examples: str, configuration: str | Callable[[argparse.Namespace], Any]) -> Option:
-    """Declares `--set` of a command.
-
-    Args:
-        examples: FIELD=VALUE of the most important fields.
-        configuration: `module:type` of the configuration, or a function that makes it from the
-            options before `--set`.
-    """
+    """Declares `--set`, with FIELD=VALUE as examples, of a configuration: `module:type`, or a
+    function that makes it from the options before `--set`."""
 
     def make_default(options: argparse.Namespace) -> Any:
         module, _, name = str(configuration).partition(":")
@@ -201,8 +191,8 @@ def set_option(*examples: str, configuration: str | Callable[[argparse.Namespace
 
 
 def read_config(options: argparse.Namespace, *overrides: str, **changes: Any) -> Any:
-    """Reads the configuration of a command: its defaults with the `changes` that are not None,
-    then `--config`, `--set` and `overrides`."""
+    """Reads `--config` and `--set` over a command's defaults with the `changes` that are not
+    None."""
     from splatpilot.systems.common.config import load_config
 
     config = options.default_config(options)
@@ -230,7 +220,7 @@ def input_option(name: str, *kinds: str, **keywords: Any) -> Option:
 
 
 def json_option(what: str) -> Option:
-    """Declares `--json`, which prints only the result of the command to standard output."""
+    """Declares `--json`: the result of the command is all that goes to standard output."""
     return flag("--json", f"print {what} as JSON; everything else goes to standard error")
 
 

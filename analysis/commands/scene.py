@@ -96,9 +96,33 @@ def mesh(options: argparse.Namespace) -> None:
     """Writes the zero level of a distance field as a closed mesh, for contact and distances in
     Drake (OBJ) and in other simulators and viewers (glTF, OBJ)."""
     import_extra("manifold3d", "mesh")
-    from splatpilot.analysis import mesh
+    from splatpilot.analysis.view import generated_scenario
+    from splatpilot.diagrams.worlds.scene_folder import read_scene_folder
+    from splatpilot.diagrams.worlds.world_registry import make_world
+    from splatpilot.systems.collision.field_mesh import field_mesh, require_mesh_name, write_mesh
 
-    cli.call(mesh.run, options)
+    require_mesh_name(options.out)
+    what = Path(options.what)
+    scenario = generated_scenario(what, options.seed, options.overrides)
+    if scenario is not None:
+        scenario.validate()
+        esdf = make_world(scenario.world, scenario.seed).esdf
+    elif not (what / "scene.yaml").is_file():
+        raise ValueError(
+            f"{what} must be a scene folder, OctoMap or scenario, which have distances; "
+            "reconstruct it first"
+        )
+    elif options.overrides:
+        raise ValueError(f"--set must be of a scenario, got {options.overrides[0]}; leave it out")
+    else:
+        esdf = read_scene_folder(what).esdf
+    made = field_mesh(esdf, options.conservative)
+    write_mesh(options.out, made)
+    size = " x ".join(f"{extent:.1f}" for extent in made.extents)
+    print(
+        f"Wrote {options.out}: {len(made.faces)} triangles, {size} m, within "
+        f"{esdf.voxel_size / 2:g} m"
+    )
 
 
 @cli.command(
