@@ -50,7 +50,9 @@ class Option:
         self.flag, _, metavar = spec.partition(" ")
         self.resolve, self.unused, self.exclusive = resolve, unused, exclusive
         self.completions = completions
-        self.keywords = keywords | {"help": help} | ({"metavar": metavar} if metavar else {})
+        self.keywords: dict[str, Any] = (
+            keywords | {"help": help} | ({"metavar": metavar} if metavar else {})
+        )
         if keywords.get("action", "append") == "append":
             self.keywords["type"] = type
         self.name = keywords.get("dest") or self.flag.lstrip("-").replace("-", "_")
