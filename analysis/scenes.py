@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 from splatpilot.analysis.reconstruction import run as reconstruction
 from splatpilot.analysis.reconstruction.measure_scene import METRICS, measure_scene
@@ -14,38 +13,23 @@ from splatpilot.systems.common.files import DATA, require_existing
 from splatpilot.systems.common.validation import unknown
 from splatpilot.training.captures import render as render_capture
 
-
-class Recipe(NamedTuple):
-    """The source of a scene, and the settings of its reconstruction."""
-
-    source: str  # a capture or a mesh, below the folder of data, or a scenario
-    settings: tuple[str, ...] = ()  # of `RenderedSceneConfig`, as --set takes them
-
-
-RECIPES = {
-    "hospital": Recipe("tartanair/hospital", ("voxel_size=0.05",)),
-    "bookstore": Recipe("worlds/bookstore.gltf", ("render.up=z", "initial_gaussians=160000")),
+RECIPES: dict[str, tuple[str, ...]] = {
+    "hospital": ("tartanair/hospital", "voxel_size=0.05"),
+    "bookstore": ("worlds/bookstore.gltf", "render.up=z", "initial_gaussians=160000"),
     # Optimization moves Gaussians in steps that grow with the cameras' extent. In halls and
     # buildings, Gaussians that start from exact depth need smaller steps.
-    "warehouse": Recipe(
-        "worlds/warehouse.gltf", ("render.up=z", "initial_gaussians=430000", "means_rate=4e-5")
+    "warehouse": (
+        *("worlds/warehouse.gltf", "render.up=z", "initial_gaussians=430000", "means_rate=4e-5"),
     ),
-    "hospital_building": Recipe(
-        "worlds/hospital_building.gltf",
-        (
-            "render.up=z",
-            "render.highest=2.0",
-            "render.apart=6",
-            "render.spacing=1.4",
-            "initial_gaussians=1000000",
-            "iterations=10000",
-            "means_rate=4e-5",
-        ),
+    "hospital_building": (
+        *("worlds/hospital_building.gltf", "render.up=z", "render.highest=2.0", "render.apart=6"),
+        *("render.spacing=1.4", "initial_gaussians=1000000", "iterations=10000", "means_rate=4e-5"),
     ),
-    "forest_splat": Recipe("P02"),
-    "alley_splat": Recipe("P09"),
+    "forest_splat": ("P02",),
+    "alley_splat": ("P09",),
 }
-"""Recipes of the scenes that scenarios fly in, by the scene's name."""
+"""By the name of a scene: a capture or a mesh below the folder of data, or a scenario, and settings
+of `RenderedSceneConfig`."""
 
 BENCHMARK_SCENES = tuple(name for name in RECIPES if name != "alley_splat")
 
@@ -70,7 +54,7 @@ def run(
             raise ValueError(unknown("scene", name, RECIPES))
     sources: list[Path | str] = []
     for name in names:
-        source = RECIPES[name].source
+        source = RECIPES[name][0]
         if "/" in source and data is None:
             raise ValueError(f"No folder with {source}; give --data or set {DATA}")
         if "/" in source and data is not None:
@@ -78,8 +62,7 @@ def run(
             source = data / source
         sources.append(source)
     configs = [
-        load_config(default_config(), overrides=[*RECIPES[name].settings, *overrides])
-        for name in names
+        load_config(default_config(), overrides=[*RECIPES[name][1:], *overrides]) for name in names
     ]
     for name, source, config in zip(names, sources, configs, strict=True):
         print(f"== {name}, from {source}", flush=True)

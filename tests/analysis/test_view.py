@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from pydrake.math import RigidTransform
 
 from splatpilot.analysis import view
 from splatpilot.analysis.commands.main import main
@@ -112,14 +111,6 @@ def test_bare_gaussians(room, tmp_path):
     records.tofile(tmp_path / "room.splat")
     data = data_of(view.run(what=str(tmp_path / "room.splat"), out=tmp_path / "c.html"))
     assert data["name"] == "room"
-
-
-def test_far_gaussians_have_a_note_with_their_origin(room, tmp_path):
-    path = tmp_path / "room.ply"
-    write_ply(room.gaussians.transformed_by(RigidTransform([5000.0, 0, 0])), path)
-    data = data_of(view.run(what=str(path), out=tmp_path / "a.html"))
-    assert data["grid"] is not None
-    assert any("Positions are relative to 500" in note for note in data["notes"])
 
 
 def test_map(tmp_path, monkeypatch):

@@ -7,21 +7,16 @@ import pytest
 
 from splatpilot.analysis.benchmark import replay, run_study
 from splatpilot.analysis.benchmark.rollout import (
-    Fault,
     flight_metrics,
     jerk_metrics,
     shortest_length,
 )
-from splatpilot.analysis.benchmark.run_study import fly_all
 from splatpilot.analysis.benchmark.study import StudyConfig
-from splatpilot.analysis.benchmark.study_folder import StudyFolder, keep_inputs, kept_flights
 from splatpilot.analysis.commands.main import main
 from splatpilot.diagrams.flight.flight import Flight, Outcome
 from splatpilot.systems.collision.esdf_build import esdf_from_distance_field
 from splatpilot.systems.collision.shapes import AnalyticDistanceField, Cylinder
 from splatpilot.systems.common.provenance import InfeasibleFlightError
-from splatpilot.systems.policies.checkpoint import PolicyCheckpoint
-from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK
 from splatpilot.systems.policies.straight import Straight
 from splatpilot.systems.policies.time_of_arrival import path_lengths
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
@@ -154,20 +149,3 @@ def test_an_exception_stops_the_study_which_is_resumed(
     assert main([*words, "2"]) == 0
     assert not (out / "errors").exists()
     assert len(rows_of(out / "rollouts.csv")) == 4
-
-
-def test_a_fault_in_a_worker_process_is_returned(short_scenario, tmp_path):
-    shipped = PolicyCheckpoint.load("", "diffaero", DIFFAERO_NETWORK)
-    mine = tmp_path / "mine.npz"
-    PolicyCheckpoint("diffaero", shipped.spec, dict(shipped.weights), {}).save(mine)
-    config = StudyConfig([str(short_scenario)], ["straight", f"mine={mine}"], seeds=3)
-    folder = StudyFolder(tmp_path / "out")
-    folder.begin(config, {})
-    keep_inputs(folder, config, config.load_scenarios())
-    flights = list(kept_flights(folder, config.rollouts()))
-    folder.weights("mine").unlink()
-    flown = list(fly_all(flights, jobs=2))
-    faults = [fault for fault in flown if isinstance(fault, Fault)]
-    assert {fault.id for fault in faults} == {f"short-mine-2-00{seed}" for seed in range(3)}
-    assert all("FileNotFoundError" in fault.reason for fault in faults)
-    assert len(flown) == 6

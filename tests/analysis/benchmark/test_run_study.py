@@ -155,8 +155,11 @@ def test_one_option_flies_the_dodgedrone_challenge(monkeypatch, tmp_path):
     monkeypatch.setattr(run_study, "run", run)
     command = ["benchmark", "--dodgedrone", "--out", str(tmp_path)]
     assert main(command) == 0
-    main([*command, "--scenarios", "dodgedrone_easy", "--speeds", "3", "--seeds", "2"])
+    part = ["--scenarios", "dodgedrone_easy", "--speeds", "3", "--seeds", "2"]
+    main([*command, *part, "--policies", "slow=planner:rate=2", "--sweep", "straight:rate=5,10"])
     whole, part = studies
+    labels = ["slow", "straight-rate-5", "straight-rate-10"]
+    assert part.policy_names == labels
     assert whole.scenarios == list(PUBLISHED) and whole.speeds == list(DODGEDRONE_SPEEDS)
     assert tuple(whole.policies) == BENCHMARK_POLICIES and whole.seeds == 20
     assert (part.scenarios, part.speeds, part.seeds) == (["dodgedrone_easy"], [3.0], 2)

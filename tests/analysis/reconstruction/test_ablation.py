@@ -56,24 +56,6 @@ def test_ablation_end_to_end(room, capsys, monkeypatch):
     assert "made again" in capsys.readouterr().err
 
 
-def test_studies_are_not_mixed(room, monkeypatch, capsys):
-    made = []
-
-    def fail(capture, scene, config):
-        made.append(config.iterations)
-        raise ValueError("interrupted")
-
-    monkeypatch.setattr(ablation, "reconstruct", fail)
-    assert ablate(room) == 1
-    other_steps = "--set", "iterations=13"
-    other = str(room.scene("scene", capture="room"))
-    for words, captures in ((other_steps, ("room",)), ((), (other,))):
-        assert ablate(room, *words, captures=captures) == 1
-        assert "ablation.yaml holds another configuration" in capsys.readouterr().err
-    assert ablate(room, *other_steps, "--overwrite") == 1
-    assert made == [4, 13]
-
-
 def test_each_arm_adds_one_step():
     config = ReconstructConfig(iterations=123)
     for representation in ("3dgs", "2dgs"):

@@ -121,8 +121,6 @@ def test_a_mesh_is_rendered_and_reconstructed(opengl, tmp_path, capsys):
 
     assert main(command) == 1
     assert "is there already" in capsys.readouterr().err
-    images = sorted((out / "capture" / "image_left").iterdir())
     assert main([*command, "--overwrite"]) == 0
     assert "is complete already" in capsys.readouterr().out
     assert (out / "gaussians.ply").read_bytes() == written
-    assert sorted((out / "capture" / "image_left").iterdir()) == images
