@@ -95,15 +95,6 @@ def test_infeasible_flights_fail_with_a_reason(short_scenario, tmp_path, capsys,
         replay.run(study=tmp_path / "far", id="short-straight-2-000")
 
 
-def test_a_scene_without_a_start_and_goal_does_not_stop_the_study(room, tmp_path, short_scenario):
-    hall = room.scene("hall", metric=True)
-    far = tmp_path / "far.yaml"
-    far.write_text(f"world: !SceneConfig {{path: {hall}, draw_ends: true, least_way: 30}}\n")
-    config = StudyConfig([str(far), str(short_scenario)], ["straight"], seeds=1)
-    [row] = run_study.run(config=config, out=tmp_path / "out", jobs=1)
-    assert (row["flights"], row["infeasible"]) == (2, 1)
-
-
 def fail_later(monkeypatch, error):
     """Lets the straight policy raise after half a second."""
     update = Straight._update
