@@ -110,8 +110,12 @@ def faults(options: argparse.Namespace) -> None:
     from splatpilot.analysis.faults.campaign import run
 
     # Thousands of packets are refused, and policies raise, on purpose.
-    logging.disable(logging.ERROR)
+    loggers = [logging.getLogger(name) for name in ("drake", "splatpilot")]
+    levels = [logger.level for logger in loggers]
     try:
+        for logger in loggers:
+            logger.setLevel(logging.CRITICAL)
         run(config=cli.read_config(options), out=options.out)
     finally:
-        logging.disable(logging.NOTSET)
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
