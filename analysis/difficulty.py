@@ -57,10 +57,8 @@ class Difficulty:
 
 
 def difficulty(field: DistanceField, p_WS: NDArray, p_WG: NDArray, seed: int = 0) -> Difficulty:
-    """Computes all measures of flights from p_WS to p_WG (3,) [m]; `seed` is of traversability.
-
-    Raises InfeasibleFlightError if there is no path.
-    """
+    """Computes all measures of flights from p_WS to p_WG (3,) [m]; InfeasibleFlightError without a
+    path."""
     grid = grid_distances(field, SPACING)
     path = shortest_path(field, grid, p_WS, p_WG)
     return Difficulty(
@@ -76,10 +74,7 @@ def difficulty(field: DistanceField, p_WS: NDArray, p_WG: NDArray, seed: int = 0
 
 def shortest_path(field: DistanceField, grid: NDArray, p_WS: NDArray, p_WG: NDArray) -> NDArray:
     """Returns points (K, 3) [m] of a shortest path for the vehicle, found on `grid_distances` and
-    shortened by straight segments that are free in the exact field.
-
-    Raises InfeasibleFlightError if the grid has no path.
-    """
+    shortened by straight segments that are free in the exact field."""
     states = np.where(grid > 0, FieldState.FREE, FieldState.OCCUPIED).astype(np.uint8)
     esdf = Esdf(grid.astype(np.float32), states, np.asarray(field.lower_W, float), SPACING)
     lengths = path_lengths(esdf.conservative(), p_WG)
@@ -111,16 +106,8 @@ def _is_free(field: DistanceField, p_A: NDArray, p_B: NDArray) -> bool:
 def march(
     field: DistanceField, p_W: NDArray, directions: NDArray, radius: float, longest: float
 ) -> NDArray:
-    """Computes by sphere tracing how far (N,) [m] spheres fly straight.
-
-    A flight ends where the sphere touches a surface, its center leaves the bounds, or at `longest`.
-
-    Args:
-        p_W: start of each (N, 3) [m].
-        directions: unit vectors (N, 3).
-        radius: of the spheres [m].
-        longest: [m].
-    """
+    """Computes by sphere tracing how far (N,) [m] spheres fly from p_W (N, 3) [m] in `directions`
+    (N, 3), until they touch a surface or their center leaves the bounds, at most `longest` [m]."""
     flown, moving = np.zeros(len(p_W)), np.arange(len(p_W))
     for _ in range(200):
         p = p_W[moving] + flown[moving, None] * directions[moving]
@@ -271,16 +258,8 @@ def bottleneck(field: DistanceField, grid: NDArray, p_WS: NDArray, p_WG: NDArray
 
 
 def run(*, scenarios: Sequence[str], seeds: int) -> list[str]:
-    """Prints for each scenario how many seeds are feasible, and the mean time of generation and the
-    mean difficulty of these. Scenarios without their scene are not run.
-
-    Args:
-        scenarios: names, or files; the benchmark's if empty.
-        seeds: number of seeds.
-
-    Returns:
-        The lines of the table.
-    """
+    """Prints for each scenario how many seeds are feasible, the mean time of generation and the
+    mean difficulty, and returns the lines. Scenarios without their scene are not run."""
     names = ("trav", "gap", "TO", "VO", "AOL", "detour", "neck m")
     lines = [f"{'scenario':<10}{'feasible':>10}{'CPU s':>7}" + "".join(f"{n:>8}" for n in names)]
     print(lines[0], flush=True)

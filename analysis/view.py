@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.geometry import Rgba
+from scipy.spatial import KDTree
 
 from splatpilot.diagrams.flight.blocks import goal_position
 from splatpilot.diagrams.flight.flight_diagram import empty_meshcat
@@ -29,7 +30,9 @@ from splatpilot.systems.common.files import (
     require_writable_folder,
     written_atomically,
 )
+from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.common.validation import require
+from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.splats.splat_files import read_ply, read_splats
 from splatpilot.systems.visualization.meshcat_drawing import (
     GOAL_COLOR,
@@ -39,9 +42,8 @@ from splatpilot.systems.visualization.meshcat_drawing import (
     draw_goal,
 )
 from splatpilot.systems.visualization.pages import CapturedImages, ViewerScene, scene_page
-from splatpilot.training.captures.capture import Capture
+from splatpilot.training.captures.capture import Capture, depth_points
 from splatpilot.training.captures.capture_config import CaptureConfig
-from splatpilot.training.captures.capture_gaussians import capture_gaussians
 from splatpilot.training.captures.capture_registry import read_capture, read_scene_capture
 from splatpilot.training.captures.photographs import is_video
 
@@ -50,6 +52,8 @@ _MAX_IMAGES = 60
 _IMAGE_WIDTH = 480  # [px]
 _HEADROOM = 0.15  # [-] fraction of the height that is shown above the cameras
 _BOUNDS = "#fff", "bounds"
+_MAX_POINTS, _MAX_GAUSSIANS = 2_000_000, 200_000  # of a capture
+_SPREAD = 0.6  # standard deviation of a Gaussian over the distance to its neighbors
 
 
 def run(
@@ -60,18 +64,10 @@ def run(
     overrides: Sequence[str] = (),
     overwrite: bool = False,
 ) -> Path:
-    """Writes a page.
+    """Writes a page of a scene folder, a file of Gaussians, an OctoMap, a capture or a scenario.
 
-    Args:
-        what: a scene folder, a file of Gaussians, an OctoMap, the folder of a capture, a video, or
-            a scenario.
-        out: the page; `out/view/NAME.html` if None, or `NAME-SEED.html` of a generated world.
-        seed: of a generated world; that of its scenario if None.
-        overrides: FIELD=VALUE of the scenario, or of the capture's `CaptureConfig`.
-        overwrite: replaces an existing page.
-
-    Returns:
-        The page.
+    The default `out` is `out/view/NAME.html`, or `NAME-SEED.html` of a generated world; `overrides`
+    are FIELD=VALUE of the scenario, or of the capture's `CaptureConfig`.
     """
     path = Path(what)
     name = path.resolve().name if path.is_dir() else path.stem
@@ -104,8 +100,7 @@ def run(
 
 
 def generated_scenario(path: Path, seed: int | None, overrides: Sequence[str]) -> Scenario | None:
-    """Reads a scenario, or makes that of an OctoMap; None for folders, Gaussians and videos, which
-    have no seed."""
+    """Reads a scenario, or makes that of an OctoMap; None for others, which have no seed."""
     if path.is_dir() or _may_hold_gaussians(path) or is_video(path):
         require(seed is None, "--seed", "of a generated world", seed, f"leave it out for {path}")
         return None
@@ -265,3 +260,51 @@ def _captured_images(capture: Capture) -> CapturedImages:
         width=capture.width,
         height=capture.height,
     )
+
+
+def capture_gaussians(capture: Capture, frames: Sequence[int]) -> GaussianScene | None:
+    """Returns round Gaussians at the measured depth of some frames or, without depth, at the points
+    of the registration; None without either."""
+    if capture.has_depth:
+        # A grid of pixels of each frame.
+        pixels = len(frames) * capture.width * capture.height
+        step = max(1, int(np.ceil(np.sqrt(pixels / _MAX_POINTS))))
+        parts = []
+        for i in Progress(frames, "reading depth", unit="frame", delay=2.0):
+            frame = capture.frame(i)
+            p_CQ, rows, columns = depth_points(frame.K, frame.depth, step)
+            p_WQ = frame.X_WC.multiply(p_CQ.T).T
+            parts.append(np.column_stack([p_WQ, frame.image[rows, columns] / 255]))
+        points, colors = np.split(np.concatenate(parts), 2, axis=1)
+    elif capture.points is not None:
+        points, colors = capture.points.p_WQ, capture.points.colors
+    else:
+        return None
+    if len(points) < 2:
+        return None
+    kept = _thin(points)
+    points, colors = points[kept], colors[kept]
+    distances, _ = KDTree(points).query(points, k=2)
+    # A point far from others is not larger than they are.
+    size = np.minimum(distances[:, 1], 4 * np.median(distances[:, 1])) + 1e-6
+    return GaussianScene.from_colors(
+        points,
+        np.tile([1.0, 0.0, 0.0, 0.0], (len(points), 1)),
+        _SPREAD * size[:, None].repeat(3, axis=1),
+        np.full(len(points), 0.95),
+        colors,
+    )
+
+
+def _thin(points: NDArray[np.float64]) -> NDArray[np.intp]:
+    """Returns the first point in each cell of the finest grid with few occupied cells."""
+    lower = points.min(axis=0)
+    # Few points far away must not make the cells large.
+    extent = float(np.percentile(np.ptp(points, axis=0), 50)) or 1.0
+    edge = extent / 4096
+    while True:
+        cells = np.floor((points - lower) / edge).astype(np.int64)
+        _, first = np.unique((cells[:, 0] << 42) ^ (cells[:, 1] << 21) ^ cells[:, 2], True)
+        if len(first) <= _MAX_GAUSSIANS:
+            return np.sort(first)
+        edge *= 1.3

@@ -1,15 +1,10 @@
 """Compares images and gradients of the CPU renderer with gsplat's CUDA kernels; needs a GPU.
 
-    python benchmarks/agreement.py
-
-On the benchmark's scene, and with SPLATPILOT_DATA set on gsplat's own test scene, the garden.
+python benchmarks/agreement.py
 """
 
 import importlib
-import os
-import sys
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,8 +21,6 @@ from harness import (
 from torch import Tensor
 
 from splatpilot.systems.splats import rasterize, rasterize_surfels
-
-sys.path.append(str(Path(__file__).parents[1] / "tests/systems/splats"))
 
 
 def print_devices(
@@ -82,13 +75,6 @@ def main() -> None:
     smooth = view | {"rasterize_mode": "antialiased"}
     print_devices(f"{scene_name()}, antialiased", rasterize, tensors, smooth)
     print_devices(f"{scene_name()}, surfels", rasterize_surfels, tensors, view)
-    if "SPLATPILOT_DATA" not in os.environ:
-        print("\nthe garden: skipped, SPLATPILOT_DATA is not set")
-        return
-    garden = importlib.import_module("garden").load_garden(Path(os.environ["SPLATPILOT_DATA"]))
-    view = {"viewmats": garden.viewmats, "Ks": garden.Ks, "render_mode": "RGB+D"}
-    view |= {"width": garden.width, "height": garden.height}
-    print_devices("garden", rasterize, garden.scene, view)
 
 
 if __name__ == "__main__":

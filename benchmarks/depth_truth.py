@@ -55,12 +55,8 @@ class DepthErrors(NamedTuple):
 
 
 def depth_errors(frames: Iterable[DepthFrame], reach: float, edges: bool = True) -> DepthErrors:
-    """Compares depth with the truth.
-
-    Args:
-        reach: [m], maximum depth of the camera; greater depths count as `reach`.
-        edges: includes pixels within 2 px of a discontinuity of the truth.
-    """
+    """Compares depth with the truth, both at most `reach` [m]; `edges` includes pixels within 2 px
+    of a discontinuity."""
     pairs = []
     for depth, truth in frames:
         used = ~np.isnan(truth)

@@ -14,6 +14,7 @@ from torch import Tensor
 from splatpilot import _native
 from splatpilot.systems.common.files import DATA, data_folder
 from splatpilot.systems.splats.scene import GaussianScene
+from splatpilot.training.captures.capture import depth_points
 from splatpilot.training.captures.capture_registry import read_capture
 
 
@@ -85,13 +86,11 @@ def hospital(folder: Path, count: int) -> tuple[GaussianScene, RigidTransform]:
     means, scales, colors = [], [], []
     for i in range(0, len(capture), 10):
         frame = capture.frame(i)
-        v, u = np.mgrid[0 : capture.height : step, 0 : capture.width : step]
-        near = frame.depth[v, u] < 30.0
-        u, v = u[near], v[near]
-        z = frame.depth[v, u].astype(np.float64)
-        means.append(frame.X_WC.multiply(frame.back_project(u + 0.5, v + 0.5, z).T).T)
-        scales.append(1.2 * z / 160)  # 1.2 pixels of the 320x240 images that are rendered
-        colors.append(frame.image[v, u] / 255)
+        near = np.where(frame.depth < 30.0, frame.depth, 0.0)
+        p_CQ, rows, columns = depth_points(frame.K, near, step)
+        means.append(frame.X_WC.multiply(p_CQ.T).T)
+        scales.append(1.2 * p_CQ[:, 2] / 160)  # 1.2 pixels of the 320x240 images
+        colors.append(frame.image[rows, columns] / 255)
     chosen = np.random.default_rng(0).permutation(sum(map(len, scales)))[:count]
     arrays = (np.concatenate(values)[chosen] for values in (means, scales, colors))
     return round_gaussians(*arrays), capture.X_WCs[len(capture) // 2]

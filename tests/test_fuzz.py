@@ -1,6 +1,5 @@
 """Damaged files and messages are refused in one line with their name, or read as valid values."""
 
-import gzip
 import json
 import shutil
 import struct
@@ -8,15 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import gsply
 import numpy as np
 import pycolmap
 import pytest
 import trimesh
-import zstandard
 from drake import lcmt_header
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from plyfile import PlyData, PlyElement
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 from room import write_room_capture
@@ -54,34 +52,17 @@ GAUSSIANS = GaussianScene(
     opacities=RNG.uniform(0.1, 0.9, COUNT).astype(np.float32),
     sh=RNG.normal(size=(COUNT, 4, 3)).astype(np.float32),
 )
+FOREIGN = gsply.GSData.from_arrays(
+    GAUSSIANS.means,
+    np.log(GAUSSIANS.scales),
+    GAUSSIANS.quats,
+    np.log(GAUSSIANS.opacities / (1 - GAUSSIANS.opacities)),
+    GAUSSIANS.sh[:, 0],
+    GAUSSIANS.sh[:, 1:],
+    format="ply",
+)
 _STATES = RNG.integers(0, 3, (5, 4, 3), dtype=np.uint8)
 ESDF = Esdf(RNG.normal(size=(5, 4, 3)).astype(np.float32), _STATES, np.zeros(3), 0.5)
-
-
-def write_compressed_ply(folder: Path) -> None:
-    ends = [f"{end}_{part}{a}" for end in ("min", "max") for part in ("", "scale_") for a in "xyz"]
-    chunk = np.array([(0.0, 0, 0, -3, -3, -3, 3, 3, 3, -2, -2, -2)], [(n, "f4") for n in ends])
-    names = [f"packed_{what}" for what in ("position", "rotation", "scale", "color")]
-    packed = RNG.integers(0, 2**32, (COUNT, 4), dtype=np.uint32)
-    vertex = packed.view([(name, "u4") for name in names])[:, 0]
-    elements = [PlyElement.describe(chunk, "chunk"), PlyElement.describe(vertex, "vertex")]
-    PlyData(elements).write(str(folder / "scene.ply"))
-
-
-def write_spz(folder: Path, version: int) -> None:
-    widths = 9, 1, 3, 3, 4, 9  # [bytes] of a Gaussian in the sections of degree 1
-    sections = [RNG.integers(0, 256, COUNT * width, dtype=np.uint8) for width in widths]
-    sections[0].reshape(-1, 3)[:, 2] = 0  # positions of 0 to 16 m
-    sections = [section.tobytes() for section in sections]
-    if version == 3:
-        header = struct.pack("<4sII4B", b"NGSP", 3, COUNT, 1, 12, 0, 0)
-        (folder / "scene.spz").write_bytes(gzip.compress(header + b"".join(sections), 0))
-        return
-    streams = [zstandard.ZstdCompressor().compress(section) for section in sections]
-    header = struct.pack("<4sII4BI12x", b"NGSP", 4, COUNT, 1, 12, 0, len(streams), 32)
-    sizes = zip(streams, sections, strict=True)
-    table = b"".join(struct.pack("<QQ", len(stream), len(section)) for stream, section in sizes)
-    (folder / "scene.spz").write_bytes(header + table + b"".join(streams))
 
 
 def write_splat(folder: Path) -> None:
@@ -263,9 +244,9 @@ MESSAGES = {
 UNNAMED = {"scenario", "packets", *MESSAGES}  # errors name a field, or a caller adds the sender
 SPLATS = {
     "PLY": lambda folder: write_ply(GAUSSIANS, folder / "scene.ply"),
-    "compressed PLY": write_compressed_ply,
-    "SPZ by gzip": lambda folder: write_spz(folder, 3),
-    "SPZ by zstd": lambda folder: write_spz(folder, 4),
+    "compressed PLY": lambda folder: gsply.plywrite(folder / "scene.ply", FOREIGN, compressed=True),
+    "SPZ by gzip": lambda folder: gsply.write_spz(folder / "scene.spz", FOREIGN, version=3),
+    "SPZ by zstd": lambda folder: gsply.write_spz(folder / "scene.spz", FOREIGN, version=4),
     "splat": write_splat,
 }
 CAPTURES = {

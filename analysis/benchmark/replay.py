@@ -3,7 +3,7 @@
 import platform
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple, cast
+from typing import cast
 
 import numpy as np
 
@@ -26,13 +26,6 @@ from splatpilot.systems.visualization.pages import ReplayedFlight
 from splatpilot.systems.visualization.video import VideoRecorder
 
 
-class Agreement(NamedTuple):
-    """Agreement of a flight with its record."""
-
-    exact: bool  # bitwise identical
-    deviation: float  # [m], maximum distance at the same time
-
-
 def run(
     *,
     study: Path,
@@ -41,18 +34,9 @@ def run(
     meshcat: bool = False,
     video: bool = False,
     overwrite: bool = False,
-) -> Agreement:
-    """Flies one flight of a study again, from the study's folder alone, and compares it with its
-    record.
-
-    Args:
-        study: the folder.
-        id: of the flight, as in `rollouts.csv`.
-        out: folder for page and video; `replays/ID` in the study by default.
-        meshcat: writes `flight.html`, a page with the flight.
-        video: writes `flight.mp4` of the onboard camera.
-        overwrite: replaces an earlier replay in `out`.
-    """
+) -> bool:
+    """Flies one flight of a study again, from the study's folder alone; returns True if it is
+    bitwise identical to its record. Page and video go to `replays/ID` in the study by default."""
     folder = StudyFolder(study)
     spec, row, recorded = _read_flight(folder, id)
     _, scenario = next(kept_flights(folder, [spec]))
@@ -74,9 +58,9 @@ def run(
     states = flight.states[:common], recorded["states"][:common]
     flown, before = (QuadrotorState.of(each).p_WB for each in states)
     deviation = float(np.linalg.norm(flown - before, axis=1).max())
-    agreement = Agreement(digest(flight) == row["digest"], deviation)
+    exact = digest(flight) == row["digest"]
     print(f"{id}: {flight.outcome} after {flight.times[-1]:.2f} s")
-    if agreement.exact:
+    if exact:
         print("The replay is bitwise identical to the recorded flight.")
     else:
         print(
@@ -86,24 +70,14 @@ def run(
     if filmed:
         files = {"flight.html": meshcat, "flight.mp4": video}
         print(f"Wrote {' and '.join(name for name, write in files.items() if write)} in {out}")
-    return agreement
+    return exact
 
 
 def overlay(
     *, study: Path, ids: Sequence[str], out: Path | None = None, overwrite: bool = False
 ) -> Path:
-    """Writes a page with several recorded flights through one world, in different colors, without
-    plans and camera images.
-
-    Args:
-        study: the folder.
-        ids: of the flights, as in `rollouts.csv`.
-        out: folder for `flights.html`; `replays/FIRST-ID` in the study by default.
-        overwrite: replaces the page.
-
-    Returns:
-        The page.
-    """
+    """Writes a page with several recorded flights through one world, without plans and images;
+    `replays/FIRST-ID/flights.html` in the study by default."""
     folder = StudyFolder(study)
     records = [_read_flight(folder, id) for id in ids]
     first, flights = records[0][0], []

@@ -3,6 +3,7 @@
 import base64
 import math
 from html import escape
+from itertools import cycle
 from typing import Any
 
 import numpy as np
@@ -63,14 +64,10 @@ def write_report(
     absent: dict[str, str],
     damaged: list[str],
 ) -> None:
-    """Writes `report.html` and its figures, `success_against_speed.png` and `trajectories.png`.
+    """Writes `report.html`, `success_against_speed.png` and `trajectories.png`.
 
-    Args:
-        folder, config: the study.
-        rows, timings: of its flights.
-        table, external: `policy_table` and `external_table` of them.
-        absent: reasons of the scenarios that were not flown.
-        damaged: errors of files that were flown again in this run.
+    `absent` has the reasons of scenarios that were not flown, `damaged` the errors of files that
+    were flown again.
     """
     paper = paper_rows(config, absent)
     seeds = SPLIT_NAMES[config.split] + " seeds"
@@ -135,7 +132,6 @@ def _rate(row: Row) -> _Html:
 
 
 def _success_cells(row: Row) -> list[str]:
-    """Returns the cells of the columns `_SUCCESS`."""
     passed = f"{row['scenarios_passed']}/{row['scenarios']}"
     return [_rate(row), _interval(row, "cluster"), passed]
 
@@ -292,11 +288,6 @@ def _flights(rows: list[Row]) -> str:
     return "".join(sections)
 
 
-def _color(policy: str, policies: list[str]) -> str:
-    """Returns the color of a policy in all figures of a study."""
-    return _COLORS[policies.index(policy) % len(_COLORS)]
-
-
 def _success_against_speed(
     folder: StudyFolder, table: list[Row], policies: list[str], paper: dict[str, PaperRow]
 ) -> str:
@@ -304,12 +295,11 @@ def _success_against_speed(
     velocity, a line for each policy, with the paper's points; returns its HTML."""
     figure = Figure(figsize=(7.2, 4.6), layout="constrained")
     axes = figure.subplots()
-    for policy in policies:
+    for policy, color, marker in zip(policies, cycle(_COLORS), cycle(_MARKERS), strict=False):
         rows = [row for row in table if row["policy"] == policy and row["flights"]]
         rows.sort(key=lambda row: row["speed"])
         names = "mean_speed_m_s", "success_rate", "wilson_lower", "wilson_upper"
         speeds, rates, lower, upper = (np.array([row[name] for row in rows]) for name in names)
-        color, marker = _color(policy, policies), _MARKERS[policies.index(policy) % len(_MARKERS)]
         errors = 100 * np.maximum([rates - lower, upper - rates], 0.0)
         style = {"color": color, "marker": marker, "capsize": 3}
         axes.errorbar(speeds, 100 * rates, yerr=errors, label=policy, **style)
@@ -345,12 +335,12 @@ def _trajectories(folder: StudyFolder, config: StudyConfig, rows: list[Row]) -> 
     levels = [-1e3, 0.0, VEHICLE_RADIUS]
     axes.contourf(x, y, distance, levels=levels, colors=[_OBSTACLE, _BLOCKED])
     p_WS = world.p_WS
-    for policy in config.policy_names:
+    for policy, color in zip(config.policy_names, cycle(_COLORS), strict=False):
         row, arrays = folder.read(spec._replace(policy=policy))
         if not arrays:
             continue
         p_WB = QuadrotorState.of(arrays["states"]).p_WB
-        p_WS, color = p_WB[0], _color(policy, config.policy_names)
+        p_WS = p_WB[0]
         label = f"{policy}: {row['outcome']}"
         axes.plot(p_WB[:, 0], p_WB[:, 1], color=color, lw=1.8, label=label)
         if row["outcome"] != "goal":

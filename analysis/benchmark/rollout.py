@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from pydrake.systems.framework import Diagram
 
 from splatpilot import _native
 from splatpilot.analysis.benchmark.study import RolloutSpec
@@ -59,20 +58,12 @@ class Fault(NamedTuple):
 
 
 def flight_metrics(flight: Flight, shortest: float) -> dict[str, float | str | bool]:
-    """Computes the metrics of a flight, by their columns.
+    """Computes the metrics of a flight, by their columns; `shortest` is the shortest path [m].
 
-    - `success`: reached the goal, with a clearance at the vehicle's radius that is never negative;
-    - `outcome`: `goal`, `collision`, `left_volume`, `timeout` or `error`;
-    - `flight_time_s`, `path_length_m`, `mean_speed_m_s`, `min_clearance_m`;
-    - `shortest_path_m`, `path_excess`: the path over the shortest path, minus one; NaN of flights
-      that did not arrive;
-    - `jerk_m_s3`: root mean square of the second differences of the velocity at 0.1 s;
-    - `smoothness`: the logarithmic dimensionless jerk, -ln(T³ / v_max² ∫ |jerk|² dt) (N. Hogan and
-      D. Sternad, J. Motor Behavior 41, 2009); larger is smoother.
-
-    Args:
-        flight: of a study.
-        shortest: length of the shortest path from start to goal [m].
+    A success reaches the goal with a clearance that is never negative. `path_excess` is the path
+    over the shortest one, minus one; NaN if it did not arrive. `jerk_m_s3` is the root mean square
+    of the second differences of the velocity at 0.1 s, `smoothness` the logarithmic dimensionless
+    jerk, -ln(T³ / v_max² ∫ |jerk|² dt) (N. Hogan and D. Sternad, J. Motor Behavior 41, 2009).
     """
     summary = flight.summary()
     arrived = flight.outcome == Outcome.GOAL
@@ -121,13 +112,9 @@ def fly_rollouts(
     modules: Sequence[str] = (),
     policies: Sequence[str] = (),
 ) -> list[Rollout | Fault]:
-    """Flies flights in this process, up to the first fault.
+    """Flies flights, with their scenarios as YAML, up to the first fault.
 
-    Args:
-        flights: with their scenarios as YAML; Drake's configurations and some exceptions cannot be
-            pickled.
-        modules: plugins to import.
-        policies: `module:attribute`, not registered by a module.
+    Imports the plugins `modules`, and finds `policies`, MODULE:ATTRIBUTE, that none registers.
     """
     import_modules(modules)
     for policy in policies:
@@ -143,8 +130,7 @@ def fly_rollouts(
 
 
 def _fly_rollout(spec: RolloutSpec, scenario: Scenario) -> Rollout:
-    """Flies one flight; only exceptions other than `InfeasibleFlightError`, as of a bug or a
-    missing scene, are raised and stop the study."""
+    """Flies one flight. Exceptions other than `InfeasibleFlightError` stop the study."""
     started, cpu_started = time.perf_counter(), time.process_time()
     timing: dict[str, Any] = {"id": spec.id}
     arrays = {}
@@ -160,7 +146,13 @@ def _fly_rollout(spec: RolloutSpec, scenario: Scenario) -> Rollout:
         if flight.reason:  # timing the policy could raise again
             metrics["reason"] = flight.reason
         else:
-            timing |= _flight_timing(diagram, scenario, flight)
+            render, decide = decision_times(diagram, scenario, flight)
+            timing |= {
+                "flight_wall_s": flight.wall_time,
+                "real_time_factor": float(flight.times[-1]) / flight.wall_time,
+                "policy_ms": 1e3 * decide,
+                "render_ms": 1e3 * render,
+            }
         arrays = {name: getattr(flight, name).astype(np.float32) for name in ARRAYS}
     except InfeasibleFlightError as error:
         metrics = {"success": False, "outcome": INFEASIBLE, "reason": str(error)}
@@ -180,16 +172,6 @@ def digest(flight: Flight) -> str:
     """Returns a digest, equal for bitwise identical flights."""
     arrays = (np.ascontiguousarray(getattr(flight, name)).tobytes() for name in ARRAYS)
     return hashlib.sha256(b"".join(arrays)).hexdigest()[:16]
-
-
-def _flight_timing(diagram: Diagram, scenario: Scenario, flight: Flight) -> dict[str, float]:
-    render, decide = decision_times(diagram, scenario, flight)
-    return {
-        "flight_wall_s": flight.wall_time,
-        "real_time_factor": float(flight.times[-1]) / flight.wall_time,
-        "policy_ms": 1e3 * decide,
-        "render_ms": 1e3 * render,
-    }
 
 
 _worlds: dict[tuple[type, str, int], World] = {}

@@ -47,13 +47,8 @@ _CHUNK = 6  # maximum number of flights through one world that a worker takes to
 def fly_all(
     flights: Iterable[tuple[RolloutSpec, Scenario]], jobs: int, cluster: str | None = None
 ) -> Generator[Rollout | Fault, None, None]:
-    """Flies rollouts in worker processes and yields them as they end, in any order.
-
-    Args:
-        flights: to fly; one worker flies neighbors through the same world.
-        jobs: number of worker processes on this machine.
-        cluster: address of a dask scheduler to use instead.
-    """
+    """Flies rollouts in worker processes, or on the workers of the dask scheduler `cluster`, and
+    yields them as they end, in any order."""
     modules = sorted(POLICIES.modules() | WORLDS.modules() | SENSORS.modules())
     found = [name for name in POLICIES.registered() if ":" in name]
     fly = functools.partial(fly_rollouts, modules=modules, policies=found)
@@ -97,21 +92,12 @@ def run(
     jobs: int | None = None,
     cluster: str | None = None,
 ) -> list[Row]:
-    """Flies the missing flights of a study, and writes tables and report; for the files, see
-    `splatpilot.analysis.benchmark.study_folder`.
+    """Flies the missing flights of a study, and writes tables and report; returns those of
+    `table.csv`.
 
     The same call resumes an interrupted study, whose files, except timings, are then bitwise
     identical to those of an uninterrupted one. Flights with damaged files are flown again.
     Scenarios without their scene are not flown, and reported.
-
-    Args:
-        config: the study.
-        out: its folder.
-        jobs: worker processes; one for each core by default.
-        cluster: address of a dask scheduler to use instead.
-
-    Returns:
-        The rows of `table.csv`.
     """
     require(jobs is None or jobs >= 1, "--jobs", "at least 1", jobs)
     scenarios = config.load_scenarios()

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import yaml
 
-from splatpilot.analysis.benchmark.variants import SCENARIO, Variant, parse_variant
+from splatpilot.analysis.benchmark.variants import SCENARIO, Variant, flight_name, parse_variant
 from splatpilot.diagrams.flight.policies import (
     BENCHMARK_POLICIES,
     MAX_SPEED,
@@ -31,12 +31,6 @@ class RolloutSpec(NamedTuple):
     def id(self) -> str:
         """Its name: unique in a study, and valid as the name of a file."""
         return flight_name(self.scenario, self.policy, self.speed, self.seed)
-
-
-def flight_name(scenario: str, policy: str, speed: float | None, seed: int) -> str:
-    """Returns the name of a flight; `speed` [m/s] is None if the policy has its own."""
-    parts = [scenario, policy, *([] if speed is None else [f"{speed:g}"]), f"{seed:03d}"]
-    return "-".join(parts)
 
 
 @dataclass

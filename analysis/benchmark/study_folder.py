@@ -61,6 +61,7 @@ _REQUIRED = {
 """Columns of all flights that were flown."""
 _SCENE_FILES = "gaussians.ply", "esdf.npz", FRONTIER, ENVIRONMENT
 """The files of a scene folder that flights depend on."""
+_OWN = "scenarios/"  # before the name of a scenario: label of the weights of its own policy
 _KNOWN = {"splatpilot", "__main__"} | sys.stdlib_module_names
 
 
@@ -79,12 +80,7 @@ class StudyFolder:
         return self.path / "rollouts" / f"{id}.npz"
 
     def begin(self, config: StudyConfig, program: dict[str, str]) -> None:
-        """Creates the folder, or checks that it has the same study.
-
-        Args:
-            config: of the study.
-            program: `provenance.program()`, `plugin_digests` and `input_digests`.
-        """
+        """Creates the folder, or checks that it has the same study."""
         study = yaml.safe_load(dump_config(config))
         require_writable_folder(self.path)
         if (self.path / "study.yaml").is_file():
@@ -219,7 +215,7 @@ def keep_inputs(folder: StudyFolder, config: StudyConfig, scenarios: dict[str, S
             scenario = replace(scenario, world=world)
         weights = getattr(scenario.policy, "weights", "")
         if config.flies_own_policies and weights:
-            kept = _keep_weights(folder, Path(weights), _own_label(name))
+            kept = _keep_weights(folder, Path(weights), _OWN + name)
             scenario = replace(scenario, policy=replace(scenario.policy, weights=kept))
         file, text = folder.path / "scenarios" / f"{name}.yaml", dump_config(scenario)
         if file.is_file() and file.read_text() != text:
@@ -259,11 +255,6 @@ def _keep_weights(folder: StudyFolder, file: Path, label: str) -> str:
     return str(kept.relative_to(folder.path))
 
 
-def _own_label(scenario: str) -> str:
-    """Returns the label of the weights of a scenario's own policy; no other label has a slash."""
-    return f"scenarios/{scenario}"
-
-
 def kept_scenario(folder: StudyFolder, name: str) -> Scenario:
     """Reads a scenario of a study, with scene and weights in the study's folder."""
     file = folder.path / "scenarios" / f"{name}.yaml"
@@ -274,7 +265,7 @@ def kept_scenario(folder: StudyFolder, name: str) -> Scenario:
         raise ValueError(f"{file}: {error}") from None
     if isinstance(scenario.world, SceneSource):
         scenario.world.path = str((folder.path / scenario.world.path).absolute())
-    weights = folder.weights(_own_label(name))
+    weights = folder.weights(_OWN + name)
     if weights.is_file():
         policy = replace(scenario.policy, weights=str(weights.absolute()))  # pyright: ignore
         scenario = replace(scenario, policy=policy)

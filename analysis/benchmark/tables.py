@@ -46,14 +46,10 @@ def wilson_interval(successes: int, flights: int, confidence: float = 0.95) -> I
 def cluster_interval(
     successes: ArrayLike, flights: ArrayLike, confidence: float = 0.95
 ) -> Interval:
-    """Returns the percentile interval of a success rate by a bootstrap over scenarios.
+    """Returns the percentile interval of a success rate by a bootstrap over scenarios (S,).
 
     It is [0, 1] for fewer than two scenarios. If all have the same rate, it is Wilson's with each
     scenario counted as one flight.
-
-    Args:
-        successes, flights: of each scenario, (S,).
-        confidence: of the interval.
     """
     k, n = np.asarray(successes, float), np.asarray(flights, float)
     if len(k) < 2:
@@ -67,14 +63,8 @@ def cluster_interval(
 
 
 def mcnemar(first: np.ndarray, second: np.ndarray) -> tuple[int, int, float]:
-    """Computes the exact test of McNemar (Psychometrika 12, 1947).
-
-    Args:
-        first, second: successes of two policies in the same flights, (n,) bool.
-
-    Returns:
-        How often only the first succeeds, how often only the second, and the p-value.
-    """
+    """Computes the exact test of McNemar (Psychometrika 12, 1947) of successes (n,) in the same
+    flights: how often only the first succeeds, how often only the second, and the p-value."""
     only_first = int(np.count_nonzero(first & ~second))
     only_second = int(np.count_nonzero(second & ~first))
     unequal = only_first + only_second

@@ -84,6 +84,12 @@ def parse_variant(text: str) -> Variant:
     return Variant(label, policy, tuple(overrides))
 
 
+def flight_name(scenario: str, policy: str, speed: float | None, seed: int) -> str:
+    """Returns the name of a flight; `speed` [m/s] is None if the policy has its own."""
+    parts = [scenario, policy, *([] if speed is None else [f"{speed:g}"]), f"{seed:03d}"]
+    return "-".join(parts)
+
+
 def split_policies(text: str) -> list[str]:
     """Splits a list at commas outside of brackets."""
     return [part.strip() for part in re.split("," + _OUTSIDE_BRACKETS, text) if part.strip()]

@@ -1,29 +1,59 @@
-"""The commands of `splatpilot`. They import torch and pydrake when they run: that takes seconds."""
+"""The commands of `splatpilot`. A module is imported when one of its commands is called."""
 
-from splatpilot.analysis.commands import benchmark, capture, doctor, flight, hardware, scene, train
-from splatpilot.analysis.commands.options import Command
-
-COMMANDS = (
-    *(flight.fly, flight.view, benchmark.benchmark, benchmark.replay, benchmark.difficulty),
-    capture.reconstruct,
-    Command("capture", "render a capture, or check one"),
-    *(capture.check, capture.render),
-    Command("scene", "scale, measure, export, compare or fetch scenes"),
-    *(scene.scale, scene.measure, scene.mesh, scene.ablate, scene.fidelity, scene.fetch),
-    *(train.train, train.recover),
-    Command("corpus", "collect samples for students, or inspect them"),
-    *(train.make_corpus, train.inspect_corpus),
-    Command("hardware", "fly vehicles, real or simulated, by messages"),
-    *(hardware.vehicle, hardware.bridge, hardware.px4, hardware.faults),
-    doctor.doctor,
-)
-"""In the order of the help; subcommands follow their command."""
-
-MOVED = {
-    "tour": "reconstruct",
-    "merge": "benchmark --cluster",
-    "places": "scene fetch",
-    **{name: f"scene {name}" for name in ("scale", "measure", "mesh", "ablate", "fidelity")},
-    **{name: f"hardware {name}" for name in ("vehicle", "bridge", "px4", "faults")},
+COMMANDS = {
+    "fly": ("flight", "fly to a goal and write a page, a video and a trajectory"),
+    "view": ("flight", "view a scene, a map, a capture or a generated world, and measure in it"),
+    "benchmark": ("benchmark", "fly policies through scenarios many times, and report"),
+    "replay": ("benchmark", "fly one flight of a study again, and check it"),
+    "difficulty": ("benchmark", "print how hard scenarios are, and how many seeds are feasible"),
+    "reconstruct": (
+        "capture",
+        "make a scene to fly in from a capture, a mesh or a generated world",
+    ),
+    "capture": ("", "render a capture, or check one"),
+    "capture check": ("capture", "check that poses, intrinsics and depth of a capture agree"),
+    "capture render": (
+        "capture",
+        "render a capture of a mesh or a generated world, with exact depth",
+    ),
+    "scene": ("", "scale, measure, export, compare or fetch scenes"),
+    "scene scale": (
+        "scene",
+        "scale a scene by a factor, a measured length, or the height of the cameras",
+    ),
+    "scene measure": ("scene", "compare a scene with the held-out frames of its capture"),
+    "scene mesh": (
+        "scene",
+        "write the surfaces of a scene, a map or a generated world as a mesh for collisions",
+    ),
+    "scene ablate": (
+        "scene",
+        "reconstruct captures with increasing use of depth, as 3DGS and 2DGS, and compare",
+    ),
+    "scene fidelity": (
+        "scene",
+        "measure how far from its capture's path a scene can be trusted",
+    ),
+    "scene fetch": ("scene", "make the scenes of the benchmark's photorealistic scenarios"),
+    "train": ("train", "train policies"),
+    "recover": (
+        "train",
+        "train a student, fly it, and train it again with corrections of its near-misses",
+    ),
+    "corpus": ("", "collect samples for students, or inspect them"),
+    "corpus make": (
+        "train",
+        "fly the expert through many worlds and record images and labels",
+    ),
+    "corpus inspect": ("train", "draw samples with their trajectories, and check every byte"),
+    "hardware": ("", "fly vehicles, real or simulated, by messages"),
+    "hardware vehicle": ("hardware", "simulate a vehicle that is flown by LCM messages"),
+    "hardware bridge": ("hardware", "fly a vehicle, real or simulated, by LCM messages"),
+    "hardware px4": ("hardware", "connect the bridge to PX4 by MAVLink"),
+    "hardware faults": ("hardware", "fly with faults of messages, clocks and policies"),
+    "doctor": (
+        "doctor",
+        "list what works on this machine, and what to install or set for the rest",
+    ),
 }
-"""New names of commands that have moved."""
+"""Module and help of each command, in the order of the help; "" of those with subcommands."""

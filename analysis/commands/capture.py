@@ -25,7 +25,6 @@ def _defaults(options: argparse.Namespace) -> Any:
 
 @cli.command(
     "reconstruct",
-    "make a scene to fly in from a capture, a mesh or a generated world",
     cli.input_option("source", "capture", "mesh", "scenario"),
     cli.out_option("scene folder to write"),
     cli.Option("--iterations", "optimization steps", int),
@@ -71,7 +70,6 @@ def reconstruct(options: argparse.Namespace) -> None:
 
 @cli.command(
     "capture check",
-    "check that poses, intrinsics and depth of a capture agree",
     cli.input_option("capture", "capture"),
     cli.set_option(
         *("pairs=30", "capture.depth_unit=5000"),
@@ -105,7 +103,6 @@ def _points(text: str) -> list[list[float]]:
 
 @cli.command(
     "capture render",
-    "render a capture of a mesh or a generated world, with exact depth",
     cli.input_option("world", "mesh", "scenario"),
     cli.out_option("capture folder to write"),
     cli.Option('--path "X,Y,Z X,Y,Z ..."', "points on the camera's path [m]", resolve=_points),

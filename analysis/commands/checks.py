@@ -1,7 +1,7 @@
 """Checks of names and paths that the command line makes before slow imports."""
 
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from splatpilot.analysis.benchmark.variants import SCENARIO, parse_variant
@@ -81,10 +81,8 @@ def check_scenario(name: str) -> str:
 
 
 def check_corpora(policies: Sequence[str], overrides: Sequence[str], config: Path | None) -> None:
-    """Checks that the corpora of `--set` exist, if one of the policies learns from corpora.
-
-    Those in the file `config` are checked by the training.
-    """
+    """Checks that corpora exist, if a policy learns from them; the training checks those in
+    `config`."""
     given = [text.partition("=")[2] for text in overrides if text.startswith("corpora=")]
     if (config is not None and not given) or not set(LEARN_FROM_CORPORA) & set(policies):
         return
@@ -98,52 +96,36 @@ def check_corpora(policies: Sequence[str], overrides: Sequence[str], config: Pat
 
 
 def check_kind(path: Path, *accepted: str) -> None:
-    """Checks that an existing path is one of the `accepted` keys of `_KINDS`.
-
-    The message names its kind and the command that uses it.
-    """
+    """Checks that an existing path is one of the `accepted` keys of `_KINDS`."""
     kind = _SUFFIXES.get(path.suffix.lower(), "")
     if path.is_dir():
         kind = "scene" if (path / "scene.yaml").is_file() else ""
-        if not kind and "capture" not in accepted and _is_capture(path):
-            kind = "capture"
+        if not kind and "capture" not in accepted:  # takes seconds to import, for a message
+            from splatpilot.training.captures.capture_registry import CAPTURES
+
+            captures = map(CAPTURES.find, CAPTURES.names())
+            kind = "capture" if any(each.recognizes(path) for each in captures) else ""
     if kind and kind not in accepted:
         what, remedy = _KINDS[kind]
         require(False, str(path), _list_kinds(accepted), what, remedy.format(path=path))
 
 
-def _list_kinds(kinds: Sequence[str]) -> str:
-    return _join(_KINDS[kind][0] for kind in kinds)
-
-
-def _join(words: Iterable[str]) -> str:
-    *first, last = words
+def _list_kinds(kinds: Sequence[str], described: Mapping[str, str] = {}) -> str:
+    *first, last = (_KINDS[kind][0] + described.get(kind, "") for kind in kinds)
     return f"{', '.join(first)} or {last}" if first else last
 
 
 def describe_kinds(kinds: Sequence[str]) -> str:
     """Lists kinds of environments with their suffixes, for the help of a command."""
-    described = []
-    for kind in kinds:
-        forms = ["P02"] if kind == "scenario" else []
-        forms += [suffix for suffix, other in _SUFFIXES.items() if other == kind]
-        described.append(_KINDS[kind][0] + (f" ({', '.join(forms)})" if forms else ""))
-    return _join(described)
-
-
-def _is_capture(path: Path) -> bool:
-    # Takes seconds to import, only for a message.
-    from splatpilot.training.captures.capture_registry import CAPTURES
-
-    return any(CAPTURES.find(name).recognizes(path) for name in CAPTURES.names())
+    forms: dict[str, list[str]] = {"scenario": ["P02"]}
+    for suffix, kind in _SUFFIXES.items():
+        forms.setdefault(kind, []).append(suffix)
+    return _list_kinds(kinds, {kind: f" ({', '.join(each)})" for kind, each in forms.items()})
 
 
 def find_input(path: str, *accepted: str) -> str:
-    """Finds an environment: the name of a scenario, or a path as `find_data` does.
-
-    Args:
-        accepted: keys of `_KINDS`.
-    """
+    """Finds an environment of an `accepted` kind: a scenario by name, or a path as `find_data`
+    does."""
     scenarios = SCENARIOS if "scenario" in accepted else ()
     if path in scenarios:
         return path

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from splatpilot.analysis.benchmark.variants import parse_variant
+from splatpilot.analysis.benchmark.variants import flight_name, parse_variant
 from splatpilot.analysis.commands import options as cli
 from splatpilot.analysis.commands.checks import SCENARIOS
 from splatpilot.diagrams.scenarios import scenario_file
@@ -12,7 +12,6 @@ from splatpilot.diagrams.scenarios import scenario_file
 
 @cli.command(
     "fly",
-    "fly to a goal and write a page, a video and a trajectory",
     *cli.SCENARIO_OPTIONS,
     cli.out_option("output folder (default: out/FLIGHT)", required=False, unused=True),
     cli.OVERWRITE,
@@ -40,7 +39,6 @@ def fly(options: argparse.Namespace) -> Any:
 
 def _flight_name(options: argparse.Namespace, scenario: Any) -> str:
     """Names a flight by its scenario, scene or world, policy, speed and seed, as studies do."""
-    from splatpilot.analysis.benchmark.study import flight_name
     from splatpilot.diagrams.flight.policies import policy_name, policy_speed
 
     world = options.scene or options.scenario
@@ -67,7 +65,6 @@ WORLD_FIELDS = cli.set_option(
 
 @cli.command(
     "view",
-    "view a scene, a map, a capture or a generated world, and measure in it",
     cli.input_option("what", "scene", "gaussians", "map", "capture", "scenario"),
     cli.out_option("page to write (default: out/view/NAME.html)", required=False, unused=True),
     cli.SEED,

@@ -29,7 +29,6 @@ def _hardware_config(options: argparse.Namespace) -> Any:
 
 @cli.command(
     "hardware vehicle",
-    "simulate a vehicle that is flown by LCM messages",
     cli.out_option("output folder", "out/vehicle", unused=True),
     *_MESSAGING,
     examples=(
@@ -48,7 +47,6 @@ def vehicle(options: argparse.Namespace) -> None:
 
 @cli.command(
     "hardware bridge",
-    "fly a vehicle, real or simulated, by LCM messages",
     cli.Option("--log", "write all messages to this file, as lcm-logger does", Path, unused=True),
     *_MESSAGING,
     examples=(
@@ -67,7 +65,6 @@ def bridge(options: argparse.Namespace) -> None:
 
 @cli.command(
     "hardware px4",
-    "connect the bridge to PX4 by MAVLink",
     cli.CONFIG,
     _LCM_URL,
     cli.flag("--engage", "request offboard mode"),
@@ -95,7 +92,6 @@ def px4(options: argparse.Namespace) -> None:
 
 @cli.command(
     "hardware faults",
-    "fly with faults of messages, clocks and policies",
     cli.out_option("output folder", "out/faults"),
     cli.CONFIG,
     cli.set_option(

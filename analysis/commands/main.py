@@ -14,11 +14,12 @@ import tempfile
 import threading
 import traceback
 from collections.abc import Iterator, Sequence
+from importlib import import_module
 from types import FrameType
 from typing import Any, NoReturn
 
-from splatpilot.analysis.commands import COMMANDS, MOVED
-from splatpilot.analysis.commands.options import FailureWithResultError, as_json
+from splatpilot.analysis.commands import COMMANDS
+from splatpilot.analysis.commands.options import Command, FailureWithResultError, as_json
 from splatpilot.systems.common.extras import missing_extra
 from splatpilot.systems.common.validation import TYPES, did_you_mean, unknown
 
@@ -48,7 +49,9 @@ class _ImportModule(argparse.Action):
 
 
 class _Parser(argparse.ArgumentParser):
-    """Parser that suggests similar words for unknown ones."""
+    """Parser that suggests similar words for unknown ones; `command` is added when it is called."""
+
+    command = ""
 
     def __init__(self, *args: Any, **keywords: Any) -> None:
         super().__init__(*args, **keywords)
@@ -60,10 +63,7 @@ class _Parser(argparse.ArgumentParser):
             super()._check_value(action, value)
         else:
             what = str(action.metavar or action.dest).lower()
-            message = unknown(what, value, action.choices)
-            if value in MOVED and self.prog == "splatpilot":
-                message = f"`splatpilot {value}` is now `splatpilot {MOVED[value]}`"
-            raise argparse.ArgumentError(None, message)
+            raise argparse.ArgumentError(None, unknown(what, value, action.choices))
 
     def _get_value(self, action: argparse.Action, arg_string: str) -> Any:
         try:
@@ -78,6 +78,9 @@ class _Parser(argparse.ArgumentParser):
     def parse_known_args(  # pyright: ignore[reportIncompatibleMethodOverride]
         self, args: Any = None, namespace: Any = None
     ) -> Any:
+        if self.command:
+            find_command(self.command).fill(self)
+            self.command = ""
         # The parser of the command, not that of all commands, knows the options to suggest.
         options, words = super().parse_known_args(args, namespace)
         if words:
@@ -110,11 +113,24 @@ def build_parser() -> argparse.ArgumentParser:
         "--version", action=_PrintVersion, nargs=0, help="show the version and exit"
     )
     groups: dict[str, Any] = {"": parser.add_subparsers(required=True, metavar="COMMAND")}
-    for command in COMMANDS:
-        added = command.add_to(groups[command.name.rpartition(" ")[0]])
-        if command.function is None:
-            groups[command.name] = added.add_subparsers(required=True, metavar="SUBCOMMAND")
+    for name, (module, text) in COMMANDS.items():
+        group, _, word = name.rpartition(" ")
+        added = groups[group].add_parser(word, help=text)
+        if not module:
+            added.description = f"{text[0].upper()}{text[1:]}."
+            groups[name] = added.add_subparsers(required=True, metavar="SUBCOMMAND")
+        elif "_ARGCOMPLETE" in os.environ:  # it takes the options before it parses
+            find_command(name).fill(added)
+        else:
+            added.command = name
     return parser
+
+
+def find_command(name: str) -> Command:
+    """Imports a command."""
+    module = import_module(f"splatpilot.analysis.commands.{COMMANDS[name][0]}")
+    commands = (each for each in vars(module).values() if isinstance(each, Command))
+    return next(command for command in commands if command.name == name)
 
 
 def run() -> NoReturn:
@@ -128,13 +144,9 @@ def run() -> NoReturn:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Runs `splatpilot COMMAND ...`.
+    """Runs `splatpilot COMMAND ...` and returns its exit status, see `splatpilot --help`.
 
-    Args:
-        arguments: the words after `splatpilot`; those of the process if None.
-
-    Returns:
-        The exit status, see `splatpilot --help`.
+    `arguments` are the words after `splatpilot`; those of the process if None.
     """
     parser = build_parser()
     if "_ARGCOMPLETE" in os.environ:

@@ -27,19 +27,12 @@ from splatpilot.systems.common.files import require_existing, require_scene, req
 if TYPE_CHECKING:
     from splatpilot.diagrams.flight.scenario import Scenario
 
-EXAMPLES = "examples:"
-
 
 class Option:
     """An option or argument of commands.
 
-    Args:
-        spec: flag, or name of an argument, and its metavar, such as "--seeds N".
-        help, type, keywords: of `ArgumentParser.add_argument`.
-        resolve: checks a value, each of several, before slow imports; returns it or what it names.
-        unused: the path must not exist without --overwrite.
-        completions: for shells.
-        exclusive: at most one of these options may be given.
+    `resolve` checks a value before slow imports, and returns it or what it names; the path of an
+    `unused` option must not exist without --overwrite; of `exclusive` ones at most one is given.
     """
 
     def __init__(
@@ -57,7 +50,9 @@ class Option:
         self.flag, _, metavar = spec.partition(" ")
         self.resolve, self.unused, self.exclusive = resolve, unused, exclusive
         self.completions = completions
-        self.keywords = keywords | {"help": help} | ({"metavar": metavar} if metavar else {})
+        self.keywords: dict[str, Any] = (
+            keywords | {"help": help} | ({"metavar": metavar} if metavar else {})
+        )
         if keywords.get("action", "append") == "append":
             self.keywords["type"] = type
         self.name = keywords.get("dest") or self.flag.lstrip("-").replace("-", "_")
@@ -73,25 +68,19 @@ class Command:
     """A command, such as "fly", or a subcommand, such as "scene scale"."""
 
     name: str
-    help: str  # half a sentence, for the list of commands
-    examples: Sequence[str] = ()  # command lines without `splatpilot`
-    options: Sequence[Option] = ()
-    function: Callable[[argparse.Namespace], Any] | None = None
-    """Returns what `--json` prints; its docstring is the description. None for a command with
-    subcommands."""
+    examples: Sequence[str]  # command lines without `splatpilot`
+    options: Sequence[Option]
+    function: Callable[[argparse.Namespace], Any]
+    """Returns what `--json` prints; its docstring is the description."""
 
-    def add_to(self, commands: argparse._SubParsersAction) -> argparse.ArgumentParser:
-        """Adds the parser of the command."""
+    def fill(self, parser: argparse.ArgumentParser) -> None:
+        """Adds description, examples and options to the parser of the command."""
         width = max(shutil.get_terminal_size().columns - 2, 40)
-        text = inspect.getdoc(self.function) if self.function else None
-        examples = [EXAMPLES, *(f"  splatpilot {line}" for line in self.examples)]
-        parser = commands.add_parser(
-            self.name.rpartition(" ")[2],
-            help=self.help,
-            description=textwrap.fill(text or f"{self.help[0].upper()}{self.help[1:]}.", width),
-            epilog="\n".join(examples) if self.examples else None,
-            formatter_class=argparse.RawDescriptionHelpFormatter,
+        parser.description = textwrap.fill(inspect.getdoc(self.function) or "", width)
+        parser.epilog = "\n".join(
+            ["examples:", *(f"  splatpilot {line}" for line in self.examples)]
         )
+        parser.formatter_class = argparse.RawDescriptionHelpFormatter
         exclusive = any(each.exclusive for each in self.options)
         group = parser.add_mutually_exclusive_group() if exclusive else parser
         for each in self.options:
@@ -102,7 +91,6 @@ class Command:
             if isinstance(action, SetField):
                 parser.set_defaults(default_config=action.configuration)
         parser.set_defaults(command=self)
-        return parser
 
     def run(self, options: argparse.Namespace) -> Any:
         """Checks the options and runs the command."""
@@ -114,15 +102,14 @@ class Command:
                 several = isinstance(value, list)
                 resolved = [each.resolve(one) for one in (value if several else [value])]
                 setattr(options, each.name, resolved if several else resolved[0])
-        assert self.function is not None
         return self.function(options)
 
 
 def command(
-    name: str, help: str, *options: Option, examples: Sequence[str]
+    name: str, *options: Option, examples: Sequence[str]
 ) -> Callable[[Callable[[argparse.Namespace], Any]], Command]:
     """Decorates the function of a command; for the arguments see `Command`."""
-    return lambda function: Command(name, help, examples, options, function)
+    return lambda function: Command(name, examples, options, function)
 
 
 def announce(text: str) -> None:
@@ -187,13 +174,8 @@ class SetField(argparse.Action):
 
 
 def set_option(*examples: str, configuration: str | Callable[[argparse.Namespace], Any]) -> Option:
-    """Declares `--set` of a command.
-
-    Args:
-        examples: FIELD=VALUE of the most important fields.
-        configuration: `module:type` of the configuration, or a function that makes it from the
-            options before `--set`.
-    """
+    """Declares `--set`, with FIELD=VALUE as examples, of a configuration: `module:type`, or a
+    function that makes it from the options before `--set`."""
 
     def make_default(options: argparse.Namespace) -> Any:
         module, _, name = str(configuration).partition(":")
@@ -211,8 +193,8 @@ def set_option(*examples: str, configuration: str | Callable[[argparse.Namespace
 
 
 def read_config(options: argparse.Namespace, *overrides: str, **changes: Any) -> Any:
-    """Reads the configuration of a command: its defaults with the `changes` that are not None,
-    then `--config`, `--set` and `overrides`."""
+    """Reads `--config` and `--set` over a command's defaults with the `changes` that are not
+    None."""
     from splatpilot.systems.common.config import load_config
 
     config = options.default_config(options)
@@ -240,7 +222,7 @@ def input_option(name: str, *kinds: str, **keywords: Any) -> Option:
 
 
 def json_option(what: str) -> Option:
-    """Declares `--json`, which prints only the result of the command to standard output."""
+    """Declares `--json`: the result of the command is all that goes to standard output."""
     return flag("--json", f"print {what} as JSON; everything else goes to standard error")
 
 

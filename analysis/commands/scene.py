@@ -22,7 +22,6 @@ def _point(text: str) -> list[float]:
 
 @cli.command(
     "scene scale",
-    "scale a scene by a factor, a measured length, or the height of the cameras",
     cli.path_option("scene", "a scene folder or a file of Gaussians"),
     cli.out_option("scene folder, or PLY, to write"),
     cli.Option("--up", "axis of a file that points up (z)", choices=_AXES),
@@ -66,7 +65,6 @@ def scale(options: argparse.Namespace) -> None:
 
 @cli.command(
     "scene measure",
-    "compare a scene with the held-out frames of its capture",
     cli.path_option("scene", "a scene folder"),
     cli.OVERWRITE,
     examples=("scene measure scenes/room_metric", "scene measure scenes/hospital --overwrite"),
@@ -83,7 +81,6 @@ def measure(options: argparse.Namespace) -> None:
 
 @cli.command(
     "scene mesh",
-    "write the surfaces of a scene, a map or a generated world as a mesh for collisions",
     cli.input_option("what", "scene", "map", "scenario"),
     cli.out_option("file to write: .obj or .gltf", unused=True),
     cli.flag("--conservative", "unknown space and outside of the bounds are solid"),
@@ -99,14 +96,37 @@ def mesh(options: argparse.Namespace) -> None:
     """Writes the zero level of a distance field as a closed mesh, for contact and distances in
     Drake (OBJ) and in other simulators and viewers (glTF, OBJ)."""
     import_extra("manifold3d", "mesh")
-    from splatpilot.analysis import mesh
+    from splatpilot.analysis.view import generated_scenario
+    from splatpilot.diagrams.worlds.scene_folder import read_scene_folder
+    from splatpilot.diagrams.worlds.world_registry import make_world
+    from splatpilot.systems.collision.field_mesh import field_mesh, require_mesh_name, write_mesh
 
-    cli.call(mesh.run, options)
+    require_mesh_name(options.out)
+    what = Path(options.what)
+    scenario = generated_scenario(what, options.seed, options.overrides)
+    if scenario is not None:
+        scenario.validate()
+        esdf = make_world(scenario.world, scenario.seed).esdf
+    elif not (what / "scene.yaml").is_file():
+        raise ValueError(
+            f"{what} must be a scene folder, OctoMap or scenario, which have distances; "
+            "reconstruct it first"
+        )
+    elif options.overrides:
+        raise ValueError(f"--set must be of a scenario, got {options.overrides[0]}; leave it out")
+    else:
+        esdf = read_scene_folder(what).esdf
+    made = field_mesh(esdf, options.conservative)
+    write_mesh(options.out, made)
+    size = " x ".join(f"{extent:.1f}" for extent in made.extents)
+    print(
+        f"Wrote {options.out}: {len(made.faces)} triangles, {size} m, within "
+        f"{esdf.voxel_size / 2:g} m"
+    )
 
 
 @cli.command(
     "scene ablate",
-    "reconstruct captures with increasing use of depth, as 3DGS and 2DGS, and compare",
     cli.input_option("captures", "capture", "scene", nargs="+", metavar="CAPTURE"),
     cli.out_option("output folder", "out/ablation"),
     cli.OVERWRITE,
@@ -132,7 +152,6 @@ def ablate(options: argparse.Namespace) -> None:
 
 @cli.command(
     "scene fidelity",
-    "measure how far from its capture's path a scene can be trusted",
     cli.path_option("scenes", "a scene folder", nargs="+", metavar="SCENE"),
     cli.out_option("output folder", "out/fidelity"),
     cli.OVERWRITE,
@@ -157,7 +176,6 @@ def fidelity(options: argparse.Namespace) -> None:
 
 @cli.command(
     "scene fetch",
-    "make the scenes of the benchmark's photorealistic scenarios",
     cli.Option(
         "names", "hospital, bookstore, ... (default: R13 to R17)", nargs="*", metavar="NAME"
     ),

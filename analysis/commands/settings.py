@@ -34,7 +34,10 @@ def _settings(config: Any, prefix: str) -> Iterator[tuple[str, str]]:
             yield f"{name}  ({' or '.join(dict.fromkeys(tags))})", field.text
             yield from _settings(field.value, f"{name}.")
         else:
-            yield f"{name}={_as_yaml(field.value)}  ({_type_name(config, field)})", field.text
+            plain = field.value.tolist() if isinstance(field.value, np.ndarray) else field.value
+            text = yaml.safe_dump(plain, default_flow_style=True, width=math.inf)
+            text = text.removesuffix("...\n").strip()
+            yield f"{name}={text}  ({_type_name(config, field)})", field.text
 
 
 def _type_name(config: Any, field: FieldDescription) -> str:
@@ -45,9 +48,3 @@ def _type_name(config: Any, field: FieldDescription) -> str:
         found = types[field.name]
         return found.__name__ if type(found) is type else str(found)
     return "number, text or null" if field.value is None else type(field.value).__name__
-
-
-def _as_yaml(value: Any) -> str:
-    plain = value.tolist() if isinstance(value, np.ndarray) else value
-    text = yaml.safe_dump(plain, default_flow_style=True, width=math.inf)
-    return text.removesuffix("...\n").strip()

@@ -27,7 +27,6 @@ def _trainer_defaults(options: argparse.Namespace) -> Any:
 
 @cli.command(
     "train",
-    "train policies",
     cli.Option(
         "policies",
         "name of a trainer, such as diffaero, or module:attribute",
@@ -90,7 +89,6 @@ def train(options: argparse.Namespace) -> None:
 
 @cli.command(
     "recover",
-    "train a student, fly it, and train it again with corrections of its near-misses",
     cli.Option("policy", "student to train", choices=LEARN_FROM_CORPORA),
     cli.out_option("folder to write; resumes an interrupted run of the same configuration"),
     cli.Option("--flights N", "in each world, at most (%(default)s)", int, default=6),
@@ -135,7 +133,6 @@ def recover(options: argparse.Namespace) -> None:
 
 @cli.command(
     "corpus make",
-    "fly the expert through many worlds and record images and labels",
     cli.out_option("folder of the corpus"),
     cli.Option("--worlds N", "number of worlds", int, required=True),
     cli.JOBS,
@@ -160,7 +157,6 @@ def make_corpus(options: argparse.Namespace) -> None:
 
 @cli.command(
     "corpus inspect",
-    "draw samples with their trajectories, and check every byte",
     cli.path_option("corpus", "the folder of a corpus"),
     cli.out_option("image to draw", metavar="PNG", unused=True),
     cli.Option("--samples N", "(%(default)s)", int, default=12),

@@ -1,8 +1,6 @@
 """Fidelity of scenes off the path of their capture, the study of the paper's Fig. 7.
 
-Compares views beside the path with the truth: rendered, if the capture was rendered from a world,
-or stretches of frames that a reconstruction for this study leaves out. The result bounds how far
-poses may be perturbed in training (Sec. IV-B).
+The truth is rendered, if the capture was, or frames that a reconstruction leaves out.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -98,12 +96,10 @@ def run(
     find_camera: Callable[[Path], TrueCamera | None] = true_camera,
     overwrite: bool = False,
 ) -> list[FidelityStudy]:
-    """Studies scene folders, and writes the bounds into their `scene.yaml` and figures into `out`.
+    """Studies scene folders, and writes the bounds into their `scene.yaml` and `fidelity.png`,
+    `fidelity.csv`, `fidelity.yaml` and image grids into `out`.
 
-    `out` gets `fidelity.png`, `fidelity.csv`, an image grid of each scene, and `fidelity.yaml` with
-    the study. Reconstructions without held-out frames are in `out/SCENE`, and used again.
     `find_camera` returns the camera that renders the truth of a capture's folder, or None.
-    `overwrite` replaces another study in `out` and in the scenes.
     """
     config.validate()
     names = [scene.resolve().name for scene in scenes]
@@ -187,12 +183,11 @@ def study_scene(
 
 
 def store_bounds(scene: Path, study: FidelityStudy) -> SceneMetadata:
-    """Writes the maximum displacement [m] of each pose of the capture, and of all poses, into
-    `scene.yaml`.
+    """Writes the maximum displacement [m] of each pose, and of all poses, into `scene.yaml`.
 
     A pose may move left, right, up and down while its view keeps within the study's limit of unseen
-    pixels, at most as far as was measured. The bound of all poses is the study's reach if the truth
-    was rendered, and otherwise the median over the poses: holding frames out removes views, too.
+    pixels, at most as far as was measured. The bound of all poses is the reach or, of held-out
+    frames, the median over the poses.
     """
     views = SceneViews(scene)
     support, X_WCs = _support(views), views.capture.X_WCs

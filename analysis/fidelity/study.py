@@ -47,17 +47,12 @@ def band(x: ArrayLike, y: ArrayLike) -> Band:
     return Band(at, np.array([len(group) for group in groups]), low, middle, high)
 
 
-def monotone_fit(x: ArrayLike, y: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Returns mean x of the groups of `band`, and the non-decreasing least-squares fit to their
-    medians of y; medians ignore views of space that no camera saw."""
-    found = band(x, y)
-    return found.at, isotonic_regression(found.middle, weights=found.counts).x
-
-
 def reach(x: ArrayLike, y: ArrayLike, limit: float) -> float:
-    """Returns the largest x up to which the monotone fit of y, linear in between, is within
-    `limit`: at most the largest measured x, and 0 if the fit starts above."""
-    return first_crossing(*monotone_fit(x, y), limit)
+    """Returns the largest x up to which the non-decreasing least-squares fit to the medians of
+    `band`, linear in between, is within `limit`; 0 if the fit starts above."""
+    found = band(x, y)
+    fit = isotonic_regression(found.middle, weights=found.counts).x
+    return first_crossing(found.at, fit, limit)
 
 
 def first_crossing(x: ArrayLike, y: Iterable[float], limit: float) -> float:
@@ -219,9 +214,8 @@ def displace_pose(
 class ViewSupport:
     """The fraction of a view's pixels whose surface a fitted camera saw similarly.
 
-    A camera did if the point is in its image at the depth of the scene there (within 5 %: it is not
-    occluded), from a direction within 45 degrees and from at most twice the distance. Only the 16
-    closest cameras count. Pixels without a surface are unseen. `camera` is K (3, 3), width and
+    One of the 16 closest cameras saw the point at the depth of the scene (within 5 %), from a
+    direction within 45 degrees and from at most twice the distance. `camera` is K (3, 3), width and
     height [px].
     """
 

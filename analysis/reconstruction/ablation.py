@@ -167,14 +167,8 @@ class AblationStudy:
 
 
 def arm_config(arm: Arm, config: ReconstructConfig) -> ReconstructConfig:
-    """Returns the settings of an arm.
-
-    The last arm of each representation follows `config`; the one before differs only in
-    `depth_weight`, the paper's equation 2. The first uses no metric depth: it starts from points
-    triangulated between the images, and densifies. The second starts from depth, with the strategy,
-    learning rates and scale limits that follow from it. All arms have the same steps, images, color
-    losses, maximum number of Gaussians, photometry and distance field, which is not measured.
-    """
+    """Returns the settings of an arm. The last of a representation follows `config`; the first uses
+    no metric depth. All have the same steps, images, maximum number of Gaussians and photometry."""
     return replace(
         config,
         representation=arm.representation,
@@ -187,12 +181,8 @@ def arm_config(arm: Arm, config: ReconstructConfig) -> ReconstructConfig:
 def run(
     captures: Sequence[Path], out: Path, config: ReconstructConfig, overwrite: bool = False
 ) -> AblationResult:
-    """Reconstructs and measures each capture in every arm, and writes the study to `out`.
-
-    Every arm is a scene folder `out/CAPTURE/ARM`; an existing one of the same capture and settings
-    is used again. `ablation.md` and `ablation.csv` have the table, `CAPTURE.png` an image grid of
-    the arms, `ablation.yaml` the study. With `overwrite` it replaces another study in `out`.
-    """
+    """Reconstructs and measures each capture in every arm, as a scene folder `out/CAPTURE/ARM`, and
+    writes `ablation.md`, `ablation.csv`, `ablation.yaml` and an image grid of each capture."""
     config.validate()
     require_renderer(config.device)
     require(config.hold_out != 0, "hold_out", "not 0, to measure", config.hold_out)

@@ -12,9 +12,6 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from splatpilot.analysis.output import write_png
-from splatpilot.systems.splats.background import RenderedView
-from splatpilot.training.captures.capture import CaptureFrame
-from splatpilot.training.reconstruction.metrics import has_true_depth
 
 _RED = np.array([0.95, 0.05, 0.05])
 _GRAY = 0.35  # of unknown values
@@ -59,30 +56,10 @@ def mark_floaters(image: NDArray, mask: NDArray[np.bool_]) -> NDArray[np.float64
     return np.where(mask[..., None], 0.25 * gray + 0.75 * _RED, gray)
 
 
-def view_panels(
-    frame: CaptureFrame,
-    view: RenderedView,
-    image: NDArray,
-    depths: Scale,
-    errors: Scale,
-    labels: tuple[str, str],
-) -> list[Panel]:
-    """Returns the panels of the frame, of the exposed `image` of its view, of true and rendered
-    depth and of the error of depth, with labels of image and error."""
-
-    def colorize(values: NDArray, scale: Scale, known: NDArray[np.bool_]) -> NDArray:
-        colors = colormaps[scale.colors](scale.norm(np.where(known, values, 1.0)))[..., :3]
-        return np.where(known[..., None], colors, _GRAY)
-
-    known = has_true_depth(frame.depth)
-    error: NDArray = np.abs(view.depth - np.where(known, frame.depth, 0))
-    return [
-        Panel(frame.image / 255),
-        Panel(image, labels[0]),
-        Panel(colorize(frame.depth, depths, known)),
-        Panel(colorize(view.depth, depths, view.alpha > 0)),
-        Panel(colorize(error, errors, known), labels[1]),
-    ]
+def colorize(values: NDArray, scale: Scale, known: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Returns the colors (H, W, 3) of values (H, W), gray if they are not known."""
+    colors = colormaps[scale.colors](scale.norm(np.where(known, values, 1.0)))[..., :3]
+    return np.where(known[..., None], colors, _GRAY)
 
 
 def write_grid(

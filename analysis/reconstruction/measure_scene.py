@@ -12,9 +12,9 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from splatpilot.analysis.reconstruction.figures import (
     Panel,
     Scale,
+    colorize,
     depth_scale,
     error_scale,
-    view_panels,
     write_grid,
 )
 from splatpilot.diagrams.flight.flight_diagram import MakeCamera
@@ -177,10 +177,19 @@ class SceneViews:
     def panels(
         self, frame: CaptureFrame, depths: Scale, errors: Scale, labels: tuple[str, str]
     ) -> list[Panel]:
-        """Renders a frame and returns its `view_panels`."""
+        """Returns panels of a frame, its exposed view, true and rendered depth, and depth error;
+        the labels are of view and error."""
         view, truth = self.render(frame), frame.image / 255
         image, _ = fit_exposure(view.color, truth, self.metadata.vignetting, frame.valid)
-        return view_panels(frame, view, image, depths, errors, labels)
+        known = has_true_depth(frame.depth)
+        error = np.abs(view.depth - np.where(known, frame.depth, 0))
+        return [
+            Panel(truth),
+            Panel(image, labels[0]),
+            Panel(colorize(frame.depth, depths, known)),
+            Panel(colorize(view.depth, depths, view.alpha > 0)),
+            Panel(colorize(error, errors, known), labels[1]),
+        ]
 
     def render(self, frame: CaptureFrame) -> RenderedView:
         """Renders the scene from the camera of `frame`."""

@@ -32,9 +32,11 @@ from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.distance_field import render_depth
 from splatpilot.training.reconstruction.reconstruct import start_and_goal
 
-UP_AXES = ("z", "-z", "y", "-y", "x", "-x")
-"""Axes that may be up in a file."""
-
+_KEPT = (
+    *("gains", "vignetting", "representation", "capture", "capture_settings", "capture_notes"),
+    *("origin", "held_out", "image_width", "split", "source_digest"),
+)
+"""Metadata that a scaled scene keeps."""
 _MIN_AREA = 0.05  # twice the area of a triangle on the floor, over its longest side squared
 _MIN_COSINE = 0.5  # between a floor's normal and the axis that is up
 
@@ -63,15 +65,10 @@ class RescaleSummary:
 def rescale_file(
     file: Path, out: Path, factor: float, up: str, floor: Sequence[ArrayLike]
 ) -> RescaleSummary:
-    """Writes the Gaussians of a file as PLY, scaled and rotated so that z is up.
+    """Writes the Gaussians of a file as PLY, in meters and with z up.
 
-    Args:
-        file: see `read_splats`.
-        out: the PLY.
-        factor: [m] of one of the file's units.
-        up: the file's axis that points up, one of `UP_AXES`; mostly -y in PLYs of 3DGS.
-        floor: three points (3,) of the file's floor: it becomes level, at z = 0, and `up` tells
-            its upper side.
+    Its axis `up` becomes z. If `floor` has three points (3,), their plane becomes z = 0, and `up`
+    tells its upper side.
     """
     if out.suffix.lower() != ".ply":
         raise ValueError(f"{out}: Gaussians are written as PLY; name it so, {out.stem}.ply")
@@ -130,12 +127,8 @@ def run(
 ) -> RescaleSummary:
     """Scales a scene folder by `rescale`, or a file of Gaussians by `rescale_file`.
 
-    Args:
-        scene, out: folders, or files.
-        factor: of all lengths; or
-        between, distance: two points (3,) of the scene, and the distance between them [m]; or
-        height: [m], median height of the capture's cameras above the ground.
-        up, floor: for files, see `rescale_file`.
+    The factor is given, or follows from the distance between two points (3,) or from the median
+    height of the capture's cameras [m].
     """
     if scene.is_file() and height is not None:
         raise ValueError(f"{scene}: a file has no cameras; give a factor, or points and a distance")
@@ -163,11 +156,8 @@ def run(
 
 
 def rescale(scene: Path, out: Path, factor: float) -> RescaleSummary:
-    """Writes the scene folder `scene` as `out`, all lengths times `factor`, in meters.
-
-    As reconstruction in that scale, it chooses start and goal for the vehicle, and closes the
-    frontier of a scene whose scale was unknown. Voxels are scaled. Metrics are not copied.
-    """
+    """Writes a scene folder with all lengths times `factor`, with start and goal for the vehicle
+    and a closed frontier. Metrics are not copied."""
     _positive("factor", factor)
     if out.exists():
         raise ValueError(f"{out}: exists already; choose another folder for the scaled scene")
@@ -196,17 +186,7 @@ def rescale(scene: Path, out: Path, factor: float) -> RescaleSummary:
         World(metadata.name, gaussians, field, field, background, p_WS, p_WG),
         frontier,
         provenance=f"{metadata.provenance}, scaled by {factor:.6g}",
-        gains=about.gains,
-        vignetting=about.vignetting,
-        representation=metadata.representation,
-        capture=about.capture,
-        capture_settings=about.capture_settings,
-        capture_notes=about.capture_notes,
-        origin=about.origin,
-        held_out=about.held_out,
-        image_width=about.image_width,
-        split=metadata.split,
-        source_digest=metadata.source_digest,
+        **{name: getattr(about, name) for name in _KEPT},
     )
     details = {"shortest path [m]": f"{geodesic:.1f}"}
     size = field.upper_W - field.lower_W
@@ -214,11 +194,8 @@ def rescale(scene: Path, out: Path, factor: float) -> RescaleSummary:
 
 
 def _about_capture(metadata: SceneMetadata, factor: float) -> tuple[SceneMetadata, tuple[str, ...]]:
-    """Returns the metadata of a scaled scene about its capture, and warnings.
-
-    Its capture settings scale the capture's poses. If they cannot, because measured depth gives the
-    scale, the scene no longer names the capture.
-    """
+    """Returns the metadata of a scaled scene about its capture, and warnings. It forgets a capture
+    whose measured depth gives the scale."""
     metadata = replace(metadata, origin=[factor * x for x in metadata.origin])
     if not metadata.capture:
         return metadata, ()

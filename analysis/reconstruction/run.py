@@ -10,7 +10,6 @@ from splatpilot.systems.common.progress import resumable
 from splatpilot.systems.common.torch_device import require_renderer
 from splatpilot.systems.common.validation import bounded
 from splatpilot.training.captures import render as render_capture
-from splatpilot.training.captures.capture import Capture
 from splatpilot.training.captures.capture_registry import read_capture
 from splatpilot.training.captures.check import doubts
 from splatpilot.training.captures.render import RenderConfig
@@ -69,8 +68,11 @@ def run(
     if (out / VIEWS).exists():
         require_unused(out, overwrite)
     opened = read_capture(capture, config.capture)
-    if (out / "scene.yaml").is_file() and not _is_unmeasured(out, opened):
-        require_unused(out, overwrite)
+    if (out / "scene.yaml").is_file() and not (out / VIEWS).exists():
+        about = read_scene_metadata(out)
+        made_from = about.capture, about.capture_settings
+        if made_from != (opened.folder, opened.config.settings()):  # not to be measured only
+            require_unused(out, overwrite)
     doubted = doubts(opened)
     for doubt in doubted:  # at once, and again in the summary
         print(f"warning: {doubt}", flush=True)
@@ -83,12 +85,3 @@ def run(
             metrics = measure_scene(out, opened)
         print(metrics)
     return summary, metrics
-
-
-def _is_unmeasured(scene: Path, capture: Capture) -> bool:
-    """Returns True if an interrupted run left this scene of the capture without metrics."""
-    if (scene / VIEWS).exists():
-        return False
-    metadata = read_scene_metadata(scene)
-    source = metadata.capture, metadata.capture_settings
-    return source == (capture.folder, capture.config.settings())

@@ -20,18 +20,12 @@ SIZE = np.array([6.0, 3.0, 2.5])  # [m], the room, its lower corner in the origi
 R_WC = RotationMatrix(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]))  # looking along x, level
 
 
-def room() -> GaussianScene:
+def make_room() -> GaussianScene:
     """The inside of the room, in broad colored waves."""
-    means = []
-    for axis in range(3):
-        other = [a for a in range(3) if a != axis]
-        for at in (0.0, SIZE[axis]):
-            points = np.zeros((*np.ceil(SIZE[other] / 0.1).astype(int), 3))
-            grids = np.meshgrid(*(np.arange(0.05, SIZE[a], 0.1) for a in other), indexing="ij")
-            points[..., axis] = at
-            for a, grid in zip(other, grids, strict=True):
-                points[..., a] = grid
-            means.append(points.reshape(-1, 3))
+    axes = (np.arange(0.05, size, 0.1) for size in SIZE)
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    walls = [(axis, at) for axis in range(3) for at in (0.0, SIZE[axis])]
+    means = [np.unique(np.where(np.arange(3) == axis, at, grid), axis=0) for axis, at in walls]
     means = np.concatenate(means)
     x, y, z = means.T
     waves = np.column_stack([np.sin(3 * x) * np.cos(4 * z), np.cos(5 * y), np.sin(3 * z + 2 * x)])
@@ -46,14 +40,14 @@ def room() -> GaussianScene:
 
 
 @dataclass(frozen=True)
-class Place:
+class Room:
     """The room, its capture and a folder for scenes of it."""
 
     gaussians: GaussianScene
     capture: Capture
     folder: Path
 
-    def scene(self, name: str, gaussians: GaussianScene | None = None, **said) -> Path:
+    def scene(self, name: str, gaussians: GaussianScene | None = None, **metadata) -> Path:
         """Writes a scene folder with these Gaussians, the room's own if None."""
         free = esdf_from_occupancy(
             np.zeros((60, 30, 25), bool), np.zeros((60, 30, 25), bool), np.zeros(3), 0.1
@@ -67,14 +61,14 @@ class Place:
             p_WS=np.ones(3),
             p_WG=np.ones(3),
         )
-        said = {"capture": "room", "held_out": [0, 8]} | said
-        write_scene_folder(self.folder / name, world, provenance="a test", **said)
+        metadata = {"capture": "room", "held_out": [0, 8]} | metadata
+        write_scene_folder(self.folder / name, world, provenance="a test", **metadata)
         return self.folder / name
 
 
 @pytest.fixture(scope="session")
 def seen_room() -> tuple[GaussianScene, Capture]:
-    gaussians = room()
+    gaussians = make_room()
     baked = BakedScene(gaussians)
     X_WCs = [RigidTransform(R_WC, [0.5 + 0.15 * i, 1.5, 1.2]) for i in range(16)]
     views = [baked.render(K, WIDTH, HEIGHT, X_WC) for X_WC in X_WCs]
@@ -94,7 +88,7 @@ def seen_room() -> tuple[GaussianScene, Capture]:
 
 
 @pytest.fixture
-def place(seen_room, tmp_path, monkeypatch) -> Place:
+def room(seen_room, tmp_path, monkeypatch) -> Room:
     """The room; a capture at the path "room" is its capture."""
     gaussians, capture = seen_room
 
@@ -107,4 +101,4 @@ def place(seen_room, tmp_path, monkeypatch) -> Place:
     monkeypatch.delenv("SPLATPILOT_DATA", raising=False)
     (tmp_path / "captures" / "room").mkdir(parents=True)
     monkeypatch.chdir(tmp_path / "captures")
-    return Place(gaussians, capture, tmp_path)
+    return Room(gaussians, capture, tmp_path)

@@ -76,17 +76,6 @@ def test_traversability_of_an_empty_volume_is_the_mean_distance_to_its_bounds():
     assert found == pytest.approx(exact.mean(), abs=3 * exact.std() / np.sqrt(3000))
 
 
-def test_traversability_falls_with_obstacles_and_scales():
-    rng = np.random.default_rng(5)
-    feet = rng.uniform(LOWER, UPPER, (12, 3)) * (1, 1, 0)
-    posts = [Capsule(foot - UP, foot + 5 * UP, 0.2) for foot in feet]
-    crowded = AnalyticDistanceField(posts, LOWER, UPPER)
-    free, halved, narrow = (
-        traversability(field, np.random.default_rng(1)) for field in (EMPTY, CLOSED, crowded)
-    )
-    assert free > max(halved, narrow) and min(halved, narrow) > 2.0
-
-
 def test_relative_gap_size_is_that_between_posts():
     # 2 m axis to axis, radius 0.3: gaps of 1.4 m over a diameter of 0.708 m.
     posts = [Capsule([x, 0.05, -1], [x, 0.05, 5], 0.3) for x in (2.05, 4.05, 6.05, 8.05)]

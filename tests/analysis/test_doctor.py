@@ -3,7 +3,7 @@ from importlib.metadata import PackageNotFoundError
 
 import pytest
 
-from splatpilot.analysis import doctor
+from splatpilot.analysis.commands import doctor
 from splatpilot.diagrams.scenarios import benchmark_scenarios
 from splatpilot.systems.common import extras as opengl
 from splatpilot.systems.common.extras import packages_of_extras
@@ -70,9 +70,3 @@ def test_an_unusable_gpu_differs_from_a_missing_one(driver, monkeypatch, tmp_pat
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(doctor, "_DRIVER", tmp_path if driver else tmp_path / "nowhere")
     assert ("PyTorch" in only(doctor._gpu()).remedy) == driver
-
-
-def test_each_finding_is_a_line_and_each_remedy_another():
-    findings = [doctor.Finding("a", "there"), doctor.Finding("long", "no", "do this", "that")]
-    lines = doctor.format_findings(findings).splitlines()
-    assert lines == ["+ a     there", "- long  no", "        for that: do this"]

@@ -2,7 +2,7 @@ import pytest
 import trimesh
 
 from splatpilot.analysis import scenes
-from splatpilot.analysis.scenes import BENCHMARK_SCENES, RECIPES, Recipe, default_config
+from splatpilot.analysis.scenes import BENCHMARK_SCENES, RECIPES, default_config
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.scenarios import benchmark_scenarios, other_scenarios
 from splatpilot.diagrams.worlds.scene_folder import SceneSource, read_scene_metadata
@@ -17,8 +17,8 @@ def scenes_of(files):
 def test_every_scene_of_a_scenario_has_a_recipe():
     assert scenes_of(benchmark_scenarios()) == set(BENCHMARK_SCENES)
     assert scenes_of(other_scenarios()) <= set(RECIPES)
-    for recipe in RECIPES.values():
-        load_config(default_config(), overrides=list(recipe.settings)).validate()
+    for _, *settings in RECIPES.values():
+        load_config(default_config(), overrides=settings).validate()
     for file in (benchmark_scenarios() | other_scenarios()).values():
         world = load_config(Scenario(), file).world
         if isinstance(world, SceneSource):
@@ -39,7 +39,7 @@ def test_a_scene_is_made_once_and_measured_again(opengl, tmp_path, capsys, monke
         "image_width=0",
         "initial_gaussians=2000",
     )
-    monkeypatch.setitem(RECIPES, "room", Recipe("worlds/room.obj", settings))
+    monkeypatch.setitem(RECIPES, "room", ("worlds/room.obj", *settings))
     arguments = {
         "names": ["room"],
         "data": tmp_path / "data",

@@ -8,10 +8,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from pydrake.math import RigidTransform
 
 from splatpilot.analysis import view
 from splatpilot.analysis.commands.main import main
+from splatpilot.analysis.view import capture_gaussians
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.scenarios import scenario_file
 from splatpilot.diagrams.worlds import octomap_world
@@ -21,7 +21,6 @@ from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.octomap import Octomap
 from splatpilot.systems.common.config import load_config
 from splatpilot.systems.splats.splat_files import write_ply
-from splatpilot.training.captures.capture_gaussians import capture_gaussians
 
 
 def data_of(page) -> dict:
@@ -56,11 +55,11 @@ def test_generated_world(tmp_path, capsys):
     assert "seed 3" in data["name"]
 
 
-def test_scene_with_its_capture(place):
-    scene = place.scene("scene")
-    data = data_of(view.run(what=str(scene), out=place.folder / "page.html"))
+def test_scene_with_its_capture(room):
+    scene = room.scene("scene")
+    data = data_of(view.run(what=str(scene), out=room.folder / "page.html"))
     poses = np.reshape(data["cameras"]["poses"], (-1, 4, 4))
-    truth = [X_WC.GetAsMatrix4() for X_WC in place.capture.X_WCs]
+    truth = [X_WC.GetAsMatrix4() for X_WC in room.capture.X_WCs]
     np.testing.assert_allclose(poses, truth, atol=1e-9)
     assert len(data["cameras"]["images"]) == len(data["cameras"]["names"]) == 16
     assert data["cameras"]["fov_y"] == pytest.approx(2 * np.degrees(np.arctan(24 / 32)))
@@ -68,14 +67,14 @@ def test_scene_with_its_capture(place):
     assert data["size"].startswith("6 x 3 x 2.5 m")
 
 
-def test_scene_without_scale_or_capture_is_shown(place, monkeypatch):
+def test_scene_without_scale_or_capture_is_shown(room, monkeypatch):
     def lost(path, metadata):
         raise FileNotFoundError("room: no such folder")
 
     monkeypatch.setattr(view, "read_scene_capture", lost)
-    scene = place.scene("scene")
+    scene = room.scene("scene")
     write_scene_metadata(scene, replace(read_scene_metadata(scene), metric=False))
-    data = data_of(view.run(what=str(scene), out=place.folder / "page.html"))
+    data = data_of(view.run(what=str(scene), out=room.folder / "page.html"))
     assert data["cameras"] is None
     assert data["unit"] == "units"
     assert data["size"].startswith("6 x 3 x 2.5 in units of unknown length")
@@ -83,43 +82,35 @@ def test_scene_without_scale_or_capture_is_shown(place, monkeypatch):
     assert "start" not in [name for _, name in data["legend"]]
 
 
-def test_capture_shows_what_it_measured(place, monkeypatch, tmp_path):
+def test_capture_shows_what_it_measured(room, monkeypatch, tmp_path):
     folder = tmp_path / "capture"
     folder.mkdir()
-    monkeypatch.setattr(view, "read_capture", lambda path, config: place.capture)
+    monkeypatch.setattr(view, "read_capture", lambda path, config: room.capture)
     data = data_of(view.run(what=str(folder), out=tmp_path / "page.html"))
     assert data["grid"] is None and len(data["cameras"]["poses"]) == 16
-    gaussians = capture_gaussians(place.capture, range(16))
+    gaussians = capture_gaussians(room.capture, range(16))
     assert gaussians is not None
     to_wall = np.minimum(np.abs(gaussians.means), np.abs(gaussians.means - [6, 3, 2.5])).min(axis=1)
     assert np.percentile(to_wall, 95) < 0.1  # The room's Gaussians are spheres of 6 cm.
-    bare = replace(place.capture, load_depth=type(place.capture).load_depth)
+    bare = replace(room.capture, load_depth=type(room.capture).load_depth)
     points = capture_gaussians(bare, range(16))
     assert points is not None
-    np.testing.assert_allclose(points.means, place.capture.points.p_WQ, atol=1e-6)
+    np.testing.assert_allclose(points.means, room.capture.points.p_WQ, atol=1e-6)
 
 
-def test_bare_gaussians(place, tmp_path):
+def test_bare_gaussians(room, tmp_path):
     path = tmp_path / "room.ply"
-    write_ply(place.gaussians, path)
+    write_ply(room.gaussians, path)
     assert data_of(view.run(what=str(path), out=tmp_path / "a.html"))["grid"] is not None
-    write_ply(place.gaussians.scaled_by(1000.0), path)
+    write_ply(room.gaussians.scaled_by(1000.0), path)
     data = data_of(view.run(what=str(path), out=tmp_path / "b.html"))
     assert data["grid"] is None and "Without distances" in data["notes"][0]
     records = np.zeros(100, [("p", "<f4", 3), ("s", "<f4", 3), ("rgba_q", "u1", 8)])
-    records["p"], records["s"] = place.gaussians.means[:100], place.gaussians.scales[:100]
+    records["p"], records["s"] = room.gaussians.means[:100], room.gaussians.scales[:100]
     records["rgba_q"] = 200
     records.tofile(tmp_path / "room.splat")
     data = data_of(view.run(what=str(tmp_path / "room.splat"), out=tmp_path / "c.html"))
     assert data["name"] == "room"
-
-
-def test_far_gaussians_have_a_note_with_their_origin(place, tmp_path):
-    path = tmp_path / "room.ply"
-    write_ply(place.gaussians.transformed_by(RigidTransform([5000.0, 0, 0])), path)
-    data = data_of(view.run(what=str(path), out=tmp_path / "a.html"))
-    assert data["grid"] is not None
-    assert any("Positions are relative to 500" in note for note in data["notes"])
 
 
 def test_map(tmp_path, monkeypatch):

@@ -33,18 +33,6 @@ def test_rays_end_where_the_distance_is_zero_and_meet_nothing_before(scenario):
         assert field.distance(before).min() > -3e-3
 
 
-def test_scenery_has_no_truth():
-    config = load_config(Scenario(), scenario_file("P04"))
-    spec = make_spec(config.world, 0)
-    X_WC = RigidTransform(spec.p_WG - (4, 0, 0)) @ CAMERA.X_BC()  # the end is in sight
-    bare = TrueDepth(replace(spec, surroundings=list)).image(CAMERA, X_WC)
-    truth = TrueDepth(spec).image(CAMERA, X_WC)
-    unknown = np.isnan(truth) & ~np.isnan(bare)
-    assert unknown.mean() > 0.1
-    assert not unknown[bare < 5].any()
-    np.testing.assert_array_equal(truth[~unknown], bare[~unknown])
-
-
 def test_camera_in_a_furnished_room_measures_the_truth():
     config = load_config(Scenario(), scenario_file("P10"))
     frames = frames_along_flight(config, [CAMERA], 12)[0]

@@ -25,18 +25,17 @@ def installed(tmp_path_factory) -> Path:
     return target
 
 
-def splatpilot(*words: str, path: Path, cwd: Path, status: int = 0) -> str:
-    """What the command line prints."""
+def python(*words: str, path: Path, cwd: Path, status: int = 0) -> str:
+    """Runs a Python program, and returns what it prints."""
     environment = os.environ | {"PYTHONPATH": str(path)}
-    answer = subprocess.run(
-        [sys.executable, "-c", MAIN, *words],
-        capture_output=True,
-        text=True,
-        cwd=cwd,
-        env=environment,
-    )
-    assert answer.returncode == status, answer.stderr
-    return answer.stdout + answer.stderr
+    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    answer = subprocess.run([sys.executable, *words], cwd=cwd, env=environment, **streams)
+    assert answer.returncode == status, answer.stdout
+    return answer.stdout
+
+
+def splatpilot(*words: str, path: Path, cwd: Path, status: int = 0) -> str:
+    return python("-c", MAIN, *words, path=path, cwd=cwd, status=status)
 
 
 def test_its_world_sensor_and_policy_fly_in_a_study(installed, tmp_path):
@@ -68,14 +67,8 @@ def test_its_captures_are_read(installed, tmp_path):
         "print(capture.source, len(capture), capture.K[0, 0])\n"
         "print(*capture.X_WCs[2].multiply([0, 0, 1]))\n"
     )
-    answer = subprocess.run(
-        [sys.executable, "-c", program],
-        capture_output=True,
-        text=True,
-        cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": str(installed)},
-    )
-    assert answer.stdout == f"flight log {log} 3 20.0\n2.0 0.0 1.0\n", answer.stderr
+    printed = python("-c", program, path=installed, cwd=tmp_path)
+    assert printed == f"flight log {log} 3 20.0\n2.0 0.0 1.0\n"
 
 
 def test_it_flies_uninstalled(tmp_path):

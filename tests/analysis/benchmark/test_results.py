@@ -42,8 +42,3 @@ def test_tables_of_a_page_are_written_between_their_markers(results):
     assert isinstance(interval, Interval) and results.percent(interval) in page
     assert results.with_tables(page) == page
     assert "| short | 0/3 | 0/3 |" in results.with_tables(PAGE.format("scenarios"))
-
-
-def test_paper_is_not_compared_with_fewer_scenarios(results):
-    page = results.with_tables(PAGE.format("paper"))
-    assert "did not fly P01" in page and "DiffAero" not in page

@@ -5,8 +5,6 @@ import pytest
 from splatpilot.analysis.benchmark.study import RolloutSpec, StudyConfig, default_policies
 from splatpilot.analysis.benchmark.variants import Variant, parse_variant, split_policies, sweep
 from splatpilot.diagrams.scenarios import benchmark_scenarios
-from splatpilot.systems.policies.checkpoint import PolicyCheckpoint
-from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK
 from splatpilot.systems.policies.reactive import ReactiveConfig
 
 OWN = "policy: !ReactiveConfig {speed: 1.5, margin: 0.4}\n"
@@ -21,27 +19,18 @@ def test_rollouts_are_all_combinations(short_scenario):
     assert RolloutSpec("P02", "planner", 2.0, 7).id == "P02-planner-2-007"
 
 
-@pytest.mark.parametrize(("split", "seeds"), [("dev", {0, 1}), ("test", {1000, 1001})])
-def test_split_decides_the_seeds(short_scenario, split, seeds):
-    config = StudyConfig([str(short_scenario)], ["straight"], seeds=2, split=split)
-    assert {spec.seed for spec in config.rollouts()} == seeds
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"scenarios": ["P99"]}, "there is no scenario 'P99'"),
-        ({"scenarios": ["nowhere.yaml"]}, "No such file: .*nowhere.yaml"),
         ({"scenarios": []}, "the study has no scenario"),
         ({"policies": ["plan"]}, r"there is no policy 'plan'; did you mean planner"),
         ({"policies": ["planner", "planner"]}, "the policy planner is given twice"),
-        ({"policies": ["a=straight", "a=planner"]}, "the policy a is given twice"),
         ({"policies": ["reactive:margn=0.2"]}, "policy reactive-margn-0.2: .*did you mean margin"),
         ({"policies": ["straight:rate=-1"]}, "straight-rate--1: StraightConfig.rate .* got -1"),
         ({"policies": ["scenario"]}, "short.yaml has no `policy`, which --policies scenario would"),
         ({"speeds": [2.0, 2.0000001]}, "the speed 2 is given twice"),
         ({"speeds": [-1.0]}, "speeds .* 20] m/s, got -1"),
-        ({"speeds": [float("nan")]}, "speeds .* got nan"),
         ({"seeds": 0}, r"seeds of split dev must be in \[1, 100\], got 0"),
         ({"seeds": 101}, r"seeds of split dev must be in \[1, 100\], got 101"),
         ({"split": "fresh"}, "split must be one of dev, test, got 'fresh'"),
@@ -93,7 +82,6 @@ def test_all_benchmark_scenarios_load():
     [
         ("reactive", Variant("reactive", "reactive")),
         ("fast=reactive", Variant("fast", "reactive")),
-        ("fast=reactive:margin=0.2", Variant("fast", "reactive", ("margin=0.2",))),
         ("reactive:margin=0.2", Variant("reactive-margin-0.2", "reactive", ("margin=0.2",))),
         (
             "planner:lattice.jerk=1:rate=10",
@@ -101,7 +89,6 @@ def test_all_benchmark_scenarios_load():
         ),
         ("out/mine.npz", Variant("mine", "out/mine.npz")),
         ("a=out/x=y:z/m.npz:rate=3", Variant("a", "out/x=y:z/m.npz", ("rate=3",))),
-        ("others.policies:Mine", Variant("Mine", "others.policies:Mine")),
         ("m=others:Mine:gain=2", Variant("m", "others:Mine", ("gain=2",))),
         ("r=reactive:camera={width: 32}", Variant("r", "reactive", ("camera={width: 32}",))),
     ],
@@ -114,12 +101,10 @@ def test_variants_are_parsed(text, variant):
     ("text", "message"),
     [
         ("a/b=reactive", "labeled 'a/b', but labels name files"),
-        (".=reactive", "labeled '.'"),
         ("=reactive", "'=reactive' has no label before its ="),
         ("reactive:yaws=[1, 2]", r"LABEL=POLICY"),
         ("x" * 81 + "=reactive", "at most 80"),
         ("a=reactive:speed=3", "must not set speed; give the speed of all policies"),
-        ("a=planner:lattice.speed=3", "must not set speed; give the speed of all policies"),
         ("a=diffaero:weights=x.npz", "LABEL=FILE.npz"),
         ("../mine.py", r"a policy must be .*, got \.\./mine\.py; .* write mine:CLASS"),
     ],
@@ -138,16 +123,6 @@ def test_variant_changes_the_named_fields():
     assert parse_variant("scenario").config(2.0, own) == own
     assert parse_variant("o=scenario:margin=0.3").config(2.0, own).margin == 0.3
     assert own.margin == 0.1
-
-
-def test_variant_of_a_file_has_its_weights(tmp_path):
-    shipped = PolicyCheckpoint.load("", "diffaero", DIFFAERO_NETWORK)
-    file = tmp_path / "mine.npz"
-    PolicyCheckpoint("diffaero", shipped.spec, dict(shipped.weights), {}).save(file)
-    variant = parse_variant(f"near={file}:camera.max_depth=8")
-    assert (variant.label, variant.weights) == ("near", file)
-    config = variant.config(2.0, None)
-    assert (config.weights, config.camera.max_depth) == (str(file), 8.0)
 
 
 def test_lists_are_split_outside_brackets():

@@ -60,13 +60,6 @@ def test_cluster_interval_covers_at_its_confidence():
     assert 0.9 * 200 <= covered <= 0.99 * 200
 
 
-def test_cluster_interval_without_correlation_is_that_of_flights():
-    successes = np.random.default_rng(0).binomial(20, 0.5, size=100)
-    clusters = cluster_interval(successes, np.full(100, 20))
-    flights = wilson_interval(int(successes.sum()), 2000)
-    np.testing.assert_allclose(clusters, flights, atol=0.006)
-
-
 @pytest.mark.parametrize(
     ("successes", "flights", "expected"),
     [
@@ -150,14 +143,6 @@ def test_paper_is_compared_with_unchanged_policies_in_all_scenarios():
     assert paper_rows(StudyConfig(seventeen[1:], policies)) == {}
     assert paper_rows(StudyConfig(seventeen, policies, overrides=["timeout=5"])) == {}
     assert paper_rows(StudyConfig(seventeen, policies), absent={"R13": "no scene"}) == {}
-
-
-def test_interval_of_a_policy_counts_scenarios_as_clusters():
-    rows = [row for k in range(10) for row in flights("a", f"P{k:02d}", 20 * [k < 5])]
-    (row,) = policy_table(rows, StudyConfig([], ["a"], [2.0], seeds=20))
-    assert (row["successes"], row["flights"]) == (100, 200)
-    assert row["wilson_upper"] - row["wilson_lower"] < 0.15
-    assert row["cluster_upper"] - row["cluster_lower"] > 0.5
 
 
 def test_all_pairs_are_compared_by_flights_and_by_scenarios():

@@ -9,9 +9,6 @@ from splatpilot.analysis.fidelity.study import (
     band,
     choose_held_out,
     displace_pose,
-    drop_frames,
-    first_crossing,
-    monotone_fit,
     reach,
 )
 from splatpilot.systems.splats.scene import GaussianScene
@@ -33,13 +30,6 @@ def test_reach_is_the_offset_of_the_first_limit():
     assert by_depth.agreement() == (1.0, 0.0)
     by_color = make_study(lambda x: 30 - 20 * x, lambda x: 0.01 * x)
     assert by_color.reach == pytest.approx(0.3)
-
-
-def test_fit_pools_violators():
-    x, fit = monotone_fit([3, 0, 1, 2, 2, 2, 2], [4, 0, 3, -90, 1, 3, 90])
-    np.testing.assert_allclose(x, [0, 1, 2, 3])
-    # At 2 the median is 2 (four times the weight), below the 3 at 1: pooled to 11/5.
-    np.testing.assert_allclose(fit, [0, 2.2, 2.2, 4])
 
 
 def test_reach_is_the_crossing_of_the_fit():
@@ -64,30 +54,11 @@ def test_bands():
     assert len(band(np.arange(4000), np.arange(4000)).at) == 16
 
 
-def test_first_crossing():
-    def values():
-        yield from (0.0, 1.0, 0.0)
-        raise RuntimeError("a value beyond the crossing was computed")
-
-    assert first_crossing([0, 1, 2, 3], values(), 0.25) == 0.25
-    assert first_crossing([0, 1, 2], [0.5, 0.0, 0.0], 0.25) == 0
-    assert first_crossing([0, 1, 2], [0.0, 0.1, 0.2], 0.25) == 2
-
-
 def test_held_out_stretches():
     assert choose_held_out(16, [1, 3], 2) == [2, 5, 6, 7, 10]
     assert choose_held_out(5, [1], 2) == [2]
     with pytest.raises(ValueError, match="4 frames are too few to hold out 1 between 2"):
         choose_held_out(4, [1], 2)
-
-
-def test_capture_without_frames(place):
-    rest = drop_frames(place.capture, [0, 2, 3])
-    assert len(rest) == 13 and rest.has_depth
-    for k, i in ((0, 1), (1, 4), (12, 15)):
-        assert rest.X_WCs[k] is place.capture.X_WCs[i]
-        np.testing.assert_array_equal(rest.load_image(k), place.capture.load_image(i))
-        np.testing.assert_array_equal(rest.load_depth(k), place.capture.load_depth(i))
 
 
 def test_displaced_poses():
@@ -105,17 +76,17 @@ def test_displaced_poses():
 
 
 @pytest.fixture
-def look(place):
+def look(room):
     """Returns a pose that looks along the room from x [m]."""
-    return lambda x: RigidTransform(place.capture.X_WCs[0].rotation(), [x, 1.5, 1.2])
+    return lambda x: RigidTransform(room.capture.X_WCs[0].rotation(), [x, 1.5, 1.2])
 
 
 @pytest.fixture
-def support(place):
+def support(room):
     """Returns the support by one fitted camera in the room, perhaps with more Gaussians."""
 
     def make(X_WC: RigidTransform, more: GaussianScene | None = None) -> ViewSupport:
-        capture, scene = place.capture, place.gaussians
+        capture, scene = room.capture, room.gaussians
         renderer = SceneRenderer(scene if more is None else scene.merged_with(more), "3dgs")
         return ViewSupport(renderer, (capture.K, capture.width, capture.height), [X_WC])
 

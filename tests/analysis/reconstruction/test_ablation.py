@@ -19,15 +19,15 @@ SETTINGS = (
 )
 
 
-def ablate(place, *words: str, captures: tuple[str, ...] = ("room",)) -> int:
+def ablate(room, *words: str, captures: tuple[str, ...] = ("room",)) -> int:
     settings = [word for setting in SETTINGS for word in ("--set", setting)]
-    out = str(place.folder / "out")
+    out = str(room.folder / "out")
     return main(["scene", "ablate", *captures, "--out", out, *settings, *words])
 
 
-def test_ablation_end_to_end(place, capsys, monkeypatch):
-    assert ablate(place) == 0
-    out = place.folder / "out"
+def test_ablation_end_to_end(room, capsys, monkeypatch):
+    assert ablate(room) == 0
+    out = room.folder / "out"
     printed = capsys.readouterr().out
     assert "paper    3DGS + depth term" in printed
     paper = "| paper | 2DGS from points, photometric | 29.07 | 0.8656 | 0.228 | 1.466 | 13.00% |"
@@ -47,31 +47,13 @@ def test_ablation_end_to_end(place, capsys, monkeypatch):
         raise ValueError("made again")
 
     monkeypatch.setattr(ablation, "reconstruct", fail)
-    assert ablate(place) == 0
+    assert ablate(room) == 0
     titles = "".join(f"room: {arm.title}\n" for arm in ARMS)
     assert titles in printed
     assert capsys.readouterr().out == printed.replace(titles, "")
     (out / "room" / "2dgs_points" / "reconstruct.yaml").unlink()
-    assert ablate(place) == 1
+    assert ablate(room) == 1
     assert "made again" in capsys.readouterr().err
-
-
-def test_studies_are_not_mixed(place, monkeypatch, capsys):
-    made = []
-
-    def fail(capture, scene, config):
-        made.append(config.iterations)
-        raise ValueError("interrupted")
-
-    monkeypatch.setattr(ablation, "reconstruct", fail)
-    assert ablate(place) == 1
-    other_steps = "--set", "iterations=13"
-    other = str(place.scene("scene", capture="room"))
-    for words, captures in ((other_steps, ("room",)), ((), (other,))):
-        assert ablate(place, *words, captures=captures) == 1
-        assert "ablation.yaml holds another configuration" in capsys.readouterr().err
-    assert ablate(place, *other_steps, "--overwrite") == 1
-    assert made == [4, 13]
 
 
 def test_each_arm_adds_one_step():
@@ -134,11 +116,6 @@ def test_means_and_spreads():
         ("hold_out=1", "hold_out must be 0 or"),
     ],
 )
-def test_invalid_settings(place, capsys, setting, message):
-    assert main(["scene", "ablate", "room", "--out", str(place.folder), "--set", setting]) == 1
+def test_invalid_settings(room, capsys, setting, message):
+    assert main(["scene", "ablate", "room", "--out", str(room.folder), "--set", setting]) == 1
     assert message in capsys.readouterr().err
-
-
-def test_two_captures_of_one_name(place, capsys):
-    assert ablate(place, captures=("room", str(place.scene("scene")))) == 1
-    assert "two captures are called room" in capsys.readouterr().err

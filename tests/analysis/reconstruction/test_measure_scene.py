@@ -37,8 +37,8 @@ def with_curtain(gaussians: GaussianScene, x: float) -> GaussianScene:
     return gaussians.merged_with(sheet)
 
 
-def test_a_scene_against_its_own_views(place):
-    metrics = measure_scene(place.scene("same"))
+def test_a_scene_against_its_own_views(room):
+    metrics = measure_scene(room.scene("same"))
     found = metrics.as_json()
     assert list(metrics.frames) == [0, 8] and metrics.held_out
     assert found["psnr_db"] > 55 and found["ssim"] > 0.999
@@ -46,11 +46,11 @@ def test_a_scene_against_its_own_views(place):
     assert found["lpips"] is None and "pip install lpips" in found["lpips_missing"]
 
 
-def test_a_curtain_is_a_floater(place):
-    scene = place.scene("curtain", with_curtain(place.gaussians, x=2.0), held_out=[8])
+def test_a_curtain_is_a_floater(room):
+    scene = room.scene("curtain", with_curtain(room.gaussians, x=2.0), held_out=[8])
     found = measure_scene(scene).frames[8]
-    truth = place.capture.load_depth(8)
-    to_curtain = 2.0 - place.capture.X_WCs[8].translation()[0]
+    truth = room.capture.load_depth(8)
+    to_curtain = 2.0 - room.capture.X_WCs[8].translation()[0]
     behind = truth > to_curtain
     assert found.depth_mae_m == pytest.approx((truth - to_curtain)[behind].sum() / truth.size, 0.05)
     far = truth - to_curtain > 0.1 * np.maximum(1, truth)
@@ -59,8 +59,8 @@ def test_a_curtain_is_a_floater(place):
     assert found.psnr_db is not None and found.psnr_db < 20
 
 
-def test_metrics_file(place, capsys):
-    scene = place.scene("same", with_curtain(place.gaussians, 3.0))
+def test_metrics_file(room, capsys):
+    scene = room.scene("same", with_curtain(room.gaussians, 3.0))
     assert main(["scene", "measure", str(scene)]) == 0
     printed = capsys.readouterr().out
     content = json.loads((scene / "metrics.json").read_text())
@@ -80,23 +80,23 @@ def test_metrics_file(place, capsys):
     assert np.shape(cv2.imread(str(scene / "views.png")))[1] > 5 * 64
 
 
-def test_nothing_held_out(place, capsys):
-    scene = place.scene("all", held_out=[])
+def test_nothing_held_out(room, capsys):
+    scene = room.scene("all", held_out=[])
     metrics = measure_scene(scene)
     assert list(metrics.frames) == [0, 8] and not metrics.held_out
     assert "2 frames the scene was made from" in str(metrics)
 
 
-def test_images_are_shrunk_as_for_reconstruction(place):
-    metrics = measure_scene(place.scene("small", image_width=32))
+def test_images_are_shrunk_as_for_reconstruction(room):
+    metrics = measure_scene(room.scene("small", image_width=32))
     assert (metrics.width, metrics.height) == (32, 24)
     assert metrics.as_json()["psnr_db"] > 22
     assert metrics.as_json()["depth_relative"] < 0.05
 
 
-def test_capture_without_depth(place):
-    blind = replace(place.capture, load_depth=lambda i: None)
-    scene, seeing = place.scene("blind"), place.scene("seeing")
+def test_capture_without_depth(room):
+    blind = replace(room.capture, load_depth=lambda i: None)
+    scene, seeing = room.scene("blind"), room.scene("seeing")
     metrics = measure_scene(scene, blind)
     measure_scene(seeing)
     width, wider = (np.shape(cv2.imread(str(s / "views.png")))[1] for s in (scene, seeing))
@@ -106,12 +106,12 @@ def test_capture_without_depth(place):
     assert "depth MAE [m]          -" in str(metrics)
 
 
-def test_scenes_that_cannot_be_measured(place):
+def test_scenes_that_cannot_be_measured(room):
     with pytest.raises(ValueError, match=r"scene\.yaml: names no capture"):
-        SceneViews(place.scene("lost", capture=""))
+        SceneViews(room.scene("lost", capture=""))
     with pytest.raises(ValueError, match=r"frame 16 is held out, but a room .* only 16 frames"):
-        SceneViews(place.scene("other", held_out=[0, 16]))
-    scene = place.scene("damaged")
+        SceneViews(room.scene("other", held_out=[0, 16]))
+    scene = room.scene("damaged")
     assert read_metrics(scene) is None
     (scene / "metrics.json").write_text("{}")
     with pytest.raises(ValueError, match=r"metrics\.json: .* measure again"):

@@ -1,14 +1,13 @@
 import json
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 import trimesh
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from splatpilot.analysis.commands.main import main
-from splatpilot.analysis.reconstruction.rescale import UP_AXES, rescale, run
+from splatpilot.analysis.reconstruction.rescale import rescale, run
 from splatpilot.diagrams.worlds.scene_folder import (
     read_scene,
     read_scene_folder,
@@ -27,19 +26,11 @@ SHRUNK = 0.25  # units of files per meter
 
 
 @pytest.fixture
-def photographs(seen_room, tmp_path):
+def photographs(seen_room, write_nerfstudio, tmp_path):
     """The room in nerfstudio's format without depth, in units of unknown length, with points."""
     _, capture = seen_room
     path = tmp_path / "photographs"
-    path.mkdir()
-    frames = []
-    for i in range(len(capture)):
-        cv2.imwrite(str(path / f"{i:02d}.png"), capture.load_image(i)[..., ::-1])
-        X_WC = capture.X_WCs[i]
-        X_FC = RigidTransform(X_WC.rotation(), SHRUNK * X_WC.translation())
-        matrix = X_FC.GetAsMatrix4() @ np.diag([1.0, -1, -1, 1])
-        frames.append({"file_path": f"{i:02d}.png", "transform_matrix": matrix.tolist()})
-    content = {"w": 64, "h": 48, "fl_x": 32.0, "cx": 32.0, "cy": 24.0, "frames": frames}
+    content = write_nerfstudio(path, capture, scale=SHRUNK)
     cloud = trimesh.PointCloud(SHRUNK * capture.points.p_WQ, colors=(90, 90, 90))
     cloud.export(path / "points.ply")
     content["ply_file_path"] = "points.ply"
@@ -136,14 +127,14 @@ def test_height_of_the_cameras_gives_the_scale(unscaled, tmp_path):
     assert summary.factor == pytest.approx(1 / SHRUNK, rel=0.02)
 
 
-def test_scene_of_metric_depth_forgets_its_capture(place, tmp_path):
-    summary = rescale(place.scene("metric"), tmp_path / "scaled", 2.0)
+def test_scene_of_metric_depth_forgets_its_capture(room, tmp_path):
+    summary = rescale(room.scene("metric"), tmp_path / "scaled", 2.0)
     assert "has metric depth" in str(summary)
     metadata = read_scene_metadata(tmp_path / "scaled")
     assert (metadata.capture, metadata.held_out, metadata.gains) == ("", [], [])
 
 
-@pytest.mark.parametrize("up", UP_AXES)
+@pytest.mark.parametrize("up", ["z", "-z", "y", "-y", "x", "-x"])
 def test_file_in_meters_and_upright(seen_room, tmp_path, up):
     gaussians, capture = seen_room
     along = "xyz".index(up[-1])
@@ -195,28 +186,24 @@ def test_length_in_a_file(seen_room, tmp_path, capsys):
     [
         ("room.ply --out out.ply", "what is its size? Give --factor"),
         ("room.ply --out out.spz --factor 2", "written as PLY; name it so, out.ply"),
-        ("room.ply --out room.ply --factor 2", "room.ply: exists already"),
         ("room.ply --out out.ply --height 2", "a file has no cameras"),
         ("room.ply --out out.ply --factor 0", "factor must be finite and > 0, got 0"),
         ("room.ply --out out.ply --floor 0,0,0 1,0,0 2,0,0", "lie in a line"),
         ("room.ply --out out.ply --floor 0,0,0 1,0,0 0,0,1", "at 90 degrees"),
-        ("room.ply --out out.ply --floor 0,0,0 1,0 0,0,1", "must be X,Y,Z, got '1,0'"),
+        ("room.ply --out out.ply --floor 0,0,0 1,0 0,0,1", "X,Y,Z, got '1,0'"),
         ("a.ksplat --out out.ply --up y", "a.ksplat: a KSPLAT"),
         ("unscaled --out unscaled --factor 2", "unscaled: exists already"),
         ("unscaled --out out --up -y", "z is up in scene folders; leave --up"),
-        ("unscaled --out out --factor -1", "factor must be finite and > 0, got -1.0"),
         ("unscaled --out out --height nan", "height must be finite and > 0, got nan"),
         (
             "unscaled --out out --between 0,0,0 0,0,0 --distance 1",
             "--between must differ",
         ),
-        ("unscaled --out out --between 0,0 0,0,0 --distance 1", "must be X,Y,Z, got '0,0'"),
         ("unscaled --out out --between 0,0,1 0,0,0", "--between and --distance belong together"),
-        ("unscaled --out out --factor 2 --distance 1", "--between and --distance belong together"),
     ],
 )
-def test_invalid_scales_are_refused(place, unscaled, monkeypatch, capsys, words, message):
-    folder = place.folder
+def test_invalid_scales_are_refused(room, unscaled, monkeypatch, capsys, words, message):
+    folder = room.folder
     monkeypatch.chdir(folder)
     (folder / "room.ply").write_bytes((unscaled / "gaussians.ply").read_bytes())
     (folder / "a.ksplat").write_bytes(bytes(64))
