@@ -99,7 +99,7 @@ def test_work_apart():
     with pytest.raises(ValueError, match="refuse: no"):
         run_in_subprocess("a: counting", _abort, "refuse")
     for work, why in (("abort", "its process was ended"), ("fail", "no factory")):
-        with pytest.raises(OSError, match=f"a: counting: {why}, perhaps for lack of disk space"):
+        with pytest.raises(OSError, match=f"a: counting: {why}, perhaps out of disk space"):
             run_in_subprocess("a: counting", _abort, work)
 
 

@@ -167,7 +167,7 @@ def test_bad_input_is_named(room, tmp_path, capsys):
         (tmp_path / "damaged.glb", [], "damaged.glb: not a readable mesh"),
         (tmp_path / "damaged.gltf", [], "damaged.gltf"),
         (room, ["--path", "1,2"], "finite points"),
-        (room, ["--path", "a b"], "separated by spaces"),
+        (room, ["--path", "a b"], "with spaces between"),
         (room, ["--up", "z", "--path", "0,0,0 5,0,0"], "touches something"),
         (room, ["--set", "spacing=0"], "spacing must be in [0.01, inf) m, got 0"),
         (room, ["--set", "yaws=[]"], "yaws"),
