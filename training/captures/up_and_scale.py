@@ -130,16 +130,13 @@ def _transform(
     """Returns the capture in a world N with origin p_WN, rotated and with lengths times `scale`,
     but its depth, and other `changes` of fields."""
     points, axes = capture.points, capture.axes
-
-    def position(p_WQ: NDArray[np.float64]) -> NDArray[np.float64]:
-        return scale * (p_WQ - p_WN) @ R_NW.matrix().T
-
     return dataclasses.replace(
         capture,
         X_WCs=[
-            RigidTransform(R_NW @ X.rotation(), position(X.translation())) for X in capture.X_WCs
+            RigidTransform(R_NW @ X.rotation(), scale * R_NW.multiply(X.translation() - p_WN))
+            for X in capture.X_WCs
         ],
-        points=points and SfmPoints(position(points.p_WQ), points.colors),
+        points=points and SfmPoints(scale * (points.p_WQ - p_WN) @ R_NW.matrix().T, points.colors),
         axes=FileAxes(axes.name, R_NW @ axes.R_WF, axes.R_BC),
         **changes,
     )
