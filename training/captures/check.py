@@ -6,15 +6,14 @@ same pairs of frames.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform, RotationMatrix
 from scipy.optimize import minimize
+from scipy.spatial.transform import Rotation
 
 from splatpilot.systems.common.validation import Config, bounded
 from splatpilot.training.captures.capture import (
@@ -110,15 +109,11 @@ class ColorFit:
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class CheckReport:
     """The result of `check_capture`."""
 
-    capture: str
-    frames: int
-    dropped: tuple[str, ...]
-    notes: tuple[str, ...]
-    metric: bool
+    capture: Capture
     pairs: int = 0
     agreement: ReadingFit | None = None  # None if there is no depth to compare
     others: tuple[ReadingFit, ...] = ()  # other readings, the best first
@@ -131,13 +126,14 @@ class CheckReport:
         return self.agreement is not None and not self.problem
 
     def __str__(self) -> str:
+        capture, dropped = self.capture, self.capture.dropped
         lines = [
-            f"{self.capture}",
-            f"{self.frames} frames, {len(self.dropped)} left out, {self.pairs} pairs compared",
-            *(f"  left out: {message}" for message in self.dropped[:10]),
-            *self.notes,
+            capture.source,
+            f"{len(capture)} frames, {len(dropped)} left out, {self.pairs} pairs compared",
+            *(f"  left out: {message}" for message in dropped[:10]),
+            *capture.notes,
         ]
-        if not self.metric:
+        if not capture.metric:
             lines.append("the scale is unknown; set capture.scale to fly in the scene")
         if self.agreement is None:
             return "\n".join([*lines, "not compared: there is no depth"])
@@ -186,19 +182,9 @@ def check_capture(capture: Capture, pairs: int = 12) -> CheckReport:
 
     It agrees if its median relative error is at most 2 %, no other reading leaves less than half of
     an error above 0.2 %, and colors follow depth. Without depth only its properties are reported.
-
-    Args:
-        pairs: number of pairs of frames that are compared.
     """
-    report = CheckReport(
-        capture=capture.source,
-        frames=len(capture),
-        dropped=tuple(capture.dropped),
-        notes=tuple(capture.notes),
-        metric=capture.metric,
-    )
     if not capture.has_depth:
-        return report
+        return CheckReport(capture)
     found = _choose_pairs(capture, pairs)
     if sum(len(pair.depth) for pair in found) < _MIN_POINTS:
         raise ValueError(f"{capture.source}: too few pixels have depth in two frames to compare")
@@ -229,14 +215,7 @@ def check_capture(capture: Capture, pairs: int = 12) -> CheckReport:
     else:
         color = fit_color_camera(capture, [pair.frames for pair in found])
         problem = color.problem if color is not None else ""
-    return replace(
-        report,
-        pairs=len(found),
-        agreement=agreement,
-        others=tuple(others),
-        color=color,
-        problem=problem,
-    )
+    return CheckReport(capture, len(found), agreement, tuple(others), color, problem)
 
 
 def _choose_pairs(capture: Capture, count: int) -> list[FramePair]:
@@ -309,83 +288,72 @@ def _relative_errors(reading: Reading, pair: FramePair) -> NDArray[np.float64]:
 
 def _other_readings(as_read: Reading, capture: Capture) -> list[Reading]:
     """Returns the readings with one known error each undone, which is their name."""
-    readings = []
 
-    def add(name: str, **changes: object) -> None:
-        readings.append(replace(as_read, name=name, **changes))  # pyright: ignore[reportArgumentType]
+    def posed(name: str, rotation: Callable, translation: Callable) -> Reading:
+        def pose(X_FB: RigidTransform) -> RigidTransform:
+            R = RotationMatrix(rotation(X_FB.rotation().matrix()))
+            return RigidTransform(R, translation(X_FB.translation()))
+
+        return replace(as_read, name=name, pose=pose)
+
+    def w_last(R: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Undoes that w x y z was read as x y z w."""
+        return Rotation.from_quat(Rotation.from_matrix(R).as_quat()[[1, 2, 3, 0]]).as_matrix()
 
     present = next(
         (name for name, R in _BODIES.items() if np.allclose(R, as_read.R_BC.matrix())), "its axes"
     )
-    add("depth is the distance from the camera, read as depth along its axis", is_range=True)
-    add("quaternions are w x y z, read as x y z w", pose=_from_wxyz)
-    add(
-        "rotations are stored column by column, read row by row",
-        pose=lambda X_FB: RigidTransform(X_FB.rotation().inverse(), X_FB.translation()),
-    )
+    is_range = "depth is the distance from the camera, read as depth along its axis"
+    columns = "rotations are stored column by column, read row by row"
+    readings = [
+        replace(as_read, name=is_range, is_range=True),
+        posed("quaternions are w x y z, read as x y z w", w_last, lambda p: p),
+        posed(columns, lambda R: R.T, lambda p: p),
+    ]
     for name, R in _BODIES.items():
-        R_BC = RotationMatrix(np.array(R, dtype=float))
+        body = replace(as_read, R_BC=RotationMatrix(np.array(R, dtype=float)))
         also = "" if name == present else f", and of {name}"
         if also:
-            add(f"poses are those of {name}, read as {present}", R_BC=R_BC)
-        add(
-            f"poses are world to camera{also}, read as camera to world",
-            R_BC=R_BC,
-            pose=lambda X_FB: X_FB.inverse(),
-        )
-    for axis, S in zip("xyz", 1 - 2 * np.eye(3), strict=True):
-        add(f"the world is left-handed: {axis} is mirrored", pose=partial(_mirror, np.diag(S)))
+            readings.append(replace(body, name=f"poses are those of {name}, read as {present}"))
+        name = f"poses are world to camera{also}, read as camera to world"
+        readings.append(replace(body, name=name, pose=lambda X_FB: X_FB.inverse()))
+    for axis, signs in zip("xyz", 1 - 2 * np.eye(3), strict=True):
+        M, name = np.diag(signs), f"the world is left-handed: {axis} is mirrored"
+        readings.append(posed(name, lambda R, M=M: M @ R @ M, lambda p, M=M: M @ p))
     for name, M in _WORLDS.items():
-        add(
-            f"positions and rotations are in different worlds: {name} differ",
-            pose=lambda X_FB, M=M: RigidTransform(X_FB.rotation(), M @ X_FB.translation()),
-        )
+        name = f"positions and rotations are in different worlds: {name} differ"
+        readings.append(posed(name, lambda R: R, lambda p, M=M: M @ p))
     for factor in _DEPTH_FACTORS:
         large = f"depth is {1 / factor:g} times too large, or positions too small"
         small = f"depth is {factor:g} times too small, or positions too large"
-        add(large if factor < 1 else small, factor=factor)
+        readings.append(replace(as_read, name=large if factor < 1 else small, factor=factor))
     for factor in _IMAGE_FACTORS:
-        K = np.diag([factor, factor, 1]) @ as_read.K
-        add(f"intrinsics belong to images {1 / factor:g} times as large", K=K)
-    camera = capture.depth_camera or capture
-    K = as_read.K.copy()
+        name = f"intrinsics belong to images {1 / factor:g} times as large"
+        readings.append(replace(as_read, name=name, K=np.diag([factor, factor, 1]) @ as_read.K))
+    camera, K = capture.depth_camera or capture, as_read.K.copy()
     K[:2, 2] = camera.width / 2, camera.height / 2
     if not np.allclose(K, as_read.K, atol=1):
-        add("the principal point is the image's center", K=K)
+        readings.append(replace(as_read, name="the principal point is the image's center", K=K))
     return readings
-
-
-def _mirror(M: NDArray[np.float64], X_FB: RigidTransform) -> RigidTransform:
-    return RigidTransform(RotationMatrix(M @ X_FB.rotation().matrix() @ M), M @ X_FB.translation())
-
-
-def _from_wxyz(X_FB: RigidTransform) -> RigidTransform:
-    """Undoes that w x y z was read as x y z w."""
-    w, x, y, z = X_FB.rotation().ToQuaternion().wxyz()
-    return RigidTransform(Quaternion(np.array([x, y, z, w])), X_FB.translation())
 
 
 def _fitted_readings(as_read: Reading, pairs: Sequence[FramePair]) -> list[Reading]:
     """Returns readings whose focal length, or principal point, fits best."""
 
-    def focal(x: NDArray) -> Reading:
+    def changed(x: NDArray) -> Reading:
         K = as_read.K.copy()
-        K[:2, :2] *= np.exp(x[0])
-        return replace(as_read, name=f"the focal length is wrong: {K[0, 0]:.1f} px fits best", K=K)
-
-    def principal(x: NDArray) -> Reading:
-        K = as_read.K.copy()
-        K[:2, 2] += K[0, 0] * x
-        name = f"the principal point is wrong: ({K[0, 2]:.1f}, {K[1, 2]:.1f}) px fits best"
+        if len(x) == 1:
+            K[:2, :2] *= np.exp(x[0])
+            name = f"the focal length is wrong: {K[0, 0]:.1f} px fits best"
+        else:
+            K[:2, 2] += K[0, 0] * x
+            name = f"the principal point is wrong: ({K[0, 2]:.1f}, {K[1, 2]:.1f}) px fits best"
         return replace(as_read, name=name, K=K)
 
-    readings = []
-    for make, steps in ((focal, [0.1]), (principal, [0.05, 0.05])):
-        x, _ = _minimize(
-            lambda x, make=make: min(_measure(make(x), pairs).error, 1.0), steps, 1e-4, 1e-6, 80
-        )
-        readings.append(make(x))
-    return readings
+    def cost(x: NDArray) -> float:
+        return min(_measure(changed(x), pairs).error, 1.0)
+
+    return [changed(_minimize(cost, s, 1e-4, 1e-6, 80)[0]) for s in ([0.1], [0.05, 0.05])]
 
 
 def _minimize(
@@ -404,12 +372,7 @@ def fit_color_camera(capture: Capture, pairs: Sequence[tuple[int, int]]) -> Colo
 
     A point on a surface has about the same luminance in two frames; a wrong color camera samples
     other points, which differ from frame to frame. Correlation does not depend on exposure.
-
-    Args:
-        pairs: indices of frames to compare.
-
-    Returns:
-        The fit, or None if too few points are seen twice.
+    Returns None if too few points are seen twice.
     """
     depth_camera = capture.depth_camera
     K_D = capture.K if depth_camera is None else depth_camera.K

@@ -128,14 +128,14 @@ def open_model(
 
     def frame(image: "pycolmap.Image") -> FrameFiles:
         camera_to_world = image.cam_from_world().inverse().matrix()
-        stem = Path(image.name)
+        stem, mask_names = Path(image.name), (f"{image.name}.png", image.name)
         return FrameFiles(
             images / image.name,
             lambda: pose_from_matrix(camera_to_world, f"{path}, image {image.name}"),
             _existing(depths / stem.with_suffix(s) for s in (".npy", ".png")) if depths else None,
             lenses[image.camera_id],
             # COLMAP lets the mask of a PNG have its name.
-            _existing(masks / name for name in (f"{image.name}.png", image.name) if _is_png(name)),
+            _existing(masks / name for name in mask_names if name.lower().endswith(".png")),
             name=image.name,
         )
 
@@ -189,10 +189,6 @@ def mask_folder(images: Path) -> Path:
 
 def _existing(files: Iterable[Path]) -> Path | None:
     return next((file for file in files if isfile(file)), None)
-
-
-def _is_png(name: str) -> bool:
-    return name.lower().endswith(".png")
 
 
 def _unmasked_points(

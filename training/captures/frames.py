@@ -293,9 +293,7 @@ def open_frames(
     """Opens frames, whose images and depths are read on demand.
 
     Args:
-        path: the capture's folder or file.
         source: the format's name in `Capture.source`.
-        axes: the axes of the files' poses.
         config: its `intrinsics`, `depth_unit` and `up`, if given, replace those of the format.
         lens: returns the camera of images of a width and height [px], for frames without their own.
         depth_unit: units of the stored depth per meter.
@@ -306,7 +304,6 @@ def open_frames(
             the image.
         up: up direction of the files' world, see `turn_upright`; empty leaves that to the caller.
         dropped: messages about frames that were left out already, which do not count further.
-        notes: the first of `Capture.notes`.
     """
     config = config or CaptureConfig()
     messages, complete = list(dropped), []

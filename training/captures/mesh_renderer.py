@@ -7,8 +7,7 @@ pane; `CutOuts` draws surfaces with holes in their textures.
 
 import json
 import struct
-from collections.abc import Collection, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from io import BytesIO
 from pathlib import Path
@@ -99,14 +98,13 @@ class MeshRenderer:
         properties.AddProperty("label", "id", RenderLabel(1))
         # The engine rotates glTF's y up to z.
         X_WM = RigidTransform(RotationMatrix.MakeXRotation(0.0 if up == "y" else -np.pi / 2))
-        with _opened(mesh, up, export=True) as parts:
-            self._cut_outs = parts.cut_outs
-            if parts.solid is not None:
-                solid = Mesh(str(parts.solid))
+        with TemporaryDirectory(prefix="splatpilot-") as folder:
+            solid = Path(folder, "model.gltf")
+            _, self._cut_outs = _split(mesh, up, solid)
+            if solid.is_file():
+                visual = GeometryId.get_new_id(), Mesh(str(solid)), properties, X_WM, False
                 with readable(mesh, "mesh for Drake"):
-                    self._engine.RegisterVisual(
-                        GeometryId.get_new_id(), solid, properties, X_WM, False
-                    )
+                    self._engine.RegisterVisual(*visual)
 
     def frame(
         self, X_WC: RigidTransform, K: NDArray[np.float64], width: int, height: int
@@ -151,10 +149,10 @@ def mesh_digests(mesh: Path) -> set[str]:
 def mesh_distance(mesh: Path, up: str, voxel_size: float) -> Esdf:
     """Returns the distance to the surface of a mesh, from points sampled on it outside of holes."""
     density = _SAMPLES_PER_VOXEL_FACE / voxel_size**2
-    with _opened(mesh, up, export=False) as parts:
-        points = [_sample_surface(mesh, parts.surface, density)[0]]
-        if parts.cut_outs is not None:
-            points.append(parts.cut_outs.sample(mesh, density))
+    surface, cut_outs = _split(mesh, up)
+    points = [_sample_surface(mesh, surface, density)[0]]
+    if cut_outs is not None:
+        points.append(cut_outs.sample(mesh, density))
     p_WQ = np.concatenate(points)
     with readable(mesh, "mesh"):
         if not len(p_WQ):
@@ -300,68 +298,55 @@ class CutOuts:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class _Parts:
-    """A mesh in two parts; one may be missing."""
-
-    solid: Path | None  # .gltf without holes
-    surface: trimesh.Trimesh  # [m] of the same, in W
-    cut_outs: CutOuts | None  # in W
-
-
-@contextmanager
-def _opened(path: Path, up: str, export: bool) -> Iterator[_Parts]:
-    """Opens a mesh, and exports its solid part for Drake or not."""
-    with TemporaryDirectory(prefix="splatpilot-") as folder:
-        with readable(path, "mesh"):
-            parts = _split(path, Path(folder) if export else None, _UP[up])
-        yield parts
-
-
-def _split(path: Path, folder: Path | None, R_WM: NDArray[np.float64]) -> _Parts:
-    scene, document = _read(path)
-    materials = document.get("materials", [])
-    cut_materials: dict[int, CutMaterial | None] = {}
-    solid, cut = [], {}
-    primitives = [p for mesh in document.get("meshes", []) for p in mesh["primitives"]]
-    for primitive, (name, mesh) in zip(primitives, scene.geometry.items(), strict=True):
-        if not isinstance(mesh, trimesh.Trimesh):
-            continue
-        number, visual = primitive.get("material", -1), cast(Any, mesh.visual)
-        if number < 0:
-            mesh.visual = TextureVisuals(material=PBRMaterial(doubleSided=True))
-            solid.append(name)
-            continue
-        material = materials[number]
-        if number not in cut_materials:
-            cut_materials[number] = _cut_material(document, material, visual.material)
-        if cut_materials[number] is not None:
-            cut[name] = number
-        # A mask without a texture is visible or not as a whole.
-        elif material.get("alphaMode") != "MASK" or (
-            _base_color(material)[3] >= material.get("alphaCutoff", _CUTOFF)
-        ):
-            visual.material = _opaque(visual.material, number)
-            solid.append(name)
-    surface, _, _ = _surface(scene, solid, R_WM)
-    cut_outs = None
-    if cut:
-        holed, uv, names = _surface(scene, cut, R_WM)
-        order = sorted(set(cut.values()))
-        found = [each for number in order if (each := cut_materials[number]) is not None]
-        material = np.array([order.index(cut[name]) for name in names], dtype=np.intp)
-        cut_outs = CutOuts(holed, uv, material, found)
-    if not solid and not cut:
-        raise ValueError("it holds no triangles")
-    scene.delete_geometry([name for name in scene.geometry if name not in solid])
-    if not solid or folder is None:
-        return _Parts(None, surface, cut_outs)
-    files = export_gltf(
-        scene, merge_buffers=True, tree_postprocessor=lambda tree: _restore(tree, document)
-    )
-    for name, content in files.items():
-        (folder / name).write_bytes(content)
-    return _Parts(folder / "model.gltf", surface, cut_outs)
+def _split(
+    path: Path, up: str, solid_file: Path | None = None
+) -> tuple[trimesh.Trimesh, CutOuts | None]:
+    """Returns the surfaces without and with holes, in W; writes those without, if any, to a .gltf
+    file for Drake."""
+    R_WM = _UP[up]
+    with readable(path, "mesh"):
+        scene, document = _read(path)
+        materials = document.get("materials", [])
+        cut_materials: dict[int, CutMaterial | None] = {}
+        solid, cut = [], {}
+        primitives = [p for mesh in document.get("meshes", []) for p in mesh["primitives"]]
+        for primitive, (name, mesh) in zip(primitives, scene.geometry.items(), strict=True):
+            if not isinstance(mesh, trimesh.Trimesh):
+                continue
+            number, visual = primitive.get("material", -1), cast(Any, mesh.visual)
+            if number < 0:
+                mesh.visual = TextureVisuals(material=PBRMaterial(doubleSided=True))
+                solid.append(name)
+                continue
+            material = materials[number]
+            if number not in cut_materials:
+                cut_materials[number] = _cut_material(document, material, visual.material)
+            if cut_materials[number] is not None:
+                cut[name] = number
+            # A mask without a texture is visible or not as a whole.
+            elif material.get("alphaMode") != "MASK" or (
+                _base_color(material)[3] >= material.get("alphaCutoff", _CUTOFF)
+            ):
+                visual.material = _opaque(visual.material, number)
+                solid.append(name)
+        surface, _, _ = _surface(scene, solid, R_WM)
+        cut_outs = None
+        if cut:
+            holed, uv, names = _surface(scene, cut, R_WM)
+            order = sorted(set(cut.values()))
+            found = [each for number in order if (each := cut_materials[number]) is not None]
+            material = np.array([order.index(cut[name]) for name in names], dtype=np.intp)
+            cut_outs = CutOuts(holed, uv, material, found)
+        if not solid and not cut:
+            raise ValueError("it holds no triangles")
+        if solid and solid_file is not None:
+            scene.delete_geometry([name for name in scene.geometry if name not in solid])
+            files = export_gltf(
+                scene, merge_buffers=True, tree_postprocessor=lambda tree: _restore(tree, document)
+            )
+            for name, content in files.items():
+                solid_file.with_name(name).write_bytes(content)
+        return surface, cut_outs
 
 
 def _read(path: Path) -> tuple[Any, dict[str, Any]]:
@@ -393,7 +378,9 @@ def _opaque(material: PBRMaterial, number: int) -> PBRMaterial:
     opaque.name, opaque.alphaMode, opaque.doubleSided = str(number), None, True
     for key in ("baseColorTexture", "emissiveTexture", "occlusionTexture"):
         if (image := getattr(opaque, key)) is not None:
-            setattr(opaque, key, image.convert("RGB"))
+            converted = image.convert("RGB")
+            converted.encoderinfo = {"compress_level": 0}  # Compression takes most of the export.
+            setattr(opaque, key, converted)
     return opaque
 
 

@@ -201,21 +201,16 @@ def likely_pairs(similarity: NDArray[np.float64], partners: int) -> list[tuple[i
 
 
 def similarity(database: "pycolmap.Database", names: list[str]) -> NDArray[np.float64]:
-    """Returns the similarity (N, N), -1 to 1, of images whose features a database holds."""
+    """Returns the cosines (N, N) between images whose features a database holds.
+
+    The difference of each descriptor from the nearest of 32 words is summed to one vector per image
+    (VLAD; Jegou et al. 2010).
+    """
     numbers = {image.name: image.image_id for image in database.read_all_images()}
     features = []
     for name in names:
         descriptors = database.read_descriptors(numbers[name])  # which `data` does not keep alive
         features.append(np.sqrt(np.array(descriptors.data, dtype=np.float32)))  # RootSIFT
-    return vlad_similarity(features)
-
-
-def vlad_similarity(features: list[NDArray[np.float32]]) -> NDArray[np.float64]:
-    """Returns the cosines (N, N) between N images by their descriptors, each (., D).
-
-    The difference of each descriptor from the nearest of 32 words is summed to one vector per image
-    (VLAD; Jegou et al. 2010).
-    """
     rng = np.random.default_rng(0)
     pool = np.concatenate(features)
     sample = pool[rng.permutation(len(pool))[:_SAMPLE]]

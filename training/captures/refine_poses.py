@@ -295,7 +295,13 @@ def refined_capture(capture: Capture, path: Path, config: CaptureConfig) -> Capt
     keeps them."""
     if not capture.has_depth:
         raise ValueError(f"{path}: capture.refine_poses needs depth, and it has none; omit it")
-    file = cache_folder(config, "poses") / f"poses-{_key(capture, path)}.npy"
+    parts = [capture.K, *(X_WC.GetAsMatrix34() for X_WC in capture.X_WCs)]
+    if capture.depth_camera is not None:
+        parts += [capture.depth_camera.K, capture.depth_camera.X_CD.GetAsMatrix34()]
+    read = hashlib.sha256(b"".join(each.tobytes() for each in parts)).hexdigest()
+    files = sorted(path.rglob("*")) if path.is_dir() else [path]
+    key = cache_key(filter(Path.is_file, files), _VERSION, np.__version__, read)
+    file = cache_folder(config, "poses") / f"poses-{key}.npy"
     if not file.is_file():
         prepare_cache(file.parent)
         factor = shrink_factor(capture.width, _WIDTH)
@@ -310,13 +316,3 @@ def refined_capture(capture: Capture, path: Path, config: CaptureConfig) -> Capt
             np.save(stream, np.array([X_WC.GetAsMatrix34() for X_WC in refined.X_WCs]))
     X_WCs = [RigidTransform(RotationMatrix(X[:, :3]), X[:, 3]) for X in np.load(file)]
     return replace(capture, X_WCs=X_WCs)
-
-
-def _key(capture: Capture, path: Path) -> str:
-    """Returns the cache key of a capture, by its files and their reading."""
-    files = sorted(path.rglob("*")) if path.is_dir() else [path]
-    parts = [capture.K, *(X_WC.GetAsMatrix34() for X_WC in capture.X_WCs)]
-    if capture.depth_camera is not None:
-        parts += [capture.depth_camera.K, capture.depth_camera.X_CD.GetAsMatrix34()]
-    read = hashlib.sha256(b"".join(each.tobytes() for each in parts)).hexdigest()
-    return cache_key((file for file in files if file.is_file()), _VERSION, np.__version__, read)

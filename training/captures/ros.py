@@ -11,8 +11,8 @@ cache once, in TUM's format.
 import json
 import struct
 from bisect import bisect_left, insort
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import closing
 from dataclasses import replace
 from operator import itemgetter
 from pathlib import Path
@@ -82,7 +82,7 @@ def read(path: Path, config: CaptureConfig) -> Capture:
     key = cache_key(files, config.topics, _VERSION)
 
     def write(written: Path) -> None:
-        with _opened(path) as reader:
+        with closing(_open(path)) as reader:
             _Bag(path, reader, config.topics).write(written)
 
     folder = cached_folder(cache_folder(config, "bags", key) / path.stem, write)
@@ -101,18 +101,14 @@ def read(path: Path, config: CaptureConfig) -> Capture:
     return open_sequence(folder, "ROS bag", config, lens, _DEPTH_UNIT)
 
 
-@contextmanager
-def _opened(path: Path) -> Iterator[Any]:
+def _open(path: Path) -> Any:
     highlevel: Any = import_extra("rosbags.highlevel", "ros")
     typesys: Any = import_extra("rosbags.typesys", "ros")
     with readable(path, "ROS bag"):
         types = typesys.get_typestore(typesys.Stores.LATEST)
         reader = highlevel.AnyReader([path], default_typestore=types)
         reader.open()
-    try:
-        yield reader
-    finally:
-        reader.close()
+    return reader
 
 
 class _Bag:
@@ -275,9 +271,9 @@ class TransformTree:
     def fixed_pose(self, ancestor: str, frame: str) -> RigidTransform | None:
         """Returns the pose of a frame in an ancestor, None unless all between them is fixed."""
         names = self._upwards(frame)
-        between = names[: names.index(ancestor)] if ancestor in names else names
-        fixed = [self._fixed.get(name) for name in between]
-        return _compose(fixed) if ancestor in names else None
+        if ancestor not in names:
+            return None
+        return _compose(map(self._fixed.get, names[: names.index(ancestor)]))
 
     def pose(self, frame: str, time: float) -> RigidTransform | None:
         """Returns the pose of a frame in its root at a time [s], None if the poses around it are
@@ -285,7 +281,7 @@ class TransformTree:
         *names, root = self._upwards(frame)
         if root in self._parents:
             return None
-        return _compose([self._fixed.get(name) or self._interpolate(name, time) for name in names])
+        return _compose(self._fixed.get(name) or self._interpolate(name, time) for name in names)
 
     def _upwards(self, frame: str) -> list[str]:
         """Returns the frame, its parent, and so on, up to the root or a repetition."""
@@ -305,7 +301,7 @@ class TransformTree:
         return pose_between(a, b, (time - t0) / (t1 - t0))
 
 
-def _compose(upwards: Sequence[RigidTransform | None]) -> RigidTransform | None:
+def _compose(upwards: Iterable[RigidTransform | None]) -> RigidTransform | None:
     """Returns the pose of a frame from those of it and its ancestors, None if one is unknown."""
     X = RigidTransform()
     for each in upwards:

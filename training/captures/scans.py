@@ -47,7 +47,11 @@ def read_scannet(path: Path, config: CaptureConfig) -> Capture:
     from the first pixel's center. The axes of both cameras are the same.
     """
     colors = numbered_files(path / "color", r"(\d+)\.(?:jpg|jpeg|png)")
-    lost = {number for number in colors if _is_lost(path / "pose" / f"{number}.txt")}
+    lost = set()
+    for number in colors:
+        with suppress(OSError, ValueError):
+            if not np.isfinite(read_matrix(path / "pose" / f"{number}.txt")).all():
+                lost.add(number)
     K_C = K_D = _intrinsics(path / _SCANNET_COLOR)
     if config.depth_intrinsics:
         K_D = pinhole(*config.depth_intrinsics)
@@ -75,12 +79,6 @@ def read_scannet(path: Path, config: CaptureConfig) -> Capture:
         depth_camera=depth_camera,
         dropped=[f"{path / 'pose'}: tracking was lost in {len(lost)} frames"] if lost else (),
     )
-
-
-def _is_lost(pose: Path) -> bool:
-    with suppress(OSError, ValueError):
-        return not np.isfinite(read_matrix(pose)).all()
-    return False
 
 
 def _intrinsics(file: Path) -> NDArray[np.float64]:

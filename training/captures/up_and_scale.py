@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Callable, Sequence
 from pathlib import PurePath
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -112,20 +113,32 @@ def turn_upright(capture: Capture, up: str) -> Capture:
             direction, _ = fit_ground(_known_points(capture), cameras, direction)
     else:
         direction = np.eye(3)["xyz".index(up[-1])] * (-1 if up.startswith("-") else 1)
-    return _rotate_and_scale(capture, _rotation_to_z(direction))
+    # The smallest rotation that takes it to z.
+    axis = np.cross(direction, [0.0, 0.0, 1.0])
+    axis = axis / np.linalg.norm(axis) if axis.any() else np.array([1.0, 0.0, 0.0])
+    turn = Rotation.from_rotvec(np.arccos(np.clip(direction[2], -1, 1)) * axis)
+    return _transform(capture, RotationMatrix(turn.as_matrix()))
 
 
-def _rotate_and_scale(capture: Capture, R_NW: RotationMatrix, scale: float = 1.0) -> Capture:
-    """Returns the capture in a world N, rotated and with lengths times `scale`, but its depth."""
+def _transform(
+    capture: Capture,
+    R_NW: RotationMatrix,
+    scale: float = 1.0,
+    p_WN: NDArray[np.float64] | float = 0.0,
+    **changes: Any,
+) -> Capture:
+    """Returns the capture in a world N with origin p_WN, rotated and with lengths times `scale`,
+    but its depth, and other `changes` of fields."""
     points, axes = capture.points, capture.axes
     return dataclasses.replace(
         capture,
         X_WCs=[
-            RigidTransform(R_NW @ X.rotation(), scale * R_NW.multiply(X.translation()))
+            RigidTransform(R_NW @ X.rotation(), scale * R_NW.multiply(X.translation() - p_WN))
             for X in capture.X_WCs
         ],
-        points=points and SfmPoints(scale * points.p_WQ @ R_NW.matrix().T, points.colors),
+        points=points and SfmPoints(scale * (points.p_WQ - p_WN) @ R_NW.matrix().T, points.colors),
         axes=FileAxes(axes.name, R_NW @ axes.R_WF, axes.R_BC),
+        **changes,
     )
 
 
@@ -143,14 +156,6 @@ def _known_points(capture: Capture) -> NDArray[np.float64]:
             "capture.scale by another field"
         )
     return np.concatenate(parts)
-
-
-def _rotation_to_z(up: NDArray[np.float64]) -> RotationMatrix:
-    """Returns the smallest rotation that takes the unit vector `up` to z."""
-    axis = np.cross(up, [0.0, 0.0, 1.0])
-    axis = axis / np.linalg.norm(axis) if axis.any() else np.array([1.0, 0.0, 0.0])
-    angle = np.arccos(np.clip(up[2], -1, 1))
-    return RotationMatrix(Rotation.from_rotvec(angle * axis).as_matrix())
 
 
 def make_metric(
@@ -179,7 +184,7 @@ def make_metric(
     else:
         factor = _factor_from_depth(capture)
     source = f"{capture.source}, scale {factor:.6g} from {sources[0]}"
-    return dataclasses.replace(_rotate_and_scale(capture, RotationMatrix(), factor), source=source)
+    return _transform(capture, RotationMatrix(), factor, source=source)
 
 
 def _locate(
@@ -258,12 +263,6 @@ def move_origin(capture: Capture, origin: Sequence[float]) -> Capture:
     p = np.array(origin, dtype=np.float64) if origin else choose_origin(p_WCs)
     if not p.any():
         return capture
-    points = capture.points
     note = f"positions are relative to {', '.join(f'{x:.10g}' for x in p)} of the files"
-    return dataclasses.replace(
-        capture,
-        X_WCs=[RigidTransform(X.rotation(), X.translation() - p) for X in capture.X_WCs],
-        points=points and SfmPoints(points.p_WQ - p, points.colors),
-        notes=[*capture.notes, note],
-        origin=capture.origin + p,
-    )
+    changes = {"notes": [*capture.notes, note], "origin": capture.origin + p}
+    return _transform(capture, RotationMatrix(), p_WN=p, **changes)

@@ -269,8 +269,6 @@ def gaussians_from_depth(
 
     Args:
         frames: loaded one by one, and more than once.
-        photometry: of the frames, in their order.
-        max_gaussians: maximum number.
         contrast, max_cell, max_extent: of the finest cells, see `BlockMeans.split`.
         optimized: makes Gaussians that will be optimized: wider and without an underlay; if even
             the coarsest are too many, they are sampled.
@@ -324,8 +322,10 @@ def gaussians_from_depth(
     progress.close()
     p_WQ, covariances, colors = _concatenate(parts[k] for k in range(len(frames)))
     if len(p_WQ) > max_gaussians:
-        kept = _sample_by_radius(covariances, max_gaussians)
         areas = np.trace(covariances, axis1=1, axis2=2)
+        # Drawn in proportion to their radius (Efraimidis and Spirakis 2006).
+        keys = np.log(np.random.default_rng(0).uniform(size=len(areas))) / np.sqrt(areas)
+        kept = np.sort(np.argpartition(-keys, max_gaussians)[:max_gaussians])
         covered = areas[kept].sum() / areas.sum()
         if covered < _MIN_COVERED:
             say(
@@ -337,14 +337,6 @@ def gaussians_from_depth(
     quats, scales = principal_axes(covariances)
     opacities = np.full(len(p_WQ), _OPACITY if optimized else _OPACITY_ALONE)
     return GaussianScene.from_colors(p_WQ, quats, scales, opacities, colors)
-
-
-def _sample_by_radius(covariances: NDArray, count: int) -> NDArray[np.intp]:
-    """Draws `count` Gaussians without replacement, with probabilities proportional to their radius
-    (Efraimidis and Spirakis 2006); in their order."""
-    radii = np.sqrt(np.trace(covariances, axis1=1, axis2=2))
-    keys = np.log(np.random.default_rng(0).uniform(size=len(radii))) / radii
-    return np.sort(np.argpartition(-keys, count)[:count])
 
 
 def gaussians_from_points(p_WQ: NDArray, colors: NDArray) -> GaussianScene:

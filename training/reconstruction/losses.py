@@ -44,9 +44,9 @@ def photometric_loss(rendered: Tensor, target: Tensor, ssim_weight: float = 0.2)
     require(rendered.ndim >= 3, "rendered", "(..., H, W, C)", tuple(rendered.shape))
     require(0 <= ssim_weight <= 1, "ssim_weight", "in [0, 1]", ssim_weight)
     if _is_native(rendered):
-        shape, native = (-1, *rendered.shape[-3:]), _native.photometric_loss
-        truth = {"target": target, "ssim_weight": ssim_weight}
-        return _Fused.apply(rendered, native, shape, truth)  # pyright: ignore[reportReturnType]
+        rendered, target = (x.reshape(-1, *x.shape[-3:]) for x in (rendered, target))
+        truth = {"target": target, "ssim_weight": ssim_weight, "simd": _simd()}
+        return _Native.apply(_native.photometric_loss, truth, "rendered gradient", rendered)  # pyright: ignore[reportReturnType]
     l1 = (rendered - target).abs().mean()
     return (1 - ssim_weight) * l1 + ssim_weight * (1 - ssim_map(rendered, target).mean())
 
@@ -89,9 +89,10 @@ def log_depth_loss(
     if weights is not None:
         _check_pair("rendered", rendered, "weights", weights)
     if _is_native(rendered):
-        native = _native.log_depth_loss
-        truth = {"depth": depth, "weights": weights, "epsilon": _EPSILON, "far": FAR}
-        return _Fused.apply(rendered, native, (-1,), truth)  # pyright: ignore[reportReturnType]
+        weights = None if weights is None else weights.ravel()
+        truth = {"depth": depth.ravel(), "weights": weights, "epsilon": _EPSILON, "far": FAR}
+        truth |= {"simd": _simd()}
+        return _Native.apply(_native.log_depth_loss, truth, "rendered gradient", rendered.ravel())  # pyright: ignore[reportReturnType]
     valid = (depth > _EPSILON) & (depth < FAR)
     rendered, depth = rendered[valid], depth[valid]
     loss = (rendered.clamp(min=_EPSILON).log() - depth.log()).abs()
@@ -152,8 +153,10 @@ def surface_loss(
     """
     draws = torch.from_numpy(rng.standard_normal((len(seen), 3), np.float32))
     if _is_native(means):
-        arguments = means, quats, scales, seen, draws, viewmat, K, depth
-        return _NativeSurfaceLoss.apply(*arguments)  # pyright: ignore[reportReturnType]
+        view = {"seen": seen.long(), "draws": draws, "X_CW": viewmat, "K": K, "depth": depth}
+        view |= {"reach": _REACH, "nearest": _NEAR, "far": FAR}
+        names = "means quats scales v_means v_quats v_scales"
+        return _Native.apply(_native.surface_loss, view, names, means, quats, scales)  # pyright: ignore[reportReturnType]
     means, quats, scales = (values.index_select(0, seen) for values in (means, quats, scales))
     offsets = rotation_matrices(quats) @ (draws.to(means) * scales)[..., None]
     p_CQ = (means + offsets[..., 0]) @ viewmat[:3, :3].T + viewmat[:3, 3]
@@ -177,65 +180,28 @@ def outline_loss(alpha: Tensor, depth: Tensor, weights: Tensor) -> Tensor:
     return ((alpha - solid).abs() * weights * known).sum() / known.sum().clamp(min=1)
 
 
-class _Fused(torch.autograd.Function):
-    """A native loss, with its gradient by the first tensor."""
+class _Native(torch.autograd.Function):
+    """A native loss of tensors and constants; `names` are those of the tensors and gradients."""
 
     @staticmethod
     def forward(
-        ctx: Any,
-        rendered: Tensor,
-        loss: Callable[..., float],
-        shape: tuple[int, ...],
-        truth: dict[str, Any],
+        ctx: Any, loss: Callable[..., float], constants: dict[str, Any], names: str, *inputs: Tensor
     ) -> Tensor:
-        def argument(x: Any) -> Any:
-            return x.detach().contiguous().view(shape).numpy() if isinstance(x, Tensor) else x
+        def array(x: Any) -> Any:
+            return x.detach().contiguous().numpy() if isinstance(x, Tensor) else x
 
-        gradient = torch.empty(rendered.shape) if ctx.needs_input_grad[0] else None
-        images = truth | {"rendered": rendered, "gradient": gradient}
-        arguments = {name: argument(x) for name, x in images.items()}
-        value = loss(**arguments, simd=os.environ.get("SPLATPILOT_SIMD", ""))
-        ctx.gradient = gradient
-        return rendered.new_tensor(value)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad_value: Tensor) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
-        return ctx.gradient * grad_value, *(None for _ in ctx.needs_input_grad[1:])
-
-
-class _NativeSurfaceLoss(torch.autograd.Function):
-    """The native `surface_loss`, with its gradients by the Gaussians."""
-
-    @staticmethod
-    def forward(ctx: Any, *arguments: Tensor) -> Tensor:
-        means, quats, scales, seen, draws, viewmat, K, depth = (
-            tensor.detach().contiguous() for tensor in arguments
-        )
-        ctx.gradients = [torch.zeros_like(values) for values in (means, quats, scales)]
-        v_means, v_quats, v_scales = (gradient.numpy() for gradient in ctx.gradients)
-        loss = _native.surface_loss(
-            means=means.numpy(),
-            quats=quats.numpy(),
-            scales=scales.numpy(),
-            v_means=v_means,
-            v_quats=v_quats,
-            v_scales=v_scales,
-            seen=seen.long().numpy(),
-            draws=draws.numpy(),
-            X_CW=viewmat.numpy(),
-            K=K.numpy(),
-            depth=depth.numpy(),
-            reach=_REACH,
-            nearest=_NEAR,
-            far=FAR,
-        )
-        return means.new_tensor(loss)
+        ctx.gradients = [torch.zeros(x.shape) for x in inputs]
+        given = dict(zip(names.split(), [*inputs, *ctx.gradients], strict=True)) | constants
+        return inputs[0].new_tensor(loss(**{name: array(x) for name, x in given.items()}))
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, v_loss: Tensor) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
-        return *(values * v_loss for values in ctx.gradients), *(None for _ in range(5))
+        return None, None, None, *(gradient * v_loss for gradient in ctx.gradients)
+
+
+def _simd() -> str:
+    return os.environ.get("SPLATPILOT_SIMD", "")
 
 
 def _is_native(tensor: Tensor) -> bool:

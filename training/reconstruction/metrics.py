@@ -154,8 +154,6 @@ def measure_view(
 
     Args:
         on_black: rendered before black.
-        background: of the scene.
-        frame: the truth, of the same size.
         vignetting: of the capture, see `vignette`.
         seen: (H, W), pixels to measure, see `seen_pixels`; all by default. The windows of SSIM and
             LPIPS reach over others.

@@ -186,12 +186,7 @@ class Optimization:
     """One run, from its first step or from a checkpoint.
 
     Args:
-        config: of the reconstruction.
-        views: fitted views.
-        held_out: views that measure the scene.
-        background: of the scene.
         initial: makes the Gaussians of a first step, given the extent of the cameras [m].
-        checkpoint: of this run.
         perceptual: LPIPS of two images (H, W, 3).
         fit_gains: fits the gains of `views`.
     """

@@ -141,11 +141,8 @@ class SplatParameters:
     `means` (N, 3) [m]; `quats` (N, 4) wxyz of any length; `log_scales` (N, 3); `logit_opacities`
     (N,); `sh_0` (N, 1, 3) and, if the degree is not 0, `sh_rest` (N, K - 1, 3).
 
-    Args:
-        tensors: these, by name.
-        optimizer: state of Adam, see `state`.
-        limits: smallest and largest scale (N,) [m]; 0 and infinity by default. The smallest is
-            added in squares.
+    `limits` are the smallest and largest scale (N,) [m], 0 and infinity by default. The smallest is
+    added in squares.
     """
 
     def __init__(

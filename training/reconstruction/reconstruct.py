@@ -105,10 +105,6 @@ def reconstruct(
 
     Checkpoints are in the folder `.NAME.partial` next to `out`; after an interruption, the same
     call resumes and ends in the bitwise identical scene. With `restart` it starts again.
-
-    Raises:
-        ValueError, OSError: for a damaged capture, an invalid config, a checkpoint of another run,
-            or a folder `out` that cannot be written or holds something else.
     """
     out = Path(out)
     config.validate()

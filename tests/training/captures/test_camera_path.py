@@ -1,13 +1,11 @@
 import numpy as np
 import pytest
-from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.math import RigidTransform
 
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.esdf_build import esdf_from_distance_field
 from splatpilot.systems.collision.shapes import AnalyticDistanceField, Box
 from splatpilot.training.captures.camera_path import (
-    look_along,
-    move_left,
     poses_along,
     visiting_path,
 )
@@ -62,22 +60,3 @@ def test_heading_stays_on_a_climb():
     path = np.array([[0.0, 0, 1], [3, 3, 1], [3, 3, 6]])
     ahead = np.array([X.rotation().matrix()[:, 2] for X in poses_along(path, 0.5, [0.0], 0.0)])
     np.testing.assert_allclose(ahead, np.tile([0.5**0.5, 0.5**0.5, 0], (len(ahead), 1)), atol=1e-6)
-
-
-def test_one_point_is_one_stop():
-    (X_WC,) = poses_along(np.array([[1.0, 2, 3]]), 0.5, [0.0], 0.0)
-    np.testing.assert_array_equal(X_WC.translation(), [1, 2, 3])
-
-
-def test_offset_is_exactly_lateral():
-    X_WC = look_along(np.array([1.0, 2, 3]), 0.7, -0.2)
-    X_WD = move_left(X_WC, 0.5)
-    moved = X_WC.inverse() @ X_WD
-    np.testing.assert_allclose(moved.translation(), [-0.5, 0, 0], atol=1e-12)
-    assert moved.rotation().IsNearlyEqualTo(RotationMatrix(), 1e-12)
-
-
-@pytest.mark.parametrize("path", [[[0.0, 1.0]], [], [[0, np.nan, 1]]])
-def test_bad_paths_are_named(path):
-    with pytest.raises(ValueError, match="shape"):
-        poses_along(np.array(path), 0.5, [0.0], 0.0)

@@ -43,12 +43,6 @@ def test_fisheye_is_that_of_kannala_and_brandt():
     np.testing.assert_allclose(lens.pixels(RAYS), 46 * theta * k / r * RAYS + [32, 24], atol=1e-9)
 
 
-def test_scaled_lens_sees_the_same_in_more_pixels():
-    lens = Lens(K, 64, 48, radius=20.0, source="a file").scale_to(128, 96)
-    np.testing.assert_allclose(lens.K, pinhole(92, 92, 64, 48))
-    assert (lens.radius, lens.source) == (40, "a file")
-
-
 def test_pinhole_sees_no_farther_than_the_radius_of_a_lens():
     lens = Lens(K, 64, 48, radius=20.0)
     camera = common_pinhole([lens])
@@ -90,13 +84,6 @@ def test_plane(finer):
     inner = np.s_[8 * finer : -8 * finer, 8 * finer : -8 * finer]
     # Half a pixel of the coarser camera on this slope.
     np.testing.assert_allclose(got[inner], want[inner], rtol=0.004)
-
-
-def test_same_camera_changes_nothing():
-    depth = np.random.default_rng(0).uniform(1, 5, (48, 64)).astype(np.float32)
-    depth[3, 4], depth[5, 6] = 0, np.inf
-    got = register_depth(depth, DepthCamera(K_D, 64, 48, RigidTransform()), K_D, 64, 48)
-    np.testing.assert_allclose(got, depth, rtol=1e-6)
 
 
 def test_nearer_surface_hides_the_farther():

@@ -231,7 +231,7 @@ def test_intrinsics_and_their_source_are_noted(write):
                          "capture.intrinsics")  # fmt: skip
 
 
-def test_scale(write, room_poses):
+def test_scale(write):
     path = write(depth=False)
     capture = read_capture(path)
     assert not capture.metric and not capture.has_depth
@@ -240,9 +240,6 @@ def test_scale(write, room_poses):
     assert scaled.metric
     p = [X_WC.translation() for X_WC in scaled.X_WCs]
     assert np.linalg.norm(p[9] - p[0]) == pytest.approx(10)
-    ratio = np.linalg.norm(p[5] - p[2]) / 10
-    q = [X_WC.translation() for X_WC in room_poses]
-    assert ratio == pytest.approx(np.linalg.norm(q[5] - q[2]) / np.linalg.norm(q[9] - q[0]))
 
 
 def test_points(write):
@@ -266,18 +263,13 @@ _CAMERA = "invalid camera of 00.png .*"
         ({"camera_model": "EQUIRECTANGULAR"}, "camera_model must be .*, got EQUIRECTANGULAR"),
         ({"frames": 3}, "not a readable file of nerfstudio's format"),
         ({"frames": [{"file_path": "00.png"}]}, "transform_matrix"),
-        ({"ply_file_path": 3}, "not a readable file of nerfstudio's format"),
-        ({"depth_unit_scale_factor": None}, "not a readable file of nerfstudio's format"),
         ({"depth_unit_scale_factor": 0}, "depth_unit_scale_factor must be .* got 0"),
-        ({"depth_unit_scale_factor": np.nan}, "depth_unit_scale_factor must be .* got nan"),
         ({"fl_x": "wide"}, _CAMERA),
         ({"w": np.inf}, f"{_CAMERA}infinity"),
         ({"w": 10**9}, f"{_CAMERA}image size must be .* got 1000000000x48"),
         ({"fl_x": -40}, rf"{_CAMERA}focal lengths must be .* got \[-40"),
-        ({"fl_x": 1e300}, rf"{_CAMERA}focal lengths must be .* got \[1e\+300"),
         ({"fl_x": np.nan}, rf"{_CAMERA}focal lengths must be .* got \[nan"),
         ({"cx": 64.5}, rf"{_CAMERA}principal point must be in the image of 64x48 px, got \[64\.5"),
-        ({"cx": np.nan}, rf"{_CAMERA}principal point .* got \[nan"),
         ({"k1": np.nan}, f"{_CAMERA}distortion"),
         ({"test_filenames": ["99.png"]}, r"its split names 99\.png"),
         ({"train_filenames": []}, "its split leaves no frame"),
@@ -286,11 +278,6 @@ _CAMERA = "invalid camera of 00.png .*"
 def test_invalid_transforms_are_refused(write, keys, message):
     with pytest.raises(ValueError, match=rf"transforms\.json: .*{message}"):
         read_capture(change(write(), **keys))
-
-
-def test_points_of_another_format_are_refused(write):
-    with pytest.raises(ValueError, match=r"00\.png: not a readable PLY file"):
-        read_capture(change(write(), ply_file_path="00.png"))
 
 
 @pytest.mark.parametrize(

@@ -44,15 +44,11 @@ def write(tmp_path, K, room_views):
 
 @pytest.mark.parametrize("prefix", ["", "corrected_"])
 def test_room(write, shows_room, prefix):
-    capture = read_capture(write(prefix))
+    path = write(prefix)
+    (path / "keyframes/cameras").mkdir(exist_ok=True)
+    capture = read_capture(path)
     assert capture.source.startswith("Polycam") and capture.metric and not capture.dropped
     shows_room(capture, color=4.0, depth=0.03)
-
-
-def test_corrected_poses_come_first(write, shows_room):
-    path = write("corrected_")
-    (path / "keyframes/cameras").mkdir()
-    assert len(read_capture(path)) == 10
 
 
 def test_damaged_keyframes_are_named(write):

@@ -57,16 +57,6 @@ def errors(poses: list[RigidTransform], truth: list[RigidTransform]) -> np.ndarr
     )
 
 
-def test_true_poses_leave_no_difference(frames, room_poses):
-    X_WC, X_WC_other = room_poses[2:4]
-    one, other = frames([X_WC, X_WC_other], exposure=0.67)
-    found = compare_frames(one, other, X_WC, X_WC_other, 0.04)
-    assert found is not None
-    depth, contrast = np.median(np.abs(found.residuals), axis=1)
-    assert depth < 1e-4
-    assert contrast < 0.05
-
-
 @pytest.mark.parametrize("number", range(12))
 def test_derivatives(frames, room_poses, number):
     given = room_poses[5:7]
@@ -107,19 +97,12 @@ def test_edges_and_holes_are_not_compared():
 @pytest.mark.parametrize(("noise", "left"), [(0.0, 0.1), (0.005, 0.3)])
 def test_drift_is_removed(frames, room_poses, noise, left):
     given = drifting(room_poses, 0.02, 0.02)
-    refined = refine_poses(frames(room_poses, noise), given)
+    refined = refine_poses(frames(room_poses, noise, exposure=0.97), given)
     assert (errors(refined.X_WCs, room_poses) < left * errors(given, room_poses)).all()
     assert refined.contrast[1] < refined.contrast[0]
     assert refined.depth[1] < refined.depth[0]
     assert refined.moved > 0.001
     assert "poses moved by" in str(refined)
-
-
-def test_exact_poses_stay(frames, room_poses):
-    refined = refine_poses(frames(room_poses), room_poses)
-    turned, moved = errors(refined.X_WCs, room_poses)
-    assert turned < 1e-3
-    assert moved < 1e-3
 
 
 def test_blind_frame_moves_with_its_neighbors(frames, room_poses):
@@ -201,13 +184,6 @@ def test_without_depth(tmp_path, config):
     with pytest.raises(ValueError, match=r"nerfstudio: .* needs depth"):
         read_capture(path, CaptureConfig(refine_poses=True, cache=config.cache))
     assert not Path(config.cache).exists()
-
-
-def test_cache_that_cannot_be_written_is_refused(folder, config, tmp_path, monkeypatch):
-    (tmp_path / "cache").touch()
-    monkeypatch.setattr(module, "refine_poses", lambda *_: pytest.fail("refined"))
-    with pytest.raises(OSError, match=r"cache: cannot be written .*; set capture\.cache to a"):
-        read_capture(folder, config)
 
 
 def test_frames_without_overlap_are_refused(folder, config):

@@ -1,4 +1,3 @@
-import os
 from pathlib import Path
 
 import cv2
@@ -99,10 +98,7 @@ def line_5(line: str):
             "image_left: holds no file named like",
         ),
         (lines(lambda each: each[:-1]), r"pose_left\.txt: 11 poses for 12 images and 12 dep"),
-        (lines(lambda each: [*each, each[0]]), r"pose_left\.txt: 13 poses for 12 images"),
         (line_5("0 0 0 0 0 0"), r"pose_left\.txt, line 5 must be a pose tx ty tz"),
-        (line_5("a b c d e f g"), r"pose_left\.txt, line 5 must be a pose tx ty tz"),
-        (line_5(""), r"pose_left\.txt, line 5 must be a pose tx ty tz"),
     ],
 )
 def test_damaged_sequence_is_refused(room, damage, message):
@@ -116,8 +112,6 @@ def test_damaged_sequence_is_refused(room, damage, message):
     [
         ("0 0 nan 0 0 0 1", "the pose is not finite"),
         ("0 0 0 0 0 0 1.1", "the quaternion must be 1 +- 0.001, got 1.1"),
-        ("0 0 0 0 0 0 0", "the quaternion must be 1 +- 0.001, got 0"),
-        ("0 0 0 nan 0 0 1", "the pose is not finite"),
         ("3e8 0 0 0 0 0 1", "must be within 1e+08 m"),
     ],
 )
@@ -146,19 +140,3 @@ def test_v2(tmp_path, room):
         np.testing.assert_array_equal(one.frame(i).depth, two.frame(i).depth)
         assert one.X_WCs[i].IsExactlyEqualTo(two.X_WCs[i])
     np.testing.assert_array_equal(one.K, two.K)
-
-
-@pytest.mark.skipif("SPLATPILOT_DATA" not in os.environ, reason="SPLATPILOT_DATA is not set")
-def test_hospital_reprojects_onto_itself():
-    capture = read_capture(Path(os.environ["SPLATPILOT_DATA"]) / "tartanair" / "hospital")
-    assert len(capture) == 71
-    errors = []
-    for i in (0, 20, 40, 60):
-        a, b = capture.frame(i), capture.frame(i + 1)
-        p_W = back_projected(a)[::4, ::4].reshape(-1, 3)
-        x, y, z = b.X_WC.inverse().multiply(p_W.T)
-        u = np.floor(b.K[0, 0] * x / z + b.K[0, 2]).astype(int)
-        v = np.floor(b.K[1, 1] * y / z + b.K[1, 2]).astype(int)
-        seen = (z > 0) & (u >= 0) & (u < 640) & (v >= 0) & (v < 480)
-        errors.append(np.abs(b.depth[v[seen], u[seen]] / z[seen] - 1))
-    assert np.median(np.concatenate(errors)) < 1e-3

@@ -1,4 +1,3 @@
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -101,13 +100,6 @@ def test_pixels_without_weight_hardly_count(lpips):
     assert lpips(a, differs_right, left) < 0.2 * lpips(a, differs_right)
 
 
-def test_weights_are_read_once(file):
-    a, b = images()
-    first = Lpips()(a, b)
-    file.write_bytes(b"")
-    assert Lpips()(a, b) == first
-
-
 def test_missing_weights(tmp_path, monkeypatch):
     monkeypatch.setenv("SPLATPILOT_DATA", str(tmp_path))
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
@@ -149,18 +141,6 @@ def test_other_files_are_refused(file, weights, content):
 def test_bad_images(lpips, shape):
     with pytest.raises(ValueError, match=r"images must be .* at least 17 pixels, got \("):
         lpips(torch.zeros(shape), torch.zeros(shape))
-
-
-@pytest.mark.skipif("SPLATPILOT_DATA" not in os.environ, reason="SPLATPILOT_DATA is not set")
-def test_real_weights_rank_what_people_see():
-    import cv2
-
-    folder = Path(os.environ["SPLATPILOT_DATA"]) / "tartanair" / "hospital" / "image_left"
-    image = cv2.imread(str(sorted(folder.iterdir())[20]))[::2, ::2, ::-1] / 255.0
-    blurred = cv2.GaussianBlur(image, (0, 0), 2)
-    error = ((blurred - image) ** 2).mean() ** 0.5
-    a, b, c = (torch.tensor(x.copy()).float() for x in (image, blurred, image + error))
-    assert Lpips()(b, a) > 5 * Lpips()(c, a) > 0
 
 
 def test_nothing_large_is_imported(file):

@@ -32,12 +32,6 @@ def noise(seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).uniform(0.2, 0.8, (HEIGHT, WIDTH, 3))
 
 
-def test_psnr_of_a_known_difference():
-    truth = np.zeros((HEIGHT, WIDTH, 3))
-    assert psnr_db(truth + 0.1, truth) == pytest.approx(20.0)
-    assert psnr_db(truth, truth) == np.inf
-
-
 def test_ssim():
     a, b = np.full((64, 64, 3), 0.4), np.full((64, 64, 3), 0.6)
     everywhere = np.ones((64, 64), bool)
@@ -52,6 +46,7 @@ def test_ssim():
 
 
 def test_depth_metrics_are_over_pixels_with_true_depth():
+    assert psnr_db(np.full((2, 2, 3), 0.1), np.zeros((2, 2, 3))) == pytest.approx(20.0)
     truth = np.array([[2.0, 4.0, 0.0, np.inf, 149.0, 200.0]], np.float32)
     depth = np.array([[2.5, 0.0, 9.0, 9.0, 148.0, 9.0]], np.float32)
     assert depth_metrics(depth, truth) == pytest.approx(

@@ -52,15 +52,6 @@ def test_factor_is_gain_in_the_center_and_darker_in_the_corners():
     np.testing.assert_allclose(factor, 2 * np.exp(-0.5 * rho_squared), rtol=1e-6)
 
 
-def test_points_lie_on_the_walls(views, room_in_W):
-    lower, upper = room_in_W
-    for view in views:
-        p_WQ, index = view.points()
-        np.testing.assert_array_equal(index, np.arange((64 // STRIDE) * (48 // STRIDE)))
-        to_wall = np.minimum(np.abs(p_WQ.T - lower), np.abs(p_WQ.T - upper)).min(axis=-1)
-        assert to_wall.max() < 1e-5
-
-
 def test_found_pixels_show_the_same_points(views):
     p_WQ, index = views[1].points()
     number, shown = views[1].find(p_WQ)
@@ -124,12 +115,6 @@ def test_every_point_is_kept_about_once(views):
         counts.append(count)
     assert np.mean(np.concatenate(counts) == 0) < 0.06
     assert np.mean(np.concatenate(counts) > 2) < 0.1
-
-
-def test_slow_walk_keeps_little_more_than_one_view(tmp_path, write_room):
-    poses = [((2 + 0.05 * i, 0.0, -1.2), 1.2, -0.3) for i in range(10)]
-    new = find_new_pixels(thin(write_room(tmp_path / "walk", poses=poses)))
-    assert 1 <= sum(mask.mean() for mask in new) < 2
 
 
 def test_views_named_last_yield_to_others(views):
