@@ -51,11 +51,11 @@ class Chain:
         self.px4.peer = ("127.0.0.1", self.inbox.port)
         self.lcm = lcm.LCM("memq://")
         scenario = Scenario(policy=policy_named("straight", 1.0), start=START, goal=GOAL)
-        config = Px4Config(vehicle_port=self.px4.port, commander=commander, body=body, tick=0.01)
+        config = Px4Config(vehicle_port=self.px4.port, commander=commander, body=body)
         if motion_capture:
             udp = UdpConfig(port=0)
             config.motion_capture = MotionCaptureConfig(udp, body_id=3, version=[4, 0])
-        hardware = dataclasses.replace(hardware or HardwareConfig(), tick=0.01)
+        hardware = dataclasses.replace(hardware or HardwareConfig(), tick=0.005)
         self.bridge = BuildHardwareDiagram(scenario, world, self.lcm, hardware, policy=policy)
         self.link = BuildPx4Diagram(config, self.lcm, self.inbox)
         self.simulators = {"bridge": Simulator(self.bridge), "link": Simulator(self.link)}
