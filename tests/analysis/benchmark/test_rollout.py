@@ -1,22 +1,29 @@
 import json
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
-from splatpilot.analysis.benchmark import replay, run_study
+from splatpilot.analysis.benchmark import replay, rollout, run_study
 from splatpilot.analysis.benchmark.rollout import (
+    Fault,
     flight_metrics,
     jerk_metrics,
     shortest_length,
 )
+from splatpilot.analysis.benchmark.run_study import fly_all
 from splatpilot.analysis.benchmark.study import StudyConfig
+from splatpilot.analysis.benchmark.study_folder import StudyFolder, keep_inputs, kept_flights
 from splatpilot.analysis.commands.main import main
 from splatpilot.diagrams.flight.flight import Flight, Outcome
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.worlds.forest.layout import ForestConfig
 from splatpilot.systems.collision.esdf_build import esdf_from_distance_field
 from splatpilot.systems.collision.shapes import AnalyticDistanceField, Cylinder
 from splatpilot.systems.common.provenance import InfeasibleFlightError
+from splatpilot.systems.policies.checkpoint import PolicyCheckpoint
+from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK
 from splatpilot.systems.policies.straight import Straight
 from splatpilot.systems.policies.time_of_arrival import path_lengths
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
@@ -95,6 +102,15 @@ def test_infeasible_flights_fail_with_a_reason(short_scenario, tmp_path, capsys,
         replay.run(study=tmp_path / "far", id="short-straight-2-000")
 
 
+def test_a_scene_without_a_start_and_goal_does_not_stop_the_study(room, tmp_path, short_scenario):
+    hall = room.scene("hall", metric=True)
+    far = tmp_path / "far.yaml"
+    far.write_text(f"world: !SceneConfig {{path: {hall}, draw_ends: true, least_way: 30}}\n")
+    config = StudyConfig([str(far), str(short_scenario)], ["straight"], seeds=1)
+    [row] = run_study.run(config=config, out=tmp_path / "out", jobs=1)
+    assert (row["flights"], row["infeasible"]) == (2, 1)
+
+
 def fail_later(monkeypatch, error):
     """Lets the straight policy raise after half a second."""
     update = Straight._update
@@ -140,3 +156,33 @@ def test_an_exception_stops_the_study_which_is_resumed(
     assert main([*words, "2"]) == 0
     assert not (out / "errors").exists()
     assert len(rows_of(out / "rollouts.csv")) == 4
+
+
+def test_a_fault_in_a_worker_process_is_returned(short_scenario, tmp_path):
+    shipped = PolicyCheckpoint.load("", "diffaero", DIFFAERO_NETWORK)
+    mine = tmp_path / "mine.npz"
+    PolicyCheckpoint("diffaero", shipped.spec, dict(shipped.weights), {}).save(mine)
+    config = StudyConfig([str(short_scenario)], ["straight", f"mine={mine}"], seeds=3)
+    folder = StudyFolder(tmp_path / "out")
+    folder.begin(config, {})
+    keep_inputs(folder, config, config.load_scenarios())
+    flights = list(kept_flights(folder, config.rollouts()))
+    folder.weights("mine").unlink()
+    flown = list(fly_all(flights, jobs=2))
+    faults = [fault for fault in flown if isinstance(fault, Fault)]
+    assert {fault.id for fault in faults} == {f"short-mine-2-00{seed}" for seed in range(3)}
+    assert all("FileNotFoundError" in fault.reason for fault in faults)
+    assert len(flown) == 6
+
+
+def test_worlds_of_two_types_with_the_same_fields_are_two(monkeypatch):
+    @dataclass
+    class OtherForestConfig(ForestConfig):
+        pass
+
+    monkeypatch.setattr(rollout, "_worlds", {})
+    monkeypatch.setattr(rollout, "make_world", lambda config, seed: (type(config), seed))
+    for config in (ForestConfig(), OtherForestConfig()):
+        for seed in (1_000, 1_001):
+            scenario = Scenario(seed=seed, world=config)
+            assert rollout.study_world(scenario) == (type(config), seed)

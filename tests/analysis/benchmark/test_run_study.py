@@ -2,6 +2,9 @@ import os
 import re
 import shutil
 import signal
+import subprocess
+import sys
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -40,10 +43,47 @@ def test_study_has_all_flights_tables_and_a_report(study, rows_of):
     assert all(int(row["flights"]) == 3 for row in table)
     page = (out / "report.html").read_text()
     assert page.count("data:image/png;base64,") == 2
-    assert "<h2>Policies, development seeds</h2>" in page
     assert "http" not in page.replace("http-equiv", "")
     assert all(f"splatpilot replay . {row['id']} --meshcat" in page for row in rows)
     assert not list(out.rglob(".*"))
+
+
+def test_killed_study_is_resumed_and_equals_an_uninterrupted_one(study, tmp_path, contents):
+    config, whole = study
+    out = tmp_path / "killed"
+    script = "from splatpilot.analysis.commands.main import main; main()"
+    words = ["--scenarios", config.scenarios[0], "--policies", ",".join(config.policies)]
+    words += ["--seeds", "3", "--jobs", "2", "--out", str(out)]
+    process = subprocess.Popen(
+        [sys.executable, "-c", script, "benchmark", *words],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    while process.poll() is None and not list(out.glob("rollouts/[!.]*.npz")):
+        time.sleep(0.005)
+    process.kill()
+    assert process.wait() == -signal.SIGKILL, "it ended before it could be killed"
+    flown = {path.name: path.stat().st_mtime_ns for path in out.glob("rollouts/[!.]*.npz")}
+    assert 0 < len(flown) < 6
+    assert not (out / "report.html").exists()
+
+    run_study.run(config=config, out=out, jobs=1)
+    assert contents(out) == contents(whole)
+    for name, when in flown.items():
+        assert (out / "rollouts" / name).stat().st_mtime_ns == when
+
+
+def test_study_interrupted_before_its_flights_is_resumed(study, tmp_path, monkeypatch, contents):
+    config, whole = study
+
+    def interrupt(*words):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(run_study, "keep_inputs", interrupt)
+        run_study.run(config=config, out=tmp_path / "begun", jobs=1)
+    run_study.run(config=config, out=tmp_path / "begun", jobs=1)
+    assert contents(tmp_path / "begun") == contents(whole)
 
 
 def test_damaged_files_are_flown_again_and_reported(study, tmp_path, capsys, contents):
@@ -133,6 +173,17 @@ def test_missing_cluster_is_named(study, tmp_path, monkeypatch):
         run_study.run(config=config, out=tmp_path / "out", cluster="tcp://127.0.0.1:1")
 
 
+@pytest.mark.parametrize(("split", "name"), [("dev", "development"), ("test", "test")])
+def test_report_and_table_name_the_split(short_scenario, tmp_path, capsys, split, name):
+    config = StudyConfig([str(short_scenario)], ["straight", "planner"], seeds=1, split=split)
+    run_study.run(config=config, out=tmp_path / "out", jobs=1)
+    page = (tmp_path / "out" / "report.html").read_text()
+    for heading in ("Policies", "Scenarios", "Pairs of policies on the same flights"):
+        assert f"<h2>{heading}, {name} seeds</h2>" in page
+    assert f"{name} seeds" in capsys.readouterr().out
+    assert f"split: {split}\n" in (tmp_path / "out" / "study.yaml").read_text()
+
+
 def test_test_study_flies_only_in_test_scenes_each_one_environment(room, tmp_path):
     hall = tmp_path / "hall.yaml"
     config = StudyConfig([str(hall)], ["straight"], seeds=1, split="test")
@@ -142,8 +193,7 @@ def test_test_study_flies_only_in_test_scenes_each_one_environment(room, tmp_pat
     hall.write_text(f"world: !SceneConfig {{path: {room.scene('held', split='test')}}}\n")
     (row,) = run_study.run(config=config, out=tmp_path / "out", jobs=1)
     assert row["flights"] == 1
-    page = (tmp_path / "out" / "report.html").read_text()
-    assert "Each of hall is one environment" in page and "<h2>Policies, test seeds</h2>" in page
+    assert "Each of hall is one environment" in (tmp_path / "out" / "report.html").read_text()
 
 
 def test_one_option_flies_the_dodgedrone_challenge(monkeypatch, tmp_path):
@@ -155,11 +205,8 @@ def test_one_option_flies_the_dodgedrone_challenge(monkeypatch, tmp_path):
     monkeypatch.setattr(run_study, "run", run)
     command = ["benchmark", "--dodgedrone", "--out", str(tmp_path)]
     assert main(command) == 0
-    part = ["--scenarios", "dodgedrone_easy", "--speeds", "3", "--seeds", "2"]
-    main([*command, *part, "--policies", "slow=planner:rate=2", "--sweep", "straight:rate=5,10"])
+    main([*command, "--scenarios", "dodgedrone_easy", "--speeds", "3", "--seeds", "2"])
     whole, part = studies
-    labels = ["slow", "straight-rate-5", "straight-rate-10"]
-    assert part.policy_names == labels
     assert whole.scenarios == list(PUBLISHED) and whole.speeds == list(DODGEDRONE_SPEEDS)
     assert tuple(whole.policies) == BENCHMARK_POLICIES and whole.seeds == 20
     assert (part.scenarios, part.speeds, part.seeds) == (["dodgedrone_easy"], [3.0], 2)

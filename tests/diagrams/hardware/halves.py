@@ -19,13 +19,15 @@ TICK = 0.005  # [s]
 class Halves:
     """Vehicle and bridge, whose time is two ticks behind; the test advances both."""
 
-    def __init__(self, scenario: Scenario, world, policy=None, **fields):
+    def __init__(
+        self, scenario: Scenario, world, vehicle: Scenario | None = None, policy=None, **fields
+    ):
         self.lcm = lcm.LCM("memq://")
         self.heard = heard = []  # The callback must not keep the diagrams alive.
         self.lcm.subscribe("BODY_RATE_COMMAND", lambda _, data: heard.append(data))
         config = replace(HardwareConfig(), **{"tick": TICK} | fields)
         self.tick_period = config.tick
-        self.vehicle = BuildVehicleDiagram(scenario, world, self.lcm, config)
+        self.vehicle = BuildVehicleDiagram(vehicle or scenario, world, self.lcm, config)
         self.hardware = BuildHardwareDiagram(scenario, world, self.lcm, config, policy=policy)
         self.simulators = [Simulator(self.vehicle), Simulator(self.hardware)]
         ApplySimulatorConfig(scenario.simulator, self.simulators[0])

@@ -36,6 +36,9 @@ from splatpilot.systems.messaging.receiver import (
     TimeOfFlightStream,
     UdpConfig,
 )
+from splatpilot.systems.policies.base import LearnedPolicyConfig
+from splatpilot.systems.policies.checkpoint import PolicyCheckpoint
+from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.vehicle.quadrotor import hover_state
 
@@ -47,6 +50,9 @@ STRAIGHT = Scenario(policy=policy_named("straight"))
 def forest():
     """Trunks on a ground that is drawn, which policies that see were trained to fly over."""
     return make_world(ForestConfig(length=12.0, width=8.0, height=4.0), 0)
+
+
+# The diagram --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["planner", "reactive", "depthnav", "diffaero", "diffaero_tof"])
@@ -73,6 +79,13 @@ def test_ports_are_those_of_the_flight_diagram(post_world):
         assert hardware.GetOutputPort(port.get_name()).size() == port.size()
 
 
+def test_before_the_first_state_nothing_is_commanded(post_world):
+    hardware = BuildHardwareDiagram(Scenario(), post_world, lcm.LCM("memq://"))
+    root = hardware.CreateDefaultContext()
+    expected = [status.WAITING, 0, np.inf, 0, 0, 0, 0]
+    np.testing.assert_array_equal(output(hardware, "status", root), expected)
+
+
 def test_commands_stop_when_the_vehicle_falls_silent(post_world):
     halves = Halves(STRAIGHT, post_world)
     halves.advance_to(0.5)
@@ -94,11 +107,13 @@ class Erratic(LeafSystem):
 
     raises = False
 
-    def __init__(self, port: str):
+    def __init__(self, port: str, heading: float | None = None):
         super().__init__()
         self.target = np.zeros(3)
         self.DeclareVectorInputPort("state", 13)
         self.DeclareVectorOutputPort(port, 3, self._calc)
+        if heading is not None:
+            self.DeclareStateOutputPort("heading", self.DeclareDiscreteState([heading]))
         self.DeclarePeriodicDiscreteUpdateEvent(0.1, 0.0, lambda context, state: None)
 
     def _calc(self, context, output) -> None:
@@ -135,6 +150,15 @@ def test_a_policy_that_raises_ends_no_flight(post_world, caplog):
     assert halves.mode()[0] == status.FLYING
 
 
+@pytest.mark.parametrize(
+    ("heading", "reason"), [(np.inf, status.NOT_FINITE), (np.nan, status.NONE)]
+)
+def test_a_heading_that_is_not_finite_ends_no_flight(post_world, heading, reason):
+    halves = Halves(STRAIGHT, post_world, policy=Erratic("velocity", heading))
+    halves.advance_to(0.3)
+    assert halves.mode()[1] == reason
+
+
 @pytest.mark.parametrize("seen", [True, False])
 def test_a_body_that_motion_capture_does_not_see_is_not_flown(post_world, seen):
     halves = Halves(STRAIGHT, post_world, body="starling")
@@ -147,20 +171,37 @@ def test_a_body_that_motion_capture_does_not_see_is_not_flown(post_world, seen):
         assert halves.mode() == (status.HOLDING, status.BODY_LOST)
 
 
-def test_a_policy_flies_by_the_stream_of_a_sensor(post_world):
-    stream = TimeOfFlightStream(UdpConfig(port=0))
-    scenario = Scenario(policy=policy_named("diffaero_tof"))
+@pytest.mark.parametrize("streamed", [False, True])
+def test_a_policy_flies_by_the_grid_of_a_sensor(post_world, tmp_path, streamed):
+    path, random = tmp_path / "weights.npz", np.random.default_rng(0)
+    shapes = DIFFAERO_NETWORK.weight_shapes().items()
+    weights = {key: random.normal(scale=0.1, size=shape) for key, shape in shapes}
+    PolicyCheckpoint("diffaero_tof", DIFFAERO_NETWORK, weights, {}).save(path)
+    stream = TimeOfFlightStream(UdpConfig(port=0)) if streamed else None
+    scenario = Scenario(policy=policy_named(str(path)))
     halves = Halves(scenario, post_world, time_of_flight=stream)
-    halves.advance_to(0.1)
-    assert halves.mode()[0] == status.WAITING
-    receiver = halves.hardware.GetSubsystemByName("depth_grid_receiver")
-    assert isinstance(receiver, TimeOfFlightReceiver)
-    packet = struct.pack("<IIQ144f", 0x544F4632, 1, 1, *[0.25] * 144)
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sensor:
-        sensor.sendto(packet, ("127.0.0.1", receiver.port))
-    halves.advance_to(0.3)
-    np.testing.assert_array_equal(halves.out("depth_grid"), np.full(144, 0.25))
+    if streamed:
+        halves.advance_to(0.1)
+        assert halves.mode()[0] == status.WAITING
+        receiver = halves.hardware.GetSubsystemByName("depth_grid_receiver")
+        assert isinstance(receiver, TimeOfFlightReceiver)
+        packet = struct.pack("<IIQ144f", 0x544F4632, 1, 1, *[0.25] * 144)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sensor:
+            sensor.sendto(packet, ("127.0.0.1", receiver.port))
+        halves.advance_to(0.3)
+        np.testing.assert_array_equal(halves.out("depth_grid"), np.full(144, 0.25))
+    else:
+        halves.advance_to(0.28)  # Just after an image: the vehicle moves.
+        sent = halves.vehicle.GetSubsystemByName("time_of_flight_grid")
+        expected = sent.get_output_port().Eval(sent.GetMyContextFromRoot(halves.vehicle_root))
+        differs = np.abs(halves.out("depth_grid") - expected) > 0.02
+        assert differs.mean() < 0.02  # The outline of the post moves over cells.
+        assert expected.max() > 0.1
     assert halves.mode()[0] == status.FLYING
+    policy = halves.hardware.GetSubsystemByName("policy")
+    desired = policy.GetOutputPort("velocity").Eval(policy.GetMyContextFromRoot(halves.root))
+    np.testing.assert_allclose(halves.out("velocity_setpoint")[:3], desired, atol=1e-12)
+    assert np.linalg.norm(desired) > 0.01
 
 
 def test_plans_are_sent(post_world):
@@ -201,6 +242,18 @@ def test_signals_without_messages_are_refused(post_world):
         BuildHardwareDiagram(Scenario(), post_world, transport, HardwareConfig(tick=0.0))
 
 
+def test_images_of_another_size_are_rejected(post_world):
+    policy = policy_named("diffaero")
+    assert isinstance(policy, LearnedPolicyConfig)
+    small = dataclasses.replace(policy, camera=OnboardCamera(width=32, height=18))
+    halves = Halves(Scenario(policy=policy), post_world, vehicle=Scenario(policy=small))
+    halves.advance_to(0.3)
+    mode, _, state_age, image_age, _, rejected, _ = halves.out("status")
+    assert (mode, image_age, rejected) == (status.WAITING, np.inf, 5)
+    assert state_age < 0.04
+    assert not halves.heard
+
+
 def test_both_halves_are_freed(post_world):
     halves = Halves(Scenario(policy=policy_named("diffaero")), post_world)
     transport, freed = halves.lcm, [weakref.ref(d) for d in (halves.vehicle, halves.hardware)]
@@ -209,6 +262,9 @@ def test_both_halves_are_freed(post_world):
     gc.collect()
     assert [reference() for reference in freed] == [None, None]
     assert transport is not None
+
+
+# The process --------------------------------------------------------------------------------------
 
 
 def test_three_processes_fly(udp_url, tmp_path):
@@ -250,16 +306,25 @@ def in_post_world(monkeypatch, post_world):
     monkeypatch.setattr(bridge, "make_world", lambda world, seed: post_world)
 
 
-def test_without_a_vehicle_it_gives_up_and_logs_are_not_overwritten(
-    udp_url, in_post_world, tmp_path
-):
+def test_without_a_vehicle_it_gives_up(udp_url, in_post_world):
+    config = HardwareConfig(url=udp_url, patience=0.2)
+    with pytest.raises(TimeoutError, match=r"nothing has come on QUADROTOR_STATE .*start the veh"):
+        bridge.run(scenario=STRAIGHT, config=config)
+
+
+def test_an_invalid_url_is_an_error_before_the_world_is_made():
+    with pytest.raises(OSError, match="must begin with udpm://"):
+        bridge.run(scenario=STRAIGHT, config=HardwareConfig(url="tcp://somewhere"))
+
+
+def test_logs_are_not_overwritten(udp_url, in_post_world, tmp_path):
     log = tmp_path / "log"
     log.write_text("a flight")
     config = HardwareConfig(url=udp_url, patience=0.2)
     with pytest.raises(FileExistsError):
         bridge.run(scenario=STRAIGHT, config=config, log=log)
     assert log.read_text() == "a flight"
-    with pytest.raises(TimeoutError, match=r"nothing has come on QUADROTOR_STATE .*start the veh"):
+    with pytest.raises(TimeoutError):
         bridge.run(scenario=STRAIGHT, config=config, log=log, overwrite=True)
     assert log.read_bytes() == b""
 

@@ -11,6 +11,7 @@ import pytest
 from natnet_frame import natnet_frame
 from px4_stand_in import BOOT, LAND, LOITER, OFFBOARD, POSITION, Px4StandIn
 from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import LeafSystem
 from pymavlink.dialects.v20 import common as dialect
 
 from splatpilot.analysis.commands.main import main
@@ -22,11 +23,13 @@ from splatpilot.diagrams.hardware.px4 import BuildPx4Diagram, Px4Config
 from splatpilot.diagrams.hardware.real_time import output
 from splatpilot.systems.messaging.codecs import MotionCaptureCodec
 from splatpilot.systems.messaging.failsafe import FailsafeConfig
+from splatpilot.systems.messaging.flight_limits import FlightLimits
 from splatpilot.systems.messaging.generated import lcmt_bridge_status as status
 from splatpilot.systems.messaging.lcm_ports import MessagePublisher
 from splatpilot.systems.messaging.receiver import UdpConfig, UdpInbox
 from splatpilot.systems.px4.commander import Px4CommanderConfig
 from splatpilot.systems.px4.motion_capture import MotionCaptureConfig
+from splatpilot.systems.vehicle.state import QuadrotorState
 
 START, GOAL = [1.0, 2.0, 2.0], [9.0, 2.0, 2.0]
 EPOCH = 1_800_000_000.0  # [s] Unix time when a test begins.
@@ -130,6 +133,23 @@ def test_px4_flies_along_the_policys_velocity(chain, version, setpoints):
     np.testing.assert_allclose(v, [1.0, 0.0, 0.0], atol=0.1)
 
 
+def test_nothing_arms_or_flies_by_default(chain):
+    flight = chain(commander=Px4CommanderConfig())
+    flight.advance(4.0)
+    assert not flight.px4.answers
+    assert (flight.px4.mode, flight.px4.armed) == (POSITION, False)
+    assert flight.px4.heard.count("SET_POSITION_TARGET_LOCAL_NED") > 100
+    np.testing.assert_array_equal(flight.px4.state[:3], START)
+
+
+@pytest.mark.parametrize(("version", "refusals"), [("1.16", 1), ("1.18", 0)])
+def test_a_request_that_px4_denies_is_repeated(chain, version, refusals):
+    flight = chain(version, dataclasses.replace(ENGAGED, streaming=0.5))
+    flight.advance(3.0)
+    assert [accepted for _, accepted in flight.px4.answers].count(False) == refusals
+    assert flight.px4.mode == OFFBOARD
+
+
 def test_if_the_bridge_dies_the_vehicle_holds(flight):
     flight.alive.remove("bridge")
     flight.advance(0.4)
@@ -143,9 +163,18 @@ def test_if_the_bridge_dies_the_vehicle_holds(flight):
     assert flight.px4.mode == LOITER
 
 
+def test_if_the_link_dies_px4_holds_by_itself(flight):
+    flight.alive.clear()
+    flight.advance(0.8)
+    assert flight.px4.mode == OFFBOARD
+    flight.advance(2.0)
+    assert flight.px4.mode == LOITER
+    assert np.linalg.norm(flight.px4.state[3:6]) < 0.1
+
+
 @pytest.mark.parametrize(
     ("setpoints", "silent"),
-    [("velocity", 0.25), ("velocity", 0.6), ("body_rates", 0.35)],
+    [("velocity", 0.05), ("velocity", 0.25), ("velocity", 0.6), ("body_rates", 0.35)],
 )
 def test_a_pilot_who_takes_over_keeps_the_vehicle(chain, setpoints, silent):
     flight = chain(commander=dataclasses.replace(ENGAGED, setpoints=setpoints))
@@ -208,14 +237,35 @@ def test_if_px4_falls_silent_the_bridge_stops_and_lands(chain, muted, mode):
 
 @pytest.mark.parametrize(("setpoints", "delay"), [("velocity", 0.1), ("body_rates", 0.06)])
 def test_states_that_are_late_are_brought_up_to_date(chain, setpoints, delay):
-    flight = chain(commander=dataclasses.replace(ENGAGED, setpoints=setpoints))
+    commander = dataclasses.replace(ENGAGED, setpoints=setpoints)
+    flight = chain(policy=Circle(2.0, "waypoint"), commander=commander)
     flight.px4.delay = delay
-    flight.advance(4.0)
+    flight.advance(5.0)
     for _ in range(100):
         flight.advance(0.01)
-        assert flight.px4.state[3] == pytest.approx(1.0, abs=0.1)
-        assert np.linalg.norm(flight.out("state")[:3] - flight.px4.state[:3]) < 0.03
+        assert np.linalg.norm(flight.px4.state[3:6]) == pytest.approx(2.0, abs=0.2)
+        assert np.linalg.norm(flight.out("state")[:3] - flight.px4.state[:3]) < 0.05
         assert flight.out("status")[2] > delay
+
+
+@pytest.mark.parametrize("sees", [None, {"body": 8}, {"body": 3, "tracked": False}])
+def test_if_motion_capture_loses_the_body_the_bridge_stops(chain, sees):
+    flight = chain(body="starling", hardware=HardwareConfig(body="starling"), motion_capture=True)
+    flight.advance(4.0)
+    assert flight.mode()[0] == status.FLYING
+    sent = len(flight.px4.odometry)
+    assert sent == pytest.approx(200, abs=3)
+    flight.sees = sees
+    flight.advance(0.26)
+    assert flight.mode()[0] == status.FLYING
+    flight.advance(0.06)
+    assert flight.mode() == (status.HOLDING, status.BODY_LOST)
+    flight.advance(0.02)
+    assert np.linalg.norm(flight.px4.velocity) == 0.0
+    flight.advance(2.0)
+    assert np.linalg.norm(flight.px4.state[3:6]) < 0.1
+    assert len(flight.px4.odometry) <= sent + 1
+    assert np.isfinite([[m.x, m.y, m.z, *m.q] for m in flight.px4.odometry]).all()
 
 
 def test_px4_learns_our_clock_and_when_cameras_exposed(chain):
@@ -244,6 +294,51 @@ def test_motion_capture_of_lcm_is_sent_on(chain):
     assert odometry.time_usec == pytest.approx(1e6 * (EPOCH + 0.1), abs=2)
 
 
+class Circle(LeafSystem):
+    """A policy that flies around the post."""
+
+    def __init__(self, speed: float, decision: str):
+        super().__init__()
+        self.speed = speed
+        self.DeclareVectorInputPort("state", 13)
+        self.DeclareVectorOutputPort(decision, 3, self._calc)
+
+    def _calc(self, context, output) -> None:
+        p_WB = self.get_input_port().Eval(context)[:3]
+        from_post = p_WB - [5.0, 0.0, p_WB[2]]
+        distance = np.linalg.norm(from_post)
+        out_W = from_post / distance
+        velocity = self.speed * np.cross(out_W, [0.0, 0.0, 1.0]) + (2.0 - distance) * out_W
+        velocity[2] = 2.0 - p_WB[2]
+        is_waypoint = self.HasOutputPort("waypoint")
+        output.set_value(p_WB + 0.4 * velocity if is_waypoint else velocity)
+
+
+@pytest.mark.parametrize(
+    ("decision", "speed", "max_speed"), [("waypoint", 0.8, 6.0), ("velocity", 1.6, 0.8)]
+)
+def test_over_velocities_the_camera_looks_along_a_curve(chain, decision, speed, max_speed):
+    hardware = HardwareConfig(failsafe=FailsafeConfig(limits=FlightLimits(max_speed=max_speed)))
+    flight = chain(policy=Circle(speed, decision), hardware=hardware)
+    flight.advance(5.0)
+    for _ in range(20):
+        flight.advance(0.2)
+        state = QuadrotorState.of(flight.px4.state)
+        along = np.arctan2(state.v_WB[1], state.v_WB[0])
+        assert np.linalg.norm(state.v_WB[:2]) == pytest.approx(0.8, abs=0.1)
+        assert np.cos(along - state.heading) > np.cos(np.radians(10.0))
+
+
+def test_a_vehicle_below_its_fence_is_armed_and_takes_off_into_it(chain):
+    flight = chain()
+    flight.px4.state[2] = -0.3
+    flight.advance(3.0)
+    assert (flight.px4.mode, flight.px4.armed) == (OFFBOARD, True)
+    flight.advance(4.0)
+    assert flight.mode()[0] == status.FLYING
+    assert flight.px4.state[2] > 0.35
+
+
 def test_the_process_says_what_it_does_not_do_and_how_long_there_is_no_heartbeat(
     udp_url, capsys, monkeypatch
 ):
@@ -269,3 +364,9 @@ def test_the_process_says_what_it_does_not_do_and_how_long_there_is_no_heartbeat
 def test_invalid_input_is_an_error_before_anything_is_sent(words, why, capsys):
     assert main(["hardware", "px4", *words]) == 1
     assert why in capsys.readouterr().err
+
+
+def test_a_port_that_is_taken_is_an_error(udp_url):
+    inbox = UdpInbox(UdpConfig(port=0))
+    with contextlib.closing(inbox), pytest.raises(OSError, match="Address already in use"):
+        px4.run(config=Px4Config(url=udp_url, udp=UdpConfig(port=inbox.port)))
