@@ -186,13 +186,17 @@ def _to_numpy(tensor: Tensor) -> NDArray[Any]:
     return np.ascontiguousarray(tensor.detach().numpy())
 
 
-def pair_meta(
-    names: Sequence[str], projected: Sequence[tuple[NDArray, ...]], width: int, height: int
-) -> dict[str, Any]:
-    """Returns gsplat's meta of both rasterizers from the arrays, with `names`, of each camera."""
-    counts = [len(arrays[0]) for arrays in projected]
-    arrays = (a[0] if len(a) == 1 else np.concatenate(a) for a in zip(*projected, strict=True))
-    return dict(zip(names, map(torch.from_numpy, arrays), strict=True)) | {
+def joined(parts: Sequence[tuple[NDArray, ...]]) -> list[Tensor]:
+    """Concatenates the arrays of each camera."""
+    return [
+        torch.from_numpy(arrays[0] if len(arrays) == 1 else np.concatenate(arrays))
+        for arrays in zip(*parts, strict=True)
+    ]
+
+
+def pair_meta(counts: list[int], width: int, height: int) -> dict[str, Any]:
+    """Returns gsplat's meta of both rasterizers for `counts` visible Gaussians of each camera."""
+    return {
         "camera_ids": torch.repeat_interleave(torch.arange(len(counts)), torch.tensor(counts)),
         "width": width,
         "height": height,
@@ -421,11 +425,18 @@ def rasterize(
         given = None if antialiased else arrays["opacities"]
         projected.append(_native.projected(views.renderer, frame, given))
         frames.append(frame)
-    names = "gaussian_ids", "radii", "means2d", "depths", "conics", "opacities"
-    meta = pair_meta(names, projected, width, height)
+    ids, radii, means2d, depths, conics, splat_opacities = joined(projected)
     if views.with_gradients:
-        splats = Project.apply(views, frames, (meta["means2d"],), *scene)
+        splats = Project.apply(views, frames, (means2d,), *scene)
         style = views.renderer, frames, depth_mode, behind, (image, alpha)
         image, alpha = Composite.apply(*style, *splats, backgrounds)  # pyright: ignore[reportGeneralTypeIssues]
-        meta["means2d"] = splats[0]  # pyright: ignore[reportOptionalSubscript]
+        means2d = splats[0]  # pyright: ignore[reportOptionalSubscript]
+    meta = pair_meta([frame.splat_count for frame in frames], width, height) | {
+        "gaussian_ids": ids,
+        "radii": radii,
+        "means2d": means2d,
+        "depths": depths,
+        "conics": conics,
+        "opacities": splat_opacities,
+    }
     return image, alpha, meta

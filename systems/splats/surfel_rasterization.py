@@ -9,7 +9,15 @@ from torch.autograd.function import once_differentiable
 from splatpilot import _native
 from splatpilot.systems.common.extras import import_extra
 from splatpilot.systems.common.validation import require
-from splatpilot.systems.splats import rasterization
+from splatpilot.systems.splats.rasterization import (
+    Views,
+    joined,
+    named_tensors,
+    over_backgrounds,
+    pair_meta,
+    prepare,
+    require_choice,
+)
 
 IMAGES = {"color": 3, "normal": 3, "depth": 1, "alpha": 1, "median": 1, "distort": 1}  # channels
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
@@ -24,7 +32,7 @@ class RasterizeSurfels(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx,
-        views: rasterization.Views,
+        views: Views,
         frames: list[_native.SurfelFrame],
         distort: bool,
         results: tuple[Tensor, ...],
@@ -134,11 +142,11 @@ def rasterize_surfels(
             tile_size, tile_width, tile_height, n_cameras, render_distort.
     """
     scene = (means, quats, scales, opacities, colors, viewmats)
-    rasterization.require_choice("render_mode", render_mode, RENDER_MODES)
-    rasterization.require_choice("depth_mode", depth_mode, ("expected", "median"))
+    require_choice("render_mode", render_mode, RENDER_MODES)
+    require_choice("depth_mode", depth_mode, ("expected", "median"))
     with_depth = "D" in render_mode
     require(not distloss or with_depth, "render_mode", "one with depth for distloss", render_mode)
-    tensors = rasterization.named_tensors(*scene, Ks, backgrounds, sh_degree=sh_degree)
+    tensors = named_tensors(*scene, Ks, backgrounds, sh_degree=sh_degree)
     optics: dict[str, Any] = {
         "width": width,
         "height": height,
@@ -151,9 +159,9 @@ def rasterize_surfels(
         image, alpha, *others = _rasterize_by_gsplat(
             *scene, Ks, **optics, sh_degree=sh_degree, **modes
         )
-        image = rasterization.over_backgrounds(backgrounds, image, alpha, render_mode)
+        image = over_backgrounds(backgrounds, image, alpha, render_mode)
         return image, alpha, *others  # pyright: ignore[reportReturnType]
-    views, arrays = rasterization.prepare(tensors, sh_degree, renderer, scale_axes=2, **optics)
+    views, arrays = prepare(tensors, sh_degree, renderer, scale_axes=2, **optics)
     keep, shape = views.with_gradients, (len(viewmats), height, width)
     images = tuple(torch.empty((*shape, channels)) for channels in IMAGES.values())
     if not distloss:
@@ -180,11 +188,17 @@ def rasterize_surfels(
     parts = [color] if "RGB" in render_mode else []
     if with_depth:
         parts.append(expected if "ED" in render_mode else depth)
-    image = rasterization.over_backgrounds(backgrounds, torch.cat(parts, -1), alpha, render_mode)
-    names = "gaussian_ids", "radii", "means2d", "depths", "normals"
-    meta = rasterization.pair_meta(names, projected, width, height)
-    meta["opacities"] = torch.from_numpy(arrays["opacities"])[meta["gaussian_ids"]]
-    meta["render_distort"] = distort
+    image = over_backgrounds(backgrounds, torch.cat(parts, -1), alpha, render_mode)
+    ids, radii, means2d, depths, normals = joined(projected)
+    meta = pair_meta([len(of_camera[0]) for of_camera in projected], width, height) | {
+        "gaussian_ids": ids,
+        "radii": radii,
+        "means2d": means2d,
+        "depths": depths,
+        "normals": normals,
+        "opacities": torch.from_numpy(arrays["opacities"])[ids],
+        "render_distort": distort,
+    }
     return image, alpha, normal, surface, distort, median, meta
 
 

@@ -356,7 +356,7 @@ def test_gsplat_gives_pairs_with_normals_in_the_world(monkeypatch):
 
     stand_in = types.SimpleNamespace(rasterization_2dgs=rasterization_2dgs)
     monkeypatch.setattr(surfel_rasterization, "import_extra", lambda *_: stand_in)
-    monkeypatch.setattr(surfel_rasterization.rasterization, "named_tensors", lambda *_, **__: None)
+    monkeypatch.setattr(surfel_rasterization, "named_tensors", lambda *_, **__: None)
     scene = random_scene(count=N) | {"means": FakeCuda(N)}
     scene["viewmats"][0, :3, :3] = R = torch.tensor([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
     options = {"width": WIDTH, "height": HEIGHT, "render_mode": "RGB+ED"}
