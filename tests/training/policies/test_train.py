@@ -2,6 +2,10 @@ import csv
 import json
 import os
 import re
+import signal
+import subprocess
+import sys
+import time
 import zipfile
 from contextlib import contextmanager
 from pathlib import Path
@@ -80,6 +84,22 @@ def test_run_leaves_what_it_says(finished):
     assert {"velocity", "contact", "success", "collisions"} <= set(rows[0])
     summary = json.loads((finished / "summary.json").read_text())
     assert summary["updates"] == 6 and summary["seed"] == 0
+
+
+def test_killed_run_ends_as_one_that_was_not(finished, tmp_path):
+    program = "from splatpilot.analysis.commands.main import main; raise SystemExit(main())"
+    command = [sys.executable, "-c", program, "train", "diffaero", "--out", str(tmp_path)]
+    for override in TINY:
+        command += ["--set", override]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    while not (tmp_path / "checkpoint.pt").exists() and process.poll() is None:
+        time.sleep(0.002)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    run(config=tiny(), out=tmp_path, make=TRAINERS.find("diffaero").make)
+    assert_same(tmp_path, finished)
+    rows = (tmp_path / "curves.csv").read_text()
+    assert rows == (finished / "curves.csv").read_text()
 
 
 def test_a_command_trains_seeds_one_after_the_other(finished, tmp_path):
