@@ -155,8 +155,10 @@ class ShapeUnion:
         """
         points = np.ascontiguousarray(p_WQ, dtype=float)
         distances, gradients = np.empty(points.shape[:-1]), np.empty(points.shape)
-        wanted = {"gradients": gradients.reshape(-1, 3)} if with_gradient else {}
-        self._native.nearest(p_WQ=points.reshape(-1, 3), distances=distances.reshape(-1), **wanted)
+        outputs = {"distances": distances.reshape(-1)}
+        if with_gradient:
+            outputs["gradients"] = gradients.reshape(-1, 3)
+        self._native.nearest(p_WQ=points.reshape(-1, 3), **outputs)
         return distances, gradients
 
 
@@ -205,7 +207,12 @@ class MovingSpheres:
 
     def __init__(self, radii: ArrayLike, paths: Sequence[NDArray], period: float) -> None:
         self.radii = np.asarray(radii, dtype=float)
-        self._last = np.array([len(path) - 1 for path in paths])
+        rows = [len(path) for path in paths]
+        valid = len(rows) == len(self.radii) and all(rows)
+        require(valid, "paths", f"{len(self.radii)}, like radii, of at least one row each", rows)
+        require((self.radii > 0.0).all(), "radii", "> 0 m", self.radii.tolist())
+        require(period > 0.0, "period", "> 0 s", period)
+        self._last = np.array(rows, dtype=int) - 1
         self._rows = np.concatenate([np.zeros((0, 3)), *paths])
         self._first = np.cumsum(self._last + 1) - self._last - 1
         self._period = period
@@ -214,8 +221,8 @@ class MovingSpheres:
         """Returns the centers (M, 3) [m] at a time [s]."""
         # Steps that end on a row reach it, however the time was rounded.
         step = int(np.floor(time / self._period + 1e-6))
-        there_and_back = step % np.maximum(2 * self._last, 1)
-        return self._rows[self._first + np.minimum(there_and_back, 2 * self._last - there_and_back)]
+        forward = step % np.maximum(2 * self._last, 1)
+        return self._rows[self._first + np.minimum(forward, 2 * self._last - forward)]
 
     def among(self, field: DistanceField, time: float) -> "FieldWithSpheres":
         """Returns a distance field with the spheres at a time [s]."""

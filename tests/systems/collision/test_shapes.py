@@ -170,6 +170,20 @@ def test_impossible_shapes_are_refused(make, message):
         field_of(make())
 
 
+@pytest.mark.parametrize(
+    ("radii", "paths", "period", "message"),
+    [
+        ([1.0, 1.0], [np.zeros((1, 3))], 0.1, "paths must be 2"),
+        ([1.0], [np.zeros((0, 3))], 0.1, "at least one row"),
+        ([0.0], [np.zeros((1, 3))], 0.1, "radii must be > 0"),
+        ([1.0], [np.zeros((1, 3))], 0.0, "period must be > 0"),
+    ],
+)
+def test_impossible_moving_spheres_are_refused(radii, paths, period, message):
+    with pytest.raises(ValueError, match=message):
+        MovingSpheres(radii, paths, period)
+
+
 def test_empty_bounds_are_refused():
     with pytest.raises(ValueError, match="upper_W must be above"):
         AnalyticDistanceField([], np.zeros(3), np.array([1.0, 0.0, 1.0]))
