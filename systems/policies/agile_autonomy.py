@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 
-from splatpilot.systems.common.drake import input_port, output_port
 from splatpilot.systems.policies.base import LearnedPolicyConfig, Observation, Policy
 from splatpilot.systems.policies.checkpoint import (
     PolicyCheckpoint,
@@ -25,7 +24,7 @@ from splatpilot.systems.policies.recurrent_network import (
     leaky_relu,
 )
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
-from splatpilot.systems.vehicle.flatness import array_namespace
+from splatpilot.systems.vehicle.state import array_namespace
 
 RATE = 15.0  # [Hz]
 CAMERA_SIZE = 128, 96  # [px] width and height before pooling
@@ -37,9 +36,8 @@ WAYPOINT_SCALE = 2.0  # [m] per unit of the network's output
 PROGRESS = 0.1
 """[1/m] Reward for progress; by collision costs alone the cheapest trajectory is often to stay."""
 
-NEAR_TIE = (
-    0.02  # Below this difference of costs, the one that continues the last plan is preferred.
-)
+NEAR_TIE = 0.02
+"""Difference of costs below which the hypothesis that continues the last plan is preferred."""
 IMAGE_SIZE = 24, 32  # [px] height and width
 
 
@@ -172,9 +170,6 @@ class AgileAutonomy(Policy):
     - ``hypotheses`` (8 + 31 * 3): as `Hypotheses.to_vector`, in the body frame B at the time of
       planning; NaN before the first update.
     """
-
-    depth_image_32f_input_port = input_port("depth_image_32f")
-    hypotheses_output_port = output_port("hypotheses")
 
     def __init__(self, config: AgileAutonomyConfig | None = None) -> None:
         super().__init__(config or AgileAutonomyConfig(), "depth_image_32f")

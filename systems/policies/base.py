@@ -11,7 +11,6 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
-from splatpilot.systems.common.drake import input_port
 from splatpilot.systems.common.validation import Config, bounded, require
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.vehicle.state import QuadrotorState, pose_from_state
@@ -74,9 +73,6 @@ class Policy(LeafSystem):
         config: has `rate` [Hz] and `validate()`; with an image of a camera, `camera`.
         image: name of the image port; empty if the policy has none.
     """
-
-    state_input_port = input_port("state")
-    goal_input_port = input_port("goal")
 
     def __init__(self, config: Any, image: str = "") -> None:
         super().__init__()

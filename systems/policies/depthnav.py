@@ -9,7 +9,6 @@ from math import atan2
 import numpy as np
 from pydrake.math import RotationMatrix
 
-from splatpilot.systems.common.drake import input_port, output_port
 from splatpilot.systems.policies.base import LearnedPolicyConfig, Observation, Policy
 from splatpilot.systems.policies.observations import (
     heading_frame,
@@ -93,10 +92,6 @@ class DepthNav(Policy):
     - ``acceleration`` (3): a_WB [m/s^2], W frame, gravity excluded.
     - ``heading`` (1): of body x, from world x seen from above [rad]; NaN before the first update.
     """
-
-    depth_image_32f_input_port = input_port("depth_image_32f")
-    acceleration_output_port = output_port("acceleration")
-    heading_output_port = output_port("heading")
 
     def __init__(self, config: DepthNavConfig | None = None) -> None:
         super().__init__(config or DepthNavConfig(), "depth_image_32f")

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from splatpilot.systems.common.drake import input_port, output_port
 from splatpilot.systems.policies.base import LearnedPolicyConfig, Observation, Policy
 from splatpilot.systems.policies.observations import (
     heading_frame,
@@ -107,9 +106,6 @@ class DiffAero(Policy):
     - ``acceleration`` (3): a_WB [m/s^2], W frame, gravity excluded.
     """
 
-    depth_image_32f_input_port = input_port("depth_image_32f")
-    acceleration_output_port = output_port("acceleration")
-
     def __init__(self, config: DiffAeroConfig | None = None) -> None:
         super().__init__(config or DiffAeroConfig(), "depth_image_32f")
         self._network = load_network(self._config.weights, "diffaero", DIFFAERO_NETWORK)
@@ -136,9 +132,6 @@ class DiffAeroTof(Policy):
 
     - ``velocity`` (3): desired v_WB [m/s], W frame.
     """
-
-    depth_grid_input_port = input_port("depth_grid")
-    velocity_output_port = output_port("velocity")
 
     def __init__(self, config: DiffAeroTofConfig | None = None) -> None:
         super().__init__(config or DiffAeroTofConfig(), "depth_grid")

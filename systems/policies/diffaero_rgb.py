@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from splatpilot.systems.common.drake import input_port, output_port
 from splatpilot.systems.common.validation import require, require_field
 from splatpilot.systems.policies.base import LearnedPolicyConfig, Observation, Policy
 from splatpilot.systems.policies.checkpoint import PolicyCheckpoint, check_weights
@@ -170,9 +169,6 @@ class DiffAeroRgb(Policy):
 
     - ``acceleration`` (3): a_WB [m/s^2], W frame, gravity excluded.
     """
-
-    color_image_input_port = input_port("color_image")
-    acceleration_output_port = output_port("acceleration")
 
     def __init__(self, config: DiffAeroRgbConfig | None = None) -> None:
         super().__init__(config or DiffAeroRgbConfig(), "color_image")

@@ -17,7 +17,6 @@ from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
-from splatpilot.systems.common.drake import input_port, output_port
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.vehicle.state import QuadrotorState
 
@@ -128,10 +127,6 @@ class HypothesisSelector(LeafSystem):
         num_hypotheses: K, as at the policy.
         lookahead: [s], in (0, 1], as at the controller.
     """
-
-    hypotheses_input_port = input_port("hypotheses")
-    state_input_port = input_port("state")
-    waypoint_output_port = output_port("waypoint")
 
     def __init__(self, num_hypotheses: int = 3, lookahead: float = 0.4) -> None:
         super().__init__()

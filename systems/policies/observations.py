@@ -6,7 +6,7 @@ dimensions `...` are batches.
 
 from typing import Any
 
-from splatpilot.systems.vehicle.flatness import array_namespace
+from splatpilot.systems.vehicle.state import array_namespace
 
 
 def pool_depth(depth: Any, height: int, width: int) -> Any:

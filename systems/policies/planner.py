@@ -10,7 +10,7 @@ from pydrake.systems.framework import Context, DiscreteValues, ValueProducer
 from splatpilot.systems.collision.distance_field import Distances
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.shapes import MovingSpheres
-from splatpilot.systems.common.drake import output_port, weak_callback
+from splatpilot.systems.common.drake import weak_callback
 from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.common.validation import Config, bounded, require
 from splatpilot.systems.policies.base import Policy
@@ -88,8 +88,6 @@ class PrivilegedPlanner(Policy):
     trajectories know their future positions. Updates raise InfeasibleFlightError if the goal is
     outside the known volume, too close to an obstacle or cut off from the vehicle.
     """
-
-    hypotheses_output_port = output_port("hypotheses")
 
     def __init__(
         self,

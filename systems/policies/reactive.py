@@ -11,7 +11,6 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from splatpilot.systems.collision.distance_field import soft_barrier
-from splatpilot.systems.common.drake import input_port, output_port
 from splatpilot.systems.common.validation import Config, bounded, require_field
 from splatpilot.systems.policies.base import Observation, Policy
 from splatpilot.systems.policies.motion_primitives import rotation_to, velocity_fan
@@ -210,9 +209,6 @@ class Reactive(Policy):
     The second group of the discrete state holds the points of the last ``memory`` images in the
     world frame; missing ones are NaN.
     """
-
-    depth_image_32f_input_port = input_port("depth_image_32f")
-    acceleration_output_port = output_port("acceleration")
 
     def __init__(self, config: ReactiveConfig | None = None) -> None:
         config = config or ReactiveConfig()

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from splatpilot.systems.common.drake import output_port
 from splatpilot.systems.common.validation import Config, bounded
 from splatpilot.systems.policies.base import Observation, Policy
 from splatpilot.systems.policies.observations import target_velocity
@@ -36,8 +35,6 @@ class Straight(Policy):
 
     - ``acceleration`` (3): a_WB [m/s^2], W frame, gravity excluded.
     """
-
-    acceleration_output_port = output_port("acceleration")
 
     def __init__(self, config: StraightConfig | None = None) -> None:
         super().__init__(config or StraightConfig())

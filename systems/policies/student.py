@@ -11,7 +11,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from splatpilot.systems.common.drake import output_port
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.policies.base import LearnedPolicyConfig, Observation, Policy
 from splatpilot.systems.policies.checkpoint import (
@@ -280,8 +279,6 @@ class Student(Policy):
     - ``hypotheses`` (8 + 31 * 3): as `Hypotheses.to_vector`, in the body frame B at the time of
       planning; NaN before the first update.
     """
-
-    hypotheses_output_port = output_port("hypotheses")
 
     def __init__(self, config: StudentConfig) -> None:
         rgb = config.observation == "rgb"

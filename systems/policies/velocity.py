@@ -6,13 +6,9 @@ from typing import Any
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
-from splatpilot.systems.common.drake import input_port, optional_input, output_port
-from splatpilot.systems.vehicle.flatness import (
-    FlatnessControllerConfig,
-    array_namespace,
-    heading_along_motion,
-)
-from splatpilot.systems.vehicle.state import QuadrotorState
+from splatpilot.systems.common.drake import optional_input, vector_input
+from splatpilot.systems.vehicle.flatness import FlatnessControllerConfig, heading_along_motion
+from splatpilot.systems.vehicle.state import QuadrotorState, array_namespace
 
 SLOWING_TIME = 0.75  # [s] for `target_velocity`, of classical policies
 RESPONSE_TIME = 0.4  # [s] time constant of velocity tracking; that of the attitude is 0.1 s
@@ -44,10 +40,6 @@ class VelocityTracker(LeafSystem):
     - ``acceleration`` (3): a_WB [m/s^2], W frame, gravity excluded.
     """
 
-    state_input_port = input_port("state")
-    velocity_input_port = input_port("velocity")
-    acceleration_output_port = output_port("acceleration")
-
     def __init__(self) -> None:
         super().__init__()
         self.DeclareVectorInputPort("state", 13)
@@ -55,8 +47,8 @@ class VelocityTracker(LeafSystem):
         self.DeclareVectorOutputPort("acceleration", 3, self._calc)
 
     def _calc(self, context: Context, output: BasicVector) -> None:
-        state = QuadrotorState.of(np.asarray(self.GetInputPort("state").Eval(context)))
-        v_desired = np.asarray(self.GetInputPort("velocity").Eval(context))
+        state = QuadrotorState.of(vector_input(self, "state", context))
+        v_desired = vector_input(self, "velocity", context)
         output.SetFromVector(tracking_acceleration(state.v_WB, v_desired))
 
 
@@ -93,13 +85,6 @@ class VelocitySetpoint(LeafSystem):
         controller: its `lookahead` and `yaw_speed` are used.
     """
 
-    state_input_port = input_port("state")
-    velocity_input_port = input_port("velocity")
-    waypoint_input_port = input_port("waypoint")
-    acceleration_input_port = input_port("acceleration")
-    heading_input_port = input_port("heading")
-    velocity_setpoint_output_port = output_port("velocity_setpoint")
-
     def __init__(self, controller: FlatnessControllerConfig):
         super().__init__()
         self._lookahead, self._yaw_speed = controller.lookahead, controller.yaw_speed
@@ -109,7 +94,7 @@ class VelocitySetpoint(LeafSystem):
         self.DeclareVectorOutputPort("velocity_setpoint", 4, self._calc)
 
     def _calc(self, context: Context, output: BasicVector) -> None:
-        state = QuadrotorState.of(np.asarray(self.GetInputPort("state").Eval(context)))
+        state = QuadrotorState.of(vector_input(self, "state", context))
         velocity, waypoint, heading = (
             optional_input(self, name, context) for name in ("velocity", "waypoint", "heading")
         )
@@ -117,7 +102,7 @@ class VelocitySetpoint(LeafSystem):
         if velocity is None and waypoint is not None:
             velocity = motion_W = (waypoint - state.p_WB) / self._lookahead
         elif velocity is None:
-            a_WB = np.asarray(self.GetInputPort("acceleration").Eval(context))
+            a_WB = vector_input(self, "acceleration", context)
             velocity = state.v_WB + RESPONSE_TIME * a_WB
         if heading is None or math.isnan(heading[0]):
             along, fraction = heading_along_motion(motion_W, self._yaw_speed)

@@ -23,7 +23,7 @@ def field_of(shapes, size) -> Esdf:
 
 @pytest.fixture(scope="session")
 def empty() -> Esdf:
-    """16 x 8 x 6 m of nothing but its bounds."""
+    """16 x 8 x 6 m without obstacles."""
     shape = (80, 40, 30)
     far, free = np.full(shape, 50.0, np.float32), np.zeros(shape, np.uint8)
     return Esdf(far, free, np.zeros(3), VOXEL_SIZE).conservative()

@@ -35,11 +35,12 @@ def test_nearest_points_are_those_of_single_pixels():
 
 
 def test_responses_solve_the_tracking_equation():
-    p, v, wanted = np.array([1.0, 2.0, 3.0]), np.array([2.0, 0.0, -1.0]), np.array([0.0, 1.0, 1.0])
-    positions = responses(p, v, wanted[None], horizon=1.5)[0]
+    p, v = np.array([1.0, 2.0, 3.0]), np.array([2.0, 0.0, -1.0])
+    desired = np.array([0.0, 1.0, 1.0])
+    positions = responses(p, v, desired[None], horizon=1.5)[0]
     step, expected = 1e-4, []
     for k in range(1, 15001):
-        v = v + step * (wanted - v) / RESPONSE_TIME
+        v = v + step * (desired - v) / RESPONSE_TIME
         p = p + step * v
         if k % 2500 == 0:
             expected.append(p)
@@ -80,7 +81,7 @@ def test_contact_and_the_unseen_cost():
     assert unseen - seen == pytest.approx(CONFIG.unseen_weight * steps[far].sum())
 
 
-def test_angles_mean_what_they_mean_to_the_planner():
+def test_candidates_are_those_of_the_planner():
     angles = {"max_yaw": 0.7, "max_pitch": 0.2, "num_yaws": 5, "num_pitches": 3}
     v = candidate_velocities(np.array([1.0, 0.0, 0.0]), ReactiveConfig(**angles))
     lattice = final_velocities(LatticeConfig(**angles))
@@ -93,22 +94,22 @@ def observe(depth: np.ndarray, yaw: float, p_WG: list[float]) -> Observation:
     return Observation(0.0, pose_from_state(state), QuadrotorState.of(state), np.array(p_WG), depth)
 
 
-NOTHING = np.full((CONFIG.memory * CONFIG.rows * CONFIG.columns, 3), np.nan)
+NO_POINTS = np.full((CONFIG.memory * CONFIG.rows * CONFIG.columns, 3), np.nan)
 
 
 def test_flies_ahead_in_the_open_and_aside_of_a_post():
     post = empty_image()
     post[:, 26:34] = 2.0  # From left of the middle to just right of it.
     ahead, right, left = (
-        decide(observe(depth, 0.0, [10.0, 0.0, 2.0]), NOTHING, CONFIG)[0]
+        decide(observe(depth, 0.0, [10.0, 0.0, 2.0]), NO_POINTS, CONFIG)[0]
         for depth in (empty_image(), post, post[:, ::-1])
     )
     assert ahead[0] > 3.0 and np.abs(ahead[1:]).max() < 0.5
     assert right[1] < -0.5 and left[1] == pytest.approx(-right[1])
 
 
-def test_remembers_what_it_no_longer_sees():
-    config, points = ReactiveConfig(memory=2), NOTHING[: 2 * 144]
+def test_remembers_points_that_are_no_longer_seen():
+    config, points = ReactiveConfig(memory=2), NO_POINTS[: 2 * 144]
     for k, depth in enumerate((3.0, np.inf, np.inf, np.inf)):
         seen = observe(np.full_like(empty_image(), depth), np.pi / 2, [0.0, 10.0, 2.0])
         _, points = decide(seen, points, config)

@@ -15,10 +15,10 @@ def test_velocities_are_approached_in_four_tenths_of_a_second():
     system = VelocityTracker()
     context = system.CreateDefaultContext()
     state = np.array([9.0, 9, 9, 1, 0, -1, 1, 0, 0, 0, 0, 0, 0])
-    system.state_input_port().FixValue(context, state)
-    for wanted, expected in (([2, 1, -1], [2.5, 2.5, 0]), ([1, 0, 7], [0, 0, 6])):
-        system.velocity_input_port().FixValue(context, np.array(wanted, dtype=float))
-        found = system.acceleration_output_port().Eval(context)
+    system.GetInputPort("state").FixValue(context, state)
+    for desired, expected in (([2, 1, -1], [2.5, 2.5, 0]), ([1, 0, 7], [0, 0, 6])):
+        system.GetInputPort("velocity").FixValue(context, np.array(desired, dtype=float))
+        found = system.GetOutputPort("acceleration").Eval(context)
         np.testing.assert_allclose(found, expected, atol=1e-12)
 
 
@@ -38,22 +38,22 @@ def setpoint(**inputs) -> np.ndarray:
     context = system.CreateDefaultContext()
     for name, value in {"state": STATE, **inputs}.items():
         system.GetInputPort(name).FixValue(context, value)
-    return system.velocity_setpoint_output_port().Eval(context)
+    return system.GetOutputPort("velocity_setpoint").Eval(context)
 
 
-def test_acceleration_leads_to_the_velocity_that_was_wanted():
-    wanted = np.array([1.5, 0.5, -0.3])
-    acceleration = tracking_acceleration(STATE[3:6], wanted)
-    np.testing.assert_allclose(setpoint(acceleration=acceleration)[:3], wanted)
+def test_acceleration_leads_to_the_desired_velocity():
+    desired = np.array([1.5, 0.5, -0.3])
+    acceleration = tracking_acceleration(STATE[3:6], desired)
+    np.testing.assert_allclose(setpoint(acceleration=acceleration)[:3], desired)
 
 
-def test_velocity_is_told_as_it_is():
+def test_velocity_passes_unchanged():
     np.testing.assert_array_equal(setpoint(velocity=np.array([1.0, -2, 3]))[:3], [1, -2, 3])
 
 
 def test_waypoint_is_reached_in_time():
-    told = setpoint(waypoint=np.array([2.0, 2, 2]), heading=np.array([0.7]))
-    np.testing.assert_allclose(told, [2.0, 0.0, -2.0, 0.7])
+    found = setpoint(waypoint=np.array([2.0, 2, 2]), heading=np.array([0.7]))
+    np.testing.assert_allclose(found, [2.0, 0.0, -2.0, 0.7])
 
 
 @pytest.mark.parametrize("speed", [0.1, 0.3, 0.5, 2.0])
@@ -66,16 +66,16 @@ def test_without_a_heading_the_turn_is_that_of_the_controller(decision, speed, h
         "waypoint": state[:3] + CONTROLLER.lookahead * state[3:6],
         "acceleration": np.zeros(3),
     }
-    told = setpoint(state=state, **{decision: inputs[decision]}, **heading)
+    found = setpoint(state=state, **{decision: inputs[decision]}, **heading)
     controller = FlatnessController(CONTROLLER, QuadrotorParams(drag=0.0))
     context = controller.CreateDefaultContext()
     for name, value in {"state": state, decision: inputs[decision]}.items():
         controller.GetInputPort(name).FixValue(context, value)
     command = controller.EvalUniquePeriodicDiscreteUpdate(context).value(0)
-    assert CONTROLLER.yaw_gain * (told[3] - 3.0) == pytest.approx(command[3], abs=1e-9)
+    assert CONTROLLER.yaw_gain * (found[3] - 3.0) == pytest.approx(command[3], abs=1e-9)
     assert command[3] == pytest.approx(3.0 * (2 * np.pi - 5.8) * min(1.0, speed / 0.5) ** 2)
 
 
-def test_no_speed_asks_for_no_turn():
+def test_heading_stays_at_rest():
     state = hover_state([1.0, 2.0, 3.0], yaw=3.0)
     assert setpoint(state=state, acceleration=np.array([1.0, 0, 0]))[3] == pytest.approx(3.0)
