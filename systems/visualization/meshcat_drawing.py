@@ -16,6 +16,7 @@ from pydrake.systems.sensors import CameraInfo, ImageRgba8U
 from splatpilot.systems.collision.distance_field import DistanceField, FieldState
 from splatpilot.systems.collision.field_mesh import add_primitive, data_uri
 from splatpilot.systems.collision.shapes import MovingSpheres
+from splatpilot.systems.common.drake import vector_input
 from splatpilot.systems.policies.hypotheses import Hypotheses, hypotheses_size, num_hypotheses_in
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.splats.splat_camera import SplatCamera
@@ -95,8 +96,7 @@ def draw_vehicle(meshcat: Meshcat, path: str, radius: float) -> None:
         )
 
 
-UNKNOWN_GRAY = 0.4
-"""Shade of unobserved space."""
+UNKNOWN_GRAY = 0.4  # Shade of unobserved space.
 
 
 def distance_colors(distances: np.ndarray) -> np.ndarray:
@@ -162,7 +162,7 @@ class FlightVisualizer(LeafSystem):
         name: FlightVisualizer
         input_ports: [state, hypotheses]
 
-    Publishes every `period` seconds. `<path>/vehicle` must have the vehicle's shape, see
+    Publishes every `period` [s]. `/splatpilot/vehicle` must have the vehicle's shape, see
     `draw_vehicle`. Hypotheses are green (lowest cost) to red (highest).
     """
 
@@ -171,20 +171,10 @@ class FlightVisualizer(LeafSystem):
         meshcat: Meshcat,
         num_hypotheses: int,
         period: float = 1 / 15,
-        path: str = "/splatpilot",
     ):
-        """Declares the ports.
-
-        Args:
-            num_hypotheses: 0 for no port `hypotheses`.
-            period: [s] between images.
-            path: Meshcat path of all objects.
-        """
+        """Declares the ports; `num_hypotheses` is 0 for no port `hypotheses`."""
         super().__init__()
-        self._meshcat = meshcat
-        self._num_hypotheses = num_hypotheses
-        self._period = period
-        self._path = path
+        self._meshcat, self._num_hypotheses = meshcat, num_hypotheses
         self.DeclareVectorInputPort("state", 13)
         if num_hypotheses:
             self.DeclareVectorInputPort("hypotheses", hypotheses_size(num_hypotheses))
@@ -209,13 +199,10 @@ class FlightVisualizer(LeafSystem):
             builder.Connect(hypotheses_port, visualizer.GetInputPort("hypotheses"))
         return visualizer
 
-    def _eval(self, port: str, context: Context) -> np.ndarray:
-        return np.asarray(self.GetInputPort(port).Eval(context))
-
     def _trail(self, context: Context) -> np.ndarray:
         """Returns the positions (n, 3) [m] of the last images and of this one."""
         before = context.get_discrete_state_vector().value().reshape(-1, 3)
-        p_WB = QuadrotorState.of(self._eval("state", context)).p_WB
+        p_WB = QuadrotorState.of(vector_input(self, "state", context)).p_WB
         return np.vstack([before[~np.isnan(before[:, 0])], p_WB])
 
     def _extend_trail(self, context: Context, discrete_state) -> EventStatus:
@@ -225,15 +212,15 @@ class FlightVisualizer(LeafSystem):
         return EventStatus.Succeeded()
 
     def _publish(self, context: Context) -> EventStatus:
-        X_WB = pose_from_state(self._eval("state", context))
-        self._meshcat.SetTransform(f"{self._path}/vehicle", X_WB, context.get_time())
+        X_WB = pose_from_state(vector_input(self, "state", context))
+        self._meshcat.SetTransform("/splatpilot/vehicle", X_WB, context.get_time())
         red = Rgba(0.9, 0.1, 0.1)
-        self._meshcat.SetLine(f"{self._path}/trail", self._trail(context).T, 4.0, red)
+        self._meshcat.SetLine("/splatpilot/trail", self._trail(context).T, 4.0, red)
         if self._num_hypotheses:
-            vector = self._eval("hypotheses", context)
+            vector = vector_input(self, "hypotheses", context)
             plan = Hypotheses.from_vector(vector, self._num_hypotheses)
             if plan is not None:
-                self._meshcat.SetTriangleColorMesh(f"{self._path}/hypotheses", *fan_mesh(plan))
+                self._meshcat.SetTriangleColorMesh("/splatpilot/hypotheses", *fan_mesh(plan))
         return EventStatus.Succeeded()
 
 
@@ -264,6 +251,10 @@ def fan_mesh(plan: Hypotheses, width: float = 0.02) -> tuple[np.ndarray, np.ndar
     return sides.reshape(-1, 3).T, faces.astype(np.int32), np.repeat(color, 2 * T, axis=0).T
 
 
+_CAMERA_PATH = "/splatpilot/vehicle/camera"
+_PICTURE_DEPTH = 0.6  # [m] from the camera to the shown image
+
+
 class CameraVisualizer(LeafSystem):
     """Shows the camera's image in Meshcat, across its view frustum.
 
@@ -272,8 +263,8 @@ class CameraVisualizer(LeafSystem):
         name: CameraVisualizer
         input_ports: [color_image]
 
-    Evaluates an image every `period` seconds and shows every `stride`-th. Its Meshcat path is below
-    that of the vehicle, at X_BC.
+    Evaluates an image every `period` [s] and shows every `stride`-th, below the vehicle's Meshcat
+    path.
     """
 
     def __init__(
@@ -283,8 +274,6 @@ class CameraVisualizer(LeafSystem):
         X_BC: RigidTransform,
         period: float = 1 / 15,
         stride: int = 3,
-        depth: float = 0.6,
-        path: str = "/splatpilot/vehicle/camera",
     ):
         """Declares the port.
 
@@ -292,25 +281,22 @@ class CameraVisualizer(LeafSystem):
             X_BC: pose of the camera in the vehicle's body frame.
             period: [s] between images, equal to that of other users of the camera.
             stride: number of images per shown one.
-            depth: [m] from the camera to the shown image.
-            path: Meshcat path of the camera.
         """
         super().__init__()
-        self._meshcat = meshcat
-        self._period = period
-        self._stride = stride
-        self._path = path
+        self._meshcat, self._period, self._stride = meshcat, period, stride
         width, height = camera_info.width(), camera_info.height()
         corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], dtype=float)
         center = [camera_info.center_x(), camera_info.center_y()]
         focal = [camera_info.focal_x(), camera_info.focal_y()]
         # (4, 3) [m], frame C: top left, top right, bottom right, bottom left.
-        self._p_CCorners = depth * np.column_stack([(corners - center) / focal, np.ones(4)])
+        self._p_CCorners = _PICTURE_DEPTH * np.column_stack(
+            [(corners - center) / focal, np.ones(4)]
+        )
         self.DeclareAbstractInputPort("color_image", Value(ImageRgba8U(width, height)))
         self.DeclarePeriodicPublishEvent(period, 0.0, self._publish)
-        meshcat.SetTransform(path, X_BC)
+        meshcat.SetTransform(_CAMERA_PATH, X_BC)
         edges = np.stack([np.zeros((4, 3)), self._p_CCorners], axis=1).reshape(8, 3)
-        meshcat.SetLine(f"{path}/frustum", edges.T, 2.0)
+        meshcat.SetLine(f"{_CAMERA_PATH}/frustum", edges.T, 2.0)
 
     @staticmethod
     def AddToBuilder(
@@ -329,7 +315,7 @@ class CameraVisualizer(LeafSystem):
         image = cast(ImageRgba8U, self.GetInputPort("color_image").Eval(context))
         rgb = np.asarray(image.data)[..., :3]
         gltf = MemoryFile(picture_gltf(rgb, self._p_CCorners), ".gltf", "onboard picture")
-        self._meshcat.SetObject(f"{self._path}/picture", Mesh(InMemoryMesh(mesh_file=gltf)))
+        self._meshcat.SetObject(f"{_CAMERA_PATH}/picture", Mesh(InMemoryMesh(mesh_file=gltf)))
         return EventStatus.Succeeded()
 
 
@@ -367,19 +353,19 @@ _HIDDEN = np.array([0.0, 0.0, -1000.0])  # [m], of spheres that are absent
 
 
 class MovingSpheresVisualizer(LeafSystem):
-    """Draws moving spheres at the Context's time, sphere k at `<path>/k`; it has no ports."""
+    """Draws moving spheres at the Context's time, sphere k at
+    `/splatpilot/spheres/k`; it has no ports."""
 
     def __init__(
         self,
         meshcat: Meshcat,
         spheres: MovingSpheres,
         period: float = 1 / 15,
-        path: str = "/splatpilot/spheres",
     ):
         super().__init__()
-        self._meshcat, self._spheres, self._path = meshcat, spheres, path
+        self._meshcat, self._spheres = meshcat, spheres
         for k, radius in enumerate(spheres.radii):
-            meshcat.SetObject(f"{path}/{k}", Sphere(radius), Rgba(0.9, 0.75, 0.1))
+            meshcat.SetObject(f"/splatpilot/spheres/{k}", Sphere(radius), Rgba(0.9, 0.75, 0.1))
         self.DeclarePeriodicPublishEvent(period, 0.0, self._publish)
 
     @staticmethod
@@ -395,5 +381,5 @@ class MovingSpheresVisualizer(LeafSystem):
         time = context.get_time()
         for k, center in enumerate(self._spheres.centers(time)):
             p_WO = center if np.isfinite(center).all() else _HIDDEN
-            self._meshcat.SetTransform(f"{self._path}/{k}", RigidTransform(p_WO), time)
+            self._meshcat.SetTransform(f"/splatpilot/spheres/{k}", RigidTransform(p_WO), time)
         return EventStatus.Succeeded()

@@ -43,8 +43,8 @@ def disks(step: float = 0.08) -> GaussianScene:
     )
 
 
-def room(**said) -> ViewerScene:
-    """The room; a block stands in its middle, and its far end was seen by nobody."""
+def room(**options) -> ViewerScene:
+    """The room, with a block in its middle and an unknown far end."""
     occupied, unknown = np.zeros((2, 60, 40, 25), bool)
     occupied[25:35, 15:25] = True
     unknown[50:] = True
@@ -59,7 +59,7 @@ def room(**said) -> ViewerScene:
         "field": esdf_from_occupancy(occupied, unknown, np.zeros(3), 0.1),
         "images": images,
         "scale_command": "splatpilot scene scale room --out room-scaled",
-    } | said
+    } | options
     return ViewerScene(name="room", **fields)
 
 
