@@ -1,6 +1,5 @@
 """A Euclidean signed distance field on a voxel grid: queries and storage."""
 
-import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ from splatpilot.systems.collision.distance_transform import conservative_distanc
 from splatpilot.systems.common.files import written_atomically
 from splatpilot.systems.common.readers import read_archive
 from splatpilot.systems.common.validation import require
+from splatpilot.systems.vehicle.state import array_namespace
 
 FORMAT_VERSION = 1
 
@@ -122,13 +122,13 @@ class Esdf:
 
     def distance(self, p_WQ: Any) -> Any:
         """Returns signed distances (...,) [m] at the points, NaN outside the bounds."""
-        if _is_tensor(p_WQ):
+        if array_namespace(p_WQ) is not np:
             return self.query(p_WQ).distance
         return self._interpolate(_points(p_WQ), with_gradient=False)[0]
 
     def query(self, p_WQ: Any) -> FieldSample:
         """Returns distance, exact gradient of the interpolant and state at the points."""
-        if _is_tensor(p_WQ):
+        if array_namespace(p_WQ) is not np:
             return self._query_tensor(p_WQ)
         p_WQ = _points(p_WQ)
         distance, gradient = self._interpolate(p_WQ)
@@ -150,7 +150,7 @@ class Esdf:
         distance, gradient = (p_WQ.new_tensor(array) for array in sample[:2])
         # Adds zero, whose derivative by p_WQ is the gradient.
         distance = distance + (gradient * (p_WQ - p_WQ.detach())).sum(-1)
-        state = sys.modules["torch"].as_tensor(sample.state, device=p_WQ.device)
+        state = array_namespace(p_WQ).as_tensor(sample.state, device=p_WQ.device)
         return FieldSample(distance, gradient, state)
 
     def conservative(self) -> "Esdf":
@@ -203,11 +203,6 @@ class Esdf:
             return cls(distances, states, lower_W, float(voxel_size), bool(outside))
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from error
-
-
-def _is_tensor(p_WQ: Any) -> bool:
-    torch = sys.modules.get("torch")  # A tensor can only come from an imported torch.
-    return torch is not None and isinstance(p_WQ, torch.Tensor)
 
 
 def _points(p_WQ: Any) -> np.ndarray:
