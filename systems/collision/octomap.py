@@ -14,7 +14,7 @@ import numpy as np
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.esdf_build import esdf_from_occupancy, grid_shape
-from splatpilot.systems.common.readers import POINTER, REFUSAL, require_file
+from splatpilot.systems.common.readers import LFS_ERROR, LFS_POINTER, require_file
 from splatpilot.systems.common.validation import require
 
 _DEPTH = 16  # levels of children below the root
@@ -93,8 +93,8 @@ def read_octomap(path: str | Path) -> Octomap:
     header, separator, tree = content.partition(b"\ndata\n")
     lines = header.split(b"\n")
     start = b"# Octomap OcTree binary file"
-    if content.startswith(POINTER):
-        raise ValueError(f"{path}: {REFUSAL}")
+    if content.startswith(LFS_POINTER):
+        raise ValueError(f"{path}: {LFS_ERROR}")
     valid = separator and lines[0].startswith(start)
     require(valid, f"{path}: start", f"{start.decode()!r} of a binary OctoMap", content[:20])
     entries = dict(

@@ -134,7 +134,7 @@ def error_summary(error: object) -> str:
     return " ".join(short)[:300] or type(error).__name__
 
 
-POINTER = b"version https://git-lfs"
-"""Beginning of a pointer of git-LFS."""
+LFS_POINTER = b"version https://git-lfs"
+"""Start of a file that git-LFS has not downloaded."""
 
-REFUSAL = "the pointer of git-LFS to a file, not the file; run `git lfs pull` where it comes from"
+LFS_ERROR = "the pointer of git-LFS to a file, not the file; run `git lfs pull` where it comes from"

@@ -1,4 +1,4 @@
-"""Registries of policies, worlds, sensors and other things, our own and those of other packages."""
+"""Registries of policies, worlds, sensors and other plugins, built-in or of other packages."""
 
 import functools
 import importlib

@@ -3,7 +3,7 @@
 | seeds | purpose |
 |---|---|
 | 0 to 99 | development: studies by which policies, worlds and defaults are chosen |
-| 1,000 to 999,999 | test: studies that are reported, of what is no longer changed |
+| 1,000 to 999,999 | test: reported studies, after the last change of policies and worlds |
 | from 1,000,000 | training, `SEEDS_PER_RUN` a run |
 | from 2,000,000 | validation: choose among checkpoints |
 | from 3,000,000 | Monte Carlo simulations |

@@ -89,7 +89,7 @@ class SplatRenderEngine(RenderEngine):
         """
         super().__init__()
         environment = background if isinstance(background, EnvironmentMap) else None
-        color = np.asarray(BLACK if isinstance(background, EnvironmentMap) else background)
+        color = np.asarray(BLACK if environment else background)
         valid = color.shape == (3,) and np.all((color >= 0) & (color <= 1))
         require(valid, "background", "three numbers in [0, 1]", background)
         load_triton()

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement
 from pydrake.math import RigidTransform, RotationMatrix
 
-from splatpilot.systems.common import readers
 from splatpilot.systems.common.extras import import_extra
 from splatpilot.systems.common.files import written_atomically
 from splatpilot.systems.common.readers import (
+    LFS_ERROR,
+    LFS_POINTER,
     read_ply_file,
     readable,
     require_file,
@@ -63,13 +64,13 @@ def _drop_invalid(path: Path, arrays: Arrays, recenter: bool = True) -> Gaussian
     return GaussianScene(*arrays.values(), origin=origin)
 
 
-def _insert_largest(small: NDArray, which: NDArray) -> NDArray[np.float64]:
-    """Inserts the largest component, of index `which` and >= 0, into unit quaternions (N, 4)."""
+def _insert_largest(small: NDArray, index: NDArray) -> NDArray[np.float64]:
+    """Inserts the largest component, of this index and >= 0, into unit quaternions (N, 4)."""
     quats = np.empty((len(small), 4))
-    others = np.array([[i for i in range(4) if i != k] for k in range(4)])[which]
+    others = np.array([[i for i in range(4) if i != k] for k in range(4)])[index]
     np.put_along_axis(quats, others, small, axis=1)
     largest = np.sqrt(np.maximum(1 - (small**2).sum(axis=1, keepdims=True), 0))
-    np.put_along_axis(quats, which[:, None], largest, axis=1)
+    np.put_along_axis(quats, index[:, None], largest, axis=1)
     return quats
 
 
@@ -309,7 +310,7 @@ def _unpack_zstd(zstandard: Any, content: bytes, sizes: list[int]) -> bytes:
 _CONVERT = "convert it to PLY, for example with PlayCanvas's splat-transform"
 # Starts, or suffixes, of other files that are mistaken for Gaussians.
 _OTHERS = {
-    readers.POINTER: readers.REFUSAL,
+    LFS_POINTER: LFS_ERROR,
     b"glTF": f"a binary glTF; {_CONVERT}, or render a mesh with `splatpilot capture render`",
     b"PK": f"an archive; if it is SOG, {_CONVERT}",
     b"<": "a web page or an XML file, perhaps of a link saved instead of the file",

@@ -16,8 +16,8 @@ K = np.array([[40.0, 0.0, 40.0], [0.0, 40.0, 30.0], [0.0, 0.0, 1.0]])
 
 
 def half_seen_room(closet: bool = False) -> Esdf:
-    """A room of 4 x 2 x 2 m with walls of 0.2 m, of which the last 1.5 m along x are unknown; a
-    closet of 0.4 m behind a wall is known too. Voxels of 0.1 m, the lower corner is the origin."""
+    """A room of 4 x 2 x 2 m with walls of 0.2 m, in voxels of 0.1 m from the origin. The last 1.5 m
+    along x are unknown, except for a closet of 0.4 m behind a wall."""
     occupied = np.ones((44, 24, 24), bool)
     occupied[2:42, 2:22, 2:22] = False
     unknown = np.zeros_like(occupied)
@@ -27,7 +27,7 @@ def half_seen_room(closet: bool = False) -> Esdf:
     return esdf_from_occupancy(occupied, unknown, np.zeros(3), 0.1)
 
 
-def test_only_what_a_vehicle_can_look_into_is_closed():
+def test_reachable_space_holds_the_vehicle():
     field = half_seen_room(closet=True)
     free = field.states == FieldState.FREE
     expected = free.copy()
@@ -37,7 +37,7 @@ def test_only_what_a_vehicle_can_look_into_is_closed():
     assert free[27:].any()
 
 
-def test_obstacles_begin_two_voxels_behind_what_was_seen():
+def test_obstacles_begin_two_voxels_behind_seen_space():
     field = half_seen_room()
     reachable = reachable_space(field, 0.35)
     hidden, before, _ = hidden_frontier(field, reachable, [], K, [])

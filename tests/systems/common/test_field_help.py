@@ -12,8 +12,8 @@ ENGINES = Registry("engine", "tests.engines", object)
 
 @dataclass
 class Wheel:
-    """What
-    rolls.
+    """A part
+    that rolls.
 
     More of it."""
 
@@ -48,15 +48,13 @@ class Car(Vehicle):
 
 
 def test_comments_and_strings_describe_fields():
-    """A comment above, one after and a string below describe a field; what an empty line keeps
-    apart does not. A configuration that nobody describes has what its class says."""
     texts = {field.name: field.text for field in describe_fields(Vehicle())}
     assert texts == {
         "mass": "Above, on two lines.",
         "name": "After: of it.",
         "wheel": "Below, on two lines.",
         "bare": "",
-        "spare": "What rolls.",
+        "spare": "A part that rolls.",
         "engine": "[-] Of any kind.",
     }
 
@@ -69,21 +67,19 @@ def test_inherited_fields_keep_their_descriptions():
     assert fields[-1].value == 2
 
 
-def test_open_fields_name_their_registry():
-    """What may stand in an open field can be looked up; others have no registry."""
+def test_registry_fields_name_their_registry():
     registries = {field.name: field.registry for field in describe_fields(Vehicle())}
     assert registries.pop("engine") is ENGINES
     assert set(registries.values()) == {None}
 
 
-def test_drakes_own_are_described_by_drake():
+def test_docstrings_of_drake_describe_its_fields():
     texts = {field.name: field.text for field in describe_fields(CameraConfig())}
     assert texts["width"] == "Image width (in pixels)."
     assert texts["X_PB"].startswith("The pose of the body camera relative to a parent frame P.")
 
 
-def test_a_class_without_source_has_bare_fields():
-    """What was typed into a session has fields that nobody describes, after those of its base."""
+def test_a_class_without_source_describes_only_inherited_fields():
     names = {"dataclass": dataclass, "Car": Car, "__name__": "a_session"}
     exec("@dataclass\nclass Taxi(Car):\n    fare: float = 2.0", names)
     fields = {field.name: field for field in describe_fields(names["Taxi"]())}

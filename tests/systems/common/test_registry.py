@@ -7,7 +7,7 @@ from splatpilot.systems.common.registry import Registry, check_name, import_modu
 
 
 @dataclass(frozen=True)
-class Kind:
+class Entry:
     config: type
 
 
@@ -20,14 +20,14 @@ class DerivedConfig(OneConfig):
 
 
 @pytest.fixture
-def registry() -> Registry[Kind]:
-    registry = Registry("thing", "splatpilot.test_things", Kind)
-    registry.add("one", Kind(OneConfig))
+def registry() -> Registry[Entry]:
+    registry = Registry("toy", "splatpilot.test_toys", Entry)
+    registry.add("one", Entry(OneConfig))
     return registry
 
 
 def package(folder, name: str, body: str, group: str = "", point: str = "") -> None:
-    """Writes a module, and what an installation of it would announce."""
+    """Writes a module, and the metadata of an installation with an entry point."""
     (folder / f"{name}.py").write_text(body)
     if group:
         about = folder / f"{name}-1.0.dist-info"
@@ -36,65 +36,60 @@ def package(folder, name: str, body: str, group: str = "", point: str = "") -> N
         (about / "entry_points.txt").write_text(f"[{group}]\n{point}\n")
 
 
-def test_kinds_are_found_by_name_and_by_configuration(registry):
-    """A name gives its kind; a configuration that of its type, or of the nearest base."""
-    assert registry.find("one") == Kind(OneConfig)
-    assert registry.entry_for(OneConfig()) == Kind(OneConfig)
-    assert registry.entry_for(DerivedConfig()) == Kind(OneConfig)
-    registry.add("derived", Kind(DerivedConfig))
-    assert registry.entry_for(DerivedConfig()) == Kind(DerivedConfig)
+def test_entries_are_found_by_name_and_by_configuration(registry):
+    assert registry.find("one") == Entry(OneConfig)
+    assert registry.entry_for(OneConfig()) == Entry(OneConfig)
+    assert registry.entry_for(DerivedConfig()) == Entry(OneConfig)
+    registry.add("derived", Entry(DerivedConfig))
+    assert registry.entry_for(DerivedConfig()) == Entry(DerivedConfig)
 
 
-def test_what_nobody_knows_is_refused_with_what_there_is(registry):
-    with pytest.raises(ValueError, match=r"no thing 'two'; there are one, and module:attribute"):
+def test_unknown_names_and_configurations_are_refused_with_the_known(registry):
+    with pytest.raises(ValueError, match=r"no toy 'two'; there are one, and module:attribute"):
         registry.find("two")
-    with pytest.raises(ValueError, match=r"no thing has the configuration int; known are OneCon"):
+    with pytest.raises(ValueError, match=r"no toy has the configuration int; known are OneCon"):
         registry.entry_for(3)
 
 
 def test_names_are_given_once(registry):
-    """The same kind again is no error; another one of the name, or of a type of the same name in
-    files, is."""
-    registry.add("one", Kind(OneConfig))
-    with pytest.raises(ValueError, match=r"there is a thing 'one' already"):
-        registry.add("one", Kind(DerivedConfig))
+    registry.add("one", Entry(OneConfig))
+    with pytest.raises(ValueError, match=r"there is a toy 'one' already"):
+        registry.add("one", Entry(DerivedConfig))
     namesake = type("OneConfig", (), {})
     with pytest.raises(ValueError, match=r"has the name of .*OneConfig.*; rename it"):
-        registry.add("two", Kind(namesake))
+        registry.add("two", Entry(namesake))
 
 
-def test_announced_kinds_are_there(registry, tmp_path, monkeypatch):
+def test_announced_entries_load_on_first_use(registry, tmp_path, monkeypatch):
     package(
         tmp_path,
         "announcer",
-        "from test_registry_doubles import Kind\nclass FarConfig: pass\nFAR = Kind(FarConfig)\n",
-        "splatpilot.test_things",
+        "from test_registry_doubles import Entry\nclass FarConfig: pass\nFAR = Entry(FarConfig)\n",
+        "splatpilot.test_toys",
         "far = announcer:FAR",
     )
-    monkeypatch.setitem(sys.modules, "test_registry_doubles", sys.modules[Kind.__module__])
+    monkeypatch.setitem(sys.modules, "test_registry_doubles", sys.modules[Entry.__module__])
     monkeypatch.syspath_prepend(tmp_path)
     assert registry.names() == ["one", "far"]
     for name in ("one", "far", "module:Class"):
-        check_name("thing", "splatpilot.test_things", name, ["one"])
-    with pytest.raises(ValueError, match=r"no thing 'two'; there are one, far, and module:attr"):
-        check_name("thing", "splatpilot.test_things", "two", ["one"])
+        check_name("toy", "splatpilot.test_toys", name, ["one"])
+    with pytest.raises(ValueError, match=r"no toy 'two'; there are one, far, and module:attr"):
+        check_name("toy", "splatpilot.test_toys", "two", ["one"])
     assert "announcer" not in sys.modules
     registry.load_announced()
     assert [config.__name__ for config in registry.configs()] == ["OneConfig", "FarConfig"]
     assert registry.find("far").config.__name__ == "FarConfig"
 
 
-def test_module_and_attribute_name_a_kind(registry, tmp_path, monkeypatch):
-    """`module:attribute` is imported, also from the working directory; what is not there, or no
-    such kind, is named."""
+def test_module_and_attribute_name_an_entry(registry, tmp_path, monkeypatch):
     package(tmp_path, "loose", "class LooseConfig: pass\nNUMBER = 3\n")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))
     with pytest.raises(ValueError, match=r"'loose:Absent' is not at loose:Absent"):
         registry.find("loose:Absent")
-    with pytest.raises(ValueError, match=r"loose:NUMBER must be a Kind of a thing"):
+    with pytest.raises(ValueError, match=r"loose:NUMBER must be a Entry of a toy"):
         registry.find("loose:NUMBER")
-    registry.add("loose", Kind(sys.modules["loose"].LooseConfig))
+    registry.add("loose", Entry(sys.modules["loose"].LooseConfig))
     assert registry.find("loose:LooseConfig") == registry.find("loose")
     with pytest.raises(ValueError, match=r"the module nowhere cannot be imported"):
         import_modules(["nowhere"])
@@ -105,4 +100,4 @@ def test_module_and_attribute_name_a_kind(registry, tmp_path, monkeypatch):
 
 def test_modules_are_those_that_others_must_import(registry):
     assert registry.modules() == {OneConfig.__module__}
-    assert Registry("thing", "splatpilot.test_things", Kind).modules() == set()
+    assert Registry("toy", "splatpilot.test_toys", Entry).modules() == set()
