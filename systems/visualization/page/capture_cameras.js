@@ -1,4 +1,4 @@
-// The cameras of a capture, as frusta, and what one of them saw.
+// The cameras of a capture, as frusta, and the image of one.
 "use strict";
 
 class CaptureCameras {

@@ -2,8 +2,8 @@
 "use strict";
 
 class DistanceSlice {
-  // `grid` of `pages.scene_page`, and its values: x the fastest, then y, then z; 255 where
-  // nobody looked.
+  // `grid` of `pages.scene_page`, and its values: x the fastest, then y, then z; 255 in
+  // unobserved space.
   constructor(grid, values) {
     const THREE = MeshCat.THREE, [nx, ny] = grid.shape, edge = grid.voxel_size;
     Object.assign(this, grid, {values});

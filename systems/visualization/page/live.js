@@ -1,19 +1,19 @@
-// What Drake's Meshcat draws while it runs, beside the Gaussians that this page holds.
+// Gaussians of this page, with the live drawings of Drake's Meshcat.
 "use strict";
 
 // `url`: of Meshcat's web socket. Gaussians above a height, at first `cut`, are left out; the slider
 // goes from `lower` to `upper` [m].
 function showLive(splats, {url, lower, upper, cut}) {
   viewer.camera.far = 1000;
-  // There the Gaussians are points.
+  // Meshcat's points of the same Gaussians.
   viewer.set_property(["splatpilot", "scene"], "visible", false);
-  // The sky stays, whatever is said of the background from now on.
+  // Meshcat's messages about the background do not replace the sky.
   if (document.getElementById("sky").textContent) viewer.update_background = () => {};
   const status = document.getElementById("status-message");
   const connection = new WebSocket(url);
   connection.binaryType = "arraybuffer";
   connection.onmessage = (message) => {
-    // Meshcat gives files to its own page alone: what the onboard camera sees is shown only there.
+    // Meshcat serves files to its own page only, so the onboard camera's image is shown only there.
     const {object} = viewer.decode(message);
     if (object?.object?.type !== "_meshfile_object") handle_message(message);
   };

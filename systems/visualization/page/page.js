@@ -8,7 +8,7 @@ async function inflate(text) {
   return new Response(stream).arrayBuffer();
 }
 
-// Those that an element holds.
+// Unpacks the compressed text of an element.
 function unpack(id) {
   return inflate(document.getElementById(id).textContent);
 }
@@ -48,7 +48,7 @@ function bindKeys(keys) {
   });
 }
 
-// Adds a slider of heights from `lower` to `upper` [m]; what is above one is to be hidden.
+// Adds a slider of heights from `lower` to `upper` [m]; content above the height is hidden.
 function addHeightSlider(bar, id, lower, upper, change) {
   const slider = Object.assign(document.createElement("input"), {
     type: "range", id, min: lower, max: upper, step: "any"});

@@ -1,5 +1,5 @@
-// A flight, or several through one world, in a Meshcat page: vehicle, trail, plans, what the camera
-// saw, speed and clearance, all at the time of one slider.
+// A flight, or several through one world, in a Meshcat page: vehicle, trail, plans, camera images,
+// speed and clearance, all at the time of one slider.
 //
 // Keys: space plays and pauses, arrows step, 1 2 3 choose the view, d switches color and depth.
 "use strict";
@@ -138,7 +138,7 @@ class Replay {
     this.viewer.set_dirty();
   }
 
-  // Who looks out of a vehicle does not see it, nor its trail; the way to come is seen from above.
+  // The onboard view shows neither the vehicle nor its trail; only the overview the path ahead.
   hideOwn() {
     for (const flight of this.flights) {
       const seen = !(this.view === "onboard" && flight.chosen);
@@ -158,7 +158,7 @@ class Replay {
       return flight.pose(this.time).multiply(this.X_BC)
         .multiply(new THREE.Matrix4().makeScale(1, -1, -1));
     }
-    // It follows the vehicle where that has flown, a second behind, so that nothing is between.
+    // It follows the vehicle along its own path, a second behind, so that no obstacle is between.
     const p = flight.position(this.time), eye = flight.position(this.time - 1.0);
     const ahead = flight.position(this.time + 0.5).sub(eye).setZ(0);
     if (ahead.lengthSq() < 1e-6) {

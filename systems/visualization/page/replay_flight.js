@@ -39,7 +39,7 @@ class ReplayFlight {
     }
   }
 
-  // Index and share of the way to the next of the sample before a time.
+  // Indices of the samples around a time, and the fraction s between them.
   at(time) {
     const last = this.times.length - 1;
     let low = 0, high = last;
@@ -90,7 +90,7 @@ class ReplayFlight {
   }
 
   // All hypotheses of a plan as one mesh of level ribbons, from green (lowest cost) to red (highest),
-  // but for what is nearer than `nearest` [m] to `eye` and would cover the view.
+  // except for parts nearer than `nearest` [m] to `eye` and would cover the view.
   showPlan(index, eye, nearest) {
     const THREE = MeshCat.THREE;
     this.fan.visible = index >= 0 && this.chosen;

@@ -26,7 +26,7 @@ class Ruler {
     this.set([]);
   }
 
-  // The point after the second begins anew.
+  // A third point begins another length.
   add(point) {
     this.set(this.points.length === 2 ? [point] : [...this.points, point]);
   }
@@ -53,7 +53,7 @@ class Ruler {
   }
 
   // Keeps the label at the middle of the line.
-  place() {
+  moveLabel() {
     if (!this.line.visible) return;
     const p = this.viewer.scene.localToWorld(this.middle.clone()).project(this.viewer.camera);
     this.label.hidden = p.z > 1;

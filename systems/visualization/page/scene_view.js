@@ -1,8 +1,8 @@
-// A scene in a Meshcat page: what can be hidden, distances at a height, where it was captured from,
-// and a ruler.
+// A scene in a Meshcat page: hidden parts, distances at a height, cameras of the capture, and a
+// ruler.
 //
-// Keys: 1 shows the scene from above; r, f, b and u switch the ruler, the distances, what is beyond
-// the bounds and the hatched surfaces where nobody looked any further.
+// Keys: 1 shows the scene from above; r, f, b and u switch the ruler, the distances, Gaussians
+// beyond the bounds and the hatched surfaces before unobserved space.
 "use strict";
 
 class SceneView {
@@ -28,7 +28,7 @@ class SceneView {
     this.look();
     viewer.render_callback = () => {
       if (this.pose) placeCamera(viewer, this.pose.clone());
-      this.ruler.place();
+      this.ruler.moveLabel();
     };
     // Meshcat's controls have the pointer's events end here, not at the canvas.
     const pane = viewer.dom_element;
@@ -138,7 +138,7 @@ class SceneView {
     this.tell();
   }
 
-  // What the ruler says, and what to do with it.
+  // The length on the ruler, and the command that uses it.
   tell(missed = false) {
     const {points, length} = this.ruler, {unit, scale_command} = this.data;
     const text = (p) => p.map((value) => value.toFixed(3)).join(",");

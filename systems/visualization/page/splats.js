@@ -58,8 +58,8 @@ class Splats {
       centers.set(this.floats.subarray(8 * i, 8 * i + 3), 3 * i);
     }
     this.worker.postMessage({centers}, [centers.buffer]);
-    this.view = null;     // of what is drawn in order
-    this.asked = null;    // of what the worker sorts
+    this.view = null;       // by which the drawn order is sorted
+    this.requested = null;  // that the worker sorts by
   }
 
   // Height in W above which nothing is drawn [m].
@@ -67,14 +67,14 @@ class Splats {
     this.mesh.material.uniforms.upper.value.z = Math.min(height, 1e9);
   }
 
-  // Leaves out what reaches beside or below a box, with corners in W.
+  // Hides Gaussians that reach beside or below a box, with corners in W.
   bound(lower, upper) {
     const {uniforms} = this.mesh.material;
     uniforms.lower.value.set(...lower);
     uniforms.upper.value.setX(upper[0]).setY(upper[1]);
   }
 
-  // How many are drawn, from the first.
+  // Number of drawn Gaussians, from the first.
   set shown(count) {
     this.mesh.material.uniforms.shown.value = count;
   }
@@ -84,9 +84,9 @@ class Splats {
     const m = this.mesh.modelViewMatrix.multiplyMatrices(
       camera.matrixWorldInverse, this.mesh.matrixWorld).elements;
     const view = [m[2], m[6], m[10], m[14]];
-    this.wanted = view;
-    if (!this.asked && !Splats.same(view, this.view)) {
-      this.asked = view;
+    this.current = view;
+    if (!this.requested && !Splats.same(view, this.view)) {
+      this.requested = view;
       this.worker.postMessage({view});
     }
   }
@@ -97,21 +97,21 @@ class Splats {
     this.order.addUpdateRange(0, order.length);
     this.order.needsUpdate = true;
     this.mesh.geometry.instanceCount = order.length;
-    this.view = this.asked;
-    this.asked = null;
+    this.view = this.requested;
+    this.requested = null;
     this.viewer.set_dirty();
   }
 
-  // Whether what is on the screen was sorted for the view it is seen from.
+  // True if the drawn order is that of the current view.
   get settled() {
-    return !this.asked && Splats.same(this.wanted, this.view);
+    return !this.requested && Splats.same(this.current, this.view);
   }
 
   static same(a, b) {
     return a && b && a.every((value, i) => Math.abs(value - b[i]) < 1e-4);
   }
 
-  // The worker: a counting sort of what is in front of the camera, farthest first.
+  // The worker: a counting sort of Gaussians in front of the camera, farthest first.
   static sorter = () => {
     // The bits of a float grow with its logarithm: a bin is 0.02 % of the depth, from 0.05 m on.
     const nearest = 0.05, bins = 1 << 16, hidden = 1 << 17;
