@@ -1,12 +1,12 @@
 #!/bin/sh
 # Builds the native module for aarch64 and runs the tests of its kernels on it, under qemu's
-# emulation of that processor, with Debian's Python and PyPI's packages for it. On Debian, or what
-# keeps its archive's keys, as any user:
+# emulation of that processor, with Debian's Python and PyPI's packages for it. On Debian, or a
+# system with the keys of its archive, as any user:
 #
 #     apt-get install g++-aarch64-linux-gnu qemu-user-static
 #     native/aarch64.sh [python] [test files]
 #
-# What is downloaded and built stays in build/aarch64. Emulation is slow: imports take minutes.
+# Downloads and builds stay in build/aarch64. Emulation is slow: imports take minutes.
 set -eu
 root=$(cd "$(dirname "$0")/.." && pwd)
 python=${1:-$root/.venv/bin/python}
@@ -20,8 +20,8 @@ for tool in aarch64-linux-gnu-g++ qemu-aarch64-static apt-get cmake; do
   }
 done
 
-# Debian's Python for the emulated machine, unpacked and not installed: an apt of its own, which
-# knows of that processor's packages alone.
+# Debian's Python for the emulated machine, unpacked but not installed, by a separate apt that knows
+# only the packages of that processor.
 if [ ! -e "$work/system/usr/bin/python3.13" ]; then
   apt=$work/apt
   mkdir -p "$apt/etc/preferences.d" "$apt/state/lists/partial" "$apt/cache/archives/partial"
@@ -39,8 +39,8 @@ if [ ! -e "$work/system/usr/bin/python3.13" ]; then
   for package in "$apt"/cache/archives/*.deb; do dpkg-deb --extract "$package" "$work/system"; done
 fi
 
-# What the tests import, without what has no wheel for aarch64 and flies only (scikit-fmm). PyPI's
-# later PyTorch for it wants CUDA.
+# Packages of the tests, without scikit-fmm, which only flights need and which has no wheel for
+# aarch64. Later versions of PyTorch need CUDA there.
 if [ ! -e "$work/site/torch" ]; then
   "$python" -m uv pip install --quiet --target "$work/site" --only-binary :all: \
     --python-platform aarch64-manylinux_2_40 --python-version 3.13 \

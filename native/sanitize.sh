@@ -16,7 +16,7 @@ build=$root/build/sanitize
   -DCMAKE_CXX_FLAGS="-O1 -g1 -fsanitize=address,undefined -fno-sanitize-recover=all"
 "$python" -m cmake --build "$build"
 
-# The tests that run native code; others only wrap what these run.
+# The tests that run native code.
 [ $# -gt 0 ] || set -- $(cat "$root/native/kernel_tests.txt")
 # splatpilot._native comes from the build folder. pytest must not swallow the report (-s).
 program='

@@ -17,7 +17,7 @@ struct BlockRecord {
 struct BlockBackward {
   LaneCenters pixel;
   F16 transmittance;
-  F16 red, green, blue, depth, alpha;  // dL/d of what the pixel shows
+  F16 red, green, blue, depth, alpha;  // dL/d(pixel)
   F16 behind;
 };
 

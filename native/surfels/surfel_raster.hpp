@@ -37,7 +37,7 @@ struct SurfelSample {
   F16 alpha;  // 0 below the cut
 };
 
-// alpha = o exp(-r2 / 2): r2 is the lesser of u^2 + v^2 on the surfel's plane and of the blob's
+// alpha = o exp(-r2 / 2): r2 is the smaller of u^2 + v^2 on the surfel's plane and of the blob's
 // |d|^2 / kBlobVariance (the larger of the two Gaussians; Huang et al. 2024, equation 11).
 SP_INLINE SurfelSample sample_surfel(const Surfel& s, const LaneCenters& pixel,
                                      const F16& near_plane) {
