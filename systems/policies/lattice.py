@@ -14,7 +14,7 @@ from splatpilot.systems.common.validation import Config, bounded, require_field
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS, WAYPOINT_PERIOD
 from splatpilot.systems.policies.motion_primitives import (
     MIN_UPRIGHT,
-    lengths,
+    norms,
     quintic_basis,
     rotation_to,
     select_distinct,
@@ -141,7 +141,7 @@ class TrajectoryLattice:
         positions, jerks = trajectories
         distances = field.distance(positions)  # (N, S)
         starts = np.broadcast_to(p_WB, (len(positions), 1, 3))
-        steps = lengths(np.diff(positions, axis=1, prepend=starts))  # (N, S) [m]
+        steps = norms(np.diff(positions, axis=1, prepend=starts))  # (N, S) [m]
         proximity = ((slowness(distances) - 1.0) * steps).sum(axis=1)
         too_close = np.maximum(VEHICLE_RADIUS + config.margin - distances, 0.0)
         too_fast = np.maximum(steps / WAYPOINT_PERIOD - config.speed, 0.0)

@@ -74,7 +74,7 @@ def select_distinct(
     chosen = [int(np.argmin(costs))]
     apart = np.full(len(costs), np.inf)
     while len(chosen) < count:
-        apart = np.minimum(apart, lengths(positions - positions[chosen[-1]]).mean(axis=1))
+        apart = np.minimum(apart, norms(positions - positions[chosen[-1]]).mean(axis=1))
         apart[chosen] = -1.0  # not again
         distinct = apart > separation
         if distinct.any():
@@ -84,6 +84,6 @@ def select_distinct(
     return np.array(chosen)[np.argsort(costs[chosen], kind="stable")]
 
 
-def lengths(vectors: np.ndarray) -> np.ndarray:
+def norms(vectors: np.ndarray) -> np.ndarray:
     """Returns the lengths (...,) of vectors (..., 3)."""
     return np.sqrt(np.einsum("...i,...i->...", vectors, vectors))
