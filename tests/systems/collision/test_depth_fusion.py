@@ -24,7 +24,7 @@ R_BC = RotationMatrix(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0
 
 
 def room() -> AnalyticDistanceField:
-    """A room of 4 x 3 x 2.5 m with a ball, a pillar and a crate."""
+    """A room of 4 x 3 x 2.5 m with a sphere, a pillar and a crate."""
     walls = [
         HalfSpace(np.array(normal, float), offset)
         for normal, offset in (
@@ -36,14 +36,14 @@ def room() -> AnalyticDistanceField:
             ([0, 0, -1], -2.5),
         )
     ]
-    things = [
+    objects = [
         Sphere(np.array([2.5, 1.5, 0.8]), 0.5),
         Cylinder(np.array([1.2, 2.2, 0.0]), np.array([1.3, 2.2, 2.5]), 0.15),
         Box(
             RigidTransform(RollPitchYaw(0.0, 0.0, 0.5), np.array([3.2, 0.6, 0.3])), [0.6, 0.4, 0.6]
         ),
     ]
-    return AnalyticDistanceField([*walls, *things], np.full(3, -1.0), np.array([5.0, 4.0, 3.5]))
+    return AnalyticDistanceField([*walls, *objects], np.full(3, -1.0), np.array([5.0, 4.0, 3.5]))
 
 
 def render(field: AnalyticDistanceField, X_WC: RigidTransform) -> np.ndarray:
@@ -60,7 +60,7 @@ def render(field: AnalyticDistanceField, X_WC: RigidTransform) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def capture() -> tuple[list[np.ndarray], list[RigidTransform]]:
-    """Sixteen views that turn about at four places of the room."""
+    """Views in four directions from each of four points of the room."""
     X_WCs = [
         RigidTransform(
             RotationMatrix(RollPitchYaw(0.0, 0.3 * (k % 3 - 1), k * np.pi / 4)).multiply(R_BC),
@@ -86,7 +86,7 @@ def test_the_fused_field_is_that_of_the_room(capture):
     # Space hidden behind an edge may count as occupied, so distances far away err to the safe side.
     assert -0.2 < error[free].mean() < 0.05
     assert np.quantile(error[free], 0.99) < 0.5
-    # What is free is free and most of the room was seen.
+    # Free voxels are free, and most of the room was seen.
     assert truth[free].min() > -0.5 * voxel_size
     assert np.mean(field.states[truth > 0.0] != UNKNOWN) > 0.9
     assert np.mean(truth[field.states == OCCUPIED] < 0.5 * voxel_size) > 0.988
@@ -134,7 +134,7 @@ def test_a_wall_is_measured_along_its_normal(slope):
     field = esdf_from_depth_images([wall(1.5, slope)], K, [RigidTransform()], *box, 0.05)
     p = np.stack(np.meshgrid(*field.voxel_centers(), indexing="ij"), -1)
     plane = (1.5 + slope * p[..., 0] - p[..., 2]) / np.sqrt(1.0 + slope**2)
-    # Away from the sides of the box, beyond which the wall goes on.
+    # Away from the sides of the box, beyond which the wall continues.
     near = (np.abs(plane) < 0.07) & (np.abs(p[..., 0]) < 0.4) & (field.states != UNKNOWN)
     assert np.count_nonzero(near) > 300
     # A pixel is 2.5 cm wide there, a voxel takes the depth of the pixel it falls in.
@@ -142,18 +142,18 @@ def test_a_wall_is_measured_along_its_normal(slope):
     assert abs(np.mean(field.distances[near] - plane[near])) < 0.004
 
 
-def test_pixels_without_depth_say_nothing():
+def test_pixels_without_depth_are_ignored():
     box = np.array([-0.5, -0.4, 0.2]), np.array([0.5, 0.4, 2.4])
     clean = wall(1.5)
-    for nothing in (0.0, np.nan, -1.0):
+    for unknown in (0.0, np.nan, -1.0):
         depth = clean.copy()
-        depth[:, :60] = nothing
+        depth[:, :60] = unknown
         field = esdf_from_depth_images([depth], K, [RigidTransform()], *box, 0.05)
         half = field.shape[0] // 2
         assert (field.states[:half] == UNKNOWN).all()
         assert (field.states[half:] == FREE).any() and (field.states[half:] == OCCUPIED).any()
         blind = esdf_from_depth_images(
-            [np.full_like(depth, nothing)], K, [RigidTransform()], *box, 0.05
+            [np.full_like(depth, unknown)], K, [RigidTransform()], *box, 0.05
         )
         assert (blind.states == UNKNOWN).all()
 

@@ -93,7 +93,7 @@ def test_state_is_that_of_the_voxel_around_the_point():
     np.testing.assert_array_equal(field.query(p).state, states[i, j, k])
 
 
-def test_outside_the_bounds_nothing_is_claimed():
+def test_outside_the_bounds_distances_are_nan():
     field = sphere_field()
     inside = [0.5, 2.5, 1.0]
     p = np.array(
@@ -107,7 +107,7 @@ def test_outside_the_bounds_nothing_is_claimed():
     assert sample.distance[0] == field.distance(inside)
 
 
-def test_scaled_field_is_that_of_the_scaled_place():
+def test_scaled_field_is_that_of_the_scaled_scene():
     field = sphere_field()
     scaled = field.scaled_by(3.0)
     p = points_in(field)
@@ -160,7 +160,7 @@ def test_conservative_field_has_no_ridge_along_a_wall_seen_from_one_side():
     np.testing.assert_allclose(field.distance(p), -x, atol=0.05 * VOXEL)
 
 
-def test_conservative_field_goes_on_outside_the_box():
+def test_conservative_field_continues_outside_the_box():
     field = grid_of(lambda x, y, z: 5.0 + 0.0 * x).conservative()
     p = np.array([[-1.5, 2.8, 1.1], [0.0, 4.6, 1.1], [-1.3, 1.6, 1.1], [3.0, 2.8, 9.0]])
     nearest = np.clip(p, field.lower_W, field.upper_W)

@@ -17,7 +17,7 @@ SIZES = {
 
 
 class CountingField(AnalyticDistanceField):
-    """A ball of radius 1 at the origin that counts its queries."""
+    """A sphere of radius 1 at the origin that counts its queries."""
 
     def __init__(self):
         super().__init__([Sphere(np.zeros(3), 1.0)], np.full(3, -5.0), np.full(3, 5.0))
@@ -49,7 +49,7 @@ def test_outputs_beside_an_obstacle():
     assert out["field_state"][0] == FieldState.FREE
 
 
-def test_outside_the_field_no_collision_is_claimed():
+def test_outside_the_field_there_is_no_collision():
     out = outputs_at(EsdfCollision(CountingField()), [0.0, 0.0, 5.1])
     for name in ("distance", "clearance", "barrier"):
         assert np.isnan(out[name][0])

@@ -22,7 +22,7 @@ def field(distance, unknown=None) -> Esdf:
     return Esdf(distances, states, LOWER, VOXEL)
 
 
-def ball(p_WQ):
+def sphere(p_WQ):
     return np.linalg.norm(p_WQ - CENTER, axis=-1) - RADIUS
 
 
@@ -41,13 +41,13 @@ def drakes_distances(path, p_WQ) -> np.ndarray:
     return np.array([query.ComputeSignedDistanceToPoint(p)[0].distance for p in p_WQ])
 
 
-def test_a_ball_is_a_ball():
-    mesh = field_mesh(field(ball))
+def test_a_sphere_keeps_its_shape():
+    mesh = field_mesh(field(sphere))
     assert mesh.is_watertight and mesh.is_winding_consistent
     assert mesh.volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.02)
-    assert np.abs(ball(mesh.vertices)).max() < 0.3 * VOXEL
+    assert np.abs(sphere(mesh.vertices)).max() < 0.3 * VOXEL
     assert len(mesh.faces) < 2 * 4 * np.pi * RADIUS**2 / VOXEL**2
-    again = field_mesh(field(ball))
+    again = field_mesh(field(sphere))
     np.testing.assert_array_equal(mesh.vertices, again.vertices)
     np.testing.assert_array_equal(mesh.faces, again.faces)
 
@@ -55,10 +55,10 @@ def test_a_ball_is_a_ball():
 @pytest.mark.parametrize(("conservative", "within"), [(False, 0.5), (True, 0.85)])
 def test_drakes_distances_are_the_fields(tmp_path, conservative, within):
     esdf = field(
-        lambda p: np.minimum(ball(p), floor(p)),
+        lambda p: np.minimum(sphere(p), floor(p)),
         unknown=lambda p: (p[..., 0] > 1.5) & (p[..., 2] > 1.3),
     )
-    path = tmp_path / "place.obj"
+    path = tmp_path / "scene.obj"
     write_mesh(path, field_mesh(esdf, conservative))
     p_WQ = np.random.default_rng(0).uniform(LOWER + 0.1, esdf.upper_W - 0.1, (4000, 3))
     expected = (esdf.conservative() if conservative else esdf).distance(p_WQ)
@@ -85,21 +85,21 @@ def test_what_is_solid_ends_at_the_box():
 
 
 def test_files_are_read_by_others(tmp_path):
-    mesh = field_mesh(field(ball))
-    for name in ("ball.obj", "ball.gltf"):
+    mesh = field_mesh(field(sphere))
+    for name in ("sphere.obj", "sphere.gltf"):
         write_mesh(tmp_path / name, mesh)
         read = trimesh.load(tmp_path / name, force="mesh")
         x, y, z = CENTER
         np.testing.assert_allclose(
-            read.bounds.mean(axis=0), [x, y, z] if name == "ball.obj" else [x, z, -y], atol=0.02
+            read.bounds.mean(axis=0), [x, y, z] if name == "sphere.obj" else [x, z, -y], atol=0.02
         )
         assert len(read.faces) == len(mesh.faces)
         assert read.volume == pytest.approx(mesh.volume, rel=1e-3)
-    assert sorted(file.name for file in tmp_path.iterdir()) == ["ball.gltf", "ball.obj"]
-    with pytest.raises(ValueError, match=r"ball\.stl: suffix must be .* got .stl"):
-        write_mesh(tmp_path / "ball.stl", mesh)
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["sphere.gltf", "sphere.obj"]
+    with pytest.raises(ValueError, match=r"sphere\.stl: suffix must be .* got .stl"):
+        write_mesh(tmp_path / "sphere.stl", mesh)
 
 
 def test_without_anything_solid_there_is_no_mesh():
     with pytest.raises(ValueError, match="no surface in this field"):
-        field_mesh(field(lambda p: ball(p) + 10.0))
+        field_mesh(field(lambda p: sphere(p) + 10.0))

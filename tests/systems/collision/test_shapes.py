@@ -33,14 +33,14 @@ def field_of(*shapes) -> AnalyticDistanceField:
 
 
 def surface_points(name: str) -> np.ndarray:
-    """Many points on the surface, made from the shape's own parametrisation."""
+    """Many points on the surface, made from the shape's own parametrization."""
     random = np.random.default_rng(0)
     n = 150_000
     shape = SHAPES[name]
-    way = random.normal(size=(n, 3))
-    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    direction = random.normal(size=(n, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     if name == "sphere":
-        return shape.p_WO + shape.radius * way
+        return shape.p_WO + shape.radius * direction
     if name == "half space":
         normal = np.array([1.0, 2.0, -2.0]) / 3.0
         p = random.uniform(-6.0, 6.0, (4 * n, 3))
@@ -51,11 +51,11 @@ def surface_points(name: str) -> np.ndarray:
         return X_WO.multiply((p * shape.size).T).T
     length = np.linalg.norm(B - A)
     axis = (B - A) / length
-    radial = way - np.outer(way @ axis, axis)
+    radial = direction - np.outer(direction @ axis, axis)
     radial /= np.linalg.norm(radial, axis=1, keepdims=True)
     side = A + np.outer(random.uniform(0.0, length, n), axis) + 0.4 * radial
     if name == "capsule":
-        ends = np.where((way @ axis > 0.0)[:, None], B, A) + 0.4 * way
+        ends = np.where((direction @ axis > 0.0)[:, None], B, A) + 0.4 * direction
     else:
         ends = np.where(random.random((n, 1)) < 0.5, A, B)
         ends = ends + 0.4 * np.sqrt(random.random((n, 1))) * radial
@@ -209,7 +209,7 @@ def test_paths_are_followed_there_and_back():
 
 
 @pytest.mark.parametrize("time", [0.0, 0.5, 1.2])
-def test_the_field_is_that_of_everything_where_it_is(time):
+def test_the_field_has_the_spheres_of_its_time(time):
     standing = Sphere([0.0, -2.0, 1.0], 0.7)
     placed = [
         Sphere(center, radius)
@@ -227,7 +227,7 @@ def test_the_field_is_that_of_everything_where_it_is(time):
     assert field.query(p_WQ[0, 0]).distance.shape == ()
 
 
-def test_samples_of_trajectories_meet_the_balls_of_their_times():
+def test_samples_of_trajectories_meet_the_spheres_of_their_times():
     field = AnalyticDistanceField([Sphere([0.0, -2.0, 1.0], 0.7)], LOWER, UPPER)
     times = np.array([0.2, 0.6, 1.1, 1.4])
     p_WQ = np.random.default_rng(1).uniform(-4.0, 4.0, (30, 4, 3))

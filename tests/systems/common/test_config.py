@@ -14,7 +14,6 @@ from splatpilot.training.corpus.library import LibraryConfig
 
 
 def test_file_and_overrides_set_only_what_they_name(tmp_path):
-    """Overrides come after the file, the file after the defaults, and nothing else changes."""
     path = tmp_path / "scenario.yaml"
     path.write_text("timeout: 9\nworld: {spacing: 2.5}\npolicy: {lattice: {speed: 3.0}}\n")
     scenario = load_config(
@@ -64,20 +63,17 @@ def test_dumped_scenario_loads_as_itself(tmp_path):
     ],
 )
 def test_bad_override_is_named(override, message):
-    """An unknown field, a value of another type and broken YAML name the override and the field."""
     with pytest.raises(ValueError, match=message):
         load_config(Scenario(), overrides=[override])
 
 
-def test_letters_are_no_list():
+def test_a_word_is_not_read_as_a_list():
     with pytest.raises(ValueError, match=r"kinds must be a list, got P02; write \[P02\]"):
         load_config(LibraryConfig(), overrides=["kinds=P02"])
     assert load_config(LibraryConfig(), overrides=["kinds=[P02]"]).kinds == ["P02"]
 
 
-def test_a_field_of_the_type_that_is_there_first_of_all():
-    """In a fresh process the first override of a field in what another type than the default's
-    holds leaves that type."""
+def test_first_override_in_a_process_keeps_the_type_of_its_configuration():
     program = (
         "from splatpilot.diagrams.flight.scenario import Scenario\n"
         "from splatpilot.systems.common.config import load_config\n"
@@ -98,25 +94,25 @@ def test_bad_file_is_named(tmp_path):
     with pytest.raises(ValueError, match=r"scenario.yaml: there is no field timout; did"):
         load_config(Scenario(), path)
     path.write_text("seed: 3\ntimeout: [\n")
-    with pytest.raises(ValueError, match=r"scenario.yaml is not YAML: line 3: expected .*") as said:
+    with pytest.raises(
+        ValueError, match=r"scenario.yaml is not YAML: line 3: expected .*"
+    ) as caught:
         load_config(Scenario(), path)
-    assert "\n" not in str(said.value)
-    for nothing in ("", "# seed: 3\n", "---\n"):
-        path.write_text(nothing)
+    assert "\n" not in str(caught.value)
+    for empty in ("", "# seed: 3\n", "---\n"):
+        path.write_text(empty)
         with pytest.raises(ValueError, match=r"scenario.yaml: the text must be fields"):
             load_config(Scenario(), path)
 
 
 def test_files_are_not_repeated_in_errors(tmp_path):
-    """Of a file that holds no fields an error shows enough to know it by, not all it holds; one
-    that is too large, no text, or nested without end is not read at all."""
     path = tmp_path / "secret.yaml"
     path.write_text("password\n" * 1000)
     with pytest.raises(
         ValueError, match=r"secret.yaml: the text must be .* got password p"
-    ) as said:
+    ) as caught:
         load_config(Scenario(), path)
-    assert len(str(said.value)) < 200 + len(str(path))
+    assert len(str(caught.value)) < 200 + len(str(path))
     path.write_bytes(b"seed: \xff")
     with pytest.raises(ValueError, match=r"secret.yaml must be a text .* 0xff at byte 6"):
         load_config(Scenario(), path)
@@ -175,12 +171,11 @@ def test_fields_that_may_be_empty_may_be_null(tmp_path):
     ],
 )
 def test_scenario_refuses_what_cannot_be_flown(override, message):
-    """Values out of range are refused by field, value and limit."""
     with pytest.raises(ValueError, match=message):
         load_config(Scenario(), overrides=[override]).validate()
 
 
-def test_nothing_named_gives_the_defaults_and_they_are_valid(tmp_path):
+def test_defaults_are_valid_and_checked(tmp_path):
     path = tmp_path / "scenario.yaml"
     path.write_text("seed: 0\n")
     scenario = load_config(Scenario(), path)
@@ -192,7 +187,6 @@ def test_nothing_named_gives_the_defaults_and_they_are_valid(tmp_path):
 
 
 def test_override_keeps_the_type_that_a_file_chose(tmp_path):
-    """An override of a field of another policy or world than the default's sets that field."""
     path = tmp_path / "scenario.yaml"
     path.write_text("world: !SceneConfig {path: a}\npolicy: !ReactiveConfig {speed: 1.5}\n")
     overrides = ["world.path=b", "policy.camera.width=32"]
@@ -201,12 +195,12 @@ def test_override_keeps_the_type_that_a_file_chose(tmp_path):
     assert (scenario.policy.speed, scenario.policy.camera.width) == (1.5, 32)
 
 
-def test_unknown_type_is_refused_with_those_there_are():
+def test_unknown_type_is_refused_with_the_known_ones():
     with pytest.raises(
         ValueError,
-        match=r"policy must be one of .*!StraightC.* got !Nobody.*--import",
+        match=r"policy must be one of .*!StraightC.* got !Absent.*--import",
     ):
-        load_config(Scenario(), overrides=["policy=!NobodyConfig {}"])
+        load_config(Scenario(), overrides=["policy=!AbsentConfig {}"])
 
 
 def test_type_of_another_package_is_read_and_written():
@@ -226,7 +220,7 @@ def test_type_of_another_package_is_read_and_written():
     assert "!ForestConfig" not in dump_config(Scenario())
 
 
-def test_drakes_functions_read_and_write_open_fields():
+def test_drakes_functions_read_and_write_registry_fields():
     program = (
         "from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed\n"
         "import splatpilot as sp\n"
@@ -241,7 +235,7 @@ def test_drakes_functions_read_and_write_open_fields():
     subprocess.run([sys.executable, "-c", program], check=True)
 
 
-def test_override_reaches_a_configuration_that_is_not_there_yet():
+def test_override_creates_an_absent_configuration():
     config = load_config(HardwareConfig(), overrides=["time_of_flight.latency=0.1"])
     assert config.time_of_flight is not None and config.time_of_flight.latency == 0.1
     sensors = ["sensors={down: !OnboardCamera {width: 20}}", "sensors.down.height=10"]

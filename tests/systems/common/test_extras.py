@@ -35,7 +35,6 @@ torch.optim.Adam([weights]).step()
 
 
 def test_missing_package_says_which_extra_brings_it():
-    """What is installed is imported; what is not names itself and the command that installs it."""
     assert import_extra("json", "train").loads("1") == 1
     message = r"^absent_package is not installed; pip install 'splatpilot\[photos\]'$"
     with pytest.raises(ModuleNotFoundError, match=message) as caught:
@@ -66,7 +65,6 @@ def test_no_extra_brings_what_flying_needs(package):
 
 
 def test_missing_driver_is_an_error_that_says_what_to_install(opengl, monkeypatch):
-    """Without any EGL driver, the answer is an error and not the end of the process."""
     monkeypatch.setenv("__EGL_VENDOR_LIBRARY_FILENAMES", "/nonexistent")
     monkeypatch.setenv("DISPLAY", "")
     require_opengl.cache_clear()

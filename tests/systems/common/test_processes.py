@@ -15,7 +15,7 @@ def _square(number: int) -> tuple[int, int]:
 
 
 def _killed(folder: Path) -> str:
-    """The first to come here marks the folder and is killed; later ones end."""
+    """Kills its process on the first call for a folder."""
     try:
         (folder / "mark").touch(exist_ok=False)
     except FileExistsError:
@@ -26,7 +26,6 @@ def _killed(folder: Path) -> str:
 
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_results_are_those_of_the_function(jobs):
-    """Every piece of work has its result once; one job works in this process, several in others."""
     results = list(map_processes(_square, range(7), jobs))
     assert sorted(square for square, _ in results) == [n * n for n in range(7)]
     assert ({pid for _, pid in results} == {os.getpid()}) == (jobs == 1)
@@ -37,7 +36,7 @@ def _slow(number: int) -> int:
     return number
 
 
-def test_who_has_enough_ends_it_without_a_warning(recwarn):
+def test_closing_early_gives_no_warning(recwarn):
     results = map_processes(_slow, range(6), jobs=2)
     assert next(results) == 0
     results.close()
@@ -46,7 +45,6 @@ def test_who_has_enough_ends_it_without_a_warning(recwarn):
 
 
 def test_killed_process_is_named_and_the_next_call_works(tmp_path):
-    """A process that is killed ends the call with the remedy; the same call again goes on."""
     with pytest.raises(OSError, match=r"was killed.*run the same command again, with fewer --jobs"):
         list(map_processes(_killed, [tmp_path] * 3, jobs=2))
     assert list(map_processes(_killed, [tmp_path] * 3, jobs=2)) == ["ended"] * 3
@@ -61,7 +59,6 @@ def _is_running(pid: int) -> bool:
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs Linux's /proc")
 def test_processes_end_with_a_parent_that_is_killed(tmp_path):
-    """Neither one at work nor one that waits for more outlives a parent that could not tell it."""
     script = tmp_path / "script.py"
     script.write_text(
         "import os, pathlib, time\n"
@@ -93,7 +90,7 @@ def _abort(work):
     return work, os.getpid()
 
 
-def test_work_apart():
+def test_work_in_a_subprocess():
     work, process = run_in_subprocess("a: counting", _abort, "count")
     assert work == "count" and process != os.getpid()
     with pytest.raises(ValueError, match="refuse: no"):

@@ -12,7 +12,7 @@ PERIOD, TICK = 0.1, 0.002
 
 
 class Policy(LeafSystem):
-    """Keeps its last image, and counts. It raises an exception at a place that `broken` names."""
+    """Keeps its last image, and counts; raises an exception in the method that `broken` names."""
 
     broken = ""
 

@@ -25,8 +25,8 @@ def test_near_ties_continue_the_last_plan():
 
 def test_progress_reduces_costs():
     def network(image, state):
-        way = PATH * [1, 0, 0]
-        return np.stack([0.2 * way, way, -way]), np.full(3, 0.3)
+        ahead = PATH * [1, 0, 0]
+        return np.stack([0.2 * ahead, ahead, -ahead]), np.full(3, 0.3)
 
     depth, p_WG = np.full((24, 32), 9.0), np.array([9, 0, 2])
     seen = Observation(0.0, pose_from_state(X), QuadrotorState.of(X), p_WG, depth)

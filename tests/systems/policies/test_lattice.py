@@ -43,8 +43,8 @@ def test_trajectories_keep_their_ends(pillar):
     R_WL = rotation_to(-toa.gradient(p))
     ends = p + 2.0 * 2.0 * final_velocities(lattice.config) @ R_WL.T
     np.testing.assert_allclose(trajectories.positions[:-3, -1], ends, atol=1e-12)
-    way, _ = toa.path(p, 4.0 * np.array(lattice.config.speed_fractions))
-    np.testing.assert_allclose(trajectories.positions[-3:, -1], way, atol=1e-12)
+    path, _ = toa.path(p, 4.0 * np.array(lattice.config.speed_fractions))
+    np.testing.assert_allclose(trajectories.positions[-3:, -1], path, atol=1e-12)
 
 
 def test_costs_are_the_documented_sum(pillar):
@@ -126,13 +126,13 @@ def test_is_the_lattices_own(distance):
     direction = np.array([2.0, -1.0, 0.4]) / np.linalg.norm([2.0, -1.0, 0.4])
     p_WG = p_WB + distance * direction
     a_WB = level_acceleration(R_WB, v_WB, QuadrotorParams())
-    ways_W = lattice.trajectories(p_WB, v_WB, a_WB, _Open(p_WG)).positions[-1, :10]
+    paths_W = lattice.trajectories(p_WB, v_WB, a_WB, _Open(p_WG)).positions[-1, :10]
     found = reference_trajectory(R_WB.T @ v_WB, R_WB.T @ (p_WG - p_WB), R_WB[2], 2.6)
-    np.testing.assert_allclose(found @ R_WB.T + p_WB, ways_W, atol=1e-9)
+    np.testing.assert_allclose(found @ R_WB.T + p_WB, paths_W, atol=1e-9)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_goals_told_as_at_the_reach_are_flown_on_to(dtype):
+def test_goals_at_the_reach_are_passed_at_speed(dtype):
     directions = torch.from_numpy(np.random.default_rng(2).normal(size=(1000, 3))).to(dtype)
     directions = directions / directions.norm(dim=1, keepdim=True)
     up_B, basis = torch.tensor([0.0, 0.0, 1.0], dtype=dtype), torch.from_numpy(BASIS).to(dtype)

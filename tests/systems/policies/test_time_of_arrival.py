@@ -32,7 +32,7 @@ def test_goes_around_a_wall(half_wall):
     corner = np.array([6.2, 6.0 + VEHICLE_RADIUS, 2.0])
     shortest = np.linalg.norm(corner - p_WB) + np.linalg.norm(p_WG - corner)
     assert shortest < toa.value(p_WB) < 1.5 * shortest
-    # Before the wall the way leads to its end and off the wall, not to the goal behind it.
+    # Before the wall the path leads to its end and off the wall, not to the goal behind it.
     downhill = -toa.gradient(np.array([5.0, 3.0, 2.0]))
     assert downhill[1] > 0.5 and downhill[0] < 0.0
 
@@ -47,7 +47,7 @@ def test_gradient_is_the_slowness(pillar):
     assert np.mean(np.abs(ratio - 1.0) < 0.15) > 0.95
 
 
-def test_way_goes_down_the_gradient(u_trap):
+def test_path_goes_down_the_gradient(u_trap):
     toa = time_of_arrival(u_trap, np.array([10.0, 4.0, 2.0]))
     rng = np.random.default_rng(0)
     points = rng.uniform(u_trap.lower_W - 0.5, u_trap.upper_W + 0.5, (200, 3))
@@ -68,7 +68,7 @@ def test_slowness_rises_toward_contact():
     assert 10.0 < slowness(np.array(VEHICLE_RADIUS)) < 12.0
 
 
-def test_way_leads_to_the_goal(u_trap):
+def test_path_leads_to_the_goal(u_trap):
     p_WG = np.array([12.0, 5.0, 2.0])
     toa = time_of_arrival(u_trap, p_WG, margin=0.05)
     lengths = np.arange(0.0, 40.0, 0.2)

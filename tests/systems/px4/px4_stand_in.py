@@ -1,5 +1,5 @@
 """A STAND-IN for PX4, which is in no package registry: real MAVLink over UDP, a quadrotor, and the
-rules of offboard mode in PX4's documentation of v1.16 and v1.18. It proves nothing about PX4."""
+rules of offboard mode in PX4's documentation of v1.16 and v1.18. PX4 may differ."""
 
 import socket
 
@@ -148,7 +148,7 @@ class Px4StandIn:
             self._send(self.delayed.pop(0)[1])
         if self.tick % 10 == 0:
             self._send(dialect.MAVLink_timesync_message(0, round(1e9 * (now - BOOT))))
-        if self.tick % 100 == 0:  # PX4's heartbeat has 1 Hz, whatever is asked for.
+        if self.tick % 100 == 0:  # PX4's heartbeat has 1 Hz, whatever is requested.
             base = dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
             base |= dialect.MAV_MODE_FLAG_SAFETY_ARMED if self.armed else 0
             custom = (self.mode[0] << 16) | (self.mode[1] << 24)

@@ -103,7 +103,7 @@ def test_only_what_the_lens_shows_is_drawn():
     view = images[0]
     assert (view.color[~shown] == 0).all() and (view.alpha[~shown] == 0).all()
     assert (view.depth[~shown] == 0).all()
-    # The map is white, and what is not covered shows it.
+    # The map is white, and pixels without Gaussians show it.
     clear = shown & (view.alpha == 0)
     assert clear.any() and (view.color[clear] == 1).all()
 

@@ -13,8 +13,8 @@ class Page:
     Args:
         tab: Playwright's.
         path: the page.
-        settled: JavaScript that is true when the picture shows what was asked for.
-        hidden: CSS selectors of what is no part of the picture of the scene.
+        settled: JavaScript that is true when the picture is complete.
+        hidden: CSS selectors of elements that are not part of the picture.
     """
 
     def __init__(self, tab, path, settled: str, hidden: str):
@@ -31,7 +31,7 @@ class Page:
             self.errors.append(text)
 
     def settle(self) -> None:
-        """Waits until the picture shows what was asked for."""
+        """Waits until the picture is complete."""
         self.tab.wait_for_function(f"{self.settled} && !viewer.needs_render")
 
     def run(self, script: str):
@@ -49,7 +49,7 @@ class Page:
 
 @pytest.fixture(scope="session")
 def browser():
-    """Chromium; skips where there is none on the PATH."""
+    """Chromium; skips the test if it is not on the PATH."""
     chromium = shutil.which("chromium") or shutil.which("chromium-browser")
     if chromium is None:
         pytest.skip("there is no Chromium on the PATH")

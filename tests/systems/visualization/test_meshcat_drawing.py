@@ -1,4 +1,4 @@
-"""What is drawn in Meshcat."""
+"""Drawings in Meshcat, read back."""
 
 import base64
 import json
@@ -141,7 +141,7 @@ def test_many_gaussians_are_thinned_evenly(meshcat):
     np.testing.assert_array_equal(position[:, 0], x[::3])
 
 
-def test_goal_is_a_ball_at_its_place(meshcat):
+def test_goal_is_a_sphere_at_its_position(meshcat):
     draw_goal(meshcat, "/splatpilot/goal", np.array([3.0, -1.0, 2.0]), radius=0.3)
     drawing = drawn(meshcat, "/splatpilot/goal")
     assert drawing["geometries"][0]["radius"] == 0.3
@@ -179,7 +179,7 @@ def test_distance_slice_is_colored_by_distance(meshcat):
     np.testing.assert_allclose(color, 0.4)
 
 
-def test_camera_picture_is_hung_at_its_rate(meshcat):
+def test_camera_picture_is_shown_at_its_rate(meshcat):
     info = CameraInfo(width=32, height=24, fov_y=1.0)
     builder = DiagramBuilder()
     shown_at = []

@@ -33,7 +33,7 @@ def test_words_hold_centers_shades_and_covariances():
     assert (words[:, 7] == 0).all()
 
 
-def test_what_no_half_holds_shrinks_as_a_whole():
+def test_covariances_beyond_half_floats_shrink_as_a_whole():
     scene = GaussianScene.from_colors(
         means=np.zeros((1, 3)),
         quats=[[np.cos(np.pi / 8), 0, 0, -np.sin(np.pi / 8)]],  # -45 degrees about z

@@ -87,7 +87,7 @@ def open_page(open_in_browser):
 
 
 def seen(gaussians, background, X_WB: RigidTransform) -> np.ndarray:
-    """What the onboard camera sees, as `Page.picture` has it."""
+    """The onboard camera's image, in the format of `Page.picture`."""
     info = CameraInfo(WIDTH, HEIGHT, FOV_Y)
     view = BakedScene(gaussians).render(
         info.intrinsic_matrix(),

@@ -80,7 +80,7 @@ def open_page(open_in_browser):
 
 
 def pixels_of(page, points) -> list[list[float]]:
-    """Where points of W are in the window [px]."""
+    """Positions of points of W in the window [px]."""
     return page.run(
         f"""() => {{
           viewer.render();
