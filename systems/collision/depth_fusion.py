@@ -14,6 +14,7 @@ from splatpilot.systems.common.validation import require
 _BLOCK = 8  # [voxels] edge of a block, the unit in which invisible space is skipped
 _CHUNK = 1024  # blocks fused at once
 _MIN_COSINE = 0.15  # of incidence
+_MARGIN = 0.2  # [m] around all cameras and points seen
 _MAX_DEPTH_BEHIND = 2.0  # [truncations] behind a surface in which a pixel counts
 
 
@@ -202,9 +203,8 @@ def bounds_of_depth_images(
     K: np.ndarray,
     X_WCs: Sequence[RigidTransform],
     max_range: float = 8.0,
-    margin: float = 0.2,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the corners (3,) [m] of the box of all cameras and points seen, and a margin [m].
+    """Returns the corners (3,) [m] of the box of all cameras and points seen, and 0.2 m around it.
 
     Takes every fourth pixel along both axes; see `esdf_from_depth_images`.
     """
@@ -219,7 +219,7 @@ def bounds_of_depth_images(
         points = np.concatenate([p_WQ, X_WC.translation()[None]])
         lower = np.minimum(lower, points.min(axis=0))
         upper = np.maximum(upper, points.max(axis=0))
-    return lower - margin, upper + margin
+    return lower - _MARGIN, upper + _MARGIN
 
 
 def _pair(

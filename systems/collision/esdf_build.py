@@ -219,13 +219,13 @@ def esdf_from_distance_field(field: DistanceField, voxel_size: float) -> Esdf:
 
 
 def cubes_of_points(
-    x: np.ndarray, y: np.ndarray, z: np.ndarray, edge: int = 16
+    x: np.ndarray, y: np.ndarray, z: np.ndarray
 ) -> Iterator[tuple[tuple[slice, slice, slice], np.ndarray]]:
-    """Yields the points of a grid in cubes of `edge` points a side: slices and points (n, n, n, 3).
+    """Yields the points of a grid in cubes of 16 points a side: slices and points (n, n, n, 3).
 
     Fields find the nearest of many shapes faster for points that lie close together.
     """
-    for i, j, k in itertools.product(*(range(0, len(axis), edge) for axis in (x, y, z))):
-        part = np.s_[i : i + edge, j : j + edge, k : k + edge]
+    for i, j, k in itertools.product(*(range(0, len(axis), 16) for axis in (x, y, z))):
+        part = np.s_[i : i + 16, j : j + 16, k : k + 16]
         axes = np.meshgrid(x[part[0]], y[part[1]], z[part[2]], indexing="ij")
         yield part, np.stack(axes, axis=-1)

@@ -15,6 +15,7 @@ from splatpilot.systems.messaging.receiver import UdpInbox
 from splatpilot.systems.px4.mavlink import HOLD, LAND, OFFBOARD, Mavlink
 from splatpilot.systems.px4.telemetry import HEARTBEAT_TIMEOUT
 
+_PERIOD = 0.02  # [s] between setpoints.
 _HEARTBEAT_PERIOD = 1.0  # [s], also between repeated commands.
 _BRAKING = 2.0  # [s] of stopping PX4 after the last setpoint: two of its heartbeats.
 _STOP = np.array([0.0, 0.0, 0.0, math.nan])  # A velocity setpoint.
@@ -83,9 +84,9 @@ class Px4Commander(LeafSystem):
     - ``heartbeat_age`` (1) [s], ``armed`` (1), ``mode`` (2), ``granted`` (2): of `Px4Telemetry`.
     - ``motion_capture_pose`` (7), ``motion_capture_age`` (1) [s], optional: p_WB [m] and q_WB.
 
-    Sends setpoints, if fresh, every ``period`` [s] from time 0 and as they come, for which it looks
-    every ``tick`` [s]; every second a heartbeat; and poses as ODOMETRY, each once and at most every
-    0.9 ``period``, if they are as fresh.
+    Sends setpoints, if fresh, every 0.02 s from time 0 and as they come, for which it looks every
+    ``tick`` [s]; every second a heartbeat; and poses as ODOMETRY, each once and at most every
+    0.018 s, if they are as fresh.
 
     After ``streaming`` seconds of setpoints it requests offboard mode, and in it arming, each if
     configured and if the bridge flies, once a second until PX4 grants it.
@@ -104,25 +105,24 @@ class Px4Commander(LeafSystem):
         mavlink: Mavlink,
         address: tuple[str, int],
         gravity: float,
-        period: float = 0.02,
         tick: float = 0.002,
     ):
         super().__init__()
         config.validate()
-        self._config, self._mavlink, self._gravity, self._period = config, mavlink, gravity, period
+        self._config, self._mavlink, self._gravity = config, mavlink, gravity
         self._send = lambda packet: inbox.send(packet, address)
         for name, size in _INPUTS.items():
             self.DeclareVectorInputPort(name, size)
         self.DeclareDiscreteState(np.array(_Memory()))
-        intervals = {"setpoint_age": SAME_TIME, "motion_capture_age": 0.9 * period}
+        intervals = {"setpoint_age": SAME_TIME, "motion_capture_age": 0.9 * _PERIOD}
         # By the ages of arrivals: the min time between two that are sent on [s], and the state.
         self._arrivals = {
             name: (interval, int(self.DeclareDiscreteState(np.array(_Arrival()))))
             for name, interval in intervals.items()
         }
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        self.DeclarePeriodicDiscreteUpdateEvent(_PERIOD, 0.0, self._update)
         self.DeclarePeriodicDiscreteUpdateEvent(tick, 0.0, self._look)
-        self.DeclarePeriodicPublishEvent(period, PUBLISH_OFFSET, self._publish)
+        self.DeclarePeriodicPublishEvent(_PERIOD, PUBLISH_OFFSET, self._publish)
         self.DeclarePeriodicPublishEvent(tick, PUBLISH_OFFSET, self._publish_arrivals)
 
     def _is_fresh(self, context: Context, name: str) -> bool:
@@ -196,7 +196,7 @@ class Px4Commander(LeafSystem):
 
     def _publish_arrivals(self, context: Context) -> None:
         now = context.get_time() - PUBLISH_OFFSET
-        is_due = abs(math.remainder(now, self._period)) < PUBLISH_OFFSET  # `_publish` sends it.
+        is_due = abs(math.remainder(now, _PERIOD)) < PUBLISH_OFFSET  # `_publish` sends it.
         if self._has_come(context, "setpoint_age") and not is_due:
             self._publish_setpoint(context)
         if self._has_come(context, "motion_capture_age"):
@@ -224,9 +224,9 @@ class Px4Commander(LeafSystem):
 
     def _publish(self, context: Context) -> None:
         now, memory = context.get_time() - PUBLISH_OFFSET, _Memory.read(context)
-        tick = round(now / self._period)
-        if tick % round(_HEARTBEAT_PERIOD / self._period) == 0:
+        tick = round(now / _PERIOD)
+        if tick % round(_HEARTBEAT_PERIOD / _PERIOD) == 0:
             self._send(self._mavlink.heartbeat())
         self._publish_setpoint(context)
-        if abs(now - memory.asked) < 0.5 * self._period and (request := self._request(context)):
+        if abs(now - memory.asked) < 0.5 * _PERIOD and (request := self._request(context)):
             self._send(request)

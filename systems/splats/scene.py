@@ -211,15 +211,11 @@ class GaussianScene:
         origin = _vector(factor * np.array(self.origin))
         return GaussianScene(means, self.quats, scales, self.opacities, self.sh, origin=origin)
 
-    def merged_with(
-        self, other: GaussianScene, X_WO: RigidTransform | None = None
-    ) -> GaussianScene:
-        """Returns this scene with `other`, whose frame O has the pose `X_WO` (identity if None).
+    def merged_with(self, other: GaussianScene) -> GaussianScene:
+        """Returns this scene with the Gaussians of another in the same frame.
 
         The lower of the two degrees of spherical harmonics is padded with zeros.
         """
-        if X_WO is not None:
-            other = other.transformed_by(X_WO)
         K = max(self.sh.shape[1], other.sh.shape[1])
         merged = {
             name: np.concatenate([getattr(self, name), getattr(other, name)])

@@ -142,11 +142,9 @@ def distance_slice(
     return p_WQ, faces.astype(np.int32), colors
 
 
-def draw_distance_slice(
-    meshcat: Meshcat, path: str, field: DistanceField, height: float, spacing: float = 0.2
-) -> None:
+def draw_distance_slice(meshcat: Meshcat, path: str, field: DistanceField, height: float) -> None:
     """Draws the `distance_slice` of a field at z = `height` [m], blue from 2 m on."""
-    p_WQ, faces, colors = distance_slice(field, height, spacing, max_distance=2.0)
+    p_WQ, faces, colors = distance_slice(field, height, spacing=0.2, max_distance=2.0)
     meshcat.SetTriangleColorMesh(path, p_WQ.T, faces.T, colors.T)
 
 
@@ -224,11 +222,11 @@ class FlightVisualizer(LeafSystem):
         return EventStatus.Succeeded()
 
 
-def fan_mesh(plan: Hypotheses, width: float = 0.02) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Makes horizontal ribbons along K hypotheses, from green (lowest cost) to red (highest).
+_RIBBON_WIDTH = 0.02  # [m]
 
-    Args:
-        width: [m] of a ribbon.
+
+def fan_mesh(plan: Hypotheses) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Makes horizontal ribbons along K hypotheses, from green (lowest cost) to red (highest).
 
     Returns:
         Vertices (3, V) [m], triangles (3, F) int32 seen from both sides, colors (3, V) in 0 to 1.
@@ -238,8 +236,8 @@ def fan_mesh(plan: Hypotheses, width: float = 0.02) -> tuple[np.ndarray, np.ndar
     path = np.concatenate([start, plan.waypoints_W], axis=1)  # (K, T + 1, 3)
     along = np.gradient(path, axis=1)
     across = np.stack([-along[..., 1], along[..., 0], np.zeros(along.shape[:2])], axis=-1)
-    across /= np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-9)
-    sides = np.stack([path - 0.5 * width * across, path + 0.5 * width * across], axis=2)
+    across *= 0.5 * _RIBBON_WIDTH / np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-9)
+    sides = np.stack([path - across, path + across], axis=2)
     cost = (plan.costs - plan.costs.min()) / max(np.ptp(plan.costs), 1e-9)
     color = np.column_stack(
         [np.minimum(1, 2 * cost), np.minimum(1, 2 * (1 - cost)), np.full(K, 0.1)]

@@ -175,14 +175,14 @@ def test_the_sky_clears_the_space_before_it():
 
 def test_bounds_hold_all_seen_points_and_cameras(capture):
     depths, X_WCs = capture
-    lower_W, upper_W = bounds_of_depth_images(depths, K, X_WCs, margin=0.2)
+    lower_W, upper_W = bounds_of_depth_images(depths, K, X_WCs)
     np.testing.assert_allclose(lower_W, [-0.2, -0.2, -0.2], atol=0.01)
     np.testing.assert_allclose(upper_W, [4.2, 3.2, 2.7], atol=0.01)
     lower_W, upper_W = bounds_of_depth_images(
-        [wall(9.0)], K, [RigidTransform(np.array([1.0, 2.0, 3.0]))], max_range=2.0, margin=0.0
+        [wall(9.0)], K, [RigidTransform(np.array([1.0, 2.0, 3.0]))], max_range=2.0
     )
-    assert (lower_W >= np.array([1.0, 2.0, 3.0]) - 2.0).all()
-    assert 4.9 < upper_W[2] <= 5.0 and lower_W[2] == 3.0
+    assert (lower_W >= np.array([1.0, 2.0, 3.0]) - 2.2).all()
+    assert 5.1 < upper_W[2] <= 5.2 and lower_W[2] == 2.8
 
 
 @pytest.mark.parametrize(

@@ -192,16 +192,15 @@ def render(
     height,
     sh_degree=None,
     background=(0.0, 0.0, 0.0),
-    dtype=torch.float64,
     **projection_options,
 ) -> Reference:
     means, quats, scales, opacities, colors, viewmat, K = (
-        a.to(dtype) for a in (means, quats, scales, opacities, colors, viewmat, K)
+        a.double() for a in (means, quats, scales, opacities, colors, viewmat, K)
     )
     p = project(means, quats, scales, opacities, viewmat, K, width, height, **projection_options)
     seen = seen_colors(means[p.ids], colors[p.ids], viewmat, sh_degree)
     result = composite(p, seen, width, height)
-    behind = (1 - result.alpha)[..., None] * torch.as_tensor(background, dtype=dtype)
+    behind = (1 - result.alpha)[..., None] * torch.as_tensor(background, dtype=torch.float64)
     return result._replace(color=result.color + behind)
 
 

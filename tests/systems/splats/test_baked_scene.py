@@ -303,7 +303,7 @@ def test_a_moving_body_is_drawn_like_a_static_one():
     scene, body = random_scene(2048, seed=1, sh_degree=1), random_scene(300, seed=2, sh_degree=0)
     center = np.array([0.3, 0.2, 0.5])
     moving = MovingGaussians([body], lambda time: time * center[None])
-    whole = scene.merged_with(body, RigidTransform(center))
+    whole = scene.merged_with(body.transformed_by(RigidTransform(center)))
     expected = BakedScene(whole).render(K, WIDTH, HEIGHT, X_WC, background=(0.1, 0.2, 0.3))
     view = BakedScene(scene).render(
         K, WIDTH, HEIGHT, X_WC, background=(0.1, 0.2, 0.3), moving=moving.at(1.0)

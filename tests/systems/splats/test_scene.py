@@ -122,11 +122,12 @@ def test_scaled_scene_has_all_lengths_times_the_factor():
         np.testing.assert_array_equal(getattr(scaled, name), getattr(scene, name))
 
 
-def test_merge_places_the_other_scene_and_pads_the_lower_degree():
+def test_merge_pads_the_lower_degree():
     first = GaussianScene(**random_arrays(N=3, K=9))
     other = GaussianScene(**random_arrays(N=2, K=4, seed=5))
     X_WO = RigidTransform(RollPitchYaw(0.1, 0.2, 0.3), np.array([10.0, 0.0, 0.0]))
-    merged, placed = first.merged_with(other, X_WO), other.transformed_by(X_WO)
+    placed = other.transformed_by(X_WO)
+    merged = first.merged_with(placed)
     for name in ("means", "quats", "scales", "opacities"):
         expected = np.concatenate([getattr(first, name), getattr(placed, name)])
         np.testing.assert_array_equal(getattr(merged, name), expected)
