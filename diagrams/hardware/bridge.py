@@ -205,8 +205,7 @@ def image_codecs(scenario: Scenario, policy: System) -> list[codecs.Codec]:
 
 def require_messages_for(scenario: Scenario, world: World) -> None:
     """Raises ValueError for sensors and moving obstacles, which have no messages."""
-    sensors = getattr(scenario.policy, "sensors", {}) | scenario.sensors
-    if sensors:
+    if sensors := blocks.onboard_sensors(scenario):
         raise ValueError(f"there are no messages of the sensors {', '.join(sensors)}; remove them")
     if world.moving:
         raise ValueError(

@@ -33,7 +33,7 @@ def encoded(codec, value, number: int = 0, utime: int = 0) -> bytes:
 
 
 class Line:
-    """States sent through a relay every 20 ms, of which those from 1 s to 2 s have faults."""
+    """States sent through a relay every 20 ms; those from 1 s to 2 s have faults."""
 
     def __init__(self, *kinds: str, size: float = 2.0):
         near, far, codec = lcm.LCM("memq://"), lcm.LCM("memq://"), StateCodec()

@@ -169,7 +169,7 @@ def test_what_builds_no_policy_is_named(post_world, monkeypatch):
         flown(Scenario(timeout=1.0, policy=config), post_world)
 
 
-def test_configuration_that_nobody_knows_is_refused(post_world):
+def test_unregistered_configuration_is_refused(post_world):
 
     class MineConfig:
         rate = 10.0

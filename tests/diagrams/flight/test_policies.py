@@ -28,7 +28,7 @@ from splatpilot.systems.policies.depthnav import DEPTHNAV_NETWORK, DepthNavConfi
 
 @dataclass
 class _OneSpeedConfig:
-    """Of a policy whose speed nobody sets."""
+    """Configures a policy with a fixed speed."""
 
     def validate(self) -> None: ...
 
