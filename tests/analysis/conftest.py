@@ -1,3 +1,4 @@
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -64,6 +65,12 @@ class Room:
         metadata = {"capture": "room", "held_out": [0, 8]} | metadata
         write_scene_folder(self.folder / name, world, provenance="a test", **metadata)
         return self.folder / name
+
+
+@pytest.fixture(scope="session")
+def set_fields() -> Callable[..., list[str]]:
+    """Returns the words of a command line that set fields, FIELD=VALUE each."""
+    return lambda *fields: [word for field in fields for word in ("--set", field)]
 
 
 @pytest.fixture(scope="session")
