@@ -8,7 +8,7 @@ from typing import Any, cast
 import numpy as np
 from lcm import LCM
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort, System
+from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort, System
 
 from splatpilot.diagrams.flight.blocks import ConnectInputs
 from splatpilot.systems.messaging.bridge_status import UnixClock
@@ -22,11 +22,6 @@ from splatpilot.systems.messaging.lcm_ports import (
 
 MAX_LAG = 0.05  # [s] Max lag of a diagram behind the wall clock.
 _WATCH_PERIOD = 0.02  # [s] between calls of `over`, which is slower than most ticks.
-
-
-def output(diagram: Diagram, name: str, root: Context) -> np.ndarray:
-    """Returns the vector at an output port of a diagram."""
-    return np.asarray(diagram.GetOutputPort(name).Eval(root))
 
 
 def run_in_real_time(

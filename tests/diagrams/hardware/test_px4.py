@@ -20,7 +20,7 @@ from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.hardware import px4
 from splatpilot.diagrams.hardware.bridge import BuildHardwareDiagram, HardwareConfig
 from splatpilot.diagrams.hardware.px4 import BuildPx4Diagram, Px4Config
-from splatpilot.diagrams.hardware.real_time import output
+from splatpilot.systems.common.drake import vector_output
 from splatpilot.systems.messaging.codecs import MotionCaptureCodec
 from splatpilot.systems.messaging.failsafe import FailsafeConfig
 from splatpilot.systems.messaging.flight_limits import FlightLimits
@@ -93,7 +93,7 @@ class Chain:
 
     def out(self, name: str) -> np.ndarray:
         """An output of the bridge."""
-        return output(self.bridge, name, self.simulators["bridge"].get_context())
+        return vector_output(self.bridge, name, self.simulators["bridge"].get_context())
 
 
 @pytest.fixture
