@@ -49,7 +49,7 @@ def run_in_real_time(
     simulator.AdvanceTo(2 * PUBLISH_OFFSET)
     ready()
     # The wall clock is read once, since it may be set.
-    epoch, started, number, overruns, told = time.time(), time.monotonic(), 0, 0, 0.0
+    epoch, started, number, overruns, last_lag = time.time(), time.monotonic(), 0, 0, 0.0
     clock.set_epoch(root, epoch)
     looked = -0.5 * _WATCH_PERIOD  # Between messages, which are sent at multiples of it.
     while True:
@@ -66,9 +66,9 @@ def run_in_real_time(
         overruns += late > 0.0
         lag = max(late, 0.0)
         for name, value in (("overruns", float(overruns)), ("lag", lag)):
-            if lag != told and diagram.HasInputPort(name):
+            if lag != last_lag and diagram.HasInputPort(name):
                 diagram.GetInputPort(name).FixValue(root, np.array([value]))
-        told = lag
+        last_lag = lag
         if late <= 0.0:
             time.sleep(-late)
             continue

@@ -79,7 +79,7 @@ def test_scene_without_scale_or_capture_is_shown(room, monkeypatch):
     assert "start" not in [name for _, name in data["legend"]]
 
 
-def test_capture_shows_what_it_measured(room, monkeypatch, tmp_path):
+def test_capture_shows_its_measured_surfaces(room, monkeypatch, tmp_path):
     folder = tmp_path / "capture"
     folder.mkdir()
     monkeypatch.setattr(view, "read_capture", lambda path, config: room.capture)

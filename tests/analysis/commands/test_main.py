@@ -265,7 +265,7 @@ def test_messages_are_below_progress_bars(statement, status, message, tmp_path):
     assert last == f"splatpilot: {message}".replace("FILE", str(tmp_path / "working.py"))
 
 
-def test_an_interruption_tells_what_is_kept(tmp_path, capsys, monkeypatch):
+def test_an_interruption_names_the_kept_files(tmp_path, capsys, monkeypatch):
     def interrupted(**_keywords):
         with resumable(lambda: "one scene is in scenes; the same command resumes"):
             raise KeyboardInterrupt

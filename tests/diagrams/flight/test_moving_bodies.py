@@ -64,7 +64,7 @@ def test_a_sphere_hits_at_its_time(post_world):
 
 
 @pytest.mark.parametrize("policy", ["planner", "reactive"])
-def test_the_same_flight_again(post_world, policy):
+def test_flights_are_bitwise_identical(post_world, policy):
     scenario = Scenario(timeout=2.0, policy=policy_named(policy))
     world = with_sphere(post_world, falling(3.0, 0.6, 2.0))
     diagram = BuildFlightDiagram(scenario, world, camera=False)
@@ -123,7 +123,7 @@ def test_a_start_in_a_sphere_is_refused(post_world):
         sample_initial_state(hovering(), world)
 
 
-def test_meshcat_shows_the_sphere_if_there_is_one(post_world):
+def test_meshcat_shows_moving_spheres(post_world):
     scenario, meshcat = hovering(), Meshcat()
     world = with_sphere(post_world, falling(1.0, 0.0, 3.0))
     for flown, shown in ((post_world, False), (world, True)):
