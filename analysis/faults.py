@@ -245,7 +245,7 @@ class Nonsense(LeafSystem):
         output.SetFromVector(target)
 
 
-def _spoilt_policy(scenario: Scenario, world: World, faults: tuple[Fault, ...]) -> Diagram:
+def _faulty_policy(scenario: Scenario, world: World, faults: tuple[Fault, ...]) -> Diagram:
     """Builds the scenario's policy of accelerations or velocities with `Nonsense` after it."""
     builder = DiagramBuilder()
     policy = builder.AddNamedSystem("policy", make_policy(scenario, world))
@@ -277,7 +277,7 @@ def fly_trial(
         failsafe=FailsafeConfig(limits=limits),
     )
     near, far, faults = LCM("memq://"), LCM("memq://"), trial.faults
-    policy = _spoilt_policy(scenario, world, faults)
+    policy = _faulty_policy(scenario, world, faults)
     vehicle = BuildVehicleDiagram(scenario, world, near, config)
     bridge = BuildHardwareDiagram(scenario, world, far, config, policy=policy)
     grid_port = None
@@ -359,7 +359,7 @@ def fly_trial(
 
 @dataclass
 class FaultsConfig(Config):
-    """A campaign."""
+    """A campaign of trials, and the limits that safe ones keep."""
 
     # [-] Number of flights, which alternate between faults, commands and policies.
     trials: int = bounded(600, "[1, inf)")
