@@ -26,12 +26,11 @@ from splatpilot.diagrams.flight.flight import (
 from splatpilot.diagrams.flight.policies import policy_named
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.hardware.bridge import BuildHardwareDiagram, HardwareConfig, image_codecs
-from splatpilot.diagrams.hardware.real_time import output
 from splatpilot.diagrams.hardware.vehicle import BuildVehicleDiagram
 from splatpilot.diagrams.worlds.forest.forest import ForestConfig
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import make_world
-from splatpilot.systems.common.drake import vector_input, weak_callback
+from splatpilot.systems.common.drake import vector_input, vector_output, weak_callback
 from splatpilot.systems.common.files import claim_folder, locks_folder, written_atomically
 from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.common.validation import Config, bounded
@@ -246,7 +245,7 @@ class Nonsense(LeafSystem):
         output.SetFromVector(target)
 
 
-def _spoilt_policy(scenario: Scenario, world: World, faults: tuple[Fault, ...]) -> Diagram:
+def _faulty_policy(scenario: Scenario, world: World, faults: tuple[Fault, ...]) -> Diagram:
     """Builds the scenario's policy of accelerations or velocities with `Nonsense` after it."""
     builder = DiagramBuilder()
     policy = builder.AddNamedSystem("policy", make_policy(scenario, world))
@@ -278,7 +277,7 @@ def fly_trial(
         failsafe=FailsafeConfig(limits=limits),
     )
     near, far, faults = LCM("memq://"), LCM("memq://"), trial.faults
-    policy = _spoilt_policy(scenario, world, faults)
+    policy = _faulty_policy(scenario, world, faults)
     vehicle = BuildVehicleDiagram(scenario, world, near, config)
     bridge = BuildHardwareDiagram(scenario, world, far, config, policy=policy)
     grid_port = None
@@ -314,18 +313,18 @@ def fly_trial(
         else:
             bridge_simulator.AdvanceTo(now - stalled + 2 * PUBLISH_OFFSET)
             clock.set_epoch(bridge_root, stalled)
-            mode, reason = output(bridge, "status", bridge_root)[:2]
+            mode, reason = vector_output(bridge, "status", bridge_root)[:2]
             reasons.add(int(reason))
-        state = QuadrotorState.of(output(vehicle, "state", root))
+        state = QuadrotorState.of(vector_output(vehicle, "state", root))
         max_speed = max(max_speed, float(np.linalg.norm(state.v_WB)))
         max_tilt = max(max_tilt, float(state.tilt))
         if has_landed(vehicle, root):
             outcome = Outcome.LANDED
             break
         autopilot_context = autopilot.GetMyContextFromRoot(root)
-        own_mode = np.asarray(autopilot.GetOutputPort("mode").Eval(autopilot_context))[0]
+        own_mode = vector_output(autopilot, "mode", autopilot_context)[0]
         if status.LANDING not in (mode, own_mode):
-            min_clearance = min(min_clearance, float(output(vehicle, "clearance", root)[0]))
+            min_clearance = min(min_clearance, float(vector_output(vehicle, "clearance", root)[0]))
             to_fence = np.min([state.p_WB - box.lower_W, box.upper_W - state.p_WB])
             min_inside = min(min_inside, float(to_fence) - VEHICLE_RADIUS)
         outcome = flight_outcome(vehicle, root, p_WG, scenario.goal_radius)
@@ -333,7 +332,7 @@ def fly_trial(
             break
 
     # Result.
-    v_WB = QuadrotorState.of(output(vehicle, "state", root)).v_WB
+    v_WB = QuadrotorState.of(vector_output(vehicle, "state", root)).v_WB
     if outcome is not None:
         ended = str(outcome)
     elif np.linalg.norm(v_WB[:2]) < _RESTING and v_WB[2] < _RESTING:
@@ -360,7 +359,7 @@ def fly_trial(
 
 @dataclass
 class FaultsConfig(Config):
-    """A campaign."""
+    """A campaign of trials, and the limits that safe ones keep."""
 
     # [-] Number of flights, which alternate between faults, commands and policies.
     trials: int = bounded(600, "[1, inf)")

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydrake.geometry import Rgba
 from scipy.spatial import KDTree
 
-from splatpilot.diagrams.flight.blocks import goal_position
+from splatpilot.diagrams.flight.blocks import goal_position, start_position
 from splatpilot.diagrams.flight.flight_diagram import empty_meshcat
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.scenarios import scenario_file
@@ -119,8 +119,7 @@ def _may_hold_gaussians(path: Path) -> bool:
 def _generated(scenario: Scenario) -> ViewerScene:
     scenario.validate()
     world = make_world(scenario.world, scenario.seed)
-    p_WS = world.p_WS if scenario.start is None else np.asarray(scenario.start, dtype=float)
-    ends = p_WS, goal_position(scenario, world)
+    ends = start_position(scenario, world), goal_position(scenario, world)
     return _show_world(world, f"{world.name}, seed {scenario.seed}", ends)
 
 

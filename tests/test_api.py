@@ -11,7 +11,7 @@ def run(program: str) -> str:
     return answer.stdout.strip()
 
 
-def test_every_public_name_is_there():
+def test_every_public_name_exists():
     for name in sp.__all__:
         assert getattr(sp, name) is not None
         assert name in dir(sp) or name == "__version__"

@@ -7,11 +7,7 @@ from typing import Any, NamedTuple
 import yaml
 
 from splatpilot.analysis.benchmark.variants import SCENARIO, Variant, flight_name, parse_variant
-from splatpilot.diagrams.flight.policies import (
-    BENCHMARK_POLICIES,
-    MAX_SPEED,
-    policy_speed,
-)
+from splatpilot.diagrams.flight.policies import BENCHMARK_POLICIES, MAX_SPEED, policy_speed
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.scenarios import benchmark_scenarios, scenario_file
 from splatpilot.systems.common.config import load_config

@@ -165,7 +165,7 @@ class StudyFolder:
             arrays = read_archive(file)
             row = json.loads(str(arrays.pop("row")))
             if row["outcome"] == INFEASIBLE:
-                missing = {"reason"} - row.keys()
+                missing = {"success", "reason"} - row.keys()
             else:
                 missing = _REQUIRED - row.keys()
                 shapes = {n: (len(arrays["times"]), *shape) for n, shape in _SHAPES.items()}

@@ -46,8 +46,8 @@ class Finding:
 def doctor(options: argparse.Namespace) -> list[Finding]:
     """Checks processor, GPU, EGL, the route of LCM messages, the video encoder, the packages of
     each extra, data and scenes. Each missing part has one remedy."""
-    checks = _program, _processor, _gpu, _opengl, _messages, _video, _browser, _extras, _data
-    findings = [finding for check in (*checks, _scenes) for finding in check()]
+    machine = _program, _processor, _gpu, _opengl, _messages, _video, _browser
+    findings = [each for check in (*machine, _extras, _data, _scenes) for each in check()]
     print(format_findings(findings))
     return findings
 

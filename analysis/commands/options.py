@@ -164,9 +164,9 @@ class SetField(argparse.Action):
         option_string: str | None = None,
     ) -> None:
         if values == "help":
-            from splatpilot.analysis.commands.settings import format_settings  # imports Drake
+            from splatpilot.systems.common.field_help import format_fields  # imports Drake
 
-            print(format_settings(self.configuration(namespace)))
+            print(format_fields(self.configuration(namespace)))
             parser.exit()
         if "=" not in values:
             raise argparse.ArgumentError(None, f"--set must be FIELD=VALUE, got {values!r}")

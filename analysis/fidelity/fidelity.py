@@ -237,7 +237,7 @@ def _held_out_frames(
     held_out = choose_held_out(len(capture), config.stretches, config.kept)
     representation = views.metadata.representation
     settings = replace(config.reconstruct, representation=representation, hold_out=0)
-    recipe = f"{dump_config(settings)}withheld: {held_out}\n"
+    recipe = f"{dump_config(settings)}held_out: {held_out}\n"
     file = out / _RECIPE
     part = drop_frames(capture, held_out)
     if not file.is_file() or file.read_text() != recipe:

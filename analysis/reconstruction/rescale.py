@@ -53,7 +53,7 @@ class RescaleSummary:
 
     def __str__(self) -> str:
         rows = {
-            "file" if self.out.suffix else "scene": self.out,
+            "file" if self.out.is_file() else "scene": self.out,
             "factor": f"{self.factor:.6g}",
             "size": " x ".join(f"{length:.3g}" for length in self.size) + " m",
             **self.details,

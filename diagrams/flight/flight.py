@@ -18,6 +18,7 @@ from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.common.config import dump_config
+from splatpilot.systems.common.drake import vector_output
 from splatpilot.systems.common.files import written_atomically
 from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.messaging.flight_limits import LEVEL
@@ -239,11 +240,11 @@ def flight_outcome(
     diagram: Diagram, context: Context, p_WG: np.ndarray, goal_radius: float
 ) -> Outcome | None:
     """Returns the outcome at this instant; None during the flight."""
-    if _evaluated(diagram, "in_collision", context)[0]:
+    if vector_output(diagram, "in_collision", context)[0]:
         return Outcome.COLLISION
-    if _evaluated(diagram, "field_state", context)[0] >= FieldState.UNKNOWN:
+    if vector_output(diagram, "field_state", context)[0] >= FieldState.UNKNOWN:
         return Outcome.LEFT_VOLUME
-    p_WB = QuadrotorState.of(_evaluated(diagram, "state", context)).p_WB
+    p_WB = QuadrotorState.of(vector_output(diagram, "state", context)).p_WB
     if np.linalg.norm(p_WG - p_WB) <= goal_radius:
         return Outcome.GOAL
     return None
@@ -251,10 +252,10 @@ def flight_outcome(
 
 def has_landed(diagram: Diagram, context: Context) -> bool:
     """Checks if the vehicle touches a level surface, slowly."""
-    v_WB = QuadrotorState.of(_evaluated(diagram, "state", context)).v_WB
+    v_WB = QuadrotorState.of(vector_output(diagram, "state", context)).v_WB
     return bool(
-        _evaluated(diagram, "clearance", context)[0] < _TOUCH
-        and _evaluated(diagram, "gradient", context)[2] > LEVEL
+        vector_output(diagram, "clearance", context)[0] < _TOUCH
+        and vector_output(diagram, "gradient", context)[2] > LEVEL
         and np.linalg.norm(v_WB) < _TOUCHDOWN_SPEED
     )
 
@@ -272,8 +273,8 @@ def record_flight(
     states, commands = (log.data().T.copy() for log in logs.values())
     if root.get_time() > times[-1] and outcome is not Outcome.ERROR:
         times = np.append(times, root.get_time())
-        states = np.vstack([states, _evaluated(diagram, "state", root)])
-        commands = np.vstack([commands, _evaluated(diagram, "command", root)])
+        states = np.vstack([states, vector_output(diagram, "state", root)])
+        commands = np.vstack([commands, vector_output(diagram, "command", root)])
     return Flight(
         outcome=outcome,
         times=times,
@@ -293,7 +294,7 @@ def _recorded_plans(diagram: Diagram, root: Context, with_last: bool) -> np.ndar
     plans = sink.FindLog(root).data().T.copy()
     # A log samples before the policy updates at the same instant: the last plan is missing.
     if with_last:
-        last = _evaluated(diagram, "hypotheses", root)
+        last = vector_output(diagram, "hypotheses", root)
         if last[0] != plans[-1, 0]:
             plans = np.vstack([plans, last])
     return plans[np.isfinite(plans[:, 0])]
@@ -304,10 +305,6 @@ def _reason(error: Exception, time: float, state: np.ndarray) -> str:
     p_WB, v_WB, _, _ = (part.round(2).tolist() for part in QuadrotorState.of(state))
     kind = "" if isinstance(error, InfeasibleFlightError) else f"{type(error).__name__}: "
     return f"at t = {time:.2f} s, p_WB = {p_WB} m, v_WB = {v_WB} m/s: {kind}{error}"
-
-
-def _evaluated(diagram: Diagram, port: str, context: Context) -> np.ndarray:
-    return np.asarray(diagram.GetOutputPort(port).Eval(context))
 
 
 FLIGHT_FILES = "trajectory.npz", "scenario.yaml", "summary.json"

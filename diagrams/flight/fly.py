@@ -80,9 +80,9 @@ def write_flight_page(
     meshcat = open_meshcat(scenario, world)
     for k in range(len(flights)):
         draw_vehicle(meshcat, f"/splatpilot/vehicles/{k}", VEHICLE_RADIUS)
-    balls = world.moving.spheres if world.moving else None
+    spheres = world.moving.spheres if world.moving else None
     page = replay_page(
-        meshcat.StaticHtml(), world.gaussians, world.background, view, flights, balls
+        meshcat.StaticHtml(), world.gaussians, world.background, view, flights, spheres
     )
     with written_atomically(path) as partial:
         partial.write_text(page)

@@ -17,9 +17,10 @@ from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 from splatpilot.diagrams.flight import blocks
 from splatpilot.diagrams.flight.flight import Outcome, flight_outcome, has_landed
 from splatpilot.diagrams.flight.scenario import Scenario
-from splatpilot.diagrams.hardware.real_time import MessagePorts, output, run_in_real_time
+from splatpilot.diagrams.hardware.real_time import MessagePorts, run_in_real_time
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import make_world
+from splatpilot.systems.common.drake import vector_output
 from splatpilot.systems.common.validation import Config, bounded
 from splatpilot.systems.messaging import codecs
 from splatpilot.systems.messaging.arrival_triggered import ArrivalTriggered, can_be_triggered
@@ -205,8 +206,7 @@ def image_codecs(scenario: Scenario, policy: System) -> list[codecs.Codec]:
 
 def require_messages_for(scenario: Scenario, world: World) -> None:
     """Raises ValueError for sensors and moving obstacles, which have no messages."""
-    sensors = getattr(scenario.policy, "sensors", {}) | scenario.sensors
-    if sensors:
+    if sensors := blocks.onboard_sensors(scenario):
         raise ValueError(f"there are no messages of the sensors {', '.join(sensors)}; remove them")
     if world.moving:
         raise ValueError(
@@ -241,7 +241,7 @@ def run(
         # Waits again, so that policies update just after images of the same rate.
         ready = functools.partial(wait_for_messages, diagram, config.patience)
         run_in_real_time(simulator, diagram, config.tick, flight.is_over, ready)
-    counts = output(diagram, "status", root)[4:]
+    counts = vector_output(diagram, "status", root)[4:]
     summary = {"outcome": flight.outcome, "flight_time_s": flight.duration}
     summary |= dict(zip(("gaps", "rejected", "overruns"), counts, strict=True))
     print(*(f"{name:<14} {value}" for name, value in summary.items()), sep="\n")
@@ -266,7 +266,7 @@ class BridgeFlight:
     def is_over(self, now: float) -> bool:
         """Checks at a time [s] if the flight is over, and how it ended."""
         status, charge, collision = (
-            output(self.diagram, name, self.root)
+            vector_output(self.diagram, name, self.root)
             for name in ("status", "in_charge", "in_collision")
         )
         in_charge, landed = bool(charge[0]), has_landed(self.diagram, self.root)

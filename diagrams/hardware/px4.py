@@ -11,8 +11,9 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import Demultiplexer
 
-from splatpilot.diagrams.hardware.real_time import MessagePorts, output, run_in_real_time
+from splatpilot.diagrams.hardware.real_time import MessagePorts, run_in_real_time
 from splatpilot.diagrams.hardware.vehicle import STATUS_PERIOD
+from splatpilot.systems.common.drake import vector_output
 from splatpilot.systems.common.validation import Config, bounded, require_field
 from splatpilot.systems.messaging import codecs
 from splatpilot.systems.messaging.lcm_ports import DEFAULT_URL, open_lcm
@@ -141,7 +142,7 @@ def run(*, config: Px4Config, duration: float = np.inf) -> None:
         def over(now: float) -> bool:
             nonlocal before, reminders
             age, armed, mode = (
-                output(diagram, name, root) for name in ("heartbeat_age", "armed", "mode")
+                vector_output(diagram, name, root) for name in ("heartbeat_age", "armed", "mode")
             )
             report = "not heard"
             if age[0] <= HEARTBEAT_TIMEOUT:

@@ -8,7 +8,7 @@ from typing import Any, cast
 import numpy as np
 from lcm import LCM
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort, System
+from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort, System
 
 from splatpilot.diagrams.flight.blocks import ConnectInputs
 from splatpilot.systems.messaging.bridge_status import UnixClock
@@ -22,11 +22,6 @@ from splatpilot.systems.messaging.lcm_ports import (
 
 MAX_LAG = 0.05  # [s] Max lag of a diagram behind the wall clock.
 _WATCH_PERIOD = 0.02  # [s] between calls of `over`, which is slower than most ticks.
-
-
-def output(diagram: Diagram, name: str, root: Context) -> np.ndarray:
-    """Returns the vector at an output port of a diagram."""
-    return np.asarray(diagram.GetOutputPort(name).Eval(root))
 
 
 def run_in_real_time(
@@ -54,7 +49,7 @@ def run_in_real_time(
     simulator.AdvanceTo(2 * PUBLISH_OFFSET)
     ready()
     # The wall clock is read once, since it may be set.
-    epoch, started, number, overruns, told = time.time(), time.monotonic(), 0, 0, 0.0
+    epoch, started, number, overruns, last_lag = time.time(), time.monotonic(), 0, 0, 0.0
     clock.set_epoch(root, epoch)
     looked = -0.5 * _WATCH_PERIOD  # Between messages, which are sent at multiples of it.
     while True:
@@ -71,9 +66,9 @@ def run_in_real_time(
         overruns += late > 0.0
         lag = max(late, 0.0)
         for name, value in (("overruns", float(overruns)), ("lag", lag)):
-            if lag != told and diagram.HasInputPort(name):
+            if lag != last_lag and diagram.HasInputPort(name):
                 diagram.GetInputPort(name).FixValue(root, np.array([value]))
-        told = lag
+        last_lag = lag
         if late <= 0.0:
             time.sleep(-late)
             continue

@@ -24,11 +24,12 @@ from splatpilot.diagrams.flight.flight import (
 from splatpilot.diagrams.flight.flight_diagram import LOG_PERIOD
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.hardware.bridge import HardwareConfig, image_codecs, require_messages_for
-from splatpilot.diagrams.hardware.real_time import MessagePorts, output, run_in_real_time
+from splatpilot.diagrams.hardware.real_time import MessagePorts, run_in_real_time
 from splatpilot.diagrams.worlds.appearance import randomize_appearance
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.collision.esdf_collision import EsdfCollision
+from splatpilot.systems.common.drake import vector_output
 from splatpilot.systems.common.files import locks_folder, require_writable_folder
 from splatpilot.systems.messaging import codecs
 from splatpilot.systems.messaging.failsafe import Failsafe, FailsafeConfig
@@ -172,7 +173,7 @@ def run(*, scenario: Scenario, config: HardwareConfig, out: Path) -> dict[str, f
 
     def over(now: float) -> bool:
         nonlocal took_off
-        if math.isinf(output(diagram, "command_age", root)[0]):
+        if math.isinf(vector_output(diagram, "command_age", root)[0]):
             if now > config.patience:
                 raise TimeoutError(
                     f"no command has come for {config.patience:g} s; start the bridge, with the "

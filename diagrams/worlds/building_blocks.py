@@ -34,7 +34,9 @@ def box(lower: ArrayLike, upper: ArrayLike, material: str, seed: int) -> Solid:
     return Solid(Box(RigidTransform((lower + upper) / 2), upper - lower), material, seed)
 
 
-def rotated_box(p_W: ArrayLike, R_W: RotationMatrix, size: ArrayLike, material: str, seed: int):
+def rotated_box(
+    p_W: ArrayLike, R_W: RotationMatrix, size: ArrayLike, material: str, seed: int
+) -> Solid:
     """Returns a box about p_W (3,) [m] with edges `size` (3,) [m] along the axes of R_W."""
     return Solid(Box(RigidTransform(R_W, np.asarray(p_W, float)), size), material, seed)
 

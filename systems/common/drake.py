@@ -40,6 +40,11 @@ def vector_input(system: System, name: str, context: Context) -> np.ndarray:
     return np.asarray(system.GetInputPort(name).Eval(context))
 
 
+def vector_output(system: System, name: str, context: Context) -> np.ndarray:
+    """Returns the vector at an output port; a diagram takes its root context."""
+    return np.asarray(system.GetOutputPort(name).Eval(context))
+
+
 def optional_input(system: System, name: str, context: Context) -> np.ndarray | None:
     """Returns the vector at an input port, None if the port is not connected."""
     port = system.GetInputPort(name)

@@ -1,3 +1,4 @@
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.esdf_build import esdf_from_occupancy
 from splatpilot.systems.splats.baked_scene import BakedScene
 from splatpilot.systems.splats.scene import GaussianScene
-from splatpilot.training.captures import capture_registry as capture_of_scene
+from splatpilot.training.captures import capture_registry
 from splatpilot.training.captures.capture import Capture, SfmPoints
 
 WIDTH, HEIGHT = 64, 48
@@ -67,6 +68,12 @@ class Room:
 
 
 @pytest.fixture(scope="session")
+def set_fields() -> Callable[..., list[str]]:
+    """Returns the words of a command line that set fields, FIELD=VALUE each."""
+    return lambda *fields: [word for field in fields for word in ("--set", field)]
+
+
+@pytest.fixture(scope="session")
 def seen_room() -> tuple[GaussianScene, Capture]:
     gaussians = make_room()
     baked = BakedScene(gaussians)
@@ -96,7 +103,7 @@ def room(seen_room, tmp_path, monkeypatch) -> Room:
         assert str(path) == "room"
         return capture
 
-    for module in (capture_of_scene, ablation):
+    for module in (ablation, capture_registry):
         monkeypatch.setattr(module, "read_capture", read_capture)
     monkeypatch.delenv("SPLATPILOT_DATA", raising=False)
     (tmp_path / "captures" / "room").mkdir(parents=True)

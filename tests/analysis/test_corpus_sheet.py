@@ -16,16 +16,14 @@ def test_points_in_front_of_the_camera_are_projected():
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
+def folder(tmp_path_factory, set_fields):
     """A corpus of one small room."""
     out = tmp_path_factory.mktemp("corpus")
-    words = ["corpus", "make", "--out", str(out), "--worlds", "1", "--jobs", "1"]
-    for setting in (
+    fields = set_fields(
         "worlds.kinds=[P10]", "flights=1", "expert.period=0.6",
         "camera.width=48", "camera.height=36", "appearance=0",
-    ):  # fmt: skip
-        words += ["--set", setting]
-    assert main(words) == 0
+    )  # fmt: skip
+    assert main(["corpus", "make", "--out", str(out), "--worlds=1", "--jobs=1", *fields]) == 0
     return out
 
 

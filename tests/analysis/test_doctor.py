@@ -5,9 +5,8 @@ import pytest
 
 from splatpilot.analysis.commands import doctor
 from splatpilot.diagrams.scenarios import benchmark_scenarios
-from splatpilot.systems.common import extras as opengl
-from splatpilot.systems.common.extras import packages_of_extras
-from splatpilot.systems.messaging import lcm_ports as open_lcm
+from splatpilot.systems.common import extras
+from splatpilot.systems.messaging import lcm_ports
 
 
 def only(findings: list[doctor.Finding]) -> doctor.Finding:
@@ -16,8 +15,8 @@ def only(findings: list[doctor.Finding]) -> doctor.Finding:
 
 
 def test_working_parts_need_no_remedy(monkeypatch):
-    monkeypatch.setattr(opengl, "require_opengl", lambda: None)
-    monkeypatch.setattr(open_lcm, "open_lcm", lambda: None)
+    monkeypatch.setattr(extras, "require_opengl", lambda: None)
+    monkeypatch.setattr(lcm_ports, "open_lcm", lambda: None)
     for check in (doctor._program, doctor._processor, doctor._opengl, doctor._messages):
         assert only(check()).remedy == ""
     assert "SIMD levels v" in only(doctor._processor()).found
@@ -32,8 +31,8 @@ def test_missing_parts_have_one_remedy(monkeypatch):
     def absent(name: str) -> str:
         raise PackageNotFoundError(name)
 
-    monkeypatch.setattr(opengl, "require_opengl", fails)
-    monkeypatch.setattr(open_lcm, "open_lcm", fails)
+    monkeypatch.setattr(extras, "require_opengl", fails)
+    monkeypatch.setattr(lcm_ports, "open_lcm", fails)
     for check in (doctor._opengl, doctor._messages):
         finding = only(check())
         assert finding.found == "there is no route" and finding.serves
@@ -44,7 +43,7 @@ def test_missing_parts_have_one_remedy(monkeypatch):
     remedies = {finding.what: finding.remedy for finding in doctor._extras()}
     assert remedies == {
         f"extra {extra}": f"pip install 'splatpilot[{extra}]'"
-        for extra in packages_of_extras()
+        for extra in extras.packages_of_extras()
         if extra != "cuda"
     }
 

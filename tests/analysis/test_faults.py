@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from drake import lcmt_header
 
-from splatpilot.analysis import faults
 from splatpilot.analysis.commands.main import main
-from splatpilot.analysis.faults import DELAY, KINDS, Fault, Relay, Trial, fly_trial
+from splatpilot.analysis.faults import DELAY, KINDS, Fault, Relay, Trial, fly_trial, summarize
 from splatpilot.diagrams.flight.policies import policy_named
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.worlds.forest.forest import ForestConfig
@@ -33,7 +32,7 @@ def encoded(codec, value, number: int = 0, utime: int = 0) -> bytes:
 
 
 class Line:
-    """States sent through a relay every 20 ms, of which those from 1 s to 2 s have faults."""
+    """States sent through a relay every 20 ms; those from 1 s to 2 s have faults."""
 
     def __init__(self, *kinds: str, size: float = 2.0):
         near, far, codec = lcm.LCM("memq://"), lcm.LCM("memq://"), StateCodec()
@@ -170,40 +169,28 @@ def test_a_state_that_freezes_while_images_are_lost_ends_safely():
     assert row["min_clearance"] >= 0.09
 
 
-SETTINGS = ["world.length=10.0", "world.width=6.0", "start_radius=0.05"]
-SETS = [word for setting in SETTINGS for word in ("--set", f"scenario.{setting}")]
-WORDS = ["hardware", "faults", "--set", "worlds=1", *SETS]
-
-
-def test_a_trial_of_a_campaign_is_safe(tmp_path):
-    assert main([*WORDS, "--set", "trials=1", "--out", str(tmp_path)]) == 0
-    [row] = map(json.loads, (tmp_path / "trials.jsonl").read_text().splitlines())
-    assert row["safe"] and row["faults"][0]["kind"] == "dropped"
-    summary = json.loads((tmp_path / "summary.json").read_text())
-    assert (summary["trials"], summary["safe"]) == (1, 1)
-
-
-def test_a_campaign_resumes_and_repeats(tmp_path, monkeypatch):
-    def fly_trial(scenario, world, trial, limits, seed):
-        hit = [{"kind": fault.kind, "begin": fault.begin} for fault in trial.faults]
-        return {"faults": hit, "seed": seed, "safe": True, "outcome": "hover"}
-
-    monkeypatch.setattr(faults, "fly_trial", fly_trial)
-    words, again = [*WORDS, "--set", "trials=3"], tmp_path / "again"
-    assert main([*words, "--out", str(tmp_path / "whole")]) == 0
-    rows = (tmp_path / "whole" / "trials.jsonl").read_text().splitlines(keepends=True)
+def test_a_campaign_is_safe_resumes_and_repeats(tmp_path, set_fields):
+    fields = set_fields(
+        *("trials=2", "worlds=1", "scenario.world.length=10.0", "scenario.world.width=6.0"),
+        "scenario.start_radius=0.05",
+    )
+    words, whole, again = ["hardware", "faults", *fields], tmp_path / "whole", tmp_path / "again"
+    assert main([*words, "--out", str(whole)]) == 0
+    rows = (whole / "trials.jsonl").read_text().splitlines(keepends=True)
+    assert [json.loads(row)["seed"] for row in rows if json.loads(row)["safe"]] == [0, 1]
     again.mkdir()
-    shutil.copy(tmp_path / "whole" / "config.yaml", again)
+    shutil.copy(whole / "config.yaml", again)
     (again / "trials.jsonl").write_text(rows[0])
     assert main([*words, "--out", str(again)]) == 0
     assert (again / "trials.jsonl").read_text() == "".join(rows)
-    assert json.loads(rows[2])["seed"] == 2
+    summary = json.loads((again / "summary.json").read_text())
+    assert (summary["trials"], summary["safe"]) == (2, 2)
     for other in ("seed=1", "trials=0"):
-        assert main([*words, "--set", other, "--out", str(again)]) == 1
+        assert main([*words, *set_fields(other), "--out", str(again)]) == 1
 
 
 def test_accidents_are_counted():
     row = {"faults": [{"kind": "dropped"}], "safe": True, "outcome": "hover"}
-    summary = faults.summarize([row, {**row, "safe": False, "outcome": "collision"}])
+    summary = summarize([row, {**row, "safe": False, "outcome": "collision"}])
     assert (summary["trials"], summary["safe"]) == (2, 1)
     assert summary["kinds"]["dropped"]["outcomes"] == {"collision": 1, "hover": 1}

@@ -36,13 +36,10 @@ def grid_of(data) -> np.ndarray:
     return np.frombuffer(values, np.uint8).reshape(data["grid"]["shape"], order="F")
 
 
-def test_generated_world(tmp_path, capsys):
+def test_generated_world(tmp_path, capsys, set_fields):
     out = tmp_path / "there" / "forest.html"
     changes = ["world.length=8", "world.width=5", "world.height=3", "world.voxel_size=0.25"]
-    command = ["view", "P02", "--seed", "3", "--out", str(out)]
-    for change in changes:
-        command += ["--set", change]
-    assert main(command) == 0
+    assert main(["view", "P02", "--seed", "3", "--out", str(out), *set_fields(*changes)]) == 0
     assert str(out) in capsys.readouterr().out
     data = data_of(out)
     scenario = load_config(Scenario(), scenario_file("P02"), changes)
@@ -82,7 +79,7 @@ def test_scene_without_scale_or_capture_is_shown(room, monkeypatch):
     assert "start" not in [name for _, name in data["legend"]]
 
 
-def test_capture_shows_what_it_measured(room, monkeypatch, tmp_path):
+def test_capture_shows_its_measured_surfaces(room, monkeypatch, tmp_path):
     folder = tmp_path / "capture"
     folder.mkdir()
     monkeypatch.setattr(view, "read_capture", lambda path, config: room.capture)

@@ -55,9 +55,9 @@ def test_flight_by_hand(tmp_path):
 def test_splats_behind_drake(opengl, tmp_path):
     red = []
     for seconds in (0.0, 0.2, 0.5):
-        words = "--width", 240, "--seconds", seconds, "--out", tmp_path / "ball.png"
+        words = "--width", 240, "--seconds", seconds, "--out", tmp_path / "sphere.png"
         run("splats_behind_drake.py", *words, cwd=tmp_path)
-        image = np.array(cv2.imread(str(tmp_path / "ball.png")), dtype=int)
+        image = np.array(cv2.imread(str(tmp_path / "sphere.png")), dtype=int)
         is_red = image[..., 2] > 100 + image[..., :2].max(axis=-1)
         assert image[~is_red].std() > 20
         red.append(int(is_red.sum()))

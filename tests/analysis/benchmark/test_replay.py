@@ -46,3 +46,13 @@ def test_replay_equals_the_record_and_says_so(study, tmp_path, capsys):
     file.unlink()
     with pytest.raises(FileNotFoundError, match=f"{spec.id} has not been flown yet in .*again"):
         replay.run(study=copy, id=spec.id)
+
+
+def test_flights_through_one_world_are_shown_on_one_page(study, tmp_path, capsys):
+    config, whole = study
+    ids = [spec.id for spec in config.rollouts()]  # two policies, seed by seed
+    words = ["replay", str(whole), "--out", str(tmp_path)]
+    assert main([*words, *ids[:2]]) == 0
+    assert (tmp_path / "flights.html").stat().st_size > 1e5
+    assert main([*words, *ids[1:3], "--overwrite"]) == 1
+    assert f"{ids[2]} flew another world than {ids[1]}" in capsys.readouterr().err

@@ -17,6 +17,7 @@ from splatpilot.analysis.commands.main import main
 from splatpilot.diagrams.flight.policies import POLICIES
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.systems.common.provenance import program
+from splatpilot.systems.policies import checkpoint
 from splatpilot.systems.policies.checkpoint import PolicyCheckpoint
 from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK
 
@@ -104,6 +105,34 @@ def test_weights_from_a_file_fly_and_are_kept(short_scenario, tmp_path, rows_of,
         run_study.run(config=config, out=folder.path, jobs=1)
     mine.unlink()
     assert replay.run(study=folder.path, id="short-mine-2-000")
+
+
+def test_study_is_not_resumed_with_other_shipped_weights(
+    short_scenario, tmp_path, monkeypatch, save_weights
+):
+    save_weights("diffaero.npz")
+    monkeypatch.setattr(checkpoint, "_SHIPPED", tmp_path)
+    config = StudyConfig([str(short_scenario)], ["diffaero"], seeds=2)
+    folder = StudyFolder(tmp_path / "out")
+    run_study.run(config=config, out=folder.path, jobs=1)
+    assert len(folder.program()["weights of diffaero"]) == 16
+
+    save_weights("diffaero.npz", **thrust_weights(0.0))
+    folder.trajectory("short-diffaero-2-001").unlink()
+    with pytest.raises(ValueError, match="was started with weights of diffaero"):
+        run_study.run(config=config, out=folder.path, jobs=1)
+
+
+def test_variants_of_a_policy_fly_side_by_side(short_scenario, tmp_path, rows_of):
+    out = tmp_path / "out"
+    words = ["--scenarios", str(short_scenario), "--seeds", "1", "--jobs", "1"]
+    words += ["--policies", "slow=planner:rate=2,planner", "--sweep", "straight:rate=5,10"]
+    assert main(["benchmark", "--out", str(out), *words]) == 0
+    rows = rows_of(out / "rollouts.csv")
+    labels = ["slow", "planner", "straight-rate-5", "straight-rate-10"]
+    assert [row["policy"] for row in rows] == labels
+    assert len({row["digest"] for row in rows}) == 4
+    assert replay.run(study=out, id="short-slow-2-000")
 
 
 def test_own_policy_of_a_scenario_flies_and_is_kept(short_scenario, tmp_path, capsys, save_weights):

@@ -76,6 +76,10 @@ RENDER = "got a mesh; render a capture of it with `splatpilot capture render roo
         ("view scene --seed 1", "--seed must be of a generated world"),
         ("view scene --set world.length=3", "--set must be of a scenario or a capture"),
         ("view fast.yaml --out fast.yaml", "fast.yaml is there already; choose another, or repl"),
+        ("fly --graphviz fast.yaml", "fast.yaml is there already"),
+        ("hardware vehicle --out scene", "scene is there already"),
+        ("hardware bridge --log fast.yaml", "fast.yaml is there already"),
+        ("corpus inspect folder --out fast.yaml", "fast.yaml is there already"),
         ("scene mesh P02 --out a.stl", "a.stl: suffix must be .gltf or .obj, got .stl"),
         ("reconstruct nowhere --out a", "No such file or folder: nowhere"),
         ("reconstruct scene --out a", "got a scene folder; fly in it with `splatpilot fly --sce"),
@@ -118,12 +122,12 @@ def test_an_error_has_status_1_and_one_sentence_and_writes_nothing(
         ("--version", 0),
         ("fly --help", 0),
         ("fly --nonsense", 2),
-        ("fly --policy nobody", 1),
+        ("fly --policy missing", 1),
         ("fly --scene nowhere", 1),
-        ("benchmark --out study --policies planner,nobody", 1),
+        ("benchmark --out study --policies planner,missing", 1),
         ("replay nowhere id", 1),
         ("reconstruct nowhere --out scene", 1),
-        ("train nobody --out run", 1),
+        ("train missing --out run", 1),
         ("corpus inspect nowhere --out samples.png", 1),
     ],
 )
@@ -261,7 +265,7 @@ def test_messages_are_below_progress_bars(statement, status, message, tmp_path):
     assert last == f"splatpilot: {message}".replace("FILE", str(tmp_path / "working.py"))
 
 
-def test_an_interruption_tells_what_is_kept(tmp_path, capsys, monkeypatch):
+def test_an_interruption_names_the_kept_files(tmp_path, capsys, monkeypatch):
     def interrupted(**_keywords):
         with resumable(lambda: "one scene is in scenes; the same command resumes"):
             raise KeyboardInterrupt

@@ -77,10 +77,9 @@ def test_cameras_stay_inside_walls(room, find_camera):
     assert set(found.column("offset")) == {0.0, 1.0}
 
 
-def test_held_out_stretches(room):
+def test_held_out_stretches(room, set_fields):
     scene, out = room.scene("real", held_out=[0]), room.folder / "out"
-    command = ["scene", "fidelity", str(scene), "--out", str(out)]
-    for setting in (
+    fields = set_fields(
         "stretches=[1, 3]",
         "kept=3",
         "reconstruct.iterations=10",
@@ -89,8 +88,8 @@ def test_held_out_stretches(room):
         "reconstruct.voxel_size=0.2",
         "max_depth_error=0.5",
         "max_psnr_drop=30",
-    ):
-        command += ["--set", setting]
+    )
+    command = ["scene", "fidelity", str(scene), "--out", str(out), *fields]
     assert main(command) == 0
     rows = read_rows(out)
     assert [int(row["frame"]) for row in rows] == [3, 7, 8, 9]

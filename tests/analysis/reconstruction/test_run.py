@@ -96,13 +96,12 @@ def test_invalid_captures_are_refused(tmp_path, config, capsys):
     assert "iterations are given by --iterations and by --set" in capsys.readouterr().err
 
 
-def test_a_mesh_is_rendered_and_reconstructed(opengl, tmp_path, capsys):
+def test_a_mesh_is_rendered_and_reconstructed(opengl, tmp_path, capsys, set_fields):
     mesh = trimesh.creation.box((7.0, 4.0, 3.0))
     mesh.invert()
     mesh.export(tmp_path / "room.obj", include_normals=True)
     out = tmp_path / "scene"
-    command = ["reconstruct", str(tmp_path / "room.obj"), "--up", "z", "--out", str(out)]
-    for setting in (
+    fields = set_fields(
         "render.width=64",
         "render.height=48",
         "render.path=[[-2, 0, 0], [2, 0, 0]]",
@@ -110,8 +109,8 @@ def test_a_mesh_is_rendered_and_reconstructed(opengl, tmp_path, capsys):
         "iterations=5",
         "image_width=0",
         "initial_gaussians=2000",
-    ):
-        command += ["--set", setting]
+    )
+    command = ["reconstruct", str(tmp_path / "room.obj"), "--up", "z", "--out", str(out), *fields]
     assert main(command) == 0
     written = (out / "gaussians.ply").read_bytes()
     assert (out / "metrics.json").is_file()

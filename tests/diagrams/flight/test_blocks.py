@@ -85,7 +85,7 @@ def test_frames_with_a_rate_reach_the_policy_and_repeat(post_world):
     assert np.any(first != states(post_world, latency=0.03))
 
 
-def test_diagram_has_only_what_the_scenario_asks_for(post_world):
+def test_diagram_has_only_the_configured_systems(post_world):
     scenario = Scenario(policy=policy_named("reactive"))
     diagram = BuildFlightDiagram(scenario, post_world, camera=False)
     names = {"depth_noise", "color_noise", "delayed_pose"}

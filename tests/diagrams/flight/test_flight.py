@@ -82,7 +82,7 @@ class Failing(LeafSystem):
         output.SetFromVector([1.0, 0.0, 0.0])
 
 
-def test_an_exception_in_flight_keeps_what_was_flown(post_world):
+def test_an_exception_in_flight_keeps_the_record(post_world):
     scenario = Scenario(timeout=5.0)
     diagram = BuildFlightDiagram(scenario, post_world, policy=Failing(KeyError("depth")))
     message = r"at t = 0.5\d* s, p_WB = \[.*KeyError: 'depth'"
@@ -176,7 +176,7 @@ def test_a_flight_that_starts_at_its_goal_is_refused(post_world):
     sample_initial_state(Scenario(goal=near, goal_radius=0.2), post_world)
 
 
-def test_same_seed_gives_the_same_bits_in_two_processes():
+def test_same_seed_flies_bitwise_identically_in_two_processes():
     script = (
         "import hashlib; from splatpilot.diagrams.flight.scenario import Scenario;"
         "from splatpilot.diagrams.flight.flight import fly;"

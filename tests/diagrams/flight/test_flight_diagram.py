@@ -55,7 +55,7 @@ def test_a_policy_needs_only_its_outputs(post_world):
     assert np.linalg.norm(flight.states[-1, :3] - [3.0, 0, 2]) < 0.3
 
 
-def test_a_world_looks_otherwise_and_is_the_same(post_world):
+def test_appearance_changes_colors_and_no_flight(post_world):
 
     def seen(**fields):
         diagram = BuildFlightDiagram(Scenario(timeout=0.5, **fields), post_world)
@@ -149,7 +149,9 @@ def test_scenarios_out_of_range_are_refused(post_world):
         (WORLDS, {}, "make for ForestConfig must be a World, got NoneType"),
     ],
 )
-def test_what_makes_nothing_is_named(post_world, monkeypatch, registry, field, message):
+def test_worlds_and_sensors_of_another_type_are_refused(
+    post_world, monkeypatch, registry, field, message
+):
     kind = registry.find(registry.registered()[0])
     function = "make" if registry is WORLDS else "build"
     kind = dataclasses.replace(kind, **{function: lambda *_: None})
@@ -160,7 +162,7 @@ def test_what_makes_nothing_is_named(post_world, monkeypatch, registry, field, m
         flown(Scenario(timeout=1.0, **field), post_world)
 
 
-def test_what_builds_no_policy_is_named(post_world, monkeypatch):
+def test_policies_of_another_type_are_refused(post_world, monkeypatch):
     config = policy_named("straight")
     kind = dataclasses.replace(POLICIES.entry_for(config), build=lambda *_: None)
     monkeypatch.setattr(POLICIES, "entry_for", lambda _: kind)
@@ -169,7 +171,7 @@ def test_what_builds_no_policy_is_named(post_world, monkeypatch):
         flown(Scenario(timeout=1.0, policy=config), post_world)
 
 
-def test_configuration_that_nobody_knows_is_refused(post_world):
+def test_unregistered_configuration_is_refused(post_world):
 
     class MineConfig:
         rate = 10.0
@@ -179,7 +181,7 @@ def test_configuration_that_nobody_knows_is_refused(post_world):
 
 
 @pytest.mark.parametrize("shown", [{"video": True}, {"meshcat": object()}])
-def test_what_shows_the_camera_needs_it(post_world, shown):
+def test_video_and_meshcat_need_the_camera(post_world, shown):
     with pytest.raises(ValueError, match="camera must be True with meshcat or video"):
         BuildFlightDiagram(Scenario(), post_world, camera=False, **shown)
 

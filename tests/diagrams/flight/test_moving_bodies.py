@@ -19,19 +19,19 @@ from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
 
-def with_ball(world: World, path: np.ndarray, radius: float = 0.5) -> World:
-    """The world with one red ball on a path, a row every 0.02 s."""
+def with_sphere(world: World, path: np.ndarray, radius: float = 0.5) -> World:
+    """The world with one red sphere on a path, a row every 0.02 s."""
     directions = np.random.default_rng(0).normal(size=(300, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    ball = GaussianScene.from_colors(
+    sphere = GaussianScene.from_colors(
         radius * directions,
         np.tile([1.0, 0, 0, 0], (300, 1)),
         np.full((300, 3), 0.06),
         np.full(300, 0.99),
         np.tile([1.0, 0.0, 0.0], (300, 1)),
     )
-    balls = MovingSpheres([radius], [path], 0.02)
-    return replace(world, moving=MovingBodies(balls, MovingGaussians([ball], balls.centers)))
+    spheres = MovingSpheres([radius], [path], 0.02)
+    return replace(world, moving=MovingBodies(spheres, MovingGaussians([sphere], spheres.centers)))
 
 
 def falling(x: float, y: float, speed: float) -> np.ndarray:
@@ -45,28 +45,28 @@ def hovering(**changes) -> Scenario:
     return Scenario(timeout=4.0, start_radius=0.0, policy=policy_named("straight", 0.01), **changes)
 
 
-def test_a_ball_hits_at_its_time(post_world):
+def test_a_sphere_hits_at_its_time(post_world):
     hit_at = (9.0 - 2.0 - 0.5 - VEHICLE_RADIUS) / 3.0
     scenario = hovering()
     for aside, outcome in ((0.0, Outcome.COLLISION), (2.5, Outcome.TIMEOUT)):
-        world = with_ball(post_world, falling(1.0, aside, 3.0))
+        world = with_sphere(post_world, falling(1.0, aside, 3.0))
         flight = fly(BuildFlightDiagram(scenario, world, camera=False), scenario, world)
         assert flight.outcome == outcome
         if not aside:
             assert flight.times[-1] == pytest.approx(hit_at, abs=0.045)
             assert flight.clearances[-1] < 0 < flight.clearances[-3]
-    # The record of clearances has the ball at the time of each sample.
+    # The record of clearances has the sphere at the time of each sample.
     fall = 3.0 * flight.times
-    ball = np.column_stack([np.ones_like(fall), np.full_like(fall, 2.5), 9.0 - fall])
-    apart = np.linalg.norm(flight.states[:, :3] - ball, axis=1) - 0.5 - VEHICLE_RADIUS
+    sphere = np.column_stack([np.ones_like(fall), np.full_like(fall, 2.5), 9.0 - fall])
+    apart = np.linalg.norm(flight.states[:, :3] - sphere, axis=1) - 0.5 - VEHICLE_RADIUS
     to_post = np.linalg.norm(flight.states[:, :2] - [5.0, 0.0], axis=1) - 0.5 - VEHICLE_RADIUS
     np.testing.assert_allclose(flight.clearances, np.minimum(apart, to_post), atol=0.07)
 
 
 @pytest.mark.parametrize("policy", ["planner", "reactive"])
-def test_the_same_flight_bit_for_bit(post_world, policy):
+def test_flights_are_bitwise_identical(post_world, policy):
     scenario = Scenario(timeout=2.0, policy=policy_named(policy))
-    world = with_ball(post_world, falling(3.0, 0.6, 2.0))
+    world = with_sphere(post_world, falling(3.0, 0.6, 2.0))
     diagram = BuildFlightDiagram(scenario, world, camera=False)
     first, again = fly(diagram, scenario, world), fly(diagram, scenario, world)
     other = fly(BuildFlightDiagram(scenario, world, camera=False), scenario, world)
@@ -75,10 +75,10 @@ def test_the_same_flight_bit_for_bit(post_world, policy):
             np.testing.assert_array_equal(getattr(flight, name), getattr(first, name))
 
 
-def test_the_camera_of_a_flight_sees_the_ball_come(post_world):
+def test_the_camera_of_a_flight_sees_the_sphere_come(post_world):
     scenario = hovering()
     approach = np.column_stack([4.0 - 0.02 * np.arange(100), np.zeros(100), np.full(100, 2.0)])
-    world = with_ball(post_world, approach)
+    world = with_sphere(post_world, approach)
     diagram = BuildFlightDiagram(scenario, world)
     root = Simulator(diagram).get_mutable_context()
     plant = diagram.GetSubsystemByName("plant").GetMyMutableContextFromRoot(root)
@@ -95,11 +95,11 @@ def test_the_camera_of_a_flight_sees_the_ball_come(post_world):
     assert red[0] < red[1] < red[2]
 
 
-def test_the_planner_leaves_room_to_a_ball(post_world):
+def test_the_planner_keeps_clear_of_a_sphere(post_world):
     scenario = Scenario(timeout=15.0)
     blind = fly(BuildFlightDiagram(scenario, post_world, camera=False), scenario, post_world)
     in_the_way = blind.states[np.argmax(blind.states[:, 0] > 2.8), :3]
-    world = with_ball(post_world, in_the_way[None])
+    world = with_sphere(post_world, in_the_way[None])
     flight = fly(BuildFlightDiagram(scenario, world, camera=False), scenario, world)
     assert flight.outcome == Outcome.GOAL and flight.clearances.min() > 0
 
@@ -110,22 +110,22 @@ def test_the_planner_looks_ahead(post_world):
     meeting = np.argmax(blind.states[:, 0] > 3.0)
     way = 4.0 * (0.02 * np.arange(600) - blind.times[meeting])
     path = blind.states[meeting, :3] + np.column_stack([0 * way, way, 0 * way])
-    world = with_ball(post_world, path)
+    world = with_sphere(post_world, path)
     hit = world.distances(blind.times, blind.states[:, :3]) - VEHICLE_RADIUS
     assert hit.min() < -0.4
     flight = fly(BuildFlightDiagram(scenario, world, camera=False), scenario, world)
     assert flight.outcome == Outcome.GOAL and flight.clearances.min() > 0
 
 
-def test_a_start_in_a_ball_is_refused(post_world):
-    world = with_ball(post_world, falling(1.0, 0.0, 3.0) - [0.0, 0.0, 7.0])
+def test_a_start_in_a_sphere_is_refused(post_world):
+    world = with_sphere(post_world, falling(1.0, 0.0, 3.0) - [0.0, 0.0, 7.0])
     with pytest.raises(InfeasibleFlightError, match=r"start .* from the nearest surface"):
         sample_initial_state(hovering(), world)
 
 
-def test_meshcat_shows_the_ball_if_there_is_one(post_world):
+def test_meshcat_shows_moving_spheres(post_world):
     scenario, meshcat = hovering(), Meshcat()
-    world = with_ball(post_world, falling(1.0, 0.0, 3.0))
+    world = with_sphere(post_world, falling(1.0, 0.0, 3.0))
     for flown, shown in ((post_world, False), (world, True)):
         diagram = BuildFlightDiagram(scenario, flown, meshcat=meshcat)
         assert diagram.HasSubsystemNamed("spheres_visualizer") == shown

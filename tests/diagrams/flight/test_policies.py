@@ -28,7 +28,7 @@ from splatpilot.systems.policies.depthnav import DEPTHNAV_NETWORK, DepthNavConfi
 
 @dataclass
 class _OneSpeedConfig:
-    """Of a policy whose speed nobody sets."""
+    """Configures a policy with a fixed speed."""
 
     def validate(self) -> None: ...
 
@@ -36,7 +36,7 @@ class _OneSpeedConfig:
 @pytest.mark.parametrize(
     ("name", "outcome"), [("straight", Outcome.COLLISION), ("reactive", Outcome.GOAL)]
 )
-def test_policies_fly_with_a_post_in_the_way(name, outcome, post_world):
+def test_policies_fly_toward_a_post(name, outcome, post_world):
     scenario = Scenario(timeout=20.0, start_radius=0.0, policy=policy_named(name))
     diagram = BuildFlightDiagram(scenario, post_world, camera=False)
     flight = fly(diagram, scenario, post_world)
@@ -46,7 +46,7 @@ def test_policies_fly_with_a_post_in_the_way(name, outcome, post_world):
     assert not diagram.HasSubsystemNamed("camera")
 
 
-def test_onlooking_camera_changes_no_flight(post_world):
+def test_the_scenario_camera_changes_no_flight(post_world):
     scenario = Scenario(timeout=1.0, policy=policy_named("reactive"))
     scenario.camera.width, scenario.camera.height = 32, 24
     bare = fly(BuildFlightDiagram(scenario, post_world, camera=False), scenario, post_world)

@@ -22,7 +22,7 @@ def test_scenarios_outside_the_benchmark_have_names_too():
     assert scenario_file("alley_splat").is_file()
 
 
-def test_unknown_scenario_lists_those_there_are():
+def test_unknown_scenario_lists_the_known_ones():
     with pytest.raises(ValueError, match=r"no scenario 'nothing'.*P01, P02"):
         scenario_file("nothing")
 

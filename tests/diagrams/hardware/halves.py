@@ -9,8 +9,8 @@ from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
 from splatpilot.diagrams.flight.flight import sample_initial_state
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.hardware.bridge import BuildHardwareDiagram, HardwareConfig
-from splatpilot.diagrams.hardware.real_time import output
 from splatpilot.diagrams.hardware.vehicle import BuildVehicleDiagram
+from splatpilot.systems.common.drake import vector_output
 from splatpilot.systems.messaging.lcm_ports import PUBLISH_OFFSET
 
 TICK = 0.005  # [s]
@@ -48,11 +48,11 @@ class Halves:
             self.tick += 1
 
     def state(self) -> np.ndarray:
-        return output(self.vehicle, "state", self.vehicle_root)
+        return vector_output(self.vehicle, "state", self.vehicle_root)
 
     def out(self, name: str) -> np.ndarray:
         """An output of the bridge."""
-        return output(self.hardware, name, self.root)
+        return vector_output(self.hardware, name, self.root)
 
     def mode(self) -> tuple[float, float]:
         return tuple(self.out("status")[:2])

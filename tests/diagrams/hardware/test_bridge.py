@@ -21,10 +21,10 @@ from splatpilot.diagrams.flight.policies import policy_named
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.hardware import bridge
 from splatpilot.diagrams.hardware.bridge import BuildHardwareDiagram, HardwareConfig
-from splatpilot.diagrams.hardware.real_time import output
 from splatpilot.diagrams.hardware.vehicle import BuildVehicleDiagram
 from splatpilot.diagrams.worlds.forest.forest import ForestConfig
 from splatpilot.diagrams.worlds.world_registry import make_world
+from splatpilot.systems.common.drake import vector_output
 from splatpilot.systems.messaging.codecs import StateCodec, VehicleStatusCodec
 from splatpilot.systems.messaging.failsafe import FailsafeConfig
 from splatpilot.systems.messaging.flight_limits import FlightLimits
@@ -83,7 +83,7 @@ def test_before_the_first_state_nothing_is_commanded(post_world):
     hardware = BuildHardwareDiagram(Scenario(), post_world, lcm.LCM("memq://"))
     root = hardware.CreateDefaultContext()
     expected = [status.WAITING, 0, np.inf, 0, 0, 0, 0]
-    np.testing.assert_array_equal(output(hardware, "status", root), expected)
+    np.testing.assert_array_equal(vector_output(hardware, "status", root), expected)
 
 
 def test_commands_stop_when_the_vehicle_falls_silent(post_world):
@@ -225,7 +225,7 @@ def test_a_known_obstacle_is_not_flown_into(post_world, setpoints, speed):
     closest = np.inf
     for step in range(150):
         halves.advance_to(0.02 * step)
-        closest = min(closest, output(halves.vehicle, "clearance", halves.vehicle_root)[0])
+        closest = min(closest, vector_output(halves.vehicle, "clearance", halves.vehicle_root)[0])
     assert halves.mode() == (status.FLYING, status.LIMITED_CLEARANCE)
     assert 0.099 < closest < 0.2
 
@@ -378,7 +378,7 @@ def test_before_the_bridge_is_in_charge_nothing_ends(watched):
     for where in (GROUND, AIR, watched.p_WG, None):
         watched.hear(1.2, NOT_IN_CHARGE, where)
         assert not watched.over
-        mode = output(watched.diagram, "status", watched.simulator.get_context())[0]
+        mode = vector_output(watched.diagram, "status", watched.simulator.get_context())[0]
         assert mode != status.LANDING
 
 

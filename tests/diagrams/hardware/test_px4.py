@@ -20,7 +20,7 @@ from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.hardware import px4
 from splatpilot.diagrams.hardware.bridge import BuildHardwareDiagram, HardwareConfig
 from splatpilot.diagrams.hardware.px4 import BuildPx4Diagram, Px4Config
-from splatpilot.diagrams.hardware.real_time import output
+from splatpilot.systems.common.drake import vector_output
 from splatpilot.systems.messaging.codecs import MotionCaptureCodec
 from splatpilot.systems.messaging.failsafe import FailsafeConfig
 from splatpilot.systems.messaging.flight_limits import FlightLimits
@@ -93,7 +93,7 @@ class Chain:
 
     def out(self, name: str) -> np.ndarray:
         """An output of the bridge."""
-        return output(self.bridge, name, self.simulators["bridge"].get_context())
+        return vector_output(self.bridge, name, self.simulators["bridge"].get_context())
 
 
 @pytest.fixture
@@ -339,9 +339,7 @@ def test_a_vehicle_below_its_fence_is_armed_and_takes_off_into_it(chain):
     assert flight.px4.state[2] > 0.35
 
 
-def test_the_process_says_what_it_does_not_do_and_how_long_there_is_no_heartbeat(
-    udp_url, capsys, monkeypatch
-):
+def test_the_process_prints_its_limits_and_missing_heartbeats(udp_url, capsys, monkeypatch):
     monkeypatch.setattr(px4, "REMINDER", 0.1)
     px4.run(config=Px4Config(url=udp_url, udp=UdpConfig(port=0)), duration=0.35)
     printed = capsys.readouterr().out

@@ -48,24 +48,24 @@ def ran(needs: float, until: float = 0.2):
     overruns = run_in_real_time(simulator, diagram, 0.01, over, ready)
     took = time.monotonic() - started[0]
     unix = clock.get_output_port().Eval(clock.GetMyContextFromRoot(root))[0]
-    told = worker.get_input_port().Eval(worker.GetMyContextFromRoot(root))[0]
+    reported = worker.get_input_port().Eval(worker.GetMyContextFromRoot(root))[0]
     updates = worker.GetMyContextFromRoot(root).get_discrete_state(0).value()[0]
     missing = round(looked[-1] / 0.01) + 1 - updates
-    return missing, overruns, told, took, time.time() - unix
+    return missing, overruns, reported, took, time.time() - unix
 
 
 def test_no_tick_begins_early():
-    missing, overruns, told, took, _ = ran(needs=0.0)
+    missing, overruns, reported, took, _ = ran(needs=0.0)
     assert missing == 0
     assert took >= 0.2
-    assert told == overruns
+    assert reported == overruns
 
 
 @pytest.mark.parametrize("needs", [0.03, 0.4])
 def test_overruns_are_counted_and_leave_nothing_out(needs):
-    missing, overruns, told, took, behind = ran(needs)
+    missing, overruns, reported, took, behind = ran(needs)
     assert missing == 0
-    assert overruns == told >= 1
+    assert overruns == reported >= 1
     assert took >= max(0.2, needs + 0.15 - MAX_LAG)
     assert behind >= -1e-3
     # Lag beyond the limit has been left behind: only waiting remains.

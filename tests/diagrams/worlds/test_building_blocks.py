@@ -11,37 +11,37 @@ from splatpilot.diagrams.worlds.building_blocks import (
 from splatpilot.diagrams.worlds.solids.surfaces import FloorPlan
 from splatpilot.systems.collision.shapes import AnalyticDistanceField
 
-PLOT = FloorPlan.of_size(12.0, 8.0, 4.0)
+PLAN = FloorPlan.of_size(12.0, 8.0, 4.0)
 LOWER, UPPER = np.array([-3.0, 2.0]), np.array([27.0, 14.0])
 
 
 def _distance(solids, p_W: np.ndarray) -> np.ndarray:
     shapes = [solid.shape for solid in solids]
-    return AnalyticDistanceField(shapes, PLOT.lower - 2, PLOT.upper + 2).distance(p_W)
+    return AnalyticDistanceField(shapes, PLAN.lower - 2, PLAN.upper + 2).distance(p_W)
 
 
 def test_walls_and_roof_enclose_the_volume():
-    p = np.random.default_rng(0).uniform(PLOT.lower, PLOT.upper, (500, 3))
-    to_bounds = np.minimum((p - PLOT.lower)[:, :2].min(axis=1), (PLOT.upper - p).min(axis=1))
-    solids = [*hall(PLOT, ["brick"], np.random.default_rng(1)), roof(PLOT)]
+    p = np.random.default_rng(0).uniform(PLAN.lower, PLAN.upper, (500, 3))
+    to_bounds = np.minimum((p - PLAN.lower)[:, :2].min(axis=1), (PLAN.upper - p).min(axis=1))
+    solids = [*hall(PLAN, ["brick"], np.random.default_rng(1)), roof(PLAN)]
     np.testing.assert_allclose(_distance(solids, p), to_bounds, atol=1e-12)
 
 
 def test_signs_hang_on_the_inner_faces_of_a_hall():
-    walls = hall(PLOT, ["brick"], np.random.default_rng(1))
+    walls = hall(PLAN, ["brick"], np.random.default_rng(1))
     signs = signs_in(walls, 3, 1, np.random.default_rng(2))
     middles = np.array([sign.shape.X_WO.translation() for sign in signs])
     assert len(signs) == 8
     np.testing.assert_allclose(middles[:3, 1], -4 + 0.01)
     np.testing.assert_allclose(middles[3:6, 1], 4 - 0.01)
     np.testing.assert_allclose(middles[6:, 0], (0.01, 12 - 0.01))
-    assert ((middles > PLOT.lower) & (middles < PLOT.upper)).all()
+    assert ((middles > PLAN.lower) & (middles < PLAN.upper)).all()
     assert not signs_in(walls, 0, 0, np.random.default_rng(2))
 
 
-def test_start_and_goal_are_at_the_ends_and_at_the_heights_asked_for():
+def test_start_and_goal_are_at_the_ends_and_within_the_heights():
     rng = np.random.default_rng(0)
-    ends = np.array([start_and_goal(PLOT, rng, (0.5, 0.7)) for _ in range(50)])  # (50, 2, 3)
+    ends = np.array([start_and_goal(PLAN, rng, (0.5, 0.7)) for _ in range(50)])  # (50, 2, 3)
     np.testing.assert_allclose(ends[..., 0], np.tile((1.5, 10.5), (50, 1)))
     assert np.abs(ends[..., 1]).max() < 4 and np.ptp(ends[..., 1]) > 2
     assert ends[..., 2].min() >= 0.5 and ends[..., 2].max() <= 0.7
@@ -57,7 +57,7 @@ def test_no_two_points_are_closer_than_the_spacing():
 
 def test_the_rectangle_is_filled():
     points = poisson_disk(LOWER, UPPER, 1.3, np.random.default_rng(0))
-    places = np.random.default_rng(1).uniform(LOWER, UPPER, (5000, 2))
-    distance, _ = KDTree(points).query(places)
+    p = np.random.default_rng(1).uniform(LOWER, UPPER, (5000, 2))
+    distance, _ = KDTree(points).query(p)
     assert distance.max() < 1.5 * 1.3
     assert np.mean(distance < 1.3) > 0.99

@@ -89,7 +89,7 @@ def test_space_too_narrow_for_a_route_is_refused(upper, choose):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_drawn_ends_are_as_far_apart_as_asked(seed):
+def test_drawn_ends_keep_the_minimum_distance(seed):
     esdf = corridors(ALONG_X, ALONG_Y)
     _, _, longest = choose_start_and_goal(esdf, RADIUS)
     _, _, length = choose_start_and_goal(esdf, RADIUS, least=0.8 * longest, seed=seed)
@@ -98,7 +98,7 @@ def test_drawn_ends_are_as_far_apart_as_asked(seed):
         choose_start_and_goal(esdf, RADIUS, least=50.0, seed=seed)
 
 
-def test_a_wire_between_grid_points_closes_the_way():
+def test_a_net_of_wires_between_grid_points_blocks_the_path():
     lower, upper = np.array([0.0, -1.5, 0]), np.array([8.0, 1.5, 3])
     ends = np.array([1.5, 0, 1.5]), np.array([6.5, 0, 1.5])
     net = [Capsule([4.0, y, -1], [4.0, y, 4], 0.01) for y in np.arange(-1.3, 1.5, 0.52)]

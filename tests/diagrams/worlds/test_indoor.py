@@ -34,7 +34,7 @@ def test_every_room_has_a_door_that_the_vehicle_passes(seed):
     assert np.asarray(label(plan(spec, 2.55) > VEHICLE_RADIUS)[0]).max() >= count
 
 
-def test_rooms_and_doors_have_the_sizes_asked_for():
+def test_rooms_and_doors_have_the_configured_sizes():
     config = replace(EMPTY, second_doors=1.0)
     gaps = []
     for seed in range(3):

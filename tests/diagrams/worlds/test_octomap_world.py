@@ -66,7 +66,7 @@ def test_maps_without_free_space_are_refused(in_map):
         in_map(octomap)
 
 
-def test_places_are_told_apart_by_suffix(tmp_path):
+def test_suffixes_tell_scenes_from_maps(tmp_path):
     assert scene_config(tmp_path / "a.bt") == OctomapConfig(path=str(tmp_path / "a.bt"))
     assert scene_config(tmp_path / "a.spz") == SceneConfig(path=str(tmp_path / "a.spz"))
 

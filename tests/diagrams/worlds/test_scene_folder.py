@@ -267,7 +267,7 @@ def test_frontier_hides_nothing_that_was_captured(captured, closed):
         assert np.mean(seen_depth(closed[1], X_WC) < depth - 0.1) < 0.005
 
 
-def test_what_was_captured_beyond_the_range_of_the_field_is_not_hidden(captured):
+def test_surfaces_beyond_the_range_of_the_field_are_not_hidden(captured):
     _, depths, X_WCs = captured
     box = np.full(3, -0.4), SIZE + 0.4
     field = esdf_from_depth_images(depths, K, X_WCs, *box, VOXEL, max_range=3.0)

@@ -41,7 +41,7 @@ def test_test_source_is_of_split_test(asked):
 @pytest.mark.parametrize(
     ("digests", "found"), [(part_digests(IMAGES), "train"), ({"0" * 16}, "test")]
 )
-def test_what_is_only_tested_in_gets_no_other_split(digests, found):
+def test_test_sources_get_no_other_split(digests, found):
     with pytest.raises(ValueError, match="split of renamed must be test, got train"):
         choose_split("renamed", digests, "train", found)
 

@@ -22,7 +22,7 @@ def _config(name: str):
     return load_config(Scenario(), next(f for f in FILES if f.stem == name)).world
 
 
-def test_there_are_seventeen_and_all_are_valid():
+def test_all_seventeen_scenarios_are_valid():
     assert [file.stem for file in FILES] == [
         *(f"P{k:02d}" for k in range(1, 13)),
         *(f"R{k}" for k in range(13, 18)),
@@ -45,7 +45,7 @@ def test_instances_are_feasible_and_repeatable(file):
     assert fields[0].distance(np.stack([one.p_WS, one.p_WG])).min() >= CLEARANCE
 
 
-def test_what_is_drawn_is_where_it_is_hit():
+def test_drawn_surfaces_are_those_of_the_distance_field():
     world = make_world(_config("P10"), 1)
     p = world.gaussians.means.astype(float)
     lower, upper = world.distance_field.lower_W, world.distance_field.upper_W
@@ -83,6 +83,6 @@ def test_what_is_drawn_is_where_it_is_hit():
         (OctomapConfig(path="x", lower=[0.0, 0, 0]), "lower and upper must be given both"),
     ],
 )
-def test_what_cannot_be_built_is_refused(config, message):
+def test_invalid_worlds_are_refused(config, message):
     with pytest.raises(ValueError, match=message):
         config.validate()

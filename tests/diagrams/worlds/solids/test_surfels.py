@@ -29,7 +29,7 @@ SHAPES = {
     "plank": (Box(TURNED, [0.9, 1.2, 0.05]), "wood"),
     "pillar": (Cylinder([0.0, 0, -0.8], [0.1, 0, 0.7], 0.25), "concrete"),
     "wire": (Capsule([0.0, -2, 0], [0.0, 2, 0.3], 0.02), "cable"),
-    "ball": (Sphere([0.0, 0, 0], 0.8), "foliage"),
+    "sphere": (Sphere([0.0, 0, 0], 0.8), "foliage"),
 }
 
 

@@ -39,7 +39,7 @@ def test_value_noise_takes_the_lattice_values_with_zero_slope(dimension):
         assert np.abs(near - value).max() < 20e-6 * dimension + 1e-6
 
 
-def test_a_point_has_its_noise_whatever_is_asked_beside_it(points):
+def test_noise_of_a_point_does_not_depend_on_other_points(points):
     whole = fbm(points, 4, seed=2)
     order = np.random.default_rng(2).permutation(len(points))
     np.testing.assert_array_equal(fbm(points[order], 4, seed=2), whole[order])
