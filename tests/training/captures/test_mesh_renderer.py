@@ -146,6 +146,25 @@ def test_missing_texture_is_named(scene):
         mesh_distance(scene({"alphaMode": "MASK"}, "nowhere.png"), "y", 0.1)
 
 
+@pytest.mark.parametrize("name", ["wall.glb", "wall.obj"])
+def test_vertex_colors_are_rendered(opengl, tmp_path, name):
+    p, _, triangles = square(WALL, 4.0)
+    red = np.full((4, 4), [255, 0, 0, 255], np.uint8)
+    trimesh.Trimesh(p, triangles, process=False, vertex_colors=red).export(tmp_path / name)
+    up = "y" if name.endswith("glb") else "z"
+    color = MeshRenderer(tmp_path / name, up, SKY).frame(X_WC, K, 32, 24).image[12, 16]
+    assert is_red(color)
+
+
+def test_texture_on_other_coordinates_is_refused(scene):
+    file = scene({}, png(HALVES))
+    document = json.loads(file.read_text())
+    document["materials"][1]["pbrMetallicRoughness"]["baseColorTexture"]["texCoord"] = 1
+    file.write_text(json.dumps(document))
+    with pytest.raises(ValueError, match="texCoord of baseColorTexture must be 0, got 1"):
+        mesh_distance(file, "y", 0.1)
+
+
 ROOM = np.array([6.0, 4.0, 3.0])  # [m]
 
 
