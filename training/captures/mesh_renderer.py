@@ -413,7 +413,7 @@ def _restore(tree: dict[str, Any], document: dict[str, Any]) -> None:
                 texture = document["textures"][originals[key]["index"]]
                 sampler = {"sampler": texture["sampler"]} if "sampler" in texture else {}
                 tree["textures"][info["index"]].update(sampler)
-                info.update(originals[key] | {"index": info["index"], "texCoord": 0})
+                info.update(originals[key] | {"index": info["index"]})
     if not tree["samplers"]:
         del tree["samplers"]
 

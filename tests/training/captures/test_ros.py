@@ -231,7 +231,7 @@ def test_calibration_is_in_the_namespace_of_the_images(bag, config, compressed):
     ("calibrations", "problem"),
     [
         ([{"topic": "/a/info", "scale": 1.3}, {"topic": "/b/info"}],
-         "/a/info, /b/info differ, and none is beside /camera/color"),
+         "/a/info, /b/info differ, and none is next to /camera/color"),
         ([{"model": "omnidirectional"}], "/info has the distortion 'omnidirectional'"),
     ],
 )  # fmt: skip

@@ -82,9 +82,9 @@ def test_flights_that_do_not_arrive_are_taken_all_along():
 
 
 @pytest.fixture
-def folder(gathered, tmp_path):
+def folder(collected, tmp_path):
     """A copy of the corpus, to be added to."""
-    return shutil.copytree(gathered.shards[0].path.parents[1], tmp_path / "corpus")
+    return shutil.copytree(collected.shards[0].path.parents[1], tmp_path / "corpus")
 
 
 def straight_flight(record) -> StudentFlight:
@@ -98,8 +98,8 @@ def straight_flight(record) -> StudentFlight:
     return StudentFlight(record.name, world.p_WG, times, states, clear)
 
 
-def test_what_the_expert_would_have_done_is_added(folder, gathered):
-    record = gathered.worlds[1]
+def test_what_the_expert_would_have_done_is_added(folder, collected):
+    record = collected.worlds[1]
     flight = straight_flight(record)
     field = record.make().distance_field
     events = near_misses(flight.times, obstacle_clearances(flight, field))
@@ -107,8 +107,8 @@ def test_what_the_expert_would_have_done_is_added(folder, gathered):
     corpus = add_recovery(folder, [flight], jobs=1)
     samples = corpus.samples(np.arange(len(corpus)))
     old, new = samples.source == EXPERT, samples.source == RECOVERY
-    assert old.sum() == len(gathered)
-    assert new.sum() == len(corpus) - len(gathered) > 0
+    assert old.sum() == len(collected)
+    assert new.sum() == len(corpus) - len(collected) > 0
     assert {corpus.worlds[k].name for k in samples.world[new]} == {record.name}
     exact = samples.X_WB[new][::2, 4:]
     for p_WB in exact:
@@ -121,8 +121,8 @@ def test_what_the_expert_would_have_done_is_added(folder, gathered):
     assert (field.distance(first_W.astype(float)) > VEHICLE_RADIUS - 1e-3).all()
 
 
-def test_the_same_flights_add_nothing_twice(folder, gathered):
-    flight = straight_flight(gathered.worlds[0])
+def test_the_same_flights_add_nothing_twice(folder, collected):
+    flight = straight_flight(collected.worlds[0])
     once = add_recovery(folder, [flight], jobs=1)
     shard = once.shards[-1].path
     before = (shard / "color.npy").stat().st_mtime_ns
@@ -140,8 +140,8 @@ def test_the_same_flights_add_nothing_twice(folder, gathered):
     assert sum("recovery" in row for row in rows) == 2
 
 
-def test_flights_elsewhere_are_refused(folder, gathered):
-    flight = straight_flight(gathered.worlds[0])
+def test_flights_elsewhere_are_refused(folder, collected):
+    flight = straight_flight(collected.worlds[0])
     stray = StudentFlight("P99-7", flight.p_WG, flight.times, flight.states, flight.clearances)
     with pytest.raises(ValueError, match="not collected in the world 'P99-7'"):
         add_recovery(folder, [stray])

@@ -21,19 +21,19 @@ from splatpilot.training.policies.student_data import (
 from splatpilot.training.policies.student_network import StudentModule
 
 HELD_OUT = 0.2
-"""Share of which one of the three worlds is."""
+"""Fraction that holds out one of the three worlds."""
 
 
 @pytest.fixture(scope="module")
 def two(student_corpus, tmp_path_factory) -> list[Corpus]:
-    """The corpus of 72 samples, and a copy that lacks the 24 of one of the three worlds."""
+    """The corpus of 72 samples, and a copy without the 24 of one of its three worlds."""
     part = tmp_path_factory.mktemp("part") / "corpus"
     shutil.copytree(student_corpus, part)
     shutil.rmtree(part / "shards" / "expert-pillars-1")
     return [Corpus(student_corpus), Corpus(part)]
 
 
-def test_worlds_are_on_one_side_whatever_is_gathered_later(two):
+def test_worlds_stay_held_out_as_corpora_grow(two):
     alone, joined = StudentData(two[1:], HELD_OUT), StudentData(two[::-1], HELD_OUT)
     assert alone.held_out_worlds == joined.held_out_worlds and len(alone.held_out_worlds) == 1
     for data, count in ((alone, 48), (joined, 72)):

@@ -36,7 +36,7 @@ def image_pair(shape, seed=0):
 
 
 def depth_pair(shape, seed=0):
-    """A true depth of 0 to 200 m, of which some pixels are unknown, and a noisy render of it."""
+    """A true depth of 0 to 200 m with unknown pixels, and a noisy render of it."""
     rng = torch.Generator().manual_seed(seed)
     depth = 200 * torch.rand(shape, generator=rng) ** 3
     rendered = depth * (1 + 0.1 * normal_tensor(seed, *shape))
