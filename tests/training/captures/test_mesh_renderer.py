@@ -101,6 +101,11 @@ def test_masks_are_visible_or_not_by_their_cutoff(opengl, scene, alpha, visible)
             assert depth == pytest.approx(QUAD if visible else WALL, abs=1e-4)
 
 
+def test_alpha_of_opaque_materials_is_ignored(opengl, scene):
+    for color, depth in sides(view(scene({}, png(np.zeros((4, 4)))))):
+        assert is_green(color) and depth == pytest.approx(QUAD, abs=1e-4)
+
+
 def test_panes_are_translucent_and_have_depth(opengl, scene):
     glass = {"baseColorFactor": [0.0, 0.8, 0.0, 0.5]}
     factor = view(scene({"alphaMode": "BLEND", "pbrMetallicRoughness": glass}))

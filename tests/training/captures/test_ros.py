@@ -256,7 +256,7 @@ def test_the_bag_is_read_once(bag, config, shows_room):
     shows_room(capture, color=0.5, depth=0.002)
 
 
-def test_what_is_missing_is_named(bag, config):
+def test_missing_parts_are_named(bag, config):
     recorded = bag(1)
     recorded.images()
     with pytest.raises(ValueError, match=r"has no topic of poses; it has /color, /depth"):

@@ -38,19 +38,17 @@ def all_bytes(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in files}
 
 
-def test_interrupted_and_run_again_leaves_the_same_bytes(small, collected, tmp_path, monkeypatch):
+def test_interrupted_run_ends_with_identical_files(small, collected, tmp_path, monkeypatch):
     whole = all_bytes(collected.shards[0].path.parents[1])
-    write_shard = collect.collect_world.__globals__["write_shard"]
 
     def killed(path, *args, **kwargs):
         (path.parent / f".{path.name}.1.partial").mkdir()
         raise KeyboardInterrupt
 
     collect.run(config=small, out=tmp_path, worlds=1, jobs=1)
-    monkeypatch.setitem(collect.collect_world.__globals__, "write_shard", killed)
-    with pytest.raises(KeyboardInterrupt):
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(collect, "write_shard", killed)
         collect.run(config=small, out=tmp_path, worlds=2, jobs=1)
-    monkeypatch.setitem(collect.collect_world.__globals__, "write_shard", write_shard)
     collect.run(config=small, out=tmp_path, worlds=2, jobs=1)
     assert all_bytes(tmp_path) == whole
 
@@ -86,7 +84,7 @@ def test_samples_of_another_version_stay(small, collected, tmp_path):
     assert all_bytes(out) == before
 
 
-def test_states_off_the_path_have_shards_of_their_own(small, collected, tmp_path):
+def test_states_off_the_path_have_their_own_shards(small, collected, tmp_path):
     config = replace(small, off_path=70)
     corpus = collect.run(config=config, out=tmp_path, worlds=1, jobs=1)
     shard, off_path = corpus.shards
@@ -159,7 +157,7 @@ def test_another_program_adds_no_worlds(small, collected, tmp_path, monkeypatch)
     assert all_bytes(out) == before
 
 
-def test_a_kind_that_has_changed_is_not_added_to(small, collected, tmp_path):
+def test_corpus_of_a_changed_kind_is_not_extended(small, collected, tmp_path):
     grove = tmp_path / "grove.yaml"
     grove.write_text(Path(small.worlds.kinds[0]).read_text())
     config = replace(small, worlds=replace(small.worlds, kinds=[str(grove)]))
@@ -178,7 +176,7 @@ def test_half_a_world_of_an_interrupted_run_is_not_used(small, collected, tmp_pa
     assert all_bytes(out) == all_bytes(collected.folder)
 
 
-def test_another_corpus_is_not_added_to(small, collected):
+def test_corpus_of_another_configuration_is_not_extended(small, collected):
     folder = collected.shards[0].path.parents[1]
     other = load_config(small, overrides=["flights=3"])
     with pytest.raises(ValueError, match="another configuration"):
@@ -340,7 +338,7 @@ def test_perturbations_keep_clear_of_obstacles(world, labeler):
     assert 0.05 < moved.max() <= 0.5 - 0.354 + 1e-9
 
 
-def test_trajectories_that_touch_something_are_no_demonstrations(labeler):
+def test_trajectories_in_contact_are_no_demonstrations(labeler):
     X_WB = RigidTransform([5.0, 0.0, 2.0])
     ahead = np.linspace(0.1, 1.0, 10)[:, None] * [1.0, 0.0, 0.0]
     out = 3.0 * ahead[:, [1, 0, 2]]  # 3 m to the left, to the hall's edge

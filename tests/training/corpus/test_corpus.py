@@ -41,7 +41,7 @@ def test_a_world_that_changed_is_refused(folder):
         record.make()
 
 
-def test_what_is_missing_is_named(folder, tmp_path):
+def test_missing_parts_are_named(folder, tmp_path):
     with pytest.raises(FileNotFoundError, match=r"no corpus.*splatpilot corpus make"):
         Corpus(tmp_path)
     name = Corpus(folder).worlds[0].name

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from splatpilot.diagrams.flight.flight import fly
 from splatpilot.systems.common.config import load_config
 from splatpilot.systems.policies.checkpoint import checkpoint_policy
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
@@ -90,7 +91,7 @@ def test_student_flies_and_trains_again_with_recovery_samples(expert, tmp_path, 
 
 def test_next_round_is_flown_by_the_weights_of_the_last(expert, tmp_path, monkeypatch):
     both_stages(expert, tmp_path / "first")
-    flown, fly = [], recovery.fly
+    flown = []
 
     def watched(diagram, scenario, world):
         flown.append(scenario.policy)
@@ -156,7 +157,7 @@ def test_recovery_share_is_the_fraction_of_recovery_samples(expert, tmp_path):
 
 
 def test_rgb_policy_recovers_too(tmp_path, monkeypatch):
-    speeds, fly = [], recovery.fly
+    speeds = []
 
     def watched(diagram, scenario, world):
         speeds.append(scenario.policy.speed)
