@@ -299,6 +299,16 @@ def rotated(angle: float, x: float = 0.0) -> RigidTransform:
     return RigidTransform(RotationMatrix.MakeZRotation(angle), [x, 0, 0])
 
 
+def test_poses_are_composed_and_interpolated():
+    tree = TransformTree()
+    tree.fix("body", "camera", rotated(0.0, 1.0))
+    tree.move("map", "body", 10.1, rotated(0.4, 4.0))
+    tree.move("map", "body", 10.0, rotated(0.2, 2.0))  # later in the bag
+    for time, X_WB in ((10.05, rotated(0.3, 3.0)), (10.1, rotated(0.4, 4.0))):
+        pose = tree.pose("camera", time)
+        assert pose is not None and pose.IsNearlyEqualTo(X_WB @ rotated(0.0, 1.0), 1e-9)
+
+
 def test_unknown_poses():
     tree = TransformTree()
     for time in (1.0, 2.0):
