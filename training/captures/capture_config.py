@@ -1,4 +1,4 @@
-"""Configuration of captures, and the cache of what is computed from them."""
+"""Configuration of captures, and the cache of computed results."""
 
 import hashlib
 import json

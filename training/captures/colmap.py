@@ -101,10 +101,10 @@ def load_model(model: Path) -> "pycolmap.Reconstruction":
         for image in reconstruction.images.values():
             _ = image.name  # which may not be UTF-8
         reconstruction.write_binary(copy)
-        for file in files:  # pycolmap reads on beyond their end.
+        for file in files:  # pycolmap does not check their end.
             complete = Path(copy, file.name)
-            if complete.is_file() and file.stat().st_size < complete.stat().st_size:
-                raise ValueError(f"{file.name} is truncated")
+            if complete.is_file() and file.stat().st_size != (size := complete.stat().st_size):
+                raise ValueError(f"{file.name} must have {size} bytes, got {file.stat().st_size}")
     return reconstruction
 
 

@@ -166,8 +166,8 @@ def _open_exr(file: Path, **options: bool) -> Any:
 
 
 def numbered_files(folder: Path, pattern: str) -> dict[int, Path]:
-    """Returns the files of a folder by the number that is the group of `pattern`, a regular
-    expression of the whole name, in its order."""
+    """Returns the files of a folder by number, in order: the group of `pattern`, a regular
+    expression for the full name."""
     if not folder.is_dir():
         raise FileNotFoundError(f"No such folder: {folder}")
     found = ((re.fullmatch(pattern, file.name), file) for file in folder.iterdir())

@@ -315,7 +315,7 @@ def _split(
                 continue
             number, visual = primitive.get("material", -1), cast(Any, mesh.visual)
             if number < 0:
-                mesh.visual = TextureVisuals(material=PBRMaterial(doubleSided=True))
+                mesh.visual = _with_material(visual, PBRMaterial(doubleSided=True))
                 solid.append(name)
                 continue
             material = materials[number]
@@ -357,7 +357,8 @@ def _read(path: Path) -> tuple[Any, dict[str, Any]]:
     if path.suffix == ".obj":
         for mesh in scene.geometry.values():
             # Its materials are not metallic, as glTF's are by default.
-            mesh.visual = mesh.visual if mesh.visual.kind == "texture" else TextureVisuals()
+            if mesh.visual.kind != "texture":
+                mesh.visual = _with_material(mesh.visual)
             mesh.visual.material = mesh.visual.material.to_pbr()
             mesh.visual.material.metallicFactor, mesh.visual.material.roughnessFactor = 0.0, 1.0
         content = scene.export(file_type="glb")
@@ -366,6 +367,14 @@ def _read(path: Path) -> tuple[Any, dict[str, Any]]:
         (size,) = struct.unpack_from("<I", content, 12)
         content = content[20 : 20 + size]
     return scene, json.loads(content)
+
+
+def _with_material(visual: Any, material: PBRMaterial | None = None) -> TextureVisuals:
+    """Returns a material, trimesh's default if None, with the vertex colors of `visual`."""
+    textured = TextureVisuals(material=material)
+    if visual.kind == "vertex":
+        textured.vertex_attributes["color"] = visual.vertex_colors
+    return textured
 
 
 def _base_color(material: dict[str, Any]) -> list[float]:
@@ -404,7 +413,7 @@ def _restore(tree: dict[str, Any], document: dict[str, Any]) -> None:
                 texture = document["textures"][originals[key]["index"]]
                 sampler = {"sampler": texture["sampler"]} if "sampler" in texture else {}
                 tree["textures"][info["index"]].update(sampler)
-                info.update(originals[key] | {"index": info["index"], "texCoord": 0})
+                info.update(originals[key] | {"index": info["index"]})
     if not tree["samplers"]:
         del tree["samplers"]
 
@@ -415,13 +424,16 @@ def _cut_material(
     """Returns a material whose texture has holes, None for any other."""
     pbr, mode = material.get("pbrMetallicRoughness", {}), material.get("alphaMode", "OPAQUE")
     for key, info in [*material.items(), *pbr.items()]:
-        if key.endswith("Texture") and getattr(read, key, None) is None:
+        if not key.endswith("Texture"):
+            continue
+        if getattr(read, key, None) is None:
             image = document["images"][document["textures"][info["index"]]["source"]]
             raise ValueError(f"its image {image.get('uri', '')[:80]} cannot be read")
+        # trimesh reads no other.
+        require(info.get("texCoord", 0) == 0, f"texCoord of {key}", "0", info.get("texCoord"))
     info, image = pbr.get("baseColorTexture", {}), read.baseColorTexture
     if mode == "OPAQUE" or image is None or not image.has_transparency_data:
         return None
-    require(info.get("texCoord", 0) == 0, "texCoord of a cut-out", "0", info.get("texCoord"))
     pixels = np.asarray(image.convert("RGBA"), dtype=np.float32) / 255
     pixels[..., :3] **= _GAMMA
     pixels *= np.asarray(_base_color(material), dtype=np.float32)

@@ -233,7 +233,7 @@ class _Bag:
         topic, message = found[0], infos[found[0]]
         matrix, projection, distortion = (_info_field(message, name) for name in "kpd")
         if any(not np.array_equal(_info_field(infos[each], "k"), matrix) for each in found):
-            return {"problem": f"{', '.join(found)} differ, and none is beside {self._color}"}
+            return {"problem": f"{', '.join(found)} differ, and none is next to {self._color}"}
         K, model = np.asarray(matrix, dtype=float).reshape(3, 3), message.distortion_model
         if image.startswith("image_rect"):
             K, model, distortion = np.asarray(projection, dtype=float).reshape(3, 4), "", []

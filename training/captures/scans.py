@@ -106,7 +106,7 @@ def read_seven_scenes(path: Path, config: CaptureConfig) -> Capture:
         )
 
     def lens(width: int, height: int) -> Lens:
-        source = "what was measured on redkitchen: set capture.intrinsics of another camera"
+        source = "a measurement on redkitchen; set capture.intrinsics for another camera"
         return Lens(pinhole(*_SEVEN_SCENES_COLOR), 640, 480, source=source).scale_to(width, height)
 
     def depth_camera(width: int, height: int) -> DepthCamera:

@@ -74,7 +74,7 @@ def read(path: Path, config: CaptureConfig) -> Capture:
             focal, distortion = _CAMERAS[found[1] or found[2]]
             own = opencv_lens(centered_pinhole(*focal), 640, 480, distortion)
             return replace(own, source=f"the name {found[0]}").scale_to(width, height)
-        assumed = "what TUM's driver assumes: set capture.intrinsics of another camera"
+        assumed = "the default of TUM's driver; set capture.intrinsics for another camera"
         return Lens(centered_pinhole(*_DEFAULT), 640, 480, source=assumed).scale_to(width, height)
 
     return open_sequence(path, "TUM RGB-D sequence", config, lens, 5000.0)

@@ -81,8 +81,8 @@ def fit_ground(
     best = max(np.flatnonzero(below & ~steep).tolist(), key=score, default=None)
     if best is None or score(best) < max(_GROUND_SHARE * len(p_WQ), 1):
         raise ValueError(
-            "no ground was found: no plane below the cameras holds a fiftieth of the points; set "
-            "capture.scale or capture.up by another field"
+            "no ground was found: no plane below the cameras holds a fiftieth of the points; "
+            "choose another capture.up, or another field of capture.scale"
         )
     n, d = normals[best], offsets[best]
     for width in near * np.array([1, 0.5, 0.25, 0.125]):
@@ -152,8 +152,8 @@ def _known_points(capture: Capture) -> NDArray[np.float64]:
         parts.append(capture.X_WCs[i].multiply(p_CQ.T).T)
     if not sum(len(part) for part in parts):
         raise ValueError(
-            f"{capture.source}: has neither points nor depth to find the ground; set capture.up or "
-            "capture.scale by another field"
+            f"{capture.source}: has neither points nor depth to find the ground; choose another "
+            "capture.up, or another field of capture.scale"
         )
     return np.concatenate(parts)
 

@@ -184,9 +184,9 @@ def collect_world(folder: Path, config: CorpusConfig, index: int, revision: str)
     rngs = [np.random.default_rng([config.seed, source.seed, k]) for k in range(config.flights)]
     min_time = 0.5 * labeler.toa.value(world.p_WS)
     starts = [world.p_WS]
-    for rng in rngs[1:]:
+    if config.flights > 1:
         free = labeler.toa.starts(labeler.field, _START_CLEARANCE, min_time)
-        starts.append(free[rng.integers(len(free))])
+        starts += [free[rng.integers(len(free))] for rng in rngs[1:]]
     if config.expert.policy == PLANNER:
         flights = fly_planner(np.stack(starts), world, config.expert, labeler)
     else:

@@ -97,7 +97,7 @@ class Corpus:
         )
 
     def verify(self) -> None:
-        """Reads everything; raises an error for content that differs from what was written."""
+        """Reads everything; raises an error for content that has changed since."""
         types = self.config.size.image_types()
         for shard in self.shards:
             shard.verify()

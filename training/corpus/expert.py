@@ -54,8 +54,8 @@ class ExpertConfig(Config):
     policy: str = PLANNER
     # [m/s] Nominal speed of the expert.
     speed: float = 2.0
-    # [s] Time between labeled states, and between plans of a planner that flies. Plans last 1 s, of
-    # which the controller looks 0.4 s ahead.
+    # [s] Time between labeled states, and between plans of a planner that flies. Plans last 1 s;
+    # the controller follows them 0.4 s ahead.
     period: float = bounded(0.4, f"[0.02, {_MAX_PERIOD:g}] s")
     # [-] Trajectories of each label, K.
     num_hypotheses: int = 3

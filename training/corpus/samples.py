@@ -166,7 +166,7 @@ class Shard:
         return self._count
 
     def verify(self) -> None:
-        """Reads everything; raises ValueError for content that differs from what was written."""
+        """Reads everything; raises ValueError for content that has changed since."""
         for name, (_, checksum) in self._files.items():
             if _checksum(self.path / name) != checksum:
                 raise ValueError(f"{self.path / name} is damaged (wrong checksum); {_REMEDY}")

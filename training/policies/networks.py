@@ -1,4 +1,4 @@
-"""Networks of depth policies in torch, with the names of weights of those in numpy that fly."""
+"""Networks of depth policies in torch; their weights have the names that flight expects."""
 
 import torch
 from torch import Tensor, nn

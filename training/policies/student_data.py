@@ -41,7 +41,7 @@ class Labels(NamedTuple):
 
 
 class StudentData:
-    """The distinct samples of several corpora, of which a fraction of the worlds is held out, see
+    """The distinct samples of several corpora. A fraction of their worlds is held out, see
     `is_held_out`. Labels are on a device; images stay on disk."""
 
     def __init__(self, corpora: Sequence[Corpus], held_out: float, device: str = "cpu") -> None:

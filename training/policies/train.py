@@ -1,4 +1,4 @@
-"""The training loop: any trainer, resumable, with everything recorded beside the weights."""
+"""The training loop: any trainer, resumable, with a record next to the weights."""
 
 import csv
 import io

@@ -69,7 +69,7 @@ class CorpusTraining(TrainingConfig):
     batch: int = bounded(32, "[1, inf)")
     # File of this policy's weights to continue from; none if empty.
     begin: str = ""
-    # Changes of the look of images.
+    # Changes of the appearance of images.
     appearance: Appearance = field(default_factory=Appearance)
     # Noise of images.
     noise: ObservationNoise = field(default_factory=ObservationNoise)
@@ -81,8 +81,8 @@ class CorpusTraining(TrainingConfig):
 
 FLIGHTS = """\
 Flown in simulation as in training. `success` is the fraction that reached the goal; `collisions`
-and `left` (the volume) are failures, as is running out of time; a scenario's name stands before the
-success in worlds of its kind."""
+and `left` (the volume) are failures, as is running out of time; rows named by a scenario are the
+success in its kind of worlds."""
 
 
 class Trainer:

@@ -19,10 +19,8 @@ from splatpilot.training.reconstruction.views import ReconstructionViews
 _VERSION = 3
 _REMEDY = "start again with --restart, which discards it"
 # Fields that may differ when a run resumes: they do not change the optimization.
-_UNCOMPARED = {
-    *("threads", "checkpoint_every", "tensorboard"),
-    *("voxel_size", "max_range", "distance_field", "split"),
-}
+_UNCOMPARED = {"threads", "checkpoint_every", "tensorboard", "split"}
+_UNCOMPARED |= {"voxel_size", "max_range", "distance_field"}
 
 
 def save_tensors(content: dict[str, Any], path: Path) -> None:

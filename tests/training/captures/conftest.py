@@ -1,4 +1,4 @@
-"""A small room seen by cameras of any kind, ray-traced by formulas of its own."""
+"""A small room, ray-traced for cameras of any kind."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -60,3 +60,14 @@ def test_heading_stays_on_a_climb():
     path = np.array([[0.0, 0, 1], [3, 3, 1], [3, 3, 6]])
     ahead = np.array([X.rotation().matrix()[:, 2] for X in poses_along(path, 0.5, [0.0], 0.0)])
     np.testing.assert_allclose(ahead, np.tile([0.5**0.5, 0.5**0.5, 0], (len(ahead), 1)), atol=1e-6)
+
+
+def test_one_point_is_one_stop():
+    (X_WC,) = poses_along(np.array([[1.0, 2, 3]]), 0.5, [0.0], 0.0)
+    np.testing.assert_array_equal(X_WC.translation(), [1, 2, 3])
+
+
+@pytest.mark.parametrize("path", [[], [[1.0, 2]], [[1.0, 2, np.nan]]])
+def test_invalid_paths_are_refused(path):
+    with pytest.raises(ValueError, match="path must be of finite points x, y, z"):
+        poses_along(np.array(path), 0.5, [0.0], 0.0)

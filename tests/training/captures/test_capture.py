@@ -57,7 +57,7 @@ def test_principal_point_outside_the_image_is_refused(center):
 
 
 @pytest.mark.parametrize(("cx", "eccentric"), [(32, False), (47, False), (49, True), (15, True)])
-def test_eccentric_lenses_are_told(cx, eccentric):
+def test_eccentric_lenses_are_recognized(cx, eccentric):
     assert Lens(pinhole(46, 46, cx, 24), 64, 48).is_eccentric == eccentric
 
 
@@ -134,7 +134,7 @@ def test_edges_holes_and_sky():
     np.testing.assert_allclose(shrink(make_frame(depth), 2).depth, expected, rtol=1e-6)
 
 
-def test_pixels_are_valid_that_replace_valid_ones_alone():
+def test_shrunken_pixels_are_valid_if_all_replaced_ones_are():
     frame = make_frame(np.ones((5, 8)))
     valid = np.ones((5, 8), bool)
     valid[1, 2] = valid[3, 6:] = valid[4] = False

@@ -54,7 +54,7 @@ def folder(tmp_path, monkeypatch):
     sys.modules.pop("pairs", None)
 
 
-def test_a_kind_of_another_package(folder, tmp_path):
+def test_format_of_another_package(folder, tmp_path):
     info = tmp_path / "packages" / "pairs-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: pairs\nVersion: 1.0\n")
@@ -68,7 +68,7 @@ def test_a_kind_of_another_package(folder, tmp_path):
     assert plain.K[0, 0] == 20 and plain.config.cache == str(Path("kept").absolute())
 
 
-def test_a_kind_that_is_not_installed(folder):
+def test_format_that_is_not_installed(folder):
     assert read_capture(folder, CaptureConfig(kind="pairs:PAIR")).source == f"pair {folder}"
     for kind, message in (
         ("pairs:NUMBER", "pairs:NUMBER must be a CaptureFormat"),
@@ -79,7 +79,7 @@ def test_a_kind_that_is_not_installed(folder):
             read_capture(folder, CaptureConfig(kind=kind))
 
 
-def test_registered_kinds_are_listed(folder):
+def test_registered_formats_are_listed(folder):
     register_capture(
         "cubes", lambda path: False, lambda path, config: None, description="cubes (*)"
     )
@@ -93,7 +93,7 @@ def test_registered_kinds_are_listed(folder):
         register_capture("tum", lambda path: True, lambda path, config: None)
 
 
-def test_settings_say_what_is_not_as_usual(folder):
+def test_settings_are_the_fields_without_default_values(folder):
     config = CaptureConfig(depth_unit=1e-05, up="-y", p_DC=[0.0, 1e-7, np.pi])
     config.scale.between = ["a b.jpg@1,2", "c: #d.jpg"]
     config.scale.distance = 2.0

@@ -294,10 +294,10 @@ def test_photographs_are_registered_once(model, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["cameras", "images", "points3D", "rigs", "frames"])
-def test_damaged_or_truncated_model_is_refused(model, name):
+def test_damaged_truncated_or_extended_model_is_refused(model, name):
     file = model / f"sparse/0/{name}.bin"
     content = file.read_bytes()
-    for damaged in (b"\xff" * 8 + content[8:], content[:-1]):
+    for damaged in (b"\xff" * 8 + content[8:], content[:-1], content + b"\0"):
         file.write_bytes(damaged)
         with pytest.raises(ValueError, match=r"sparse/0: not a readable COLMAP model"):
             read_capture(model)

@@ -101,6 +101,11 @@ def test_masks_are_visible_or_not_by_their_cutoff(opengl, scene, alpha, visible)
             assert depth == pytest.approx(QUAD if visible else WALL, abs=1e-4)
 
 
+def test_alpha_of_opaque_materials_is_ignored(opengl, scene):
+    for color, depth in sides(view(scene({}, png(np.zeros((4, 4)))))):
+        assert is_green(color) and depth == pytest.approx(QUAD, abs=1e-4)
+
+
 def test_panes_are_translucent_and_have_depth(opengl, scene):
     glass = {"baseColorFactor": [0.0, 0.8, 0.0, 0.5]}
     factor = view(scene({"alphaMode": "BLEND", "pbrMetallicRoughness": glass}))
@@ -144,6 +149,25 @@ def test_nothing_is_cut_behind_what_is_opaque(opengl, scene):
 def test_missing_texture_is_named(scene):
     with pytest.raises(ValueError, match=r"scene\.gltf: not a readable mesh \(.*nowhere\.png"):
         mesh_distance(scene({"alphaMode": "MASK"}, "nowhere.png"), "y", 0.1)
+
+
+@pytest.mark.parametrize("name", ["wall.glb", "wall.obj"])
+def test_vertex_colors_are_rendered(opengl, tmp_path, name):
+    p, _, triangles = square(WALL, 4.0)
+    red = np.full((4, 4), [255, 0, 0, 255], np.uint8)
+    trimesh.Trimesh(p, triangles, process=False, vertex_colors=red).export(tmp_path / name)
+    up = "y" if name.endswith("glb") else "z"
+    color = MeshRenderer(tmp_path / name, up, SKY).frame(X_WC, K, 32, 24).image[12, 16]
+    assert is_red(color)
+
+
+def test_texture_on_other_coordinates_is_refused(scene):
+    file = scene({}, png(HALVES))
+    document = json.loads(file.read_text())
+    document["materials"][1]["pbrMetallicRoughness"]["baseColorTexture"]["texCoord"] = 1
+    file.write_text(json.dumps(document))
+    with pytest.raises(ValueError, match="texCoord of baseColorTexture must be 0, got 1"):
+        mesh_distance(file, "y", 0.1)
 
 
 ROOM = np.array([6.0, 4.0, 3.0])  # [m]

@@ -105,6 +105,11 @@ def test_drift_is_removed(frames, room_poses, noise, left):
     assert "poses moved by" in str(refined)
 
 
+def test_exact_poses_stay(frames, room_poses):
+    refined = refine_poses(frames(room_poses), room_poses)
+    assert (errors(refined.X_WCs, room_poses) < 1e-3).all()
+
+
 def test_blind_frame_moves_with_its_neighbors(frames, room_poses):
     given = drifting(room_poses, 0.02, 0.02)
     seen = frames(room_poses)

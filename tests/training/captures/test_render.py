@@ -186,7 +186,7 @@ def test_other_contents_are_not_overwritten(opengl, room, tmp_path):
     assert len(read_capture(tmp_path / "capture")) == 4
 
 
-def test_captures_of_meshes_drawn_otherwise_are_refused(tmp_path):
+def test_captures_by_another_version_of_the_renderer_are_refused(tmp_path):
     assert true_camera(tmp_path) is None
     (tmp_path / "world.yaml").write_text("mesh: room.obj\n")
     with pytest.raises(ValueError, match=r"world\.yaml: version must be 2, got 1; render it again"):

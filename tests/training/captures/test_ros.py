@@ -231,7 +231,7 @@ def test_calibration_is_in_the_namespace_of_the_images(bag, config, compressed):
     ("calibrations", "problem"),
     [
         ([{"topic": "/a/info", "scale": 1.3}, {"topic": "/b/info"}],
-         "/a/info, /b/info differ, and none is beside /camera/color"),
+         "/a/info, /b/info differ, and none is next to /camera/color"),
         ([{"model": "omnidirectional"}], "/info has the distortion 'omnidirectional'"),
     ],
 )  # fmt: skip
@@ -256,7 +256,7 @@ def test_the_bag_is_read_once(bag, config, shows_room):
     shows_room(capture, color=0.5, depth=0.002)
 
 
-def test_what_is_missing_is_named(bag, config):
+def test_missing_parts_are_named(bag, config):
     recorded = bag(1)
     recorded.images()
     with pytest.raises(ValueError, match=r"has no topic of poses; it has /color, /depth"):
@@ -297,6 +297,16 @@ def test_damaged_bag(tmp_path, config):
 
 def rotated(angle: float, x: float = 0.0) -> RigidTransform:
     return RigidTransform(RotationMatrix.MakeZRotation(angle), [x, 0, 0])
+
+
+def test_poses_are_composed_and_interpolated():
+    tree = TransformTree()
+    tree.fix("body", "camera", rotated(0.0, 1.0))
+    tree.move("map", "body", 10.1, rotated(0.4, 4.0))
+    tree.move("map", "body", 10.0, rotated(0.2, 2.0))  # later in the bag
+    for time, X_WB in ((10.05, rotated(0.3, 3.0)), (10.1, rotated(0.4, 4.0))):
+        pose = tree.pose("camera", time)
+        assert pose is not None and pose.IsNearlyEqualTo(X_WB @ rotated(0.0, 1.0), 1e-9)
 
 
 def test_unknown_poses():

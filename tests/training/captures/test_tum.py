@@ -74,7 +74,7 @@ def test_bag_that_the_list_names_tells_the_camera(sequence):
     assert capture.notes[0].endswith("from the name freiburg1")
 
 
-def test_calibration_beside_the_images_is_read(sequence):
+def test_calibration_next_to_the_images_is_read(sequence):
     (sequence / "calibration.txt").write_text("62.8742 63.5 38.3309 29.5\n")
     capture = read_capture(sequence)
     expected = [[62.8742, 0, 38.8309], [0, 63.5, 30], [0, 0, 1]]

@@ -34,7 +34,7 @@ def write_far(write_room, path, offset=FAR):
 
 
 @pytest.mark.parametrize("offset", [FAR, FAR * 10, [4180273.7, 927013.4, 4711663.3]])
-def test_far_capture_is_what_it_is_at_the_origin(write_room, tmp_path, offset):
+def test_far_capture_is_moved_to_the_origin(write_room, tmp_path, offset):
     near = read_capture(write_room(tmp_path / "near"))
     far = read_capture(write_far(write_room, tmp_path / "far", np.array(offset)))
     assert not near.origin.any()
@@ -57,7 +57,7 @@ def test_points_move_with_the_cameras():
 
 
 @pytest.mark.parametrize("origin", [[], [0.0, 0.0, 0.0], [100.0, 0.0, 0.0]])
-def test_origin_that_is_given_is_taken(write_room, tmp_path, origin):
+def test_given_origin_is_taken(write_room, tmp_path, origin):
     room = write_far(write_room, tmp_path / "room", np.array([2000.0, 0, 0]))
     capture = read_capture(room, CaptureConfig(origin=origin))
     given = origin or [2003.0, 0.0, 1.0]

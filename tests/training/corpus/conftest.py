@@ -1,7 +1,7 @@
 import pytest
 
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
-from splatpilot.training.corpus import collect as make
+from splatpilot.training.corpus import collect
 from splatpilot.training.corpus.corpus import Corpus, CorpusConfig
 from splatpilot.training.corpus.expert import ExpertConfig
 from splatpilot.training.corpus.library import LibraryConfig
@@ -21,6 +21,6 @@ def small(tmp_path_factory) -> CorpusConfig:
 
 
 @pytest.fixture(scope="session")
-def gathered(small, tmp_path_factory) -> Corpus:
+def collected(small, tmp_path_factory) -> Corpus:
     """A corpus of two worlds; not to be written to."""
-    return make.run(config=small, out=tmp_path_factory.mktemp("corpus"), worlds=2, jobs=1)
+    return collect.run(config=small, out=tmp_path_factory.mktemp("corpus"), worlds=2, jobs=1)

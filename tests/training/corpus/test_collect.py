@@ -19,7 +19,7 @@ from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 from splatpilot.systems.vehicle.state import QuadrotorState, pose_from_state
-from splatpilot.training.corpus import collect as make
+from splatpilot.training.corpus import collect
 from splatpilot.training.corpus.collect import (
     Demonstration,
     draw_off_path,
@@ -38,149 +38,149 @@ def all_bytes(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in files}
 
 
-def test_interrupted_and_run_again_leaves_the_same_bytes(small, gathered, tmp_path, monkeypatch):
-    whole = all_bytes(gathered.shards[0].path.parents[1])
-    write_shard = make.collect_world.__globals__["write_shard"]
+def test_interrupted_run_ends_with_identical_files(small, collected, tmp_path, monkeypatch):
+    whole = all_bytes(collected.shards[0].path.parents[1])
 
     def killed(path, *args, **kwargs):
         (path.parent / f".{path.name}.1.partial").mkdir()
         raise KeyboardInterrupt
 
-    make.run(config=small, out=tmp_path, worlds=1, jobs=1)
-    monkeypatch.setitem(make.collect_world.__globals__, "write_shard", killed)
-    with pytest.raises(KeyboardInterrupt):
-        make.run(config=small, out=tmp_path, worlds=2, jobs=1)
-    monkeypatch.setitem(make.collect_world.__globals__, "write_shard", write_shard)
-    make.run(config=small, out=tmp_path, worlds=2, jobs=1)
+    collect.run(config=small, out=tmp_path, worlds=1, jobs=1)
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(collect, "write_shard", killed)
+        collect.run(config=small, out=tmp_path, worlds=2, jobs=1)
+    collect.run(config=small, out=tmp_path, worlds=2, jobs=1)
     assert all_bytes(tmp_path) == whole
 
 
-def test_what_is_damaged_is_gathered_again(small, gathered, tmp_path, monkeypatch):
-    folder = gathered.shards[0].path.parents[1]
+def test_damaged_worlds_are_collected_again(small, collected, tmp_path, monkeypatch):
+    folder = collected.shards[0].path.parents[1]
     out = shutil.copytree(folder, tmp_path / "corpus")
-    asked = []
-    gather = make.collect_world
-    monkeypatch.setattr(make, "collect_world", lambda *a: (asked.append(a[2]), gather(*a)))
-    make.run(config=small, out=out, worlds=2, jobs=1)
-    assert asked == []
-    depth = out / "shards" / gathered.shards[1].path.name / "depth.npy"
+    again = []
+    collect_world = collect.collect_world
+    monkeypatch.setattr(
+        collect, "collect_world", lambda *a: (again.append(a[2]), collect_world(*a))
+    )
+    collect.run(config=small, out=out, worlds=2, jobs=1)
+    assert again == []
+    depth = out / "shards" / collected.shards[1].path.name / "depth.npy"
     depth.write_bytes(depth.read_bytes()[:-1])
-    esdf = out / "worlds" / gathered.worlds[0].name / "esdf.npz"
+    esdf = out / "worlds" / collected.worlds[0].name / "esdf.npz"
     content = bytearray(esdf.read_bytes())
     content[len(content) // 2] ^= 1
     esdf.write_bytes(content)
-    make.run(config=small, out=out, worlds=2, jobs=1)
-    assert asked == [0, 1]
+    collect.run(config=small, out=out, worlds=2, jobs=1)
+    assert again == [0, 1]
     assert all_bytes(out) == all_bytes(folder)
 
 
-def test_what_another_version_gathered_stays(small, gathered, tmp_path):
-    out = shutil.copytree(gathered.shards[0].path.parents[1], tmp_path / "corpus")
-    about = out / "shards" / gathered.shards[0].path.name / "shard.json"
+def test_samples_of_another_version_stay(small, collected, tmp_path):
+    out = shutil.copytree(collected.shards[0].path.parents[1], tmp_path / "corpus")
+    about = out / "shards" / collected.shards[0].path.name / "shard.json"
     about.write_text(about.read_text().replace('"format_version": 2', '"format_version": 3'))
     before = all_bytes(out)
     with pytest.raises(ValueError, match="must be 2, got 3; use the version"):
-        make.run(config=small, out=out, worlds=2, jobs=1)
+        collect.run(config=small, out=out, worlds=2, jobs=1)
     assert all_bytes(out) == before
 
 
-def test_states_off_the_path_have_shards_of_their_own(small, gathered, tmp_path):
+def test_states_off_the_path_have_their_own_shards(small, collected, tmp_path):
     config = replace(small, off_path=70)
-    corpus = make.run(config=config, out=tmp_path, worlds=1, jobs=1)
-    beside, shard = corpus.shards[1], corpus.shards[0]
-    assert (shard.source, beside.source) == (EXPERT, OFF_PATH)
-    np.testing.assert_array_equal(shard.arrays["depth"], gathered.shards[0].arrays["depth"])
-    assert 35 <= len(beside) <= 70 and not np.isnan(beside.arrays["trajectories_B"][:, 0]).any()
+    corpus = collect.run(config=config, out=tmp_path, worlds=1, jobs=1)
+    shard, off_path = corpus.shards
+    assert (shard.source, off_path.source) == (EXPERT, OFF_PATH)
+    np.testing.assert_array_equal(shard.arrays["depth"], collected.shards[0].arrays["depth"])
+    assert 35 <= len(off_path) <= 70 and not np.isnan(off_path.arrays["trajectories_B"][:, 0]).any()
     before = all_bytes(tmp_path)
-    with (beside.path / "color.npy").open("r+b") as file:
+    with (off_path.path / "color.npy").open("r+b") as file:
         file.seek(5000)
         file.write(b"damage")
-    make.run(config=config, out=tmp_path, worlds=1, jobs=1)
+    collect.run(config=config, out=tmp_path, worlds=1, jobs=1)
     assert all_bytes(tmp_path) == before
     rows = list(csv.DictReader((tmp_path / "ledger.csv").open()))
-    assert [(row["source"], row["states"]) for row in rows][-1] == ("off_path", str(len(beside)))
+    assert [(row["source"], row["states"]) for row in rows][-1] == ("off_path", str(len(off_path)))
 
 
-def test_the_ledger_accounts_for_every_sample(gathered):
-    folder = gathered.shards[0].path.parents[1]
+def test_the_ledger_accounts_for_every_sample(collected):
+    folder = collected.shards[0].path.parents[1]
     rows = list(csv.DictReader((folder / "ledger.csv").open()))
     assert len(rows) == 4
-    assert 2 * sum(int(row["states"]) for row in rows) == len(gathered) > 0
+    assert 2 * sum(int(row["states"]) for row in rows) == len(collected) > 0
     assert {int(row["seed"]) for row in rows} == {TRAINING_SEEDS, TRAINING_SEEDS + 1}
     assert all(row["outcome"] == "goal" and float(row["least_clearance_m"]) > 0 for row in rows)
 
 
-def test_worlds_that_cannot_be_flown_are_left_out(small, gathered, tmp_path, monkeypatch, capsys):
-    def gather(folder, config, index, revision):
+def test_worlds_that_cannot_be_flown_are_left_out(small, collected, tmp_path, monkeypatch, capsys):
+    def collect_world(folder, config, index, revision):
         if index == 0:
-            raise InfeasibleFlightError("no way")
-        shutil.copytree(gathered.shards[0].path.parents[1], folder, dirs_exist_ok=True)
+            raise InfeasibleFlightError("no path")
+        shutil.copytree(collected.shards[0].path.parents[1], folder, dirs_exist_ok=True)
 
-    monkeypatch.setattr(make, "collect_world", gather)
-    make.run(config=small, out=tmp_path, worlds=2, jobs=1)
-    assert "world 0 is left out: no way" in "".join(capsys.readouterr())
+    monkeypatch.setattr(collect, "collect_world", collect_world)
+    collect.run(config=small, out=tmp_path, worlds=2, jobs=1)
+    assert "world 0 is left out: no path" in "".join(capsys.readouterr())
 
 
 @pytest.mark.parametrize(
     ("override", "message"),
     [
         ("appearance=1.5", r"appearance must be in \[0, 1\], got 1.5"),
-        ("expert.policy=nobody", "no policy 'nobody'"),
+        ("expert.policy=unknown", "no policy 'unknown'"),
         ("worlds.kinds=[R13]", "worlds.kinds must be of generated worlds, got R13"),
     ],
 )
 def test_values_out_of_range_are_named(small, tmp_path, override, message):
     config = load_config(small, overrides=[override])
     with pytest.raises(ValueError, match=message):
-        make.run(config=config, out=tmp_path / "c", worlds=1)
+        collect.run(config=config, out=tmp_path / "c", worlds=1)
     assert not (tmp_path / "c").exists()
 
 
 @pytest.mark.parametrize("number", ["worlds", "jobs"])
 def test_numbers_below_one_are_refused(small, tmp_path, number):
     with pytest.raises(ValueError, match=f"--{number} must be at least 1, got 0"):
-        make.run(config=small, out=tmp_path, **{"worlds": 1, "jobs": 1} | {number: 0})
+        collect.run(config=small, out=tmp_path, **{"worlds": 1, "jobs": 1} | {number: 0})
 
 
-def test_another_program_adds_no_worlds(small, gathered, tmp_path, monkeypatch):
-    out = shutil.copytree(gathered.folder, tmp_path / "corpus")
+def test_another_program_adds_no_worlds(small, collected, tmp_path, monkeypatch):
+    out = shutil.copytree(collected.folder, tmp_path / "corpus")
     before = all_bytes(out)
-    monkeypatch.setattr(make, "revision", lambda: "another")
-    assert len(make.run(config=small, out=out, worlds=2, jobs=1)) == len(gathered)
-    depth = out / "shards" / gathered.shards[1].path.name / "depth.npy"
+    monkeypatch.setattr(collect, "revision", lambda: "another")
+    assert len(collect.run(config=small, out=out, worlds=2, jobs=1)) == len(collected)
+    depth = out / "shards" / collected.shards[1].path.name / "depth.npy"
     content = depth.read_bytes()
     for wrong in (content, content[:-1]):
         depth.write_bytes(wrong)
         with pytest.raises(ValueError, match="must be that of the program, another, got"):
-            make.run(config=small, out=out, worlds=2 + (wrong == content), jobs=1)
+            collect.run(config=small, out=out, worlds=2 + (wrong == content), jobs=1)
     depth.write_bytes(content)
     assert all_bytes(out) == before
 
 
-def test_a_kind_that_has_changed_is_not_added_to(small, gathered, tmp_path):
+def test_corpus_of_a_changed_kind_is_not_extended(small, collected, tmp_path):
     grove = tmp_path / "grove.yaml"
     grove.write_text(Path(small.worlds.kinds[0]).read_text())
     config = replace(small, worlds=replace(small.worlds, kinds=[str(grove)]))
-    make.run(config=config, out=tmp_path / "corpus", worlds=1, jobs=1)
+    collect.run(config=config, out=tmp_path / "corpus", worlds=1, jobs=1)
     grove.write_text("world: !ForestConfig {length: 11, width: 8, height: 4}\n")
     with pytest.raises(ValueError, match="grove-1000000 is a world of another definition"):
-        make.run(config=config, out=tmp_path / "corpus", worlds=2, jobs=1)
+        collect.run(config=config, out=tmp_path / "corpus", worlds=2, jobs=1)
 
 
-def test_what_an_interruption_left_of_a_world_is_not_used(small, gathered, tmp_path):
-    out = shutil.copytree(gathered.folder, tmp_path / "corpus")
-    other, world = (record.path.name for record in gathered.worlds)
-    shutil.rmtree(out / "shards" / gathered.shards[1].path.name)
+def test_half_a_world_of_an_interrupted_run_is_not_used(small, collected, tmp_path):
+    out = shutil.copytree(collected.folder, tmp_path / "corpus")
+    other, world = (record.path.name for record in collected.worlds)
+    shutil.rmtree(out / "shards" / collected.shards[1].path.name)
     shutil.copy(out / "worlds" / other / "esdf.npz", out / "worlds" / world / "esdf.npz")
-    make.run(config=small, out=out, worlds=2, jobs=1)
-    assert all_bytes(out) == all_bytes(gathered.folder)
+    collect.run(config=small, out=out, worlds=2, jobs=1)
+    assert all_bytes(out) == all_bytes(collected.folder)
 
 
-def test_another_corpus_is_not_added_to(small, gathered):
-    folder = gathered.shards[0].path.parents[1]
+def test_corpus_of_another_configuration_is_not_extended(small, collected):
+    folder = collected.shards[0].path.parents[1]
     other = load_config(small, overrides=["flights=3"])
     with pytest.raises(ValueError, match="another configuration"):
-        make.run(config=other, out=folder, worlds=1)
+        collect.run(config=other, out=folder, worlds=1)
 
 
 P_WG = np.array([11.0, 4.0, 1.5])
@@ -196,7 +196,7 @@ def labeler_of(radius: float = RADIUS) -> Labeler:
     return Labeler(esdf_from_distance_field(exact, 0.2), P_WG, ExpertConfig())
 
 
-def test_half_stand_before_a_pillar_and_none_in_one():
+def test_half_of_the_states_are_before_a_pillar_and_none_in_one():
     labeler, count = labeler_of(), 400
     states = draw_off_path(labeler, count, 2.5, np.random.default_rng(0))
     assert states.shape == (count, 13)
@@ -223,20 +223,20 @@ def test_half_stand_before_a_pillar_and_none_in_one():
     to_goal = np.linalg.norm(p_WB[arriving] - P_WG, axis=1)
     assert to_goal.max() < 4.0 and (to_goal < 1.0).mean() > 0.15
     assert np.abs(looking[arriving].mean(0)).max() < 0.25
-    ways = P_WG[:2] - p_WB[anywhere, :2]
-    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
-    assert np.median((ways * looking[anywhere]).sum(1)) > 0.6
+    to_goal = P_WG[:2] - p_WB[anywhere, :2]
+    to_goal /= np.linalg.norm(to_goal, axis=1, keepdims=True)
+    assert np.median((to_goal * looking[anywhere]).sum(1)) > 0.6
     assert np.ptp(p_WB[others], axis=0) == pytest.approx([11.0, 7.0, 2.2], abs=1.2)
 
 
-def test_a_place_without_room_is_named():
+def test_world_without_free_space_is_refused():
     labeler = labeler_of()
     labeler.toa = replace(labeler.toa, reachable=np.zeros_like(labeler.toa.reachable))
     with pytest.raises(InfeasibleFlightError, match="no free position with a path"):
         draw_off_path(labeler, 5, 2.0, np.random.default_rng(0))
 
 
-BALL = np.array([5.0, 1.2, 2.6])  # p_W, ahead, to the left and above of the states below
+SPHERE = np.array([5.0, 1.2, 2.6])  # p_W, ahead, to the left and above of the states below
 CONFIG = CorpusConfig(
     camera=OnboardCamera(width=160, height=120),
     perturbation=PerturbationConfig(copies=2, distance=0.3, yaw=0.2, tilt=0.1),
@@ -246,13 +246,13 @@ CONFIG = CorpusConfig(
 
 @pytest.fixture(scope="module")
 def world() -> World:
-    """A small white ball in a black hall without walls, 10 x 6 x 4 m."""
+    """A small white sphere in a black hall without walls, 10 x 6 x 4 m."""
     free = np.zeros((50, 30, 20), bool)
     esdf = esdf_from_occupancy(free, free, np.array([0.0, -3.0, 0.0]), 0.2)
     one = np.ones((1, 3))
     return World(
         name="hall",
-        gaussians=GaussianScene.from_colors([BALL], [[1, 0, 0, 0]], 0.05 * one, [0.99], one),
+        gaussians=GaussianScene.from_colors([SPHERE], [[1, 0, 0, 0]], 0.05 * one, [0.99], one),
         distance_field=esdf,
         esdf=esdf,
         background=(0.0, 0.0, 0.0),
@@ -305,7 +305,7 @@ def test_images_are_taken_from_the_pose_that_is_recorded(world, labeler):
     _, samples = see(world, labeler)
     camera = CONFIG.camera
     for k, X_WP in enumerate(poses(samples)):
-        forward, left, up = X_WP.inverse().multiply(BALL) - np.array(camera.p_BC)
+        forward, left, up = X_WP.inverse().multiply(SPHERE) - np.array(camera.p_BC)
         column = camera.width / 2 - camera.focal_x * left / forward
         row = camera.height / 2 - camera.focal_y * up / forward
         light = samples.color[k].sum(axis=2)
@@ -338,7 +338,7 @@ def test_perturbations_keep_clear_of_obstacles(world, labeler):
     assert 0.05 < moved.max() <= 0.5 - 0.354 + 1e-9
 
 
-def test_trajectories_that_touch_something_are_no_demonstrations(labeler):
+def test_trajectories_in_contact_are_no_demonstrations(labeler):
     X_WB = RigidTransform([5.0, 0.0, 2.0])
     ahead = np.linspace(0.1, 1.0, 10)[:, None] * [1.0, 0.0, 0.0]
     out = 3.0 * ahead[:, [1, 0, 2]]  # 3 m to the left, to the hall's edge
@@ -351,7 +351,7 @@ def test_trajectories_that_touch_something_are_no_demonstrations(labeler):
     assert np.isnan(kept[0].waypoints_W[2]).all()
 
 
-def test_a_look_changes_colors_and_not_depth(world, labeler):
+def test_appearance_changes_colors_but_not_depth(world, labeler):
     _, plain = see(world, labeler)
     config = replace(CONFIG, appearance=1.0, perturbation=PerturbationConfig(copies=0))
     _, other = see(world, labeler, config=config)

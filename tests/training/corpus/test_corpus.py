@@ -8,30 +8,30 @@ from splatpilot.training.corpus.samples import EXPERT
 
 
 @pytest.fixture
-def folder(gathered, tmp_path):
+def folder(collected, tmp_path):
     """A copy of the corpus, to be damaged."""
-    return shutil.copytree(gathered.shards[0].path.parents[1], tmp_path / "corpus")
+    return shutil.copytree(collected.shards[0].path.parents[1], tmp_path / "corpus")
 
 
-def test_samples_come_in_the_order_asked_for(gathered):
-    first, second = gathered.shards
-    assert len(gathered) == len(first) + len(second)
+def test_samples_are_in_the_order_of_their_indices(collected):
+    first, second = collected.shards
+    assert len(collected) == len(first) + len(second)
     indices = np.array([len(first) + 1, 0, len(first) - 1, 0, len(first)])
-    found = gathered.samples(indices)
+    found = collected.samples(indices)
     rows = [(second, 1), (first, 0), (first, len(first) - 1), (first, 0), (second, 0)]
     for name in ("color", "depth", "X_WB", "v_B", "goal_B", "trajectories_B"):
         expected = np.stack([shard.arrays[name][row] for shard, row in rows])
         np.testing.assert_array_equal(getattr(found, name), expected)
         assert getattr(found, name).flags.c_contiguous
-    assert [gathered.worlds[k].name for k in found.world] == [shard.world for shard, _ in rows]
+    assert [collected.worlds[k].name for k in found.world] == [shard.world for shard, _ in rows]
     assert (found.source == EXPERT).all()
-    assert len(gathered.samples(np.array([], int))) == 0
+    assert len(collected.samples(np.array([], int))) == 0
 
 
 @pytest.mark.parametrize("index", [-1, 10**6])
-def test_indices_out_of_range_are_refused(gathered, index):
+def test_indices_out_of_range_are_refused(collected, index):
     with pytest.raises(IndexError, match=r"in \[0, "):
-        gathered.samples(np.array([0, index]))
+        collected.samples(np.array([0, index]))
 
 
 def test_a_world_that_changed_is_refused(folder):
@@ -41,7 +41,7 @@ def test_a_world_that_changed_is_refused(folder):
         record.make()
 
 
-def test_what_is_missing_is_named(folder, tmp_path):
+def test_missing_parts_are_named(folder, tmp_path):
     with pytest.raises(FileNotFoundError, match=r"no corpus.*splatpilot corpus make"):
         Corpus(tmp_path)
     name = Corpus(folder).worlds[0].name

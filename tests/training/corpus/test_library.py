@@ -120,7 +120,7 @@ def test_there_are_as_many_worlds_as_seeds(index):
         world_source(LibraryConfig(), 0, index)
 
 
-def test_some_kind_or_scene_is_needed(tmp_path):
+def test_library_without_kinds_and_scenes_is_refused(tmp_path):
     LibraryConfig(kinds=[], scenes=[write_scene(tmp_path / "attic", 0.1)]).validate()
     for kinds, message in (
         ([], "must be one kind or more"),
@@ -135,7 +135,7 @@ X_WB = RigidTransform(RollPitchYaw(0.3, -0.2, 2.0), np.array([1.0, 2.0, 3.0]))
 
 
 @pytest.mark.parametrize(("distance", "reach"), [(0.3, 1.0), (0.5, 0.2), (0.5, -0.1)])
-def test_displacements_fill_the_smaller_ball(distance, reach):
+def test_displacements_fill_the_smaller_sphere(distance, reach):
     config = PerturbationConfig(distance=distance, yaw=0.0, tilt=0.0)
     rng = np.random.default_rng(0)
     poses = [perturb_pose(X_WB, config, reach, rng) for _ in range(2000)]

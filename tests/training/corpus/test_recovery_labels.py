@@ -36,7 +36,7 @@ def clearances(*dips: tuple[float, float]) -> np.ndarray:
         ([(11.98, 0.0)], [11.98]),  # a collision ends the flight
     ],
 )
-def test_near_misses_are_the_least_clearances(dips, expected):
+def test_near_misses_are_the_minimum_clearances(dips, expected):
     np.testing.assert_allclose(near_misses(TIMES, clearances(*dips)), expected, atol=1e-9)
 
 
@@ -55,7 +55,7 @@ def test_ground_and_ceiling_are_no_obstacles():
     np.testing.assert_array_equal(obstacle_clearances(flight, field), expected)
 
 
-def test_states_are_taken_before_them():
+def test_states_are_labeled_before_near_misses():
     rows = rows_before(TIMES, np.array([2.0, 8.0]), 0.4)
     expected = [0.3, 0.7, 1.1, 1.5, 5.5, 5.9, 6.3, 6.7, 7.1, 7.5]
     np.testing.assert_allclose(TIMES[rows], expected, atol=0.02 + 1e-9)
@@ -63,7 +63,7 @@ def test_states_are_taken_before_them():
     assert len(rows_before(TIMES, np.array([8.0, 8.4]), 0.4)) == 7
 
 
-def test_flights_that_do_not_arrive_are_taken_all_along():
+def test_flights_that_do_not_arrive_are_labeled_all_along():
     def rows(end: float, clear: np.ndarray) -> list[float]:
         p_WB = np.linspace([0.0, 0.0, 1.5], [end, 0.0, 1.5], len(TIMES))
         states = np.stack([hover_state(p) for p in p_WB])
@@ -82,13 +82,13 @@ def test_flights_that_do_not_arrive_are_taken_all_along():
 
 
 @pytest.fixture
-def folder(gathered, tmp_path):
+def folder(collected, tmp_path):
     """A copy of the corpus, to be added to."""
-    return shutil.copytree(gathered.shards[0].path.parents[1], tmp_path / "corpus")
+    return shutil.copytree(collected.shards[0].path.parents[1], tmp_path / "corpus")
 
 
 def straight_flight(record) -> StudentFlight:
-    """Through a world from start to goal in 8 s, as if nothing stood there."""
+    """A straight flight from start to goal in 8 s, through obstacles."""
     world = record.make()
     times = np.arange(0.0, 8.0, 0.02)
     p_WB = world.p_WS + times[:, None] / 8.0 * (world.p_WG - world.p_WS)
@@ -98,8 +98,8 @@ def straight_flight(record) -> StudentFlight:
     return StudentFlight(record.name, world.p_WG, times, states, clear)
 
 
-def test_what_the_expert_would_have_done_is_added(folder, gathered):
-    record = gathered.worlds[1]
+def test_recovery_samples_have_the_labels_of_the_expert(folder, collected):
+    record = collected.worlds[1]
     flight = straight_flight(record)
     field = record.make().distance_field
     events = near_misses(flight.times, obstacle_clearances(flight, field))
@@ -107,8 +107,8 @@ def test_what_the_expert_would_have_done_is_added(folder, gathered):
     corpus = add_recovery(folder, [flight], jobs=1)
     samples = corpus.samples(np.arange(len(corpus)))
     old, new = samples.source == EXPERT, samples.source == RECOVERY
-    assert old.sum() == len(gathered)
-    assert new.sum() == len(corpus) - len(gathered) > 0
+    assert old.sum() == len(collected)
+    assert new.sum() == len(corpus) - len(collected) > 0
     assert {corpus.worlds[k].name for k in samples.world[new]} == {record.name}
     exact = samples.X_WB[new][::2, 4:]
     for p_WB in exact:
@@ -121,8 +121,8 @@ def test_what_the_expert_would_have_done_is_added(folder, gathered):
     assert (field.distance(first_W.astype(float)) > VEHICLE_RADIUS - 1e-3).all()
 
 
-def test_the_same_flights_add_nothing_twice(folder, gathered):
-    flight = straight_flight(gathered.worlds[0])
+def test_the_same_flights_add_nothing_twice(folder, collected):
+    flight = straight_flight(collected.worlds[0])
     once = add_recovery(folder, [flight], jobs=1)
     shard = once.shards[-1].path
     before = (shard / "color.npy").stat().st_mtime_ns
@@ -140,8 +140,8 @@ def test_the_same_flights_add_nothing_twice(folder, gathered):
     assert sum("recovery" in row for row in rows) == 2
 
 
-def test_flights_elsewhere_are_refused(folder, gathered):
-    flight = straight_flight(gathered.worlds[0])
+def test_flights_in_other_worlds_are_refused(folder, collected):
+    flight = straight_flight(collected.worlds[0])
     stray = StudentFlight("P99-7", flight.p_WG, flight.times, flight.states, flight.clearances)
     with pytest.raises(ValueError, match="not collected in the world 'P99-7'"):
         add_recovery(folder, [stray])

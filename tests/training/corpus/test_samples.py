@@ -59,14 +59,14 @@ def test_images_are_mapped_and_cannot_be_written(tmp_path):
         color[0] = 0
 
 
-def test_a_shard_of_nothing_is_one(tmp_path):
+def test_empty_shard(tmp_path):
     shard = Shard(write(tmp_path / "a"))
     shard.verify()
     assert len(shard) == 0
     assert shard.arrays == {}
 
 
-def test_one_that_is_there_stays(tmp_path):
+def test_existing_shard_is_not_overwritten(tmp_path):
     path = write(tmp_path / "a", random_samples(2, seed=1))
     before = (path / "color.npy").read_bytes()
     write(path, random_samples(3, seed=2))
@@ -117,7 +117,7 @@ def test_other_versions_are_refused(tmp_path):
         ({"flights": [{"states": "x"}]}, "states must be whole numbers"),
     ],
 )
-def test_descriptions_that_cannot_be(tmp_path, change, message):
+def test_invalid_descriptions_are_refused(tmp_path, change, message):
     path = write(tmp_path / "a", random_samples(1))
     about = json.loads((path / "shard.json").read_text()) | change
     about = {name: value for name, value in about.items() if value is not None}
@@ -126,7 +126,7 @@ def test_descriptions_that_cannot_be(tmp_path, change, message):
         Shard(path)
 
 
-def test_a_description_of_more_than_there_is(tmp_path):
+def test_description_of_more_samples_than_the_arrays_have(tmp_path):
     path = write(tmp_path / "a", random_samples(3))
     about = json.loads((path / "shard.json").read_text())
     (path / "shard.json").write_text(json.dumps(about | {"samples": 5}))

@@ -37,7 +37,7 @@ def wide_corpus(tmp_path_factory) -> Path:
 
 
 def _write_corpus(folder: Path, worlds: int, states: int, camera: OnboardCamera) -> Path:
-    """Random states on the way past pillars; red is near, and what is far is blue."""
+    """Random states on a path past pillars; near pixels are red, far ones blue."""
     config = CorpusConfig(camera=camera)
     claim_folder(folder / CONFIG, config)
     for part in ("worlds", "shards"):

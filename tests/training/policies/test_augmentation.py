@@ -91,7 +91,7 @@ def test_appearance_has_its_sizes():
         lambda x, g: change_appearance(x, Appearance(), g),
     ],
 )
-def test_each_image_has_changes_of_its_own_and_seeds_repeat_them(change):
+def test_each_image_changes_independently_and_seeds_repeat_it(change):
     color = torch.full((2, 16, 16, 3), 100.0)
     first, same, other = (change(color, torch.Generator().manual_seed(s)) for s in (0, 0, 1))
     assert torch.equal(first, same) and not torch.equal(first, other)

@@ -24,25 +24,25 @@ class Straight:
 
     def decide(self, seen, memory):
         self.speeds.append(seen.speed)
-        way = torch.nn.functional.normalize(seen.p_WG - seen.vehicle.p, dim=1)
-        return 3.0 * (way * seen.speed[:, None] - seen.vehicle.v), None, memory
+        direction = torch.nn.functional.normalize(seen.p_WG - seen.vehicle.p, dim=1)
+        return 3.0 * (direction * seen.speed[:, None] - seen.vehicle.v), None, memory
 
 
 def test_each_speed_is_flown_in_as_many_worlds():
     agent = Straight()
     worlds = validation_worlds(WORLDS)
     outcomes = evaluate_agent(agent, worlds, FlightConditions(), depth_noise())
-    asked = agent.speeds[0]
-    counts = [(asked == speed).sum().item() for speed in (2.0, 3.0, 4.0)]
+    speeds = agent.speeds[0]
+    counts = [(speeds == speed).sum().item() for speed in (2.0, 3.0, 4.0)]
     assert sorted(counts) == [2, 2, 3]
-    assert torch.equal(outcomes.nominal_speed, asked)
-    assert outcomes.mean_speed[asked == 4.0].min() > outcomes.mean_speed[asked == 2.0].max()
+    assert torch.equal(outcomes.nominal_speed, speeds)
+    assert outcomes.mean_speed[speeds == 4.0].min() > outcomes.mean_speed[speeds == 2.0].max()
     again = Straight()
     evaluate_agent(again, worlds, FlightConditions(), depth_noise())
-    assert torch.equal(again.speeds[0], asked)
+    assert torch.equal(again.speeds[0], speeds)
 
 
-def test_success_is_told_apart_by_speed_and_kind():
+def test_success_is_listed_by_speed_and_kind():
     reached = torch.tensor([True, True, True, False])
     zero, speed = torch.zeros(4), torch.tensor([2.0, 2.0, 4.0, 4.0])
     metrics = Outcomes(reached, ~reached, zero, zero, zero, speed).metrics(["P01", "P02"])

@@ -30,12 +30,12 @@ def some_world(seed: int, count: int = 8) -> list[Shape]:
     shapes: list[Shape] = [HalfSpace([0, 0, 1], 0.0), HalfSpace([0, 0, -1], -6.0)]
     for _ in range(count):
         a, b, c, d = rng.uniform(LOWER, UPPER, (4, 3))
-        way = rng.normal(size=3)
+        axis = rng.normal(size=3)
         shapes += [
             Sphere(a, rng.uniform(0.1, 1.0)),
             Box(RigidTransform(RollPitchYaw(rng.uniform(-3, 3, 3)), b), rng.uniform(0.2, 1.0, 3)),
-            Cylinder(c, c + way, rng.uniform(0.1, 0.4)),
-            Capsule(d, d + way, rng.uniform(0.1, 0.4)),
+            Cylinder(c, c + axis, rng.uniform(0.1, 0.4)),
+            Capsule(d, d + axis, rng.uniform(0.1, 0.4)),
         ]
     return shapes
 
@@ -114,7 +114,7 @@ def test_wide_pixels_see_what_the_pooled_image_of_a_finer_camera_sees(shape):
     assert (np.abs(coarse - pooled)[near] > 0.05 * pooled[near]).mean() <= outlines
 
 
-def test_nothing_is_left_out_among_many_shapes():
+def test_depth_of_many_shapes_is_the_minimum_of_each():
     shapes = some_world(3, 60)
     p, R = cameras(3, 8)
     world = ShapeGeometry([shapes]).depth(p, R, RAYS, numbers(8) * 0)
@@ -138,7 +138,7 @@ def test_the_nearest_of_many_are_the_first_when_all_are_sorted():
             np.testing.assert_allclose(normals[n, k], gradient, atol=1e-3)
 
 
-def test_fewer_shapes_than_asked_for_are_infinitely_far():
+def test_missing_shapes_are_at_infinite_distance():
     distances, normals = ShapeGeometry([[Sphere([3, 0, 0], 1.0)]]).nearest(
         floats([[0, 0, 0]]), numbers(1), 3
     )
@@ -147,8 +147,8 @@ def test_fewer_shapes_than_asked_for_are_infinitely_far():
 
 
 def test_normals_are_unit_vectors_where_distances_have_a_ridge():
-    ball, log, post = Sphere([1, 1, 1], 0.5), Capsule([0] * 3, [2, 0, 0], 0.5), [0.0, 0.0, 3.0]
-    geometry = ShapeGeometry([[ball], [log], [Cylinder([0, 0, 0], [0, 0, 6], 0.5)]])
+    sphere, log, post = Sphere([1, 1, 1], 0.5), Capsule([0] * 3, [2, 0, 0], 0.5), [0.0, 0.0, 3.0]
+    geometry = ShapeGeometry([[sphere], [log], [Cylinder([0, 0, 0], [0, 0, 6], 0.5)]])
     _, normals = geometry.nearest(floats([[1, 1, 1], [1, 0, 0], post]), numbers(3), 1)
     np.testing.assert_allclose(normals.norm(dim=2), 1.0, atol=1e-6)
     assert normals[1, 0, 0] == 0.0
@@ -202,7 +202,7 @@ def test_grids_are_interpolated_as_the_distance_field_is():
         np.testing.assert_allclose(a, b, atol=1e-5)
 
 
-def test_threads_and_instructions_change_no_bit():
+def test_threads_and_instructions_do_not_change_results():
     shapes, fields = some_world(5, 30), [field_of(some_world(5))]
     p, R = cameras(5, 13)
     world = numbers(13) * 0

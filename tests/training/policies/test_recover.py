@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 import torch
 
+from splatpilot.diagrams.flight.flight import fly
 from splatpilot.systems.common.config import load_config
 from splatpilot.systems.policies.checkpoint import checkpoint_policy
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
-from splatpilot.training.corpus import collect as make
+from splatpilot.training.corpus import collect
 from splatpilot.training.corpus.corpus import Corpus, CorpusConfig
 from splatpilot.training.corpus.expert import ExpertConfig
 from splatpilot.training.corpus.library import LibraryConfig
@@ -29,8 +30,8 @@ TINY = [
 ]
 
 
-def gather(folder: Path, worlds: Path, camera: OnboardCamera) -> None:
-    """A corpus of one short flight in each of two small forests."""
+def collect_corpus(folder: Path, worlds: Path, camera: OnboardCamera) -> None:
+    """Collects one short flight in each of two small forests."""
     grove = worlds / "grove.yaml"
     grove.write_text("world: !ForestConfig {length: 10, width: 8, height: 4}\n")
     config = CorpusConfig(
@@ -39,14 +40,14 @@ def gather(folder: Path, worlds: Path, camera: OnboardCamera) -> None:
         flights=1,
         camera=camera,
     )
-    make.run(config=config, out=folder, worlds=2, jobs=1)
+    collect.run(config=config, out=folder, worlds=2, jobs=1)
 
 
 @pytest.fixture(scope="module")
 def expert(tmp_path_factory) -> Path:
     """The folder of a corpus in depth and colors for students."""
     folder = tmp_path_factory.mktemp("expert")
-    gather(folder, tmp_path_factory.mktemp("worlds"), OnboardCamera(width=32, height=24))
+    collect_corpus(folder, tmp_path_factory.mktemp("worlds"), OnboardCamera(width=32, height=24))
     return folder
 
 
@@ -60,7 +61,7 @@ def weights(out: Path) -> dict[str, np.ndarray]:
         return {name: file[name] for name in file.files if name != "about"}
 
 
-def test_student_flies_and_is_trained_anew_with_what_it_lacked(expert, tmp_path, monkeypatch):
+def test_student_flies_and_trains_again_with_recovery_samples(expert, tmp_path, monkeypatch):
     before = {path: path.stat().st_mtime_ns for path in expert.rglob("*")}
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     ledger = both_stages(expert, whole)
@@ -88,9 +89,9 @@ def test_student_flies_and_is_trained_anew_with_what_it_lacked(expert, tmp_path,
     assert all(np.array_equal(found[name], value) for name, value in expected.items())
 
 
-def test_another_round_is_flown_by_the_weights_of_the_one_before(expert, tmp_path, monkeypatch):
+def test_next_round_is_flown_by_the_weights_of_the_last(expert, tmp_path, monkeypatch):
     both_stages(expert, tmp_path / "first")
-    flown, fly = [], recovery.fly
+    flown = []
 
     def watched(diagram, scenario, world):
         flown.append(scenario.policy)
@@ -98,12 +99,12 @@ def test_another_round_is_flown_by_the_weights_of_the_one_before(expert, tmp_pat
 
     monkeypatch.setattr(recovery, "fly", watched)
     corpus, out = tmp_path / "first" / "corpora" / "0", tmp_path / "second"
-    pilot = str(tmp_path / "first" / "stage_2" / "student_depth.npz")
+    flown_by = str(tmp_path / "first" / "stage_2" / "student_depth.npz")
     config = load_config(StudentDepthTraining(), overrides=[f"corpora=[{corpus}]", *TINY])
     round_of = {"config": config, "make": StudentTrainer, "out": out, "flights": 1, "jobs": 1}
-    ledger = recovery.run(**round_of, flown_by=pilot)
-    assert [(policy.weights, policy.camera.width) for policy in flown] == [(pilot, 32)]
-    assert ledger["flown_by"] == pilot and not (out / "stage_1").exists()
+    ledger = recovery.run(**round_of, flown_by=flown_by)
+    assert [(policy.weights, policy.camera.width) for policy in flown] == [(flown_by, 32)]
+    assert ledger["flown_by"] == flown_by and not (out / "stage_1").exists()
     before = Corpus(corpus)
     earlier = (before.samples(np.arange(len(before))).source == RECOVERY).sum()
     assert ledger["recovery_samples"] > earlier > 0
@@ -111,17 +112,19 @@ def test_another_round_is_flown_by_the_weights_of_the_one_before(expert, tmp_pat
         recovery.run(**round_of)
     others = load_config(StudentDepthTraining(), overrides=[f"corpora=[{expert}]", *TINY])
     with pytest.raises(ValueError, match=r"holds another configuration, with .*first/corpora/0"):
-        recovery.run(**round_of | {"config": others}, flown_by=pilot)
+        recovery.run(**round_of | {"config": others}, flown_by=flown_by)
     with pytest.raises(FileNotFoundError, match="nowhere holds no corpus"):
         nowhere = load_config(StudentDepthTraining(), overrides=["corpora=[nowhere]", *TINY])
-        recovery.run(**round_of | {"config": nowhere, "out": tmp_path / "fourth"}, flown_by=pilot)
+        recovery.run(
+            **round_of | {"config": nowhere, "out": tmp_path / "fourth"}, flown_by=flown_by
+        )
     assert not (tmp_path / "fourth").exists()
-    with pytest.raises(ValueError, match="nobody"):
-        recovery.run(**round_of | {"out": tmp_path / "third"}, flown_by="nobody")
+    with pytest.raises(ValueError, match="unknown"):
+        recovery.run(**round_of | {"out": tmp_path / "third"}, flown_by="unknown")
     assert not (tmp_path / "third").exists()
 
 
-def test_what_was_lost_or_damaged_is_made_again(expert, tmp_path, capsys):
+def test_lost_and_damaged_files_are_made_again(expert, tmp_path, capsys):
     source = tmp_path / "source"
     shutil.copytree(expert, source)
     ledger = both_stages(source, tmp_path / "out")
@@ -139,7 +142,7 @@ def test_what_was_lost_or_damaged_is_made_again(expert, tmp_path, capsys):
         both_stages(source, tmp_path / "out")
 
 
-def test_recovery_share_is_the_part_that_students_came_to(expert, tmp_path):
+def test_recovery_share_is_the_fraction_of_recovery_samples(expert, tmp_path):
     both_stages(expert, tmp_path)
     data = StudentData([Corpus(tmp_path / "corpora" / "0")], 0.5)
     generator = torch.Generator().manual_seed(0)
@@ -153,15 +156,15 @@ def test_recovery_share_is_the_part_that_students_came_to(expert, tmp_path):
     assert set(plain.draw(4000, generator, 0.5)) == set(plain.training)
 
 
-def test_what_sees_in_colors_recovers_too(tmp_path, monkeypatch):
-    speeds, fly = [], recovery.fly
+def test_rgb_policy_recovers_too(tmp_path, monkeypatch):
+    speeds = []
 
     def watched(diagram, scenario, world):
         speeds.append(scenario.policy.speed)
         return fly(diagram, scenario, world)
 
     monkeypatch.setattr(recovery, "fly", watched)
-    gather(tmp_path / "expert", tmp_path, OnboardCamera(width=160, height=90))
+    collect_corpus(tmp_path / "expert", tmp_path, OnboardCamera(width=160, height=90))
     tiny = [setting for setting in TINY if not setting.startswith(("pretrained", "frozen"))]
     overrides = [f"corpora=[{tmp_path / 'expert'}]", *tiny]
     config = load_config(DiffAeroRgbTraining(), overrides=overrides)

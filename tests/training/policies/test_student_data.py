@@ -21,19 +21,19 @@ from splatpilot.training.policies.student_data import (
 from splatpilot.training.policies.student_network import StudentModule
 
 HELD_OUT = 0.2
-"""Share of which one of the three worlds is."""
+"""Fraction that holds out one of the three worlds."""
 
 
 @pytest.fixture(scope="module")
 def two(student_corpus, tmp_path_factory) -> list[Corpus]:
-    """The corpus of 72 samples, and a copy that lacks the 24 of one of the three worlds."""
+    """The corpus of 72 samples, and a copy without the 24 of one of its three worlds."""
     part = tmp_path_factory.mktemp("part") / "corpus"
     shutil.copytree(student_corpus, part)
     shutil.rmtree(part / "shards" / "expert-pillars-1")
     return [Corpus(student_corpus), Corpus(part)]
 
 
-def test_worlds_are_on_one_side_whatever_is_gathered_later(two):
+def test_worlds_stay_held_out_as_corpora_grow(two):
     alone, joined = StudentData(two[1:], HELD_OUT), StudentData(two[::-1], HELD_OUT)
     assert alone.held_out_worlds == joined.held_out_worlds and len(alone.held_out_worlds) == 1
     for data, count in ((alone, 48), (joined, 72)):
@@ -102,7 +102,7 @@ def test_corpora_of_test_scenes_are_refused(two, monkeypatch, digest, message):
         StudentData(two, 0.3)
 
 
-def test_a_world_keeps_its_side_when_a_corpus_grows():
+def test_held_out_worlds_depend_only_on_their_names():
     library = CorpusConfig().worlds
     names = [world_source(library, seed, k).name for seed in (0, 3) for k in range(400)]
     sides = {name: is_held_out(name, 0.1) for name in names}
@@ -123,7 +123,7 @@ def test_different_worlds_of_one_name_are_refused(two, tmp_path):
         StudentData([two[0], Corpus(other)], HELD_OUT)
 
 
-def test_corpora_that_do_not_fit_are_refused(two, tmp_path):
+def test_corpora_with_different_settings_are_refused(two, tmp_path):
     other = tmp_path / "corpus"
     shutil.copytree(two[1].worlds[0].path.parents[1], other)
     config = two[0].config
@@ -152,7 +152,7 @@ def data(student_corpus) -> StudentData:
     return StudentData([Corpus(student_corpus)], HELD_OUT)
 
 
-def test_features_are_those_of_the_modules(data, network, tmp_path):
+def test_features_equal_the_output_of_the_modules(data, network, tmp_path):
     indices = np.concatenate([data.held_out[[3, 0]], data.training[[5, 30]]])
     with torch.no_grad():
         expected = network.features[:FROZEN](encode_images(data.pixels(indices, "depth")))

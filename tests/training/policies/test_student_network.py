@@ -32,7 +32,7 @@ def disturbed(module: StudentModule) -> StudentModule:
 @pytest.mark.parametrize("observation", ["rgb", "depth"])
 @pytest.mark.parametrize("size", [(64, 48), (80, 70)])
 @pytest.mark.parametrize("p_WG", [[4.0, 2.0, 1.5], [1.0, -2.0, 0.5], [0.0, 0.0, 0.0]])
-def test_what_flies_is_what_was_trained(observation, size, p_WG):
+def test_flight_computes_what_training_computes(observation, size, p_WG):
     torch.manual_seed(0)
     spec = StudentSpec(observation, *size, head_features=20, nominal_speed=2.6)
     module = disturbed(StudentModule(spec))
@@ -67,7 +67,7 @@ def test_images_of_another_size_are_refused():
         StudentNetwork(spec, weights)(np.zeros((3, 48, 65), np.float32), np.zeros(6))
 
 
-def test_untrained_encoder_lets_images_through():
+def test_untrained_encoder_keeps_the_variance_of_images():
     torch.manual_seed(0)
     module = StudentModule(StudentSpec("rgb", 96, 64))
     with torch.no_grad():

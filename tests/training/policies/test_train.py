@@ -67,13 +67,13 @@ def assert_same(a: Path, b: Path) -> None:
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory) -> Path:
-    """The folder of a tiny run that was not disturbed."""
+    """The folder of a tiny run that was not interrupted."""
     out = tmp_path_factory.mktemp("runs") / "whole"
     run(config=tiny(), out=out, make=TRAINERS.find("diffaero").make)
     return out
 
 
-def test_run_leaves_what_it_says(finished):
+def test_run_writes_its_files(finished):
     checkpoint = PolicyCheckpoint.load(finished / "diffaero.npz", "diffaero", DIFFAERO_NETWORK)
     assert "updates: 6" in checkpoint.provenance["config"]
     assert checkpoint.provenance["revision"]
@@ -86,7 +86,7 @@ def test_run_leaves_what_it_says(finished):
     assert summary["updates"] == 6 and summary["seed"] == 0
 
 
-def test_killed_run_ends_as_one_that_was_not(finished, tmp_path):
+def test_killed_run_ends_in_the_same_weights(finished, tmp_path):
     program = "from splatpilot.analysis.commands.main import main; raise SystemExit(main())"
     command = [sys.executable, "-c", program, "train", "diffaero", "--out", str(tmp_path)]
     for override in TINY:
@@ -111,7 +111,7 @@ def test_a_command_trains_seeds_one_after_the_other(finished, tmp_path):
 
 
 @pytest.mark.parametrize("policy", ["diffaero", "depthnav", "agile_autonomy"])
-def test_interrupted_training_ends_as_whole(policy, tmp_path):
+def test_interrupted_training_ends_in_the_same_weights(policy, tmp_path):
     trainer_kind = TRAINERS.find(policy)
     config = load_config(trainer_kind.config(), overrides=[*SMALL, *OF_POLICY[policy]])
 
@@ -202,7 +202,7 @@ class FragileTrainer(TinyTrainer):
         return {"first": size, "second": size * (torch.nan if self.update >= 5 else 1.0)}
 
 
-def test_training_seeds_are_not_the_benchmarks(monkeypatch):
+def test_training_seeds_are_not_those_of_the_benchmark(monkeypatch):
     asked: list[int] = []
     monkeypatch.setattr(training_worlds, "scenario_world", str)
     monkeypatch.setattr(WorldCache, "world", lambda self, config, seed: asked.append(seed))
@@ -235,7 +235,7 @@ class Interrupted(TinyTrainer):
             raise KeyboardInterrupt
 
 
-def test_an_ended_run_says_what_it_kept_and_resumes_there(tmp_path, monkeypatch, capsys):
+def test_stopped_run_reports_its_checkpoint_and_resumes_there(tmp_path, monkeypatch, capsys):
     config = TinyTraining()
     with pytest.raises(KeyboardInterrupt) as ended:
         run(config=config, out=tmp_path / "at_updates", make=Interrupted)
@@ -253,7 +253,7 @@ def test_an_ended_run_says_what_it_kept_and_resumes_there(tmp_path, monkeypatch,
     assert lines[0] == f"resuming {tmp_path / 'by_time'} at update 5 of 9"
 
 
-def test_a_run_that_kept_nothing_says_so(tmp_path):
+def test_stopped_run_without_a_checkpoint_reports_it(tmp_path):
     def interrupted(config):
         raise KeyboardInterrupt
 
@@ -263,7 +263,7 @@ def test_a_run_that_kept_nothing_says_so(tmp_path):
     assert note == f"no update is in {tmp_path} yet; the same command starts again"
 
 
-def test_a_run_goes_on_with_what_it_began_with_alone(tmp_path):
+def test_run_with_changed_inputs_is_not_resumed(tmp_path):
     config = TinyTraining()
     summary = run(config=config, out=tmp_path, make=Reader)
     curves = (tmp_path / "curves.csv").read_text()
@@ -286,7 +286,7 @@ def test_a_run_goes_on_with_what_it_began_with_alone(tmp_path):
         run(config=config, out=tmp_path, make=Reader)
 
 
-def test_a_mistake_in_what_a_run_names_leaves_its_folder_free(student_corpus, tmp_path):
+def test_run_with_an_invalid_input_leaves_its_folder_free(student_corpus, tmp_path):
     trainer = TRAINERS.find("student_depth")
     tiny_student = ["pretrained=false", "frozen=0", "batch=2", "held_out=0.2"]
     tiny_student += ["schedule.updates=1", "schedule.checkpoint_every=1"]

@@ -51,7 +51,7 @@ def trained(wide_corpus, tmp_path_factory) -> Path:
     return out
 
 
-def test_what_flies_is_what_was_trained():
+def test_flight_computes_what_training_computes():
     torch.manual_seed(0)
     spec = MonocularSpec()
     module = MonocularModule(spec)
@@ -65,7 +65,7 @@ def test_what_flies_is_what_was_trained():
     np.testing.assert_allclose(found, expected, atol=1e-4 * np.abs(expected).max())
 
 
-def test_trainer_shows_what_flight_shows(wide_corpus):
+def test_training_views_are_those_of_flight(wide_corpus):
     trainer = DiffAeroRgbTrainer(training(wide_corpus))
     numbers = np.array([3, 20])
     color, rays, target = trainer._samples(numbers)
@@ -97,7 +97,7 @@ def test_flipped_views_have_flipped_rays():
     np.testing.assert_array_equal(found[1], views[0])
 
 
-def test_it_learns_what_it_is_shown_and_flies(trained):
+def test_trained_network_predicts_depth_and_flies(trained):
     rows = list(csv.DictReader((trained / "curves.csv").open()))
     curve = [{name: float(value) for name, value in row.items() if value} for row in rows]
     assert curve[-1]["likelihood"] < curve[0]["likelihood"] - 0.3
@@ -114,7 +114,7 @@ def test_it_learns_what_it_is_shown_and_flies(trained):
     assert np.linalg.norm(flight.states[-1, :3] - flight.states[0, :3]) > 0.1
 
 
-def test_sight_is_trained_further(trained, wide_corpus, tmp_path):
+def test_training_continues_from_given_weights(trained, wide_corpus, tmp_path):
     file = trained / "diffaero_rgb.npz"
     trainer = DiffAeroRgbTrainer(training(wide_corpus, f"begin={file}"))
     with np.load(file) as weights:
@@ -129,6 +129,6 @@ def test_sight_is_trained_further(trained, wide_corpus, tmp_path):
         DiffAeroRgbTrainer(training(wide_corpus, f"begin={other}"))
 
 
-def test_a_corpus_seen_through_another_camera_is_refused(student_corpus):
+def test_corpus_of_another_camera_is_refused(student_corpus):
     with pytest.raises(ValueError, match=r"160 pixels wide.* got 32x24"):
         DiffAeroRgbTrainer(training(student_corpus))

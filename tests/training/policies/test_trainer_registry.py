@@ -21,7 +21,7 @@ register_trainer("mean", MeanTraining, TinyTrainer)
 
 
 @pytest.mark.parametrize("installed", [True, False])
-def test_a_trainer_of_another_package_trains_by_the_same_verb(installed, tmp_path, monkeypatch):
+def test_trainer_of_another_package_trains_by_the_same_command(installed, tmp_path, monkeypatch):
     name = "mean_package" if installed else "mean_module"
     (tmp_path / f"{name}.py").write_text(PACKAGE.replace("mean", name).replace("Mean", name))
     if installed:
@@ -41,7 +41,7 @@ def test_a_trainer_of_another_package_trains_by_the_same_verb(installed, tmp_pat
     sys.modules.pop(name)
 
 
-def test_what_nobody_trains_is_refused_with_what_there_is(tmp_path, capsys):
+def test_policy_without_a_trainer_is_refused_with_the_known_ones(tmp_path, capsys):
     assert main(["train", "planner", "--out", str(tmp_path / "out")]) == 1
     message = capsys.readouterr().err
     assert "no trainer 'planner'" in message

@@ -32,7 +32,7 @@ from splatpilot.training.policies.training_worlds import (
 UPPER = np.array([12.0, 7.0, 4.0])
 
 
-def write_place(folder: Path, split: str = "train") -> str:
+def write_yard(folder: Path, split: str = "train") -> str:
     """A captured yard with a post in it."""
     shapes = [HalfSpace([0, 0, 1], 0.0), Capsule([6.0, 3.5, 0.0], [6.0, 3.5, 5.0], 0.5)]
     esdf = esdf_from_distance_field(AnalyticDistanceField(shapes, np.zeros(3), UPPER), 0.2)
@@ -53,7 +53,7 @@ def write_place(folder: Path, split: str = "train") -> str:
 
 @pytest.fixture(scope="module")
 def yard(tmp_path_factory) -> str:
-    return write_place(tmp_path_factory.mktemp("places") / "yard")
+    return write_yard(tmp_path_factory.mktemp("scenes") / "yard")
 
 
 def selection(yard: str, **fields) -> WorldSelection:
@@ -64,7 +64,7 @@ def field_of(yard: str) -> Esdf:
     return make_world(SceneConfig(path=yard), seed=0).esdf
 
 
-def test_kinds_and_places_come_in_turn(yard):
+def test_kinds_and_scenes_take_turns(yard):
     worlds = training_worlds(selection(yard, voxel_size=0.5), seed=3)
     held_out = validation_worlds(selection(yard))
     for batch, number, seed in ((worlds, 2, 1_003_002), (held_out, 0, 2_000_000)):
@@ -80,7 +80,7 @@ def test_kinds_and_places_come_in_turn(yard):
     assert (field.distance(np.concatenate([ends, goals]).astype(float)) > VEHICLE_RADIUS).all()
 
 
-def test_what_is_seen_in_places_is_their_distance_field(yard):
+def test_images_of_scenes_show_their_distance_field(yard):
     worlds = training_worlds(selection(yard, voxel_size=0.5), seed=0)
     alone = EsdfGeometry([field_of(yard).conservative()])
     rays = PixelRays.of(16, 9, 90.0)
@@ -99,7 +99,7 @@ def test_what_is_seen_in_places_is_their_distance_field(yard):
     assert distances[1].isfinite().all()  # a forest has more than four trees
 
 
-def test_ways_in_places_lead_around_what_stands_there(yard):
+def test_paths_in_scenes_lead_around_obstacles(yard):
     worlds = training_worlds(selection(yard), seed=0)
     p, world = torch.tensor([[3.0, 3.5, 1.5]]), torch.tensor([1])
     field = field_of(yard)
@@ -109,7 +109,7 @@ def test_ways_in_places_lead_around_what_stands_there(yard):
     assert (p - worlds.p_WG[1]).norm() < 0.2
 
 
-def test_policies_learn_in_places(yard):
+def test_policies_learn_in_scenes(yard):
     worlds = training_worlds(WorldSelection(kinds=["P02"], scenes=[yard], count=2), seed=0)
     for batch in (worlds, worlds.without_obstacles()):
         learner = DiffAeroLearner(DiffAeroLoss())
@@ -123,7 +123,7 @@ def test_policies_learn_in_places(yard):
 
 def test_bad_selections_are_refused(yard, tmp_path):
     WorldSelection(kinds=["office"]).validate()  # other scenarios than the benchmark's are kinds
-    tested = write_place(tmp_path / "warehouse", "test")
+    tested = write_yard(tmp_path / "warehouse", "test")
     for fields, message in (
         ({"kinds": ["R13"]}, "worlds.kinds must be of generated worlds, got R13"),
         ({"scenes": [tested]}, "split of .*warehouse must be train, got 'test'"),
@@ -166,7 +166,7 @@ def assert_same(a, b) -> None:
         np.testing.assert_array_equal(getattr(a[1], name), getattr(b[1], name))
 
 
-def test_what_was_made_is_read_again(folder, monkeypatch):
+def test_arrival_is_read_from_the_cache(folder, monkeypatch):
     made = arrival()
     monkeypatch.setattr(world_cache, "time_of_arrival", None)
     assert_same(arrival(), made)
@@ -187,14 +187,14 @@ def test_damaged_files_are_made_again(folder):
     assert file.read_bytes() == content
 
 
-def test_a_cache_that_cannot_be_written_keeps_nothing(folder, tmp_path, monkeypatch):
+def test_unwritable_cache_is_not_used(folder, tmp_path, monkeypatch):
     made = arrival()
     (tmp_path / "file").touch()
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
     assert_same(arrival(), made)
 
 
-def test_what_was_not_used_for_longest_goes_first(folder, monkeypatch):
+def test_least_recently_used_files_are_removed_first(folder, monkeypatch):
     cache = WorldCache()
     for goal in (1.2, 1.3, 1.4):
         arrival(goal)
@@ -207,7 +207,7 @@ def test_what_was_not_used_for_longest_goes_first(folder, monkeypatch):
 
 
 @pytest.mark.parametrize("kind", ["P02", "P05", "P10", "P11"])
-def test_generated_worlds_are_read_again(folder, monkeypatch, kind):
+def test_generated_worlds_are_read_from_the_cache(folder, monkeypatch, kind):
     made = WorldCache().world(scenario_world(kind), 7)
     monkeypatch.setattr(world_cache, "make_spec", None)
     again = WorldCache().world(scenario_world(kind), 7)

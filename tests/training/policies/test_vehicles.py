@@ -49,7 +49,7 @@ def test_point_mass_solves_its_equation_exactly():
         many = many.step(a_cmd, 0.0002)
     for name in "pva":
         torch.testing.assert_close(getattr(once, name), getattr(many, name), rtol=0, atol=1e-10)
-    # And the equation itself: the acceleration's rate is what it lacks over the lag.
+    # And the equation itself: the rate of the acceleration is its error over the lag.
     rate = (start.step(a_cmd, 1e-6).a - start.a) / 1e-6
     torch.testing.assert_close(rate, (a_cmd - start.a) / start.lag, rtol=1e-4, atol=1e-4)
 
@@ -64,7 +64,7 @@ def test_gradient_decay_scales_gradients_alone():
     torch.testing.assert_close(a.grad, torch.full((1, 3), 0.3))
 
 
-def test_point_mass_turns_its_nose_along_its_motion():
+def test_point_mass_turns_along_its_motion():
     zero = torch.zeros(1, 3)
     v, lag = torch.tensor([[0.0, 2.0, 0.0]]), torch.ones(1, 1)
     vehicle = PointMass(zero, v, zero, torch.zeros(1), lag)
@@ -184,7 +184,7 @@ class Watcher:
         return {"none": transitions.a.sum()}
 
 
-def test_rollouts_see_late_images_and_know_their_state():
+def test_rollouts_have_late_images_and_the_current_state():
     worlds, watcher = training_worlds(SELECTION, seed=0), Watcher()
     config = RolloutConfig(environments=6, steps=3, noise=TWO_STEPS)
     rollout = DifferentiableRollout(watcher, worlds, config, torch.Generator().manual_seed(0))
@@ -205,7 +205,7 @@ def test_rollouts_see_late_images_and_know_their_state():
         torch.testing.assert_close(watcher.seen[now].depth[0], fresh[0], rtol=0, atol=0)
 
 
-def test_measured_flights_see_late_images():
+def test_evaluated_flights_have_late_images():
     worlds, watcher = training_worlds(SELECTION, seed=0), Watcher()
     evaluate_agent(watcher, worlds, FlightConditions(speeds=[2.0], patience=0.05), TWO_STEPS)
     assert len(watcher.seen) > 4
@@ -216,7 +216,7 @@ def test_measured_flights_see_late_images():
         torch.testing.assert_close(watcher.seen[now].depth, expected, rtol=0, atol=0)
 
 
-def test_imitation_learns_from_late_images():
+def test_imitation_has_late_images():
     config = AgileAutonomyTraining(
         worlds=SELECTION, environments=1, steps=6, ask_every=1, noise=TWO_STEPS
     )

@@ -36,7 +36,7 @@ def image_pair(shape, seed=0):
 
 
 def depth_pair(shape, seed=0):
-    """A true depth of 0 to 200 m, of which some pixels are unknown, and a noisy render of it."""
+    """A true depth of 0 to 200 m with unknown pixels, and a noisy render of it."""
     rng = torch.Generator().manual_seed(seed)
     depth = 200 * torch.rand(shape, generator=rng) ** 3
     rendered = depth * (1 + 0.1 * normal_tensor(seed, *shape))
@@ -213,7 +213,7 @@ def loss_of(means, quats, scales, depth, seed=0):
     return surface_loss(means, quats, scales, everyone, VIEWMAT, K, depth, rng)
 
 
-def test_gaussians_are_drawn_to_the_surface_they_belong_to():
+def test_gaussians_move_to_their_surface():
     depth = torch.full((HEIGHT, WIDTH), 2.0)
     depth[:, 40:] = torch.inf
     z = torch.tensor([2.06, 1.98, 1.5, 2.02, 2.02])
@@ -239,7 +239,7 @@ def test_points_depend_only_on_the_generator():
     assert unknown.item() == 0 and not means.grad.any()
 
 
-def test_outlines_are_those_of_what_is_solid():
+def test_outlines_are_those_of_surfaces():
     depth = torch.tensor([[2.0, torch.inf, 0.0, 200.0]])
     weights = torch.tensor([[1.0, 5.0, 5.0, 1.0]])
     alpha = torch.full((1, 4), 0.5, requires_grad=True)

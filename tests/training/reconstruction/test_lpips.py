@@ -1,7 +1,10 @@
+import os
 import subprocess
 import sys
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 import torch
 from torch.nn.functional import conv2d, max_pool2d
@@ -141,6 +144,17 @@ def test_other_files_are_refused(file, weights, content):
 def test_bad_images(lpips, shape):
     with pytest.raises(ValueError, match=r"images must be .* at least 17 pixels, got \("):
         lpips(torch.zeros(shape), torch.zeros(shape))
+
+
+@pytest.mark.skipif("SPLATPILOT_DATA" not in os.environ, reason="SPLATPILOT_DATA is not set")
+def test_blur_is_worse_than_brightness_of_the_same_error():
+    folder = Path(os.environ["SPLATPILOT_DATA"]) / "tartanair" / "hospital" / "image_left"
+    image = cv2.imread(str(folder / "000020_left.png"))[::2, ::2, ::-1] / 255
+    blurred = cv2.GaussianBlur(image, (0, 0), 2)
+    brighter = image + np.sqrt(((blurred - image) ** 2).mean())
+    a, b, c = (torch.from_numpy(x.astype(np.float32)) for x in (image, blurred, brighter))
+    lpips = Lpips()
+    assert lpips(b, a) > 5 * lpips(c, a) > 0
 
 
 def test_nothing_large_is_imported(file):

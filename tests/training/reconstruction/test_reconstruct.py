@@ -37,7 +37,7 @@ def test_room_end_to_end(tmp_path, write_room, room_in_W):
     assert len(of_scene) == summary.gaussians < len(world.gaussians)
     assert "TartanAir V1" in metadata.provenance and len(metadata.gains) == 12
 
-    # It collides like the room: 6 x 3 x 2.5 m, of which not all was seen.
+    # It collides like the room: 6 x 3 x 2.5 m, not all of it seen.
     lower, upper = room_in_W
     assert 30 < metadata.observed_free_volume <= 6 * 3 * 2.5 * 1.05
     p_WQ = np.array([[2.0, 0.0, 1.2], [4.0, 0.3, 1.4]])

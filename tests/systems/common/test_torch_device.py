@@ -1,5 +1,3 @@
-"""Devices that are asked for."""
-
 import os
 import platform
 import subprocess
@@ -11,15 +9,13 @@ import torch
 from splatpilot.systems.common.torch_device import require_device, require_renderer
 
 
-def test_what_is_there_is_accepted():
-    """The CPU always is."""
+def test_cpu_is_accepted():
     require_device("cpu")
     require_renderer("cpu")
 
 
 @pytest.mark.parametrize("device", ["cuda", "cuda:1"])
-def test_a_gpu_that_is_absent_is_one_sentence(device, monkeypatch):
-    """Its absence is said with the remedy, before anything is computed."""
+def test_missing_gpu_is_refused(device, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     for require in (require_device, require_renderer):
         with pytest.raises(ValueError, match=rf"device must be cpu, got '{device}'; "):
@@ -27,7 +23,6 @@ def test_a_gpu_that_is_absent_is_one_sentence(device, monkeypatch):
 
 
 def test_rendering_on_a_gpu_needs_gsplat(monkeypatch):
-    """Where only gsplat is missing, that is said; training alone does not need it."""
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     require_device("cuda")
@@ -35,8 +30,7 @@ def test_rendering_on_a_gpu_needs_gsplat(monkeypatch):
         require_renderer("cuda")
 
 
-def test_other_words_are_refused():
-    """A misspelled device is named with those that there are."""
+def test_unknown_device_is_refused():
     with pytest.raises(ValueError, match=r"device must be cpu .*got 'gpu'"):
         require_device("gpu")
 
@@ -48,7 +42,7 @@ from splatpilot.systems.common.torch_device import keep_freed_memory
 
 torch.set_num_threads(1)
 layer = torch.nn.Conv2d(3, 96, 1)
-image = torch.zeros(8, 3, 60, 80)  # 15 MB become of it, four times at once
+image = torch.zeros(8, 3, 60, 80)  # its four outputs take 15 MB each
 
 
 def faults():
@@ -62,15 +56,14 @@ def faults():
 
 given_back = min(faults() for _ in range(3))
 keep_freed_memory()
-# The least of several: at times the heap still grows, where what is free lies badly.
+# The minimum of several: a fragmented heap may still grow.
 print(given_back, min(faults() for _ in range(6)))
 """
 
 
-@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="it is glibc that is told")
-def test_memory_of_tensors_that_are_gone_is_kept():
-    """Passes of a layer no longer have the system clear memory for each of them."""
-    # As glibc begins; by itself it would raise this limit, at times so far that nothing is cleared.
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="an option of glibc")
+def test_memory_of_freed_tensors_is_kept():
+    # The initial value of glibc, which raises it at times, so far that nothing is cleared.
     environment = os.environ | {"MALLOC_MMAP_THRESHOLD_": "131072"}
     command = [sys.executable, "-c", PASSES]
     ended = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
