@@ -85,7 +85,7 @@ def sensor(out: Path) -> None:
     X_WB = pose_from_state(sample_initial_state(scenario, world))
     camera = make_camera(OnboardCamera(420, 280, readout=0.03), world)
     X_WB_start = X_WB @ RigidTransform(RollPitchYaw(-0.12, 0.0, 0.12), [-0.1, 0.0, 0.0])
-    views = [camera.render(X_WB), camera.render(X_WB, 0.0, X_WB_start)]
+    views = [camera.render(X_WB), camera.render(X_WB, None, X_WB_start)]
     still, rolled = (color_pixels(view.color) for view in views)
     night = ObservationNoise(exposure_error=4.0, full_well=8000.0, read_noise=8.0)
     grain = np.random.default_rng([0, 0]).standard_normal(still.shape)

@@ -67,8 +67,7 @@ def AddPolicyAndController(
             zeros, and `finite_heading` such headings by NaN; `command` is not exported.
     """
     # Pose, distances and goal.
-    spheres = world.moving.spheres if world.moving else None
-    pose, collision = StateToPose(), EsdfCollision(world.distance_field, spheres)
+    pose, collision = StateToPose(), EsdfCollision(world.distance_field)
     for name, system in (("pose", pose), ("collision", collision)):
         builder.AddNamedSystem(name, system)
         builder.Connect(state, system.GetInputPort("state"))
@@ -151,6 +150,8 @@ def ConnectObservation(
     observed = observed | {"goal": builder.GetSubsystemByName("goal").get_output_port(0)}
     for index in range(policy.num_input_ports()):
         port = policy.get_input_port(index)
+        if port.get_name() == "moving" and "moving" not in observed:
+            continue
         if port.get_name() not in observed:
             raise ValueError(
                 f"nothing gives the input {port.get_name()!r} of the policy "

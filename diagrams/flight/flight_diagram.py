@@ -26,6 +26,7 @@ from splatpilot.diagrams.worlds.appearance import randomize_appearance
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.splats.background import Background, mean_color
+from splatpilot.systems.splats.moving_bodies import MovingBodies
 from splatpilot.systems.splats.splat_camera import SplatCamera
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS, QuadrotorPlant
 from splatpilot.systems.visualization.meshcat_drawing import (
@@ -186,6 +187,12 @@ def BuildFlightDiagram(
         if video:
             VideoRecorder.AddToBuilder(builder, onboard, scenario.camera.fps)
 
+    if world.moving:
+        moving = builder.AddNamedSystem("moving", MovingBodies(world.moving))
+        for system in builder.GetSystems():
+            if system is not moving and system.HasInputPort("moving"):
+                builder.Connect(moving.get_output_port(), system.GetInputPort("moving"))
+
     # Logs.
     logs = [(plant, "state", LOG_PERIOD), (controller, "command", LOG_PERIOD)]
     if policy.HasOutputPort("hypotheses"):
@@ -209,7 +216,6 @@ def MakeCamera(scenario: Scenario, world: World) -> SplatCamera:
         near=config.clipping_near,
         far=config.clipping_far,
         background=world.background,
-        moving=world.moving.gaussians if world.moving else None,
     )
 
 

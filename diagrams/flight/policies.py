@@ -96,9 +96,7 @@ def register_policy(
 
 register_policy(
     PrivilegedPlannerConfig,
-    lambda config, world, vehicle: PrivilegedPlanner(
-        world.esdf, config, vehicle, world.moving.spheres if world.moving else None
-    ),
+    lambda config, world, vehicle: PrivilegedPlanner(world.esdf, config, vehicle),
     name="planner",
     speed_field="lattice.speed",
 )

@@ -62,7 +62,6 @@ def make_camera(config: OnboardCamera, world: World, latency: float = 0.0) -> Sp
         min_depth=config.min_depth,
         max_depth=config.max_depth,
         background=world.background,
-        moving=world.moving.gaussians if world.moving else None,
         latency=latency,
         distortion=config.distortion,
         readout=config.readout,

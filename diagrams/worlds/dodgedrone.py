@@ -11,10 +11,11 @@ from splatpilot.diagrams.worlds.solids.shading import Illumination
 from splatpilot.diagrams.worlds.solids.solid import Solid, WorldSpec
 from splatpilot.diagrams.worlds.solids.surfaces import FloorPlan
 from splatpilot.diagrams.worlds.solids.surfels import build, draw
-from splatpilot.diagrams.worlds.world import MovingBodies, World
+from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.shapes import MovingSpheres, Sphere
 from splatpilot.systems.common.validation import Config, bounded
 from splatpilot.systems.splats.baked_scene import MovingGaussians
+from splatpilot.systems.splats.moving_bodies import MovingObstacles
 from splatpilot.systems.splats.scene import GaussianScene
 
 Array = NDArray[np.float64]
@@ -149,7 +150,7 @@ def dodgedrone_world(config: DodgeDroneConfig, seed: int) -> World:
     spheres = MovingSpheres([o.radius for o in moving], [o.path for o in moving], PERIOD)
     sun = light(world.esdf)
     bodies = [_draw_body(o, spec, sun) for o in moving]
-    return replace(world, moving=MovingBodies(spheres, MovingGaussians(bodies, spheres.centers)))
+    return replace(world, moving=MovingObstacles(spheres, MovingGaussians(bodies, spheres.centers)))
 
 
 def _draw_body(obstacle: Obstacle, course: WorldSpec, light: Illumination) -> GaussianScene:

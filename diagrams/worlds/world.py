@@ -8,18 +8,10 @@ from numpy.typing import NDArray
 
 from splatpilot.systems.collision.distance_field import DistanceField
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.collision.shapes import MovingSpheres
 from splatpilot.systems.splats.background import Background
-from splatpilot.systems.splats.baked_scene import BakedScene, MovingGaussians
+from splatpilot.systems.splats.baked_scene import BakedScene
+from splatpilot.systems.splats.moving_bodies import MovingObstacles
 from splatpilot.systems.splats.scene import GaussianScene
-
-
-@dataclass(frozen=True, eq=False)
-class MovingBodies:
-    """Moving obstacles, as functions of time alone."""
-
-    spheres: MovingSpheres  # for collisions
-    gaussians: MovingGaussians  # for cameras
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +25,7 @@ class World:
     background: Background  # color of pixels without Gaussians
     p_WS: NDArray[np.float64]  # (3,) [m], default start
     p_WG: NDArray[np.float64]  # (3,) [m], default goal
-    moving: MovingBodies | None = None
+    moving: MovingObstacles | None = None
 
     def field_at(self, time: float) -> DistanceField:
         """Returns the distance field for collisions at a time [s] of a flight."""

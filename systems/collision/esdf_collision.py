@@ -8,7 +8,7 @@ from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import LeafSystem, ValueProducer
 
 from splatpilot.systems.collision.distance_field import DistanceField, in_collision, soft_barrier
-from splatpilot.systems.collision.shapes import MovingSpheres
+from splatpilot.systems.common.drake import optional_value, vector_input
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 from splatpilot.systems.vehicle.state import QuadrotorState
@@ -22,6 +22,7 @@ class EsdfCollision(LeafSystem):
         name: EsdfCollision
         input_ports:
         - state
+        - moving (optional)
         output_ports:
         - distance
         - gradient
@@ -35,13 +36,12 @@ class EsdfCollision(LeafSystem):
     vehicle, `in_collision` 1 if that is negative, `barrier` [m] equation 3, see `soft_barrier`, and
     `field_state` a `FieldState`. Outside the field's bounds distance, clearance and barrier are
     NaN, the gradient is zero and there is no collision. All outputs share one query of the field,
-    with obstacles that are `moving` with the Context's time.
+    with the bodies of `moving`, see `MovingBodies`.
     """
 
     def __init__(
         self,
         field: DistanceField,
-        moving: MovingSpheres | None = None,
         radius: float = VEHICLE_RADIUS,
         beta: float = 4.0,
         margin: float = 1.0,
@@ -49,8 +49,9 @@ class EsdfCollision(LeafSystem):
         super().__init__()
         require(radius >= 0.0, "radius", "at least 0 m", radius)
         require(beta > 0.0, "beta", "> 0 1/m", beta)
-        self._field, self._moving = field, moving
-        state = self.DeclareVectorInputPort("state", 13)
+        self._field = field
+        self.DeclareVectorInputPort("state", 13)
+        self.DeclareAbstractInputPort("moving", AbstractValue.Make(object()))
         # Drake never frees a system that its own callbacks refer to.
         collision = weakref.proxy(self)
         cache = self.DeclareCacheEntry(
@@ -59,8 +60,7 @@ class EsdfCollision(LeafSystem):
                 allocate=lambda: AbstractValue.Make(object()),
                 calc=lambda context, sample: collision._sample(context, sample),
             ),
-            prerequisites_of_calc={self.input_port_ticket(state.get_index())}
-            | ({self.time_ticket()} if moving is not None else set()),
+            prerequisites_of_calc={self.all_input_ports_ticket()},
         )
         index, ticket = cache.cache_index(), cache.ticket()
 
@@ -79,8 +79,9 @@ class EsdfCollision(LeafSystem):
         declare("field_state", 1, lambda sample: float(sample.state))
 
     def _sample(self, context: Any, sample: Any) -> None:
-        state = np.asarray(self.get_input_port().Eval(context))
-        field = self._field
-        if self._moving is not None:
-            field = self._moving.among(field, context.get_time())
+        state, bodies = (
+            vector_input(self, "state", context),
+            optional_value(self, "moving", context),
+        )
+        field = bodies.among(self._field, bodies.time) if bodies else self._field
         sample.set_value(field.query(QuadrotorState.of(state).p_WB))

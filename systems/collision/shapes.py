@@ -198,7 +198,27 @@ class AnalyticDistanceField:
         return ((p_WQ >= self.lower_W) & (p_WQ <= self.upper_W)).all(axis=-1)
 
 
-class MovingSpheres:
+class SpheresInTime:
+    """Base class of spheres whose positions depend on time."""
+
+    radii: Any  # (M,) [m]
+
+    def centers(self, time: float) -> NDArray[np.float64]:
+        """Returns the centers (M, 3) [m] at a time [s]; infinite for an absent sphere."""
+        raise NotImplementedError
+
+    def among(self, field: DistanceField, time: float) -> "FieldWithSpheres":
+        """Returns a distance field with the spheres at a time [s]."""
+        return FieldWithSpheres(field, self.centers(time), self.radii)
+
+    def along(self, field: DistanceField, times: ArrayLike) -> "DistancesAlongTrajectories":
+        """Returns the distances of trajectories sampled at `times` (S,), with the spheres."""
+        return DistancesAlongTrajectories(
+            [self.among(field, float(time)) for time in np.asarray(times)]
+        )
+
+
+class MovingSpheres(SpheresInTime):
     """M spheres of `radii` (M,) [m] that follow given paths back and forth.
 
     Each has a row (3,) [m] of its path, one at least, per `period` [s] and rests in between. A row
@@ -212,6 +232,7 @@ class MovingSpheres:
         require(valid, "paths", f"{len(self.radii)}, like radii, of at least one row each", rows)
         require((self.radii > 0.0).all(), "radii", "> 0 m", self.radii.tolist())
         require(period > 0.0, "period", "> 0 s", period)
+        self._paths = list(paths)
         self._last = np.array(rows, dtype=int) - 1
         self._rows = np.concatenate([np.zeros((0, 3)), *paths])
         self._first = np.cumsum(self._last + 1) - self._last - 1
@@ -224,15 +245,11 @@ class MovingSpheres:
         forward = step % np.maximum(2 * self._last, 1)
         return self._rows[self._first + np.minimum(forward, 2 * self._last - forward)]
 
-    def among(self, field: DistanceField, time: float) -> "FieldWithSpheres":
-        """Returns a distance field with the spheres at a time [s]."""
-        return FieldWithSpheres(field, self.centers(time), self.radii)
-
-    def along(self, field: DistanceField, times: ArrayLike) -> "DistancesAlongTrajectories":
-        """Returns the distances of trajectories sampled at `times` (S,), with the spheres."""
-        return DistancesAlongTrajectories(
-            [self.among(field, float(time)) for time in np.asarray(times)]
-        )
+    def merged_with(self, other: "MovingSpheres") -> "MovingSpheres":
+        """Returns the spheres of both; their periods must be equal."""
+        require(self._period == other._period, "period", f"{self._period} s", other._period)
+        radii = np.append(self.radii, other.radii)
+        return MovingSpheres(radii, [*self._paths, *other._paths], self._period)
 
 
 class FieldWithSpheres:

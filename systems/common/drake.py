@@ -51,6 +51,12 @@ def optional_input(system: System, name: str, context: Context) -> np.ndarray | 
     return np.asarray(port.Eval(context)) if port.HasValue(context) else None
 
 
+def optional_value(system: System, name: str, context: Context) -> Any:
+    """Returns the value at an abstract input port, None if the port is not connected."""
+    port = system.GetInputPort(name)
+    return port.Eval(context) if port.HasValue(context) else None
+
+
 def connect(builder: DiagramBuilder, source: OutputPort, target: InputPort) -> None:
     """Connects two ports; raises ValueError, naming both, if their types or sizes differ."""
     if (source.get_data_type(), source.size()) != (target.get_data_type(), target.size()):

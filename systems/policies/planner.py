@@ -4,13 +4,12 @@ from dataclasses import dataclass, field
 from typing import Any, cast
 
 import numpy as np
-from pydrake.common.value import Value
+from pydrake.common.value import AbstractValue, Value
 from pydrake.systems.framework import Context, DiscreteValues, ValueProducer
 
 from splatpilot.systems.collision.distance_field import Distances
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.collision.shapes import MovingSpheres
-from splatpilot.systems.common.drake import weak_callback
+from splatpilot.systems.common.drake import optional_value, weak_callback
 from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.common.validation import Config, bounded, require
 from splatpilot.systems.policies.base import Policy
@@ -77,6 +76,7 @@ class PrivilegedPlanner(Policy):
         input_ports:
         - state
         - goal
+        - moving (optional)
         output_ports:
         - hypotheses
 
@@ -84,9 +84,10 @@ class PrivilegedPlanner(Policy):
       the time of planning; NaN before the first update.
 
     Unknown space and all outside the box of `esdf` count as occupied. The time of arrival is
-    computed once per goal and cached in the Context. It ignores moving obstacles; the costs of
-    trajectories know their future positions. Updates raise InfeasibleFlightError if the goal is
-    outside the known volume, too close to an obstacle or cut off from the vehicle.
+    computed once per goal and cached in the Context. It ignores the bodies of `moving`; the costs
+    of trajectories know their future positions, see `MovingBodies`. Updates raise
+    InfeasibleFlightError if the goal is outside the known volume, too close to an obstacle or cut
+    off from the vehicle.
     """
 
     def __init__(
@@ -94,14 +95,14 @@ class PrivilegedPlanner(Policy):
         esdf: Esdf,
         config: PrivilegedPlannerConfig | None = None,
         params: QuadrotorParams | None = None,
-        moving: MovingSpheres | None = None,
     ) -> None:
         super().__init__(config or PrivilegedPlannerConfig())
         lattice = self._config.lattice
         self._params = params or QuadrotorParams()
         self._params.validate()
         self._field = esdf if esdf.occupied_outside else esdf.conservative()
-        self._moving, self._lattice = moving, TrajectoryLattice(lattice)
+        self._lattice = TrajectoryLattice(lattice)
+        self.DeclareAbstractInputPort("moving", AbstractValue.Make(object()))
         self.declare_state(no_plan(lattice.num_hypotheses), "hypotheses")
         # The march belongs to the start of a simulation, not to its first instant.
         self.DeclareInitializationPublishEvent(self._prepare)
@@ -126,8 +127,8 @@ class PrivilegedPlanner(Policy):
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         time, obstacles = context.get_time(), None
-        if self._moving is not None:
-            obstacles = self._moving.along(self._field, time + self._lattice.sample_times)
+        if bodies := optional_value(self, "moving", context):
+            obstacles = bodies.along(self._field, bodies.time + self._lattice.sample_times)
         state, arrival = np.asarray(self._state_port.Eval(context)), self._time_of_arrival(context)
         hypotheses = plan(time, state, self._field, arrival, self._lattice, self._params, obstacles)
         discrete_state.set_value(hypotheses.to_vector())

@@ -40,22 +40,32 @@ NO_GAUSSIANS = PlacedGaussians(
 )
 
 
+def placed_together(parts: "Sequence[GaussianScene | PlacedGaussians]") -> PlacedGaussians:
+    """Concatenates Gaussians; lower degrees of spherical harmonics are padded with zeros."""
+    if not parts:
+        return NO_GAUSSIANS
+    count = max(part.sh.shape[1] for part in parts)
+    means, quats, scales, opacities = (
+        np.concatenate([getattr(part, name) for part in parts])
+        for name in PlacedGaussians._fields[:-1]
+    )
+    padded = [np.pad(part.sh, ((0, 0), (0, count - part.sh.shape[1]), (0, 0))) for part in parts]
+    return PlacedGaussians(means, quats, scales, opacities, np.concatenate(padded))
+
+
 class MovingGaussians:
     """M bodies of Gaussians that move without rotating.
 
     Args:
-        bodies: each about its own center; all of one degree of spherical harmonics.
+        bodies: each about its own center.
         centers: from a time [s] to the centers (M, 3) [m]; infinite for an absent body.
     """
 
     def __init__(
         self, bodies: Sequence[GaussianScene], centers: Callable[[float], NDArray]
     ) -> None:
-        arrays = (
-            np.concatenate([getattr(body, name) for body in bodies] or [none])
-            for name, none in NO_GAUSSIANS._asdict().items()
-        )
-        self._about_centers = PlacedGaussians(*arrays)
+        self.bodies = list(bodies)
+        self._about_centers = placed_together(bodies)
         self._body = np.repeat(np.arange(len(bodies)), [len(body) for body in bodies])
         self._centers = centers
 
@@ -228,3 +238,8 @@ class BakedScene:
             for image in images:
                 image.reshape(-1, image.shape[2])[hidden] = 0.0
         return images
+
+
+def bake(scene: BakedScene | GaussianScene) -> BakedScene:
+    """Bakes a scene unless it is baked."""
+    return BakedScene(scene) if isinstance(scene, GaussianScene) else scene

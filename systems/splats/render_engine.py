@@ -1,9 +1,11 @@
-"""Gaussian scenes in any Drake simulation."""
+"""Gaussian scenes, and bodies of Gaussians, in any Drake simulation."""
 
+from collections.abc import Iterable
 from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
+from pydrake.common.value import Value
 from pydrake.geometry import (
     ColorRenderCamera,
     DepthRange,
@@ -23,11 +25,13 @@ from pydrake.geometry import (
     RenderLabel,
     SceneGraph,
     Shape,
+    Sphere,
 )
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import Context
+from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem
 from pydrake.systems.sensors import ImageDepth32F, ImageLabel16I, ImageRgba8U
 
+from splatpilot.systems.common.drake import weak_callback
 from splatpilot.systems.common.extras import load_triton
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.splats.background import (
@@ -37,14 +41,26 @@ from splatpilot.systems.splats.background import (
     RenderedView,
     pixel_rays,
 )
-from splatpilot.systems.splats.baked_scene import BakedScene
+from splatpilot.systems.splats.baked_scene import (
+    BakedScene,
+    PlacedGaussians,
+    bake,
+    placed_together,
+)
+from splatpilot.systems.splats.moving_bodies import MovingObstacles
+from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.splats.splat_camera import (
     color_pixels,
+    empty_scene,
+    label_body,
     ranged_depth,
     surface_labels,
 )
 
 _SHAPES = "shapes"
+_PROPERTY = "splats", "gaussians"
+_MAX_DISTANCE = 1e8  # [m] from the world's origin of bodies that are drawn
+_ABSENT = RigidTransform(np.array([0.0, 0.0, -10.0 * _MAX_DISTANCE]))
 
 # A sky, and light from the camera, so that no side of a shape is black.
 _LIGHTS = [
@@ -53,20 +69,89 @@ _LIGHTS = [
 ]
 
 
+def gaussian_properties(
+    gaussians: GaussianScene, label: RenderLabel | None = None
+) -> PerceptionProperties:
+    """Returns properties of a geometry that a `SplatRenderEngine` draws as Gaussians.
+
+    Only other renderers draw the geometry's shape.
+
+    Args:
+        gaussians: in the geometry's frame.
+        label: of pixels that show the body; that of other Gaussians if None.
+    """
+    properties = PerceptionProperties()
+    properties.AddProperty(*_PROPERTY, gaussians)
+    if label is not None:
+        properties.AddProperty("label", "id", label)
+    return properties
+
+
+class ObstacleGeometry(LeafSystem):
+    """Outputs the poses of a world's moving obstacles for a SceneGraph.
+
+    .. pydrake_system::
+
+        name: ObstacleGeometry
+        output_ports: [geometry_pose]
+    """
+
+    def __init__(self, obstacles: MovingObstacles, frames: list[FrameId]) -> None:
+        super().__init__()
+        self._obstacles, self._frames = obstacles, frames
+        self.DeclareAbstractOutputPort(
+            "geometry_pose",
+            lambda: Value(FramePoseVector()),
+            weak_callback(self._calc),
+            {self.time_ticket()},
+        )
+
+    @staticmethod
+    def AddToBuilder(
+        builder: DiagramBuilder,
+        scene_graph: SceneGraph,
+        obstacles: MovingObstacles,
+        name: str = "obstacles",
+    ) -> "ObstacleGeometry":
+        """Registers the obstacles for a `SplatRenderEngine`, and adds the system of their poses."""
+        source, frames = scene_graph.RegisterSource(name), []
+        bodies = zip(obstacles.spheres.radii, obstacles.gaussians.bodies, strict=True)
+        for index, (radius, gaussians) in enumerate(bodies):
+            obstacle = f"obstacle_{index}"
+            frames.append(scene_graph.RegisterFrame(source, GeometryFrame(obstacle)))
+            geometry = GeometryInstance(RigidTransform(), Sphere(radius), obstacle)
+            geometry.set_perception_properties(gaussian_properties(gaussians))
+            scene_graph.RegisterGeometry(source, frames[-1], geometry)
+        system = ObstacleGeometry(obstacles, frames)
+        builder.AddNamedSystem(name, system)
+        builder.Connect(system.get_output_port(), scene_graph.get_source_pose_port(source))
+        return system
+
+    def _calc(self, context: Context, output) -> None:
+        poses = output.get_mutable_value()
+        centers = self._obstacles.spheres.centers(context.get_time())
+        for frame, center in zip(self._frames, centers, strict=True):
+            present = np.isfinite(center).all()  # SceneGraph refuses infinite poses
+            poses.set_value(frame, RigidTransform(center) if present else _ABSENT)
+
+
 class SplatRenderEngine(RenderEngine):
     """Renders a Gaussian scene together with the shapes of a SceneGraph, the nearer in each pixel.
 
     Add it with `scene_graph.AddRenderer("splats", SplatRenderEngine(scene))` and name "splats" in
     the cameras of `RgbdSensor`. The frame of the Gaussians is SceneGraph's world frame.
 
-    A second engine with the same camera renders the shapes. Per pixel, with its color c and depth d
-    (infinite without a shape) and the Gaussians' color C, alpha A and median depth D:
+    Geometries with `gaussian_properties` are drawn as Gaussians at their poses, and not at all
+    beyond 1e8 m. A second engine with the same camera renders the shapes. Per pixel, with its
+    color c and depth d (infinite without a shape) and the Gaussians' color C, alpha A and median
+    depth D:
 
     - color is c if d <= D, else C + (1 - A) c, with c that of the background or environment where
       there is no shape;
     - depth is min(d, D), planar z in meters, 0 nearer than the camera's depth range and infinity
       beyond it; d if the Gaussians have no surface;
-    - labels are those of the shapes if d <= D or there is no D, else `RenderLabel.kUnspecified`.
+    - labels are those of the shapes if d <= D or there is no D, else of the body of
+      Gaussians, else `RenderLabel.kUnspecified`.
 
     A pixel has one D: a shape between two translucent layers of Gaussians is drawn before or behind
     both. Gaussians cast no shadows on shapes, nor shapes on Gaussians.
@@ -76,12 +161,15 @@ class SplatRenderEngine(RenderEngine):
     """
 
     def __init__(
-        self, scene: BakedScene, shapes: RenderEngine | None = None, background: Background = BLACK
+        self,
+        scene: BakedScene | GaussianScene,
+        shapes: RenderEngine | None = None,
+        background: Background = BLACK,
     ):
         """Creates the engine of the shapes, and a SceneGraph for it.
 
         Args:
-            scene: Gaussians, held by reference.
+            scene: Gaussians, baked unless they are; a baked scene is held by reference.
             shapes: engine of the shapes and the background, copied; RenderEngineVtk if None, which
                 needs an OpenGL that works without a display (Debian: libegl1 libegl-mesa0
                 libgl1-mesa-dri libglib2.0-0 libx11-6 libsm6).
@@ -99,11 +187,14 @@ class SplatRenderEngine(RenderEngine):
         # A separate SceneGraph: only SceneGraph moves the geometries of an engine.
         scene_graph = SceneGraph()
         scene_graph.AddRenderer(_SHAPES, shapes)
-        self._share(scene, environment, scene_graph)
+        self._share(bake(scene), environment, scene_graph)
         self._source = scene_graph.RegisterSource(_SHAPES)
         self._frames: dict[GeometryId, FrameId] = {}  # of every geometry ever registered
         self._X_WG: dict[FrameId, RigidTransform] = {}
         self._geometries: dict[GeometryId, GeometryId] = {}  # to that in _scene_graph
+        # Bodies of Gaussians, with their shapes and properties.
+        self._bodies: dict[GeometryId, tuple[Shape, PerceptionProperties]] = {}
+        self._body_poses: dict[GeometryId, RigidTransform] = {}
         self._X_WC = RigidTransform()
 
     def _share(
@@ -123,6 +214,7 @@ class SplatRenderEngine(RenderEngine):
         copy._frames = dict(self._frames)
         copy._X_WG = dict(self._X_WG)
         copy._geometries = dict(self._geometries)
+        copy._bodies, copy._body_poses = dict(self._bodies), dict(self._body_poses)
         copy._X_WC = self._X_WC
         # Drake does not copy the list of geometries with poses to update of a Python engine; only
         # registration makes one. DoRegisterVisual ignores geometries that the copy already has.
@@ -134,6 +226,8 @@ class SplatRenderEngine(RenderEngine):
                 inspector.GetPerceptionProperties(ours),
                 self._X_WG[self._frames[id]],
             )
+        for id, (shape, properties) in self._bodies.items():
+            copy.RegisterVisual(id, shape, properties, self._body_poses[id])
         return copy
 
     @property
@@ -147,7 +241,11 @@ class SplatRenderEngine(RenderEngine):
     def DoRegisterVisual(
         self, id: GeometryId, shape: Shape, properties: PerceptionProperties, X_WG: RigidTransform
     ) -> bool:
-        if id in self._geometries:
+        if id in self._geometries or id in self._bodies:
+            return True
+        if properties.HasProperty(*_PROPERTY):
+            self._bodies[id] = shape, PerceptionProperties(properties)
+            self._body_poses[id] = RigidTransform(X_WG)
             return True
         name = str(id.get_value())
         if id not in self._frames:
@@ -166,9 +264,15 @@ class SplatRenderEngine(RenderEngine):
         return True
 
     def DoUpdateVisualPose(self, id: GeometryId, X_WG: RigidTransform) -> None:
-        self._X_WG[self._frames[id]] = RigidTransform(X_WG)
+        if id in self._bodies:
+            self._body_poses[id] = RigidTransform(X_WG)
+        else:
+            self._X_WG[self._frames[id]] = RigidTransform(X_WG)
 
     def DoRemoveGeometry(self, id: GeometryId) -> bool:
+        if id in self._bodies:
+            del self._bodies[id], self._body_poses[id]
+            return True
         if id not in self._geometries:
             return False
         self._scene_graph.RemoveGeometry(self._source, self._geometries.pop(id))
@@ -203,6 +307,12 @@ class SplatRenderEngine(RenderEngine):
         view = self._view(camera.core())
         shapes = np.asarray(self._shapes().RenderLabelImage(*self._same(camera)).data)[..., 0]
         splats = surface_labels(view)
+        for id, (_, properties) in self._bodies.items():
+            if properties.HasProperty("label", "id"):
+                label = int(cast(RenderLabel, properties.GetProperty("label", "id")))
+                alone, _ = self._camera(camera.core())
+                depth = empty_scene().render_depth(*alone, moving=self._placed([id]))
+                label_body(splats, view.depth, depth, label)
         empty = int(RenderLabel.kEmpty)
         shape_seen = (self._shape_depth(camera.core()) <= view.depth) | (splats == empty)
         labels = np.where(shape_seen & (shapes != empty), shapes, splats)
@@ -211,7 +321,7 @@ class SplatRenderEngine(RenderEngine):
     def _view(self, core: RenderCameraCore) -> RenderedView:
         camera, key = self._camera(core)
         if self._last_view is None or self._last_view[0] != key:
-            self._last_view = key, self._scene.render(*camera)
+            self._last_view = key, self._scene.render(*camera, moving=self._placed(self._bodies))
         return self._last_view[1]
 
     def _depth(self, core: RenderCameraCore) -> NDArray[np.float32]:
@@ -219,15 +329,26 @@ class SplatRenderEngine(RenderEngine):
         camera, key = self._camera(core)
         if self._last_view is not None and self._last_view[0] == key:
             return self._last_view[1].depth
-        return self._scene.render_depth(*camera)
+        return self._scene.render_depth(*camera, moving=self._placed(self._bodies))
+
+    def _placed(self, ids: Iterable[GeometryId]) -> PlacedGaussians:
+        """Returns the Gaussians of bodies in W that are present."""
+        placed = []
+        for id in ids:
+            X_WG = self._body_poses[id]
+            if np.linalg.norm(X_WG.translation()) < _MAX_DISTANCE:
+                gaussians = cast(GaussianScene, self._bodies[id][1].GetProperty(*_PROPERTY))
+                placed.append(gaussians.transformed_by(X_WG))
+        return placed_together(placed)
 
     def _camera(self, core: RenderCameraCore) -> tuple[tuple[Any, ...], bytes]:
-        """Returns K, width, height, X_WC, near and far, and these as bytes."""
+        """Returns K, width, height, X_WC, near and far, and all that a view depends on as bytes."""
         info, clipping = core.intrinsics(), core.clipping()
         K, size = info.intrinsic_matrix(), (info.width(), info.height())
         planes = clipping.near(), clipping.far()
-        numbers = [K.ravel(), self._X_WC.GetAsMatrix34().ravel(), size, planes]
-        return (K, *size, self._X_WC, *planes), np.concatenate(numbers).tobytes()
+        poses = [X.GetAsMatrix34().ravel() for X in (self._X_WC, *self._body_poses.values())]
+        key = np.concatenate([K.ravel(), *poses, size, planes]).tobytes()
+        return (K, *size, self._X_WC, *planes), key
 
     def _shapes(self) -> QueryObject:
         if self._context is None:

@@ -160,6 +160,9 @@ class GaussianScene:
     def __len__(self) -> int:
         return len(self.means)
 
+    def __deepcopy__(self, memo: dict) -> GaussianScene:
+        return self  # It does not change.
+
     @property
     def sh_degree(self) -> int:
         return harmonic_degree(self.sh.shape[1])

@@ -1,13 +1,15 @@
 """Cameras in Gaussian scenes."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import cache
 from itertools import pairwise
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.common.value import Value
+from pydrake.common.value import AbstractValue, Value
 from pydrake.geometry import RenderLabel
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, ValueProducer
@@ -19,16 +21,22 @@ from pydrake.systems.sensors import (
     ImageRgba8U,
 )
 
-from splatpilot.systems.common.drake import input_port, output_port, weak_callback
+from splatpilot.systems.common.drake import (
+    input_port,
+    optional_value,
+    output_port,
+    weak_callback,
+)
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.splats.background import BLACK, Background, RenderedView
 from splatpilot.systems.splats.baked_scene import (
     NO_GAUSSIANS,
     BakedScene,
-    MovingGaussians,
     PlacedGaussians,
+    bake,
 )
 from splatpilot.systems.splats.lens import Distortion
+from splatpilot.systems.splats.moving_bodies import Bodies
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.vehicle.state import pose_between
 
@@ -55,6 +63,26 @@ def surface_labels(view: RenderedView) -> NDArray[np.int16]:
     return np.where(view.depth > 0, unspecified, empty).astype(np.int16)
 
 
+_LABEL_TOLERANCE = 0.02  # [m] between the surface in a pixel and that of its body
+
+
+def label_body(
+    labels: NDArray[np.int16],
+    depth: NDArray[np.float32],
+    body_depth: NDArray[np.float32],
+    label: int,
+) -> None:
+    """Labels pixels (H, W) whose depth [m] is that of a body alone, 0 without its surface."""
+    shown = (body_depth > 0) & (np.abs(body_depth - depth) < _LABEL_TOLERANCE)
+    labels[shown] = label
+
+
+@cache
+def empty_scene() -> BakedScene:
+    """Returns a scene without Gaussians."""
+    return BakedScene(cast(GaussianScene, NO_GAUSSIANS))
+
+
 _MAX_STEP = 0.5  # [px] that a point at 1 m may move on the image from one band to the next
 _MIN_BANDS = 8  # of an image with a rolling shutter if Gaussians move
 
@@ -75,6 +103,17 @@ def row_bands(
     return list(pairwise(edges))
 
 
+class View(NamedTuple):
+    """A camera at one instant."""
+
+    camera_info: CameraInfo
+    X_BC: RigidTransform
+    X_WB: RigidTransform  # pose of the body, with a readout at the last row
+    time: float = 0.0  # [s] at which the image is taken
+    X_WB_start: RigidTransform | None = None  # pose of the body at the first row of a readout
+    bodies: Bodies | None = None
+
+
 class SplatCamera(LeafSystem):
     """Renders color, depth and label images of a Gaussian scene, with the ports of `RgbdSensor`.
 
@@ -83,6 +122,7 @@ class SplatCamera(LeafSystem):
         name: SplatCamera
         input_ports:
         - body_pose
+        - moving (optional)
         - start_pose (with a readout)
         output_ports:
         - color_image
@@ -94,15 +134,19 @@ class SplatCamera(LeafSystem):
 
     `body_pose` is the pose X_WB of the body that carries the camera; the camera has the pose X_WC =
     X_WB X_BC with x right, y down and z forward for all images. With a `readout`, a rolling
-    shutter, that is the pose at the last row, and `start_pose` X_WB at the first.
+    shutter, that is the pose at the last row, and `start_pose` X_WB at the first. `moving` adds the
+    Gaussians of `MovingBodies`. `image_time` [s] is that of the capture.
 
     Depth is planar z of the surface, the median depth of `rasterize`, in meters
     (`depth_image_32f`) or millimeters (`depth_image_16u`). As in Drake, nearer than `min_depth`
     reads 0; farther than `max_depth` and pixels without a surface read infinity or 65535. Labels
-    are those of `surface_labels`.
+    are those of `surface_labels`, and k for body k of `MovingBodies.DeclareBody`.
+
+    X_BC and the intrinsics are parameters of the Context, see `SetX_BC` and `SetCameraInfo`.
     """
 
     body_pose_input_port = input_port("body_pose")
+    moving_input_port = input_port("moving")
     color_image_output_port = output_port("color_image")
     depth_image_32f_output_port = output_port("depth_image_32f")
     depth_image_16u_output_port = output_port("depth_image_16u")
@@ -124,43 +168,42 @@ class SplatCamera(LeafSystem):
         near: float = 0.01,
         far: float = 1e10,
         background: Background = BLACK,
-        moving: MovingGaussians | None = None,
-        latency: float = 0.0,
+        latency: float | Callable[[float], float] = 0.0,
         distortion: Distortion | None = None,
         readout: float = 0.0,
     ):
         """Bakes the scene unless it is baked; see `BakedScene.render`.
 
         Args:
-            X_BC: pose of the camera in the body that carries it; identity if None.
+            camera_info, X_BC: defaults of the parameters: the intrinsics, and the pose of the
+                camera in the body that carries it, identity if None.
             min_depth, max_depth: range of the depth image [m].
-            latency: age of the images [s], by which moving Gaussians are late; the pose at the
+            latency: age of the images [s], or the function from the time [s] to it. The pose at the
                 input port must be as old.
             readout: time between reading the first row and the last [s]; 0 reads all at once.
         """
         super().__init__()
         valid, got = 0 <= min_depth < max_depth < np.inf, f"[{min_depth}, {max_depth}] m"
         require(valid, "the depth range", "0 <= min_depth < max_depth < inf", got)
-        focal = camera_info.focal_x(), camera_info.focal_y()
-        require(min(focal) > 0, "the focal lengths", "> 0 px", focal)
         require(0.0 <= readout < np.inf, "readout", "finite and >= 0 s", readout)
-        self._scene = BakedScene(scene) if isinstance(scene, GaussianScene) else scene
+        self._scene = bake(scene)
         self._camera_info = camera_info
         self._X_BC = RigidTransform() if X_BC is None else X_BC
         self._depth_range = (min_depth, max_depth)
         self._clipping = (near, far)
         self._background = background
-        self._moving, self._latency, self._readout = moving, latency, readout
+        self._latency, self._readout = latency, readout
         if distortion is not None:
             distortion.validate()
         self._options: dict[str, Any] = {"distortion": distortion, "max_depth": max_depth}
 
+        self._info_index = self.DeclareAbstractParameter(Value(camera_info))
+        self._mount_index = self.DeclareAbstractParameter(Value(self._X_BC))
         pose_port = self.DeclareAbstractInputPort("body_pose", Value(RigidTransform()))
-        pose_ticket = self.input_port_ticket(pose_port.get_index())
-        tickets = {pose_ticket} if moving is None else {pose_ticket, self.time_ticket()}
+        self.DeclareAbstractInputPort("moving", AbstractValue.Make(object()))
         if readout > 0.0:
-            start_port = self.DeclareAbstractInputPort("start_pose", Value(RigidTransform()))
-            tickets.add(self.input_port_ticket(start_port.get_index()))
+            self.DeclareAbstractInputPort("start_pose", Value(RigidTransform()))
+        tickets = {self.all_input_ports_ticket(), self.all_parameters_ticket()}
         view_entry, depth_entry = (
             self.DeclareCacheEntry(
                 name,
@@ -175,91 +218,121 @@ class SplatCamera(LeafSystem):
         # The indices: Drake would never free a system that keeps the entries themselves.
         self._view_index, self._depth_index = view_entry.cache_index(), depth_entry.cache_index()
         width, height = camera_info.width(), camera_info.height()
-        for name, image, calc, entry in (
-            ("color_image", ImageRgba8U, self._calc_color, view_entry),
-            ("depth_image_32f", ImageDepth32F, self._calc_depth_32f, depth_entry),
-            ("depth_image_16u", ImageDepth16U, self._calc_depth_16u, depth_entry),
-            ("label_image", ImageLabel16I, self._calc_label, view_entry),
+        for name, image, calc, prerequisites in (
+            ("color_image", ImageRgba8U, self._calc_color, {view_entry.ticket()}),
+            ("depth_image_32f", ImageDepth32F, self._calc_depth_32f, {depth_entry.ticket()}),
+            ("depth_image_16u", ImageDepth16U, self._calc_depth_16u, {depth_entry.ticket()}),
+            ("label_image", ImageLabel16I, self._calc_label, {view_entry.ticket(), *tickets}),
         ):
             self.DeclareAbstractOutputPort(
                 name,
                 alloc=lambda image=image: Value(image(width, height)),
                 calc=weak_callback(calc),
-                prerequisites_of_calc={entry.ticket()},
+                prerequisites_of_calc=prerequisites,
             )
         self.DeclareAbstractOutputPort(
             "body_pose_in_world",
             alloc=lambda: Value(RigidTransform()),
             calc=weak_callback(self._calc_body_pose),
-            prerequisites_of_calc={pose_ticket},
+            prerequisites_of_calc={pose_port.ticket()},
         )
         self.DeclareVectorOutputPort(
             "image_time", 1, self._calc_image_time, prerequisites_of_calc={self.time_ticket()}
         )
 
-    def camera_info(self) -> CameraInfo:
-        return self._camera_info
+    def camera_info(self, context: Context | None = None) -> CameraInfo:
+        """Returns the intrinsics of a Context, or the default ones."""
+        if context is None:
+            return self._camera_info
+        return cast(Any, context.get_abstract_parameter(self._info_index)).get_value()
 
-    def X_BC(self) -> RigidTransform:
-        return self._X_BC
+    def X_BC(self, context: Context | None = None) -> RigidTransform:
+        """Returns the camera's pose in the body in a Context, or the default one."""
+        if context is None:
+            return self._X_BC
+        return cast(Any, context.get_abstract_parameter(self._mount_index)).get_value()
+
+    def SetX_BC(self, context: Context, X_BC: RigidTransform) -> None:
+        """Sets the camera's pose in the body, in this system's Context."""
+        context.get_mutable_abstract_parameter(self._mount_index).set_value(X_BC)
+
+    def SetCameraInfo(self, context: Context, camera_info: CameraInfo) -> None:
+        """Sets the intrinsics, in this system's Context; the image keeps its size."""
+        sizes = [f"{info.width()}x{info.height()}" for info in (self._camera_info, camera_info)]
+        require(sizes[0] == sizes[1], "the image size", f"{sizes[0]} pixels", sizes[1])
+        context.get_mutable_abstract_parameter(self._info_index).set_value(camera_info)
 
     def render(
-        self, X_WB: RigidTransform, time: float = 0.0, X_WB_start: RigidTransform | None = None
+        self,
+        X_WB: RigidTransform,
+        bodies: Bodies | None = None,
+        X_WB_start: RigidTransform | None = None,
     ) -> RenderedView:
-        """Renders the view from body pose X_WB at a time [s], before it becomes Drake images.
+        """Renders the view from body pose X_WB, before it becomes Drake images.
 
-        With X_WB_start, the first row is read at that pose, `readout` earlier.
+        Args:
+            bodies: drawn where they are as old as the images.
+            X_WB_start: pose at which the first row is read, `readout` earlier.
         """
+        time = bodies.time if bodies else 0.0
+        camera = View(
+            self._camera_info, self._X_BC, X_WB, time - self._age(time), X_WB_start, bodies
+        )
+        return self._render(camera)
+
+    def _render(self, view: View) -> RenderedView:
         views = [
             self._scene.render(*camera, background=self._background, moving=moving, **self._options)
-            for camera, moving in self._bands(X_WB, time, X_WB_start)
+            for camera, moving in self._bands(view)
         ]
         if len(views) == 1:
             return views[0]
         return RenderedView(*map(np.concatenate, zip(*views, strict=True)))
 
-    def _bands(
-        self, X_WB: RigidTransform, time: float, X_WB_start: RigidTransform | None
-    ) -> Iterator[tuple[tuple[Any, ...], PlacedGaussians]]:
+    def _render_depth(self, scene: BakedScene, view: View) -> NDArray[np.float32]:
+        depths = [
+            scene.render_depth(*camera, moving=moving, **self._options)
+            for camera, moving in self._bands(view)
+        ]
+        return depths[0] if len(depths) == 1 else np.concatenate(depths)
+
+    def _bands(self, view: View) -> Iterator[tuple[tuple[Any, ...], PlacedGaussians]]:
         """Yields K (3, 3) [px], width, height, X_WC, near and far of each band, and its bodies."""
-        info, time = self._camera_info, time - self._latency
+        info, X_WC1 = view.camera_info, view.X_WB @ view.X_BC
         K, width, height = info.intrinsic_matrix(), info.width(), info.height()
-        X_WC1 = X_WB @ self._X_BC
-        if X_WB_start is None:
-            yield (K, width, height, X_WC1, *self._clipping), self._moved(time)
+        if view.X_WB_start is None:
+            yield (K, width, height, X_WC1, *self._clipping), _placed(view.bodies, view.time)
             return
-        X_WC0, min_count = X_WB_start @ self._X_BC, 1 if self._moving is None else _MIN_BANDS
+        X_WC0, min_count = view.X_WB_start @ view.X_BC, 1 if view.bodies is None else _MIN_BANDS
         focal = float(max(K[0, 0], K[1, 1]))
         for first, last in row_bands(X_WC0, X_WC1, focal, height, min_count):
             s = 0.5 * (first + last) / height  # of the time from the first row to the last
             K_band = K.copy()
             K_band[1, 2] -= first
             X_WC = pose_between(X_WC0, X_WC1, s)
-            moved = self._moved(time - (1.0 - s) * self._readout)
-            yield (K_band, width, last - first, X_WC, *self._clipping), moved
+            placed = _placed(view.bodies, view.time - (1.0 - s) * self._readout)
+            yield (K_band, width, last - first, X_WC, *self._clipping), placed
 
-    def _moved(self, time: float) -> PlacedGaussians:
-        return NO_GAUSSIANS if self._moving is None else self._moving.at(max(0.0, time))
+    def _age(self, time: float) -> float:
+        return self._latency(time) if callable(self._latency) else self._latency
 
-    def _poses(self, context) -> tuple[RigidTransform, float, RigidTransform | None]:
-        """Returns X_WB at the last row, the time, and X_WB at the first row of a readout."""
+    def _view_now(self, context: Context) -> View:
         names = ["body_pose", "start_pose"] if self._readout > 0.0 else ["body_pose"]
         X_WB, *start = (cast(RigidTransform, self.GetInputPort(n).Eval(context)) for n in names)
-        return X_WB, context.get_time(), start[0] if start else None
+        bodies = optional_value(self, "moving", context)
+        time = bodies.time - self._age(bodies.time) if bodies else 0.0
+        camera = self.camera_info(context), self.X_BC(context)
+        return View(*camera, X_WB, time, start[0] if start else None, bodies)
 
     def _calc_view(self, context, value) -> None:
-        value.set_value(self.render(*self._poses(context)))
+        value.set_value(self._render(self._view_now(context)))
 
     def _calc_depth(self, context, value) -> None:
         entry = self.get_cache_entry(self._view_index)
         if not entry.is_out_of_date(context):
             depth = self._view(context).depth
         else:
-            depths = [
-                self._scene.render_depth(*camera, moving=moving, **self._options)
-                for camera, moving in self._bands(*self._poses(context))
-            ]
-            depth = depths[0] if len(depths) == 1 else np.concatenate(depths)
+            depth = self._render_depth(self._scene, self._view_now(context))
         value.set_value(ranged_depth(depth, *self._depth_range))
 
     def _view(self, context) -> RenderedView:
@@ -281,10 +354,22 @@ class SplatCamera(LeafSystem):
         value.get_mutable_value().mutable_data[..., 0] = millimeters
 
     def _calc_label(self, context, value) -> None:
-        value.get_mutable_value().mutable_data[..., 0] = surface_labels(self._view(context))
+        seen, view = self._view(context), self._view_now(context)
+        labels = surface_labels(seen)
+        bodies = view.bodies or Bodies(0.0)
+        for label, track in enumerate(bodies.tracks):
+            alone = view._replace(bodies=replace(bodies, obstacles=None, tracks=(track,)))
+            label_body(labels, seen.depth, self._render_depth(empty_scene(), alone), label)
+        value.get_mutable_value().mutable_data[..., 0] = labels
 
     def _calc_body_pose(self, context, value) -> None:
         value.set_value(self.GetInputPort("body_pose").Eval(context))
 
     def _calc_image_time(self, context: Context, output: BasicVector) -> None:
-        output.SetAtIndex(0, context.get_time())
+        time = context.get_time()
+        # The oldest pose that is known is that of the start.
+        output.SetAtIndex(0, min(time, max(0.0, time - self._age(time))))
+
+
+def _placed(bodies: Bodies | None, time: float) -> PlacedGaussians:
+    return NO_GAUSSIANS if bodies is None else bodies.gaussians(max(0.0, time))

@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 from pydrake.common import MemoryFile
 from pydrake.common.value import Value
-from pydrake.geometry import Box, Cylinder, InMemoryMesh, Mesh, Meshcat, Rgba, Sphere
-from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.geometry import Cylinder, InMemoryMesh, Mesh, Meshcat, Rgba, Sphere
+from pydrake.math import RigidTransform
 from pydrake.perception import BaseField, Fields, PointCloud
 from pydrake.systems.framework import Context, DiagramBuilder, EventStatus, LeafSystem, OutputPort
 from pydrake.systems.sensors import CameraInfo, ImageRgba8U
@@ -20,6 +20,7 @@ from splatpilot.systems.common.drake import vector_input
 from splatpilot.systems.policies.hypotheses import Hypotheses, hypotheses_size, num_hypotheses_in
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.splats.splat_camera import SplatCamera
+from splatpilot.systems.vehicle.quadrotor_geometry import quadrotor_parts
 from splatpilot.systems.vehicle.state import QuadrotorState, pose_from_state
 
 
@@ -77,23 +78,9 @@ def draw_box(meshcat: Meshcat, path: str, lower_W: np.ndarray, upper_W: np.ndarr
 
 def draw_vehicle(meshcat: Meshcat, path: str, radius: float) -> None:
     """Draws a quadrotor whose propeller tips reach `radius` [m]; frame B: x forward, z up."""
-    propeller = 0.36 * radius
-    arm = radius - propeller
-    dark, front, rear = Rgba(0.1, 0.1, 0.12), Rgba(0.9, 0.2, 0.1, 0.6), Rgba(0.3, 0.3, 0.35, 0.6)
-    meshcat.SetObject(f"{path}/body", Box(0.5 * radius, 0.35 * radius, 0.2 * radius), dark)
-    for name, angle, color in (
-        ("front_left", np.pi / 4, front),
-        ("rear_left", 3 * np.pi / 4, rear),
-        ("rear_right", -3 * np.pi / 4, rear),
-        ("front_right", -np.pi / 4, front),
-    ):
-        R_BA = RotationMatrix.MakeZRotation(angle)
-        meshcat.SetObject(f"{path}/{name}_arm", Box(arm, 0.02, 0.02), dark)
-        meshcat.SetTransform(f"{path}/{name}_arm", RigidTransform(R_BA, R_BA @ [arm / 2, 0, 0]))
-        meshcat.SetObject(f"{path}/{name}_propeller", Cylinder(propeller, 0.01), color)
-        meshcat.SetTransform(
-            f"{path}/{name}_propeller", RigidTransform(R_BA @ np.array([arm, 0, 0.03]))
-        )
+    for part in quadrotor_parts(radius):
+        meshcat.SetObject(f"{path}/{part.name}", part.shape, part.color)
+        meshcat.SetTransform(f"{path}/{part.name}", part.X_BP)
 
 
 UNKNOWN_GRAY = 0.4  # Shade of unobserved space.

@@ -11,10 +11,11 @@ from splatpilot.diagrams.flight.flight import Outcome, fly, sample_initial_state
 from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
 from splatpilot.diagrams.flight.policies import policy_named
 from splatpilot.diagrams.flight.scenario import Scenario
-from splatpilot.diagrams.worlds.world import MovingBodies, World
+from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.shapes import MovingSpheres
 from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.splats.baked_scene import MovingGaussians
+from splatpilot.systems.splats.moving_bodies import MovingObstacles
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
@@ -31,7 +32,9 @@ def with_sphere(world: World, path: np.ndarray, radius: float = 0.5) -> World:
         np.tile([1.0, 0.0, 0.0], (300, 1)),
     )
     spheres = MovingSpheres([radius], [path], 0.02)
-    return replace(world, moving=MovingBodies(spheres, MovingGaussians([sphere], spheres.centers)))
+    return replace(
+        world, moving=MovingObstacles(spheres, MovingGaussians([sphere], spheres.centers))
+    )
 
 
 def falling(x: float, y: float, speed: float) -> np.ndarray:

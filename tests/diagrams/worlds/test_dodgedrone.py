@@ -18,6 +18,7 @@ from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.common.config import load_config
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
+from splatpilot.systems.splats.moving_bodies import Bodies
 
 EASY = DodgeDroneConfig(level="easy", voxel_size=0.5)
 
@@ -67,7 +68,7 @@ def test_spheres_are_seen_where_they_are_hit(course, time):
         X_WC = RigidTransform(p_WC) @ config.X_BC()
         rays_W = config.ray_slopes().reshape(-1, 3) @ X_WC.rotation().matrix().T
         truth = sphere_depth(rays_W, X_WC.translation(), np.array([1.0, 0, 0]), centers, radii)
-        seen = camera.render(RigidTransform(p_WC), time).depth.ravel()
+        seen = camera.render(RigidTransform(p_WC), Bodies(time, course.moving)).depth.ravel()
         near = truth < 8.0
         wrong += (np.abs(seen - truth) > np.maximum(0.1, 0.05 * truth))[near].sum()
         pixels += near.sum()

@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 import torch
 from baked_scenes import HEIGHT, LEVELS, WIDTH, X_WC, K, random_scene
+from pydrake.common.value import Value
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.sensors import CameraInfo
 from random_scenes import random_scene as random_gaussians
 from reference_rasterizer import median_depth
 
+from splatpilot.systems.collision.shapes import MovingSpheres
 from splatpilot.systems.splats import rasterize
 from splatpilot.systems.splats.baked_scene import (
     BakedScene,
@@ -20,6 +22,7 @@ from splatpilot.systems.splats.baked_scene import (
     create_renderer,
 )
 from splatpilot.systems.splats.lens import Distortion
+from splatpilot.systems.splats.moving_bodies import Bodies, MovingObstacles
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.splats.splat_camera import SplatCamera
 
@@ -295,10 +298,6 @@ def disc(color: tuple[float, float, float]) -> GaussianScene:
     )
 
 
-def along(*depths: float):
-    return lambda time: np.array([[0.0, 0.0, depths[int(time)]]])
-
-
 def test_a_moving_body_is_drawn_like_a_static_one():
     scene, body = random_scene(2048, seed=1, sh_degree=1), random_scene(300, seed=2, sh_degree=0)
     center = np.array([0.3, 0.2, 0.5])
@@ -323,17 +322,20 @@ def test_an_absent_body_is_not_drawn():
         np.testing.assert_array_equal(a, b)
 
 
+def moving_disc(*depths: float) -> MovingObstacles:
+    path = np.array([[0.0, 0.0, depth] for depth in depths])
+    spheres = MovingSpheres([0.5], [path], 1.0)
+    return MovingObstacles(spheres, MovingGaussians([disc((1.0, 0.0, 0.0))], spheres.centers))
+
+
 def test_a_body_hides_and_is_hidden():
-    camera = SplatCamera(
-        disc((0.0, 1.0, 0.0)),
-        CameraInfo(64, 48, 40.0, 40.0, 32.0, 24.0),
-        moving=MovingGaussians([disc((1.0, 0.0, 0.0))], along(-1.0, 1.0)),
-    )
+    camera = SplatCamera(disc((0.0, 1.0, 0.0)), CameraInfo(64, 48, 40.0, 40.0, 32.0, 24.0))
     context = camera.CreateDefaultContext()
     X_WB = RigidTransform(RotationMatrix(), np.array([0.0, 0.0, -3.0]))
     camera.GetInputPort("body_pose").FixValue(context, X_WB)
+    obstacles = moving_disc(-1.0, 1.0)
     for time, seen, depth in ((0.0, 0, 2.0), (1.0, 1, 3.0), (0.5, 0, 2.0)):
-        context.SetTime(time)
+        camera.GetInputPort("moving").FixValue(context, Value[object](Bodies(time, obstacles)))
         color = camera.color_image_output_port().Eval(context).data[24, 32, :3]
         assert color.argmax() == seen and color.max() > 240
         assert camera.depth_image_32f_output_port().Eval(context).data[24, 32, 0] == (
@@ -342,13 +344,14 @@ def test_a_body_hides_and_is_hidden():
 
 
 def test_late_images_show_bodies_where_they_were():
-    info = CameraInfo(64, 48, 40.0, 40.0, 32.0, 24.0)
-    moving = MovingGaussians([disc((1.0, 0.0, 0.0))], along(1.0, 2.0, 3.0))
-    camera = SplatCamera(disc((0.0, 1.0, 0.0)), info, moving=moving, latency=1.0)
-    prompt = SplatCamera(disc((0.0, 1.0, 0.0)), info, moving=moving)
+    info, obstacles = CameraInfo(64, 48, 40.0, 40.0, 32.0, 24.0), moving_disc(1.0, 2.0, 3.0)
+    camera = SplatCamera(disc((0.0, 1.0, 0.0)), info, latency=1.0)
+    prompt = SplatCamera(disc((0.0, 1.0, 0.0)), info)
     X_WB = RigidTransform(np.array([1.2, 0.0, -3.0]))
     for time, then in ((0.5, 0.0), (1.5, 0.5), (2.5, 1.5)):
+        late = camera.render(X_WB, Bodies(time, obstacles))
         np.testing.assert_array_equal(
-            camera.render(X_WB, time).color, prompt.render(X_WB, then).color
+            late.color, prompt.render(X_WB, Bodies(then, obstacles)).color
         )
-    assert not np.array_equal(prompt.render(X_WB, 0.0).color, prompt.render(X_WB, 1.0).color)
+    first, later = (prompt.render(X_WB, Bodies(time, obstacles)).color for time in (0.0, 1.0))
+    assert not np.array_equal(first, later)

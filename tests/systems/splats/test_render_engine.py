@@ -33,9 +33,15 @@ from pydrake.systems.sensors import (
     RgbdSensor,
 )
 
+from splatpilot.systems.collision.shapes import MovingSpheres
 from splatpilot.systems.splats.background import EnvironmentMap, pixel_rays
-from splatpilot.systems.splats.baked_scene import BakedScene
-from splatpilot.systems.splats.render_engine import SplatRenderEngine
+from splatpilot.systems.splats.baked_scene import BakedScene, MovingGaussians
+from splatpilot.systems.splats.moving_bodies import Bodies, MovingObstacles
+from splatpilot.systems.splats.render_engine import (
+    ObstacleGeometry,
+    SplatRenderEngine,
+    gaussian_properties,
+)
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.splats.splat_camera import SplatCamera
 
@@ -294,3 +300,54 @@ def test_shapes_that_name_their_renderer():
     image = query.RenderDepthImage(depth_camera(), SceneGraph.world_frame_id(), RigidTransform())
     assert image.data[CENTER][0] == pytest.approx(2.0, abs=1e-4)
     assert image.data[CENTER[0], 2][0] == pytest.approx(4.0, rel=2e-3)
+
+
+def body_of_gaussians(x: float) -> GaussianScene:
+    return GaussianScene.from_colors(
+        np.array([[x, 0.0, 0.0]]), [[1.0, 0, 0, 0]], [[0.4, 0.4, 0.001]], [0.99], [[1.0, 0, 0]]
+    )
+
+
+def test_a_geometry_is_drawn_as_gaussians_at_its_pose():
+    engine = SplatRenderEngine(wall(4.0))
+    id, pose = GeometryId.get_new_id(), RigidTransform([0.0, 0.0, 2.0])
+    properties = gaussian_properties(body_of_gaussians(0.0), label=RenderLabel(3))
+    engine.RegisterVisual(id, Box(1, 1, 1), properties, pose)
+    for copied in (engine, copy.deepcopy(engine)):
+        copied.UpdateViewpoint(RigidTransform())
+        assert depth(copied)[CENTER] == pytest.approx(2.0, abs=0.01)
+        assert label(copied)[CENTER] == 3
+        assert label(copied)[CORNER] == UNSPECIFIED
+        copied.DoUpdateVisualPose(id, RigidTransform([0.0, 0.0, 3.0]))
+        assert depth(copied)[CENTER] == pytest.approx(3.0, abs=0.01)
+        copied.DoUpdateVisualPose(id, RigidTransform([1e9, 0.0, 3.0]))
+        assert depth(copied)[CENTER] == pytest.approx(4.0, rel=2e-3)
+    assert engine.RemoveGeometry(id)
+    assert label(engine)[CENTER] == UNSPECIFIED
+
+
+def test_a_scene_is_baked():
+    engine = SplatRenderEngine(body_of_gaussians(0.0))
+    engine.UpdateViewpoint(RigidTransform([0.0, 0.0, -1.0]))
+    assert depth(engine)[CENTER] == pytest.approx(1.0, abs=0.01)
+
+
+@pytest.mark.parametrize("time", [0.0, 3.0])
+def test_moving_obstacles_are_seen_as_by_a_splat_camera(time):
+    path = np.array([[0.0, 0.0, 2.0], [0.0, 0.0, 2.5], [0.0, 0.0, 3.0], [np.inf] * 3])
+    spheres = MovingSpheres([0.4], [path], 1.0)
+    obstacles = MovingObstacles(spheres, MovingGaussians([body_of_gaussians(0.0)], spheres.centers))
+    builder = DiagramBuilder()
+    scene_graph = builder.AddSystem(SceneGraph())
+    scene_graph.AddRenderer("splats", SplatRenderEngine(wall(4.0)))
+    ObstacleGeometry.AddToBuilder(builder, scene_graph, obstacles)
+    sensor = builder.AddSystem(
+        RgbdSensor(SceneGraph.world_frame_id(), RigidTransform(), COLOR_CAMERA, depth_camera())
+    )
+    builder.Connect(scene_graph.get_query_output_port(), sensor.query_object_input_port())
+    root = builder.Build().CreateDefaultContext()
+    root.SetTime(time)
+    image = sensor.depth_image_32F_output_port().Eval(sensor.GetMyContextFromRoot(root)).data
+    seen = SplatCamera(wall(4.0), INFO).render(RigidTransform(), Bodies(time, obstacles)).depth
+    np.testing.assert_allclose(image[..., 0], seen, rtol=1e-5)
+    assert image[CENTER][0] == pytest.approx(2.0 if time == 0.0 else 4.0, rel=2e-3)

@@ -12,9 +12,11 @@ from pydrake.geometry import (
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.sensors import CameraInfo, RgbdSensor
 
+from splatpilot.systems.collision.shapes import MovingSpheres
 from splatpilot.systems.splats.background import EnvironmentMap
 from splatpilot.systems.splats.baked_scene import BakedScene, MovingGaussians
 from splatpilot.systems.splats.lens import Distortion
+from splatpilot.systems.splats.moving_bodies import Bodies, MovingObstacles
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.splats.splat_camera import SplatCamera, row_bands
 from splatpilot.systems.vehicle.state import pose_between
@@ -162,7 +164,7 @@ def yawed(angle: float) -> RigidTransform:
 
 
 def test_a_pole_leans_as_the_camera_turns():
-    view = SplatCamera(pole(), SHUTTER_INFO, readout=0.02).render(yawed(0.1), 0.0, yawed(-0.1))
+    view = SplatCamera(pole(), SHUTTER_INFO, readout=0.02).render(yawed(0.1), None, yawed(-0.1))
     angle = np.interp(np.arange(HEIGHT) + 0.5, [0, HEIGHT], [-0.1, 0.1])
     expected = WIDTH / 2 - FOCAL * np.tan(angle)
     assert np.abs(columns(view.color) - expected).max() < 0.3
@@ -174,7 +176,7 @@ def test_each_row_is_that_of_its_pose():
     X_0 = RigidTransform(RotationMatrix.MakeXRotation(0.3), [0.1, 0.0, -0.2])
     X_1 = RigidTransform(RotationMatrix.MakeYRotation(0.6), [0.3, 0.1, 0.4])
     assert len(row_bands(X_0, X_1, FOCAL, HEIGHT)) == HEIGHT
-    view = camera.render(X_1, 0.0, X_0)
+    view = camera.render(X_1, None, X_0)
     for row in range(0, HEIGHT, 7):
         own = camera.render(pose_between(X_0, X_1, (row + 0.5) / HEIGHT))
         np.testing.assert_allclose(view.color[row], own.color[row], atol=2e-2)
@@ -231,9 +233,51 @@ def test_invalid_options_are_named(options, message):
 
 
 def test_a_moving_body_is_seen_at_the_time_of_each_row():
-    scene = pole(50.0)
-    moving = MovingGaussians([pole()], lambda time: np.array([[2.0 * time, 0, 0]]))
-    camera = SplatCamera(BakedScene(scene), SHUTTER_INFO, readout=0.2, moving=moving)
-    seen = columns(camera.render(RigidTransform(), 0.5, RigidTransform()).color)
+    path = np.array([[0.002 * row, 0.0, 0.0] for row in range(1000)])
+    spheres = MovingSpheres([0.1], [path], 0.001)
+    obstacles = MovingObstacles(spheres, MovingGaussians([pole()], spheres.centers))
+    camera = SplatCamera(BakedScene(pole(50.0)), SHUTTER_INFO, readout=0.2)
+    view = camera.render(RigidTransform(), Bodies(0.5, obstacles), RigidTransform())
     times = np.interp(np.arange(HEIGHT) + 0.5, [0, HEIGHT], [0.3, 0.5])
-    assert np.abs(seen - (WIDTH / 2 + FOCAL * 2.0 * times / 4.0)).max() < 0.4
+    expected = WIDTH / 2 + FOCAL * 2.0 * times / 4.0
+    assert np.abs(columns(view.color) - expected).max() < 0.4
+
+
+def test_mount_and_intrinsics_are_parameters_of_the_context():
+    camera = SplatCamera(wall(5.0), INFO, X_BC)
+    context = camera.CreateDefaultContext()
+    camera.GetInputPort("body_pose").FixValue(context, RigidTransform())
+    port = camera.GetOutputPort("depth_image_32f")
+    assert port.Eval(context).data[12, 16, 0] == pytest.approx(4.9, abs=1e-3)
+    X = RigidTransform(X_BC.rotation(), [1.5, 0.0, 0.0])
+    camera.SetX_BC(context, X)
+    assert port.Eval(context).data[12, 16, 0] == pytest.approx(3.5, abs=1e-3)
+    assert camera.X_BC(context).IsExactlyEqualTo(X) and camera.X_BC().IsExactlyEqualTo(X_BC)
+
+    turned = RigidTransform(RotationMatrix.MakeZRotation(0.5)) @ X
+    camera.SetX_BC(context, turned)
+    before = port.Eval(context).data.copy()
+    camera.SetCameraInfo(context, CameraInfo(32, 24, 40.0, 40.0, 16.0, 12.0))
+    assert camera.camera_info(context).focal_x() == 40.0
+    assert np.abs(port.Eval(context).data - before).max() > 0.1
+    other = SplatCamera(wall(5.0), CameraInfo(32, 24, 40.0, 40.0, 16.0, 12.0), turned)
+    np.testing.assert_array_equal(
+        port.Eval(context).data, evaluate(other, "depth_image_32f", RigidTransform())
+    )
+
+
+def test_intrinsics_of_another_size_are_refused():
+    camera = SplatCamera(wall(5.0), INFO, X_BC)
+    with pytest.raises(ValueError, match="image size must be 32x24 pixels, got 16x24"):
+        camera.SetCameraInfo(camera.CreateDefaultContext(), CameraInfo(16, 24, 1.0))
+
+
+@pytest.mark.parametrize(
+    ("latency", "time", "taken"),
+    [(0.0, 2.0, 2.0), (0.2, 2.0, 1.8), (0.2, 0.1, 0.0), (lambda t: t % 0.5, 2.3, 2.0)],
+)
+def test_image_time_is_that_of_the_capture(latency, time, taken):
+    camera = SplatCamera(wall(5.0), INFO, latency=latency)
+    context = camera.CreateDefaultContext()
+    context.SetTime(time)
+    assert camera.image_time_output_port().Eval(context)[0] == pytest.approx(taken)

@@ -1,0 +1,148 @@
+import numpy as np
+import pytest
+from pydrake.common.value import Value
+from pydrake.geometry import RenderLabel
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder, LeafSystem
+from pydrake.systems.sensors import CameraInfo
+
+from splatpilot.systems.collision.esdf_collision import EsdfCollision
+from splatpilot.systems.collision.shapes import AnalyticDistanceField, HalfSpace, MovingSpheres
+from splatpilot.systems.splats.baked_scene import MovingGaussians
+from splatpilot.systems.splats.moving_bodies import Bodies, MovingBodies, MovingObstacles, Track
+from splatpilot.systems.splats.scene import GaussianScene
+from splatpilot.systems.splats.splat_camera import SplatCamera
+from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS, hover_state
+from splatpilot.systems.vehicle.quadrotor_geometry import quadrotor_gaussians
+
+R_BC = RotationMatrix(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]))
+INFO = CameraInfo(64, 48, 60.0, 60.0, 32.0, 24.0)
+FIELD = AnalyticDistanceField([HalfSpace([0, 0, 1], -50.0)], np.full(3, -60.0), np.full(3, 60.0))
+ROW = [0.0, 1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
+
+
+def wall(x: float) -> GaussianScene:
+    y, z = (grid.ravel() for grid in np.meshgrid(*[np.arange(-20, 20.1, 0.5)] * 2))
+    count = y.size
+    return GaussianScene.from_colors(
+        means=np.column_stack([np.full(count, x), y, z]),
+        quats=np.tile([1.0, 0, 0, 0], (count, 1)),
+        scales=np.tile([1e-3, 0.5, 0.5], (count, 1)),
+        opacities=np.full(count, 0.99),
+        colors=np.tile([1.0, 0.5, 0.0], (count, 1)),
+    )
+
+
+def obstacle(path: np.ndarray, radius: float = 0.5) -> MovingObstacles:
+    spheres = MovingSpheres([radius], [path], 1.0)
+    return MovingObstacles(spheres, MovingGaussians([quadrotor_gaussians()], spheres.centers))
+
+
+def two_bodies():
+    """A camera and a distance at the origin, with a vehicle whose pose is an input."""
+    builder = DiagramBuilder()
+    moving = builder.AddSystem(MovingBodies())
+    camera = builder.AddSystem(SplatCamera(wall(5.0), INFO, RigidTransform(R_BC)))
+    collision = builder.AddSystem(EsdfCollision(FIELD))
+    pose = moving.DeclareBody("other", quadrotor_gaussians(), VEHICLE_RADIUS)
+    for system in (camera, collision):
+        builder.Connect(moving.moving_output_port(), system.GetInputPort("moving"))
+    builder.ExportInput(pose, "other")
+    builder.ExportInput(camera.GetInputPort("body_pose"), "body_pose")
+    builder.ExportInput(collision.GetInputPort("state"), "state")
+    for name in ("color_image", "depth_image_32f", "label_image"):
+        builder.ExportOutput(camera.GetOutputPort(name), name)
+    for name in ("distance", "in_collision"):
+        builder.ExportOutput(collision.GetOutputPort(name), name)
+    diagram = builder.Build()
+    context = diagram.CreateDefaultContext()
+    diagram.GetInputPort("body_pose").FixValue(context, RigidTransform())
+    diagram.GetInputPort("state").FixValue(context, hover_state([0.0, 0.0, 0.0]))
+    return diagram, context
+
+
+@pytest.mark.parametrize(("x", "collides"), [(2.0, False), (0.7, True)])
+def test_a_body_with_a_pose_is_seen_labeled_and_hit(x, collides):
+    diagram, context = two_bodies()
+    X_WO = RigidTransform(RotationMatrix.MakeYRotation(np.pi / 2), [x, 0.0, 0.0])
+    diagram.GetInputPort("other").FixValue(context, X_WO)
+    depth = diagram.GetOutputPort("depth_image_32f").Eval(context).data[..., 0]
+    labels = diagram.GetOutputPort("label_image").Eval(context).data[..., 0]
+    assert depth[24, 32] == pytest.approx(x - 0.1 * VEHICLE_RADIUS, abs=0.1)
+    assert depth[0, 0] == pytest.approx(5.0, abs=0.01)
+    shown = depth < 4.0
+    assert shown.sum() > 40
+    np.testing.assert_array_equal(labels == 0, shown)
+    assert (labels[~shown] == int(RenderLabel.kUnspecified)).all()
+    distance = diagram.GetOutputPort("distance").Eval(context)[0]
+    assert distance == pytest.approx(x - VEHICLE_RADIUS)
+    assert diagram.GetOutputPort("in_collision").Eval(context)[0] == collides
+
+
+def test_a_body_behind_a_surface_has_no_label():
+    diagram, context = two_bodies()
+    diagram.GetInputPort("other").FixValue(context, RigidTransform([6.0, 0.0, 0.0]))
+    labels = diagram.GetOutputPort("label_image").Eval(context).data
+    assert (labels == int(RenderLabel.kUnspecified)).all()
+
+
+def test_bodies_follow_their_poses_without_a_new_build():
+    diagram, context = two_bodies()
+    for x in (1.0, 2.0, 3.0):
+        diagram.GetInputPort("other").FixValue(context, RigidTransform([x, 0.0, 0.0]))
+        distance = diagram.GetOutputPort("distance").Eval(context)[0]
+        assert distance == pytest.approx(x - VEHICLE_RADIUS)
+
+
+class Flyby(LeafSystem):
+    def __init__(self):
+        super().__init__()
+        self.DeclareAbstractOutputPort("pose", lambda: Value(RigidTransform()), self._calc)
+
+    def _calc(self, context, output):
+        time = context.get_time()
+        output.set_value(RigidTransform(np.array([2.0 * time, 0.0, time])))
+
+
+def test_poses_are_remembered_and_predicted():
+    builder = DiagramBuilder()
+    source, moving = builder.AddSystem(Flyby()), builder.AddSystem(MovingBodies())
+    pose = moving.DeclareBody("other", quadrotor_gaussians(), 0.3)
+    builder.Connect(source.get_output_port(), pose)
+    simulator = Simulator(builder.Build())
+    simulator.AdvanceTo(2.513)
+    context = moving.GetMyContextFromRoot(simulator.get_context())
+    bodies = moving.GetOutputPort("moving").Eval(context)
+    assert bodies.time == 2.513
+    for time in (0.6, 1.333, 2.513, 3.7):
+        np.testing.assert_allclose(bodies.centers(time), [[2.0 * time, 0.0, time]], atol=1e-9)
+    np.testing.assert_array_equal(bodies.centers(-1.0), bodies.centers(0.0))
+
+
+def test_obstacles_and_bodies_are_together():
+    obstacles = obstacle(np.array([[0.0, 3.0, 0.0], [1.0, 3.0, 0.0]]))
+    both = obstacles.merged_with(obstacle(np.array([[0.0, -3.0, 0.0]]), 0.25))
+    bodies = Bodies(1.0, both, (Track(quadrotor_gaussians(), 0.3, np.array([ROW])),))
+    np.testing.assert_array_equal(bodies.centers(1.0), [[1, 3, 0], [0, -3, 0], [1, 0, 0]])
+    np.testing.assert_array_equal(bodies.radii, [0.5, 0.25, 0.3])
+    assert len(bodies.gaussians(1.0).means) == 3 * len(quadrotor_gaussians())
+    times = np.array([0.0, 1.0])
+    distances = bodies.along(FIELD, times).distance(np.zeros((1, 2, 3)))
+    np.testing.assert_allclose(distances, [[0.7, 0.7]])
+
+
+def test_invalid_bodies_are_refused():
+    moving = MovingBodies()
+    with pytest.raises(ValueError, match=r"radius must be in \[0, inf\) m, got -1"):
+        moving.DeclareBody("a", quadrotor_gaussians(), -1)
+    moving.DeclareBody("a", quadrotor_gaussians(), 0.3)
+    with pytest.raises(ValueError, match="name must be new among the bodies, got 'a'"):
+        moving.DeclareBody("a", quadrotor_gaussians(), 0.3)
+
+
+def test_the_quadrotor_of_gaussians_fits_its_sphere():
+    gaussians = quadrotor_gaussians()
+    assert 200 < len(gaussians) < 700
+    extent = np.linalg.norm(gaussians.means, axis=1).max()
+    assert 0.9 * VEHICLE_RADIUS < extent < VEHICLE_RADIUS + 0.01
