@@ -68,7 +68,7 @@ def _draw_labels(
 
 def project(camera: OnboardCamera, p_BQ: np.ndarray) -> np.ndarray:
     """Projects points p_BQ (N, 3) [m] in front of the camera to columns and rows (n, 2) [px]."""
-    p_CQ = camera.X_BC().inverse().multiply(p_BQ.T.astype(float)).reshape(3, -1).T
+    p_CQ = camera.mount().inverse().multiply(p_BQ.T.astype(float)).reshape(3, -1).T
     p_CQ = p_CQ[p_CQ[:, 2] > _NEAR]
     center = np.array([camera.width, camera.height]) / 2
     focal = np.array([camera.focal_x, camera.focal_y])

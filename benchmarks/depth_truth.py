@@ -123,7 +123,7 @@ def frames_along_flight(
             camera.GetInputPort("body_pose").FixValue(context, X_WB)
             image = cast(ImageDepth32F, camera.GetOutputPort("depth_image_32f").Eval(context))
             depth = np.array(image.data)[..., 0]
-            found.append(DepthFrame(depth, truth.image(config, X_WB @ config.X_BC())))
+            found.append(DepthFrame(depth, truth.image(config, X_WB @ config.mount())))
     return frames
 
 

@@ -113,7 +113,7 @@ def print_depth() -> None:
         X_WB = RigidTransform(sample_initial_state(scenario, world)[:3])
         for width, height in ((64, 36), (320, 240)):
             optics = OnboardCamera(width=width, height=height)
-            info, X_WC = optics.camera_info(), X_WB @ optics.X_BC()
+            info, X_WC = optics.camera_info(), X_WB @ optics.mount()
             camera = (info.intrinsic_matrix(), width, height, X_WC)
             calls: list[Callable[[], object]] = [lambda c=camera, w=world: w.baked.render(*c)]
             for limit in (np.inf, 20.0, 6.0):

@@ -58,7 +58,7 @@ def make_camera(config: OnboardCamera, world: World, latency: float = 0.0) -> Sp
     return SplatCamera(
         world.baked,
         config.camera_info(),
-        config.X_BC(),
+        config.mount(),
         min_depth=config.min_depth,
         max_depth=config.max_depth,
         background=world.background,

@@ -165,16 +165,22 @@ def _with_field(config: Any, path: list[str], value: str, source: str) -> Any:
     return config
 
 
-def _check_names(config: Any, given: Any, prefix: str) -> None:
-    """Raises ValueError for unknown fields, with their likely spelling, and for wrong types."""
+def _check_names(config: Any, given: Any, prefix: str, kinds: Sequence[Any] = ()) -> None:
+    """Raises ValueError for unknown fields, with their likely spelling, and for wrong types.
+
+    `kinds` are the types that a tag may name.
+    """
+    if isinstance(given, dict) and "_tag" in given:
+        tag, given = given["_tag"], {name: each for name, each in given.items() if name != "_tag"}
+        config = next((kind() for kind in kinds if f"!{kind.__name__}" == tag), None)
     known, what = field_types(config), prefix.rstrip(".") or "the text"
-    if not (known or isinstance(config, dict)) or (isinstance(given, dict) and "_tag" in given):
-        return  # Drake's reader checks plain values, and tagged values of other types.
+    if not (known or isinstance(config, dict)):
+        return  # Drake's reader checks plain values, and tags.
     require(isinstance(given, dict), what, "fields, NAME: VALUE each", _shortened(given))
     for name, value in given.items():
         if isinstance(config, dict):
             require(value is not None, f"{prefix}{name}", "fields, NAME: VALUE each", "null")
-            _check_names(config.get(name), value, f"{prefix}{name}.")
+            _check_names(config.get(name), value, f"{prefix}{name}.", kinds)
             continue
         if name not in known:
             hint = _hint(config, name, value, prefix)
@@ -185,11 +191,19 @@ def _check_names(config: Any, given: Any, prefix: str) -> None:
         is_list = not (isinstance(held, list) and isinstance(value, str))  # list("abc") works
         require(is_list, prefix + name, "a list", _shortened(value), f"write [{value}]")
         _check_type(f"{prefix}{name}", known[name], value)
-        _check_names(held, value, f"{prefix}{name}.")
+        _check_names(held, value, f"{prefix}{name}.", _tagged_types(known[name]))
+
+
+def _tagged_types(expected: Any) -> list[Any]:
+    """Returns the types that tags of a field, or of the items of its dictionary, may name."""
+    options = get_args(get_args(expected)[1] if get_origin(expected) is dict else expected)
+    return [option for option in options if dataclasses.is_dataclass(option)]
 
 
 def _hint(config: Any, name: Any, value: Any, prefix: str) -> str:
     """Suggests fields of the same name elsewhere, fields that `value` names, or similar names."""
+    if instead := getattr(config, "FORMER_FIELDS", {}).get(name):
+        return f"write {prefix}{instead}"
     known = field_types(config)
     fields = _nested(config, str(name), prefix)
     fields += [prefix + each for each in _names(value) if each in known]

@@ -2,9 +2,10 @@
 
 import weakref
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
+from pydrake.systems import sensors
 from pydrake.systems.framework import (
     Context,
     DiagramBuilder,
@@ -58,18 +59,41 @@ def optional_value(system: System, name: str, context: Context) -> Any:
 
 
 def connect(builder: DiagramBuilder, source: OutputPort, target: InputPort) -> None:
-    """Connects two ports; raises ValueError, naming both, if their types or sizes differ."""
-    if (source.get_data_type(), source.size()) != (target.get_data_type(), target.size()):
+    """Connects two ports; raises ValueError, naming both, if their types or sizes differ.
+
+    An image of size 0 stands for any size.
+    """
+    given, taken = _content(source), _content(target)
+    kinds = (source.get_data_type(), given[0]), (target.get_data_type(), taken[0])
+    sizes_differ = given[1] != taken[1] and all(map(np.prod, (given[1], taken[1])))
+    if kinds[0] != kinds[1] or sizes_differ:
         raise ValueError(
             f"{_describe(target)} must be of the type and size of its source, {_describe(source)}"
         )
     builder.Connect(source, target)
 
 
+_IMAGES = "ImageDepth16U", "ImageDepth32F", "ImageLabel16I", "ImageRgb8U", "ImageRgba8U"
+
+
+def _content(port: InputPort | OutputPort) -> tuple[str, tuple[int, ...]]:
+    """Returns the type and size of a port's vector or image; of other values nothing."""
+    if port.get_data_type() == PortDataType.kVectorValued:
+        return "vector", (port.size(),)
+    if isinstance(port, OutputPort):
+        value = port.Allocate()
+    else:
+        value = cast(Any, port.get_system()).AllocateInputAbstract(port)
+    image: Any = value.get_value() if hasattr(value, "get_value") else None
+    names = [name for name in _IMAGES if type(image) is getattr(sensors, name)]
+    return (names[0], (image.width(), image.height())) if names else ("", ())
+
+
 def _describe(port: InputPort | OutputPort) -> str:
-    vector = port.get_data_type() == PortDataType.kVectorValued
     kind = "input" if isinstance(port, InputPort) else "output"
-    what = f"a vector of {port.size()}" if vector else "not a vector"
+    content, size = _content(port)
+    what = f"{content} of {'x'.join(map(str, size))}" if content else "not a vector"
+    what = f"a {what}" if content == "vector" else what
     system = type(port.get_system()).__name__
     return f"the {kind} {port.get_name()!r} of {system} ({what})"
 

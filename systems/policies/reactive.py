@@ -177,7 +177,7 @@ def decide(
     depth and the points_W of earlier images, whose missing ones are NaN."""
     depth = seen.image.astype(float)
     p_WB, v_WB, _, _ = seen.state
-    X_WC = seen.X_WB @ config.camera.X_BC()
+    X_WC = seen.X_WB @ config.camera.mount()
     R_WC, p_WC = X_WC.rotation().matrix(), X_WC.translation()
     points = nearest_points(depth, config) @ R_WC.T + p_WC
     points_W = np.concatenate([points, points_W[: -len(points)]])

@@ -1,17 +1,23 @@
 """Configuration of a policy's camera."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
+from pydrake.common.schema import Rotation, Transform
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.sensors import CameraInfo
 
+from splatpilot.systems.common.config import dump_config
 from splatpilot.systems.common.validation import Config, bounded, require_field
 from splatpilot.systems.splats.lens import Distortion
 
-_R_BC_LEVEL = RotationMatrix(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]))
-"""Optical axes (x right, y down, z forward) of a level camera that looks ahead, in body axes."""
+
+def _level_mount() -> Transform:
+    """Returns the pose of a camera at the front that looks ahead, in body axes."""
+    rotation = Rotation(value=Rotation.Rpy(deg=[-90.0, 0.0, -90.0]))
+    return Transform(translation=[0.1, 0.0, 0.0], rotation=rotation)
 
 
 @dataclass
@@ -32,12 +38,25 @@ class OnboardCamera(Config):
     min_depth: float = bounded(0.1, "[0, inf) m")
     # [m] Maximum depth of its depth images.
     max_depth: float = bounded(20.0, "(0, inf) m")
-    # [m] Position on the vehicle.
-    p_BC: list[float] = bounded(lambda: [0.1, 0.0, 0.0], "(-inf, inf) m")
-    # [deg] Upward pitch.
-    pitch: float = bounded(0.0, "[-90, 90] deg")
+    # Pose on the vehicle: axes x right, y down and z forward of the image in body axes x forward, y
+    # left and z up. Its rotation !Rpy {deg: [UP - 90, 0, LEFT - 90]} looks up and left by angles.
+    X_BC: Transform = field(default_factory=_level_mount)
     # [s] Between reading the first row of an image and the last; 0 is a global shutter.
     readout: float = bounded(0.0, "[0, 0.2] s")
+
+    FORMER_FIELDS: ClassVar[dict[str, str]] = {
+        "p_BC": "X_BC.translation",
+        "pitch": "X_BC.rotation: !Rpy {deg: [PITCH - 90, 0, -90]}",
+    }
+    """What to write instead of fields of former versions."""
+
+    def __eq__(self, other: object) -> bool:
+        """Compares all fields; Drake's transforms compare by identity."""
+        if type(other) is not type(self):
+            return NotImplemented
+        return dump_config(self) == dump_config(other)
+
+    __hash__ = None  # pyright: ignore
 
     def check(self) -> None:
         if self.distortion is not None:
@@ -48,7 +67,10 @@ class OnboardCamera(Config):
                 require_field(self, name, valid, f"below {widest:.1f} deg, the limit of the lens")
         valid = self.min_depth < self.max_depth
         require_field(self, "max_depth", valid, f"above min_depth = {self.min_depth} m")
-        require_field(self, "p_BC", len(self.p_BC) == 3, "three finite numbers x, y, z in m")
+        valid = self.X_BC.IsDeterministic() and not self.X_BC.base_frame
+        require_field(self, "X_BC", valid, "a pose without distributions and without base_frame")
+        valid = np.isfinite(self.X_BC.GetDeterministicValue().GetAsMatrix4()).all()
+        require_field(self, "X_BC", valid, "finite")
 
     @property
     def focal_x(self) -> float:
@@ -73,10 +95,12 @@ class OnboardCamera(Config):
         size, middle = (self.width, self.height), (0.5 * self.width, 0.5 * self.height)
         return CameraInfo(*size, self.focal_x, self.focal_y, *middle)
 
-    def X_BC(self) -> RigidTransform:
-        """Returns the pose of the camera (x right, y down, z forward) in the body."""
-        R_BC = RotationMatrix.MakeYRotation(-math.radians(self.pitch)) @ _R_BC_LEVEL
-        return RigidTransform(R_BC, np.array(self.p_BC))
+    def mount(self) -> RigidTransform:
+        """Returns X_BC, without the rounding of right angles."""
+        X_BC = self.X_BC.GetDeterministicValue()
+        R_BC = X_BC.rotation().matrix()
+        R_BC = np.where(np.abs(R_BC) < 1e-15, 0.0, R_BC)
+        return RigidTransform(RotationMatrix(R_BC), X_BC.translation())
 
     def ray_slopes(self) -> np.ndarray:
         """Returns the points p_CQ (height, width, 3) of the pixels at planar depth 1."""

@@ -9,7 +9,7 @@ from splatpilot.training.corpus.corpus import Corpus
 
 
 def test_points_in_front_of_the_camera_are_projected():
-    camera = OnboardCamera(width=160, height=120, fov_x=90.0, p_BC=[0.1, 0.0, 0.0])
+    camera = OnboardCamera(width=160, height=120, fov_x=90.0)
     points = [[2.1, 0, 0], [2.1, 1.0, 0], [4.1, 0, 1.0], [-1.0, 0, 0], [0.1, 0, 0]]
     expected = [[80, 60], [40, 60], [80, 40]]
     np.testing.assert_allclose(project(camera, np.array(points)), expected, atol=1e-9)

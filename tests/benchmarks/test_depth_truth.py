@@ -19,7 +19,7 @@ CAMERA = OnboardCamera(64, 36)
 def test_rays_end_where_the_distance_is_zero_and_meet_nothing_before(scenario):
     config = load_config(Scenario(), scenario_file(scenario))
     spec = replace(make_spec(config.world, 0), surroundings=list)
-    X_WC = RigidTransform(spec.p_WS) @ CAMERA.X_BC()
+    X_WC = RigidTransform(spec.p_WS) @ CAMERA.mount()
     depth = TrueDepth(spec).image(CAMERA, X_WC)
     hit = np.isfinite(depth)
     assert hit.mean() > 0.4

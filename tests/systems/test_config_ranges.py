@@ -1,6 +1,7 @@
 import math
 
 import pytest
+from pydrake.common.schema import GaussianVector, Transform
 
 from splatpilot.systems.messaging.failsafe import FailsafeConfig
 from splatpilot.systems.messaging.flight_limits import FlightLimits
@@ -38,7 +39,9 @@ OTHER_FIELDS = [
     (ObservationNoise, {"jitter": 0.1, "frame_rate": [10.0]}),
     (ObservationNoise, {"frame_rate": [30.0, 10.0]}),
     (ObservationNoise, {"frame_rate": [0.0, 10.0]}),
-    (OnboardCamera, {"fov_x": 180.0, "max_depth": 0.05, "p_BC": [1.0, 2.0], "pitch": 91.0}),
+    (OnboardCamera, {"fov_x": 180.0, "max_depth": 0.05}),
+    (OnboardCamera, {"X_BC": Transform(translation=[NAN, 0.0, 0.0])}),
+    (OnboardCamera, {"X_BC": Transform(translation=GaussianVector[3]([0.0] * 3, [0.1] * 3))}),
     (OnboardCamera, {"readout": 0.3}),
     (Px4CommanderConfig, {"setpoints": "position", "arm": True}),
     (QuadrotorParams, {"drag": -0.1, "gravity": -9.81}),

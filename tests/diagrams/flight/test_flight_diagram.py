@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from pydrake.common.schema import Rotation, Transform
 from pydrake.systems.framework import LeafSystem
 from pydrake.systems.primitives import ConstantVectorSource
 
@@ -187,11 +188,14 @@ def test_video_and_meshcat_need_the_camera(post_world, shown):
 
 
 def test_sensors_of_a_scenario_are_on_board(post_world):
-    text = "sensors: {down: !OnboardCamera {width: 8, height: 6, pitch: -90}}\ntimeout: 1.0\n"
+    text = "sensors: {down: !OnboardCamera {width: 8, height: 6, X_BC: {rotation: !Rpy {deg: "
+    text += "[-180, 0, -90]}}}}\ntimeout: 1.0\n"
     scenario = load_config(
         parse_config(Scenario(), text, "text"), overrides=["sensors.down.width=10"]
     )
-    assert scenario.sensors == {"down": OnboardCamera(width=10, height=6, pitch=-90)}
+    rotation = Rotation(value=Rotation.Rpy(deg=[-180.0, 0.0, -90.0]))
+    down = Transform(translation=[0.1, 0.0, 0.0], rotation=rotation)
+    assert scenario.sensors == {"down": OnboardCamera(width=10, height=6, X_BC=down)}
     assert parse_config(Scenario(), dump_config(scenario), "dump").sensors == scenario.sensors
     diagram = BuildFlightDiagram(scenario, post_world, camera=False)
     image = diagram.GetOutputPort("down_depth_image_32f").Eval(diagram.CreateDefaultContext())

@@ -96,7 +96,7 @@ def test_world_in_another_look_is_rendered_as_if_made_so():
     world = make_world(ForestConfig(length=8.0, width=6.0, height=4.0), 1)
     seen = with_appearance(world, draw(3))
     camera = OnboardCamera(width=64, height=48)
-    view = camera.camera_info().intrinsic_matrix(), 64, 48, camera.X_BC()
+    view = camera.camera_info().intrinsic_matrix(), 64, 48, camera.mount()
     image = seen.baked.render(*view)
     for one, same in zip(image, BakedScene(seen.gaussians).render(*view), strict=True):
         np.testing.assert_array_equal(one, same)

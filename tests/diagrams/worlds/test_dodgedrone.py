@@ -65,7 +65,7 @@ def test_spheres_are_seen_where_they_are_hit(course, time):
         p_WC = centers[sphere] - [radii[sphere] + 2.0, 0.0, 0.0]
         if p_WC[2] < 0.3 or (np.linalg.norm(centers - p_WC, axis=1) < radii + 0.3).any():
             continue
-        X_WC = RigidTransform(p_WC) @ config.X_BC()
+        X_WC = RigidTransform(p_WC) @ config.mount()
         rays_W = config.ray_slopes().reshape(-1, 3) @ X_WC.rotation().matrix().T
         truth = sphere_depth(rays_W, X_WC.translation(), np.array([1.0, 0, 0]), centers, radii)
         seen = camera.render(RigidTransform(p_WC), Bodies(time, course.moving)).depth.ravel()

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from pydrake.common.value import Value
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
+from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
 from splatpilot.systems.common.drake import (
     connect,
@@ -50,6 +51,38 @@ def test_connected_ports_have_one_type_and_size():
         connect(builder, first.text_output_port(), second.value_input_port())
     connect(builder, first.double_output_port(), second.value_input_port())
     assert len(builder.Build().GetSystems()) == 2
+
+
+class Camera(LeafSystem):
+    def __init__(self) -> None:
+        super().__init__()
+        self.DeclareAbstractOutputPort(
+            "image", lambda: Value(ImageDepth32F(64, 36)), lambda *_: None
+        )
+
+
+class Viewer(LeafSystem):
+    def __init__(self, image) -> None:
+        super().__init__()
+        self.DeclareAbstractInputPort("image", Value(image))
+
+
+@pytest.mark.parametrize(
+    ("image", "name"),
+    [(ImageDepth32F(10, 10), "ImageDepth32F of 10x10"), (ImageRgba8U(64, 36), "ImageRgba8U of")],
+)
+def test_connected_images_have_one_type_and_size(image, name):
+    builder = DiagramBuilder()
+    camera, viewer = builder.AddSystem(Camera()), builder.AddSystem(Viewer(image))
+    message = rf"input 'image' of Viewer \({name}.* \(ImageDepth32F of 64x36\)"
+    with pytest.raises(ValueError, match=message):
+        connect(builder, camera.get_output_port(), viewer.get_input_port())
+
+
+def test_images_of_size_zero_stand_for_any_size():
+    builder = DiagramBuilder()
+    camera, viewer = builder.AddSystem(Camera()), builder.AddSystem(Viewer(ImageDepth32F()))
+    connect(builder, camera.get_output_port(), viewer.get_input_port())
 
 
 def test_weak_callbacks_do_not_keep_their_system_alive():

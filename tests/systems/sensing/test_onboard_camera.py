@@ -1,6 +1,9 @@
 import numpy as np
 import pytest
 
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.systems.common.config import dump_config, load_config, parse_config
+from splatpilot.systems.policies.reactive import ReactiveConfig
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 
 
@@ -16,7 +19,37 @@ def test_rays_agree_with_drakes_intrinsics(fov_y):
     assert np.rad2deg(camera.camera_info().fov_y()) == pytest.approx(fov_y or square)
 
 
-def test_mount_looks_ahead_and_up():
-    R_BC = OnboardCamera(pitch=30.0).X_BC().rotation().matrix()
-    np.testing.assert_allclose(R_BC[:, 2], [np.cos(np.pi / 6), 0, 0.5], atol=1e-12)
-    np.testing.assert_allclose(R_BC[:, 0], [0, -1, 0], atol=1e-12)
+def test_the_default_mount_looks_ahead():
+    X_BC = OnboardCamera().mount()
+    np.testing.assert_array_equal(X_BC.rotation().matrix(), [[0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+    np.testing.assert_array_equal(X_BC.translation(), [0.1, 0.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("up", "left", "direction"),
+    [
+        (30.0, 0.0, [np.cos(np.pi / 6), 0.0, 0.5]),
+        (0.0, 90.0, [0.0, 1.0, 0.0]),
+        (-90.0, 0.0, [0.0, 0.0, -1.0]),
+    ],
+)
+def test_a_mount_looks_up_and_left(up, left, direction):
+    text = f"X_BC: {{rotation: !Rpy {{deg: [{up - 90}, 0, {left - 90}]}}}}"
+    camera = parse_config(OnboardCamera(), text, "text")
+    np.testing.assert_allclose(camera.mount().rotation().col(2), direction, atol=1e-12)
+    np.testing.assert_array_equal(camera.mount().translation(), [0.1, 0.0, 0.0])
+    assert parse_config(OnboardCamera(), dump_config(camera), "text") == camera != OnboardCamera()
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("policy.camera.p_BC=[0, 0, 0]", r"write policy\.camera\.X_BC\.translation"),
+        ("policy.camera.pitch=-20", r"write policy\.camera\.X_BC\.rotation: !Rpy"),
+        ("sensors={down: !OnboardCamera {pitch: -90}}", r"write .*X_BC\.rotation: !Rpy"),
+    ],
+)
+def test_former_fields_name_what_replaces_them(override, message):
+    scenario = Scenario(policy=ReactiveConfig())
+    with pytest.raises(ValueError, match=message):
+        load_config(scenario, overrides=[override])

@@ -305,7 +305,7 @@ def test_images_are_taken_from_the_pose_that_is_recorded(world, labeler):
     _, samples = see(world, labeler)
     camera = CONFIG.camera
     for k, X_WP in enumerate(poses(samples)):
-        forward, left, up = X_WP.inverse().multiply(SPHERE) - np.array(camera.p_BC)
+        forward, left, up = X_WP.inverse().multiply(SPHERE) - camera.mount().translation()
         column = camera.width / 2 - camera.focal_x * left / forward
         row = camera.height / 2 - camera.focal_y * up / forward
         light = samples.color[k].sum(axis=2)

@@ -1,0 +1,97 @@
+"""An inertial measurement unit: accelerometer and gyroscope with noise and drifting biases."""
+
+import zlib
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
+
+from splatpilot.systems.common.drake import vector_input
+from splatpilot.systems.common.validation import Config, bounded
+from splatpilot.systems.vehicle.quadrotor import QuadrotorParams, quadrotor_derivatives
+from splatpilot.systems.vehicle.state import QuadrotorState, pose_from_state
+
+
+@dataclass
+class Imu(Config):
+    """An IMU at the origin of the body, with its axes.
+
+    The defaults are those of the ADIS16448 in the EuRoC data sets.
+    """
+
+    # [Hz] Measurements per second.
+    rate: float = bounded(200.0, "(0, 1000] Hz")
+    # [m/s^2/sqrt(Hz)] White noise of the accelerometer.
+    accelerometer_noise: float = bounded(2.0e-3, "[0, inf) m/s^2/sqrt(Hz)")
+    # [rad/s/sqrt(Hz)] White noise of the gyroscope.
+    gyroscope_noise: float = bounded(1.6968e-4, "[0, inf) rad/s/sqrt(Hz)")
+    # [m/s^3/sqrt(Hz)] Random walk of the accelerometer's bias.
+    accelerometer_walk: float = bounded(3.0e-3, "[0, inf) m/s^3/sqrt(Hz)")
+    # [rad/s^2/sqrt(Hz)] Random walk of the gyroscope's bias.
+    gyroscope_walk: float = bounded(1.9393e-5, "[0, inf) rad/s^2/sqrt(Hz)")
+
+
+def specific_force(state: np.ndarray, command: np.ndarray, params: QuadrotorParams) -> np.ndarray:
+    """Computes the acceleration less gravity (3,) [m/s^2] in B, from state (13,) and command (4,).
+
+    f_B = R_BW (d/dt v_WB + g e_z), see `quadrotor_derivatives`.
+    """
+    f_W = np.array(quadrotor_derivatives(state, command, params)[3:6])
+    f_W[2] += params.gravity
+    return pose_from_state(state).rotation().inverse().multiply(f_W)
+
+
+class ImuSensor(LeafSystem):
+    """Measures specific force and body rates.
+
+    .. pydrake_system::
+
+        name: ImuSensor
+        input_ports: [state, command]
+        output_ports: [accelerometer, gyroscope]
+
+    - ``state`` (13), ``command`` (4): those of `QuadrotorPlant`.
+    - ``accelerometer`` (3): `specific_force` [m/s^2] in B, of a vehicle without wind.
+    - ``gyroscope`` (3): w_WB_B [rad/s].
+
+    Samples at the rate from time 0 and holds; before, it measures a vehicle at rest. Sample k, with
+    w_k and u_k drawn from N(0, 1), has the noise and the bias (Kalibr's IMU noise model)
+
+        y_k = x_k + b_k + noise sqrt(rate) w_k
+        b_k+1 = b_k + walk / sqrt(rate) u_k,  b_0 = 0.
+
+    The draws follow from the seed, the system's name and k.
+    """
+
+    def __init__(self, config: Imu, params: QuadrotorParams, seed: int) -> None:
+        super().__init__()
+        config.validate()
+        self._config, self._params, self._seed = config, params, seed
+        self._noise = np.repeat([config.accelerometer_noise, config.gyroscope_noise], 3)
+        self._walk = np.repeat([config.accelerometer_walk, config.gyroscope_walk], 3)
+        self.DeclareVectorInputPort("state", 13)
+        self.DeclareVectorInputPort("command", 4)
+        at_rest = self.DeclareDiscreteState(np.array([0.0, 0.0, params.gravity]))
+        self.DeclareStateOutputPort("accelerometer", at_rest)
+        self.DeclareStateOutputPort("gyroscope", self.DeclareDiscreteState(3))
+        self.DeclareDiscreteState(6)  # biases
+        self.DeclarePeriodicDiscreteUpdateEvent(1.0 / config.rate, 0.0, self._sample)
+
+    def _sample(self, context: Context, discrete_state: DiscreteValues) -> None:
+        state, command = (vector_input(self, name, context) for name in ("state", "command"))
+        rate, bias = self._config.rate, np.array(context.get_discrete_state(2).value())
+        random = sample_generator(self, self._seed, context.get_time(), rate)
+        white, step = random.standard_normal((2, 6))
+        force = specific_force(state, command, self._params)
+        measured = np.append(force, QuadrotorState.of(state).w_WB_B)
+        measured += bias + self._noise * np.sqrt(rate) * white
+        next_bias = bias + self._walk / np.sqrt(rate) * step
+        for group, values in enumerate((measured[:3], measured[3:], next_bias)):
+            discrete_state.set_value(group, values)
+
+
+def sample_generator(system: Any, seed: int, time: float, rate: float) -> np.random.Generator:
+    """Returns the random numbers of a sensor's sample at a time [s], of the rate [Hz]."""
+    name = zlib.crc32(system.get_name().encode())
+    return np.random.default_rng([seed, name, int(np.floor(time * rate + 1e-6))])

@@ -1,0 +1,79 @@
+import numpy as np
+import pytest
+from pydrake.math import RollPitchYaw
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
+
+from splatpilot.systems.sensing.imu import Imu, ImuSensor, specific_force
+from splatpilot.systems.vehicle.quadrotor import QuadrotorParams, QuadrotorPlant, hover_state
+
+IDEAL = {
+    name: 0.0
+    for name in (
+        "accelerometer_noise",
+        "gyroscope_noise",
+        "accelerometer_walk",
+        "gyroscope_walk",
+    )
+}
+PARAMS = QuadrotorParams()
+
+
+def measure(config: Imu, seed: int, duration: float, command=(9.81, 0.0, 0.0, 0.0), name="imu"):
+    builder = DiagramBuilder()
+    plant = builder.AddSystem(QuadrotorPlant(PARAMS, hover_state([0.0, 0.0, 5.0])))
+    source = builder.AddSystem(ConstantVectorSource(np.array(command)))
+    imu = builder.AddNamedSystem(name, ImuSensor(config, PARAMS, seed))
+    builder.Connect(source.get_output_port(), plant.GetInputPort("command"))
+    builder.Connect(source.get_output_port(), imu.GetInputPort("command"))
+    builder.Connect(plant.GetOutputPort("state"), imu.GetInputPort("state"))
+    logs = [
+        LogVectorOutput(imu.GetOutputPort(port), builder, 1.0 / config.rate)
+        for port in ("accelerometer", "gyroscope")
+    ]
+    simulator = Simulator(builder.Build())
+    simulator.AdvanceTo(duration)
+    return [log.FindLog(simulator.get_context()).data()[:, 1:].T for log in logs]
+
+
+@pytest.mark.parametrize("roll", [0.0, 0.7])
+def test_specific_force_is_thrust_less_drag_in_body_axes(roll):
+    R_WB = RollPitchYaw(roll, 0.2, 1.0).ToRotationMatrix()
+    v_WB = np.array([2.0, -1.0, 0.5])
+    q_WB = R_WB.ToQuaternion().wxyz()
+    state = np.concatenate([np.zeros(3), v_WB, q_WB, np.zeros(3)])
+    expected = [0.0, 0.0, 12.0] - PARAMS.drag * (R_WB.matrix().T @ v_WB)
+    force = specific_force(state, np.array([12.0, 0.0, 0.0, 0.0]), PARAMS)
+    np.testing.assert_allclose(force, expected, atol=1e-12)
+
+
+def test_an_ideal_imu_measures_hover_and_rates():
+    accelerometer, _ = measure(Imu(**IDEAL), 0, 0.5)
+    np.testing.assert_allclose(accelerometer, np.tile([0.0, 0.0, 9.81], (100, 1)), atol=1e-9)
+    _, gyroscope = measure(Imu(**IDEAL), 0, 1.0, command=(9.81, 0.0, 0.0, 0.4))
+    np.testing.assert_allclose(gyroscope[-1], [0.0, 0.0, 0.4], atol=1e-6)
+
+
+def test_white_noise_has_the_density():
+    config = Imu(**IDEAL | {"accelerometer_noise": 0.01, "gyroscope_noise": 0.001})
+    accelerometer, gyroscope = measure(config, 3, 20.0)
+    assert accelerometer.std(axis=0) == pytest.approx(0.01 * np.sqrt(200.0), rel=0.05)
+    assert gyroscope.std(axis=0) == pytest.approx(0.001 * np.sqrt(200.0), rel=0.05)
+
+
+def test_biases_walk():
+    config = Imu(**IDEAL | {"gyroscope_walk": 0.01})
+    gyroscope = np.vstack([measure(config, seed, 4.0)[1] for seed in range(3)])
+    steps = np.diff(gyroscope, axis=0)
+    small = np.abs(steps) < 0.01  # not those from one flight to the next
+    assert steps[small].std() == pytest.approx(0.01 / np.sqrt(200.0), rel=0.05)
+
+
+def test_noise_follows_from_seed_and_name():
+    first, again, other, renamed = (
+        measure(Imu(), seed, 0.1, name=name)[0]
+        for seed, name in ((1, "imu"), (1, "imu"), (2, "imu"), (1, "second"))
+    )
+    np.testing.assert_array_equal(first, again)
+    assert not np.isclose(first, other).any() and not np.isclose(first, renamed).any()
