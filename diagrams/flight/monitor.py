@@ -2,6 +2,8 @@
 
 import copy
 import enum
+import math
+from typing import Any
 
 import numpy as np
 from pydrake.common.value import Value
@@ -13,6 +15,8 @@ from pydrake.systems.framework import (
     LeafSystem,
     OutputPort,
     System,
+    ValueProducer,
+    WitnessFunction,
     WitnessFunctionDirection,
 )
 from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
@@ -21,14 +25,13 @@ from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf_collision import EsdfCollision
-from splatpilot.systems.common.drake import connect, vector_input, vector_output, weak_callback
+from splatpilot.systems.common.drake import connect, vector_output, weak_callback
 from splatpilot.systems.messaging.flight_limits import LEVEL
 from splatpilot.systems.vehicle.state import QuadrotorState
 
 LOG_PERIOD = 0.02  # [s]
 _TOUCH = 0.03  # [m] max clearance of a landed vehicle, and
 _TOUCHDOWN_SPEED = 0.8  # [m/s] its max speed.
-_KNOWN = FieldState.UNKNOWN - 0.5  # Known space has a lower `FieldState`.
 
 
 class Outcome(enum.StrEnum):
@@ -53,9 +56,19 @@ def start_position(scenario: Scenario, world: World) -> np.ndarray:
     return np.asarray(world.p_WS if scenario.start is None else scenario.start, dtype=float)
 
 
-def _outcome(clearance: float, known: float, to_goal: float) -> Outcome | None:
-    """Returns the outcome by the first margin that is not positive; NaN is no margin."""
-    margins = {Outcome.COLLISION: clearance, Outcome.LEFT_VOLUME: known, Outcome.GOAL: to_goal}
+def _margins(
+    state: np.ndarray, p_WG: np.ndarray, clearance: float, field_state: float, goal_radius: float
+) -> dict[Outcome, float]:
+    """Returns what is left until each outcome; NaN is no margin."""
+    return {
+        Outcome.COLLISION: clearance,
+        Outcome.LEFT_VOLUME: FieldState.UNKNOWN - 0.5 - field_state,
+        Outcome.GOAL: math.dist(p_WG, QuadrotorState.of(state).p_WB) - goal_radius,
+    }
+
+
+def _outcome(margins: dict[Outcome, float]) -> Outcome | None:
+    """Returns the outcome of the first margin that is not positive."""
     return next((outcome for outcome, margin in margins.items() if margin <= 0), None)
 
 
@@ -73,7 +86,7 @@ class FlightMonitor(LeafSystem):
     - ``outcome``: str, of `Outcome` at this instant; empty during the flight.
 
     Each simulator step ends with ReachedTermination if the flight is over. Where the Context has an
-    accuracy, as `make_flight_simulator` sets it, witness functions end the step at that instant.
+    accuracy, as `make_flight_simulator` sets it, a witness function ends the step at that instant.
     """
 
     def __init__(self, scenario: Scenario, world: World) -> None:
@@ -84,37 +97,35 @@ class FlightMonitor(LeafSystem):
             self.DeclareVectorInputPort(name, size)
         calc = weak_callback(self._calc_outcome)
         self.DeclareAbstractOutputPort("outcome", lambda: Value(""), calc)
-        self._witnesses = [
-            self.MakeWitnessFunction(
-                name, WitnessFunctionDirection.kPositiveThenNonPositive, weak_callback(margin)
-            )
-            for name, margin in (
-                ("contact", self._clearance),
-                ("left volume", self._known),
-                ("goal", self._to_goal),
-            )
-        ]
+        calc = weak_callback(self._calc_margins)
+        self._margins = self.DeclareCacheEntry(
+            "margins", ValueProducer(lambda: Value(object), calc), {self.all_input_ports_ticket()}
+        ).cache_index()
+        self._witness = self.MakeWitnessFunction(
+            "end",
+            WitnessFunctionDirection.kPositiveThenNonPositive,
+            weak_callback(self._least_margin),
+        )
         self.DeclarePerStepPublishEvent(self._check)
         self.DeclarePeriodicPublishEvent(scenario.timeout, scenario.timeout, self._check)
 
-    def DoGetWitnessFunctions(self, context: Context) -> list:
+    def DoGetWitnessFunctions(self, context: Context) -> list[WitnessFunction]:
         # Drake cannot isolate the instant without an accuracy.
-        return [] if context.get_accuracy() is None else self._witnesses
+        return [] if context.get_accuracy() is None else [self._witness]
 
-    def _clearance(self, context: Context) -> float:
-        return float(vector_input(self, "clearance", context)[0])
+    def _calc_margins(self, context: Context, margins: Any) -> None:
+        state, p_WG, clearance, field_state = (
+            self.get_input_port(index).Eval(context) for index in range(4)
+        )
+        radius = self.scenario.goal_radius
+        margins.set_value(_margins(state, p_WG, clearance[0], field_state[0], radius))
 
-    def _known(self, context: Context) -> float:
-        return _KNOWN - float(vector_input(self, "field_state", context)[0])
-
-    def _to_goal(self, context: Context) -> float:
-        p_WB = QuadrotorState.of(vector_input(self, "state", context)).p_WB
-        distance = np.linalg.norm(vector_input(self, "goal", context) - p_WB)
-        return float(distance) - self.scenario.goal_radius
+    def _least_margin(self, context: Context) -> float:
+        return min(self.get_cache_entry(self._margins).Eval(context).values())
 
     def outcome(self, context: Context) -> Outcome | None:
         """Returns the outcome at the instant of this system's Context; None during the flight."""
-        outcome = _outcome(self._clearance(context), self._known(context), self._to_goal(context))
+        outcome = _outcome(self.get_cache_entry(self._margins).Eval(context))
         is_late = context.get_time() >= self.scenario.timeout
         return outcome or (Outcome.TIMEOUT if is_late else None)
 
@@ -194,11 +205,10 @@ def flight_outcome(
     diagram: Diagram, context: Context, p_WG: np.ndarray, goal_radius: float
 ) -> Outcome | None:
     """Returns the outcome at this instant, by the ports of a hardware diagram; None in flight."""
-    clearance, field_state, state = (
-        vector_output(diagram, name, context) for name in ("clearance", "field_state", "state")
+    state, clearance, field_state = (
+        vector_output(diagram, name, context) for name in ("state", "clearance", "field_state")
     )
-    distance = float(np.linalg.norm(p_WG - QuadrotorState.of(state).p_WB))
-    return _outcome(clearance[0], _KNOWN - field_state[0], distance - goal_radius)
+    return _outcome(_margins(state, p_WG, clearance[0], field_state[0], goal_radius))
 
 
 def has_landed(diagram: Diagram, context: Context) -> bool:
