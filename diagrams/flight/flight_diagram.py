@@ -206,7 +206,8 @@ def AddFlight(
             ConnectOrExport(builder, system, known, f"{prefix}{what}")
     onboard = None
     if camera:
-        onboard = builder.AddNamedSystem("camera", MakeCamera(scenario, world))
+        onboard = MakeCamera(scenario, world)
+        builder.AddNamedSystem("camera", onboard)
         builder.Connect(pose, onboard.GetInputPort("body_pose"))
 
     # End and logs.
@@ -340,7 +341,7 @@ def BuildFlightDiagram(
     ExportFlight(builder, parts)
     if meshcat is not None:
         AddMeshcat(builder, parts, meshcat)
-    if video:
+    if video and parts.camera is not None:
         VideoRecorder.AddToBuilder(builder, parts.camera, scenario.camera.fps)
     try:
         diagram = builder.Build()

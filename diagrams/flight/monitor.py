@@ -3,7 +3,7 @@
 import copy
 import enum
 import math
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from pydrake.common.value import Value
@@ -115,21 +115,24 @@ class FlightMonitor(LeafSystem):
 
     def _calc_margins(self, context: Context, margins: Any) -> None:
         state, p_WG, clearance, field_state = (
-            self.get_input_port(index).Eval(context) for index in range(4)
+            np.asarray(self.get_input_port(index).Eval(context)) for index in range(4)
         )
         radius = self.scenario.goal_radius
         margins.set_value(_margins(state, p_WG, clearance[0], field_state[0], radius))
 
     def _least_margin(self, context: Context) -> float:
-        return min(self.get_cache_entry(self._margins).Eval(context).values())
+        return min(self._eval_margins(context).values())
+
+    def _eval_margins(self, context: Context) -> dict[Outcome, float]:
+        return cast(dict[Outcome, float], self.get_cache_entry(self._margins).Eval(context))
 
     def outcome(self, context: Context) -> Outcome | None:
         """Returns the outcome at the instant of this system's Context; None during the flight."""
-        outcome = _outcome(self.get_cache_entry(self._margins).Eval(context))
+        outcome = _outcome(self._eval_margins(context))
         is_late = context.get_time() >= self.scenario.timeout
         return outcome or (Outcome.TIMEOUT if is_late else None)
 
-    def _calc_outcome(self, context: Context, output: Value) -> None:
+    def _calc_outcome(self, context: Context, output: Any) -> None:
         output.set_value(str(self.outcome(context) or ""))
 
     def _check(self, context: Context) -> EventStatus:
@@ -167,7 +170,8 @@ def AddFlightMonitor(
     if goal is None:
         source = ConstantVectorSource(goal_position(scenario, world))
         goal = builder.AddNamedSystem("goal", source).get_output_port()
-    monitor = builder.AddNamedSystem("monitor", FlightMonitor(scenario, world))
+    monitor = FlightMonitor(scenario, world)
+    builder.AddNamedSystem("monitor", monitor)
     clearance = collision.GetOutputPort("clearance")
     for name, port in (
         ("state", state),

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 from pydrake.common import RandomGenerator
 from pydrake.systems.analysis import Simulator
@@ -46,7 +47,7 @@ def random_flights(
     def make_simulator(generator: RandomGenerator) -> Simulator:
         sample = replace(scenario, seed=MONTE_CARLO_SEEDS[generator() % len(MONTE_CARLO_SEEDS)])
         flown = world or make_world(sample.world, sample.seed)
-        made = {
+        made: dict[str, Any] = {
             name: system if isinstance(system, str) else system(sample, flown)
             for name, system in systems.items()
         }
