@@ -36,8 +36,8 @@ def random_flights(
     Args:
         scenario: of the flights, but for its seed.
         world: of all flights; by default made of each seed, which is slow.
-        systems: arguments of `BuildFlightDiagram` such as `policy="velocity"`; systems are made
-            anew for each flight, by functions of its scenario and world.
+        systems: arguments of `BuildFlightDiagram` such as `policy="velocity"`; functions of
+            scenario and world make a system for each flight.
 
     Returns:
         The `make_simulator` of these functions, which raises `InfeasibleFlightError` for a world
