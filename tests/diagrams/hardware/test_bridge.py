@@ -76,6 +76,8 @@ def test_ports_are_those_of_the_flight_diagram(post_world):
     hardware = BuildHardwareDiagram(scenario, post_world, lcm.LCM("memq://"))
     for index in range(flight.num_output_ports()):
         port = flight.get_output_port(index)
+        if port.get_name() == "outcome" or port.get_name().startswith("observation_"):
+            continue
         assert hardware.GetOutputPort(port.get_name()).size() == port.size()
 
 
