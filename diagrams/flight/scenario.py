@@ -36,7 +36,6 @@ WITHOUT_EFFECT = (
     "renderer_class",
     "background",
     "capture_offset",
-    "output_delay",
     "label",
     "show_rgb",
     "do_compress",
@@ -127,6 +126,8 @@ def _check_camera(camera: CameraConfig) -> None:
     center = camera.principal_point()
     valid = np.all((center > 0) & (center < [camera.width, camera.height]))
     require(valid, "camera's principal point", "inside the image [pixels]", center.tolist())
+    delay = camera.output_delay
+    require(0.0 <= delay <= 1.0, "camera.output_delay", "in [0, 1] s", delay)
     require(0.01 <= camera.fps <= 1000, "camera.fps", "in [0.01, 1000] Hz", camera.fps)
     for name in WITHOUT_EFFECT:
         value, default = (repr(getattr(c, name)) for c in (camera, CameraConfig()))

@@ -9,7 +9,9 @@ from pydrake.systems.framework import System
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.common.config import require_configuration
 from splatpilot.systems.common.registry import Registry
+from splatpilot.systems.sensing.imu import Imu, ImuSensor
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
+from splatpilot.systems.sensing.range_finder import RangeFinder, RangeFinderSensor
 from splatpilot.systems.splats.splat_camera import SplatCamera
 
 
@@ -28,18 +30,20 @@ class SensorEntry:
     """Entry of the registry."""
 
     config: type  # of its configurations
-    build: Callable[[Any, World], System]
-    """Makes a system of a configuration and the world. Its inputs `body_pose` (X_WB), `state` and
-    `start_pose` (X_WB the configuration's `readout` [s] before) are connected to the vehicle, if
-    any. An output `p` of the sensor `s` is the output `s_p` of the flight, and the input of that
-    name of the policy."""
+    build: Callable[[Any, World, Any], System]
+    """Makes a system of a configuration, the world and the scenario, with its seed.
+
+    Its inputs are any of `state` (13) and `body_pose` (X_WB), the true ones, `command` (4), `goal`
+    (3), `moving` (see `MovingBodies`), `start_pose` (X_WB the configuration's `readout` [s]
+    before), the policy's images, and outputs of other sensors. An output `p` of the sensor `s` is
+    the output `s_p` of the flight, and the input of that name of policies and sensors."""
 
 
 SENSORS = Registry("sensor", "splatpilot.sensors", SensorEntry)
 """All sensors, by the names of their configurations' types."""
 
 
-def register_sensor(config: type, build: Callable[[Any, World], System]) -> None:
+def register_sensor(config: type, build: Callable[[Any, World, Any], System]) -> None:
     """Registers a sensor.
 
     Args:
@@ -53,8 +57,10 @@ def register_sensor(config: type, build: Callable[[Any, World], System]) -> None
     SENSORS.add(config.__name__, SensorEntry(config, build))
 
 
-def make_camera(config: OnboardCamera, world: World, latency: float = 0.0) -> SplatCamera:
-    """Makes a camera of the Gaussians of the world, as they were `latency` [s] ago."""
+def make_camera(
+    config: OnboardCamera, world: World, latency: float | Callable[[float], float] = 0.0
+) -> SplatCamera:
+    """Makes a camera of the Gaussians of the world; for `latency` see `SplatCamera`."""
     return SplatCamera(
         world.baked,
         config.camera_info(),
@@ -68,4 +74,11 @@ def make_camera(config: OnboardCamera, world: World, latency: float = 0.0) -> Sp
     )
 
 
-register_sensor(OnboardCamera, make_camera)
+register_sensor(OnboardCamera, lambda config, world, scenario: make_camera(config, world))
+register_sensor(
+    Imu, lambda config, world, scenario: ImuSensor(config, scenario.vehicle, scenario.seed)
+)
+register_sensor(
+    RangeFinder,
+    lambda config, world, scenario: RangeFinderSensor(config, world.distance_field, scenario.seed),
+)
