@@ -45,6 +45,7 @@ from splatpilot.diagrams.flight.monitor import (
 )
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.worlds.appearance import randomize_appearance
+from splatpilot.diagrams.worlds.moving_spheres import add_moving_spheres
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.common.drake import connect
 from splatpilot.systems.common.provenance import InfeasibleFlightError
@@ -176,6 +177,7 @@ def AddFlight(
     scenario.validate()
     if scenario.appearance > 0:
         world = randomize_appearance(world, scenario.appearance, scenario.seed)
+    world = add_moving_spheres(world, scenario.moving)
     given = {"plant": plant, "controller": controller}
 
     # Vehicle.

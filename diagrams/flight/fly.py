@@ -30,6 +30,7 @@ from splatpilot.diagrams.flight.flight_diagram import (
 from splatpilot.diagrams.flight.monitor import flight_monitors, goal_position, start_position
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.worlds.appearance import randomize_appearance
+from splatpilot.diagrams.worlds.moving_spheres import add_moving_spheres
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.common.files import (
@@ -81,6 +82,7 @@ def write_flight_page(
     meshcat = open_meshcat(scenario, world)
     for k in range(len(flights)):
         draw_vehicle(meshcat, f"/splatpilot/vehicles/{k}", VEHICLE_RADIUS)
+    world = add_moving_spheres(world, scenario.moving)
     spheres = world.moving.spheres if world.moving else None
     page = replay_page(
         meshcat.StaticHtml(), world.gaussians, world.background, view, flights, spheres

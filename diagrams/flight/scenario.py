@@ -11,6 +11,7 @@ from pydrake.systems.sensors import CameraConfig
 from splatpilot.diagrams.flight.policies import POLICIES, PolicyConfig
 from splatpilot.diagrams.flight.sensors import SENSORS, SensorConfig
 from splatpilot.diagrams.worlds.forest.forest import ForestConfig
+from splatpilot.diagrams.worlds.moving_spheres import MovingSphere
 from splatpilot.diagrams.worlds.world_registry import WORLDS, WorldConfig
 from splatpilot.systems.common.config import registry_field
 from splatpilot.systems.common.seeds import check_seed
@@ -89,6 +90,8 @@ class Scenario(Config):
     policy: PolicyConfig = registry_field(POLICIES, PrivilegedPlannerConfig)
     # Further onboard sensors, by name; see `sensors.py`.
     sensors: dict[str, SensorConfig] = registry_field(SENSORS, dict)
+    # Spheres that move through the world, by name.
+    moving: dict[str, MovingSphere] = field(default_factory=dict)
     # Noise and latency of the policy's camera; none by default.
     observation: ObservationNoise = field(default_factory=ObservationNoise)
     controller: FlatnessControllerConfig = field(default_factory=FlatnessControllerConfig)

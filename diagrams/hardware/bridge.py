@@ -218,7 +218,7 @@ def require_messages_for(scenario: Scenario, world: World) -> None:
     """Raises ValueError for sensors and moving obstacles, which have no messages."""
     if sensors := blocks.onboard_sensors(scenario):
         raise ValueError(f"there are no messages of the sensors {', '.join(sensors)}; remove them")
-    if world.moving:
+    if world.moving or scenario.moving:
         raise ValueError(
             f"there are no messages of the moving obstacles in {world.name}; choose another world"
         )

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from gymnasium.spaces import Box
 from pydrake.common.schema import Rotation, Transform
+from pydrake.common.value import Value
 from pydrake.gym import DrakeGymEnv
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantVectorSource
+from pydrake.systems.sensors import ImageDepth32F
 
 from splatpilot.diagrams.flight.flight import (
     Outcome,
@@ -20,11 +22,15 @@ from splatpilot.diagrams.flight.flight_diagram import AddFlight, BuildFlightDiag
 from splatpilot.diagrams.flight.monte_carlo import random_flights
 from splatpilot.diagrams.flight.policies import POLICIES, policy_named
 from splatpilot.diagrams.flight.scenario import Scenario
-from splatpilot.diagrams.flight.sensors import SENSORS
+from splatpilot.diagrams.flight.sensors import SENSORS, SensorEntry
 from splatpilot.diagrams.worlds.world_registry import WORLDS, make_world
 from splatpilot.systems.common.config import dump_config, load_config, parse_config
+from splatpilot.systems.common.validation import Config
 from splatpilot.systems.policies.reactive import Reactive
+from splatpilot.systems.sensing.imu import Imu
+from splatpilot.systems.sensing.noise import ObservationNoise
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
+from splatpilot.systems.sensing.range_finder import RangeFinder
 from splatpilot.systems.vehicle.flatness import FlatnessController
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS, QuadrotorPlant
 
@@ -129,7 +135,7 @@ def test_ports_of_another_size_are_named(post_world):
             self.DeclareVectorOutputPort("waypoint", 3, lambda _, y: None)
             self.camera = OnboardCamera()
 
-    with pytest.raises(ValueError, match=r"'color_image' of SplatCamera \(not a vector\)"):
+    with pytest.raises(ValueError, match=r"'color_image' of SplatCamera \(ImageRgba8U"):
         flown(Scenario(timeout=1.0), post_world, policy=Painter())
 
 
@@ -362,3 +368,93 @@ def test_an_algebraic_loop_is_named(post_world):
         BuildFlightDiagram(
             Scenario(), post_world, camera=False, policy=Hasty(), estimator=FromCommand()
         )
+
+
+@dataclasses.dataclass
+class EchoConfig(Config):
+    pass
+
+
+def test_sensors_connect_to_command_images_and_each_other(post_world, monkeypatch):
+    class Echo(LeafSystem):
+        def __init__(self):
+            super().__init__()
+            self.DeclareVectorInputPort("goal", 3)
+            self.DeclareVectorInputPort("height_range", 1)
+            image = Value(ImageDepth32F())
+            self.DeclareAbstractInputPort("depth_image_32f", image)
+            self.DeclareVectorOutputPort("sum", 1, self._calc)
+
+        def _calc(self, context, output):
+            image = self.GetInputPort("depth_image_32f").Eval(context).data
+            height = self.GetInputPort("height_range").Eval(context)
+            output.SetAtIndex(0, height[0] + image.size)
+
+    entry = SensorEntry(EchoConfig, lambda config, world, scenario: Echo())
+    monkeypatch.setitem(SENSORS._entries, "EchoConfig", entry)
+    sensors = {"echo": EchoConfig(), "height": RangeFinder(noise=0.0), "imu": Imu()}
+    scenario = Scenario(sensors=sensors, timeout=0.5, policy=policy_named("straight", 1.0))
+    diagram = BuildFlightDiagram(scenario, post_world, camera=False)
+    simulator = make_flight_simulator(diagram)
+    simulator.AdvanceTo(0.5)
+    root = simulator.get_context()
+    assert diagram.GetOutputPort("echo_sum").Eval(root)[0] == np.inf  # no ground in this hall
+    force = diagram.GetOutputPort("imu_accelerometer").Eval(root)
+    assert 5.0 < force[2] < 25.0
+
+
+def test_an_input_that_a_sensor_cannot_have_is_named(post_world, monkeypatch):
+    class Gust(LeafSystem):
+        def __init__(self):
+            super().__init__()
+            self.DeclareVectorInputPort("wind", 3)
+
+    entry = SensorEntry(EchoConfig, lambda config, world, scenario: Gust())
+    monkeypatch.setitem(SENSORS._entries, "EchoConfig", entry)
+    with pytest.raises(ValueError, match=r"input 'wind' of the sensor 'gust' Gust; there are"):
+        flown(Scenario(sensors={"gust": EchoConfig()}), post_world)
+
+
+def test_an_image_of_another_size_is_refused(post_world):
+    class Small(LeafSystem):
+        def __init__(self):
+            super().__init__()
+            self.DeclareAbstractInputPort("depth_image_32f", Value(ImageDepth32F(10, 10)))
+            self.DeclareVectorOutputPort("velocity", 3, lambda context, output: None)
+
+    with pytest.raises(ValueError, match=r"ImageDepth32F of 10x10.*ImageDepth32F of 64x36"):
+        BuildFlightDiagram(Scenario(), post_world, camera=False, policy=Small())
+
+
+def test_image_time_of_a_late_policy_camera_is_that_of_the_capture(post_world):
+    noise = ObservationNoise(latency=0.2)
+    scenario = Scenario(policy=policy_named("reactive"), observation=noise, timeout=2.0)
+    diagram = BuildFlightDiagram(scenario, post_world, camera=False)
+    simulator = make_flight_simulator(diagram)
+    simulator.AdvanceTo(1.0)
+    camera = diagram.GetSubsystemByName("policy_camera")
+    context = camera.GetMyContextFromRoot(simulator.get_context())
+    assert camera.image_time_output_port().Eval(context)[0] == pytest.approx(0.8)
+
+
+def test_output_delay_delays_the_camera(post_world):
+    overrides = ["camera.output_delay=0.1", "camera.width=8", "camera.height=6"]
+    scenario = load_config(Scenario(timeout=2.0), overrides=overrides)
+    diagram = BuildFlightDiagram(scenario, post_world)
+    simulator = make_flight_simulator(diagram)
+    simulator.AdvanceTo(0.9)
+    plant = diagram.GetSubsystemByName("plant")
+    state = plant.GetOutputPort("state")
+    before = state.Eval(plant.GetMyContextFromRoot(simulator.get_context()))[:3]
+    simulator.AdvanceTo(1.0)
+    camera = diagram.GetSubsystemByName("camera")
+    context = camera.GetMyContextFromRoot(simulator.get_context())
+    assert camera.image_time_output_port().Eval(context)[0] == pytest.approx(0.9)
+    X_WB = camera.body_pose_in_world_output_port().Eval(context)
+    np.testing.assert_allclose(X_WB.translation(), before, atol=1e-3)
+
+
+@pytest.mark.parametrize("name", ["output_delay=2", "capture_offset=0.1"])
+def test_delays_that_a_camera_cannot_have_are_refused(name):
+    with pytest.raises(ValueError, match=rf"camera\.{name.partition('=')[0]} must be"):
+        load_config(Scenario(), overrides=[f"camera.{name}"]).validate()

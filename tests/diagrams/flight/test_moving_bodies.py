@@ -1,23 +1,40 @@
 """Flights among bodies that move: seen, hit and planned around where they are at the time."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from pydrake.geometry import Meshcat
 from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
 
-from splatpilot.diagrams.flight.flight import Outcome, fly, sample_initial_state
-from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
+from splatpilot.diagrams.flight.flight import Outcome, fly, fly_all, sample_initial_state
+from splatpilot.diagrams.flight.flight_diagram import AddFlight, BuildFlightDiagram
 from splatpilot.diagrams.flight.policies import policy_named
 from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.worlds.moving_spheres import MovingSphere
 from splatpilot.diagrams.worlds.world import World
-from splatpilot.systems.collision.shapes import MovingSpheres
+from splatpilot.systems.collision.esdf_build import esdf_from_distance_field
+from splatpilot.systems.collision.shapes import AnalyticDistanceField, HalfSpace, MovingSpheres
+from splatpilot.systems.common.config import dump_config, parse_config
 from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.splats.baked_scene import MovingGaussians
 from splatpilot.systems.splats.moving_bodies import MovingObstacles
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
+
+
+@pytest.fixture(scope="module")
+def open_world(post_world) -> World:
+    """The hall without its post, and with one Gaussian beyond it."""
+    lower, upper = post_world.distance_field.lower_W, post_world.distance_field.upper_W
+    field = AnalyticDistanceField([HalfSpace([0, 0, 1], -9.0)], lower, upper)
+    beyond = GaussianScene.from_colors(
+        [[50.0, 50.0, 0.0]], [[1.0, 0, 0, 0]], [[0.1] * 3], [0.9], [[1.0, 0, 0]]
+    )
+    esdf = esdf_from_distance_field(field, 0.2)
+    return replace(post_world, gaussians=beyond, distance_field=field, esdf=esdf)
 
 
 def with_sphere(world: World, path: np.ndarray, radius: float = 0.5) -> World:
@@ -134,3 +151,74 @@ def test_meshcat_shows_moving_spheres(post_world):
         diagram = BuildFlightDiagram(scenario, flown, meshcat=meshcat)
         assert diagram.HasSubsystemNamed("spheres_visualizer") == shown
         assert meshcat.HasPath("/splatpilot/spheres/0") == shown
+
+
+@pytest.mark.parametrize(
+    ("policy", "outcome"), [("straight", Outcome.COLLISION), ("planner", Outcome.GOAL)]
+)
+def test_two_vehicles_meet_head_on(open_world, policy, outcome):
+    a, z = open_world.p_WS.tolist(), open_world.p_WG.tolist()
+    scenario = Scenario(timeout=20.0, policy=policy_named(policy), start_radius=0.0)
+    builder = DiagramBuilder()
+    there, back = replace(scenario, start=a, goal=z), replace(scenario, start=z, goal=a)
+    one = AddFlight(builder, there, open_world, name="one", camera=False)
+    AddFlight(builder, back, open_world, name="two", camera=False, others=[one])
+    flights = list(fly_all(builder.Build()).values())
+    assert {flight.outcome for flight in flights} == {outcome}
+    for flight in flights:
+        collides = outcome == Outcome.COLLISION
+        assert (flight.clearances.min() <= 0.0) == collides
+    ends = [flight.times[-1] for flight in flights]
+    if outcome == Outcome.COLLISION:
+        one_p, two_p = (flight.states[-1, :3] for flight in flights)
+        assert ends[0] == ends[1]
+        assert np.linalg.norm(one_p - two_p) == pytest.approx(2 * VEHICLE_RADIUS, abs=1e-6)
+
+
+def test_vehicles_see_each_other(open_world):
+    a, z = open_world.p_WS, np.add(open_world.p_WS, [2.0, 0.0, 0.0])
+    goals = open_world.p_WG.tolist(), open_world.p_WS.tolist()
+    builder = DiagramBuilder()
+    scenario = Scenario(start_radius=0.0, policy=policy_named("reactive"))
+    one = AddFlight(builder, replace(scenario, start=a.tolist(), goal=goals[0]), open_world)
+    other = replace(scenario, start=z.tolist(), goal=goals[1])
+    two = AddFlight(builder, other, open_world, name="two", others=[one])
+    root = builder.Build().CreateDefaultContext()
+    for parts in (one, two):
+        camera = parts.camera
+        context = camera.GetMyContextFromRoot(root)
+        depth = camera.depth_image_32f_output_port().Eval(context).data[120, 160, 0]
+        label = camera.label_image_output_port().Eval(context).data[120, 160, 0]
+        assert depth == pytest.approx(1.9 - 0.25 * VEHICLE_RADIUS, abs=0.1) and label == 0
+        image = parts.observation["depth_image_32f"]
+        context = image.get_system().GetMyContextFromRoot(root)
+        assert np.isclose(image.Eval(context).data[..., 0], depth, atol=0.1).any()
+        context = parts.collision.GetMyContextFromRoot(root)
+        clearance = parts.collision.GetOutputPort("clearance").Eval(context)[0]
+        assert clearance <= 2.0 - 2 * VEHICLE_RADIUS + 1e-9
+
+
+def test_vehicles_that_start_in_contact_are_refused(open_world):
+    builder, scenario = DiagramBuilder(), Scenario(start_radius=0.0)
+    one = AddFlight(builder, scenario, open_world, camera=False)
+    with pytest.raises(InfeasibleFlightError, match="starts of two and flight must be >"):
+        AddFlight(builder, scenario, open_world, name="two", camera=False, others=[one])
+
+
+def test_spheres_of_a_scenario_move(post_world):
+    path = {"waypoints": [[1.0, 0.0, 4.0], [1.0, 0.0, 1.0]], "radius": 0.5, "speed": 2.0}
+    text = f"moving: {{ball: {json.dumps(path)}}}"
+    scenario = parse_config(hovering(), text, "text")
+    assert parse_config(Scenario(), dump_config(scenario), "dump").moving == scenario.moving
+    flight = fly(BuildFlightDiagram(scenario, post_world, camera=False))
+    assert flight.outcome == Outcome.COLLISION
+    assert flight.times[-1] == pytest.approx((2.0 - 0.5 - VEHICLE_RADIUS) / 2.0, abs=0.03)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"), [("radius", 0.0), ("speed", -1.0), ("waypoints", [[1.0, 2.0]])]
+)
+def test_invalid_spheres_are_named(field, value):
+    scenario = Scenario(moving={"ball": MovingSphere(**{field: value})})
+    with pytest.raises(ValueError, match=rf"moving\.ball\.{field} must be .*, got"):
+        scenario.validate()
