@@ -17,6 +17,8 @@ from .diagrams.flight.monte_carlo import random_flights
 from .diagrams.flight.policies import policy_named, register_policy
 from .diagrams.flight.scenario import Scenario
 from .diagrams.flight.sensors import register_sensor
+from .diagrams.worlds.moving_spheres import MovingSphere
+from .diagrams.worlds.splat_world import AddSplatWorld
 from .diagrams.worlds.world import World
 from .diagrams.worlds.world_registry import make_world, register_world
 from .systems.collision.esdf import Esdf
@@ -26,17 +28,21 @@ from .systems.common.config import dump_config, load_config
 from .systems.common.validation import Config, bounded
 from .systems.policies.hypotheses import HypothesisSelector
 from .systems.policies.planner import PrivilegedPlanner
+from .systems.sensing.imu import Imu
 from .systems.sensing.noise import ObservationNoise
 from .systems.sensing.onboard_camera import OnboardCamera
+from .systems.sensing.range_finder import RangeFinder
 from .systems.splats.baked_scene import BakedScene
 from .systems.splats.lens import Distortion
+from .systems.splats.moving_bodies import MovingBodies
 from .systems.splats.rasterization import rasterize
-from .systems.splats.render_engine import SplatRenderEngine
+from .systems.splats.render_engine import SplatRenderEngine, gaussian_properties
 from .systems.splats.scene import GaussianScene
 from .systems.splats.splat_camera import SplatCamera
 from .systems.splats.splat_files import read_ply, write_ply
 from .systems.vehicle.flatness import FlatnessController
 from .systems.vehicle.quadrotor import QuadrotorParams, QuadrotorPlant, hover_state
+from .systems.vehicle.quadrotor_geometry import QuadrotorGeometry, quadrotor_gaussians
 from .systems.vehicle.state import QuadrotorState, StateToPose
 from .training.captures.capture import Capture
 from .training.captures.capture_registry import read_capture, register_capture
@@ -46,6 +52,7 @@ from .training.reconstruction.reconstruct import reconstruct
 __all__ = [
     "AddFlight",
     "AddFlightMonitor",
+    "AddSplatWorld",
     "BakedScene",
     "BuildFlightDiagram",
     "Capture",
@@ -60,14 +67,19 @@ __all__ = [
     "FlightParts",
     "GaussianScene",
     "HypothesisSelector",
+    "Imu",
     "MakeCamera",
+    "MovingBodies",
+    "MovingSphere",
     "ObservationNoise",
     "OnboardCamera",
     "Outcome",
     "PrivilegedPlanner",
+    "QuadrotorGeometry",
     "QuadrotorParams",
     "QuadrotorPlant",
     "QuadrotorState",
+    "RangeFinder",
     "Scenario",
     "SplatCamera",
     "SplatRenderEngine",
@@ -79,11 +91,13 @@ __all__ = [
     "field_mesh",
     "fly",
     "fly_all",
+    "gaussian_properties",
     "hover_state",
     "load_config",
     "make_flight_simulator",
     "make_world",
     "policy_named",
+    "quadrotor_gaussians",
     "random_flights",
     "rasterize",
     "read_capture",

@@ -48,7 +48,7 @@ class OnboardCamera(Config):
         "p_BC": "X_BC.translation",
         "pitch": "X_BC.rotation: !Rpy {deg: [PITCH - 90, 0, -90]}",
     }
-    """What to write instead of fields of former versions."""
+    """Fields of former versions, and those that replace them."""
 
     def __eq__(self, other: object) -> bool:
         """Compares all fields; Drake's transforms compare by identity."""

@@ -152,7 +152,7 @@ class QuadrotorGeometry(LeafSystem):
         of radius `VEHICLE_RADIUS`.
 
         Args:
-            label: of the vehicle in label images; `RenderLabel.kUnspecified` if None.
+            label: of the vehicle in label images; `RenderLabel.kDontCare` if None.
         """
         source = scene_graph.RegisterSource(name)
         frame = scene_graph.RegisterFrame(source, GeometryFrame(name))
@@ -161,7 +161,7 @@ class QuadrotorGeometry(LeafSystem):
             perception, illustration = PerceptionProperties(), IllustrationProperties()
             for properties in (perception, illustration):
                 properties.AddProperty("phong", "diffuse", part.color)
-            perception.AddProperty("label", "id", label or RenderLabel.kUnspecified)
+            perception.AddProperty("label", "id", label or RenderLabel.kDontCare)
             geometry.set_perception_properties(perception)
             geometry.set_illustration_properties(illustration)
             scene_graph.RegisterGeometry(source, frame, geometry)
