@@ -148,8 +148,8 @@ def AddFlight(
             `splatpilot.systems.policies.hypotheses`), `command` (4: thrust [m/s^2], body rates
             [rad/s]), `acceleration`, `velocity` and `waypoint` (3 each), and optionally `heading`
             (1). Its inputs are any of `state` (13), `goal` (3), `depth_image_32f`, `color_image`
-            and `depth_grid` of its own camera (its attribute `camera`, an `OnboardCamera`), and the
-            outputs of sensors.
+            and `depth_grid` of its own camera (its attribute `camera`, an `OnboardCamera`), the
+            outputs of sensors, and `moving` of `MovingBodies`, without a value if nothing moves.
 
             A decision, such as "velocity", becomes an exported input of that name.
         plant: replaces `QuadrotorPlant`: any system with the input `command` (4) and the output
