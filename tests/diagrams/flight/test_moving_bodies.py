@@ -154,11 +154,16 @@ def test_meshcat_shows_moving_spheres(post_world):
 
 
 @pytest.mark.parametrize(
-    ("policy", "outcome"), [("straight", Outcome.COLLISION), ("planner", Outcome.GOAL)]
+    ("policy", "outcome"),
+    [
+        ("straight", Outcome.COLLISION),
+        ("planner", Outcome.GOAL),
+        ("reactive", Outcome.GOAL),
+    ],
 )
 def test_two_vehicles_meet_head_on(open_world, policy, outcome):
-    a, z = open_world.p_WS.tolist(), open_world.p_WG.tolist()
-    scenario = Scenario(timeout=20.0, policy=policy_named(policy), start_radius=0.0)
+    a, z = [1.0, 0.0, 2.0], [9.0, 0.4, 2.0]
+    scenario = Scenario(timeout=12.0, policy=policy_named(policy), start_radius=0.0)
     builder = DiagramBuilder()
     there, back = replace(scenario, start=a, goal=z), replace(scenario, start=z, goal=a)
     one = AddFlight(builder, there, open_world, name="one", camera=False)
