@@ -6,11 +6,24 @@ from typing import Any, ClassVar, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pydrake.autodiffutils import AutoDiffXd
 from pydrake.common.value import Value
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import (
+    BasicVector_,  # pyright: ignore[reportAttributeAccessIssue]
+    Context,
+    DiscreteStateIndex,
+    DiscreteValues,
+    LeafSystem,
+    LeafSystem_,  # pyright: ignore[reportAttributeAccessIssue]
+    PortDataType,
+    ValueProducer,
+)
+from pydrake.systems.scalar_conversion import SystemScalarConverter
 from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
+from splatpilot.systems.common.drake import vector_input, weak_callback
+from splatpilot.systems.common.scalars import float_values
 from splatpilot.systems.common.validation import Config, bounded, require
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.vehicle.state import QuadrotorState, pose_from_state
@@ -29,6 +42,12 @@ class Observation(NamedTuple):
     p_WG: np.ndarray  # (3,) [m], the goal
     # (H, W) [m] planar depth, (H, W, 3) uint8 RGB, or (9, 16) proximities; else empty.
     image: np.ndarray
+
+
+def observation(time: Any, state: Any, p_WG: Any, image: Any = None) -> Observation:
+    """Returns the observation of a state (13,), a goal (3,) [m] and, if any, an image."""
+    image = np.empty(0) if image is None else image
+    return Observation(time, pose_from_state(state), QuadrotorState.of(state), p_WG, image)
 
 
 @dataclass
@@ -69,15 +88,24 @@ class Policy(LeafSystem):
     - ``depth_grid`` (144): proximities in 16x9 cells, see
       :class:`~splatpilot.systems.sensing.time_of_flight.TimeOfFlightGrid`.
 
+    Converted to AutoDiffXd, a policy decides by the values of its inputs, and its decisions have
+    zero derivatives; or exact ones, if it is `differentiable`.
+
     Args:
         config: has `rate` [Hz] and `validate()`; with an image of a camera, `camera`.
         image: name of the image port; empty if the policy has none.
     """
 
+    differentiable: ClassVar[bool] = False
+    """If `decide` also takes AutoDiffXd."""
+
     def __init__(self, config: Any, image: str = "") -> None:
-        super().__init__()
+        converter = SystemScalarConverter()
+        converter._AddConstructor[AutoDiffXd, float](_AutoDiffPolicy)
+        super().__init__(converter=converter)
         config.validate()
         self._config, self._image = config, image
+        self.state_outputs: dict[str, DiscreteStateIndex] = {}
         self._state_port = self.DeclareVectorInputPort("state", 13)
         self._goal_port = self.DeclareVectorInputPort("goal", 3)
         if image in _CHANNELS:
@@ -93,6 +121,7 @@ class Policy(LeafSystem):
         group = self.DeclareDiscreteState(np.asarray(initial, dtype=float))
         if output:
             self.DeclareStateOutputPort(output, group)
+            self.state_outputs[output] = group
 
     def decide(self, seen: Observation, *state: np.ndarray) -> Sequence[np.ndarray]:
         """Returns the next values of the groups of `declare_state`, from the present ones."""
@@ -102,9 +131,7 @@ class Policy(LeafSystem):
         x = np.asarray(self._state_port.Eval(context))
         p_WG = np.asarray(self._goal_port.Eval(context))
         image = self._read_image(context)
-        seen = Observation(
-            context.get_time(), pose_from_state(x), QuadrotorState.of(x), p_WG, image
-        )
+        seen = observation(context.get_time(), x, p_WG, image)
         old = context.get_discrete_state()
         groups = [np.array(old.value(i)) for i in range(old.num_groups())]
         for i, value in enumerate(self.decide(seen, *groups)):
@@ -117,3 +144,59 @@ class Policy(LeafSystem):
         if self._image in _CHANNELS:
             return np.asarray(cast(Any, image).data)[..., _CHANNELS[self._image][1]]
         return np.reshape(cast(Any, image), GRID_SHAPE)
+
+
+class _AutoDiffPolicy(LeafSystem_[AutoDiffXd]):
+    """A policy for AutoDiffXd, see `Policy`."""
+
+    def __init__(self, policy: Policy) -> None:
+        super().__init__()
+        self.set_name(policy.get_name())
+        self._policy = policy
+        for index in range(policy.num_input_ports()):
+            port = policy.get_input_port(index)
+            if port.get_data_type() == PortDataType.kVectorValued:
+                self.DeclareVectorInputPort(port.get_name(), port.size())
+            else:
+                self.DeclareAbstractInputPort(port.get_name(), policy.AllocateInputAbstract(port))
+        start = policy.CreateDefaultContext().get_discrete_state()
+        for group in range(start.num_groups()):
+            self.DeclareDiscreteState(BasicVector_[AutoDiffXd](start.value(group)))
+        for name, group in policy.state_outputs.items():
+            self.DeclareStateOutputPort(name, group)
+        # The policy's Context keeps cached results, as the planner's time of arrival.
+        self._inner = self.DeclareCacheEntry(
+            "context of the policy",
+            ValueProducer(Value[object], weak_callback(self._make_context)),
+            {self.nothing_ticket()},
+        ).cache_index()
+        update = policy.GetUniquePeriodicDiscreteUpdateAttribute()
+        self.DeclarePeriodicDiscreteUpdateEvent(
+            update.period_sec(), update.offset_sec(), self._update
+        )
+
+    def _make_context(self, context, value):
+        value.set_value(self._policy.CreateDefaultContext())
+
+    def _update(self, context, discrete_state):
+        policy, old = self._policy, context.get_discrete_state()
+        groups = [old.value(group) for group in range(old.num_groups())]
+        if policy.differentiable:
+            state, goal = (vector_input(self, name, context) for name in ("state", "goal"))
+            new = policy.decide(observation(context.get_time(), state, goal), *groups)
+        else:
+            new = self._decide_by_values(context, groups)
+        for group, value in enumerate(new):
+            discrete_state.set_value(group, value)
+
+    def _decide_by_values(self, context, groups):
+        policy, inner = self._policy, self.get_cache_entry(self._inner).Eval(context)
+        inner.SetTime(float_values(context.get_time()))
+        for index in range(policy.num_input_ports()):
+            port = self.get_input_port(index)
+            if port.HasValue(context):
+                policy.get_input_port(index).FixValue(inner, float_values(port.Eval(context)))
+        for group, value in enumerate(groups):
+            inner.SetDiscreteState(group, float_values(value))
+        new = policy.EvalUniquePeriodicDiscreteUpdate(inner)
+        return [new.value(group) for group in range(new.num_groups())]
