@@ -43,7 +43,7 @@ class BarrierParams(Config):
 
 @system_template("EsdfCollision_")
 def EsdfCollision_(T):
-    class Impl(LeafSystem_[T]):
+    class EsdfCollision(LeafSystem_[T]):
         """Computes the distance to obstacles and the collision signals of a vehicle.
 
         .. pydrake_system::
@@ -134,7 +134,7 @@ def EsdfCollision_(T):
                 field = self._moving.among(field, float_values(context.get_time()))
             sample.set_value(sample_field(field, QuadrotorState.of(state).p_WB))
 
-    return Impl
+    return EsdfCollision
 
 
 EsdfCollision = EsdfCollision_[None]

@@ -3,28 +3,29 @@
 from typing import Any
 
 import numpy as np
-from pydrake.solvers import Binding, Constraint, Cost, MathematicalProgram
+from pydrake.solvers import MathematicalProgram
 
 from splatpilot.systems.collision.distance_field import DistanceField, sample_field, soft_barrier
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
-# Solvers need numbers outside the bounds too; `Esdf.conservative` has them.
-
 
 def AddClearanceConstraint(
     prog: MathematicalProgram, field: DistanceField, p_WQ: np.ndarray, lower: float = VEHICLE_RADIUS
-) -> "Binding[Constraint]":
-    """Adds the constraint distance(p_WQ) >= lower.
+) -> Any:
+    """Adds the constraint distance(p_WQ) >= lower, and returns its Binding.
 
     Args:
         field: has distances everywhere, as `Esdf.conservative`; NaN stops solvers.
         p_WQ: (3,) decision variables [m].
         lower: [m].
     """
-    return prog.AddConstraint(
-        lambda p: np.array([_distance(field, p)]), lb=[lower], ub=[np.inf], vars=_point(p_WQ)
-    )
+
+    def distance(p: Any) -> np.ndarray:
+        return np.array([_distance(field, p)])
+
+    bounds = np.array([lower]), np.array([np.inf])
+    return prog.AddConstraint(distance, *bounds, vars=_point(p_WQ))
 
 
 def AddBarrierCost(
@@ -34,8 +35,8 @@ def AddBarrierCost(
     radius: float = VEHICLE_RADIUS,
     beta: float = 4.0,
     margin: float = 1.0,
-) -> "Binding[Cost]":
-    """Adds the `soft_barrier` of distance(p_WQ) to the cost.
+) -> Any:
+    """Adds the `soft_barrier` of distance(p_WQ) to the cost, and returns its Binding.
 
     Args:
         field: has distances everywhere, as `Esdf.conservative`; NaN stops solvers.

@@ -12,8 +12,9 @@ from pydrake.autodiffutils import AutoDiffXd
 from pydrake.systems.framework import (
     BasicVector_,  # pyright: ignore[reportAttributeAccessIssue]
     Context,
+    SystemScalarConverter,
 )
-from pydrake.systems.scalar_conversion import SystemScalarConverter, TemplateSystem
+from pydrake.systems.scalar_conversion import TemplateSystem
 
 from splatpilot.systems.common.validation import Config
 
@@ -63,7 +64,8 @@ def system_template(
 
     def define(instantiate: Callable[[Any], type[_S]]) -> _Template[_S]:
         scope = sys.modules[instantiate.__module__]
-        return _SystemTemplate.define(name, T_list=list(scalars), scope=scope)(instantiate)
+        decorator: Any = _SystemTemplate.define(name, T_list=list(scalars), scope=scope)
+        return decorator(instantiate)
 
     return define
 

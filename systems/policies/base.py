@@ -17,9 +17,9 @@ from pydrake.systems.framework import (
     LeafSystem,
     LeafSystem_,  # pyright: ignore[reportAttributeAccessIssue]
     PortDataType,
+    SystemScalarConverter,
     ValueProducer,
 )
-from pydrake.systems.scalar_conversion import SystemScalarConverter
 from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
 from splatpilot.systems.common.drake import vector_input, weak_callback
@@ -100,7 +100,7 @@ class Policy(LeafSystem):
     """If `decide` also takes AutoDiffXd."""
 
     def __init__(self, config: Any, image: str = "") -> None:
-        converter = SystemScalarConverter()
+        converter: Any = SystemScalarConverter()
         converter._AddConstructor[AutoDiffXd, float](_AutoDiffPolicy)
         super().__init__(converter=converter)
         config.validate()
@@ -167,10 +167,10 @@ class _AutoDiffPolicy(LeafSystem_[AutoDiffXd]):
         # The policy's Context keeps cached results, as the planner's time of arrival.
         self._inner = self.DeclareCacheEntry(
             "context of the policy",
-            ValueProducer(Value[object], weak_callback(self._make_context)),
+            ValueProducer(cast(Any, Value[object]), weak_callback(self._make_context)),
             {self.nothing_ticket()},
         ).cache_index()
-        update = policy.GetUniquePeriodicDiscreteUpdateAttribute()
+        update: Any = policy.GetUniquePeriodicDiscreteUpdateAttribute()
         self.DeclarePeriodicDiscreteUpdateEvent(
             update.period_sec(), update.offset_sec(), self._update
         )

@@ -111,7 +111,7 @@ class Hypotheses:
 
 @system_template("HypothesisSelector_")
 def HypothesisSelector_(T):
-    class Impl(LeafSystem_[T]):
+    class HypothesisSelector(LeafSystem_[T]):
         """Follows the hypothesis of lowest cost, `lookahead` ahead of the present time.
 
         .. pydrake_system::
@@ -158,7 +158,7 @@ def HypothesisSelector_(T):
                 time = context.get_time() + self._lookahead
                 output.SetFromVector(plan.position_W(time, plan.best))
 
-    return Impl
+    return HypothesisSelector
 
 
 HypothesisSelector = HypothesisSelector_[None]

@@ -33,7 +33,7 @@ def tracking_acceleration(v_WB: Any, v_desired: Any) -> Any:
 
 @system_template("VelocityTracker_")
 def VelocityTracker_(T):
-    class Impl(LeafSystem_[T]):
+    class VelocityTracker(LeafSystem_[T]):
         """Tracks velocities as an autopilot does, by `tracking_acceleration`.
 
         .. pydrake_system::
@@ -65,7 +65,7 @@ def VelocityTracker_(T):
             v_desired = vector_input(self, "velocity", context)
             output.SetFromVector(tracking_acceleration(state.v_WB, v_desired))
 
-    return Impl
+    return VelocityTracker
 
 
 VelocityTracker = VelocityTracker_[None]

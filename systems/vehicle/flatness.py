@@ -185,7 +185,7 @@ def _components(vectors: Any) -> tuple[Any, Any, Any]:
 
 @system_template("FlatnessController_")
 def FlatnessController_(T):
-    class Impl(LeafSystem_[T]):
+    class FlatnessController(LeafSystem_[T]):
         """Flies a quadrotor to a waypoint, or with an acceleration, by thrust and body rates.
 
         .. pydrake_system::
@@ -282,7 +282,7 @@ def FlatnessController_(T):
             require(np.isfinite(numbers).all(), what, "finite", numbers.tolist())
             return value
 
-    return Impl
+    return FlatnessController
 
 
 FlatnessController = FlatnessController_[None]

@@ -135,7 +135,7 @@ def rk4_step(state: Any, command: Any, params: QuadrotorParams, dt: Any) -> Any:
 
 @system_template("QuadrotorPlant_", (float, AutoDiffXd, Expression))
 def QuadrotorPlant_(T):
-    class Impl(LeafSystem_[T]):
+    class QuadrotorPlant(LeafSystem_[T]):
         """Simulates a quadrotor: exact thrust, body rates with a short lag.
 
         .. pydrake_system::
@@ -192,13 +192,13 @@ def QuadrotorPlant_(T):
             # Lists, because arithmetic on Python floats is several times faster than on numpy's.
             state = context.get_continuous_state_vector().CopyToVector().tolist()
             command, wind, disturbance = (self._input(context, index) for index in range(3))
-            parameters = context.get_numeric_parameter(0).CopyToVector().tolist()
+            drag, lag, gravity = context.get_numeric_parameter(0).CopyToVector().tolist()
             try:
-                rates = component_derivatives(state, command, *parameters, wind, disturbance)
+                rates = component_derivatives(state, command, drag, lag, gravity, wind, disturbance)
             except ZeroDivisionError:
                 raise ValueError(
                     f"q_WB and rate_time_constant of {self.get_name()} must not be zero, got "
-                    f"{state[6:10]} and {parameters[1]} s at t = {context.get_time()} s"
+                    f"{state[6:10]} and {lag} s at t = {context.get_time()} s"
                 ) from None
             derivatives.get_mutable_vector().SetFromVector(np.array(rates))
 
@@ -214,7 +214,7 @@ def QuadrotorPlant_(T):
                 require(False, f"{what} at t = {context.get_time()} s", "finite", value)
             return value
 
-    return Impl
+    return QuadrotorPlant
 
 
 QuadrotorPlant = QuadrotorPlant_[None]

@@ -154,7 +154,7 @@ def rotation_matrices(q: Any) -> Any:
 
 @system_template("StateToPose_")
 def StateToPose_(T):
-    class Impl(LeafSystem_[T]):
+    class StateToPose(LeafSystem_[T]):
         """Outputs the ``pose`` X_WB (RigidTransform) of a ``state`` (13), see `pose_from_state`.
 
         Supports the scalars float and AutoDiffXd.
@@ -174,7 +174,7 @@ def StateToPose_(T):
         def _calc_pose(self, context, output):
             output.set_value(pose_from_state(vector_input(self, "state", context)))
 
-    return Impl
+    return StateToPose
 
 
 StateToPose = StateToPose_[None]
