@@ -123,6 +123,10 @@ def EsdfCollision_(T):
             declare("barrier", 1, lambda sample, *each: soft_barrier(sample.distance, *each))
             declare("field_state", 1, lambda sample, *_: float(sample.state))
 
+        def get_input_port(self, port_index=0):
+            """Returns an input port by its index; `state` by default."""
+            return super().get_input_port(port_index)
+
         SetRadius = parameter_setter("radius")
         SetBeta = parameter_setter("beta")
         SetMargin = parameter_setter("margin")
