@@ -90,7 +90,7 @@ def EsdfCollision_(T):
             self._arguments = field, moving, radius, beta, margin
             self._field, self._moving = field, moving
             self._parameters = [ConfigParameter(self, T, params)]
-            state = self.DeclareVectorInputPort("state", 13)
+            state = self._state_port = self.DeclareVectorInputPort("state", 13)
             # Drake never frees a system that its own callbacks refer to.
             collision = weakref.proxy(self)
             cache = self.DeclareCacheEntry(
@@ -107,21 +107,20 @@ def EsdfCollision_(T):
             def declare(name, size, value_of):
                 def calc(context, output):
                     sample = collision.get_cache_entry(index).Eval(context)
-                    parameters = context.get_numeric_parameter(0).value()
-                    output.SetFromVector(np.atleast_1d(value_of(sample, *parameters)))
+                    parameters = context.get_numeric_parameter(0)
+                    output.SetFromVector(np.atleast_1d(value_of(sample, parameters)))
 
                 self.DeclareVectorOutputPort(name, size, calc, prerequisites_of_calc=tickets)
 
-            declare("distance", 1, lambda sample, *_: sample.distance)
-            declare("gradient", 3, lambda sample, *_: sample.gradient)
-            declare("clearance", 1, lambda sample, radius, *_: sample.distance - radius)
-            declare(
-                "in_collision",
-                1,
-                lambda sample, radius, *_: 1.0 * in_collision(sample.distance, radius),
-            )
-            declare("barrier", 1, lambda sample, *each: soft_barrier(sample.distance, *each))
-            declare("field_state", 1, lambda sample, *_: float(sample.state))
+            def hit(sample, parameters):
+                return 1.0 * in_collision(sample.distance, parameters[0])
+
+            declare("distance", 1, lambda sample, _: sample.distance)
+            declare("gradient", 3, lambda sample, _: sample.gradient)
+            declare("clearance", 1, lambda sample, each: sample.distance - each[0])
+            declare("in_collision", 1, hit)
+            declare("barrier", 1, lambda sample, each: soft_barrier(sample.distance, *each.value()))
+            declare("field_state", 1, lambda sample, _: float(sample.state))
 
         def get_input_port(self, port_index=0):
             """Returns an input port by its index; `state` by default."""
@@ -132,7 +131,7 @@ def EsdfCollision_(T):
         SetMargin = parameter_setter("margin")
 
         def _sample(self, context: Any, sample: Any) -> None:
-            state = np.asarray(self.GetInputPort("state").Eval(context))
+            state = np.asarray(self._state_port.Eval(context))
             field = self._field
             if self._moving is not None:
                 field = self._moving.among(field, float_values(context.get_time()))

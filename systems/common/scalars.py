@@ -4,6 +4,7 @@ import functools
 import inspect
 import sys
 from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import fields, replace
 from typing import Any, Protocol, TypeVar
 
@@ -95,8 +96,10 @@ class ConfigParameter:
 
     def config(self, context: Context) -> Any:
         """Returns the configuration with the numbers of a Context."""
-        numbers = context.get_numeric_parameter(self._index).CopyToVector()
-        return replace(self._config, **dict(zip(self.names, numbers, strict=True)))  # pyright: ignore
+        config = copy(self._config)
+        numbers = context.get_numeric_parameter(self._index).CopyToVector().tolist()
+        vars(config).update(zip(self.names, numbers, strict=True))
+        return config
 
     def set(self, context: Context, name: str, value: Any) -> None:
         """Sets one of the numbers; raises ValueError if the configuration is invalid with it."""

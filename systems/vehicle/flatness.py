@@ -13,6 +13,7 @@ are in rad.
 """
 
 import math
+from contextlib import nullcontext
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -271,7 +272,7 @@ def FlatnessController_(T):
             heading = optional_input(self, "heading", context)
             heading = None if heading is None else heading[0]
             # At rest arctan2 of AutoDiffXd warns of a division, and returns zero derivatives.
-            with np.errstate(divide="ignore"):
+            with nullcontext() if T is float else np.errstate(divide="ignore"):
                 command = flatness_command(state, a_WB, motion_W, heading, config, params)
             discrete_state.set_value(command)
 

@@ -174,9 +174,10 @@ def QuadrotorPlant_(T):
             require_rotation(QuadrotorState.of(start).q_WB)
             self._arguments = replace(params), start
             self._parameters = [ConfigParameter(self, T, params)]
-            self.DeclareVectorInputPort("command", 4)
-            self.DeclareVectorInputPort("wind", 3)
-            self.DeclareVectorInputPort("disturbance", 3)
+            self._ports = [
+                self.DeclareVectorInputPort(name, size)
+                for name, size in (("command", 4), ("wind", 3), ("disturbance", 3))
+            ]
             index = self.DeclareContinuousState(BasicVector_[T](start))
             self.DeclareStateOutputPort("state", index)
 
@@ -191,7 +192,11 @@ def QuadrotorPlant_(T):
         def DoCalcTimeDerivatives(self, context, derivatives):
             # Lists, because arithmetic on Python floats is several times faster than on numpy's.
             state = context.get_continuous_state_vector().CopyToVector().tolist()
-            command, wind, disturbance = (self._input(context, index) for index in range(3))
+            command, *optional = self._ports
+            wind, disturbance = [
+                self._read(port, context) if port.HasValue(context) else None for port in optional
+            ]
+            command = self._read(command, context)
             drag, lag, gravity = context.get_numeric_parameter(0).CopyToVector().tolist()
             try:
                 rates = component_derivatives(state, command, drag, lag, gravity, wind, disturbance)
@@ -202,14 +207,10 @@ def QuadrotorPlant_(T):
                 ) from None
             derivatives.get_mutable_vector().SetFromVector(np.array(rates))
 
-        def _input(self, context, index):
-            port = super().get_input_port(index)
-            if index and not port.HasValue(context):
-                return None
+        def _read(self, port, context):
             value = port.Eval(context).tolist()
-            total = sum(value)
             # Error control would shorten the steps without end.
-            if T is not Expression and not math.isfinite(float_values(total)):
+            if T is not Expression and not math.isfinite(float_values(sum(value))):
                 what = f"input '{port.get_name()}' of '{self.get_name()}'"
                 require(False, f"{what} at t = {context.get_time()} s", "finite", value)
             return value

@@ -118,7 +118,7 @@ def test_parameters_of_a_context_change_the_outputs_without_another_query():
 
 @pytest.mark.parametrize("field", [3.0, object()])
 def test_what_is_not_a_field_is_named_at_construction(field):
-    with pytest.raises(ValueError, match="field must be a DistanceField, got a .*distance_field"):
+    with pytest.raises(ValueError, match=r"field must be a DistanceField, got a .*distance_field"):
         EsdfCollision(field)
 
 

@@ -67,7 +67,7 @@ def test_a_subclass_is_not_converted_to_its_base():
     class Other(Power_[None]):
         pass
 
-    with pytest.raises(RuntimeError, match="Other.* does not support scalar conversion"):
+    with pytest.raises(RuntimeError, match=r"Other.* does not support scalar conversion"):
         Other(2.0).ToAutoDiffXd()  # pyright: ignore[reportAttributeAccessIssue]
 
 
