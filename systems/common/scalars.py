@@ -104,7 +104,7 @@ class ConfigParameter:
     def set(self, context: Context, name: str, value: Any) -> None:
         """Sets one of the numbers; raises ValueError if the configuration is invalid with it."""
         vector = context.get_mutable_numeric_parameter(self._index)
-        numbers = dict(zip(self.names, float_values(vector.CopyToVector()), strict=True))
+        numbers = dict(zip(self.names, float_values(vector.CopyToVector()).tolist(), strict=True))
         replace(self._config, **numbers | {name: float_values(value)}).validate()  # pyright: ignore
         vector.SetAtIndex(list(self.names).index(name), value)
 
