@@ -1,5 +1,18 @@
-from .diagrams.flight.flight import Flight, Outcome, fly, sample_initial_state
-from .diagrams.flight.flight_diagram import BuildFlightDiagram, MakeCamera
+from .diagrams.flight.flight import (
+    Flight,
+    fly,
+    fly_all,
+    make_flight_simulator,
+    sample_initial_state,
+)
+from .diagrams.flight.flight_diagram import (
+    AddFlight,
+    BuildFlightDiagram,
+    ExportFlight,
+    FlightParts,
+    MakeCamera,
+)
+from .diagrams.flight.monitor import AddFlightMonitor, FlightMonitor, Outcome
 from .diagrams.flight.monte_carlo import random_flights
 from .diagrams.flight.policies import policy_named, register_policy
 from .diagrams.flight.scenario import Scenario
@@ -35,6 +48,8 @@ from .training.reconstruction.reconstruct import reconstruct
 __all__ = [
     "AddBarrierCost",
     "AddClearanceConstraint",
+    "AddFlight",
+    "AddFlightMonitor",
     "BakedScene",
     "BuildFlightDiagram",
     "Capture",
@@ -43,9 +58,12 @@ __all__ = [
     "Esdf",
     "EsdfCollision",
     "EsdfCollision_",
+    "ExportFlight",
     "FlatnessController",
     "FlatnessController_",
     "Flight",
+    "FlightMonitor",
+    "FlightParts",
     "GaussianScene",
     "HypothesisSelector",
     "HypothesisSelector_",
@@ -71,8 +89,10 @@ __all__ = [
     "dump_config",
     "field_mesh",
     "fly",
+    "fly_all",
     "hover_state",
     "load_config",
+    "make_flight_simulator",
     "make_world",
     "policy_named",
     "random_flights",
