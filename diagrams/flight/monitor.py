@@ -88,9 +88,9 @@ def FlightMonitor_(T):
           `EsdfCollision`.
         - ``outcome``: str, of `Outcome` at this instant; empty during the flight.
 
-        Each simulator step ends with ReachedTermination if the flight is over. Where the Context has
-        an accuracy, as `make_flight_simulator` sets it, a witness function ends the step at that
-        instant. Supports the scalars float and AutoDiffXd, which ends flights by values, without it.
+        Each simulator step ends with ReachedTermination if the flight is over. Where the Context
+        has an accuracy, as `make_flight_simulator` sets it, a witness function ends the step at
+        that instant. Supports the scalars float and AutoDiffXd, the latter without the witness.
         """
 
         def __init__(self, scenario: Scenario, world: World, *, converter: Any = None) -> None:
@@ -135,7 +135,7 @@ def FlightMonitor_(T):
             return cast(dict[Outcome, float], self.get_cache_entry(self._margins).Eval(context))
 
         def outcome(self, context: Context) -> Outcome | None:
-            """Returns the outcome at the instant of this system's Context; None during the flight."""
+            """Returns the outcome at the instant of a Context; None during the flight."""
             outcome = _outcome(self._eval_margins(context))
             is_late = float_values(context.get_time()) >= self.scenario.timeout
             return outcome or (Outcome.TIMEOUT if is_late else None)
