@@ -111,7 +111,7 @@ GAINS = ["Lookahead", "MinThrust", "MaxThrust", "MaxTilt", "TiltGain", "MaxTiltR
 def test_setters_change_one_number_of_a_context(system, names):
     for name in names:
         context, default = system.CreateDefaultContext(), system.CreateDefaultContext()
-        value = 0.75 if name == "Lookahead" else 15.0 if name == "MaxThrust" else 1.25
+        value = {"Lookahead": 0.75, "MaxThrust": 15.0, "TiltGain": 12.0}.get(name, 1.25)
         getattr(system, f"Set{name}")(context, value)
         changed = [
             (context.get_numeric_parameter(i).value() != default.get_numeric_parameter(i).value())
