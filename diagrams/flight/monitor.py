@@ -12,7 +12,7 @@ from pydrake.systems.framework import (
     Diagram,
     DiagramBuilder,
     EventStatus,
-    LeafSystem_,  # pyright: ignore[reportAttributeAccessIssue]
+    LeafSystem,
     OutputPort,
     System,
     ValueProducer,
@@ -26,7 +26,7 @@ from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf_collision import EsdfCollision
 from splatpilot.systems.common.drake import connect, vector_output, weak_callback
-from splatpilot.systems.common.scalars import float_values, system_template
+from splatpilot.systems.common.scalars import ByValues
 from splatpilot.systems.messaging.flight_limits import LEVEL
 from splatpilot.systems.vehicle.state import QuadrotorState
 
@@ -73,86 +73,94 @@ def _outcome(margins: dict[Outcome, float]) -> Outcome | None:
     return next((outcome for outcome, margin in margins.items() if margin <= 0), None)
 
 
-@system_template("FlightMonitor_")
-def FlightMonitor_(T):
-    class FlightMonitor(LeafSystem_[T]):
-        """Ends a flight at a collision, outside the known volume, at the goal, or after its time.
+class FlightMonitor(LeafSystem):
+    """Ends a flight at a collision, outside the known volume, at the goal, or after its time.
 
-        .. pydrake_system::
+    .. pydrake_system::
 
-            name: FlightMonitor
-            input_ports: [state, goal, clearance, field_state]
-            output_ports: [outcome]
+        name: FlightMonitor
+        input_ports: [state, goal, clearance, field_state]
+        output_ports: [outcome]
 
-        - ``state`` (13), ``goal`` (3) p_WG [m]; ``clearance`` (1) [m], ``field_state`` (1): of
-          `EsdfCollision`.
-        - ``outcome``: str, of `Outcome` at this instant; empty during the flight.
+    - ``state`` (13), ``goal`` (3) p_WG [m]; ``clearance`` (1) [m], ``field_state`` (1): of
+      `EsdfCollision`.
+    - ``outcome``: str, of `Outcome` at this instant; empty during the flight.
 
-        Each simulator step ends with ReachedTermination if the flight is over. Where the Context
-        has an accuracy, as `make_flight_simulator` sets it, a witness function ends the step at
-        that instant. Supports the scalars float and AutoDiffXd, the latter without the witness.
-        """
+    Each simulator step ends with ReachedTermination if the flight is over. Where the Context has an
+    accuracy, as `make_flight_simulator` sets it, a witness function ends the step at that instant.
+    Supports the scalars float and, by values and without the witness function, AutoDiffXd.
+    """
 
-        def __init__(self, scenario: Scenario, world: World, *, converter: Any = None) -> None:
-            super().__init__(converter=converter)
-            scenario.validate()
-            self._arguments = self.scenario, self.world = copy.deepcopy(scenario), world
-            for name, size in (("state", 13), ("goal", 3), ("clearance", 1), ("field_state", 1)):
-                self.DeclareVectorInputPort(name, size)
-            calc = weak_callback(self._calc_outcome)
-            self.DeclareAbstractOutputPort("outcome", lambda: Value(""), calc)
-            calc = weak_callback(self._calc_margins)
-            self._margins = self.DeclareCacheEntry(
-                "margins",
-                ValueProducer(lambda: Value(object), calc),
-                {self.all_input_ports_ticket()},
-            ).cache_index()
-            if T is float:
-                self._witness = self.MakeWitnessFunction(
-                    "end",
-                    WitnessFunctionDirection.kPositiveThenNonPositive,
-                    weak_callback(self._least_margin),
-                )
-            self.DeclarePerStepPublishEvent(self._check)
-            self.DeclarePeriodicPublishEvent(scenario.timeout, scenario.timeout, self._check)
+    def __init__(self, scenario: Scenario, world: World) -> None:
+        super().__init__(converter=_MonitorByValues.converter())
+        scenario.validate()
+        self.scenario, self.world = copy.deepcopy(scenario), world
+        for name, size in (("state", 13), ("goal", 3), ("clearance", 1), ("field_state", 1)):
+            self.DeclareVectorInputPort(name, size)
+        calc = weak_callback(self._calc_outcome)
+        self.DeclareAbstractOutputPort("outcome", lambda: Value(""), calc)
+        calc = weak_callback(self._calc_margins)
+        self._margins = self.DeclareCacheEntry(
+            "margins", ValueProducer(lambda: Value(object), calc), {self.all_input_ports_ticket()}
+        ).cache_index()
+        self._witness = self.MakeWitnessFunction(
+            "end",
+            WitnessFunctionDirection.kPositiveThenNonPositive,
+            weak_callback(self._least_margin),
+        )
+        self.DeclarePerStepPublishEvent(self._check)
+        self.DeclarePeriodicPublishEvent(scenario.timeout, scenario.timeout, self._check)
 
-        def DoGetWitnessFunctions(self, context: Context) -> list[WitnessFunction]:
-            # Drake cannot isolate the instant without an accuracy.
-            has_accuracy = context.get_accuracy() is not None
-            return [self._witness] if T is float and has_accuracy else []
+    def DoGetWitnessFunctions(self, context: Context) -> list[WitnessFunction]:
+        # Drake cannot isolate the instant without an accuracy.
+        return [] if context.get_accuracy() is None else [self._witness]
 
-        def _calc_margins(self, context: Context, margins: Any) -> None:
-            state, p_WG, clearance, field_state = (
-                float_values(self.get_input_port(index).Eval(context)) for index in range(4)
-            )
-            radius = self.scenario.goal_radius
-            margins.set_value(_margins(state, p_WG, clearance[0], field_state[0], radius))
+    def _calc_margins(self, context: Context, margins: Any) -> None:
+        state, p_WG, clearance, field_state = (
+            np.asarray(self.get_input_port(index).Eval(context)) for index in range(4)
+        )
+        radius = self.scenario.goal_radius
+        margins.set_value(_margins(state, p_WG, clearance[0], field_state[0], radius))
 
-        def _least_margin(self, context: Context) -> float:
+    def _least_margin(self, context: Context) -> float:
         return min(m for m in self._eval_margins(context).values() if not math.isnan(m))
 
-        def _eval_margins(self, context: Context) -> dict[Outcome, float]:
-            return cast(dict[Outcome, float], self.get_cache_entry(self._margins).Eval(context))
+    def _eval_margins(self, context: Context) -> dict[Outcome, float]:
+        return cast(dict[Outcome, float], self.get_cache_entry(self._margins).Eval(context))
 
-        def outcome(self, context: Context) -> Outcome | None:
-            """Returns the outcome at the instant of a Context; None during the flight."""
-            outcome = _outcome(self._eval_margins(context))
-            is_late = float_values(context.get_time()) >= self.scenario.timeout
-            return outcome or (Outcome.TIMEOUT if is_late else None)
+    def outcome(self, context: Context) -> Outcome | None:
+        """Returns the outcome at the instant of this system's Context; None during the flight."""
+        outcome = _outcome(self._eval_margins(context))
+        is_late = context.get_time() >= self.scenario.timeout
+        return outcome or (Outcome.TIMEOUT if is_late else None)
 
-        def _calc_outcome(self, context: Context, output: Any) -> None:
-            output.set_value(str(self.outcome(context) or ""))
+    def _calc_outcome(self, context: Context, output: Any) -> None:
+        output.set_value(str(self.outcome(context) or ""))
 
-        def _check(self, context: Context) -> EventStatus:
-            outcome = self.outcome(context)
-            if outcome is None:
-                return EventStatus.DidNothing()
-            return EventStatus.ReachedTermination(self, f"{self.get_name()}: {outcome}")
-
-    return FlightMonitor
+    def _check(self, context: Context) -> EventStatus:
+        outcome = self.outcome(context)
+        if outcome is None:
+            return EventStatus.DidNothing()
+        return EventStatus.ReachedTermination(self, f"{self.get_name()}: {outcome}")
 
 
-FlightMonitor = FlightMonitor_[None]
+class _MonitorByValues(ByValues):
+    """A monitor for AutoDiffXd."""
+
+    def __init__(self, monitor: FlightMonitor) -> None:
+        super().__init__(monitor)
+        self.DeclareAbstractOutputPort(
+            "outcome", lambda: Value(""), weak_callback(self._calc_outcome)
+        )
+        timeout = monitor.scenario.timeout
+        self.DeclarePerStepPublishEvent(self._check)
+        self.DeclarePeriodicPublishEvent(timeout, timeout, self._check)
+
+    def _calc_outcome(self, context, output):
+        output.set_value(str(self._system.outcome(self.context_of_values(context)) or ""))
+
+    def _check(self, context):
+        return self._system._check(self.context_of_values(context))
 
 
 def AddFlightMonitor(

@@ -6,17 +6,22 @@ import sys
 from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import fields, replace
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar, cast
 
 import numpy as np
 from pydrake.autodiffutils import AutoDiffXd
+from pydrake.common.value import Value
 from pydrake.systems.framework import (
     BasicVector_,  # pyright: ignore[reportAttributeAccessIssue]
     Context,
+    LeafSystem_,  # pyright: ignore[reportAttributeAccessIssue]
+    PortDataType,
     SystemScalarConverter,
+    ValueProducer,
 )
 from pydrake.systems.scalar_conversion import TemplateSystem
 
+from splatpilot.systems.common.drake import weak_callback
 from splatpilot.systems.common.validation import Config
 
 _S = TypeVar("_S", covariant=True)
@@ -82,6 +87,48 @@ _value = np.frompyfunc(lambda x: x.value() if isinstance(x, AutoDiffXd) else flo
 def float_values(x: Any) -> Any:
     """Returns numbers (...) of AutoDiffXd as floats; other arrays and floats as they are."""
     return np.asarray(_value(x), dtype=float)[()] if is_autodiff(x) else x
+
+
+class ByValues(LeafSystem_[AutoDiffXd]):
+    """Base class of the conversions of float systems that compute by the values of their inputs."""
+
+    def __init__(self, system: Any) -> None:
+        """Declares the input ports of a float system."""
+        super().__init__()
+        self.set_name(system.get_name())
+        self._system = system
+        for index in range(system.num_input_ports()):
+            port = system.get_input_port(index)
+            if port.get_data_type() == PortDataType.kVectorValued:
+                self.DeclareVectorInputPort(port.get_name(), port.size())
+            else:
+                self.DeclareAbstractInputPort(port.get_name(), system.AllocateInputAbstract(port))
+        # The float Context keeps cached results.
+        self._inner = self.DeclareCacheEntry(
+            "context of values",
+            ValueProducer(cast(Any, Value[object]), weak_callback(self._make_context)),
+            {self.nothing_ticket()},
+        ).cache_index()
+
+    @classmethod
+    def converter(cls) -> Any:
+        """Returns the `converter` of the float system."""
+        converter: Any = SystemScalarConverter()
+        converter._AddConstructor[AutoDiffXd, float](cls)
+        return converter
+
+    def _make_context(self, context: Any, value: Any) -> None:
+        value.set_value(self._system.CreateDefaultContext())
+
+    def context_of_values(self, context: Any) -> Any:
+        """Returns a Context of the float system with time and inputs by their values."""
+        inner: Any = self.get_cache_entry(self._inner).Eval(context)
+        inner.SetTime(float_values(context.get_time()))
+        for index in range(self.num_input_ports()):
+            port = self.get_input_port(index)
+            if port.HasValue(context):
+                self._system.get_input_port(index).FixValue(inner, float_values(port.Eval(context)))
+        return inner
 
 
 class ConfigParameter:

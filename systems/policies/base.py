@@ -15,15 +15,11 @@ from pydrake.systems.framework import (
     DiscreteStateIndex,
     DiscreteValues,
     LeafSystem,
-    LeafSystem_,  # pyright: ignore[reportAttributeAccessIssue]
-    PortDataType,
-    SystemScalarConverter,
-    ValueProducer,
 )
 from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
-from splatpilot.systems.common.drake import vector_input, weak_callback
-from splatpilot.systems.common.scalars import float_values
+from splatpilot.systems.common.drake import vector_input
+from splatpilot.systems.common.scalars import ByValues, float_values
 from splatpilot.systems.common.validation import Config, bounded, require
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.vehicle.state import QuadrotorState, pose_from_state
@@ -100,9 +96,7 @@ class Policy(LeafSystem):
     """If `decide` also takes AutoDiffXd."""
 
     def __init__(self, config: Any, image: str = "") -> None:
-        converter: Any = SystemScalarConverter()
-        converter._AddConstructor[AutoDiffXd, float](_AutoDiffPolicy)
-        super().__init__(converter=converter)
+        super().__init__(converter=_PolicyByValues.converter())
         config.validate()
         self._config, self._image = config, image
         self.state_outputs: dict[str, DiscreteStateIndex] = {}
@@ -146,57 +140,32 @@ class Policy(LeafSystem):
         return np.reshape(cast(Any, image), GRID_SHAPE)
 
 
-class _AutoDiffPolicy(LeafSystem_[AutoDiffXd]):
+class _PolicyByValues(ByValues):
     """A policy for AutoDiffXd, see `Policy`."""
 
     def __init__(self, policy: Policy) -> None:
-        super().__init__()
-        self.set_name(policy.get_name())
-        self._policy = policy
-        for index in range(policy.num_input_ports()):
-            port = policy.get_input_port(index)
-            if port.get_data_type() == PortDataType.kVectorValued:
-                self.DeclareVectorInputPort(port.get_name(), port.size())
-            else:
-                self.DeclareAbstractInputPort(port.get_name(), policy.AllocateInputAbstract(port))
+        super().__init__(policy)
         start = policy.CreateDefaultContext().get_discrete_state()
         for group in range(start.num_groups()):
             self.DeclareDiscreteState(BasicVector_[AutoDiffXd](start.value(group)))
         for name, group in policy.state_outputs.items():
             self.DeclareStateOutputPort(name, group)
-        # The policy's Context keeps cached results, as the planner's time of arrival.
-        self._inner = self.DeclareCacheEntry(
-            "context of the policy",
-            ValueProducer(cast(Any, Value[object]), weak_callback(self._make_context)),
-            {self.nothing_ticket()},
-        ).cache_index()
         update: Any = policy.GetUniquePeriodicDiscreteUpdateAttribute()
         self.DeclarePeriodicDiscreteUpdateEvent(
             update.period_sec(), update.offset_sec(), self._update
         )
 
-    def _make_context(self, context, value):
-        value.set_value(self._policy.CreateDefaultContext())
-
     def _update(self, context, discrete_state):
-        policy, old = self._policy, context.get_discrete_state()
+        old = context.get_discrete_state()
         groups = [old.value(group) for group in range(old.num_groups())]
-        if policy.differentiable:
+        if self._system.differentiable:
             state, goal = (vector_input(self, name, context) for name in ("state", "goal"))
-            new = policy.decide(observation(context.get_time(), state, goal), *groups)
+            new = self._system.decide(observation(context.get_time(), state, goal), *groups)
         else:
-            new = self._decide_by_values(context, groups)
+            inner = self.context_of_values(context)
+            for group, value in enumerate(groups):
+                inner.SetDiscreteState(group, float_values(value))
+            values = self._system.EvalUniquePeriodicDiscreteUpdate(inner)
+            new = [values.value(group) for group in range(len(groups))]
         for group, value in enumerate(new):
             discrete_state.set_value(group, value)
-
-    def _decide_by_values(self, context, groups):
-        policy, inner = self._policy, self.get_cache_entry(self._inner).Eval(context)
-        inner.SetTime(float_values(context.get_time()))
-        for index in range(policy.num_input_ports()):
-            port = self.get_input_port(index)
-            if port.HasValue(context):
-                policy.get_input_port(index).FixValue(inner, float_values(port.Eval(context)))
-        for group, value in enumerate(groups):
-            inner.SetDiscreteState(group, float_values(value))
-        new = policy.EvalUniquePeriodicDiscreteUpdate(inner)
-        return [new.value(group) for group in range(new.num_groups())]
