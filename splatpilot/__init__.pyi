@@ -20,12 +20,14 @@ from .diagrams.flight.sensors import register_sensor
 from .diagrams.worlds.world import World
 from .diagrams.worlds.world_registry import make_world, register_world
 from .systems.collision.esdf import Esdf
-from .systems.collision.esdf_collision import EsdfCollision
+from .systems.collision.esdf_collision import EsdfCollision, EsdfCollision_
 from .systems.collision.field_mesh import field_mesh, write_mesh
+from .systems.collision.optimization import AddBarrierCost, AddClearanceConstraint
 from .systems.common.config import dump_config, load_config
 from .systems.common.validation import Config, bounded
-from .systems.policies.hypotheses import HypothesisSelector
+from .systems.policies.hypotheses import HypothesisSelector, HypothesisSelector_
 from .systems.policies.planner import PrivilegedPlanner
+from .systems.policies.velocity import VelocityTracker, VelocityTracker_
 from .systems.sensing.noise import ObservationNoise
 from .systems.sensing.onboard_camera import OnboardCamera
 from .systems.splats.baked_scene import BakedScene
@@ -35,15 +37,17 @@ from .systems.splats.render_engine import SplatRenderEngine
 from .systems.splats.scene import GaussianScene
 from .systems.splats.splat_camera import SplatCamera
 from .systems.splats.splat_files import read_ply, write_ply
-from .systems.vehicle.flatness import FlatnessController
-from .systems.vehicle.quadrotor import QuadrotorParams, QuadrotorPlant, hover_state
-from .systems.vehicle.state import QuadrotorState, StateToPose
+from .systems.vehicle.flatness import FlatnessController, FlatnessController_
+from .systems.vehicle.quadrotor import QuadrotorParams, QuadrotorPlant, QuadrotorPlant_, hover_state
+from .systems.vehicle.state import QuadrotorState, StateToPose, StateToPose_
 from .training.captures.capture import Capture
 from .training.captures.capture_registry import read_capture, register_capture
 from .training.policies.trainer_registry import register_trainer
 from .training.reconstruction.reconstruct import reconstruct
 
 __all__ = [
+    "AddBarrierCost",
+    "AddClearanceConstraint",
     "AddFlight",
     "AddFlightMonitor",
     "BakedScene",
@@ -53,13 +57,16 @@ __all__ = [
     "Distortion",
     "Esdf",
     "EsdfCollision",
+    "EsdfCollision_",
     "ExportFlight",
     "FlatnessController",
+    "FlatnessController_",
     "Flight",
     "FlightMonitor",
     "FlightParts",
     "GaussianScene",
     "HypothesisSelector",
+    "HypothesisSelector_",
     "MakeCamera",
     "ObservationNoise",
     "OnboardCamera",
@@ -67,11 +74,15 @@ __all__ = [
     "PrivilegedPlanner",
     "QuadrotorParams",
     "QuadrotorPlant",
+    "QuadrotorPlant_",
     "QuadrotorState",
     "Scenario",
     "SplatCamera",
     "SplatRenderEngine",
     "StateToPose",
+    "StateToPose_",
+    "VelocityTracker",
+    "VelocityTracker_",
     "World",
     "__version__",
     "bounded",
