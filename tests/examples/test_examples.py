@@ -6,10 +6,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import trimesh
-
-from splatpilot.training.captures import render as render_capture
-from splatpilot.training.captures.render import RenderConfig
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 FILES = sorted(EXAMPLES.glob("*.py"))
@@ -93,19 +89,6 @@ def test_unregistered_own_policy_flies_in_worker_processes(tmp_path):
     assert re.search(r"mine +2 +2/2", out)
 
 
-def test_photographs_to_flight(opengl, tmp_path):
-    room = trimesh.creation.box((7.0, 4.0, 3.0))
-    room.invert()
-    room.export(tmp_path / "room.obj", include_normals=True)
-    config = RenderConfig(
-        width=64, height=48, path=[[-2, 0, 0], [2, 0, 0]], spacing=1, yaws=[0, 90, 180, -90], up="z"
-    )
-    render_capture.run(world=tmp_path / "room.obj", out=tmp_path / "photos", config=config)
-    out = run("photographs_to_flight.py", "photos", "--iterations", 20, cwd=tmp_path)
-    assert re.search(r"outcome +goal", out)
-    assert (tmp_path / "out/photos/flight/flight.html").is_file()
-
-
 def test_monte_carlo(tmp_path):
     pytest.importorskip("pandas")
     (tmp_path / "short.yaml").write_text(SHORT)
@@ -126,18 +109,6 @@ def test_lqr_hover(tmp_path):
     out = run("lqr_hover.py", cwd=tmp_path)
     assert number(r"from (\S+) s on", out) < 5
     assert number(r", (\S+) mm", out) < 0.5
-
-
-def test_crash_replayed(tmp_path):
-    wall = "world: !WallsConfig {pattern: big_wall, length: 14, width: 14, wall: 8}\n"
-    (tmp_path / "wall.yaml").write_text(wall)
-    out = run("crash_replayed.py", "--scenario", "wall.yaml", cwd=tmp_path)
-    assert "is bitwise identical to the recorded flight" in out
-    assert number(r"along \[(\S+),", out) == pytest.approx(1.0, abs=0.05)
-    speed = number(r"at (\S+) m/s", out)
-    ahead = number(r"was (\S+) m away", out)
-    assert ahead == pytest.approx(0.5 * speed + 0.354 - 0.1, abs=0.25)
-    assert (tmp_path / "out/crash/before.png").is_file()
 
 
 def test_drakes_quadrotor(tmp_path):
