@@ -19,15 +19,8 @@ from PIL import Image
 from pydrake.math import RigidTransform, RotationMatrix
 from scipy.spatial.transform import Rotation
 
+from splatpilot.systems.common import readers
 from splatpilot.systems.common.extras import import_extra
-from splatpilot.systems.common.readers import (
-    array_layout,
-    read_array,
-    read_text,
-    readable,
-    require_file,
-    require_readable_size,
-)
 from splatpilot.systems.common.validation import require
 from splatpilot.training.captures.capture import (
     Capture,
@@ -64,8 +57,8 @@ def image_size(file: Path) -> tuple[int, int]:
 
 def _image_header(file: Path) -> tuple[tuple[int, int], str]:
     """Returns width and height [px], and Pillow's mode of the pixels."""
-    require_file(file)
-    with readable(file, "image"):
+    readers.require_file(file)
+    with readers.readable(file, "image"):
         with Image.open(file) as image:
             size, form, mode = image.size, image.format, image.mode
             if "transparency" in image.info:  # of one color, or of those of a palette
@@ -75,7 +68,7 @@ def _image_header(file: Path) -> tuple[tuple[int, int], str]:
             stream.seek(max(0, file.stat().st_size - 65536))
             if _ENDS.get(form or "", b"") not in stream.read():
                 raise ValueError("its end is missing")
-    require_readable_size(file, 4 * size[0] * size[1])
+    readers.require_readable_size(file, 4 * size[0] * size[1])
     return size, mode
 
 
@@ -85,7 +78,7 @@ def _depth_size(file: Path) -> tuple[int, int]:
         (left, top), (right, bottom) = _open_exr(file, header_only=True).header()["dataWindow"]
         return int(right - left + 1), int(bottom - top + 1)
     if file.suffix == ".npy":
-        shape, dtype = array_layout(file)
+        shape, dtype = readers.array_layout(file)
         _require_depth(file, shape, dtype)
         return shape[1], shape[0]
     size, mode = _image_header(file)
@@ -122,7 +115,7 @@ def read_depth(file: Path, unit: float) -> NDArray[np.float32]:
     become 0, unknown.
     """
     if file.suffix == ".npy":
-        raw = read_array(file)
+        raw = readers.read_array(file)
     elif file.suffix == ".exr":
         channels = _open_exr(file, separate_channels=True).channels()
         raw = np.asarray(next(iter(channels.values())).pixels, dtype=np.float32)
@@ -151,7 +144,7 @@ def _drop_invalid(depth: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _decode(file: Path, flags: int) -> NDArray:
-    with readable(file, "image"):
+    with readers.readable(file, "image"):
         image = cv2.imdecode(np.frombuffer(file.read_bytes(), np.uint8), flags)
         if image is None:
             raise ValueError("OpenCV cannot decode it")
@@ -160,8 +153,8 @@ def _decode(file: Path, flags: int) -> NDArray:
 
 def _open_exr(file: Path, **options: bool) -> Any:
     OpenEXR: Any = import_extra("OpenEXR", "exr")
-    require_file(file)
-    with readable(file, "EXR file"):
+    readers.require_file(file)
+    with readers.readable(file, "EXR file"):
         return OpenEXR.File(str(file), **options)
 
 
@@ -183,7 +176,9 @@ def read_rows(file: Path, columns: int, what: str) -> list[NDArray[np.float64]]:
     NaN is read as such; lines that start with # and empty lines at the end are left out.
     """
     rows = []
-    for number, line in enumerate(read_text(file, "replace").rstrip().splitlines(), start=1):
+    for number, line in enumerate(
+        readers.read_text(file, "replace").rstrip().splitlines(), start=1
+    ):
         if line.startswith("#"):
             continue
         try:
