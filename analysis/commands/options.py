@@ -21,11 +21,9 @@ if TYPE_CHECKING:
 
 
 class Option:
-    """An option or argument of commands.
-
-    `resolve` checks a value before slow imports, and returns it or what it names; the path of an
-    `unused` option must not exist without --overwrite; of `exclusive` ones at most one is given.
-    """
+    """An option or argument of commands. `resolve` checks a value before slow imports, and returns
+    it or what it names; the path of an `unused` option must not exist without --overwrite; of
+    `exclusive` ones at most one is given."""
 
     def __init__(
         self,

@@ -57,11 +57,8 @@ class RescaleSummary:
 def rescale_file(
     file: Path, out: Path, factor: float, up: str, floor: Sequence[ArrayLike]
 ) -> RescaleSummary:
-    """Writes the Gaussians of a file as PLY, in meters and with z up.
-
-    Its axis `up` becomes z. If `floor` has three points (3,), their plane becomes z = 0, and `up`
-    tells its upper side.
-    """
+    """Writes the Gaussians of a file as PLY, in meters and with z up. Its axis `up` becomes z. If
+    `floor` has three points (3,), their plane becomes z = 0, and `up` tells its upper side."""
     if out.suffix.lower() != ".ply":
         raise ValueError(f"{out}: Gaussians are written as PLY; name it so, {out.stem}.ply")
     if out.exists():
@@ -117,11 +114,9 @@ def run(
     up: str | None = None,
     floor: Sequence[ArrayLike] = (),
 ) -> RescaleSummary:
-    """Scales a scene folder by `rescale`, or a file of Gaussians by `rescale_file`.
-
-    The factor is given, or follows from the distance between two points (3,) or from the median
-    height of the capture's cameras [m].
-    """
+    """Scales a scene folder by `rescale`, or a file of Gaussians by `rescale_file`. The factor is
+    given, or follows from the distance between two points (3,) or from the median height of the
+    capture's cameras [m]."""
     if scene.is_file() and height is not None:
         raise ValueError(f"{scene}: a file has no cameras; give a factor, or points and a distance")
     if scene.is_dir() and (up is not None or len(floor)):

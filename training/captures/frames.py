@@ -109,11 +109,8 @@ def _read_alpha(file: Path) -> NDArray[np.bool_]:
 
 def read_depth(file: Path, unit: float) -> NDArray[np.float32]:
     """Returns depth (H, W) [m] from `.npy`, `.exr`, or an image of integers or floats, in `unit`
-    per meter.
-
-    NaN, negative depth and the largest 16-bit number, which sensors write where they see nothing,
-    become 0, unknown.
-    """
+    per meter. NaN, negative depth and the largest 16-bit number, which sensors write where they see
+    nothing, become 0, unknown."""
     if file.suffix == ".npy":
         raw = readers.read_array(file)
     elif file.suffix == ".exr":
@@ -171,10 +168,8 @@ def numbered_files(folder: Path, pattern: str) -> dict[int, Path]:
 
 
 def read_rows(file: Path, columns: int, what: str) -> list[NDArray[np.float64]]:
-    """Returns the rows of numbers of a text file, each (columns,), called `what` in messages.
-
-    NaN is read as such; lines that start with # and empty lines at the end are left out.
-    """
+    """Returns the rows of numbers of a text file, each (columns,), called `what` in messages. NaN
+    is read as such; lines that start with # and empty lines at the end are left out."""
     rows = []
     for number, line in enumerate(
         readers.read_text(file, "replace").rstrip().splitlines(), start=1

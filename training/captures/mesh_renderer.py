@@ -250,10 +250,8 @@ class CutOuts:
         return points[self._sample_at(triangle, points)[1] > 0]
 
     def draw(self, frame: CaptureFrame) -> CaptureFrame:
-        """Returns the frame with these surfaces drawn where nothing in it hides them.
-
-        Depth is that of the first surface, opaque or not.
-        """
+        """Returns the frame with these surfaces drawn where nothing in it hides them. Depth is that
+        of the first surface, opaque or not."""
         if not trimesh.ray.has_embree:
             raise ModuleNotFoundError(
                 "textures with holes need embreex, which has no wheel for this processor; render "

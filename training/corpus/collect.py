@@ -214,11 +214,9 @@ def shard_folder(folder: Path, world: str, source: int = EXPERT) -> Path:
 
 @locks_folder("out")
 def run(*, config: CorpusConfig, out: Path, worlds: int, jobs: int | None = None) -> Corpus:
-    """Collects the first `worlds` worlds of a corpus in `out`, except those that it has already.
-
-    An interrupted run is resumed by the same call, with bitwise identical results. Damaged shards
-    are collected again. `jobs` worker processes, one for each core by default.
-    """
+    """Collects the first `worlds` worlds of a corpus in `out`, except those that it has already. An
+    interrupted run is resumed by the same call, with bitwise identical results. Damaged shards are
+    collected again. `jobs` worker processes, one for each core by default."""
     try:
         config.validate()
     except FieldError as error:

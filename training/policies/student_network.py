@@ -17,10 +17,8 @@ IMAGE_MODULES = (
 
 
 class StudentModule(nn.Module):
-    """The network of a `StudentSpec`, with the names of weights of `StudentNetwork`.
-
-    The encoder is torchvision's with a bias instead of each batch norm.
-    """
+    """The network of a `StudentSpec`, with the names of weights of `StudentNetwork`. The encoder is
+    torchvision's with a bias instead of each batch norm."""
 
     _basis: Tensor
 

@@ -59,10 +59,8 @@ _POINTS = "lower_W", "upper_W", "p_WS", "p_WG"
 
 
 class WorldCache:
-    """Cache of training worlds and their times of arrival in the user's folder.
-
-    It depends on the version of the program. A folder that cannot be written stays empty.
-    """
+    """Cache of training worlds and their times of arrival in the user's folder. It depends on the
+    version of the program. A folder that cannot be written stays empty."""
 
     def __init__(self) -> None:
         self._folder = cache_folder("worlds")
@@ -217,10 +215,8 @@ class WorldBatch:
 
     def direction(self, p_WQ: Tensor, world: Tensor) -> Tensor:
         """Computes directions (N, 3) of the paths to the goals at p_WQ (N, 3) [m] in `world` (N,).
-
         They follow the negative gradient of the time of arrival, and are straight near the goal and
-        without a gradient.
-        """
+        without a gradient."""
         to_goal = self.p_WG[world] - p_WQ
         if self._times is None:
             return torch.nn.functional.normalize(to_goal, dim=1)

@@ -128,10 +128,8 @@ def fit_exposure(
     fit_gain: bool = True,
 ) -> tuple[NDArray, float]:
     """Returns a rendered image (H, W, 3) with vignetting and exposure of the camera, and its gain.
-
     The gain is the least-squares fit to the true image over the pixels `seen` (H, W): that of a
-    held-out frame is unknown, and does not depend on the scene. Without `fit_gain` it is 1.
-    """
+    held-out frame is unknown, and does not depend on the scene. Without `fit_gain` it is 1."""
     height, width = color.shape[:2]
     image = np.clip(color, 0, None) * vignette(vignetting, width, height)[..., None]
     gain, x, y = 1.0, image[seen], truth[seen]

@@ -47,12 +47,9 @@ _MEASURE_EVERY = 1000  # steps between metrics on held-out frames
 
 
 class DefaultStrategy:
-    """Densification of 3D Gaussian splatting (Kerbl et al. 2023, section 5.2).
-
-    Clones small and splits large Gaussians with a large gradient on the image, removes faint and
-    huge ones, and resets opacities periodically. The cameras are within `extent` [m] of `center`
-    (3,) [m].
-    """
+    """Densification of 3D Gaussian splatting (Kerbl et al. 2023, section 5.2). Clones small and
+    splits large Gaussians with a large gradient on the image, removes faint and huge ones, and
+    resets opacities periodically. The cameras are within `extent` [m] of `center` (3,) [m]."""
 
     def __init__(self, config: ReconstructConfig, center: Tensor, extent: float, count: int):
         self._config, self._center, self._extent = config, center, extent

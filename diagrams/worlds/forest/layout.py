@@ -107,10 +107,8 @@ class ForestLayout(FloorPlan):
 
     def solids(self) -> tuple[list[Solid], list[Solid]]:
         """Returns the solids that can be nearest to a point of the volume, and the other solids.
-
         The ground is never farther from such a point than the volume is high, so distances are
-        exact without solids farther from the volume than that.
-        """
+        exact without solids farther from the volume than that."""
         ceiling, trees = self.upper[2], self.trees
         near = self.outside(trees.base) - trees.radius - ceiling * np.hypot(*trees.lean.T) < ceiling
         foot, top = trees.at(-BURIED), trees.at(ceiling + 2)

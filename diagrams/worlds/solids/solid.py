@@ -124,10 +124,8 @@ class Face:
 
 
 def cut_faces(shape: shapes.Shape, lower: Array, upper: Array) -> list[Face]:
-    """Cuts the surface of `shape` into faces.
-
-    A half space must be horizontal; its face ends `GROUND_REACH` beyond [lower, upper] (3,).
-    """
+    """Cuts the surface of `shape` into faces. A half space must be horizontal; its face ends
+    `GROUND_REACH` beyond [lower, upper] (3,)."""
     x, y, z = np.eye(3)
     match shape:
         case shapes.Sphere():
