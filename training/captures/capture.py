@@ -91,12 +91,8 @@ def centered_pinhole(fx: float, fy: float, cx: float, cy: float) -> NDArray[np.f
 def opencv_lens(
     K: NDArray[np.float64], width: int, height: int, distortion: Sequence[float], k4: float = 0.0
 ) -> Lens:
-    """Returns a lens of OpenCV's rational model.
-
-    Args:
-        distortion: k1, k2, p1, p2, k3, ... in OpenCV's order.
-        k4: radial term of r^8, which OpenCV's model is without.
-    """
+    """Returns a lens of OpenCV's rational model. `distortion` is k1, k2, p1, p2, k3, ... in
+    OpenCV's order, `k4` the radial term of r^8, which OpenCV's model is without."""
     if not np.any(distortion) and not k4:
         return Lens(K, width, height)
     radial = [*distortion[:2], *distortion[4:]]

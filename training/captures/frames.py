@@ -282,18 +282,13 @@ def open_frames(
 ) -> Capture:
     """Opens frames, whose images and depths are read on demand.
 
-    Args:
-        source: the format's name in `Capture.source`.
-        config: its `intrinsics`, `depth_unit` and `up`, if given, replace those of the format.
-        lens: returns the camera of images of a width and height [px], for frames without their own.
-        depth_unit: units of the stored depth per meter.
-        read_depth: reads the depth [m] in a file of a unit.
-        depth_camera: returns the camera of depth images of a width and height [px]; None if depth
-            has the pixels of the images before they are undistorted.
-        stretch_depth: True if depth, without a camera of its own, may have another resolution than
-            the image.
-        up: up direction of the files' world, see `turn_upright`; empty leaves that to the caller.
-        dropped: messages about frames that were left out already, which do not count further.
+    `intrinsics`, `depth_unit` and `up` of `config` replace those of the format. `lens` and
+    `depth_camera` return the cameras of images and depth images of a width and height [px], for
+    frames without their own; without `depth_camera` depth has the pixels of the images before they
+    are undistorted or, if `stretch_depth`, another resolution. `read_depth` reads a file of
+    `depth_unit` units per meter. `up` is the up direction of the files' world, see `turn_upright`;
+    empty leaves that to the caller. `dropped` are messages about frames left out already, which do
+    not count further.
     """
     config = config or CaptureConfig()
     messages, complete = list(dropped), []

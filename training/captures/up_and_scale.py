@@ -98,12 +98,8 @@ def fit_ground(
 
 
 def turn_upright(capture: Capture, up: str) -> Capture:
-    """Rotates the world of a capture so that z is up.
-
-    Args:
-        up: x, y, z, -x, -y or -z of the present world, `cameras` or `ground`; see
-            `up_of_cameras` and `fit_ground`.
-    """
+    """Rotates the world of a capture so that z is up. `up` is x, y, z, -x, -y or -z of the present
+    world, `cameras` or `ground`; see `up_of_cameras` and `fit_ground`."""
     if up == "z":
         return capture
     if up in ("cameras", "ground"):
@@ -164,11 +160,8 @@ def make_metric(
     locate: Callable[[str, NDArray[np.float64]], NDArray[np.float64]] | None = None,
 ) -> Capture:
     """Scales poses and points in unknown units to meters, or marks the capture as not metric.
-
-    Args:
-        locate: returns the point (3,) that is seen in the image of a name at a pixel (2,), or
-            raises ValueError; None if pixels cannot be located.
-    """
+    `locate` returns the point (3,) that the image of a name shows at a pixel (2,), or raises
+    ValueError; None if pixels cannot be located."""
     sources = scale.sources()
     if not sources:
         return dataclasses.replace(capture, metric=False)

@@ -259,15 +259,13 @@ def gaussians_from_depth(
     max_cell: int = 16,
     max_extent: float = 0.06,
 ) -> GaussianScene:
-    """Covers all surfaces of the frames with Gaussians, each surface once.
+    """Covers all surfaces of the frames with Gaussians, each surface once. Frames are loaded more
+    than once.
 
-    Cells become coarser until the Gaussians fit: first by more contrast, then by size.
-
-    Args:
-        frames: loaded one by one, and more than once.
-        contrast, max_cell, max_extent: of the finest cells, see `BlockMeans.split`.
-        optimized: makes Gaussians that will be optimized: wider and without an underlay; if even
-            the coarsest are too many, they are sampled.
+    `contrast`, `max_cell` and `max_extent` are of the finest cells, see `BlockMeans.split`; they
+    become coarser until the Gaussians fit: first by more contrast, then by size. If they will be
+    `optimized`, Gaussians are wider and without an underlay, and if even the coarsest are too many,
+    they are sampled.
     """
     views = [ThinnedFrame.of(frame) for frame in frames]
     if not any(view.depth.any() for view in views):

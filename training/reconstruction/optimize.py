@@ -180,13 +180,9 @@ def view_loss(
 
 
 class Optimization:
-    """One run, from its first step or from a checkpoint.
-
-    Args:
-        initial: makes the Gaussians of a first step, given the extent of the cameras [m].
-        perceptual: LPIPS of two images (H, W, 3).
-        fit_gains: fits the gains of `views`.
-    """
+    """One run, from its first step or from a checkpoint. `initial` makes the Gaussians of a first
+    step, given the extent of the cameras [m]; `perceptual` is the LPIPS of two images (H, W, 3);
+    `fit_gains` fits the gains of `views`."""
 
     def __init__(
         self,
