@@ -100,9 +100,9 @@ def test_student_flies_and_trains_again_with_recovery_samples(
 def test_next_round_is_flown_by_the_weights_of_the_last(expert, recovered, tmp_path, monkeypatch):
     flown = []
 
-    def watched(diagram, scenario, world):
-        flown.append(scenario.policy)
-        return fly(diagram, scenario, world)
+    def watched(diagram):
+        flown.append(diagram.GetSubsystemByName("monitor").scenario.policy)
+        return fly(diagram)
 
     monkeypatch.setattr(recovery, "fly", watched)
     corpus, out = recovered / "corpora" / "0", tmp_path / "second"
@@ -165,9 +165,9 @@ def test_recovery_share_is_the_fraction_of_recovery_samples(expert, recovered):
 def test_rgb_policy_recovers_too(tmp_path, monkeypatch):
     speeds = []
 
-    def watched(diagram, scenario, world):
-        speeds.append(scenario.policy.speed)
-        return fly(diagram, scenario, world)
+    def watched(diagram):
+        speeds.append(diagram.GetSubsystemByName("monitor").scenario.policy.speed)
+        return fly(diagram)
 
     monkeypatch.setattr(recovery, "fly", watched)
     collect_corpus(tmp_path / "expert", tmp_path, OnboardCamera(width=160, height=90))
