@@ -59,14 +59,14 @@ def test_flight_by_hand(run):
 
 def test_splats_behind_drake(opengl, run, tmp_path):
     red = []
-    for seconds in (0.0, 0.2, 0.5):
+    for seconds in (0.2, 0.5):
         words = "--width", 240, "--seconds", seconds, "--out", tmp_path / "sphere.png"
         run("splats_behind_drake.py", *words)
         image = np.array(cv2.imread(str(tmp_path / "sphere.png")), dtype=int)
         is_red = image[..., 2] > 100 + image[..., :2].max(axis=-1)
         assert image[~is_red].std() > 20
         red.append(int(is_red.sum()))
-    assert red[1] == 0 and 0 < red[0] < 0.6 * red[2]
+    assert red[0] == 0 < red[1]
 
 
 def test_bouncing_sphere(run, tmp_path):
