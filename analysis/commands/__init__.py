@@ -57,3 +57,12 @@ COMMANDS = {
     ),
 }
 """Module and help of each command, in the order of the help; "" of those with subcommands."""
+
+MOVED = {
+    "tour": "reconstruct",
+    "merge": "benchmark --cluster",
+    "places": "scene fetch",
+    **{name: f"scene {name}" for name in ("scale", "measure", "mesh", "ablate", "fidelity")},
+    **{name: f"hardware {name}" for name in ("vehicle", "bridge", "px4", "faults")},
+}
+"""New names of commands that have moved."""

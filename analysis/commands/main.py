@@ -18,7 +18,7 @@ from importlib import import_module
 from types import FrameType
 from typing import Any, NoReturn
 
-from splatpilot.analysis.commands import COMMANDS
+from splatpilot.analysis.commands import COMMANDS, MOVED
 from splatpilot.analysis.commands.options import Command, FailureWithResultError, as_json
 from splatpilot.systems.common.extras import missing_extra
 from splatpilot.systems.common.validation import TYPES, did_you_mean, unknown
@@ -63,7 +63,10 @@ class _Parser(argparse.ArgumentParser):
             super()._check_value(action, value)
         else:
             what = str(action.metavar or action.dest).lower()
-            raise argparse.ArgumentError(None, unknown(what, value, action.choices))
+            message = unknown(what, value, action.choices)
+            if value in MOVED and self.prog == "splatpilot":
+                message = f"`splatpilot {value}` is now `splatpilot {MOVED[value]}`"
+            raise argparse.ArgumentError(None, message)
 
     def _get_value(self, action: argparse.Action, arg_string: str) -> Any:
         try:
