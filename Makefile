@@ -7,7 +7,7 @@ BUILT_FROM := pyproject.toml CMakeLists.txt $(shell find native lcmtypes -type f
 SPLATPILOT := .venv/bin/splatpilot
 NATIVE := $(shell find native -name '*.hpp' -o -name '*.cpp')
 
-.PHONY: fly test lint docs sanitize nightly clean
+.PHONY: fly test lint docs stub sanitize nightly clean
 
 fly: .venv/flying
 	$(SPLATPILOT) fly --out out/fly --overwrite
@@ -27,6 +27,10 @@ lint: .venv/installed
 docs: .venv/installed
 	.venv/bin/sphinx-build --fail-on-warning --keep-going --quiet docs build/site
 	@echo "open build/site/index.html"
+
+# Writes the types of the native module, after a change of its bindings.
+stub: .venv/installed
+	.venv/bin/python -m nanobind.stubgen --quiet --module splatpilot._native --output-file splatpilot/_native.pyi
 
 # The tests of the native kernels on a build with AddressSanitizer and UndefinedBehaviorSanitizer.
 sanitize: .venv/installed
