@@ -91,10 +91,8 @@ def with_appearance(world: World, look: Appearance) -> World:
 
 
 def recolored(scene: GaussianScene, look: Appearance) -> GaussianScene:
-    """Returns the Gaussians in other colors.
-
-    The base color is painted and lit again; the view dependence scales with its brightness.
-    """
+    """Returns the Gaussians in other colors. The base color is painted and lit again; the view
+    dependence scales with its brightness."""
     before, normals = scene.base_colors, scene.normals  # (N, 3)
     after = np.empty_like(before)
     for first in range(0, len(before), _BATCH):

@@ -44,11 +44,9 @@ class InsertedConfig(SceneSource):
 
 
 def inserted_world(config: InsertedConfig, seed: int) -> World:
-    """Reads the scene and inserts solids drawn from the seed near the line from start to goal.
-
-    Any two are at least `gap` apart, start and goal keep 0.9 m, and a route remains that is `gap`
-    wide everywhere.
-    """
+    """Reads the scene and inserts solids drawn from the seed near the line from start to goal. Any
+    two are at least `gap` apart, start and goal keep 0.9 m, and a route remains that is `gap` wide
+    everywhere."""
     config.validate()
     scene = read_scene_world(config, seed)
     for attempt in range(TRIES):

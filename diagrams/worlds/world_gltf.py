@@ -53,11 +53,9 @@ class _Tile:
 
 
 def write_gltf(spec: WorldSpec, path: Path, texel: float = 0.02) -> None:
-    """Writes the world of a spec as one self-contained .gltf file, y up.
-
-    Light is baked into emissive pictures with pixels of `texel` [m] on the solids: an engine shows
-    the same colors whatever lamps it has.
-    """
+    """Writes the world of a spec as one self-contained .gltf file, y up. Light is baked into
+    emissive pictures with pixels of `texel` [m] on the solids: an engine shows the same colors
+    whatever lamps it has."""
     light = spec.light(esdf_from_distance_field(spec.distance_field, spec.voxel_size))
     meshes = _solid_meshes(spec, light, texel)
     if surroundings := spec.surroundings():

@@ -135,10 +135,8 @@ class Sunlight:
         return self.daylight.irradiance(n_W, sunlit) * openness(self.esdf, p_W, n_W)[:, None]
 
     def _sunlit(self, p_W: Array) -> Array:
-        """Computes the fraction of the sun (N,) at points p_W (N, 3) by sphere tracing.
-
-        The narrowest passage, as an angle, determines it: distant obstacles have soft shadows.
-        """
+        """Computes the fraction of the sun (N,) at points p_W (N, 3) by sphere tracing. The
+        narrowest passage, as an angle, determines it: distant obstacles have soft shadows."""
         lit = np.ones(len(p_W))
         active = np.arange(len(p_W))
         traveled = np.full(len(p_W), 0.05)  # [m]

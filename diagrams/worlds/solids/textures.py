@@ -37,9 +37,7 @@ def _mix_bits(h: NDArray[np.uint32]) -> NDArray[np.uint32]:
 
 def value_noise(p: ArrayLike, seed: int = 0) -> Array:
     """Computes smooth noise in [-1, 1] with a period of about two units at (..., d), d = 1 to 3.
-
-    Random values on the integer lattice are blended with 6 t^5 - 15 t^4 + 10 t^3.
-    """
+    Random values on the integer lattice are blended with 6 t^5 - 15 t^4 + 10 t^3."""
     p = np.asarray(p, dtype=np.float64)
     # Weight and hash of each corner of a cell, axis by axis.
     corners = [(np.float32(1.0), np.uint32(_seeded(seed)))]
