@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from splatpilot.diagrams.worlds.solids.shading import GAMMA
+from splatpilot.diagrams.worlds.solids.textures import GAMMA
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.esdf import interpolate_grid
 from splatpilot.systems.splats.background import Background, EnvironmentMap

@@ -8,9 +8,9 @@ from numpy.typing import ArrayLike, NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
 from splatpilot.diagrams.worlds.solids.patterns import SIGN
-from splatpilot.diagrams.worlds.solids.shading import Daylight, Illumination, Lamplight, Sunlight
 from splatpilot.diagrams.worlds.solids.solid import Solid, WorldSpec
 from splatpilot.diagrams.worlds.solids.surfaces import FloorPlan
+from splatpilot.diagrams.worlds.solids.textures import Daylight, Illumination, Lamplight, Sunlight
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.esdf_build import grid_shape
 from splatpilot.systems.collision.shapes import Box, HalfSpace, Shape, ShapeUnion

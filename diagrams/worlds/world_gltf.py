@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from splatpilot.diagrams.worlds.solids.shading import Illumination, shade
 from splatpilot.diagrams.worlds.solids.solid import MATERIALS, Face, Solid, WorldSpec, cut_faces
 from splatpilot.diagrams.worlds.solids.surfaces import GROUND_REACH, merge
+from splatpilot.diagrams.worlds.solids.textures import Illumination, shade
 from splatpilot.systems.collision.esdf_build import esdf_from_distance_field
 from splatpilot.systems.collision.field_mesh import add_primitive, data_uri
 from splatpilot.systems.collision.shapes import HalfSpace

@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatpilot.diagrams.worlds.solids import patterns
-from splatpilot.diagrams.worlds.solids.shading import Illumination
 from splatpilot.diagrams.worlds.solids.surfaces import GROUND_REACH, FloorPlan, perpendicular
-from splatpilot.diagrams.worlds.solids.textures import BIRCH, OAK, PINE
+from splatpilot.diagrams.worlds.solids.textures import BIRCH, OAK, PINE, Illumination
 from splatpilot.systems.collision import shapes
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.common.validation import require

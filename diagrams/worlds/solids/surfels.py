@@ -4,7 +4,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatpilot.diagrams.worlds.solids import surfaces
-from splatpilot.diagrams.worlds.solids.shading import Illumination, shade
 from splatpilot.diagrams.worlds.solids.solid import (
     MATERIALS,
     Face,
@@ -13,6 +12,7 @@ from splatpilot.diagrams.worlds.solids.solid import (
     WorldSpec,
     cut_faces,
 )
+from splatpilot.diagrams.worlds.solids.textures import Illumination, shade
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.esdf_build import esdf_from_distance_field
 from splatpilot.systems.collision.shapes import AnalyticDistanceField, HalfSpace
