@@ -22,12 +22,14 @@ from .diagrams.worlds.splat_world import AddSplatWorld
 from .diagrams.worlds.world import World
 from .diagrams.worlds.world_registry import make_world, register_world
 from .systems.collision.esdf import Esdf
-from .systems.collision.esdf_collision import EsdfCollision
+from .systems.collision.esdf_collision import EsdfCollision, EsdfCollision_
 from .systems.collision.field_mesh import field_mesh, write_mesh
+from .systems.collision.optimization import AddBarrierCost, AddClearanceConstraint
 from .systems.common.config import dump_config, load_config
 from .systems.common.validation import Config, bounded
-from .systems.policies.hypotheses import HypothesisSelector
+from .systems.policies.hypotheses import HypothesisSelector, HypothesisSelector_
 from .systems.policies.planner import PrivilegedPlanner
+from .systems.policies.velocity import VelocityTracker, VelocityTracker_
 from .systems.sensing.imu import Imu
 from .systems.sensing.noise import ObservationNoise
 from .systems.sensing.onboard_camera import OnboardCamera
@@ -40,16 +42,18 @@ from .systems.splats.render_engine import SplatRenderEngine, gaussian_properties
 from .systems.splats.scene import GaussianScene
 from .systems.splats.splat_camera import SplatCamera
 from .systems.splats.splat_files import read_ply, write_ply
-from .systems.vehicle.flatness import FlatnessController
-from .systems.vehicle.quadrotor import QuadrotorParams, QuadrotorPlant, hover_state
+from .systems.vehicle.flatness import FlatnessController, FlatnessController_
+from .systems.vehicle.quadrotor import QuadrotorParams, QuadrotorPlant, QuadrotorPlant_, hover_state
 from .systems.vehicle.quadrotor_geometry import QuadrotorGeometry, quadrotor_gaussians
-from .systems.vehicle.state import QuadrotorState, StateToPose
+from .systems.vehicle.state import QuadrotorState, StateToPose, StateToPose_
 from .training.captures.capture import Capture
 from .training.captures.capture_registry import read_capture, register_capture
 from .training.policies.trainer_registry import register_trainer
 from .training.reconstruction.reconstruct import reconstruct
 
 __all__ = [
+    "AddBarrierCost",
+    "AddClearanceConstraint",
     "AddFlight",
     "AddFlightMonitor",
     "AddSplatWorld",
@@ -60,13 +64,16 @@ __all__ = [
     "Distortion",
     "Esdf",
     "EsdfCollision",
+    "EsdfCollision_",
     "ExportFlight",
     "FlatnessController",
+    "FlatnessController_",
     "Flight",
     "FlightMonitor",
     "FlightParts",
     "GaussianScene",
     "HypothesisSelector",
+    "HypothesisSelector_",
     "Imu",
     "MakeCamera",
     "MovingBodies",
@@ -78,12 +85,16 @@ __all__ = [
     "QuadrotorGeometry",
     "QuadrotorParams",
     "QuadrotorPlant",
+    "QuadrotorPlant_",
     "QuadrotorState",
     "RangeFinder",
     "Scenario",
     "SplatCamera",
     "SplatRenderEngine",
     "StateToPose",
+    "StateToPose_",
+    "VelocityTracker",
+    "VelocityTracker_",
     "World",
     "__version__",
     "bounded",

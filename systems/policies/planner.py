@@ -11,11 +11,10 @@ from splatpilot.systems.collision.distance_field import Distances
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.common.drake import optional_value, weak_callback
 from splatpilot.systems.common.provenance import InfeasibleFlightError
-from splatpilot.systems.common.validation import Config, bounded, require
+from splatpilot.systems.common.validation import Config, bounded, require, require_type
 from splatpilot.systems.policies.base import Policy
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS, Hypotheses, no_plan
-from splatpilot.systems.policies.lattice import LatticeConfig, TrajectoryLattice
-from splatpilot.systems.policies.motion_primitives import level_acceleration
+from splatpilot.systems.policies.lattice import LatticeConfig, TrajectoryLattice, level_acceleration
 from splatpilot.systems.policies.time_of_arrival import TimeOfArrival, time_of_arrival
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS, QuadrotorParams
 from splatpilot.systems.vehicle.state import QuadrotorState, pose_from_state
@@ -88,6 +87,8 @@ class PrivilegedPlanner(Policy):
     of trajectories know their future positions, see `MovingBodies`. Updates raise
     InfeasibleFlightError if the goal is outside the known volume, too close to an obstacle or cut
     off from the vehicle.
+
+    Supports the scalars float and AutoDiffXd; its hypotheses have zero derivatives.
     """
 
     def __init__(
@@ -96,7 +97,10 @@ class PrivilegedPlanner(Policy):
         config: PrivilegedPlannerConfig | None = None,
         params: QuadrotorParams | None = None,
     ) -> None:
-        super().__init__(config or PrivilegedPlannerConfig())
+        config = PrivilegedPlannerConfig() if config is None else config
+        require_type(esdf, Esdf, "esdf", "pass the `esdf` of a world")
+        require_type(config, PrivilegedPlannerConfig, "config")
+        super().__init__(config)
         lattice = self._config.lattice
         self._params = params or QuadrotorParams()
         self._params.validate()
