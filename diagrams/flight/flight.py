@@ -14,7 +14,7 @@ from pydrake.systems.framework import Context, Diagram, EventStatus
 from pydrake.systems.primitives import VectorLogSink
 
 from splatpilot.diagrams.flight.blocks import goal_position, policy_images, start_position
-from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.flight.scenario import Scenario, sample_scenario
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.common.config import dump_config
@@ -35,6 +35,7 @@ def sample_initial_state(scenario: Scenario, world: World) -> np.ndarray:
         InfeasibleFlightError: if a vehicle at start or goal would collide or be in unknown space,
             or if the start is at the goal.
     """
+    scenario = sample_scenario(scenario)
     p_WG, p_WS = goal_position(scenario, world), start_position(scenario, world)
     _check_free(world, "start", p_WS)
     _check_free(world, "goal", p_WG)
@@ -156,6 +157,7 @@ def fly(
     Raises:
         FlightError: from any other exception after time 0.
     """
+    scenario = sample_scenario(scenario)
     simulator = flight_simulator(diagram, scenario, world, progress)
     simulator.set_target_realtime_rate(realtime_rate)
     root = simulator.get_mutable_context()
@@ -188,6 +190,7 @@ def flight_simulator(
     progress: Callable[[float], object] | None = None,
 ) -> Simulator:
     """Makes a simulator of a diagram made by `BuildFlightDiagram` that ends with the flight."""
+    scenario = sample_scenario(scenario)
     scenario.validate()
     simulator = Simulator(diagram)
     ApplySimulatorConfig(scenario.simulator, simulator)

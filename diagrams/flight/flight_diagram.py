@@ -21,7 +21,7 @@ from splatpilot.diagrams.flight.blocks import (
     start_position,
 )
 from splatpilot.diagrams.flight.flight import sample_initial_state
-from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.flight.scenario import Scenario, sample_scenario
 from splatpilot.diagrams.worlds.appearance import randomize_appearance
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.common.validation import require
@@ -147,6 +147,7 @@ def BuildFlightDiagram(
     """
     valid = camera or not (video or meshcat is not None)
     require(valid, "camera", "True with meshcat or video, which show its images", camera)
+    scenario = sample_scenario(scenario)
     scenario.validate()
     world = randomize_appearance(world, scenario.appearance, scenario.seed)
     builder = DiagramBuilder()
@@ -199,7 +200,7 @@ def BuildFlightDiagram(
 
 def MakeCamera(scenario: Scenario, world: World) -> SplatCamera:
     """Makes the scenario's camera of the world's Gaussians."""
-    config = scenario.camera
+    config = sample_scenario(scenario).camera
     return SplatCamera(
         world.baked,
         camera_info(config),

@@ -27,7 +27,7 @@ from splatpilot.diagrams.flight.flight_diagram import (
     camera_mount,
     open_meshcat,
 )
-from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.flight.scenario import Scenario, sample_scenario
 from splatpilot.diagrams.worlds.appearance import randomize_appearance
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import make_world
@@ -135,6 +135,7 @@ def run(
     Returns:
         `Flight.summary()` and `render_ms`, the mean time of a render along the flight [ms].
     """
+    scenario = sample_scenario(scenario)
     scenario.validate()
     for path in (out, graphviz):
         if path is not None:
