@@ -1,8 +1,9 @@
+from .analysis.benchmark.run_study import study
 from .diagrams.flight.flight import Flight, Outcome, fly, sample_initial_state
 from .diagrams.flight.flight_diagram import BuildFlightDiagram, MakeCamera
 from .diagrams.flight.monte_carlo import random_flights
 from .diagrams.flight.policies import policy_named, register_policy
-from .diagrams.flight.scenario import Scenario
+from .diagrams.flight.scenario import Scenario, sample_scenario
 from .diagrams.flight.sensors import register_sensor
 from .diagrams.worlds.world import World
 from .diagrams.worlds.world_registry import make_world, register_world
@@ -75,6 +76,8 @@ __all__ = [
     "register_trainer",
     "register_world",
     "sample_initial_state",
+    "sample_scenario",
+    "study",
     "write_mesh",
     "write_ply",
 ]

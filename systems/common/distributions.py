@@ -203,21 +203,22 @@ def sample_distributions[Configuration](
         return config
     config = copy.deepcopy(config)
     for place in list(find_distributions(config, path)):
-        place.put(_draw(place, seed))
+        place.put(draw(place.distribution, seed, place.name))
     return config
 
 
-def _draw(place: Place, seed: int) -> Any:
-    stream = hashlib.sha256(f"{seed} {place.name}".encode()).digest()
-    value: Any = place.distribution.Sample(RandomGenerator(int.from_bytes(stream[:4])))
-    if isinstance(place.distribution, Transform):
+def draw(distribution: Any, seed: int, name: str) -> Any:
+    """Returns a value of a distribution, or of a transform that has one, by seed and name."""
+    stream = hashlib.sha256(f"{seed} {name}".encode()).digest()
+    value = distribution.Sample(RandomGenerator(int.from_bytes(stream[:4])))
+    if isinstance(distribution, Transform):
         drawn = Transform(value)
-        drawn.base_frame = place.distribution.base_frame
+        drawn.base_frame = distribution.base_frame
         return drawn
-    if isinstance(place.distribution, DistributionVector):
+    if isinstance(distribution, DistributionVector):
         return value.tolist()
-    kinds = {name: kind for name, _, kind in _fields(place.holder)}
-    return int(value) if _without_none(kinds.get(place.path[-1])) is int else value  # pyright: ignore
+    whole = isinstance(distribution, UniformDiscrete) and value.is_integer()
+    return int(value) if whole else value
 
 
 def take_distributions(text: str, path: Path = ()) -> tuple[str, dict[Path, Any]]:

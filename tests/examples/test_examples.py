@@ -107,7 +107,6 @@ def test_photographs_to_flight(opengl, tmp_path):
 
 
 def test_monte_carlo(tmp_path):
-    pytest.importorskip("pandas")
     (tmp_path / "short.yaml").write_text(SHORT)
     words = ["--scenarios", "short.yaml", "--seeds", 1, "--jobs", 1]
     out = run("monte_carlo.py", *words, cwd=tmp_path)

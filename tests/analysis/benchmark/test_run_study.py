@@ -108,8 +108,8 @@ def test_damaged_files_are_flown_again_and_reported(study, tmp_path, capsys, con
 def test_folder_of_another_study_is_refused(study, tmp_path, contents):
     config, whole = study
     before = contents(whole)
-    with pytest.raises(ValueError, match=r"holds a study with seeds 3, not 4"):
-        run_study.run(config=replace(config, seeds=4), out=whole, jobs=1)
+    with pytest.raises(ValueError, match=r"holds a study with seeds 3, not 2"):
+        run_study.run(config=replace(config, seeds=2), out=whole, jobs=1)
     with pytest.raises(ValueError, match=r"study with overrides \[\], not \['timeout=2'\]"):
         run_study.run(config=replace(config, overrides=["timeout=2"]), out=whole, jobs=1)
     assert contents(whole) == before
@@ -130,7 +130,7 @@ def test_absent_scene_is_not_run_and_never_passed(short_scenario, tmp_path, caps
     absent = tmp_path / "R99.yaml"
     absent.write_text(f"world: !SceneConfig {{path: {tmp_path / 'nowhere'}}}\n")
     config = StudyConfig([str(short_scenario), str(absent)], ["straight"], [2.0], seeds=2)
-    table = run_study.run(config=config, out=tmp_path / "out", jobs=1)
+    table = run_study.run(config=config, out=tmp_path / "out", jobs=1).table
     assert (table[0]["flights"], table[0]["not_run"]) == (2, 2)
     printed = capsys.readouterr().out
     assert f"R99 is not flown: No such file or folder: {tmp_path / 'nowhere'}" in printed
@@ -191,7 +191,7 @@ def test_test_study_flies_only_in_test_scenes_each_one_environment(room, tmp_pat
     with pytest.raises(ValueError, match=r"split of .*own, in which hall flies, must be test"):
         run_study.run(config=config, out=tmp_path / "out", jobs=1)
     hall.write_text(f"world: !SceneConfig {{path: {room.scene('held', split='test')}}}\n")
-    (row,) = run_study.run(config=config, out=tmp_path / "out", jobs=1)
+    (row,) = run_study.run(config=config, out=tmp_path / "out", jobs=1).table
     assert row["flights"] == 1
     assert "Each of hall is one environment" in (tmp_path / "out" / "report.html").read_text()
 
