@@ -1,6 +1,8 @@
+import importlib
 import subprocess
 import sys
 import textwrap
+import threading
 
 import numpy as np
 import pandas as pd
@@ -151,7 +153,7 @@ def test_systems_of_functions_fly_in_worker_processes_too(short, tmp_path, capsy
     assert here.end_z_m[0] > here.end_z_m[1]
     with pytest.raises(ValueError, match="flown by a system that a function of Python made"):
         replay.run(study=tmp_path / "out", id=there.id[0])
-    lock = __import__("threading").Lock()
+    lock = threading.Lock()
     with pytest.raises(ValueError, match=r"policy up must be picklable .*; use one job"):
         sp.study(short, policies={"up": lambda *_: lock and Climb(1.0)}, seeds=1, jobs=2)
 
@@ -213,12 +215,12 @@ def test_policies_of_main_are_the_cause_if_several_jobs_cannot_import_them(tmp_p
         import splatpilot as sp
         from splatpilot.systems.policies.straight import Straight, StraightConfig
 
-        @dataclass
-        class HoldConfig(StraightConfig):
-            pass
+        for run_of_a_cell in range(2):
+            @dataclass
+            class HoldConfig(StraightConfig):
+                pass
 
-        sp.register_policy(HoldConfig, lambda config, world, vehicle: Straight(config))
-        sp.register_policy(HoldConfig, lambda config, world, vehicle: Straight(config))
+            sp.register_policy(HoldConfig, lambda config, world, vehicle: Straight(config))
         scenario = sp.load_config(sp.Scenario(), overrides=["timeout=0.2", "world.length=8"])
         print(len(sp.study(scenario, policies="hold", seeds=1, jobs=1)))
         sp.study(scenario, policies="hold", seeds=1, jobs=2)
@@ -257,7 +259,7 @@ def test_policies_of_others_have_their_own_files_of_weights(short, tmp_path, mon
     monkeypatch.setitem(sys.modules, "linear_of_test", None)
     del sys.modules["linear_of_test"]
     (tmp_path / "linear_of_test.py").write_text(LINEAR)
-    __import__("linear_of_test")
+    importlib.import_module("linear_of_test")
     (tmp_path / "w.txt").write_text("0 0 1")
     policy, out = f"mine=linear:weights={tmp_path / 'w.txt'}", tmp_path / "out"
     flights = sp.study(short, policies=policy, seeds=1, jobs=1, out=out)

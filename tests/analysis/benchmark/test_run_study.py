@@ -28,6 +28,16 @@ def test_chunks_are_flights_through_one_world(short_scenario):
     assert all(len({spec.seed for spec, _ in part}) == 1 for part in parts)
 
 
+def test_variants_of_a_scenario_share_chunks_if_they_share_worlds():
+    texts = ["P02:vehicle.drag=0.3", "P02:world.spacing=2", "P02:vehicle.drag=0.5"]
+    config = StudyConfig(texts, ["straight"], seeds=2)
+    flights = [(spec, spec.id) for spec in config.rollouts()]
+    changed = {each.label: each for each in config.scenario_variants}
+    parts = [[spec for spec, _ in part] for part in chunks(flights, 6, changed)]
+    assert [len(part) for part in parts] == [2, 2, 1, 1]
+    assert [spec.scenario for spec in parts[0]] == ["P02-vehicle.drag-0.3", "P02-vehicle.drag-0.5"]
+
+
 def test_study_has_all_flights_tables_and_a_report(study, rows_of):
     config, out = study
     rows = rows_of(out / "rollouts.csv")
@@ -201,6 +211,7 @@ def test_one_option_flies_the_dodgedrone_challenge(monkeypatch, tmp_path):
 
     def run(*, config, out, jobs, cluster):
         studies.append(config)
+        return run_study.Flown([], [])
 
     monkeypatch.setattr(run_study, "run", run)
     command = ["benchmark", "--dodgedrone", "--out", str(tmp_path)]
