@@ -20,7 +20,9 @@ OBSERVATIONS = [
 def main(out: Path, scenarios: list[str], seeds: int, jobs: int | None) -> None:
     policies = ["reactive", "careful=reactive:margin=0.3"]
     flights = sp.study(scenarios, OBSERVATIONS, policies=policies, seeds=seeds, jobs=jobs, out=out)
-    flights["observation"] = flights["observation.latency"].map({0.0: "clean", 0.05: "noisy"})
+    flights["observation"] = [
+        "noisy" if each else "clean" for each in flights["observation.latency"]
+    ]
     flights["arrived"] = flights.outcome == "goal"
     summary = flights.groupby(["policy", "observation"]).agg(
         flights=("id", "count"),

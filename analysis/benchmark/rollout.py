@@ -153,7 +153,7 @@ def _fly_rollout(
     spec: RolloutSpec, scenario: Scenario, base: ScenarioVariant, make: MakeSystem | None
 ) -> Rollout:
     """Flies one flight. Exceptions other than `InfeasibleFlightError` stop the study."""
-    names = [*base.fields, *(place.name for place in find_distributions(scenario))]
+    names = [*base.fields, *(drawn.name for drawn in find_distributions(scenario))]
     scenario = sample_scenario(scenario)
     values = {name: _field_value(scenario, name) for name in names}
     started, cpu_started = time.perf_counter(), time.process_time()

@@ -8,8 +8,6 @@ from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import yaml
-
 from splatpilot.systems.common.validation import require
 
 SCENARIO = "scenario"
@@ -36,6 +34,8 @@ class Variant(NamedTuple):
         """The file of weights, if the policy or its field `weights` is one."""
         given = [text.partition("=")[2] for text in self.overrides if text.startswith(_WEIGHTS)]
         if given:
+            import yaml  # the command line parses variants before slow imports
+
             return Path(str(yaml.safe_load(given[-1])))
         return Path(self.policy) if self.policy.endswith(".npz") else None
 

@@ -80,7 +80,7 @@ for _kind in vars(schema).values():
         pickle_by_fields(_kind)
 
 
-class Place(NamedTuple):
+class DrawnField(NamedTuple):
     """A field, or an item of one, that holds a distribution."""
 
     path: Path
@@ -115,7 +115,7 @@ def distribution_text(distribution: Any) -> str:
     return yaml.serialize(_node(distribution), width=float("inf")).strip()
 
 
-def find_distributions(config: Any, path: Path = ()) -> Iterator[Place]:
+def find_distributions(config: Any, path: Path = ()) -> Iterator[DrawnField]:
     """Yields the distributions in a configuration, and transforms that have one.
 
     Args:
@@ -136,13 +136,13 @@ def _fields(config: Any) -> Iterator[tuple[str, Any, Any]]:
         yield field.name, getattr(config, field.name), field.type
 
 
-def _find(holder: Any, path: Path, value: Any, kind: Any) -> Iterator[Place]:
+def _find(holder: Any, path: Path, value: Any, kind: Any) -> Iterator[DrawnField]:
     if is_distribution(value):
         _check(path, value, kind)
-        yield Place(path, holder, value)
+        yield DrawnField(path, holder, value)
     elif isinstance(value, Transform):
         if not value.IsDeterministic():
-            yield Place(path, holder, value)
+            yield DrawnField(path, holder, value)
     elif isinstance(value, dict | list):
         items = value.items() if isinstance(value, dict) else enumerate(value)
         kinds = [each for each in get_args(_without_none(kind)) if each is not NoneType]
@@ -202,8 +202,8 @@ def sample_distributions[Configuration](
     if next(find_distributions(config, path), None) is None:
         return config
     config = copy.deepcopy(config)
-    for place in list(find_distributions(config, path)):
-        place.put(draw(place.distribution, seed, place.name))
+    for field in list(find_distributions(config, path)):
+        field.put(draw(field.distribution, seed, field.name))
     return config
 
 
@@ -270,20 +270,20 @@ def _read(node: yaml.Node, path: Path) -> Any:
 
 def dump_with_distributions(config: Any) -> str:
     """Returns a configuration as YAML with every field."""
-    if not any(is_distribution(place.distribution) for place in find_distributions(config)):
+    if not any(is_distribution(field.distribution) for field in find_distributions(config)):
         return str(yaml_dump_typed(config))
     plain = copy.deepcopy(config)
-    places = [p for p in find_distributions(plain) if is_distribution(p.distribution)]
-    for place in places:
-        place.put([] if isinstance(place.distribution, DistributionVector) else 0)
+    drawn = [p for p in find_distributions(plain) if is_distribution(p.distribution)]
+    for field in drawn:
+        field.put([] if isinstance(field.distribution, DistributionVector) else 0)
     root = yaml.compose(str(yaml_dump_typed(plain)), yaml.SafeLoader)
-    for place in places:
+    for field in drawn:
         holder = root
-        for name in place.path[:-1]:
+        for name in field.path[:-1]:
             holder = holder.value[_row(holder, name)]
             holder = holder[1] if isinstance(holder, tuple) else holder
-        row = _row(holder, place.path[-1])
-        node = _node(place.distribution)
+        row = _row(holder, field.path[-1])
+        node = _node(field.distribution)
         held = holder.value[row]
         holder.value[row] = (held[0], node) if isinstance(held, tuple) else node
     return yaml.serialize(root)
