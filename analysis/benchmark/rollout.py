@@ -19,9 +19,9 @@ from splatpilot import _native
 from splatpilot.analysis.benchmark.study import RolloutSpec
 from splatpilot.analysis.benchmark.variants import ScenarioVariant
 from splatpilot.analysis.difficulty import Difficulty, world_difficulty
-from splatpilot.diagrams.flight.blocks import goal_position, start_position
-from splatpilot.diagrams.flight.flight import Flight, Outcome, decision_times, fly
-from splatpilot.diagrams.flight.flight_diagram import LOG_PERIOD, BuildFlightDiagram
+from splatpilot.diagrams.flight.flight import Flight, decision_times, fly
+from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
+from splatpilot.diagrams.flight.monitor import LOG_PERIOD, Outcome, goal_position, start_position
 from splatpilot.diagrams.flight.policies import POLICIES
 from splatpilot.diagrams.flight.scenario import Scenario, sample_scenario
 from splatpilot.diagrams.worlds.world import World
@@ -164,7 +164,7 @@ def _fly_rollout(
         timing["world_s"] = time.perf_counter() - started
         policy = None if make is None else make(scenario, world)
         diagram = BuildFlightDiagram(scenario, world, camera=False, policy=policy)
-        flight = fly(diagram, scenario, world)
+        flight = fly(diagram)
         ends = tuple(start_position(scenario, world)), tuple(goal_position(scenario, world))
         lengths = _lengths_to(world, ends[1])
         p_WS = QuadrotorState.of(flight.states[0]).p_WB

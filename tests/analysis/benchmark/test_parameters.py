@@ -220,7 +220,7 @@ def test_policies_of_main_are_the_cause_if_several_jobs_cannot_import_them(tmp_p
             class HoldConfig(StraightConfig):
                 pass
 
-            sp.register_policy(HoldConfig, lambda config, world, vehicle: Straight(config))
+            sp.register_policy(HoldConfig, lambda config, world, scenario: Straight(config))
         scenario = sp.load_config(sp.Scenario(), overrides=["timeout=0.2", "world.length=8"])
         print(len(sp.study(scenario, policies="hold", seeds=1, jobs=1)))
         sp.study(scenario, policies="hold", seeds=1, jobs=2)
@@ -249,7 +249,7 @@ class Linear(LeafSystem):
         v_W = np.loadtxt(config.weights)
         self.DeclareVectorOutputPort("velocity", 3, lambda _, y: y.SetFromVector(v_W))
 
-sp.register_policy(LinearConfig, lambda config, world, vehicle: Linear(config))
+sp.register_policy(LinearConfig, lambda config, world, scenario: Linear(config))
 """
 
 

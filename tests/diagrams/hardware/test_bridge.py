@@ -58,7 +58,7 @@ def forest():
 @pytest.mark.parametrize("name", ["planner", "reactive", "depthnav", "diffaero", "diffaero_tof"])
 def test_the_two_halves_fly_as_the_whole(forest, name):
     scenario = Scenario(timeout=1.6, policy=policy_named(name))
-    whole = fly(BuildFlightDiagram(scenario, forest, camera=False), scenario, forest)
+    whole = fly(BuildFlightDiagram(scenario, forest, camera=False))
     limits = FlightLimits(max_speed=20.0, max_tilt=1.5, deceleration=100.0, min_clearance=0.0)
     halves = Halves(scenario, forest, failsafe=FailsafeConfig(limits=limits), tick=0.002)
     halves.advance_to(1.6)
@@ -76,6 +76,8 @@ def test_ports_are_those_of_the_flight_diagram(post_world):
     hardware = BuildHardwareDiagram(scenario, post_world, lcm.LCM("memq://"))
     for index in range(flight.num_output_ports()):
         port = flight.get_output_port(index)
+        if port.get_name() == "outcome" or port.get_name().startswith("observation_"):
+            continue
         assert hardware.GetOutputPort(port.get_name()).size() == port.size()
 
 

@@ -137,7 +137,6 @@ def test_a_drawn_scenario_flies_and_is_recorded(tmp_path):
     scenario = load(*words[1::2])
     world = sp.make_world(scenario.world, scenario.seed)
     flown, drawn = (
-        sp.fly(sp.BuildFlightDiagram(each, world), each, world)
-        for each in (scenario, sample_scenario(scenario))
+        sp.fly(sp.BuildFlightDiagram(each, world)) for each in (scenario, sample_scenario(scenario))
     )
     assert (flown.states == drawn.states).all()
