@@ -23,7 +23,7 @@ def parameter_rows(parameters: Any, samples: int | None = None) -> list[dict[str
 
     Args:
         parameters: a table (a DataFrame, or a list of rows), whose missing values are left out; or
-            a dictionary of lists, of which it returns all combinations, and distributions.
+            a grid (a dictionary of lists: all combinations), which may have distributions.
         samples: number of values drawn from the distributions. By default these stay, and each
             flight draws by its seed.
     """

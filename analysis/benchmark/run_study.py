@@ -163,7 +163,7 @@ def run(
     if jobs > 1 or cluster is not None:
         _require_importable(complete, systems)
     flown_by = program() | plugin_digests(complete) | input_digests(config, loaded)
-    flown_by |= {f"source of {label}": source_digest(make) for label, make in systems.items()}
+    flown_by |= {f"system of {label}": source_digest(make) for label, make in systems.items()}
     folder = StudyFolder(out)
     folder.begin(config, flown_by)
     keep_inputs(folder, config, flyable)

@@ -223,7 +223,7 @@ def success_summary(rows: list[Row], bases: Mapping[str, str] | None = None) -> 
     of the same kinds.
 
     Args:
-        bases: the scenarios of which others are variants.
+        bases: names of the scenarios without changed fields, by those of their variants.
     """
     flights, wins = (_count(rows, lambda row: row["scenario"], won) for won in (False, True))
     worlds, won = (_count(rows, _world, won) for won in (False, True))

@@ -114,13 +114,13 @@ def test_distributions_are_drawn_for_each_seed_and_recorded(short, tmp_path):
     parameters = {"vehicle.drag": Uniform(min=0.3, max=0.5)}
     out = tmp_path / "out"
     flights = sp.study(short, parameters, policies="straight", seeds=3, jobs=1, out=out)
-    assert flights["vehicle.drag"].between(0.3, 0.5).all()
-    assert flights["vehicle.drag"].nunique() == 3
+    drags = flights["vehicle.drag"].tolist()
+    assert len(set(drags)) == 3 and 0.3 <= min(drags) <= max(drags) <= 0.5
     written = pd.read_csv(out / "rollouts.csv")
-    assert written["vehicle.drag"].tolist() == flights["vehicle.drag"].tolist()
+    assert written["vehicle.drag"].tolist() == drags
     assert replay.run(study=out, id=flights.id[1])
     drawn = sp.study(short, parameters, policies="straight", seeds=1, samples=2, jobs=1)
-    assert drawn["vehicle.drag"].nunique() == 2 and set(drawn.seed) == {0}
+    assert set(drawn.seed) == {0} and len(set(drawn["vehicle.drag"])) == 2
 
 
 def test_a_study_grows_in_place_and_flies_only_what_is_missing(short, tmp_path, contents):
