@@ -26,6 +26,7 @@ from splatpilot.diagrams.worlds.feasibility import (
     grid_cell,
     grid_distances,
 )
+from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.collision.distance_field import DistanceField, FieldState
 from splatpilot.systems.collision.esdf import Esdf
@@ -70,6 +71,12 @@ def difficulty(field: DistanceField, p_WS: NDArray, p_WG: NDArray, seed: int = 0
         detour_ratio=float(path_length(path) / np.linalg.norm(p_WG - p_WS)),
         bottleneck_m=bottleneck(field, grid, p_WS, p_WG),
     )
+
+
+def world_difficulty(world: World, p_WS: NDArray, p_WG: NDArray, seed: int) -> Difficulty:
+    """Computes `difficulty` in a world, in which unknown space of grids counts as occupied."""
+    field = world.distance_field
+    return difficulty(field.conservative() if isinstance(field, Esdf) else field, p_WS, p_WG, seed)
 
 
 def shortest_path(field: DistanceField, grid: NDArray, p_WS: NDArray, p_WG: NDArray) -> NDArray:
@@ -279,10 +286,7 @@ def _measure(file: Path, seeds: int) -> str:
                 world = make_world(config, seed)
             finally:
                 spent.append(time.process_time() - started)
-            field = world.distance_field
-            # Unknown space of grids counts as occupied.
-            field = field.conservative() if isinstance(field, Esdf) else field
-            rows.append(list(vars(difficulty(field, world.p_WS, world.p_WG, seed)).values()))
+            rows.append(list(vars(world_difficulty(world, world.p_WS, world.p_WG, seed)).values()))
     means = np.mean(rows, axis=0) if rows else np.full(len(fields(Difficulty)), np.nan)
     columns = f"{f'{len(rows)}/{seeds}':>10}{np.mean(spent):>7.2f}"
     return columns + "".join(f"{mean:>8.2f}" for mean in means)

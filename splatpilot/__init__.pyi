@@ -1,3 +1,4 @@
+from .analysis.benchmark.run_study import study
 from .diagrams.flight.flight import (
     Flight,
     fly,
@@ -15,7 +16,7 @@ from .diagrams.flight.flight_diagram import (
 from .diagrams.flight.monitor import AddFlightMonitor, FlightMonitor, Outcome
 from .diagrams.flight.monte_carlo import random_flights
 from .diagrams.flight.policies import policy_named, register_policy
-from .diagrams.flight.scenario import Scenario
+from .diagrams.flight.scenario import Scenario, sample_scenario
 from .diagrams.flight.sensors import register_sensor
 from .diagrams.worlds.moving_spheres import MovingSphere
 from .diagrams.worlds.splat_world import AddSplatWorld
@@ -120,6 +121,8 @@ __all__ = [
     "register_trainer",
     "register_world",
     "sample_initial_state",
+    "sample_scenario",
+    "study",
     "write_mesh",
     "write_ply",
 ]

@@ -31,13 +31,13 @@ SETTINGS = [
 ]
 
 
-def _digests(settings: dict[str, str]) -> dict[str, str]:
+def _digests(settings: dict[str, str], first: str = "") -> dict[str, str]:
     from splatpilot import _native
 
     if settings["SPLATPILOT_SIMD"] not in _native.simd_levels():
         settings = {name: v for name, v in settings.items() if name != "SPLATPILOT_SIMD"}
     ended = subprocess.run(
-        [sys.executable, "-c", _FLY],
+        [sys.executable, "-c", first + _FLY],
         env=os.environ | settings,
         check=True,
         capture_output=True,
@@ -49,6 +49,10 @@ def _digests(settings: dict[str, str]) -> dict[str, str]:
 def test_flights_do_not_depend_on_threads_and_simd_levels():
     first, second = map(_digests, SETTINGS)
     assert first == second
+
+
+def test_flights_do_not_depend_on_the_order_of_imports():
+    assert _digests(SETTINGS[0], "import pandas, pydrake.all\n") == _digests(SETTINGS[0])
 
 
 def test_importing_the_package_changes_no_environment():

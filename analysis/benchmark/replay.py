@@ -11,6 +11,7 @@ from splatpilot.analysis.benchmark.rollout import digest, study_world
 from splatpilot.analysis.benchmark.study import RolloutSpec
 from splatpilot.analysis.benchmark.study_folder import StudyFolder, kept_flights, plugin_digests
 from splatpilot.analysis.benchmark.tables import Row
+from splatpilot.analysis.benchmark.variants import LIVE
 from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
 from splatpilot.diagrams.flight.fly import (
     fly_with_bar,
@@ -18,7 +19,7 @@ from splatpilot.diagrams.flight.fly import (
     replayed_flight,
     write_flight_page,
 )
-from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.flight.scenario import Scenario, sample_scenario
 from splatpilot.systems.common.files import require_unused, require_writable_folder
 from splatpilot.systems.common.provenance import program
 from splatpilot.systems.vehicle.state import QuadrotorState
@@ -39,7 +40,13 @@ def run(
     bitwise identical to its record. Page and video go to `replays/ID` in the study by default."""
     folder = StudyFolder(study)
     spec, row, recorded = _read_flight(folder, id)
-    _, scenario = next(kept_flights(folder, [spec]))
+    live = [each.label for each in folder.config().variants if each.policy == LIVE]
+    if spec.policy in live:
+        raise ValueError(
+            f"{id} was flown by a system that a function of Python made; fly it again by the same "
+            "call of study, in another folder"
+        )
+    scenario = sample_scenario(next(kept_flights(folder, [spec]))[1])
     world = study_world(scenario)
     out = out or study / "replays" / id
     filmed = meshcat or video
@@ -92,7 +99,7 @@ def overlay(
         )
         no_plans = np.empty((0, 0))
         flights.append(ReplayedFlight(spec.id, row["outcome"], times, states, clearances, no_plans))
-    _, scenario = next(kept_flights(folder, [first]))
+    scenario = sample_scenario(next(kept_flights(folder, [first]))[1])
     out = out or study / "replays" / first.id
     page = out / "flights.html"
     require_unused(page, overwrite)

@@ -26,6 +26,7 @@ from splatpilot.analysis.benchmark.tables import (
 )
 from splatpilot.analysis.output import write_png
 from splatpilot.diagrams.flight.monitor import goal_position
+from splatpilot.diagrams.flight.scenario import sample_scenario
 from splatpilot.diagrams.worlds.scene_folder import SceneSource
 from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.common.files import written_atomically
@@ -245,8 +246,9 @@ def _pairs(config: StudyConfig, rows: list[Row]) -> str:
     header = ["policies", "speed [m/s]", "only the first succeeds", "only the second"]
     header += ["p, these scenarios", "p, new scenarios"]
     return _table(header, lines) + _note(
-        "Exact McNemar tests over flights, for these scenarios with new seeds, and sign-flip "
-        "permutation tests over scenarios, for others of the same kinds. Both are corrected by "
+        "Exact McNemar tests over flights, for these scenarios with new seeds (sign-flip tests "
+        "over worlds if flights share them), and sign-flip permutation tests over scenarios, for "
+        "others of the same kinds. Both are corrected by "
         f"Holm for the {len(lines)} pairs."
     )
 
@@ -318,7 +320,7 @@ def _success_against_speed(
 def _trajectories(folder: StudyFolder, config: StudyConfig, rows: list[Row]) -> str:
     """Draws Fig. 6, flights through one field, as `trajectories.png`; returns its HTML."""
     spec = _telling_flight(rows)
-    _, scenario = next(kept_flights(folder, [spec]))
+    scenario = sample_scenario(next(kept_flights(folder, [spec]))[1])
     world = make_world(scenario.world, scenario.seed)
     field, p_WG = world.distance_field, goal_position(scenario, world)
     extent = field.upper_W - field.lower_W

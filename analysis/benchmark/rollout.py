@@ -8,25 +8,33 @@ import math
 import platform
 import time
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, fields
 from typing import Any, NamedTuple
 
 import numpy as np
+from pydrake.systems.framework import System
 
 from splatpilot import _native
 from splatpilot.analysis.benchmark.study import RolloutSpec
+from splatpilot.analysis.benchmark.variants import ScenarioVariant
+from splatpilot.analysis.difficulty import Difficulty, world_difficulty
 from splatpilot.diagrams.flight.flight import Flight, decision_times, fly
 from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
-from splatpilot.diagrams.flight.monitor import LOG_PERIOD, Outcome, goal_position
+from splatpilot.diagrams.flight.monitor import LOG_PERIOD, Outcome, goal_position, start_position
 from splatpilot.diagrams.flight.policies import POLICIES
-from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.flight.scenario import Scenario, sample_scenario
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import make_world
-from splatpilot.systems.common.config import dump_config, parse_config
+from splatpilot.systems.common.config import dump_config, is_configuration, parse_config
+from splatpilot.systems.common.distributions import find_distributions
 from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.common.registry import import_modules
 from splatpilot.systems.policies.time_of_arrival import TimeOfArrival, path_lengths
 from splatpilot.systems.vehicle.state import QuadrotorState
+
+MakeSystem = Callable[[Scenario, World], System]
+"""Makes the system of a policy for one flight."""
 
 ARRAYS = "times", "states", "commands", "clearances"
 """The arrays of `Flight` in a study."""
@@ -34,6 +42,8 @@ ARRAYS = "times", "states", "commands", "clearances"
 INFEASIBLE = "infeasible"
 """The outcome of a flight that cannot start (`InfeasibleFlightError`), a failure with a reason. One
 that becomes infeasible in flight has `Outcome.ERROR`."""
+
+_END = "end_x_m", "end_y_m", "end_z_m"  # p_WB at the end
 
 _JERK_STRIDE = 5
 """Samples between differentiated velocities: 0.1 s, beyond the controller's steps of 0.02 s."""
@@ -64,6 +74,7 @@ def flight_metrics(flight: Flight, shortest: float) -> dict[str, float | str | b
     over the shortest one, minus one; NaN if it did not arrive. `jerk_m_s3` is the root mean square
     of the second differences of the velocity at 0.1 s, `smoothness` the logarithmic dimensionless
     jerk, -ln(T³ / v_max² ∫ |jerk|² dt) (N. Hogan and D. Sternad, J. Motor Behavior 41, 2009).
+    `end_x_m` to `end_z_m` are where it ended.
     """
     summary = flight.summary()
     arrived = flight.outcome == Outcome.GOAL
@@ -77,6 +88,7 @@ def flight_metrics(flight: Flight, shortest: float) -> dict[str, float | str | b
         "path_length_m": length,
         "mean_speed_m_s": float(summary["mean_speed_m_s"]),
         "min_clearance_m": clearance,
+        **dict(zip(_END, QuadrotorState.of(flight.states[-1]).p_WB.tolist(), strict=True)),
         "shortest_path_m": shortest,
         "path_excess": length / shortest - 1.0 if arrived and shortest > 0 else math.nan,
         "jerk_m_s3": jerk,
@@ -111,10 +123,16 @@ def fly_rollouts(
     flights: list[tuple[RolloutSpec, str]],
     modules: Sequence[str] = (),
     policies: Sequence[str] = (),
+    changed: Mapping[str, ScenarioVariant] = {},
+    systems: Mapping[str, MakeSystem] = {},
 ) -> list[Rollout | Fault]:
     """Flies flights, with their scenarios as YAML, up to the first fault.
 
     Imports the plugins `modules`, and finds `policies`, MODULE:ATTRIBUTE, that none registers.
+
+    Args:
+        changed: scenarios by label, whose changed fields are columns of the rows.
+        systems: functions by label of policies that make the policy's system.
     """
     import_modules(modules)
     for policy in policies:
@@ -122,27 +140,37 @@ def fly_rollouts(
     flown: list[Rollout | Fault] = []
     for spec, text in flights:
         try:
-            flown.append(_fly_rollout(spec, parse_config(Scenario(), text, f"flight {spec.id}")))
+            scenario = parse_config(Scenario(), text, f"flight {spec.id}")
+            base = changed.get(spec.scenario, ScenarioVariant(spec.scenario, spec.scenario))
+            flown.append(_fly_rollout(spec, scenario, base, systems.get(spec.policy)))
         except Exception as error:
             reason = f"{type(error).__name__}: {error}".partition("\n")[0]
             return [*flown, Fault(spec.id, reason, traceback.format_exc())]
     return flown
 
 
-def _fly_rollout(spec: RolloutSpec, scenario: Scenario) -> Rollout:
+def _fly_rollout(
+    spec: RolloutSpec, scenario: Scenario, base: ScenarioVariant, make: MakeSystem | None
+) -> Rollout:
     """Flies one flight. Exceptions other than `InfeasibleFlightError` stop the study."""
+    names = [*base.fields, *(drawn.name for drawn in find_distributions(scenario))]
+    scenario = sample_scenario(scenario)
+    values = {name: _field_value(scenario, name) for name in names}
     started, cpu_started = time.perf_counter(), time.process_time()
     timing: dict[str, Any] = {"id": spec.id}
     arrays = {}
     try:
         world = study_world(scenario)
         timing["world_s"] = time.perf_counter() - started
-        diagram = BuildFlightDiagram(scenario, world, camera=False)
+        policy = None if make is None else make(scenario, world)
+        diagram = BuildFlightDiagram(scenario, world, camera=False, policy=policy)
         flight = fly(diagram)
-        lengths = _lengths_to(world, tuple(goal_position(scenario, world)))
+        ends = tuple(start_position(scenario, world)), tuple(goal_position(scenario, world))
+        lengths = _lengths_to(world, ends[1])
         p_WS = QuadrotorState.of(flight.states[0]).p_WB
         shortest = shortest_length(lengths, p_WS, scenario.goal_radius)
         metrics = flight_metrics(flight, shortest) | {"digest": digest(flight)}
+        metrics |= _difficulty(world, *ends, scenario.seed)
         if flight.reason:  # timing the policy could raise again
             metrics["reason"] = flight.reason
         else:
@@ -162,10 +190,31 @@ def _fly_rollout(spec: RolloutSpec, scenario: Scenario) -> Rollout:
         "host": platform.node(),
         "simd": _native.simd_levels()[0],
     }
-    row = spec._asdict() | metrics
+    row = spec._asdict() | {"world_id": _world_name(base, spec.seed, values)} | values | metrics
     file = io.BytesIO()
     np.savez_compressed(file, row=np.array(json.dumps(row)), **arrays)
     return Rollout({"id": spec.id} | row, file.getvalue(), timing)
+
+
+def _field_value(scenario: Scenario, name: str) -> Any:
+    """Returns the value of a field, by its dotted name, as JSON holds it."""
+    value: Any = scenario
+    for part in name.split("."):
+        if isinstance(value, list):
+            value = value[int(part)]
+        else:
+            value = value[part] if isinstance(value, dict) else getattr(value, part)
+    if is_configuration(value):
+        return dump_config(value)
+    return value.tolist() if isinstance(value, np.ndarray) else value
+
+
+def _world_name(base: ScenarioVariant, seed: int, values: dict[str, Any]) -> str:
+    """Names the world of a flight: flights of the same name share it."""
+    changed = {name: value for name, value in values.items() if name.startswith("world")}
+    text = json.dumps(changed, sort_keys=True)
+    suffix = f"-{hashlib.sha256(text.encode()).hexdigest()[:8]}" if changed else ""
+    return f"{base.base}-{seed:03d}{suffix}"
 
 
 def digest(flight: Flight) -> str:
@@ -185,6 +234,17 @@ def study_world(scenario: Scenario) -> World:
             _worlds.pop(next(iter(_worlds)))
         _worlds[key] = make_world(scenario.world, scenario.seed)
     return _worlds[key]
+
+
+@functools.lru_cache(maxsize=2)
+def _difficulty(
+    world: World, p_WS: tuple[float, ...], p_WG: tuple[float, ...], seed: int
+) -> dict[str, float]:
+    """Computes the measures of `Difficulty`; NaN without a path on its grid."""
+    try:
+        return asdict(world_difficulty(world, np.array(p_WS), np.array(p_WG), seed))
+    except InfeasibleFlightError:
+        return dict.fromkeys((field.name for field in fields(Difficulty)), math.nan)
 
 
 @functools.lru_cache(maxsize=2)

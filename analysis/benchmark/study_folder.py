@@ -3,21 +3,22 @@
     study.yaml       the study, and the program that flies it
     scenarios/       with all fields
     scenes/          reconstructed scenes of the scenarios
-    weights/         of policies that were given as files, by label
+    weights/         files of weights of policies, by label, as they are
     rollouts/        trajectory and metrics of each flight
     timings/         times and machine of each flight, which differ between runs of a study
     errors/          traceback of a flight that stopped the study
-    rollouts.csv, timings.csv, table.csv, report.html
+    rollouts.csv, timings.csv, table.csv, pairs.csv, report.html
     external.csv     for scenarios with published results
 
 Files are written atomically; a flight is complete if its file in `rollouts/` exists.
 """
 
 import hashlib
+import inspect
 import json
 import shutil
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -28,7 +29,7 @@ import yaml
 from splatpilot.analysis.benchmark.rollout import ARRAYS, INFEASIBLE, Fault, Rollout
 from splatpilot.analysis.benchmark.study import RolloutSpec, StudyConfig
 from splatpilot.analysis.benchmark.tables import Row
-from splatpilot.analysis.benchmark.variants import SCENARIO
+from splatpilot.analysis.benchmark.variants import LIVE, SCENARIO
 from splatpilot.diagrams.flight.policies import POLICIES, weights_file
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.flight.sensors import SENSORS
@@ -71,40 +72,42 @@ class StudyFolder:
 
     path: Path
 
-    def weights(self, label: str) -> Path:
-        """Returns the file with the weights of a policy that was given as a file."""
-        return self.path / "weights" / f"{label}.npz"
+    def weights(self, label: str, suffix: str = ".npz") -> Path:
+        """Returns the file with the weights of a policy."""
+        return self.path / "weights" / f"{label}{suffix}"
 
     def trajectory(self, id: str) -> Path:
         """Returns the file of a flight."""
         return self.path / "rollouts" / f"{id}.npz"
 
     def begin(self, config: StudyConfig, program: dict[str, str]) -> None:
-        """Creates the folder, or checks that it has the same study."""
+        """Creates the folder, or checks that its study is the same, or a part of it."""
         study = yaml.safe_load(dump_config(config))
         require_writable_folder(self.path)
         if (self.path / "study.yaml").is_file():
             begun = yaml.safe_load(dump_config(StudyConfig())) | self._read()["study"]
             for name, value in study.items():
-                if begun[name] != value:
+                if begun[name] != value and not _is_part(name, begun[name], value):
                     raise ValueError(
                         f"{self.path} holds a study with {name} {begun[name]}, not {value}; choose "
-                        "another folder, or the same study"
+                        "another folder, the same study, or one that has all of it and more"
                     )
         else:
             if any(self.path.iterdir()):
                 raise ValueError(
                     f"{self.path} is not empty and holds no study; choose another folder"
                 )
-            self._write({"format_version": FORMAT_VERSION, "study": study, "program": program})
+            self.record(config, program)
         for folder in ("scenarios", "scenes", "weights", "rollouts", "timings"):
             require_writable_folder(self.path / folder)
         shutil.rmtree(self.path / "errors", ignore_errors=True)
 
-    def keep_program(self, program: dict[str, str]) -> None:
-        """Replaces the program of `begin`."""
-        if self.program() != program:
-            self._write(self._read() | {"program": program})
+    def record(self, config: StudyConfig, program: dict[str, str]) -> None:
+        """Writes the study, which may have grown, and the program that flies it."""
+        study = yaml.safe_load(dump_config(config))
+        described = {"format_version": FORMAT_VERSION, "study": study, "program": program}
+        with written_atomically(self.path / "study.yaml") as path:
+            path.write_text(yaml.safe_dump(described, sort_keys=False))
 
     def config(self) -> StudyConfig:
         """Reads the study."""
@@ -117,12 +120,8 @@ class StudyFolder:
         return config
 
     def program(self) -> dict[str, str]:
-        """Reads the program of `begin` or `keep_program`."""
+        """Reads the program that flies the study."""
         return self._read()["program"]
-
-    def _write(self, described: dict[str, Any]) -> None:
-        with written_atomically(self.path / "study.yaml") as path:
-            path.write_text(yaml.safe_dump(described, sort_keys=False))
 
     def _read(self) -> dict[str, Any]:
         file = self.path / "study.yaml"
@@ -189,6 +188,13 @@ class StudyFolder:
         return timing if isinstance(timing, dict) else {}
 
 
+def _is_part(name: str, begun: Any, value: Any) -> bool:
+    """Checks that a study which has begun is a part of another, by a field of its configuration."""
+    if name == "seeds":
+        return begun <= value
+    return name in ("scenarios", "policies", "speeds") and all(each in value for each in begun)
+
+
 def require_test_scenes(scenarios: dict[str, Scenario]) -> None:
     """Checks that a test study flies only in scenes of the test split, or Gaussians of one."""
     for name, scenario in scenarios.items():
@@ -215,7 +221,7 @@ def keep_inputs(folder: StudyFolder, config: StudyConfig, scenarios: dict[str, S
             scenario = replace(scenario, world=world)
         weights = getattr(scenario.policy, "weights", "")
         if config.flies_own_policies and weights:
-            kept = _keep_weights(folder, Path(weights), _OWN + name)
+            kept = _keep_weights(folder, Path(weights), _OWN + name)  # relative to the folder
             scenario = replace(scenario, policy=replace(scenario.policy, weights=kept))
         file, text = folder.path / "scenarios" / f"{name}.yaml", dump_config(scenario)
         if file.is_file() and file.read_text() != text:
@@ -244,14 +250,15 @@ def _keep_scene(folder: StudyFolder, world: SceneSource) -> str:
 
 def _keep_weights(folder: StudyFolder, file: Path, label: str) -> str:
     """Copies weights into the study, and returns their path there."""
-    kept = folder.weights(label)
+    kept = folder.weights(label, file.suffix)
     if kept.is_file() and kept.read_bytes() != file.read_bytes():
         raise ValueError(
             f"{file} has changed since {folder.path} was started; choose another folder with --out"
         )
-    kept.parent.mkdir(exist_ok=True)
-    with written_atomically(kept) as path:
-        shutil.copyfile(file, path)
+    if not kept.is_file():
+        kept.parent.mkdir(exist_ok=True)
+        with written_atomically(kept) as path:
+            shutil.copyfile(file, path)
     return str(kept.relative_to(folder.path))
 
 
@@ -265,7 +272,7 @@ def kept_scenario(folder: StudyFolder, name: str) -> Scenario:
         raise ValueError(f"{file}: {error}") from None
     if isinstance(scenario.world, SceneSource):
         scenario.world.path = str((folder.path / scenario.world.path).absolute())
-    weights = folder.weights(_OWN + name)
+    weights = folder.path / str(getattr(scenario.policy, "weights", ""))
     if weights.is_file():
         policy = replace(scenario.policy, weights=str(weights.absolute()))  # pyright: ignore
         scenario = replace(scenario, policy=policy)
@@ -277,25 +284,31 @@ def kept_flights(
 ) -> Iterator[tuple[RolloutSpec, Scenario]]:
     """Yields flights with their scenario, policy and seed, from the study's folder alone.
 
+    Distributions are not yet drawn, see `sample_scenario`.
+
     Raises ValueError for a policy whose module is not imported; files never import modules.
     """
+    config = folder.config()
+    overrides = {each.label: each.policy_overrides for each in config.scenario_variants}
     variants = {}
-    for variant in folder.config().variants:
+    for variant in config.variants:
         module, colon, _ = variant.policy.partition(":")
         if colon and module not in sys.modules:
             raise ValueError(
                 f"{folder.path} flies {variant.policy}, whose module is not imported; if you trust "
                 f"it, add --import {module} in front of the command"
             )
-        if variant.weights is not None:
-            variant = variant._replace(policy=str(folder.weights(variant.label).absolute()))
+        if (weights := variant.weights) is not None:
+            kept = folder.weights(variant.label, weights.suffix)
+            variant = variant.with_weights(kept.absolute())
         variants[variant.label] = variant
     scenarios: dict[str, Scenario] = {}
     for spec in specs:
         if spec.scenario not in scenarios:
             scenarios[spec.scenario] = kept_scenario(folder, spec.scenario)
         scenario = scenarios[spec.scenario]
-        policy = variants[spec.policy].config(spec.speed, scenario.policy)
+        inner = overrides[spec.scenario]
+        policy = variants[spec.policy].config(spec.speed, scenario.policy, inner)
         yield spec, replace(scenario, policy=policy, seed=spec.seed)
 
 
@@ -308,6 +321,8 @@ def input_digests(config: StudyConfig, scenarios: dict[str, Scenario]) -> dict[s
             key = f"weights of {variant.label}"
             if variant.policy == SCENARIO:
                 key += f" in {name}"
+            if variant.policy == LIVE:
+                continue
             if key not in digests:
                 file = weights_file(variant.config(config.speeds[0], scenario.policy))
                 if file is not None:
@@ -337,6 +352,16 @@ def plugin_digests(scenarios: Iterable[Scenario]) -> dict[str, str]:
             modules = [getattr(part, "__module__", None) for part in (type(config), *parts)]
             packages |= {module.partition(".")[0] for module in modules if module}
     return {f"source of {name}": _source_digest(name) for name in sorted(packages - _KNOWN)}
+
+
+def source_digest(function: Callable[..., Any]) -> str:
+    """Returns a digest of the source of a function or callable object, or else of its name."""
+    code = function if hasattr(function, "__code__") else type(function)
+    try:
+        text = inspect.getsource(code)
+    except (OSError, TypeError):
+        text = getattr(code, "__qualname__", repr(code))
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def _source_digest(package: str) -> str:

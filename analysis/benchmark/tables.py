@@ -2,13 +2,13 @@
 
 import math
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Mapping
 from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import binomtest
+from scipy.stats import binomtest, norm
 
 from splatpilot.analysis.benchmark.rollout import INFEASIBLE
 from splatpilot.analysis.benchmark.study import StudyConfig
@@ -17,9 +17,11 @@ from splatpilot.diagrams.scenarios import benchmark_scenarios
 from splatpilot.systems.common.seeds import describe_seeds
 from splatpilot.training.corpus.library import PROCEDURAL
 
-# Wilson's interval and McNemar's test take flights as independent: they hold for these scenarios
-# with new seeds. The cluster bootstrap and the sign-flip test take scenarios as independent, whose
-# flights are correlated: they hold for new scenarios of the same kinds.
+# Wilson's interval and McNemar's test take worlds as independent: they hold for these scenarios
+# with new seeds. If flights share worlds, the interval is of `effective_flights`, and the test is
+# that of sign flips over worlds, which equals McNemar's for worlds of one flight. The cluster
+# bootstrap and the sign-flip test take scenarios as independent, whose flights are correlated: they
+# hold for new scenarios of the same kinds.
 
 Row = dict[str, Any]
 """The specification and metrics of a flight, or a row of a table."""
@@ -35,12 +37,37 @@ class Interval(NamedTuple):
     upper: float
 
 
-def wilson_interval(successes: int, flights: int, confidence: float = 0.95) -> Interval:
-    """Returns the score interval of a success rate (E. B. Wilson, 1927); [0, 1] without flights."""
+def wilson_interval(successes: float, flights: float, confidence: float = 0.95) -> Interval:
+    """Returns the score interval of a success rate (E. B. Wilson, 1927); [0, 1] without flights.
+
+    Args:
+        flights: number of independent flights, which `effective_flights` counts.
+    """
     if flights == 0:
         return Interval(0.0, 1.0)
-    interval = binomtest(successes, flights).proportion_ci(confidence, method="wilson")
-    return Interval(float(interval.low), float(interval.high))
+    p, z2 = successes / flights, float(norm.ppf((1 + confidence) / 2)) ** 2
+    center = (p + z2 / (2 * flights)) / (1 + z2 / flights)
+    half = math.sqrt(z2 * (p * (1 - p) + z2 / (4 * flights)) / flights) / (1 + z2 / flights)
+    lower, upper = max(center - half, 0.0), min(center + half, 1.0)
+    return Interval(0.0 if p == 0 else lower, 1.0 if p == 1 else upper)
+
+
+def effective_flights(successes: ArrayLike, flights: ArrayLike) -> float:
+    """Returns the number of independent flights that are as informative as those of worlds (W,).
+
+    It is the number of flights over the design effect (L. Kish, Survey Sampling, 1965): the
+    variance of the success rate by worlds over that of independent flights. If all or none succeed
+    it is the number of worlds.
+    """
+    k, n = np.asarray(successes, float), np.asarray(flights, float)
+    total, worlds = n.sum(), len(n)
+    rate = k.sum() / total if total else 0.0
+    if worlds == total:
+        return float(total)
+    if worlds < 2 or rate in (0.0, 1.0):
+        return float(worlds)
+    between = np.square(k - rate * n).sum() * worlds / (worlds - 1) / total**2
+    return float(np.clip(rate * (1 - rate) / between, 1.0, total)) if between else float(total)
 
 
 def cluster_interval(
@@ -171,8 +198,10 @@ def mean_column(rows: list[Row], name: str) -> float:
     return float(np.mean(values)) if values else math.nan
 
 
-def _success(successes: int, flights: int) -> Row:
-    interval = wilson_interval(successes, flights)
+def _success(successes: int, flights: int, effective: float | None = None) -> Row:
+    independent = flights if effective is None else effective
+    rate = successes / flights if flights else 0.0
+    interval = wilson_interval(rate * independent, independent)
     return {
         "flights": flights,
         "successes": successes,
@@ -182,17 +211,30 @@ def _success(successes: int, flights: int) -> Row:
     }
 
 
-def success_summary(rows: list[Row]) -> Row:
+def _world(row: Row) -> str:
+    """Returns the name of the world of a flight."""
+    return str(row.get("world_id", f"{row['scenario']}-{row['seed']}"))
+
+
+def success_summary(rows: list[Row], bases: Mapping[str, str] | None = None) -> Row:
     """Counts flights by outcome, and scenarios, which are passed if most of their flights succeed.
 
     The success rate has 95 % intervals: Wilson's for these scenarios, and by clusters for new ones
     of the same kinds.
+
+    Args:
+        bases: names of the scenarios without changed fields, by those of their variants.
     """
-    flights = Counter(row["scenario"] for row in rows)
-    wins = Counter(row["scenario"] for row in rows if row["success"])
-    clusters = cluster_interval([wins[name] for name in flights], list(flights.values()))
+    flights, wins = (_count(rows, lambda row: row["scenario"], won) for won in (False, True))
+    worlds, won = (_count(rows, _world, won) for won in (False, True))
+    named = {name: name for name in flights} | dict(bases or {})
+    base, base_wins = (
+        _count(rows, lambda row: named[row["scenario"]], won) for won in (False, True)
+    )
+    clusters = cluster_interval([base_wins[name] for name in base], list(base.values()))
+    effective = effective_flights([won[name] for name in worlds], list(worlds.values()))
     return (
-        _success(wins.total(), len(rows))
+        _success(wins.total(), len(rows), effective)
         | {"cluster_lower": clusters.lower, "cluster_upper": clusters.upper}
         | {str(outcome): sum(row["outcome"] == outcome for row in rows) for outcome in FAILURES}
         | {"scenarios": len(flights)}
@@ -200,16 +242,20 @@ def success_summary(rows: list[Row]) -> Row:
     )
 
 
+def _count(rows: list[Row], key: Callable[[Row], str], successes: bool) -> Counter[str]:
+    return Counter(key(row) for row in rows if row["success"] or not successes)
+
+
 def policy_table(rows: list[Row], config: StudyConfig, absent: int = 0) -> list[Row]:
     """Returns a row for each policy and speed: `success_summary`, the number of flights not run in
     `absent` scenarios, and the means of `METRICS`."""
-    table = []
+    table, bases = [], {each.label: each.base for each in config.scenario_variants}
     for policy in config.policy_names:
         for speed in config.speeds:
             flown = select(rows, policy=policy, speed=speed)
             table.append(
                 {"policy": policy, "speed": speed}
-                | success_summary(flown)
+                | success_summary(flown, bases)
                 | {"not_run": absent * config.seeds}
                 | {name: mean_column(flown, name) for name in METRICS}
             )
@@ -244,28 +290,45 @@ class Comparison(NamedTuple):
     speed: float  # [m/s]
     only_first: int  # flights in which only the first succeeded
     only_second: int
-    p_seeds: float  # McNemar's, for these scenarios with new seeds
+    # McNemar's, or of sign flips over worlds that flights share, for these scenarios with new seeds
+    p_seeds: float
     p_scenarios: float  # of sign flips, for new scenarios of the same kinds
 
 
 def compare(rows: list[Row], config: StudyConfig) -> list[Comparison]:
     """Compares all pairs of a study's policies at each speed, with Holm's correction."""
-
-    def wins(policy: str, speed: float) -> np.ndarray:  # (scenarios, seeds), of one order
-        flown = select(rows, policy=policy, speed=speed)
-        flown.sort(key=lambda row: (row["scenario"], row["seed"]))
-        return np.array([row["success"] for row in flown], dtype=bool).reshape(-1, config.seeds)
-
+    bases = {each.label: each.base for each in config.scenario_variants}
     pairs = []
     for speed in config.speeds:
+        flown = {
+            name: sorted(
+                select(rows, policy=name, speed=speed),
+                key=lambda row: (row["scenario"], row["seed"]),
+            )
+            for name in config.policy_names
+        }
         for names in combinations(config.policy_names, 2):
-            first, second = (wins(name, speed) for name in names)
-            p_scenarios = sign_flip(first.mean(axis=1) - second.mean(axis=1))
-            pairs.append(Comparison(*names, speed, *mcnemar(first, second), p_scenarios))
+            first, second = (np.array([r["success"] for r in flown[name]], bool) for name in names)
+            worlds = [_world(row) for row in flown[names[0]]]
+            kinds = [bases[row["scenario"]] for row in flown[names[0]]]
+            only_first, only_second, p_seeds = mcnemar(first, second)
+            difference = first.astype(float) - second
+            if len(set(worlds)) < len(worlds):
+                p_seeds = sign_flip(_sum_by(worlds, difference))
+            p_scenarios = sign_flip(
+                _sum_by(kinds, difference) / _sum_by(kinds, np.ones(len(kinds)))
+            )
+            pairs.append(Comparison(*names, speed, only_first, only_second, p_seeds, p_scenarios))
     for name in ("p_seeds", "p_scenarios"):
         adjusted = holm([getattr(pair, name) for pair in pairs])
         pairs = [p._replace(**{name: float(a)}) for p, a in zip(pairs, adjusted, strict=True)]
     return pairs
+
+
+def _sum_by(keys: list[str], values: np.ndarray) -> np.ndarray:
+    """Returns the sums of values (N,) of equal keys."""
+    _, index = np.unique(keys, return_inverse=True)
+    return np.bincount(index, weights=values) if len(keys) else np.zeros(0)
 
 
 def format_table(table: list[Row], config: StudyConfig) -> str:

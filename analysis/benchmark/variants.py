@@ -1,7 +1,9 @@
-"""Policies of a study, with changed fields and a label that names their flights."""
+"""Policies and scenarios of a study, with changed fields and a label that names their flights."""
 
+import hashlib
+import json
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,7 +13,11 @@ from splatpilot.systems.common.validation import require
 SCENARIO = "scenario"
 """The policy of the scenario itself, its `policy` block."""
 
+LIVE = "live"
+"""A policy that a function of Python makes for each flight, see `run_study.study`."""
+
 _LABEL = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+-]{0,79}")
+_WEIGHTS = "weights="
 _FIELD = r"[A-Za-z_][\w.]*="
 _OUTSIDE_BRACKETS = r"(?![^\[{(]*[\]})])"
 
@@ -25,24 +31,91 @@ class Variant(NamedTuple):
 
     @property
     def weights(self) -> Path | None:
-        """The file of weights, if it is given as one."""
+        """The file of weights, if the policy or its field `weights` is one."""
+        given = [text.partition("=")[2] for text in self.overrides if text.startswith(_WEIGHTS)]
+        if given:
+            import yaml  # the command line parses variants before slow imports
+
+            return Path(str(yaml.safe_load(given[-1])))
         return Path(self.policy) if self.policy.endswith(".npz") else None
 
-    def config(self, speed: float, own: Any) -> Any:
-        """Returns the configuration for a nominal speed [m/s]; `own` is the scenario's policy."""
+    def with_weights(self, file: Path) -> "Variant":
+        """Returns the policy with its weights in another file."""
+        if self.policy.endswith(".npz"):
+            return self._replace(policy=str(file))
+        return self._replace(overrides=(*self.overrides, _WEIGHTS + json.dumps(str(file))))
+
+    def config(self, speed: float, own: Any, overrides: Sequence[str] = ()) -> Any:
+        """Returns the configuration for a nominal speed [m/s]; `own` is the scenario's policy.
+
+        Args:
+            overrides: of the scenario, after those of the variant.
+        """
         # The command line parses variants before slow imports.
         from splatpilot.diagrams.flight.policies import policy_named
         from splatpilot.systems.common.config import load_config
+        from splatpilot.systems.common.distributions import sample_distributions
 
-        config = own if self.policy == SCENARIO else policy_named(self.policy, speed)
-        if not self.overrides:
+        config = own if self.policy in (SCENARIO, LIVE) else policy_named(self.policy, speed)
+        overrides = [*self.overrides, *overrides]
+        if not overrides:
             return config
         try:
-            config = load_config(config, overrides=list(self.overrides))
-            config.validate()
+            config = load_config(config, overrides=overrides)
+            sample_distributions(config, 0, ("policy",)).validate()
         except ValueError as error:
             raise ValueError(f"policy {self.label}: {error}") from None
         return config
+
+
+class ScenarioVariant(NamedTuple):
+    """A scenario, with a label and changed fields."""
+
+    label: str  # names its flights, and files
+    scenario: str  # name, or YAML file
+    overrides: tuple[str, ...] = ()  # "dotted.field=YAML value" of all but its policy
+    policy_overrides: tuple[str, ...] = ()  # of the policy that flies
+
+    @property
+    def base(self) -> str:
+        """The name of the scenario without the changes."""
+        return Path(self.scenario).stem
+
+    @property
+    def world(self) -> tuple[str, ...]:
+        """Equal for variants of a scenario that have the same worlds."""
+        return (self.scenario, *(text for text in self.overrides if text.startswith("world")))
+
+    @property
+    def fields(self) -> list[str]:
+        """The dotted names of the changed fields."""
+        inner = [f"policy.{text}" for text in self.policy_overrides]
+        return [text.partition("=")[0] for text in (*self.overrides, *inner)]
+
+
+def parse_scenario(text: str) -> ScenarioVariant:
+    """Parses `[LABEL=]SCENARIO[:FIELD=VALUE[:FIELD=VALUE...]]`.
+
+    The default label is the name of the scenario or file with the fields that are set, or with a
+    digest of them if that is too long: `P02:world.spacing=2` is labeled `P02-world.spacing-2`.
+    """
+    label, _, rest = text.partition("=")
+    if not (rest and _LABEL.fullmatch(label)):
+        label, rest = "", text
+    scenario, *overrides = re.split(f":(?={_FIELD})", rest)
+    if not label:
+        label = default_label(Path(scenario).stem, overrides)
+    inner = [each.removeprefix("policy.") for each in overrides if each.startswith("policy.")]
+    others = [each for each in overrides if not each.startswith("policy.")]
+    return ScenarioVariant(label, scenario, tuple(others), tuple(inner))
+
+
+def default_label(name: str, overrides: Sequence[str]) -> str:
+    """Returns a name with fields that are set, or with a digest of them if it names no file."""
+    label = "-".join([name, *(override.replace("=", "-", 1) for override in overrides)])
+    if not overrides or _LABEL.fullmatch(label):
+        return label
+    return f"{name}-{hashlib.sha256(':'.join(overrides).encode()).hexdigest()[:8]}"
 
 
 def parse_variant(text: str) -> Variant:
@@ -58,13 +131,11 @@ def parse_variant(text: str) -> Variant:
         label, rest = "", text
     policy, *overrides = re.split(f":(?={_FIELD})", rest)
     for override in overrides:
-        field = override.partition("=")[0].rpartition(".")[2]
-        remedy = {
-            "speed": "give the speed of all policies by --speed (fly) or --speeds (benchmark)",
-            "weights": "give the file of weights as the policy, LABEL=FILE.npz",
-        }.get(field)
-        if remedy:
-            raise ValueError(f"the policy {text!r} must not set {field}; {remedy}")
+        if override.partition("=")[0].rpartition(".")[2] == "speed":
+            raise ValueError(
+                f"the policy {text!r} must not set speed; give the speed of all policies by "
+                "--speed (fly) or --speeds (benchmark)"
+            )
     file = Path(policy[:100])
     require(
         policy.endswith(".npz") or not (policy.endswith(".py") or "/" in policy),
@@ -100,9 +171,16 @@ def sweep(text: str) -> Iterator[str]:
     policy, *fields = re.split(f":(?={_FIELD})", text)
     if not fields:
         raise ValueError(f"the sweep {text!r} has no field; write POLICY:FIELD=VALUE,VALUE")
-    choices = []
-    for given in fields:
-        field, _, values = given.partition("=")
-        choices.append([f"{field}={value}" for value in split_policies(values)])
-    for chosen in product(*choices):
+    for chosen in product(*map(_choices, fields)):
         yield ":".join([policy, *chosen])
+
+
+def scenario_sweep(text: str) -> list[str] | None:
+    """Returns `FIELD=VALUE` for each value of `FIELD=A,B,...`; None for the sweep of a policy."""
+    is_field = re.fullmatch(_FIELD + ".*", text) and not re.search(f":{_FIELD}", text)
+    return _choices(text) if is_field else None
+
+
+def _choices(text: str) -> list[str]:
+    field, _, values = text.partition("=")
+    return [f"{field}={value}" for value in split_policies(values)]

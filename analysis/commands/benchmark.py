@@ -1,11 +1,17 @@
 """`splatpilot benchmark`, `replay` and `difficulty`."""
 
 import argparse
+from itertools import product
 from typing import Any
 
-from splatpilot.analysis.benchmark.variants import split_policies, sweep
+from splatpilot.analysis.benchmark.variants import scenario_sweep, split_policies, sweep
 from splatpilot.analysis.commands import options as cli
-from splatpilot.analysis.commands.checks import SCENARIOS, check_policy, check_scenario
+from splatpilot.analysis.commands.checks import (
+    SCENARIOS,
+    check_policy,
+    check_scenario,
+    check_study_scenario,
+)
 from splatpilot.systems.common.validation import require
 
 QUICK = {
@@ -18,6 +24,14 @@ QUICK = {
 
 def _names(text: str) -> list[str]:
     return [name.strip() for name in text.split(",") if name.strip()]
+
+
+def _check_sweep(text: str) -> str:
+    """Checks the sweep of a policy, or of a field of the scenarios, and returns it."""
+    if scenario_sweep(text) is None:
+        for policy in sweep(text):
+            check_policy(policy)
+    return text
 
 
 def _speed(text: str) -> float:
@@ -48,14 +62,19 @@ def _speed(text: str) -> float:
         resolve=check_policy,
     ),
     cli.Option(
-        "--sweep A:FIELD=1,2,3",
-        "a policy with each of these values of a field, and all combinations of the values of "
-        "several (repeatable)",
+        "--sweep [A:]FIELD=1,2,3",
+        "a policy, or without A all scenarios, with each of these values of a field, and all "
+        "combinations of the values of several (repeatable)",
         action="append",
         default=[],
-        resolve=lambda text: [check_policy(policy) for policy in sweep(text)],
+        resolve=_check_sweep,
     ),
-    cli.Option("--scenarios P02,FILE.yaml", "default: all", _names, resolve=check_scenario),
+    cli.Option(
+        "--scenarios P02,FILE.yaml:FIELD=VALUE,...",
+        "names or files, with LABEL= before and fields after; default: all",
+        split_policies,
+        resolve=check_study_scenario,
+    ),
     cli.Option("--speeds 2,3", "nominal, m/s; default: 2", _names, resolve=_speed),
     cli.Option("--seeds N", "flights of each; default: 20", int),
     cli.Option("--split", "seeds to fly: dev (default) for development, test for final results"),
@@ -69,6 +88,7 @@ def _speed(text: str) -> float:
     examples=(
         "benchmark --out out/quick --quick",
         "benchmark --out out/study --scenarios P02,P03 --policies planner,reactive:margin=0.2",
+        "benchmark --out out/drag --scenarios P02 --policies planner --sweep vehicle.drag=0.3,0.5",
         "benchmark --out out/mine --policies mine=out/forests/diffaero.npz --speeds 2,3 --json",
     ),
 )
@@ -89,12 +109,15 @@ def benchmark(options: argparse.Namespace) -> Any:
     for name in ("scenarios", "seeds", "split", "speeds"):
         if getattr(options, name) is not None:
             fields[name] = getattr(options, name)
-    if options.policies is not None or options.sweep:
-        fields["policies"] = sum(options.sweep, options.policies or [])
+    swept = [values for text in options.sweep if (values := scenario_sweep(text))]
+    policies = [each for text in options.sweep if not scenario_sweep(text) for each in sweep(text)]
+    if options.policies is not None or policies:
+        fields["policies"] = [*(options.policies or []), *policies]
     config = StudyConfig(**fields)
+    config.scenarios = [":".join(each) for each in product(config.scenarios, *swept)]
     if "policies" not in fields:
         config.policies = default_policies(config.scenarios)
-    table = cli.call(run_study.run, options, config=config)
+    table = cli.call(run_study.run, options, config=config).table
     if table and all(row["infeasible"] == row["flights"] for row in table):
         raise cli.FailureWithResultError(
             "none of the flights could be flown; rollouts.csv has the reasons", table

@@ -4,7 +4,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from splatpilot.analysis.benchmark.variants import SCENARIO, parse_variant
+from splatpilot.analysis.benchmark.variants import SCENARIO, parse_scenario, parse_variant
 from splatpilot.diagrams.scenarios import benchmark_scenarios, other_scenarios, scenario_file
 from splatpilot.systems.common.files import find_data, require_corpus, require_existing
 from splatpilot.systems.common.registry import check_name
@@ -78,6 +78,12 @@ def check_scenario(name: str) -> str:
     """Checks the name or the file of a scenario, and returns it."""
     require_existing(scenario_file(name), "a scenario")
     return name
+
+
+def check_study_scenario(text: str) -> str:
+    """Checks a scenario of a study, with fields that are changed, and returns the text."""
+    check_scenario(parse_scenario(text).scenario)
+    return text
 
 
 def check_corpora(policies: Sequence[str], overrides: Sequence[str], config: Path | None) -> None:

@@ -232,9 +232,9 @@ UP = Option("--up", "axis of the mesh file that points up", choices=("y", "z"))
 
 
 def read_scenario(options: argparse.Namespace) -> "Scenario":
-    """Reads the scenario of `SCENARIO_OPTIONS`."""
+    """Reads the scenario of `SCENARIO_OPTIONS`, with values drawn from its distributions."""
     from splatpilot.diagrams.flight.policies import DEFAULT_SPEED, at_speed
-    from splatpilot.diagrams.flight.scenario import Scenario
+    from splatpilot.diagrams.flight.scenario import Scenario, sample_scenario
     from splatpilot.diagrams.scenarios import scenario_file
     from splatpilot.diagrams.worlds.world_registry import scene_config
     from splatpilot.systems.common.config import load_config
@@ -249,7 +249,7 @@ def read_scenario(options: argparse.Namespace) -> "Scenario":
         scenario.world = scene_config(require_scene(str(options.scene)).absolute())
     if options.seed is not None:
         scenario.seed = options.seed
-    return load_config(scenario, overrides=options.overrides)
+    return sample_scenario(load_config(scenario, overrides=options.overrides))
 
 
 def _check_scene(path: Path) -> Path:

@@ -21,7 +21,7 @@ from splatpilot.diagrams.flight.monitor import (
     goal_position,
     start_position,
 )
-from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.flight.scenario import Scenario, sample_scenario
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.common.config import dump_config
@@ -43,6 +43,7 @@ def sample_initial_state(scenario: Scenario, world: World) -> np.ndarray:
         InfeasibleFlightError: if a vehicle at start or goal would collide or be in unknown space,
             or if the start is at the goal.
     """
+    scenario = sample_scenario(scenario)
     p_WG, p_WS = goal_position(scenario, world), start_position(scenario, world)
     _check_free(world, "start", p_WS)
     _check_free(world, "goal", p_WG)

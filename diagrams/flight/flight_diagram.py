@@ -43,7 +43,7 @@ from splatpilot.diagrams.flight.monitor import (
     goal_position,
     start_position,
 )
-from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.flight.scenario import Scenario, sample_scenario
 from splatpilot.diagrams.worlds.appearance import randomize_appearance
 from splatpilot.diagrams.worlds.moving_spheres import add_moving_spheres
 from splatpilot.diagrams.worlds.world import World
@@ -174,6 +174,7 @@ def AddFlight(
         policy = DecisionInput(policy)
     elif not (policy is None or isinstance(policy, System)):
         scenario, policy = replace(scenario, policy=policy), None
+    scenario = sample_scenario(scenario)
     scenario.validate()
     if scenario.appearance > 0:
         world = randomize_appearance(world, scenario.appearance, scenario.seed)
@@ -436,7 +437,7 @@ def AddMeshcat(builder: DiagramBuilder, parts: FlightParts, meshcat: Meshcat) ->
 
 def MakeCamera(scenario: Scenario, world: World) -> SplatCamera:
     """Makes the scenario's camera of the world's Gaussians."""
-    config = scenario.camera
+    config = sample_scenario(scenario).camera
     return SplatCamera(
         world.baked,
         camera_info(config),

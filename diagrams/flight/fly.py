@@ -28,7 +28,7 @@ from splatpilot.diagrams.flight.flight_diagram import (
     open_meshcat,
 )
 from splatpilot.diagrams.flight.monitor import flight_monitors, goal_position, start_position
-from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.flight.scenario import Scenario, sample_scenario
 from splatpilot.diagrams.worlds.appearance import randomize_appearance
 from splatpilot.diagrams.worlds.moving_spheres import add_moving_spheres
 from splatpilot.diagrams.worlds.world import World
@@ -138,6 +138,7 @@ def run(
     Returns:
         `Flight.summary()` and `render_ms`, the mean time of a render along the flight [ms].
     """
+    scenario = sample_scenario(scenario)
     scenario.validate()
     for path in (out, graphviz):
         if path is not None:

@@ -21,7 +21,7 @@ from pydrake.systems.framework import (
 )
 from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
 
-from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.flight.scenario import Scenario, sample_scenario
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf_collision import EsdfCollision
@@ -94,6 +94,7 @@ class FlightMonitor(LeafSystem):
 
     def __init__(self, scenario: Scenario, world: World) -> None:
         super().__init__(converter=_MonitorByValues.converter())
+        scenario = sample_scenario(scenario)
         scenario.validate()
         self.scenario, self.world = copy.deepcopy(scenario), world
         for name, size in (("state", 13), ("goal", 3), ("clearance", 1), ("field_state", 1)):
@@ -184,6 +185,7 @@ def AddFlightMonitor(
         collision: an `EsdfCollision`; by default one named `collision` of the world's field.
         hypotheses: plans to log, every `plan_period` [s].
     """
+    scenario = sample_scenario(scenario)
     if collision is None:
         collision = EsdfCollision(world.distance_field)
         builder.AddNamedSystem("collision", collision)

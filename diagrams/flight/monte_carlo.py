@@ -10,7 +10,7 @@ from pydrake.systems.framework import System
 
 from splatpilot.diagrams.flight.flight import make_flight_simulator
 from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
-from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.flight.scenario import Scenario, sample_scenario
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.common.seeds import MONTE_CARLO_SEEDS
@@ -45,7 +45,8 @@ def random_flights(
     """
 
     def make_simulator(generator: RandomGenerator) -> Simulator:
-        sample = replace(scenario, seed=MONTE_CARLO_SEEDS[generator() % len(MONTE_CARLO_SEEDS)])
+        seed = MONTE_CARLO_SEEDS[generator() % len(MONTE_CARLO_SEEDS)]
+        sample = sample_scenario(replace(scenario, seed=seed))
         flown = world or make_world(sample.world, sample.seed)
         made: dict[str, Any] = {
             name: system if isinstance(system, str) else system(sample, flown)

@@ -5,6 +5,7 @@ from math import inf
 
 import numpy as np
 from pydrake.common.schema import Rotation, Transform
+from pydrake.geometry import Rgba
 from pydrake.systems.analysis import GetIntegrationSchemes, SimulatorConfig
 from pydrake.systems.sensors import CameraConfig
 
@@ -13,7 +14,8 @@ from splatpilot.diagrams.flight.sensors import SENSORS, SensorConfig
 from splatpilot.diagrams.worlds.forest.forest import ForestConfig
 from splatpilot.diagrams.worlds.moving_spheres import MovingSphere
 from splatpilot.diagrams.worlds.world_registry import WORLDS, WorldConfig
-from splatpilot.systems.common.config import registry_field
+from splatpilot.systems.common.config import dump_config, registry_field
+from splatpilot.systems.common.distributions import pickle_by_fields, sample_distributions
 from splatpilot.systems.common.seeds import check_seed
 from splatpilot.systems.common.validation import (
     Config,
@@ -26,6 +28,10 @@ from splatpilot.systems.policies.planner import PrivilegedPlannerConfig
 from splatpilot.systems.sensing.noise import ObservationNoise
 from splatpilot.systems.vehicle.flatness import FlatnessControllerConfig
 from splatpilot.systems.vehicle.quadrotor import QuadrotorParams
+
+pickle_by_fields(
+    CameraConfig, CameraConfig.FocalLength, CameraConfig.FovDegrees, Rgba, SimulatorConfig
+)
 
 _MAX_PIXELS = 4096 * 2304  # [-] limit of H.264
 
@@ -64,7 +70,11 @@ def _default_simulator() -> SimulatorConfig:
 
 @dataclass
 class Scenario(Config):
-    """One flight. Flights of the same scenario are bitwise identical."""
+    """One flight. Flights of the same scenario are bitwise identical.
+
+    Any field of numbers may hold a distribution of `pydrake.common.schema` instead, as may the
+    transforms of cameras; `sample_scenario` draws its value from the seed.
+    """
 
     # Seed of everything random: generated world, start, noise.
     seed: int = 0
@@ -97,7 +107,19 @@ class Scenario(Config):
     controller: FlatnessControllerConfig = field(default_factory=FlatnessControllerConfig)
     simulator: SimulatorConfig = field(default_factory=_default_simulator)
 
+    def __eq__(self, other: object) -> bool:
+        """Compares all fields; Drake's configurations compare by identity."""
+        if type(other) is not type(self):
+            return NotImplemented
+        return dump_config(self) == dump_config(other)
+
+    __hash__ = None  # pyright: ignore
+
     def validate(self) -> None:
+        drawn = sample_scenario(self)
+        if drawn is not self:
+            drawn.validate()
+            return
         parts = [(WORLDS, self.world), (POLICIES, self.policy)]
         for registry, part in [*parts, *((SENSORS, sensor) for sensor in self.sensors.values())]:
             registry.entry_for(part)
@@ -114,6 +136,17 @@ class Scenario(Config):
             require_field(self, name, valid, "three finite numbers x, y, z [m]")
         _check_camera(self.camera)
         _check_simulator(self.simulator)
+
+
+def sample_scenario(scenario: Scenario) -> Scenario:
+    """Returns the scenario with values drawn from its distributions, or itself without any.
+
+    The values are of its seed and the path of their field alone.
+
+    Raises:
+        ValueError: for a distribution in a field that is not of numbers.
+    """
+    return sample_distributions(scenario, scenario.seed)
 
 
 def _check_camera(camera: CameraConfig) -> None:

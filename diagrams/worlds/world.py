@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,24 @@ class World:
     p_WS: NDArray[np.float64]  # (3,) [m], default start
     p_WG: NDArray[np.float64]  # (3,) [m], default goal
     moving: MovingObstacles | None = None
+    source: tuple[Any, int] | None = None  # the configuration and seed that make this world
+
+    def __eq__(self, other: object) -> bool:
+        """Compares the configurations and seeds that make the worlds, or else the objects."""
+        if self.source is None or not isinstance(other, World):
+            return self is other
+        return self.source == other.source
+
+    def __hash__(self) -> int:
+        return hash((self.name, self.source[1])) if self.source else id(self)
+
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        """Pickles the configuration and the seed, which make the world again."""
+        if self.source is None:
+            return super().__reduce_ex__(protocol)
+        from splatpilot.diagrams.worlds.world_registry import make_world  # imports this module
+
+        return make_world, self.source
 
     def field_at(self, time: float) -> DistanceField:
         """Returns the distance field for collisions at a time [s] of a flight."""
@@ -40,6 +59,6 @@ class World:
 
     def recolored(self, gaussians: GaussianScene, background: Background) -> "World":
         """Returns this world with the colors of `gaussians`; shares the baked geometry."""
-        world = replace(self, gaussians=gaussians, background=background)
+        world = replace(self, gaussians=gaussians, background=background, source=None)
         vars(world)["baked"] = self.baked.recolored(gaussians.sh)
         return world

@@ -1,7 +1,8 @@
 """All worlds: their configurations and generators."""
 
+import copy
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
@@ -16,6 +17,7 @@ from splatpilot.diagrams.worlds.solids.solid import WorldSpec
 from splatpilot.diagrams.worlds.solids.surfels import build
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.common.config import require_configuration
+from splatpilot.systems.common.distributions import sample_distributions
 from splatpilot.systems.common.registry import Registry
 
 
@@ -58,13 +60,20 @@ def register_world(
 
 
 def make_world(config: WorldConfig, seed: int) -> World:
-    """Generates or reads the world of a registered configuration. The seed is of generated worlds,
-    inserted obstacles, and start and goal if they are drawn."""
+    """Generates or reads the world of a registered configuration.
+
+    The seed is of generated worlds, inserted obstacles, start and goal if they are drawn, and the
+    distributions of the configuration, see `sample_scenario`.
+    """
+    config = sample_distributions(config, seed, ("world",))
     world = WORLDS.entry_for(config).make(config, seed)
     if not isinstance(world, World):
         name, made = type(config).__name__, type(world).__name__
         raise ValueError(f"result of make for {name} must be a World, got {made}")
-    return world
+    made = replace(world, source=(copy.deepcopy(config), seed))
+    if "baked" in vars(world):
+        vars(made)["baked"] = world.baked
+    return made
 
 
 def scene_config(path: Path) -> SceneConfig | OctomapConfig:
@@ -83,7 +92,7 @@ def make_spec(config: WorldConfig, seed: int) -> WorldSpec:
     plan = WORLDS.entry_for(config).make_spec
     if plan is None:
         raise ValueError(f"{type(config).__name__} is not a generated world: it has no spec")
-    return plan(config, seed)
+    return plan(sample_distributions(config, seed, ("world",)), seed)
 
 
 register_world(ForestConfig, make_spec=forest_spec)

@@ -13,8 +13,16 @@ from textwrap import indent
 from types import NoneType, UnionType
 from typing import Any, Union, cast, get_args, get_origin
 
-from pydrake.common.yaml import yaml_dump_typed, yaml_load_data, yaml_load_typed
+from pydrake.common.yaml import yaml_load_data, yaml_load_typed
 
+from splatpilot.systems.common.distributions import (
+    FieldPath,
+    distribution_text,
+    dump_with_distributions,
+    find_distributions,
+    is_distribution,
+    take_distributions,
+)
 from splatpilot.systems.common.readers import error_summary, read_text, yaml_errors
 from splatpilot.systems.common.registry import Registry
 from splatpilot.systems.common.validation import TYPES, did_you_mean, require
@@ -103,9 +111,17 @@ def parse_config[Configuration](
     with yaml_errors(source):
         given = yaml_load_data(text, private=True)
         try:
+            drawn, start = {}, tuple(filter(None, prefix.split(".")))
+            if dataclasses.is_dataclass(defaults):  # Drake's types take the distributions they can
+                text, drawn = take_distributions(text, start)
+            given = yaml_load_data(text, private=True) if drawn else given
             _check_names(defaults, given, prefix)
             _import_types(defaults, text)
-            return yaml_load_typed(schema=type(defaults), data=text, defaults=defaults)
+            config = yaml_load_typed(schema=type(defaults), data=text, defaults=defaults)
+            for path, distribution in drawn.items():
+                _put(config, path[len(start) :], distribution, prefix)
+            list(find_distributions(config, start))  # checks them
+            return config
         except RecursionError:
             raise
         except Exception as error:  # Drake's reader raises any type.
@@ -116,7 +132,7 @@ def parse_config[Configuration](
 
 def dump_config(config: Any) -> str:
     """Returns a configuration as YAML with every field."""
-    return cast(str, yaml_dump_typed(config))
+    return dump_with_distributions(config)
 
 
 def is_configuration(value: Any) -> bool:
@@ -165,11 +181,30 @@ def _with_field(config: Any, path: list[str], value: str, source: str) -> Any:
     return config
 
 
+def _put(config: Any, path: FieldPath, distribution: Any, prefix: str) -> None:
+    """Sets the field of a configuration at `path` to a distribution."""
+    *holders, name = path
+    for holder in holders:
+        plain = isinstance(config, dict | list)
+        config = config[holder] if plain else getattr(config, str(holder))  # pyright: ignore
+        prefix += f"{holder}."
+    if isinstance(config, dict | list):
+        config[name] = distribution  # pyright: ignore
+        return
+    if name not in field_types(config):
+        raise ValueError(f"there is no field {prefix}{name}; {_hint(config, name, None, prefix)}")
+    plain = not dataclasses.is_dataclass(config)
+    require(not plain, f"{prefix}{name}", "one value", distribution_text(distribution))
+    object.__setattr__(config, str(name), distribution)
+
+
 def _check_names(config: Any, given: Any, prefix: str, kinds: Sequence[Any] = ()) -> None:
     """Raises ValueError for unknown fields, with their likely spelling, and for wrong types.
 
     `kinds` are the types that a tag may name.
     """
+    if is_distribution(config):
+        return
     if isinstance(given, dict) and "_tag" in given:
         tag, given = given["_tag"], {name: each for name, each in given.items() if name != "_tag"}
         config = next((kind() for kind in kinds if f"!{kind.__name__}" == tag), None)
@@ -277,5 +312,7 @@ def _unknown_tag(config: Any, tag: str, name: str) -> str:
 
 def _shortened(value: Any) -> str:
     """Returns a value's text, shortened: it may be a whole file."""
+    if isinstance(value, dict) and "_tag" in value:
+        value = value["_tag"]
     text = "null" if value is None else " ".join(str(value).split())
     return text if len(text) <= 40 else f"{text[:40]}..."

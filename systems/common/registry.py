@@ -42,16 +42,25 @@ class Registry[Entry]:
         self._entries: dict[str, Entry] = {}
 
     def add(self, name: str, entry: Entry) -> None:
-        """Registers an entry."""
-        if self._entries.get(name, entry) != entry:
-            raise ValueError(f"there is a {self.what} {name!r} already; choose another name")
+        """Registers an entry. It replaces those of the same qualified name, as a cell of a notebook
+        that runs again, or `importlib.reload`, defines them."""
         config = getattr(entry, "config", None)
+        again = [each for each in self._entries.values() if _qualified(each) == _qualified(entry)]
+        if name in self._entries and self._entries[name] not in [entry, *again]:
+            raise ValueError(f"there is a {self.what} {name!r} already; choose another name")
         for other in self.configs():
-            if config is not None and config.__name__ == other.__name__ and config is not other:
+            if (
+                config is not None
+                and config.__name__ == other.__name__
+                and _qualified_name(config) != _qualified_name(other)
+            ):
                 raise ValueError(
                     f"{config.__module__}.{config.__name__} has the name of {other.__module__}."
                     f"{other.__name__}, and files could not tell them apart; rename it"
                 )
+        for known, other in self._entries.items():
+            if other in again:
+                self._entries[known] = entry
         self._entries[name] = entry
 
     def registered(self) -> list[str]:
@@ -79,6 +88,11 @@ class Registry[Entry]:
         for base in type(config).__mro__:
             if entry := self._by_config(base):
                 return entry
+        name = _qualified_name(type(config))
+        if name in map(_qualified_name, self.configs()):
+            raise ValueError(
+                f"{name} was registered again after this configuration was made; make it again"
+            )
         known = ", ".join(known.__name__ for known in self.configs())
         raise ValueError(
             f"no {self.what} has the configuration {type(config).__name__}; known are {known}, and "
@@ -130,6 +144,17 @@ class Registry[Entry]:
             )
         self.add(point.name, entry)
         return entry
+
+
+def _qualified_name(value: Any) -> str:
+    return f"{value.__module__}.{value.__qualname__}"
+
+
+def _qualified(entry: Any) -> tuple[str, ...]:
+    """Returns the qualified name of an entry's configuration, or else of its functions."""
+    config = getattr(entry, "config", None)
+    parts = vars(entry).values() if config is None else [config]
+    return tuple(_qualified_name(part) for part in parts if hasattr(part, "__qualname__"))
 
 
 def check_name(what: str, group: str, name: str, ours: Sequence[str]) -> None:

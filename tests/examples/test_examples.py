@@ -99,7 +99,6 @@ def test_unregistered_own_policy_flies_in_worker_processes(tmp_path):
 
 
 def test_monte_carlo(run, tmp_path):
-    pytest.importorskip("pandas")
     (tmp_path / "short.yaml").write_text(SHORT)
     words = ["--scenarios", "short.yaml", "--seeds", 1, "--jobs", 1]
     out = run("monte_carlo.py", *words)

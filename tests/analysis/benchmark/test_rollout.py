@@ -83,13 +83,13 @@ def test_shortest_path_goes_around_a_post():
 def test_infeasible_flights_fail_with_a_reason(short_scenario, tmp_path, capsys, rows_of):
     overrides = ["goal=[6.5, 0, 0.36]"]
     config = StudyConfig([str(short_scenario)], ["straight", "planner"], [2.0], 1, overrides)
-    table = run_study.run(config=config, out=tmp_path / "near", jobs=1)
+    table = run_study.run(config=config, out=tmp_path / "near", jobs=1).table
     assert [row["infeasible"] for row in table] == [0, 1]
     assert (table[1]["flights"], table[1]["successes"]) == (1, 0)
     assert "must be at least" in rows_of(tmp_path / "near" / "rollouts.csv")[1]["reason"]
 
     config = replace(config, overrides=["goal=[50, 0, 1.8]"])
-    table = run_study.run(config=config, out=tmp_path / "far", jobs=1)
+    table = run_study.run(config=config, out=tmp_path / "far", jobs=1).table
     assert [row["infeasible"] for row in table] == [1, 1]
     assert "short-straight-2-000, infeasible: goal" in capsys.readouterr().out
     words = ["--scenarios", str(short_scenario), "--policies", "straight,planner", "--seeds", "1"]
@@ -107,7 +107,7 @@ def test_a_scene_without_a_start_and_goal_does_not_stop_the_study(room, tmp_path
     far = tmp_path / "far.yaml"
     far.write_text(f"world: !SceneConfig {{path: {hall}, draw_ends: true, least_way: 30}}\n")
     config = StudyConfig([str(far), str(short_scenario)], ["straight"], seeds=1)
-    [row] = run_study.run(config=config, out=tmp_path / "out", jobs=1)
+    [row] = run_study.run(config=config, out=tmp_path / "out", jobs=1).table
     assert (row["flights"], row["infeasible"]) == (2, 1)
 
 
@@ -128,7 +128,7 @@ def test_a_flight_that_becomes_infeasible_is_an_error_of_its_row(
 ):
     fail_later(monkeypatch, InfeasibleFlightError("no route leads to the goal"))
     config = StudyConfig([str(short_scenario)], ["straight", "planner"], [2.0], 1)
-    straight, planner = run_study.run(config=config, out=tmp_path / "out", jobs=1)
+    straight, planner = run_study.run(config=config, out=tmp_path / "out", jobs=1).table
     assert (straight["error"], straight["infeasible"], planner["error"]) == (1, 0, 0)
     row = rows_of(tmp_path / "out" / "rollouts.csv")[0]
     assert row["outcome"] == "error" and 0.5 < float(row["flight_time_s"]) < 0.6

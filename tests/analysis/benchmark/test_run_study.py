@@ -28,6 +28,16 @@ def test_chunks_are_flights_through_one_world(short_scenario):
     assert all(len({spec.seed for spec, _ in part}) == 1 for part in parts)
 
 
+def test_variants_of_a_scenario_share_chunks_if_they_share_worlds():
+    texts = ["P02:vehicle.drag=0.3", "P02:world.spacing=2", "P02:vehicle.drag=0.5"]
+    config = StudyConfig(texts, ["straight"], seeds=2)
+    flights = [(spec, spec.id) for spec in config.rollouts()]
+    changed = {each.label: each for each in config.scenario_variants}
+    parts = [[spec for spec, _ in part] for part in chunks(flights, 6, changed)]
+    assert [len(part) for part in parts] == [2, 2, 1, 1]
+    assert [spec.scenario for spec in parts[0]] == ["P02-vehicle.drag-0.3", "P02-vehicle.drag-0.5"]
+
+
 def test_study_has_all_flights_tables_and_a_report(study, rows_of):
     config, out = study
     rows = rows_of(out / "rollouts.csv")
@@ -108,8 +118,8 @@ def test_damaged_files_are_flown_again_and_reported(study, tmp_path, capsys, con
 def test_folder_of_another_study_is_refused(study, tmp_path, contents):
     config, whole = study
     before = contents(whole)
-    with pytest.raises(ValueError, match=r"holds a study with seeds 3, not 4"):
-        run_study.run(config=replace(config, seeds=4), out=whole, jobs=1)
+    with pytest.raises(ValueError, match=r"holds a study with seeds 3, not 2"):
+        run_study.run(config=replace(config, seeds=2), out=whole, jobs=1)
     with pytest.raises(ValueError, match=r"study with overrides \[\], not \['timeout=2'\]"):
         run_study.run(config=replace(config, overrides=["timeout=2"]), out=whole, jobs=1)
     assert contents(whole) == before
@@ -130,7 +140,7 @@ def test_absent_scene_is_not_run_and_never_passed(short_scenario, tmp_path, caps
     absent = tmp_path / "R99.yaml"
     absent.write_text(f"world: !SceneConfig {{path: {tmp_path / 'nowhere'}}}\n")
     config = StudyConfig([str(short_scenario), str(absent)], ["straight"], [2.0], seeds=2)
-    table = run_study.run(config=config, out=tmp_path / "out", jobs=1)
+    table = run_study.run(config=config, out=tmp_path / "out", jobs=1).table
     assert (table[0]["flights"], table[0]["not_run"]) == (2, 2)
     printed = capsys.readouterr().out
     assert f"R99 is not flown: No such file or folder: {tmp_path / 'nowhere'}" in printed
@@ -191,7 +201,7 @@ def test_test_study_flies_only_in_test_scenes_each_one_environment(room, tmp_pat
     with pytest.raises(ValueError, match=r"split of .*own, in which hall flies, must be test"):
         run_study.run(config=config, out=tmp_path / "out", jobs=1)
     hall.write_text(f"world: !SceneConfig {{path: {room.scene('held', split='test')}}}\n")
-    (row,) = run_study.run(config=config, out=tmp_path / "out", jobs=1)
+    (row,) = run_study.run(config=config, out=tmp_path / "out", jobs=1).table
     assert row["flights"] == 1
     assert "Each of hall is one environment" in (tmp_path / "out" / "report.html").read_text()
 
@@ -201,6 +211,7 @@ def test_one_option_flies_the_dodgedrone_challenge(monkeypatch, tmp_path):
 
     def run(*, config, out, jobs, cluster):
         studies.append(config)
+        return run_study.Flown([], [])
 
     monkeypatch.setattr(run_study, "run", run)
     command = ["benchmark", "--dodgedrone", "--out", str(tmp_path)]

@@ -105,7 +105,6 @@ def test_variants_are_parsed(text, variant):
         ("reactive:yaws=[1, 2]", r"LABEL=POLICY"),
         ("x" * 81 + "=reactive", "at most 80"),
         ("a=reactive:speed=3", "must not set speed; give the speed of all policies"),
-        ("a=diffaero:weights=x.npz", "LABEL=FILE.npz"),
         ("../mine.py", r"a policy must be .*, got \.\./mine\.py; .* write mine:CLASS"),
     ],
 )

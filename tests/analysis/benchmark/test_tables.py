@@ -7,6 +7,7 @@ from splatpilot.analysis.benchmark.study import StudyConfig
 from splatpilot.analysis.benchmark.tables import (
     cluster_interval,
     compare,
+    effective_flights,
     external_table,
     format_external,
     format_table,
@@ -131,6 +132,39 @@ def test_table_has_a_row_for_each_policy():
     assert [round(row["min_clearance_m"], 6) for row in table] == [0.5, 0.3]
     planner, straight = format_table(table, config).splitlines()[2:]
     assert "2/2" in planner and "1/1" in planner and "0/1" in straight
+
+
+def test_effective_flights_are_those_over_the_design_effect():
+    assert effective_flights([1, 0, 1], [1, 1, 1]) == 3
+    assert effective_flights([], []) == 0
+    assert effective_flights([4, 4], [4, 4]) == effective_flights([0, 0], [4, 4]) == 2
+    # Equal flights of a world count once: 40 worlds of 5 flights are about 40 flights.
+    wins = np.repeat([0, 5], 20)
+    assert effective_flights(wins, np.full(40, 5)) == pytest.approx(39)
+    # Independent ones all count.
+    wins = np.random.default_rng(0).binomial(5, 0.6, size=2000)
+    assert effective_flights(wins, np.full(2000, 5)) == pytest.approx(10000, rel=0.1)
+
+
+def test_flights_that_share_worlds_are_clustered():
+    """Two vehicles in each of ten worlds: the second policy fails in six worlds, for both."""
+    variants = ["P01:vehicle.drag=0.3", "P01:vehicle.drag=0.5"]
+    config = StudyConfig(variants, ["a", "b"], [2.0], seeds=10)
+    rows = []
+    for scenario in config.scenario_variants:
+        rows += flights("a", scenario.label, [True] * 10)
+        rows += flights("b", scenario.label, [False] * 6 + [True] * 4)
+    apart = compare(rows, config)[0]
+    for row in rows:
+        row["world_id"] = f"P01-{row['seed']:03d}"
+    (pair,) = compare(rows, config)
+    assert (pair.only_first, pair.p_seeds) == (12, 2 / 2**6)
+    assert apart.p_seeds == 2 / 2**12
+    assert pair.p_scenarios == 1.0  # one scenario
+    table = policy_table(rows, config)
+    assert (table[0]["wilson_lower"], table[0]["wilson_upper"]) == wilson_interval(10, 10)
+    assert table[1]["wilson_lower"] == pytest.approx(wilson_interval(3.6, 9).lower)
+    assert (table[1]["cluster_lower"], table[1]["cluster_upper"]) == (0.0, 1.0)
 
 
 def test_paper_is_compared_with_unchanged_policies_in_all_scenarios():

@@ -55,9 +55,19 @@ def test_names_are_given_once(registry):
     registry.add("one", Entry(OneConfig))
     with pytest.raises(ValueError, match=r"there is a toy 'one' already"):
         registry.add("one", Entry(DerivedConfig))
-    namesake = type("OneConfig", (), {})
+    namesake = type("OneConfig", (), {"__module__": "elsewhere"})
     with pytest.raises(ValueError, match=r"has the name of .*OneConfig.*; rename it"):
         registry.add("two", Entry(namesake))
+
+
+def test_same_qualified_name_is_replaced(registry):
+    again = Entry(type("OneConfig", (), {"__module__": OneConfig.__module__}))
+    registry.add("first", registry.find("one"))
+    registry.add("one", again)
+    assert registry.find("one") == registry.find("first") == registry.entry_for(again.config())
+    assert registry.configs() == [again.config]
+    with pytest.raises(ValueError, match=r"OneConfig was registered again after .*; make it again"):
+        registry.entry_for(OneConfig())
 
 
 def test_announced_entries_load_on_first_use(registry, tmp_path, monkeypatch):

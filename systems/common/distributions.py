@@ -1,0 +1,303 @@
+"""Distributions in numeric fields of configurations: reading, writing and sampling.
+
+They are those of `pydrake.common.schema`. In YAML a tag names them, as in
+`drag: !Uniform {min: 0.3, max: 0.5}`.
+"""
+
+import copy
+import copyreg
+import dataclasses
+import hashlib
+import re
+from collections.abc import Iterator
+from types import NoneType
+from typing import Any, NamedTuple, get_args, get_origin
+
+import yaml
+from pydrake.common import RandomGenerator, schema
+from pydrake.common.schema import (
+    Deterministic,
+    DeterministicVectorX,
+    Distribution,
+    DistributionVector,
+    Gaussian,
+    GaussianVectorX,
+    Rotation,
+    Transform,
+    Uniform,
+    UniformDiscrete,
+    UniformVectorX,
+)
+from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed
+
+from splatpilot.systems.common.validation import require
+
+FieldPath = tuple[str | int, ...]
+"""The path to a value in a configuration: names of fields, keys and indices."""
+
+_STRUCTURAL = {"seed", "width", "height"}  # whole numbers that must not be drawn
+_TRANSFORM = re.compile(r"X_[A-Z]{2}")  # Drake's reader reads the distributions in these.
+
+
+def _name(kind: type) -> str:
+    return kind.__name__.partition("𝓣")[0]  # without the parameters of a vector's template
+
+
+_KINDS: dict[str, Any] = {
+    f"!{_name(kind)}": kind
+    for kind in (
+        *(Deterministic, Gaussian, Uniform, UniformDiscrete),
+        *(DeterministicVectorX, GaussianVectorX, UniformVectorX),
+    )
+}
+
+
+def pickle_by_fields(*kinds: type) -> None:
+    """Lets `pickle` carry values of Drake's configuration types, which have no pickling."""
+    for kind in kinds:
+        copyreg.pickle(kind, _reduce)
+
+
+def _reduce(value: Any) -> tuple[Any, ...]:
+    fields = {field.name: getattr(value, field.name) for field in type(value).__fields__}
+    return _from_fields, (type(value), fields)
+
+
+def _from_fields(kind: Any, fields: dict[str, Any]) -> Any:
+    value = kind()
+    for name, held in fields.items():
+        setattr(value, name, held)
+    return value
+
+
+_TAG = re.compile(rf"({'|'.join(_KINDS)})\b")
+
+
+pickle_by_fields(Rotation, Transform)
+pickle_by_fields(*(part for part in vars(Rotation).values() if isinstance(part, type)))
+for _kind in vars(schema).values():
+    if isinstance(_kind, type) and issubclass(_kind, Distribution | DistributionVector):
+        pickle_by_fields(_kind)
+
+
+class DrawnField(NamedTuple):
+    """A field, or an item of one, that holds a distribution."""
+
+    path: FieldPath
+    holder: Any  # the configuration, dictionary or list that holds it
+    distribution: Distribution | DistributionVector | Transform
+
+    @property
+    def name(self) -> str:
+        """The dotted path."""
+        return dotted(self.path)
+
+    def put(self, value: Any) -> None:
+        """Replaces the distribution."""
+        if isinstance(self.holder, dict | list):
+            self.holder[self.path[-1]] = value  # pyright: ignore
+        else:
+            object.__setattr__(self.holder, str(self.path[-1]), value)
+
+
+def dotted(path: FieldPath) -> str:
+    """Joins a path with dots."""
+    return ".".join(map(str, path))
+
+
+def is_distribution(value: Any) -> bool:
+    """Returns True for distributions of numbers and of vectors."""
+    return isinstance(value, Distribution | DistributionVector)
+
+
+def distribution_text(distribution: Any) -> str:
+    """Returns a distribution as YAML in one line."""
+    return yaml.serialize(_node(distribution), width=float("inf")).strip()
+
+
+def find_distributions(config: Any, path: FieldPath = ()) -> Iterator[DrawnField]:
+    """Yields the distributions in a configuration, and transforms that have one.
+
+    Args:
+        path: of the configuration.
+
+    Raises:
+        ValueError: for a distribution in a field that is not of numbers, or an invalid one.
+    """
+    parts = () if isinstance(config, Transform | Rotation) else _fields(config)
+    for name, value, kind in parts:
+        yield from _find(config, (*path, name), value, kind)
+
+
+def _fields(config: Any) -> Iterator[tuple[str, Any, Any]]:
+    """Yields the names, values and types of a configuration's fields."""
+    drake = getattr(config, "__fields__", ())
+    for field in dataclasses.fields(config) if dataclasses.is_dataclass(config) else drake:
+        yield field.name, getattr(config, field.name), field.type
+
+
+def _find(holder: Any, path: FieldPath, value: Any, kind: Any) -> Iterator[DrawnField]:
+    if is_distribution(value):
+        _check(path, value, kind)
+        yield DrawnField(path, holder, value)
+    elif isinstance(value, Transform):
+        if not value.IsDeterministic():
+            yield DrawnField(path, holder, value)
+    elif isinstance(value, dict | list):
+        items = value.items() if isinstance(value, dict) else enumerate(value)
+        kinds = [each for each in get_args(_without_none(kind)) if each is not NoneType]
+        for key, item in items:
+            yield from _find(value, (*path, key), item, kinds[-1] if kinds else None)
+    elif not isinstance(value, type):
+        yield from find_distributions(value, path)
+
+
+def _without_none(kind: Any) -> Any:
+    """Returns the type T of `T | None`, or else the type itself."""
+    options = [each for each in get_args(kind) if each is not NoneType]
+    return options[0] if len(options) == 1 and NoneType in get_args(kind) else kind
+
+
+def _check(path: FieldPath, distribution: Any, kind: Any) -> None:
+    """Raises ValueError unless a field of this type can have the distribution."""
+    kind, text, name = _without_none(kind), distribution_text(distribution), dotted(path)
+    is_vector = get_origin(kind) is list or getattr(kind, "__name__", "") == "ndarray"
+    if isinstance(distribution, DistributionVector):
+        require(is_vector, name, "one value", text, "only lists of numbers have such distributions")
+    else:
+        require(not is_vector, name, "a list", text, "write !UniformVector or !GaussianVector")
+        valid = kind is float or (kind is int and path[-1] not in _STRUCTURAL)
+        require(valid, name, "one value", text, "only numbers can have a distribution")
+    if kind is int:
+        whole = isinstance(distribution, UniformDiscrete) and all(
+            value == int(value) for value in distribution.values
+        )
+        require(whole, name, "a !UniformDiscrete of whole numbers", text)
+    parts = {field: value for field, value, _ in _fields(distribution)}
+    require(len(parts.get("values", [0])) > 0, f"values of {name}", "at least one", text)
+    if "max" in parts:
+        valid = _all(parts["min"], parts["max"])
+        require(valid, f"min of {name}", "at most its max", text)
+    if "stddev" in parts:
+        require(_all(0.0, parts["stddev"]), f"stddev of {name}", "at least 0", text)
+
+
+def _all(lower: Any, upper: Any) -> bool:
+    """Checks lower <= upper, also by components."""
+    below = lower <= upper
+    return bool(below if isinstance(below, bool) else below.all())
+
+
+def sample_distributions[Configuration](
+    config: Configuration, seed: int, path: FieldPath = ()
+) -> Configuration:
+    """Returns the configuration with values drawn from its distributions, or itself without any.
+
+    Each has a random stream of its own, of the seed and its path: a further distribution changes
+    none of the other values.
+
+    Args:
+        path: of the configuration in that to which the seed belongs.
+    """
+    if next(find_distributions(config, path), None) is None:
+        return config
+    config = copy.deepcopy(config)
+    for field in list(find_distributions(config, path)):
+        field.put(draw(field.distribution, seed, field.name))
+    return config
+
+
+def draw(distribution: Any, seed: int, name: str) -> Any:
+    """Returns a value of a distribution, or of a transform that has one, by seed and name."""
+    stream = hashlib.sha256(f"{seed} {name}".encode()).digest()
+    value = distribution.Sample(RandomGenerator(int.from_bytes(stream[:4])))
+    if isinstance(distribution, Transform):
+        drawn = Transform(value)
+        drawn.base_frame = distribution.base_frame
+        return drawn
+    if isinstance(distribution, DistributionVector):
+        return value.tolist()
+    whole = isinstance(distribution, UniformDiscrete) and value.is_integer()
+    return int(value) if whole else value
+
+
+def take_distributions(text: str, path: FieldPath = ()) -> tuple[str, dict[FieldPath, Any]]:
+    """Returns a YAML text without the distributions in it, and these by their paths.
+
+    Items of lists become 0. Transforms keep theirs.
+
+    Args:
+        path: of the text, where the paths begin.
+    """
+    root = yaml.compose(text, yaml.SafeLoader) if _TAG.search(text) else None
+    if root is None:
+        return text, {}
+    found: dict[FieldPath, Any] = {}
+    _take(root, path, found)
+    return yaml.serialize(root), found
+
+
+def _take(node: yaml.Node, path: FieldPath, found: dict[FieldPath, Any]) -> None:
+    if isinstance(node, yaml.MappingNode):
+        kept = []
+        for key, value in node.value:
+            inner = (*path, key.value)
+            if value.tag in _KINDS and not _TRANSFORM.fullmatch(key.value):
+                found[inner] = _read(value, inner)
+                continue
+            kept.append((key, value))
+            if not _TRANSFORM.fullmatch(key.value):
+                _take(value, inner, found)
+        node.value = kept
+    elif isinstance(node, yaml.SequenceNode):
+        for index, value in enumerate(node.value):
+            if value.tag in _KINDS:
+                found[(*path, index)] = _read(value, (*path, index))
+                node.value[index] = yaml.ScalarNode("tag:yaml.org,2002:int", "0")
+            else:
+                _take(value, (*path, index), found)
+
+
+def _read(node: yaml.Node, path: FieldPath) -> Any:
+    kind = _KINDS[node.tag]
+    names = {key.value for key, _ in node.value} if isinstance(node, yaml.MappingNode) else None
+    known = [field.name for field in kind.__fields__]
+    form = f"{node.tag} {{{', '.join(f'{name}: ...' for name in known)}}}"
+    require(names == set(known), dotted(path), form, yaml.serialize(node).strip())
+    node.tag = "tag:yaml.org,2002:map"
+    return yaml_load_typed(schema=kind, data=yaml.serialize(node))
+
+
+def dump_with_distributions(config: Any) -> str:
+    """Returns a configuration as YAML with every field."""
+    if not any(is_distribution(field.distribution) for field in find_distributions(config)):
+        return str(yaml_dump_typed(config))
+    plain = copy.deepcopy(config)
+    drawn = [p for p in find_distributions(plain) if is_distribution(p.distribution)]
+    for field in drawn:
+        field.put([] if isinstance(field.distribution, DistributionVector) else 0)
+    root = yaml.compose(str(yaml_dump_typed(plain)), yaml.SafeLoader)
+    for field in drawn:
+        holder = root
+        for name in field.path[:-1]:
+            holder = holder.value[_row(holder, name)]
+            holder = holder[1] if isinstance(holder, tuple) else holder
+        row = _row(holder, field.path[-1])
+        node = _node(field.distribution)
+        held = holder.value[row]
+        holder.value[row] = (held[0], node) if isinstance(held, tuple) else node
+    return yaml.serialize(root)
+
+
+def _row(node: Any, name: str | int) -> int:
+    """Returns the row of a key, or the index, in the value of a YAML node."""
+    if isinstance(node, yaml.MappingNode):
+        return next(k for k, (key, _) in enumerate(node.value) if key.value == str(name))
+    return int(name)
+
+
+def _node(distribution: Any) -> yaml.Node:
+    """Returns the YAML node of a distribution, with its tag."""
+    node = yaml.compose(str(yaml_dump_typed(distribution)), yaml.SafeLoader)
+    node.tag, node.flow_style = f"!{_name(type(distribution))}", True
+    return node
