@@ -28,9 +28,9 @@ from splatpilot.systems.common.validation import require
 from splatpilot.systems.splats.background import Background, mean_color
 from splatpilot.systems.splats.splat_camera import SplatCamera
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS, QuadrotorPlant
+from splatpilot.systems.visualization.flight_visualizer import FlightVisualizer
 from splatpilot.systems.visualization.meshcat_drawing import (
     CameraVisualizer,
-    FlightVisualizer,
     MovingSpheresVisualizer,
     draw_distance_slice,
     draw_gaussians,
