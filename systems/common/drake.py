@@ -1,10 +1,11 @@
-"""Helpers for Drake systems: ports by methods, optional inputs, connections, weak callbacks."""
+"""Helpers for Drake systems: ports, connections, weak callbacks, sliders of Meshcat."""
 
 import weakref
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from pydrake.geometry import Meshcat
 from pydrake.systems.framework import (
     Context,
     DiagramBuilder,
@@ -82,3 +83,12 @@ def weak_callback(method: Callable[..., Any]) -> Callable[..., Any]:
         return bound(*arguments)
 
     return call
+
+
+def add_slider(
+    meshcat: Meshcat, name: str, range: tuple[float, float], step: float, value: float, *keys: str
+) -> None:
+    """Adds a slider to Meshcat's controls, or adds it again; `keys` are those to decrement and increment."""
+    if name in meshcat.GetSliderNames():
+        meshcat.DeleteSlider(name)
+    meshcat.AddSlider(name, *range, step, value, *keys)
