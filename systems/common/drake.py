@@ -88,7 +88,7 @@ def weak_callback(method: Callable[..., Any]) -> Callable[..., Any]:
 def add_slider(
     meshcat: Meshcat, name: str, range: tuple[float, float], step: float, value: float, *keys: str
 ) -> None:
-    """Adds a slider to Meshcat's controls, or adds it again; `keys` are those to decrement and increment."""
+    """Adds a slider to Meshcat's controls, or resets it; `keys` decrement and increment it."""
     if name in meshcat.GetSliderNames():
         meshcat.DeleteSlider(name)
     meshcat.AddSlider(name, *range, step, value, *keys)

@@ -176,6 +176,14 @@ class FlightVisualizer(LeafSystem):
 _RIBBON_WIDTH = 0.02  # [m]
 
 
+def hypothesis_colors(costs: np.ndarray) -> np.ndarray:
+    """Returns colors (K, 3), 0 to 1, of costs (K,): green (lowest) to red (highest)."""
+    cost = (costs - costs.min()) / max(np.ptp(costs), 1e-9)
+    return np.column_stack(
+        [np.minimum(1, 2 * cost), np.minimum(1, 2 * (1 - cost)), np.full(len(cost), 0.1)]
+    )
+
+
 def fan_mesh(plan: Hypotheses) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Makes horizontal ribbons along K hypotheses, from green (lowest cost) to red (highest).
 
@@ -189,10 +197,7 @@ def fan_mesh(plan: Hypotheses) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     across = np.stack([-along[..., 1], along[..., 0], np.zeros(along.shape[:2])], axis=-1)
     across *= 0.5 * _RIBBON_WIDTH / np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-9)
     sides = np.stack([path - across, path + across], axis=2)
-    cost = (plan.costs - plan.costs.min()) / max(np.ptp(plan.costs), 1e-9)
-    color = np.column_stack(
-        [np.minimum(1, 2 * cost), np.minimum(1, 2 * (1 - cost)), np.full(K, 0.1)]
-    )
+    color = hypothesis_colors(plan.costs)
     T = path.shape[1]
     first = (2 * (np.arange(K)[:, None] * T + np.arange(T - 1))).ravel()
     a, b, c, d = first, first + 1, first + 2, first + 3

@@ -132,6 +132,7 @@ def drag(tab, x: int, y: int, dx: int) -> None:
     tab.keyboard.down("Control")
     tab.mouse.move(x, y)
     tab.mouse.down()
+    tab.keyboard.up("Control")
     tab.mouse.move(x + dx, y)
 
 

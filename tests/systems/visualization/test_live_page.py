@@ -10,7 +10,7 @@ from pydrake.math import RigidTransform
 from splatpilot.systems.splats.background import EnvironmentMap
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.visualization.meshcat_drawing import draw_gaussians, picture_gltf
-from splatpilot.systems.visualization.pages import live_page
+from splatpilot.systems.visualization.pages import ReplayView, live_page
 
 SKY = EnvironmentMap(np.full((4, 8, 3), [0.2, 0.9, 0.9], np.float32))
 
@@ -23,11 +23,12 @@ def test_page_follows_meshcat(open_in_browser):
     red = GaussianScene.from_colors(
         [[0.0, 0.0, 0.0]], [[1.0, 0, 0, 0]], [[0.6] * 3], [0.99], [[0.9, 0.0, 0.0]]
     )
-    html = live_page(meshcat, red, SKY, (-2.0, 2.0), cut=1.0)
+    view = ReplayView("forest", RigidTransform(), fov_y=1.0, radius=0.3, lower=-2.0, upper=2.0)
+    html = live_page(meshcat, red, SKY, view, cut=1.0)
     # Nearer than the Gaussian, to be seen if they were drawn.
     green = dataclasses.replace(red, sh=red.sh[:, :, [1, 0, 2]], means=red.means - [1.0, 0, 0])
     draw_gaussians(meshcat, "/splatpilot/scene", green, np.full(3, -5.0), np.full(3, 5.0))
-    page = open_in_browser(html, 320, 240, "window.live && live.settled", "#none")
+    page = open_in_browser(html, 320, 240, "window.live && live.settled", ".panel, .bar")
 
     def middle() -> list[int]:
         return page.picture()[120, 160].tolist()

@@ -29,7 +29,7 @@ from splatpilot.systems.visualization.pages import (
 WIDTH, HEIGHT, FOV_Y = 240, 180, 1.2
 # Optical axes (x right, y down, z forward) in a body with x forward, y left, z up.
 X_BC = RigidTransform(RotationMatrix(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])), [0.1, 0, 0])
-VIEW = ReplayView(X_BC, FOV_Y, radius=0.35, lower=0.0, upper=4.0)
+VIEW = ReplayView("forest, seed 3", X_BC, FOV_Y, radius=0.35, lower=0.0, upper=4.0)
 
 SETTLED = (
     "window.replay && replay.splats.settled"
