@@ -34,6 +34,11 @@ class World:
     p_WS: NDArray[np.float64]  # (3,) [m], default start
     p_WG: NDArray[np.float64]  # (3,) [m], default goal
     moving: MovingBodies | None = None
+    num_frontier: int = 0  # last Gaussians, which close unobserved space
+
+    def __repr__(self) -> str:
+        size = " x ".join(f"{length:.3g}" for length in self.esdf.upper_W - self.esdf.lower_W)
+        return f"World({self.name!r}: {len(self.gaussians.means):,} Gaussians, {size} m)"
 
     def field_at(self, time: float) -> DistanceField:
         """Returns the distance field for collisions at a time [s] of a flight."""

@@ -69,7 +69,7 @@ class RerunSink(LeafSystem):
             "depth_image_32f": self._log_depth,
             "outcome": self._log_outcome,
         }
-        self._outcome = ""
+        self._outcome: str | None = None
         for name, port in ports.items():
             require(name in self._log, "ports", f"some of {', '.join(self._log)}", name)
             if port.get_data_type() == PortDataType.kVectorValued:

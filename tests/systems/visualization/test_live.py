@@ -38,6 +38,8 @@ class Drifter(LeafSystem):
     def DoCalcTimeDerivatives(self, context, derivatives):
         port = self.GetInputPort("disturbance")
         pushed = np.array(port.Eval(context)) if port.HasValue(context) else np.zeros(3)
+        if pushed.any() != self.flying.pushed.any():
+            self.flying.changed["pushed"] = time.time()
         self.flying.pushed = pushed
         v = context.get_continuous_state_vector().CopyToVector()[3:]
         derivatives.get_mutable_vector().SetFromVector(np.concatenate([v, pushed]))
@@ -52,18 +54,25 @@ class Watched(LiveControls):
     def _apply(self, context):
         super()._apply(context)
         packed = msgpack.unpackb(self._meshcat._GetPackedTransform("/splatpilot/goal"))
-        self.flying.goal = np.array(packed["matrix"][12:15])
-        self.flying.rate = self._meshcat.GetSliderValue(RATE)
-        self.flying.has_slice = self._meshcat.HasPath("/splatpilot/distance_slice")
-        self.flying.paused, self.flying.time = self.paused, context.get_time()
+        seen = {
+            "time": context.get_time(),
+            "paused": self.paused,
+            "goal": packed["matrix"][12:15],
+            "rate": self._meshcat.GetSliderValue(RATE),
+            "slice": self._meshcat.HasPath("/splatpilot/distance_slice"),
+        }
+        for name, value in seen.items():
+            if value != self.flying.seen.get(name):
+                self.flying.changed[name] = time.time()
+        self.flying.seen = seen
 
 
 class Flying:
     """A simulation with controls, which runs in a thread."""
 
     def __init__(self):
-        self.ended, self.url, self.time = "", "", -1.0
-        self.pushed = np.zeros(3)
+        self.ended, self.url = "", ""
+        self.seen, self.changed, self.pushed = {}, {}, np.zeros(3)
         self.thread = threading.Thread(target=self._run, daemon=True)
         self.thread.start()
 
@@ -88,18 +97,18 @@ class Flying:
         simulator.set_monitor(controls)
         self.url = meshcat.web_url()
         self.ended = simulator.AdvanceTo(3600.0).message()
+        self.changed["ended"] = time.time()
         context = goal.GetMyContextFromRoot(simulator.get_context())
         self.p_WG = np.array(goal.get_source_value(context).value())
 
 
 def until(condition, what: str, act=lambda: None) -> None:
-    """Acts, waits until a condition holds, and prints the time [s] that it took."""
-    started = time.perf_counter()
+    """Acts, and waits until a condition holds."""
     act()
+    started = time.perf_counter()
     while not condition():
         assert time.perf_counter() - started < 20, what
         time.sleep(0.002)
-    print(f"{what}: {time.perf_counter() - started:.3f} s")
 
 
 @pytest.fixture
@@ -107,10 +116,15 @@ def flying(browser):
     flight = Flying()
     until(lambda: flight.url, "controls")
     time.sleep(0.1)
-    assert flight.time < 0  # It waits for a viewer.
+    assert not flight.seen  # It waits for a viewer.
     flight.tab = browser.new_page(viewport={"width": 600, "height": 400})
+    flight.tab.add_init_script(
+        """for (const kind of ["keydown", "click", "change", "pointermove"]) {
+          document.addEventListener(kind, () => { window.acted = Date.now(); }, true);
+        }"""
+    )
     flight.tab.goto(flight.url)
-    until(lambda: flight.time > 0, "starts with the first viewer")
+    until(lambda: flight.seen, "starts with the first viewer")
     flight.tab.wait_for_function(
         "viewer.scene_tree.find(['drake', 'illustration', 'plant', 'plant']).object.children.length"
     )
@@ -126,6 +140,7 @@ def set_slider(tab, name: str, value: float) -> None:
     row = tab.locator("li", has_text=name).locator("input").last
     row.fill(str(value))
     row.press("Enter")
+    row.blur()
 
 
 def drag(tab, x: int, y: int, dx: int) -> None:
@@ -136,27 +151,40 @@ def drag(tab, x: int, y: int, dx: int) -> None:
     tab.mouse.move(x + dx, y)
 
 
+def report(flying, **changed: str) -> None:
+    """Prints the times [s] from the last event in the page to changes of the simulation."""
+    for what, name in changed.items():
+        acted = flying.tab.evaluate("acted") / 1000
+        print(f"{what}: {flying.changed[name] - acted:.3f} s")
+
+
 def test_simulation_pauses_steps_and_changes_its_rate(flying):
-    keyboard = flying.tab.keyboard
-    until(lambda: flying.paused, "pause", lambda: keyboard.press("Space"))
-    before = flying.time
+    keyboard, seen = flying.tab.keyboard, lambda name: flying.seen[name]
+    until(lambda: seen("paused"), "pause", lambda: keyboard.press("Space"))
+    report(flying, pause="paused")
+    before = seen("time")
     time.sleep(0.1)
-    assert flying.time == before
-    until(lambda: flying.time > before, "step", lambda: keyboard.press("n"))
-    until(lambda: flying.paused, "end of the step")
-    assert flying.time == pytest.approx(before + 0.1)
+    assert seen("time") == before
+    until(lambda: not seen("paused"), "step", lambda: keyboard.press("n"))
+    report(flying, step="paused")
+    until(lambda: seen("paused"), "end of the step")
+    assert seen("time") == pytest.approx(before + 0.1)
     resume = flying.tab.get_by_text(PAUSE)
-    until(lambda: flying.time > before + 0.1, "resume", resume.click)
-    until(lambda: flying.rate == 0.25, "rate", lambda: set_slider(flying.tab, RATE, 0.25))
-    wall, flown = time.perf_counter(), flying.time
+    until(lambda: not seen("paused"), "resume", resume.click)
+    report(flying, resume="paused")
+    until(lambda: seen("rate") == 0.25, "rate", lambda: set_slider(flying.tab, RATE, 0.25))
+    report(flying, rate="rate")
+    wall, flown = time.perf_counter(), seen("time")
     time.sleep(1.0)
-    rate = (flying.time - flown) / (time.perf_counter() - wall)
+    rate = (seen("time") - flown) / (time.perf_counter() - wall)
     assert rate == pytest.approx(0.25, abs=0.1)
 
 
 def test_restart_ends_the_simulation_and_the_slice_follows_its_slider(flying):
-    until(lambda: flying.has_slice, "slice", lambda: set_slider(flying.tab, SLICE, 1.5))
+    until(lambda: flying.seen["slice"], "slice", lambda: set_slider(flying.tab, SLICE, 1.5))
+    report(flying, slice="slice")
     until(lambda: flying.ended, "restart", lambda: flying.tab.keyboard.press("r"))
+    report(flying, restart="ended")
     assert flying.ended == RESTART
 
 
@@ -168,11 +196,17 @@ def test_mouse_drags_the_goal_and_pushes_the_vehicle(flying):
           return [(0.5 + 0.5 * q.x) * innerWidth, (0.5 - 0.5 * q.y) * innerHeight];
         }"""
     )
-    until(lambda: flying.goal[1] < 1.8, "goal", lambda: drag(flying.tab, x, y, 40))
+
+    def goal():
+        return np.array(flying.seen["goal"])
+
+    until(lambda: goal()[1] < 1.8, "goal", lambda: drag(flying.tab, x, y, 40))
+    report(flying, goal="goal")
     flying.tab.mouse.up()
-    np.testing.assert_allclose(flying.goal[[0, 2]], [0, 1], atol=0.05)
+    np.testing.assert_allclose(goal()[[0, 2]], [0, 1], atol=0.05)
     until(lambda: flying.pushed[1] > 1, "push", lambda: drag(flying.tab, 300, 200, -50))
+    report(flying, push="pushed")
     until(lambda: not flying.pushed.any(), "end of the push", flying.tab.mouse.up)
     flying.tab.keyboard.press("r")
     until(lambda: flying.ended, "restart")
-    np.testing.assert_allclose(flying.p_WG, flying.goal)
+    np.testing.assert_allclose(flying.p_WG, goal())
