@@ -83,7 +83,7 @@ class FlightVisualizer(LeafSystem):
         Args:
             num_hypotheses: 0 for no port `hypotheses`.
             draw: names of `DRAWINGS`, and "axes" for those of the body.
-            path: Meshcat's folder of the drawings, of which `vehicle` is the vehicle.
+            path: Meshcat's folder of the drawings; the vehicle is `PATH/vehicle`.
         """
         super().__init__()
         self._meshcat, self._num_hypotheses, self._path = meshcat, num_hypotheses, path

@@ -28,6 +28,7 @@ PAUSE, STEP, AGAIN = "pause or resume (space)", "step (n)", "restart (r)"
 RATE, SLICE = "real-time rate (0: unlimited)", "distances at height [m] (lowest: hidden)"
 STEP_TIME = 0.1  # [s] of simulated time
 STIFFNESS = 25.0  # [1/s^2] of the spring between a dragged vehicle and the mouse
+_PUSH = "disturbance"  # [m/s^2] port of vehicles
 _POLL = 0.01  # [s] between looks at the controls while the simulation waits
 _HANDLE_RADIUS = 0.5  # [m] of goals
 _MAX_DELAY = 0.2  # [s] behind real time that are caught up
@@ -59,7 +60,7 @@ class DragHandles:
         self._context = self._diagram.CreateDefaultContext()
         self._plant_context = self._plant.GetMyMutableContextFromRoot(self._context)
 
-    def place(self, name: str, p_WQ: ArrayLike, v_WQ: ArrayLike = (0.0, 0.0, 0.0)) -> None:
+    def move(self, name: str, p_WQ: ArrayLike, v_WQ: ArrayLike = (0.0, 0.0, 0.0)) -> None:
         """Moves a sphere to a position [m] with a velocity [m/s]."""
         body, context = self._plant.GetBodyByName(name), self._plant_context
         self._plant.SetFreeBodyPose(context, body, RigidTransform(np.asarray(p_WQ)))
@@ -87,8 +88,7 @@ class LiveControls:
     - Buttons pause, step and restart: the last ends the simulation with the message `RESTART`.
     - A slider sets the real-time rate, another the height of the slice of the distance field.
     - With the Ctrl key the mouse drags each goal (a ConstantVectorSource named `goal` or
-      `NAME_goal`), and by a spring each vehicle (a system with the input port `disturbance` and
-      the output port `state`).
+      `NAME_goal`), and by a spring each system with the ports of `QuadrotorPlant`.
 
     The simulation starts when the first viewer is connected.
     """
@@ -98,7 +98,7 @@ class LiveControls:
 
         Args:
             diagram: the simulated one, that holds goals and vehicles.
-            field: of which a slice is shown.
+            field: distance field, for the slice.
         """
         self._meshcat, self._diagram, self._field = meshcat, diagram, field
         systems = {system.get_name(): system for system in diagram.GetSystems()}
@@ -110,7 +110,7 @@ class LiveControls:
         self._vehicles = {
             name: system
             for name, system in systems.items()
-            if system.HasInputPort("disturbance") and system.HasOutputPort("state")
+            if system.HasInputPort(_PUSH) and system.HasOutputPort("state")
         }
         radii = dict.fromkeys(self._goals, _HANDLE_RADIUS)
         self._handles = DragHandles(meshcat, radii | dict.fromkeys(self._vehicles, VEHICLE_RADIUS))
@@ -203,11 +203,11 @@ class LiveControls:
         """Moves the goals, and pushes the vehicles."""
         for name, goal in self._goals.items():
             value = goal.get_source_value(goal.GetMyContextFromRoot(context)).value()
-            self._handles.place(name, value)
+            self._handles.move(name, value)
         for name, vehicle in self._vehicles.items():
             x = vector_output(vehicle, "state", vehicle.GetMyContextFromRoot(context))
             state = QuadrotorState.of(x)
-            self._handles.place(name, state.p_WB, state.v_WB)
+            self._handles.move(name, state.p_WB, state.v_WB)
         self._handles.draw()
         before, dragged = self._grabbed, self._handles.dragged()
         if before is not None and before[0] in self._vehicles and dragged is None:
@@ -232,5 +232,5 @@ class LiveControls:
 
     def _push(self, name: str, acceleration: np.ndarray, context: Context) -> None:
         vehicle = self._vehicles[name]
-        port = vehicle.GetInputPort("disturbance")
+        port = vehicle.GetInputPort(_PUSH)
         port.FixValue(vehicle.GetMyMutableContextFromRoot(context), acceleration)

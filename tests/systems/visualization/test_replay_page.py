@@ -242,6 +242,7 @@ def test_page_names_its_environment_and_fits_phones(open_page):
     content = page.tab.get_attribute("meta[name=viewport]", "content")
     assert content == "width=device-width, initial-scale=1"
     # The window is narrow: the panel is closed at first.
+    page.tab.set_viewport_size({"width": 390, "height": 844})
     assert "forest, seed 3" in page.tab.inner_text("#replay-panel")
     assert not page.tab.is_visible("#replay-picture")
     page.tab.click("#replay-panel header button")
