@@ -1,7 +1,7 @@
 """LiveControls: the viewers of Meshcat pause, step, restart and push a running simulation."""
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -151,10 +151,13 @@ class LiveControls:
         while not self._meshcat.GetNumActiveConnections():
             time.sleep(_POLL)
 
-    def wait_for_restart(self) -> None:
-        """Waits for a click on the button to restart."""
+    def wait_for_restart(self, stop: Callable[[], bool]) -> bool:
+        """Waits for a click on the button to restart; returns False if `stop` returns True."""
         while not self._clicked(AGAIN):
+            if stop():
+                return False
             time.sleep(_POLL)
+        return True
 
     def _restart(self, now: float) -> None:
         self._wall_start, self._sim_start = time.perf_counter(), now
@@ -202,8 +205,11 @@ class LiveControls:
     def _drag(self, context: Context) -> None:
         """Moves the goals, and pushes the vehicles."""
         for name, goal in self._goals.items():
-            value = goal.get_source_value(goal.GetMyContextFromRoot(context)).value()
-            self._handles.move(name, value)
+            p_WG = goal.get_source_value(goal.GetMyContextFromRoot(context)).value()
+            self._handles.move(name, p_WG)
+            vehicle = [*filter(None, [vehicle_prefix(goal, "goal")])]
+            path = "/".join(["/splatpilot", *vehicle, "goal"])
+            self._meshcat.SetTransform(path, RigidTransform(p_WG))
         for name, vehicle in self._vehicles.items():
             x = vector_output(vehicle, "state", vehicle.GetMyContextFromRoot(context))
             state = QuadrotorState.of(x)
@@ -225,10 +231,7 @@ class LiveControls:
         # The viewer's report may be of an earlier goal: the grabbed point is that of the start.
         grip = p_WQ - value.value() if before is None or before[0] != name else before[1]
         self._grabbed = name, grip
-        p_WG = p_WQ + acceleration / STIFFNESS - grip
-        value.set_value(p_WG)
-        path = "/".join(["/splatpilot", *filter(None, [vehicle_prefix(goal, "goal")]), "goal"])
-        self._meshcat.SetTransform(path, RigidTransform(p_WG))
+        value.set_value(p_WQ + acceleration / STIFFNESS - grip)
 
     def _push(self, name: str, acceleration: np.ndarray, context: Context) -> None:
         vehicle = self._vehicles[name]

@@ -261,6 +261,7 @@ class CameraVisualizer(LeafSystem):
         rgb = np.asarray(image.data)[..., :3]
         gltf = MemoryFile(picture_gltf(rgb, self._p_CCorners), ".gltf", "onboard picture")
         self._meshcat.SetObject(f"{self._path}/picture", Mesh(InMemoryMesh(mesh_file=gltf)))
+        send_picture(self._meshcat, self._path, rgb)
         if self._depth:
             depth = cast(ImageDepth32F, self.GetInputPort("depth_image_32f").Eval(context))
             self._draw_depth(rgb, np.asarray(depth.data)[..., 0])
@@ -277,6 +278,21 @@ class CameraVisualizer(LeafSystem):
         draw_points(self._meshcat, f"{self._path}/depth", p_CQ, rgb[rows, columns] / 255, 0.03)
 
 
+_JPEG = [cv2.IMWRITE_JPEG_QUALITY, 80]
+
+
+def send_picture(meshcat: Meshcat, path: str, rgb: np.ndarray) -> None:
+    """Sends an image (H, W, 3) to pages of `live_page`, as a property of a path in Meshcat.
+
+    Meshcat's properties are numbers: the first is the size of the JPEG file [bytes], and each
+    other holds six of its bytes, the lowest first.
+    """
+    data = cv2.imencode(".jpg", rgb[..., ::-1], _JPEG)[1].tobytes()
+    padded = np.frombuffer(data + bytes(-len(data) % 6), np.uint8).reshape(-1, 6)
+    numbers = padded @ (256.0 ** np.arange(6))
+    meshcat.SetProperty(path, "jpeg", [float(len(data)), *numbers.tolist()])
+
+
 def picture_gltf(rgb: np.ndarray, corners: np.ndarray) -> str:
     """Makes a glTF 2.0 document of an image on a rectangle, unlit and visible from both sides.
 
@@ -284,7 +300,7 @@ def picture_gltf(rgb: np.ndarray, corners: np.ndarray) -> str:
         rgb: (H, W, 3) uint8.
         corners: (4, 3) [m], top left, top right, bottom right and bottom left.
     """
-    _, jpeg = cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 80])
+    _, jpeg = cv2.imencode(".jpg", rgb[..., ::-1], _JPEG)
     document = {
         "asset": {"version": "2.0"},
         "scene": 0,

@@ -386,7 +386,7 @@ def live_page(
 ) -> str:
     """Makes an HTML page with the Gaussians that receives the rest from `meshcat`, on this machine.
 
-    It hides the points at `/splatpilot/scene`. It shows the last `send_picture` in its panel.
+    It hides the points at `/splatpilot/scene`, and shows the last `send_picture` in its panel.
 
     Args:
         cut: [m] height above which Gaussians are hidden at first.
@@ -401,15 +401,3 @@ def live_page(
         ("live.js",),
         "window.views = showLive(splats, data); window.live = splats;",
     )
-
-
-def send_picture(meshcat: Meshcat, path: str, rgb: NDArray[np.uint8]) -> None:
-    """Sends an image (H, W, 3) to pages of `live_page`, as a property of a path in Meshcat.
-
-    Meshcat's properties are numbers: the first is the size of the JPEG file [bytes], and each
-    other holds six of its bytes, the lowest first.
-    """
-    data = cv2.imencode(".jpg", rgb[..., ::-1], _JPEG)[1].tobytes()
-    padded = np.frombuffer(data + bytes(-len(data) % 6), np.uint8).reshape(-1, 6)
-    numbers = padded @ (256.0 ** np.arange(6))
-    meshcat.SetProperty(path, "jpeg", [float(len(data)), *numbers.tolist()])

@@ -9,8 +9,12 @@ from pydrake.math import RigidTransform
 
 from splatpilot.systems.splats.background import EnvironmentMap
 from splatpilot.systems.splats.scene import GaussianScene
-from splatpilot.systems.visualization.meshcat_drawing import draw_gaussians, picture_gltf
-from splatpilot.systems.visualization.pages import ReplayView, live_page, send_picture
+from splatpilot.systems.visualization.meshcat_drawing import (
+    draw_gaussians,
+    picture_gltf,
+    send_picture,
+)
+from splatpilot.systems.visualization.pages import ReplayView, live_page
 
 SKY = EnvironmentMap(np.full((4, 8, 3), [0.2, 0.9, 0.9], np.float32))
 
