@@ -10,12 +10,12 @@ from splatpilot.systems.common.validation import Config, bounded
 from splatpilot.systems.policies.base import Observation, Policy
 
 AXES = {
-    "forward": ("forward [m/s] (w, s)", "KeyS", "KeyW"),
-    "left": ("left [m/s] (a, d)", "KeyD", "KeyA"),
-    "up": ("up [m/s] (arrows)", "ArrowDown", "ArrowUp"),
-    "turn": ("turn left [rad/s] (arrows)", "ArrowRight", "ArrowLeft"),
+    "forward": ("forward (w, s)", "KeyS", "KeyW"),
+    "left": ("left (a, d)", "KeyD", "KeyA"),
+    "up": ("up (arrows)", "ArrowDown", "ArrowUp"),
+    "turn": ("turn (arrows)", "ArrowRight", "ArrowLeft"),
 }
-"""Names of sliders, and their keys to decrement and increment."""
+"""Names of sliders [m/s, rad/s], and their keys to decrement and increment."""
 STOP = "stop (x)"
 _STEPS = 4  # [-] presses of a key from rest to the maximum
 _DEAD_BAND = 0.1  # [-] of the gamepad's sticks

@@ -25,7 +25,7 @@ RESTART = "restart"
 """Message of the termination that the button for it causes."""
 
 PAUSE, STEP, AGAIN = "pause or resume (space)", "step (n)", "restart (r)"
-RATE, SLICE = "real-time rate (0: unlimited)", "distances at height [m] (lowest: hidden)"
+RATE, SLICE = "real-time rate", "distances at [m]"
 STEP_TIME = 0.1  # [s] of simulated time
 STIFFNESS = 25.0  # [1/s^2] of the spring between a dragged vehicle and the mouse
 _PUSH = "disturbance"  # [m/s^2] port of vehicles
@@ -86,7 +86,8 @@ class LiveControls:
     """Lets the viewers of Meshcat control a simulation; a monitor of `fly` or a Drake Simulator.
 
     - Buttons pause, step and restart: the last ends the simulation with the message `RESTART`.
-    - A slider sets the real-time rate, another the height of the slice of the distance field.
+    - A slider sets the real-time rate, 0 for as fast as possible, another the height of the slice
+      of the distance field, which the lowest one hides.
     - With the Ctrl key the mouse drags each goal (a ConstantVectorSource named `goal` or
       `NAME_goal`), and by a spring each system with the ports of `QuadrotorPlant`.
 

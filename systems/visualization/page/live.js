@@ -48,7 +48,9 @@ function showLive(splats, {name, url, lower, upper, cut, fov_y}) {
   let height = cut;
   const views = new Views(viewer, bar, "live", {chase, onboard}, fov_y, (view) => {
     splats.cut = view === "overview" ? height : Infinity;
-    viewer.scene_tree.find(["splatpilot", "vehicle"]).object.visible = view !== "onboard";
+    for (const own of ["vehicle", "trail", "hypotheses"]) {
+      viewer.scene_tree.find(["splatpilot", own]).object.visible = view !== "onboard";
+    }
   });
   const slider = addHeightSlider(bar, "live-cut", lower, upper, (z) => {
     height = z;
