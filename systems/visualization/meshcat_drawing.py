@@ -169,6 +169,26 @@ _PICTURE_DEPTH = 0.6  # [m] from the camera to the shown image
 _DEPTH_POINTS = 10_000  # [-] at most
 
 
+def camera_rays(camera_info: CameraInfo, pixels: np.ndarray) -> np.ndarray:
+    """Returns the points (N, 3) of depth 1 at pixels (N, 2), frame C."""
+    homogeneous = np.column_stack([pixels, np.ones(len(pixels))])
+    return homogeneous @ np.linalg.inv(camera_info.intrinsic_matrix()).T
+
+
+def draw_frustum(
+    meshcat: Meshcat, path: str, camera_info: CameraInfo, X_BC: RigidTransform
+) -> np.ndarray:
+    """Draws the view frustum of a camera; returns its corners (4, 3) [m], frame C: top left, top
+    right, bottom right, bottom left."""
+    width, height = camera_info.width(), camera_info.height()
+    corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], dtype=float)
+    p_CCorners = _PICTURE_DEPTH * camera_rays(camera_info, corners)
+    meshcat.SetTransform(path, X_BC)
+    edges = np.stack([np.zeros((4, 3)), p_CCorners], axis=1).reshape(8, 3)
+    meshcat.SetLine(f"{path}/frustum", edges.T, 2.0)
+    return p_CCorners
+
+
 class CameraVisualizer(LeafSystem):
     """Shows the camera's image in Meshcat, across its view frustum, and its depth as points.
 
@@ -203,19 +223,14 @@ class CameraVisualizer(LeafSystem):
         super().__init__()
         self._meshcat, self._period, self._stride = meshcat, period, stride
         self._path, self._depth = path, depth
+        self._camera_info = camera_info
+        self._p_CCorners = draw_frustum(meshcat, path, camera_info, X_BC)
         width, height = camera_info.width(), camera_info.height()
-        self._inverse_K = np.linalg.inv(camera_info.intrinsic_matrix())
-        corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], dtype=float)
-        # (4, 3) [m], frame C: top left, top right, bottom right, bottom left.
-        self._p_CCorners = _PICTURE_DEPTH * self._rays(corners)
         self.DeclareAbstractInputPort("color_image", Value(ImageRgba8U(width, height)))
         if depth:
             self.DeclareAbstractInputPort("depth_image_32f", Value(ImageDepth32F(width, height)))
         self.DeclarePeriodicPublishEvent(period, 0.0, self._publish_some)
         self.DeclareForcedPublishEvent(self._publish)
-        meshcat.SetTransform(path, X_BC)
-        edges = np.stack([np.zeros((4, 3)), self._p_CCorners], axis=1).reshape(8, 3)
-        meshcat.SetLine(f"{path}/frustum", edges.T, 2.0)
 
     @staticmethod
     def AddToBuilder(
@@ -247,10 +262,6 @@ class CameraVisualizer(LeafSystem):
             builder.Connect(camera.GetOutputPort(port.get_name()), port)
         return visualizer
 
-    def _rays(self, pixels: np.ndarray) -> np.ndarray:
-        """Returns the points (N, 3) of depth 1 at pixels (N, 2), frame C."""
-        return np.column_stack([pixels, np.ones(len(pixels))]) @ self._inverse_K.T
-
     def _publish_some(self, context: Context) -> EventStatus:
         if round(context.get_time() / self._period) % self._stride:
             return EventStatus.DidNothing()
@@ -274,7 +285,9 @@ class CameraVisualizer(LeafSystem):
         )
         valid = np.isfinite(depth[rows, columns]) & (depth[rows, columns] > 0)
         rows, columns = rows[valid], columns[valid]
-        p_CQ = depth[rows, columns, None] * self._rays(np.column_stack([columns, rows]) + 0.5)
+        p_CQ = depth[rows, columns, None] * camera_rays(
+            self._camera_info, np.column_stack([columns, rows]) + 0.5
+        )
         draw_points(self._meshcat, f"{self._path}/depth", p_CQ, rgb[rows, columns] / 255, 0.03)
 
 

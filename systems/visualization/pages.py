@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 from importlib import resources
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -18,6 +19,7 @@ from pydrake.math import RigidTransform
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.shapes import MovingSpheres
+from splatpilot.systems.common.files import written_atomically
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.policies.hypotheses import Hypotheses, num_hypotheses_in
 from splatpilot.systems.splats.background import Background, EnvironmentMap
@@ -93,6 +95,22 @@ def splat_page(
     )
     head, body, tail = meshcat_page.rpartition("</body>")
     return head + added + body + tail
+
+
+class HtmlPage:
+    """A self-contained HTML page; notebooks show it inline."""
+
+    def __init__(self, html: str):
+        self.html = html
+
+    def _repr_html_(self) -> str:
+        style = "width: 100%; height: 600px; border: 0"
+        return f'<iframe srcdoc="{escape(self.html)}" style="{style}"></iframe>'
+
+    def save(self, path: Path) -> None:
+        """Writes the page atomically."""
+        with written_atomically(path) as partial:
+            partial.write_text(self.html)
 
 
 def compressed(data: bytes) -> str:

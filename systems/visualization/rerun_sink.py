@@ -40,7 +40,8 @@ class RerunSink(LeafSystem):
         input_ports: [state, command, clearance, hypotheses, color_image, depth_image_32f, outcome]
 
     All inputs are optional; those of the constructor are declared. They are recorded every `period`
-    [s], and `outcome`, a string, at each step that changes it. The file is complete after `close`.
+    [s], and `outcome`, a string, at each step that changes it. The file is that of the last
+    simulation, and complete after `close`.
     """
 
     def __init__(
@@ -52,7 +53,7 @@ class RerunSink(LeafSystem):
         goal: NDArray[np.float64] | None = None,
         period: float = 1 / 15,
     ):
-        """Opens the file and declares an input like each of `ports`, by name.
+        """Declares an input like each of `ports`, by name.
 
         Args:
             gaussians: those of the world.
@@ -76,14 +77,17 @@ class RerunSink(LeafSystem):
                 self.DeclareVectorInputPort(name, port.size())
             else:
                 self.DeclareAbstractInputPort(name, port.Allocate())
-        self._recording = self._rr.RecordingStream("splatpilot", recording_id="flight")
-        self._recording.save(path)
+        self._path = path
+        self._recording: Any = None
+        self._statics: list[tuple[str, Any]] = []
         if gaussians is not None:
-            self._static("world/splats", self._splats(gaussians))
+            self._statics.append(("world/splats", self._splats(gaussians)))
         if goal is not None:
-            self._static("world/goal", self._rr.Points3D([goal], radii=0.3, colors=[0, 200, 80]))
+            goals = self._rr.Points3D([goal], radii=0.3, colors=[0, 200, 80])
+            self._statics.append(("world/goal", goals))
         radii = [[VEHICLE_RADIUS, VEHICLE_RADIUS, 0.3 * VEHICLE_RADIUS]]
-        self._static("world/vehicle", self._rr.Ellipsoids3D(half_sizes=radii))
+        self._statics.append(("world/vehicle", self._rr.Ellipsoids3D(half_sizes=radii)))
+        self.DeclareInitializationPublishEvent(self._begin)
         self.DeclarePeriodicPublishEvent(period, 0.0, self._publish)
         self.DeclareForcedPublishEvent(self._publish)
         if "outcome" in ports:
@@ -114,17 +118,32 @@ class RerunSink(LeafSystem):
 
     def show_camera(self, info: CameraInfo, X_BC: RigidTransform) -> None:
         """Records the intrinsics of the camera and its pose in the vehicle's body frame."""
-        self._static(_CAMERA, self._transform(X_BC.translation(), X_BC.rotation().ToQuaternion()))
+        q_BC = X_BC.rotation().ToQuaternion().wxyz()
+        self._statics.append((_CAMERA, self._transform(X_BC.translation(), q_BC)))
         resolution = [info.width(), info.height()]
         pinhole = self._rr.Pinhole(image_from_camera=info.intrinsic_matrix(), resolution=resolution)
-        self._static(_CAMERA, pinhole)
+        self._statics.append((_CAMERA, pinhole))
 
     def close(self) -> None:
         """Completes the file; the sink records no more."""
-        self._recording.flush()
-        self._recording.disconnect()
+        if self._recording is not None:
+            self._recording.flush()
+            self._recording.disconnect()
+            self._recording = None
+
+    def _begin(self, context: Context) -> EventStatus:
+        """Opens the file, and records what does not change."""
+        self.close()
+        self._outcome = None
+        self._recording = self._rr.RecordingStream("splatpilot", recording_id="flight")
+        self._recording.save(self._path)
+        for path, value in self._statics:
+            self._recording.log(path, value, static=True)
+        return EventStatus.Succeeded()
 
     def _publish(self, context: Context) -> EventStatus:
+        if self._recording is None:
+            self._begin(context)
         for k in range(self.num_input_ports()):
             port = self.get_input_port(k)
             self._record(context, port.get_name(), port.Eval(context))
@@ -140,15 +159,12 @@ class RerunSink(LeafSystem):
         self._recording.set_time("time", duration=context.get_time())
         self._log[name](value)
 
-    def _static(self, path: str, value: Any) -> None:
-        self._recording.log(path, value, static=True)
-
     def _scalars(self, path: str, values: NDArray[np.float64]) -> None:
         self._recording.log(path, self._rr.Scalars(values))
 
-    def _transform(self, p: NDArray[np.float64], q: Any) -> Any:
-        xyzw = self._rr.Quaternion(xyzw=np.roll(np.asarray(getattr(q, "wxyz", lambda: q)()), -1))
-        return self._rr.Transform3D(translation=p, quaternion=xyzw)
+    def _transform(self, p: NDArray[np.float64], q: NDArray[np.float64]) -> Any:
+        """Makes a transform of a position and a quaternion (w, x, y, z)."""
+        return self._rr.Transform3D(translation=p, quaternion=np.roll(q, -1))
 
     def _splats(self, gaussians: GaussianScene) -> Any:
         shades = np.column_stack([gaussians.base_colors, gaussians.opacities])
