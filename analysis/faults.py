@@ -16,12 +16,15 @@ from lcm import LCM
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
 from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, LeafSystem
 
-from splatpilot.diagrams.flight.blocks import goal_position, make_policy
+from splatpilot.diagrams.flight.blocks import make_policy
 from splatpilot.diagrams.flight.flight import (
+    sample_initial_state,
+)
+from splatpilot.diagrams.flight.monitor import (
     Outcome,
     flight_outcome,
+    goal_position,
     has_landed,
-    sample_initial_state,
 )
 from splatpilot.diagrams.flight.policies import policy_named
 from splatpilot.diagrams.flight.scenario import Scenario

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from pydrake.geometry import Rgba
 from scipy.spatial import KDTree
 
-from splatpilot.diagrams.flight.blocks import goal_position, start_position
 from splatpilot.diagrams.flight.flight_diagram import empty_meshcat
+from splatpilot.diagrams.flight.monitor import goal_position, start_position
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.scenarios import scenario_file
 from splatpilot.diagrams.worlds.octomap_world import OCTOMAP

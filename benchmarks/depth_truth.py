@@ -113,7 +113,7 @@ def frames_along_flight(
     time."""
     truth = TrueDepth(make_spec(scenario.world, scenario.seed))
     world = make_world(scenario.world, scenario.seed)
-    flight = fly(BuildFlightDiagram(scenario, world, camera=False), scenario, world)
+    flight = fly(BuildFlightDiagram(scenario, world, camera=False))
     rows = np.linspace(0, len(flight.states) - 1, count).astype(int)
     frames: list[list[DepthFrame]] = [[] for _ in cameras]
     for config, found in zip(cameras, frames, strict=True):

@@ -56,4 +56,4 @@ class Sidestep(LeafSystem):
         discrete_state.set_value(self._config.speed * (ahead * (1 - near.mean()) + step))
 
 
-sp.register_policy(SidestepConfig, lambda config, world, vehicle: Sidestep(config))
+sp.register_policy(SidestepConfig, lambda config, world, scenario: Sidestep(config))

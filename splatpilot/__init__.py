@@ -4,7 +4,7 @@
 
     scenario = sp.Scenario(seed=5)
     world = sp.make_world(scenario.world, scenario.seed)
-    flight = sp.fly(sp.BuildFlightDiagram(scenario, world), scenario, world)
+    flight = sp.fly(sp.BuildFlightDiagram(scenario, world))
 
 The public names are listed in `__init__.pyi`. Each is imported on first use, so flying imports
 neither torch nor the capture readers.

@@ -1,5 +1,18 @@
-from .diagrams.flight.flight import Flight, Outcome, fly, sample_initial_state
-from .diagrams.flight.flight_diagram import BuildFlightDiagram, MakeCamera
+from .diagrams.flight.flight import (
+    Flight,
+    fly,
+    fly_all,
+    make_flight_simulator,
+    sample_initial_state,
+)
+from .diagrams.flight.flight_diagram import (
+    AddFlight,
+    BuildFlightDiagram,
+    ExportFlight,
+    FlightParts,
+    MakeCamera,
+)
+from .diagrams.flight.monitor import AddFlightMonitor, FlightMonitor, Outcome
 from .diagrams.flight.monte_carlo import random_flights
 from .diagrams.flight.policies import policy_named, register_policy
 from .diagrams.flight.scenario import Scenario
@@ -31,6 +44,8 @@ from .training.policies.trainer_registry import register_trainer
 from .training.reconstruction.reconstruct import reconstruct
 
 __all__ = [
+    "AddFlight",
+    "AddFlightMonitor",
     "BakedScene",
     "BuildFlightDiagram",
     "Capture",
@@ -38,8 +53,11 @@ __all__ = [
     "Distortion",
     "Esdf",
     "EsdfCollision",
+    "ExportFlight",
     "FlatnessController",
     "Flight",
+    "FlightMonitor",
+    "FlightParts",
     "GaussianScene",
     "HypothesisSelector",
     "MakeCamera",
@@ -60,8 +78,10 @@ __all__ = [
     "dump_config",
     "field_mesh",
     "fly",
+    "fly_all",
     "hover_state",
     "load_config",
+    "make_flight_simulator",
     "make_world",
     "policy_named",
     "random_flights",

@@ -21,7 +21,7 @@ digests = {}
 for name in ("planner", "diffaero"):
     scenario.policy = policy_named(name)
     diagram = BuildFlightDiagram(scenario, world, camera=False)
-    digests[name] = digest(fly(diagram, scenario, world))
+    digests[name] = digest(fly(diagram))
 print(json.dumps(digests))
 """
 

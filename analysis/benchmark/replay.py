@@ -47,7 +47,7 @@ def run(
         require_unused(out, overwrite)
         require_writable_folder(out)
     diagram = BuildFlightDiagram(scenario, world, video=filmed, camera=filmed)
-    flight = fly_with_bar(diagram, scenario, world)
+    flight = fly_with_bar(diagram)
     recorder = cast(VideoRecorder, diagram.GetSubsystemByName("video")) if filmed else None
     if recorder is not None and meshcat:
         shown = replayed_flight(id, flight, recorded_frames(recorder, scenario))

@@ -15,9 +15,9 @@ import numpy as np
 
 from splatpilot import _native
 from splatpilot.analysis.benchmark.study import RolloutSpec
-from splatpilot.diagrams.flight.blocks import goal_position
-from splatpilot.diagrams.flight.flight import Flight, Outcome, decision_times, fly
-from splatpilot.diagrams.flight.flight_diagram import LOG_PERIOD, BuildFlightDiagram
+from splatpilot.diagrams.flight.flight import Flight, decision_times, fly
+from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
+from splatpilot.diagrams.flight.monitor import LOG_PERIOD, Outcome, goal_position
 from splatpilot.diagrams.flight.policies import POLICIES
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.worlds.world import World
@@ -138,7 +138,7 @@ def _fly_rollout(spec: RolloutSpec, scenario: Scenario) -> Rollout:
         world = study_world(scenario)
         timing["world_s"] = time.perf_counter() - started
         diagram = BuildFlightDiagram(scenario, world, camera=False)
-        flight = fly(diagram, scenario, world)
+        flight = fly(diagram)
         lengths = _lengths_to(world, tuple(goal_position(scenario, world)))
         p_WS = QuadrotorState.of(flight.states[0]).p_WB
         shortest = shortest_length(lengths, p_WS, scenario.goal_radius)

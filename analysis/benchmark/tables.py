@@ -12,7 +12,7 @@ from scipy.stats import binomtest
 
 from splatpilot.analysis.benchmark.rollout import INFEASIBLE
 from splatpilot.analysis.benchmark.study import StudyConfig
-from splatpilot.diagrams.flight.flight import Outcome
+from splatpilot.diagrams.flight.monitor import Outcome
 from splatpilot.diagrams.scenarios import benchmark_scenarios
 from splatpilot.systems.common.seeds import describe_seeds
 from splatpilot.training.corpus.library import PROCEDURAL

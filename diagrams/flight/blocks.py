@@ -4,9 +4,7 @@ import math
 from dataclasses import replace
 from typing import NamedTuple
 
-import numpy as np
 from pydrake.systems.framework import DiagramBuilder, OutputPort, System
-from pydrake.systems.primitives import ConstantVectorSource
 
 from splatpilot.diagrams.flight.policies import POLICIES
 from splatpilot.diagrams.flight.scenario import Scenario
@@ -25,71 +23,84 @@ from splatpilot.systems.sensing.time_of_flight import TimeOfFlightGrid, equivale
 from splatpilot.systems.vehicle.flatness import FlatnessController
 from splatpilot.systems.vehicle.state import StateToPose
 
+DECISIONS = {"command": 4, "acceleration": 3, "velocity": 3, "waypoint": 3}
+"""Decisions of policies besides hypotheses, and their sizes."""
+
 
 class Autonomy(NamedTuple):
     """Systems and ports of `AddPolicyAndController`."""
 
     policy: System
-    controller: System
-    pose: OutputPort  # X_WB
-    target: OutputPort  # `waypoint`, `acceleration` or `velocity`.
+    controller: System | None  # None if the policy decides the command
+    target: OutputPort  # one of `DECISIONS`
+    command: OutputPort  # (4)
 
 
 def make_policy(scenario: Scenario, world: World) -> System:
     """Builds the scenario's policy."""
     kind = POLICIES.entry_for(scenario.policy)
-    policy = kind.build(scenario.policy, world, scenario.vehicle)
+    policy = kind.build(scenario.policy, world, scenario)
     what = f"the result of building the policy {POLICIES.entry_name(kind)!r}"
     require(isinstance(policy, System), what, "a Drake system", type(policy).__name__)
     return policy
 
 
-def AddPolicyAndController(
-    builder: DiagramBuilder,
-    scenario: Scenario,
-    world: World,
-    state: OutputPort,
-    policy: System | None = None,
-    controller: System | None = None,
-    *,
-    guarded: bool = False,
-) -> Autonomy:
-    """Adds the systems `pose`, `collision`, `goal`, `policy`, `controller`, `selector` for
-    hypotheses, and `velocity_tracker` for velocities.
-
-    Exports `command`, `hypotheses`, `clearance`, `gradient`, `in_collision` and `field_state`.
-    `ConnectObservation` must follow.
-
-    Args:
-        state: (13) of the vehicle.
-        policy, controller: see `BuildFlightDiagram`.
-        guarded: if a failsafe follows. `finite_target` replaces targets that are not finite by
-            zeros, and `finite_heading` such headings by NaN; `command` is not exported.
-    """
-    # Pose, distances and goal.
+def AddPoseAndCollision(
+    builder: DiagramBuilder, world: World, state: OutputPort
+) -> tuple[OutputPort, EsdfCollision]:
+    """Adds the systems `pose` and `collision` of a state (13); returns the port of X_WB too."""
     spheres = world.moving.spheres if world.moving else None
     pose, collision = StateToPose(), EsdfCollision(world.distance_field, spheres)
     for name, system in (("pose", pose), ("collision", collision)):
         builder.AddNamedSystem(name, system)
         builder.Connect(state, system.GetInputPort("state"))
-    builder.AddNamedSystem("goal", ConstantVectorSource(goal_position(scenario, world)))
+    return pose.GetOutputPort("pose"), collision
 
-    # Policy and controller.
-    policy = policy or make_policy(scenario, world)
-    controller = controller or FlatnessController(scenario.controller, scenario.vehicle)
-    builder.AddNamedSystem("policy", policy)
-    builder.AddNamedSystem("controller", controller)
-    require_ports("controller", controller, inputs=["state"], outputs=["command"])
-    target = _add_target(builder, scenario, state, policy)
-    _connect_controller(builder, state, policy, target, controller, guarded)
 
+def ExportCollision(builder: DiagramBuilder, collision: System) -> None:
+    """Exports `clearance`, `gradient`, `in_collision` and `field_state`."""
     for name in ("clearance", "gradient", "in_collision", "field_state"):
         builder.ExportOutput(collision.GetOutputPort(name), name)
-    if policy.HasOutputPort("hypotheses"):
-        builder.ExportOutput(policy.GetOutputPort("hypotheses"), "hypotheses")
-    if not guarded:
-        builder.ExportOutput(controller.GetOutputPort("command"), "command")
-    return Autonomy(policy, controller, pose.GetOutputPort("pose"), target)
+
+
+def AddPolicyAndController(
+    builder: DiagramBuilder,
+    scenario: Scenario,
+    state: OutputPort,
+    policy: System,
+    controller: System | None = None,
+    *,
+    guarded: bool = False,
+) -> Autonomy:
+    """Adds the systems `policy`, `controller`, `selector` for hypotheses, and `velocity_tracker`
+    for velocities. `ConnectObservation` must follow.
+
+    Args:
+        state: (13) of the vehicle, as policy and controller know it.
+        policy, controller: see `AddFlight`.
+        guarded: if a failsafe follows. `finite_target` replaces targets that are not finite by
+            zeros, and `finite_heading` such headings by NaN.
+    """
+    add_system(builder, "policy", policy)
+    target = _add_target(builder, scenario, state, policy)
+    if target.get_name() == "command":
+        other = controller or guarded
+        require(not other, "the policy's decision", "other than command", "command", _NO_COMMAND)
+        return Autonomy(policy, None, target, target)
+    controller = controller or FlatnessController(scenario.controller, scenario.vehicle)
+    add_system(builder, "controller", controller)
+    require_ports("controller", controller, inputs=["state"], outputs=["command"])
+    _connect_controller(builder, state, policy, target, controller, guarded)
+    return Autonomy(policy, controller, target, controller.GetOutputPort("command"))
+
+
+_NO_COMMAND = "a controller of its own and the failsafe need another decision"
+
+
+def add_system(builder: DiagramBuilder, name: str, system: System) -> None:
+    """Adds a system under a name, unless it is in the builder already."""
+    if all(system is not added for added in builder.GetSystems()):
+        builder.AddNamedSystem(name, system)
 
 
 def _add_target(
@@ -104,15 +115,13 @@ def _add_target(
         builder.Connect(hypotheses, selector.GetInputPort("hypotheses"))
         builder.Connect(state, selector.GetInputPort("state"))
         return selector.GetOutputPort("waypoint")
-    names = [
-        name for name in ("acceleration", "velocity", "waypoint") if policy.HasOutputPort(name)
-    ]
-    if not names:
+    name = next((name for name in DECISIONS if policy.HasOutputPort(name)), None)
+    if name is None:
         raise ValueError(
             f"the policy {type(policy).__name__} has none of the outputs hypotheses, "
-            "acceleration, velocity and waypoint; give it one"
+            f"{', '.join(DECISIONS)}; give it one"
         )
-    return policy.GetOutputPort(names[0])
+    return policy.GetOutputPort(name)
 
 
 def _connect_controller(
@@ -145,19 +154,34 @@ def _connect_controller(
 
 
 def ConnectObservation(
-    builder: DiagramBuilder, observed: dict[str, OutputPort], policy: System
+    builder: DiagramBuilder, what: str, system: System, observed: dict[str, OutputPort]
 ) -> None:
-    """Connects each input of the policy to the port of its name."""
-    observed = observed | {"goal": builder.GetSubsystemByName("goal").get_output_port(0)}
-    for index in range(policy.num_input_ports()):
-        port = policy.get_input_port(index)
+    """Connects each open input of a system, named `what`, to the port of its name."""
+    for index in range(system.num_input_ports()):
+        port = system.get_input_port(index)
+        if builder.IsConnectedOrExported(port):
+            continue
         if port.get_name() not in observed:
             raise ValueError(
-                f"nothing gives the input {port.get_name()!r} of the policy "
-                f"{type(policy).__name__}; there are {', '.join(observed)}, and the outputs of "
+                f"nothing gives the input {port.get_name()!r} of the {what} "
+                f"{type(system).__name__}; there are {', '.join(observed)}, and the outputs of "
                 "sensors that the scenario names"
             )
         connect(builder, observed[port.get_name()], port)
+
+
+def ConnectOrExport(
+    builder: DiagramBuilder, system: System, known: dict[str, OutputPort], prefix: str
+) -> None:
+    """Connects open inputs to ports of their names; exports each other input `p` as `prefix_p`."""
+    for index in range(system.num_input_ports()):
+        port = system.get_input_port(index)
+        if builder.IsConnectedOrExported(port):
+            continue
+        if port.get_name() in known:
+            connect(builder, known[port.get_name()], port)
+        else:
+            builder.ExportInput(port, f"{prefix}_{port.get_name()}")
 
 
 def ConnectInputs(builder: DiagramBuilder, system: System, sources: dict[str, OutputPort]) -> None:
@@ -175,16 +199,6 @@ def require_ports(what: str, system: System, inputs: list[str], outputs: list[st
             f"the {what} {type(system).__name__} has no port {missing[0]!r}; it needs the inputs "
             f"{inputs} and the outputs {outputs}"
         )
-
-
-def goal_position(scenario: Scenario, world: World) -> np.ndarray:
-    """Returns p_WG (3,) [m] of the scenario, or of the world if the scenario has none."""
-    return np.asarray(world.p_WG if scenario.goal is None else scenario.goal, dtype=float)
-
-
-def start_position(scenario: Scenario, world: World) -> np.ndarray:
-    """Returns p_WS (3,) [m] of the scenario, or of the world if the scenario has none."""
-    return np.asarray(world.p_WS if scenario.start is None else scenario.start, dtype=float)
 
 
 def decision_period(scenario: Scenario, policy: System) -> float:
@@ -217,16 +231,16 @@ def AddObservation(
     state: OutputPort,
     pose: OutputPort,
     policy: System,
+    names: list[str],
 ) -> dict[str, OutputPort]:
-    """Adds `policy_camera` if the policy has images as inputs; it renders when the policy updates.
+    """Adds `policy_camera` if images are named; it renders when the policy updates.
 
     `delayed_pose`, `depth_noise` and `color_noise` apply the scenario's `observation`, and
     `time_of_flight_grid` makes grids of depth. `policy_camera_start_pose` is for a rolling shutter.
 
     Returns:
-        The policy's input images, by their names.
+        The images, by their names.
     """
-    names = policy_images(policy)
     if not names:
         return {}
 
@@ -282,30 +296,18 @@ def _connect_start_pose(
     builder.Connect(start.GetOutputPort("pose"), camera.GetInputPort("start_pose"))
 
 
-_RESERVED = {
-    *("plant", "pose", "collision", "goal", "policy", "controller", "camera", "video"),
-    *("selector", "velocity_tracker"),
-    *("policy_camera", "policy_camera_start_pose", "delayed_pose"),
-    *("depth_noise", "color_noise", "time_of_flight_grid"),
-    *("flight_visualizer", "camera_visualizer", "spheres_visualizer"),
-    *("state_log", "command_log", "hypotheses_log"),
-}
-"""Names of the other systems of a flight."""
-
-
 def AddSensors(
     builder: DiagramBuilder,
     sensors: dict[str, SensorConfig],
     world: World,
+    scenario: Scenario,
     state: OutputPort,
     pose: OutputPort,
 ) -> dict[str, OutputPort]:
     """Adds sensors under their names; returns their outputs, `p` of the sensor `s` as `s_p`."""
     measured = {}
     for name, config in sensors.items():
-        if name in _RESERVED:
-            raise ValueError(f"a sensor is named {name!r}, as a part of the flight; rename it")
-        sensor = SENSORS.entry_for(config).build(config, world)
+        sensor = SENSORS.entry_for(config).build(config, world, scenario)
         what = f"the result of building the sensor {name!r}"
         require(isinstance(sensor, System), what, "a Drake system", type(sensor).__name__)
         builder.AddNamedSystem(name, sensor)

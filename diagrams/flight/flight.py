@@ -1,6 +1,5 @@
 """Simulation of one flight, and its record."""
 
-import enum
 import json
 import time
 from collections.abc import Callable
@@ -9,21 +8,30 @@ from pathlib import Path
 from typing import cast
 
 import numpy as np
+from pydrake.common import RandomGenerator
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
 from pydrake.systems.framework import Context, Diagram, EventStatus
 from pydrake.systems.primitives import VectorLogSink
 
-from splatpilot.diagrams.flight.blocks import goal_position, policy_images, start_position
+from splatpilot.diagrams.flight.blocks import policy_images
+from splatpilot.diagrams.flight.monitor import (
+    FlightMonitor,
+    Outcome,
+    flight_monitors,
+    goal_position,
+    start_position,
+)
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.common.config import dump_config
-from splatpilot.systems.common.drake import vector_output
 from splatpilot.systems.common.files import written_atomically
 from splatpilot.systems.common.provenance import InfeasibleFlightError
-from splatpilot.systems.messaging.flight_limits import LEVEL
+from splatpilot.systems.common.validation import require
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS, hover_state
 from splatpilot.systems.vehicle.state import QuadrotorState
+
+_ACCURACY = 3e-4  # of the Context: a flight ends within 1e-7 s, less than a micrometer.
 
 
 def sample_initial_state(scenario: Scenario, world: World) -> np.ndarray:
@@ -79,21 +87,6 @@ def _check_free(world: World, what: str, p_WQ: np.ndarray) -> None:
         )
 
 
-_TOUCH = 0.03  # [m] max clearance of a landed vehicle, and
-_TOUCHDOWN_SPEED = 0.8  # [m/s] its max speed.
-
-
-class Outcome(enum.StrEnum):
-    """Result of a flight."""
-
-    GOAL = "goal"
-    COLLISION = "collision"
-    LEFT_VOLUME = "left_volume"
-    TIMEOUT = "timeout"
-    LANDED = "landed"
-    ERROR = "error"
-
-
 @dataclass(frozen=True, eq=False)
 class Flight:
     """Record of a flight; N samples at `LOG_PERIOD` and one at the end."""
@@ -137,16 +130,44 @@ class FlightError(ValueError):
         self.flight = flight
 
 
+class FlightInterrupted(KeyboardInterrupt):
+    """Ctrl-C during a flight; `flight` is the record until then."""
+
+    def __init__(self, flight: Flight) -> None:
+        super().__init__()
+        self.flight = flight
+
+
+def make_flight_simulator(diagram: Diagram, generator: RandomGenerator | None = None) -> Simulator:
+    """Makes a simulator of a diagram with a `FlightMonitor`, as its scenario says.
+
+    The Context is that of SetRandomContext with the generator, by default of the scenario's seed,
+    so that Drake's random sources repeat. Its accuracy lets the flight end at the exact instant.
+
+    Raises:
+        ValueError: if the diagram has no `FlightMonitor`.
+    """
+    scenario = _require_monitors(diagram)[0][1].scenario
+    simulator = Simulator(diagram)
+    ApplySimulatorConfig(scenario.simulator, simulator)
+    root = simulator.get_mutable_context()
+    diagram.SetRandomContext(root, generator or RandomGenerator(scenario.seed))
+    root.SetAccuracy(_ACCURACY)
+    return simulator
+
+
 def fly(
     diagram: Diagram,
-    scenario: Scenario,
-    world: World,
+    *,
+    monitor: Callable[[Context], EventStatus | None] | None = None,
     progress: Callable[[float], object] | None = None,
     realtime_rate: float = 0.0,
 ) -> Flight:
-    """Simulates a diagram made by `BuildFlightDiagram` until the flight ends.
+    """Simulates a diagram with one `FlightMonitor` until the flight ends.
 
     Args:
+        monitor: called with the root Context after each step; may end the flight by
+            ReachedTermination.
         progress: called with the simulated time [s].
         realtime_rate: max simulated over real time; 0 for as fast as possible.
 
@@ -154,55 +175,105 @@ def fly(
         The flight. Its outcome is `ERROR` if a system raised `InfeasibleFlightError` after time 0.
 
     Raises:
+        ValueError: if the diagram has none or several monitors; see `fly_all`.
         FlightError: from any other exception after time 0.
+        FlightInterrupted: after Ctrl-C.
     """
-    simulator = flight_simulator(diagram, scenario, world, progress)
+    count = len(_require_monitors(diagram))
+    require(count == 1, "the number of flights in the diagram", "1", count, "call fly_all")
+    (flight,) = fly_all(
+        diagram, monitor=monitor, progress=progress, realtime_rate=realtime_rate
+    ).values()
+    return flight
+
+
+def fly_all(
+    diagram: Diagram,
+    *,
+    monitor: Callable[[Context], EventStatus | None] | None = None,
+    progress: Callable[[float], object] | None = None,
+    realtime_rate: float = 0.0,
+) -> dict[str, Flight]:
+    """Simulates all flights of a diagram until each has ended, by the name of its monitor.
+
+    A vehicle whose flight has ended flies on until the last one has. Exceptions are those of `fly`
+    and hold the first flight that had not ended.
+    """
+    monitors = {
+        system.get_name(): (parent, system) for parent, system in _require_monitors(diagram)
+    }
+    simulator = make_flight_simulator(diagram)
     simulator.set_target_realtime_rate(realtime_rate)
     root = simulator.get_mutable_context()
-    plant_context = diagram.GetSubsystemByName("plant").GetMyMutableContextFromRoot(root)
-    plant_context.SetContinuousState(sample_initial_state(scenario, world))
+
+    def watch(context: Context) -> EventStatus:
+        if progress is not None:
+            progress(context.get_time())
+        return (monitor and monitor(context)) or EventStatus.DidNothing()
+
+    if progress is not None or monitor is not None:
+        simulator.set_monitor(watch)
+    limit = max(system.scenario.timeout for _, system in monitors.values())
+    flights: dict[str, Flight] = {}
+
+    def record(outcome: Outcome | None = None) -> None:
+        """Records the flights that have ended; with an outcome, all others too."""
+        for name, (parent, system) in monitors.items():
+            if name not in flights:
+                ended = outcome or system.outcome(system.GetMyContextFromRoot(root))
+                if ended is not None:
+                    wall_time = time.perf_counter() - started
+                    prefix = name.removesuffix("monitor")
+                    flights[name] = record_flight(parent, root, ended, wall_time, prefix)
+
     simulator.Initialize()
     started = time.perf_counter()
     try:
-        simulator.AdvanceTo(scenario.timeout)
+        record()
+        for name, flight in flights.items():
+            require(
+                flight.outcome is Outcome.GOAL,
+                name,
+                "in flight at its start",
+                flight.outcome,
+                _START,
+            )
+        while len(flights) < len(monitors):
+            status = simulator.AdvanceTo(limit)
+            record()
+            if not isinstance(status.system(), FlightMonitor):
+                break
+        record(Outcome.INTERRUPTED)
+    except KeyboardInterrupt as error:
+        record(Outcome.INTERRUPTED)
+        raise FlightInterrupted(_first(flights, Outcome.INTERRUPTED)) from error
     except Exception as error:
         if root.get_time() == 0.0 or isinstance(error, MemoryError):
             raise
-        wall_time = time.perf_counter() - started
-        flight = record_flight(diagram, root, world, Outcome.ERROR, wall_time)
-        flight = replace(flight, reason=_reason(error, root.get_time(), flight.states[-1]))
-        if isinstance(error, InfeasibleFlightError):
-            return flight
-        raise FlightError(flight) from error
-    wall_time = time.perf_counter() - started
-
-    p_WG = goal_position(scenario, world)
-    ended = flight_outcome(diagram, root, p_WG, scenario.goal_radius) or Outcome.TIMEOUT
-    return record_flight(diagram, root, world, ended, wall_time)
+        record(Outcome.ERROR)
+        for name, flight in flights.items():
+            if flight.outcome is Outcome.ERROR:
+                reason = _reason(error, root.get_time(), flight.states[-1])
+                flights[name] = replace(flight, reason=reason)
+        if not isinstance(error, InfeasibleFlightError):
+            raise FlightError(_first(flights, Outcome.ERROR)) from error
+    return flights
 
 
-def flight_simulator(
-    diagram: Diagram,
-    scenario: Scenario,
-    world: World,
-    progress: Callable[[float], object] | None = None,
-) -> Simulator:
-    """Makes a simulator of a diagram made by `BuildFlightDiagram` that ends with the flight."""
-    scenario.validate()
-    simulator = Simulator(diagram)
-    ApplySimulatorConfig(scenario.simulator, simulator)
-    p_WG = goal_position(scenario, world)
+_START = "build the plant with sample_initial_state(scenario, world)"
 
-    def monitor(context: Context) -> EventStatus:
-        if progress is not None:
-            progress(context.get_time())
-        outcome = flight_outcome(diagram, context, p_WG, scenario.goal_radius)
-        if outcome is None:
-            return EventStatus.DidNothing()
-        return EventStatus.ReachedTermination(diagram, outcome)
 
-    simulator.set_monitor(monitor)
-    return simulator
+def _first(flights: dict[str, Flight], outcome: Outcome) -> Flight:
+    return next(flight for flight in flights.values() if flight.outcome is outcome)
+
+
+def _require_monitors(diagram: Diagram) -> list[tuple[Diagram, FlightMonitor]]:
+    monitors = flight_monitors(diagram)
+    if not monitors:
+        raise ValueError(
+            "the diagram must have a FlightMonitor to be flown; add one by AddFlightMonitor"
+        )
+    return monitors
 
 
 def decision_times(
@@ -236,68 +307,46 @@ def decision_times(
     return float(render), float(decide)
 
 
-def flight_outcome(
-    diagram: Diagram, context: Context, p_WG: np.ndarray, goal_radius: float
-) -> Outcome | None:
-    """Returns the outcome at this instant; None during the flight."""
-    if vector_output(diagram, "in_collision", context)[0]:
-        return Outcome.COLLISION
-    if vector_output(diagram, "field_state", context)[0] >= FieldState.UNKNOWN:
-        return Outcome.LEFT_VOLUME
-    p_WB = QuadrotorState.of(vector_output(diagram, "state", context)).p_WB
-    if np.linalg.norm(p_WG - p_WB) <= goal_radius:
-        return Outcome.GOAL
-    return None
-
-
-def has_landed(diagram: Diagram, context: Context) -> bool:
-    """Checks if the vehicle touches a level surface, slowly."""
-    v_WB = QuadrotorState.of(vector_output(diagram, "state", context)).v_WB
-    return bool(
-        vector_output(diagram, "clearance", context)[0] < _TOUCH
-        and vector_output(diagram, "gradient", context)[2] > LEVEL
-        and np.linalg.norm(v_WB) < _TOUCHDOWN_SPEED
-    )
-
-
 def record_flight(
-    diagram: Diagram, root: Context, world: World, outcome: Outcome, wall_time: float
+    diagram: Diagram, root: Context, outcome: Outcome, wall_time: float, prefix: str = ""
 ) -> Flight:
-    """Collects the logs of a flight; after an error no port is evaluated, as it may raise again."""
-    logs = {
-        name: cast(VectorLogSink, diagram.GetSubsystemByName(f"{name}_log")).FindLog(root)
-        for name in ("state", "command")
-    }
-    times = logs["state"].sample_times().copy()
-    # Copies, since logs return views of memory of the diagram.
-    states, commands = (log.data().T.copy() for log in logs.values())
-    if root.get_time() > times[-1] and outcome is not Outcome.ERROR:
-        times = np.append(times, root.get_time())
-        states = np.vstack([states, vector_output(diagram, "state", root)])
-        commands = np.vstack([commands, vector_output(diagram, "command", root)])
+    """Collects the logs of a flight, see `AddLogs`, whose names in its diagram have a prefix.
+
+    After an error no port is evaluated, as it may raise again.
+    """
+    is_complete = outcome is not Outcome.ERROR
+
+    def samples(name: str, again: bool = False) -> tuple[np.ndarray, np.ndarray]:
+        """Returns times and rows of a log with those of this instant, if later or `again`."""
+        sink = cast(VectorLogSink, diagram.GetSubsystemByName(f"{prefix}{name}_log"))
+        log = sink.FindLog(root)
+        # Copies, since logs return views of memory of the diagram.
+        times, rows = log.sample_times().copy(), log.data().T.copy()
+        if is_complete and (again or root.get_time() > times[-1]):
+            # Ports of Drake's own systems, once in Python, keep their diagram alive.
+            last = sink.EvalVectorInput(sink.GetMyContextFromRoot(root), 0).CopyToVector()
+            times, rows = np.append(times, root.get_time()), np.vstack([rows, last])
+        return times, rows
+
+    times, states = samples("state")
+    _, commands = samples("command")
+    _, clearances = samples("clearance")
+    plans = np.empty((0, 0))
+    if diagram.HasSubsystemNamed(f"{prefix}hypotheses_log"):
+        # A log samples before the policy updates at the same instant: the last plan is missing.
+        _, plans = samples("hypotheses", again=True)
+        is_new = np.diff(plans[:, 0], prepend=np.nan) != 0
+        plans = plans[is_new & np.isfinite(plans[:, 0])]
+    count = min(map(len, (states, commands, clearances)))  # An error may leave the last ones out.
     return Flight(
         outcome=outcome,
-        times=times,
-        states=states,
-        commands=commands,
-        clearances=world.distances(times, QuadrotorState.of(states).p_WB) - VEHICLE_RADIUS,
-        hypotheses=_recorded_plans(diagram, root, outcome is not Outcome.ERROR),
+        times=times[:count],
+        states=states[:count],
+        commands=commands[:count],
+        clearances=clearances[:count, 0],
+        hypotheses=plans,
         wall_time=wall_time,
     )
-
-
-def _recorded_plans(diagram: Diagram, root: Context, with_last: bool) -> np.ndarray:
-    """Returns all plans (M, size), or (0, 0) without any."""
-    if not diagram.HasOutputPort("hypotheses"):
-        return np.empty((0, 0))
-    sink = cast(VectorLogSink, diagram.GetSubsystemByName("hypotheses_log"))
-    plans = sink.FindLog(root).data().T.copy()
-    # A log samples before the policy updates at the same instant: the last plan is missing.
-    if with_last:
-        last = vector_output(diagram, "hypotheses", root)
-        if last[0] != plans[-1, 0]:
-            plans = np.vstack([plans, last])
-    return plans[np.isfinite(plans[:, 0])]
 
 
 def _reason(error: Exception, time: float, state: np.ndarray) -> str:

@@ -1,29 +1,50 @@
-"""BuildFlightDiagram: the closed loop of vehicle, camera, policy and controller."""
+"""AddFlight and BuildFlightDiagram: the closed loop of vehicle, sensors, policy and controller."""
 
-from typing import cast
+from collections import Counter
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from pydrake.geometry import Meshcat, MeshcatParams
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import Diagram, DiagramBuilder, System
-from pydrake.systems.primitives import LogVectorOutput
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    Diagram,
+    DiagramBuilder,
+    LeafSystem,
+    OutputPort,
+    System,
+)
+from pydrake.systems.primitives import ConstantVectorSource
 from pydrake.systems.sensors import CameraConfig, CameraInfo
 
 from splatpilot.diagrams.flight.blocks import (
+    DECISIONS,
     AddObservation,
     AddPolicyAndController,
+    AddPoseAndCollision,
     AddSensors,
     ConnectObservation,
+    ConnectOrExport,
+    add_system,
     decision_period,
-    goal_position,
+    make_policy,
     onboard_sensors,
+    policy_images,
     require_ports,
-    start_position,
 )
 from splatpilot.diagrams.flight.flight import sample_initial_state
+from splatpilot.diagrams.flight.monitor import (
+    AddFlightMonitor,
+    FlightMonitor,
+    goal_position,
+    start_position,
+)
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.worlds.appearance import randomize_appearance
 from splatpilot.diagrams.worlds.world import World
+from splatpilot.systems.common.drake import connect
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.splats.background import Background, mean_color
 from splatpilot.systems.splats.splat_camera import SplatCamera
@@ -66,8 +87,278 @@ def open_meshcat(scenario: Scenario, world: World) -> Meshcat:
     return meshcat
 
 
-def AddMeshcat(builder: DiagramBuilder, scenario: Scenario, world: World, meshcat: Meshcat) -> None:
-    """Draws the Gaussians and the vehicle; adds visualizers of `plant`, `policy` and `camera`."""
+class FlightParts(NamedTuple):
+    """Systems and ports of a flight, see `AddFlight`."""
+
+    name: str
+    scenario: Scenario
+    world: World
+    plant: System
+    estimator: System | None
+    policy: System
+    controller: System | None
+    collision: System
+    camera: SplatCamera | None
+    monitor: FlightMonitor
+    state: OutputPort  # (13), the true one
+    pose: OutputPort  # the true X_WB
+    goal: OutputPort  # (3) p_WG [m]
+    decision: OutputPort  # `hypotheses` or one of `DECISIONS`
+    command: OutputPort  # (4)
+    observation: dict[str, OutputPort]  # for the policy
+    measured: dict[str, OutputPort]  # by sensors
+
+
+def AddFlight(
+    builder: DiagramBuilder,
+    scenario: Scenario,
+    world: World,
+    *,
+    name: str = "flight",
+    policy: Any = None,
+    plant: System | None = None,
+    controller: System | None = None,
+    estimator: System | None = None,
+    camera: bool = True,
+) -> FlightParts:
+    """Adds the closed loop of one vehicle to a builder.
+
+    Systems: `plant`, `pose`, `collision`, `goal`, `camera`, the sensors under their names, and
+    those of `AddPolicyAndController`, `AddObservation` and `AddFlightMonitor`. Names of a flight
+    that is not named `flight` begin with its name: `two_plant`.
+
+    Systems that are given may be in the builder already, with connected inputs. Open inputs of a
+    given plant or controller are exported, as `plant_wind`.
+
+    Args:
+        name: of the flight.
+        policy: replaces the scenario's: a configuration, a system, or one of `DECISIONS`.
+
+            A system has one of the outputs `hypotheses` (see
+            `splatpilot.systems.policies.hypotheses`), `command` (4: thrust [m/s^2], body rates
+            [rad/s]), `acceleration`, `velocity` and `waypoint` (3 each), and optionally `heading`
+            (1). Its inputs are any of `state` (13), `goal` (3), `depth_image_32f`, `color_image`
+            and `depth_grid` of its own camera (its attribute `camera`, an `OnboardCamera`), and the
+            outputs of sensors.
+
+            A decision, such as "velocity", becomes an exported input of that name.
+        plant: replaces `QuadrotorPlant`: any system with the input `command` (4) and the output
+            `state` (13). It starts as its default Context says, see `sample_initial_state`.
+        controller: replaces `FlatnessController`: any system with the input `state`, that for the
+            policy's output, and the output `command`.
+        estimator: makes the `state` (13) for policy and controller. Its inputs are any of `state`
+            and `body_pose`, the true ones, `command`, `goal`, the policy's images and the outputs
+            of sensors.
+        camera: adds the scenario's camera.
+
+    Raises:
+        InfeasibleFlightError: see `sample_initial_state`.
+        ValueError: for an invalid configuration, a system without the ports it needs, and a name
+            that is taken.
+    """
+    before = builder.GetSystems()
+    prefix = "" if name == "flight" else f"{name}_"
+    is_external = isinstance(policy, str)
+    if is_external:
+        policy = DecisionInput(policy)
+    elif not (policy is None or isinstance(policy, System)):
+        scenario, policy = replace(scenario, policy=policy), None
+    scenario.validate()
+    if scenario.appearance > 0:
+        world = randomize_appearance(world, scenario.appearance, scenario.seed)
+    given = {"plant": plant, "controller": controller}
+
+    # Vehicle.
+    plant = plant or QuadrotorPlant(scenario.vehicle, sample_initial_state(scenario, world))
+    assert plant is not None
+    add_system(builder, "plant", plant)
+    require_ports("plant", plant, inputs=["command"], outputs=["state"])
+    state = plant.GetOutputPort("state")
+    pose, collision = AddPoseAndCollision(builder, world, state)
+    source = ConstantVectorSource(goal_position(scenario, world))
+    goal = builder.AddNamedSystem("goal", source).get_output_port()
+    estimate = state
+    if estimator is not None:
+        add_system(builder, "estimator", estimator)
+        require_ports("estimator", estimator, inputs=[], outputs=["state"])
+        estimate = estimator.GetOutputPort("state")
+
+    # Policy and controller.
+    sensors = onboard_sensors(scenario, policy)
+    policy = policy or make_policy(scenario, world)
+    autonomy = AddPolicyAndController(builder, scenario, estimate, policy, controller)
+    connect(builder, autonomy.command, plant.GetInputPort("command"))
+
+    # Sensors.
+    if is_external:
+        builder.ExportInput(policy.get_input_port(), f"{prefix}{autonomy.target.get_name()}")
+    names = ["color_image", "depth_image_32f"] if is_external else policy_images(policy)
+    images = AddObservation(builder, scenario, world, state, pose, policy, names)
+    measured = AddSensors(builder, sensors, world, scenario, state, pose)
+    observation = {"state": estimate, "goal": goal} | images | measured
+    ConnectObservation(builder, "policy", policy, observation)
+    if estimator is not None:
+        truth = {"state": state, "body_pose": pose, "command": autonomy.command}
+        ConnectObservation(builder, "estimator", estimator, observation | truth)
+    for what, system in given.items():
+        if system is not None:
+            known = observation if what == "controller" else {}
+            ConnectOrExport(builder, system, known, f"{prefix}{what}")
+    onboard = None
+    if camera:
+        onboard = MakeCamera(scenario, world)
+        builder.AddNamedSystem("camera", onboard)
+        builder.Connect(pose, onboard.GetInputPort("body_pose"))
+
+    # End and logs.
+    plans = policy.GetOutputPort("hypotheses") if policy.HasOutputPort("hypotheses") else None
+    monitor = AddFlightMonitor(
+        builder,
+        scenario,
+        world,
+        state,
+        autonomy.command,
+        goal=goal,
+        collision=collision,
+        hypotheses=plans,
+        plan_period=decision_period(scenario, policy),
+    )
+    added = [system for system in builder.GetSystems() if all(system is not old for old in before)]
+    for system in added:
+        system.set_name(f"{prefix}{system.get_name()}")
+    counts = Counter(system.get_name() for system in builder.GetSystems())
+    for system, count in counts.items():
+        require(count == 1, "names of systems", "different", f"{count} of {system!r}", _RENAME)
+    return FlightParts(
+        name,
+        scenario,
+        world,
+        plant,
+        estimator,
+        policy,
+        autonomy.controller,
+        collision,
+        onboard,
+        monitor,
+        state,
+        pose,
+        goal,
+        plans or autonomy.target,
+        autonomy.command,
+        observation,
+        measured,
+    )
+
+
+_RENAME = "rename the sensor, or give AddFlight another name"
+
+
+class DecisionInput(LeafSystem):
+    """Decides as its input says: a policy outside of the diagram.
+
+    The input and the output have the name and size of one of `DECISIONS`.
+    """
+
+    def __init__(self, decision: str) -> None:
+        super().__init__()
+        require(decision in DECISIONS, "policy", f"one of {', '.join(DECISIONS)}", decision)
+        source = self.DeclareVectorInputPort(decision, DECISIONS[decision])
+        self.DeclareVectorOutputPort(
+            decision, source.size(), self._calc, prerequisites_of_calc={source.ticket()}
+        )
+
+    def _calc(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self.EvalVectorInput(context, 0).CopyToVector())
+
+
+def ExportFlight(builder: DiagramBuilder, parts: FlightParts) -> None:
+    """Exports the ports of a flight as `BuildFlightDiagram` names them."""
+    outputs = {"state": parts.state, "command": parts.command}
+    outputs["outcome"] = parts.monitor.get_output_port()
+    for name in ("clearance", "gradient", "in_collision", "field_state"):
+        outputs[name] = parts.collision.GetOutputPort(name)
+    if parts.decision.get_name() == "hypotheses":
+        outputs["hypotheses"] = parts.decision
+    if parts.camera is not None:
+        for name in ("color_image", "depth_image_32f", "depth_image_16u"):
+            outputs[name] = parts.camera.GetOutputPort(name)
+    if parts.estimator is not None:
+        outputs["estimated_state"] = parts.observation["state"]
+    outputs |= {f"observation_{name}": port for name, port in parts.observation.items()}
+    for name, port in (outputs | parts.measured).items():
+        builder.ExportOutput(port, name)
+    ConnectOrExport(builder, parts.plant, {}, "plant")
+
+
+def BuildFlightDiagram(
+    scenario: Scenario,
+    world: World,
+    meshcat: Meshcat | None = None,
+    video: bool = False,
+    camera: bool = True,
+    *,
+    policy: Any = None,
+    plant: System | None = None,
+    controller: System | None = None,
+    estimator: System | None = None,
+) -> Diagram:
+    """Builds the diagram of one flight of `AddFlight`.
+
+    Its default Context is the scenario's start, see `sample_initial_state`.
+
+    .. pydrake_system::
+
+        name: flight
+        output_ports: [state, command, outcome, hypotheses, color_image, depth_image_32f,
+            depth_image_16u, clearance, gradient, in_collision, field_state, estimated_state]
+
+    The port `hypotheses` is of policies that have it, the images are of the scenario's camera. Each
+    output `p` of a sensor `s` is `s_p`, and what the policy can observe as `p` is `observation_p`.
+
+    Args:
+        meshcat: draws the flight; see `open_meshcat`.
+        video: records the camera's images at its rate, for `VideoRecorder.save`.
+        camera: adds the scenario's camera; Meshcat and videos need it, flights do not.
+        policy, plant, controller, estimator: see `AddFlight`.
+
+    Raises:
+        InfeasibleFlightError, ValueError: see `AddFlight`; also for Meshcat or video without the
+            camera, and an algebraic loop.
+    """
+    valid = camera or not (video or meshcat is not None)
+    require(valid, "camera", "True with meshcat or video, which show its images", camera)
+    builder = DiagramBuilder()
+    parts = AddFlight(
+        builder,
+        scenario,
+        world,
+        policy=policy,
+        plant=plant,
+        controller=controller,
+        estimator=estimator,
+        camera=camera,
+    )
+    ExportFlight(builder, parts)
+    if meshcat is not None:
+        AddMeshcat(builder, parts, meshcat)
+    if video and parts.camera is not None:
+        VideoRecorder.AddToBuilder(builder, parts.camera, scenario.camera.fps)
+    try:
+        diagram = builder.Build()
+    except RuntimeError as error:
+        if "algebraic loop" not in str(error):
+            raise
+        raise ValueError(
+            f"the given systems must not depend on their own outputs at the same instant, got "
+            f"{error}; declare the prerequisites of outputs, or hold one in a discrete state"
+        ) from None
+    diagram.set_name("flight")
+    return diagram
+
+
+def AddMeshcat(builder: DiagramBuilder, parts: FlightParts, meshcat: Meshcat) -> None:
+    """Draws the Gaussians and the vehicle; adds visualizers of vehicle, plans and camera."""
+    world = parts.world
     field = world.distance_field
     margin = np.array([5.0, 5.0, 3.0])  # [m] of surroundings
     draw_gaussians(
@@ -79,122 +370,13 @@ def AddMeshcat(builder: DiagramBuilder, scenario: Scenario, world: World, meshca
     )
     draw_vehicle(meshcat, "/splatpilot/vehicle", VEHICLE_RADIUS)
 
-    plant, policy = (builder.GetSubsystemByName(name) for name in ("plant", "policy"))
-    plans = policy.HasOutputPort("hypotheses")
-    FlightVisualizer.AddToBuilder(
-        builder,
-        plant.GetOutputPort("state"),
-        meshcat,
-        policy.GetOutputPort("hypotheses") if plans else None,
-    )
+    plans = parts.decision if parts.decision.get_name() == "hypotheses" else None
+    FlightVisualizer.AddToBuilder(builder, parts.state, meshcat, plans)
     if world.moving:
         MovingSpheresVisualizer.AddToBuilder(builder, world.moving.spheres, meshcat)
-    camera = cast(SplatCamera, builder.GetSubsystemByName("camera"))
-    CameraVisualizer.AddToBuilder(builder, camera, meshcat, period=1 / scenario.camera.fps)
-
-
-LOG_PERIOD = 0.02  # [s]
-
-
-def BuildFlightDiagram(
-    scenario: Scenario,
-    world: World,
-    meshcat: Meshcat | None = None,
-    video: bool = False,
-    camera: bool = True,
-    *,
-    policy: System | None = None,
-    plant: System | None = None,
-    controller: System | None = None,
-) -> Diagram:
-    """Builds the diagram of one flight.
-
-    Its default Context is the scenario's start, see `sample_initial_state`; so is the one of
-    SetRandomContext, since Drake does not let systems in Python sample their states. For random
-    flights see `random_flights`.
-
-    Systems, by name: `plant`, those of `AddPolicyAndController` and `AddObservation`, the sensors
-    under their names, `camera`, and the loggers `state_log`, `command_log` and `hypotheses_log`;
-    with Meshcat also `flight_visualizer` and `camera_visualizer`, with video `video`.
-
-    .. pydrake_system::
-
-        name: flight
-        output_ports: [state, command, hypotheses, color_image, depth_image_32f, depth_image_16u,
-            clearance, gradient, in_collision, field_state]
-
-    The port `hypotheses` is of policies that have it, the images are of the scenario's camera. Each
-    output `p` of a sensor `s` is `s_p`.
-
-    Args:
-        meshcat: draws the flight; see `open_meshcat`.
-        video: records the camera's images at its rate, for `VideoRecorder.save`.
-        camera: adds the scenario's camera; Meshcat and videos need it, flights do not.
-        policy: replaces the scenario's. Any system with one of the outputs `hypotheses`
-            (see `splatpilot.systems.policies.hypotheses`), `acceleration`, `velocity` and
-            `waypoint` (3 each), and optionally `heading` (1). Its inputs are any of `state` (13),
-            `goal` (3), `depth_image_32f`, `color_image` and `depth_grid` of its own camera (its
-            attribute `camera`, an `OnboardCamera`), and the outputs of sensors.
-        plant: replaces `QuadrotorPlant`: any system with the input `command` (4), the output
-            `state` (13), and that state as its continuous state, which `fly` sets to the start.
-        controller: replaces `FlatnessController`: any system with the input `state`, that for the
-            policy's output, and the output `command`.
-
-    Raises:
-        InfeasibleFlightError: see `sample_initial_state`.
-        ValueError: for an invalid configuration, a system without the ports it needs, and Meshcat
-            or video without the camera.
-    """
-    valid = camera or not (video or meshcat is not None)
-    require(valid, "camera", "True with meshcat or video, which show its images", camera)
-    scenario.validate()
-    world = randomize_appearance(world, scenario.appearance, scenario.seed)
-    builder = DiagramBuilder()
-
-    # Vehicle.
-    if plant is None:
-        start = sample_initial_state(scenario, world)
-        plant = cast(System, QuadrotorPlant(scenario.vehicle, start))
-    builder.AddNamedSystem("plant", plant)
-    require_ports("plant", plant, inputs=["command"], outputs=["state"])
-    state = plant.GetOutputPort("state")
-    builder.ExportOutput(state, "state")
-
-    # Policy and controller.
-    sensors = onboard_sensors(scenario, policy)
-    policy, controller, pose, _ = AddPolicyAndController(
-        builder, scenario, world, state, policy, controller
-    )
-    builder.Connect(controller.GetOutputPort("command"), plant.GetInputPort("command"))
-
-    # Sensors.
-    images = AddObservation(builder, scenario, world, state, pose, policy)
-    measured = AddSensors(builder, sensors, world, state, pose)
-    ConnectObservation(builder, {"state": state} | images | measured, policy)
-    for name, port in measured.items():
-        builder.ExportOutput(port, name)
-
-    # Camera, video and Meshcat.
-    if camera:
-        onboard = MakeCamera(scenario, world)
-        builder.AddNamedSystem("camera", onboard)
-        builder.Connect(pose, onboard.GetInputPort("body_pose"))
-        for name in ("color_image", "depth_image_32f", "depth_image_16u"):
-            builder.ExportOutput(onboard.GetOutputPort(name), name)
-        if meshcat is not None:
-            AddMeshcat(builder, scenario, world, meshcat)
-        if video:
-            VideoRecorder.AddToBuilder(builder, onboard, scenario.camera.fps)
-
-    # Logs.
-    logs = [(plant, "state", LOG_PERIOD), (controller, "command", LOG_PERIOD)]
-    if policy.HasOutputPort("hypotheses"):
-        logs.append((policy, "hypotheses", decision_period(scenario, policy)))
-    for system, name, period in logs:
-        LogVectorOutput(system.GetOutputPort(name), builder, period).set_name(f"{name}_log")
-    diagram = builder.Build()
-    diagram.set_name("flight")
-    return diagram
+    assert parts.camera is not None
+    fps = parts.scenario.camera.fps
+    CameraVisualizer.AddToBuilder(builder, parts.camera, meshcat, period=1 / fps)
 
 
 def MakeCamera(scenario: Scenario, world: World) -> SplatCamera:

@@ -11,11 +11,11 @@ import numpy as np
 from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Diagram
 
-from splatpilot.diagrams.flight.blocks import goal_position, start_position
 from splatpilot.diagrams.flight.flight import (
     FLIGHT_FILES,
     Flight,
     FlightError,
+    FlightInterrupted,
     fly,
     sample_initial_state,
     write_flight,
@@ -27,6 +27,7 @@ from splatpilot.diagrams.flight.flight_diagram import (
     camera_mount,
     open_meshcat,
 )
+from splatpilot.diagrams.flight.monitor import flight_monitors, goal_position, start_position
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.worlds.appearance import randomize_appearance
 from splatpilot.diagrams.worlds.world import World
@@ -156,11 +157,13 @@ def run(
     if graphviz is not None:
         with written_atomically(graphviz) as path:
             path.write_text(diagram.GetGraphvizString())
-    failure = None
+    failure = interruption = None
     try:
-        flight = fly_with_bar(diagram, scenario, world, realtime_rate=1.0 if live else 0.0)
+        flight = fly_with_bar(diagram, realtime_rate=1.0 if live else 0.0)
     except FlightError as error:
         flight, failure = error.flight, error
+    except FlightInterrupted as error:
+        flight, interruption = error.flight, error.__cause__
     for name in ("flight.html", "flight.mp4", _TRACEBACK, *FLIGHT_FILES):
         (out / name).unlink(missing_ok=True)
     write_flight(out, scenario, flight)
@@ -182,24 +185,21 @@ def run(
 
     print(format_summary(summary))
     print(f"Wrote {', '.join(written)} in {out}")
+    if interruption is not None:
+        raise interruption
     if live:
         with contextlib.suppress(EOFError):
             input("Press Enter to stop serving Meshcat. ")
     return summary
 
 
-def fly_with_bar(
-    diagram: Diagram, scenario: Scenario, world: World, realtime_rate: float = 0.0
-) -> Flight:
+def fly_with_bar(diagram: Diagram, realtime_rate: float = 0.0) -> Flight:
     """Calls `fly` with a progress bar of simulated time."""
+    limit = flight_monitors(diagram)[0][1].scenario.timeout
     layout = "{desc} {n:.1f} s of at most {total:.0f} s [{elapsed}]"
-    with Progress(total=scenario.timeout, desc="flying", bar_format=layout, leave=False) as bar:
+    with Progress(total=limit, desc="flying", bar_format=layout, leave=False) as bar:
         return fly(
-            diagram,
-            scenario,
-            world,
-            progress=lambda now: bar.update(now - bar.n),
-            realtime_rate=realtime_rate,
+            diagram, progress=lambda now: bar.update(now - bar.n), realtime_rate=realtime_rate
         )
 
 

@@ -2,11 +2,13 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 from pydrake.common import RandomGenerator
 from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import System
 
-from splatpilot.diagrams.flight.flight import flight_simulator
+from splatpilot.diagrams.flight.flight import make_flight_simulator
 from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.worlds.world import World
@@ -15,7 +17,9 @@ from splatpilot.systems.common.seeds import MONTE_CARLO_SEEDS
 
 
 def random_flights(
-    scenario: Scenario, world: World | None = None
+    scenario: Scenario,
+    world: World | None = None,
+    **systems: str | Callable[[Scenario, World], System],
 ) -> Callable[[RandomGenerator], Simulator]:
     """
     Makes simulators of flights with random seeds, and so random starts, observation noise, latency
@@ -26,12 +30,14 @@ def random_flights(
 
         MonteCarloSimulation(random_flights(scenario), clearance, scenario.timeout, 20)
 
-    Seeds are of `MONTE_CARLO_SEEDS`; the default Context of the diagram is the start of its
-    flight. A simulation ends at the goal, at a collision or outside of the volume.
+    Seeds are of `MONTE_CARLO_SEEDS`. The Context is the start of the flight, and a simulation ends
+    with it, see `FlightMonitor`.
 
     Args:
         scenario: of the flights, but for its seed.
         world: of all flights; by default made of each seed, which is slow.
+        systems: arguments of `BuildFlightDiagram` such as `policy="velocity"`; functions of
+            scenario and world make a system for each flight.
 
     Returns:
         The `make_simulator` of these functions, which raises `InfeasibleFlightError` for a world
@@ -41,7 +47,10 @@ def random_flights(
     def make_simulator(generator: RandomGenerator) -> Simulator:
         sample = replace(scenario, seed=MONTE_CARLO_SEEDS[generator() % len(MONTE_CARLO_SEEDS)])
         flown = world or make_world(sample.world, sample.seed)
-        diagram = BuildFlightDiagram(sample, flown, camera=False)
-        return flight_simulator(diagram, sample, flown)
+        made: dict[str, Any] = {
+            name: system if isinstance(system, str) else system(sample, flown)
+            for name, system in systems.items()
+        }
+        return make_flight_simulator(BuildFlightDiagram(sample, flown, camera=False, **made))
 
     return make_simulator

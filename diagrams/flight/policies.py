@@ -30,7 +30,6 @@ from splatpilot.systems.policies.student import (
     StudentDepthConfig,
     StudentRgbConfig,
 )
-from splatpilot.systems.vehicle.quadrotor import QuadrotorParams
 
 
 class PolicyConfig(Protocol):
@@ -56,13 +55,13 @@ class PolicyConfig(Protocol):
 class PolicyEntry:
     """Entry of the registry.
 
-    `build` makes a system, with ports as `BuildFlightDiagram` connects them, of a configuration,
-    the world (for privileged policies) and the vehicle's parameters. `speed_field` is the field of
-    the nominal speed [m/s], such as `lattice.speed`; empty for a fixed speed.
+    `build` makes a system, with ports as `AddFlight` connects them, of a configuration, the world
+    (for privileged policies) and the scenario, with its seed and vehicle. `speed_field` is the
+    field of the nominal speed [m/s], such as `lattice.speed`; empty for a fixed speed.
     """
 
     config: type
-    build: Callable[[Any, World, QuadrotorParams], System]
+    build: Callable[[Any, World, Any], System]
     speed_field: str
 
 
@@ -72,7 +71,7 @@ POLICIES = Registry("policy", "splatpilot.policies", PolicyEntry)
 
 def register_policy(
     config: type,
-    build: Callable[[Any, World, QuadrotorParams], System],
+    build: Callable[[Any, World, Any], System],
     *,
     name: str = "",
     speed_field: str = "speed",
@@ -96,8 +95,8 @@ def register_policy(
 
 register_policy(
     PrivilegedPlannerConfig,
-    lambda config, world, vehicle: PrivilegedPlanner(
-        world.esdf, config, vehicle, world.moving.spheres if world.moving else None
+    lambda config, world, scenario: PrivilegedPlanner(
+        world.esdf, config, scenario.vehicle, world.moving.spheres if world.moving else None
     ),
     name="planner",
     speed_field="lattice.speed",
@@ -114,7 +113,7 @@ for _name, _config, _system in (
     ("student_depth", StudentDepthConfig, Student),
 ):
     register_policy(
-        _config, lambda config, world, vehicle, system=_system: system(config), name=_name
+        _config, lambda config, world, scenario, system=_system: system(config), name=_name
     )
 
 BENCHMARK_POLICIES = "planner", "straight", "reactive", "diffaero", "depthnav", "agile_autonomy"

@@ -28,18 +28,18 @@ class SensorEntry:
     """Entry of the registry."""
 
     config: type  # of its configurations
-    build: Callable[[Any, World], System]
-    """Makes a system of a configuration and the world. Its inputs `body_pose` (X_WB), `state` and
-    `start_pose` (X_WB the configuration's `readout` [s] before) are connected to the vehicle, if
-    any. An output `p` of the sensor `s` is the output `s_p` of the flight, and the input of that
-    name of the policy."""
+    build: Callable[[Any, World, Any], System]
+    """Makes a system of a configuration, the world and the scenario, with its seed. Its inputs
+    `body_pose` (X_WB), `state` and `start_pose` (X_WB the configuration's `readout` [s] before) are
+    connected to the vehicle, if any. An output `p` of the sensor `s` is the output `s_p` of the
+    flight, and the input of that name of the policy."""
 
 
 SENSORS = Registry("sensor", "splatpilot.sensors", SensorEntry)
 """All sensors, by the names of their configurations' types."""
 
 
-def register_sensor(config: type, build: Callable[[Any, World], System]) -> None:
+def register_sensor(config: type, build: Callable[[Any, World, Any], System]) -> None:
     """Registers a sensor.
 
     Args:
@@ -69,4 +69,4 @@ def make_camera(config: OnboardCamera, world: World, latency: float = 0.0) -> Sp
     )
 
 
-register_sensor(OnboardCamera, make_camera)
+register_sensor(OnboardCamera, lambda config, world, scenario: make_camera(config, world))

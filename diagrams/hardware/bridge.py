@@ -12,10 +12,16 @@ import numpy as np
 from lcm import LCM
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, System
+from pydrake.systems.primitives import ConstantVectorSource
 from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
 from splatpilot.diagrams.flight import blocks
-from splatpilot.diagrams.flight.flight import Outcome, flight_outcome, has_landed
+from splatpilot.diagrams.flight.monitor import (
+    Outcome,
+    flight_outcome,
+    goal_position,
+    has_landed,
+)
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.hardware.real_time import MessagePorts, run_in_real_time
 from splatpilot.diagrams.worlds.world import World
@@ -113,8 +119,10 @@ def BuildHardwareDiagram(
         policy.GetOutputPort(name) if policy.HasOutputPort(name) else None
         for name in ("decided", "failed", "heading", "hypotheses")
     )
+    _, collision = blocks.AddPoseAndCollision(builder, world, state)
+    blocks.ExportCollision(builder, collision)
     autonomy = blocks.AddPolicyAndController(
-        builder, scenario, world, state, policy, controller, guarded=True
+        builder, scenario, state, policy, controller, guarded=True
     )
 
     # Images.
@@ -139,13 +147,14 @@ def BuildHardwareDiagram(
     builder.ExportInput(status.GetInputPort("overruns"), "overruns")
     observation_age = status.GetOutputPort("observation_age")
     age = observation_age if images else state_age
-    blocks.ConnectObservation(builder, observed | {"observation_age": age}, autonomy.policy)
+    goal = ports.add("goal", ConstantVectorSource(goal_position(scenario, world)))
+    others = {"observation_age": age, "goal": goal.get_output_port()}
+    blocks.ConnectObservation(builder, "policy", autonomy.policy, observed | others)
 
     # Failsafe.
     target = {autonomy.target.get_name(): autonomy.target}
     setpoint = VelocitySetpoint(scenario.controller)
     ports.add("velocity_setpoint", setpoint, state=state, heading=heading, **target)
-    collision = builder.GetSubsystemByName("collision")
     vehicle_status = ports.subscribe(codecs.VehicleStatusCodec())
     body = ports.subscribe(codecs.MotionCaptureCodec(config.body)) if config.body else None
     field = world.distance_field
@@ -158,7 +167,7 @@ def BuildHardwareDiagram(
         state_age=state_age,
         observation_age=observation_age,
         velocity_setpoint=setpoint.GetOutputPort("velocity_setpoint"),
-        command=autonomy.controller.GetOutputPort("command"),
+        command=autonomy.command,
         clearance=collision.GetOutputPort("clearance"),
         gradient=collision.GetOutputPort("gradient"),
         vehicle_status=vehicle_status.GetOutputPort("vehicle_status"),
@@ -181,6 +190,7 @@ def BuildHardwareDiagram(
     if plans is not None:
         codec = codecs.HypothesesCodec(num_hypotheses_in(plans.size()))
         ports.publish(codec, plans, period, decided=decided)
+        builder.ExportOutput(plans, "hypotheses")
 
     for name, port in observed.items():
         builder.ExportOutput(port, name)
@@ -236,7 +246,7 @@ def run(
         wait_for_messages(diagram, config.patience)
         simulator = Simulator(diagram)
         root = simulator.get_context()
-        p_WG = blocks.goal_position(scenario, world)
+        p_WG = goal_position(scenario, world)
         flight = BridgeFlight(diagram, root, scenario, p_WG, config)
         # Waits again, so that policies update just after images of the same rate.
         ready = functools.partial(wait_for_messages, diagram, config.patience)

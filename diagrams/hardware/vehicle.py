@@ -13,22 +13,24 @@ from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort
 
 from splatpilot.diagrams.flight import blocks
 from splatpilot.diagrams.flight.flight import (
-    Outcome,
-    flight_outcome,
-    has_landed,
     record_flight,
     sample_initial_state,
     write_flight,
     write_summary,
 )
-from splatpilot.diagrams.flight.flight_diagram import LOG_PERIOD
+from splatpilot.diagrams.flight.monitor import (
+    AddLogs,
+    Outcome,
+    flight_outcome,
+    goal_position,
+    has_landed,
+)
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.hardware.bridge import HardwareConfig, image_codecs, require_messages_for
 from splatpilot.diagrams.hardware.real_time import MessagePorts, run_in_real_time
 from splatpilot.diagrams.worlds.appearance import randomize_appearance
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import make_world
-from splatpilot.systems.collision.esdf_collision import EsdfCollision
 from splatpilot.systems.common.drake import vector_output
 from splatpilot.systems.common.files import locks_folder, require_writable_folder
 from splatpilot.systems.messaging import codecs
@@ -38,7 +40,6 @@ from splatpilot.systems.messaging.lcm_ports import open_lcm
 from splatpilot.systems.policies.velocity import VelocityTracker
 from splatpilot.systems.vehicle.flatness import FlatnessController
 from splatpilot.systems.vehicle.quadrotor import QuadrotorPlant
-from splatpilot.systems.vehicle.state import StateToPose
 
 SILENCE = 0.1
 """[s] without commands after which the vehicle holds its position, until they come again."""
@@ -71,8 +72,7 @@ def BuildVehicleDiagram(
     # Vehicle.
     plant = builder.AddNamedSystem("plant", QuadrotorPlant(scenario.vehicle))
     state = plant.GetOutputPort("state")
-    pose = ports.add("pose", StateToPose(), state=state).GetOutputPort("pose")
-    collision = ports.add("collision", EsdfCollision(world.distance_field), state=state)
+    pose, collision = blocks.AddPoseAndCollision(builder, world, state)
 
     # Commands, by a failsafe that knows no map and limits speed as MPC_XY_VEL_MAX of PX4.
     by_velocity = config.setpoints == "velocity"
@@ -114,16 +114,17 @@ def BuildVehicleDiagram(
 
     # Images, whose size and rate are the policy's.
     policy = blocks.make_policy(scenario, world)
-    images = blocks.AddObservation(builder, scenario, world, state, pose, policy)
+    images = blocks.AddObservation(
+        builder, scenario, world, state, pose, policy, blocks.policy_images(policy)
+    )
     for codec in image_codecs(scenario, policy):
         ports.publish(codec, images[codec.port], blocks.decision_period(scenario, policy))
 
-    for name, port in (("state", state), ("command", held)):
-        primitives.LogVectorOutput(port, builder, LOG_PERIOD).set_name(f"{name}_log")
+    logged = {"state": state, "command": held, "clearance": collision.GetOutputPort("clearance")}
+    AddLogs(builder, logged)
+    for name, port in {"state": state, "command": held, "command_age": command_age}.items():
         builder.ExportOutput(port, name)
-    builder.ExportOutput(command_age, "command_age")
-    for name in ("clearance", "gradient", "in_collision", "field_state"):
-        builder.ExportOutput(collision.GetOutputPort(name), name)
+    blocks.ExportCollision(builder, collision)
     diagram = builder.Build()
     diagram.set_name("vehicle")
     return diagram
@@ -163,7 +164,7 @@ def run(*, scenario: Scenario, config: HardwareConfig, out: Path) -> dict[str, f
     root = simulator.get_mutable_context()
     plant = diagram.GetSubsystemByName("plant").GetMyMutableContextFromRoot(root)
     plant.SetContinuousState(start)
-    p_WG = blocks.goal_position(scenario, world)
+    p_WG = goal_position(scenario, world)
     took_off = math.inf
 
     def outcome() -> Outcome | None:
@@ -189,7 +190,7 @@ def run(*, scenario: Scenario, config: HardwareConfig, out: Path) -> dict[str, f
     wall_time = time.monotonic() - started
     diagram.ForcedPublish(root)  # The bridge needs the last state too.
     ended = outcome() or Outcome.TIMEOUT
-    flight = record_flight(diagram, root, world, ended, wall_time)
+    flight = record_flight(diagram, root, ended, wall_time)
     rows = flight.times >= took_off
     flight = dataclasses.replace(
         flight,

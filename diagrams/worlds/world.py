@@ -46,13 +46,6 @@ class World:
             return self.distance_field
         return self.moving.spheres.among(self.distance_field, time)
 
-    def distances(self, times: NDArray, p_WQ: NDArray) -> NDArray[np.float64]:
-        """Computes distances (N,) [m] of points p_WQ (N, 3) [m], each at its time, (N,) [s]."""
-        if self.moving is None:
-            return self.distance_field.distance(p_WQ)
-        rows = zip(times, p_WQ, strict=True)
-        return np.array([self.field_at(time).distance(p) for time, p in rows])
-
     @cached_property
     def baked(self) -> BakedScene:
         """The Gaussians as cameras render them."""

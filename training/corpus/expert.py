@@ -116,7 +116,7 @@ def fly_policy(
     policy = policy_named(config.policy, config.speed)
     scenario = Scenario(start=p_WS.tolist(), start_radius=0.0, policy=policy)
     scenario.validate()
-    flight = fly(BuildFlightDiagram(scenario, world, camera=False), scenario, world)
+    flight = fly(BuildFlightDiagram(scenario, world, camera=False))
     times = np.arange(0.0, flight.times[-1], config.period)
     return ExpertFlight(
         flight.outcome,

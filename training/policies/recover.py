@@ -130,7 +130,7 @@ def _fly_world(name: str, config: CorpusConfig, work: tuple[WorldRecord, list[Ta
             policy=policy,
         )
         try:
-            flight = fly(BuildFlightDiagram(scenario, world, camera=False), scenario, world)
+            flight = fly(BuildFlightDiagram(scenario, world, camera=False))
         except InfeasibleFlightError:
             continue
         parts = np.array(task.goal), flight.times, flight.states, flight.clearances

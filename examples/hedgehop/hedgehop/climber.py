@@ -83,4 +83,4 @@ class Climber(LeafSystem):
         discrete_state.set_value(2.0 * (v_desired - v_WB))
 
 
-register_policy(ClimberConfig, lambda config, world, vehicle: Climber(config))
+register_policy(ClimberConfig, lambda config, world, scenario: Climber(config))

@@ -7,7 +7,7 @@ from pydrake.common.value import Value
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
-from splatpilot import Config, World, bounded, register_sensor
+from splatpilot import Config, Scenario, World, bounded, register_sensor
 from splatpilot.systems.collision.distance_field import DistanceField
 from splatpilot.systems.common.validation import require_field
 
@@ -69,7 +69,7 @@ class Rangefinder(LeafSystem):
         output.SetAtIndex(0, cast_ray(self._field, X_WB.translation(), e_W, self._far))
 
 
-def _build(config: RangefinderConfig, world: World) -> Rangefinder:
+def _build(config: RangefinderConfig, world: World, scenario: Scenario) -> Rangefinder:
     return Rangefinder(config, world.distance_field)
 
 

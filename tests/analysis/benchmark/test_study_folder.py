@@ -189,7 +189,7 @@ class StrayingConfig:
         pass
 
 
-splatpilot.register_policy(StrayingConfig, lambda config, world, vehicle: Straying())
+splatpilot.register_policy(StrayingConfig, lambda config, world, scenario: Straying())
 """
 
 

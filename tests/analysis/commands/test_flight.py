@@ -142,6 +142,18 @@ def test_an_exception_in_flight_leaves_page_and_trajectory(
     assert (out / "traceback.txt").exists() is written
 
 
+def test_ctrl_c_leaves_page_and_trajectory(tmp_path, monkeypatch):
+    def interrupt(policy, context, discrete_state):
+        if context.get_time() > 0.3:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(Straight, "_update", interrupt)
+    out = tmp_path / "flight"
+    assert main(["fly", "--policy", "straight", "--out", str(out), *SHORT]) == 130
+    assert json.loads((out / "summary.json").read_text())["outcome"] == "interrupted"
+    assert (out / "flight.html").stat().st_size > 1e4
+
+
 @pytest.mark.skipif("SPLATPILOT_DATA" not in os.environ, reason="SPLATPILOT_DATA is not set")
 def test_flight_through_a_real_capture(tmp_path):
     capture = Path(os.environ["SPLATPILOT_DATA"]) / "tartanair" / "hospital"

@@ -23,7 +23,7 @@ def states(world, **noise) -> np.ndarray:
     scenario = Scenario(
         timeout=1.5, policy=policy_named("reactive"), observation=ObservationNoise(**noise)
     )
-    return fly(BuildFlightDiagram(scenario, world, camera=False), scenario, world).states
+    return fly(BuildFlightDiagram(scenario, world, camera=False)).states
 
 
 def test_noise_and_latency_reach_the_policy_and_repeat(post_world):

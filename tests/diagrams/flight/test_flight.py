@@ -15,11 +15,11 @@ from pydrake.systems.framework import LeafSystem
 from splatpilot.diagrams.flight.flight import (
     FlightError,
     Outcome,
-    flight_outcome,
     fly,
     sample_initial_state,
 )
 from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
+from splatpilot.diagrams.flight.monitor import flight_outcome
 from splatpilot.diagrams.flight.policies import policy_named
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.worlds.world_registry import make_world
@@ -32,9 +32,7 @@ from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS, hover_state
 def test_flies_round_the_post_to_the_goal(post_world):
     scenario = Scenario(timeout=20.0)
     seen = []
-    flight = fly(
-        BuildFlightDiagram(scenario, post_world), scenario, post_world, progress=seen.append
-    )
+    flight = fly(BuildFlightDiagram(scenario, post_world), progress=seen.append)
     assert flight.outcome == Outcome.GOAL
     assert np.linalg.norm(flight.states[-1, :3] - post_world.p_WG) <= scenario.goal_radius
     post_distance = np.linalg.norm(flight.states[:, :2] - [5.0, 0.0], axis=1) - 0.5
@@ -56,7 +54,7 @@ def test_flies_round_the_post_to_the_goal(post_world):
 
 def test_plans_are_recorded_as_flown(post_world):
     scenario = Scenario(timeout=1.0)
-    flight = fly(BuildFlightDiagram(scenario, post_world), scenario, post_world)
+    flight = fly(BuildFlightDiagram(scenario, post_world))
     num_hypotheses = scenario.policy.lattice.num_hypotheses
     plans = [Hypotheses.from_vector(row, num_hypotheses) for row in flight.hypotheses]
     times = [plan.plan_time for plan in plans if plan is not None]
@@ -87,7 +85,7 @@ def test_an_exception_in_flight_keeps_the_record(post_world):
     diagram = BuildFlightDiagram(scenario, post_world, policy=Failing(KeyError("depth")))
     message = r"at t = 0.5\d* s, p_WB = \[.*KeyError: 'depth'"
     with pytest.raises(FlightError, match=message) as raised:
-        fly(diagram, scenario, post_world)
+        fly(diagram)
     flight = raised.value.flight
     assert flight.outcome == Outcome.ERROR
     assert isinstance(raised.value.__cause__, KeyError)
@@ -100,7 +98,7 @@ def test_a_flight_that_becomes_infeasible_ends_with_an_error(post_world):
     scenario = Scenario(timeout=5.0)
     error = InfeasibleFlightError("no route leads to the goal")
     diagram = BuildFlightDiagram(scenario, post_world, policy=Failing(error))
-    flight = fly(diagram, scenario, post_world)
+    flight = fly(diagram)
     assert flight.outcome == Outcome.ERROR
     assert flight.reason.endswith("m/s: no route leads to the goal")
 
@@ -132,7 +130,7 @@ def test_collision_ends_the_flight(post_world):
     )
     world = dataclasses.replace(post_world, esdf=empty)
     scenario = Scenario(start_radius=0.0)
-    flight = fly(BuildFlightDiagram(scenario, world), scenario, world)
+    flight = fly(BuildFlightDiagram(scenario, world))
     assert flight.outcome == Outcome.COLLISION
     assert -0.1 < flight.clearances[-1] < 0
     assert flight.clearances[:-1].min() >= 0
@@ -140,7 +138,7 @@ def test_collision_ends_the_flight(post_world):
 
 def test_timeout_ends_the_flight(post_world):
     scenario = Scenario(timeout=0.5)
-    flight = fly(BuildFlightDiagram(scenario, post_world), scenario, post_world)
+    flight = fly(BuildFlightDiagram(scenario, post_world))
     assert flight.outcome == Outcome.TIMEOUT
     assert flight.times[-1] == pytest.approx(0.5)
 
@@ -183,7 +181,7 @@ def test_same_seed_flies_bitwise_identically_in_two_processes():
         "from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram;"
         "from splatpilot.diagrams.worlds.world_registry import make_world;"
         "s = Scenario(seed=3, timeout=3.0); w = make_world(s.world, s.seed);"
-        "f = fly(BuildFlightDiagram(s, w, video=True), s, w);"
+        "f = fly(BuildFlightDiagram(s, w, video=True));"
         "print(len(f.times), *(hashlib.sha256(a.tobytes()).hexdigest()"
         " for a in (f.times, f.states, f.commands, f.clearances, f.hypotheses)))"
     )
@@ -211,7 +209,7 @@ def test_flight_path_does_not_import_torch():
 def test_forests_are_flown_through_at_nominal_speed(seed):
     scenario = Scenario(seed=seed)
     world = make_world(scenario.world, scenario.seed)
-    flight = fly(BuildFlightDiagram(scenario, world), scenario, world)
+    flight = fly(BuildFlightDiagram(scenario, world))
     assert flight.outcome == Outcome.GOAL
     assert np.nanmin(flight.clearances) > 0
     summary: dict[str, Any] = flight.summary()
@@ -223,7 +221,7 @@ def test_flown_diagrams_are_freed(name, post_world):
     noise = ObservationNoise(depth_additive=0.01, latency=0.02)
     scenario = Scenario(timeout=0.2, policy=policy_named(name), observation=noise)
     diagram = BuildFlightDiagram(scenario, post_world)
-    fly(diagram, scenario, post_world)
+    fly(diagram)
     references = [weakref.ref(system) for system in (diagram, *diagram.GetSystems())]
     assert references[0]() is diagram
     del diagram

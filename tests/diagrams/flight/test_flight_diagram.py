@@ -4,11 +4,19 @@ import dataclasses
 
 import numpy as np
 import pytest
-from pydrake.systems.framework import LeafSystem
+from gymnasium.spaces import Box
+from pydrake.gym import DrakeGymEnv
+from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantVectorSource
 
-from splatpilot.diagrams.flight.flight import Outcome, fly
-from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
+from splatpilot.diagrams.flight.flight import (
+    Outcome,
+    fly,
+    make_flight_simulator,
+    sample_initial_state,
+)
+from splatpilot.diagrams.flight.flight_diagram import AddFlight, BuildFlightDiagram
+from splatpilot.diagrams.flight.monte_carlo import random_flights
 from splatpilot.diagrams.flight.policies import POLICIES, policy_named
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.flight.sensors import SENSORS
@@ -17,11 +25,11 @@ from splatpilot.systems.common.config import dump_config, load_config, parse_con
 from splatpilot.systems.policies.reactive import Reactive
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.vehicle.flatness import FlatnessController
-from splatpilot.systems.vehicle.quadrotor import QuadrotorPlant
+from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS, QuadrotorPlant
 
 
 def flown(scenario: Scenario, world, **systems):
-    return fly(BuildFlightDiagram(scenario, world, camera=False, **systems), scenario, world)
+    return fly(BuildFlightDiagram(scenario, world, camera=False, **systems))
 
 
 def test_finished_systems_fly_as_configured_ones(post_world):
@@ -31,7 +39,7 @@ def test_finished_systems_fly_as_configured_ones(post_world):
         scenario,
         post_world,
         policy=Reactive(scenario.policy),
-        plant=QuadrotorPlant(scenario.vehicle),
+        plant=QuadrotorPlant(scenario.vehicle, sample_initial_state(scenario, post_world)),
         controller=FlatnessController(scenario.controller, scenario.vehicle),
     )
     np.testing.assert_array_equal(given.states, configured.states)
@@ -133,9 +141,6 @@ def test_scenarios_out_of_range_are_refused(post_world):
     ):
         with pytest.raises(ValueError, match=message):
             BuildFlightDiagram(Scenario(**wrong), post_world, camera=False)
-    diagram = BuildFlightDiagram(Scenario(), post_world, camera=False)
-    with pytest.raises(ValueError, match=r"timeout .* got -1"):
-        fly(diagram, Scenario(timeout=-1.0), post_world)
 
 
 @pytest.mark.parametrize(
@@ -196,12 +201,160 @@ def test_sensors_of_a_scenario_are_on_board(post_world):
     diagram = BuildFlightDiagram(scenario, post_world, camera=False)
     image = diagram.GetOutputPort("down_depth_image_32f").Eval(diagram.CreateDefaultContext())
     assert image.data.shape == (6, 10, 1)
-    with_sensor = fly(diagram, scenario, post_world)
+    with_sensor = fly(diagram)
     np.testing.assert_array_equal(
         with_sensor.states, flown(Scenario(timeout=1.0), post_world).states
     )
 
 
 def test_sensor_named_as_a_part_of_the_flight_is_refused(post_world):
-    with pytest.raises(ValueError, match=r"a sensor is named 'plant'"):
+    with pytest.raises(ValueError, match=r"different, got 2 of 'plant'; rename"):
         flown(Scenario(sensors={"plant": OnboardCamera()}), post_world)
+
+
+class Biased(LeafSystem):
+    """Estimates the state with an offset of the position."""
+
+    def __init__(self, offset, size=13):
+        super().__init__()
+        self._offset = np.r_[offset, np.zeros(10)]
+        self.DeclareVectorInputPort("state", size)
+        self.DeclareVectorOutputPort("state", 13, self._calc)
+
+    def _calc(self, context, output):
+        output.SetFromVector(self.EvalVectorInput(context, 0).CopyToVector() + self._offset)
+
+
+def test_policy_and_controller_get_the_estimate_and_the_rest_the_truth(post_world):
+    scenario = Scenario(
+        start=[1.0, 0, 2], start_radius=0.0, goal=[3.0, 0, 2], policy=policy_named("straight", 1.0)
+    )
+    diagram = BuildFlightDiagram(
+        scenario, post_world, camera=False, estimator=Biased([0.0, 0.3, 0.0])
+    )
+    context = diagram.CreateDefaultContext()
+    for name, y in (("state", 0.0), ("estimated_state", 0.3), ("observation_state", 0.3)):
+        assert diagram.GetOutputPort(name).Eval(context)[1] == y
+    clearance = diagram.GetOutputPort("clearance").Eval(context)[0]
+    truth = BuildFlightDiagram(scenario, post_world, camera=False)
+    exact = truth.GetOutputPort("clearance").Eval(truth.CreateDefaultContext())
+    assert clearance == exact[0]
+    flight = fly(diagram)
+    # It flies where it believes to be on the line.
+    assert flight.states[-1, 1] == pytest.approx(-0.3, abs=0.05)
+    np.testing.assert_allclose(flight.clearances[-1], clearance_of(post_world, flight), atol=1e-12)
+
+
+def clearance_of(world, flight) -> float:
+    return float(world.distance_field.distance(flight.states[-1, :3])) - VEHICLE_RADIUS
+
+
+@pytest.mark.parametrize("decision", ["velocity", "acceleration", "waypoint", "command"])
+def test_a_decision_can_be_an_input_of_the_diagram(post_world, decision):
+    diagram = BuildFlightDiagram(Scenario(), post_world, camera=False, policy=decision)
+    assert [diagram.get_input_port(0).get_name()] == [decision]
+    value = {"command": [9.81, 0, 0, 0], "waypoint": [2.0, 0, 2.0]}.get(decision, [0.5, 0.0, 0.0])
+    simulator = make_flight_simulator(diagram)
+    root = simulator.get_mutable_context()
+    diagram.get_input_port(0).FixValue(root, value)
+    simulator.AdvanceTo(0.5)
+    state = diagram.GetOutputPort("observation_state").Eval(root)
+    assert (state[0] > 1.02) == (decision != "command")
+    image = diagram.GetOutputPort("observation_depth_image_32f").Eval(root)
+    assert np.isfinite(image.data).any()
+
+
+def test_drakes_environment_acts_through_the_decision(post_world):
+    scenario = Scenario(timeout=1.0)
+    env = DrakeGymEnv(
+        random_flights(scenario, post_world, policy="velocity"),
+        time_step=0.1,
+        action_space=Box(-1.0, 1.0, (3,)),
+        observation_space=Box(-np.inf, np.inf, (13,)),
+        reward=lambda system, context: 0.0,
+        action_port_id="velocity",
+        observation_port_id="observation_state",
+    )
+    env.reset(seed=1)
+    for _ in range(20):
+        observation, _, terminated, _, _ = env.step(np.array([1.0, 0.0, 0.0]))
+        if terminated:
+            break
+    assert terminated and observation[0] > 1.4
+
+
+def test_inputs_of_given_systems_are_connected_or_exported(post_world):
+    class Windy(QuadrotorPlant):
+        def __init__(self, *arguments):
+            super().__init__(*arguments)
+            self.DeclareVectorInputPort("gust", 3)
+
+    scenario = Scenario()
+    start = sample_initial_state(scenario, post_world)
+    diagram = BuildFlightDiagram(
+        scenario, post_world, camera=False, plant=Windy(scenario.vehicle, start)
+    )
+    assert diagram.HasInputPort("plant_gust")
+
+    builder = DiagramBuilder()
+    plant = builder.AddNamedSystem("mine", Windy(scenario.vehicle, start))
+    gust = builder.AddSystem(ConstantVectorSource(np.ones(3)))
+    builder.Connect(gust.get_output_port(), plant.GetInputPort("gust"))
+    AddFlight(builder, scenario, post_world, plant=plant, camera=False)
+    assert not builder.Build().HasInputPort("plant_gust")
+
+
+def test_a_controller_may_also_read_what_the_policy_reads(post_world):
+    class ToGoal(LeafSystem):
+        def __init__(self):
+            super().__init__()
+            for name, size in (("state", 13), ("acceleration", 3), ("goal", 3)):
+                self.DeclareVectorInputPort(name, size)
+            self.DeclareVectorOutputPort("command", 4, self._calc)
+
+        def _calc(self, context, output):
+            output.SetFromVector([9.81 + self.GetInputPort("goal").Eval(context)[2], 0, 0, 0])
+
+    class Rest(LeafSystem):
+        def __init__(self):
+            super().__init__()
+            self.DeclareVectorOutputPort("acceleration", 3, lambda _, y: y.SetFromVector([0] * 3))
+
+    diagram = BuildFlightDiagram(
+        Scenario(), post_world, camera=False, policy=Rest(), controller=ToGoal()
+    )
+    assert diagram.num_input_ports() == 0
+    command = diagram.GetOutputPort("command").Eval(diagram.CreateDefaultContext())
+    assert command[0] == pytest.approx(9.81 + post_world.p_WG[2])
+
+
+@pytest.mark.parametrize(
+    ("systems", "message"),
+    [
+        ({"policy": "speed"}, "policy must be one of command, .*, got speed"),
+        ({"policy": "command", "controller": FlatnessController()}, "other than command"),
+        ({"estimator": Biased([0, 0, 0], size=12)}, r"'state' of Biased \(a vector of 12\) must"),
+    ],
+)
+def test_systems_that_do_not_fit_are_named(post_world, systems, message):
+    with pytest.raises(ValueError, match=message):
+        BuildFlightDiagram(Scenario(), post_world, camera=False, **systems)
+
+
+def test_an_algebraic_loop_is_named(post_world):
+    class Hasty(LeafSystem):
+        def __init__(self):
+            super().__init__()
+            self.DeclareVectorInputPort("state", 13)
+            self.DeclareVectorOutputPort("command", 4, lambda context, output: None)
+
+    class FromCommand(LeafSystem):
+        def __init__(self):
+            super().__init__()
+            self.DeclareVectorInputPort("command", 4)
+            self.DeclareVectorOutputPort("state", 13, lambda context, output: None)
+
+    with pytest.raises(ValueError, match="must not depend on their own outputs at the same"):
+        BuildFlightDiagram(
+            Scenario(), post_world, camera=False, policy=Hasty(), estimator=FromCommand()
+        )

@@ -26,7 +26,7 @@ def test_default_context_is_the_start_of_the_scenario(post_world):
     converted = plant.CreateDefaultContext().get_continuous_state_vector().CopyToVector()
     np.testing.assert_array_equal([x.value() for x in converted], start)
 
-    flight = fly(diagram, scenario, post_world)
+    flight = fly(diagram)
     simulator = random_flights(scenario, post_world)(lambda: 3)
     simulator.AdvanceTo(scenario.timeout)
     ended = simulator.get_system().GetOutputPort("state").Eval(simulator.get_context())

@@ -50,7 +50,7 @@ def test_a_sphere_hits_at_its_time(post_world):
     scenario = hovering()
     for aside, outcome in ((0.0, Outcome.COLLISION), (2.5, Outcome.TIMEOUT)):
         world = with_sphere(post_world, falling(1.0, aside, 3.0))
-        flight = fly(BuildFlightDiagram(scenario, world, camera=False), scenario, world)
+        flight = fly(BuildFlightDiagram(scenario, world, camera=False))
         assert flight.outcome == outcome
         if not aside:
             assert flight.times[-1] == pytest.approx(hit_at, abs=0.045)
@@ -68,8 +68,8 @@ def test_flights_are_bitwise_identical(post_world, policy):
     scenario = Scenario(timeout=2.0, policy=policy_named(policy))
     world = with_sphere(post_world, falling(3.0, 0.6, 2.0))
     diagram = BuildFlightDiagram(scenario, world, camera=False)
-    first, again = fly(diagram, scenario, world), fly(diagram, scenario, world)
-    other = fly(BuildFlightDiagram(scenario, world, camera=False), scenario, world)
+    first, again = fly(diagram), fly(diagram)
+    other = fly(BuildFlightDiagram(scenario, world, camera=False))
     for flight in (again, other):
         for name in ("times", "states", "commands", "clearances", "hypotheses"):
             np.testing.assert_array_equal(getattr(flight, name), getattr(first, name))
@@ -97,23 +97,24 @@ def test_the_camera_of_a_flight_sees_the_sphere_come(post_world):
 
 def test_the_planner_keeps_clear_of_a_sphere(post_world):
     scenario = Scenario(timeout=15.0)
-    blind = fly(BuildFlightDiagram(scenario, post_world, camera=False), scenario, post_world)
+    blind = fly(BuildFlightDiagram(scenario, post_world, camera=False))
     in_the_way = blind.states[np.argmax(blind.states[:, 0] > 2.8), :3]
     world = with_sphere(post_world, in_the_way[None])
-    flight = fly(BuildFlightDiagram(scenario, world, camera=False), scenario, world)
+    flight = fly(BuildFlightDiagram(scenario, world, camera=False))
     assert flight.outcome == Outcome.GOAL and flight.clearances.min() > 0
 
 
 def test_the_planner_looks_ahead(post_world):
     scenario = Scenario(timeout=15.0)
-    blind = fly(BuildFlightDiagram(scenario, post_world, camera=False), scenario, post_world)
+    blind = fly(BuildFlightDiagram(scenario, post_world, camera=False))
     meeting = np.argmax(blind.states[:, 0] > 3.0)
     way = 4.0 * (0.02 * np.arange(600) - blind.times[meeting])
     path = blind.states[meeting, :3] + np.column_stack([0 * way, way, 0 * way])
     world = with_sphere(post_world, path)
-    hit = world.distances(blind.times, blind.states[:, :3]) - VEHICLE_RADIUS
+    rows = zip(blind.times, blind.states[:, :3], strict=True)
+    hit = np.array([world.field_at(time).distance(p) for time, p in rows]) - VEHICLE_RADIUS
     assert hit.min() < -0.4
-    flight = fly(BuildFlightDiagram(scenario, world, camera=False), scenario, world)
+    flight = fly(BuildFlightDiagram(scenario, world, camera=False))
     assert flight.outcome == Outcome.GOAL and flight.clearances.min() > 0
 
 

@@ -39,7 +39,7 @@ class _OneSpeedConfig:
 def test_policies_fly_toward_a_post(name, outcome, post_world):
     scenario = Scenario(timeout=20.0, start_radius=0.0, policy=policy_named(name))
     diagram = BuildFlightDiagram(scenario, post_world, camera=False)
-    flight = fly(diagram, scenario, post_world)
+    flight = fly(diagram)
     assert flight.outcome == outcome
     assert flight.hypotheses.shape == (0, 0)
     assert diagram.HasSubsystemNamed("policy_camera") == (name == "reactive")
@@ -49,9 +49,9 @@ def test_policies_fly_toward_a_post(name, outcome, post_world):
 def test_the_scenario_camera_changes_no_flight(post_world):
     scenario = Scenario(timeout=1.0, policy=policy_named("reactive"))
     scenario.camera.width, scenario.camera.height = 32, 24
-    bare = fly(BuildFlightDiagram(scenario, post_world, camera=False), scenario, post_world)
+    bare = fly(BuildFlightDiagram(scenario, post_world, camera=False))
     shown = BuildFlightDiagram(scenario, post_world, Meshcat(), video=True)
-    watched = fly(shown, scenario, post_world)
+    watched = fly(shown)
     np.testing.assert_array_equal(bare.states, watched.states)
 
 
@@ -61,7 +61,7 @@ def test_name_gives_a_policy_of_that_speed(name, post_world):
     for speed in (1.5, 3.0):
         scenario = Scenario(timeout=1.5, start_radius=0.0, policy=policy_named(name, speed))
         diagram = BuildFlightDiagram(scenario, post_world, camera=False)
-        states = fly(diagram, scenario, post_world).states
+        states = fly(diagram).states
         assert np.linalg.norm(states[:, 3:6], axis=1).max() < 1.3 * speed
         reach.append(np.linalg.norm(states[-1, :3] - states[0, :3]))
     assert reach[1] > 1.2 * reach[0] > 0.5
@@ -98,7 +98,7 @@ def test_types_that_can_be_no_configuration_are_refused():
         (OpenConfig, r"OpenConfig makes no YAML \(TypeError: .*'rate'.*; give all fields defaults"),
     ):
         with pytest.raises(ValueError, match=message):
-            register_policy(config, lambda config, world, vehicle: None)
+            register_policy(config, lambda config, world, scenario: None)
 
 
 def test_file_of_weights_is_a_policy(tmp_path):
@@ -123,7 +123,7 @@ def test_speed_is_set_where_the_configuration_keeps_it(name):
 
 def test_policy_that_knows_one_speed_refuses_others(monkeypatch):
     monkeypatch.setattr(policies, "POLICIES", Registry("policy", "none", PolicyEntry))
-    register_policy(_OneSpeedConfig, lambda config, world, vehicle: ConstantVectorSource([0.0]))
+    register_policy(_OneSpeedConfig, lambda config, world, scenario: ConstantVectorSource([0.0]))
     assert policy_speed(_OneSpeedConfig()) is None
     with pytest.raises(ValueError, match="_onespeed flies as fast as it has learned"):
         at_speed(_OneSpeedConfig(), 3.0)

@@ -58,7 +58,7 @@ def forest():
 @pytest.mark.parametrize("name", ["planner", "reactive", "depthnav", "diffaero", "diffaero_tof"])
 def test_the_two_halves_fly_as_the_whole(forest, name):
     scenario = Scenario(timeout=1.6, policy=policy_named(name))
-    whole = fly(BuildFlightDiagram(scenario, forest, camera=False), scenario, forest)
+    whole = fly(BuildFlightDiagram(scenario, forest, camera=False))
     limits = FlightLimits(max_speed=20.0, max_tilt=1.5, deceleration=100.0, min_clearance=0.0)
     halves = Halves(scenario, forest, failsafe=FailsafeConfig(limits=limits), tick=0.002)
     halves.advance_to(1.6)

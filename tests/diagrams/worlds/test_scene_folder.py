@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
-from splatpilot.diagrams.flight.flight import Outcome, flight_outcome
 from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
+from splatpilot.diagrams.flight.monitor import Outcome, flight_outcome
 from splatpilot.diagrams.flight.policies import policy_named
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.worlds.scene_folder import (

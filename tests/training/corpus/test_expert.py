@@ -61,7 +61,7 @@ def test_planner_flies_as_in_the_diagram(world, starts, flights):
     policy = PrivilegedPlannerConfig(rate=2.5)
     start = starts[0].tolist()
     scenario = Scenario(world=WORLD, start_radius=0.0, start=start, policy=policy)
-    drake = fly(BuildFlightDiagram(scenario, world, camera=False), scenario, world)
+    drake = fly(BuildFlightDiagram(scenario, world, camera=False))
     found = flights[0]
     assert found.outcome is drake.outcome is Outcome.GOAL
     assert found.time == pytest.approx(drake.times[-1], abs=0.3)

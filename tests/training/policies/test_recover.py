@@ -93,9 +93,9 @@ def test_next_round_is_flown_by_the_weights_of_the_last(expert, tmp_path, monkey
     both_stages(expert, tmp_path / "first")
     flown = []
 
-    def watched(diagram, scenario, world):
-        flown.append(scenario.policy)
-        return fly(diagram, scenario, world)
+    def watched(diagram):
+        flown.append(diagram.GetSubsystemByName("monitor").scenario.policy)
+        return fly(diagram)
 
     monkeypatch.setattr(recovery, "fly", watched)
     corpus, out = tmp_path / "first" / "corpora" / "0", tmp_path / "second"
@@ -159,9 +159,9 @@ def test_recovery_share_is_the_fraction_of_recovery_samples(expert, tmp_path):
 def test_rgb_policy_recovers_too(tmp_path, monkeypatch):
     speeds = []
 
-    def watched(diagram, scenario, world):
-        speeds.append(scenario.policy.speed)
-        return fly(diagram, scenario, world)
+    def watched(diagram):
+        speeds.append(diagram.GetSubsystemByName("monitor").scenario.policy.speed)
+        return fly(diagram)
 
     monkeypatch.setattr(recovery, "fly", watched)
     collect_corpus(tmp_path / "expert", tmp_path, OnboardCamera(width=160, height=90))

@@ -110,7 +110,7 @@ def test_trained_network_predicts_depth_and_flies(trained):
     assert load_network(file).policy.initial_hidden().shape == (128,)
     world = make_world(ForestConfig(length=12.0, width=8.0, height=4.0), 1_000_000)
     scenario = Scenario(seed=1_000_000, policy=policy_named(file, 3.0), timeout=1.0)
-    flight = fly(BuildFlightDiagram(scenario, world, camera=False), scenario, world)
+    flight = fly(BuildFlightDiagram(scenario, world, camera=False))
     assert np.linalg.norm(flight.states[-1, :3] - flight.states[0, :3]) > 0.1
 
 

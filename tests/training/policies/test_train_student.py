@@ -133,7 +133,7 @@ def test_student_flies_by_its_weights(trained):
     )
     world = make_world(ForestConfig(length=12.0, width=8.0, height=4.0), 1_000_000)
     scenario = Scenario(seed=1_000_000, policy=config, timeout=1.0)
-    flight = fly(BuildFlightDiagram(scenario, world, camera=False), scenario, world)
+    flight = fly(BuildFlightDiagram(scenario, world, camera=False))
     plans = [Hypotheses.from_vector(row, 3) for row in flight.hypotheses]
     first, to_goal = plans[0], world.p_WG - flight.states[0, :3]
     assert len(plans) >= 15 and first is not None

@@ -1,0 +1,225 @@
+"""The end of a flight, as a system."""
+
+import copy
+import enum
+import math
+from typing import Any, cast
+
+import numpy as np
+from pydrake.common.value import Value
+from pydrake.systems.framework import (
+    Context,
+    Diagram,
+    DiagramBuilder,
+    EventStatus,
+    LeafSystem,
+    OutputPort,
+    System,
+    ValueProducer,
+    WitnessFunction,
+    WitnessFunctionDirection,
+)
+from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
+
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.worlds.world import World
+from splatpilot.systems.collision.distance_field import FieldState
+from splatpilot.systems.collision.esdf_collision import EsdfCollision
+from splatpilot.systems.common.drake import connect, vector_output, weak_callback
+from splatpilot.systems.messaging.flight_limits import LEVEL
+from splatpilot.systems.vehicle.state import QuadrotorState
+
+LOG_PERIOD = 0.02  # [s]
+_TOUCH = 0.03  # [m] max clearance of a landed vehicle, and
+_TOUCHDOWN_SPEED = 0.8  # [m/s] its max speed.
+
+
+class Outcome(enum.StrEnum):
+    """Result of a flight."""
+
+    GOAL = "goal"
+    COLLISION = "collision"
+    LEFT_VOLUME = "left_volume"
+    TIMEOUT = "timeout"
+    LANDED = "landed"
+    ERROR = "error"
+    INTERRUPTED = "interrupted"
+
+
+def goal_position(scenario: Scenario, world: World) -> np.ndarray:
+    """Returns p_WG (3,) [m] of the scenario, or of the world if the scenario has none."""
+    return np.asarray(world.p_WG if scenario.goal is None else scenario.goal, dtype=float)
+
+
+def start_position(scenario: Scenario, world: World) -> np.ndarray:
+    """Returns p_WS (3,) [m] of the scenario, or of the world if the scenario has none."""
+    return np.asarray(world.p_WS if scenario.start is None else scenario.start, dtype=float)
+
+
+def _margins(
+    state: np.ndarray, p_WG: np.ndarray, clearance: float, field_state: float, goal_radius: float
+) -> dict[Outcome, float]:
+    """Returns what is left until each outcome; NaN is no margin."""
+    return {
+        Outcome.COLLISION: clearance,
+        Outcome.LEFT_VOLUME: FieldState.UNKNOWN - 0.5 - field_state,
+        Outcome.GOAL: math.dist(p_WG, QuadrotorState.of(state).p_WB) - goal_radius,
+    }
+
+
+def _outcome(margins: dict[Outcome, float]) -> Outcome | None:
+    """Returns the outcome of the first margin that is not positive."""
+    return next((outcome for outcome, margin in margins.items() if margin <= 0), None)
+
+
+class FlightMonitor(LeafSystem):
+    """Ends a flight at a collision, outside the known volume, at the goal, or after its time.
+
+    .. pydrake_system::
+
+        name: FlightMonitor
+        input_ports: [state, goal, clearance, field_state]
+        output_ports: [outcome]
+
+    - ``state`` (13), ``goal`` (3) p_WG [m]; ``clearance`` (1) [m], ``field_state`` (1): of
+      `EsdfCollision`.
+    - ``outcome``: str, of `Outcome` at this instant; empty during the flight.
+
+    Each simulator step ends with ReachedTermination if the flight is over. Where the Context has an
+    accuracy, as `make_flight_simulator` sets it, a witness function ends the step at that instant.
+    """
+
+    def __init__(self, scenario: Scenario, world: World) -> None:
+        super().__init__()
+        scenario.validate()
+        self.scenario, self.world = copy.deepcopy(scenario), world
+        for name, size in (("state", 13), ("goal", 3), ("clearance", 1), ("field_state", 1)):
+            self.DeclareVectorInputPort(name, size)
+        calc = weak_callback(self._calc_outcome)
+        self.DeclareAbstractOutputPort("outcome", lambda: Value(""), calc)
+        calc = weak_callback(self._calc_margins)
+        self._margins = self.DeclareCacheEntry(
+            "margins", ValueProducer(lambda: Value(object), calc), {self.all_input_ports_ticket()}
+        ).cache_index()
+        self._witness = self.MakeWitnessFunction(
+            "end",
+            WitnessFunctionDirection.kPositiveThenNonPositive,
+            weak_callback(self._least_margin),
+        )
+        self.DeclarePerStepPublishEvent(self._check)
+        self.DeclarePeriodicPublishEvent(scenario.timeout, scenario.timeout, self._check)
+
+    def DoGetWitnessFunctions(self, context: Context) -> list[WitnessFunction]:
+        # Drake cannot isolate the instant without an accuracy.
+        return [] if context.get_accuracy() is None else [self._witness]
+
+    def _calc_margins(self, context: Context, margins: Any) -> None:
+        state, p_WG, clearance, field_state = (
+            np.asarray(self.get_input_port(index).Eval(context)) for index in range(4)
+        )
+        radius = self.scenario.goal_radius
+        margins.set_value(_margins(state, p_WG, clearance[0], field_state[0], radius))
+
+    def _least_margin(self, context: Context) -> float:
+        return min(self._eval_margins(context).values())
+
+    def _eval_margins(self, context: Context) -> dict[Outcome, float]:
+        return cast(dict[Outcome, float], self.get_cache_entry(self._margins).Eval(context))
+
+    def outcome(self, context: Context) -> Outcome | None:
+        """Returns the outcome at the instant of this system's Context; None during the flight."""
+        outcome = _outcome(self._eval_margins(context))
+        is_late = context.get_time() >= self.scenario.timeout
+        return outcome or (Outcome.TIMEOUT if is_late else None)
+
+    def _calc_outcome(self, context: Context, output: Any) -> None:
+        output.set_value(str(self.outcome(context) or ""))
+
+    def _check(self, context: Context) -> EventStatus:
+        outcome = self.outcome(context)
+        if outcome is None:
+            return EventStatus.DidNothing()
+        return EventStatus.ReachedTermination(self, f"{self.get_name()}: {outcome}")
+
+
+def AddFlightMonitor(
+    builder: DiagramBuilder,
+    scenario: Scenario,
+    world: World,
+    state: OutputPort,
+    command: OutputPort,
+    *,
+    goal: OutputPort | None = None,
+    collision: System | None = None,
+    hypotheses: OutputPort | None = None,
+    plan_period: float = LOG_PERIOD,
+) -> FlightMonitor:
+    """Adds what `fly` needs: the system `monitor`, and its logs of state, command and clearance.
+
+    Args:
+        state: (13), the true one.
+        goal: (3) p_WG [m]; by default a source `goal` of the scenario's.
+        collision: an `EsdfCollision`; by default one named `collision` of the world's field.
+        hypotheses: plans to log, every `plan_period` [s].
+    """
+    if collision is None:
+        spheres = world.moving.spheres if world.moving else None
+        collision = EsdfCollision(world.distance_field, spheres)
+        builder.AddNamedSystem("collision", collision)
+        connect(builder, state, collision.GetInputPort("state"))
+    if goal is None:
+        source = ConstantVectorSource(goal_position(scenario, world))
+        goal = builder.AddNamedSystem("goal", source).get_output_port()
+    monitor = FlightMonitor(scenario, world)
+    builder.AddNamedSystem("monitor", monitor)
+    clearance = collision.GetOutputPort("clearance")
+    for name, port in (
+        ("state", state),
+        ("goal", goal),
+        ("clearance", clearance),
+        ("field_state", collision.GetOutputPort("field_state")),
+    ):
+        connect(builder, port, monitor.GetInputPort(name))
+    AddLogs(builder, {"state": state, "command": command, "clearance": clearance})
+    if hypotheses is not None:
+        AddLogs(builder, {"hypotheses": hypotheses}, plan_period)
+    return monitor
+
+
+def AddLogs(
+    builder: DiagramBuilder, ports: dict[str, OutputPort], period: float = LOG_PERIOD
+) -> None:
+    """Logs each port `p` in a sink `p_log`, every `period` [s]."""
+    for name, port in ports.items():
+        LogVectorOutput(port, builder, period).set_name(f"{name}_log")
+
+
+def flight_monitors(diagram: Diagram) -> list[tuple[Diagram, FlightMonitor]]:
+    """Returns all monitors in a diagram, each with the diagram that holds it."""
+    found = []
+    for system in diagram.GetSystems():
+        if isinstance(system, FlightMonitor):
+            found.append((diagram, system))
+        elif isinstance(system, Diagram):
+            found += flight_monitors(system)
+    return found
+
+
+def flight_outcome(
+    diagram: Diagram, context: Context, p_WG: np.ndarray, goal_radius: float
+) -> Outcome | None:
+    """Returns the outcome at this instant, by the ports of a hardware diagram; None in flight."""
+    state, clearance, field_state = (
+        vector_output(diagram, name, context) for name in ("state", "clearance", "field_state")
+    )
+    return _outcome(_margins(state, p_WG, clearance[0], field_state[0], goal_radius))
+
+
+def has_landed(diagram: Diagram, context: Context) -> bool:
+    """Checks if the vehicle touches a level surface, slowly."""
+    v_WB = QuadrotorState.of(vector_output(diagram, "state", context)).v_WB
+    return bool(
+        vector_output(diagram, "clearance", context)[0] < _TOUCH
+        and vector_output(diagram, "gradient", context)[2] > LEVEL
+        and np.linalg.norm(v_WB) < _TOUCHDOWN_SPEED
+    )
