@@ -8,12 +8,8 @@ from numpy.typing import ArrayLike
 from pydrake.geometry import Meshcat, Sphere
 from pydrake.lcm import DrakeLcm
 from pydrake.math import RigidTransform
-from pydrake.multibody.math import SpatialVelocity
-from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
-from pydrake.multibody.tree import SpatialInertia
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, EventStatus
 from pydrake.systems.primitives import ConstantVectorSource
-from pydrake.visualization import ApplyVisualizationConfig, VisualizationConfig
 
 from splatpilot.systems.collision.distance_field import DistanceField
 from splatpilot.systems.common.drake import add_slider, vector_output
@@ -39,6 +35,11 @@ class DragHandles:
 
     def __init__(self, meshcat: Meshcat, radii: Mapping[str, float]):
         """Adds a sphere of each radius [m], by name."""
+        # These are slow to load.
+        from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
+        from pydrake.multibody.tree import SpatialInertia
+        from pydrake.visualization import ApplyVisualizationConfig, VisualizationConfig
+
         builder = DiagramBuilder()
         self._plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.0)
         for name, radius in radii.items():
@@ -62,6 +63,8 @@ class DragHandles:
 
     def move(self, name: str, p_WQ: ArrayLike, v_WQ: ArrayLike = (0.0, 0.0, 0.0)) -> None:
         """Moves a sphere to a position [m] with a velocity [m/s]."""
+        from pydrake.multibody.math import SpatialVelocity
+
         body, context = self._plant.GetBodyByName(name), self._plant_context
         self._plant.SetFreeBodyPose(context, body, RigidTransform(np.asarray(p_WQ)))
         velocity = SpatialVelocity(np.zeros(3), np.asarray(v_WQ, dtype=float))

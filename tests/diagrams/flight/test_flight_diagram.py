@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from gymnasium.spaces import Box
+from pydrake.geometry import Meshcat
 from pydrake.gym import DrakeGymEnv
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantVectorSource
@@ -358,3 +359,25 @@ def test_an_algebraic_loop_is_named(post_world):
         BuildFlightDiagram(
             Scenario(), post_world, camera=False, policy=Hasty(), estimator=FromCommand()
         )
+
+
+def test_meshcat_draws_on_request_and_gives_controls_of_teleop(post_world):
+    scenario = Scenario(timeout=1.0)
+    scenario.camera.width, scenario.camera.height = 32, 24
+    meshcat = Meshcat()
+    draw = ["axes", "thrust", "waypoint", "nearest", "barrier", "depth", "limits"]
+    diagram = BuildFlightDiagram(scenario, post_world, meshcat, draw=draw)
+    diagram.ForcedPublish(diagram.CreateDefaultContext())
+    for name in ("thrust", "waypoint", "nearest", "barrier", "limits", "vehicle/camera/depth"):
+        assert meshcat.HasPath(f"/splatpilot/{name}"), name
+    with pytest.raises(ValueError, match="draw must be without frustum"):
+        BuildFlightDiagram(scenario, post_world, meshcat, draw=["frustum"])
+    scenario.policy = policy_named("reactive")
+    BuildFlightDiagram(scenario, post_world, meshcat, draw=["frustum"])
+    assert meshcat.HasPath("/splatpilot/vehicle/policy_camera/frustum")
+    scenario.policy = policy_named("teleop")
+    diagram = BuildFlightDiagram(scenario, post_world, meshcat)
+    meshcat.SetSliderValue("up (arrows)", 2.0)
+    flight = fly(diagram)
+    assert flight.states[-1, 2] > flight.states[0, 2] + 0.5
+    assert np.ptp(flight.states[:, :2], axis=0).max() < 0.1
