@@ -11,7 +11,9 @@ from .diagrams.flight.flight_diagram import (
     ExportFlight,
     FlightParts,
     MakeCamera,
+    open_meshcat,
 )
+from .diagrams.flight.fly import flight_page
 from .diagrams.flight.monitor import AddFlightMonitor, FlightMonitor, Outcome
 from .diagrams.flight.monte_carlo import random_flights
 from .diagrams.flight.policies import policy_named, register_policy
@@ -38,6 +40,11 @@ from .systems.splats.splat_files import read_ply, write_ply
 from .systems.vehicle.flatness import FlatnessController
 from .systems.vehicle.quadrotor import QuadrotorParams, QuadrotorPlant, hover_state
 from .systems.vehicle.state import QuadrotorState, StateToPose
+from .systems.visualization.flight_visualizer import FlightVisualizer
+from .systems.visualization.live import LiveControls
+from .systems.visualization.meshcat_drawing import CameraVisualizer
+from .systems.visualization.rerun_sink import RerunSink
+from .systems.visualization.video import VideoRecorder
 from .training.captures.capture import Capture
 from .training.captures.capture_registry import read_capture, register_capture
 from .training.policies.trainer_registry import register_trainer
@@ -48,6 +55,7 @@ __all__ = [
     "AddFlightMonitor",
     "BakedScene",
     "BuildFlightDiagram",
+    "CameraVisualizer",
     "Capture",
     "Config",
     "Distortion",
@@ -58,8 +66,10 @@ __all__ = [
     "Flight",
     "FlightMonitor",
     "FlightParts",
+    "FlightVisualizer",
     "GaussianScene",
     "HypothesisSelector",
+    "LiveControls",
     "MakeCamera",
     "ObservationNoise",
     "OnboardCamera",
@@ -68,21 +78,25 @@ __all__ = [
     "QuadrotorParams",
     "QuadrotorPlant",
     "QuadrotorState",
+    "RerunSink",
     "Scenario",
     "SplatCamera",
     "SplatRenderEngine",
     "StateToPose",
+    "VideoRecorder",
     "World",
     "__version__",
     "bounded",
     "dump_config",
     "field_mesh",
+    "flight_page",
     "fly",
     "fly_all",
     "hover_state",
     "load_config",
     "make_flight_simulator",
     "make_world",
+    "open_meshcat",
     "policy_named",
     "random_flights",
     "rasterize",
