@@ -7,7 +7,14 @@ from typing import NamedTuple, cast
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.geometry import Meshcat, Rgba
-from pydrake.systems.framework import Context, DiagramBuilder, EventStatus, LeafSystem, OutputPort
+from pydrake.systems.framework import (
+    Context,
+    DiagramBuilder,
+    EventStatus,
+    LeafSystem,
+    OutputPort,
+    System,
+)
 
 from splatpilot.systems.common.drake import connect, vector_input
 from splatpilot.systems.common.validation import require
@@ -127,7 +134,7 @@ class FlightVisualizer(LeafSystem):
                 system of `state_port`, is named `NAME_plant`.
             path: `/splatpilot` by default, or `/splatpilot/NAME`.
         """
-        vehicle = vehicle_prefix(state_port.get_system(), "plant")
+        vehicle = vehicle_prefix(cast(System, state_port.get_system()), "plant")
         name = name or "_".join([*([vehicle] if vehicle else []), "flight_visualizer"])
         path = path or "/".join(["/splatpilot", *([vehicle] if vehicle else [])])
         count = num_hypotheses_in(hypotheses_port.size()) if hypotheses_port is not None else 0

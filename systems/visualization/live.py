@@ -121,7 +121,7 @@ class LiveControls:
         self._grabbed: tuple[str, np.ndarray] | None = None
         for name, key in ((PAUSE, "Space"), (STEP, "KeyN"), (AGAIN, "KeyR")):
             meshcat.AddButton(name, key)
-        self._clicks = dict.fromkeys((PAUSE, STEP, AGAIN), 0)
+        self._clicks: dict[str, int] = {PAUSE: 0, STEP: 0, AGAIN: 0}
         add_slider(meshcat, RATE, (0.0, 4.0), 0.25, 1.0)
         self._rate = 1.0
         if field is not None:
