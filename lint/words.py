@@ -22,7 +22,7 @@ INSTEAD = {
     r"\bgo(es)? on\b": "resume, continue",
     r"\bwithheld\b": "held-out",
     r"\bgather(s|ed|ing)?\b": "collect",
-    r"\bdisturb": "corrupt, add noise",
+    r"\bdisturb(?!ance)": "corrupt, add noise",
     r"\bjudge[sd]?\b": "predict, estimate",
     r"\bin a mirror\b": "flipped",
     r"\bleaky rectifier\b": "leaky ReLU",

@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from pydrake.geometry import Meshcat, MeshcatParams
@@ -391,7 +391,7 @@ def AddMeshcat(
     if "frustum" in draw:
         named = builder.HasSubsystemNamed("policy_camera")
         require(named, "draw", "without frustum for a policy without images", "frustum")
-        seen = builder.GetSubsystemByName("policy_camera")
+        seen = cast(SplatCamera, builder.GetSubsystemByName("policy_camera"))
         draw_frustum(meshcat, "/splatpilot/vehicle/policy_camera", seen.camera_info(), seen.X_BC())
     if isinstance(parts.policy, Teleop):
         parts.policy.add_controls(meshcat)
