@@ -121,7 +121,7 @@ class FlightMonitor(LeafSystem):
         margins.set_value(_margins(state, p_WG, clearance[0], field_state[0], radius))
 
     def _least_margin(self, context: Context) -> float:
-        return min(self._eval_margins(context).values())
+        return min(m for m in self._eval_margins(context).values() if not math.isnan(m))
 
     def _eval_margins(self, context: Context) -> dict[Outcome, float]:
         return cast(dict[Outcome, float], self.get_cache_entry(self._margins).Eval(context))

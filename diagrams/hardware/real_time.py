@@ -11,6 +11,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort, System
 
 from splatpilot.diagrams.flight.blocks import ConnectInputs
+from splatpilot.systems.common.validation import require
 from splatpilot.systems.messaging.bridge_status import UnixClock
 from splatpilot.systems.messaging.codecs import Codec
 from splatpilot.systems.messaging.lcm_ports import (
@@ -84,6 +85,8 @@ class MessagePorts:
     clock; systems look for messages every `tick` [s]."""
 
     def __init__(self, builder: DiagramBuilder, lcm: LCM, tick: float) -> None:
+        given = f"{type(lcm).__module__}.{type(lcm).__name__}"
+        require(hasattr(lcm, "subscribe"), "lcm", "a handle of the package lcm, as lcm.LCM", given)
         self._builder, self._lcm, self._tick = builder, lcm, tick
         self._unix_time = builder.AddNamedSystem("clock", UnixClock()).get_output_port()
 
