@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, cast
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
@@ -28,6 +29,7 @@ from splatpilot.systems.vehicle.state import QuadrotorState
 from splatpilot.systems.visualization.flight_visualizer import hypothesis_colors
 
 _JPEG_QUALITY = 80
+_TOO_FAR = np.iinfo(np.uint16).max  # of Drake's images of depth [mm]
 _CAMERA = "world/vehicle/camera"
 
 
@@ -37,7 +39,7 @@ class RerunSink(LeafSystem):
     .. pydrake_system::
 
         name: RerunSink
-        input_ports: [state, command, clearance, hypotheses, color_image, depth_image_32f, outcome]
+        input_ports: [state, command, clearance, hypotheses, color_image, depth_image_16u, outcome]
 
     All inputs are optional; those of the constructor are declared. They are recorded every `period`
     [s], and `outcome`, a string, at each step that changes it. The file is that of the last
@@ -67,7 +69,7 @@ class RerunSink(LeafSystem):
             "clearance": lambda value: self._scalars("clearance", value),
             "hypotheses": self._log_hypotheses,
             "color_image": self._log_color,
-            "depth_image_32f": self._log_depth,
+            "depth_image_16u": self._log_depth,
             "outcome": self._log_outcome,
         }
         self._outcome: str | None = None
@@ -106,7 +108,7 @@ class RerunSink(LeafSystem):
         name: str = "rerun",
     ) -> "RerunSink":
         """Adds a sink that is connected to `ports`, and to the images of a camera."""
-        images = ("color_image", "depth_image_32f") if camera is not None else ()
+        images = ("color_image", "depth_image_16u") if camera is not None else ()
         ports = {**ports, **{image: camera.GetOutputPort(image) for image in images if camera}}
         sink = RerunSink(path, ports, gaussians=gaussians, goal=goal, period=period)
         if camera is not None:
@@ -199,8 +201,9 @@ class RerunSink(LeafSystem):
 
     def _log_depth(self, image: Any) -> None:
         depth = np.asarray(image.data)[..., 0]
-        finite = np.where(np.isfinite(depth), depth, 0).astype(np.float32)
-        self._recording.log(f"{_CAMERA}/depth", self._rr.DepthImage(finite, meter=1.0))
+        png = cv2.imencode(".png", np.where(depth == _TOO_FAR, 0, depth))[1].tobytes()
+        encoded = self._rr.EncodedDepthImage(contents=png, media_type="image/png", meter=1e3)
+        self._recording.log(f"{_CAMERA}/depth", encoded)
 
     def _log_outcome(self, outcome: str) -> None:
         if outcome != self._outcome:

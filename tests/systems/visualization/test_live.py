@@ -73,6 +73,7 @@ class Flying:
     def __init__(self):
         self.ended, self.url = "", ""
         self.seen, self.changed, self.pushed = {}, {}, np.zeros(3)
+        self.closed = threading.Event()
         self.thread = threading.Thread(target=self._run, daemon=True)
         self.thread.start()
 
@@ -100,6 +101,8 @@ class Flying:
         self.changed["ended"] = time.time()
         context = goal.GetMyContextFromRoot(simulator.get_context())
         self.p_WG = np.array(goal.get_source_value(context).value())
+        # Meshcat's server may log, in Python, as long as it has a viewer.
+        self.closed.wait(20)
 
 
 def until(condition, what: str, act=lambda: None) -> None:
@@ -132,8 +135,10 @@ def flying(browser):
     yield flight
     if not flight.ended:
         flight.tab.keyboard.press("r")
-    flight.thread.join(10)
+    until(lambda: flight.ended, "end")
     flight.tab.close()
+    flight.closed.set()
+    flight.thread.join(20)
 
 
 def set_slider(tab, name: str, value: float) -> None:
