@@ -202,7 +202,7 @@ class RerunSink(LeafSystem):
     def _log_depth(self, image: Any) -> None:
         depth = np.asarray(image.data)[..., 0]
         png = cv2.imencode(".png", np.where(depth == _TOO_FAR, 0, depth))[1].tobytes()
-        encoded = self._rr.EncodedDepthImage(contents=png, media_type="image/png", meter=1e3)
+        encoded = self._rr.EncodedDepthImage(blob=png, media_type="image/png", meter=1e3)
         self._recording.log(f"{_CAMERA}/depth", encoded)
 
     def _log_outcome(self, outcome: str) -> None:
