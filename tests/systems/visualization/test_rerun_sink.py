@@ -4,8 +4,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
+from pydrake.common.value import Value
 from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
@@ -27,8 +29,6 @@ class Outcome(LeafSystem):
 
     def __init__(self):
         super().__init__()
-        from pydrake.common.value import Value
-
         self.DeclareAbstractOutputPort("outcome", lambda: Value(""), self._calc)
 
     def _calc(self, context, value):
@@ -84,6 +84,9 @@ def test_recording_is_valid_and_holds_everything_on_one_timeline(recording):
         times = [time.total_seconds() for time in columns(recording, entity)["time"]]
         np.testing.assert_allclose(np.unique(times), [0.0, 0.1, 0.2, 0.3], atol=1e-9)
     assert columns(recording, "/clearance")["Scalars:scalars"][0] == [0.7]
+    blob = columns(recording, "/world/vehicle/camera/depth")["EncodedDepthImage:blob"][0][0]
+    depth = cv2.imdecode(np.array(blob, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert depth.dtype == np.uint16 and depth.shape == (24, 32) and depth.max() < 65535
     splats = columns(recording, "/world/splats")
     np.testing.assert_allclose(splats["GaussianSplats3D:centers"], [[[3, 0, 2], [4, 0, 2]]])
     # x y z w
