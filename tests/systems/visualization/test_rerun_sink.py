@@ -85,7 +85,7 @@ def test_recording_is_valid_and_holds_everything_on_one_timeline(recording):
         np.testing.assert_allclose(np.unique(times), [0.0, 0.1, 0.2, 0.3], atol=1e-9)
     assert columns(recording, "/clearance")["Scalars:scalars"][0] == [0.7]
     blob = columns(recording, "/world/vehicle/camera/depth")["EncodedDepthImage:blob"][0][0]
-    depth = cv2.imdecode(np.array(blob, np.uint8), cv2.IMREAD_UNCHANGED)
+    depth = np.asarray(cv2.imdecode(np.array(blob, np.uint8), cv2.IMREAD_UNCHANGED))
     assert depth.dtype == np.uint16 and depth.shape == (24, 32) and depth.max() < 65535
     splats = columns(recording, "/world/splats")
     np.testing.assert_allclose(splats["GaussianSplats3D:centers"], [[[3, 0, 2], [4, 0, 2]]])
