@@ -138,6 +138,7 @@ class LiveControls:
         now = context.get_time()
         if now < self._last_time:  # the start
             self.wait_for_viewer()
+            self._pause_time = np.inf
             self._restart(now)
         self._last_time = now
         if now >= self._pause_time - 1e-9:
