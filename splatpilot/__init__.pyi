@@ -22,12 +22,14 @@ from .diagrams.flight.sensors import register_sensor
 from .diagrams.worlds.world import World
 from .diagrams.worlds.world_registry import make_world, register_world
 from .systems.collision.esdf import Esdf
-from .systems.collision.esdf_collision import EsdfCollision
+from .systems.collision.esdf_collision import EsdfCollision, EsdfCollision_
 from .systems.collision.field_mesh import field_mesh, write_mesh
+from .systems.collision.optimization import AddBarrierCost, AddClearanceConstraint
 from .systems.common.config import dump_config, load_config
 from .systems.common.validation import Config, bounded
-from .systems.policies.hypotheses import HypothesisSelector
+from .systems.policies.hypotheses import HypothesisSelector, HypothesisSelector_
 from .systems.policies.planner import PrivilegedPlanner
+from .systems.policies.velocity import VelocityTracker, VelocityTracker_
 from .systems.sensing.noise import ObservationNoise
 from .systems.sensing.onboard_camera import OnboardCamera
 from .systems.splats.baked_scene import BakedScene
@@ -37,9 +39,9 @@ from .systems.splats.render_engine import SplatRenderEngine
 from .systems.splats.scene import GaussianScene
 from .systems.splats.splat_camera import SplatCamera
 from .systems.splats.splat_files import read_ply, write_ply
-from .systems.vehicle.flatness import FlatnessController
-from .systems.vehicle.quadrotor import QuadrotorParams, QuadrotorPlant, hover_state
-from .systems.vehicle.state import QuadrotorState, StateToPose
+from .systems.vehicle.flatness import FlatnessController, FlatnessController_
+from .systems.vehicle.quadrotor import QuadrotorParams, QuadrotorPlant, QuadrotorPlant_, hover_state
+from .systems.vehicle.state import QuadrotorState, StateToPose, StateToPose_
 from .systems.visualization.flight_visualizer import FlightVisualizer
 from .systems.visualization.live import LiveControls
 from .systems.visualization.meshcat_drawing import CameraVisualizer
@@ -51,6 +53,8 @@ from .training.policies.trainer_registry import register_trainer
 from .training.reconstruction.reconstruct import reconstruct
 
 __all__ = [
+    "AddBarrierCost",
+    "AddClearanceConstraint",
     "AddFlight",
     "AddFlightMonitor",
     "BakedScene",
@@ -61,14 +65,17 @@ __all__ = [
     "Distortion",
     "Esdf",
     "EsdfCollision",
+    "EsdfCollision_",
     "ExportFlight",
     "FlatnessController",
+    "FlatnessController_",
     "Flight",
     "FlightMonitor",
     "FlightParts",
     "FlightVisualizer",
     "GaussianScene",
     "HypothesisSelector",
+    "HypothesisSelector_",
     "LiveControls",
     "MakeCamera",
     "ObservationNoise",
@@ -77,12 +84,16 @@ __all__ = [
     "PrivilegedPlanner",
     "QuadrotorParams",
     "QuadrotorPlant",
+    "QuadrotorPlant_",
     "QuadrotorState",
     "RerunSink",
     "Scenario",
     "SplatCamera",
     "SplatRenderEngine",
     "StateToPose",
+    "StateToPose_",
+    "VelocityTracker",
+    "VelocityTracker_",
     "VideoRecorder",
     "World",
     "__version__",

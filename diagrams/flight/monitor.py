@@ -26,6 +26,7 @@ from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf_collision import EsdfCollision
 from splatpilot.systems.common.drake import connect, vector_output, weak_callback
+from splatpilot.systems.common.scalars import ByValues
 from splatpilot.systems.messaging.flight_limits import LEVEL
 from splatpilot.systems.vehicle.state import QuadrotorState
 
@@ -87,10 +88,11 @@ class FlightMonitor(LeafSystem):
 
     Each simulator step ends with ReachedTermination if the flight is over. Where the Context has an
     accuracy, as `make_flight_simulator` sets it, a witness function ends the step at that instant.
+    Supports the scalars float and, by values and without the witness function, AutoDiffXd.
     """
 
     def __init__(self, scenario: Scenario, world: World) -> None:
-        super().__init__()
+        super().__init__(converter=_MonitorByValues.converter())
         scenario.validate()
         self.scenario, self.world = copy.deepcopy(scenario), world
         for name, size in (("state", 13), ("goal", 3), ("clearance", 1), ("field_state", 1)):
@@ -140,6 +142,25 @@ class FlightMonitor(LeafSystem):
         if outcome is None:
             return EventStatus.DidNothing()
         return EventStatus.ReachedTermination(self, f"{self.get_name()}: {outcome}")
+
+
+class _MonitorByValues(ByValues):
+    """A monitor for AutoDiffXd."""
+
+    def __init__(self, monitor: FlightMonitor) -> None:
+        super().__init__(monitor)
+        self.DeclareAbstractOutputPort(
+            "outcome", lambda: Value(""), weak_callback(self._calc_outcome)
+        )
+        timeout = monitor.scenario.timeout
+        self.DeclarePerStepPublishEvent(self._check)
+        self.DeclarePeriodicPublishEvent(timeout, timeout, self._check)
+
+    def _calc_outcome(self, context, output):
+        output.set_value(str(self._system.outcome(self.context_of_values(context)) or ""))
+
+    def _check(self, context):
+        return self._system._check(self.context_of_values(context))
 
 
 def AddFlightMonitor(

@@ -4,17 +4,18 @@ import importlib
 import inspect
 import pkgutil
 from collections.abc import Iterator
-from typing import Any
 
 from pydrake.systems.framework import LeafSystem
+from pydrake.systems.scalar_conversion import TemplateSystem
 
 import splatpilot
 import splatpilot.systems
 
 
 def public_names() -> list[str]:
-    """Returns the public names, `sp.NAME` after `import splatpilot as sp`."""
-    return [name for name in splatpilot.__all__ if name != "__version__"]
+    """Returns the public names, `sp.NAME` after `import splatpilot as sp`, without templates."""
+    names = [name for name in splatpilot.__all__ if name != "__version__"]
+    return [name for name in names if not isinstance(getattr(splatpilot, name), TemplateSystem)]
 
 
 def leaf_systems() -> Iterator[str]:
@@ -32,26 +33,11 @@ def page() -> str:
     """Returns the sections of the page in Markdown."""
     parts = ["## Public names\n"]
     for name in public_names():
-        member = getattr(splatpilot, name)
-        if "𝓣" in member.__name__:
-            parts.append(_template_entry(name, member))
-        else:
-            kind = "class" if inspect.isclass(member) else "function"
-            parts.append(_entry(f"sp.{name}", kind, f"splatpilot.{name}"))
+        kind = "class" if inspect.isclass(getattr(splatpilot, name)) else "function"
+        parts.append(_entry(f"sp.{name}", kind, f"splatpilot.{name}"))
     parts.append("## Other systems\n")
     parts += [_entry(name.rpartition(".")[2], "class", name) for name in leaf_systems()]
     return "\n".join(parts)
-
-
-def _template_entry(name: str, system: Any) -> str:
-    """Returns the section of a template system, of the signature of `_construct`.
-
-    Its name includes the scalar type, so autodoc would show an alias.
-    """
-    system.__name__ = name
-    parameters = inspect.signature(system._construct).parameters.items()
-    shown = ", ".join(str(p) for key, p in parameters if key not in ("self", "converter"))
-    return _entry(f"sp.{name}", "class", f"splatpilot.{name}({shown})", members=False)
 
 
 def _entry(heading: str, kind: str, name: str, members: bool = True) -> str:

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
+from splatpilot.systems.common.scalars import float_values, is_autodiff
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.vehicle.state import array_namespace
 
@@ -20,7 +21,10 @@ class FieldState(IntEnum):
 
 
 class FieldSample(NamedTuple):
-    """Values of a distance field at points p_WQ (..., 3), numpy arrays or torch tensors."""
+    """Values of a distance field at points p_WQ (..., 3), numpy arrays or torch tensors.
+
+    Distances of AutoDiffXd points or tensors are differentiable.
+    """
 
     # (...,) [m] to the nearest occupied surface, negative inside an obstacle. Where the state is
     # UNKNOWN it is the distance to observed surfaces, an upper bound of the true one; where it is
@@ -56,19 +60,39 @@ class DistanceField(Distances, Protocol):
         ...
 
 
-def soft_barrier(distance: Any, radius: float, beta: float = 4.0, margin: float = 1.0) -> Any:
+def linearize(value: Any, gradient: Any, step: Any) -> Any:
+    """Returns value (...,) + gradient (..., n) step (..., n); for a step of zeros that has
+    derivatives, value with the derivatives of the chain rule."""
+    return value + (gradient * step).sum(-1)
+
+
+def sample_field(field: DistanceField, p_WQ: Any) -> FieldSample:
+    """Queries any field at points (..., 3) [m], floats or AutoDiffXd; the gradient is floats."""
+    if not is_autodiff(p_WQ):
+        return field.query(p_WQ)
+    points = float_values(p_WQ)
+    sample = field.query(points)
+    return sample._replace(distance=linearize(sample.distance, sample.gradient, p_WQ - points))
+
+
+def soft_barrier(distance: Any, radius: Any, beta: Any = 4.0, margin: Any = 1.0) -> Any:
     """Computes a differentiable collision penalty [m], near zero in free space (equation 3).
 
         soft(d) = softplus(beta (radius + margin - d)) / beta
 
-    The signed distance (...,) [m] is a numpy array, float or torch tensor; NaN in, NaN out.
+    The signed distance (...,) [m] is a numpy array, float or torch tensor. AutoDiffXd may be among
+    all arguments. NaN in, NaN out.
     """
     require(beta > 0.0, "beta", "> 0 1/m", beta)
     exponent = beta * (radius + margin - distance)
     if array_namespace(exponent) is not np:
         return exponent.logaddexp(exponent.new_zeros(())) / beta
+    x = float_values(exponent)
     with np.errstate(invalid="ignore"):  # NaN in, NaN out, without a warning
-        return np.logaddexp(exponent, 0.0) / beta
+        softplus = np.logaddexp(x, 0.0)
+        if is_autodiff(exponent):
+            softplus = softplus + np.exp(x - softplus) * (exponent - x)
+    return softplus / beta
 
 
 def in_collision(distance: Any, radius: float) -> Any:

@@ -7,10 +7,16 @@ from typing import Any
 import numpy as np
 
 from splatpilot import _native
-from splatpilot.systems.collision.distance_field import FieldSample, FieldState
+from splatpilot.systems.collision.distance_field import (
+    FieldSample,
+    FieldState,
+    linearize,
+    sample_field,
+)
 from splatpilot.systems.collision.distance_transform import conservative_distances
 from splatpilot.systems.common.files import written_atomically
 from splatpilot.systems.common.readers import read_archive
+from splatpilot.systems.common.scalars import is_autodiff
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.vehicle.state import array_namespace
 
@@ -62,7 +68,7 @@ class Esdf:
     the interpolant and jumps at the planes through voxel centers. The arrays are read-only.
 
     Points p_WQ (..., 3) [m] are numpy arrays or torch tensors; results are of the same type, and
-    distances of tensors are differentiable.
+    distances of tensors and of AutoDiffXd are differentiable.
     """
 
     distances: np.ndarray  # (nx, ny, nz) float32 [m]
@@ -122,8 +128,8 @@ class Esdf:
 
     def distance(self, p_WQ: Any) -> Any:
         """Returns signed distances (...,) [m] at the points, NaN outside the bounds."""
-        if array_namespace(p_WQ) is not np:
-            return self.query(p_WQ).distance
+        if array_namespace(p_WQ) is not np or is_autodiff(p_WQ):
+            return sample_field(self, p_WQ).distance
         return self._interpolate(_points(p_WQ), with_gradient=False)[0]
 
     def query(self, p_WQ: Any) -> FieldSample:
@@ -148,8 +154,7 @@ class Esdf:
     def _query_tensor(self, p_WQ: Any) -> FieldSample:
         sample = self.query(p_WQ.detach().cpu().numpy())
         distance, gradient = (p_WQ.new_tensor(array) for array in sample[:2])
-        # Adds zero, whose derivative by p_WQ is the gradient.
-        distance = distance + (gradient * (p_WQ - p_WQ.detach())).sum(-1)
+        distance = linearize(distance, gradient, p_WQ - p_WQ.detach())
         state = array_namespace(p_WQ).as_tensor(sample.state, device=p_WQ.device)
         return FieldSample(distance, gradient, state)
 

@@ -1,86 +1,143 @@
 """A Drake system for distances and collisions of a vehicle."""
 
 import weakref
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import LeafSystem, ValueProducer
+from pydrake.systems.framework import (
+    LeafSystem_,  # pyright: ignore[reportAttributeAccessIssue]
+    ValueProducer,
+)
 
-from splatpilot.systems.collision.distance_field import DistanceField, in_collision, soft_barrier
+from splatpilot.systems.collision.distance_field import (
+    DistanceField,
+    in_collision,
+    sample_field,
+    soft_barrier,
+)
 from splatpilot.systems.collision.shapes import MovingSpheres
-from splatpilot.systems.common.validation import require
+from splatpilot.systems.common.scalars import (
+    ConfigParameter,
+    float_values,
+    parameter_setter,
+    system_template,
+)
+from splatpilot.systems.common.validation import Config, bounded, require
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 from splatpilot.systems.vehicle.state import QuadrotorState
 
 
-class EsdfCollision(LeafSystem):
-    """Computes the distance to obstacles and the collision signals of a vehicle.
+@dataclass
+class BarrierParams(Config):
+    """Parameters of `soft_barrier`."""
 
-    .. pydrake_system::
+    # [m] Radius of the vehicle.
+    radius: float = bounded(VEHICLE_RADIUS, "[0, inf) m")
+    # [1/m] Sharpness.
+    beta: float = bounded(4.0, "(0, inf) 1/m")
+    # [m] Clearance at which the barrier rises.
+    margin: float = bounded(1.0, "(-inf, inf) m")
 
-        name: EsdfCollision
-        input_ports:
-        - state
-        output_ports:
-        - distance
-        - gradient
-        - clearance
-        - in_collision
-        - barrier
-        - field_state
 
-    `state` is that of a `QuadrotorState`. `distance` [m] is that of p_WB to occupied surfaces,
-    `gradient` its derivative by p_WB in W, `clearance` [m] the distance less the radius of the
-    vehicle, `in_collision` 1 if that is negative, `barrier` [m] equation 3, see `soft_barrier`, and
-    `field_state` a `FieldState`. Outside the field's bounds distance, clearance and barrier are
-    NaN, the gradient is zero and there is no collision. All outputs share one query of the field,
-    with obstacles that are `moving` with the Context's time.
-    """
+@system_template("EsdfCollision_")
+def EsdfCollision_(T):
+    class EsdfCollision(LeafSystem_[T]):
+        """Computes the distance to obstacles and the collision signals of a vehicle.
 
-    def __init__(
-        self,
-        field: DistanceField,
-        moving: MovingSpheres | None = None,
-        radius: float = VEHICLE_RADIUS,
-        beta: float = 4.0,
-        margin: float = 1.0,
-    ) -> None:
-        super().__init__()
-        require(radius >= 0.0, "radius", "at least 0 m", radius)
-        require(beta > 0.0, "beta", "> 0 1/m", beta)
-        self._field, self._moving = field, moving
-        state = self.DeclareVectorInputPort("state", 13)
-        # Drake never frees a system that its own callbacks refer to.
-        collision = weakref.proxy(self)
-        cache = self.DeclareCacheEntry(
-            description="sample of the distance field at p_WB",
-            value_producer=ValueProducer(
-                allocate=lambda: AbstractValue.Make(object()),
-                calc=lambda context, sample: collision._sample(context, sample),
-            ),
-            prerequisites_of_calc={self.input_port_ticket(state.get_index())}
-            | ({self.time_ticket()} if moving is not None else set()),
-        )
-        index, ticket = cache.cache_index(), cache.ticket()
+        .. pydrake_system::
 
-        def declare(name, size, value_of):
-            def calc(context, output):
-                sample = collision.get_cache_entry(index).Eval(context)
-                output.SetFromVector(np.atleast_1d(value_of(sample)))
+            name: EsdfCollision
+            input_ports:
+            - state
+            output_ports:
+            - distance
+            - gradient
+            - clearance
+            - in_collision
+            - barrier
+            - field_state
 
-            self.DeclareVectorOutputPort(name, size, calc, prerequisites_of_calc={ticket})
+        `state` is that of a `QuadrotorState`. `distance` [m] is that of p_WB to occupied surfaces,
+        `gradient` its derivative by p_WB in W, `clearance` [m] the distance less the radius of the
+        vehicle, `in_collision` 1 if that is negative, `barrier` [m] equation 3, see `soft_barrier`,
+        and `field_state` a `FieldState`. Outside the field's bounds distance, clearance and barrier
+        are NaN, the gradient is zero and there is no collision. All outputs share one query of the
+        field, with obstacles that are `moving` with the Context's time.
 
-        declare("distance", 1, lambda sample: sample.distance)
-        declare("gradient", 3, lambda sample: sample.gradient)
-        declare("clearance", 1, lambda sample: sample.distance - radius)
-        declare("in_collision", 1, lambda sample: float(in_collision(sample.distance, radius)))
-        declare("barrier", 1, lambda sample: soft_barrier(sample.distance, radius, beta, margin))
-        declare("field_state", 1, lambda sample: float(sample.state))
+        Numeric parameter 0 (3): ``[radius [m], beta [1/m], margin [m]]``. Supports the scalars
+        float and AutoDiffXd, by the exact gradient; `gradient` itself has zero derivatives, and so
+        has the motion of obstacles.
+        """
 
-    def _sample(self, context: Any, sample: Any) -> None:
-        state = np.asarray(self.get_input_port().Eval(context))
-        field = self._field
-        if self._moving is not None:
-            field = self._moving.among(field, context.get_time())
-        sample.set_value(field.query(QuadrotorState.of(state).p_WB))
+        def __init__(
+            self,
+            field: DistanceField,
+            moving: MovingSpheres | None = None,
+            radius: float = VEHICLE_RADIUS,
+            beta: float = 4.0,
+            margin: float = 1.0,
+            *,
+            converter: Any = None,
+        ) -> None:
+            super().__init__(converter=converter)
+            name, valid = type(field).__name__, hasattr(field, "query")
+            remedy = "pass the `distance_field` of a world"
+            require(valid, "field", "a DistanceField", f"a {name}", remedy)
+            params = BarrierParams(radius, beta, margin)
+            params.validate()
+            self._arguments = field, moving, radius, beta, margin
+            self._field, self._moving = field, moving
+            self._parameters = [ConfigParameter(self, T, params)]
+            state = self._state_port = self.DeclareVectorInputPort("state", 13)
+            # Drake never frees a system that its own callbacks refer to.
+            collision = weakref.proxy(self)
+            cache = self.DeclareCacheEntry(
+                description="sample of the distance field at p_WB",
+                value_producer=ValueProducer(
+                    allocate=lambda: AbstractValue.Make(object()),
+                    calc=lambda context, sample: collision._sample(context, sample),
+                ),
+                prerequisites_of_calc={self.input_port_ticket(state.get_index())}
+                | ({self.time_ticket()} if moving is not None else set()),
+            )
+            index, tickets = cache.cache_index(), {cache.ticket(), self.all_parameters_ticket()}
+
+            def declare(name, size, value_of):
+                def calc(context, output):
+                    sample = collision.get_cache_entry(index).Eval(context)
+                    parameters = context.get_numeric_parameter(0)
+                    output.SetFromVector(np.atleast_1d(value_of(sample, parameters)))
+
+                self.DeclareVectorOutputPort(name, size, calc, prerequisites_of_calc=tickets)
+
+            def hit(sample, parameters):
+                return 1.0 * in_collision(sample.distance, parameters[0])
+
+            declare("distance", 1, lambda sample, _: sample.distance)
+            declare("gradient", 3, lambda sample, _: sample.gradient)
+            declare("clearance", 1, lambda sample, each: sample.distance - each[0])
+            declare("in_collision", 1, hit)
+            declare("barrier", 1, lambda sample, each: soft_barrier(sample.distance, *each.value()))
+            declare("field_state", 1, lambda sample, _: float(sample.state))
+
+        def get_input_port(self, port_index=0):
+            """Returns an input port by its index; `state` by default."""
+            return super().get_input_port(port_index)
+
+        SetRadius = parameter_setter("radius")
+        SetBeta = parameter_setter("beta")
+        SetMargin = parameter_setter("margin")
+
+        def _sample(self, context: Any, sample: Any) -> None:
+            state = np.asarray(self._state_port.Eval(context))
+            field = self._field
+            if self._moving is not None:
+                field = self._moving.among(field, float_values(context.get_time()))
+            sample.set_value(sample_field(field, QuadrotorState.of(state).p_WB))
+
+    return EsdfCollision
+
+
+EsdfCollision = EsdfCollision_[None]

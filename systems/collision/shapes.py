@@ -14,7 +14,9 @@ from splatpilot.systems.collision.distance_field import (
     Distances,
     FieldSample,
     FieldState,
+    sample_field,
 )
+from splatpilot.systems.common.scalars import is_autodiff
 from splatpilot.systems.common.validation import require
 
 # The `parameters` of a shape are numbers as native code takes them; O is a shape's own frame.
@@ -179,6 +181,8 @@ class AnalyticDistanceField:
 
     def distance(self, p_WQ: ArrayLike) -> np.ndarray:
         """Returns signed distances (...,) [m] at p_WQ (..., 3) [m], NaN outside the bounds."""
+        if is_autodiff(p_WQ):
+            return sample_field(self, p_WQ).distance
         p_WQ = np.asarray(p_WQ, dtype=float)
         return np.where(self._contains(p_WQ), self._union.distance(p_WQ), np.nan)
 
@@ -248,6 +252,8 @@ class FieldWithSpheres:
 
     def distance(self, p_WQ: ArrayLike) -> np.ndarray:
         """Returns signed distances (...,) [m] at p_WQ (..., 3) [m], NaN where the field's are."""
+        if is_autodiff(p_WQ):
+            return sample_field(self, p_WQ).distance
         return np.minimum(self._field.distance(p_WQ), self._spheres.distance(p_WQ))
 
     def query(self, p_WQ: ArrayLike) -> FieldSample:

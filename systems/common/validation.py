@@ -37,6 +37,12 @@ def require(valid: object, what: str, condition: str, value: object, remedy: str
         )
 
 
+def require_type(value: object, kind: type, what: str, remedy: str = "") -> None:
+    """Raises ValueError, see `require`, unless `value` is a `kind`."""
+    name = type(value).__name__
+    require(isinstance(value, kind), what, f"of type {kind.__name__}", f"a {name}", remedy)
+
+
 class FieldError(ValueError):
     """A field of a configuration is out of range; the message names the configuration's type."""
 

@@ -341,8 +341,8 @@ class FiniteVector(LeafSystem):
     def __init__(self, size: int, substitute: float = 0.0):
         super().__init__()
         self._substitute = substitute
-        self.DeclareVectorInputPort("signal", size)
-        self.DeclareVectorOutputPort("finite", size, self._calc)
+        signal = self.DeclareVectorInputPort("signal", size)
+        self.DeclareVectorOutputPort("finite", size, self._calc, {signal.ticket()})
 
     def _calc(self, context: Context, output: BasicVector) -> None:
         signal = vector_input(self, "signal", context)

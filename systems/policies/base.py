@@ -6,11 +6,20 @@ from typing import Any, ClassVar, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pydrake.autodiffutils import AutoDiffXd
 from pydrake.common.value import Value
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import (
+    BasicVector_,  # pyright: ignore[reportAttributeAccessIssue]
+    Context,
+    DiscreteStateIndex,
+    DiscreteValues,
+    LeafSystem,
+)
 from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
+from splatpilot.systems.common.drake import vector_input
+from splatpilot.systems.common.scalars import ByValues, float_values
 from splatpilot.systems.common.validation import Config, bounded, require
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.vehicle.state import QuadrotorState, pose_from_state
@@ -29,6 +38,12 @@ class Observation(NamedTuple):
     p_WG: np.ndarray  # (3,) [m], the goal
     # (H, W) [m] planar depth, (H, W, 3) uint8 RGB, or (9, 16) proximities; else empty.
     image: np.ndarray
+
+
+def observation(time: Any, state: Any, p_WG: Any, image: Any = None) -> Observation:
+    """Returns the observation of a state (13,), a goal (3,) [m] and, if any, an image."""
+    image = np.empty(0) if image is None else image
+    return Observation(time, pose_from_state(state), QuadrotorState.of(state), p_WG, image)
 
 
 @dataclass
@@ -69,15 +84,22 @@ class Policy(LeafSystem):
     - ``depth_grid`` (144): proximities in 16x9 cells, see
       :class:`~splatpilot.systems.sensing.time_of_flight.TimeOfFlightGrid`.
 
+    Converted to AutoDiffXd, a policy decides by the values of its inputs, and its decisions have
+    zero derivatives; or exact ones, if it is `differentiable`.
+
     Args:
         config: has `rate` [Hz] and `validate()`; with an image of a camera, `camera`.
         image: name of the image port; empty if the policy has none.
     """
 
+    differentiable: ClassVar[bool] = False
+    """If `decide` also takes AutoDiffXd."""
+
     def __init__(self, config: Any, image: str = "") -> None:
-        super().__init__()
+        super().__init__(converter=_PolicyByValues.converter())
         config.validate()
         self._config, self._image = config, image
+        self.state_outputs: dict[str, DiscreteStateIndex] = {}
         self._state_port = self.DeclareVectorInputPort("state", 13)
         self._goal_port = self.DeclareVectorInputPort("goal", 3)
         if image in _CHANNELS:
@@ -93,6 +115,7 @@ class Policy(LeafSystem):
         group = self.DeclareDiscreteState(np.asarray(initial, dtype=float))
         if output:
             self.DeclareStateOutputPort(output, group)
+            self.state_outputs[output] = group
 
     def decide(self, seen: Observation, *state: np.ndarray) -> Sequence[np.ndarray]:
         """Returns the next values of the groups of `declare_state`, from the present ones."""
@@ -102,9 +125,7 @@ class Policy(LeafSystem):
         x = np.asarray(self._state_port.Eval(context))
         p_WG = np.asarray(self._goal_port.Eval(context))
         image = self._read_image(context)
-        seen = Observation(
-            context.get_time(), pose_from_state(x), QuadrotorState.of(x), p_WG, image
-        )
+        seen = observation(context.get_time(), x, p_WG, image)
         old = context.get_discrete_state()
         groups = [np.array(old.value(i)) for i in range(old.num_groups())]
         for i, value in enumerate(self.decide(seen, *groups)):
@@ -117,3 +138,34 @@ class Policy(LeafSystem):
         if self._image in _CHANNELS:
             return np.asarray(cast(Any, image).data)[..., _CHANNELS[self._image][1]]
         return np.reshape(cast(Any, image), GRID_SHAPE)
+
+
+class _PolicyByValues(ByValues):
+    """A policy for AutoDiffXd, see `Policy`."""
+
+    def __init__(self, policy: Policy) -> None:
+        super().__init__(policy)
+        start = policy.CreateDefaultContext().get_discrete_state()
+        for group in range(start.num_groups()):
+            self.DeclareDiscreteState(BasicVector_[AutoDiffXd](start.value(group)))
+        for name, group in policy.state_outputs.items():
+            self.DeclareStateOutputPort(name, group)
+        update: Any = policy.GetUniquePeriodicDiscreteUpdateAttribute()
+        self.DeclarePeriodicDiscreteUpdateEvent(
+            update.period_sec(), update.offset_sec(), self._update
+        )
+
+    def _update(self, context, discrete_state):
+        old = context.get_discrete_state()
+        groups = [old.value(group) for group in range(old.num_groups())]
+        if self._system.differentiable:
+            state, goal = (vector_input(self, name, context) for name in ("state", "goal"))
+            new = self._system.decide(observation(context.get_time(), state, goal), *groups)
+        else:
+            inner = self.context_of_values(context)
+            for group, value in enumerate(groups):
+                inner.SetDiscreteState(group, float_values(value))
+            values = self._system.EvalUniquePeriodicDiscreteUpdate(inner)
+            new = [values.value(group) for group in range(len(groups))]
+        for group, value in enumerate(new):
+            discrete_state.set_value(group, value)

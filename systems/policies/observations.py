@@ -6,7 +6,7 @@ dimensions `...` are batches.
 
 from typing import Any
 
-from splatpilot.systems.vehicle.state import array_namespace
+from splatpilot.systems.vehicle.state import array_namespace, clip, stack
 
 
 def pool_depth(depth: Any, height: int, width: int) -> Any:
@@ -37,8 +37,8 @@ def target_velocity(p_WB: Any, p_WG: Any, speed: Any, slowing_time: float = 1.0)
     """Returns the velocity (..., 3) [m/s] straight to the goal: (p_WG - p_WB) / max(distance /
     speed, slowing_time), at `speed` (...,) [m/s] until `slowing_time` [s] before it."""
     to_goal = p_WG - p_WB
-    distance = array_namespace(to_goal).sqrt((to_goal * to_goal).sum(-1).clip(min=1e-6))
-    return to_goal / (distance / speed).clip(min=slowing_time)[..., None]
+    distance = array_namespace(to_goal).sqrt(clip((to_goal * to_goal).sum(-1), low=1e-6))
+    return to_goal / stack([clip(distance / speed, low=slowing_time)])
 
 
 def heading_observation(p_WB: Any, v_WB: Any, z_WB: Any, p_WG: Any, speed: Any, R_WH: Any) -> Any:

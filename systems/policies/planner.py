@@ -12,7 +12,7 @@ from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.shapes import MovingSpheres
 from splatpilot.systems.common.drake import weak_callback
 from splatpilot.systems.common.provenance import InfeasibleFlightError
-from splatpilot.systems.common.validation import Config, bounded, require
+from splatpilot.systems.common.validation import Config, bounded, require, require_type
 from splatpilot.systems.policies.base import Policy
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS, Hypotheses, no_plan
 from splatpilot.systems.policies.lattice import LatticeConfig, TrajectoryLattice
@@ -87,6 +87,8 @@ class PrivilegedPlanner(Policy):
     computed once per goal and cached in the Context. It ignores moving obstacles; the costs of
     trajectories know their future positions. Updates raise InfeasibleFlightError if the goal is
     outside the known volume, too close to an obstacle or cut off from the vehicle.
+
+    Supports the scalars float and AutoDiffXd; its hypotheses have zero derivatives.
     """
 
     def __init__(
@@ -96,7 +98,10 @@ class PrivilegedPlanner(Policy):
         params: QuadrotorParams | None = None,
         moving: MovingSpheres | None = None,
     ) -> None:
-        super().__init__(config or PrivilegedPlannerConfig())
+        config = PrivilegedPlannerConfig() if config is None else config
+        require_type(esdf, Esdf, "esdf", "pass the `esdf` of a world")
+        require_type(config, PrivilegedPlannerConfig, "config")
+        super().__init__(config)
         lattice = self._config.lattice
         self._params = params or QuadrotorParams()
         self._params.validate()

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from splatpilot.systems.common.validation import Config, bounded
+from splatpilot.systems.common.validation import Config, bounded, require_type
 from splatpilot.systems.policies.base import Observation, Policy
 from splatpilot.systems.policies.observations import target_velocity
 from splatpilot.systems.policies.velocity import SLOWING_TIME, tracking_acceleration
@@ -34,10 +34,16 @@ class Straight(Policy):
         - acceleration
 
     - ``acceleration`` (3): a_WB [m/s^2], W frame, gravity excluded.
+
+    Supports the scalars float and AutoDiffXd, with exact derivatives.
     """
 
+    differentiable = True
+
     def __init__(self, config: StraightConfig | None = None) -> None:
-        super().__init__(config or StraightConfig())
+        config = StraightConfig() if config is None else config
+        require_type(config, StraightConfig, "config")
+        super().__init__(config)
         self.declare_state(np.zeros(3), "acceleration")
 
     def decide(self, seen: Observation, *state: np.ndarray) -> list[np.ndarray]:

@@ -7,19 +7,36 @@ RA-L 2018). Rates tilt the body z axis by the shortest rotation and yaw slower, 
 moves the vehicle (Brescianini and D'Andrea, "Tilt-prioritized quadrocopter attitude control",
 T-CST 2018).
 
-Frames: W world, B body, D the desired body. The functions take numpy arrays or torch tensors of one
-vehicle or of N, and are differentiable. Thrust is over mass [m/s^2], angles are in rad.
+Frames: W world, B body, D the desired body. The functions take numpy arrays (of AutoDiffXd too) or
+torch tensors of one vehicle or of N, and are differentiable. Thrust is over mass [m/s^2], angles
+are in rad.
 """
 
 import math
-from dataclasses import dataclass, replace
+from contextlib import nullcontext
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
-from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import (
+    BasicVector_,  # pyright: ignore[reportAttributeAccessIssue]
+    LeafSystem_,  # pyright: ignore[reportAttributeAccessIssue]
+)
 
 from splatpilot.systems.common.drake import optional_input, vector_input
-from splatpilot.systems.common.validation import Config, bounded, require, require_field
+from splatpilot.systems.common.scalars import (
+    ConfigParameter,
+    float_values,
+    parameter_setter,
+    system_template,
+)
+from splatpilot.systems.common.validation import (
+    Config,
+    bounded,
+    require,
+    require_field,
+    require_type,
+)
 from splatpilot.systems.vehicle.quadrotor import QuadrotorParams
 from splatpilot.systems.vehicle.state import (
     QuadrotorState,
@@ -129,16 +146,16 @@ def flatness_command(
 
     fx, fy, fz = _components(a_WB + params.drag * v_WB)
     fz = clip(fz + params.gravity, low=config.min_thrust)
-    widest = fz * math.tan(config.max_tilt)  # keeps the lift, gives up sideways thrust
+    widest = fz * np.tan(config.max_tilt)  # keeps the lift, gives up sideways thrust
     shrink = clip(widest / xp.sqrt(fx * fx + fy * fy + _TINY), high=1.0)
     f_W = stack([shrink * fx, shrink * fy, fz])
-    f_W = f_W * clip(config.max_thrust / xp.sqrt((f_W * f_W).sum(-1)), high=1.0)[..., None]
+    f_W = f_W * clip(config.max_thrust / xp.sqrt((f_W * f_W).sum(-1, keepdims=True)), high=1.0)
 
     along, strength = heading_along_motion(motion_W, config.yaw_speed)
     if heading is None:
         heading = along
     else:
-        free = xp.isnan(heading)
+        free = heading != heading  # NaN, of any type of number
         heading = xp.where(free, along, heading)
         strength = xp.where(free, strength, xp.ones_like(strength))
     R_BD = R_WB.mT @ attitude_from_thrust(f_W, heading)
@@ -167,69 +184,106 @@ def _components(vectors: Any) -> tuple[Any, Any, Any]:
     return vectors[..., 0], vectors[..., 1], vectors[..., 2]
 
 
-class FlatnessController(LeafSystem):
-    """Flies a quadrotor to a moving waypoint, or with an acceleration, by thrust and body rates.
+@system_template("FlatnessController_")
+def FlatnessController_(T):
+    class FlatnessController(LeafSystem_[T]):
+        """Flies a quadrotor to a waypoint, or with an acceleration, by thrust and body rates.
 
-    .. pydrake_system::
+        .. pydrake_system::
 
-        name: FlatnessController
-        input_ports: [state, waypoint, acceleration, heading]
-        output_ports: [command]
+            name: FlatnessController
+            input_ports: [state, waypoint, acceleration, heading]
+            output_ports: [command]
 
-    - ``state`` (13), ``command`` (4): see `QuadrotorPlant`; the command is held between updates,
-      and that of hovering before the first.
-    - ``waypoint`` (3): p_WR [m], where the vehicle should be ``lookahead`` seconds from now; or
-      ``acceleration`` (3): a_WB [m/s^2], gravity excluded. Connect exactly one.
-    - ``heading`` (1), optional: of body x, seen from above, [rad] from world x; along the motion if
-      it is not connected or NaN.
+        - ``state`` (13), ``command`` (4): see `QuadrotorPlant`; the command is held between
+          updates, and that of hovering before the first.
+        - ``waypoint`` (3): p_WR [m], where the vehicle should be ``lookahead`` seconds from now; or
+          ``acceleration`` (3): a_WB [m/s^2], gravity excluded. Connect exactly one.
+        - ``heading`` (1), optional: of body x, seen from above, [rad] from world x; along the
+          motion if it is not connected or NaN.
+        - Numeric parameter 0 (9): the fields of the configuration from ``lookahead`` on; numeric
+          parameter 1 (2): ``[drag [1/s], gravity [m/s^2]]`` of the vehicle.
 
-    Updates every ``period`` [s] from time 0, see `reaching_acceleration` and `flatness_command`.
-    The motion is toward the waypoint, or along v_WB if an acceleration is given.
-    """
+        Updates every ``period`` [s] from time 0, see `reaching_acceleration` and
+        `flatness_command`. The motion is toward the waypoint, or along v_WB if an acceleration is
+        given. Supports the scalars float and AutoDiffXd; derivatives pass through its updates.
+        """
 
-    def __init__(
-        self, config: FlatnessControllerConfig | None = None, params: QuadrotorParams | None = None
-    ):
-        super().__init__()
-        self._config = replace(config or FlatnessControllerConfig())
-        self._params = replace(params or QuadrotorParams())
-        self._params.validate()
-        self._config.validate()
-        lift = self._params.gravity / math.cos(self._config.max_tilt)
-        condition = f"above {lift:.2f} m/s^2 to carry the weight at max_tilt"
-        above = self._config.max_thrust > lift
-        require_field(self._config, "max_thrust", above, condition)
-        self.DeclareVectorInputPort("state", 13)
-        self.DeclareVectorInputPort("waypoint", 3)
-        self.DeclareVectorInputPort("acceleration", 3)
-        self.DeclareVectorInputPort("heading", 1)
-        command = self.DeclareDiscreteState(np.array([self._params.gravity, 0.0, 0.0, 0.0]))
-        self.DeclareStateOutputPort("command", command)
-        self.DeclarePeriodicDiscreteUpdateEvent(self._config.period, 0.0, self._update)
+        def __init__(
+            self,
+            config: FlatnessControllerConfig | None = None,
+            params: QuadrotorParams | None = None,
+            *,
+            converter: Any = None,
+        ):
+            super().__init__(converter=converter)
+            config = FlatnessControllerConfig() if config is None else config
+            params = QuadrotorParams() if params is None else params
+            require_type(config, FlatnessControllerConfig, "config")
+            require_type(params, QuadrotorParams, "params")
+            self._arguments = config, params = replace(config), replace(params)
+            params.validate()
+            config.validate()
+            lift = params.gravity / math.cos(config.max_tilt)
+            condition = f"above {lift:.2f} m/s^2 to carry the weight at max_tilt"
+            require_field(config, "max_thrust", config.max_thrust > lift, condition)
+            gains = [field.name for field in fields(config) if field.name != "period"]
+            self._parameters = [
+                ConfigParameter(self, T, config, gains),
+                ConfigParameter(self, T, params, ["drag", "gravity"]),
+            ]
+            self.DeclareVectorInputPort("state", 13)
+            self.DeclareVectorInputPort("waypoint", 3)
+            self.DeclareVectorInputPort("acceleration", 3)
+            self.DeclareVectorInputPort("heading", 1)
+            hover = BasicVector_[T]([params.gravity, 0.0, 0.0, 0.0])
+            self.DeclareStateOutputPort("command", self.DeclareDiscreteState(hover))
+            self.DeclarePeriodicDiscreteUpdateEvent(config.period, 0.0, self._update)
 
-    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        config, state = self._config, self._eval_finite("state", context)
-        p_WB, v_WB, q_WB, _ = QuadrotorState.of(state)
-        require_rotation(q_WB)
-        use_waypoint = self.GetInputPort("waypoint").HasValue(context)
-        if use_waypoint == self.GetInputPort("acceleration").HasValue(context):
-            raise ValueError(
-                f"exactly one of 'waypoint' and 'acceleration' of '{self.get_name()}' must be "
-                f"connected, got {'both' if use_waypoint else 'neither'}"
-            )
-        if use_waypoint:
-            p_WR = self._eval_finite("waypoint", context)
-            a_WB = reaching_acceleration(p_WR, p_WB, v_WB, config.lookahead)
-            motion_W = (p_WR - p_WB) / config.lookahead
-        else:
-            a_WB, motion_W = self._eval_finite("acceleration", context), v_WB
-        heading = optional_input(self, "heading", context)
-        heading = None if heading is None else heading[0]
-        command = flatness_command(state, a_WB, motion_W, heading, config, self._params)
-        discrete_state.set_value(command)
+        SetLookahead = parameter_setter("lookahead")
+        SetMinThrust = parameter_setter("min_thrust")
+        SetMaxThrust = parameter_setter("max_thrust")
+        SetMaxTilt = parameter_setter("max_tilt")
+        SetTiltGain = parameter_setter("tilt_gain")
+        SetMaxTiltRate = parameter_setter("max_tilt_rate")
+        SetYawGain = parameter_setter("yaw_gain")
+        SetMaxYawRate = parameter_setter("max_yaw_rate")
+        SetYawSpeed = parameter_setter("yaw_speed")
+        SetDrag = parameter_setter("drag")
+        SetGravity = parameter_setter("gravity")
 
-    def _eval_finite(self, name: str, context: Context) -> np.ndarray:
-        value = vector_input(self, name, context)
-        what = f"input '{name}' of '{self.get_name()}' at t = {context.get_time()} s"
-        require(np.isfinite(value).all(), what, "finite", value.tolist())
-        return value
+        def _update(self, context, discrete_state):
+            config, params = (each.config(context) for each in self._parameters)
+            state = self._eval_finite("state", context)
+            p_WB, v_WB, q_WB, _ = QuadrotorState.of(state)
+            require_rotation(q_WB)
+            use_waypoint = self.GetInputPort("waypoint").HasValue(context)
+            if use_waypoint == self.GetInputPort("acceleration").HasValue(context):
+                raise ValueError(
+                    f"exactly one of 'waypoint' and 'acceleration' of '{self.get_name()}' must be "
+                    f"connected, got {'both' if use_waypoint else 'neither'}"
+                )
+            if use_waypoint:
+                p_WR = self._eval_finite("waypoint", context)
+                a_WB = reaching_acceleration(p_WR, p_WB, v_WB, config.lookahead)
+                motion_W = (p_WR - p_WB) / config.lookahead
+            else:
+                a_WB, motion_W = self._eval_finite("acceleration", context), v_WB
+            heading = optional_input(self, "heading", context)
+            heading = None if heading is None else heading[0]
+            # At rest arctan2 of AutoDiffXd warns of a division, and returns zero derivatives.
+            with nullcontext() if T is float else np.errstate(divide="ignore"):
+                command = flatness_command(state, a_WB, motion_W, heading, config, params)
+            discrete_state.set_value(command)
+
+        def _eval_finite(self, name, context):
+            value = vector_input(self, name, context)
+            numbers = float_values(value)
+            what = f"input '{name}' of '{self.get_name()}' at t = {context.get_time()} s"
+            require(np.isfinite(numbers).all(), what, "finite", numbers.tolist())
+            return value
+
+    return FlatnessController
+
+
+FlatnessController = FlatnessController_[None]

@@ -9,18 +9,25 @@ that the simulated plant and the training loop share one model.
 
 import math
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, replace
 from typing import Any
 
 import numpy as np
+from pydrake.autodiffutils import AutoDiffXd
+from pydrake.symbolic import Expression
 from pydrake.systems.framework import (
     BasicVector_,  # pyright: ignore[reportAttributeAccessIssue]
     LeafSystem_,  # pyright: ignore[reportAttributeAccessIssue]
 )
-from pydrake.systems.scalar_conversion import TemplateSystem
 
-from splatpilot.systems.common.validation import Config, bounded
-from splatpilot.systems.vehicle.state import QuadrotorState, array_namespace
+from splatpilot.systems.common.scalars import (
+    ConfigParameter,
+    float_values,
+    parameter_setter,
+    system_template,
+)
+from splatpilot.systems.common.validation import Config, bounded, require, require_type
+from splatpilot.systems.vehicle.state import QuadrotorState, array_namespace, require_rotation
 
 VEHICLE_RADIUS = 0.354
 """Propeller-tip radius of the vehicle [m]: closer than this to a surface is a collision."""
@@ -75,20 +82,37 @@ def quadrotor_derivatives(state: Any, command: Any, params: QuadrotorParams) -> 
 
 
 def component_derivatives(
-    state: Any, command: Any, drag: Any, rate_time_constant: Any, gravity: Any
+    state: Any,
+    command: Any,
+    drag: Any,
+    rate_time_constant: Any,
+    gravity: Any,
+    wind: Any = None,
+    disturbance: Any = None,
 ) -> tuple[Any, ...]:
     """Returns the 13 components of :func:`quadrotor_derivatives` from 13 + 4 components; plain
-    Python floats are by far the fastest for a single vehicle."""
+    Python floats are by far the fastest for a single vehicle.
+
+    Args:
+        wind: v_WA (3) [m/s] of the air in W: drag acts on v_WB - v_WA.
+        disturbance: added acceleration (3) [m/s^2] in W.
+    """
     _, _, _, vx, vy, vz, qw, qx, qy, qz, wx, wy, wz = state
     c, wx_cmd, wy_cmd, wz_cmd = command
     norm2 = qw * qw + qx * qx + qy * qy + qz * qz
     thrust = c / norm2
     pull = _NORM_GAIN * (1.0 - norm2)
+    v_AB = (vx, vy, vz) if wind is None else (vx - wind[0], vy - wind[1], vz - wind[2])
+    a_WB = (
+        thrust * (2.0 * (qx * qz + qw * qy)) - drag * v_AB[0],
+        thrust * (2.0 * (qy * qz - qw * qx)) - drag * v_AB[1],
+        thrust * (qw * qw - qx * qx - qy * qy + qz * qz) - drag * v_AB[2] - gravity,
+    )
+    if disturbance is not None:
+        a_WB = tuple(a + added for a, added in zip(a_WB, disturbance, strict=True))
     return (
         *(vx, vy, vz),
-        thrust * (2.0 * (qx * qz + qw * qy)) - drag * vx,
-        thrust * (2.0 * (qy * qz - qw * qx)) - drag * vy,
-        thrust * (qw * qw - qx * qx - qy * qy + qz * qz) - drag * vz - gravity,
+        *a_WB,
         0.5 * (-qx * wx - qy * wy - qz * wz) + pull * qw,
         0.5 * (qw * wx + qy * wz - qz * wy) + pull * qx,
         0.5 * (qw * wy + qz * wx - qx * wz) + pull * qy,
@@ -109,62 +133,89 @@ def rk4_step(state: Any, command: Any, params: QuadrotorParams, dt: Any) -> Any:
     return state + (dt / 6.0) * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
 
 
-@TemplateSystem.define("QuadrotorPlant_")
+@system_template("QuadrotorPlant_", (float, AutoDiffXd, Expression))
 def QuadrotorPlant_(T):
-    class Impl(LeafSystem_[T]):
+    class QuadrotorPlant(LeafSystem_[T]):
         """Simulates a quadrotor: exact thrust, body rates with a short lag.
 
         .. pydrake_system::
 
             name: QuadrotorPlant
-            input_ports: [command]
+            input_ports: [command, wind, disturbance]
             output_ports: [state]
 
         - ``command`` (4), ``state`` (13): as at the top of this module; the state is continuous, by
           default a level hover at the world's origin.
+        - ``wind`` (3), optional: v_WA [m/s] of the air in W; drag acts on v_WB - v_WA.
+        - ``disturbance`` (3), optional: acceleration [m/s^2] in W, added to that of the forces.
         - Numeric parameter 0 (3): ``[drag [1/s], rate_time_constant [s], gravity [m/s^2]]``.
 
-        See `quadrotor_derivatives`. Supports the scalars float, AutoDiffXd and Expression.
+        See `quadrotor_derivatives`. Supports the scalars float, AutoDiffXd and Expression. A
+        subclass supports them if it is a `system_template` of its own.
         Integrate in steps of at most 0.02 s: after 5 s of random commands at 50 Hz,
         ``runge_kutta3`` is within 2 cm of the solution.
         """
 
-        def _construct(
+        def __init__(
             self,
             params: QuadrotorParams | None = None,
             initial_state: np.ndarray | None = None,
-            converter=None,
+            *,
+            converter: Any = None,
         ):
             super().__init__(converter=converter)
-            params = params or QuadrotorParams()
+            params = QuadrotorParams() if params is None else params
+            require_type(params, QuadrotorParams, "params")
             params.validate()
-            self._defaults = astuple(params)
-            self.DeclareNumericParameter(BasicVector_[T](list(self._defaults)))
-            self.DeclareVectorInputPort("command", 4)
             start = hover_state([0.0, 0.0, 0.0]) if initial_state is None else initial_state
-            self._start = QuadrotorState.of(np.asarray(start, dtype=float)).to_vector()
-            index = self.DeclareContinuousState(BasicVector_[T](self._start))
+            start = np.array(start, dtype=float)
+            valid = start.shape == (13,) and np.isfinite(start).all()
+            require(valid, "initial_state", "13 finite numbers", start.tolist())
+            require_rotation(QuadrotorState.of(start).q_WB)
+            self._arguments = replace(params), start
+            self._parameters = [ConfigParameter(self, T, params)]
+            self._ports = [
+                self.DeclareVectorInputPort(name, size)
+                for name, size in (("command", 4), ("wind", 3), ("disturbance", 3))
+            ]
+            index = self.DeclareContinuousState(BasicVector_[T](start))
             self.DeclareStateOutputPort("state", index)
 
-        def _construct_copy(self, other, converter=None):
-            params = QuadrotorParams(*other._defaults)
-            Impl._construct(self, params, other._start, converter=converter)
+        SetDrag = parameter_setter("drag")
+        SetRateTimeConstant = parameter_setter("rate_time_constant")
+        SetGravity = parameter_setter("gravity")
+
+        def get_input_port(self, port_index=0):
+            """Returns an input port by its index; `command` by default."""
+            return super().get_input_port(port_index)
 
         def DoCalcTimeDerivatives(self, context, derivatives):
             # Lists, because arithmetic on Python floats is several times faster than on numpy's.
             state = context.get_continuous_state_vector().CopyToVector().tolist()
-            command = self.get_input_port(0).Eval(context).tolist()
-            parameters = context.get_numeric_parameter(0).CopyToVector().tolist()
+            command, *optional = self._ports
+            wind, disturbance = [
+                self._read(port, context) if port.HasValue(context) else None for port in optional
+            ]
+            command = self._read(command, context)
+            drag, lag, gravity = context.get_numeric_parameter(0).CopyToVector().tolist()
             try:
-                rates = component_derivatives(state, command, *parameters)
+                rates = component_derivatives(state, command, drag, lag, gravity, wind, disturbance)
             except ZeroDivisionError:
                 raise ValueError(
                     f"q_WB and rate_time_constant of {self.get_name()} must not be zero, got "
-                    f"{state[6:10]} and {parameters[1]} s at t = {context.get_time()} s"
+                    f"{state[6:10]} and {lag} s at t = {context.get_time()} s"
                 ) from None
             derivatives.get_mutable_vector().SetFromVector(np.array(rates))
 
-    return Impl
+        def _read(self, port, context):
+            value = port.Eval(context).tolist()
+            # Error control would shorten the steps without end.
+            if T is not Expression and not math.isfinite(float_values(sum(value))):
+                what = f"input '{port.get_name()}' of '{self.get_name()}'"
+                require(False, f"{what} at t = {context.get_time()} s", "finite", value)
+            return value
+
+    return QuadrotorPlant
 
 
-QuadrotorPlant: Any = QuadrotorPlant_[None]
+QuadrotorPlant = QuadrotorPlant_[None]

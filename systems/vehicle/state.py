@@ -6,13 +6,27 @@ from types import ModuleType
 from typing import Any, NamedTuple, Self
 
 import numpy as np
-from pydrake.common.eigen_geometry import Quaternion
-from pydrake.common.value import Value
-from pydrake.math import RigidTransform, RotationMatrix
-from pydrake.systems.framework import BasicVector, Context, LeafSystem
+from pydrake.autodiffutils import AutoDiffXd
+from pydrake.common.eigen_geometry import (
+    Quaternion,
+    Quaternion_,  # pyright: ignore[reportAttributeAccessIssue]
+)
+from pydrake.common.value import AbstractValue
+from pydrake.math import (
+    RigidTransform,
+    RigidTransform_,  # pyright: ignore[reportAttributeAccessIssue]
+    RotationMatrix,
+)
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    LeafSystem,
+    LeafSystem_,  # pyright: ignore[reportAttributeAccessIssue]
+)
 from scipy.spatial.transform import Rotation
 
 from splatpilot.systems.common.drake import vector_input, weak_callback
+from splatpilot.systems.common.scalars import is_autodiff, system_template
 from splatpilot.systems.common.validation import require
 
 LONGEST_PREDICTION = 0.1  # [s], maximum age of states that are predicted to the present.
@@ -50,14 +64,23 @@ class QuadrotorState(NamedTuple):
 
 
 def pose_from_state(state: np.ndarray) -> RigidTransform:
-    """Returns X_WB of `state` (13,), whose quaternion may have any length but zero."""
+    """Returns X_WB of `state` (13,), see `make_pose`."""
     p_WB, _, q_WB, _ = QuadrotorState.of(state)
-    return RigidTransform(Quaternion(q_WB / require_rotation(q_WB)), p_WB)
+    return make_pose(p_WB, q_WB)
 
 
-def require_rotation(q_WB: np.ndarray) -> float:
+def make_pose(p_WB: np.ndarray, q_WB: np.ndarray) -> RigidTransform:
+    """Returns X_WB of a position (3,) [m] and a quaternion (4,) of any length but zero; of
+    AutoDiffXd if they are."""
+    pose, quaternion = RigidTransform, Quaternion
+    if is_autodiff(q_WB):
+        pose, quaternion = RigidTransform_[AutoDiffXd], Quaternion_[AutoDiffXd]
+    return pose(quaternion(q_WB / require_rotation(q_WB)), p_WB)
+
+
+def require_rotation(q_WB: np.ndarray) -> Any:
     """Returns the length of a quaternion (4,); raises ValueError if it is zero or not finite."""
-    norm = math.sqrt(q_WB.dot(q_WB))
+    norm = np.sqrt(q_WB.dot(q_WB))
     condition = "a rotation (w, x, y, z), entries 6 to 9 of the state,"
     require(1e-9 < norm < math.inf, "q_WB", condition, q_WB.tolist())
     return norm
@@ -129,17 +152,32 @@ def rotation_matrices(q: Any) -> Any:
     )
 
 
-class StateToPose(LeafSystem):
-    """Outputs the ``pose`` X_WB (RigidTransform) of a ``state`` (13), see `pose_from_state`."""
+@system_template("StateToPose_")
+def StateToPose_(T):
+    class StateToPose(LeafSystem_[T]):
+        """Outputs the ``pose`` X_WB (RigidTransform) of a ``state`` (13), see `pose_from_state`.
 
-    def __init__(self):
-        super().__init__()
-        state, calc = self.DeclareVectorInputPort("state", 13), weak_callback(self._calc_pose)
-        tickets = {state.ticket()}
-        self.DeclareAbstractOutputPort("pose", lambda: Value(RigidTransform()), calc, tickets)
+        Supports the scalars float and AutoDiffXd.
+        """
 
-    def _calc_pose(self, context, output):
-        output.set_value(pose_from_state(vector_input(self, "state", context)))
+        def __init__(self, *, converter: Any = None):
+            super().__init__(converter=converter)
+            self._arguments = ()
+            state = self.DeclareVectorInputPort("state", 13)
+            self.DeclareAbstractOutputPort(
+                "pose",
+                lambda: AbstractValue.Make(RigidTransform_[T]()),
+                weak_callback(self._calc_pose),
+                {state.ticket()},
+            )
+
+        def _calc_pose(self, context, output):
+            output.set_value(pose_from_state(vector_input(self, "state", context)))
+
+    return StateToPose
+
+
+StateToPose = StateToPose_[None]
 
 
 class StatePredictor(LeafSystem):

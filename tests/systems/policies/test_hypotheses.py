@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from pydrake.autodiffutils import ExtractGradient, ExtractValue, InitializeAutoDiff
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from splatpilot.systems.policies.hypotheses import (
@@ -100,3 +101,21 @@ def test_without_a_cheapest_hypothesis_there_is_no_waypoint(costs):
 def test_a_lookahead_beyond_the_plan_is_refused(lookahead):
     with pytest.raises(ValueError, match=r"lookahead must be in \(0, 1\] s, got "):
         HypothesisSelector(3, lookahead)
+
+
+def test_derivatives_of_the_waypoint_equal_differences():
+    rng = np.random.default_rng(2)
+    X_WB = RigidTransform(RollPitchYaw(0.1, 0.2, 1.5), np.array([1.0, 2.0, 3.0]))
+    plan = Hypotheses(4.0, X_WB, rng.normal(size=(2, 10, 3)), costs=np.array([2.0, 1.0]))
+    selector, x = HypothesisSelector(2), plan.to_vector()
+    dual = waypoint(selector.ToAutoDiffXd(), InitializeAutoDiff(x).ravel(), 4.03)
+    h = 1e-6
+    differences = [
+        waypoint(selector, x + h * e, 4.03) - waypoint(selector, x - h * e, 4.03)
+        for e in np.eye(len(x))
+    ]
+    np.testing.assert_allclose(
+        ExtractGradient(dual), np.transpose(differences) / (2 * h), atol=1e-7
+    )
+    before = waypoint(selector.ToAutoDiffXd(), no_plan(2), 0.5)
+    np.testing.assert_array_equal(ExtractValue(before).ravel(), [7, 8, 9])

@@ -7,6 +7,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, EventStatus
 from pydrake.systems.primitives import LogVectorOutput
 
+from splatpilot.systems.collision.shapes import AnalyticDistanceField
 from splatpilot.systems.policies import planner as privileged_planner
 from splatpilot.systems.policies.hypotheses import Hypotheses, HypothesisSelector
 from splatpilot.systems.policies.lattice import LatticeConfig, TrajectoryLattice
@@ -212,3 +213,18 @@ def test_a_state_that_is_not_finite_is_refused(pillar_plan):
     state[4] = np.nan
     with pytest.raises(ValueError, match="must be 13 finite numbers"):
         pillar_plan(state)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (
+            (AnalyticDistanceField([], [0, 0, 0], [1, 1, 1]),),
+            "esdf must be .* got a Analytic.*`esdf`",
+        ),
+        ((None,), "esdf must be of type Esdf"),
+    ],
+)
+def test_what_is_not_a_grid_is_named_at_construction(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        PrivilegedPlanner(*arguments)

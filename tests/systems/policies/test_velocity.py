@@ -1,6 +1,8 @@
 import numpy as np
 import pytest
+from pydrake.autodiffutils import ExtractGradient, InitializeAutoDiff
 
+from splatpilot.systems.messaging.failsafe import FiniteVector
 from splatpilot.systems.policies.velocity import (
     RESPONSE_TIME,
     VelocitySetpoint,
@@ -79,3 +81,54 @@ def test_without_a_heading_the_turn_is_that_of_the_controller(decision, speed, h
 def test_heading_stays_at_rest():
     state = hover_state([1.0, 2.0, 3.0], yaw=3.0)
     assert setpoint(state=state, acceleration=np.array([1.0, 0, 0]))[3] == pytest.approx(3.0)
+
+
+def test_derivatives_of_tracking_equal_differences():
+    system = VelocityTracker()
+
+    def acceleration(system, x):
+        context = system.CreateDefaultContext()
+        system.GetInputPort("state").FixValue(context, x[:13])
+        system.GetInputPort("velocity").FixValue(context, x[13:])
+        return system.get_output_port().Eval(context)
+
+    for velocity in ([1.0, 0.0, 0.5], [9.0, -4.0, 1.0]):
+        x = np.concatenate([STATE, velocity])
+        dual = acceleration(system.ToAutoDiffXd(), InitializeAutoDiff(x).ravel())
+        h = 1e-6
+        differences = [
+            acceleration(system, x + h * e) - acceleration(system, x - h * e) for e in np.eye(16)
+        ]
+        expected = np.transpose(differences) / (2 * h)
+        np.testing.assert_allclose(ExtractGradient(dual), expected, atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("kind", "arguments", "inputs"),
+    [
+        (VelocityTracker, (), {"state": STATE, "velocity": np.ones(3)}),
+        (VelocitySetpoint, (CONTROLLER,), {"state": STATE, "velocity": np.ones(3)}),
+        (FiniteVector, (3,), {"signal": np.ones(3)}),
+    ],
+)
+def test_outputs_are_not_computed_again_as_time_moves(kind, arguments, inputs):
+    class Counting(kind):
+        calls = 0
+
+        def _calc(self, context, output):
+            self.calls += 1
+            super()._calc(context, output)
+
+    system = Counting(*arguments)
+    context = system.CreateDefaultContext()
+    for name, value in inputs.items():
+        system.GetInputPort(name).FixValue(context, value)
+    for time in (0.0, 1.0, 2.0):
+        context.SetTime(time)
+        system.get_output_port().Eval(context)
+    assert system.calls == 1
+
+
+def test_wrong_arguments_are_named_at_construction():
+    with pytest.raises(ValueError, match="controller must be of type FlatnessControllerConfig"):
+        VelocitySetpoint(None)  # pyright: ignore[reportArgumentType]

@@ -5,9 +5,10 @@ import pytest
 import torch
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from pydrake.autodiffutils import AutoDiffXd, ExtractGradient, ExtractValue, InitializeAutoDiff
 from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
-from pydrake.systems.primitives import VectorLogSink
+from pydrake.systems.primitives import Linearize, VectorLogSink
 from scipy.spatial.transform import Rotation
 
 from splatpilot.systems.vehicle.flatness import (
@@ -253,3 +254,60 @@ def test_an_input_that_is_not_finite_is_an_error(port):
     inputs[port][1] = math.nan
     with pytest.raises(ValueError, match=rf"input '{port}' .* at t = 0\.5 s must be finite"):
         command_for(time=0.5, **inputs)
+
+
+def update(controller, x, port="waypoint", heading=None):
+    """The command (4,) of an update for a state (13) and a target (3)."""
+    context = controller.CreateDefaultContext()
+    controller.GetInputPort("state").FixValue(context, x[:13])
+    controller.GetInputPort(port).FixValue(context, x[13:])
+    if heading is not None:
+        controller.GetInputPort("heading").FixValue(context, [heading])
+    return controller.EvalUniquePeriodicDiscreteUpdate(context).value(0)
+
+
+@pytest.mark.parametrize("port", ["waypoint", "acceleration"])
+@pytest.mark.parametrize("heading", [None, math.nan, 0.4])
+def test_derivatives_of_an_update_equal_differences(port, heading):
+    controller = FlatnessController(CONFIG, PARAMS)
+    x = np.concatenate([hover_state([0.0, 0.0, 2.0], 0.3), [0.4, 0.1, 0.2]])
+    x += 0.05 * np.random.default_rng(1).normal(size=16)
+    dual = update(controller.ToAutoDiffXd(), InitializeAutoDiff(x).ravel(), port, heading)
+    h = 1e-6
+    differences = [
+        update(controller, x + h * e, port, heading) - update(controller, x - h * e, port, heading)
+        for e in np.eye(16)
+    ]
+    np.testing.assert_allclose(ExtractValue(dual).ravel(), update(controller, x, port, heading))
+    expected = np.column_stack(differences) / (2 * h)
+    np.testing.assert_allclose(ExtractGradient(dual), expected, rtol=1e-6, atol=1e-6)
+
+
+def test_derivatives_of_an_update_by_a_gain():
+    controller, x = FlatnessController().ToAutoDiffXd(), hover_state([0.0, 0.0, 2.0])
+    context = controller.CreateDefaultContext()
+    controller.GetInputPort("state").FixValue(context, x)
+    controller.GetInputPort("waypoint").FixValue(context, [0.1, 0.0, 2.0])
+    controller.SetTiltGain(context, AutoDiffXd(10.0, [1.0]))
+    command = controller.EvalUniquePeriodicDiscreteUpdate(context).value(0)
+    assert command[2].derivatives()[0] == pytest.approx(command[2].value() / 10.0)
+
+
+def test_the_controller_is_linearized_at_rest():
+    controller, state = FlatnessController(), hover_state([0.0, 0.0, 2.0])
+    context = controller.CreateDefaultContext()
+    controller.GetInputPort("state").FixValue(context, state)
+    controller.GetInputPort("waypoint").FixValue(context, state[:3])
+    ports = controller.GetInputPort("waypoint"), controller.GetOutputPort("command")
+    linear = Linearize(controller, context, *(port.get_index() for port in ports))
+    assert linear.time_period() == CONFIG.period
+    lift = 2.0 / CONFIG.lookahead**2
+    tilt = CONFIG.tilt_gain * lift / 9.81
+    expected = [[0, 0, lift], [0, -tilt, 0], [tilt, 0, 0], [0, 0, 0]]
+    np.testing.assert_allclose(linear.B(), expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("arguments", [("x",), (None, "x")])
+def test_wrong_arguments_are_named_at_construction(arguments):
+    with pytest.raises(ValueError, match=r"(config|params) must be of type .* got a str"):
+        FlatnessController(*arguments)

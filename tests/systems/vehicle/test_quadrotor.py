@@ -5,9 +5,10 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from pydrake.autodiffutils import ExtractGradient, ExtractValue, InitializeAutoDiff
+from pydrake.autodiffutils import AutoDiffXd, ExtractGradient, ExtractValue, InitializeAutoDiff
 from pydrake.symbolic import Evaluate, MakeVectorVariable
 from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
+from pydrake.systems.primitives import Linearize
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
@@ -179,3 +180,70 @@ def test_conversions_keep_the_parameters_and_the_equations():
 def test_a_zero_quaternion_is_an_error_that_names_it():
     with pytest.raises(ValueError, match=r"q_WB .* must not be zero, got \[0\.0, "):
         derivatives_at(QuadrotorPlant(), np.zeros(17))
+
+
+@pytest.mark.parametrize("convert", [lambda plant: plant, lambda plant: plant.ToAutoDiffXd()])
+def test_wind_moves_the_air_and_a_disturbance_accelerates(convert):
+    plant = convert(QuadrotorPlant(QuadrotorParams(drag=0.5)))
+    context = plant.CreateDefaultContext()
+    plant.get_input_port().FixValue(context, [9.81, 0.0, 0.0, 0.0])
+
+    def acceleration():
+        derivatives = plant.EvalTimeDerivatives(context).CopyToVector()
+        return np.float64([x if isinstance(x, float) else x.value() for x in derivatives[3:6]])
+
+    np.testing.assert_allclose(acceleration(), 0.0, atol=1e-12)
+    plant.GetInputPort("wind").FixValue(context, [3.0, -1.0, 2.0])
+    np.testing.assert_allclose(acceleration(), [1.5, -0.5, 1.0], atol=1e-12)
+    plant.GetInputPort("disturbance").FixValue(context, [0.0, 0.25, -1.0])
+    np.testing.assert_allclose(acceleration(), [1.5, -0.25, 0.0], atol=1e-12)
+
+
+@pytest.mark.parametrize("convert", [lambda plant: plant, lambda plant: plant.ToAutoDiffXd()])
+@pytest.mark.parametrize("port", ["command", "wind", "disturbance"])
+def test_an_input_that_is_not_finite_is_an_error_with_error_control(convert, port):
+    plant = convert(QuadrotorPlant())
+    context = plant.CreateDefaultContext()
+    plant.get_input_port().FixValue(context, [9.81, 0.0, 0.0, 0.0])
+    plant.GetInputPort(port).FixValue(context, np.full(plant.GetInputPort(port).size(), np.nan))
+    with pytest.raises(ValueError, match=rf"input '{port}' .* must be finite, got \[.*nan"):
+        plant.EvalTimeDerivatives(context)
+    if isinstance(plant, QuadrotorPlant):
+        with pytest.raises(ValueError, match="must be finite"):
+            Simulator(plant, context).AdvanceTo(0.1)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("x",), "params must be of type QuadrotorParams, got a str"),
+        ((None, np.zeros(13)), r"q_WB must be a rotation .* got \[0\.0, 0\.0, 0\.0, 0\.0\]"),
+        ((None, np.zeros(12)), "initial_state must be 13 finite numbers"),
+        ((None, np.full(13, np.nan)), "initial_state must be 13 finite numbers"),
+    ],
+)
+def test_wrong_arguments_are_named_at_construction(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        QuadrotorPlant(*arguments)
+
+
+def test_a_subclass_is_not_linearized_as_its_base():
+    class Draggy(QuadrotorPlant):
+        pass
+
+    plant = Draggy()
+    context = plant.CreateDefaultContext()
+    plant.get_input_port().FixValue(context, [9.81, 0.0, 0.0, 0.0])
+    with pytest.raises(RuntimeError, match="Draggy"):
+        Linearize(plant, context)
+
+
+def test_derivatives_by_a_parameter():
+    plant = QuadrotorPlant().ToAutoDiffXd()
+    context = plant.CreateDefaultContext()
+    state = hover_state([0.0, 0.0, 0.0])
+    state[3] = 2.0
+    context.SetContinuousState(state)
+    plant.get_input_port().FixValue(context, [9.81, 0.0, 0.0, 0.0])
+    plant.SetDrag(context, AutoDiffXd(0.5, [1.0]))
+    assert plant.EvalTimeDerivatives(context)[3].derivatives() == [-2.0]

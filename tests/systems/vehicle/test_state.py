@@ -5,6 +5,7 @@ import pytest
 import torch
 from hypothesis import assume, given
 from hypothesis import strategies as st
+from pydrake.autodiffutils import ExtractGradient, InitializeAutoDiff
 from pydrake.common.eigen_geometry import AngleAxis, Quaternion
 from pydrake.math import RigidTransform, RotationMatrix
 from scipy.spatial.transform import Rotation
@@ -129,3 +130,19 @@ def test_the_length_of_zero_has_no_gradient():
     zero = torch.zeros(2, 3, requires_grad=True)
     lengths(zero).sum().backward()
     assert zero.grad is not None and (zero.grad == 0).all()
+
+
+def test_derivatives_of_a_pose_equal_differences():
+    system, x = StateToPose(), hover_state([1.0, 2.0, 3.0], 0.4)
+
+    def point(system, x):
+        context = system.CreateDefaultContext()
+        system.get_input_port().FixValue(context, x)
+        return system.get_output_port().Eval(context) @ np.array([1.0, -2.0, 0.5])
+
+    dual = point(system.ToAutoDiffXd(), InitializeAutoDiff(x).ravel())
+    h = 1e-6
+    differences = [point(system, x + h * e) - point(system, x - h * e) for e in np.eye(13)]
+    np.testing.assert_allclose(
+        ExtractGradient(dual), np.transpose(differences) / (2 * h), atol=1e-8
+    )
