@@ -50,7 +50,7 @@ def test_live_flight_starts_with_its_viewer_and_is_recorded_for_rerun(
     tmp_path, monkeypatch, capsys
 ):
     viewers = []
-    monkeypatch.setattr(LiveControls, "wait_for_viewer", viewers.append)
+    monkeypatch.setattr(LiveControls, "wait_for_viewer", lambda self: viewers.append(self))
     out, record = tmp_path / "flight", tmp_path / "flight.rrd"
     words = ["--live", "--draw", "thrust,axes", "--rerun", str(record), *SHORT]
     assert main(["fly", "--out", str(out), *words]) == 0

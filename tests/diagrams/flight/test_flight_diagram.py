@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import msgpack
 import numpy as np
 import pytest
 from gymnasium.spaces import Box
@@ -27,6 +28,7 @@ from splatpilot.systems.policies.reactive import Reactive
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.vehicle.flatness import FlatnessController
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS, QuadrotorPlant
+from splatpilot.systems.visualization.live import LiveControls
 
 
 def flown(scenario: Scenario, world, **systems):
@@ -381,3 +383,25 @@ def test_meshcat_draws_on_request_and_gives_controls_of_teleop(post_world):
     flight = fly(diagram)
     assert flight.states[-1, 2] > flight.states[0, 2] + 0.5
     assert np.ptp(flight.states[:, :2], axis=0).max() < 0.1
+
+
+def test_live_controls_drag_the_goal_and_push_the_vehicle_of_a_flight(post_world, monkeypatch):
+    monkeypatch.setattr(LiveControls, "wait_for_viewer", lambda self: None)
+    meshcat = Meshcat()
+    scenario = Scenario(timeout=0.5, policy=policy_named("teleop"))
+    flown = {}
+    for name in ("", "goal", "plant"):
+        diagram = BuildFlightDiagram(scenario, post_world, camera=False)
+        controls = LiveControls(meshcat, diagram)
+        meshcat.SetSliderValue("real-time rate", 0.0)
+        start = post_world.p_WG if name == "goal" else post_world.p_WS
+        ends = (start, start + [0.0, 0.0, 0.4]) if name else ([], [])
+        drag = {"type": "mouse_drag", "name": name and f"/drake/illustration/{name}/{name}"}
+        drag |= {"drag_anchor": [*map(float, ends[0])], "drag_target": [*map(float, ends[1])]}
+        meshcat._InjectWebsocketMessage(msgpack.packb(drag))
+        flown[name] = fly(diagram, monitor=controls).states[-1, :3]
+        goal = msgpack.unpackb(meshcat._GetPackedTransform("/splatpilot/goal"))["matrix"][12:15]
+        raised = 0.4 if name == "goal" else 0.0
+        np.testing.assert_allclose(goal, post_world.p_WG + [0, 0, raised], atol=1e-6)
+    np.testing.assert_allclose(flown["goal"], flown[""], atol=1e-9)
+    assert flown["plant"][2] > flown[""][2] + 0.05
