@@ -395,13 +395,13 @@ def test_live_controls_drag_the_goal_and_push_the_vehicle_of_a_flight(post_world
         controls = LiveControls(meshcat, diagram)
         meshcat.SetSliderValue("real-time rate", 0.0)
         start = post_world.p_WG if name == "goal" else post_world.p_WS
-        ends = (start, start + [0.0, 0.0, 0.4]) if name else ([], [])
+        ends = (start, np.add(start, [0.0, 0.0, 0.4])) if name else ([], [])
         drag = {"type": "mouse_drag", "name": name and f"/drake/illustration/{name}/{name}"}
         drag |= {"drag_anchor": [*map(float, ends[0])], "drag_target": [*map(float, ends[1])]}
         meshcat._InjectWebsocketMessage(msgpack.packb(drag))
         flown[name] = fly(diagram, monitor=controls).states[-1, :3]
         goal = msgpack.unpackb(meshcat._GetPackedTransform("/splatpilot/goal"))["matrix"][12:15]
         raised = 0.4 if name == "goal" else 0.0
-        np.testing.assert_allclose(goal, post_world.p_WG + [0, 0, raised], atol=1e-6)
+        np.testing.assert_allclose(goal, np.add(post_world.p_WG, [0, 0, raised]), atol=1e-6)
     np.testing.assert_allclose(flown["goal"], flown[""], atol=1e-9)
     assert flown["plant"][2] > flown[""][2] + 0.05
