@@ -13,7 +13,7 @@ fly: .venv/flying
 	$(SPLATPILOT) fly --out out/fly --overwrite
 
 test: lint
-	OMP_NUM_THREADS=1 .venv/bin/python -m pytest -n auto --dist loadfile
+	OMP_NUM_THREADS=1 .venv/bin/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 
 lint: .venv/installed
 	.venv/bin/ruff check .

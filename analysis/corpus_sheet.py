@@ -19,10 +19,8 @@ _GOAL = (255, 0, 255)
 
 
 def draw_sheet(corpus: Corpus, out: Path, count: int, seed: int = 0) -> None:
-    """Draws `count` random samples into the PNG `out`.
-
-    Trajectories are green, yellow and red in order of cost; a goal ahead is a magenta ring.
-    """
+    """Draws `count` random samples into the PNG `out`. Trajectories are green, yellow and red in
+    order of cost; a goal ahead is a magenta ring."""
     rng = np.random.default_rng(seed)
     indices = np.sort(rng.choice(len(corpus), min(count, len(corpus)), replace=False))
     samples = corpus.samples(indices)

@@ -140,11 +140,9 @@ def _is_inside(field: DistanceField, p_W: NDArray) -> NDArray[np.bool_]:
 
 
 def traversability(field: DistanceField, rng: np.random.Generator, samples: int = 300) -> float:
-    """Computes AvoidBench's traversability, (1 / n r) sum_i s_i; high is easy.
-
-    s_i [m] is how far the vehicle of radius r flies in a random horizontal direction, from a
-    random point where it fits, until it touches an obstacle or reaches the bounds.
-    """
+    """Computes AvoidBench's traversability, (1 / n r) sum_i s_i; high is easy. s_i [m] is how far
+    the vehicle of radius r flies in a random horizontal direction, from a random point where it
+    fits, until it touches an obstacle or reaches the bounds."""
     p = rng.uniform(field.lower_W, field.upper_W, (20 * samples, 3))
     p = p[conservative_distance(field, p) > VEHICLE_RADIUS][:samples]
     angle = rng.uniform(0, 2 * np.pi, len(p))
@@ -155,10 +153,8 @@ def traversability(field: DistanceField, rng: np.random.Generator, samples: int 
 
 def relative_gap_size(field: DistanceField, height: float) -> float:
     """Computes the mean gap between an obstacle and its nearest neighbor, in vehicle diameters.
-
     Obstacles are the connected parts of the occupied space in the slice z = `height` [m], on a grid
-    of 0.1 m. NaN for fewer than two.
-    """
+    of 0.1 m. NaN for fewer than two."""
     step = 0.1
     x, y = (
         np.arange(low + step / 2, high, step)

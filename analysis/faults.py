@@ -384,11 +384,9 @@ class FaultsConfig(Config):
 
 @locks_folder("out")
 def run(*, config: FaultsConfig, out: Path) -> dict[str, Any]:
-    """Flies the trials, or resumes an interrupted campaign of the same configuration.
-
-    Writes into `out`: `trials.jsonl`, results of `fly_trial`; `config.yaml`; `summary.json`, the
-    number of safe trials and the outcomes by the type of fault, which is also returned.
-    """
+    """Flies the trials, or resumes an interrupted campaign of the same configuration. Writes into
+    `out`: `trials.jsonl`, results of `fly_trial`; `config.yaml`; `summary.json`, the number of safe
+    trials and the outcomes by the type of fault, which is also returned."""
     config.validate()
     claim_folder(out / "config.yaml", config)
     lines = out / "trials.jsonl"

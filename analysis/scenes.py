@@ -44,10 +44,7 @@ def run(
     *, names: Sequence[str], data: Path | None, scenes: Path, overrides: Sequence[str] = ()
 ) -> None:
     """Makes the scene folders `scenes/NAME` of `RECIPES`, or of the benchmark; the same call
-    resumes.
-
-    Rendered captures are kept in `scenes/captures/NAME`.
-    """
+    resumes. Rendered captures are kept in `scenes/captures/NAME`."""
     names = list(names) or list(BENCHMARK_SCENES)
     for name in names:
         if name not in RECIPES:

@@ -64,10 +64,8 @@ def run(
     overwrite: bool = False,
 ) -> Path:
     """Writes a page of a scene folder, a file of Gaussians, an OctoMap, a capture or a scenario.
-
     The default `out` is `out/view/NAME.html`, or `NAME-SEED.html` of a generated world; `overrides`
-    are FIELD=VALUE of the scenario, or of the capture's `CaptureConfig`.
-    """
+    are FIELD=VALUE of the scenario, or of the capture's `CaptureConfig`."""
     path = Path(what)
     name = path.resolve().name if path.is_dir() else path.stem
     scenario = generated_scenario(path, seed, overrides)

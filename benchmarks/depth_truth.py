@@ -74,10 +74,8 @@ def depth_errors(frames: Iterable[DepthFrame], reach: float, edges: bool = True)
 
 
 class TrueDepth:
-    """Renders exact depth of the solids of a generated world.
-
-    Scenery beyond the volume has no solids, nor have the crowns of forests above it.
-    """
+    """Renders exact depth of the solids of a generated world. Scenery beyond the volume has no
+    solids, nor have the crowns of forests above it."""
 
     def __init__(self, spec: WorldSpec) -> None:
         self._lower_W, self._upper_W = spec.lower_W - _BEYOND, spec.upper_W + _BEYOND

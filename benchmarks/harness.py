@@ -19,10 +19,8 @@ from splatpilot.training.captures.capture_registry import read_capture
 
 
 def milliseconds(call: Callable[[], object], repeats: int = 30) -> float:
-    """Returns the minimum CPU time of the process [ms] over `repeats` calls, after a first one.
-
-    CPU time does not count the waiting on a busy machine.
-    """
+    """Returns the minimum CPU time of the process [ms] over `repeats` calls, after a first one. CPU
+    time does not count the waiting on a busy machine."""
     durations = []
     call()
     for _ in range(repeats):

@@ -24,23 +24,16 @@ import numpy as np
 from drake import lcmt_image_array
 from harness import header, machine, row
 
-from splatpilot.systems.messaging.generated import (
-    lcmt_body_rate_command,
-    lcmt_bridge_status,
-    lcmt_depth_grid,
-    lcmt_quadrotor_state,
-    lcmt_trajectory_hypotheses,
-    lcmt_velocity_setpoint,
-)
+from splatpilot.systems.messaging import generated
 
 TYPES = {
-    "QUADROTOR_STATE": lcmt_quadrotor_state,
+    "QUADROTOR_STATE": generated.lcmt_quadrotor_state,
     "DEPTH_IMAGE": lcmt_image_array,
-    "DEPTH_GRID": lcmt_depth_grid,
-    "TRAJECTORY_HYPOTHESES": lcmt_trajectory_hypotheses,
-    "BODY_RATE_COMMAND": lcmt_body_rate_command,
-    "VELOCITY_SETPOINT": lcmt_velocity_setpoint,
-    "BRIDGE_STATUS": lcmt_bridge_status,
+    "DEPTH_GRID": generated.lcmt_depth_grid,
+    "TRAJECTORY_HYPOTHESES": generated.lcmt_trajectory_hypotheses,
+    "BODY_RATE_COMMAND": generated.lcmt_body_rate_command,
+    "VELOCITY_SETPOINT": generated.lcmt_velocity_setpoint,
+    "BRIDGE_STATUS": generated.lcmt_bridge_status,
 }
 REGULAR = ("QUADROTOR_STATE", "BODY_RATE_COMMAND", "VELOCITY_SETPOINT")
 PERIOD = 20.0  # [ms], of regular messages

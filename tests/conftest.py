@@ -15,6 +15,13 @@ tqdm.monitor_interval = 0
 settings.register_profile("repeatable", deadline=None, derandomize=True)
 settings.load_profile("repeatable")
 
+_SLOWEST = "test_wheel.py", "test_crash.py"
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begins with the files that take longest, so that parallel workers end together."""
+    items.sort(key=lambda item: item.path.name not in _SLOWEST)
+
 
 @pytest.fixture(scope="session", autouse=True)
 def cache_of_the_tests(tmp_path_factory) -> None:

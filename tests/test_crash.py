@@ -56,9 +56,8 @@ class Command:
         words, self._patterns = COMMANDS[name]
         self._words, self._valid, self._folder = words.split(), root / "valid", root / "run"
         self._context = multiprocessing.get_context("forkserver")
-        self._context.set_forkserver_preload(
-            ["splatpilot.analysis.commands.main", "splatpilot.training.reconstruction.reconstruct"]
-        )
+        modules = "commands.main", "benchmark.run_study", "reconstruction.run"
+        self._context.set_forkserver_preload([f"splatpilot.analysis.{name}" for name in modules])
         write_room_capture(self._valid / "room")
         (self._valid / "short.yaml").write_text(SCENARIO)
         started = time.monotonic()

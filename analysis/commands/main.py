@@ -148,9 +148,7 @@ def run() -> NoReturn:
 
 def main(arguments: list[str] | None = None) -> int:
     """Runs `splatpilot COMMAND ...` and returns its exit status, see `splatpilot --help`.
-
-    `arguments` are the words after `splatpilot`; those of the process if None.
-    """
+    `arguments` are the words after `splatpilot`; those of the process if None."""
     parser = build_parser()
     if "_ARGCOMPLETE" in os.environ:
         import argcomplete

@@ -13,15 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splatpilot.analysis.benchmark.variants import parse_variant
-from splatpilot.analysis.commands.checks import (
-    POLICIES,
-    SCENARIOS,
-    check_kind,
-    check_policy,
-    check_scenario,
-    describe_kinds,
-    find_input,
-)
+from splatpilot.analysis.commands import checks
 from splatpilot.systems.common.files import require_existing, require_scene, require_unused
 
 if TYPE_CHECKING:
@@ -29,11 +21,9 @@ if TYPE_CHECKING:
 
 
 class Option:
-    """An option or argument of commands.
-
-    `resolve` checks a value before slow imports, and returns it or what it names; the path of an
-    `unused` option must not exist without --overwrite; of `exclusive` ones at most one is given.
-    """
+    """An option or argument of commands. `resolve` checks a value before slow imports, and returns
+    it or what it names; the path of an `unused` option must not exist without --overwrite; of
+    `exclusive` ones at most one is given."""
 
     def __init__(
         self,
@@ -217,8 +207,8 @@ def path_option(spec: str, what: str, **keywords: Any) -> Option:
 
 def input_option(name: str, *kinds: str, **keywords: Any) -> Option:
     """Declares an argument for environments of these kinds, see `find_input`."""
-    help = describe_kinds(kinds)
-    return Option(name, help, resolve=lambda path: find_input(path, *kinds), **keywords)
+    help = checks.describe_kinds(kinds)
+    return Option(name, help, resolve=lambda path: checks.find_input(path, *kinds), **keywords)
 
 
 def json_option(what: str) -> Option:
@@ -263,7 +253,7 @@ def read_scenario(options: argparse.Namespace) -> "Scenario":
 
 
 def _check_scene(path: Path) -> Path:
-    check_kind(require_scene(str(path)), "scene", "gaussians", "map")
+    checks.check_kind(require_scene(str(path)), "scene", "gaussians", "map")
     return path
 
 
@@ -271,14 +261,14 @@ SCENARIO_OPTIONS = (
     Option(
         "--scenario P02|FILE.yaml",
         "scenario to fly: one of the benchmark, or a file",
-        resolve=check_scenario,
-        completions=SCENARIOS,
+        resolve=checks.check_scenario,
+        completions=checks.SCENARIOS,
     ),
     Option(
         "--policy NAME[:FIELD=VALUE]",
-        f"policy: {', '.join(POLICIES)}, a file of weights, or module:Class",
-        resolve=check_policy,
-        completions=POLICIES,
+        f"policy: {', '.join(checks.POLICIES)}, a file of weights, or module:Class",
+        resolve=checks.check_policy,
+        completions=checks.POLICIES,
     ),
     Option("--speed M/S", "nominal, of any policy", float),
     Option(

@@ -97,10 +97,8 @@ def run(
     overwrite: bool = False,
 ) -> list[FidelityStudy]:
     """Studies scene folders, and writes the bounds into their `scene.yaml` and `fidelity.png`,
-    `fidelity.csv`, `fidelity.yaml` and image grids into `out`.
-
-    `find_camera` returns the camera that renders the truth of a capture's folder, or None.
-    """
+    `fidelity.csv`, `fidelity.yaml` and image grids into `out`. `find_camera` returns the camera
+    that renders the truth of a capture's folder, or None."""
     config.validate()
     names = [scene.resolve().name for scene in scenes]
     if len(set(names)) < len(names):

@@ -193,11 +193,8 @@ def drop_frames(capture: Capture, held_out: Sequence[int]) -> Capture:
 def displace_pose(
     X_WCs: Sequence[RigidTransform], i: int, offset: float
 ) -> tuple[RigidTransform, RigidTransform, RigidTransform, RigidTransform]:
-    """Returns pose i of a path moved by `offset` [m] left, right, up and down.
-
-    Left is horizontal and perpendicular to the path or, if that is vertical or at rest, along the
-    camera's -x axis.
-    """
+    """Returns pose i of a path moved by `offset` [m] left, right, up and down. Left is horizontal
+    and perpendicular to the path or, if that is vertical or at rest, along the camera's -x axis."""
     before, after = X_WCs[max(i - 1, 0)], X_WCs[min(i + 1, len(X_WCs) - 1)]
     path = after.translation() - before.translation()
     left = np.array([-path[1], path[0], 0.0])
@@ -212,12 +209,9 @@ def displace_pose(
 
 
 class ViewSupport:
-    """The fraction of a view's pixels whose surface a fitted camera saw similarly.
-
-    One of the 16 closest cameras saw the point at the depth of the scene (within 5 %), from a
-    direction within 45 degrees and from at most twice the distance. `camera` is K (3, 3), width and
-    height [px].
-    """
+    """The fraction of a view's pixels whose surface a fitted camera saw similarly. One of the 16
+    closest cameras saw the point at the depth of the scene (within 5 %), from a direction within 45
+    degrees and from at most twice the distance. `camera` is K (3, 3), width and height [px]."""
 
     def __init__(
         self,

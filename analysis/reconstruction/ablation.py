@@ -10,13 +10,7 @@ from typing import Any
 import numpy as np
 
 from splatpilot.analysis.output import write_csv
-from splatpilot.analysis.reconstruction.figures import (
-    Panel,
-    depth_scale,
-    error_scale,
-    mark_floaters,
-    write_grid,
-)
+from splatpilot.analysis.reconstruction import figures
 from splatpilot.analysis.reconstruction.measure_scene import (
     NAMES,
     SceneMetrics,
@@ -277,20 +271,22 @@ def _write_grid(path: Path, capture: Capture, out: Path, result: AblationResult)
     ordered = sorted(frames, key=lambda i: frames[i].floater_fraction or 0.0)
     i = ordered[len(ordered) // 2]
     drawn = sorted(PAPER, key=lambda arm: (arm.step != "points", arm.key))
-    depths, errors = None, error_scale(_ERROR_LIMIT)
-    rows: list[list[Panel | None]] = [[], [], [], []]
+    depths, errors = None, figures.error_scale(_ERROR_LIMIT)
+    rows: list[list[figures.Panel | None]] = [[], [], [], []]
     for arm in drawn:
         views = SceneViews(out / arm.key, capture)
         frame, found = views.frame(i), arms[arm.key].frames[i]
-        depths = depths or depth_scale([frame.depth])
+        depths = depths or figures.depth_scale([frame.depth])
         labels = format_metric(found.psnr_db, "{:.1f} dB"), f"{found.depth_mae_m or 0.0:.2f} m"
         truth, image, true_depth, *depth = views.panels(frame, depths, errors, labels)
         if not rows[0]:
             rows = [[truth], [None], [true_depth], [None]]
-        marked = mark_floaters(image.image, floaters(views.render(frame).depth, frame.depth))
-        panels = image, Panel(marked, f"{found.floater_fraction or 0.0:.1%}"), *depth
+        marked = figures.mark_floaters(
+            image.image, floaters(views.render(frame).depth, frame.depth)
+        )
+        panels = image, figures.Panel(marked, f"{found.floater_fraction or 0.0:.1%}"), *depth
         for row, panel in zip(rows, panels, strict=True):
             row.append(panel)
     columns = ["captured", *(arm.title.partition(",")[0] for arm in drawn)]
     titles = [f"frame {i}", "floaters", "depth", "depth error"]
-    write_grid(path, rows, columns, titles, [None, None, depths, errors])
+    figures.write_grid(path, rows, columns, titles, [None, None, depths, errors])

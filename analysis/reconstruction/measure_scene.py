@@ -19,13 +19,7 @@ from splatpilot.analysis.reconstruction.figures import (
 )
 from splatpilot.diagrams.flight.flight_diagram import MakeCamera
 from splatpilot.diagrams.flight.scenario import Scenario
-from splatpilot.diagrams.worlds.scene_folder import (
-    FRONTIER,
-    SceneMetadata,
-    read_background,
-    read_scene_folder,
-    read_scene_metadata,
-)
+from splatpilot.diagrams.worlds import scene_folder
 from splatpilot.systems.common.files import require_unused, written_atomically
 from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.common.provenance import InfeasibleFlightError
@@ -149,8 +143,8 @@ class SceneViews:
     """A scene folder and its capture, by default that of `scene.yaml`."""
 
     def __init__(self, scene: Path, capture: Capture | None = None):
-        self.metadata: SceneMetadata = read_scene_metadata(scene)
-        self.background = read_background(scene, self.metadata)
+        self.metadata: scene_folder.SceneMetadata = scene_folder.read_scene_metadata(scene)
+        self.background = scene_folder.read_background(scene, self.metadata)
         self.capture = capture = capture or read_scene_capture(scene, self.metadata)
         missing = [i for i in self.metadata.held_out if i >= len(capture)]
         if missing:
@@ -233,7 +227,7 @@ def measure_scene(scene: Path, capture: Capture | None = None) -> SceneMetrics:
 def run(scene: Path, overwrite: bool = False) -> SceneMetrics:
     """Measures a scene folder, see `measure_scene`, and prints its origin and the table."""
     require_unused(scene / METRICS, overwrite)
-    metadata = read_scene_metadata(scene)
+    metadata = scene_folder.read_scene_metadata(scene)
     metrics = measure_scene(scene)
     if metadata.provenance:
         print(f"{'made from':<22} {metadata.provenance}")
@@ -272,10 +266,10 @@ def _write_views(path: Path, views: SceneViews, metrics: SceneMetrics) -> None:
 def unseen_fraction(scene: Path) -> float | None:
     """Returns the mean fraction of the onboard camera's pixels that show the frontier, looking
     ahead along the route from start to goal; None without a route."""
-    metadata = read_scene_metadata(scene)
+    metadata = scene_folder.read_scene_metadata(scene)
     if not metadata.metric:
         return None
-    world = read_scene_folder(scene)
+    world = scene_folder.read_scene_folder(scene)
     try:
         toa = time_of_arrival(world.esdf.conservative(), world.p_WG)
     except InfeasibleFlightError:
@@ -288,7 +282,7 @@ def unseen_fraction(scene: Path) -> float | None:
         replace(gaussians, sh=np.full((len(gaussians), 1, 3), color_to_sh(gray), np.float32))
         for gaussians, gray in (
             (read_ply(scene / "gaussians.ply"), 0.0),
-            (read_ply(scene / FRONTIER), 1.0),
+            (read_ply(scene / scene_folder.FRONTIER), 1.0),
         )
     )
     painted = seen.merged_with(frontier)

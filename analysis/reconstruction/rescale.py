@@ -9,15 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
-from splatpilot.diagrams.worlds.scene_folder import (
-    FRONTIER,
-    SceneMetadata,
-    check_scene_target,
-    close_frontier,
-    read_background,
-    read_scene_metadata,
-    write_scene_folder,
-)
+from splatpilot.diagrams.worlds import scene_folder
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.common.config import load_config
@@ -65,11 +57,8 @@ class RescaleSummary:
 def rescale_file(
     file: Path, out: Path, factor: float, up: str, floor: Sequence[ArrayLike]
 ) -> RescaleSummary:
-    """Writes the Gaussians of a file as PLY, in meters and with z up.
-
-    Its axis `up` becomes z. If `floor` has three points (3,), their plane becomes z = 0, and `up`
-    tells its upper side.
-    """
+    """Writes the Gaussians of a file as PLY, in meters and with z up. Its axis `up` becomes z. If
+    `floor` has three points (3,), their plane becomes z = 0, and `up` tells its upper side."""
     if out.suffix.lower() != ".ply":
         raise ValueError(f"{out}: Gaussians are written as PLY; name it so, {out.stem}.ply")
     if out.exists():
@@ -125,11 +114,9 @@ def run(
     up: str | None = None,
     floor: Sequence[ArrayLike] = (),
 ) -> RescaleSummary:
-    """Scales a scene folder by `rescale`, or a file of Gaussians by `rescale_file`.
-
-    The factor is given, or follows from the distance between two points (3,) or from the median
-    height of the capture's cameras [m].
-    """
+    """Scales a scene folder by `rescale`, or a file of Gaussians by `rescale_file`. The factor is
+    given, or follows from the distance between two points (3,) or from the median height of the
+    capture's cameras [m]."""
     if scene.is_file() and height is not None:
         raise ValueError(f"{scene}: a file has no cameras; give a factor, or points and a distance")
     if scene.is_dir() and (up is not None or len(floor)):
@@ -141,7 +128,7 @@ def run(
         factor = _positive("distance", distance) / length
     elif height is not None:
         factor = _positive("height", height) / camera_height(
-            read_scene_capture(scene, read_scene_metadata(scene))
+            read_scene_capture(scene, scene_folder.read_scene_metadata(scene))
         )
     elif factor is None and (up is not None or len(floor)):
         factor = 1.0
@@ -161,27 +148,29 @@ def rescale(scene: Path, out: Path, factor: float) -> RescaleSummary:
     _positive("factor", factor)
     if out.exists():
         raise ValueError(f"{out}: exists already; choose another folder for the scaled scene")
-    check_scene_target(out)
-    metadata = read_scene_metadata(scene)
+    scene_folder.check_scene_target(out)
+    metadata = scene_folder.read_scene_metadata(scene)
     gaussians = read_ply(scene / "gaussians.ply").scaled_by(factor)
     field = Esdf.load(scene / "esdf.npz").scaled_by(factor)
     about, warnings = _about_capture(metadata, factor)
     frontier = None
     if metadata.frontier:
-        frontier = read_ply(scene / FRONTIER).scaled_by(factor)
+        frontier = read_ply(scene / scene_folder.FRONTIER).scaled_by(factor)
     elif not metadata.metric:
         try:
             capture = read_scene_capture(scene, about)
             shrunk = shrink_factor(capture.width, about.image_width)
             threads = ReconstructConfig().renderer_threads
             depth = render_depth(capture, shrunk, gaussians, about.representation, threads)
-            field, frontier = close_frontier(field, depth.images(), depth.K, depth.X_WCs)
+            field, frontier = scene_folder.close_frontier(
+                field, depth.images(), depth.K, depth.X_WCs
+            )
         except (ValueError, OSError) as error:
             warnings += (f"the frontier of the scene stays open: {error}",)
     ends = factor * np.array(metadata.p_WS), factor * np.array(metadata.p_WG)
     p_WS, p_WG, geodesic, unflyable = start_and_goal(field, True, ends)
-    background = read_background(scene, metadata)
-    write_scene_folder(
+    background = scene_folder.read_background(scene, metadata)
+    scene_folder.write_scene_folder(
         out,
         World(metadata.name, gaussians, field, field, background, p_WS, p_WG),
         frontier,
@@ -193,7 +182,9 @@ def rescale(scene: Path, out: Path, factor: float) -> RescaleSummary:
     return RescaleSummary(out, factor, size, details, (*warnings, *unflyable))
 
 
-def _about_capture(metadata: SceneMetadata, factor: float) -> tuple[SceneMetadata, tuple[str, ...]]:
+def _about_capture(
+    metadata: scene_folder.SceneMetadata, factor: float
+) -> tuple[scene_folder.SceneMetadata, tuple[str, ...]]:
     """Returns the metadata of a scaled scene about its capture, and warnings. It forgets a capture
     whose measured depth gives the scale."""
     metadata = replace(metadata, origin=[factor * x for x in metadata.origin])

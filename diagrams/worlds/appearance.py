@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from splatpilot.diagrams.worlds.solids.shading import GAMMA
+from splatpilot.diagrams.worlds.solids.textures import GAMMA
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.esdf import interpolate_grid
 from splatpilot.systems.splats.background import Background, EnvironmentMap
@@ -91,10 +91,8 @@ def with_appearance(world: World, look: Appearance) -> World:
 
 
 def recolored(scene: GaussianScene, look: Appearance) -> GaussianScene:
-    """Returns the Gaussians in other colors.
-
-    The base color is painted and lit again; the view dependence scales with its brightness.
-    """
+    """Returns the Gaussians in other colors. The base color is painted and lit again; the view
+    dependence scales with its brightness."""
     before, normals = scene.base_colors, scene.normals  # (N, 3)
     after = np.empty_like(before)
     for first in range(0, len(before), _BATCH):

@@ -8,9 +8,9 @@ from numpy.typing import ArrayLike, NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
 from splatpilot.diagrams.worlds.solids.patterns import SIGN
-from splatpilot.diagrams.worlds.solids.shading import Daylight, Illumination, Lamplight, Sunlight
 from splatpilot.diagrams.worlds.solids.solid import Solid, WorldSpec
 from splatpilot.diagrams.worlds.solids.surfaces import FloorPlan
+from splatpilot.diagrams.worlds.solids.textures import Daylight, Illumination, Lamplight, Sunlight
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.esdf_build import grid_shape
 from splatpilot.systems.collision.shapes import Box, HalfSpace, Shape, ShapeUnion
@@ -181,9 +181,7 @@ def poisson_disk(
     lower: ArrayLike, upper: ArrayLike, spacing: float, rng: np.random.Generator
 ) -> NDArray[np.float64]:
     """Fills the rectangle [lower, upper], (2,) [m], with points (N, 2) at least `spacing` apart.
-
-    Bridson's algorithm (2007), with a grid of cells that hold at most one point.
-    """
+    Bridson's algorithm (2007), with a grid of cells that hold at most one point."""
     lower, upper = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
     cell = spacing / np.sqrt(2)
     grid = np.full((*(np.floor((upper - lower) / cell).astype(int) + 5), 2), np.inf)

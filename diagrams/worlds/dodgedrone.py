@@ -7,10 +7,10 @@ from numpy.typing import NDArray
 
 from splatpilot.diagrams.worlds.building_blocks import daylight, ground
 from splatpilot.diagrams.worlds.forest.forest import trees_around
-from splatpilot.diagrams.worlds.solids.shading import Illumination
 from splatpilot.diagrams.worlds.solids.solid import Solid, WorldSpec
 from splatpilot.diagrams.worlds.solids.surfaces import FloorPlan
 from splatpilot.diagrams.worlds.solids.surfels import build, draw
+from splatpilot.diagrams.worlds.solids.textures import Illumination
 from splatpilot.diagrams.worlds.world import MovingBodies, World
 from splatpilot.systems.collision.shapes import MovingSpheres, Sphere
 from splatpilot.systems.common.validation import Config, bounded

@@ -48,10 +48,8 @@ def until_feasible[C: Config](
 
 
 def is_feasible(spec: WorldSpec) -> bool:
-    """Checks that start and goal are clear and that a path joins them.
-
-    A coarse grid finds most paths; the finest finds those through gaps of 1 m.
-    """
+    """Checks that start and goal are clear and that a path joins them. A coarse grid finds most
+    paths; the finest finds those through gaps of 1 m."""
     field, ends = spec.distance_field, (spec.p_WS, spec.p_WG)
     if not (conservative_distance(field, np.stack(ends)) >= CLEARANCE).all():
         return False
@@ -67,11 +65,9 @@ def conservative_distance(field: DistanceField, p_WQ: NDArray) -> NDArray[np.flo
 def connects(
     field: DistanceField, p_WS: NDArray, p_WG: NDArray, radius: float, spacing: float
 ) -> bool:
-    """Checks by a grid that a sphere of `radius` [m] can fly from p_WS to p_WG (3,) [m].
-
-    Neighbors along an axis, `spacing` h [m] apart, both farther than radius + h / 2 from every
-    obstacle, are joined by a free segment, since distances change no faster than the position.
-    """
+    """Checks by a grid that a sphere of `radius` [m] can fly from p_WS to p_WG (3,) [m]. Neighbors
+    along an axis, `spacing` h [m] apart, both farther than radius + h / 2 from every obstacle, are
+    joined by a free segment, since distances change no faster than the position."""
     grid = grid_distances(field, spacing)
     free = grid > radius + spacing / 2
     return are_connected(free, *(grid_cell(field, grid, spacing, p) for p in (p_WS, p_WG)))
@@ -171,10 +167,8 @@ def choose_ends(
 
 
 def _longest_part(esdf: Esdf, radius: float, margin: float, longest: float, least: float) -> _Part:
-    """Returns the connected part of the free space with the longest path, up to `longest` [m].
-
-    Half of the margin is preferred for a path `_GAIN` times as long if one is not `LONG_ENOUGH`.
-    """
+    """Returns the connected part of the free space with the longest path, up to `longest` [m]. Half
+    of the margin is preferred for a path `_GAIN` times as long if one is not `LONG_ENOUGH`."""
     best, reach = None, 0.0
     for graph, p_WN, spacing in _free_graphs(esdf, radius, margin):
         if best is not None and best.length >= max(LONG_ENOUGH, least):

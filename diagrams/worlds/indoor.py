@@ -155,11 +155,8 @@ JAMB = 0.25  # [m], minimum length of wall between a door and a corner
 
 @dataclass
 class OfficeConfig(blocks.VolumeConfig):
-    """A floor divided into rooms, with start and goal in rooms at opposite ends.
-
-    Walls divide it until no side is twice `room`. Every wall has one or two doors, so all rooms are
-    connected.
-    """
+    """A floor divided into rooms, with start and goal in rooms at opposite ends. Walls divide it
+    until no side is twice `room`. Every wall has one or two doors, so all rooms are connected."""
 
     length: float = bounded(22.0, "[6, 200] m")  # [m] along x: from 0 to length
     width: float = bounded(14.0, "[4, 200] m")  # [m] along y, centered on 0

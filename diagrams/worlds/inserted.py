@@ -10,9 +10,9 @@ from scipy.ndimage import label
 from splatpilot.diagrams.worlds.building_blocks import TIGHT_CLEARING, has_clearance, require_order
 from splatpilot.diagrams.worlds.feasibility import TRIES, choose_ends
 from splatpilot.diagrams.worlds.scene_folder import SceneSource, read_scene_world
-from splatpilot.diagrams.worlds.solids.shading import Lamplight
 from splatpilot.diagrams.worlds.solids.solid import Solid, WorldSpec, cut_faces
 from splatpilot.diagrams.worlds.solids.surfels import draw
+from splatpilot.diagrams.worlds.solids.textures import Lamplight
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf
@@ -44,11 +44,9 @@ class InsertedConfig(SceneSource):
 
 
 def inserted_world(config: InsertedConfig, seed: int) -> World:
-    """Reads the scene and inserts solids drawn from the seed near the line from start to goal.
-
-    Any two are at least `gap` apart, start and goal keep 0.9 m, and a route remains that is `gap`
-    wide everywhere.
-    """
+    """Reads the scene and inserts solids drawn from the seed near the line from start to goal. Any
+    two are at least `gap` apart, start and goal keep 0.9 m, and a route remains that is `gap` wide
+    everywhere."""
     config.validate()
     scene = read_scene_world(config, seed)
     for attempt in range(TRIES):

@@ -11,8 +11,14 @@ from scipy.ndimage import binary_dilation, gaussian_filter, map_coordinates
 from splatpilot.diagrams.worlds.feasibility import choose_ends
 from splatpilot.diagrams.worlds.scene_folder import SceneSource, find_scene
 from splatpilot.diagrams.worlds.solids import surfaces
-from splatpilot.diagrams.worlds.solids.shading import GAMMA, Daylight, develop
-from splatpilot.diagrams.worlds.solids.textures import fbm, hash_unit, ramp
+from splatpilot.diagrams.worlds.solids.textures import (
+    GAMMA,
+    Daylight,
+    develop,
+    fbm,
+    hash_unit,
+    ramp,
+)
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf

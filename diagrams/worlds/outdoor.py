@@ -188,12 +188,9 @@ class WallsConfig(blocks.VolumeConfig):
 
 @until_feasible
 def walls_spec(config: WallsConfig, seed: int, rng: np.random.Generator) -> WorldSpec:
-    """Builds the hall of `config`.
-
-    `big_wall` leaves a gap at either side of one wall; `u_trap` opens a cul-de-sac toward the
-    start; the walls of `slits` have one slit each, away from the last; those of `slalom` leave gaps
-    at alternating sides.
-    """
+    """Builds the hall of `config`. `big_wall` leaves a gap at either side of one wall; `u_trap`
+    opens a cul-de-sac toward the start; the walls of `slits` have one slit each, away from the
+    last; those of `slalom` leave gaps at alternating sides."""
     plan = config.plan
     across = {"big_wall": _big_wall, "u_trap": _u_trap, "slits": _slits, "slalom": _slalom}
     p_WS, p_WG = blocks.start_and_goal(plan, rng)

@@ -192,10 +192,8 @@ def write_scene_folder(
     path: str | Path, world: World, frontier: GaussianScene | None = None, **fields: Any
 ) -> SceneMetadata:
     """Writes `world` as a scene folder atomically, replacing a scene there; returns its metadata.
-
     `esdf` is its distance field, the frontier is that of `close_frontier`, and `fields` are further
-    ones of `SceneMetadata`; numpy arrays become lists.
-    """
+    ones of `SceneMetadata`; numpy arrays become lists."""
     path = Path(path).absolute()
     check_scene_target(path)
     esdf = world.esdf

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from splatpilot.diagrams.worlds.solids.shading import Illumination, shade
 from splatpilot.diagrams.worlds.solids.solid import MATERIALS, Face, Solid, WorldSpec, cut_faces
 from splatpilot.diagrams.worlds.solids.surfaces import GROUND_REACH, merge
+from splatpilot.diagrams.worlds.solids.textures import Illumination, shade
 from splatpilot.systems.collision.esdf_build import esdf_from_distance_field
 from splatpilot.systems.collision.field_mesh import add_primitive, data_uri
 from splatpilot.systems.collision.shapes import HalfSpace
@@ -53,11 +53,9 @@ class _Tile:
 
 
 def write_gltf(spec: WorldSpec, path: Path, texel: float = 0.02) -> None:
-    """Writes the world of a spec as one self-contained .gltf file, y up.
-
-    Light is baked into emissive pictures with pixels of `texel` [m] on the solids: an engine shows
-    the same colors whatever lamps it has.
-    """
+    """Writes the world of a spec as one self-contained .gltf file, y up. Light is baked into
+    emissive pictures with pixels of `texel` [m] on the solids: an engine shows the same colors
+    whatever lamps it has."""
     light = spec.light(esdf_from_distance_field(spec.distance_field, spec.voxel_size))
     meshes = _solid_meshes(spec, light, texel)
     if surroundings := spec.surroundings():

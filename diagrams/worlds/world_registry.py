@@ -47,11 +47,9 @@ def register_world(
     make: Callable[[Any, int], World] | None = None,
     make_spec: Callable[[Any, int], WorldSpec] | None = None,
 ) -> None:
-    """Registers a world, so that scenarios can name it by its configuration's type.
-
-    `make` and `make_spec` map a configuration and a seed to a world and to a spec, to train and
-    render captures in it; by default `make` draws the spec.
-    """
+    """Registers a world, so that scenarios can name it by its configuration's type. `make` and
+    `make_spec` map a configuration and a seed to a world and to a spec, to train and render
+    captures in it; by default `make` draws the spec."""
     if make is None and make_spec is None:
         raise ValueError(f"{config.__name__}: give make or make_spec")
     require_configuration(config)
@@ -60,10 +58,8 @@ def register_world(
 
 
 def make_world(config: WorldConfig, seed: int) -> World:
-    """Generates or reads the world of a registered configuration.
-
-    The seed is of generated worlds, inserted obstacles, and start and goal if they are drawn.
-    """
+    """Generates or reads the world of a registered configuration. The seed is of generated worlds,
+    inserted obstacles, and start and goal if they are drawn."""
     world = WORLDS.entry_for(config).make(config, seed)
     if not isinstance(world, World):
         name, made = type(config).__name__, type(world).__name__

@@ -7,12 +7,12 @@ import numpy as np
 from scipy.ndimage import binary_dilation
 
 from splatpilot.systems.collision.distance_field import DistanceField, FieldState
-from splatpilot.systems.collision.distance_transform import (
+from splatpilot.systems.collision.esdf import (
+    Esdf,
     distances_from_band,
     neighbor_slices,
     occupancy_distances,
 )
-from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.splats.scene import GaussianScene

@@ -8,12 +8,12 @@ from pydrake.math import RigidTransform
 from scipy.ndimage import binary_dilation, label, maximum_filter
 
 from splatpilot.systems.collision.distance_field import FieldState
-from splatpilot.systems.collision.distance_transform import (
+from splatpilot.systems.collision.esdf import (
+    Esdf,
     distance_to_voxels,
     neighbor_slices,
     occupancy_distances,
 )
-from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.splats.background import FAR
 
 

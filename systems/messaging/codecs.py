@@ -20,11 +20,9 @@ from splatpilot.systems.policies.hypotheses import (
 
 
 class Codec:
-    """Converts a signal to messages of one channel and back.
-
-    By default the signal is a vector of the message's `fields`, in their order. Quaternions, whose
-    names begin with q, have length 1, and all numbers are finite but those of `unbounded` fields.
-    """
+    """Converts a signal to messages of one channel and back. By default the signal is a vector of
+    the message's `fields`, in their order. Quaternions, whose names begin with q, have length 1,
+    and all numbers are finite but those of `unbounded` fields."""
 
     channel: ClassVar[str]
     port: ClassVar[str]  # Name of the ports of the signal.

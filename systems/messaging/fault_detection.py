@@ -46,11 +46,9 @@ class Signals(NamedTuple):
         law: FlatnessControllerConfig,
         box: Box,
     ) -> int:
-        """Returns the most severe fault, a reason of `lcmt_bridge_status`, or NONE.
-
-        The limits of `law` hold for the command. The box must hold the vehicle, unless only
-        commands are sent: their sender is responsible for the position.
-        """
+        """Returns the most severe fault, a reason of `lcmt_bridge_status`, or NONE. The limits of
+        `law` hold for the command. The box must hold the vehicle, unless only commands are sent:
+        their sender is responsible for the position."""
         max_rates = _TOLERANCE * np.array([law.max_tilt_rate, law.max_tilt_rate, law.max_yaw_rate])
         max_thrust = _TOLERANCE * law.max_thrust
         thrust, rates, p_WB = self.command[0], self.command[1:], self.state.p_WB

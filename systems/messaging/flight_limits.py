@@ -78,11 +78,9 @@ class Motion(NamedTuple):
         deceleration: float,
         law: FlatnessControllerConfig,
     ) -> "Motion":
-        """Predicts where a vehicle that is controlled by a delayed state comes to rest.
-
-        A command takes effect after a dead time: the `age` of the state [s], for which it is
-        predicted, `unpredicted` age [s], the lag of the attitude, and the period of commands.
-        """
+        """Predicts where a vehicle that is controlled by a delayed state comes to rest. A command
+        takes effect after a dead time: the `age` of the state [s], for which it is predicted,
+        `unpredicted` age [s], the lag of the attitude, and the period of commands."""
         stop = stopping_displacement(v_WB, RESPONSE_TIME, deceleration)
         dead_time = max(age, 0.0) + unpredicted + 1.0 / law.tilt_gain + law.period
         return cls(p_WB, stop + unpredicted * v_WB, math.e * dead_time)

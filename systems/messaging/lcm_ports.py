@@ -308,10 +308,8 @@ def recorded(lcm: LCM, path: Path, overwrite: bool = False) -> Iterator[None]:
 
 def replay(path: Path, lcm: LCM, simulator: Simulator, clock: UnixClock) -> None:
     """Simulates a diagram while it receives the messages of a log at the times of their arrival.
-
     The same log gives a bitwise identical simulation. The diagram, with its `clock`, has an LCM of
-    `memq://`; its time is 0, the time of the first message.
-    """
+    `memq://`; its time is 0, the time of the first message."""
     if not path.is_file():
         raise FileNotFoundError(f"No such file: {path}")
     events = [(event.timestamp, event.channel, event.data) for event in EventLog(path)]

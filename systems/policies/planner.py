@@ -15,8 +15,7 @@ from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.common.validation import Config, bounded, require, require_type
 from splatpilot.systems.policies.base import Policy
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS, Hypotheses, no_plan
-from splatpilot.systems.policies.lattice import LatticeConfig, TrajectoryLattice
-from splatpilot.systems.policies.motion_primitives import level_acceleration
+from splatpilot.systems.policies.lattice import LatticeConfig, TrajectoryLattice, level_acceleration
 from splatpilot.systems.policies.time_of_arrival import TimeOfArrival, time_of_arrival
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS, QuadrotorParams
 from splatpilot.systems.vehicle.state import QuadrotorState, pose_from_state

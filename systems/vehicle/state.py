@@ -81,8 +81,10 @@ def make_pose(p_WB: np.ndarray, q_WB: np.ndarray) -> RigidTransform:
 def require_rotation(q_WB: np.ndarray) -> Any:
     """Returns the length of a quaternion (4,); raises ValueError if it is zero or not finite."""
     norm = np.sqrt(q_WB.dot(q_WB))
-    condition = "a rotation (w, x, y, z), entries 6 to 9 of the state,"
-    require(1e-9 < norm < math.inf, "q_WB", condition, q_WB.tolist())
+    condition = "a rotation (w, x, y, z) in entries 6 to 9 of the state"
+    require(
+        1e-9 < norm < math.inf, "q_WB", condition, q_WB.tolist(), "check the estimator or plant"
+    )
     return norm
 
 

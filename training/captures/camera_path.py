@@ -77,14 +77,9 @@ def visiting_path(
 def poses_along(
     path: NDArray[np.float64], spacing: float, yaws: Sequence[float], pitch: float
 ) -> list[RigidTransform]:
-    """Returns the poses X_WC of a camera that stops on a path, with rounded corners, and turns.
-
-    Args:
-        path: (N, 3) [m], N >= 1; a path of one point is one stop that travels along x.
-        spacing: [m] between stops.
-        yaws: [deg] of the poses of a stop, from the direction of travel to the left.
-        pitch: [deg], upward.
-    """
+    """Returns the poses X_WC of a camera that stops every `spacing` [m] on a path (N, 3) [m], with
+    rounded corners, and turns to `yaws` [deg], to the left from the direction of travel, at a
+    `pitch` [deg], upward. A single point is one stop that travels along x."""
     path = np.asarray(path, dtype=np.float64)
     valid = path.ndim == 2 and path.shape[1] == 3 and len(path) and np.isfinite(path).all()
     require(valid, "path", "of finite points x, y, z", f"shape {path.shape}")

@@ -23,10 +23,8 @@ _ONE_SURFACE = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Lens:
-    """A camera with its distortion.
-
-    Image coordinates are those of `CaptureFrame`: the first pixel's center is (0.5, 0.5).
-    """
+    """A camera with its distortion. Image coordinates are those of `CaptureFrame`: the first
+    pixel's center is (0.5, 0.5)."""
 
     K: NDArray[np.float64]  # (3, 3) [px], of the camera without its distortion
     width: int  # [px]
@@ -93,12 +91,8 @@ def centered_pinhole(fx: float, fy: float, cx: float, cy: float) -> NDArray[np.f
 def opencv_lens(
     K: NDArray[np.float64], width: int, height: int, distortion: Sequence[float], k4: float = 0.0
 ) -> Lens:
-    """Returns a lens of OpenCV's rational model.
-
-    Args:
-        distortion: k1, k2, p1, p2, k3, ... in OpenCV's order.
-        k4: radial term of r^8, which OpenCV's model is without.
-    """
+    """Returns a lens of OpenCV's rational model. `distortion` is k1, k2, p1, p2, k3, ... in
+    OpenCV's order, `k4` the radial term of r^8, which OpenCV's model is without."""
     if not np.any(distortion) and not k4:
         return Lens(K, width, height)
     radial = [*distortion[:2], *distortion[4:]]
@@ -127,11 +121,9 @@ def _bent_lens(
 
 
 def common_pinhole(lenses: Sequence[Lens]) -> Lens:
-    """Returns the pinhole camera that images of all `lenses` are resampled into.
-
-    It has the size and center of the first, and the shortest focal length, not below the first's,
-    at which every one of its pixels is seen through every lens.
-    """
+    """Returns the pinhole camera that images of all `lenses` are resampled into. It has the size
+    and center of the first, and the shortest focal length, not below the first's, at which every
+    one of its pixels is seen through every lens."""
     first = lenses[0]
     s, zero, one = np.linspace(0, 1, 33), np.zeros(33), np.ones(33)
     sides = np.stack([[s, zero], [s, one], [zero, s], [one, s]])  # (4, 2, 33)
@@ -256,10 +248,8 @@ _EVERYWHERE = np.ones((1, 1), dtype=bool)
 
 @dataclass(frozen=True, eq=False)
 class CaptureFrame:
-    """One photograph with its depth.
-
-    The center of the pixel in column i and row j has the image coordinates (i + 0.5, j + 0.5).
-    """
+    """One photograph with its depth. The center of the pixel in column i and row j has the image
+    coordinates (i + 0.5, j + 0.5)."""
 
     image: NDArray[np.uint8]  # (H, W, 3) red, green, blue
     depth: NDArray[np.float32]  # (H, W) [m], along the optical axis; 0 unknown, inf beyond range
@@ -286,10 +276,8 @@ class SfmPoints:
 
 @dataclass(frozen=True, eq=False)
 class FileAxes:
-    """The axes in which the files of a capture give their poses.
-
-    With the pose X_FB of a body B in a world F as the files have it, X_WC = R_WF X_FB R_BC.
-    """
+    """The axes in which the files of a capture give their poses. With the pose X_FB of a body B in
+    a world F as the files have it, X_WC = R_WF X_FB R_BC."""
 
     name: str
     R_WF: RotationMatrix
@@ -314,9 +302,7 @@ def all_valid(i: int) -> NDArray[np.bool_]:
 @dataclass(frozen=True, eq=False)
 class Capture:
     """A sequence of posed images, with depth if there is any, loaded frame by frame on demand.
-
-    Cameras are pinholes: readers undistort. World W has z up and, if `metric`, is in meters.
-    """
+    Cameras are pinholes: readers undistort. World W has z up and, if `metric`, is in meters."""
 
     name: str
     source: str  # format and path, for messages

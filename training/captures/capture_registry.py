@@ -83,14 +83,9 @@ for _name, _format in _BUILT_IN.items():
 
 
 def read_capture(path: str | Path, config: CaptureConfig | None = None) -> Capture:
-    """Opens a capture of any format, which is recognized by its files.
-
-    Formats of other packages are tried first, because any folder of images passes for photographs.
-
-    Args:
-        path: a folder or a file.
-        config: settings that the files leave open; `capture.yaml` in the folder completes them.
-    """
+    """Opens a capture of any format, which is recognized by its files, those of other packages
+    first: any folder of images passes for photographs. `capture.yaml` in the folder completes
+    `config`."""
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"No such file or folder: {path}")

@@ -178,11 +178,9 @@ def doubts(capture: Capture) -> tuple[str, ...]:
 
 
 def check_capture(capture: Capture, pairs: int = 12) -> CheckReport:
-    """Measures the agreement of a capture with itself, as read and in other readings.
-
-    It agrees if its median relative error is at most 2 %, no other reading leaves less than half of
-    an error above 0.2 %, and colors follow depth. Without depth only its properties are reported.
-    """
+    """Measures the agreement of a capture with itself, as read and in other readings. It agrees if
+    its median relative error is at most 2 %, no other reading leaves less than half of an error
+    above 0.2 %, and colors follow depth. Without depth only its properties are reported."""
     if not capture.has_depth:
         return CheckReport(capture)
     found = _choose_pairs(capture, pairs)
@@ -219,11 +217,9 @@ def check_capture(capture: Capture, pairs: int = 12) -> CheckReport:
 
 
 def _choose_pairs(capture: Capture, count: int) -> list[FramePair]:
-    """Chooses frames spread over the capture, each with a later one that sees it differently.
-
-    That is at most 16 frames later: the first whose camera has moved by an eighth of the median
-    depth or rotated by ten degrees, but by no more than 45, else the last.
-    """
+    """Chooses frames spread over the capture, each with a later one that sees it differently. That
+    is at most 16 frames later: the first whose camera has moved by an eighth of the median depth or
+    rotated by ten degrees, but by no more than 45, else the last."""
     camera = capture.depth_camera
     X_CD = camera.X_CD if camera is not None else RigidTransform()
     X_DB = X_CD @ RigidTransform(capture.axes.R_BC.inverse())

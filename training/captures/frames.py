@@ -19,15 +19,8 @@ from PIL import Image
 from pydrake.math import RigidTransform, RotationMatrix
 from scipy.spatial.transform import Rotation
 
+from splatpilot.systems.common import readers
 from splatpilot.systems.common.extras import import_extra
-from splatpilot.systems.common.readers import (
-    array_layout,
-    read_array,
-    read_text,
-    readable,
-    require_file,
-    require_readable_size,
-)
 from splatpilot.systems.common.validation import require
 from splatpilot.training.captures.capture import (
     Capture,
@@ -64,8 +57,8 @@ def image_size(file: Path) -> tuple[int, int]:
 
 def _image_header(file: Path) -> tuple[tuple[int, int], str]:
     """Returns width and height [px], and Pillow's mode of the pixels."""
-    require_file(file)
-    with readable(file, "image"):
+    readers.require_file(file)
+    with readers.readable(file, "image"):
         with Image.open(file) as image:
             size, form, mode = image.size, image.format, image.mode
             if "transparency" in image.info:  # of one color, or of those of a palette
@@ -75,7 +68,7 @@ def _image_header(file: Path) -> tuple[tuple[int, int], str]:
             stream.seek(max(0, file.stat().st_size - 65536))
             if _ENDS.get(form or "", b"") not in stream.read():
                 raise ValueError("its end is missing")
-    require_readable_size(file, 4 * size[0] * size[1])
+    readers.require_readable_size(file, 4 * size[0] * size[1])
     return size, mode
 
 
@@ -85,7 +78,7 @@ def _depth_size(file: Path) -> tuple[int, int]:
         (left, top), (right, bottom) = _open_exr(file, header_only=True).header()["dataWindow"]
         return int(right - left + 1), int(bottom - top + 1)
     if file.suffix == ".npy":
-        shape, dtype = array_layout(file)
+        shape, dtype = readers.array_layout(file)
         _require_depth(file, shape, dtype)
         return shape[1], shape[0]
     size, mode = _image_header(file)
@@ -116,13 +109,10 @@ def _read_alpha(file: Path) -> NDArray[np.bool_]:
 
 def read_depth(file: Path, unit: float) -> NDArray[np.float32]:
     """Returns depth (H, W) [m] from `.npy`, `.exr`, or an image of integers or floats, in `unit`
-    per meter.
-
-    NaN, negative depth and the largest 16-bit number, which sensors write where they see nothing,
-    become 0, unknown.
-    """
+    per meter. NaN, negative depth and the largest 16-bit number, which sensors write where they see
+    nothing, become 0, unknown."""
     if file.suffix == ".npy":
-        raw = read_array(file)
+        raw = readers.read_array(file)
     elif file.suffix == ".exr":
         channels = _open_exr(file, separate_channels=True).channels()
         raw = np.asarray(next(iter(channels.values())).pixels, dtype=np.float32)
@@ -151,7 +141,7 @@ def _drop_invalid(depth: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _decode(file: Path, flags: int) -> NDArray:
-    with readable(file, "image"):
+    with readers.readable(file, "image"):
         image = cv2.imdecode(np.frombuffer(file.read_bytes(), np.uint8), flags)
         if image is None:
             raise ValueError("OpenCV cannot decode it")
@@ -160,8 +150,8 @@ def _decode(file: Path, flags: int) -> NDArray:
 
 def _open_exr(file: Path, **options: bool) -> Any:
     OpenEXR: Any = import_extra("OpenEXR", "exr")
-    require_file(file)
-    with readable(file, "EXR file"):
+    readers.require_file(file)
+    with readers.readable(file, "EXR file"):
         return OpenEXR.File(str(file), **options)
 
 
@@ -178,12 +168,12 @@ def numbered_files(folder: Path, pattern: str) -> dict[int, Path]:
 
 
 def read_rows(file: Path, columns: int, what: str) -> list[NDArray[np.float64]]:
-    """Returns the rows of numbers of a text file, each (columns,), called `what` in messages.
-
-    NaN is read as such; lines that start with # and empty lines at the end are left out.
-    """
+    """Returns the rows of numbers of a text file, each (columns,), called `what` in messages. NaN
+    is read as such; lines that start with # and empty lines at the end are left out."""
     rows = []
-    for number, line in enumerate(read_text(file, "replace").rstrip().splitlines(), start=1):
+    for number, line in enumerate(
+        readers.read_text(file, "replace").rstrip().splitlines(), start=1
+    ):
         if line.startswith("#"):
             continue
         try:
@@ -292,18 +282,13 @@ def open_frames(
 ) -> Capture:
     """Opens frames, whose images and depths are read on demand.
 
-    Args:
-        source: the format's name in `Capture.source`.
-        config: its `intrinsics`, `depth_unit` and `up`, if given, replace those of the format.
-        lens: returns the camera of images of a width and height [px], for frames without their own.
-        depth_unit: units of the stored depth per meter.
-        read_depth: reads the depth [m] in a file of a unit.
-        depth_camera: returns the camera of depth images of a width and height [px]; None if depth
-            has the pixels of the images before they are undistorted.
-        stretch_depth: True if depth, without a camera of its own, may have another resolution than
-            the image.
-        up: up direction of the files' world, see `turn_upright`; empty leaves that to the caller.
-        dropped: messages about frames that were left out already, which do not count further.
+    `intrinsics`, `depth_unit` and `up` of `config` replace those of the format. `lens` and
+    `depth_camera` return the cameras of images and depth images of a width and height [px], for
+    frames without their own; without `depth_camera` depth has the pixels of the images before they
+    are undistorted or, if `stretch_depth`, another resolution. `read_depth` reads a file of
+    `depth_unit` units per meter. `up` is the up direction of the files' world, see `turn_upright`;
+    empty leaves that to the caller. `dropped` are messages about frames left out already, which do
+    not count further.
     """
     config = config or CaptureConfig()
     messages, complete = list(dropped), []

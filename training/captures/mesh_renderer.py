@@ -74,13 +74,8 @@ _UP = {"y": RotationMatrix.MakeXRotation(np.pi / 2).matrix().round(), "z": np.ey
 
 
 class MeshRenderer:
-    """Renders a mesh.
-
-    Args:
-        mesh: .gltf, .glb, or .obj with its materials.
-        up: the axis of the file's coordinates that points up, "y" (as glTF says) or "z".
-        background: red, green, blue in 0 to 1.
-    """
+    """Renders a mesh: .gltf, .glb, or .obj with its materials. `up` is the axis of the file that
+    points up, "y" (as glTF says) or "z"; `background` is red, green, blue in 0 to 1."""
 
     def __init__(self, mesh: Path, up: str, background: Sequence[float]):
         check_mesh(mesh, up)
@@ -189,11 +184,8 @@ class CutMaterial:
     translucent: bool  # or opaque
 
     def sample(self, uv: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Returns linear colors (n, 3) and alphas (n,), 0 in holes.
-
-        Args:
-            uv: (n, 2), texture coordinates as in glTF, from the upper left corner.
-        """
+        """Returns linear colors (n, 3) and alphas (n,), 0 in holes, at texture coordinates `uv` (n,
+        2) as in glTF, from the upper left corner."""
         size = self.pixels.shape[1::-1]
         position = (uv @ self.transform[:, :2].T + self.transform[:, 2]) * size - 0.5
         for x, n, wrap in zip(position.T, size, self.wrap, strict=True):
@@ -250,10 +242,8 @@ class CutOuts:
         return points[self._sample_at(triangle, points)[1] > 0]
 
     def draw(self, frame: CaptureFrame) -> CaptureFrame:
-        """Returns the frame with these surfaces drawn where nothing in it hides them.
-
-        Depth is that of the first surface, opaque or not.
-        """
+        """Returns the frame with these surfaces drawn where nothing in it hides them. Depth is that
+        of the first surface, opaque or not."""
         if not trimesh.ray.has_embree:
             raise ModuleNotFoundError(
                 "textures with holes need embreex, which has no wheel for this processor; render "

@@ -10,15 +10,9 @@ from pydrake.math import RigidTransform
 
 from splatpilot.systems.common.readers import read_text, readable
 from splatpilot.systems.common.validation import require
+from splatpilot.training.captures import frames
 from splatpilot.training.captures.capture import OPENGL_AXES, Capture, Lens, pinhole
 from splatpilot.training.captures.capture_config import CaptureConfig
-from splatpilot.training.captures.frames import (
-    FrameFiles,
-    numbered_files,
-    open_frames,
-    pose_from_matrix,
-    pose_from_quaternion,
-)
 
 _METADATA = "metadata.json"
 
@@ -34,11 +28,11 @@ def read_polycam(path: Path, config: CaptureConfig) -> Capture:
     folder = path / "keyframes"
     prefix = "corrected_" if (folder / "corrected_cameras").is_dir() else ""
 
-    def frame(camera: Path) -> FrameFiles:
+    def frame(camera: Path) -> frames.FrameFiles:
         def X_FB() -> RigidTransform:
             if isinstance(read, ValueError):
                 raise read
-            return pose_from_matrix(read[1], str(camera))
+            return frames.pose_from_matrix(read[1], str(camera))
 
         try:
             read = _read_keyframe(camera, config.intrinsics)
@@ -47,10 +41,10 @@ def read_polycam(path: Path, config: CaptureConfig) -> Capture:
         image = folder / f"{prefix}images" / f"{camera.stem}.jpg"
         depth = folder / "depth" / f"{camera.stem}.png"
         lens = None if isinstance(read, ValueError) else read[0]
-        return FrameFiles(image, X_FB, depth if depth.is_file() else None, lens)
+        return frames.FrameFiles(image, X_FB, depth if depth.is_file() else None, lens)
 
-    cameras = numbered_files(folder / f"{prefix}cameras", r"(\d+)\.json")
-    return open_frames(
+    cameras = frames.numbered_files(folder / f"{prefix}cameras", r"(\d+)\.json")
+    return frames.open_frames(
         path,
         "Polycam capture",
         [frame(camera) for camera in cameras.values()],
@@ -102,7 +96,7 @@ def read_record3d(path: Path, config: CaptureConfig) -> Capture:
         own = np.array(content.get("perFrameIntrinsicCoeffs") or [], dtype=np.float64)
         intrinsics = own if own.shape == intrinsics.shape else intrinsics  # fx fy cx cy
         size = int(content["w"]), int(content["h"])
-    images = numbered_files(path / "rgb", r"(\d+)\.(?:jpg|jpeg|png)")
+    images = frames.numbered_files(path / "rgb", r"(\d+)\.(?:jpg|jpeg|png)")
     if max(images) >= len(poses):
         raise ValueError(
             f"{file}: {len(poses)} poses, but {images[max(images)].name} is frame {max(images)}; "
@@ -110,19 +104,19 @@ def read_record3d(path: Path, config: CaptureConfig) -> Capture:
         )
     lenses: dict[bytes, Lens] = {}  # Equal cameras share one, and one resampling.
 
-    def frame(i: int, image: Path) -> FrameFiles:
+    def frame(i: int, image: Path) -> frames.FrameFiles:
         values = np.array(config.intrinsics) if config.intrinsics else intrinsics[i]
         source = "capture.intrinsics" if config.intrinsics else _METADATA
         lens = Lens(pinhole(*values), *size, source=source)
         depth, pose = path / "depth" / f"{i}.exr", np.roll(poses[i], 3)
-        return FrameFiles(
+        return frames.FrameFiles(
             image,
-            lambda: pose_from_quaternion(pose, f"{file}, frame {i}"),
+            lambda: frames.pose_from_quaternion(pose, f"{file}, frame {i}"),
             depth if depth.is_file() else None,
             lenses.setdefault(values.tobytes(), lens),
         )
 
-    return open_frames(
+    return frames.open_frames(
         path,
         "Record3D export",
         [frame(i, image) for i, image in images.items()],

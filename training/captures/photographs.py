@@ -56,10 +56,8 @@ def image_files(path: Path) -> list[Path]:
 
 
 def read_photographs(path: Path, config: CaptureConfig) -> Capture:
-    """Opens photographs without poses, registered by pycolmap; the cache keeps the registration.
-
-    At least three, and half of them, must be registered.
-    """
+    """Opens photographs without poses, registered by pycolmap; the cache keeps the registration. At
+    least three, and half of them, must be registered."""
     files, dropped = [], []
     for file in image_files(path):
         try:
@@ -111,9 +109,8 @@ def _one_camera(files: list[Path]) -> bool:
 
 def _register(work: tuple[Path, list[str], bool, int, Path]) -> None:
     """Writes the largest model of a folder's images, for `work`: the folder, names of images, true
-    for one camera, partners, and the folder to write.
-
-    Seeds are fixed and images are numbered in order, so that threads do not change the result."""
+    for one camera, partners, and the folder to write. Seeds are fixed and images are numbered in
+    order, so that threads do not change the result."""
     folder, names, is_one_camera, partners, written = work
     temporary = written / "work"
     temporary.mkdir()
@@ -201,11 +198,9 @@ def likely_pairs(similarity: NDArray[np.float64], partners: int) -> list[tuple[i
 
 
 def similarity(database: "pycolmap.Database", names: list[str]) -> NDArray[np.float64]:
-    """Returns the cosines (N, N) between images whose features a database holds.
-
-    The difference of each descriptor from the nearest of 32 words is summed to one vector per image
-    (VLAD; Jegou et al. 2010).
-    """
+    """Returns the cosines (N, N) between images whose features a database holds. The difference of
+    each descriptor from the nearest of 32 words is summed to one vector per image (VLAD; Jegou et
+    al. 2010)."""
     numbers = {image.name: image.image_id for image in database.read_all_images()}
     features = []
     for name in names:

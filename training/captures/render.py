@@ -97,13 +97,10 @@ class RenderedWorld:
 def run(*, world: str | Path, out: str | Path, config: RenderConfig, seed: int = 0) -> None:
     """Renders a capture of a world to the folder `out`, as a TartanAir V1 sequence.
 
-    Frames are collected in `.NAME.partial` next to `out`, where the same command resumes after an
-    interruption. A complete capture is left as it is.
-
-    Args:
-        world: a mesh (.gltf, .glb or .obj), or a scenario whose world is procedural, one of the
-            benchmark's ("P02") or a file (.yaml): that world, drawn from `seed`, is exported as
-            `world.gltf` into the capture.
+    `world` is a mesh (.gltf, .glb or .obj) or a scenario ("P02", or a .yaml file) of a procedural
+    world, which is drawn from `seed` and exported as `world.gltf` into the capture. Frames are
+    collected in `.NAME.partial` next to `out`, where the same command resumes. A complete capture
+    is left as it is.
     """
     config.validate()
     out = Path(out).absolute()

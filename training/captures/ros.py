@@ -214,11 +214,9 @@ class _Bag:
         return times
 
     def _calibration(self, frame: str) -> dict[str, Any]:
-        """Returns the calibration of the color images, which are in `frame`, or the problem.
-
-        It is in the namespace of the images or, without one there, has their frame. K and D
-        describe images as the camera took them, P those that are rectified (CameraInfo).
-        """
+        """Returns the calibration of the color images, which are in `frame`, or the problem. It is
+        in the namespace of the images or, without one there, has their frame. K and D describe
+        images as the camera took them, P those that are rectified (CameraInfo)."""
         images = self._color
         for transport in _TRANSPORTS:
             images = images.removesuffix(transport)

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
+from splatpilot.training.captures import frames
 from splatpilot.training.captures.capture import (
     OPTICAL_AXES,
     Capture,
@@ -16,13 +17,6 @@ from splatpilot.training.captures.capture import (
     pinhole,
 )
 from splatpilot.training.captures.capture_config import CaptureConfig
-from splatpilot.training.captures.frames import (
-    FrameFiles,
-    numbered_files,
-    open_frames,
-    pose_from_matrix,
-    read_matrix,
-)
 
 _SCANNET_COLOR = Path("intrinsic", "intrinsic_color.txt")
 _SCANNET_DEPTH = Path("intrinsic", "intrinsic_depth.txt")
@@ -46,11 +40,11 @@ def read_scannet(path: Path, config: CaptureConfig) -> Capture:
     where tracking was lost, `intrinsic/intrinsic_color.txt` and `intrinsic_depth.txt` 4x4, counted
     from the first pixel's center. The axes of both cameras are the same.
     """
-    colors = numbered_files(path / "color", r"(\d+)\.(?:jpg|jpeg|png)")
+    colors = frames.numbered_files(path / "color", r"(\d+)\.(?:jpg|jpeg|png)")
     lost = set()
     for number in colors:
         with suppress(OSError, ValueError):
-            if not np.isfinite(read_matrix(path / "pose" / f"{number}.txt")).all():
+            if not np.isfinite(frames.read_matrix(path / "pose" / f"{number}.txt")).all():
                 lost.add(number)
     K_C = K_D = _intrinsics(path / _SCANNET_COLOR)
     if config.depth_intrinsics:
@@ -58,18 +52,18 @@ def read_scannet(path: Path, config: CaptureConfig) -> Capture:
     elif (path / _SCANNET_DEPTH).is_file():
         K_D = _intrinsics(path / _SCANNET_DEPTH)
 
-    def frame(number: int, color: Path) -> FrameFiles:
+    def frame(number: int, color: Path) -> frames.FrameFiles:
         pose, depth = path / "pose" / f"{number}.txt", path / "depth" / f"{number}.png"
-        return FrameFiles(
+        return frames.FrameFiles(
             color,
-            lambda: pose_from_matrix(read_matrix(pose), str(pose)),
+            lambda: frames.pose_from_matrix(frames.read_matrix(pose), str(pose)),
             depth if depth.is_file() else None,
         )
 
     def depth_camera(width: int, height: int) -> DepthCamera:
         return DepthCamera(Lens(K_D, width, height).K, width, height, RigidTransform())
 
-    return open_frames(
+    return frames.open_frames(
         path,
         "ScanNet folder",
         [frame(number, color) for number, color in colors.items() if number not in lost],
@@ -82,7 +76,7 @@ def read_scannet(path: Path, config: CaptureConfig) -> Capture:
 
 
 def _intrinsics(file: Path) -> NDArray[np.float64]:
-    K = read_matrix(file)
+    K = frames.read_matrix(file)
     return centered_pinhole(K[0, 0], K[1, 1], K[0, 2], K[1, 2])
 
 
@@ -93,15 +87,15 @@ def read_seven_scenes(path: Path, config: CaptureConfig) -> Capture:
     `config.intrinsics` and `depth_intrinsics`, if equal and with `p_DC` zero, describe depth that
     is registered to color.
     """
-    colors = numbered_files(path, r"frame-(\d+)\.color\.(?:jpg|jpeg|png)")
+    colors = frames.numbered_files(path, r"frame-(\d+)\.color\.(?:jpg|jpeg|png)")
     X_DC = RigidTransform(np.array(config.p_DC or _P_DC))
 
-    def frame(color: Path) -> FrameFiles:
+    def frame(color: Path) -> frames.FrameFiles:
         stem = color.name.partition(".")[0]
         pose = path / f"{stem}.pose.txt"
-        return FrameFiles(
+        return frames.FrameFiles(
             color,
-            lambda: pose_from_matrix(read_matrix(pose), str(pose)) @ X_DC,
+            lambda: frames.pose_from_matrix(frames.read_matrix(pose), str(pose)) @ X_DC,
             path / f"{stem}.depth.png",
         )
 
@@ -116,7 +110,7 @@ def read_seven_scenes(path: Path, config: CaptureConfig) -> Capture:
             K = Lens(pinhole(*_SEVEN_SCENES_DEPTH), 640, 480).scale_to(width, height).K
         return DepthCamera(K, width, height, X_DC.inverse())
 
-    return open_frames(
+    return frames.open_frames(
         path,
         "7-Scenes folder",
         [frame(color) for color in colors.values()],

@@ -13,17 +13,9 @@ from pathlib import Path
 import numpy as np
 from pydrake.math import RotationMatrix
 
+from splatpilot.training.captures import frames
 from splatpilot.training.captures.capture import Capture, FileAxes, Lens, pinhole
 from splatpilot.training.captures.capture_config import CaptureConfig
-from splatpilot.training.captures.frames import (
-    FrameFiles,
-    numbered_files,
-    open_frames,
-    pose_from_quaternion,
-    read_depth,
-    read_packed_depth,
-    read_rows,
-)
 
 AXES = FileAxes(
     "north-east-down: camera looks along x, y right, z down",
@@ -47,9 +39,9 @@ def read(path: Path, config: CaptureConfig, version: str) -> Capture:
     suffix = "depth.npy" if version == "V1" else "depth.png"
     image_folder, depth_folder = path / f"image_{camera}", path / f"depth_{camera}"
     pose_file = path / f"pose_{camera}.txt"
-    images = numbered_files(image_folder, rf"(\d+)_{camera}\.png")
-    depths = numbered_files(depth_folder, rf"(\d+)_{camera}_{re.escape(suffix)}")
-    rows = read_rows(pose_file, 7, "a pose tx ty tz qx qy qz qw")
+    images = frames.numbered_files(image_folder, rf"(\d+)_{camera}\.png")
+    depths = frames.numbered_files(depth_folder, rf"(\d+)_{camera}_{re.escape(suffix)}")
+    rows = frames.read_rows(pose_file, 7, "a pose tx ty tz qx qy qz qw")
     numbers = sorted(images.keys() | depths.keys())
     extra: list[str] = []
     if len(numbers) != len(rows) and len(images) == len(rows):
@@ -61,11 +53,11 @@ def read(path: Path, config: CaptureConfig, version: str) -> Capture:
             "the number of lines must be that of frames"
         )
 
-    def frame(number: int, i: int) -> FrameFiles:
+    def frame(number: int, i: int) -> frames.FrameFiles:
         name = f"{number:06d}_{camera}"
-        return FrameFiles(
+        return frames.FrameFiles(
             images.get(number, image_folder / f"{name}.png"),
-            lambda: pose_from_quaternion(rows[i], f"{pose_file}, line {i + 1}"),
+            lambda: frames.pose_from_quaternion(rows[i], f"{pose_file}, line {i + 1}"),
             depths.get(number, depth_folder / f"{name}_{suffix}"),
         )
 
@@ -73,7 +65,7 @@ def read(path: Path, config: CaptureConfig, version: str) -> Capture:
         K = pinhole(width / 2, width / 2, width / 2, height / 2)
         return Lens(K, width, height, source="TartanAir's 90 degrees of width")
 
-    return open_frames(
+    return frames.open_frames(
         path,
         f"TartanAir {version} sequence",
         [frame(number, i) for i, number in enumerate(numbers)],
@@ -81,6 +73,6 @@ def read(path: Path, config: CaptureConfig, version: str) -> Capture:
         config=config,
         lens=lens,
         depth_unit=1.0,
-        read_depth=read_depth if version == "V1" else read_packed_depth,
+        read_depth=frames.read_depth if version == "V1" else frames.read_packed_depth,
         dropped=extra,
     )

@@ -98,12 +98,8 @@ def fit_ground(
 
 
 def turn_upright(capture: Capture, up: str) -> Capture:
-    """Rotates the world of a capture so that z is up.
-
-    Args:
-        up: x, y, z, -x, -y or -z of the present world, `cameras` or `ground`; see
-            `up_of_cameras` and `fit_ground`.
-    """
+    """Rotates the world of a capture so that z is up. `up` is x, y, z, -x, -y or -z of the present
+    world, `cameras` or `ground`; see `up_of_cameras` and `fit_ground`."""
     if up == "z":
         return capture
     if up in ("cameras", "ground"):
@@ -164,11 +160,8 @@ def make_metric(
     locate: Callable[[str, NDArray[np.float64]], NDArray[np.float64]] | None = None,
 ) -> Capture:
     """Scales poses and points in unknown units to meters, or marks the capture as not metric.
-
-    Args:
-        locate: returns the point (3,) that is seen in the image of a name at a pixel (2,), or
-            raises ValueError; None if pixels cannot be located.
-    """
+    `locate` returns the point (3,) that the image of a name shows at a pixel (2,), or raises
+    ValueError; None if pixels cannot be located."""
     sources = scale.sources()
     if not sources:
         return dataclasses.replace(capture, metric=False)
@@ -233,9 +226,7 @@ def camera_height(capture: Capture) -> float:
 
 def _factor_from_depth(capture: Capture) -> float:
     """Returns the median ratio of measured depth to that of the points, over all images with depth.
-
-    A point that is hidden in an image has a ratio too small; the median bears fewer than half.
-    """
+    A point that is hidden in an image has a ratio too small; the median bears fewer than half."""
     ratios = [np.zeros(0)]
     points = capture.points.p_WQ if capture.points is not None else np.zeros((0, 3))
     for i in range(len(capture) if capture.has_depth and len(points) else 0):
@@ -255,10 +246,8 @@ def _factor_from_depth(capture: Capture) -> float:
 
 def move_origin(capture: Capture, origin: Sequence[float]) -> Capture:
     """Returns the capture in a world whose origin is at `origin` (3,) of its present one; if empty,
-    in the middle of cameras that are far away.
-
-    Gaussians are in single precision, in which a step is 0.06 m at 800 km.
-    """
+    in the middle of cameras that are far away. Gaussians are in single precision, in which a step
+    is 0.06 m at 800 km."""
     p_WCs = np.array([X_WC.translation() for X_WC in capture.X_WCs])
     p = np.array(origin, dtype=np.float64) if origin else choose_origin(p_WCs)
     if not p.any():

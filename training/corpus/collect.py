@@ -23,15 +23,9 @@ from splatpilot.systems.common.validation import FieldError, require
 from splatpilot.systems.splats.splat_camera import color_pixels, ranged_depth
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 from splatpilot.systems.vehicle.state import QuadrotorState, pose_from_state
+from splatpilot.training.corpus import library
 from splatpilot.training.corpus.corpus import CONFIG, Corpus, CorpusConfig, subfolders, write_ledger
 from splatpilot.training.corpus.expert import PLANNER, Label, Labeler, fly_planner, fly_policy
-from splatpilot.training.corpus.library import (
-    WorldRecord,
-    WorldSource,
-    perturb_pose,
-    record_world,
-    world_source,
-)
 from splatpilot.training.corpus.samples import (
     EXPERT,
     OFF_PATH,
@@ -84,7 +78,9 @@ def render_samples(
         p_WB, v_WB, _, _ = QuadrotorState.of(state)
         X_WB = pose_from_state(state)
         reach = min(bound, float(labeler.field.distance(p_WB)) - VEHICLE_RADIUS)
-        around = [perturb_pose(X_WB, config.perturbation, reach, rng) for _ in range(copies)]
+        around = [
+            library.perturb_pose(X_WB, config.perturbation, reach, rng) for _ in range(copies)
+        ]
         for X_WP in [X_WB, *around]:
             R_PW, p_WP = X_WP.rotation().matrix().T, X_WP.translation()
             view = camera.render(X_WP)
@@ -159,11 +155,11 @@ _START_CLEARANCE = 0.3  # [m]
 
 def collect_world(folder: Path, config: CorpusConfig, index: int, revision: str) -> None:
     """Collects the world `index` of the library: its record, then its shards."""
-    source = world_source(config.worlds, config.seed, index)
+    source = library.world_source(config.worlds, config.seed, index)
     world = make_world(source.world, source.seed)
     labeler = Labeler(world.esdf, world.p_WG, config.expert)
     bound = source.perturbation_bound
-    record_world(folder / "worlds" / source.name, source, world.esdf)
+    library.record_world(folder / "worlds" / source.name, source, world.esdf)
 
     def write(kind: int, parts: list[Samples], flights: list[dict]) -> None:
         about = {"world": source.name, "source": kind, "flights": flights, "revision": revision}
@@ -218,11 +214,9 @@ def shard_folder(folder: Path, world: str, source: int = EXPERT) -> Path:
 
 @locks_folder("out")
 def run(*, config: CorpusConfig, out: Path, worlds: int, jobs: int | None = None) -> Corpus:
-    """Collects the first `worlds` worlds of a corpus in `out`, except those that it has already.
-
-    An interrupted run is resumed by the same call, with bitwise identical results. Damaged shards
-    are collected again. `jobs` worker processes, one for each core by default.
-    """
+    """Collects the first `worlds` worlds of a corpus in `out`, except those that it has already. An
+    interrupted run is resumed by the same call, with bitwise identical results. Damaged shards are
+    collected again. `jobs` worker processes, one for each core by default."""
     try:
         config.validate()
     except FieldError as error:
@@ -230,7 +224,7 @@ def run(*, config: CorpusConfig, out: Path, worlds: int, jobs: int | None = None
     jobs = available_cores() if jobs is None else jobs
     require(jobs >= 1, "--jobs", "at least 1", jobs)
     require(worlds >= 1, "--worlds", "at least 1", worlds)
-    sources = [world_source(config.worlds, config.seed, k) for k in range(worlds)]
+    sources = [library.world_source(config.worlds, config.seed, k) for k in range(worlds)]
     claim_folder(out / CONFIG, config)
     for part in ("worlds", "shards"):
         require_writable_folder(out / part)
@@ -266,10 +260,10 @@ def run(*, config: CorpusConfig, out: Path, worlds: int, jobs: int | None = None
     return corpus
 
 
-def _damage(out: Path, source: WorldSource, config: CorpusConfig) -> str:
+def _damage(out: Path, source: library.WorldSource, config: CorpusConfig) -> str:
     """Describes the damage of a collected world; empty without damage."""
     try:
-        record = WorldRecord(out / "worlds" / source.name)
+        record = library.WorldRecord(out / "worlds" / source.name)
         _ = record.esdf
         for kind in (EXPERT, OFF_PATH) if config.off_path else (EXPERT,):
             Shard(shard_folder(out, source.name, kind)).verify()

@@ -65,10 +65,8 @@ class CorpusConfig(Config):
 
 
 class Corpus:
-    """The samples of a folder, indexed through its shards in order of their names.
-
-    Images are mapped into memory and read as they are used.
-    """
+    """The samples of a folder, indexed through its shards in order of their names. Images are
+    mapped into memory and read as they are used."""
 
     def __init__(self, folder: Path) -> None:
         require_corpus(folder)
@@ -156,10 +154,8 @@ def distinct_worlds(corpora: Sequence[Corpus]) -> dict[str, WorldRecord]:
 
 
 def distinct_shards(corpora: Sequence[Corpus]) -> list[list[Shard]]:
-    """Lists the shards of each corpus that are not in those before it.
-
-    Shards are equal if their names and descriptions are, which have checksums of all files.
-    """
+    """Lists the shards of each corpus that are not in those before it. Shards are equal if their
+    names and descriptions are, which have checksums of all files."""
     seen: set[tuple[str, bytes]] = set()
     kept: list[list[Shard]] = []
     for corpus in corpora:

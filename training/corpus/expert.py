@@ -130,10 +130,8 @@ def fly_planner(
     p_WS: np.ndarray, world: World, config: ExpertConfig, labeler: Labeler
 ) -> list[ExpertFlight]:
     """Flies the planner from each of the starts p_WS (N, 3) [m] to the labeler's goal, all at once.
-
-    The vehicles have the equations of the simulated plant and its controller. They look along
-    their path and follow their labels.
-    """
+    The vehicles have the equations of the simulated plant and its controller. They look along their
+    path and follow their labels."""
     control, params, p_WG = FlatnessControllerConfig(), QuadrotorParams(), labeler.toa.p_WG
     substeps = ceil(config.period / _STEP - 1e-9)
     dt = config.period / substeps

@@ -223,11 +223,9 @@ class PerturbationConfig(Config):
 def perturb_pose(
     X_WB: RigidTransform, config: PerturbationConfig, reach: float, rng: np.random.Generator
 ) -> RigidTransform:
-    """Draws a pose near X_WB, displaced by at most `config.distance` and at most `reach` [m].
-
-    The displacement is uniform in that sphere. If `reach` is at most the clearance at X_WB, the
-    pose is free too.
-    """
+    """Draws a pose near X_WB, displaced by at most `config.distance` and at most `reach` [m]. The
+    displacement is uniform in that sphere. If `reach` is at most the clearance at X_WB, the pose is
+    free too."""
     direction = rng.normal(size=3)
     radius = max(0.0, min(config.distance, reach)) * rng.uniform() ** (1 / 3)
     p_BP_W = radius * direction / np.linalg.norm(direction)

@@ -59,11 +59,9 @@ class StudentFlight:
 
 
 def obstacle_clearances(flight: StudentFlight, field: DistanceField) -> np.ndarray:
-    """Returns the clearances (N,) [m] of a flight; infinite if ground or ceiling are nearest.
-
-    Their normal is vertical, and no horizontal step leads away from them; one does from a wire, the
-    top of a wall or a table.
-    """
+    """Returns the clearances (N,) [m] of a flight; infinite if ground or ceiling are nearest. Their
+    normal is vertical, and no horizontal step leads away from them; one does from a wire, the top
+    of a wall or a table."""
     p_WB = flight.states[:, :3]
     nearest = field.query(p_WB)
     level = np.abs(nearest.gradient[:, 2]) > _LEVEL
@@ -73,10 +71,8 @@ def obstacle_clearances(flight: StudentFlight, field: DistanceField) -> np.ndarr
 
 
 def near_misses(times: np.ndarray, clearances: np.ndarray) -> np.ndarray:
-    """Finds the times (m,) [s] of minima below `NEAR` of evenly sampled clearances (N,) [m].
-
-    They are at least `SEPARATION` apart; the first and the last sample may be minima.
-    """
+    """Finds the times (m,) [s] of minima below `NEAR` of evenly sampled clearances (N,) [m]. They
+    are at least `SEPARATION` apart; the first and the last sample may be minima."""
     closeness = np.concatenate([[-np.inf], -np.nan_to_num(clearances, nan=np.inf), [-np.inf]])
     samples = max(1.0, SEPARATION / np.median(np.diff(times))) if len(times) > 1 else 1.0
     peaks, _ = find_peaks(closeness, height=np.nextafter(-NEAR, 0.0), distance=samples)

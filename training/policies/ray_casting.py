@@ -41,11 +41,9 @@ class Geometry:
     _native: Any  # `_native.ShapeWorlds` or `_native.GridWorlds`
 
     def depth(self, p_WC: Tensor, R_WC: Tensor, rays: PixelRays, world: Tensor) -> Tensor:
-        """Renders planar depth (N, R) [m] from p_WC (N, 3) [m]; infinite without a surface.
-
-        A pixel has the minimum depth of all its parts: rays hit surfaces within half a pixel, at
-        the depth of the widened surface plus half a pixel's width there.
-        """
+        """Renders planar depth (N, R) [m] from p_WC (N, 3) [m]; infinite without a surface. A pixel
+        has the minimum depth of all its parts: rays hit surfaces within half a pixel, at the depth
+        of the widened surface plus half a pixel's width there."""
         depth = torch.empty(len(p_WC), len(rays.directions_C))
         self._native.depth(
             p_WC=_array(p_WC),

@@ -166,22 +166,14 @@ def run[Config: CorpusTraining](
     jobs: int,
     flown_by: str = "",
 ) -> dict[str, Any]:
-    """Trains a student, flies it, labels its near-misses, and trains another on all samples.
+    """Trains a student, flies it, labels its near-misses, and trains another on all samples. The
+    same call resumes an interrupted run; the corpora of `config` are not changed.
 
-    An interrupted run is resumed by the same call. The corpora of `config` are not changed.
-
-    Writes to `out`: `stage_1`, unless another policy flies, and `stage_2`, see `train.run`;
-    `corpora`, links to those of `config`, with the recovery samples; `flights`, a file per world;
-    `recovery.yaml`, see `RecoveryFlights`; `recovery.json`, counts of flights and samples, which is
-    returned.
-
-    Args:
-        config: configuration of both stages.
-        make: makes the trainer of a configuration.
-        flights: maximum number of flights in each world.
-        jobs: processes that fly.
-        flown_by: policy or file of weights that flies instead of a first stage. Students see
-            through the corpora's camera, others through their own.
+    Writes to `out`: `stage_1` and `stage_2`, see `train.run`; `corpora`, links to those of
+    `config`, with the recovery samples; `flights`, a file per world, of up to `flights` flights
+    each; `recovery.yaml`, see `RecoveryFlights`; `recovery.json`, counts of flights and samples,
+    which is returned. `flown_by`, a policy or file of weights, flies instead of a first stage,
+    through its own camera; students see through the corpora's.
     """
     for name, value in (("flights", flights), ("jobs", jobs)):
         require(value >= 1, f"--{name}", "at least 1", value)

@@ -144,11 +144,9 @@ class StudentData:
 
 
 def is_held_out(name: str, fraction: float) -> bool:
-    """Tells whether a world is among the `fraction` of all worlds that validate.
-
-    Only its name counts, so that it stays on its side when corpora grow. The worlds of a smaller
-    fraction are among those of a larger one.
-    """
+    """Tells whether a world is among the `fraction` of all worlds that validate. Only its name
+    counts, so that it stays on its side when corpora grow. The worlds of a smaller fraction are
+    among those of a larger one."""
     return _digest(name) < fraction * _DIGESTS
 
 
@@ -164,11 +162,9 @@ def encode_images(pixels: np.ndarray, device: str | torch.device = "cpu") -> Ten
 
 
 class FrozenFeatures:
-    """Outputs of the network's first modules for all samples, computed once and kept in files.
-
-    The file of a shard is named by a digest of its images and the modules' weights, so that runs
-    share files and corpora may grow. `frozen` is the number of modules, of `IMAGE_MODULES`.
-    """
+    """Outputs of the network's first modules for all samples, computed once and kept in files. The
+    file of a shard is named by a digest of its images and the modules' weights, so that runs share
+    files and corpora may grow. `frozen` is the number of modules, of `IMAGE_MODULES`."""
 
     def __init__(
         self, folder: Path, data: StudentData, network: StudentModule, frozen: int

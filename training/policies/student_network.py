@@ -7,47 +7,39 @@ import torch
 from torch import Tensor, nn
 from torchvision.models import mobilenet_v2
 
+from splatpilot.systems.policies import student
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS
 from splatpilot.systems.policies.lattice import BASIS, reference_trajectory
-from splatpilot.systems.policies.student import (
-    BLOCKS,
-    CHANNELS,
-    HYPOTHESES,
-    STATE_SIZE,
-    StudentSpec,
-    deviations,
-    mobilenet_blocks,
-)
 
-IMAGE_MODULES = BLOCKS + 1  # that an image passes: the encoder's, and the layer of its cells
+IMAGE_MODULES = (
+    student.BLOCKS + 1
+)  # that an image passes: the encoder's, and the layer of its cells
 
 
 class StudentModule(nn.Module):
-    """The network of a `StudentSpec`, with the names of weights of `StudentNetwork`.
-
-    The encoder is torchvision's with a bias instead of each batch norm.
-    """
+    """The network of a `StudentSpec`, with the names of weights of `StudentNetwork`. The encoder is
+    torchvision's with a bias instead of each batch norm."""
 
     _basis: Tensor
 
-    def __init__(self, spec: StudentSpec) -> None:
+    def __init__(self, spec: student.StudentSpec) -> None:
         super().__init__()
         self.spec = spec
         self.features = mobilenet_v2(norm_layer=_Bias).features
         self._initialize_encoder()
-        self.cell_layer = nn.Linear(CHANNELS, spec.cell_features)
-        self.state_layer = nn.Linear(STATE_SIZE, spec.state_features)
+        self.cell_layer = nn.Linear(student.CHANNELS, spec.cell_features)
+        self.state_layer = nn.Linear(student.STATE_SIZE, spec.state_features)
         self.state_layer_2 = nn.Linear(spec.state_features, spec.state_features)
         joined = spec.image_features + spec.state_features
         self.hidden_layer = nn.Linear(joined, spec.head_features)
-        self.head = nn.Linear(spec.head_features, HYPOTHESES * (3 * NUM_WAYPOINTS + 1))
+        self.head = nn.Linear(spec.head_features, student.HYPOTHESES * (3 * NUM_WAYPOINTS + 1))
         self.register_buffer("_basis", torch.from_numpy(BASIS).float(), persistent=False)
 
     def _initialize_encoder(self) -> None:
         """Initializes the encoder such that the variance of activations is kept without batch
         norms, and that modules with a skip add zero."""
         weights = self.state_dict()
-        for block in mobilenet_blocks():
+        for block in student.mobilenet_blocks():
             rectified = False
             for layer in block:
                 kind = "relu" if rectified else "linear"
@@ -76,12 +68,12 @@ class StudentModule(nn.Module):
             cells = self.encode_image(image, first)
         y = self.state_layer_2(self.state_layer(state).relu()).relu()
         hidden = self.hidden_layer(torch.cat([cells.float(), y], 1)).relu()
-        output = self.head(hidden).unflatten(1, (HYPOTHESES, -1))
+        output = self.head(hidden).unflatten(1, (student.HYPOTHESES, -1))
         waypoints = output[..., :-1].unflatten(2, (NUM_WAYPOINTS, 3))
         v_B, direction, up_B = state.unflatten(1, (3, 3)).unbind(1)
         goal_B = self.spec.reach * direction
         reference = reference_trajectory(v_B, goal_B, up_B, self.spec.nominal_speed, self._basis)
-        return reference[:, None] + deviations(waypoints, goal_B), output[..., -1]
+        return reference[:, None] + student.deviations(waypoints, goal_B), output[..., -1]
 
 
 class _Bias(nn.Module):
@@ -130,7 +122,7 @@ def imagenet_weights() -> dict[str, Tensor]:
 def _folded(state: dict[str, Tensor]) -> dict[str, Tensor]:
     weights: dict[str, Tensor] = {}
     scaled = True
-    for block in mobilenet_blocks():
+    for block in student.mobilenet_blocks():
         for layer in block:
             norm = layer.bias.removesuffix("bias")
             variance, mean = state[f"{norm}running_var"], state[f"{norm}running_mean"]
@@ -139,7 +131,7 @@ def _folded(state: dict[str, Tensor]) -> dict[str, Tensor]:
             weights[layer.weight] = state[layer.weight] * scale[:, None, None, None]
             weights[layer.bias] = state[layer.bias] - mean * scale
     if not scaled:
-        first = mobilenet_blocks()[0][0]
+        first = student.mobilenet_blocks()[0][0]
         mean, std = torch.tensor(_MEAN), torch.tensor(_STD)
         filters = weights[first.weight] / std[:, None, None]
         weights[first.bias] += (filters.sum((2, 3)) * (0.5 - mean)).sum(1)

@@ -17,16 +17,7 @@ from torch import Tensor
 
 from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.common.validation import bounded, require_field
-from splatpilot.systems.policies.agile_autonomy import (
-    AGILE_NETWORK,
-    FOV_X,
-    MAX_DEPTH,
-    MIN_DEPTH,
-    MODES,
-    PROGRESS,
-    RATE,
-    state_observation,
-)
+from splatpilot.systems.policies import agile_autonomy
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS
 from splatpilot.systems.policies.lattice import LatticeConfig, TrajectoryLattice
 from splatpilot.systems.policies.observations import target_velocity
@@ -35,6 +26,7 @@ from splatpilot.systems.sensing.noise import ObservationNoise
 from splatpilot.systems.vehicle.flatness import FlatnessControllerConfig, reaching_acceleration
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 from splatpilot.systems.vehicle.state import QuadrotorState
+from splatpilot.training.policies import vehicles
 from splatpilot.training.policies.augmentation import check_noise, depth_noise, noisy_depth
 from splatpilot.training.policies.evaluation import (
     FlightConditions,
@@ -46,13 +38,6 @@ from splatpilot.training.policies.networks import TrajectoryModule
 from splatpilot.training.policies.ray_casting import PixelRays
 from splatpilot.training.policies.trainer import Schedule
 from splatpilot.training.policies.training_worlds import STARTS
-from splatpilot.training.policies.vehicles import (
-    BodyRate,
-    History,
-    Observation,
-    Vehicle,
-    choose_rows,
-)
 
 LOOKAHEAD = 3  # index of the tracked waypoint, at 0.4 s, the controller's lookahead
 
@@ -60,47 +45,52 @@ LOOKAHEAD = 3  # index of the tracked waypoint, at 0.4 s, the controller's looka
 class AgileAutonomyAgent:
     """Flies by the cheapest hypothesis, as `HypothesisSelector` and `FlatnessController` do."""
 
-    rate = RATE
+    rate = agile_autonomy.RATE
 
     def __init__(self, network: TrajectoryModule, device: torch.device | str = "cpu") -> None:
         spec = network.spec
         self.network = network
-        self.rays = PixelRays.of(spec.image_width, spec.image_height, FOV_X)
+        self.rays = PixelRays.of(spec.image_width, spec.image_height, agile_autonomy.FOV_X)
         self._device = device
 
     def initial_memory(self, count: int) -> Tensor:
         return torch.zeros(count, 0, device=self._device)
 
-    def observe(self, seen: Observation) -> tuple[Tensor, Tensor]:
+    def observe(self, seen: vehicles.Observation) -> tuple[Tensor, Tensor]:
         """Computes images (N, 24, 32) and states (N, 18)."""
         vehicle, R_WB = seen.vehicle, seen.vehicle.attitude()
         rates = 0.0 * vehicle.v
-        if isinstance(vehicle, BodyRate):
+        if isinstance(vehicle, vehicles.BodyRate):
             rates = QuadrotorState.of(vehicle.state).w_WB_B
         v_target = target_velocity(vehicle.p, seen.p_WG, seen.speed)
-        state = state_observation(R_WB, vehicle.v, rates, v_target)
+        state = agile_autonomy.state_observation(R_WB, vehicle.v, rates, v_target)
         return self.encode_depth(seen.depth), state
 
     def encode_depth(self, depth: Tensor) -> Tensor:
         """Computes images (N, 24, 32) of depth (N, R) [m]."""
-        spec, image = self.network.spec, 1.0 / depth.clamp(MIN_DEPTH, MAX_DEPTH)
+        spec, image = (
+            self.network.spec,
+            1.0 / depth.clamp(agile_autonomy.MIN_DEPTH, agile_autonomy.MAX_DEPTH),
+        )
         return image.reshape(-1, spec.image_height, spec.image_width)
 
-    def hypotheses(self, seen: Observation) -> tuple[Tensor, Tensor]:
+    def hypotheses(self, seen: vehicles.Observation) -> tuple[Tensor, Tensor]:
         """Computes waypoints (N, 3, 10, 3) [m] in the body frame and costs (N, 3) less progress."""
         image, state = self.observe(seen)
         waypoints, costs = self.network(image, state)
         ahead_B = torch.nn.functional.normalize(state[:, -3:], dim=1)
-        return waypoints, costs - PROGRESS * (waypoints[:, :, -1] * ahead_B[:, None]).sum(2)
+        return waypoints, costs - agile_autonomy.PROGRESS * (
+            waypoints[:, :, -1] * ahead_B[:, None]
+        ).sum(2)
 
-    def decide(self, seen: Observation, memory: Tensor) -> tuple[Tensor, None, Tensor]:
+    def decide(self, seen: vehicles.Observation, memory: Tensor) -> tuple[Tensor, None, Tensor]:
         waypoints, costs = self.hypotheses(seen)
         best = waypoints[torch.arange(len(costs), device=costs.device), costs.argmin(1)]
         p_WR = seen.vehicle.p + (seen.vehicle.attitude() @ best[:, LOOKAHEAD, :, None])[:, :, 0]
         return _reach(p_WR, seen.vehicle), None, memory
 
 
-def _reach(p_WR: Tensor, vehicle: Vehicle) -> Tensor:
+def _reach(p_WR: Tensor, vehicle: vehicles.Vehicle) -> Tensor:
     return reaching_acceleration(p_WR, vehicle.p, vehicle.v, FlatnessControllerConfig.lookahead)
 
 
@@ -149,7 +139,7 @@ class AgileAutonomyTrainer(FlightTrainer):
     policy = "agile_autonomy"
 
     def __init__(self, config: AgileAutonomyTraining) -> None:
-        network = TrajectoryModule(AGILE_NETWORK).to(config.device)
+        network = TrajectoryModule(agile_autonomy.AGILE_NETWORK).to(config.device)
         super().__init__(config, AgileAutonomyAgent(network, config.device), config.noise)
         self._config = config
         self._lattices = [TrajectoryLattice(LatticeConfig(speed=s)) for s in config.speeds]
@@ -178,7 +168,7 @@ class AgileAutonomyTrainer(FlightTrainer):
         errors = (10.0 / (3 * NUM_WAYPOINTS)) * (
             sample["experts"][:, :, None] - waypoints[:, None]
         ).square().sum((3, 4))  # (N, K, M)
-        pull = torch.full_like(errors, EPSILON / (MODES - 1))
+        pull = torch.full_like(errors, EPSILON / (agile_autonomy.MODES - 1))
         pull.scatter_(2, errors.argmin(2, keepdim=True), 1.0 - EPSILON)
         imitated = (pull * errors).sum(2) * sample["imitated"]
         target = self._collision_costs(waypoints.detach(), sample)
@@ -218,7 +208,7 @@ class AgileAutonomyTrainer(FlightTrainer):
         which = torch.randint(len(config.speeds), (N,), generator=self.generator, device=device)
         speed = torch.tensor(config.speeds, device=device)[which]
         vehicle, by_student = self._start(world, student)
-        history = History.start(vehicle, config.noise, RATE, self.generator)
+        history = vehicles.History.start(vehicle, config.noise, agile_autonomy.RATE, self.generator)
         tracked = vehicle.p[:, None].repeat(1, NUM_WAYPOINTS + config.ask_every, 1)
         rows: list[dict[str, Tensor]] = []
         for step in steps:
@@ -226,16 +216,18 @@ class AgileAutonomyTrainer(FlightTrainer):
             ended = (clearance < 0.0) | ~inside | ((vehicle.p - p_WG).norm(dim=1) < 0.5)
             if ended.any():
                 new, flown = self._start(world, student)
-                vehicle = choose_rows(ended, new, vehicle)
-                past = History.start(new, config.noise, RATE, self.generator).past
-                history = history._replace(past=choose_rows(ended, past, history.past))
+                vehicle = vehicles.choose_rows(ended, new, vehicle)
+                past = vehicles.History.start(
+                    new, config.noise, agile_autonomy.RATE, self.generator
+                ).past
+                history = history._replace(past=vehicles.choose_rows(ended, past, history.past))
                 by_student = torch.where(ended, flown, by_student)
                 tracked = torch.where(ended[:, None, None], vehicle.p[:, None], tracked)
             history, R_WB = history.push(vehicle), vehicle.attitude()
-            now = torch.full((N,), step / RATE, device=device)
-            seen_from = history.seen(config.noise, RATE, now)
+            now = torch.full((N,), step / agile_autonomy.RATE, device=device)
+            seen_from = history.seen(config.noise, agile_autonomy.RATE, now)
             depth = render_depth(seen_from, worlds.geometry, self.agent.rays, world)
-            seen = Observation(depth, vehicle, p_WG, speed)
+            seen = vehicles.Observation(depth, vehicle, p_WG, speed)
             if step % config.ask_every == 0:
                 valid, experts, costs = self._ask(vehicle, world, which)
                 best = experts[:, 0] @ R_WB.mT + vehicle.p[:, None]
@@ -261,20 +253,20 @@ class AgileAutonomyTrainer(FlightTrainer):
             a_student, _, _ = self.agent.decide(noisy, self.agent.initial_memory(N))
             a_expert = _reach(p_WR, vehicle)
             a_cmd = torch.where(by_student[:, None], a_student, a_expert)
-            vehicle = vehicle.step(a_cmd.clamp(-12.0, 12.0), 1.0 / RATE)
+            vehicle = vehicle.step(a_cmd.clamp(-12.0, 12.0), 1.0 / agile_autonomy.RATE)
         return {name: torch.cat([row[name] for row in rows]) for name in rows[0]}
 
-    def _start(self, world: Tensor, student: float) -> tuple[BodyRate, Tensor]:
+    def _start(self, world: Tensor, student: float) -> tuple[vehicles.BodyRate, Tensor]:
         """Places vehicles at rest in their worlds; draws which of them the student flies."""
         N, device = len(world), world.device
         draws = torch.rand(N, 3, generator=self.generator, device=device)
         p = self.worlds.starts_W[world, (draws[:, 0] * STARTS).long().clamp(max=STARTS - 1)]
         direction = self.worlds.direction(p, world)
         yaw = torch.atan2(direction[:, 1], direction[:, 0]) + 1.5 * (draws[:, 1] - 0.5)
-        return BodyRate.hovering(p, yaw), draws[:, 2] < student
+        return vehicles.BodyRate.hovering(p, yaw), draws[:, 2] < student
 
     def _ask(
-        self, vehicle: BodyRate, world: Tensor, which: Tensor
+        self, vehicle: vehicles.BodyRate, world: Tensor, which: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Computes the expert's three best trajectories: whether there are any (N,), waypoints
         (N, 3, 10, 3) [m] in the body frame, and costs (N, 3)."""

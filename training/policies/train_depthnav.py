@@ -14,15 +14,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from splatpilot.systems.policies.depthnav import (
-    ACCELERATION_LIMITS,
-    CAMERA_SIZE,
-    DEPTHNAV_NETWORK,
-    FOV_X,
-    MAX_DEPTH,
-    MIN_DEPTH,
-    RATE,
-)
+from splatpilot.systems.policies import depthnav
 from splatpilot.systems.policies.observations import heading_frame, limit_smoothly, target_velocity
 from splatpilot.systems.vehicle.quadrotor import GRAVITY
 from splatpilot.training.policies.networks import TrainableNetwork
@@ -67,15 +59,19 @@ class DepthNavTraining(RolloutTraining):
 class DepthNavLearner:
     """Flies by DepthNav's network, see `splatpilot.training.policies.rollouts.Learner`."""
 
-    rate = RATE
+    rate = depthnav.RATE
 
     def __init__(self, loss: DepthNavLoss, device: torch.device | str = "cpu") -> None:
-        spec = DEPTHNAV_NETWORK
-        aspect = (CAMERA_SIZE[1] / spec.image_height) / (CAMERA_SIZE[0] / spec.image_width)
-        self.rays = PixelRays.of(spec.image_width, spec.image_height, FOV_X, aspect)
+        spec = depthnav.DEPTHNAV_NETWORK
+        aspect = (depthnav.CAMERA_SIZE[1] / spec.image_height) / (
+            depthnav.CAMERA_SIZE[0] / spec.image_width
+        )
+        self.rays = PixelRays.of(spec.image_width, spec.image_height, depthnav.FOV_X, aspect)
         self.network = TrainableNetwork(spec, head_scale=1.0).to(device)
         self._loss = loss
-        self._limits = torch.tensor(ACCELERATION_LIMITS, dtype=torch.float32, device=device)
+        self._limits = torch.tensor(
+            depthnav.ACCELERATION_LIMITS, dtype=torch.float32, device=device
+        )
 
     def initial_memory(self, count: int) -> Tensor:
         """Returns the network's hidden states and the yaw of the start frame, NaN at first."""
@@ -87,7 +83,7 @@ class DepthNavLearner:
         spec, vehicle, speed = self.network.spec, seen.vehicle, seen.speed
         start_yaw = torch.where(memory[:, -1].isnan(), vehicle.yaw, memory[:, -1]).detach()
         R_WS = heading_frame(start_yaw)
-        image = 1.0 / seen.depth.clamp(MIN_DEPTH, MAX_DEPTH)
+        image = 1.0 / seen.depth.clamp(depthnav.MIN_DEPTH, depthnav.MAX_DEPTH)
         v_target = target_velocity(vehicle.p, seen.p_WG, speed)
         q_SB = quaternion_from_rotation(R_WS.mT @ vehicle.attitude())
         state = torch.cat([_rows(vehicle.v, R_WS), q_SB, _rows(v_target, R_WS), speed[:, None]], 1)

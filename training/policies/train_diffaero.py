@@ -14,16 +14,7 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from splatpilot.systems.policies.diffaero import (
-    ACCELERATION_LIMITS,
-    DIFFAERO_NETWORK,
-    FOV_X,
-    MAX_DEPTH,
-    MIN_DEPTH,
-    RATE,
-    VELOCITY_LIMITS,
-    DiffAeroTofConfig,
-)
+from splatpilot.systems.policies import diffaero
 from splatpilot.systems.policies.observations import (
     heading_frame,
     heading_observation,
@@ -73,21 +64,26 @@ class DiffAeroTraining(RolloutTraining):
 class DiffAeroLearner:
     """Flies by DiffAero's network, see `splatpilot.training.policies.rollouts.Learner`."""
 
-    rate = RATE
+    rate = diffaero.RATE
 
     def __init__(self, loss: DiffAeroLoss, device: torch.device | str = "cpu") -> None:
-        spec = DIFFAERO_NETWORK
-        self.rays = PixelRays.of(spec.image_width, spec.image_height, FOV_X)
+        spec = diffaero.DIFFAERO_NETWORK
+        self.rays = PixelRays.of(spec.image_width, spec.image_height, diffaero.FOV_X)
         self.network = TrainableNetwork(spec).to(device)
         self._loss = loss
-        self._limits = torch.tensor(ACCELERATION_LIMITS, dtype=torch.float32, device=device)
+        self._limits = torch.tensor(
+            diffaero.ACCELERATION_LIMITS, dtype=torch.float32, device=device
+        )
 
     def initial_memory(self, count: int) -> Tensor:
         return torch.zeros(count, self.network.spec.hidden_size, device=self._limits.device)
 
     def encode(self, depth: Tensor) -> Tensor:
         """Encodes depth (N, R) [m] as images (N, 9, 16)."""
-        spec, image = self.network.spec, inverse_depth(depth, MIN_DEPTH, MAX_DEPTH)
+        spec, image = (
+            self.network.spec,
+            inverse_depth(depth, diffaero.MIN_DEPTH, diffaero.MAX_DEPTH),
+        )
         return image.reshape(-1, spec.image_height, spec.image_width)
 
     def decide(self, seen: Observation, memory: Tensor) -> tuple[Tensor, None, Tensor]:
@@ -140,14 +136,14 @@ class DiffAeroTofLearner(DiffAeroLearner):
 
     def __init__(self, loss: DiffAeroLoss, device: torch.device | str = "cpu") -> None:
         super().__init__(loss, device)
-        camera = DiffAeroTofConfig().camera
+        camera = diffaero.DiffAeroTofConfig().camera
         self.rays = PixelRays.of(
             camera.width, camera.height, camera.fov_x, camera.focal_x / camera.focal_y
         )
         self._sensor = sensor = equivalent_sensor(camera)
         to_range = range_of_depth(sensor.height, sensor.width, sensor.fov_x, sensor.fov_y)
         self._range_of_depth = torch.tensor(to_range, dtype=torch.float32, device=device)
-        self._limits = torch.tensor(VELOCITY_LIMITS, dtype=torch.float32, device=device)
+        self._limits = torch.tensor(diffaero.VELOCITY_LIMITS, dtype=torch.float32, device=device)
 
     def encode(self, depth: Tensor) -> Tensor:
         """Encodes depth (N, R) [m] as proximities (N, 9, 16), the lowest row first, see

@@ -114,9 +114,7 @@ def hypothesis_errors(expert: Tensor, waypoints: Tensor) -> Tensor:
 
 def imitation_terms(errors: Tensor, epsilon: float) -> tuple[Tensor, Tensor]:
     """Computes the relaxed winner-takes-all loss: the terms of the closest and of the others.
-
-    mean_n (1 - epsilon) min_m L_m  and  mean_n epsilon / (M - 1) (sum_m L_m - min_m L_m)
-    """
+    mean_n (1 - epsilon) min_m L_m and mean_n epsilon / (M - 1) (sum_m L_m - min_m L_m)."""
     closest = errors.min(1).values
     others = (errors.sum(1) - closest) / max(errors.shape[1] - 1, 1)
     return (1.0 - epsilon) * closest.mean(), epsilon * others.mean()

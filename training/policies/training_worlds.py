@@ -48,13 +48,7 @@ from splatpilot.systems.common.seeds import SEEDS_PER_RUN, VALIDATION_SEEDS, fir
 from splatpilot.systems.common.validation import Config, bounded
 from splatpilot.systems.policies.time_of_arrival import TimeOfArrival, time_of_arrival
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
-from splatpilot.training.corpus.library import (
-    PROCEDURAL,
-    ROUNDABOUT,
-    check_library,
-    scenario_world,
-    training_scene,
-)
+from splatpilot.training.corpus import library
 from splatpilot.training.policies.ray_casting import Geometry, Grids, MixedGeometry, ShapeGeometry
 
 _LIMIT = 1 << 30  # [bytes] of the cache; the files that were used last stay.
@@ -65,10 +59,8 @@ _POINTS = "lower_W", "upper_W", "p_WS", "p_WG"
 
 
 class WorldCache:
-    """Cache of training worlds and their times of arrival in the user's folder.
-
-    It depends on the version of the program. A folder that cannot be written stays empty.
-    """
+    """Cache of training worlds and their times of arrival in the user's folder. It depends on the
+    version of the program. A folder that cannot be written stays empty."""
 
     def __init__(self) -> None:
         self._folder = cache_folder("worlds")
@@ -223,10 +215,8 @@ class WorldBatch:
 
     def direction(self, p_WQ: Tensor, world: Tensor) -> Tensor:
         """Computes directions (N, 3) of the paths to the goals at p_WQ (N, 3) [m] in `world` (N,).
-
         They follow the negative gradient of the time of arrival, and are straight near the goal and
-        without a gradient.
-        """
+        without a gradient."""
         to_goal = self.p_WG[world] - p_WQ
         if self._times is None:
             return torch.nn.functional.normalize(to_goal, dim=1)
@@ -259,7 +249,7 @@ class WorldSelection(Config):
 
     # Scenarios whose generated worlds take turns, the benchmark's or files; naming one twice
     # doubles its share.
-    kinds: list[str] = field(default_factory=lambda: [*PROCEDURAL, *ROUNDABOUT])
+    kinds: list[str] = field(default_factory=lambda: [*library.PROCEDURAL, *library.ROUNDABOUT])
     # Scene folders or OctoMaps that take turns after the kinds, each time with another start and
     # goal; also in held-out worlds.
     scenes: list[str] = field(default_factory=list)
@@ -271,9 +261,9 @@ class WorldSelection(Config):
     voxel_size: float = bounded(0.25, "[0.05, 0.5] m")
 
     def check(self) -> None:
-        check_library(self.kinds, self.scenes)
+        library.check_library(self.kinds, self.scenes)
         for scene in self.scenes:
-            training_scene(scene)
+            library.training_scene(scene)
 
     @property
     def turns(self) -> list[str]:
@@ -301,13 +291,13 @@ def _make_worlds(
 ) -> list[TrainingWorld]:
     scenes = {}
     for scene in selection.scenes:
-        esdf = make_world(scene_config(training_scene(scene)), seed=0).esdf
+        esdf = make_world(scene_config(library.training_scene(scene)), seed=0).esdf
         scenes[scene] = esdf, esdf.conservative()
     cache, worlds = WorldCache(), []
     seeds = Progress(range(first, first + count), f"making {what}", unit="world")
     for seed, turn in zip(seeds, cycle(selection.turns), strict=False):
         if turn not in scenes:
-            worlds.append(cache.world(scenario_world(turn), seed))
+            worlds.append(cache.world(library.scenario_world(turn), seed))
             continue
         esdf, conservative = scenes[turn]
         p_WS, p_WG, _ = choose_start_and_goal(

@@ -50,10 +50,8 @@ class PointMass(NamedTuple):
 
     def step(self, a_cmd: Tensor, dt: float, heading: Tensor | None = None) -> "PointMass":
         """Computes the state after `dt` [s] of constant commanded accelerations (N, 3) [m/s^2].
-
-        Exact for da/dt = (a_cmd - a) / lag. The vehicle turns toward `heading` (N,) [rad], or
-        along the velocity, as under the controller.
-        """
+        Exact for da/dt = (a_cmd - a) / lag. The vehicle turns toward `heading` (N,) [rad], or along
+        the velocity, as under the controller."""
         decay = torch.exp(-dt / self.lag)
         behind = self.a - a_cmd
         # Fused operations: with few vehicles, their number determines the time.

@@ -62,9 +62,7 @@ def kept_work(out: Path) -> str:
 
 class Checkpoint:
     """The file with the state of an optimization of the scene folder `out`, in `work_folder(out)`.
-
-    Without the fitted `views`, it compares only the config with that of the checkpoint.
-    """
+    Without the fitted `views`, it compares only the config with that of the checkpoint."""
 
     def __init__(
         self, out: Path, config: ReconstructConfig, views: ReconstructionViews | None = None

@@ -111,11 +111,8 @@ def fuse(source: DepthSource, grid: FieldGrid) -> Esdf:
 def make_distance_field(
     capture: Capture, frames: ShrunkFrames, gaussians: GaussianScene, config: ReconstructConfig
 ) -> tuple[Esdf, DepthSource]:
-    """Makes the distance field of a reconstruction from its fitted frames and Gaussians.
-
-    Returns:
-        The field, and the captured depth, or the rendered depth of a capture without any.
-    """
+    """Makes the distance field of a reconstruction from its fitted frames and Gaussians. Returns it
+    with the captured depth, or the rendered depth of a capture without any."""
     captured = captured_depth(capture, range(len(capture)))
 
     def fuse_within(source: DepthSource, bounds: DepthSource) -> Esdf:

@@ -168,11 +168,9 @@ def _concatenate(parts: Iterable[tuple[NDArray, NDArray, NDArray]]) -> tuple:
 def cell_gaussians(
     frame: CaptureFrame, cells: Cells, spread: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Returns the centers p_WQ (n, 3) [m] and covariances in W (n, 3, 3) [m^2] of flat Gaussians.
-
-    A cell's edges on the surface are t_u = s dP/du and t_v = s dP/dv, with P = r / w along the
-    pixel's ray r; `spread` times them are the standard deviations.
-    """
+    """Returns the centers p_WQ (n, 3) [m] and covariances in W (n, 3, 3) [m^2] of flat Gaussians. A
+    cell's edges on the surface are t_u = s dP/du and t_v = s dP/dv, with P = r / w along the
+    pixel's ray r; `spread` times them are the standard deviations."""
     f_u, f_v = frame.K[0, 0], frame.K[1, 1]
     z = 1 / cells.w
     P = frame.back_project(cells.u, cells.v, z)  # (n, 3)
@@ -193,10 +191,8 @@ def cell_gaussians(
 def principal_axes(
     covariances: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Returns quaternions wxyz (n, 4) and standard deviations (n, 3) of covariances (n, 3, 3).
-
-    The smallest comes last: the third axis of a flat Gaussian is its normal, as of surfels.
-    """
+    """Returns quaternions wxyz (n, 4) and standard deviations (n, 3) of covariances (n, 3, 3). The
+    smallest comes last: the third axis of a flat Gaussian is its normal, as of surfels."""
     variances, R = np.linalg.eigh(covariances)
     variances, R = variances[:, ::-1], R[:, :, ::-1].copy()
     R[np.linalg.det(R) < 0, :, 0] *= -1
@@ -263,15 +259,13 @@ def gaussians_from_depth(
     max_cell: int = 16,
     max_extent: float = 0.06,
 ) -> GaussianScene:
-    """Covers all surfaces of the frames with Gaussians, each surface once.
+    """Covers all surfaces of the frames with Gaussians, each surface once. Frames are loaded more
+    than once.
 
-    Cells become coarser until the Gaussians fit: first by more contrast, then by size.
-
-    Args:
-        frames: loaded one by one, and more than once.
-        contrast, max_cell, max_extent: of the finest cells, see `BlockMeans.split`.
-        optimized: makes Gaussians that will be optimized: wider and without an underlay; if even
-            the coarsest are too many, they are sampled.
+    `contrast`, `max_cell` and `max_extent` are of the finest cells, see `BlockMeans.split`; they
+    become coarser until the Gaussians fit: first by more contrast, then by size. If they will be
+    `optimized`, Gaussians are wider and without an underlay, and if even the coarsest are too many,
+    they are sampled.
     """
     views = [ThinnedFrame.of(frame) for frame in frames]
     if not any(view.depth.any() for view in views):
@@ -372,10 +366,8 @@ def random_points(
 
 
 def triangulate(capture: Capture, numbers: Sequence[int]) -> SfmPoints:
-    """Triangulates points between frames of a capture by pycolmap, with the capture's poses.
-
-    SIFT features of each frame are matched with those of the next ten in order.
-    """
+    """Triangulates points between frames of a capture by pycolmap, with the capture's poses. SIFT
+    features of each frame are matched with those of the next ten in order."""
     with tempfile.TemporaryDirectory(prefix="splatpilot-") as folder:
         images, masks = Path(folder) / "images", Path(folder) / "masks"
         images.mkdir()
@@ -410,10 +402,8 @@ def triangulate(capture: Capture, numbers: Sequence[int]) -> SfmPoints:
 def _triangulate(
     work: tuple[Path, NDArray[np.float64], dict[str, NDArray[np.float64]]],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Returns points (n, 3) and their colors (n, 3), 0 to 1.
-
-    `work` is the folder of `images` and `masks`, K (3, 3) [px], and poses X_CW (3, 4) by name.
-    """
+    """Returns points (n, 3) and their colors (n, 3), 0 to 1. `work` is the folder of `images` and
+    `masks`, K (3, 3) [px], and poses X_CW (3, 4) by name."""
     folder, K, poses = work
     pycolmap = import_pycolmap()
     pycolmap.logging.minloglevel = max(pycolmap.logging.minloglevel, 2)

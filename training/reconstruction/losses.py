@@ -30,15 +30,11 @@ _NEAR = 0.05  # [m], minimum depth of a point
 
 
 def photometric_loss(rendered: Tensor, target: Tensor, ssim_weight: float = 0.2) -> Tensor:
-    """Computes (1 - w) L1 + w (1 - SSIM), the loss of 3D Gaussian splatting (Kerbl et al. 2023).
+    """Computes (1 - w) L1 + w (1 - SSIM), the loss of 3D Gaussian splatting (Kerbl et al. 2023), of
+    images (..., H, W, C) with values about [0, 1].
 
-    L1 is the mean absolute difference. SSIM is the mean, over pixels and channels, of Wang et al.
-    2004 with a Gaussian window of 11 x 11 pixels and sigma 1.5, K1 = 0.01, K2 = 0.03, a dynamic
-    range of 1 and zeros outside the image.
-
-    Args:
-        rendered, target: (..., H, W, C), values about [0, 1].
-        ssim_weight: w, in [0, 1].
+    SSIM is the mean, over pixels and channels, of Wang et al. 2004 with a Gaussian window of 11 x
+    11 pixels and sigma 1.5, K1 = 0.01, K2 = 0.03, a dynamic range of 1 and zeros outside the image.
     """
     _check_pair("rendered", rendered, "target", target)
     require(rendered.ndim >= 3, "rendered", "(..., H, W, C)", tuple(rendered.shape))
@@ -76,15 +72,9 @@ def log_depth_loss(
     depth: Tensor,
     weights: Tensor | None = None,
 ) -> Tensor:
-    """Computes 1 / |V| sum over V of weight |log max(rendered, epsilon) - log depth|, where
-    V = {pixels: epsilon < depth < far}, from 1 mm to 150 m; 0 if V is empty.
-
-    The same relative error costs the same at any range.
-
-    Args:
-        rendered, depth: (...) [m], expected or accumulated depth, and the truth.
-        weights: (...), for example from `depth_edge_weights`; 1 by default.
-    """
+    """Computes 1 / |V| sum over V of weight |log max(rendered, epsilon) - log depth|, where V =
+    {pixels: epsilon < depth < far}, from 1 mm to 150 m; 0 if V is empty. Depths (...) are expected
+    or accumulated, and true, in [m]; weights are 1 by default."""
     _check_pair("rendered", rendered, "depth", depth)
     if weights is not None:
         _check_pair("rendered", rendered, "weights", weights)
@@ -137,19 +127,12 @@ def surface_loss(
     depth: Tensor,
     rng: np.random.Generator,
 ) -> Tensor:
-    """Returns the mean of |log z - log depth| over a point drawn from each Gaussian of `seen`, for
-    points within 5 % of the true depth at their pixel.
+    """Returns the mean of |log z - log depth| over a point, drawn by `rng`, from each Gaussian of
+    `seen` (M,), for points within 5 % of the true depth (H, W) [m] at their pixel.
 
     It moves centers to the surface, flattens Gaussians and aligns them with it, so that the median
-    depth is right, and does not act across edges.
-
-    Args:
-        means, quats, scales: (N, 3) [m], (N, 4) and (N, 3) [m], of all Gaussians.
-        seen: (M,) indices of those in view.
-        viewmat: (4, 4) world to camera.
-        K: (3, 3) [px].
-        depth: (H, W) [m], the truth.
-        rng: draws the points.
+    depth is right, and does not act across edges. Means (N, 3) [m], quats (N, 4) and scales (N, 3)
+    [m] are those of all Gaussians, `viewmat` (4, 4) is world to camera.
     """
     draws = torch.from_numpy(rng.standard_normal((len(seen), 3), np.float32))
     if _is_native(means):

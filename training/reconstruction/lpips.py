@@ -59,11 +59,9 @@ class Lpips:
 
     With f_l the features of layer l, each pixel's scaled to unit length over channels, the distance
     is the sum over seven layers of the mean over pixels of w_l . (f_l(a) - f_l(b))^2. It is not
-    comparable with that of the AlexNet or VGG backbones. A process loads the network once.
-
-    Weights are `{"squeezenet1_1": state dict, "lin": state dict}` in
-    `$SPLATPILOT_DATA/weights/lpips_squeeze.pt`, or else torchvision's downloaded SqueezeNet with
-    the linear layers of the installed package `lpips`.
+    comparable with that of the AlexNet or VGG backbones. Weights are `{"squeezenet1_1": state dict,
+    "lin": state dict}` in `$SPLATPILOT_DATA/weights/lpips_squeeze.pt`, or else torchvision's
+    downloaded SqueezeNet with the linear layers of the installed package `lpips`.
     """
 
     def __init__(self):
@@ -71,13 +69,9 @@ class Lpips:
         _load(self._source, torch.device("cpu"))
 
     def __call__(self, a: Tensor, b: Tensor, weights: Tensor | None = None) -> Tensor:
-        """Returns the distance of two images, a scalar at least 0, differentiable in `a`.
-
-        Args:
-            a, b: (..., H, W, 3) float32, RGB in [0, 1]; the distance of several is their mean.
-            weights: (..., H, W) of the pixels, averaged over each cell of a layer. Equal by
-                default, as published.
-        """
+        """Returns the distance of two images (..., H, W, 3) float32, RGB in [0, 1], a scalar at
+        least 0, differentiable in `a`; that of several is their mean. `weights` (..., H, W) of the
+        pixels are averaged over each cell of a layer; equal by default, as published."""
         valid = a.shape == b.shape and a.ndim >= 3 and a.shape[-1] == 3
         require(
             valid and min(a.shape[-3:-1]) >= _MIN_SIZE,

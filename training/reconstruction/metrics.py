@@ -88,10 +88,9 @@ def has_true_depth(truth: NDArray) -> NDArray[np.bool_]:
 def depth_metrics(depth: NDArray, truth: NDArray) -> dict[str, float | None]:
     """Compares the depth (H, W) [m] of cameras of unlimited range, 0 in a hole, with the truth.
 
-    Returns:
-        Over pixels with true depth: the mean absolute error [m], which is the true depth in a hole;
-        the mean of |error| / true depth; the fraction of `floaters`; and the fraction of holes,
-        which policies take for free space. None without any.
+    Over pixels with true depth: the mean absolute error [m], which is the true depth in a hole; the
+    mean of |error| / true depth; the fraction of `floaters`; and the fraction of holes, which
+    policies take for free space. None without any.
     """
     known = has_true_depth(truth)
     error = np.abs(depth[known] - truth[known])
@@ -128,10 +127,8 @@ def fit_exposure(
     fit_gain: bool = True,
 ) -> tuple[NDArray, float]:
     """Returns a rendered image (H, W, 3) with vignetting and exposure of the camera, and its gain.
-
     The gain is the least-squares fit to the true image over the pixels `seen` (H, W): that of a
-    held-out frame is unknown, and does not depend on the scene. Without `fit_gain` it is 1.
-    """
+    held-out frame is unknown, and does not depend on the scene. Without `fit_gain` it is 1."""
     height, width = color.shape[:2]
     image = np.clip(color, 0, None) * vignette(vignetting, width, height)[..., None]
     gain, x, y = 1.0, image[seen], truth[seen]
@@ -150,16 +147,9 @@ def measure_view(
     *,
     fit_gain: bool = True,
 ) -> ViewMetrics:
-    """Compares a rendered view with the frame of its camera.
-
-    Args:
-        on_black: rendered before black.
-        vignetting: of the capture, see `vignette`.
-        seen: (H, W), pixels to measure, see `seen_pixels`; all by default. The windows of SSIM and
-            LPIPS reach over others.
-        lpips: the perceptual distance; None leaves it out.
-        fit_gain: compares colors after `fit_exposure`; otherwise the gain is 1.
-    """
+    """Compares a view that is rendered before black with the frame of its camera: colors after
+    `fit_exposure`, by default over all pixels, else over those `seen` (H, W). The windows of SSIM
+    and LPIPS reach over others. Without `lpips` that is left out."""
     truth, sky = frame.image / 255, frame.depth >= FAR
     seen = frame.valid if seen is None else seen & frame.valid
     camera = truth, vignetting, seen, fit_gain

@@ -47,12 +47,9 @@ _MEASURE_EVERY = 1000  # steps between metrics on held-out frames
 
 
 class DefaultStrategy:
-    """Densification of 3D Gaussian splatting (Kerbl et al. 2023, section 5.2).
-
-    Clones small and splits large Gaussians with a large gradient on the image, removes faint and
-    huge ones, and resets opacities periodically. The cameras are within `extent` [m] of `center`
-    (3,) [m].
-    """
+    """Densification of 3D Gaussian splatting (Kerbl et al. 2023, section 5.2). Clones small and
+    splits large Gaussians with a large gradient on the image, removes faint and huge ones, and
+    resets opacities periodically. The cameras are within `extent` [m] of `center` (3,) [m]."""
 
     def __init__(self, config: ReconstructConfig, center: Tensor, extent: float, count: int):
         self._config, self._center, self._extent = config, center, extent
@@ -183,13 +180,9 @@ def view_loss(
 
 
 class Optimization:
-    """One run, from its first step or from a checkpoint.
-
-    Args:
-        initial: makes the Gaussians of a first step, given the extent of the cameras [m].
-        perceptual: LPIPS of two images (H, W, 3).
-        fit_gains: fits the gains of `views`.
-    """
+    """One run, from its first step or from a checkpoint. `initial` makes the Gaussians of a first
+    step, given the extent of the cameras [m]; `perceptual` is the LPIPS of two images (H, W, 3);
+    `fit_gains` fits the gains of `views`."""
 
     def __init__(
         self,

@@ -39,12 +39,9 @@ _FINAL_ON_SURFACE = 0.1
 
 
 def learning_rates(config: ReconstructConfig, extent: float, progress: float) -> dict[str, float]:
-    """Returns the learning rate of each parameter of `SplatParameters`.
-
-    Gaussians that start from depth are on surfaces already: their means move slower, their other
-    parameters faster at first. `progress` is the fraction of all steps, `extent` [m] scales the
-    rate of the means.
-    """
+    """Returns the learning rate of each parameter of `SplatParameters`. Gaussians that start from
+    depth are on surfaces already: their means move slower, their other parameters faster at first.
+    `progress` is the fraction of all steps, `extent` [m] scales the rate of the means."""
     rates = {"means": config.means_rate * extent * _FINAL_MEANS**progress} | _RATES
     if config.initialization != "depth":
         return rates
@@ -60,10 +57,8 @@ def splat_shapes(
     log_scales: Tensor, logit_opacities: Tensor, smallest: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Returns scales (N, 3) = sqrt(exp(2 log_scales) + smallest^2) [m], with `smallest` (N,)
-    without gradient, and opacities (N,), the sigmoid of their logits.
-
-    float32 tensors on the CPU take native code.
-    """
+    without gradient, and opacities (N,), the sigmoid of their logits. float32 tensors on the CPU
+    take native code."""
     if log_scales.device.type == "cpu" and log_scales.dtype == torch.float32:
         return _Shapes.apply(log_scales, logit_opacities, smallest)  # pyright: ignore[reportReturnType]
     scales = torch.sqrt(torch.exp(2 * log_scales) + smallest[:, None] ** 2)

@@ -96,11 +96,9 @@ class ThinnedFrame:
 def find_new_pixels(
     views: Sequence[ThinnedFrame], last: Collection[int] = ()
 ) -> list[NDArray[np.bool_]]:
-    """Finds, for each view, the pixels (h, w) to keep so that every point is kept about once.
-
-    Keeps pixels that are nearly the finest of their point, in the first view that has them. Views
-    are visited from the closest to the farthest, those with an index in `last` after the others.
-    """
+    """Finds, for each view, the pixels (h, w) to keep so that every point is kept about once. Keeps
+    pixels that are nearly the finest of their point, in the first view that has them. Views are
+    visited from the closest to the farthest, those with an index in `last` after the others."""
     points = [view.points() for view in views]
     overlapping = []  # views that see some points
     for view in views:
@@ -163,10 +161,8 @@ def _smaller_difference(values: NDArray, axis: int) -> NDArray:
 
 @dataclass(frozen=True, eq=False)
 class Photometry:
-    """Relates image values I to those of the scene S: I = gain_i exp(vignetting rho^2) S.
-
-    The logarithms of the gains have the mean 0. For rho, see `radius_squared`.
-    """
+    """Relates image values I to those of the scene S: I = gain_i exp(vignetting rho^2) S. The
+    logarithms of the gains have the mean 0. For rho, see `radius_squared`."""
 
     gains: NDArray[np.float64]  # (n,)
     vignetting: float  # logarithm of the relative brightness of the corners, at most 0

@@ -101,11 +101,9 @@ class ReconstructSummary:
 def reconstruct(
     capture: Capture, out: str | Path, config: ReconstructConfig, *, restart: bool = False
 ) -> ReconstructSummary:
-    """Reconstructs a capture as the scene folder `out`.
-
-    Checkpoints are in the folder `.NAME.partial` next to `out`; after an interruption, the same
-    call resumes and ends in the bitwise identical scene. With `restart` it starts again.
-    """
+    """Reconstructs a capture as the scene folder `out`. Checkpoints are in the folder
+    `.NAME.partial` next to `out`; after an interruption, the same call resumes and ends in the
+    bitwise identical scene. With `restart` it starts again."""
     out = Path(out)
     config.validate()
     check_scene_target(out)

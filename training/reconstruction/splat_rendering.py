@@ -46,14 +46,12 @@ def render(
     distortion: bool = False,
     renderer: Renderer | None = None,
 ) -> Rendering:
-    """Renders color and depth of one camera, see `rasterize` for the arguments.
+    """Renders color and depth of one camera, see `rasterize` for the arguments; `gaussians` are
+    means, quats, scales, opacities and spherical harmonics.
 
-    Args:
-        gaussians: means, quats, scales, opacities and spherical harmonics.
-        depth_mode: "D", accumulated, "ED", expected, or "MD", median, which has no gradient and
-            is 0 without a surface.
-        eps2d: blur of Gaussians; surfels have their own.
-        distortion: renders the distortion of surfels along their rays.
+    `depth_mode` is "D", accumulated, "ED", expected, or "MD", median, which has no gradient and is
+    0 without a surface. `eps2d` blurs Gaussians, not surfels; `distortion` renders that of surfels
+    along their rays.
     """
     scene = *gaussians, viewmat, K, width, height
     options: dict[str, Any] = {

@@ -111,11 +111,9 @@ class ReconstructionViews:
 
 
 def learn_background(frames: Sequence[CaptureFrame], photometry: Photometry) -> Background:
-    """Learns the sky of the frames in every direction; black without any.
-
-    Each texel has the mean color, without gains and vignetting, of the pixels that look into it, or
-    else is interpolated.
-    """
+    """Learns the sky of the frames in every direction; black without any. Each texel has the mean
+    color, without gains and vignetting, of the pixels that look into it, or else is
+    interpolated."""
     sums, counts = np.zeros((_HEIGHT * _WIDTH, 3)), np.zeros(_HEIGHT * _WIDTH)
     for k, frame in enumerate(frames):
         sky = frame.depth >= FAR

@@ -16,7 +16,6 @@ from splatpilot.diagrams.worlds.forest.layout import (
     lay_out,
 )
 from splatpilot.diagrams.worlds.solids import textures
-from splatpilot.diagrams.worlds.solids.shading import Daylight, shade
 from splatpilot.diagrams.worlds.solids.solid import WorldSpec
 from splatpilot.diagrams.worlds.solids.surfaces import (
     COVERAGE,
@@ -32,7 +31,16 @@ from splatpilot.diagrams.worlds.solids.surfaces import (
     tube,
     widest,
 )
-from splatpilot.diagrams.worlds.solids.textures import BIRCH, OAK, PINE, mix, ramp, smoothstep
+from splatpilot.diagrams.worlds.solids.textures import (
+    BIRCH,
+    OAK,
+    PINE,
+    Daylight,
+    mix,
+    ramp,
+    shade,
+    smoothstep,
+)
 from splatpilot.systems.common.seeds import check_seed
 from splatpilot.systems.splats.scene import GaussianScene
 

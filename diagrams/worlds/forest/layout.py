@@ -6,15 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
 
-from splatpilot.diagrams.worlds.building_blocks import (
-    CLEARING,
-    INSET,
-    PASSAGE,
-    VolumeConfig,
-    ground,
-    poisson_disk,
-    require_order,
-)
+from splatpilot.diagrams.worlds import building_blocks
 from splatpilot.diagrams.worlds.solids.solid import Solid
 from splatpilot.diagrams.worlds.solids.surfaces import FloorPlan
 from splatpilot.diagrams.worlds.solids.textures import BIRCH, OAK, PINE
@@ -23,10 +15,12 @@ from splatpilot.systems.common.validation import bounded, require_field
 
 
 @dataclass
-class TrunksConfig(VolumeConfig):
+class TrunksConfig(building_blocks.VolumeConfig):
     """Volume and trunks of a forest."""
 
-    length: float = bounded(36.0, f"[{2 * (INSET + CLEARING):g}, inf) m")  # [m] along x, from 0
+    length: float = bounded(
+        36.0, f"[{2 * (building_blocks.INSET + building_blocks.CLEARING):g}, inf) m"
+    )  # [m] along x, from 0
     width: float = bounded(16.0, "(0, inf) m")  # [m] along y, centered on 0
     # [m] Minimum distance of two trunks on the ground, axis to axis.
     spacing: float = bounded(3.0, "(0, inf) m")
@@ -36,7 +30,7 @@ class TrunksConfig(VolumeConfig):
     rocks: int = bounded(10, "[0, 1000]")  # [-] boulders, at most knee-high, fewer if cramped
     logs: int = bounded(5, "[0, 1000]")  # [-] fallen trunks on the ground, fewer if cramped
     # [m] Height of start and goal.
-    flight_height: float = bounded(1.8, f"[{CLEARING:g}, inf) m")
+    flight_height: float = bounded(1.8, f"[{building_blocks.CLEARING:g}, inf) m")
 
     @property
     def narrowest(self) -> float:
@@ -47,14 +41,14 @@ class TrunksConfig(VolumeConfig):
     def check(self) -> None:
         super().check()
         # A narrower forest can be blocked by one trunk.
-        narrow = 2 * (self.radius_max + PASSAGE)
+        narrow = 2 * (self.radius_max + building_blocks.PASSAGE)
         require_field(self, "width", self.width >= narrow, f"at least {narrow:g} m")
-        highest = self.height - CLEARING
-        condition = f"at most height - {CLEARING:g} m = {highest:g} m"
+        highest = self.height - building_blocks.CLEARING
+        condition = f"at most height - {building_blocks.CLEARING:g} m = {highest:g} m"
         require_field(self, "flight_height", self.flight_height <= highest, condition)
-        require_order(self, "radius_min", "radius_max")
+        building_blocks.require_order(self, "radius_min", "radius_max")
         # The vehicle fits between any two trunks.
-        spacing = self.spacing + PASSAGE - self.narrowest
+        spacing = self.spacing + building_blocks.PASSAGE - self.narrowest
         require_field(self, "spacing", self.spacing >= spacing, f"at least {spacing:.2f} m")
 
 
@@ -113,10 +107,8 @@ class ForestLayout(FloorPlan):
 
     def solids(self) -> tuple[list[Solid], list[Solid]]:
         """Returns the solids that can be nearest to a point of the volume, and the other solids.
-
         The ground is never farther from such a point than the volume is high, so distances are
-        exact without solids farther from the volume than that.
-        """
+        exact without solids farther from the volume than that."""
         ceiling, trees = self.upper[2], self.trees
         near = self.outside(trees.base) - trees.radius - ceiling * np.hypot(*trees.lean.T) < ceiling
         foot, top = trees.at(-BURIED), trees.at(ceiling + 2)
@@ -129,7 +121,7 @@ class ForestLayout(FloorPlan):
         logs = (Capsule(log[:3], log[3:6], float(log[6])) for log in self.logs)
         rocks = (Sphere(rock[:3], float(rock[3])) for rock in self.rocks)
         solids = [
-            ground("forest_floor"),
+            building_blocks.ground("forest_floor"),
             *(trunk for trunk, is_near in zip(trunks, near, strict=True) if is_near),
             *(Solid(log, "oak", k) for k, log in enumerate(logs)),
             *(Solid(rock, "stone", k) for k, rock in enumerate(rocks)),
@@ -153,7 +145,7 @@ def lay_out(
     clear = np.asarray(clear)
     plan = FloorPlan.of_size(config.length, config.width, config.height)
     lower, upper = plan.lower, plan.upper
-    base = poisson_disk(lower[:2] - MARGIN, upper[:2] + MARGIN, config.spacing, rng)
+    base = building_blocks.poisson_disk(lower[:2] - MARGIN, upper[:2] + MARGIN, config.spacing, rng)
     N = len(base)
     radius = rng.uniform(config.radius_min, config.radius_max, N)
     angle, slope = rng.uniform(0, 2 * np.pi, N), np.tan(np.deg2rad(config.lean_max))

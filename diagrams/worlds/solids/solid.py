@@ -9,19 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from splatpilot.diagrams.worlds.solids import patterns
-from splatpilot.diagrams.worlds.solids.shading import Illumination
 from splatpilot.diagrams.worlds.solids.surfaces import GROUND_REACH, FloorPlan, perpendicular
-from splatpilot.diagrams.worlds.solids.textures import BIRCH, OAK, PINE
+from splatpilot.diagrams.worlds.solids.textures import BIRCH, OAK, PINE, Illumination
+from splatpilot.systems.collision import shapes
 from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.collision.shapes import (
-    AnalyticDistanceField,
-    Box,
-    Capsule,
-    Cylinder,
-    HalfSpace,
-    Shape,
-    Sphere,
-)
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.splats.scene import GaussianScene
 
@@ -90,7 +81,7 @@ Array = NDArray[np.float64]
 class Solid:
     """A shape in W and its material."""
 
-    shape: Shape
+    shape: shapes.Shape
     material: str  # a key of `MATERIALS`
     seed: int = 0  # of the part and tone of the material
 
@@ -107,15 +98,15 @@ class Solid:
         shape = self.shape
         shift = 7.3 * np.array([self.seed % 61, self.seed % 53, 0.0])
         match shape:
-            case Sphere():
+            case shapes.Sphere():
                 return p_W - np.asarray(shape.p_WO) + shift
-            case Box():
+            case shapes.Box():
                 return shape.X_WO.inverse().multiply(p_W.T).T + shift
-            case Capsule() | Cylinder():
+            case shapes.Capsule() | shapes.Cylinder():
                 p_WA = np.asarray(shape.p_WA, dtype=float)
                 e_1, e_2, axis, _ = _axes(shape)
                 return (p_W - p_WA) @ np.column_stack([e_1, e_2, axis]) + shift
-            case HalfSpace():
+            case shapes.HalfSpace():
                 return p_W
 
 
@@ -131,27 +122,25 @@ class Face:
     round: bool = False  # a disc or part of a sphere, on which lines of constant u meet
 
 
-def cut_faces(shape: Shape, lower: Array, upper: Array) -> list[Face]:
-    """Cuts the surface of `shape` into faces.
-
-    A half space must be horizontal; its face ends `GROUND_REACH` beyond [lower, upper] (3,).
-    """
+def cut_faces(shape: shapes.Shape, lower: Array, upper: Array) -> list[Face]:
+    """Cuts the surface of `shape` into faces. A half space must be horizontal; its face ends
+    `GROUND_REACH` beyond [lower, upper] (3,)."""
     x, y, z = np.eye(3)
     match shape:
-        case Sphere():
+        case shapes.Sphere():
             return [_dome(np.asarray(shape.p_WO, float), x, z, shape.radius, -1.0)]
-        case Box():
+        case shapes.Box():
             return _box_faces(shape)
-        case Capsule() | Cylinder():
+        case shapes.Capsule() | shapes.Cylinder():
             e_1, _, axis, length = _axes(shape)
             p_WA, p_WB = np.asarray(shape.p_WA, float), np.asarray(shape.p_WB, float)
-            end = _dome if isinstance(shape, Capsule) else _disc
+            end = _dome if isinstance(shape, shapes.Capsule) else _disc
             return [
                 _side(p_WA, e_1, axis, shape.radius, length),
                 end(p_WA, e_1, -axis, shape.radius, 0.0),
                 end(p_WB, e_1, axis, shape.radius, 0.0),
             ]
-        case HalfSpace():
+        case shapes.HalfSpace():
             normal = np.asarray(shape.normal)
             require(np.allclose(normal[:2], 0), "HalfSpace.normal", "vertical to be drawn", normal)
             up = float(np.sign(normal[2]))
@@ -168,7 +157,7 @@ def _flat(corner: Array, e_u: Array, e_v: Array, n: Array, width: float, height:
     return Face((width, height), at)
 
 
-def _box_faces(box: Box) -> list[Face]:
+def _box_faces(box: shapes.Box) -> list[Face]:
     R, p = box.X_WO.rotation().matrix(), box.X_WO.translation()
     half = np.asarray(box.size, float) / 2
     faces = []
@@ -183,7 +172,7 @@ def _box_faces(box: Box) -> list[Face]:
     return faces
 
 
-def _axes(shape: Capsule | Cylinder) -> tuple[Array, Array, Array, float]:
+def _axes(shape: shapes.Capsule | shapes.Cylinder) -> tuple[Array, Array, Array, float]:
     """Returns two unit vectors across the axis, the unit axis and the length [m]."""
     p_AB = np.asarray(shape.p_WB, float) - np.asarray(shape.p_WA, float)
     length = float(np.linalg.norm(p_AB))
@@ -251,9 +240,9 @@ class WorldSpec:
     gaussians: Callable[[Illumination], GaussianScene] | None = None
 
     @property
-    def distance_field(self) -> AnalyticDistanceField:
+    def distance_field(self) -> shapes.AnalyticDistanceField:
         """The exact distances of the solids in the volume."""
-        return AnalyticDistanceField(
+        return shapes.AnalyticDistanceField(
             [solid.shape for solid in self.solids], self.lower_W, self.upper_W
         )
 

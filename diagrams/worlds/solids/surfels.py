@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from splatpilot.diagrams.worlds.solids.shading import Illumination, shade
+from splatpilot.diagrams.worlds.solids import surfaces
 from splatpilot.diagrams.worlds.solids.solid import (
     MATERIALS,
     Face,
@@ -12,17 +12,7 @@ from splatpilot.diagrams.worlds.solids.solid import (
     WorldSpec,
     cut_faces,
 )
-from splatpilot.diagrams.worlds.solids.surfaces import (
-    COVERAGE,
-    GROUND_REACH,
-    RIM,
-    Surfels,
-    ground_rings,
-    inset,
-    merge,
-    to_gaussians,
-    widest,
-)
+from splatpilot.diagrams.worlds.solids.textures import Illumination, shade
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.esdf_build import esdf_from_distance_field
 from splatpilot.systems.collision.shapes import AnalyticDistanceField, HalfSpace
@@ -41,18 +31,18 @@ def draw(spec: WorldSpec, solids: list[Solid], light: Illumination) -> GaussianS
     rng = np.random.default_rng([spec.seed, 99])
     drawn = [_patches(solid, spec, rng) for solid in solids]
     patches, albedos, opacities = zip(*drawn, strict=True)
-    surfels = Surfels.concatenate(list(patches))
+    surfels = surfaces.Surfels.concatenate(list(patches))
     albedo, opacity = np.concatenate(albedos), np.concatenate(opacities)
     seen = _is_seen(spec, surfels)
     surfels, albedo, opacity = surfels[seen], np.clip(albedo[seen], 0, 1), opacity[seen]
     irradiance = light.irradiance(surfels.p, surfels.n)
     colors = shade(albedo, irradiance, light.haze, spec.plan.outside(surfels.p))
-    return to_gaussians(surfels, colors, opacity)
+    return surfaces.to_gaussians(surfels, colors, opacity)
 
 
 def _patches(
     solid: Solid, spec: WorldSpec, rng: np.random.Generator
-) -> tuple[Surfels, Array, Array]:
+) -> tuple[surfaces.Surfels, Array, Array]:
     """Returns patches of one solid, their albedo (N, 3) and opacity (N,)."""
     material = MATERIALS[solid.material]
     is_ground = isinstance(solid.shape, HalfSpace)
@@ -66,21 +56,24 @@ def _patches(
         if not facing.any():
             continue
         uv, extent = uv[facing], extent[facing]
-        layer = Surfels(*face.at(uv), extent)
+        layer = surfaces.Surfels(*face.at(uv), extent)
         if _bulges(face):
-            layer = inset(layer, extent[:, 0], face.curved[0])
+            layer = surfaces.inset(layer, extent[:, 0], face.curved[0])
         # Means of the pattern at two points: thin lines tint all the patches they cross.
         layers.append((layer, 0.99, face, [uv + corner * extent for corner in _CORNERS]))
         for marks in () if face.round else material.marks:
             low, high = np.zeros(2), np.array(face.size)
             if is_ground:
-                low, high = np.full(2, GROUND_REACH - 0.5), high - (GROUND_REACH - 0.5)
+                low, high = (
+                    np.full(2, surfaces.GROUND_REACH - 0.5),
+                    high - (surfaces.GROUND_REACH - 0.5),
+                )
             uv, extent = _place_marks(marks, low, high, rng)
             p, n, t = face.at(uv)
-            layers.append((Surfels(p + _RAISED * n, n, t, extent), 0.93, face, [uv]))
+            layers.append((surfaces.Surfels(p + _RAISED * n, n, t, extent), 0.93, face, [uv]))
     if not layers:
         zero = np.zeros((0, 3))
-        return Surfels(zero, zero, zero, zero[:, :2]), zero, zero[:, 0]
+        return surfaces.Surfels(zero, zero, zero, zero[:, :2]), zero, zero[:, 0]
     uv = np.concatenate([q for *_, samples in layers for q in samples])
     p = np.concatenate([face.at(q)[0] for *_, face, samples in layers for q in samples])
     colors = solid.albedo(uv, p)  # all at once: calls of patterns are expensive
@@ -92,7 +85,7 @@ def _patches(
     tinted = np.concatenate(albedo)
     tinted = tinted * rng.uniform(0.95, 1.05, (len(tinted), 1))
     opacity = np.concatenate([np.full(len(patches), o) for patches, o, *_ in layers])
-    return Surfels.concatenate([patches for patches, *_ in layers]), tinted, opacity
+    return surfaces.Surfels.concatenate([patches for patches, *_ in layers]), tinted, opacity
 
 
 def _lattice(face: Face, spacing: float, rng: np.random.Generator) -> tuple[Array, Array]:
@@ -100,15 +93,15 @@ def _lattice(face: Face, spacing: float, rng: np.random.Generator) -> tuple[Arra
     (N, 2) [m] with which it has no holes and ends at the edge."""
     size, spacings = np.array(face.size), np.full(2, spacing)
     if _bulges(face):
-        spacings[0] = min(spacing, widest(face.curved[0], _INSET))
+        spacings[0] = min(spacing, surfaces.widest(face.curved[0], _INSET))
     n = np.maximum(np.ceil(size / spacings - 1e-6).astype(int), 1)
     step = size / n
     i, j = np.meshgrid(np.arange(n[0]), np.arange(n[1]), indexing="ij")
     uv = np.stack([i + 0.5, j + 0.5], axis=-1).reshape(-1, 2)
     uv = (uv + rng.uniform(-0.2, 0.2, uv.shape)) * step
-    extent = np.minimum(COVERAGE * step, np.minimum(uv, size - uv) / RIM)
+    extent = np.minimum(surfaces.COVERAGE * step, np.minimum(uv, size - uv) / surfaces.RIM)
     if _bulges(face):  # no edge around
-        extent[:, 0] = COVERAGE * step[0]
+        extent[:, 0] = surfaces.COVERAGE * step[0]
     return uv, extent
 
 
@@ -142,17 +135,17 @@ def _spiral(face: Face, spacing: float, rng: np.random.Generator) -> tuple[Array
     radius, (around, height) = face.curved[0], face.size
     flat = not _bulges(face)
     if not flat:
-        spacing = min(spacing, widest(radius, _INSET))
+        spacing = min(spacing, surfaces.widest(radius, _INSET))
     whole = height > 0.4 * around  # a full sphere, not half
     area = np.pi * radius**2 * (1 if flat else 4 if whole else 2)
     N = max(6, round(area / spacing**2))
     part = (np.arange(N) + 0.5) / N
     angle = np.arange(N) * np.pi * (3 - np.sqrt(5)) + rng.uniform(0, 2 * np.pi)
     step = np.sqrt(area / N)
-    extent = np.full((N, 2), COVERAGE * step)
+    extent = np.full((N, 2), surfaces.COVERAGE * step)
     if flat:
         v = (radius - 0.4 * step) * np.sqrt(part)
-        extent[:, 1] = np.minimum(extent[:, 1], (radius - v) / RIM)
+        extent[:, 1] = np.minimum(extent[:, 1], (radius - v) / surfaces.RIM)
     else:
         first = -1.0 if whole else 0.0
         latitude = np.arcsin(first + (1 - first) * part)
@@ -164,17 +157,17 @@ def _ground(
     face: Face, spacing: float, spec: WorldSpec, rng: np.random.Generator
 ) -> tuple[Array, Array]:
     """Covers a horizontal plane, coarser outside the volume."""
-    corner = spec.lower_W[:2] - GROUND_REACH
+    corner = spec.lower_W[:2] - surfaces.GROUND_REACH
     uv, extent = [], []
     coarser = 1.0, 2.0, 4.0, 7.0, 12.0
-    rings = ground_rings(spec.plan, [times * spacing for times in coarser], rng)
+    rings = surfaces.ground_rings(spec.plan, [times * spacing for times in coarser], rng)
     for times, p in zip(coarser, rings, strict=True):
         uv.append(p - corner)
-        extent.append(COVERAGE * times * spacing * rng.uniform(0.85, 1.2, (len(p), 2)))
+        extent.append(surfaces.COVERAGE * times * spacing * rng.uniform(0.85, 1.2, (len(p), 2)))
     return np.concatenate(uv), np.concatenate(extent)
 
 
-def _is_seen(spec: WorldSpec, surfels: Surfels) -> NDArray[np.bool_]:
+def _is_seen(spec: WorldSpec, surfels: surfaces.Surfels) -> NDArray[np.bool_]:
     """Marks patches that face the volume and are in no other solid."""
     seen = spec.plan.is_faced(surfels.p, surfels.n)
     shapes = [solid.shape for solid in spec.solids]
@@ -192,6 +185,6 @@ def build(spec: WorldSpec) -> World:
     if spec.gaussians is not None:
         gaussians = spec.gaussians(light)
     else:
-        gaussians = merge([draw(spec, spec.solids, light), *spec.surroundings()])
+        gaussians = surfaces.merge([draw(spec, spec.solids, light), *spec.surroundings()])
     haze = tuple(light.haze.tolist())
     return World(spec.name, gaussians, field, esdf, haze, spec.p_WS, spec.p_WG)

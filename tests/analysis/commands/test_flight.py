@@ -185,9 +185,16 @@ def test_ctrl_c_leaves_page_and_trajectory(tmp_path, monkeypatch):
 
 @pytest.mark.skipif("SPLATPILOT_DATA" not in os.environ, reason="SPLATPILOT_DATA is not set")
 def test_flight_through_a_real_capture(tmp_path):
-    capture = Path(os.environ["SPLATPILOT_DATA"]) / "tartanair" / "hospital"
+    whole, capture = Path(os.environ["SPLATPILOT_DATA"]) / "tartanair/hospital", tmp_path / "third"
     scene, out = tmp_path / "hospital", tmp_path / "flight"
-    assert main(["reconstruct", str(capture), "--out", str(scene), "--iterations", "0"]) == 0
+    for part in ("image_left", "depth_left"):
+        (capture / part).mkdir(parents=True)
+        for file in sorted((whole / part).iterdir())[::3]:
+            (capture / part / file.name).symlink_to(file)
+    poses = (whole / "pose_left.txt").read_text().splitlines(keepends=True)
+    (capture / "pose_left.txt").write_text("".join(poses[::3]))
+    words = ["--iterations", "0", "--set", "voxel_size=0.1"]
+    assert main(["reconstruct", str(capture), "--out", str(scene), *words]) == 0
     assert main(["fly", "--scene", str(scene), "--out", str(out)]) == 0
     summary = json.loads((out / "summary.json").read_text())
     assert summary["outcome"] == "goal"

@@ -8,13 +8,7 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from splatpilot.analysis.commands.main import main
 from splatpilot.analysis.reconstruction.rescale import rescale, run
-from splatpilot.diagrams.worlds.scene_folder import (
-    read_scene,
-    read_scene_folder,
-    read_scene_metadata,
-    write_scene_folder,
-    write_scene_metadata,
-)
+from splatpilot.diagrams.worlds import scene_folder
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf_build import esdf_from_occupancy
@@ -56,7 +50,7 @@ def unscaled(seen_room, photographs, tmp_path):
         p_WG=np.full(3, SHRUNK),
     )
     path = tmp_path / "unscaled"
-    write_scene_folder(
+    scene_folder.write_scene_folder(
         path,
         world,
         provenance="photographs",
@@ -76,7 +70,7 @@ def scale(*words) -> int:
 
 def test_scene_of_photographs_can_be_flown_in_at_its_scale(unscaled, seen_room, tmp_path, capsys):
     with pytest.raises(ValueError, match=r"splatpilot view .* `splatpilot scene scale`"):
-        read_scene(unscaled)
+        scene_folder.read_scene(unscaled)
     before = {file.name: file.read_bytes() for file in unscaled.iterdir()}
     out = tmp_path / "scaled"
     points = "-0.1,0.2,0.3", "1.4,.2,.3"
@@ -84,10 +78,10 @@ def test_scene_of_photographs_can_be_flown_in_at_its_scale(unscaled, seen_room, 
     assert "6 x 3 x 2.5 m" in capsys.readouterr().out
     assert {file.name: file.read_bytes() for file in unscaled.iterdir()} == before
 
-    old, new = read_scene_folder(unscaled, metric=False), read_scene(out)
+    old, new = scene_folder.read_scene_folder(unscaled, metric=False), scene_folder.read_scene(out)
     gaussians, capture = seen_room
     np.testing.assert_allclose(new.gaussians.means[: len(gaussians)], gaussians.means, atol=1e-5)
-    metadata = read_scene_metadata(out)
+    metadata = scene_folder.read_scene_metadata(out)
     assert (metadata.split, metadata.source_digest) == ("validation", ["0123456789abcdef"])
     assert (metadata.held_out, metadata.gains) == ([0, 8], [1.0] * 16)
     assert "scaled by 4" in metadata.provenance
@@ -106,16 +100,18 @@ def test_scene_of_photographs_can_be_flown_in_at_its_scale(unscaled, seen_room, 
 
 def test_factors_multiply(unscaled, tmp_path):
     origin = [100.0, 200.0, -30.0]
-    write_scene_metadata(unscaled, replace(read_scene_metadata(unscaled), origin=origin))
-    poses = read_scene_capture(unscaled, read_scene_metadata(unscaled)).X_WCs
+    scene_folder.write_scene_metadata(
+        unscaled, replace(scene_folder.read_scene_metadata(unscaled), origin=origin)
+    )
+    poses = read_scene_capture(unscaled, scene_folder.read_scene_metadata(unscaled)).X_WCs
     rescale(unscaled, tmp_path / "once", 4.0)
     summary = rescale(tmp_path / "once", tmp_path / "twice", 0.5)
-    once, twice = (read_scene(tmp_path / name) for name in ("once", "twice"))
+    once, twice = (scene_folder.read_scene(tmp_path / name) for name in ("once", "twice"))
     np.testing.assert_array_equal(twice.esdf.distances, 0.5 * once.esdf.distances)
     np.testing.assert_array_equal(twice.esdf.states, once.esdf.states)
     np.testing.assert_allclose(twice.gaussians.scales, 0.5 * once.gaussians.scales, rtol=1e-6)
     np.testing.assert_allclose(summary.size, [3, 1.5, 1.25])
-    metadata = read_scene_metadata(tmp_path / "twice")
+    metadata = scene_folder.read_scene_metadata(tmp_path / "twice")
     assert metadata.capture_settings == ["scale.factor=2.0"]
     assert metadata.origin == [200.0, 400.0, -60.0]
     for X, Y in zip(poses, read_scene_capture(tmp_path / "twice", metadata).X_WCs, strict=True):
@@ -130,7 +126,7 @@ def test_height_of_the_cameras_gives_the_scale(unscaled, tmp_path):
 def test_scene_of_metric_depth_forgets_its_capture(room, tmp_path):
     summary = rescale(room.scene("metric"), tmp_path / "scaled", 2.0)
     assert "has metric depth" in str(summary)
-    metadata = read_scene_metadata(tmp_path / "scaled")
+    metadata = scene_folder.read_scene_metadata(tmp_path / "scaled")
     assert (metadata.capture, metadata.held_out, metadata.gains) == ("", [], [])
 
 

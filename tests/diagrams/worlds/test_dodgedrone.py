@@ -6,20 +6,13 @@ from splatpilot.diagrams.flight.flight import sample_initial_state
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.flight.sensors import make_camera
 from splatpilot.diagrams.scenarios import scenario_file
-from splatpilot.diagrams.worlds.dodgedrone import (
-    LEVELS,
-    SEED,
-    DodgeDroneConfig,
-    Group,
-    dodgedrone_world,
-    draw_obstacles,
-)
+from splatpilot.diagrams.worlds import dodgedrone
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.common.config import load_config
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 
-EASY = DodgeDroneConfig(level="easy", voxel_size=0.5)
+EASY = dodgedrone.DodgeDroneConfig(level="easy", voxel_size=0.5)
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +37,7 @@ def sphere_depth(rays_W, p_WC, forward, centers, radii) -> np.ndarray:
 
 @pytest.mark.parametrize("time", [0.0, 3.3])
 def test_spheres_are_seen_where_they_are_hit(course, time):
-    obstacles = draw_obstacles(LEVELS["easy"], SEED + 1)
+    obstacles = dodgedrone.draw_obstacles(dodgedrone.LEVELS["easy"], dodgedrone.SEED + 1)
     config = OnboardCamera(width=96, height=72)
     camera = make_camera(config, course)
     step = round(time / 0.02)
@@ -75,17 +68,19 @@ def test_spheres_are_seen_where_they_are_hit(course, time):
 
 
 def test_a_course_repeats(course):
-    again = dodgedrone_world(DodgeDroneConfig("easy", first_seed=SEED + 1, voxel_size=0.5), 0)
+    again = dodgedrone.dodgedrone_world(
+        dodgedrone.DodgeDroneConfig("easy", first_seed=dodgedrone.SEED + 1, voxel_size=0.5), 0
+    )
     assert again.moving and course.moving
     for time in (0.0, 11.0):
         np.testing.assert_array_equal(
             again.moving.spheres.centers(time), course.moving.spheres.centers(time)
         )
-    same = dodgedrone_world(EASY, 1)
+    same = dodgedrone.dodgedrone_world(EASY, 1)
     np.testing.assert_array_equal(same.gaussians.sh, course.gaussians.sh)
 
 
-@pytest.mark.parametrize("level", LEVELS)
+@pytest.mark.parametrize("level", dodgedrone.LEVELS)
 def test_scenarios_have_the_rules(level, course):
     scenario = load_config(Scenario(), scenario_file(f"dodgedrone_{level}"))
     scenario.validate()
@@ -120,7 +115,7 @@ STORED = {
 
 @pytest.mark.parametrize(("level", "seed"), STORED)
 def test_agrees_with_the_stored_lists(level, seed):
-    obstacles = draw_obstacles(LEVELS[level], seed)
+    obstacles = dodgedrone.draw_obstacles(dodgedrone.LEVELS[level], seed)
     for number, diameter, place in STORED[level, seed]:
         obstacle = obstacles[number]
         assert 2 * obstacle.radius == pytest.approx(diameter, rel=1e-14)
@@ -132,12 +127,12 @@ def test_an_accelerated_path_agrees_with_the_stored_one():
     flat = (0.0, -10.0, 0.0), (60.0, 10.0, 10.0)
     third = (40.0, -10.0, 0.0), (60.0, 10.0, 10.0)
     groups = (
-        Group(744, *flat, (0.1, 3.0)),
-        Group(88, (20.0, -10.0, 0.0), (60.0, 10.0, 10.0), (0.5, 2.0), (5.0, 5.0, 2.0)),
-        Group(244, *third, (0.1, 3.0)),
-        Group(44, *third, (0.5, 1.5), (1.0, 1.0, 1.0), 30.0),
+        dodgedrone.Group(744, *flat, (0.1, 3.0)),
+        dodgedrone.Group(88, (20.0, -10.0, 0.0), (60.0, 10.0, 10.0), (0.5, 2.0), (5.0, 5.0, 2.0)),
+        dodgedrone.Group(244, *third, (0.1, 3.0)),
+        dodgedrone.Group(44, *third, (0.5, 1.5), (1.0, 1.0, 1.0), 30.0),
     )
-    obstacle = draw_obstacles(groups, PUBLISHED_SEED)[744 + 88 + 244 + 40]
+    obstacle = dodgedrone.draw_obstacles(groups, PUBLISHED_SEED)[744 + 88 + 244 + 40]
     assert 2 * obstacle.radius == pytest.approx(1.3379624605997786, rel=1e-14)
     assert len(obstacle.path) == 71
     stored = {
@@ -150,9 +145,9 @@ def test_an_accelerated_path_agrees_with_the_stored_one():
         np.testing.assert_allclose(obstacle.path[row], place, rtol=1e-12)
 
 
-@pytest.mark.parametrize("level", LEVELS)
+@pytest.mark.parametrize("level", dodgedrone.LEVELS)
 def test_nothing_is_near_start_and_target(level):
-    for obstacle in draw_obstacles(LEVELS[level], 3):
+    for obstacle in dodgedrone.draw_obstacles(dodgedrone.LEVELS[level], 3):
         x, y, z = obstacle.path.T
         near = (abs(y) < 3) & (z > 0) & (z < 5)
         assert not (near & ((abs(x) < 3) | (abs(x - 59) < 2))).any()

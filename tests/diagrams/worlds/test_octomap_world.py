@@ -4,7 +4,7 @@ import pytest
 from splatpilot.diagrams.worlds import octomap_world as module
 from splatpilot.diagrams.worlds.octomap_world import OctomapConfig, octomap_world, voxel_gaussians
 from splatpilot.diagrams.worlds.scene_folder import SceneConfig
-from splatpilot.diagrams.worlds.solids.shading import Daylight
+from splatpilot.diagrams.worlds.solids.textures import Daylight
 from splatpilot.diagrams.worlds.world_registry import scene_config
 from splatpilot.systems.collision.esdf_build import esdf_from_occupancy
 from splatpilot.systems.collision.octomap import Octomap

@@ -8,15 +8,7 @@ from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
 from splatpilot.diagrams.flight.monitor import Outcome, flight_outcome
 from splatpilot.diagrams.flight.policies import policy_named
 from splatpilot.diagrams.flight.scenario import Scenario
-from splatpilot.diagrams.worlds.scene_folder import (
-    check_scene_target,
-    close_frontier,
-    read_scene,
-    read_scene_folder,
-    read_scene_metadata,
-    write_scene_folder,
-    write_scene_metadata,
-)
+from splatpilot.diagrams.worlds import scene_folder
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.depth_fusion import esdf_from_depth_images
 from splatpilot.systems.collision.esdf import Esdf
@@ -68,9 +60,11 @@ def world() -> World:
 
 def test_round_trip(tmp_path, world):
     folder = tmp_path / "scene"
-    written = write_scene_folder(folder, world, gains=np.array([1.0, 1.25]), representation="2dgs")
+    written = scene_folder.write_scene_folder(
+        folder, world, gains=np.array([1.0, 1.25]), representation="2dgs"
+    )
     assert {file.name for file in folder.iterdir()} == {"gaussians.ply", "esdf.npz", "scene.yaml"}
-    back = read_scene(folder)
+    back = scene_folder.read_scene(folder)
     assert (back.name, back.background) == ("box", (0.1, 0.2, 0.3))
     np.testing.assert_array_equal(back.p_WS, world.p_WS)
     np.testing.assert_array_equal(back.p_WG, world.p_WG)
@@ -78,58 +72,58 @@ def test_round_trip(tmp_path, world):
     np.testing.assert_array_equal(back.esdf.distances, world.esdf.distances)
     np.testing.assert_array_equal(back.esdf.states, world.esdf.states)
     assert back.distance_field is back.esdf
-    metadata = read_scene_metadata(folder)
+    metadata = scene_folder.read_scene_metadata(folder)
     assert metadata == written
     assert (metadata.gains, metadata.representation) == ([1.0, 1.25], "2dgs")
     np.testing.assert_allclose(metadata.lower_W, [1, 2, 3])
     np.testing.assert_allclose(metadata.upper_W, [5, 4, 5])
     assert metadata.observed_free_volume == pytest.approx(14 * 10 * 10 * 0.2**3)
     measured = replace(written, perturbation_bound=0.4, pose_perturbation_bounds=[0.3, 0.5])
-    write_scene_metadata(folder, measured)
-    assert read_scene_metadata(folder) == measured
+    scene_folder.write_scene_metadata(folder, measured)
+    assert scene_folder.read_scene_metadata(folder) == measured
 
 
 def test_missing_fields_have_defaults(tmp_path, world):
-    write_scene_folder(tmp_path / "scene", world, image_width=320)
+    scene_folder.write_scene_folder(tmp_path / "scene", world, image_width=320)
     file = tmp_path / "scene" / "scene.yaml"
     lines = file.read_text().splitlines(keepends=True)
     file.write_text("".join(line for line in lines if not line.startswith("image_width")))
-    assert read_scene_metadata(tmp_path / "scene").image_width == 0
+    assert scene_folder.read_scene_metadata(tmp_path / "scene").image_width == 0
 
 
 def test_frontier_is_seen_in_flight_and_kept_apart(tmp_path, world):
     folder, frontier = tmp_path / "scene", box_of_gaussians(step=1.0)
-    written = write_scene_folder(folder, world, frontier, provenance="")
+    written = scene_folder.write_scene_folder(folder, world, frontier, provenance="")
     assert written.frontier and len(read_ply(folder / "gaussians.ply")) == len(world.gaussians)
     means = np.concatenate([world.gaussians.means, frontier.means])
-    np.testing.assert_array_equal(read_scene(folder).gaussians.means, means)
+    np.testing.assert_array_equal(scene_folder.read_scene(folder).gaussians.means, means)
     (folder / "frontier.ply").unlink()
     with pytest.raises(FileNotFoundError, match=r"frontier\.ply"):
-        read_scene(folder)
+        scene_folder.read_scene(folder)
 
 
 def test_an_environment_is_kept(tmp_path, world):
     folder = tmp_path / "scene"
     texels = np.random.default_rng(0).random((8, 16, 3), np.float32)
     sky = replace(world, background=EnvironmentMap(texels))
-    metadata = write_scene_folder(folder, sky, provenance="")
-    back = read_scene(folder).background
+    metadata = scene_folder.write_scene_folder(folder, sky, provenance="")
+    back = scene_folder.read_scene(folder).background
     assert isinstance(back, EnvironmentMap)
     np.testing.assert_allclose(back.texels, texels, atol=0.5 / 255 + 1e-6)
     assert metadata.background == pytest.approx(mean_color(sky.background))
     (folder / "environment.png").unlink()
     with pytest.raises(FileNotFoundError, match=r"No such file: .*environment\.png"):
-        read_scene(folder)
-    write_scene_folder(folder, world, provenance="")
-    assert read_scene(folder).background == world.background
+        scene_folder.read_scene(folder)
+    scene_folder.write_scene_folder(folder, world, provenance="")
+    assert scene_folder.read_scene(folder).background == world.background
 
 
 def test_a_scene_is_replaced_whole(tmp_path, world):
     folder = tmp_path / "scene"
-    write_scene_folder(folder, world, provenance="first")
+    scene_folder.write_scene_folder(folder, world, provenance="first")
     (folder / "metrics.json").write_text("{}")
-    write_scene_folder(folder, world, provenance="second")
-    assert read_scene_metadata(folder).provenance == "second"
+    scene_folder.write_scene_folder(folder, world, provenance="second")
+    assert scene_folder.read_scene_metadata(folder).provenance == "second"
     assert not (folder / "metrics.json").exists()
     assert list(tmp_path.iterdir()) == [folder]
 
@@ -140,31 +134,31 @@ def test_other_folders_are_not_overwritten(tmp_path, world):
     (folder / "photo.jpg").write_bytes(b"x")
     for target in (folder, folder / "photo.jpg"):
         with pytest.raises(ValueError, match="scene folder must be new, empty or a scene"):
-            write_scene_folder(target, world, provenance="")
+            scene_folder.write_scene_folder(target, world, provenance="")
     assert (folder / "photo.jpg").read_bytes() == b"x"
     empty = tmp_path / "empty"
     empty.mkdir()
-    check_scene_target(empty)
+    scene_folder.check_scene_target(empty)
 
 
 def test_unwritable_place(tmp_path, world):
-    write_scene_folder(tmp_path / "new" / "folder" / "scene", world, provenance="")
-    assert read_scene(tmp_path / "new" / "folder" / "scene").name == world.name
+    scene_folder.write_scene_folder(tmp_path / "new" / "folder" / "scene", world, provenance="")
+    assert scene_folder.read_scene(tmp_path / "new" / "folder" / "scene").name == world.name
     (tmp_path / "file").write_text("")
     with pytest.raises(NotADirectoryError, match="file: is a file"):
-        check_scene_target(tmp_path / "file" / "scene")
+        scene_folder.check_scene_target(tmp_path / "file" / "scene")
     with pytest.raises(OSError, match="cannot write to the output folder /proc"):
-        check_scene_target("/proc/scene")
+        scene_folder.check_scene_target("/proc/scene")
 
 
 @pytest.mark.parametrize("missing", ["gaussians.ply", "esdf.npz", "scene.yaml"])
 def test_missing_file(tmp_path, world, missing):
     folder = tmp_path / "scene"
-    write_scene_folder(folder, world, provenance="")
+    scene_folder.write_scene_folder(folder, world, provenance="")
     (folder / missing).unlink()
     with pytest.raises(FileNotFoundError, match=rf"No such file: .*{missing}"):
-        read_scene(folder)
-    for read in (read_scene, read_scene_folder):
+        scene_folder.read_scene(folder)
+    for read in (scene_folder.read_scene, scene_folder.read_scene_folder):
         with pytest.raises(FileNotFoundError, match=r"nowhere"):
             read(tmp_path / "nowhere")
 
@@ -183,18 +177,18 @@ def test_missing_file(tmp_path, world, missing):
 )
 def test_bad_metadata(tmp_path, world, old, new, message):
     folder = tmp_path / "scene"
-    write_scene_folder(folder, world, provenance="")
+    scene_folder.write_scene_folder(folder, world, provenance="")
     text = (folder / "scene.yaml").read_text()
     assert old in text
     (folder / "scene.yaml").write_text(text.replace(old, new))
     with pytest.raises(ValueError, match=rf"(?s)scene\.yaml: .*{message}"):
-        read_scene(folder)
+        scene_folder.read_scene(folder)
 
 
 def test_bare_ply(tmp_path):
     path = tmp_path / "hall.ply"
     write_ply(box_of_gaussians(), path)
-    world = read_scene(path)
+    world = scene_folder.read_scene(path)
     assert world.name == "hall"
     assert len(world.gaussians) > 1000
     assert world.distance_field is world.esdf
@@ -212,7 +206,7 @@ def test_stray_gaussians_do_not_stretch_a_bare_ply(tmp_path):
         [[1000, 0, 0]], [[1, 0, 0, 0]], [[1, 1, 1]], [0.9], [[1, 1, 1]]
     )
     write_ply(scene.merged_with(stray), tmp_path / "hall.ply")
-    assert (read_scene(tmp_path / "hall.ply").esdf.upper_W < 10).all()
+    assert (scene_folder.read_scene(tmp_path / "hall.ply").esdf.upper_W < 10).all()
 
 
 SIZE = np.array([6.0, 4.0, 3.0])  # [m]
@@ -251,7 +245,7 @@ def captured() -> tuple[Esdf, list[np.ndarray], list[RigidTransform]]:
 @pytest.fixture(scope="module")
 def closed(captured) -> tuple[Esdf, GaussianScene]:
     field, depths, X_WCs = captured
-    closed, frontier = close_frontier(field, depths, K, X_WCs)
+    closed, frontier = scene_folder.close_frontier(field, depths, K, X_WCs)
     assert frontier is not None
     return closed, frontier
 
@@ -271,7 +265,7 @@ def test_surfaces_beyond_the_range_of_the_field_are_not_hidden(captured):
     _, depths, X_WCs = captured
     box = np.full(3, -0.4), SIZE + 0.4
     field = esdf_from_depth_images(depths, K, X_WCs, *box, VOXEL, max_range=3.0)
-    _, frontier = close_frontier(field, depths, K, X_WCs)
+    _, frontier = scene_folder.close_frontier(field, depths, K, X_WCs)
     assert frontier is not None
     for depth, X_WC in zip(depths, X_WCs, strict=True):
         assert np.mean(seen_depth(frontier, X_WC) < depth - 0.1) < 0.005
@@ -316,4 +310,4 @@ def test_touching_the_frontier_is_a_collision(captured, closed):
 def test_closed_place_is_left_as_it_is(captured):
     field = captured[0]
     known = Esdf(np.abs(field.distances) + 0.4, 0 * field.states, field.lower_W, VOXEL)
-    assert close_frontier(known, [], K, []) == (known, None)
+    assert scene_folder.close_frontier(known, [], K, []) == (known, None)

@@ -8,19 +8,13 @@ from pydrake.systems.analysis import Simulator
 from splatpilot.systems.collision.distance_field import DistanceField
 from splatpilot.systems.messaging.failsafe import Failsafe, FailsafeConfig
 from splatpilot.systems.policies.velocity import RESPONSE_TIME, tracking_acceleration
+from splatpilot.systems.vehicle import quadrotor
 from splatpilot.systems.vehicle.flatness import FlatnessControllerConfig, flatness_command
-from splatpilot.systems.vehicle.quadrotor import (
-    GRAVITY,
-    VEHICLE_RADIUS,
-    QuadrotorParams,
-    hover_state,
-    rk4_step,
-)
 from splatpilot.systems.vehicle.state import predict_state
 
 LOWER, UPPER = np.array([0.0, -5.0, 0.0]), np.array([20.0, 5.0, 6.0])
-HOVER = np.array([GRAVITY, 0.0, 0.0, 0.0])
-LAW, VEHICLE = FlatnessControllerConfig(), QuadrotorParams()
+HOVER = np.array([quadrotor.GRAVITY, 0.0, 0.0, 0.0])
+LAW, VEHICLE = FlatnessControllerConfig(), quadrotor.QuadrotorParams()
 PERIOD = LAW.period
 
 
@@ -45,7 +39,7 @@ class Bench:
         self.simulator = Simulator(self.failsafe)
         self.context = self.simulator.get_mutable_context()
         self.age, self.by, self.box, self.field = age, by, box, field
-        self.state = hover_state(p_WB)
+        self.state = quadrotor.hover_state(p_WB)
         self.state[3:6] = v_WB
         moved = np.append(PERIOD * self.state[3:6], np.zeros(10))
         self.states = [self.state - k * moved for k in range(round(age / PERIOD), -1, -1)]
@@ -65,7 +59,9 @@ class Bench:
         self.give(state=state, measured_state=measured, state_age=self.age)
         if self.field is not None:
             sample = self.field.query(state[:3])
-            self.give(clearance=sample.distance - VEHICLE_RADIUS, gradient=sample.gradient)
+            self.give(
+                clearance=sample.distance - quadrotor.VEHICLE_RADIUS, gradient=sample.gradient
+            )
 
     def accelerate(self, a_WB, v_WB=None) -> None:
         """Gives setpoint and command of a policy that desires an acceleration."""
@@ -91,7 +87,7 @@ class Bench:
                 command = flatness_command(
                     self.state, acceleration, np.zeros(3), setpoint[3], LAW, VEHICLE
                 )
-            self.state = rk4_step(self.state, command, VEHICLE, PERIOD)
+            self.state = quadrotor.rk4_step(self.state, command, VEHICLE, PERIOD)
             self.states.append(self.state)
             self.min_room = min(self.min_room, self._room())
             self.tick += 1
@@ -99,9 +95,9 @@ class Bench:
     def _room(self) -> float:
         """The distance [m] by which limits are kept: min_clearance, and the sphere in the box."""
         p_WB, (lower, upper) = self.state[:3], self.box
-        room = float(np.min([p_WB - lower, upper - p_WB])) - VEHICLE_RADIUS
+        room = float(np.min([p_WB - lower, upper - p_WB])) - quadrotor.VEHICLE_RADIUS
         if self.field is not None:
-            room = min(room, float(self.field.distance(p_WB)) - VEHICLE_RADIUS - 0.1)
+            room = min(room, float(self.field.distance(p_WB)) - quadrotor.VEHICLE_RADIUS - 0.1)
         return room
 
     def out(self, name: str) -> np.ndarray:

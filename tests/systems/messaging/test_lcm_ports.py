@@ -12,15 +12,9 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantVectorSource
 
+from splatpilot.systems.messaging import lcm_ports
 from splatpilot.systems.messaging.bridge_status import UnixClock
 from splatpilot.systems.messaging.codecs import CommandCodec, DepthGridCodec
-from splatpilot.systems.messaging.lcm_ports import (
-    MeasurementPublisher,
-    MessagePublisher,
-    open_lcm,
-    recorded,
-    replay,
-)
 
 EPOCH = 1_800_000_000.25  # [s], also of the listener.
 CHANNEL = CommandCodec.channel
@@ -36,16 +30,16 @@ CHANNEL = CommandCodec.channel
 )
 def test_unusable_urls_are_refused(url, reason):
     with pytest.raises(OSError, match=reason):
-        open_lcm(url)
+        lcm_ports.open_lcm(url)
 
 
 def test_a_port_in_use_is_refused(udp_url):
-    open_lcm(udp_url)
+    lcm_ports.open_lcm(udp_url)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("", 0))
         url = f"udpm://239.255.76.67:{other.getsockname()[1]}?ttl=0"
         with pytest.raises(OSError, match="does not deliver its own messages; use a multicast"):
-            open_lcm(url)
+            lcm_ports.open_lcm(url)
 
 
 def test_too_many_open_files_are_an_error_and_no_crash():
@@ -58,7 +52,7 @@ def test_too_many_open_files_are_an_error_and_no_crash():
         while not files or files[-1] < 1000:
             files.append(os.open(os.devnull, os.O_RDONLY))
         with pytest.raises(OSError, match="at most 1000 files may be open"):
-            open_lcm("memq://")
+            lcm_ports.open_lcm("memq://")
     finally:
         for file in files:
             os.close(file)
@@ -93,7 +87,7 @@ def published(publisher, until: float, step: float, **sources) -> list:
 
 def periodic(source, until: float, tick: float | None = None, **sources) -> list:
     def make(transport, codec):
-        return MessagePublisher(transport, codec, 0.02, tick)
+        return lcm_ports.MessagePublisher(transport, codec, 0.02, tick)
 
     name = "y0" if isinstance(source, ConstantVectorSource) else "command"
     heard = published(make, until, until, command=(source, name), **sources)
@@ -165,7 +159,9 @@ class Sensor(LeafSystem):
 def test_measurements_are_sent_once_as_they_come_with_their_own_time():
     sensor = Sensor([0.1, 0.103, 0.2, 0.3], latency=0.048)
     sources = {"command": (sensor, "command"), "age": (sensor, "age")}
-    heard = published(lambda *made: MeasurementPublisher(*made, 0.01), 0.5, 0.001, **sources)
+    heard = published(
+        lambda *made: lcm_ports.MeasurementPublisher(*made, 0.01), 0.5, 0.001, **sources
+    )
     times = [m.header.utime * 1e-6 - EPOCH for m, _ in heard]
     np.testing.assert_allclose(times, [0.1, 0.103, 0.2, 0.3], atol=2e-6)
     assert [m.thrust for m, _ in heard] == [0.1, 0.103, 0.2, 0.3]
@@ -266,7 +262,7 @@ def send(transport: lcm.LCM, messages: list[bytes]) -> None:
 def test_a_log_is_lcms_and_replays(listener, tmp_path):
     now, path, transport = time.time(), tmp_path / "flight.lcm", lcm.LCM("memq://")
     messages = [message(k, 0.02 * k, thrust=k, epoch=now) for k in (0, 1, 2, 4, 5)]
-    with recorded(transport, path):
+    with lcm_ports.recorded(transport, path):
         send(transport, messages)
     logged = list(lcm.EventLog(path))
     assert [(e.channel, e.data) for e in logged] == [(CHANNEL, data) for data in messages]
@@ -274,7 +270,7 @@ def test_a_log_is_lcms_and_replays(listener, tmp_path):
     ages = []
     for _ in range(2):
         ours = listener(CommandCodec())
-        replay(path, ours.lcm, ours.simulator, ours.clock)
+        lcm_ports.replay(path, ours.lcm, ours.simulator, ours.clock)
         ours.advance_to(ours.root.get_time() + 0.01)
         assert (ours.value[0], ours.counts) == (5.0, (1, 0))
         ages.append(ours.output("age")[0])
@@ -284,7 +280,7 @@ def test_a_log_is_lcms_and_replays(listener, tmp_path):
 def test_a_full_disk_only_ends_the_log(caplog):
     transport, heard = lcm.LCM("memq://"), []
     transport.subscribe(CHANNEL, lambda _, data: heard.append(data))
-    with recorded(transport, Path("/dev/full"), overwrite=True):
+    with lcm_ports.recorded(transport, Path("/dev/full"), overwrite=True):
         send(transport, [bytes(1000)] * 100)
     assert len(heard) == 100
     [record] = caplog.records
@@ -296,7 +292,7 @@ def test_invalid_logs_are_errors(listener, tmp_path):
     ours = listener(CommandCodec())
     for name, error in (("nowhere", FileNotFoundError), ("junk", ValueError)):
         with pytest.raises(error, match=name):
-            replay(tmp_path / name, ours.lcm, ours.simulator, ours.clock)
+            lcm_ports.replay(tmp_path / name, ours.lcm, ours.simulator, ours.clock)
     for name, error in (("junk", FileExistsError), ("no folder/log", OSError)):
-        with pytest.raises(error), recorded(ours.lcm, tmp_path / name):
+        with pytest.raises(error), lcm_ports.recorded(ours.lcm, tmp_path / name):
             pass

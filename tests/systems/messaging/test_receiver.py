@@ -6,17 +6,11 @@ import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
 
-from splatpilot.systems.messaging.receiver import (
-    Received,
-    TimeOfFlightReceiver,
-    TimeOfFlightStream,
-    UdpConfig,
-    UdpInbox,
-)
+from splatpilot.systems.messaging import receiver
 
 
 def test_contexts_share_what_has_come():
-    received = Received(rejected=1)
+    received = receiver.Received(rejected=1)
     assert copy.deepcopy(received) is received
 
 
@@ -27,7 +21,7 @@ def send(port: int, data: bytes, sender: str = "127.0.0.1") -> None:
 
 
 def test_strangers_are_dropped_and_counted():
-    inbox = UdpInbox(UdpConfig(port=0, senders=["127.0.0.1", "127.0.0.3"]))
+    inbox = receiver.UdpInbox(receiver.UdpConfig(port=0, senders=["127.0.0.1", "127.0.0.3"]))
     for data, last in ((b"a", 1), (b"b", 2), (b"c", 3), (b"d", 2), (b"", 1)):
         send(inbox.port, data, f"127.0.0.{last}")
     assert inbox.receive() == ([b"a", b"c", b""], 2)
@@ -36,13 +30,15 @@ def test_strangers_are_dropped_and_counted():
 
 
 def test_a_port_in_use_and_an_address_of_another_host_are_refused():
-    assert UdpConfig().host == "127.0.0.1" and UdpConfig().senders == ["127.0.0.1"]
-    inbox = UdpInbox(UdpConfig(port=0))
+    assert receiver.UdpConfig().host == "127.0.0.1" and receiver.UdpConfig().senders == [
+        "127.0.0.1"
+    ]
+    inbox = receiver.UdpInbox(receiver.UdpConfig(port=0))
     with pytest.raises(OSError, match=rf"127.0.0.1:{inbox.port}: Address already in use"):
-        UdpInbox(UdpConfig(port=inbox.port))
+        receiver.UdpInbox(receiver.UdpConfig(port=inbox.port))
     inbox.close()
     with pytest.raises(OSError, match="an address of this host"):
-        UdpInbox(UdpConfig(host="192.0.2.1", port=0))
+        receiver.UdpInbox(receiver.UdpConfig(host="192.0.2.1", port=0))
 
 
 def packet(value: float, seq: int, time_ns: int) -> bytes:
@@ -53,8 +49,8 @@ class Sensor:
     """A receiver of a sensor's stream."""
 
     def __init__(self):
-        config = TimeOfFlightStream(UdpConfig(port=0), latency=0.02)
-        self.system = TimeOfFlightReceiver(config, 0.01)
+        config = receiver.TimeOfFlightStream(receiver.UdpConfig(port=0), latency=0.02)
+        self.system = receiver.TimeOfFlightReceiver(config, 0.01)
         self.simulator = Simulator(self.system)
         self.simulator.Initialize()
 

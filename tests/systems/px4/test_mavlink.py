@@ -7,16 +7,9 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import common as dialect
 
-from splatpilot.systems.px4.mavlink import (
-    HOLD,
-    OFFBOARD,
-    Attitude,
-    Heartbeat,
-    Mavlink,
-    Position,
-)
+from splatpilot.systems.px4 import mavlink
 
-OURS = Mavlink()
+OURS = mavlink.Mavlink()
 PX4 = dialect.MAVLink(None, 1, 1)
 
 
@@ -67,7 +60,7 @@ def test_odometry_is_that_of_ekf2():
 
 
 def test_requests_are_those_of_px4():
-    for mode in (OFFBOARD, HOLD):
+    for mode in (mavlink.OFFBOARD, mavlink.HOLD):
         message = received(OURS.set_mode(mode))
         assert message.command == dialect.MAV_CMD_DO_SET_MODE
         assert (message.param1, message.param2, message.param3) == (1.0, *mode)
@@ -87,8 +80,8 @@ def test_px4s_estimates_are_in_our_frames():
     )
     others = bytes(d.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3).pack(d.MAVLink(None, 255, 190)))
     (heartbeat, position, attitude), refused = OURS.read(packet + others)
-    assert heartbeat == Heartbeat(True, OFFBOARD)
-    assert isinstance(position, Position) and isinstance(attitude, Attitude)
+    assert heartbeat == mavlink.Heartbeat(True, mavlink.OFFBOARD)
+    assert isinstance(position, mavlink.Position) and isinstance(attitude, mavlink.Attitude)
     assert (position.time, attitude.time, refused) == (2.5, 2.25, [])
     np.testing.assert_array_equal(position.p_WB, [1, -2, 3])
     np.testing.assert_array_equal(position.v_WB, [0.5, -0.25, 0.125])
@@ -115,7 +108,7 @@ LONG = dialect.MAVLink_attitude_quaternion_message(0, 2.0, 0, 0, 0, 0, 0, 0)
 )
 def test_an_invalid_message_hides_no_other(packet, why):
     messages, refused = OURS.read(packet)
-    assert messages == [Heartbeat(False, (3, 0))]
+    assert messages == [mavlink.Heartbeat(False, (3, 0))]
     assert len(refused) == 1 and re.search(why, refused[0])
 
 

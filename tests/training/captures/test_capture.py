@@ -5,18 +5,7 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 
-from splatpilot.training.captures.capture import (
-    CaptureFrame,
-    DepthCamera,
-    Lens,
-    common_pinhole,
-    fisheye_lens,
-    opencv_lens,
-    pinhole,
-    register_depth,
-    shrink,
-    shrink_factor,
-)
+from splatpilot.training.captures import capture
 from splatpilot.training.captures.capture_config import (
     CaptureConfig,
     cache_folder,
@@ -24,19 +13,19 @@ from splatpilot.training.captures.capture_config import (
     prepare_cache,
 )
 
-K = pinhole(46.0, 46.0, 32.0, 24.0)
+K = capture.pinhole(46.0, 46.0, 32.0, 24.0)
 RAYS = np.random.default_rng(0).uniform(-0.7, 0.7, (50, 2))
 
 
 def test_fourth_radial_term_is_of_the_eighth_power():
-    lens = opencv_lens(K, 64, 48, [0.02, -0.01, 0, 0, 0.005], k4=0.12)
+    lens = capture.opencv_lens(K, 64, 48, [0.02, -0.01, 0, 0, 0.005], k4=0.12)
     r2 = (RAYS**2).sum(axis=1, keepdims=True)
     stretch = 1 + 0.02 * r2 - 0.01 * r2**2 + 0.005 * r2**3 + 0.12 * r2**4
     np.testing.assert_allclose(lens.pixels(RAYS), 46 * stretch * RAYS + [32, 24], atol=1e-9)
 
 
 def test_fisheye_is_that_of_kannala_and_brandt():
-    lens = fisheye_lens(K, 64, 48, [0.1, -0.02, 0.003, 0.001])
+    lens = capture.fisheye_lens(K, 64, 48, [0.1, -0.02, 0.003, 0.001])
     r = np.linalg.norm(RAYS, axis=1, keepdims=True)
     theta = np.arctan(r)
     k = 1 + 0.1 * theta**2 - 0.02 * theta**4 + 0.003 * theta**6 + 0.001 * theta**8
@@ -44,8 +33,8 @@ def test_fisheye_is_that_of_kannala_and_brandt():
 
 
 def test_pinhole_sees_no_farther_than_the_radius_of_a_lens():
-    lens = Lens(K, 64, 48, radius=20.0)
-    camera = common_pinhole([lens])
+    lens = capture.Lens(K, 64, 48, radius=20.0)
+    camera = capture.common_pinhole([lens])
     corner = (np.array([0, 0]) - camera.K[:2, 2]) / np.diag(camera.K)[:2]
     assert np.linalg.norm(lens.pixels(corner[None]) - [32, 24]) == pytest.approx(20, rel=2e-3)
 
@@ -53,12 +42,12 @@ def test_pinhole_sees_no_farther_than_the_radius_of_a_lens():
 @pytest.mark.parametrize("center", [(64.8, 24.0), (32.0, -1.0)])
 def test_principal_point_outside_the_image_is_refused(center):
     with pytest.raises(ValueError, match=r"principal point must be in the image of 64x48 px, got"):
-        Lens(pinhole(46, 46, *center), 64, 48)
+        capture.Lens(capture.pinhole(46, 46, *center), 64, 48)
 
 
 @pytest.mark.parametrize(("cx", "eccentric"), [(32, False), (47, False), (49, True), (15, True)])
 def test_eccentric_lenses_are_recognized(cx, eccentric):
-    assert Lens(pinhole(46, 46, cx, 24), 64, 48).is_eccentric == eccentric
+    assert capture.Lens(capture.pinhole(46, 46, cx, 24), 64, 48).is_eccentric == eccentric
 
 
 K_D = np.array([[58.5, 0, 32], [0, 58.5, 24], [0, 0, 1.0]])
@@ -79,7 +68,9 @@ def test_plane(finer):
     n_C = X_CD.rotation().multiply(n)
     d_C = d + n_C @ X_CD.translation()
     depth = plane_depth(n, d, K_D, 64, 48).astype(np.float32)
-    got = register_depth(depth, DepthCamera(K_D, 64, 48, X_CD), K, 64 * finer, 48 * finer)
+    got = capture.register_depth(
+        depth, capture.DepthCamera(K_D, 64, 48, X_CD), K, 64 * finer, 48 * finer
+    )
     want = plane_depth(n_C, d_C, K, 64 * finer, 48 * finer)
     inner = np.s_[8 * finer : -8 * finer, 8 * finer : -8 * finer]
     # Half a pixel of the coarser camera on this slope.
@@ -89,24 +80,26 @@ def test_plane(finer):
 def test_nearer_surface_hides_the_farther():
     depth = np.full((48, 64), 4.0, np.float32)
     depth[:, 20:30] = 1.0
-    got = register_depth(depth, DepthCamera(K_D, 64, 48, RigidTransform([0.3, 0, 0])), K_D, 64, 48)
+    got = capture.register_depth(
+        depth, capture.DepthCamera(K_D, 64, 48, RigidTransform([0.3, 0, 0])), K_D, 64, 48
+    )
     shift = 0.3 * 58.5
     covered = got[:, int(np.ceil(20 + shift)) : int(30 + shift)]
     np.testing.assert_array_equal(covered, 1.0)
 
 
-def make_frame(depth: np.ndarray) -> CaptureFrame:
+def make_frame(depth: np.ndarray) -> capture.CaptureFrame:
     height, width = depth.shape
     K = np.array([[30.0, 0, width / 2], [0, 30.0, height / 2], [0, 0, 1]])
     image = np.arange(height * width * 3, dtype=np.uint8).reshape(height, width, 3)
-    return CaptureFrame(image, depth.astype(np.float32), RigidTransform(), K)
+    return capture.CaptureFrame(image, depth.astype(np.float32), RigidTransform(), K)
 
 
 @pytest.mark.parametrize(
     ("width", "desired", "factor"), [(640, 320, 2), (640, 0, 1), (100, 320, 1), (2832, 320, 9)]
 )
 def test_factors_are_whole_and_never_enlarge(width, desired, factor):
-    assert shrink_factor(width, desired) == factor
+    assert capture.shrink_factor(width, desired) == factor
 
 
 @pytest.mark.parametrize("factor", [2, 3])
@@ -115,7 +108,7 @@ def test_a_slanted_plane_keeps_its_depth(factor):
         return plane_depth(np.array([0.3, -0.2, 1.0]), 2, K, width, height)
 
     frame = make_frame(np.ones((25, 32)))
-    small = shrink(make_frame(plane(frame.K, 32, 25)), factor)
+    small = capture.shrink(make_frame(plane(frame.K, 32, 25)), factor)
     assert small.depth.shape == small.image.shape[:2] == (25 // factor, 32 // factor)
     np.testing.assert_allclose(small.depth, plane(small.K, 32 // factor, 25 // factor), rtol=1e-6)
 
@@ -131,14 +124,14 @@ def test_edges_holes_and_sky():
         ]
     )
     expected = [[1, 0, inf, 4], [1, 2, 0, 2 / (1 + 1 / 1.02)]]
-    np.testing.assert_allclose(shrink(make_frame(depth), 2).depth, expected, rtol=1e-6)
+    np.testing.assert_allclose(capture.shrink(make_frame(depth), 2).depth, expected, rtol=1e-6)
 
 
 def test_shrunken_pixels_are_valid_if_all_replaced_ones_are():
     frame = make_frame(np.ones((5, 8)))
     valid = np.ones((5, 8), bool)
     valid[1, 2] = valid[3, 6:] = valid[4] = False
-    small = shrink(dataclasses.replace(frame, valid=valid), 2)
+    small = capture.shrink(dataclasses.replace(frame, valid=valid), 2)
     expected = [[True, False, True, True], [True, True, True, False]]
     np.testing.assert_array_equal(small.valid, expected)
     np.testing.assert_array_equal(small.depth > 0, expected)
@@ -147,7 +140,7 @@ def test_shrunken_pixels_are_valid_if_all_replaced_ones_are():
 def test_colors_are_averaged():
     frame = make_frame(np.ones((4, 6)))
     mean = frame.image.reshape(2, 2, 3, 2, 3).mean(axis=(1, 3))
-    assert np.abs(shrink(frame, 2).image - mean).max() <= 0.5
+    assert np.abs(capture.shrink(frame, 2).image - mean).max() <= 0.5
 
 
 def test_cache_folder(monkeypatch, tmp_path):

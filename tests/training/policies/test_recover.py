@@ -56,41 +56,48 @@ def both_stages(expert: Path, out: Path) -> dict:
     return recovery.run(config=config, make=StudentTrainer, out=out, flights=1, jobs=1)
 
 
+@pytest.fixture(scope="module")
+def recovered(expert, tmp_path_factory) -> Path:
+    """The folder of both stages."""
+    out = tmp_path_factory.mktemp("recovered")
+    both_stages(expert, out)
+    return out
+
+
 def weights(out: Path) -> dict[str, np.ndarray]:
     with np.load(out / "stage_2" / "student_depth.npz") as file:
         return {name: file[name] for name in file.files if name != "about"}
 
 
-def test_student_flies_and_trains_again_with_recovery_samples(expert, tmp_path, monkeypatch):
-    before = {path: path.stat().st_mtime_ns for path in expert.rglob("*")}
-    whole, parts = tmp_path / "whole", tmp_path / "parts"
-    ledger = both_stages(expert, whole)
-    assert {path: path.stat().st_mtime_ns for path in expert.rglob("*")} == before
-    corpus = Corpus(whole / "corpora" / "0")
+def test_student_flies_and_trains_again_with_recovery_samples(
+    expert, recovered, tmp_path, monkeypatch
+):
+    ledger = json.loads((recovered / "recovery.json").read_text())
+    corpus = Corpus(recovered / "corpora" / "0")
     samples = corpus.samples(np.arange(len(corpus)))
     assert ledger["expert_samples"] == (samples.source == EXPERT).sum() == len(Corpus(expert))
     assert ledger["recovery_samples"] == (samples.source == RECOVERY).sum() > 0
     assert sum(ledger["flights"].values()) == 1 <= ledger["near_misses"]
     assert len(set(samples.world[samples.source == RECOVERY])) == 1
-    assert len(list((whole / "flights" / "0").iterdir())) == 1
-    assert json.loads((whole / "recovery.json").read_text()) == ledger
+    assert len(list((recovered / "flights" / "0").iterdir())) == 1
 
+    before = {path: path.stat().st_mtime_ns for path in expert.rglob("*")}
     for module, step in ((recovery, "_fly_world"), (recovery, "_count")):
         with monkeypatch.context() as patch:
             patch.setattr(module, step, interrupt)
             with pytest.raises(KeyboardInterrupt):
-                both_stages(expert, parts)
+                both_stages(expert, tmp_path)
     config = load_config(StudentDepthTraining(), overrides=[f"corpora=[{expert}]", *TINY])
     with pytest.raises(ValueError, match=r"recovery.yaml holds another configuration"):
-        recovery.run(config=config, make=StudentTrainer, out=parts, flights=2, jobs=1)
+        recovery.run(config=config, make=StudentTrainer, out=tmp_path, flights=2, jobs=1)
     monkeypatch.setattr(recovery, "_fly_world", interrupt)  # which has been done
-    assert both_stages(expert, parts)["flights"] == ledger["flights"]
-    expected, found = weights(whole), weights(parts)
+    assert both_stages(expert, tmp_path) == ledger
+    assert {path: path.stat().st_mtime_ns for path in expert.rglob("*")} == before
+    expected, found = weights(recovered), weights(tmp_path)
     assert all(np.array_equal(found[name], value) for name, value in expected.items())
 
 
-def test_next_round_is_flown_by_the_weights_of_the_last(expert, tmp_path, monkeypatch):
-    both_stages(expert, tmp_path / "first")
+def test_next_round_is_flown_by_the_weights_of_the_last(expert, recovered, tmp_path, monkeypatch):
     flown = []
 
     def watched(diagram):
@@ -98,8 +105,8 @@ def test_next_round_is_flown_by_the_weights_of_the_last(expert, tmp_path, monkey
         return fly(diagram)
 
     monkeypatch.setattr(recovery, "fly", watched)
-    corpus, out = tmp_path / "first" / "corpora" / "0", tmp_path / "second"
-    flown_by = str(tmp_path / "first" / "stage_2" / "student_depth.npz")
+    corpus, out = recovered / "corpora" / "0", tmp_path / "second"
+    flown_by = str(recovered / "stage_2" / "student_depth.npz")
     config = load_config(StudentDepthTraining(), overrides=[f"corpora=[{corpus}]", *TINY])
     round_of = {"config": config, "make": StudentTrainer, "out": out, "flights": 1, "jobs": 1}
     ledger = recovery.run(**round_of, flown_by=flown_by)
@@ -111,7 +118,7 @@ def test_next_round_is_flown_by_the_weights_of_the_last(expert, tmp_path, monkey
     with pytest.raises(ValueError, match=r"recovery.yaml holds another configuration"):
         recovery.run(**round_of)
     others = load_config(StudentDepthTraining(), overrides=[f"corpora=[{expert}]", *TINY])
-    with pytest.raises(ValueError, match=r"holds another configuration, with .*first/corpora/0"):
+    with pytest.raises(ValueError, match=r"holds another configuration, with .*/corpora/0"):
         recovery.run(**round_of | {"config": others}, flown_by=flown_by)
     with pytest.raises(FileNotFoundError, match="nowhere holds no corpus"):
         nowhere = load_config(StudentDepthTraining(), overrides=["corpora=[nowhere]", *TINY])
@@ -142,9 +149,8 @@ def test_lost_and_damaged_files_are_made_again(expert, tmp_path, capsys):
         both_stages(source, tmp_path / "out")
 
 
-def test_recovery_share_is_the_fraction_of_recovery_samples(expert, tmp_path):
-    both_stages(expert, tmp_path)
-    data = StudentData([Corpus(tmp_path / "corpora" / "0")], 0.5)
+def test_recovery_share_is_the_fraction_of_recovery_samples(expert, recovered):
+    data = StudentData([Corpus(recovered / "corpora" / "0")], 0.5)
     generator = torch.Generator().manual_seed(0)
     natural = len(data.recovered) / len(data.training)
     assert 0.0 < natural < 1.0

@@ -6,15 +6,8 @@ import torch
 from pydrake.math import RigidTransform, RollPitchYaw
 from torchvision.models import mobilenet_v2
 
+from splatpilot.systems.policies import student
 from splatpilot.systems.policies.base import Observation
-from splatpilot.systems.policies.student import (
-    STATE_SIZE,
-    StudentNetwork,
-    StudentSpec,
-    encode_state,
-    mobilenet_shapes,
-    plan,
-)
 from splatpilot.systems.vehicle.state import QuadrotorState
 from splatpilot.training.policies.student_data import encode_images
 from splatpilot.training.policies.student_network import IN_DATA, StudentModule, imagenet_weights
@@ -34,7 +27,7 @@ def disturbed(module: StudentModule) -> StudentModule:
 @pytest.mark.parametrize("p_WG", [[4.0, 2.0, 1.5], [1.0, -2.0, 0.5], [0.0, 0.0, 0.0]])
 def test_flight_computes_what_training_computes(observation, size, p_WG):
     torch.manual_seed(0)
-    spec = StudentSpec(observation, *size, head_features=20, nominal_speed=2.6)
+    spec = student.StudentSpec(observation, *size, head_features=20, nominal_speed=2.6)
     module = disturbed(StudentModule(spec))
     weights = {name: w.numpy() for name, w in module.state_dict().items()}
     assert {name: w.shape for name, w in weights.items()} == spec.weight_shapes()
@@ -46,30 +39,30 @@ def test_flight_computes_what_training_computes(observation, size, p_WG):
     X_WB, p_WG = RigidTransform(rotation, p_WB), np.array(p_WG)
     R_WB = X_WB.rotation().matrix()
     labels = (R_WB, R_WB.T @ v_WB, R_WB.T @ (p_WG - p_WB))
-    state = encode_state(*(torch.tensor(x).float()[None] for x in labels), spec.reach)
+    state = student.encode_state(*(torch.tensor(x).float()[None] for x in labels), spec.reach)
 
     image = color if observation == "rgb" else depth
     with torch.no_grad():
         expected = module(encode_images(image[None]), state)
     still = QuadrotorState(p_WB, v_WB, rotation.ToQuaternion().wxyz(), np.zeros(3))
     seen = Observation(0.5, X_WB, still, p_WG, image)
-    found = plan(StudentNetwork(spec, weights), seen)
+    found = student.plan(student.StudentNetwork(spec, weights), seen)
     np.testing.assert_allclose(found.waypoints_B, expected[0][0], atol=1e-4)
     np.testing.assert_allclose(found.costs, expected[1][0], atol=1e-4)
     assert np.ptp(found.costs) > 1e-3 and found.plan_time == 0.5
 
 
 def test_images_of_another_size_are_refused():
-    spec = StudentSpec("depth", 64, 48)
+    spec = student.StudentSpec("depth", 64, 48)
     weights = {name: np.zeros(shape, np.float32) for name, shape in spec.weight_shapes().items()}
     message = r"must be \(3, 48, 64\), got \(3, 48, 65\); give it a camera of 64x48"
     with pytest.raises(ValueError, match=message):
-        StudentNetwork(spec, weights)(np.zeros((3, 48, 65), np.float32), np.zeros(6))
+        student.StudentNetwork(spec, weights)(np.zeros((3, 48, 65), np.float32), np.zeros(6))
 
 
 def test_untrained_encoder_keeps_the_variance_of_images():
     torch.manual_seed(0)
-    module = StudentModule(StudentSpec("rgb", 96, 64))
+    module = StudentModule(student.StudentSpec("rgb", 96, 64))
     with torch.no_grad():
         features = module.features(torch.rand(4, 3, 64, 96) * 2.0 - 1.0)
     assert 0.05 < features.std().item() < 2.0
@@ -77,9 +70,9 @@ def test_untrained_encoder_keeps_the_variance_of_images():
 
 
 def test_frozen_modules_and_modules_in_parts():
-    module = StudentModule(StudentSpec("depth", 64, 48))
+    module = StudentModule(student.StudentSpec("depth", 64, 48))
     module.image_modules(14).requires_grad_(False)
-    image, state = torch.randn(2, 3, 48, 64), torch.randn(2, STATE_SIZE)
+    image, state = torch.randn(2, 3, 48, 64), torch.randn(2, student.STATE_SIZE)
     whole = module(image, state)
     for first in 0, 14, 19, 20:
         parts = module(module.encode_image(image, 0, first), state, first)
@@ -115,7 +108,7 @@ def test_batch_norms_and_scaling_are_folded(encoder_file):
     with torch.no_grad():
         first = theirs.eval().features[0](scaled)
         rest = theirs.features[1:](first)
-    module = StudentModule(StudentSpec(way_version=2))
+    module = StudentModule(student.StudentSpec(way_version=2))
     module.load_state_dict(weights, strict=False)
     with torch.no_grad():
         ours = module.features[0](2.0 * image - 1.0)
@@ -127,7 +120,7 @@ def test_folded_weights_keep_their_scaling(encoder_file):
     theirs = mobilenet_v2()
     torch.save(theirs.state_dict(), encoder_file)
     weights = imagenet_weights()
-    assert weights.keys() == mobilenet_shapes().keys()
+    assert weights.keys() == student.mobilenet_shapes().keys()
     first = theirs.state_dict()["features.0.0.weight"]
     torch.testing.assert_close(weights["features.0.0.weight"], first, atol=1e-5, rtol=1e-4)
 
@@ -142,4 +135,4 @@ def test_other_files_are_refused(encoder_file, tmp_path, monkeypatch):
         imagenet_weights()
     (tmp_path / "checkpoints").mkdir()
     torch.save(mobilenet_v2().state_dict(), tmp_path / "checkpoints/mobilenet_v2-7ebf99e0.pth")
-    assert imagenet_weights().keys() == mobilenet_shapes().keys()
+    assert imagenet_weights().keys() == student.mobilenet_shapes().keys()

@@ -13,19 +13,8 @@ from splatpilot.training.captures.capture import (
     project_points,
 )
 from splatpilot.training.captures.capture_registry import read_capture
+from splatpilot.training.reconstruction import initialize
 from splatpilot.training.reconstruction.config import ReconstructConfig
-from splatpilot.training.reconstruction.initialize import (
-    BlockMeans,
-    cell_gaussians,
-    frame_gaussians,
-    gaussians_from_depth,
-    gaussians_from_points,
-    held_out_frames,
-    principal_axes,
-    random_points,
-    resolve_config,
-    triangulate,
-)
 from splatpilot.training.reconstruction.photometry import ThinnedFrame, estimate_photometry
 
 
@@ -54,7 +43,7 @@ class Frames:
 )
 def test_steps_follow_the_fitted_images(count, has_depth, iterations, expected):
     config = ReconstructConfig(iterations=iterations)
-    resolved = resolve_config(config, Frames(count, has_depth))  # pyright: ignore[reportArgumentType]
+    resolved = initialize.resolve_config(config, Frames(count, has_depth))  # pyright: ignore[reportArgumentType]
     assert resolved.iterations == expected
     assert resolved.initialization == ("depth" if has_depth else "random")
 
@@ -62,7 +51,7 @@ def test_steps_follow_the_fitted_images(count, has_depth, iterations, expected):
 def from_depth(frames, **changes):
     photometry = estimate_photometry([ThinnedFrame.of(frame) for frame in frames], 0)
     options = {"max_gaussians": 100_000, "contrast": 1.0, "optimized": True, "max_extent": 0.2}
-    return gaussians_from_depth(frames, photometry, **options | changes)
+    return initialize.gaussians_from_depth(frames, photometry, **options | changes)
 
 
 @pytest.fixture
@@ -106,7 +95,7 @@ def test_invalid_pixels_give_no_gaussians(capture):
         load_valid=lambda i: valid,
     )
     frames = list(masked.frames())
-    _, colors = random_points(frames, 5000, 0.5, 8.0, seed=0)
+    _, colors = initialize.random_points(frames, 5000, 0.5, 8.0, seed=0)
     for found in (from_depth(frames).base_colors, colors):
         assert len(found) > 500
         assert not ((np.abs(found - magenta / 255) < 0.05).all(axis=1)).any()
@@ -118,23 +107,23 @@ def test_invalid_pixels_give_no_gaussians(capture):
 )
 def test_held_out_frames(hold_out, in_files, expected):
     config = ReconstructConfig(hold_out=hold_out)
-    assert held_out_frames(Frames(10, True, in_files), config) == expected  # pyright: ignore[reportArgumentType]
+    assert initialize.held_out_frames(Frames(10, True, in_files), config) == expected  # pyright: ignore[reportArgumentType]
 
 
 def test_points_become_gaussians_of_their_spacing():
     p_WQ = np.stack(np.meshgrid(*[0.2 * np.arange(5)] * 3), axis=-1).reshape(-1, 3)
     colors = np.random.default_rng(0).uniform(size=p_WQ.shape)
-    scene = gaussians_from_points(p_WQ, colors)
+    scene = initialize.gaussians_from_points(p_WQ, colors)
     np.testing.assert_allclose(scene.scales, 0.1, rtol=1e-5)
     np.testing.assert_allclose(scene.means, p_WQ, rtol=1e-6)
     np.testing.assert_allclose(scene.base_colors, colors, atol=1e-5)
     with pytest.raises(ValueError, match="3 points are too few"):
-        gaussians_from_points(p_WQ[:3], colors[:3])
+        initialize.gaussians_from_points(p_WQ[:3], colors[:3])
 
 
 def test_random_points_lie_in_view(capture):
     frame = capture.frame(2)
-    p_WQ, colors = random_points([frame], 500, 0.5, 8.0, seed=1)
+    p_WQ, colors = initialize.random_points([frame], 500, 0.5, 8.0, seed=1)
     assert p_WQ.shape == (500, 3)
     p_CQ = frame.X_WC.inverse().multiply(p_WQ.T).T
     assert p_CQ[:, 2].min() >= 0.5 and 4 < p_CQ[:, 2].max() <= 8
@@ -169,7 +158,7 @@ def covered(cells) -> np.ndarray:
 def test_plain_plane_takes_the_largest_cells(rows, columns):
     whole, part = plane_frame([0.5, 0.2, 0.8], 1.6), (slice(rows), slice(columns))
     frame = CaptureFrame(whole.image[part], whole.depth[part], X_WC, K)
-    means = BlockMeans(frame, GRAY[part], ALL[part], 8)
+    means = initialize.BlockMeans(frame, GRAY[part], ALL[part], 8)
     cells = means.split(0.05, 8, 0.75, 9)
     assert (set(cells.size) == {8}) == (rows == 48)
     assert (covered(cells)[:rows, :columns] == 1).all()
@@ -182,7 +171,7 @@ def test_texture_and_edges_take_small_cells():
     frame = replace(frame, depth=depth)
     image = GRAY.copy()
     image[20] = 0.1
-    cells = BlockMeans(frame, image, ALL, 8).split(0.05, 8, 0.75, 9)
+    cells = initialize.BlockMeans(frame, image, ALL, 8).split(0.05, 8, 0.75, 9)
     assert (covered(cells) == 1).all()
     on_step = np.abs(cells.u - 41) < 1
     assert set(cells.size[on_step]) == {1}
@@ -196,7 +185,7 @@ def test_only_masked_pixels_with_depth_are_covered():
     depth, mask = frame.depth.copy(), ALL.copy()
     depth[:4], depth[4:8] = 0, np.inf
     mask[:, 32:] = False
-    means = BlockMeans(replace(frame, depth=depth), GRAY, mask, 8)
+    means = initialize.BlockMeans(replace(frame, depth=depth), GRAY, mask, 8)
     count = covered(means.split(1, 8, 0.75, 9))
     assert (count[8:, :32] == 1).all()
     assert count[:8].sum() == count[:, 32:].sum() == 0
@@ -206,8 +195,8 @@ def test_gaussians_are_flat_and_cover_their_cell_in_the_image():
     normal_C = np.array([0.3, -0.4, 0.85])
     normal_C /= np.linalg.norm(normal_C)
     frame = plane_frame(normal_C, 2.0)
-    cells = BlockMeans(frame, GRAY, ALL, 4).split(0.05, 4, 0.75, 9)
-    p_WQ, covariances = cell_gaussians(frame, cells, spread=0.5)
+    cells = initialize.BlockMeans(frame, GRAY, ALL, 4).split(0.05, 4, 0.75, 9)
+    p_WQ, covariances = initialize.cell_gaussians(frame, cells, spread=0.5)
     R_CW = X_WC.rotation().matrix().T
     p_CQ, covariances = X_WC.inverse().multiply(p_WQ.T).T, R_CW @ covariances @ R_CW.T
     np.testing.assert_allclose(p_CQ @ normal_C, 2.0, atol=1e-5)
@@ -222,9 +211,9 @@ def test_gaussians_are_flat_and_cover_their_cell_in_the_image():
 
 def test_cells_do_not_extend_too_far():
     frame = plane_frame([0.6, 0, 0.8], 1.0)
-    cells = BlockMeans(frame, GRAY, ALL, 16).split(1, 16, 0.75, 0.1)
+    cells = initialize.BlockMeans(frame, GRAY, ALL, 16).split(1, 16, 0.75, 0.1)
     assert (covered(cells) == 1).all()
-    _, covariances = cell_gaussians(frame, cells, spread=1)
+    _, covariances = initialize.cell_gaussians(frame, cells, spread=1)
     longest = np.sqrt(np.linalg.eigvalsh(covariances)[:, 2])
     large = cells.size > 1
     assert large.any()
@@ -236,7 +225,7 @@ def test_underlay_lies_behind_and_closes_gaps():
     wide = K * np.array([[10, 1, 1], [1, 10, 1], [1, 1, 1]])
     depth = np.full((HEIGHT, WIDTH), 2, np.float32)
     frame = CaptureFrame(np.zeros((HEIGHT, WIDTH, 3), np.uint8), depth, X_WC, wide)
-    p_WQ, covariances, colors = frame_gaussians(frame, GRAY, ALL, 0.05, 4, 1.0)
+    p_WQ, covariances, colors = initialize.frame_gaussians(frame, GRAY, ALL, 0.05, 4, 1.0)
     z = X_WC.inverse().multiply(p_WQ.T)[2]
     surface, under = np.abs(z - 2) < 1e-5, np.abs(z - 2.06) < 1e-5
     assert (surface.sum(), under.sum(), len(z)) == (12 * 16, 6 * 8, 12 * 16 + 6 * 8)
@@ -249,12 +238,12 @@ def test_underlay_lies_behind_and_closes_gaps():
 def test_third_principal_axis_is_the_normal():
     R, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(20, 3, 3)))
     covariances = R @ np.diag([0.04, 1e-6, 0.01]) @ R.transpose(0, 2, 1)
-    quats, scales = principal_axes(covariances)
+    quats, scales = initialize.principal_axes(covariances)
     np.testing.assert_allclose(scales, [[0.2, 0.1, 1e-3]] * 20, rtol=1e-3)
     found = np.array([RotationMatrix(Quaternion(quat)).matrix() for quat in quats])
     axes = found * scales[:, None]
     np.testing.assert_allclose(axes @ axes.transpose(0, 2, 1), covariances, atol=1e-10)
-    _, flat = principal_axes(np.diag([0.0, 1.0, 4.0])[None])
+    _, flat = initialize.principal_axes(np.diag([0.0, 1.0, 4.0])[None])
     assert (flat > 0).all() and flat.max() == pytest.approx(2)
 
 
@@ -287,7 +276,9 @@ def test_triangulated_points_lie_on_the_plane():
         loaded.append(i)
         return capture.load_image(i)
 
-    points, again = (triangulate(replace(capture, load_image=load_image), [0, 1, 3]) for _ in "ab")
+    points, again = (
+        initialize.triangulate(replace(capture, load_image=load_image), [0, 1, 3]) for _ in "ab"
+    )
     np.testing.assert_array_equal(points.p_WQ, again.p_WQ)
     assert loaded == [0, 1, 3] * 2
     x, y, z = points.p_WQ.T
@@ -303,4 +294,4 @@ def test_too_little_texture():
     gray = np.full((120, 160, 3), 128, np.uint8)
     capture = replace(posters(), source="gray walls", load_image=lambda i: gray)
     with pytest.raises(ValueError, match=r"gray walls: .* must be at least 100, got 0"):
-        triangulate(capture, [0, 1])
+        initialize.triangulate(capture, [0, 1])

@@ -10,15 +10,7 @@ from pydrake.math import RigidTransform
 from splatpilot.systems.splats.background import RenderedView
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.training.captures.capture import CaptureFrame
-from splatpilot.training.reconstruction.metrics import (
-    depth_metrics,
-    fit_exposure,
-    floaters,
-    mean_metric,
-    measure_view,
-    psnr_db,
-    ssim,
-)
+from splatpilot.training.reconstruction import metrics
 from splatpilot.training.reconstruction.photometry import vignette
 from splatpilot.training.reconstruction.splat_rendering import SceneRenderer
 
@@ -36,20 +28,20 @@ def test_ssim():
     a, b = np.full((64, 64, 3), 0.4), np.full((64, 64, 3), 0.6)
     everywhere = np.ones((64, 64), bool)
     luminance = (2 * 0.4 * 0.6 + 1e-4) / (0.4**2 + 0.6**2 + 1e-4)
-    assert ssim(a, b, everywhere) == pytest.approx(luminance, abs=0.03)
-    assert ssim(a, a, everywhere) == pytest.approx(1, abs=1e-6)
-    whole = ssim(noise(0), noise(1), EVERYWHERE)
+    assert metrics.ssim(a, b, everywhere) == pytest.approx(luminance, abs=0.03)
+    assert metrics.ssim(a, a, everywhere) == pytest.approx(1, abs=1e-6)
+    whole = metrics.ssim(noise(0), noise(1), EVERYWHERE)
     assert whole < 0.3
     for fraction in (0.2, 0.5, 0.8):
         part = np.random.default_rng(2).random((HEIGHT, WIDTH)) >= fraction
-        assert ssim(noise(0), noise(1), part) == pytest.approx(whole, abs=0.03)
+        assert metrics.ssim(noise(0), noise(1), part) == pytest.approx(whole, abs=0.03)
 
 
 def test_depth_metrics_are_over_pixels_with_true_depth():
-    assert psnr_db(np.full((2, 2, 3), 0.1), np.zeros((2, 2, 3))) == pytest.approx(20.0)
+    assert metrics.psnr_db(np.full((2, 2, 3), 0.1), np.zeros((2, 2, 3))) == pytest.approx(20.0)
     truth = np.array([[2.0, 4.0, 0.0, np.inf, 149.0, 200.0]], np.float32)
     depth = np.array([[2.5, 0.0, 9.0, 9.0, 148.0, 9.0]], np.float32)
-    assert depth_metrics(depth, truth) == pytest.approx(
+    assert metrics.depth_metrics(depth, truth) == pytest.approx(
         {
             "depth_mae_m": (0.5 + 4 + 1) / 3,
             "depth_relative": (0.25 + 1 + 1 / 149) / 3,
@@ -57,7 +49,7 @@ def test_depth_metrics_are_over_pixels_with_true_depth():
             "hole_fraction": 1 / 3,
         }
     )
-    assert set(depth_metrics(np.zeros((2, 2)), np.zeros((2, 2))).values()) == {None}
+    assert set(metrics.depth_metrics(np.zeros((2, 2)), np.zeros((2, 2))).values()) == {None}
 
 
 def test_floaters_are_in_front_by_the_margin():
@@ -73,8 +65,8 @@ def test_floaters_are_in_front_by_the_margin():
         (np.inf, 1.0, False),
     ]
     truth, depth, expected = map(np.array, zip(*cases, strict=True))
-    np.testing.assert_array_equal(floaters(depth, truth), expected.astype(bool))
-    assert depth_metrics(depth, truth)["floater_fraction"] == pytest.approx(3 / 7)
+    np.testing.assert_array_equal(metrics.floaters(depth, truth), expected.astype(bool))
+    assert metrics.depth_metrics(depth, truth)["floater_fraction"] == pytest.approx(3 / 7)
 
 
 def plane(z: float) -> GaussianScene:
@@ -98,16 +90,16 @@ def test_a_plane_in_front_is_all_floater(representation):
         view = SceneRenderer(plane(z), representation).render(K, WIDTH, HEIGHT, X_WC)
         assert view.alpha.min() > 0.99
         assert view.color == pytest.approx(np.full((HEIGHT, WIDTH, 3), 0.6), abs=0.01)
-        found = depth_metrics(view.depth, truth)
+        found = metrics.depth_metrics(view.depth, truth)
         assert found["depth_mae_m"] == pytest.approx(error, abs=2e-3)
         assert found["floater_fraction"] == fraction
 
 
 def test_exposure_is_the_least_squares_fit():
     scene, truth = 0.5 * noise(), noise(1)
-    black, gain = fit_exposure(np.zeros_like(scene), truth, -0.5, EVERYWHERE)
+    black, gain = metrics.fit_exposure(np.zeros_like(scene), truth, -0.5, EVERYWHERE)
     assert gain == 1.0 and not black.any()
-    _, best = fit_exposure(scene, truth, 0.0, EVERYWHERE)
+    _, best = metrics.fit_exposure(scene, truth, 0.0, EVERYWHERE)
     errors = [np.sum((g * scene - truth) ** 2) for g in (best - 0.01, best, best + 0.01)]
     assert errors[1] < min(errors[0], errors[2])
 
@@ -126,7 +118,7 @@ def test_metrics_of_a_view():
     exposed = 1.2 * color * vignette(-0.2, WIDTH, HEIGHT)[..., None]
     near = DEPTH.copy()
     near[:6] = 1.0  # a quarter
-    found = measure_view(*make_view(color, exposed, near), vignetting=-0.2)
+    found = metrics.measure_view(*make_view(color, exposed, near), vignetting=-0.2)
     assert found.psnr_db > 50 and found.ssim > 0.999
     assert found.gain == pytest.approx(1.2, rel=1e-3)
     assert found.lpips is None
@@ -146,7 +138,7 @@ def test_a_translucent_surface_is_a_hole():
     color = alpha[..., None] * np.float32([gray])
     seen = RenderedView(color, np.where(alpha > 0.5, truth, 0), alpha)
     frame = make_view(color, np.full((HEIGHT, WIDTH, 3), 0.5), truth=truth)[-1]
-    found = measure_view(seen, gray, frame)
+    found = metrics.measure_view(seen, gray, frame)
     assert found.hole_fraction == pytest.approx(0.5)
     assert found.depth_mae_m == pytest.approx(1.0)
     assert found.floater_fraction == 0
@@ -154,7 +146,7 @@ def test_a_translucent_surface_is_a_hole():
     assert found.psnr_on_black_db < 20
     solid = np.float32(alpha > 0)
     opaque = RenderedView(solid[..., None] * np.float32([gray]), truth, solid)
-    assert measure_view(opaque, gray, frame).psnr_on_black_db > 50
+    assert metrics.measure_view(opaque, gray, frame).psnr_on_black_db > 50
 
 
 def test_invalid_and_unseen_pixels_are_not_measured():
@@ -165,12 +157,12 @@ def test_invalid_and_unseen_pixels_are_not_measured():
     image = np.where(used[..., None], color, (1, 0, 1))
     view, black, frame = make_view(color, image, np.where(used, DEPTH, 0))
     frame = replace(frame, valid=valid)
-    found = measure_view(view, black, frame, seen=seen)
+    found = metrics.measure_view(view, black, frame, seen=seen)
     assert found.psnr_db > 50 and found.psnr_on_black_db > 50
     assert (found.depth_mae_m, found.hole_fraction) == (0, 0)
     assert found.unseen_fraction == pytest.approx(0.5)
     assert found.gain == pytest.approx(1, abs=1e-3)
-    everything = measure_view(view, black, frame)
+    everything = metrics.measure_view(view, black, frame)
     assert everything.hole_fraction == pytest.approx(1 / 3)
     assert everything.unseen_fraction == pytest.approx(0.25)
     assert everything.ssim + 0.1 < found.ssim < 0.9  # windows reach over what is left out
@@ -181,14 +173,14 @@ def test_an_unseen_view_has_no_metrics():
         raise AssertionError("measured")
 
     view = make_view(noise(0), noise(1))
-    blind = measure_view(*view, seen=~EVERYWHERE, lpips=never)
-    seeing = measure_view(*view)
+    blind = metrics.measure_view(*view, seen=~EVERYWHERE, lpips=never)
+    seeing = metrics.measure_view(*view)
     assert {blind.psnr_db, blind.psnr_on_black_db, blind.ssim, blind.lpips} == {None}
     assert {blind.depth_mae_m, blind.floater_fraction, blind.hole_fraction} == {None}
     assert (blind.unseen_fraction, blind.gain) == (1.0, 1.0)
     for name in ("psnr_db", "ssim", "depth_mae_m"):
-        assert mean_metric([blind, seeing], name) == (getattr(seeing, name), 1)
-    assert mean_metric([blind], "psnr_db") == (None, 0)
+        assert metrics.mean_metric([blind, seeing], name) == (getattr(seeing, name), 1)
+    assert metrics.mean_metric([blind], "psnr_db") == (None, 0)
 
 
 def test_gain_is_fitted_or_not():
@@ -197,7 +189,9 @@ def test_gain_is_fitted_or_not():
         return (a - b).abs().max()
 
     view = make_view(np.full((HEIGHT, WIDTH, 3), 0.4), np.full((HEIGHT, WIDTH, 3), 0.5))
-    strict, fitted = (measure_view(*view, lpips=difference, fit_gain=fit) for fit in (False, True))
+    strict, fitted = (
+        metrics.measure_view(*view, lpips=difference, fit_gain=fit) for fit in (False, True)
+    )
     assert strict.gain == 1.0 and strict.lpips == pytest.approx(0.1, abs=0.01)
     assert strict.psnr_db == pytest.approx(20.0, abs=0.2)
     assert fitted.gain == pytest.approx(1.25, rel=0.01) and fitted.lpips < 0.01

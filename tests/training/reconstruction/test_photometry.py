@@ -4,30 +4,21 @@ from pydrake.math import RigidTransform
 
 from splatpilot.training.captures.capture import CaptureFrame
 from splatpilot.training.captures.capture_registry import read_capture
-from splatpilot.training.reconstruction.photometry import (
-    STRIDE,
-    Photometry,
-    ThinnedFrame,
-    estimate_photometry,
-    find_new_pixels,
-    radius_squared,
-    seen_pixels,
-    vignette,
-)
+from splatpilot.training.reconstruction import photometry
 
 
-def thin(folder) -> list[ThinnedFrame]:
-    return [ThinnedFrame.of(frame) for frame in read_capture(folder).frames()]
+def thin(folder) -> list[photometry.ThinnedFrame]:
+    return [photometry.ThinnedFrame.of(frame) for frame in read_capture(folder).frames()]
 
 
 @pytest.fixture
-def views(tmp_path, write_room) -> list[ThinnedFrame]:
+def views(tmp_path, write_room) -> list[photometry.ThinnedFrame]:
     return thin(write_room(tmp_path / "room"))
 
 
 def test_recovers_gains_and_vignetting(tmp_path, write_room):
     gains = np.exp(0.1 * np.sin(np.arange(12)))
-    truth = Photometry(gains / np.exp(np.log(gains).mean()), -0.25)
+    truth = photometry.Photometry(gains / np.exp(np.log(gains).mean()), -0.25)
     room = write_room(
         tmp_path / "room",
         width=160,
@@ -35,20 +26,20 @@ def test_recovers_gains_and_vignetting(tmp_path, write_room):
         brightness=lambda i, rho: truth.gains[i] * np.exp(truth.vignetting * rho),
     )
     views = thin(room)
-    found, again = (estimate_photometry(views, seed=0) for _ in "ab")
+    found, again = (photometry.estimate_photometry(views, seed=0) for _ in "ab")
     np.testing.assert_allclose(found.gains, truth.gains, rtol=0.02)
     assert found.vignetting == pytest.approx(truth.vignetting, abs=0.03)
     np.testing.assert_array_equal(found.gains, again.gains)
-    alone = estimate_photometry(views[:1], seed=0)
+    alone = photometry.estimate_photometry(views[:1], seed=0)
     assert (alone.gains.tolist(), alone.vignetting) == ([1.0], 0.0)
 
 
 def test_factor_is_gain_in_the_center_and_darker_in_the_corners():
-    rho_squared = radius_squared(41, 31)
+    rho_squared = photometry.radius_squared(41, 31)
     assert rho_squared.shape == (31, 41) and rho_squared[15, 20] == 0
     assert rho_squared[0, 0] == pytest.approx((20**2 + 15**2) / (20.5**2 + 15.5**2))
-    np.testing.assert_allclose(vignette(-0.5, 41, 31), np.exp(-0.5 * rho_squared))
-    factor = Photometry(np.array([1.0, 2.0]), -0.5).factor(1, 31, 41)
+    np.testing.assert_allclose(photometry.vignette(-0.5, 41, 31), np.exp(-0.5 * rho_squared))
+    factor = photometry.Photometry(np.array([1.0, 2.0]), -0.5).factor(1, 31, 41)
     np.testing.assert_allclose(factor, 2 * np.exp(-0.5 * rho_squared), rtol=1e-6)
 
 
@@ -61,7 +52,7 @@ def test_found_pixels_show_the_same_points(views):
     number, shown = views[1].find(other_WQ)
     assert len(number) > 100
     distance = np.linalg.norm(other_WQ[:, number] - p_WQ[:, shown], axis=0)
-    assert (distance < 4 * STRIDE * views[1].pixel_size.flat[shown]).all()
+    assert (distance < 4 * photometry.STRIDE * views[1].pixel_size.flat[shown]).all()
     X_WC = views[0].X_WC
     depth = views[0].depth[12, 16]
     for p_CQ, found in (
@@ -84,13 +75,15 @@ def wall(x: float, depth: float = 2.0) -> CaptureFrame:
 
 
 def test_seen_pixels_are_those_that_another_camera_saw():
-    frame, beside = wall(0.0), ThinnedFrame.of(wall(-0.5))
-    seen = seen_pixels(frame, [beside])
+    frame, beside = wall(0.0), photometry.ThinnedFrame.of(wall(-0.5))
+    seen = photometry.seen_pixels(frame, [beside])
     assert seen[:8].all()
     assert seen[8:, :47].all() and not seen[8:, 49:].any()
-    other = ThinnedFrame.of(wall(0.0, depth=1.5))
-    assert not seen_pixels(frame, [other])[8:].any()
-    assert seen_pixels(frame, [other, beside, ThinnedFrame.of(wall(0.5))])[8:].all()
+    other = photometry.ThinnedFrame.of(wall(0.0, depth=1.5))
+    assert not photometry.seen_pixels(frame, [other])[8:].any()
+    assert photometry.seen_pixels(frame, [other, beside, photometry.ThinnedFrame.of(wall(0.5))])[
+        8:
+    ].all()
 
 
 @pytest.mark.parametrize(("slope", "size", "tolerance"), [(0, 1, 1e-3), (np.pi / 3, 2, 0.05)])
@@ -99,12 +92,12 @@ def test_pixel_size_of_a_plane(slope, size, tolerance):
     u = (np.arange(64) + 0.5 - 32) / 200
     depth = np.tile(np.float32(2 / (1 - np.tan(slope) * u)), (48, 1))
     frame = CaptureFrame(np.zeros((48, 64, 3), np.uint8), depth, RigidTransform(), K)
-    found = ThinnedFrame.of(frame).pixel_size[12, 16]
+    found = photometry.ThinnedFrame.of(frame).pixel_size[12, 16]
     assert found == pytest.approx(size * 2 / 200, rel=tolerance)
 
 
 def test_every_point_is_kept_about_once(views):
-    new = find_new_pixels(views)
+    new = photometry.find_new_pixels(views)
     counts = []
     for view in views:
         p_WQ, _ = view.points()
@@ -119,6 +112,6 @@ def test_every_point_is_kept_about_once(views):
 
 def test_views_named_last_yield_to_others(views):
     twice = [views[0], views[0], views[3]]
-    first, last = find_new_pixels(twice), find_new_pixels(twice, last=[0])
+    first, last = photometry.find_new_pixels(twice), photometry.find_new_pixels(twice, last=[0])
     assert first[0].any() and not first[1].any()
     assert last[1].any() and not last[0].any()

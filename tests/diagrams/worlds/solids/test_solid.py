@@ -3,22 +3,15 @@ import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from splatpilot.diagrams.worlds.solids.solid import MATERIALS, Solid, cut_faces
-from splatpilot.systems.collision.shapes import (
-    Box,
-    Capsule,
-    Cylinder,
-    HalfSpace,
-    ShapeUnion,
-    Sphere,
-)
+from splatpilot.systems.collision import shapes
 
-BOX = Box(RigidTransform(RollPitchYaw(0.2, -0.4, 1.0), [1.0, 0, 2]), [1.0, 2.0, 0.5])
+BOX = shapes.Box(RigidTransform(RollPitchYaw(0.2, -0.4, 1.0), [1.0, 0, 2]), [1.0, 2.0, 0.5])
 SHAPES = {
-    "sphere": Sphere([1.0, 2, 3], 0.7),
-    "capsule": Capsule([0.0, 0, 1], [1.0, 0.5, 2], 0.3),
-    "cylinder": Cylinder([0.0, 0, 1], [1.0, 0.5, 2], 0.3),
+    "sphere": shapes.Sphere([1.0, 2, 3], 0.7),
+    "capsule": shapes.Capsule([0.0, 0, 1], [1.0, 0.5, 2], 0.3),
+    "cylinder": shapes.Cylinder([0.0, 0, 1], [1.0, 0.5, 2], 0.3),
     "box": BOX,
-    "ground": HalfSpace([0.0, 0, 1], 0.0),
+    "ground": shapes.HalfSpace([0.0, 0, 1], 0.0),
 }
 AREAS = {
     "sphere": 4 * np.pi * 0.7**2,
@@ -36,8 +29,8 @@ def test_faces_lie_on_the_surface_and_look_outwards(kind):
     rng = np.random.default_rng(0)
     for face in cut_faces(shape, *BOUNDS):
         p, n, t = face.at(rng.uniform(0.02, 0.98, (200, 2)) * face.size)
-        np.testing.assert_allclose(ShapeUnion.of([shape]).distance(p), 0, atol=1e-12)
-        outwards = ShapeUnion.of([shape]).nearest(p + 1e-6 * n)[1]
+        np.testing.assert_allclose(shapes.ShapeUnion.of([shape]).distance(p), 0, atol=1e-12)
+        outwards = shapes.ShapeUnion.of([shape]).nearest(p + 1e-6 * n)[1]
         np.testing.assert_allclose(outwards, n, atol=1e-4)
         np.testing.assert_allclose(np.einsum("nk,nk->n", n, t), 0, atol=1e-12)
 
@@ -60,7 +53,9 @@ def test_materials_have_colors_and_something_to_see(material):
     rng = np.random.default_rng(1)
     uv = rng.uniform(0, 2, (4000, 2))
     ground = material in ("grass", "paving", "forest_floor")
-    shape, height = (HalfSpace([0.0, 0, 1], 0.0), 0 * uv[:, 0]) if ground else (BOX, 3 + uv[:, 1])
+    shape, height = (
+        (shapes.HalfSpace([0.0, 0, 1], 0.0), 0 * uv[:, 0]) if ground else (BOX, 3 + uv[:, 1])
+    )
     p = np.column_stack([uv, height])
     colors, again, other = (Solid(shape, material, seed).albedo(uv, p) for seed in (3, 3, 5))
     assert colors.shape == (4000, 3)
@@ -75,4 +70,4 @@ def test_unknown_material_and_tilted_ground_are_refused():
     with pytest.raises(ValueError, match=r"material must be one of brick, .* got 'gold'"):
         Solid(SHAPES["sphere"], "gold")
     with pytest.raises(ValueError, match=r"HalfSpace.normal must be vertical"):
-        cut_faces(HalfSpace([0.1, 0, 1], 0.0), *BOUNDS)
+        cut_faces(shapes.HalfSpace([0.1, 0, 1], 0.0), *BOUNDS)

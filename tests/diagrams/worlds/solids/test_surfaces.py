@@ -4,22 +4,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from splatpilot.diagrams.worlds.solids.surfaces import (
-    THICKNESS,
-    FloorPlan,
-    Surfels,
-    on_ground,
-    rectangle,
-    sphere,
-    to_gaussians,
-    tube,
-)
+from splatpilot.diagrams.worlds.solids import surfaces
 
 P_A, P_B = np.array([1.0, 2.0, -0.5]), np.array([1.4, 1.8, 4.0])
 
 
-def _tube(taper=1.0) -> Surfels:
-    return tube(P_A, P_B, 0.4, (0.1, 0.2), np.random.default_rng(0), taper)
+def _tube(taper=1.0) -> surfaces.Surfels:
+    return surfaces.tube(P_A, P_B, 0.4, (0.1, 0.2), np.random.default_rng(0), taper)
 
 
 def _along_and_radial(p: NDArray) -> tuple[NDArray, NDArray]:
@@ -45,13 +36,13 @@ def test_a_tapered_tube_narrows_linearly():
 
 
 def test_patches_of_a_sphere_lie_on_it():
-    surfels = sphere((1, 2, 3), 0.7, 0.1)
+    surfels = surfaces.sphere((1, 2, 3), 0.7, 0.1)
     np.testing.assert_allclose(surfels.p, np.array([1, 2, 3]) + 0.7 * surfels.n, atol=1e-12)
     np.testing.assert_allclose(np.linalg.norm(surfels.n, axis=1), 1)
     np.testing.assert_allclose(np.sum(surfels.t * surfels.n, axis=1), 0, atol=1e-12)
 
 
-def _transmittance(surfels: Surfels, p: NDArray, n: NDArray) -> NDArray:
+def _transmittance(surfels: surfaces.Surfels, p: NDArray, n: NDArray) -> NDArray:
     """What passes straight through a layer of patches of opacity 0.99 at p (M, 3) along n."""
     offset = p[:, None] - surfels.p
     u = np.sum(offset * surfels.t, axis=-1) / surfels.extent[:, 0]
@@ -72,10 +63,10 @@ def test_layers_have_no_holes():
 
     n = rng.normal(size=(300, 3))
     n /= np.linalg.norm(n, axis=1, keepdims=True)
-    assert _transmittance(sphere((0, 0, 0), 0.7, 0.1), 0.7 * n, n).max() < 0.2
+    assert _transmittance(surfaces.sphere((0, 0, 0), 0.7, 0.1), 0.7 * n, n).max() < 0.2
 
-    grid = rectangle((0, 0), (3, 2), 0.1, rng)
-    ground = on_ground(grid, np.zeros(len(grid)), (0.062, 0.062), 0.0)
+    grid = surfaces.rectangle((0, 0), (3, 2), 0.1, rng)
+    ground = surfaces.on_ground(grid, np.zeros(len(grid)), (0.062, 0.062), 0.0)
     p = np.column_stack([rng.uniform(0.2, 1.8, (300, 2)), np.zeros(300)])
     assert _transmittance(ground, p, np.tile((0, 0, 1.0), (300, 1))).max() < 0.2
 
@@ -83,18 +74,18 @@ def test_layers_have_no_holes():
 def test_gaussians_are_as_flat_and_oriented_as_their_patches():
     surfels = _tube()
     colors = np.random.default_rng(2).uniform(size=(len(surfels), 3))
-    scene = to_gaussians(surfels, colors, 0.7)
+    scene = surfaces.to_gaussians(surfels, colors, 0.7)
     np.testing.assert_allclose(scene.means, surfels.p, atol=1e-6)
     np.testing.assert_allclose(scene.base_colors, colors, atol=1e-6)
     np.testing.assert_allclose(scene.opacities, 0.7)
     np.testing.assert_allclose(scene.scales[:, :2], surfels.extent, rtol=1e-6)
-    np.testing.assert_allclose(scene.scales[:, 2], THICKNESS)
+    np.testing.assert_allclose(scene.scales[:, 2], surfaces.THICKNESS)
     R = Rotation.from_quat(np.roll(scene.quats, -1, axis=1)).as_matrix()
     np.testing.assert_allclose(R[..., 0], surfels.t, atol=1e-6)
     np.testing.assert_allclose(R[..., 2], surfels.n, atol=1e-6)
 
 
-PLOT = FloorPlan.of_size(6.0, 4.0, 3.0)
+PLOT = surfaces.FloorPlan.of_size(6.0, 4.0, 3.0)
 
 
 def test_surfaces_face_the_volume_if_they_face_one_of_its_corners():
