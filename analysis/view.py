@@ -17,7 +17,6 @@ from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.scenarios import scenario_file
 from splatpilot.diagrams.worlds.octomap_world import OCTOMAP
 from splatpilot.diagrams.worlds.scene_folder import (
-    FRONTIER,
     read_scene,
     read_scene_folder,
     read_scene_metadata,
@@ -33,7 +32,7 @@ from splatpilot.systems.common.files import (
 from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.splats.scene import GaussianScene
-from splatpilot.systems.splats.splat_files import read_ply, read_splats
+from splatpilot.systems.splats.splat_files import read_splats
 from splatpilot.systems.visualization.meshcat_drawing import (
     GOAL_COLOR,
     MARKER_RADIUS,
@@ -136,7 +135,6 @@ def _scene(path: Path) -> ViewerScene:
     target = shlex.quote(f"{path}-scaled")
     return replace(
         _show_world(world, world.name, ends, images),
-        num_frontier=len(read_ply(path / FRONTIER)) if metadata.frontier else 0,
         beyond=False,
         metric=metadata.metric,
         notes=notes,
@@ -212,6 +210,7 @@ def _show_world(
         upper_W=upper_W,
         height=_shown_height(lower_W, upper_W, p_WQ),
         field=world.esdf,
+        num_frontier=world.num_frontier,
         ends=ends,
         images=images,
         legend=legend,

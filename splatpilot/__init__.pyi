@@ -12,7 +12,9 @@ from .diagrams.flight.flight_diagram import (
     ExportFlight,
     FlightParts,
     MakeCamera,
+    open_meshcat,
 )
+from .diagrams.flight.fly import flight_page
 from .diagrams.flight.monitor import AddFlightMonitor, FlightMonitor, Outcome
 from .diagrams.flight.monte_carlo import random_flights
 from .diagrams.flight.policies import policy_named, register_policy
@@ -47,6 +49,11 @@ from .systems.vehicle.flatness import FlatnessController, FlatnessController_
 from .systems.vehicle.quadrotor import QuadrotorParams, QuadrotorPlant, QuadrotorPlant_, hover_state
 from .systems.vehicle.quadrotor_geometry import QuadrotorGeometry, quadrotor_gaussians
 from .systems.vehicle.state import QuadrotorState, StateToPose, StateToPose_
+from .systems.visualization.flight_visualizer import FlightVisualizer
+from .systems.visualization.live import LiveControls
+from .systems.visualization.meshcat_drawing import CameraVisualizer
+from .systems.visualization.rerun_sink import RerunSink
+from .systems.visualization.video import VideoRecorder
 from .training.captures.capture import Capture
 from .training.captures.capture_registry import read_capture, register_capture
 from .training.policies.trainer_registry import register_trainer
@@ -60,6 +67,7 @@ __all__ = [
     "AddSplatWorld",
     "BakedScene",
     "BuildFlightDiagram",
+    "CameraVisualizer",
     "Capture",
     "Config",
     "Distortion",
@@ -72,10 +80,12 @@ __all__ = [
     "Flight",
     "FlightMonitor",
     "FlightParts",
+    "FlightVisualizer",
     "GaussianScene",
     "HypothesisSelector",
     "HypothesisSelector_",
     "Imu",
+    "LiveControls",
     "MakeCamera",
     "MovingBodies",
     "MovingSphere",
@@ -89,6 +99,7 @@ __all__ = [
     "QuadrotorPlant_",
     "QuadrotorState",
     "RangeFinder",
+    "RerunSink",
     "Scenario",
     "SplatCamera",
     "SplatRenderEngine",
@@ -96,11 +107,13 @@ __all__ = [
     "StateToPose_",
     "VelocityTracker",
     "VelocityTracker_",
+    "VideoRecorder",
     "World",
     "__version__",
     "bounded",
     "dump_config",
     "field_mesh",
+    "flight_page",
     "fly",
     "fly_all",
     "gaussian_properties",
@@ -108,6 +121,7 @@ __all__ = [
     "load_config",
     "make_flight_simulator",
     "make_world",
+    "open_meshcat",
     "policy_named",
     "quadrotor_gaussians",
     "random_flights",

@@ -22,6 +22,7 @@ from splatpilot.diagrams.hardware.px4 import Px4Config
 from splatpilot.diagrams.worlds.world_registry import WORLDS
 from splatpilot.systems.common.config import load_config
 from splatpilot.systems.common.field_help import describe_fields
+from splatpilot.systems.visualization.live import LiveControls
 from splatpilot.training.captures.capture_config import CaptureConfig
 
 ROOT = Path(__file__).parents[1]
@@ -131,7 +132,8 @@ def test_files_are_configurations(page, tmp_path):
     [p for p in PAGES if blocks(p, "python") and p.name != "README.md"],
     ids=lambda page: page.stem,
 )
-def test_python_runs(page):
+def test_python_runs(page, monkeypatch):
+    monkeypatch.setattr(LiveControls, "wait_for_viewer", lambda self: None)
     names: dict[str, Any] = {}
     for code in blocks(page, "python"):
         exec(code, names)

@@ -1,5 +1,6 @@
 """`splatpilot replay`: flies one flight of a study again."""
 
+import contextlib
 import platform
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,16 +15,21 @@ from splatpilot.analysis.benchmark.tables import Row
 from splatpilot.analysis.benchmark.variants import LIVE
 from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
 from splatpilot.diagrams.flight.fly import (
+    flight_page,
     fly_with_bar,
     recorded_frames,
     replayed_flight,
-    write_flight_page,
 )
 from splatpilot.diagrams.flight.scenario import Scenario, sample_scenario
-from splatpilot.systems.common.files import require_unused, require_writable_folder
+from splatpilot.systems.common.files import (
+    require_unused,
+    require_writable_folder,
+    written_atomically,
+)
 from splatpilot.systems.common.provenance import program
 from splatpilot.systems.vehicle.state import QuadrotorState
 from splatpilot.systems.visualization.pages import ReplayedFlight
+from splatpilot.systems.visualization.rerun_sink import RerunSink
 from splatpilot.systems.visualization.video import VideoRecorder
 
 
@@ -34,10 +40,12 @@ def run(
     out: Path | None = None,
     meshcat: bool = False,
     video: bool = False,
+    rerun: Path | None = None,
     overwrite: bool = False,
 ) -> bool:
     """Flies one flight of a study again, from the study's folder alone; returns True if it is
-    bitwise identical to its record. Page and video go to `replays/ID` in the study by default."""
+    bitwise identical to its record. Page and video go to `replays/ID` in the study by default;
+    `rerun` is the file of a `RerunSink`."""
     folder = StudyFolder(study)
     spec, row, recorded = _read_flight(folder, id)
     live = [each.label for each in folder.config().variants if each.policy == LIVE]
@@ -53,12 +61,17 @@ def run(
     if filmed:
         require_unused(out, overwrite)
         require_writable_folder(out)
-    diagram = BuildFlightDiagram(scenario, world, video=filmed, camera=filmed)
-    flight = fly_with_bar(diagram)
+    with contextlib.ExitStack() as stack:
+        recording = stack.enter_context(written_atomically(rerun)) if rerun else None
+        camera = filmed or recording is not None
+        diagram = BuildFlightDiagram(scenario, world, video=filmed, camera=camera, rerun=recording)
+        flight = fly_with_bar(diagram)
+        if recording is not None:
+            cast(RerunSink, diagram.GetSubsystemByName("rerun")).close()
     recorder = cast(VideoRecorder, diagram.GetSubsystemByName("video")) if filmed else None
     if recorder is not None and meshcat:
         shown = replayed_flight(id, flight, recorded_frames(recorder, scenario))
-        write_flight_page(out / "flight.html", scenario, world, [shown])
+        flight_page(scenario, world, [shown]).save(out / "flight.html")
     if recorder is not None and video:
         recorder.save(out / "flight.mp4", scenario.camera.z_far)
     common = min(len(flight.times), len(recorded["times"]))
@@ -104,7 +117,7 @@ def overlay(
     page = out / "flights.html"
     require_unused(page, overwrite)
     require_writable_folder(out)
-    write_flight_page(page, scenario, study_world(scenario), flights)
+    flight_page(scenario, study_world(scenario), flights).save(page)
     print(f"Wrote {page}")
     return page
 

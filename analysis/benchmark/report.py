@@ -40,19 +40,22 @@ _OBSTACLE, _BLOCKED = "#5b5f66", "#d9dbde"
 _SPACING = 0.05  # [m], of samples of the distance field
 _LEGEND_COLUMNS = 4
 _STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; color: #1c1e21; max-width: 1360px; margin: 2em auto;
-       padding: 0 1em; }
+:root { color-scheme: light dark; }
+body { font: 15px/1.5 system-ui, sans-serif; max-width: 1360px; margin: 2em auto; padding: 0 1em; }
 h1 { font-size: 1.7em; } h2 { font-size: 1.25em; margin-top: 2em; }
 table { display: block; overflow-x: auto; border-collapse: collapse; font-size: 14px;
         font-variant-numeric: tabular-nums; margin: .6em 0; }
 th, td { padding: .25em .4em; white-space: nowrap; text-align: right;
-         border-bottom: 1px solid #e3e5e8; }
+         border-bottom: 1px solid light-dark(#e3e5e8, #3a3f47); }
 th:first-child, td:first-child { text-align: left; }
-th { background: #f4f5f7; font-weight: 600; white-space: normal; }
-img { max-width: 100%; } code { background: #f4f5f7; padding: .1em .3em; font-size: 13px; }
+th { background: light-dark(#f4f5f7, #2a2e35); font-weight: 600; white-space: normal; }
+img { max-width: 100%; }
+code { background: light-dark(#f4f5f7, #2a2e35); padding: .1em .3em; font-size: 13px; }
 details { margin: .3em 0; } summary { cursor: pointer; }
-.note { color: #555; } .warn { background: #fff4d6; padding: .5em .8em; border-radius: 4px; }
+.note { color: light-dark(#555, #aaa); }
+.warn { background: light-dark(#fff4d6, #4a3d12); padding: .5em .8em; border-radius: 4px; }
 """
+_VIEWPORT = '<meta name="viewport" content="width=device-width, initial-scale=1">'
 
 
 def write_report(
@@ -91,7 +94,9 @@ def write_report(
     with written_atomically(folder.path / "report.html") as path:
         path.write_text(
             f'<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
-            f"<style>{_STYLE}</style></head><body>" + "\n".join(body) + "</body></html>\n"
+            f"{_VIEWPORT}<style>{_STYLE}</style></head><body>"
+            + "\n".join(body)
+            + "</body></html>\n"
         )
 
 
@@ -274,13 +279,21 @@ def _scenarios(
     return _table(["scenario", *header], lines) + (note if single else "")
 
 
+def _link(id: str) -> _Html:
+    """Links a flight to the page that `splatpilot replay` writes."""
+    return _Html(f'<a href="replays/{escape(id)}/flight.html">{escape(id)}</a>')
+
+
 def _flights(rows: list[Row]) -> str:
     header = ["flight", "outcome", "time [s]", "min. clearance [m]", "velocity [m/s]", "replay"]
     columns = {"flight_time_s": ".1f", "min_clearance_m": "+.2f", "mean_speed_m_s": ".2f"}
-    sections = ["<p>The commands run in the folder that holds this report.</p>"]
+    sections = [
+        "<p>The commands run in the folder that holds this report; each writes the page that its "
+        "flight links to.</p>"
+    ]
     for name in dict.fromkeys(row["scenario"] for row in rows):
         lines = [
-            [row["id"], row["outcome"]]
+            [_link(row["id"]), row["outcome"]]
             + [_number(row.get(column, math.nan), form) for column, form in columns.items()]
             + [_Html(f"<code>splatpilot replay . {escape(row['id'])} --meshcat</code>")]
             for row in select(rows, scenario=name)

@@ -2,6 +2,7 @@
 
 import argparse
 from itertools import product
+from pathlib import Path
 from typing import Any
 
 from splatpilot.analysis.benchmark.variants import scenario_sweep, split_policies, sweep
@@ -131,6 +132,7 @@ def benchmark(options: argparse.Namespace) -> Any:
     cli.Option("ids", "of flights through one world, see rollouts.csv", nargs="+", metavar="id"),
     cli.flag("--meshcat", "write flight.html, to watch the flight"),
     cli.flag("--video", "write flight.mp4, the onboard video"),
+    cli.Option("--rerun FILE", "record the flight for the viewer Rerun", Path, unused=True),
     cli.out_option("folder for these (STUDY/replays/ID)", required=False),
     cli.OVERWRITE,
     examples=(

@@ -19,7 +19,7 @@ LEARN_FROM_CORPORA = "student_rgb", "student_depth", "diffaero_rgb"
 TRAINERS = "diffaero", "depthnav", "diffaero_tof", "agile_autonomy", *LEARN_FROM_CORPORA
 """The names of the trainers of this package; importing their registry takes seconds."""
 
-POLICIES = "planner", "straight", "reactive", *TRAINERS
+POLICIES = "planner", "straight", "teleop", "reactive", *TRAINERS
 """The names of the policies of this package."""
 
 _SUFFIXES = {

@@ -10,17 +10,26 @@ from splatpilot.analysis.commands.checks import SCENARIOS
 from splatpilot.diagrams.scenarios import scenario_file
 
 
+def _names(text: str) -> list[str]:
+    return text.split(",")
+
+
 @cli.command(
     "fly",
     *cli.SCENARIO_OPTIONS,
     cli.out_option("output folder (default: out/FLIGHT)", required=False, unused=True),
     cli.OVERWRITE,
-    cli.flag("--live", "serve Meshcat during the flight, in real time"),
+    cli.flag("--live", "serve Meshcat during the flight, in real time, with controls"),
+    cli.Option(
+        "--draw NAMES", "what Meshcat draws, such as thrust,nearest,axes", _names, default=[]
+    ),
     cli.flag("--no-video", "do not write flight.mp4"),
+    cli.Option("--rerun FILE", "record the flight for the viewer Rerun", Path, unused=True),
     cli.Option("--graphviz FILE", "write the diagram as Graphviz", Path, unused=True),
     cli.json_option("the summary"),
     examples=(
         "fly --scenario P02 --policy diffaero --speed 3",
+        "fly --policy teleop --live --draw thrust,nearest",
         "fly --scene scenes/hospital --policy reactive:margin=0.2 --no-video --json",
     ),
 )

@@ -4,6 +4,7 @@ import json
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from html import escape
 from pathlib import Path
 from typing import cast
 
@@ -30,6 +31,7 @@ from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS, hover_state
 from splatpilot.systems.vehicle.state import QuadrotorState
+from splatpilot.systems.visualization.live import RESTART
 
 _ACCURACY = 3e-4  # of the Context: a flight ends within 1e-7 s, less than a micrometer.
 
@@ -117,6 +119,20 @@ class Flight:
             "real_time_factor": duration / self.wall_time,
         } | ({"reason": self.reason} if self.reason else {})
 
+    def __repr__(self) -> str:
+        return (
+            f"Flight({self.outcome} after {self.times[-1]:.2f} s, "
+            f"min. clearance {np.nanmin(self.clearances):+.2f} m)"
+        )
+
+    def _repr_html_(self) -> str:
+        texts = {
+            name: value if isinstance(value, str) else f"{value:.3f}"
+            for name, value in self.summary().items()
+        }
+        rows = (f"<tr><td>{name}</td><td>{escape(text)}</td></tr>" for name, text in texts.items())
+        return f"<table>{''.join(rows)}</table>"
+
     def save(self, path: Path) -> None:
         """Writes the arrays to a compressed .npz file, deterministically."""
         names = ("times", "states", "commands", "clearances", "hypotheses")
@@ -167,8 +183,8 @@ def fly(
     """Simulates a diagram with one `FlightMonitor` until the flight ends.
 
     Args:
-        monitor: called with the root Context after each step; may end the flight by
-            ReachedTermination.
+        monitor: called with the root Context after each step, such as `LiveControls`; may end the
+            flight by ReachedTermination. With the message `RESTART` it begins again.
         progress: called with the simulated time [s].
         realtime_rate: max simulated over real time; 0 for as fast as possible.
 
@@ -242,6 +258,10 @@ def fly_all(
         while len(flights) < len(monitors):
             status = simulator.AdvanceTo(limit)
             record()
+            if status.message() == RESTART:
+                return fly_all(
+                    diagram, monitor=monitor, progress=progress, realtime_rate=realtime_rate
+                )
             if not isinstance(status.system(), FlightMonitor):
                 break
         record(Outcome.INTERRUPTED)

@@ -1,8 +1,9 @@
 """AddFlight and BuildFlightDiagram: the closed loop of vehicle, sensors, policy and controller."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -50,6 +51,7 @@ from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.common.drake import connect
 from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.common.validation import require
+from splatpilot.systems.policies.teleop import Teleop
 from splatpilot.systems.sensing.latency import DelayedPose, FrameTimes
 from splatpilot.systems.splats.background import Background, mean_color
 from splatpilot.systems.splats.moving_bodies import MovingBodies
@@ -57,15 +59,17 @@ from splatpilot.systems.splats.splat_camera import SplatCamera
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS, QuadrotorPlant
 from splatpilot.systems.vehicle.quadrotor_geometry import quadrotor_gaussians
 from splatpilot.systems.vehicle.state import QuadrotorState
+from splatpilot.systems.visualization.flight_visualizer import FlightVisualizer
 from splatpilot.systems.visualization.meshcat_drawing import (
     CameraVisualizer,
-    FlightVisualizer,
     MovingSpheresVisualizer,
+    draw_box,
     draw_distance_slice,
+    draw_frustum,
     draw_gaussians,
     draw_goal,
-    draw_vehicle,
 )
+from splatpilot.systems.visualization.rerun_sink import RerunSink
 from splatpilot.systems.visualization.video import VideoRecorder
 
 
@@ -357,6 +361,8 @@ def BuildFlightDiagram(
     plant: System | None = None,
     controller: System | None = None,
     estimator: System | None = None,
+    draw: Collection[str] = (),
+    rerun: Path | None = None,
 ) -> Diagram:
     """Builds the diagram of one flight of `AddFlight`.
 
@@ -376,6 +382,8 @@ def BuildFlightDiagram(
         video: records the camera's images at its rate, for `VideoRecorder.save`.
         camera: adds the scenario's camera; Meshcat and videos need it, flights do not.
         policy, plant, controller, estimator: see `AddFlight`.
+        draw: see `AddMeshcat`.
+        rerun: file of the system `rerun`, a `RerunSink`.
 
     Raises:
         InfeasibleFlightError, ValueError: see `AddFlight`; also for Meshcat or video without the
@@ -396,7 +404,9 @@ def BuildFlightDiagram(
     )
     ExportFlight(builder, parts)
     if meshcat is not None:
-        AddMeshcat(builder, parts, meshcat)
+        AddMeshcat(builder, parts, meshcat, draw)
+    if rerun is not None:
+        AddRerun(builder, parts, rerun)
     if video and parts.camera is not None:
         VideoRecorder.AddToBuilder(builder, parts.camera, scenario.camera.fps)
     try:
@@ -412,8 +422,15 @@ def BuildFlightDiagram(
     return diagram
 
 
-def AddMeshcat(builder: DiagramBuilder, parts: FlightParts, meshcat: Meshcat) -> None:
-    """Draws the Gaussians and the vehicle; adds visualizers of vehicle, plans and camera."""
+def AddMeshcat(
+    builder: DiagramBuilder, parts: FlightParts, meshcat: Meshcat, draw: Collection[str] = ()
+) -> None:
+    """Draws the Gaussians; adds visualizers of vehicle, plans and camera, and controls of `Teleop`.
+
+    Args:
+        draw: names of `DRAWINGS`; "axes" of the body; "depth" of the camera, as points; "frustum"
+            of the policy's camera; "limits" of the world.
+    """
     world = parts.world
     field = world.distance_field
     margin = np.array([5.0, 5.0, 3.0])  # [m] of surroundings
@@ -424,15 +441,54 @@ def AddMeshcat(builder: DiagramBuilder, parts: FlightParts, meshcat: Meshcat) ->
         field.lower_W - margin,
         field.upper_W + margin,
     )
-    draw_vehicle(meshcat, "/splatpilot/vehicle", VEHICLE_RADIUS)
+    if "limits" in draw:
+        draw_box(meshcat, "/splatpilot/limits", field.lower_W, field.upper_W)
+    if "frustum" in draw:
+        named = builder.HasSubsystemNamed("policy_camera")
+        require(named, "draw", "without frustum for a policy without images", "frustum")
+        seen = cast(SplatCamera, builder.GetSubsystemByName("policy_camera"))
+        draw_frustum(meshcat, "/splatpilot/vehicle/policy_camera", seen.camera_info(), seen.X_BC())
+    if isinstance(parts.policy, Teleop):
+        parts.policy.add_controls(meshcat)
 
     plans = parts.decision if parts.decision.get_name() == "hypotheses" else None
-    FlightVisualizer.AddToBuilder(builder, parts.state, meshcat, plans)
+    outputs = ("distance", "gradient", "barrier")
+    sources = {name: parts.collision.GetOutputPort(name) for name in outputs}
+    sources["command"] = parts.command
+    if plans is not None:
+        selector = builder.GetSubsystemByName("selector")
+        sources["waypoint"] = selector.GetOutputPort("waypoint")
+    elif parts.decision.get_name() == "waypoint":
+        sources["waypoint"] = parts.decision
+    vehicle = [name for name in draw if name not in ("depth", "frustum", "limits")]
+    FlightVisualizer.AddToBuilder(
+        builder, parts.state, meshcat, plans, draw=vehicle, sources=sources
+    )
     if world.moving:
         MovingSpheresVisualizer.AddToBuilder(builder, world.moving.spheres, meshcat)
     assert parts.camera is not None
     fps = parts.scenario.camera.fps
-    CameraVisualizer.AddToBuilder(builder, parts.camera, meshcat, period=1 / fps)
+    CameraVisualizer.AddToBuilder(
+        builder, parts.camera, meshcat, period=1 / fps, depth="depth" in draw
+    )
+
+
+def AddRerun(builder: DiagramBuilder, parts: FlightParts, path: Path) -> RerunSink:
+    """Records a flight for the viewer Rerun."""
+    ports = {"state": parts.state, "command": parts.command}
+    ports["clearance"] = parts.collision.GetOutputPort("clearance")
+    ports["outcome"] = parts.monitor.get_output_port()
+    if parts.decision.get_name() == "hypotheses":
+        ports["hypotheses"] = parts.decision
+    return RerunSink.AddToBuilder(
+        builder,
+        path,
+        ports,
+        gaussians=parts.world.gaussians,
+        goal=goal_position(parts.scenario, parts.world),
+        camera=parts.camera,
+        period=1 / parts.scenario.camera.fps,
+    )
 
 
 def MakeCamera(scenario: Scenario, world: World) -> SplatCamera:

@@ -1,6 +1,8 @@
 """`splatpilot fly`: one flight with its page and video."""
 
 import contextlib
+import select
+import sys
 import time
 import traceback
 from collections.abc import Sequence
@@ -40,17 +42,22 @@ from splatpilot.systems.common.files import (
     written_atomically,
 )
 from splatpilot.systems.common.progress import Progress
+from splatpilot.systems.common.validation import require
+from splatpilot.systems.policies.teleop import TeleopConfig
 from splatpilot.systems.splats.splat_camera import SplatCamera
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 from splatpilot.systems.vehicle.state import pose_from_state
+from splatpilot.systems.visualization.live import LiveControls
 from splatpilot.systems.visualization.meshcat_drawing import draw_vehicle
 from splatpilot.systems.visualization.pages import (
     Frames,
+    HtmlPage,
     ReplayedFlight,
     ReplayView,
     live_page,
     replay_page,
 )
+from splatpilot.systems.visualization.rerun_sink import RerunSink
 from splatpilot.systems.visualization.video import VideoRecorder
 
 
@@ -63,49 +70,50 @@ def replayed_flight(name: str, flight: Flight, frames: Frames | None) -> Replaye
 def recorded_frames(recorder: VideoRecorder, scenario: Scenario) -> Frames:
     """Returns the images of the scenario's camera."""
     color, depth = zip(*recorder.frames(scenario.camera.z_far), strict=True)
-    return Frames(1 / scenario.camera.fps, color, depth)
+    return Frames(1 / scenario.camera.fps, color, depth, scenario.camera.z_far)
 
 
-def write_flight_page(
-    path: Path, scenario: Scenario, world: World, flights: Sequence[ReplayedFlight]
-) -> None:
-    """Writes a page that shows flights from one start to one goal, see `replay_page`."""
+def flight_page(
+    scenario: Scenario, world: World, flights: Sequence[Flight | ReplayedFlight]
+) -> HtmlPage:
+    """Makes a page that shows flights from one start to one goal, see `replay_page`.
+
+    A notebook shows it inline.
+    """
     world = randomize_appearance(world, scenario.appearance, scenario.seed)
-    lower, upper = _heights(world)
-    view = ReplayView(
-        X_BC=camera_mount(scenario.camera),
-        fov_y=camera_info(scenario.camera).fov_y(),
-        radius=VEHICLE_RADIUS,
-        lower=lower,
-        upper=upper,
-    )
     meshcat = open_meshcat(scenario, world)
-    for k in range(len(flights)):
+    shown = [
+        replayed_flight(f"flight {k}", flight, None) if isinstance(flight, Flight) else flight
+        for k, flight in enumerate(flights)
+    ]
+    for k in range(len(shown)):
         draw_vehicle(meshcat, f"/splatpilot/vehicles/{k}", VEHICLE_RADIUS)
     world = add_moving_spheres(world, scenario.moving)
     spheres = world.moving.spheres if world.moving else None
-    page = replay_page(
-        meshcat.StaticHtml(), world.gaussians, world.background, view, flights, spheres
-    )
-    with written_atomically(path) as partial:
-        partial.write_text(page)
+    view, scene = _view(scenario, world), (world.gaussians, world.background)
+    return HtmlPage(replay_page(meshcat.StaticHtml(), *scene, view, shown, spheres))
 
 
-def write_live_page(path: Path, meshcat: Meshcat, scenario: Scenario, world: World) -> None:
-    """Writes a page that shows a running flight, which `meshcat` draws, see `live_page`."""
+def running_page(meshcat: Meshcat, scenario: Scenario, world: World) -> HtmlPage:
+    """Makes a page that shows a running flight, which `meshcat` draws, see `live_page`."""
     world = randomize_appearance(world, scenario.appearance, scenario.seed)
-    lower, upper = _heights(world)
     highest = max(start_position(scenario, world)[2], goal_position(scenario, world)[2])
-    cut = min(highest + 2 * VEHICLE_RADIUS, upper)
-    page = live_page(meshcat, world.gaussians, world.background, (lower, upper), cut)
-    with written_atomically(path) as partial:
-        partial.write_text(page)
+    view, scene = _view(scenario, world), (world.gaussians, world.background)
+    cut = min(highest + 2 * VEHICLE_RADIUS, view.upper)
+    return HtmlPage(live_page(meshcat, *scene, view, cut))
 
 
-def _heights(world: World) -> tuple[float, float]:
-    """Returns the heights [m] of floor and ceiling."""
+def _view(scenario: Scenario, world: World) -> ReplayView:
     field = world.distance_field
-    return float(np.asarray(field.lower_W)[2]), float(np.asarray(field.upper_W)[2])
+    return ReplayView(
+        name=f"{world.name}, seed {scenario.seed}",
+        X_BC=camera_mount(scenario.camera),
+        fov_y=camera_info(scenario.camera).fov_y(),
+        radius=VEHICLE_RADIUS,
+        lower=float(np.asarray(field.lower_W)[2]),
+        upper=float(np.asarray(field.upper_W)[2]),
+        num_frontier=world.num_frontier,
+    )
 
 
 _TRACEBACK = "traceback.txt"
@@ -117,7 +125,9 @@ def run(
     scenario: Scenario,
     out: Path,
     live: bool = False,
+    draw: Sequence[str] = (),
     video: bool = True,
+    rerun: Path | None = None,
     graphviz: Path | None = None,
     overwrite: bool = False,
 ) -> dict[str, float | str]:
@@ -129,9 +139,11 @@ def run(
     - the files of `write_flight` and `write_summary`.
 
     Args:
-        live: serves Meshcat while flying, at real time, and afterwards until Enter is pressed;
+        live: serves Meshcat with `LiveControls`, and afterwards until Enter is pressed;
             `live.html` in `out` shows it with the world's Gaussians.
+        draw: what Meshcat draws, see `AddMeshcat`.
         video: writes `flight.mp4`.
+        rerun: file of a `RerunSink`.
         graphviz: file for the diagram as Graphviz source.
         overwrite: replaces files in `out`, after the flight.
 
@@ -140,29 +152,63 @@ def run(
     """
     scenario = sample_scenario(scenario)
     scenario.validate()
-    for path in (out, graphviz):
+    for path in (out, rerun, graphviz):
         if path is not None:
             require_unused(path, overwrite)
-    if graphviz is not None:
-        require_writable_folder(graphviz.parent)
+    for path in (rerun, graphviz):
+        if path is not None:
+            require_writable_folder(path.absolute().parent)
+    by_hand = isinstance(scenario.policy, TeleopConfig)
+    require(live or not by_hand, "--policy teleop", "flown with --live", "none of it")
+    require(live or not draw, "--draw", "left out without --live", ",".join(draw))
     print(f"Building the world, seed {scenario.seed}...", flush=True)
     world = make_world(scenario.world, scenario.seed)
     sample_initial_state(scenario, world)  # Checks start and goal early.
 
-    meshcat = open_meshcat(scenario, world) if live else None
-    if meshcat is not None:
-        page = out / "live.html"
-        write_live_page(page, meshcat, scenario, world)
-        print(
-            f"Watch the flight: open {page}, or {meshcat.web_url()} without Gaussians", flush=True
+    with contextlib.ExitStack() as stack:
+        meshcat = open_meshcat(scenario, world) if live else None
+        recording = stack.enter_context(written_atomically(rerun)) if rerun else None
+        diagram = BuildFlightDiagram(
+            scenario, world, meshcat, video=True, draw=draw, rerun=recording
         )
-    diagram = BuildFlightDiagram(scenario, world, meshcat, video=True)
-    if graphviz is not None:
-        with written_atomically(graphviz) as path:
-            path.write_text(diagram.GetGraphvizString())
+        if recording is not None:
+            stack.callback(cast(RerunSink, diagram.GetSubsystemByName("rerun")).close)
+        if graphviz is not None:
+            with written_atomically(graphviz) as path:
+                path.write_text(diagram.GetGraphvizString())
+        if meshcat is None:
+            return _fly_and_write(scenario, world, diagram, out, video)
+        running_page(meshcat, scenario, world).save(out / "live.html")
+        address = f"{out / 'live.html'}, or {meshcat.web_url()} without Gaussians"
+        print(f"The flight starts when you open {address}", flush=True)
+        controls = LiveControls(meshcat, diagram, world.distance_field)
+        while True:
+            summary = _fly_and_write(scenario, world, diagram, out, video, controls)
+            print("Press Enter to stop serving Meshcat, or restart in the page.", flush=True)
+            if not controls.wait_for_restart(_is_stopped):
+                return summary
+
+
+def _is_stopped() -> bool:
+    """Checks if Enter was pressed, or if nothing can be."""
+    try:
+        stopped = bool(select.select([sys.stdin], [], [], 0)[0])
+    except (OSError, ValueError):  # not a terminal
+        return True
+    return stopped and (sys.stdin.readline(), True)[1]
+
+
+def _fly_and_write(
+    scenario: Scenario,
+    world: World,
+    diagram: Diagram,
+    out: Path,
+    video: bool,
+    monitor: LiveControls | None = None,
+) -> dict[str, float | str]:
     failure = interruption = None
     try:
-        flight = fly_with_bar(diagram, realtime_rate=1.0 if live else 0.0)
+        flight = fly_with_bar(diagram, monitor)
     except FlightError as error:
         flight, failure = error.flight, error
     except FlightInterrupted as error:
@@ -180,7 +226,7 @@ def run(
     frames = recorded_frames(recorder, scenario)
     name = f"{world.name}, seed {scenario.seed}"
     shown = replayed_flight(name, flight, frames)
-    write_flight_page(out / "flight.html", scenario, world, [shown])
+    flight_page(scenario, world, [shown]).save(out / "flight.html")
     written = ["flight.html", *FLIGHT_FILES, *([_TRACEBACK] if failure is not None else [])]
     if video:
         recorder.save(out / "flight.mp4", scenario.camera.z_far)
@@ -190,20 +236,15 @@ def run(
     print(f"Wrote {', '.join(written)} in {out}")
     if interruption is not None:
         raise interruption
-    if live:
-        with contextlib.suppress(EOFError):
-            input("Press Enter to stop serving Meshcat. ")
     return summary
 
 
-def fly_with_bar(diagram: Diagram, realtime_rate: float = 0.0) -> Flight:
+def fly_with_bar(diagram: Diagram, monitor: LiveControls | None = None) -> Flight:
     """Calls `fly` with a progress bar of simulated time."""
     limit = flight_monitors(diagram)[0][1].scenario.timeout
     layout = "{desc} {n:.1f} s of at most {total:.0f} s [{elapsed}]"
     with Progress(total=limit, desc="flying", bar_format=layout, leave=False) as bar:
-        return fly(
-            diagram, progress=lambda now: bar.update(now - bar.n), realtime_rate=realtime_rate
-        )
+        return fly(diagram, monitor=monitor, progress=lambda now: bar.update(now - bar.n))
 
 
 def format_summary(summary: dict[str, float | str]) -> str:

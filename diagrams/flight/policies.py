@@ -30,6 +30,7 @@ from splatpilot.systems.policies.student import (
     StudentDepthConfig,
     StudentRgbConfig,
 )
+from splatpilot.systems.policies.teleop import Teleop, TeleopConfig
 
 
 class PolicyConfig(Protocol):
@@ -101,6 +102,7 @@ register_policy(
 )
 for _name, _config, _system in (
     ("straight", StraightConfig, Straight),
+    ("teleop", TeleopConfig, Teleop),
     ("reactive", ReactiveConfig, Reactive),
     ("diffaero", DiffAeroConfig, DiffAero),
     ("depthnav", DepthNavConfig, DepthNav),

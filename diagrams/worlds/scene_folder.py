@@ -154,6 +154,7 @@ def read_scene_folder(path: str | Path, *, metric: bool = True) -> World:
         remedy = f"measure a length in `splatpilot view {path}`, then use `splatpilot scene scale`"
         require(metadata.metric, f"{path / 'scene.yaml'}: metric", "true to fly", "false", remedy)
     gaussians = read_ply(path / "gaussians.ply")
+    num_observed = len(gaussians)
     if metadata.frontier:
         gaussians = gaussians.merged_with(read_ply(path / FRONTIER))
     esdf = Esdf.load(path / "esdf.npz")
@@ -163,7 +164,8 @@ def read_scene_folder(path: str | Path, *, metric: bool = True) -> World:
     valid = np.allclose(stated, found, atol=1e-6)
     require(valid, what, condition, stated, "the files are of different scenes")
     background, ends = read_background(path, metadata), np.array([metadata.p_WS, metadata.p_WG])
-    return World(metadata.name, gaussians, esdf, esdf, background, *ends)
+    num_frontier = len(gaussians) - num_observed
+    return World(metadata.name, gaussians, esdf, esdf, background, *ends, num_frontier=num_frontier)
 
 
 def read_background(path: Path, metadata: SceneMetadata) -> Background:

@@ -27,6 +27,7 @@ class World:
     p_WS: NDArray[np.float64]  # (3,) [m], default start
     p_WG: NDArray[np.float64]  # (3,) [m], default goal
     moving: MovingObstacles | None = None
+    num_frontier: int = 0  # last Gaussians, which close unobserved space
     source: tuple[Any, int] | None = None  # the configuration and seed that make this world
 
     def __eq__(self, other: object) -> bool:
@@ -45,6 +46,10 @@ class World:
         from splatpilot.diagrams.worlds.world_registry import make_world  # imports this module
 
         return make_world, self.source
+
+    def __repr__(self) -> str:
+        size = " x ".join(f"{length:.3g}" for length in self.esdf.upper_W - self.esdf.lower_W)
+        return f"World({self.name!r}: {len(self.gaussians.means):,} Gaussians, {size} m)"
 
     def field_at(self, time: float) -> DistanceField:
         """Returns the distance field for collisions at a time [s] of a flight."""

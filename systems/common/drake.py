@@ -1,10 +1,11 @@
-"""Helpers for Drake systems: ports by methods, optional inputs, connections, weak callbacks."""
+"""Helpers for Drake systems: ports, connections, weak callbacks, sliders of Meshcat."""
 
 import weakref
 from collections.abc import Callable
 from typing import Any, cast
 
 import numpy as np
+from pydrake.geometry import Meshcat
 from pydrake.systems import sensors
 from pydrake.systems.framework import (
     Context,
@@ -112,3 +113,12 @@ def weak_callback(method: Callable[..., Any]) -> Callable[..., Any]:
         return bound(*arguments)
 
     return call
+
+
+def add_slider(
+    meshcat: Meshcat, name: str, range: tuple[float, float], step: float, value: float, *keys: str
+) -> None:
+    """Adds a slider to Meshcat's controls, or resets it; `keys` decrement and increment it."""
+    if name in meshcat.GetSliderNames():
+        meshcat.DeleteSlider(name)
+    meshcat.AddSlider(name, *range, step, value, *keys)

@@ -10,18 +10,21 @@ from pydrake.common.value import Value
 from pydrake.geometry import Cylinder, InMemoryMesh, Mesh, Meshcat, Rgba, Sphere
 from pydrake.math import RigidTransform
 from pydrake.perception import BaseField, Fields, PointCloud
-from pydrake.systems.framework import Context, DiagramBuilder, EventStatus, LeafSystem, OutputPort
-from pydrake.systems.sensors import CameraInfo, ImageRgba8U
+from pydrake.systems.framework import (
+    Context,
+    DiagramBuilder,
+    EventStatus,
+    LeafSystem,
+    System,
+)
+from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageRgba8U
 
 from splatpilot.systems.collision.distance_field import DistanceField, FieldState
 from splatpilot.systems.collision.field_mesh import add_primitive, data_uri
 from splatpilot.systems.collision.shapes import MovingSpheres
-from splatpilot.systems.common.drake import vector_input
-from splatpilot.systems.policies.hypotheses import Hypotheses, hypotheses_size, num_hypotheses_in
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.splats.splat_camera import SplatCamera
 from splatpilot.systems.vehicle.quadrotor_geometry import quadrotor_parts
-from splatpilot.systems.vehicle.state import QuadrotorState, pose_from_state
 
 
 def draw_gaussians(
@@ -39,12 +42,20 @@ def draw_gaussians(
     inside = np.flatnonzero(np.all((scene.means >= lower_W) & (scene.means <= upper_W), axis=1))
     if len(inside) > max_points:
         inside = inside[np.linspace(0, len(inside) - 1, max_points).astype(int)]
-    cloud = PointCloud(len(inside), Fields(BaseField.kXYZs | BaseField.kRGBs))
-    cloud.mutable_xyzs()[:] = scene.means[inside].T
-    # Meshcat expects linear colors of points.
-    cloud.mutable_rgbs()[:] = (scene.base_colors[inside].T ** 2.2 * 255).astype(np.uint8)
     extent = np.median(scene.scales[inside].max(axis=1)) if len(inside) else 0.05
-    meshcat.SetObject(path, cloud, point_size=2.0 * float(extent))
+    colors = scene.base_colors[inside]
+    draw_points(meshcat, path, scene.means[inside], colors, 2.0 * float(extent))
+
+
+def draw_points(
+    meshcat: Meshcat, path: str, p_Q: np.ndarray, colors: np.ndarray, size: float
+) -> None:
+    """Draws points (N, 3) [m] of a size [m]; sRGB colors (N, 3) are 0 to 1."""
+    cloud = PointCloud(len(p_Q), Fields(BaseField.kXYZs | BaseField.kRGBs))
+    cloud.mutable_xyzs()[:] = p_Q.T
+    # Meshcat expects linear colors of points.
+    cloud.mutable_rgbs()[:] = (colors.T**2.2 * 255).astype(np.uint8)
+    meshcat.SetObject(path, cloud, point_size=size)
 
 
 GOAL_COLOR, START_COLOR = Rgba(0.1, 0.9, 0.3, 0.4), Rgba(0.1, 0.5, 1.0, 0.4)
@@ -135,121 +146,45 @@ def draw_distance_slice(meshcat: Meshcat, path: str, field: DistanceField, heigh
     meshcat.SetTriangleColorMesh(path, p_WQ.T, faces.T, colors.T)
 
 
-_TRAIL = 120
-"""[-] Number of images that the trail spans."""
+def vehicle_prefix(system: System, base: str) -> str:
+    """Returns the vehicle's name if the system is named `VEHICLE_base`, "" if it is `base`."""
+    name = system.get_name()
+    return "" if name == base else name.removesuffix(f"_{base}")
 
 
-class FlightVisualizer(LeafSystem):
-    """Draws the vehicle, its trail and the fan of trajectory hypotheses in Meshcat.
-
-    .. pydrake_system::
-
-        name: FlightVisualizer
-        input_ports: [state, hypotheses]
-
-    Publishes every `period` [s]. `/splatpilot/vehicle` must have the vehicle's shape, see
-    `draw_vehicle`. Hypotheses are green (lowest cost) to red (highest).
-    """
-
-    def __init__(
-        self,
-        meshcat: Meshcat,
-        num_hypotheses: int,
-        period: float = 1 / 15,
-    ):
-        """Declares the ports; `num_hypotheses` is 0 for no port `hypotheses`."""
-        super().__init__()
-        self._meshcat, self._num_hypotheses = meshcat, num_hypotheses
-        self.DeclareVectorInputPort("state", 13)
-        if num_hypotheses:
-            self.DeclareVectorInputPort("hypotheses", hypotheses_size(num_hypotheses))
-        # Positions of the last images, the latest last; NaN before.
-        self.DeclareDiscreteState(np.full(3 * _TRAIL, np.nan))
-        self.DeclarePeriodicPublishEvent(period, 0.0, self._publish)
-        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._extend_trail)
-
-    @staticmethod
-    def AddToBuilder(
-        builder: DiagramBuilder,
-        state_port: OutputPort,
-        meshcat: Meshcat,
-        hypotheses_port: OutputPort | None = None,
-    ) -> "FlightVisualizer":
-        """Adds a visualizer, named `flight_visualizer`."""
-        count = num_hypotheses_in(hypotheses_port.size()) if hypotheses_port is not None else 0
-        visualizer = FlightVisualizer(meshcat, count)
-        builder.AddNamedSystem("flight_visualizer", visualizer)
-        builder.Connect(state_port, visualizer.GetInputPort("state"))
-        if hypotheses_port is not None:
-            builder.Connect(hypotheses_port, visualizer.GetInputPort("hypotheses"))
-        return visualizer
-
-    def _trail(self, context: Context) -> np.ndarray:
-        """Returns the positions (n, 3) [m] of the last images and of this one."""
-        before = context.get_discrete_state_vector().value().reshape(-1, 3)
-        p_WB = QuadrotorState.of(vector_input(self, "state", context)).p_WB
-        return np.vstack([before[~np.isnan(before[:, 0])], p_WB])
-
-    def _extend_trail(self, context: Context, discrete_state) -> EventStatus:
-        trail = self._trail(context)[-_TRAIL:]
-        missing = np.full((_TRAIL - len(trail), 3), np.nan)
-        discrete_state.set_value(np.vstack([missing, trail]).ravel())
-        return EventStatus.Succeeded()
-
-    def _publish(self, context: Context) -> EventStatus:
-        X_WB = pose_from_state(vector_input(self, "state", context))
-        self._meshcat.SetTransform("/splatpilot/vehicle", X_WB, context.get_time())
-        red = Rgba(0.9, 0.1, 0.1)
-        self._meshcat.SetLine("/splatpilot/trail", self._trail(context).T, 4.0, red)
-        if self._num_hypotheses:
-            vector = vector_input(self, "hypotheses", context)
-            plan = Hypotheses.from_vector(vector, self._num_hypotheses)
-            if plan is not None:
-                self._meshcat.SetTriangleColorMesh("/splatpilot/hypotheses", *fan_mesh(plan))
-        return EventStatus.Succeeded()
-
-
-_RIBBON_WIDTH = 0.02  # [m]
-
-
-def fan_mesh(plan: Hypotheses) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Makes horizontal ribbons along K hypotheses, from green (lowest cost) to red (highest).
-
-    Returns:
-        Vertices (3, V) [m], triangles (3, F) int32 seen from both sides, colors (3, V) in 0 to 1.
-    """
-    K = len(plan.costs)
-    start = np.broadcast_to(plan.X_WB.translation(), (K, 1, 3))
-    path = np.concatenate([start, plan.waypoints_W], axis=1)  # (K, T + 1, 3)
-    along = np.gradient(path, axis=1)
-    across = np.stack([-along[..., 1], along[..., 0], np.zeros(along.shape[:2])], axis=-1)
-    across *= 0.5 * _RIBBON_WIDTH / np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-9)
-    sides = np.stack([path - across, path + across], axis=2)
-    cost = (plan.costs - plan.costs.min()) / max(np.ptp(plan.costs), 1e-9)
-    color = np.column_stack(
-        [np.minimum(1, 2 * cost), np.minimum(1, 2 * (1 - cost)), np.full(K, 0.1)]
-    )
-    T = path.shape[1]
-    first = (2 * (np.arange(K)[:, None] * T + np.arange(T - 1))).ravel()
-    a, b, c, d = first, first + 1, first + 2, first + 3
-    faces = np.concatenate([[a, b, c], [c, b, d], [a, c, b], [c, d, b]], axis=1)
-    return sides.reshape(-1, 3).T, faces.astype(np.int32), np.repeat(color, 2 * T, axis=0).T
-
-
-_CAMERA_PATH = "/splatpilot/vehicle/camera"
 _PICTURE_DEPTH = 0.6  # [m] from the camera to the shown image
+_DEPTH_POINTS = 10_000  # [-] at most
+
+
+def camera_rays(camera_info: CameraInfo, pixels: np.ndarray) -> np.ndarray:
+    """Returns the points (N, 3) of depth 1 at pixels (N, 2), frame C."""
+    homogeneous = np.column_stack([pixels, np.ones(len(pixels))])
+    return homogeneous @ np.linalg.inv(camera_info.intrinsic_matrix()).T
+
+
+def draw_frustum(
+    meshcat: Meshcat, path: str, camera_info: CameraInfo, X_BC: RigidTransform
+) -> np.ndarray:
+    """Draws the view frustum of a camera; returns its corners (4, 3) [m], frame C: top left, top
+    right, bottom right, bottom left."""
+    width, height = camera_info.width(), camera_info.height()
+    corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], dtype=float)
+    p_CCorners = _PICTURE_DEPTH * camera_rays(camera_info, corners)
+    meshcat.SetTransform(path, X_BC)
+    edges = np.stack([np.zeros((4, 3)), p_CCorners], axis=1).reshape(8, 3)
+    meshcat.SetLine(f"{path}/frustum", edges.T, 2.0)
+    return p_CCorners
 
 
 class CameraVisualizer(LeafSystem):
-    """Shows the camera's image in Meshcat, across its view frustum.
+    """Shows the camera's image in Meshcat, across its view frustum, and its depth as points.
 
     .. pydrake_system::
 
         name: CameraVisualizer
-        input_ports: [color_image]
+        input_ports: [color_image, depth_image_32f]
 
-    Evaluates an image every `period` [s] and shows every `stride`-th, below the vehicle's Meshcat
-    path.
+    Evaluates an image every `period` [s] and shows every `stride`-th; ForcedPublish shows it too.
     """
 
     def __init__(
@@ -259,49 +194,103 @@ class CameraVisualizer(LeafSystem):
         X_BC: RigidTransform,
         period: float = 1 / 15,
         stride: int = 3,
+        *,
+        depth: bool = False,
+        path: str = "/splatpilot/vehicle/camera",
     ):
-        """Declares the port.
+        """Declares the ports.
 
         Args:
             X_BC: pose of the camera in the vehicle's body frame.
             period: [s] between images, equal to that of other users of the camera.
             stride: number of images per shown one.
+            depth: declares the port `depth_image_32f`, whose points are drawn.
+            path: of the camera in Meshcat, below that of the vehicle.
         """
         super().__init__()
         self._meshcat, self._period, self._stride = meshcat, period, stride
+        self._path, self._depth = path, depth
+        self._camera_info = camera_info
+        self._p_CCorners = draw_frustum(meshcat, path, camera_info, X_BC)
         width, height = camera_info.width(), camera_info.height()
-        corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], dtype=float)
-        center = [camera_info.center_x(), camera_info.center_y()]
-        focal = [camera_info.focal_x(), camera_info.focal_y()]
-        # (4, 3) [m], frame C: top left, top right, bottom right, bottom left.
-        self._p_CCorners = _PICTURE_DEPTH * np.column_stack(
-            [(corners - center) / focal, np.ones(4)]
-        )
         self.DeclareAbstractInputPort("color_image", Value(ImageRgba8U(width, height)))
-        self.DeclarePeriodicPublishEvent(period, 0.0, self._publish)
-        meshcat.SetTransform(_CAMERA_PATH, X_BC)
-        edges = np.stack([np.zeros((4, 3)), self._p_CCorners], axis=1).reshape(8, 3)
-        meshcat.SetLine(f"{_CAMERA_PATH}/frustum", edges.T, 2.0)
+        if depth:
+            self.DeclareAbstractInputPort("depth_image_32f", Value(ImageDepth32F(width, height)))
+        self.DeclarePeriodicPublishEvent(period, 0.0, self._publish_some)
+        self.DeclareForcedPublishEvent(self._publish)
 
     @staticmethod
     def AddToBuilder(
-        builder: DiagramBuilder, camera: SplatCamera, meshcat: Meshcat, period: float = 1 / 15
+        builder: DiagramBuilder,
+        camera: SplatCamera,
+        meshcat: Meshcat,
+        period: float = 1 / 15,
+        *,
+        depth: bool = False,
+        name: str = "",
+        path: str = "",
     ) -> "CameraVisualizer":
-        """Adds a visualizer, named `camera_visualizer`, of the images of a camera."""
-        visualizer = CameraVisualizer(meshcat, camera.camera_info(), camera.X_BC(), period)
-        builder.AddNamedSystem("camera_visualizer", visualizer)
-        builder.Connect(camera.GetOutputPort("color_image"), visualizer.GetInputPort("color_image"))
+        """Adds a visualizer of the images of a camera.
+
+        Args:
+            depth: draws its depth as points.
+            name: the camera's name and `_visualizer` by default.
+            path: `/splatpilot/vehicle/camera` by default, `/splatpilot/NAME/vehicle/camera` if the
+                camera is named `NAME_camera`.
+        """
+        vehicle = vehicle_prefix(camera, "camera")
+        path = path or "/".join(["/splatpilot", *([vehicle] if vehicle else []), "vehicle/camera"])
+        visualizer = CameraVisualizer(
+            meshcat, camera.camera_info(), camera.X_BC(), period, depth=depth, path=path
+        )
+        builder.AddNamedSystem(name or f"{camera.get_name()}_visualizer", visualizer)
+        for k in range(visualizer.num_input_ports()):
+            port = visualizer.get_input_port(k)
+            builder.Connect(camera.GetOutputPort(port.get_name()), port)
         return visualizer
 
-    def _publish(self, context: Context) -> EventStatus:
-        time = context.get_time()
-        if round(time / self._period) % self._stride:
+    def _publish_some(self, context: Context) -> EventStatus:
+        if round(context.get_time() / self._period) % self._stride:
             return EventStatus.DidNothing()
+        return self._publish(context)
+
+    def _publish(self, context: Context) -> EventStatus:
         image = cast(ImageRgba8U, self.GetInputPort("color_image").Eval(context))
         rgb = np.asarray(image.data)[..., :3]
         gltf = MemoryFile(picture_gltf(rgb, self._p_CCorners), ".gltf", "onboard picture")
-        self._meshcat.SetObject(f"{_CAMERA_PATH}/picture", Mesh(InMemoryMesh(mesh_file=gltf)))
+        self._meshcat.SetObject(f"{self._path}/picture", Mesh(InMemoryMesh(mesh_file=gltf)))
+        send_picture(self._meshcat, self._path, rgb)
+        if self._depth:
+            depth = cast(ImageDepth32F, self.GetInputPort("depth_image_32f").Eval(context))
+            self._draw_depth(rgb, np.asarray(depth.data)[..., 0])
         return EventStatus.Succeeded()
+
+    def _draw_depth(self, rgb: np.ndarray, depth: np.ndarray) -> None:
+        step = int(np.ceil(np.sqrt(depth.size / _DEPTH_POINTS)))
+        rows, columns = (
+            index.ravel() for index in np.mgrid[: depth.shape[0] : step, : depth.shape[1] : step]
+        )
+        valid = np.isfinite(depth[rows, columns]) & (depth[rows, columns] > 0)
+        rows, columns = rows[valid], columns[valid]
+        p_CQ = depth[rows, columns, None] * camera_rays(
+            self._camera_info, np.column_stack([columns, rows]) + 0.5
+        )
+        draw_points(self._meshcat, f"{self._path}/depth", p_CQ, rgb[rows, columns] / 255, 0.03)
+
+
+_JPEG = [cv2.IMWRITE_JPEG_QUALITY, 80]
+
+
+def send_picture(meshcat: Meshcat, path: str, rgb: np.ndarray) -> None:
+    """Sends an image (H, W, 3) to pages of `live_page`, as a property of a path in Meshcat.
+
+    Meshcat's properties are numbers: the first is the size of the JPEG file [bytes], and each
+    other holds six of its bytes, the lowest first.
+    """
+    data = cv2.imencode(".jpg", rgb[..., ::-1], _JPEG)[1].tobytes()
+    padded = np.frombuffer(data + bytes(-len(data) % 6), np.uint8).reshape(-1, 6)
+    numbers = padded @ (256.0 ** np.arange(6))
+    meshcat.SetProperty(path, "jpeg", [float(len(data)), *numbers.tolist()])
 
 
 def picture_gltf(rgb: np.ndarray, corners: np.ndarray) -> str:
@@ -311,7 +300,7 @@ def picture_gltf(rgb: np.ndarray, corners: np.ndarray) -> str:
         rgb: (H, W, 3) uint8.
         corners: (4, 3) [m], top left, top right, bottom right and bottom left.
     """
-    _, jpeg = cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 80])
+    _, jpeg = cv2.imencode(".jpg", rgb[..., ::-1], _JPEG)
     document = {
         "asset": {"version": "2.0"},
         "scene": 0,
@@ -338,33 +327,40 @@ _HIDDEN = np.array([0.0, 0.0, -1000.0])  # [m], of spheres that are absent
 
 
 class MovingSpheresVisualizer(LeafSystem):
-    """Draws moving spheres at the Context's time, sphere k at
-    `/splatpilot/spheres/k`; it has no ports."""
+    """Draws moving spheres at the Context's time, sphere k at `PATH/k`; it has no ports."""
 
     def __init__(
         self,
         meshcat: Meshcat,
         spheres: MovingSpheres,
         period: float = 1 / 15,
+        *,
+        path: str = "/splatpilot/spheres",
     ):
         super().__init__()
-        self._meshcat, self._spheres = meshcat, spheres
+        self._meshcat, self._spheres, self._path = meshcat, spheres, path
         for k, radius in enumerate(spheres.radii):
-            meshcat.SetObject(f"/splatpilot/spheres/{k}", Sphere(radius), Rgba(0.9, 0.75, 0.1))
+            meshcat.SetObject(f"{path}/{k}", Sphere(radius), Rgba(0.9, 0.75, 0.1))
         self.DeclarePeriodicPublishEvent(period, 0.0, self._publish)
+        self.DeclareForcedPublishEvent(self._publish)
 
     @staticmethod
     def AddToBuilder(
-        builder: DiagramBuilder, spheres: MovingSpheres, meshcat: Meshcat
+        builder: DiagramBuilder,
+        spheres: MovingSpheres,
+        meshcat: Meshcat,
+        *,
+        name: str = "spheres_visualizer",
+        path: str = "/splatpilot/spheres",
     ) -> "MovingSpheresVisualizer":
-        """Adds a visualizer, named `spheres_visualizer`."""
-        visualizer = MovingSpheresVisualizer(meshcat, spheres)
-        builder.AddNamedSystem("spheres_visualizer", visualizer)
+        """Adds a visualizer."""
+        visualizer = MovingSpheresVisualizer(meshcat, spheres, path=path)
+        builder.AddNamedSystem(name, visualizer)
         return visualizer
 
     def _publish(self, context: Context) -> EventStatus:
         time = context.get_time()
         for k, center in enumerate(self._spheres.centers(time)):
             p_WO = center if np.isfinite(center).all() else _HIDDEN
-            self._meshcat.SetTransform(f"/splatpilot/spheres/{k}", RigidTransform(p_WO), time)
+            self._meshcat.SetTransform(f"{self._path}/{k}", RigidTransform(p_WO), time)
         return EventStatus.Succeeded()

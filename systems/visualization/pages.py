@@ -5,7 +5,9 @@ import gzip
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from html import escape
 from importlib import resources
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -17,12 +19,14 @@ from pydrake.math import RigidTransform
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.shapes import MovingSpheres
+from splatpilot.systems.common.files import written_atomically
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.policies.hypotheses import Hypotheses, num_hypotheses_in
 from splatpilot.systems.splats.background import Background, EnvironmentMap
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.vehicle.state import QuadrotorState
 from splatpilot.systems.visualization.meshcat_drawing import UNKNOWN_GRAY, distance_colors
+from splatpilot.systems.visualization.video import colorize_depth
 
 _COVARIANCE_SCALE = 256.0
 """Scales covariances of 1 mm to 16 m to the range of half floats."""
@@ -50,8 +54,12 @@ def pack_gaussians(scene: GaussianScene) -> NDArray[np.uint32]:
 _JPEG = [cv2.IMWRITE_JPEG_QUALITY, 80]
 
 
+_VIEWPORT = '<meta name="viewport" content="width=device-width, initial-scale=1">'
+
+
 def splat_page(
     meshcat_page: str,
+    title: str,
     gaussians: GaussianScene,
     background: Background,
     data: dict[str, Any],
@@ -62,6 +70,7 @@ def splat_page(
 
     Args:
         meshcat_page: `Meshcat.StaticHtml()`.
+        title: name of the environment, `name` in the page's data.
         data: further content, as for JSON.
         scripts: names of files in `page`, in the order of their dependencies.
         start: JavaScript of `splats` and `data` that runs last.
@@ -72,6 +81,7 @@ def splat_page(
         mirrored = EnvironmentMap(background.texels[:, ::-1])
         sky = base64.b64encode(mirrored.png()).decode()
     sources = [_source(name) for name in ("splats.js", *scripts, "page.js")]
+    data = {"name": title, **data}
     sources.append(f"openPage().then(({{splats, data}}) => {{ {start} }});")
     added = (
         f"<style>{_source('page.css')}</style>"
@@ -80,8 +90,27 @@ def splat_page(
         f'<script type="text/plain" id="sky">{sky}</script>'
         f'<script type="text/plain" id="data">{compressed(json.dumps(data).encode())}</script>'
     ) + "".join(f"<script>{source}</script>" for source in sources)
+    meshcat_page = meshcat_page.replace(
+        "<title>Drake MeshCat</title>", f"<title>{escape(title)}</title>{_VIEWPORT}", 1
+    )
     head, body, tail = meshcat_page.rpartition("</body>")
     return head + added + body + tail
+
+
+class HtmlPage:
+    """A self-contained HTML page; notebooks show it inline."""
+
+    def __init__(self, html: str):
+        self.html = html
+
+    def _repr_html_(self) -> str:
+        style = "width: 100%; height: 600px; border: 0"
+        return f'<iframe srcdoc="{escape(self.html)}" style="{style}"></iframe>'
+
+    def save(self, path: Path) -> None:
+        """Writes the page atomically."""
+        with written_atomically(path) as partial:
+            partial.write_text(self.html)
 
 
 def compressed(data: bytes) -> str:
@@ -166,7 +195,6 @@ def scene_page(meshcat_page: str, scene: ViewerScene) -> str:
     lengths += " m" if scene.metric else " in units of unknown length"
     field, images = scene.field, scene.images
     data: dict[str, Any] = {
-        "name": scene.name,
         "size": f"{lengths}, {len(scene.gaussians):,} Gaussians",
         "unit": unit,
         "notes": list(scene.notes),
@@ -183,7 +211,8 @@ def scene_page(meshcat_page: str, scene: ViewerScene) -> str:
         "cameras": images and _cameras(images, float(np.linalg.norm(size))),
     }
     start = "SceneView.open(viewer, splats, data).then((view) => { window.view = view; });"
-    return splat_page(meshcat_page, scene.gaussians, scene.background, data, _SCRIPTS, start)
+    shown = scene.gaussians, scene.background
+    return splat_page(meshcat_page, scene.name, *shown, data, _SCRIPTS, start)
 
 
 def _grid(field: Esdf, max_distance: float) -> dict[str, Any]:
@@ -217,7 +246,7 @@ def _cameras(images: CapturedImages, extent: float) -> dict[str, Any]:
     }
 
 
-_COLORS = ("#e8432e", "#2f8fe8", "#e8b52e", "#a05ce0", "#30b870", "#e060b0", "#50c8d0", "#b0b0b0")
+_COLORS = ("#2f8fe8", "#e8b52e", "#e8432e", "#a05ce0", "#30b870", "#e060b0", "#50c8d0", "#b0b0b0")
 _RATE = 30.0  # [Hz], samples of a flight in the page
 _SPHERES_PERIOD = 0.1  # [s] between samples of moving spheres
 
@@ -229,6 +258,7 @@ class Frames:
     period: float  # [s]
     color: Sequence[NDArray[np.uint8]]  # (H, W, 3) each, BGR
     depth: Sequence[NDArray[np.uint8]]  # (H, W, 3) each, BGR, see `colorize_depth`
+    max_depth: float = 20.0  # [m], see `colorize_depth`
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,14 +276,16 @@ class ReplayedFlight:
 
 @dataclass(frozen=True, eq=False)
 class ReplayView:
-    """Vehicle, camera and heights of a page."""
+    """Environment, vehicle, camera and heights of a page."""
 
+    name: str  # of the environment
     X_BC: RigidTransform  # pose of the onboard camera in the vehicle's body frame
     fov_y: float  # [rad] of the onboard camera
     radius: float  # [m] of the vehicle
     lower: float  # [m] height of the world's floor
     upper: float  # [m] height of its ceiling
     margin: float = 0.2  # [m] clearance below which the vehicle is red
+    num_frontier: int = 0  # last Gaussians, which close unseen space
 
 
 def replay_page(
@@ -280,6 +312,8 @@ def replay_page(
         "fov_y": np.degrees(view.fov_y),
         "radius": view.radius,
         "margin": view.margin,
+        "unknown": view.num_frontier,
+        "depth_scale": _depth_scale(max(f.frames.max_depth if f.frames else 1 for f in flights)),
         "lower": view.lower,
         "upper": view.upper,
         "cut": min(view.upper, highest + 2 * view.radius),
@@ -290,12 +324,23 @@ def replay_page(
     }
     return splat_page(
         meshcat_page,
+        view.name,
         gaussians,
         background,
         data,
-        ("replay_flight.js", "replay.js"),
+        ("plot.js", "replay_flight.js", "replay.js"),
         "window.replay = new Replay(viewer, splats, data);",
     )
+
+
+def _depth_scale(max_depth: float) -> dict[str, Any]:
+    """Returns colors evenly spaced in depth [m], and texts."""
+    colors = colorize_depth(np.linspace(0.5, max_depth, 33)[None], max_depth)[0]
+    middle = 0.5 * (0.5 + max_depth)
+    return {
+        "colors": [f"rgb({r}, {g}, {b})" for b, g, r in colors.tolist()],
+        "texts": [f"{depth:.3g} m" for depth in (0.5, middle, max_depth)],
+    }
 
 
 def _flight_data(flight: ReplayedFlight, color: str) -> dict[str, Any]:
@@ -354,23 +399,23 @@ def live_page(
     meshcat: Meshcat,
     gaussians: GaussianScene,
     background: Background,
-    heights: tuple[float, float],
+    view: ReplayView,
     cut: float,
 ) -> str:
     """Makes an HTML page with the Gaussians that receives the rest from `meshcat`, on this machine.
 
-    It hides the points at `/splatpilot/scene`, and the image of the onboard camera, which Meshcat
-    serves as a file.
+    It hides the points at `/splatpilot/scene`, and shows the last `send_picture` in its panel.
 
     Args:
-        heights: [m] of floor and ceiling.
         cut: [m] height above which Gaussians are hidden at first.
     """
+    fov_y, heights = float(np.degrees(view.fov_y)), {"lower": view.lower, "upper": view.upper}
     return splat_page(
         meshcat.StaticHtml(),
+        view.name,
         gaussians,
         background,
-        {"url": meshcat.ws_url(), "lower": heights[0], "upper": heights[1], "cut": cut},
+        {"url": meshcat.ws_url(), "cut": cut, "fov_y": fov_y, **heights},
         ("live.js",),
-        "showLive(splats, data); window.live = splats;",
+        "window.views = showLive(splats, data); window.live = splats;",
     )

@@ -45,11 +45,15 @@ class VideoRecorder(LeafSystem):
         self.DeclarePeriodicPublishEvent(1 / fps, 0.0, self._record)
 
     @staticmethod
-    def AddToBuilder(builder: DiagramBuilder, camera: SplatCamera, fps: float) -> "VideoRecorder":
-        """Adds a recorder, named `video`, of a camera."""
+    def AddToBuilder(
+        builder: DiagramBuilder, camera: SplatCamera, fps: float, *, name: str = ""
+    ) -> "VideoRecorder":
+        """Adds a recorder of a camera, named `video` if that is named `camera`, else its name and
+        `_video`."""
         info = camera.camera_info()
         recorder = VideoRecorder(info.width(), info.height(), fps)
-        builder.AddNamedSystem("video", recorder)
+        default = "video" if camera.get_name() == "camera" else f"{camera.get_name()}_video"
+        builder.AddNamedSystem(name or default, recorder)
         builder.Connect(camera.GetOutputPort("color_image"), recorder.GetInputPort("color_image"))
         builder.Connect(
             camera.GetOutputPort("depth_image_16u"), recorder.GetInputPort("depth_image_16u")

@@ -32,24 +32,14 @@ class DistanceSlice {
     this.mesh.position.z = z;
   }
 
-  // What the colors mean.
-  drawLegend(canvas, unit) {
-    const context = canvas.getContext("2d"), {width} = canvas, wide = 0.68 * width;
-    context.font = "22px system-ui, sans-serif";
-    for (let x = 0; x < wide; ++x) {
-      context.fillStyle = `rgb(${this.palette[Math.round(254 * x / wide)]})`;
-      context.fillRect(x, 0, 1, 26);
-    }
-    context.fillStyle = `rgb(${this.palette[255]})`;
-    context.fillRect(0.74 * width, 0, 0.26 * width, 26);
-    context.fillStyle = `rgb(${this.palette[255].map((value) => 0.6 * value)})`;
-    for (let x = 0.74 * width; x < width; x += 14) context.fillRect(x, 0, 5, 26);
-    context.fillStyle = "#eee";
-    context.fillText("surface", 0, 50);
-    context.textAlign = "center";
-    context.fillText(`${+(this.reach / 2).toPrecision(3)} ${unit}`, wide / 2, 50);
-    context.textAlign = "right";
-    context.fillText(`${+this.reach.toPrecision(3)} ${unit} +`, wide, 50);
-    context.fillText("never seen", width, 50);
+  // Colors and texts of the scale, the last of unobserved space.
+  legend(unit) {
+    const css = (value) => `rgb(${this.palette[value]})`;
+    const colors = [0, 32, 64, 96, 127, 159, 191, 222, 254].map((value) => css(value));
+    const length = (value) => `${+value.toPrecision(3)} ${unit}`;
+    return {
+      colors: [...colors, `${css(254)} 80%`, `${css(255)} 80%`, css(255)],
+      texts: ["surface", length(this.reach / 2), `${length(this.reach)} +`, "never seen"],
+    };
   }
 }

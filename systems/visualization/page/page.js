@@ -48,13 +48,96 @@ function bindKeys(keys) {
   });
 }
 
+// Adds a panel with a title and a button that collapses it; it is closed at first on phones.
+function addPanel(id, title) {
+  const panel = addElement(document.body, "div", {id, className: "panel"});
+  const header = addElement(panel, "header");
+  addElement(header, "b", {textContent: title});
+  const button = addElement(header, "button", {title: "collapse or expand"});
+  const close = (closed) => {
+    panel.classList.toggle("closed", closed);
+    button.textContent = closed ? "+" : "–";
+  };
+  button.onclick = () => close(!panel.classList.contains("closed"));
+  close(window.innerWidth < 600);
+  return panel;
+}
+
 // Adds a slider of heights from `lower` to `upper` [m]; content above the height is hidden.
 function addHeightSlider(bar, id, lower, upper, change) {
   const slider = Object.assign(document.createElement("input"), {
-    type: "range", id, min: lower, max: upper, step: "any"});
+    type: "range", id, className: "cut", min: lower, max: upper, step: "any"});
   slider.oninput = () => change(Number(slider.value));
   bar.append("hide above", slider);
   return slider;
+}
+
+// Adds a button for a switch, with a key; returns a function that sets the switch.
+function addSwitch(bar, key, id, text, start, change) {
+  const button = addElement(bar, "button", {textContent: `${text} (${key})`, id});
+  const set = (on) => {
+    button.classList.toggle("chosen", on);
+    change(on);
+    viewer.set_dirty();
+  };
+  button.onclick = () => set(!button.classList.contains("chosen"));
+  bindKeys({[key]: button.onclick});
+  set(start);
+  return set;
+}
+
+// Adds the switch of the last `count` Gaussians, those before unobserved space.
+function addNeverSeen(bar, id, splats, count) {
+  return addSwitch(bar, "u", id, "never seen", false, (on) => {
+    splats.shown = splats.count - (on ? 0 : count);
+  });
+}
+
+// Adds a scale of CSS colors with texts below, evenly spaced.
+function addScale(panel, id, colors, texts) {
+  const scale = addElement(panel, "div", {id, className: "scale"});
+  addElement(scale, "div").style.background = `linear-gradient(to right, ${colors.join(", ")})`;
+  const row = addElement(scale, "p");
+  for (const text of texts) addElement(row, "span", {textContent: text});
+  return scale;
+}
+
+// Buttons for the views: overview, by Meshcat's own controls, or by the poses in W (z backwards)
+// that the functions `chase` and `onboard` return.
+class Views {
+  constructor(viewer, bar, id, poses, fov_y, change) {
+    Object.assign(this, {viewer, poses, fov_y, change, name: "overview"});
+    this.buttons = ["overview", "chase", "onboard"].map((name, k) => addElement(bar, "button", {
+      textContent: `${name} (${k + 1})`, id: `${id}-${name}`, onclick: () => this.look(name)}));
+    bindKeys({1: () => this.look("overview"), 2: () => this.look("chase"),
+      3: () => this.look("onboard")});
+    viewer.controls.maxPolarAngle = 0.5 * Math.PI;  // above ground
+    viewer.render_callback = () => {
+      const pose = this.poses[this.name]?.();
+      if (pose) placeCamera(viewer, pose);
+    };
+  }
+
+  look(name) {
+    const {camera, controls} = this.viewer;
+    if (name === "overview" && this.orbit) camera.position.copy(this.orbit);
+    if (name !== "overview") this.orbit ??= camera.position.clone();
+    else this.orbit = null;
+    this.name = name;
+    controls.enabled = name === "overview";
+    camera.fov = name === "onboard" ? this.fov_y : 75;
+    for (const button of this.buttons) {
+      button.classList.toggle("chosen", button.id.endsWith(name));
+    }
+    this.change(name);
+    this.viewer.set_dirty();
+  }
+}
+
+// The pose that looks from `eye` at `target`, both in W.
+function lookAt(eye, target) {
+  const THREE = MeshCat.THREE;
+  return new THREE.Matrix4().lookAt(eye, target, new THREE.Vector3(0, 0, 1)).setPosition(eye);
 }
 
 // Shows the Gaussians and the sky; returns the former and the page's other data.

@@ -1,7 +1,8 @@
 // A flight, or several through one world, in a Meshcat page: vehicle, trail, plans, camera images,
 // speed and clearance, all at the time of one slider.
 //
-// Keys: space plays and pauses, arrows step, 1 2 3 choose the view, d switches color and depth.
+// Keys: space plays and pauses, arrows step, l loops, 1 2 3 choose the view, d switches color and
+// depth, u the hatched surfaces before unobserved space.
 "use strict";
 
 class Replay {
@@ -13,8 +14,8 @@ class Replay {
     this.flights = data.flights.map((flight, k) => new ReplayFlight(flight, k, this));
     this.duration = Math.max(...this.flights.map((flight) => flight.duration));
     this.X_BC = new THREE.Matrix4().fromArray(data.X_BC).transpose();
-    this.playing = false;
-    this.depth = false;
+    this.playing = this.depth = this.looping = false;
+    this.speed = 1;
     this.pictures = new Map();
     for (const flight of this.flights) viewer.scene.add(flight.group);
     this.spheres = data.spheres && new ReplaySpheres(data.spheres);
@@ -23,12 +24,11 @@ class Replay {
     this.choose(this.flights[0]);
     this.look("overview");
     this.setCut(data.cut);
-    viewer.render_callback = () => this.placeCamera();
     const ended = this.flights[0].outcome === "collision" ? this.flights[0].duration : 0;
     this.seek(Math.max(ended - 2, 0));
     let before = performance.now();
     const tick = (now) => {
-      if (this.playing) this.seek(this.time + (now - before) / 1000);
+      if (this.playing) this.seek(this.time + this.speed * (now - before) / 1000);
       before = now;
       requestAnimationFrame(tick);
     };
@@ -36,7 +36,7 @@ class Replay {
   }
 
   build() {
-    const panel = addElement(document.body, "div", {id: "replay-panel", className: "panel"});
+    const panel = addPanel("replay-panel", this.name);
     for (const flight of this.flights) {
       flight.button = addElement(panel, "button", {
         className: "flight", onclick: () => this.choose(flight)});
@@ -44,15 +44,15 @@ class Replay {
       flight.button.append(`${flight.name}: ${flight.outcome}, ${flight.duration.toFixed(1)} s`);
     }
     this.picture = addElement(panel, "canvas", {width: 648, height: 486, id: "replay-picture"});
+    const {colors, texts} = this.depth_scale;
+    this.scale = addScale(panel, "replay-scale", colors, texts);
     this.depthButton = addElement(panel, "button", {
       textContent: "color / depth (d)", id: "replay-depth", onclick: () => this.switchDepth()});
-    this.plot = addElement(panel, "canvas", {width: 648, height: 300, id: "replay-plot"});
-    this.plot.onclick = (event) =>
-      this.seek(event.offsetX / this.plot.clientWidth * this.duration);
+    this.plots = [
+      {name: "speeds", title: "speed [m/s]", margin: null},
+      {name: "clearances", title: `clearance [m], red below ${this.margin}`, margin: this.margin},
+    ].map((options) => new Plot(panel, `replay-${options.name}`, options, this));
     addElement(panel, "div", {className: "legend", innerHTML: `
-      <span class="mark" style="background:#6fb7ff"></span>speed
-      <span class="mark" style="background:#ffc04d"></span>clearance, red below
-      ${this.margin} m<br>
       <span class="mark" style="background:#1aff1a"></span>plan of lowest cost
       <span class="mark" style="background:#ff1a1a"></span>highest cost
       <span class="mark" style="background:#1ae64d"></span>goal`});
@@ -66,42 +66,45 @@ class Replay {
       this.seek(Number(this.slider.value));
     };
     this.clock = addElement(bar, "span");
-    this.viewButtons = ["overview", "chase", "onboard"].map((name, k) => addElement(bar, "button", {
-      textContent: `${name} (${k + 1})`, id: `replay-${name}`, onclick: () => this.look(name)}));
+    const speeds = addElement(bar, "select", {id: "replay-speed", title: "playback speed"});
+    for (const speed of [0.1, 0.25, 0.5, 1, 2, 4]) {
+      addElement(speeds, "option", {value: speed, textContent: `${speed}×`, selected: speed === 1});
+    }
+    speeds.onchange = () => { this.speed = Number(speeds.value); };
+    addSwitch(bar, "l", "replay-loop", "loop", false, (on) => { this.looping = on; });
+    const poses = {chase: () => this.chasePose(), onboard: () => this.onboardPose()};
+    this.views = new Views(this.viewer, bar, "replay", poses, this.fov_y, (name) => {
+      this.splats.cut = name === "overview" ? this.cut : Infinity;
+      this.setNeverSeen?.(name !== "overview");
+      this.hideOwn();
+      this.seek(this.time ?? 0);
+    });
+    if (this.unknown) {
+      this.setNeverSeen = addNeverSeen(bar, "replay-unknown", this.splats, this.unknown);
+    }
     this.cutSlider = addHeightSlider(
       bar, "replay-cut", this.lower, this.upper, (z) => this.setCut(z));
     bindKeys({
       " ": () => this.play(!this.playing),
       ArrowLeft: () => this.seek(this.time - 0.1),
       ArrowRight: () => this.seek(this.time + 0.1),
-      1: () => this.look("overview"),
-      2: () => this.look("chase"),
-      3: () => this.look("onboard"),
       d: () => this.switchDepth(),
     });
     this.play(false);
+  }
+
+  get view() {
+    return this.views.name;
+  }
+
+  look(view) {
+    this.views.look(view);
   }
 
   play(playing) {
     if (playing && this.time >= this.duration) this.seek(0);
     this.playing = playing;
     this.playButton.textContent = playing ? "❚❚" : "▶";
-  }
-
-  look(view) {
-    this.view = view;
-    ["overview", "chase", "onboard"].forEach((name, k) =>
-      this.viewButtons[k].classList.toggle("chosen", name === view));
-    this.viewer.controls.enabled = view === "overview";
-    if (view === "overview" && this.orbit) {
-      this.viewer.camera.position.copy(this.orbit);
-    } else if (view !== "overview") {
-      this.orbit ??= this.viewer.camera.position.clone();
-    }
-    this.viewer.camera.fov = view === "onboard" ? this.fov_y : 75;
-    this.splats.cut = view === "overview" ? this.cut : Infinity;
-    this.hideOwn();
-    this.seek(this.time ?? 0);
   }
 
   setCut(height) {
@@ -127,6 +130,7 @@ class Replay {
   }
 
   seek(time) {
+    if (this.playing && this.looping && time >= this.duration) time = 0;
     this.time = Math.min(Math.max(time, 0), this.duration);
     if (this.time >= this.duration && this.playing) this.play(false);
     this.slider.value = this.time;
@@ -134,7 +138,7 @@ class Replay {
     for (const flight of this.flights) flight.show(this.time, this);
     this.spheres?.show(this.time);
     this.drawPicture();
-    this.drawPlot();
+    for (const plot of this.plots) plot.draw();
     this.viewer.set_dirty();
   }
 
@@ -150,35 +154,29 @@ class Replay {
     }
   }
 
-  // The view's pose in W, z backwards; null where Meshcat's own controls decide.
-  cameraPose() {
-    const THREE = MeshCat.THREE, flight = this.chosen;
-    if (this.view === "overview") return null;
-    if (this.view === "onboard") {
-      return flight.pose(this.time).multiply(this.X_BC)
-        .multiply(new THREE.Matrix4().makeScale(1, -1, -1));
-    }
-    // It follows the vehicle along its own path, a second behind, so that no obstacle is between.
-    const p = flight.position(this.time), eye = flight.position(this.time - 1.0);
+  onboardPose() {
+    return this.chosen.pose(this.time).multiply(this.X_BC)
+      .multiply(new MeshCat.THREE.Matrix4().makeScale(1, -1, -1));
+  }
+
+  // It follows the vehicle along its own path, 2 m behind, so that no obstacle is between.
+  chasePose() {
+    const THREE = MeshCat.THREE, flight = this.chosen, {i, j, s} = flight.at(this.time);
+    const flown = lerp(flight.lengths[i], flight.lengths[j], s);
+    const p = flight.position(this.time), eye = flight.positionAt(flown - 2);
     const ahead = flight.position(this.time + 0.5).sub(eye).setZ(0);
     if (ahead.lengthSq() < 1e-6) {
       ahead.set(1, 0, 0).applyMatrix4(new THREE.Matrix4().extractRotation(flight.pose(this.time)));
     }
-    const distance = p.clone().sub(eye).length();
-    eye.addScaledVector(ahead.setZ(0).normalize(), -Math.max(2 - distance, 0));
+    eye.addScaledVector(ahead.setZ(0).normalize(), -Math.max(0.8 - flown, 0));
     eye.z += 0.5;
-    const pose = new THREE.Matrix4().lookAt(eye, p, new THREE.Vector3(0, 0, 1));
-    return pose.setPosition(eye);
-  }
-
-  placeCamera() {
-    const pose = this.cameraPose();
-    if (pose) placeCamera(this.viewer, pose);
+    return lookAt(eye, p);
   }
 
   drawPicture() {
     const frames = this.chosen.frames, canvas = this.picture;
     this.picture.hidden = this.depthButton.hidden = !frames;
+    this.scale.hidden = !frames || !this.depth;
     if (!frames) return;
     const row = this.depth ? frames.depth : frames.color;
     const index = Math.min(Math.floor(this.time / frames.period + 1e-6), row.length - 1);
@@ -194,46 +192,5 @@ class Replay {
     if (!image.complete || !image.naturalWidth) return;
     canvas.height = Math.round(canvas.width * image.naturalHeight / image.naturalWidth);
     canvas.getContext("2d").drawImage(image, 0, 0, canvas.width, canvas.height);
-  }
-
-  drawPlot() {
-    const canvas = this.plot, context = canvas.getContext("2d"), flight = this.chosen;
-    const {width, height} = canvas;
-    const known = (name) => flight[name].filter((value) => value !== null);
-    const top = Math.max(1, ...known("speeds"), ...known("clearances"));
-    const bottom = Math.min(0, ...known("clearances"));
-    const x = (time) => time / this.duration * width;
-    const y = (value) => 10 + (top - value) / (top - bottom) * (height - 40);
-    context.fillStyle = "#15171b";
-    context.fillRect(0, 0, width, height);
-    context.font = "22px system-ui, sans-serif";
-    context.fillStyle = context.strokeStyle = "#888";
-    context.lineWidth = 1;
-    for (let value = Math.ceil(bottom); value <= top; ++value) {
-      context.beginPath();
-      context.moveTo(0, y(value));
-      context.lineTo(width, y(value));
-      context.stroke();
-      context.fillText(`${value}`, 2, y(value) - 3);
-    }
-    context.fillStyle = "rgba(255, 32, 32, 0.3)";
-    context.fillRect(0, y(this.margin), width, y(bottom) - y(this.margin));
-    for (const [name, color] of [["speeds", "#6fb7ff"], ["clearances", "#ffc04d"]]) {
-      context.strokeStyle = color;
-      context.lineWidth = 3;
-      context.beginPath();
-      flight.times.forEach((time, i) => {
-        if (flight[name][i] !== null) context.lineTo(x(time), y(flight[name][i]));
-      });
-      context.stroke();
-    }
-    context.fillStyle = "#fff";
-    context.fillRect(x(this.time) - 1, 0, 3, height - 28);
-    const tell = (name, unit) => {
-      const value = flight.value(name, this.time);
-      return value === null ? "–" : `${value.toFixed(2)} ${unit}`;
-    };
-    context.fillText(
-      `${tell("speeds", "m/s")}   clearance ${tell("clearances", "m")}`, 30, height - 6);
   }
 }

@@ -57,6 +57,14 @@ class ReplayFlight {
     return this.points[i].clone().lerp(this.points[j], s);
   }
 
+  // The position after a length [m] of the path.
+  positionAt(length) {
+    const after = this.lengths.findIndex((l) => l >= length), i = Math.max(after - 1, 0);
+    const span = this.lengths[after] - this.lengths[i];
+    const s = span > 0 ? Math.max((length - this.lengths[i]) / span, 0) : 0;
+    return this.points[i].clone().lerp(this.points[after], s);
+  }
+
   pose(time) {
     const THREE = MeshCat.THREE, {i, j, s} = this.at(time);
     return new THREE.Matrix4().compose(

@@ -21,6 +21,7 @@ class SceneView {
       viewer.scene.add(this.slice.mesh);
     }
     viewer.camera.far = 1000;
+    viewer.controls.maxPolarAngle = 0.5 * Math.PI;  // above ground
     this.switches = {};
     this.build();
     this.setHeight(data.height);
@@ -50,8 +51,7 @@ class SceneView {
 
   build() {
     const {data} = this;
-    const panel = addElement(document.body, "div", {id: "view-panel", className: "panel"});
-    addElement(panel, "b", {textContent: data.name});
+    const panel = addPanel("view-panel", data.name);
     addElement(panel, "div", {textContent: data.size, id: "view-size"});
     for (const note of data.notes) addElement(panel, "div", {className: "part", textContent: note});
     const legend = addElement(panel, "div", {className: "legend"});
@@ -61,8 +61,8 @@ class SceneView {
     }
     if (this.slice) {
       addElement(panel, "div", {className: "part", textContent: "distance to the nearest surface:"});
-      const canvas = addElement(panel, "canvas", {width: 648, height: 56, id: "view-legend"});
-      this.slice.drawLegend(canvas, data.unit);
+      const {colors, texts} = this.slice.legend(data.unit);
+      addScale(panel, "view-legend", colors, texts);
     }
     if (this.cameras) {
       const row = addElement(panel, "div", {className: "part"});
@@ -82,18 +82,10 @@ class SceneView {
     this.result = addElement(panel, "div", {className: "part", id: "view-result"});
 
     const bar = addElement(document.body, "div", {id: "view-bar", className: "bar"});
-    const keys = {1: () => this.look()};
-    addElement(bar, "button", {textContent: "from above (1)", onclick: keys[1]});
-    const toggle = (key, name, text, start, change) => {
-      const button = addElement(bar, "button", {textContent: `${text} (${key})`, id: `view-${name}`});
-      this.switches[name] = (on) => {
-        button.classList.toggle("chosen", on);
-        change(on);
-        this.viewer.set_dirty();
-      };
-      button.onclick = keys[key] = () =>
-        this.switches[name](!button.classList.contains("chosen"));
-      this.switches[name](start);
+    addElement(bar, "button", {textContent: "from above (1)", onclick: () => this.look()});
+    bindKeys({1: () => this.look()});
+    const toggle = (key, name, ...rest) => {
+      this.switches[name] = addSwitch(bar, key, `view-${name}`, ...rest);
     };
     toggle("r", "ruler", "ruler", false, (on) => this.rule(on));
     if (this.slice) {
@@ -102,14 +94,11 @@ class SceneView {
     toggle("b", "beyond", "beyond bounds", data.beyond, (on) => this.splats.bound(
       on ? [-1e9, -1e9, -1e9] : data.lower, on ? [1e9, 1e9] : data.upper));
     if (data.unknown > 0) {
-      toggle("u", "unknown", "never seen", false, (on) => {
-        this.splats.shown = this.splats.count - (on ? 0 : data.unknown);
-      });
+      this.switches.unknown = addNeverSeen(bar, "view-unknown", this.splats, data.unknown);
     }
     this.slider = addHeightSlider(
       bar, "view-height", data.lower[2], data.upper[2], (z) => this.setHeight(z));
     this.heightText = addElement(bar, "span");
-    bindKeys(keys);
   }
 
   setHeight(z) {
@@ -192,10 +181,9 @@ class SceneView {
       ...[0, 1, 2].map((axis) => (k >> axis & 1 ? upper : lower)[axis])));
     const left = 2 * panel / width - 0.97;
     const fits = (p) => p.x > left && p.x < 0.97 && p.y > -0.8 && p.y < 0.95 && p.z < 1;
-    const up = new THREE.Vector3(0, 0, 1);
     for (let distance = 0.5 * target.distanceTo(corners[0]); ; distance *= 1.05) {
       const eye = target.clone().addScaledVector(toward, distance);
-      placeCamera(this.viewer, new THREE.Matrix4().lookAt(eye, target, up).setPosition(eye));
+      placeCamera(this.viewer, lookAt(eye, target));
       camera.updateMatrixWorld();
       if (corners.every((p) => fits(scene.localToWorld(p.clone()).project(camera)))) break;
     }

@@ -15,7 +15,10 @@ def test_replay_equals_the_record_and_says_so(study, tmp_path, capsys):
     copy = tmp_path / "elsewhere"
     shutil.copytree(whole, copy)
     spec = config.rollouts()[1]
-    assert main(["replay", str(copy), spec.id, "--meshcat", "--video"]) == 0
+    record = tmp_path / "flight.rrd"
+    words = ["--meshcat", "--video", "--rerun", str(record)]
+    assert main(["replay", str(copy), spec.id, *words]) == 0
+    assert record.stat().st_size > 1e5
     assert "is bitwise identical to the recorded flight" in capsys.readouterr().out
     assert (copy / "replays" / spec.id / "flight.html").stat().st_size > 1e5
     assert (copy / "replays" / spec.id / "flight.mp4").stat().st_size > 1e3

@@ -55,6 +55,8 @@ def test_study_has_all_flights_tables_and_a_report(study, rows_of):
     assert page.count("data:image/png;base64,") == 2
     assert "http" not in page.replace("http-equiv", "")
     assert all(f"splatpilot replay . {row['id']} --meshcat" in page for row in rows)
+    assert all(f'href="replays/{row["id"]}/flight.html"' in page for row in rows)
+    assert 'name="viewport"' in page and "color-scheme: light dark" in page
     assert not list(out.rglob(".*"))
 
 

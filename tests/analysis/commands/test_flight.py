@@ -12,6 +12,7 @@ from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.systems.common.config import load_config
 from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.policies.straight import Straight, StraightConfig
+from splatpilot.systems.visualization.live import LiveControls
 
 SMALL = ["--set", "world.length=10", "--set", "world.width=6"]
 SHORT = [*SMALL, "--set", "timeout=0.5", "--no-video"]
@@ -43,6 +44,34 @@ def test_fly_writes_page_video_trajectory_and_summary(tmp_path, capsys):
     assert "<html" in (out / "flight.html").read_text().lower()
     assert "digraph" in graph.read_text()
     assert not list(out.glob(".*"))
+
+
+def test_live_flight_starts_with_its_viewer_and_is_recorded_for_rerun(
+    tmp_path, monkeypatch, capsys
+):
+    viewers = []
+    monkeypatch.setattr(LiveControls, "wait_for_viewer", lambda self: viewers.append(self))
+    out, record = tmp_path / "flight", tmp_path / "flight.rrd"
+    words = ["--live", "--draw", "thrust,axes", "--rerun", str(record), *SHORT]
+    assert main(["fly", "--out", str(out), *words]) == 0
+    assert len(viewers) == 1
+    assert "The flight starts when you open" in capsys.readouterr().out
+    assert "window.live" in (out / "live.html").read_text()
+    assert record.stat().st_size > 1e5 and not list(tmp_path.glob(".*"))
+    assert main(["fly", "--out", str(tmp_path / "b"), "--rerun", str(record), *SHORT]) == 1
+    assert f"{record} is there already" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("--policy teleop", "--policy teleop must be flown with --live"),
+        ("--draw axes", "--draw must be left out without --live, got axes"),
+    ],
+)
+def test_what_needs_a_viewer_is_refused_without_one(words, message, tmp_path, capsys):
+    assert main(["fly", "--out", str(tmp_path / "a"), *words.split(), *SHORT]) == 1
+    assert message in capsys.readouterr().err
 
 
 def test_a_written_scenario_flies_the_same_flight(tmp_path):
@@ -87,7 +116,7 @@ def test_the_trajectory_is_written_before_the_page(tmp_path, monkeypatch):
     def fail(*arguments):
         raise OSError("the disk is full")
 
-    monkeypatch.setattr(fly, "write_flight_page", fail)
+    monkeypatch.setattr(fly, "flight_page", fail)
     assert main(["fly", "--policy", "straight", "--out", str(tmp_path / "f"), *SHORT]) == 1
     assert {"trajectory.npz", "scenario.yaml"} <= {p.name for p in (tmp_path / "f").iterdir()}
 

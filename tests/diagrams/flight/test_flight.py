@@ -3,6 +3,7 @@
 import dataclasses
 import gc
 import hashlib
+import re
 import subprocess
 import sys
 import weakref
@@ -10,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from pydrake.systems.framework import LeafSystem
+from pydrake.systems.framework import EventStatus, LeafSystem
 
 from splatpilot.diagrams.flight.flight import (
     FlightError,
@@ -19,6 +20,7 @@ from splatpilot.diagrams.flight.flight import (
     sample_initial_state,
 )
 from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
+from splatpilot.diagrams.flight.fly import flight_page
 from splatpilot.diagrams.flight.monitor import flight_outcome
 from splatpilot.diagrams.flight.policies import policy_named
 from splatpilot.diagrams.flight.scenario import Scenario
@@ -27,6 +29,7 @@ from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.policies.hypotheses import Hypotheses
 from splatpilot.systems.sensing.noise import ObservationNoise
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS, hover_state
+from splatpilot.systems.visualization.live import RESTART
 
 
 def test_flies_round_the_post_to_the_goal(post_world):
@@ -50,6 +53,31 @@ def test_flies_round_the_post_to_the_goal(post_world):
         summary["path_length_m"] / summary["flight_time_s"]
     )
     assert summary["real_time_factor"] == pytest.approx(flight.times[-1] / flight.wall_time)
+
+
+def test_monitor_restarts_a_flight(post_world):
+    diagram = BuildFlightDiagram(Scenario(timeout=1.0), post_world, camera=False)
+    times = []
+
+    def restart_once(context):
+        times.append(context.get_time())
+        again = times.count(0.0) == 1 and times[-1] > 0.2
+        return EventStatus.ReachedTermination(diagram, RESTART) if again else None
+
+    flight = fly(diagram, monitor=restart_once)
+    assert times.count(0.0) == 2
+    assert flight.outcome == Outcome.TIMEOUT and flight.times[0] == 0.0
+    assert (np.diff(flight.times) > 0).all()
+
+
+def test_flight_and_world_are_short_in_notebooks(post_world):
+    scenario = Scenario(timeout=0.5)
+    flight = fly(BuildFlightDiagram(scenario, post_world, camera=False))
+    assert re.fullmatch(r"Flight\(timeout after 0.50 s, min. clearance \+\d.\d\d m\)", repr(flight))
+    assert "<td>outcome</td><td>timeout</td>" in flight._repr_html_()
+    assert len(repr(post_world)) < 80
+    shown = flight_page(scenario, post_world, [flight])._repr_html_()
+    assert shown.startswith("<iframe srcdoc=") and "&lt;title&gt;" in shown
 
 
 def test_plans_are_recorded_as_flown(post_world):

@@ -2,11 +2,13 @@
 
 import dataclasses
 
+import msgpack
 import numpy as np
 import pytest
 from gymnasium.spaces import Box
 from pydrake.common.schema import Rotation, Transform
 from pydrake.common.value import Value
+from pydrake.geometry import Meshcat
 from pydrake.gym import DrakeGymEnv
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantVectorSource
@@ -33,6 +35,7 @@ from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.sensing.range_finder import RangeFinder
 from splatpilot.systems.vehicle.flatness import FlatnessController
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS, QuadrotorPlant
+from splatpilot.systems.visualization.live import LiveControls
 
 
 def flown(scenario: Scenario, world, **systems):
@@ -458,3 +461,47 @@ def test_output_delay_delays_the_camera(post_world):
 def test_delays_that_a_camera_cannot_have_are_refused(name):
     with pytest.raises(ValueError, match=rf"camera\.{name.partition('=')[0]} must be"):
         load_config(Scenario(), overrides=[f"camera.{name}"]).validate()
+
+
+def test_meshcat_draws_on_request_and_gives_controls_of_teleop(post_world):
+    scenario = Scenario(timeout=1.0)
+    scenario.camera.width, scenario.camera.height = 32, 24
+    meshcat = Meshcat()
+    draw = ["axes", "thrust", "waypoint", "nearest", "barrier", "depth", "limits"]
+    diagram = BuildFlightDiagram(scenario, post_world, meshcat, draw=draw)
+    diagram.ForcedPublish(diagram.CreateDefaultContext())
+    for name in ("thrust", "waypoint", "nearest", "barrier", "limits", "vehicle/camera/depth"):
+        assert meshcat.HasPath(f"/splatpilot/{name}"), name
+    with pytest.raises(ValueError, match="draw must be without frustum"):
+        BuildFlightDiagram(scenario, post_world, meshcat, draw=["frustum"])
+    scenario.policy = policy_named("reactive")
+    BuildFlightDiagram(scenario, post_world, meshcat, draw=["frustum"])
+    assert meshcat.HasPath("/splatpilot/vehicle/policy_camera/frustum")
+    scenario.policy = policy_named("teleop")
+    diagram = BuildFlightDiagram(scenario, post_world, meshcat)
+    meshcat.SetSliderValue("up (arrows)", 2.0)
+    flight = fly(diagram)
+    assert flight.states[-1, 2] > flight.states[0, 2] + 0.5
+    assert np.ptp(flight.states[:, :2], axis=0).max() < 0.1
+
+
+def test_live_controls_drag_the_goal_and_push_the_vehicle_of_a_flight(post_world, monkeypatch):
+    monkeypatch.setattr(LiveControls, "wait_for_viewer", lambda self: None)
+    meshcat = Meshcat()
+    scenario = Scenario(timeout=0.5, policy=policy_named("teleop"))
+    flown = {}
+    for name in ("", "goal", "plant"):
+        diagram = BuildFlightDiagram(scenario, post_world, camera=False)
+        controls = LiveControls(meshcat, diagram)
+        meshcat.SetSliderValue("real-time rate", 0.0)
+        start = post_world.p_WG if name == "goal" else post_world.p_WS
+        ends = (start, np.add(start, [0.0, 0.0, 0.4])) if name else ([], [])
+        drag = {"type": "mouse_drag", "name": name and f"/drake/illustration/{name}/{name}"}
+        drag |= {"drag_anchor": [*map(float, ends[0])], "drag_target": [*map(float, ends[1])]}
+        meshcat._InjectWebsocketMessage(msgpack.packb(drag))
+        flown[name] = fly(diagram, monitor=controls).states[-1, :3]
+        goal = msgpack.unpackb(meshcat._GetPackedTransform("/splatpilot/goal"))["matrix"][12:15]
+        raised = 0.4 if name == "goal" else 0.0
+        np.testing.assert_allclose(goal, np.add(post_world.p_WG, [0, 0, raised]), atol=1e-6)
+    np.testing.assert_allclose(flown["goal"], flown[""], atol=1e-9)
+    assert flown["plant"][2] > flown[""][2] + 0.05

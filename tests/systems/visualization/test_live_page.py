@@ -9,8 +9,12 @@ from pydrake.math import RigidTransform
 
 from splatpilot.systems.splats.background import EnvironmentMap
 from splatpilot.systems.splats.scene import GaussianScene
-from splatpilot.systems.visualization.meshcat_drawing import draw_gaussians, picture_gltf
-from splatpilot.systems.visualization.pages import live_page
+from splatpilot.systems.visualization.meshcat_drawing import (
+    draw_gaussians,
+    picture_gltf,
+    send_picture,
+)
+from splatpilot.systems.visualization.pages import ReplayView, live_page
 
 SKY = EnvironmentMap(np.full((4, 8, 3), [0.2, 0.9, 0.9], np.float32))
 
@@ -23,11 +27,12 @@ def test_page_follows_meshcat(open_in_browser):
     red = GaussianScene.from_colors(
         [[0.0, 0.0, 0.0]], [[1.0, 0, 0, 0]], [[0.6] * 3], [0.99], [[0.9, 0.0, 0.0]]
     )
-    html = live_page(meshcat, red, SKY, (-2.0, 2.0), cut=1.0)
+    view = ReplayView("forest", RigidTransform(), fov_y=1.0, radius=0.3, lower=-2.0, upper=2.0)
+    html = live_page(meshcat, red, SKY, view, cut=1.0)
     # Nearer than the Gaussian, to be seen if they were drawn.
     green = dataclasses.replace(red, sh=red.sh[:, :, [1, 0, 2]], means=red.means - [1.0, 0, 0])
     draw_gaussians(meshcat, "/splatpilot/scene", green, np.full(3, -5.0), np.full(3, 5.0))
-    page = open_in_browser(html, 320, 240, "window.live && live.settled", "#none")
+    page = open_in_browser(html, 320, 240, "window.live && live.settled", ".panel, .bar")
 
     def middle() -> list[int]:
         return page.picture()[120, 160].tolist()
@@ -50,13 +55,23 @@ def test_page_follows_meshcat(open_in_browser):
     page.tab.wait_for_function("viewer.scene_tree.find(['box']).object.position.x === 3")
     assert middle()[2] > 180
     assert page.picture()[120, 10].tolist() == [230, 230, 51]
-    picture = MemoryFile(
-        picture_gltf(np.zeros((4, 4, 3), np.uint8), np.eye(4, 3)), ".gltf", "picture"
-    )
-    meshcat.SetObject("/picture", Mesh(InMemoryMesh(mesh_file=picture)))
+    gltf = MemoryFile(picture_gltf(np.zeros((4, 4, 3), np.uint8), np.eye(4, 3)), ".gltf", "picture")
+    meshcat.SetObject("/picture", Mesh(InMemoryMesh(mesh_file=gltf)))
     page.tab.evaluate(
         "() => { const s = document.getElementById('live-cut'); s.value = -0.1;"
         " s.dispatchEvent(new Event('input')); }"
     )
     assert middle()[2] < 20  # The box behind it.
+    meshcat.SetTransform("/splatpilot/vehicle", RigidTransform([0, 3, 0]))
+    meshcat.SetTransform("/splatpilot/vehicle/camera", RigidTransform([0.1, 0, 0]))
+    picture = np.full((30, 40, 3), 200, np.uint8)
+    send_picture(meshcat, "/splatpilot/vehicle/camera", picture)
+    page.tab.wait_for_function("document.getElementById('live-picture').naturalWidth === 40")
+    page.tab.keyboard.press("3")
+    page.settle()
+    eye = page.tab.evaluate(
+        """() => viewer.scene.worldToLocal(new MeshCat.THREE.Vector3()
+          .setFromMatrixPosition(viewer.camera.matrixWorld)).toArray()"""
+    )
+    np.testing.assert_allclose(eye, [0.1, 3, 0], atol=1e-5)
     assert page.errors == []

@@ -12,7 +12,11 @@ from pydrake.geometry import Meshcat
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
-from pydrake.systems.primitives import ConstantVectorSource, TrajectorySource
+from pydrake.systems.primitives import (
+    ConstantValueSource,
+    ConstantVectorSource,
+    TrajectorySource,
+)
 from pydrake.systems.sensors import CameraInfo, ImageRgba8U
 from pydrake.trajectories import PiecewisePolynomial
 
@@ -20,18 +24,24 @@ from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.shapes import AnalyticDistanceField, MovingSpheres, Sphere
 from splatpilot.systems.policies.hypotheses import Hypotheses
 from splatpilot.systems.splats.scene import GaussianScene
+from splatpilot.systems.splats.splat_camera import SplatCamera
 from splatpilot.systems.vehicle.quadrotor import hover_state
+from splatpilot.systems.vehicle.state import StateToPose
+from splatpilot.systems.visualization.flight_visualizer import (
+    DRAWINGS,
+    FlightVisualizer,
+    fan_mesh,
+)
 from splatpilot.systems.visualization.meshcat_drawing import (
     CameraVisualizer,
-    FlightVisualizer,
     MovingSpheresVisualizer,
     draw_distance_slice,
     draw_gaussians,
     draw_goal,
     draw_vehicle,
-    fan_mesh,
     picture_gltf,
 )
+from splatpilot.systems.visualization.video import VideoRecorder
 
 
 @pytest.fixture(scope="module")
@@ -63,6 +73,99 @@ def test_flight_is_drawn_with_its_trail_and_plan(meshcat):
     np.testing.assert_allclose(trail, [[1 + 0.2 * k, 0, 2] for k in range(4)], atol=1e-6)
     fan = vertices(drawn(meshcat, "/splatpilot/hypotheses"), "position")
     assert len(fan) == 3 * 11 * 2
+
+
+def position(meshcat, path: str) -> list[float]:
+    """The position of a path in its parent [m]."""
+    return msgpack.unpackb(meshcat._GetPackedTransform(path))["matrix"][12:15]
+
+
+def test_forced_publish_draws_vehicle_camera_and_spheres(meshcat):
+    builder = DiagramBuilder()
+    state = builder.AddSystem(ConstantVectorSource(hover_state([1, 2, 3])))
+    image = builder.AddSystem(ConstantValueSource(Value(ImageRgba8U(32, 24))))
+    FlightVisualizer.AddToBuilder(builder, state.get_output_port(), meshcat)
+    camera = builder.AddSystem(
+        CameraVisualizer(meshcat, CameraInfo(32, 24, 1.0), RigidTransform(), stride=3)
+    )
+    builder.Connect(image.get_output_port(), camera.get_input_port())
+    spheres = MovingSpheres([0.5], [np.array([[float(k), 0, 1] for k in range(20)])], 0.1)
+    MovingSpheresVisualizer.AddToBuilder(builder, spheres, meshcat)
+    diagram = builder.Build()
+    context = diagram.CreateDefaultContext()
+    context.SetTime(16 / 15)  # not a multiple of the stride
+    diagram.ForcedPublish(context)
+    vehicle = f"/splatpilot/{state.get_name()}/vehicle"
+    assert position(meshcat, vehicle) == [1, 2, 3]
+    assert meshcat.HasPath("/splatpilot/vehicle/camera/picture")
+    assert position(meshcat, "/splatpilot/spheres/0") == [10, 0, 1]
+
+
+def test_visualizers_of_two_vehicles_share_a_diagram(meshcat):
+    builder = DiagramBuilder()
+    scene = GaussianScene.from_colors(
+        [[3.0, 0, 1]], [[1.0, 0, 0, 0]], [[0.3] * 3], [0.9], [[1] * 3]
+    )
+    for k, prefix in enumerate(("", "b_")):
+        plant = builder.AddNamedSystem(
+            f"{prefix}plant", ConstantVectorSource(hover_state([k, 0, 1]))
+        )
+        pose = builder.AddSystem(StateToPose())
+        camera = SplatCamera(scene, CameraInfo(32, 24, 1.0), RigidTransform())
+        builder.AddNamedSystem(f"{prefix}camera", camera)
+        builder.Connect(plant.get_output_port(), pose.get_input_port())
+        builder.Connect(pose.get_output_port(), camera.GetInputPort("body_pose"))
+        FlightVisualizer.AddToBuilder(builder, plant.get_output_port(), meshcat)
+        CameraVisualizer.AddToBuilder(builder, camera, meshcat, depth=True)
+        VideoRecorder.AddToBuilder(builder, camera, 15.0)
+    diagram = builder.Build()
+    assert diagram.HasSubsystemNamed("b_flight_visualizer") and diagram.HasSubsystemNamed("video")
+    diagram.ForcedPublish(diagram.CreateDefaultContext())
+    assert position(meshcat, "/splatpilot/vehicle") == [0, 0, 1]
+    assert position(meshcat, "/splatpilot/b/vehicle") == [1, 0, 1]
+    for name in ("picture", "frustum", "depth"):
+        assert meshcat.HasPath(f"/splatpilot/b/vehicle/camera/{name}")
+
+
+def test_arrows_are_drawn_on_request(meshcat):
+    values = {
+        "command": [9.81, 0.2, 0, 0],
+        "waypoint": [2.0, 0, 1],
+        "distance": [2.0],
+        "gradient": [0, 1.0, 0],
+        "barrier": [0.5],
+    }
+    builder = DiagramBuilder()
+    ports = {
+        name: builder.AddSystem(ConstantVectorSource(value)).get_output_port()
+        for name, value in values.items()
+    }
+    x = hover_state([1, 0, 1])
+    x[3:6] = 2, 0, 0
+    plant = builder.AddNamedSystem("plant", ConstantVectorSource(x))
+    draw = [*DRAWINGS, "axes"]
+    FlightVisualizer.AddToBuilder(
+        builder, plant.get_output_port(), meshcat, draw=draw, sources=ports
+    )
+    diagram = builder.Build()
+    diagram.ForcedPublish(diagram.CreateDefaultContext())
+    for name, tip in {
+        "velocity": [2, 0, 1],
+        "thrust": [1, 0, 1.981],
+        "rates": [1.1, 0, 1],
+        "waypoint": [2, 0, 1],
+        "nearest": [1, -2, 1],
+        "barrier": [1, 0.5, 1],
+    }.items():
+        drawing = vertices(drawn(meshcat, f"/splatpilot/{name}"), "position")
+        np.testing.assert_allclose(drawing, [[1, 0, 1], tip], atol=1e-6)
+    assert meshcat.HasPath("/splatpilot/vehicle/axes/z")
+    with pytest.raises(ValueError, match=r"draw must be names of velocity, .*, got wings"):
+        FlightVisualizer(meshcat, draw=["wings"])
+    with pytest.raises(ValueError, match="sources must be with command"):
+        FlightVisualizer.AddToBuilder(
+            DiagramBuilder(), plant.get_output_port(), meshcat, draw=["thrust"]
+        )
 
 
 def test_fan_is_ribbons_along_the_plans_in_the_colors_of_their_costs():

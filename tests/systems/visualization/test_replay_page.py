@@ -1,6 +1,7 @@
 """Pages of flights, in a real browser where there is one."""
 
 import base64
+import dataclasses
 import gzip
 import re
 
@@ -29,7 +30,7 @@ from splatpilot.systems.visualization.pages import (
 WIDTH, HEIGHT, FOV_Y = 240, 180, 1.2
 # Optical axes (x right, y down, z forward) in a body with x forward, y left, z up.
 X_BC = RigidTransform(RotationMatrix(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])), [0.1, 0, 0])
-VIEW = ReplayView(X_BC, FOV_Y, radius=0.35, lower=0.0, upper=4.0)
+VIEW = ReplayView("forest, seed 3", X_BC, FOV_Y, radius=0.35, lower=0.0, upper=4.0)
 
 SETTLED = (
     "window.replay && replay.splats.settled"
@@ -70,7 +71,7 @@ def straight(name: str, outcome: str, y: float = 0.0, roll: float = 0.0) -> Repl
 def open_page(open_in_browser):
     """Opens a page of flights; its window is as large as the onboard camera's image."""
 
-    def opened(gaussians, flights, background=(0.2, 0.4, 0.6), spheres=None):
+    def opened(gaussians, flights, background=(0.2, 0.4, 0.6), spheres=None, view=VIEW):
         meshcat = Meshcat()
         meshcat.SetCameraPose([-2, 0, 4], [4, 0, 1.5])
         color = background if isinstance(background, tuple) else (0.0, 0.0, 0.0)
@@ -80,7 +81,7 @@ def open_page(open_in_browser):
             meshcat.SetProperty(path, "visible", False)
         for k in range(len(flights)):
             draw_vehicle(meshcat, f"/splatpilot/vehicles/{k}", 0.35)
-        html = replay_page(meshcat.StaticHtml(), gaussians, background, VIEW, flights, spheres)
+        html = replay_page(meshcat.StaticHtml(), gaussians, background, view, flights, spheres)
         return open_in_browser(html, WIDTH, HEIGHT, SETTLED, "#replay-panel, #replay-bar")
 
     return opened
@@ -184,6 +185,70 @@ def test_flights_are_told_apart_and_crashes_start_before_their_end(open_page):
     sphere = page.run("() => Array.from(replay.spheres.mesh.instanceMatrix.array)")
     assert sphere[0] == 0
     assert page.errors == []
+
+
+def test_playback_changes_its_speed_and_loops(open_page):
+    page = open_page(cloud(np.random.default_rng(1)), [straight("a", "goal")])
+    page.tab.select_option("#replay-speed", "4")
+    page.run("() => { replay.seek(0); replay.play(true); }")
+    page.tab.wait_for_function("!replay.playing")
+    assert page.run("() => replay.time") == 4.0
+    page.tab.keyboard.press("l")
+    # Beyond the end it starts again, and does not stop.
+    looped = "() => { replay.play(true); replay.seek(4.5); return [replay.time, replay.playing]; }"
+    assert page.tab.evaluate(looped) == [0, True]
+    page.run("() => replay.play(false)")
+    # The mouse does not lead below the ground.
+    assert page.run("() => viewer.controls.maxPolarAngle") == pytest.approx(np.pi / 2)
+    assert page.errors == []
+
+
+def test_frontier_is_hidden_from_above_and_seen_on_board(open_page):
+    view = dataclasses.replace(VIEW, num_frontier=100)
+    page = open_page(cloud(np.random.default_rng(1)), [straight("a", "goal")], view=view)
+    shown = "() => replay.splats.mesh.material.uniforms.shown.value"
+    assert page.run(shown) == 300
+    page.tab.keyboard.press("u")
+    assert page.run(shown) == 400
+    page.run("() => replay.look('onboard')")
+    assert page.run(shown) == 400
+    page.tab.keyboard.press("1")
+    assert page.run(shown) == 300
+
+
+def test_curves_of_flights_lie_over_one_another_on_axes(open_page):
+    flights = [straight("a", "goal"), straight("b", "goal", y=1.0)]
+    flights[1].states[:, 3] = 0.75
+    page = open_page(cloud(np.random.default_rng(1)), flights)
+    assert page.run("() => Plot.ticks(-0.3, 4, 4)") == [0, 2, 4]
+    assert page.run("() => Plot.ticks(0, 1, 4)") == [0, 0.5, 1]
+    for flight, speed in zip((0, 1), (0.25, 0.75), strict=True):
+        pixel = page.run(
+            f"""() => {{
+              replay.seek(0);
+              const plot = replay.plots[0], context = plot.canvas.getContext("2d");
+              const [x, y] = [plot.x(3), plot.y({speed})].map(Math.round);
+              return Array.from(context.getImageData(x, y, 1, 1).data.slice(0, 3));
+            }}"""
+        )
+        color = page.run(f"() => replay.flights[{flight}].color")
+        drawn = "#" + "".join(f"{value:02x}" for value in pixel)
+        assert drawn == color
+
+
+def test_page_names_its_environment_and_fits_phones(open_page):
+    page = open_page(cloud(np.random.default_rng(1)), [straight("a", "goal")])
+    assert page.tab.title() == "forest, seed 3"
+    content = page.tab.get_attribute("meta[name=viewport]", "content")
+    assert content == "width=device-width, initial-scale=1"
+    # The window is narrow: the panel is closed at first.
+    page.tab.set_viewport_size({"width": 390, "height": 844})
+    assert "forest, seed 3" in page.tab.inner_text("#replay-panel")
+    assert not page.tab.is_visible("#replay-picture")
+    page.tab.click("#replay-panel header button")
+    assert page.tab.is_visible("#replay-picture") and not page.tab.is_visible("#replay-scale")
+    page.tab.keyboard.press("d")
+    assert "0.5 m" in page.tab.inner_text("#replay-scale")
 
 
 def test_page_holds_its_gaussians_and_is_the_same_every_time():
