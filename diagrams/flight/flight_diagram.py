@@ -335,7 +335,7 @@ def ExportFlight(builder: DiagramBuilder, parts: FlightParts) -> None:
     """Exports the ports of a flight as `BuildFlightDiagram` names them."""
     outputs = {"state": parts.state, "command": parts.command}
     outputs["outcome"] = parts.monitor.get_output_port()
-    for name in ("clearance", "gradient", "in_collision", "field_state"):
+    for name in ("clearance", "barrier", "gradient", "in_collision", "field_state"):
         outputs[name] = parts.collision.GetOutputPort(name)
     if parts.decision.get_name() == "hypotheses":
         outputs["hypotheses"] = parts.decision
@@ -372,7 +372,8 @@ def BuildFlightDiagram(
 
         name: flight
         output_ports: [state, command, outcome, hypotheses, color_image, depth_image_32f,
-            depth_image_16u, clearance, gradient, in_collision, field_state, estimated_state]
+            depth_image_16u, clearance, barrier, gradient, in_collision, field_state,
+            estimated_state]
 
     The port `hypotheses` is of policies that have it, the images are of the scenario's camera. Each
     output `p` of a sensor `s` is `s_p`, and what the policy can observe as `p` is `observation_p`.

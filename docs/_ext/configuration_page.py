@@ -5,6 +5,7 @@ import typing
 from collections.abc import Iterator
 from typing import Any
 
+import numpy as np
 import yaml
 
 from splatpilot.analysis.faults import FaultsConfig
@@ -148,7 +149,7 @@ def _default(field: FieldDescription) -> str:
     if type(value).__module__.startswith("pydrake"):
         return _link(type(value)) if type(value).__name__.endswith("Config") else f"`{value}`"
     ours = zip(describe_fields(value), describe_fields(type(value)()), strict=True)
-    changed = [f"`{a.name}: {_yaml(a.value)}`" for a, b in ours if a.value != b.value]
+    changed = [f"`{a.name}: {_yaml(a.value)}`" for a, b in ours if _yaml(a.value) != _yaml(b.value)]
     return _link(type(value)) + (f" with {', '.join(changed)}" if changed else "")
 
 
@@ -161,4 +162,5 @@ def _yaml(value: Any) -> str:
         return str(value)
     if isinstance(value, dict):
         return "{" + ", ".join(f"{name}: {_yaml(held)}" for name, held in value.items()) + "}"
-    return yaml.safe_dump(value, default_flow_style=True, width=1000).split("\n")[0]
+    plain = value.tolist() if isinstance(value, np.ndarray) else value
+    return yaml.safe_dump(plain, default_flow_style=True, width=1000).split("\n")[0]
