@@ -147,14 +147,6 @@ class FlightError(ValueError):
         self.flight = flight
 
 
-class FlightInterrupted(KeyboardInterrupt):
-    """Ctrl-C during a flight; `flight` is the record until then."""
-
-    def __init__(self, flight: Flight) -> None:
-        super().__init__()
-        self.flight = flight
-
-
 def make_flight_simulator(diagram: Diagram, generator: RandomGenerator | None = None) -> Simulator:
     """Makes a simulator of a diagram with a `FlightMonitor`, as its scenario says.
 
@@ -194,7 +186,7 @@ def fly(
     Raises:
         ValueError: if the diagram has none or several monitors; see `fly_all`.
         FlightError: from any other exception after time 0.
-        FlightInterrupted: after Ctrl-C.
+        KeyboardInterrupt: after Ctrl-C, whose `flight` is the record until then.
     """
     count = len(_require_monitors(diagram))
     require(count == 1, "the number of flights in the diagram", "1", count, "call fly_all")
@@ -267,7 +259,8 @@ def fly_all(
         record(Outcome.INTERRUPTED)
     except KeyboardInterrupt as error:
         record(Outcome.INTERRUPTED)
-        raise FlightInterrupted(_first(flights, Outcome.INTERRUPTED)) from error
+        vars(error)["flight"] = _first(flights, Outcome.INTERRUPTED)
+        raise
     except Exception as error:
         if root.get_time() == 0.0 or isinstance(error, MemoryError):
             raise

@@ -17,7 +17,6 @@ from splatpilot.diagrams.flight.flight import (
     FLIGHT_FILES,
     Flight,
     FlightError,
-    FlightInterrupted,
     fly,
     sample_initial_state,
     write_flight,
@@ -211,8 +210,10 @@ def _fly_and_write(
         flight = fly_with_bar(diagram, monitor)
     except FlightError as error:
         flight, failure = error.flight, error
-    except FlightInterrupted as error:
-        flight, interruption = error.flight, error.__cause__
+    except KeyboardInterrupt as error:
+        if "flight" not in vars(error):
+            raise
+        flight, interruption = vars(error)["flight"], error
     for name in ("flight.html", "flight.mp4", _TRACEBACK, *FLIGHT_FILES):
         (out / name).unlink(missing_ok=True)
     write_flight(out, scenario, flight)

@@ -204,7 +204,7 @@ class FragileTrainer(TinyTrainer):
 
 def test_training_seeds_are_not_those_of_the_benchmark(monkeypatch):
     asked: list[int] = []
-    monkeypatch.setattr(training_worlds, "scenario_world", str)
+    monkeypatch.setattr(training_worlds.library, "scenario_world", str)
     monkeypatch.setattr(WorldCache, "world", lambda self, config, seed: asked.append(seed))
     monkeypatch.setattr(training_worlds, "WorldBatch", lambda *_: None)
     selection = training_worlds.WorldSelection(count=1000, held_out=1000)
