@@ -34,6 +34,7 @@ from splatpilot.systems.vehicle.state import QuadrotorState
 LOG_PERIOD = 0.02  # [s]
 _TOUCH = 0.03  # [m] max clearance of a landed vehicle, and
 _TOUCHDOWN_SPEED = 0.8  # [m/s] its max speed.
+_KNOWN = FieldState.UNKNOWN - 0.5  # Field states in the known volume are below.
 
 
 class Outcome(enum.StrEnum):
@@ -64,7 +65,7 @@ def _margins(
     """Returns what is left until each outcome; NaN is no margin."""
     return {
         Outcome.COLLISION: clearance,
-        Outcome.LEFT_VOLUME: FieldState.UNKNOWN - 0.5 - field_state,
+        Outcome.LEFT_VOLUME: _KNOWN - field_state,
         Outcome.GOAL: math.dist(p_WG, QuadrotorState.of(state).p_WB) - goal_radius,
     }
 
@@ -97,13 +98,14 @@ class FlightMonitor(LeafSystem):
         scenario = sample_scenario(scenario)
         scenario.validate()
         self.scenario, self.world = copy.deepcopy(scenario), world
-        for name, size in (("state", 13), ("goal", 3), ("clearance", 1), ("field_state", 1)):
-            self.DeclareVectorInputPort(name, size)
-        calc = weak_callback(self._calc_outcome)
-        self.DeclareAbstractOutputPort("outcome", lambda: Value(""), calc)
-        calc = weak_callback(self._calc_margins)
-        self._margins = self.DeclareCacheEntry(
-            "margins", ValueProducer(lambda: Value(object), calc), {self.all_input_ports_ticket()}
+        sizes = {"state": 13, "goal": 3, "clearance": 1, "field_state": 1}
+        self._ports = [self.DeclareVectorInputPort(*each) for each in sizes.items()]
+        self.DeclareAbstractOutputPort(
+            "outcome", lambda: Value(""), weak_callback(self._calc_outcome)
+        )
+        calc = weak_callback(self._calc_end)
+        self._end_index = self.DeclareCacheEntry(
+            "end", ValueProducer(lambda: Value(object), calc), {self.all_input_ports_ticket()}
         ).cache_index()
         self._witness = self.MakeWitnessFunction(
             "end",
@@ -117,24 +119,25 @@ class FlightMonitor(LeafSystem):
         # Drake cannot isolate the instant without an accuracy.
         return [] if context.get_accuracy() is None else [self._witness]
 
-    def _calc_margins(self, context: Context, margins: Any) -> None:
+    def _calc_end(self, context: Context, end: Any) -> None:
         state, p_WG, clearance, field_state = (
-            np.asarray(self.get_input_port(index).Eval(context)) for index in range(4)
+            np.asarray(port.Eval(context)) for port in self._ports
         )
         radius = self.scenario.goal_radius
-        margins.set_value(_margins(state, p_WG, clearance[0], field_state[0], radius))
+        margins = _margins(state, p_WG, clearance[0], field_state[0], radius)
+        end.set_value((min(m for m in margins.values() if m == m), _outcome(margins)))
+
+    def _eval_end(self, context: Context) -> tuple[float, Outcome | None]:
+        """Returns the least margin, and the outcome before the time is over."""
+        return cast(Any, self.get_cache_entry(self._end_index).Eval(context))
 
     def _least_margin(self, context: Context) -> float:
-        return min(m for m in self._eval_margins(context).values() if not math.isnan(m))
-
-    def _eval_margins(self, context: Context) -> dict[Outcome, float]:
-        return cast(dict[Outcome, float], self.get_cache_entry(self._margins).Eval(context))
+        return self._eval_end(context)[0]
 
     def outcome(self, context: Context) -> Outcome | None:
         """Returns the outcome at the instant of this system's Context; None during the flight."""
-        outcome = _outcome(self._eval_margins(context))
         is_late = context.get_time() >= self.scenario.timeout
-        return outcome or (Outcome.TIMEOUT if is_late else None)
+        return self._eval_end(context)[1] or (Outcome.TIMEOUT if is_late else None)
 
     def _calc_outcome(self, context: Context, output: Any) -> None:
         output.set_value(str(self.outcome(context) or ""))

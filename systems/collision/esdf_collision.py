@@ -17,7 +17,6 @@ from splatpilot.systems.collision.distance_field import (
     sample_field,
     soft_barrier,
 )
-from splatpilot.systems.common.drake import optional_value
 from splatpilot.systems.common.scalars import (
     ConfigParameter,
     parameter_setter,
@@ -131,8 +130,9 @@ def EsdfCollision_(T):
 
         def _sample(self, context: Any, sample: Any) -> None:
             state = np.asarray(self._state_port.Eval(context))
-            bodies = optional_value(self, "moving", context)
-            field = bodies.among(self._field, bodies.time) if bodies else self._field
+            moving, field = self.EvalAbstractInput(context, 1), self._field
+            if moving is not None and (bodies := moving.get_value()):
+                field = bodies.among(field, bodies.time)
             sample.set_value(sample_field(field, QuadrotorState.of(state).p_WB))
 
     return EsdfCollision

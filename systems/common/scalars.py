@@ -139,12 +139,15 @@ class ConfigParameter:
         self._config = config
         self.names = names or [field.name for field in fields(config)]  # pyright: ignore
         defaults = [getattr(config, name) for name in self.names]
+        self._defaults = defaults if scalar is float else None
         self._index = system.DeclareNumericParameter(BasicVector_[scalar](defaults))
 
     def config(self, context: Context) -> Any:
         """Returns the configuration with the numbers of a Context."""
+        numbers = context.get_numeric_parameter(self._index).value().tolist()
+        if numbers == self._defaults:
+            return self._config  # A copy costs as much as a control step.
         config = copy(self._config)
-        numbers = context.get_numeric_parameter(self._index).CopyToVector().tolist()
         vars(config).update(zip(self.names, numbers, strict=True))
         return config
 

@@ -279,8 +279,9 @@ def FlatnessController_(T):
         def _eval_finite(self, name, context):
             value = vector_input(self, name, context)
             numbers = float_values(value)
-            what = f"input '{name}' of '{self.get_name()}' at t = {context.get_time()} s"
-            require(np.isfinite(numbers).all(), what, "finite", numbers.tolist())
+            if not np.isfinite(numbers).all():
+                what = f"input '{name}' of '{self.get_name()}' at t = {context.get_time()} s"
+                require(False, what, "finite", numbers.tolist())
             return value
 
     return FlatnessController

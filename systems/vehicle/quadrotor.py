@@ -22,7 +22,6 @@ from pydrake.systems.framework import (
 
 from splatpilot.systems.common.scalars import (
     ConfigParameter,
-    float_values,
     parameter_setter,
     system_template,
 )
@@ -174,10 +173,8 @@ def QuadrotorPlant_(T):
             require_rotation(QuadrotorState.of(start).q_WB)
             self._arguments = replace(params), start
             self._parameters = [ConfigParameter(self, T, params)]
-            self._ports = [
+            for name, size in (("command", 4), ("wind", 3), ("disturbance", 3)):
                 self.DeclareVectorInputPort(name, size)
-                for name, size in (("command", 4), ("wind", 3), ("disturbance", 3))
-            ]
             index = self.DeclareContinuousState(BasicVector_[T](start))
             self.DeclareStateOutputPort("state", index)
 
@@ -192,12 +189,9 @@ def QuadrotorPlant_(T):
         def DoCalcTimeDerivatives(self, context, derivatives):
             # Lists, because arithmetic on Python floats is several times faster than on numpy's.
             state = context.get_continuous_state_vector().CopyToVector().tolist()
-            command, *optional = self._ports
-            wind, disturbance = [
-                self._read(port, context) if port.HasValue(context) else None for port in optional
-            ]
-            command = self._read(command, context)
-            drag, lag, gravity = context.get_numeric_parameter(0).CopyToVector().tolist()
+            command = self._read(0, context)
+            wind, disturbance = self._read(1, context), self._read(2, context)
+            drag, lag, gravity = context.get_numeric_parameter(0).value().tolist()
             try:
                 rates = component_derivatives(state, command, drag, lag, gravity, wind, disturbance)
             except ZeroDivisionError:
@@ -207,11 +201,15 @@ def QuadrotorPlant_(T):
                 ) from None
             derivatives.get_mutable_vector().SetFromVector(np.array(rates))
 
-        def _read(self, port, context):
-            value = port.Eval(context).tolist()
+        def _read(self, index, context):
+            vector = self.EvalVectorInput(context, index)
+            if vector is None:  # Drake raises for a command that is not connected.
+                return None if index > 0 else self.get_input_port(index).Eval(context)
+            value = vector.value().tolist()
+            total = sum(value)
             # Error control would shorten the steps without end.
-            if T is not Expression and not math.isfinite(float_values(sum(value))):
-                what = f"input '{port.get_name()}' of '{self.get_name()}'"
+            if T is not Expression and not total - total == 0.0:
+                what = f"input '{self.get_input_port(index).get_name()}' of '{self.get_name()}'"
                 require(False, f"{what} at t = {context.get_time()} s", "finite", value)
             return value
 
