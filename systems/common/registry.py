@@ -45,7 +45,11 @@ class Registry[Entry]:
         """Registers an entry. It replaces those of the same qualified name, as a cell of a notebook
         that runs again, or `importlib.reload`, defines them."""
         config = getattr(entry, "config", None)
-        again = [each for each in self._entries.values() if _qualified(each) == _qualified(entry)]
+        again = [
+            other
+            for known, other in self._entries.items()
+            if (known == name or config is not None) and _qualified(other) == _qualified(entry)
+        ]
         if name in self._entries and self._entries[name] not in [entry, *again]:
             raise ValueError(f"there is a {self.what} {name!r} already; choose another name")
         for other in self.configs():
