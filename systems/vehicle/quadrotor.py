@@ -20,6 +20,7 @@ from pydrake.systems.framework import (
     LeafSystem_,  # pyright: ignore[reportAttributeAccessIssue]
 )
 
+from splatpilot.systems.common.drake import require_finite
 from splatpilot.systems.common.scalars import (
     ConfigParameter,
     float_values,
@@ -211,8 +212,7 @@ def QuadrotorPlant_(T):
             value = port.Eval(context).tolist()
             # Error control would shorten the steps without end.
             if T is not Expression and not math.isfinite(float_values(sum(value))):
-                what = f"input '{port.get_name()}' of '{self.get_name()}'"
-                require(False, f"{what} at t = {context.get_time()} s", "finite", value)
+                require_finite(port, context, float_values(np.array(value)))
             return value
 
     return QuadrotorPlant
