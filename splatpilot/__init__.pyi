@@ -1,6 +1,7 @@
 from .analysis.benchmark.run_study import study
 from .diagrams.flight.flight import (
     Flight,
+    FlightError,
     fly,
     fly_all,
     make_flight_simulator,
@@ -24,13 +25,15 @@ from .diagrams.worlds.moving_spheres import MovingSphere
 from .diagrams.worlds.splat_world import AddSplatWorld
 from .diagrams.worlds.world import World
 from .diagrams.worlds.world_registry import make_world, register_world
+from .systems.collision.distance_field import FieldState
 from .systems.collision.esdf import Esdf
 from .systems.collision.esdf_collision import EsdfCollision, EsdfCollision_
 from .systems.collision.field_mesh import field_mesh, write_mesh
 from .systems.collision.optimization import AddBarrierCost, AddClearanceConstraint
 from .systems.common.config import dump_config, load_config
+from .systems.common.provenance import InfeasibleFlightError
 from .systems.common.validation import Config, bounded
-from .systems.policies.hypotheses import HypothesisSelector, HypothesisSelector_
+from .systems.policies.hypotheses import Hypotheses, HypothesisSelector, HypothesisSelector_
 from .systems.policies.planner import PrivilegedPlanner
 from .systems.policies.velocity import VelocityTracker, VelocityTracker_
 from .systems.sensing.imu import Imu
@@ -46,7 +49,12 @@ from .systems.splats.scene import GaussianScene
 from .systems.splats.splat_camera import SplatCamera
 from .systems.splats.splat_files import read_ply, write_ply
 from .systems.vehicle.flatness import FlatnessController, FlatnessController_
-from .systems.vehicle.quadrotor import QuadrotorParams, QuadrotorPlant, QuadrotorPlant_, hover_state
+from .systems.vehicle.quadrotor import (
+    QuadrotorParams,
+    QuadrotorPlant,
+    QuadrotorPlant_,
+    hover_state,
+)
 from .systems.vehicle.quadrotor_geometry import QuadrotorGeometry, quadrotor_gaussians
 from .systems.vehicle.state import QuadrotorState, StateToPose, StateToPose_
 from .systems.visualization.flight_visualizer import FlightVisualizer
@@ -75,16 +83,20 @@ __all__ = [
     "EsdfCollision",
     "EsdfCollision_",
     "ExportFlight",
+    "FieldState",
     "FlatnessController",
     "FlatnessController_",
     "Flight",
+    "FlightError",
     "FlightMonitor",
     "FlightParts",
     "FlightVisualizer",
     "GaussianScene",
+    "Hypotheses",
     "HypothesisSelector",
     "HypothesisSelector_",
     "Imu",
+    "InfeasibleFlightError",
     "LiveControls",
     "MakeCamera",
     "MovingBodies",

@@ -13,7 +13,7 @@ from splatpilot.diagrams.flight.sensors import SENSORS, SensorConfig, make_camer
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.esdf_collision import EsdfCollision
 from splatpilot.systems.common.drake import connect
-from splatpilot.systems.common.validation import require
+from splatpilot.systems.common.validation import require, require_type
 from splatpilot.systems.messaging.failsafe import FiniteVector
 from splatpilot.systems.policies.hypotheses import HypothesisSelector, num_hypotheses_in
 from splatpilot.systems.policies.velocity import VelocityTracker
@@ -54,7 +54,7 @@ def AddPoseAndCollision(
     pose, collision = StateToPose(), EsdfCollision(world.distance_field)
     for name, system in (("pose", pose), ("collision", collision)):
         builder.AddNamedSystem(name, system)
-        builder.Connect(state, system.GetInputPort("state"))
+        connect(builder, state, system.GetInputPort("state"))
     return pose.GetOutputPort("pose"), collision
 
 
@@ -114,6 +114,7 @@ _NO_COMMAND = "a controller of its own and the failsafe need another decision"
 
 def add_system(builder: DiagramBuilder, name: str, system: System) -> None:
     """Adds a system under a name, unless it is in the builder already."""
+    require_type(system, System, name)
     if all(system is not added for added in builder.GetSystems()):
         builder.AddNamedSystem(name, system)
 
@@ -128,7 +129,7 @@ def _add_target(
         selector = HypothesisSelector(count, scenario.controller.lookahead)
         builder.AddNamedSystem("selector", selector)
         builder.Connect(hypotheses, selector.GetInputPort("hypotheses"))
-        builder.Connect(state, selector.GetInputPort("state"))
+        connect(builder, state, selector.GetInputPort("state"))
         return selector.GetOutputPort("waypoint")
     name = next((name for name in DECISIONS if policy.HasOutputPort(name)), None)
     if name is None:
@@ -157,11 +158,11 @@ def _connect_controller(
     name, source = target.get_name(), finite("finite_target", target)
     if name == "velocity":
         tracker = builder.AddNamedSystem("velocity_tracker", VelocityTracker())
-        builder.Connect(state, tracker.GetInputPort("state"))
+        connect(builder, state, tracker.GetInputPort("state"))
         connect(builder, source, tracker.GetInputPort("velocity"))
         name, source = "acceleration", tracker.GetOutputPort("acceleration")
     require_ports("controller", controller, inputs=["state", name], outputs=["command"])
-    builder.Connect(state, controller.GetInputPort("state"))
+    connect(builder, state, controller.GetInputPort("state"))
     connect(builder, source, controller.GetInputPort(name))
     if policy.HasOutputPort("heading"):
         heading = finite("finite_heading", policy.GetOutputPort("heading"), math.nan)

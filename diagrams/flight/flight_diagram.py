@@ -50,7 +50,7 @@ from splatpilot.diagrams.worlds.moving_spheres import add_moving_spheres
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.common.drake import connect
 from splatpilot.systems.common.provenance import InfeasibleFlightError
-from splatpilot.systems.common.validation import require
+from splatpilot.systems.common.validation import require, require_type
 from splatpilot.systems.policies.teleop import Teleop
 from splatpilot.systems.sensing.latency import DelayedPose, FrameTimes
 from splatpilot.systems.splats.background import Background, mean_color
@@ -171,6 +171,8 @@ def AddFlight(
         ValueError: for an invalid configuration, a system without the ports it needs, and a name
             that is taken.
     """
+    require_type(scenario, Scenario, "scenario")
+    require_type(world, World, "world")
     before = builder.GetSystems()
     prefix = "" if name == "flight" else f"{name}_"
     is_external = isinstance(policy, str)

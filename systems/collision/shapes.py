@@ -157,7 +157,7 @@ class ShapeUnion:
         """
         points = np.ascontiguousarray(p_WQ, dtype=float)
         distances, gradients = np.empty(points.shape[:-1]), np.empty(points.shape)
-        outputs = {"distances": distances.reshape(-1)}
+        outputs: dict[str, np.ndarray] = {"distances": distances.reshape(-1)}
         if with_gradient:
             outputs["gradients"] = gradients.reshape(-1, 3)
         self._native.nearest(p_WQ=points.reshape(-1, 3), **outputs)

@@ -16,6 +16,8 @@ from pydrake.systems.framework import (
     System,
 )
 
+from splatpilot.systems.common.validation import require
+
 
 def input_port(name: str) -> Callable[[System], InputPort]:
     """Returns a method, for a system's class, that returns the input port of that name."""
@@ -57,6 +59,15 @@ def optional_value(system: System, name: str, context: Context) -> Any:
     """Returns the value at an abstract input port, None if the port is not connected."""
     port = system.GetInputPort(name)
     return port.Eval(context) if port.HasValue(context) else None
+
+
+def require_finite(port: InputPort, context: Context, numbers: np.ndarray) -> None:
+    """Raises ValueError, naming the port, unless the numbers at an input port are finite."""
+    if not np.isfinite(numbers).all():
+        system = cast(System, port.get_system())
+        what = f"input '{port.get_name()}' of '{system.get_name() or type(system).__name__}'"
+        remedy = "check the system that is connected to it"
+        require(False, f"{what} at t = {context.get_time()} s", "finite", numbers.tolist(), remedy)
 
 
 def connect(builder: DiagramBuilder, source: OutputPort, target: InputPort) -> None:

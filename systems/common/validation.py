@@ -14,6 +14,7 @@ import dataclasses
 import difflib
 import re
 from collections.abc import Iterable, Iterator
+from numbers import Real
 from typing import Any, cast
 
 TYPES = {float: "a number", int: "a whole number", bool: "true or false"}
@@ -145,5 +146,8 @@ def _is_in(value: Any, domain: str) -> bool:
     if domain.startswith("{"):
         return value in domain.strip("{}").split(", ")
     left, lower, upper, right = cast(re.Match[str], _INTERVAL.match(domain)).groups()
+    if not isinstance(value, Real):
+        return False
+    value = float(value)
     above = value >= float(lower) if left == "[" else value > float(lower)
     return bool(above and (value <= float(upper) if right == "]" else value < float(upper)))

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from splatpilot import _native
-from splatpilot.systems.common.validation import require
+from splatpilot.systems.common.validation import require, require_type
 from splatpilot.systems.splats.background import (
     BLACK,
     Background,
@@ -242,4 +242,6 @@ class BakedScene:
 
 def bake(scene: BakedScene | GaussianScene) -> BakedScene:
     """Bakes a scene unless it is baked."""
-    return BakedScene(scene) if isinstance(scene, GaussianScene) else scene
+    scene = BakedScene(scene) if isinstance(scene, GaussianScene) else scene
+    require_type(scene, BakedScene, "scene", "pass `baked` or `gaussians` of a world")
+    return scene

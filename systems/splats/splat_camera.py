@@ -27,7 +27,7 @@ from splatpilot.systems.common.drake import (
     output_port,
     weak_callback,
 )
-from splatpilot.systems.common.validation import require
+from splatpilot.systems.common.validation import require, require_type
 from splatpilot.systems.splats.background import BLACK, Background, RenderedView
 from splatpilot.systems.splats.baked_scene import (
     NO_GAUSSIANS,
@@ -186,9 +186,11 @@ class SplatCamera(LeafSystem):
         valid, got = 0 <= min_depth < max_depth < np.inf, f"[{min_depth}, {max_depth}] m"
         require(valid, "the depth range", "0 <= min_depth < max_depth < inf", got)
         require(0.0 <= readout < np.inf, "readout", "finite and >= 0 s", readout)
+        require_type(camera_info, CameraInfo, "camera_info")
+        X_BC = RigidTransform() if X_BC is None else X_BC
+        require_type(X_BC, RigidTransform, "X_BC")
         self._scene = bake(scene)
-        self._camera_info = camera_info
-        self._X_BC = RigidTransform() if X_BC is None else X_BC
+        self._camera_info, self._X_BC = camera_info, X_BC
         self._depth_range = (min_depth, max_depth)
         self._clipping = (near, far)
         self._background = background

@@ -23,7 +23,7 @@ from pydrake.systems.framework import (
     LeafSystem_,  # pyright: ignore[reportAttributeAccessIssue]
 )
 
-from splatpilot.systems.common.drake import optional_input, vector_input
+from splatpilot.systems.common.drake import optional_input, require_finite, vector_input
 from splatpilot.systems.common.scalars import (
     ConfigParameter,
     float_values,
@@ -33,7 +33,6 @@ from splatpilot.systems.common.scalars import (
 from splatpilot.systems.common.validation import (
     Config,
     bounded,
-    require,
     require_field,
     require_type,
 )
@@ -280,8 +279,7 @@ def FlatnessController_(T):
             value = vector_input(self, name, context)
             numbers = float_values(value)
             if not np.isfinite(numbers).all():
-                what = f"input '{name}' of '{self.get_name()}' at t = {context.get_time()} s"
-                require(False, what, "finite", numbers.tolist())
+                require_finite(self.GetInputPort(name), context, numbers)
             return value
 
     return FlatnessController

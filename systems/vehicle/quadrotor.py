@@ -20,8 +20,10 @@ from pydrake.systems.framework import (
     LeafSystem_,  # pyright: ignore[reportAttributeAccessIssue]
 )
 
+from splatpilot.systems.common.drake import require_finite
 from splatpilot.systems.common.scalars import (
     ConfigParameter,
+    float_values,
     parameter_setter,
     system_template,
 )
@@ -209,8 +211,8 @@ def QuadrotorPlant_(T):
             total = sum(value)
             # Error control would shorten the steps without end.
             if T is not Expression and not total - total == 0.0:
-                what = f"input '{self.get_input_port(index).get_name()}' of '{self.get_name()}'"
-                require(False, f"{what} at t = {context.get_time()} s", "finite", value)
+                numbers = float_values(np.array(value))
+                require_finite(self.get_input_port(index), context, numbers)
             return value
 
     return QuadrotorPlant

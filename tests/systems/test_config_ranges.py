@@ -1,4 +1,5 @@
 import math
+from typing import Any, cast
 
 import pytest
 from pydrake.common.schema import GaussianVector, Transform
@@ -41,7 +42,10 @@ OTHER_FIELDS = [
     (ObservationNoise, {"frame_rate": [0.0, 10.0]}),
     (OnboardCamera, {"fov_x": 180.0, "max_depth": 0.05}),
     (OnboardCamera, {"X_BC": Transform(translation=[NAN, 0.0, 0.0])}),
-    (OnboardCamera, {"X_BC": Transform(translation=GaussianVector[3]([0.0] * 3, [0.1] * 3))}),
+    (
+        OnboardCamera,
+        {"X_BC": Transform(translation=cast(Any, GaussianVector)[3]([0.0] * 3, [0.1] * 3))},
+    ),
     (OnboardCamera, {"readout": 0.3}),
     (Px4CommanderConfig, {"setpoints": "position", "arm": True}),
     (QuadrotorParams, {"drag": -0.1, "gravity": -9.81}),

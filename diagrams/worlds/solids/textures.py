@@ -266,9 +266,6 @@ def fade(colors: ArrayLike, haze: ArrayLike, distance: ArrayLike) -> NDArray[np.
     return np.asarray(colors) * clear + np.asarray(haze) * (1 - clear)
 
 
-Array = NDArray[np.floating]
-
-
 class Illumination(Protocol):
     """Light baked into colors."""
 

@@ -15,12 +15,13 @@ from pydrake.systems.primitives import ConstantVectorSource
 from pydrake.systems.sensors import ImageDepth32F
 
 from splatpilot.diagrams.flight.flight import (
-    Outcome,
+    FlightError,
     fly,
     make_flight_simulator,
     sample_initial_state,
 )
 from splatpilot.diagrams.flight.flight_diagram import AddFlight, BuildFlightDiagram
+from splatpilot.diagrams.flight.monitor import Outcome
 from splatpilot.diagrams.flight.monte_carlo import random_flights
 from splatpilot.diagrams.flight.policies import POLICIES, policy_named
 from splatpilot.diagrams.flight.scenario import Scenario
@@ -34,7 +35,7 @@ from splatpilot.systems.sensing.noise import ObservationNoise
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.sensing.range_finder import RangeFinder
 from splatpilot.systems.vehicle.flatness import FlatnessController
-from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS, QuadrotorPlant
+from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS, QuadrotorParams, QuadrotorPlant
 from splatpilot.systems.visualization.live import LiveControls
 
 
@@ -289,11 +290,9 @@ def test_drakes_environment_acts_through_the_decision(post_world):
         observation_port_id="observation_state",
     )
     env.reset(seed=1)
-    for _ in range(20):
-        observation, _, terminated, _, _ = env.step(np.array([1.0, 0.0, 0.0]))
-        if terminated:
-            break
-    assert terminated and observation[0] > 1.4
+    steps = (env.step(np.array([1.0, 0.0, 0.0])) for _ in range(20))
+    ended = next(observation for observation, _, terminated, _, _ in steps if terminated)
+    assert ended[0] > 1.4
 
 
 def test_inputs_of_given_systems_are_connected_or_exported(post_world):
@@ -341,17 +340,54 @@ def test_a_controller_may_also_read_what_the_policy_reads(post_world):
     assert command[0] == pytest.approx(9.81 + post_world.p_WG[2])
 
 
+class Constant(LeafSystem):
+    """Has the input `command` and an output that is always zero."""
+
+    def __init__(self, name, size):
+        super().__init__()
+        self.DeclareVectorInputPort("command", 4)
+        self.DeclareVectorOutputPort(
+            name, size, lambda _, output: output.SetZero(), {self.nothing_ticket()}
+        )
+
+
 @pytest.mark.parametrize(
     ("systems", "message"),
     [
         ({"policy": "speed"}, "policy must be one of command, .*, got speed"),
         ({"policy": "command", "controller": FlatnessController()}, "other than command"),
         ({"estimator": Biased([0, 0, 0], size=12)}, r"'state' of Biased \(a vector of 12\) must"),
+        ({"estimator": Constant("state", 12)}, r"'state' of Constant \(a vector of 12\)"),
+        ({"plant": Constant("state", 12)}, r"'state' of Constant \(a vector of 12\)"),
+        ({"plant": QuadrotorParams()}, "plant must be of type System, got a QuadrotorParams"),
+        ({"estimator": abs}, "estimator must be of type System, got a builtin_function"),
     ],
 )
 def test_systems_that_do_not_fit_are_named(post_world, systems, message):
     with pytest.raises(ValueError, match=message):
         BuildFlightDiagram(Scenario(), post_world, camera=False, **systems)
+
+
+def test_arguments_in_the_wrong_order_are_named(post_world):
+    with pytest.raises(ValueError, match="scenario must be of type Scenario, got a World"):
+        BuildFlightDiagram(post_world, Scenario(), camera=False)  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize("policy", ["planner", "straight", "reactive"])
+def test_an_estimate_that_is_not_finite_ends_the_flight_by_name(post_world, policy):
+    class Lost(LeafSystem):
+        def __init__(self):
+            super().__init__()
+            self.DeclareVectorInputPort("state", 13)
+            self.DeclareVectorOutputPort("state", 13, self._calc)
+
+        def _calc(self, context, output):
+            scale = np.nan if context.get_time() > 0.4 else 1.0
+            output.SetFromVector(scale * self.EvalVectorInput(context, 0).CopyToVector())
+
+    with pytest.raises(FlightError, match=r"state' .* finite, got \[nan.*; check the") as raised:
+        flown(Scenario(policy=policy_named(policy)), post_world, estimator=Lost())
+    assert raised.value.flight.times[-1] > 0.3
 
 
 def test_an_algebraic_loop_is_named(post_world):

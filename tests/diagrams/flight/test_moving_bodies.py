@@ -191,6 +191,7 @@ def test_vehicles_see_each_other(open_world):
     root = builder.Build().CreateDefaultContext()
     for parts in (one, two):
         camera = parts.camera
+        assert camera is not None
         context = camera.GetMyContextFromRoot(root)
         depth = camera.depth_image_32f_output_port().Eval(context).data[120, 160, 0]
         label = camera.label_image_output_port().Eval(context).data[120, 160, 0]

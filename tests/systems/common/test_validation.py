@@ -91,6 +91,7 @@ class Outer(Config):
     [
         ({"speed": 0.0}, r"Outer\.speed must be in \(0, 20\] m/s, got 0\.0"),
         ({"speed": float("nan")}, "speed .* got nan"),
+        ({"speed": "fast"}, "speed .* got fast"),
         ({"kind": "c"}, r"kind must be in \{a, b\}, got c"),
         ({"sizes": [1, 10]}, r"sizes must be in \[1, 9\], got \[1, 10\]"),
         ({"height": float("inf")}, "height must be in .* got inf"),

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from pydrake.common.value import Value
+from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform, RotationMatrix
 
 from splatpilot.systems.collision.shapes import (
@@ -27,7 +27,7 @@ def measure(X_WB: RigidTransform, time: float = 0.0, bodies=None, seed: int = 0,
     context.SetTime(time)
     sensor.GetInputPort("body_pose").FixValue(context, X_WB)
     if bodies is not None:
-        sensor.GetInputPort("moving").FixValue(context, Value[object](bodies))
+        sensor.GetInputPort("moving").FixValue(context, AbstractValue.Make(bodies))
     return sensor.get_output_port().Eval(context)[0]
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from baked_scenes import HEIGHT, LEVELS, WIDTH, X_WC, K, random_scene
-from pydrake.common.value import Value
+from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.sensors import CameraInfo
 from random_scenes import random_scene as random_gaussians
@@ -335,7 +335,7 @@ def test_a_body_hides_and_is_hidden():
     camera.GetInputPort("body_pose").FixValue(context, X_WB)
     obstacles = moving_disc(-1.0, 1.0)
     for time, seen, depth in ((0.0, 0, 2.0), (1.0, 1, 3.0), (0.5, 0, 2.0)):
-        camera.GetInputPort("moving").FixValue(context, Value[object](Bodies(time, obstacles)))
+        camera.GetInputPort("moving").FixValue(context, AbstractValue.Make(Bodies(time, obstacles)))
         color = camera.color_image_output_port().Eval(context).data[24, 32, :3]
         assert color.argmax() == seen and color.max() > 240
         assert camera.depth_image_32f_output_port().Eval(context).data[24, 32, 0] == (

@@ -232,6 +232,19 @@ def test_invalid_options_are_named(options, message):
         SplatCamera(pole(), INFO, **options)
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("hall", INFO), r"scene must be of type BakedScene, got a str; pass `baked`"),
+        ((pole(), INFO, np.eye(4)), "X_BC must be of type RigidTransform, got a ndarray"),
+        ((pole(), (64, 48)), "camera_info must be of type CameraInfo, got a tuple"),
+    ],
+)
+def test_wrong_arguments_are_named_at_construction(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        SplatCamera(*arguments)
+
+
 def test_a_moving_body_is_seen_at_the_time_of_each_row():
     path = np.array([[0.002 * row, 0.0, 0.0] for row in range(1000)])
     spheres = MovingSpheres([0.1], [path], 0.001)

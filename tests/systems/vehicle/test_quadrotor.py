@@ -206,7 +206,7 @@ def test_an_input_that_is_not_finite_is_an_error_with_error_control(convert, por
     context = plant.CreateDefaultContext()
     plant.get_input_port().FixValue(context, [9.81, 0.0, 0.0, 0.0])
     plant.GetInputPort(port).FixValue(context, np.full(plant.GetInputPort(port).size(), np.nan))
-    with pytest.raises(ValueError, match=rf"input '{port}' .* must be finite, got \[.*nan"):
+    with pytest.raises(ValueError, match=rf"'{port}' of 'Quadrotor.* finite, got \[.*nan.*; check"):
         plant.EvalTimeDerivatives(context)
     if isinstance(plant, QuadrotorPlant):
         with pytest.raises(ValueError, match="must be finite"):
