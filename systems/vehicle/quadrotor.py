@@ -20,11 +20,7 @@ from pydrake.systems.framework import (
     LeafSystem_,  # pyright: ignore[reportAttributeAccessIssue]
 )
 
-from splatpilot.systems.common.scalars import (
-    ConfigParameter,
-    parameter_setter,
-    system_template,
-)
+from splatpilot.systems.common.drake import ConfigParameter, parameter_setter, system_template
 from splatpilot.systems.common.validation import Config, bounded, require, require_type
 from splatpilot.systems.vehicle.state import QuadrotorState, array_namespace, require_rotation
 
