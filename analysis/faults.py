@@ -17,17 +17,9 @@ from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
 from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, LeafSystem
 
 from splatpilot.diagrams.flight.blocks import make_policy
-from splatpilot.diagrams.flight.flight import (
-    sample_initial_state,
-)
-from splatpilot.diagrams.flight.monitor import (
-    Outcome,
-    flight_outcome,
-    goal_position,
-    has_landed,
-)
+from splatpilot.diagrams.flight.monitor import Outcome, flight_outcome, has_landed
 from splatpilot.diagrams.flight.policies import policy_named
-from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.flight.scenario import Scenario, goal_position, sample_initial_state
 from splatpilot.diagrams.hardware.bridge import BuildHardwareDiagram, HardwareConfig, image_codecs
 from splatpilot.diagrams.hardware.vehicle import BuildVehicleDiagram
 from splatpilot.diagrams.worlds.forest.forest import ForestConfig

@@ -12,8 +12,7 @@ from pydrake.geometry import Rgba
 from scipy.spatial import KDTree
 
 from splatpilot.diagrams.flight.flight_diagram import empty_meshcat
-from splatpilot.diagrams.flight.monitor import goal_position, start_position
-from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.flight.scenario import Scenario, goal_position, start_position
 from splatpilot.diagrams.scenarios import scenario_file
 from splatpilot.diagrams.worlds.octomap_world import OCTOMAP
 from splatpilot.diagrams.worlds.scene_folder import (

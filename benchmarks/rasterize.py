@@ -28,8 +28,7 @@ from harness import (
 from pydrake.math import RigidTransform
 
 from splatpilot import _native
-from splatpilot.diagrams.flight.flight import sample_initial_state
-from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.flight.scenario import Scenario, sample_initial_state
 from splatpilot.diagrams.scenarios import scenario_file
 from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.common.config import load_config

@@ -19,9 +19,8 @@ from playwright.sync_api import Page, sync_playwright
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.sensors import CameraConfig
 
-from splatpilot.diagrams.flight.flight import sample_initial_state
 from splatpilot.diagrams.flight.flight_diagram import MakeCamera
-from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.flight.scenario import Scenario, sample_initial_state
 from splatpilot.diagrams.flight.sensors import make_camera
 from splatpilot.diagrams.scenarios import benchmark_scenarios
 from splatpilot.diagrams.worlds.world_registry import is_procedural, make_world

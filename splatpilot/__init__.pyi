@@ -5,7 +5,6 @@ from .diagrams.flight.flight import (
     fly,
     fly_all,
     make_flight_simulator,
-    sample_initial_state,
 )
 from .diagrams.flight.flight_diagram import (
     AddFlight,
@@ -19,7 +18,7 @@ from .diagrams.flight.fly import flight_page
 from .diagrams.flight.monitor import AddFlightMonitor, FlightMonitor, Outcome
 from .diagrams.flight.monte_carlo import random_flights
 from .diagrams.flight.policies import policy_named, register_policy
-from .diagrams.flight.scenario import Scenario, sample_scenario
+from .diagrams.flight.scenario import Scenario, sample_initial_state, sample_scenario
 from .diagrams.flight.sensors import register_sensor
 from .diagrams.worlds.moving_spheres import MovingSphere
 from .diagrams.worlds.splat_world import AddSplatWorld

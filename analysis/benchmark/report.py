@@ -25,8 +25,7 @@ from splatpilot.analysis.benchmark.tables import (
     success_summary,
 )
 from splatpilot.analysis.output import write_png
-from splatpilot.diagrams.flight.monitor import goal_position
-from splatpilot.diagrams.flight.scenario import sample_scenario
+from splatpilot.diagrams.flight.scenario import goal_position, sample_scenario
 from splatpilot.diagrams.worlds.scene_folder import SceneSource
 from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.common.files import written_atomically

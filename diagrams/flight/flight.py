@@ -15,79 +15,18 @@ from pydrake.systems.framework import Context, Diagram, EventStatus
 from pydrake.systems.primitives import VectorLogSink
 
 from splatpilot.diagrams.flight.blocks import policy_images
-from splatpilot.diagrams.flight.monitor import (
-    FlightMonitor,
-    Outcome,
-    flight_monitors,
-    goal_position,
-    start_position,
+from splatpilot.diagrams.flight.monitor import FlightMonitor, Outcome, flight_monitors
+from splatpilot.diagrams.flight.scenario import (
+    Scenario,
 )
-from splatpilot.diagrams.flight.scenario import Scenario, sample_scenario
-from splatpilot.diagrams.worlds.world import World
-from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.common.config import dump_config
 from splatpilot.systems.common.files import written_atomically
 from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.common.validation import require
-from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS, hover_state
 from splatpilot.systems.vehicle.state import QuadrotorState
 from splatpilot.systems.visualization.live import RESTART
 
 _ACCURACY = 3e-4  # of the Context: a flight ends within 1e-7 s, less than a micrometer.
-
-
-def sample_initial_state(scenario: Scenario, world: World) -> np.ndarray:
-    """Samples the initial state (13,): level, at rest, with the heading to the goal.
-
-    By the scenario's seed the position is uniform in the sphere of `start_radius` about the start.
-
-    Raises:
-        InfeasibleFlightError: if a vehicle at start or goal would collide or be in unknown space,
-            or if the start is at the goal.
-    """
-    scenario = sample_scenario(scenario)
-    p_WG, p_WS = goal_position(scenario, world), start_position(scenario, world)
-    _check_free(world, "start", p_WS)
-    _check_free(world, "goal", p_WG)
-    distance = float(np.linalg.norm(p_WG - p_WS))
-    if distance <= scenario.goal_radius:
-        raise InfeasibleFlightError(
-            f"the distance from start to goal must be > goal_radius, {scenario.goal_radius} m, got "
-            f"{distance:.2f} m in {world.name}; set start and goal"
-        )
-
-    generator = np.random.default_rng(scenario.seed)
-    p_WB = None
-    # A neighborhood of the start is free: the search ends.
-    while p_WB is None or not _is_free(world, p_WB):
-        direction = generator.normal(size=3)
-        distance = scenario.start_radius * generator.uniform() ** (1 / 3)
-        p_WB = p_WS + distance * direction / np.linalg.norm(direction)
-    heading = p_WG - p_WB
-    return hover_state(p_WB, yaw=np.arctan2(heading[1], heading[0]))
-
-
-def _is_free(world: World, p_WQ: np.ndarray) -> bool:
-    sample = world.field_at(0.0).query(p_WQ)
-    return bool(sample.state == FieldState.FREE and sample.distance > VEHICLE_RADIUS)
-
-
-def _check_free(world: World, what: str, p_WQ: np.ndarray) -> None:
-    """Raises InfeasibleFlightError if a vehicle at p_WQ (3,) [m] would collide."""
-    field = world.field_at(0.0)
-    sample = field.query(p_WQ)
-    where = f"{what} {np.round(p_WQ, 3).tolist()}"
-    if sample.state >= FieldState.UNKNOWN:
-        known = "outside the world" if sample.state == FieldState.OUTSIDE else "in unseen space"
-        raise InfeasibleFlightError(
-            f"{where} is {known}, which spans {np.round(field.lower_W, 2).tolist()} to "
-            f"{np.round(field.upper_W, 2).tolist()} m; choose a point in known free space"
-        )
-    if sample.distance <= VEHICLE_RADIUS:
-        raise InfeasibleFlightError(
-            f"{where} is {float(sample.distance):.3f} m from the nearest surface, but the "
-            f"vehicle's radius is {VEHICLE_RADIUS} m; choose a point with more clearance"
-        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -37,14 +37,14 @@ from splatpilot.diagrams.flight.blocks import (
     policy_images,
     require_ports,
 )
-from splatpilot.diagrams.flight.flight import sample_initial_state
-from splatpilot.diagrams.flight.monitor import (
-    AddFlightMonitor,
-    FlightMonitor,
+from splatpilot.diagrams.flight.monitor import AddFlightMonitor, FlightMonitor
+from splatpilot.diagrams.flight.scenario import (
+    Scenario,
     goal_position,
+    sample_initial_state,
+    sample_scenario,
     start_position,
 )
-from splatpilot.diagrams.flight.scenario import Scenario, sample_scenario
 from splatpilot.diagrams.worlds.appearance import randomize_appearance
 from splatpilot.diagrams.worlds.moving_spheres import add_moving_spheres
 from splatpilot.diagrams.worlds.world import World
@@ -184,7 +184,8 @@ def AddFlight(
     scenario.validate()
     if scenario.appearance > 0:
         world = randomize_appearance(world, scenario.appearance, scenario.seed)
-    world = add_moving_spheres(world, scenario.moving)
+    if scenario.moving:
+        world = add_moving_spheres(world, scenario.moving)
     given = {"plant": plant, "controller": controller}
 
     # Vehicle.

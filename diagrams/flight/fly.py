@@ -18,7 +18,6 @@ from splatpilot.diagrams.flight.flight import (
     Flight,
     FlightError,
     fly,
-    sample_initial_state,
     write_flight,
     write_summary,
 )
@@ -28,8 +27,14 @@ from splatpilot.diagrams.flight.flight_diagram import (
     camera_mount,
     open_meshcat,
 )
-from splatpilot.diagrams.flight.monitor import flight_monitors, goal_position, start_position
-from splatpilot.diagrams.flight.scenario import Scenario, sample_scenario
+from splatpilot.diagrams.flight.monitor import flight_monitors
+from splatpilot.diagrams.flight.scenario import (
+    Scenario,
+    goal_position,
+    sample_initial_state,
+    sample_scenario,
+    start_position,
+)
 from splatpilot.diagrams.worlds.appearance import randomize_appearance
 from splatpilot.diagrams.worlds.moving_spheres import add_moving_spheres
 from splatpilot.diagrams.worlds.world import World
@@ -87,7 +92,8 @@ def flight_page(
     ]
     for k in range(len(shown)):
         draw_vehicle(meshcat, f"/splatpilot/vehicles/{k}", VEHICLE_RADIUS)
-    world = add_moving_spheres(world, scenario.moving)
+    if scenario.moving:
+        world = add_moving_spheres(world, scenario.moving)
     spheres = world.moving.spheres if world.moving else None
     view, scene = _view(scenario, world), (world.gaussians, world.background)
     return HtmlPage(replay_page(meshcat.StaticHtml(), *scene, view, shown, spheres))

@@ -21,12 +21,11 @@ from pydrake.systems.framework import (
 )
 from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
 
-from splatpilot.diagrams.flight.scenario import Scenario, sample_scenario
+from splatpilot.diagrams.flight.scenario import Scenario, goal_position, sample_scenario
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf_collision import EsdfCollision
-from splatpilot.systems.common.drake import connect, vector_output, weak_callback
-from splatpilot.systems.common.scalars import ByValues
+from splatpilot.systems.common.drake import ByValues, connect, vector_output, weak_callback
 from splatpilot.systems.messaging.flight_limits import LEVEL
 from splatpilot.systems.splats.moving_bodies import MovingBodies
 from splatpilot.systems.vehicle.state import QuadrotorState
@@ -47,16 +46,6 @@ class Outcome(enum.StrEnum):
     LANDED = "landed"
     ERROR = "error"
     INTERRUPTED = "interrupted"
-
-
-def goal_position(scenario: Scenario, world: World) -> np.ndarray:
-    """Returns p_WG (3,) [m] of the scenario, or of the world if the scenario has none."""
-    return np.asarray(world.p_WG if scenario.goal is None else scenario.goal, dtype=float)
-
-
-def start_position(scenario: Scenario, world: World) -> np.ndarray:
-    """Returns p_WS (3,) [m] of the scenario, or of the world if the scenario has none."""
-    return np.asarray(world.p_WS if scenario.start is None else scenario.start, dtype=float)
 
 
 def _margins(

@@ -13,21 +13,24 @@ from splatpilot.diagrams.flight.policies import POLICIES, PolicyConfig
 from splatpilot.diagrams.flight.sensors import SENSORS, SensorConfig
 from splatpilot.diagrams.worlds.forest.forest import ForestConfig
 from splatpilot.diagrams.worlds.moving_spheres import MovingSphere
+from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import WORLDS, WorldConfig
+from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.common.config import dump_config, registry_field
 from splatpilot.systems.common.distributions import pickle_by_fields, sample_distributions
-from splatpilot.systems.common.seeds import check_seed
+from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.common.validation import (
     Config,
     FieldError,
     bounded,
+    check_seed,
     require,
     require_field,
 )
 from splatpilot.systems.policies.planner import PrivilegedPlannerConfig
 from splatpilot.systems.sensing.noise import ObservationNoise
 from splatpilot.systems.vehicle.flatness import FlatnessControllerConfig
-from splatpilot.systems.vehicle.quadrotor import QuadrotorParams
+from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS, QuadrotorParams, hover_state
 
 pickle_by_fields(
     CameraConfig, CameraConfig.FocalLength, CameraConfig.FovDegrees, Rgba, SimulatorConfig
@@ -147,6 +150,70 @@ def sample_scenario(scenario: Scenario) -> Scenario:
         ValueError: for a distribution in a field that is not of numbers.
     """
     return sample_distributions(scenario, scenario.seed)
+
+
+def goal_position(scenario: Scenario, world: World) -> np.ndarray:
+    """Returns p_WG (3,) [m] of the scenario, or of the world if the scenario has none."""
+    return np.asarray(world.p_WG if scenario.goal is None else scenario.goal, dtype=float)
+
+
+def start_position(scenario: Scenario, world: World) -> np.ndarray:
+    """Returns p_WS (3,) [m] of the scenario, or of the world if the scenario has none."""
+    return np.asarray(world.p_WS if scenario.start is None else scenario.start, dtype=float)
+
+
+def sample_initial_state(scenario: Scenario, world: World) -> np.ndarray:
+    """Samples the initial state (13,): level, at rest, with the heading to the goal.
+
+    By the scenario's seed the position is uniform in the sphere of `start_radius` about the start.
+
+    Raises:
+        InfeasibleFlightError: if a vehicle at start or goal would collide or be in unknown space,
+            or if the start is at the goal.
+    """
+    scenario = sample_scenario(scenario)
+    p_WG, p_WS = goal_position(scenario, world), start_position(scenario, world)
+    _check_free(world, "start", p_WS)
+    _check_free(world, "goal", p_WG)
+    distance = float(np.linalg.norm(p_WG - p_WS))
+    if distance <= scenario.goal_radius:
+        raise InfeasibleFlightError(
+            f"the distance from start to goal must be > goal_radius, {scenario.goal_radius} m, got "
+            f"{distance:.2f} m in {world.name}; set start and goal"
+        )
+
+    generator = np.random.default_rng(scenario.seed)
+    p_WB = None
+    # A neighborhood of the start is free: the search ends.
+    while p_WB is None or not _is_free(world, p_WB):
+        direction = generator.normal(size=3)
+        distance = scenario.start_radius * generator.uniform() ** (1 / 3)
+        p_WB = p_WS + distance * direction / np.linalg.norm(direction)
+    heading = p_WG - p_WB
+    return hover_state(p_WB, yaw=np.arctan2(heading[1], heading[0]))
+
+
+def _is_free(world: World, p_WQ: np.ndarray) -> bool:
+    sample = world.field_at(0.0).query(p_WQ)
+    return bool(sample.state == FieldState.FREE and sample.distance > VEHICLE_RADIUS)
+
+
+def _check_free(world: World, what: str, p_WQ: np.ndarray) -> None:
+    """Raises InfeasibleFlightError if a vehicle at p_WQ (3,) [m] would collide."""
+    field = world.field_at(0.0)
+    sample = field.query(p_WQ)
+    where = f"{what} {np.round(p_WQ, 3).tolist()}"
+    if sample.state >= FieldState.UNKNOWN:
+        known = "outside the world" if sample.state == FieldState.OUTSIDE else "in unseen space"
+        raise InfeasibleFlightError(
+            f"{where} is {known}, which spans {np.round(field.lower_W, 2).tolist()} to "
+            f"{np.round(field.upper_W, 2).tolist()} m; choose a point in known free space"
+        )
+    if sample.distance <= VEHICLE_RADIUS:
+        raise InfeasibleFlightError(
+            f"{where} is {float(sample.distance):.3f} m from the nearest surface, but the "
+            f"vehicle's radius is {VEHICLE_RADIUS} m; choose a point with more clearance"
+        )
 
 
 def _check_camera(camera: CameraConfig) -> None:

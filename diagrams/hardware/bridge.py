@@ -16,13 +16,8 @@ from pydrake.systems.primitives import ConstantVectorSource
 from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
 from splatpilot.diagrams.flight import blocks
-from splatpilot.diagrams.flight.monitor import (
-    Outcome,
-    flight_outcome,
-    goal_position,
-    has_landed,
-)
-from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.flight.monitor import Outcome, flight_outcome, has_landed
+from splatpilot.diagrams.flight.scenario import Scenario, goal_position
 from splatpilot.diagrams.hardware.real_time import MessagePorts, run_in_real_time
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import make_world

@@ -16,8 +16,7 @@ from splatpilot.systems.collision.distance_field import DistanceField
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.esdf_build import cubes_of_points
 from splatpilot.systems.common.provenance import InfeasibleFlightError
-from splatpilot.systems.common.seeds import check_seed
-from splatpilot.systems.common.validation import Config
+from splatpilot.systems.common.validation import Config, check_seed
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
 _log = logging.getLogger(__name__)

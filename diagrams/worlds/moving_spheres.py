@@ -43,9 +43,7 @@ class MovingSphere(Config):
 
 
 def add_moving_spheres(world: World, spheres: Mapping[str, MovingSphere]) -> World:
-    """Returns the world with the spheres among its moving obstacles."""
-    if not spheres:
-        return world
+    """Returns the world with the spheres, at least one, among its moving obstacles."""
     radii, paths = zip(*((each.radius, each.path()) for each in spheres.values()), strict=True)
     moving = MovingSpheres(radii, paths, PERIOD)
     bodies = [_draw_sphere(radius) for radius in radii]

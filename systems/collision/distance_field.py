@@ -6,7 +6,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from splatpilot.systems.common.scalars import float_values, is_autodiff
+from splatpilot.systems.common.drake import float_values, is_autodiff
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.vehicle.state import array_namespace
 

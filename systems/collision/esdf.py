@@ -16,9 +16,9 @@ from splatpilot.systems.collision.distance_field import (
     linearize,
     sample_field,
 )
+from splatpilot.systems.common.drake import is_autodiff
 from splatpilot.systems.common.files import written_atomically
 from splatpilot.systems.common.readers import read_archive
-from splatpilot.systems.common.scalars import is_autodiff
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.vehicle.state import array_namespace
 

@@ -17,11 +17,7 @@ from splatpilot.systems.collision.distance_field import (
     sample_field,
     soft_barrier,
 )
-from splatpilot.systems.common.scalars import (
-    ConfigParameter,
-    parameter_setter,
-    system_template,
-)
+from splatpilot.systems.common.drake import ConfigParameter, parameter_setter, system_template
 from splatpilot.systems.common.validation import Config, bounded, require
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 from splatpilot.systems.vehicle.state import QuadrotorState

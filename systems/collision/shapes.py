@@ -16,7 +16,7 @@ from splatpilot.systems.collision.distance_field import (
     FieldState,
     sample_field,
 )
-from splatpilot.systems.common.scalars import is_autodiff
+from splatpilot.systems.common.drake import is_autodiff
 from splatpilot.systems.common.validation import require
 
 # The `parameters` of a shape are numbers as native code takes them; O is a shape's own frame.

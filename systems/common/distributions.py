@@ -110,6 +110,23 @@ def is_distribution(value: Any) -> bool:
     return isinstance(value, Distribution | DistributionVector)
 
 
+def has_distributions(value: Any) -> bool:
+    """Checks if `find_distributions` yields any, without paths and types, which cost more."""
+    if value is None or isinstance(value, str | float | int):
+        return False
+    if isinstance(value, dict | list):
+        return any(map(has_distributions, value.values() if isinstance(value, dict) else value))
+    if isinstance(value, Transform):
+        return not value.IsDeterministic()
+    if dataclasses.is_dataclass(value):
+        return not isinstance(value, type) and has_distributions(vars(value))
+    fields = getattr(value, "__fields__", ())
+    is_plain = isinstance(value, Rotation | type)
+    return is_distribution(value) or (
+        not is_plain and any(has_distributions(getattr(value, field.name)) for field in fields)
+    )
+
+
 def distribution_text(distribution: Any) -> str:
     """Returns a distribution as YAML in one line."""
     return yaml.serialize(_node(distribution), width=float("inf")).strip()
@@ -199,7 +216,7 @@ def sample_distributions[Configuration](
     Args:
         path: of the configuration in that to which the seed belongs.
     """
-    if next(find_distributions(config, path), None) is None:
+    if not has_distributions(config):
         return config
     config = copy.deepcopy(config)
     for field in list(find_distributions(config, path)):

@@ -1,22 +1,34 @@
-"""Helpers for Drake systems: ports, connections, weak callbacks, sliders of Meshcat."""
+"""Helpers for Drake systems: ports, connections, scalar types, parameters of Contexts."""
 
+import functools
+import inspect
+import sys
 import weakref
-from collections.abc import Callable
-from typing import Any, cast
+from collections.abc import Callable, Sequence
+from copy import copy
+from dataclasses import fields, replace
+from typing import Any, Protocol, TypeVar, cast
 
 import numpy as np
+from pydrake.autodiffutils import AutoDiffXd
+from pydrake.common.value import Value
 from pydrake.geometry import Meshcat
 from pydrake.systems import sensors
 from pydrake.systems.framework import (
+    BasicVector_,  # pyright: ignore[reportAttributeAccessIssue]
     Context,
     DiagramBuilder,
     InputPort,
+    LeafSystem_,  # pyright: ignore[reportAttributeAccessIssue]
     OutputPort,
     PortDataType,
     System,
+    SystemScalarConverter,
+    ValueProducer,
 )
+from pydrake.systems.scalar_conversion import TemplateSystem
 
-from splatpilot.systems.common.validation import require
+from splatpilot.systems.common.validation import Config, require
 
 
 def input_port(name: str) -> Callable[[System], InputPort]:
@@ -133,3 +145,149 @@ def add_slider(
     if name in meshcat.GetSliderNames():
         meshcat.DeleteSlider(name)
     meshcat.AddSlider(name, *range, step, value, *keys)
+
+
+_S = TypeVar("_S", covariant=True)
+
+
+class _Template(Protocol[_S]):
+    def __getitem__(self, scalar: Any) -> type[_S]: ...
+
+
+class _SystemTemplate(TemplateSystem):
+    """A TemplateSystem of classes with an ordinary `__init__`, see `system_template`."""
+
+    def _on_add(self, param: Any, cls: Any, skip_rename: bool) -> Any:
+        init = cls.__init__
+
+        def construct(system: Any, *args: Any, converter: Any = None, **options: Any) -> None:
+            if type(system) is not cls and converter is self._converter:
+                converter = SystemScalarConverter()  # A subclass is not converted to its base.
+            init(system, *args, converter=converter, **options)
+
+        def construct_copy(system: Any, other: Any, converter: Any = None) -> None:
+            construct(system, *other._arguments, converter=converter)
+
+        cls._construct, cls._construct_copy = construct, construct_copy
+        del cls.__init__
+        cls = super()._on_add(param, cls, skip_rename)
+        # Drake's constructor takes any arguments.
+        functools.update_wrapper(cls.__init__, init)
+        signature = inspect.signature(init)
+        arguments = [each for name, each in signature.parameters.items() if name != "converter"]
+        cls.__init__.__signature__ = signature.replace(parameters=arguments)
+        if param == (float,):
+            cls.__name__ = cls.__qualname__ = self.name.removesuffix("_")
+        return cls
+
+
+def system_template(
+    name: str, scalars: Sequence[Any] = (float, AutoDiffXd)
+) -> Callable[[Callable[[Any], type[_S]]], _Template[_S]]:
+    """Defines a system for several scalar types by a function from the type to the class.
+
+    As Drake's `TemplateSystem.define`, but the class has an `__init__`, with the keyword
+    `converter` for LeafSystem. It stores in `_arguments` the arguments with which a conversion
+    constructs the system again. A subclass does not support conversion, unless it is a template.
+    """
+
+    def define(instantiate: Callable[[Any], type[_S]]) -> _Template[_S]:
+        scope = sys.modules[instantiate.__module__]
+        decorator: Any = _SystemTemplate.define(name, T_list=list(scalars), scope=scope)
+        return decorator(instantiate)
+
+    return define
+
+
+def is_autodiff(x: Any) -> bool:
+    """Checks if x is an AutoDiffXd or an array of objects such as these."""
+    return isinstance(x, AutoDiffXd) or getattr(getattr(x, "dtype", None), "kind", "") == "O"
+
+
+_value = np.frompyfunc(lambda x: x.value() if isinstance(x, AutoDiffXd) else float(x), 1, 1)
+
+
+def float_values(x: Any) -> Any:
+    """Returns numbers (...) of AutoDiffXd as floats; other arrays and floats as they are."""
+    return np.asarray(_value(x), dtype=float)[()] if is_autodiff(x) else x
+
+
+class ByValues(LeafSystem_[AutoDiffXd]):
+    """Base class of the conversions of float systems that compute by the values of their inputs."""
+
+    def __init__(self, system: Any) -> None:
+        """Declares the input ports of a float system."""
+        super().__init__()
+        self.set_name(system.get_name())
+        self._system = system
+        for index in range(system.num_input_ports()):
+            port = system.get_input_port(index)
+            if port.get_data_type() == PortDataType.kVectorValued:
+                self.DeclareVectorInputPort(port.get_name(), port.size())
+            else:
+                self.DeclareAbstractInputPort(port.get_name(), system.AllocateInputAbstract(port))
+        # The float Context keeps cached results.
+        self._inner = self.DeclareCacheEntry(
+            "context of values",
+            ValueProducer(cast(Any, Value[object]), weak_callback(self._make_context)),
+            {self.nothing_ticket()},
+        ).cache_index()
+
+    @classmethod
+    def converter(cls) -> Any:
+        """Returns the `converter` of the float system."""
+        converter: Any = SystemScalarConverter()
+        converter._AddConstructor[AutoDiffXd, float](cls)
+        return converter
+
+    def _make_context(self, context: Any, value: Any) -> None:
+        value.set_value(self._system.CreateDefaultContext())
+
+    def context_of_values(self, context: Any) -> Any:
+        """Returns a Context of the float system with time and inputs by their values."""
+        inner: Any = self.get_cache_entry(self._inner).Eval(context)
+        inner.SetTime(float_values(context.get_time()))
+        for index in range(self.num_input_ports()):
+            port = self.get_input_port(index)
+            if port.HasValue(context):
+                self._system.get_input_port(index).FixValue(inner, float_values(port.Eval(context)))
+        return inner
+
+
+class ConfigParameter:
+    """Numbers of a configuration as a numeric parameter of a system's Contexts."""
+
+    def __init__(self, system: Any, scalar: Any, config: Config, names: Sequence[str] = ()) -> None:
+        """Declares the parameter; `names` are the fields it has, all by default."""
+        self._config = config
+        self.names = names or [field.name for field in fields(config)]  # pyright: ignore
+        defaults = [getattr(config, name) for name in self.names]
+        self._defaults = defaults if scalar is float else None
+        self._index = system.DeclareNumericParameter(BasicVector_[scalar](defaults))
+
+    def config(self, context: Context) -> Any:
+        """Returns the configuration with the numbers of a Context."""
+        numbers = context.get_numeric_parameter(self._index).value().tolist()
+        if numbers == self._defaults:
+            return self._config  # A copy costs as much as a control step.
+        config = copy(self._config)
+        vars(config).update(zip(self.names, numbers, strict=True))
+        return config
+
+    def set(self, context: Context, name: str, value: Any) -> None:
+        """Sets one of the numbers; raises ValueError if the configuration is invalid with it."""
+        vector = context.get_mutable_numeric_parameter(self._index)
+        numbers = dict(zip(self.names, float_values(vector.CopyToVector()).tolist(), strict=True))
+        replace(self._config, **numbers | {name: float_values(value)}).validate()  # pyright: ignore
+        vector.SetAtIndex(list(self.names).index(name), value)
+
+
+def parameter_setter(name: str) -> Callable[[Any, Context, Any], None]:
+    """Returns a method, for a system's class, that sets a number of one of its `_parameters`."""
+
+    def set_parameter(self: Any, context: Context, value: Any) -> None:
+        self.ValidateContext(context)
+        next(each for each in self._parameters if name in each.names).set(context, name, value)
+
+    set_parameter.__doc__ = f"Sets the parameter `{name}` of a Context."
+    return set_parameter

@@ -11,7 +11,6 @@
 
 from splatpilot.systems.common.validation import require
 
-MAX_SEED = 2**31 - 1
 TRAINING_SEEDS = 1_000_000
 VALIDATION_SEEDS = 2_000_000
 SEEDS_PER_RUN = 1000
@@ -36,11 +35,6 @@ def describe_seeds(split: str, count: int) -> str:
     """Describes the seeds of a study, as "development seeds 0 to 19"."""
     seeds = study_seeds(split, count)
     return f"{SPLIT_NAMES[split]} seeds {seeds[0]} to {seeds[-1]}"
-
-
-def check_seed(seed: int) -> None:
-    """Raises ValueError unless a seed is in [0, `MAX_SEED`]."""
-    require(0 <= seed <= MAX_SEED, "seed", f"in [0, {MAX_SEED}]", seed)
 
 
 def first_training_seed(run: int) -> int:

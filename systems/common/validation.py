@@ -44,6 +44,14 @@ def require_type(value: object, kind: type, what: str, remedy: str = "") -> None
     require(isinstance(value, kind), what, f"of type {kind.__name__}", f"a {name}", remedy)
 
 
+MAX_SEED = 2**31 - 1
+
+
+def check_seed(seed: int) -> None:
+    """Raises ValueError unless a seed is in [0, `MAX_SEED`]."""
+    require(0 <= seed <= MAX_SEED, "seed", f"in [0, {MAX_SEED}]", seed)
+
+
 class FieldError(ValueError):
     """A field of a configuration is out of range; the message names the configuration's type."""
 

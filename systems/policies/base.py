@@ -18,8 +18,7 @@ from pydrake.systems.framework import (
 )
 from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
-from splatpilot.systems.common.drake import vector_input
-from splatpilot.systems.common.scalars import ByValues, float_values
+from splatpilot.systems.common.drake import ByValues, float_values, vector_input
 from splatpilot.systems.common.validation import Config, bounded, require
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.vehicle.state import QuadrotorState, pose_from_state

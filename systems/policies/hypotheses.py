@@ -19,8 +19,7 @@ from pydrake.systems.framework import (
     LeafSystem_,  # pyright: ignore[reportAttributeAccessIssue]
 )
 
-from splatpilot.systems.common.drake import vector_input
-from splatpilot.systems.common.scalars import float_values, is_autodiff, system_template
+from splatpilot.systems.common.drake import float_values, is_autodiff, system_template, vector_input
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.vehicle.state import QuadrotorState, clip, make_pose
 

@@ -11,8 +11,7 @@ from pydrake.systems.framework import (
     LeafSystem_,  # pyright: ignore[reportAttributeAccessIssue]
 )
 
-from splatpilot.systems.common.drake import optional_input, vector_input
-from splatpilot.systems.common.scalars import system_template
+from splatpilot.systems.common.drake import optional_input, system_template, vector_input
 from splatpilot.systems.common.validation import require_type
 from splatpilot.systems.vehicle.flatness import FlatnessControllerConfig, heading_along_motion
 from splatpilot.systems.vehicle.state import QuadrotorState, array_namespace, clip

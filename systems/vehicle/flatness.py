@@ -23,12 +23,14 @@ from pydrake.systems.framework import (
     LeafSystem_,  # pyright: ignore[reportAttributeAccessIssue]
 )
 
-from splatpilot.systems.common.drake import optional_input, require_finite, vector_input
-from splatpilot.systems.common.scalars import (
+from splatpilot.systems.common.drake import (
     ConfigParameter,
     float_values,
+    optional_input,
     parameter_setter,
+    require_finite,
     system_template,
+    vector_input,
 )
 from splatpilot.systems.common.validation import (
     Config,

@@ -20,11 +20,11 @@ from pydrake.systems.framework import (
     LeafSystem_,  # pyright: ignore[reportAttributeAccessIssue]
 )
 
-from splatpilot.systems.common.drake import require_finite
-from splatpilot.systems.common.scalars import (
+from splatpilot.systems.common.drake import (
     ConfigParameter,
     float_values,
     parameter_setter,
+    require_finite,
     system_template,
 )
 from splatpilot.systems.common.validation import Config, bounded, require, require_type

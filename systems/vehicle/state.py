@@ -25,8 +25,12 @@ from pydrake.systems.framework import (
 )
 from scipy.spatial.transform import Rotation
 
-from splatpilot.systems.common.drake import vector_input, weak_callback
-from splatpilot.systems.common.scalars import is_autodiff, system_template
+from splatpilot.systems.common.drake import (
+    is_autodiff,
+    system_template,
+    vector_input,
+    weak_callback,
+)
 from splatpilot.systems.common.validation import require
 
 LONGEST_PREDICTION = 0.1  # [s], maximum age of states that are predicted to the present.

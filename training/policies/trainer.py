@@ -6,8 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from splatpilot.systems.common.seeds import check_seed
-from splatpilot.systems.common.validation import Config, bounded, require_field
+from splatpilot.systems.common.validation import Config, bounded, check_seed, require_field
 from splatpilot.systems.sensing.noise import ObservationNoise
 from splatpilot.training.policies.augmentation import Appearance
 

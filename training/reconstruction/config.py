@@ -3,8 +3,7 @@
 from dataclasses import dataclass, field
 
 from splatpilot.systems.common.processes import available_cores
-from splatpilot.systems.common.seeds import check_seed
-from splatpilot.systems.common.validation import Config, bounded, require_field
+from splatpilot.systems.common.validation import Config, bounded, check_seed, require_field
 from splatpilot.training.captures.capture_config import CaptureConfig
 
 HOLD_OUT = 8

@@ -41,7 +41,7 @@ from splatpilot.diagrams.worlds.solids.textures import (
     shade,
     smoothstep,
 )
-from splatpilot.systems.common.seeds import check_seed
+from splatpilot.systems.common.validation import check_seed
 from splatpilot.systems.splats.scene import GaussianScene
 
 

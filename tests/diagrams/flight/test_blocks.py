@@ -8,10 +8,10 @@ from pydrake.common.value import Value
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import LeafSystem
 
-from splatpilot.diagrams.flight.flight import fly, sample_initial_state
+from splatpilot.diagrams.flight.flight import fly
 from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
 from splatpilot.diagrams.flight.policies import policy_named
-from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.flight.scenario import Scenario, sample_initial_state
 from splatpilot.diagrams.flight.sensors import make_camera
 from splatpilot.systems.sensing.noise import ObservationNoise
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera

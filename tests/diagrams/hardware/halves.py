@@ -6,8 +6,7 @@ import lcm
 import numpy as np
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
 
-from splatpilot.diagrams.flight.flight import sample_initial_state
-from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.flight.scenario import Scenario, sample_initial_state
 from splatpilot.diagrams.hardware.bridge import BuildHardwareDiagram, HardwareConfig
 from splatpilot.diagrams.hardware.vehicle import BuildVehicleDiagram
 from splatpilot.systems.common.drake import vector_output

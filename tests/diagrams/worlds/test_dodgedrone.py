@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform
 
-from splatpilot.diagrams.flight.flight import sample_initial_state
-from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.flight.scenario import Scenario, sample_initial_state
 from splatpilot.diagrams.flight.sensors import make_camera
 from splatpilot.diagrams.scenarios import scenario_file
 from splatpilot.diagrams.worlds import dodgedrone

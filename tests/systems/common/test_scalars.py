@@ -8,7 +8,7 @@ from pydrake.systems.framework import (
 )
 
 import splatpilot as sp
-from splatpilot.systems.common.scalars import float_values, is_autodiff, system_template
+from splatpilot.systems.common.drake import float_values, is_autodiff, system_template
 
 
 @system_template("Power_")
