@@ -114,7 +114,7 @@ def shrink(picture: Path, out: Path) -> None:
 def flight(html: Path, out: Path) -> None:
     """Saves the page of a flight at 6 s, from above and following the vehicle."""
     scripts = [f"replay.look('{view}'); replay.seek(6)" for view in ("overview", "chase")]
-    save(splat_page(html, scripts), out)
+    save(splat_page(html, scripts, height=700), out)
 
 
 def scene(html: Path, out: Path) -> None:
@@ -122,11 +122,11 @@ def scene(html: Path, out: Path) -> None:
     save(splat_page(html, ["view.choose(27)", "view.switches.slice(true)"]), out)
 
 
-def splat_page(html: Path, scripts: list[str]) -> Picture:
+def splat_page(html: Path, scripts: list[str], height: int = 620) -> Picture:
     """Returns views of a page after each of the scripts, next to each other."""
     settled = "(window.replay || window.view)?.splats.settled && !viewer.needs_render"
     views = []
-    with open_page(html, 1000, 620) as tab:
+    with open_page(html, 1000, height) as tab:
         tab.wait_for_function(settled)
         for script in scripts:
             tab.evaluate(f"() => {{ {script}; }}")

@@ -253,7 +253,7 @@ def _pairs(config: StudyConfig, rows: list[Row]) -> str:
         "Exact McNemar tests over flights, for these scenarios with new seeds (sign-flip tests "
         "over worlds if flights share them), and sign-flip permutation tests over scenarios, for "
         "others of the same kinds. Both are corrected by "
-        f"Holm for the {len(lines)} pairs."
+        f"Holm for all pairs (here {len(lines)})."
     )
 
 

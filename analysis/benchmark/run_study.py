@@ -214,6 +214,8 @@ def study(
     """
     Flies scenarios x parameters x policies x speeds x seeds, and returns a row for each flight.
 
+    .. code-block:: python
+
         flights = sp.study("P02", {"vehicle.drag": [0.3, 0.5]}, policies=["planner", "reactive"])
         flights.groupby(["policy", "vehicle.drag"]).success.mean()
 
@@ -236,12 +238,12 @@ def study(
         samples: draws this number of values of distributions instead, and flies each with all
             seeds.
         split: seeds, "dev" or "test".
-        jobs: worker processes; by default one a core.
+        jobs: worker processes; by default one for each core.
         cluster: address of a dask scheduler whose workers fly.
         out: folder of the study; by default a temporary one.
 
     Returns:
-        Columns: scenario, policy, speed and seed; the swept and drawn fields; outcome, success,
+        Rows with scenario, policy, speed and seed; the swept and drawn fields; outcome, success,
         flight time, path, minimum clearance, position p_WB at the end; measures of difficulty; see
         `flight_metrics` and `Difficulty`.
     """

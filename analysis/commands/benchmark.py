@@ -57,15 +57,16 @@ def _speed(text: str) -> float:
     ),
     cli.Option(
         "--policies A,B.npz,C:FIELD=VALUE,...",
-        "names, files of weights or module:Class, with LABEL= before and fields after; scenario: "
-        "each scenario's own; default: that, if all have one, or all policies",
+        "names, files of weights or module:Class, with LABEL= before and fields after; "
+        "'scenario' is each scenario's own policy, the default if all have one; otherwise the "
+        "default is all policies",
         split_policies,
         resolve=check_policy,
     ),
     cli.Option(
         "--sweep [A:]FIELD=1,2,3",
-        "a policy, or without A all scenarios, with each of these values of a field, and all "
-        "combinations of the values of several (repeatable)",
+        "fly policy A, or without A all scenarios, with each of these values of a field; several "
+        "sweeps fly all combinations (repeatable)",
         action="append",
         default=[],
         resolve=_check_sweep,
@@ -76,8 +77,12 @@ def _speed(text: str) -> float:
         split_policies,
         resolve=check_study_scenario,
     ),
-    cli.Option("--speeds 2,3", "nominal, m/s; default: 2", _names, resolve=_speed),
-    cli.Option("--seeds N", "flights of each; default: 20", int),
+    cli.Option("--speeds 2,3", "nominal speeds [m/s]; default: 2", _names, resolve=_speed),
+    cli.Option(
+        "--seeds N",
+        "flights of each policy, scenario and speed; default: 20",
+        int,
+    ),
     cli.Option("--split", "seeds to fly: dev (default) for development, test for final results"),
     cli.JOBS,
     cli.Option("--cluster ADDRESS", "fly on the workers of this dask scheduler"),

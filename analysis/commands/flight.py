@@ -17,15 +17,21 @@ def _names(text: str) -> list[str]:
 @cli.command(
     "fly",
     *cli.SCENARIO_OPTIONS,
-    cli.out_option("output folder (default: out/FLIGHT)", required=False, unused=True),
+    cli.out_option(
+        "output folder (default: out/SCENARIO-POLICY-SPEED-SEED)", required=False, unused=True
+    ),
     cli.OVERWRITE,
-    cli.flag("--live", "serve Meshcat during the flight, in real time, with controls"),
+    cli.flag("--live", "serve Meshcat during the flight, with buttons to pause, step and restart"),
     cli.Option(
-        "--draw NAMES", "what Meshcat draws, such as thrust,nearest,axes", _names, default=[]
+        "--draw NAMES",
+        "with --live, draw some of velocity,thrust,rates,waypoint,nearest,barrier,axes,depth,"
+        "frustum,limits",
+        _names,
+        default=[],
     ),
     cli.flag("--no-video", "do not write flight.mp4"),
-    cli.Option("--rerun FILE", "record the flight for the viewer Rerun", Path, unused=True),
-    cli.Option("--graphviz FILE", "write the diagram as Graphviz", Path, unused=True),
+    cli.Option("--rerun FILE", "record the flight for the viewer Rerun (.rrd)", Path, unused=True),
+    cli.Option("--graphviz FILE", "write the diagram as Graphviz (.dot)", Path, unused=True),
     cli.json_option("the summary"),
     examples=(
         "fly --scenario P02 --policy diffaero --speed 3",

@@ -260,7 +260,7 @@ def _check_scene(path: Path) -> Path:
 SCENARIO_OPTIONS = (
     Option(
         "--scenario P02|FILE.yaml",
-        "scenario to fly: one of the benchmark, or a file",
+        "name of a benchmark scenario, or a scenario file",
         resolve=checks.check_scenario,
         completions=checks.SCENARIOS,
     ),
@@ -270,7 +270,7 @@ SCENARIO_OPTIONS = (
         resolve=checks.check_policy,
         completions=checks.POLICIES,
     ),
-    Option("--speed M/S", "nominal, of any policy", float),
+    Option("--speed M/S", "nominal speed of the policy", float),
     Option(
         "--scene DIR_OR_FILE",
         "fly in this scene folder, file of Gaussians (PLY, SPZ, .splat; meters, z up) or OctoMap "

@@ -59,7 +59,7 @@ from splatpilot.systems.splats.splat_camera import SplatCamera
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS, QuadrotorPlant
 from splatpilot.systems.vehicle.quadrotor_geometry import quadrotor_gaussians
 from splatpilot.systems.vehicle.state import QuadrotorState
-from splatpilot.systems.visualization.flight_visualizer import FlightVisualizer
+from splatpilot.systems.visualization.flight_visualizer import DRAWINGS, FlightVisualizer
 from splatpilot.systems.visualization.meshcat_drawing import (
     CameraVisualizer,
     MovingSpheresVisualizer,
@@ -145,7 +145,7 @@ def AddFlight(
     given plant or controller are exported, as `plant_wind`.
 
     Args:
-        name: of the flight.
+        name: of the flight; "flight" adds no prefix to the names of systems.
         policy: replaces the scenario's: a configuration, a system, or one of `DECISIONS`.
 
             A system has one of the outputs `hypotheses` (see
@@ -426,6 +426,13 @@ def BuildFlightDiagram(
     return diagram
 
 
+def check_drawings(draw: Collection[str]) -> None:
+    """Raises ValueError for a name that `AddMeshcat` does not draw."""
+    known = [*DRAWINGS, "axes", "depth", "frustum", "limits"]
+    for name in draw:
+        require(name in known, "draw", f"names of {', '.join(known)}", name)
+
+
 def AddMeshcat(
     builder: DiagramBuilder, parts: FlightParts, meshcat: Meshcat, draw: Collection[str] = ()
 ) -> None:
@@ -435,6 +442,7 @@ def AddMeshcat(
         draw: names of `DRAWINGS`; "axes" of the body; "depth" of the camera, as points; "frustum"
             of the policy's camera; "limits" of the world.
     """
+    check_drawings(draw)
     world = parts.world
     field = world.distance_field
     margin = np.array([5.0, 5.0, 3.0])  # [m] of surroundings

@@ -25,6 +25,7 @@ from splatpilot.diagrams.flight.flight_diagram import (
     BuildFlightDiagram,
     camera_info,
     camera_mount,
+    check_drawings,
     open_meshcat,
 )
 from splatpilot.diagrams.flight.monitor import flight_monitors
@@ -164,7 +165,8 @@ def run(
         if path is not None:
             require_writable_folder(path.absolute().parent)
     by_hand = isinstance(scenario.policy, TeleopConfig)
-    require(live or not by_hand, "--policy teleop", "flown with --live", "none of it")
+    require(live or not by_hand, "--policy teleop", "flown with --live", "no --live")
+    check_drawings(draw)
     require(live or not draw, "--draw", "left out without --live", ",".join(draw))
     print(f"Building the world, seed {scenario.seed}...", flush=True)
     world = make_world(scenario.world, scenario.seed)

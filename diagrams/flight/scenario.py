@@ -118,6 +118,10 @@ class Scenario(Config):
 
     __hash__ = None  # pyright: ignore
 
+    def __repr__(self) -> str:
+        """Shows all fields as YAML; Drake's distributions do not show their parameters."""
+        return dump_config(self)
+
     def validate(self) -> None:
         drawn = sample_scenario(self)
         if drawn is not self:

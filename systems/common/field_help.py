@@ -5,6 +5,7 @@ import dataclasses
 import functools
 import inspect
 import math
+import re
 import shutil
 import textwrap
 from collections.abc import Iterator
@@ -84,7 +85,9 @@ def _type_name(config: Any, field: FieldDescription) -> str:
     if dataclasses.is_dataclass(config):
         types = {each.name: each.type for each in dataclasses.fields(config)}
         found = types[field.name]
-        return found.__name__ if type(found) is type else str(found)
+        return found.__name__ if type(found) is type else re.sub(r"\b\w+\.(?=\w)", "", str(found))
+    if isinstance(field.value, np.ndarray):
+        return "list[float]"
     return "number, text or null" if field.value is None else type(field.value).__name__
 
 

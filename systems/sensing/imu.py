@@ -15,9 +15,10 @@ from splatpilot.systems.vehicle.state import QuadrotorState, pose_from_state
 
 @dataclass
 class Imu(Config):
-    """An IMU at the origin of the body, with its axes.
+    """An IMU at the origin of the body, with its axes; see `ImuSensor`.
 
-    The defaults are those of the ADIS16448 in the EuRoC data sets.
+    Its outputs are ``accelerometer`` (3) [m/s^2] and ``gyroscope`` (3) [rad/s]. The defaults are
+    those of the ADIS16448 in the EuRoC data sets.
     """
 
     # [Hz] Measurements per second.

@@ -16,7 +16,11 @@ from splatpilot.systems.sensing.imu import sample_generator
 
 @dataclass
 class RangeFinder(Config):
-    """A range finder at the origin of the body, which looks down."""
+    """A range finder at the origin of the body, which looks down by default; see
+    `RangeFinderSensor`.
+
+    Its output is ``range`` (1) [m].
+    """
 
     # Direction in body axes: x forward, y left, z up.
     direction: list[float] = bounded(lambda: [0.0, 0.0, -1.0], "(-inf, inf)")

@@ -13,7 +13,7 @@ function showLive(splats, {name, url, lower, upper, cut, fov_y}) {
   const panel = addPanel("live-panel", name);
   const picture = addElement(panel, "img", {id: "live-picture", hidden: true});
   addElement(panel, "div", {className: "part", textContent:
-    "Drag the vehicle or the goal with Ctrl and the mouse; further controls are on the right."});
+    "Drag the vehicle or the goal with Ctrl and the mouse. Open Controls has the other controls."});
   const status = document.getElementById("status-message");
   const connection = new WebSocket(url);
   connection.binaryType = "arraybuffer";
@@ -25,7 +25,10 @@ function showLive(splats, {name, url, lower, upper, cut, fov_y}) {
       picture.hidden = false;
     }
     // Meshcat serves files to its own page only.
-    else if (object?.object?.type !== "_meshfile_object") handle_message(message);
+    else if (object?.object?.type !== "_meshfile_object") {
+      handle_message(message);
+      if (object?.materials?.[0]?.vertexColors) viewer.scene_tree.object.traverse(unlight);
+    }
   };
   connection.onclose = () => { status.style.display = "block"; };
   viewer.connection = connection;
@@ -59,6 +62,18 @@ function showLive(splats, {name, url, lower, upper, cut, fov_y}) {
   slider.value = cut;
   slider.oninput();
   return views;
+}
+
+// Shows colored meshes, such as plans and distances, in their own colors: lights darken them.
+function unlight(mesh) {
+  if (mesh.material?.type !== "MeshPhongMaterial" || !mesh.material.vertexColors) return;
+  const {transparent, opacity, visible} = mesh.material, {color} = mesh.geometry.attributes;
+  for (let i = 0; i < color.count; ++i) {
+    const linear = new MeshCat.THREE.Color().fromBufferAttribute(color, i).convertSRGBToLinear();
+    color.setXYZ(i, linear.r, linear.g, linear.b);
+  }
+  mesh.material = new MeshCat.THREE.MeshBasicMaterial(
+    {vertexColors: true, side: MeshCat.THREE.DoubleSide, transparent, opacity, visible});
 }
 
 // The bytes of a picture, six in each number, the lowest first; the first number is their count.
