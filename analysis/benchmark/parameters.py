@@ -115,7 +115,8 @@ def _config_overrides(config: Any) -> tuple[str, list[str]]:
     """Returns the name of a configuration's policy, and the fields that are not its defaults."""
     entry = POLICIES.entry_for(config)
     what = f"a policy's configuration {type(config).__name__}"
-    require(type(config) is entry.config, what, "registered", "another type", "register_policy")
+    remedy = "register it by register_policy"
+    require(type(config) is entry.config, what, "registered", "another type", remedy)
     node, default = (yaml.compose(dump_config(each)) for each in (config, entry.config()))
     changed = dict(_differences(node, default, ()))
     changed.pop(entry.speed_field, None)
@@ -147,8 +148,8 @@ def _one_line(node: Any) -> str:
 
 
 def named_scenarios(scenario: Any) -> tuple[list[str], dict[str, Scenario]]:
-    """Returns the names of scenarios, and those that are given as such; these are named by their
-    worlds if they have no name."""
+    """Returns the names of scenarios, and the given `Scenario` objects by name; a single object is
+    named after its world."""
     if isinstance(scenario, Scenario):
         name = type(scenario.world).__name__.removesuffix("Config").lower()
         return [name], {name: scenario}

@@ -157,7 +157,7 @@ def AddFlight(
 
             A decision, such as "velocity", becomes an exported input of that name.
         plant: replaces `QuadrotorPlant`: any system with the input `command` (4) and the output
-            `state` (13). It starts as its default Context says, see `sample_initial_state`.
+            `state` (13). Its default Context has the initial state, see `sample_initial_state`.
         controller: replaces `FlatnessController`: any system with the input `state`, that for the
             policy's output, and the output `command`.
         estimator: makes the `state` (13) for policy and controller. Its inputs are any of `state`
@@ -292,7 +292,7 @@ def AddFlight(
 
 
 def _moving_bodies(builder: DiagramBuilder, parts: FlightParts) -> MovingBodies:
-    """Returns the system `moving` of a flight, which it adds at first."""
+    """Returns the system `moving` of a flight; adds it if it is missing."""
     name = "moving" if parts.name == "flight" else f"{parts.name}_moving"
     if builder.HasSubsystemNamed(name):
         return cast(MovingBodies, builder.GetSubsystemByName(name))
@@ -317,7 +317,7 @@ _RENAME = "rename the sensor, or give AddFlight another name"
 
 
 class DecisionInput(LeafSystem):
-    """Decides as its input says: a policy outside of the diagram.
+    """Passes the decision of a policy outside of the diagram from its input to its output.
 
     The input and the output have the name and size of one of `DECISIONS`.
     """

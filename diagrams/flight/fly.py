@@ -173,7 +173,8 @@ def run(
     sample_initial_state(scenario, world)  # Checks start and goal early.
 
     with contextlib.ExitStack() as stack:
-        meshcat = open_meshcat(scenario, world) if live else None
+        seen = randomize_appearance(world, scenario.appearance, scenario.seed)
+        meshcat = open_meshcat(scenario, seen) if live else None
         recording = stack.enter_context(written_atomically(rerun)) if rerun else None
         diagram = BuildFlightDiagram(
             scenario, world, meshcat, video=True, draw=draw, rerun=recording
@@ -197,12 +198,14 @@ def run(
 
 
 def _is_stopped() -> bool:
-    """Checks if Enter was pressed, or if nothing can be."""
+    """Checks if Enter was pressed, or standard input cannot be read."""
     try:
         stopped = bool(select.select([sys.stdin], [], [], 0)[0])
     except (OSError, ValueError):  # not a terminal
         return True
-    return stopped and (sys.stdin.readline(), True)[1]
+    if stopped:
+        sys.stdin.readline()
+    return stopped
 
 
 def _fly_and_write(

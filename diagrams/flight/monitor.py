@@ -51,7 +51,7 @@ class Outcome(enum.StrEnum):
 def _margins(
     state: np.ndarray, p_WG: np.ndarray, clearance: float, field_state: float, goal_radius: float
 ) -> dict[Outcome, float]:
-    """Returns what is left until each outcome; NaN is no margin."""
+    """Returns the margin to each outcome, [m] or [-], positive until it is reached; NaN is none."""
     return {
         Outcome.COLLISION: clearance,
         Outcome.LEFT_VOLUME: _KNOWN - field_state,
@@ -65,7 +65,7 @@ def _outcome(margins: dict[Outcome, float]) -> Outcome | None:
 
 
 class FlightMonitor(LeafSystem):
-    """Ends a flight at a collision, outside the known volume, at the goal, or after its time.
+    """Ends a flight at a collision, outside the known volume, at the goal, or at its timeout.
 
     .. pydrake_system::
 
@@ -99,7 +99,7 @@ class FlightMonitor(LeafSystem):
         self._witness = self.MakeWitnessFunction(
             "end",
             WitnessFunctionDirection.kPositiveThenNonPositive,
-            weak_callback(self._least_margin),
+            weak_callback(self._min_margin),
         )
         self.DeclarePerStepPublishEvent(self._check)
         self.DeclarePeriodicPublishEvent(scenario.timeout, scenario.timeout, self._check)
@@ -114,13 +114,13 @@ class FlightMonitor(LeafSystem):
         )
         radius = self.scenario.goal_radius
         margins = _margins(state, p_WG, clearance[0], field_state[0], radius)
-        end.set_value((min(m for m in margins.values() if m == m), _outcome(margins)))
+        end.set_value((min(m for m in margins.values() if not math.isnan(m)), _outcome(margins)))
 
     def _eval_end(self, context: Context) -> tuple[float, Outcome | None]:
         """Returns the least margin, and the outcome before the time is over."""
         return cast(Any, self.get_cache_entry(self._end_index).Eval(context))
 
-    def _least_margin(self, context: Context) -> float:
+    def _min_margin(self, context: Context) -> float:
         return self._eval_end(context)[0]
 
     def outcome(self, context: Context) -> Outcome | None:
@@ -169,10 +169,10 @@ def AddFlightMonitor(
     hypotheses: OutputPort | None = None,
     plan_period: float = LOG_PERIOD,
 ) -> FlightMonitor:
-    """Adds what `fly` needs: the system `monitor`, and its logs of state, command and clearance.
+    """Adds the system `monitor`, and the logs of state, command and clearance that `fly` reads.
 
     Args:
-        state: (13), the true one.
+        state: (13), the true one; command: (4).
         goal: (3) p_WG [m]; by default a source `goal` of the scenario's.
         collision: an `EsdfCollision`; by default one named `collision` of the world's field.
         hypotheses: plans to log, every `plan_period` [s].
