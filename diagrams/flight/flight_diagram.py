@@ -1,5 +1,6 @@
 """AddFlight and BuildFlightDiagram: the closed loop of vehicle, sensors, policy and controller."""
 
+import re
 from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import replace
@@ -418,9 +419,11 @@ def BuildFlightDiagram(
     except RuntimeError as error:
         if "algebraic loop" not in str(error):
             raise
+        ports = re.findall(r"\((\w+)\) of System ::(\S+)", str(error))
+        loop = " -> ".join(f"{system}.{port}" for port, system in ports)
         raise ValueError(
-            f"the given systems must not depend on their own outputs at the same instant, got "
-            f"{error}; declare the prerequisites of outputs, or hold one in a discrete state"
+            f"the systems must not depend on their own outputs at the same instant, got {loop}; "
+            "declare the prerequisites of outputs, or hold one in a discrete state"
         ) from None
     diagram.set_name("flight")
     return diagram

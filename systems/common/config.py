@@ -279,6 +279,8 @@ def _check_type(name: str, expected: Any, value: Any) -> None:
         _check_type(name, options[0], value)
     elif expected in TYPES:
         require(_converts(value, expected), name, TYPES[expected], _shortened(value))
+    elif expected is str:
+        require(not isinstance(value, dict | list), name, "text", _shortened(value))
 
 
 def _converts(value: Any, expected: type) -> bool:

@@ -398,10 +398,24 @@ def test_an_algebraic_loop_is_named(post_world):
             self.DeclareVectorInputPort("command", 4)
             self.DeclareVectorOutputPort("state", 13, lambda context, output: None)
 
-    with pytest.raises(ValueError, match="must not depend on their own outputs at the same"):
+    with pytest.raises(ValueError, match=r"must not depend on .* got .*policy\.command.*; declare"):
         BuildFlightDiagram(
             Scenario(), post_world, camera=False, policy=Hasty(), estimator=FromCommand()
         )
+
+
+def test_an_algebraic_loop_of_a_sensor_is_named(post_world, monkeypatch):
+    class OwnEcho(LeafSystem):
+        def __init__(self):
+            super().__init__()
+            self.DeclareVectorInputPort("echo_sum", 1)
+            self.DeclareVectorOutputPort("sum", 1, lambda context, output: None)
+
+    entry = SensorEntry(EchoConfig, lambda config, world, scenario: OwnEcho())
+    monkeypatch.setitem(SENSORS._entries, "EchoConfig", entry)
+    scenario = Scenario(sensors={"echo": EchoConfig()})
+    with pytest.raises(ValueError, match=r"got echo\.echo_sum -> echo\.sum -> echo\.echo_sum; dec"):
+        BuildFlightDiagram(scenario, post_world, camera=False)
 
 
 @dataclasses.dataclass

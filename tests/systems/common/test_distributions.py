@@ -84,6 +84,7 @@ def test_worlds_pickle_and_compare_by_configuration_and_seed():
         ("seed=!Uniform {min: 1, max: 2}", "seed must be one value, got !Uniform {min: 1.0, max"),
         ("world=!Uniform {min: 1, max: 2}", "world must be one value"),
         ("camera.fps=!Uniform {min: 1, max: 2}", "camera.fps must be a number, got !Uniform"),
+        ("simulator.integration_scheme=!Uniform {min: 0, max: 1}", "scheme must be text, got !Uni"),
         ("simulator.use_error_control=!UniformDiscrete {values: [0]}", "must be true or false"),
         (
             "world.rocks=!Uniform {min: 1, max: 2}",
