@@ -51,7 +51,7 @@ class Outcome(enum.StrEnum):
 def _margins(
     state: np.ndarray, p_WG: np.ndarray, clearance: float, field_state: float, goal_radius: float
 ) -> dict[Outcome, float]:
-    """Returns the margin to each outcome, [m] or [-], positive until it is reached. NaN has no sign."""
+    """Returns the margin to each outcome, [m] or [-], positive until it is reached, or NaN."""
     return {
         Outcome.COLLISION: clearance,
         Outcome.LEFT_VOLUME: _KNOWN - field_state,
