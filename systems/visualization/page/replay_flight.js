@@ -110,6 +110,8 @@ class ReplayFlight {
     const positions = [], colors = [], halfWidth = 0.012;
     waypoints_W.forEach((waypoints, k) => {
       const share = (costs[k] - lowest) / span;
+      const color = new THREE.Color(Math.min(1, 2 * share), Math.min(1, 2 * (1 - share)), 0.1)
+        .convertSRGBToLinear();
       let a = p_WB;
       for (const b of waypoints) {
         if (eye.distanceTo(new THREE.Vector3(...a)) < nearest) {
@@ -125,7 +127,7 @@ class ReplayFlight {
         ];
         for (const corner of [0, 1, 2, 0, 2, 3]) {
           positions.push(...corners[corner]);
-          colors.push(Math.min(1, 2 * share), Math.min(1, 2 * (1 - share)), 0.1);
+          colors.push(color.r, color.g, color.b);
         }
         a = b;
       }
