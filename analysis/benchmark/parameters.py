@@ -13,7 +13,7 @@ from splatpilot.analysis.benchmark.rollout import MakeSystem
 from splatpilot.analysis.benchmark.variants import LIVE, SCENARIO, default_label
 from splatpilot.diagrams.flight.policies import POLICIES, policy_name, policy_speed
 from splatpilot.diagrams.flight.scenario import Scenario
-from splatpilot.systems.common.config import dump_config
+from splatpilot.systems.common.config import dump_config, yaml_line
 from splatpilot.systems.common.distributions import distribution_text, draw, is_distribution
 from splatpilot.systems.common.validation import require
 
@@ -74,8 +74,7 @@ def _text(value: Any) -> str:
         return distribution_text(value)
     plain = value.tolist() if isinstance(value, np.ndarray | np.generic) else value
     plain = str(plain) if isinstance(plain, Path) else plain
-    text = yaml.safe_dump(plain, default_flow_style=True, width=math.inf)
-    return text.removesuffix("...\n").strip()
+    return yaml_line(plain)
 
 
 def policy_texts(policies: Any) -> tuple[list[str], dict[str, MakeSystem], list[float]]:

@@ -21,18 +21,18 @@ from pydrake.systems.framework import (
 )
 from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
 
+from splatpilot.diagrams.flight.blocks import AddMovingBodies
 from splatpilot.diagrams.flight.scenario import Scenario, goal_position, sample_scenario
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf_collision import EsdfCollision
 from splatpilot.systems.common.drake import ByValues, connect, vector_output, weak_callback
 from splatpilot.systems.messaging.flight_limits import LEVEL
-from splatpilot.systems.splats.moving_bodies import MovingBodies
 from splatpilot.systems.vehicle.state import QuadrotorState
 
 LOG_PERIOD = 0.02  # [s]
-_TOUCH = 0.03  # [m] max clearance of a landed vehicle, and
-_TOUCHDOWN_SPEED = 0.8  # [m/s] its max speed.
+_TOUCH = 0.03  # [m] max clearance of a landed vehicle
+_TOUCHDOWN_SPEED = 0.8  # [m/s] max speed of a landed vehicle
 _KNOWN = FieldState.UNKNOWN - 0.5  # Field states in the known volume are below.
 
 
@@ -117,7 +117,7 @@ class FlightMonitor(LeafSystem):
         end.set_value((min(m for m in margins.values() if not math.isnan(m)), _outcome(margins)))
 
     def _eval_end(self, context: Context) -> tuple[float, Outcome | None]:
-        """Returns the least margin, and the outcome before the time is over."""
+        """Returns the minimum margin, and the outcome other than a timeout."""
         return cast(Any, self.get_cache_entry(self._end_index).Eval(context))
 
     def _min_margin(self, context: Context) -> float:
@@ -182,9 +182,7 @@ def AddFlightMonitor(
         collision = EsdfCollision(world.distance_field)
         builder.AddNamedSystem("collision", collision)
         if world.moving:
-            bodies = MovingBodies(world.moving)
-            builder.AddNamedSystem("moving", bodies)
-            builder.Connect(bodies.moving_output_port(), collision.GetInputPort("moving"))
+            AddMovingBodies(builder, world, [collision])
         connect(builder, state, collision.GetInputPort("state"))
     if goal is None:
         source = ConstantVectorSource(goal_position(scenario, world))
@@ -235,7 +233,7 @@ def flight_outcome(
 
 
 def has_landed(diagram: Diagram, context: Context) -> bool:
-    """Checks if the vehicle touches a level surface, slowly."""
+    """Checks if the vehicle touches a level surface at less than 0.8 m/s."""
     v_WB = QuadrotorState.of(vector_output(diagram, "state", context)).v_WB
     return bool(
         vector_output(diagram, "clearance", context)[0] < _TOUCH

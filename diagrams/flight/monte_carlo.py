@@ -34,7 +34,7 @@ def random_flights(
     with it, see `FlightMonitor`.
 
     Args:
-        scenario: of the flights, but for its seed.
+        scenario: of the flights; each replaces its seed.
         world: of all flights; by default made of each seed, which is slow.
         systems: arguments of `BuildFlightDiagram` such as `policy="velocity"`; functions of
             scenario and world make a system for each flight.

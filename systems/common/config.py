@@ -8,11 +8,13 @@ import copy
 import dataclasses
 import re
 from collections.abc import Callable, Sequence
+from math import inf
 from pathlib import Path
 from textwrap import indent
 from types import NoneType, UnionType
 from typing import Any, Union, cast, get_args, get_origin
 
+import yaml
 from pydrake.common.yaml import yaml_load_data, yaml_load_typed
 
 from splatpilot.systems.common.distributions import (
@@ -133,6 +135,12 @@ def parse_config[Configuration](
 def dump_config(config: Any) -> str:
     """Returns a configuration as YAML with every field."""
     return dump_with_distributions(config)
+
+
+def yaml_line(value: Any) -> str:
+    """Returns a plain value as YAML in one line."""
+    text: str = yaml.safe_dump(value, default_flow_style=True, width=inf)
+    return text.removesuffix("...\n").strip()
 
 
 def is_configuration(value: Any) -> bool:

@@ -4,7 +4,6 @@ import ast
 import dataclasses
 import functools
 import inspect
-import math
 import re
 import shutil
 import textwrap
@@ -13,9 +12,8 @@ from itertools import zip_longest
 from typing import Any
 
 import numpy as np
-import yaml
 
-from splatpilot.systems.common.config import RegistryField, is_configuration
+from splatpilot.systems.common.config import RegistryField, is_configuration, yaml_line
 from splatpilot.systems.common.registry import Registry
 
 
@@ -74,9 +72,7 @@ def _described(config: Any, prefix: str) -> Iterator[tuple[str, str]]:
             yield from _described(field.value, f"{name}.")
         else:
             plain = field.value.tolist() if isinstance(field.value, np.ndarray) else field.value
-            text = yaml.safe_dump(plain, default_flow_style=True, width=math.inf)
-            text = text.removesuffix("...\n").strip()
-            yield f"{name}={text}  ({_type_name(config, field)})", field.text
+            yield f"{name}={yaml_line(plain)}  ({_type_name(config, field)})", field.text
 
 
 def _type_name(config: Any, field: FieldDescription) -> str:
