@@ -24,6 +24,7 @@ _USES = {
     "mocap": "OptiTrack in `splatpilot hardware px4`",
     "photos": "photographs without poses, and COLMAP models",
     "px4": "`splatpilot hardware px4`",
+    "rerun": "`splatpilot fly --rerun`",
     "tensorboard": "curves in TensorBoard",
     "train": "training, reconstruction and metrics of scenes",
     "ros": "captures in ROS bags",

@@ -73,8 +73,8 @@ def AddMovingBodies(
 
 
 def ExportCollision(builder: DiagramBuilder, collision: System) -> None:
-    """Exports `clearance`, `gradient`, `in_collision` and `field_state`."""
-    for name in ("clearance", "gradient", "in_collision", "field_state"):
+    """Exports `clearance`, `barrier`, `gradient`, `in_collision` and `field_state`."""
+    for name in ("clearance", "barrier", "gradient", "in_collision", "field_state"):
         builder.ExportOutput(collision.GetOutputPort(name), name)
 
 

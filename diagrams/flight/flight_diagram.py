@@ -31,6 +31,7 @@ from splatpilot.diagrams.flight.blocks import (
     AddSensors,
     ConnectObservation,
     ConnectOrExport,
+    ExportCollision,
     add_system,
     decision_period,
     make_policy,
@@ -339,8 +340,6 @@ def ExportFlight(builder: DiagramBuilder, parts: FlightParts) -> None:
     """Exports the ports of a flight as `BuildFlightDiagram` names them."""
     outputs = {"state": parts.state, "command": parts.command}
     outputs["outcome"] = parts.monitor.get_output_port()
-    for name in ("clearance", "barrier", "gradient", "in_collision", "field_state"):
-        outputs[name] = parts.collision.GetOutputPort(name)
     if parts.decision.get_name() == "hypotheses":
         outputs["hypotheses"] = parts.decision
     if parts.camera is not None:
@@ -351,6 +350,7 @@ def ExportFlight(builder: DiagramBuilder, parts: FlightParts) -> None:
     outputs |= {f"observation_{name}": port for name, port in parts.observation.items()}
     for name, port in (outputs | parts.measured).items():
         builder.ExportOutput(port, name)
+    ExportCollision(builder, parts.collision)
     ConnectOrExport(builder, parts.plant, {}, "plant")
 
 

@@ -85,7 +85,7 @@ def BuildHardwareDiagram(
         name: hardware
         input_ports: [overruns, lag]
         output_ports: [state, command, hypotheses, color_image, depth_image_32f, clearance,
-            gradient, in_collision, field_state, velocity_setpoint, status, in_charge]
+            barrier, gradient, in_collision, field_state, velocity_setpoint, status, in_charge]
 
     `status` and `overruns` are those of `BridgeStatus`; `command`, `velocity_setpoint`, `in_charge`
     and `lag` those of `Failsafe`; the others those of `BuildFlightDiagram`. The scenario's vehicle

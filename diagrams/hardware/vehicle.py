@@ -47,7 +47,8 @@ def BuildVehicleDiagram(
     .. pydrake_system::
 
         name: vehicle
-        output_ports: [state, command, command_age, clearance, gradient, in_collision, field_state]
+        output_ports: [state, command, command_age, clearance, barrier, gradient, in_collision,
+            field_state]
 
     The ports are those of `BuildFlightDiagram`; `command_age` [s] is infinite before the first
     command.
