@@ -16,7 +16,7 @@ from splatpilot.diagrams.worlds.moving_spheres import MovingSphere
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import WORLDS, WorldConfig
 from splatpilot.systems.collision.distance_field import FieldState
-from splatpilot.systems.common.config import dump_config, registry_field
+from splatpilot.systems.common.config import dump_config, equal_by_fields, registry_field
 from splatpilot.systems.common.distributions import pickle_by_fields, sample_distributions
 from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.common.validation import (
@@ -110,12 +110,7 @@ class Scenario(Config):
     controller: FlatnessControllerConfig = field(default_factory=FlatnessControllerConfig)
     simulator: SimulatorConfig = field(default_factory=_default_simulator)
 
-    def __eq__(self, other: object) -> bool:
-        """Compares all fields; Drake's configurations compare by identity."""
-        if type(other) is not type(self):
-            return NotImplemented
-        return dump_config(self) == dump_config(other)
-
+    __eq__ = equal_by_fields
     __hash__ = None  # pyright: ignore
 
     def __repr__(self) -> str:

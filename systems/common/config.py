@@ -137,6 +137,11 @@ def dump_config(config: Any) -> str:
     return dump_with_distributions(config)
 
 
+def equal_by_fields(config: Any, other: object) -> bool:
+    """Compares two configurations by all fields; Drake's types compare by identity."""
+    return type(other) is type(config) and dump_config(config) == dump_config(other)
+
+
 def yaml_line(value: Any) -> str:
     """Returns a plain value as YAML in one line."""
     text: str = yaml.safe_dump(value, default_flow_style=True, width=inf)

@@ -9,7 +9,7 @@ from pydrake.common.schema import Rotation, Transform
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.sensors import CameraInfo
 
-from splatpilot.systems.common.config import dump_config
+from splatpilot.systems.common.config import equal_by_fields
 from splatpilot.systems.common.validation import Config, bounded, require_field
 from splatpilot.systems.splats.lens import Distortion
 
@@ -50,12 +50,7 @@ class OnboardCamera(Config):
     }
     """Fields of former versions, and those that replace them."""
 
-    def __eq__(self, other: object) -> bool:
-        """Compares all fields; Drake's transforms compare by identity."""
-        if type(other) is not type(self):
-            return NotImplemented
-        return dump_config(self) == dump_config(other)
-
+    __eq__ = equal_by_fields
     __hash__ = None  # pyright: ignore
 
     def check(self) -> None:

@@ -1,4 +1,4 @@
-"""How flights end in Drake's own simulations, and in diagrams wired by hand."""
+"""Ends of flights: in Drake's own simulations, and in diagrams wired by hand."""
 
 import numpy as np
 import pytest
