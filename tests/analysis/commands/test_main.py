@@ -151,7 +151,7 @@ def test_help_and_refusals_import_nothing_heavy(words, status, tmp_path):
         "train diffaero --out run",
         "recover student_rgb --out run",
         "corpus make --out corpus --worlds 2",
-        "scene fetch forest_splat --out scenes",
+        "library make forest_splat --out scenes",
         "reconstruct . --out scene",
         "scene ablate . --out study",
         "scene fidelity . --out study",
