@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 from splatpilot.analysis.commands import options as cli
-from splatpilot.diagrams.worlds.splits import SPLITS
 from splatpilot.systems.common.files import data_folder, require_existing, scenes_folder
 
 _OUT = cli.out_option("folder of scenes (default: $SPLATPILOT_SCENES, or scenes)", required=False)
@@ -15,7 +14,9 @@ _OUT = cli.out_option("folder of scenes (default: $SPLATPILOT_SCENES, or scenes)
     "library make",
     cli.Option("names", "hospital, cafe, ... (default: all)", nargs="*", metavar="NAME"),
     cli.Option("--data", "folder of captures, meshes and maps (default: $SPLATPILOT_DATA)", Path),
-    cli.Option("--split", "only environments of this split", choices=SPLITS),
+    cli.Option(
+        "--split", "only environments of this split", choices=("train", "validation", "test")
+    ),
     _OUT,
     cli.set_option(
         *("iterations=3000", "render.spacing=1"),
