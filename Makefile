@@ -7,12 +7,16 @@ BUILT_FROM := pyproject.toml CMakeLists.txt $(shell find native -type f)
 SPLATPILOT := .venv/bin/splatpilot
 NATIVE := $(shell find native -name '*.hpp' -o -name '*.cpp')
 
-.PHONY: fly test lint docs stub messages sanitize nightly clean
+.PHONY: fly test pytest lint docs stub messages sanitize nightly clean
 
 fly: .venv/flying
 	$(SPLATPILOT) fly --out out/fly --overwrite
 
-test: lint
+# Pyright has one thread, which the tests need not wait for.
+test: .venv/installed
+	+@$(MAKE) --no-print-directory --jobs=2 --output-sync=target lint pytest
+
+pytest: .venv/installed
 	OMP_NUM_THREADS=1 .venv/bin/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 
 lint: .venv/installed
