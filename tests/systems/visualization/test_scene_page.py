@@ -12,7 +12,7 @@ from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.visualization.meshcat_drawing import draw_box
 from splatpilot.systems.visualization.pages import CapturedImages, ViewerScene, scene_page
 
-WIDTH, HEIGHT = 240, 180
+WIDTH, HEIGHT = 480, 360
 UPPER = np.array([6.0, 4.0, 2.5])  # [m], of the room, whose lower corner is in the origin
 K = np.array([[60.0, 0, 60], [0, 60.0, 45], [0, 0, 1]])
 R_WC = RotationMatrix(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]))  # looking along x, level
@@ -20,7 +20,7 @@ X_WCS = [RigidTransform(R_WC, [0.5 + i, 2.0, 1.2]) for i in range(3)]
 SHADES = ((40, 40, 200), (40, 200, 40), (200, 40, 40))  # of the images, blue first
 
 
-def disks(step: float = 0.12) -> GaussianScene:
+def disks(step: float = 0.08) -> GaussianScene:
     """Walls, floor and ceiling of the room, in waves of gray, as flat disks."""
     means, quats = [], []
     turns = [(0.5**0.5, 0, 0.5**0.5, 0), (0.5**0.5, 0.5**0.5, 0, 0), (1, 0, 0, 0)]
