@@ -53,14 +53,15 @@ nightly: sanitize
 clean:
 	rm -rf .venv build
 
-# What flies, and then what trains, reconstructs and checks too.
+# What flies, and then what trains, reconstructs and checks too: with EXTRAS, it downloads while it compiles.
 .venv/flying: $(BUILT_FROM)
 	@test -n "$(PYTHON)" || { echo "No Python 3.12 or newer found; install one, or name it: make PYTHON=/path/to/python3.12" >&2; exit 1; }
 	$(PYTHON) -m venv .venv
 	.venv/bin/python -m pip install --quiet uv
-	.venv/bin/uv pip install --python .venv/bin/python --editable .
+	.venv/bin/uv pip install --python .venv/bin/python --editable '.$(EXTRAS)'
 	touch $@
 
+.venv/installed: EXTRAS := [dev]
 .venv/installed: .venv/flying
-	.venv/bin/uv pip install --python .venv/bin/python --compile-bytecode --requirements pyproject.toml --extra dev
+	.venv/bin/uv pip install --python .venv/bin/python --requirements pyproject.toml --extra dev
 	touch $@
