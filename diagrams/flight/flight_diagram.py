@@ -24,6 +24,7 @@ from pydrake.systems.sensors import CameraConfig, CameraInfo
 
 from splatpilot.diagrams.flight.blocks import (
     DECISIONS,
+    AddDelayedPose,
     AddMovingBodies,
     AddObservation,
     AddPolicyAndController,
@@ -55,7 +56,7 @@ from splatpilot.systems.common.drake import connect
 from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.common.validation import require, require_type
 from splatpilot.systems.policies.teleop import Teleop
-from splatpilot.systems.sensing.latency import DelayedPose, FrameTimes
+from splatpilot.systems.sensing.latency import FrameTimes
 from splatpilot.systems.splats.background import Background, mean_color
 from splatpilot.systems.splats.moving_bodies import MovingBodies
 from splatpilot.systems.splats.splat_camera import SplatCamera
@@ -242,10 +243,8 @@ def AddFlight(
         builder.AddNamedSystem("camera", onboard)
         seen_from, delay = pose, scenario.camera.output_delay
         if delay > 0.0:
-            delayed = DelayedPose(FrameTimes.late(delay))
-            builder.AddNamedSystem("camera_delayed_pose", delayed)
-            builder.Connect(state, delayed.GetInputPort("state"))
-            seen_from = delayed.GetOutputPort("pose")
+            frames = FrameTimes.late(delay)
+            seen_from = AddDelayedPose(builder, "camera_delayed_pose", state, frames)
         builder.Connect(seen_from, onboard.GetInputPort("body_pose"))
 
     # End and logs.
