@@ -9,8 +9,8 @@ from pathlib import Path
 import yaml
 
 from splatpilot.diagrams.worlds import splits
+from splatpilot.diagrams.worlds.mesh import mesh_digests
 from splatpilot.training.captures.capture_registry import read_capture
-from splatpilot.training.captures.mesh_renderer import mesh_digests
 
 SOURCES = {
     "hospital": "tartanair/hospital",
