@@ -10,8 +10,8 @@ import yaml
 
 from splatpilot.analysis.environments import known_entries
 from splatpilot.diagrams.worlds import splits
+from splatpilot.diagrams.worlds.mesh import mesh_digests
 from splatpilot.training.captures.capture_registry import read_capture
-from splatpilot.training.captures.mesh_renderer import mesh_digests
 
 
 def table(data: Path) -> dict[str, list[str]]:
