@@ -8,7 +8,7 @@ import pytest
 from gymnasium.spaces import Box
 from pydrake.common.schema import Rotation, Transform
 from pydrake.common.value import Value
-from pydrake.geometry import Meshcat
+from pydrake.geometry import Meshcat, SceneGraph
 from pydrake.gym import DrakeGymEnv
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantVectorSource
@@ -550,3 +550,28 @@ def test_live_controls_drag_the_goal_and_push_the_vehicle_of_a_flight(post_world
         np.testing.assert_allclose(goal, np.add(post_world.p_WG, [0, 0, raised]), atol=1e-6)
     np.testing.assert_allclose(flown["goal"], flown[""], atol=1e-9)
     assert flown["plant"][2] > flown[""][2] + 0.05
+
+
+def test_flights_share_a_scene_graph(post_world):
+    builder = DiagramBuilder()
+    scene_graph = builder.AddSystem(SceneGraph())
+    starts = {"flight": [1.0, 0, 2], "other": [1.0, 2, 2]}
+    flights = [
+        AddFlight(
+            builder,
+            Scenario(start=start, start_radius=0.0),
+            post_world,
+            name=name,
+            camera=False,
+            scene_graph=scene_graph,
+        )
+        for name, start in starts.items()
+    ]
+    diagram = builder.Build()
+    assert scene_graph.HasRenderer("splats")
+    context = diagram.CreateDefaultContext()
+    query = scene_graph.get_query_output_port()
+    query = query.Eval(scene_graph.GetMyContextFromRoot(context))
+    for flight, start in zip(flights, starts.values(), strict=True):
+        frame = flight.geometry.get_frame_id()
+        np.testing.assert_allclose(query.GetPoseInWorld(frame).translation(), start)
