@@ -14,7 +14,7 @@ fly: .venv/flying
 
 # Pyright has one thread, which the tests need not wait for.
 test: .venv/installed
-	+@$(MAKE) --no-print-directory --jobs=2 --output-sync=target lint pytest
+	+@$(MAKE) --no-print-directory --jobs=2 lint pytest
 
 pytest: .venv/installed
 	OMP_NUM_THREADS=1 .venv/bin/python -m pytest -n auto --dist loadfile --no-loadscope-reorder

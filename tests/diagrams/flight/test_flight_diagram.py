@@ -459,7 +459,7 @@ def test_an_input_that_a_sensor_cannot_have_is_named(post_world, monkeypatch):
 
     entry = SensorEntry(EchoConfig, lambda config, world, scenario: Gust())
     monkeypatch.setitem(SENSORS._entries, "EchoConfig", entry)
-    with pytest.raises(ValueError, match=r"input 'wind' of the sensor 'gust' Gust; there are"):
+    with pytest.raises(ValueError, match=r"of the sensor 'gust' Gust must be one of .* got 'wind'"):
         flown(Scenario(sensors={"gust": EchoConfig()}), post_world)
 
 

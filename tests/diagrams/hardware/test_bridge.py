@@ -238,7 +238,7 @@ def test_signals_without_messages_are_refused(post_world):
         BuildHardwareDiagram(Scenario(sensors={"down": OnboardCamera()}), post_world, transport)
     moving = dataclasses.replace(post_world, moving=object())
     for build in (BuildHardwareDiagram, BuildVehicleDiagram):
-        with pytest.raises(ValueError, match="moving obstacles in post"):
+        with pytest.raises(ValueError, match="world post must be without moving"):
             build(Scenario(), moving, transport)
     with pytest.raises(ValueError, match=r"tick must be in .* got 0.0"):
         BuildHardwareDiagram(Scenario(), post_world, transport, HardwareConfig(tick=0.0))
