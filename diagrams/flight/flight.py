@@ -20,11 +20,14 @@ from splatpilot.diagrams.flight.monitor import FlightMonitor, Outcome, flight_mo
 from splatpilot.diagrams.flight.scenario import (
     Scenario,
 )
+from splatpilot.diagrams.worlds.observed_routes import ObservedViews
+from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.common.config import dump_config
 from splatpilot.systems.common.files import written_atomically
 from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.common.validation import require
-from splatpilot.systems.vehicle.state import QuadrotorState
+from splatpilot.systems.sensing.onboard_camera import OnboardCamera
+from splatpilot.systems.vehicle.state import QuadrotorState, pose_from_state
 from splatpilot.systems.visualization.live import RESTART
 
 _ACCURACY = 3e-4  # of the Context: a flight ends within 1e-7 s, less than a micrometer.
@@ -44,6 +47,8 @@ class Flight:
     # without plans.
     hypotheses: np.ndarray
     wall_time: float  # [s] that the simulation took after its initialization
+    # Mean fraction of the policy's view without an observed surface; NaN if it is not known.
+    unobserved: float = math.nan
     reason: str = ""  # of the outcome `ERROR`: when and where which exception was raised
 
     def summary(self) -> dict[str, float | str]:
@@ -58,7 +63,9 @@ class Flight:
             "mean_speed_m_s": path_length / duration if duration > 0 else 0.0,
             "min_clearance_m": float(np.nanmin(self.clearances)),
             "real_time_factor": duration / self.wall_time,
-        } | ({"reason": self.reason} if self.reason else {})
+            **({} if math.isnan(self.unobserved) else {"unobserved_fraction": self.unobserved}),
+            **({"reason": self.reason} if self.reason else {}),
+        }
 
     def __repr__(self) -> str:
         return (
@@ -182,7 +189,9 @@ def fly_all(
                 if ended is not None:
                     wall_time = time.perf_counter() - started
                     prefix = name.removesuffix("monitor")
-                    flights[name] = record_flight(parent, root, ended, wall_time, prefix)
+                    flight = record_flight(parent, root, ended, wall_time, prefix)
+                    fraction = unobserved_fraction(system.scenario, system.world, flight.states)
+                    flights[name] = replace(flight, unobserved=fraction)
 
     simulator.Initialize()
     started = time.perf_counter()
@@ -243,6 +252,20 @@ def _next_time(monitor: FlightMonitor, root: Context) -> float:
     margin = monitor.margin(monitor.GetMyContextFromRoot(root))
     duration = margin / (margin - beyond) * (end - now)
     return min(now + duration + (-_CLOSE if duration > 2 * _CLOSE else _CLOSE), end)
+
+
+_MAX_VIEWS = 60  # of a flight
+
+
+def unobserved_fraction(scenario: Scenario, world: World, states: np.ndarray) -> float:
+    """Returns the mean fraction of `ObservedViews` along states (N, 13), for the camera of the
+    scenario's policy; NaN for a world that is not captured, or of an older scene."""
+    if world.observations is None and not world.num_frontier:
+        return math.nan
+    camera = getattr(scenario.policy, "camera", None) or OnboardCamera()
+    views = ObservedViews(world, camera)
+    rows = np.linspace(0, len(states) - 1, min(_MAX_VIEWS, len(states))).astype(int)
+    return float(np.mean([views.unobserved(pose_from_state(state)) for state in states[rows]]))
 
 
 _START = "build the plant with sample_initial_state(scenario, world)"
