@@ -22,8 +22,8 @@ RECIPES: dict[str, tuple[str, ...]] = {
         *("worlds/warehouse.gltf", "render.up=z", "initial_gaussians=430000", "means_rate=4e-5"),
     ),
     "hospital_building": (
-        *("worlds/hospital_building.gltf", "render.up=z", "render.highest=2.0", "render.apart=6"),
-        *("render.spacing=1.4", "initial_gaussians=1000000", "iterations=10000", "means_rate=4e-5"),
+        *("worlds/hospital_building.gltf", "render.up=z", "render.highest=2.0"),
+        *("initial_gaussians=1000000", "iterations=10000", "means_rate=4e-5"),
     ),
     "forest_splat": ("P02",),
     "alley_splat": ("P09",),
