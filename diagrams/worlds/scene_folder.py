@@ -42,7 +42,7 @@ from splatpilot.systems.common.readers import error_summary, read_text, yaml_err
 from splatpilot.systems.common.validation import Config, bounded, require, require_field
 from splatpilot.systems.splats.background import FAR, Background, EnvironmentMap, mean_color
 from splatpilot.systems.splats.scene import GaussianScene
-from splatpilot.systems.splats.splat_files import read_ply, read_splats, write_ply
+from splatpilot.systems.splats.splat_files import read_ply, read_splats, sog_meta, write_ply
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
 FORMAT_VERSION = 2
@@ -137,7 +137,8 @@ _MAX_VOXEL = 0.25  # [m], at which a vehicle of 0.354 m radius still finds a rou
 def read_scene(path: str | Path) -> World:
     """Reads a scene folder, or a file of Gaussians alone, see `read_splats`."""
     path = Path(path)
-    return read_scene_folder(path) if path.is_dir() else _read_bare_gaussians(path)
+    is_scene = path.is_dir() and sog_meta(path) is None
+    return read_scene_folder(path) if is_scene else _read_bare_gaussians(path)
 
 
 def read_scene_folder(path: str | Path, *, metric: bool = True) -> World:
@@ -242,7 +243,7 @@ def _read_bare_gaussians(path: Path) -> World:
 class SceneSource(Config):
     """An environment on disk."""
 
-    # A scene folder, or a file of Gaussians (PLY, SPZ or .splat): here, or in the folder of the
+    # A scene folder, or a file of Gaussians (see `read_splats`): here, or in the folder of the
     # environment variable SPLATPILOT_SCENES, by default `scenes`.
     path: str = ""
     # How to get the scene, for the error if it is missing.
