@@ -185,7 +185,7 @@ def rescale(scene: Path, out: Path, factor: float) -> RescaleSummary:
         provenance=f"{metadata.provenance}, scaled by {factor:.6g}",
         **{name: getattr(about, name) for name in _KEPT},
     )
-    details = {"shortest path [m]": f"{geodesic:.1f}"}
+    details = {"shortest path [m]": f"{geodesic:.1f}"} if math.isfinite(geodesic) else {}
     size = field.upper_W - field.lower_W
     return RescaleSummary(out, factor, size, details, (*warnings, *unflyable))
 

@@ -62,7 +62,7 @@ class ReconstructSummary:
     field: Esdf
     p_WS: NDArray[np.float64]  # (3,) [m]
     p_WG: NDArray[np.float64]  # (3,) [m]
-    geodesic: float  # [m], shortest path from start to goal
+    geodesic: float  # [m], shortest path from start to goal; NaN if the scene cannot be flown in
     held_out: HeldOutMetrics | None = None
     notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
@@ -84,8 +84,9 @@ class ReconstructSummary:
             "corner brightness": f"{np.exp(self.vignetting):.3f}",
         }
         if self.metric:
+            rows["seen free [m^3]"] = f"{self.field.volume(FieldState.FREE):.1f}"
+        if np.isfinite(self.geodesic):
             rows |= {
-                "seen free [m^3]": f"{self.field.volume(FieldState.FREE):.1f}",
                 "default start [m]": vector(self.p_WS),
                 "default goal [m]": vector(self.p_WG),
                 "shortest path [m]": f"{self.geodesic:.1f}",
