@@ -25,8 +25,10 @@ class ReconstructConfig(Config):
     initialization: str = bounded("auto", "{auto, depth, points, random}")
     """Initial positions: surfaces from "depth", "points" of structure from motion, or "random" in
     the cameras' views; "auto" takes the first that the capture has."""
-    initial_gaussians: int = bounded(120_000, "[1, inf)")
-    """Maximum number of initial Gaussians."""
+    initial_gaussians: int = bounded(0, "[0, inf)")
+    """Maximum number of initial Gaussians. 0 takes as many as shape and texture need at the
+    resolution of the closest images, at most 1,000,000, if they start from depth, and 120,000 if
+    they start at random."""
     max_gaussians: int = bounded(180_000, "[1, inf)")
     """Maximum number of Gaussians. Without iterations, it sets how finely texture is resolved."""
     split: str = bounded("", "{, train, validation, test}")
