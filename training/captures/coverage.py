@@ -127,7 +127,7 @@ def _count(patch: NDArray, direction: NDArray, size: int) -> NDArray[np.intp]:
 def _free_space(
     esdf: Esdf, heights: tuple[float, float], clearance: float, inside: NDArray | None
 ) -> tuple[NDArray[np.float64], float]:
-    """Returns the nodes (N, 3) [m] of the space in which the camera moves, and their spacing [m]."""
+    """Returns the nodes (N, 3) [m] of the space in which the camera moves, and their spacing."""
     extent = esdf.upper_W - esdf.lower_W
     spacing = max(esdf.voxel_size, 0.2, float(np.cbrt(np.prod(extent) / _MAX_NODES)))
     shape = np.maximum((extent / spacing).astype(int), 1)
