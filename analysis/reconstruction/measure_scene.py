@@ -2,12 +2,11 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydrake.math import RigidTransform, RollPitchYaw
 
 from splatpilot.analysis.reconstruction.figures import (
     Panel,
@@ -17,15 +16,13 @@ from splatpilot.analysis.reconstruction.figures import (
     error_scale,
     write_grid,
 )
-from splatpilot.diagrams.flight.flight_diagram import MakeCamera
-from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.worlds import scene_folder
+from splatpilot.diagrams.worlds.observed_routes import ObservedViews
 from splatpilot.systems.common.files import require_unused, written_atomically
 from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.policies.time_of_arrival import time_of_arrival
 from splatpilot.systems.splats.background import RenderedView, put_behind
-from splatpilot.systems.splats.scene import color_to_sh
 from splatpilot.systems.splats.splat_files import read_ply
 from splatpilot.training.captures.capture import Capture, CaptureFrame, shrink, shrink_factor
 from splatpilot.training.captures.capture_registry import read_scene_capture
@@ -285,8 +282,8 @@ def _write_views(path: Path, views: SceneViews, metrics: SceneMetrics) -> None:
 
 
 def unseen_fraction(scene: Path) -> float | None:
-    """Returns the mean fraction of the onboard camera's pixels that show the frontier, looking
-    ahead along the route from start to goal; None without a route."""
+    """Returns the mean fraction of `ObservedViews` along the route from start to goal; None without
+    a route."""
     metadata = scene_folder.read_scene_metadata(scene)
     if not metadata.metric:
         return None
@@ -297,25 +294,12 @@ def unseen_fraction(scene: Path) -> float | None:
         return None
     if not toa.is_reachable(world.p_WS):
         return None
-    if not metadata.frontier:
-        return 0.0
-    seen, frontier = (
-        replace(gaussians, sh=np.full((len(gaussians), 1, 3), color_to_sh(gray), np.float32))
-        for gaussians, gray in (
-            (read_ply(scene / "gaussians.ply"), 0.0),
-            (read_ply(scene / scene_folder.FRONTIER), 1.0),
-        )
-    )
-    painted = seen.merged_with(frontier)
-    camera = MakeCamera(Scenario(), replace(world, gaussians=painted, background=(0.0, 0.0, 0.0)))
     # Points beyond the goal are the goal, without direction.
     reach = float(toa.value(world.p_WS))  # [m] at 1 m/s, at least the length of the route
     points, directions = toa.path(world.p_WS, np.linspace(0.0, reach, 8 * _POSES))
     before = np.flatnonzero(np.linalg.norm(directions[:, :2], axis=1) > 0.0)
     chosen = before[np.linspace(0, len(before) - 1, _POSES).astype(int)]
-    fractions = []
-    for p_WB, direction in zip(points[chosen], directions[chosen], strict=True):
-        yaw = np.arctan2(direction[1], direction[0])
-        view = camera.render(RigidTransform(RollPitchYaw(0.0, 0.0, yaw), p_WB))
-        fractions.append((view.color[..., 0] > 0.5).mean())
-    return float(np.mean(fractions))
+    views = ObservedViews(world)
+    yaws = np.arctan2(directions[chosen, 1], directions[chosen, 0])
+    ahead = (views.ahead(p, yaw) for p, yaw in zip(points[chosen], yaws, strict=True))
+    return float(np.mean(list(ahead)))
