@@ -111,6 +111,40 @@ def mesh_distance(mesh: Path, up: str, voxel_size: float, scale: float = 1.0) ->
     return esdf_from_occupancy(occupied, None, lower_W, voxel_size)
 
 
+def sample_colors(
+    path: Path, up: str, scale: float, count: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], float]:
+    """Samples the surface of a mesh without its holes: points [m] and normals (N, 3) in W, linear
+    base colors (N, 3), and the area [m^2] that they stand for. N is about `count`, or less with
+    holes."""
+    surface, cut_outs = split(path, up, scale)
+    area = surface.area + (0.0 if cut_outs is None else cut_outs.surface.area)
+    with readable(path, "mesh"):
+        scene, _ = _read(path)
+        R_WM, parts = UP[up], []
+        for node in scene.graph.nodes_geometry:
+            X_MN, name = scene.graph[node]
+            mesh = scene.geometry[name]
+            if not isinstance(mesh, trimesh.Trimesh) or not mesh.area > 0:
+                continue
+            placed = mesh.copy().apply_transform(X_MN)
+            number = max(round(count * scale**2 * placed.area / area), 1)
+            sampled: Any = trimesh.sample.sample_surface(placed, number, sample_color=True, seed=0)
+            points, face, colors = sampled
+            seen = colors[:, 3] >= 255 * _CUTOFF if _has_holes(mesh) else slice(None)
+            normals = placed.face_normals[face]
+            linear = (colors[:, :3] / 255.0) ** GAMMA
+            parts.append((scale * points @ R_WM.T, normals @ R_WM.T, linear))
+            parts[-1] = tuple(each[seen] for each in parts[-1])
+    points, normals, colors = (np.concatenate(each) for each in zip(*parts, strict=True))
+    return points, normals, colors, area
+
+
+def _has_holes(mesh: trimesh.Trimesh) -> bool:
+    material = getattr(mesh.visual, "material", None)
+    return getattr(material, "alphaMode", None) in ("MASK", "BLEND")
+
+
 def suitable_voxel(lower_W: ArrayLike, upper_W: ArrayLike) -> float:
     """Returns a size of voxels [m] for the distance field of a box: fine, but not too many."""
     volume = np.prod(np.subtract(upper_W, lower_W))

@@ -87,23 +87,33 @@ class MeshRenderer:
                     self._engine.RegisterVisual(*visual)
 
     def render(
-        self, X_WC: RigidTransform, K: NDArray[np.float64], width: int, height: int
+        self,
+        X_WC: RigidTransform,
+        K: NDArray[np.float64],
+        width: int,
+        height: int,
+        depth_range: tuple[float, float] = (MIN_DEPTH, MAX_DEPTH),
+        with_color: bool = True,
     ) -> MeshImages:
-        """Returns the view of a camera at X_WC with intrinsics K (3, 3) [px], with exact depth."""
+        """Returns the view of a camera at X_WC with intrinsics K (3, 3) [px], with exact depth,
+        in a range of depth [m]; black unless `with_color`."""
         # In OpenGL's image plane, too, the principal point of a symmetric view is width / 2.
         info = CameraInfo(width, height, K[0, 0], K[1, 1], K[0, 2], K[1, 2])
-        core = RenderCameraCore("", info, ClippingRange(MIN_DEPTH, MAX_DEPTH), RigidTransform())
+        core = RenderCameraCore("", info, ClippingRange(*depth_range), RigidTransform())
         color, depth = ImageRgba8U(width, height), ImageDepth32F(width, height)
         self._engine.UpdateViewpoint(X_WC)
-        self._engine.RenderColorImage(ColorRenderCamera(core), color)
-        self._engine.RenderDepthImage(
-            DepthRenderCamera(core, DepthRange(MIN_DEPTH, MAX_DEPTH)), depth
-        )
+        if with_color:
+            self._engine.RenderColorImage(ColorRenderCamera(core), color)
+        self._engine.RenderDepthImage(DepthRenderCamera(core, DepthRange(*depth_range)), depth)
         images = MeshImages(np.array(color.data)[..., :3], np.array(depth.data)[..., 0])
-        return images if self._cut_outs is None else _draw(self._cut_outs, images, X_WC, K)
+        return (
+            images
+            if self._cut_outs is None
+            else _draw(self._cut_outs, images, X_WC, K, depth_range[0])
+        )
 
 
-def _shade(albedo: NDArray[np.float64], normal: NDArray[np.float64]) -> NDArray[np.float64]:
+def shade(albedo: NDArray[np.float64], normal: NDArray[np.float64]) -> NDArray[np.float64]:
     """Returns colors (n, 3), 0 to 1, of rough dielectric surfaces as VTK lights them."""
     light = np.zeros(len(normal))
     for direction, intensity in _LAMPS:
@@ -113,7 +123,11 @@ def _shade(albedo: NDArray[np.float64], normal: NDArray[np.float64]) -> NDArray[
 
 
 def _draw(
-    cut_outs: CutOuts, images: MeshImages, X_WC: RigidTransform, K: NDArray[np.float64]
+    cut_outs: CutOuts,
+    images: MeshImages,
+    X_WC: RigidTransform,
+    K: NDArray[np.float64],
+    near: float,
 ) -> MeshImages:
     """Returns the images with surfaces with holes drawn where nothing in them hides these. Depth is
     that of the first surface, opaque or not."""
@@ -131,8 +145,8 @@ def _draw(
     p_WC = X_WC.translation()
     depth, color = images.depth.reshape(-1).astype(np.float64), np.zeros((len(rays), 3))
     limit = depth.copy()
-    behind, reached = np.ones(len(rays)), np.full(len(rays), MIN_DEPTH)
-    active = np.flatnonzero(limit > MIN_DEPTH)
+    behind, reached = np.ones(len(rays)), np.full(len(rays), near)
+    active = np.flatnonzero(limit > near)
     while len(active):
         origins = p_WC + reached[active, None] * rays[active]
         triangle = cut_outs.surface.ray.intersects_first(origins, rays[active])  # -1 for none
@@ -147,7 +161,7 @@ def _draw(
         albedo, alpha = cut_outs.sample_at(triangle, p_WC + z[:, None] * ray)
         facing = -np.sign(slope[seen])[:, None] * normal[seen]
         share = behind[active] * alpha
-        color[active] += share[:, None] * _shade(albedo, facing)
+        color[active] += share[:, None] * shade(albedo, facing)
         first = (behind[active] == 1) & (alpha > 0)
         depth[active[first]] = z[first]
         behind[active] -= share

@@ -30,6 +30,7 @@ class World:
     moving: MovingObstacles | None = None
     num_frontier: int = 0  # last Gaussians, which close unobserved space
     observations: Observations | None = None  # of the capture; None if not known
+    rendered: BakedScene | None = None  # for cameras, instead of the Gaussians
     source: tuple[Any, int] | None = None  # the configuration and seed that make this world
 
     def __eq__(self, other: object) -> bool:
@@ -61,8 +62,8 @@ class World:
 
     @cached_property
     def baked(self) -> BakedScene:
-        """The Gaussians as cameras render them."""
-        return BakedScene(self.gaussians)
+        """The scene as cameras render it."""
+        return self.rendered or BakedScene(self.gaussians)
 
     def recolored(self, gaussians: GaussianScene, background: Background) -> "World":
         """Returns this world with the colors of `gaussians`; shares the baked geometry."""

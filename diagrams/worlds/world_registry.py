@@ -11,6 +11,7 @@ from splatpilot.diagrams.worlds.dodgedrone import DodgeDroneConfig, dodgedrone_w
 from splatpilot.diagrams.worlds.forest.forest import forest_spec
 from splatpilot.diagrams.worlds.forest.layout import ForestConfig
 from splatpilot.diagrams.worlds.inserted import InsertedConfig, inserted_world
+from splatpilot.diagrams.worlds.mesh_world import MeshWorld, mesh_world
 from splatpilot.diagrams.worlds.octomap_world import OCTOMAP, OctomapConfig, octomap_world
 from splatpilot.diagrams.worlds.scene_folder import SceneConfig, read_scene_world
 from splatpilot.diagrams.worlds.solids.solid import WorldSpec
@@ -105,4 +106,5 @@ register_world(outdoor.OverUnderConfig, make_spec=outdoor.over_under_spec)
 register_world(SceneConfig, read_scene_world)
 register_world(InsertedConfig, inserted_world)
 register_world(OctomapConfig, octomap_world)
+register_world(MeshWorld, mesh_world)
 register_world(DodgeDroneConfig, dodgedrone_world)

@@ -1,6 +1,7 @@
 """Plans camera poses that see the surfaces around a free space, each from several directions."""
 
 import heapq
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -107,7 +108,7 @@ def plan_capture(
     p_WQ = p_WQ[seen]
     toward = stops[stop] - p_WQ[patch]
     toward /= np.linalg.norm(toward, axis=1, keepdims=True)
-    direction = (np.round(toward).astype(int) + 1) @ [1, 3, 9]  # one of 26
+    direction = (np.round(toward).astype(int) + 1) @ np.array([1, 3, 9])  # one of 26
     possible = _count(patch, direction, len(p_WQ))
     candidates = _candidates(stops, stop, toward, K, size)
     required = np.minimum(possible, views)
@@ -127,10 +128,10 @@ def _count(patch: NDArray, direction: NDArray, size: int) -> NDArray[np.intp]:
 def _free_space(
     esdf: Esdf, heights: tuple[float, float], clearance: float, inside: NDArray | None
 ) -> tuple[NDArray[np.float64], float]:
-    """Returns the nodes (N, 3) [m] of the space in which the camera moves, and their spacing."""
+    """Returns nodes (N, 3) [m] of the space in which the camera moves, and their spacing [m]."""
     extent = esdf.upper_W - esdf.lower_W
     spacing = max(esdf.voxel_size, 0.2, float(np.cbrt(np.prod(extent) / _MAX_NODES)))
-    shape = np.maximum((extent / spacing).astype(int), 1)
+    shape = np.maximum((extent / spacing).astype(int), 1).tolist()
     p_WN = esdf.lower_W + spacing * (np.stack(np.indices(shape), axis=-1) + 0.5)
     found = esdf.distance(p_WN)
     above = p_WN[..., 2] - _surface_below(esdf, shape, spacing)
@@ -157,10 +158,12 @@ def _free_space(
     return p_WN[parts == part], spacing
 
 
-def _surface_below(esdf: Esdf, shape: NDArray, spacing: float) -> NDArray[np.float64]:
+def _surface_below(esdf: Esdf, shape: Sequence[int], spacing: float) -> NDArray[np.float64]:
     """Returns the heights [m] of the next surfaces below the nodes of a grid; -inf for none."""
     voxels = np.argwhere(esdf.states == FieldState.OCCUPIED)
-    cells = np.minimum(((voxels + 0.5) * esdf.voxel_size / spacing).astype(int), shape - 1)
+    cells = np.minimum(
+        ((voxels + 0.5) * esdf.voxel_size / spacing).astype(int), np.array(shape) - 1
+    )
     below = np.full(shape, -np.inf)
     np.maximum.at(below, tuple(cells.T), esdf.lower_W[2] + esdf.voxel_size * (voxels[:, 2] + 1))
     return np.maximum.accumulate(below, axis=2)

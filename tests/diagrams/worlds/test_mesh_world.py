@@ -1,0 +1,102 @@
+import pickle
+
+import numpy as np
+import pytest
+import trimesh
+from pydrake.math import RigidTransform
+
+from splatpilot.diagrams.flight.flight import fly
+from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
+from splatpilot.diagrams.flight.monitor import Outcome
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.worlds.mesh_world import MeshWorld
+from splatpilot.diagrams.worlds.world_registry import make_world
+from splatpilot.systems.common.config import load_config
+from splatpilot.systems.splats.lens import Distortion
+from splatpilot.training.captures.camera_path import look_along
+
+SIZE = np.array([14.0, 8.0, 4.0])  # [m] of a room on the ground, with a pillar in its middle
+K = np.array([[32.0, 0, 32], [0, 32, 24], [0, 0, 1]])
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory):
+    walls = trimesh.creation.box(SIZE, RigidTransform([0, 0, SIZE[2] / 2]).GetAsMatrix4())
+    walls.invert()
+    pillar = trimesh.creation.box([0.6, 0.6, SIZE[2]], walls.bounding_box.primitive.transform)
+    for mesh, color in ((walls, [200, 200, 190, 255]), (pillar, [190, 60, 40, 255])):
+        colors = np.tile(np.uint8(color), (len(mesh.vertices), 1))
+        mesh.visual = trimesh.visual.ColorVisuals(mesh, vertex_colors=colors)
+    path = tmp_path_factory.mktemp("room") / "room.glb"
+    trimesh.Scene([walls, pillar]).export(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def config(room):
+    return MeshWorld(path=str(room), up="z")
+
+
+@pytest.fixture(scope="module")
+def world(config):
+    return make_world(config, 0)
+
+
+def test_distance_field_is_that_of_the_triangles(world):
+    p_WQ = np.array([[-6.0, 0, 2.0], [-3, 2, 2], [1.3, 0, 2], [0, 0, 5]])
+    found = world.esdf.distance(p_WQ)
+    np.testing.assert_allclose(found[:3], [1.0, 2.0, 1.0], atol=0.2)
+    assert np.isnan(found[3])
+
+
+def test_camera_shows_the_mesh(opengl, world):
+    X_WC = look_along(np.array([-4.0, 0, 2.0]), 0.0, 0.0)
+    view = world.baked.render(K, 64, 48, X_WC)
+    assert view.depth[24, 32] == pytest.approx(3.7, abs=1e-3)
+    assert view.depth[24, 2] == pytest.approx(4.0 / (29.5 / 32), rel=1e-3)
+    assert view.color[24, 32, 0] > 2 * view.color[24, 32, 2]
+    depth = world.baked.render_depth(K, 64, 48, X_WC, max_depth=5.0)
+    np.testing.assert_array_equal(depth, np.where(view.depth <= 5, view.depth, 0))
+
+
+def test_lens_bends_the_image(opengl, world):
+    X_WC = look_along(np.array([-4.0, 0, 2.0]), 0.0, 0.0)
+    plain = world.baked.render(K, 64, 48, X_WC)
+    bent = world.baked.render(K, 64, 48, X_WC, distortion=Distortion(radial=[-0.1, 0.0]))
+    assert bent.depth.shape == (48, 64)
+    assert bent.depth[24, 32] == pytest.approx(plain.depth[24, 32], abs=1e-3)
+    # Barrel distortion shows more of the side walls: they are nearer at the border.
+    assert bent.depth[24, 0] < plain.depth[24, 0] - 0.1
+
+
+def test_world_pickles_by_its_configuration(world):
+    assert pickle.loads(pickle.dumps(world)) == world
+
+
+@pytest.mark.parametrize("policy", ["!PrivilegedPlannerConfig {}", "!DiffAeroConfig {}"])
+def test_policies_fly_in_a_mesh(opengl, room, tmp_path, policy):
+    text = f"world: !MeshWorld {{path: {room}, up: z}}\npolicy: {policy}\nstart: [-5.0, -1.0, 2.0]\ngoal: [5.0, 1.0, 2.0]\n"
+    (tmp_path / "scenario.yaml").write_text(text)
+    scenario = load_config(Scenario(), tmp_path / "scenario.yaml")
+    world = make_world(scenario.world, scenario.seed)
+    flight = fly(BuildFlightDiagram(scenario, world, camera=False))
+    assert flight.outcome is Outcome.GOAL
+    assert flight.clearances.min() > 0
+
+
+def test_textures_are_not_randomized(world):
+    with pytest.raises(ValueError, match="appearance must be 0 in a mesh"):
+        world.recolored(world.gaussians, world.background)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"path": ""}, "path must be a mesh"),
+        ({"path": "no.glb"}, "No such file or folder: no.glb; expected a mesh"),
+        ({"up": "x"}, r"up must be in \{y, z\}, got x"),
+    ],
+)
+def test_bad_input_is_named(room, fields, message):
+    with pytest.raises((ValueError, FileNotFoundError), match=message):
+        make_world(MeshWorld(**{"path": str(room), "up": "z"} | fields), 0)
