@@ -12,6 +12,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from splatpilot.diagrams.worlds import scene_folder
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.collision.observations import Observations
 from splatpilot.systems.common.config import load_config
 from splatpilot.systems.common.files import require_writable_folder
 from splatpilot.systems.common.validation import require
@@ -28,7 +29,7 @@ from splatpilot.training.captures.capture_registry import read_scene_capture
 from splatpilot.training.captures.up_and_scale import camera_height
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.distance_field import render_depth
-from splatpilot.training.reconstruction.reconstruct import start_and_goal
+from splatpilot.training.reconstruction.reconstruct import with_default_route
 
 _KEPT = (
     *("gains", "vignetting", "representation", "capture", "capture_settings", "capture_notes"),
@@ -161,7 +162,9 @@ def rescale(scene: Path, out: Path, factor: float) -> RescaleSummary:
     gaussians = read_ply(scene / "gaussians.ply").scaled_by(factor)
     field = Esdf.load(scene / "esdf.npz").scaled_by(factor)
     about, warnings = _about_capture(metadata, factor)
-    frontier = None
+    observations = frontier = None
+    if (scene / scene_folder.OBSERVATIONS).exists():
+        observations = Observations.load(scene / scene_folder.OBSERVATIONS).scaled_by(factor)
     if metadata.frontier:
         frontier = read_ply(scene / scene_folder.FRONTIER).scaled_by(factor)
     elif not metadata.metric:
@@ -176,16 +179,20 @@ def rescale(scene: Path, out: Path, factor: float) -> RescaleSummary:
         except (ValueError, OSError) as error:
             warnings += (f"the frontier of the scene stays open: {error}",)
     ends = factor * np.array(metadata.p_WS), factor * np.array(metadata.p_WG)
-    p_WS, p_WG, geodesic, unflyable = start_and_goal(field, True, ends)
     background = scene_folder.read_background(scene, metadata)
+    world = World(
+        metadata.name, gaussians, field, field, background, *ends, observations=observations
+    )
+    world, route, unflyable = with_default_route(world, frontier, True)
     scene_folder.write_scene_folder(
         out,
-        World(metadata.name, gaussians, field, field, background, p_WS, p_WG),
+        world,
         frontier,
         provenance=f"{metadata.provenance}, scaled by {factor:.6g}",
         **{name: getattr(about, name) for name in _KEPT},
     )
-    details = {"shortest path [m]": f"{geodesic:.1f}"} if math.isfinite(geodesic) else {}
+    length = route.length
+    details = {"shortest path [m]": f"{length:.1f}"} if math.isfinite(length) else {}
     size = field.upper_W - field.lower_W
     return RescaleSummary(out, factor, size, details, (*warnings, *unflyable))
 
