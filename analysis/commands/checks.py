@@ -24,7 +24,8 @@ POLICY_NAMES = "planner", "straight", "teleop", "reactive", *TRAINER_NAMES
 
 _SUFFIXES = {
     **dict.fromkeys((".gltf", ".glb", ".obj"), "mesh"),
-    **dict.fromkeys((".ply", ".spz", ".splat"), "gaussians"),
+    **dict.fromkeys((".ply", ".spz", ".sog", ".splat"), "gaussians"),
+    **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), "gaussians"),
     **dict.fromkeys((".yaml", ".yml"), "scenario"),
     ".bt": "map",
 }
@@ -104,8 +105,11 @@ def check_corpora(policies: Sequence[str], overrides: Sequence[str], config: Pat
 def check_kind(path: Path, *accepted: str) -> None:
     """Checks that an existing path is one of the `accepted` keys of `_KINDS`."""
     kind = _SUFFIXES.get(path.suffix.lower(), "")
+    if kind == "mesh" and path.is_file() and b"KHR_gaussian_splatting" in path.read_bytes():
+        kind = "gaussians"
     if path.is_dir():
         kind = "scene" if (path / "scene.yaml").is_file() else ""
+        kind = "gaussians" if (path / "means_l.webp").is_file() else kind  # an unbundled SOG
         if not kind and "capture" not in accepted:  # takes seconds to import, for a message
             from splatpilot.training.captures.capture_registry import CAPTURES
 

@@ -273,8 +273,7 @@ SCENARIO_OPTIONS = (
     Option("--speed M/S", "nominal speed of the policy", float),
     Option(
         "--scene DIR_OR_FILE",
-        "fly in this scene folder, file of Gaussians (PLY, SPZ, .splat; meters, z up) or OctoMap "
-        "(.bt)",
+        "fly in this scene folder, file of Gaussians (meters, z up) or OctoMap (.bt)",
         Path,
         resolve=_check_scene,
     ),

@@ -22,7 +22,7 @@ from splatpilot.training.reconstruction.reconstruct import ReconstructSummary, r
 class RenderedSceneConfig(ReconstructConfig):
     """Settings of a mesh or a generated world: its capture and reconstruction."""
 
-    render: RenderConfig = field(default_factory=lambda: RenderConfig(spacing=0.8, apart=4.0))
+    render: RenderConfig = field(default_factory=lambda: RenderConfig())
     voxel_size: float = bounded(0.1, "[0, inf) m")
     """[m], of the distance field; the planner searches a hall in seconds."""
 

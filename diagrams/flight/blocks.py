@@ -131,12 +131,12 @@ def _add_target(
         builder.Connect(hypotheses, selector.GetInputPort("hypotheses"))
         connect(builder, state, selector.GetInputPort("state"))
         return selector.GetOutputPort("waypoint")
-    name = next((name for name in DECISIONS if policy.HasOutputPort(name)), None)
-    if name is None:
-        outputs = [policy.get_output_port(k).get_name() for k in range(policy.num_output_ports())]
-        what = f"an output of the policy {type(policy).__name__}"
-        require(False, what, f"one of hypotheses, {', '.join(DECISIONS)}", ", ".join(outputs))
-    return policy.GetOutputPort(name)
+    decisions = [name for name in DECISIONS if policy.HasOutputPort(name)]
+    outputs = [policy.get_output_port(k).get_name() for k in range(policy.num_output_ports())]
+    what = f"an output of the policy {type(policy).__name__}"
+    known = f"one of hypotheses, {', '.join(DECISIONS)}"
+    require(decisions, what, known, ", ".join(outputs))
+    return policy.GetOutputPort(decisions[0])
 
 
 def _connect_controller(

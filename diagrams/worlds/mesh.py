@@ -17,7 +17,7 @@ from urllib.parse import unquote
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 from pydrake.math import RotationMatrix
 from scipy.ndimage import map_coordinates
@@ -41,6 +41,7 @@ _UNITS = {"centimeters": 0.01, "millimeters": 0.001, "inches": 0.0254, "kilomete
 _CUTOFF = 0.5  # glTF's default alpha from which a MASK is opaque
 _VISIBLE = 1 / 255  # alpha from which a BLEND is visible
 _SAMPLES_PER_VOXEL_FACE = 8
+_VOXEL, _MAX_VOXELS = 0.1, 2e7  # [m], and number of suitable voxels
 _NEAREST = 9728
 _WRAPS = {33071: "clamp", 33648: "mirror"}
 # Required extensions that cannot be read, with a remedy each.
@@ -77,7 +78,7 @@ def mesh_digests(mesh: Path) -> set[str]:
     """Returns a digest of each triangle of a mesh, by its corners to a millimeter, independent of
     the file's format and materials."""
     with readable(mesh, "mesh"):
-        surface: Any = trimesh.load(mesh, force="mesh", resolver=_Files(mesh))
+        surface: Any = trimesh.load(mesh, force="mesh", resolver=_Files(str(mesh)))
         if not 0 < surface.area < np.inf:
             raise ValueError("it has no surface")
     corners = np.round(surface.triangles * 1000).astype(np.int64)
@@ -88,9 +89,13 @@ def mesh_digests(mesh: Path) -> set[str]:
 
 def mesh_distance(mesh: Path, up: str, voxel_size: float, scale: float = 1.0) -> Esdf:
     """Returns the distance to the surface of a mesh, from points sampled on it outside of holes.
-    `scale` [m] is the unit of the file."""
-    density = _SAMPLES_PER_VOXEL_FACE / voxel_size**2
+    `scale` [m] is the unit of the file. A `voxel_size` of 0 is a suitable one."""
     surface, cut_outs = split(mesh, up, scale)
+    if voxel_size == 0:
+        corners = [surface] if cut_outs is None else [surface, cut_outs.surface]
+        p_WV = np.concatenate([part.vertices for part in corners])
+        voxel_size = suitable_voxel(p_WV.min(axis=0), p_WV.max(axis=0))
+    density = _SAMPLES_PER_VOXEL_FACE / voxel_size**2
     points = [_sample_surface(mesh, surface, density)[0]]
     if cut_outs is not None:
         points.append(cut_outs.sample(mesh, density))
@@ -104,6 +109,12 @@ def mesh_distance(mesh: Path, up: str, voxel_size: float, scale: float = 1.0) ->
     occupied = np.zeros(shape, dtype=bool)
     occupied[tuple(((p_WQ - lower_W) / voxel_size).astype(int).T)] = True
     return esdf_from_occupancy(occupied, None, lower_W, voxel_size)
+
+
+def suitable_voxel(lower_W: ArrayLike, upper_W: ArrayLike) -> float:
+    """Returns a size of voxels [m] for the distance field of a box: fine, but not too many."""
+    volume = np.prod(np.subtract(upper_W, lower_W))
+    return max(_VOXEL, float(np.cbrt(volume / _MAX_VOXELS)))
 
 
 def _sample_surface(
@@ -260,7 +271,7 @@ def _read(path: Path) -> tuple[Any, dict[str, Any]]:
     require_readable_size(path, 4 * path.stat().st_size)
     content, kind = path.read_bytes(), path.suffix.lower().lstrip(".")
     scene: Any = trimesh.load(
-        BytesIO(content), file_type=kind, resolver=_Files(path), force="scene", process=False
+        BytesIO(content), file_type=kind, resolver=_Files(str(path)), force="scene", process=False
     )
     if kind == "obj":
         for mesh in scene.geometry.values():

@@ -45,7 +45,7 @@ from splatpilot.systems.common.readers import error_summary, read_text, yaml_err
 from splatpilot.systems.common.validation import Config, bounded, require, require_field
 from splatpilot.systems.splats.background import FAR, Background, EnvironmentMap, mean_color
 from splatpilot.systems.splats.scene import GaussianScene, color_to_sh
-from splatpilot.systems.splats.splat_files import read_ply, read_splats, write_ply
+from splatpilot.systems.splats.splat_files import read_ply, read_splats, sog_meta, write_ply
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
 FORMAT_VERSION = 2
@@ -141,9 +141,8 @@ _MAX_VOXEL = 0.25  # [m], at which a vehicle of 0.354 m radius still finds a rou
 def read_scene(path: str | Path, hatched: bool = False) -> World:
     """Reads a scene folder, or a file of Gaussians alone, see `read_splats`."""
     path = Path(path)
-    if not path.is_dir():
-        return _read_bare_gaussians(path)
-    return read_scene_folder(path, hatched=hatched)
+    is_scene = path.is_dir() and sog_meta(path) is None
+    return read_scene_folder(path, hatched=hatched) if is_scene else _read_bare_gaussians(path)
 
 
 def read_scene_folder(path: str | Path, *, metric: bool = True, hatched: bool = False) -> World:
@@ -260,7 +259,7 @@ def _read_bare_gaussians(path: Path) -> World:
 class SceneSource(Config):
     """An environment on disk."""
 
-    # A scene folder, or a file of Gaussians (PLY, SPZ or .splat): here, or in the folder of the
+    # A scene folder, or a file of Gaussians (see `read_splats`): here, or in the folder of the
     # environment variable SPLATPILOT_SCENES, by default `scenes`.
     path: str = ""
     # How to get the scene, for the error if it is missing.

@@ -1,4 +1,4 @@
-"""Paths of a camera through free space, and the poses on them."""
+"""Poses of a camera on a path."""
 
 from collections.abc import Sequence
 
@@ -6,72 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 from scipy.ndimage import gaussian_filter1d
-from scipy.sparse.csgraph import connected_components, dijkstra
 
-from splatpilot.diagrams.worlds.feasibility import grid_graph
-from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.common.validation import require
 
 _STEP = 0.05  # [m], of a path while it is smoothed
 _ROUNDING = 0.4  # [m], standard deviation of the smoothing of corners
-
-
-def visiting_path(
-    esdf: Esdf,
-    lower_W: NDArray[np.float64],
-    upper_W: NDArray[np.float64],
-    clearance: float,
-    apart: float,
-) -> NDArray[np.float64]:
-    """Returns a path (N, 3) [m] that visits all the free space of a box.
-
-    In the largest connected part of the space with `clearance` [m], stops are chosen farthest from
-    those before, along paths, until none is farther than `apart` [m] from one. The path begins at
-    the stop in the middle, so that later cameras see its surroundings too, and continues to the
-    nearest stop not visited yet, by shortest paths.
-    """
-    spacing = max(esdf.voxel_size, 0.2)
-    axes = [
-        low + spacing * (np.arange(max(int((high - low) / spacing), 1)) + 0.5)
-        for low, high in zip(lower_W, upper_W, strict=True)
-    ]
-    p_WN = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)  # (nx, ny, nz, 3)
-    found = esdf.conservative().distance(p_WN)
-    if np.count_nonzero(found > clearance) < 2:
-        raise ValueError(
-            f"no camera path: the largest clearance from {np.round(lower_W, 1).tolist()} to "
-            f"{np.round(upper_W, 1).tolist()} is {found.max():.2f} m, {clearance} m is required; "
-            "require less clearance, or allow other heights"
-        )
-    graph, nodes = grid_graph(found > clearance, spacing)
-    p_WF = p_WN.reshape(-1, 3)[nodes]
-    _, label = connected_components(graph, directed=False)
-    part = label == np.bincount(label).argmax()
-
-    def lengths_from(node: int) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-        lengths, before = dijkstra(graph, directed=False, indices=node, return_predecessors=True)
-        lengths[~part] = -1
-        return lengths, before
-
-    stops = [int(np.argmax(lengths_from(int(np.argmax(part)))[0]))]
-    tables = [lengths_from(stops[0])]
-    nearest = tables[0][0].copy()
-    while nearest.max() > apart:
-        stops.append(int(np.argmax(nearest)))
-        tables.append(lengths_from(stops[-1]))
-        np.minimum(nearest, tables[-1][0], out=nearest)
-
-    here = min(range(len(stops)), key=lambda k: tables[k][0].max())
-    path, left = [stops[here]], set(range(len(stops))) - {here}
-    while left:
-        lengths, before = tables[here]
-        here = min(left, key=lambda k: (lengths[stops[k]], k))
-        leg = [stops[here]]
-        while leg[-1] != path[-1]:
-            leg.append(int(before[leg[-1]]))
-        path += leg[-2::-1]
-        left.remove(here)
-    return p_WF[path]
 
 
 def poses_along(

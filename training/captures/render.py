@@ -1,5 +1,6 @@
 """Captures rendered of meshes and generated worlds, with exact depth."""
 
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,7 +12,7 @@ from pydrake.math import RigidTransform
 
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.scenarios import benchmark_scenarios
-from splatpilot.diagrams.worlds.mesh import check_mesh, mesh_digests, mesh_distance
+from splatpilot.diagrams.worlds.mesh import check_mesh, mesh_digests, mesh_distance, suitable_voxel
 from splatpilot.diagrams.worlds.mesh_renderer import MeshRenderer
 from splatpilot.diagrams.worlds.splits import check_split, choose_split, part_digests, source_digest
 from splatpilot.diagrams.worlds.world_gltf import write_gltf
@@ -31,11 +32,13 @@ from splatpilot.training.captures.camera_path import (
     move_left,
     poses_along,
     resample,
-    visiting_path,
 )
 from splatpilot.training.captures.capture import CaptureFrame, pinhole
+from splatpilot.training.captures.coverage import CapturePlan, plan_capture
 from splatpilot.training.captures.frames import pose_row
 from splatpilot.training.captures.tartanair import AXES
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(kw_only=True)
@@ -44,17 +47,21 @@ class RenderConfig(Config):
 
     width: int = bounded(640, "[8, 4096] px")  # of the images
     height: int = bounded(480, "[8, 4096] px")  # of the images
-    # [m] Points x, y, z of the camera path; empty: one that visits all free space between the
-    # heights, with a visited point every `apart` along it.
+    # [m] Points x, y, z of the camera path; empty: poses that see all surfaces around the free
+    # space, see `plan_capture`.
     path: list[list[float]] = field(default_factory=list)
-    lowest: float = bounded(1.0, "(-inf, inf) m")  # height of a path that is not given
-    highest: float = bounded(2.2, "(-inf, inf) m")  # height of a path that is not given
-    apart: float = bounded(3.0, "[0.01, inf) m")  # minimum distance of two visited points
+    lowest: float = bounded(1.0, "[0, inf) m")  # height of planned poses above the surface below
+    highest: float = bounded(2.2, "(0, inf) m")  # the same, at most
+    views: int = bounded(3, "[1, 26]")  # directions from which planned poses see each surface
+    reach: float = bounded(0.0, "[0, inf) m")  # of planned poses; 0: 4 m, or up to 10 m outdoors
+    max_frames: int = bounded(600, "[1, inf)")  # number of planned poses
+    # [m] A point x, y, z in the space to capture; empty: in the largest that does not lead out.
+    inside: list[float] = bounded(list, "(-inf, inf) m")
     clearance: float = bounded(0.5, "[0, inf) m")  # of the camera from surfaces
-    spacing: float = bounded(0.6, "[0.01, inf) m")  # between stops on the path
-    # [deg] Viewing directions at each stop, from that of travel to the left.
+    spacing: float = bounded(0.6, "[0.01, inf) m")  # between stops on a given path
+    # [deg] Viewing directions at each stop of it, from that of travel to the left.
     yaws: list[float] = bounded(lambda: [0.0, 90.0, -90.0], "(-inf, inf) deg")
-    pitch: float = bounded(-5.0, "(-90, 90) deg")  # of the camera, upward
+    pitch: float = bounded(-5.0, "(-90, 90) deg")  # of the camera there, upward
     # [m] To the camera's left, negative to its right: each adds a second capture `offset_...` of
     # the poses that are free there.
     offsets: list[float] = bounded(list, "(-inf, inf) m")
@@ -62,7 +69,8 @@ class RenderConfig(Config):
     scale: float = bounded(1.0, "(0, inf) m")  # unit of the mesh
     # Color of the background; red, green, blue in 0 to 1.
     background: list[float] = bounded(lambda: [0.6, 0.75, 0.9], "[0, 1]")
-    voxel_size: float = bounded(0.1, "[0.01, inf) m")  # of the grid in which the path is planned
+    # Of the grid in which poses are planned; 0: 0.1 m, or more for 20 million voxels.
+    voxel_size: float = bounded(0.0, "[0, inf) m")
     # Split of scenes of the capture: train, validation or test. Empty: train, but test for what
     # the benchmark tests in, and for its worlds of seeds below those of training.
     split: str = ""
@@ -70,12 +78,15 @@ class RenderConfig(Config):
     def check(self) -> None:
         check_split(self.split)
         require_field(self, "lowest", self.lowest < self.highest, f"below highest, {self.highest}")
+        require_field(self, "inside", len(self.inside) in (0, 3), "x, y, z, or empty")
         require_field(self, "yaws", self.yaws, "at least one angle")
         require_field(self, "offsets", all(self.offsets), "other than 0")
         require_field(self, "background", len(self.background) == 3, "red, green and blue")
 
 
 RECIPE = "world.yaml"
+COVERAGE = "coverage.png"
+_COVERED = 0.8  # share of surfaces, below which a capture is warned about
 _VERSION = 3  # of the drawing of meshes
 
 
@@ -151,8 +162,11 @@ def _render(world: Path, out: Path, partial: Path, config: RenderConfig, seed: i
     if spec is None:
         esdf = mesh_distance(world, config.up, config.voxel_size, config.scale)
     else:
-        esdf = esdf_from_distance_field(spec.distance_field, config.voxel_size)
-    X_WCs = _poses(esdf, config)
+        bounds = spec.distance_field.lower_W, spec.distance_field.upper_W
+        voxel_size = config.voxel_size or suitable_voxel(*bounds)
+        esdf = esdf_from_distance_field(spec.distance_field, voxel_size)
+    plan = None if config.path else _plan(esdf, config)
+    X_WCs = _poses_on_path(esdf, config) if plan is None else plan.X_WCs
     with written_atomically(partial / RECIPE) as file:
         file.write_text(text)
     mesh = partial / recipe.mesh
@@ -164,6 +178,10 @@ def _render(world: Path, out: Path, partial: Path, config: RenderConfig, seed: i
         moved = [move_left(X_WC, offset) for X_WC in X_WCs]
         free = [X_WC for X_WC in moved if _is_free(esdf, X_WC.translation(), config.clearance)]
         _write_frames(partial / f"offset_{offset:+.2f}", f"offset {offset:+.2f} m", free, view)
+    if plan is not None:
+        with written_atomically(partial / COVERAGE) as file:
+            _, content = cv2.imencode(".png", np.ascontiguousarray(plan.picture()[..., ::-1]))
+            file.write_bytes(content.tobytes())
     if out.exists():
         out.rmdir()
     partial.rename(out)
@@ -187,8 +205,13 @@ def _camera(mesh: Path, config: RenderConfig) -> Callable[[RigidTransform], Capt
     """Returns a function that renders a mesh with a camera as TartanAir's, 90 degrees wide."""
     renderer = MeshRenderer(mesh, config.up, config.background, config.scale)
     width, height = config.width, config.height
-    K = pinhole(width / 2, width / 2, width / 2, height / 2)
+    K = _intrinsics(config)
     return lambda X_WC: CaptureFrame(*renderer.render(X_WC, K, width, height), X_WC, K)
+
+
+def _intrinsics(config: RenderConfig) -> NDArray[np.float64]:
+    width, height = config.width, config.height
+    return pinhole(width / 2, width / 2, width / 2, height / 2)
 
 
 def rendered_world(capture: Path) -> RenderedWorld | None:
@@ -207,25 +230,51 @@ def _generated_split(world: WorldConfig, seed: int) -> str:
     return "train" if seed < VALIDATION_SEEDS else "validation"
 
 
-def _poses(esdf: Esdf, config: RenderConfig) -> list[RigidTransform]:
-    """Returns the camera poses of the path, given or planned."""
-    if config.path:
-        X_WCs = poses_along(np.array(config.path), config.spacing, config.yaws, config.pitch)
-        stops = np.array([X_WC.translation() for X_WC in X_WCs])
-        for p_W in resample(stops, esdf.voxel_size / 2):
-            if not _is_free(esdf, p_W, min(config.clearance, esdf.voxel_size)):
-                raise ValueError(
-                    f"the path touches something at {np.round(p_W, 2).tolist()} m; lead it around"
-                )
-        return X_WCs
-    path = visiting_path(
+def _poses_on_path(esdf: Esdf, config: RenderConfig) -> list[RigidTransform]:
+    """Returns the camera poses of the given path."""
+    X_WCs = poses_along(np.array(config.path), config.spacing, config.yaws, config.pitch)
+    stops = np.array([X_WC.translation() for X_WC in X_WCs])
+    for p_W in resample(stops, esdf.voxel_size / 2):
+        if not _is_free(esdf, p_W, min(config.clearance, esdf.voxel_size)):
+            raise ValueError(
+                f"the path touches something at {np.round(p_W, 2).tolist()} m; lead it around"
+            )
+    return X_WCs
+
+
+def _plan(esdf: Esdf, config: RenderConfig) -> CapturePlan:
+    """Plans the camera poses; prints how much of the surfaces they see."""
+    plan = plan_capture(
         esdf,
-        np.append(esdf.lower_W[:2], config.lowest),
-        np.append(esdf.upper_W[:2], config.highest),
+        _intrinsics(config),
+        (config.width, config.height),
+        (config.lowest, config.highest),
         config.clearance,
-        config.apart,
+        config.views,
+        config.reach,
+        config.max_frames,
+        np.array(config.inside) if config.inside else None,
     )
-    return poses_along(path, config.spacing, config.yaws, config.pitch)
+    once, possible = np.mean(plan.views > 0), np.mean(plan.possible >= config.views)
+    print(
+        f"{len(plan.X_WCs)} poses in {plan.free_area:.0f} m^2 see {plan.coverage:.0%} of the "
+        f"surfaces from {config.views} directions ({possible:.0%} are possible) and {once:.0%} at "
+        f"least once, within {plan.reach:.1f} m"
+    )
+    if plan.coverage < _COVERED:
+        remedies = [f"see {COVERAGE} of the capture for where"]
+        if plan.more_frames:
+            count = config.max_frames + plan.more_frames
+            remedies.append(f"set max_frames={count}")
+        if possible < _COVERED:
+            remedies.append("allow other heights, or less clearance")
+        _log.warning(
+            "only %.0f %% of the surfaces are seen from %d directions; %s",
+            100 * plan.coverage,
+            config.views,
+            "; ".join(remedies),
+        )
+    return plan
 
 
 def _is_free(esdf: Esdf, p_WQ: NDArray, clearance: float) -> bool:

@@ -204,7 +204,7 @@ def principal_axes(
 
 def _available(capture: Capture) -> dict[str, bool]:
     """Returns which initializations the capture has, the best first."""
-    return {"depth": capture.has_depth, "points": capture.points is not None, "random": True}
+    return {"depth": capture.has_depth, "points": True, "random": True}
 
 
 def resolve_config(config: ReconstructConfig, capture: Capture) -> ReconstructConfig:
@@ -244,8 +244,14 @@ def make_initial_gaussians(
     if kind == "depth":
         count = config.initial_gaussians or _MAX_FROM_DEPTH
         return gaussians_from_depth(frames, photometry, count, config.contrast, optimized=True)
-    if capture.points is not None and kind == "points":
-        return gaussians_from_points(capture.points.p_WQ, capture.points.colors)
+    if kind == "points":
+        points = capture.points
+        try:
+            points = points or triangulate(capture, getattr(frames, "numbers", range(len(capture))))
+        except (ValueError, ModuleNotFoundError) as error:
+            say(f"{error}; starting from random points")
+        if points is not None:
+            return gaussians_from_points(points.p_WQ, points.colors)
     near, far = (extent * depth for depth in _RANDOM_DEPTH)
     count = config.initial_gaussians or _RANDOM
     return gaussians_from_points(*random_points(frames, count, near, far, config.seed))

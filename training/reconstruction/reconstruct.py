@@ -68,7 +68,7 @@ class ReconstructSummary:
     gain_range: tuple[float, float]
     metric: bool  # lengths are in meters
     field: Esdf
-    route: ObservedRoute  # default start and goal
+    route: ObservedRoute  # default start and goal; of length NaN if the scene cannot be flown in
     held_out: HeldOutMetrics | None = None
     notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
@@ -90,8 +90,9 @@ class ReconstructSummary:
             "corner brightness": f"{np.exp(self.vignetting):.3f}",
         }
         if self.metric:
+            rows["seen free [m^3]"] = f"{self.field.volume(FieldState.FREE):.1f}"
+        if np.isfinite(self.route.length):
             rows |= {
-                "seen free [m^3]": f"{self.field.volume(FieldState.FREE):.1f}",
                 "default start [m]": vector(self.route.p_WS),
                 "default goal [m]": vector(self.route.p_WG),
                 "shortest path [m]": f"{self.route.length:.1f}",
