@@ -3,7 +3,7 @@
 import copy
 import enum
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable
 from typing import Any, cast
 
 import numpy as np
@@ -53,8 +53,8 @@ _ENDS = Outcome.COLLISION, Outcome.LEFT_VOLUME, Outcome.GOAL
 
 
 def _end(
-    p_WB: Sequence[float],
-    p_WG: Sequence[float],
+    p_WB: Iterable[float],
+    p_WG: Iterable[float],
     clearance: float,
     field_state: float,
     goal_radius: float,
@@ -117,7 +117,8 @@ class FlightMonitor(LeafSystem):
         p_WB, p_WG, clearance, field_state = (
             self._read(index, context, size) for index, size in enumerate((3, 3, 1, 1))
         )
-        end.set_value(_end(p_WB, p_WG, *clearance, *field_state, self.scenario.goal_radius))
+        radius = self.scenario.goal_radius
+        end.set_value(_end(p_WB, p_WG, clearance[0], field_state[0], radius))
 
     def _read(self, index: int, context: Context, size: int) -> list[float]:
         """Returns the first numbers at an input port; an array would cost several times as much."""

@@ -49,7 +49,7 @@ class MeshWorld(Config):
     # If true, start and goal are drawn from the seed; otherwise a long route decides.
     draw_ends: bool = False
     # [m] Minimum length of the shortest route between ends that are drawn.
-    least_way: float = bounded(SHORTEST, "[0, inf) m")
+    min_path: float = bounded(SHORTEST, "[0, inf) m")
 
     def check(self) -> None:
         require_field(self, "path", self.path, "a mesh")
@@ -62,7 +62,7 @@ def mesh_world(config: MeshWorld, seed: int) -> World:
     path = find_data(Path(config.path), "a mesh")
     check_mesh(path, config.up)
     esdf = mesh_distance(path, config.up, config.voxel_size, config.scale)
-    drawn = {"least": config.least_way, "seed": seed} if config.draw_ends else {}
+    drawn = {"least": config.min_path, "seed": seed} if config.draw_ends else {}
     ends = choose_ends(esdf, config.path, **drawn)
     points, normals, colors, area = sample_colors(path, config.up, config.scale, _PREVIEW)
     extent = np.full((len(points), 2), _GAP * COVERAGE * np.sqrt(area / len(points)))
@@ -101,7 +101,7 @@ class MeshScene(BakedScene):
     ) -> RenderedView:
         """Renders color and depth; see `BakedScene.render`. The background is that of the mesh."""
         color, depth = self._images(K, width, height, X_WC, near, far, distortion, color=True)
-        view = RenderedView(color.astype(np.float32) / 255, depth, (depth > 0).astype(np.float32))
+        view = RenderedView((color / 255).astype(np.float32), depth, (depth > 0).astype(np.float32))
         if len(moving.means):
             camera = np.asarray(K, float), width, height, X_WC, near, far
             bodies = empty_scene().render(*camera, moving=moving, distortion=distortion)

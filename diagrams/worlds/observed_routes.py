@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.math import RigidTransform, RollPitchYaw
 from scipy.sparse.csgraph import dijkstra
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from splatpilot.diagrams.worlds.feasibility import CLEARANCE, LONG_ENOUGH, SHORTEST, longest_part
 from splatpilot.diagrams.worlds.world import World
@@ -161,7 +161,7 @@ class _Search:
         typical = float(np.median(clearance[self._part.nodes]))
         self._open = clearance >= min(CLEARANCE, typical)
         self._table = observations.unobserved
-        points = cKDTree(observations.view_points)
+        points = KDTree(observations.view_points)
         self._row = np.asarray(points.query(self._p_WN)[1])  # of the table, for each node
 
     def longest(self, limit: float) -> ObservedRoute | None:

@@ -267,7 +267,7 @@ class SceneSource(Config):
     # If true, start and goal are drawn from the seed; otherwise they are the scene's own.
     draw_ends: bool = False
     # [m] Minimum length of the shortest route between ends that are drawn.
-    least_way: float = bounded(SHORTEST, "[0, inf) m")
+    min_path: float = bounded(SHORTEST, "[0, inf) m")
     # [-] Maximum mean fraction of pixels without an observed surface that a camera sees along the
     # route between ends that are drawn; 1 for any. A scene without observations has no limit.
     max_unobserved: float = bounded(MAX_UNOBSERVED, "[0, 1]")
@@ -298,7 +298,7 @@ def read_scene_world(config: SceneSource, seed: int) -> World:
 def draw_ends(config: SceneSource, world: World, seed: int) -> World:
     """Returns the world with another start and goal, see `SceneSource`."""
     known = world.observations is not None and len(world.observations.view_points)
-    limit, length = config.max_unobserved, config.least_way
+    limit, length = config.max_unobserved, config.min_path
     if known and limit < 1.0:
         route = choose_observed_route(world, limit, length, seed)
         return replace(world, p_WS=route.p_WS, p_WG=route.p_WG)

@@ -130,6 +130,7 @@ def EsdfCollision_(T):
             state = self.EvalVectorInput(context, 0)
             if state is None:  # Drake raises.
                 self.get_input_port().Eval(context)
+            assert state is not None
             moving, field = self.EvalAbstractInput(context, 1), self._field
             if moving is not None and (bodies := moving.get_value()):
                 field = bodies.among(field, bodies.time)

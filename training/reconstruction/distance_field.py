@@ -107,8 +107,10 @@ def choose_grid(source: DepthSource, metric: bool, config: ReconstructConfig) ->
 def fuse(source: DepthSource, grid: FieldGrid, swept_radius: float = 0.0) -> Esdf:
     """Fuses depth images into a distance field; space that no image saw is unknown, but for that
     within `swept_radius` [m] of the path of the cameras."""
-    options = vars(grid) | {"swept_radius": swept_radius}
-    return esdf_from_depth_images(source.images(), source.K, source.X_WCs, **options)
+    images = source.images()
+    return esdf_from_depth_images(
+        images, source.K, source.X_WCs, **vars(grid), swept_radius=swept_radius
+    )
 
 
 def make_distance_field(

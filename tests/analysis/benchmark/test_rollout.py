@@ -105,7 +105,7 @@ def test_infeasible_flights_fail_with_a_reason(short_scenario, tmp_path, capsys,
 def test_a_scene_without_a_start_and_goal_does_not_stop_the_study(room, tmp_path, short_scenario):
     hall = room.scene("hall", metric=True)
     far = tmp_path / "far.yaml"
-    far.write_text(f"world: !SceneConfig {{path: {hall}, draw_ends: true, least_way: 30}}\n")
+    far.write_text(f"world: !SceneConfig {{path: {hall}, draw_ends: true, min_path: 30}}\n")
     config = StudyConfig([str(far), str(short_scenario)], ["straight"], seeds=1)
     [row] = run_study.run(config=config, out=tmp_path / "out", jobs=1).table
     assert (row["flights"], row["infeasible"]) == (2, 1)

@@ -573,5 +573,6 @@ def test_flights_share_a_scene_graph(post_world):
     query = scene_graph.get_query_output_port()
     query = query.Eval(scene_graph.GetMyContextFromRoot(context))
     for flight, start in zip(flights, starts.values(), strict=True):
+        assert flight.geometry is not None
         frame = flight.geometry.get_frame_id()
         np.testing.assert_allclose(query.GetPoseInWorld(frame).translation(), start)

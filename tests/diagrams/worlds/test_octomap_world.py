@@ -52,9 +52,9 @@ def test_short_routes_are_warned_of(in_map, caplog):
 
 
 def test_drawn_ends_are_as_far_apart_as_the_scenario_says(in_map):
-    in_map(hall(40, 20), draw_ends=True, least_way=6.0)
+    in_map(hall(40, 20), draw_ends=True, min_path=6.0)
     with pytest.raises(InfeasibleFlightError, match="at least 30 m, got"):
-        in_map(hall(40, 20), draw_ends=True, least_way=30.0)
+        in_map(hall(40, 20), draw_ends=True, min_path=30.0)
 
 
 def test_maps_without_free_space_are_refused(in_map):
