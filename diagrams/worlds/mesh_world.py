@@ -101,7 +101,7 @@ class MeshScene(BakedScene):
     ) -> RenderedView:
         """Renders color and depth; see `BakedScene.render`. The background is that of the mesh."""
         color, depth = self._images(K, width, height, X_WC, near, far, distortion, color=True)
-        view = RenderedView(color.astype(np.float32) / 255, depth, (depth > 0).astype(np.float32))
+        view = RenderedView((color / 255).astype(np.float32), depth, (depth > 0).astype(np.float32))
         if len(moving.means):
             camera = np.asarray(K, float), width, height, X_WC, near, far
             bodies = empty_scene().render(*camera, moving=moving, distortion=distortion)

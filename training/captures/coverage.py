@@ -3,6 +3,7 @@
 import heapq
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -137,7 +138,8 @@ def _free_space(
     above = p_WN[..., 2] - _surface_below(esdf, shape, spacing)
     low, high = heights
     usable = (found > clearance) & (above >= low) & (above <= high)
-    parts, count = label(usable, np.ones((3, 3, 3)))  # pyright: ignore
+    labeled: Any = label(usable, np.ones((3, 3, 3)))
+    parts, count = labeled
     if count == 0:
         raise ValueError(
             f"the clearance between {low:g} and {high:g} m above surfaces must be more than "
