@@ -79,7 +79,7 @@ def flight_metrics(flight: Flight, shortest: float) -> dict[str, float | str | b
     over the shortest one, minus one; NaN if it did not arrive. `jerk_m_s3` is the root mean square
     of the second differences of the velocity at 0.1 s, `smoothness` the logarithmic dimensionless
     jerk, -ln(T³ / v_max² ∫ |jerk|² dt) (N. Hogan and D. Sternad, J. Motor Behavior 41, 2009).
-    `end_x_m` to `end_z_m` are where it ended.
+    `end_x_m` to `end_z_m` are where it ended. `unobserved_fraction` is of `Flight.unobserved`.
     """
     summary = flight.summary()
     arrived = flight.outcome == Outcome.GOAL
@@ -95,6 +95,7 @@ def flight_metrics(flight: Flight, shortest: float) -> dict[str, float | str | b
         "min_clearance_m": clearance,
         **dict(zip(_END, QuadrotorState.of(flight.states[-1]).p_WB.tolist(), strict=True)),
         "shortest_path_m": shortest,
+        "unobserved_fraction": flight.unobserved,
         "path_excess": length / shortest - 1.0 if arrived and shortest > 0 else math.nan,
         "jerk_m_s3": jerk,
         "smoothness": smoothness,

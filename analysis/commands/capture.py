@@ -83,8 +83,8 @@ def reconstruct(options: argparse.Namespace) -> None:
 )
 def check(options: argparse.Namespace) -> Any:
     """Projects depth from frame to frame and compares. If it disagrees, tests the usual errors,
-    names the most likely one, and exits with status 1. Without depth, it reports what was read or
-    registered."""
+    names the most likely one, and exits with status 1. Without depth, it compares features with
+    their epipolar lines."""
     cli.announce(f"checking {options.capture}")
     from splatpilot.training.captures import check
 

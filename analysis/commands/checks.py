@@ -16,15 +16,16 @@ SCENARIOS = tuple(benchmark_scenarios() | other_scenarios())
 LEARN_FROM_CORPORA = "student_rgb", "student_depth", "diffaero_rgb"
 """Trainers that learn from corpora."""
 
-TRAINERS = "diffaero", "depthnav", "diffaero_tof", "agile_autonomy", *LEARN_FROM_CORPORA
+TRAINER_NAMES = "diffaero", "depthnav", "diffaero_tof", "agile_autonomy", *LEARN_FROM_CORPORA
 """The names of the trainers of this package; importing their registry takes seconds."""
 
-POLICIES = "planner", "straight", "teleop", "reactive", *TRAINERS
+POLICY_NAMES = "planner", "straight", "teleop", "reactive", *TRAINER_NAMES
 """The names of the policies of this package."""
 
 _SUFFIXES = {
     **dict.fromkeys((".gltf", ".glb", ".obj"), "mesh"),
-    **dict.fromkeys((".ply", ".spz", ".splat"), "gaussians"),
+    **dict.fromkeys((".ply", ".spz", ".sog", ".splat"), "gaussians"),
+    **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), "gaussians"),
     **dict.fromkeys((".yaml", ".yml"), "scenario"),
     ".bt": "map",
 }
@@ -50,21 +51,21 @@ def check_policy(text: str) -> str:
     name, colon, field = variant.policy.partition(":")
     if variant.weights is not None:
         require_existing(variant.weights, "a file of weights")
-    elif colon and name in POLICIES:
+    elif colon and name in POLICY_NAMES:
         raise ValueError(
             f"the policy {variant.policy!r} names a field of {name} without a value; write "
             f"{name}:{field}=VALUE"
         )
     elif variant.policy != SCENARIO:
         registry = "splatpilot.diagrams.flight.policies"
-        _check_name("policy", "splatpilot.policies", variant.policy, POLICIES, registry)
+        _check_name("policy", "splatpilot.policies", variant.policy, POLICY_NAMES, registry)
     return text
 
 
 def check_trainer(name: str) -> str:
     """Checks the name of a trainer, and returns it."""
     registry = "splatpilot.training.policies.trainer_registry"
-    _check_name("trainer", "splatpilot.trainers", name, TRAINERS, registry)
+    _check_name("trainer", "splatpilot.trainers", name, TRAINER_NAMES, registry)
     return name
 
 
@@ -104,8 +105,11 @@ def check_corpora(policies: Sequence[str], overrides: Sequence[str], config: Pat
 def check_kind(path: Path, *accepted: str) -> None:
     """Checks that an existing path is one of the `accepted` keys of `_KINDS`."""
     kind = _SUFFIXES.get(path.suffix.lower(), "")
+    if kind == "mesh" and path.is_file() and b"KHR_gaussian_splatting" in path.read_bytes():
+        kind = "gaussians"
     if path.is_dir():
         kind = "scene" if (path / "scene.yaml").is_file() else ""
+        kind = "gaussians" if (path / "means_l.webp").is_file() else kind  # an unbundled SOG
         if not kind and "capture" not in accepted:  # takes seconds to import, for a message
             from splatpilot.training.captures.capture_registry import CAPTURES
 

@@ -266,15 +266,14 @@ SCENARIO_OPTIONS = (
     ),
     Option(
         "--policy NAME[:FIELD=VALUE]",
-        f"policy: {', '.join(checks.POLICIES)}, a file of weights, or module:Class",
+        f"policy: {', '.join(checks.POLICY_NAMES)}, a file of weights, or module:Class",
         resolve=checks.check_policy,
-        completions=checks.POLICIES,
+        completions=checks.POLICY_NAMES,
     ),
     Option("--speed M/S", "nominal speed of the policy", float),
     Option(
         "--scene DIR_OR_FILE",
-        "fly in this scene folder, file of Gaussians (PLY, SPZ, .splat; meters, z up) or OctoMap "
-        "(.bt)",
+        "fly in this scene folder, file of Gaussians (meters, z up) or OctoMap (.bt)",
         Path,
         resolve=_check_scene,
     ),

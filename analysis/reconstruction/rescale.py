@@ -12,17 +12,24 @@ from pydrake.math import RigidTransform, RotationMatrix
 from splatpilot.diagrams.worlds import scene_folder
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.collision.observations import Observations
 from splatpilot.systems.common.config import load_config
 from splatpilot.systems.common.files import require_writable_folder
 from splatpilot.systems.common.validation import require
-from splatpilot.systems.splats.splat_files import read_ply, read_splats, write_ply
+from splatpilot.systems.splats.splat_files import (
+    WRITTEN,
+    read_ply,
+    read_splats,
+    sog_meta,
+    write_splats,
+)
 from splatpilot.training.captures.capture import shrink_factor
 from splatpilot.training.captures.capture_config import CaptureConfig, complete_config
 from splatpilot.training.captures.capture_registry import read_scene_capture
 from splatpilot.training.captures.up_and_scale import camera_height
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.distance_field import render_depth
-from splatpilot.training.reconstruction.reconstruct import start_and_goal
+from splatpilot.training.reconstruction.reconstruct import with_default_route
 
 _KEPT = (
     *("gains", "vignetting", "representation", "capture", "capture_settings", "capture_notes"),
@@ -57,16 +64,17 @@ class RescaleSummary:
 def rescale_file(
     file: Path, out: Path, factor: float, up: str, floor: Sequence[ArrayLike]
 ) -> RescaleSummary:
-    """Writes the Gaussians of a file as PLY, in meters and with z up. Its axis `up` becomes z. If
-    `floor` has three points (3,), their plane becomes z = 0, and `up` tells its upper side."""
-    if out.suffix.lower() != ".ply":
-        raise ValueError(f"{out}: Gaussians are written as PLY; name it so, {out.stem}.ply")
+    """Writes the Gaussians of a file as PLY, glTF or USD, in meters. Its axis `up` becomes z, or y
+    of glTF. If `floor` has three points (3,), their plane becomes z = 0, and `up` tells its upper
+    side."""
+    suffix = out.suffix.lower()
+    require(suffix in WRITTEN, f"{out}: the suffix", f"one of {', '.join(WRITTEN)}", repr(suffix))
     if out.exists():
         raise ValueError(f"{out}: exists already; choose another name for the scaled file")
     require_writable_folder(out.absolute().parent)
     X_WF = _upright(up, floor)
     gaussians = read_splats(file).transformed_by(X_WF).scaled_by(factor)
-    write_ply(gaussians, out)
+    write_splats(gaussians, out)
     lower_W, upper_W = np.percentile(gaussians.means.astype(float), [1, 99], axis=0)
     details = {"Gaussians": str(len(gaussians))}
     if any(gaussians.origin):
@@ -117,9 +125,10 @@ def run(
     """Scales a scene folder by `rescale`, or a file of Gaussians by `rescale_file`. The factor is
     given, or follows from the distance between two points (3,) or from the median height of the
     capture's cameras [m]."""
-    if scene.is_file() and height is not None:
+    is_file = scene.is_file() or sog_meta(scene) is not None
+    if is_file and height is not None:
         raise ValueError(f"{scene}: a file has no cameras; give a factor, or points and a distance")
-    if scene.is_dir() and (up is not None or len(floor)):
+    if not is_file and (up is not None or len(floor)):
         raise ValueError(f"{scene}: z is up in scene folders; leave --up and --floor out")
     if distance is not None:
         a, b = (np.asarray(p, dtype=float) for p in between)
@@ -134,7 +143,7 @@ def run(
         factor = 1.0
     if factor is None:
         raise ValueError("give a factor, two points and the distance between them, or a height")
-    if scene.is_file():
+    if is_file:
         summary = rescale_file(scene, out, _positive("factor", factor), up or "z", floor)
     else:
         summary = rescale(scene, out, factor)
@@ -153,7 +162,9 @@ def rescale(scene: Path, out: Path, factor: float) -> RescaleSummary:
     gaussians = read_ply(scene / "gaussians.ply").scaled_by(factor)
     field = Esdf.load(scene / "esdf.npz").scaled_by(factor)
     about, warnings = _about_capture(metadata, factor)
-    frontier = None
+    observations = frontier = None
+    if (scene / scene_folder.OBSERVATIONS).exists():
+        observations = Observations.load(scene / scene_folder.OBSERVATIONS).scaled_by(factor)
     if metadata.frontier:
         frontier = read_ply(scene / scene_folder.FRONTIER).scaled_by(factor)
     elif not metadata.metric:
@@ -168,16 +179,20 @@ def rescale(scene: Path, out: Path, factor: float) -> RescaleSummary:
         except (ValueError, OSError) as error:
             warnings += (f"the frontier of the scene stays open: {error}",)
     ends = factor * np.array(metadata.p_WS), factor * np.array(metadata.p_WG)
-    p_WS, p_WG, geodesic, unflyable = start_and_goal(field, True, ends)
     background = scene_folder.read_background(scene, metadata)
+    world = World(
+        metadata.name, gaussians, field, field, background, *ends, observations=observations
+    )
+    world, route, unflyable = with_default_route(world, frontier, True)
     scene_folder.write_scene_folder(
         out,
-        World(metadata.name, gaussians, field, field, background, p_WS, p_WG),
+        world,
         frontier,
         provenance=f"{metadata.provenance}, scaled by {factor:.6g}",
         **{name: getattr(about, name) for name in _KEPT},
     )
-    details = {"shortest path [m]": f"{geodesic:.1f}"}
+    length = route.length
+    details = {"shortest path [m]": f"{length:.1f}"} if math.isfinite(length) else {}
     size = field.upper_W - field.lower_W
     return RescaleSummary(out, factor, size, details, (*warnings, *unflyable))
 

@@ -1,6 +1,7 @@
 """Simulation of one flight, and its record."""
 
 import json
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -10,7 +11,7 @@ from typing import cast
 
 import numpy as np
 from pydrake.common import RandomGenerator
-from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
+from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorStatus
 from pydrake.systems.framework import Context, Diagram, EventStatus
 from pydrake.systems.primitives import VectorLogSink
 
@@ -19,14 +20,18 @@ from splatpilot.diagrams.flight.monitor import FlightMonitor, Outcome, flight_mo
 from splatpilot.diagrams.flight.scenario import (
     Scenario,
 )
+from splatpilot.diagrams.worlds.observed_routes import ObservedViews
+from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.common.config import dump_config
 from splatpilot.systems.common.files import written_atomically
 from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.common.validation import require
-from splatpilot.systems.vehicle.state import QuadrotorState
+from splatpilot.systems.sensing.onboard_camera import OnboardCamera
+from splatpilot.systems.vehicle.state import QuadrotorState, pose_from_state
 from splatpilot.systems.visualization.live import RESTART
 
 _ACCURACY = 3e-4  # of the Context: a flight ends within 1e-7 s, less than a micrometer.
+_CLOSE = 2e-8  # [s] to the end; twice that needs no isolation at this accuracy
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +47,8 @@ class Flight:
     # without plans.
     hypotheses: np.ndarray
     wall_time: float  # [s] that the simulation took after its initialization
+    # Mean fraction of the policy's view without an observed surface; NaN if it is not known.
+    unobserved: float = math.nan
     reason: str = ""  # of the outcome `ERROR`: when and where which exception was raised
 
     def summary(self) -> dict[str, float | str]:
@@ -56,7 +63,9 @@ class Flight:
             "mean_speed_m_s": path_length / duration if duration > 0 else 0.0,
             "min_clearance_m": float(np.nanmin(self.clearances)),
             "real_time_factor": duration / self.wall_time,
-        } | ({"reason": self.reason} if self.reason else {})
+            **({} if math.isnan(self.unobserved) else {"unobserved_fraction": self.unobserved}),
+            **({"reason": self.reason} if self.reason else {}),
+        }
 
     def __repr__(self) -> str:
         return (
@@ -154,13 +163,21 @@ def fly_all(
     simulator.set_target_realtime_rate(realtime_rate)
     root = simulator.get_mutable_context()
 
+    systems = [system for _, system in monitors.values()]
+    for system in systems:
+        system.overrun = None
+
     def watch(context: Context) -> EventStatus:
         if progress is not None:
             progress(context.get_time())
-        return (monitor and monitor(context)) or EventStatus.DidNothing()
+        status = (monitor and monitor(context)) or EventStatus.DidNothing()
+        for system in systems:
+            if system.overrun is not None and system.overrun[0] > context.get_time():
+                if status.severity() in _SEVERITIES_IN_FLIGHT:
+                    return EventStatus.ReachedTermination(system, _NEAR_END)
+        return status
 
-    if progress is not None or monitor is not None:
-        simulator.set_monitor(watch)
+    simulator.set_monitor(watch)
     limit = max(system.scenario.timeout for _, system in monitors.values())
     flights: dict[str, Flight] = {}
 
@@ -172,7 +189,9 @@ def fly_all(
                 if ended is not None:
                     wall_time = time.perf_counter() - started
                     prefix = name.removesuffix("monitor")
-                    flights[name] = record_flight(parent, root, ended, wall_time, prefix)
+                    flight = record_flight(parent, root, ended, wall_time, prefix)
+                    fraction = unobserved_fraction(system.scenario, system.world, flight.states)
+                    flights[name] = replace(flight, unobserved=fraction)
 
     simulator.Initialize()
     started = time.perf_counter()
@@ -187,13 +206,15 @@ def fly_all(
                 _START,
             )
         while len(flights) < len(monitors):
-            status = simulator.AdvanceTo(limit)
+            end = min(_next_time(system, root) for system in systems)
+            status = simulator.AdvanceTo(min(end, limit))
             record()
             if status.message() == RESTART:
                 return fly_all(
                     diagram, monitor=monitor, progress=progress, realtime_rate=realtime_rate
                 )
-            if not isinstance(status.system(), FlightMonitor):
+            near = end < limit and status.reason() == _BOUNDARY
+            if not near and not isinstance(status.system(), FlightMonitor):
                 break
         record(Outcome.INTERRUPTED)
     except KeyboardInterrupt as error:
@@ -211,6 +232,40 @@ def fly_all(
         if not isinstance(error, InfeasibleFlightError):
             raise FlightError(_first(flights, Outcome.ERROR)) from error
     return flights
+
+
+_NEAR_END = "near the end"
+_BOUNDARY = SimulatorStatus.ReturnReason.kReachedBoundaryTime
+_SEVERITIES_IN_FLIGHT = EventStatus.Severity.kDidNothing, EventStatus.Severity.kSucceeded
+
+
+def _next_time(monitor: FlightMonitor, root: Context) -> float:
+    """Returns a time [s] close to the end of a flight that a step of its simulator has passed.
+
+    Drake isolates such an end by halving the step, and begins again with a full one after each that
+    stops before the end. The secant, first to just before the end, takes a tenth of those steps.
+    """
+    (end, beyond), now = monitor.overrun or (0.0, 0.0), root.get_time()
+    if end <= now:
+        monitor.overrun = None
+        return math.inf
+    margin = monitor.margin(monitor.GetMyContextFromRoot(root))
+    duration = margin / (margin - beyond) * (end - now)
+    return min(now + duration + (-_CLOSE if duration > 2 * _CLOSE else _CLOSE), end)
+
+
+_MAX_VIEWS = 60  # of a flight
+
+
+def unobserved_fraction(scenario: Scenario, world: World, states: np.ndarray) -> float:
+    """Returns the mean fraction of `ObservedViews` along states (N, 13), for the camera of the
+    scenario's policy; NaN for a world that is not captured, or of an older scene."""
+    if world.observations is None and not world.num_frontier:
+        return math.nan
+    camera = getattr(scenario.policy, "camera", None) or OnboardCamera()
+    views = ObservedViews(world, camera)
+    rows = np.linspace(0, len(states) - 1, min(_MAX_VIEWS, len(states))).astype(int)
+    return float(np.mean([views.unobserved(pose_from_state(state)) for state in states[rows]]))
 
 
 _START = "build the plant with sample_initial_state(scenario, world)"

@@ -267,10 +267,13 @@ def format_summary(summary: dict[str, float | str]) -> str:
         ("path length", "path_length_m", "{:.2f} m"),
         ("mean speed", "mean_speed_m_s", "{:.2f} m/s"),
         ("minimum clearance", "min_clearance_m", "{:+.3f} m"),
+        ("unobserved pixels", "unobserved_fraction", "{:.1%}"),
         ("real-time factor", "real_time_factor", "{:.1f}"),
         ("render", "render_ms", "{:.1f} ms"),
     )
-    return "\n".join(f"{title:<18} {form.format(summary[key])}" for title, key, form in rows)
+    return "\n".join(
+        f"{title:<18} {form.format(summary[key])}" for title, key, form in rows if key in summary
+    )
 
 
 def _render_ms(camera: SplatCamera, flight: Flight, num_views: int = 30) -> float:

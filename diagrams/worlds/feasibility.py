@@ -12,8 +12,8 @@ from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 
 from splatpilot.diagrams.worlds.solids.solid import WorldSpec
-from splatpilot.systems.collision.distance_field import DistanceField
-from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.collision.distance_field import DistanceField, FieldState
+from splatpilot.systems.collision.esdf import Esdf, distance_to_voxels
 from splatpilot.systems.collision.esdf_build import cubes_of_points
 from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.common.validation import Config, check_seed
@@ -129,7 +129,7 @@ def choose_start_and_goal(
     shortest path is at least 60 % of that. After `_DRAWS` starts without such a goal, the start is
     an end of the longest path.
     """
-    part = _longest_part(esdf, radius, margin, longest, least)
+    part = longest_part(esdf, radius, margin, longest, least)
     if seed is None:
         goal, length = _farthest(part.graph, part.end, longest)
         return part.p_WN[part.end], part.p_WN[goal], length
@@ -165,7 +165,13 @@ def choose_ends(
     return p_WS, p_WG
 
 
-def _longest_part(esdf: Esdf, radius: float, margin: float, longest: float, least: float) -> _Part:
+def longest_part(
+    esdf: Esdf,
+    radius: float,
+    margin: float = 0.2,
+    longest: float = 40.0,
+    least: float = SHORTEST,
+) -> _Part:
     """Returns the connected part of the free space with the longest path, up to `longest` [m]. Half
     of the margin is preferred for a path `_GAIN` times as long if one is not `LONG_ENOUGH`."""
     best, reach = None, 0.0
@@ -193,8 +199,12 @@ def _free_graphs(
     esdf: Esdf, radius: float, margin: float
 ) -> Iterator[tuple[csr_array, NDArray[np.float64], float]]:
     """Yields graphs of the space free for a sphere, with all and half of `margin`: graph, nodes
-    (N, 3) [m] and their spacing [m]."""
-    field = esdf.conservative()
+    (N, 3) [m] and their spacing [m]. The free spheres about the ends of an edge cover it."""
+    # As in `Esdf.conservative`, but for free space alone, which takes a fifth of the time.
+    unknown = esdf.states == FieldState.UNKNOWN
+    distances = distance_to_voxels(unknown, esdf.voxel_size) - np.float32(0.5 * esdf.voxel_size)
+    distances = np.minimum(esdf.distances, distances)
+    field = Esdf(distances, esdf.states, esdf.lower_W, esdf.voxel_size)
     extent = esdf.upper_W - esdf.lower_W
     spacing = max(esdf.voxel_size, 0.15, float(np.cbrt(np.prod(extent) / _MAX_NODES)))
     axes = [
@@ -202,10 +212,14 @@ def _free_graphs(
         for low, size in zip(esdf.lower_W, extent, strict=True)
     ]
     p_WN = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)  # (nx, ny, nz, 3)
-    clearance = field.distance(p_WN) - radius  # [m]
+    clearance = conservative_distance(field, p_WN) - radius  # [m]
     for need in (margin, margin / 2):
         if np.count_nonzero(clearance > need) >= 2:
             graph, nodes = grid_graph(clearance > need, spacing)
+            edges, room = graph.tocoo(), clearance.flat[nodes]
+            kept = room[edges.row] + room[edges.col] >= edges.data
+            ends = edges.row[kept], edges.col[kept]
+            graph = csr_array((edges.data[kept], ends), shape=graph.shape)
             yield graph, p_WN.reshape(-1, 3)[nodes], spacing
 
 

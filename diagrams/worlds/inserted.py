@@ -1,6 +1,6 @@
 """Reconstructed scenes with inserted obstacles."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,8 +8,8 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from scipy.ndimage import label
 
 from splatpilot.diagrams.worlds.building_blocks import TIGHT_CLEARING, has_clearance, require_order
-from splatpilot.diagrams.worlds.feasibility import TRIES, choose_ends
-from splatpilot.diagrams.worlds.scene_folder import SceneSource, read_scene_world
+from splatpilot.diagrams.worlds.feasibility import TRIES
+from splatpilot.diagrams.worlds.scene_folder import SceneSource, draw_ends, read_scene_world
 from splatpilot.diagrams.worlds.solids.solid import Solid, WorldSpec, cut_faces
 from splatpilot.diagrams.worlds.solids.surfels import draw
 from splatpilot.diagrams.worlds.solids.textures import Lamplight
@@ -53,8 +53,7 @@ def inserted_world(config: InsertedConfig, seed: int) -> World:
         rng = np.random.default_rng([seed, attempt])
         if config.draw_ends and attempt % 10 == 9:
             again = int(rng.integers(2**31))
-            p_WS, p_WG = choose_ends(scene.esdf, config.path, config.least_way, again)
-            scene = replace(scene, p_WS=p_WS, p_WG=p_WG)
+            scene = draw_ends(config, scene, again)
         solids = _draw_solids(config, scene, rng)
         if len(solids) < config.least:
             continue
@@ -144,5 +143,6 @@ def _insert(world: World, solids: list[Solid], esdf: Esdf, seed: int) -> World:
     name, ends = f"{world.name}_inserted", (world.p_WS, world.p_WG)
     box = esdf.lower_W, esdf.upper_W
     spec = WorldSpec(name, *box, solids, *ends, light=lambda _: light, seed=seed)
-    gaussians = world.gaussians.merged_with(draw(spec, solids, light))
-    return World(name, gaussians, esdf, esdf, world.background, *ends)
+    gaussians = draw(spec, solids, light).merged_with(world.gaussians)  # the frontier stays last
+    frontier = world.num_frontier
+    return World(name, gaussians, esdf, esdf, world.background, *ends, num_frontier=frontier)

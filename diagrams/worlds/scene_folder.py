@@ -3,6 +3,7 @@
 `gaussians.ply` is for cameras, `esdf.npz` for collisions, and `scene.yaml` is `SceneMetadata`.
 `environment.png`, if present, is the background (`EnvironmentMap`). `frontier.ply`, if present,
 closes the scene at unobserved space: cameras of flights see it, metrics of the scene do not.
+`observations.npz`, if present, tells how often and from where images saw each surface.
 """
 
 import functools
@@ -19,6 +20,7 @@ from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed
 from pydrake.math import RigidTransform
 
 from splatpilot.diagrams.worlds.feasibility import SHORTEST, choose_ends
+from splatpilot.diagrams.worlds.observed_routes import MAX_UNOBSERVED, choose_observed_route
 from splatpilot.diagrams.worlds.solids.surfaces import Surfels, to_gaussians
 from splatpilot.diagrams.worlds.splits import check_split
 from splatpilot.diagrams.worlds.world import World
@@ -32,6 +34,7 @@ from splatpilot.systems.collision.frontier import (
     reachable_space,
     with_obstacles,
 )
+from splatpilot.systems.collision.observations import Observations
 from splatpilot.systems.common.files import (
     folder_written_atomically,
     require_scene,
@@ -41,14 +44,15 @@ from splatpilot.systems.common.files import (
 from splatpilot.systems.common.readers import error_summary, read_text, yaml_errors
 from splatpilot.systems.common.validation import Config, bounded, require, require_field
 from splatpilot.systems.splats.background import FAR, Background, EnvironmentMap, mean_color
-from splatpilot.systems.splats.scene import GaussianScene
-from splatpilot.systems.splats.splat_files import read_ply, read_splats, write_ply
+from splatpilot.systems.splats.scene import GaussianScene, color_to_sh
+from splatpilot.systems.splats.splat_files import read_ply, read_splats, sog_meta, write_ply
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
 FORMAT_VERSION = 2
 CAPTURE = "capture"  # folder of a capture that was rendered for the scene
 ENVIRONMENT = "environment.png"
 FRONTIER = "frontier.ply"
+OBSERVATIONS = "observations.npz"
 REPRESENTATIONS = "3dgs", "2dgs"
 WORLD_FRAME = "z up"
 
@@ -134,14 +138,16 @@ _MAX_VOXELS = 2e7
 _MAX_VOXEL = 0.25  # [m], at which a vehicle of 0.354 m radius still finds a route
 
 
-def read_scene(path: str | Path) -> World:
+def read_scene(path: str | Path, hatched: bool = False) -> World:
     """Reads a scene folder, or a file of Gaussians alone, see `read_splats`."""
     path = Path(path)
-    return read_scene_folder(path) if path.is_dir() else _read_bare_gaussians(path)
+    is_scene = path.is_dir() and sog_meta(path) is None
+    return read_scene_folder(path, hatched=hatched) if is_scene else _read_bare_gaussians(path)
 
 
-def read_scene_folder(path: str | Path, *, metric: bool = True) -> World:
-    """Reads a scene folder; accepts one without scale unless `metric`."""
+def read_scene_folder(path: str | Path, *, metric: bool = True, hatched: bool = False) -> World:
+    """Reads a scene folder; accepts one without scale unless `metric`. Its frontier is plain and
+    dark, or `hatched`."""
     path = Path(path)
     for file in (path, path / "scene.yaml", path / "gaussians.ply", path / "esdf.npz"):
         if not file.exists():
@@ -156,7 +162,7 @@ def read_scene_folder(path: str | Path, *, metric: bool = True) -> World:
     gaussians = read_ply(path / "gaussians.ply")
     num_observed = len(gaussians)
     if metadata.frontier:
-        gaussians = gaussians.merged_with(read_ply(path / FRONTIER))
+        gaussians = gaussians.merged_with(_paint_frontier(read_ply(path / FRONTIER), hatched))
     esdf = Esdf.load(path / "esdf.npz")
     stated = np.array([metadata.lower_W, metadata.upper_W])
     found = np.array([esdf.lower_W, esdf.upper_W])
@@ -164,8 +170,17 @@ def read_scene_folder(path: str | Path, *, metric: bool = True) -> World:
     valid = np.allclose(stated, found, atol=1e-6)
     require(valid, what, condition, stated, "the files are of different scenes")
     background, ends = read_background(path, metadata), np.array([metadata.p_WS, metadata.p_WG])
-    num_frontier = len(gaussians) - num_observed
-    return World(metadata.name, gaussians, esdf, esdf, background, *ends, num_frontier=num_frontier)
+    file = path / OBSERVATIONS
+    return World(
+        metadata.name,
+        gaussians,
+        esdf,
+        esdf,
+        background,
+        *ends,
+        num_frontier=len(gaussians) - num_observed,
+        observations=Observations.load(file) if file.exists() else None,
+    )
 
 
 def read_background(path: Path, metadata: SceneMetadata) -> Background:
@@ -214,6 +229,8 @@ def write_scene_folder(
         if frontier is not None:
             write_ply(frontier, new / FRONTIER)
         esdf.save(new / "esdf.npz")
+        if world.observations is not None:
+            world.observations.save(new / OBSERVATIONS)
         if isinstance(world.background, EnvironmentMap):
             world.background.save(new / ENVIRONMENT)
         if (path / CAPTURE).is_dir():
@@ -242,7 +259,7 @@ def _read_bare_gaussians(path: Path) -> World:
 class SceneSource(Config):
     """An environment on disk."""
 
-    # A scene folder, or a file of Gaussians (PLY, SPZ or .splat): here, or in the folder of the
+    # A scene folder, or a file of Gaussians (see `read_splats`): here, or in the folder of the
     # environment variable SPLATPILOT_SCENES, by default `scenes`.
     path: str = ""
     # How to get the scene, for the error if it is missing.
@@ -251,6 +268,11 @@ class SceneSource(Config):
     draw_ends: bool = False
     # [m] Minimum length of the shortest route between ends that are drawn.
     least_way: float = bounded(SHORTEST, "[0, inf) m")
+    # [-] Maximum mean fraction of pixels without an observed surface that a camera sees along the
+    # route between ends that are drawn; 1 for any. A scene without observations has no limit.
+    max_unobserved: float = bounded(MAX_UNOBSERVED, "[0, 1]")
+    # If true, surfaces that close unobserved space are hatched; otherwise they are plain and dark.
+    hatched: bool = False
 
     def check(self) -> None:
         require_field(self, "path", self.path, "a scene folder or a file of Gaussians")
@@ -269,11 +291,19 @@ def find_scene(config: SceneSource) -> Path:
 
 def read_scene_world(config: SceneSource, seed: int) -> World:
     """Reads the scene of `config`."""
-    world = read_scene(find_scene(config))
-    if config.draw_ends:
-        p_WS, p_WG = choose_ends(world.esdf, config.path, config.least_way, seed)
-        world = replace(world, p_WS=p_WS, p_WG=p_WG)
-    return world
+    world = read_scene(find_scene(config), config.hatched)
+    return draw_ends(config, world, seed) if config.draw_ends else world
+
+
+def draw_ends(config: SceneSource, world: World, seed: int) -> World:
+    """Returns the world with another start and goal, see `SceneSource`."""
+    known = world.observations is not None and len(world.observations.view_points)
+    limit, length = config.max_unobserved, config.least_way
+    if known and limit < 1.0:
+        route = choose_observed_route(world, limit, length, seed)
+        return replace(world, p_WS=route.p_WS, p_WG=route.p_WG)
+    p_WS, p_WG = choose_ends(world.esdf, config.path, length, seed)
+    return replace(world, p_WS=p_WS, p_WG=p_WG)
 
 
 _CELL = 2  # [voxels] edge of the cells whose faces one surfel covers
@@ -287,6 +317,7 @@ _WIDTH = 160  # [px] approximate width to which depth images are subsampled
 _FAR_VOXEL, _FAR_VOXELS = 2, 2e6
 _STRIPE = 0.4  # [m] period of the hatching along each axis
 _SHADES = np.array([0.62, 0.42])  # gray of its two tones, 0 to 1
+_PLAIN = 0.1  # gray of a frontier that is not hatched
 
 
 def close_frontier(
@@ -294,8 +325,8 @@ def close_frontier(
 ) -> tuple[Esdf, GaussianScene | None]:
     """Closes a captured scene where reachable space ends in unknown space.
 
-    Returns the distance field with obstacles where unknown space begins, and hatched surfels that
-    draw them; `esdf` and None if the scene is closed. Space before the sky, and before surfaces
+    Returns the distance field with obstacles where unknown space begins, and surfels that draw
+    them; `esdf` and None if the scene is closed. Space before the sky, and before surfaces
     beyond the field's range, has no obstacles; its surfels begin behind all that the images saw.
     For depths, K and X_WCs see `esdf_from_depth_images`.
     """
@@ -351,5 +382,12 @@ def _draw(esdf: Esdf, centers: NDArray[np.float64], normals: NDArray[np.float64]
     # A square of edge a has the deviation a / sqrt(12); a surfel of _COVERAGE a covers it.
     extent = _COVERAGE * np.sqrt(12.0 * variance[:, [2, 1]]) * esdf.voxel_size
     surfels = Surfels(p, R_WP[:, :, 0], R_WP[:, :, 2], extent)
-    shade = _SHADES[np.floor(2.0 * p.sum(axis=1) / _STRIPE).astype(int) % 2]
-    return to_gaussians(surfels, np.repeat(shade[:, None], 3, axis=1), 0.99)
+    return to_gaussians(surfels, np.full((len(p), 3), _PLAIN), 0.99)
+
+
+def _paint_frontier(frontier: GaussianScene, hatched: bool) -> GaussianScene:
+    """Paints a frontier plain, or in stripes."""
+    stripe = np.floor(2.0 * frontier.means.sum(axis=1) / _STRIPE).astype(int) % 2
+    shade = _SHADES[stripe] if hatched else np.full(len(frontier), _PLAIN)
+    sh = np.repeat(color_to_sh(shade)[:, None, None], 3, axis=2)
+    return replace(frontier, sh=sh.astype(np.float32))

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from splatpilot.systems.collision.distance_field import DistanceField
 from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.collision.observations import Observations
 from splatpilot.systems.splats.background import Background
 from splatpilot.systems.splats.baked_scene import BakedScene
 from splatpilot.systems.splats.moving_bodies import MovingObstacles
@@ -29,6 +30,7 @@ class World:
     moving: MovingObstacles | None = None
     num_frontier: int = 0  # last Gaussians, which close unobserved space
     rendered: BakedScene | None = None  # for cameras, instead of the Gaussians
+    observations: Observations | None = None  # of the capture; None if not known
     source: tuple[Any, int] | None = None  # the configuration and seed that make this world
 
     def __eq__(self, other: object) -> bool:

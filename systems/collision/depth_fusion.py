@@ -5,6 +5,7 @@ from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 from pydrake.math import RigidTransform
+from scipy.ndimage import distance_transform_edt
 
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.esdf_build import esdf_from_occupancy, grid_shape
@@ -171,6 +172,7 @@ def esdf_from_depth_images(
     upper_W: np.ndarray,
     voxel_size: float,
     max_range: float = 8.0,
+    swept_radius: float = 0.0,
 ) -> Esdf:
     """Fuses depth images into a distance field that marks unobserved space.
 
@@ -188,14 +190,45 @@ def esdf_from_depth_images(
         lower_W, upper_W: (3,) [m], the box to fill, see `bounds_of_depth_images`.
         max_range: distance from the camera up to which space is seen [m]; a surface beyond it still
             clears the space before it.
+        swept_radius: unobserved space within this distance of the cameras' path is FREE [m].
     """
     fusion = DepthFusion(lower_W, upper_W, voxel_size)
     for depth, X_WC in _pair(depths, K, X_WCs, max_range, "fusing depth"):
         fusion.add(depth, np.asarray(K, dtype=float), X_WC, max_range)
     distance, seen = fusion.grids()
+    if swept_radius > 0.0:
+        swept = swept_space(X_WCs, lower_W, fusion.shape, voxel_size, swept_radius) & ~seen
+        distance[swept] = np.nan
+        unknown = ~(seen | swept)
+    else:
+        unknown = ~seen
     occupied = seen & (distance <= 0.0)
     offset = np.where(seen, distance, np.float32(np.nan))
-    return esdf_from_occupancy(occupied, ~seen, lower_W, voxel_size, offset)
+    return esdf_from_occupancy(occupied, unknown, lower_W, voxel_size, offset)
+
+
+def swept_space(
+    X_WCs: Sequence[RigidTransform],
+    lower_W: np.ndarray,
+    shape: Sequence[int],
+    voxel_size: float,
+    radius: float,
+) -> np.ndarray:
+    """Returns the voxels (nx, ny, nz) within `radius` [m] of the path of a camera. Poses farther
+    apart than twice the radius are not connected: the path between them is unknown."""
+    p_WCs = np.array([X_WC.translation() for X_WC in X_WCs])
+    points = [p_WCs]
+    for a, b in itertools.pairwise(p_WCs):
+        if voxel_size < (length := float(np.linalg.norm(b - a))) <= 2.0 * radius:
+            s = np.linspace(0.0, 1.0, 1 + int(np.ceil(length / voxel_size)))[1:-1, None]
+            points.append(a + s * (b - a))
+    away = np.ones(tuple(shape), dtype=bool)
+    index = np.floor((np.concatenate(points) - lower_W) / voxel_size).astype(int)
+    index = index[((index >= 0) & (index < shape)).all(axis=1)]
+    away[tuple(index.T)] = False
+    if not len(index):
+        return ~away
+    return distance_transform_edt(away, sampling=voxel_size) <= radius
 
 
 def bounds_of_depth_images(

@@ -136,6 +136,7 @@ class BakedScene:
         """Bakes a scene without keeping a reference to it; see `create_renderer`."""
         self._renderer = create_renderer(threads, simd)
         self._scene = _native.BakedScene(_native_gaussians(scene))
+        self._antialiased = getattr(scene, "antialiased", False)
 
     def recolored(self, sh: np.ndarray) -> "BakedScene":
         """Returns the same Gaussians in other colors, `sh` (N, K, 3), without baking again."""
@@ -146,6 +147,7 @@ class BakedScene:
         recolored = object.__new__(BakedScene)
         recolored._scene = self._scene.recolored(sh, harmonic_degree(sh.shape[1]))
         recolored._renderer = self._renderer
+        recolored._antialiased = self._antialiased
         return recolored
 
     def render(
@@ -218,6 +220,7 @@ class BakedScene:
             far_plane=far,
             eps2d=EPS2D,
             max_depth=max_depth,
+            antialiased=self._antialiased,
             **lens,
         )
         depth, color, alpha = (np.empty((height, width, n), np.float32) for n in (1, 3, 1))

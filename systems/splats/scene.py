@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -84,6 +84,15 @@ def sh_rotations(R: ArrayLike, degree: int) -> list[NDArray[np.float64]]:
     return [np.linalg.lstsq(basis_W[:, b], basis_O[:, b], rcond=None)[0] for b in bands]
 
 
+def rotated_sh(sh: NDArray, R_WO: ArrayLike) -> NDArray[np.float64]:
+    """Returns coefficients (N, K, 3) of colors in frame O for directions in W."""
+    rotated = np.empty(sh.shape)
+    for l, matrix in enumerate(sh_rotations(R_WO, harmonic_degree(sh.shape[1]))):  # noqa: E741
+        band = slice(l * l, (l + 1) ** 2)
+        rotated[:, band] = np.einsum("jk,nkc->njc", matrix, sh[:, band])
+    return rotated
+
+
 def require_valid(
     valid: NDArray[np.bool_], name: str, array: NDArray, condition: str, remedy: str = ""
 ) -> None:
@@ -116,6 +125,9 @@ class GaussianScene:
     sh: NDArray[np.float32]  # (N, K, 3), K in {1, 4, 9, 16}: coefficients of red, green, blue
     origin: tuple[float, float, float] = field(default=(0.0, 0.0, 0.0), kw_only=True)
     """[m], position of the frame's origin in that of the file, whose Gaussians are far from 0."""
+    antialiased: bool = field(default=False, kw_only=True)
+    """True if they were trained so that Gaussians narrower than a pixel keep their light, and must
+    be rendered so, see `rasterize_mode` of `rasterize`."""
 
     def __post_init__(self):
         for name, columns in _SHAPES.items():
@@ -194,16 +206,11 @@ class GaussianScene:
         R_WO = X_WO.rotation().matrix()
         rotations = Rotation.from_matrix(R_WO) * Rotation.from_quat(self.quats, scalar_first=True)
         quats = rotations.as_quat(scalar_first=True)
-        sh = np.empty(self.sh.shape)
-        for l, matrix in enumerate(sh_rotations(R_WO, self.sh_degree)):  # noqa: E741
-            band = slice(l * l, (l + 1) ** 2)
-            sh[:, band] = np.einsum("jk,nkc->njc", matrix, self.sh[:, band])
-        return GaussianScene(
+        return replace(
+            self,
             means=(self.means @ R_WO.T + X_WO.translation()).astype(np.float32),
             quats=quats.astype(np.float32),
-            scales=self.scales,
-            opacities=self.opacities,
-            sh=sh.astype(np.float32),
+            sh=rotated_sh(self.sh, R_WO).astype(np.float32),
             origin=_vector(R_WO @ self.origin),
         )
 
@@ -212,12 +219,13 @@ class GaussianScene:
         scale = np.float32(factor)
         means, scales = self.means * scale, self.scales * scale
         origin = _vector(factor * np.array(self.origin))
-        return GaussianScene(means, self.quats, scales, self.opacities, self.sh, origin=origin)
+        return replace(self, means=means, scales=scales, origin=origin)
 
     def merged_with(self, other: GaussianScene) -> GaussianScene:
         """Returns this scene with the Gaussians of another in the same frame.
 
-        The lower of the two degrees of spherical harmonics is padded with zeros.
+        The lower of the two degrees of spherical harmonics is padded with zeros. The result is
+        `antialiased` as this scene is.
         """
         K = max(self.sh.shape[1], other.sh.shape[1])
         merged = {
@@ -228,7 +236,7 @@ class GaussianScene:
             np.pad(scene.sh, ((0, 0), (0, K - scene.sh.shape[1]), (0, 0)))
             for scene in (self, other)
         ]
-        return GaussianScene(**merged, sh=np.concatenate(padded), origin=self.origin)
+        return replace(self, **merged, sh=np.concatenate(padded))
 
 
 def _vector(p: NDArray[np.float64]) -> tuple[float, float, float]:

@@ -1,6 +1,7 @@
 """Checks that poses, intrinsics and depth of a capture agree, and finds a likely error if not.
 
-The capture as read, and readings of its files that each undo one known error, are measured on the
+Without depth, features that are matched between frames must lie on their epipolar lines. The
+capture as read, and readings of its files that each undo one known error, are measured on the
 same pairs of frames.
 """
 
@@ -25,6 +26,7 @@ from splatpilot.training.captures.capture import (
 )
 from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.capture_registry import read_capture
+from splatpilot.training.captures.epipolar import epipolar_errors, match_frames
 
 _BODIES = {
     "optical axes (x right, y down, z forward)": np.eye(3),
@@ -45,6 +47,10 @@ _TOLERANCE = 0.02  # median relative error up to which a capture agrees with its
 _NEGLIGIBLE = 0.002  # median relative error up to which other readings are ignored
 _MIN_GAIN = 0.5  # maximum fraction of the error that another reading may leave to be accepted
 _DEPTH_POINTS = 5000  # approximate number of pixels per image whose depth is compared
+
+# The same of epipolar errors, in focal lengths.
+_EPIPOLAR_TOLERANCE, _EPIPOLAR_NEGLIGIBLE = 0.01, 0.002
+_MIN_BEFORE = 0.5  # fraction of points that must lie before both cameras for a reading to count
 
 # The same of colors, whose error is 1 - their correlation between frames: 0.02 to 0.04 in captures
 # of real cameras, and 0.11 if one is wrongly read as registered.
@@ -76,18 +82,22 @@ class Reading:
     R_BC: RotationMatrix
     pose: Callable[[RigidTransform], RigidTransform] = lambda X_FB: X_FB
     factor: float = 1.0  # scale of depth
+    bend: float = 0.0  # k1 of radial distortion that the images still have
     is_range: bool = False  # if distance from the camera is stored instead of depth along its axis
 
 
 @dataclass(frozen=True)
 class ReadingFit:
-    """Agreement of depth between frames under a reading."""
+    """Agreement between frames under a reading."""
 
     name: str
     error: float
     """Median of |z' / z - 1|, depth z carried into another frame and z' found there; infinite if
-    the frames hardly overlap."""
-    inside: float  # fraction of points that fall onto measured depth in the other frame
+    the frames hardly overlap. Without depth the median distance of features from their epipolar
+    lines, in focal lengths."""
+    inside: float
+    """Fraction of points that fall onto measured depth in the other frame or, without depth, that
+    lie before both cameras."""
 
 
 @dataclass(frozen=True)
@@ -115,7 +125,7 @@ class CheckReport:
 
     capture: Capture
     pairs: int = 0
-    agreement: ReadingFit | None = None  # None if there is no depth to compare
+    agreement: ReadingFit | None = None  # None if nothing could be compared
     others: tuple[ReadingFit, ...] = ()  # other readings, the best first
     color: ColorFit | None = None
     problem: str = ""  # the most likely error in one sentence; empty if none was found
@@ -136,7 +146,9 @@ class CheckReport:
         if not capture.metric:
             lines.append("the scale is unknown; set capture.scale to fly in the scene")
         if self.agreement is None:
-            return "\n".join([*lines, "not compared: there is no depth"])
+            return "\n".join([*lines, "not compared: the images share too few features"])
+        if not capture.has_depth:
+            lines.append("distance of features from epipolar lines, in focal lengths:")
         lines.append(f"{'median error':>12}  {'overlap':>7}  reading")
         lines += [
             f"{each.error:12.2%}  {each.inside:7.0%}  {each.name}"
@@ -166,8 +178,6 @@ def run(*, capture: str | Path, config: CheckConfig) -> CheckReport:
 
 def doubts(capture: Capture) -> tuple[str, ...]:
     """Returns the error that `check_capture` finds, if any, as a warning."""
-    if not capture.has_depth:
-        return ()
     try:
         problem = check_capture(capture).problem
     except ValueError as error:
@@ -180,16 +190,19 @@ def doubts(capture: Capture) -> tuple[str, ...]:
 def check_capture(capture: Capture, pairs: int = 12) -> CheckReport:
     """Measures the agreement of a capture with itself, as read and in other readings. It agrees if
     its median relative error is at most 2 %, no other reading leaves less than half of an error
-    above 0.2 %, and colors follow depth. Without depth only its properties are reported."""
+    above 0.2 %, and colors follow depth. Without depth, features are compared instead, see
+    `epipolar_errors`, with a tolerance of 1 % of the focal length."""
     if not capture.has_depth:
-        return CheckReport(capture)
+        return _check_features(capture, pairs)
     found = _choose_pairs(capture, pairs)
     if sum(len(pair.depth) for pair in found) < _MIN_POINTS:
         raise ValueError(f"{capture.source}: too few pixels have depth in two frames to compare")
     K = (capture.depth_camera or capture).K
     as_read = Reading("as it was read", K, capture.axes.R_BC)
     agreement = _measure(as_read, found)
-    readings = _other_readings(as_read, capture) + _fitted_readings(as_read, found)
+    readings = _pose_readings(as_read) + _depth_readings(as_read)
+    readings += _camera_readings(as_read, capture)
+    readings += _fitted_readings(as_read, lambda reading: _measure(reading, found))
     others = sorted((_measure(each, found) for each in readings), key=lambda fit: fit.error)
     best, color = others[0], None
     X_CW = capture.X_WCs[0].inverse()
@@ -214,6 +227,58 @@ def check_capture(capture: Capture, pairs: int = 12) -> CheckReport:
         color = fit_color_camera(capture, [pair.frames for pair in found])
         problem = color.problem if color is not None else ""
     return CheckReport(capture, len(found), agreement, tuple(others), color, problem)
+
+
+def _check_features(capture: Capture, pairs: int) -> CheckReport:
+    """Measures how well poses and intrinsics explain features that frames share."""
+    matched = match_frames(capture, pairs)
+    if sum(len(pair.pixels[0]) for pair in matched) < _MIN_POINTS:
+        return CheckReport(capture)
+    R_BC = capture.axes.R_BC
+    X_FW = RigidTransform(capture.axes.R_WF.inverse()) @ RigidTransform(capture.origin)
+    X_CB = RigidTransform(R_BC.inverse())
+    poses = [X_FW @ X_WC @ X_CB for X_WC in capture.X_WCs]
+
+    def measure(reading: Reading) -> ReadingFit:
+        X = RigidTransform(reading.R_BC)
+        errors, before = zip(*(
+            epipolar_errors(
+                reading.K,
+                reading.bend,
+                pair,
+                (reading.pose(poses[j]) @ X).inverse() @ reading.pose(poses[i]) @ X,
+            )
+            for pair in matched
+            for i, j in [pair.frames]
+        ), strict=True)  # fmt: skip
+        inside = float(np.concatenate(before).mean())
+        median = float(np.median(np.concatenate(errors)))
+        return ReadingFit(reading.name, median if inside >= _MIN_BEFORE else np.inf, inside)
+
+    as_read = Reading("as it was read", capture.K, R_BC)
+    readings = _pose_readings(as_read) + _camera_readings(as_read, capture)
+    # A wrong principal point looks like a camera that is mounted askew.
+    readings += _fitted_readings(as_read, measure)[:1]
+    bend, _ = _minimize(
+        lambda x: min(measure(replace(as_read, bend=x[0])).error, 1.0), [0.1], 1e-3, 1e-7, 60
+    )
+    k1 = float(bend[0])
+    name = f"the images are still distorted: k1 = {k1:.2f} fits best"
+    readings.append(replace(as_read, name=name, bend=k1))
+    agreement = measure(as_read)
+    others = sorted(map(measure, readings), key=lambda fit: fit.error)
+    best, problem = others[0], ""
+    left = f"{best.error:.2%} of the focal length instead of {agreement.error:.2%}"
+    if agreement.error > _EPIPOLAR_NEGLIGIBLE and best.error < _MIN_GAIN * agreement.error:
+        problem = f"most likely {best.name}: features would miss their epipolar lines by {left}"
+    elif agreement.error > _EPIPOLAR_TOLERANCE:
+        problem = (
+            f"features miss their epipolar lines by {agreement.error:.1%} of the focal length, "
+            f"more than {_EPIPOLAR_TOLERANCE:.0%}, and no other reading explains it (the best, "
+            f"{best.name}, leaves {best.error:.1%}); poses may be inaccurate, or things may have "
+            "moved"
+        )
+    return CheckReport(capture, len(matched), agreement, tuple(others), None, problem)
 
 
 def _choose_pairs(capture: Capture, count: int) -> list[FramePair]:
@@ -282,8 +347,8 @@ def _relative_errors(reading: Reading, pair: FramePair) -> NDArray[np.float64]:
     return np.minimum(np.abs(found[known] / p_CQ[hit, 2][known] - 1), 1.0)
 
 
-def _other_readings(as_read: Reading, capture: Capture) -> list[Reading]:
-    """Returns the readings with one known error each undone, which is their name."""
+def _pose_readings(as_read: Reading) -> list[Reading]:
+    """Returns the readings with one known error of poses each undone, which is their name."""
 
     def posed(name: str, rotation: Callable, translation: Callable) -> Reading:
         def pose(X_FB: RigidTransform) -> RigidTransform:
@@ -299,10 +364,8 @@ def _other_readings(as_read: Reading, capture: Capture) -> list[Reading]:
     present = next(
         (name for name, R in _BODIES.items() if np.allclose(R, as_read.R_BC.matrix())), "its axes"
     )
-    is_range = "depth is the distance from the camera, read as depth along its axis"
     columns = "rotations are stored column by column, read row by row"
     readings = [
-        replace(as_read, name=is_range, is_range=True),
         posed("quaternions are w x y z, read as x y z w", w_last, lambda p: p),
         posed(columns, lambda R: R.T, lambda p: p),
     ]
@@ -319,10 +382,21 @@ def _other_readings(as_read: Reading, capture: Capture) -> list[Reading]:
     for name, M in _WORLDS.items():
         name = f"positions and rotations are in different worlds: {name} differ"
         readings.append(posed(name, lambda R: R, lambda p, M=M: M @ p))
+    return readings
+
+
+def _depth_readings(as_read: Reading) -> list[Reading]:
+    is_range = "depth is the distance from the camera, read as depth along its axis"
+    readings = [replace(as_read, name=is_range, is_range=True)]
     for factor in _DEPTH_FACTORS:
         large = f"depth is {1 / factor:g} times too large, or positions too small"
         small = f"depth is {factor:g} times too small, or positions too large"
         readings.append(replace(as_read, name=large if factor < 1 else small, factor=factor))
+    return readings
+
+
+def _camera_readings(as_read: Reading, capture: Capture) -> list[Reading]:
+    readings = []
     for factor in _IMAGE_FACTORS:
         name = f"intrinsics belong to images {1 / factor:g} times as large"
         readings.append(replace(as_read, name=name, K=np.diag([factor, factor, 1]) @ as_read.K))
@@ -333,7 +407,7 @@ def _other_readings(as_read: Reading, capture: Capture) -> list[Reading]:
     return readings
 
 
-def _fitted_readings(as_read: Reading, pairs: Sequence[FramePair]) -> list[Reading]:
+def _fitted_readings(as_read: Reading, measure: Callable[[Reading], ReadingFit]) -> list[Reading]:
     """Returns readings whose focal length, or principal point, fits best."""
 
     def changed(x: NDArray) -> Reading:
@@ -347,7 +421,7 @@ def _fitted_readings(as_read: Reading, pairs: Sequence[FramePair]) -> list[Readi
         return replace(as_read, name=name, K=K)
 
     def cost(x: NDArray) -> float:
-        return min(_measure(changed(x), pairs).error, 1.0)
+        return min(measure(changed(x)).error, 1.0)
 
     return [changed(_minimize(cost, s, 1e-4, 1e-6, 80)[0]) for s in ([0.1], [0.05, 0.05])]
 

@@ -23,10 +23,13 @@ class ReconstructConfig(Config):
     representation: str = bounded("3dgs", "{3dgs, 2dgs}")
     """"3dgs", Gaussians, or "2dgs", flat Gaussians (Huang et al. 2024)."""
     initialization: str = bounded("auto", "{auto, depth, points, random}")
-    """Initial positions: surfaces from "depth", "points" of structure from motion, or "random" in
-    the cameras' views; "auto" takes the first that the capture has."""
-    initial_gaussians: int = bounded(120_000, "[1, inf)")
-    """Maximum number of initial Gaussians."""
+    """Initial positions: surfaces from "depth", "points" of structure from motion, which are
+    triangulated between the images of a capture without any, or "random" in the cameras' views;
+    "auto" takes depth or, without it, points."""
+    initial_gaussians: int = bounded(0, "[0, inf)")
+    """Maximum number of initial Gaussians. 0 takes as many as shape and texture need at the
+    resolution of the closest images, at most 1,000,000, if they start from depth, and 120,000 if
+    they start at random."""
     max_gaussians: int = bounded(180_000, "[1, inf)")
     """Maximum number of Gaussians. Without iterations, it sets how finely texture is resolved."""
     split: str = bounded("", "{, train, validation, test}")

@@ -11,6 +11,7 @@ from splatpilot.systems.collision.depth_fusion import bounds_of_depth_images, es
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.splats.background import FAR
 from splatpilot.systems.splats.scene import GaussianScene
+from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 from splatpilot.training.captures.capture import Capture, shrink_mask
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.splat_rendering import SceneRenderer
@@ -103,9 +104,11 @@ def choose_grid(source: DepthSource, metric: bool, config: ReconstructConfig) ->
     return FieldGrid(lower_W, upper_W, voxel_size, max_range)
 
 
-def fuse(source: DepthSource, grid: FieldGrid) -> Esdf:
-    """Fuses depth images into a distance field; space that no image saw is unknown."""
-    return esdf_from_depth_images(source.images(), source.K, source.X_WCs, **vars(grid))
+def fuse(source: DepthSource, grid: FieldGrid, swept_radius: float = 0.0) -> Esdf:
+    """Fuses depth images into a distance field; space that no image saw is unknown, but for that
+    within `swept_radius` [m] of the path of the cameras."""
+    options = vars(grid) | {"swept_radius": swept_radius}
+    return esdf_from_depth_images(source.images(), source.K, source.X_WCs, **options)
 
 
 def make_distance_field(
@@ -127,5 +130,7 @@ def make_distance_field(
         capture, frames.factor, gaussians, config.representation, config.renderer_threads
     )
     if not capture.has_depth:
-        return fuse_within(rendered, rendered), rendered
+        # Depth that was not measured leaves gaps where the camera, and so the vehicle, has been.
+        grid = choose_grid(rendered, capture.metric, config)
+        return fuse(rendered, grid, VEHICLE_RADIUS if capture.metric else 0.0), rendered
     return fuse_within(add_sky(rendered, frames), captured), captured

@@ -20,10 +20,10 @@ from splatpilot.training.captures.capture import Capture, CaptureFrame, SfmPoint
 from splatpilot.training.captures.colmap import import_pycolmap
 from splatpilot.training.reconstruction.config import HOLD_OUT, ReconstructConfig
 from splatpilot.training.reconstruction.photometry import (
-    STRIDE,
     Photometry,
     ThinnedFrame,
     find_new_pixels,
+    widen,
 )
 
 MAX_STEPS = 7000
@@ -48,6 +48,7 @@ _MIN_COVERED = 0.8  # fraction of the surfaces, below which optimization leaves 
 _OPACITY, _OPACITY_ALONE = 0.9, 0.99  # on surfaces, with and without optimization
 _POINT_OPACITY, _POINT_SIZE = 0.1, 0.5  # size relative to the distance of the three closest others
 _RANDOM_DEPTH = (0.1, 10.0)  # in extents of the cameras
+_MAX_FROM_DEPTH, _RANDOM = 1_000_000, 120_000  # default maximum numbers of initial Gaussians
 _OVERLAP, _FEATURES = 10, 2048  # of images to be matched, and maximum of an image
 _MIN_POINTS = 100  # that are triangulated
 
@@ -203,7 +204,7 @@ def principal_axes(
 
 def _available(capture: Capture) -> dict[str, bool]:
     """Returns which initializations the capture has, the best first."""
-    return {"depth": capture.has_depth, "points": capture.points is not None, "random": True}
+    return {"depth": capture.has_depth, "points": True, "random": True}
 
 
 def resolve_config(config: ReconstructConfig, capture: Capture) -> ReconstructConfig:
@@ -240,12 +241,19 @@ def make_initial_gaussians(
     kind, available = config.initialization, _available(capture)
     possible = " or ".join(name for name, exists in available.items() if exists)
     require(available[kind], "initialization", f"{possible} for {capture.name}", kind)
-    count = config.initial_gaussians
     if kind == "depth":
+        count = config.initial_gaussians or _MAX_FROM_DEPTH
         return gaussians_from_depth(frames, photometry, count, config.contrast, optimized=True)
-    if capture.points is not None and kind == "points":
-        return gaussians_from_points(capture.points.p_WQ, capture.points.colors)
+    if kind == "points":
+        points = capture.points
+        try:
+            points = points or triangulate(capture, getattr(frames, "numbers", range(len(capture))))
+        except (ValueError, ModuleNotFoundError) as error:
+            say(f"{error}; starting from random points")
+        if points is not None:
+            return gaussians_from_points(points.p_WQ, points.colors)
     near, far = (extent * depth for depth in _RANDOM_DEPTH)
+    count = config.initial_gaussians or _RANDOM
     return gaussians_from_points(*random_points(frames, count, near, far, config.seed))
 
 
@@ -286,14 +294,14 @@ def gaussians_from_depth(
             height, width = frame.depth.shape
             factor = photometry.factor(k, height, width)
             image = (frame.image / (255 * factor[..., None])).astype(np.float32)
-            mask = new[k].repeat(STRIDE, axis=0).repeat(STRIDE, axis=1)[:height, :width]
+            mask = widen(new[k], views[k].stride, height, width)
             parts[k] = frame_gaussians(
                 frame, image, mask, contrast, max_cell, max_extent, underlay=not optimized
             )
             progress.update()
         return sum(len(p_WQ) for p_WQ, _, _ in parts.values())
 
-    # A subset of the frames tells early if the Gaussians are far too many.
+    # A subset of the frames tells early that the Gaussians are far too many.
     subset = range(0, len(frames), _SUBSET)
     rest = [k for k in range(len(frames)) if k not in subset]
     while True:

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from splatpilot.systems.common.progress import CheckpointClock, Progress
-from splatpilot.systems.splats.background import FAR, Background
+from splatpilot.systems.splats.background import Background
 from splatpilot.systems.splats.baked_scene import create_renderer
 from splatpilot.systems.splats.rasterization import EPS2D
 from splatpilot.systems.splats.scene import GaussianScene
@@ -42,7 +42,7 @@ _NORMAL_WEIGHT, _NORMAL_START = 0.05, 7 / 30
 _LPIPS_FRACTION, _LPIPS_EVERY = 0.1, 4  # of the last steps, one in four computes LPIPS
 _SURFACE_FRACTION = 1 / 4  # of the Gaussians in view, drawn in each step for the surface loss
 _GAIN_FITS = (0.1, 0.2, 0.4)  # fractions of all steps after which unknown gains are fitted
-_LIMIT_EVERY = 500  # steps between updates of the scale limits
+_MIN_LIMIT_STEPS = 500  # between updates of the scale limits, or a quarter of all steps
 _MEASURE_EVERY = 1000  # steps between metrics on held-out frames
 
 
@@ -144,16 +144,18 @@ def view_loss(
     """Returns the loss of the rendering of view `k` before `background` (1, 3), in an image of this
     gain; `outlines` are fitted instead of colors. `perceptual` is LPIPS of two images (H, W, 3)."""
     device = config.device
-    depth = views.depths[k].to(device)
+    frame = views.frame(k)
+    depth = torch.from_numpy(frame.depth).to(device)
     edges = views.edges[k].to(device).float()
     if outlines:
         loss = config.outline_weight * outline_loss(rendering.alpha, depth, edges)
     else:
-        target = views.target(k, gain, background.cpu()[0]).to(device)
-        valid = views.valid[k].to(device)[..., None]
-        color, invalid = rendering.color, rendering.color.detach()
-        # Invalid pixels are equal in both, so that no window compares them.
-        color, target = (torch.where(valid, image, invalid) for image in (color, target))
+        target = views.target(frame, gain, background.cpu()[0]).to(device)
+        color = rendering.color
+        if not frame.valid.all():
+            # Invalid pixels are equal in both, so that no window compares them.
+            valid, same = torch.tensor(frame.valid, device=device)[..., None], color.detach()
+            color, target = (torch.where(valid, image, same) for image in (color, target))
         loss = photometric_loss(color, target)
         late = step >= (1 - _LPIPS_FRACTION) * config.iterations
         if perceptual is not None and late and step % _LPIPS_EVERY == 0:
@@ -203,10 +205,7 @@ class Optimization:
         if held_out is not None:
             fitted = [ThinnedFrame.of(views.frame(k)) for k in range(len(views))]
             self._seen = [seen_pixels(held_out.frame(k), fitted) for k in range(len(held_out))]
-        sky = views.depths >= FAR
-        solid = (views.depths > 0) & ~sky
-        both = sky.flatten(1).any(dim=1) & solid.flatten(1).any(dim=1)
-        self._has_outlines = (both & (config.outline_weight > 0)).tolist()
+        self._fits_outlines = [config.outline_weight > 0 and has for has in views.has_outlines]
         self._perceptual = perceptual
         center, self.extent = views.extent()
         state = checkpoint.load()
@@ -258,7 +257,7 @@ class Optimization:
         background = torch.from_numpy(color).to(config.device)
         viewmat, K = self._views.camera(k, config.device)
         gaussians = self._gaussians(config.device)
-        outlines = self._has_outlines[k] and self.step % 2 == 1
+        outlines = self._fits_outlines[k] and self.step % 2 == 1
         rendering = render(
             config.representation,
             gaussians,
@@ -295,7 +294,8 @@ class Optimization:
             self._fit_gains()
         if self._strategy is not None:
             self._strategy.refine(self.step, splats)
-        if self.step % _LIMIT_EVERY == 0 or len(splats) != count:
+        every = max(_MIN_LIMIT_STEPS, config.iterations // 4)
+        if self.step % every == 0 or len(splats) != count:
             self._limit_scales()
 
     @torch.no_grad()
@@ -327,8 +327,9 @@ class Optimization:
         gains = []
         for k, rendering in enumerate(self._renderings(views)):
             color = rendering.color * views.vignette[..., None]
-            image = rendering.alpha[..., None] * views.images[k] / 255
-            gains.append(fit_gain(color, image, views.valid[k]))
+            frame = views.frame(k)
+            image = rendering.alpha[..., None] * torch.from_numpy(frame.image) / 255
+            gains.append(fit_gain(color, image, torch.tensor(frame.valid)))
         log_gains = torch.log(torch.tensor(gains).clamp(min=0.1))
         self.gains = torch.exp(log_gains - log_gains.mean())
 

@@ -120,7 +120,7 @@ def scale_limits(means: Tensor, views: ReconstructionViews, bounded: bool) -> li
         u, v, _ = (p_CQ / z[:, None] @ K.T).unbind(dim=1)
         inside = (z > 0) & (u >= 0) & (u < views.width) & (v >= 0) & (v < views.height)
         index = inside.nonzero()[:, 0]
-        shown = views.depths[k][v[index].long().cpu(), u[index].long().cpu()].to(means.device)
+        shown = views.depth(k)[v[index].long().cpu(), u[index].long().cpu()].to(means.device)
         index = index[(shown <= 0) | (z[index] < _HIDDEN * shown)]
         depth[index] = torch.minimum(depth[index], z[index])
     seen = depth.isfinite()

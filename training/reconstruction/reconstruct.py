@@ -7,7 +7,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from splatpilot.diagrams.worlds.feasibility import choose_start_and_goal, short_route_warning
+from splatpilot.diagrams.worlds.feasibility import short_route_warning
+from splatpilot.diagrams.worlds.observed_routes import (
+    MAX_UNOBSERVED,
+    ObservedRoute,
+    choose_default_route,
+    with_views,
+)
 from splatpilot.diagrams.worlds.scene_folder import (
     check_scene_target,
     close_frontier,
@@ -17,15 +23,16 @@ from splatpilot.diagrams.worlds.splits import choose_split, part_digests, source
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.collision.observations import Observations
 from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.common.torch_device import one_torch_thread
-from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
+from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.training.captures.capture import Capture, shrink_factor
 from splatpilot.training.captures.render import RECIPE, rendered_world
 from splatpilot.training.reconstruction.checkpoint import Checkpoint
 from splatpilot.training.reconstruction.config import ReconstructConfig
-from splatpilot.training.reconstruction.distance_field import make_distance_field
+from splatpilot.training.reconstruction.distance_field import DepthSource, make_distance_field
 from splatpilot.training.reconstruction.initialize import (
     gaussians_from_depth,
     held_out_frames,
@@ -39,6 +46,7 @@ from splatpilot.training.reconstruction.photometry import (
     Photometry,
     ThinnedFrame,
     estimate_photometry,
+    predict_gains,
 )
 from splatpilot.training.reconstruction.views import (
     ReconstructionViews,
@@ -60,9 +68,7 @@ class ReconstructSummary:
     gain_range: tuple[float, float]
     metric: bool  # lengths are in meters
     field: Esdf
-    p_WS: NDArray[np.float64]  # (3,) [m]
-    p_WG: NDArray[np.float64]  # (3,) [m]
-    geodesic: float  # [m], shortest path from start to goal
+    route: ObservedRoute  # default start and goal; of length NaN if the scene cannot be flown in
     held_out: HeldOutMetrics | None = None
     notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
@@ -84,11 +90,13 @@ class ReconstructSummary:
             "corner brightness": f"{np.exp(self.vignetting):.3f}",
         }
         if self.metric:
+            rows["seen free [m^3]"] = f"{self.field.volume(FieldState.FREE):.1f}"
+        if np.isfinite(self.route.length):
             rows |= {
-                "seen free [m^3]": f"{self.field.volume(FieldState.FREE):.1f}",
-                "default start [m]": vector(self.p_WS),
-                "default goal [m]": vector(self.p_WG),
-                "shortest path [m]": f"{self.geodesic:.1f}",
+                "default start [m]": vector(self.route.p_WS),
+                "default goal [m]": vector(self.route.p_WG),
+                "shortest path [m]": f"{self.route.length:.1f}",
+                "unobserved on it": f"{self.route.unobserved:.1%} of a camera's pixels",
             }
         if self.held_out is not None:
             rows["held-out frames"] = self.held_out
@@ -150,21 +158,24 @@ def reconstruct(
         )
         optimization.run()
         gains[fitted] = optimization.gains
+        gains[held_out] = predict_gains(fitted, gains[fitted], held_out)
         gaussians = optimization.splats.scene(flat=config.representation == "2dgs")
         metrics = optimization.measure()
-        if metrics is not None:
-            gains[held_out] = [view.gain for view in metrics.views]
         how = f"{config.representation}, {config.iterations} steps"
 
     field, depth = make_distance_field(capture, frames, gaussians, config)
+    observations = observe(depth, field.voxel_size)
     frontier = None
     if capture.metric:
         field, frontier = close_frontier(field, depth.images(), depth.K, depth.X_WCs)
     ends = capture.X_WCs[0].translation(), capture.X_WCs[-1].translation()
-    p_WS, p_WG, geodesic, warnings = start_and_goal(field, capture.metric, ends)
+    world = World(
+        capture.name, gaussians, field, field, background, *ends, observations=observations
+    )
+    world, route, warnings = with_default_route(world, frontier, capture.metric)
     write_scene_folder(
         out,
-        World(capture.name, gaussians, field, field, background, p_WS, p_WG),
+        world,
         frontier,
         provenance=f"{capture.source}, {len(capture)} frames, {how}",
         gains=[float(gain) for gain in gains],
@@ -190,9 +201,7 @@ def reconstruct(
         gain_range=(float(gains[fitted].min()), float(gains[fitted].max())),
         metric=capture.metric,
         field=field,
-        p_WS=p_WS,
-        p_WG=p_WG,
-        geodesic=geodesic,
+        route=route,
         held_out=metrics,
         notes=tuple(capture.notes),
         warnings=(*capture.dropped, *without_depth, *warnings),
@@ -239,17 +248,35 @@ def _without_depth(
     return (f"{len(empty)} of {len(frames)} frames have no pixel with depth: {listed}",)
 
 
-def start_and_goal(
-    field: Esdf, metric: bool, default: tuple[NDArray[np.float64], NDArray[np.float64]]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], float, tuple[str, ...]]:
-    """Returns p_WS, p_WG, the length of the shortest path [m] and warnings; the points `default` if
-    the scene cannot be flown in."""
+def observe(depth: DepthSource, voxel_size: float) -> Observations:
+    """Counts the observations of surfaces, in voxels twice as large as those of the field."""
+    images = depth.images()
+    return Observations.from_depth_images(images, depth.K, depth.X_WCs, 2.0 * voxel_size)
+
+
+def with_default_route(
+    world: World, frontier: GaussianScene | None, metric: bool
+) -> tuple[World, ObservedRoute, tuple[str, ...]]:
+    """Returns the world with its table of views and its default start and goal, this route, and
+    warnings. The ends remain if the scene cannot be flown in."""
+    route = ObservedRoute(world.p_WS, world.p_WG, float("nan"), float("nan"))
+    if not metric:
+        return world, route, ("this scene cannot be flown in: its scale is unknown",)
+    shown = world
+    if frontier is not None:
+        gaussians = world.gaussians.merged_with(frontier)
+        shown = replace(world, gaussians=gaussians, num_frontier=len(frontier))
     try:
-        if metric:
-            p_WS, p_WG, length = choose_start_and_goal(field, VEHICLE_RADIUS)
-            warning = short_route_warning(length)
-            return p_WS, p_WG, length, ((warning,) if warning else ())
-        reason = "its scale is unknown"
+        shown = with_views(shown)
+        route = choose_default_route(shown)
     except InfeasibleFlightError as error:
-        reason = str(error)
-    return *default, float("nan"), (f"this scene cannot be flown in: {reason}",)
+        return world, route, (f"this scene cannot be flown in: {error}",)
+    warnings = [short_route_warning(route.length)]
+    if route.unobserved > MAX_UNOBSERVED:
+        warnings.append(
+            f"a camera along the default route sees {route.unobserved:.0%} of unobserved pixels, "
+            f"and more than {MAX_UNOBSERVED:.0%} along every other route of this length that was "
+            "tried: capture more of the scene, in the directions of flight"
+        )
+    world = replace(world, p_WS=route.p_WS, p_WG=route.p_WG, observations=shown.observations)
+    return world, route, tuple(warning for warning in warnings if warning)

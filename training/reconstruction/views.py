@@ -2,18 +2,16 @@
 
 import hashlib
 from collections.abc import Sequence
-from functools import cache
+from dataclasses import replace
 
 import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from pydrake.math import RigidTransform
 from torch import Tensor
 
 from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.splats.background import (
-    BLACK,
     FAR,
     Background,
     EnvironmentMap,
@@ -24,62 +22,81 @@ from splatpilot.training.captures.capture import Capture, CaptureFrame, shrink
 from splatpilot.training.reconstruction.losses import depth_edge_weights
 from splatpilot.training.reconstruction.photometry import Photometry
 
-_PIXEL_SIZE, _MEMORY = 8, 1e9  # [bytes], of a pixel with depth and validity; of cached frames
+_MIN_DEPTH = 1e-3  # [m], of cached frames
+_CODES = 65535  # of cached depth: 0 is unknown, the last is FAR, equal ratios are between others
+_SPARSE = 4  # one in so many pixels along each axis gives the mean color
 _HEIGHT, _WIDTH = 128, 256  # texels of the background, powers of two
+
+
+def _depth_codes() -> NDArray[np.float32]:
+    """Returns the depth [m] of each code."""
+    depths = np.geomspace(_MIN_DEPTH, FAR, _CODES).astype(np.float32)
+    return np.concatenate([np.zeros(1, np.float32), depths[:-1], np.full(1, np.inf, np.float32)])
+
+
+_DEPTHS = _depth_codes()
 
 
 class ShrunkFrames(Sequence[CaptureFrame]):
     """The frames `numbers` of a capture, shrunk by an integer `factor`, loaded on first use and
-    kept if all of them take at most 1 GB."""
+    kept in 5 bytes a pixel. Depth is rounded by at most 1e-4 of it."""
 
     def __init__(self, capture: Capture, numbers: Sequence[int], factor: int):
         self._capture, self.numbers, self.factor = capture, list(numbers), factor
-        pixels = len(self.numbers) * (capture.width // factor) * (capture.height // factor)
-        small = pixels * _PIXEL_SIZE <= _MEMORY
-        self._load = cache(self._load_and_shrink) if small else self._load_and_shrink
+        self._kept: dict[int, tuple[CaptureFrame, NDArray[np.uint16]]] = {}
 
     def __len__(self) -> int:
         return len(self.numbers)
 
     def __getitem__(self, k: int) -> CaptureFrame:  # pyright: ignore[reportIncompatibleMethodOverride]
-        return self._load(range(len(self))[k])
-
-    def _load_and_shrink(self, k: int) -> CaptureFrame:
-        return shrink(self._capture.frame(self.numbers[k]), self.factor)
+        k = range(len(self))[k]
+        if k not in self._kept:
+            frame = shrink(self._capture.frame(self.numbers[k]), self.factor)
+            known = np.where(frame.depth > 0, frame.depth, FAR).clip(_MIN_DEPTH, FAR)
+            codes = (
+                np.rint(np.log(known / _MIN_DEPTH) / np.log(FAR / _MIN_DEPTH) * (_CODES - 1)) + 1
+            )
+            codes = np.where(frame.depth > 0, codes, 0).astype(np.uint16)
+            valid = np.ones((1, 1), bool) if frame.valid.all() else frame.valid
+            nothing = np.broadcast_to(np.float32(0), codes.shape)
+            self._kept[k] = replace(frame, depth=nothing, valid=valid), codes
+        frame, codes = self._kept[k]
+        return replace(frame, depth=_DEPTHS[codes])
 
 
 class ReconstructionViews:
-    """Frames of one size and K, with their photometry, as tensors on the CPU."""
+    """Frames of one size and K, with their photometry, for tensors on the CPU."""
 
     def __init__(self, frames: Sequence[CaptureFrame], photometry: Photometry):
-        images, depths, edges, valid, viewmats = [], [], [], [], []
+        self._frames = frames
+        edges, viewmats, outlines = [], [], []
         for frame in Progress(frames, "loading frames", len(frames), unit="frame"):
-            images.append(torch.from_numpy(frame.image))
-            depths.append(torch.from_numpy(frame.depth))
-            edges.append(depth_edge_weights(depths[-1]).half())
-            valid.append(torch.from_numpy(frame.valid.copy()))
+            depth = torch.from_numpy(frame.depth)
+            edges.append(depth_edge_weights(depth).to(torch.uint8))
             viewmats.append(torch.from_numpy(frame.X_WC.inverse().GetAsMatrix4()).float())
-        self.images = torch.stack(images)  # (n, H, W, 3) uint8
-        self.depths = torch.stack(depths)  # (n, H, W) [m]
+            sky = frame.depth >= FAR
+            outlines.append(bool(sky.any() and ((frame.depth > 0) & ~sky).any()))
         self.edges = torch.stack(edges)  # (n, H, W) weights of the depth term
-        self.valid = torch.stack(valid)  # (n, H, W) pixels that are used
         self.viewmats = torch.stack(viewmats)  # (n, 4, 4) X_CW
+        self.has_outlines = outlines  # (n,), surfaces before the sky
         self.K = torch.from_numpy(frames[0].K).float()[None]  # (1, 3, 3) [px]
-        self.height, self.width = self.depths.shape[1:]
+        self.height, self.width = self.edges.shape[1:]
         self.vignetting = photometry.vignetting
         self.gains = torch.from_numpy(photometry.gains).float()  # (n,)
         vignette = photometry.factor(0, self.height, self.width) / photometry.gains[0]
         self.vignette = torch.from_numpy(vignette).float()  # (H, W)
 
     def __len__(self) -> int:
-        return len(self.images)
+        return len(self._frames)
 
     def digest(self) -> str:
         """Returns a digest of images, depths and cameras."""
-        tensors = (self.images, self.depths, self.valid, self.viewmats, self.K, self.gains)
         digest = hashlib.sha256()
-        for tensor in tensors:
+        for tensor in (self.viewmats, self.K, self.gains):
             digest.update(tensor.numpy().tobytes())
+        for frame in self._frames:
+            for array in (frame.image, frame.depth, frame.valid):
+                digest.update(array.tobytes())
         return digest.hexdigest()
 
     def camera(self, k: int, device: str) -> tuple[Tensor, Tensor]:
@@ -97,30 +114,37 @@ class ReconstructionViews:
 
     def frame(self, k: int) -> CaptureFrame:
         """Returns a frame as given."""
-        X_WC = RigidTransform(self.viewmats[k].double().numpy()).inverse()
-        K = self.K[0].double().numpy()
-        arrays = (self.images[k].numpy(), self.depths[k].numpy())
-        return CaptureFrame(*arrays, X_WC, K, self.valid[k].numpy())
+        return self._frames[k]
 
-    def target(self, k: int, gain: Tensor, background: Tensor) -> Tensor:
-        """Returns the image (H, W, 3) without gain and vignetting, about 0 to 1, with `background`
-        (3,) in the sky."""
-        color = self.images[k].float().mul_((1 / (255 * gain * self.vignette))[..., None])
-        color[self.depths[k] >= FAR] = background
+    def depth(self, k: int) -> Tensor:
+        """Returns the depth (H, W) [m] of view k."""
+        return torch.from_numpy(self._frames[k].depth)
+
+    def target(self, frame: CaptureFrame, gain: Tensor, background: Tensor) -> Tensor:
+        """Returns the image (H, W, 3) of a frame without gain and vignetting, about 0 to 1, with
+        `background` (3,) in the sky."""
+        image = torch.from_numpy(frame.image).float()
+        color = image.mul_((1 / (255 * gain * self.vignette))[..., None])
+        color[torch.from_numpy(frame.depth >= FAR)] = background
         return color
 
 
 def learn_background(frames: Sequence[CaptureFrame], photometry: Photometry) -> Background:
-    """Learns the sky of the frames in every direction; black without any. Each texel has the mean
-    color, without gains and vignetting, of the pixels that look into it, or else is
-    interpolated."""
+    """Learns the sky of the frames in every direction. Each texel has the mean color, without gains
+    and vignetting, of the pixels that look into it, or else is interpolated. Without any sky, it is
+    the mean color of the frames, the best guess for what none of them shows."""
+    mean = np.zeros(3)
     sums, counts = np.zeros((_HEIGHT * _WIDTH, 3)), np.zeros(_HEIGHT * _WIDTH)
     for k, frame in enumerate(frames):
         sky = frame.depth >= FAR
+        factor = photometry.factor(k, *sky.shape)
+        valid = frame.valid[::_SPARSE, ::_SPARSE]
+        if valid.any():
+            image = frame.image[::_SPARSE, ::_SPARSE] / (255 * factor[::_SPARSE, ::_SPARSE, None])
+            mean += image[valid].mean(axis=0) / len(frames)
         if not sky.any():
             continue
         rows, columns = np.nonzero(sky)
-        factor = photometry.factor(k, *sky.shape)
         color = frame.image[sky] / (255 * factor[sky])[:, None]
         v_W = pixel_rays(frame.K, rows, columns, frame.X_WC)
         row, column = texel_position(v_W, _HEIGHT, _WIDTH)
@@ -128,7 +152,7 @@ def learn_background(frames: Sequence[CaptureFrame], photometry: Photometry) -> 
         np.add.at(sums, row * _WIDTH + column, color)
         np.add.at(counts, row * _WIDTH + column, 1)
     if not counts.any():
-        return BLACK
+        return tuple(mean.clip(0, 1).tolist())
     texels = _fill(sums.reshape(_HEIGHT, _WIDTH, 3), counts.reshape(_HEIGHT, _WIDTH))
     return EnvironmentMap(texels.clip(0, 1).astype(np.float32))
 

@@ -355,3 +355,13 @@ def test_late_images_show_bodies_where_they_were():
         )
     first, later = (prompt.render(X_WB, Bodies(time, obstacles)).color for time in (0.0, 1.0))
     assert not np.array_equal(first, later)
+
+
+def test_antialiased_scenes_are_rendered_as_they_were_trained():
+    scene = replace(random_scene(400), scales=np.full((400, 3), 2e-3, np.float32))
+    plain = BakedScene(scene).render(K, WIDTH, HEIGHT, X_WC)
+    marked = replace(scene, antialiased=True).scaled_by(1)
+    found = BakedScene(marked).recolored(scene.sh).render(K, WIDTH, HEIGHT, X_WC)
+    alpha = rasterized(scene, rasterize_mode="antialiased", render_mode="RGB")[1]
+    np.testing.assert_allclose(found.alpha, np.asarray(alpha).reshape(HEIGHT, WIDTH), atol=2e-5)
+    assert found.alpha.mean() < 0.5 * plain.alpha.mean()

@@ -1,6 +1,9 @@
 import dataclasses
 import gzip
+import io
+import json
 import struct
+import zipfile
 
 import gsply
 import numpy as np
@@ -9,11 +12,12 @@ import pytest
 from baked_scenes import random_scene as small_scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from PIL import Image
 from plyfile import PlyData, PlyElement
 from pydrake.math import RigidTransform, RotationMatrix
 
 from splatpilot.systems.splats.scene import C0, GaussianScene
-from splatpilot.systems.splats.splat_files import read_ply, read_splats, write_ply
+from splatpilot.systems.splats.splat_files import read_ply, read_splats, write_ply, write_splats
 
 N = 600  # more than two chunks of compressed PLY
 
@@ -47,6 +51,11 @@ def spz(version: int, count: int) -> bytes:
     return struct.pack("<4sII4B", b"NGSP", version, count, 0, 12, 0, 0) + bytes(16)
 
 
+def packed_gltf(extension: str) -> bytes:
+    used = {"extensionsUsed": ["KHR_gaussian_splatting", extension]}
+    return json.dumps({"asset": {"version": "2.0"}} | used).encode()
+
+
 def assert_close(found: GaussianScene, scene: GaussianScene, mean, log_scale, quat, sh) -> None:
     order = np.argmin(
         np.linalg.norm(found.means[:, None] - scene.means[None], axis=2), axis=0
@@ -74,6 +83,178 @@ def test_files_of_other_tools(tmp_path, degree):
         assert_close(read_splats(tmp_path / "scene.spz"), scene, 0.0002, 0.032, 0.005, 0.015)
 
 
+def webp(rows: np.ndarray) -> bytes:
+    """Returns rows (N, 4) as a picture whose last pixels are unused."""
+    picture = np.zeros((-(-len(rows) // 32) * 32, 4), np.uint8)
+    picture[: len(rows)] = rows
+    stream = io.BytesIO()
+    Image.fromarray(picture.reshape(-1, 32, 4)).save(stream, "WEBP", lossless=True, exact=True)
+    return stream.getvalue()
+
+
+def sog(scene: GaussianScene, version: int) -> dict[str, bytes]:
+    """Returns the files of PlayCanvas's published format; harmonics of degree 1 repeat 64 times."""
+    logs = np.sign(scene.means) * np.log1p(np.abs(scene.means))
+    lower, upper = logs.min(0), logs.max(0)
+    words = np.round((logs - lower) / (upper - lower) * 65535).astype(int)
+    order = np.abs(scene.quats).argmax(1)
+    quats = scene.quats * np.sign(np.take_along_axis(scene.quats, order[:, None], 1))
+    small = np.stack([np.delete(q, k) for q, k in zip(quats, order, strict=True)])
+    rotation = np.round((small * np.sqrt(2) + 1) * 127.5).clip(0, 255)
+    bounds = {"mins": lower.tolist(), "maxs": upper.tolist()}
+    files = {
+        "means_l.webp": webp(np.column_stack([words & 255, np.full(N, 255)])),
+        "means_u.webp": webp(np.column_stack([words >> 8, np.full(N, 255)])),
+        "quats.webp": webp(np.column_stack([rotation, order + 252])),
+    }
+    meta = {"means": bounds | {"files": [*files][:2]}, "quats": {"files": ["quats.webp"]}}
+    a = scene.opacities[:, None]
+    last = a if version == 2 else np.log(a / (1 - a))
+    for name, values in (
+        ("scales", np.log(scene.scales)),
+        ("sh0", np.hstack([scene.sh[:, 0], last])),
+    ):
+        low, high = values.min(0), values.max(0)
+        if version == 2:
+            low, high = np.full(values.shape[1], -7.0), np.full(values.shape[1], 7.0)
+            low[3:], high[3:] = 0, 1
+        steps = np.round((values - low) / (high - low) * 255)
+        files[f"{name}.webp"] = webp(np.column_stack([steps, np.full(N, 255)])[:, :4])
+        given = {"codebook": np.linspace(-7, 7, 256).tolist()}
+        if version == 1:
+            given = {"mins": low.tolist(), "maxs": high.tolist()}
+        meta[name] = given | {"files": [f"{name}.webp"]}
+    centroids = np.round((scene.sh[:64, 1:4] + 1) * 127.5).reshape(-1, 3)
+    given = {"codebook": np.linspace(-1, 1, 256).tolist()} if version == 2 else {}
+    meta["shN"] = given | {"mins": -1, "maxs": 1, "files": ["shN_c.webp", "shN_l.webp"]}
+    stream = io.BytesIO()
+    pixels = np.column_stack([centroids, np.full(192, 255)]).astype(np.uint8)[None]
+    Image.fromarray(pixels).save(stream, "WEBP", lossless=True, exact=True)
+    labels = np.zeros((N, 4), int)
+    labels[:, 0], labels[:, 3] = np.arange(N) % 64, 255
+    files |= {"shN_c.webp": stream.getvalue(), "shN_l.webp": webp(labels)}
+    counted = {"version": 2, "count": N, "antialias": True} if version == 2 else {}
+    meta["means"] |= {"shape": [N, 3]}
+    return files | {"meta.json": json.dumps(meta | counted).encode()}
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_sog_archives_and_folders(tmp_path, version):
+    scene = random_scene(1)
+    repeated = np.concatenate([scene.sh[:, :1], scene.sh[np.arange(N) % 64, 1:]], axis=1)
+    scene = dataclasses.replace(scene, sh=repeated)
+    with zipfile.ZipFile(tmp_path / "a.sog", "w") as archive:
+        for name, content in sog(scene, version).items():
+            archive.writestr(name, content)
+            (tmp_path / name).write_bytes(content)
+    for path in (tmp_path / "a.sog", tmp_path / "meta.json", tmp_path):
+        found = read_splats(path)
+        assert_close(found, scene, 0.001, 0.03, 0.02, 0.03)
+        assert found.antialiased == (version == 2)
+
+
+@pytest.mark.parametrize("suffix", [".glb", ".gltf", ".usda", ".usdc"])
+@pytest.mark.parametrize("degree", [0, 3])
+def test_gltf_and_usd_round_trip(tmp_path, suffix, degree):
+    scene = dataclasses.replace(random_scene(degree), origin=(456789.0, 5412345.0, 283.0))
+    write_splats(scene, tmp_path / f"a{suffix}")
+    found = read_splats(tmp_path / f"a{suffix}")
+    shift = np.array(found.origin) - scene.origin
+    np.testing.assert_allclose(found.means + shift, scene.means, atol=2e-6)
+    for name in ("scales", "opacities", "sh"):
+        np.testing.assert_allclose(getattr(found, name), getattr(scene, name), atol=1e-6)
+    np.testing.assert_allclose(np.abs((found.quats * scene.quats).sum(1)), 1, atol=1e-6)
+
+
+def test_gltf_is_y_up_and_its_nodes_transform(tmp_path):
+    scene = random_scene(1)
+    write_splats(scene, tmp_path / "a.gltf")
+    document = json.loads((tmp_path / "a.gltf").read_text())
+    low = document["accessors"][0]["min"]  # of POSITION
+    np.testing.assert_allclose(low[:2], [scene.means[:, 0].min(), scene.means[:, 2].min()])
+    half = np.sqrt(0.5)
+    inner = {"mesh": 0, "scale": [1, 1, 3]}
+    document["nodes"] = [{"children": [1], "rotation": [0, half, 0, half], "scale": [2] * 3}, inner]
+    (tmp_path / "b.gltf").write_text(json.dumps(document))
+    found = read_splats(tmp_path / "b.gltf")
+    # y of glTF is z of W, and its -z is y.
+    M = RotationMatrix.MakeZRotation(np.pi / 2).matrix() @ np.diag([2.0, 6.0, 2.0])
+    np.testing.assert_allclose(found.means, scene.means @ M.T, atol=1e-5)
+    np.testing.assert_allclose(found.covariances, M @ scene.covariances @ M.T, atol=2e-5, rtol=1e-4)
+
+
+def test_usd_of_other_units_axes_and_defaults(tmp_path):
+    (tmp_path / "a.usda").write_text(
+        """#usda 1.0
+(
+    metersPerUnit = 0.01
+    upAxis = "Y"
+)
+def Xform "World" {
+    double3 xformOp:translate = (0, 100, 0)
+    uniform token[] xformOpOrder = ["xformOp:translate"]
+    def ParticleField3DGaussianSplat "Splats" {
+        half3[] scalesh = [(1, 2, 4)]
+        point3f[] positions = [(100, 200, 300)]
+        quatf[] orientations = [(0.8, 0.6, 0, 0)]
+    }
+}"""
+    )
+    found = read_splats(tmp_path / "a.usda")
+    np.testing.assert_allclose(found.means, [[1, -3, 3]], atol=1e-6)
+    np.testing.assert_allclose(found.scales, [[0.01, 0.02, 0.04]], rtol=1e-5)
+    R = RotationMatrix.MakeXRotation(np.pi / 2 + 2 * np.arctan2(0.6, 0.8)).matrix()
+    np.testing.assert_allclose(found.rotations[0], R, atol=1e-6)
+
+
+def test_unknown_suffixes_are_not_written(tmp_path):
+    with pytest.raises(ValueError, match=r"a\.sog: the suffix must be one of \.ply, .*\.usdc"):
+        write_splats(random_scene(0), tmp_path / "a.sog")
+
+
+def test_antialiased_gaussians_of_ply_and_spz(tmp_path, caplog):
+    scene = dataclasses.replace(random_scene(0), antialiased=True)
+    write_ply(scene, tmp_path / "a.ply")
+    assert read_splats(tmp_path / "a.ply").scaled_by(2).antialiased
+    ply = PlyData.read(tmp_path / "a.ply")
+    ply.comments = ["antialiased 1"]
+    ply.write(tmp_path / "b.ply")
+    assert read_splats(tmp_path / "b.ply").antialiased
+    gsply.write_spz(tmp_path / "c.spz", foreign(scene), version=3)
+    content = bytearray(gzip.decompress((tmp_path / "c.spz").read_bytes()))
+    assert not read_splats(tmp_path / "c.spz").antialiased
+    content[14] |= 1
+    (tmp_path / "c.spz").write_bytes(gzip.compress(content, mtime=0))
+    assert read_splats(tmp_path / "c.spz").antialiased
+    write_splats(scene, tmp_path / "d.glb")
+    assert "d.glb: cannot record that Gaussians were trained antialiased" in caplog.text
+
+
+def test_filter_of_mip_splatting_blurs_each_gaussian(tmp_path):
+    scene = random_scene(0)
+    table = vertices(scene, tmp_path / "a.ply")
+    blur = np.full(N, 0.05, np.float32)
+    table = rfn.append_fields(table, "filter_3D", blur, usemask=False)
+    write_table(table, tmp_path / "b.ply")
+    found = read_splats(tmp_path / "b.ply")
+    scales = np.sqrt(scene.scales**2 + 0.05**2)
+    np.testing.assert_allclose(found.scales, scales, rtol=1e-5)
+    opacities = scene.opacities * (scene.scales / scales).prod(axis=1)
+    np.testing.assert_allclose(found.opacities, opacities, rtol=1e-4)
+
+
+def test_activated_values_are_reported(tmp_path, caplog):
+    table = vertices(random_scene(0), tmp_path / "a.ply")
+    for name in ("scale_0", "scale_1", "scale_2"):
+        table[name] = np.exp(table[name])
+    table["opacity"] = 1 / (1 + np.exp(-table["opacity"]))
+    write_table(table, tmp_path / "b.ply")
+    read_splats(tmp_path / "a.ply")
+    assert not caplog.text
+    read_splats(tmp_path / "b.ply")
+    assert "b.ply: all opacities are in [0, 1] and all scales > 0" in caplog.text
+
+
 def test_records(tmp_path):
     record = struct.pack("<6f8B", 1, 2, 3, 0.1, 0.2, 0.3, 255, 0, 51, 204, 128, 228, 128, 128)
     (tmp_path / "a.splat").write_bytes(2 * record)
@@ -90,10 +271,14 @@ def test_records(tmp_path):
     [
         ("a.ply", b"version https://git-lfs.github.com/spec/v1\noid ", "the pointer of git-LFS"),
         ("a.ply", b"", "the size must be > 0 bytes"),
-        ("a.dat", b"nothing that is known", "not PLY, SPZ or .splat"),
-        ("a.glb", b"glTF\x02\x00\x00\x00", "a binary glTF; convert it to PLY"),
-        ("a.sog", b"PK\x03\x04", "a SOG; convert it to PLY"),
-        ("a.zip", b"PK\x03\x04", "an archive; if it is SOG"),
+        ("a.dat", b"nothing that is known", "not PLY, SPZ, SOG, .splat, glTF or USD; convert"),
+        ("a.glb", b"glTF\x02\x00\x00\x00", "not a readable glTF file"),
+        ("a.gltf", b'{"asset": {"version": "2.0"}}', "a glTF without KHR_gaussian_splatting"),
+        ("a.gltf", packed_gltf("KHR_meshopt_compression"), "compressed by KHR_meshopt_compression"),
+        ("a.usda", b"#usda 1.0\n", "a USD file without ParticleField3DGaussianSplat"),
+        ("a.sog", b"PK\x03\x04", "not a readable SOG archive"),
+        ("a.zip", b"PK\x03\x04", "an archive; unpack it first"),
+        ("a.ot", b"# Octomap OcTree file\n", "a full OctoMap; write it as .bt"),
         ("a.ksplat", bytes(64), "a KSPLAT; convert it to PLY"),
         ("a.splat", bytes(63), "the size must be a multiple of 32 bytes, got 63"),
         ("a.spz", spz(5, 9)[:16], r".*the version must be 4, got 5"),

@@ -3,14 +3,23 @@ import os
 import re
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform, RotationMatrix
+from room import rotation_from_yaw_pitch, tiled_color, trace_room
 
 from splatpilot.analysis.commands.main import main
 from splatpilot.systems.common.config import load_config
-from splatpilot.training.captures.capture import Capture, DepthCamera, FileAxes, no_depth
+from splatpilot.training.captures.capture import (
+    OPENGL_AXES,
+    OPTICAL_AXES,
+    Capture,
+    DepthCamera,
+    FileAxes,
+    no_depth,
+)
 from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.capture_registry import read_capture
 from splatpilot.training.captures.check import check_capture, doubts
@@ -192,12 +201,66 @@ def test_doubts(room):
     assert "not checked" in doubt and "too few pixels have depth" in doubt
 
 
-def test_without_depth_nothing_is_compared(room):
-    report = check_capture(room(load_depth=no_depth, metric=False, notes=["11 of 11 images"]))
+def test_without_depth_and_features_nothing_is_compared(room):
+    report = check_capture(
+        room(
+            load_depth=no_depth,
+            load_image=lambda i: np.full((HEIGHT, WIDTH, 3), 128, np.uint8),
+            metric=False,
+            notes=["11 of 11 images"],
+        )
+    )
     assert not report.agrees and not report.problem
     lines = str(report).splitlines()
     assert "11 of 11 images" in lines and "not compared" in lines[-1]
     assert any("scale is unknown" in line for line in lines)
+
+
+@pytest.fixture(scope="module")
+def flight() -> Capture:
+    """A flight along a tiled room, in images of 320x240 px without depth."""
+    K, poses, images = np.array([[160.0, 0, 160], [0, 160, 120], [0, 0, 1]]), [], []
+    R_WN = RotationMatrix(np.diag([1.0, -1, -1]))
+    for i in range(8):
+        R_NB, _ = rotation_from_yaw_pitch(0.3 * np.sin(i), 0.1 * np.cos(2 * i))
+        p_N = np.array([0.5 + 0.15 * i, 0.4 * np.sin(1.3 * i), -1.2 + 0.2 * np.cos(i)])
+        images.append((255 * trace_room(p_N, R_NB, 320, 240, tiled_color)[1]).astype(np.uint8))
+        R_WC = R_WN @ RotationMatrix(R_NB) @ NED
+        poses.append(RigidTransform(R_WC, R_WN.multiply(p_N)))
+    return Capture("flight", "a flight", K, 320, 240, poses, lambda i: images[i], axes=OPTICAL_AXES)
+
+
+def distorted(image: np.ndarray, K: np.ndarray, k1: float) -> np.ndarray:
+    v, u = np.mgrid[:240, :320] + 0.5
+    x, y = (u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]
+    factor = 1 / (1 + k1 * (x**2 + y**2))
+    maps = x * factor * K[0, 0] + K[0, 2] - 0.5, y * factor * K[1, 1] + K[1, 2] - 0.5
+    return cv2.remap(image, *(m.astype(np.float32) for m in maps), cv2.INTER_LINEAR)
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        (lambda c: {}, ""),
+        (
+            lambda c: {"X_WCs": [X @ RigidTransform(OPENGL_AXES.R_BC) for X in c.X_WCs]},
+            "most likely poses are those of OpenGL axes .*, read as optical axes",
+        ),
+        (lambda c: {"X_WCs": [X.inverse() for X in c.X_WCs]}, "most likely poses are world to cam"),
+        (
+            lambda c: {"K": np.diag([1.4, 1.4, 1]) @ c.K - [[0, 0, 64], [0, 0, 48], [0, 0, 0]]},
+            r"most likely the focal length is wrong: 1(5|6)\d\.\d px",
+        ),
+        (
+            lambda c: {"load_image": lambda i: distorted(c.load_image(i), c.K, 0.25)},
+            r"most likely the images are still distorted: k1 = -?0\.\d+ fits best",
+        ),
+    ],
+)
+def test_features_without_depth_tell_errors_apart(flight, change, problem):
+    report = check_capture(dataclasses.replace(flight, **change(flight)))
+    assert report.agreement is not None and report.agrees == (not problem), report
+    assert re.match(problem, report.problem), report.problem
 
 
 def test_command(tmp_path, write_room, capsys):

@@ -45,7 +45,7 @@ def test_steps_follow_the_fitted_images(count, has_depth, iterations, expected):
     config = ReconstructConfig(iterations=iterations)
     resolved = initialize.resolve_config(config, Frames(count, has_depth))  # pyright: ignore[reportArgumentType]
     assert resolved.iterations == expected
-    assert resolved.initialization == ("depth" if has_depth else "random")
+    assert resolved.initialization == ("depth" if has_depth else "points")
 
 
 def from_depth(frames, **changes):

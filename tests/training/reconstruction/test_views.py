@@ -4,9 +4,9 @@ import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 
 from splatpilot.systems.splats.background import EnvironmentMap
-from splatpilot.training.captures.capture import CaptureFrame
+from splatpilot.training.captures.capture import Capture, CaptureFrame
 from splatpilot.training.reconstruction.photometry import Photometry
-from splatpilot.training.reconstruction.views import learn_background
+from splatpilot.training.reconstruction.views import ShrunkFrames, learn_background
 
 HEIGHT, WIDTH = 48, 64
 K = np.array([[32.0, 0, 32], [0, 32.0, 24], [0, 0, 1]])
@@ -54,4 +54,31 @@ def test_depth_beyond_the_far_limit_is_sky():
     a, b = (learn_background([f], one) for f in (distant, replace(distant, depth=depth)))
     assert isinstance(a, EnvironmentMap) and isinstance(b, EnvironmentMap)
     np.testing.assert_array_equal(a.texels, b.texels)
-    assert learn_background([replace(distant, depth=depth - 2)], one) == (0.0, 0.0, 0.0)
+
+
+def test_without_sky_the_background_is_the_mean_color():
+    inside = replace(frame(0.0, ground=False), depth=np.full((HEIGHT, WIDTH), 3, np.float32))
+    dimmer = replace(inside, image=(0.5 * inside.image).astype(np.uint8))
+    background = learn_background([inside, dimmer], Photometry(np.array([1, 0.5]), 0.0))
+    np.testing.assert_allclose(background, inside.image.mean((0, 1)) / 255, atol=0.01)
+
+
+def test_cached_frames_keep_images_and_masks_and_round_depth():
+    rng = np.random.default_rng(0)
+    depth = np.exp(rng.uniform(np.log(0.01), np.log(140), (HEIGHT, WIDTH))).astype(np.float32)
+    depth[:8], depth[8:16] = 0, np.inf
+    masked = replace(frame(0.5), depth=depth, valid=rng.random((HEIGHT, WIDTH)) > 0.2)
+    frames = [masked, replace(frame(1.0), depth=depth)]
+    capture = Capture(
+        *("room", "a room", K, WIDTH, HEIGHT, [each.X_WC for each in frames]),
+        load_image=lambda i: frames[i].image,
+        load_depth=lambda i: frames[i].depth,
+        load_valid=lambda i: frames[i].valid,
+    )
+    kept = ShrunkFrames(capture, [1, 0], 1)
+    for _ in range(2):  # loaded, then cached
+        for found, given in zip(kept, frames[::-1], strict=True):
+            expected = np.where(given.valid, given.depth, 0)
+            np.testing.assert_allclose(found.depth, expected, rtol=1e-4)
+            np.testing.assert_array_equal(found.image, given.image)
+            np.testing.assert_array_equal(found.valid, given.valid)

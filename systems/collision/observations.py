@@ -1,0 +1,174 @@
+"""Observations of a captured environment: how often, and from where, images saw each surface."""
+
+import itertools
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydrake.math import RigidTransform
+
+from splatpilot.systems.collision.depth_fusion import ray_slopes
+from splatpilot.systems.common.files import written_atomically
+from splatpilot.systems.common.readers import read_archive
+from splatpilot.systems.common.validation import require
+from splatpilot.systems.splats.background import FAR
+
+FORMAT_VERSION = 1
+HEADINGS = 8  # of a table of views, counterclockwise from the x axis
+
+_WIDTH = 160  # [px] approximate width to which depth images are subsampled
+_BITS = 21  # of a voxel's index along each axis, in its key
+_MIN_COSINE = 0.5  # of the angle between two views of a surface that agree
+# Directions are those to the 26 neighbors of a voxel; the middle one, number 13, is not used.
+_AXES = np.array(list(itertools.product((-1, 0, 1), repeat=3)))  # (27, 3)
+_UNIT = _AXES / np.maximum(np.linalg.norm(_AXES, axis=1, keepdims=True), 1.0)
+_FLAGS = np.uint32(1) << np.arange(27, dtype=np.uint32)
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """Observed voxels, sparse, in ascending order of their keys."""
+
+    voxel_size: float  # [m], edge of a voxel; voxel (i, j, k) begins at (i, j, k) voxel_size
+    voxels: NDArray[np.int32]  # (V, 3), their indices
+    counts: NDArray[np.uint16]  # (V,), number of images that saw a surface in the voxel
+    directions: NDArray[np.uint32]  # (V,), a bit for each direction from which they saw it
+    # Table of views: the fraction of pixels that show no observed surface, of a level camera at
+    # n points in `HEADINGS` directions; empty if not known.
+    view_points: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
+    unobserved: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, HEADINGS)))
+
+    @classmethod
+    def from_depth_images(
+        cls,
+        depths: Iterable[np.ndarray],
+        K: np.ndarray,
+        X_WCs: Sequence[RigidTransform],
+        voxel_size: float,
+    ) -> "Observations":
+        """Counts the images that saw each voxel; see `esdf_from_depth_images` for the images."""
+        keys, bits = [], []
+        for depth, X_WC in zip(depths, X_WCs, strict=True):
+            step = max(depth.shape[1] // _WIDTH, 1)
+            x, y = np.meshgrid(
+                *(slopes[step // 2 :: step] for slopes in ray_slopes(depth.shape, K))
+            )
+            z = depth[step // 2 :: step, step // 2 :: step]
+            known = (z > 0.0) & (z < FAR)
+            p_CQ = (np.stack([x, y, np.ones_like(x)], axis=-1) * z[..., None])[known]
+            p_WQ = p_CQ @ X_WC.rotation().matrix().T + X_WC.translation()
+            key = np.unique(_key(np.floor(p_WQ / voxel_size).astype(np.int64)))
+            keys.append(key)
+            to_camera = X_WC.translation() - voxel_size * (_voxel(key) + 0.5)
+            bits.append(_FLAGS[np.argmax(to_camera @ _UNIT.T, axis=1)])
+        key, order, counts = _grouped(keys)
+        directions = np.bitwise_or.reduceat(np.concatenate(bits)[order], _starts(counts))
+        counts = np.minimum(counts, np.iinfo(np.uint16).max).astype(np.uint16)
+        return cls(float(voxel_size), _voxel(key).astype(np.int32), counts, directions)
+
+    def counts_at(self, p_WQ: ArrayLike) -> NDArray[np.uint16]:
+        """Returns the number of images (N,) that saw the voxels of points (N, 3) [m]."""
+        voxel = np.floor(np.asarray(p_WQ) / self.voxel_size).astype(np.int64)
+        return _look_up(self._keys, self.counts, _key(voxel))
+
+    def agree_with(self, p_WQ: ArrayLike, p_WC: ArrayLike) -> NDArray[np.bool_]:
+        """Checks which points (N, 3) [m] lie within a voxel of a surface that an image saw from at
+        most about 60 degrees beside a camera at p_WC (3,) [m]."""
+        p_WQ = np.asarray(p_WQ, float)
+        ray = np.asarray(p_WC) - p_WQ
+        cosine = ray @ _UNIT.T / np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-12)
+        allowed = ((cosine >= _MIN_COSINE) * _FLAGS).sum(axis=1, dtype=np.uint32)
+        keys, directions = self._dilated
+        key = _key(np.floor(p_WQ / self.voxel_size).astype(np.int64))
+        return (_look_up(keys, directions, key) & allowed) != 0
+
+    @cached_property
+    def _keys(self) -> NDArray[np.int64]:
+        return _key(self.voxels.astype(np.int64))
+
+    @cached_property
+    def _dilated(self) -> tuple[NDArray[np.int64], NDArray[np.uint32]]:
+        """Keys of all voxels within one of an observed one, and the directions of these."""
+        keys, directions = self._keys, self.directions
+        for offset in _key(np.eye(3, dtype=np.int64)) - _key(np.zeros(3, np.int64)):
+            keys, order, counts = _grouped([keys - offset, keys, keys + offset])
+            directions = np.bitwise_or.reduceat(np.tile(directions, 3)[order], _starts(counts))
+        return keys, directions
+
+    def scaled_by(self, factor: float) -> "Observations":
+        """Returns the voxels with all lengths from the origin times `factor`, without views."""
+        size = factor * self.voxel_size
+        return Observations(size, self.voxels, self.counts, self.directions)
+
+    def save(self, path: str | Path) -> None:
+        """Writes the voxels to `path`, by custom `observations.npz`, atomically."""
+        with written_atomically(Path(path)) as partial, partial.open("wb") as file:
+            np.savez_compressed(
+                file,
+                version=np.int64(FORMAT_VERSION),
+                voxel_size=np.float64(self.voxel_size),
+                voxels=self.voxels,
+                counts=self.counts,
+                directions=self.directions,
+                view_points=self.view_points.astype(np.float32),
+                unobserved=self.unobserved.astype(np.float32),
+            )
+
+    @classmethod
+    def load(cls, path: str | Path) -> "Observations":
+        """Reads voxels that `save` wrote; raises ValueError for other or damaged files."""
+        archive = read_archive(Path(path))
+        names = "voxel_size", "voxels", "counts", "directions", "view_points", "unobserved"
+        missing = [name for name in ("version", *names) if name not in archive]
+        require(not missing, f"{path}: arrays", "all of a scene's observations", f"no {missing}")
+        version = int(archive["version"])
+        require(version == FORMAT_VERSION, f"{path}: version", str(FORMAT_VERSION), version)
+        size, voxels, counts, directions, points, unobserved = (archive[name] for name in names)
+        number = len(voxels)
+        valid = voxels.shape == (number, 3) and counts.shape == directions.shape == (number,)
+        shapes = voxels.shape, counts.shape, directions.shape
+        require(valid, f"{path}: voxels, counts and directions", "of equal length", shapes)
+        valid = points.shape == (len(points), 3) and unobserved.shape == (len(points), HEADINGS)
+        shapes = points.shape, unobserved.shape
+        require(valid, f"{path}: views", f"of shapes (n, 3) and (n, {HEADINGS})", shapes)
+        return cls(
+            float(size), voxels, counts, directions, points.astype(float), unobserved.astype(float)
+        )
+
+
+def _key(voxel: NDArray) -> NDArray[np.int64]:
+    """Packs indices (..., 3) into integers of the same order."""
+    shifted = voxel + (1 << (_BITS - 1))
+    return (shifted[..., 0] << 2 * _BITS) | (shifted[..., 1] << _BITS) | shifted[..., 2]
+
+
+def _voxel(key: NDArray[np.int64]) -> NDArray[np.int64]:
+    parts = [key >> 2 * _BITS, key >> _BITS, key]
+    return (np.stack(parts, axis=-1) & ((1 << _BITS) - 1)) - (1 << (_BITS - 1))
+
+
+def _grouped(
+    keys: Sequence[NDArray[np.int64]],
+) -> tuple[NDArray[np.int64], NDArray[np.intp], NDArray[np.int64]]:
+    """Returns the different keys, the order that sorts all of them, and the number of each."""
+    every = np.concatenate(keys)
+    order = np.argsort(every, kind="stable")
+    unique, counts = np.unique(every[order], return_counts=True)
+    return unique, order, counts
+
+
+def _starts(counts: NDArray[np.int64]) -> NDArray[np.int64]:
+    return np.cumsum(counts) - counts
+
+
+def _look_up[T: np.generic](
+    keys: NDArray[np.int64], values: NDArray[T], key: NDArray[np.int64]
+) -> NDArray[T]:
+    """Returns the values (V,) of sorted keys (V,) at others (N,), 0 for those that are missing."""
+    if not len(keys):
+        return np.zeros(key.shape, values.dtype)
+    index = np.minimum(np.searchsorted(keys, key), len(keys) - 1)
+    return np.where(keys[index] == key, values[index], values.dtype.type(0))

@@ -1,0 +1,61 @@
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform, RotationMatrix
+
+from splatpilot.systems.collision.observations import Observations
+
+K = np.array([[80.0, 0.0, 80.0], [0.0, 80.0, 60.0], [0.0, 0.0, 1.0]])
+AHEAD = RotationMatrix(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]))
+WALL = np.array([[2.0, 0.0, 0.0], [2.0, 0.5, 0.3]])  # on the wall x = 2 m
+
+
+@pytest.fixture(scope="module")
+def wall() -> Observations:
+    """A wall 2 m ahead, seen by three cameras at the origin."""
+    depth = np.full((120, 160), 2.0, np.float32)
+    depth[:10] = np.inf
+    return Observations.from_depth_images(
+        [depth] * 3, K, [RigidTransform(AHEAD, np.zeros(3))] * 3, 0.1
+    )
+
+
+def test_counts_of_images(wall):
+    assert wall.counts_at(WALL + 0.01).tolist() == [3, 3]
+    assert wall.counts_at(WALL + 1.0).tolist() == [0, 0]
+
+
+@pytest.mark.parametrize(
+    ("p_WC", "agrees"),
+    [([0.0, 0.0, 0.0], True), ([1.0, 0.8, 0.0], True), ([4.0, 0.0, 0.0], False)],
+)
+def test_views_agree_from_the_observed_side(wall, p_WC, agrees):
+    assert wall.agree_with(WALL, p_WC).tolist() == [agrees, agrees]
+
+
+def test_views_agree_within_a_voxel_of_the_surface(wall):
+    offsets = np.array([[0.1, 0.0, 0.0], [0.25, 0.0, 0.0]])
+    assert wall.agree_with(WALL[0] + offsets, np.zeros(3)).tolist() == [True, False]
+
+
+def test_file(wall, tmp_path):
+    wall.save(tmp_path / "observations.npz")
+    read = Observations.load(tmp_path / "observations.npz")
+    for name in ("voxels", "counts", "directions", "view_points", "unobserved"):
+        np.testing.assert_array_equal(getattr(read, name), getattr(wall, name))
+    assert read.voxel_size == wall.voxel_size
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [({"version": 9}, "version.*got 9"), ({"counts": np.zeros(1, np.uint16)}, "counts")],
+)
+def test_damaged_files(wall, tmp_path, change, message):
+    file = tmp_path / "observations.npz"
+    wall.save(file)
+    np.savez(file, **(dict(np.load(file)) | change))
+    with pytest.raises(ValueError, match=message):
+        Observations.load(file)
+
+
+def test_scaled(wall):
+    assert wall.scaled_by(2.0).counts_at(2.0 * WALL + 0.02).tolist() == [3, 3]
