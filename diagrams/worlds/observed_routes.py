@@ -208,10 +208,10 @@ class _Search:
 
     def infeasible(self, limit: float) -> InfeasibleFlightError:
         return InfeasibleFlightError(
-            f"the unobserved pixels of a camera along a route of at least {self._min_length:g} m in "
-            f"{self._name} must be at most {limit:.0%} on average, got no such route; "
-            f"the best single view has {self._table.min(initial=1.0):.0%}: capture more of the "
-            "scene, or raise max_unobserved"
+            f"unobserved pixels along a route of at least {self._min_length:g} m in {self._name} "
+            f"must be at most {limit:.0%} of a camera's, on average, got no such route; the best "
+            f"single view has {self._table.min(initial=1.0):.0%}: capture more of the scene, or "
+            "raise max_unobserved"
         )
 
     def _starts(self, limit: float, rng: np.random.Generator) -> NDArray[np.intp]:

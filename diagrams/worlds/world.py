@@ -29,8 +29,8 @@ class World:
     p_WG: NDArray[np.float64]  # (3,) [m], default goal
     moving: MovingObstacles | None = None
     num_frontier: int = 0  # last Gaussians, which close unobserved space
-    rendered: BakedScene | None = None  # for cameras, instead of the Gaussians
     observations: Observations | None = None  # of the capture; None if not known
+    rendered: BakedScene | None = None  # for cameras, instead of the Gaussians
     source: tuple[Any, int] | None = None  # the configuration and seed that make this world
 
     def __eq__(self, other: object) -> bool:

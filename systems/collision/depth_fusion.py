@@ -228,7 +228,7 @@ def swept_space(
     away[tuple(index.T)] = False
     if not len(index):
         return ~away
-    return distance_transform_edt(away, sampling=voxel_size) <= radius
+    return np.asarray(distance_transform_edt(away, sampling=voxel_size)) <= radius
 
 
 def bounds_of_depth_images(

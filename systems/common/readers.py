@@ -55,7 +55,7 @@ def read_text(path: Path, errors: str = "strict") -> str:
             "another file"
         )
     try:
-        return path.read_text(encoding="utf-8", errors=errors)
+        return path.read_text(encoding="utf-8-sig", errors=errors)
     except UnicodeDecodeError as error:
         found = f"{error.object[error.start]:#04x} at byte {error.start}"
         raise ValueError(f"{path} must be a text in UTF-8, got {found}") from None

@@ -58,11 +58,26 @@ def import_pycolmap() -> ModuleType:
 
 
 def model_folder(path: Path) -> Path | None:
-    """Returns the folder of the COLMAP model in a capture, None without one."""
+    """Returns the folder of the COLMAP model in a capture, the largest of several, None without
+    one."""
     for name in _MODEL_FOLDERS:
-        for suffix in (".bin", ".txt"):
-            if all((path / name / f"{part}{suffix}").is_file() for part in ("cameras", "images")):
-                return path / name
+        if found := [each for each in _siblings(path / name) if _images_file(each)]:
+            return max(found, key=lambda each: _images_file(each).stat().st_size)  # pyright: ignore
+    return None
+
+
+def _siblings(folder: Path) -> list[Path]:
+    """Returns a model's folder, and those of the other parts of a scene that fell apart."""
+    if folder.name != "0" or not folder.parent.is_dir():
+        return [folder]
+    return sorted(each for each in folder.parent.iterdir() if each.name.isdigit())
+
+
+def _images_file(folder: Path) -> Path | None:
+    """Returns the file of registered images of a model's folder."""
+    for suffix in (".bin", ".txt"):
+        if all((folder / f"{part}{suffix}").is_file() for part in ("cameras", "images")):
+            return folder / f"images{suffix}"
     return None
 
 

@@ -1,13 +1,14 @@
 """Opens captures that keep their frames in files.
 
 Frames with a missing, damaged or differently sized file, or with an invalid or distant pose, are
-left out, with a message each in `Capture.dropped`. More than a fifth of them are an error, because
-then the capture is read wrongly.
+left out, with a message each in `Capture.dropped`. More than a fifth of those with an image are
+an error, because then the capture is read wrongly.
 """
 
 import re
+import unicodedata
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -48,6 +49,17 @@ _MAX_DROPPED = 0.2  # fraction of frames that may be left out
 _MAPS = 8  # cameras whose resampling is kept at a time
 _VALID = 0.999  # fraction of a resampled pixel that must come from valid ones
 _SAME_SHAPE = 0.02  # relative difference of aspect ratios below which depth shows the same view
+
+
+def existing_file(file: Path) -> Path:
+    """Returns the file, or the one that is meant if another system wrote its name: with \\ for /,
+    or with letters and accents composed otherwise."""
+    if not file.exists():
+        for name in (str(file), str(file).replace("\\", "/")):
+            for form in ("NFC", "NFD"):
+                if (found := Path(unicodedata.normalize(form, name))).exists():
+                    return found
+    return file
 
 
 def image_size(file: Path) -> tuple[int, int]:
@@ -250,6 +262,7 @@ class FrameFiles:
     lens: Lens | None = None  # the camera of this frame; None takes that of the capture
     mask: Path | None = None  # an image that is black where this one is not to be used
     name: str = ""  # path of the image as the files give it; empty for the name of the file
+    confidence: Path | None = None  # an image that is 0 where depth is a guess
     held_out: bool = False  # true if the files hold this frame out from training
 
 
@@ -291,19 +304,21 @@ def open_frames(
     not count further.
     """
     config = config or CaptureConfig()
-    messages, complete = list(dropped), []
+    messages, complete, missing = list(dropped), [], 0
     for files in frames:
         try:
             complete.append(_inspect(files))
         except (ValueError, OSError) as error:
             messages.append(str(error))
+            missing += not existing_file(files.image).exists()
     registered = depth_camera is None and not stretch_depth
     same_size = _drop_other_sizes(complete, messages, registered, stretch_depth)
     usable = _drop_distant(same_size, messages)
-    if len(usable) < max(2, (1 - _MAX_DROPPED) * len(frames)):
+    # Images that someone has deleted, such as blurred ones, are no sign of a wrong reading.
+    if len(usable) < max(2, (1 - _MAX_DROPPED) * (len(frames) - missing)):
         first = f"; the first that cannot: {messages[0]}" if messages else ""
         raise ValueError(
-            f"{path}: {len(usable)} of {len(frames)} frames can be used, at least 2 and "
+            f"{path}: {len(usable)} of {len(frames) - missing} frames can be used, at least 2 and "
             f"{1 - _MAX_DROPPED:.0%} must be{first}"
         )
 
@@ -345,6 +360,10 @@ def open_frames(
         if file is None or size is None:
             return None
         depth = _require_size(read_depth(file, config.depth_unit or depth_unit), file, size)
+        if (confidence := usable[i].files.confidence) is not None:
+            shown = _decode(confidence, cv2.IMREAD_ANYDEPTH)
+            shown = cv2.resize(shown, size, interpolation=cv2.INTER_NEAREST_EXACT)
+            depth = np.where(shown > 0, depth, np.float32(0))
         if depth_camera:
             return depth
         # An average between two surfaces would lie on neither.
@@ -405,6 +424,9 @@ def _notes(lenses: Sequence[Lens], masked: int, transparent: int, total: int) ->
 
 
 def _inspect(frame: FrameFiles) -> _Frame:
+    parts = ("image", "depth", "mask")
+    found = {name: file and existing_file(file) for name in parts if (file := getattr(frame, name))}
+    frame = replace(frame, **found)
     size, mode = _image_header(frame.image)
     if frame.lens is not None:
         _check_size(frame.image, size, (frame.lens.width, frame.lens.height))

@@ -30,7 +30,9 @@ from splatpilot.training.captures.capture import (
 )
 from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.frames import (
+    IMAGE_SUFFIXES,
     FrameFiles,
+    existing_file,
     image_size,
     open_frames,
     pose_from_matrix,
@@ -79,7 +81,7 @@ def read(path: Path, config: CaptureConfig) -> Capture:
         if entry.get("is_bad") or held_out[i] is None:
             bad.append(f"{file}: {name} {'is_bad' if entry.get('is_bad') else 'is in no split'}")
             continue
-        image = _image_file(path / name)
+        image = _image_file(existing_file(path / name))
         frames.append(
             FrameFiles(
                 image,
@@ -148,7 +150,8 @@ def _pose(matrix: Any, source: str) -> RigidTransform:
 
 def _image_file(file: Path) -> Path:
     """Returns the file of an image, whose name may be without its suffix."""
-    if isfile(file) or file.suffix or not file.parent.is_dir():
+    known = file.suffix.lower() in IMAGE_SUFFIXES
+    if isfile(file) or known or not file.parent.is_dir():
         return file
     return next((f for f in sorted(file.parent.iterdir()) if f.stem == file.name), file)
 

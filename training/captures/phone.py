@@ -34,16 +34,29 @@ def read_polycam(path: Path, config: CaptureConfig) -> Capture:
                 raise read
             return frames.pose_from_matrix(read[1], str(camera))
 
+        image = folder / f"{prefix}images" / f"{camera.stem}.jpg"
         try:
-            read = _read_keyframe(camera, config.intrinsics)
+            read = _read_keyframe(camera, image, config.intrinsics)
         except ValueError as error:
             read = error
-        image = folder / f"{prefix}images" / f"{camera.stem}.jpg"
         depth = folder / "depth" / f"{camera.stem}.png"
         lens = None if isinstance(read, ValueError) else read[0]
-        return frames.FrameFiles(image, X_FB, depth if depth.is_file() else None, lens)
+        confidence = folder / "confidence" / f"{camera.stem}.png"
+        return frames.FrameFiles(
+            image,
+            X_FB,
+            depth if depth.is_file() else None,
+            lens,
+            confidence=confidence if confidence.is_file() else None,
+        )
 
-    cameras = frames.numbered_files(folder / f"{prefix}cameras", r"(\d+)\.json")
+    pattern = r"(\d+)\.json"
+    cameras = frames.numbered_files(folder / f"{prefix}cameras", pattern)
+    dropped = []
+    if prefix and (folder / "cameras").is_dir():
+        raw = frames.numbered_files(folder / "cameras", pattern)
+        if alone := len(raw.keys() - cameras.keys()):
+            dropped = [f"{folder}: {alone} of {len(raw)} keyframes have no corrected camera"]
     return frames.open_frames(
         path,
         "Polycam capture",
@@ -52,16 +65,21 @@ def read_polycam(path: Path, config: CaptureConfig) -> Capture:
         config=config,
         stretch_depth=True,
         up="y",
+        dropped=dropped,
     )
 
 
-def _read_keyframe(camera: Path, intrinsics: Sequence[float]) -> tuple[Lens, NDArray[np.float64]]:
+def _read_keyframe(
+    camera: Path, image: Path, intrinsics: Sequence[float]
+) -> tuple[Lens, NDArray[np.float64]]:
     """Returns the camera and the pose (3, 4) of a keyframe."""
     text = read_text(camera)
     with readable(camera, "camera of a keyframe"):
         values = json.loads(text)
         focal = intrinsics or [float(values[name]) for name in ("fx", "fy", "cx", "cy")]
         source = "capture.intrinsics" if intrinsics else f"{camera.parent.name}/"
+        if "width" not in values:  # as in newer corrected cameras
+            values["width"], values["height"] = frames.image_size(image)
         lens = Lens(pinhole(*focal), int(values["width"]), int(values["height"]), source=source)
         matrix = [float(values[f"t_{row}{column}"]) for row in range(3) for column in range(4)]
     return lens, np.array(matrix).reshape(3, 4)

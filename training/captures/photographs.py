@@ -14,6 +14,7 @@ from scipy.cluster.vq import kmeans2, vq
 
 from splatpilot.systems.common.processes import available_cores, run_in_subprocess
 from splatpilot.systems.common.progress import Progress, resumable
+from splatpilot.systems.common.validation import require
 from splatpilot.training.captures.capture import Capture
 from splatpilot.training.captures.capture_config import (
     CaptureConfig,
@@ -40,16 +41,20 @@ _MAX_EXHAUSTIVE = 60  # photographs up to which, by default, each is matched wit
 _PARTNERS = 20  # number of photographs that each of more is matched with
 _SEED = 0
 _VIDEO_SUFFIXES = {".avi", ".m4v", ".mkv", ".mov", ".mp4", ".webm"}
+_UNREADABLE = {".heic", ".heif", ".avif", ".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw"}
+_POSES = ("poses_bounds.npy", "cameras.xml")  # of LLFF, of Metashape
 _MIN_PHOTOGRAPHS = 3
 _SHARPNESS_WIDTH = 480  # [px], at which frames are compared
 _QUALITY = 97
 
 
 def image_files(path: Path) -> list[Path]:
-    """Returns the images in a folder, or in its folder `images`."""
+    """Returns the images in a folder, or in its folder `images`, that are photographs by their
+    suffix; none of an unbundled SOG."""
     for folder in (path, path / "images"):
-        if folder.is_dir():
-            files = [file for file in folder.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES]
+        if folder.is_dir() and not (folder / "means_l.webp").exists():
+            suffixes = IMAGE_SUFFIXES | _UNREADABLE
+            files = [file for file in folder.iterdir() if file.suffix.lower() in suffixes]
             if files:
                 return sorted(files)
     return []
@@ -59,15 +64,33 @@ def read_photographs(path: Path, config: CaptureConfig) -> Capture:
     """Opens photographs without poses, registered by pycolmap; the cache keeps the registration. At
     least three, and half of them, must be registered."""
     files, dropped = [], []
-    for file in image_files(path):
+    if poses := [name for name in _POSES if (path / name).exists()]:
+        if config.kind != "photographs":
+            raise ValueError(
+                f"{path}: its poses in {poses[0]} are not read; convert them to COLMAP or "
+                "nerfstudio, or set capture.kind=photographs to register the images again"
+            )
+    found = image_files(path)
+    if unreadable := [file for file in found if file.suffix.lower() in _UNREADABLE]:
+        kinds = ", ".join(sorted({file.suffix[1:].upper() for file in unreadable}))
+        dropped.append(
+            f"{path}: {len(unreadable)} {kinds} images cannot be read; convert them to JPEG"
+        )
+    for file in found:
+        if file in unreadable:
+            continue
         try:
             image_size(file)
+            with Image.open(file) as image:
+                is_depth = image.mode.startswith(("I", "F"))
+            require(not is_depth, f"{file}", "a photograph", "depth, one number per pixel")
             files.append(file)
         except (ValueError, OSError) as error:
             dropped.append(str(error))
     total = len(files) + len(dropped)
     if len(files) < _MIN_PHOTOGRAPHS:
-        raise ValueError(f"{path}: readable photographs must be at least 3, got {len(files)}")
+        why = f"; {dropped[0]}" if dropped else ""
+        raise ValueError(f"{path}: readable photographs must be at least 3, got {len(files)}{why}")
     folder = files[0].parent
     names = [file.name for file in files]
     masks = sorted(file for file in mask_folder(folder).rglob("*") if file.is_file())

@@ -211,6 +211,10 @@ class _Bag:
                 image = f"{name}/{times[-1]:.9f}.{suffix}"
                 (folder / image).write_bytes(content)
                 file.write(f"{times[-1]:.9f} {image}\n")
+        if not any(times):
+            raise ValueError(
+                f"{self._path}: header stamps of {topic} are 0; write the times of recording there"
+            )
         return times
 
     def _calibration(self, frame: str) -> dict[str, Any]:

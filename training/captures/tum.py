@@ -52,6 +52,8 @@ _CAMERAS = {
     ),
 }
 _DEFAULT = (525.0, 525.0, 319.5, 239.5)
+_UNITS = ((1e16, 1e-9), (1e13, 1e-6), (1e11, 1e-3))
+"""Times since 1970 above which they are not in seconds, and the unit [s] that they are in."""
 _CALIBRATION = "calibration.txt"  # of the images themselves, as in ETH3D's sequences
 
 
@@ -107,6 +109,7 @@ def open_sequence(
     rows = read_rows(pose_file, 8, "a pose t tx ty tz qx qy qz qw")
     rows = np.array([row for row in rows if np.isfinite(row).all()]).reshape(-1, 8)
     require(len(rows) >= 2, f"{pose_file}: finite poses", "at least 2", len(rows))
+    rows[:, 0] = _seconds(rows[:, 0])
     rows = rows[np.argsort(rows[:, 0], kind="stable")]
     for file, times in ((pose_file, rows[:, 0]), (path / "depth.txt", depth_times)):
         begin, end = color_times.min(), color_times.max()
@@ -166,7 +169,7 @@ def _read_list(file: Path) -> tuple[NDArray[np.float64], list[str]]:
         if not line.strip() or line.startswith("#"):
             continue
         try:
-            time, name = line.split()
+            time, name = line.split(maxsplit=1)
             times.append(float(time))
         except ValueError:
             raise ValueError(
@@ -175,4 +178,10 @@ def _read_list(file: Path) -> tuple[NDArray[np.float64], list[str]]:
         names.append(name)
     if not names:
         raise ValueError(f"{file}: lists no file")
-    return np.array(times), names
+    return _seconds(np.array(times)), names
+
+
+def _seconds(times: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns times [s] that may be in seconds, milli-, micro- or nanoseconds since 1970."""
+    largest = np.abs(times).max(initial=0)
+    return times * next((unit for least, unit in _UNITS if largest > least), 1.0)

@@ -75,8 +75,8 @@ def test_world_pickles_by_its_configuration(world):
 
 @pytest.mark.parametrize("policy", ["!PrivilegedPlannerConfig {}", "!DiffAeroConfig {}"])
 def test_policies_fly_in_a_mesh(opengl, room, tmp_path, policy):
-    ends = "start: [-5.0, -1.0, 2.0]\ngoal: [5.0, 1.0, 2.0]\n"
-    text = f"world: !MeshWorld {{path: {room}, up: z}}\npolicy: {policy}\n{ends}"
+    world = f"world: !MeshWorld {{path: {room}, up: z}}\n"
+    text = f"{world}policy: {policy}\nstart: [-5.0, -1.0, 2.0]\ngoal: [5.0, 1.0, 2.0]\n"
     (tmp_path / "scenario.yaml").write_text(text)
     scenario = load_config(Scenario(), tmp_path / "scenario.yaml")
     world = make_world(scenario.world, scenario.seed)

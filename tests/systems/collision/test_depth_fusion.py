@@ -208,3 +208,16 @@ def test_bad_arguments_are_refused(change, message):
     esdf_from_depth_images(**good)
     with pytest.raises(ValueError, match=message):
         esdf_from_depth_images(**good | change)
+
+
+def test_unobserved_space_along_the_path_is_free():
+    X_WCs = [RigidTransform(R_BC, [x, 1.5, 1.2]) for x in (0.5, 1.0, 3.0)]
+    depths = np.zeros((3, HEIGHT, WIDTH))
+    depths[0, :, : WIDTH // 2] = 0.05  # a surface right before the first camera
+    options = {"lower_W": np.zeros(3), "upper_W": np.array([4, 3, 2.5]), "voxel_size": 0.1}
+    without = esdf_from_depth_images(depths, K, X_WCs, **options)
+    esdf = esdf_from_depth_images(depths, K, X_WCs, swept_radius=0.35, **options)
+    x, y, z = [4, 7, 30, 20], [14, 14, 12, 15], [14, 12, 12, 12]  # voxels
+    np.testing.assert_array_equal(esdf.states[x, y, z], [FREE, FREE, FREE, UNKNOWN])
+    assert (without.states[x, y, z] == UNKNOWN).all()
+    assert esdf.volume(OCCUPIED) == without.volume(OCCUPIED) > 0

@@ -27,7 +27,7 @@ from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.splats.splat_camera import SplatCamera
 
 
-def rasterized(scene, background=(0.0, 0.0, 0.0), X=X_WC, **options):
+def rasterized(scene, background=(0.0, 0.0, 0.0), X=X_WC, render_mode="RGB+MD", **options):
     names = ("means", "quats", "scales", "opacities")
     image, alpha, _ = rasterize(
         **{name: torch.from_numpy(getattr(scene, name)) for name in names},
@@ -38,7 +38,7 @@ def rasterized(scene, background=(0.0, 0.0, 0.0), X=X_WC, **options):
         height=HEIGHT,
         sh_degree=scene.sh_degree,
         backgrounds=torch.tensor([background]),
-        render_mode="RGB+MD",
+        render_mode=render_mode,
         **options,
     )
     return image[0].numpy(), alpha[0, ..., 0].numpy()

@@ -11,6 +11,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from splatpilot.training.captures.capture import Capture, SfmPoints
 from splatpilot.training.captures.capture_config import CaptureConfig, ScaleConfig
 from splatpilot.training.captures.capture_registry import read_capture
+from splatpilot.training.captures.colmap import model_folder
 from splatpilot.training.captures.up_and_scale import camera_height
 
 SHRINK = 0.25
@@ -319,3 +320,12 @@ def test_pycolmap_leaves_signal_handlers_and_png_files_alone(tmp_path):
     command = [sys.executable, "-c", script, str(tmp_path / "a.png")]
     done = subprocess.run(command, capture_output=True, timeout=60)
     assert (done.returncode, done.stderr) == (7, b"")
+
+
+def test_largest_of_several_models_is_taken(tmp_path):
+    for number, size in ((0, 10), (1, 30), (2, 20)):
+        folder = tmp_path / f"sparse/{number}"
+        folder.mkdir(parents=True)
+        (folder / "cameras.bin").touch()
+        (folder / "images.bin").write_bytes(bytes(size))
+    assert model_folder(tmp_path) == tmp_path / "sparse/1"

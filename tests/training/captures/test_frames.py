@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from splatpilot.training.captures.frames import pose_from_matrix
+from splatpilot.training.captures.frames import existing_file, pose_from_matrix
 
 MATRIX = np.array(
     [[0.0, 0.0, 1.0, 4.0], [1.0, 0.0, 0.0, 5.0], [0.0, 1.0, 0.0, 6.0], [0.0, 0.0, 0.0, 1.0]]
@@ -27,3 +27,14 @@ def test_pose_is_read_from_rows(matrix):
 def test_matrix_that_is_not_a_pose_is_refused(matrix, message):
     with pytest.raises(ValueError, match=message):
         pose_from_matrix(matrix, "here")
+
+
+@pytest.mark.parametrize(
+    ("written", "stored"),
+    [("images\\a.png", "images/a.png"), ("images/küche.png", "images/ku\u0308che.png")],
+)
+def test_names_of_other_systems_are_found(tmp_path, written, stored):
+    (tmp_path / "images").mkdir()
+    (tmp_path / stored).touch()
+    assert existing_file(tmp_path / written) == tmp_path / stored
+    assert existing_file(tmp_path / "b.png") == tmp_path / "b.png"

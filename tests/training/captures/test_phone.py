@@ -137,3 +137,32 @@ def test_damaged_depth_is_named(write_record3d):
     (path / "depth/3.exr").write_bytes(whole[:40])
     capture = read_capture(path)
     assert len(capture) == 9 and "3.exr: not a readable EXR file" in capture.dropped[0]
+
+
+def test_size_of_keyframes_is_that_of_their_images(write):
+    path = write("corrected_")
+    for camera in (path / "keyframes/corrected_cameras").iterdir():
+        values = json.loads(camera.read_text())
+        del values["width"], values["height"]
+        camera.write_text(json.dumps(values))
+    capture = read_capture(path)
+    assert len(capture) == 10 and not capture.dropped
+
+
+def test_keyframes_without_corrected_cameras_are_counted(write):
+    path = write("corrected_")
+    (path / "keyframes/cameras").mkdir()
+    for i in range(13):
+        (path / f"keyframes/cameras/{638443502 + i}.json").write_text("{}")
+    assert "3 of 13 keyframes have no corrected camera" in read_capture(path).dropped[0]
+
+
+def test_depth_without_confidence_is_unknown(write):
+    path = write()
+    (path / "keyframes/confidence").mkdir()
+    confidence = np.full((24, 32), 255, np.uint8)
+    confidence[:, :16] = 0
+    cv2.imwrite(str(path / "keyframes/confidence/638443502.png"), confidence)
+    capture = read_capture(path)
+    known = capture.registered_depth(0) > 0
+    assert not known[:, :30].any() and known[:, 34:].all() and capture.registered_depth(1).all()

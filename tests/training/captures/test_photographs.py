@@ -130,3 +130,18 @@ def test_photographs_that_show_nothing(tmp_path):
     with pytest.raises(ValueError, match="3 photographs could not be registered"):
         read_capture(path, CaptureConfig(cache=str(tmp_path / "cache")))
     assert not list((tmp_path / "cache").iterdir())
+
+
+def test_images_that_are_no_readable_photographs_are_named(tmp_path):
+    cv2.imwrite(str(tmp_path / "depth0.png"), np.ones((8, 8), np.uint16))
+    with pytest.raises(ValueError, match=r"got 0; .*depth0\.png must be a photograph, got depth"):
+        read_capture(tmp_path)
+    (tmp_path / "a.HEIC").write_bytes(b"ftypheic")
+    with pytest.raises(ValueError, match="1 HEIC images cannot be read; convert them to JPEG"):
+        read_capture(tmp_path)
+    (tmp_path / "poses_bounds.npy").touch()
+    with pytest.raises(ValueError, match=r"its poses in poses_bounds\.npy are not read"):
+        read_capture(tmp_path)
+    (tmp_path / "means_l.webp").touch()
+    with pytest.raises(ValueError, match="unknown capture format"):
+        read_capture(tmp_path)

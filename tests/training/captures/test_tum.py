@@ -130,3 +130,16 @@ def test_clocks_must_overlap(sequence):
         ValueError, match=r"groundtruth\.txt: runs from 1000100\.000 to .*rgb\.txt from 100\.000"
     ):
         read_capture(sequence)
+
+
+def test_times_in_nanoseconds_with_a_byte_order_mark(sequence):
+    seconds = 1_700_000_000
+    for name in ("rgb", "depth", "groundtruth"):
+        lines = [line.split(" ", 1) for line in (sequence / f"{name}.txt").read_text().splitlines()]
+        written = [
+            " ".join([t, rest] if t == "#" else [str(int((seconds + float(t)) * 1e9)), rest])
+            for t, rest in lines
+        ]
+        (sequence / f"{name}.txt").write_text("\n".join(written), encoding="utf-8-sig")
+    capture = read_capture(sequence)
+    assert len(capture) == 10 and not capture.dropped
