@@ -49,7 +49,7 @@ class MeshWorld(Config):
     # If true, start and goal are drawn from the seed; otherwise a long route decides.
     draw_ends: bool = False
     # [m] Minimum length of the shortest route between ends that are drawn.
-    least_way: float = bounded(SHORTEST, "[0, inf) m")
+    min_route: float = bounded(SHORTEST, "[0, inf) m")
 
     def check(self) -> None:
         require_field(self, "path", self.path, "a mesh")
@@ -62,7 +62,7 @@ def mesh_world(config: MeshWorld, seed: int) -> World:
     path = find_data(Path(config.path), "a mesh")
     check_mesh(path, config.up)
     esdf = mesh_distance(path, config.up, config.voxel_size, config.scale)
-    drawn = {"least": config.least_way, "seed": seed} if config.draw_ends else {}
+    drawn = {"least": config.min_route, "seed": seed} if config.draw_ends else {}
     ends = choose_ends(esdf, config.path, **drawn)
     points, normals, colors, area = sample_colors(path, config.up, config.scale, _PREVIEW)
     extent = np.full((len(points), 2), _GAP * COVERAGE * np.sqrt(area / len(points)))
