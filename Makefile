@@ -7,12 +7,16 @@ BUILT_FROM := pyproject.toml CMakeLists.txt $(shell find native -type f)
 SPLATPILOT := .venv/bin/splatpilot
 NATIVE := $(shell find native -name '*.hpp' -o -name '*.cpp')
 
-.PHONY: fly test lint docs stub messages sanitize nightly clean
+.PHONY: fly test pytest lint docs stub messages sanitize nightly clean
 
 fly: .venv/flying
 	$(SPLATPILOT) fly --out out/fly --overwrite
 
-test: lint
+# Pyright has one thread, which the tests need not wait for.
+test: .venv/installed
+	+@$(MAKE) --no-print-directory --jobs=2 lint pytest
+
+pytest: .venv/installed
 	OMP_NUM_THREADS=1 .venv/bin/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 
 lint: .venv/installed
@@ -49,14 +53,15 @@ nightly: sanitize
 clean:
 	rm -rf .venv build
 
-# What flies, and then what trains, reconstructs and checks too.
+# What flies, and then what trains, reconstructs and checks too: with EXTRAS, it downloads while it compiles.
 .venv/flying: $(BUILT_FROM)
 	@test -n "$(PYTHON)" || { echo "No Python 3.12 or newer found; install one, or name it: make PYTHON=/path/to/python3.12" >&2; exit 1; }
 	$(PYTHON) -m venv .venv
 	.venv/bin/python -m pip install --quiet uv
-	.venv/bin/uv pip install --python .venv/bin/python --editable .
+	.venv/bin/uv pip install --python .venv/bin/python --editable '.$(EXTRAS)'
 	touch $@
 
+.venv/installed: EXTRAS := [dev]
 .venv/installed: .venv/flying
-	.venv/bin/uv pip install --python .venv/bin/python --compile-bytecode --requirements pyproject.toml --extra dev
+	.venv/bin/uv pip install --python .venv/bin/python --requirements pyproject.toml --extra dev
 	touch $@

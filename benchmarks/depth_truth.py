@@ -20,7 +20,7 @@ from pydrake.systems.sensors import ImageDepth32F
 from splatpilot.diagrams.flight.flight import fly
 from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
 from splatpilot.diagrams.flight.scenario import Scenario
-from splatpilot.diagrams.flight.sensors import make_camera
+from splatpilot.diagrams.flight.sensors import make_onboard_camera
 from splatpilot.diagrams.scenarios import benchmark_scenarios, scenario_file
 from splatpilot.diagrams.worlds.solids.solid import WorldSpec
 from splatpilot.diagrams.worlds.solids.surfaces import merge
@@ -115,7 +115,7 @@ def frames_along_flight(
     rows = np.linspace(0, len(flight.states) - 1, count).astype(int)
     frames: list[list[DepthFrame]] = [[] for _ in cameras]
     for config, found in zip(cameras, frames, strict=True):
-        camera = make_camera(config, world)
+        camera = make_onboard_camera(config, world)
         context = camera.CreateDefaultContext()
         for X_WB in map(pose_from_state, flight.states[rows]):
             camera.GetInputPort("body_pose").FixValue(context, X_WB)

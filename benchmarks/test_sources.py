@@ -8,32 +8,19 @@ from pathlib import Path
 
 import yaml
 
+from splatpilot.analysis.environments import known_entries
 from splatpilot.diagrams.worlds import splits
+from splatpilot.diagrams.worlds.mesh import mesh_digests
 from splatpilot.training.captures.capture_registry import read_capture
-from splatpilot.training.captures.mesh_renderer import mesh_digests
-
-SOURCES = {
-    "hospital": "tartanair/hospital",
-    "redkitchen": "redkitchen",
-    "bookstore": "worlds/bookstore.gltf",
-    "warehouse": "worlds/warehouse.gltf",
-    "hospital_building": "worlds/hospital_building.gltf",
-    "cafe": "worlds/cafe.glb",
-    "edgar_mine": "worlds/edgar_mine.glb",
-    "spaceship": "worlds/spaceship.glb",
-    "farm": "worlds/farm.glb",
-    "mansion_garden": "worlds/mansion_garden.glb",
-    "canyon": "worlds/canyon.glb",
-    "beach": "worlds/beach.glb",
-}
-"""Captures and meshes below the folder of data."""
 
 
-def table(data: Path, names: list[str]) -> dict[str, list[str]]:
-    """Returns the digests of sources by name."""
+def table(data: Path) -> dict[str, list[str]]:
+    """Returns the digests of the test sources in a folder of data, by name."""
     digests = {}
-    for name in names:
-        path = data / SOURCES[name]
+    for name, entry in known_entries().items():
+        path = data / entry.source
+        if entry.split != "test" or not path.exists():  # a scenario
+            continue
         if path.is_dir():
             capture = read_capture(path)
             images = (capture.load_image(i) for i in range(len(capture)))
@@ -47,6 +34,6 @@ def table(data: Path, names: list[str]) -> dict[str, list[str]]:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("data", type=Path, help="folder of captures and meshes")
-    found = table(parser.parse_args().data, list(SOURCES))
+    found = table(parser.parse_args().data)
     text = yaml.safe_dump(found, sort_keys=False, default_flow_style=None, width=200)
     splits.TABLE.write_text(text)

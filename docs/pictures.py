@@ -21,7 +21,7 @@ from pydrake.systems.sensors import CameraConfig
 
 from splatpilot.diagrams.flight.flight_diagram import MakeCamera
 from splatpilot.diagrams.flight.scenario import Scenario, sample_initial_state
-from splatpilot.diagrams.flight.sensors import make_camera
+from splatpilot.diagrams.flight.sensors import make_onboard_camera
 from splatpilot.diagrams.scenarios import benchmark_scenarios
 from splatpilot.diagrams.worlds.world_registry import is_procedural, make_world
 from splatpilot.systems.common.config import load_config
@@ -82,7 +82,7 @@ def sensor(out: Path) -> None:
     scenario = load_config(Scenario(), benchmark_scenarios()["P10"])
     world = make_world(scenario.world, scenario.seed)
     X_WB = pose_from_state(sample_initial_state(scenario, world))
-    camera = make_camera(OnboardCamera(420, 280, readout=0.03), world)
+    camera = make_onboard_camera(OnboardCamera(420, 280, readout=0.03), world)
     X_WB_start = X_WB @ RigidTransform(RollPitchYaw(-0.12, 0.0, 0.12), [-0.1, 0.0, 0.0])
     views = [camera.render(X_WB), camera.render(X_WB, None, X_WB_start)]
     still, rolled = (color_pixels(view.color) for view in views)

@@ -15,6 +15,9 @@ tqdm.monitor_interval = 0
 settings.register_profile("repeatable", deadline=None, derandomize=True)
 settings.load_profile("repeatable")
 
+# gsply's compiler takes longer than all that it compiles here.
+os.environ["NUMBA_DISABLE_JIT"] = "1"
+
 _SLOWEST = "test_wheel.py", "test_crash.py"
 
 

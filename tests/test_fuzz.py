@@ -20,6 +20,7 @@ from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 from room import write_room_capture
 
 from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.worlds.mesh import mesh_distance
 from splatpilot.diagrams.worlds.scene_folder import read_scene, write_scene_folder
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.esdf import Esdf
@@ -38,7 +39,6 @@ from splatpilot.systems.splats.baked_scene import BakedScene
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.splats.splat_files import read_splats, write_ply
 from splatpilot.training.captures.capture_registry import read_capture
-from splatpilot.training.captures.render import mesh_distance
 
 WIDTH, HEIGHT, FRAMES, COUNT = 16, 12, 6, 20
 R_WC = RotationMatrix(np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]]))

@@ -83,8 +83,8 @@ def fly_all(
         client = distributed.Client(cluster, timeout=CONNECT_TIMEOUT)
     except (OSError, TimeoutError, ValueError) as error:
         raise OSError(
-            f"no dask scheduler answers at {cluster} ({error}); start one with `dask scheduler` "
-            "and workers with `dask worker ADDRESS --nthreads 1`"
+            f"--cluster must be the address of a dask scheduler, got {cluster} ({error}); start "
+            "one with `dask scheduler` and workers with `dask worker ADDRESS --nthreads 1`"
         ) from None
     with client:
         futures = client.map(fly, list(work), pure=False, retries=3)
@@ -181,8 +181,8 @@ def run(
         for name, version in folder.program().items():
             if flown_by.get(name) != version:
                 raise ValueError(
-                    f"{out} was started with {name} {version}, this is {flown_by.get(name)}, and "
-                    "one program must fly a study; use that one or choose another --out"
+                    f"{name} of {out} must be {version}, with which it was started, got "
+                    f"{flown_by.get(name)}; use that one or choose another --out"
                 )
         print(f"{len(rows)} of {len(specs)} flights exist already.")
     if missing:
@@ -211,8 +211,7 @@ def study(
     cluster: str | None = None,
     out: Path | str | None = None,
 ) -> "pd.DataFrame":
-    """
-    Flies scenarios x parameters x policies x speeds x seeds, and returns a row for each flight.
+    """Flies scenarios x parameters x policies x speeds x seeds; returns a row for each flight.
 
     .. code-block:: python
 

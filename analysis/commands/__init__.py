@@ -16,7 +16,7 @@ COMMANDS = {
         "capture",
         "render a capture of a mesh or a generated world, with exact depth",
     ),
-    "scene": ("", "scale, measure, export, compare or fetch scenes"),
+    "scene": ("", "scale, measure, export or compare scenes"),
     "scene scale": (
         "scene",
         "scale a scene by a factor, a measured length, or the height of the cameras",
@@ -34,7 +34,9 @@ COMMANDS = {
         "scene",
         "measure how far from its capture's path a scene can be trusted",
     ),
-    "scene fetch": ("scene", "make the scenes of the benchmark's photorealistic scenarios"),
+    "library": ("", "make and list the environments of a folder of data"),
+    "library make": ("library", "reconstruct, measure and record environments"),
+    "library show": ("library", "print the recorded environments, and draw each"),
     "train": ("train", "train policies"),
     "recover": (
         "train",
@@ -61,7 +63,8 @@ COMMANDS = {
 MOVED = {
     "tour": "reconstruct",
     "merge": "benchmark --cluster",
-    "places": "scene fetch",
+    "places": "library make",
+    "scene fetch": "library make",
     **{name: f"scene {name}" for name in ("scale", "measure", "mesh", "ablate", "fidelity")},
     **{name: f"hardware {name}" for name in ("vehicle", "bridge", "px4", "faults")},
 }

@@ -16,10 +16,10 @@ SCENARIOS = tuple(benchmark_scenarios() | other_scenarios())
 LEARN_FROM_CORPORA = "student_rgb", "student_depth", "diffaero_rgb"
 """Trainers that learn from corpora."""
 
-TRAINERS = "diffaero", "depthnav", "diffaero_tof", "agile_autonomy", *LEARN_FROM_CORPORA
+TRAINER_NAMES = "diffaero", "depthnav", "diffaero_tof", "agile_autonomy", *LEARN_FROM_CORPORA
 """The names of the trainers of this package; importing their registry takes seconds."""
 
-POLICIES = "planner", "straight", "teleop", "reactive", *TRAINERS
+POLICY_NAMES = "planner", "straight", "teleop", "reactive", *TRAINER_NAMES
 """The names of the policies of this package."""
 
 _SUFFIXES = {
@@ -50,21 +50,21 @@ def check_policy(text: str) -> str:
     name, colon, field = variant.policy.partition(":")
     if variant.weights is not None:
         require_existing(variant.weights, "a file of weights")
-    elif colon and name in POLICIES:
+    elif colon and name in POLICY_NAMES:
         raise ValueError(
             f"the policy {variant.policy!r} names a field of {name} without a value; write "
             f"{name}:{field}=VALUE"
         )
     elif variant.policy != SCENARIO:
         registry = "splatpilot.diagrams.flight.policies"
-        _check_name("policy", "splatpilot.policies", variant.policy, POLICIES, registry)
+        _check_name("policy", "splatpilot.policies", variant.policy, POLICY_NAMES, registry)
     return text
 
 
 def check_trainer(name: str) -> str:
     """Checks the name of a trainer, and returns it."""
     registry = "splatpilot.training.policies.trainer_registry"
-    _check_name("trainer", "splatpilot.trainers", name, TRAINERS, registry)
+    _check_name("trainer", "splatpilot.trainers", name, TRAINER_NAMES, registry)
     return name
 
 

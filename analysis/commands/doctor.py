@@ -164,7 +164,7 @@ def _data() -> list[Finding]:
         return [Finding("data", f"{folder}: {names or 'empty'}")]
     found = f"{DATA} is not set" if folder is None else f"No such folder: {folder}"
     remedy = f"export {DATA}=FOLDER of captures and meshes"
-    serves = "`splatpilot scene fetch`, and tests on real captures"
+    serves = "`splatpilot library make`, and tests on real captures"
     return [Finding("data", found, remedy, serves)]
 
 
@@ -181,5 +181,5 @@ def _scenes() -> list[Finding]:
     found = f"{scenes_folder()} has those of {present or 'no scenario'}"
     if not absent:
         return [Finding("scenes", found)]
-    remedy = f"splatpilot scene fetch, or export {SCENES}=FOLDER of scenes"
+    remedy = f"splatpilot library make, or export {SCENES}=FOLDER of scenes"
     return [Finding("scenes", found, remedy, f"the scenarios {', '.join(absent)}")]

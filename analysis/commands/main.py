@@ -64,8 +64,9 @@ class _Parser(argparse.ArgumentParser):
         else:
             what = str(action.metavar or action.dest).lower()
             message = unknown(what, value, action.choices)
-            if value in MOVED and self.prog == "splatpilot":
-                message = f"`splatpilot {value}` is now `splatpilot {MOVED[value]}`"
+            words = f"{self.prog} {value}"
+            if new := MOVED.get(words.removeprefix("splatpilot ")):
+                message = f"`{words}` is now `splatpilot {new}`"
             raise argparse.ArgumentError(None, message)
 
     def _get_value(self, action: argparse.Action, arg_string: str) -> Any:

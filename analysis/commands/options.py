@@ -266,9 +266,9 @@ SCENARIO_OPTIONS = (
     ),
     Option(
         "--policy NAME[:FIELD=VALUE]",
-        f"policy: {', '.join(checks.POLICIES)}, a file of weights, or module:Class",
+        f"policy: {', '.join(checks.POLICY_NAMES)}, a file of weights, or module:Class",
         resolve=checks.check_policy,
-        completions=checks.POLICIES,
+        completions=checks.POLICY_NAMES,
     ),
     Option("--speed M/S", "nominal speed of the policy", float),
     Option(

@@ -7,7 +7,6 @@ from splatpilot.analysis.commands import options as cli
 from splatpilot.analysis.commands.checks import check_kind
 from splatpilot.analysis.commands.flight import WORLD_FIELDS
 from splatpilot.systems.common.extras import import_extra
-from splatpilot.systems.common.files import data_folder, require_existing, scenes_folder
 
 _AXES = "x", "-x", "y", "-y", "z", "-z"
 
@@ -172,30 +171,3 @@ def fidelity(options: argparse.Namespace) -> None:
     from splatpilot.analysis.fidelity import fidelity
 
     cli.call(fidelity.run, options, config=cli.read_config(options))
-
-
-@cli.command(
-    "scene fetch",
-    cli.Option(
-        "names", "hospital, bookstore, ... (default: R13 to R17)", nargs="*", metavar="NAME"
-    ),
-    cli.Option("--data", "folder of captures and meshes (default: $SPLATPILOT_DATA)", Path),
-    cli.out_option("folder of scenes (default: $SPLATPILOT_SCENES, or scenes)", required=False),
-    cli.set_option(
-        *("iterations=3000", "render.spacing=1"),
-        configuration="splatpilot.analysis.scenes:default_config",
-    ),
-    examples=("scene fetch --data data", "scene fetch forest_splat --out scenes"),
-)
-def fetch(options: argparse.Namespace) -> None:
-    """Renders captures of meshes and generated worlds, reconstructs all captures, and writes scene
-    folders for the scenarios. If interrupted, the same command resumes."""
-    data, scenes = options.data or data_folder(), options.out or scenes_folder()
-    if data is not None:
-        require_existing(data, "the folder of captures and meshes")
-    cli.announce(f"making {', '.join(options.names) or 'the scenes of the benchmark'} in {scenes}")
-    from splatpilot.analysis import scenes as recipes
-    from splatpilot.systems.common.progress import resumable
-
-    with resumable(lambda: f"scenes that are finished are in {scenes}; the same command resumes"):
-        cli.call(recipes.run, options, data=data, scenes=scenes)

@@ -7,7 +7,7 @@ from typing import Any
 from splatpilot.analysis.commands import options as cli
 from splatpilot.analysis.commands.checks import (
     LEARN_FROM_CORPORA,
-    TRAINERS,
+    TRAINER_NAMES,
     check_corpora,
     check_scenario,
     check_trainer,
@@ -33,7 +33,7 @@ def _trainer_defaults(options: argparse.Namespace) -> Any:
         nargs="+",
         metavar="POLICY",
         resolve=check_trainer,
-        completions=TRAINERS,
+        completions=TRAINER_NAMES,
     ),
     cli.out_option(
         "folder to write; resumes an interrupted run of the same configuration; several runs have "

@@ -44,6 +44,7 @@ NAMES = {
     "psnr_on_black_db": ("PSNR on black [dB]", "{:.2f}"),
     "ssim": ("SSIM", "{:.4f}"),
     "lpips": ("LPIPS-squeeze", "{:.3f}"),
+    "lpips_vgg": ("LPIPS-VGG", "{:.3f}"),
     "depth_mae_m": ("depth MAE [m]", "{:.3f}"),
     "depth_relative": ("depth error, relative", "{:.2%}"),
     "floater_fraction": ("floaters", "{:.2%}"),
@@ -65,7 +66,9 @@ class SceneMetrics:
     width: int  # [px], of the frames, shrunk as for reconstruction
     height: int
     frames: dict[int, ViewMetrics]  # over pixels that a fitted frame saw, with fitted exposure
-    strict_frames: dict[int, ViewMetrics]  # over all pixels, with a gain of 1
+    strict_width: int  # [px], of the frames as captured
+    strict_height: int
+    strict_frames: dict[int, ViewMetrics]  # over all pixels in that size, with predicted exposure
     lpips_missing: str  # reason for missing LPIPS
     flight_unseen_fraction: float | None  # see `unseen_fraction`
 
@@ -84,6 +87,8 @@ class SceneMetrics:
             "held_out": self.held_out,
             "width": self.width,
             "height": self.height,
+            "strict_width": self.strict_width,
+            "strict_height": self.strict_height,
             "lpips_missing": self.lpips_missing,
             "flight_unseen_fraction": self.flight_unseen_fraction,
             "frames": {str(i): asdict(frame) for i, frame in self.frames.items()},
@@ -95,9 +100,12 @@ class SceneMetrics:
         content = self.as_json()
         lines = [
             f"{'measured on':<22} {len(self.frames)} {kind}, {self.width} x {self.height}",
-            f"{'':<22} {'seen pixels, gain fitted':<26} all pixels, no gain",
+            f"{'':<22} {'seen pixels, gain fitted':<26} strict: all pixels, nothing fitted, "
+            f"{self.strict_width} x {self.strict_height}",
         ]
         for name, (title, form) in NAMES.items():
+            if name == "lpips_vgg" and content[name] is None:
+                continue  # few have its weights
             cell, count = format_metric(content[name], form), content["counts"][name]
             if 0 < count < len(self.frames):
                 cell += f" ({count} of {len(self.frames)} frames)"
@@ -200,21 +208,34 @@ def measure_scene(scene: Path, capture: Capture | None = None) -> SceneMetrics:
     """Measures a scene folder on its held-out frames or, without any, on every eighth frame, and
     writes `metrics.json` and `views.png` into it."""
     views = SceneViews(scene, capture)
-    lpips, missing = None, ""
-    try:
-        lpips = Lpips()
-    except (OSError, ValueError) as error:
-        missing = str(error)
+    lpips, missing = {}, ""
+    for name, backbone in (("lpips_vgg", "vgg"), ("lpips", "squeeze")):
+        try:
+            lpips[name] = Lpips(backbone)
+        except (OSError, ValueError) as error:
+            missing = str(error)
+    if "lpips" in lpips:
+        missing = ""
     fitted = [ThinnedFrame.of(views.frame(i)) for i in views.fitted]
-    frames, strict, size = {}, {}, (0, 0)
+    gains = views.metadata.gains or [1.0] * len(views.capture)
+    frames, strict = {}, {}
     for i in Progress(views.measured, "measuring frames", unit="frame"):
-        frame = views.frame(i)
-        size = frame.depth.shape
+        whole = views.capture.frame(i)
+        frame = shrink(whole, views.factor)
         frames[i] = views.measure(frame, seen=seen_pixels(frame, fitted), lpips=lpips)
-        strict[i] = views.measure(frame, lpips=lpips, fit_gain=False)
-    height, width = size
-    held_out, unseen = bool(views.metadata.held_out), unseen_fraction(scene)
-    metrics = SceneMetrics(held_out, width, height, frames, strict, missing, unseen)
+        strict[i] = views.measure(whole, lpips=lpips, gain=gains[i])
+    width, height = views.capture.width, views.capture.height
+    metrics = SceneMetrics(
+        held_out=bool(views.metadata.held_out),
+        width=width // views.factor,
+        height=height // views.factor,
+        frames=frames,
+        strict_width=width,
+        strict_height=height,
+        strict_frames=strict,
+        lpips_missing=missing,
+        flight_unseen_fraction=unseen_fraction(scene),
+    )
     _write_views(scene / VIEWS, views, metrics)
     with written_atomically(scene / METRICS) as partial:  # last: it marks the scene as measured
         partial.write_text(json.dumps(metrics.as_json(), indent=2))

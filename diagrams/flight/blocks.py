@@ -9,7 +9,7 @@ from pydrake.systems.framework import DiagramBuilder, OutputPort, System
 
 from splatpilot.diagrams.flight.policies import POLICIES
 from splatpilot.diagrams.flight.scenario import Scenario
-from splatpilot.diagrams.flight.sensors import SENSORS, SensorConfig, make_camera
+from splatpilot.diagrams.flight.sensors import SENSORS, SensorConfig, make_onboard_camera
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.esdf_collision import EsdfCollision
 from splatpilot.systems.common.drake import connect
@@ -40,9 +40,9 @@ class Autonomy(NamedTuple):
 
 def make_policy(scenario: Scenario, world: World) -> System:
     """Builds the scenario's policy."""
-    kind = POLICIES.entry_for(scenario.policy)
-    policy = kind.build(scenario.policy, world, scenario)
-    what = f"the result of building the policy {POLICIES.entry_name(kind)!r}"
+    entry = POLICIES.entry_for(scenario.policy)
+    policy = entry.build(scenario.policy, world, scenario)
+    what = f"the result of building the policy {POLICIES.entry_name(entry)!r}"
     require(isinstance(policy, System), what, "a Drake system", type(policy).__name__)
     return policy
 
@@ -131,13 +131,12 @@ def _add_target(
         builder.Connect(hypotheses, selector.GetInputPort("hypotheses"))
         connect(builder, state, selector.GetInputPort("state"))
         return selector.GetOutputPort("waypoint")
-    name = next((name for name in DECISIONS if policy.HasOutputPort(name)), None)
-    if name is None:
-        raise ValueError(
-            f"the policy {type(policy).__name__} has none of the outputs hypotheses, "
-            f"{', '.join(DECISIONS)}; give it one"
-        )
-    return policy.GetOutputPort(name)
+    decisions = [name for name in DECISIONS if policy.HasOutputPort(name)]
+    outputs = [policy.get_output_port(k).get_name() for k in range(policy.num_output_ports())]
+    what = f"an output of the policy {type(policy).__name__}"
+    known = f"one of hypotheses, {', '.join(DECISIONS)}"
+    require(decisions, what, known, ", ".join(outputs))
+    return policy.GetOutputPort(decisions[0])
 
 
 def _connect_controller(
@@ -180,13 +179,11 @@ def ConnectObservation(
         port = system.get_input_port(index)
         if builder.IsConnectedOrExported(port) or port.get_name() == "moving":
             continue
-        if port.get_name() not in observed:
-            raise ValueError(
-                f"nothing gives the input {port.get_name()!r} of the {what} "
-                f"{type(system).__name__}; there are {', '.join(observed)}, and the outputs of "
-                "sensors that the scenario names"
-            )
-        connect(builder, observed[port.get_name()], port)
+        name = port.get_name()
+        described = f"each input of the {what} {type(system).__name__}"
+        known = f"one of {', '.join(observed)}, or an output of the scenario's sensors"
+        require(name in observed, described, known, repr(name))
+        connect(builder, observed[name], port)
 
 
 def ConnectOrExport(
@@ -213,11 +210,9 @@ def require_ports(what: str, system: System, inputs: list[str], outputs: list[st
     """Raises ValueError unless the system, named `what`, has these ports."""
     missing = [name for name in inputs if not system.HasInputPort(name)]
     missing += [name for name in outputs if not system.HasOutputPort(name)]
-    if missing:
-        raise ValueError(
-            f"the {what} {type(system).__name__} has no port {missing[0]!r}; it needs the inputs "
-            f"{inputs} and the outputs {outputs}"
-        )
+    described = f"ports of the {what} {type(system).__name__}"
+    condition = f"the inputs {inputs} and the outputs {outputs}"
+    require(not missing, described, condition, f"no {', '.join(map(repr, missing))}")
 
 
 def decision_period(scenario: Scenario, policy: System) -> float:
@@ -267,12 +262,10 @@ def AddObservation(
     config, noise = policy_camera(scenario, policy), scenario.observation
     frames = FrameTimes.draw(noise, scenario.seed)
     age = frames.age if noise.is_late else 0.0
-    camera = builder.AddNamedSystem("policy_camera", make_camera(config, world, age))
+    camera = builder.AddNamedSystem("policy_camera", make_onboard_camera(config, world, age))
     _connect_start_pose(builder, "policy_camera", camera, config, state, frames)
     if noise.is_late:
-        delayed = builder.AddNamedSystem("delayed_pose", DelayedPose(frames))
-        builder.Connect(state, delayed.GetInputPort("state"))
-        pose = delayed.GetOutputPort("pose")
+        pose = AddDelayedPose(builder, "delayed_pose", state, frames)
     builder.Connect(pose, camera.GetInputPort("body_pose"))
     rendered = {"depth_image_32f" if name == "depth_grid" else name for name in names}
     images = {name: camera.GetOutputPort(name) for name in sorted(rendered)}
@@ -298,6 +291,19 @@ def AddObservation(
     return images
 
 
+def AddDelayedPose(
+    builder: DiagramBuilder,
+    name: str,
+    state: OutputPort,
+    frames: FrameTimes,
+    period: float = 0.02,
+) -> OutputPort:
+    """Adds a `DelayedPose` of a state (13); returns the port of X_WB."""
+    delayed = builder.AddNamedSystem(name, DelayedPose(frames, period))
+    builder.Connect(state, delayed.GetInputPort("state"))
+    return delayed.GetOutputPort("pose")
+
+
 def _connect_start_pose(
     builder: DiagramBuilder,
     name: str,
@@ -310,10 +316,10 @@ def _connect_start_pose(
     if not camera.HasInputPort("start_pose"):
         return
     readout = getattr(config, "readout", 0.0)
-    start = DelayedPose(replace(frames, before=readout), period=min(0.02, readout))
-    builder.AddNamedSystem(f"{name}_start_pose", start)
-    builder.Connect(state, start.GetInputPort("state"))
-    builder.Connect(start.GetOutputPort("pose"), camera.GetInputPort("start_pose"))
+    start = AddDelayedPose(
+        builder, f"{name}_start_pose", state, replace(frames, before=readout), min(0.02, readout)
+    )
+    builder.Connect(start, camera.GetInputPort("start_pose"))
 
 
 def AddSensors(

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 import numpy as np
-from pydrake.geometry import Meshcat, MeshcatParams
+from pydrake.geometry import Meshcat, MeshcatParams, SceneGraph
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import (
     BasicVector,
@@ -24,6 +24,7 @@ from pydrake.systems.sensors import CameraConfig, CameraInfo
 
 from splatpilot.diagrams.flight.blocks import (
     DECISIONS,
+    AddDelayedPose,
     AddMovingBodies,
     AddObservation,
     AddPolicyAndController,
@@ -49,17 +50,18 @@ from splatpilot.diagrams.flight.scenario import (
 )
 from splatpilot.diagrams.worlds.appearance import randomize_appearance
 from splatpilot.diagrams.worlds.moving_spheres import add_moving_spheres
+from splatpilot.diagrams.worlds.splat_world import AddSplatWorld
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.common.drake import connect
 from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.common.validation import require, require_type
 from splatpilot.systems.policies.teleop import Teleop
-from splatpilot.systems.sensing.latency import DelayedPose, FrameTimes
+from splatpilot.systems.sensing.latency import FrameTimes
 from splatpilot.systems.splats.background import Background, mean_color
 from splatpilot.systems.splats.moving_bodies import MovingBodies
 from splatpilot.systems.splats.splat_camera import SplatCamera
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS, QuadrotorPlant
-from splatpilot.systems.vehicle.quadrotor_geometry import quadrotor_gaussians
+from splatpilot.systems.vehicle.quadrotor_geometry import QuadrotorGeometry, quadrotor_gaussians
 from splatpilot.systems.vehicle.state import QuadrotorState
 from splatpilot.systems.visualization.flight_visualizer import DRAWINGS, FlightVisualizer
 from splatpilot.systems.visualization.meshcat_drawing import (
@@ -113,6 +115,7 @@ class FlightParts(NamedTuple):
     controller: System | None
     collision: System
     camera: SplatCamera | None
+    geometry: QuadrotorGeometry | None
     monitor: FlightMonitor
     state: OutputPort  # (13), the true one
     pose: OutputPort  # the true X_WB
@@ -135,6 +138,7 @@ def AddFlight(
     controller: System | None = None,
     estimator: System | None = None,
     camera: bool = True,
+    scene_graph: SceneGraph | None = None,
     others: Sequence[FlightParts] = (),
 ) -> FlightParts:
     """Adds the closed loop of one vehicle to a builder.
@@ -166,6 +170,8 @@ def AddFlight(
             and `body_pose`, the true ones, `command`, `goal`, the policy's images and the outputs
             of sensors.
         camera: adds the scenario's camera.
+        scene_graph: gets the vehicle, see `QuadrotorGeometry`, and the world as the renderer
+            `splats` if it has none of that name, see `AddSplatWorld`.
         others: flights in this builder whose vehicles and this one see and hit each other.
 
     Raises:
@@ -237,10 +243,8 @@ def AddFlight(
         builder.AddNamedSystem("camera", onboard)
         seen_from, delay = pose, scenario.camera.output_delay
         if delay > 0.0:
-            delayed = DelayedPose(FrameTimes.late(delay))
-            builder.AddNamedSystem("camera_delayed_pose", delayed)
-            builder.Connect(state, delayed.GetInputPort("state"))
-            seen_from = delayed.GetOutputPort("pose")
+            frames = FrameTimes.late(delay)
+            seen_from = AddDelayedPose(builder, "camera_delayed_pose", state, frames)
         builder.Connect(seen_from, onboard.GetInputPort("body_pose"))
 
     # End and logs.
@@ -259,6 +263,14 @@ def AddFlight(
     systems = [each for each in builder.GetSystems() if all(each is not old for old in before)]
     for system in systems:
         system.set_name(f"{prefix}{system.get_name()}")
+    geometry = None
+    if scene_graph is not None:
+        if not scene_graph.HasRenderer("splats"):
+            AddSplatWorld(builder, scene_graph, world)
+        geometry = QuadrotorGeometry.AddToBuilder(
+            builder, state, scene_graph, name=f"{prefix}quadrotor"
+        )
+        systems.append(geometry)
     counts = Counter(system.get_name() for system in builder.GetSystems())
     for system, count in counts.items():
         require(count == 1, "names of systems", "different", f"{count} of {system!r}", _RENAME)
@@ -272,6 +284,7 @@ def AddFlight(
         controller=autonomy.controller,
         collision=collision,
         camera=onboard,
+        geometry=geometry,
         monitor=monitor,
         state=state,
         pose=pose,

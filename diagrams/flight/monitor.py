@@ -3,6 +3,7 @@
 import copy
 import enum
 import math
+from collections.abc import Sequence
 from typing import Any, cast
 
 import numpy as np
@@ -48,20 +49,22 @@ class Outcome(enum.StrEnum):
     INTERRUPTED = "interrupted"
 
 
-def _margins(
-    state: np.ndarray, p_WG: np.ndarray, clearance: float, field_state: float, goal_radius: float
-) -> dict[Outcome, float]:
-    """Returns the margin to each outcome, [m] or [-], positive until it is reached, or NaN."""
-    return {
-        Outcome.COLLISION: clearance,
-        Outcome.LEFT_VOLUME: _KNOWN - field_state,
-        Outcome.GOAL: math.dist(p_WG, QuadrotorState.of(state).p_WB) - goal_radius,
-    }
+_ENDS = Outcome.COLLISION, Outcome.LEFT_VOLUME, Outcome.GOAL
 
 
-def _outcome(margins: dict[Outcome, float]) -> Outcome | None:
-    """Returns the outcome of the first margin that is not positive."""
-    return next((outcome for outcome, margin in margins.items() if margin <= 0), None)
+def _end(
+    p_WB: Sequence[float],
+    p_WG: Sequence[float],
+    clearance: float,
+    field_state: float,
+    goal_radius: float,
+) -> tuple[float, Outcome | None]:
+    """Returns the minimum margin to `_ENDS`, [m] or [-], and the first that is not positive."""
+    margins = clearance, _KNOWN - field_state, math.dist(p_WG, p_WB) - goal_radius
+    margin = min(m for m in margins if not math.isnan(m))
+    if margin > 0:
+        return margin, None
+    return margin, next(end for end, m in zip(_ENDS, margins, strict=True) if m <= 0)
 
 
 class FlightMonitor(LeafSystem):
@@ -87,8 +90,8 @@ class FlightMonitor(LeafSystem):
         scenario = sample_scenario(scenario)
         scenario.validate()
         self.scenario, self.world = copy.deepcopy(scenario), world
-        sizes = {"state": 13, "goal": 3, "clearance": 1, "field_state": 1}
-        self._ports = [self.DeclareVectorInputPort(*each) for each in sizes.items()]
+        for name, size in {"state": 13, "goal": 3, "clearance": 1, "field_state": 1}.items():
+            self.DeclareVectorInputPort(name, size)
         self.DeclareAbstractOutputPort(
             "outcome", lambda: Value(""), weak_callback(self._calc_outcome)
         )
@@ -96,10 +99,12 @@ class FlightMonitor(LeafSystem):
         self._end_index = self.DeclareCacheEntry(
             "end", ValueProducer(lambda: Value(object), calc), {self.all_input_ports_ticket()}
         ).cache_index()
+        # Time [s] and margin of the last witness value that was not positive: a hint for `fly`.
+        self.overrun: tuple[float, float] | None = None
         self._witness = self.MakeWitnessFunction(
             "end",
             WitnessFunctionDirection.kPositiveThenNonPositive,
-            weak_callback(self._min_margin),
+            weak_callback(self._margin),
         )
         self.DeclarePerStepPublishEvent(self._check)
         self.DeclarePeriodicPublishEvent(scenario.timeout, scenario.timeout, self._check)
@@ -109,19 +114,31 @@ class FlightMonitor(LeafSystem):
         return [] if context.get_accuracy() is None else [self._witness]
 
     def _calc_end(self, context: Context, end: Any) -> None:
-        state, p_WG, clearance, field_state = (
-            np.asarray(port.Eval(context)) for port in self._ports
+        p_WB, p_WG, clearance, field_state = (
+            self._read(index, context, size) for index, size in enumerate((3, 3, 1, 1))
         )
-        radius = self.scenario.goal_radius
-        margins = _margins(state, p_WG, clearance[0], field_state[0], radius)
-        end.set_value((min(m for m in margins.values() if not math.isnan(m)), _outcome(margins)))
+        end.set_value(_end(p_WB, p_WG, *clearance, *field_state, self.scenario.goal_radius))
+
+    def _read(self, index: int, context: Context, size: int) -> list[float]:
+        """Returns the first numbers at an input port; an array would cost several times as much."""
+        vector = self.EvalVectorInput(context, index)
+        if vector is None:  # Drake raises.
+            self.get_input_port(index).Eval(context)
+        return [vector.GetAtIndex(i) for i in range(size)]
 
     def _eval_end(self, context: Context) -> tuple[float, Outcome | None]:
         """Returns the minimum margin, and the outcome other than a timeout."""
         return cast(Any, self.get_cache_entry(self._end_index).Eval(context))
 
-    def _min_margin(self, context: Context) -> float:
+    def margin(self, context: Context) -> float:
+        """Returns the minimum margin to an outcome other than a timeout, [m] or [-]."""
         return self._eval_end(context)[0]
+
+    def _margin(self, context: Context) -> float:
+        margin = self.margin(context)
+        if margin <= 0:
+            self.overrun = context.get_time(), margin
+        return margin
 
     def outcome(self, context: Context) -> Outcome | None:
         """Returns the outcome at the instant of this system's Context; None during the flight."""
@@ -229,7 +246,8 @@ def flight_outcome(
     state, clearance, field_state = (
         vector_output(diagram, name, context) for name in ("state", "clearance", "field_state")
     )
-    return _outcome(_margins(state, p_WG, clearance[0], field_state[0], goal_radius))
+    p_WB = QuadrotorState.of(state).p_WB
+    return _end(p_WB, p_WG, clearance[0], field_state[0], goal_radius)[1]
 
 
 def has_landed(diagram: Diagram, context: Context) -> bool:

@@ -21,9 +21,7 @@ def random_flights(
     world: World | None = None,
     **systems: str | Callable[[Scenario, World], System],
 ) -> Callable[[RandomGenerator], Simulator]:
-    """
-    Makes simulators of flights with random seeds, and so random starts, observation noise, latency
-    and worlds.
+    """Makes simulators of flights with random seeds: starts, noise, latency and worlds differ.
 
         def clearance(diagram, context):
             return diagram.GetOutputPort("clearance").Eval(context)[0]

@@ -90,8 +90,8 @@ def register_policy(
     require_configuration(config)
     if speed_field == "speed" and "speed" not in {field.name for field in fields(config)}:
         speed_field = ""
-    kind = PolicyEntry(config, build, speed_field)
-    POLICIES.add(name or config.__name__.removesuffix("Config").lower(), kind)
+    entry = PolicyEntry(config, build, speed_field)
+    POLICIES.add(name or config.__name__.removesuffix("Config").lower(), entry)
 
 
 register_policy(
@@ -130,9 +130,9 @@ def policy_named(name: str, speed: float = DEFAULT_SPEED) -> Any:
         name: a registered name, `module:attribute`, or a file of trained weights (.npz).
     """
     weights = name if name.endswith(".npz") else ""
-    kind = POLICIES.find(checkpoint_policy(weights) if weights else name)
-    config = kind.config()
-    if kind.speed_field:
+    entry = POLICIES.find(checkpoint_policy(weights) if weights else name)
+    config = entry.config()
+    if entry.speed_field:
         config = at_speed(config, speed)
     if weights:
         config = replace(config, weights=weights)
@@ -143,11 +143,8 @@ def policy_named(name: str, speed: float = DEFAULT_SPEED) -> Any:
 def at_speed(config: Any, speed: float) -> Any:
     """Changes the nominal speed [m/s] of a policy's configuration."""
     field = POLICIES.entry_for(config).speed_field
-    if not field:
-        raise ValueError(
-            f"the policy {policy_name(config)} flies as fast as it has learned, not at {speed:g} "
-            "m/s; leave the speed out"
-        )
+    what, learned = f"the speed of {policy_name(config)}", "left out, as it has learned one"
+    require(field, what, learned, f"{speed:g} m/s")
     require(0.0 < speed <= MAX_SPEED, "the speed", f"in (0, {MAX_SPEED:g}] m/s", f"{speed:g}")
     return _with_field(config, field, speed)
 

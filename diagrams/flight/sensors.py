@@ -57,7 +57,7 @@ def register_sensor(config: type, build: Callable[[Any, World, Any], System]) ->
     SENSORS.add(config.__name__, SensorEntry(config, build))
 
 
-def make_camera(
+def make_onboard_camera(
     config: OnboardCamera, world: World, latency: float | Callable[[float], float] = 0.0
 ) -> SplatCamera:
     """Makes a camera of the Gaussians of the world; for `latency` see `SplatCamera`."""
@@ -74,7 +74,7 @@ def make_camera(
     )
 
 
-register_sensor(OnboardCamera, lambda config, world, scenario: make_camera(config, world))
+register_sensor(OnboardCamera, lambda config, world, scenario: make_onboard_camera(config, world))
 register_sensor(
     Imu, lambda config, world, scenario: ImuSensor(config, scenario.vehicle, scenario.seed)
 )

@@ -22,7 +22,7 @@ from splatpilot.diagrams.hardware.real_time import MessagePorts, run_in_real_tim
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.common.drake import vector_output
-from splatpilot.systems.common.validation import Config, bounded
+from splatpilot.systems.common.validation import Config, bounded, require
 from splatpilot.systems.messaging import codecs
 from splatpilot.systems.messaging.arrival_triggered import ArrivalTriggered, can_be_triggered
 from splatpilot.systems.messaging.bridge_status import BridgeStatus
@@ -211,12 +211,14 @@ def image_codecs(scenario: Scenario, policy: System) -> list[codecs.Codec]:
 
 def require_messages_for(scenario: Scenario, world: World) -> None:
     """Raises ValueError for sensors and moving obstacles, which have no messages."""
-    if sensors := blocks.onboard_sensors(scenario):
-        raise ValueError(f"there are no messages of the sensors {', '.join(sensors)}; remove them")
-    if world.moving or scenario.moving:
-        raise ValueError(
-            f"there are no messages of the moving obstacles in {world.name}; choose another world"
-        )
+    sensors = blocks.onboard_sensors(scenario)
+    require(not sensors, "sensors", f"left out, {_NO_MESSAGES}", ", ".join(sensors))
+    moving = world.moving or scenario.moving
+    what, condition = f"the world {world.name}", f"without moving obstacles, {_NO_MESSAGES}"
+    require(not moving, what, condition, "some", "choose another world")
+
+
+_NO_MESSAGES = "which have no messages"
 
 
 def run(
@@ -309,7 +311,7 @@ def wait_for_messages(diagram: Diagram, patience: float) -> None:
         while not system.has_message():
             if time.monotonic() > deadline:
                 raise TimeoutError(
-                    f"nothing has come on {system.source} for {patience:g} s; start the "
-                    "vehicle, with the same URL and scenario"
+                    f"the first message on {system.source} must come within {patience:g} s, got "
+                    "none; start the vehicle, with the same URL and scenario"
                 )
             time.sleep(0.001)

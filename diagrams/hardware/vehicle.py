@@ -135,9 +135,10 @@ def _AddVelocityControl(
 
 @locks_folder("out")
 def run(*, scenario: Scenario, config: HardwareConfig, out: Path) -> dict[str, float | str]:
-    """
-    Hovers at the scenario's start and flies by commands until the flight ends; writes the files of
-    `write_flight` and `write_summary` into `out`. Time is counted from the first command.
+    """Hovers at the scenario's start and flies by commands until the flight ends.
+
+    Writes the files of `write_flight` and `write_summary` into `out`. Time begins with the first
+    command.
 
     Returns `Flight.summary()` and `overruns`, of ticks.
     """

@@ -152,7 +152,7 @@ class _Search:
     def __init__(self, world: World, least: float) -> None:
         observations = world.observations
         assert observations is not None and len(observations.view_points)
-        self._name, self._least = world.name, least
+        self._name, self._min_length = world.name, least
         self._views = ObservedViews(world)
         self._part = longest_part(world.esdf, VEHICLE_RADIUS, least=least)
         self._p_WN = self._part.p_WN
@@ -169,7 +169,7 @@ class _Search:
         best = None
         for start in self._starts(limit, np.random.default_rng(0)):
             tree = _Tree(self, start)
-            least = self._least if best is None else np.nextafter(best.length, np.inf)
+            least = self._min_length if best is None else np.nextafter(best.length, np.inf)
             goals = np.flatnonzero((tree.goals >= least) & (tree.unobserved <= limit))
             goals = goals[np.argsort(-tree.lengths[goals], kind="stable")]
             for goal in goals[:: max(len(goals) // _GOALS, 1)]:
@@ -183,7 +183,7 @@ class _Search:
         """Draws a route of at least the desired length [m] within the limit."""
         for start in self._starts(limit, rng):
             tree = _Tree(self, start)
-            longer = tree.goals >= max(desired, self._least)
+            longer = tree.goals >= max(desired, self._min_length)
             for goal in rng.permutation(np.flatnonzero(longer & (tree.unobserved <= limit)))[
                 :_GOALS
             ]:
@@ -208,7 +208,7 @@ class _Search:
 
     def infeasible(self, limit: float) -> InfeasibleFlightError:
         return InfeasibleFlightError(
-            f"the unobserved pixels of a camera along a route of at least {self._least:g} m in "
+            f"the unobserved pixels of a camera along a route of at least {self._min_length:g} m in "
             f"{self._name} must be at most {limit:.0%} on average, but no such route was found; "
             f"the best single view has {self._table.min(initial=1.0):.0%}: capture more of the "
             "scene, or raise max_unobserved"
@@ -241,7 +241,7 @@ class _Tree:
             return_predecessors=True,
         )
         self.start = start
-        self.before = np.where(before < 0, start, before)  # of each node on the way from the start
+        self.before = np.where(before < 0, start, before)  # of each node, towards the start
         self.lengths = np.where(np.isfinite(lengths), lengths, -1.0)  # [m]
         self.goals = np.where(search._open, self.lengths, -1.0)  # [m]
         step = search._p_WN - search._p_WN[self.before]

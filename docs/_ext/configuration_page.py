@@ -54,7 +54,7 @@ GROUPS: list[tuple[str, str, list[type] | Registry]] = [
     (
         "Reconstruction",
         "For `splatpilot reconstruct` and `scene ablate`; for meshes and generated worlds in "
-        "`reconstruct` and `scene fetch`; and for `scene fidelity`.",
+        "`reconstruct` and `library make`; and for `scene fidelity`.",
         [ReconstructConfig, RenderedSceneConfig, FidelityConfig],
     ),
     ("Training", "For `splatpilot train` and `recover`, by policy.", TRAINERS),

@@ -141,8 +141,8 @@ void raster_tile_channels(const RasterInput& in, const Image& image, const Stage
 }
 
 // Seeks the median depth of one block among the staged splats; returns whether a pixel has none.
-SP_INLINE bool seek_block(const StagedTile& staged, int words, int b, const LaneCenters& pixel,
-                          F16& transmittance, F16& median_w) {
+SP_INLINE bool seek_median_of_block(const StagedTile& staged, int words, int b,
+                                    const LaneCenters& pixel, F16& transmittance, F16& median_w) {
   for (int word = 0; word < words; ++word) {
     for (uint64_t bits = staged.touching[b][word]; bits; bits &= bits - 1) {
       const int i = 64 * word + __builtin_ctzll(bits);
@@ -156,7 +156,7 @@ SP_INLINE bool seek_block(const StagedTile& staged, int words, int b, const Lane
 }
 
 // The median depth of one tile alone, bitwise identical to that of `raster_tile_channels`.
-inline void seek_tile(const RasterInput& in, const Image& image, int tile) {
+inline void raster_median_depth(const RasterInput& in, const Image& image, int tile) {
   F16 transmittance[kBlocksPerTile], median_w[kBlocksPerTile];
   StagedTile staged;
   composite_tile(
@@ -169,7 +169,7 @@ inline void seek_tile(const RasterInput& in, const Image& image, int tile) {
         stage(in, true, first, count, left, top, staged);
       },
       [&](int b, size_t, int words, const LaneCenters& pixel) {
-        return seek_block(staged, words, b, pixel, transmittance[b], median_w[b]);
+        return seek_median_of_block(staged, words, b, pixel, transmittance[b], median_w[b]);
       },
       [&](int b, int left, int top) {
         alignas(64) float depth[kLanes];
@@ -182,7 +182,7 @@ inline void seek_tile(const RasterInput& in, const Image& image, int tile) {
 
 inline void raster_tile(const RasterInput& in, const Image& image, const StageWriter* record,
                         int tile) {
-  if (!image.alpha) return seek_tile(in, image, tile);
+  if (!image.alpha) return raster_median_depth(in, image, tile);
   const bool color = image.color, median = image.depth && image.depth_mode == DepthMode::kMedian;
   if (median && color) return raster_tile_channels<true, false, true>(in, image, record, tile);
   if (median) return raster_tile_channels<false, false, true>(in, image, record, tile);

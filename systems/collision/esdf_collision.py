@@ -13,6 +13,7 @@ from pydrake.systems.framework import (
 
 from splatpilot.systems.collision.distance_field import (
     DistanceField,
+    FieldSample,
     in_collision,
     sample_field,
     soft_barrier,
@@ -84,7 +85,7 @@ def EsdfCollision_(T):
             self._arguments = field, radius, beta, margin
             self._field = field
             self._parameters = [ConfigParameter(self, T, params)]
-            self._state_port = self.DeclareVectorInputPort("state", 13)
+            self.DeclareVectorInputPort("state", 13)
             self.DeclareAbstractInputPort("moving", AbstractValue.Make(object()))
             # Drake never frees a system that its own callbacks refer to.
             collision = weakref.proxy(self)
@@ -98,23 +99,24 @@ def EsdfCollision_(T):
             )
             index, tickets = cache.cache_index(), {cache.ticket(), self.all_parameters_ticket()}
 
-            def declare(name, size, value_of):
+            def declare(name, value_of, size=1):
                 def calc(context, output):
                     sample = collision.get_cache_entry(index).Eval(context)
-                    parameters = context.get_numeric_parameter(0)
-                    output.SetFromVector(np.atleast_1d(value_of(sample, parameters)))
+                    value = value_of(sample, context.get_numeric_parameter(0))
+                    # Setting one number costs a fraction of setting an array.
+                    output.SetFromVector(value) if size > 1 else output.SetAtIndex(0, value)
 
                 self.DeclareVectorOutputPort(name, size, calc, prerequisites_of_calc=tickets)
 
             def hit(sample, parameters):
                 return 1.0 * in_collision(sample.distance, parameters[0])
 
-            declare("distance", 1, lambda sample, _: sample.distance)
-            declare("gradient", 3, lambda sample, _: sample.gradient)
-            declare("clearance", 1, lambda sample, each: sample.distance - each[0])
-            declare("in_collision", 1, hit)
-            declare("barrier", 1, lambda sample, each: soft_barrier(sample.distance, *each.value()))
-            declare("field_state", 1, lambda sample, _: float(sample.state))
+            declare("distance", lambda sample, _: sample.distance)
+            declare("gradient", lambda sample, _: sample.gradient, 3)
+            declare("clearance", lambda sample, each: sample.distance - each[0])
+            declare("in_collision", hit)
+            declare("barrier", lambda sample, each: soft_barrier(sample.distance, *each.value()))
+            declare("field_state", lambda sample, _: sample.state)
 
         def get_input_port(self, port_index=0):
             """Returns an input port by its index; `state` by default."""
@@ -125,11 +127,14 @@ def EsdfCollision_(T):
         SetMargin = parameter_setter("margin")
 
         def _sample(self, context: Any, sample: Any) -> None:
-            state = np.asarray(self._state_port.Eval(context))
+            state = self.EvalVectorInput(context, 0)
+            if state is None:  # Drake raises.
+                self.get_input_port().Eval(context)
             moving, field = self.EvalAbstractInput(context, 1), self._field
             if moving is not None and (bodies := moving.get_value()):
                 field = bodies.among(field, bodies.time)
-            sample.set_value(sample_field(field, QuadrotorState.of(state).p_WB))
+            distance, gradient, space = sample_field(field, QuadrotorState.of(state.value()).p_WB)
+            sample.set_value(FieldSample(np.asarray(distance).item(), gradient, float(space)))
 
     return EsdfCollision
 

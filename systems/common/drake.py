@@ -92,7 +92,8 @@ def connect(builder: DiagramBuilder, source: OutputPort, target: InputPort) -> N
     sizes_differ = given[1] != taken[1] and all(map(np.prod, (given[1], taken[1])))
     if kinds[0] != kinds[1] or sizes_differ:
         raise ValueError(
-            f"{_describe(target)} must be of the type and size of its source, {_describe(source)}"
+            f"{_describe(target)} must be of the type and size of its source, got "
+            f"{_describe(source)}"
         )
     builder.Connect(source, target)
 
@@ -212,6 +213,16 @@ def float_values(x: Any) -> Any:
     return np.asarray(_value(x), dtype=float)[()] if is_autodiff(x) else x
 
 
+def declare_input_ports_like(system: Any, other: Any) -> None:
+    """Declares input ports with the names and types of those of another system."""
+    for index in range(other.num_input_ports()):
+        port = other.get_input_port(index)
+        if port.get_data_type() == PortDataType.kVectorValued:
+            system.DeclareVectorInputPort(port.get_name(), port.size())
+        else:
+            system.DeclareAbstractInputPort(port.get_name(), other.AllocateInputAbstract(port))
+
+
 class ByValues(LeafSystem_[AutoDiffXd]):
     """Base class of the conversions of float systems that compute by the values of their inputs."""
 
@@ -220,12 +231,7 @@ class ByValues(LeafSystem_[AutoDiffXd]):
         super().__init__()
         self.set_name(system.get_name())
         self._system = system
-        for index in range(system.num_input_ports()):
-            port = system.get_input_port(index)
-            if port.get_data_type() == PortDataType.kVectorValued:
-                self.DeclareVectorInputPort(port.get_name(), port.size())
-            else:
-                self.DeclareAbstractInputPort(port.get_name(), system.AllocateInputAbstract(port))
+        declare_input_ports_like(self, system)
         # The float Context keeps cached results.
         self._inner = self.DeclareCacheEntry(
             "context of values",

@@ -15,7 +15,7 @@ from pydrake.systems.framework import (
     System,
 )
 
-from splatpilot.systems.common.drake import vector_input
+from splatpilot.systems.common.drake import declare_input_ports_like, vector_input
 
 _log = logging.getLogger(__name__)
 
@@ -63,12 +63,7 @@ class ArrivalTriggered(LeafSystem):
         update = system.GetUniquePeriodicDiscreteUpdateAttribute()
         assert update is not None
         self._period = update.period_sec()
-        for index in range(system.num_input_ports()):
-            port = system.get_input_port(index)
-            if port.get_data_type() == PortDataType.kVectorValued:
-                self.DeclareVectorInputPort(port.get_name(), port.size())
-            else:
-                self.DeclareAbstractInputPort(port.get_name(), port.Allocate())
+        declare_input_ports_like(self, system)
         self.DeclareVectorInputPort("observation_age", 1)
         default = system.CreateDefaultContext()
         for group in range(default.num_discrete_state_groups()):

@@ -122,22 +122,22 @@ def state_observation(R_WB: Any, v_WB: Any, w_WB_B: Any, v_target: Any) -> Any:
 
 
 def plan(
-    network: TrajectoryNetwork, seen: Observation, speed: float, last: Hypotheses | None
+    network: TrajectoryNetwork, observed: Observation, speed: float, last: Hypotheses | None
 ) -> Hypotheses:
     """Computes the hypotheses from depth (H, W) and the nominal speed [m/s].
 
     A cost is the network's collision cost minus `PROGRESS` per meter toward the goal. Among near
     ties the hypothesis that continues the `last` plan gets the lowest cost.
     """
-    image = 1.0 / np.clip(pool_depth(seen.image, *IMAGE_SIZE), MIN_DEPTH, MAX_DEPTH)
-    p_WB, v_WB, _, w_WB_B = seen.state
-    v_target = target_velocity(p_WB, seen.p_WG, speed)
-    state = state_observation(seen.X_WB.rotation().matrix(), v_WB, w_WB_B, v_target)
+    image = 1.0 / np.clip(pool_depth(observed.image, *IMAGE_SIZE), MIN_DEPTH, MAX_DEPTH)
+    p_WB, v_WB, _, w_WB_B = observed.state
+    v_target = target_velocity(p_WB, observed.p_WG, speed)
+    state = state_observation(observed.X_WB.rotation().matrix(), v_WB, w_WB_B, v_target)
     waypoints_B, costs = network(image, state)
     v_target_B = state[-3:]
     progress = waypoints_B[:, -1] @ v_target_B / max(float(np.linalg.norm(v_target_B)), 1e-6)
     costs = costs.astype(float) - PROGRESS * progress
-    new = Hypotheses(seen.time, seen.X_WB, waypoints_B.astype(float), costs)
+    new = Hypotheses(observed.time, observed.X_WB, waypoints_B.astype(float), costs)
     return new if last is None else prefer_continuation(new, last)
 
 
@@ -177,6 +177,6 @@ class AgileAutonomy(Policy):
         self._network = checkpoint.build(TrajectoryNetwork)
         self.declare_state(no_plan(MODES), "hypotheses")
 
-    def decide(self, seen: Observation, *state: np.ndarray) -> list[np.ndarray]:
+    def decide(self, observed: Observation, *state: np.ndarray) -> list[np.ndarray]:
         last = Hypotheses.from_vector(state[0], MODES)
-        return [plan(self._network, seen, self._config.speed, last).to_vector()]
+        return [plan(self._network, observed, self._config.speed, last).to_vector()]

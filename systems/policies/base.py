@@ -116,7 +116,7 @@ class Policy(LeafSystem):
             self.DeclareStateOutputPort(output, group)
             self.state_outputs[output] = group
 
-    def decide(self, seen: Observation, *state: np.ndarray) -> Sequence[np.ndarray]:
+    def decide(self, observed: Observation, *state: np.ndarray) -> Sequence[np.ndarray]:
         """Returns the next values of the groups of `declare_state`, from the present ones."""
         raise NotImplementedError
 
@@ -124,10 +124,10 @@ class Policy(LeafSystem):
         x = np.asarray(self._state_port.Eval(context))
         p_WG = np.asarray(self._goal_port.Eval(context))
         image = self._read_image(context)
-        seen = observation(context.get_time(), x, p_WG, image)
+        observed = observation(context.get_time(), x, p_WG, image)
         old = context.get_discrete_state()
         groups = [np.array(old.value(i)) for i in range(old.num_groups())]
-        for i, value in enumerate(self.decide(seen, *groups)):
+        for i, value in enumerate(self.decide(observed, *groups)):
             discrete_state.set_value(i, value)
 
     def _read_image(self, context: Context) -> np.ndarray:

@@ -55,20 +55,24 @@ class DepthNavConfig(LearnedPolicyConfig):
     )
 
 
-def decide(
-    network: RecurrentNetwork, seen: Observation, speed: float, start_yaw: float, memory: np.ndarray
+def compute_command(
+    network: RecurrentNetwork,
+    observed: Observation,
+    speed: float,
+    start_yaw: float,
+    memory: np.ndarray,
 ) -> tuple[np.ndarray, float, np.ndarray]:
     """Computes a_WB (3,) [m/s^2] without gravity, the heading [rad] and the next hidden state (H,).
 
     From depth (H, W), nominal speed [m/s], yaw of the start frame [rad] and hidden state (H,).
     """
     R_WS = heading_frame(np.array(start_yaw))
-    image = 1.0 / np.clip(pool_depth(seen.image, *IMAGE_SIZE), MIN_DEPTH, MAX_DEPTH)
-    R_SB = RotationMatrix.MakeZRotation(-start_yaw) @ seen.X_WB.rotation()
+    image = 1.0 / np.clip(pool_depth(observed.image, *IMAGE_SIZE), MIN_DEPTH, MAX_DEPTH)
+    R_SB = RotationMatrix.MakeZRotation(-start_yaw) @ observed.X_WB.rotation()
     q_SB = R_SB.ToQuaternion().wxyz()
     q_SB *= np.copysign(1.0, q_SB[0])
-    v_target = target_velocity(seen.X_WB.translation(), seen.p_WG, speed)
-    state = np.concatenate([seen.state.v_WB @ R_WS, q_SB, v_target @ R_WS, [speed]])
+    v_target = target_velocity(observed.X_WB.translation(), observed.p_WG, speed)
+    state = np.concatenate([observed.state.v_WB @ R_WS, q_SB, v_target @ R_WS, [speed]])
     output, memory = network.step(image, state, memory)
     a_WB = R_WS @ limit_smoothly(output[:3], ACCELERATION_LIMITS)
     to_goal = atan2(v_target[1], v_target[0])
@@ -101,10 +105,12 @@ class DepthNav(Policy):
         self.declare_state(self._network.initial_hidden())
         self.declare_state([np.nan])  # yaw of the start frame
 
-    def decide(self, seen: Observation, *state: np.ndarray) -> list[np.ndarray]:
+    def decide(self, observed: Observation, *state: np.ndarray) -> list[np.ndarray]:
         memory, start_yaw = state[2:]
         if np.isnan(start_yaw[0]):
-            start_yaw = np.array([float(seen.state.heading)])
+            start_yaw = np.array([float(observed.state.heading)])
         speed = self._config.speed
-        a_WB, heading, memory = decide(self._network, seen, speed, float(start_yaw[0]), memory)
+        a_WB, heading, memory = compute_command(
+            self._network, observed, speed, float(start_yaw[0]), memory
+        )
         return [a_WB, np.array([heading]), memory, start_yaw]

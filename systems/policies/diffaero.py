@@ -68,24 +68,24 @@ class DiffAeroTofConfig(LearnedPolicyConfig):
     )  # The sensor's range is 5 m; the noise of depths beyond it stays below 6 m.
 
 
-def depth_grid(depth: np.ndarray) -> np.ndarray:
+def encode_depth(depth: np.ndarray) -> np.ndarray:
     """Encodes planar depth (H, W) [m]: the inverse of the minimum in each of the 9x16 cells."""
     return inverse_depth(pool_depth(depth, *IMAGE_SIZE), MIN_DEPTH, MAX_DEPTH)
 
 
-def decide(
+def compute_command(
     network: RecurrentNetwork,
     grid: np.ndarray,
-    seen: Observation,
+    observed: Observation,
     speed: float,
     memory: np.ndarray,
     limits: np.ndarray = ACCELERATION_LIMITS,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Computes the command (3,) in the world and the next hidden state (H,), from `depth_grid` or
+    """Computes the command (3,) in the world and the next hidden state (H,), from `encode_depth` or
     proximities (9, 16), the nominal speed [m/s], the hidden state and the command's limits (3,)."""
-    p_WB, v_WB, _, _ = seen.state
-    R_WH, z_WB = heading_frame(seen.state.heading), seen.X_WB.rotation().matrix()[:, 2]
-    state = heading_observation(p_WB, v_WB, z_WB, seen.p_WG, speed, R_WH)
+    p_WB, v_WB, _, _ = observed.state
+    R_WH, z_WB = heading_frame(observed.state.heading), observed.X_WB.rotation().matrix()[:, 2]
+    state = heading_observation(p_WB, v_WB, z_WB, observed.p_WG, speed, R_WH)
     output, memory = network.step(grid, state, memory)
     return R_WH @ limit_smoothly(output, limits), memory
 
@@ -112,9 +112,9 @@ class DiffAero(Policy):
         self.declare_state(np.zeros(3), "acceleration")
         self.declare_state(self._network.initial_hidden())
 
-    def decide(self, seen: Observation, *state: np.ndarray) -> tuple[np.ndarray, ...]:
-        grid = depth_grid(seen.image)
-        return decide(self._network, grid, seen, self._config.speed, state[1])
+    def decide(self, observed: Observation, *state: np.ndarray) -> tuple[np.ndarray, ...]:
+        grid = encode_depth(observed.image)
+        return compute_command(self._network, grid, observed, self._config.speed, state[1])
 
 
 class DiffAeroTof(Policy):
@@ -139,6 +139,8 @@ class DiffAeroTof(Policy):
         self.declare_state(np.zeros(3), "velocity")
         self.declare_state(self._network.initial_hidden())
 
-    def decide(self, seen: Observation, *state: np.ndarray) -> tuple[np.ndarray, ...]:
+    def decide(self, observed: Observation, *state: np.ndarray) -> tuple[np.ndarray, ...]:
         speed = self._config.speed
-        return decide(self._network, seen.image, seen, speed, state[1], VELOCITY_LIMITS)
+        return compute_command(
+            self._network, observed.image, observed, speed, state[1], VELOCITY_LIMITS
+        )

@@ -13,7 +13,7 @@ from splatpilot.systems.policies.convolutions import (
     convolution_shapes,
     opencv_net,
 )
-from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK, RATE, decide
+from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK, RATE, compute_command
 from splatpilot.systems.policies.observations import heading_frame
 from splatpilot.systems.policies.recurrent_network import NetworkSpec, RecurrentNetwork
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
@@ -176,7 +176,7 @@ class DiffAeroRgb(Policy):
         self.declare_state(np.zeros(3), "acceleration")
         self.declare_state(self._network.policy.initial_hidden())
 
-    def decide(self, seen: Observation, *state: np.ndarray) -> tuple[np.ndarray, ...]:
+    def decide(self, observed: Observation, *state: np.ndarray) -> tuple[np.ndarray, ...]:
         network = self._network
-        grid, _ = network.monocular(encode_view(seen.image, seen.X_WB.rotation().matrix()))
-        return decide(network.policy, grid, seen, self._config.speed, state[1])
+        grid, _ = network.monocular(encode_view(observed.image, observed.X_WB.rotation().matrix()))
+        return compute_command(network.policy, grid, observed, self._config.speed, state[1])

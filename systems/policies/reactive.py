@@ -140,11 +140,11 @@ def candidate_costs(
     v_WB: np.ndarray,
     p_WG: np.ndarray,
     points_W: np.ndarray,
-    seen: np.ndarray,
+    free: np.ndarray,
     config: ReactiveConfig,
 ) -> np.ndarray:
     """Computes the costs (N,) [m] of candidates, see `ReactiveConfig`, by their positions
-    (N, S, 3), velocities (N, 3), the seen points_W (M, 3) and positions `seen` to be free (N, S).
+    (N, S, 3), velocities (N, 3), the seen points_W (M, 3) and whether they are known `free` (N, S).
     """
     distances = np.full(positions.shape[:2], np.inf)
     farthest = np.linalg.norm(positions - p_WB, axis=2).max() + _MAX_DISTANCE
@@ -155,7 +155,7 @@ def candidate_costs(
     steps = np.linalg.norm(np.diff(positions, axis=1, prepend=starts), axis=2)  # (N, S) [m]
     barrier = soft_barrier(distances, VEHICLE_RADIUS, margin=config.barrier_margin)
     contact = np.maximum(VEHICLE_RADIUS + config.margin - distances, 0.0)
-    unseen = ~seen & (np.linalg.norm(positions - p_WB, axis=2) > _FREE_RADIUS)
+    unseen = ~free & (np.linalg.norm(positions - p_WB, axis=2) > _FREE_RADIUS)
     to_goal = p_WG - positions[:, -1]
     along = (
         config.barrier_weight * barrier
@@ -170,24 +170,24 @@ def candidate_costs(
     )
 
 
-def decide(
-    seen: Observation, points_W: np.ndarray, config: ReactiveConfig
+def compute_command(
+    observed: Observation, points_W: np.ndarray, config: ReactiveConfig
 ) -> tuple[np.ndarray, np.ndarray]:
     """Computes a_WB (3,) [m/s^2], gravity excluded, and the points (M, 3) [m] to remember, from
     depth and the points_W of earlier images, whose missing ones are NaN."""
-    depth = seen.image.astype(float)
-    p_WB, v_WB, _, _ = seen.state
-    X_WC = seen.X_WB @ config.camera.mount()
+    depth = observed.image.astype(float)
+    p_WB, v_WB, _, _ = observed.state
+    X_WC = observed.X_WB @ config.camera.mount()
     R_WC, p_WC = X_WC.rotation().matrix(), X_WC.translation()
     points = nearest_points(depth, config) @ R_WC.T + p_WC
     points_W = np.concatenate([points, points_W[: -len(points)]])
     known = points_W[np.isfinite(points_W[:, 0])]
 
-    straight = target_velocity(p_WB, seen.p_WG, config.speed, SLOWING_TIME)
-    velocities = np.vstack([candidate_velocities(seen.p_WG - p_WB, config), straight])
+    straight = target_velocity(p_WB, observed.p_WG, config.speed, SLOWING_TIME)
+    velocities = np.vstack([candidate_velocities(observed.p_WG - p_WB, config), straight])
     positions = responses(p_WB, v_WB, velocities, config.horizon)
     free = is_seen((positions - p_WC) @ R_WC, depth, config.camera)
-    costs = candidate_costs(positions, velocities, p_WB, v_WB, seen.p_WG, known, free, config)
+    costs = candidate_costs(positions, velocities, p_WB, v_WB, observed.p_WG, known, free, config)
     return tracking_acceleration(v_WB, velocities[np.argmin(costs)]), points_W
 
 
@@ -216,6 +216,6 @@ class Reactive(Policy):
         self.declare_state(np.zeros(3), "acceleration")
         self.declare_state(np.full(config.memory * config.rows * config.columns * 3, np.nan))
 
-    def decide(self, seen: Observation, *state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        a_WB, points = decide(seen, state[1].reshape(-1, 3), self._config)
+    def decide(self, observed: Observation, *state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        a_WB, points = compute_command(observed, state[1].reshape(-1, 3), self._config)
         return a_WB, points.ravel()

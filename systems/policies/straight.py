@@ -46,6 +46,8 @@ class Straight(Policy):
         super().__init__(config)
         self.declare_state(np.zeros(3), "acceleration")
 
-    def decide(self, seen: Observation, *state: np.ndarray) -> list[np.ndarray]:
-        v_desired = target_velocity(seen.state.p_WB, seen.p_WG, self._config.speed, SLOWING_TIME)
-        return [tracking_acceleration(seen.state.v_WB, v_desired)]
+    def decide(self, observed: Observation, *state: np.ndarray) -> list[np.ndarray]:
+        v_desired = target_velocity(
+            observed.state.p_WB, observed.p_WG, self._config.speed, SLOWING_TIME
+        )
+        return [tracking_acceleration(observed.state.v_WB, v_desired)]

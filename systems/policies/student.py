@@ -226,16 +226,16 @@ def load_network(path: str, observation: str, speed: float | None = None) -> Stu
     return load_checkpoint(path, observation).build(partial(StudentNetwork, speed=speed))
 
 
-def plan(network: StudentNetwork, seen: Observation) -> Hypotheses:
+def plan(network: StudentNetwork, observed: Observation) -> Hypotheses:
     """Computes the hypotheses from RGB (H, W, 3) uint8 or planar depth (H, W) [m], by
     `network.spec.observation`."""
-    R_WB = seen.X_WB.rotation().matrix()
-    v_B = R_WB.T @ seen.state.v_WB / network.pace
-    goal_B = R_WB.T @ (seen.p_WG - seen.X_WB.translation())
+    R_WB = observed.X_WB.rotation().matrix()
+    v_B = R_WB.T @ observed.state.v_WB / network.pace
+    goal_B = R_WB.T @ (observed.p_WG - observed.X_WB.translation())
     state = encode_state(R_WB[None], v_B[None], goal_B[None], network.reach)[0]
     encode = encode_color if network.spec.pixels == "color" else encode_depth
-    waypoints_B, costs = network(encode(seen.image.astype(np.float32)), state)
-    return Hypotheses(seen.time, seen.X_WB, waypoints_B.astype(float), costs.astype(float))
+    waypoints_B, costs = network(encode(observed.image.astype(np.float32)), state)
+    return Hypotheses(observed.time, observed.X_WB, waypoints_B.astype(float), costs.astype(float))
 
 
 @dataclass
@@ -290,5 +290,5 @@ class Student(Policy):
             require(given == trained, f"camera.{name} of the student", trained, given, remedy)
         self.declare_state(no_plan(HYPOTHESES), "hypotheses")
 
-    def decide(self, seen: Observation, *state: np.ndarray) -> list[np.ndarray]:
-        return [plan(self._network, seen).to_vector()]
+    def decide(self, observed: Observation, *state: np.ndarray) -> list[np.ndarray]:
+        return [plan(self._network, observed).to_vector()]

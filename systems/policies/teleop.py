@@ -68,9 +68,9 @@ class Teleop(Policy):
         for (name, *keys), limit in zip(AXES.values(), self._limits, strict=True):
             add_slider(meshcat, name, (-limit, limit), limit / _STEPS, 0.0, *keys)
 
-    def decide(self, seen: Observation, *state: np.ndarray) -> list[np.ndarray]:
+    def decide(self, observed: Observation, *state: np.ndarray) -> list[np.ndarray]:
         forward, left, up, turn = self._read_controls()
-        heading = state[1][0] if np.isfinite(state[1][0]) else seen.state.heading
+        heading = state[1][0] if np.isfinite(state[1][0]) else observed.state.heading
         heading += turn / self._config.rate
         cos, sin = np.cos(heading), np.sin(heading)
         velocity = np.array([forward * cos - left * sin, forward * sin + left * cos, up])

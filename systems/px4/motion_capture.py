@@ -78,7 +78,7 @@ class MotionCaptureReceiver(Receiver[_Pose]):
                 frame = self._frame(packet)
                 pose = None if frame is None else self._pose(frame)
             except Exception as error:  # natnet raises any type for bytes that are not a frame.
-                raise ValueError(f"it is not a frame of data ({error})") from None
+                raise ValueError(f"the packet must be a NatNet frame, got {error}") from None
             if frame is None:
                 return last
             number = frame.prefix.frame_number
@@ -94,7 +94,7 @@ class MotionCaptureReceiver(Receiver[_Pose]):
         buffer = self._natnet.PacketBuffer(packet)
         kind, size = buffer.read_uint16(), buffer.read_uint16()
         if size != len(packet) - 4:
-            raise ValueError(f"it has {len(packet)} bytes and says {size + 4}")
+            raise ValueError(f"the packet must have {size + 4} bytes, got {len(packet)}")
         if kind != _FRAME_OF_DATA:
             return None
         return self._natnet.DataFrame.read_from_buffer(buffer, self._version)

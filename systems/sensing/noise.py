@@ -120,8 +120,7 @@ def corrupt_depth(
 
 
 def rotate_hue(color: Any, cos: Any, sin: Any) -> Any:
-    """
-    Rotates colors (..., 3), 0 to 255, about gray by an angle: red toward green, green toward blue.
+    """Rotates colors (..., 3), 0 to 255, about gray by an angle, red toward green toward blue.
 
     Rodrigues' formula with the axis k = (1, 1, 1) / sqrt(3).
 
@@ -147,9 +146,9 @@ def expose(color: Any, noise: ObservationNoise, error: Any, photons: Any) -> Any
 
 
 def corrupt_color(color: Any, noise: ObservationNoise, brighter: Any, grain: Any) -> Any:
-    """
-    Changes the brightness of colors (..., 3), 0 to 255, and adds noise; `brighter` u is drawn from
-    U(-1, 1) for each image, `grain` n from N(0, 1), of the colors' shape.
+    """Changes the brightness of colors (..., 3), 0 to 255, and adds noise.
+
+    `brighter` u is drawn from U(-1, 1) for each image, and `grain` n (..., 3) from N(0, 1).
 
         c' = clip(c (1 + brightness_jitter u) + 255 color_noise n)
     """

@@ -103,7 +103,7 @@ def row_bands(
     return list(pairwise(edges))
 
 
-class View(NamedTuple):
+class CameraState(NamedTuple):
     """A camera at one instant."""
 
     camera_info: CameraInfo
@@ -277,72 +277,73 @@ class SplatCamera(LeafSystem):
             X_WB_start: pose at which the first row is read, `readout` earlier.
         """
         time = bodies.time if bodies else 0.0
-        camera = View(
+        camera = CameraState(
             self._camera_info, self._X_BC, X_WB, time - self._age(time), X_WB_start, bodies
         )
         return self._render(camera)
 
-    def _render(self, view: View) -> RenderedView:
+    def _render(self, camera: CameraState) -> RenderedView:
         views = [
-            self._scene.render(*camera, background=self._background, moving=moving, **self._options)
-            for camera, moving in self._bands(view)
+            self._scene.render(*band, background=self._background, moving=moving, **self._options)
+            for band, moving in self._bands(camera)
         ]
         if len(views) == 1:
             return views[0]
         return RenderedView(*map(np.concatenate, zip(*views, strict=True)))
 
-    def _render_depth(self, scene: BakedScene, view: View) -> NDArray[np.float32]:
+    def _render_depth(self, scene: BakedScene, camera: CameraState) -> NDArray[np.float32]:
         depths = [
-            scene.render_depth(*camera, moving=moving, **self._options)
-            for camera, moving in self._bands(view)
+            scene.render_depth(*band, moving=moving, **self._options)
+            for band, moving in self._bands(camera)
         ]
         return depths[0] if len(depths) == 1 else np.concatenate(depths)
 
-    def _bands(self, view: View) -> Iterator[tuple[tuple[Any, ...], PlacedGaussians]]:
+    def _bands(self, camera: CameraState) -> Iterator[tuple[tuple[Any, ...], PlacedGaussians]]:
         """Yields K (3, 3) [px], width, height, X_WC, near and far of each band, and its bodies."""
-        info, X_WC1 = view.camera_info, view.X_WB @ view.X_BC
+        info, X_WC1 = camera.camera_info, camera.X_WB @ camera.X_BC
         K, width, height = info.intrinsic_matrix(), info.width(), info.height()
-        if view.X_WB_start is None:
-            yield (K, width, height, X_WC1, *self._clipping), _placed(view.bodies, view.time)
+        if camera.X_WB_start is None:
+            yield (K, width, height, X_WC1, *self._clipping), _placed(camera.bodies, camera.time)
             return
-        X_WC0, min_count = view.X_WB_start @ view.X_BC, 1 if view.bodies is None else _MIN_BANDS
+        X_WC0 = camera.X_WB_start @ camera.X_BC
+        min_count = 1 if camera.bodies is None else _MIN_BANDS
         focal = float(max(K[0, 0], K[1, 1]))
         for first, last in row_bands(X_WC0, X_WC1, focal, height, min_count):
             s = 0.5 * (first + last) / height  # of the time from the first row to the last
             K_band = K.copy()
             K_band[1, 2] -= first
             X_WC = pose_between(X_WC0, X_WC1, s)
-            placed = _placed(view.bodies, view.time - (1.0 - s) * self._readout)
+            placed = _placed(camera.bodies, camera.time - (1.0 - s) * self._readout)
             yield (K_band, width, last - first, X_WC, *self._clipping), placed
 
     def _age(self, time: float) -> float:
         return self._latency(time) if callable(self._latency) else self._latency
 
-    def _view_now(self, context: Context) -> View:
+    def _camera_state(self, context: Context) -> CameraState:
         names = ["body_pose", "start_pose"] if self._readout > 0.0 else ["body_pose"]
         X_WB, *start = (cast(RigidTransform, self.GetInputPort(n).Eval(context)) for n in names)
         bodies = optional_value(self, "moving", context)
         time = bodies.time - self._age(bodies.time) if bodies else 0.0
         camera = self.camera_info(context), self.X_BC(context)
-        return View(*camera, X_WB, time, start[0] if start else None, bodies)
+        return CameraState(*camera, X_WB, time, start[0] if start else None, bodies)
 
     def _calc_view(self, context, value) -> None:
-        value.set_value(self._render(self._view_now(context)))
+        value.set_value(self._render(self._camera_state(context)))
 
     def _calc_depth(self, context, value) -> None:
         entry = self.get_cache_entry(self._view_index)
         if not entry.is_out_of_date(context):
-            depth = self._view(context).depth
+            depth = self._rendered(context).depth
         else:
-            depth = self._render_depth(self._scene, self._view_now(context))
+            depth = self._render_depth(self._scene, self._camera_state(context))
         value.set_value(ranged_depth(depth, *self._depth_range))
 
-    def _view(self, context) -> RenderedView:
+    def _rendered(self, context) -> RenderedView:
         return cast(RenderedView, self.get_cache_entry(self._view_index).Eval(context))
 
     def _calc_color(self, context, value) -> None:
         pixels = value.get_mutable_value().mutable_data  # (H, W, 4)
-        pixels[..., :3] = color_pixels(self._view(context).color)
+        pixels[..., :3] = color_pixels(self._rendered(context).color)
         pixels[..., 3] = 255
 
     def _depth(self, context) -> np.ndarray:
@@ -356,12 +357,12 @@ class SplatCamera(LeafSystem):
         value.get_mutable_value().mutable_data[..., 0] = millimeters
 
     def _calc_label(self, context, value) -> None:
-        seen, view = self._view(context), self._view_now(context)
-        labels = surface_labels(seen)
-        bodies = view.bodies or Bodies(0.0)
+        rendered, camera = self._rendered(context), self._camera_state(context)
+        labels = surface_labels(rendered)
+        bodies = camera.bodies or Bodies(0.0)
         for label, track in enumerate(bodies.tracks):
-            alone = view._replace(bodies=replace(bodies, obstacles=None, tracks=(track,)))
-            label_body(labels, seen.depth, self._render_depth(empty_scene(), alone), label)
+            alone = camera._replace(bodies=replace(bodies, obstacles=None, tracks=(track,)))
+            label_body(labels, rendered.depth, self._render_depth(empty_scene(), alone), label)
         value.get_mutable_value().mutable_data[..., 0] = labels
 
     def _calc_body_pose(self, context, value) -> None:

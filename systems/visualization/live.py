@@ -20,8 +20,8 @@ from splatpilot.systems.visualization.meshcat_drawing import draw_distance_slice
 RESTART = "restart"
 """Message of the termination that the button for it causes."""
 
-PAUSE, STEP, AGAIN = "pause or resume (space)", "step (n)", "restart (r)"
-RATE, SLICE = "real-time rate", "distances at [m]"
+PAUSE_BUTTON, STEP_BUTTON, RESTART_BUTTON = "pause or resume (space)", "step (n)", "restart (r)"
+RATE_SLIDER, SLICE_SLIDER = "real-time rate", "distances at [m]"
 STEP_TIME = 0.1  # [s] of simulated time
 STIFFNESS = 25.0  # [1/s^2] of the spring between a dragged vehicle and the mouse
 _PUSH = "disturbance"  # [m/s^2] port of vehicles
@@ -119,19 +119,19 @@ class LiveControls:
         radii = dict.fromkeys(self._goals, _HANDLE_RADIUS)
         self._handles = DragHandles(meshcat, radii | dict.fromkeys(self._vehicles, VEHICLE_RADIUS))
         self._grabbed: tuple[str, np.ndarray] | None = None
-        for name, key in ((PAUSE, "Space"), (STEP, "KeyN"), (AGAIN, "KeyR")):
+        for name, key in ((PAUSE_BUTTON, "Space"), (STEP_BUTTON, "KeyN"), (RESTART_BUTTON, "KeyR")):
             meshcat.AddButton(name, key)
-        self._clicks: dict[str, int] = {PAUSE: 0, STEP: 0, AGAIN: 0}
-        add_slider(meshcat, RATE, (0.0, 4.0), 0.25, 1.0)
+        self._clicks: dict[str, int] = {PAUSE_BUTTON: 0, STEP_BUTTON: 0, RESTART_BUTTON: 0}
+        add_slider(meshcat, RATE_SLIDER, (0.0, 4.0), 0.25, 1.0)
         self._rate = 1.0
         if field is not None:
             lower, upper = float(np.asarray(field.lower_W)[2]), float(np.asarray(field.upper_W)[2])
-            add_slider(meshcat, SLICE, (lower, upper), (upper - lower) / 50, lower)
-            self._height = meshcat.GetSliderValue(SLICE)
+            add_slider(meshcat, SLICE_SLIDER, (lower, upper), (upper - lower) / 50, lower)
+            self._height = meshcat.GetSliderValue(SLICE_SLIDER)
         self.paused = False
         self._pause_time = np.inf  # [s] simulated, of the end of a step
         self._last_time = np.inf
-        self._restart(0.0)
+        self._reset_clock(0.0)
 
     def __call__(self, context: Context) -> EventStatus:
         """Waits as long as the viewers want; see `Simulator.set_monitor`."""
@@ -139,13 +139,13 @@ class LiveControls:
         if now < self._last_time:  # the start
             self.wait_for_viewer()
             self._pause_time = np.inf
-            self._restart(now)
+            self._reset_clock(now)
         self._last_time = now
         if now >= self._pause_time - 1e-9:
             self.paused, self._pause_time = True, np.inf
         while True:
             self._apply(context)
-            if self._clicked(AGAIN):
+            if self._clicked(RESTART_BUTTON):
                 return EventStatus.ReachedTermination(self._diagram, RESTART)
             if not self.paused and self._lead(now) <= 0:
                 return EventStatus.DidNothing()
@@ -158,13 +158,13 @@ class LiveControls:
 
     def wait_for_restart(self, stop: Callable[[], bool]) -> bool:
         """Waits for a click on the button to restart; returns False if `stop` returns True."""
-        while not self._clicked(AGAIN):
+        while not self._clicked(RESTART_BUTTON):
             if stop():
                 return False
             time.sleep(_POLL)
         return True
 
-    def _restart(self, now: float) -> None:
+    def _reset_clock(self, now: float) -> None:
         self._wall_start, self._sim_start = time.perf_counter(), now
 
     def _lead(self, now: float) -> float:
@@ -174,7 +174,7 @@ class LiveControls:
         flown = (now - self._sim_start) / self._rate
         lead = flown - (time.perf_counter() - self._wall_start)
         if lead < -_MAX_DELAY:
-            self._restart(now)
+            self._reset_clock(now)
         return lead
 
     def _clicked(self, button: str) -> bool:
@@ -185,23 +185,26 @@ class LiveControls:
     def _apply(self, context: Context) -> None:
         """Applies the controls to the simulation at its present time."""
         now = context.get_time()
-        if self._clicked(PAUSE):
+        if self._clicked(PAUSE_BUTTON):
             self.paused = not self.paused
-            self._restart(now)
-        if self._clicked(STEP):
+            self._reset_clock(now)
+        if self._clicked(STEP_BUTTON):
             self.paused, self._pause_time = False, now + STEP_TIME
-            self._restart(now)
-        rate = self._meshcat.GetSliderValue(RATE)
+            self._reset_clock(now)
+        rate = self._meshcat.GetSliderValue(RATE_SLIDER)
         if rate != self._rate:
             self._rate = rate
-            self._restart(now)
+            self._reset_clock(now)
         self._draw_slice()
         self._drag(context)
 
     def _draw_slice(self) -> None:
-        if self._field is None or self._meshcat.GetSliderValue(SLICE) == self._height:
+        if self._field is None or self._meshcat.GetSliderValue(SLICE_SLIDER) == self._height:
             return
-        self._height, path = self._meshcat.GetSliderValue(SLICE), "/splatpilot/distance_slice"
+        self._height, path = (
+            self._meshcat.GetSliderValue(SLICE_SLIDER),
+            "/splatpilot/distance_slice",
+        )
         shown = self._height > float(np.asarray(self._field.lower_W)[2])
         if shown:
             draw_distance_slice(self._meshcat, path, self._field, self._height)

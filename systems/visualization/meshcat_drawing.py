@@ -278,7 +278,9 @@ class CameraVisualizer(LeafSystem):
         draw_points(self._meshcat, f"{self._path}/depth", p_CQ, rgb[rows, columns] / 255, 0.03)
 
 
-_JPEG = [cv2.IMWRITE_JPEG_QUALITY, 80]
+def encode_jpeg(rgb: np.ndarray) -> bytes:
+    """Encodes an image (H, W, 3) as a JPEG file."""
+    return cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 80])[1].tobytes()
 
 
 def send_picture(meshcat: Meshcat, path: str, rgb: np.ndarray) -> None:
@@ -287,7 +289,7 @@ def send_picture(meshcat: Meshcat, path: str, rgb: np.ndarray) -> None:
     Meshcat's properties are numbers: the first is the size of the JPEG file [bytes], and each
     other holds six of its bytes, the lowest first.
     """
-    data = cv2.imencode(".jpg", rgb[..., ::-1], _JPEG)[1].tobytes()
+    data = encode_jpeg(rgb)
     padded = np.frombuffer(data + bytes(-len(data) % 6), np.uint8).reshape(-1, 6)
     numbers = padded @ (256.0 ** np.arange(6))
     meshcat.SetProperty(path, "jpeg", [float(len(data)), *numbers.tolist()])
@@ -300,7 +302,7 @@ def picture_gltf(rgb: np.ndarray, corners: np.ndarray) -> str:
         rgb: (H, W, 3) uint8.
         corners: (4, 3) [m], top left, top right, bottom right and bottom left.
     """
-    _, jpeg = cv2.imencode(".jpg", rgb[..., ::-1], _JPEG)
+    jpeg = encode_jpeg(rgb)
     document = {
         "asset": {"version": "2.0"},
         "scene": 0,
@@ -315,7 +317,7 @@ def picture_gltf(rgb: np.ndarray, corners: np.ndarray) -> str:
         ],
         "extensionsUsed": ["KHR_materials_unlit"],
         "textures": [{"source": 0}],
-        "images": [{"uri": data_uri("image/jpeg", jpeg.tobytes())}],
+        "images": [{"uri": data_uri("image/jpeg", jpeg)}],
     }
     uv, triangles = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]), np.array([[0, 1, 2], [0, 2, 3]])
     primitive = add_primitive(document, corners, uv, triangles)

@@ -10,7 +10,6 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.geometry import Meshcat
@@ -25,7 +24,11 @@ from splatpilot.systems.policies.hypotheses import Hypotheses, num_hypotheses_in
 from splatpilot.systems.splats.background import Background, EnvironmentMap
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.vehicle.state import QuadrotorState
-from splatpilot.systems.visualization.meshcat_drawing import UNKNOWN_GRAY, distance_colors
+from splatpilot.systems.visualization.meshcat_drawing import (
+    UNKNOWN_GRAY,
+    distance_colors,
+    encode_jpeg,
+)
 from splatpilot.systems.visualization.video import colorize_depth
 
 _COVARIANCE_SCALE = 256.0
@@ -49,9 +52,6 @@ def pack_gaussians(scene: GaussianScene) -> NDArray[np.uint32]:
     halves = covariances[(slice(None), *np.triu_indices(3))]
     words[:, 4:7] = np.ascontiguousarray(halves, np.float16).view(np.uint32)
     return words
-
-
-_JPEG = [cv2.IMWRITE_JPEG_QUALITY, 80]
 
 
 _VIEWPORT = '<meta name="viewport" content="width=device-width, initial-scale=1">'
@@ -125,7 +125,7 @@ def rounded(values: NDArray[np.floating]) -> list:
 
 def jpeg(image: NDArray[np.uint8]) -> str:
     """Encodes an image (H, W, 3), BGR, for a page."""
-    return base64.b64encode(cv2.imencode(".jpg", image, _JPEG)[1].tobytes()).decode()
+    return base64.b64encode(encode_jpeg(image[..., ::-1])).decode()
 
 
 def _source(name: str) -> str:

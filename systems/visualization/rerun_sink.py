@@ -1,6 +1,7 @@
 """RerunSink: records a flight for the viewer Rerun."""
 
 from collections.abc import Callable, Mapping
+from importlib import import_module
 from pathlib import Path
 from typing import Any, cast
 
@@ -31,6 +32,16 @@ from splatpilot.systems.visualization.flight_visualizer import hypothesis_colors
 _JPEG_QUALITY = 80
 _TOO_FAR = np.iinfo(np.uint16).max  # of Drake's images of depth [mm]
 _CAMERA = "world/vehicle/camera"
+# The curves, and the names of their components
+_CURVES = {
+    "clearance": ("clearance [m]",),
+    "command/thrust": ("thrust [m/s^2]",),
+    "command/rates": ("x [rad/s]", "y [rad/s]", "z [rad/s]"),
+    "state/p_WB": ("x [m]", "y [m]", "z [m]"),
+    "state/v_WB": ("x [m/s]", "y [m/s]", "z [m/s]"),
+    "state/q_WB": ("w", "x", "y", "z"),
+    "state/w_WB_B": ("x [rad/s]", "y [rad/s]", "z [rad/s]"),
+}
 
 
 class RerunSink(LeafSystem):
@@ -88,7 +99,12 @@ class RerunSink(LeafSystem):
             goals = self._rr.Points3D([goal], radii=0.3, colors=[0, 200, 80])
             self._statics.append(("world/goal", goals))
         radii = [[VEHICLE_RADIUS, VEHICLE_RADIUS, 0.3 * VEHICLE_RADIUS]]
-        self._statics.append(("world/vehicle", self._rr.Ellipsoids3D(half_sizes=radii)))
+        vehicle = self._rr.Ellipsoids3D(
+            half_sizes=radii, colors=[255, 120, 0], fill_mode="solid", labels="vehicle"
+        )
+        self._statics.append(("world/vehicle", vehicle))
+        for curve, names in _CURVES.items():
+            self._statics.append((curve, self._rr.SeriesLines(names=names)))
         self.DeclareInitializationPublishEvent(self._begin)
         self.DeclarePeriodicPublishEvent(period, 0.0, self._publish)
         self.DeclareForcedPublishEvent(self._publish)
@@ -138,10 +154,30 @@ class RerunSink(LeafSystem):
         self.close()
         self._outcome = None
         self._recording = self._rr.RecordingStream("splatpilot", recording_id="flight")
-        self._recording.save(self._path)
+        self._recording.save(self._path, default_blueprint=self._layout())
         for path, value in self._statics:
             self._recording.log(path, value, static=True)
         return EventStatus.Succeeded()
+
+    def _layout(self) -> Any:
+        """Lays out the views: the world around the vehicle, its images, and the curves."""
+        views = import_module("rerun.blueprint")
+        eye = views.EyeControls3D(tracking_entity="world/vehicle")
+        world = views.Spatial3DView(origin="world", name="World", eye_controls=eye)
+        images = views.Horizontal(
+            views.Spatial2DView(origin=_CAMERA, contents=f"{_CAMERA}/color", name="Color"),
+            views.Spatial2DView(origin=_CAMERA, contents=f"{_CAMERA}/depth", name="Depth"),
+        )
+        curves = [views.TimeSeriesView(origin=curve, name=curve) for curve in _CURVES]
+        return views.Blueprint(
+            views.Horizontal(
+                views.Vertical(world, views.TextLogView(origin="events"), row_shares=[5, 1]),
+                views.Vertical(images, views.Grid(*curves, grid_columns=2), row_shares=[2, 3]),
+                column_shares=[5, 4],
+            ),
+            views.TimePanel(timeline="time"),
+            collapse_panels=True,
+        )
 
     def _publish(self, context: Context) -> EventStatus:
         if self._recording is None:

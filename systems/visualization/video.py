@@ -19,8 +19,7 @@ from splatpilot.systems.splats.splat_camera import SplatCamera
 
 
 class VideoRecorder(LeafSystem):
-    """
-    Records color and depth images at a fixed rate; `frames` reads them, and `save` writes a video.
+    """Records color and depth images at a fixed rate; `frames` reads, `save` writes a video.
 
     .. pydrake_system::
 

@@ -11,6 +11,8 @@ from pydrake.math import RigidTransform
 
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.scenarios import benchmark_scenarios
+from splatpilot.diagrams.worlds.mesh import check_mesh, mesh_digests, mesh_distance
+from splatpilot.diagrams.worlds.mesh_renderer import MeshRenderer
 from splatpilot.diagrams.worlds.splits import check_split, choose_split, part_digests, source_digest
 from splatpilot.diagrams.worlds.world_gltf import write_gltf
 from splatpilot.diagrams.worlds.world_registry import WorldConfig, is_procedural, make_spec
@@ -33,12 +35,6 @@ from splatpilot.training.captures.camera_path import (
 )
 from splatpilot.training.captures.capture import CaptureFrame, pinhole
 from splatpilot.training.captures.frames import pose_row
-from splatpilot.training.captures.mesh_renderer import (
-    MeshRenderer,
-    check_mesh,
-    mesh_digests,
-    mesh_distance,
-)
 from splatpilot.training.captures.tartanair import AXES
 
 
@@ -63,6 +59,7 @@ class RenderConfig(Config):
     # the poses that are free there.
     offsets: list[float] = bounded(list, "(-inf, inf) m")
     up: str = bounded("y", "{y, z}")  # axis of the file that points up: y, as glTF says, or z
+    scale: float = bounded(1.0, "(0, inf) m")  # unit of the mesh
     # Color of the background; red, green, blue in 0 to 1.
     background: list[float] = bounded(lambda: [0.6, 0.75, 0.9], "[0, 1]")
     voxel_size: float = bounded(0.1, "[0.01, inf) m")  # of the grid in which the path is planned
@@ -79,7 +76,7 @@ class RenderConfig(Config):
 
 
 RECIPE = "world.yaml"
-_VERSION = 2  # of the drawing of meshes
+_VERSION = 3  # of the drawing of meshes
 
 
 @dataclass
@@ -152,7 +149,7 @@ def _render(world: Path, out: Path, partial: Path, config: RenderConfig, seed: i
             f"{partial}: holds a part of another capture; remove it, or repeat that command"
         )
     if spec is None:
-        esdf = mesh_distance(world, config.up, config.voxel_size)
+        esdf = mesh_distance(world, config.up, config.voxel_size, config.scale)
     else:
         esdf = esdf_from_distance_field(spec.distance_field, config.voxel_size)
     X_WCs = _poses(esdf, config)
@@ -188,10 +185,10 @@ def true_camera(capture: Path) -> Callable[[RigidTransform], CaptureFrame] | Non
 
 def _camera(mesh: Path, config: RenderConfig) -> Callable[[RigidTransform], CaptureFrame]:
     """Returns a function that renders a mesh with a camera as TartanAir's, 90 degrees wide."""
-    renderer = MeshRenderer(mesh, config.up, config.background)
+    renderer = MeshRenderer(mesh, config.up, config.background, config.scale)
     width, height = config.width, config.height
     K = pinhole(width / 2, width / 2, width / 2, height / 2)
-    return lambda X_WC: renderer.frame(X_WC, K, width, height)
+    return lambda X_WC: CaptureFrame(*renderer.render(X_WC, K, width, height), X_WC, K)
 
 
 def rendered_world(capture: Path) -> RenderedWorld | None:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from pydrake.math import RollPitchYaw
 
-from splatpilot.diagrams.flight.sensors import make_camera
+from splatpilot.diagrams.flight.sensors import make_onboard_camera
 from splatpilot.diagrams.worlds.appearance import draw_appearance, with_appearance
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import make_world
@@ -72,7 +72,10 @@ def render_samples(
     if not demonstrations:
         return samples
     appearance = draw_appearance(rng, config.appearance)
-    camera, optics = make_camera(config.camera, with_appearance(world, appearance)), config.camera
+    camera, optics = (
+        make_onboard_camera(config.camera, with_appearance(world, appearance)),
+        config.camera,
+    )
     row = 0
     for state, waypoints_W in demonstrations:
         p_WB, v_WB, _, _ = QuadrotorState.of(state)

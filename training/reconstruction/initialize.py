@@ -20,10 +20,10 @@ from splatpilot.training.captures.capture import Capture, CaptureFrame, SfmPoint
 from splatpilot.training.captures.colmap import import_pycolmap
 from splatpilot.training.reconstruction.config import HOLD_OUT, ReconstructConfig
 from splatpilot.training.reconstruction.photometry import (
-    STRIDE,
     Photometry,
     ThinnedFrame,
     find_new_pixels,
+    widen,
 )
 
 MAX_STEPS = 7000
@@ -286,7 +286,7 @@ def gaussians_from_depth(
             height, width = frame.depth.shape
             factor = photometry.factor(k, height, width)
             image = (frame.image / (255 * factor[..., None])).astype(np.float32)
-            mask = new[k].repeat(STRIDE, axis=0).repeat(STRIDE, axis=1)[:height, :width]
+            mask = widen(new[k], views[k].stride, height, width)
             parts[k] = frame_gaussians(
                 frame, image, mask, contrast, max_cell, max_extent, underlay=not optimized
             )

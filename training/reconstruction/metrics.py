@@ -1,6 +1,6 @@
 """Metrics of rendered views against captured frames: color, depth, floaters and holes."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,6 +31,7 @@ class ViewMetrics:
     psnr_on_black_db: float | None  # [dB], before black, except in the sky
     ssim: float | None
     lpips: float | None  # LPIPS-squeeze; None without its weights, too
+    lpips_vgg: float | None  # likewise
     depth_mae_m: float | None  # [m]
     depth_relative: float | None
     floater_fraction: float | None
@@ -124,16 +125,17 @@ def fit_exposure(
     truth: NDArray,
     vignetting: float,
     seen: NDArray[np.bool_],
-    fit_gain: bool = True,
+    gain: float | None = None,
 ) -> tuple[NDArray, float]:
     """Returns a rendered image (H, W, 3) with vignetting and exposure of the camera, and its gain.
-    The gain is the least-squares fit to the true image over the pixels `seen` (H, W): that of a
-    held-out frame is unknown, and does not depend on the scene. Without `fit_gain` it is 1."""
+    Without a `gain`, it is the least-squares fit to the true image over the pixels `seen` (H, W),
+    because the exposure of a held-out frame does not depend on the scene."""
     height, width = color.shape[:2]
     image = np.clip(color, 0, None) * vignette(vignetting, width, height)[..., None]
-    gain, x, y = 1.0, image[seen], truth[seen]
-    if fit_gain and (energy := float((x * x).sum())) > 0:
-        gain = float((x * y).sum()) / energy
+    if gain is None:
+        x, y = image[seen], truth[seen]
+        energy = float((x * x).sum())
+        gain = float((x * y).sum()) / energy if energy > 0 else 1.0
     return np.clip(gain * image, 0, 1), gain
 
 
@@ -143,30 +145,30 @@ def measure_view(
     frame: CaptureFrame,
     vignetting: float = 0.0,
     seen: NDArray[np.bool_] | None = None,
-    lpips: Lpips | None = None,
+    lpips: Mapping[str, Lpips] | None = None,
     *,
-    fit_gain: bool = True,
+    gain: float | None = None,
 ) -> ViewMetrics:
     """Compares a view that is rendered before black with the frame of its camera: colors after
     `fit_exposure`, by default over all pixels, else over those `seen` (H, W). The windows of SSIM
-    and LPIPS reach over others. Without `lpips` that is left out."""
+    and LPIPS reach over others. `lpips` are the networks of `lpips` and `lpips_vgg`, if any."""
     truth, sky = frame.image / 255, frame.depth >= FAR
     seen = frame.valid if seen is None else seen & frame.valid
-    camera = truth, vignetting, seen, fit_gain
+    camera = truth, vignetting, seen, gain
     view = put_behind(on_black, background, frame.K, frame.X_WC)
     exposed, gain = fit_exposure(view.color, *camera)
     before_black = np.where(sky[..., None], view.color, on_black.color)
     exposed_before_black, _ = fit_exposure(before_black, *camera)
-    distance = None
-    if lpips is not None and seen.any():
+    distances = dict.fromkeys(("lpips", "lpips_vgg"))
+    if seen.any():
+        tensors = [torch.from_numpy(x.astype(np.float32)) for x in (exposed, truth, seen)]
         with torch.no_grad():
-            tensors = (torch.from_numpy(x.astype(np.float32)) for x in (exposed, truth, seen))
-            distance = lpips(*tensors).item()
+            distances |= {name: f(*tensors).item() for name, f in (lpips or {}).items()}
     return ViewMetrics(
         psnr_db=psnr_db(exposed[seen], truth[seen]),
         psnr_on_black_db=psnr_db(exposed_before_black[seen], truth[seen]),
         ssim=ssim(exposed, truth, seen),
-        lpips=distance,
+        **distances,
         **depth_metrics(view.depth, np.where(seen, frame.depth, 0)),
         unseen_fraction=float(1 - seen.mean()),
         gain=gain,

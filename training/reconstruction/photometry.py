@@ -15,9 +15,7 @@ from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.splats.background import FAR
 from splatpilot.training.captures.capture import CaptureFrame, back_project, project_points
 
-STRIDE = 2
-"""Thinned frames keep every second pixel along each axis."""
-
+_THINNED_WIDTH = 160  # [px], about that of thinned frames
 _DEPTH_TOLERANCE = 0.01  # relative, of depth on the same surface, without its slope
 _COARSER = 1.5  # size of pixels that count as finest, relative to the finest
 _SAMPLES_PER_PAIR = 100
@@ -37,10 +35,21 @@ def vignette(vignetting: float, width: int, height: int) -> NDArray[np.float64]:
     return np.exp(vignetting * radius_squared(width, height))
 
 
+def thinning(width: int) -> int:
+    """Returns the stride of a thinned frame: it keeps one in so many pixels along each axis."""
+    return max(2, round(width / _THINNED_WIDTH))
+
+
+def widen(pixels: NDArray, stride: int, height: int, width: int) -> NDArray:
+    """Returns pixels (h, w) of a thinned frame in the size (height, width) of the frame."""
+    return pixels.repeat(stride, axis=0).repeat(stride, axis=1)[:height, :width]
+
+
 @dataclass(frozen=True, eq=False)
 class ThinnedFrame:
-    """A frame for comparison with others; (h, w) = (H, W) / `STRIDE`."""
+    """A frame for comparison with others; (h, w) = (H, W) / `stride`."""
 
+    stride: int
     X_WC: RigidTransform
     K: NDArray[np.float64]  # (3, 3) [px], of the whole frame
     depth: NDArray[np.floating]  # (h, w) [m]; 0 if unknown or sky
@@ -51,8 +60,9 @@ class ThinnedFrame:
 
     @classmethod
     def of(cls, frame: CaptureFrame) -> "ThinnedFrame":
-        thin = (slice(None, None, STRIDE), slice(None, None, STRIDE))
         height, width = frame.depth.shape
+        stride = thinning(width)
+        thin = (slice(None, None, stride), slice(None, None, stride))
         depth = np.where(frame.depth < FAR, frame.depth, 0).astype(np.float32)
         w = np.divide(1, depth, out=np.zeros_like(depth), where=depth > 0)
         w_v, w_u = (_smaller_difference(w, axis)[thin] for axis in (0, 1))
@@ -62,10 +72,11 @@ class ThinnedFrame:
         slope = depth * np.hypot(w_u, w_v)  # relative change of depth per pixel
         f = frame.K[0, 0]
         return cls(
+            stride=stride,
             X_WC=frame.X_WC,
             K=frame.K,
             depth=depth,
-            tolerance=depth * (_DEPTH_TOLERANCE + np.minimum(STRIDE * slope, 0.1)),
+            tolerance=depth * (_DEPTH_TOLERANCE + np.minimum(stride * slope, 0.1)),
             pixel_size=depth / f * np.minimum(np.hypot(1, f * slope), 10),
             luminance=frame.image[thin].mean(-1) / 255,
             radius_squared=radius_squared(width, height)[thin].astype(np.float32),
@@ -73,12 +84,12 @@ class ThinnedFrame:
 
     def points(self, step: int = 1) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
         """Returns the points p_WQ (3, n) of every `step`-th pixel and the flat index of each."""
-        h, w = self.depth.shape
+        (h, w), s = self.depth.shape, self.stride
         rows, columns = np.mgrid[0:h:step, 0:w:step]
         index = (rows * w + columns).ravel()
         index = index[self.depth.flat[index] > 0]
         z = self.depth.flat[index].astype(np.float64)
-        p_CQ = back_project(self.K, index % w * STRIDE + 0.5, index // w * STRIDE + 0.5, z)
+        p_CQ = back_project(self.K, index % w * s + 0.5, index // w * s + 0.5, z)
         return self.X_WC.multiply(p_CQ.T), index
 
     def find(self, p_WQ: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -86,11 +97,31 @@ class ThinnedFrame:
         pixel of each."""
         h, w = self.depth.shape
         p_CQ = self.X_WC.inverse().multiply(p_WQ).T
-        K = self.K / [[STRIDE], [STRIDE], [1]]
+        K = self.K / [[self.stride], [self.stride], [1]]
         inside, rows, columns = project_points(K, p_CQ, w, h)
         number, index = np.flatnonzero(inside), rows * w + columns
         same = np.abs(self.depth.flat[index] - p_CQ[number, 2]) < self.tolerance.flat[index]
         return number[same], index[same]
+
+
+def find_overlaps(views: Sequence[ThinnedFrame]) -> list[list[int]]:
+    """Returns, for each view, the indices of the views that see some of its points, itself among
+    them if it has any."""
+    X_CWs = np.stack([view.X_WC.inverse().GetAsMatrix34() for view in views]).astype(np.float32)
+    KX_CWs = np.stack([view.K for view in views]).astype(np.float32) @ X_CWs  # (n, 3, 4)
+    sizes = [
+        (view.stride * view.depth.shape[1], view.stride * view.depth.shape[0]) for view in views
+    ]
+    limit = np.array(sizes, np.float32)[..., None] + 1  # (n, 2, 1) [px], with a margin
+    overlaps = []
+    for view in views:
+        p_WQ, _ = view.points(step=8)
+        projected = KX_CWs @ np.concatenate([p_WQ, np.ones((1, p_WQ.shape[1]))]).astype(np.float32)
+        z = projected[:, 2:]  # (n, 1, m)
+        inside = (projected[:, :2] >= -z) & (projected[:, :2] <= limit * z)  # with a margin of 1 px
+        possible = np.flatnonzero((inside.all(axis=1) & (z[:, 0] > 0)).any(axis=1))
+        overlaps.append([j for j in possible.tolist() if len(views[j].find(p_WQ)[0])])
+    return overlaps
 
 
 def find_new_pixels(
@@ -99,15 +130,10 @@ def find_new_pixels(
     """Finds, for each view, the pixels (h, w) to keep so that every point is kept about once. Keeps
     pixels that are nearly the finest of their point, in the first view that has them. Views are
     visited from the closest to the farthest, those with an index in `last` after the others."""
-    points = [view.points() for view in views]
-    overlapping = []  # views that see some points
-    for view in views:
-        p_WQ, _ = view.points(step=8)
-        overlapping.append([j for j, other in enumerate(views) if len(other.find(p_WQ)[0])])
-
+    overlapping = find_overlaps(views)
     fine = []  # pixels that are nearly the finest
     for i, view in enumerate(Progress(views, "comparing frames", unit="frame")):
-        p_WQ, pixel = points[i]
+        p_WQ, pixel = view.points()
         finest = np.full(view.depth.size, np.inf, dtype=np.float32)
         for j in overlapping[i]:
             number, shown = views[j].find(p_WQ)
@@ -121,7 +147,7 @@ def find_new_pixels(
     new: dict[int, NDArray[np.bool_]] = {}
     for i in Progress(order, "choosing frames", unit="frame"):
         view = views[i]
-        p_WQ, pixel = points[i]
+        p_WQ, pixel = view.points()
         covered = np.zeros(view.depth.size, dtype=bool)
         for j in overlapping[i]:
             if j in new:
@@ -148,7 +174,7 @@ def seen_pixels(frame: CaptureFrame, views: Sequence[ThinnedFrame]) -> NDArray[n
     image = seen.reshape(own.depth.shape).astype(np.uint8)
     image = cv2.morphologyEx(image, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     height, width = frame.depth.shape
-    return image.repeat(STRIDE, axis=0).repeat(STRIDE, axis=1)[:height, :width] > 0
+    return widen(image, own.stride, height, width) > 0
 
 
 def _smaller_difference(values: NDArray, axis: int) -> NDArray:
@@ -182,11 +208,12 @@ def estimate_photometry(views: Sequence[ThinnedFrame], seed: int) -> Photometry:
     rng = np.random.default_rng(seed)
     n = len(views)
     samples = []
-    for i, view in enumerate(views):
+    for i, (view, overlapping) in enumerate(zip(views, find_overlaps(views), strict=True)):
         p_WQ, pixel_i = view.points(step=4)
-        for j, other in enumerate(views):
+        for j in overlapping:
             if i == j:
                 continue
+            other = views[j]
             index, pixel_j = other.find(p_WQ)
             I_i, I_j = view.luminance.flat[pixel_i[index]], other.luminance.flat[pixel_j]
             low, high = _BRIGHTNESS
@@ -215,6 +242,25 @@ def estimate_photometry(views: Sequence[ThinnedFrame], seed: int) -> Photometry:
         weights = 1 / np.sqrt(np.maximum(np.abs(b - A @ x), 0.01))
     log_gains = x[:n] - x[:n].mean()
     return Photometry(np.exp(log_gains), float(min(x[n], 0)))
+
+
+def predict_gains(
+    fitted: Sequence[int], gains: NDArray[np.float64], others: Sequence[int]
+) -> NDArray[np.float64]:
+    """Predicts the gains of the frames `others` (m,) from those of the `fitted` frames (n,), both
+    numbered in order of time.
+
+    Interpolates logarithms between neighbors and shrinks them by the factor, from 0 to 1, that
+    predicts fitted gains best from their own neighbors. So it follows the exposure of a video, and
+    is 1 for photographs in any order.
+    """
+    numbers, log_gains = np.asarray(fitted, float), np.log(gains)
+    middle = numbers[1:-1]
+    share = (middle - numbers[:-2]) / np.maximum(numbers[2:] - numbers[:-2], 1)
+    neighbors = (1 - share) * log_gains[:-2] + share * log_gains[2:]
+    energy = float(neighbors @ neighbors)
+    factor = float(neighbors @ log_gains[1:-1]) / energy if energy > 0 else 0.0
+    return np.exp(min(max(factor, 0.0), 1.0) * np.interp(others, numbers, log_gains))
 
 
 def fit_gain(color: Tensor, image: Tensor, valid: Tensor) -> float:

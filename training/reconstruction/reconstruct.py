@@ -47,6 +47,7 @@ from splatpilot.training.reconstruction.photometry import (
     Photometry,
     ThinnedFrame,
     estimate_photometry,
+    predict_gains,
 )
 from splatpilot.training.reconstruction.views import (
     ReconstructionViews,
@@ -157,10 +158,9 @@ def reconstruct(
         )
         optimization.run()
         gains[fitted] = optimization.gains
+        gains[held_out] = predict_gains(fitted, gains[fitted], held_out)
         gaussians = optimization.splats.scene(flat=config.representation == "2dgs")
         metrics = optimization.measure()
-        if metrics is not None:
-            gains[held_out] = [view.gain for view in metrics.views]
         how = f"{config.representation}, {config.iterations} steps"
 
     field, depth = make_distance_field(capture, frames, gaussians, config)

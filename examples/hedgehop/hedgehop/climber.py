@@ -46,8 +46,7 @@ def desired_velocity(
 
 
 class Climber(LeafSystem):
-    """
-    Flies by two rangefinders.
+    """Flies by two rangefinders.
 
     .. pydrake_system::
 

@@ -10,6 +10,7 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem
 from splatpilot import Config, Scenario, World, bounded, register_sensor
 from splatpilot.systems.collision.distance_field import DistanceField
 from splatpilot.systems.common.validation import require_field
+from splatpilot.systems.sensing.range_finder import cast_ray
 
 
 @dataclass
@@ -26,21 +27,8 @@ class RangefinderConfig(Config):
         require_field(self, "direction", valid, "three numbers, not all 0")
 
 
-def cast_ray(distance_field: DistanceField, p_WQ: np.ndarray, e_W: np.ndarray, far: float) -> float:
-    """Computes by sphere tracing (Hart 1996) the distance [m] from p_WQ (3,) along the unit vector
-    e_W (3,) to the first surface, at most `far`."""
-    distance = 0.0
-    while distance < far:
-        step = float(distance_field.distance(p_WQ + distance * e_W))
-        if not step > 1e-3:  # a surface, or NaN beyond the world
-            return far if np.isnan(step) else distance
-        distance += step
-    return far
-
-
 class Rangefinder(LeafSystem):
-    """
-    Measures the distance along a ray that stays level at any attitude of the vehicle.
+    """Measures the distance along a ray that stays level at any attitude of the vehicle.
 
     .. pydrake_system::
 
@@ -66,7 +54,8 @@ class Rangefinder(LeafSystem):
         X_WB = self.GetInputPort("body_pose").Eval(context)
         R_WL = RollPitchYaw(0, 0, RollPitchYaw(X_WB.rotation()).yaw_angle()).ToRotationMatrix()
         e_W = R_WL.multiply(self._e_L)
-        output.SetAtIndex(0, cast_ray(self._field, X_WB.translation(), e_W, self._far))
+        distance = cast_ray(self._field, X_WB.translation(), e_W, self._far)
+        output.SetAtIndex(0, min(distance, self._far))
 
 
 def _build(config: RangefinderConfig, world: World, scenario: Scenario) -> Rangefinder:

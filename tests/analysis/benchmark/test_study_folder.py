@@ -119,7 +119,7 @@ def test_study_is_not_resumed_with_other_shipped_weights(
 
     save_weights("diffaero.npz", **thrust_weights(0.0))
     folder.trajectory("short-diffaero-2-001").unlink()
-    with pytest.raises(ValueError, match="was started with weights of diffaero"):
+    with pytest.raises(ValueError, match=r"weights of diffaero .*must be .* it was started"):
         run_study.run(config=config, out=folder.path, jobs=1)
 
 
@@ -215,7 +215,7 @@ def test_a_study_is_flown_by_one_version_of_a_plugin(short_scenario, tmp_path, c
     first.unlink()
     capsys.readouterr()
     assert main(words) == 1
-    assert "was started with source of straying" in capsys.readouterr().err
+    assert "source of straying" in capsys.readouterr().err
     # This process has imported the version that flew.
     assert main(["--import", "straying.policy", "replay", "study", second.stem]) == 0
 

@@ -8,7 +8,7 @@ from importlib.metadata import version
 
 import pytest
 
-from splatpilot.analysis import scenes
+from splatpilot.analysis import environments
 from splatpilot.analysis.commands import MOVED
 from splatpilot.analysis.commands import main as cli
 from splatpilot.analysis.commands.main import main
@@ -151,7 +151,7 @@ def test_help_and_refusals_import_nothing_heavy(words, status, tmp_path):
         "train diffaero --out run",
         "recover student_rgb --out run",
         "corpus make --out corpus --worlds 2",
-        "scene fetch forest_splat --out scenes",
+        "library make forest_splat --out scenes",
         "reconstruct . --out scene",
         "scene ablate . --out study",
         "scene fidelity . --out study",
@@ -270,8 +270,8 @@ def test_an_interruption_names_the_kept_files(tmp_path, capsys, monkeypatch):
         with resumable(lambda: "one scene is in scenes; the same command resumes"):
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(scenes, "run", interrupted)
-    assert main(["scene", "fetch", "forest_splat", "--out", str(tmp_path)]) == 130
+    monkeypatch.setattr(environments, "make", interrupted)
+    assert main(["library", "make", "forest_splat", "--out", str(tmp_path)]) == 130
     last = capsys.readouterr().err.splitlines()[-1]
     assert last == "splatpilot: interrupted; one scene is in scenes; the same command resumes"
 

@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from splatpilot.analysis.commands import COMMANDS
-from splatpilot.analysis.commands.checks import POLICIES, TRAINERS
+from splatpilot.analysis.commands.checks import POLICY_NAMES, TRAINER_NAMES
 from splatpilot.analysis.commands.main import build_parser, find_command, main
 from splatpilot.diagrams.flight import policies
 from splatpilot.systems.common.config import load_config
@@ -47,9 +47,12 @@ def test_set_help_lists_the_fields_of_the_configuration(capsys):
 
 
 def test_names_that_are_checked_early_are_those_of_the_registries():
-    assert set(POLICIES) <= set(policies.POLICIES.registered())
-    assert set(TRAINERS) <= set(trainer_registry.TRAINERS.registered())
-    for registry, names in ((policies.POLICIES, POLICIES), (trainer_registry.TRAINERS, TRAINERS)):
+    assert set(POLICY_NAMES) <= set(policies.POLICIES.registered())
+    assert set(TRAINER_NAMES) <= set(trainer_registry.TRAINERS.registered())
+    for registry, names in (
+        (policies.POLICIES, POLICY_NAMES),
+        (trainer_registry.TRAINERS, TRAINER_NAMES),
+    ):
         ours = {n for n in registry.registered() if _is_ours(registry.find(n).config)}
         assert ours == set(names)
 

@@ -90,6 +90,7 @@ def test_nothing_held_out(room, capsys):
 def test_images_are_shrunk_as_for_reconstruction(room):
     metrics = measure_scene(room.scene("small", image_width=32))
     assert (metrics.width, metrics.height) == (32, 24)
+    assert (metrics.strict_width, metrics.strict_height) == (64, 48)
     assert metrics.as_json()["psnr_db"] > 22
     assert metrics.as_json()["depth_relative"] < 0.05
 
@@ -155,7 +156,7 @@ def test_unseen_fraction_without_frontier_or_scale(write_scene):
 
 
 def test_flight_into_unseen_space_is_warned_of():
-    metrics = SceneMetrics(True, 8, 8, {}, {}, "", flight_unseen_fraction=0.2)
+    metrics = SceneMetrics(True, 8, 8, {}, 8, 8, {}, "", flight_unseen_fraction=0.2)
     assert "unseen in flight       20.0%" in str(metrics)
     assert "warning" not in str(metrics)
     assert "warning: a flight" in str(replace(metrics, flight_unseen_fraction=0.6))

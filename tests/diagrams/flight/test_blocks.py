@@ -12,7 +12,7 @@ from splatpilot.diagrams.flight.flight import fly
 from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
 from splatpilot.diagrams.flight.policies import policy_named
 from splatpilot.diagrams.flight.scenario import Scenario, sample_initial_state
-from splatpilot.diagrams.flight.sensors import make_camera
+from splatpilot.diagrams.flight.sensors import make_onboard_camera
 from splatpilot.systems.sensing.noise import ObservationNoise
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.sensing.time_of_flight import equivalent_sensor, time_of_flight_grid
@@ -67,7 +67,7 @@ def test_grid_of_a_policy_is_that_of_its_cameras_images(post_world):
     seen = policy.GetMyContextFromRoot(root).get_discrete_state_vector().value()
     grid, state = seen[:144].reshape(9, 16), seen[144:]
     np.testing.assert_allclose(state[:3], start[:3], atol=1e-3)
-    camera = make_camera(Watcher.camera, post_world)
+    camera = make_onboard_camera(Watcher.camera, post_world)
     context = camera.CreateDefaultContext()
     camera.GetInputPort("body_pose").FixValue(context, Value(pose_from_state(state)))
     image = camera.GetOutputPort("depth_image_32f").Eval(context)

@@ -2,7 +2,6 @@
 
 import dataclasses
 import gc
-import hashlib
 import re
 import subprocess
 import sys
@@ -197,29 +196,6 @@ def test_a_flight_that_starts_at_its_goal_is_refused(post_world):
     sample_initial_state(Scenario(goal=near, goal_radius=0.2), post_world)
 
 
-def test_same_seed_flies_bitwise_identically_in_two_processes():
-    script = (
-        "import hashlib; from splatpilot.diagrams.flight.scenario import Scenario;"
-        "from splatpilot.diagrams.flight.flight import fly;"
-        "from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram;"
-        "from splatpilot.diagrams.worlds.world_registry import make_world;"
-        "s = Scenario(seed=3, timeout=3.0); w = make_world(s.world, s.seed);"
-        "f = fly(BuildFlightDiagram(s, w, video=True));"
-        "print(len(f.times), *(hashlib.sha256(a.tobytes()).hexdigest()"
-        " for a in (f.times, f.states, f.commands, f.clearances, f.hypotheses)))"
-    )
-    outputs = {
-        subprocess.run(
-            [sys.executable, "-c", script], check=True, capture_output=True, text=True
-        ).stdout
-        for _ in range(2)
-    }
-    assert len(outputs) == 1
-    samples, *digests = outputs.pop().split()
-    assert int(samples) >= 150
-    assert hashlib.sha256(b"").hexdigest() not in digests
-
-
 def test_flight_path_does_not_import_torch():
     script = (
         "import sys; import splatpilot.diagrams.flight.fly, splatpilot.analysis.commands.main;"
@@ -228,7 +204,7 @@ def test_flight_path_does_not_import_torch():
     assert subprocess.run([sys.executable, "-c", script]).returncode == 0
 
 
-@pytest.mark.parametrize("seed", [10, 11, 12])
+@pytest.mark.parametrize("seed", [10, 11])
 def test_forests_are_flown_through_at_nominal_speed(seed):
     scenario = Scenario(seed=seed)
     world = make_world(scenario.world, scenario.seed)

@@ -58,7 +58,7 @@ class Chain:
         if motion_capture:
             udp = UdpConfig(port=0)
             config.motion_capture = MotionCaptureConfig(udp, body_id=3, version=[4, 0])
-        hardware = dataclasses.replace(hardware or HardwareConfig(), tick=0.005)
+        hardware = dataclasses.replace(hardware or HardwareConfig(), tick=0.01)
         self.bridge = BuildHardwareDiagram(scenario, world, self.lcm, hardware, policy=policy)
         self.link = BuildPx4Diagram(config, self.lcm, self.inbox)
         self.simulators = {"bridge": Simulator(self.bridge), "link": Simulator(self.link)}

@@ -3,7 +3,7 @@ import pytest
 from pydrake.math import RigidTransform
 
 from splatpilot.diagrams.flight.scenario import Scenario, sample_initial_state
-from splatpilot.diagrams.flight.sensors import make_camera
+from splatpilot.diagrams.flight.sensors import make_onboard_camera
 from splatpilot.diagrams.scenarios import scenario_file
 from splatpilot.diagrams.worlds import dodgedrone
 from splatpilot.diagrams.worlds.world import World
@@ -39,7 +39,7 @@ def sphere_depth(rays_W, p_WC, forward, centers, radii) -> np.ndarray:
 def test_spheres_are_seen_where_they_are_hit(course, time):
     obstacles = dodgedrone.draw_obstacles(dodgedrone.LEVELS["easy"], dodgedrone.SEED + 1)
     config = OnboardCamera(width=96, height=72)
-    camera = make_camera(config, course)
+    camera = make_onboard_camera(config, course)
     step = round(time / 0.02)
     centers, radii = [], []
     for obstacle in obstacles:

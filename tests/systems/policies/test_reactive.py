@@ -8,7 +8,7 @@ from splatpilot.systems.policies.reactive import (
     ReactiveConfig,
     candidate_costs,
     candidate_velocities,
-    decide,
+    compute_command,
     is_seen,
     nearest_points,
     responses,
@@ -101,7 +101,7 @@ def test_flies_ahead_in_the_open_and_aside_of_a_post():
     post = empty_image()
     post[:, 26:34] = 2.0  # From left of the middle to just right of it.
     ahead, right, left = (
-        decide(observe(depth, 0.0, [10.0, 0.0, 2.0]), NO_POINTS, CONFIG)[0]
+        compute_command(observe(depth, 0.0, [10.0, 0.0, 2.0]), NO_POINTS, CONFIG)[0]
         for depth in (empty_image(), post, post[:, ::-1])
     )
     assert ahead[0] > 3.0 and np.abs(ahead[1:]).max() < 0.5
@@ -112,7 +112,7 @@ def test_remembers_points_that_are_no_longer_seen():
     config, points = ReactiveConfig(memory=2), NO_POINTS[: 2 * 144]
     for k, depth in enumerate((3.0, np.inf, np.inf, np.inf)):
         seen = observe(np.full_like(empty_image(), depth), np.pi / 2, [0.0, 10.0, 2.0])
-        _, points = decide(seen, points, config)
+        _, points = compute_command(seen, points, config)
         known = points[np.isfinite(points[:, 0])]
         assert len(known) == (144 if k < 2 else 0)
         np.testing.assert_allclose(known[:, 1], 3.1, atol=1e-6)

@@ -14,7 +14,13 @@ from pydrake.systems.primitives import ConstantVectorSource
 
 from splatpilot.systems.collision.shapes import AnalyticDistanceField, Sphere
 from splatpilot.systems.vehicle.quadrotor import hover_state
-from splatpilot.systems.visualization.live import PAUSE, RATE, RESTART, SLICE, LiveControls
+from splatpilot.systems.visualization.live import (
+    PAUSE_BUTTON,
+    RATE_SLIDER,
+    RESTART,
+    SLICE_SLIDER,
+    LiveControls,
+)
 from splatpilot.systems.visualization.meshcat_drawing import draw_goal, draw_vehicle
 
 FIELD = AnalyticDistanceField([Sphere([2, 0, 1], 0.5)], [0, -10, 0], [20, 10, 5])
@@ -58,7 +64,7 @@ class Watched(LiveControls):
             "time": context.get_time(),
             "paused": self.paused,
             "goal": packed["matrix"][12:15],
-            "rate": self._meshcat.GetSliderValue(RATE),
+            "rate": self._meshcat.GetSliderValue(RATE_SLIDER),
             "slice": self._meshcat.HasPath("/splatpilot/distance_slice"),
         }
         for name, value in seen.items():
@@ -174,10 +180,10 @@ def test_simulation_pauses_steps_and_changes_its_rate(flying):
     report(flying, step="paused")
     until(lambda: seen("paused"), "end of the step")
     assert seen("time") == pytest.approx(before + 0.1)
-    resume = flying.tab.get_by_text(PAUSE)
+    resume = flying.tab.get_by_text(PAUSE_BUTTON)
     until(lambda: not seen("paused"), "resume", resume.click)
     report(flying, resume="paused")
-    until(lambda: seen("rate") == 0.25, "rate", lambda: set_slider(flying.tab, RATE, 0.25))
+    until(lambda: seen("rate") == 0.25, "rate", lambda: set_slider(flying.tab, RATE_SLIDER, 0.25))
     report(flying, rate="rate")
     wall, flown = time.perf_counter(), seen("time")
     time.sleep(1.0)
@@ -186,7 +192,7 @@ def test_simulation_pauses_steps_and_changes_its_rate(flying):
 
 
 def test_restart_ends_the_simulation_and_the_slice_follows_its_slider(flying):
-    until(lambda: flying.seen["slice"], "slice", lambda: set_slider(flying.tab, SLICE, 1.5))
+    until(lambda: flying.seen["slice"], "slice", lambda: set_slider(flying.tab, SLICE_SLIDER, 1.5))
     report(flying, slice="slice")
     until(lambda: flying.ended, "restart", lambda: flying.tab.keyboard.press("r"))
     report(flying, restart="ended")

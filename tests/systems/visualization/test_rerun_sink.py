@@ -92,6 +92,8 @@ def test_recording_is_valid_and_holds_everything_on_one_timeline(recording):
     # x y z w
     quaternions = splats["GaussianSplats3D:quaternions"]
     np.testing.assert_allclose(quaternions, [[[0, 0, 0, 1], [1, 0, 0, 0]]])
+    names = columns(recording, "/state/v_WB")["SeriesLines:names"]
+    assert names == [["x [m/s]", "y [m/s]", "z [m/s]"]]
     assert columns(recording, "/events")["TextLog:text"] == [["start"], ["goal"]]
 
 

@@ -10,13 +10,13 @@ from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.scenarios import benchmark_scenarios
 from splatpilot.diagrams.worlds import splits
 from splatpilot.diagrams.worlds.indoor import RoomConfig
+from splatpilot.diagrams.worlds.mesh import mesh_digests
 from splatpilot.diagrams.worlds.scene_folder import read_scene_metadata
 from splatpilot.diagrams.worlds.splits import source_digest
 from splatpilot.diagrams.worlds.world_registry import make_spec
 from splatpilot.systems.common.config import load_config
 from splatpilot.training.captures import render as render_capture
 from splatpilot.training.captures.capture_registry import read_capture
-from splatpilot.training.captures.mesh_renderer import mesh_digests
 from splatpilot.training.captures.render import (
     RenderConfig,
     rendered_world,
@@ -189,5 +189,5 @@ def test_other_contents_are_not_overwritten(opengl, room, tmp_path):
 def test_captures_by_another_version_of_the_renderer_are_refused(tmp_path):
     assert true_camera(tmp_path) is None
     (tmp_path / "world.yaml").write_text("mesh: room.obj\n")
-    with pytest.raises(ValueError, match=r"world\.yaml: version must be 2, got 1; render it again"):
+    with pytest.raises(ValueError, match=r"world\.yaml: version must be 3, got 1; render it again"):
         true_camera(tmp_path)

@@ -44,19 +44,23 @@ def flown(image: np.ndarray) -> base.Observation:
 
 def fly_diffaero(network, depth, hidden):
     seen = flown(depth.repeat(4, axis=0).repeat(4, axis=1))  # pooled to the same
-    a_WB, hidden = diffaero.decide(network, diffaero.depth_grid(seen.image), seen, 2.0, hidden)
+    a_WB, hidden = diffaero.compute_command(
+        network, diffaero.encode_depth(seen.image), seen, 2.0, hidden
+    )
     return a_WB, None, hidden
 
 
 def fly_diffaero_tof(network, depth, hidden):
     seen = flown(time_of_flight_grid(depth, equivalent_sensor(diffaero.DiffAeroTofConfig().camera)))
     limits = diffaero.VELOCITY_LIMITS
-    v_WB, hidden = diffaero.decide(network, seen.image, seen, 2.0, hidden, limits)
+    v_WB, hidden = diffaero.compute_command(network, seen.image, seen, 2.0, hidden, limits)
     return tracking_acceleration(seen.state.v_WB, v_WB), None, hidden
 
 
 def fly_depthnav(network, depth, hidden):
-    return depthnav.decide(network, flown(depth.repeat(4, 0).repeat(4, 1)), 2.0, 2.0, hidden)
+    return depthnav.compute_command(
+        network, flown(depth.repeat(4, 0).repeat(4, 1)), 2.0, 2.0, hidden
+    )
 
 
 @pytest.mark.parametrize(

@@ -173,7 +173,7 @@ def test_an_unseen_view_has_no_metrics():
         raise AssertionError("measured")
 
     view = make_view(noise(0), noise(1))
-    blind = metrics.measure_view(*view, seen=~EVERYWHERE, lpips=never)
+    blind = metrics.measure_view(*view, seen=~EVERYWHERE, lpips={"lpips": never})
     seeing = metrics.measure_view(*view)
     assert {blind.psnr_db, blind.psnr_on_black_db, blind.ssim, blind.lpips} == {None}
     assert {blind.depth_mae_m, blind.floater_fraction, blind.hole_fraction} == {None}
@@ -183,16 +183,26 @@ def test_an_unseen_view_has_no_metrics():
     assert metrics.mean_metric([blind], "psnr_db") == (None, 0)
 
 
-def test_gain_is_fitted_or_not():
+def test_strict_metrics_fit_nothing_to_the_image():
     def difference(a, b, weights):
         assert a.shape == (HEIGHT, WIDTH, 3) and (weights == 1).all()
         return (a - b).abs().max()
 
-    view = make_view(np.full((HEIGHT, WIDTH, 3), 0.4), np.full((HEIGHT, WIDTH, 3), 0.5))
-    strict, fitted = (
-        metrics.measure_view(*view, lpips=difference, fit_gain=fit) for fit in (False, True)
-    )
-    assert strict.gain == 1.0 and strict.lpips == pytest.approx(0.1, abs=0.01)
-    assert strict.psnr_db == pytest.approx(20.0, abs=0.2)
-    assert fitted.gain == pytest.approx(1.25, rel=0.01) and fitted.lpips < 0.01
-    assert fitted.psnr_db > 50
+    # A gray scene of half the brightness that the camera is known to have, with one black quarter
+    # that nothing covers: the error is 0 elsewhere, and the image itself there.
+    color = np.full((HEIGHT, WIDTH, 3), 0.25)
+    color[:12, :16] = 0
+    shade = vignette(-0.3, WIDTH, HEIGHT)[..., None]
+    view = make_view(color, np.full((HEIGHT, WIDTH, 3), 0.5) * shade)
+    networks = {"lpips": difference, "lpips_vgg": difference}
+    strict = metrics.measure_view(*view, -0.3, lpips=networks, gain=2.0)
+    error = np.mean(np.square(0.5 * shade[:12, :16])) / 4
+    assert strict.psnr_db == pytest.approx(-10 * np.log10(error), abs=0.02)
+    assert strict.lpips == strict.lpips_vgg == pytest.approx(0.5 * shade[:12, :16].max(), abs=0.01)
+    assert (strict.gain, strict.unseen_fraction) == (2.0, 0.0)
+    other = metrics.measure_view(*view, -0.3, gain=1.0)
+    error += 3 / 4 * np.mean(np.square(0.25 * np.broadcast_to(shade, color.shape)[color > 0]))
+    assert other.psnr_db == pytest.approx(-10 * np.log10(error), abs=0.02)
+    seen = color[..., 0] > 0
+    fitted = metrics.measure_view(*view, -0.3, seen)
+    assert fitted.gain == pytest.approx(2.0, rel=0.01) and fitted.psnr_db > 50

@@ -52,7 +52,7 @@ def test_found_pixels_show_the_same_points(views):
     number, shown = views[1].find(other_WQ)
     assert len(number) > 100
     distance = np.linalg.norm(other_WQ[:, number] - p_WQ[:, shown], axis=0)
-    assert (distance < 4 * photometry.STRIDE * views[1].pixel_size.flat[shown]).all()
+    assert (distance < 4 * views[1].stride * views[1].pixel_size.flat[shown]).all()
     X_WC = views[0].X_WC
     depth = views[0].depth[12, 16]
     for p_CQ, found in (
@@ -115,3 +115,15 @@ def test_views_named_last_yield_to_others(views):
     first, last = photometry.find_new_pixels(twice), photometry.find_new_pixels(twice, last=[0])
     assert first[0].any() and not first[1].any()
     assert last[1].any() and not last[0].any()
+
+
+def test_gains_of_a_video_are_interpolated_and_those_of_photographs_are_not():
+    numbers = np.arange(40)
+    smooth = np.exp(0.2 * np.sin(numbers / 6))
+    fitted, others = numbers[numbers % 4 != 0], numbers[numbers % 4 == 0]
+    found = photometry.predict_gains(fitted.tolist(), smooth[fitted], others.tolist())
+    np.testing.assert_allclose(found[1:], smooth[others][1:], rtol=0.01)
+    jumping = np.exp(0.2 * (-1.0) ** np.arange(len(fitted)))
+    found = photometry.predict_gains(fitted.tolist(), jumping, others.tolist())
+    np.testing.assert_array_equal(found, 1.0)
+    np.testing.assert_array_equal(photometry.predict_gains([3], np.ones(1), [0, 9]), 1.0)

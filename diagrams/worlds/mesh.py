@@ -1,138 +1,83 @@
-"""Renders meshes, and measures the distance to them.
+"""Reads meshes: glTF, binary glTF, and Wavefront .obj with its materials.
 
 Faces have two sides, and alpha is what glTF says. Drake draws any alpha as translucent, and its
-depth ignores alpha. So it gets a mesh whose alpha is only that of panes, whose depth is that of the
-pane; `CutOuts` draws surfaces with holes in their textures.
+depth ignores alpha. So `split` separates surfaces with holes in their textures, which are drawn by
+ray casting, from the others, whose alpha is only that of panes.
 """
 
 import json
+import logging
 import struct
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, cast
+from urllib.parse import unquote
 
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
-from pydrake.geometry import (
-    ClippingRange,
-    ColorRenderCamera,
-    DepthRange,
-    DepthRenderCamera,
-    GeometryId,
-    LightParameter,
-    MakeRenderEngineVtk,
-    Mesh,
-    PerceptionProperties,
-    RenderCameraCore,
-    RenderEngineVtkParams,
-    RenderLabel,
-)
-from pydrake.math import RigidTransform, RotationMatrix
-from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageRgba8U
+from PIL import Image
+from pydrake.math import RotationMatrix
 from scipy.ndimage import map_coordinates
 from trimesh.exchange.gltf import export_gltf
+from trimesh.resolvers import FilePathResolver
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 from splatpilot.diagrams.worlds.splits import part_digests
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.esdf_build import esdf_from_occupancy, grid_shape
-from splatpilot.systems.common.extras import require_opengl
 from splatpilot.systems.common.readers import readable, require_file, require_readable_size
 from splatpilot.systems.common.validation import require
-from splatpilot.training.captures.capture import CaptureFrame, pixel_rays
 
-MIN_DEPTH, MAX_DEPTH = 0.05, 150.0  # [m], range of the depth images; nearer is 0, farther is inf
-
-# Lamps at infinity: direction and intensity of one overhead, four from the sides so that no wall is
-# dark or like its neighbor, one from below for undersides.
-_LAMPS = (
-    ((0.15, 0.25, -1.0), 1.6),
-    ((1.0, 0.15, -0.5), 1.1),
-    ((-1.0, -0.15, -0.5), 1.3),
-    ((0.15, 1.0, -0.5), 0.9),
-    ((-0.15, -1.0, -0.5), 1.5),
-    ((0.2, 0.3, 1.0), 0.8),
-)
-_SUFFIXES = (".gltf", ".glb", ".obj")
-_GAMMA = 2.2  # of textures and images, as in VTK
-_GLOSS = 0.01  # fraction of white light that VTK's rough surfaces reflect, whatever their color
-_STEP = 1e-4  # [m], and fraction of depth, from a surface to the start of the search for the next
-_HIDDEN = 0.01  # fraction of the light from behind below which the search ends
+SUFFIXES = (".gltf", ".glb", ".obj")
+GAMMA = 2.2  # of textures and images, as in VTK
 _MAX_POSITION = 1e6  # [m]
+_EXTENTS = (1.0, 1000.0)  # [m], of the longest side of an environment
+# Units [m] that a file may have instead, the likely ones first.
+_UNITS = {"centimeters": 0.01, "millimeters": 0.001, "inches": 0.0254, "kilometers": 1000.0}
 _CUTOFF = 0.5  # glTF's default alpha from which a MASK is opaque
 _VISIBLE = 1 / 255  # alpha from which a BLEND is visible
 _SAMPLES_PER_VOXEL_FACE = 8
 _NEAREST = 9728
 _WRAPS = {33071: "clamp", 33648: "mirror"}
+# Required extensions that cannot be read, with a remedy each.
+_COMPRESSED = {
+    "EXT_meshopt_compression": "decompress it with `gltf-transform copy IN.glb OUT.glb`",
+    "KHR_meshopt_compression": "decompress it with `gltf-transform copy IN.glb OUT.glb`",
+    "KHR_draco_mesh_compression": "decompress it with `gltf-transform copy IN.glb OUT.glb`",
+    "KHR_texture_basisu": "convert its textures with `gltf-transform png IN.glb OUT.glb`",
+}
 # R_WM, of the axes of a file M by the one that points up.
-_UP = {"y": RotationMatrix.MakeXRotation(np.pi / 2).matrix().round(), "z": np.eye(3)}
+UP = {"y": RotationMatrix.MakeXRotation(np.pi / 2).matrix().round(), "z": np.eye(3)}
 
-
-class MeshRenderer:
-    """Renders a mesh: .gltf, .glb, or .obj with its materials. `up` is the axis of the file that
-    points up, "y" (as glTF says) or "z"; `background` is red, green, blue in 0 to 1."""
-
-    def __init__(self, mesh: Path, up: str, background: Sequence[float]):
-        check_mesh(mesh, up)
-        require_opengl()
-        lights = [
-            LightParameter(type="directional", frame="world", direction=d, intensity=intensity)
-            for d, intensity in _LAMPS
-        ]
-        self._engine = MakeRenderEngineVtk(
-            RenderEngineVtkParams(
-                lights=lights, default_clear_color=np.array(background), force_to_pbr=True
-            )
-        )
-        properties = PerceptionProperties()
-        properties.AddProperty("label", "id", RenderLabel(1))
-        # The engine rotates glTF's y up to z.
-        X_WM = RigidTransform(RotationMatrix.MakeXRotation(0.0 if up == "y" else -np.pi / 2))
-        with TemporaryDirectory(prefix="splatpilot-") as folder:
-            solid = Path(folder, "model.gltf")
-            _, self._cut_outs = _split(mesh, up, solid)
-            if solid.is_file():
-                visual = GeometryId.get_new_id(), Mesh(str(solid)), properties, X_WM, False
-                with readable(mesh, "mesh for Drake"):
-                    self._engine.RegisterVisual(*visual)
-
-    def frame(
-        self, X_WC: RigidTransform, K: NDArray[np.float64], width: int, height: int
-    ) -> CaptureFrame:
-        """Returns the view of a camera at X_WC with intrinsics K (3, 3) [px], with exact depth."""
-        # In OpenGL's image plane, too, the principal point of a symmetric view is width / 2.
-        info = CameraInfo(width, height, K[0, 0], K[1, 1], K[0, 2], K[1, 2])
-        core = RenderCameraCore("", info, ClippingRange(MIN_DEPTH, MAX_DEPTH), RigidTransform())
-        color, depth = ImageRgba8U(width, height), ImageDepth32F(width, height)
-        self._engine.UpdateViewpoint(X_WC)
-        self._engine.RenderColorImage(ColorRenderCamera(core), color)
-        self._engine.RenderDepthImage(
-            DepthRenderCamera(core, DepthRange(MIN_DEPTH, MAX_DEPTH)), depth
-        )
-        frame = CaptureFrame(
-            np.array(color.data)[..., :3], np.array(depth.data)[..., 0], X_WC, np.array(K)
-        )
-        return frame if self._cut_outs is None else self._cut_outs.draw(frame)
+_log = logging.getLogger(__name__)
 
 
 def check_mesh(mesh: Path, up: str) -> None:
-    """Checks the arguments of `MeshRenderer`."""
+    """Checks the file and the axis of a mesh, and that no extension is required that cannot be
+    read."""
     require_file(mesh)
-    suffixes = ", ".join(_SUFFIXES)
-    require(mesh.suffix in _SUFFIXES, f"{mesh}: the suffix", f"one of {suffixes}", mesh.suffix)
-    require(up in _UP, "up", "y (as glTF says) or z", up)
+    suffixes = ", ".join(SUFFIXES)
+    require(
+        mesh.suffix.lower() in SUFFIXES, f"{mesh}: the suffix", f"one of {suffixes}", mesh.suffix
+    )
+    require(up in UP, "up", "y (as glTF says) or z", up)
+    if mesh.suffix.lower() != ".obj":
+        with readable(mesh, "mesh"):
+            required = _description(mesh.read_bytes()).get("extensionsRequired", [])
+        for extension, remedy in _COMPRESSED.items():
+            what, condition = f"{mesh}: extensionsRequired", f"without {extension}"
+            require(extension not in required, what, condition, required, remedy)
 
 
 def mesh_digests(mesh: Path) -> set[str]:
     """Returns a digest of each triangle of a mesh, by its corners to a millimeter, independent of
     the file's format and materials."""
     with readable(mesh, "mesh"):
-        surface: Any = trimesh.load(mesh, force="mesh")
+        surface: Any = trimesh.load(mesh, force="mesh", resolver=_Files(mesh))
         if not 0 < surface.area < np.inf:
             raise ValueError("it has no surface")
     corners = np.round(surface.triangles * 1000).astype(np.int64)
@@ -141,10 +86,11 @@ def mesh_digests(mesh: Path) -> set[str]:
     return part_digests(triangle.tobytes() for triangle in triangles)
 
 
-def mesh_distance(mesh: Path, up: str, voxel_size: float) -> Esdf:
-    """Returns the distance to the surface of a mesh, from points sampled on it outside of holes."""
+def mesh_distance(mesh: Path, up: str, voxel_size: float, scale: float = 1.0) -> Esdf:
+    """Returns the distance to the surface of a mesh, from points sampled on it outside of holes.
+    `scale` [m] is the unit of the file."""
     density = _SAMPLES_PER_VOXEL_FACE / voxel_size**2
-    surface, cut_outs = _split(mesh, up)
+    surface, cut_outs = split(mesh, up, scale)
     points = [_sample_surface(mesh, surface, density)[0]]
     if cut_outs is not None:
         points.append(cut_outs.sample(mesh, density))
@@ -206,15 +152,6 @@ class CutMaterial:
         return color, np.where(alpha >= self.cutoff, alpha if self.translucent else 1.0, 0.0)
 
 
-def _shade(albedo: NDArray[np.float64], normal: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns colors (n, 3), 0 to 1, of rough dielectric surfaces as VTK lights them."""
-    light = np.zeros(len(normal))
-    for direction, intensity in _LAMPS:
-        toward = -np.asarray(direction) / np.linalg.norm(direction)
-        light += intensity / np.pi * np.maximum(normal @ toward, 0)
-    return np.clip((albedo + _GLOSS) * light[:, None], 0, 1) ** (1 / _GAMMA)
-
-
 @dataclass(frozen=True, eq=False)
 class CutOuts:
     """Triangles with holes."""
@@ -224,7 +161,7 @@ class CutOuts:
     material: NDArray[np.intp]  # (T,)
     materials: Sequence[CutMaterial]
 
-    def _sample_at(
+    def sample_at(
         self, triangle: NDArray[np.intp], p_WQ: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Returns colors (n, 3) and alphas (n,) of points (n, 3) on triangles (n,)."""
@@ -239,61 +176,15 @@ class CutOuts:
     def sample(self, path: Path, density: float) -> NDArray[np.float64]:
         """Returns points (N, 3) [m] outside of holes; see `_sample_surface`."""
         points, triangle = _sample_surface(path, self.surface, density)
-        return points[self._sample_at(triangle, points)[1] > 0]
-
-    def draw(self, frame: CaptureFrame) -> CaptureFrame:
-        """Returns the frame with these surfaces drawn where nothing in it hides them. Depth is that
-        of the first surface, opaque or not."""
-        if not trimesh.ray.has_embree:
-            raise ModuleNotFoundError(
-                "textures with holes need embreex, which has no wheel for this processor; render "
-                "the capture on another machine",
-                name="embreex",
-            )
-        height, width = frame.depth.shape
-        # Rays have depth 1, so that distances along them are depths.
-        rays = pixel_rays(frame.K, width, height).reshape(-1, 3)
-        rays = rays @ frame.X_WC.rotation().matrix().T
-        p_WC = frame.X_WC.translation()
-        depth, color = frame.depth.reshape(-1).astype(np.float64), np.zeros((len(rays), 3))
-        limit = depth.copy()
-        behind, reached = np.ones(len(rays)), np.full(len(rays), MIN_DEPTH)
-        active = np.flatnonzero(limit > MIN_DEPTH)
-        while len(active):
-            origins = p_WC + reached[active, None] * rays[active]
-            triangle = self.surface.ray.intersects_first(origins, rays[active])  # -1 for none
-            active, triangle = active[triangle >= 0], triangle[triangle >= 0]
-            # Intersect again in double precision.
-            normal, ray = self.surface.face_normals[triangle], rays[active]
-            slope = (ray * normal).sum(axis=1)
-            offset = ((self.surface.triangles[triangle, 0] - p_WC) * normal).sum(axis=1)
-            z = np.maximum(offset / np.where(slope == 0, 1, slope), reached[active])
-            seen = z < limit[active]
-            active, triangle, z, ray = active[seen], triangle[seen], z[seen], ray[seen]
-            albedo, alpha = self._sample_at(triangle, p_WC + z[:, None] * ray)
-            facing = -np.sign(slope[seen])[:, None] * normal[seen]
-            share = behind[active] * alpha
-            color[active] += share[:, None] * _shade(albedo, facing)
-            first = (behind[active] == 1) & (alpha > 0)
-            depth[active[first]] = z[first]
-            behind[active] -= share
-            reached[active] = z + _STEP * np.maximum(z, 1)
-            active = active[behind[active] > _HIDDEN]
-        image = 255 * color.reshape(height, width, 3)
-        image += behind.reshape(height, width, 1) * frame.image
-        return replace(
-            frame,
-            image=np.round(image).clip(0, 255).astype(np.uint8),
-            depth=depth.reshape(height, width).astype(np.float32),
-        )
+        return points[self.sample_at(triangle, points)[1] > 0]
 
 
-def _split(
-    path: Path, up: str, solid_file: Path | None = None
+def split(
+    path: Path, up: str, scale: float = 1.0, solid_file: Path | None = None
 ) -> tuple[trimesh.Trimesh, CutOuts | None]:
     """Returns the surfaces without and with holes, in W; writes those without, if any, to a .gltf
-    file for Drake."""
-    R_WM = _UP[up]
+    file for Drake, in units of the file, `scale` [m]."""
+    R_WM = scale * UP[up]
     with readable(path, "mesh"):
         scene, document = _read(path)
         materials = document.get("materials", [])
@@ -310,7 +201,7 @@ def _split(
                 continue
             material = materials[number]
             if number not in cut_materials:
-                cut_materials[number] = _cut_material(document, material, visual.material)
+                cut_materials[number] = _cut_material(path, document, material, visual.material)
             if cut_materials[number] is not None:
                 cut[name] = number
             # A mask without a texture is visible or not as a whole.
@@ -318,6 +209,8 @@ def _split(
                 _base_color(material)[3] >= material.get("alphaCutoff", _CUTOFF)
             ):
                 visual.material = _opaque(visual.material, number)
+                if visual.uv is None and visual.material.emissiveTexture is not None:
+                    visual.uv = np.zeros((len(mesh.vertices), 2))
                 solid.append(name)
         surface, _, _ = _surface(scene, solid, R_WM)
         cut_outs = None
@@ -329,22 +222,47 @@ def _split(
             cut_outs = CutOuts(holed, uv, material, found)
         if not solid and not cut:
             raise ValueError("it holds no triangles")
-        if solid and solid_file is not None:
+    _check_extent(path, surface, cut_outs)
+    if solid and solid_file is not None:
+        with readable(path, "mesh"):
             scene.delete_geometry([name for name in scene.geometry if name not in solid])
             files = export_gltf(
                 scene, merge_buffers=True, tree_postprocessor=lambda tree: _restore(tree, document)
             )
             for name, content in files.items():
                 solid_file.with_name(name).write_bytes(content)
-        return surface, cut_outs
+    return surface, cut_outs
+
+
+def _check_extent(path: Path, surface: trimesh.Trimesh, cut_outs: CutOuts | None) -> None:
+    """Checks that surfaces have the size of an environment; suggests another unit if not."""
+    parts = [surface] if cut_outs is None else [surface, cut_outs.surface]
+    p_WQ = np.concatenate([part.vertices for part in parts])
+    extent = np.ptp(p_WQ, axis=0) if len(p_WQ) else np.zeros(3)
+    low, high = _EXTENTS
+    fitting = [
+        f"scale={unit:g} if it is in {name}"
+        for name, unit in _UNITS.items()
+        if 2 * low <= unit * extent.max() <= high / 2
+    ]
+    size = " x ".join(f"{length:.3g}" for length in extent)
+    require(
+        low <= extent.max() <= high,
+        f"{path}: the longest side",
+        f"in [{low:g}, {high:g}] m",
+        f"{size} m",
+        f"set {', or '.join(fitting)}" if fitting else "set scale to its unit in m",
+    )
 
 
 def _read(path: Path) -> tuple[Any, dict[str, Any]]:
     """Returns a mesh, and its description in glTF, whose primitives are in the mesh's order."""
     require_readable_size(path, 4 * path.stat().st_size)
-    scene: Any = trimesh.load(path, force="scene", process=False)
-    content = path.read_bytes()
-    if path.suffix == ".obj":
+    content, kind = path.read_bytes(), path.suffix.lower().lstrip(".")
+    scene: Any = trimesh.load(
+        BytesIO(content), file_type=kind, resolver=_Files(path), force="scene", process=False
+    )
+    if kind == "obj":
         for mesh in scene.geometry.values():
             # Its materials are not metallic, as glTF's are by default.
             if mesh.visual.kind != "texture":
@@ -353,10 +271,25 @@ def _read(path: Path) -> tuple[Any, dict[str, Any]]:
             mesh.visual.material.metallicFactor, mesh.visual.material.roughnessFactor = 0.0, 1.0
         content = scene.export(file_type="glb")
         scene = trimesh.load(BytesIO(content), file_type="glb", force="scene", process=False)
+    return scene, _description(content)
+
+
+class _Files(FilePathResolver):
+    """Files beside a mesh, whose names in glTF may be escaped."""
+
+    def get(self, name: str) -> bytes:
+        try:
+            return super().get(name)
+        except OSError:
+            return super().get(unquote(name).replace("\\", "/"))
+
+
+def _description(content: bytes) -> dict[str, Any]:
+    """Returns the JSON of a glTF."""
     if content.startswith(b"glTF"):  # binary: a header, then the description
         (size,) = struct.unpack_from("<I", content, 12)
         content = content[20 : 20 + size]
-    return scene, json.loads(content)
+    return json.loads(content)
 
 
 def _with_material(visual: Any, material: PBRMaterial | None = None) -> TextureVisuals:
@@ -377,10 +310,19 @@ def _opaque(material: PBRMaterial, number: int) -> PBRMaterial:
     opaque.name, opaque.alphaMode, opaque.doubleSided = str(number), None, True
     for key in ("baseColorTexture", "emissiveTexture", "occlusionTexture"):
         if (image := getattr(opaque, key)) is not None:
-            converted = image.convert("RGB")
+            converted = _eight_bits(image).convert("RGB")
             converted.encoderinfo = {"compress_level": 0}  # Compression takes most of the export.
             setattr(opaque, key, converted)
+    if opaque.emissiveTexture is None and np.any(opaque.emissiveFactor):
+        opaque.emissiveTexture = Image.new("RGB", (1, 1), "white")  # VTK needs one.
     return opaque
+
+
+def _eight_bits(image: Image.Image) -> Image.Image:
+    """Returns an image of 16-bit grays, which Pillow would clip, in 8 bits."""
+    if not image.mode.startswith("I"):
+        return image
+    return Image.fromarray((np.asarray(image) >> 8).astype(np.uint8))
 
 
 def _restore(tree: dict[str, Any], document: dict[str, Any]) -> None:
@@ -399,7 +341,7 @@ def _restore(tree: dict[str, Any], document: dict[str, Any]) -> None:
             pbr["baseColorFactor"] = [*color[:3], 1.0]
         originals = {**material, **material.get("pbrMetallicRoughness", {})}
         for key, info in [*exported.items(), *pbr.items()]:
-            if key.endswith("Texture"):
+            if key in originals and key.endswith("Texture"):
                 texture = document["textures"][originals[key]["index"]]
                 sampler = {"sampler": texture["sampler"]} if "sampler" in texture else {}
                 tree["textures"][info["index"]].update(sampler)
@@ -409,7 +351,7 @@ def _restore(tree: dict[str, Any], document: dict[str, Any]) -> None:
 
 
 def _cut_material(
-    document: dict[str, Any], material: dict[str, Any], read: PBRMaterial
+    path: Path, document: dict[str, Any], material: dict[str, Any], read: PBRMaterial
 ) -> CutMaterial | None:
     """Returns a material whose texture has holes, None for any other."""
     pbr, mode = material.get("pbrMetallicRoughness", {}), material.get("alphaMode", "OPAQUE")
@@ -417,15 +359,17 @@ def _cut_material(
         if not key.endswith("Texture"):
             continue
         if getattr(read, key, None) is None:
-            image = document["images"][document["textures"][info["index"]]["source"]]
-            raise ValueError(f"its image {image.get('uri', '')[:80]} cannot be read")
+            texture = document["textures"][info["index"]]
+            image = document["images"][texture["source"]] if "source" in texture else {}
+            name = unquote(image.get("uri", image.get("name", f"of {texture}")))[:80]
+            _log.warning("%s: cannot read the image %s; drawing its surfaces without", path, name)
         # trimesh reads no other.
         require(info.get("texCoord", 0) == 0, f"texCoord of {key}", "0", info.get("texCoord"))
     info, image = pbr.get("baseColorTexture", {}), read.baseColorTexture
     if mode == "OPAQUE" or image is None or not image.has_transparency_data:
         return None
     pixels = np.asarray(image.convert("RGBA"), dtype=np.float32) / 255
-    pixels[..., :3] **= _GAMMA
+    pixels[..., :3] **= GAMMA
     pixels *= np.asarray(_base_color(material), dtype=np.float32)
     pixels[..., :3] *= pixels[..., 3:]
     sampler = document.get("samplers", [{}])[document["textures"][info["index"]].get("sampler", 0)]

@@ -1,5 +1,6 @@
 import json
 import os
+from base64 import b64decode
 from io import BytesIO
 from pathlib import Path
 
@@ -8,10 +9,11 @@ import pytest
 import trimesh
 from PIL import Image
 
+from splatpilot.diagrams.worlds.mesh import mesh_digests, mesh_distance
+from splatpilot.diagrams.worlds.mesh_renderer import MeshRenderer
 from splatpilot.diagrams.worlds.splits import find_test_source
 from splatpilot.systems.collision.field_mesh import add_primitive, data_uri
 from splatpilot.training.captures.camera_path import look_along
-from splatpilot.training.captures.mesh_renderer import MeshRenderer, mesh_digests, mesh_distance
 
 K = np.array([[16.0, 0, 16], [0, 16, 12], [0, 0, 1]])
 X_WC = look_along(np.zeros(3), 0.0, 0.0)  # along x
@@ -60,14 +62,14 @@ def scene(tmp_path):
 
 
 def view(file):
-    return MeshRenderer(file, "y", SKY).frame(X_WC, K, 32, 24)
+    return MeshRenderer(file, "y", SKY).render(X_WC, K, 32, 24)
 
 
 HALVES = np.repeat(np.r_[np.zeros(16), np.full(16, 255)][None], 32, axis=0)  # right half opaque
 
 
 def sides(frame):
-    return [(frame.image[12, column].tolist(), frame.depth[12, column]) for column in (12, 19)]
+    return [(frame.color[12, column].tolist(), frame.depth[12, column]) for column in (12, 19)]
 
 
 def is_red(color) -> bool:
@@ -127,7 +129,7 @@ def test_cut_out_looks_like_what_is_opaque(opengl, scene):
     masked = view(
         scene({"alphaMode": "MASK"}, png(np.r_[np.full((63, 64), 255), np.zeros((1, 64))]))
     )
-    np.testing.assert_allclose(masked.image[12, 12:20].astype(int), opaque.image[12, 12:20], atol=4)
+    np.testing.assert_allclose(masked.color[12, 12:20].astype(int), opaque.color[12, 12:20], atol=4)
     np.testing.assert_allclose(masked.depth[12], opaque.depth[12], atol=1e-4)
 
 
@@ -141,23 +143,110 @@ def test_holes_are_free(scene, mode, expected):
 def test_nothing_is_cut_behind_what_is_opaque(opengl, scene):
     file = scene({"alphaMode": "MASK"}, png(HALVES))
     behind = look_along(np.array([6.0, 0, 0]), np.pi, 0.0)
-    frame = MeshRenderer(file, "y", SKY).frame(behind, K, 32, 24)
-    assert is_red(frame.image[12, 12]) and is_red(frame.image[12, 19])
+    frame = MeshRenderer(file, "y", SKY).render(behind, K, 32, 24)
+    assert is_red(frame.color[12, 12]) and is_red(frame.color[12, 19])
     np.testing.assert_allclose(frame.depth[12, 8:24], 6 - WALL, atol=1e-4)
 
 
-def test_missing_texture_is_named(scene):
-    with pytest.raises(ValueError, match=r"scene\.gltf: not a readable mesh \(.*nowhere\.png"):
-        mesh_distance(scene({"alphaMode": "MASK"}, "nowhere.png"), "y", 0.1)
+def test_missing_image_is_named_and_drawn_without(opengl, scene, caplog):
+    frame = view(scene({"alphaMode": "MASK"}, "no%20where.png"))
+    assert "cannot read the image no where.png" in caplog.text
+    for color, depth in sides(frame):
+        assert is_green(color) and depth == pytest.approx(QUAD, abs=1e-4)
 
 
-@pytest.mark.parametrize("name", ["wall.glb", "wall.obj"])
+@pytest.mark.parametrize("uri", ["grün weiß.png", "gr%C3%BCn%20wei%C3%9F.png"])
+def test_names_of_images_and_buffers_may_be_escaped(opengl, scene, tmp_path, uri):
+    file = scene({}, uri)
+    Image.new("RGB", (4, 4), "white").save(tmp_path / "grün weiß.png")
+    document = json.loads(file.read_text())
+    for number, buffer in enumerate(document["buffers"]):
+        content = b64decode(buffer["uri"].partition(",")[2])
+        (tmp_path / f"my café {number}.bin").write_bytes(content)
+        buffer["uri"] = f"my%20caf%C3%A9%20{number}.bin"
+    file.write_text(json.dumps(document))
+    for color, _ in sides(view(file)):
+        assert is_green(color)
+
+
+def test_emissive_factor_without_texture_glows(opengl, scene):
+    black = {"baseColorFactor": [0, 0, 0, 1]}
+    material = {"pbrMetallicRoughness": black, "emissiveFactor": [0.0, 0.9, 0.0]}
+    for color, _ in sides(view(scene(material))):
+        assert is_green(color)
+
+
+@pytest.mark.parametrize(
+    ("kind", "mode"), [("WEBP", "RGB"), ("PNG", "I;16"), ("PNG", "P"), ("JPEG", "RGB")]
+)
+def test_images_of_many_kinds(opengl, scene, kind, mode):
+    level = 26000 if mode == "I;16" else 101
+    pixels = np.full((8, 8), level, np.uint16 if mode == "I;16" else np.uint8)
+    stream = BytesIO()
+    image = Image.fromarray(pixels)
+    (image if mode == "I;16" else image.convert(mode)).save(stream, kind)
+    uri = data_uri(f"image/{kind.lower()}", stream.getvalue())
+    white = {"pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 1]}}
+    expected = view(scene(dict(white), png(np.full((4, 4), 255), (101, 101, 101))))
+    seen = view(scene(dict(white), uri))
+    np.testing.assert_allclose(seen.color[12, 16].astype(int), expected.color[12, 16], atol=2)
+
+
+def test_white_that_faces_up_is_not_clipped(opengl, scene):
+    file = scene({"pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 1]}})
+    # Turns the square from x = 2 m to y = 2 m, up in the file.
+    document = json.loads(file.read_text())
+    document["nodes"][1] = {"mesh": 1, "rotation": [0, 0, np.sqrt(0.5), np.sqrt(0.5)]}
+    file.write_text(json.dumps(document))
+    below = MeshRenderer(file, "y", SKY).render(
+        look_along(np.array([0, 0, 4.0]), 0.0, -np.pi / 2 + 1e-3), K, 32, 24
+    )
+    assert 230 < below.color[12, 16].min() <= below.color[12, 16].max() < 255
+
+
+@pytest.mark.parametrize(
+    ("scale", "remedy"),
+    [
+        (1000.0, "set scale=0.01 if it is in centimeters, or scale=0.001 if it is in millimeters"),
+        (0.01, "set scale=1000 if it is in kilometers"),
+    ],
+)
+def test_extent_of_no_environment_is_refused(scene, scale, remedy):
+    file = scene({})
+    document = json.loads(file.read_text())
+    for node in document["nodes"]:
+        node["scale"] = 3 * [scale]
+    file.write_text(json.dumps(document))
+    with pytest.raises(ValueError, match="the longest side must be in") as error:
+        mesh_distance(file, "y", 0.1)
+    assert remedy in str(error.value)
+
+
+def test_scale_is_the_unit_of_the_file(opengl, scene):
+    file = scene({})
+    assert sides(MeshRenderer(file, "y", SKY, 2.0).render(X_WC, K, 32, 24))[0][1] == pytest.approx(
+        2 * QUAD, abs=1e-3
+    )
+    esdf = mesh_distance(file, "y", 0.1, 2.0)
+    assert esdf.distance(np.array([4.5, 0, 0])) == pytest.approx(0.5, abs=0.1)
+
+
+def test_compressed_mesh_is_refused_with_a_remedy(scene):
+    file = scene({})
+    document = json.loads(file.read_text())
+    document["extensionsRequired"] = ["EXT_meshopt_compression"]
+    file.write_text(json.dumps(document))
+    with pytest.raises(ValueError, match=r"without EXT_meshopt_compression, got .*; deco"):
+        view(file)
+
+
+@pytest.mark.parametrize("name", ["wall.glb", "wall.obj", "wall.GLB"])
 def test_vertex_colors_are_rendered(opengl, tmp_path, name):
     p, _, triangles = square(WALL, 4.0)
     red = np.full((4, 4), [255, 0, 0, 255], np.uint8)
     trimesh.Trimesh(p, triangles, process=False, vertex_colors=red).export(tmp_path / name)
-    up = "y" if name.endswith("glb") else "z"
-    color = MeshRenderer(tmp_path / name, up, SKY).frame(X_WC, K, 32, 24).image[12, 16]
+    up = "y" if name.lower().endswith("glb") else "z"
+    color = MeshRenderer(tmp_path / name, up, SKY).render(X_WC, K, 32, 24).color[12, 16]
     assert is_red(color)
 
 
