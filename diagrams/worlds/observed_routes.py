@@ -208,8 +208,8 @@ class _Search:
 
     def infeasible(self, limit: float) -> InfeasibleFlightError:
         return InfeasibleFlightError(
-            f"the unobserved pixels of a camera along a route of at least {self._min_length:g} m in "
-            f"{self._name} must be at most {limit:.0%} on average, but no such route was found; "
+            f"the unobserved pixels of a camera along a route in {self._name}, at least "
+            f"{self._min_length:g} m long, must be at most {limit:.0%} on average, but no such route was found; "
             f"the best single view has {self._table.min(initial=1.0):.0%}: capture more of the "
             "scene, or raise max_unobserved"
         )
