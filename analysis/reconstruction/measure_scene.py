@@ -294,10 +294,14 @@ def unseen_fraction(scene: Path) -> float | None:
         return None
     if not toa.is_reachable(world.p_WS):
         return None
+    if world.observations is None and not metadata.frontier:
+        return 0.0
     # Points beyond the goal are the goal, without direction.
     reach = float(toa.value(world.p_WS))  # [m] at 1 m/s, at least the length of the route
     points, directions = toa.path(world.p_WS, np.linspace(0.0, reach, 8 * _POSES))
     before = np.flatnonzero(np.linalg.norm(directions[:, :2], axis=1) > 0.0)
+    if not len(before):
+        return None
     chosen = before[np.linspace(0, len(before) - 1, _POSES).astype(int)]
     views = ObservedViews(world)
     yaws = np.arctan2(directions[chosen, 1], directions[chosen, 0])

@@ -133,8 +133,8 @@ def choose_observed_route(
 
 
 def choose_default_route(world: World) -> ObservedRoute:
-    """Chooses nearly the longest observed route or, if that is shorter than `LONG_ENOUGH`, one of
-    that length with nearly the smallest unobserved fraction, or else the longest route.
+    """Chooses nearly the longest observed route or, if that is shorter than `LONG_ENOUGH`, a long
+    one with nearly the smallest unobserved fraction. The world needs a table of views.
 
     Raises:
         InfeasibleFlightError: if there is no route of `SHORTEST`.
@@ -142,7 +142,7 @@ def choose_default_route(world: World) -> ObservedRoute:
     search = _Search(world, SHORTEST)
     observed = search.longest(MAX_UNOBSERVED)
     if observed is None or observed.length < LONG_ENOUGH:
-        return search.best() or observed or search.longest(1.0) or search.fallback()
+        return search.best() or observed or search.fallback()
     return observed
 
 
@@ -193,11 +193,11 @@ class _Search:
         return None
 
     def best(self) -> ObservedRoute | None:
-        """Returns a route of `LONG_ENOUGH` with nearly the smallest unobserved fraction."""
-        routes = []
+        """Returns a long route with nearly the smallest unobserved fraction."""
+        routes, least = [], min(LONG_ENOUGH, 0.6 * self._part.length)
         for start in self._starts(1.0, np.random.default_rng(0)):
             tree = _Tree(self, start)
-            fractions = np.where(tree.goals >= LONG_ENOUGH, tree.unobserved, np.inf)
+            fractions = np.where(tree.goals >= least, tree.unobserved, np.inf)
             if np.isfinite(fractions).any():
                 routes.append(self._route(tree, int(np.argmin(fractions))))
         return min(routes, key=lambda route: route.unobserved, default=None)
@@ -241,9 +241,7 @@ class _Tree:
             return_predecessors=True,
         )
         self.start = start
-        self.before = np.where(
-            before < 0, start, before
-        )  # of each node on the route from the start
+        self.before = np.where(before < 0, start, before)  # of each node, towards the start
         self.lengths = np.where(np.isfinite(lengths), lengths, -1.0)  # [m]
         self.goals = np.where(search._open, self.lengths, -1.0)  # [m]
         step = search._p_WN - search._p_WN[self.before]

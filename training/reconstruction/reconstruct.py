@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from splatpilot.diagrams.worlds.feasibility import short_route_warning
+from splatpilot.diagrams.worlds.feasibility import choose_start_and_goal, short_route_warning
 from splatpilot.diagrams.worlds.observed_routes import (
     MAX_UNOBSERVED,
     ObservedRoute,
@@ -28,6 +28,7 @@ from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.common.torch_device import one_torch_thread
 from splatpilot.systems.splats.scene import GaussianScene
+from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 from splatpilot.training.captures.capture import Capture, shrink_factor
 from splatpilot.training.captures.render import RECIPE, rendered_world
 from splatpilot.training.reconstruction.checkpoint import Checkpoint
@@ -267,8 +268,12 @@ def with_default_route(
         gaussians = world.gaussians.merged_with(frontier)
         shown = replace(world, gaussians=gaussians, num_frontier=len(frontier))
     try:
-        shown = with_views(shown)
-        route = choose_default_route(shown)
+        if shown.observations is None:
+            ends = choose_start_and_goal(shown.esdf, VEHICLE_RADIUS)
+            route = ObservedRoute(*ends, float("nan"))
+        else:
+            shown = with_views(shown)
+            route = choose_default_route(shown)
     except InfeasibleFlightError as error:
         return world, route, (f"this scene cannot be flown in: {error}",)
     warnings = [short_route_warning(route.length)]
