@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.math import RigidTransform, RollPitchYaw
 from scipy.sparse.csgraph import dijkstra
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from splatpilot.diagrams.worlds.feasibility import CLEARANCE, LONG_ENOUGH, SHORTEST, longest_part
 from splatpilot.diagrams.worlds.world import World
@@ -82,14 +82,14 @@ class ObservedViews:
 
 
 def with_views(world: World) -> World:
-    """Returns a world whose observations have a table of views in its flyable space."""
+    """Returns a world whose observations have a table of views in its flyable space.
+
+    Raises:
+        InfeasibleFlightError: if there is no such space.
+    """
     if world.observations is None:
         return world
-    try:
-        part = longest_part(world.esdf, VEHICLE_RADIUS)
-    except InfeasibleFlightError:
-        return world
-    points, spacing = part.p_WN, _MIN_SPACING
+    points, spacing = longest_part(world.esdf, VEHICLE_RADIUS).p_WN, _MIN_SPACING
     while True:
         cells = np.round(points / spacing).astype(int)
         first = np.sort(np.unique(cells, axis=0, return_index=True)[1])
@@ -161,7 +161,7 @@ class _Search:
         typical = float(np.median(clearance[self._part.nodes]))
         self._open = clearance >= min(CLEARANCE, typical)
         self._table = observations.unobserved
-        points = cKDTree(observations.view_points)
+        points = KDTree(observations.view_points)
         self._row = np.asarray(points.query(self._p_WN)[1])  # of the table, for each node
 
     def longest(self, limit: float) -> ObservedRoute | None:
@@ -194,10 +194,10 @@ class _Search:
 
     def best(self) -> ObservedRoute | None:
         """Returns a long route with nearly the smallest unobserved fraction."""
-        routes, least = [], min(LONG_ENOUGH, 0.6 * self._part.length)
-        for start in self._starts(1.0, np.random.default_rng(0)):
-            tree = _Tree(self, start)
-            fractions = np.where(tree.goals >= least, tree.unobserved, np.inf)
+        routes, least = [], min(LONG_ENOUGH, 0.8 * self._part.length)
+        for start in np.random.default_rng(0).permutation(self._part.nodes)[: 4 * _STARTS]:
+            tree = _Tree(self, int(start))
+            fractions = np.where(tree.lengths >= least, tree.unobserved, np.inf)
             if np.isfinite(fractions).any():
                 routes.append(self._route(tree, int(np.argmin(fractions))))
         return min(routes, key=lambda route: route.unobserved, default=None)
@@ -209,7 +209,8 @@ class _Search:
     def infeasible(self, limit: float) -> InfeasibleFlightError:
         return InfeasibleFlightError(
             f"the unobserved pixels of a camera along a route in {self._name}, at least "
-            f"{self._min_length:g} m long, must be at most {limit:.0%} on average, but no such route was found; "
+            f"{self._min_length:g} m long, must be at most {limit:.0%} on average, "
+            "but no such route was found; "
             f"the best single view has {self._table.min(initial=1.0):.0%}: capture more of the "
             "scene, or raise max_unobserved"
         )
