@@ -82,14 +82,14 @@ class ObservedViews:
 
 
 def with_views(world: World) -> World:
-    """Returns a world whose observations have a table of views in its flyable space."""
+    """Returns a world whose observations have a table of views in its flyable space.
+
+    Raises:
+        InfeasibleFlightError: if there is no such space.
+    """
     if world.observations is None:
         return world
-    try:
-        part = longest_part(world.esdf, VEHICLE_RADIUS)
-    except InfeasibleFlightError:
-        return world
-    points, spacing = part.p_WN, _MIN_SPACING
+    points, spacing = longest_part(world.esdf, VEHICLE_RADIUS).p_WN, _MIN_SPACING
     while True:
         cells = np.round(points / spacing).astype(int)
         first = np.sort(np.unique(cells, axis=0, return_index=True)[1])
@@ -194,10 +194,10 @@ class _Search:
 
     def best(self) -> ObservedRoute | None:
         """Returns a long route with nearly the smallest unobserved fraction."""
-        routes, least = [], min(LONG_ENOUGH, 0.6 * self._part.length)
-        for start in self._starts(1.0, np.random.default_rng(0)):
-            tree = _Tree(self, start)
-            fractions = np.where(tree.goals >= least, tree.unobserved, np.inf)
+        routes, least = [], min(LONG_ENOUGH, 0.8 * self._part.length)
+        for start in np.random.default_rng(0).permutation(self._part.nodes)[: 4 * _STARTS]:
+            tree = _Tree(self, int(start))
+            fractions = np.where(tree.lengths >= least, tree.unobserved, np.inf)
             if np.isfinite(fractions).any():
                 routes.append(self._route(tree, int(np.argmin(fractions))))
         return min(routes, key=lambda route: route.unobserved, default=None)
