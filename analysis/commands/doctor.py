@@ -29,6 +29,7 @@ _USES = {
     "train": "training, reconstruction and metrics of scenes",
     "ros": "captures in ROS bags",
     "spz": "Gaussians in SPZ of version 4",
+    "usd": "Gaussians in USD",
 }
 """The use of each extra."""
 

@@ -150,11 +150,11 @@ class _Search:
     """Shortest routes of free space, and the fraction of unobserved pixels along them."""
 
     def __init__(self, world: World, least: float) -> None:
+        self._name, self._min_length = world.name, least
+        self._part = longest_part(world.esdf, VEHICLE_RADIUS, least=least)
         observations = world.observations
         assert observations is not None and len(observations.view_points)
-        self._name, self._min_length = world.name, least
         self._views = ObservedViews(world)
-        self._part = longest_part(world.esdf, VEHICLE_RADIUS, least=least)
         self._p_WN = self._part.p_WN
         clearance = world.esdf.distance(self._p_WN)
         # Ends keep off surfaces, or a flight would end with a view of one.

@@ -47,7 +47,7 @@ def test_folder_of_data_adds_entries(tmp_path):
 
 @pytest.fixture
 def data(tmp_path):
-    mesh = trimesh.creation.box((14.0, 8.0, 3.0))
+    mesh = trimesh.creation.box((7.0, 5.0, 3.0))
     mesh.invert()
     (tmp_path / "data/worlds").mkdir(parents=True)
     mesh.export(tmp_path / "data/worlds/room.obj", include_normals=True)
@@ -55,10 +55,10 @@ def data(tmp_path):
         "render.up=z",
         "render.width=64",
         "render.height=48",
-        "render.path=[[-5, 0, 0], [5, 0, 0]]",
+        "render.path=[[-2, 0, 0], [2, 0, 0]]",
         "render.yaws=[0, 90, 180, -90]",
         "image_width=0",
-        "initial_gaussians=37000",
+        "initial_gaussians=20000",
     )
     entry = {"source": "worlds/room.obj", "split": "test", "settings": settings}
     (tmp_path / "data/environments.yaml").write_text(json.dumps({"room": entry}))
@@ -76,7 +76,7 @@ def test_an_environment_is_made_measured_recorded_and_shown(opengl, data, tmp_pa
     assert record.feasible_seeds == 20 and record.reason == ""
     assert record.psnr_db and record.fidelity_bound is not None
     assert record.flown_depth_mae_m is not None and record.flown_depth_mae_m < 0.5
-    np.testing.assert_allclose(record.size, [14, 8, 3], atol=1.5)
+    np.testing.assert_allclose(record.size, [7, 5, 3], atol=1.5)
 
     written = (room / "gaussians.ply").read_bytes()
     capsys.readouterr()

@@ -53,8 +53,9 @@ def read_polycam(path: Path, config: CaptureConfig) -> Capture:
     pattern = r"(\d+)\.json"
     cameras = frames.numbered_files(folder / f"{prefix}cameras", pattern)
     dropped = []
-    if prefix and (folder / "cameras").is_dir():
-        raw = frames.numbered_files(folder / "cameras", pattern)
+    raw_folder = folder / "cameras"
+    if prefix and raw_folder.is_dir() and any(raw_folder.iterdir()):
+        raw = frames.numbered_files(raw_folder, pattern)
         if alone := len(raw.keys() - cameras.keys()):
             dropped = [f"{folder}: {alone} of {len(raw)} keyframes have no corrected camera"]
     return frames.open_frames(

@@ -249,6 +249,8 @@ def make_initial_gaussians(
         try:
             points = points or triangulate(capture, getattr(frames, "numbers", range(len(capture))))
         except (ValueError, ModuleNotFoundError) as error:
+            if capture.has_depth:  # points were chosen
+                raise
             say(f"{error}; starting from random points")
         if points is not None:
             return gaussians_from_points(points.p_WQ, points.colors)

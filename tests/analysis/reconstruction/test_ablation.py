@@ -80,6 +80,7 @@ def make_metrics(psnr: float, mae: float, floaters: float) -> SceneMetrics:
         psnr_on_black_db=psnr - 1,
         ssim=0.9,
         lpips=None,
+        lpips_vgg=None,
         depth_mae_m=mae,
         depth_relative=mae / 2,
         floater_fraction=floaters,
@@ -87,7 +88,7 @@ def make_metrics(psnr: float, mae: float, floaters: float) -> SceneMetrics:
         unseen_fraction=0.0,
         gain=1.0,
     )
-    return SceneMetrics(True, 8, 8, {0: view}, {0: view}, "none", None)
+    return SceneMetrics(True, 8, 8, 8, 8, {0: view}, {0: view}, "none", None)
 
 
 def test_means_and_spreads():

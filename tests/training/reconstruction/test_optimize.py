@@ -179,7 +179,9 @@ def test_scene_of_unknown_scale_cannot_be_flown_in(tmp_path, room):
 
 
 def test_initialization_that_the_capture_does_not_have(tmp_path, room):
-    with pytest.raises(ValueError, match="must be depth or random for room, got points"):
+    with pytest.raises(
+        ValueError, match="number of points between its images must be at least 100"
+    ):
         fit(read_capture(room), tmp_path / "scene", initialization="points")
     assert not (tmp_path / "scene").exists()
 
