@@ -88,7 +88,7 @@ def make_metrics(psnr: float, mae: float, floaters: float) -> SceneMetrics:
         unseen_fraction=0.0,
         gain=1.0,
     )
-    return SceneMetrics(True, 8, 8, 8, 8, {0: view}, {0: view}, "none", None)
+    return SceneMetrics(True, 8, 8, {0: view}, 8, 8, {0: view}, "none", None)
 
 
 def test_means_and_spreads():
