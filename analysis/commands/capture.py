@@ -118,8 +118,8 @@ def _points(text: str) -> list[list[float]]:
     ),
 )
 def render(options: argparse.Namespace) -> None:
-    """Writes a TartanAir V1 sequence. Without --path the camera visits all free space between the
-    heights."""
+    """Writes a TartanAir V1 sequence. Without --path, poses are planned that see each surface
+    around the free space from several directions."""
     cli.announce(f"rendering {options.world} to {options.out}")
     from splatpilot.training.captures import render
 
