@@ -19,7 +19,7 @@ _OUT = cli.out_option("folder of scenes (default: $SPLATPILOT_SCENES, or scenes)
     ),
     _OUT,
     cli.set_option(
-        *("iterations=3000", "render.spacing=1"),
+        *("iterations=3000", "render.max_frames=100"),
         configuration="splatpilot.analysis.reconstruction.run:RenderedSceneConfig",
     ),
     cli.json_option("the records"),
