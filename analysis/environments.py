@@ -30,6 +30,7 @@ from splatpilot.analysis.reconstruction.measure_scene import (
 from splatpilot.analysis.reconstruction.run import RenderedSceneConfig
 from splatpilot.diagrams.flight.flight_diagram import MakeCamera
 from splatpilot.diagrams.flight.scenario import Scenario, sample_initial_state
+from splatpilot.diagrams.scenarios import benchmark_scenarios
 from splatpilot.diagrams.worlds.octomap_world import OCTOMAP, OctomapConfig
 from splatpilot.diagrams.worlds.scene_folder import (
     SceneConfig,
@@ -270,7 +271,7 @@ def _store(scenes: Path, record: Record) -> None:
 
 def _source(entry: Entry, data: Path | None) -> Path | str:
     """Returns the path of a capture, mesh or OctoMap, or the name of a scenario."""
-    if "/" not in entry.source and Path(entry.source).suffix == "" and entry.source[:1].isupper():
+    if entry.source in benchmark_scenarios():
         return entry.source
     if data is None:
         raise ValueError(f"No folder with {entry.source}; give --data or set {DATA}")
@@ -403,10 +404,11 @@ def _write_sheet(path: Path, records: Sequence[Record], scenes: Path) -> None:
     panels: list[Panel | None] = []
     for record in Progress(records, "contact sheet", unit="view", leave=False):
         panels += _panels(record, scenes)
-    per_row = 2 * _COLUMNS
+    columns = min(_COLUMNS, len(records))
+    per_row = 2 * columns
     panels += [None] * (-len(panels) % per_row)
     rows = [panels[k : k + per_row] for k in range(0, len(panels), per_row)]
-    write_grid(path, rows, ["color", "depth"] * _COLUMNS, [""] * len(rows))
+    write_grid(path, rows, ["color", "depth"] * columns, [""] * len(rows))
 
 
 def _panels(record: Record, scenes: Path) -> list[Panel]:
@@ -419,4 +421,4 @@ def _panels(record: Record, scenes: Path) -> list[Panel]:
         X_WB = RigidTransform(world.p_WS)
     view = MakeCamera(Scenario(), world).render(X_WB)
     depth = colorize(view.depth, depth_scale([view.depth]), view.depth > 0)
-    return [Panel(view.color, record.name), Panel(depth, f"{record.split}")]
+    return [Panel(view.color, record.name), Panel(depth, record.split)]

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 from pydrake.systems.sensors import ImageDepth32F
 
-from splatpilot.diagrams.flight.flight import fly
 from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.flight.sensors import make_onboard_camera
+from splatpilot.diagrams.flight.simulation import fly
 from splatpilot.diagrams.scenarios import benchmark_scenarios, scenario_file
 from splatpilot.diagrams.worlds.solids.solid import WorldSpec
 from splatpilot.diagrams.worlds.solids.surfaces import merge

@@ -1,13 +1,7 @@
 from .analysis.benchmark.run_study import study
-from .diagrams.flight.flight import (
-    Flight,
-    FlightError,
-    fly,
-    fly_all,
-    make_flight_simulator,
-)
 from .diagrams.flight.flight_diagram import (
     AddFlight,
+    AddSplatWorld,
     BuildFlightDiagram,
     ExportFlight,
     FlightParts,
@@ -20,8 +14,14 @@ from .diagrams.flight.monte_carlo import random_flights
 from .diagrams.flight.policies import policy_named, register_policy
 from .diagrams.flight.scenario import Scenario, sample_initial_state, sample_scenario
 from .diagrams.flight.sensors import register_sensor
+from .diagrams.flight.simulation import (
+    Flight,
+    FlightError,
+    fly,
+    fly_all,
+    make_flight_simulator,
+)
 from .diagrams.worlds.moving_spheres import MovingSphere
-from .diagrams.worlds.splat_world import AddSplatWorld
 from .diagrams.worlds.world import World
 from .diagrams.worlds.world_registry import make_world, register_world
 from .systems.collision.distance_field import FieldState

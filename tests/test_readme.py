@@ -5,7 +5,7 @@ import sys
 import tomllib
 from pathlib import Path
 
-from splatpilot.diagrams.flight.flight import Outcome
+from splatpilot.diagrams.flight.simulation import Outcome
 
 README = Path(__file__).parents[1] / "README.md"
 

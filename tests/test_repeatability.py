@@ -9,7 +9,7 @@ _FLY = """
 import functools
 import json
 from splatpilot.analysis.benchmark.rollout import digest
-from splatpilot.diagrams.flight.flight import fly
+from splatpilot.diagrams.flight.simulation import fly
 from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
 from splatpilot.diagrams.flight.policies import policy_named
 from splatpilot.diagrams.flight.scenario import Scenario

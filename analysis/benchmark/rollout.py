@@ -19,7 +19,6 @@ from splatpilot import _native
 from splatpilot.analysis.benchmark.study import RolloutSpec
 from splatpilot.analysis.benchmark.variants import ScenarioVariant
 from splatpilot.analysis.difficulty import Difficulty, world_difficulty
-from splatpilot.diagrams.flight.flight import Flight, decision_times, fly
 from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
 from splatpilot.diagrams.flight.monitor import LOG_PERIOD, Outcome
 from splatpilot.diagrams.flight.policies import POLICIES
@@ -29,6 +28,7 @@ from splatpilot.diagrams.flight.scenario import (
     sample_scenario,
     start_position,
 )
+from splatpilot.diagrams.flight.simulation import Flight, decision_times, fly
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.common.config import dump_config, is_configuration, parse_config

@@ -50,7 +50,6 @@ from splatpilot.diagrams.flight.scenario import (
 )
 from splatpilot.diagrams.worlds.appearance import randomize_appearance
 from splatpilot.diagrams.worlds.moving_spheres import add_moving_spheres
-from splatpilot.diagrams.worlds.splat_world import AddSplatWorld
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.common.drake import connect
 from splatpilot.systems.common.provenance import InfeasibleFlightError
@@ -59,6 +58,7 @@ from splatpilot.systems.policies.teleop import Teleop
 from splatpilot.systems.sensing.latency import FrameTimes
 from splatpilot.systems.splats.background import Background, mean_color
 from splatpilot.systems.splats.moving_bodies import MovingBodies
+from splatpilot.systems.splats.render_engine import ObstacleGeometry, SplatRenderEngine
 from splatpilot.systems.splats.splat_camera import SplatCamera
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS, QuadrotorPlant
 from splatpilot.systems.vehicle.quadrotor_geometry import QuadrotorGeometry, quadrotor_gaussians
@@ -347,6 +347,24 @@ class DecisionInput(LeafSystem):
 
     def _calc(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(self.EvalVectorInput(context, 0).CopyToVector())
+
+
+def AddSplatWorld(
+    builder: DiagramBuilder,
+    scene_graph: SceneGraph,
+    world: World,
+    renderer_name: str = "splats",
+) -> None:
+    """Adds a renderer of the world's Gaussians, sky and moving obstacles to a SceneGraph.
+
+    Cameras of the renderer show the SceneGraph's shapes among the Gaussians, see
+    `SplatRenderEngine`. The world is static for contacts and distances of the SceneGraph.
+    """
+    engine = SplatRenderEngine(world.baked, background=world.background)
+    scene_graph.AddRenderer(renderer_name, engine)
+    if world.moving is not None:
+        name = f"{renderer_name}_obstacles"
+        ObstacleGeometry.AddToBuilder(builder, scene_graph, world.moving, name)
 
 
 def ExportFlight(builder: DiagramBuilder, parts: FlightParts) -> None:

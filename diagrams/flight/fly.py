@@ -13,14 +13,6 @@ import numpy as np
 from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Diagram
 
-from splatpilot.diagrams.flight.flight import (
-    FLIGHT_FILES,
-    Flight,
-    FlightError,
-    fly,
-    write_flight,
-    write_summary,
-)
 from splatpilot.diagrams.flight.flight_diagram import (
     BuildFlightDiagram,
     camera_info,
@@ -35,6 +27,14 @@ from splatpilot.diagrams.flight.scenario import (
     sample_initial_state,
     sample_scenario,
     start_position,
+)
+from splatpilot.diagrams.flight.simulation import (
+    FLIGHT_FILES,
+    Flight,
+    FlightError,
+    fly,
+    write_flight,
+    write_summary,
 )
 from splatpilot.diagrams.worlds.appearance import randomize_appearance
 from splatpilot.diagrams.worlds.moving_spheres import add_moving_spheres

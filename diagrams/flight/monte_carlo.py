@@ -8,9 +8,9 @@ from pydrake.common import RandomGenerator
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import System
 
-from splatpilot.diagrams.flight.flight import make_flight_simulator
 from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
 from splatpilot.diagrams.flight.scenario import Scenario, sample_scenario
+from splatpilot.diagrams.flight.simulation import make_flight_simulator
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.common.seeds import MONTE_CARLO_SEEDS

@@ -12,9 +12,9 @@ from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
 from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort
 
 from splatpilot.diagrams.flight import blocks
-from splatpilot.diagrams.flight.flight import record_flight, write_flight, write_summary
 from splatpilot.diagrams.flight.monitor import AddLogs, Outcome, flight_outcome, has_landed
 from splatpilot.diagrams.flight.scenario import Scenario, goal_position, sample_initial_state
+from splatpilot.diagrams.flight.simulation import record_flight, write_flight, write_summary
 from splatpilot.diagrams.hardware.bridge import HardwareConfig, image_codecs, require_messages_for
 from splatpilot.diagrams.hardware.real_time import MessagePorts, run_in_real_time
 from splatpilot.diagrams.worlds.appearance import randomize_appearance

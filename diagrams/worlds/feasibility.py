@@ -118,18 +118,18 @@ def choose_start_and_goal(
     radius: float,
     margin: float = 0.2,
     longest: float = 40.0,
-    least: float = SHORTEST,
+    min_length: float = SHORTEST,
     seed: int | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
     """Returns p_WS (3,), p_WG (3,) and the length of the shortest path between them, all in [m].
 
-    They are the ends of (nearly) the longest of all shortest paths, `least` to `longest` [m], of a
-    sphere of `radius` through known free space, with `margin` [m] to spare or half of that. Given a
-    seed, they are drawn: the start from the same part of free space, the goal from the nodes whose
+    They are the ends of (nearly) the longest of all shortest paths, `min_length` to `longest` [m],
+    of a sphere of `radius` through known free space, with `margin` [m] to spare or half of that.
+    Given a seed, they are drawn: the start from the same part of free space, the goal from the nodes whose
     shortest path is at least 60 % of that. After `_DRAWS` starts without such a goal, the start is
     an end of the longest path.
     """
-    part = longest_part(esdf, radius, margin, longest, least)
+    part = longest_part(esdf, radius, margin, longest, min_length)
     if seed is None:
         goal, length = _farthest(part.graph, part.end, longest)
         return part.p_WN[part.end], part.p_WN[goal], length
@@ -137,12 +137,12 @@ def choose_start_and_goal(
     for attempt in range(_DRAWS + 1):
         start = int(rng.choice(part.nodes)) if attempt < _DRAWS else part.end
         lengths = dijkstra(part.graph, directed=False, indices=start, limit=longest)
-        desired = max(0.6 * min(part.length, longest), least)
+        desired = max(0.6 * min(part.length, longest), min_length)
         far = np.flatnonzero(np.isfinite(lengths) & (lengths >= desired))
         if len(far):
             goal = int(rng.choice(far))
             return part.p_WN[start], part.p_WN[goal], float(lengths[goal])
-    raise _infeasible(esdf, radius, margin, part.length, least)
+    raise _infeasible(esdf, radius, margin, part.length, min_length)
 
 
 def short_route_warning(length: float) -> str:
@@ -156,10 +156,12 @@ def short_route_warning(length: float) -> str:
 
 
 def choose_ends(
-    esdf: Esdf, source: object, least: float = SHORTEST, seed: int | None = None
+    esdf: Esdf, source: object, min_length: float = SHORTEST, seed: int | None = None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Chooses p_WS and p_WG, or draws them; warns if the longest route of the `source` is short."""
-    p_WS, p_WG, length = choose_start_and_goal(esdf, VEHICLE_RADIUS, least=least, seed=seed)
+    p_WS, p_WG, length = choose_start_and_goal(
+        esdf, VEHICLE_RADIUS, min_length=min_length, seed=seed
+    )
     if seed is None and (warning := short_route_warning(length)):
         _log.warning("%s: %s", source, warning)
     return p_WS, p_WG
@@ -170,13 +172,13 @@ def longest_part(
     radius: float,
     margin: float = 0.2,
     longest: float = 40.0,
-    least: float = SHORTEST,
+    min_length: float = SHORTEST,
 ) -> _Part:
     """Returns the connected part of the free space with the longest path, up to `longest` [m]. Half
     of the margin is preferred for a path `_GAIN` times as long if one is not `LONG_ENOUGH`."""
     best, reach = None, 0.0
     for graph, p_WN, spacing in _free_graphs(esdf, radius, margin):
-        if best is not None and best.length >= max(LONG_ENOUGH, least):
+        if best is not None and best.length >= max(LONG_ENOUGH, min_length):
             break
         _, label = connected_components(graph, directed=False)
         sizes = np.bincount(label)
@@ -190,8 +192,8 @@ def longest_part(
             if length > reach:
                 best, reach = _Part(graph, p_WN, nodes, end, length), length
         reach *= _GAIN
-    if best is None or best.length < least:
-        raise _infeasible(esdf, radius, margin, 0.0 if best is None else best.length, least)
+    if best is None or best.length < min_length:
+        raise _infeasible(esdf, radius, margin, 0.0 if best is None else best.length, min_length)
     return best
 
 
@@ -224,13 +226,13 @@ def _free_graphs(
 
 
 def _infeasible(
-    esdf: Esdf, radius: float, margin: float, reach: float, least: float
+    esdf: Esdf, radius: float, margin: float, reach: float, min_length: float
 ) -> InfeasibleFlightError:
     largest = float(esdf.conservative().distances.max())
     return InfeasibleFlightError(
         f"the longest route of a vehicle of radius {radius} m with {margin / 2:g} m to spare must "
-        f"be at least {least:g} m, got {reach:.2f} m; the largest clearance is {largest:.2f} m, "
-        "and unknown space counts as occupied: capture more of the scene"
+        f"be at least {min_length:g} m, got {reach:.2f} m; the largest clearance is "
+        f"{largest:.2f} m, and unknown space counts as occupied: capture more of the scene"
     )
 
 

@@ -62,7 +62,7 @@ def mesh_world(config: MeshWorld, seed: int) -> World:
     path = find_data(Path(config.path), "a mesh")
     check_mesh(path, config.up)
     esdf = mesh_distance(path, config.up, config.voxel_size, config.scale)
-    drawn = {"least": config.min_path, "seed": seed} if config.draw_ends else {}
+    drawn = {"min_length": config.min_path, "seed": seed} if config.draw_ends else {}
     ends = choose_ends(esdf, config.path, **drawn)
     points, normals, colors, area = sample_colors(path, config.up, config.scale, _PREVIEW)
     extent = np.full((len(points), 2), _GAP * COVERAGE * np.sqrt(area / len(points)))
@@ -98,9 +98,11 @@ class MeshScene(BakedScene):
         moving: PlacedGaussians = NO_GAUSSIANS,
         distortion: Distortion | None = None,
         max_depth: float = np.inf,
+        with_color: bool = True,
     ) -> RenderedView:
         """Renders color and depth; see `BakedScene.render`. The background is that of the mesh."""
-        color, depth = self._images(K, width, height, X_WC, near, far, distortion, color=True)
+        span = max(near, _NEAR), min(far, _FAR)
+        color, depth = self._images(K, (width, height), X_WC, span, distortion, with_color)
         view = RenderedView((color / 255).astype(np.float32), depth, (depth > 0).astype(np.float32))
         if len(moving.means):
             camera = np.asarray(K, float), width, height, X_WC, near, far
@@ -111,39 +113,34 @@ class MeshScene(BakedScene):
 
     def render_depth(self, *camera: Any, **options: Any) -> NDArray[np.float32]:
         """Renders depth (H, W) [m]; see `BakedScene.render_depth`."""
-        if len(options.get("moving", NO_GAUSSIANS).means):
-            return self.render(*camera, **options).depth
-        max_depth = options.get("max_depth", np.inf)
-        distortion = options.get("distortion")
-        _, depth = self._images(*camera, distortion=distortion, color=False)
-        return np.where(depth <= max_depth, depth, np.float32(0))
+        return self.render(*camera, **options, with_color=False).depth
 
     def _images(
         self,
         K: ArrayLike,
-        width: int,
-        height: int,
+        size: tuple[int, int],
         X_WC: "RigidTransform",
-        near: float = 0.01,
-        far: float = 1e10,
-        distortion: Distortion | None = None,
-        *,
-        color: bool,
+        span: tuple[float, float],
+        distortion: Distortion | None,
+        with_color: bool,
     ) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Returns color (H, W, 3) and depth (H, W) [m], 0 without a surface."""
-        K = np.array(K, dtype=np.float64)
-        size, slopes = (width, height), None
+        """Returns color (H, W, 3), black if not asked, and depth (H, W) [m], 0 without a surface.
+
+        Args:
+            size: width and height [px].
+            span: smallest and largest depth [m].
+        """
+        K, slopes = np.array(K, dtype=np.float64), None
         if distortion is not None:
             # A pinhole camera around all rays of the lens, from which the image is resampled.
-            slopes = pixel_slopes(distortion, K, width, height)
+            slopes = pixel_slopes(distortion, K, *size)
             lower, upper = np.nanmin(slopes, axis=(0, 1)), np.nanmax(slopes, axis=(0, 1))
             widest = max(-lower.min(), upper.max())
             require(widest < _MAX_SLOPE, "slopes of rays in a mesh", f"< {_MAX_SLOPE}", widest)
             focal = K[[0, 1], [0, 1]]
             K[:2, 2] = 1 - focal * lower
             size = tuple(np.ceil(focal * (upper - lower) + 2).astype(int).tolist())
-        span = max(near, _NEAR), min(far, _FAR)
-        images = self._renderer.render(X_WC, K, *size, depth_range=span, with_color=color)
+        images = self._renderer.render(X_WC, K, *size, depth_range=span, with_color=with_color)
         seen = np.where(np.isfinite(images.depth), images.depth, np.float32(0))
         if slopes is None:
             return images.color, seen
@@ -151,8 +148,8 @@ class MeshScene(BakedScene):
         hidden = np.isnan(points[..., 0])
         points[hidden] = -1e6  # outside, where remap fills with 0
         u, v = np.ascontiguousarray(points[..., 0]), np.ascontiguousarray(points[..., 1])
-        resampled = cv2.remap(images.color, u, v, cv2.INTER_LINEAR) if color else images.color
-        return np.asarray(resampled), np.asarray(cv2.remap(seen, u, v, cv2.INTER_NEAREST))
+        color = cv2.remap(images.color, u, v, cv2.INTER_LINEAR)
+        return np.asarray(color), np.asarray(cv2.remap(seen, u, v, cv2.INTER_NEAREST))
 
 
 def _in_front(view: RenderedView, bodies: RenderedView) -> RenderedView:

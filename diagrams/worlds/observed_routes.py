@@ -113,17 +113,21 @@ class ObservedRoute:
 
 
 def choose_observed_route(
-    world: World, limit: float = MAX_UNOBSERVED, least: float = SHORTEST, seed: int | None = None
+    world: World,
+    limit: float = MAX_UNOBSERVED,
+    min_length: float = SHORTEST,
+    seed: int | None = None,
 ) -> ObservedRoute:
-    """Chooses a shortest route through known free space, at least `least` [m] long, along which the
-    mean fraction of pixels without an observed surface is at most `limit`.
+    """Chooses a shortest route through known free space, at least `min_length` [m] long.
 
-    Given a seed, start and goal are drawn. Otherwise the route is nearly the longest.
+    Along it the mean fraction of pixels without an observed surface is at most `limit`.
+
+    Given a seed, start and goal are drawn; otherwise the route is nearly the longest.
 
     Raises:
         InfeasibleFlightError: if no such route is found.
     """
-    search = _Search(world, least)
+    search = _Search(world, min_length)
     longest = search.longest(limit)
     if longest is None:
         raise search.infeasible(limit)
@@ -149,9 +153,9 @@ def choose_default_route(world: World) -> ObservedRoute:
 class _Search:
     """Shortest routes of free space, and the fraction of unobserved pixels along them."""
 
-    def __init__(self, world: World, least: float) -> None:
-        self._name, self._min_length = world.name, least
-        self._part = longest_part(world.esdf, VEHICLE_RADIUS, least=least)
+    def __init__(self, world: World, min_length: float) -> None:
+        self._name, self._min_length = world.name, min_length
+        self._part = longest_part(world.esdf, VEHICLE_RADIUS, min_length=min_length)
         observations = world.observations
         assert observations is not None and len(observations.view_points)
         self._views = ObservedViews(world)
@@ -169,8 +173,8 @@ class _Search:
         best = None
         for start in self._starts(limit, np.random.default_rng(0)):
             tree = _Tree(self, start)
-            least = self._min_length if best is None else np.nextafter(best.length, np.inf)
-            goals = np.flatnonzero((tree.goals >= least) & (tree.unobserved <= limit))
+            shortest = self._min_length if best is None else np.nextafter(best.length, np.inf)
+            goals = np.flatnonzero((tree.goals >= shortest) & (tree.unobserved <= limit))
             goals = goals[np.argsort(-tree.lengths[goals], kind="stable")]
             for goal in goals[:: max(len(goals) // _GOALS, 1)]:
                 route = self._route(tree, goal)
@@ -194,10 +198,10 @@ class _Search:
 
     def best(self) -> ObservedRoute | None:
         """Returns a long route with nearly the smallest unobserved fraction."""
-        routes, least = [], min(LONG_ENOUGH, 0.8 * self._part.length)
+        routes, enough = [], min(LONG_ENOUGH, 0.8 * self._part.length)
         for start in np.random.default_rng(0).permutation(self._part.nodes)[: 4 * _STARTS]:
             tree = _Tree(self, int(start))
-            fractions = np.where(tree.lengths >= least, tree.unobserved, np.inf)
+            fractions = np.where(tree.lengths >= enough, tree.unobserved, np.inf)
             if np.isfinite(fractions).any():
                 routes.append(self._route(tree, int(np.argmin(fractions))))
         return min(routes, key=lambda route: route.unobserved, default=None)

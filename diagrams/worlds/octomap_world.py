@@ -67,7 +67,7 @@ def octomap_world(config: OctomapConfig, seed: int) -> World:
             f"{path}: no space from {lower_W} to {upper_W} m is known to be free; choose another "
             "map, or another part of it by world.lower and world.upper"
         )
-    drawn = {"least": config.min_path, "seed": seed} if config.draw_ends else {}
+    drawn = {"min_length": config.min_path, "seed": seed} if config.draw_ends else {}
     ends = choose_ends(esdf, config.path, **drawn)
     hour = Daylight.sample(np.random.default_rng([seed, 1]))
     name, haze = Path(config.path).stem, tuple(hour.haze.tolist())

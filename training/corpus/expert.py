@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from splatpilot.diagrams.flight.flight import Outcome, fly
 from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
 from splatpilot.diagrams.flight.policies import policy_named
 from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.flight.simulation import Outcome, fly
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.common.provenance import InfeasibleFlightError

@@ -17,10 +17,10 @@ from typing import Any
 
 import numpy as np
 
-from splatpilot.diagrams.flight.flight import fly
 from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
 from splatpilot.diagrams.flight.policies import policy_named
 from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.flight.simulation import fly
 from splatpilot.systems.common.files import claim_folder, locks_folder, written_atomically
 from splatpilot.systems.common.processes import map_processes
 from splatpilot.systems.common.progress import Progress, resumable, say

@@ -16,8 +16,8 @@ from splatpilot.analysis.benchmark.run_study import fly_all
 from splatpilot.analysis.benchmark.study import StudyConfig
 from splatpilot.analysis.benchmark.study_folder import StudyFolder, keep_inputs, kept_flights
 from splatpilot.analysis.commands.main import main
-from splatpilot.diagrams.flight.flight import Flight, Outcome
 from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.flight.simulation import Flight, Outcome
 from splatpilot.diagrams.worlds.forest.layout import ForestConfig
 from splatpilot.systems.collision.esdf_build import esdf_from_distance_field
 from splatpilot.systems.collision.shapes import AnalyticDistanceField, Cylinder

@@ -8,11 +8,11 @@ from pydrake.common.value import Value
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import LeafSystem
 
-from splatpilot.diagrams.flight.flight import fly
 from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
 from splatpilot.diagrams.flight.policies import policy_named
 from splatpilot.diagrams.flight.scenario import Scenario, sample_initial_state
 from splatpilot.diagrams.flight.sensors import make_onboard_camera
+from splatpilot.diagrams.flight.simulation import fly
 from splatpilot.systems.sensing.noise import ObservationNoise
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.sensing.time_of_flight import equivalent_sensor, time_of_flight_grid

@@ -7,11 +7,11 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, EventStatus, LeafSystem
 from pydrake.systems.primitives import ConstantVectorSource, RandomSource
 
-from splatpilot.diagrams.flight.flight import Outcome, fly, fly_all, make_flight_simulator
 from splatpilot.diagrams.flight.flight_diagram import AddFlight, BuildFlightDiagram
 from splatpilot.diagrams.flight.monitor import AddFlightMonitor
 from splatpilot.diagrams.flight.policies import policy_named
 from splatpilot.diagrams.flight.scenario import Scenario, sample_initial_state
+from splatpilot.diagrams.flight.simulation import Outcome, fly, fly_all, make_flight_simulator
 from splatpilot.systems.vehicle.flatness import FlatnessController
 from splatpilot.systems.vehicle.quadrotor import QuadrotorPlant, hover_state
 

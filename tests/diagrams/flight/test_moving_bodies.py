@@ -9,10 +9,10 @@ from pydrake.geometry import Meshcat
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
-from splatpilot.diagrams.flight.flight import Outcome, fly, fly_all
 from splatpilot.diagrams.flight.flight_diagram import AddFlight, BuildFlightDiagram
 from splatpilot.diagrams.flight.policies import policy_named
 from splatpilot.diagrams.flight.scenario import Scenario, sample_initial_state
+from splatpilot.diagrams.flight.simulation import Outcome, fly, fly_all
 from splatpilot.diagrams.worlds.moving_spheres import MovingSphere
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.esdf_build import esdf_from_distance_field

@@ -8,7 +8,6 @@ from pydrake.geometry import Meshcat
 from pydrake.systems.primitives import ConstantVectorSource
 
 from splatpilot.diagrams.flight import policies
-from splatpilot.diagrams.flight.flight import Outcome, fly
 from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
 from splatpilot.diagrams.flight.policies import (
     BENCHMARK_POLICIES,
@@ -21,6 +20,7 @@ from splatpilot.diagrams.flight.policies import (
     register_policy,
 )
 from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.flight.simulation import Outcome, fly
 from splatpilot.systems.common.registry import Registry
 from splatpilot.systems.policies.checkpoint import PolicyCheckpoint
 from splatpilot.systems.policies.depthnav import DEPTHNAV_NETWORK, DepthNavConfig

@@ -16,10 +16,10 @@ from pydrake.lcm import DrakeLcm
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import LeafSystem
 
-from splatpilot.diagrams.flight.flight import fly
 from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
 from splatpilot.diagrams.flight.policies import policy_named
 from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.flight.simulation import fly
 from splatpilot.diagrams.hardware import bridge
 from splatpilot.diagrams.hardware.bridge import BuildHardwareDiagram, HardwareConfig
 from splatpilot.diagrams.hardware.vehicle import BuildVehicleDiagram

@@ -92,10 +92,10 @@ def test_space_too_narrow_for_a_route_is_refused(upper, choose):
 def test_drawn_ends_keep_the_minimum_distance(seed):
     esdf = corridors(ALONG_X, ALONG_Y)
     _, _, longest = choose_start_and_goal(esdf, RADIUS)
-    _, _, length = choose_start_and_goal(esdf, RADIUS, least=0.8 * longest, seed=seed)
+    _, _, length = choose_start_and_goal(esdf, RADIUS, min_length=0.8 * longest, seed=seed)
     assert 0.8 * longest <= length <= longest + 1e-9
     with pytest.raises(InfeasibleFlightError, match=r"at least 50 m, got \d\.\d+ m"):
-        choose_start_and_goal(esdf, RADIUS, least=50.0, seed=seed)
+        choose_start_and_goal(esdf, RADIUS, min_length=50.0, seed=seed)
 
 
 def test_a_net_of_wires_between_grid_points_blocks_the_path():

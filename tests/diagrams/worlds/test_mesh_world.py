@@ -5,10 +5,10 @@ import pytest
 import trimesh
 from pydrake.math import RigidTransform
 
-from splatpilot.diagrams.flight.flight import fly
 from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
 from splatpilot.diagrams.flight.monitor import Outcome
 from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.flight.simulation import fly
 from splatpilot.diagrams.worlds.mesh_world import MeshWorld
 from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.common.config import load_config

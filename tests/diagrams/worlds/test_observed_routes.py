@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
-from splatpilot.diagrams.flight.flight import unobserved_fraction
 from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.flight.simulation import unobserved_fraction
 from splatpilot.diagrams.worlds.observed_routes import (
     ObservedViews,
     choose_default_route,

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from splatpilot.diagrams.flight.flight import Outcome, fly
 from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
 from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.flight.simulation import Outcome, fly
 from splatpilot.diagrams.worlds.forest.forest import ForestConfig
 from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.collision.esdf_build import esdf_from_occupancy

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from splatpilot.diagrams.flight.flight import fly
+from splatpilot.diagrams.flight.simulation import fly
 from splatpilot.systems.common.config import load_config
 from splatpilot.systems.policies.checkpoint import checkpoint_policy
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from pydrake.systems.framework import EventStatus, LeafSystem
 
-from splatpilot.diagrams.flight.flight import FlightError, Outcome, fly
 from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
 from splatpilot.diagrams.flight.fly import flight_page
 from splatpilot.diagrams.flight.monitor import flight_outcome
 from splatpilot.diagrams.flight.policies import policy_named
 from splatpilot.diagrams.flight.scenario import Scenario, sample_initial_state
+from splatpilot.diagrams.flight.simulation import FlightError, Outcome, fly
 from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.policies.hypotheses import Hypotheses
