@@ -125,9 +125,9 @@ def choose_start_and_goal(
 
     They are the ends of (nearly) the longest of all shortest paths, `min_length` to `longest` [m],
     of a sphere of `radius` through known free space, with `margin` [m] to spare or half of that.
-    Given a seed, they are drawn: the start from the same part of free space, the goal from the nodes whose
-    shortest path is at least 60 % of that. After `_DRAWS` starts without such a goal, the start is
-    an end of the longest path.
+    Given a seed, they are drawn: the start from the same part of free space, the goal from the
+    nodes whose shortest path is at least 60 % of that. After `_DRAWS` starts without such a goal,
+    the start is an end of the longest path.
     """
     part = longest_part(esdf, radius, margin, longest, min_length)
     if seed is None:
