@@ -129,8 +129,11 @@ def sample_colors(
                 continue
             placed = mesh.copy().apply_transform(X_MN)
             number = max(round(count * scale**2 * placed.area / area), 1)
-            sampled: Any = trimesh.sample.sample_surface(placed, number, sample_color=True, seed=0)
-            points, face, colors = sampled
+            sampled: Any = trimesh.sample.sample_surface(
+                placed, number, return_barycentric=True, seed=0
+            )
+            points, face, weights = sampled
+            colors = _base_colors(mesh, face, weights)
             seen = colors[:, 3] >= 255 * _CUTOFF if _has_holes(mesh) else slice(None)
             normals = placed.face_normals[face]
             linear = (colors[:, :3] / 255.0) ** GAMMA
@@ -138,6 +141,22 @@ def sample_colors(
             parts[-1] = tuple(each[seen] for each in parts[-1])
     points, normals, colors = (np.concatenate(each) for each in zip(*parts, strict=True))
     return points, normals, colors, area
+
+
+def _base_colors(mesh: trimesh.Trimesh, face: NDArray, weights: NDArray) -> NDArray[np.float64]:
+    """Returns the colors (N, 4), 0 to 255, at barycentric coordinates (N, 3) of faces (N,)."""
+    visual: Any = mesh.visual
+    if not isinstance(visual, trimesh.visual.TextureVisuals):
+        return visual.face_colors[face].astype(float)
+    material = visual.material
+    factor = getattr(material, "baseColorFactor", None)
+    factor = np.full(4, 255.0) if factor is None else np.asarray(factor, float)
+    image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
+    if image is None or visual.uv is None:
+        plain = factor if hasattr(material, "baseColorFactor") else material.main_color
+        return np.tile(np.asarray(plain, float), (len(face), 1))
+    uv = np.einsum("nk,nkd->nd", weights, visual.uv[mesh.faces[face]])
+    return trimesh.visual.color.uv_to_interpolated_color(uv, image) * (factor / 255.0)
 
 
 def _has_holes(mesh: trimesh.Trimesh) -> bool:

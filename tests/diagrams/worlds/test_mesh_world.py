@@ -3,12 +3,14 @@ import pickle
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 from pydrake.math import RigidTransform
 
 from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
 from splatpilot.diagrams.flight.monitor import Outcome
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.flight.simulation import fly
+from splatpilot.diagrams.worlds.mesh import sample_colors
 from splatpilot.diagrams.worlds.mesh_world import MeshWorld
 from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.common.config import load_config
@@ -47,6 +49,20 @@ def test_distance_field_is_that_of_the_triangles(world):
     found = world.esdf.distance(p_WQ)
     np.testing.assert_allclose(found[:3], [1.0, 2.0, 1.0], atol=0.2)
     assert np.isnan(found[3])
+
+
+def test_viewers_show_the_colors_of_textures(tmp_path):
+    image = Image.fromarray(np.array([[[200, 0, 0], [0, 0, 200]]], np.uint8).repeat(4, axis=1))
+    material = trimesh.visual.material.PBRMaterial(baseColorTexture=image)
+    floor = trimesh.Trimesh([[0, 0, 0], [8, 0, 0], [8, 6, 0], [0, 6, 0]], [[0, 1, 2], [0, 2, 3]])
+    uv = [[0, 0], [1, 0], [1, 1], [0, 1]]
+    floor.visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
+    trimesh.Scene([floor]).export(tmp_path / "floor.glb")
+    points, _, colors, area = sample_colors(tmp_path / "floor.glb", "z", 1.0, 500)
+    assert area == pytest.approx(48.0)
+    red, blue = points[:, 0] < 3.0, points[:, 0] > 5.0
+    assert (colors[red, 0] > 0.4).all() and (colors[red, 2] < 0.01).all()
+    assert (colors[blue, 2] > 0.4).all() and (colors[blue, 0] < 0.01).all()
 
 
 def test_camera_shows_the_mesh(opengl, world):
