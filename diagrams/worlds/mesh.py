@@ -24,6 +24,7 @@ from scipy.ndimage import map_coordinates
 from trimesh.exchange.gltf import export_gltf
 from trimesh.resolvers import FilePathResolver
 from trimesh.visual import TextureVisuals
+from trimesh.visual.color import uv_to_interpolated_color
 from trimesh.visual.material import PBRMaterial
 
 from splatpilot.diagrams.worlds.splits import part_digests
@@ -146,7 +147,7 @@ def sample_colors(
 def _base_colors(mesh: trimesh.Trimesh, face: NDArray, weights: NDArray) -> NDArray[np.float64]:
     """Returns the colors (N, 4), 0 to 255, at barycentric coordinates (N, 3) of faces (N,)."""
     visual: Any = mesh.visual
-    if not isinstance(visual, trimesh.visual.TextureVisuals):
+    if not isinstance(visual, TextureVisuals):
         return visual.face_colors[face].astype(float)
     material = visual.material
     factor = getattr(material, "baseColorFactor", None)
@@ -155,8 +156,8 @@ def _base_colors(mesh: trimesh.Trimesh, face: NDArray, weights: NDArray) -> NDAr
     if image is None or visual.uv is None:
         plain = factor if hasattr(material, "baseColorFactor") else material.main_color
         return np.tile(np.asarray(plain, float), (len(face), 1))
-    uv = np.einsum("nk,nkd->nd", weights, visual.uv[mesh.faces[face]])
-    return trimesh.visual.color.uv_to_interpolated_color(uv, image) * (factor / 255.0)
+    uv = (weights[..., None] * visual.uv[mesh.faces[face]]).sum(axis=1)
+    return uv_to_interpolated_color(uv, image) * (factor / 255.0)
 
 
 def _has_holes(mesh: trimesh.Trimesh) -> bool:
