@@ -1,7 +1,7 @@
 """Blocks of flight diagrams: policy, controller and sensors, in simulation and on hardware."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -17,7 +17,8 @@ from splatpilot.systems.common.validation import require, require_type
 from splatpilot.systems.messaging.failsafe import FiniteVector
 from splatpilot.systems.policies.hypotheses import HypothesisSelector, num_hypotheses_in
 from splatpilot.systems.policies.velocity import VelocityTracker
-from splatpilot.systems.sensing.latency import DelayedPose, FrameTimes
+from splatpilot.systems.sensing.imaging import AutoExposure, Compression, DepthSensor
+from splatpilot.systems.sensing.latency import DecisionDelay, DelayedPose, FrameTimes
 from splatpilot.systems.sensing.noise import ColorNoise, DepthNoise
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.sensing.time_of_flight import TimeOfFlightGrid, equivalent_sensor
@@ -86,6 +87,7 @@ def AddPolicyAndController(
     controller: System | None = None,
     *,
     guarded: bool = False,
+    delay: Sequence[float] = (),
 ) -> Autonomy:
     """Adds the systems `policy`, `controller`, `selector` for hypotheses, and `velocity_tracker`
     for velocities. `ConnectObservation` must follow.
@@ -95,9 +97,16 @@ def AddPolicyAndController(
         policy, controller: see `AddFlight`.
         guarded: if a failsafe follows. `finite_target` replaces targets that are not finite by
             zeros, and `finite_heading` such headings by NaN.
+        delay: see `DecisionDelay`; adds `delayed_` and the name of each of the policy's outputs.
     """
     add_system(builder, "policy", policy)
-    target = _add_target(builder, scenario, state, policy)
+    decision, heading = _decision(policy), None
+    if policy.HasOutputPort("heading"):
+        heading = policy.GetOutputPort("heading")
+    if delay and delay[1] > 0.0:
+        decision = _add_delay(builder, policy, decision, delay, scenario.seed)
+        heading = heading and _add_delay(builder, policy, heading, delay, scenario.seed)
+    target = _add_target(builder, scenario, state, decision)
     if target.get_name() == "command":
         other = controller or guarded
         require(not other, "the policy's decision", "other than command", "command", _NO_COMMAND)
@@ -105,7 +114,7 @@ def AddPolicyAndController(
     controller = controller or FlatnessController(scenario.controller, scenario.vehicle)
     add_system(builder, "controller", controller)
     require_ports("controller", controller, inputs=["state"], outputs=["command"])
-    _connect_controller(builder, state, policy, target, controller, guarded)
+    _connect_controller(builder, state, target, heading, controller, guarded)
     return Autonomy(policy, controller, target, controller.GetOutputPort("command"))
 
 
@@ -119,18 +128,10 @@ def add_system(builder: DiagramBuilder, name: str, system: System) -> None:
         builder.AddNamedSystem(name, system)
 
 
-def _add_target(
-    builder: DiagramBuilder, scenario: Scenario, state: OutputPort, policy: System
-) -> OutputPort:
-    """Returns the policy's output; of hypotheses, the waypoint of the best."""
+def _decision(policy: System) -> OutputPort:
+    """Returns the policy's hypotheses or decision."""
     if policy.HasOutputPort("hypotheses"):
-        hypotheses = policy.GetOutputPort("hypotheses")
-        count = num_hypotheses_in(hypotheses.size())
-        selector = HypothesisSelector(count, scenario.controller.lookahead)
-        builder.AddNamedSystem("selector", selector)
-        builder.Connect(hypotheses, selector.GetInputPort("hypotheses"))
-        connect(builder, state, selector.GetInputPort("state"))
-        return selector.GetOutputPort("waypoint")
+        return policy.GetOutputPort("hypotheses")
     decisions = [name for name in DECISIONS if policy.HasOutputPort(name)]
     outputs = [policy.get_output_port(k).get_name() for k in range(policy.num_output_ports())]
     what = f"an output of the policy {type(policy).__name__}"
@@ -139,11 +140,38 @@ def _add_target(
     return policy.GetOutputPort(decisions[0])
 
 
+def _add_delay(
+    builder: DiagramBuilder, policy: System, output: OutputPort, delay: Sequence[float], seed: int
+) -> OutputPort:
+    update, name = policy.GetUniquePeriodicDiscreteUpdateAttribute(), output.get_name()
+    condition = "empty for a policy without a periodic discrete update"
+    require(update, "decision_delay", condition, delay, "declare one in the policy")
+    assert update is not None
+    system = DecisionDelay(name, output.size(), update.period_sec(), delay, seed)
+    builder.AddNamedSystem(f"delayed_{name}", system)
+    builder.Connect(output, system.get_input_port())
+    return system.get_output_port()
+
+
+def _add_target(
+    builder: DiagramBuilder, scenario: Scenario, state: OutputPort, decision: OutputPort
+) -> OutputPort:
+    """Returns the decision; of hypotheses, the waypoint of the best."""
+    if decision.get_name() != "hypotheses":
+        return decision
+    count = num_hypotheses_in(decision.size())
+    selector = HypothesisSelector(count, scenario.controller.lookahead)
+    builder.AddNamedSystem("selector", selector)
+    builder.Connect(decision, selector.GetInputPort("hypotheses"))
+    connect(builder, state, selector.GetInputPort("state"))
+    return selector.GetOutputPort("waypoint")
+
+
 def _connect_controller(
     builder: DiagramBuilder,
     state: OutputPort,
-    policy: System,
     target: OutputPort,
+    heading: OutputPort | None,
     controller: System,
     guarded: bool,
 ) -> None:
@@ -163,9 +191,9 @@ def _connect_controller(
     require_ports("controller", controller, inputs=["state", name], outputs=["command"])
     connect(builder, state, controller.GetInputPort("state"))
     connect(builder, source, controller.GetInputPort(name))
-    if policy.HasOutputPort("heading"):
-        heading = finite("finite_heading", policy.GetOutputPort("heading"), math.nan)
-        connect(builder, heading, controller.GetInputPort("heading"))
+    if heading is not None:
+        source = finite("finite_heading", heading, math.nan)
+        connect(builder, source, controller.GetInputPort("heading"))
 
 
 def ConnectObservation(
@@ -249,8 +277,9 @@ def AddObservation(
 ) -> dict[str, OutputPort]:
     """Adds `policy_camera` if images are named; it renders when the policy updates.
 
-    `delayed_pose`, `depth_noise` and `color_noise` apply the scenario's `observation`, and
-    `time_of_flight_grid` makes grids of depth. `policy_camera_start_pose` is for a rolling shutter.
+    `delayed_pose`, `depth_noise` and `color_noise` apply the scenario's `observation`;
+    `depth_sensor`, `auto_exposure` and `compression` its `imaging`. `time_of_flight_grid` makes
+    grids of depth. `policy_camera_start_pose` is for a rolling shutter and for motion blur.
 
     Returns:
         The images, by their names.
@@ -259,32 +288,51 @@ def AddObservation(
         return {}
 
     # Camera.
-    config, noise = policy_camera(scenario, policy), scenario.observation
+    nominal, noise, imaging = (
+        policy_camera(scenario, policy),
+        scenario.observation,
+        scenario.imaging,
+    )
+    config, exposure = imaging.camera(nominal), 0.0
+    if "color_image" in names:
+        exposure = imaging.exposure_time
     frames = FrameTimes.draw(noise, scenario.seed)
     age = frames.age if noise.is_late else 0.0
-    camera = builder.AddNamedSystem("policy_camera", make_onboard_camera(config, world, age))
-    _connect_start_pose(builder, "policy_camera", camera, config, state, frames)
+    camera = builder.AddNamedSystem(
+        "policy_camera", make_onboard_camera(config, world, age, exposure)
+    )
+    _connect_start_pose(builder, "policy_camera", camera, config, state, frames, exposure)
     if noise.is_late:
         pose = AddDelayedPose(builder, "delayed_pose", state, frames)
     builder.Connect(pose, camera.GetInputPort("body_pose"))
     rendered = {"depth_image_32f" if name == "depth_grid" else name for name in names}
     images = {name: camera.GetOutputPort(name) for name in sorted(rendered)}
 
-    # Noise.
-    for port, name, noise_type, active in (
-        ("depth_image_32f", "depth_noise", DepthNoise, noise.changes_depth),
-        ("color_image", "color_noise", ColorNoise, noise.changes_color),
-    ):
-        if port in images and active:
-            rate = 1 / decision_period(scenario, policy)
-            system = builder.AddNamedSystem(name, noise_type(noise, config, rate, scenario.seed))
+    # Sensor and noise.
+    period, is_grid = decision_period(scenario, policy), "depth_grid" in names
+    rest = config, 1 / period, scenario.seed
+    changes: list[tuple[str, System]] = []
+    if depth_sensor := imaging.depth_sensor(is_grid):
+        changes.append(("depth_sensor", DepthSensor(depth_sensor, *rest)))
+    if noise.changes_depth:
+        changes.append(("depth_noise", DepthNoise(noise, *rest)))
+    if imaging.changes_light:
+        changes.append(("auto_exposure", AutoExposure(imaging, config, period)))
+    if noise.changes_color:
+        changes.append(("color_noise", ColorNoise(noise, *rest)))
+    if imaging.jpeg_quality is not None:
+        changes.append(("compression", Compression(imaging, *rest)))
+    for name, system in changes:
+        port = system.get_input_port().get_name()
+        if port in images:
+            builder.AddNamedSystem(name, system)
             builder.Connect(images[port], system.get_input_port())
             images[port] = system.get_output_port()
 
     # Time of flight.
-    if "depth_grid" in names:
+    if is_grid:
         grid = builder.AddNamedSystem(
-            "time_of_flight_grid", TimeOfFlightGrid(equivalent_sensor(config))
+            "time_of_flight_grid", TimeOfFlightGrid(equivalent_sensor(nominal))
         )
         builder.Connect(images["depth_image_32f"], grid.GetInputPort("depth_image_32f"))
         images["depth_grid"] = grid.GetOutputPort("depth_grid")
@@ -311,13 +359,18 @@ def _connect_start_pose(
     config: SensorConfig,
     state: OutputPort,
     frames: FrameTimes,
+    exposure: float = 0.0,
 ) -> None:
-    """Connects a rolling shutter to the pose at the readout of the first row."""
+    """Connects a camera to the pose at the beginning of its first row's exposure."""
     if not camera.HasInputPort("start_pose"):
         return
     readout = getattr(config, "readout", 0.0)
     start = AddDelayedPose(
-        builder, f"{name}_start_pose", state, replace(frames, before=readout), min(0.02, readout)
+        builder,
+        f"{name}_start_pose",
+        state,
+        replace(frames, before=exposure + readout),
+        min(0.02, readout or 0.02),
     )
     builder.Connect(start, camera.GetInputPort("start_pose"))
 

@@ -48,6 +48,7 @@ from splatpilot.diagrams.flight.scenario import (
     sample_scenario,
     start_position,
 )
+from splatpilot.diagrams.flight.sensors import ESTIMATORS
 from splatpilot.diagrams.worlds.appearance import randomize_appearance
 from splatpilot.diagrams.worlds.moving_spheres import add_moving_spheres
 from splatpilot.diagrams.worlds.world import World
@@ -166,7 +167,8 @@ def AddFlight(
             `state` (13). Its default Context has the initial state, see `sample_initial_state`.
         controller: replaces `FlatnessController`: any system with the input `state`, that for the
             policy's output, and the output `command`.
-        estimator: makes the `state` (13) for policy and controller. Its inputs are any of `state`
+        estimator: replaces the scenario's; makes the `state` (13) for policy and controller. Its
+            inputs are any of `state`
             and `body_pose`, the true ones, `command`, `goal`, the policy's images and the outputs
             of sensors.
         camera: adds the scenario's camera.
@@ -205,16 +207,23 @@ def AddFlight(
     pose, collision = AddPoseAndCollision(builder, world, state)
     source = ConstantVectorSource(goal_position(scenario, world))
     goal = builder.AddNamedSystem("goal", source).get_output_port()
-    estimate = state
+    estimate, estimator_sensors = state, {}
+    if estimator is None:
+        estimator = ESTIMATORS.entry_for(scenario.estimator).build(
+            scenario.estimator, world, scenario
+        )
+        estimator_sensors = getattr(scenario.estimator, "sensors", {})
     if estimator is not None:
         add_system(builder, "estimator", estimator)
         require_ports("estimator", estimator, inputs=[], outputs=["state"])
         estimate = estimator.GetOutputPort("state")
 
     # Policy and controller.
-    sensors = onboard_sensors(scenario, policy)
+    sensors = onboard_sensors(scenario, policy) | estimator_sensors
     policy = policy or make_policy(scenario, world)
-    autonomy = AddPolicyAndController(builder, scenario, estimate, policy, controller)
+    autonomy = AddPolicyAndController(
+        builder, scenario, estimate, policy, controller, delay=scenario.decision_delay
+    )
     connect(builder, autonomy.command, plant.GetInputPort("command"))
 
     # Sensors.

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from functools import cache
 from math import inf
+from typing import ClassVar
 
 import numpy as np
 from pydrake.common.schema import Rotation, Transform
@@ -11,7 +12,8 @@ from pydrake.systems.analysis import GetIntegrationSchemes, SimulatorConfig
 from pydrake.systems.sensors import CameraConfig
 
 from splatpilot.diagrams.flight.policies import POLICIES, PolicyConfig
-from splatpilot.diagrams.flight.sensors import SENSORS, SensorConfig
+from splatpilot.diagrams.flight.sensors import ESTIMATORS, SENSORS, SensorConfig
+from splatpilot.diagrams.scenarios import profile_file
 from splatpilot.diagrams.worlds.forest.forest import ForestConfig
 from splatpilot.diagrams.worlds.moving_spheres import MovingSphere
 from splatpilot.diagrams.worlds.world import World
@@ -29,6 +31,8 @@ from splatpilot.systems.common.validation import (
     require_field,
 )
 from splatpilot.systems.policies.planner import PrivilegedPlannerConfig
+from splatpilot.systems.sensing.estimators import TrueState
+from splatpilot.systems.sensing.imaging import Imaging
 from splatpilot.systems.sensing.noise import ObservationNoise
 from splatpilot.systems.vehicle.flatness import FlatnessControllerConfig
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS, QuadrotorParams, hover_state
@@ -108,8 +112,19 @@ class Scenario(Config):
     moving: dict[str, MovingSphere] = field(default_factory=dict)
     # Noise and latency of the policy's camera; none by default.
     observation: ObservationNoise = field(default_factory=ObservationNoise)
+    # Image formation of the policy's camera; none by default.
+    imaging: Imaging = field(default_factory=Imaging)
+    # Estimator of the state for policy and controller: the true state, or (!VisualInertial, ...)
+    # another of the registry.
+    estimator: SensorConfig = registry_field(ESTIMATORS, TrueState)
+    # [s] Range from which the delay of each decision is drawn, for inference and link; none if
+    # empty.
+    decision_delay: list[float] = bounded(list, "[0, 1] s")
     controller: FlatnessControllerConfig = field(default_factory=FlatnessControllerConfig)
     simulator: SimulatorConfig = field(default_factory=_default_simulator)
+
+    OVERLAYS: ClassVar = {"profile": profile_file}
+    """Overrides that read several fields from a file, see `load_config`."""
 
     __eq__ = equal_by_fields
     __hash__ = None  # pyright: ignore
@@ -123,7 +138,7 @@ class Scenario(Config):
         if drawn is not self:
             drawn.validate()
             return
-        parts = [(WORLDS, self.world), (POLICIES, self.policy)]
+        parts = [(WORLDS, self.world), (POLICIES, self.policy), (ESTIMATORS, self.estimator)]
         for registry, part in [*parts, *((SENSORS, sensor) for sensor in self.sensors.values())]:
             registry.entry_for(part)
         try:
@@ -137,6 +152,10 @@ class Scenario(Config):
             point = getattr(self, name)
             valid = point is None or (len(point) == 3 and np.isfinite(point).all())
             require_field(self, name, valid, "three finite numbers x, y, z [m]")
+        delay = self.decision_delay
+        valid = not delay or (len(delay) == 2 and delay[0] <= delay[1])
+        require_field(self, "decision_delay", valid, "two numbers in ascending order, or empty")
+        _check_rates(self)
         _check_camera(self.camera)
         _check_simulator(self.simulator)
 
@@ -214,6 +233,18 @@ def _check_free(world: World, what: str, p_WQ: np.ndarray) -> None:
             f"{where} is {float(sample.distance):.3f} m from the nearest surface, but the "
             f"vehicle's radius is {VEHICLE_RADIUS} m; choose a point with more clearance"
         )
+
+
+def _check_rates(scenario: Scenario) -> None:
+    """Checks the times of estimator and exposure against those of the policy."""
+    rate, estimates = scenario.policy.rate, getattr(scenario.estimator, "rate", inf)
+    remedy = "a policy needs an estimate at each update"
+    require(estimates >= rate, "estimator.rate", f"at least {rate:g} Hz", estimates, remedy)
+    period = 1.0 / max([rate, *scenario.observation.frame_rate])
+    exposure = scenario.imaging.exposure_time
+    condition = f"at most {period:.4g} s, the period of the images"
+    remedy = "shorten it, or lower observation.frame_rate"
+    require(exposure <= period, "imaging.exposure_time", condition, exposure, remedy)
 
 
 @cache

@@ -1,4 +1,4 @@
-"""Registry of sensors."""
+"""Registries of sensors and of estimators."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,7 +9,15 @@ from pydrake.systems.framework import System
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.common.config import require_configuration
 from splatpilot.systems.common.registry import Registry
+from splatpilot.systems.sensing.estimators import (
+    MotionCapture,
+    MotionCaptureEstimator,
+    TrueState,
+    VisualInertial,
+    VisualInertialEstimator,
+)
 from splatpilot.systems.sensing.imu import Imu, ImuSensor
+from splatpilot.systems.sensing.inertial_filter import InertialFilter, InertialFilterEstimator
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.sensing.range_finder import RangeFinder, RangeFinderSensor
 from splatpilot.systems.splats.splat_camera import SplatCamera
@@ -57,10 +65,27 @@ def register_sensor(config: type, build: Callable[[Any, World, Any], System]) ->
     SENSORS.add(config.__name__, SensorEntry(config, build))
 
 
+ESTIMATORS = Registry("estimator", "splatpilot.estimators", SensorEntry)
+"""All estimators, by the names of their configurations' types.
+
+`build` makes a system as `AddFlight` describes it, or None for the true state. A configuration may
+have `sensors`, by name, and a `rate` [Hz].
+"""
+
+
+def register_estimator(config: type, build: Callable[[Any, World, Any], System | None]) -> None:
+    """Registers an estimator; see `ESTIMATORS` and `register_sensor`."""
+    require_configuration(config)
+    ESTIMATORS.add(config.__name__, SensorEntry(config, build))  # pyright: ignore
+
+
 def make_onboard_camera(
-    config: OnboardCamera, world: World, latency: float | Callable[[float], float] = 0.0
+    config: OnboardCamera,
+    world: World,
+    latency: float | Callable[[float], float] = 0.0,
+    exposure: float = 0.0,
 ) -> SplatCamera:
-    """Makes a camera of the Gaussians of the world; for `latency` see `SplatCamera`."""
+    """Makes a camera of the Gaussians of the world; for the other arguments see `SplatCamera`."""
     return SplatCamera(
         world.baked,
         config.camera_info(),
@@ -71,6 +96,7 @@ def make_onboard_camera(
         latency=latency,
         distortion=config.distortion,
         readout=config.readout,
+        exposure=exposure,
     )
 
 
@@ -81,4 +107,15 @@ register_sensor(
 register_sensor(
     RangeFinder,
     lambda config, world, scenario: RangeFinderSensor(config, world.distance_field, scenario.seed),
+)
+register_estimator(TrueState, lambda config, world, scenario: None)
+register_estimator(
+    MotionCapture, lambda config, world, scenario: MotionCaptureEstimator(config, scenario.seed)
+)
+register_estimator(
+    VisualInertial, lambda config, world, scenario: VisualInertialEstimator(config, scenario.seed)
+)
+register_estimator(
+    InertialFilter,
+    lambda config, world, scenario: InertialFilterEstimator(config, scenario.vehicle),
 )

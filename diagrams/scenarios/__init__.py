@@ -1,4 +1,4 @@
-"""The scenarios that come with the program, one YAML file each."""
+"""The scenarios and profiles that come with the program, one YAML file each."""
 
 from pathlib import Path
 
@@ -17,11 +17,24 @@ def other_scenarios() -> dict[str, Path]:
     return {path.stem: path for path in sorted((_FOLDER / "others").glob("*.yaml"))}
 
 
+def profiles() -> dict[str, Path]:
+    """Returns the files of the profiles, fields that any scenario may have, by name."""
+    return {path.stem: path for path in sorted((_FOLDER / "profiles").glob("*.yaml"))}
+
+
 def scenario_file(scenario: str) -> Path:
     """Returns the file of a scenario, given by its name or its path."""
-    known = benchmark_scenarios() | other_scenarios()
-    if scenario in known:
-        return known[scenario]
-    if Path(scenario).suffix in (".yaml", ".yml") or Path(scenario).is_file():
-        return Path(scenario)
-    raise ValueError(unknown("scenario", scenario, known, "and others as YAML files"))
+    return _file("scenario", scenario, benchmark_scenarios() | other_scenarios())
+
+
+def profile_file(profile: str) -> Path:
+    """Returns the file of a profile, given by its name or its path."""
+    return _file("profile", profile, profiles())
+
+
+def _file(what: str, name: str, known: dict[str, Path]) -> Path:
+    if name in known:
+        return known[name]
+    if Path(name).suffix in (".yaml", ".yml") or Path(name).is_file():
+        return Path(name)
+    raise ValueError(unknown(what, name, known, "and others as YAML files"))

@@ -88,7 +88,8 @@ def load_config[Configuration](
     Args:
         defaults: configuration with the values of all other fields.
         path: YAML file, or None.
-        overrides: "dotted.field=YAML value" each, applied in order after the file.
+        overrides: "dotted.field=YAML value" each, applied in order after the file; or "NAME=FILE",
+            with the fields of a YAML file, of a name in `defaults.OVERLAYS`.
 
     Raises:
         ValueError: naming the file or override, and the field with its likely spelling.
@@ -97,6 +98,10 @@ def load_config[Configuration](
     for override in overrides or ():
         name, equals, value = override.partition("=")
         require(equals, "an override", "FIELD=VALUE", repr(override))
+        if name in (overlays := getattr(config, "OVERLAYS", {})):
+            file = overlays[name](value)
+            config = parse_config(copy.deepcopy(config), read_text(file), str(file))
+            continue
         config = _with_field(config, name.split("."), value, f"override {override!r}")
     return config
 

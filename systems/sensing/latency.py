@@ -1,13 +1,14 @@
-"""Times and delays of camera frames, and the pose of the last one that arrived."""
+"""Times and delays of camera frames and of decisions, and the pose of the last frame that came."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from pydrake.common.value import Value
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from splatpilot.systems.common.drake import weak_callback
 from splatpilot.systems.common.validation import require
@@ -130,3 +131,53 @@ class DelayedPose(LeafSystem):
         then = context.get_time() - self._frames.age(context.get_time())
         state = np.array([np.interp(then, rows[:, 0], column) for column in rows[:, 1:].T])
         output.set_value(pose_from_state(state))
+
+
+class DecisionDelay(LeafSystem):
+    """Delays an output of a policy by the time of inference and of the link to the controller.
+
+    Its input and its output have the output's name and size. The decision at time t comes at t + d,
+    with d drawn for each from U(`delay`) [s]; the newest that has come is held.
+
+    Args:
+        period: time between decisions [s].
+        delay: min and max [s]; the max is above 0.
+        seed: equal delays follow from equal seeds.
+    """
+
+    def __init__(
+        self, output: str, size: int, period: float, delay: Sequence[float], seed: int
+    ) -> None:
+        super().__init__()
+        self._delays = np.random.default_rng([seed, CYCLE, 1]).uniform(delay[0], delay[1], CYCLE)
+        self._period, self._count = period, math.ceil(delay[1] / period - 1e-9)
+        self.DeclareVectorInputPort(output, size)
+        self.DeclareDiscreteState(np.array([-period]))  # time of the newest decision [s]
+        self.DeclareDiscreteState(self._count * size)  # earlier decisions, the newest first
+        self.DeclareVectorOutputPort(output, size, self._calc)
+        self.DeclareInitializationDiscreteUpdateEvent(self._begin)
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+
+    def _decision(self, context: Context) -> np.ndarray:
+        return np.asarray(self.get_input_port().Eval(context))
+
+    def _begin(self, context: Context, discrete_state: DiscreteValues) -> None:
+        discrete_state.set_value(1, np.tile(self._decision(context), self._count))
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        # The policy updates at the same instant, and the input is the decision before.
+        decision, earlier = self._decision(context), context.get_discrete_state(1).value()
+        discrete_state.set_value(0, np.array([context.get_time()]))
+        discrete_state.set_value(1, np.append(decision, earlier)[: len(earlier)])
+
+    def _calc(self, context: Context, output: BasicVector) -> None:
+        newest = context.get_discrete_state(0).GetAtIndex(0)
+        decision = self._decision(context)
+        rows = np.append(decision, context.get_discrete_state(1).value()).reshape(-1, len(decision))
+        for back in range(self._count):
+            time = newest - back * self._period
+            delay = self._delays[round(time / self._period) % CYCLE]
+            if time + delay <= context.get_time():
+                output.SetFromVector(rows[back])
+                return
+        output.SetFromVector(rows[-1])

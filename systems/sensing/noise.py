@@ -23,6 +23,16 @@ from splatpilot.systems.vehicle.state import array_namespace
 _GAMMA = 2.2  # of colors over light
 
 
+def light_of_color(color: Any) -> Any:
+    """Returns the light (...), 0 to 1, of colors, 0 to 255."""
+    return (color / 255.0) ** _GAMMA
+
+
+def color_of_light(light: Any) -> Any:
+    """Returns the colors (...), 0 to 255, of light, clipped to 0 to 1."""
+    return 255.0 * light.clip(0.0, 1.0) ** (1.0 / _GAMMA)
+
+
 @dataclass
 class ObservationNoise(Config):
     """Sizes of noise, none by default; standard deviations of Gaussians if not stated otherwise."""
@@ -114,9 +124,14 @@ def corrupt_depth(
     measured = xp.isfinite(depth) & (depth > 0.0)
     z = xp.where(measured, depth, 1.0)
     z = z * (1.0 + noise.depth_multiplicative * relative) + noise.depth_additive * absolute
-    z = xp.where(z < min_depth, 0.0, xp.where(z > max_depth, math.inf, z))
-    z = xp.where(measured, z, depth)
+    z = xp.where(measured, limit_depth(z, min_depth, max_depth), depth)
     return xp.where(drop < noise.depth_dropout, math.inf, z)
+
+
+def limit_depth(depth: Any, min_depth: float, max_depth: float) -> Any:
+    """Reads 0 below the minimum depth [m] of a camera and infinity above its maximum, as Drake."""
+    xp = array_namespace(depth)
+    return xp.where(depth < min_depth, 0.0, xp.where(depth > max_depth, math.inf, depth))
 
 
 def rotate_hue(color: Any, cos: Any, sin: Any) -> Any:
@@ -138,11 +153,11 @@ def expose(color: Any, noise: ObservationNoise, error: Any, photons: Any) -> Any
         light' = 2^(exposure_error u) (c / 255)^2.2
         c' = 255 clip(light' + n sqrt(light' / full_well + (read_noise / full_well)^2))^(1 / 2.2)
     """
-    light = (color / 255.0) ** _GAMMA * 2.0 ** (noise.exposure_error * error)
+    light = light_of_color(color) * 2.0 ** (noise.exposure_error * error)
     if noise.full_well > 0.0:
         variance = light / noise.full_well + (noise.read_noise / noise.full_well) ** 2
         light = light + photons * variance**0.5
-    return 255.0 * light.clip(0.0, 1.0) ** (1.0 / _GAMMA)
+    return color_of_light(light)
 
 
 def corrupt_color(color: Any, noise: ObservationNoise, brighter: Any, grain: Any) -> Any:
@@ -156,55 +171,57 @@ def corrupt_color(color: Any, noise: ObservationNoise, brighter: Any, grain: Any
     return (gain * color + 255.0 * noise.color_noise * grain).clip(0.0, 255.0)
 
 
-class _ImageNoise(LeafSystem):
-    """Base of systems that change images of a `camera`.
+class ImageChange(LeafSystem):
+    """Base of systems that change images of a `camera`, by a `config`.
 
     Stateless: the noise follows from the seed and the image's number, the time in units of 1 /
-    `rate` [Hz], so that evaluations at one time agree.
+    `rate` [Hz], so that evaluations at one time agree. Types differ in their `stream`.
     """
 
     port: ClassVar[str]
     image: ClassVar[type]
+    stream: ClassVar[tuple[int, ...]] = ()
 
-    def __init__(
-        self, noise: ObservationNoise, camera: OnboardCamera, rate: float, seed: int
-    ) -> None:
+    def __init__(self, config: Config, camera: OnboardCamera, rate: float, seed: int) -> None:
         super().__init__()
-        noise.validate()
-        self._noise, self._camera, self._rate, self._seed = noise, camera, rate, seed
+        config.validate()
+        self.config: Any = config
+        self.camera, self._rate, self._seed = camera, rate, seed
         blank = self.image(camera.width, camera.height)
         self.DeclareAbstractInputPort(self.port, Value(blank))
         self.DeclareAbstractOutputPort(self.port, lambda: Value(blank), weak_callback(self._calc))
 
     def _calc(self, context: Context, output: AbstractValue) -> None:
         image = np.asarray(cast(Any, self.get_input_port().Eval(context)).data)
-        random = np.random.default_rng([self._seed, round(context.get_time() * self._rate)])
+        number = round(context.get_time() * self._rate)
+        random = np.random.default_rng([self._seed, number, *self.stream])
         pixels = cast(Any, output.get_mutable_value()).mutable_data
-        pixels[:] = self._noisy(image, random)
+        pixels[:] = self.changed(image, random)
 
-    def _noisy(self, image: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    def changed(self, image: np.ndarray, random: np.random.Generator) -> np.ndarray:
+        """Returns the changed image (H, W, C)."""
         raise NotImplementedError
 
 
-class DepthNoise(_ImageNoise):
+class DepthNoise(ImageChange):
     """Adds errors and holes to ``depth_image_32f`` of planar depth [m], see `corrupt_depth`."""
 
     port, image = "depth_image_32f", ImageDepth32F
 
-    def _noisy(self, image: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    def changed(self, image: np.ndarray, random: np.random.Generator) -> np.ndarray:
         relative, absolute = random.standard_normal((2, *image.shape))
-        drop, limits = random.random(image.shape), (self._camera.min_depth, self._camera.max_depth)
-        return corrupt_depth(image, self._noise, relative, absolute, drop, *limits)
+        drop, limits = random.random(image.shape), (self.camera.min_depth, self.camera.max_depth)
+        return corrupt_depth(image, self.config, relative, absolute, drop, *limits)
 
 
-class ColorNoise(_ImageNoise):
+class ColorNoise(ImageChange):
     """Changes hue, blur, exposure and brightness of ``color_image``, and adds noise to each pixel;
     see `rotate_hue`, `expose` and `corrupt_color`. Alpha is kept."""
 
     port, image = "color_image", ImageRgba8U
 
-    def _noisy(self, image: np.ndarray, random: np.random.Generator) -> np.ndarray:
-        noise, color = self._noise, image[..., :3].astype(np.float32)
+    def changed(self, image: np.ndarray, random: np.random.Generator) -> np.ndarray:
+        noise, color = self.config, image[..., :3].astype(np.float32)
         brighter = random.uniform(-1.0, 1.0)
         grain = random.standard_normal(color.shape, dtype=np.float32)
         if noise.hue_jitter > 0.0:

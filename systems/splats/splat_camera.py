@@ -28,6 +28,7 @@ from splatpilot.systems.common.drake import (
     weak_callback,
 )
 from splatpilot.systems.common.validation import require, require_type
+from splatpilot.systems.sensing.noise import color_of_light, light_of_color
 from splatpilot.systems.splats.background import BLACK, Background, RenderedView
 from splatpilot.systems.splats.baked_scene import (
     NO_GAUSSIANS,
@@ -85,6 +86,15 @@ def empty_scene() -> BakedScene:
 
 _MAX_STEP = 0.5  # [px] that a point at 1 m may move on the image from one band to the next
 _MIN_BANDS = 8  # of an image with a rolling shutter if Gaussians move
+_MAX_BLUR_STEP = 1.5  # [px] that a point at 1 m may move from one pose of an exposure to the next
+_MAX_EXPOSURES = 15  # Number of poses of an image with motion blur.
+
+
+def image_shift(X_WC0: RigidTransform, X_WC1: RigidTransform, focal: float) -> float:
+    """Returns a bound [px] of the shift of points at 1 m between images from two poses."""
+    angle = (X_WC0.rotation().inverse() @ X_WC1.rotation()).ToAngleAxis().angle()
+    distance = np.linalg.norm(X_WC1.translation() - X_WC0.translation())
+    return focal * (abs(angle) + float(distance))
 
 
 def row_bands(
@@ -95,10 +105,8 @@ def row_bands(
     Returns the first row of each of at least `min_count` bands, and the row after its last; the
     camera has the poses X_WC0 and X_WC1 at the first and the last row.
     """
-    angle = (X_WC0.rotation().inverse() @ X_WC1.rotation()).ToAngleAxis().angle()
-    distance = np.linalg.norm(X_WC1.translation() - X_WC0.translation())
-    shift = focal * (abs(angle) + float(distance))
-    count = min(height, max(min_count, math.ceil(shift / _MAX_STEP)))
+    steps = image_shift(X_WC0, X_WC1, focal) / _MAX_STEP
+    count = min(height, max(min_count, math.ceil(steps)))
     edges = np.linspace(0, height, count + 1).round().astype(int).tolist()
     return list(pairwise(edges))
 
@@ -110,7 +118,8 @@ class CameraState(NamedTuple):
     X_BC: RigidTransform
     X_WB: RigidTransform  # pose of the body, with a readout at the last row
     time: float = 0.0  # [s] at which the image is taken
-    X_WB_start: RigidTransform | None = None  # pose of the body at the first row of a readout
+    # Pose of the body at the beginning of the exposure of the first row.
+    X_WB_start: RigidTransform | None = None
     bodies: Bodies | None = None
 
 
@@ -123,7 +132,7 @@ class SplatCamera(LeafSystem):
         input_ports:
         - body_pose
         - moving (optional)
-        - start_pose (with a readout)
+        - start_pose (with a readout or an exposure)
         output_ports:
         - color_image
         - depth_image_32f
@@ -134,8 +143,10 @@ class SplatCamera(LeafSystem):
 
     `body_pose` is the pose X_WB of the body that carries the camera; the camera has the pose X_WC =
     X_WB X_BC with x right, y down and z forward for all images. With a `readout`, a rolling
-    shutter, that is the pose at the last row, and `start_pose` X_WB at the first. `moving` adds the
-    Gaussians of `MovingBodies`. `image_time` [s] is that of the capture.
+    shutter, that is the pose at the last row, and `start_pose` X_WB at the first. With an
+    `exposure` they are the poses at its end and its beginning, and color images are the mean of the
+    light in between; depth is that in the middle. `moving` adds the Gaussians of `MovingBodies`.
+    `image_time` [s] is that of the capture.
 
     Depth is planar z of the surface, the median depth of `rasterize`, in meters
     (`depth_image_32f`) or millimeters (`depth_image_16u`). As in Drake, nearer than `min_depth`
@@ -171,6 +182,7 @@ class SplatCamera(LeafSystem):
         latency: float | Callable[[float], float] = 0.0,
         distortion: Distortion | None = None,
         readout: float = 0.0,
+        exposure: float = 0.0,
     ):
         """Bakes the scene unless it is baked; see `BakedScene.render`.
 
@@ -181,11 +193,13 @@ class SplatCamera(LeafSystem):
             latency: age of the images [s], or the function from the time [s] to it. The pose at the
                 input port must be as old.
             readout: time between reading the first row and the last [s]; 0 reads all at once.
+            exposure: time for which each row collects light [s]; images blur by motion.
         """
         super().__init__()
         valid, got = 0 <= min_depth < max_depth < np.inf, f"[{min_depth}, {max_depth}] m"
         require(valid, "the depth range", "0 <= min_depth < max_depth < inf", got)
-        require(0.0 <= readout < np.inf, "readout", "finite and >= 0 s", readout)
+        for name, duration in (("readout", readout), ("exposure", exposure)):
+            require(0.0 <= duration < np.inf, name, "finite and >= 0 s", duration)
         require_type(camera_info, CameraInfo, "camera_info")
         X_BC = RigidTransform() if X_BC is None else X_BC
         require_type(X_BC, RigidTransform, "X_BC")
@@ -194,7 +208,7 @@ class SplatCamera(LeafSystem):
         self._depth_range = (min_depth, max_depth)
         self._clipping = (near, far)
         self._background = background
-        self._latency, self._readout = latency, readout
+        self._latency, self._readout, self._exposure = latency, readout, exposure
         if distortion is not None:
             distortion.validate()
         self._options: dict[str, Any] = {"distortion": distortion, "max_depth": max_depth}
@@ -203,7 +217,7 @@ class SplatCamera(LeafSystem):
         self._mount_index = self.DeclareAbstractParameter(Value(self._X_BC))
         pose_port = self.DeclareAbstractInputPort("body_pose", Value(RigidTransform()))
         self.DeclareAbstractInputPort("moving", AbstractValue.Make(object()))
-        if readout > 0.0:
+        if readout + exposure > 0.0:
             self.DeclareAbstractInputPort("start_pose", Value(RigidTransform()))
         tickets = {self.all_input_ports_ticket(), self.all_parameters_ticket()}
         view_entry, depth_entry = (
@@ -274,7 +288,8 @@ class SplatCamera(LeafSystem):
 
         Args:
             bodies: drawn where they are as old as the images.
-            X_WB_start: pose at which the first row is read, `readout` earlier.
+            X_WB_start: pose at the beginning of the exposure of the first row, `readout` plus
+                `exposure` earlier.
         """
         time = bodies.time if bodies else 0.0
         camera = CameraState(
@@ -283,6 +298,34 @@ class SplatCamera(LeafSystem):
         return self._render(camera)
 
     def _render(self, camera: CameraState) -> RenderedView:
+        if self._exposure == 0.0 or camera.X_WB_start is None:
+            return self._render_instant(camera)
+        X_WC0, X_WC1 = (X_WB @ camera.X_BC for X_WB in (camera.X_WB_start, camera.X_WB))
+        share = self._exposure / (self._exposure + self._readout)
+        shift = share * image_shift(X_WC0, X_WC1, camera.camera_info.focal_x())
+        count = min(_MAX_EXPOSURES, math.ceil(shift / _MAX_BLUR_STEP)) | 1  # odd: one in the middle
+        parts = (np.arange(count) + 0.5) / count
+        views = [self._render_instant(self._shutter(camera, float(s))) for s in parts]
+        if count == 1:
+            return views[0]
+        light = np.mean([light_of_color(255.0 * view.color.clip(0.0)) for view in views], axis=0)
+        return views[count // 2]._replace(color=color_of_light(light) / np.float32(255.0))
+
+    def _shutter(self, camera: CameraState, s: float) -> CameraState:
+        """Returns a camera with an exposure at a fraction s of it, from 0 to 1."""
+        if self._exposure == 0.0 or camera.X_WB_start is None:
+            return camera
+        duration = self._exposure + self._readout
+        first = s * self._exposure / duration
+        X_WBs = [
+            pose_between(camera.X_WB_start, camera.X_WB, part)
+            for part in (first, first + self._readout / duration)
+        ]
+        start = X_WBs[0] if self._readout > 0.0 else None
+        time = camera.time - (1.0 - s) * self._exposure
+        return camera._replace(X_WB=X_WBs[1], X_WB_start=start, time=time)
+
+    def _render_instant(self, camera: CameraState) -> RenderedView:
         views = [
             self._scene.render(*band, background=self._background, moving=moving, **self._options)
             for band, moving in self._bands(camera)
@@ -294,7 +337,7 @@ class SplatCamera(LeafSystem):
     def _render_depth(self, scene: BakedScene, camera: CameraState) -> NDArray[np.float32]:
         depths = [
             scene.render_depth(*band, moving=moving, **self._options)
-            for band, moving in self._bands(camera)
+            for band, moving in self._bands(self._shutter(camera, 0.5))
         ]
         return depths[0] if len(depths) == 1 else np.concatenate(depths)
 
@@ -320,7 +363,8 @@ class SplatCamera(LeafSystem):
         return self._latency(time) if callable(self._latency) else self._latency
 
     def _camera_state(self, context: Context) -> CameraState:
-        names = ["body_pose", "start_pose"] if self._readout > 0.0 else ["body_pose"]
+        has_start = self._readout + self._exposure > 0.0
+        names = ["body_pose", "start_pose"] if has_start else ["body_pose"]
         X_WB, *start = (cast(RigidTransform, self.GetInputPort(n).Eval(context)) for n in names)
         bodies = optional_value(self, "moving", context)
         time = bodies.time - self._age(bodies.time) if bodies else 0.0

@@ -1,0 +1,158 @@
+"""Depth as stereo cameras and time-of-flight cameras measure it.
+
+Both formulas change the exact planar depth of a camera. Pixels without a measurement read infinity.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+
+import cv2
+import numpy as np
+from scipy.ndimage import gaussian_filter
+
+from splatpilot.systems.common.validation import Config, bounded
+from splatpilot.systems.sensing.onboard_camera import OnboardCamera
+
+
+@dataclass
+class Stereo(Config):
+    """A stereo camera, see `stereo_depth`.
+
+    The defaults are a RealSense D435 at 848x480: baseline, size and search range of Intel's data
+    sheet (337029), noise and step of "Tuning depth cameras for best performance" (Grunnet-Jepsen,
+    Sweetser, Woodfill).
+    """
+
+    # [m] Distance of the right camera from the left, which takes the depth image.
+    baseline: float = bounded(0.05, "(0, 1] m")
+    # [px] Width of the images that are matched.
+    width: int = bounded(848, "[1, 8192] px")
+    # [px] Standard deviation of disparities; 0.05 on a textured wall, 0.08 is usual.
+    noise: float = bounded(0.08, "[0, 10] px")
+    # [px] Step of disparities; 0 is without rounding.
+    step: float = bounded(0.03125, "[0, 1] px")
+    # [px] Maximum disparity; nearer surfaces are not measured.
+    max_disparity: float = bounded(126.0, "(0, inf) px")
+    # [px] Standard deviation of the window of matching, within which errors agree.
+    window: float = bounded(9.0, "[0, 100] px")
+
+
+@dataclass
+class TimeOfFlightErrors(Config):
+    """Errors of a time-of-flight camera, see `time_of_flight_depth`.
+
+    The defaults are a pmd flexx2 (IRS2381C) indoors: 1 % noise of its data sheet, and a range of
+    7 m. Errors in corners are a few centimeters at 2 m (Fuchs, "Multipath interference compensation
+    in time-of-flight camera images", ICPR 2010).
+    """
+
+    # [-] Standard deviation of the noise, relative to depth.
+    noise: float = bounded(0.01, "[0, 1]")
+    # [m] Range at which ambient light hides the echo; 2 m to 3 m in sunlight.
+    ambient_range: float = bounded(7.0, "(0, inf) m")
+    # [-] Spread of that range between pixels, by their reflectivity; a standard deviation.
+    ambient_spread: float = bounded(0.1, "[0, 1]")
+    # [-] Strength of the light that takes a detour in concave corners.
+    multipath: float = bounded(0.3, "[0, 1]")
+    # [deg] Half the angle of the surface from which such light comes.
+    multipath_angle: float = bounded(5.0, "[0, 45] deg")
+    # [-] Probability that a pixel at an edge reads a depth between near and far.
+    mixed_pixels: float = bounded(0.5, "[0, 1]")
+
+
+_EDGE = 0.2  # [-] relative step of depth from which neighbors are different surfaces
+
+
+def correlated_noise(white: np.ndarray, sigma: float) -> np.ndarray:
+    """Correlates white noise (H, W) by a Gaussian of `sigma` [px]; its variance stays."""
+    if sigma < 0.1:
+        return white
+    return gaussian_filter(white, sigma, mode="wrap") / _filtered_deviation(white.shape, sigma)
+
+
+@cache
+def _filtered_deviation(shape: tuple[int, int], sigma: float) -> float:
+    point = np.zeros(shape)
+    point[0, 0] = 1.0
+    return float(np.linalg.norm(gaussian_filter(point, sigma, mode="wrap")))
+
+
+def stereo_depth(
+    depth: np.ndarray, sensor: Stereo, camera: OnboardCamera, noise: np.ndarray
+) -> np.ndarray:
+    """Computes the depth (H, W) [m] that matching measures; `noise` n (H, W) is drawn from N(0, 1).
+
+    With the focal length f [px] at the sensor's width and the baseline b,
+
+        d = round((f b / z + noise n) / step) step,  z' = f b / d.
+
+    A pixel is not measured if d is above `max_disparity` or not positive, if its match lies beyond
+    the left border of the right image, or if a nearer surface hides it from the right camera.
+    """
+    pixels = sensor.width / camera.width  # of the sensor in one of the camera
+    fb = camera.focal_x * pixels * sensor.baseline
+    measured = np.isfinite(depth) & (depth > 0.0)
+    exact = fb / np.where(measured, depth, np.inf)
+    columns = (np.arange(depth.shape[1]) + 0.5) * pixels
+    seen = columns - exact  # columns in the right image
+    right = np.minimum.accumulate(seen[:, ::-1], axis=1)[:, ::-1]
+    hidden = np.zeros(depth.shape, dtype=bool)
+    hidden[:, :-1] = right[:, 1:] <= seen[:, :-1]
+    errors = correlated_noise(noise, sensor.window / pixels)
+    disparity = exact + sensor.noise * errors
+    if sensor.step > 0.0:
+        disparity = np.round(disparity / sensor.step) * sensor.step
+    valid = (disparity > 0.0) & (disparity <= sensor.max_disparity) & (seen >= 0.0) & ~hidden
+    z = fb / np.where(disparity > 0.0, disparity, 1.0)
+    return np.where(measured, np.where(valid, z, np.inf), depth)
+
+
+def time_of_flight_depth(
+    depth: np.ndarray,
+    sensor: TimeOfFlightErrors,
+    camera: OnboardCamera,
+    noise: np.ndarray,
+    reflectivity: np.ndarray,
+    mixing: np.ndarray,
+) -> np.ndarray:
+    """Computes the depth (H, W) [m] that a time-of-flight camera measures.
+
+        z' = (z + multipath s)(1 + noise n)
+
+    s is the sag of a concave corner: how far z lies behind the chord between the points at
+    `multipath_angle` to the left and right, or above and below. It is zero on planes. At an edge, a
+    pixel reads a depth between those of its neighbors with the probability `mixed_pixels`. A pixel
+    is not measured if z (1 + ambient_spread r) is above `ambient_range`.
+
+    Args:
+        noise, reflectivity: n and r (H, W), drawn from N(0, 1).
+        mixing: (2, H, W), drawn from U(0, 1).
+    """
+    measured = np.isfinite(depth) & (depth > 0.0)
+    z = np.where(measured, depth, sensor.ambient_range).astype(float)
+    z = z * (1.0 + sensor.multipath * _relative_sag(z, sensor.multipath_angle, camera))
+    kernel = np.ones((3, 3), np.uint8)
+    near, far = cv2.erode(z, kernel), cv2.dilate(z, kernel)
+    mixed = (far > (1.0 + _EDGE) * near) & (mixing[0] < sensor.mixed_pixels)
+    z = np.where(mixed, near + mixing[1] * (far - near), z) * (1.0 + sensor.noise * noise)
+    lost = z * (1.0 + sensor.ambient_spread * reflectivity) > sensor.ambient_range
+    return np.where(measured, np.where(lost, np.inf, z), depth)
+
+
+def _relative_sag(z: np.ndarray, angle: float, camera: OnboardCamera) -> np.ndarray:
+    """Returns the sag of corners over z: inverse depth is affine along a plane's image."""
+    inverse, sag = 1.0 / z, np.zeros_like(z)
+    for axis, focal in ((0, camera.focal_y), (1, camera.focal_x)):
+        offset = min(round(focal * np.tan(np.radians(angle))), z.shape[axis] - 1)
+        if offset < 1:
+            continue
+        margin = [(offset, offset) if k == axis else (0, 0) for k in range(2)]
+        padded = np.pad(inverse, margin, mode="reflect", reflect_type="odd")
+        count = z.shape[axis]
+        before, after = (
+            padded.take(range(first, first + count), axis) for first in (0, 2 * offset)
+        )
+        relative = z * 0.5 * (before + after) - 1.0
+        edges = np.abs(before - after) > _EDGE * (before + after)
+        sag = np.maximum(sag, np.where(edges | (relative > _EDGE), 0.0, relative))
+    return sag

@@ -1,0 +1,240 @@
+"""State estimates as motion capture and visual-inertial odometry make them.
+
+Estimators sample at their rate; the estimate is held in between, and as late as their latency. All
+random numbers follow from the seed, the system's name and the sample's number.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
+from scipy.spatial.transform import Rotation
+
+from splatpilot.systems.common.drake import vector_input
+from splatpilot.systems.common.validation import Config, bounded
+from splatpilot.systems.sensing.imu import sample_generator
+from splatpilot.systems.vehicle.quadrotor import hover_state
+from splatpilot.systems.vehicle.state import QuadrotorState, stack
+
+
+@dataclass
+class TrueState(Config):
+    """The exact state, without delay."""
+
+
+@dataclass
+class MotionCapture(Config):
+    """Poses of a motion capture system, and a gyroscope, see `MotionCaptureEstimator`.
+
+    Accuracy and latency are those that OptiTrack states for its Prime 13: 0.2 mm, 0.5 deg, 4.2 ms;
+    the latency here adds the way to the vehicle.
+    """
+
+    # [Hz] Frames per second.
+    rate: float = bounded(100.0, "[1, 1000] Hz")
+    # [s] Age of the estimate, rounded up to whole frames.
+    latency: float = bounded(0.01, "[0, 1] s")
+    # [m] Standard deviation of positions.
+    position_noise: float = bounded(2e-4, "[0, 1] m")
+    # [rad] Standard deviation of rotations about each axis.
+    rotation_noise: float = bounded(2e-3, "[0, 1] rad")
+    # [rad/s] Standard deviation of body rates, which a gyroscope measures.
+    rate_noise: float = bounded(3e-3, "[0, inf) rad/s")
+    # [-] Probability that a frame is lost.
+    dropout: float = bounded(0.01, "[0, 1)")
+    # [s] Time constant of the filter of velocities, which are differences of positions.
+    velocity_filter: float = bounded(0.03, "[0, 1] s")
+
+
+@dataclass
+class VisualInertial(Config):
+    """The drift of visual-inertial odometry and errors with memory, see `drifting_state`.
+
+    Position and yaw drift as published systems do on the EuRoC data sets: about 0.1 m and 1 deg
+    after 80 s (Delmerico and Scaramuzza, ICRA 2018). Errors of velocity, direction and height are
+    those of the training of "Flying in Clutter" (arXiv 2512.17349).
+    """
+
+    # [Hz] Estimates per second.
+    rate: float = bounded(50.0, "[1, 1000] Hz")
+    # [s] Age of the estimate, rounded up to whole samples.
+    latency: float = bounded(0.0, "[0, 1] s")
+    # [m/sqrt(s)] Random walk of the position along each axis.
+    position_walk: float = bounded(0.01, "[0, 10] m/sqrt(s)")
+    # [rad/sqrt(s)] Random walk of the yaw.
+    yaw_walk: float = bounded(0.002, "[0, 1] rad/sqrt(s)")
+    # [-] Bias of the scale of velocities and distances.
+    scale_bias: float = bounded(0.0, "[-0.5, 0.5]")
+    # [Hz] Mean number of jumps per second.
+    jump_rate: float = bounded(0.0, "[0, 10] Hz")
+    # [m] Standard deviation of a jump along each axis.
+    jump_size: float = bounded(0.1, "[0, 10] m")
+    # [m/s] Standard deviation of the velocity along each axis.
+    velocity_noise: float = bounded(0.08, "[0, 10] m/s")
+    # [rad] Standard deviation of the yaw, and so of directions.
+    direction_noise: float = bounded(0.05, "[0, 1] rad")
+    # [m] Standard deviation of the height.
+    height_noise: float = bounded(0.03, "[0, 10] m")
+    # [s] Correlation time of these three errors.
+    memory: float = bounded(0.5, "(0, 100] s")
+
+
+def drift_step(config: VisualInertial, errors: Any, v_WB: Any, normal: Any, uniform: Any) -> Any:
+    """Returns the errors (..., 9) of the next sample.
+
+    They are those of the position (3) and yaw (1), which add up, and of velocity (3), direction (1)
+    and height (1), which are Ornstein-Uhlenbeck processes: with a = exp(-T / memory),
+
+        x' = a x + sigma sqrt(1 - a^2) n.
+
+    Args:
+        v_WB: (..., 3) [m/s].
+        normal, uniform: (..., 12) and (...), drawn from N(0, 1) and U(0, 1).
+    """
+    period = 1.0 / config.rate
+    jump = config.jump_size * (uniform < config.jump_rate * period)[..., None]
+    step = math.sqrt(period) * config.position_walk * normal[..., :3] + jump * normal[..., 9:]
+    drifted = (1.0 + config.scale_bias) * rotate_yaw(errors[..., 3], v_WB)
+    position = errors[..., :3] + period * (drifted - v_WB) + step
+    yaw = errors[..., 3:4] + math.sqrt(period) * config.yaw_walk * normal[..., 3:4]
+    keep = math.exp(-period / config.memory)
+    fresh = math.sqrt(1.0 - keep**2) * stationary(config) * normal[..., 4:9]
+    return np.concatenate([position, yaw, keep * errors[..., 4:] + fresh], axis=-1)
+
+
+def stationary(config: VisualInertial) -> np.ndarray:
+    """Returns the standard deviations (5,) of velocity, direction and height."""
+    return np.array([*[config.velocity_noise] * 3, config.direction_noise, config.height_noise])
+
+
+def rotate_yaw(yaw: Any, vectors: Any) -> np.ndarray:
+    """Rotates vectors (..., 3) about z by yaw (...) [rad]."""
+    cos, sin, (x, y, z) = np.cos(yaw), np.sin(yaw), (vectors[..., k] for k in range(3))
+    return stack([cos * x - sin * y, sin * x + cos * y, z])
+
+
+def drifting_state(config: VisualInertial, state: np.ndarray, errors: np.ndarray) -> np.ndarray:
+    """Returns the estimate (13,) of a state (13,) with the errors (9,) of `drift_step`."""
+    p_WB, v_WB, q_WB, w_WB_B = QuadrotorState.of(state)
+    p_WB = p_WB + errors[:3] + [0.0, 0.0, errors[8]]
+    v_WB = (1.0 + config.scale_bias) * rotate_yaw(errors[3], v_WB) + errors[4:7]
+    half, (w, x, y, z) = 0.5 * (errors[3] + errors[7]), q_WB
+    cos, sin = math.cos(half), math.sin(half)
+    q_WB = np.array([cos * w - sin * z, cos * x - sin * y, cos * y + sin * x, cos * z + sin * w])
+    return QuadrotorState(p_WB, v_WB, q_WB, w_WB_B).to_vector()
+
+
+class _Estimator(LeafSystem):
+    """Base of estimators that sample the true ``state`` (13) and output another, late.
+
+    The discrete state has the estimates on their way, oldest first, and the `memory`.
+    """
+
+    def __init__(self, config: Any, seed: int, size: int) -> None:
+        super().__init__()
+        config.validate()
+        self._config, self._seed = config, seed
+        self._late = math.ceil(config.latency * config.rate - 1e-9)
+        self.DeclareVectorInputPort("state", 13)
+        hover = hover_state([0.0, 0.0, 0.0])
+        self.DeclareStateOutputPort("state", self.DeclareDiscreteState(hover))
+        self.DeclareDiscreteState(np.tile(hover, self._late))
+        self.DeclareDiscreteState(size)
+        self.DeclareInitializationDiscreteUpdateEvent(self._begin)
+        self.DeclarePeriodicDiscreteUpdateEvent(1.0 / config.rate, 0.0, self._sample)
+
+    def first(self, state: np.ndarray, random: np.random.Generator) -> np.ndarray:
+        """Returns the memory at time 0."""
+        raise NotImplementedError
+
+    def estimate(
+        self, state: np.ndarray, memory: np.ndarray, random: np.random.Generator
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the estimate (13,) of a state (13,) and the next memory."""
+        raise NotImplementedError
+
+    def _begin(self, context: Context, discrete_state: DiscreteValues) -> None:
+        state = vector_input(self, "state", context)
+        random = np.random.default_rng([self._seed, 0])
+        discrete_state.set_value(0, state)
+        discrete_state.set_value(1, np.tile(state, self._late))
+        discrete_state.set_value(2, self.first(state, random))
+
+    def _sample(self, context: Context, discrete_state: DiscreteValues) -> None:
+        old = context.get_discrete_state()
+        random = sample_generator(self, self._seed, context.get_time(), self._config.rate)
+        state, memory = vector_input(self, "state", context), np.array(old.value(2))
+        estimate, memory = self.estimate(state, memory, random)
+        queue = np.append(old.value(1), estimate)
+        discrete_state.set_value(0, queue[:13])
+        discrete_state.set_value(1, queue[13:])
+        discrete_state.set_value(2, memory)
+
+
+class VisualInertialEstimator(_Estimator):
+    """Estimates the state with drift and noise, see `drifting_state`.
+
+    .. pydrake_system::
+
+        name: VisualInertialEstimator
+        input_ports: [state]
+        output_ports: [state]
+
+    ``state`` (13): the true one, and the estimate.
+    """
+
+    def __init__(self, config: VisualInertial, seed: int) -> None:
+        super().__init__(config, seed, 9)
+
+    def first(self, state: np.ndarray, random: np.random.Generator) -> np.ndarray:
+        return np.append(np.zeros(4), stationary(self._config) * random.standard_normal(5))
+
+    def estimate(
+        self, state: np.ndarray, memory: np.ndarray, random: np.random.Generator
+    ) -> tuple[np.ndarray, np.ndarray]:
+        normal, uniform = random.standard_normal(12), np.asarray(random.random())
+        errors = drift_step(self._config, memory, state[3:6], normal, uniform)
+        return drifting_state(self._config, state, memory), errors
+
+
+class MotionCaptureEstimator(_Estimator):
+    """Estimates the state from noisy poses, some of which are lost, and noisy body rates.
+
+    .. pydrake_system::
+
+        name: MotionCaptureEstimator
+        input_ports: [state]
+        output_ports: [state]
+
+    ``state`` (13): the true one, and the estimate. Its velocity follows the differences of received
+    positions with the time constant `velocity_filter`; while frames are lost, it is that of the
+    last one.
+    """
+
+    def __init__(self, config: MotionCapture, seed: int) -> None:
+        super().__init__(config, seed, 14)
+
+    def first(self, state: np.ndarray, random: np.random.Generator) -> np.ndarray:
+        return np.append(state, 1.0)  # the last estimate, and its age in frames
+
+    def estimate(
+        self, state: np.ndarray, memory: np.ndarray, random: np.random.Generator
+    ) -> tuple[np.ndarray, np.ndarray]:
+        config, normal = self._config, random.standard_normal((3, 3))
+        last, missed = QuadrotorState.of(memory[:13]), memory[13]
+        true = QuadrotorState.of(state)
+        w_WB_B = true.w_WB_B + config.rate_noise * normal[2]
+        if random.random() < config.dropout:
+            kept = last._replace(w_WB_B=w_WB_B).to_vector()
+            return kept, np.append(kept, missed + 1.0)
+        p_WB = true.p_WB + config.position_noise * normal[0]
+        turn = Rotation.from_rotvec(config.rotation_noise * normal[1])
+        q_WB = Rotation.from_quat(true.q_WB, scalar_first=True) * turn
+        duration = missed / config.rate
+        follow = duration / (duration + config.velocity_filter)
+        v_WB = last.v_WB + follow * ((p_WB - last.p_WB) / duration - last.v_WB)
+        q = q_WB.as_quat(scalar_first=True)
+        measured = QuadrotorState(p_WB, v_WB, q, w_WB_B).to_vector()
+        return measured, np.append(measured, 1.0)
