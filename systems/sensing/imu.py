@@ -43,6 +43,13 @@ def specific_force(state: np.ndarray, command: np.ndarray, params: QuadrotorPara
     return pose_from_state(state).rotation().inverse().multiply(f_W)
 
 
+def measurement_error(
+    bias: np.ndarray, white: Any, step: Any, noise: Any, walk: Any, rate: float
+) -> tuple[Any, Any]:
+    """Returns the error of sample k and the next bias, see `ImuSensor`."""
+    return bias + noise * np.sqrt(rate) * white, bias + walk / np.sqrt(rate) * step
+
+
 class ImuSensor(LeafSystem):
     """Measures specific force and body rates.
 
@@ -86,8 +93,8 @@ class ImuSensor(LeafSystem):
         white, step = random.standard_normal((2, 6))
         force = specific_force(state, command, self._params)
         measured = np.append(force, QuadrotorState.of(state).w_WB_B)
-        measured += bias + self._noise * np.sqrt(rate) * white
-        next_bias = bias + self._walk / np.sqrt(rate) * step
+        error, next_bias = measurement_error(bias, white, step, self._noise, self._walk, rate)
+        measured += error
         for group, values in enumerate((measured[:3], measured[3:], next_bias)):
             discrete_state.set_value(group, values)
 

@@ -66,8 +66,8 @@ class InertialFilterEstimator(LeafSystem):
     (Leishman et al., "Quadrotors and accelerometers", IEEE Control Systems 2014). Position along
     the ground and yaw drift, since no sensor measures them.
 
-    Discrete state: the estimate (13); biases of accelerometer and gyroscope (6); their covariance
-    with position, velocity and rotation in B (15, 15); height of the ground (1) [m].
+    Discrete state: the estimate (13); biases of accelerometer and gyroscope and the height of the
+    ground (7); their covariance (16, 16) with position, velocity and rotation in B.
     """
 
     def __init__(self, config: InertialFilter, params: QuadrotorParams) -> None:
@@ -80,10 +80,10 @@ class InertialFilterEstimator(LeafSystem):
             self.DeclareVectorInputPort(f"filter_{name}", size)
         group = self.DeclareDiscreteState(hover_state([0.0, 0.0, 0.0]))
         self.DeclareStateOutputPort("state", group)
-        for size in (6, 225, 1):
+        for size in (7, 256):
             self.DeclareDiscreteState(size)
         imu = config.imu
-        self._noise = np.zeros(15)
+        self._noise = np.zeros(16)
         for k, density in (
             (3, imu.accelerometer_noise),
             (6, imu.gyroscope_noise),
@@ -96,12 +96,12 @@ class InertialFilterEstimator(LeafSystem):
 
     def _begin(self, context: Context, discrete_state: DiscreteValues) -> None:
         state = vector_input(self, "state", context)
-        discrete_state.set_value(0, state)
-        discrete_state.set_value(1, np.zeros(6))
-        # As of a vehicle that stood still on the ground: millimeters and milliradians.
-        discrete_state.set_value(2, (1e-6 * np.eye(15)).ravel())
         height = vector_input(self, "filter_height_range", context)[0]
-        discrete_state.set_value(3, np.array([state[2] - height]))
+        # As of a vehicle that stood still: millimeters and milliradians.
+        variances = np.append(np.full(15, 1e-6), self._config.height.noise**2)
+        biases = np.append(np.zeros(6), state[2] - height)
+        for group, values in enumerate((state, biases, np.diag(variances).ravel())):
+            discrete_state.set_value(group, values)
 
     def _step(self, context: Context, discrete_state: DiscreteValues) -> None:
         number = round(context.get_time() * self._config.imu.rate)
@@ -109,14 +109,14 @@ class InertialFilterEstimator(LeafSystem):
             return
         old = context.get_discrete_state()
         x, bias, P = (np.array(old.value(k)) for k in range(3))
-        P = P.reshape(15, 15)
+        P = P.reshape(16, 16)
         force = vector_input(self, "filter_imu_accelerometer", context) - bias[:3]
-        rates = vector_input(self, "filter_imu_gyroscope", context) - bias[3:]
+        rates = vector_input(self, "filter_imu_gyroscope", context) - bias[3:6]
         x, P = self._predict(x, P, force, rates)
         if number % self._every == 0:
             reading = vector_input(self, "filter_height_range", context)[0]
-            x, bias, P = self._correct(x, bias, P, force, reading, old.value(3)[0])
-        x[10:] = vector_input(self, "filter_imu_gyroscope", context) - bias[3:]
+            x, bias, P = self._correct(x, bias, P, force, reading)
+        x[10:] = vector_input(self, "filter_imu_gyroscope", context) - bias[3:6]
         for group, values in enumerate((x, bias, P.ravel())):
             discrete_state.set_value(group, values)
 
@@ -131,12 +131,12 @@ class InertialFilterEstimator(LeafSystem):
         turn = Rotation.from_rotvec(T * rates)
         a = (attitude * Rotation.from_rotvec(0.5 * T * rates)).apply(force)
         a[2] -= self._params.gravity
-        F = np.eye(15)
+        F = np.eye(16)
         F[0:3, 3:6] = T * np.eye(3)
         F[3:6, 6:9], F[3:6, 9:12] = -T * R @ skew(force), -T * R
         F[6:9, 6:9], F[6:9, 12:15] = turn.as_matrix().T, -T * np.eye(3)
         P = F @ P @ F.T
-        P[np.diag_indices(15)] += self._noise
+        P[np.diag_indices(16)] += self._noise
         q = (attitude * turn).as_quat(scalar_first=True)
         return QuadrotorState(p + T * v + 0.5 * T * T * a, v + T * a, q, rates).to_vector(), P
 
@@ -147,22 +147,21 @@ class InertialFilterEstimator(LeafSystem):
         P: np.ndarray,
         force: np.ndarray,
         reading: float,
-        ground: float,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Corrects the estimate by drag, and by the reading [m] of the range finder if finite."""
         config, drag = self._config, self._params.drag
         p, v, q, w = QuadrotorState.of(x)
         R = Rotation.from_quat(q, scalar_first=True).as_matrix()
         v_B = R.T @ v
-        H, residual, variance = np.zeros((3, 15)), np.zeros(3), np.zeros(3)
+        H, residual, variance = np.zeros((3, 16)), np.zeros(3), np.zeros(3)
         H[:2, 3:6], H[:2, 6:9] = -drag * R.T[:2], -drag * skew(v_B)[:2]
         H[:2, 9:12] = np.eye(3)[:2]
         residual[:2] = force[:2] + drag * v_B[:2]
         white = config.imu.accelerometer_noise**2 * config.imu.rate
         variance[:2] = config.drag_noise**2 + white
-        H[2, 2], residual[2] = 1.0, reading * R[2, 2] + ground - p[2]
+        H[2, [2, 15]], residual[2] = (1.0, -1.0), reading * R[2, 2] + bias[6] - p[2]
         variance[2] = config.height.noise**2 + 1e-6
-        error = np.zeros(15)
+        error = np.zeros(16)
         for h, measured, r in zip(H, residual, variance, strict=True):
             innovation, S = measured - h @ error, h @ P @ h + r
             if not innovation**2 <= config.gate**2 * S:  # also of infinite ranges

@@ -5,7 +5,12 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource, LogVectorOutput
 
-from splatpilot.systems.sensing.imu import Imu, ImuSensor, specific_force
+from splatpilot.systems.sensing.imu import (
+    Imu,
+    ImuSensor,
+    measurement_error,
+    specific_force,
+)
 from splatpilot.systems.vehicle.quadrotor import QuadrotorParams, QuadrotorPlant, hover_state
 
 IDEAL = {
@@ -77,3 +82,19 @@ def test_noise_follows_from_seed_and_name():
     )
     np.testing.assert_array_equal(first, again)
     assert not np.isclose(first, other).any() and not np.isclose(first, renamed).any()
+
+
+def test_allan_deviation_is_that_of_the_model():
+    config = Imu(accelerometer_noise=2e-3, accelerometer_walk=3e-3)
+    random, flights, samples = np.random.default_rng(0), 600, 20_000
+    bias, errors = np.zeros(flights), np.empty((samples, flights))
+    for k in range(samples):
+        draws = random.standard_normal((2, flights))
+        errors[k], bias = measurement_error(bias, *draws, 2e-3, 3e-3, config.rate)
+    sums = np.cumsum(errors, axis=0) / config.rate
+    for m in np.unique(np.geomspace(1, 1000, 13).round().astype(int)):  # 5 ms to 5 s
+        tau = m / config.rate
+        second = sums[2 * m :: m] - 2.0 * sums[m:-m:m] + sums[: -2 * m : m]
+        found = np.sqrt(0.5 * np.mean(second**2)) / tau
+        expected = np.sqrt(2e-3**2 / tau + 3e-3**2 * tau * (1 / 3 + 1 / (6 * m**2)))
+        assert found == pytest.approx(expected, rel=0.05)

@@ -3,7 +3,7 @@ import pytest
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
-from splatpilot.systems.sensing.latency import DelayedPose, FrameTimes
+from splatpilot.systems.sensing.latency import DecisionDelay, DelayedPose, FrameTimes
 from splatpilot.systems.vehicle.quadrotor import hover_state
 
 
@@ -44,3 +44,34 @@ def test_delayed_pose_is_the_pose_then(latency):
 def test_a_negative_latency_is_refused():
     with pytest.raises(ValueError, match=r"delays of frames must be .* got -0.1"):
         DelayedPose(FrameTimes.late(-0.1))
+
+
+class Counter(LeafSystem):
+    """Decides the number of its update."""
+
+    def __init__(self, period: float) -> None:
+        super().__init__()
+        self.DeclareStateOutputPort("velocity", self.DeclareDiscreteState(np.array([-1.0])))
+        self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+
+    def _update(self, context, discrete_state) -> None:
+        discrete_state.set_value(context.get_discrete_state_vector().value() + 1.0)
+
+
+@pytest.mark.parametrize("delay", [(0.0, 0.08), (0.03, 0.03), (0.09, 0.09)])
+def test_decisions_come_when_their_delay_is_over(delay):
+    builder, period = DiagramBuilder(), 0.05
+    policy = builder.AddSystem(Counter(period))
+    late = builder.AddSystem(DecisionDelay("velocity", 1, period, delay, 3))
+    builder.Connect(policy.get_output_port(), late.get_input_port())
+    simulator = Simulator(builder.Build())
+    port, context = late.get_output_port(), late.GetMyContextFromRoot(simulator.get_context())
+    steps = np.arange(1, 2000) * 1e-3 + 5e-4
+    found = []
+    for time in steps:
+        simulator.AdvanceTo(time)
+        found.append(port.Eval(context)[0])
+    first = [steps[np.array(found) >= k][0] - k * period for k in range(35)]
+    assert min(first) >= delay[0] - 1e-3 and max(first) <= delay[1] + 1e-3
+    if delay[0] < delay[1]:
+        assert np.std(first) > 0.015
