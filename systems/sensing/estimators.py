@@ -29,7 +29,7 @@ class MotionCapture(Config):
     """Poses of a motion capture system, and a gyroscope, see `MotionCaptureEstimator`.
 
     Accuracy and latency are those that OptiTrack states for its Prime 13: 0.2 mm, 0.5 deg, 4.2 ms;
-    the latency here adds the way to the vehicle.
+    the latency here adds the link to the vehicle.
     """
 
     # [Hz] Frames per second.
@@ -129,7 +129,7 @@ def drifting_state(config: VisualInertial, state: np.ndarray, errors: np.ndarray
 class _Estimator(LeafSystem):
     """Base of estimators that sample the true ``state`` (13) and output another, late.
 
-    The discrete state has the estimates on their way, oldest first, and the `memory`.
+    The discrete state has the current estimate, later ones in order, and the memory.
     """
 
     def __init__(self, config: Any, seed: int, size: int) -> None:
@@ -200,7 +200,7 @@ class VisualInertialEstimator(_Estimator):
 
 
 class MotionCaptureEstimator(_Estimator):
-    """Estimates the state from noisy poses, some of which are lost, and noisy body rates.
+    """Estimates the state from noisy poses, with lost frames, and noisy body rates.
 
     .. pydrake_system::
 

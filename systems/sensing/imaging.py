@@ -1,4 +1,4 @@
-"""How the camera of a policy forms images: exposure, lens, compression and depth sensor."""
+"""Image formation of a policy's camera: exposure, lens, compression and depth sensor."""
 
 import math
 from dataclasses import dataclass, replace

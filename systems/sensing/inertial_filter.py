@@ -15,6 +15,7 @@ from splatpilot.systems.vehicle.quadrotor import QuadrotorParams, hover_state
 from splatpilot.systems.vehicle.state import QuadrotorState
 
 _DOWN = [0.0, 0.0, -1.0]
+_UNKNOWN_GROUND = 10.0  # [m] standard deviation of its height before the first measurement
 
 
 @dataclass
@@ -98,8 +99,10 @@ class InertialFilterEstimator(LeafSystem):
         state = vector_input(self, "state", context)
         height = vector_input(self, "filter_height_range", context)[0]
         # As of a vehicle that stood still: millimeters and milliradians.
-        variances = np.append(np.full(15, 1e-6), self._config.height.noise**2)
-        biases = np.append(np.zeros(6), state[2] - height)
+        variances, biases = np.full(16, 1e-6), np.append(np.zeros(6), state[2])
+        variances[15] = _UNKNOWN_GROUND**2
+        if np.isfinite(height):
+            biases[6], variances[15] = state[2] - height, self._config.height.noise**2
         for group, values in enumerate((state, biases, np.diag(variances).ravel())):
             discrete_state.set_value(group, values)
 

@@ -13,6 +13,7 @@ from splatpilot.diagrams.flight.policies import policy_named
 from splatpilot.diagrams.flight.scenario import Scenario, sample_initial_state
 from splatpilot.diagrams.flight.sensors import make_onboard_camera
 from splatpilot.diagrams.flight.simulation import fly
+from splatpilot.systems.common.config import load_config
 from splatpilot.systems.sensing.noise import ObservationNoise
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.sensing.time_of_flight import equivalent_sensor, time_of_flight_grid
@@ -117,3 +118,64 @@ def test_rolling_shutter_starts_where_the_vehicle_was(post_world, latency):
         assert np.abs(seen.translation() - then.translation()).max() < 2e-3
         assert (seen.rotation().inverse() @ then.rotation()).ToAngleAxis().angle() < 5e-3
     assert np.linalg.norm(states[now][3:6]) > 0.5
+
+
+@pytest.mark.parametrize("policy", ["planner", "reactive", "diffaero_tof", "diffaero_rgb"])
+def test_profiles_fly_every_policy_and_repeat(policy, post_world):
+    scenario = load_config(
+        Scenario(timeout=1.0, policy=policy_named(policy)), overrides=["profile=realistic"]
+    )
+    first, again = (
+        fly(BuildFlightDiagram(scenario, post_world, camera=False)).states for _ in range(2)
+    )
+    np.testing.assert_array_equal(first, again)
+    scenario.seed = 1
+    assert np.any(
+        fly(BuildFlightDiagram(scenario, post_world, camera=False)).states[-1] != first[-1]
+    )
+
+
+@pytest.mark.parametrize(
+    "estimator",
+    ["!MotionCapture {}", "!VisualInertial {}", "!InertialFilter {height: {max_range: 4.0}}"],
+)
+def test_policies_get_the_scenarios_estimate_and_collisions_the_truth(estimator, post_world):
+    policy, states = policy_named("straight"), {}
+    for text in (estimator, "{}"):
+        scenario = load_config(
+            Scenario(timeout=2.0, policy=policy, start_radius=0.0), overrides=[f"estimator={text}"]
+        )
+        diagram = BuildFlightDiagram(scenario, post_world, camera=False)
+        states[text] = fly(diagram).states[:90]
+        assert diagram.HasOutputPort("estimated_state") == (text != "{}")
+    assert np.any(states[estimator] != states["{}"])
+    np.testing.assert_allclose(states[estimator][-1, :3], states["{}"][-1, :3], atol=0.4)
+
+
+class Climber(LeafSystem):
+    """A policy that decides continually."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.DeclareVectorOutputPort(
+            "velocity", 3, lambda context, output: output.SetFromVector([0.0, 0.0, 1.0])
+        )
+
+
+def test_a_continual_policy_has_no_decision_delay(post_world):
+    scenario = Scenario(decision_delay=[0.0, 0.1])
+    with pytest.raises(ValueError, match=r"decision_delay must be empty for a policy without"):
+        BuildFlightDiagram(scenario, post_world, camera=False, policy=Climber())
+
+
+def test_the_controller_has_its_own_rate(post_world):
+    scenario = Scenario(timeout=0.5, policy=policy_named("straight"))
+    scenario.controller.period = 0.002
+    diagram = BuildFlightDiagram(scenario, post_world, camera=False)
+    controller = diagram.GetSubsystemByName("controller")
+    update = controller.GetUniquePeriodicDiscreteUpdateAttribute()
+    assert update is not None and update.period_sec() == 0.002
+    fast = fly(diagram).states[-1, :3]
+    scenario.controller.period = 0.02
+    slow = fly(BuildFlightDiagram(scenario, post_world, camera=False)).states[-1, :3]
+    assert 0.0 < np.linalg.norm(fast - slow) < 0.05

@@ -5,8 +5,14 @@ import sys
 
 import pytest
 
-from splatpilot.diagrams.flight.scenario import Scenario
-from splatpilot.diagrams.scenarios import benchmark_scenarios, other_scenarios, scenario_file
+from splatpilot.diagrams.flight.policies import policy_named
+from splatpilot.diagrams.flight.scenario import Scenario, sample_scenario
+from splatpilot.diagrams.scenarios import (
+    benchmark_scenarios,
+    other_scenarios,
+    profiles,
+    scenario_file,
+)
 from splatpilot.systems.common.config import dump_config, load_config, parse_config
 
 
@@ -47,3 +53,63 @@ print(sp.dump_config(yaml_load_typed(schema=sp.Scenario, data={text!r})))
 """
     ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert ran.stdout.strip() == dump_config(parse_config(Scenario(), text, "text")).strip()
+
+
+def loaded(*overrides: str, **fields) -> Scenario:
+    return load_config(Scenario(**fields), overrides=overrides)
+
+
+def test_a_profile_sets_its_fields_and_keeps_the_others():
+    overrides = "vehicle.drag=!Uniform {min: 0.3, max: 0.5}", "timeout=9", "profile=realistic"
+    scenario = loaded(*overrides, "observation.latency=0")
+    assert scenario.timeout == 9 and scenario.observation.latency == 0
+    assert 0.3 < sample_scenario(scenario).vehicle.drag < 0.5
+    drawn = [sample_scenario(loaded("profile=harsh", f"seed={k}")).imaging for k in (1, 2)]
+    assert drawn[0].focal_scale != drawn[1].focal_scale
+    assert drawn[0].stereo == drawn[1].stereo != scenario.imaging.stereo
+    again = parse_config(Scenario(), dump_config(scenario), "again")
+    assert again == scenario
+
+
+def test_a_profile_may_be_a_file(tmp_path):
+    file = tmp_path / "mine.yaml"
+    file.write_text("controller: {period: 0.005}\nestimator: !MotionCapture {rate: 200}\n")
+    scenario = loaded(f"profile={file}")
+    assert (scenario.controller.period, scenario.estimator.rate) == (0.005, 200)
+    with pytest.raises(ValueError, match=r"no profile 'real'.*realistic"):
+        loaded("profile=real")
+    file.write_text("estimators: {}\n")
+    with pytest.raises(ValueError, match=r"mine.yaml: there is no field estimators; did you mean"):
+        loaded(f"profile={file}")
+
+
+@pytest.mark.parametrize("name", profiles())
+@pytest.mark.parametrize("policy", ["planner", "diffaero", "diffaero_tof", "diffaero_rgb"])
+def test_profiles_are_valid_for_every_seed(name, policy):
+    for seed in range(20):
+        loaded(f"profile={name}", f"seed={seed}", policy=policy_named(policy)).validate()
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (
+            ["estimator=!VisualInertial {rate: 10}"],
+            r"estimator\.rate must be at least 15 Hz, got 10.*; a policy needs",
+        ),
+        (
+            ["imaging.exposure_time=0.08"],
+            r"imaging\.exposure_time must be at most 0\.06667 s, .*, got 0\.08; shorten it",
+        ),
+        (
+            ["imaging.exposure_time=0.04", "observation.frame_rate=[20, 30]"],
+            r"exposure_time must be at most 0\.03333 s",
+        ),
+        (["decision_delay=[0.1, 0.05]"], r"decision_delay must be two numbers in ascending"),
+        (["decision_delay=[0.0, 2.0]"], r"decision_delay must be in \[0, 1\] s"),
+        (["imaging.stereo={baseline: 0}"], r"imaging\.stereo\.baseline must be in \(0, 1\] m"),
+    ],
+)
+def test_times_that_do_not_fit_are_named(overrides, message):
+    with pytest.raises(ValueError, match=message):
+        loaded(*overrides, policy=policy_named("diffaero")).validate()

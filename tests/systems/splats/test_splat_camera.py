@@ -13,6 +13,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.sensors import CameraInfo, RgbdSensor
 
 from splatpilot.systems.collision.shapes import MovingSpheres
+from splatpilot.systems.sensing.noise import light_of_color
 from splatpilot.systems.splats.background import EnvironmentMap
 from splatpilot.systems.splats.baked_scene import BakedScene, MovingGaussians
 from splatpilot.systems.splats.lens import Distortion
@@ -186,6 +187,40 @@ def test_each_row_is_that_of_its_pose():
         np.testing.assert_allclose(view.depth[row][both], own.depth[row][both], rtol=5e-3)
 
 
+def light(view) -> np.ndarray:
+    return light_of_color(255.0 * view.color)
+
+
+@pytest.mark.parametrize("readout", [0.0, 0.01])
+def test_motion_blur_is_the_mean_light_of_the_exposure(readout):
+    exposure, end = 0.02, (0.02 + readout) / 0.02
+    camera = SplatCamera(pole(), SHUTTER_INFO, exposure=exposure, readout=readout)
+    sharp = SplatCamera(pole(), SHUTTER_INFO, readout=readout)
+    X_0, X_1 = yawed(-0.15), RigidTransform(yawed(0.15 * (2 * end - 1)).rotation(), [0.1, 0.2, 0.0])
+    view = camera.render(X_1, None, X_0)
+    instants = [
+        sharp.render(
+            pose_between(X_0, X_1, (s + end - 1) / end),
+            None,
+            pose_between(X_0, X_1, s / end) if readout else None,
+        )
+        for s in (np.arange(400) + 0.5) / 400
+    ]
+    expected = np.mean([light(each) for each in instants], axis=0)
+    assert np.abs(light(instants[200]) - expected).max() > 0.5  # A sharp image is another.
+    assert np.abs(light(view) - expected).max() < 0.05
+    np.testing.assert_allclose(light(view).sum(axis=1), expected.sum(axis=1), rtol=0.02)
+    assert np.mean(np.abs(view.depth - instants[199].depth) > 0.05) < 0.01
+
+
+def test_a_still_camera_renders_once():
+    scene = wall(3)
+    camera = SplatCamera(scene, INFO, X_BC, exposure=0.02)
+    still = camera.render(RigidTransform(), None, RigidTransform())
+    assert scene.renders == 1
+    np.testing.assert_array_equal(still.color, camera.render(RigidTransform()).color)
+
+
 def test_bands():
     X = RigidTransform()
     assert row_bands(X, X, FOCAL, HEIGHT) == [(0, HEIGHT)]
@@ -224,6 +259,7 @@ def test_ports(distortion):
     ("options", "message"),
     [
         ({"min_depth": 2.0, "max_depth": 1.0}, r"depth range must be .* got \[2.0, 1.0\]"),
+        ({"exposure": -0.01}, r"exposure must be finite and >= 0 s, got -0\.01"),
         ({"readout": -0.01}, r"readout must be finite and >= 0 s, got -0\.01"),
     ],
 )
