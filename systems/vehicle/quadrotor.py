@@ -78,7 +78,7 @@ class QuadrotorParams(Config):
     rate_time_constant: float = bounded(0.05, "(0, inf) s")
     # [-] Time constant of yaw over that of roll and pitch.
     yaw_time_ratio: float = bounded(1.0, "(0, inf)")
-    # [s] First-order lag of the thrust; with rotors, of their speeds. 0 is none.
+    # [s] First-order lag of the thrust; with rotors, of their speeds; 0 disables it.
     motor_time_constant: float = bounded(0.0, "[0, inf) s")
     # [m/s^2] Minimum thrust over mass.
     min_thrust: float = bounded(0.0, "[0, inf) m/s^2")
@@ -96,7 +96,7 @@ class QuadrotorParams(Config):
     battery_charge: float = bounded(1.0, "[0, 1]")
     # [s] Time of hovering that empties a full battery.
     battery_endurance: float = bounded(math.inf, "(0, inf] s")
-    # [m] Radius of the rotors for the ground effect over the plane z = 0; 0 is none.
+    # [m] Radius of the rotors for the ground effect over the plane z = 0; 0 disables it.
     ground_effect: float = bounded(0.0, "[0, inf) m")
     # [m/s^2] Gravitational acceleration, along -z of the world.
     gravity: float = bounded(GRAVITY, "[0, inf) m/s^2")
@@ -116,6 +116,9 @@ class QuadrotorParams(Config):
 
     def check(self) -> None:
         """Raises FieldError for a vehicle that cannot hover, or whose rate loop is unstable."""
+        for name, size in _SIZES.items():
+            valid = len(getattr(self, name)) == size
+            require_field(self, name, valid, f"{size} numbers")
         needed = self.gravity / self.thrust_scale
         needed /= 1.0 - self.battery_sag * (1.0 - self.battery_charge)
         condition = f"above {needed:.4g} m/s^2, to hover"
@@ -144,6 +147,7 @@ class QuadrotorParams(Config):
         return min(lag for lag in lags if lag > 0.0)
 
 
+_SIZES = {"rotor_drag": 3, "quadratic_drag": 3, "inertia": 3, "arm": 2}
 _IDEAL = ["drag", "rate_time_constant", "gravity"]
 _ROTORS = ["mass", "inertia", "arm", "thrust_coefficient", "torque_ratio"]
 _NAMES = [field.name for field in fields(QuadrotorParams)]
@@ -312,7 +316,7 @@ def actuated_derivatives(
             state[:13], (thrust, *rates), params.drag, 1.0, params.gravity, wind, added
         )[:10],
         *accelerations,
-        -power * sqrt(power) / params.battery_endurance,
+        -power * sqrt(power) * (1.0 / params.battery_endurance),  # x / inf of AutoDiffXd is NaN
         *(
             (u - now) / params.motor_time_constant
             for u, now in zip(targets, actuators, strict=False)

@@ -16,7 +16,13 @@ from scipy.linalg import block_diag, cholesky, expm, solve_continuous_lyapunov
 
 from splatpilot.systems.common.distributions import draw
 from splatpilot.systems.common.drake import ConfigParameter, parameter_setter, system_template
-from splatpilot.systems.common.validation import Config, bounded, check_seed, require_type
+from splatpilot.systems.common.validation import (
+    Config,
+    bounded,
+    check_seed,
+    require_field,
+    require_type,
+)
 
 _FOOT = 0.3048  # [m]
 
@@ -34,6 +40,9 @@ class Wind(Config):
     altitude: float = bounded(10 * _FOOT, f"[{10 * _FOOT}, {1000 * _FOOT}] m")
     # [m/s] Speed of the vehicle through the gusts, which travel with the air.
     airspeed: float = bounded(2.0, "(0, inf) m/s")
+
+    def check(self) -> None:
+        require_field(self, "mean", len(self.mean) == 3, "three numbers [m/s]")
 
 
 def dryden_scales(wind: Wind) -> tuple[np.ndarray, np.ndarray]:
@@ -81,7 +90,7 @@ def dryden_filter(wind: Wind, period: float) -> tuple[Any, Any, Any, Any]:
         roots.append(cholesky(covariance - steps[-1] @ covariance @ steps[-1].T, lower=True))
         starts.append(cholesky(covariance, lower=True))
     across = np.array([[math.sqrt(3.0), 1.0 - math.sqrt(3.0)]])
-    C = block_diag(*(s * form for s, form in zip(sigmas, ([[1.0]], across, across), strict=True)))
+    C = block_diag(*(s * form for s, form in zip(sigmas, (np.eye(1), across, across), strict=True)))
     return block_diag(*steps), block_diag(*roots), C, block_diag(*starts)
 
 
