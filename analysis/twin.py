@@ -20,7 +20,12 @@ from splatpilot.analysis.benchmark.tables import Row
 from splatpilot.analysis.output import write_csv, write_png
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.worlds.mesh_world import MeshWorld
-from splatpilot.diagrams.worlds.scene_folder import SceneConfig, read_scene_metadata
+from splatpilot.diagrams.worlds.scene_folder import (
+    SceneConfig,
+    draw_ends,
+    read_scene_folder,
+    read_scene_metadata,
+)
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.common.progress import Progress
@@ -76,8 +81,8 @@ def run(
     *, scenes: Sequence[Path], out: Path, config: TwinConfig, jobs: int | None = None
 ) -> list[dict[str, Any]]:
     """Flies all policies in scenes and in their meshes, and writes `flights.csv`, `twin.csv` and
-    `twin.png`. The same call resumes, and
-    with more scenes flies what is missing. Returns the rows of `twin.csv`, see `predictions`."""
+    `twin.png`. The same call resumes, and with more scenes flies what is missing. Returns the rows
+    of `twin.csv`, see `predictions`."""
     config.validate()
     names = [scene.resolve().name for scene in scenes]
     unique = len(set(names)) == len(names)
@@ -137,12 +142,13 @@ def draw_routes(scene: Path, mesh: World, count: int) -> list[Route]:
     """Draws `count` starts and goals in well-observed space of the scene folder `scene`, that a
     path in the mesh connects, too. Others are skipped, and counted."""
     esdf = mesh.esdf.conservative()
+    config, world = SceneConfig(path=str(scene.resolve())), read_scene_folder(scene)
     routes, skipped, reason = [], 0, ""
     for seed in Progress(range(_DRAWS * count), f"routes of {scene.name}", unit="seed"):
         if len(routes) == count:
             break
         try:
-            drawn = make_world(SceneConfig(path=str(scene.resolve()), draw_ends=True), seed)
+            drawn = draw_ends(config, world, seed)
             if not time_of_arrival(esdf, drawn.p_WG).is_reachable(drawn.p_WS):
                 raise InfeasibleFlightError("no path in the mesh")
         except InfeasibleFlightError as error:
