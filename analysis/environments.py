@@ -34,12 +34,14 @@ from splatpilot.diagrams.scenarios import benchmark_scenarios
 from splatpilot.diagrams.worlds.octomap_world import OCTOMAP, OctomapConfig
 from splatpilot.diagrams.worlds.scene_folder import (
     SceneConfig,
+    SceneSource,
+    draw_ends,
     read_scene_folder,
     read_scene_metadata,
 )
 from splatpilot.diagrams.worlds.splits import SPLITS, part_digests, source_digest
 from splatpilot.diagrams.worlds.world import World
-from splatpilot.diagrams.worlds.world_registry import WorldConfig, make_world, scene_config
+from splatpilot.diagrams.worlds.world_registry import make_world, scene_config
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.common.config import load_config
 from splatpilot.systems.common.files import (
@@ -328,10 +330,10 @@ def _make(
     )
 
 
-def _record(name: str, entry: Entry, config: WorldConfig, digest: list[str]) -> Record:
+def _record(name: str, entry: Entry, config: SceneSource, digest: list[str]) -> Record:
     """Returns the part of a record that does not depend on a capture."""
-    feasible, reason = feasible_seeds(config)
     world = make_world(config, 0)
+    feasible, reason = feasible_seeds(config, world)
     return Record(
         name=name,
         source=entry.source,
@@ -349,14 +351,13 @@ def _record(name: str, entry: Entry, config: WorldConfig, digest: list[str]) -> 
     )
 
 
-def feasible_seeds(config: WorldConfig, seeds: int = _SEEDS) -> tuple[int, str]:
+def feasible_seeds(config: SceneSource, scene: World, seeds: int = _SEEDS) -> tuple[int, str]:
     """Counts the seeds from 0 whose start and goal a search on the distance field connects, and
     returns the reason of the first that is not one of them."""
     count, reason = 0, ""
-    drawn = replace(config, draw_ends=True)
     for seed in Progress(range(seeds), "starts and goals", unit="seed", leave=False):
         try:
-            world = make_world(drawn, seed)
+            world = draw_ends(config, scene, seed)
             state = sample_initial_state(Scenario(seed=seed), world)
             toa = time_of_arrival(world.esdf.conservative(), world.p_WG)
             if not toa.is_reachable(state[:3]):

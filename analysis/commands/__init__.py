@@ -34,6 +34,10 @@ COMMANDS = {
         "scene",
         "measure how far from its capture's path a scene can be trusted",
     ),
+    "scene twin": (
+        "scene",
+        "measure how well flights in scenes predict flights in the meshes that they show",
+    ),
     "library": ("", "make and list the environments of a folder of data"),
     "library make": ("library", "reconstruct, measure and record environments"),
     "library show": ("library", "print the recorded environments, and draw each"),

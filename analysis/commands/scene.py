@@ -171,3 +171,26 @@ def fidelity(options: argparse.Namespace) -> None:
     from splatpilot.analysis.fidelity import fidelity
 
     cli.call(fidelity.run, options, config=cli.read_config(options))
+
+
+@cli.command(
+    "scene twin",
+    cli.path_option("scenes", "a scene folder of a rendered capture", nargs="+", metavar="SCENE"),
+    cli.out_option("output folder", "out/twin"),
+    cli.JOBS,
+    cli.set_option(
+        *("routes=10", "policies=[planner, mine.npz]"),
+        configuration="splatpilot.analysis.twin:TwinConfig",
+    ),
+    examples=("scene twin scenes/small_house scenes/cafe", "scene twin scenes/cafe --set routes=5"),
+)
+def twin(options: argparse.Namespace) -> None:
+    """Flies policies in scenes and, from the same starts to the same goals, in the meshes that
+    their captures were rendered of, and writes how well success in the one predicts success in the
+    other. If interrupted, the same command resumes."""
+    cli.announce(f"flying in {len(options.scenes)} scenes and their meshes in {options.out}")
+    for scene in options.scenes:
+        check_kind(scene, "scene")
+    from splatpilot.analysis import twin as twins
+
+    cli.call(twins.run, options, config=cli.read_config(options))

@@ -20,7 +20,8 @@ import trimesh
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 from pydrake.math import RotationMatrix
-from scipy.ndimage import map_coordinates
+from scipy.ndimage import binary_dilation, map_coordinates
+from scipy.spatial import KDTree
 from trimesh.exchange.gltf import export_gltf
 from trimesh.resolvers import FilePathResolver
 from trimesh.visual import TextureVisuals
@@ -28,8 +29,9 @@ from trimesh.visual.color import uv_to_interpolated_color
 from trimesh.visual.material import PBRMaterial
 
 from splatpilot.diagrams.worlds.splits import part_digests
-from splatpilot.systems.collision.esdf import Esdf
-from splatpilot.systems.collision.esdf_build import esdf_from_occupancy, grid_shape
+from splatpilot.systems.collision.distance_field import FieldState
+from splatpilot.systems.collision.esdf import Esdf, distances_from_band
+from splatpilot.systems.collision.esdf_build import grid_shape
 from splatpilot.systems.common.readers import readable, require_file, require_readable_size
 from splatpilot.systems.common.validation import require
 
@@ -109,7 +111,14 @@ def mesh_distance(mesh: Path, up: str, voxel_size: float, scale: float = 1.0) ->
     shape = np.ceil((upper_W - lower_W) / voxel_size).astype(int)
     occupied = np.zeros(shape, dtype=bool)
     occupied[tuple(((p_WQ - lower_W) / voxel_size).astype(int).T)] = True
-    return esdf_from_occupancy(occupied, None, lower_W, voxel_size)
+    # The exact distances next to occupied voxels continue into the rest.
+    near = binary_dilation(occupied, np.ones((3, 3, 3), bool)) & ~occupied
+    band = np.full(shape, np.nan, np.float32)
+    centers = lower_W + (np.argwhere(near) + 0.5) * voxel_size
+    band[near] = KDTree(p_WQ, balanced_tree=False).query(centers, workers=-1)[0]
+    distances = distances_from_band(occupied, band, voxel_size)
+    states = occupied.astype(np.uint8) * np.uint8(FieldState.OCCUPIED)
+    return Esdf(distances, states, lower_W, voxel_size)
 
 
 def sample_colors(

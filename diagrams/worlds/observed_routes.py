@@ -1,5 +1,6 @@
 """Starts and goals whose views along the route the capture observed."""
 
+import functools
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -127,8 +128,7 @@ def choose_observed_route(
     Raises:
         InfeasibleFlightError: if no such route is found.
     """
-    search = _Search(world, min_length)
-    longest = search.longest(limit)
+    search, longest = _search(world, limit, min_length)
     if longest is None:
         raise search.infeasible(limit)
     if seed is None:
@@ -148,6 +148,15 @@ def choose_default_route(world: World) -> ObservedRoute:
     if observed is None or observed.length < LONG_ENOUGH:
         return search.best() or observed or search.fallback()
     return observed
+
+
+@functools.lru_cache(maxsize=1)
+def _search(
+    world: World, limit: float, min_length: float
+) -> tuple["_Search", ObservedRoute | None]:
+    """Returns what does not depend on the seed: the search, and its longest route."""
+    search = _Search(world, min_length)
+    return search, search.longest(limit)
 
 
 class _Search:

@@ -100,7 +100,9 @@ def load_config[Configuration](
         require(equals, "an override", "FIELD=VALUE", repr(override))
         if name in (overlays := getattr(config, "OVERLAYS", {})):
             file = overlays[name](value)
-            config = parse_config(copy.deepcopy(config), read_text(file), str(file))
+            with yaml_errors(str(file)):
+                root = yaml.compose(read_text(file), yaml.SafeLoader)
+            config = _with_fields(config, root, [], str(file))
             continue
         config = _with_field(config, name.split("."), value, f"override {override!r}")
     return config
@@ -172,6 +174,27 @@ def require_configuration(config: type) -> None:
             f"{name} makes no YAML ({type(error).__name__}: {error_summary(error)}); give all "
             "fields defaults, and types of bool, int, float, str, list, dict or other dataclasses"
         ) from None
+
+
+def _with_fields(config: Any, node: yaml.Node | None, path: list[str], source: str) -> Any:
+    """Returns a copy of `config` with the fields of a YAML mapping, one by one: parts without a tag
+    keep their type and their other fields."""
+    what = ".".join(path) or source
+    require(isinstance(node, yaml.MappingNode), what, "fields, NAME: VALUE each", "none")
+    assert isinstance(node, yaml.MappingNode)
+    for key, value in node.value:
+        inner, part = [*path, key.value], config
+        for name in inner:
+            part = getattr(part, name, None)
+        plain = isinstance(value, yaml.MappingNode) and value.tag.startswith("tag:yaml.org")
+        if plain and is_configuration(part):
+            config = _with_fields(config, value, inner, source)
+        else:
+            if isinstance(value, yaml.CollectionNode):
+                value.flow_style = True
+            text = yaml.serialize(value, width=inf).removesuffix("...\n").strip()
+            config = _with_field(config, inner, text, source)
+    return config
 
 
 def _with_field(config: Any, path: list[str], value: str, source: str) -> Any:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from splatpilot.systems.common.drake import vector_input
+from splatpilot.systems.common.drake import optional_input, vector_input
 from splatpilot.systems.common.validation import Config, bounded
 from splatpilot.systems.vehicle.quadrotor import QuadrotorParams, quadrotor_derivatives
 from splatpilot.systems.vehicle.state import QuadrotorState, pose_from_state
@@ -33,13 +33,9 @@ class Imu(Config):
     gyroscope_walk: float = bounded(1.9393e-5, "[0, inf) rad/s^2/sqrt(Hz)")
 
 
-def specific_force(state: np.ndarray, command: np.ndarray, params: QuadrotorParams) -> np.ndarray:
-    """Computes the acceleration less gravity (3,) [m/s^2] in B, from state (13,) and command (4,).
-
-    f_B = R_BW (d/dt v_WB + g e_z), see `quadrotor_derivatives`.
-    """
-    f_W = np.array(quadrotor_derivatives(state, command, params)[3:6])
-    f_W[2] += params.gravity
+def specific_force(state: np.ndarray, a_WB: np.ndarray, gravity: float) -> np.ndarray:
+    """Computes f_B = R_BW (a_WB + g e_z) (3,) [m/s^2], of a state (13,) and acceleration (3,)."""
+    f_W = a_WB + np.array([0.0, 0.0, gravity])
     return pose_from_state(state).rotation().inverse().multiply(f_W)
 
 
@@ -56,11 +52,13 @@ class ImuSensor(LeafSystem):
     .. pydrake_system::
 
         name: ImuSensor
-        input_ports: [state, command]
+        input_ports: [state, command, acceleration]
         output_ports: [accelerometer, gyroscope]
 
     - ``state`` (13), ``command`` (4): those of `QuadrotorPlant`.
-    - ``accelerometer`` (3): `specific_force` [m/s^2] in B, of a vehicle without wind.
+    - ``acceleration`` (3), optional: a_WB [m/s^2]; by default that of a vehicle with linear drag
+      alone in calm air, `quadrotor_derivatives`.
+    - ``accelerometer`` (3): specific force [m/s^2] in B.
     - ``gyroscope`` (3): w_WB_B [rad/s].
 
     Samples at the rate from time 0 and holds; before, it measures a vehicle at rest. Sample k, with
@@ -80,6 +78,7 @@ class ImuSensor(LeafSystem):
         self._walk = np.repeat([config.accelerometer_walk, config.gyroscope_walk], 3)
         self.DeclareVectorInputPort("state", 13)
         self.DeclareVectorInputPort("command", 4)
+        self.DeclareVectorInputPort("acceleration", 3)
         at_rest = self.DeclareDiscreteState(np.array([0.0, 0.0, params.gravity]))
         self.DeclareStateOutputPort("accelerometer", at_rest)
         self.DeclareStateOutputPort("gyroscope", self.DeclareDiscreteState(3))
@@ -87,11 +86,17 @@ class ImuSensor(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(1.0 / config.rate, 0.0, self._sample)
 
     def _sample(self, context: Context, discrete_state: DiscreteValues) -> None:
-        state, command = (vector_input(self, name, context) for name in ("state", "command"))
+        state, a_WB = (
+            vector_input(self, "state", context),
+            optional_input(self, "acceleration", context),
+        )
+        if a_WB is None:
+            command = vector_input(self, "command", context)
+            a_WB = np.array(quadrotor_derivatives(state, command, self._params)[3:6])
         rate, bias = self._config.rate, np.array(context.get_discrete_state(2).value())
         random = sample_generator(self, self._seed, context.get_time(), rate)
         white, step = random.standard_normal((2, 6))
-        force = specific_force(state, command, self._params)
+        force = specific_force(state, a_WB, self._params.gravity)
         measured = np.append(force, QuadrotorState.of(state).w_WB_B)
         error, next_bias = measurement_error(bias, white, step, self._noise, self._walk, rate)
         measured += error

@@ -4,6 +4,7 @@ import subprocess
 import sys
 
 import pytest
+from pydrake.common.schema import Uniform
 
 from splatpilot.diagrams.flight.policies import policy_named
 from splatpilot.diagrams.flight.scenario import Scenario, sample_scenario
@@ -14,6 +15,7 @@ from splatpilot.diagrams.scenarios import (
     scenario_file,
 )
 from splatpilot.systems.common.config import dump_config, load_config, parse_config
+from splatpilot.systems.vehicle.vehicles import Kingfisher
 
 
 def test_names_and_paths_are_found(tmp_path):
@@ -69,6 +71,17 @@ def test_a_profile_sets_its_fields_and_keeps_the_others():
     assert drawn[0].stereo == drawn[1].stereo != scenario.imaging.stereo
     again = parse_config(Scenario(), dump_config(scenario), "again")
     assert again == scenario
+
+
+def test_a_profile_keeps_the_type_of_the_vehicle(tmp_path):
+    file = tmp_path / "mine.yaml"
+    file.write_text("vehicle: {thrust_scale: 0.9, drag: !Uniform {min: 0.3, max: 0.5}}\n")
+    vehicle = loaded("vehicle=!Kingfisher {mass: 0.8}", f"profile={file}").vehicle
+    assert vehicle == Kingfisher(mass=0.8, thrust_scale=0.9, drag=vehicle.drag)
+    assert isinstance(vehicle.drag, Uniform)
+    file.write_text("[1, 2]\n")
+    with pytest.raises(ValueError, match=r"mine.yaml must be fields, NAME: VALUE each"):
+        loaded(f"profile={file}")
 
 
 def test_a_profile_may_be_a_file(tmp_path):

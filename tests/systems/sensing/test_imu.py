@@ -11,7 +11,12 @@ from splatpilot.systems.sensing.imu import (
     measurement_error,
     specific_force,
 )
-from splatpilot.systems.vehicle.quadrotor import QuadrotorParams, QuadrotorPlant, hover_state
+from splatpilot.systems.vehicle.quadrotor import (
+    QuadrotorParams,
+    QuadrotorPlant,
+    hover_state,
+    quadrotor_derivatives,
+)
 
 IDEAL = {
     name: 0.0
@@ -49,7 +54,8 @@ def test_specific_force_is_thrust_less_drag_in_body_axes(roll):
     q_WB = R_WB.ToQuaternion().wxyz()
     state = np.concatenate([np.zeros(3), v_WB, q_WB, np.zeros(3)])
     expected = [0.0, 0.0, 12.0] - PARAMS.drag * (R_WB.matrix().T @ v_WB)
-    force = specific_force(state, np.array([12.0, 0.0, 0.0, 0.0]), PARAMS)
+    a_WB = np.array(quadrotor_derivatives(state, np.array([12.0, 0.0, 0.0, 0.0]), PARAMS)[3:6])
+    force = specific_force(state, a_WB, PARAMS.gravity)
     np.testing.assert_allclose(force, expected, atol=1e-12)
 
 
@@ -58,6 +64,22 @@ def test_an_ideal_imu_measures_hover_and_rates():
     np.testing.assert_allclose(accelerometer, np.tile([0.0, 0.0, 9.81], (100, 1)), atol=1e-9)
     _, gyroscope = measure(Imu(**IDEAL), 0, 1.0, command=(9.81, 0.0, 0.0, 0.4))
     np.testing.assert_allclose(gyroscope[-1], [0.0, 0.0, 0.4], atol=1e-6)
+
+
+def test_an_imu_feels_wind_through_the_acceleration():
+    builder = DiagramBuilder()
+    plant = builder.AddSystem(QuadrotorPlant(PARAMS, hover_state([0.0, 0.0, 5.0])))
+    imu = builder.AddSystem(ImuSensor(Imu(**IDEAL), PARAMS, 0))
+    for port, values in (("command", [9.81, 0.0, 0.0, 0.0]), ("wind", [4.0, 0.0, 0.0])):
+        source = builder.AddSystem(ConstantVectorSource(values))
+        builder.Connect(source.get_output_port(), plant.GetInputPort(port))
+    for port in ("state", "acceleration"):
+        builder.Connect(plant.GetOutputPort(port), imu.GetInputPort(port))
+    simulator = Simulator(builder.Build())
+    simulator.AdvanceTo(0.001)
+    context = imu.GetMyContextFromRoot(simulator.get_context())
+    force = imu.GetOutputPort("accelerometer").Eval(context)
+    np.testing.assert_allclose(force, [4.0 * PARAMS.drag, 0.0, 9.81], atol=1e-9)
 
 
 def test_white_noise_has_the_density():

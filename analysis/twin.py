@@ -1,0 +1,304 @@
+"""`splatpilot scene twin`: how well flights in scenes predict flights in what was captured.
+
+The scenes are of rendered captures. Each policy flies from the same starts to the same goals in the
+scene and in the mesh that the capture shows.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import rankdata
+
+from splatpilot.analysis.benchmark import run_study
+from splatpilot.analysis.benchmark.parameters import scenario_texts
+from splatpilot.analysis.benchmark.study import StudyConfig
+from splatpilot.analysis.benchmark.tables import Row
+from splatpilot.analysis.output import write_csv, write_png
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.worlds.mesh_world import MeshWorld
+from splatpilot.diagrams.worlds.scene_folder import (
+    SceneConfig,
+    draw_ends,
+    read_scene_folder,
+    read_scene_metadata,
+)
+from splatpilot.diagrams.worlds.world import World
+from splatpilot.diagrams.worlds.world_registry import make_world
+from splatpilot.systems.common.progress import Progress
+from splatpilot.systems.common.provenance import InfeasibleFlightError
+from splatpilot.systems.common.validation import Config, bounded, require
+from splatpilot.systems.policies.time_of_arrival import time_of_arrival
+from splatpilot.training.captures.render import RECIPE, rendered_world
+
+POLICIES = (
+    "planner",
+    "straight",
+    "reactive",
+    "close=reactive:margin=0.0:barrier_margin=0.2",
+    "diffaero",
+    "diffaero_4=diffaero:speed=4",
+    "diffaero_8=diffaero:speed=8",
+    "depthnav",
+    "depthnav_4=depthnav:speed=4",
+    "agile_autonomy",
+    "student_depth",
+    "student_rgb",
+    "diffaero_rgb",
+    "diffaero_rgb_4=diffaero_rgb:speed=4",
+)
+"""Default policies: of all kinds, and at speeds at which they fail."""
+
+_DRAWS = 5  # routes that are drawn at most, for each that is flown
+_RESAMPLES = 10_000
+
+
+@dataclass
+class TwinConfig(Config):
+    """What flies, and where from and to."""
+
+    policies: list[str] = field(default_factory=lambda: list(POLICIES))
+    routes: int = bounded(20, "[2, 1000]")  # starts and goals in each scene
+    timeout: float = bounded(30.0, "(0, 3600] s")
+    # [m] The meshes are flown again from starts within this distance, to learn how well flights in
+    # one environment agree with each other; 0: they are not.
+    repeat_radius: float = bounded(0.0, "[0, 1] m")
+    # Generated scenarios that are flown with as many seeds, as another prediction.
+    control: list[str] = field(default_factory=lambda: ["P02", "P04"])
+
+
+class Route(NamedTuple):
+    """A start and a goal [m], in the world frame of the scene."""
+
+    p_WS: NDArray[np.float64]
+    p_WG: NDArray[np.float64]
+
+
+def run(
+    *, scenes: Sequence[Path], out: Path, config: TwinConfig, jobs: int | None = None
+) -> list[dict[str, Any]]:
+    """Flies all policies in scenes and in their meshes, and writes `flights.csv`, `twin.csv` and
+    `twin.png`. The same call resumes, and with more scenes flies what is missing. Returns the rows
+    of `twin.csv`, see `predictions`."""
+    config.validate()
+    names = [scene.resolve().name for scene in scenes]
+    unique = len(set(names)) == len(names)
+    require(unique, "names of scenes", "different", ", ".join(names), "rename one folder")
+    given, texts = {}, []
+    for name, scene in zip(names, scenes, strict=True):
+        mesh = mesh_of(scene)
+        worlds = {"splat": SceneConfig(path=str(scene.resolve())), "mesh": mesh}
+        routes = draw_routes(scene, make_world(mesh, 0), config.routes)
+        for kind, world in worlds.items():
+            given[f"{name}.{kind}"] = Scenario(world=world)
+        for kind in ("splat", "mesh", "again")[: 2 + bool(config.repeat_radius)]:
+            radius = config.repeat_radius if kind == "again" else 0.0
+            base = f"{name}.{'splat' if kind == 'splat' else 'mesh'}"
+            for k, (start, goal) in enumerate(routes):
+                ends = {"start": start.tolist(), "goal": goal.tolist(), "start_radius": radius}
+                (text,) = scenario_texts([base], [ends])
+                texts.append(f"{name}.{kind}.{k}={text}")
+    overrides = [f"timeout={config.timeout}"]
+    study = StudyConfig(texts, list(config.policies), seeds=1, overrides=overrides)
+    folder = out / "twins"
+    rows = run_study.run(config=study, out=folder, jobs=jobs, given=given, report=False).rows
+    generated: list[Row] = []
+    if config.control:
+        study = replace(study, scenarios=list(config.control), seeds=config.routes)
+        folder = out / "control"
+        generated = run_study.run(config=study, out=folder, jobs=jobs, report=False).rows
+    pairs = paired_flights(rows)
+    write_csv(out / "flights.csv", pairs)
+    table = predictions(pairs, generated)
+    write_csv(out / "twin.csv", table)
+    _write_figure(out / "twin.png", pairs, generated)
+    _print_table(table)
+    print(f"Wrote flights.csv, twin.csv and twin.png in {out}")
+    return table
+
+
+def mesh_of(scene: Path) -> MeshWorld:
+    """Returns the mesh that the capture of the scene folder `scene` was rendered of."""
+    capture = read_scene_metadata(scene).capture
+    recipe = rendered_world(Path(capture)) if capture else None
+    if recipe is None:
+        raise ValueError(
+            f"{scene} must be of a rendered capture, got {capture or 'an unknown one'} without "
+            f"{RECIPE}; render one by `splatpilot capture render`"
+        )
+    config = recipe.config
+    return MeshWorld(
+        path=str(Path(capture) / recipe.mesh),
+        up=config.up,
+        scale=config.scale,
+        background=config.background,
+    )
+
+
+def draw_routes(scene: Path, mesh: World, count: int) -> list[Route]:
+    """Draws `count` starts and goals in well-observed space of the scene folder `scene`, that a
+    path in the mesh connects, too. Others are skipped, and counted."""
+    esdf = mesh.esdf.conservative()
+    config, world = SceneConfig(path=str(scene.resolve())), read_scene_folder(scene)
+    routes, skipped, reason = [], 0, ""
+    for seed in Progress(range(_DRAWS * count), f"routes of {scene.name}", unit="seed"):
+        if len(routes) == count:
+            break
+        try:
+            drawn = draw_ends(config, world, seed)
+            if not time_of_arrival(esdf, drawn.p_WG).is_reachable(drawn.p_WS):
+                raise InfeasibleFlightError("no path in the mesh")
+        except InfeasibleFlightError as error:
+            skipped, reason = skipped + 1, str(error)
+            continue
+        routes.append(Route(np.round(drawn.p_WS, 3), np.round(drawn.p_WG, 3)))
+    if skipped:
+        print(f"{scene.name}: {skipped} routes skipped, the last for: {reason}")
+    require(len(routes) == count, f"routes in {scene}", f"{count}", len(routes), "ask for fewer")
+    return routes
+
+
+def paired_flights(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """Returns a row for each environment, policy and route, with the success, outcome and minimum
+    clearance [m] of the flight in the splat, in the mesh, and in the mesh again."""
+    pairs: dict[tuple[str, str, int], dict[str, Any]] = {}
+    for row in rows:
+        name, kind, route = row["scenario"].rsplit(".", 2)
+        key = name, row["policy"], int(route)
+        pair = pairs.setdefault(key, {"environment": name, "policy": key[1], "route": key[2]})
+        pair[kind] = int(row["success"])
+        pair[f"{kind}_outcome"] = row["outcome"]
+        clearance = row.get("min_clearance_m")
+        pair[f"{kind}_clearance_m"] = "" if clearance in (None, "") else round(clearance, 3)
+    return list(pairs.values())
+
+
+def predictions(
+    pairs: Sequence[dict[str, Any]], control: Sequence[Row] = ()
+) -> list[dict[str, Any]]:
+    """Computes how well flights in the splat predict those in the mesh: for each environment, and
+    for all of them together.
+
+    Each row has `flights`, the success rates `mesh` and `splat`, `agreement`, the fraction of
+    flights with the same success, Cohen's `kappa`, the same of the `again` flights if there are
+    any, and Spearman's rank correlation of the policies' success rates in splat and mesh, `rho`.
+    `control` is that of their success in generated scenarios instead. `_low` and `_high` are 95 %
+    percentile intervals of a bootstrap that draws policies and, in each environment, routes.
+    """
+    environments = list(dict.fromkeys(pair["environment"] for pair in pairs))
+    policies = list(dict.fromkeys(pair["policy"] for pair in pairs))
+    cubes = {kind: _cube(pairs, kind, environments, policies) for kind in ("splat", "mesh")}
+    again = _cube(pairs, "again", environments, policies) if "again" in pairs[0] else None
+    found = ([row["success"] for row in control if row["policy"] == p] for p in policies)
+    generated = np.array([np.mean(successes or [np.nan]) for successes in found])
+    table = []
+    parts = [(name, slice(k, k + 1)) for k, name in enumerate(environments)]
+    for name, part in [*parts, ("all", slice(None))]:
+        mesh, splat = cubes["mesh"][part], cubes["splat"][part]
+        row: dict[str, Any] = {"environment": name, "flights": mesh.size}
+        row |= {"mesh": mesh.mean(), "splat": splat.mean()}
+        row |= {"agreement": np.mean(mesh == splat), "kappa": cohen_kappa(mesh, splat)}
+        if again is not None:
+            row["again_agreement"] = np.mean(mesh == again[part])
+            row["again_kappa"] = cohen_kappa(mesh, again[part])
+        row |= _correlations(mesh, splat, generated)
+        table.append({name: round(x, 4) if isinstance(x, float) else x for name, x in row.items()})
+    return table
+
+
+def _cube(
+    pairs: Sequence[dict[str, Any]], kind: str, environments: list[str], policies: list[str]
+) -> NDArray[np.float64]:
+    """Returns successes (environments, policies, routes)."""
+    routes = 1 + max(pair["route"] for pair in pairs)
+    cube = np.full((len(environments), len(policies), routes), np.nan)
+    for pair in pairs:
+        k = environments.index(pair["environment"]), policies.index(pair["policy"])
+        cube[*k, pair["route"]] = pair[kind]
+    require(np.isfinite(cube).all(), "flights", "complete", "missing ones", "run it again")
+    return cube
+
+
+def _correlations(
+    mesh: NDArray[np.float64], splat: NDArray[np.float64], generated: NDArray[np.float64]
+) -> dict[str, float]:
+    """Returns `rho` and `control` with intervals, of successes (E, P, R) and rates (P,)."""
+    count, num_policies, num_routes = mesh.shape
+    rng = np.random.default_rng(0)
+    rates = np.empty((3, _RESAMPLES + 1, num_policies))
+    for k in range(_RESAMPLES + 1):
+        routes = rng.integers(num_routes, size=(count, 1, num_routes))
+        chosen = rng.integers(num_policies, size=num_policies)
+        if k == 0:  # what was flown
+            routes[:], chosen = np.arange(num_routes), np.arange(num_policies)
+        for i, each in enumerate((mesh, splat)):
+            rates[i, k] = np.take_along_axis(each, routes, axis=2).mean(axis=(0, 2))[chosen]
+        rates[2, k] = generated[chosen]
+    result = {}
+    for name, predicted in (("rho", rates[1]), ("control", rates[2])):
+        rho = rank_correlations(rates[0], predicted)
+        known = rho[np.isfinite(rho)]
+        low, high = np.quantile(known, [0.025, 0.975]) if len(known) else (np.nan, np.nan)
+        result |= {name: float(rho[0]), f"{name}_low": float(low), f"{name}_high": float(high)}
+    return result
+
+
+def rank_correlations(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[Any]:
+    """Computes Spearman's rank correlations (N,) of rows (N, P); NaN for constant rows."""
+    ranks = (rankdata(each, axis=1, nan_policy="propagate") for each in (first, second))
+    x, y = (each - each.mean(axis=1, keepdims=True) for each in ranks)
+    with np.errstate(invalid="ignore"):
+        return (x * y).sum(axis=1) / np.sqrt((x * x).sum(axis=1) * (y * y).sum(axis=1))
+
+
+def cohen_kappa(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
+    """Computes the agreement of successes beyond that of chance (J. Cohen, 1960); NaN if chance
+    agrees always."""
+    p, q = first.mean(), second.mean()
+    chance = p * q + (1 - p) * (1 - q)
+    return float((np.mean(first == second) - chance) / (1 - chance)) if chance < 1 else np.nan
+
+
+def _print_table(table: Sequence[dict[str, Any]]) -> None:
+    for row in table:
+        rho, control = (
+            "{:.3f} [{:.3f}, {:.3f}]".format(*(row[name + end] for end in ("", "_low", "_high")))
+            for name in ("rho", "control")
+        )
+        print(
+            f"{row['environment']}: {row['flights']} flights, success {row['mesh']:.1%} in the "
+            f"mesh and {row['splat']:.1%} in the splat, {row['agreement']:.1%} agree (kappa "
+            f"{row['kappa']:.2f}), rank correlation {rho}, of the control {control}"
+        )
+
+
+def _write_figure(path: Path, pairs: Sequence[dict[str, Any]], control: Sequence[Row]) -> None:
+    """Draws each policy's success in the mesh against that in the splat and the control."""
+    from matplotlib.figure import Figure
+
+    policies = list(dict.fromkeys(pair["policy"] for pair in pairs))
+    figure = Figure(figsize=(9, 4.5), layout="constrained")
+    panels = figure.subplots(1, 2 if control else 1, sharey=True, squeeze=False)[0]
+
+    def rate(rows: Sequence[Row], policy: str, column: str) -> float:
+        return float(np.mean([row[column] for row in rows if row["policy"] == policy]))
+
+    for axes, rows, column, where in zip(
+        panels,
+        (pairs, control),
+        ("splat", "success"),
+        ("reconstructions", "generated worlds"),
+        strict=False,
+    ):
+        for policy in policies:
+            xy = rate(rows, policy, column), rate(pairs, policy, "mesh")
+            axes.plot(*xy, "o", color="tab:blue")
+            axes.annotate(policy, xy, xytext=(4, 4), textcoords="offset points", fontsize=7)
+        axes.plot([0, 1], [0, 1], color="0.7", linewidth=1)
+        axes.set(xlabel=f"success in {where}", xlim=(-0.03, 1.03), ylim=(-0.03, 1.03))
+        axes.set_aspect("equal")
+    panels[0].set_ylabel("success in the meshes")
+    write_png(figure, path)
