@@ -13,7 +13,7 @@ from splatpilot.analysis.fidelity.fidelity import FidelityConfig
 from splatpilot.analysis.reconstruction.run import RenderedSceneConfig
 from splatpilot.diagrams.flight.policies import POLICIES
 from splatpilot.diagrams.flight.scenario import WITHOUT_EFFECT, Scenario
-from splatpilot.diagrams.flight.sensors import SENSORS
+from splatpilot.diagrams.flight.sensors import ESTIMATORS, SENSORS
 from splatpilot.diagrams.hardware.bridge import HardwareConfig
 from splatpilot.diagrams.hardware.px4 import Px4Config
 from splatpilot.diagrams.worlds.world_registry import WORLDS
@@ -41,6 +41,11 @@ GROUPS: list[tuple[str, str, list[type] | Registry]] = [
         VEHICLES,
     ),
     ("Sensors", "Entries of `sensors` in a scenario or a policy.", SENSORS),
+    (
+        "Estimators",
+        "Types of `estimator` in a scenario: `--set 'estimator=!VisualInertial {}'`.",
+        ESTIMATORS,
+    ),
     (
         "Policies",
         "Types of `policy` in a scenario: `policy: !ReactiveConfig {margin: 0.2}` in a file, "
