@@ -38,7 +38,7 @@ from splatpilot.systems.messaging.lcm_ports import PUBLISH_OFFSET
 from splatpilot.systems.messaging.receiver import TimeOfFlightStream, UdpConfig
 from splatpilot.systems.sensing.time_of_flight import GRID_MAGIC
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
-from splatpilot.systems.vehicle.state import QuadrotorState
+from splatpilot.systems.vehicle.state import QuadrotorState, set_state
 
 KINDS = (
     *("dropped", "delayed", "duplicated", "reordered", "clock_jump"),
@@ -288,7 +288,7 @@ def fly_trial(
         simulator.get_mutable_context() for simulator in (vehicle_simulator, bridge_simulator)
     )
     plant = vehicle.GetSubsystemByName("plant").GetMyMutableContextFromRoot(root)
-    plant.SetContinuousState(sample_initial_state(scenario, world))
+    set_state(plant, sample_initial_state(scenario, world))
     autopilot = vehicle.GetSubsystemByName("failsafe")
     clock = cast(UnixClock, bridge.GetSubsystemByName("clock"))
 

@@ -56,6 +56,14 @@ from .systems.vehicle.quadrotor import (
 )
 from .systems.vehicle.quadrotor_geometry import QuadrotorGeometry, quadrotor_gaussians
 from .systems.vehicle.state import QuadrotorState, StateToPose, StateToPose_
+from .systems.vehicle.vehicles import (
+    Crazyflie21Brushless,
+    Kingfisher,
+    Px4Sih,
+    Starling2Max,
+    register_vehicle,
+)
+from .systems.vehicle.wind import DrydenWind, DrydenWind_, Wind
 from .systems.visualization.flight_visualizer import FlightVisualizer
 from .systems.visualization.live import LiveControls
 from .systems.visualization.meshcat_drawing import CameraVisualizer
@@ -77,7 +85,10 @@ __all__ = [
     "CameraVisualizer",
     "Capture",
     "Config",
+    "Crazyflie21Brushless",
     "Distortion",
+    "DrydenWind",
+    "DrydenWind_",
     "Esdf",
     "EsdfCollision",
     "EsdfCollision_",
@@ -96,6 +107,7 @@ __all__ = [
     "HypothesisSelector_",
     "Imu",
     "InfeasibleFlightError",
+    "Kingfisher",
     "LiveControls",
     "MakeCamera",
     "MovingBodies",
@@ -104,6 +116,7 @@ __all__ = [
     "OnboardCamera",
     "Outcome",
     "PrivilegedPlanner",
+    "Px4Sih",
     "QuadrotorGeometry",
     "QuadrotorParams",
     "QuadrotorPlant",
@@ -114,11 +127,13 @@ __all__ = [
     "Scenario",
     "SplatCamera",
     "SplatRenderEngine",
+    "Starling2Max",
     "StateToPose",
     "StateToPose_",
     "VelocityTracker",
     "VelocityTracker_",
     "VideoRecorder",
+    "Wind",
     "World",
     "__version__",
     "bounded",
@@ -144,6 +159,7 @@ __all__ = [
     "register_policy",
     "register_sensor",
     "register_trainer",
+    "register_vehicle",
     "register_world",
     "sample_initial_state",
     "sample_scenario",

@@ -51,6 +51,7 @@ from splatpilot.systems.common.progress import Progress, resumable
 from splatpilot.systems.common.provenance import program
 from splatpilot.systems.common.readers import error_summary
 from splatpilot.systems.common.validation import require
+from splatpilot.systems.vehicle.vehicles import VEHICLES
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -68,7 +69,8 @@ def fly_all(
 ) -> Generator[Rollout | Fault, None, None]:
     """Flies rollouts in worker processes, or on the workers of the dask scheduler `cluster`, and
     yields them as they end, in any order; see `fly_rollouts`."""
-    modules = sorted(POLICIES.modules() | WORLDS.modules() | SENSORS.modules())
+    registries = POLICIES, WORLDS, SENSORS, VEHICLES
+    modules = sorted(each for registry in registries for each in registry.modules())
     found = [name for name in POLICIES.registered() if ":" in name]
     fly = functools.partial(
         fly_rollouts, modules=modules, policies=found, changed=changed, systems=systems

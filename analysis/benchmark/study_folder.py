@@ -51,6 +51,7 @@ from splatpilot.systems.common.files import (
 )
 from splatpilot.systems.common.readers import error_summary, read_archive, read_text, yaml_errors
 from splatpilot.systems.common.validation import require
+from splatpilot.systems.vehicle.vehicles import VEHICLES
 
 FORMAT_VERSION = 1
 _SHAPES = {"times": (), "states": (13,), "commands": (4,), "clearances": ()}
@@ -345,6 +346,7 @@ def plugin_digests(scenarios: Iterable[Scenario]) -> dict[str, str]:
         for registry, config in (
             (POLICIES, scenario.policy),
             (WORLDS, scenario.world),
+            (VEHICLES, scenario.vehicle),
             *((SENSORS, sensor) for sensor in scenario.sensors.values()),
         ):
             entry: Any = registry.entry_for(config)

@@ -5,7 +5,9 @@ from collections.abc import Iterable
 from dataclasses import replace
 from typing import NamedTuple
 
+import numpy as np
 from pydrake.systems.framework import DiagramBuilder, OutputPort, System
+from pydrake.systems.primitives import ConstantVectorSource
 
 from splatpilot.diagrams.flight.policies import POLICIES
 from splatpilot.diagrams.flight.scenario import Scenario
@@ -24,6 +26,7 @@ from splatpilot.systems.sensing.time_of_flight import TimeOfFlightGrid, equivale
 from splatpilot.systems.splats.moving_bodies import MovingBodies
 from splatpilot.systems.vehicle.flatness import FlatnessController
 from splatpilot.systems.vehicle.state import StateToPose
+from splatpilot.systems.vehicle.wind import DrydenWind
 
 DECISIONS = {"command": 4, "acceleration": 3, "velocity": 3, "waypoint": 3}
 """Decisions of policies besides hypotheses, and their sizes."""
@@ -48,14 +51,31 @@ def make_policy(scenario: Scenario, world: World) -> System:
 
 
 def AddPoseAndCollision(
-    builder: DiagramBuilder, world: World, state: OutputPort
+    builder: DiagramBuilder, world: World, state: OutputPort, radius: float
 ) -> tuple[OutputPort, EsdfCollision]:
-    """Adds the systems `pose` and `collision` of a state (13); returns the port of X_WB too."""
-    pose, collision = StateToPose(), EsdfCollision(world.distance_field)
+    """Adds the systems `pose` and `collision` of a state (13) and a radius [m]; returns the port of
+    X_WB too."""
+    pose, collision = StateToPose(), EsdfCollision(world.distance_field, radius)
     for name, system in (("pose", pose), ("collision", collision)):
         builder.AddNamedSystem(name, system)
         connect(builder, state, system.GetInputPort("state"))
     return pose.GetOutputPort("pose"), collision
+
+
+def AddWind(builder: DiagramBuilder, scenario: Scenario, plant: System) -> None:
+    """Adds the system `wind` to a plant whose input `wind` is open, unless the scenario is calm."""
+    wind = scenario.wind
+    if not (wind.gusts or any(wind.mean)):
+        return
+    require_ports("plant", plant, inputs=["wind"], outputs=[])
+    port = plant.GetInputPort("wind")
+    if not builder.IsConnectedOrExported(port):
+        source = (
+            DrydenWind(wind, scenario.seed)
+            if wind.gusts
+            else ConstantVectorSource(np.array(wind.mean))
+        )
+        builder.Connect(builder.AddNamedSystem("wind", source).get_output_port(), port)
 
 
 def AddMovingBodies(

@@ -30,6 +30,7 @@ from splatpilot.diagrams.flight.blocks import (
     AddPolicyAndController,
     AddPoseAndCollision,
     AddSensors,
+    AddWind,
     ConnectObservation,
     ConnectOrExport,
     ExportCollision,
@@ -60,7 +61,7 @@ from splatpilot.systems.splats.background import Background, mean_color
 from splatpilot.systems.splats.moving_bodies import MovingBodies
 from splatpilot.systems.splats.render_engine import ObstacleGeometry, SplatRenderEngine
 from splatpilot.systems.splats.splat_camera import SplatCamera
-from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS, QuadrotorPlant
+from splatpilot.systems.vehicle.quadrotor import QuadrotorPlant
 from splatpilot.systems.vehicle.quadrotor_geometry import QuadrotorGeometry, quadrotor_gaussians
 from splatpilot.systems.vehicle.state import QuadrotorState
 from splatpilot.systems.visualization.flight_visualizer import DRAWINGS, FlightVisualizer
@@ -202,7 +203,8 @@ def AddFlight(
     add_system(builder, "plant", plant)
     require_ports("plant", plant, inputs=["command"], outputs=["state"])
     state = plant.GetOutputPort("state")
-    pose, collision = AddPoseAndCollision(builder, world, state)
+    AddWind(builder, scenario, plant)
+    pose, collision = AddPoseAndCollision(builder, world, state, scenario.vehicle.radius)
     source = ConstantVectorSource(goal_position(scenario, world))
     goal = builder.AddNamedSystem("goal", source).get_output_port()
     estimate = state
@@ -229,6 +231,8 @@ def AddFlight(
     observation = {"state": estimate, "goal": goal} | images | measured
     ConnectObservation(builder, "policy", policy, observation)
     truth = {"state": state, "body_pose": pose, "command": autonomy.command}
+    if plant.HasOutputPort("acceleration"):
+        truth["acceleration"] = plant.GetOutputPort("acceleration")
     for sensor_name, sensor in added.items():
         ConnectObservation(builder, f"sensor {sensor_name!r}", sensor, observation | truth)
     if estimator is not None:
@@ -268,7 +272,11 @@ def AddFlight(
         if not scene_graph.HasRenderer("splats"):
             AddSplatWorld(builder, scene_graph, world)
         geometry = QuadrotorGeometry.AddToBuilder(
-            builder, state, scene_graph, name=f"{prefix}quadrotor"
+            builder,
+            state,
+            scene_graph,
+            name=f"{prefix}quadrotor",
+            radius=scenario.vehicle.radius,
         )
         systems.append(geometry)
     counts = Counter(system.get_name() for system in builder.GetSystems())
@@ -301,7 +309,8 @@ def AddFlight(
         _require_apart(parts, other)
         for seeing, seen in ((parts, other), (other, parts)):
             bodies = _moving_bodies(builder, seeing)
-            port = bodies.DeclareBody(seen.name, quadrotor_gaussians(), VEHICLE_RADIUS)
+            radius = seen.scenario.vehicle.radius
+            port = bodies.DeclareBody(seen.name, quadrotor_gaussians(radius), radius)
             builder.Connect(seen.pose, port)
     return parts
 
@@ -321,10 +330,11 @@ def _require_apart(parts: FlightParts, other: FlightParts) -> None:
         state = plant.GetOutputPort("state").Eval(plant.CreateDefaultContext())
         starts.append(QuadrotorState.of(np.asarray(state)).p_WB)
     distance = float(np.linalg.norm(starts[0] - starts[1]))
-    if distance <= 2.0 * VEHICLE_RADIUS:
+    apart = parts.scenario.vehicle.radius + other.scenario.vehicle.radius
+    if distance <= apart:
         raise InfeasibleFlightError(
             f"the distance between the starts of {parts.name} and {other.name} must be > "
-            f"{2.0 * VEHICLE_RADIUS} m, got {distance:.2f} m; set start of one scenario"
+            f"{apart:g} m, got {distance:.2f} m; set start of one scenario"
         )
 
 
@@ -508,7 +518,13 @@ def AddMeshcat(
         sources["waypoint"] = parts.decision
     vehicle = [name for name in draw if name not in ("depth", "frustum", "limits")]
     FlightVisualizer.AddToBuilder(
-        builder, parts.state, meshcat, plans, draw=vehicle, sources=sources
+        builder,
+        parts.state,
+        meshcat,
+        plans,
+        draw=vehicle,
+        sources=sources,
+        radius=parts.scenario.vehicle.radius,
     )
     if world.moving:
         MovingSpheresVisualizer.AddToBuilder(builder, world.moving.spheres, meshcat)
@@ -532,6 +548,7 @@ def AddRerun(builder: DiagramBuilder, parts: FlightParts, path: Path) -> RerunSi
         ports,
         gaussians=parts.world.gaussians,
         goal=goal_position(parts.scenario, parts.world),
+        radius=parts.scenario.vehicle.radius,
         camera=parts.camera,
         period=1 / parts.scenario.camera.fps,
     )

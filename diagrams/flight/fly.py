@@ -50,7 +50,6 @@ from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.policies.teleop import TeleopConfig
 from splatpilot.systems.splats.splat_camera import SplatCamera
-from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 from splatpilot.systems.vehicle.state import pose_from_state
 from splatpilot.systems.visualization.live import LiveControls
 from splatpilot.systems.visualization.meshcat_drawing import draw_vehicle
@@ -92,7 +91,7 @@ def flight_page(
         for k, flight in enumerate(flights)
     ]
     for k in range(len(shown)):
-        draw_vehicle(meshcat, f"/splatpilot/vehicles/{k}", VEHICLE_RADIUS)
+        draw_vehicle(meshcat, f"/splatpilot/vehicles/{k}", scenario.vehicle.radius)
     if scenario.moving:
         world = add_moving_spheres(world, scenario.moving)
     spheres = world.moving.spheres if world.moving else None
@@ -105,7 +104,7 @@ def running_page(meshcat: Meshcat, scenario: Scenario, world: World) -> HtmlPage
     world = randomize_appearance(world, scenario.appearance, scenario.seed)
     highest = max(start_position(scenario, world)[2], goal_position(scenario, world)[2])
     view, scene = _view(scenario, world), (world.gaussians, world.background)
-    cut = min(highest + 2 * VEHICLE_RADIUS, view.upper)
+    cut = min(highest + 2 * scenario.vehicle.radius, view.upper)
     return HtmlPage(live_page(meshcat, *scene, view, cut))
 
 
@@ -115,7 +114,7 @@ def _view(scenario: Scenario, world: World) -> ReplayView:
         name=f"{world.name}, seed {scenario.seed}",
         X_BC=camera_mount(scenario.camera),
         fov_y=camera_info(scenario.camera).fov_y(),
-        radius=VEHICLE_RADIUS,
+        radius=scenario.vehicle.radius,
         lower=float(np.asarray(field.lower_W)[2]),
         upper=float(np.asarray(field.upper_W)[2]),
         num_frontier=world.num_frontier,

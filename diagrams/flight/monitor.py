@@ -197,7 +197,7 @@ def AddFlightMonitor(
     """
     scenario = sample_scenario(scenario)
     if collision is None:
-        collision = EsdfCollision(world.distance_field)
+        collision = EsdfCollision(world.distance_field, scenario.vehicle.radius)
         builder.AddNamedSystem("collision", collision)
         if world.moving:
             AddMovingBodies(builder, world, [collision])

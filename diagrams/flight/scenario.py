@@ -31,7 +31,9 @@ from splatpilot.systems.common.validation import (
 from splatpilot.systems.policies.planner import PrivilegedPlannerConfig
 from splatpilot.systems.sensing.noise import ObservationNoise
 from splatpilot.systems.vehicle.flatness import FlatnessControllerConfig
-from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS, QuadrotorParams, hover_state
+from splatpilot.systems.vehicle.quadrotor import QuadrotorParams, hover_state
+from splatpilot.systems.vehicle.vehicles import VEHICLES
+from splatpilot.systems.vehicle.wind import Wind
 
 pickle_by_fields(
     CameraConfig, CameraConfig.FocalLength, CameraConfig.FovDegrees, Rgba, SimulatorConfig
@@ -97,7 +99,10 @@ class Scenario(Config):
     goal_radius: float = bounded(0.3, "(0, inf) m")
     # [s] The flight ends after this time.
     timeout: float = bounded(60.0, "(0, 3600] s")
-    vehicle: QuadrotorParams = field(default_factory=QuadrotorParams)
+    # Vehicle: that of the benchmark, or (!Kingfisher, ...) another of the registry.
+    vehicle: QuadrotorParams = registry_field(VEHICLES, QuadrotorParams)
+    # Wind at the vehicle; calm by default.
+    wind: Wind = field(default_factory=Wind)
     # Camera of videos and viewers; policies have cameras of their own.
     camera: CameraConfig = field(default_factory=_default_camera)
     # Policy: the privileged planner, or (!ReactiveConfig, ...) another of the registry.
@@ -123,7 +128,7 @@ class Scenario(Config):
         if drawn is not self:
             drawn.validate()
             return
-        parts = [(WORLDS, self.world), (POLICIES, self.policy)]
+        parts = [(WORLDS, self.world), (POLICIES, self.policy), (VEHICLES, self.vehicle)]
         for registry, part in [*parts, *((SENSORS, sensor) for sensor in self.sensors.values())]:
             registry.entry_for(part)
         try:
@@ -139,6 +144,15 @@ class Scenario(Config):
             require_field(self, name, valid, "three finite numbers x, y, z [m]")
         _check_camera(self.camera)
         _check_simulator(self.simulator)
+        step = self.simulator.max_step_size
+        lag = self.vehicle.min_time_constant()
+        require(
+            self.simulator.use_error_control or lag >= 0.5 * step,
+            "the shortest time constant of the vehicle",
+            f"at least half of simulator.max_step_size, {step} s, for stable integration",
+            f"{lag:g} s",
+            f"set simulator.max_step_size to at most {2.0 * lag:g}",
+        )
 
 
 def sample_scenario(scenario: Scenario) -> Scenario:
@@ -173,8 +187,9 @@ def sample_initial_state(scenario: Scenario, world: World) -> np.ndarray:
     """
     scenario = sample_scenario(scenario)
     p_WG, p_WS = goal_position(scenario, world), start_position(scenario, world)
-    _check_free(world, "start", p_WS)
-    _check_free(world, "goal", p_WG)
+    radius = scenario.vehicle.radius
+    _check_free(world, "start", p_WS, radius)
+    _check_free(world, "goal", p_WG, radius)
     distance = float(np.linalg.norm(p_WG - p_WS))
     if distance <= scenario.goal_radius:
         raise InfeasibleFlightError(
@@ -185,7 +200,7 @@ def sample_initial_state(scenario: Scenario, world: World) -> np.ndarray:
     generator = np.random.default_rng(scenario.seed)
     p_WB = None
     # A neighborhood of the start is free: the search ends.
-    while p_WB is None or not _is_free(world, p_WB):
+    while p_WB is None or not _is_free(world, p_WB, radius):
         direction = generator.normal(size=3)
         distance = scenario.start_radius * generator.uniform() ** (1 / 3)
         p_WB = p_WS + distance * direction / np.linalg.norm(direction)
@@ -193,12 +208,12 @@ def sample_initial_state(scenario: Scenario, world: World) -> np.ndarray:
     return hover_state(p_WB, yaw=np.arctan2(heading[1], heading[0]))
 
 
-def _is_free(world: World, p_WQ: np.ndarray) -> bool:
+def _is_free(world: World, p_WQ: np.ndarray, radius: float) -> bool:
     sample = world.field_at(0.0).query(p_WQ)
-    return bool(sample.state == FieldState.FREE and sample.distance > VEHICLE_RADIUS)
+    return bool(sample.state == FieldState.FREE and sample.distance > radius)
 
 
-def _check_free(world: World, what: str, p_WQ: np.ndarray) -> None:
+def _check_free(world: World, what: str, p_WQ: np.ndarray, radius: float) -> None:
     """Raises InfeasibleFlightError if a vehicle at p_WQ (3,) [m] would collide."""
     field = world.field_at(0.0)
     sample = field.query(p_WQ)
@@ -209,10 +224,10 @@ def _check_free(world: World, what: str, p_WQ: np.ndarray) -> None:
             f"{where} is {known}, which spans {np.round(field.lower_W, 2).tolist()} to "
             f"{np.round(field.upper_W, 2).tolist()} m; choose a point in known free space"
         )
-    if sample.distance <= VEHICLE_RADIUS:
+    if sample.distance <= radius:
         raise InfeasibleFlightError(
             f"{where} is {float(sample.distance):.3f} m from the nearest surface, but the "
-            f"vehicle's radius is {VEHICLE_RADIUS} m; choose a point with more clearance"
+            f"vehicle's radius is {radius} m; choose a point with more clearance"
         )
 
 

@@ -27,7 +27,7 @@ from splatpilot.systems.common.files import written_atomically
 from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
-from splatpilot.systems.vehicle.state import QuadrotorState, pose_from_state
+from splatpilot.systems.vehicle.state import QuadrotorState, pose_from_state, set_state
 from splatpilot.systems.visualization.live import RESTART
 
 _ACCURACY = 3e-4  # of the Context: a flight ends within 1e-7 s, less than a micrometer.
@@ -301,7 +301,7 @@ def decision_times(
     # The first time fills caches, and does not count.
     for k, row in enumerate([0, *rows]):
         root.SetTime(flight.times[row])
-        plant.SetContinuousState(flight.states[row])
+        set_state(plant, flight.states[row])
         started = time.perf_counter()
         for name in images:
             policy.GetInputPort(name).Eval(context)

@@ -114,7 +114,7 @@ def BuildHardwareDiagram(
         policy.GetOutputPort(name) if policy.HasOutputPort(name) else None
         for name in ("decided", "failed", "heading", "hypotheses")
     )
-    _, collision = blocks.AddPoseAndCollision(builder, world, state)
+    _, collision = blocks.AddPoseAndCollision(builder, world, state, scenario.vehicle.radius)
     blocks.ExportCollision(builder, collision)
     autonomy = blocks.AddPolicyAndController(
         builder, scenario, state, policy, controller, guarded=True

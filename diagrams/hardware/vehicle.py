@@ -29,6 +29,7 @@ from splatpilot.systems.messaging.lcm_ports import open_lcm
 from splatpilot.systems.policies.velocity import VelocityTracker
 from splatpilot.systems.vehicle.flatness import FlatnessController
 from splatpilot.systems.vehicle.quadrotor import QuadrotorPlant
+from splatpilot.systems.vehicle.state import set_state
 
 SILENCE = 0.1
 """[s] without commands after which the vehicle holds its position, until they come again."""
@@ -62,7 +63,8 @@ def BuildVehicleDiagram(
     # Vehicle.
     plant = builder.AddNamedSystem("plant", QuadrotorPlant(scenario.vehicle))
     state = plant.GetOutputPort("state")
-    pose, collision = blocks.AddPoseAndCollision(builder, world, state)
+    blocks.AddWind(builder, scenario, plant)
+    pose, collision = blocks.AddPoseAndCollision(builder, world, state, scenario.vehicle.radius)
 
     # Commands, by a failsafe that knows no map and limits speed as MPC_XY_VEL_MAX of PX4.
     by_velocity = config.setpoints == "velocity"
@@ -153,8 +155,7 @@ def run(*, scenario: Scenario, config: HardwareConfig, out: Path) -> dict[str, f
     simulator = Simulator(diagram)
     ApplySimulatorConfig(scenario.simulator, simulator)
     root = simulator.get_mutable_context()
-    plant = diagram.GetSubsystemByName("plant").GetMyMutableContextFromRoot(root)
-    plant.SetContinuousState(start)
+    set_state(diagram.GetSubsystemByName("plant").GetMyMutableContextFromRoot(root), start)
     p_WG = goal_position(scenario, world)
     took_off = math.inf
 

@@ -20,6 +20,7 @@ from splatpilot.diagrams.worlds.world_registry import WORLDS
 from splatpilot.systems.common.config import is_configuration
 from splatpilot.systems.common.field_help import FieldDescription, describe_fields
 from splatpilot.systems.common.registry import Registry
+from splatpilot.systems.vehicle.vehicles import VEHICLES
 from splatpilot.training.captures.check import CheckConfig
 from splatpilot.training.captures.render import RenderConfig
 from splatpilot.training.corpus.corpus import CorpusConfig
@@ -32,6 +33,12 @@ GROUPS: list[tuple[str, str, list[type] | Registry]] = [
         "For `splatpilot fly`, `benchmark`, `hardware vehicle` and `hardware bridge`: fields of a "
         "scenario file, or `--set timeout=20`.",
         [Scenario],
+    ),
+    (
+        "Vehicles",
+        "Types of `vehicle` in a scenario: `vehicle: !Kingfisher {model: lags}` in a file, "
+        "`--set 'vehicle=!Kingfisher {}'`.",
+        VEHICLES,
     ),
     ("Sensors", "Entries of `sensors` in a scenario or a policy.", SENSORS),
     (

@@ -261,13 +261,13 @@ class ByValues(LeafSystem_[AutoDiffXd]):
 
 
 class ConfigParameter:
-    """Numbers of a configuration as a numeric parameter of a system's Contexts."""
+    """Numbers of a configuration, and lists of numbers, as a numeric parameter of Contexts."""
 
     def __init__(self, system: Any, scalar: Any, config: Config, names: Sequence[str] = ()) -> None:
         """Declares the parameter; `names` are the fields it has, all by default."""
         self._config = config
         self.names = names or [field.name for field in fields(config)]  # pyright: ignore
-        defaults = [getattr(config, name) for name in self.names]
+        defaults = np.hstack([getattr(config, name) for name in self.names]).tolist()
         self._defaults = defaults if scalar is float else None
         self._index = system.DeclareNumericParameter(BasicVector_[scalar](defaults))
 
@@ -277,15 +277,25 @@ class ConfigParameter:
         if numbers == self._defaults:
             return self._config  # A copy costs as much as a control step.
         config = copy(self._config)
-        vars(config).update(zip(self.names, numbers, strict=True))
+        vars(config).update(self._by_name(numbers))
         return config
 
+    def _by_name(self, numbers: list[Any]) -> dict[str, Any]:
+        rest, values = iter(numbers), {}
+        for name in self.names:
+            value = getattr(self._config, name)
+            values[name] = [next(rest) for _ in value] if isinstance(value, list) else next(rest)
+        return values
+
     def set(self, context: Context, name: str, value: Any) -> None:
-        """Sets one of the numbers; raises ValueError if the configuration is invalid with it."""
+        """Sets a field; raises ValueError if the configuration is invalid with it."""
         vector = context.get_mutable_numeric_parameter(self._index)
-        numbers = dict(zip(self.names, float_values(vector.CopyToVector()).tolist(), strict=True))
-        replace(self._config, **numbers | {name: float_values(value)}).validate()  # pyright: ignore
-        vector.SetAtIndex(list(self.names).index(name), value)
+        numbers = self._by_name(float_values(vector.CopyToVector()).tolist())
+        changed = [*map(float_values, value)] if isinstance(value, list) else float_values(value)
+        replace(self._config, **numbers | {name: changed}).validate()  # pyright: ignore
+        start = sum(np.size(numbers[each]) for each in self.names[: self.names.index(name)])
+        for k, number in enumerate(value if isinstance(value, list) else [value]):
+            vector.SetAtIndex(start + k, number)
 
 
 def parameter_setter(name: str) -> Callable[[Any, Context, Any], None]:

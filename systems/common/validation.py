@@ -126,7 +126,7 @@ class Config:
     def validate(self) -> None:
         """Raises ValueError unless all fields, the configurations in them and `check` are valid."""
         for field in dataclasses.fields(cast(Any, self)):
-            value, domain = getattr(self, field.name), field.metadata.get(_DOMAIN)
+            value, domain = getattr(self, field.name), _domain(type(self), field.name)
             if domain:
                 require_field(self, field.name, _is_in(value, domain), f"in {domain}")
             for part in _configurations(value):
@@ -135,6 +135,13 @@ class Config:
 
     def check(self) -> None:
         """Checks conditions between fields; raises ValueError."""
+
+
+def _domain(config: type, name: str) -> str | None:
+    """Returns the valid values of a field, those of a base class if the class declares none."""
+    declared = (vars(base).get("__dataclass_fields__", {}).get(name) for base in config.__mro__)
+    domains = (field.metadata.get(_DOMAIN) for field in declared if field is not None)
+    return next((domain for domain in domains if domain), None)
 
 
 def _configurations(value: Any) -> Iterator[Any]:

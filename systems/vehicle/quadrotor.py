@@ -3,18 +3,24 @@
 State (13): ``[p_WB (3) [m], v_WB (3) [m/s], q_WB (4, wxyz), w_WB_B (3) [rad/s]]``.
 Command (4): ``[c [m/s^2], w_cmd_B (3) [rad/s]]``, with c the thrust over mass along body +z.
 
-The same formula serves floats, torch and numpy batches, and Drake's AutoDiffXd and Expression, so
-that the simulated plant and the training loop share one model.
+`quadrotor_derivatives` is the model of policies and training: exact thrust, one lag, linear drag.
+Its formula serves floats, torch and numpy batches, and Drake's AutoDiffXd and Expression, so that
+the simulated plant and the training loop share one model. `actuated_derivatives` adds actuators,
+aerodynamics and battery.
 """
 
 import math
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass, replace
+from dataclasses import dataclass, fields, replace
+from functools import reduce
 from typing import Any
 
 import numpy as np
 from pydrake.autodiffutils import AutoDiffXd
 from pydrake.common.value import AbstractValue
+from pydrake.math import max as max2
+from pydrake.math import min as min2
+from pydrake.math import sqrt
 from pydrake.symbolic import Expression
 from pydrake.systems.framework import (
     BasicVector_,  # pyright: ignore[reportAttributeAccessIssue]
@@ -30,7 +36,13 @@ from splatpilot.systems.common.drake import (
     system_template,
     weak_callback,
 )
-from splatpilot.systems.common.validation import Config, bounded, require, require_type
+from splatpilot.systems.common.validation import (
+    Config,
+    bounded,
+    require,
+    require_field,
+    require_type,
+)
 from splatpilot.systems.vehicle.state import QuadrotorState, array_namespace, require_rotation
 
 VEHICLE_RADIUS = 0.354
@@ -38,20 +50,109 @@ VEHICLE_RADIUS = 0.354
 
 GRAVITY = 9.81  # Standard gravity [m/s^2], along -z of the world.
 
+_TINY = 1e-12  # Keeps roots, their gradients and quotients finite.
 _NORM_GAIN = 5.0  # [1/s] pull of the quaternion toward unit length; errors decay as exp(-10 t).
 
 
 @dataclass
 class QuadrotorParams(Config):
-    """Parameters of the quadrotor; the defaults describe a small camera drone."""
+    """Parameters of the quadrotor.
 
+    The defaults are the model of the benchmark: a small camera drone whose thrust is exact, and
+    whose body rates have one lag. Any other field that is set adds its effect. With
+    ``model: rotors`` an onboard controller tracks the body rates by the torques of four rotors.
+    """
+
+    # Model of thrust and rates: first-order `lags` behind their commands, or `rotors`: a rate
+    # controller, a mixer that saturates, and rotor speeds with a lag.
+    model: str = bounded("lags", "{lags, rotors}")
     # [1/s] Linear drag coefficient over mass. Identified racing quadrotors have 0.39-0.54
     # (Faessler, Franchi, Scaramuzza, RA-L 2018).
     drag: float = bounded(0.375, "[0, inf) 1/s")
-    # [s] First-order lag of the body rates behind their command.
+    # [1/s] Further linear drag over mass along body x, y, z, the rotor drag of Faessler et al.
+    rotor_drag: list[float] = bounded(lambda: [0.0] * 3, "[0, inf) 1/s")
+    # [1/m] Quadratic drag over mass along body x, y, z, times the speed in the air.
+    quadratic_drag: list[float] = bounded(lambda: [0.0] * 3, "[0, inf) 1/m")
+    # [s] First-order lag of the body rates behind their command; with rotors, of the rate
+    # controller if they were at once.
     rate_time_constant: float = bounded(0.05, "(0, inf) s")
+    # [-] Time constant of yaw over that of roll and pitch.
+    yaw_time_ratio: float = bounded(1.0, "(0, inf)")
+    # [s] First-order lag of the thrust; with rotors, of their speeds; 0 disables it.
+    motor_time_constant: float = bounded(0.0, "[0, inf) s")
+    # [m/s^2] Minimum thrust over mass.
+    min_thrust: float = bounded(0.0, "[0, inf) m/s^2")
+    # [m/s^2] Maximum thrust over mass; that of a rotor is a quarter.
+    max_thrust: float = bounded(math.inf, "(0, inf] m/s^2")
+    # [rad/s] Maximum roll and pitch rate.
+    max_tilt_rate: float = bounded(math.inf, "(0, inf] rad/s")
+    # [rad/s] Maximum yaw rate.
+    max_yaw_rate: float = bounded(math.inf, "(0, inf] rad/s")
+    # [-] Thrust over its command, the error of the hover thrust.
+    thrust_scale: float = bounded(1.0, "(0, 2]")
+    # [-] Fraction of the thrust that an empty battery loses, by the square of its voltage.
+    battery_sag: float = bounded(0.0, "[0, 1)")
+    # [-] Charge of the battery at the start.
+    battery_charge: float = bounded(1.0, "[0, 1]")
+    # [s] Time of hovering that empties a full battery.
+    battery_endurance: float = bounded(math.inf, "(0, inf] s")
+    # [m] Radius of the rotors for the ground effect over the plane z = 0; 0 disables it.
+    ground_effect: float = bounded(0.0, "[0, inf) m")
     # [m/s^2] Gravitational acceleration, along -z of the world.
     gravity: float = bounded(GRAVITY, "[0, inf) m/s^2")
+    # [m] Radius of the collision sphere, to the tips of the propellers. Policies and generated
+    # worlds assume the default.
+    radius: float = bounded(VEHICLE_RADIUS, "(0, 1] m")
+    # [kg] Mass, of rotors only, as the following fields. They are PX4's simulated quadrotor's.
+    mass: float = bounded(1.0, "(0, inf) kg")
+    # [kg m^2] Moments of inertia about body x, y, z.
+    inertia: list[float] = bounded(lambda: [0.025, 0.025, 0.03], "(0, inf) kg m^2")
+    # [m] Distances of the rotors from the center of mass along body x and y.
+    arm: list[float] = bounded(lambda: [0.2, 0.2], "(0, inf) m")
+    # [N s^2/rad^2] Thrust of a rotor over the square of its speed.
+    thrust_coefficient: float = bounded(5e-6, "(0, inf) N s^2/rad^2")
+    # [m] Torque of a rotor about its axis over its thrust.
+    torque_ratio: float = bounded(0.02, "(0, inf) m")
+
+    def check(self) -> None:
+        """Raises FieldError for a vehicle that cannot hover, or whose rate loop is unstable."""
+        for name, size in _SIZES.items():
+            valid = len(getattr(self, name)) == size
+            require_field(self, name, valid, f"{size} numbers")
+        needed = self.gravity / self.thrust_scale
+        needed /= 1.0 - self.battery_sag * (1.0 - self.battery_charge)
+        condition = f"above {needed:.4g} m/s^2, to hover"
+        require_field(self, "max_thrust", self.max_thrust > needed, condition)
+        below = self.min_thrust < needed
+        require_field(self, "min_thrust", below, f"below {needed:.4g} m/s^2, to hover")
+        if self.model == "rotors":
+            finite = math.isfinite(self.max_thrust)
+            require_field(self, "max_thrust", finite, "finite [m/s^2] with rotors")
+            lag = self.motor_time_constant
+            require_field(self, "motor_time_constant", lag > 0.0, "above 0 s with rotors")
+            # Rate loop: 1 + s tau + s^2 tau lag, damped by sqrt(tau / lag) / 2.
+            fastest = self.rate_time_constant * min(1.0, self.yaw_time_ratio)
+            condition = f"at least {0.5 * lag / min(1.0, self.yaw_time_ratio):.4g} s, half of "
+            condition += "motor_time_constant, for a stable rate controller"
+            require_field(self, "rate_time_constant", fastest >= 0.5 * lag, condition)
+
+    def is_ideal(self) -> bool:
+        """Checks if `quadrotor_derivatives` describes the vehicle."""
+        neutral = QuadrotorParams()
+        return all(getattr(self, name) == getattr(neutral, name) for name in _EFFECTS)
+
+    def min_time_constant(self) -> float:
+        """Returns the shortest lag [s]: integration needs steps of at most twice that."""
+        lags = [self.rate_time_constant * min(1.0, self.yaw_time_ratio), self.motor_time_constant]
+        return min(lag for lag in lags if lag > 0.0)
+
+
+_SIZES = {"rotor_drag": 3, "quadratic_drag": 3, "inertia": 3, "arm": 2}
+_IDEAL = ["drag", "rate_time_constant", "gravity"]
+_ROTORS = ["mass", "inertia", "arm", "thrust_coefficient", "torque_ratio"]
+_NAMES = [field.name for field in fields(QuadrotorParams)]
+_EFFECTS = [name for name in _NAMES if name not in (*_IDEAL, *_ROTORS, "radius")]
+_FURTHER = [name for name in (*_EFFECTS, *_ROTORS) if name not in ("model", "battery_charge")]
 
 
 def hover_state(p_WB: Sequence[float] | np.ndarray, yaw: float = 0.0) -> np.ndarray:
@@ -73,7 +174,9 @@ def quadrotor_derivatives(state: Any, command: Any, params: QuadrotorParams) -> 
     The last term of the quaternion rate holds its length at one against integration error.
     """
     rates = component_derivatives(
-        [state[..., i] for i in range(13)], [command[..., i] for i in range(4)], *astuple(params)
+        [state[..., i] for i in range(13)],
+        [command[..., i] for i in range(4)],
+        *(params.drag, params.rate_time_constant, params.gravity),
     )
     xp = array_namespace(state)
     if xp is not np:
@@ -127,6 +230,135 @@ def component_derivatives(
     )
 
 
+def actuated_derivatives(
+    state: Any, command: Any, params: QuadrotorParams, wind: Any = None, disturbance: Any = None
+) -> list[Any]:
+    """Returns the time derivatives of the components of an actuated vehicle.
+
+    To `component_derivatives` it adds, with v the velocity in the air and s the charge::
+
+        a_drag_B = -(rotor_drag + quadratic_drag |v|) v_B
+        lift     = thrust_scale (1 - battery_sag (1 - s)) / (1 - (ground_effect / 4 z)²)
+        d/dt s   = -(c_now / g)^1.5 / battery_endurance
+        lags:    c_now = lift c_lag,  d/dt c_lag = (c - c_lag) / motor_time_constant
+        rotors:  f_i = lift k u_i²,   d/dt u_i = (sqrt(f_cmd_i / k) - u_i) / motor_time_constant
+                 J d/dt w = M(f) - w × J w,  M(f_cmd) = J (w_cmd - w) / tau + w × J w
+
+    Commands are limited first, and f_cmd by `mix`. Sources: rotor drag, Faessler et al., RA-L 2018;
+    ground effect, Cheeseman and Bennett, ARC R&M 3021, 1955, at most that of z = ground_effect / 2;
+    power by momentum theory; rate controller, Foehn et al., "Agilicious", Science Robotics 2022.
+
+    Args:
+        state: 13 components of the state, the charge, and, unless `motor_time_constant` is 0, the
+            thrust over mass [m/s^2] or, with rotors, their speeds (4) [rad/s], see `mix`.
+        command, wind, disturbance: see `component_derivatives`.
+    """
+    _, _, z, *velocity = state[:6]
+    (qw, qx, qy, qz), rates, charge, actuators = state[6:10], state[10:13], state[13], state[14:]
+    norm2 = qw * qw + qx * qx + qy * qy + qz * qz
+    R_WB = (
+        (
+            1 - 2 * (qy * qy + qz * qz) / norm2,
+            2 * (qx * qy - qw * qz) / norm2,
+            2 * (qx * qz + qw * qy) / norm2,
+        ),
+        (
+            2 * (qx * qy + qw * qz) / norm2,
+            1 - 2 * (qx * qx + qz * qz) / norm2,
+            2 * (qy * qz - qw * qx) / norm2,
+        ),
+        (
+            2 * (qx * qz - qw * qy) / norm2,
+            2 * (qy * qz + qw * qx) / norm2,
+            1 - 2 * (qx * qx + qy * qy) / norm2,
+        ),
+    )
+    v_AB = velocity if wind is None else [v - w for v, w in zip(velocity, wind, strict=True)]
+    speed = sqrt(_dot(v_AB, v_AB) + _TINY)
+    a_B = [
+        -(linear + quadratic * speed) * _dot(column, v_AB)
+        for linear, quadratic, column in zip(
+            params.rotor_drag, params.quadratic_drag, zip(*R_WB, strict=True), strict=True
+        )
+    ]
+    added = [_dot(row, a_B) for row in R_WB]
+    if disturbance is not None:
+        added = [a + more for a, more in zip(added, disturbance, strict=True)]
+
+    height = max2(z, max2(0.5 * params.ground_effect, _TINY))
+    lift = params.thrust_scale * (1.0 - params.battery_sag * (1.0 - max2(charge, 0.0)))
+    lift = lift / (1.0 - (0.25 * params.ground_effect / height) ** 2)
+    limits = params.max_tilt_rate, params.max_tilt_rate, params.max_yaw_rate
+    rates_cmd = [max2(-high, min2(w, high)) for w, high in zip(command[1:], limits, strict=True)]
+    thrust_cmd = max2(params.min_thrust, min2(command[0], params.max_thrust))
+    tilt = params.rate_time_constant
+    lags = tilt, tilt, tilt * params.yaw_time_ratio
+    accelerations = [(c - w) / lag for c, w, lag in zip(rates_cmd, rates, lags, strict=True)]
+    if params.model == "rotors":
+        forces = [lift * params.thrust_coefficient * u * u for u in actuators]
+        thrust = sum(forces) / params.mass
+        momentum = [J * w for J, w in zip(params.inertia, rates, strict=True)]
+        gyroscopic = _cross(rates, momentum)
+        torques_cmd = [
+            J * a + g for J, a, g in zip(params.inertia, accelerations, gyroscopic, strict=True)
+        ]
+        desired = mix(params.mass * thrust_cmd, torques_cmd, params)
+        targets = [sqrt(max2(f, _TINY) / params.thrust_coefficient) for f in desired]
+        accelerations = [
+            (M - g) / J
+            for M, g, J in zip(torques(forces, params), gyroscopic, params.inertia, strict=True)
+        ]
+    else:
+        thrust, targets = lift * (actuators[0] if actuators else thrust_cmd), [thrust_cmd]
+    power = max2(thrust / GRAVITY, _TINY)
+    return [
+        *component_derivatives(
+            state[:13], (thrust, *rates), params.drag, 1.0, params.gravity, wind, added
+        )[:10],
+        *accelerations,
+        -power * sqrt(power) * (1.0 / params.battery_endurance),  # x / inf of AutoDiffXd is NaN
+        *(
+            (u - now) / params.motor_time_constant
+            for u, now in zip(targets, actuators, strict=False)
+        ),
+    ]
+
+
+# Sides of the rotors along body x and y, and their torque about z: front left, rear left, rear
+# right, front right.
+_SIGNS = (1, 1, 1), (-1, 1, -1), (-1, -1, 1), (1, -1, -1)
+
+
+def mix(thrust: Any, torque: Any, params: QuadrotorParams) -> list[Any]:
+    """Returns the forces (4) [N] of the rotors for a thrust [N] and a torque (3) [N m] about B.
+
+    Beyond the limits of a rotor, first yaw is given up, then thrust, then roll and pitch.
+    """
+    (x, y), kappa = params.arm, params.torque_ratio
+    low, high = (0.25 * params.mass * each for each in (params.min_thrust, params.max_thrust))
+    tilt = [0.25 * (right * torque[0] / y - front * torque[1] / x) for front, right, _ in _SIGNS]
+    top, bottom = reduce(max2, tilt), reduce(min2, tilt)
+    common = max2(low - bottom, min2(0.25 * thrust, high - top))
+    room = max2(min2(high - top - common, common + bottom - low), 0.0)
+    yaw = max2(-room, min2(0.25 * torque[2] / kappa, room))
+    forces = (common + each + spin * yaw for each, (_, _, spin) in zip(tilt, _SIGNS, strict=True))
+    return [max2(low, min2(each, high)) for each in forces]
+
+
+def torques(forces: Any, params: QuadrotorParams) -> tuple[Any, Any, Any]:
+    """Returns the torque (3) [N m] about B of the forces (4) [N] of the rotors."""
+    front, right, spin = (_dot(sides, forces) for sides in zip(*_SIGNS, strict=True))
+    return params.arm[1] * right, -params.arm[0] * front, params.torque_ratio * spin
+
+
+def _dot(a: Any, b: Any) -> Any:
+    return sum(x * y for x, y in zip(a, b, strict=True))
+
+
+def _cross(a: Any, b: Any) -> tuple[Any, Any, Any]:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
 def rk4_step(state: Any, command: Any, params: QuadrotorParams, dt: Any) -> Any:
     """Returns the state (..., 13) after ``dt`` [s] of constant ``command`` (..., 4), by one step of
     the classical Runge-Kutta method, for the array types of :func:`quadrotor_derivatives`."""
@@ -140,22 +372,26 @@ def rk4_step(state: Any, command: Any, params: QuadrotorParams, dt: Any) -> Any:
 @system_template("QuadrotorPlant_", (float, AutoDiffXd, Expression))
 def QuadrotorPlant_(T):
     class QuadrotorPlant(LeafSystem_[T]):
-        """Simulates a quadrotor: exact thrust, body rates with a short lag.
+        """Simulates a quadrotor by thrust and body rates.
 
         .. pydrake_system::
 
             name: QuadrotorPlant
             input_ports: [command, wind, disturbance]
-            output_ports: [state]
+            output_ports: [state, acceleration]
 
-        - ``command`` (4), ``state`` (13): as at the top of this module; the state is continuous, by
-          default a level hover at the world's origin.
+        - ``command`` (4), ``state`` (13): as at the top of this module; by default a level hover at
+          the world's origin.
         - ``wind`` (3), optional: v_WA [m/s] of the air in W; drag acts on v_WB - v_WA.
         - ``disturbance`` (3), optional: acceleration [m/s^2] in W, added to that of the forces.
-        - Numeric parameter 0 (3): ``[drag [1/s], rate_time_constant [s], gravity [m/s^2]]``.
+        - ``acceleration`` (3): a_WB [m/s^2].
+        - Continuous state: the 13, and if `QuadrotorParams.is_ideal` is false those of
+          `actuated_derivatives`, at the charge and thrust of the start.
+        - Numeric parameter 0: ``[drag [1/s], rate_time_constant [s], gravity [m/s^2]]``, then, if
+          `is_ideal` is false, the other numbers of the configuration.
 
-        See `quadrotor_derivatives`. Supports the scalars float, AutoDiffXd and Expression. A
-        subclass supports them if it is a `system_template` of its own.
+        See `quadrotor_derivatives` and `actuated_derivatives`. Supports the scalars float,
+        AutoDiffXd and Expression. A subclass supports them if it is a `system_template` of its own.
         Integrate in steps of at most 0.02 s: after 5 s of random commands at 50 Hz,
         ``runge_kutta3`` is within 2 cm of the solution.
         """
@@ -177,11 +413,18 @@ def QuadrotorPlant_(T):
             require(valid, "initial_state", "13 finite numbers", start.tolist())
             require_rotation(QuadrotorState.of(start).q_WB)
             self._arguments = replace(params), start
-            self._parameters = [ConfigParameter(self, T, params)]
+            self._ideal = params.is_ideal()
+            names = _IDEAL if self._ideal else _IDEAL + _FURTHER
+            self._parameters = [ConfigParameter(self, T, params, names)]
             for name, size in (("command", 4), ("wind", 3), ("disturbance", 3)):
                 self.DeclareVectorInputPort(name, size)
-            index = self.DeclareContinuousState(BasicVector_[T](start))
-            self.DeclareStateOutputPort("state", index)
+            actuators = [] if self._ideal else _hovering_actuators(params)
+            index = self.DeclareContinuousState(BasicVector_[T]([*start, *actuators]))
+            if self._ideal:
+                self.DeclareStateOutputPort("state", index)
+            else:
+                self.DeclareVectorOutputPort("state", 13, self._calc_state, {self.xc_ticket()})
+            self.DeclareVectorOutputPort("acceleration", 3, self._calc_acceleration)
             # Most inputs are constant within a step.
             calc = weak_callback(self._calc_inputs)
             self._inputs_index = self.DeclareCacheEntry(
@@ -194,30 +437,54 @@ def QuadrotorPlant_(T):
         SetRateTimeConstant = parameter_setter("rate_time_constant")
         SetGravity = parameter_setter("gravity")
 
+        def SetParameter(self, context, name, value):
+            """Sets a number of the configuration, or a list of numbers, in a Context."""
+            known = self._parameters[0].names
+            require(name in known, "name", f"one of {', '.join(known)}", name)
+            parameter_setter(name)(self, context, value)
+
         def get_input_port(self, port_index=0):
             """Returns an input port by its index; `command` by default."""
             return super().get_input_port(port_index)
 
+        def get_output_port(self, port_index=0):
+            """Returns an output port by its index; `state` by default."""
+            return super().get_output_port(port_index)
+
         def DoCalcTimeDerivatives(self, context, derivatives):
-            # Python floats, one by one: several times faster than arrays of numpy.
-            vector = context.get_continuous_state_vector()
-            state = [vector.GetAtIndex(i) for i in range(13)]
-            inputs = self.get_cache_entry(self._inputs_index).Eval(context)
-            try:
-                rates = component_derivatives(state, *inputs)
-            except ZeroDivisionError:
-                raise ValueError(
-                    f"q_WB and rate_time_constant of {self.get_name()} must not be zero, got "
-                    f"{state[6:10]} and {inputs[2]} s at t = {context.get_time()} s"
-                ) from None
             vector = derivatives.get_mutable_vector()
-            for i, rate in enumerate(rates):
+            for i, rate in enumerate(self._rates(context)):
                 vector.SetAtIndex(i, rate)
 
+        def _rates(self, context):
+            # Python floats, one by one: several times faster than arrays of numpy.
+            vector = context.get_continuous_state_vector()
+            state = [vector.GetAtIndex(i) for i in range(vector.size())]
+            inputs = self.get_cache_entry(self._inputs_index).Eval(context)
+            try:
+                return (component_derivatives if self._ideal else actuated_derivatives)(
+                    state, *inputs
+                )
+            except ZeroDivisionError:
+                lag = inputs[2] if self._ideal else inputs[1].rate_time_constant
+                raise ValueError(
+                    f"q_WB and rate_time_constant of {self.get_name()} must not be zero, got "
+                    f"{state[6:10]} and {lag} s at t = {context.get_time()} s"
+                ) from None
+
+        def _calc_state(self, context, output):
+            vector = context.get_continuous_state_vector()
+            for i in range(13):
+                output.SetAtIndex(i, vector.GetAtIndex(i))
+
+        def _calc_acceleration(self, context, output):
+            output.SetFromVector(self._rates(context)[3:6])
+
         def _calc_inputs(self, context, inputs):
-            """Computes the arguments of `component_derivatives` after the state."""
+            """Computes the arguments of the derivatives after the state."""
             command, wind, disturbance = (self._read(index, context) for index in range(3))
-            parameters = context.get_numeric_parameter(0).value().tolist()
+            params = self._parameters[0].config(context)
+            parameters = [getattr(params, name) for name in _IDEAL] if self._ideal else [params]
             inputs.set_value((command, *parameters, wind, disturbance))
 
         def _read(self, index, context):
@@ -230,6 +497,14 @@ def QuadrotorPlant_(T):
             return value.tolist()
 
     return QuadrotorPlant
+
+
+def _hovering_actuators(params: QuadrotorParams) -> list[float]:
+    """Returns the charge at the start, and the thrust or the rotor speeds of hovering."""
+    if params.model == "rotors":
+        force = 0.25 * params.mass * params.gravity / params.thrust_coefficient
+        return [params.battery_charge, *[math.sqrt(force)] * 4]
+    return [params.battery_charge, *([params.gravity] if params.motor_time_constant else [])]
 
 
 QuadrotorPlant = QuadrotorPlant_[None]

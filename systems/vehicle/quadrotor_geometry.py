@@ -145,18 +145,19 @@ class QuadrotorGeometry(LeafSystem):
         scene_graph: SceneGraph,
         name: str = "quadrotor",
         label: RenderLabel | None = None,
+        radius: float = VEHICLE_RADIUS,
     ) -> "QuadrotorGeometry":
         """Registers the vehicle and adds the system of its pose, both named `name`.
 
-        Renderers and viewers show `quadrotor_parts`. Contacts and distances are those of the sphere
-        of radius `VEHICLE_RADIUS`.
+        Renderers and viewers show `quadrotor_parts`. Contacts and distances are those of a sphere.
 
         Args:
             label: of the vehicle in label images; `RenderLabel.kDontCare` if None.
+            radius: of the vehicle [m].
         """
         source = scene_graph.RegisterSource(name)
         frame = scene_graph.RegisterFrame(source, GeometryFrame(name))
-        for part in quadrotor_parts():
+        for part in quadrotor_parts(radius):
             geometry = GeometryInstance(part.X_BP, part.shape, part.name)
             perception, illustration = PerceptionProperties(), IllustrationProperties()
             for properties in (perception, illustration):
@@ -165,7 +166,7 @@ class QuadrotorGeometry(LeafSystem):
             geometry.set_perception_properties(perception)
             geometry.set_illustration_properties(illustration)
             scene_graph.RegisterGeometry(source, frame, geometry)
-        sphere = GeometryInstance(RigidTransform(), Sphere(VEHICLE_RADIUS), "collision")
+        sphere = GeometryInstance(RigidTransform(), Sphere(radius), "collision")
         sphere.set_proximity_properties(ProximityProperties())
         scene_graph.RegisterGeometry(source, frame, sphere)
         system = QuadrotorGeometry(frame)

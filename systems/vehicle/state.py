@@ -67,6 +67,13 @@ class QuadrotorState(NamedTuple):
         return np.concatenate(self, axis=-1)
 
 
+def set_state(context: Context, state: np.ndarray) -> None:
+    """Sets the first 13 continuous states of a plant's Context, those of its output ``state``."""
+    vector = context.get_mutable_continuous_state_vector()
+    for i, value in enumerate(state):
+        vector.SetAtIndex(i, value)
+
+
 def pose_from_state(state: np.ndarray) -> RigidTransform:
     """Returns X_WB of `state` (13,), see `make_pose`."""
     p_WB, _, q_WB, _ = QuadrotorState.of(state)

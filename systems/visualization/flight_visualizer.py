@@ -84,6 +84,7 @@ class FlightVisualizer(LeafSystem):
         *,
         draw: Collection[str] = (),
         path: str = "/splatpilot",
+        radius: float = VEHICLE_RADIUS,
     ):
         """Declares the ports.
 
@@ -91,6 +92,7 @@ class FlightVisualizer(LeafSystem):
             num_hypotheses: 0 for no port `hypotheses`.
             draw: names of `DRAWINGS`, and "axes" for those of the body.
             path: Meshcat's folder of the drawings; the vehicle is `PATH/vehicle`.
+            radius: of the vehicle [m].
         """
         super().__init__()
         self._meshcat, self._num_hypotheses, self._path = meshcat, num_hypotheses, path
@@ -98,9 +100,9 @@ class FlightVisualizer(LeafSystem):
             known = [*DRAWINGS, "axes"]
             require(name in known, "draw", f"names of {', '.join(known)}", name)
         self._drawings = [name for name in draw if name in DRAWINGS]
-        draw_vehicle(meshcat, f"{path}/vehicle", VEHICLE_RADIUS)
+        draw_vehicle(meshcat, f"{path}/vehicle", radius)
         for k, (axis, color) in enumerate(_AXES.items() if "axes" in draw else ()):
-            ends = np.column_stack([np.zeros(3), 1.5 * VEHICLE_RADIUS * np.eye(3)[k]])
+            ends = np.column_stack([np.zeros(3), 1.5 * radius * np.eye(3)[k]])
             meshcat.SetLine(f"{path}/vehicle/axes/{axis}", ends, 3.0, color)
         self.DeclareVectorInputPort("state", 13)
         if num_hypotheses:
@@ -125,6 +127,7 @@ class FlightVisualizer(LeafSystem):
         sources: Mapping[str, OutputPort] = MappingProxyType({}),
         name: str = "",
         path: str = "",
+        radius: float = VEHICLE_RADIUS,
     ) -> "FlightVisualizer":
         """Adds a visualizer.
 
@@ -133,12 +136,13 @@ class FlightVisualizer(LeafSystem):
             name: `flight_visualizer` by default, `NAME_flight_visualizer` if the vehicle, the
                 system of `state_port`, is named `NAME_plant`.
             path: `/splatpilot` by default, or `/splatpilot/NAME`.
+            radius: of the vehicle [m].
         """
         vehicle = vehicle_prefix(cast(System, state_port.get_system()), "plant")
         name = name or "_".join([*([vehicle] if vehicle else []), "flight_visualizer"])
         path = path or "/".join(["/splatpilot", *([vehicle] if vehicle else [])])
         count = num_hypotheses_in(hypotheses_port.size()) if hypotheses_port is not None else 0
-        visualizer = FlightVisualizer(meshcat, count, draw=draw, path=path)
+        visualizer = FlightVisualizer(meshcat, count, draw=draw, path=path, radius=radius)
         inputs = [visualizer.get_input_port(k) for k in range(visualizer.num_input_ports())]
         ports = {"state": state_port, "hypotheses": hypotheses_port, **sources}
         for port in inputs:

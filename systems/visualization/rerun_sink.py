@@ -64,6 +64,7 @@ class RerunSink(LeafSystem):
         *,
         gaussians: GaussianScene | None = None,
         goal: NDArray[np.float64] | None = None,
+        radius: float = VEHICLE_RADIUS,
         period: float = 1 / 15,
     ):
         """Declares an input like each of `ports`, by name.
@@ -71,6 +72,7 @@ class RerunSink(LeafSystem):
         Args:
             gaussians: those of the world.
             goal: p_WG (3,) [m].
+            radius: of the vehicle [m].
         """
         super().__init__()
         self._rr = cast(Any, import_extra("rerun", "rerun"))
@@ -98,7 +100,7 @@ class RerunSink(LeafSystem):
         if goal is not None:
             goals = self._rr.Points3D([goal], radii=0.3, colors=[0, 200, 80])
             self._statics.append(("world/goal", goals))
-        radii = [[VEHICLE_RADIUS, VEHICLE_RADIUS, 0.3 * VEHICLE_RADIUS]]
+        radii = [[radius, radius, 0.3 * radius]]
         vehicle = self._rr.Ellipsoids3D(
             half_sizes=radii, colors=[255, 120, 0], fill_mode="solid", labels="vehicle"
         )
@@ -119,6 +121,7 @@ class RerunSink(LeafSystem):
         *,
         gaussians: GaussianScene | None = None,
         goal: NDArray[np.float64] | None = None,
+        radius: float = VEHICLE_RADIUS,
         camera: SplatCamera | None = None,
         period: float = 1 / 15,
         name: str = "rerun",
@@ -126,7 +129,8 @@ class RerunSink(LeafSystem):
         """Adds a sink that is connected to `ports`, and to the images of a camera."""
         images = ("color_image", "depth_image_16u") if camera is not None else ()
         ports = {**ports, **{image: camera.GetOutputPort(image) for image in images if camera}}
-        sink = RerunSink(path, ports, gaussians=gaussians, goal=goal, period=period)
+        static = {"gaussians": gaussians, "goal": goal, "radius": radius}
+        sink = RerunSink(path, ports, **static, period=period)
         if camera is not None:
             sink.show_camera(camera.camera_info(), camera.X_BC())
         builder.AddNamedSystem(name, sink)

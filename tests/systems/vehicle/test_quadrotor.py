@@ -154,7 +154,7 @@ def test_ports_and_parameters_have_their_documented_names_and_order():
     context.SetContinuousState(state)
     np.testing.assert_array_equal(plant.GetOutputPort("state").Eval(context), state)
     assert plant.GetInputPort("command").size() == 4
-    assert not plant.HasAnyDirectFeedthrough()
+    assert not plant.HasDirectFeedthrough(output_port=0)
 
 
 def derivatives_at(plant, x):

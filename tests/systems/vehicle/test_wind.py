@@ -1,0 +1,119 @@
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pydrake.symbolic import Expression
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import LogVectorOutput
+
+from splatpilot.systems.vehicle.wind import (
+    DrydenWind,
+    Wind,
+    dryden_filter,
+    dryden_scales,
+    dryden_spectra,
+)
+
+MODERATE = Wind(gusts=15.4, altitude=6.0, airspeed=3.0)
+PERIOD = 0.02  # [s]
+
+
+def sampled(wind, seed, duration):
+    """Returns the outputs (3, n) [m/s] of a wind, every period."""
+    builder = DiagramBuilder()
+    source = builder.AddSystem(DrydenWind(wind, seed))
+    log = LogVectorOutput(source.get_output_port(), builder, PERIOD)
+    simulator = Simulator(builder.Build())
+    simulator.AdvanceTo(duration)
+    return log.FindLog(simulator.get_context()).data()
+
+
+def test_scales_are_those_of_the_specification():
+    # At 1000 feet: level is 1, lengths are 1000 feet and deviations a tenth of the wind at 20 feet.
+    lengths, sigmas = dryden_scales(Wind(gusts=10.0, altitude=304.8))
+    np.testing.assert_allclose(lengths, 304.8, rtol=1e-3)
+    np.testing.assert_allclose(sigmas, 1.0, rtol=1e-3)
+    # At 20 feet, by hand.
+    lengths, sigmas = dryden_scales(Wind(gusts=15.4, altitude=6.096))
+    np.testing.assert_allclose(lengths, [43.77, 43.77, 6.096], rtol=2e-3)
+    np.testing.assert_allclose(sigmas, [2.971, 2.971, 1.54], rtol=2e-3)
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_spectra_integrate_to_the_variance(axis):
+    frequency = np.geomspace(1e-5, 1e5, 100_001)
+    integral = np.trapezoid(dryden_spectra(MODERATE, frequency)[axis], frequency)
+    assert integral == pytest.approx(dryden_scales(MODERATE)[1][axis] ** 2, rel=1e-3)
+
+
+def test_the_filter_has_the_spectra_within_5_percent_over_three_decades():
+    A, B, C, _ = dryden_filter(MODERATE, PERIOD)
+    frequency = np.geomspace(0.035, 35.0, 301)  # [rad/s]; corners are at 0.07 to 0.5 rad/s
+    z = np.exp(1j * frequency * PERIOD)
+    gains = np.array([C @ np.linalg.solve(each * np.eye(5) - A, B) for each in z])
+    spectra = PERIOD / math.pi * (np.abs(gains) ** 2).sum(2).T
+    np.testing.assert_allclose(spectra, dryden_spectra(MODERATE, frequency), rtol=0.05)
+
+
+def test_the_filter_is_stationary_from_its_start():
+    A, B, C, start = dryden_filter(MODERATE, PERIOD)
+    covariance = start @ start.T
+    np.testing.assert_allclose(A @ covariance @ A.T + B @ B.T, covariance, atol=1e-12)
+    variances = np.diag(C @ covariance @ C.T)
+    np.testing.assert_allclose(variances, dryden_scales(MODERATE)[1] ** 2, rtol=1e-9)
+
+
+def test_outputs_have_the_variance_about_the_mean_from_time_0():
+    wind = replace(MODERATE, mean=[1.0, -2.0, 0.5], airspeed=30.0)
+    first = np.array([sampled(wind, seed, 0.0)[:, 0] for seed in range(400)])
+    later = sampled(wind, 7, 200.0)
+    sigmas = dryden_scales(wind)[1]
+    for gusts, tolerance in ((first.T, 0.15), (later, 0.25)):
+        np.testing.assert_allclose(gusts.std(axis=1), sigmas, rtol=tolerance)
+        np.testing.assert_allclose(gusts.mean(axis=1), wind.mean, atol=0.3 * sigmas.max())
+
+
+def test_a_seed_repeats_the_wind_and_another_changes_it():
+    one, again, other = (sampled(MODERATE, seed, 1.0) for seed in (3, 3, 4))
+    np.testing.assert_array_equal(one, again)
+    assert np.abs(one - other).max() > 0.1
+
+
+def test_gusts_along_the_wind_turn_with_its_mean():
+    east, north = (
+        sampled(replace(MODERATE, mean=mean), 3, 0.1) - np.array([mean]).T
+        for mean in ([2.0, 0.0, 0.0], [0.0, 2.0, 0.0])
+    )
+    np.testing.assert_allclose(north, [-east[1], east[0], east[2]], atol=1e-12)
+
+
+def test_numbers_are_parameters_of_the_context():
+    source = DrydenWind(Wind(gusts=5.0))
+    context = source.CreateDefaultContext()
+    gusts = source.get_output_port().Eval(context)
+    source.SetMean(context, [1.0, 2.0, 3.0])
+    source.SetGusts(context, 10.0)
+    np.testing.assert_allclose(source.get_output_port().Eval(context), 2 * gusts + [1, 2, 3])
+    with pytest.raises(ValueError, match=r"Wind.gusts must be in .*, got -1"):
+        source.SetGusts(context, -1.0)
+    for converted in (source.ToAutoDiffXd(), source.ToSymbolic()):
+        value = converted.get_output_port().Eval(converted.CreateDefaultContext())[0]
+        number = float(value.Evaluate()) if isinstance(value, Expression) else value.value()
+        assert number == pytest.approx(gusts[0])
+
+
+@pytest.mark.parametrize(
+    ("wind", "message"),
+    [
+        (Wind(gusts=-1.0), r"Wind.gusts must be in \[0, inf\) m/s, got -1"),
+        (Wind(altitude=1.0), r"Wind.altitude must be in \[3.048, 304.8\] m, got 1"),
+        (Wind(airspeed=0.0), r"Wind.airspeed must be in \(0, inf\) m/s, got 0"),
+        (Wind(mean=[math.nan, 0, 0]), "Wind.mean must be in"),
+        (Wind(mean=[1.0]), "Wind.mean must be three numbers"),
+    ],
+)
+def test_an_invalid_wind_is_named(wind, message):
+    with pytest.raises(ValueError, match=message):
+        DrydenWind(wind)
