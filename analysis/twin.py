@@ -62,7 +62,7 @@ _RESAMPLES = 10_000
 
 @dataclass
 class TwinConfig(Config):
-    """What flies, and where from and to."""
+    """Policies and routes that are flown."""
 
     # "[LABEL=]POLICY[:FIELD=VALUE...][@SPEED]" each, with the nominal speed, by default 2 m/s.
     policies: list[str] = field(default_factory=lambda: list(POLICIES))
@@ -95,7 +95,7 @@ def run(
     by_speed = policies_by_speed(config.policies)
     given, texts = {}, []
     for name, scene in zip(names, scenes, strict=True):
-        mesh = mesh_of(scene)
+        mesh = captured_mesh(scene)
         worlds = {"splat": SceneConfig(path=str(scene.resolve())), "mesh": mesh}
         routes = draw_routes(scene, make_world(mesh, 0), config.routes)
         for kind, world in worlds.items():
@@ -141,7 +141,7 @@ def policies_by_speed(policies: Sequence[str]) -> dict[float, list[str]]:
     return groups
 
 
-def mesh_of(scene: Path) -> MeshWorld:
+def captured_mesh(scene: Path) -> MeshWorld:
     """Returns the mesh that the capture of the scene folder `scene` was rendered of."""
     capture = read_scene_metadata(scene).capture
     recipe = rendered_world(Path(capture)) if capture else None
