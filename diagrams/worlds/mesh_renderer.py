@@ -111,9 +111,11 @@ class MeshRenderer:
         if with_color:
             fine = ImageRgba8U(_SAMPLES * width, _SAMPLES * height)
             self._engine.RenderColorImage(ColorRenderCamera(core(_SAMPLES)), fine)
-            color = cv2.resize(fine.data[..., :3], (width, height), interpolation=cv2.INTER_AREA)
+            color = cv2.resize(
+                np.asarray(fine.data)[..., :3], (width, height), interpolation=cv2.INTER_AREA
+            )
         self._engine.RenderDepthImage(DepthRenderCamera(core(1), DepthRange(*depth_range)), depth)
-        images = MeshImages(color, np.array(depth.data)[..., 0])
+        images = MeshImages(color.astype(np.uint8), np.array(depth.data)[..., 0])
         return (
             images
             if self._cut_outs is None
