@@ -17,7 +17,9 @@ from splatpilot.analysis.benchmark import run_study
 from splatpilot.analysis.benchmark.parameters import scenario_texts
 from splatpilot.analysis.benchmark.study import StudyConfig
 from splatpilot.analysis.benchmark.tables import Row
+from splatpilot.analysis.benchmark.variants import parse_variant
 from splatpilot.analysis.output import write_csv, write_png
+from splatpilot.diagrams.flight.policies import DEFAULT_SPEED
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.worlds.mesh_world import MeshWorld
 from splatpilot.diagrams.worlds.scene_folder import (
@@ -40,26 +42,29 @@ POLICIES = (
     "reactive",
     "close=reactive:margin=0.0:barrier_margin=0.2",
     "diffaero",
-    "diffaero_4=diffaero:speed=4",
-    "diffaero_8=diffaero:speed=8",
+    "diffaero@4",
+    "diffaero@8",
     "depthnav",
-    "depthnav_4=depthnav:speed=4",
+    "depthnav@4",
+    "depthnav@8",
     "agile_autonomy",
     "student_depth",
     "student_rgb",
     "diffaero_rgb",
-    "diffaero_rgb_4=diffaero_rgb:speed=4",
+    "diffaero_rgb@4",
 )
 """Default policies: of all kinds, and at speeds at which they fail."""
 
+_AT = "@"  # between policy and speed
 _DRAWS = 5  # routes that are drawn at most, for each that is flown
 _RESAMPLES = 10_000
 
 
 @dataclass
 class TwinConfig(Config):
-    """What flies, and where from and to."""
+    """Policies and routes that are flown."""
 
+    # "[LABEL=]POLICY[:FIELD=VALUE...][@SPEED]" each, with the nominal speed, by default 2 m/s.
     policies: list[str] = field(default_factory=lambda: list(POLICIES))
     routes: int = bounded(20, "[2, 1000]")  # starts and goals in each scene
     timeout: float = bounded(30.0, "(0, 3600] s")
@@ -87,9 +92,10 @@ def run(
     names = [scene.resolve().name for scene in scenes]
     unique = len(set(names)) == len(names)
     require(unique, "names of scenes", "different", ", ".join(names), "rename one folder")
+    by_speed = policies_by_speed(config.policies)
     given, texts = {}, []
     for name, scene in zip(names, scenes, strict=True):
-        mesh = mesh_of(scene)
+        mesh = captured_mesh(scene)
         worlds = {"splat": SceneConfig(path=str(scene.resolve())), "mesh": mesh}
         routes = draw_routes(scene, make_world(mesh, 0), config.routes)
         for kind, world in worlds.items():
@@ -101,15 +107,16 @@ def run(
                 ends = {"start": start.tolist(), "goal": goal.tolist(), "start_radius": radius}
                 (text,) = scenario_texts([base], [ends])
                 texts.append(f"{name}.{kind}.{k}={text}")
-    overrides = [f"timeout={config.timeout}"]
-    study = StudyConfig(texts, list(config.policies), seeds=1, overrides=overrides)
-    folder = out / "twins"
-    rows = run_study.run(config=study, out=folder, jobs=jobs, given=given, report=False).rows
-    generated: list[Row] = []
-    if config.control:
-        study = replace(study, scenarios=list(config.control), seeds=config.routes)
-        folder = out / "control"
-        generated = run_study.run(config=study, out=folder, jobs=jobs, report=False).rows
+    rows, generated = [], []
+    for speed, policies in by_speed.items():
+        study = StudyConfig(texts, policies, [speed], seeds=1)
+        study.overrides = [f"timeout={config.timeout}"]
+        options: dict[str, Any] = {"jobs": jobs, "report": False}
+        folder = out / f"{speed:g}m_s"
+        rows += run_study.run(config=study, out=folder / "twins", given=given, **options).rows
+        if config.control:
+            study = replace(study, scenarios=list(config.control), seeds=config.routes)
+            generated += run_study.run(config=study, out=folder / "control", **options).rows
     pairs = paired_flights(rows)
     write_csv(out / "flights.csv", pairs)
     table = predictions(pairs, generated)
@@ -120,7 +127,21 @@ def run(
     return table
 
 
-def mesh_of(scene: Path) -> MeshWorld:
+def policies_by_speed(policies: Sequence[str]) -> dict[float, list[str]]:
+    """Returns the policies of `TwinConfig`, as `parse_variant` reads them, by speed [m/s]."""
+    groups: dict[float, list[str]] = {}
+    for text in policies:
+        policy, _, speed = text.partition(_AT)
+        try:
+            nominal = float(speed or DEFAULT_SPEED)
+        except ValueError:
+            raise ValueError(f"the speed of {text} must be a number [m/s], got {speed}") from None
+        parse_variant(policy).config(nominal, None)
+        groups.setdefault(nominal, []).append(policy)
+    return groups
+
+
+def captured_mesh(scene: Path) -> MeshWorld:
     """Returns the mesh that the capture of the scene folder `scene` was rendered of."""
     capture = read_scene_metadata(scene).capture
     recipe = rendered_world(Path(capture)) if capture else None
@@ -167,13 +188,18 @@ def paired_flights(rows: Sequence[Row]) -> list[dict[str, Any]]:
     pairs: dict[tuple[str, str, int], dict[str, Any]] = {}
     for row in rows:
         name, kind, route = row["scenario"].rsplit(".", 2)
-        key = name, row["policy"], int(route)
+        key = name, _flown_policy(row), int(route)
         pair = pairs.setdefault(key, {"environment": name, "policy": key[1], "route": key[2]})
         pair[kind] = int(row["success"])
         pair[f"{kind}_outcome"] = row["outcome"]
         clearance = row.get("min_clearance_m")
         pair[f"{kind}_clearance_m"] = "" if clearance in (None, "") else round(clearance, 3)
     return list(pairs.values())
+
+
+def _flown_policy(row: Row) -> str:
+    speed = f"{row['speed']:g}" if row["speed"] != DEFAULT_SPEED else ""
+    return row["policy"] + (_AT + speed if speed else "")
 
 
 def predictions(
@@ -192,7 +218,7 @@ def predictions(
     policies = list(dict.fromkeys(pair["policy"] for pair in pairs))
     cubes = {kind: _cube(pairs, kind, environments, policies) for kind in ("splat", "mesh")}
     again = _cube(pairs, "again", environments, policies) if "again" in pairs[0] else None
-    found = ([row["success"] for row in control if row["policy"] == p] for p in policies)
+    found = ([row["success"] for row in control if _flown_policy(row) == p] for p in policies)
     generated = np.array([np.mean(successes or [np.nan]) for successes in found])
     table = []
     parts = [(name, slice(k, k + 1)) for k, name in enumerate(environments)]
@@ -283,12 +309,14 @@ def _write_figure(path: Path, pairs: Sequence[dict[str, Any]], control: Sequence
     figure = Figure(figsize=(9, 4.5), layout="constrained")
     panels = figure.subplots(1, 2 if control else 1, sharey=True, squeeze=False)[0]
 
+    flights = [row | {"policy": _flown_policy(row)} for row in control]
+
     def rate(rows: Sequence[Row], policy: str, column: str) -> float:
         return float(np.mean([row[column] for row in rows if row["policy"] == policy]))
 
     for axes, rows, column, where in zip(
         panels,
-        (pairs, control),
+        (pairs, flights),
         ("splat", "success"),
         ("reconstructions", "generated worlds"),
         strict=False,

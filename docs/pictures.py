@@ -1,6 +1,6 @@
 """Makes the pictures of the documentation; `pictures.md` has the commands.
 
-python docs/pictures.py moving out/fly/flight.mp4 docs/flight.webp
+python docs/pictures.py moving out/house/flight.mp4 docs/flight.webp
 
 Pages need Chromium on the PATH, but no display.
 """

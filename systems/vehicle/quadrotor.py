@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 from pydrake.autodiffutils import AutoDiffXd
 from pydrake.common.value import AbstractValue
-from pydrake.math import max as max2
-from pydrake.math import min as min2
+from pydrake.math import max as maximum
+from pydrake.math import min as minimum
 from pydrake.math import sqrt
 from pydrake.symbolic import Expression
 from pydrake.systems.framework import (
@@ -73,8 +73,8 @@ class QuadrotorParams(Config):
     rotor_drag: list[float] = bounded(lambda: [0.0] * 3, "[0, inf) 1/s")
     # [1/m] Quadratic drag over mass along body x, y, z, times the speed in the air.
     quadratic_drag: list[float] = bounded(lambda: [0.0] * 3, "[0, inf) 1/m")
-    # [s] First-order lag of the body rates behind their command; with rotors, of the rate
-    # controller if they were at once.
+    # [s] First-order lag of the body rates behind their command; with rotors, the inverse gain of
+    # the rate controller.
     rate_time_constant: float = bounded(0.05, "(0, inf) s")
     # [-] Time constant of yaw over that of roll and pitch.
     yaw_time_ratio: float = bounded(1.0, "(0, inf)")
@@ -133,7 +133,7 @@ class QuadrotorParams(Config):
             # Rate loop: 1 + s tau + s^2 tau lag, damped by sqrt(tau / lag) / 2.
             fastest = self.rate_time_constant * min(1.0, self.yaw_time_ratio)
             condition = f"at least {0.5 * lag / min(1.0, self.yaw_time_ratio):.4g} s, half of "
-            condition += "motor_time_constant, for a stable rate controller"
+            condition += "motor_time_constant, below which the rate controller oscillates"
             require_field(self, "rate_time_constant", fastest >= 0.5 * lag, condition)
 
     def is_ideal(self) -> bool:
@@ -254,43 +254,26 @@ def actuated_derivatives(
         command, wind, disturbance: see `component_derivatives`.
     """
     _, _, z, *velocity = state[:6]
-    (qw, qx, qy, qz), rates, charge, actuators = state[6:10], state[10:13], state[13], state[14:]
-    norm2 = qw * qw + qx * qx + qy * qy + qz * qz
-    R_WB = (
-        (
-            1 - 2 * (qy * qy + qz * qz) / norm2,
-            2 * (qx * qy - qw * qz) / norm2,
-            2 * (qx * qz + qw * qy) / norm2,
-        ),
-        (
-            2 * (qx * qy + qw * qz) / norm2,
-            1 - 2 * (qx * qx + qz * qz) / norm2,
-            2 * (qy * qz - qw * qx) / norm2,
-        ),
-        (
-            2 * (qx * qz - qw * qy) / norm2,
-            2 * (qy * qz + qw * qx) / norm2,
-            1 - 2 * (qx * qx + qy * qy) / norm2,
-        ),
-    )
+    (qw, *q), rates, charge, actuators = state[6:10], state[10:13], state[13], state[14:]
+    scale = 2.0 / (qw * qw + _dot(q, q))
     v_AB = velocity if wind is None else [v - w for v, w in zip(velocity, wind, strict=True)]
     speed = sqrt(_dot(v_AB, v_AB) + _TINY)
-    a_B = [
-        -(linear + quadratic * speed) * _dot(column, v_AB)
-        for linear, quadratic, column in zip(
-            params.rotor_drag, params.quadratic_drag, zip(*R_WB, strict=True), strict=True
-        )
-    ]
-    added = [_dot(row, a_B) for row in R_WB]
+    drags = zip(params.rotor_drag, params.quadratic_drag, strict=True)
+    coefficients = [linear + quadratic * speed for linear, quadratic in drags]
+    v_AB_B = _rotate(scale, -qw, q, v_AB)
+    a_B = [-c * v for c, v in zip(coefficients, v_AB_B, strict=True)]
+    added = _rotate(scale, qw, q, a_B)
     if disturbance is not None:
         added = [a + more for a, more in zip(added, disturbance, strict=True)]
 
-    height = max2(z, max2(0.5 * params.ground_effect, _TINY))
-    lift = params.thrust_scale * (1.0 - params.battery_sag * (1.0 - max2(charge, 0.0)))
+    height = maximum(z, maximum(0.5 * params.ground_effect, _TINY))
+    lift = params.thrust_scale * (1.0 - params.battery_sag * (1.0 - maximum(charge, 0.0)))
     lift = lift / (1.0 - (0.25 * params.ground_effect / height) ** 2)
     limits = params.max_tilt_rate, params.max_tilt_rate, params.max_yaw_rate
-    rates_cmd = [max2(-high, min2(w, high)) for w, high in zip(command[1:], limits, strict=True)]
-    thrust_cmd = max2(params.min_thrust, min2(command[0], params.max_thrust))
+    rates_cmd = [
+        maximum(-high, minimum(w, high)) for w, high in zip(command[1:], limits, strict=True)
+    ]
+    thrust_cmd = maximum(params.min_thrust, minimum(command[0], params.max_thrust))
     tilt = params.rate_time_constant
     lags = tilt, tilt, tilt * params.yaw_time_ratio
     accelerations = [(c - w) / lag for c, w, lag in zip(rates_cmd, rates, lags, strict=True)]
@@ -303,14 +286,14 @@ def actuated_derivatives(
             J * a + g for J, a, g in zip(params.inertia, accelerations, gyroscopic, strict=True)
         ]
         desired = mix(params.mass * thrust_cmd, torques_cmd, params)
-        targets = [sqrt(max2(f, _TINY) / params.thrust_coefficient) for f in desired]
+        targets = [sqrt(maximum(f, _TINY) / params.thrust_coefficient) for f in desired]
         accelerations = [
             (M - g) / J
             for M, g, J in zip(torques(forces, params), gyroscopic, params.inertia, strict=True)
         ]
     else:
         thrust, targets = lift * (actuators[0] if actuators else thrust_cmd), [thrust_cmd]
-    power = max2(thrust / GRAVITY, _TINY)
+    power = maximum(thrust / GRAVITY, _TINY)
     return [
         *component_derivatives(
             state[:13], (thrust, *rates), params.drag, 1.0, params.gravity, wind, added
@@ -337,12 +320,12 @@ def mix(thrust: Any, torque: Any, params: QuadrotorParams) -> list[Any]:
     (x, y), kappa = params.arm, params.torque_ratio
     low, high = (0.25 * params.mass * each for each in (params.min_thrust, params.max_thrust))
     tilt = [0.25 * (right * torque[0] / y - front * torque[1] / x) for front, right, _ in _SIGNS]
-    top, bottom = reduce(max2, tilt), reduce(min2, tilt)
-    common = max2(low - bottom, min2(0.25 * thrust, high - top))
-    room = max2(min2(high - top - common, common + bottom - low), 0.0)
-    yaw = max2(-room, min2(0.25 * torque[2] / kappa, room))
+    top, bottom = reduce(maximum, tilt), reduce(minimum, tilt)
+    common = maximum(low - bottom, minimum(0.25 * thrust, high - top))
+    room = maximum(minimum(high - top - common, common + bottom - low), 0.0)
+    yaw = maximum(-room, minimum(0.25 * torque[2] / kappa, room))
     forces = (common + each + spin * yaw for each, (_, _, spin) in zip(tilt, _SIGNS, strict=True))
-    return [max2(low, min2(each, high)) for each in forces]
+    return [maximum(low, minimum(each, high)) for each in forces]
 
 
 def torques(forces: Any, params: QuadrotorParams) -> tuple[Any, Any, Any]:
@@ -353,6 +336,13 @@ def torques(forces: Any, params: QuadrotorParams) -> tuple[Any, Any, Any]:
 
 def _dot(a: Any, b: Any) -> Any:
     return sum(x * y for x, y in zip(a, b, strict=True))
+
+
+def _rotate(scale: Any, w: Any, q: Any, vector: Any) -> list[Any]:
+    """Rotates a vector (3) by the quaternion (w, q), where `scale` is 2 / (w² + q²)."""
+    once = _cross(q, vector)
+    twice = _cross(q, once)
+    return [v + scale * (w * a + b) for v, a, b in zip(vector, once, twice, strict=True)]
 
 
 def _cross(a: Any, b: Any) -> tuple[Any, Any, Any]:
@@ -414,11 +404,13 @@ def QuadrotorPlant_(T):
             require_rotation(QuadrotorState.of(start).q_WB)
             self._arguments = replace(params), start
             self._ideal = params.is_ideal()
+            self._derivatives = component_derivatives if self._ideal else actuated_derivatives
             names = _IDEAL if self._ideal else _IDEAL + _FURTHER
             self._parameters = [ConfigParameter(self, T, params, names)]
             for name, size in (("command", 4), ("wind", 3), ("disturbance", 3)):
                 self.DeclareVectorInputPort(name, size)
             actuators = [] if self._ideal else _hovering_actuators(params)
+            self._size = 13 + len(actuators)
             index = self.DeclareContinuousState(BasicVector_[T]([*start, *actuators]))
             if self._ideal:
                 self.DeclareStateOutputPort("state", index)
@@ -459,12 +451,10 @@ def QuadrotorPlant_(T):
         def _rates(self, context):
             # Python floats, one by one: several times faster than arrays of numpy.
             vector = context.get_continuous_state_vector()
-            state = [vector.GetAtIndex(i) for i in range(vector.size())]
+            state = [vector.GetAtIndex(i) for i in range(self._size)]
             inputs = self.get_cache_entry(self._inputs_index).Eval(context)
             try:
-                return (component_derivatives if self._ideal else actuated_derivatives)(
-                    state, *inputs
-                )
+                return self._derivatives(state, *inputs)
             except ZeroDivisionError:
                 lag = inputs[2] if self._ideal else inputs[1].rate_time_constant
                 raise ValueError(

@@ -47,7 +47,7 @@ def test_intervals_cover_the_truth_and_shrink_with_routes():
 def test_control_is_correlated_with_the_mesh():
     mesh = np.zeros((1, 3, 4), bool)
     mesh[0, 1, :2] = mesh[0, 2] = True
-    control = [{"policy": f"p{p}", "success": p == 0} for p in range(3)]
+    control = [{"policy": f"p{p}", "speed": 2.0, "success": p == 0} for p in range(3)]
     (_, every) = predictions(make_pairs(mesh, mesh), control)
     assert every["rho"] == 1
     assert every["control"] == pytest.approx(spearmanr([0, 0.5, 1], [1, 0, 0]).statistic, abs=1e-4)
@@ -74,19 +74,32 @@ def test_policies_fly_the_same_routes_in_scene_and_mesh(opengl, room, tmp_path, 
     recipe = RenderedWorld(str(tmp_path / "room.obj"), config=RenderConfig(up="z"))
     (capture / RECIPE).write_text(dump_config(recipe))
     scene, out = room.scene("perfect", capture=str(capture)), tmp_path / "out"
-    settings = ("routes=2", "policies=[straight, diffaero]", "control=[]", "repeat_radius=0.05")
+    settings = ("routes=2", "policies=[straight, diffaero@3]", "control=[]")
+    settings += ("repeat_radius=0.05",)
     command = ["scene", "twin", str(scene), "--out", str(out), "--jobs", "1"]
     main([*command, *(word for setting in settings for word in ("--set", setting))])
     assert "perfect: 4 flights, success 100.0% in the mesh" in capsys.readouterr().out
     rows = list(csv.DictReader((out / "flights.csv").open()))
     assert [(row["policy"], row["route"]) for row in rows] == [
-        (policy, str(route)) for route in range(2) for policy in ("straight", "diffaero")
+        (policy, str(route)) for policy in ("straight", "diffaero@3") for route in range(2)
     ]
     for row in rows:
         assert row["splat"] == row["mesh"] == row["again"] == "1"
         mesh, again = (float(row[f"{kind}_clearance_m"]) for kind in ("mesh", "again"))
         assert 0 < abs(mesh - again) < 0.05
     assert (out / "twin.png").is_file() and (out / "twin.csv").is_file()
+
+
+def test_policies_are_checked_before_anything_is_drawn():
+    groups = twin.policies_by_speed(["planner", "fast=diffaero@4", "a=reactive:margin=0.1"])
+    assert groups == {2.0: ["planner", "a=reactive:margin=0.1"], 4.0: ["fast=diffaero"]}
+    for text, words in (
+        ("diffaero@fast", r"the speed of diffaero@fast must be a number \[m/s\], got fast"),
+        ("diffaero@50", r"the speed must be in"),
+        ("nobody", "nobody"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            twin.policies_by_speed([text])
 
 
 def test_scenes_without_a_mesh_are_refused(room, tmp_path):

@@ -141,9 +141,10 @@ def _free_space(
     parts, count = cast(Any, label(usable, np.ones((3, 3, 3))))
     if count == 0:
         raise ValueError(
-            f"the clearance between {low:g} and {high:g} m above surfaces must be more than "
-            f"{clearance} m somewhere, got {np.nanmax(found):.2f} m at most; require less "
-            "clearance, or allow other heights"
+            f"poses between {low:g} and {high:g} m above surfaces with a clearance of more than "
+            f"{clearance} m must exist, got none in {' x '.join(f'{x:.3g}' for x in extent)} m; "
+            "correct the scale if this size is wrong, require less clearance, or allow other "
+            "heights"
         )
     sizes = np.bincount(parts.ravel(), minlength=count + 1)
     sizes[0] = 0

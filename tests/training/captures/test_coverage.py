@@ -114,5 +114,5 @@ def test_heights_are_above_the_ground(tmp_path: Path):
 
 
 def test_space_without_clearance_is_named(field):
-    with pytest.raises(ValueError, match=r"must be more than 9.0 m somewhere, got"):
+    with pytest.raises(ValueError, match=r"9.0 m must exist, got none in .* m; correct the scale"):
         plan_capture(field, K, SIZE, (1.0, 2.2), 9.0)
