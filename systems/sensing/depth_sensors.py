@@ -140,19 +140,16 @@ def time_of_flight_depth(
 
 
 def _relative_sag(z: np.ndarray, angle: float, camera: OnboardCamera) -> np.ndarray:
-    """Returns the sag of corners over z: inverse depth is affine along a plane's image."""
-    inverse, sag = 1.0 / z, np.zeros_like(z)
-    for axis, focal in ((0, camera.focal_y), (1, camera.focal_x)):
-        offset = min(round(focal * np.tan(np.radians(angle))), z.shape[axis] - 1)
-        if offset < 1:
+    """Returns the sag of corners over z, 0 at the border: inverse depth is affine on a plane."""
+    sag = np.zeros_like(z)
+    for focal, depth, found in ((camera.focal_y, z, sag), (camera.focal_x, z.T, sag.T)):
+        offset = round(focal * np.tan(np.radians(angle)))
+        if not 0 < 2 * offset < len(depth):
             continue
-        margin = [(offset, offset) if k == axis else (0, 0) for k in range(2)]
-        padded = np.pad(inverse, margin, mode="reflect", reflect_type="odd")
-        count = z.shape[axis]
-        before, after = (
-            padded.take(range(first, first + count), axis) for first in (0, 2 * offset)
-        )
-        relative = z * 0.5 * (before + after) - 1.0
+        before, after = 1.0 / depth[: -2 * offset], 1.0 / depth[2 * offset :]
+        relative = 0.5 * depth[offset:-offset] * (before + after) - 1.0
         edges = np.abs(before - after) > _EDGE * (before + after)
-        sag = np.maximum(sag, np.where(edges | (relative > _EDGE), 0.0, relative))
+        relative[edges | (relative > _EDGE)] = 0.0
+        inner = found[offset:-offset]  # a view
+        np.maximum(inner, relative, out=inner)
     return sag
