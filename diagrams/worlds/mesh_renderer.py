@@ -5,6 +5,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
@@ -42,6 +43,7 @@ _LAMPS = (
     ((0.2, 0.3, 1.0), 0.8),
 )
 _GLOSS = 0.01  # fraction of white light that VTK's rough surfaces reflect, whatever their color
+_SAMPLES = 2  # colors along each side of a pixel, whose mean is its color, without jagged edges
 _STEP = 1e-4  # [m], and fraction of depth, from a surface to the start of the search for the next
 _HIDDEN = 0.01  # fraction of the light from behind below which the search ends
 
@@ -95,17 +97,25 @@ class MeshRenderer:
         depth_range: tuple[float, float] = (MIN_DEPTH, MAX_DEPTH),
         with_color: bool = True,
     ) -> MeshImages:
-        """Returns the view of a camera at X_WC with intrinsics K (3, 3) [px], with exact depth,
-        in a range of depth [m]; black unless `with_color`."""
+        """Returns the view of a camera at X_WC with intrinsics K (3, 3) [px], in a range of depth
+        [m]; black unless `with_color`. Depth is exact, at the centers of pixels."""
+
         # In OpenGL's image plane, too, the principal point of a symmetric view is width / 2.
-        info = CameraInfo(width, height, K[0, 0], K[1, 1], K[0, 2], K[1, 2])
-        core = RenderCameraCore("", info, ClippingRange(*depth_range), RigidTransform())
-        color, depth = ImageRgba8U(width, height), ImageDepth32F(width, height)
+        def core(samples: int) -> RenderCameraCore:
+            intrinsics = samples * K[[0, 1, 0, 1], [0, 1, 2, 2]]
+            info = CameraInfo(samples * width, samples * height, *intrinsics)
+            return RenderCameraCore("", info, ClippingRange(*depth_range), RigidTransform())
+
+        depth, color = ImageDepth32F(width, height), np.zeros((height, width, 3), np.uint8)
         self._engine.UpdateViewpoint(X_WC)
         if with_color:
-            self._engine.RenderColorImage(ColorRenderCamera(core), color)
-        self._engine.RenderDepthImage(DepthRenderCamera(core, DepthRange(*depth_range)), depth)
-        images = MeshImages(np.array(color.data)[..., :3], np.array(depth.data)[..., 0])
+            fine = ImageRgba8U(_SAMPLES * width, _SAMPLES * height)
+            self._engine.RenderColorImage(ColorRenderCamera(core(_SAMPLES)), fine)
+            color = cv2.resize(
+                np.asarray(fine.data)[..., :3], (width, height), interpolation=cv2.INTER_AREA
+            )
+        self._engine.RenderDepthImage(DepthRenderCamera(core(1), DepthRange(*depth_range)), depth)
+        images = MeshImages(color.astype(np.uint8), np.array(depth.data)[..., 0])
         return (
             images
             if self._cut_outs is None

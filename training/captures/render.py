@@ -87,7 +87,7 @@ class RenderConfig(Config):
 RECIPE = "world.yaml"
 COVERAGE = "coverage.png"
 _COVERED = 0.8  # share of surfaces, below which a capture is warned about
-_VERSION = 3  # of the drawing of meshes
+_VERSION = 4  # of the drawing of meshes
 
 
 @dataclass

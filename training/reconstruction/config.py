@@ -50,8 +50,8 @@ class ReconstructConfig(Config):
     surface_weight: float = bounded(1.5, "[0, inf)")
     """Weight of the distance between Gaussians and their surface, see `surface_loss`."""
     outline_weight: float = bounded(1.0, "[0, inf)")
-    """Weight of the outlines of objects before the sky, see `outline_loss`. Every other step of a
-    view with such outlines fits them instead of colors."""
+    """Weight of the outlines of objects before the sky, see `outline_loss`. Up to
+    half of the steps of a view, the more sky it has the more, fit them instead of colors."""
     lpips_weight: float = bounded(0.0, "[0, inf)")
     """Weight of LPIPS in the last tenth of the steps."""
     sh_degree: int = bounded(0, "[0, 3]")
@@ -69,7 +69,8 @@ class ReconstructConfig(Config):
     reset_every: int = bounded(3000, "[0, inf)")
     """Steps between resets of all opacities, while there are changes; 0 never resets them."""
     means_rate: float = bounded(1.6e-4, "[0, inf)")
-    """Learning rate of the means relative to the extent of the scene; falls to a hundredth."""
+    """Learning rate of the means, which falls to a hundredth, relative to the median depth if
+    Gaussians start from depth, or else to the extent of the cameras."""
 
     contrast: float = bounded(0.03, "[0.001, inf)")
     """Standard deviation of color (0 to 1) that one initial Gaussian may average."""

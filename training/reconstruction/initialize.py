@@ -15,6 +15,7 @@ from splatpilot.systems.common.processes import run_in_subprocess
 from splatpilot.systems.common.progress import Progress, say
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.splats.background import FAR
+from splatpilot.systems.splats.baked_scene import BakedScene
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.training.captures.capture import Capture, CaptureFrame, SfmPoints
 from splatpilot.training.captures.colmap import import_pycolmap
@@ -33,10 +34,11 @@ _MIN_STEPS, _STEPS_PER_IMAGE = 2000, 32
 # A cell is flat if its inverse depth differs from a plane by less than this fraction (rms), and its
 # slope against the ray, sideways to forward, is below the second number.
 _FLATNESS, _MAX_SLOPE = 2e-3, 10.0
-_MAX_STRETCH = 8.0  # longest to shortest side of a cell on its surface
+_MAX_STRETCH = 30.0  # longest to shortest side of a cell on its surface
+_DISAGREEMENT = 0.2  # of the slopes to the two neighbors of a pixel on one plane
 # Standard deviation relative to the edge of a cell, with an underlay, of the underlay and without
 # one. A small one keeps texture sharp, a large one leaves no gaps.
-_SPREAD, _UNDERLAY_SPREAD, _SPREAD_ALONE = 0.4, 0.6, 0.5
+_SPREAD, _UNDERLAY_SPREAD, _SPREAD_ALONE = 0.4, 0.6, 0.65
 _THICKNESS = 0.1  # relative to the other standard deviations
 # Distance of the underlay behind the surface as a fraction of depth, more on slanted surfaces up to
 # a maximum, so that it is drawn behind; and minimum size of its cells [px].
@@ -45,7 +47,8 @@ _MAX_ODDITY = 0.05  # of the logarithm of a gain, beyond which other images are 
 _SUBSET = 4  # one in so many frames is tried first
 _LARGEST_CELL = 64  # [px]
 _MIN_COVERED = 0.8  # fraction of the surfaces, below which optimization leaves holes
-_OPACITY, _OPACITY_ALONE = 0.9, 0.99  # on surfaces, with and without optimization
+_OPACITY = 0.99  # on surfaces
+_BEHIND = 0.1  # relative difference of depth, above which another surface shows
 _POINT_OPACITY, _POINT_SIZE = 0.1, 0.5  # size relative to the distance of the three closest others
 _RANDOM_DEPTH = (0.1, 10.0)  # in extents of the cameras
 _MAX_FROM_DEPTH, _RANDOM = 1_000_000, 120_000  # default maximum numbers of initial Gaussians
@@ -84,6 +87,7 @@ class BlockMeans:
         channels = [valid, np.pad(mask, pad) & valid, w, w * w, w * u, w * v, *color, *color**2]
         means = np.stack(channels)  # (12, H, W), float64
         self._focal_length = frame.K[0, 0]
+        self._slopes = [_pixel_slope(w, axis) for axis in (1, 0)]
         self._means = {1: means}
         while (size := 2 * max(self._means)) <= max_size:
             means = means[:, ::2] + means[:, 1::2]
@@ -107,9 +111,9 @@ class BlockMeans:
             v, u = (np.indices(w.shape) + 0.5) * size
             # Least-squares plane through the inverse depths of the block.
             spread = (size**2 - 1) / 12  # variance of the pixel coordinates
-            w_u, w_v = (
-                (moment / spread if size > 1 else 0 * w) for moment in (wu - w * u, wv - w * v)
-            )
+            w_u, w_v = self._slopes
+            if size > 1:
+                w_u, w_v = (wu - w * u) / spread, (wv - w * v) / spread
             residual = ww - w**2 - spread * (w_u**2 + w_v**2)
             leaf = undecided & (valid == 1) & (masked >= fraction)
             if size > 1:
@@ -126,6 +130,16 @@ class BlockMeans:
             undecided = (undecided & ~leaf).repeat(2, axis=0).repeat(2, axis=1)
             size //= 2
         return Cells(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def _pixel_slope(w: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
+    """Returns the slope of inverse depth at each pixel along an axis [1/(m px)], 0 unless both
+    neighbors agree on it."""
+    step = np.diff(w, axis=axis)
+    zero = np.zeros_like(w.take([0], axis))
+    before, after = np.concatenate([zero, step], axis), np.concatenate([step, zero], axis)
+    agree = np.abs(after - before) < _DISAGREEMENT * np.abs(after + before)
+    return np.where(agree, (before + after) / 2, 0)
 
 
 def frame_gaussians(
@@ -275,7 +289,7 @@ def gaussians_from_depth(
     `contrast`, `max_cell` and `max_extent` are of the finest cells, see `BlockMeans.split`; they
     become coarser until the Gaussians fit: first by more contrast, then by size. If they will be
     `optimized`, Gaussians are wider and without an underlay, and if even the coarsest are too many,
-    they are sampled.
+    they are sampled; else more fill the gaps that the frames show between them.
     """
     views = [ThinnedFrame.of(frame) for frame in frames]
     if not any(view.depth.any() for view in views):
@@ -286,7 +300,8 @@ def gaussians_from_depth(
     # A gain approximates another tone curve, so other images are preferred to odd ones.
     log_gains = np.log(photometry.gains)
     odd = np.flatnonzero(np.abs(log_gains - np.log(np.median(photometry.gains))) > _MAX_ODDITY)
-    new = find_new_pixels(views, last=odd.tolist())
+    last = odd.tolist()
+    new = find_new_pixels(views, last)
     progress = Progress(desc="placing Gaussians", unit="frame")
     parts: dict[int, tuple[NDArray, NDArray, NDArray]] = {}
 
@@ -323,8 +338,16 @@ def gaussians_from_depth(
                 f"{max_gaussians} Gaussians are too few for {len(frames)} frames, even with "
                 f"cells of {max_cell} pixels; allow more, or use fewer frames"
             )
+    surfaces = _concatenate(parts[k] for k in range(len(frames)))
+    if optimized and len(surfaces[0]) < max_gaussians:
+        scene = BakedScene(_opaque_gaussians(*surfaces))
+        new = find_new_pixels(
+            [_gaps(scene, *pair) for pair in zip(frames, views, strict=True)], last, smooth=False
+        )
+        cover(k for k in range(len(frames)) if new[k].any())
+        surfaces = _concatenate([surfaces, *(parts[k] for k in parts if new[k].any())])
     progress.close()
-    p_WQ, covariances, colors = _concatenate(parts[k] for k in range(len(frames)))
+    p_WQ, covariances, colors = surfaces
     if len(p_WQ) > max_gaussians:
         areas = np.trace(covariances, axis1=1, axis2=2)
         # Drawn in proportion to their radius (Efraimidis and Spirakis 2006).
@@ -338,9 +361,25 @@ def gaussians_from_depth(
                 "closer to that, or use frames of a smaller part of the scene"
             )
         p_WQ, covariances, colors = p_WQ[kept], covariances[kept], colors[kept]
+    return _opaque_gaussians(p_WQ, covariances, colors)
+
+
+def _opaque_gaussians(p_WQ: NDArray, covariances: NDArray, colors: NDArray) -> GaussianScene:
     quats, scales = principal_axes(covariances)
-    opacities = np.full(len(p_WQ), _OPACITY if optimized else _OPACITY_ALONE)
+    opacities = np.full(len(p_WQ), _OPACITY)
     return GaussianScene.from_colors(p_WQ, quats, scales, opacities, colors)
+
+
+def _gaps(scene: BakedScene, frame: CaptureFrame, view: ThinnedFrame) -> ThinnedFrame:
+    """Returns the thinned frame with depth only at gaps of the scene, which shows nothing there, or
+    a surface behind the true one."""
+    height, width = frame.depth.shape
+    depth = scene.render_depth(frame.K, width, height, frame.X_WC)
+    surface = (frame.depth > 0) & (frame.depth < FAR)
+    gap = surface & ((depth == 0) | (depth > (1 + _BEHIND) * frame.depth))
+    s = view.stride
+    gap = cv2.dilate(gap.astype(np.uint8), np.ones((s, s), np.uint8), anchor=(0, 0))[::s, ::s]
+    return replace(view, depth=np.where(gap, view.depth, 0))
 
 
 def gaussians_from_points(p_WQ: NDArray, colors: NDArray) -> GaussianScene:

@@ -205,15 +205,14 @@ class Optimization:
         if held_out is not None:
             fitted = [ThinnedFrame.of(views.frame(k)) for k in range(len(views))]
             self._seen = [seen_pixels(held_out.frame(k), fitted) for k in range(len(held_out))]
-        self._fits_outlines = [config.outline_weight > 0 and has for has in views.has_outlines]
         self._perceptual = perceptual
-        center, self.extent = views.extent()
+        center, extent = views.extent()
+        # The distance of the cameras from each other says little about surfaces of known depth.
+        self._length = views.median_depth if config.initialization == "depth" else extent
         state = checkpoint.load()
         if state is None:
             self.step, self.gains = 0, views.gains
-            self.splats = SplatParameters.of_scene(
-                initial(self.extent), config.sh_degree, config.device
-            )
+            self.splats = SplatParameters.of_scene(initial(extent), config.sh_degree, config.device)
             self._limit_scales()
         else:
             self.step, self.gains = state["step"], state["gains"]
@@ -221,7 +220,7 @@ class Optimization:
         self._strategy = None
         if config.strategy == "default":
             center = torch.tensor(center, dtype=torch.float32, device=config.device)
-            self._strategy = DefaultStrategy(config, center, self.extent, len(self.splats))
+            self._strategy = DefaultStrategy(config, center, extent, len(self.splats))
             if state is not None:
                 self._strategy.gradients, self._strategy.counts = state["strategy"]
 
@@ -246,8 +245,8 @@ class Optimization:
                         self._save()
 
     def take_step(self) -> None:
-        """Fits one image or, in every other step of a view with objects before the sky, their
-        outlines as depth cameras see them: without the blur of color cameras."""
+        """Fits one image or, in some steps of a view with objects before the sky, their outlines
+        as depth cameras see them: without the blur of color cameras."""
         config, splats, count = self._config, self.splats, len(self.splats)
         # Image and background color are random, but depend only on seed and step.
         n = len(self._views)
@@ -257,7 +256,8 @@ class Optimization:
         background = torch.from_numpy(color).to(config.device)
         viewmat, K = self._views.camera(k, config.device)
         gaussians = self._gaussians(config.device)
-        outlines = self._fits_outlines[k] and self.step % 2 == 1
+        chance = np.random.default_rng([config.seed, self.step, 3]).random()
+        outlines = config.outline_weight > 0 and chance < self._views.outline_shares[k]
         rendering = render(
             config.representation,
             gaussians,
@@ -288,7 +288,7 @@ class Optimization:
         loss.backward()
         if self._strategy is not None:
             self._strategy.observe(rendering, splats, viewmat, K)
-        splats.step(learning_rates(config, self.extent, self.step / config.iterations))
+        splats.step(learning_rates(config, self._length, self.step / config.iterations))
         self.step += 1
         if self.step in self._gain_steps:
             self._fit_gains()

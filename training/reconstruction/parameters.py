@@ -34,15 +34,15 @@ _RATES = {
 }
 _FINAL_MEANS = 0.01
 # Factors for Gaussians that start on surfaces, and the fraction to which all but the means' fall.
-_ON_SURFACE = {"means": 0.25, "quats": 6.0, "log_scales": 6.0, "sh_0": 3.0, "sh_rest": 3.0}
+_ON_SURFACE = {"quats": 6.0, "log_scales": 6.0, "sh_0": 3.0, "sh_rest": 3.0}
 _FINAL_ON_SURFACE = 0.1
 
 
-def learning_rates(config: ReconstructConfig, extent: float, progress: float) -> dict[str, float]:
+def learning_rates(config: ReconstructConfig, length: float, progress: float) -> dict[str, float]:
     """Returns the learning rate of each parameter of `SplatParameters`. Gaussians that start from
-    depth are on surfaces already: their means move slower, their other parameters faster at first.
-    `progress` is the fraction of all steps, `extent` [m] scales the rate of the means."""
-    rates = {"means": config.means_rate * extent * _FINAL_MEANS**progress} | _RATES
+    depth are on surfaces already: all parameters but their means move faster at first. `progress`
+    is the fraction of all steps, `length` [m] scales the rate of the means."""
+    rates = {"means": config.means_rate * length * _FINAL_MEANS**progress} | _RATES
     if config.initialization != "depth":
         return rates
     cosine = (1 + math.cos(math.pi * progress)) / 2

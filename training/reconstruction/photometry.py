@@ -125,11 +125,12 @@ def find_overlaps(views: Sequence[ThinnedFrame]) -> list[list[int]]:
 
 
 def find_new_pixels(
-    views: Sequence[ThinnedFrame], last: Collection[int] = ()
+    views: Sequence[ThinnedFrame], last: Collection[int] = (), smooth: bool = True
 ) -> list[NDArray[np.bool_]]:
     """Finds, for each view, the pixels (h, w) to keep so that every point is kept about once. Keeps
     pixels that are nearly the finest of their point, in the first view that has them. Views are
-    visited from the closest to the farthest, those with an index in `last` after the others."""
+    visited from the closest to the farthest, those with an index in `last` after the others.
+    `smooth` removes speckle."""
     overlapping = find_overlaps(views)
     fine = []  # pixels that are nearly the finest
     for i, view in enumerate(Progress(views, "comparing frames", unit="frame")):
@@ -154,8 +155,9 @@ def find_new_pixels(
                 number, shown = views[j].find(p_WQ)
                 covered[pixel[number]] |= new[j].flat[shown]
         keep = fine[i] & ~covered.reshape(view.depth.shape)
-        # Without speckle where two views are about equally fine.
-        new[i] = (cv2.medianBlur(keep.astype(np.uint8), 5) > 0) & (view.depth > 0)
+        if smooth:  # for speckle, where two views are about equally fine
+            keep = cv2.medianBlur(keep.astype(np.uint8), 5) > 0
+        new[i] = keep & (view.depth > 0)
     return [new[i] for i in range(len(views))]
 
 

@@ -24,7 +24,8 @@ from splatpilot.training.reconstruction.photometry import Photometry
 
 _MIN_DEPTH = 1e-3  # [m], of cached frames
 _CODES = 65535  # of cached depth: 0 is unknown, the last is FAR, equal ratios are between others
-_SPARSE = 4  # one in so many pixels along each axis gives the mean color
+_OUTLINES = 4  # share of a view's steps that fit outlines, relative to that of sky in it
+_SPARSE = 4  # one in so many pixels along each axis gives the mean color and the median depth
 _HEIGHT, _WIDTH = 128, 256  # texels of the background, powers of two
 
 
@@ -69,16 +70,22 @@ class ReconstructionViews:
 
     def __init__(self, frames: Sequence[CaptureFrame], photometry: Photometry):
         self._frames = frames
-        edges, viewmats, outlines = [], [], []
+        edges, viewmats, outlines, depths = [], [], [], []
         for frame in Progress(frames, "loading frames", len(frames), unit="frame"):
             depth = torch.from_numpy(frame.depth)
             edges.append(depth_edge_weights(depth).to(torch.uint8))
             viewmats.append(torch.from_numpy(frame.X_WC.inverse().GetAsMatrix4()).float())
             sky = frame.depth >= FAR
-            outlines.append(bool(sky.any() and ((frame.depth > 0) & ~sky).any()))
+            surfaces = ((frame.depth > 0) & ~sky).any()
+            outlines.append(min(_OUTLINES * sky.mean(), 0.5) if surfaces else 0.0)
+            sparse = frame.depth[::_SPARSE, ::_SPARSE]
+            depths.append(sparse[(sparse > 0) & (sparse < FAR)])
         self.edges = torch.stack(edges)  # (n, H, W) weights of the depth term
         self.viewmats = torch.stack(viewmats)  # (n, 4, 4) X_CW
-        self.has_outlines = outlines  # (n,), surfaces before the sky
+        # (n,) of the steps, which fit the outlines of surfaces before the sky
+        self.outline_shares = outlines
+        known = np.concatenate(depths)
+        self.median_depth = float(np.median(known)) if len(known) else 0.0  # [m]
         self.K = torch.from_numpy(frames[0].K).float()[None]  # (1, 3, 3) [px]
         self.height, self.width = self.edges.shape[1:]
         self.vignetting = photometry.vignetting
@@ -105,7 +112,7 @@ class ReconstructionViews:
 
     def extent(self) -> tuple[NDArray[np.float64], float]:
         """Returns the mean position (3,) [m] of the cameras and 1.1 times the largest distance from
-        it [m], which scales learning rates and sizes; 1 m if all cameras coincide."""
+        it [m], which scales sizes and the rate of the means; 1 m if all cameras coincide."""
         X_CWs = self.viewmats.double().numpy()
         p_WCs = -np.einsum("nji,nj->ni", X_CWs[:, :3, :3], X_CWs[:, :3, 3])
         center = p_WCs.mean(axis=0)

@@ -295,3 +295,13 @@ def test_mesh_digests_do_not_depend_on_the_file(room_mesh, tmp_path, name):
 def test_real_meshes_are_those_of_the_table(file, source):
     mesh = Path(os.environ["SPLATPILOT_DATA"]) / "worlds" / file
     assert find_test_source(mesh_digests(mesh)) == source
+
+
+def test_pixels_on_edges_have_mean_colors_but_depth_of_their_centers(opengl, scene):
+    shifted = K.copy()
+    shifted[0, 2] += 0.4  # the quad ends in the left half of a pixel
+    frame = MeshRenderer(scene({}), "y", SKY).render(X_WC, shifted, 32, 24)
+    quad, edge, wall = frame.color[12, 23:26].astype(float)
+    assert is_green(quad) and is_red(wall)
+    assert edge == pytest.approx((quad + wall) / 2, abs=1)
+    assert frame.depth[12, 24] == pytest.approx(WALL, abs=1e-4)

@@ -189,5 +189,5 @@ def test_other_contents_are_not_overwritten(opengl, room, tmp_path):
 def test_captures_by_another_version_of_the_renderer_are_refused(tmp_path):
     assert true_camera(tmp_path) is None
     (tmp_path / "world.yaml").write_text("mesh: room.obj\n")
-    with pytest.raises(ValueError, match=r"world\.yaml: version must be 3, got 1; render it again"):
+    with pytest.raises(ValueError, match=r"world\.yaml: version must be 4, got 1; render it again"):
         true_camera(tmp_path)

@@ -30,8 +30,7 @@ def test_learning_rates(start):
     )
     published = {"means": 3.0 * 1.6e-4, "quats": 1e-3, "log_scales": 5e-3}
     published |= {"logit_opacities": 5e-2, "sh_0": 2.5e-3, "sh_rest": 1.25e-4}
-    factor = 0.25 if start == "depth" else 1.0
-    assert first["means"] == pytest.approx(factor * published.pop("means"))
+    assert first["means"] == pytest.approx(published.pop("means"))
     assert last["means"] == pytest.approx(first["means"] / 100)
     for name, rate in published.items():
         if start == "points":
