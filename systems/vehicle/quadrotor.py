@@ -12,7 +12,6 @@ aerodynamics and battery.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -307,35 +306,36 @@ def actuated_derivatives(
     ]
 
 
-# Sides of the rotors along body x and y, and their torque about z: front left, rear left, rear
-# right, front right.
-_SIGNS = (1, 1, 1), (-1, 1, -1), (-1, -1, 1), (1, -1, -1)
-
-
 def mix(thrust: Any, torque: Any, params: QuadrotorParams) -> list[Any]:
     """Returns the forces (4) [N] of the rotors for a thrust [N] and a torque (3) [N m] about B.
 
-    Beyond the limits of a rotor, first yaw is given up, then thrust, then roll and pitch.
+    Rotors are front left, rear left, rear right, front right; the first and third push B to the
+    left about z. Beyond their limits, first yaw is given up, then thrust, then roll and pitch.
     """
-    (x, y), kappa = params.arm, params.torque_ratio
-    low, high = (0.25 * params.mass * each for each in (params.min_thrust, params.max_thrust))
-    tilt = [0.25 * (right * torque[0] / y - front * torque[1] / x) for front, right, _ in _SIGNS]
-    top, bottom = reduce(maximum, tilt), reduce(minimum, tilt)
-    common = maximum(low - bottom, minimum(0.25 * thrust, high - top))
-    room = maximum(minimum(high - top - common, common + bottom - low), 0.0)
-    yaw = maximum(-room, minimum(0.25 * torque[2] / kappa, room))
-    forces = (common + each + spin * yaw for each, (_, _, spin) in zip(tilt, _SIGNS, strict=True))
-    return [maximum(low, minimum(each, high)) for each in forces]
+    low, high = 0.25 * params.mass * params.min_thrust, 0.25 * params.mass * params.max_thrust
+    roll, pitch = 0.25 * torque[0] / params.arm[1], 0.25 * torque[1] / params.arm[0]
+    tilt = abs(roll) + abs(pitch)
+    common = maximum(low + tilt, minimum(0.25 * thrust, high - tilt))
+    room = maximum(minimum(high - tilt - common, common - tilt - low), 0.0)
+    yaw = maximum(-room, minimum(0.25 * torque[2] / params.torque_ratio, room))
+    a, b, c = common + roll, common - roll, pitch - yaw
+    d = pitch + yaw
+    return [maximum(low, minimum(f, high)) for f in (a - c, a + c, b + d, b - d)]
 
 
 def torques(forces: Any, params: QuadrotorParams) -> tuple[Any, Any, Any]:
     """Returns the torque (3) [N m] about B of the forces (4) [N] of the rotors."""
-    front, right, spin = (_dot(sides, forces) for sides in zip(*_SIGNS, strict=True))
-    return params.arm[1] * right, -params.arm[0] * front, params.torque_ratio * spin
+    front_left, rear_left, rear_right, front_right = forces
+    left, right = front_left + rear_left, rear_right + front_right
+    return (
+        params.arm[1] * (left - right),
+        params.arm[0] * (rear_left + rear_right - front_left - front_right),
+        params.torque_ratio * (front_left + rear_right - rear_left - front_right),
+    )
 
 
 def _dot(a: Any, b: Any) -> Any:
-    return sum(x * y for x, y in zip(a, b, strict=True))
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def _rotate(scale: Any, w: Any, q: Any, vector: Any) -> list[Any]:
