@@ -66,7 +66,9 @@ class TwinConfig(Config):
 
     # "[LABEL=]POLICY[:FIELD=VALUE...][@SPEED]" each, with the nominal speed, by default 2 m/s.
     policies: list[str] = field(default_factory=lambda: list(POLICIES))
-    routes: int = bounded(20, "[2, 1000]")  # starts and goals in each scene
+    # [-] Starts and goals in each scene.
+    routes: int = bounded(20, "[2, 1000]")
+    # [s] Flights end after this time.
     timeout: float = bounded(30.0, "(0, 3600] s")
     # [m] The meshes are flown again from starts within this distance, to learn how well flights in
     # one environment agree with each other; 0: they are not.

@@ -11,6 +11,7 @@ import yaml
 from splatpilot.analysis.faults import FaultsConfig
 from splatpilot.analysis.fidelity.fidelity import FidelityConfig
 from splatpilot.analysis.reconstruction.run import RenderedSceneConfig
+from splatpilot.analysis.twin import TwinConfig
 from splatpilot.diagrams.flight.policies import POLICIES
 from splatpilot.diagrams.flight.scenario import WITHOUT_EFFECT, Scenario
 from splatpilot.diagrams.flight.sensors import ESTIMATORS, SENSORS
@@ -66,8 +67,8 @@ GROUPS: list[tuple[str, str, list[type] | Registry]] = [
     (
         "Reconstruction",
         "For `splatpilot reconstruct` and `scene ablate`; for meshes and generated worlds in "
-        "`reconstruct` and `library make`; and for `scene fidelity`.",
-        [ReconstructConfig, RenderedSceneConfig, FidelityConfig],
+        "`reconstruct` and `library make`; for `scene fidelity` and `scene twin`.",
+        [ReconstructConfig, RenderedSceneConfig, FidelityConfig, TwinConfig],
     ),
     ("Training", "For `splatpilot train` and `recover`, by policy.", TRAINERS),
     ("Corpora", "For `splatpilot corpus make`.", [CorpusConfig]),
