@@ -179,7 +179,7 @@ def fidelity(options: argparse.Namespace) -> None:
     cli.out_option("output folder", "out/twin"),
     cli.JOBS,
     cli.set_option(
-        *("routes=10", "policies=[planner, mine.npz]"),
+        *("routes=10", "repeat_radius=0.05"),
         configuration="splatpilot.analysis.twin:TwinConfig",
     ),
     examples=("scene twin scenes/small_house scenes/cafe", "scene twin scenes/cafe --set routes=5"),
