@@ -91,24 +91,8 @@ def run(
     `twin.png`. The same call resumes, and with more scenes flies what is missing. Returns the rows
     of `twin.csv`, see `predictions`."""
     config.validate()
-    names = [scene.resolve().name for scene in scenes]
-    unique = len(set(names)) == len(names)
-    require(unique, "names of scenes", "different", ", ".join(names), "rename one folder")
     by_speed = policies_by_speed(config.policies)
-    given, texts = {}, []
-    for name, scene in zip(names, scenes, strict=True):
-        mesh = captured_mesh(scene)
-        worlds = {"splat": SceneConfig(path=str(scene.resolve())), "mesh": mesh}
-        routes = draw_routes(scene, make_world(mesh, 0), config.routes)
-        for kind, world in worlds.items():
-            given[f"{name}.{kind}"] = Scenario(world=world)
-        for kind in ("splat", "mesh", "again")[: 2 + bool(config.repeat_radius)]:
-            radius = config.repeat_radius if kind == "again" else 0.0
-            base = f"{name}.{'splat' if kind == 'splat' else 'mesh'}"
-            for k, (start, goal) in enumerate(routes):
-                ends = {"start": start.tolist(), "goal": goal.tolist(), "start_radius": radius}
-                (text,) = scenario_texts([base], [ends])
-                texts.append(f"{name}.{kind}.{k}={text}")
+    given, texts = twin_scenarios(scenes, config)
     rows, generated = [], []
     for speed, policies in by_speed.items():
         study = StudyConfig(texts, policies, [speed], seeds=1)
@@ -127,6 +111,29 @@ def run(
     _print_table(table)
     print(f"Wrote flights.csv, twin.csv and twin.png in {out}")
     return table
+
+
+def twin_scenarios(
+    scenes: Sequence[Path], config: TwinConfig
+) -> tuple[dict[str, Scenario], list[str]]:
+    """Returns scenarios by name, and texts for `parse_scenario` of all routes through them, labeled
+    "SCENE.KIND.ROUTE", where KIND is splat, mesh or again."""
+    names = [scene.resolve().name for scene in scenes]
+    unique = len(set(names)) == len(names)
+    require(unique, "names of scenes", "different", ", ".join(names), "rename one folder")
+    given, texts = {}, []
+    for name, scene in zip(names, scenes, strict=True):
+        mesh = captured_mesh(scene)
+        routes = draw_routes(scene, make_world(mesh, 0), config.routes)
+        kinds = [("splat", SceneConfig(path=str(scene.resolve())), 0.0), ("mesh", mesh, 0.0)]
+        if config.repeat_radius:
+            kinds.append(("again", mesh, config.repeat_radius))
+        for kind, world, radius in kinds:
+            given[f"{name}.{kind}"] = Scenario(world=world, start_radius=radius)
+            ends = [{"start": each.p_WS.tolist(), "goal": each.p_WG.tolist()} for each in routes]
+            flights = scenario_texts([f"{name}.{kind}"], ends)
+            texts += [f"{name}.{kind}.{k}={text}" for k, text in enumerate(flights)]
+    return given, texts
 
 
 def policies_by_speed(policies: Sequence[str]) -> dict[float, list[str]]:
@@ -163,23 +170,24 @@ def captured_mesh(scene: Path) -> MeshWorld:
 
 def draw_routes(scene: Path, mesh: World, count: int) -> list[Route]:
     """Draws `count` starts and goals in well-observed space of the scene folder `scene`, that a
-    path in the mesh connects, too. Others are skipped, and counted."""
+    path in the mesh connects, too. Others are skipped, and said."""
     esdf = mesh.esdf.conservative()
     config, world = SceneConfig(path=str(scene.resolve())), read_scene_folder(scene)
-    routes, skipped, reason = [], 0, ""
-    for seed in Progress(range(_DRAWS * count), f"routes of {scene.name}", unit="seed"):
-        if len(routes) == count:
+    routes, reason = [], ""
+    seeds = iter(range(_DRAWS * count))
+    for _ in Progress(range(count), f"routes of {scene.name}", unit="route"):
+        for seed in seeds:
+            try:
+                drawn = draw_ends(config, world, seed)
+                if not time_of_arrival(esdf, drawn.p_WG).is_reachable(drawn.p_WS):
+                    raise InfeasibleFlightError("no path in the mesh")
+            except InfeasibleFlightError as error:
+                reason = str(error)
+                continue
+            routes.append(Route(np.round(drawn.p_WS, 3), np.round(drawn.p_WG, 3)))
             break
-        try:
-            drawn = draw_ends(config, world, seed)
-            if not time_of_arrival(esdf, drawn.p_WG).is_reachable(drawn.p_WS):
-                raise InfeasibleFlightError("no path in the mesh")
-        except InfeasibleFlightError as error:
-            skipped, reason = skipped + 1, str(error)
-            continue
-        routes.append(Route(np.round(drawn.p_WS, 3), np.round(drawn.p_WG, 3)))
-    if skipped:
-        print(f"{scene.name}: {skipped} routes skipped, the last for: {reason}")
+    if reason:
+        print(f"{scene.name}: some routes are skipped, the last for: {reason}")
     require(len(routes) == count, f"routes in {scene}", f"{count}", len(routes), "ask for fewer")
     return routes
 
@@ -310,7 +318,6 @@ def _write_figure(path: Path, pairs: Sequence[dict[str, Any]], control: Sequence
     policies = list(dict.fromkeys(pair["policy"] for pair in pairs))
     figure = Figure(figsize=(9, 4.5), layout="constrained")
     panels = figure.subplots(1, 2 if control else 1, sharey=True, squeeze=False)[0]
-
     flights = [row | {"policy": _flown_policy(row)} for row in control]
 
     def rate(rows: Sequence[Row], policy: str, column: str) -> float:

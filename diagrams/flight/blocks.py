@@ -71,11 +71,8 @@ def AddWind(builder: DiagramBuilder, scenario: Scenario, plant: System) -> None:
     require_ports("plant", plant, inputs=["wind"], outputs=[])
     port = plant.GetInputPort("wind")
     if not builder.IsConnectedOrExported(port):
-        source = (
-            DrydenWind(wind, scenario.seed)
-            if wind.gusts
-            else ConstantVectorSource(np.array(wind.mean))
-        )
+        gusty = DrydenWind(wind, scenario.seed) if wind.gusts else None
+        source = gusty or ConstantVectorSource(np.array(wind.mean))
         builder.Connect(builder.AddNamedSystem("wind", source).get_output_port(), port)
 
 
@@ -310,14 +307,10 @@ def AddObservation(
         return {}
 
     # Camera.
-    nominal, noise, imaging = (
-        policy_camera(scenario, policy),
-        scenario.observation,
-        scenario.imaging,
-    )
-    config, exposure = imaging.camera(nominal), 0.0
-    if "color_image" in names:
-        exposure = imaging.exposure_time
+    noise, imaging = scenario.observation, scenario.imaging
+    nominal = policy_camera(scenario, policy)
+    config = imaging.camera(nominal)
+    exposure = imaging.exposure_time if "color_image" in names else 0.0
     frames = FrameTimes.draw(noise, scenario.seed)
     age = frames.age if noise.is_late else 0.0
     camera = builder.AddNamedSystem(

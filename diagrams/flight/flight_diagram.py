@@ -169,9 +169,8 @@ def AddFlight(
         controller: replaces `FlatnessController`: any system with the input `state`, that for the
             policy's output, and the output `command`.
         estimator: replaces the scenario's; makes the `state` (13) for policy and controller. Its
-            inputs are any of `state`
-            and `body_pose`, the true ones, `command`, `goal`, the policy's images and the outputs
-            of sensors.
+            inputs are any of `state` and `body_pose`, the true ones, `command`, `goal`, the
+            policy's images and the outputs of sensors.
         camera: adds the scenario's camera.
         scene_graph: gets the vehicle, see `QuadrotorGeometry`, and the world as the renderer
             `splats` if it has none of that name, see `AddSplatWorld`.
@@ -211,9 +210,8 @@ def AddFlight(
     goal = builder.AddNamedSystem("goal", source).get_output_port()
     estimate, estimator_sensors = state, {}
     if estimator is None:
-        estimator = ESTIMATORS.entry_for(scenario.estimator).build(
-            scenario.estimator, world, scenario
-        )
+        make = ESTIMATORS.entry_for(scenario.estimator).build
+        estimator = make(scenario.estimator, world, scenario)
         estimator_sensors = getattr(scenario.estimator, "sensors", {})
     if estimator is not None:
         add_system(builder, "estimator", estimator)

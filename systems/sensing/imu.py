@@ -86,10 +86,8 @@ class ImuSensor(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(1.0 / config.rate, 0.0, self._sample)
 
     def _sample(self, context: Context, discrete_state: DiscreteValues) -> None:
-        state, a_WB = (
-            vector_input(self, "state", context),
-            optional_input(self, "acceleration", context),
-        )
+        state = vector_input(self, "state", context)
+        a_WB = optional_input(self, "acceleration", context)
         if a_WB is None:
             command = vector_input(self, "command", context)
             a_WB = np.array(quadrotor_derivatives(state, command, self._params)[3:6])

@@ -96,7 +96,7 @@ def test_policies_are_checked_before_anything_is_drawn():
     for text, words in (
         ("diffaero@fast", r"the speed of diffaero@fast must be a number \[m/s\], got fast"),
         ("diffaero@50", r"the speed must be in"),
-        ("nobody", "nobody"),
+        ("unregistered", "unregistered"),
     ):
         with pytest.raises(ValueError, match=words):
             twin.policies_by_speed([text])

@@ -9,7 +9,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydrake.autodiffutils import ExtractGradient, ExtractValue, InitializeAutoDiff
 from pydrake.symbolic import Evaluate, MakeVectorVariable
-from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
 from scipy.spatial.transform import Rotation
 
 from splatpilot.systems.vehicle.quadrotor import (
@@ -21,6 +20,7 @@ from splatpilot.systems.vehicle.quadrotor import (
     torques,
 )
 from splatpilot.systems.vehicle.vehicles import Kingfisher
+from tests.systems.vehicle.responses import respond
 
 HOVER = [9.81, 0.0, 0.0, 0.0]
 LAGS = QuadrotorParams(
@@ -53,20 +53,6 @@ def derivatives_at(plant, state, command=HOVER, wind=None):
     if wind is not None:
         plant.GetInputPort("wind").FixValue(context, wind)
     return plant.EvalTimeDerivatives(context).CopyToVector()
-
-
-def respond(params, command, times, state=None):
-    """Returns all continuous states (n, ...) at times [s] after a constant command."""
-    plant = QuadrotorPlant(params, state)
-    simulator = Simulator(plant)
-    ResetIntegratorFromFlags(simulator, "runge_kutta5", 0.001)
-    simulator.get_mutable_integrator().set_fixed_step_mode(True)
-    context, states = simulator.get_mutable_context(), []
-    plant.get_input_port().FixValue(context, command)
-    for time in times:
-        simulator.AdvanceTo(time)
-        states.append(context.get_continuous_state_vector().CopyToVector())
-    return np.array(states)
 
 
 def test_effects_that_are_neutral_leave_the_equations():

@@ -5,9 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
 
-from splatpilot.systems.vehicle.quadrotor import QuadrotorParams, QuadrotorPlant, hover_state
+from splatpilot.systems.vehicle.quadrotor import QuadrotorParams, hover_state
 from splatpilot.systems.vehicle.vehicles import (
     VEHICLES,
     Crazyflie21Brushless,
@@ -15,6 +14,7 @@ from splatpilot.systems.vehicle.vehicles import (
     Px4Sih,
     Starling2Max,
 )
+from tests.systems.vehicle.responses import respond
 
 
 class Published(NamedTuple):
@@ -34,20 +34,6 @@ PUBLISHED = {
     Px4Sih: Published(1.0, 5.0, None, 0.05, None, 1.0, 0.0),
     Starling2Max: Published(0.566, 5.17, math.sqrt(1.388 / 3.965e-6), 0.055, None, None, 0.0),
 }
-
-
-def respond(params, command, times, start=None):
-    """Returns all continuous states (n, ...) at times [s] after a constant command."""
-    plant = QuadrotorPlant(params, start)
-    simulator = Simulator(plant)
-    ResetIntegratorFromFlags(simulator, "runge_kutta5", 0.005)
-    simulator.get_mutable_integrator().set_fixed_step_mode(True)
-    context, states = simulator.get_mutable_context(), []
-    plant.get_input_port().FixValue(context, command)
-    for time in times:
-        simulator.AdvanceTo(time)
-        states.append(context.get_continuous_state_vector().CopyToVector())
-    return np.array(states)
 
 
 def test_all_named_vehicles_are_held_to_published_parameters():
@@ -78,7 +64,7 @@ def test_full_thrust_and_free_fall_have_the_published_forces(vehicle, published)
     terminal = weight / drag
     if drag_2:
         terminal = (math.sqrt(drag**2 + 4 * drag_2 * weight) - drag) / (2 * drag_2)
-    fallen = respond(vehicle(), [0.0, 0.0, 0.0, 0.0], [30.0])[0]
+    fallen = respond(vehicle(), [0.0, 0.0, 0.0, 0.0], [30.0], step=0.005)[0]
     assert -fallen[5] == pytest.approx(terminal, rel=0.05)
 
 
