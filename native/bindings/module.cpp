@@ -319,6 +319,7 @@ NB_MODULE(_native, m) {
   bind_fitting(m);
   bind_shapes(m);
   bind_grids(m);
+  bind_flight(m);
 }
 
 }  // namespace splatpilot
