@@ -27,6 +27,7 @@ using VoxelStates = Array<const uint8_t, nb::ndim<3>>;
 using FieldStates = Array<uint8_t, nb::ndim<1>>;
 using Numbers = Doubles<nb::ndim<1>>;
 using Rows = Doubles<nb::ndim<2>>;
+using Packs = Doubles<nb::shape<-1, kFlightParameters, kPackVehicles>>;
 using Flags = Array<const bool, nb::ndim<1>>;
 using Counts = Array<int32_t, nb::ndim<1>>;
 
@@ -72,23 +73,36 @@ class FlightWorlds {
 
   size_t size() const { return worlds_.size(); }
 
-  SpaceSample sample(size_t world, const double* p) const {
-    return std::visit([&](const auto& box) { return box.sample(p); }, worlds_[world]);
+  SpaceSample sample(int64_t world, const double* p, double* gradient) const {
+    return std::visit([&](const auto& box) { return box.sample(p, gradient); }, at(world));
+  }
+
+  bool is_clear(int64_t world, const double* p, double distance, double moved,
+                double radius) const {
+    return std::visit([&](const auto& box) { return box.is_clear(p, distance, moved, radius); },
+                      at(world));
   }
 
   void query(const QueryPoints& p, const Indices& world, const Distances& distances,
-             const FieldStates& states) const {
-    require_rows(p.shape(0), "points, distances and states differ in number", distances, states);
-    require_worlds(world, p.shape(0), size());
+             const FieldStates& states, const std::optional<Gradients>& gradients) const {
+    const size_t count = p.shape(0);
+    require_rows(count, "points, distances and states differ in number", distances, states);
+    require(!gradients || gradients->shape(0) == count, "points and gradients differ in number");
+    require_worlds(world, count, size());
     const nb::gil_scoped_release release;
-    for (size_t i = 0; i < p.shape(0); ++i) {
-      const SpaceSample at = sample(static_cast<size_t>(world.data()[i]), p.data() + 3 * i);
+    for (size_t i = 0; i < count; ++i) {
+      double* gradient = gradients ? gradients->data() + 3 * i : nullptr;
+      const SpaceSample at = sample(world.data()[i], p.data() + 3 * i, gradient);
       distances.data()[i] = at.distance;
       states.data()[i] = at.state;
     }
   }
 
  private:
+  const std::variant<ShapeBox, GridBox>& at(int64_t world) const {
+    return worlds_[static_cast<size_t>(world)];
+  }
+
   std::vector<std::variant<ShapeBox, GridBox>> worlds_;
   std::vector<std::pair<Grid, VoxelStates>> grids_;  // kept alive
 };
@@ -100,7 +114,7 @@ enum End : uint8_t { kInFlight, kCollision, kLeftVolume, kGoal, kTimeout };
 struct Vehicles {
   Array<double, nb::shape<-1, kStateSize>> states;
   Array<double, nb::ndim<1>> thrusts;
-  Rows parameters;  // (kFlightParameters, N)
+  Packs parameters;  // by packs of vehicles
   Indices world;
   QueryPoints goals;
   Numbers radii, goal_radii;
@@ -156,9 +170,10 @@ class FlightThreads {
         kernels_.advance(pack, action, actuated, step, steps);
         for (uint32_t bits = live; bits; bits &= bits - 1u) {
           const int lane = __builtin_ctz(bits);
-          const bool ended = finish_period(worlds, vehicles, vehicle(lane), pack, lane);
+          const bool last = period + 1 == periods;
+          const bool ended = finish_period(worlds, vehicles, vehicle(lane), pack, lane, last);
           if (ended) live &= ~(1u << lane);
-          if (ended || period + 1 == periods) store(vehicles, vehicle(lane), pack, lane);
+          if (ended || last) store(vehicles, vehicle(lane), pack, lane);
         }
       }
     });
@@ -175,16 +190,15 @@ class FlightThreads {
 
   // Lanes without a vehicle repeat the first.
   static void load(const Vehicles& vehicles, size_t first, int lanes, VehiclePack& pack) {
-    const size_t count = vehicles.count();
+    constexpr size_t kSize = kFlightParameters * kPackVehicles;
+    std::copy_n(vehicles.parameters.data() + first / kPackVehicles * kSize, kSize,
+                pack.parameters[0]);
     for (int lane = 0; lane < kPackVehicles; ++lane) {
       const size_t n = first + static_cast<size_t>(lane < lanes ? lane : 0);
       for (size_t i = 0; i < kStateSize; ++i) {
         pack.state[i][lane] = vehicles.states.data()[n * kStateSize + i];
       }
       pack.state[kLaggedThrust][lane] = vehicles.thrusts.data()[n];
-      for (size_t i = 0; i < kFlightParameters; ++i) {
-        pack.parameters[i][lane] = vehicles.parameters.data()[i * count + n];
-      }
     }
   }
 
@@ -195,32 +209,46 @@ class FlightThreads {
     vehicles.thrusts.data()[n] = pack.state[kLaggedThrust][lane];
   }
 
-  // Writes distance, state of space, remaining periods and end of a vehicle; returns if it ended.
+  // Writes the end of a vehicle, its remaining periods and, at its end and at the `last` period,
+  // distance and state of space. Returns if it ended.
   static bool finish_period(const FlightWorlds& worlds, const Vehicles& vehicles, size_t n,
-                            const VehiclePack& pack, int lane) {
-    double p[3], square = 0.0;
-    for (int k = 0; k < 3; ++k) {
+                            const VehiclePack& pack, int lane, bool last) {
+    double p[3], to_goal = 0.0, moved = 0.0;
+    for (size_t k = 0; k < 3; ++k) {
       p[k] = pack.state[k][lane];
-      const double away = vehicles.goals.data()[3 * n + static_cast<size_t>(k)] - p[k];
-      square += away * away;
+      to_goal += square(vehicles.goals.data()[3 * n + k] - p[k]);
+      // The state and the distance of the beginning are still there.
+      moved += square(vehicles.states.data()[n * kStateSize + k] - p[k]);
     }
-    const SpaceSample at = worlds.sample(static_cast<size_t>(vehicles.world.data()[n]), p);
-    vehicles.distances.data()[n] = at.distance;
-    vehicles.field_states.data()[n] = at.state;
-    const int32_t remaining = --vehicles.remaining.data()[n];
+    const bool at_goal = std::sqrt(to_goal) - vehicles.goal_radii.data()[n] <= 0.0;
+    const bool is_late = --vehicles.remaining.data()[n] <= 0;
+    const int64_t world = vehicles.world.data()[n];
+    const double radius = vehicles.radii.data()[n];
+    double& distance = vehicles.distances.data()[n];
+    if (!last && !at_goal && !is_late &&
+        worlds.is_clear(world, p, distance, std::sqrt(moved), radius)) {
+      return false;
+    }
+    const SpaceSample at = worlds.sample(world, p, nullptr);
     End end = kInFlight;
-    if (at.distance - vehicles.radii.data()[n] <= 0.0) {
+    if (at.distance - radius <= 0.0) {
       end = kCollision;
     } else if (at.state >= kUnknown) {
       end = kLeftVolume;
-    } else if (std::sqrt(square) - vehicles.goal_radii.data()[n] <= 0.0) {
+    } else if (at_goal) {
       end = kGoal;
-    } else if (remaining <= 0) {
+    } else if (is_late) {
       end = kTimeout;
+    }
+    if (last || end != kInFlight) {
+      distance = at.distance;
+      vehicles.field_states.data()[n] = at.state;
     }
     vehicles.ends.data()[n] = end;
     return end != kInFlight;
   }
+
+  static double square(double x) { return x * x; }
 
   const FlightKernels& kernels_;
   ThreadPool pool_;
@@ -252,20 +280,23 @@ void bind_flight(nb::module_& m) {
            "lower_W"_a, "upper_W"_a, "voxel_size"_a, "occupied_outside"_a,
            "Adds a world of a grid, see `grid_distances`; returns its number.")
       .def("query", &FlightWorlds::query, nb::kw_only(), "p_WQ"_a, "world"_a, "distances"_a,
-           "states"_a, "Writes the distances (N,) and the states of space (N,) at N points.");
-  nb::class_<Vehicles>(m, "Vehicles", "Arrays of N vehicles, which `FlightThreads` updates.")
+           "states"_a, "gradients"_a = nb::none(),
+           "Writes the distances (N,), their gradients (N, 3) and the states of space (N,).");
+  nb::class_<Vehicles>(m, "Vehicles",
+                       "Arrays of N vehicles, which `FlightThreads` updates. Parameters are in "
+                       "packs\n(ceil(N / 16), len(FLIGHT_PARAMETERS), 16).")
       .def(
           "__init__",
           [](Vehicles* self, const Array<double, nb::shape<-1, kStateSize>>& states,
-             const Array<double, nb::ndim<1>>& thrusts, const Rows& parameters,
+             const Array<double, nb::ndim<1>>& thrusts, const Packs& parameters,
              const Indices& world, const QueryPoints& goals, const Numbers& radii,
              const Numbers& goal_radii, const Counts& remaining, const Distances& distances,
              const FieldStates& field_states, const FieldStates& ends) {
             const size_t n = states.shape(0);
             require_rows(n, "arrays of vehicles differ in length", thrusts, world, goals, radii,
                          goal_radii, remaining, distances, field_states, ends);
-            require(parameters.shape(0) == kFlightParameters && parameters.shape(1) == n,
-                    "parameters must have a row for each of FLIGHT_PARAMETERS");
+            require_rows((n + kPackVehicles - 1) / kPackVehicles,
+                         "parameters must have packs for all vehicles", parameters);
             new (self) Vehicles{states,     thrusts,   parameters, world,        goals, radii,
                                 goal_radii, remaining, distances,  field_states, ends};
           },

@@ -61,20 +61,31 @@ class ShapeBox {
     }
   }
 
-  SpaceSample sample(const double* p) const {
+  // Writes the gradient of the distance unless it is null.
+  SpaceSample sample(const double* p, double* gradient) const {
+    if (gradient) std::fill_n(gradient, 3, 0.0);
+    if (!contains(p)) return {std::numeric_limits<double>::quiet_NaN(), kOutside};
     size_t at[3];
     for (int k = 0; k < 3; ++k) {
-      if (!(p[k] >= lower_[k] && p[k] <= upper_[k])) {
-        return {std::numeric_limits<double>::quiet_NaN(), kOutside};
-      }
       at[k] = std::min(shape_[k] - 1, static_cast<size_t>((p[k] - lower_[k]) * per_meter_[k]));
     }
     const size_t number = cell(at[0], at[1], at[2]);
-    double nearest = std::numeric_limits<double>::infinity();
+    double min_distance = std::numeric_limits<double>::infinity();
+    const uint32_t* nearest = nullptr;
     for (uint32_t i = first_[number]; i < first_[number + 1]; ++i) {
-      nearest = std::min(nearest, distance(candidates_[i], p));
+      const double d = distance(candidates_[i], p, nullptr);
+      if (d < min_distance) {
+        min_distance = d;
+        nearest = &candidates_[i];
+      }
     }
-    return {nearest, nearest < 0.0 ? kOccupied : kFree};
+    if (gradient && nearest) distance(*nearest, p, gradient);
+    return {min_distance, min_distance < 0.0 ? kOccupied : kFree};
+  }
+
+  // Checks that no shape is within `radius` of p, which has `moved` from a point at a distance.
+  bool is_clear(const double* p, double distance, double moved, double radius) const {
+    return distance - moved > std::max(radius, 0.0) + 1e-9 && contains(p);
   }
 
  private:
@@ -83,10 +94,15 @@ class ShapeBox {
 
   size_t cell(size_t x, size_t y, size_t z) const { return (x * shape_[1] + y) * shape_[2] + z; }
 
-  double distance(uint32_t shape, const double* p) const {
-    const double* none = nullptr;
-    return SIMD_LEVEL::shape_distance(kinds_[shape], rows_.data() + shape * kShapeSize, p,
-                                      const_cast<double*>(none));
+  bool contains(const double* p) const {
+    bool inside = true;
+    for (int k = 0; k < 3; ++k) inside = inside && p[k] >= lower_[k] && p[k] <= upper_[k];
+    return inside;
+  }
+
+  double distance(uint32_t shape, const double* p, double* gradient) const {
+    const double* row = rows_.data() + shape * kShapeSize;
+    return SIMD_LEVEL::shape_distance(kinds_[shape], row, p, gradient);
   }
 
   // Finds those among `shapes` that can be the nearest in the cells from (x, y, z) on: distances
@@ -103,7 +119,7 @@ class ShapeBox {
     std::vector<double> distances(shapes.size());
     double limit = std::numeric_limits<double>::infinity();
     for (size_t i = 0; i < shapes.size(); ++i) {
-      distances[i] = distance(shapes[i], center);
+      distances[i] = distance(shapes[i], center, nullptr);
       limit = std::min(limit, distances[i]);
     }
     limit += std::sqrt(square) + 1e-6;
@@ -125,7 +141,7 @@ struct GridBox {
   GridField field;
   const uint8_t* states;
 
-  SpaceSample sample(const double* p) const {
+  SpaceSample sample(const double* p, double* gradient) const {
     bool inside = true;
     int64_t at = 0;
     for (int k = 0; k < 3; ++k) {
@@ -136,8 +152,11 @@ struct GridBox {
       const int64_t voxel = position > 0.0 ? static_cast<int64_t>(std::min(position, 1e9)) : 0;
       at = at * field.grid.shape[k] + std::min(voxel, last);
     }
-    return {field.distance(p, nullptr), inside ? states[at] : uint8_t{kOutside}};
+    return {field.distance(p, gradient), inside ? states[at] : uint8_t{kOutside}};
   }
+
+  // Interpolants are steeper than distances.
+  bool is_clear(const double*, double, double, double) const { return false; }
 };
 
 }  // namespace splatpilot
