@@ -285,8 +285,8 @@ class VectorFlightEnv(VectorEnv):
         require(valid, "shape of the rewards", f"({self.num_envs},)", rewards.shape)
         if resting.any():
             rewards = np.where(flying, rewards, 0.0)
-            given = np.where(flying[:, None], given, 0.0)
-        self._previous, self._decisions, self._ended = given, decided, ended
+        self._previous[flying] = given[flying]
+        self._decisions, self._ended = decided, ended
         self._count += flying
         infos: dict[str, Any] = {}
         if ended.any():
