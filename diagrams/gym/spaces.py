@@ -237,7 +237,7 @@ class FlightEnvConfig(Config):
     camera: OnboardCamera = field(default_factory=lambda: OnboardCamera(max_depth=12.0))
     # From transitions of N vehicles to their rewards (N,).
     reward: Callable[[Transition], NDArray[np.float64]] = field(default_factory=Reward)
-    # Number of worlds, of the seeds from that of the scenario on, of which a reset draws one.
+    # Number of worlds among which resets draw, of the seeds from that of the scenario on.
     num_worlds: int = bounded(1, "[1, 1000000]")
 
     __hash__: ClassVar[None] = None  # pyright: ignore

@@ -116,7 +116,7 @@ def test_flights_end_by_name(post_world):
         env.step(AHEAD)
     *_, info = flown(env, 0, goal=[2.5, 0.0, 2.0])
     assert info == {"outcome": "goal", "is_success": True}
-    *_, info = flown(env, 0, start=[6.0, 0.0, 2.0])
+    *_, info = flown(env, 0, start=[1.0, 2.0, 2.0], goal=[9.0, 2.0, 2.0])
     assert info == {"outcome": "timeout", "is_success": False}
 
 
