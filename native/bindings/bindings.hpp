@@ -31,6 +31,7 @@ using Values = Floats<nb::ndim<1>>;
 using ValuesOut = Writable<nb::ndim<1>>;
 using Pixels = Floats<nb::ndim<3>>;
 using Output = Writable<nb::ndim<3>>;
+using Views = Writable<nb::ndim<4>>;
 using Background = Floats<nb::shape<3>>;
 using Rows3 = Floats<nb::shape<-1, 3>>;
 using Rows4 = Floats<nb::shape<-1, 4>>;
@@ -160,5 +161,6 @@ void bind_surfels(nb::module_& m);
 void bind_fitting(nb::module_& m);
 void bind_shapes(nb::module_& m);
 void bind_grids(nb::module_& m);
+void bind_flight(nb::module_& m);
 
 }  // namespace splatpilot

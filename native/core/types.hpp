@@ -209,6 +209,7 @@ using BinKernel = size_t (*)(const Splat*, const uint32_t* order, size_t begin, 
 struct SurfelKernels;
 struct LossKernels;
 struct CastingKernels;
+struct FlightKernels;
 
 // The kernels of one SIMD level.
 struct Kernels {
@@ -216,6 +217,7 @@ struct Kernels {
   const SurfelKernels* surfels;
   const LossKernels* losses;
   const CastingKernels* casting;
+  const FlightKernels* flight;
   // Projects Gaussians [begin, end). Writes visible ones, their planes unless null, and the bits of
   // their depths in input order; returns their number.
   size_t (*project)(const GaussianArrays&, const Camera&, size_t begin, size_t end, Splat*,
