@@ -209,6 +209,7 @@ def AddFlightMonitor(
     collision: System | None = None,
     hypotheses: OutputPort | None = None,
     plan_period: float = LOG_PERIOD,
+    logs: bool = True,
 ) -> FlightMonitor:
     """Adds the system `monitor`, and the logs of state, command and clearance that `fly` reads.
 
@@ -217,6 +218,7 @@ def AddFlightMonitor(
         goal: (3) p_WG [m]; by default a source `goal` of the scenario's.
         collision: an `EsdfCollision`; by default one named `collision` of the world's field.
         hypotheses: plans to log, every `plan_period` [s].
+        logs: adds the logs.
     """
     scenario = sample_scenario(scenario)
     if collision is None:
@@ -238,8 +240,9 @@ def AddFlightMonitor(
         ("field_state", collision.GetOutputPort("field_state")),
     ):
         connect(builder, port, monitor.GetInputPort(name))
-    AddLogs(builder, {"state": state, "command": command, "clearance": clearance})
-    if hypotheses is not None:
+    if logs:
+        AddLogs(builder, {"state": state, "command": command, "clearance": clearance})
+    if logs and hypotheses is not None:
         AddLogs(builder, {"hypotheses": hypotheses}, plan_period)
     return monitor
 

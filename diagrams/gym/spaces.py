@@ -4,7 +4,7 @@ The heading frame H has its origin in the vehicle, z up and x above the body's x
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
@@ -17,7 +17,7 @@ from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.gym.rewards import Reward, Transition
 from splatpilot.diagrams.scenarios import scenario_file
 from splatpilot.systems.common.config import load_config
-from splatpilot.systems.common.validation import Config, bounded, require, require_field
+from splatpilot.systems.common.validation import MAX_SEED, Config, bounded, require, require_field
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.vehicle.quadrotor import GRAVITY
 from splatpilot.systems.vehicle.state import QuadrotorState
@@ -237,7 +237,7 @@ class FlightEnvConfig(Config):
     camera: OnboardCamera = field(default_factory=lambda: OnboardCamera(max_depth=12.0))
     # From transitions of N vehicles to their rewards (N,).
     reward: Callable[[Transition], NDArray[np.float64]] = field(default_factory=Reward)
-    # Number of worlds, of the seeds from that of the scenario on, of which a reset draws one.
+    # Number of worlds among which resets draw, of the seeds from that of the scenario on.
     num_worlds: int = bounded(1, "[1, 1000000]")
 
     __hash__: ClassVar[None] = None  # pyright: ignore
@@ -266,6 +266,14 @@ class FlightEnvConfig(Config):
     def limits(self) -> NDArray[np.float64]:
         """Returns the scale (n,) of actions."""
         return np.array(self.action_limits or _LIMITS[self.action])
+
+
+def draw_flight(config: FlightEnvConfig, generator: np.random.Generator) -> tuple[int, Scenario]:
+    """Draws the seed of the next flight's world, and its scenario, whose seed is that of start and
+    noise."""
+    world_seed = config.scenario.seed + int(generator.integers(config.num_worlds))
+    flight_seed = int(generator.integers(MAX_SEED))
+    return world_seed, replace(config.scenario, seed=flight_seed)
 
 
 def find_scenario(scenario: Scenario | str | Path) -> Scenario:
