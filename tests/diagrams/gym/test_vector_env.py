@@ -7,7 +7,7 @@ from pydrake.systems.framework import DiagramBuilder
 
 from splatpilot.diagrams.flight.flight_diagram import AddFlight, ExportFlight
 from splatpilot.diagrams.flight.scenario import Scenario
-from splatpilot.diagrams.gym.spaces import decisions, env_config
+from splatpilot.diagrams.gym.spaces import decisions
 from splatpilot.diagrams.gym.vector_env import VectorFlightEnv
 from splatpilot.systems.vehicle.quadrotor import QuadrotorParams
 from splatpilot.systems.vehicle.wind import Wind
