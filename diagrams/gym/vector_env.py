@@ -4,7 +4,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar, cast
+from typing import Any, cast
 
 import numpy as np
 from gymnasium.error import ResetNeeded
@@ -37,7 +37,7 @@ from splatpilot.systems.splats.baked_scene import BatchRenderer
 from splatpilot.systems.splats.splat_camera import color_pixels, ranged_depth
 from splatpilot.systems.vehicle.state import pose_from_state
 
-_OUTCOMES = np.array(["", *ENDS, Outcome.TIMEOUT], dtype=object)  # by the native ends
+_OUTCOMES = np.array([None, *ENDS, Outcome.TIMEOUT], dtype=object)  # by the native ends
 _OPTIONS = "reset_mask", "flight", "start", "goal"
 _GOAL, _TIMEOUT = list(_OUTCOMES).index(Outcome.GOAL), len(_OUTCOMES) - 1
 
@@ -70,8 +70,6 @@ class VectorFlightEnv(VectorEnv):
         InfeasibleFlightError, ValueError: see `WorldPool`; ValueError also for invalid arguments.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 10}
-
     def __init__(
         self,
         num_envs: int = 1,
@@ -93,8 +91,9 @@ class VectorFlightEnv(VectorEnv):
         configs = [env_config(each, **fields) for each in scenarios]
         self.num_envs, self.render_mode, self.config = num_envs, render_mode, configs[0]
         self._mode = AutoresetMode(autoreset_mode)
-        self.metadata = self.metadata | {
+        self.metadata = {
             "autoreset_mode": self._mode,
+            "render_modes": ["rgb_array"],
             "render_fps": self.config.rate,
         }
         self.single_observation_space = observation_space(self.config)
@@ -215,9 +214,9 @@ class VectorFlightEnv(VectorEnv):
             seeds = list(seed)
             condition = f"a number, or {self.num_envs} numbers"
             require(len(seeds) == self.num_envs, "seed", condition, f"{len(seeds)} numbers")
-        for i in np.flatnonzero(mask):
-            if seeds[i] is not None:
-                self._seeds[i], self._episodes[i] = seeds[i], 0
+        for i, each in enumerate(seeds):
+            if mask[i] and each is not None:
+                self._seeds[i], self._episodes[i] = each, 0
         self._is_seeded = True
 
     def _begin(self, rows: NDArray[np.intp], flights: NDArray[np.intp] | None = None) -> None:
@@ -298,7 +297,7 @@ class VectorFlightEnv(VectorEnv):
         self._count += flying
         infos: dict[str, Any] = {}
         if ended.any():
-            infos = {"outcome": np.where(ended, _OUTCOMES[ends], None), "is_success": reached}
+            infos = {"outcome": _OUTCOMES[ends], "is_success": reached}
             infos |= {f"_{name}": ended.copy() for name in infos}
             if self._mode is AutoresetMode.SAME_STEP:
                 return self._reset_same_step(rewards, terminated, truncated, infos)

@@ -1,4 +1,4 @@
-"""Prepared worlds and flights, of which the vehicles of `VectorFlightEnv` draw theirs."""
+"""Prepared worlds and flights, from which the vehicles of `VectorFlightEnv` draw."""
 
 import math
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ from splatpilot.systems.collision.distance_field import DistanceField
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.shapes import AnalyticDistanceField, shape_rows
 from splatpilot.systems.common.progress import Progress
-from splatpilot.systems.common.validation import MAX_SEED, require
+from splatpilot.systems.common.validation import MAX_SEED, require, require_type
 from splatpilot.systems.policies.velocity import MAX_ACCELERATION, RESPONSE_TIME
 from splatpilot.systems.sensing.estimators import TrueState
 from splatpilot.systems.sensing.imaging import Imaging
@@ -150,9 +150,8 @@ def add_field(worlds: _native.FlightWorlds, field: DistanceField, name: str) -> 
             voxel_size=field.voxel_size,
             occupied_outside=field.occupied_outside,
         )
-    known = isinstance(field, AnalyticDistanceField)
-    condition = "an AnalyticDistanceField or an Esdf"
-    require(known, f"distance_field of {name}", condition, type(field).__name__)
+    require_type(field, AnalyticDistanceField, f"distance_field of {name}", "or an Esdf")
+    assert isinstance(field, AnalyticDistanceField)  # for type checkers
     rows, kinds = shape_rows(field.shapes)
     return worlds.add_shapes(shapes=rows, kinds=kinds, lower_W=field.lower_W, upper_W=field.upper_W)
 
