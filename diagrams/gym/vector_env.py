@@ -29,7 +29,7 @@ from splatpilot.diagrams.gym.spaces import (
     observe_image,
     require_actions,
 )
-from splatpilot.diagrams.gym.world_pool import PACK, WorldPool
+from splatpilot.diagrams.gym.world_pool import PACK, WorldPool, require_supported
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.common.validation import MAX_SEED, require
 from splatpilot.systems.sensing.latency import CYCLE
@@ -64,6 +64,7 @@ class VectorFlightEnv(VectorEnv):
         render_mode: "rgb_array" renders the scenario's camera.
         threads: of native code; by default one per processor.
         world: of all flights, as for `FlightEnv`.
+        pool: that of another environment with the same scenarios.
         fields: of `FlightEnvConfig`.
 
     Raises:
@@ -79,6 +80,7 @@ class VectorFlightEnv(VectorEnv):
         render_mode: str | None = None,
         threads: int | None = None,
         world: World | None = None,
+        pool: WorldPool | None = None,
         **fields: Any,
     ) -> None:
         require(num_envs >= 1, "num_envs", "at least 1", num_envs)
@@ -117,7 +119,11 @@ class VectorFlightEnv(VectorEnv):
         simd = os.environ.get("SPLATPILOT_SIMD", "")
         self._threads = _native.FlightThreads(threads, simd)
         self._renderer = BatchRenderer(threads, simd)
-        self.pool = WorldPool(configs, world)
+        for config in configs:
+            require_supported(config)
+        self.pool = pool or WorldPool(configs, world)
+        same = self.pool.matches(configs)
+        require(same, "pool", "that of the same scenarios and num_worlds", "another")
         self._allocate()
 
     def _allocate(self) -> None:

@@ -55,8 +55,7 @@ class WorldPool:
         self.scenarios: list[Scenario] = []  # (F,), of the flights
         self._made: World | None = None  # the last one
         self._fields: dict[int, int] = {}  # native numbers by the identity of distance fields
-        for config in configs:
-            _require_supported(config)
+        self._configs = list(configs)
         worlds, world_seeds, states = [], [], []
         turns = [(config, k) for config in configs for k in range(config.num_worlds)]
         for config, k in Progress(turns, "making worlds", unit="world", delay=1.0):
@@ -72,7 +71,7 @@ class WorldPool:
                         randomize_appearance(made, scenario.appearance, scenario.seed)
                     )
                     if any(name in IMAGES for name in config.observation_names()):
-                        assert self.worlds[-1].baked  # on first use
+                        _ = self.worlds[-1].baked  # Now, rather than at the first image.
                 worlds.append(len(self.worlds) - 1)
                 world_seeds.append(seed)
                 states.append(sample_initial_state(scenario, made))
@@ -111,6 +110,13 @@ class WorldPool:
 
     def __len__(self) -> int:
         return len(self.scenarios)
+
+    def matches(self, configs: Sequence[FlightEnvConfig]) -> bool:
+        """Checks if the pool has the flights of these configurations."""
+        given, made = (
+            [(c.scenario, c.num_worlds) for c in each] for each in (configs, self._configs)
+        )
+        return given == made
 
     def _add(self, world: World) -> World:
         """Adds the distance field of a world to the native ones; returns the world, with the arrays
@@ -156,7 +162,7 @@ def add_field(worlds: _native.FlightWorlds, field: DistanceField, name: str) -> 
     return worlds.add_shapes(shapes=rows, kinds=kinds, lower_W=field.lower_W, upper_W=field.upper_W)
 
 
-def _require_supported(config: FlightEnvConfig) -> None:
+def require_supported(config: FlightEnvConfig) -> None:
     """Raises ValueError for what `VectorFlightEnv` cannot fly, by the name of the field."""
     scenario = sample_scenario(config.scenario)
     vehicle, simulator = scenario.vehicle, scenario.simulator

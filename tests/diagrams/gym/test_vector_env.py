@@ -16,13 +16,11 @@ from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.gym.flight_env import FlightEnv
 from splatpilot.diagrams.gym.spaces import decisions
 from splatpilot.diagrams.gym.vector_env import VectorFlightEnv
-from splatpilot.diagrams.gym.world_pool import add_field
 from splatpilot.diagrams.worlds.moving_spheres import MovingSphere
-from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.sensing.imaging import Imaging
 from splatpilot.systems.sensing.noise import ObservationNoise
-from splatpilot.systems.vehicle.quadrotor import QuadrotorParams, component_derivatives
+from splatpilot.systems.vehicle.quadrotor import QuadrotorParams
 from splatpilot.systems.vehicle.wind import Wind
 
 LAGGING = Scenario(
@@ -130,40 +128,6 @@ def test_color_of_random_appearance_is_that_of_add_flight():
     parts = AddFlight(DiagramBuilder(), scenario, world, policy="velocity", camera=False)
     np.testing.assert_array_equal(parts.world.gaussians.sh, pool.worlds[1].gaussians.sh)
     assert [frame.shape for frame in envs.render() or ()] == [(240, 320, 3)] * 2
-
-
-@pytest.mark.parametrize("kind", ["shapes", "grid", "occupied outside"])
-def test_distances_are_those_of_the_field(kind, post_world):
-    field = post_world.distance_field
-    if kind != "shapes":
-        grid = post_world.esdf
-        states = np.random.default_rng(0).integers(3, size=grid.shape).astype(np.uint8)
-        outside = kind == "occupied outside"
-        field = Esdf(grid.distances, states, grid.lower_W, grid.voxel_size, outside)
-    worlds = _native.FlightWorlds()
-    number = add_field(worlds, field, "post")
-    low, high = field.lower_W - 1, field.upper_W + 1
-    points = np.random.default_rng(1).uniform(low, high, (2000, 3))
-    points[:3] = field.lower_W, field.upper_W, [np.nan] * 3
-    distances, states = np.empty(2000), np.empty(2000, np.uint8)
-    gradients, world = np.empty((2000, 3)), np.full(2000, number)
-    given = {"p_WQ": points, "world": world, "distances": distances, "states": states}
-    worlds.query(**given, gradients=gradients)
-    with np.errstate(invalid="ignore"):
-        truth = field.query(points)
-    np.testing.assert_array_equal(distances, truth.distance)
-    np.testing.assert_array_equal(gradients, truth.gradient)
-    np.testing.assert_array_equal(states, truth.state)
-
-
-def test_native_derivatives_are_those_of_the_formula():
-    random = np.random.default_rng(0)
-    state, command = random.normal(size=13), random.normal(size=4)
-    wind, disturbance, rates = random.normal(size=3), random.normal(size=3), np.empty(13)
-    for extra in ((None, None), (wind, None), (wind, disturbance)):
-        truth = component_derivatives(state, command, 0.4, 0.05, 9.81, *extra)
-        _native.quadrotor_derivatives(state, command, 0.4, 0.05, 9.81, rates, *extra)
-        np.testing.assert_allclose(rates, np.array(truth), rtol=1e-12, atol=1e-12)
 
 
 def flown(envs: VectorFlightEnv, seed: int, steps: int = 30) -> list[Any]:
