@@ -2,8 +2,9 @@
 
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar, cast
+from typing import Any, cast
 
 import numpy as np
 from gymnasium.error import ResetNeeded
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from splatpilot import _native
 from splatpilot.diagrams.flight.flight_diagram import camera_info, camera_mount
 from splatpilot.diagrams.flight.monitor import ENDS, Outcome
-from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.flight.scenario import Scenario, goal_position, sample_initial_state
 from splatpilot.diagrams.gym.rewards import Transition
 from splatpilot.diagrams.gym.spaces import (
     IMAGES,
@@ -28,14 +29,16 @@ from splatpilot.diagrams.gym.spaces import (
     observe_image,
     require_actions,
 )
-from splatpilot.diagrams.gym.world_pool import PACK, WorldPool
+from splatpilot.diagrams.gym.world_pool import PACK, WorldPool, require_supported
+from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.common.validation import MAX_SEED, require
 from splatpilot.systems.sensing.latency import CYCLE
 from splatpilot.systems.splats.baked_scene import BatchRenderer
 from splatpilot.systems.splats.splat_camera import color_pixels, ranged_depth
 from splatpilot.systems.vehicle.state import pose_from_state
 
-_OUTCOMES = np.array(["", *ENDS, Outcome.TIMEOUT], dtype=object)  # by the native ends
+_OUTCOMES = np.array([None, *ENDS, Outcome.TIMEOUT], dtype=object)  # by the native ends
+_OPTIONS = "reset_mask", "flight", "start", "goal"
 _GOAL, _TIMEOUT = list(_OUTCOMES).index(Outcome.GOAL), len(_OUTCOMES) - 1
 
 
@@ -60,13 +63,13 @@ class VectorFlightEnv(VectorEnv):
         autoreset_mode: of `gymnasium.vector.AutoresetMode`.
         render_mode: "rgb_array" renders the scenario's camera.
         threads: of native code; by default one per processor.
+        world: of all flights, as for `FlightEnv`.
+        pool: that of another environment with the same scenarios.
         fields: of `FlightEnvConfig`.
 
     Raises:
         InfeasibleFlightError, ValueError: see `WorldPool`; ValueError also for invalid arguments.
     """
-
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 10}
 
     def __init__(
         self,
@@ -76,6 +79,8 @@ class VectorFlightEnv(VectorEnv):
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         render_mode: str | None = None,
         threads: int | None = None,
+        world: World | None = None,
+        pool: WorldPool | None = None,
         **fields: Any,
     ) -> None:
         require(num_envs >= 1, "num_envs", "at least 1", num_envs)
@@ -83,11 +88,14 @@ class VectorFlightEnv(VectorEnv):
         require(render_mode in (None, "rgb_array"), "render_mode", known, repr(render_mode))
         scenarios = [scenario] if isinstance(scenario, Scenario | str | Path) else list(scenario)
         require(scenarios, "scenario", "one or several scenarios", scenarios)
+        valid = world is None or fields.get("num_worlds", 1) == 1
+        require(valid, "num_worlds", "1 with a world", fields.get("num_worlds"))
         configs = [env_config(each, **fields) for each in scenarios]
         self.num_envs, self.render_mode, self.config = num_envs, render_mode, configs[0]
         self._mode = AutoresetMode(autoreset_mode)
-        self.metadata = self.metadata | {
+        self.metadata = {
             "autoreset_mode": self._mode,
+            "render_modes": ["rgb_array"],
             "render_fps": self.config.rate,
         }
         self.single_observation_space = observation_space(self.config)
@@ -111,7 +119,11 @@ class VectorFlightEnv(VectorEnv):
         simd = os.environ.get("SPLATPILOT_SIMD", "")
         self._threads = _native.FlightThreads(threads, simd)
         self._renderer = BatchRenderer(threads, simd)
-        self.pool = WorldPool(configs)
+        for config in configs:
+            require_supported(config)
+        self.pool = pool or WorldPool(configs, world)
+        same = self.pool.matches(configs)
+        require(same, "pool", "that of the same scenarios and num_worlds", "another")
         self._allocate()
 
     def _allocate(self) -> None:
@@ -155,16 +167,16 @@ class VectorFlightEnv(VectorEnv):
 
         Args:
             seed: of the first environment, those of others follow; or one for each.
-            options: `reset_mask` (N,) of the environments to reset, all by default; `flight`,
-                the numbers of flights of the pool for them.
+            options: `reset_mask` (N,) of the environments to reset, all by default; for them
+                `flight`, a number of the pool's flights or one for each, and `start` and `goal` (3)
+                [m].
 
         Returns:
             Observations, and infos with the seeds `world_seed` and `flight_seed` of flights.
         """
         options = options or {}
         for name in options:
-            known = "reset_mask, flight"
-            require(name in ("reset_mask", "flight"), "options", f"of {known}", repr(name))
+            require(name in _OPTIONS, "options", f"of {', '.join(_OPTIONS)}", repr(name))
         mask = np.ones(self.num_envs, bool)
         if "reset_mask" in options:
             mask = np.asarray(options["reset_mask"])
@@ -179,20 +191,23 @@ class VectorFlightEnv(VectorEnv):
             valid = ((flights >= 0) & (flights < len(self.pool))).all()
             require(valid, "flight", f"in [0, {len(self.pool)})", flights.tolist())
         self._begin(rows, flights)
-        if not mask.all():  # Images of the others stay, and may be rendered again.
-            infos = {name: np.where(mask, v, 0) for name, v in self._reset_infos().items()}
-        else:
-            infos = self._reset_infos()
-        for name in list(infos):
-            infos[f"_{name}"] = mask.copy()
-        return self._observe(), infos
+        points = {name: list(options[name]) for name in ("start", "goal") if name in options}
+        if points:
+            self._move(rows, points)
+        seeds = {"world_seed": self.pool.world_seeds, "flight_seed": self.pool.seeds}
+        infos = {name: np.where(mask, each[self._flight], 0) for name, each in seeds.items()}
+        return self._observe(), infos | {f"_{name}": mask.copy() for name in infos}
 
-    def _reset_infos(self) -> dict[str, Any]:
-        pool = self.pool
-        return {
-            "world_seed": pool.world_seeds[self._flight],
-            "flight_seed": pool.seeds[self._flight],
-        }
+    def _move(self, rows: NDArray[np.intp], points: dict[str, list[float]]) -> None:
+        """Moves start or goal of flights that have not begun."""
+        for row in rows:
+            flight = self._flight[row]
+            world = self.pool.worlds[self.pool.world[flight]]
+            scenario = replace(self.pool.scenarios[flight], **points)
+            scenario.validate()
+            self._states[row] = sample_initial_state(scenario, world)
+            self._p_WG[row] = goal_position(scenario, world)
+            self._distances[row] = world.distance_field.distance(self._states[row, :3])
 
     def _seed(self, seed: int | Sequence[int | None] | None, mask: NDArray[np.bool_]) -> None:
         if seed is None and self._is_seeded:
@@ -205,9 +220,9 @@ class VectorFlightEnv(VectorEnv):
             seeds = list(seed)
             condition = f"a number, or {self.num_envs} numbers"
             require(len(seeds) == self.num_envs, "seed", condition, f"{len(seeds)} numbers")
-        for i in np.flatnonzero(mask):
-            if seeds[i] is not None:
-                self._seeds[i], self._episodes[i] = seeds[i], 0
+        for i, each in enumerate(seeds):
+            if mask[i] and each is not None:
+                self._seeds[i], self._episodes[i] = each, 0
         self._is_seeded = True
 
     def _begin(self, rows: NDArray[np.intp], flights: NDArray[np.intp] | None = None) -> None:
@@ -220,16 +235,14 @@ class VectorFlightEnv(VectorEnv):
         self._flight[rows] = flights
         self._states[rows], self._p_WG[rows] = pool.states[flights], pool.p_WG[flights]
         self._parameters[rows // PACK, :, rows % PACK] = pool.parameters[flights]
-        self._thrusts[rows], self._goal_radii[rows] = (
-            pool.thrusts[flights],
-            pool.goal_radii[flights],
-        )
-        self._remaining[rows], self._field[rows] = pool.periods[flights], pool.field[flights]
+        self._thrusts[rows], self._remaining[rows] = pool.thrusts[flights], pool.periods[flights]
+        self._goal_radii[rows], self._field[rows] = pool.goal_radii[flights], pool.field[flights]
         self._previous[rows], self._count[rows] = 0.0, 0
         self._distances[rows] = pool.distances[flights]
         self._ends[rows], self._ended[rows] = 0, False
-        # Until the first action has come, that of zeros counts, as in FlightEnv.
-        self._decisions[rows] = decisions(self.config, self._previous[rows], self._states[rows])
+        if pool.is_delayed:  # Until the first action has come, that of zeros counts.
+            zeros = self._previous[rows]
+            self._decisions[rows] = decisions(self.config, zeros, self._states[rows])
 
     def step(
         self, actions: Any
@@ -240,7 +253,7 @@ class VectorFlightEnv(VectorEnv):
         """
         config = self.config
         given = require_actions(actions, self._previous.shape)
-        resting = self._ended
+        resting = self._ended.copy()
         if resting.any():
             if self._mode is not AutoresetMode.NEXT_STEP or not self._is_seeded:
                 ended = np.flatnonzero(resting).tolist()
@@ -290,7 +303,7 @@ class VectorFlightEnv(VectorEnv):
         self._count += flying
         infos: dict[str, Any] = {}
         if ended.any():
-            infos = {"outcome": np.where(ended, _OUTCOMES[ends], None), "is_success": reached}
+            infos = {"outcome": _OUTCOMES[ends], "is_success": reached}
             infos |= {f"_{name}": ended.copy() for name in infos}
             if self._mode is AutoresetMode.SAME_STEP:
                 return self._reset_same_step(rewards, terminated, truncated, infos)

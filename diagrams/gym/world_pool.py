@@ -1,4 +1,4 @@
-"""Prepared worlds and flights, of which the vehicles of `VectorFlightEnv` draw theirs."""
+"""Prepared worlds and flights, from which the vehicles of `VectorFlightEnv` draw."""
 
 import math
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ from splatpilot.systems.collision.distance_field import DistanceField
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.shapes import AnalyticDistanceField, shape_rows
 from splatpilot.systems.common.progress import Progress
-from splatpilot.systems.common.validation import MAX_SEED, require
+from splatpilot.systems.common.validation import MAX_SEED, require, require_type
 from splatpilot.systems.policies.velocity import MAX_ACCELERATION, RESPONSE_TIME
 from splatpilot.systems.sensing.estimators import TrueState
 from splatpilot.systems.sensing.imaging import Imaging
@@ -42,45 +42,50 @@ class WorldPool:
 
     Args:
         configs: whose worlds and flights are made, alike but for their scenarios.
+        world: of all flights, instead of made ones.
 
     Raises:
         InfeasibleFlightError: for a world, start or goal that cannot be flown.
         ValueError: for a scenario that native code cannot fly, by the name of its field.
     """
 
-    def __init__(self, configs: Sequence[FlightEnvConfig]) -> None:
-        self.worlds: list[World] = []
+    def __init__(self, configs: Sequence[FlightEnvConfig], world: World | None = None) -> None:
+        self.worlds: list[World] = []  # by appearances
         self.native = _native.FlightWorlds()
         self.scenarios: list[Scenario] = []  # (F,), of the flights
-        world, world_seeds, states, delays = [], [], [], []
+        self._made: World | None = None  # the last one
         self._fields: dict[int, int] = {}  # native numbers by the identity of distance fields
-        for config in configs:
-            _require_supported(config)
+        self._configs = list(configs)
+        worlds, world_seeds, states = [], [], []
         turns = [(config, k) for config in configs for k in range(config.num_worlds)]
         for config, k in Progress(turns, "making worlds", unit="world", delay=1.0):
-            made = self._shared(make_world(config.scenario.world, config.scenario.seed + k))
+            seed = config.scenario.seed + k
+            made = self._add(world or make_world(config.scenario.world, seed))
             is_varied = config.scenario.appearance > 0.0
-            seeds = np.random.default_rng([config.scenario.seed, k])
-            for _ in range(_LOOKS if is_varied else _FLIGHTS):
-                drawn = replace(config.scenario, seed=int(seeds.integers(MAX_SEED)))
-                scenario = sample_scenario(drawn)
-                if is_varied or not states or self.worlds[-1] is not made:
-                    look = randomize_appearance(made, scenario.appearance, scenario.seed)
-                    self.worlds.append(look)
-                world.append(len(self.worlds) - 1)
-                world_seeds.append(config.scenario.seed + k)
+            drawn = np.random.default_rng([config.scenario.seed, k])
+            for i in range(_LOOKS if is_varied else _FLIGHTS):
+                flight_seed = int(drawn.integers(MAX_SEED))
+                scenario = sample_scenario(replace(config.scenario, seed=flight_seed))
+                if is_varied or i == 0:
+                    self.worlds.append(
+                        randomize_appearance(made, scenario.appearance, scenario.seed)
+                    )
+                    if any(name in IMAGES for name in config.observation_names()):
+                        _ = self.worlds[-1].baked  # Now, rather than at the first image.
+                worlds.append(len(self.worlds) - 1)
+                world_seeds.append(seed)
                 states.append(sample_initial_state(scenario, made))
-                delays.append(decision_delays(scenario.decision_delay, scenario.seed))
                 self.scenarios.append(scenario)
-        self.world = np.array(world)  # (F,), index of `worlds`
-        self.field = np.array([self._fields[id(w.distance_field)] for w in self.worlds])[world]
+        self.world = np.array(worlds)  # (F,), index of `worlds`
+        self.field = np.array([self._fields[id(w.distance_field)] for w in self.worlds])[worlds]
         self.states = np.array(states)  # (F, 13)
         self.p_WG = np.array(
-            [goal_position(s, self.worlds[w]) for s, w in zip(self.scenarios, world, strict=True)]
+            [goal_position(s, self.worlds[w]) for s, w in zip(self.scenarios, worlds, strict=True)]
         )
         period = configs[0].scenario.controller.period
         # (F, CYCLE), of decisions, in periods
-        self.delays = np.ceil(np.array(delays) / period - 1e-9).astype(np.int32)
+        delays = np.array([decision_delays(s.decision_delay, s.seed) for s in self.scenarios])
+        self.delays = np.ceil(delays / period - 1e-9).astype(np.int32)
         self.is_delayed = bool(self.delays.any())
         self.seeds = np.array([s.seed for s in self.scenarios])  # (F,), of flights
         self.world_seeds = np.array(world_seeds)  # (F,)
@@ -106,16 +111,28 @@ class WorldPool:
     def __len__(self) -> int:
         return len(self.scenarios)
 
-    def _shared(self, world: World) -> World:
+    def matches(self, configs: Sequence[FlightEnvConfig]) -> bool:
+        """Checks if the pool has the flights of these configurations."""
+        given, made = (
+            [(c.scenario, c.num_worlds) for c in each] for each in (configs, self._configs)
+        )
+        return given == made
+
+    def _add(self, world: World) -> World:
         """Adds the distance field of a world to the native ones; returns the world, with the arrays
         of the last one if they are equal, as those of a captured scene are."""
-        last = self.worlds[-1] if self.worlds else None
+        last, self._made = self._made, world
         if last is not None and _are_equal(world, last):
             shared = {"distance_field": last.distance_field, "esdf": last.esdf}
-            return replace(world, gaussians=last.gaussians, rendered=last.baked, **shared)
+            self._made = replace(world, gaussians=last.gaussians, rendered=last.baked, **shared)
+            return self._made
+        require(world.moving is None, f"moving of {world.name}", "None", "moving obstacles", _OTHER)
         field = world.distance_field
         self._fields[id(field)] = add_field(self.native, field, world.name)
         return world
+
+
+_OTHER = "use FlightEnv in gymnasium.vector.SyncVectorEnv"
 
 
 def _are_equal(world: World, other: World) -> bool:
@@ -139,19 +156,17 @@ def add_field(worlds: _native.FlightWorlds, field: DistanceField, name: str) -> 
             voxel_size=field.voxel_size,
             occupied_outside=field.occupied_outside,
         )
-    known = isinstance(field, AnalyticDistanceField)
-    condition = "an AnalyticDistanceField or an Esdf"
-    require(known, f"distance_field of {name}", condition, type(field).__name__)
+    require_type(field, AnalyticDistanceField, f"distance_field of {name}", "or an Esdf")
+    assert isinstance(field, AnalyticDistanceField)  # for type checkers
     rows, kinds = shape_rows(field.shapes)
     return worlds.add_shapes(shapes=rows, kinds=kinds, lower_W=field.lower_W, upper_W=field.upper_W)
 
 
-def _require_supported(config: FlightEnvConfig) -> None:
+def require_supported(config: FlightEnvConfig) -> None:
     """Raises ValueError for what `VectorFlightEnv` cannot fly, by the name of the field."""
     scenario = sample_scenario(config.scenario)
     vehicle, simulator = scenario.vehicle, scenario.simulator
     scheme, estimator = simulator.integration_scheme, type(scenario.estimator).__name__
-    remedy = "use FlightEnv in gymnasium.vector.SyncVectorEnv"
     images = [n for n in config.observation_names() if n in IMAGES]
     neutral: dict[str, tuple[bool, str, Any]] = {
         "moving": (not scenario.moving, "empty", list(scenario.moving)),
@@ -171,13 +186,13 @@ def _require_supported(config: FlightEnvConfig) -> None:
         "camera.readout": (not images or config.camera.readout == 0.0, "0", config.camera.readout),
     }  # fmt: skip
     for name, (valid, condition, value) in neutral.items():
-        require(valid, f"{name} of VectorFlightEnv", condition, value, remedy)
+        require(valid, f"{name} of VectorFlightEnv", condition, value, _OTHER)
     for name in config.observation_names():
         known = f"one of {', '.join(OBSERVATIONS)} in VectorFlightEnv"
-        require(name in OBSERVATIONS, "observation", known, repr(name), remedy)
+        require(name in OBSERVATIONS, "observation", known, repr(name), _OTHER)
     longest, period = max(scenario.decision_delay, default=0.0), 1.0 / config.rate
     condition = f"at most the policy's period, {period:g} s, in VectorFlightEnv"
-    require(longest <= period + 1e-9, "decision_delay", condition, longest, remedy)
+    require(longest <= period + 1e-9, "decision_delay", condition, longest, _OTHER)
 
 
 def native_parameters(scenario: Scenario) -> NDArray[np.float64]:
