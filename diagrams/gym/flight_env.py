@@ -12,6 +12,7 @@ from pydrake.common import RandomGenerator
 from pydrake.geometry import Meshcat
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
 from pydrake.systems.framework import (
+    Diagram,
     DiagramBuilder,
     OutputPort,
     PortDataType,
@@ -25,6 +26,7 @@ from splatpilot.diagrams.flight.flight_diagram import (
     AddMeshcat,
     DecisionInput,
     ExportFlight,
+    FlightParts,
     open_meshcat,
 )
 from splatpilot.diagrams.flight.monitor import ENDS, Outcome
@@ -32,7 +34,11 @@ from splatpilot.diagrams.flight.scenario import (
     Scenario,
     goal_position,
     sample_initial_state,
-    sample_scenario,
+)
+from splatpilot.diagrams.gym.native_flight import (
+    NativeFlight,
+    can_fly_natively,
+    only_start_is_random,
 )
 from splatpilot.diagrams.gym.rewards import Transition
 from splatpilot.diagrams.gym.spaces import (
@@ -52,9 +58,6 @@ from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.vehicle.state import set_state
-
-# Fields of a scenario besides the start of which a seed draws values, if they are not the defaults.
-_RANDOM = ("appearance", "wind", "sensors", "observation", "imaging", "estimator", "decision_delay")
 
 
 class FlightEnv(gymnasium.Env):
@@ -77,6 +80,8 @@ class FlightEnv(gymnasium.Env):
             used.
         render_mode: "rgb_array" renders the scenario's camera; "human" serves Meshcat, in real
             time.
+        native: flies by the native code of `VectorFlightEnv` if that knows all systems with a
+            state, and sets the Context; otherwise, and in "human" mode, the simulator advances.
         world: of all flights; by default `num_worlds` are made of seeds from the scenario's on.
         fields: of `FlightEnvConfig`, such as `observation`, `action`, `rate`, `reward` and
             `num_worlds`.
@@ -94,6 +99,7 @@ class FlightEnv(gymnasium.Env):
         *,
         render_mode: str | None = None,
         world: World | None = None,
+        native: bool = True,
         **fields: Any,
     ) -> None:
         modes = self.metadata["render_modes"]
@@ -106,9 +112,11 @@ class FlightEnv(gymnasium.Env):
         self.metadata = self.metadata | {"render_fps": self.config.rate}
         self.time_step = 1.0 / self.config.rate
         self._worlds: dict[Any, World] = {}
+        self._flights: dict[int, _BuiltFlight] = {}  # by the identity of their world
+        self._native = native
         self.meshcat: Meshcat | None = None
         self._ended = True
-        self._build(self.config.scenario, self._find_world(self.config.scenario))
+        self._take(self._build(self.config.scenario, self._find_world(self.config.scenario)))
         ports = self.parts.measured
         self._spaces = {n: _port_space(ports[n]) for n in self._names() if n in ports}
         self.observation_space = observation_space(self.config, self._spaces)
@@ -123,36 +131,33 @@ class FlightEnv(gymnasium.Env):
             return self._world
         key = repr(scenario.world), scenario.seed
         if key not in self._worlds:
+            if len(self._worlds) >= _MAX_WORLDS:
+                oldest = self._worlds.pop(next(iter(self._worlds)))
+                self._flights.pop(id(oldest), None)
             self._worlds[key] = make_world(scenario.world, scenario.seed)
         return self._worlds[key]
 
-    def _build(self, scenario: Scenario, world: World) -> None:
+    def _build(self, scenario: Scenario, world: World) -> "_BuiltFlight":
         """Builds the diagram and the simulator of a flight."""
-        builder = DiagramBuilder()
-        policy = DecisionInput(self.config.action, self.config.camera, self.config.rate)
+        builder, config = DiagramBuilder(), self.config
+        policy = DecisionInput(config.action, config.camera, config.rate)
         camera = self.render_mode is not None
         parts = AddFlight(builder, scenario, world, policy=policy, camera=camera, logs=False)
         if self.render_mode == "human":
             self.meshcat = self.meshcat or open_meshcat(scenario, world)
             AddMeshcat(builder, parts, self.meshcat)
         ExportFlight(builder, parts)
-        self.parts, self.diagram = parts, builder.Build()
-        self.simulator = Simulator(self.diagram)
-        ApplySimulatorConfig(scenario.simulator, self.simulator)
+        simulator = Simulator(builder.Build())
+        ApplySimulatorConfig(scenario.simulator, simulator)
         if self.render_mode == "human":
-            self.simulator.set_target_realtime_rate(1.0)
-        self._world_built: World | None = world
+            simulator.set_target_realtime_rate(1.0)
+        return _BuiltFlight(parts, simulator)
+
+    def _take(self, flight: "_BuiltFlight") -> None:
+        """Makes a flight the present one."""
+        self._flight, self.parts, self.simulator = flight, flight.parts, flight.simulator
+        self.diagram = cast(Diagram, self.simulator.get_system())
         self._action = self.diagram.GetInputPort(self.config.action)
-        root = self.simulator.get_mutable_context()
-        collision = parts.collision
-        read = {n: collision.GetOutputPort(n) for n in ("distance", "gradient")}
-        read |= {"true_state": parts.state, "goal": parts.goal, **parts.measured}
-        read |= {n: port for n, port in parts.observation.items() if n != "goal"}
-        self._ports = {
-            name: (port, cast(System, port.get_system()).GetMyContextFromRoot(root))
-            for name, port in read.items()
-        }
-        self._monitor = parts.monitor, parts.monitor.GetMyContextFromRoot(root)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -172,38 +177,47 @@ class FlightEnv(gymnasium.Env):
             config.validate()
             require(self._world is None, "world", "left out with options of a scenario", "a world")
             self.config = config
-            self._world_built = None
+            self._flights.clear()
         world_seed, scenario = draw_flight(self.config, self.np_random)
         points = {name: list(options[name]) for name in ("start", "goal") if name in options}
         if points:
             scenario = replace(scenario, **points)
             scenario.validate()
         world = self._find_world(replace(self.config.scenario, seed=world_seed))
-        if world is self._world_built and only_start_is_random(self.config.scenario):
+        if only_start_is_random(self.config.scenario):
             self._restart(scenario, world)
         else:
-            self._build(scenario, world)
+            self._take(self._build(scenario, world))
             context = self.simulator.get_mutable_context()
             self.diagram.SetRandomContext(context, RandomGenerator(scenario.seed))
-        context = self.simulator.get_mutable_context()
-        self._read_true()
+        flight = self._flight
+        self._vehicles = flight.native.vehicles() if flight.native else flight.vehicles()
         self._previous = np.zeros((1, *cast(Box, self.action_space).shape))
         hover = decisions(self.config, self._previous, self._vehicles.states)
-        self._action.FixValue(context, hover[0])
+        self._action.FixValue(self.simulator.get_mutable_context(), hover[0])
         self.simulator.Initialize()
         self._steps, self._ended = 0, False
         return self._observe(), {}
 
     def _restart(self, scenario: Scenario, world: World) -> None:
-        """Sets the Context to the start of a flight."""
-        state = sample_initial_state(scenario, world)
+        """Sets the Context of the diagram of a world to the start of a flight."""
+        if id(world) not in self._flights:
+            flight = self._flights[id(world)] = self._build(scenario, world)
+            if self._native and self.render_mode != "human":
+                if can_fly_natively(self.config, world):
+                    context = flight.simulator.get_mutable_context()
+                    flight.native = NativeFlight(self.config, flight.parts, context)
+        self._take(self._flights[id(world)])
+        state, p_WG = sample_initial_state(scenario, world), goal_position(scenario, world)
         context = self.simulator.get_mutable_context()
         context.SetTime(0.0)
         self.diagram.SetDefaultContext(context)
         set_state(self.parts.plant.GetMyMutableContextFromRoot(context), state)
         source = cast(ConstantVectorSource, self.parts.goal.get_system())
         goal = source.get_mutable_source_value(source.GetMyMutableContextFromRoot(context))
-        goal.SetFromVector(goal_position(scenario, world))
+        goal.SetFromVector(p_WG)
+        if self._flight.native:
+            self._flight.native.begin(state, p_WG)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Flies for one period with an action in [-1, 1]."""
@@ -211,16 +225,20 @@ class FlightEnv(gymnasium.Env):
             raise gymnasium.error.ResetNeeded("the flight must be begun by reset() before step()")
         config, before = self.config, self._vehicles
         actions = require_actions(action, cast(Box, self.action_space).shape)[None]
-        context = self.simulator.get_mutable_context()
-        self._action.FixValue(context, decisions(config, actions, before.states)[0])
+        decision = decisions(config, actions, before.states)
+        self._action.FixValue(self.simulator.get_mutable_context(), decision[0])
         self._steps += 1
-        period = config.scenario.controller.period
-        periods = self._steps * round(self.time_step / period)
-        # The time of the controller's update as Drake computes it, which saves a tiny step.
-        self.simulator.AdvanceTo(min(periods * period, config.scenario.timeout))
-        monitor, monitor_context = self._monitor
-        outcome = monitor.outcome(monitor_context)
-        self._read_true()
+        flight, period = self._flight, config.scenario.controller.period
+        periods = round(self.time_step / period)
+        if flight.native:
+            outcome = flight.native.step(decision, periods)
+            self._vehicles = flight.native.vehicles()
+        else:
+            # The time of the controller's update as Drake computes it, which saves a tiny step.
+            end = self._steps * periods * period
+            self.simulator.AdvanceTo(min(end, config.scenario.timeout))
+            outcome = flight.parts.monitor.outcome(flight.monitor_context)
+            self._vehicles = flight.vehicles()
         transition = Transition(
             states=before.states,
             next_states=self._vehicles.states,
@@ -242,31 +260,17 @@ class FlightEnv(gymnasium.Env):
         terminated, truncated = outcome in ENDS, outcome is Outcome.TIMEOUT
         return self._observe(), float(reward[0]), terminated, truncated, info
 
-    def _eval(self, name: str) -> NDArray[Any]:
-        """Returns a copy of the vector or image at an output port."""
-        port, context = self._ports[name]
-        value: Any = port.Eval(context)
-        if port.get_data_type() == PortDataType.kVectorValued:
-            return np.array(value)
-        return np.array(value.data[..., 0] if value.data.shape[-1] == 1 else value.data)
-
-    def _read_true(self) -> None:
-        """Reads the true state of the vehicle."""
-        names = "true_state", "goal", "distance", "gradient"
-        state, goal, distance, gradient = map(self._eval, names)
-        self._vehicles = Vehicles(state[None], goal[None], distance, gradient[None])
-
     def _observe(self) -> Any:
         names, vehicles = self._names(), self._vehicles
         if self.parts.estimator is not None:
-            vehicles = vehicles._replace(states=self._eval("state")[None])
+            vehicles = vehicles._replace(states=self._flight.eval("state")[None])
         observed: dict[str, Any] = {n: v[0] for n, v in observe(names, vehicles).items()}
         for name in names:
             if name in IMAGES:
-                image = self._eval(IMAGES[name])
+                image = self._flight.eval(IMAGES[name])
                 observed[name] = observe_image(name, image, self.config.camera.max_depth)
             elif name not in observed:
-                observed[name] = self._eval(name).astype(self._spaces[name].dtype)
+                observed[name] = self._flight.eval(name).astype(self._spaces[name].dtype)
         if isinstance(self.config.observation, str):
             return observed[self.config.observation]
         return {name: observed[name] for name in names}
@@ -283,13 +287,37 @@ class FlightEnv(gymnasium.Env):
 
 
 _OPTIONS = "scenario", "start", "goal"
+_MAX_WORLDS = 64  # that are kept
 
 
-def only_start_is_random(scenario: Scenario) -> bool:
-    """Checks if flights of a scenario in one world differ by seed in their start alone."""
-    default = Scenario()
-    steady = all(getattr(scenario, name) == getattr(default, name) for name in _RANDOM)
-    return steady and sample_scenario(scenario) is scenario
+class _BuiltFlight:
+    """A diagram of a flight with its simulator, and how it is read and flown."""
+
+    def __init__(self, parts: FlightParts, simulator: Simulator) -> None:
+        self.parts, self.simulator = parts, simulator
+        self.native: NativeFlight | None = None
+        root, collision = simulator.get_mutable_context(), parts.collision
+        self.monitor_context = parts.monitor.GetMyContextFromRoot(root)
+        ports = {n: collision.GetOutputPort(n) for n in ("distance", "gradient")}
+        ports |= parts.observation | {"goal": parts.goal, "true_state": parts.state}
+        self._ports = {
+            name: (port, cast(System, port.get_system()).GetMyContextFromRoot(root))
+            for name, port in ports.items()
+        }
+
+    def eval(self, name: str) -> NDArray[Any]:
+        """Returns a copy of the vector or image at an output port."""
+        port, context = self._ports[name]
+        value: Any = port.Eval(context)
+        if port.get_data_type() == PortDataType.kVectorValued:
+            return np.array(value)
+        return np.array(value.data[..., 0] if value.data.shape[-1] == 1 else value.data)
+
+    def vehicles(self) -> Vehicles:
+        """Returns the vehicle, with its true state."""
+        names = "true_state", "goal", "distance", "gradient"
+        state, goal, distance, gradient = map(self.eval, names)
+        return Vehicles(state[None], goal[None], distance, gradient[None])
 
 
 _IMAGES = {

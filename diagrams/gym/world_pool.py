@@ -96,7 +96,7 @@ class WorldPool:
             distances=self.distances,
             states=np.empty(len(self), np.uint8),
         )
-        self.parameters = np.array([_parameters(s) for s in self.scenarios])  # (F, P)
+        self.parameters = np.array([native_parameters(s) for s in self.scenarios])  # (F, P)
         self.actuated = not all(
             s.vehicle.is_ideal() and not any(s.wind.mean) for s in self.scenarios
         )
@@ -195,7 +195,7 @@ def require_supported(config: FlightEnvConfig) -> None:
     require(longest <= period + 1e-9, "decision_delay", condition, longest, _OTHER)
 
 
-def _parameters(scenario: Scenario) -> NDArray[np.float64]:
+def native_parameters(scenario: Scenario) -> NDArray[np.float64]:
     """Returns the numbers (P,) of `_native.FLIGHT_PARAMETERS`."""
     vehicle, control = scenario.vehicle, scenario.controller
     motor, yaw = vehicle.motor_time_constant, vehicle.rate_time_constant * vehicle.yaw_time_ratio

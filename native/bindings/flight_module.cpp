@@ -125,6 +125,14 @@ struct Vehicles {
   size_t count() const { return states.shape(0); }
 };
 
+ActionKind action_kind(const std::string& kind) {
+  if (kind == "command") return ActionKind::kCommand;
+  if (kind == "acceleration") return ActionKind::kAcceleration;
+  if (kind == "velocity") return ActionKind::kVelocity;
+  require(kind == "waypoint", "actions are commands, accelerations, velocities or waypoints");
+  return ActionKind::kWaypoint;
+}
+
 class FlightThreads {
  public:
   FlightThreads(int threads, const std::string& simd)
@@ -180,14 +188,6 @@ class FlightThreads {
   }
 
  private:
-  static ActionKind action_kind(const std::string& kind) {
-    if (kind == "command") return ActionKind::kCommand;
-    if (kind == "acceleration") return ActionKind::kAcceleration;
-    if (kind == "velocity") return ActionKind::kVelocity;
-    require(kind == "waypoint", "actions are commands, accelerations, velocities or waypoints");
-    return ActionKind::kWaypoint;
-  }
-
   // Lanes without a vehicle repeat the first.
   static void load(const Vehicles& vehicles, size_t first, int lanes, VehiclePack& pack) {
     constexpr size_t kSize = kFlightParameters * kPackVehicles;
@@ -255,6 +255,16 @@ class FlightThreads {
   std::mutex mutex_;
 };
 
+void command(const std::string& kind, const Doubles<nb::shape<kStateSize>>& state,
+             const Numbers& action, const Doubles<nb::shape<kFlightParameters>>& parameters,
+             const Array<double, nb::shape<4>>& command) {
+  static const FlightKernels& kernels_of_machine = *kernels("").flight;
+  const ActionKind known = action_kind(kind);
+  require(action.size() == (known == ActionKind::kCommand ? 4 : 3),
+          "actions have 4 numbers if they are commands, else 3");
+  kernels_of_machine.command(known, state.data(), action.data(), parameters.data(), command.data());
+}
+
 using Vector3d = Doubles<nb::shape<3>>;
 
 void derivatives(const Doubles<nb::shape<kStateSize>>& state, const Doubles<nb::shape<4>>& command,
@@ -311,6 +321,9 @@ void bind_flight(nb::module_& m) {
           "Flies vehicles for periods of their controllers, each of `steps` steps [s], until one\n"
           "ends: 1 collision, 2 left volume, 3 goal, 4 timeout. An action follows the earlier one\n"
           "after its delay [periods].");
+  m.def("flight_command", &command, "kind"_a, "state"_a, "action"_a, "parameters"_a, "command"_a,
+        "Writes the command (4,) of the controller, for parameters in the order of\n"
+        "FLIGHT_PARAMETERS.");
   m.def("quadrotor_derivatives", &derivatives, "state"_a, "command"_a, "drag"_a,
         "rate_time_constant"_a, "gravity"_a, "derivatives"_a, "wind"_a = nb::none(),
         "disturbance"_a = nb::none(), "Writes the derivatives (13,) of `component_derivatives`.");

@@ -192,7 +192,18 @@ static void advance(VehiclePack& pack, ActionKind kind, bool actuated, double st
   advance_pack<false>(pack, kind, step, steps);
 }
 
+static void command(ActionKind kind, const double* state, const double* action,
+                    const double* parameters, double* command) {
+  Lanes states[kStateSize], actions[4], commands[4];
+  for (int i = 0; i < kStateSize; ++i) states[i] = broadcast(state[i]);
+  const int size = kind == ActionKind::kCommand ? 4 : 3;
+  for (int k = 0; k < size; ++k) actions[k] = broadcast(action[k]);
+  const auto parameter = [&](int row) { return broadcast(parameters[row]); };
+  update_controller(kind, states, actions, parameter, commands);
+  for (int k = 0; k < 4; ++k) command[k] = commands[k][0];
+}
+
 extern const FlightKernels kFlightKernels;
-const FlightKernels kFlightKernels = {advance};
+const FlightKernels kFlightKernels = {advance, command};
 
 }  // namespace splatpilot::SIMD_LEVEL

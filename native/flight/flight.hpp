@@ -54,6 +54,9 @@ struct FlightKernels {
   // Updates the controller, and integrates `steps` times over `step` [s]. Vehicles that are not
   // `actuated` have none of the parameters from the motors' gain to the wind.
   void (*advance)(VehiclePack&, ActionKind, bool actuated, double step, int steps);
+  // Updates the controller of one vehicle: writes its command (4).
+  void (*command)(ActionKind, const double* state, const double* action, const double* parameters,
+                  double* command);
 };
 
 }  // namespace splatpilot

@@ -215,3 +215,33 @@ def test_human_mode_draws_in_meshcat(post_world, monkeypatch):
     env.step(AHEAD)
     assert env.render() is None
     assert env.meshcat and env.meshcat.HasPath("/splatpilot/vehicle")
+
+
+@pytest.mark.parametrize("action", ["command", "acceleration", "velocity", "waypoint"])
+def test_native_code_flies_as_the_simulator_does(action, post_world):
+    names = ["full_state", "goal", "obstacle", "depth_m"]
+    options = {"world": post_world, "observation": names, "action": action}
+    envs = [FlightEnv(Scenario(), native=native, **options) for native in (True, False)]
+    actions = np.random.default_rng(1).uniform(-0.3, 0.4, (100, *envs[0].action_space.shape))
+    if action == "command":
+        actions *= 0.05
+    flights = [[env.reset(seed=2)[0]] for env in envs]
+    for given in actions:
+        results = [env.step(given) for env in envs]
+        for flight, result in zip(flights, results, strict=True):
+            flight.append(result[0])
+        np.testing.assert_allclose(results[0][1], results[1][1], atol=1e-6)
+        assert results[0][2:] == results[1][2:]
+        times = [env.simulator.get_context().get_time() for env in envs]
+        assert times[0] == pytest.approx(times[1], abs=1e-9)
+        for port in ("state", "command", "clearance"):
+            native, simulated = (
+                env.diagram.GetOutputPort(port).Eval(env.simulator.get_context()) for env in envs
+            )
+            np.testing.assert_allclose(native, simulated, atol=1e-7)
+        if results[0][2] or results[0][3]:
+            break
+    assert len(flights[0]) > 10
+    for native, simulated in zip(*flights, strict=True):
+        for name in names:
+            np.testing.assert_allclose(native[name], simulated[name], atol=1e-5)

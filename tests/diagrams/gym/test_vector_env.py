@@ -98,7 +98,7 @@ def test_flights_are_those_of_add_flight(action, scenario, limits):
 def test_images_and_rewards_are_those_of_flight_env(post_world):
     names = ["depth", "depth_m", "rgb", "state", "goal", "obstacle"]
     scenario = Scenario(start_radius=0.0)
-    env = FlightEnv(scenario, world=post_world, observation=names)
+    env = FlightEnv(scenario, world=post_world, observation=names, native=False)
     envs = VectorFlightEnv(3, scenario, world=post_world, observation=names)
     one, info = env.reset(seed=0)
     many, infos = envs.reset(seed=0)
