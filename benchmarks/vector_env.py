@@ -137,3 +137,7 @@ def main() -> None:
     rate = periods / best["state, N = 1024"][0]
     print(f"updates of controllers, and steps of integrators, with N = 1024: {rate:,.0f} a second")
     print(f"reset of one environment: {1e3 * reset_times(envs['state, N = 1024']):.3f} ms")
+
+
+if __name__ == "__main__":
+    main()

@@ -361,16 +361,26 @@ class VectorFlightEnv(VectorEnv):
         info, X_BC = camera.camera_info(), camera.mount()
         worlds = [self.pool.worlds[w] for w in self.pool.world[self._flight[rows]]]
         X_WCs = [pose_from_state(state) @ X_BC for state in self._states[rows]]
-        view = [world.baked for world in worlds], info.intrinsic_matrix(), info.width()
-        view = *view, info.height(), X_WCs
-        options = {"distortion": camera.distortion, "max_depth": camera.max_depth}
-        if "color_image" not in ports:
-            depth = self._renderer.render_depth(*view, **options)
-            return {"depth_image_32f": ranged_depth(depth, camera.min_depth, camera.max_depth)}
-        backgrounds = [world.background for world in worlds]
-        seen = self._renderer.render(*view, backgrounds=backgrounds, **options)
-        depth = ranged_depth(seen.depth, camera.min_depth, camera.max_depth)
-        return {"depth_image_32f": depth, "color_image": color_pixels(seen.color)}
+        views = [world.baked for world in worlds], info.intrinsic_matrix(), info.width()
+        views = *views, info.height(), X_WCs
+        options: dict[str, Any] = {
+            "distortion": camera.distortion,
+            "max_depth": camera.max_depth,
+            "merged_spread": camera.merged_spread,
+            "backgrounds": [world.background for world in worlds],
+        }
+        if len(ports) == 2:
+            color, depth, _ = self._renderer.render(*views, **options)
+        elif "color_image" in ports:
+            color, depth = self._renderer.render_color(*views, **options), None
+        else:
+            color, depth = None, self._renderer.render_depth(*views, **options)
+        images = {}
+        if depth is not None:
+            images["depth_image_32f"] = ranged_depth(depth, camera.min_depth, camera.max_depth)
+        if color is not None:
+            images["color_image"] = color_pixels(color)
+        return images
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Returns images (H, W, 3) of the scenario's camera, one of each vehicle."""
@@ -379,7 +389,7 @@ class VectorFlightEnv(VectorEnv):
         config = self.config.scenario.camera
         info, X_BC = camera_info(config), camera_mount(config)
         worlds = [self.pool.worlds[w] for w in self.pool.world[self._flight]]
-        seen = self._renderer.render(
+        color = self._renderer.render_color(
             [world.baked for world in worlds],
             info.intrinsic_matrix(),
             info.width(),
@@ -387,7 +397,7 @@ class VectorFlightEnv(VectorEnv):
             [pose_from_state(state) @ X_BC for state in self._states],
             backgrounds=[world.background for world in worlds],
         )
-        return tuple(color_pixels(seen.color))
+        return tuple(color_pixels(color))
 
 
 def _hash(numbers: NDArray[np.uint64]) -> NDArray[np.uint64]:
