@@ -25,7 +25,6 @@ from .diagrams.gym.flight_env import FlightEnv
 from .diagrams.gym.rewards import Reward, Transition
 from .diagrams.gym.spaces import FlightEnvConfig
 from .diagrams.gym.vector_env import VectorFlightEnv
-from .diagrams.gym.vector_env import VectorFlightEnv
 from .diagrams.worlds.moving_spheres import MovingSphere
 from .diagrams.worlds.world import World
 from .diagrams.worlds.world_registry import make_world, register_world
