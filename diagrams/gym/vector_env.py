@@ -386,17 +386,12 @@ class VectorFlightEnv(VectorEnv):
             "merged_spread": camera.merged_spread,
             "backgrounds": [world.background for world in worlds],
         }
-        if len(ports) == 2:
-            color, depth, _ = self._renderer.render(*views, **options)
-        elif "color_image" in ports:
-            color, depth = self._renderer.render_color(*views, **options), None
-        else:
-            color, depth = None, self._renderer.render_depth(*views, **options)
-        images = {}
-        if depth is not None:
+        images = {}  # In two passes: each leaves out what only the other needs.
+        if "depth_image_32f" in ports:
+            depth = self._renderer.render_depth(*views, **options)
             images["depth_image_32f"] = ranged_depth(depth, camera.min_depth, camera.max_depth)
-        if color is not None:
-            images["color_image"] = color_pixels(color)
+        if "color_image" in ports:
+            images["color_image"] = color_pixels(self._renderer.render_color(*views, **options))
         return images
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
