@@ -129,7 +129,7 @@ def time_of_flight_depth(
         mixing: (2, H, W), drawn from U(0, 1).
     """
     measured = np.isfinite(depth) & (depth > 0.0)
-    z = np.where(measured, depth, sensor.ambient_range).astype(float)
+    z = np.where(measured, depth, np.float32(sensor.ambient_range))
     z = z * (1.0 + sensor.multipath * _relative_sag(z, sensor.multipath_angle, camera))
     kernel = np.ones((3, 3), np.uint8)
     near, far = cv2.erode(z, kernel), cv2.dilate(z, kernel)

@@ -155,10 +155,10 @@ class DepthSensor(ImageChange):
 
     def changed(self, image: np.ndarray, random: np.random.Generator) -> np.ndarray:
         depth, sensor, camera = image[..., 0], self.config, self.camera
-        noise, reflectivity = random.standard_normal((2, *depth.shape))
+        noise, reflectivity = random.standard_normal((2, *depth.shape), dtype=np.float32)
         if isinstance(sensor, Stereo):
             z = stereo_depth(depth, sensor, camera, noise)
         else:
-            mixing = random.random((2, *depth.shape))
+            mixing = random.random((2, *depth.shape), dtype=np.float32)
             z = time_of_flight_depth(depth, sensor, camera, noise, reflectivity, mixing)
         return limit_depth(z, camera.min_depth, camera.max_depth)[..., None]

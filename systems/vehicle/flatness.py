@@ -207,14 +207,18 @@ def observe_disturbance(
         observed: (6,), the last result.
         thrust: c [m/s^2].
     """
-    _, v_WB, q_WB, _ = QuadrotorState.of(state)
-    u, d = observed[:3], observed[3:]
-    T, error = config.period, v_WB - u
+    # Numbers one by one: several times faster than arrays of numpy.
+    v_WB, (w, x, y, z) = state[3:6].tolist(), state[6:10].tolist()
+    numbers, T = observed.tolist(), config.period
+    lift = thrust / (w * w + x * x + y * y + z * z)
+    z_B = (2.0 * (x * z + w * y), 2.0 * (y * z - w * x), w * w - x * x - y * y + z * z)
     gain, limit = T / config.disturbance_time, config.max_disturbance
-    model = thrust * rotation_matrices(q_WB)[:, 2] - params.drag * v_WB
-    model = model - np.array([0.0, 0.0, params.gravity])
-    u = u + T * (model + d) + 2.0 * gain * error
-    return np.concatenate([u, clip(d + gain**2 / T * error, -limit, limit)])
+    speeds, disturbances = [], []
+    for k, (u, d, v) in enumerate(zip(numbers[:3], numbers[3:], v_WB, strict=True)):
+        model = lift * z_B[k] - params.drag * v - (params.gravity if k == 2 else 0.0)
+        speeds.append(u + T * (model + d) + 2.0 * gain * (v - u))
+        disturbances.append(max(-limit, min(d + gain**2 / T * (v - u), limit)))
+    return np.array([*speeds, *disturbances])
 
 
 def _components(vectors: Any) -> tuple[Any, Any, Any]:

@@ -243,36 +243,36 @@ def actuated_derivatives(
         rotors:  f_i = lift k u_i²,   d/dt u_i = (sqrt(f_cmd_i / k) - u_i) / motor_time_constant
                  J d/dt w = M(f) - w × J w,  M(f_cmd) = J (w_cmd - w) / tau + w × J w
 
-    Commands are limited first, and f_cmd by `mix`. Sources: rotor drag, Faessler et al., RA-L 2018;
+    `mix` limits f_cmd. Sources: rotor drag, Faessler et al., RA-L 2018;
     ground effect, Cheeseman and Bennett, ARC R&M 3021, 1955, at most that of z = ground_effect / 2;
     power by momentum theory; rate controller, Foehn et al., "Agilicious", Science Robotics 2022.
 
     Args:
         state: 13 components of the state, the charge, and, unless `motor_time_constant` is 0, the
             thrust over mass [m/s^2] or, with rotors, their speeds (4) [rad/s], see `mix`.
-        command, wind, disturbance: see `component_derivatives`.
+        command: of `limit_command`.
+        wind, disturbance: see `component_derivatives`.
     """
     _, _, z, *velocity = state[:6]
     (qw, *q), rates, charge, actuators = state[6:10], state[10:13], state[13], state[14:]
-    scale = 2.0 / (qw * qw + _dot(q, q))
-    v_AB = velocity if wind is None else [v - w for v, w in zip(velocity, wind, strict=True)]
-    speed = sqrt(_dot(v_AB, v_AB) + _TINY)
-    drags = zip(params.rotor_drag, params.quadratic_drag, strict=True)
-    coefficients = [linear + quadratic * speed for linear, quadratic in drags]
-    v_AB_B = _rotate(scale, -qw, q, v_AB)
-    a_B = [-c * v for c, v in zip(coefficients, v_AB_B, strict=True)]
-    added = _rotate(scale, qw, q, a_B)
-    if disturbance is not None:
-        added = [a + more for a, more in zip(added, disturbance, strict=True)]
+    added = disturbance
+    if not _are_zero(*params.rotor_drag, *params.quadratic_drag):  # They cost as much as the rest.
+        scale = 2.0 / (qw * qw + _dot(q, q))
+        v_AB = velocity if wind is None else [v - w for v, w in zip(velocity, wind, strict=True)]
+        speed = sqrt(_dot(v_AB, v_AB) + _TINY)
+        drags = zip(params.rotor_drag, params.quadratic_drag, strict=True)
+        coefficients = [linear + quadratic * speed for linear, quadratic in drags]
+        v_AB_B = _rotate(scale, -qw, q, v_AB)
+        a_B = [-c * v for c, v in zip(coefficients, v_AB_B, strict=True)]
+        added = _rotate(scale, qw, q, a_B)
+        if disturbance is not None:
+            added = [a + more for a, more in zip(added, disturbance, strict=True)]
 
-    height = maximum(z, maximum(0.5 * params.ground_effect, _TINY))
     lift = params.thrust_scale * (1.0 - params.battery_sag * (1.0 - maximum(charge, 0.0)))
-    lift = lift / (1.0 - (0.25 * params.ground_effect / height) ** 2)
-    limits = params.max_tilt_rate, params.max_tilt_rate, params.max_yaw_rate
-    rates_cmd = [
-        maximum(-high, minimum(w, high)) for w, high in zip(command[1:], limits, strict=True)
-    ]
-    thrust_cmd = maximum(params.min_thrust, minimum(command[0], params.max_thrust))
+    if not _are_zero(params.ground_effect):
+        height = maximum(z, maximum(0.5 * params.ground_effect, _TINY))
+        lift = lift / (1.0 - (0.25 * params.ground_effect / height) ** 2)
+    thrust_cmd, *rates_cmd = command
     tilt = params.rate_time_constant
     lags = tilt, tilt, tilt * params.yaw_time_ratio
     accelerations = [(c - w) / lag for c, w, lag in zip(rates_cmd, rates, lags, strict=True)]
@@ -306,6 +306,13 @@ def actuated_derivatives(
     ]
 
 
+def limit_command(command: Any, params: QuadrotorParams) -> list[Any]:
+    """Returns the components (4) of a command within the limits of the vehicle."""
+    limits = params.max_tilt_rate, params.max_tilt_rate, params.max_yaw_rate
+    rates = [maximum(-high, minimum(w, high)) for w, high in zip(command[1:], limits, strict=True)]
+    return [maximum(params.min_thrust, minimum(command[0], params.max_thrust)), *rates]
+
+
 def mix(thrust: Any, torque: Any, params: QuadrotorParams) -> list[Any]:
     """Returns the forces (4) [N] of the rotors for a thrust [N] and a torque (3) [N m] about B.
 
@@ -332,6 +339,11 @@ def torques(forces: Any, params: QuadrotorParams) -> tuple[Any, Any, Any]:
         params.arm[0] * (rear_left + rear_right - front_left - front_right),
         params.torque_ratio * (front_left + rear_right - rear_left - front_right),
     )
+
+
+def _are_zero(*numbers: Any) -> bool:
+    """Checks if numbers are floats and zero: AutoDiffXd keeps its derivatives."""
+    return all(isinstance(x, float) and x == 0.0 for x in numbers)
 
 
 def _dot(a: Any, b: Any) -> Any:
@@ -475,6 +487,8 @@ def QuadrotorPlant_(T):
             command, wind, disturbance = (self._read(index, context) for index in range(3))
             params = self._parameters[0].config(context)
             parameters = [getattr(params, name) for name in _IDEAL] if self._ideal else [params]
+            if not self._ideal:
+                command = limit_command(command, params)
             inputs.set_value((command, *parameters, wind, disturbance))
 
         def _read(self, index, context):
