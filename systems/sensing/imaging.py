@@ -112,7 +112,7 @@ class AutoExposure(LeafSystem):
 
     def _light(self, context: Context) -> np.ndarray:
         image = np.asarray(cast(Any, self.get_input_port().Eval(context)).data)
-        return self._falloff * _LIGHT[image[..., :3]]
+        return self._falloff * cv2.LUT(np.ascontiguousarray(image[..., :3]), _LIGHT)
 
     def _target(self, context: Context) -> float:
         """Returns the gain [EV] with which the image would have the target's mean light."""

@@ -117,10 +117,11 @@ def row_bands(
 def _pixel_slopes(
     focal: tuple[float, float], center: tuple[float, float], size: tuple[int, int], lens: Any
 ) -> NDArray[np.float32]:
-    """Returns the slopes (H, W, 2) of the rays of pixels; NaN beyond the lens."""
+    """Returns the slopes (2, H, W) of the rays of pixels; NaN beyond the lens."""
     pixels = np.stack(np.meshgrid(*(np.arange(n) + 0.5 for n in size)), axis=-1)
     points = (pixels - center) / focal
-    return (points if lens is None else lens.slopes(points)).astype(np.float32)
+    slopes = points if lens is None else lens.slopes(points)
+    return np.moveaxis(slopes, -1, 0).astype(np.float32)
 
 
 def blurred_light(
@@ -140,16 +141,17 @@ def blurred_light(
     focal = np.float32([camera_info.focal_x(), camera_info.focal_y()])
     center = camera_info.center_x(), camera_info.center_y()
     size = camera_info.width(), camera_info.height()
-    slopes = _pixel_slopes((float(focal[0]), float(focal[1])), center, size, lens)
+    x, y = _pixel_slopes((float(focal[0]), float(focal[1])), center, size, lens)
     near = np.isfinite(view.depth) & (view.depth > 0.0)
-    inverse = np.where(near, 1.0 / np.where(near, view.depth, 1.0), 0.0)[..., None]
+    inverse = np.where(near, 1.0 / np.where(near, view.depth, 1.0), np.float32(0.0))
     ends = []
     for X_CtC in X_CtCs:
         R, t = (np.float32(part) for part in (X_CtC.rotation().matrix(), X_CtC.translation()))
-        p_CtQ = slopes @ R[:, :2].T + R[:, 2] + inverse * t  # over depth
-        slope = p_CtQ[..., :2] / p_CtQ[..., 2:].clip(1e-3)
-        ends.append(focal * (slope if lens is None else lens.project(slope)))
-    motion = np.nan_to_num(ends[1] - ends[0]).astype(np.float32)  # (H, W, 2) [px]
+        # Planes one by one: several times faster than points.
+        p_CtQ = [R[k, 0] * x + R[k, 1] * y + (R[k, 2] + t[k] * inverse) for k in range(3)]
+        slope = np.stack(p_CtQ[:2], axis=-1) / p_CtQ[2].clip(1e-3)[..., None]
+        ends.append(slope if lens is None else lens.project(slope))
+    motion = np.nan_to_num(focal * (ends[1] - ends[0])).astype(np.float32)  # (H, W, 2) [px]
     light = light_of_color(255.0 * view.color.clip(0.0))
     count = min(_MAX_EXPOSURES, math.ceil(float(np.abs(motion).max()))) | 1
     grid = np.stack(np.meshgrid(*(np.arange(n, dtype=np.float32) for n in size)), axis=-1)
