@@ -1,7 +1,7 @@
 """State estimates as motion capture and visual-inertial odometry make them.
 
-Estimators sample at their rate; the estimate is held in between, and as late as their latency. All
-random numbers follow from the seed, the system's name and the sample's number.
+Estimators sample at their rate, and hold the estimate in between. Random numbers follow from the
+seed, the system's name and the sample's number.
 """
 
 import math
@@ -60,7 +60,8 @@ class VisualInertial(Config):
 
     # [Hz] Estimates per second.
     rate: float = bounded(50.0, "[1, 1000] Hz")
-    # [s] Age of the estimate, rounded up to whole samples.
+    # [s] Age of position and velocity, rounded up to whole samples; attitude and body rates follow
+    # the IMU.
     latency: float = bounded(0.0, "[0, 1] s")
     # [m/sqrt(s)] Random walk of the position along each axis.
     position_walk: float = bounded(0.01, "[0, 10] m/sqrt(s)")
@@ -98,7 +99,7 @@ def drift_step(config: VisualInertial, errors: Any, v_WB: Any, normal: Any, jump
     """
     period = 1.0 / config.rate
     root, keep = math.sqrt(period), math.exp(-period / config.memory)
-    drifted = _drifted_velocity(config, errors[3], v_WB)
+    drifted = drifted_velocity(config, errors[3], v_WB)
     walk, jump = root * config.position_walk, config.jump_size * jumps
     position = [
         errors[k] + period * (drifted[k] - v_WB[k]) + walk * normal[k] + jump * normal[9 + k]
@@ -114,7 +115,7 @@ def stationary(config: VisualInertial) -> list[float]:
     return [*[config.velocity_noise] * 3, config.direction_noise, config.height_noise]
 
 
-def _drifted_velocity(config: VisualInertial, yaw: Any, v_WB: Any) -> tuple[Any, Any, Any]:
+def drifted_velocity(config: VisualInertial, yaw: Any, v_WB: Any) -> tuple[Any, Any, Any]:
     """Returns the components (3) of the velocity with an error of yaw [rad] and the scale."""
     xp, (x, y, z) = array_namespace(yaw), v_WB
     scale = 1.0 + config.scale_bias
@@ -125,7 +126,7 @@ def _drifted_velocity(config: VisualInertial, yaw: Any, v_WB: Any) -> tuple[Any,
 def drifting_state(config: VisualInertial, state: np.ndarray, errors: Any) -> np.ndarray:
     """Returns the estimate (13,) of a state (13,) with the errors (9) of `drift_step`."""
     px, py, pz, vx, vy, vz, w, x, y, z, *w_WB_B = state.tolist()
-    drifted = _drifted_velocity(config, errors[3], (vx, vy, vz))
+    drifted = drifted_velocity(config, errors[3], (vx, vy, vz))
     half = 0.5 * (errors[3] + errors[7])
     cos, sin = math.cos(half), math.sin(half)
     return np.array(
@@ -159,6 +160,8 @@ class _Estimator(LeafSystem):
 
     draws: ClassVar[int]
     """Number of draws from N(0, 1) for each sample."""
+    num_late: ClassVar[int] = 13
+    """Number of entries of the state, from the first, that are as old as the latency."""
 
     def first(self, state: np.ndarray) -> np.ndarray:
         """Returns the memory at time 0."""
@@ -183,7 +186,8 @@ class _Estimator(LeafSystem):
         state, memory = vector_input(self, "state", context), np.array(old.value(2))
         estimate, memory = self.estimate(state, memory, normal)
         queue = np.concatenate([old.value(1), estimate])
-        discrete_state.set_value(0, queue[:13])
+        late, current = queue[: self.num_late], estimate[self.num_late :]
+        discrete_state.set_value(0, np.concatenate([late, current]))
         discrete_state.set_value(1, queue[13:])
         discrete_state.set_value(2, memory)
 
@@ -201,6 +205,7 @@ class VisualInertialEstimator(_Estimator):
     """
 
     draws = 13
+    num_late = 6
 
     def __init__(self, config: VisualInertial, seed: int) -> None:
         super().__init__(config, seed, 9)
