@@ -1,5 +1,5 @@
-"""What realism costs: policies fly P01 to P12 ideally, under `realistic` and `harsh`, and under each
-section of `harsh` alone.
+"""Measures what realism costs: policies fly P01 to P12 ideally, under `realistic` and `harsh`, and
+under each section of `harsh` alone.
 
     python -m splatpilot.analysis.realism out/realism --policies planner,diffaero --seeds 10
 

@@ -319,9 +319,7 @@ def FlatnessController_(T):
             heading = None if heading is None else heading[0]
             if config.disturbance_time > 0.0:
                 old = context.get_discrete_state()
-                observed = observe_disturbance(
-                    state, old.value(1), old.value(0)[0], config, params
-                )
+                observed = observe_disturbance(state, old.value(1), old.value(0)[0], config, params)
                 discrete_state.set_value(1, observed)
                 a_WB = a_WB - observed[3:]
             # At rest arctan2 of AutoDiffXd warns of a division, and returns zero derivatives.
