@@ -138,7 +138,7 @@ def blurred_light(
     Args:
         X_CtCs: poses of C in the frames of the camera at the start and the end of the exposure.
     """
-    focal = np.float32([camera_info.focal_x(), camera_info.focal_y()])
+    focal = np.array([camera_info.focal_x(), camera_info.focal_y()], dtype=np.float32)
     center = camera_info.center_x(), camera_info.center_y()
     size = camera_info.width(), camera_info.height()
     x, y = _pixel_slopes((float(focal[0]), float(focal[1])), center, size, lens)
@@ -146,24 +146,19 @@ def blurred_light(
     inverse = np.where(near, 1.0 / np.where(near, view.depth, 1.0), np.float32(0.0))
     ends = []
     for X_CtC in X_CtCs:
-        R, t = (np.float32(part) for part in (X_CtC.rotation().matrix(), X_CtC.translation()))
+        R, t = X_CtC.rotation().matrix().tolist(), X_CtC.translation().tolist()
         # Planes one by one: several times faster than points.
-        p_CtQ = [R[k, 0] * x + R[k, 1] * y + (R[k, 2] + t[k] * inverse) for k in range(3)]
+        p_CtQ = [R[k][0] * x + R[k][1] * y + (R[k][2] + t[k] * inverse) for k in range(3)]
         slope = np.stack(p_CtQ[:2], axis=-1) / p_CtQ[2].clip(1e-3)[..., None]
         ends.append(slope if lens is None else lens.project(slope))
     motion = np.nan_to_num(focal * (ends[1] - ends[0])).astype(np.float32)  # (H, W, 2) [px]
     light = light_of_color(255.0 * view.color.clip(0.0))
     count = min(_MAX_EXPOSURES, math.ceil(float(np.abs(motion).max()))) | 1
-    grid = np.stack(np.meshgrid(*(np.arange(n, dtype=np.float32) for n in size)), axis=-1)
+    u, v = np.meshgrid(*(np.arange(n, dtype=np.float32) for n in size))
     mean = np.zeros_like(light)
-    for s in ((k + 0.5) / count - 0.5 for k in range(count)):
-        mean += cv2.remap(
-            light,
-            grid - np.float32(s) * motion,
-            None,  # pyright: ignore[reportArgumentType]
-            cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_REPLICATE,
-        )
+    for s in (np.float32((k + 0.5) / count - 0.5) for k in range(count)):
+        maps = u - s * motion[..., 0], v - s * motion[..., 1]
+        mean += cv2.remap(light, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return mean / np.float32(count)
 
 

@@ -268,10 +268,7 @@ def actuated_derivatives(
         if disturbance is not None:
             added = [a + more for a, more in zip(added, disturbance, strict=True)]
 
-    lift = params.thrust_scale * (1.0 - params.battery_sag * (1.0 - maximum(charge, 0.0)))
-    if not _are_zero(params.ground_effect):
-        height = maximum(z, maximum(0.5 * params.ground_effect, _TINY))
-        lift = lift / (1.0 - (0.25 * params.ground_effect / height) ** 2)
+    lift = lift_factor(z, charge, params)
     thrust_cmd, *rates_cmd = command
     tilt = params.rate_time_constant
     lags = tilt, tilt, tilt * params.yaw_time_ratio
@@ -304,6 +301,15 @@ def actuated_derivatives(
             for u, now in zip(targets, actuators, strict=False)
         ),
     ]
+
+
+def lift_factor(z: Any, charge: Any, params: QuadrotorParams) -> Any:
+    """Returns the thrust over that of the nominal vehicle, at a height z [m] and a charge."""
+    lift = params.thrust_scale * (1.0 - params.battery_sag * (1.0 - maximum(charge, 0.0)))
+    if not _are_zero(params.ground_effect):
+        height = maximum(z, maximum(0.5 * params.ground_effect, _TINY))
+        lift = lift / (1.0 - (0.25 * params.ground_effect / height) ** 2)
+    return lift
 
 
 def limit_command(command: Any, params: QuadrotorParams) -> list[Any]:
@@ -421,7 +427,7 @@ def QuadrotorPlant_(T):
             self._parameters = [ConfigParameter(self, T, params, names)]
             for name, size in (("command", 4), ("wind", 3), ("disturbance", 3)):
                 self.DeclareVectorInputPort(name, size)
-            actuators = [] if self._ideal else _hovering_actuators(params)
+            actuators = [] if self._ideal else hovering_actuators(params)
             self._size = 13 + len(actuators)
             index = self.DeclareContinuousState(BasicVector_[T]([*start, *actuators]))
             if self._ideal:
@@ -503,7 +509,7 @@ def QuadrotorPlant_(T):
     return QuadrotorPlant
 
 
-def _hovering_actuators(params: QuadrotorParams) -> list[float]:
+def hovering_actuators(params: QuadrotorParams) -> list[float]:
     """Returns the charge at the start, and the thrust or the rotor speeds of hovering."""
     if params.model == "rotors":
         force = 0.25 * params.mass * params.gravity / params.thrust_coefficient
