@@ -1,5 +1,6 @@
 """Splat kernels for CPUs."""
 
+from collections.abc import Sequence
 import enum
 from typing import Annotated
 
@@ -98,6 +99,16 @@ def render_baked(scene: BakedScene, renderer: Renderer, moving: Gaussians, camer
     """
     Writes the median depth, and unless they are None color and alpha, of the scene and of
     moving Gaussians among it.
+    """
+
+class BatchRenderer:
+    """Threads that render one image each."""
+
+    def __init__(self, threads: int, simd: str = '') -> None: ...
+
+def render_views(renderer: BatchRenderer, scenes: Sequence[BakedScene], cameras: Sequence[Camera], *, backgrounds: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], color: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None, None), order='C', device='cpu')] | None, depth: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None, None), order='C', device='cpu')], alpha: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None, None), order='C', device='cpu')] | None) -> None:
+    """
+    Writes the images of N cameras as render_baked does, camera i in scene i.
     """
 
 class SurfelFrame:

@@ -31,6 +31,7 @@ using Values = Floats<nb::ndim<1>>;
 using ValuesOut = Writable<nb::ndim<1>>;
 using Pixels = Floats<nb::ndim<3>>;
 using Output = Writable<nb::ndim<3>>;
+using Views = Writable<nb::ndim<4>>;
 using Background = Floats<nb::shape<3>>;
 using Rows3 = Floats<nb::shape<-1, 3>>;
 using Rows4 = Floats<nb::shape<-1, 4>>;

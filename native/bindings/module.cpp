@@ -115,27 +115,69 @@ RenderedFrame render(Renderer& renderer, const Gaussians& gaussians,
   return RenderedFrame(renderer.render(gaussians.arrays(), make_camera(parameters), out, keep));
 }
 
+// The camera and the image of one view of a baked scene; without color, depth alone.
+struct BakedView {
+  Camera camera;
+  Image image;
+
+  BakedView(CameraParameters parameters, float* color, float* depth, float* alpha,
+            const float* background)
+      : image{color, 3, depth, 1, DepthMode::kMedian, alpha, {}} {
+    if (!color) parameters.eps2d = kDepthBlur;
+    camera = make_camera(parameters);
+    camera.depth_alone = !color;
+    std::copy_n(background, 3, image.background);
+  }
+};
+
 void render_baked(const BakedScene& scene, Renderer& renderer, const Gaussians& moving,
-                  const CameraParameters& given, const Background& background,
+                  const CameraParameters& parameters, const Background& background,
                   const std::optional<Output>& color, const Output& depth,
                   const std::optional<Output>& alpha) {
   require(color.has_value() == alpha.has_value(), "color and alpha are rendered together");
-  CameraParameters parameters = given;
   const int height = parameters.height, width = parameters.width;
-  if (!color) parameters.eps2d = kDepthBlur;
-  Camera camera = make_camera(parameters);
-  camera.depth_alone = !color;
   check_size(depth, height, width, 1);
-  Image out{nullptr, 3, depth.data(), 1, DepthMode::kMedian, nullptr, {}};
   if (color) {
     check_size(*color, height, width, 3);
     check_size(*alpha, height, width, 1);
-    out.color = color->data();
-    out.alpha = alpha->data();
-    std::copy_n(background.data(), 3, out.background);
   }
+  const BakedView view(parameters, color ? color->data() : nullptr, depth.data(),
+                       alpha ? alpha->data() : nullptr, background.data());
   const Exclusive use(renderer);
-  renderer.render(scene.arrays(), moving.arrays(), camera, out);
+  renderer.render(scene.arrays(), moving.arrays(), view.camera, view.image);
+}
+
+// Views of several scenes, each rendered by one thread.
+void render_views(BatchRenderer& renderer, const std::vector<const BakedScene*>& scenes,
+                  const std::vector<CameraParameters>& cameras, const Rows3& backgrounds,
+                  const std::optional<Views>& color, const Views& depth,
+                  const std::optional<Views>& alpha) {
+  require(color.has_value() == alpha.has_value(), "color and alpha are rendered together");
+  const size_t count = scenes.size();
+  require(cameras.size() == count, "scenes and cameras differ in number");
+  require_rows(count, "scenes and images differ in number", backgrounds, depth);
+  const auto check = [&](const Views& images, size_t channels) {
+    require_rows(count, "scenes and images differ in number", images);
+    for (const CameraParameters& camera : cameras) {
+      require(images.shape(1) == static_cast<size_t>(camera.height) &&
+                  images.shape(2) == static_cast<size_t>(camera.width) &&
+                  images.shape(3) == channels,
+              "an image has the wrong shape");
+    }
+  };
+  check(depth, 1);
+  if (color) {
+    check(*color, 3);
+    check(*alpha, 1);
+  }
+  const size_t pixels = depth.shape(1) * depth.shape(2);
+  const nb::gil_scoped_release release;
+  renderer.for_each(count, [&](Renderer& thread, size_t i) {
+    const BakedView view(cameras[i], color ? color->data() + 3 * pixels * i : nullptr,
+                         depth.data() + pixels * i, alpha ? alpha->data() + pixels * i : nullptr,
+                         backgrounds.data() + 3 * i);
+    thread.render(scenes[i]->arrays(), GaussianArrays{}, view.camera, view.image);
+  });
 }
 
 void raster_backward(Renderer& renderer, const RenderedFrame& rendered, const Pixels& v_image,
@@ -261,6 +303,17 @@ NB_MODULE(_native, m) {
         nb::kw_only(), "background"_a, "color"_a.none(), "depth"_a, "alpha"_a.none(),
         "Writes the median depth, and unless they are None color and alpha, of the scene and of\n"
         "moving Gaussians among it.");
+
+  nb::class_<BatchRenderer>(m, "BatchRenderer", "Threads that render one image each.")
+      .def(
+          "__init__",
+          [](BatchRenderer* self, int threads, const std::string& simd) {
+            new (self) BatchRenderer(checked_threads(threads), simd);
+          },
+          "threads"_a, "simd"_a = "");
+  m.def("render_views", &render_views, "renderer"_a, "scenes"_a, "cameras"_a, nb::kw_only(),
+        "backgrounds"_a, "color"_a.none(), "depth"_a, "alpha"_a.none(),
+        "Writes the images of N cameras as render_baked does, camera i in scene i.");
 
   bind_surfels(m);
   bind_fitting(m);

@@ -2,6 +2,7 @@
 #pragma once
 
 #include <atomic>
+#include <deque>
 #include <functional>
 #include <memory>
 #include <mutex>
@@ -151,6 +152,48 @@ class Renderer {
   std::vector<BinTask> bin_tasks_;
   std::vector<PairGradient> pair_gradients_;
   std::vector<SurfelGradient> surfel_pair_gradients_;
+};
+
+// Renderers of one thread each, for images at once. One call at a time.
+class BatchRenderer {
+ public:
+  BatchRenderer(int threads, const std::string& simd_level) : pool_(threads) {
+    for (int i = 0; i < threads; ++i) {
+      idle_.push_back(&renderers_.emplace_back(1, simd_level));
+    }
+  }
+
+  // Calls draw(renderer, i) for each image i in [0, count), on all threads.
+  template <typename Draw>
+  void for_each(size_t count, const Draw& draw) {
+    const std::scoped_lock<std::mutex> call(call_mutex_);
+    pool_.for_each(count, [&](size_t i) {
+      const Loan loan(*this);
+      draw(*loan.renderer, i);
+    });
+  }
+
+ private:
+  // A renderer that no other thread uses.
+  struct Loan {
+    BatchRenderer& batch;
+    Renderer* renderer;
+
+    explicit Loan(BatchRenderer& owner) : batch(owner) {
+      const std::scoped_lock<std::mutex> lock(batch.idle_mutex_);
+      renderer = batch.idle_.back();
+      batch.idle_.pop_back();
+    }
+    ~Loan() {
+      const std::scoped_lock<std::mutex> lock(batch.idle_mutex_);
+      batch.idle_.push_back(renderer);
+    }
+  };
+
+  std::mutex call_mutex_, idle_mutex_;
+  ThreadPool pool_;
+  std::deque<Renderer> renderers_;
+  std::vector<Renderer*> idle_;
 };
 
 }  // namespace splatpilot

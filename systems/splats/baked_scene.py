@@ -89,9 +89,13 @@ def create_renderer(threads: int = 1, simd: str = "") -> _native.Renderer:
         simd: one of `splatpilot._native.simd_levels()`; by default the environment variable
             SPLATPILOT_SIMD, else the widest of this machine.
     """
+    return _native_threads(_native.Renderer, threads, simd)
+
+
+def _native_threads(make: Any, threads: int, simd: str) -> Any:
     require(1 <= int(threads) <= 1024, "threads", "in [1, 1024]", threads)
     try:
-        return _native.Renderer(int(threads), simd or os.environ.get("SPLATPILOT_SIMD", ""))
+        return make(int(threads), simd or os.environ.get("SPLATPILOT_SIMD", ""))
     except RuntimeError as error:
         raise OSError(f"{error}; request fewer threads") from error
 
@@ -208,39 +212,145 @@ class BakedScene:
         max_depth: float = np.inf,
     ) -> list[NDArray[np.float32]]:
         """Returns depth (H, W, 1) and, with a background, color (H, W, 3) and alpha (H, W, 1)."""
-        K = check_camera(K, width, height, near, far)
-        require(max_depth > 0, "max_depth", "> 0 m", max_depth)
-        lens = {} if distortion is None else native_lens(distortion, K, width, height)._asdict()
-        camera = _native.Camera(
-            K=K,
-            X_CW=np.ascontiguousarray(X_WC.inverse().GetAsMatrix4()),
-            width=width,
-            height=height,
-            near_plane=near,
-            far_plane=far,
-            eps2d=EPS2D,
-            max_depth=max_depth,
-            antialiased=self._antialiased,
-            **lens,
-        )
+        camera = _checked_camera(K, width, height, near, far, max_depth, distortion)
         depth, color, alpha = (np.empty((height, width, n), np.float32) for n in (1, 3, 1))
         whole = background is not None
         _native.render_baked(
             self._scene,
             self._renderer,
             _native_gaussians(moving),
-            camera,
+            camera(self._antialiased, X_WC),
             background=background if whole else np.zeros(3, np.float32),
             color=color if whole else None,
             depth=depth,
             alpha=alpha if whole else None,
         )
         images = [depth, color, alpha] if whole else [depth]
-        if distortion is not None:
-            hidden = hidden_pixels(distortion, K, width, height)
-            for image in images:
-                image.reshape(-1, image.shape[2])[hidden] = 0.0
+        _hide_pixels(images, distortion, K)
         return images
+
+
+class BatchRenderer:
+    """Renders views of baked scenes, several at once, each on one thread.
+
+    Images are bitwise those of `BakedScene`. The N cameras differ in scene and pose alone. See
+    `create_renderer` for the arguments.
+    """
+
+    def __init__(self, threads: int = 1, simd: str = ""):
+        self._renderer = _native_threads(_native.BatchRenderer, threads, simd)
+
+    def render(
+        self,
+        scenes: Sequence[BakedScene],
+        K: ArrayLike,
+        width: int,
+        height: int,
+        X_WCs: "Sequence[RigidTransform]",
+        near: float = 0.01,
+        far: float = 1e10,
+        backgrounds: Sequence[Background] | None = None,
+        distortion: Distortion | None = None,
+        max_depth: float = np.inf,
+    ) -> RenderedView:
+        """Renders color (N, H, W, 3), median depth and alpha (N, H, W); see `BakedScene.render`.
+
+        Args:
+            scenes: of the N views.
+            X_WCs: poses of the N cameras.
+            backgrounds: of the N views; black if None.
+        """
+        backgrounds = [BLACK] * len(scenes) if backgrounds is None else backgrounds
+        maps = {i: b for i, b in enumerate(backgrounds) if isinstance(b, EnvironmentMap)}
+        colors = np.array([BLACK if i in maps else b for i, b in enumerate(backgrounds)], "f4")
+        shape = len(scenes), 3
+        valid = colors.reshape(-1, 3).shape == shape and np.isfinite(colors).all()
+        require(valid, "backgrounds", f"{shape} finite numbers", colors.tolist())
+        options = {"backgrounds": colors, "distortion": distortion, "max_depth": max_depth}
+        depth, color, alpha = self._render(scenes, K, width, height, X_WCs, near, far, **options)
+        for i, environment in maps.items():
+            view = RenderedView(color[i], depth[i, ..., 0], alpha[i, ..., 0])
+            color[i] = put_behind(view, environment, np.asarray(K), X_WCs[i], distortion).color
+        return RenderedView(color, depth[..., 0], alpha[..., 0])
+
+    def render_depth(
+        self, scenes: Sequence[BakedScene], *cameras: Any, **options: Any
+    ) -> NDArray[np.float32]:
+        """Renders the median depth (N, H, W) [m] alone, which is faster.
+
+        The arguments are those of `render` but `backgrounds`; all beyond `far` by name.
+        """
+        return self._render(scenes, *cameras, **options)[0][..., 0]
+
+    def _render(
+        self,
+        scenes: Sequence[BakedScene],
+        K: ArrayLike,
+        width: int,
+        height: int,
+        X_WCs: "Sequence[RigidTransform]",
+        near: float = 0.01,
+        far: float = 1e10,
+        backgrounds: NDArray[np.float32] | None = None,
+        distortion: Distortion | None = None,
+        max_depth: float = np.inf,
+    ) -> list[NDArray[np.float32]]:
+        """Returns depth and, with backgrounds, color and alpha, each (N, H, W, channels)."""
+        count = len(scenes)
+        require(len(X_WCs) == count, "the number of poses", f"that of scenes, {count}", len(X_WCs))
+        camera = _checked_camera(K, width, height, near, far, max_depth, distortion)
+        cameras = [
+            camera(scene._antialiased, X_WC) for scene, X_WC in zip(scenes, X_WCs, strict=True)
+        ]
+        depth, color, alpha = (np.empty((count, height, width, n), np.float32) for n in (1, 3, 1))
+        whole = backgrounds is not None
+        _native.render_views(
+            self._renderer,
+            [scene._scene for scene in scenes],
+            cameras,
+            backgrounds=backgrounds if whole else np.zeros((count, 3), np.float32),
+            color=color if whole else None,
+            depth=depth,
+            alpha=alpha if whole else None,
+        )
+        images = [depth, color, alpha] if whole else [depth]
+        _hide_pixels(images, distortion, K)
+        return images
+
+
+def _checked_camera(
+    K: ArrayLike,
+    width: int,
+    height: int,
+    near: float,
+    far: float,
+    max_depth: float,
+    distortion: Distortion | None,
+) -> "Callable[[bool, RigidTransform], _native.Camera]":
+    """Checks a camera; returns the function from antialiasing and the pose to the native one."""
+    K = check_camera(K, width, height, near, far)
+    require(max_depth > 0, "max_depth", "> 0 m", max_depth)
+    lens = {} if distortion is None else native_lens(distortion, K, width, height)._asdict()
+    options = {"near_plane": near, "far_plane": far, "eps2d": EPS2D, "max_depth": max_depth, **lens}
+
+    def make(antialiased: bool, X_WC: "RigidTransform") -> _native.Camera:
+        X_CW = np.ascontiguousarray(X_WC.inverse().GetAsMatrix4())
+        size = {"width": width, "height": height, "antialiased": antialiased}
+        return _native.Camera(K=K, X_CW=X_CW, **size, **options)
+
+    return make
+
+
+def _hide_pixels(
+    images: list[NDArray[np.float32]], distortion: Distortion | None, K: ArrayLike
+) -> None:
+    """Sets pixels without a ray to zero, in images (..., H, W, channels)."""
+    if distortion is None:
+        return
+    for image in images:
+        height, width, channels = image.shape[-3:]
+        hidden = hidden_pixels(distortion, np.asarray(K, float), width, height)
+        image.reshape(-1, height * width, channels)[:, hidden] = 0.0
 
 
 def bake(scene: BakedScene | GaussianScene) -> BakedScene:

@@ -15,8 +15,10 @@ from reference_rasterizer import median_depth
 
 from splatpilot.systems.collision.shapes import MovingSpheres
 from splatpilot.systems.splats import rasterize
+from splatpilot.systems.splats.background import EnvironmentMap
 from splatpilot.systems.splats.baked_scene import (
     BakedScene,
+    BatchRenderer,
     MovingGaussians,
     PlacedGaussians,
     create_renderer,
@@ -365,3 +367,31 @@ def test_antialiased_scenes_are_rendered_as_they_were_trained():
     alpha = rasterized(scene, rasterize_mode="antialiased", render_mode="RGB")[1]
     np.testing.assert_allclose(found.alpha, np.asarray(alpha).reshape(HEIGHT, WIDTH), atol=2e-5)
     assert found.alpha.mean() < 0.5 * plain.alpha.mean()
+
+
+@pytest.mark.parametrize("lens", [None, Distortion("opencv", [-0.1, 0.01])])
+def test_images_of_a_batch_are_those_of_each_view(lens):
+    scenes = [BakedScene(random_scene(sh_degree=1, count=500 + k)) for k in range(3)]
+    scenes = [scenes[k % 3] for k in range(7)]
+    X_WCs = [RigidTransform([0.1 * k, 0.0, -0.05 * k]) @ X_WC for k in range(7)]
+    sky = EnvironmentMap(np.random.default_rng(0).uniform(size=(4, 8, 3)).astype(np.float32))
+    backgrounds = [sky, *((0.1 * k, 0.2, 0.3) for k in range(6))]
+    camera = K, WIDTH, HEIGHT
+    batch = BatchRenderer(3)
+    options = {"distortion": lens, "max_depth": 9.0}
+    views = batch.render(scenes, *camera, X_WCs, 0.1, 50.0, backgrounds, **options)
+    depths = batch.render_depth(scenes, *camera, X_WCs, 0.1, 50.0, **options)
+    for k, (scene, X) in enumerate(zip(scenes, X_WCs, strict=True)):
+        view = scene.render(*camera, X, 0.1, 50.0, backgrounds[k], **options)
+        for name in view._fields:
+            np.testing.assert_array_equal(getattr(views, name)[k], getattr(view, name))
+        alone = scene.render_depth(*camera, X, 0.1, 50.0, **options)
+        np.testing.assert_array_equal(depths[k], alone)
+
+
+def test_refuses_batches_of_different_lengths():
+    scene, batch = BakedScene(random_scene(count=10)), BatchRenderer(2)
+    with pytest.raises(ValueError, match="number of poses must be that of scenes, 2, got 1"):
+        batch.render_depth([scene] * 2, K, WIDTH, HEIGHT, [X_WC])
+    with pytest.raises(ValueError, match=r"backgrounds must be \(2, 3\) finite numbers"):
+        batch.render([scene] * 2, K, WIDTH, HEIGHT, [X_WC] * 2, backgrounds=[(0.0, 0.0, 0.0)])
