@@ -146,7 +146,7 @@ class _Rotors(LeafSystem):
             self._params.mass,
             rotation_matrices(vector_input(self, "state", context)[6:10]),
         )
-        force = mass * (np.array(self._rates(context)[3:6]) + [0.0, 0.0, self._params.gravity])
+        force = mass * np.add(self._rates(context)[3:6], [0.0, 0.0, self._params.gravity])
         applied = ExternallyAppliedSpatialForce()
         applied.body_index, applied.p_BoBq_B = self._body, np.zeros(3)
         air = force - sum(self._thrusts(context)) * R_WB[:, 2]
