@@ -18,7 +18,6 @@ from datetime import date
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 import yaml
 
 from splatpilot.analysis.benchmark.study import StudyConfig
@@ -214,10 +213,9 @@ def realism(results: Results) -> str:
             if row["policy"] == policy
         }
         lines.append([f"`{policy}`", *(cells.get(name, "") for name in header)])
-    about = results.about
-    flown = (
-        f"Test seeds from 1000 on, flown on {about['date']} by program `{about['program'][:7]}`:"
-    )
+    flown_on, program = results.about["date"], results.about["program"][:7]
+    seeds = "Successes/flights, test seeds from 1000 on"
+    flown = f"{seeds}, flown on {flown_on} by program `{program}`:"
     return f"{flown}\n\n{table(['policy', *header], lines)}"
 
 

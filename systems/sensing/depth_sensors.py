@@ -18,16 +18,16 @@ from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 class Stereo(Config):
     """A stereo camera, see `stereo_depth`.
 
-    The defaults are a RealSense D435 at 848x480: baseline, size and search range of Intel's data
-    sheet (337029), noise and step of "Tuning depth cameras for best performance" (Grunnet-Jepsen,
-    Sweetser, Woodfill).
+    The baseline of 50 mm and the size of 848x480 are those that Intel gives for the RealSense D435
+    ("Tuning depth cameras for best performance"). Noise, step, range and window are our choice, of
+    a usual size.
     """
 
     # [m] Distance of the right camera from the left, which takes the depth image.
     baseline: float = bounded(0.05, "(0, 1] m")
     # [px] Width of the images that are matched.
     width: int = bounded(848, "[1, 8192] px")
-    # [px] Standard deviation of disparities; 0.05 on a textured wall, 0.08 is usual.
+    # [px] Standard deviation of disparities; below 0.1 on textured surfaces.
     noise: float = bounded(0.08, "[0, 10] px")
     # [px] Step of disparities; 0 is without rounding.
     step: float = bounded(0.03125, "[0, 1] px")
@@ -41,9 +41,8 @@ class Stereo(Config):
 class TimeOfFlightErrors(Config):
     """Errors of a time-of-flight camera, see `time_of_flight_depth`.
 
-    The defaults are a pmd flexx2 (IRS2381C) indoors: 1 % noise of its data sheet, and a range of
-    7 m. Errors in corners are a few centimeters at 2 m (Fuchs, "Multipath interference compensation
-    in time-of-flight camera images", ICPR 2010).
+    The defaults are our choice for a small camera indoors: 1 % noise, a range of 7 m, and errors of
+    a few centimeters in corners at 2 m.
     """
 
     # [-] Standard deviation of the noise, relative to depth.

@@ -29,8 +29,7 @@ class TrueState(Config):
 class MotionCapture(Config):
     """Poses of a motion capture system, and a gyroscope, see `MotionCaptureEstimator`.
 
-    Accuracy and latency are those that OptiTrack states for its Prime 13: 0.2 mm, 0.5 deg, 4.2 ms;
-    the latency here adds the link to the vehicle.
+    The defaults are our choice, for a room with calibrated cameras and a radio link.
     """
 
     # [Hz] Frames per second.
@@ -53,9 +52,9 @@ class MotionCapture(Config):
 class VisualInertial(Config):
     """The drift of visual-inertial odometry and errors with memory, see `drifting_state`.
 
-    Position and yaw drift as published systems do on the EuRoC data sets: about 0.1 m and 1 deg
-    after 80 s (Delmerico and Scaramuzza, ICRA 2018). Errors of velocity, direction and height are
-    those of the training of "Flying in Clutter" (arXiv 2512.17349).
+    Errors of velocity, direction and height are those of the training of "Flying in Clutter on
+    Monocular RGB" (arXiv 2512.17349). Drift, jumps and memory are our choice: about 0.1 m and 1 deg
+    after 80 s.
     """
 
     # [Hz] Estimates per second.
