@@ -35,6 +35,9 @@ class Stereo(Config):
     max_disparity: float = bounded(126.0, "(0, inf) px")
     # [px] Standard deviation of the window of matching, within which errors agree.
     window: float = bounded(9.0, "[0, 100] px")
+    # Renders and matches the images of both cameras, instead of the formula of errors; see
+    # `matched_depth`. It takes several times as long as the flight.
+    matching: bool = False
 
 
 @dataclass
@@ -59,6 +62,7 @@ class TimeOfFlightErrors(Config):
     mixed_pixels: float = bounded(0.5, "[0, 1]")
 
 
+_BLOCK = 5  # [px] matched windows
 _EDGE = 0.2  # [-] relative step of depth from which neighbors are different surfaces
 
 
@@ -104,6 +108,40 @@ def stereo_depth(
     valid = (disparity > 0.0) & (disparity <= sensor.max_disparity) & (seen >= 0.0) & ~hidden
     z = fb / np.where(disparity > 0.0, disparity, 1.0)
     return np.where(measured, np.where(valid, z, np.inf), depth)
+
+
+def matched_depth(
+    left: np.ndarray, right: np.ndarray, sensor: Stereo, camera: OnboardCamera
+) -> np.ndarray:
+    """Computes the depth (H, W) [m] of a camera by semi-global matching of two gray images (h,
+    `width`) of uint8, from the camera and from `baseline` to its right.
+
+    Each pixel has the depth in its middle. Those without a match are not measured.
+    """
+    count = 16 * int(np.ceil(sensor.max_disparity / 16.0))
+    matcher = cv2.StereoSGBM.create(
+        numDisparities=count,
+        blockSize=_BLOCK,
+        P1=8 * _BLOCK**2,
+        P2=32 * _BLOCK**2,
+        disp12MaxDiff=1,
+        uniquenessRatio=10,
+        speckleWindowSize=50,
+        speckleRange=2,
+        mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
+    )
+    # Without a margin, OpenCV leaves out the left border as wide as `count`.
+    left, right = (
+        cv2.copyMakeBorder(x, 0, 0, count, 0, cv2.BORDER_CONSTANT) for x in (left, right)
+    )
+    disparity = matcher.compute(left, right)[:, count:] / np.float32(16.0)
+    rows, columns = (
+        ((np.arange(n) + 0.5) * size / n).astype(int)
+        for n, size in zip((camera.height, camera.width), disparity.shape, strict=True)
+    )
+    disparity = disparity[np.ix_(rows, columns)]
+    fb = camera.focal_x * sensor.width / camera.width * sensor.baseline
+    return np.where(disparity > 0.0, fb / np.where(disparity > 0.0, disparity, 1.0), np.inf)
 
 
 def time_of_flight_depth(

@@ -35,7 +35,8 @@ from splatpilot.systems.vehicle.quadrotor import (
 )
 from splatpilot.systems.vehicle.state import QuadrotorState, pose_from_state, rotation_matrices
 
-_FORCES = Value[list[ExternallyAppliedSpatialForce]]
+_FORCES: Any = Value[list[ExternallyAppliedSpatialForce]]
+_ACCELERATIONS: Any = Value[list[SpatialAcceleration]]
 
 
 class QuadrotorAirframe(Diagram):
@@ -76,10 +77,10 @@ class QuadrotorAirframe(Diagram):
         (x, y), turn = params.arm, params.torque_ratio
         rotors = ((x, y, turn), (-x, y, -turn), (-x, -y, turn), (x, -y, -turn))  # as `mix`
         propellers = [
-            PropellerInfo(body.index(), RigidTransform([px, py, 0.0]), 1.0, moment)
+            PropellerInfo(body.index(), RigidTransform(np.array([px, py, 0.0])), 1.0, moment)
             for px, py, moment in rotors
         ]
-        propeller = builder.AddNamedSystem("propellers", Propeller(propellers))
+        propeller: Any = builder.AddNamedSystem("propellers", Propeller(propellers))
         builder.Connect(plant.get_body_poses_output_port(), propeller.get_body_poses_input_port())
 
         # Rotors, drag and state.
@@ -114,7 +115,7 @@ class _Rotors(LeafSystem):
         self._params, self._body = params, body
         for name, size in (("state", 13), ("command", 4), ("wind", 3), ("disturbance", 3)):
             self.DeclareVectorInputPort(name, size)
-        self.DeclareContinuousState(BasicVector(hovering_actuators(params)))
+        self.DeclareContinuousState(BasicVector(np.array(hovering_actuators(params))))
         state = self.GetInputPort("state").ticket()
         self.DeclareVectorOutputPort("thrusts", 4, self._calc_thrusts, {self.xc_ticket(), state})
         calc = weak_callback(self._calc_air)
@@ -136,10 +137,10 @@ class _Rotors(LeafSystem):
         return actuated_derivatives(state, command, self._params, *others)
 
     def DoCalcTimeDerivatives(self, context: Context, derivatives: ContinuousState) -> None:
-        derivatives.get_mutable_vector().SetFromVector(self._rates(context)[13:])
+        derivatives.get_mutable_vector().SetFromVector(np.array(self._rates(context)[13:]))
 
     def _calc_thrusts(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._thrusts(context))
+        output.SetFromVector(np.array(self._thrusts(context)))
 
     def _calc_air(self, context: Context, output: AbstractValue) -> None:
         mass, R_WB = (
@@ -161,9 +162,7 @@ class _Motion(LeafSystem):
         super().__init__()
         self._body = body
         plant_state = self.DeclareVectorInputPort("plant_state", 13)
-        accelerations = self.DeclareAbstractInputPort(
-            "accelerations", Value[list[SpatialAcceleration]]()
-        )
+        accelerations = self.DeclareAbstractInputPort("accelerations", _ACCELERATIONS())
         self.DeclareVectorOutputPort("state", 13, self._calc_state, {plant_state.ticket()})
         self.DeclareVectorOutputPort(
             "acceleration", 3, self._calc_acceleration, {accelerations.ticket()}
