@@ -120,6 +120,10 @@ class FlatnessControllerConfig(Config):
         shortest = 2.0 / self.tilt_gain
         condition = f"at least 2 / tilt_gain = {shortest:.3g} s"
         require_field(self, "lookahead", self.lookahead >= shortest, condition)
+        # A faster estimate would take the vehicle's own lag for a disturbance.
+        slow = self.disturbance_time == 0.0 or self.disturbance_time >= self.lookahead
+        condition = f"0 or at least lookahead, {self.lookahead} s"
+        require_field(self, "disturbance_time", slow, condition)
 
 
 def flatness_command(

@@ -189,6 +189,12 @@ def test_the_disturbance_estimate_removes_the_error_of_the_hover_thrust(time):
     assert states[-1, 2] == pytest.approx(2.0 - sag, abs=1e-3)
 
 
+def test_a_disturbance_estimate_faster_than_the_vehicle_is_refused():
+    match = r"disturbance_time must be 0 or at least lookahead, 0\.4 s, got 0\.1"
+    with pytest.raises(ValueError, match=match):
+        FlatnessController(FlatnessControllerConfig(disturbance_time=0.1))
+
+
 def test_the_disturbance_estimate_does_not_wind_up_while_thrust_saturates():
     flights = [
         fly(
