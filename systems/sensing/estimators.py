@@ -116,7 +116,7 @@ def stationary(config: VisualInertial) -> list[float]:
 
 def drifted_velocity(config: VisualInertial, yaw: Any, v_WB: Any) -> tuple[Any, Any, Any]:
     """Returns the components (3) of the velocity with an error of yaw [rad] and the scale."""
-    xp, (x, y, z) = array_namespace(yaw), v_WB
+    xp, (x, y, z) = math if isinstance(yaw, float) else array_namespace(yaw), v_WB
     scale = 1.0 + config.scale_bias
     cos, sin = scale * xp.cos(yaw), scale * xp.sin(yaw)
     return cos * x - sin * y, sin * x + cos * y, scale * z

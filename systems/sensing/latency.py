@@ -176,7 +176,8 @@ class DecisionDelay(LeafSystem):
     def _calc(self, context: Context, output: BasicVector) -> None:
         newest = context.get_discrete_state(0).GetAtIndex(0)
         decision = self._decision(context)
-        rows = np.append(decision, context.get_discrete_state(1).value()).reshape(-1, len(decision))
+        rows = np.concatenate([decision, context.get_discrete_state(1).value()])
+        rows = rows.reshape(-1, len(decision))
         for back in range(self._count):
             time = newest - back * self._period
             delay = self._delays[round(time / self._period) % CYCLE]

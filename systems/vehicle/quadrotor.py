@@ -270,9 +270,12 @@ def actuated_derivatives(
 
     lift = lift_factor(z, charge, params)
     thrust_cmd, *rates_cmd = command
-    tilt = params.rate_time_constant
-    lags = tilt, tilt, tilt * params.yaw_time_ratio
-    accelerations = [(c - w) / lag for c, w, lag in zip(rates_cmd, rates, lags, strict=True)]
+    lag = params.rate_time_constant
+    accelerations = [
+        (rates_cmd[0] - rates[0]) / lag,
+        (rates_cmd[1] - rates[1]) / lag,
+        (rates_cmd[2] - rates[2]) / (lag * params.yaw_time_ratio),
+    ]
     if params.model == "rotors":
         forces = [lift * params.thrust_coefficient * u * u for u in actuators]
         thrust = sum(forces) / params.mass
@@ -349,7 +352,7 @@ def torques(forces: Any, params: QuadrotorParams) -> tuple[Any, Any, Any]:
 
 def _are_zero(*numbers: Any) -> bool:
     """Checks if numbers are floats and zero: AutoDiffXd keeps its derivatives."""
-    return all(isinstance(x, float) and x == 0.0 for x in numbers)
+    return type(numbers[0]) is float and not any(numbers)
 
 
 def _dot(a: Any, b: Any) -> Any:
