@@ -98,7 +98,7 @@ def drift_step(config: VisualInertial, errors: Any, v_WB: Any, normal: Any, jump
     """
     period = 1.0 / config.rate
     root, keep = math.sqrt(period), math.exp(-period / config.memory)
-    drifted = drifted_velocity(config, errors[3], v_WB)
+    drifted = _drifted_velocity(config, errors[3], v_WB)
     walk, jump = root * config.position_walk, config.jump_size * jumps
     position = [
         errors[k] + period * (drifted[k] - v_WB[k]) + walk * normal[k] + jump * normal[9 + k]
@@ -114,7 +114,7 @@ def stationary(config: VisualInertial) -> list[float]:
     return [*[config.velocity_noise] * 3, config.direction_noise, config.height_noise]
 
 
-def drifted_velocity(config: VisualInertial, yaw: Any, v_WB: Any) -> tuple[Any, Any, Any]:
+def _drifted_velocity(config: VisualInertial, yaw: Any, v_WB: Any) -> tuple[Any, Any, Any]:
     """Returns the components (3) of the velocity with an error of yaw [rad] and the scale."""
     xp, (x, y, z) = math if isinstance(yaw, float) else array_namespace(yaw), v_WB
     scale = 1.0 + config.scale_bias
@@ -125,7 +125,7 @@ def drifted_velocity(config: VisualInertial, yaw: Any, v_WB: Any) -> tuple[Any, 
 def drifting_state(config: VisualInertial, state: np.ndarray, errors: Any) -> np.ndarray:
     """Returns the estimate (13,) of a state (13,) with the errors (9) of `drift_step`."""
     px, py, pz, vx, vy, vz, w, x, y, z, *w_WB_B = state.tolist()
-    drifted = drifted_velocity(config, errors[3], (vx, vy, vz))
+    drifted = _drifted_velocity(config, errors[3], (vx, vy, vz))
     half = 0.5 * (errors[3] + errors[7])
     cos, sin = math.cos(half), math.sin(half)
     return np.array(

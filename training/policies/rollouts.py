@@ -1,20 +1,13 @@
 """Rollouts of many vehicles whose loss is differentiated through the dynamics of flight."""
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
 from splatpilot.systems.common.validation import Config, bounded, require_field
-from splatpilot.systems.policies.checkpoint import PolicyCheckpoint
-from splatpilot.systems.sensing.estimators import (
-    VisualInertial,
-    drift_step,
-    drifted_velocity,
-    stationary,
-)
 from splatpilot.systems.sensing.noise import ObservationNoise
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 from splatpilot.training.policies.augmentation import check_noise, depth_noise, noisy_depth
@@ -24,7 +17,7 @@ from splatpilot.training.policies.evaluation import (
     FlightTraining,
     render_depth,
 )
-from splatpilot.training.policies.networks import TrainableNetwork, load_weights
+from splatpilot.training.policies.networks import TrainableNetwork
 from splatpilot.training.policies.training_worlds import STARTS, WorldBatch
 from splatpilot.training.policies.vehicles import (
     History,
@@ -78,18 +71,11 @@ class RolloutConfig(Config):
     averaging: float = bounded(0.5, "(0, inf) s")
     # [s] Maximum time of flights.
     longest: float = bounded(15.0, "(0, inf) s")
-    # [m/s^2] Standard deviation, along each axis, of a vehicle's constant acceleration by wind and
-    # an error of the hover thrust.
-    disturbance: float = bounded(0.0, "[0, inf) m/s^2")
-    # [s] Range of the delay of each decision, up to the time between two.
-    decision_delay: list[float] = bounded(lambda: [0.0, 0.0], "[0, 1] s")
-    # Errors of the state that the policy observes; none if left out.
-    estimator: VisualInertial | None = None
     # Noise and delay of images.
     noise: ObservationNoise = field(default_factory=depth_noise)
 
     def check(self) -> None:
-        for name in ("speed", "lag", "decision_delay"):
+        for name in ("speed", "lag"):
             limits = getattr(self, name)
             valid = len(limits) == 2 and limits[0] <= limits[1]
             require_field(self, name, valid, "two numbers in ascending order")
@@ -106,9 +92,6 @@ class Episodes(NamedTuple):
     memory: Tensor  # (N, H)
     speed: Tensor  # (N,) [m/s]
     age: Tensor  # (N,) [s]
-    disturbance: Tensor  # (N, 3) [m/s^2]
-    a_cmd: Tensor  # (N, 3) [m/s^2], the last
-    errors: Tensor  # (N, 9) of the estimate, see `drift_step`
 
 
 class DifferentiableRollout:
@@ -140,46 +123,23 @@ class DifferentiableRollout:
     def _uniform(self, *size: int) -> Tensor:
         return torch.rand(*size, generator=self.generator, device=self.generator.device)
 
-    def _normal(self, *size: int) -> Tensor:
-        return torch.randn(*size, generator=self.generator, device=self.generator.device)
-
-    def _between(self, limits: list[float], *size: int) -> Tensor:
-        return limits[0] + (limits[1] - limits[0]) * self._uniform(*size)
-
-    def _observed(self, vehicle: PointMass, errors: Tensor) -> tuple[PointMass, Tensor]:
-        """Returns the vehicle as estimated, and the errors at the next step."""
-        if self.config.estimator is None:
-            return vehicle, errors
-        config = replace(self.config.estimator, rate=self.learner.rate)
-        now = errors.unbind(1)
-        with torch.no_grad():
-            jumps = self._uniform(len(errors)) < config.jump_rate / config.rate
-            normal = self._normal(12, len(errors)).unbind()
-            following = drift_step(config, now, vehicle.v.unbind(1), normal, jumps)
-        height = torch.stack([torch.zeros_like(now[8]), torch.zeros_like(now[8]), now[8]], 1)
-        v = torch.stack(drifted_velocity(config, now[3], vehicle.v.unbind(1)), 1) + errors[:, 4:7]
-        p, yaw = vehicle.p + errors[:, :3] + height, vehicle.yaw + now[3] + now[7]
-        return vehicle._replace(p=p, v=v, yaw=yaw), torch.stack(following, 1)
-
     def _new_episodes(self) -> Episodes:
         """Begins episodes anywhere in any world, in flight roughly along the path to the goal."""
         config, N = self.config, self.config.environments
+
+        def between(limits: list[float], *size: int) -> Tensor:
+            return limits[0] + (limits[1] - limits[0]) * self._uniform(*size)
 
         def draw(count: int) -> Tensor:
             return (self._uniform(N) * count).long().clamp(max=count - 1)
 
         world = draw(len(self.worlds))
         p = self.worlds.starts_W[world, draw(STARTS)]
-        speed = self._between(config.speed, N)
+        speed = between(config.speed, N)
         direction = self.worlds.direction(p, world)
         v = direction * (speed * self._uniform(N))[:, None] + 0.3 * (self._uniform(N, 3) - 0.5)
         yaw = torch.atan2(direction[:, 1], direction[:, 0]) + 1.0 * (self._uniform(N) - 0.5)
-        vehicle = PointMass(p, v, torch.zeros_like(p), yaw, self._between(config.lag, N, 1))
-        errors, disturbance = torch.zeros(N, 9, device=p.device), torch.zeros_like(p)
-        if config.estimator is not None:
-            errors[:, 4:] = self._normal(N, 5) * torch.tensor(stationary(config.estimator))
-        if config.disturbance > 0.0:
-            disturbance = config.disturbance * self._normal(N, 3)
+        vehicle = PointMass(p, v, torch.zeros_like(p), yaw, between(config.lag, N, 1))
         return Episodes(
             vehicle,
             History.start(vehicle, config.noise, self.learner.rate, self.generator),
@@ -188,9 +148,6 @@ class DifferentiableRollout:
             self.learner.initial_memory(N),
             speed,
             self._uniform(N) * config.longest,
-            disturbance,
-            torch.zeros_like(p),
-            errors,
         )
 
     def _restart_ended(self, episodes: Episodes) -> Episodes:
@@ -210,7 +167,7 @@ class DifferentiableRollout:
         forget = 1.0 - math.exp(-dt / config.averaging)
         with torch.no_grad():
             episodes = self._restart_ended(self.episodes)
-        vehicle, history, world, v_mean, memory, speed, age, disturbance, last, errors = episodes
+        vehicle, history, world, v_mean, memory, speed, age = episodes
         p_WG = worlds.p_WG[world]
         vehicles, v_means, headings = [vehicle], [], []
         for step in range(config.steps):
@@ -218,25 +175,16 @@ class DifferentiableRollout:
             past = history.seen(config.noise, learner.rate, age + step * dt)
             depth = render_depth(past, worlds.geometry, learner.rays, world)
             depth = noisy_depth(depth, config.noise, self.generator)
-            estimate, errors = self._observed(vehicle, errors)
-            seen = Observation(depth, estimate, p_WG, speed)
+            seen = Observation(depth, vehicle, p_WG, speed)
             a_cmd, heading, memory = learner.decide(seen, memory)
-            applied = a_cmd
-            if config.decision_delay[1] > 0.0:  # The mean of the step stands for both commands.
-                late = self._between(config.decision_delay, len(a_cmd), 1) / dt
-                applied = torch.lerp(a_cmd, last, late.clamp(max=1.0))
-                last = a_cmd
-            if config.disturbance > 0.0:
-                applied = applied + disturbance
-            vehicle = vehicle.decay_gradient(keep).step(applied, dt, heading)
+            vehicle = vehicle.decay_gradient(keep).step(a_cmd, dt, heading)
             v_mean = torch.lerp(v_mean, vehicle.v, forget)
             vehicles.append(vehicle)
             v_means.append(v_mean)
             if heading is not None:
                 headings.append(heading)
         age = age + config.steps * dt
-        rest = disturbance, last, errors
-        episodes = Episodes(vehicle, history, world, v_mean, memory, speed, age, *rest)
+        episodes = Episodes(vehicle, history, world, v_mean, memory, speed, age)
         self.episodes = map_tensors(Tensor.detach, episodes)
         p, v = (torch.cat([getattr(step, name) for step in vehicles[1:]]) for name in "pv")
         a = torch.stack([step.a for step in vehicles])  # (steps + 1, N, 3)
@@ -270,8 +218,6 @@ class RolloutTraining(FlightTraining):
     """A training run by differentiable rollouts."""
 
     rollout: RolloutConfig = field(default_factory=RolloutConfig)
-    # File of this policy's weights to continue from; none if empty.
-    begin: str = ""
     # [-] Fraction of the updates, at first, in worlds without obstacles.
     empty: float = bounded(0.0, "[0, 1)")
 
@@ -282,9 +228,6 @@ class RolloutTrainer(FlightTrainer):
     def __init__(self, policy: str, learner: Learner, config: RolloutTraining) -> None:
         super().__init__(config, learner, config.rollout.noise)
         self.policy = policy
-        if config.begin:
-            checkpoint = PolicyCheckpoint.load(config.begin, policy, learner.network.spec)
-            load_weights(learner.network, checkpoint)
         self._first_update = round(config.empty * config.schedule.updates)
         batches = [self.worlds]
         if self._first_update:
