@@ -50,8 +50,7 @@ class QuadrotorAirframe(Diagram):
 
     The ports are those of `QuadrotorPlant`. Motion follows from Drake's equations of rigid bodies
     and from the forces of its `Propeller`; motors, mixer, rate controller, drag and battery are
-    those of `actuated_derivatives`. The body may be welded to others, or carry sensors, in a copy
-    of this diagram. Supports the scalar float.
+    those of `actuated_derivatives`. Supports the scalar float.
     """
 
     def __init__(
