@@ -177,7 +177,7 @@ class StereoMatcher(LeafSystem):
         """Returns the cameras of the images, by the names of the inputs."""
         height = round(camera.height * sensor.width / camera.width)
         left = replace(camera, width=sensor.width, height=height)
-        X_BR = camera.mount() @ RigidTransform([sensor.baseline, 0.0, 0.0])
+        X_BR = camera.mount() @ RigidTransform(np.array([sensor.baseline, 0.0, 0.0]))
         return {"left_image": left, "right_image": replace(left, X_BC=Transform(X_BR))}
 
     def _calc(self, context: Context, output: AbstractValue) -> None:
