@@ -1,11 +1,12 @@
 """Stores the results of studies, and renders the tables of pages from them.
 
 python docs/results.py keep out/study development
+python docs/results.py keep_realism out/realism
 python docs/results.py write
 
 `docs/results/NAME.csv` has a row for each policy, speed and scenario. `NAME.yaml` has the command,
 the date, the machine and the program. A table of a page is between `<!-- table KIND NAME -->` and
-`<!-- end of table -->`, where KIND is policies, scenarios, pairs or paper.
+`<!-- end of table -->`, where KIND is policies, paper or realism.
 """
 
 import argparse
@@ -14,11 +15,9 @@ import re
 import shlex
 from collections.abc import Callable, Sequence
 from datetime import date
-from itertools import combinations
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 import yaml
 
 from splatpilot.analysis.benchmark.study import StudyConfig
@@ -28,8 +27,6 @@ from splatpilot.analysis.benchmark.tables import (
     PAPER_FLIGHTS,
     Interval,
     cluster_interval,
-    holm,
-    sign_flip,
     wilson_interval,
 )
 from splatpilot.diagrams.scenarios import benchmark_scenarios
@@ -77,6 +74,25 @@ def keep(study: Path, name: str) -> None:
         "program": folder.program(),
     }
     (RESULTS / f"{name}.yaml").write_text(yaml.safe_dump(about, sort_keys=False, width=1000))
+
+
+def keep_realism(folders: Sequence[Path]) -> None:
+    """Stores the results of `splatpilot.analysis.realism`, of different policies in each folder."""
+    rows = [
+        row
+        for folder in folders
+        for row in csv.DictReader((folder / "realism.csv").read_text().splitlines())
+    ]
+    order = list(dict.fromkeys(row["conditions"] for row in rows))
+    rows.sort(key=lambda row: order.index(row["conditions"]))
+    with (RESULTS / "realism.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+    flown = (folders[0] / "realism.csv").stat().st_mtime
+    program = StudyFolder(folders[0] / "ideal").program()["splatpilot"]
+    about = {"date": date.fromtimestamp(flown).isoformat(), "program": program}
+    (RESULTS / "realism.yaml").write_text(yaml.safe_dump(about, sort_keys=False))
 
 
 def _processor() -> str:
@@ -186,33 +202,21 @@ def policies(results: Results) -> str:
     return results.description() + "\n" + table(header, lines)
 
 
-def scenarios(results: Results) -> str:
-    header = ["scenario", *map(label, results.entries)]
+def realism(results: Results) -> str:
+    """Renders successes and flights by policy and condition of `splatpilot.analysis.realism`."""
+    header = list(dict.fromkeys(row["conditions"] for row in results.rows))
     lines = []
-    for name in results.scenarios:
-        cells = [results.select(entry, [name])[0] for entry in results.entries]
-        lines.append([name, *(f"{cell['successes']}/{cell['flights']}" for cell in cells)])
-    return table(header, lines)
-
-
-def pairs(results: Results) -> str:
-    def rates(entry: tuple[str, str]) -> np.ndarray:
-        return np.array([int(r["successes"]) / int(r["flights"]) for r in results.select(entry)])
-
-    compared = list(combinations(results.entries, 2))
-    differences = [rates(first) - rates(second) for first, second in compared]
-    p_values = holm([sign_flip(d) for d in differences])
-    header = ["policies", "difference of success", "scenarios better, worse", "p"]
-    lines = [
-        [
-            f"{label(first)}; {label(second)}",
-            f"{d.mean():+.0%}",
-            f"{np.sum(d > 0)}, {np.sum(d < 0)}",
-            f"{p:.3f}" if p >= 0.001 else f"{p:.0e}",
-        ]
-        for (first, second), d, p in zip(compared, differences, p_values, strict=True)
-    ]
-    return table(header, lines)
+    for policy in dict.fromkeys(row["policy"] for row in results.rows):
+        cells = {
+            row["conditions"]: f"{row['successes']}/{row['flights']}"
+            for row in results.rows
+            if row["policy"] == policy
+        }
+        lines.append([f"`{policy}`", *(cells.get(name, "") for name in header)])
+    flown_on, program = results.about["date"], results.about["program"][:7]
+    seeds = "Successes/flights, test seeds from 1000 on"
+    flown = f"{seeds}, flown on {flown_on} by program `{program}`:"
+    return f"{flown}\n\n{re.sub(' *[|] *', '|', table(['policy', *header], lines))}"
 
 
 def paper(results: Results) -> str:
@@ -245,9 +249,8 @@ def paper(results: Results) -> str:
 
 KINDS: dict[str, Callable[[Results], str]] = {
     "policies": policies,
-    "scenarios": scenarios,
-    "pairs": pairs,
     "paper": paper,
+    "realism": realism,
 }
 
 
@@ -274,5 +277,8 @@ if __name__ == "__main__":
     keep_parser = commands.add_parser("keep", help=keep.__doc__)
     keep_parser.add_argument("study", type=Path)
     keep_parser.add_argument("name")
+    realism_parser = commands.add_parser("keep_realism", help=keep_realism.__doc__)
+    realism_parser.add_argument("folders", type=Path, nargs="+")
     options = vars(parser.parse_args())
-    {"keep": keep, "write": write}[options.pop("command")](**options)
+    known = {"keep": keep, "keep_realism": keep_realism, "write": write}
+    known[options.pop("command")](**options)

@@ -51,6 +51,7 @@ from .systems.splats.render_engine import SplatRenderEngine, gaussian_properties
 from .systems.splats.scene import GaussianScene
 from .systems.splats.splat_camera import SplatCamera
 from .systems.splats.splat_files import read_ply, write_ply
+from .systems.vehicle.airframe import QuadrotorAirframe
 from .systems.vehicle.flatness import FlatnessController, FlatnessController_
 from .systems.vehicle.quadrotor import (
     QuadrotorParams,
@@ -123,6 +124,7 @@ __all__ = [
     "Outcome",
     "PrivilegedPlanner",
     "Px4Sih",
+    "QuadrotorAirframe",
     "QuadrotorGeometry",
     "QuadrotorParams",
     "QuadrotorPlant",

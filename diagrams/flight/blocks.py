@@ -19,7 +19,13 @@ from splatpilot.systems.common.validation import require, require_type
 from splatpilot.systems.messaging.failsafe import FiniteVector
 from splatpilot.systems.policies.hypotheses import HypothesisSelector, num_hypotheses_in
 from splatpilot.systems.policies.velocity import VelocityTracker
-from splatpilot.systems.sensing.imaging import AutoExposure, Compression, DepthSensor
+from splatpilot.systems.sensing.depth_sensors import Stereo
+from splatpilot.systems.sensing.imaging import (
+    AutoExposure,
+    Compression,
+    DepthSensor,
+    StereoMatcher,
+)
 from splatpilot.systems.sensing.latency import DecisionDelay, DelayedPose, FrameTimes
 from splatpilot.systems.sensing.noise import ColorNoise, DepthNoise
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
@@ -324,12 +330,24 @@ def AddObservation(
     builder.Connect(pose, camera.GetInputPort("body_pose"))
     rendered = {"depth_image_32f" if name == "depth_grid" else name for name in names}
     images = {name: camera.GetOutputPort(name) for name in sorted(rendered)}
+    depth_sensor = imaging.depth_sensor("depth_grid" in names)
+    if isinstance(depth_sensor, Stereo) and depth_sensor.matching and "depth_image_32f" in images:
+        matcher = builder.AddNamedSystem("depth_sensor", StereoMatcher(depth_sensor, config))
+        for name, each in StereoMatcher.cameras(depth_sensor, config).items():
+            eye = builder.AddNamedSystem(
+                f"policy_camera_{name}", make_onboard_camera(each, world, age)
+            )
+            _connect_start_pose(builder, f"policy_camera_{name}", eye, each, state, frames)
+            builder.Connect(pose, eye.GetInputPort("body_pose"))
+            builder.Connect(eye.GetOutputPort("color_image"), matcher.GetInputPort(name))
+        images["depth_image_32f"] = matcher.get_output_port()
+        depth_sensor = None
 
     # Sensor and noise.
     period, is_grid = decision_period(scenario, policy), "depth_grid" in names
     rest = config, 1 / period, scenario.seed
     changes: list[tuple[str, System]] = []
-    if depth_sensor := imaging.depth_sensor(is_grid):
+    if depth_sensor is not None:
         changes.append(("depth_sensor", DepthSensor(depth_sensor, *rest)))
     if noise.changes_depth:
         changes.append(("depth_noise", DepthNoise(noise, *rest)))

@@ -1,22 +1,23 @@
 """State estimates as motion capture and visual-inertial odometry make them.
 
-Estimators sample at their rate; the estimate is held in between, and as late as their latency. All
-random numbers follow from the seed, the system's name and the sample's number.
+Estimators sample at their rate, and hold the estimate in between. Random numbers follow from the
+seed, the system's name and the sample's number.
 """
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 from scipy.spatial.transform import Rotation
+from scipy.special import ndtr
 
 from splatpilot.systems.common.drake import vector_input
 from splatpilot.systems.common.validation import Config, bounded
-from splatpilot.systems.sensing.imu import sample_generator
+from splatpilot.systems.sensing.imu import white_noise
 from splatpilot.systems.vehicle.quadrotor import hover_state
-from splatpilot.systems.vehicle.state import QuadrotorState, stack
+from splatpilot.systems.vehicle.state import QuadrotorState, array_namespace
 
 
 @dataclass
@@ -28,8 +29,7 @@ class TrueState(Config):
 class MotionCapture(Config):
     """Poses of a motion capture system, and a gyroscope, see `MotionCaptureEstimator`.
 
-    Accuracy and latency are those that OptiTrack states for its Prime 13: 0.2 mm, 0.5 deg, 4.2 ms;
-    the latency here adds the link to the vehicle.
+    The defaults are our choice, for a room with calibrated cameras and a radio link.
     """
 
     # [Hz] Frames per second.
@@ -52,14 +52,15 @@ class MotionCapture(Config):
 class VisualInertial(Config):
     """The drift of visual-inertial odometry and errors with memory, see `drifting_state`.
 
-    Position and yaw drift as published systems do on the EuRoC data sets: about 0.1 m and 1 deg
-    after 80 s (Delmerico and Scaramuzza, ICRA 2018). Errors of velocity, direction and height are
-    those of the training of "Flying in Clutter" (arXiv 2512.17349).
+    Errors of velocity, direction and height are those of the training of "Flying in Clutter on
+    Monocular RGB" (arXiv 2512.17349). Drift, jumps and memory are our choice: about 0.1 m and 1 deg
+    after 80 s.
     """
 
     # [Hz] Estimates per second.
     rate: float = bounded(50.0, "[1, 1000] Hz")
-    # [s] Age of the estimate, rounded up to whole samples.
+    # [s] Age of position and velocity, rounded up to whole samples; attitude and body rates follow
+    # the IMU.
     latency: float = bounded(0.0, "[0, 1] s")
     # [m/sqrt(s)] Random walk of the position along each axis.
     position_walk: float = bounded(0.01, "[0, 10] m/sqrt(s)")
@@ -81,8 +82,8 @@ class VisualInertial(Config):
     memory: float = bounded(0.5, "(0, 100] s")
 
 
-def drift_step(config: VisualInertial, errors: Any, v_WB: Any, normal: Any, uniform: Any) -> Any:
-    """Returns the errors (..., 9) of the next sample.
+def drift_step(config: VisualInertial, errors: Any, v_WB: Any, normal: Any, jumps: Any) -> list:
+    """Returns the components (9) of the errors of the next sample: floats, arrays or tensors.
 
     They are those of the position (3) and yaw (1), which add up, and of velocity (3), direction (1)
     and height (1), which are Ornstein-Uhlenbeck processes: with a = exp(-T / memory),
@@ -90,40 +91,51 @@ def drift_step(config: VisualInertial, errors: Any, v_WB: Any, normal: Any, unif
         x' = a x + sigma sqrt(1 - a^2) n.
 
     Args:
-        v_WB: (..., 3) [m/s].
-        normal, uniform: (..., 12) and (...), drawn from N(0, 1) and U(0, 1).
+        errors: components (9).
+        v_WB: components (3) [m/s].
+        normal: components (12), drawn from N(0, 1).
+        jumps: 1 with the probability `jump_rate` / `rate`, else 0.
     """
     period = 1.0 / config.rate
-    jump = config.jump_size * (uniform < config.jump_rate * period)[..., None]
-    step = math.sqrt(period) * config.position_walk * normal[..., :3] + jump * normal[..., 9:]
-    drifted = (1.0 + config.scale_bias) * rotate_yaw(errors[..., 3], v_WB)
-    position = errors[..., :3] + period * (drifted - v_WB) + step
-    yaw = errors[..., 3:4] + math.sqrt(period) * config.yaw_walk * normal[..., 3:4]
-    keep = math.exp(-period / config.memory)
-    fresh = math.sqrt(1.0 - keep**2) * stationary(config) * normal[..., 4:9]
-    return np.concatenate([position, yaw, keep * errors[..., 4:] + fresh], axis=-1)
+    root, keep = math.sqrt(period), math.exp(-period / config.memory)
+    drifted = _drifted_velocity(config, errors[3], v_WB)
+    walk, jump = root * config.position_walk, config.jump_size * jumps
+    position = [
+        errors[k] + period * (drifted[k] - v_WB[k]) + walk * normal[k] + jump * normal[9 + k]
+        for k in range(3)
+    ]
+    fresh, sigmas = math.sqrt(1.0 - keep**2), stationary(config)
+    rest = [keep * errors[k] + fresh * sigmas[k - 4] * normal[k] for k in range(4, 9)]
+    return [*position, errors[3] + root * config.yaw_walk * normal[3], *rest]
 
 
-def stationary(config: VisualInertial) -> np.ndarray:
-    """Returns the standard deviations (5,) of velocity, direction and height."""
-    return np.array([*[config.velocity_noise] * 3, config.direction_noise, config.height_noise])
+def stationary(config: VisualInertial) -> list[float]:
+    """Returns the standard deviations (5) of velocity, direction and height."""
+    return [*[config.velocity_noise] * 3, config.direction_noise, config.height_noise]
 
 
-def rotate_yaw(yaw: Any, vectors: Any) -> np.ndarray:
-    """Rotates vectors (..., 3) about z by yaw (...) [rad]."""
-    cos, sin, (x, y, z) = np.cos(yaw), np.sin(yaw), (vectors[..., k] for k in range(3))
-    return stack([cos * x - sin * y, sin * x + cos * y, z])
+def _drifted_velocity(config: VisualInertial, yaw: Any, v_WB: Any) -> tuple[Any, Any, Any]:
+    """Returns the components (3) of the velocity with an error of yaw [rad] and the scale."""
+    xp, (x, y, z) = math if isinstance(yaw, float) else array_namespace(yaw), v_WB
+    scale = 1.0 + config.scale_bias
+    cos, sin = scale * xp.cos(yaw), scale * xp.sin(yaw)
+    return cos * x - sin * y, sin * x + cos * y, scale * z
 
 
-def drifting_state(config: VisualInertial, state: np.ndarray, errors: np.ndarray) -> np.ndarray:
-    """Returns the estimate (13,) of a state (13,) with the errors (9,) of `drift_step`."""
-    p_WB, v_WB, q_WB, w_WB_B = QuadrotorState.of(state)
-    p_WB = p_WB + errors[:3] + [0.0, 0.0, errors[8]]
-    v_WB = (1.0 + config.scale_bias) * rotate_yaw(errors[3], v_WB) + errors[4:7]
-    half, (w, x, y, z) = 0.5 * (errors[3] + errors[7]), q_WB
+def drifting_state(config: VisualInertial, state: np.ndarray, errors: Any) -> np.ndarray:
+    """Returns the estimate (13,) of a state (13,) with the errors (9) of `drift_step`."""
+    px, py, pz, vx, vy, vz, w, x, y, z, *w_WB_B = state.tolist()
+    drifted = _drifted_velocity(config, errors[3], (vx, vy, vz))
+    half = 0.5 * (errors[3] + errors[7])
     cos, sin = math.cos(half), math.sin(half)
-    q_WB = np.array([cos * w - sin * z, cos * x - sin * y, cos * y + sin * x, cos * z + sin * w])
-    return QuadrotorState(p_WB, v_WB, q_WB, w_WB_B).to_vector()
+    return np.array(
+        [
+            *(px + errors[0], py + errors[1], pz + errors[2] + errors[8]),
+            *(v + error for v, error in zip(drifted, errors[4:7], strict=True)),
+            *(cos * w - sin * z, cos * x - sin * y, cos * y + sin * x, cos * z + sin * w),
+            *w_WB_B,
+        ]
+    )
 
 
 class _Estimator(LeafSystem):
@@ -145,30 +157,36 @@ class _Estimator(LeafSystem):
         self.DeclareInitializationDiscreteUpdateEvent(self._begin)
         self.DeclarePeriodicDiscreteUpdateEvent(1.0 / config.rate, 0.0, self._sample)
 
-    def first(self, state: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    draws: ClassVar[int]
+    """Number of draws from N(0, 1) for each sample."""
+    num_late: ClassVar[int] = 13
+    """Number of entries of the state, from the first, that are as old as the latency."""
+
+    def first(self, state: np.ndarray) -> np.ndarray:
         """Returns the memory at time 0."""
         raise NotImplementedError
 
     def estimate(
-        self, state: np.ndarray, memory: np.ndarray, random: np.random.Generator
+        self, state: np.ndarray, memory: np.ndarray, normal: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Returns the estimate (13,) of a state (13,) and the next memory."""
         raise NotImplementedError
 
     def _begin(self, context: Context, discrete_state: DiscreteValues) -> None:
         state = vector_input(self, "state", context)
-        random = np.random.default_rng([self._seed, 0])
         discrete_state.set_value(0, state)
         discrete_state.set_value(1, np.tile(state, self._late))
-        discrete_state.set_value(2, self.first(state, random))
+        discrete_state.set_value(2, self.first(state))
 
     def _sample(self, context: Context, discrete_state: DiscreteValues) -> None:
         old = context.get_discrete_state()
-        random = sample_generator(self, self._seed, context.get_time(), self._config.rate)
+        rate, time = self._config.rate, context.get_time()
+        normal = white_noise(self, self._seed, time, rate, self.draws)
         state, memory = vector_input(self, "state", context), np.array(old.value(2))
-        estimate, memory = self.estimate(state, memory, random)
-        queue = np.append(old.value(1), estimate)
-        discrete_state.set_value(0, queue[:13])
+        estimate, memory = self.estimate(state, memory, normal)
+        queue = np.concatenate([old.value(1), estimate])
+        late, current = queue[: self.num_late], estimate[self.num_late :]
+        discrete_state.set_value(0, np.concatenate([late, current]))
         discrete_state.set_value(1, queue[13:])
         discrete_state.set_value(2, memory)
 
@@ -185,18 +203,23 @@ class VisualInertialEstimator(_Estimator):
     ``state`` (13): the true one, and the estimate.
     """
 
+    draws = 13
+    num_late = 6
+
     def __init__(self, config: VisualInertial, seed: int) -> None:
         super().__init__(config, seed, 9)
 
-    def first(self, state: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    def first(self, state: np.ndarray) -> np.ndarray:
+        random = np.random.default_rng([self._seed, 0])
         return np.append(np.zeros(4), stationary(self._config) * random.standard_normal(5))
 
     def estimate(
-        self, state: np.ndarray, memory: np.ndarray, random: np.random.Generator
+        self, state: np.ndarray, memory: np.ndarray, normal: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        normal, uniform = random.standard_normal(12), np.asarray(random.random())
-        errors = drift_step(self._config, memory, state[3:6], normal, uniform)
-        return drifting_state(self._config, state, memory), errors
+        config, errors, draws = self._config, memory.tolist(), normal.tolist()
+        jumps = float(ndtr(draws[12]) < config.jump_rate / config.rate)
+        following = drift_step(config, errors, state[3:6].tolist(), draws, jumps)
+        return drifting_state(config, state, errors), np.array(following)
 
 
 class MotionCaptureEstimator(_Estimator):
@@ -213,20 +236,22 @@ class MotionCaptureEstimator(_Estimator):
     last one.
     """
 
+    draws = 10
+
     def __init__(self, config: MotionCapture, seed: int) -> None:
         super().__init__(config, seed, 14)
 
-    def first(self, state: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    def first(self, state: np.ndarray) -> np.ndarray:
         return np.append(state, 1.0)  # the last estimate, and its age in frames
 
     def estimate(
-        self, state: np.ndarray, memory: np.ndarray, random: np.random.Generator
+        self, state: np.ndarray, memory: np.ndarray, normal: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        config, normal = self._config, random.standard_normal((3, 3))
+        config, lost, normal = self._config, ndtr(normal[9]), normal[:9].reshape(3, 3)
         last, missed = QuadrotorState.of(memory[:13]), memory[13]
         true = QuadrotorState.of(state)
         w_WB_B = true.w_WB_B + config.rate_noise * normal[2]
-        if random.random() < config.dropout:
+        if lost < config.dropout:
             kept = last._replace(w_WB_B=w_WB_B).to_vector()
             return kept, np.append(kept, missed + 1.0)
         p_WB = true.p_WB + config.position_noise * normal[0]

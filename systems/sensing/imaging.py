@@ -6,7 +6,9 @@ from typing import Any, cast
 
 import cv2
 import numpy as np
+from pydrake.common.schema import Transform
 from pydrake.common.value import AbstractValue, Value
+from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
@@ -15,6 +17,7 @@ from splatpilot.systems.common.validation import Config, bounded
 from splatpilot.systems.sensing.depth_sensors import (
     Stereo,
     TimeOfFlightErrors,
+    matched_depth,
     stereo_depth,
     time_of_flight_depth,
 )
@@ -112,7 +115,7 @@ class AutoExposure(LeafSystem):
 
     def _light(self, context: Context) -> np.ndarray:
         image = np.asarray(cast(Any, self.get_input_port().Eval(context)).data)
-        return self._falloff * _LIGHT[image[..., :3]]
+        return self._falloff * cv2.LUT(np.ascontiguousarray(image[..., :3]), _LIGHT)
 
     def _target(self, context: Context) -> float:
         """Returns the gain [EV] with which the image would have the target's mean light."""
@@ -147,6 +150,49 @@ class Compression(ImageChange):
         return np.dstack([color[..., ::-1], image[..., 3]])
 
 
+class StereoMatcher(LeafSystem):
+    """Measures depth by matching images, see `matched_depth`.
+
+    .. pydrake_system::
+
+        name: StereoMatcher
+        input_ports: [left_image, right_image]
+        output_ports: [depth_image_32f]
+
+    The depth is that of the `camera`; the images are of `cameras`.
+    """
+
+    def __init__(self, sensor: Stereo, camera: OnboardCamera) -> None:
+        super().__init__()
+        sensor.validate()
+        self._sensor, self._camera = sensor, camera
+        for name, config in self.cameras(sensor, camera).items():
+            self.DeclareAbstractInputPort(name, Value(ImageRgba8U(config.width, config.height)))
+        depth = ImageDepth32F(camera.width, camera.height)
+        calc = weak_callback(self._calc)
+        self.DeclareAbstractOutputPort("depth_image_32f", lambda: Value(depth), calc)
+
+    @staticmethod
+    def cameras(sensor: Stereo, camera: OnboardCamera) -> dict[str, OnboardCamera]:
+        """Returns the cameras of the images, by the names of the inputs."""
+        height = round(camera.height * sensor.width / camera.width)
+        left = replace(camera, width=sensor.width, height=height)
+        X_BR = camera.mount() @ RigidTransform(np.array([sensor.baseline, 0.0, 0.0]))
+        return {"left_image": left, "right_image": replace(left, X_BC=Transform(X_BR))}
+
+    def _calc(self, context: Context, output: AbstractValue) -> None:
+        left, right = (
+            cv2.cvtColor(
+                np.asarray(cast(Any, self.get_input_port(k).Eval(context)).data),
+                cv2.COLOR_RGBA2GRAY,
+            )
+            for k in range(2)
+        )
+        z = matched_depth(left, right, self._sensor, self._camera)
+        z = limit_depth(z, self._camera.min_depth, self._camera.max_depth)
+        cast(Any, output.get_mutable_value()).mutable_data[..., 0] = z
+
+
 class DepthSensor(ImageChange):
     """Measures ``depth_image_32f`` [m] as a sensor does, see `stereo_depth` and
     `time_of_flight_depth`."""
@@ -155,10 +201,10 @@ class DepthSensor(ImageChange):
 
     def changed(self, image: np.ndarray, random: np.random.Generator) -> np.ndarray:
         depth, sensor, camera = image[..., 0], self.config, self.camera
-        noise, reflectivity = random.standard_normal((2, *depth.shape))
+        noise, reflectivity = random.standard_normal((2, *depth.shape), dtype=np.float32)
         if isinstance(sensor, Stereo):
             z = stereo_depth(depth, sensor, camera, noise)
         else:
-            mixing = random.random((2, *depth.shape))
+            mixing = random.random((2, *depth.shape), dtype=np.float32)
             z = time_of_flight_depth(depth, sensor, camera, noise, reflectivity, mixing)
         return limit_depth(z, camera.min_depth, camera.max_depth)[..., None]

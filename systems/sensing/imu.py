@@ -2,6 +2,7 @@
 
 import zlib
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,8 @@ from splatpilot.systems.common.drake import optional_input, vector_input
 from splatpilot.systems.common.validation import Config, bounded
 from splatpilot.systems.vehicle.quadrotor import QuadrotorParams, quadrotor_derivatives
 from splatpilot.systems.vehicle.state import QuadrotorState, pose_from_state
+
+_BLOCK = 64  # samples whose noise is drawn at once: a generator costs more than its numbers
 
 
 @dataclass
@@ -92,8 +95,7 @@ class ImuSensor(LeafSystem):
             command = vector_input(self, "command", context)
             a_WB = np.array(quadrotor_derivatives(state, command, self._params)[3:6])
         rate, bias = self._config.rate, np.array(context.get_discrete_state(2).value())
-        random = sample_generator(self, self._seed, context.get_time(), rate)
-        white, step = random.standard_normal((2, 6))
+        white, step = white_noise(self, self._seed, context.get_time(), rate, 12).reshape(2, 6)
         force = specific_force(state, a_WB, self._params.gravity)
         measured = np.append(force, QuadrotorState.of(state).w_WB_B)
         error, next_bias = measurement_error(bias, white, step, self._noise, self._walk, rate)
@@ -102,7 +104,17 @@ class ImuSensor(LeafSystem):
             discrete_state.set_value(group, values)
 
 
-def sample_generator(system: Any, seed: int, time: float, rate: float) -> np.random.Generator:
-    """Returns the random numbers of a sensor's sample at a time [s], of the rate [Hz]."""
-    name = zlib.crc32(system.get_name().encode())
-    return np.random.default_rng([seed, name, int(np.floor(time * rate + 1e-6))])
+def white_noise(system: Any, seed: int, time: float, rate: float, count: int) -> np.ndarray:
+    """Returns the draws (count,) from N(0, 1) of a sensor's sample at a time [s], of the rate [Hz].
+
+    They follow from the seed, the system's name and the sample's number.
+    """
+    block, row = divmod(int(np.floor(time * rate + 1e-6)), _BLOCK)
+    return _noise_block(seed, zlib.crc32(system.get_name().encode()), block, count)[row]
+
+
+@lru_cache(maxsize=64)
+def _noise_block(seed: int, name: int, block: int, count: int) -> np.ndarray:
+    noise = np.random.default_rng([seed, name, block]).standard_normal((_BLOCK, count))
+    noise.flags.writeable = False
+    return noise

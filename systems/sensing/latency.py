@@ -118,9 +118,9 @@ class DelayedPose(LeafSystem):
 
     def _samples(self, context: Context) -> np.ndarray:
         """Rows of time and state (n, 14) up to now, oldest first; NaN before the first."""
-        now = np.append(context.get_time(), np.asarray(self._state_port.Eval(context)))
-        held = np.asarray(context.get_discrete_state_vector().value()).reshape(-1, 14)
-        return np.vstack([held, now])
+        held = context.get_discrete_state_vector().value()
+        now = [context.get_time()], np.asarray(self._state_port.Eval(context))
+        return np.concatenate([held, *now]).reshape(-1, 14)
 
     def _sample(self, context: Context, discrete_state: DiscreteValues) -> None:
         discrete_state.set_value(self._samples(context)[1:].ravel())
@@ -129,7 +129,10 @@ class DelayedPose(LeafSystem):
         rows = self._samples(context)
         rows = rows[np.isfinite(rows[:, 0])]
         then = context.get_time() - self._frames.age(context.get_time())
-        state = np.array([np.interp(then, rows[:, 0], column) for column in rows[:, 1:].T])
+        row = int(np.searchsorted(rows[1:-1, 0], then))
+        before, after = rows[row], rows[min(row + 1, len(rows) - 1)]
+        share = (then - before[0]) / max(after[0] - before[0], 1e-12)
+        state = before[1:] + min(max(share, 0.0), 1.0) * (after[1:] - before[1:])
         output.set_value(pose_from_state(state))
 
 
@@ -179,7 +182,8 @@ class DecisionDelay(LeafSystem):
     def _calc(self, context: Context, output: BasicVector) -> None:
         newest = context.get_discrete_state(0).GetAtIndex(0)
         decision = self._decision(context)
-        rows = np.append(decision, context.get_discrete_state(1).value()).reshape(-1, len(decision))
+        rows = np.concatenate([decision, context.get_discrete_state(1).value()])
+        rows = rows.reshape(-1, len(decision))
         for back in range(self._count):
             time = newest - back * self._period
             delay = self._delays[round(time / self._period) % CYCLE]

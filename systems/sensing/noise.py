@@ -223,7 +223,9 @@ class ColorNoise(ImageChange):
     def changed(self, image: np.ndarray, random: np.random.Generator) -> np.ndarray:
         noise, color = self.config, image[..., :3].astype(np.float32)
         brighter = random.uniform(-1.0, 1.0)
-        grain = random.standard_normal(color.shape, dtype=np.float32)
+        grain = np.float32(0.0)
+        if noise.color_noise > 0.0:
+            grain = random.standard_normal(color.shape, dtype=np.float32)
         if noise.hue_jitter > 0.0:
             angle = math.radians(noise.hue_jitter * random.uniform(-1.0, 1.0))
             color = rotate_hue(color, math.cos(angle), math.sin(angle))

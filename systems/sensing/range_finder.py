@@ -11,7 +11,7 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem
 from splatpilot.systems.collision.distance_field import DistanceField, Distances
 from splatpilot.systems.common.drake import optional_value
 from splatpilot.systems.common.validation import Config, bounded, require_field
-from splatpilot.systems.sensing.imu import sample_generator
+from splatpilot.systems.sensing.imu import white_noise
 
 
 @dataclass
@@ -94,6 +94,6 @@ class RangeFinderSensor(LeafSystem):
         field = bodies.among(self._field, bodies.time) if bodies else self._field
         direction_W, config = X_WB.rotation().multiply(self._direction_B), self._config
         distance = cast_ray(field, X_WB.translation(), direction_W, config.max_range)
-        random = sample_generator(self, self._seed, context.get_time(), config.rate)
-        measured = distance + config.noise * random.standard_normal()
+        [error] = white_noise(self, self._seed, context.get_time(), config.rate, 1)
+        measured = distance + config.noise * error
         output.SetAtIndex(0, measured if measured <= config.max_range else np.inf)

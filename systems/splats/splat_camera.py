@@ -1,12 +1,13 @@
 """Cameras in Gaussian scenes."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 from typing import Any, NamedTuple, cast
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue, Value
@@ -86,7 +87,8 @@ def empty_scene() -> BakedScene:
 
 _MAX_STEP = 0.5  # [px] that a point at 1 m may move on the image from one band to the next
 _MIN_BANDS = 8  # of an image with a rolling shutter if Gaussians move
-_MAX_BLUR_STEP = 1.5  # [px] that a point at 1 m may move from one pose of an exposure to the next
+_MIN_BLUR = 0.25  # [px] that a point at 1 m must move to blur an image
+_MAX_BLUR_STEP = 6.0  # [px] that a point at 1 m may move from one pose of an exposure to the next
 _MAX_EXPOSURES = 15  # Number of poses of an image with motion blur.
 
 
@@ -109,6 +111,55 @@ def row_bands(
     count = min(height, max(min_count, math.ceil(steps)))
     edges = np.linspace(0, height, count + 1).round().astype(int).tolist()
     return list(pairwise(edges))
+
+
+@cache
+def _pixel_slopes(
+    focal: tuple[float, float], center: tuple[float, float], size: tuple[int, int], lens: Any
+) -> NDArray[np.float32]:
+    """Returns the slopes (2, H, W) of the rays of pixels; NaN beyond the lens."""
+    pixels = np.stack(np.meshgrid(*(np.arange(n) + 0.5 for n in size)), axis=-1)
+    points = (pixels - center) / focal
+    slopes = points if lens is None else lens.slopes(points)
+    return np.moveaxis(slopes, -1, 0).astype(np.float32)
+
+
+def blurred_light(
+    view: RenderedView,
+    camera_info: CameraInfo,
+    X_CtCs: Sequence[RigidTransform],
+    lens: Distortion | None = None,
+) -> NDArray[np.float32]:
+    """Computes the mean light (H, W, 3) of an exposure from the view of the camera C in its middle.
+
+    The image is shifted along the motion of each pixel's surface, which is exact up to surfaces
+    that appear or vanish. Pixels without depth are far away.
+
+    Args:
+        X_CtCs: poses of C in the frames of the camera at the start and the end of the exposure.
+    """
+    focal = np.array([camera_info.focal_x(), camera_info.focal_y()], dtype=np.float32)
+    center = camera_info.center_x(), camera_info.center_y()
+    size = camera_info.width(), camera_info.height()
+    x, y = _pixel_slopes((float(focal[0]), float(focal[1])), center, size, lens)
+    near = np.isfinite(view.depth) & (view.depth > 0.0)
+    inverse = np.where(near, 1.0 / np.where(near, view.depth, 1.0), np.float32(0.0))
+    ends = []
+    for X_CtC in X_CtCs:
+        R, t = X_CtC.rotation().matrix().tolist(), X_CtC.translation().tolist()
+        # Planes one by one: several times faster than points.
+        p_CtQ = [R[k][0] * x + R[k][1] * y + (R[k][2] + t[k] * inverse) for k in range(3)]
+        slope = np.stack(p_CtQ[:2], axis=-1) / p_CtQ[2].clip(1e-3)[..., None]
+        ends.append(slope if lens is None else lens.project(slope))
+    motion = np.nan_to_num(focal * (ends[1] - ends[0])).astype(np.float32)  # (H, W, 2) [px]
+    light = light_of_color(255.0 * view.color.clip(0.0))
+    count = min(_MAX_EXPOSURES, math.ceil(float(np.abs(motion).max()))) | 1
+    u, v = np.meshgrid(*(np.arange(n, dtype=np.float32) for n in size))
+    mean = np.zeros_like(light)
+    for s in (np.float32((k + 0.5) / count - 0.5) for k in range(count)):
+        maps = u - s * motion[..., 0], v - s * motion[..., 1]
+        mean += cv2.remap(light, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return mean / np.float32(count)
 
 
 class CameraState(NamedTuple):
@@ -309,36 +360,40 @@ class SplatCamera(LeafSystem):
         return self._render(camera)
 
     def _render(self, camera: CameraState) -> RenderedView:
-        middle = self._shutter(camera, 0.5)
-        view = RenderedView(
-            *self._render_instant(self._scene.render, middle, background=self._background)
-        )
-        if self._num_exposures(camera) == 1:
+        view = self._render_view(self._shutter(camera, 0.5))
+        if self._num_exposures(camera) == 0:
             return view
         return view._replace(color=self._render_color(camera))
 
+    def _render_view(self, camera: CameraState) -> RenderedView:
+        parts = self._render_instant(self._scene.render, camera, background=self._background)
+        return RenderedView(*parts)
+
     def _render_color(self, camera: CameraState) -> NDArray[np.float32]:
-        count = self._num_exposures(camera)
-        colors = []
-        for s in (np.arange(count) + 0.5) / count:
-            state = self._shutter(camera, float(s))
+        count, lights = self._num_exposures(camera), []
+        if count == 0:
             (color,) = self._render_instant(
-                self._scene.render_color, state, background=self._background
+                self._scene.render_color, self._shutter(camera, 0.5), background=self._background
             )
-            colors.append(color)
-        if count == 1:
-            return colors[0]
-        light = np.mean([light_of_color(255.0 * color.clip(0.0)) for color in colors], axis=0)
-        return color_of_light(light) / np.float32(255.0)
+            return color
+        for k in range(count):
+            first, middle, last = (self._shutter(camera, (k + s) / count) for s in (0.0, 0.5, 1.0))
+            X_WC = middle.X_WB @ camera.X_BC
+            X_CtCs = [(end.X_WB @ camera.X_BC).inverse() @ X_WC for end in (first, last)]
+            view, lens = self._render_view(middle), self._options["distortion"]
+            lights.append(blurred_light(view, camera.camera_info, X_CtCs, lens))
+        return color_of_light(np.mean(lights, axis=0)) / np.float32(255.0)
 
     def _num_exposures(self, camera: CameraState) -> int:
-        """Returns the number of images whose mean has motion blur, odd for one in the middle."""
+        """Returns the number of poses of an exposure that are rendered; 0 without motion blur."""
         if self._exposure == 0.0 or camera.X_WB_start is None:
-            return 1
+            return 0
         X_WC0, X_WC1 = (X_WB @ camera.X_BC for X_WB in (camera.X_WB_start, camera.X_WB))
         share = self._exposure / (self._exposure + self._readout)
         shift = share * image_shift(X_WC0, X_WC1, camera.camera_info.focal_x())
-        return min(_MAX_EXPOSURES, math.ceil(shift / _MAX_BLUR_STEP)) | 1
+        if shift < _MIN_BLUR:
+            return 0
+        return min(_MAX_EXPOSURES, math.ceil(shift / _MAX_BLUR_STEP))
 
     def _shutter(self, camera: CameraState, s: float) -> CameraState:
         """Returns a camera with an exposure at a fraction s of it, from 0 to 1."""

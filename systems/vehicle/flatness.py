@@ -107,6 +107,11 @@ class FlatnessControllerConfig(Config):
     max_yaw_rate: float = bounded(2.0, "(0, inf) rad/s")
     # [m/s] Horizontal speed from which yaw follows the motion fully.
     yaw_speed: float = bounded(0.5, "(0, inf) m/s")
+    # [s] Time constant of the estimate of acceleration that the model does not explain, such as by
+    # an error of the hover thrust or wind; 0 is without, see `observe_disturbance`.
+    disturbance_time: float = bounded(0.0, "[0, inf) s")
+    # [m/s^2] Maximum of that estimate along each axis.
+    max_disturbance: float = bounded(3.0, "(0, inf) m/s^2")
 
     def check(self) -> None:
         below = self.min_thrust < self.max_thrust
@@ -115,6 +120,10 @@ class FlatnessControllerConfig(Config):
         shortest = 2.0 / self.tilt_gain
         condition = f"at least 2 / tilt_gain = {shortest:.3g} s"
         require_field(self, "lookahead", self.lookahead >= shortest, condition)
+        # A faster estimate would take the vehicle's own lag for a disturbance.
+        slow = self.disturbance_time == 0.0 or self.disturbance_time >= self.lookahead
+        condition = f"0 or at least lookahead, {self.lookahead} s"
+        require_field(self, "disturbance_time", slow, condition)
 
 
 def flatness_command(
@@ -181,6 +190,41 @@ def flatness_command(
     return stack([thrust, rate * n1, rate * n2, yaw])
 
 
+def observe_disturbance(
+    state: Any,
+    observed: Any,
+    thrust: Any,
+    config: FlatnessControllerConfig,
+    params: QuadrotorParams,
+) -> Any:
+    """Returns the next velocity [m/s] and disturbance [m/s^2], (6,), that an observer estimates.
+
+    A Luenberger observer with both poles at -1 / `disturbance_time` predicts the velocity u from
+    the thrust c that was commanded since the last update, within its limits, so that it does not
+    wind up. With T the period, b = T / disturbance_time and e = v_WB - u::
+
+        u' = u + T (c z_B - g e_z - drag v_WB + d) + 2 b e
+        d' = clip(d + b² e / T)
+
+    Args:
+        state: (13,) at the end of the period.
+        observed: (6,), the last result.
+        thrust: c [m/s^2].
+    """
+    # Numbers one by one: several times faster than arrays of numpy.
+    v_WB, (w, x, y, z) = state[3:6].tolist(), state[6:10].tolist()
+    numbers, T = observed.tolist(), config.period
+    lift = thrust / (w * w + x * x + y * y + z * z)
+    z_B = (2.0 * (x * z + w * y), 2.0 * (y * z - w * x), w * w - x * x - y * y + z * z)
+    gain, limit = T / config.disturbance_time, config.max_disturbance
+    speeds, disturbances = [], []
+    for k, (u, d, v) in enumerate(zip(numbers[:3], numbers[3:], v_WB, strict=True)):
+        model = lift * z_B[k] - params.drag * v - (params.gravity if k == 2 else 0.0)
+        speeds.append(u + T * (model + d) + 2.0 * gain * (v - u))
+        disturbances.append(max(-limit, min(d + gain**2 / T * (v - u), limit)))
+    return np.array([*speeds, *disturbances])
+
+
 def _components(vectors: Any) -> tuple[Any, Any, Any]:
     return vectors[..., 0], vectors[..., 1], vectors[..., 2]
 
@@ -202,8 +246,10 @@ def FlatnessController_(T):
           ``acceleration`` (3): a_WB [m/s^2], gravity excluded. Connect exactly one.
         - ``heading`` (1), optional: of body x, seen from above, [rad] from world x; along the
           motion if it is not connected or NaN.
-        - Numeric parameter 0 (9): the fields of the configuration from ``lookahead`` on; numeric
-          parameter 1 (2): ``[drag [1/s], gravity [m/s^2]]`` of the vehicle.
+        - Discrete state: the command and, if ``disturbance_time`` > 0, the estimates (6) of
+          `observe_disturbance`, whose disturbance is subtracted from the acceleration.
+        - Numeric parameter 0 (9): the fields of the configuration from ``lookahead`` to
+          ``yaw_speed``; numeric parameter 1 (2): ``[drag [1/s], gravity [m/s^2]]`` of the vehicle.
 
         Updates every ``period`` [s] from time 0, see `reaching_acceleration` and
         `flatness_command`. The motion is toward the waypoint, or along v_WB if an acceleration is
@@ -228,7 +274,8 @@ def FlatnessController_(T):
             lift = params.gravity / math.cos(config.max_tilt)
             condition = f"above {lift:.2f} m/s^2 to carry the weight at max_tilt"
             require_field(config, "max_thrust", config.max_thrust > lift, condition)
-            gains = [field.name for field in fields(config) if field.name != "period"]
+            fixed = ("period", "disturbance_time", "max_disturbance")
+            gains = [field.name for field in fields(config) if field.name not in fixed]
             self._parameters = [
                 ConfigParameter(self, T, config, gains),
                 ConfigParameter(self, T, params, ["drag", "gravity"]),
@@ -239,6 +286,8 @@ def FlatnessController_(T):
             self.DeclareVectorInputPort("heading", 1)
             hover = BasicVector_[T]([params.gravity, 0.0, 0.0, 0.0])
             self.DeclareStateOutputPort("command", self.DeclareDiscreteState(hover))
+            if config.disturbance_time > 0.0:
+                self.DeclareDiscreteState(6)
             self.DeclarePeriodicDiscreteUpdateEvent(config.period, 0.0, self._update)
 
         SetLookahead = parameter_setter("lookahead")
@@ -272,10 +321,15 @@ def FlatnessController_(T):
                 a_WB, motion_W = self._eval_finite("acceleration", context), v_WB
             heading = optional_input(self, "heading", context)
             heading = None if heading is None else heading[0]
+            if config.disturbance_time > 0.0:
+                old = context.get_discrete_state()
+                observed = observe_disturbance(state, old.value(1), old.value(0)[0], config, params)
+                discrete_state.set_value(1, observed)
+                a_WB = a_WB - observed[3:]
             # At rest arctan2 of AutoDiffXd warns of a division, and returns zero derivatives.
             with nullcontext() if T is float else np.errstate(divide="ignore"):
                 command = flatness_command(state, a_WB, motion_W, heading, config, params)
-            discrete_state.set_value(command)
+            discrete_state.set_value(0, command)
 
         def _eval_finite(self, name, context):
             value = vector_input(self, name, context)

@@ -243,39 +243,39 @@ def actuated_derivatives(
         rotors:  f_i = lift k u_i²,   d/dt u_i = (sqrt(f_cmd_i / k) - u_i) / motor_time_constant
                  J d/dt w = M(f) - w × J w,  M(f_cmd) = J (w_cmd - w) / tau + w × J w
 
-    Commands are limited first, and f_cmd by `mix`. Sources: rotor drag, Faessler et al., RA-L 2018;
+    `mix` limits f_cmd. Sources: rotor drag, Faessler et al., RA-L 2018;
     ground effect, Cheeseman and Bennett, ARC R&M 3021, 1955, at most that of z = ground_effect / 2;
     power by momentum theory; rate controller, Foehn et al., "Agilicious", Science Robotics 2022.
 
     Args:
         state: 13 components of the state, the charge, and, unless `motor_time_constant` is 0, the
             thrust over mass [m/s^2] or, with rotors, their speeds (4) [rad/s], see `mix`.
-        command, wind, disturbance: see `component_derivatives`.
+        command: of `limit_command`.
+        wind, disturbance: see `component_derivatives`.
     """
     _, _, z, *velocity = state[:6]
     (qw, *q), rates, charge, actuators = state[6:10], state[10:13], state[13], state[14:]
-    scale = 2.0 / (qw * qw + _dot(q, q))
-    v_AB = velocity if wind is None else [v - w for v, w in zip(velocity, wind, strict=True)]
-    speed = sqrt(_dot(v_AB, v_AB) + _TINY)
-    drags = zip(params.rotor_drag, params.quadratic_drag, strict=True)
-    coefficients = [linear + quadratic * speed for linear, quadratic in drags]
-    v_AB_B = _rotate(scale, -qw, q, v_AB)
-    a_B = [-c * v for c, v in zip(coefficients, v_AB_B, strict=True)]
-    added = _rotate(scale, qw, q, a_B)
-    if disturbance is not None:
-        added = [a + more for a, more in zip(added, disturbance, strict=True)]
+    added = disturbance
+    if not _are_zero(*params.rotor_drag, *params.quadratic_drag):  # They cost as much as the rest.
+        scale = 2.0 / (qw * qw + _dot(q, q))
+        v_AB = velocity if wind is None else [v - w for v, w in zip(velocity, wind, strict=True)]
+        speed = sqrt(_dot(v_AB, v_AB) + _TINY)
+        drags = zip(params.rotor_drag, params.quadratic_drag, strict=True)
+        coefficients = [linear + quadratic * speed for linear, quadratic in drags]
+        v_AB_B = _rotate(scale, -qw, q, v_AB)
+        a_B = [-c * v for c, v in zip(coefficients, v_AB_B, strict=True)]
+        added = _rotate(scale, qw, q, a_B)
+        if disturbance is not None:
+            added = [a + more for a, more in zip(added, disturbance, strict=True)]
 
-    height = maximum(z, maximum(0.5 * params.ground_effect, _TINY))
-    lift = params.thrust_scale * (1.0 - params.battery_sag * (1.0 - maximum(charge, 0.0)))
-    lift = lift / (1.0 - (0.25 * params.ground_effect / height) ** 2)
-    limits = params.max_tilt_rate, params.max_tilt_rate, params.max_yaw_rate
-    rates_cmd = [
-        maximum(-high, minimum(w, high)) for w, high in zip(command[1:], limits, strict=True)
+    lift = lift_factor(z, charge, params)
+    thrust_cmd, *rates_cmd = command
+    lag = params.rate_time_constant
+    accelerations = [
+        (rates_cmd[0] - rates[0]) / lag,
+        (rates_cmd[1] - rates[1]) / lag,
+        (rates_cmd[2] - rates[2]) / (lag * params.yaw_time_ratio),
     ]
-    thrust_cmd = maximum(params.min_thrust, minimum(command[0], params.max_thrust))
-    tilt = params.rate_time_constant
-    lags = tilt, tilt, tilt * params.yaw_time_ratio
-    accelerations = [(c - w) / lag for c, w, lag in zip(rates_cmd, rates, lags, strict=True)]
     if params.model == "rotors":
         forces = [lift * params.thrust_coefficient * u * u for u in actuators]
         thrust = sum(forces) / params.mass
@@ -306,6 +306,22 @@ def actuated_derivatives(
     ]
 
 
+def lift_factor(z: Any, charge: Any, params: QuadrotorParams) -> Any:
+    """Returns the thrust over that of the nominal vehicle, at a height z [m] and a charge."""
+    lift = params.thrust_scale * (1.0 - params.battery_sag * (1.0 - maximum(charge, 0.0)))
+    if not _are_zero(params.ground_effect):
+        height = maximum(z, maximum(0.5 * params.ground_effect, _TINY))
+        lift = lift / (1.0 - (0.25 * params.ground_effect / height) ** 2)
+    return lift
+
+
+def limit_command(command: Any, params: QuadrotorParams) -> list[Any]:
+    """Returns the components (4) of a command within the limits of the vehicle."""
+    limits = params.max_tilt_rate, params.max_tilt_rate, params.max_yaw_rate
+    rates = [maximum(-high, minimum(w, high)) for w, high in zip(command[1:], limits, strict=True)]
+    return [maximum(params.min_thrust, minimum(command[0], params.max_thrust)), *rates]
+
+
 def mix(thrust: Any, torque: Any, params: QuadrotorParams) -> list[Any]:
     """Returns the forces (4) [N] of the rotors for a thrust [N] and a torque (3) [N m] about B.
 
@@ -332,6 +348,11 @@ def torques(forces: Any, params: QuadrotorParams) -> tuple[Any, Any, Any]:
         params.arm[0] * (rear_left + rear_right - front_left - front_right),
         params.torque_ratio * (front_left + rear_right - rear_left - front_right),
     )
+
+
+def _are_zero(*numbers: Any) -> bool:
+    """Checks if numbers are floats and zero: AutoDiffXd keeps its derivatives."""
+    return type(numbers[0]) is float and not any(numbers)
 
 
 def _dot(a: Any, b: Any) -> Any:
@@ -409,7 +430,7 @@ def QuadrotorPlant_(T):
             self._parameters = [ConfigParameter(self, T, params, names)]
             for name, size in (("command", 4), ("wind", 3), ("disturbance", 3)):
                 self.DeclareVectorInputPort(name, size)
-            actuators = [] if self._ideal else _hovering_actuators(params)
+            actuators = [] if self._ideal else hovering_actuators(params)
             self._size = 13 + len(actuators)
             index = self.DeclareContinuousState(BasicVector_[T]([*start, *actuators]))
             if self._ideal:
@@ -475,6 +496,8 @@ def QuadrotorPlant_(T):
             command, wind, disturbance = (self._read(index, context) for index in range(3))
             params = self._parameters[0].config(context)
             parameters = [getattr(params, name) for name in _IDEAL] if self._ideal else [params]
+            if not self._ideal:
+                command = limit_command(command, params)
             inputs.set_value((command, *parameters, wind, disturbance))
 
         def _read(self, index, context):
@@ -489,7 +512,7 @@ def QuadrotorPlant_(T):
     return QuadrotorPlant
 
 
-def _hovering_actuators(params: QuadrotorParams) -> list[float]:
+def hovering_actuators(params: QuadrotorParams) -> list[float]:
     """Returns the charge at the start, and the thrust or the rotor speeds of hovering."""
     if params.model == "rotors":
         force = 0.25 * params.mass * params.gravity / params.thrust_coefficient

@@ -13,7 +13,9 @@ from splatpilot.diagrams.flight.policies import policy_named
 from splatpilot.diagrams.flight.scenario import Scenario, sample_initial_state
 from splatpilot.diagrams.flight.sensors import make_onboard_camera
 from splatpilot.diagrams.flight.simulation import fly
+from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.common.config import load_config
+from splatpilot.systems.sensing.depth_sensors import Stereo
 from splatpilot.systems.sensing.noise import ObservationNoise
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.sensing.time_of_flight import equivalent_sensor, time_of_flight_grid
@@ -133,6 +135,24 @@ def test_profiles_fly_every_policy_and_repeat(policy, post_world):
     assert np.any(
         fly(BuildFlightDiagram(scenario, post_world, camera=False)).states[-1] != first[-1]
     )
+
+
+def test_matched_images_measure_the_depth_of_the_world():
+    overrides = ["world.length=16", "world.spacing=2.4", "policy=!DiffAeroConfig {}"]
+    scenario = load_config(Scenario(seed=3), overrides=overrides)
+    world = make_world(scenario.world, scenario.seed)
+    scenario.imaging.stereo = Stereo(matching=True)
+    diagram = BuildFlightDiagram(scenario, world, camera=False)
+    context = diagram.CreateDefaultContext()
+    found = np.array(diagram.GetOutputPort("observation_depth_image_32f").Eval(context).data)
+    camera = diagram.GetSubsystemByName("policy_camera")
+    port = camera.GetOutputPort("depth_image_32f")
+    true = np.array(port.Eval(camera.GetMyContextFromRoot(context)).data)
+    near = np.isfinite(true) & (true < 6.0)
+    matched = near & np.isfinite(found)
+    assert near.mean() > 0.2 and matched.sum() > 0.9 * near.sum()
+    # Half a pixel of disparity is 7 % at 3 m.
+    assert np.median(np.abs(found[matched] / true[matched] - 1.0)) < 0.07
 
 
 @pytest.mark.parametrize(

@@ -1,3 +1,4 @@
+import cv2
 import numpy as np
 import pytest
 
@@ -5,6 +6,7 @@ from splatpilot.systems.sensing.depth_sensors import (
     Stereo,
     TimeOfFlightErrors,
     correlated_noise,
+    matched_depth,
     stereo_depth,
     time_of_flight_depth,
 )
@@ -115,3 +117,38 @@ def test_ambient_light_hides_far_surfaces():
     assert (tof(depth, ambient_range=3.9) == np.inf).all()
     assert (tof(depth, reflectivity=1.0, ambient_range=4.1, ambient_spread=0.1) == np.inf).all()
     np.testing.assert_allclose(tof(depth, normal=2.0, noise=0.01), 4.08)
+
+
+def test_matching_measures_textured_planes_to_a_fifth_of_a_pixel():
+    # A wall at 4 m, and a board at 1.5 m in front of its middle.
+    camera, width = OnboardCamera(width=848, height=480), 848
+    sensor = Stereo(width=width, matching=True)
+    texture = np.random.default_rng(0).uniform(0, 255, (480, 2 * width)).astype(np.float32)
+    texture = cv2.GaussianBlur(texture, (0, 0), 1.2)
+    texture = cv2.normalize(texture, None, 0.0, 255.0, cv2.NORM_MINMAX)  # pyright: ignore
+    x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(480, dtype=np.float32))
+    board = (x > 300) & (x < 550)
+    depth = np.where(board, 1.5, 4.0)
+
+    def seen(near: np.ndarray, shifts: tuple[float, float]) -> np.ndarray:
+        images = [
+            cv2.remap(texture, x + np.float32(shift + start), y, cv2.INTER_CUBIC)
+            for shift, start in zip(shifts, (0.0, 600.0), strict=True)
+        ]
+        return np.where(near, images[1], images[0]).clip(0, 255).astype(np.uint8)
+
+    far, near = (424.0 * 0.05 / z for z in (4.0, 1.5))
+    moved = (x + near > 300) & (x + near < 550)
+    found = matched_depth(seen(board, (0, 0)), seen(moved, (far, near)), sensor, camera)
+    disparity, exact = 424.0 * 0.05 / found, 424.0 * 0.05 / depth
+    matched = np.isfinite(found)
+    errors = np.abs(disparity - exact)[matched]
+    assert matched.mean() > 0.9
+    assert np.median(errors) < 0.2
+    assert np.mean(errors > 1.0) < 0.03  # at the outline of the board
+
+
+def test_matching_measures_nothing_on_a_wall_without_texture():
+    gray = np.full((480, 848), 128, np.uint8)
+    found = matched_depth(gray, gray, Stereo(matching=True), OnboardCamera(width=848, height=480))
+    assert not np.isfinite(found).any()

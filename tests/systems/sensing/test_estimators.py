@@ -50,12 +50,13 @@ def walk(config: VisualInertial, steps: int, velocity: np.ndarray, count: int = 
     """Yields the errors (count, 9) after each of the steps."""
     random = np.random.default_rng(3)
     errors = np.zeros((count, 9))
-    errors[:, 4:] = stationary(config) * random.standard_normal((count, 5))
+    errors[:, 4:] = np.array(stationary(config)) * random.standard_normal((count, 5))
     v_WB = np.tile(velocity, (count, 1))
     for _ in range(steps):
         yield errors
-        draws = random.standard_normal((count, 12)), random.random(count)
-        errors = drift_step(config, errors, v_WB, *draws)
+        jumps = random.random(count) < config.jump_rate / config.rate
+        normal = random.standard_normal((12, count))
+        errors = np.stack(drift_step(config, errors.T, v_WB.T, normal, jumps), axis=-1)
     yield errors
 
 

@@ -4,7 +4,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import LogVectorOutput
 
-from splatpilot.systems.sensing.imu import ImuSensor, sample_generator
+from splatpilot.systems.sensing.imu import ImuSensor, white_noise
 from splatpilot.systems.sensing.inertial_filter import InertialFilter, InertialFilterEstimator
 from splatpilot.systems.vehicle.flatness import FlatnessController
 from splatpilot.systems.vehicle.quadrotor import QuadrotorParams, QuadrotorPlant, hover_state
@@ -30,10 +30,10 @@ class Course(LeafSystem):
 
     def _range(self, context, output) -> None:
         state = QuadrotorState.of(np.asarray(self.get_input_port().Eval(context)))
-        random = sample_generator(self, 0, context.get_time(), 50.0)
+        [noise] = white_noise(self, 0, context.get_time(), 50.0, 1)
         under = self._block if 4.0 < context.get_time() < 5.0 else 0.0
         height = (state.p_WB[2] - under) / np.cos(state.tilt)
-        output.SetFromVector([height + 0.02 * random.standard_normal()])
+        output.SetFromVector([height + 0.02 * noise])
 
 
 def flown(seed: int, duration: float, block: float = 0.0):

@@ -137,7 +137,7 @@ def test_renders_once_per_pose_and_only_when_asked():
     camera.GetInputPort("body_pose").FixValue(other, X_WB)
     camera.GetOutputPort("color_image").Eval(other)
     np.testing.assert_array_equal(camera.GetOutputPort("depth_image_32f").Eval(other).data, nearer)
-    assert (scene.colors, scene.depths) == (2, 2)
+    assert (scene.colors, scene.depths) == (2, 3)
 
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 40.0

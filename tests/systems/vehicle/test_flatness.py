@@ -175,6 +175,41 @@ def test_a_step_of_the_waypoint_converges(step):
     np.testing.assert_allclose(states[-1, 3:6], 0.0, atol=1e-3)
 
 
+@pytest.mark.parametrize("time", [0.0, 0.5, 2.0])
+def test_the_disturbance_estimate_removes_the_error_of_the_hover_thrust(time):
+    params = QuadrotorParams(thrust_scale=0.95)
+    config = FlatnessControllerConfig(disturbance_time=time)
+    start = np.append(hover_state([0.0, 0.0, 2.0]), 1.0)  # the last is the charge
+    _, states, commands = fly(
+        start, 30.0, config=config, params=params, waypoint=lambda t: [0.0, 0.0, 2.0]
+    )
+    missing = 9.81 * (1.0 / 0.95 - 1.0)
+    sag = 0.0 if time else 0.5 * config.lookahead**2 * missing
+    assert commands[-1, 0] == pytest.approx(9.81 + missing, abs=1e-6)
+    assert states[-1, 2] == pytest.approx(2.0 - sag, abs=1e-3)
+
+
+def test_a_disturbance_estimate_faster_than_the_vehicle_is_refused():
+    match = r"disturbance_time must be 0 or at least lookahead, 0\.4 s, got 0\.1"
+    with pytest.raises(ValueError, match=match):
+        FlatnessController(FlatnessControllerConfig(disturbance_time=0.1))
+
+
+def test_the_disturbance_estimate_does_not_wind_up_while_thrust_saturates():
+    flights = [
+        fly(
+            hover_state([0.0, 0.0, 0.0]),
+            10.0,
+            config=FlatnessControllerConfig(max_thrust=14.5, disturbance_time=time),
+            waypoint=lambda t: [0.0, 0.0, 100.0 if t < 4.0 else 45.0],
+        )
+        for time in (0.0, 0.5)
+    ]
+    (_, plain, commands), (_, observed, _) = flights
+    np.testing.assert_allclose(commands[1:200, 0], 14.5)
+    np.testing.assert_allclose(observed[:, :3], plain[:, :3], atol=0.05)
+
+
 def test_recovers_from_upside_down():
     state = hover_state([0.0, 0.0, 10.0])
     state[6:10], state[10:13] = [0.0, 1.0, 0.0, 0.0], [3.0, -2.0, 5.0]
