@@ -33,6 +33,7 @@ def can_fly_natively(config: FlightEnvConfig, world: World) -> bool:
     return (
         only_start_is_random(scenario)
         and scenario.vehicle.is_ideal()
+        and scenario.controller.disturbance_time == 0.0
         and world.moving is None
         and not scenario.moving
         and config.camera.readout == 0.0

@@ -172,7 +172,7 @@ def require_supported(config: FlightEnvConfig) -> None:
     vehicle, simulator = scenario.vehicle, scenario.simulator
     scheme, estimator = simulator.integration_scheme, type(scenario.estimator).__name__
     images = [n for n in config.observation_names() if n in IMAGES]
-    disturbance = getattr(scenario.controller, "disturbance_time", 0.0)
+    disturbance = scenario.controller.disturbance_time
     neutral: dict[str, tuple[bool, str, Any]] = {
         "moving": (not scenario.moving, "empty", list(scenario.moving)),
         "estimator": (isinstance(scenario.estimator, TrueState), "TrueState", estimator),

@@ -30,6 +30,7 @@ from splatpilot.systems.vehicle.quadrotor import (
     QuadrotorParams,
     actuated_derivatives,
     component_derivatives,
+    limit_command,
 )
 
 LOWER, UPPER = np.array([0.0, -4.0, 0.0]), np.array([9.0, 4.0, 3.0])
@@ -200,7 +201,7 @@ def test_flights_solve_the_equations_of_motion(kind, vehicle):
     actions += [9.0, 0.0, 0.0, 0.0] if kind == "command" else 2.0
     flown, _ = advance(vehicle, kind, actions, steps=8)
     for state, action, end in zip(some_states(20), actions, flown, strict=True):
-        command = command_of_python(kind, state, action, vehicle).tolist()
+        command = limit_command(command_of_python(kind, state, action, vehicle).tolist(), vehicle)
 
         def rates(_, x, command=command):
             if vehicle is IDEAL:
