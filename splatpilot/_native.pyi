@@ -51,7 +51,7 @@ class GaussianGradients:
 class Camera:
     """A pinhole camera or one with a lens."""
 
-    def __init__(self, *, K: Annotated[NDArray[numpy.float64], dict(shape=(3, 3), order='C', device='cpu', writable=False)], X_CW: Annotated[NDArray[numpy.float64], dict(shape=(4, 4), order='C', device='cpu', writable=False)], width: int, height: int, near_plane: float, far_plane: float, radius_clip: float = 0.0, eps2d: float = 0.0, antialiased: bool = False, max_depth: float = float('inf'), distortion: int = 0, lens: Annotated[NDArray[numpy.float64], dict(shape=(13), order='C', device='cpu', writable=False)] | None = None) -> None: ...
+    def __init__(self, *, K: Annotated[NDArray[numpy.float64], dict(shape=(3, 3), order='C', device='cpu', writable=False)], X_CW: Annotated[NDArray[numpy.float64], dict(shape=(4, 4), order='C', device='cpu', writable=False)], width: int, height: int, near_plane: float, far_plane: float, radius_clip: float = 0.0, eps2d: float = 0.0, antialiased: bool = False, max_depth: float = float('inf'), merged_spread: float = 0.0, distortion: int = 0, lens: Annotated[NDArray[numpy.float64], dict(shape=(13), order='C', device='cpu', writable=False)] | None = None) -> None: ...
 
 class Frame:
     """A rendered image, for its backward pass."""
@@ -92,13 +92,16 @@ class BakedScene:
     @property
     def count(self) -> int: ...
 
+    def merge_neighbors(self) -> None:
+        """Prepares images of cameras with a merged_spread."""
+
     def recolored(self, sh: Annotated[NDArray[numpy.float32], dict(shape=(None, None, 3), order='C', device='cpu', writable=False)], sh_degree: int) -> BakedScene:
         """The same Gaussians in other colors."""
 
-def render_baked(scene: BakedScene, renderer: Renderer, moving: Gaussians, camera: Camera, *, background: Annotated[NDArray[numpy.float32], dict(shape=(3), order='C', device='cpu', writable=False)], color: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')] | None, depth: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')], alpha: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')] | None) -> None:
+def render_baked(scene: BakedScene, renderer: Renderer, moving: Gaussians, camera: Camera, *, background: Annotated[NDArray[numpy.float32], dict(shape=(3), order='C', device='cpu', writable=False)], color: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')] | None, depth: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')] | None, alpha: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')] | None) -> None:
     """
-    Writes the median depth, and unless they are None color and alpha, of the scene and of
-    moving Gaussians among it.
+    Writes the median depth, color and alpha, unless they are None, of the scene and of moving
+    Gaussians among it.
     """
 
 class BatchRenderer:
@@ -106,7 +109,7 @@ class BatchRenderer:
 
     def __init__(self, threads: int, simd: str = '') -> None: ...
 
-def render_views(renderer: BatchRenderer, scenes: Sequence[BakedScene], cameras: Sequence[Camera], *, backgrounds: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], color: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None, None), order='C', device='cpu')] | None, depth: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None, None), order='C', device='cpu')], alpha: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None, None), order='C', device='cpu')] | None) -> None:
+def render_views(renderer: BatchRenderer, scenes: Sequence[BakedScene], cameras: Sequence[Camera], *, backgrounds: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], color: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None, None), order='C', device='cpu')] | None, depth: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None, None), order='C', device='cpu')] | None, alpha: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None, None), order='C', device='cpu')] | None) -> None:
     """
     Writes the images of N cameras as render_baked does, camera i in scene i.
     """
