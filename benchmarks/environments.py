@@ -19,14 +19,19 @@ from pydrake.gym import DrakeGymEnv
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
 
 import splatpilot as sp
+from splatpilot.diagrams.flight.flight_diagram import DecisionInput
 from splatpilot.diagrams.gym.spaces import find_scenario
+from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 
 RATE = 10.0  # [Hz]
 
 
-def drake_env(scenario: sp.Scenario, world: sp.World) -> gymnasium.Env:
+def drake_env(
+    scenario: sp.Scenario, world: sp.World, camera: OnboardCamera | None = None
+) -> gymnasium.Env:
     """Makes the environment as `docs/diagrams.md` had it: the state, and the distance as reward."""
-    diagram = sp.BuildFlightDiagram(scenario, world, policy="velocity", camera=False)
+    policy = DecisionInput("velocity", camera, RATE)
+    diagram = sp.BuildFlightDiagram(scenario, world, policy=policy, camera=False)
     simulator = Simulator(diagram)
     ApplySimulatorConfig(scenario.simulator, simulator)
 

@@ -12,7 +12,7 @@ import time
 from typing import Any
 
 import numpy as np
-from environments import RATE
+from environments import RATE, drake_env
 from harness import header, machine, row
 
 from splatpilot import _native
@@ -100,6 +100,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=os.cpu_count())
     options = parser.parse_args()
     scenario = find_scenario(options.scenario)
+    depth_camera = OnboardCamera(width=64, height=36, max_depth=MAX_DEPTH)
     envs: dict[str, VectorFlightEnv] = {}
     for name, (count, observation, (width, height)) in CASES.items():
         camera = OnboardCamera(width=width, height=height, max_depth=MAX_DEPTH)
@@ -114,19 +115,16 @@ def main() -> None:
             pool=next(iter(envs.values())).pool if envs else None,
         )
         envs[name].reset(seed=0)
-    drake = {name: make_drake(scenario, "depth" in name) for name in ("state", "depth 64x36")}
+    world = envs["state, N = 64"].pool.worlds[0]
+    drake = {name: drake_env(scenario, world, depth_camera) for name in ("state", "depth 64x36")}
     kernels = Kernels()
     best: dict[str, np.ndarray] = {}
     for _ in range(options.rounds):
         for name, env in drake.items():
-            spent = measure_drake(env, "depth" in name, 60)
-            best[f"DrakeGymEnv, {name}"] = np.minimum(
-                spent, best.get(f"DrakeGymEnv, {name}", np.inf)
-            )
+            spent, name = measure_drake(env, "depth" in name, 60), f"DrakeGymEnv, {name}"
+            best[name] = np.minimum(spent, best.get(name, np.inf))
         for name, each in envs.items():
-            spent = measure(
-                each, kernels, max(4, 16384 // each.num_envs if "state" in name[:5] else 4)
-            )
+            spent = measure(each, kernels, 4 if "depth" in name else 16384 // each.num_envs)
             best[name] = np.minimum(spent, best.get(name, np.inf))
     print(f"{options.scenario}, {options.threads} threads, {machine()}")
     header("environment", "steps/s", "CPU us a step", "outside image kernels")
@@ -139,3 +137,7 @@ def main() -> None:
     rate = periods / best["state, N = 1024"][0]
     print(f"updates of controllers, and steps of integrators, with N = 1024: {rate:,.0f} a second")
     print(f"reset of one environment: {1e3 * reset_times(envs['state, N = 1024']):.3f} ms")
+
+
+if __name__ == "__main__":
+    main()

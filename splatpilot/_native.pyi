@@ -258,14 +258,11 @@ class FlightThreads:
         after its delay [periods].
         """
 
-<<<<<<< HEAD
 def flight_command(kind: str, state: Annotated[NDArray[numpy.float64], dict(shape=(13), order='C', device='cpu', writable=False)], action: Annotated[NDArray[numpy.float64], dict(shape=(None,), order='C', device='cpu', writable=False)], parameters: Annotated[NDArray[numpy.float64], dict(shape=(30), order='C', device='cpu', writable=False)], command: Annotated[NDArray[numpy.float64], dict(shape=(4), order='C', device='cpu')]) -> None:
     """
     Writes the command (4,) of the controller, for parameters in the order of
     FLIGHT_PARAMETERS.
     """
 
-=======
->>>>>>> vector
 def quadrotor_derivatives(state: Annotated[NDArray[numpy.float64], dict(shape=(13), order='C', device='cpu', writable=False)], command: Annotated[NDArray[numpy.float64], dict(shape=(4), order='C', device='cpu', writable=False)], drag: float, rate_time_constant: float, gravity: float, derivatives: Annotated[NDArray[numpy.float64], dict(shape=(13), order='C', device='cpu')], wind: Annotated[NDArray[numpy.float64], dict(shape=(3), order='C', device='cpu', writable=False)] | None = None, disturbance: Annotated[NDArray[numpy.float64], dict(shape=(3), order='C', device='cpu', writable=False)] | None = None) -> None:
     """Writes the derivatives (13,) of `component_derivatives`."""

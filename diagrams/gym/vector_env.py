@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Sequence
+from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -156,6 +157,7 @@ class VectorFlightEnv(VectorEnv):
             ends=self._ends,
         )
         self._is_seeded = False
+        self._last: Any = None  # observations, if environments are reset by masks
 
     def reset(
         self,
@@ -196,7 +198,7 @@ class VectorFlightEnv(VectorEnv):
             self._move(rows, points)
         seeds = {"world_seed": self.pool.world_seeds, "flight_seed": self.pool.seeds}
         infos = {name: np.where(mask, each[self._flight], 0) for name, each in seeds.items()}
-        return self._observe(), infos | {f"_{name}": mask.copy() for name in infos}
+        return self._observe_again(rows), infos | {f"_{name}": mask.copy() for name in infos}
 
     def _move(self, rows: NDArray[np.intp], points: dict[str, list[float]]) -> None:
         """Moves start or goal of flights that have not begun."""
@@ -307,7 +309,10 @@ class VectorFlightEnv(VectorEnv):
             infos |= {f"_{name}": ended.copy() for name in infos}
             if self._mode is AutoresetMode.SAME_STEP:
                 return self._reset_same_step(rewards, terminated, truncated, infos)
-        return self._observe(), rewards, terminated, truncated, infos
+        observed = self._observe()
+        if self._mode is AutoresetMode.DISABLED:
+            self._last = deepcopy(observed)
+        return observed, rewards, terminated, truncated, infos
 
     def _reset_same_step(
         self,
@@ -327,6 +332,18 @@ class VectorFlightEnv(VectorEnv):
         further = {"final_obs": final, "_final_obs": ended}
         further |= {"final_info": infos, "_final_info": ended.copy()}
         return self._observe(), rewards, terminated, truncated, further
+
+    def _observe_again(self, rows: NDArray[np.intp]) -> Any:
+        """Returns the observations of all environments, where `rows` have changed."""
+        if self._mode is not AutoresetMode.DISABLED or self._last is None:
+            return self._observe()
+        part = self._observe(rows)
+        if isinstance(part, dict):
+            for name, values in part.items():
+                self._last[name][rows] = values
+        else:
+            self._last[rows] = part
+        return deepcopy(self._last)
 
     def _observe(self, rows: NDArray[np.intp] | slice = slice(None)) -> Any:
         """Returns the observations of environments, in new arrays."""
@@ -361,16 +378,26 @@ class VectorFlightEnv(VectorEnv):
         info, X_BC = camera.camera_info(), camera.mount()
         worlds = [self.pool.worlds[w] for w in self.pool.world[self._flight[rows]]]
         X_WCs = [pose_from_state(state) @ X_BC for state in self._states[rows]]
-        view = [world.baked for world in worlds], info.intrinsic_matrix(), info.width()
-        view = *view, info.height(), X_WCs
-        options = {"distortion": camera.distortion, "max_depth": camera.max_depth}
-        if "color_image" not in ports:
-            depth = self._renderer.render_depth(*view, **options)
-            return {"depth_image_32f": ranged_depth(depth, camera.min_depth, camera.max_depth)}
-        backgrounds = [world.background for world in worlds]
-        seen = self._renderer.render(*view, backgrounds=backgrounds, **options)
-        depth = ranged_depth(seen.depth, camera.min_depth, camera.max_depth)
-        return {"depth_image_32f": depth, "color_image": color_pixels(seen.color)}
+        views = [world.baked for world in worlds], info.intrinsic_matrix(), info.width()
+        views = *views, info.height(), X_WCs
+        options: dict[str, Any] = {
+            "distortion": camera.distortion,
+            "max_depth": camera.max_depth,
+            "merged_spread": camera.merged_spread,
+            "backgrounds": [world.background for world in worlds],
+        }
+        if len(ports) == 2:
+            color, depth, _ = self._renderer.render(*views, **options)
+        elif "color_image" in ports:
+            color, depth = self._renderer.render_color(*views, **options), None
+        else:
+            color, depth = None, self._renderer.render_depth(*views, **options)
+        images = {}
+        if depth is not None:
+            images["depth_image_32f"] = ranged_depth(depth, camera.min_depth, camera.max_depth)
+        if color is not None:
+            images["color_image"] = color_pixels(color)
+        return images
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Returns images (H, W, 3) of the scenario's camera, one of each vehicle."""
@@ -379,7 +406,7 @@ class VectorFlightEnv(VectorEnv):
         config = self.config.scenario.camera
         info, X_BC = camera_info(config), camera_mount(config)
         worlds = [self.pool.worlds[w] for w in self.pool.world[self._flight]]
-        seen = self._renderer.render(
+        color = self._renderer.render_color(
             [world.baked for world in worlds],
             info.intrinsic_matrix(),
             info.width(),
@@ -387,7 +414,7 @@ class VectorFlightEnv(VectorEnv):
             [pose_from_state(state) @ X_BC for state in self._states],
             backgrounds=[world.background for world in worlds],
         )
-        return tuple(color_pixels(seen.color))
+        return tuple(color_pixels(color))
 
 
 def _hash(numbers: NDArray[np.uint64]) -> NDArray[np.uint64]:

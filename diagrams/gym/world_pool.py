@@ -29,6 +29,7 @@ from splatpilot.systems.sensing.estimators import TrueState
 from splatpilot.systems.sensing.imaging import Imaging
 from splatpilot.systems.sensing.latency import decision_delays
 from splatpilot.systems.sensing.noise import ObservationNoise
+from splatpilot.systems.splats.baked_scene import BakedScene
 
 PACK = 16  # vehicles whose parameters lie together, see `_native.Vehicles`
 _FLIGHTS = 64  # prepared in each world
@@ -71,7 +72,10 @@ class WorldPool:
                         randomize_appearance(made, scenario.appearance, scenario.seed)
                     )
                     if any(name in IMAGES for name in config.observation_names()):
-                        _ = self.worlds[-1].baked  # Now, rather than at the first image.
+                        # Now, rather than at the first image.
+                        kind = type(self.worlds[-1].baked)
+                        what = f"the scene of {made.name} in images"
+                        require(kind is BakedScene, what, "of Gaussians", kind.__name__, _OTHER)
                 worlds.append(len(self.worlds) - 1)
                 world_seeds.append(seed)
                 states.append(sample_initial_state(scenario, made))
@@ -168,10 +172,12 @@ def require_supported(config: FlightEnvConfig) -> None:
     vehicle, simulator = scenario.vehicle, scenario.simulator
     scheme, estimator = simulator.integration_scheme, type(scenario.estimator).__name__
     images = [n for n in config.observation_names() if n in IMAGES]
+    disturbance = getattr(scenario.controller, "disturbance_time", 0.0)
     neutral: dict[str, tuple[bool, str, Any]] = {
         "moving": (not scenario.moving, "empty", list(scenario.moving)),
         "estimator": (isinstance(scenario.estimator, TrueState), "TrueState", estimator),
         "wind.gusts": (scenario.wind.gusts == 0.0, "0", scenario.wind.gusts),
+        "controller.disturbance_time": (disturbance == 0.0, "0", disturbance),
         "vehicle.model": (vehicle.model == "lags", "lags", vehicle.model),
         "vehicle.battery_sag": (vehicle.battery_sag == 0.0, "0", vehicle.battery_sag),
         "vehicle.ground_effect": (vehicle.ground_effect == 0.0, "0", vehicle.ground_effect),

@@ -98,7 +98,7 @@ def test_flights_are_those_of_add_flight(action, scenario, limits):
 def test_images_and_rewards_are_those_of_flight_env(post_world):
     names = ["depth", "depth_m", "rgb", "state", "goal", "obstacle"]
     scenario = Scenario(start_radius=0.0)
-    env = FlightEnv(scenario, world=post_world, observation=names)
+    env = FlightEnv(scenario, world=post_world, observation=names, native=False)
     envs = VectorFlightEnv(3, scenario, world=post_world, observation=names)
     one, info = env.reset(seed=0)
     many, infos = envs.reset(seed=0)
@@ -191,9 +191,10 @@ def test_autoreset_modes(mode, post_world):
     assert not rewards.any() and not truncated.any()
 
 
-def test_a_mask_resets_some_environments(post_world):
-    scenario = Scenario(start_radius=0.0)
-    envs = VectorFlightEnv(3, scenario, world=post_world, observation="full_state")
+@pytest.mark.parametrize("mode", ["NextStep", "Disabled"])
+def test_a_mask_resets_some_environments(mode, post_world):
+    scenario, options = Scenario(start_radius=0.0), {"autoreset_mode": mode}
+    envs = VectorFlightEnv(3, scenario, world=post_world, observation="full_state", **options)
     envs.reset(seed=0)
     flown, *_ = envs.step(np.tile([1.0, 0.0, 0.0], (3, 1)))
     options = {"reset_mask": np.array([False, True, False]), "start": [2.0, 1.0, 2.0]}
