@@ -14,7 +14,10 @@ from typing import Any
 
 import lazy_loader
 
+from splatpilot.diagrams.gym.registration import register
+
 _load, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+register()
 
 
 def __getattr__(name: str) -> Any:

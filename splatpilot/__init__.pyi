@@ -21,6 +21,10 @@ from .diagrams.flight.simulation import (
     fly_all,
     make_flight_simulator,
 )
+from .diagrams.gym.flight_env import FlightEnv
+from .diagrams.gym.rewards import Reward, Transition
+from .diagrams.gym.spaces import FlightEnvConfig
+from .diagrams.gym.vector_env import VectorFlightEnv
 from .diagrams.worlds.moving_spheres import MovingSphere
 from .diagrams.worlds.world import World
 from .diagrams.worlds.world_registry import make_world, register_world
@@ -98,6 +102,8 @@ __all__ = [
     "FlatnessController",
     "FlatnessController_",
     "Flight",
+    "FlightEnv",
+    "FlightEnvConfig",
     "FlightError",
     "FlightMonitor",
     "FlightParts",
@@ -126,12 +132,15 @@ __all__ = [
     "QuadrotorState",
     "RangeFinder",
     "RerunSink",
+    "Reward",
     "Scenario",
     "SplatCamera",
     "SplatRenderEngine",
     "Starling2Max",
     "StateToPose",
     "StateToPose_",
+    "Transition",
+    "VectorFlightEnv",
     "VelocityTracker",
     "VelocityTracker_",
     "VideoRecorder",

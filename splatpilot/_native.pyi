@@ -51,7 +51,7 @@ class GaussianGradients:
 class Camera:
     """A pinhole camera or one with a lens."""
 
-    def __init__(self, *, K: Annotated[NDArray[numpy.float64], dict(shape=(3, 3), order='C', device='cpu', writable=False)], X_CW: Annotated[NDArray[numpy.float64], dict(shape=(4, 4), order='C', device='cpu', writable=False)], width: int, height: int, near_plane: float, far_plane: float, radius_clip: float = 0.0, eps2d: float = 0.0, antialiased: bool = False, max_depth: float = float('inf'), distortion: int = 0, lens: Annotated[NDArray[numpy.float64], dict(shape=(13), order='C', device='cpu', writable=False)] | None = None) -> None: ...
+    def __init__(self, *, K: Annotated[NDArray[numpy.float64], dict(shape=(3, 3), order='C', device='cpu', writable=False)], X_CW: Annotated[NDArray[numpy.float64], dict(shape=(4, 4), order='C', device='cpu', writable=False)], width: int, height: int, near_plane: float, far_plane: float, radius_clip: float = 0.0, eps2d: float = 0.0, antialiased: bool = False, max_depth: float = float('inf'), merged_spread: float = 0.0, distortion: int = 0, lens: Annotated[NDArray[numpy.float64], dict(shape=(13), order='C', device='cpu', writable=False)] | None = None) -> None: ...
 
 class Frame:
     """A rendered image, for its backward pass."""
@@ -92,13 +92,16 @@ class BakedScene:
     @property
     def count(self) -> int: ...
 
+    def merge_neighbors(self) -> None:
+        """Prepares images of cameras with a merged_spread."""
+
     def recolored(self, sh: Annotated[NDArray[numpy.float32], dict(shape=(None, None, 3), order='C', device='cpu', writable=False)], sh_degree: int) -> BakedScene:
         """The same Gaussians in other colors."""
 
-def render_baked(scene: BakedScene, renderer: Renderer, moving: Gaussians, camera: Camera, *, background: Annotated[NDArray[numpy.float32], dict(shape=(3), order='C', device='cpu', writable=False)], color: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')] | None, depth: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')], alpha: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')] | None) -> None:
+def render_baked(scene: BakedScene, renderer: Renderer, moving: Gaussians, camera: Camera, *, background: Annotated[NDArray[numpy.float32], dict(shape=(3), order='C', device='cpu', writable=False)], color: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')] | None, depth: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')] | None, alpha: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu')] | None) -> None:
     """
-    Writes the median depth, and unless they are None color and alpha, of the scene and of
-    moving Gaussians among it.
+    Writes the median depth, color and alpha, unless they are None, of the scene and of moving
+    Gaussians among it.
     """
 
 class BatchRenderer:
@@ -106,7 +109,7 @@ class BatchRenderer:
 
     def __init__(self, threads: int, simd: str = '') -> None: ...
 
-def render_views(renderer: BatchRenderer, scenes: Sequence[BakedScene], cameras: Sequence[Camera], *, backgrounds: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], color: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None, None), order='C', device='cpu')] | None, depth: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None, None), order='C', device='cpu')], alpha: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None, None), order='C', device='cpu')] | None) -> None:
+def render_views(renderer: BatchRenderer, scenes: Sequence[BakedScene], cameras: Sequence[Camera], *, backgrounds: Annotated[NDArray[numpy.float32], dict(shape=(None, 3), order='C', device='cpu', writable=False)], color: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None, None), order='C', device='cpu')] | None, depth: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None, None), order='C', device='cpu')] | None, alpha: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None, None), order='C', device='cpu')] | None) -> None:
     """
     Writes the images of N cameras as render_baked does, camera i in scene i.
     """
@@ -212,3 +215,54 @@ def descend(*, times: Annotated[NDArray[numpy.float32], dict(shape=(None, None, 
     Writes points and the length up to them, rows (4,), down the gradient of `times` from
     p_WQ to p_WG or until `length` is covered; returns their number.
     """
+
+FLIGHT_PARAMETERS: list = ...
+
+class FlightWorlds:
+    """The distance fields of worlds."""
+
+    def __init__(self) -> None: ...
+
+    def __len__(self) -> int: ...
+
+    def add_shapes(self, *, shapes: Annotated[NDArray[numpy.float64], dict(shape=(None, 15), order='C', device='cpu', writable=False)], kinds: Annotated[NDArray[numpy.uint8], dict(shape=(None,), order='C', device='cpu', writable=False)], lower_W: Annotated[NDArray[numpy.float64], dict(shape=(3), order='C', device='cpu', writable=False)], upper_W: Annotated[NDArray[numpy.float64], dict(shape=(3), order='C', device='cpu', writable=False)]) -> int:
+        """
+        Adds a world of analytic shapes, see `ShapeWorlds`; returns its number.
+        """
+
+    def add_grid(self, *, distances: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)], states: Annotated[NDArray[numpy.uint8], dict(shape=(None, None, None), order='C', device='cpu', writable=False)], lower_W: Annotated[NDArray[numpy.float64], dict(shape=(3), order='C', device='cpu', writable=False)], upper_W: Annotated[NDArray[numpy.float64], dict(shape=(3), order='C', device='cpu', writable=False)], voxel_size: float, occupied_outside: bool) -> int:
+        """Adds a world of a grid, see `grid_distances`; returns its number."""
+
+    def query(self, *, p_WQ: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C', device='cpu', writable=False)], world: Annotated[NDArray[numpy.int64], dict(shape=(None,), order='C', device='cpu', writable=False)], distances: Annotated[NDArray[numpy.float64], dict(shape=(None,), order='C', device='cpu')], states: Annotated[NDArray[numpy.uint8], dict(shape=(None,), order='C', device='cpu')], gradients: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C', device='cpu')] | None = None) -> None:
+        """
+        Writes the distances (N,), their gradients (N, 3) and the states of space (N,).
+        """
+
+class Vehicles:
+    """
+    Arrays of N vehicles, which `FlightThreads` updates. Parameters are in packs
+    (ceil(N / 16), len(FLIGHT_PARAMETERS), 16).
+    """
+
+    def __init__(self, *, states: Annotated[NDArray[numpy.float64], dict(shape=(None, 13), order='C', device='cpu')], thrusts: Annotated[NDArray[numpy.float64], dict(shape=(None,), order='C', device='cpu')], parameters: Annotated[NDArray[numpy.float64], dict(shape=(None, 30, 16), order='C', device='cpu', writable=False)], world: Annotated[NDArray[numpy.int64], dict(shape=(None,), order='C', device='cpu', writable=False)], goals: Annotated[NDArray[numpy.float64], dict(shape=(None, 3), order='C', device='cpu', writable=False)], radii: Annotated[NDArray[numpy.float64], dict(shape=(None,), order='C', device='cpu', writable=False)], goal_radii: Annotated[NDArray[numpy.float64], dict(shape=(None,), order='C', device='cpu', writable=False)], remaining: Annotated[NDArray[numpy.int32], dict(shape=(None,), order='C', device='cpu')], distances: Annotated[NDArray[numpy.float64], dict(shape=(None,), order='C', device='cpu')], field_states: Annotated[NDArray[numpy.uint8], dict(shape=(None,), order='C', device='cpu')], ends: Annotated[NDArray[numpy.uint8], dict(shape=(None,), order='C', device='cpu')]) -> None: ...
+
+class FlightThreads:
+    """Threads without influence on flights."""
+
+    def __init__(self, threads: int, simd: str = '') -> None: ...
+
+    def advance(self, worlds: FlightWorlds, vehicles: Vehicles, *, kind: str, actions: Annotated[NDArray[numpy.float64], dict(shape=(None, None), order='C', device='cpu', writable=False)], earlier: Annotated[NDArray[numpy.float64], dict(shape=(None, None), order='C', device='cpu', writable=False)], delays: Annotated[NDArray[numpy.int32], dict(shape=(None,), order='C', device='cpu')], flying: Annotated[NDArray[numpy.bool_], dict(shape=(None,), order='C', device='cpu', writable=False)], actuated: bool, periods: int, step: float, steps: int) -> None:
+        """
+        Flies vehicles for periods of their controllers, each of `steps` steps [s], until one
+        ends: 1 collision, 2 left volume, 3 goal, 4 timeout. An action follows the earlier one
+        after its delay [periods].
+        """
+
+def flight_command(kind: str, state: Annotated[NDArray[numpy.float64], dict(shape=(13), order='C', device='cpu', writable=False)], action: Annotated[NDArray[numpy.float64], dict(shape=(None,), order='C', device='cpu', writable=False)], parameters: Annotated[NDArray[numpy.float64], dict(shape=(30), order='C', device='cpu', writable=False)], command: Annotated[NDArray[numpy.float64], dict(shape=(4), order='C', device='cpu')]) -> None:
+    """
+    Writes the command (4,) of the controller, for parameters in the order of
+    FLIGHT_PARAMETERS.
+    """
+
+def quadrotor_derivatives(state: Annotated[NDArray[numpy.float64], dict(shape=(13), order='C', device='cpu', writable=False)], command: Annotated[NDArray[numpy.float64], dict(shape=(4), order='C', device='cpu', writable=False)], drag: float, rate_time_constant: float, gravity: float, derivatives: Annotated[NDArray[numpy.float64], dict(shape=(13), order='C', device='cpu')], wind: Annotated[NDArray[numpy.float64], dict(shape=(3), order='C', device='cpu', writable=False)] | None = None, disturbance: Annotated[NDArray[numpy.float64], dict(shape=(3), order='C', device='cpu', writable=False)] | None = None) -> None:
+    """Writes the derivatives (13,) of `component_derivatives`."""

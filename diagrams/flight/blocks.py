@@ -271,7 +271,9 @@ def require_ports(what: str, system: System, inputs: list[str], outputs: list[st
 def decision_period(scenario: Scenario, policy: System) -> float:
     """Returns the period [s] of a policy's update; that of the scenario's policy if it has none."""
     update = policy.GetUniquePeriodicDiscreteUpdateAttribute()
-    return update.period_sec() if update is not None else 1 / scenario.policy.rate
+    if update is not None:
+        return update.period_sec()
+    return 1 / (getattr(policy, "rate", None) or scenario.policy.rate)
 
 
 def onboard_sensors(scenario: Scenario, policy: System | None = None) -> dict[str, SensorConfig]:

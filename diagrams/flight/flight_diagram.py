@@ -58,6 +58,7 @@ from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.common.validation import require, require_type
 from splatpilot.systems.policies.teleop import Teleop
 from splatpilot.systems.sensing.latency import FrameTimes
+from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.splats.background import Background, mean_color
 from splatpilot.systems.splats.moving_bodies import MovingBodies
 from splatpilot.systems.splats.render_engine import ObstacleGeometry, SplatRenderEngine
@@ -142,6 +143,7 @@ def AddFlight(
     camera: bool = True,
     scene_graph: SceneGraph | None = None,
     others: Sequence[FlightParts] = (),
+    logs: bool = True,
 ) -> FlightParts:
     """Adds the closed loop of one vehicle to a builder.
 
@@ -163,7 +165,8 @@ def AddFlight(
             and `depth_grid` of its own camera (its attribute `camera`, an `OnboardCamera`), the
             outputs of sensors, and `moving` of `MovingBodies`, without a value if nothing moves.
 
-            A decision, such as "velocity", becomes an exported input of that name.
+            A decision, such as "velocity", and a `DecisionInput` become an exported input of the
+            decision's name.
         plant: replaces `QuadrotorPlant`: any system with the input `command` (4) and the output
             `state` (13). Its default Context has the initial state, see `sample_initial_state`.
         controller: replaces `FlatnessController`: any system with the input `state`, that for the
@@ -175,6 +178,7 @@ def AddFlight(
         scene_graph: gets the vehicle, see `QuadrotorGeometry`, and the world as the renderer
             `splats` if it has none of that name, see `AddSplatWorld`.
         others: flights in this builder whose vehicles and this one see and hit each other.
+        logs: adds the logs that `fly` reads.
 
     Raises:
         InfeasibleFlightError: see `sample_initial_state`; also for vehicles that start in contact.
@@ -185,8 +189,7 @@ def AddFlight(
     require_type(world, World, "world")
     before = builder.GetSystems()
     prefix = "" if name == "flight" else f"{name}_"
-    is_external = isinstance(policy, str)
-    if is_external:
+    if isinstance(policy, str):
         policy = DecisionInput(policy)
     elif not (policy is None or isinstance(policy, System)):
         scenario, policy = replace(scenario, policy=policy), None
@@ -227,6 +230,7 @@ def AddFlight(
     connect(builder, autonomy.command, plant.GetInputPort("command"))
 
     # Sensors.
+    is_external = isinstance(policy, DecisionInput)
     if is_external:
         builder.ExportInput(policy.get_input_port(), f"{prefix}{autonomy.target.get_name()}")
     added, measured = AddSensors(builder, sensors, world, scenario, state)
@@ -270,6 +274,7 @@ def AddFlight(
         collision=collision,
         hypotheses=plans,
         plan_period=decision_period(scenario, policy),
+        logs=logs,
     )
     systems = [each for each in builder.GetSystems() if all(each is not old for old in before)]
     for system in systems:
@@ -352,11 +357,18 @@ class DecisionInput(LeafSystem):
     """Passes the decision of a policy outside of the diagram from its input to its output.
 
     The input and the output have the name and size of one of `DECISIONS`.
+
+    Args:
+        camera, rate: of the policy, its images and decisions [Hz]; by default those of the
+            scenario's policy.
     """
 
-    def __init__(self, decision: str) -> None:
+    def __init__(
+        self, decision: str, camera: OnboardCamera | None = None, rate: float | None = None
+    ) -> None:
         super().__init__()
         require(decision in DECISIONS, "policy", f"one of {', '.join(DECISIONS)}", decision)
+        self.camera, self.rate = camera, rate
         source = self.DeclareVectorInputPort(decision, DECISIONS[decision])
         self.DeclareVectorOutputPort(
             decision, source.size(), self._calc, prerequisites_of_calc={source.ticket()}

@@ -49,7 +49,8 @@ class Outcome(enum.StrEnum):
     INTERRUPTED = "interrupted"
 
 
-_ENDS = Outcome.COLLISION, Outcome.LEFT_VOLUME, Outcome.GOAL
+ENDS = Outcome.COLLISION, Outcome.LEFT_VOLUME, Outcome.GOAL
+"""Outcomes of flights besides timeouts; of several, the first counts."""
 
 
 def _end(
@@ -59,12 +60,34 @@ def _end(
     field_state: float,
     goal_radius: float,
 ) -> tuple[float, Outcome | None]:
-    """Returns the minimum margin to `_ENDS`, [m] or [-], and the first that is not positive."""
+    """Returns the minimum margin to `ENDS`, [m] or [-], and the first that is not positive."""
     margins = clearance, _KNOWN - field_state, math.dist(p_WG, p_WB) - goal_radius
     margin = min(m for m in margins if not math.isnan(m))
     if margin > 0:
         return margin, None
-    return margin, next(end for end, m in zip(_ENDS, margins, strict=True) if m <= 0)
+    return margin, next(end for end, m in zip(ENDS, margins, strict=True) if m <= 0)
+
+
+def end_indices(
+    p_WB: np.ndarray,
+    p_WG: np.ndarray,
+    clearances: np.ndarray,
+    field_states: np.ndarray,
+    goal_radius: float,
+) -> np.ndarray:
+    """Returns how N flights end at this instant, by the rules of `FlightMonitor`.
+
+    Args:
+        p_WB, p_WG: (N, 3) [m], vehicles and goals.
+        clearances: (N,) [m], NaN outside the world.
+        field_states: (N,), see `FieldState`.
+
+    Returns:
+        (N,) indices of `ENDS`, -1 in flight.
+    """
+    to_goal = np.sqrt(((p_WG - p_WB) ** 2).sum(-1)) - goal_radius
+    ended = np.stack([clearances <= 0, field_states >= _KNOWN, to_goal <= 0], axis=-1)
+    return np.where(ended.any(-1), ended.argmax(-1), -1)
 
 
 class FlightMonitor(LeafSystem):
@@ -186,6 +209,7 @@ def AddFlightMonitor(
     collision: System | None = None,
     hypotheses: OutputPort | None = None,
     plan_period: float = LOG_PERIOD,
+    logs: bool = True,
 ) -> FlightMonitor:
     """Adds the system `monitor`, and the logs of state, command and clearance that `fly` reads.
 
@@ -194,6 +218,7 @@ def AddFlightMonitor(
         goal: (3) p_WG [m]; by default a source `goal` of the scenario's.
         collision: an `EsdfCollision`; by default one named `collision` of the world's field.
         hypotheses: plans to log, every `plan_period` [s].
+        logs: adds the logs.
     """
     scenario = sample_scenario(scenario)
     if collision is None:
@@ -215,8 +240,9 @@ def AddFlightMonitor(
         ("field_state", collision.GetOutputPort("field_state")),
     ):
         connect(builder, port, monitor.GetInputPort(name))
-    AddLogs(builder, {"state": state, "command": command, "clearance": clearance})
-    if hypotheses is not None:
+    if logs:
+        AddLogs(builder, {"state": state, "command": command, "clearance": clearance})
+    if logs and hypotheses is not None:
         AddLogs(builder, {"hypotheses": hypotheses}, plan_period)
     return monitor
 

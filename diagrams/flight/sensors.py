@@ -97,6 +97,7 @@ def make_onboard_camera(
         distortion=config.distortion,
         readout=config.readout,
         exposure=exposure,
+        merged_spread=config.merged_spread,
     )
 
 

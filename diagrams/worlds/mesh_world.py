@@ -98,9 +98,11 @@ class MeshScene(BakedScene):
         moving: PlacedGaussians = NO_GAUSSIANS,
         distortion: Distortion | None = None,
         max_depth: float = np.inf,
+        merged_spread: float = 0.0,
         with_color: bool = True,
     ) -> RenderedView:
-        """Renders color and depth; see `BakedScene.render`. The background is that of the mesh."""
+        """Renders color and depth; see `BakedScene.render`. The background is that of the mesh, and
+        `merged_spread` has no effect."""
         span = max(near, _NEAR), min(far, _FAR)
         color, depth = self._images(K, (width, height), X_WC, span, distortion, with_color)
         view = RenderedView((color / 255).astype(np.float32), depth, (depth > 0).astype(np.float32))
@@ -110,6 +112,10 @@ class MeshScene(BakedScene):
             view = _in_front(view, bodies)
         depth = np.where(view.depth <= max_depth, view.depth, np.float32(0))
         return view._replace(depth=depth)
+
+    def render_color(self, *camera: Any, **options: Any) -> NDArray[np.float32]:
+        """Renders color (H, W, 3); see `BakedScene.render_color`."""
+        return self.render(*camera, **options).color
 
     def render_depth(self, *camera: Any, **options: Any) -> NDArray[np.float32]:
         """Renders depth (H, W) [m]; see `BakedScene.render_depth`."""

@@ -161,5 +161,6 @@ void bind_surfels(nb::module_& m);
 void bind_fitting(nb::module_& m);
 void bind_shapes(nb::module_& m);
 void bind_grids(nb::module_& m);
+void bind_flight(nb::module_& m);
 
 }  // namespace splatpilot

@@ -11,6 +11,7 @@
 #include "casting/ray_casting.hpp"
 #include "core/dispatch.hpp"
 #include "core/thread_pool.hpp"
+#include "fields/grid_interpolation.hpp"
 
 namespace splatpilot {
 
@@ -20,6 +21,8 @@ using DepthRows = Writable<nb::ndim<2>>;
 using QueryPoints = Doubles<nb::shape<-1, 3>>;
 using Distances = Array<double, nb::ndim<1>>;
 using Gradients = Array<double, nb::shape<-1, 3>>;
+using Grid = Floats<nb::ndim<3>>;
+using Point = Doubles<nb::shape<3>>;
 
 constexpr size_t kPack = 16;
 constexpr size_t kCameras = 4;  // to a task
@@ -33,6 +36,17 @@ inline void require_worlds(const Indices& world, size_t queries, size_t worlds) 
                                   std::to_string(w));
     }
   }
+}
+
+inline VoxelGrid voxel_grid(const Grid& values, const Point& lower_W, double voxel_size) {
+  require(voxel_size > 0.0, "voxel_size must be > 0");
+  VoxelGrid grid{values.data(), {}, {}, voxel_size};
+  for (int k = 0; k < 3; ++k) {
+    grid.shape[k] = static_cast<int64_t>(values.shape(k));
+    require(grid.shape[k] >= 2, "a grid has at least 2 voxels along each axis");
+    grid.lower_W[k] = lower_W.data()[k];
+  }
+  return grid;
 }
 
 // The rays of a camera, in whole packs.

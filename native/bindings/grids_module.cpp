@@ -1,11 +1,10 @@
 // Python bindings of worlds of regular grids, and of distances in and descent along one grid.
 #include <nanobind/stl/optional.h>
 
-#include <limits>
 #include <optional>
 
 #include "bindings/casting_bindings.hpp"
-#include "fields/grid_interpolation.hpp"
+#include "fields/grid_distance.hpp"
 
 #define SIMD_LEVEL baseline
 #include "core/vectors.hpp"
@@ -13,8 +12,6 @@
 namespace splatpilot {
 namespace {
 
-using Grid = Floats<nb::ndim<3>>;
-using Point = Doubles<nb::shape<3>>;
 using PathRows = Array<double, nb::shape<-1, 4>>;
 using GridShapes = Array<const int64_t, nb::shape<-1, 3>>;
 using Vector = SIMD_LEVEL::Vector3<double>;
@@ -76,51 +73,17 @@ class GridWorlds : Casting {
   std::vector<GridWorld> grids_;
 };
 
-VoxelGrid voxel_grid(const Grid& values, const Point& lower_W, double voxel_size) {
-  require(voxel_size > 0.0, "voxel_size must be > 0");
-  VoxelGrid grid{values.data(), {}, {}, voxel_size};
-  for (int k = 0; k < 3; ++k) {
-    grid.shape[k] = static_cast<int64_t>(values.shape(k));
-    require(grid.shape[k] >= 2, "a grid has at least 2 voxels along each axis");
-    grid.lower_W[k] = lower_W.data()[k];
-  }
-  return grid;
-}
-
 void grid_distances(const Grid& grid, const Point& lower_W, const Point& upper_W, double voxel_size,
                     bool occupied_outside, const QueryPoints& p_WQ, const Distances& distances,
                     const std::optional<Gradients>& gradients) {
   const size_t count = p_WQ.shape(0);
   require(distances.size() == count && (!gradients || gradients->shape(0) == count),
           "points, distances and gradients differ in number");
-  const VoxelGrid voxels = voxel_grid(grid, lower_W, voxel_size);
-  const double *lower = lower_W.data(), *upper = upper_W.data();
+  GridField field{voxel_grid(grid, lower_W, voxel_size), {}, occupied_outside};
+  std::copy_n(upper_W.data(), 3, field.upper_W);
   for (size_t i = 0; i < count; ++i) {
-    const double* p = p_WQ.data() + 3 * i;
-    double in_box[3], beyond[3];
-    bool inside = true;
-    for (int k = 0; k < 3; ++k) {
-      in_box[k] = p[k] < lower[k] ? lower[k] : p[k] > upper[k] ? upper[k] : p[k];
-      beyond[k] = p[k] - in_box[k];
-      inside = inside && p[k] == in_box[k];  // false also for NaN
-    }
     double* gradient = gradients ? gradients->data() + 3 * i : nullptr;
-    if (!inside && !occupied_outside) {
-      distances.data()[i] = std::numeric_limits<double>::quiet_NaN();
-      if (gradient) std::fill_n(gradient, 3, 0.0);
-      continue;
-    }
-    Interpolant at = voxels.interpolate(in_box);
-    if (!inside) {
-      const double away =
-          std::sqrt(beyond[0] * beyond[0] + beyond[1] * beyond[1] + beyond[2] * beyond[2]);
-      at.value -= away;
-      for (int k = 0; k < 3; ++k) {
-        at.gradient[k] = (beyond[k] == 0.0 ? at.gradient[k] : 0.0) - beyond[k] / away;
-      }
-    }
-    distances.data()[i] = at.value;
-    if (gradient) std::copy_n(at.gradient, 3, gradient);
+    distances.data()[i] = field.distance(p_WQ.data() + 3 * i, gradient);
   }
 }
 

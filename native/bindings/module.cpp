@@ -28,7 +28,7 @@ struct RenderedFrame {
 void init_camera(CameraParameters* self, const Doubles<nb::shape<3, 3>>& K,
                  const Doubles<nb::shape<4, 4>>& X_CW, int width, int height, double near_plane,
                  double far_plane, double radius_clip, double eps2d, bool antialiased,
-                 double max_depth, int distortion,
+                 double max_depth, double merged_spread, int distortion,
                  const std::optional<Doubles<nb::shape<13>>>& lens) {
   require(width > 0 && height > 0 && width <= 32768 && height <= 32768,
           "the image size must be in [1, 32768] px");
@@ -41,6 +41,7 @@ void init_camera(CameraParameters* self, const Doubles<nb::shape<3, 3>>& K,
   p.eps2d = eps2d;
   p.antialiased = antialiased;
   p.max_depth = max_depth;
+  p.merged_spread = merged_spread;
   std::copy_n(K.data(), 9, p.K);
   std::copy_n(X_CW.data(), 16, p.X_CW);
   if (lens) {
@@ -120,10 +121,12 @@ struct BakedView {
   Camera camera;
   Image image;
 
-  BakedView(CameraParameters parameters, float* color, float* depth, float* alpha,
-            const float* background)
+  BakedView(const BakedArrays& scene, CameraParameters parameters, float* color, float* depth,
+            float* alpha, const float* background)
       : image{color, 3, depth, 1, DepthMode::kMedian, alpha, {}} {
     if (!color) parameters.eps2d = kDepthBlur;
+    if (!depth) image.depth_mode = DepthMode::kExpected;
+    require(parameters.merged_spread == 0.0 || scene.merged_geometry, "neighbors are not merged");
     camera = make_camera(parameters);
     camera.depth_alone = !color;
     std::copy_n(background, 3, image.background);
@@ -132,17 +135,19 @@ struct BakedView {
 
 void render_baked(const BakedScene& scene, Renderer& renderer, const Gaussians& moving,
                   const CameraParameters& parameters, const Background& background,
-                  const std::optional<Output>& color, const Output& depth,
+                  const std::optional<Output>& color, const std::optional<Output>& depth,
                   const std::optional<Output>& alpha) {
   require(color.has_value() == alpha.has_value(), "color and alpha are rendered together");
   const int height = parameters.height, width = parameters.width;
-  check_size(depth, height, width, 1);
+  require(color || depth, "no image");
+  if (depth) check_size(*depth, height, width, 1);
   if (color) {
     check_size(*color, height, width, 3);
     check_size(*alpha, height, width, 1);
   }
-  const BakedView view(parameters, color ? color->data() : nullptr, depth.data(),
-                       alpha ? alpha->data() : nullptr, background.data());
+  const BakedView view(scene.arrays(), parameters, color ? color->data() : nullptr,
+                       depth ? depth->data() : nullptr, alpha ? alpha->data() : nullptr,
+                       background.data());
   const Exclusive use(renderer);
   renderer.render(scene.arrays(), moving.arrays(), view.camera, view.image);
 }
@@ -150,12 +155,13 @@ void render_baked(const BakedScene& scene, Renderer& renderer, const Gaussians& 
 // Views of several scenes, each rendered by one thread.
 void render_views(BatchRenderer& renderer, const std::vector<const BakedScene*>& scenes,
                   const std::vector<CameraParameters>& cameras, const Rows3& backgrounds,
-                  const std::optional<Views>& color, const Views& depth,
+                  const std::optional<Views>& color, const std::optional<Views>& depth,
                   const std::optional<Views>& alpha) {
   require(color.has_value() == alpha.has_value(), "color and alpha are rendered together");
+  require(color || depth, "no image");
   const size_t count = scenes.size();
   require(cameras.size() == count, "scenes and cameras differ in number");
-  require_rows(count, "scenes and images differ in number", backgrounds, depth);
+  require_rows(count, "scenes and backgrounds differ in number", backgrounds);
   const auto check = [&](const Views& images, size_t channels) {
     require_rows(count, "scenes and images differ in number", images);
     for (const CameraParameters& camera : cameras) {
@@ -165,17 +171,19 @@ void render_views(BatchRenderer& renderer, const std::vector<const BakedScene*>&
               "an image has the wrong shape");
     }
   };
-  check(depth, 1);
+  if (depth) check(*depth, 1);
   if (color) {
     check(*color, 3);
     check(*alpha, 1);
   }
-  const size_t pixels = depth.shape(1) * depth.shape(2);
+  const Views& any = depth ? *depth : *color;
+  const size_t pixels = any.shape(1) * any.shape(2);
   const nb::gil_scoped_release release;
   renderer.for_each(count, [&](Renderer& thread, size_t i) {
-    const BakedView view(cameras[i], color ? color->data() + 3 * pixels * i : nullptr,
-                         depth.data() + pixels * i, alpha ? alpha->data() + pixels * i : nullptr,
-                         backgrounds.data() + 3 * i);
+    const BakedView view(scenes[i]->arrays(), cameras[i],
+                         color ? color->data() + 3 * pixels * i : nullptr,
+                         depth ? depth->data() + pixels * i : nullptr,
+                         alpha ? alpha->data() + pixels * i : nullptr, backgrounds.data() + 3 * i);
     thread.render(scenes[i]->arrays(), GaussianArrays{}, view.camera, view.image);
   });
 }
@@ -261,7 +269,7 @@ NB_MODULE(_native, m) {
       .def("__init__", &init_camera, nb::kw_only(), "K"_a, "X_CW"_a, "width"_a, "height"_a,
            "near_plane"_a, "far_plane"_a, "radius_clip"_a = 0.0, "eps2d"_a = 0.0,
            "antialiased"_a = false, "max_depth"_a = std::numeric_limits<double>::infinity(),
-           "distortion"_a = 0, "lens"_a = nb::none());
+           "merged_spread"_a = 0.0, "distortion"_a = 0, "lens"_a = nb::none());
   nb::class_<RenderedFrame>(m, "Frame", "A rendered image, for its backward pass.")
       .def_ro("splat_count", &RenderedFrame::splat_count, "Number of visible Gaussians.");
   m.def("projected", &projected, "renderer"_a, "frame"_a, "opacities"_a.none(),
@@ -290,6 +298,8 @@ NB_MODULE(_native, m) {
           },
           "gaussians"_a)
       .def_prop_ro("count", &BakedScene::count)
+      .def("merge_neighbors", &BakedScene::merge_neighbors,
+           "Prepares images of cameras with a merged_spread.")
       .def(
           "recolored",
           [](const BakedScene& scene, const Colors& sh, int sh_degree) {
@@ -299,10 +309,11 @@ NB_MODULE(_native, m) {
             return BakedScene(scene, sh.data(), static_cast<int>(sh.shape(1)), sh_degree);
           },
           "sh"_a, "sh_degree"_a, "The same Gaussians in other colors.");
-  m.def("render_baked", &render_baked, "scene"_a, "renderer"_a, "moving"_a, "camera"_a,
-        nb::kw_only(), "background"_a, "color"_a.none(), "depth"_a, "alpha"_a.none(),
-        "Writes the median depth, and unless they are None color and alpha, of the scene and of\n"
-        "moving Gaussians among it.");
+  m.def(
+      "render_baked", &render_baked, "scene"_a, "renderer"_a, "moving"_a, "camera"_a, nb::kw_only(),
+      "background"_a, "color"_a.none(), "depth"_a.none(), "alpha"_a.none(),
+      "Writes the median depth, color and alpha, unless they are None, of the scene and of moving\n"
+      "Gaussians among it.");
 
   nb::class_<BatchRenderer>(m, "BatchRenderer", "Threads that render one image each.")
       .def(
@@ -312,13 +323,14 @@ NB_MODULE(_native, m) {
           },
           "threads"_a, "simd"_a = "");
   m.def("render_views", &render_views, "renderer"_a, "scenes"_a, "cameras"_a, nb::kw_only(),
-        "backgrounds"_a, "color"_a.none(), "depth"_a, "alpha"_a.none(),
+        "backgrounds"_a, "color"_a.none(), "depth"_a.none(), "alpha"_a.none(),
         "Writes the images of N cameras as render_baked does, camera i in scene i.");
 
   bind_surfels(m);
   bind_fitting(m);
   bind_shapes(m);
   bind_grids(m);
+  bind_flight(m);
 }
 
 }  // namespace splatpilot

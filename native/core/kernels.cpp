@@ -32,6 +32,7 @@ static bool all_normalizable(const float* quats, size_t count) {
 extern const SurfelKernels kSurfelKernels;
 extern const LossKernels kLossKernels;
 extern const CastingKernels kCastingKernels;
+extern const FlightKernels kFlightKernels;
 
 #define SP_STRING_OF(name) #name
 #define SP_STRING(name) SP_STRING_OF(name)
@@ -40,6 +41,7 @@ const Kernels kKernels = {SP_STRING(SIMD_LEVEL),
                           &kSurfelKernels,
                           &kLossKernels,
                           &kCastingKernels,
+                          &kFlightKernels,
                           project_arrays,
                           project_baked,
                           bin_footprints<SplatFootprint>,

@@ -335,6 +335,41 @@ SP_INLINE F16 to_float(const D16& a) {
 SP_ARITHMETIC(D16, SP_EACH_DOUBLE)
 #undef SP_EACH_DOUBLE
 
+// One register of doubles; of an unordered pair `min` and `max` return the second operand.
+constexpr int kDoubleLanes = kRegisterBytes / 8;
+
+SP_INLINE DoubleRegister broadcast(double s) { return s - DoubleRegister{}; }
+SP_INLINE DoubleRegister load(const double* p) {
+  DoubleRegister a;
+  std::memcpy(&a, p, kRegisterBytes);
+  return a;
+}
+SP_INLINE void store(double* p, DoubleRegister a) { std::memcpy(p, &a, kRegisterBytes); }
+#if defined(__AVX512F__)
+#define SP_INTRINSIC(name) _mm512_##name
+#elif defined(__AVX2__)
+#define SP_INTRINSIC(name) _mm256_##name
+#elif defined(__SSE4_1__)
+#define SP_INTRINSIC(name) _mm_##name
+#endif
+#ifdef SP_INTRINSIC
+SP_INLINE DoubleRegister min(DoubleRegister a, DoubleRegister b) {
+  return SP_INTRINSIC(min_pd)(a, b);
+}
+SP_INLINE DoubleRegister max(DoubleRegister a, DoubleRegister b) {
+  return SP_INTRINSIC(max_pd)(a, b);
+}
+SP_INLINE DoubleRegister sqrt(DoubleRegister a) { return SP_INTRINSIC(sqrt_pd)(a); }
+#undef SP_INTRINSIC
+#else
+SP_INLINE DoubleRegister min(DoubleRegister a, DoubleRegister b) { return a < b ? a : b; }
+SP_INLINE DoubleRegister max(DoubleRegister a, DoubleRegister b) { return a > b ? a : b; }
+SP_INLINE DoubleRegister sqrt(DoubleRegister a) {
+  for (int i = 0; i < kDoubleLanes; ++i) a[i] = __builtin_sqrt(a[i]);
+  return a;
+}
+#endif
+
 #undef SP_FUNCTION
 
 }  // namespace splatpilot::SIMD_LEVEL

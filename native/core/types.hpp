@@ -14,7 +14,8 @@ constexpr int kStageSize = 256;     // splats of a tile held at a time
 constexpr int kChunkSize = 2048;    // Gaussians projected by one task
 constexpr int kPrefetchAhead = 8;   // splats are read in an order that caches cannot guess
 constexpr float kMinSquaredNorm = 1e-30f, kMaxSquaredNorm = 1e30f;  // of quaternions
-constexpr int kBoundSize = 64;  // baked Gaussians that share one bounding box
+constexpr int kBoundSize = 64;   // baked Gaussians that share one bounding box
+constexpr int kMergeLevels = 3;  // of 16, 4 and 1 merged Gaussians a box
 constexpr size_t kBackwardScratchBytes = 576 * 1024;
 
 constexpr float kAlphaCut = 1.0f / 255.0f;
@@ -46,6 +47,7 @@ struct Camera {
   float radius_clip, eps2d;     // [px], [px^2]
   bool antialiased;             // opacities fall as the blur spreads small Gaussians
   float max_depth;              // [m], of the median depth
+  float merged_spread;          // [px] of baked Gaussians that are drawn as one; 0 merges none
   bool depth_alone;             // no colors; Gaussians that hold no pixel's center are left out
   float R_CW[9];                // row-major
   // The center in two parts, so that p_W - center keeps its digits far from the world's origin.
@@ -111,6 +113,11 @@ struct BakedArrays {
   int sh_degree;          // 0: colors are final
   const float* bounds;    // (groups of 16 boxes, 7, 16): center 3, half size 3,
                           // largest scale; one box per kBoundSize Gaussians
+  // Merged Gaussians, or null: a group for each box and level, as above, and the root mean square
+  // distance of the centers that merge, the largest of the box; infinite if none merge.
+  const float* merged_geometry;  // (boxes, levels, 10, 16)
+  const float* merged_colors;    // (boxes, levels, 3 K, 16)
+  const float* spreads;          // (groups of 16 boxes, levels, 16)
 };
 
 // sum w z; that divided by alpha; or z where the transmittance of footprints without blur falls
@@ -209,6 +216,7 @@ using BinKernel = size_t (*)(const Splat*, const uint32_t* order, size_t begin, 
 struct SurfelKernels;
 struct LossKernels;
 struct CastingKernels;
+struct FlightKernels;
 
 // The kernels of one SIMD level.
 struct Kernels {
@@ -216,6 +224,7 @@ struct Kernels {
   const SurfelKernels* surfels;
   const LossKernels* losses;
   const CastingKernels* casting;
+  const FlightKernels* flight;
   // Projects Gaussians [begin, end). Writes visible ones, their planes unless null, and the bits of
   // their depths in input order; returns their number.
   size_t (*project)(const GaussianArrays&, const Camera&, size_t begin, size_t end, Splat*,

@@ -19,6 +19,11 @@ class BakedScene {
   BakedScene(const BakedScene& other, const float* colors, int sh_coefficients, int sh_degree);
 
   size_t count() const { return shape_->order.size(); }
+
+  // Merges neighbors for cameras with a `merged_spread`, once: means and covariances by moments,
+  // and opacities so that the covered area stays.
+  void merge_neighbors();
+
   const BakedArrays& arrays() const { return arrays_; }
 
  private:
@@ -27,11 +32,20 @@ class BakedScene {
     std::vector<float> geometry, bounds;
   };
 
+  struct Merged {
+    // Slots of each full box, halved along its widest axis again and again: a level merges runs.
+    std::vector<uint32_t> slots;  // (boxes, kBoundSize)
+    std::vector<double> areas;    // (boxes, kBoundSize), that the Gaussians cover
+    std::vector<float> geometry, spreads;
+  };
+
   static Shape pack_shape(const GaussianArrays& g);
   void store_colors(const float* colors, int sh_coefficients, int sh_degree);
+  void merge_colors();
 
   std::shared_ptr<const Shape> shape_;
-  std::vector<float> colors_;
+  std::shared_ptr<const Merged> merged_;
+  std::vector<float> colors_, merged_colors_;
   BakedArrays arrays_{};
 };
 

@@ -71,6 +71,7 @@ Camera make_camera(const CameraParameters& p) {
   c.eps2d = static_cast<float>(p.eps2d);
   c.antialiased = p.antialiased;
   c.max_depth = static_cast<float>(p.max_depth);
+  c.merged_spread = static_cast<float>(p.merged_spread);
 
   // center = -R^-1 t by cofactors: R may be a rotation only to single precision.
   double R[3][3], t[3];

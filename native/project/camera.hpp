@@ -15,6 +15,7 @@ struct CameraParameters {
   double X_CW[16];               // world to camera, row-major
   double near_plane, far_plane;  // [m]
   double max_depth;              // [m], of the median depth
+  double merged_spread;          // [px] of baked Gaussians that are drawn as one
   double radius_clip, eps2d;     // [px], [px^2]
   bool antialiased;
   Distortion distortion;

@@ -189,8 +189,13 @@ inline size_t project_arrays(const GaussianArrays& g, const Camera& camera, size
   return project(g, camera, begin, end, splats, planes, depth_bits);
 }
 
-// The boxes, of the 16 of one bound group, that may touch the image.
-SP_INLINE uint32_t visible_boxes(const BakedArrays& scene, const Camera& camera, size_t group) {
+// Boxes of the 16 of one bound group, one bit each.
+struct Boxes {
+  uint32_t visible;               // may touch the image
+  uint32_t merged[kMergeLevels];  // may be drawn merged
+};
+
+SP_INLINE Boxes find_boxes(const BakedArrays& scene, const Camera& camera, size_t group) {
   const float* bounds = scene.bounds + group * 7 * kLanes;
   const Vector16 p_C = to_camera(
       camera, from_center(camera, load(bounds), load(bounds + kLanes), load(bounds + 2 * kLanes)));
@@ -220,13 +225,22 @@ SP_INLINE uint32_t visible_boxes(const BakedArrays& scene, const Camera& camera,
         reach_along(camera.side_normal[side]) + F16(camera.side_reach[side]) * largest_scale;
     visible = visible & (dot(camera.side_normal[side], p_C) + reach > F16(0.0f));
   }
-  return lane_bits(visible);
+  Boxes boxes{lane_bits(visible), {}};
+  if (camera.merged_spread > 0.0f) {
+    const F16 limit = F16(camera.merged_spread / max(camera.fx, camera.fy)) * (p_C.z - depth_reach);
+    for (int level = 0; level < kMergeLevels; ++level) {
+      const F16 spread = load(scene.spreads + (group * kMergeLevels + level) * kLanes);
+      boxes.merged[level] = lane_bits(spread <= limit);
+    }
+  }
+  return boxes;
 }
 
+// `geometry` and `colors` are those of a group whose first Gaussian has the number `first`.
 template <bool kDistorted>
-SP_INLINE size_t project_baked_group(const BakedArrays& scene, const Camera& camera, size_t group,
+SP_INLINE size_t project_baked_group(const BakedArrays& scene, const Camera& camera,
+                                     const float* geometry, const float* colors, size_t first,
                                      Splat* splats, DepthPlane* planes, uint32_t* depth_bits) {
-  const float* geometry = scene.geometry + group * 10 * kLanes;
   const auto field = [&](int f) { return load(geometry + f * kLanes); };
   const Vector16 d_W = from_center(camera, field(0), field(1), field(2));
   F16 L[6];
@@ -247,8 +261,6 @@ SP_INLINE size_t project_baked_group(const BakedArrays& scene, const Camera& cam
     return to_camera(camera, Vector16{n0, n1, n2});
   };
   const auto write_colors = [&](uint32_t, F16 color[3]) {
-    const int coefficients = (scene.sh_degree + 1) * (scene.sh_degree + 1);
-    const float* colors = scene.colors + group * (3 * coefficients) * kLanes;
     if (scene.sh_degree == 0) {
       for (int c = 0; c < 3; ++c) color[c] = load(colors + c * kLanes);
     } else {
@@ -256,7 +268,7 @@ SP_INLINE size_t project_baked_group(const BakedArrays& scene, const Camera& cam
     }
   };
   uint32_t indices[kLanes];
-  for (int i = 0; i < kLanes; ++i) indices[i] = static_cast<uint32_t>(group * kLanes + i);
+  for (int i = 0; i < kLanes; ++i) indices[i] = static_cast<uint32_t>(first + i);
   return project_pack<kDistorted>(camera, d_W, field(9), 0xffff, indices, times_L, normal,
                                   write_colors, splats, planes, depth_bits);
 }
@@ -266,15 +278,28 @@ size_t project_baked_through(const BakedArrays& scene, const Camera& camera, siz
                              size_t end, Splat* splats, DepthPlane* planes, uint32_t* depth_bits) {
   constexpr size_t kGroupsPerBox = kBoundSize / kLanes;
   const size_t last_group = end / kLanes;
+  const size_t values = 3 * static_cast<size_t>((scene.sh_degree + 1) * (scene.sh_degree + 1));
   size_t count = 0;
-  for (size_t box = begin / kBoundSize; box * kGroupsPerBox < last_group; box += kLanes) {
-    uint32_t boxes = visible_boxes(scene, camera, box / kLanes);
-    for (; boxes; boxes &= boxes - 1) {
-      const size_t first = (box + __builtin_ctz(boxes)) * kGroupsPerBox;
+  const auto project = [&](const float* geometry, const float* colors, size_t group, size_t first) {
+    count += project_baked_group<kDistorted>(
+        scene, camera, geometry + group * 10 * kLanes, colors + group * values * kLanes, first,
+        splats + count, planes ? planes + count : nullptr, depth_bits + count);
+  };
+  for (size_t begin_box = begin / kBoundSize; begin_box * kGroupsPerBox < last_group;
+       begin_box += kLanes) {
+    const Boxes boxes = find_boxes(scene, camera, begin_box / kLanes);
+    for (uint32_t bits = boxes.visible; bits; bits &= bits - 1) {
+      const int lane = __builtin_ctz(bits);
+      const size_t box = begin_box + lane, first = box * kGroupsPerBox;
+      int level = kMergeLevels;
+      while (level > 0 && !(boxes.merged[level - 1] >> lane & 1)) --level;
+      if (level > 0) {
+        project(scene.merged_geometry, scene.merged_colors, box * kMergeLevels + level - 1,
+                first * kLanes);
+        continue;
+      }
       for (size_t group = first; group < first + kGroupsPerBox && group < last_group; ++group) {
-        count +=
-            project_baked_group<kDistorted>(scene, camera, group, splats + count,
-                                            planes ? planes + count : nullptr, depth_bits + count);
+        project(scene.geometry, scene.colors, group, group * kLanes);
       }
     }
   }

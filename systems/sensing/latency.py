@@ -136,6 +136,12 @@ class DelayedPose(LeafSystem):
         output.set_value(pose_from_state(state))
 
 
+def decision_delays(delay: Sequence[float], seed: int) -> np.ndarray:
+    """Draws the delays (CYCLE,) [s] of decisions from U(`delay`), in turn; zeros if it is empty."""
+    low, high = delay or (0.0, 0.0)
+    return np.random.default_rng([seed, CYCLE, 1]).uniform(low, high, CYCLE)
+
+
 class DecisionDelay(LeafSystem):
     """Delays an output of a policy by the time of inference and of the link to the controller.
 
@@ -152,7 +158,7 @@ class DecisionDelay(LeafSystem):
         self, output: str, size: int, period: float, delay: Sequence[float], seed: int
     ) -> None:
         super().__init__()
-        self._delays = np.random.default_rng([seed, CYCLE, 1]).uniform(delay[0], delay[1], CYCLE)
+        self._delays = decision_delays(delay, seed)
         self._period, self._count = period, math.ceil(delay[1] / period - 1e-9)
         self.DeclareVectorInputPort(output, size)
         self.DeclareDiscreteState(np.array([-period]))  # time of the newest decision [s]

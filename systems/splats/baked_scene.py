@@ -128,6 +128,9 @@ def _native_gaussians(gaussians: "GaussianScene | PlacedGaussians") -> _native.G
     )
 
 
+_ALL = "color", "depth", "alpha"
+
+
 class BakedScene:
     """A Gaussian scene prepared for fast repeated rendering.
 
@@ -166,6 +169,7 @@ class BakedScene:
         moving: PlacedGaussians = NO_GAUSSIANS,
         distortion: Distortion | None = None,
         max_depth: float = np.inf,
+        merged_spread: float = 0.0,
     ) -> RenderedView:
         """Renders color, median depth and alpha.
 
@@ -179,55 +183,57 @@ class BakedScene:
             distortion: Lens; a pinhole if None. Pixels without a ray are black, with alpha and
                 depth 0.
             max_depth: Gaussians beyond this depth [m] are left out of the depth image.
+            merged_spread: Neighbors that spread by less on the image [px] are drawn as one, which
+                is faster where Gaussians are smaller than pixels; 0 merges none. The first such
+                image prepares the scene.
         """
-        environment = background if isinstance(background, EnvironmentMap) else None
-        color = np.array(BLACK if environment else background, dtype=np.float32)
-        valid = color.shape == (3,) and np.isfinite(color).all()
-        require(valid, "background", "3 finite numbers", color.tolist())
         options = {"moving": moving, "distortion": distortion, "max_depth": max_depth}
-        depth, seen, alpha = self._render(K, width, height, X_WC, near, far, color, **options)
-        view = RenderedView(seen, depth[..., 0], alpha[..., 0])
-        if environment is None:
-            return view
-        return put_behind(view, environment, np.asarray(K), X_WC, distortion)
+        options |= {"background": background, "merged_spread": merged_spread}
+        return self._render(_ALL, K, width, height, X_WC, near, far, **options)
+
+    def render_color(self, *camera: Any, **options: Any) -> NDArray[np.float32]:
+        """Renders the color (H, W, 3), bitwise identical to that of `render` but faster.
+
+        The arguments are those of `render`; all beyond `far` by name.
+        """
+        return self._render(("color", "alpha"), *camera, **options).color
 
     def render_depth(self, *camera: Any, **options: Any) -> NDArray[np.float32]:
         """Renders the median depth (H, W) [m], bitwise identical to that of `render` but faster.
 
-        The arguments are those of `render` but `background`; all beyond `far` by name.
+        The arguments are those of `render`; all beyond `far` by name.
         """
-        return self._render(*camera, **options)[0][..., 0]
+        return self._render(("depth",), *camera, **options).depth
 
     def _render(
         self,
+        names: tuple[str, ...],
         K: ArrayLike,
         width: int,
         height: int,
         X_WC: "RigidTransform",
         near: float = 0.01,
         far: float = 1e10,
-        background: NDArray[np.float32] | None = None,
+        background: Background = BLACK,
         moving: PlacedGaussians = NO_GAUSSIANS,
         distortion: Distortion | None = None,
         max_depth: float = np.inf,
-    ) -> list[NDArray[np.float32]]:
-        """Returns depth (H, W, 1) and, with a background, color (H, W, 3) and alpha (H, W, 1)."""
-        camera = _checked_camera(K, width, height, near, far, max_depth, distortion)
-        depth, color, alpha = (np.empty((height, width, n), np.float32) for n in (1, 3, 1))
-        whole = background is not None
+        merged_spread: float = 0.0,
+    ) -> RenderedView:
+        """Renders images of these names; the others are empty."""
+        arguments = near, far, distortion, max_depth, merged_spread
+        camera = _checked_camera(K, width, height, *arguments)
+        (color,) = _background_colors([background])
+        images = _new_images(names, (height, width))
         _native.render_baked(
             self._scene,
             self._renderer,
             _native_gaussians(moving),
-            camera(self._antialiased, X_WC),
-            background=background if whole else np.zeros(3, np.float32),
-            color=color if whole else None,
-            depth=depth,
-            alpha=alpha if whole else None,
+            camera(self, X_WC),
+            background=color,
+            **{name: image if name in names else None for name, image in images.items()},
         )
-        images = [depth, color, alpha] if whole else [depth]
-        _hide_pixels(images, distortion, K)
-        return images
+        return _finished(images, [background], K, [X_WC], distortion)
 
 
 class BatchRenderer:
@@ -252,6 +258,7 @@ class BatchRenderer:
         backgrounds: Sequence[Background] | None = None,
         distortion: Distortion | None = None,
         max_depth: float = np.inf,
+        merged_spread: float = 0.0,
     ) -> RenderedView:
         """Renders color (N, H, W, 3), median depth and alpha (N, H, W); see `BakedScene.render`.
 
@@ -260,30 +267,21 @@ class BatchRenderer:
             X_WCs: poses of the N cameras.
             backgrounds: of the N views; black if None.
         """
-        backgrounds = [BLACK] * len(scenes) if backgrounds is None else backgrounds
-        maps = {i: b for i, b in enumerate(backgrounds) if isinstance(b, EnvironmentMap)}
-        colors = np.array([BLACK if i in maps else b for i, b in enumerate(backgrounds)], "f4")
-        shape = len(scenes), 3
-        valid = colors.reshape(-1, 3).shape == shape and np.isfinite(colors).all()
-        require(valid, "backgrounds", f"{shape} finite numbers", colors.tolist())
-        options = {"backgrounds": colors, "distortion": distortion, "max_depth": max_depth}
-        depth, color, alpha = self._render(scenes, K, width, height, X_WCs, near, far, **options)
-        for i, environment in maps.items():
-            view = RenderedView(color[i], depth[i, ..., 0], alpha[i, ..., 0])
-            color[i] = put_behind(view, environment, np.asarray(K), X_WCs[i], distortion).color
-        return RenderedView(color, depth[..., 0], alpha[..., 0])
+        options = {"backgrounds": backgrounds, "distortion": distortion, "max_depth": max_depth}
+        cameras = scenes, K, width, height, X_WCs, near, far
+        return self._render(_ALL, *cameras, merged_spread=merged_spread, **options)
 
-    def render_depth(
-        self, scenes: Sequence[BakedScene], *cameras: Any, **options: Any
-    ) -> NDArray[np.float32]:
-        """Renders the median depth (N, H, W) [m] alone, which is faster.
+    def render_color(self, *cameras: Any, **options: Any) -> NDArray[np.float32]:
+        """Renders the colors (N, H, W, 3) alone, which is faster; see `render`."""
+        return self._render(("color", "alpha"), *cameras, **options).color
 
-        The arguments are those of `render` but `backgrounds`; all beyond `far` by name.
-        """
-        return self._render(scenes, *cameras, **options)[0][..., 0]
+    def render_depth(self, *cameras: Any, **options: Any) -> NDArray[np.float32]:
+        """Renders the median depth (N, H, W) [m] alone, which is faster; see `render`."""
+        return self._render(("depth",), *cameras, **options).depth
 
     def _render(
         self,
+        names: tuple[str, ...],
         scenes: Sequence[BakedScene],
         K: ArrayLike,
         width: int,
@@ -291,31 +289,68 @@ class BatchRenderer:
         X_WCs: "Sequence[RigidTransform]",
         near: float = 0.01,
         far: float = 1e10,
-        backgrounds: NDArray[np.float32] | None = None,
+        backgrounds: Sequence[Background] | None = None,
         distortion: Distortion | None = None,
         max_depth: float = np.inf,
-    ) -> list[NDArray[np.float32]]:
-        """Returns depth and, with backgrounds, color and alpha, each (N, H, W, channels)."""
+        merged_spread: float = 0.0,
+    ) -> RenderedView:
+        """Renders images of these names; the others are empty."""
         count = len(scenes)
-        require(len(X_WCs) == count, "the number of poses", f"that of scenes, {count}", len(X_WCs))
-        camera = _checked_camera(K, width, height, near, far, max_depth, distortion)
-        cameras = [
-            camera(scene._antialiased, X_WC) for scene, X_WC in zip(scenes, X_WCs, strict=True)
-        ]
-        depth, color, alpha = (np.empty((count, height, width, n), np.float32) for n in (1, 3, 1))
-        whole = backgrounds is not None
+        backgrounds = [BLACK] * count if backgrounds is None else backgrounds
+        for name, rows in (("poses", X_WCs), ("backgrounds", backgrounds)):
+            condition = f"that of scenes, {count}"
+            require(len(rows) == count, f"the number of {name}", condition, len(rows))
+        arguments = near, far, distortion, max_depth, merged_spread
+        camera = _checked_camera(K, width, height, *arguments)
+        images = _new_images(names, (count, height, width))
         _native.render_views(
             self._renderer,
             [scene._scene for scene in scenes],
-            cameras,
-            backgrounds=backgrounds if whole else np.zeros((count, 3), np.float32),
-            color=color if whole else None,
-            depth=depth,
-            alpha=alpha if whole else None,
+            [camera(scene, X_WC) for scene, X_WC in zip(scenes, X_WCs, strict=True)],
+            backgrounds=_background_colors(backgrounds),
+            **{name: image if name in names else None for name, image in images.items()},
         )
-        images = [depth, color, alpha] if whole else [depth]
-        _hide_pixels(images, distortion, K)
-        return images
+        return _finished(images, backgrounds, K, X_WCs, distortion)
+
+
+def _new_images(names: tuple[str, ...], shape: tuple[int, ...]) -> dict[str, NDArray[np.float32]]:
+    """Returns arrays for images (..., H, W, channels); others have no pixels."""
+    none = (*shape[:-2], 0, 0)
+    return {
+        name: np.empty((*(shape if name in names else none), channels), np.float32)
+        for name, channels in {"color": 3, "depth": 1, "alpha": 1}.items()
+    }
+
+
+def _background_colors(backgrounds: Sequence[Background]) -> NDArray[np.float32]:
+    """Returns the colors (N, 3) behind N views; black for environments, which follow."""
+    colors = [BLACK if isinstance(behind, EnvironmentMap) else behind for behind in backgrounds]
+    for color in colors:
+        valid = len(color) == 3 and np.isfinite(color).all()
+        require(valid, "background", "3 finite numbers", list(color))
+    return np.array(colors, np.float32).reshape(-1, 3)
+
+
+def _finished(
+    images: dict[str, NDArray[np.float32]],
+    backgrounds: Sequence[Background],
+    K: ArrayLike,
+    X_WCs: "Sequence[RigidTransform]",
+    distortion: Distortion | None,
+) -> RenderedView:
+    """Returns images (..., H, W, channels) of N views, without the pixels that have no ray, and
+    before their environments."""
+    if distortion is not None:
+        for image in filter(np.size, images.values()):
+            height, width, channels = image.shape[-3:]
+            hidden = hidden_pixels(distortion, np.asarray(K, float), width, height)
+            image.reshape(-1, height * width, channels)[:, hidden] = 0.0
+    view = RenderedView(images["color"], images["depth"][..., 0], images["alpha"][..., 0])
+    for i, background in enumerate(backgrounds):
+        if view.color.size and isinstance(background, EnvironmentMap):
+            part = view if view.depth.ndim == 2 else RenderedView(*(image[i] for image in view))
+            part.color[:] = put_behind(part, background, np.asarray(K), X_WCs[i], distortion).color
+    return view
 
 
 def _checked_camera(
@@ -324,33 +359,34 @@ def _checked_camera(
     height: int,
     near: float,
     far: float,
-    max_depth: float,
     distortion: Distortion | None,
-) -> "Callable[[bool, RigidTransform], _native.Camera]":
-    """Checks a camera; returns the function from antialiasing and the pose to the native one."""
+    max_depth: float,
+    merged_spread: float,
+) -> "Callable[[BakedScene, RigidTransform], _native.Camera]":
+    """Checks a camera; returns the function from a scene and the pose to the native one."""
     K = check_camera(K, width, height, near, far)
     require(max_depth > 0, "max_depth", "> 0 m", max_depth)
+    require(0 <= merged_spread < np.inf, "merged_spread", "finite and >= 0 px", merged_spread)
     lens = {} if distortion is None else native_lens(distortion, K, width, height)._asdict()
-    options = {"near_plane": near, "far_plane": far, "eps2d": EPS2D, "max_depth": max_depth, **lens}
 
-    def make(antialiased: bool, X_WC: "RigidTransform") -> _native.Camera:
-        X_CW = np.ascontiguousarray(X_WC.inverse().GetAsMatrix4())
-        size = {"width": width, "height": height, "antialiased": antialiased}
-        return _native.Camera(K=K, X_CW=X_CW, **size, **options)
+    def make(scene: BakedScene, X_WC: "RigidTransform") -> _native.Camera:
+        if merged_spread:
+            scene._scene.merge_neighbors()
+        return _native.Camera(
+            K=K,
+            X_CW=np.ascontiguousarray(X_WC.inverse().GetAsMatrix4()),
+            width=width,
+            height=height,
+            near_plane=near,
+            far_plane=far,
+            eps2d=EPS2D,
+            max_depth=max_depth,
+            merged_spread=merged_spread,
+            antialiased=scene._antialiased,
+            **lens,
+        )
 
     return make
-
-
-def _hide_pixels(
-    images: list[NDArray[np.float32]], distortion: Distortion | None, K: ArrayLike
-) -> None:
-    """Sets pixels without a ray to zero, in images (..., H, W, channels)."""
-    if distortion is None:
-        return
-    for image in images:
-        height, width, channels = image.shape[-3:]
-        hidden = hidden_pixels(distortion, np.asarray(K, float), width, height)
-        image.reshape(-1, height * width, channels)[:, hidden] = 0.0
 
 
 def bake(scene: BakedScene | GaussianScene) -> BakedScene:

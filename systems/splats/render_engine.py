@@ -306,7 +306,7 @@ class SplatRenderEngine(RenderEngine):
     def DoRenderLabelImage(self, camera: ColorRenderCamera, label_image_out: ImageLabel16I) -> None:
         view = self._view(camera.core())
         shapes = np.asarray(self._shapes().RenderLabelImage(*self._same(camera)).data)[..., 0]
-        splats = surface_labels(view)
+        splats = surface_labels(view.depth)
         for id, (_, properties) in self._bodies.items():
             if properties.HasProperty("label", "id"):
                 label = int(cast(RenderLabel, properties.GetProperty("label", "id")))

@@ -59,10 +59,10 @@ def ranged_depth(
     return np.where(in_range, np.where(depth < min_depth, np.float32(0), depth), np.inf)
 
 
-def surface_labels(view: RenderedView) -> NDArray[np.int16]:
-    """Labels pixels (H, W) with a surface `kUnspecified` and others `kEmpty`."""
+def surface_labels(depth: NDArray[np.float32]) -> NDArray[np.int16]:
+    """Labels pixels (H, W) with a surface `kUnspecified` and others, of depth 0, `kEmpty`."""
     unspecified, empty = int(RenderLabel.kUnspecified), int(RenderLabel.kEmpty)
-    return np.where(view.depth > 0, unspecified, empty).astype(np.int16)
+    return np.where(depth > 0, unspecified, empty).astype(np.int16)
 
 
 _LABEL_TOLERANCE = 0.02  # [m] between the surface in a pixel and that of its body
@@ -234,6 +234,7 @@ class SplatCamera(LeafSystem):
         distortion: Distortion | None = None,
         readout: float = 0.0,
         exposure: float = 0.0,
+        merged_spread: float = 0.0,
     ):
         """Bakes the scene unless it is baked; see `BakedScene.render`.
 
@@ -245,6 +246,7 @@ class SplatCamera(LeafSystem):
                 input port must be as old.
             readout: time between reading the first row and the last [s]; 0 reads all at once.
             exposure: time for which each row collects light [s]; images blur by motion.
+            merged_spread: see `BakedScene.render`.
         """
         super().__init__()
         valid, got = 0 <= min_depth < max_depth < np.inf, f"[{min_depth}, {max_depth}] m"
@@ -262,7 +264,11 @@ class SplatCamera(LeafSystem):
         self._latency, self._readout, self._exposure = latency, readout, exposure
         if distortion is not None:
             distortion.validate()
-        self._options: dict[str, Any] = {"distortion": distortion, "max_depth": max_depth}
+        self._options: dict[str, Any] = {
+            "distortion": distortion,
+            "max_depth": max_depth,
+            "merged_spread": merged_spread,
+        }
 
         self._info_index = self.DeclareAbstractParameter(Value(camera_info))
         self._mount_index = self.DeclareAbstractParameter(Value(self._X_BC))
@@ -271,7 +277,7 @@ class SplatCamera(LeafSystem):
         if readout + exposure > 0.0:
             self.DeclareAbstractInputPort("start_pose", Value(RigidTransform()))
         tickets = {self.all_input_ports_ticket(), self.all_parameters_ticket()}
-        view_entry, depth_entry = (
+        color_entry, depth_entry = (
             self.DeclareCacheEntry(
                 name,
                 ValueProducer(
@@ -280,16 +286,21 @@ class SplatCamera(LeafSystem):
                 ),
                 tickets,
             )
-            for name, calc in (("view", self._calc_view), ("depth", self._calc_depth))
+            for name, calc in (("color", self._calc_colors), ("depth", self._calc_depth))
         )
         # The indices: Drake would never free a system that keeps the entries themselves.
-        self._view_index, self._depth_index = view_entry.cache_index(), depth_entry.cache_index()
+        self._color_index, self._depth_index = color_entry.cache_index(), depth_entry.cache_index()
         width, height = camera_info.width(), camera_info.height()
         for name, image, calc, prerequisites in (
-            ("color_image", ImageRgba8U, self._calc_color, {view_entry.ticket()}),
+            ("color_image", ImageRgba8U, self._calc_color, {color_entry.ticket()}),
             ("depth_image_32f", ImageDepth32F, self._calc_depth_32f, {depth_entry.ticket()}),
             ("depth_image_16u", ImageDepth16U, self._calc_depth_16u, {depth_entry.ticket()}),
-            ("label_image", ImageLabel16I, self._calc_label, {view_entry.ticket(), *tickets}),
+            (
+                "label_image",
+                ImageLabel16I,
+                self._calc_label,
+                {depth_entry.ticket(), *tickets},
+            ),
         ):
             self.DeclareAbstractOutputPort(
                 name,
@@ -349,24 +360,40 @@ class SplatCamera(LeafSystem):
         return self._render(camera)
 
     def _render(self, camera: CameraState) -> RenderedView:
+        view = self._render_view(self._shutter(camera, 0.5))
+        if self._num_exposures(camera) == 0:
+            return view
+        return view._replace(color=self._render_color(camera))
+
+    def _render_view(self, camera: CameraState) -> RenderedView:
+        parts = self._render_instant(self._scene.render, camera, background=self._background)
+        return RenderedView(*parts)
+
+    def _render_color(self, camera: CameraState) -> NDArray[np.float32]:
+        count, lights = self._num_exposures(camera), []
+        if count == 0:
+            (color,) = self._render_instant(
+                self._scene.render_color, self._shutter(camera, 0.5), background=self._background
+            )
+            return color
+        for k in range(count):
+            first, middle, last = (self._shutter(camera, (k + s) / count) for s in (0.0, 0.5, 1.0))
+            X_WC = middle.X_WB @ camera.X_BC
+            X_CtCs = [(end.X_WB @ camera.X_BC).inverse() @ X_WC for end in (first, last)]
+            view, lens = self._render_view(middle), self._options["distortion"]
+            lights.append(blurred_light(view, camera.camera_info, X_CtCs, lens))
+        return color_of_light(np.mean(lights, axis=0)) / np.float32(255.0)
+
+    def _num_exposures(self, camera: CameraState) -> int:
+        """Returns the number of poses of an exposure that are rendered; 0 without motion blur."""
         if self._exposure == 0.0 or camera.X_WB_start is None:
-            return self._render_instant(camera)
+            return 0
         X_WC0, X_WC1 = (X_WB @ camera.X_BC for X_WB in (camera.X_WB_start, camera.X_WB))
         share = self._exposure / (self._exposure + self._readout)
         shift = share * image_shift(X_WC0, X_WC1, camera.camera_info.focal_x())
         if shift < _MIN_BLUR:
-            return self._render_instant(self._shutter(camera, 0.5))
-        count = min(_MAX_EXPOSURES, math.ceil(shift / _MAX_BLUR_STEP)) | 1  # odd: one in the middle
-        lights, views = [], []
-        for k in range(count):
-            first, middle, last = (self._shutter(camera, (k + s) / count) for s in (0.0, 0.5, 1.0))
-            views.append(self._render_instant(middle))
-            X_WC = middle.X_WB @ camera.X_BC
-            X_CtCs = [(end.X_WB @ camera.X_BC).inverse() @ X_WC for end in (first, last)]
-            lens = self._options["distortion"]
-            lights.append(blurred_light(views[-1], camera.camera_info, X_CtCs, lens))
-        color = color_of_light(np.mean(lights, axis=0)) / np.float32(255.0)
-        return views[count // 2]._replace(color=color)
+            return 0
+        return min(_MAX_EXPOSURES, math.ceil(shift / _MAX_BLUR_STEP))
 
     def _shutter(self, camera: CameraState, s: float) -> CameraState:
         """Returns a camera with an exposure at a fraction s of it, from 0 to 1."""
@@ -382,21 +409,21 @@ class SplatCamera(LeafSystem):
         time = camera.time - (1.0 - s) * self._exposure
         return camera._replace(X_WB=X_WBs[1], X_WB_start=start, time=time)
 
-    def _render_instant(self, camera: CameraState) -> RenderedView:
-        views = [
-            self._scene.render(*band, background=self._background, moving=moving, **self._options)
+    def _render_instant(
+        self, render: Callable[..., Any], camera: CameraState, **options: Any
+    ) -> list[NDArray[np.float32]]:
+        """Renders the bands of an image, or of a view of several, and joins them."""
+        bands = [
+            render(*band, moving=moving, **self._options, **options)
             for band, moving in self._bands(camera)
         ]
-        if len(views) == 1:
-            return views[0]
-        return RenderedView(*map(np.concatenate, zip(*views, strict=True)))
+        parts = [band if isinstance(band, RenderedView) else (band,) for band in bands]
+        return (
+            list(parts[0]) if len(parts) == 1 else [*map(np.concatenate, zip(*parts, strict=True))]
+        )
 
     def _render_depth(self, scene: BakedScene, camera: CameraState) -> NDArray[np.float32]:
-        depths = [
-            scene.render_depth(*band, moving=moving, **self._options)
-            for band, moving in self._bands(self._shutter(camera, 0.5))
-        ]
-        return depths[0] if len(depths) == 1 else np.concatenate(depths)
+        return self._render_instant(scene.render_depth, self._shutter(camera, 0.5))[0]
 
     def _bands(self, camera: CameraState) -> Iterator[tuple[tuple[Any, ...], PlacedGaussians]]:
         """Yields K (3, 3) [px], width, height, X_WC, near and far of each band, and its bodies."""
@@ -428,42 +455,36 @@ class SplatCamera(LeafSystem):
         camera = self.camera_info(context), self.X_BC(context)
         return CameraState(*camera, X_WB, time, start[0] if start else None, bodies)
 
-    def _calc_view(self, context, value) -> None:
-        value.set_value(self._render(self._camera_state(context)))
+    def _calc_colors(self, context, value) -> None:
+        value.set_value(self._render_color(self._camera_state(context)))
 
     def _calc_depth(self, context, value) -> None:
-        entry = self.get_cache_entry(self._view_index)
-        if not entry.is_out_of_date(context):
-            depth = self._rendered(context).depth
-        else:
-            depth = self._render_depth(self._scene, self._camera_state(context))
-        value.set_value(ranged_depth(depth, *self._depth_range))
-
-    def _rendered(self, context) -> RenderedView:
-        return cast(RenderedView, self.get_cache_entry(self._view_index).Eval(context))
+        value.set_value(self._render_depth(self._scene, self._camera_state(context)))
 
     def _calc_color(self, context, value) -> None:
+        color = cast(Any, self.get_cache_entry(self._color_index).Eval(context))
         pixels = value.get_mutable_value().mutable_data  # (H, W, 4)
-        pixels[..., :3] = color_pixels(self._rendered(context).color)
+        pixels[..., :3] = color_pixels(color)
         pixels[..., 3] = 255
 
-    def _depth(self, context) -> np.ndarray:
+    def _depth(self, context) -> NDArray[np.float32]:
         return cast(Any, self.get_cache_entry(self._depth_index).Eval(context))
 
     def _calc_depth_32f(self, context, value) -> None:
-        value.get_mutable_value().mutable_data[..., 0] = self._depth(context)
+        depth = ranged_depth(self._depth(context), *self._depth_range)
+        value.get_mutable_value().mutable_data[..., 0] = depth
 
     def _calc_depth_16u(self, context, value) -> None:
-        millimeters = np.minimum(self._depth(context) * 1000.0 + 0.5, 65535.0)
-        value.get_mutable_value().mutable_data[..., 0] = millimeters
+        depth = ranged_depth(self._depth(context), *self._depth_range)
+        value.get_mutable_value().mutable_data[..., 0] = np.minimum(depth * 1000.0 + 0.5, 65535.0)
 
     def _calc_label(self, context, value) -> None:
-        rendered, camera = self._rendered(context), self._camera_state(context)
-        labels = surface_labels(rendered)
+        depth, camera = self._depth(context), self._camera_state(context)
+        labels = surface_labels(depth)
         bodies = camera.bodies or Bodies(0.0)
         for label, track in enumerate(bodies.tracks):
             alone = camera._replace(bodies=replace(bodies, obstacles=None, tracks=(track,)))
-            label_body(labels, rendered.depth, self._render_depth(empty_scene(), alone), label)
+            label_body(labels, depth, self._render_depth(empty_scene(), alone), label)
         value.get_mutable_value().mutable_data[..., 0] = labels
 
     def _calc_body_pose(self, context, value) -> None:

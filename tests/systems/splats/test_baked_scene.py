@@ -393,5 +393,63 @@ def test_refuses_batches_of_different_lengths():
     scene, batch = BakedScene(random_scene(count=10)), BatchRenderer(2)
     with pytest.raises(ValueError, match="number of poses must be that of scenes, 2, got 1"):
         batch.render_depth([scene] * 2, K, WIDTH, HEIGHT, [X_WC])
-    with pytest.raises(ValueError, match=r"backgrounds must be \(2, 3\) finite numbers"):
+    with pytest.raises(ValueError, match="number of backgrounds must be that of scenes, 2, got 1"):
         batch.render([scene] * 2, K, WIDTH, HEIGHT, [X_WC] * 2, backgrounds=[(0.0, 0.0, 0.0)])
+
+
+def textured_wall(sh_degree=0):
+    """Returns a wall at z = 3 m of Gaussians 3 cm apart, with waves of color."""
+    y, x = (grid.ravel() for grid in np.mgrid[-4.5:4.5:0.03, -4.5:4.5:0.03])
+    scene = GaussianScene.from_colors(
+        means=np.column_stack([x, y, np.full_like(x, 3.0)]),
+        quats=np.tile([1.0, 0, 0, 0], (x.size, 1)),
+        scales=np.tile([0.021, 0.021, 1e-3], (x.size, 1)),
+        opacities=np.full(x.size, 0.9),
+        colors=0.5 + 0.4 * np.stack([np.sin(4 * x), np.sin(4 * y), np.sin(3 * x + 2 * y)], -1),
+    )
+    pads = ((0, 0), (0, (sh_degree + 1) ** 2 - 1), (0, 0))
+    return replace(scene, sh=np.pad(scene.sh, pads))
+
+
+@pytest.mark.parametrize("simd", LEVELS)
+@pytest.mark.parametrize("degree", [0, 2])
+def test_merged_neighbors_show_the_same_picture(simd, degree):
+    scene = BakedScene(textured_wall(degree), simd=simd)
+    small = np.array([[24.0, 0, 24.0], [0, 24.0, 18.0], [0, 0, 1]])
+    fine = np.array([[192.0, 0, 192.0], [0, 192.0, 144.0], [0, 0, 1]])
+    X = RigidTransform(RollPitchYaw(0.1, 0.1, 0.2), np.zeros(3))
+    truth = scene.render(fine, 384, 288, X).color.reshape(36, 8, 48, 8, 3).mean((1, 3))
+    views = [scene.render(small, 48, 36, X, merged_spread=spread) for spread in (0.0, 1.0)]
+    errors = [np.abs(view.color - truth).mean() for view in views]
+    assert errors[1] < 0.8 * errors[0]
+    assert np.any(views[0].color != views[1].color)
+    assert np.isclose(views[1].depth, views[0].depth, rtol=1e-3).mean() > 0.995
+    assert views[1].alpha.mean() > 0.99
+
+
+def test_recolored_scenes_keep_their_merged_neighbors():
+    wall = textured_wall()
+    scene = BakedScene(wall)
+    camera = K, WIDTH, HEIGHT, RigidTransform()
+    view = scene.render(*camera, merged_spread=2.0)
+    inverted = replace(wall, sh=-wall.sh)
+    for baked in (scene.recolored(inverted.sh), BakedScene(inverted)):
+        image = baked.render_color(*camera, merged_spread=2.0)
+        np.testing.assert_allclose(image + view.color, view.alpha[..., None] * [1, 1, 1], atol=1e-4)
+
+
+def test_few_gaussians_far_apart_do_not_merge():
+    scene = BakedScene(random_scene(count=130))
+    views = [scene.render(K, WIDTH, HEIGHT, X_WC, merged_spread=s) for s in (0.0, 1e-3)]
+    for name in ("color", "depth", "alpha"):
+        np.testing.assert_array_equal(*(getattr(view, name) for view in views))
+
+
+@pytest.mark.parametrize("lens", [None, Distortion("opencv", [-0.1, 0.01])])
+def test_color_alone_is_bitwise_that_of_the_view(lens):
+    scene = BakedScene(random_scene())
+    for spread in (0.0, 2.0):
+        options = {"background": (0.1, 0.2, 0.3), "distortion": lens, "merged_spread": spread}
+        view = scene.render(K, WIDTH, HEIGHT, X_WC, **options)
+        alone = scene.render_color(K, WIDTH, HEIGHT, X_WC, **options)
+        np.testing.assert_array_equal(alone, view.color)

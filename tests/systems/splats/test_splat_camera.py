@@ -28,11 +28,11 @@ X_BC = RigidTransform(RotationMatrix(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 
 
 
 class CountingScene(BakedScene):
-    renders = depths = 0
+    colors = depths = 0
 
-    def render(self, *args, **kwargs):
-        self.renders += 1
-        return super().render(*args, **kwargs)
+    def render_color(self, *args, **kwargs):
+        self.colors += 1
+        return super().render_color(*args, **kwargs)
 
     def render_depth(self, *args, **kwargs):
         self.depths += 1
@@ -118,26 +118,26 @@ def test_renders_once_per_pose_and_only_when_asked():
     camera = SplatCamera(scene, INFO, X_BC)
     context = camera.CreateDefaultContext()
     camera.GetInputPort("body_pose").FixValue(context, RigidTransform())
-    assert scene.renders == 0
+    assert scene.colors == scene.depths == 0
     for time in (0.0, 1.0):
         context.SetTime(time)
         for port in ("color_image", "depth_image_32f", "depth_image_16u", "label_image"):
             camera.GetOutputPort(port).Eval(context)
         assert camera.GetOutputPort("image_time").Eval(context)[0] == time
-    assert (scene.renders, scene.depths) == (1, 0)
+    assert (scene.colors, scene.depths) == (1, 1)
     X_WB = RigidTransform([1.0, 0, 0])
     camera.GetInputPort("body_pose").FixValue(context, X_WB)
     for port in ("depth_image_32f", "depth_image_16u"):
         camera.GetOutputPort(port).Eval(context)
     nearer = camera.GetOutputPort("depth_image_32f").Eval(context).data.copy()
     assert camera.GetOutputPort("body_pose_in_world").Eval(context).IsExactlyEqualTo(X_WB)
-    assert (scene.renders, scene.depths) == (1, 1)
+    assert (scene.colors, scene.depths) == (1, 2)
     np.testing.assert_allclose(nearer, 1.9, rtol=2e-3)
     other = camera.CreateDefaultContext()
     camera.GetInputPort("body_pose").FixValue(other, X_WB)
     camera.GetOutputPort("color_image").Eval(other)
     np.testing.assert_array_equal(camera.GetOutputPort("depth_image_32f").Eval(other).data, nearer)
-    assert (scene.renders, scene.depths) == (2, 1)
+    assert (scene.colors, scene.depths) == (2, 3)
 
 
 WIDTH, HEIGHT, FOCAL = 64, 48, 40.0
@@ -217,7 +217,7 @@ def test_a_still_camera_renders_once():
     scene = wall(3)
     camera = SplatCamera(scene, INFO, X_BC, exposure=0.02)
     still = camera.render(RigidTransform(), None, RigidTransform())
-    assert scene.renders == 1
+    assert scene.colors == 0  # rendered with depth, at once
     np.testing.assert_array_equal(still.color, camera.render(RigidTransform()).color)
 
 

@@ -1,0 +1,293 @@
+"""Observations, actions and configuration of the environments, for batches of N vehicles.
+
+The heading frame H has its origin in the vehicle, z up and x above the body's x axis.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+from gymnasium.spaces import Box, Dict, Space
+from numpy.typing import NDArray
+
+from splatpilot.diagrams.flight.blocks import DECISIONS
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.gym.rewards import Reward, Transition
+from splatpilot.diagrams.scenarios import scenario_file
+from splatpilot.systems.common.config import load_config
+from splatpilot.systems.common.validation import MAX_SEED, Config, bounded, require, require_field
+from splatpilot.systems.sensing.onboard_camera import OnboardCamera
+from splatpilot.systems.vehicle.quadrotor import GRAVITY
+from splatpilot.systems.vehicle.state import QuadrotorState
+
+
+class Vehicles(NamedTuple):
+    """N vehicles at one instant."""
+
+    states: NDArray[np.float64]  # (N, 13), see `QuadrotorState`
+    p_WG: NDArray[np.float64]  # (N, 3) [m], goals
+    distances: NDArray[np.float64]  # (N,) [m] from p_WB to the nearest surface; NaN outside
+    gradients: NDArray[np.float64]  # (N, 3) of the distances by p_WB, in W; zero outside
+
+
+_SPEED, _RATE, _RANGE = 30.0, 20.0, 10.0  # [m/s], [rad/s], [m] at which observations are clipped
+_GOAL_UNIT = 10.0  # [m]
+
+# Bounds of observations that are vectors: those above clip, and distances to goals end at 1 km.
+_BOUNDS: dict[str, tuple[list[float], list[float]]] = {
+    "state": ([-_SPEED] * 3 + [-1.0] * 3 + [-_RATE] * 3, [_SPEED] * 3 + [1.0] * 3 + [_RATE] * 3),
+    "full_state": (
+        [-1e3] * 3 + [-_SPEED] * 3 + [-1.0] * 4 + [-_RATE] * 3,
+        [1e3] * 3 + [_SPEED] * 3 + [1.0] * 4 + [_RATE] * 3,
+    ),
+    "goal": ([-1.0] * 3 + [0.0], [1.0] * 3 + [100.0]),
+    "obstacle": ([-1.0] * 3 + [-_RANGE], [1.0] * 3 + [_RANGE]),
+}
+
+IMAGES = {"depth": "depth_image_32f", "depth_m": "depth_image_32f", "rgb": "color_image"}
+"""Observations that are images, and the port of the policy's camera that each needs."""
+
+OBSERVATIONS = (*_BOUNDS, *IMAGES)
+"""Names of all observations besides the outputs of sensors."""
+
+
+def observation_space(
+    config: "FlightEnvConfig", sensors: Mapping[str, Space[Any]] | None = None
+) -> Space[Any]:
+    """Returns the space of one vehicle's observation: a Dict, or a Box if `observation` is a name.
+
+    Args:
+        sensors: spaces of the outputs of sensors by name, such as `imu_acceleration`.
+    """
+    sensors = sensors or {}
+    names = config.observation_names()
+    for name in names:
+        known = [*OBSERVATIONS, *sensors]
+        condition = f"one of {', '.join(known)}, or an output of the scenario's sensors"
+        require(name in known, "observation", condition, repr(name))
+    spaces = {name: sensors.get(name) or _space(name, config.camera) for name in names}
+    return spaces[names[0]] if isinstance(config.observation, str) else Dict(spaces)
+
+
+def _space(name: str, camera: OnboardCamera) -> Box:
+    if name in _BOUNDS:
+        low, high = (np.array(bound, dtype=np.float32) for bound in _BOUNDS[name])
+        return Box(low, high, dtype=np.float32)
+    size = camera.height, camera.width
+    if name == "depth_m":
+        return Box(0.0, camera.max_depth, size, np.float32)
+    return Box(0, 255, (*size, 3 if name == "rgb" else 1), np.uint8)
+
+
+def observe(names: Sequence[str], vehicles: Vehicles) -> dict[str, NDArray[np.float32]]:
+    """Returns the observations (N, n) that are vectors, of those named, within their bounds:
+
+    - `state` (9): v_WB [m/s] and the body's z axis, both in H, and w_WB_B [rad/s];
+    - `full_state` (13): that of `QuadrotorState`;
+    - `goal` (4): the direction to the goal in H, and its distance [10 m];
+    - `obstacle` (4): the direction away from the nearest surface in H, the gradient of the distance
+      field, and the distance of p_WB to it [m]; zeros outside the world.
+    """
+    observed: dict[str, NDArray[np.float32]] = {}
+    p_WB, v_WB, q_WB, w_WB_B = QuadrotorState.of(vehicles.states)
+    heading = _heading(q_WB)
+    for name in names:
+        if name == "state":
+            parts = [_to_heading(v_WB, *heading), _to_heading(_up(q_WB), *heading), w_WB_B]
+        elif name == "full_state":
+            parts = [vehicles.states]
+        elif name == "goal":
+            to_goal = vehicles.p_WG - p_WB
+            distance = np.sqrt((to_goal * to_goal).sum(-1, keepdims=True))
+            direction = to_goal / np.maximum(distance, 1e-9)
+            parts = [_to_heading(direction, *heading), distance / _GOAL_UNIT]
+        elif name == "obstacle":
+            distance = np.nan_to_num(vehicles.distances, nan=0.0)[..., None]
+            parts = [_to_heading(vehicles.gradients, *heading), distance]
+        else:
+            continue
+        whole = np.concatenate(parts, axis=-1) if len(parts) > 1 else parts[0]
+        observed[name] = np.clip(whole, *_CLIPS[name]).astype(np.float32)
+    return observed
+
+
+_CLIPS = {name: tuple(map(np.array, bounds)) for name, bounds in _BOUNDS.items()}
+
+
+def observe_image(name: str, image: NDArray[Any], max_depth: float) -> NDArray[Any]:
+    """Returns an observation of `IMAGES` of an image of its port.
+
+    - `depth` (..., H, W, 1) uint8: proximity, 255 (1 - z / `max_depth`) of planar depth z, and 0
+      where nothing is seen;
+    - `depth_m` (..., H, W) float32 [m]: planar depth, `max_depth` where nothing is seen;
+    - `rgb` (..., H, W, 3) uint8.
+
+    Args:
+        image: (..., H, W) planar depth [m], 0 if too near and inf if too far; or (..., H, W, 3 or
+            4) uint8.
+    """
+    if name == "rgb":
+        return np.ascontiguousarray(image[..., :3])
+    depth = np.minimum(image, np.float32(max_depth))
+    if name == "depth_m":
+        return depth
+    proximity = np.float32(255.5) - depth * np.float32(255.0 / max_depth)
+    return proximity.astype(np.uint8)[..., None]
+
+
+# [-] Scale of actions at 1: thrust [m/s^2] and body rates [rad/s], [m/s^2], [m/s], [m].
+_LIMITS = {
+    "command": (GRAVITY, 6.0, 6.0, 2.0),
+    "acceleration": (6.0, 6.0, 6.0),
+    "velocity": (3.0, 3.0, 3.0),
+    "waypoint": (1.2, 1.2, 1.2),
+}
+
+
+def action_space(config: "FlightEnvConfig") -> Box:
+    """Returns the space of one vehicle's action, [-1, 1] (n,) float32; see `decisions`."""
+    return Box(-1.0, 1.0, (DECISIONS[config.action],), np.float32)
+
+
+def require_actions(actions: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """Returns actions as floats; raises ValueError unless all are in [-1, 1] and of this shape."""
+    given = np.asarray(actions, dtype=float)
+    require(given.shape == shape, "shape of action", str(shape), given.shape)
+    if not (np.abs(given) <= 1.0).all():  # NaN too
+        worst = given[~(np.abs(given) <= 1.0)][0]
+        remedy = "clip actions, as gymnasium.wrappers.ClipAction does"
+        require(False, "action", "in [-1, 1]", worst, remedy)
+    return given
+
+
+def decisions(
+    config: "FlightEnvConfig", actions: NDArray[np.float64], states: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Converts actions (N, n) in [-1, 1] to decisions (N, n) of `AddFlight`, in W, which one step
+    holds; `config.limits()` is the scale:
+
+    - `command`: thrust over mass g + limit a [m/s^2], and body rates [rad/s];
+    - `acceleration` [m/s^2] and `velocity` [m/s]: in H at the beginning of the step;
+    - `waypoint` [m]: relative to p_WB, in H at the beginning of the step.
+
+    Args:
+        states: (N, 13) at the beginning of the step.
+    """
+    scaled = actions * config.limits()
+    if config.action == "command":
+        scaled[..., 0] += GRAVITY
+        return scaled
+    p_WB, _, q_WB, _ = QuadrotorState.of(states)
+    cos, sin = _heading(q_WB)
+    rotated = _to_heading(scaled, cos, -sin)
+    return rotated + p_WB if config.action == "waypoint" else rotated
+
+
+def _heading(q_WB: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Returns cosine and sine (N,) of headings, 1 and 0 if body x is vertical."""
+    w, x, y, z = (q_WB[..., i] for i in range(4))
+    along, left = w * w + x * x - y * y - z * z, 2.0 * (w * z + x * y)
+    length = np.sqrt(along * along + left * left)
+    is_vertical = length < 1e-9
+    length = length + is_vertical
+    return np.where(is_vertical, 1.0, along / length), left / length
+
+
+def _to_heading(
+    vectors: NDArray[np.float64], cos: NDArray[np.float64], sin: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Rotates vectors (N, 3) from W to H."""
+    rotated = np.empty_like(vectors)
+    x, y = vectors[..., 0], vectors[..., 1]
+    rotated[..., 0] = cos * x + sin * y
+    rotated[..., 1] = cos * y - sin * x
+    rotated[..., 2] = vectors[..., 2]
+    return rotated
+
+
+def _up(q_WB: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns the body's z axis (N, 3) in W."""
+    w, x, y, z = (q_WB[..., i] for i in range(4))
+    norm2 = w * w + x * x + y * y + z * z
+    up = np.empty((*q_WB.shape[:-1], 3))
+    up[..., 0] = 2.0 * (x * z + w * y) / norm2
+    up[..., 1] = 2.0 * (y * z - w * x) / norm2
+    up[..., 2] = (w * w - x * x - y * y + z * z) / norm2
+    return up
+
+
+@dataclass
+class FlightEnvConfig(Config):
+    """Configuration of `FlightEnv` and `VectorFlightEnv`."""
+
+    # World, vehicle, start, goal, timeout and noise; its policy is not used.
+    scenario: Scenario = field(default_factory=Scenario)
+    # Names of `OBSERVATIONS`, and outputs of the scenario's sensors; one name for a Box.
+    observation: str | Sequence[str] = ("state", "goal")
+    # Decision of the policy, see `decisions`.
+    action: str = bounded("velocity", "{command, acceleration, velocity, waypoint}")
+    # [Hz] Steps per second; a step is a whole number of the controller's periods.
+    rate: float = bounded(10.0, "(0, 1000] Hz")
+    # Scale of the components of actions; if empty ±g and 6, 6, 2 rad/s for commands, 6 m/s^2, 3 m/s
+    # and 1.2 m.
+    action_limits: list[float] = bounded(list, "(0, inf)")
+    # Camera of the images.
+    camera: OnboardCamera = field(default_factory=lambda: OnboardCamera(max_depth=12.0))
+    # From transitions of N vehicles to their rewards (N,).
+    reward: Callable[[Transition], NDArray[np.float64]] = field(default_factory=Reward)
+    # Number of worlds among which resets draw, of the seeds from that of the scenario on.
+    num_worlds: int = bounded(1, "[1, 1000000]")
+
+    __hash__: ClassVar[None] = None  # pyright: ignore
+
+    def check(self) -> None:
+        size = DECISIONS[self.action]
+        limits = self.action_limits
+        valid = len(limits) in (0, size) and np.isfinite(limits).all()
+        require_field(self, "action_limits", valid, f"{size} finite numbers, or empty")
+        if limits and self.action == "command":
+            condition = f"at most g = {GRAVITY} m/s^2 for the thrust, which must not be negative"
+            require_field(self, "action_limits", limits[0] <= GRAVITY, condition)
+        steps = 1.0 / (self.rate * self.scenario.controller.period)
+        valid = steps > 0.5 and abs(steps - round(steps)) < 1e-6
+        condition = f"{1.0 / self.scenario.controller.period:g} Hz, the controller's, over a whole "
+        require_field(self, "rate", valid, f"{condition}number")
+        names = self.observation_names()
+        valid = names and len(set(names)) == len(names)
+        require_field(self, "observation", valid, "different names, at least one")
+        require_field(self, "reward", callable(self.reward), "a function of a Transition")
+
+    def observation_names(self) -> list[str]:
+        """Returns the names of the observations."""
+        return [self.observation] if isinstance(self.observation, str) else list(self.observation)
+
+    def limits(self) -> NDArray[np.float64]:
+        """Returns the scale (n,) of actions."""
+        return np.array(self.action_limits or _LIMITS[self.action])
+
+
+def draw_flight(config: FlightEnvConfig, generator: np.random.Generator) -> tuple[int, Scenario]:
+    """Draws the seed of the next flight's world, and its scenario, whose seed is that of start and
+    noise."""
+    world_seed = config.scenario.seed + int(generator.integers(config.num_worlds))
+    flight_seed = int(generator.integers(MAX_SEED))
+    return world_seed, replace(config.scenario, seed=flight_seed)
+
+
+def find_scenario(scenario: Scenario | str | Path) -> Scenario:
+    """Returns a scenario, given as such, by the name of one that ships, or by a YAML file."""
+    if isinstance(scenario, Scenario):
+        return scenario
+    return load_config(Scenario(), scenario_file(str(scenario)))
+
+
+def env_config(scenario: Scenario | str | Path, **fields: Any) -> FlightEnvConfig:
+    """Returns the valid configuration of an environment of a scenario, see `find_scenario`."""
+    known = {name for name in FlightEnvConfig.__dataclass_fields__ if name != "scenario"}
+    for name in fields:
+        require(name in known, "argument", f"one of {', '.join(sorted(known))}", repr(name))
+    config = FlightEnvConfig(find_scenario(scenario), **fields)
+    config.validate()
+    return config

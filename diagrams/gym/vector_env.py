@@ -1,0 +1,425 @@
+"""VectorFlightEnv: many flights as one Gymnasium environment, flown as arrays by native code."""
+
+import os
+from collections.abc import Sequence
+from copy import deepcopy
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+from gymnasium.error import ResetNeeded
+from gymnasium.spaces import Box
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from splatpilot import _native
+from splatpilot.diagrams.flight.flight_diagram import camera_info, camera_mount
+from splatpilot.diagrams.flight.monitor import ENDS, Outcome
+from splatpilot.diagrams.flight.scenario import Scenario, goal_position, sample_initial_state
+from splatpilot.diagrams.gym.rewards import Transition
+from splatpilot.diagrams.gym.spaces import (
+    IMAGES,
+    Vehicles,
+    action_space,
+    decisions,
+    env_config,
+    observation_space,
+    observe,
+    observe_image,
+    require_actions,
+)
+from splatpilot.diagrams.gym.world_pool import PACK, WorldPool, require_supported
+from splatpilot.diagrams.worlds.world import World
+from splatpilot.systems.common.validation import MAX_SEED, require
+from splatpilot.systems.sensing.latency import CYCLE
+from splatpilot.systems.splats.baked_scene import BatchRenderer
+from splatpilot.systems.splats.splat_camera import color_pixels, ranged_depth
+from splatpilot.systems.vehicle.state import pose_from_state
+
+_OUTCOMES = np.array([None, *ENDS, Outcome.TIMEOUT], dtype=object)  # by the native ends
+_OPTIONS = "reset_mask", "flight", "start", "goal"
+_GOAL, _TIMEOUT = list(_OUTCOMES).index(Outcome.GOAL), len(_OUTCOMES) - 1
+
+
+class VectorFlightEnv(VectorEnv):
+    """Many flights of `AddFlight` as one environment, each in a world of its own.
+
+        envs = gymnasium.make_vec("splatpilot:Flight-v0", num_envs=64, scenario="P02")
+
+    Observations, actions, rewards and ends are those of `FlightEnv`; the end of a flight is found
+    after each period of the controller. Flights equal those of `AddFlight` with the seeds in the
+    infos of `reset` within rounding, and do not depend on the number of threads.
+
+    Each flight is drawn from a `WorldPool`, whose worlds are made at the beginning. Environment i
+    of a `reset` with the seed s draws its flights from the seed s + i.
+
+    When a flight ends, infos have its `outcome` and `is_success`, by environments, and masks of
+    the environments that have them, `_outcome` and `_is_success`.
+
+    Args:
+        num_envs: number of environments.
+        scenario: as for `FlightEnv`; of several, each has `num_worlds` worlds.
+        autoreset_mode: of `gymnasium.vector.AutoresetMode`.
+        render_mode: "rgb_array" renders the scenario's camera.
+        threads: of native code; by default one per processor.
+        world: of all flights, as for `FlightEnv`.
+        pool: that of another environment with the same scenarios.
+        fields: of `FlightEnvConfig`.
+
+    Raises:
+        InfeasibleFlightError, ValueError: see `WorldPool`; ValueError also for invalid arguments.
+    """
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        scenario: Scenario | str | Path | Sequence[Scenario | str | Path] = "P01",
+        *,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        render_mode: str | None = None,
+        threads: int | None = None,
+        world: World | None = None,
+        pool: WorldPool | None = None,
+        **fields: Any,
+    ) -> None:
+        require(num_envs >= 1, "num_envs", "at least 1", num_envs)
+        known = "rgb_array or None"
+        require(render_mode in (None, "rgb_array"), "render_mode", known, repr(render_mode))
+        scenarios = [scenario] if isinstance(scenario, Scenario | str | Path) else list(scenario)
+        require(scenarios, "scenario", "one or several scenarios", scenarios)
+        valid = world is None or fields.get("num_worlds", 1) == 1
+        require(valid, "num_worlds", "1 with a world", fields.get("num_worlds"))
+        configs = [env_config(each, **fields) for each in scenarios]
+        self.num_envs, self.render_mode, self.config = num_envs, render_mode, configs[0]
+        self._mode = AutoresetMode(autoreset_mode)
+        self.metadata = {
+            "autoreset_mode": self._mode,
+            "render_modes": ["rgb_array"],
+            "render_fps": self.config.rate,
+        }
+        self.single_observation_space = observation_space(self.config)
+        self.single_action_space = action_space(self.config)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.time_step = 1.0 / self.config.rate
+        periods = {each.scenario.controller.period for each in configs}
+        steps = {each.scenario.simulator.max_step_size for each in configs}
+        for name, values in (("controller.period", periods), ("simulator.max_step_size", steps)):
+            require(len(values) == 1, name, "the same in all scenarios", sorted(values))
+        (period,), (step,) = periods, steps
+        # As Drake divides the time between updates of the controller.
+        count = max(1, int(np.ceil(period / step - 1e-6)))
+        self._steps = {
+            "periods": round(self.time_step / period),
+            "steps": count,
+            "step": period / count,
+        }
+        threads = threads or os.cpu_count() or 1
+        simd = os.environ.get("SPLATPILOT_SIMD", "")
+        self._threads = _native.FlightThreads(threads, simd)
+        self._renderer = BatchRenderer(threads, simd)
+        for config in configs:
+            require_supported(config)
+        self.pool = pool or WorldPool(configs, world)
+        same = self.pool.matches(configs)
+        require(same, "pool", "that of the same scenarios and num_worlds", "another")
+        self._allocate()
+
+    def _allocate(self) -> None:
+        """Allocates the arrays of the N vehicles, which native code updates."""
+        n, size = self.num_envs, cast(Box, self.single_action_space).shape[0]
+        packs = -(-n // PACK), len(_native.FLIGHT_PARAMETERS), PACK
+        self._flight = np.zeros(n, int)  # index in the pool
+        self._states, self._p_WG = np.zeros((n, 13)), np.zeros((n, 3))
+        self._distances, self._gradients = np.zeros(n), np.zeros((n, 3))
+        self._field_states, self._ends = np.zeros(n, np.uint8), np.zeros(n, np.uint8)
+        self._thrusts, self._goal_radii = np.zeros(n), np.zeros(n)
+        self._remaining = np.zeros(n, np.int32)
+        self._field = np.zeros(n, np.int64)
+        self._parameters = np.ones(packs)
+        self._delays, self._decisions = np.zeros(n, np.int32), np.zeros((n, size))
+        self._previous, self._count = np.zeros((n, size)), np.zeros(n, np.int64)
+        self._seeds, self._episodes = np.zeros(n, np.uint64), np.zeros(n, np.uint64)
+        self._ended = np.ones(n, bool)
+        self._vehicles = _native.Vehicles(
+            states=self._states,
+            thrusts=self._thrusts,
+            parameters=self._parameters,
+            world=self._field,
+            goals=self._p_WG,
+            radii=np.full(n, self.pool.radius),
+            goal_radii=self._goal_radii,
+            remaining=self._remaining,
+            distances=self._distances,
+            field_states=self._field_states,
+            ends=self._ends,
+        )
+        self._is_seeded = False
+        self._last: Any = None  # observations, if environments are reset by masks
+
+    def reset(
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begins flights.
+
+        Args:
+            seed: of the first environment, those of others follow; or one for each.
+            options: `reset_mask` (N,) of the environments to reset, all by default; for them
+                `flight`, a number of the pool's flights or one for each, and `start` and `goal` (3)
+                [m].
+
+        Returns:
+            Observations, and infos with the seeds `world_seed` and `flight_seed` of flights.
+        """
+        options = options or {}
+        for name in options:
+            require(name in _OPTIONS, "options", f"of {', '.join(_OPTIONS)}", repr(name))
+        mask = np.ones(self.num_envs, bool)
+        if "reset_mask" in options:
+            mask = np.asarray(options["reset_mask"])
+            valid = mask.shape == (self.num_envs,) and mask.dtype == bool and mask.any()
+            condition = f"({self.num_envs},) bool with a True"
+            require(valid, "reset_mask", condition, f"{mask.dtype} of {mask.shape}")
+        self._seed(seed, mask)
+        rows = np.flatnonzero(mask)
+        flights = None
+        if "flight" in options:
+            flights = np.broadcast_to(np.asarray(options["flight"], int), rows.shape)
+            valid = ((flights >= 0) & (flights < len(self.pool))).all()
+            require(valid, "flight", f"in [0, {len(self.pool)})", flights.tolist())
+        self._begin(rows, flights)
+        points = {name: list(options[name]) for name in ("start", "goal") if name in options}
+        if points:
+            self._move(rows, points)
+        seeds = {"world_seed": self.pool.world_seeds, "flight_seed": self.pool.seeds}
+        infos = {name: np.where(mask, each[self._flight], 0) for name, each in seeds.items()}
+        return self._observe_again(rows), infos | {f"_{name}": mask.copy() for name in infos}
+
+    def _move(self, rows: NDArray[np.intp], points: dict[str, list[float]]) -> None:
+        """Moves start or goal of flights that have not begun."""
+        for row in rows:
+            flight = self._flight[row]
+            world = self.pool.worlds[self.pool.world[flight]]
+            scenario = replace(self.pool.scenarios[flight], **points)
+            scenario.validate()
+            self._states[row] = sample_initial_state(scenario, world)
+            self._p_WG[row] = goal_position(scenario, world)
+            self._distances[row] = world.distance_field.distance(self._states[row, :3])
+
+    def _seed(self, seed: int | Sequence[int | None] | None, mask: NDArray[np.bool_]) -> None:
+        if seed is None and self._is_seeded:
+            return
+        if seed is None or isinstance(seed, int | np.integer):
+            super().reset(seed=None if seed is None else int(seed))
+            first = int(self.np_random.integers(MAX_SEED)) if seed is None else int(seed)
+            seeds = [first + i for i in range(self.num_envs)]
+        else:
+            seeds = list(seed)
+            condition = f"a number, or {self.num_envs} numbers"
+            require(len(seeds) == self.num_envs, "seed", condition, f"{len(seeds)} numbers")
+        for i, each in enumerate(seeds):
+            if mask[i] and each is not None:
+                self._seeds[i], self._episodes[i] = each, 0
+        self._is_seeded = True
+
+    def _begin(self, rows: NDArray[np.intp], flights: NDArray[np.intp] | None = None) -> None:
+        """Begins flights of the environments `rows`, drawn from the pool unless they are given."""
+        pool = self.pool
+        if flights is None:
+            drawn = _hash(_hash(self._seeds[rows]) + self._episodes[rows])
+            flights = (drawn % np.uint64(len(pool))).astype(int)
+        self._episodes[rows] += np.uint64(1)
+        self._flight[rows] = flights
+        self._states[rows], self._p_WG[rows] = pool.states[flights], pool.p_WG[flights]
+        self._parameters[rows // PACK, :, rows % PACK] = pool.parameters[flights]
+        self._thrusts[rows], self._remaining[rows] = pool.thrusts[flights], pool.periods[flights]
+        self._goal_radii[rows], self._field[rows] = pool.goal_radii[flights], pool.field[flights]
+        self._previous[rows], self._count[rows] = 0.0, 0
+        self._distances[rows] = pool.distances[flights]
+        self._ends[rows], self._ended[rows] = 0, False
+        if pool.is_delayed:  # Until the first action has come, that of zeros counts.
+            zeros = self._previous[rows]
+            self._decisions[rows] = decisions(self.config, zeros, self._states[rows])
+
+    def step(
+        self, actions: Any
+    ) -> tuple[Any, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
+        """Flies for one period of the policy with actions (N, n) in [-1, 1].
+
+        An environment whose flight ended begins the next one as its `autoreset_mode` says.
+        """
+        config = self.config
+        given = require_actions(actions, self._previous.shape)
+        resting = self._ended.copy()
+        if resting.any():
+            if self._mode is not AutoresetMode.NEXT_STEP or not self._is_seeded:
+                ended = np.flatnonzero(resting).tolist()
+                raise ResetNeeded(f"flights must be begun by reset() before step(), got {ended}")
+            self._begin(np.flatnonzero(resting))
+        flying = ~resting
+        before = self._states.copy()
+        decided = decisions(config, given, before)
+        if self.pool.is_delayed:
+            self._delays[:] = self.pool.delays[self._flight, self._count % CYCLE]
+        self._threads.advance(
+            self.pool.native,
+            self._vehicles,
+            kind=config.action,
+            actions=decided,
+            earlier=self._decisions,
+            delays=self._delays,
+            flying=flying,
+            actuated=self.pool.actuated,
+            **self._steps,
+        )
+        ends = self._ends
+        ended, reached = ends > 0, ends == _GOAL
+        truncated = ends == _TIMEOUT
+        terminated = ended ^ truncated
+        rewards = config.reward(
+            Transition(
+                states=before,
+                next_states=self._states,
+                p_WG=self._p_WG,
+                distances=self._distances,
+                actions=given,
+                previous_actions=self._previous,
+                reached=reached,
+                failed=terminated ^ reached,
+                duration=self.time_step,
+                radius=self.pool.radius,
+            )
+        )
+        rewards = np.asarray(rewards, dtype=float)
+        valid = rewards.shape == (self.num_envs,)
+        require(valid, "shape of the rewards", f"({self.num_envs},)", rewards.shape)
+        if resting.any():
+            rewards = np.where(flying, rewards, 0.0)
+        self._previous[flying] = given[flying]
+        self._decisions, self._ended = decided, ended
+        self._count += flying
+        infos: dict[str, Any] = {}
+        if ended.any():
+            infos = {"outcome": _OUTCOMES[ends], "is_success": reached}
+            infos |= {f"_{name}": ended.copy() for name in infos}
+            if self._mode is AutoresetMode.SAME_STEP:
+                return self._reset_same_step(rewards, terminated, truncated, infos)
+        observed = self._observe()
+        if self._mode is AutoresetMode.DISABLED:
+            self._last = deepcopy(observed)
+        return observed, rewards, terminated, truncated, infos
+
+    def _reset_same_step(
+        self,
+        rewards: NDArray[np.float64],
+        terminated: NDArray[np.bool_],
+        truncated: NDArray[np.bool_],
+        infos: dict[str, Any],
+    ) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        ended = self._ended.copy()
+        rows = np.flatnonzero(ended)
+        last = self._observe(rows)
+        final = np.full(self.num_envs, None, dtype=object)
+        for k, row in enumerate(rows):
+            is_whole = isinstance(last, dict)
+            final[row] = {name: v[k] for name, v in last.items()} if is_whole else last[k]
+        self._begin(rows)
+        further = {"final_obs": final, "_final_obs": ended}
+        further |= {"final_info": infos, "_final_info": ended.copy()}
+        return self._observe(), rewards, terminated, truncated, further
+
+    def _observe_again(self, rows: NDArray[np.intp]) -> Any:
+        """Returns the observations of all environments, where `rows` have changed."""
+        if self._mode is not AutoresetMode.DISABLED or self._last is None:
+            return self._observe()
+        part = self._observe(rows)
+        if isinstance(part, dict):
+            for name, values in part.items():
+                self._last[name][rows] = values
+        else:
+            self._last[rows] = part
+        return deepcopy(self._last)
+
+    def _observe(self, rows: NDArray[np.intp] | slice = slice(None)) -> Any:
+        """Returns the observations of environments, in new arrays."""
+        names = self.config.observation_names()
+        states = self._states[rows]
+        vehicles = Vehicles(states, self._p_WG[rows], self._distances[rows], self._gradients[rows])
+        if "obstacle" in names:
+            distances, gradients = np.empty(len(states)), np.empty((len(states), 3))
+            self.pool.native.query(
+                p_WQ=np.ascontiguousarray(states[:, :3]),
+                world=self._field[rows],
+                distances=distances,
+                states=np.empty(len(states), np.uint8),
+                gradients=gradients,
+            )
+            vehicles = vehicles._replace(distances=distances, gradients=gradients)
+        observed: dict[str, Any] = dict(observe(names, vehicles))
+        ports = {IMAGES[name] for name in names if name in IMAGES}
+        if ports:
+            images = self._render(rows, ports)
+            for name in names:
+                if name in IMAGES:
+                    max_depth = self.config.camera.max_depth
+                    observed[name] = observe_image(name, images[IMAGES[name]], max_depth)
+        if isinstance(self.config.observation, str):
+            return observed[self.config.observation]
+        return {name: observed[name] for name in names}
+
+    def _render(self, rows: NDArray[np.intp] | slice, ports: set[str]) -> dict[str, NDArray]:
+        """Renders images of the policy's camera, by the ports of `SplatCamera`."""
+        camera = self.config.camera
+        info, X_BC = camera.camera_info(), camera.mount()
+        worlds = [self.pool.worlds[w] for w in self.pool.world[self._flight[rows]]]
+        X_WCs = [pose_from_state(state) @ X_BC for state in self._states[rows]]
+        views = [world.baked for world in worlds], info.intrinsic_matrix(), info.width()
+        views = *views, info.height(), X_WCs
+        options: dict[str, Any] = {
+            "distortion": camera.distortion,
+            "max_depth": camera.max_depth,
+            "merged_spread": camera.merged_spread,
+            "backgrounds": [world.background for world in worlds],
+        }
+        if len(ports) == 2:
+            color, depth, _ = self._renderer.render(*views, **options)
+        elif "color_image" in ports:
+            color, depth = self._renderer.render_color(*views, **options), None
+        else:
+            color, depth = None, self._renderer.render_depth(*views, **options)
+        images = {}
+        if depth is not None:
+            images["depth_image_32f"] = ranged_depth(depth, camera.min_depth, camera.max_depth)
+        if color is not None:
+            images["color_image"] = color_pixels(color)
+        return images
+
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
+        """Returns images (H, W, 3) of the scenario's camera, one of each vehicle."""
+        if self.render_mode is None:
+            return None
+        config = self.config.scenario.camera
+        info, X_BC = camera_info(config), camera_mount(config)
+        worlds = [self.pool.worlds[w] for w in self.pool.world[self._flight]]
+        color = self._renderer.render_color(
+            [world.baked for world in worlds],
+            info.intrinsic_matrix(),
+            info.width(),
+            info.height(),
+            [pose_from_state(state) @ X_BC for state in self._states],
+            backgrounds=[world.background for world in worlds],
+        )
+        return tuple(color_pixels(color))
+
+
+def _hash(numbers: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """Mixes the bits of numbers, as SplitMix64 does (Steele, Lea and Flood, OOPSLA 2014)."""
+    z = numbers + np.uint64(0x9E3779B97F4A7C15)
+    z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return z ^ (z >> np.uint64(31))

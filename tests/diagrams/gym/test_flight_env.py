@@ -1,0 +1,247 @@
+import subprocess
+import sys
+import warnings
+
+import av
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from gymnasium.wrappers import RecordEpisodeStatistics, RecordVideo
+from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
+from stable_baselines3.common.env_checker import check_env as check_env_of_sb3
+
+from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.gym.flight_env import FlightEnv
+from splatpilot.systems.common.config import dump_config
+from splatpilot.systems.common.provenance import InfeasibleFlightError
+from splatpilot.systems.sensing.imu import Imu
+from splatpilot.systems.sensing.noise import ObservationNoise
+from splatpilot.systems.vehicle.quadrotor import GRAVITY
+
+AHEAD = np.array([0.5, 0.0, 0.0], np.float32)
+
+
+def flown(env: gymnasium.Env, seed: int, steps: int = 60, **options):
+    """Flies ahead; returns observations, rewards and the last info."""
+    observation, info = env.reset(seed=seed, options=options)
+    observed, rewards = [observation], []
+    for step in range(steps):
+        action = np.array([0.5, 0.2 * np.sin(step), 0.0])
+        observation, reward, terminated, truncated, info = env.step(action)
+        observed.append(observation)
+        rewards.append(reward)
+        if terminated or truncated:
+            break
+    return observed, rewards, info
+
+
+def assert_identical(first, second):
+    assert first[1] == second[1]
+    assert len(first[0]) == len(second[0])
+    for one, other in zip(first[0], second[0], strict=True):
+        for name in one:
+            np.testing.assert_array_equal(one[name], other[name], name)
+
+
+@pytest.mark.parametrize("observation", [["depth", "state", "goal"], ["rgb", "obstacle"], "state"])
+def test_checkers_pass_without_warnings(observation, post_world):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        env = FlightEnv(
+            Scenario(), world=post_world, observation=observation, render_mode="rgb_array"
+        )
+        check_env(env, skip_render_check=True)
+        check_env_of_sb3(env)
+
+
+@pytest.mark.parametrize("order", ["gymnasium, splatpilot", "splatpilot, gymnasium"])
+def test_gymnasium_makes_it(order):
+    program = f"""import {order}
+env = gymnasium.make("splatpilot:Flight-v0", scenario="P01", observation="goal", action="command")
+print(env.observation_space.shape, env.action_space.shape)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.stdout.strip() == "(4,) (4,)", done.stderr
+
+
+def test_a_seed_repeats_flights(post_world):
+    names = ["depth", "rgb", "full_state", "goal", "obstacle"]
+    env = FlightEnv(Scenario(), world=post_world, observation=names)
+    first, other, again = (flown(env, seed) for seed in (3, 4, 3))
+    assert_identical(first, again)
+    assert first[1] != other[1]
+    assert_identical(first, flown(FlightEnv(Scenario(), world=post_world, observation=names), 3))
+
+
+def test_a_seed_repeats_noise_and_sensors(post_world):
+    noise = ObservationNoise(depth_multiplicative=0.05, latency=0.03)
+    scenario = Scenario(observation=noise, sensors={"imu": Imu()})
+    names = ["depth_m", "imu_accelerometer"]
+    env = FlightEnv(scenario, world=post_world, observation=names)
+    first, other, again = (flown(env, seed, 5) for seed in (3, 4, 3))
+    assert_identical(first, again)
+    assert (first[0][1]["imu_accelerometer"] != other[0][1]["imu_accelerometer"]).any()
+    assert env.observation_space.contains(first[0][1])
+
+
+def test_it_flies_as_a_simulation_of_the_diagram(post_world):
+    scenario, action = Scenario(start_radius=0.0), np.array([0.125, 0.03125, -0.0625, 0.25])
+    env = FlightEnv(scenario, world=post_world, observation="full_state", action="command")
+    env.reset(seed=0)
+    for _ in range(10):
+        env.step(action)
+    diagram = BuildFlightDiagram(scenario, post_world, camera=False, policy="command")
+    simulator = Simulator(diagram)
+    ApplySimulatorConfig(scenario.simulator, simulator)
+    context = simulator.get_mutable_context()
+    command = GRAVITY * np.array([1.0, 0.0, 0.0, 0.0]) + action * [GRAVITY, 6.0, 6.0, 2.0]
+    diagram.GetInputPort("command").FixValue(context, command)
+    simulator.AdvanceTo(1.0)
+    for port in ("state", "command", "clearance"):
+        ours, theirs = (
+            each.GetOutputPort(port).Eval(inside)
+            for each, inside in ((env.diagram, env.simulator.get_context()), (diagram, context))
+        )
+        np.testing.assert_allclose(ours, theirs, atol=1e-9)
+    assert env.simulator.get_context().get_time() == 1.0
+
+
+def test_flights_end_by_name(post_world):
+    env = FlightEnv(Scenario(timeout=4.0), world=post_world)
+    *_, info = flown(env, 0)
+    assert info == {"outcome": "collision", "is_success": False}
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step(AHEAD)
+    *_, info = flown(env, 0, goal=[2.5, 0.0, 2.0])
+    assert info == {"outcome": "goal", "is_success": True}
+    *_, info = flown(env, 0, start=[1.0, 2.0, 2.0], goal=[9.0, 2.0, 2.0])
+    assert info == {"outcome": "timeout", "is_success": False}
+
+
+def test_a_reset_of_one_world_keeps_the_diagram(post_world):
+    env = FlightEnv(Scenario(), world=post_world)
+    diagram, simulator = env.diagram, env.simulator
+    flown(env, 0)
+    env.reset(options={"goal": [1.0, 2.0, 2.0]})
+    assert env.diagram is diagram and env.simulator is simulator
+    assert env.simulator.get_context().get_time() == 0.0
+
+
+def test_worlds_are_drawn_from_the_seeds_of_the_scenario():
+    env = FlightEnv("P01", num_worlds=2)
+    names = set()
+    for seed in range(6):
+        env.reset(seed=seed)
+        assert env.parts.world.source is not None
+        names.add(env.parts.world.source[1])
+    assert names == {0, 1}
+
+
+def test_options_choose_the_scenario(tmp_path):
+    (tmp_path / "short.yaml").write_text(dump_config(Scenario(timeout=0.2, seed=7)))
+    env = FlightEnv("P01")
+    env.reset(seed=0, options={"scenario": str(tmp_path / "short.yaml")})
+    _, _, terminated, truncated, _ = env.step(AHEAD)
+    assert (terminated, truncated) == (False, False)
+    _, _, terminated, truncated, info = env.step(AHEAD)
+    assert (terminated, truncated, info["outcome"]) == (False, True, "timeout")
+    assert env.parts.world.source[1] == 7
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"goals": [1, 2, 3]}, ValueError, "options must be of scenario, start, goal"),
+        ({"goal": [1.0, 2.0]}, ValueError, "goal must be three finite numbers"),
+        ({"goal": [5.0, 0.0, 2.0]}, InfeasibleFlightError, "goal .* from the nearest surface"),
+        ({"start": [50.0, 0.0, 2.0]}, InfeasibleFlightError, "start .* outside the world"),
+        ({"scenario": "P99"}, ValueError, "there is no scenario 'P99'"),
+    ],
+)
+def test_invalid_options_are_errors(options, error, message, post_world):
+    with pytest.raises(error, match=message):
+        FlightEnv(Scenario(), world=post_world).reset(seed=0, options=options)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"observation": ["state", "sonar"]}, "observation must be one of state"),
+        ({"render_mode": "ansi"}, "render_mode must be one of rgb_array, human"),
+        ({"num_worlds": 2}, "num_worlds must be 1 with a world"),
+        ({"scenario": Scenario(start=[5.0, 0.0, 2.0])}, "start .* from the nearest surface"),
+    ],
+)
+def test_invalid_arguments_are_errors(fields, message, post_world):
+    with pytest.raises(ValueError, match=message):
+        FlightEnv(**{"scenario": Scenario(), "world": post_world} | fields)
+
+
+def test_rewards_are_replaceable(post_world):
+    def height(transition):
+        return transition.next_states[:, 2]
+
+    env = FlightEnv(Scenario(), world=post_world, observation="full_state", reward=height)
+    env.reset(seed=0)
+    observation, reward, *_ = env.step(AHEAD)
+    assert reward == pytest.approx(observation[2])
+    env = FlightEnv(Scenario(), world=post_world, reward=lambda transition: 1.0)
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"shape of the reward must be \(N,\)"):
+        env.step(AHEAD)
+
+
+def test_wrappers_record_statistics_and_video(post_world, tmp_path):
+    env = FlightEnv(Scenario(timeout=1.0), world=post_world, render_mode="rgb_array")
+    env = RecordEpisodeStatistics(RecordVideo(env, str(tmp_path / "videos"), disable_logger=True))
+    _, rewards, info = flown(env, 0)
+    env.close()
+    assert info["episode"]["l"] == len(rewards)
+    assert info["episode"]["r"] == pytest.approx(sum(rewards))
+    (video,) = tmp_path.glob("videos/*.mp4")
+    with av.open(str(video)) as file:
+        frames = [frame.to_ndarray(format="rgb24") for frame in file.decode(video=0)]
+    assert len(frames) >= len(rewards)
+    assert frames[0].shape == (240, 320, 3)
+    assert frames[0].std() > 5.0
+
+
+def test_human_mode_draws_in_meshcat(post_world, monkeypatch):
+    env = FlightEnv(Scenario(timeout=1.0), world=post_world, render_mode="human")
+    env.reset(seed=0)
+    env.simulator.set_target_realtime_rate(0.0)
+    env.step(AHEAD)
+    assert env.render() is None
+    assert env.meshcat and env.meshcat.HasPath("/splatpilot/vehicle")
+
+
+@pytest.mark.parametrize("action", ["command", "acceleration", "velocity", "waypoint"])
+def test_native_code_flies_as_the_simulator_does(action, post_world):
+    names = ["full_state", "goal", "obstacle", "depth_m"]
+    options = {"world": post_world, "observation": names, "action": action}
+    envs = [FlightEnv(Scenario(), native=native, **options) for native in (True, False)]
+    actions = np.random.default_rng(1).uniform(-0.3, 0.4, (100, *envs[0].action_space.shape))
+    if action == "command":
+        actions *= 0.05
+    flights = [[env.reset(seed=2)[0]] for env in envs]
+    for given in actions:
+        results = [env.step(given) for env in envs]
+        for flight, result in zip(flights, results, strict=True):
+            flight.append(result[0])
+        np.testing.assert_allclose(results[0][1], results[1][1], atol=1e-6)
+        assert results[0][2:] == results[1][2:]
+        times = [env.simulator.get_context().get_time() for env in envs]
+        assert times[0] == pytest.approx(times[1], abs=1e-9)
+        for port in ("state", "command", "clearance"):
+            native, simulated = (
+                env.diagram.GetOutputPort(port).Eval(env.simulator.get_context()) for env in envs
+            )
+            np.testing.assert_allclose(native, simulated, atol=1e-7)
+        if results[0][2] or results[0][3]:
+            break
+    assert len(flights[0]) > 10
+    for native, simulated in zip(*flights, strict=True):
+        for name in names:
+            np.testing.assert_allclose(native[name], simulated[name], atol=1e-5)

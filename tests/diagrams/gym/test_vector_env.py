@@ -1,0 +1,286 @@
+import warnings
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import data_equivalence
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
+from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
+from pydrake.systems.framework import DiagramBuilder
+
+from splatpilot import _native
+from splatpilot.diagrams.flight.flight_diagram import AddFlight, ExportFlight
+from splatpilot.diagrams.flight.monitor import Outcome
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.gym.flight_env import FlightEnv
+from splatpilot.diagrams.gym.spaces import decisions
+from splatpilot.diagrams.gym.vector_env import VectorFlightEnv
+from splatpilot.diagrams.worlds.moving_spheres import MovingSphere
+from splatpilot.systems.common.provenance import InfeasibleFlightError
+from splatpilot.systems.sensing.imaging import Imaging
+from splatpilot.systems.sensing.noise import ObservationNoise
+from splatpilot.systems.vehicle.quadrotor import QuadrotorParams
+from splatpilot.systems.vehicle.wind import Wind
+
+LAGGING = Scenario(
+    vehicle=QuadrotorParams(
+        motor_time_constant=0.04,
+        yaw_time_ratio=2.0,
+        thrust_scale=0.97,
+        max_thrust=18.0,
+        max_tilt_rate=3.0,
+        rotor_drag=[0.02, 0.03, 0.05],
+        quadratic_drag=[0.01, 0.02, 0.03],
+    ),
+    wind=Wind(mean=[0.5, -0.3, 0.1]),
+)
+
+
+def random_actions(envs: VectorFlightEnv, steps: int) -> np.ndarray:
+    """Returns actions (steps, N, n) that change smoothly."""
+    shape = steps + 8, envs.num_envs, envs.config.limits().size
+    noise = np.random.default_rng(0).normal(size=shape)
+    return np.clip(sum(noise[k : k + steps] for k in range(8)) / 4, -1, 1)
+
+
+def fly_in_drake(
+    envs: VectorFlightEnv, flight: int, actions: np.ndarray
+) -> tuple[np.ndarray, list[str]]:
+    """Flies actions (steps, n) by AddFlight; returns states (steps, 13) and outcomes."""
+    config, pool = envs.config, envs.pool
+    scenario, world = pool.scenarios[flight], pool.worlds[pool.world[flight]]
+    builder = DiagramBuilder()
+    ExportFlight(builder, AddFlight(builder, scenario, world, policy=config.action, camera=False))
+    diagram = builder.Build()
+    simulator = Simulator(diagram)
+    ApplySimulatorConfig(scenario.simulator, simulator)
+    context = simulator.get_mutable_context()
+    port, states, outcomes = diagram.GetInputPort(config.action), [], []
+    for step, action in enumerate(actions):
+        state = diagram.GetOutputPort("state").Eval(context)
+        port.FixValue(context, decisions(config, action[None], state[None])[0])
+        simulator.AdvanceTo((step + 1) * 5 * 0.02)  # as Drake computes times of updates
+        states.append(diagram.GetOutputPort("state").Eval(context).copy())
+        outcomes.append(diagram.GetOutputPort("outcome").Eval(context))
+        if outcomes[-1]:
+            break
+    return np.array(states), outcomes
+
+
+@pytest.mark.parametrize(
+    ("action", "scenario", "limits"),
+    [
+        ("velocity", "P02", [0.8] * 3),
+        ("waypoint", "P02", [0.8] * 3),
+        ("acceleration", LAGGING, [1.0] * 3),
+        ("command", LAGGING, [2.0, 0.3, 0.3, 0.5]),
+    ],
+)
+def test_flights_are_those_of_add_flight(action, scenario, limits):
+    envs = VectorFlightEnv(2, scenario, action=action, action_limits=limits, num_worlds=1)
+    envs.reset(seed=2)
+    actions, flights = random_actions(envs, 100), envs._flight.copy()
+    states, outcomes = np.full((100, 2, 13), np.nan), np.full((100, 2), "", dtype=object)
+    flying = np.ones(2, bool)
+    for step, now in enumerate(actions):
+        *_, infos = envs.step(now)
+        states[step, flying] = envs._states[flying]
+        if "outcome" in infos:
+            outcomes[step, flying] = [o or "" for o in infos["outcome"][flying]]
+            flying &= ~infos["_outcome"]
+    for i in range(2):
+        truth, ends = fly_in_drake(envs, flights[i], actions[:, i])
+        np.testing.assert_allclose(states[: len(truth), i], truth, rtol=0, atol=1e-6)
+        assert outcomes[: len(truth), i].tolist() == ends
+
+
+def test_images_and_rewards_are_those_of_flight_env(post_world):
+    names = ["depth", "depth_m", "rgb", "state", "goal", "obstacle"]
+    scenario = Scenario(start_radius=0.0)
+    env = FlightEnv(scenario, world=post_world, observation=names, native=False)
+    envs = VectorFlightEnv(3, scenario, world=post_world, observation=names)
+    one, info = env.reset(seed=0)
+    many, infos = envs.reset(seed=0)
+    for step in range(60):
+        for name in ("depth", "depth_m", "rgb"):
+            np.testing.assert_array_equal(many[name][1], one[name], name)
+        for name in ("state", "goal", "obstacle"):
+            np.testing.assert_allclose(many[name][1], one[name], atol=1e-6)
+        action = np.array([0.4, 0.2 * np.sin(step), 0.0])
+        one, reward, terminated, truncated, info = env.step(action)
+        many, rewards, terminations, truncations, infos = envs.step(np.tile(action, (3, 1)))
+        assert rewards[1] == pytest.approx(reward, abs=1e-9)
+        assert (terminations[1], truncations[1]) == (terminated, truncated)
+        if terminated or truncated:
+            break
+    assert infos["outcome"][1] == info["outcome"] == Outcome.COLLISION
+    assert not infos["is_success"][1]
+
+
+def test_color_of_random_appearance_is_that_of_add_flight():
+    envs = VectorFlightEnv(2, Scenario(appearance=1.0), observation="rgb", render_mode="rgb_array")
+    observed, infos = envs.reset(seed=0, options={"flight": [0, 1]})
+    pool = envs.pool
+    assert (observed[0] != observed[1]).mean() > 0.5
+    assert infos["world_seed"].tolist() == [0, 0]
+    scenario, world = pool.scenarios[1], FlightEnv(Scenario()).parts.world
+    parts = AddFlight(DiagramBuilder(), scenario, world, policy="velocity", camera=False)
+    np.testing.assert_array_equal(parts.world.gaussians.sh, pool.worlds[1].gaussians.sh)
+    assert [frame.shape for frame in envs.render() or ()] == [(240, 320, 3)] * 2
+
+
+def flown(envs: VectorFlightEnv, seed: int, steps: int = 30) -> list[Any]:
+    """Returns all that environments return for random actions."""
+    returned = [envs.reset(seed=seed)]
+    return returned + [envs.step(actions) for actions in random_actions(envs, steps)]
+
+
+def test_flights_repeat_with_any_threads_and_simd_level(post_world, monkeypatch):
+    def make(threads):
+        scenario = Scenario(vehicle=QuadrotorParams(motor_time_constant=0.03))
+        return VectorFlightEnv(37, scenario, world=post_world, threads=threads)
+
+    first = flown(make(1), seed=3)
+    envs = make(3)
+    assert data_equivalence(first, flown(envs, seed=3), exact=True)
+    assert not data_equivalence(first, flown(envs, seed=4), exact=True)
+    assert data_equivalence(first, flown(envs, seed=3), exact=True)
+    monkeypatch.setenv("SPLATPILOT_SIMD", _native.simd_levels()[-1])
+    assert data_equivalence(first, flown(make(2), seed=3), exact=True)
+
+
+def test_environments_draw_their_own_flights(post_world):
+    envs = VectorFlightEnv(4, Scenario(), world=post_world, observation="full_state")
+    observed, infos = envs.reset(seed=5)
+    other, _ = envs.reset(seed=6)
+    np.testing.assert_array_equal(observed[1:], other[:-1])
+    assert len(set(infos["flight_seed"].tolist())) == 4
+    listed, _ = envs.reset(seed=[8, 7, 6, 5])
+    np.testing.assert_array_equal(listed[:1:-1], observed[:2])
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
+def test_autoreset_modes(mode, post_world):
+    scenario = Scenario(timeout=0.4, start_radius=0.0)
+    envs = VectorFlightEnv(
+        3, scenario, world=post_world, observation="full_state", autoreset_mode=mode
+    )
+    assert envs.metadata["autoreset_mode"].value == mode
+    start, _ = envs.reset(seed=0)
+    ahead = np.tile([1.0, 0.0, 0.0], (3, 1))
+    for _ in range(3):
+        *_, truncated, infos = envs.step(ahead)
+        assert not truncated.any() and not infos
+    observed, _, _, truncated, infos = envs.step(ahead)
+    assert truncated.all()
+    if mode == "SameStep":
+        np.testing.assert_array_equal(observed, start)
+        assert infos["final_obs"][2][0] > start[2, 0] and infos["_final_obs"].all()
+        assert infos["final_info"]["outcome"].tolist() == ["timeout"] * 3
+        return
+    assert infos["outcome"].tolist() == ["timeout"] * 3
+    if mode == "Disabled":
+        with pytest.raises(gymnasium.error.ResetNeeded, match=r"got \[0, 1, 2\]"):
+            envs.step(ahead)
+        envs.reset(options={"reset_mask": np.ones(3, bool)})
+        assert not envs.step(ahead)[3].any()
+        return
+    observed, rewards, _, truncated, _ = envs.step(ahead)
+    np.testing.assert_array_equal(observed, start)
+    assert not rewards.any() and not truncated.any()
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "Disabled"])
+def test_a_mask_resets_some_environments(mode, post_world):
+    scenario, options = Scenario(start_radius=0.0), {"autoreset_mode": mode}
+    envs = VectorFlightEnv(3, scenario, world=post_world, observation="full_state", **options)
+    envs.reset(seed=0)
+    flown, *_ = envs.step(np.tile([1.0, 0.0, 0.0], (3, 1)))
+    options = {"reset_mask": np.array([False, True, False]), "start": [2.0, 1.0, 2.0]}
+    observed, infos = envs.reset(options=options)
+    np.testing.assert_array_equal(observed[[0, 2]], flown[[0, 2]])
+    np.testing.assert_array_equal(observed[1, :3], [2.0, 1.0, 2.0])
+    assert infos["_flight_seed"].tolist() == [False, True, False]
+    with pytest.raises(InfeasibleFlightError, match=r"goal .* from the nearest surface"):
+        envs.reset(options={"goal": [5.0, 0.0, 2.0]})
+
+
+def test_gymnasium_makes_it_without_warnings():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        made = gymnasium.make_vec(
+            "splatpilot:Flight-v0",
+            num_envs=5,
+            vectorization_mode="vector_entry_point",
+            scenario=["P01", Scenario(timeout=0.5)],
+            observation=["depth", "goal"],
+        )
+        envs = RecordEpisodeStatistics(made)
+        observed, infos = envs.reset(seed=0)
+        assert envs.observation_space.contains(observed)
+        for _ in range(5):
+            observed, rewards, terminated, truncated, infos = envs.step(envs.action_space.sample())
+            assert envs.observation_space.contains(observed)
+            assert rewards.dtype == np.float64
+            assert terminated.dtype == truncated.dtype == bool
+    assert isinstance(made.unwrapped, VectorFlightEnv)
+    assert infos["episode"]["l"].max() == 5
+    envs.close()
+
+
+def test_delayed_decisions_come_late(post_world):
+    def moved(**fields):
+        scenario = Scenario(start_radius=0.0, **fields)
+        envs = VectorFlightEnv(1, scenario, world=post_world, observation="full_state")
+        start, _ = envs.reset(seed=0)
+        return envs.step([[1.0, 0.0, 0.0]])[0][0, 0] - start[0, 0]
+
+    late = moved(decision_delay=[0.06, 0.06])
+    assert 0 < late < 0.5 * moved()
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"scenario": Scenario(moving={"a": MovingSphere()})}, "moving of VectorFlightEnv"),
+        ({"scenario": Scenario(wind=Wind(gusts=5.0))}, "wind.gusts of VectorFlightEnv must be 0"),
+        ({"scenario": Scenario(decision_delay=[0.0, 0.2])}, "decision_delay must be at most"),
+        ({"scenario": Scenario(start=[5.0, 0.0, 2.0])}, "start .* from the nearest surface"),
+        (
+            {"scenario": Scenario(observation=ObservationNoise(latency=0.1)), "observation": "rgb"},
+            "observation of VectorFlightEnv must be left out",
+        ),
+        (
+            {"scenario": Scenario(imaging=Imaging(vignetting=1.0)), "observation": "rgb"},
+            "imaging of VectorFlightEnv must be left out",
+        ),
+        ({"observation": ["imu_gyro"]}, "observation must be one of state"),
+        ({"num_envs": 0}, "num_envs must be at least 1"),
+        ({"render_mode": "human"}, "render_mode must be rgb_array or None"),
+        ({"speed": 2.0}, "argument must be one of"),
+    ],
+)
+def test_invalid_arguments_are_errors(fields, message, post_world):
+    with pytest.raises(ValueError, match=message):
+        VectorFlightEnv(**{"scenario": Scenario(), "world": post_world} | fields)
+
+
+def test_invalid_steps_and_resets_are_errors(post_world):
+    envs = VectorFlightEnv(2, Scenario(), world=post_world)
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        envs.step(np.zeros((2, 3)))
+    envs.reset(seed=0)
+    for actions in (np.full((2, 3), np.nan), np.full((2, 3), 1.1), np.zeros(3)):
+        with pytest.raises(ValueError, match="action must be"):
+            envs.step(actions)
+    for options, message in (
+        ({"reset_mask": [True]}, "reset_mask must be"),
+        ({"flight": 64}, "flight must be in"),
+        ({"world": 1}, "options must be of reset_mask"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            envs.reset(options=options)
+    envs.config.reward = lambda transition: 1.0
+    with pytest.raises(ValueError, match=r"shape of the rewards must be \(2,\)"):
+        envs.step(np.zeros((2, 3)))
