@@ -216,7 +216,7 @@ def realism(results: Results) -> str:
     flown_on, program = results.about["date"], results.about["program"][:7]
     seeds = "Successes/flights, test seeds from 1000 on"
     flown = f"{seeds}, flown on {flown_on} by program `{program}`:"
-    return f"{flown}\n\n{table(['policy', *header], lines).replace(' | ', '|')}"
+    return f"{flown}\n\n{re.sub(' *[|] *', '|', table(['policy', *header], lines))}"
 
 
 def paper(results: Results) -> str:
