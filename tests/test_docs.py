@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from stable_baselines3 import PPO
 
 from splatpilot.analysis.commands.checks import SCENARIOS
 from splatpilot.analysis.commands.main import main
@@ -134,6 +135,8 @@ def test_files_are_configurations(page, tmp_path):
 )
 def test_python_runs(page, monkeypatch):
     monkeypatch.setattr(LiveControls, "wait_for_viewer", lambda self: None)
+    learn = PPO.learn
+    monkeypatch.setattr(PPO, "learn", lambda ppo, **_: learn(ppo, ppo.n_steps * ppo.n_envs))
     names: dict[str, Any] = {}
     for code in blocks(page, "python"):
         exec(code, names)

@@ -15,6 +15,7 @@ from splatpilot.analysis.twin import TwinConfig
 from splatpilot.diagrams.flight.policies import POLICIES
 from splatpilot.diagrams.flight.scenario import WITHOUT_EFFECT, Scenario
 from splatpilot.diagrams.flight.sensors import ESTIMATORS, SENSORS
+from splatpilot.diagrams.gym.spaces import FlightEnvConfig
 from splatpilot.diagrams.hardware.bridge import HardwareConfig
 from splatpilot.diagrams.hardware.px4 import Px4Config
 from splatpilot.diagrams.worlds.world_registry import WORLDS
@@ -71,6 +72,7 @@ GROUPS: list[tuple[str, str, list[type] | Registry]] = [
         [ReconstructConfig, RenderedSceneConfig, FidelityConfig, TwinConfig],
     ),
     ("Training", "For `splatpilot train` and `recover`, by policy.", TRAINERS),
+    ("Environments", "Arguments of `FlightEnv` and `VectorFlightEnv`.", [FlightEnvConfig]),
     ("Corpora", "For `splatpilot corpus make`.", [CorpusConfig]),
     (
         "Hardware",
