@@ -4,7 +4,22 @@
         [--merged-spread 0]
 
 The environments take turns, and each figure is the best of all rounds. CPU times are those of all
-threads. The last column is the part of the CPU time that is not spent in the image kernels.
+threads. The last column is the part of the CPU time that is not spent in the image kernels. P02, 16
+worlds, 8 rounds, two cores of an AMD EPYC that others used too:
+
+| environment | steps/s | CPU us a step | outside image kernels |
+|---|---|---|---|
+| DrakeGymEnv, state | 403 | 2,402.66 | |
+| DrakeGymEnv, depth 64x36 | 273 | 3,661.74 | |
+| state, N = 64 | 255,128 | 4.07 | |
+| state, N = 256 | 654,415 | 1.53 | |
+| state, N = 1024 | 1,211,784 | 0.88 | |
+| state, N = 4096 | 1,664,174 | 0.66 | |
+| depth 64x36, N = 64 | 2,065 | 731.43 | 6% |
+| depth and RGB 64x48, N = 64 | 314 | 4,486.91 | 2% |
+| depth and RGB 160x120, N = 64 | 224 | 6,167.10 | 4% |
+
+A reset of one environment takes 0.027 ms before its images.
 """
 
 import argparse
@@ -95,7 +110,7 @@ def reset_times(envs: VectorFlightEnv, count: int = 50) -> float:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser()
     parser.add_argument("--scenario", default="P02")
     parser.add_argument("--worlds", type=int, default=16)
     parser.add_argument("--rounds", type=int, default=7)
