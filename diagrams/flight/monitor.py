@@ -68,28 +68,6 @@ def _end(
     return margin, next(end for end, m in zip(ENDS, margins, strict=True) if m <= 0)
 
 
-def end_indices(
-    p_WB: np.ndarray,
-    p_WG: np.ndarray,
-    clearances: np.ndarray,
-    field_states: np.ndarray,
-    goal_radius: float,
-) -> np.ndarray:
-    """Returns how N flights end at this instant, by the rules of `FlightMonitor`.
-
-    Args:
-        p_WB, p_WG: (N, 3) [m], vehicles and goals.
-        clearances: (N,) [m], NaN outside the world.
-        field_states: (N,), see `FieldState`.
-
-    Returns:
-        (N,) indices of `ENDS`, -1 in flight.
-    """
-    to_goal = np.sqrt(((p_WG - p_WB) ** 2).sum(-1)) - goal_radius
-    ended = np.stack([clearances <= 0, field_states >= _KNOWN, to_goal <= 0], axis=-1)
-    return np.where(ended.any(-1), ended.argmax(-1), -1)
-
-
 class FlightMonitor(LeafSystem):
     """Ends a flight at a collision, outside the known volume, at the goal, or at its timeout.
 

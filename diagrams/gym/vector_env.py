@@ -262,8 +262,9 @@ class VectorFlightEnv(VectorEnv):
                 raise ResetNeeded(f"flights must be begun by reset() before step(), got {ended}")
             self._begin(np.flatnonzero(resting))
         flying = ~resting
-        before = self._states.copy()
-        decided = decisions(config, given, before)
+        # By columns, which are several times faster to compute with.
+        before, p_WG = np.asfortranarray(self._states), np.asfortranarray(self._p_WG)
+        decided = np.ascontiguousarray(decisions(config, given, before))
         if self.pool.is_delayed:
             self._delays[:] = self.pool.delays[self._flight, self._count % CYCLE]
         self._threads.advance(
@@ -284,8 +285,8 @@ class VectorFlightEnv(VectorEnv):
         rewards = config.reward(
             Transition(
                 states=before,
-                next_states=self._states,
-                p_WG=self._p_WG,
+                next_states=np.asfortranarray(self._states),
+                p_WG=p_WG,
                 distances=self._distances,
                 actions=given,
                 previous_actions=self._previous,
@@ -348,8 +349,8 @@ class VectorFlightEnv(VectorEnv):
     def _observe(self, rows: NDArray[np.intp] | slice = slice(None)) -> Any:
         """Returns the observations of environments, in new arrays."""
         names = self.config.observation_names()
-        states = self._states[rows]
-        vehicles = Vehicles(states, self._p_WG[rows], self._distances[rows], self._gradients[rows])
+        states, p_WG = (np.asfortranarray(each[rows]) for each in (self._states, self._p_WG))
+        vehicles = Vehicles(states, p_WG, self._distances[rows], self._gradients[rows])
         if "obstacle" in names:
             distances, gradients = np.empty(len(states)), np.empty((len(states), 3))
             self.pool.native.query(
@@ -360,7 +361,9 @@ class VectorFlightEnv(VectorEnv):
                 gradients=gradients,
             )
             vehicles = vehicles._replace(distances=distances, gradients=gradients)
-        observed: dict[str, Any] = dict(observe(names, vehicles))
+        observed: dict[str, Any] = {
+            name: np.ascontiguousarray(values) for name, values in observe(names, vehicles).items()
+        }
         ports = {IMAGES[name] for name in names if name in IMAGES}
         if ports:
             images = self._render(rows, ports)
@@ -386,17 +389,12 @@ class VectorFlightEnv(VectorEnv):
             "merged_spread": camera.merged_spread,
             "backgrounds": [world.background for world in worlds],
         }
-        if len(ports) == 2:
-            color, depth, _ = self._renderer.render(*views, **options)
-        elif "color_image" in ports:
-            color, depth = self._renderer.render_color(*views, **options), None
-        else:
-            color, depth = None, self._renderer.render_depth(*views, **options)
-        images = {}
-        if depth is not None:
+        images = {}  # In two passes: each leaves out what only the other needs.
+        if "depth_image_32f" in ports:
+            depth = self._renderer.render_depth(*views, **options)
             images["depth_image_32f"] = ranged_depth(depth, camera.min_depth, camera.max_depth)
-        if color is not None:
-            images["color_image"] = color_pixels(color)
+        if "color_image" in ports:
+            images["color_image"] = color_pixels(self._renderer.render_color(*views, **options))
         return images
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:

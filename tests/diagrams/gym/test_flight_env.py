@@ -222,7 +222,7 @@ def test_native_code_flies_as_the_simulator_does(action, post_world):
     names = ["full_state", "goal", "obstacle", "depth_m"]
     options = {"world": post_world, "observation": names, "action": action}
     envs = [FlightEnv(Scenario(), native=native, **options) for native in (True, False)]
-    actions = np.random.default_rng(1).uniform(-0.3, 0.4, (100, *envs[0].action_space.shape))
+    actions = np.random.default_rng(1).uniform(-0.3, 0.4, (100, envs[0].config.limits().size))
     if action == "command":
         actions *= 0.05
     flights = [[env.reset(seed=2)[0]] for env in envs]

@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from splatpilot.diagrams.flight.monitor import ENDS, Outcome, end_indices
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.gym.rewards import Reward, Transition
 from splatpilot.diagrams.gym.spaces import (
@@ -123,15 +122,6 @@ def test_one_name_makes_a_box():
     config = env_config("P01", observation="depth", action="command")
     assert observation_space(config).shape == (36, 64, 1)
     assert action_space(config).shape == (4,)
-
-
-def test_ends_are_those_of_the_monitor_in_their_order():
-    p_WG = np.zeros((5, 3))
-    p_WB = np.array([[5.0, 0, 0], [0.1, 0, 0], [5.0, 0, 0], [5.0, 0, 0], [0.1, 0, 0]])
-    clearances = np.array([1.0, 1.0, -0.1, np.nan, -0.1])
-    ends = end_indices(p_WB, p_WG, clearances, np.array([0, 0, 1, 3, 1]), goal_radius=0.3)
-    expected = [None, Outcome.GOAL, Outcome.COLLISION, Outcome.LEFT_VOLUME, Outcome.COLLISION]
-    assert [ENDS[end] if end >= 0 else None for end in ends] == expected
 
 
 def test_rewards_sum_weighted_terms():

@@ -1,4 +1,5 @@
 import warnings
+from dataclasses import replace
 from typing import Any
 
 import gymnasium
@@ -6,17 +7,20 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import data_equivalence
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
+from pydrake.common.schema import Uniform
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
 from pydrake.systems.framework import DiagramBuilder
 
 from splatpilot import _native
 from splatpilot.diagrams.flight.flight_diagram import AddFlight, ExportFlight
 from splatpilot.diagrams.flight.monitor import Outcome
-from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.flight.scenario import Scenario, sample_scenario
 from splatpilot.diagrams.gym.flight_env import FlightEnv
 from splatpilot.diagrams.gym.spaces import decisions
 from splatpilot.diagrams.gym.vector_env import VectorFlightEnv
 from splatpilot.diagrams.worlds.moving_spheres import MovingSphere
+from splatpilot.systems.collision.distance_field import FieldState
+from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.sensing.imaging import Imaging
 from splatpilot.systems.sensing.noise import ObservationNoise
@@ -93,6 +97,35 @@ def test_flights_are_those_of_add_flight(action, scenario, limits):
         truth, ends = fly_in_drake(envs, flights[i], actions[:, i])
         np.testing.assert_allclose(states[: len(truth), i], truth, rtol=0, atol=1e-6)
         assert outcomes[: len(truth), i].tolist() == ends
+
+
+def test_flights_in_grids_end_as_those_of_add_flight(post_world):
+    grid = post_world.esdf
+    states = grid.states.copy()
+    states[15:] = FieldState.UNKNOWN  # from x = 3 m on
+    field = Esdf(grid.distances, states, grid.lower_W, grid.voxel_size)
+    world = replace(post_world, distance_field=field, esdf=field)
+    envs = VectorFlightEnv(1, Scenario(goal=[2.5, 2.0, 2.0], start_radius=0.0), world=world)
+    envs.reset(seed=0)
+    ahead, flown, outcomes = np.array([0.5, -1.0, 0.0]), [], []
+    while not outcomes:
+        *_, infos = envs.step(ahead[None])
+        flown.append(envs._states[0].copy())
+        outcomes = list(infos.get("outcome", []))
+    truth, ends = fly_in_drake(envs, 0, np.tile(ahead, (60, 1)))
+    np.testing.assert_allclose(flown, truth, rtol=0, atol=1e-6)
+    assert ends[-1] == outcomes[0] == Outcome.LEFT_VOLUME
+
+
+def test_each_flight_draws_its_vehicle(post_world):
+    scenario = Scenario(vehicle=QuadrotorParams(thrust_scale=Uniform(min=0.9, max=1.1)))  # pyright: ignore
+    envs = VectorFlightEnv(20, scenario, world=post_world)
+    _, infos = envs.reset(seed=0)
+    row = _native.FLIGHT_PARAMETERS.index("thrust_scale")
+    for i, seed in enumerate(infos["flight_seed"].tolist()):
+        drawn = sample_scenario(replace(scenario, seed=seed)).vehicle.thrust_scale
+        assert envs._parameters[i // 16, row, i % 16] == drawn
+    assert len(set(envs._parameters[:, row].ravel())) > 16
 
 
 def test_images_and_rewards_are_those_of_flight_env(post_world):

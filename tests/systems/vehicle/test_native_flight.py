@@ -138,25 +138,32 @@ def some_states(count: int) -> np.ndarray:
 
 
 def advance(
-    vehicle: QuadrotorParams, kind: str, actions: np.ndarray, simd: str = "", steps: int = 1
-) -> np.ndarray:
-    """Returns states (N, 13) after one period of the controller in an empty world."""
+    vehicle: QuadrotorParams,
+    kind: str,
+    actions: np.ndarray,
+    simd: str = "",
+    steps: int = 1,
+    states: np.ndarray | None = None,
+    solids: list[Shape] | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns states (N, 13) after one period of the controller, and ends (N,)."""
     count = len(actions)
-    worlds, states, zeros = _native.FlightWorlds(), some_states(count), np.zeros(count)
-    add_shapes(worlds, [])
+    states = some_states(count) if states is None else states
+    worlds, ends = _native.FlightWorlds(), np.zeros(count, np.uint8)
+    add_shapes(worlds, solids or [])
     packs = np.repeat(parameters(vehicle)[None, :, None], 16, axis=-1)
     vehicles = _native.Vehicles(
         states=states,
         thrusts=np.full(count, vehicle.gravity),
         parameters=np.repeat(packs, -(-count // 16), axis=0),
         world=np.zeros(count, np.int64),
-        goals=np.full((count, 3), 9.0),
-        radii=zeros,
-        goal_radii=zeros,
+        goals=np.tile([8.0, 0.0, 1.5], (count, 1)),
+        radii=np.full(count, 0.3),
+        goal_radii=np.full(count, 0.3),
         remaining=np.full(count, 9, np.int32),
         distances=np.full(count, np.inf),
         field_states=np.zeros(count, np.uint8),
-        ends=np.zeros(count, np.uint8),
+        ends=ends,
     )
     _native.FlightThreads(2, simd).advance(
         worlds,
@@ -171,7 +178,7 @@ def advance(
         step=CONTROL.period / steps,
         steps=steps,
     )
-    return states
+    return states, ends
 
 
 def command_of_python(kind: str, state: np.ndarray, action: np.ndarray, vehicle: QuadrotorParams):
@@ -191,7 +198,7 @@ def command_of_python(kind: str, state: np.ndarray, action: np.ndarray, vehicle:
 def test_flights_solve_the_equations_of_motion(kind, vehicle):
     actions = np.random.default_rng(4).normal(size=(20, 4 if kind == "command" else 3))
     actions += [9.0, 0.0, 0.0, 0.0] if kind == "command" else 2.0
-    flown = advance(vehicle, kind, actions, steps=8)
+    flown, _ = advance(vehicle, kind, actions, steps=8)
     for state, action, end in zip(some_states(20), actions, flown, strict=True):
         command = command_of_python(kind, state, action, vehicle).tolist()
 
@@ -211,6 +218,23 @@ def test_flights_solve_the_equations_of_motion(kind, vehicle):
 def test_simd_levels_agree_bitwise(vehicle):
     actions = np.random.default_rng(5).normal(size=(37, 3))
     levels = _native.simd_levels()
-    first, *others = (advance(vehicle, "velocity", actions, level) for level in levels)
+    first, *others = (advance(vehicle, "velocity", actions, level)[0] for level in levels)
     for other in others:
         np.testing.assert_array_equal(first, other)
+
+
+def test_the_first_end_counts():
+    states = np.zeros((5, 13))
+    states[:, 6] = 1.0
+    states[:, :3] = (
+        [2.0, 0.0, 1.5],
+        [4.0, 0.0, 1.5],
+        [4.0, 5.0, 1.5],
+        [8.2, 0.0, 1.5],
+        [7.8, 0, 1.5],
+    )
+    solids: list[Shape] = [Sphere([4.0, 0.0, 1.0], 0.3), Sphere([7.5, 0.0, 1.5], 0.1)]
+    hover = np.tile([IDEAL.gravity, 0.0, 0.0, 0.0], (5, 1))
+    _, ends = advance(IDEAL, "command", hover, states=states, solids=solids)
+    # None, collision, left volume, goal, and collision at the goal.
+    assert ends.tolist() == [0, 1, 2, 3, 1]
