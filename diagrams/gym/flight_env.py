@@ -116,7 +116,8 @@ class FlightEnv(gymnasium.Env):
         self._native = native
         self.meshcat: Meshcat | None = None
         self._ended = True
-        self._take(self._build(self.config.scenario, self._find_world(self.config.scenario)))
+        world = self._find_world(self.config.scenario)
+        self._take(self._find_flight(self.config.scenario, world))
         ports = self.parts.measured
         self._spaces = {n: _port_space(ports[n]) for n in self._names() if n in ports}
         self.observation_space = observation_space(self.config, self._spaces)
@@ -153,6 +154,18 @@ class FlightEnv(gymnasium.Env):
             simulator.set_target_realtime_rate(1.0)
         return _BuiltFlight(parts, simulator)
 
+    def _find_flight(self, scenario: Scenario, world: World) -> "_BuiltFlight":
+        """Returns the flight of a world, or a new one if noise differs from flight to flight."""
+        if not only_start_is_random(self.config.scenario):
+            return self._build(scenario, world)
+        if id(world) not in self._flights:
+            flight = self._flights[id(world)] = self._build(scenario, world)
+            is_native = self._native and self.render_mode != "human"
+            if is_native and can_fly_natively(self.config, world):
+                context = flight.simulator.get_mutable_context()
+                flight.native = NativeFlight(self.config, flight.parts, context)
+        return self._flights[id(world)]
+
     def _take(self, flight: "_BuiltFlight") -> None:
         """Makes a flight the present one."""
         self._flight, self.parts, self.simulator = flight, flight.parts, flight.simulator
@@ -169,6 +182,7 @@ class FlightEnv(gymnasium.Env):
             options: `scenario`, flown from now on; `start` and `goal` (3) [m] of this flight.
         """
         super().reset(seed=seed)
+        self._ended = True  # also if this fails
         options = options or {}
         for name in options:
             require(name in _OPTIONS, "options", f"of {', '.join(_OPTIONS)}", repr(name))
@@ -184,10 +198,10 @@ class FlightEnv(gymnasium.Env):
             scenario = replace(scenario, **points)
             scenario.validate()
         world = self._find_world(replace(self.config.scenario, seed=world_seed))
+        self._take(self._find_flight(scenario, world))
         if only_start_is_random(self.config.scenario):
             self._restart(scenario, world)
         else:
-            self._take(self._build(scenario, world))
             context = self.simulator.get_mutable_context()
             self.diagram.SetRandomContext(context, RandomGenerator(scenario.seed))
         flight = self._flight
@@ -201,13 +215,6 @@ class FlightEnv(gymnasium.Env):
 
     def _restart(self, scenario: Scenario, world: World) -> None:
         """Sets the Context of the diagram of a world to the start of a flight."""
-        if id(world) not in self._flights:
-            flight = self._flights[id(world)] = self._build(scenario, world)
-            if self._native and self.render_mode != "human":
-                if can_fly_natively(self.config, world):
-                    context = flight.simulator.get_mutable_context()
-                    flight.native = NativeFlight(self.config, flight.parts, context)
-        self._take(self._flights[id(world)])
         state, p_WG = sample_initial_state(scenario, world), goal_position(scenario, world)
         context = self.simulator.get_mutable_context()
         context.SetTime(0.0)
@@ -225,7 +232,7 @@ class FlightEnv(gymnasium.Env):
             raise gymnasium.error.ResetNeeded("the flight must be begun by reset() before step()")
         config, before = self.config, self._vehicles
         actions = require_actions(action, cast(Box, self.action_space).shape)[None]
-        decision = decisions(config, actions, before.states)
+        decision = decisions(config, actions, self._estimates)
         self._action.FixValue(self.simulator.get_mutable_context(), decision[0])
         self._steps += 1
         flight, period = self._flight, config.scenario.controller.period
@@ -264,6 +271,7 @@ class FlightEnv(gymnasium.Env):
         names, vehicles = self._names(), self._vehicles
         if self.parts.estimator is not None:
             vehicles = vehicles._replace(states=self._flight.eval("state")[None])
+        self._estimates = vehicles.states
         observed: dict[str, Any] = {n: v[0] for n, v in observe(names, vehicles).items()}
         for name in names:
             if name in IMAGES:

@@ -16,6 +16,7 @@ from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.gym.flight_env import FlightEnv
 from splatpilot.systems.common.config import dump_config
 from splatpilot.systems.common.provenance import InfeasibleFlightError
+from splatpilot.systems.sensing.estimators import MotionCapture
 from splatpilot.systems.sensing.imu import Imu
 from splatpilot.systems.sensing.noise import ObservationNoise
 from splatpilot.systems.vehicle.quadrotor import GRAVITY
@@ -84,6 +85,20 @@ def test_a_seed_repeats_noise_and_sensors(post_world):
     assert_identical(first, again)
     assert (first[0][1]["imu_accelerometer"] != other[0][1]["imu_accelerometer"]).any()
     assert env.observation_space.contains(first[0][1])
+
+
+def test_the_policy_sees_and_acts_by_the_estimate(post_world):
+    scenario = Scenario(estimator=MotionCapture(rate=50.0, latency=0.05))
+    env = FlightEnv(scenario, world=post_world, observation="full_state", action="waypoint")
+    env.reset(seed=0)
+    for _ in range(4):
+        env.step(AHEAD)
+    before, *_ = env.step(AHEAD)
+    env.step(AHEAD)
+    waypoint = env.diagram.GetInputPort("waypoint").Eval(env.simulator.get_context())
+    true = env.diagram.GetOutputPort("state").Eval(env.simulator.get_context())
+    assert np.linalg.norm(before[:3] - true[:3]) > 0.02
+    assert np.linalg.norm(waypoint - before[:3]) == pytest.approx(0.5 * 1.2, abs=1e-5)
 
 
 def test_it_flies_as_a_simulation_of_the_diagram(post_world):

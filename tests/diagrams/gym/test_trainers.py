@@ -5,7 +5,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import torch
-from skrl.agents.torch import ppo
+from skrl.agents.torch import ExperimentCfg, ppo
 from skrl.envs.wrappers.torch import wrap_env
 from skrl.memories.torch import RandomMemory
 from skrl.models.torch import DeterministicMixin, GaussianMixin, Model
@@ -97,7 +97,7 @@ class Value(DeterministicMixin, Model):
         return self.net(inputs["observations"]), {}
 
 
-def test_skrl_trains_on_many_flights():
+def test_skrl_trains_on_many_flights(tmp_path):
     envs = gymnasium.make_vec(
         "splatpilot:Flight-v0", 4, scenario=Scenario(timeout=1.0), observation="full_state"
     )
@@ -112,7 +112,12 @@ def test_skrl_trains_on_many_flights():
         observation_space=env.observation_space,
         action_space=env.action_space,
         device="cpu",
-        cfg=ppo.PPO_CFG(rollouts=16, learning_epochs=1, mini_batches=1),
+        cfg=ppo.PPO_CFG(
+            experiment=ExperimentCfg(directory=str(tmp_path)),
+            rollouts=16,
+            learning_epochs=1,
+            mini_batches=1,
+        ),
     )
     before = parameters(models["policy"])
     cfg = {"timesteps": 32, "headless": True, "close_environment_at_exit": False}
