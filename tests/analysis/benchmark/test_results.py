@@ -41,4 +41,12 @@ def test_tables_of_a_page_are_written_between_their_markers(results):
     interval = results.wilson_interval(0, 3)
     assert isinstance(interval, Interval) and results.percent(interval) in page
     assert results.with_tables(page) == page
-    assert "| short | 0/3 | 0/3 |" in results.with_tables(PAGE.format("scenarios"))
+
+
+def test_realism_is_shown_by_policy_and_condition(results):
+    rows = "ideal,planner,3,3\nharsh,planner,3,1\nideal,straight,3,2\n"
+    (results.RESULTS / "realism.csv").write_text(f"conditions,policy,flights,successes\n{rows}")
+    (results.RESULTS / "realism.yaml").write_text("date: 2026-01-02\nprogram: 0123456789\n")
+    page = results.with_tables(PAGE.format("realism").replace("small", "realism"))
+    assert "|policy|ideal|harsh|" in page
+    assert "|`planner`|3/3|1/3|\n|`straight`|2/3||" in page
