@@ -20,6 +20,7 @@ _DRIVER = Path("/proc/driver/nvidia")
 _USES = {
     "cluster": "`splatpilot benchmark --cluster`",
     "exr": "depth of Record3D's exports",
+    "gym": "reinforcement learning in Gymnasium",
     "mesh": "`splatpilot scene mesh`",
     "mocap": "OptiTrack in `splatpilot hardware px4`",
     "photos": "photographs without poses, and COLMAP models",
