@@ -6,6 +6,7 @@ scene and in the mesh that the capture shows.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import cycle
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -316,7 +317,7 @@ def _write_figure(path: Path, pairs: Sequence[dict[str, Any]], control: Sequence
     from matplotlib.figure import Figure
 
     policies = list(dict.fromkeys(pair["policy"] for pair in pairs))
-    figure = Figure(figsize=(9, 4.5), layout="constrained")
+    figure = Figure(figsize=(10, 4), layout="constrained")
     panels = figure.subplots(1, 2 if control else 1, sharey=True, squeeze=False)[0]
     flights = [row | {"policy": _flown_policy(row)} for row in control]
 
@@ -330,12 +331,12 @@ def _write_figure(path: Path, pairs: Sequence[dict[str, Any]], control: Sequence
         ("reconstructions", "generated worlds"),
         strict=False,
     ):
-        for policy in policies:
+        for policy, marker in zip(policies, cycle("os^vDPX*<>"), strict=False):
             xy = rate(rows, policy, column), rate(pairs, policy, "mesh")
-            axes.plot(*xy, "o", color="tab:blue")
-            axes.annotate(policy, xy, xytext=(4, 4), textcoords="offset points", fontsize=7)
+            axes.plot(*xy, marker, alpha=0.7, markersize=8, clip_on=False, label=policy)
         axes.plot([0, 1], [0, 1], color="0.7", linewidth=1)
         axes.set(xlabel=f"success in {where}", xlim=(-0.03, 1.03), ylim=(-0.03, 1.03))
         axes.set_aspect("equal")
     panels[0].set_ylabel("success in the meshes")
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside right center")
     write_png(figure, path)

@@ -6,7 +6,14 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from pydrake.systems.framework import DiagramBuilder, OutputPort, System
+from pydrake.systems.framework import (
+    BasicVector,
+    Context,
+    DiagramBuilder,
+    LeafSystem,
+    OutputPort,
+    System,
+)
 from pydrake.systems.primitives import ConstantVectorSource
 
 from splatpilot.diagrams.flight.policies import POLICIES
@@ -37,6 +44,31 @@ from splatpilot.systems.vehicle.wind import DrydenWind
 
 DECISIONS = {"command": 4, "acceleration": 3, "velocity": 3, "waypoint": 3}
 """Decisions of policies besides hypotheses, and their sizes."""
+
+
+class DecisionInput(LeafSystem):
+    """Passes the decision of a policy outside of the diagram from its input to its output.
+
+    The input and the output have the name and size of one of `DECISIONS`.
+
+    Args:
+        camera, rate: of the policy, its images and decisions [Hz]; by default those of the
+            scenario's policy.
+    """
+
+    def __init__(
+        self, decision: str, camera: OnboardCamera | None = None, rate: float | None = None
+    ) -> None:
+        super().__init__()
+        require(decision in DECISIONS, "policy", f"one of {', '.join(DECISIONS)}", decision)
+        self.camera, self.rate = camera, rate
+        source = self.DeclareVectorInputPort(decision, DECISIONS[decision])
+        self.DeclareVectorOutputPort(
+            decision, source.size(), self._calc, prerequisites_of_calc={source.ticket()}
+        )
+
+    def _calc(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self.EvalVectorInput(context, 0).CopyToVector())
 
 
 class Autonomy(NamedTuple):

@@ -11,11 +11,8 @@ import numpy as np
 from pydrake.geometry import Meshcat, MeshcatParams, SceneGraph
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import (
-    BasicVector,
-    Context,
     Diagram,
     DiagramBuilder,
-    LeafSystem,
     OutputPort,
     System,
 )
@@ -23,7 +20,6 @@ from pydrake.systems.primitives import ConstantVectorSource
 from pydrake.systems.sensors import CameraConfig, CameraInfo
 
 from splatpilot.diagrams.flight.blocks import (
-    DECISIONS,
     AddDelayedPose,
     AddMovingBodies,
     AddObservation,
@@ -33,6 +29,7 @@ from splatpilot.diagrams.flight.blocks import (
     AddWind,
     ConnectObservation,
     ConnectOrExport,
+    DecisionInput,
     ExportCollision,
     add_system,
     decision_period,
@@ -58,7 +55,6 @@ from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.common.validation import require, require_type
 from splatpilot.systems.policies.teleop import Teleop
 from splatpilot.systems.sensing.latency import FrameTimes
-from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.splats.background import Background, mean_color
 from splatpilot.systems.splats.moving_bodies import MovingBodies
 from splatpilot.systems.splats.render_engine import ObstacleGeometry, SplatRenderEngine
@@ -351,31 +347,6 @@ def _require_apart(parts: FlightParts, other: FlightParts) -> None:
 
 
 _RENAME = "rename the sensor, or give AddFlight another name"
-
-
-class DecisionInput(LeafSystem):
-    """Passes the decision of a policy outside of the diagram from its input to its output.
-
-    The input and the output have the name and size of one of `DECISIONS`.
-
-    Args:
-        camera, rate: of the policy, its images and decisions [Hz]; by default those of the
-            scenario's policy.
-    """
-
-    def __init__(
-        self, decision: str, camera: OnboardCamera | None = None, rate: float | None = None
-    ) -> None:
-        super().__init__()
-        require(decision in DECISIONS, "policy", f"one of {', '.join(DECISIONS)}", decision)
-        self.camera, self.rate = camera, rate
-        source = self.DeclareVectorInputPort(decision, DECISIONS[decision])
-        self.DeclareVectorOutputPort(
-            decision, source.size(), self._calc, prerequisites_of_calc={source.ticket()}
-        )
-
-    def _calc(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self.EvalVectorInput(context, 0).CopyToVector())
 
 
 def AddSplatWorld(

@@ -21,10 +21,10 @@ from pydrake.systems.framework import (
 from pydrake.systems.primitives import ConstantVectorSource
 from pydrake.systems.sensors import ImageDepth16U, ImageDepth32F, ImageRgba8U
 
+from splatpilot.diagrams.flight.blocks import DecisionInput
 from splatpilot.diagrams.flight.flight_diagram import (
     AddFlight,
     AddMeshcat,
-    DecisionInput,
     ExportFlight,
     FlightParts,
     open_meshcat,

@@ -117,9 +117,7 @@ class VectorFlightEnv(VectorEnv):
             "step": period / count,
         }
         threads = threads or os.cpu_count() or 1
-        simd = os.environ.get("SPLATPILOT_SIMD", "")
-        self._threads = _native.FlightThreads(threads, simd)
-        self._renderer = BatchRenderer(threads, simd)
+        self._threads, self._renderer = _native.FlightThreads(threads), BatchRenderer(threads)
         for config in configs:
             require_supported(config)
         self.pool = pool or WorldPool(configs, world)
@@ -381,8 +379,8 @@ class VectorFlightEnv(VectorEnv):
         info, X_BC = camera.camera_info(), camera.mount()
         worlds = [self.pool.worlds[w] for w in self.pool.world[self._flight[rows]]]
         X_WCs = [pose_from_state(state) @ X_BC for state in self._states[rows]]
-        views = [world.baked for world in worlds], info.intrinsic_matrix(), info.width()
-        views = *views, info.height(), X_WCs
+        scenes, size = [world.baked for world in worlds], (info.width(), info.height())
+        views = scenes, info.intrinsic_matrix(), *size, X_WCs
         options: dict[str, Any] = {
             "distortion": camera.distortion,
             "max_depth": camera.max_depth,

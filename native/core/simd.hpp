@@ -120,7 +120,6 @@ using Register = FloatRegister;
 SP_INLINE Register register_min(Register a, Register b) { return SP_INTRINSIC(min_ps)(a, b); }
 SP_INLINE Register register_max(Register a, Register b) { return SP_INTRINSIC(max_ps)(a, b); }
 SP_INLINE Register register_sqrt(Register a) { return SP_INTRINSIC(sqrt_ps)(a); }
-#undef SP_INTRINSIC
 #else
 SP_INLINE Register register_min(Register a, Register b) { return a < b ? a : b; }
 SP_INLINE Register register_max(Register a, Register b) { return a > b ? a : b; }
@@ -345,13 +344,6 @@ SP_INLINE DoubleRegister load(const double* p) {
   return a;
 }
 SP_INLINE void store(double* p, DoubleRegister a) { std::memcpy(p, &a, kRegisterBytes); }
-#if defined(__AVX512F__)
-#define SP_INTRINSIC(name) _mm512_##name
-#elif defined(__AVX2__)
-#define SP_INTRINSIC(name) _mm256_##name
-#elif defined(__SSE4_1__)
-#define SP_INTRINSIC(name) _mm_##name
-#endif
 #ifdef SP_INTRINSIC
 SP_INLINE DoubleRegister min(DoubleRegister a, DoubleRegister b) {
   return SP_INTRINSIC(min_pd)(a, b);

@@ -212,17 +212,13 @@ class BakedScene:
         width: int,
         height: int,
         X_WC: "RigidTransform",
-        near: float = 0.01,
-        far: float = 1e10,
+        *clip: float,
         background: Background = BLACK,
         moving: PlacedGaussians = NO_GAUSSIANS,
-        distortion: Distortion | None = None,
-        max_depth: float = np.inf,
-        merged_spread: float = 0.0,
+        **options: Any,
     ) -> RenderedView:
         """Renders images of these names; the others are empty."""
-        arguments = near, far, distortion, max_depth, merged_spread
-        camera = _checked_camera(K, width, height, *arguments)
+        camera = _checked_camera(K, width, height, *clip, **options)
         (color,) = _background_colors([background])
         images = _new_images(names, (height, width))
         _native.render_baked(
@@ -233,7 +229,7 @@ class BakedScene:
             background=color,
             **{name: image if name in names else None for name, image in images.items()},
         )
-        return _finished(images, [background], K, [X_WC], distortion)
+        return _finished(images, [background], K, [X_WC], options.get("distortion"))
 
 
 class BatchRenderer:
@@ -246,30 +242,15 @@ class BatchRenderer:
     def __init__(self, threads: int = 1, simd: str = ""):
         self._renderer = _native_threads(_native.BatchRenderer, threads, simd)
 
-    def render(
-        self,
-        scenes: Sequence[BakedScene],
-        K: ArrayLike,
-        width: int,
-        height: int,
-        X_WCs: "Sequence[RigidTransform]",
-        near: float = 0.01,
-        far: float = 1e10,
-        backgrounds: Sequence[Background] | None = None,
-        distortion: Distortion | None = None,
-        max_depth: float = np.inf,
-        merged_spread: float = 0.0,
-    ) -> RenderedView:
-        """Renders color (N, H, W, 3), median depth and alpha (N, H, W); see `BakedScene.render`.
+    def render(self, *cameras: Any, **options: Any) -> RenderedView:
+        """Renders color (N, H, W, 3), median depth and alpha (N, H, W).
 
         Args:
-            scenes: of the N views.
-            X_WCs: poses of the N cameras.
-            backgrounds: of the N views; black if None.
+            cameras: the scenes of the N views, and the arguments of `BakedScene.render` but
+                `moving`, with the N poses X_WC; all beyond `far` by name.
+            options: the same; `backgrounds` are those of the N views, black by default.
         """
-        options = {"backgrounds": backgrounds, "distortion": distortion, "max_depth": max_depth}
-        cameras = scenes, K, width, height, X_WCs, near, far
-        return self._render(_ALL, *cameras, merged_spread=merged_spread, **options)
+        return self._render(_ALL, *cameras, **options)
 
     def render_color(self, *cameras: Any, **options: Any) -> NDArray[np.float32]:
         """Renders the colors (N, H, W, 3) alone, which is faster; see `render`."""
@@ -287,12 +268,9 @@ class BatchRenderer:
         width: int,
         height: int,
         X_WCs: "Sequence[RigidTransform]",
-        near: float = 0.01,
-        far: float = 1e10,
+        *clip: float,
         backgrounds: Sequence[Background] | None = None,
-        distortion: Distortion | None = None,
-        max_depth: float = np.inf,
-        merged_spread: float = 0.0,
+        **options: Any,
     ) -> RenderedView:
         """Renders images of these names; the others are empty."""
         count = len(scenes)
@@ -300,8 +278,7 @@ class BatchRenderer:
         for name, rows in (("poses", X_WCs), ("backgrounds", backgrounds)):
             condition = f"that of scenes, {count}"
             require(len(rows) == count, f"the number of {name}", condition, len(rows))
-        arguments = near, far, distortion, max_depth, merged_spread
-        camera = _checked_camera(K, width, height, *arguments)
+        camera = _checked_camera(K, width, height, *clip, **options)
         images = _new_images(names, (count, height, width))
         _native.render_views(
             self._renderer,
@@ -310,7 +287,7 @@ class BatchRenderer:
             backgrounds=_background_colors(backgrounds),
             **{name: image if name in names else None for name, image in images.items()},
         )
-        return _finished(images, backgrounds, K, X_WCs, distortion)
+        return _finished(images, backgrounds, K, X_WCs, options.get("distortion"))
 
 
 def _new_images(names: tuple[str, ...], shape: tuple[int, ...]) -> dict[str, NDArray[np.float32]]:
@@ -338,8 +315,12 @@ def _finished(
     X_WCs: "Sequence[RigidTransform]",
     distortion: Distortion | None,
 ) -> RenderedView:
-    """Returns images (..., H, W, channels) of N views, without the pixels that have no ray, and
-    before their environments."""
+    """Returns the views of images (..., H, W, channels): pixels without a ray are zero, and
+    environments stand behind.
+
+    Args:
+        backgrounds, X_WCs: of the N views.
+    """
     if distortion is not None:
         for image in filter(np.size, images.values()):
             height, width, channels = image.shape[-3:]
@@ -357,11 +338,12 @@ def _checked_camera(
     K: ArrayLike,
     width: int,
     height: int,
-    near: float,
-    far: float,
-    distortion: Distortion | None,
-    max_depth: float,
-    merged_spread: float,
+    near: float = 0.01,
+    far: float = 1e10,
+    *,
+    distortion: Distortion | None = None,
+    max_depth: float = np.inf,
+    merged_spread: float = 0.0,
 ) -> "Callable[[BakedScene, RigidTransform], _native.Camera]":
     """Checks a camera; returns the function from a scene and the pose to the native one."""
     K = check_camera(K, width, height, near, far)

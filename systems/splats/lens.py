@@ -137,7 +137,7 @@ def _cached[T](maxsize: int) -> Callable[[Callable[..., T]], Callable[..., T]]:
     def decorate(compute: Callable[..., T]) -> Callable[..., T]:
         cached = lru_cache(maxsize)(compute)
 
-        def call(distortion: Distortion, K: "NDArray", width: int, height: int) -> T:
+        def call(distortion: Distortion | None, K: "NDArray", width: int, height: int) -> T:
             intrinsics = tuple(map(float, K[[0, 1, 0, 1], [0, 1, 2, 2]]))
             return cached(distortion, intrinsics, width, height)
 
@@ -172,12 +172,14 @@ def native_lens(
 
 @_cached(8)
 def pixel_slopes(
-    distortion: Distortion, intrinsics: _Intrinsics, width: int, height: int
+    distortion: Distortion | None, intrinsics: _Intrinsics, width: int, height: int
 ) -> "NDArray[np.float64]":
-    """Returns the slopes (height, width, 2) of a camera's pixels; NaN without a ray."""
+    """Returns the slopes (height, width, 2) of a camera's pixels; NaN without a ray. The camera is
+    a pinhole if `distortion` is None."""
     fx, fy, cx, cy = intrinsics
     u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    slopes = distortion.slopes(np.stack([(u - cx) / fx, (v - cy) / fy], -1))
+    points = np.stack([(u - cx) / fx, (v - cy) / fy], -1).astype(np.float64)
+    slopes = points if distortion is None else distortion.slopes(points)
     slopes.setflags(write=False)
     return slopes
 

@@ -37,7 +37,7 @@ from splatpilot.systems.splats.baked_scene import (
     PlacedGaussians,
     bake,
 )
-from splatpilot.systems.splats.lens import Distortion
+from splatpilot.systems.splats.lens import Distortion, pixel_slopes
 from splatpilot.systems.splats.moving_bodies import Bodies
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.vehicle.state import pose_between
@@ -113,17 +113,6 @@ def row_bands(
     return list(pairwise(edges))
 
 
-@cache
-def _pixel_slopes(
-    focal: tuple[float, float], center: tuple[float, float], size: tuple[int, int], lens: Any
-) -> NDArray[np.float32]:
-    """Returns the slopes (2, H, W) of the rays of pixels; NaN beyond the lens."""
-    pixels = np.stack(np.meshgrid(*(np.arange(n) + 0.5 for n in size)), axis=-1)
-    points = (pixels - center) / focal
-    slopes = points if lens is None else lens.slopes(points)
-    return np.moveaxis(slopes, -1, 0).astype(np.float32)
-
-
 def blurred_light(
     view: RenderedView,
     camera_info: CameraInfo,
@@ -139,9 +128,9 @@ def blurred_light(
         X_CtCs: poses of C in the frames of the camera at the start and the end of the exposure.
     """
     focal = np.array([camera_info.focal_x(), camera_info.focal_y()], dtype=np.float32)
-    center = camera_info.center_x(), camera_info.center_y()
     size = camera_info.width(), camera_info.height()
-    x, y = _pixel_slopes((float(focal[0]), float(focal[1])), center, size, lens)
+    slopes = pixel_slopes(lens, camera_info.intrinsic_matrix(), *size).astype(np.float32)
+    x, y = np.ascontiguousarray(np.moveaxis(slopes, -1, 0))
     near = np.isfinite(view.depth) & (view.depth > 0.0)
     inverse = np.where(near, 1.0 / np.where(near, view.depth, 1.0), np.float32(0.0))
     ends = []

@@ -142,11 +142,9 @@ class _Rotors(LeafSystem):
         output.SetFromVector(np.array(self._thrusts(context)))
 
     def _calc_air(self, context: Context, output: AbstractValue) -> None:
-        mass, R_WB = (
-            self._params.mass,
-            rotation_matrices(vector_input(self, "state", context)[6:10]),
-        )
-        force = mass * np.add(self._rates(context)[3:6], [0.0, 0.0, self._params.gravity])
+        R_WB = rotation_matrices(vector_input(self, "state", context)[6:10])
+        weight = [0.0, 0.0, self._params.gravity]
+        force = self._params.mass * np.add(self._rates(context)[3:6], weight)
         applied = ExternallyAppliedSpatialForce()
         applied.body_index, applied.p_BoBq_B = self._body, np.zeros(3)
         air = force - sum(self._thrusts(context)) * R_WB[:, 2]

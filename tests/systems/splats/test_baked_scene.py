@@ -379,7 +379,7 @@ def test_images_of_a_batch_are_those_of_each_view(lens):
     camera = K, WIDTH, HEIGHT
     batch = BatchRenderer(3)
     options = {"distortion": lens, "max_depth": 9.0}
-    views = batch.render(scenes, *camera, X_WCs, 0.1, 50.0, backgrounds, **options)
+    views = batch.render(scenes, *camera, X_WCs, 0.1, 50.0, backgrounds=backgrounds, **options)
     depths = batch.render_depth(scenes, *camera, X_WCs, 0.1, 50.0, **options)
     for k, (scene, X) in enumerate(zip(scenes, X_WCs, strict=True)):
         view = scene.render(*camera, X, 0.1, 50.0, backgrounds[k], **options)
