@@ -16,7 +16,10 @@ SCENARIOS = tuple(benchmark_scenarios() | other_scenarios())
 LEARN_FROM_CORPORA = "student_rgb", "student_depth", "diffaero_rgb"
 """Trainers that learn from corpora."""
 
-TRAINER_NAMES = "diffaero", "depthnav", "diffaero_tof", "agile_autonomy", *LEARN_FROM_CORPORA
+TRAINER_NAMES = (
+    *("diffaero", "depthnav", "diffaero_tof", "agile_autonomy", "distilled_rgb"),
+    *LEARN_FROM_CORPORA,
+)
 """The names of the trainers of this package; importing their registry takes seconds."""
 
 POLICY_NAMES = "planner", "straight", "teleop", "reactive", *TRAINER_NAMES

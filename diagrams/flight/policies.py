@@ -21,7 +21,12 @@ from splatpilot.systems.policies.diffaero import (
     DiffAeroTof,
     DiffAeroTofConfig,
 )
-from splatpilot.systems.policies.diffaero_rgb import DiffAeroRgb, DiffAeroRgbConfig
+from splatpilot.systems.policies.diffaero_rgb import (
+    DiffAeroRgb,
+    DiffAeroRgbConfig,
+    DistilledRgb,
+    DistilledRgbConfig,
+)
 from splatpilot.systems.policies.planner import PrivilegedPlanner, PrivilegedPlannerConfig
 from splatpilot.systems.policies.reactive import Reactive, ReactiveConfig
 from splatpilot.systems.policies.straight import Straight, StraightConfig
@@ -109,6 +114,7 @@ for _name, _config, _system in (
     ("agile_autonomy", AgileAutonomyConfig, AgileAutonomy),
     ("diffaero_tof", DiffAeroTofConfig, DiffAeroTof),
     ("diffaero_rgb", DiffAeroRgbConfig, DiffAeroRgb),
+    ("distilled_rgb", DistilledRgbConfig, DistilledRgb),
     ("student_rgb", StudentRgbConfig, Student),
     ("student_depth", StudentDepthConfig, Student),
 ):

@@ -20,7 +20,6 @@ from splatpilot.systems.policies.recurrent_network import (
     DepthEncoder,
     DepthLayer,
     DepthSpec,
-    depth_layers,
     leaky_relu,
 )
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
@@ -76,7 +75,7 @@ class TrajectoryNetworkSpec(DepthSpec):
     def weight_shapes(self) -> dict[str, tuple[int, ...]]:
         """Returns the shapes of all arrays of weights by name."""
         joined = self.image_features + self.state_features
-        return convolution_shapes(depth_layers(self.convolutions)) | linear_shapes(
+        return convolution_shapes(self.image_layers()) | linear_shapes(
             ("image_layer", self.image_outputs(), self.image_features),
             ("state_layer", STATE_SIZE, self.state_features),
             ("state_layer_2", self.state_features, self.state_features),

@@ -1,4 +1,8 @@
-"""DiffAeroRgb: DiffAero that predicts its depth grid from a single RGB image."""
+"""DiffAero that predicts its depth grid from a single RGB image.
+
+`DiffAeroRgb` joins a network for the grid and DiffAero's, trained apart. `DistilledRgb` is trained
+as a whole, in flight; features of the image reach its decisions beside the grid.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -15,7 +19,11 @@ from splatpilot.systems.policies.convolutions import (
 )
 from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK, RATE, compute_command
 from splatpilot.systems.policies.observations import heading_frame
-from splatpilot.systems.policies.recurrent_network import NetworkSpec, RecurrentNetwork
+from splatpilot.systems.policies.recurrent_network import (
+    NetworkSpec,
+    RecurrentNetwork,
+    leaky_relu,
+)
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 
 WIDTH, HEIGHT = 160, 90  # [px] of the view, the middle of the image
@@ -38,12 +46,19 @@ class DiffAeroRgbConfig(LearnedPolicyConfig):
         require_field(self.camera, "fov_x", self.camera.fov_x == FOV_X, f"{FOV_X:g} deg")
 
 
+@dataclass
+class DistilledRgbConfig(DiffAeroRgbConfig):
+    """Weights, speed and a camera as of `DiffAeroRgbConfig`."""
+
+
 @dataclass(frozen=True)
 class MonocularSpec:
     """Architecture: residual blocks at a fifth and at a tenth of the image's size.
 
     A block adds to its input a dilated convolution of 3x3, followed by one of 1x1.
     """
+
+    features = 0  # channels beside the grid
 
     fine_channels: int = 32
     fine_dilations: tuple[int, ...] = (1, 2)
@@ -59,7 +74,7 @@ class MonocularSpec:
         layers.append(_convolution("halving", fine, coarse, 3, stride=2))
         for i, dilation in enumerate(self.coarse_dilations):
             layers += _block(f"coarse.{i}", coarse, dilation)
-        return [*layers, _convolution("head", coarse, 2, 1, activation="")]
+        return [*layers, _convolution("head", coarse, 2 + self.features, 1, activation="")]
 
     def weight_shapes(self) -> dict[str, tuple[int, ...]]:
         """Returns the shapes of all arrays of weights by name."""
@@ -84,12 +99,11 @@ class MonocularDepth:
     def __init__(self, spec: MonocularSpec, weights: Mapping[str, np.ndarray]) -> None:
         self._net = opencv_net((CHANNELS, HEIGHT, WIDTH), spec.layers(), weights)
 
-    def __call__(self, view: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Predicts inverse depths (9, 16) and the logarithms of their expected absolute errors
-        from a view (6, 90, 160), see `encode_view`."""
+    def __call__(self, view: np.ndarray) -> np.ndarray:
+        """Predicts (2 + F, 9, 16) from a view (6, 90, 160), see `encode_view`: inverse depths, the
+        logarithms of their expected absolute errors, and features."""
         self._net.setInput(view[None])
-        inverse, log_error = self._net.forward()[0]
-        return inverse, log_error
+        return self._net.forward()[0]
 
 
 @dataclass(frozen=True)
@@ -101,6 +115,31 @@ class DiffAeroRgbSpec:
 
 
 DIFFAERO_RGB_NETWORK = DiffAeroRgbSpec()
+
+
+@dataclass(frozen=True)
+class FeatureSpec(MonocularSpec):
+    """A network with features beside the grid."""
+
+    features: int = 8
+
+
+@dataclass(frozen=True)
+class DistilledPolicySpec(NetworkSpec):
+    """A network by the grid and features."""
+
+    image_channels: int = 1 + FeatureSpec.features
+
+
+@dataclass(frozen=True)
+class DistilledRgbSpec(DiffAeroRgbSpec):
+    """Architecture of both networks with features between them."""
+
+    monocular: FeatureSpec = field(default_factory=FeatureSpec)
+    policy: DistilledPolicySpec = DistilledPolicySpec(**vars(DIFFAERO_NETWORK))
+
+
+DISTILLED_RGB_NETWORK = DistilledRgbSpec()
 
 
 class DiffAeroRgbNetwork:
@@ -115,11 +154,17 @@ class DiffAeroRgbNetwork:
         self.monocular = MonocularDepth(spec.monocular, monocular)
         self.policy = RecurrentNetwork(spec.policy, part("policy", spec.policy.weight_shapes()))
 
+    def see(self, color: np.ndarray, R_WB: np.ndarray) -> np.ndarray:
+        """Computes the image (9, 16) or (1 + F, 9, 16) for the policy, see `encode_view`."""
+        inverse, _, *features = self.monocular(encode_view(color, R_WB))
+        return np.stack([inverse, *leaky_relu(np.array(features))]) if features else inverse
 
-def load_network(path: str | None) -> DiffAeroRgbNetwork:
+
+def load_network(
+    path: str | None, policy: str = "diffaero_rgb", spec: DiffAeroRgbSpec = DIFFAERO_RGB_NETWORK
+) -> DiffAeroRgbNetwork:
     """Loads the networks from a file of weights, see `PolicyCheckpoint.load`."""
-    checkpoint = PolicyCheckpoint.load(path, "diffaero_rgb", DIFFAERO_RGB_NETWORK)
-    return checkpoint.build(DiffAeroRgbNetwork)
+    return PolicyCheckpoint.load(path, policy, spec).build(DiffAeroRgbNetwork)
 
 
 def encode_view(color: np.ndarray, R_WB: np.ndarray) -> np.ndarray:
@@ -170,13 +215,35 @@ class DiffAeroRgb(Policy):
     - ``acceleration`` (3): a_WB [m/s^2], W frame, gravity excluded.
     """
 
+    _network_kind = "diffaero_rgb", DIFFAERO_RGB_NETWORK
+    _default = DiffAeroRgbConfig
+
     def __init__(self, config: DiffAeroRgbConfig | None = None) -> None:
-        super().__init__(config or DiffAeroRgbConfig(), "color_image")
-        self._network = load_network(self._config.weights)
+        super().__init__(config or self._default(), "color_image")
+        self._network = load_network(self._config.weights, *self._network_kind)
         self.declare_state(np.zeros(3), "acceleration")
         self.declare_state(self._network.policy.initial_hidden())
 
     def decide(self, observed: Observation, *state: np.ndarray) -> tuple[np.ndarray, ...]:
-        network = self._network
-        grid, _ = network.monocular(encode_view(observed.image, observed.X_WB.rotation().matrix()))
-        return compute_command(network.policy, grid, observed, self._config.speed, state[1])
+        image = self._network.see(observed.image, observed.X_WB.rotation().matrix())
+        return compute_command(self._network.policy, image, observed, self._config.speed, state[1])
+
+
+class DistilledRgb(DiffAeroRgb):
+    """Flies to the goal by an RGB image and a hidden state, trained in flight.
+
+    .. pydrake_system::
+
+        name: DistilledRgb
+        input_ports:
+        - state
+        - goal
+        - color_image
+        output_ports:
+        - acceleration
+
+    - ``acceleration`` (3): a_WB [m/s^2], W frame, gravity excluded.
+    """
+
+    _network_kind = "distilled_rgb", DISTILLED_RGB_NETWORK
+    _default = DistilledRgbConfig

@@ -28,9 +28,9 @@ DepthLayer = tuple[int, int, int, int]
 """Channels, width of the kernel, stride and padding of a convolution."""
 
 
-def depth_layers(layers: Sequence[DepthLayer]) -> list[Convolution]:
-    """Returns convolutions of an image of one channel, each followed by a leaky ReLU."""
-    convolutions, inputs = [], 1
+def depth_layers(layers: Sequence[DepthLayer], channels: int = 1) -> list[Convolution]:
+    """Returns convolutions of an image of `channels`, each followed by a leaky ReLU."""
+    convolutions, inputs = [], channels
     for i, (outputs, kernel, stride, padding) in enumerate(layers):
         weight, bias = f"convolutions.{i}.weight", f"convolutions.{i}.bias"
         sizes = inputs, outputs, kernel, stride
@@ -43,30 +43,36 @@ def depth_layers(layers: Sequence[DepthLayer]) -> list[Convolution]:
 class DepthSpec:
     """Base class of architectures with convolutions of a depth image."""
 
+    image_channels = 1
     image_height: int
     image_width: int
     convolutions: tuple[DepthLayer, ...]
 
     def image_size(self) -> tuple[int, int, int]:
         """Returns channels, height and width of the image."""
-        return 1, self.image_height, self.image_width
+        return self.image_channels, self.image_height, self.image_width
 
     def image_outputs(self) -> int:
         """Returns the number of outputs of the last convolution."""
-        return prod(output_size(self.image_size(), depth_layers(self.convolutions)))
+        return prod(output_size(self.image_size(), self.image_layers()))
+
+    def image_layers(self) -> list[Convolution]:
+        """Lists the convolutions, first to last."""
+        return depth_layers(self.convolutions, self.image_channels)
 
 
 class DepthEncoder:
     """The convolutions of a `DepthSpec` with their weights."""
 
     def __init__(self, spec: DepthSpec, weights: Mapping[str, np.ndarray]) -> None:
-        self._net = opencv_net(spec.image_size(), depth_layers(spec.convolutions), weights)
-        self._size = spec.image_size()[1:]
+        self._net = opencv_net(spec.image_size(), spec.image_layers(), weights)
+        channels, *size = self._size = spec.image_size()
+        self._shape = tuple(size) if channels == 1 else self._size
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
-        """Computes the features (F,) of an image (height, width)."""
-        require_shape("image", image, self._size)
-        self._net.setInput(np.asarray(image, np.float32)[None, None])
+        """Computes the features (F,) of an image (height, width), or of several channels."""
+        require_shape("image", image, self._shape)
+        self._net.setInput(np.asarray(image, np.float32).reshape(1, *self._size))
         return self._net.forward().ravel()
 
 
@@ -90,7 +96,7 @@ class NetworkSpec(DepthSpec):
     def weight_shapes(self) -> dict[str, tuple[int, ...]]:
         """Returns the shapes of all arrays of weights by name."""
         H, inputs = self.hidden_size, self.image_outputs() + self.state_features
-        shapes = convolution_shapes(depth_layers(self.convolutions))
+        shapes = convolution_shapes(self.image_layers())
         shapes |= linear_shapes(("state_layer", self.state_size, self.state_features))
         shapes |= {"memory.weight_ih": (3 * H, inputs), "memory.weight_hh": (3 * H, H)}
         shapes |= {"memory.bias_ih": (3 * H,), "memory.bias_hh": (3 * H,)}
@@ -112,8 +118,8 @@ class RecurrentNetwork:
     def step(
         self, image: np.ndarray, state: np.ndarray, hidden: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Computes the output (O,) and the next hidden state (H,) from encoded depth (height,
-        width), a state (S,) and the hidden state (H,)."""
+        """Computes the output (O,) and the next hidden state (H,) from the image of the encoder, a
+        state (S,) and the hidden state (H,)."""
         spec, w, H = self.spec, self._weights, self.spec.hidden_size
         require_shape("state", state, (spec.state_size,))
         require_shape("hidden state", hidden, (H,))

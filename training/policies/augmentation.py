@@ -87,5 +87,8 @@ def change_appearance(color: Tensor, appearance: Appearance, generator: torch.Ge
     """Changes exposure and hue of colors (N, H, W, 3), 0 to 255."""
     draws = torch.rand(2, len(color), 1, 1, 1, generator=generator, device=color.device)
     exposure, hue = 2.0 * draws - 1.0
+    color = 2.0 ** (appearance.exposure * exposure) * color
+    if appearance.hue == 0.0:
+        return color
     angle = (appearance.hue * hue).deg2rad()
-    return rotate_hue(2.0 ** (appearance.exposure * exposure) * color, angle.cos(), angle.sin())
+    return rotate_hue(color, angle.cos(), angle.sin())

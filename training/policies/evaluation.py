@@ -152,7 +152,8 @@ def evaluate_agent(
         past = history.seen(noise, agent.rate, time[flying])
         depth = render_depth(past, worlds.geometry, agent.rays, flying)
         depth = noisy_depth(depth, noise, generator)
-        seen = Observation(depth, vehicle, p_WG[flying], speed[flying])
+        color = worlds.color(past, flying)
+        seen = Observation(depth, vehicle, p_WG[flying], speed[flying], color)
         a_cmd, heading, memory = agent.decide(seen, memory)
         before = vehicle.p
         vehicle = vehicle.step(a_cmd, dt, heading)

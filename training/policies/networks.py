@@ -12,7 +12,7 @@ from splatpilot.systems.policies.agile_autonomy import (
 from splatpilot.systems.policies.checkpoint import PolicyCheckpoint
 from splatpilot.systems.policies.convolutions import LEAK, Convolution
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS
-from splatpilot.systems.policies.recurrent_network import DepthSpec, NetworkSpec, depth_layers
+from splatpilot.systems.policies.recurrent_network import DepthSpec, NetworkSpec
 
 
 class TrainableNetwork(nn.Module):
@@ -30,9 +30,9 @@ class TrainableNetwork(nn.Module):
             self.head.bias.zero_()
 
     def forward(self, image: Tensor, state: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
-        """Computes outputs (N, O) and hidden states (N, H) from images (N, height, width), states
-        (N, S) and hidden states."""
-        x = image[:, None]
+        """Computes outputs (N, O) and hidden states (N, H) from images (N, height, width), or of
+        several channels, states (N, S) and hidden states."""
+        x = image if image.dim() == 4 else image[:, None]
         for layer in self.convolutions:
             x = _leaky(layer(x))
         features = _leaky(self.state_layer(state))
@@ -83,7 +83,7 @@ def _leaky(x: Tensor) -> Tensor:
 
 
 def _convolutions(spec: DepthSpec) -> nn.ModuleList:
-    return nn.ModuleList(map(make_convolution, depth_layers(spec.convolutions)))
+    return nn.ModuleList(map(make_convolution, spec.image_layers()))
 
 
 def make_convolution(layer: Convolution) -> nn.Conv2d:

@@ -17,7 +17,6 @@ from splatpilot.training.policies.evaluation import (
     FlightTraining,
     render_depth,
 )
-from splatpilot.training.policies.networks import TrainableNetwork
 from splatpilot.training.policies.training_worlds import STARTS, WorldBatch
 from splatpilot.training.policies.vehicles import (
     History,
@@ -46,10 +45,11 @@ class Transitions(NamedTuple):
 class Learner(Agent, Protocol):
     """An agent with a network and a loss."""
 
-    network: TrainableNetwork
+    network: Any  # torch.nn.Module with the `spec` of its architecture
 
     def losses(self, transitions: Transitions) -> dict[str, Tensor]:
-        """Computes the weighted terms of the loss, each a mean over the transitions."""
+        """Computes the weighted terms of the loss, each a mean over the transitions since the last
+        call."""
         ...
 
 
@@ -175,7 +175,7 @@ class DifferentiableRollout:
             past = history.seen(config.noise, learner.rate, age + step * dt)
             depth = render_depth(past, worlds.geometry, learner.rays, world)
             depth = noisy_depth(depth, config.noise, self.generator)
-            seen = Observation(depth, vehicle, p_WG, speed)
+            seen = Observation(depth, vehicle, p_WG, speed, worlds.color(past, world))
             a_cmd, heading, memory = learner.decide(seen, memory)
             vehicle = vehicle.decay_gradient(keep).step(a_cmd, dt, heading)
             v_mean = torch.lerp(v_mean, vehicle.v, forget)

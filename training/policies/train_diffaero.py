@@ -80,11 +80,8 @@ class DiffAeroLearner:
 
     def encode(self, depth: Tensor) -> Tensor:
         """Encodes depth (N, R) [m] as images (N, 9, 16)."""
-        spec, image = (
-            self.network.spec,
-            inverse_depth(depth, diffaero.MIN_DEPTH, diffaero.MAX_DEPTH),
-        )
-        return image.reshape(-1, spec.image_height, spec.image_width)
+        image = inverse_depth(depth, diffaero.MIN_DEPTH, diffaero.MAX_DEPTH)
+        return image.reshape(-1, *diffaero.IMAGE_SIZE)
 
     def decide(self, seen: Observation, memory: Tensor) -> tuple[Tensor, None, Tensor]:
         vehicle, R_WH = seen.vehicle, heading_frame(seen.vehicle.yaw)

@@ -21,6 +21,7 @@ from splatpilot.systems.policies.diffaero_rgb import (
     DIFFAERO_RGB_NETWORK,
     HEIGHT,
     WIDTH,
+    DiffAeroRgbSpec,
     MonocularSpec,
     rays_B,
     require_view,
@@ -79,11 +80,11 @@ class _Block(nn.Sequential):
 class DiffAeroRgbModule(nn.Module):
     """The monocular network, which learns, and DiffAero's, which is fixed."""
 
-    def __init__(self) -> None:
+    def __init__(self, spec: DiffAeroRgbSpec = DIFFAERO_RGB_NETWORK) -> None:
         super().__init__()
-        self.monocular = MonocularModule(DIFFAERO_RGB_NETWORK.monocular)
+        self.monocular = MonocularModule(spec.monocular)
         self.monocular = self.monocular.to(memory_format=torch.channels_last)
-        self.policy = TrainableNetwork(DIFFAERO_RGB_NETWORK.policy).requires_grad_(False)
+        self.policy = TrainableNetwork(spec.policy).requires_grad_(False)
 
 
 _NEAR = 6.0  # [m] maximum depth of cells that are evaluated

@@ -18,6 +18,10 @@ from splatpilot.training.policies.train_diffaero import (
     DiffAeroTraining,
 )
 from splatpilot.training.policies.train_diffaero_rgb import DiffAeroRgbTrainer, DiffAeroRgbTraining
+from splatpilot.training.policies.train_distilled_rgb import (
+    DistilledRgbTrainer,
+    DistilledRgbTraining,
+)
 from splatpilot.training.policies.train_student import (
     StudentDepthTraining,
     StudentRgbTraining,
@@ -54,5 +58,6 @@ for _name, _config, _learner in (
     register_trainer(_name, _config, partial(_rollout_trainer, _name, _learner))
 register_trainer("agile_autonomy", AgileAutonomyTraining, AgileAutonomyTrainer)
 register_trainer("diffaero_rgb", DiffAeroRgbTraining, DiffAeroRgbTrainer)
+register_trainer("distilled_rgb", DistilledRgbTraining, DistilledRgbTrainer)
 register_trainer("student_rgb", StudentRgbTraining, StudentTrainer)
 register_trainer("student_depth", StudentDepthTraining, StudentTrainer)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, fields
 from hashlib import blake2b
 from itertools import cycle
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -50,6 +50,7 @@ from splatpilot.systems.policies.time_of_arrival import TimeOfArrival, time_of_a
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 from splatpilot.training.corpus import library
 from splatpilot.training.policies.ray_casting import Geometry, Grids, MixedGeometry, ShapeGeometry
+from splatpilot.training.policies.vehicles import Vehicle
 
 _LIMIT = 1 << 30  # [bytes] of the cache; the files that were used last stay.
 
@@ -162,6 +163,12 @@ class TrainingWorld:
     p_WG: np.ndarray  # (3,) [m] goal
 
 
+class Views(Protocol):
+    """Color images of worlds, see `splatpilot.training.policies.world_views`."""
+
+    def render(self, vehicle: Vehicle, world: Tensor) -> Tensor: ...
+
+
 class WorldBatch:
     """W worlds as tensors: surfaces, volumes, starts, goals, and the path to each goal by grids of
     the time of arrival with `voxel_size` [m]; None for evaluation, without grids."""
@@ -180,6 +187,7 @@ class WorldBatch:
         self.p_WS, self.p_WG = (
             tensor([getattr(world, name) for world in worlds]) for name in ("p_WS", "p_WG")
         )
+        self.views: Views | None = None  # of colors
         self._surfaces = [world.surfaces for world in worlds]
         self.geometry: Geometry = MixedGeometry(self._surfaces)
         self._times = None
@@ -231,6 +239,10 @@ class WorldBatch:
         distances, _ = self.geometry.nearest(p_WQ, world, 1)
         inside = (p_WQ > self.lower_W[world]) & (p_WQ < self.upper_W[world])
         return distances[:, 0] - VEHICLE_RADIUS, inside.all(1)
+
+    def color(self, vehicle: Vehicle, world: Tensor) -> Tensor | None:
+        """Renders colors (N, H, W, 3) by the `views`, if there are any."""
+        return None if self.views is None else self.views.render(vehicle, world)
 
     def distance(self, p_WQ: Tensor, world: Tensor) -> Tensor:
         """Interpolates signed distances (N,) [m] at p_WQ (N, 3) [m] in `world` (N,); the bounds of

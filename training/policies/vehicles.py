@@ -133,6 +133,7 @@ class Observation(NamedTuple):
     vehicle: Vehicle
     p_WG: Tensor  # (N, 3) [m]
     speed: Tensor  # (N,) [m/s], nominal
+    color: Tensor | None = None  # (N, H, W, 3), uint8, if the worlds have `views`
 
 
 def map_tensors(function: Callable[..., Tensor], first: Any, *others: Any) -> Any:
