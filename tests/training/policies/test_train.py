@@ -47,6 +47,7 @@ TINY = [*SMALL, "rollout.environments=4", "rollout.steps=4"]
 OF_POLICY = {
     "diffaero": TINY[-2:],
     "depthnav": [*TINY[-2:], "empty=0.5", "rollout.noise.latency=0.1"],
+    "distilled_rgb": TINY[-2:],
     "agile_autonomy": ["rounds=2", "round_updates=3", "environments=4", "steps=16", "batch=8"],
 }
 
@@ -110,7 +111,7 @@ def test_a_command_trains_seeds_one_after_the_other(finished, tmp_path):
     assert json.loads((tmp_path / "seed_1" / "summary.json").read_text())["seed"] == 1
 
 
-@pytest.mark.parametrize("policy", ["diffaero", "depthnav", "agile_autonomy"])
+@pytest.mark.parametrize("policy", OF_POLICY)
 def test_interrupted_training_ends_in_the_same_weights(policy, tmp_path):
     trainer_kind = TRAINERS.find(policy)
     config = load_config(trainer_kind.config(), overrides=[*SMALL, *OF_POLICY[policy]])

@@ -1,0 +1,193 @@
+import numpy as np
+import torch
+
+from splatpilot.diagrams.worlds.appearance import randomize_appearance
+from splatpilot.diagrams.worlds.world_registry import make_world
+from splatpilot.systems.common.config import load_config
+from splatpilot.systems.policies.base import observation
+from splatpilot.systems.policies.checkpoint import PolicyCheckpoint
+from splatpilot.systems.policies.diffaero_rgb import (
+    DISTILLED_RGB_NETWORK,
+    DistilledRgb,
+    DistilledRgbConfig,
+    load_network,
+)
+from splatpilot.systems.vehicle.state import pose_from_state
+from splatpilot.training.corpus.library import scenario_world
+from splatpilot.training.policies.train_distilled_rgb import (
+    DistilledRgbLearner,
+    DistilledRgbModule,
+    DistilledRgbTrainer,
+    DistilledRgbTraining,
+)
+from splatpilot.training.policies.training_worlds import WorldSelection
+from splatpilot.training.policies.vehicles import BodyRate, Observation, PointMass
+from splatpilot.training.policies.world_views import WorldViews
+
+TINY = [
+    "worlds.kinds=[P10]",
+    "worlds.count=1",
+    "worlds.held_out=1",
+    "worlds.voxel_size=0.5",
+    "rollout.environments=4",
+    "rollout.steps=3",
+    "appearance.exposure=0",
+    "noise.color_noise=0",
+    "noise.brightness_jitter=0",
+]
+
+
+def training(*more: str) -> DistilledRgbTraining:
+    return load_config(DistilledRgbTraining(), overrides=[*TINY, *more])
+
+
+def random_module() -> DistilledRgbModule:
+    """A module in which features matter."""
+    torch.manual_seed(0)
+    module = DistilledRgbModule()
+    with torch.no_grad():
+        module.policy.convolutions[0].weight[:, 1:].normal_(std=0.3)
+        module.monocular.head.weight.normal_(std=0.1)
+    return module
+
+
+def saved(module: DistilledRgbModule, path) -> str:
+    weights = {name: w.numpy() for name, w in module.state_dict().items()}
+    PolicyCheckpoint("distilled_rgb", DISTILLED_RGB_NETWORK, weights, {}).save(path)
+    return str(path)
+
+
+def seen_by(count: int = 2, *, seed: int = 0) -> Observation:
+    """Vehicles in different states with different images."""
+    rng = np.random.default_rng(seed)
+
+    def normal(*size: int) -> torch.Tensor:
+        return torch.from_numpy(rng.normal(size=size)).float()
+
+    vehicle = PointMass(
+        normal(count, 3), normal(count, 3), normal(count, 3), normal(count), torch.ones(count, 1)
+    )
+    color = torch.from_numpy(rng.integers(0, 256, (count, 90, 160, 3)).astype(np.uint8))
+    depth = 5.0 + normal(count, 144).abs()
+    return Observation(depth, vehicle, 5.0 * normal(count, 3), torch.full((count,), 2.0), color)
+
+
+def mirrored(seen: Observation) -> Observation:
+    """The mirror image about the plane y = 0."""
+    m, vehicle = torch.tensor([1.0, -1.0, 1.0]), seen.vehicle
+    flipped = vehicle._replace(p=m * vehicle.p, v=m * vehicle.v, a=m * vehicle.a, yaw=-vehicle.yaw)
+    depth = seen.depth.reshape(-1, 9, 16).flip(2).flatten(1)
+    return Observation(depth, flipped, m * seen.p_WG, seen.speed, seen.color.flip(2))
+
+
+def test_it_begins_as_the_shipped_policy():
+    torch.manual_seed(3)
+    module, network = DistilledRgbModule(), load_network(None)
+    rng = np.random.default_rng(0)
+    view = rng.uniform(-1, 1, (6, 90, 160)).astype(np.float32)
+    state, hidden = rng.normal(size=(1, 9)), rng.normal(size=(1, 128))
+    with torch.no_grad():
+        image, _ = module.see(torch.from_numpy(view)[None], bfloat16=False)
+        inputs = (torch.from_numpy(x).float() for x in (state, hidden))
+        found, memory = module.policy(image, *inputs)
+    expected, expected_memory = network.policy.step(network.monocular(view)[0], *state, *hidden)
+    np.testing.assert_allclose(found[0], expected, atol=1e-4)
+    np.testing.assert_allclose(memory[0], expected_memory, atol=1e-5)
+
+
+def test_flight_decides_as_training_does(tmp_path):
+    learner = DistilledRgbLearner(training())
+    learner.network = module = random_module()
+    file = saved(module, tmp_path / "distilled_rgb.npz")
+    policy = DistilledRgb(DistilledRgbConfig(weights=file))
+    seen, states = seen_by(), np.random.default_rng(1).normal(size=(2, 13))
+    states[:, 6:10] /= np.linalg.norm(states[:, 6:10], axis=1, keepdims=True)
+    vehicle = BodyRate(torch.from_numpy(states).float(), torch.zeros(2, 3))
+    memory, flown = learner.initial_memory(2), [np.zeros(128, np.float32)] * 2
+    for _ in range(3):
+        with torch.no_grad():
+            a_cmd, _, memory = learner.decide(seen._replace(vehicle=vehicle), memory)
+        for n in range(2):
+            p_WG, image = seen.p_WG[n].numpy(), seen.color[n].numpy()
+            observed = observation(0.0, states[n], p_WG, image)
+            decided, flown[n] = policy.decide(observed, np.zeros(3), flown[n])
+            np.testing.assert_allclose(a_cmd[n], decided, atol=1e-3)
+
+
+def test_every_second_vehicle_learns_in_the_mirror_image():
+    learner = DistilledRgbLearner(training())
+    learner.network = random_module()
+    seen = seen_by(1)
+    both = [seen, mirrored(seen)]
+    joined = Observation(
+        *(torch.cat(part) for part in zip(*(o[:1] for o in both), strict=True)),
+        PointMass(*(torch.cat(part) for part in zip(*(o.vehicle for o in both), strict=True))),
+        *(torch.cat(part) for part in zip(*(o[2:] for o in both), strict=True)),
+    )
+    memory = learner.initial_memory(2)
+    for _ in range(2):
+        a_cmd, _, memory = learner.decide(joined, memory)
+    mirror = torch.tensor([1.0, -1.0, 1.0])
+    torch.testing.assert_close(a_cmd[0], mirror * a_cmd[1], atol=1e-3, rtol=0)
+    assert memory[:, -1].tolist() == [1.0, -1.0]
+    torch.testing.assert_close(memory[0, :128], memory[1, :128], atol=1e-4, rtol=0)
+
+
+def test_imitation_has_no_gradient_through_the_flight():
+    learner = DistilledRgbLearner(training())
+    seen = seen_by(2)
+    v = seen.vehicle.v.requires_grad_()
+    a_cmd, _, _ = learner.decide(seen, learner.initial_memory(2))
+    ((imitation, likelihood),) = learner._terms
+    (through_flight,) = torch.autograd.grad(a_cmd.sum(), v, retain_graph=True)
+    assert through_flight.abs().max() > 0.1
+    assert torch.autograd.grad(imitation + likelihood, v, allow_unused=True) == (None,)
+
+
+def test_views_are_those_of_the_camera_in_flight():
+    selection, camera = WorldSelection(kinds=["P10", "P01"]), DistilledRgbConfig().camera
+    views = WorldViews(selection, 2, 2_000_000, camera)
+    views.looks[1] = torch.tensor([5.0, 0.7])
+    views.restore(views.looks)
+    p_WB, yaw = torch.tensor([[2.0, 0.3, 1.5], [3.0, -0.5, 1.2]]), torch.tensor([0.3, -0.4])
+    vehicle = BodyRate.hovering(p_WB, yaw)
+    found = views.render(vehicle, torch.tensor([0, 1]))
+    info = camera.camera_info()
+    for n, kind in enumerate(selection.kinds):
+        world = make_world(scenario_world(kind), 2_000_000 + n)
+        world = randomize_appearance(world, *((0.7, 5) if n else (0.0, 0)))
+        X_WC = pose_from_state(vehicle.state[n].double().numpy()) @ camera.mount()
+        color = world.baked.render_color(
+            info.intrinsic_matrix(), info.width(), info.height(), X_WC, background=world.background
+        )
+        error = np.abs(found[n].numpy().astype(float) - 255.0 * np.clip(color, 0.0, 1.0))
+        assert error.mean() < 0.6 and np.quantile(error, 0.999) < 3.0
+
+
+def test_learning_reduces_the_difference_to_the_teacher():
+    config = training("repaint=0", "loss.dynamics=0", "rollout.environments=8", "rollout.steps=8")
+    torch.manual_seed(0)
+    trainer = DistilledRgbTrainer(config)
+    optimizer = torch.optim.Adam(trainer.network.parameters(), lr=3e-4)
+    curve = []
+    for update in range(24):
+        trainer.begin_update(update)
+        terms = trainer.losses()
+        optimizer.zero_grad()
+        (terms["imitation"] + terms["likelihood"]).backward()
+        optimizer.step()
+        curve.append(float(terms["imitation"]))
+    assert np.mean(curve[-6:]) < 0.8 * np.mean(curve[:6])
+
+
+def test_worlds_change_their_appearance():
+    trainer = DistilledRgbTrainer(training("repaint=0.8"))
+    before = trainer._views.render(trainer._current.episodes.vehicle, torch.zeros(4, dtype=int))
+    trainer.begin_update(0)
+    after = trainer._views.render(trainer._current.episodes.vehicle, torch.zeros(4, dtype=int))
+    assert (before.float() - after.float()).abs().mean() > 2.0
+    state = trainer.state_dict()
+    again = DistilledRgbTrainer(training("repaint=0.8"))
+    again.load_state_dict(state)
+    shown = again._views.render(trainer._current.episodes.vehicle, torch.zeros(4, dtype=int))
+    assert torch.equal(shown, after)
