@@ -38,6 +38,7 @@ COMMANDS = {
         "scene",
         "measure how well flights in scenes predict flights in the meshes that they show",
     ),
+    "gap": ("scene", "compare what policies decide by photographs and by renderings"),
     "library": ("", "make and list the environments of a folder of data"),
     "library make": ("library", "reconstruct, measure and record environments"),
     "library show": ("library", "print the recorded environments, and draw each"),

@@ -2,6 +2,7 @@
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 from splatpilot.analysis.commands import options as cli
 from splatpilot.analysis.commands.checks import check_kind
@@ -194,3 +195,26 @@ def twin(options: argparse.Namespace) -> None:
     from splatpilot.analysis import twin as twins
 
     cli.call(twins.run, options, config=cli.read_config(options))
+
+
+@cli.command(
+    "gap",
+    cli.path_option("scenes", "a scene folder with its capture", nargs="+", metavar="SCENE"),
+    cli.out_option("output folder", "out/gap"),
+    cli.OVERWRITE,
+    cli.set_option(
+        *("policies=[distilled_rgb, mine.npz]", "viewpoints=60"),
+        configuration="splatpilot.analysis.gap:GapConfig",
+    ),
+    cli.json_option("the table"),
+    examples=("gap scenes/redkitchen scenes/hospital",),
+)
+def gap(options: argparse.Namespace) -> Any:
+    """Asks policies for plans by the real images of captures and by renderings from the same poses,
+    and in generated worlds, and compares how many plans are clear of obstacles."""
+    cli.announce(f"comparing plans in {len(options.scenes)} scenes in {options.out}")
+    for scene in options.scenes:
+        check_kind(scene, "scene")
+    from splatpilot.analysis import gap as gaps
+
+    return cli.call(gaps.run, options, config=cli.read_config(options))

@@ -172,10 +172,10 @@ class AgileAutonomy(Policy):
 
     def __init__(self, config: AgileAutonomyConfig | None = None) -> None:
         super().__init__(config or AgileAutonomyConfig(), "depth_image_32f")
-        checkpoint = PolicyCheckpoint.load(self._config.weights, "agile_autonomy", AGILE_NETWORK)
+        checkpoint = PolicyCheckpoint.load(self.config.weights, "agile_autonomy", AGILE_NETWORK)
         self._network = checkpoint.build(TrajectoryNetwork)
         self.declare_state(no_plan(MODES), "hypotheses")
 
     def decide(self, observed: Observation, *state: np.ndarray) -> list[np.ndarray]:
         last = Hypotheses.from_vector(state[0], MODES)
-        return [plan(self._network, observed, self._config.speed, last).to_vector()]
+        return [plan(self._network, observed, self.config.speed, last).to_vector()]

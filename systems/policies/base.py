@@ -97,7 +97,7 @@ class Policy(LeafSystem):
     def __init__(self, config: Any, image: str = "") -> None:
         super().__init__(converter=_PolicyByValues.converter())
         config.validate()
-        self._config, self._image = config, image
+        self.config, self.image = config, image
         self.state_outputs: dict[str, DiscreteStateIndex] = {}
         self._state_port = self.DeclareVectorInputPort("state", 13)
         self._goal_port = self.DeclareVectorInputPort("goal", 3)
@@ -131,11 +131,11 @@ class Policy(LeafSystem):
             discrete_state.set_value(i, value)
 
     def _read_image(self, context: Context) -> np.ndarray:
-        if not self._image:
+        if not self.image:
             return np.empty(0)
         image = self._image_port.Eval(context)
-        if self._image in _CHANNELS:
-            return np.asarray(cast(Any, image).data)[..., _CHANNELS[self._image][1]]
+        if self.image in _CHANNELS:
+            return np.asarray(cast(Any, image).data)[..., _CHANNELS[self.image][1]]
         return np.reshape(cast(Any, image), GRID_SHAPE)
 
 

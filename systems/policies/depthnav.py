@@ -99,7 +99,7 @@ class DepthNav(Policy):
 
     def __init__(self, config: DepthNavConfig | None = None) -> None:
         super().__init__(config or DepthNavConfig(), "depth_image_32f")
-        self._network = load_network(self._config.weights, "depthnav", DEPTHNAV_NETWORK)
+        self._network = load_network(self.config.weights, "depthnav", DEPTHNAV_NETWORK)
         self.declare_state(np.zeros(3), "acceleration")
         self.declare_state([np.nan], "heading")
         self.declare_state(self._network.initial_hidden())
@@ -109,7 +109,7 @@ class DepthNav(Policy):
         memory, start_yaw = state[2:]
         if np.isnan(start_yaw[0]):
             start_yaw = np.array([float(observed.state.heading)])
-        speed = self._config.speed
+        speed = self.config.speed
         a_WB, heading, memory = compute_command(
             self._network, observed, speed, float(start_yaw[0]), memory
         )

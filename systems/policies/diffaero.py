@@ -108,13 +108,13 @@ class DiffAero(Policy):
 
     def __init__(self, config: DiffAeroConfig | None = None) -> None:
         super().__init__(config or DiffAeroConfig(), "depth_image_32f")
-        self._network = load_network(self._config.weights, "diffaero", DIFFAERO_NETWORK)
+        self._network = load_network(self.config.weights, "diffaero", DIFFAERO_NETWORK)
         self.declare_state(np.zeros(3), "acceleration")
         self.declare_state(self._network.initial_hidden())
 
     def decide(self, observed: Observation, *state: np.ndarray) -> tuple[np.ndarray, ...]:
         grid = encode_depth(observed.image)
-        return compute_command(self._network, grid, observed, self._config.speed, state[1])
+        return compute_command(self._network, grid, observed, self.config.speed, state[1])
 
 
 class DiffAeroTof(Policy):
@@ -135,12 +135,12 @@ class DiffAeroTof(Policy):
 
     def __init__(self, config: DiffAeroTofConfig | None = None) -> None:
         super().__init__(config or DiffAeroTofConfig(), "depth_grid")
-        self._network = load_network(self._config.weights, "diffaero_tof", DIFFAERO_NETWORK)
+        self._network = load_network(self.config.weights, "diffaero_tof", DIFFAERO_NETWORK)
         self.declare_state(np.zeros(3), "velocity")
         self.declare_state(self._network.initial_hidden())
 
     def decide(self, observed: Observation, *state: np.ndarray) -> tuple[np.ndarray, ...]:
-        speed = self._config.speed
+        speed = self.config.speed
         return compute_command(
             self._network, observed.image, observed, speed, state[1], VELOCITY_LIMITS
         )

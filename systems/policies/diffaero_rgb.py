@@ -220,13 +220,13 @@ class DiffAeroRgb(Policy):
 
     def __init__(self, config: DiffAeroRgbConfig | None = None) -> None:
         super().__init__(config or self._default(), "color_image")
-        self._network = load_network(self._config.weights, *self._network_kind)
+        self._network = load_network(self.config.weights, *self._network_kind)
         self.declare_state(np.zeros(3), "acceleration")
         self.declare_state(self._network.policy.initial_hidden())
 
     def decide(self, observed: Observation, *state: np.ndarray) -> tuple[np.ndarray, ...]:
         image = self._network.see(observed.image, observed.X_WB.rotation().matrix())
-        return compute_command(self._network.policy, image, observed, self._config.speed, state[1])
+        return compute_command(self._network.policy, image, observed, self.config.speed, state[1])
 
 
 class DistilledRgb(DiffAeroRgb):

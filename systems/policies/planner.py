@@ -101,7 +101,7 @@ class PrivilegedPlanner(Policy):
         require_type(esdf, Esdf, "esdf", "pass the `esdf` of a world")
         require_type(config, PrivilegedPlannerConfig, "config")
         super().__init__(config)
-        lattice = self._config.lattice
+        lattice = self.config.lattice
         self._params = params or QuadrotorParams()
         self._params.validate()
         self._field = esdf if esdf.occupied_outside else esdf.conservative()
@@ -121,7 +121,7 @@ class PrivilegedPlanner(Policy):
         last = value.get_value()
         # A goal port whose source is not constant reports a change at every step.
         if not isinstance(last, TimeOfArrival) or not np.array_equal(last.p_WG, p_WG):
-            value.set_value(time_of_arrival(self._field, p_WG, self._config.lattice.margin))
+            value.set_value(time_of_arrival(self._field, p_WG, self.config.lattice.margin))
 
     def _prepare(self, context: Context) -> None:
         self._time_of_arrival(context)

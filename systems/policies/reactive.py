@@ -217,5 +217,5 @@ class Reactive(Policy):
         self.declare_state(np.full(config.memory * config.rows * config.columns * 3, np.nan))
 
     def decide(self, observed: Observation, *state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        a_WB, points = compute_command(observed, state[1].reshape(-1, 3), self._config)
+        a_WB, points = compute_command(observed, state[1].reshape(-1, 3), self.config)
         return a_WB, points.ravel()

@@ -48,6 +48,6 @@ class Straight(Policy):
 
     def decide(self, observed: Observation, *state: np.ndarray) -> list[np.ndarray]:
         v_desired = target_velocity(
-            observed.state.p_WB, observed.p_WG, self._config.speed, SLOWING_TIME
+            observed.state.p_WB, observed.p_WG, self.config.speed, SLOWING_TIME
         )
         return [tracking_acceleration(observed.state.v_WB, v_desired)]

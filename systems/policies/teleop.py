@@ -58,8 +58,8 @@ class Teleop(Policy):
         self.declare_state(np.zeros(3), "velocity")
         self.declare_state([np.nan], "heading")
         self._meshcat: Meshcat | None = None
-        speed = self._config.speed
-        self._limits = np.array([speed, speed, speed, self._config.turn_rate])
+        speed = self.config.speed
+        self._limits = np.array([speed, speed, speed, self.config.turn_rate])
 
     def add_controls(self, meshcat: Meshcat) -> None:
         """Adds the sliders, and a button that sets them to zero."""
@@ -71,7 +71,7 @@ class Teleop(Policy):
     def decide(self, observed: Observation, *state: np.ndarray) -> list[np.ndarray]:
         forward, left, up, turn = self._read_controls()
         heading = state[1][0] if np.isfinite(state[1][0]) else observed.state.heading
-        heading += turn / self._config.rate
+        heading += turn / self.config.rate
         cos, sin = np.cos(heading), np.sin(heading)
         velocity = np.array([forward * cos - left * sin, forward * sin + left * cos, up])
         return [velocity, np.array([heading])]

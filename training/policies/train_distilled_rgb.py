@@ -148,7 +148,7 @@ class DistilledRgbLearner(DiffAeroLearner):
     """Flies by RGB, and collects the teacher's decisions while it learns.
 
     A row of the memory has the hidden state; the same with gradients of the images alone, not of
-    the flight; the teacher's; and -1 in a mirror image, else 1, or 0 before the first image.
+    the flight; the teacher's; and -1 if the world is flipped, else 1, or 0 before the first image.
     """
 
     def __init__(self, config: DistilledRgbTraining) -> None:

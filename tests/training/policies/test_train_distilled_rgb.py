@@ -76,6 +76,7 @@ def mirrored(seen: Observation) -> Observation:
     """The mirror image about the plane y = 0."""
     m, vehicle = torch.tensor([1.0, -1.0, 1.0]), seen.vehicle
     flipped = vehicle._replace(p=m * vehicle.p, v=m * vehicle.v, a=m * vehicle.a, yaw=-vehicle.yaw)
+    assert seen.color is not None
     depth = seen.depth.reshape(-1, 9, 16).flip(2).flatten(1)
     return Observation(depth, flipped, m * seen.p_WG, seen.speed, seen.color.flip(2))
 
@@ -125,8 +126,8 @@ def test_every_second_vehicle_learns_in_the_mirror_image():
         *(torch.cat(part) for part in zip(*(o[2:] for o in both), strict=True)),
     )
     memory = learner.initial_memory(2)
-    for _ in range(2):
-        a_cmd, _, memory = learner.decide(joined, memory)
+    _, _, memory = learner.decide(joined, memory)
+    a_cmd, _, memory = learner.decide(joined, memory)
     mirror = torch.tensor([1.0, -1.0, 1.0])
     torch.testing.assert_close(a_cmd[0], mirror * a_cmd[1], atol=1e-3, rtol=0)
     assert memory[:, -1].tolist() == [1.0, -1.0]
@@ -176,7 +177,7 @@ def test_learning_reduces_the_difference_to_the_teacher():
         optimizer.zero_grad()
         (terms["imitation"] + terms["likelihood"]).backward()
         optimizer.step()
-        curve.append(float(terms["imitation"]))
+        curve.append(terms["imitation"].item())
     assert np.mean(curve[-6:]) < 0.8 * np.mean(curve[:6])
 
 
