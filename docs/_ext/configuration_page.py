@@ -10,6 +10,7 @@ import yaml
 
 from splatpilot.analysis.faults import FaultsConfig
 from splatpilot.analysis.fidelity.fidelity import FidelityConfig
+from splatpilot.analysis.gap import GapConfig
 from splatpilot.analysis.reconstruction.run import RenderedSceneConfig
 from splatpilot.analysis.twin import TwinConfig
 from splatpilot.diagrams.flight.policies import POLICIES
@@ -68,8 +69,8 @@ GROUPS: list[tuple[str, str, list[type] | Registry]] = [
     (
         "Reconstruction",
         "For `splatpilot reconstruct` and `scene ablate`; for meshes and generated worlds in "
-        "`reconstruct` and `library make`; for `scene fidelity` and `scene twin`.",
-        [ReconstructConfig, RenderedSceneConfig, FidelityConfig, TwinConfig],
+        "`reconstruct` and `library make`; for `scene fidelity`, `scene twin` and `gap`.",
+        [ReconstructConfig, RenderedSceneConfig, FidelityConfig, TwinConfig, GapConfig],
     ),
     ("Training", "For `splatpilot train` and `recover`, by policy.", TRAINERS),
     ("Environments", "Arguments of `FlightEnv` and `VectorFlightEnv`.", [FlightEnvConfig]),

@@ -11,7 +11,7 @@ from splatpilot.diagrams.worlds.solids.solid import Solid
 from splatpilot.diagrams.worlds.solids.surfaces import FloorPlan
 from splatpilot.diagrams.worlds.solids.textures import BIRCH, OAK, PINE
 from splatpilot.systems.collision.shapes import Capsule, Sphere
-from splatpilot.systems.common.validation import bounded, require_field
+from splatpilot.systems.common.validation import bounded, require, require_field
 
 
 @dataclass
@@ -24,6 +24,8 @@ class TrunksConfig(building_blocks.VolumeConfig):
     width: float = bounded(16.0, "(0, inf) m")  # [m] along y, centered on 0
     # [m] Minimum distance of two trunks on the ground, axis to axis.
     spacing: float = bounded(3.0, "(0, inf) m")
+    # [1/m^2] Trunks per area, drawn among those that are `spacing` apart; 0 leaves all.
+    density: float = bounded(0.0, "[0, inf) 1/m^2")
     radius_min: float = bounded(0.25, "(0, inf) m")  # [m] thinnest trunk
     radius_max: float = bounded(0.45, "(0, inf) m")  # [m] thickest trunk
     lean_max: float = bounded(1.5, "[0, 10] deg")  # [deg] largest tilt of a trunk
@@ -146,6 +148,11 @@ def lay_out(
     plan = FloorPlan.of_size(config.length, config.width, config.height)
     lower, upper = plan.lower, plan.upper
     base = building_blocks.poisson_disk(lower[:2] - MARGIN, upper[:2] + MARGIN, config.spacing, rng)
+    if config.density > 0.0:
+        count = round(config.density * float(np.prod(upper[:2] - lower[:2] + 2.0 * MARGIN)))
+        condition = f"at most {len(base)} trunks at this spacing"
+        require(count <= len(base), "density", condition, count, "lower it, or the spacing")
+        base = base[np.sort(rng.permutation(len(base))[:count])]
     N = len(base)
     radius = rng.uniform(config.radius_min, config.radius_max, N)
     angle, slope = rng.uniform(0, 2 * np.pi, N), np.tan(np.deg2rad(config.lean_max))
