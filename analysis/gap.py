@@ -89,7 +89,7 @@ class GapConfig(Config):
     voxel_size: float = bounded(0.05, "[0.02, 0.5] m")
     """[m], of the distance field that is fused from depth."""
     seed: int = 0
-    """Of viewpoints, velocities and goals."""
+    """Draws viewpoints, velocities and goals."""
 
     def check(self) -> None:
         require_field(self, "policies", self.policies, "one policy or more")

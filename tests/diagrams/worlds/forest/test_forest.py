@@ -6,11 +6,14 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import pdist
 
+from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.scenarios import scenario_file
 from splatpilot.diagrams.worlds.building_blocks import CLEARING, INSET, PASSAGE
 from splatpilot.diagrams.worlds.forest.layout import ForestConfig, lay_out
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.collision.shapes import AnalyticDistanceField, Capsule, ShapeUnion, Sphere
+from splatpilot.systems.common.config import load_config
 from splatpilot.systems.splats.background import mean_color
 
 SMALL = ForestConfig(length=9.0, width=7.0, height=4.0, voxel_size=0.25)
@@ -146,9 +149,25 @@ def test_trees_left_out_of_the_field_are_never_the_nearest():
     np.testing.assert_array_equal(full.distance(p), field.distance(p))
 
 
+@pytest.mark.parametrize("area", [80, 50, 30, 25])
+def test_forests_have_a_tree_in_each_so_many_square_meters(area):
+    config = load_config(Scenario(), scenario_file(f"trees_{area}")).world
+    assert isinstance(config, ForestConfig)
+    counts, layouts = [], [_layout(config, seed) for seed in range(8)]
+    for layout, _, p_WS, p_WG in layouts:
+        base = layout.trees.base
+        inside = (base > layout.lower[:2]) & (base < layout.upper[:2])
+        counts.append(inside.all(1).sum() * area / (config.length * config.width))
+        assert pdist(base).min() >= config.spacing
+        assert p_WG[0] - p_WS[0] == 60.0
+    # Start and goal are cleared.
+    assert np.mean(counts) == pytest.approx(1.0, abs=0.08)
+
+
 @pytest.mark.parametrize(
     "values, message",
     [
+        ({"density": 0.2}, r"density must be at most \d+ trunks at this spacing, got \d+"),
         ({"voxel_size": 1e-4}, "a box of .* use larger voxels"),
         ({"width": 150.0, "length": 190.0}, r"length \* width must be at most 20000 m\^2"),
         ({"width": 2.0}, r"width must be at least 2.5.* got 2.0"),
