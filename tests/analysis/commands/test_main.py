@@ -186,7 +186,10 @@ def test_version(capsys):
     with pytest.raises(SystemExit) as ended:
         main(["--version"])
     assert ended.value.code == 0
-    assert capsys.readouterr().out == f"splatpilot {version('splatpilot')}\n"
+    expected = f"splatpilot {version('splatpilot')}\n"
+    assert capsys.readouterr().out == expected
+    module = [sys.executable, "-m", "splatpilot", "--version"]
+    assert subprocess.run(module, capture_output=True, text=True, check=True).stdout == expected
 
 
 SIGNALS = [(signal.SIGTERM, 143, "terminated"), (signal.SIGINT, 130, "interrupted")]
