@@ -21,6 +21,7 @@ _USES = {
     "cluster": "`splatpilot benchmark --cluster`",
     "exr": "depth of Record3D's exports",
     "gym": "reinforcement learning in Gymnasium",
+    "lerobot": "`splatpilot corpus export`",
     "mesh": "`splatpilot scene mesh`",
     "mocap": "OptiTrack in `splatpilot hardware px4`",
     "photos": "photographs without poses, and COLMAP models",

@@ -179,3 +179,22 @@ def inspect_corpus(options: argparse.Namespace) -> None:
     corpus.verify()
     draw_sheet(corpus, options.out, options.samples, options.seed)
     print(f"{corpus}; drew {options.out}")
+
+
+@cli.command(
+    "corpus export",
+    cli.path_option("corpus", "the folder of a corpus"),
+    cli.out_option("folder of the dataset", unused=True),
+    cli.OVERWRITE,
+    examples=(
+        "corpus export out/corpus --out out/lerobot",
+        "corpus export out/corpus --out out/lerobot --overwrite",
+    ),
+)
+def export_corpus(options: argparse.Namespace) -> None:
+    """Exports the expert's flights as a LeRobotDataset of version 3.0: parquet files, and videos of
+    color and depth."""
+    from splatpilot.training.corpus.corpus import Corpus
+    from splatpilot.training.corpus.lerobot import export
+
+    print(export(Corpus(options.corpus), options.out, replace=options.overwrite))

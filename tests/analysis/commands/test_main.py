@@ -80,6 +80,7 @@ RENDER = "got a mesh; render a capture of it with `splatpilot capture render roo
         ("hardware vehicle --out scene", "scene is there already"),
         ("hardware bridge --log fast.yaml", "fast.yaml is there already"),
         ("corpus inspect folder --out fast.yaml", "fast.yaml is there already"),
+        ("corpus export folder --out fast.yaml", "fast.yaml is there already"),
         ("scene mesh P02 --out a.stl", "a.stl: suffix must be .gltf or .obj, got .stl"),
         ("reconstruct nowhere --out a", "No such file or folder: nowhere"),
         ("reconstruct scene --out a", "got a scene folder; fly in it with `splatpilot fly --sce"),
