@@ -114,7 +114,7 @@ _PACES = 1.0, 0.5, 0.25
 """Fractions of the nominal speed, tried in turn until a trajectory beats waiting; only the quintics
 of slow lattices follow narrow bends."""
 
-_FIRST_COUNT = 64  # trajectories, of which the best are often among those that arrive first
+_FIRST_COUNT = 64  # Trajectories; the best are often among those that arrive first.
 _ROUNDING = 1e-6  # [s] bound on that of a cost
 
 

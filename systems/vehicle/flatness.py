@@ -191,9 +191,7 @@ def flatness_command(
     return stack([thrust, rate * n1, rate * n2, yaw])
 
 
-def native_control(
-    config: FlatnessControllerConfig, params: QuadrotorParams
-) -> dict[str, float]:
+def native_control(config: FlatnessControllerConfig, params: QuadrotorParams) -> dict[str, float]:
     """Returns the numbers of the controller among `_native.FLIGHT_PARAMETERS`, by name."""
     names = ("lookahead", "tilt_gain", "yaw_gain", "yaw_speed")
     return {name: getattr(config, name) for name in names} | {
