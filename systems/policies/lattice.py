@@ -81,9 +81,16 @@ def select_distinct(
     Greedy: repeatedly the cheapest of positions (N, S, 3) [m] whose mean distance from all chosen
     ones exceeds `separation` [m]; without one, the most distant.
     """
-    chosen = [int(np.argmin(costs))]
+    return _choose(positions, costs, count, separation)[0]
+
+
+def _choose(
+    positions: np.ndarray, costs: np.ndarray, count: int, separation: float
+) -> tuple[np.ndarray, bool]:
+    """Returns the indices of `select_distinct`, and if all are distinct."""
+    chosen, all_distinct = [int(np.argmin(costs))], len(costs) >= count
     apart = np.full(len(costs), np.inf)
-    while len(chosen) < count:
+    while len(chosen) < min(count, len(costs)):
         apart = np.minimum(apart, norms(positions - positions[chosen[-1]]).mean(axis=1))
         apart[chosen] = -1.0  # not again
         distinct = apart > separation
@@ -91,12 +98,14 @@ def select_distinct(
             chosen.append(int(np.argmin(np.where(distinct, costs, np.inf))))
         else:
             chosen.append(int(np.argmax(apart)))
-    return np.array(chosen)[np.argsort(costs[chosen], kind="stable")]
+            all_distinct = False
+    return np.array(chosen)[np.argsort(costs[chosen], kind="stable")], all_distinct
 
 
 def norms(vectors: np.ndarray) -> np.ndarray:
     """Returns the lengths (...,) of vectors (..., 3)."""
-    return np.sqrt(np.einsum("...i,...i->...", vectors, vectors))
+    x, y, z = np.moveaxis(vectors * vectors, -1, 0)  # faster than sums over three numbers each
+    return np.sqrt(x + y + z)
 
 
 MIN_SPEED_FRACTION = 0.25  # of the nominal speed, near the goal
@@ -104,6 +113,9 @@ MIN_SPEED_FRACTION = 0.25  # of the nominal speed, near the goal
 _PACES = 1.0, 0.5, 0.25
 """Fractions of the nominal speed, tried in turn until a trajectory beats waiting; only the quintics
 of slow lattices follow narrow bends."""
+
+_FIRST_COUNT = 64  # Trajectories; the best are often among those that arrive first.
+_ROUNDING = 1e-6  # [s] bound on that of a cost
 
 
 @dataclass
@@ -242,19 +254,37 @@ class TrajectoryLattice:
         While the cheapest leads no nearer to a goal out of reach, slower ones are tried, and taken
         if cheaper.
         """
-        config = self.config
         arrival = float(toa.value(p_WB))
         positions, costs = np.empty(0), np.array([np.inf])
         for pace in _PACES:
             trajectories = self.trajectories(p_WB, v_WB, a_WB, toa, pace)
-            found = self.costs(trajectories, p_WB, field, toa)
-            if found.min() < costs.min():
-                positions, costs = trajectories.positions, found
-            nearer = toa.value(positions[np.argmin(costs), -1]) < arrival
+            found = self._select(trajectories, p_WB, field, toa)
+            if found[1][0] < costs[0]:
+                positions, costs = found
+            nearer = toa.value(positions[0, -1]) < arrival
             if nearer or arrival < self._stopping_distance:
                 break
-        chosen = select_distinct(positions, costs, config.num_hypotheses, config.separation)
-        return positions[chosen], costs[chosen]
+        return positions, costs
+
+    def _select(
+        self, trajectories: Trajectories, p_WB: np.ndarray, field: Distances, toa: TimeOfArrival
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Returns positions (K, S, 3) [m] and costs (K,) of the K best distinct of trajectories."""
+        config = self.config
+        # No cost is below the time of arrival: in its order, most trajectories need no distances.
+        arrivals = toa.value(trajectories.positions[:, -1])
+        order = np.argsort(arrivals)
+        count = _FIRST_COUNT
+        while True:
+            some = np.sort(order[:count])
+            positions = trajectories.positions[some]
+            costs = self.costs(Trajectories(positions, trajectories.jerks[some]), p_WB, field, toa)
+            chosen, distinct = _choose(positions, costs, config.num_hypotheses, config.separation)
+            if len(some) == len(order) or (
+                distinct and costs[chosen[-1]] < arrivals[order[count]] - _ROUNDING
+            ):
+                return positions[chosen], costs[chosen]
+            count *= 4
 
 
 def final_velocities(config: LatticeConfig) -> np.ndarray:

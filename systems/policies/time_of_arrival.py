@@ -166,8 +166,12 @@ def time_of_arrival(
     times = np.where(sphere, to_goal, start) * goal_slowness
     times += np.where(sphere, 0.0, np.ma.getdata(marched))
     if not reachable.all():
-        gap, nearest = distance_transform_edt(~reachable, return_indices=True)  # type: ignore
-        times = times[tuple(nearest)] + gap * (field.voxel_size / CONTACT_SPEED)
+        nearest = distance_transform_edt(~reachable, return_distances=False, return_indices=True)
+        assert isinstance(nearest, np.ndarray)  # (3, nx, ny, nz) int32, for type checkers
+        cells = np.nonzero(~reachable)
+        nearest = nearest[:, *cells]
+        gap = np.sqrt(np.square(nearest - cells).sum(axis=0))
+        times[cells] = times[*nearest] + gap * (field.voxel_size / CONTACT_SPEED)
     times = times.astype(np.float32)
     times.flags.writeable = reachable.flags.writeable = p_WG.flags.writeable = False
     return TimeOfArrival(p_WG, times, reachable, field.lower_W, field.voxel_size)

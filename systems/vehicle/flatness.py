@@ -23,6 +23,7 @@ from pydrake.systems.framework import (
     LeafSystem_,  # pyright: ignore[reportAttributeAccessIssue]
 )
 
+from splatpilot import _native
 from splatpilot.systems.common.drake import (
     ConfigParameter,
     float_values,
@@ -190,6 +191,20 @@ def flatness_command(
     return stack([thrust, rate * n1, rate * n2, yaw])
 
 
+def native_control(config: FlatnessControllerConfig, params: QuadrotorParams) -> dict[str, float]:
+    """Returns the numbers of the controller among `_native.FLIGHT_PARAMETERS`, by name."""
+    names = ("lookahead", "tilt_gain", "yaw_gain", "yaw_speed")
+    return {name: getattr(config, name) for name in names} | {
+        "drag": params.drag,
+        "gravity": params.gravity,
+        "control_min": config.min_thrust,
+        "control_max": config.max_thrust,
+        "control_tilt": config.max_tilt_rate,
+        "control_yaw": config.max_yaw_rate,
+        "max_tilt_tangent": math.tan(config.max_tilt),
+    }
+
+
 def observe_disturbance(
     state: Any,
     observed: Any,
@@ -280,6 +295,8 @@ def FlatnessController_(T):
                 ConfigParameter(self, T, config, gains),
                 ConfigParameter(self, T, params, ["drag", "gravity"]),
             ]
+            numbers = native_control(config, params)
+            self._numbers = np.array([numbers.get(n, 0.0) for n in _native.FLIGHT_PARAMETERS])
             self.DeclareVectorInputPort("state", 13)
             self.DeclareVectorInputPort("waypoint", 3)
             self.DeclareVectorInputPort("acceleration", 3)
@@ -313,14 +330,25 @@ def FlatnessController_(T):
                     f"exactly one of 'waypoint' and 'acceleration' of '{self.get_name()}' must be "
                     f"connected, got {'both' if use_waypoint else 'neither'}"
                 )
+            heading = optional_input(self, "heading", context)
+            heading = None if heading is None else heading[0]
+            if (
+                T is float
+                and (heading is None or math.isnan(heading))
+                and config.disturbance_time == 0.0
+                and (config, params) == self._arguments
+            ):
+                kind = "waypoint" if use_waypoint else "acceleration"
+                target, command = self._eval_finite(kind, context), np.empty(4)
+                _native.flight_command(kind, state, target, self._numbers, command)
+                discrete_state.set_value(0, command)
+                return
             if use_waypoint:
                 p_WR = self._eval_finite("waypoint", context)
                 a_WB = reaching_acceleration(p_WR, p_WB, v_WB, config.lookahead)
                 motion_W = (p_WR - p_WB) / config.lookahead
             else:
                 a_WB, motion_W = self._eval_finite("acceleration", context), v_WB
-            heading = optional_input(self, "heading", context)
-            heading = None if heading is None else heading[0]
             if config.disturbance_time > 0.0:
                 old = context.get_discrete_state()
                 observed = observe_disturbance(state, old.value(1), old.value(0)[0], config, params)

@@ -27,6 +27,7 @@ from pydrake.systems.framework import (
     ValueProducer,
 )
 
+from splatpilot import _native
 from splatpilot.systems.common.drake import (
     ConfigParameter,
     float_values,
@@ -465,15 +466,22 @@ def QuadrotorPlant_(T):
             return super().get_output_port(port_index)
 
         def DoCalcTimeDerivatives(self, context, derivatives):
-            vector = derivatives.get_mutable_vector()
-            for i, rate in enumerate(self._rates(context)):
+            vector, rates = derivatives.get_mutable_vector(), self._rates(context)
+            if isinstance(rates, np.ndarray):
+                return vector.SetFromVector(rates)
+            for i, rate in enumerate(rates):
                 vector.SetAtIndex(i, rate)
 
         def _rates(self, context):
-            # Python floats, one by one: several times faster than arrays of numpy.
             vector = context.get_continuous_state_vector()
+            inputs, native = self.get_cache_entry(self._inputs_index).Eval(context)
+            if native:
+                rates = np.empty(13)
+                _native.quadrotor_derivatives(vector.CopyToVector(), *native, derivatives=rates)
+                if not math.isnan(rates[3]):  # as of a quaternion of zeros
+                    return rates
+            # Python floats, one by one: several times faster than arrays of numpy.
             state = [vector.GetAtIndex(i) for i in range(self._size)]
-            inputs = self.get_cache_entry(self._inputs_index).Eval(context)
             try:
                 return self._derivatives(state, *inputs)
             except ZeroDivisionError:
@@ -498,7 +506,10 @@ def QuadrotorPlant_(T):
             parameters = [getattr(params, name) for name in _IDEAL] if self._ideal else [params]
             if not self._ideal:
                 command = limit_command(command, params)
-            inputs.set_value((command, *parameters, wind, disturbance))
+            native = ()
+            if T is float and self._ideal and parameters[1] and wind is disturbance is None:
+                native = np.array(command), *parameters
+            inputs.set_value(((command, *parameters, wind, disturbance), native))
 
         def _read(self, index, context):
             vector = self.EvalVectorInput(context, index)
