@@ -242,14 +242,15 @@ def images(effort: Effort) -> Iterator[Headline]:
 
     camera = make_onboard_camera(OnboardCamera(readout=0.02), world)
     X_WB = _poses(scenario, world, 1)[0]
-    X_WB_start = X_WB @ RigidTransform(RollPitchYaw(0, 0, 0.02), [-0.04, 0, 0])
+    X_WB_start = X_WB @ RigidTransform(RollPitchYaw(0, 0, 0.02), np.array([-0.04, 0, 0]))
     rolling = milliseconds(partial(camera.render, X_WB, X_WB_start=X_WB_start), repeats)
     ratio = rolling / milliseconds(partial(camera.render, X_WB), repeats)
     yield Headline("rolling shutter at 1 rad/s and 2 m/s, over none", ratio, "x", max=1.6)
 
     from splatpilot.systems.splats import rasterize
 
-    tensors = _tensors(world, view, X_WCs[:1]) | {"render_mode": "RGB+MD"}
+    tensors: dict[str, Any] = _tensors(world, view, X_WCs[:1])
+    tensors["render_mode"] = "RGB+MD"
     ratio = milliseconds(partial(rasterize, **tensors), repeats) / milliseconds(
         partial(baked.render, *view, X_WCs[0]), repeats
     )
@@ -298,7 +299,7 @@ def flight(effort: Effort) -> Iterator[Headline]:
     policy = DiffAero(scenario.policy)
     context, camera = policy.CreateDefaultContext(), scenario.policy.camera
     image = ImageDepth32F(camera.width, camera.height)
-    image.mutable_data[:] = 5.0
+    np.asarray(image.mutable_data)[:] = 5.0
     inputs = {"state": sample_initial_state(scenario, world), "goal": world.p_WG}
     for name, value in (inputs | {"depth_image_32f": image}).items():
         policy.GetInputPort(name).FixValue(context, value)
@@ -371,7 +372,8 @@ def gpu_agreement(effort: Effort, device: str = "cuda") -> Iterator[Headline]:
     from splatpilot.systems.splats import rasterize
 
     scenario, world = _forest()
-    given = _tensors(world, *_views(scenario, world, 320, 240, 1)) | {"render_mode": "RGB+ED"}
+    given: dict[str, Any] = _tensors(world, *_views(scenario, world, 320, 240, 1))
+    given["render_mode"] = "RGB+ED"
     ours = rasterize(**given)[0]
     theirs = rasterize(**{k: _moved(v, device) for k, v in given.items()})[0]
     error = (ours - theirs.cpu()).abs()
