@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from harness import camera_tensors, header, load_scene, machine, row, scene_name, scene_tensors
+from harness import camera_tensors, header, load_scene, row, scene_name, scene_tensors
 from torch import Tensor
 
+from splatpilot.analysis.headlines import machine
 from splatpilot.systems.splats import rasterize, rasterize_surfels
 
 

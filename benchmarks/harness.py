@@ -1,8 +1,6 @@
 """Timing, tables and scenes that the benchmarks share."""
 
 import os
-import platform
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,34 +9,10 @@ import torch
 from pydrake.math import RigidTransform, RotationMatrix
 from torch import Tensor
 
-from splatpilot import _native
 from splatpilot.systems.common.files import DATA, data_folder
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.training.captures.capture import depth_points
 from splatpilot.training.captures.capture_registry import read_capture
-
-
-def milliseconds(call: Callable[[], object], repeats: int = 30) -> float:
-    """Returns the minimum CPU time of the process [ms] over `repeats` calls, after a first one. CPU
-    time does not count the waiting on a busy machine."""
-    durations = []
-    call()
-    for _ in range(repeats):
-        start = time.process_time()
-        call()
-        durations.append(1e3 * (time.process_time() - start))
-    return min(durations)
-
-
-def machine() -> str:
-    """Describes the machine and the software."""
-    lines = Path("/proc/cpuinfo").read_text().splitlines()
-    models = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
-    return (
-        f"{models[0] if models else platform.machine()}, {os.cpu_count()} cores, "
-        f"{platform.platform()}, SIMD levels {', '.join(_native.simd_levels())}, Python "
-        f"{platform.python_version()}, torch {torch.__version__}, load {os.getloadavg()[0]:.1f}"
-    )
 
 
 def peak_growth(call: Callable[[], object]) -> float:

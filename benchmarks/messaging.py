@@ -22,8 +22,9 @@ from pathlib import Path
 import lcm
 import numpy as np
 from drake import lcmt_image_array
-from harness import header, machine, row
+from harness import header, row
 
+from splatpilot.analysis.headlines import machine
 from splatpilot.systems.messaging import generated
 
 TYPES = {

@@ -18,8 +18,6 @@ from harness import (
     header,
     intrinsics,
     load_scene,
-    machine,
-    milliseconds,
     peak_growth,
     row,
     scene_name,
@@ -28,6 +26,7 @@ from harness import (
 from pydrake.math import RigidTransform
 
 from splatpilot import _native
+from splatpilot.analysis.headlines import machine, milliseconds
 from splatpilot.diagrams.flight.scenario import Scenario, sample_initial_state
 from splatpilot.diagrams.scenarios import scenario_file
 from splatpilot.diagrams.worlds.world_registry import make_world

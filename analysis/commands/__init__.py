@@ -63,6 +63,7 @@ COMMANDS = {
         "doctor",
         "list what works on this machine, and what to install or set for the rest",
     ),
+    "headlines": ("doctor", "measure the documented speeds on this machine"),
 }
 """Module and help of each command, in the order of the help; "" of those with subcommands."""
 

@@ -1,4 +1,4 @@
-"""`splatpilot doctor`: what works on this machine, and what to install or set for the rest."""
+"""`splatpilot doctor` and `headlines`: what works on this machine, what to install, and speeds."""
 
 import argparse
 import importlib.util
@@ -8,11 +8,18 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import Any
 
 from splatpilot.analysis.commands import options as cli
 from splatpilot.diagrams.scenarios import benchmark_scenarios
 from splatpilot.systems.common.extras import packages_of_extras
-from splatpilot.systems.common.files import DATA, SCENES, data_folder, scenes_folder
+from splatpilot.systems.common.files import (
+    DATA,
+    SCENES,
+    data_folder,
+    scenes_folder,
+    written_atomically,
+)
 from splatpilot.systems.common.processes import available_cores
 
 _DRIVER = Path("/proc/driver/nvidia")
@@ -54,6 +61,26 @@ def doctor(options: argparse.Namespace) -> list[Finding]:
     findings = [each for check in (*machine, _extras, _data, _scenes) for each in check()]
     print(format_findings(findings))
     return findings
+
+
+@cli.command(
+    "headlines",
+    cli.json_option("the measured values"),
+    cli.out_option("Markdown file to write", required=False, unused=True),
+    cli.OVERWRITE,
+    examples=("headlines", "headlines --out headlines.md", "headlines --json"),
+)
+def headlines(options: argparse.Namespace) -> dict[str, Any]:
+    """Measures the speeds that the documentation states on this machine, with pass marks, in two
+    minutes of an idle CPU. With a GPU, it also measures that for at most twelve minutes."""
+    cli.announce("measuring speeds for about two minutes; with a GPU, up to twelve more")
+    from splatpilot.analysis.headlines import run
+
+    result = run()
+    if options.out is not None:
+        with written_atomically(options.out) as partial:
+            partial.write_text(result["table"])
+    return {name: value for name, value in result.items() if name != "table"}
 
 
 def format_findings(findings: list[Finding]) -> str:
