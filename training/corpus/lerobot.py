@@ -129,7 +129,7 @@ class _Writer:
         if not runs:
             return
         chunk, file = divmod(self.files, _FILES_PER_CHUNK)
-        place = {"chunk_index": chunk, "file_index": file}
+        numbers = {"chunk_index": chunk, "file_index": file}
         rows = np.concatenate(runs)
         near, far = self._log_bounds
         depth = np.clip(
@@ -138,8 +138,8 @@ class _Writer:
         codes = np.rint(_MAX_CODE * (np.log(depth + _SHIFT) - near) / (far - near))
         images = {COLOR: shard.arrays["color"][rows], DEPTH: codes.astype(np.uint16)[..., None]}
         for key in images:
-            self._encode(self._path(_VIDEO, video_key=key, **place), images[key])
-        with pq.ParquetWriter(self._path(_DATA, **place), _schema()) as parquet:
+            self._encode(self._path(_VIDEO, video_key=key, **numbers), images[key])
+        with pq.ParquetWriter(self._path(_DATA, **numbers), _schema()) as parquet:
             first = 0
             for run in runs:
                 part = slice(first, first + len(run))
@@ -150,15 +150,15 @@ class _Writer:
                     "from": float(part.start / self.rate),
                     "to": float(part.stop / self.rate),
                 }
-                where = place | {f"{end}_timestamp": time for end, time in seconds.items()}
-                self.episodes[-1] |= {f"data/{name}": k for name, k in place.items()} | {
+                where = numbers | {f"{end}_timestamp": time for end, time in seconds.items()}
+                self.episodes[-1] |= {f"data/{name}": k for name, k in numbers.items()} | {
                     f"videos/{key}/{name}": value for key in images for name, value in where.items()
                 }
                 first = part.stop
         self.files += 1
 
-    def _path(self, pattern: str, **place: Any) -> Path:
-        path = self.folder / pattern.format(**place)
+    def _path(self, pattern: str, **numbers: Any) -> Path:
+        path = self.folder / pattern.format(**numbers)
         path.parent.mkdir(parents=True, exist_ok=True)
         return path
 
