@@ -203,7 +203,7 @@ def twin(options: argparse.Namespace) -> None:
     cli.out_option("output folder", "out/gap"),
     cli.OVERWRITE,
     cli.set_option(
-        *("policies=[distilled_rgb, mine.npz]", "viewpoints=60"),
+        *("'policies=[distilled_rgb, mine.npz]'", "viewpoints=60"),
         configuration="splatpilot.analysis.gap:GapConfig",
     ),
     cli.json_option("the table"),
