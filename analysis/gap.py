@@ -8,6 +8,7 @@ field is fused from the capture's depth; without depth it is the scene's.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import cycle, islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -198,8 +199,8 @@ def _fused(capture: Capture, voxel_size: float) -> DistanceField:
 def generated_viewpoints(config: GapConfig) -> Iterator[Viewpoint]:
     """Yields viewpoints in free space of generated worlds, with level cameras that move ahead."""
     step = 0.5 * config.speed / 15.0  # [m] between images
-    kinds = [config.generated[i % len(config.generated)] for i in range(config.viewpoints)]
-    for i, kind in enumerate(Progress(kinds if config.generated else [], "making worlds")):
+    kinds = list(islice(cycle(config.generated), config.viewpoints))
+    for i, kind in enumerate(Progress(kinds, "making worlds")):
         seed = MONTE_CARLO_SEEDS[config.seed] + i
         world, rng = make_world(scenario_world(kind), seed), np.random.default_rng([seed, 1])
         lower, upper = world.esdf.lower_W, world.esdf.upper_W

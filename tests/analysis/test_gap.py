@@ -114,6 +114,11 @@ def test_a_perfect_scene_has_no_gap_and_one_without_a_wall_has(room, capsys):
     assert "perfect" in capsys.readouterr().out
 
 
+def test_generated_worlds_can_be_left_out(room):
+    config = GapConfig(**{**SMALL, "generated": []})
+    assert set(run([room.scene("room")], room.folder / "out", config)) == {"room"}
+
+
 def test_the_interval_is_of_viewpoints():
     rows = [
         Row("s", "p", kind, f"frame {n}", 0, 1.0, clearance, 0.0, 0.0, 0.0, 0.0)
