@@ -16,7 +16,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw
-from pydrake.systems.sensors import CameraInfo
 
 from splatpilot.analysis.output import write_csv
 from splatpilot.analysis.reconstruction.figures import Panel, write_grid
@@ -42,6 +41,7 @@ from splatpilot.systems.policies.hypotheses import (
     num_hypotheses_in,
 )
 from splatpilot.systems.policies.velocity import RESPONSE_TIME, tracking_acceleration
+from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.splats.splat_camera import color_pixels, ranged_depth
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 from splatpilot.training.captures.capture import (
@@ -58,7 +58,8 @@ KINDS = "real", "rendered", "generated"
 """Kinds of images."""
 _TIMES = WAYPOINT_PERIOD * np.arange(1, NUM_WAYPOINTS + 1)[:, None]  # (10, 1) [s] of plans
 _MAX_STEP, _MAX_TURN = 0.5, np.deg2rad(30)  # between frames that follow each other
-_FREE = 0.5  # [m] minimum clearance of cameras in generated worlds
+_FREE, _TRIES = 0.5, 1000  # [m] minimum clearance of cameras in generated worlds; draws of each
+_IMAGE_RATE = 15.0  # [Hz] of cameras in generated worlds
 _FUSED = 150  # maximum number of depth images that are fused
 _RANGE = 8.0  # [m] of fused depth
 _RESAMPLES = 2000  # of the bootstrap
@@ -90,7 +91,7 @@ class GapConfig(Config):
     voxel_size: float = bounded(0.05, "[0.02, 0.5] m")
     """[m], of the distance field that is fused from depth."""
     seed: int = 0
-    """Draws viewpoints, velocities and goals."""
+    """Seed of viewpoints, velocities and goals."""
 
     def check(self) -> None:
         require_field(self, "policies", self.policies, "one policy or more")
@@ -198,18 +199,19 @@ def _fused(capture: Capture, voxel_size: float) -> DistanceField:
 
 def generated_viewpoints(config: GapConfig) -> Iterator[Viewpoint]:
     """Yields viewpoints in free space of generated worlds, with level cameras that move ahead."""
-    step = 0.5 * config.speed / 15.0  # [m] between images
+    step = 0.5 * config.speed / _IMAGE_RATE  # [m] between images
     kinds = list(islice(cycle(config.generated), config.viewpoints))
     for i, kind in enumerate(Progress(kinds, "making worlds")):
         seed = MONTE_CARLO_SEEDS[config.seed] + i
         world, rng = make_world(scenario_world(kind), seed), np.random.default_rng([seed, 1])
         lower, upper = world.esdf.lower_W, world.esdf.upper_W
         back = step * np.arange(config.frames - 1, -1, -1)[:, None]
-        while True:
-            p_WC, yaw = rng.uniform(lower, upper), rng.uniform(-np.pi, np.pi)
-            path = p_WC - back * [np.cos(yaw), np.sin(yaw), 0.0]
-            if world.distance_field.distance(path).min() > _FREE:
-                break
+        p_WC, yaws = rng.uniform(lower, upper, (_TRIES, 1, 3)), rng.uniform(-np.pi, np.pi, _TRIES)
+        ahead = np.stack([np.cos(yaws), np.sin(yaws), np.zeros(_TRIES)], axis=-1)
+        paths = p_WC - back * ahead[:, None]
+        free = world.distance_field.distance(paths).min(axis=1) > _FREE
+        require(free.any(), kind, f"a world with {_FREE:g} m of clearance", "none", "leave it out")
+        path, yaw = paths[free.argmax()], float(yaws[free.argmax()])
         R_WC = RollPitchYaw(-np.pi / 2, 0.0, yaw - np.pi / 2).ToRotationMatrix()
         X_WCs = [RigidTransform(R_WC, p) for p in path]
         yield Viewpoint(f"{kind} {seed}", X_WCs, [], world, world.distance_field)
@@ -231,10 +233,9 @@ def _plans(
         images: dict[tuple[Any, ...], dict[str, tuple[list[View], float]]] = {}
         for name, policy in policies.items():
             camera = policy.config.camera
-            info = camera.camera_info()
-            key = info.width(), info.height(), info.focal_x(), camera.max_depth
+            key = camera.width, camera.height, camera.focal_x, camera.max_depth
             if key not in images:
-                images[key] = _images(viewpoint, info, camera, capture)
+                images[key] = _images(viewpoint, camera, capture)
             X_CB = camera.mount().inverse()
             for kind, (views, seen) in images[key].items():
                 for draw, (v_WB, p_WG) in enumerate(draws):
@@ -260,11 +261,11 @@ def _draw(
 
 
 def _images(
-    viewpoint: Viewpoint, info: CameraInfo, camera: Any, capture: Capture | None
+    viewpoint: Viewpoint, camera: OnboardCamera, capture: Capture | None
 ) -> dict[str, tuple[list[View], float]]:
     """Returns the images at the poses of a viewpoint by their kind, and the fraction of the last
     one that is real; the rest of a real image is rendered."""
-    K, size = info.intrinsic_matrix(), (info.width(), info.height())
+    K, size = camera.camera_info().intrinsic_matrix(), (camera.width, camera.height)
     limits = camera.min_depth, camera.max_depth
     rendered, real, seen = [], [], 0.0
     for k, X_WC in enumerate(viewpoint.X_WCs):
@@ -396,11 +397,10 @@ def _shown(
     viewpoints: Sequence[Viewpoint], policy: Policy, capture: Capture
 ) -> list[list[Panel | None]]:
     """Returns rows of real and rendered images, as the policy sees them."""
-    camera = policy.config.camera
     rows: list[list[Panel | None]] = []
     for viewpoint in viewpoints[:: max(1, len(viewpoints) // _SHOWN)][:_SHOWN]:
         last = viewpoint._replace(X_WCs=viewpoint.X_WCs[-1:], frames=viewpoint.frames[-1:])
-        images = _images(last, camera.camera_info(), camera, capture)
+        images = _images(last, policy.config.camera, capture)
         rows.append(
             [Panel(images[kind][0][-1].color / 255.0, viewpoint.name) for kind in KINDS[:2]]
         )

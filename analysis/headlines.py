@@ -220,7 +220,6 @@ def _drake_env(scenario: Any, world: Any, camera: Any = None) -> Any:
 
 def images(effort: Effort) -> Iterator[Headline]:
     """Measures images of P02 on the CPU, on one thread unless in batches."""
-
     scenario, world = _forest()
     baked, near, repeats = world.baked, {"max_depth": MAX_DEPTH}, 6 * effort.rounds
     view, X_WCs = _views(scenario, world, 64, 36, effort.views)
@@ -269,7 +268,6 @@ def _views(
     scenario: Any, world: Any, width: int, height: int, count: int
 ) -> tuple[tuple[np.ndarray, int, int], list[Any]]:
     """Returns K, width and height of the onboard camera, and poses X_WC."""
-
     camera = OnboardCamera(width=width, height=height)
     X_WCs = [X_WB @ camera.mount() for X_WB in _poses(scenario, world, count)]
     return (camera.camera_info().intrinsic_matrix(), width, height), X_WCs
@@ -290,7 +288,6 @@ def _tensors(world: Any, view: tuple[np.ndarray, int, int], X_WCs: Sequence[Any]
 
 def flight(effort: Effort) -> Iterator[Headline]:
     """Measures a flight of P02 by DiffAero, and its decisions without rendering."""
-
     scenario, world = _forest()
     scenario = replace(scenario, policy=policy_named("diffaero"))
     flown = sp.fly(sp.BuildFlightDiagram(scenario, world)).summary()
@@ -395,7 +392,7 @@ def gpu_reconstruct(effort: Effort, device: str = "cuda") -> Iterator[Headline]:
         began = time.perf_counter()
         _, metrics = run(capture=capture, out=Path(folder) / "scene", config=config)
         yield Headline("GPU, hospital reconstructed", time.perf_counter() - began, "s")
-    yield Headline("GPU, PSNR of the hospital", metrics.mean("psnr") or np.nan, "dB")
+    yield Headline("GPU, PSNR of the hospital", metrics.mean("psnr_db") or np.nan, "dB")
 
 
 def gpu_student(effort: Effort, device: str = "cuda") -> Iterator[Headline]:

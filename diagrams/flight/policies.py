@@ -24,7 +24,6 @@ from splatpilot.systems.policies.diffaero import (
 from splatpilot.systems.policies.diffaero_rgb import (
     DiffAeroRgb,
     DiffAeroRgbConfig,
-    DistilledRgb,
     DistilledRgbConfig,
 )
 from splatpilot.systems.policies.planner import PrivilegedPlanner, PrivilegedPlannerConfig
@@ -114,7 +113,7 @@ for _name, _config, _system in (
     ("agile_autonomy", AgileAutonomyConfig, AgileAutonomy),
     ("diffaero_tof", DiffAeroTofConfig, DiffAeroTof),
     ("diffaero_rgb", DiffAeroRgbConfig, DiffAeroRgb),
-    ("distilled_rgb", DistilledRgbConfig, DistilledRgb),
+    ("distilled_rgb", DistilledRgbConfig, DiffAeroRgb),
     ("student_rgb", StudentRgbConfig, Student),
     ("student_depth", StudentDepthConfig, Student),
 ):

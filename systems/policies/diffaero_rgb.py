@@ -1,11 +1,13 @@
 """DiffAero that predicts its depth grid from a single RGB image.
 
-`DiffAeroRgb` joins a network for the grid and DiffAero's, trained apart. `DistilledRgb` is trained
-as a whole, in flight; features of the image reach its decisions beside the grid.
+A network predicts the grid, and DiffAero's network decides. By `DiffAeroRgbConfig` they are trained
+apart; by `DistilledRgbConfig` as a whole, in flight, and features of the image reach the decisions
+beside the grid.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 
@@ -36,6 +38,8 @@ class DiffAeroRgbConfig(LearnedPolicyConfig):
     """Weights, speed and a camera of 160 pixels and 90 degrees; its middle 90 rows are used."""
 
     rate = RATE
+    policy: ClassVar[str] = "diffaero_rgb"
+    """Name of the policy that the weights are of."""
 
     camera: OnboardCamera = field(
         default_factory=lambda: OnboardCamera(width=WIDTH, height=HEIGHT, fov_x=FOV_X)
@@ -49,6 +53,8 @@ class DiffAeroRgbConfig(LearnedPolicyConfig):
 @dataclass
 class DistilledRgbConfig(DiffAeroRgbConfig):
     """Weights, speed and a camera as of `DiffAeroRgbConfig`."""
+
+    policy = "distilled_rgb"
 
 
 @dataclass(frozen=True)
@@ -160,11 +166,12 @@ class DiffAeroRgbNetwork:
         return np.stack([inverse, *leaky_relu(np.array(features))]) if features else inverse
 
 
-def load_network(
-    path: str | None, policy: str = "diffaero_rgb", spec: DiffAeroRgbSpec = DIFFAERO_RGB_NETWORK
-) -> DiffAeroRgbNetwork:
-    """Loads the networks from a file of weights, see `PolicyCheckpoint.load`."""
-    return PolicyCheckpoint.load(path, policy, spec).build(DiffAeroRgbNetwork)
+_NETWORKS = {"diffaero_rgb": DIFFAERO_RGB_NETWORK, "distilled_rgb": DISTILLED_RGB_NETWORK}
+
+
+def load_network(path: str | None, policy: str = "diffaero_rgb") -> DiffAeroRgbNetwork:
+    """Loads the networks of a policy from a file of weights, see `PolicyCheckpoint.load`."""
+    return PolicyCheckpoint.load(path, policy, _NETWORKS[policy]).build(DiffAeroRgbNetwork)
 
 
 def encode_view(color: np.ndarray, R_WB: np.ndarray) -> np.ndarray:
@@ -215,35 +222,12 @@ class DiffAeroRgb(Policy):
     - ``acceleration`` (3): a_WB [m/s^2], W frame, gravity excluded.
     """
 
-    _network_kind = "diffaero_rgb", DIFFAERO_RGB_NETWORK
-    _default = DiffAeroRgbConfig
-
     def __init__(self, config: DiffAeroRgbConfig | None = None) -> None:
-        super().__init__(config or self._default(), "color_image")
-        self._network = load_network(self.config.weights, *self._network_kind)
+        super().__init__(config or DiffAeroRgbConfig(), "color_image")
+        self._network = load_network(self.config.weights, self.config.policy)
         self.declare_state(np.zeros(3), "acceleration")
         self.declare_state(self._network.policy.initial_hidden())
 
     def decide(self, observed: Observation, *state: np.ndarray) -> tuple[np.ndarray, ...]:
         image = self._network.see(observed.image, observed.X_WB.rotation().matrix())
         return compute_command(self._network.policy, image, observed, self.config.speed, state[1])
-
-
-class DistilledRgb(DiffAeroRgb):
-    """Flies to the goal by an RGB image and a hidden state, trained in flight.
-
-    .. pydrake_system::
-
-        name: DistilledRgb
-        input_ports:
-        - state
-        - goal
-        - color_image
-        output_ports:
-        - acceleration
-
-    - ``acceleration`` (3): a_WB [m/s^2], W frame, gravity excluded.
-    """
-
-    _network_kind = "distilled_rgb", DISTILLED_RGB_NETWORK
-    _default = DistilledRgbConfig

@@ -332,6 +332,7 @@ def FlatnessController_(T):
                 )
             heading = optional_input(self, "heading", context)
             heading = None if heading is None else heading[0]
+            # One native call, if it knows the case and the Context has the default parameters.
             if (
                 T is float
                 and (heading is None or math.isnan(heading))

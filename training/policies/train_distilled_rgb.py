@@ -18,7 +18,11 @@ from torch import Tensor, nn
 
 from splatpilot.systems.common.seeds import VALIDATION_SEEDS, first_training_seed
 from splatpilot.systems.common.validation import bounded
-from splatpilot.systems.policies.checkpoint import PolicyCheckpoint, checkpoint_policy
+from splatpilot.systems.policies.checkpoint import (
+    PolicyCheckpoint,
+    checkpoint_policy,
+    shipped_weights,
+)
 from splatpilot.systems.policies.convolutions import LEAK
 from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK
 from splatpilot.systems.policies.diffaero_rgb import (
@@ -36,6 +40,7 @@ from splatpilot.systems.policies.observations import (
 )
 from splatpilot.systems.policies.student import encode_color
 from splatpilot.systems.sensing.noise import ObservationNoise
+from splatpilot.training.corpus.library import training_scene
 from splatpilot.training.policies.augmentation import (
     Appearance,
     change_appearance,
@@ -237,8 +242,11 @@ class DistilledRgbTrainer(RolloutTrainer):
         learner = DistilledRgbLearner(config)
         super().__init__("distilled_rgb", learner, config)
         digest = blake2b(digest_size=16)
-        for file in filter(None, (config.begin, config.teacher)):
-            digest.update(Path(file).read_bytes())
+        for file, shipped in ((config.begin, "diffaero_rgb"), (config.teacher, "diffaero")):
+            digest.update(Path(file or shipped_weights(shipped)).read_bytes())
+        for scene in dict.fromkeys(config.worlds.scenes):
+            found = training_scene(scene)
+            digest.update((found / "gaussians.ply" if found.is_dir() else found).read_bytes())
         self.learns_from = digest.hexdigest()
         selection, self._repaint = config.worlds, config.repaint
         camera = replace(DistilledRgbConfig().camera, merged_spread=config.merged_spread)

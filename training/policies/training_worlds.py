@@ -298,6 +298,11 @@ def validation_worlds(selection: WorldSelection, device: torch.device | str = "c
     return WorldBatch(worlds, None, device)
 
 
+def world_turns(selection: WorldSelection, count: int, first: int) -> list[tuple[int, str]]:
+    """Lists the seed, from `first` on, and the kind or scene of each of `count` worlds."""
+    return list(zip(range(first, first + count), cycle(selection.turns), strict=False))
+
+
 def _make_worlds(
     selection: WorldSelection, count: int, first: int, what: str
 ) -> list[TrainingWorld]:
@@ -306,8 +311,8 @@ def _make_worlds(
         esdf = make_world(scene_config(library.training_scene(scene)), seed=0).esdf
         scenes[scene] = esdf, esdf.conservative()
     cache, worlds = WorldCache(), []
-    seeds = Progress(range(first, first + count), f"making {what}", unit="world")
-    for seed, turn in zip(seeds, cycle(selection.turns), strict=False):
+    turns = world_turns(selection, count, first)
+    for seed, turn in Progress(turns, f"making {what}", unit="world"):
         if turn not in scenes:
             worlds.append(cache.world(library.scenario_world(turn), seed))
             continue

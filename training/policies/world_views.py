@@ -1,7 +1,6 @@
 """Color images of many vehicles in training worlds, whose appearance changes while they fly."""
 
 import os
-from itertools import cycle, islice
 
 import torch
 from pydrake.math import RigidTransform, RotationMatrix
@@ -15,7 +14,7 @@ from splatpilot.systems.splats.baked_scene import BatchRenderer
 from splatpilot.systems.splats.splat_camera import color_pixels
 from splatpilot.training.corpus import library
 from splatpilot.training.policies.evaluation import CAMERA_AHEAD
-from splatpilot.training.policies.training_worlds import WorldSelection
+from splatpilot.training.policies.training_worlds import WorldSelection, world_turns
 from splatpilot.training.policies.vehicles import Vehicle
 
 
@@ -34,10 +33,10 @@ class WorldViews:
             scene: make_world(scene_config(library.training_scene(scene)), seed=0)
             for scene in selection.scenes
         }
-        turns = list(islice(cycle(selection.turns), count))
+        turns = Progress(world_turns(selection, count, first), "rendering worlds", unit="world")
         self._worlds = [
-            scenes.get(turn) or make_world(library.scenario_world(turn), first + i)
-            for i, turn in enumerate(Progress(turns, "rendering worlds", unit="world"))
+            scenes.get(turn) or make_world(library.scenario_world(turn), seed)
+            for seed, turn in turns
         ]
         self._seen = list(self._worlds)
         # (W, 2), seed and strength of each appearance; a strength of 0 is the world's own.

@@ -4,6 +4,7 @@ import torch
 from numpy.polynomial import Polynomial
 from pydrake.math import RollPitchYaw
 
+from splatpilot.systems.policies import lattice
 from splatpilot.systems.policies.lattice import (
     BASIS,
     LatticeConfig,
@@ -49,6 +50,28 @@ def test_trajectories_keep_their_ends(pillar):
     np.testing.assert_allclose(trajectories.positions[:-3, -1], ends, atol=1e-12)
     path, _ = toa.path(p, 4.0 * np.array(lattice.config.speed_fractions))
     np.testing.assert_allclose(trajectories.positions[-3:, -1], path, atol=1e-12)
+
+
+def test_plans_are_the_best_of_all_trajectories(pillar, monkeypatch):
+    instance, rng = TrajectoryLattice(), np.random.default_rng(0)
+    toa = time_of_arrival(pillar, np.array([14.0, 4.0, 3.0]))
+    few, all_of_them, sizes = [], [], []
+    costs = TrajectoryLattice.costs
+    monkeypatch.setattr(
+        TrajectoryLattice,
+        "costs",
+        lambda self, some, *rest: sizes.append(len(some.positions)) or costs(self, some, *rest),
+    )
+    for plans, count in ((few, lattice._FIRST_COUNT), (all_of_them, 10_000)):
+        monkeypatch.setattr(lattice, "_FIRST_COUNT", count)
+        rng = np.random.default_rng(0)
+        for _ in range(60):
+            p, v = rng.uniform([1.0, 1.0, 1.0], [13.0, 7.0, 4.0]), rng.normal(size=3)
+            plans.append(instance.best(p, v, rng.normal(size=3), pillar, toa))
+    for found, expected in zip(few, all_of_them, strict=True):
+        for values, exact in zip(found, expected, strict=True):
+            np.testing.assert_array_equal(values, exact)
+    assert np.median(sizes[: len(sizes) // 2]) < 100  # It pays.
 
 
 def test_costs_are_the_documented_sum(pillar):

@@ -1,5 +1,5 @@
 import json
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import av
@@ -101,6 +101,28 @@ def test_a_flight_is_split_where_a_state_is_missing(collected, tmp_path):
     episodes = pq.read_table(tmp_path / "out/meta/episodes/chunk-000/file-000.parquet")
     first, second = (flight["states"] for flight in shard.flights)
     assert episodes["length"].to_pylist() == [5, first - 6, second]
+
+
+@pytest.mark.parametrize(
+    ("camera", "message"),
+    [
+        ({"width": 33}, "image size of .* must be even and at least 16 px, as video, got 33x24"),
+        ({"height": 8}, "image size of .* must be even and at least 16 px, as video, got 32x8"),
+    ],
+)
+def test_images_that_no_video_has_are_refused(collected, tmp_path, camera, message):
+    corpus = Corpus(collected.folder)
+    corpus.config = replace(corpus.config, camera=replace(corpus.config.camera, **camera))
+    with pytest.raises(ValueError, match=message):
+        export(corpus, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_corpus_without_flights_is_refused(collected, tmp_path):
+    corpus = Corpus(collected.folder)
+    corpus.shards = []
+    with pytest.raises(ValueError, match="a corpus with flights of an expert, got none"):
+        export(corpus, tmp_path / "out")
 
 
 def test_lerobot_opens_it(dataset):

@@ -8,7 +8,7 @@ from splatpilot.systems.policies.base import observation
 from splatpilot.systems.policies.checkpoint import PolicyCheckpoint
 from splatpilot.systems.policies.diffaero_rgb import (
     DISTILLED_RGB_NETWORK,
-    DistilledRgb,
+    DiffAeroRgb,
     DistilledRgbConfig,
     load_network,
 )
@@ -100,7 +100,7 @@ def test_flight_decides_as_training_does(tmp_path):
     learner = DistilledRgbLearner(training())
     learner.network = module = random_module()
     file = saved(module, tmp_path / "distilled_rgb.npz")
-    policy = DistilledRgb(DistilledRgbConfig(weights=file))
+    policy = DiffAeroRgb(DistilledRgbConfig(weights=file))
     seen, states = seen_by(), np.random.default_rng(1).normal(size=(2, 13))
     states[:, 6:10] /= np.linalg.norm(states[:, 6:10], axis=1, keepdims=True)
     vehicle = BodyRate(torch.from_numpy(states).float(), torch.zeros(2, 3))
