@@ -140,19 +140,19 @@ def run(
     claim_folder(out / "gap.yaml", config, overwrite)
     policies = {name: _policy(name, config.speed) for name in config.policies}
     rows: list[Row] = []
-    panels: list[list[Panel | None]] = []
+    panels: dict[str, list[Panel | None]] = {}
     for scene in scenes:
         name = scene.resolve().name
         capture = read_scene_capture(scene, read_scene_metadata(scene))
         world = read_scene_folder(scene)
         viewpoints = captured_viewpoints(capture, world, config)
         rows += _plans(name, viewpoints, policies, config, capture)
-        panels += _shown(viewpoints, next(iter(policies.values())), capture)
+        panels |= _shown(name, viewpoints, next(iter(policies.values())), capture)
     viewpoints = list(generated_viewpoints(config))
     rows += _plans("generated", viewpoints, policies, config, None)
     write_csv(out / "gap.csv", (row._asdict() for row in rows))
     titles = [f"{kind} image" for kind in KINDS[:2]]
-    write_grid(out / "views.png", panels, titles, [""] * len(panels))
+    write_grid(out / "views.png", list(panels.values()), titles, list(panels))
     table = summarize(rows)
     print(format_table(table))
     return table
@@ -276,12 +276,22 @@ def _images(
         if capture is not None:
             color, depth, valid = _photograph(capture, viewpoint.frames[k], K, *size)
             depth = np.where(depth > 0.0, ranged_depth(depth, *limits), drawn.depth)
-            color = np.where(valid[..., None], color, drawn.color)
+            color = np.where(valid[..., None], color, _exposed(drawn.color, color, valid))
             real.append(View(color, np.where(valid, depth, drawn.depth)))
             seen = float(valid.mean())
     if capture is None:
         return {"generated": (rendered, 1.0)}
     return {"real": (real, seen), "rendered": (rendered, seen)}
+
+
+def _exposed(
+    rendered: NDArray[np.uint8], real: NDArray[np.uint8], valid: NDArray[np.bool_]
+) -> NDArray[np.uint8]:
+    """Returns the rendering with the gain that fits it to the valid pixels of the real image, so
+    that no edge stands where that one ends."""
+    a, b = rendered[valid].astype(float), real[valid].astype(float)
+    gain = float((a * b).sum() / max((a * a).sum(), 1.0)) if valid.any() else 1.0
+    return color_pixels(rendered * (gain / 255.0))
 
 
 def _photograph(
@@ -394,14 +404,13 @@ def format_table(table: dict[str, Any]) -> str:
 
 
 def _shown(
-    viewpoints: Sequence[Viewpoint], policy: Policy, capture: Capture
-) -> list[list[Panel | None]]:
-    """Returns rows of real and rendered images, as the policy sees them."""
-    rows: list[list[Panel | None]] = []
+    scene: str, viewpoints: Sequence[Viewpoint], policy: Policy, capture: Capture
+) -> dict[str, list[Panel | None]]:
+    """Returns real and rendered images, as the policy sees them, by the scene and frame."""
+    rows: dict[str, list[Panel | None]] = {}
     for viewpoint in viewpoints[:: max(1, len(viewpoints) // _SHOWN)][:_SHOWN]:
         last = viewpoint._replace(X_WCs=viewpoint.X_WCs[-1:], frames=viewpoint.frames[-1:])
         images = _images(last, policy.config.camera, capture)
-        rows.append(
-            [Panel(images[kind][0][-1].color / 255.0, viewpoint.name) for kind in KINDS[:2]]
-        )
+        panels = [Panel(images[kind][0][-1].color / 255.0) for kind in KINDS[:2]]
+        rows[f"{scene}\n{viewpoint.name}"] = [*panels]
     return rows
