@@ -48,12 +48,16 @@ class Agent(Protocol):
         ...
 
 
+def camera_poses(vehicle: Vehicle) -> tuple[Tensor, Tensor]:
+    """Computes p_WC (N, 3) [m] and R_WC (N, 3, 3) of the vehicles' cameras."""
+    x, y, z = vehicle.attitude().unbind(2)
+    return vehicle.p + CAMERA_AHEAD * x, torch.stack([-y, -z, x], 2)
+
+
 @torch.no_grad()
 def render_depth(vehicle: Vehicle, geometry: Geometry, rays: PixelRays, world: Tensor) -> Tensor:
     """Renders depth (N, R) [m] from the vehicles' cameras, each in its `world` (N,)."""
-    x, y, z = vehicle.attitude().unbind(2)
-    R_WC = torch.stack([-y, -z, x], 2)
-    return geometry.depth(vehicle.p + CAMERA_AHEAD * x, R_WC, rays, world)
+    return geometry.depth(*camera_poses(vehicle), rays, world)
 
 
 class Outcomes(NamedTuple):

@@ -13,6 +13,7 @@ from hashlib import blake2b
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -24,7 +25,7 @@ from splatpilot.systems.policies.checkpoint import (
     shipped_weights,
 )
 from splatpilot.systems.policies.convolutions import LEAK
-from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK
+from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK, MAX_DEPTH, MIN_DEPTH
 from splatpilot.systems.policies.diffaero_rgb import (
     DIFFAERO_RGB_NETWORK,
     DISTILLED_RGB_NETWORK,
@@ -36,6 +37,7 @@ from splatpilot.systems.policies.diffaero_rgb import (
 from splatpilot.systems.policies.observations import (
     heading_frame,
     heading_observation,
+    inverse_depth,
     limit_smoothly,
 )
 from splatpilot.systems.policies.student import encode_color
@@ -62,7 +64,8 @@ from splatpilot.training.policies.vehicles import Observation
 from splatpilot.training.policies.world_views import WorldViews
 
 _ACCELERATION = 2.0  # [m/s^2] where Huber's loss of the decisions changes from squares
-_NEAR = 2.0  # [m] Decisions where something is nearer count twice.
+# Decisions where something is nearer than 2 m count twice.
+_NEAR = float(inverse_depth(np.float64(2.0), MIN_DEPTH, MAX_DEPTH))
 
 
 @dataclass
@@ -81,7 +84,7 @@ class DistillationLoss:
 
 @dataclass
 class DistilledRgbTraining(RolloutTraining):
-    """A training run of DistilledRgb."""
+    """A training run of `distilled_rgb`."""
 
     schedule: Schedule = field(
         default_factory=lambda: Schedule(
@@ -122,7 +125,7 @@ class DistilledRgbTraining(RolloutTraining):
 
 
 class DistilledRgbModule(DiffAeroRgbModule):
-    """Both networks of `DistilledRgb`; the policy's weights of features are zero at first."""
+    """Both networks of `distilled_rgb`; the policy's weights of features are zero at first."""
 
     def __init__(self, begin: str = "") -> None:
         super().__init__(DISTILLED_RGB_NETWORK)
@@ -229,14 +232,14 @@ def _compare(
     """Computes the terms of decisions (N, 3) and of grids (N, 9, 16)."""
     difference = (decided - taught) / _ACCELERATION
     huber = nn.functional.smooth_l1_loss(difference, torch.zeros_like(difference), reduction="none")
-    weight = 1.0 + (target.amax((1, 2)) > 3.0 / _NEAR - 0.6)
+    weight = 1.0 + (target.amax((1, 2)) > _NEAR)
     error = (inverse - target).abs()
     likelihood = (error * torch.exp(-log_error) + log_error).mean()
     return (huber.sum(1) * weight).mean() / weight.mean(), likelihood
 
 
 class DistilledRgbTrainer(RolloutTrainer):
-    """Trains DistilledRgb."""
+    """Trains `distilled_rgb`."""
 
     def __init__(self, config: DistilledRgbTraining) -> None:
         learner = DistilledRgbLearner(config)

@@ -13,7 +13,7 @@ from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.splats.baked_scene import BatchRenderer
 from splatpilot.systems.splats.splat_camera import color_pixels
 from splatpilot.training.corpus import library
-from splatpilot.training.policies.evaluation import CAMERA_AHEAD
+from splatpilot.training.policies.evaluation import camera_poses
 from splatpilot.training.policies.training_worlds import WorldSelection, world_turns
 from splatpilot.training.policies.vehicles import Vehicle
 
@@ -65,12 +65,10 @@ class WorldViews:
     def render(self, vehicle: Vehicle, world: Tensor) -> Tensor:
         """Renders colors (N, H, W, 3), uint8, from the vehicles' cameras, each in its `world`
         (N,)."""
-        x, y, z = vehicle.attitude().unbind(2)
-        R_WC = torch.stack([-y, -z, x], 2).double().cpu().numpy()
-        p_WC = (vehicle.p + CAMERA_AHEAD * x).double().cpu().numpy()
+        poses = (part.double().cpu().numpy() for part in camera_poses(vehicle))
         X_WCs = [
-            RigidTransform(RotationMatrix.ProjectToRotationMatrix(R), p)
-            for R, p in zip(R_WC, p_WC, strict=True)
+            RigidTransform(RotationMatrix.ProjectToRotationMatrix(R_WC), p_WC)
+            for p_WC, R_WC in zip(*poses, strict=True)
         ]
         worlds = [self._seen[index] for index in world.tolist()]
         info = self._camera.camera_info()
