@@ -36,7 +36,10 @@ from splatpilot.diagrams.flight.sensors import SENSORS
 from splatpilot.diagrams.worlds.scene_folder import (
     CAPTURE,
     ENVIRONMENT,
+    ESDF,
     FRONTIER,
+    GAUSSIANS,
+    PACKED_GAUSSIANS,
     SceneSource,
     find_scene,
     read_scene_metadata,
@@ -61,7 +64,7 @@ _REQUIRED = {
     *("min_clearance_m", "jerk_m_s3"),
 }
 """Columns of all flights that were flown."""
-_SCENE_FILES = "gaussians.ply", "esdf.npz", FRONTIER, ENVIRONMENT
+_SCENE_FILES = GAUSSIANS, PACKED_GAUSSIANS, ESDF, FRONTIER, ENVIRONMENT
 """The files of a scene folder that flights depend on."""
 _OWN = "scenarios/"  # before the name of a scenario: label of the weights of its own policy
 _KNOWN = {"splatpilot", "__main__"} | sys.stdlib_module_names

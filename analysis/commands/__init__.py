@@ -42,6 +42,8 @@ COMMANDS = {
     "library": ("", "make and list the environments of a folder of data"),
     "library make": ("library", "reconstruct, measure and record environments"),
     "library show": ("library", "print the recorded environments, and draw each"),
+    "library pack": ("library", "write recorded scenes in a form to be shared"),
+    "library get": ("library", "copy packed scenes from a folder or a file server"),
     "train": ("train", "train policies"),
     "recover": (
         "train",

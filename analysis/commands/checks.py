@@ -6,7 +6,12 @@ from pathlib import Path
 
 from splatpilot.analysis.benchmark.variants import SCENARIO, parse_scenario, parse_variant
 from splatpilot.diagrams.scenarios import benchmark_scenarios, other_scenarios, scenario_file
-from splatpilot.systems.common.files import find_data, require_corpus, require_existing
+from splatpilot.systems.common.files import (
+    find_data,
+    locate_scene,
+    require_corpus,
+    require_existing,
+)
 from splatpilot.systems.common.registry import check_name
 from splatpilot.systems.common.validation import did_you_mean, require
 
@@ -137,12 +142,13 @@ def describe_kinds(kinds: Sequence[str]) -> str:
 
 
 def find_input(path: str, *accepted: str) -> str:
-    """Finds an environment of an `accepted` kind: a scenario by name, or a path as `find_data`
-    does."""
+    """Finds an environment of an `accepted` kind: a scenario by name, or a path as `locate_scene`
+    and `find_data` do."""
     scenarios = SCENARIOS if "scenario" in accepted else ()
     if path in scenarios:
         return path
     hint = did_you_mean(path, scenarios)
-    found = find_data(Path(path), _list_kinds(accepted), hint)
+    scene = locate_scene(path) if "scene" in accepted else None
+    found = scene or find_data(Path(path), _list_kinds(accepted), hint)
     check_kind(found, *accepted)
     return str(found)

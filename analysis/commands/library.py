@@ -48,3 +48,38 @@ def show(options: argparse.Namespace) -> Any:
     from splatpilot.analysis import environments
 
     return environments.show(scenes=options.out or scenes_folder())
+
+
+@cli.command(
+    "library pack",
+    cli.Option("names", "of recorded scenes", nargs="+", metavar="NAME"),
+    cli.out_option("folder that a file server can offer"),
+    examples=("library pack small_house --out out/packed",),
+)
+def pack(options: argparse.Namespace) -> None:
+    """Writes recorded scenes as SPZ and distance fields, to be shared, with scenes.json, which
+    `library get` reads. The scenes are those of $SPLATPILOT_SCENES, or of the folder scenes."""
+    from splatpilot.analysis import scene_downloads
+
+    packed = scene_downloads.pack(names=options.names, scenes=scenes_folder(), out=options.out)
+    for name, scene in packed.items():
+        size = sum(file.bytes for file in scene.files.values())
+        print(f"Wrote {options.out / name}, {size / 1e6:.1f} MB; license: {scene.license}")
+
+
+@cli.command(
+    "library get",
+    cli.Option("names", "of scenes", nargs="+", metavar="NAME"),
+    cli.Option(
+        "--from", "folder, or its URL, that `library pack` wrote", dest="source", required=True
+    ),
+    _OUT,
+    examples=("library get small_house --from out/packed",),
+)
+def get(options: argparse.Namespace) -> None:
+    """Copies packed scenes from a folder or a file server, and checks their digests."""
+    from splatpilot.analysis import scene_downloads
+
+    scene_downloads.get(
+        names=options.names, source=options.source, scenes=options.out or scenes_folder()
+    )

@@ -23,7 +23,6 @@ from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.policies.time_of_arrival import time_of_arrival
 from splatpilot.systems.splats.background import RenderedView, put_behind
-from splatpilot.systems.splats.splat_files import read_ply
 from splatpilot.training.captures.capture import Capture, CaptureFrame, shrink, shrink_factor
 from splatpilot.training.captures.capture_registry import read_scene_capture
 from splatpilot.training.reconstruction.lpips import Lpips
@@ -161,7 +160,7 @@ class SceneViews:
         self.fitted = [i for i in range(len(capture)) if i not in held_out]
         self.factor = shrink_factor(capture.width, self.metadata.image_width)
         self.renderer = SceneRenderer(
-            read_ply(scene / "gaussians.ply"), self.metadata.representation
+            scene_folder.read_gaussians(scene), self.metadata.representation
         )
 
     @property

@@ -159,8 +159,8 @@ def rescale(scene: Path, out: Path, factor: float) -> RescaleSummary:
         raise ValueError(f"{out}: exists already; choose another folder for the scaled scene")
     scene_folder.check_scene_target(out)
     metadata = scene_folder.read_scene_metadata(scene)
-    gaussians = read_ply(scene / "gaussians.ply").scaled_by(factor)
-    field = Esdf.load(scene / "esdf.npz").scaled_by(factor)
+    gaussians = scene_folder.read_gaussians(scene).scaled_by(factor)
+    field = Esdf.load(scene / scene_folder.ESDF).scaled_by(factor)
     about, warnings = _about_capture(metadata, factor)
     observations = frontier = None
     if (scene / scene_folder.OBSERVATIONS).exists():

@@ -1,6 +1,7 @@
 """Scene folders: a reconstructed environment on disk.
 
-`gaussians.ply` is for cameras, `esdf.npz` for collisions, and `scene.yaml` is `SceneMetadata`.
+`gaussians.ply`, or `gaussians.spz` in scenes that were packed, is for cameras, `esdf.npz` for
+collisions, and `scene.yaml` is `SceneMetadata`.
 `environment.png`, if present, is the background (`EnvironmentMap`). `frontier.ply`, if present,
 closes the scene at unobserved space: cameras of flights see it, metrics of the scene do not.
 `observations.npz`, if present, tells how often and from where images saw each surface.
@@ -50,6 +51,9 @@ from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
 FORMAT_VERSION = 2
 CAPTURE = "capture"  # folder of a capture that was rendered for the scene
+GAUSSIANS = "gaussians.ply"
+PACKED_GAUSSIANS = "gaussians.spz"
+ESDF = "esdf.npz"
 ENVIRONMENT = "environment.png"
 FRONTIER = "frontier.ply"
 OBSERVATIONS = "observations.npz"
@@ -134,6 +138,18 @@ def write_scene_metadata(path: str | Path, metadata: SceneMetadata) -> None:
         yaml_dump_typed(metadata, filename=str(partial))
 
 
+def gaussians_file(scene: Path) -> Path:
+    """Returns the file with the Gaussians of a scene folder, without its frontier."""
+    packed = scene / PACKED_GAUSSIANS
+    return packed if packed.exists() else scene / GAUSSIANS
+
+
+def read_gaussians(scene: Path) -> GaussianScene:
+    """Reads the Gaussians of a scene folder, without its frontier."""
+    file = gaussians_file(scene)
+    return read_ply(file) if file.name == GAUSSIANS else read_splats(file)
+
+
 _MAX_VOXELS = 2e7
 _MAX_VOXEL = 0.25  # [m], at which a vehicle of 0.354 m radius still finds a route
 
@@ -149,7 +165,7 @@ def read_scene_folder(path: str | Path, *, metric: bool = True, hatched: bool = 
     """Reads a scene folder; accepts one without scale unless `metric`. Its frontier is plain and
     dark, or `hatched`."""
     path = Path(path)
-    for file in (path, path / "scene.yaml", path / "gaussians.ply", path / "esdf.npz"):
+    for file in (path, path / "scene.yaml", gaussians_file(path), path / ESDF):
         if not file.exists():
             raise FileNotFoundError(
                 f"No such file: {file}; a scene is a folder with gaussians.ply, esdf.npz and "
@@ -159,11 +175,11 @@ def read_scene_folder(path: str | Path, *, metric: bool = True, hatched: bool = 
     if metric:
         remedy = f"measure a length in `splatpilot view {path}`, then use `splatpilot scene scale`"
         require(metadata.metric, f"{path / 'scene.yaml'}: metric", "true to fly", "false", remedy)
-    gaussians = read_ply(path / "gaussians.ply")
+    gaussians = read_gaussians(path)
     num_observed = len(gaussians)
     if metadata.frontier:
         gaussians = gaussians.merged_with(_paint_frontier(read_ply(path / FRONTIER), hatched))
-    esdf = Esdf.load(path / "esdf.npz")
+    esdf = Esdf.load(path / ESDF)
     stated = np.array([metadata.lower_W, metadata.upper_W])
     found = np.array([esdf.lower_W, esdf.upper_W])
     what, condition = f"{path / 'scene.yaml'}: lower_W and upper_W", f"those of esdf.npz, {found}"
@@ -225,10 +241,10 @@ def write_scene_folder(
         **{name: np.asarray(value).tolist() for name, value in fields.items()},
     )
     with folder_written_atomically(path, replace=True) as new:
-        write_ply(world.gaussians, new / "gaussians.ply")
+        write_ply(world.gaussians, new / GAUSSIANS)
         if frontier is not None:
             write_ply(frontier, new / FRONTIER)
-        esdf.save(new / "esdf.npz")
+        esdf.save(new / ESDF)
         if world.observations is not None:
             world.observations.save(new / OBSERVATIONS)
         if isinstance(world.background, EnvironmentMap):
@@ -260,7 +276,7 @@ class SceneSource(Config):
     """An environment on disk."""
 
     # A scene folder, or a file of Gaussians (see `read_splats`): here, or in the folder of the
-    # environment variable SPLATPILOT_SCENES, by default `scenes`.
+    # environment variable SPLATPILOT_SCENES, by default `scenes`, or in this package.
     path: str = ""
     # How to get the scene, for the error if it is missing.
     source: str = ""

@@ -24,6 +24,9 @@ DATA = "SPLATPILOT_DATA"
 SCENES = "SPLATPILOT_SCENES"
 """Environment variable with the folder of scenes."""
 
+SHIPPED_SCENES = Path(__file__).parents[2] / "diagrams/worlds/scenes"
+"""The folder of the scenes of this package."""
+
 _HOST = re.sub(r"[^\w-]", "-", platform.node()) or "host"
 _LEFTOVER = re.compile(rf"\..+\.{re.escape(_HOST)}\.(\d+)\.partial(\..*)?")
 _DISK_FULL = (None, errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  # None: libraries without a number
@@ -243,11 +246,16 @@ def require_corpus(folder: Path) -> None:
         )
 
 
+def locate_scene(path: str) -> Path | None:
+    """Finds what is at `path` here, in the folder of scenes, or among those of this package."""
+    found = (folder / path for folder in (Path(), scenes_folder(), SHIPPED_SCENES))
+    return next((scene for scene in found if scene.exists()), None)
+
+
 def require_scene(path: str, source: str = "") -> Path:
-    """Finds a scene, here or in the folder of scenes; `source` says how to get a missing one."""
-    for found in (Path(path), scenes_folder() / path):
-        if found.exists():
-            return found
+    """Finds a scene, see `locate_scene`; `source` says how to get a missing one."""
+    if found := locate_scene(path):
+        return found
     raise FileNotFoundError(
         f"No such file or folder: {path}; expected a scene, here or in {scenes_folder()} (the "
         f"environment variable {SCENES} names that folder); "

@@ -1,5 +1,6 @@
 """Packed files of Gaussians: compressed PLY and SOG of PlayCanvas, SPZ of Niantic."""
 
+import gzip
 import io
 import json
 import struct
@@ -166,10 +167,10 @@ def unpack_spz(path: Path) -> tuple[Arrays, bool]:
     version 4 needs the extra `spz`."""
     require_readable_size(path, path.stat().st_size)
     content = path.read_bytes()
-    in_zstd, gzip = content.startswith(MAGIC), zlib.decompressobj(wbits=zlib.MAX_WBITS | 16)
+    in_zstd, stream = content.startswith(MAGIC), zlib.decompressobj(wbits=zlib.MAX_WBITS | 16)
     zstandard = import_extra("zstandard", "spz") if in_zstd else None
     with readable(path, "SPZ file"):
-        start = content[: _HEADER.size] if in_zstd else gzip.decompress(content, _HEADER.size)
+        start = content[: _HEADER.size] if in_zstd else stream.decompress(content, _HEADER.size)
         magic, version, count, degree, bits, flags, _ = _HEADER.unpack(start)
         require(magic == MAGIC, "the content of gzip", "SPZ", magic, "unpack it first")
         known = (4,) if in_zstd else (2, 3)
@@ -183,7 +184,7 @@ def unpack_spz(path: Path) -> tuple[Arrays, bool]:
         if zstandard:
             body = _unpack_zstd(zstandard, content, [size for size in sizes if size])
         else:
-            body = gzip.decompress(gzip.unconsumed_tail, sum(sizes)) if count else b""
+            body = stream.decompress(stream.unconsumed_tail, sum(sizes)) if count else b""
         require(len(body) == sum(sizes), "the content", f"of {sum(sizes)} bytes", len(body))
     parts = np.split(np.frombuffer(body, np.uint8), np.cumsum(sizes)[:-1])
     position, opacity, color, scale, rotation, rest = (
@@ -208,6 +209,43 @@ def unpack_spz(path: Path) -> tuple[Arrays, bool]:
         "sh": np.concatenate([first, higher], axis=1),
     }
     return arrays, bool(flags & _ANTIALIASED)
+
+
+def pack_spz(arrays: Arrays, antialiased: bool) -> bytes:
+    """Returns an SPZ file of version 3 of Gaussians in its axes.
+
+    Positions keep 12 fractional bits, or as many as the farthest of them leaves of 24.
+    """
+    count, higher = len(arrays["means"]), arrays["sh"].shape[1] - 1
+    farthest = max(float(np.abs(arrays["means"]).max()), 2.0**-12)
+    bits = max(0, min(12, 22 - int(np.floor(np.log2(farthest)))))
+    fixed = np.clip(np.round(arrays["means"] * 2.0**bits), -(2**23), 2**23 - 1).astype(np.int32)
+    quats = np.roll(arrays["quats"], -1, axis=1)  # to x y z w
+    quats = quats / np.linalg.norm(quats, axis=1, keepdims=True)
+    index = np.abs(quats).argmax(axis=1)
+    quats *= np.where(np.take_along_axis(quats, index[:, None], axis=1) < 0, -1, 1)
+    small = quats[np.arange(4) != index[:, None]].reshape(count, 3)
+    fields = np.round(np.abs(small) * (511 / np.sqrt(0.5))).astype(np.uint32)
+    fields = np.minimum(fields, 511) | (small < 0).astype(np.uint32) << 9
+    words = index.astype(np.uint32) << 30
+    for i, shift in enumerate((20, 10, 0)):
+        words |= fields[:, i] << shift
+
+    def steps(values: NDArray) -> bytes:
+        return np.clip(np.round(values), 0, 255).astype(np.uint8).tobytes()
+
+    content = b"".join((
+        _HEADER.pack(
+            MAGIC, 3, count, _COEFFICIENTS.index(higher), bits, _ANTIALIASED * antialiased, 0
+        ),
+        np.ascontiguousarray(fixed, "<i4").view(np.uint8).reshape(count, 3, 4)[..., :3].tobytes(),
+        steps(255 * arrays["opacities"]),
+        steps(255 * (0.15 * arrays["sh"][:, 0] + 0.5)),
+        steps(16 * (np.log(arrays["scales"]) + 10)),
+        words.astype("<u4").tobytes(),
+        steps(128 * arrays["sh"][:, 1:] + 128),
+    ))  # fmt: skip
+    return gzip.compress(content, mtime=0)
 
 
 def _unpack_zstd(zstandard: Any, content: bytes, sizes: list[int]) -> bytes:

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from splatpilot.diagrams.worlds.scene_folder import gaussians_file
 from splatpilot.systems.common.seeds import VALIDATION_SEEDS, first_training_seed
 from splatpilot.systems.common.validation import bounded
 from splatpilot.systems.policies.checkpoint import (
@@ -249,7 +250,7 @@ class DistilledRgbTrainer(RolloutTrainer):
             digest.update(Path(file or shipped_weights(shipped)).read_bytes())
         for scene in dict.fromkeys(config.worlds.scenes):
             found = training_scene(scene)
-            digest.update((found / "gaussians.ply" if found.is_dir() else found).read_bytes())
+            digest.update((gaussians_file(found) if found.is_dir() else found).read_bytes())
         self.learns_from = digest.hexdigest()
         selection, self._repaint = config.worlds, config.repaint
         camera = replace(DistilledRgbConfig().camera, merged_spread=config.merged_spread)

@@ -181,7 +181,7 @@ def test_length_in_a_file(seen_room, tmp_path, capsys):
     ("words", "message"),
     [
         ("room.ply --out out.ply", "what is its size? Give --factor"),
-        ("room.ply --out out.spz --factor 2", "out.spz: the suffix must be one of .ply, "),
+        ("room.ply --out out.sog --factor 2", "out.sog: the suffix must be one of .ply, "),
         ("room.ply --out out.ply --height 2", "a file has no cameras"),
         ("room.ply --out out.ply --factor 0", "factor must be finite and > 0, got 0"),
         ("room.ply --out out.ply --floor 0,0,0 1,0,0 2,0,0", "lie in a line"),

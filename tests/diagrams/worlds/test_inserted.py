@@ -39,6 +39,13 @@ def test_scenes_are_found_by_name(hall, monkeypatch, tmp_path):
         make_world(SceneConfig(path="hall", source="ask Ann"), 0)
 
 
+def test_shipped_scene_can_be_flown_in():
+    world = make_world(SceneConfig(path="small_house"), 0)
+    assert len(world.gaussians) > 300_000 and world.num_frontier > 0
+    ends = np.stack([world.p_WS, world.p_WG])
+    assert (world.esdf.conservative().distance(ends) > VEHICLE_RADIUS).all()
+
+
 def test_starts_and_goals_are_drawn_from_the_seed(hall, monkeypatch):
     monkeypatch.setenv("SPLATPILOT_SCENES", str(hall))
     config = SceneConfig(path="hall", draw_ends=True)

@@ -81,6 +81,14 @@ def test_files_of_other_tools(tmp_path, degree):
         turned = scene.transformed_by(RigidTransform(RotationMatrix.MakeXRotation(np.pi)))
         gsply.write_spz(tmp_path / "scene.spz", foreign(turned), version=version)
         assert_close(read_splats(tmp_path / "scene.spz"), scene, 0.0002, 0.032, 0.005, 0.015)
+    write_splats(scene, tmp_path / "ours.spz")
+    assert_close(read_splats(tmp_path / "ours.spz"), scene, 0.0002, 0.032, 0.005, 0.015)
+    theirs = gsply.read_spz(tmp_path / "ours.spz")
+    nearest = np.linalg.norm(theirs.means[:, None] - turned.means[None], axis=2).argmin(axis=1)
+    np.testing.assert_allclose(theirs.means, turned.means[nearest], atol=0.0002)
+    np.testing.assert_allclose(theirs.scales, np.log(scene.scales[nearest]), atol=0.032)
+    same = np.abs((theirs.quats * turned.quats[nearest]).sum(axis=1))
+    assert np.arccos(np.minimum(same, 1)).max() < 0.005
 
 
 def webp(rows: np.ndarray) -> bytes:
@@ -226,6 +234,8 @@ def test_antialiased_gaussians_of_ply_and_spz(tmp_path, caplog):
     content[14] |= 1
     (tmp_path / "c.spz").write_bytes(gzip.compress(content, mtime=0))
     assert read_splats(tmp_path / "c.spz").antialiased
+    write_splats(scene, tmp_path / "d.spz")
+    assert read_splats(tmp_path / "d.spz").antialiased
     write_splats(scene, tmp_path / "d.glb")
     assert "d.glb: cannot record that Gaussians were trained antialiased" in caplog.text
 

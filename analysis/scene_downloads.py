@@ -1,0 +1,170 @@
+"""Scenes to download: measured scenes, packed into a folder that any file server can offer.
+
+`scenes.json` has, by name, what is known of each scene, and the size and digest of its files. Their
+folder, of the scene's name, is a scene folder too.
+"""
+
+import json
+import shutil
+import urllib.error
+import urllib.request
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from hashlib import sha256
+from pathlib import Path
+
+import numpy as np
+
+from splatpilot.analysis.environments import INDEX, read_index
+from splatpilot.diagrams.worlds.scene_folder import (
+    ENVIRONMENT,
+    ESDF,
+    FRONTIER,
+    OBSERVATIONS,
+    PACKED_GAUSSIANS,
+    read_gaussians,
+    read_scene_metadata,
+    write_scene_metadata,
+)
+from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.common.files import folder_written_atomically, written_atomically
+from splatpilot.systems.common.progress import Progress
+from splatpilot.systems.common.readers import read_text
+from splatpilot.systems.common.validation import require, unknown
+from splatpilot.systems.splats.splat_files import write_splats
+
+LIST = "scenes.json"
+_SCENE = "scene.yaml"
+_COPIED = FRONTIER, ENVIRONMENT, OBSERVATIONS
+_FILES = {_SCENE, PACKED_GAUSSIANS, ESDF, *_COPIED}
+_STEPS = 1024.0  # per meter; distances are rounded down to them, which halves their file
+_TIMEOUT = 30.0  # [s] without an answer
+_MAX_LIST = 1 << 24  # [bytes]
+
+
+@dataclass(frozen=True)
+class PackedFile:
+    """A file of a scene."""
+
+    bytes: int
+    sha256: str
+
+
+@dataclass(frozen=True)
+class PackedScene:
+    """A scene in `LIST`; for units see `environments.Record`."""
+
+    license: str
+    split: str
+    size: list[float]
+    gaussians: int
+    psnr_db: float | None
+    files: dict[str, PackedFile]
+
+
+def pack(*, names: Sequence[str], scenes: Path, out: Path) -> dict[str, PackedScene]:
+    """Writes scenes of the index in the folder `scenes` to `out/NAME`, and lists them in `out`.
+
+    Gaussians become SPZ, which rounds them; distances become at most 1 mm smaller.
+    """
+    records = read_index(scenes)
+    for name in names:
+        if name not in records:
+            raise ValueError(unknown(f"scene in {scenes / INDEX}", name, records))
+        license, remedy = records[name].license, "share only what the license allows"
+        free = license and "non-commercial" not in license
+        require(free, f"license of {name}", "a free one", license or "none", remedy)
+        require(not records[name].path, name, "a scene folder", "an OctoMap", "share its file")
+    listed = _read_list(out / LIST) if (out / LIST).exists() else {}
+    for name in Progress(names, "packing", unit="scene"):
+        record = records[name]
+        with folder_written_atomically(out / name, replace=True) as folder:
+            _pack(scenes / name, folder, record.source)
+            files = {
+                file.name: PackedFile(file.stat().st_size, sha256(file.read_bytes()).hexdigest())
+                for file in sorted(folder.iterdir())
+            }
+        known = record.license, record.split, record.size, record.gaussians, record.psnr_db
+        listed[name] = PackedScene(*known, files)
+        with written_atomically(out / LIST) as partial:
+            content = {each: asdict(scene) for each, scene in sorted(listed.items())}
+            partial.write_text(json.dumps(content, indent=1))
+    return {name: listed[name] for name in names}
+
+
+def _pack(scene: Path, folder: Path, source: str) -> None:
+    metadata = read_scene_metadata(scene)
+    # The capture stays where it is.
+    made_of = metadata.provenance.replace(metadata.capture or source, source)
+    write_scene_metadata(folder, replace(metadata, capture="", provenance=made_of))
+    write_splats(read_gaussians(scene), folder / PACKED_GAUSSIANS)
+    esdf = Esdf.load(scene / ESDF)
+    replace(esdf, distances=np.floor(esdf.distances * _STEPS) / _STEPS).save(folder / ESDF)
+    for name in _COPIED:
+        if (scene / name).exists():
+            shutil.copyfile(scene / name, folder / name)
+
+
+def get(*, names: Sequence[str], source: str, scenes: Path) -> dict[str, PackedScene]:
+    """Copies scenes from `source`, the path or URL of a folder that `pack` wrote, to `scenes/NAME`,
+    and checks their digests. A scene that is there already stays."""
+    base = source if "://" in source else Path(source).absolute().as_uri()
+    listed = _parse_list(_fetch(f"{base}/{LIST}", _MAX_LIST), f"{base}/{LIST}")
+    for name in names:
+        if name not in listed:
+            raise ValueError(unknown(f"scene in {source}", name, listed))
+    for name in names:
+        packed, target = listed[name], scenes / name
+        if target.exists():
+            same = all(_is_same(target / file, about) for file, about in packed.files.items())
+            remedy = "choose another --out, or remove it"
+            require(same, str(target), f"the scene of {source}", "another one", remedy)
+            print(f"{target}: is there already")
+            continue
+        with folder_written_atomically(target) as folder:
+            for file, about in Progress(packed.files.items(), f"getting {name}", unit="file"):
+                url = f"{base}/{name}/{file}"
+                content = _fetch(url, about.bytes)
+                digest, remedy = sha256(content).hexdigest(), "get it again"
+                require(digest == about.sha256, f"digest of {url}", about.sha256, digest, remedy)
+                (folder / file).write_bytes(content)
+            read_scene_metadata(folder)
+        print(f"Wrote {target}; license: {packed.license}")
+    return {name: listed[name] for name in names}
+
+
+def _is_same(file: Path, about: PackedFile) -> bool:
+    return file.is_file() and sha256(file.read_bytes()).hexdigest() == about.sha256
+
+
+def _read_list(file: Path) -> dict[str, PackedScene]:
+    return _parse_list(read_text(file).encode(), str(file))
+
+
+def _parse_list(content: bytes, where: str) -> dict[str, PackedScene]:
+    try:
+        listed = {
+            name: PackedScene(
+                **scene | {"files": {n: PackedFile(**file) for n, file in scene["files"].items()}}
+            )
+            for name, scene in json.loads(content).items()
+        }
+        for name, scene in listed.items():
+            # Names become paths.
+            if Path(name).name != name or name in ("", ".", "..") or not _FILES >= set(scene.files):
+                raise ValueError(f"{name!r} must have files {', '.join(sorted(_FILES))} only")
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise ValueError(f"{where}: not a list of scenes ({error}); pack them again") from None
+    return listed
+
+
+def _fetch(url: str, size: int) -> bytes:
+    """Reads at most `size` bytes from a URL."""
+    try:
+        with urllib.request.urlopen(url, timeout=_TIMEOUT) as answer:
+            content = answer.read(size + 1)
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "reason", error)
+        raise OSError(f"cannot read {url}: {reason}; check --from, and proxy and network") from None
+    require(len(content) <= size, f"size of {url}", f"at most {size} bytes", "more", "get it again")
+    return content
