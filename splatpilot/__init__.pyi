@@ -26,6 +26,7 @@ from .diagrams.gym.rewards import Reward, Transition
 from .diagrams.gym.spaces import FlightEnvConfig
 from .diagrams.gym.vector_env import VectorFlightEnv
 from .diagrams.worlds.moving_spheres import MovingSphere
+from .diagrams.worlds.scene_folder import SceneConfig
 from .diagrams.worlds.world import World
 from .diagrams.worlds.world_registry import make_world, register_world
 from .systems.collision.distance_field import FieldState
@@ -134,6 +135,7 @@ __all__ = [
     "RerunSink",
     "Reward",
     "Scenario",
+    "SceneConfig",
     "SplatCamera",
     "SplatRenderEngine",
     "Starling2Max",
