@@ -15,6 +15,7 @@ import numpy as np
 from lcm import LCM
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
 from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, LeafSystem
+from scipy.spatial.transform import Rotation
 
 from splatpilot.diagrams.flight.blocks import make_policy
 from splatpilot.diagrams.flight.monitor import Outcome, flight_outcome, has_landed
@@ -49,13 +50,23 @@ KINDS = (
 """Types of faults; of two, the earlier one here is applied first. Messages that are "not_finite"
 contain NaN, those that are "corrupt" are truncated and have flipped bits."""
 
+PX4_KINDS = (
+    *("state_off", "state_frozen", "state_garbage", "state_jumped", "state_slow", "state_delayed"),
+    *("state_dropped", "heading_jumped", "body_dropped", "offboard_left"),
+    *("link_off", "corrupt", "slow", "delayed", "dropped"),
+    *("policy_killed", "policy_stalled", "policy_nonsense"),
+)
+"""Types of faults by which PX4's failures appear on its link, see `docs/px4.md`; ``_off`` affects
+every message, ``slow`` leaves 2 to 5 messages per second."""
+
 DELAY = 0.3  # [s] of delayed messages.
 TICK = 0.01  # [s] of both diagrams.
 
 _PORTS = {
     **{"body_lost": "motion_capture_pose", "body_dropped": "motion_capture_pose"},
     **{"grid_dropped": "depth_grid", "grid_corrupt": "depth_grid"},
-    **{"state_frozen": "state", "state_jumped": "state"},
+    **dict.fromkeys(("state_frozen", "state_jumped", "state_off", "state_garbage"), "state"),
+    **dict.fromkeys(("state_slow", "state_delayed", "state_dropped", "heading_jumped"), "state"),
 }
 """Faults of one signal."""
 
@@ -86,7 +97,7 @@ class Fault:
             kind=kind,
             begin=float(random.uniform(0.5, 3.0)),
             duration=_FOREVER if kind == "policy_killed" else float(random.uniform(0.3, 4.0)),
-            fraction=float(random.uniform(0.3, 1.0)),
+            fraction=1.0 if kind.endswith("_off") else float(random.uniform(0.3, 1.0)),
             size=float(random.choice([-1.0, 1.0]) * 10 ** random.uniform(-1.0, 1.0)),
         )
 
@@ -104,14 +115,16 @@ class Trial:
     setpoints: str  # see `HardwareConfig.setpoints`.
 
     @classmethod
-    def sample(cls, number: int, random: np.random.Generator) -> "Trial":
+    def sample(
+        cls, number: int, random: np.random.Generator, table: tuple[str, ...] = KINDS
+    ) -> "Trial":
         """Samples the trial of a number. Types of faults, commands and policies alternate; about
         half of the trials have two faults. Faults of grids need the policy with that input."""
-        turn, kind = divmod(number, len(KINDS))
+        turn, kind = divmod(number, len(table))
         kinds = [kind]
         if random.random() < 0.5:
-            kinds.append(int(random.choice([k for k in range(len(KINDS)) if k != kind])))
-        faults = tuple(Fault.sample(KINDS[k], random) for k in sorted(kinds))
+            kinds.append(int(random.choice([k for k in range(len(table)) if k != kind])))
+        faults = tuple(Fault.sample(table[k], random) for k in sorted(kinds))
         needs_grid = any(fault.kind.startswith("grid") for fault in faults)
         policy = "diffaero_tof" if needs_grid else ("straight", "reactive")[turn // 2 % 2]
         return cls(faults, policy, ("velocity", "body_rates")[turn % 2])
@@ -135,6 +148,7 @@ class Relay:
         self._ends, self._count, self._now = (vehicle, bridge), 0, 0.0
         self._waiting: list[tuple[float, int, Callable[[bytes], None], bytes]] = []
         self._state: bytes | None = None  # that is frozen
+        self._passed: dict[tuple[Fault, str], float] = {}  # [s] of the last message, while slow
         take = weak_callback(self._take)  # The relay owns LCM, which owns its callbacks.
         for sender, signals in ((vehicle, from_vehicle), (bridge, from_bridge)):
             for codec in signals:
@@ -197,17 +211,45 @@ class Relay:
         if fault.kind == "state_jumped" and is_affected:
             jump = math.copysign(1.0 + 2.0 * fault.fraction, fault.size)  # [m]
             return edited(lambda m: setattr(m, "p_WB", np.add(m.p_WB, [0.0, jump, 0.0])))
+        if fault.kind == "heading_jumped" and is_affected:
+            angle = math.copysign(0.5 + 2.0 * fault.fraction, fault.size)  # [rad]
+            turn = Rotation.from_euler("z", angle)
+            return edited(
+                lambda m: setattr(
+                    m, "q_WB", _quaternion(turn * Rotation.from_quat(m.q_WB, scalar_first=True))
+                )
+            )
+        if fault.kind == "offboard_left":  # The autopilot follows no command any more.
+            if codec.port == "vehicle_status":
+                return edited(lambda m: setattr(m, "offboard", False))
+            return unchanged if from_vehicle else []
+        if fault.kind in ("slow", "state_slow") and is_affected:
+            key = fault, codec.channel
+            if self._now - self._passed.get(key, -math.inf) < 0.5 * fault.fraction:
+                return []
+            self._passed[key] = self._now
+            return unchanged
         if random.random() > fault.fraction or not is_affected:
             return unchanged
         match fault.kind:
+            case "link_off" | "state_off" | "state_dropped":
+                return []
             case "dropped" | "body_dropped" | "grid_dropped":
                 return []
-            case "delayed":
+            case "delayed" | "state_delayed":
                 return [(DELAY, data)]
             case "duplicated":
                 return [(0.0, data), (float(random.uniform(0.0, DELAY)), data)]
             case "reordered":
                 return [(float(random.uniform(0.0, DELAY)), data)]
+            case "state_garbage":
+                p_WB, v_WB = random.normal(scale=10 ** random.uniform(0.0, 4.0), size=(2, 3))
+                values = {
+                    "p_WB": p_WB,
+                    "v_WB": v_WB,
+                    "q_WB": _quaternion(Rotation.random(rng=random)),
+                }
+                return edited(lambda m: [setattr(m, *each) for each in values.items()])
             case "body_lost":
                 return edited(lambda m: setattr(m, "tracked", False))
             case "corrupt" | "grid_corrupt":
@@ -219,6 +261,10 @@ class Relay:
                 at = 8 * int(random.integers(1, max(len(data) // 8, 2))) - 4
                 return [(0.0, data[:at] + struct.pack(">d", math.nan) + data[at + 8 :])]
         return unchanged
+
+
+def _quaternion(rotation: Rotation) -> list[float]:
+    return rotation.as_quat(scalar_first=True).tolist()
 
 
 class Nonsense(LeafSystem):
@@ -358,6 +404,8 @@ class FaultsConfig(Config):
 
     # [-] Number of flights, which alternate between faults, commands and policies.
     trials: int = bounded(600, "[1, inf)")
+    # Faults: of messages, sensors and policies, or as PX4's failures appear on its link.
+    table: str = bounded("messages", "{messages, px4}")
     # Seed of everything random.
     seed: int = 0
     # [-] Number of worlds, which trials alternate between.
@@ -381,18 +429,19 @@ def run(*, config: FaultsConfig, out: Path) -> dict[str, Any]:
     trials and the outcomes by the type of fault, which is also returned."""
     config.validate()
     claim_folder(out / "config.yaml", config)
+    table = PX4_KINDS if config.table == "px4" else KINDS
     lines = out / "trials.jsonl"
     rows = [json.loads(line) for line in lines.read_text().splitlines()] if lines.exists() else []
     world_of_seed = cache(lambda seed: make_world(config.scenario.world, seed))
     for number in Progress(range(len(rows), config.trials), "flying trials", unit="trial"):
         world = world_of_seed(config.seed + number % config.worlds)
-        trial = Trial.sample(number, np.random.default_rng([config.seed, number]))
+        trial = Trial.sample(number, np.random.default_rng([config.seed, number]), table)
         seed, policy = config.seed + number, policy_named(trial.policy, config.speed)
         scenario = replace(config.scenario, seed=seed, policy=policy)
         rows.append(fly_trial(scenario, world, trial, config.limits, seed))
         with written_atomically(lines) as path:
             path.write_text("".join(json.dumps(row) + "\n" for row in rows))
-    summary = summarize(rows)
+    summary = summarize(rows, table)
     with written_atomically(out / "summary.json") as path:
         path.write_text(json.dumps(summary, indent=2) + "\n")
     print(f"{'fault':<16} {'safe':>9}  ended")
@@ -403,10 +452,10 @@ def run(*, config: FaultsConfig, out: Path) -> dict[str, Any]:
     return summary
 
 
-def summarize(rows: list[dict[str, Any]]) -> dict[str, Any]:
+def summarize(rows: list[dict[str, Any]], table: tuple[str, ...] = KINDS) -> dict[str, Any]:
     """Counts safe trials, and outcomes by the type of fault."""
     kinds = {}
-    for kind in KINDS:
+    for kind in table:
         of_kind = [row for row in rows if kind in {fault["kind"] for fault in row["faults"]}]
         ends = [row["outcome"] for row in of_kind]
         kinds[kind] = {

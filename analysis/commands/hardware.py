@@ -69,6 +69,7 @@ def bridge(options: argparse.Namespace) -> None:
     _LCM_URL,
     cli.flag("--engage", "request offboard mode"),
     cli.flag("--arm", "arm the motors, in offboard mode"),
+    cli.path_option("--replay LOG.ulg", "replay a log of PX4 instead, and report on it"),
     cli.set_option(
         *("vehicle_host=192.168.8.1", "udp.host=0.0.0.0"),
         configuration="splatpilot.diagrams.hardware.px4:Px4Config",
@@ -76,6 +77,7 @@ def bridge(options: argparse.Namespace) -> None:
     examples=(
         "hardware px4 --set vehicle_host=192.168.8.1",
         "hardware px4 --config px4.yaml --engage",
+        "hardware px4 --replay flight.ulg",
     ),
 )
 def px4(options: argparse.Namespace) -> None:
@@ -87,7 +89,7 @@ def px4(options: argparse.Namespace) -> None:
         config.url = options.lcm_url
     config.commander.engage |= options.engage
     config.commander.arm |= options.arm
-    px4.run(config=config)
+    px4.run(config=config, log=options.replay)
 
 
 @cli.command(

@@ -4,6 +4,7 @@ import contextlib
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 from lcm import LCM
@@ -22,6 +23,7 @@ from splatpilot.systems.px4.commander import Px4Commander, Px4CommanderConfig
 from splatpilot.systems.px4.mavlink import OFFBOARD, Mavlink
 from splatpilot.systems.px4.motion_capture import MotionCaptureConfig, MotionCaptureReceiver
 from splatpilot.systems.px4.telemetry import HEARTBEAT_TIMEOUT, Px4Telemetry
+from splatpilot.systems.px4.ulog import LogInbox
 from splatpilot.systems.vehicle.quadrotor import GRAVITY
 
 REMINDER = 10.0  # [s] of silence between messages that there is no heartbeat.
@@ -56,7 +58,7 @@ class Px4Config(Config):
 
 
 def BuildPx4Diagram(
-    config: Px4Config, lcm: LCM, inbox: UdpInbox, now: Callable[[], float] | None = None
+    config: Px4Config, lcm: LCM, inbox: UdpInbox | LogInbox, now: Callable[[], float] | None = None
 ) -> Diagram:
     """Builds the diagram between the bridge's messages and PX4. It replaces `BuildVehicleDiagram`,
     except for images, which sensors send themselves.
@@ -64,7 +66,7 @@ def BuildPx4Diagram(
     .. pydrake_system::
 
         name: px4
-        output_ports: [state, state_age, heartbeat_age, armed, mode]
+        output_ports: [state, state_age, heartbeat_age, armed, mode, rejected]
 
     The ports are those of `Px4Telemetry`; for `now` see `Receiver`.
     """
@@ -115,29 +117,30 @@ def BuildPx4Diagram(
         motion_capture_age=pose_age,
     )
 
-    for name in ("state", "age", "heartbeat_age", "armed", "mode"):
+    for name in ("state", "age", "heartbeat_age", "armed", "mode", "rejected"):
         builder.ExportOutput(telemetry.GetOutputPort(name), "state_age" if name == "age" else name)
     diagram = builder.Build()
     diagram.set_name("px4")
     return diagram
 
 
-def run(*, config: Px4Config, duration: float = np.inf) -> None:
+def run(*, config: Px4Config, duration: float = np.inf, log: Path | None = None) -> None:
     """Connects the bridge and PX4, for `duration` [s], or until it is interrupted; prints changes
-    of PX4's mode, and every ten seconds how long there has been no heartbeat."""
+    of PX4's mode, and every ten seconds how long there has been no heartbeat. Replays a `log` of
+    PX4 in real time instead, if given, and prints `replay_report`."""
     config.validate()
-    lcm, inbox = open_lcm(config.url), UdpInbox(config.udp)
+    lcm, epoch = open_lcm(config.url), time.time() - time.monotonic()
+    inbox = LogInbox(log, config.system, time.monotonic) if log else UdpInbox(config.udp)
     with contextlib.closing(inbox):
-        epoch = time.time() - time.monotonic()
         diagram = BuildPx4Diagram(config, lcm, inbox, now=lambda: epoch + time.monotonic())
         simulator = Simulator(diagram)
         root = simulator.get_context()
-        address = f"{config.udp.host}:{inbox.port}"
+        address = str(log) if log else f"{config.udp.host}:{inbox.port}"
         print(f"PX4's packets come to {address}.", flush=True)
         requests = {"Offboard mode": config.commander.engage, "Arming": config.commander.arm}
         for name, requested in requests.items():
             print(f"{name} is {'requested' if requested else 'left to the pilot'}.", flush=True)
-        before, reminders = "not heard", 0
+        before, reminders, ages = "not heard", 0, []
 
         def over(now: float) -> bool:
             nonlocal before, reminders
@@ -156,6 +159,22 @@ def run(*, config: Px4Config, duration: float = np.inf) -> None:
                 silence = f"{silences * REMINDER:g} s at {address}"
                 print(f"{now:8.2f} s: no heartbeat for {silence}", flush=True)
             reminders = silences
-            return now >= duration
+            ages.append(vector_output(diagram, "state_age", root)[0])
+            return now >= duration or (isinstance(inbox, LogInbox) and inbox.is_over)
 
         run_in_real_time(simulator, diagram, config.tick, over)
+        if isinstance(inbox, LogInbox):
+            print(replay_report(inbox, ages, vector_output(diagram, "rejected", root)[0]))
+
+
+def replay_report(inbox: LogInbox, ages: list[float], rejected: float) -> str:
+    """Reports on a replayed log: ages of states [s], numbers of rejected messages and of those that
+    were sent to PX4, and the difference of velocities and derivatives of positions."""
+    known = np.array(ages)[np.isfinite(ages)]
+    age = "no state" if known.size == 0 else f"median {np.median(known):.3f}, max {max(known):.3f}"
+    sent = ", ".join(f"{name} {count}" for name, count in sorted(inbox.sent.items()))
+    error = " ".join(f"{value:.3f}" for value in inbox.velocity_error)
+    return (
+        f"age of the state [s]: {age}\nrejected messages: {rejected:.0f}\nsent: {sent}\n"
+        f"RMS of velocity minus derivative of position, north east down [m/s]: {error}"
+    )

@@ -20,6 +20,7 @@ from splatpilot.systems.messaging.codecs import (
     DepthGridCodec,
     MotionCaptureCodec,
     StateCodec,
+    VehicleStatusCodec,
 )
 from splatpilot.systems.messaging.flight_limits import FlightLimits
 from splatpilot.systems.vehicle.quadrotor import hover_state
@@ -194,3 +195,33 @@ def test_accidents_are_counted():
     summary = summarize([row, {**row, "safe": False, "outcome": "collision"}])
     assert (summary["trials"], summary["safe"]) == (2, 1)
     assert summary["kinds"]["dropped"]["outcomes"] == {"collision": 1, "hover": 1}
+
+
+def test_failures_of_px4_affect_states_or_all_messages():
+    assert Line("state_off").numbers() == Line("link_off").numbers()
+    assert Line("link_off").numbers() == [*range(50), *range(100, 150)]
+    for kind in ("slow", "state_slow"):  # 0.5 s between messages, at a fraction of 1.
+        assert [message.header.seq for message in Line(kind).messages(Line(kind).during)] == [
+            50,
+            75,
+        ]
+    assert Line("state_delayed").delays()[70] == pytest.approx(DELAY, abs=0.021)
+    rotated = {message.q_WB for message in Line("heading_jumped").messages()[50:100]}
+    np.testing.assert_allclose([*rotated], [[np.cos(1.25), 0, 0, np.sin(1.25)]])
+    noise = Line("state_garbage").messages(Line("state_garbage").during)
+    np.testing.assert_allclose([np.linalg.norm(message.q_WB) for message in noise], 1.0)
+    assert len({message.p_WB for message in noise}) == 50
+
+
+def test_a_vehicle_that_left_offboard_mode_hears_no_commands():
+    near, far, status, heard = lcm.LCM("memq://"), lcm.LCM("memq://"), VehicleStatusCodec(), []
+    fault = (Fault("offboard_left", begin=0.0, duration=1.0, fraction=1.0, size=1.0),)
+    relay = Relay(near, far, [status], [CommandCodec()], fault, np.random.default_rng(0))
+    far.subscribe(status.channel, lambda _, data: heard.append(status.message.decode(data)))
+    near.subscribe(CommandCodec.channel, lambda _, data: heard.append("command"))
+    near.publish(status.channel, encoded(status, [1.0, 1.0]))
+    far.publish(CommandCodec.channel, encoded(CommandCodec(), [9.8, 0.0, 0.0, 0.0]))
+    relay.step(0.5)
+    while far.handle_timeout(0) or near.handle_timeout(0):
+        pass
+    assert [(each.armed, each.offboard) for each in heard] == [(True, False)]
