@@ -266,3 +266,9 @@ def flight_command(kind: str, state: Annotated[NDArray[numpy.float64], dict(shap
 
 def quadrotor_derivatives(state: Annotated[NDArray[numpy.float64], dict(shape=(13), order='C', device='cpu', writable=False)], command: Annotated[NDArray[numpy.float64], dict(shape=(4), order='C', device='cpu', writable=False)], drag: float, rate_time_constant: float, gravity: float, derivatives: Annotated[NDArray[numpy.float64], dict(shape=(13), order='C', device='cpu')], wind: Annotated[NDArray[numpy.float64], dict(shape=(3), order='C', device='cpu', writable=False)] | None = None, disturbance: Annotated[NDArray[numpy.float64], dict(shape=(3), order='C', device='cpu', writable=False)] | None = None) -> None:
     """Writes the derivatives (13,) of `component_derivatives`."""
+
+def actuated_derivatives(state: Annotated[NDArray[numpy.float64], dict(shape=(15), order='C', device='cpu', writable=False)], command: Annotated[NDArray[numpy.float64], dict(shape=(4), order='C', device='cpu', writable=False)], parameters: Annotated[NDArray[numpy.float64], dict(shape=(30), order='C', device='cpu', writable=False)], derivatives: Annotated[NDArray[numpy.float64], dict(shape=(15), order='C', device='cpu')]) -> None:
+    """
+    Writes the derivatives (15,) of `actuated_derivatives`, without that of the charge, for
+    parameters in the order of FLIGHT_PARAMETERS.
+    """

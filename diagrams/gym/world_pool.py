@@ -31,6 +31,7 @@ from splatpilot.systems.sensing.latency import decision_delays
 from splatpilot.systems.sensing.noise import ObservationNoise
 from splatpilot.systems.splats.baked_scene import BakedScene
 from splatpilot.systems.vehicle.flatness import native_control
+from splatpilot.systems.vehicle.quadrotor import native_vehicle
 
 PACK = 16  # vehicles whose parameters lie together, see `_native.Vehicles`
 _FLIGHTS = 64  # prepared in each world
@@ -205,17 +206,6 @@ def require_supported(config: FlightEnvConfig) -> None:
 def native_parameters(scenario: Scenario) -> NDArray[np.float64]:
     """Returns the numbers (P,) of `_native.FLIGHT_PARAMETERS`."""
     vehicle, control = scenario.vehicle, scenario.controller
-    motor, yaw = vehicle.motor_time_constant, vehicle.rate_time_constant * vehicle.yaw_time_ratio
-    values = native_control(control, vehicle) | {
-        "rate_gain": 1.0 / vehicle.rate_time_constant,
-        "yaw_rate_gain": 1.0 / yaw,
-        "motor_gain": 1.0 / motor if motor else 0.0,
-        "response_time": RESPONSE_TIME,
-        "max_acceleration": MAX_ACCELERATION,
-    }
-    axes = (vehicle.rotor_drag, vehicle.quadratic_drag, scenario.wind.mean)
-    for name, axis in zip(("rotor_drag", "quadratic", "wind"), axes, strict=True):
-        values |= {f"{name}_{k}": value for k, value in zip("xyz", axis, strict=True)}
-    for name in ("thrust_scale", "min_thrust", "max_thrust", "max_tilt_rate", "max_yaw_rate"):
-        values[name] = getattr(vehicle, name)
+    values = native_control(control, vehicle) | native_vehicle(vehicle, scenario.wind.mean)
+    values |= {"response_time": RESPONSE_TIME, "max_acceleration": MAX_ACCELERATION}
     return np.array([values[name] for name in _native.FLIGHT_PARAMETERS])

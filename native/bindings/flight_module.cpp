@@ -276,6 +276,20 @@ void derivatives(const Doubles<nb::shape<kStateSize>>& state, const Doubles<nb::
                                     disturbance ? disturbance->data() : nullptr, rates.data());
 }
 
+// The state has the charge, whose rate is not written, before the thrust over mass.
+void actuated(const Doubles<nb::shape<kStateSize + 2>>& state,
+              const Doubles<nb::shape<4>>& command,
+              const Doubles<nb::shape<kFlightParameters>>& parameters,
+              const Array<double, nb::shape<kStateSize + 2>>& rates) {
+  double lagged[kStateSize + 1], derivatives[kStateSize + 1];
+  std::copy_n(state.data(), kStateSize, lagged);
+  lagged[kLaggedThrust] = state.data()[kStateSize + 1];
+  const auto parameter = [&](int row) { return parameters.data()[row]; };
+  SIMD_LEVEL::actuated_derivatives(lagged, command.data(), parameter, derivatives);
+  std::copy_n(derivatives, kStateSize, rates.data());
+  rates.data()[kStateSize + 1] = derivatives[kLaggedThrust];
+}
+
 }  // namespace
 
 void bind_flight(nb::module_& m) {
@@ -327,6 +341,9 @@ void bind_flight(nb::module_& m) {
   m.def("quadrotor_derivatives", &derivatives, "state"_a, "command"_a, "drag"_a,
         "rate_time_constant"_a, "gravity"_a, "derivatives"_a, "wind"_a = nb::none(),
         "disturbance"_a = nb::none(), "Writes the derivatives (13,) of `component_derivatives`.");
+  m.def("actuated_derivatives", &actuated, "state"_a, "command"_a, "parameters"_a, "derivatives"_a,
+        "Writes the derivatives (15,) of `actuated_derivatives`, without that of the charge, for\n"
+        "parameters in the order of FLIGHT_PARAMETERS.");
 }
 
 }  // namespace splatpilot

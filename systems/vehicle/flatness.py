@@ -332,29 +332,31 @@ def FlatnessController_(T):
                 )
             heading = optional_input(self, "heading", context)
             heading = None if heading is None else heading[0]
-            # One native call, if it knows the case and the Context has the default parameters.
-            if (
-                T is float
-                and (heading is None or math.isnan(heading))
-                and config.disturbance_time == 0.0
-                and (config, params) == self._arguments
-            ):
-                kind = "waypoint" if use_waypoint else "acceleration"
-                target, command = self._eval_finite(kind, context), np.empty(4)
-                _native.flight_command(kind, state, target, self._numbers, command)
-                discrete_state.set_value(0, command)
-                return
-            if use_waypoint:
-                p_WR = self._eval_finite("waypoint", context)
-                a_WB = reaching_acceleration(p_WR, p_WB, v_WB, config.lookahead)
-                motion_W = (p_WR - p_WB) / config.lookahead
-            else:
-                a_WB, motion_W = self._eval_finite("acceleration", context), v_WB
+            kind = "waypoint" if use_waypoint else "acceleration"
+            target, disturbance = self._eval_finite(kind, context), None
             if config.disturbance_time > 0.0:
                 old = context.get_discrete_state()
                 observed = observe_disturbance(state, old.value(1), old.value(0)[0], config, params)
                 discrete_state.set_value(1, observed)
-                a_WB = a_WB - observed[3:]
+                disturbance = observed[3:]
+            # One native call, if it knows the case and the Context has the default parameters.
+            if (
+                T is float
+                and (heading is None or math.isnan(heading))
+                and (disturbance is None or not use_waypoint)
+                and (config, params) == self._arguments
+            ):
+                command = np.empty(4)
+                target = target if disturbance is None else target - disturbance
+                _native.flight_command(kind, state, target, self._numbers, command)
+                discrete_state.set_value(0, command)
+                return
+            a_WB, motion_W = target, v_WB
+            if use_waypoint:
+                a_WB = reaching_acceleration(target, p_WB, v_WB, config.lookahead)
+                motion_W = (target - p_WB) / config.lookahead
+            if disturbance is not None:
+                a_WB = a_WB - disturbance
             # At rest arctan2 of AutoDiffXd warns of a division, and returns zero derivatives.
             with nullcontext() if T is float else np.errstate(divide="ignore"):
                 command = flatness_command(state, a_WB, motion_W, heading, config, params)

@@ -293,18 +293,45 @@ def actuated_derivatives(
         ]
     else:
         thrust, targets = lift * (actuators[0] if actuators else thrust_cmd), [thrust_cmd]
-    power = maximum(thrust / GRAVITY, _TINY)
     return [
         *component_derivatives(
             state[:13], (thrust, *rates), params.drag, 1.0, params.gravity, wind, added
         )[:10],
         *accelerations,
-        -power * sqrt(power) * (1.0 / params.battery_endurance),  # x / inf of AutoDiffXd is NaN
+        charge_rate(thrust, params),
         *(
             (u - now) / params.motor_time_constant
             for u, now in zip(targets, actuators, strict=False)
         ),
     ]
+
+
+def charge_rate(thrust: Any, params: QuadrotorParams) -> Any:
+    """Returns the rate [1/s] of the charge at a thrust over mass [m/s^2]."""
+    power = maximum(thrust / GRAVITY, _TINY)
+    return -power * sqrt(power) * (1.0 / params.battery_endurance)  # x / inf of AutoDiffXd is NaN
+
+
+def knows_natively(params: QuadrotorParams) -> bool:
+    """Tells if `_native.actuated_derivatives` is that of a vehicle."""
+    lags = params.motor_time_constant > 0.0 and params.rate_time_constant > 0.0
+    constant = params.battery_sag == 0.0 and params.ground_effect == 0.0
+    return params.model != "rotors" and lags and constant
+
+
+def native_vehicle(params: QuadrotorParams, wind: Sequence[float] = (0.0, 0.0, 0.0)) -> dict:
+    """Returns the numbers of a vehicle among `_native.FLIGHT_PARAMETERS`, by name."""
+    motor, lag = params.motor_time_constant, params.rate_time_constant
+    names = ("drag", "gravity", "thrust_scale", "min_thrust", "max_thrust", "max_tilt_rate")
+    values = {name: getattr(params, name) for name in (*names, "max_yaw_rate")} | {
+        "rate_gain": 1.0 / lag,
+        "yaw_rate_gain": 1.0 / (lag * params.yaw_time_ratio),
+        "motor_gain": 1.0 / motor if motor else 0.0,
+    }
+    axes = {"rotor_drag": params.rotor_drag, "quadratic": params.quadratic_drag, "wind": wind}
+    for name, axis in axes.items():
+        values |= {f"{name}_{k}": value for k, value in zip("xyz", axis, strict=True)}
+    return values
 
 
 def lift_factor(z: Any, charge: Any, params: QuadrotorParams) -> Any:
@@ -476,8 +503,13 @@ def QuadrotorPlant_(T):
             vector = context.get_continuous_state_vector()
             inputs, native = self.get_cache_entry(self._inputs_index).Eval(context)
             if native:
-                rates = np.empty(13)
-                _native.quadrotor_derivatives(vector.CopyToVector(), *native, derivatives=rates)
+                rates, state = np.empty(self._size), vector.CopyToVector()
+                if self._ideal:
+                    _native.quadrotor_derivatives(state, *native, derivatives=rates)
+                else:
+                    _native.actuated_derivatives(state, *native, derivatives=rates)
+                    params = inputs[1]
+                    rates[13] = charge_rate(params.thrust_scale * state[14], params)
                 if not math.isnan(rates[3]):  # as of a quaternion of zeros
                     return rates
             # Python floats, one by one: several times faster than arrays of numpy.
@@ -507,7 +539,13 @@ def QuadrotorPlant_(T):
             if not self._ideal:
                 command = limit_command(command, params)
             native = ()
-            if T is float and self._ideal and parameters[1] and wind is disturbance is None:
+            if T is not float or disturbance is not None:
+                pass
+            elif not self._ideal and knows_natively(params):
+                numbers = dict.fromkeys(_native.FLIGHT_PARAMETERS, 0.0)
+                numbers |= native_vehicle(params, (0.0,) * 3 if wind is None else wind)
+                native = np.array(command), np.array([*numbers.values()])
+            elif self._ideal and parameters[1] and wind is None:
                 native = np.array(command), *parameters
             inputs.set_value(((command, *parameters, wind, disturbance), native))
 

@@ -14,7 +14,10 @@ from scipy.spatial.transform import Rotation
 from splatpilot.systems.vehicle.quadrotor import (
     QuadrotorParams,
     QuadrotorPlant,
+    actuated_derivatives,
     hover_state,
+    knows_natively,
+    limit_command,
     mix,
     quadrotor_derivatives,
     torques,
@@ -183,6 +186,20 @@ def test_conversions_keep_the_equations(params):
     ]
     scale = 1e-6 * np.abs(ExtractGradient(dual)).max()
     np.testing.assert_allclose(ExtractGradient(dual), np.transpose(differences), atol=scale)
+
+
+def test_native_derivatives_are_those_of_the_equations():
+    params = replace(LAGS, battery_sag=0.0, ground_effect=0.0)
+    plant, wind, command = QuadrotorPlant(params), [1.0, -2.0, 0.5], [30.0, 9.0, -1.0, 0.3]
+    whole = plant.CreateDefaultContext().get_continuous_state_vector().CopyToVector()
+    assert knows_natively(params)
+    for seed in range(5):
+        state = random_state(seed)
+        found = derivatives_at(plant, state, command, wind)
+        expected = actuated_derivatives(
+            [*state, *whole[13:]], limit_command(command, params), params, wind
+        )
+        np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-13)
 
 
 def test_numbers_and_lists_are_parameters_of_the_context():
