@@ -18,7 +18,7 @@ from splatpilot.systems.common.drake import vector_output
 from splatpilot.systems.common.validation import Config, bounded, require_field
 from splatpilot.systems.messaging import codecs
 from splatpilot.systems.messaging.lcm_ports import DEFAULT_URL, open_lcm
-from splatpilot.systems.messaging.receiver import UdpConfig, UdpInbox
+from splatpilot.systems.messaging.receiver import Inbox, UdpConfig, UdpInbox
 from splatpilot.systems.px4.commander import Px4Commander, Px4CommanderConfig
 from splatpilot.systems.px4.mavlink import OFFBOARD, Mavlink
 from splatpilot.systems.px4.motion_capture import MotionCaptureConfig, MotionCaptureReceiver
@@ -58,7 +58,7 @@ class Px4Config(Config):
 
 
 def BuildPx4Diagram(
-    config: Px4Config, lcm: LCM, inbox: UdpInbox | LogInbox, now: Callable[[], float] | None = None
+    config: Px4Config, lcm: LCM, inbox: Inbox, now: Callable[[], float] | None = None
 ) -> Diagram:
     """Builds the diagram between the bridge's messages and PX4. It replaces `BuildVehicleDiagram`,
     except for images, which sensors send themselves.

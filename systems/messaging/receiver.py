@@ -8,7 +8,7 @@ import struct
 import weakref
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
-from typing import Any, Self, cast
+from typing import Any, Protocol, Self, cast
 
 import numpy as np
 from pydrake.common.value import Value
@@ -144,6 +144,16 @@ def _is_address(address: str) -> bool:
     except OSError:
         return False
     return True
+
+
+class Inbox(Protocol):
+    """Source of packets, and their way back."""
+
+    port: int
+
+    def send(self, packet: bytes, address: tuple[str, int]) -> None: ...
+
+    def receive(self) -> tuple[list[bytes], int]: ...
 
 
 class UdpInbox:

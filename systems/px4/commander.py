@@ -11,7 +11,7 @@ from splatpilot.systems.common.drake import optional_input, vector_input
 from splatpilot.systems.common.validation import Config, bounded, require_field
 from splatpilot.systems.messaging.generated import lcmt_bridge_status as status
 from splatpilot.systems.messaging.lcm_ports import PUBLISH_OFFSET, SAME_TIME
-from splatpilot.systems.messaging.receiver import UdpInbox
+from splatpilot.systems.messaging.receiver import Inbox
 from splatpilot.systems.px4.mavlink import HOLD, LAND, OFFBOARD, Mavlink
 from splatpilot.systems.px4.telemetry import HEARTBEAT_TIMEOUT
 
@@ -101,7 +101,7 @@ class Px4Commander(LeafSystem):
     def __init__(
         self,
         config: Px4CommanderConfig,
-        inbox: UdpInbox,
+        inbox: Inbox,
         mavlink: Mavlink,
         address: tuple[str, int],
         gravity: float,

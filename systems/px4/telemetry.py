@@ -9,7 +9,7 @@ import numpy as np
 from pydrake.systems.framework import Context
 
 from splatpilot.systems.messaging.lcm_ports import PUBLISH_OFFSET
-from splatpilot.systems.messaging.receiver import RESTART, Received, Receiver, UdpInbox
+from splatpilot.systems.messaging.receiver import RESTART, Inbox, Received, Receiver
 from splatpilot.systems.px4 import mavlink
 from splatpilot.systems.vehicle.quadrotor import hover_state
 from splatpilot.systems.vehicle.state import QuadrotorState, predict_state
@@ -153,7 +153,7 @@ class Px4Telemetry(Receiver[_Telemetry]):
 
     def __init__(
         self,
-        inbox: UdpInbox,
+        inbox: Inbox,
         link: mavlink.Mavlink,
         address: tuple[str, int],
         period: float,

@@ -9,6 +9,7 @@ import yaml
 from px4_stand_in import OFFBOARD, Px4StandIn
 from pydrake.systems.analysis import Simulator
 
+from splatpilot.diagrams.flight.policies import policy_named
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.hardware.bridge import BuildHardwareDiagram, HardwareConfig
 from splatpilot.diagrams.hardware.px4 import BuildPx4Diagram, Px4Config
@@ -38,6 +39,7 @@ def test_compose_sets_the_parameters_of_the_page():
 def test_the_stand_in_takes_off_and_flies(monkeypatch):
     monkeypatch.chdir(FILES)
     scenario = load_config(Scenario(), Path("scenario.yaml"))
+    scenario.policy = policy_named("straight", 1.5)  # is faster than the planner
     hardware = load_config(HardwareConfig(tick=0.01), Path("hardware.yaml"))
     world, memory = make_world(scenario.world, scenario.seed), lcm.LCM("memq://")
     px4, inbox = Px4StandIn("1.18", [0.0, 0.0, 0.0]), UdpInbox(UdpConfig(port=0))
