@@ -106,7 +106,8 @@ def wall_seconds(call: Callable[[], object], repeats: int = 1) -> float:
 
 def machine() -> str:
     """Describes the machine and the software."""
-    lines = Path("/proc/cpuinfo").read_text().splitlines()
+    cpuinfo = Path("/proc/cpuinfo")  # not on macOS
+    lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
     models = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
     torch = import_module("torch") if util.find_spec("torch") else None
     with_torch = f", torch {torch.__version__}" if torch else ""

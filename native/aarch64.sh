@@ -39,8 +39,7 @@ if [ ! -e "$work/system/usr/bin/python3.13" ]; then
   for package in "$apt"/cache/archives/*.deb; do dpkg-deb --extract "$package" "$work/system"; done
 fi
 
-# Packages of the tests, without scikit-fmm, which only flights need and which has no wheel for
-# aarch64. Later versions of PyTorch need CUDA there.
+# Packages of the tests. Later versions of PyTorch need CUDA there.
 if [ ! -e "$work/site/torch" ]; then
   "$python" -m uv pip install --quiet --target "$work/site" --only-binary :all: \
     --python-platform aarch64-manylinux_2_40 --python-version 3.13 \

@@ -210,6 +210,12 @@ def grid_distances(*, grid: Annotated[NDArray[numpy.float32], dict(shape=(None, 
     NaN with a gradient of zero.
     """
 
+def travel_times(*, front: Annotated[NDArray[numpy.float64], dict(shape=(None, None, None), order='C', device='cpu', writable=False)], speed: Annotated[NDArray[numpy.float64], dict(shape=(None, None, None), order='C', device='cpu', writable=False)], blocked: Annotated[NDArray[numpy.bool_], dict(shape=(None, None, None), order='C', device='cpu', writable=False)], voxel_size: float, times: Annotated[NDArray[numpy.float64], dict(shape=(None, None, None), order='C', device='cpu')]) -> None:
+    """
+    Writes the times at which a front from the zeros of the distances `front` arrives at each
+    voxel, at most at `speed` and around blocked voxels; infinity where it does not arrive.
+    """
+
 def descend(*, times: Annotated[NDArray[numpy.float32], dict(shape=(None, None, None), order='C', device='cpu', writable=False)], lower_W: Annotated[NDArray[numpy.float64], dict(shape=(3), order='C', device='cpu', writable=False)], voxel_size: float, p_WG: Annotated[NDArray[numpy.float64], dict(shape=(3), order='C', device='cpu', writable=False)], p_WQ: Annotated[NDArray[numpy.float64], dict(shape=(3), order='C', device='cpu', writable=False)], step: float, length: float, path: Annotated[NDArray[numpy.float64], dict(shape=(None, 4), order='C', device='cpu')]) -> int:
     """
     Writes points and the length up to them, rows (4,), down the gradient of `times` from

@@ -4,6 +4,7 @@
 #include <optional>
 
 #include "bindings/casting_bindings.hpp"
+#include "fields/fast_marching.hpp"
 #include "fields/grid_distance.hpp"
 
 #define SIMD_LEVEL baseline
@@ -12,6 +13,7 @@
 namespace splatpilot {
 namespace {
 
+using Volume = Doubles<nb::ndim<3>>;
 using PathRows = Array<double, nb::shape<-1, 4>>;
 using GridShapes = Array<const int64_t, nb::shape<-1, 3>>;
 using Vector = SIMD_LEVEL::Vector3<double>;
@@ -87,6 +89,20 @@ void grid_distances(const Grid& grid, const Point& lower_W, const Point& upper_W
   }
 }
 
+void travel_times(const Volume& front, const Volume& speed,
+                  const Array<const bool, nb::ndim<3>>& blocked, double voxel_size,
+                  const Array<double, nb::ndim<3>>& times) {
+  int64_t shape[3];
+  for (size_t k = 0; k < 3; ++k) {
+    shape[k] = static_cast<int64_t>(front.shape(k));
+    require(speed.shape(k) == front.shape(k) && blocked.shape(k) == front.shape(k) &&
+                times.shape(k) == front.shape(k),
+            "front, speeds, blocked cells and times differ in shape");
+  }
+  const nb::gil_scoped_release release;
+  FastMarching(shape, voxel_size, front.data(), speed.data(), blocked.data(), times.data()).march();
+}
+
 double length(const Vector& a) { return std::sqrt(dot(a, a)); }
 Vector divided(const Vector& a, double s) { return {a.x / s, a.y / s, a.z / s}; }
 // Zero stays zero.
@@ -147,6 +163,11 @@ void bind_grids(nb::module_& m) {
         "Writes the distances (N,) at N points and their gradients (N, 3): between the centers of\n"
         "voxels the trilinear interpolant of the grid; outside, minus the distance to the box, or\n"
         "NaN with a gradient of zero.");
+  m.def(
+      "travel_times", &travel_times, nb::kw_only(), "front"_a, "speed"_a, "blocked"_a,
+      "voxel_size"_a, "times"_a,
+      "Writes the times at which a front from the zeros of the distances `front` arrives at each\n"
+      "voxel, at most at `speed` and around blocked voxels; infinity where it does not arrive.");
   m.def("descend", &descend, nb::kw_only(), "times"_a, "lower_W"_a, "voxel_size"_a, "p_WG"_a,
         "p_WQ"_a, "step"_a, "length"_a, "path"_a,
         "Writes points and the length up to them, rows (4,), down the gradient of `times` from\n"

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import cv2
 
-_LIBRARIES = "drake", "numpy", "scipy", "scikit-fmm", "torch", "onnx"
+_LIBRARIES = "drake", "numpy", "scipy", "torch", "onnx"
 _FOLDERS = "splatpilot", "native", "systems", "diagrams", "training", "analysis"
 _SUFFIXES = ".py", ".yaml", ".cpp", ".hpp", ".npz"  # with the weights that ship
 

@@ -158,13 +158,17 @@ def time_of_arrival(
     sphere = to_goal <= start
     speed = np.where(sphere, 1.0 / goal_slowness, 1.0 / slowness(field.distances))
     blocked = (field.distances < VEHICLE_RADIUS + margin) & ~sphere
-    front = np.ma.MaskedArray(to_goal - start, mask=blocked)
-    import skfmm  # no wheels for ARM, which can do everything but plan
-
-    marched = skfmm.travel_time(front, speed, dx=field.voxel_size, order=2)
-    reachable = ~np.ma.getmaskarray(marched)
+    marched = np.empty(speed.shape)
+    _native.travel_times(
+        front=to_goal - start,
+        speed=speed,
+        blocked=blocked,
+        voxel_size=field.voxel_size,
+        times=marched,
+    )
+    reachable = np.isfinite(marched) | sphere
     times = np.where(sphere, to_goal, start) * goal_slowness
-    times += np.where(sphere, 0.0, np.ma.getdata(marched))
+    times += np.where(sphere | ~reachable, 0.0, marched)
     if not reachable.all():
         nearest = distance_transform_edt(~reachable, return_distances=False, return_indices=True)
         assert isinstance(nearest, np.ndarray)  # (3, nx, ny, nz) int32, for type checkers

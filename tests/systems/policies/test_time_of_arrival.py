@@ -3,6 +3,7 @@ import copy
 import numpy as np
 import pytest
 
+from splatpilot import _native
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.policies.time_of_arrival import slowness, time_of_arrival
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
@@ -24,6 +25,20 @@ def test_is_the_distance_in_open_space(voxel_size):
     error = toa.value(p_WQ) - np.linalg.norm(p_WQ - p_WG, axis=1)
     assert np.abs(error).max() < voxel_size
     assert np.abs(error).mean() < 0.35 * voxel_size
+
+
+def test_travel_times_are_those_of_scikit_fmm():
+    skfmm = pytest.importorskip("skfmm")
+    rng = np.random.default_rng(0)
+    for shape in [(24, 18, 11), (1, 30, 30), (9, 1, 2)]:
+        cells = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1)
+        front = 0.3 * np.linalg.norm(cells - rng.uniform(0.2, 0.8, 3) * shape, axis=-1) - 0.3
+        speed = rng.uniform(0.05, 1.0, shape)
+        blocked = (rng.random(shape) < 0.3) & (front > 0.3)
+        expected = skfmm.travel_time(np.ma.MaskedArray(front, blocked), speed, dx=0.3, order=2)
+        times = np.empty(shape)
+        _native.travel_times(front=front, speed=speed, blocked=blocked, voxel_size=0.3, times=times)
+        np.testing.assert_array_equal(times, np.ma.filled(expected, np.inf))
 
 
 def test_goes_around_a_wall(half_wall):
