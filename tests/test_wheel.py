@@ -35,7 +35,9 @@ def environment(distributions, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("environment")
     python = folder / "bin" / "python"
     subprocess.run([*UV, "venv", "--clear", "--python", sys.executable, folder], check=True)
-    subprocess.run([*UV, "pip", "install", "--python", python, distributions[1]], check=True)
+    subprocess.run(
+        [*UV, "pip", "install", "--no-build", "--python", python, distributions[1]], check=True
+    )
     return folder
 
 

@@ -134,7 +134,7 @@ class FastMarching {
     values_[count_++] = second < kNever ? (1.0 / 3.0) * (4.0 * first - second) : first;
   }
 
-  // The later root of the sum of the terms in `mask`; if there is none, the earliest with fewer.
+  // The later root of the sum of the terms in `mask`; without a root, the earliest with fewer.
   double solve(unsigned mask, double squared_slowness) const {
     double a = 0.0, b = 0.0, c = 0.0;
     for (int k = 0; k < count_; ++k) {
