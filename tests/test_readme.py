@@ -27,6 +27,10 @@ def test_its_python_runs(tmp_path):
         flown = subprocess.run(
             [sys.executable, script], cwd=tmp_path, capture_output=True, text=True, check=True
         )
+    command = re.search(r"splatpilot (--import my_policy fly .*)", README.read_text())
+    assert command is not None
+    words = [*command[1].split(), "--set", "timeout=1", "--out", "flight"]
+    subprocess.run([sys.executable, "-m", "splatpilot", *words], cwd=tmp_path, check=True)
     summary = ast.literal_eval(flown.stdout)
     assert summary["outcome"] in set(Outcome) and summary["path_length_m"] > 1.0
 

@@ -17,7 +17,7 @@ from pydrake.systems.framework import (
 from pydrake.systems.primitives import ConstantVectorSource
 
 from splatpilot.diagrams.flight.policies import POLICIES
-from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.flight.scenario import Scenario, policy_rate
 from splatpilot.diagrams.flight.sensors import SENSORS, SensorConfig, make_onboard_camera
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.esdf_collision import EsdfCollision
@@ -305,7 +305,7 @@ def decision_period(scenario: Scenario, policy: System) -> float:
     update = policy.GetUniquePeriodicDiscreteUpdateAttribute()
     if update is not None:
         return update.period_sec()
-    return 1 / (getattr(policy, "rate", None) or scenario.policy.rate)
+    return 1 / (getattr(policy, "rate", None) or policy_rate(scenario.policy))
 
 
 def onboard_sensors(scenario: Scenario, policy: System | None = None) -> dict[str, SensorConfig]:

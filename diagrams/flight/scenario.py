@@ -251,9 +251,14 @@ def _check_free(world: World, what: str, p_WQ: np.ndarray, radius: float) -> Non
         )
 
 
+def policy_rate(config: object) -> float:
+    """Returns the `rate` [Hz] of a policy's configuration, or 15 Hz if it has none."""
+    return getattr(config, "rate", 15.0)
+
+
 def _check_rates(scenario: Scenario) -> None:
     """Checks the times of estimator and exposure against those of the policy."""
-    rate, estimates = scenario.policy.rate, getattr(scenario.estimator, "rate", inf)
+    rate, estimates = policy_rate(scenario.policy), getattr(scenario.estimator, "rate", inf)
     remedy = "a policy needs an estimate at each update"
     require(estimates >= rate, "estimator.rate", f"at least {rate:g} Hz", estimates, remedy)
     period = 1.0 / max([rate, *scenario.observation.frame_rate])

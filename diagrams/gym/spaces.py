@@ -4,7 +4,7 @@ The heading frame H has its origin in the vehicle, z up and x above the body's x
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
@@ -17,7 +17,14 @@ from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.gym.rewards import Reward, Transition
 from splatpilot.diagrams.scenarios import scenario_file
 from splatpilot.systems.common.config import load_config
-from splatpilot.systems.common.validation import MAX_SEED, Config, bounded, require, require_field
+from splatpilot.systems.common.validation import (
+    MAX_SEED,
+    Config,
+    bounded,
+    require,
+    require_field,
+    unknown,
+)
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.vehicle.quadrotor import GRAVITY
 from splatpilot.systems.vehicle.state import QuadrotorState
@@ -283,11 +290,12 @@ def find_scenario(scenario: Scenario | str | Path) -> Scenario:
     return load_config(Scenario(), scenario_file(str(scenario)))
 
 
-def env_config(scenario: Scenario | str | Path, **fields: Any) -> FlightEnvConfig:
+def env_config(scenario: Scenario | str | Path, **arguments: Any) -> FlightEnvConfig:
     """Returns the valid configuration of an environment of a scenario, see `find_scenario`."""
-    known = {name for name in FlightEnvConfig.__dataclass_fields__ if name != "scenario"}
-    for name in fields:
-        require(name in known, "argument", f"one of {', '.join(sorted(known))}", repr(name))
-    config = FlightEnvConfig(find_scenario(scenario), **fields)
+    known = [each.name for each in fields(FlightEnvConfig)[1:]]
+    for name in arguments:
+        if name not in known:
+            raise ValueError(unknown("argument", name, known))
+    config = FlightEnvConfig(find_scenario(scenario), **arguments)
     config.validate()
     return config

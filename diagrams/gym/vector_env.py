@@ -32,7 +32,7 @@ from splatpilot.diagrams.gym.spaces import (
 )
 from splatpilot.diagrams.gym.world_pool import PACK, WorldPool, require_supported
 from splatpilot.diagrams.worlds.world import World
-from splatpilot.systems.common.validation import MAX_SEED, require
+from splatpilot.systems.common.validation import MAX_SEED, require, require_type
 from splatpilot.systems.sensing.latency import CYCLE
 from splatpilot.systems.splats.baked_scene import BatchRenderer
 from splatpilot.systems.splats.splat_camera import color_pixels, ranged_depth
@@ -84,6 +84,7 @@ class VectorFlightEnv(VectorEnv):
         pool: WorldPool | None = None,
         **fields: Any,
     ) -> None:
+        require_type(num_envs, int, "num_envs", "name the scenario: scenario=...")
         require(num_envs >= 1, "num_envs", "at least 1", num_envs)
         known = "rgb_array or None"
         require(render_mode in (None, "rgb_array"), "render_mode", known, repr(render_mode))

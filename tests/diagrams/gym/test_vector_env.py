@@ -291,7 +291,7 @@ def test_delayed_decisions_come_late(post_world):
         ({"observation": ["imu_gyro"]}, "observation must be one of state"),
         ({"num_envs": 0}, "num_envs must be at least 1"),
         ({"render_mode": "human"}, "render_mode must be rgb_array or None"),
-        ({"speed": 2.0}, "argument must be one of"),
+        ({"speed": 2.0}, "there is no argument .speed."),
     ],
 )
 def test_invalid_arguments_are_errors(fields, message, post_world):
