@@ -208,7 +208,7 @@ def _scenes() -> list[Finding]:
     scenarios = {name: s for name, s in loaded.items() if isinstance(s.world, SceneSource)}
     absent = absent_scenes(scenarios)
     present = ", ".join(name for name in scenarios if name not in absent)
-    found = f"{scenes_folder()} has those of {present or 'no scenario'}"
+    found = f"{present or 'no scenario'} can be flown from {scenes_folder()}"
     if not absent:
         return [Finding("scenes", found)]
     remedy = f"splatpilot library make, or export {SCENES}=FOLDER of scenes"
