@@ -277,8 +277,7 @@ void derivatives(const Doubles<nb::shape<kStateSize>>& state, const Doubles<nb::
 }
 
 // The state has the charge, whose rate is not written, before the thrust over mass.
-void actuated(const Doubles<nb::shape<kStateSize + 2>>& state,
-              const Doubles<nb::shape<4>>& command,
+void actuated(const Doubles<nb::shape<kStateSize + 2>>& state, const Doubles<nb::shape<4>>& command,
               const Doubles<nb::shape<kFlightParameters>>& parameters,
               const Array<double, nb::shape<kStateSize + 2>>& rates) {
   double lagged[kStateSize + 1], derivatives[kStateSize + 1];

@@ -147,7 +147,7 @@ def _is_address(address: str) -> bool:
 
 
 class Inbox(Protocol):
-    """Source of packets, and their way back."""
+    """Receives packets, and sends some back."""
 
     port: int
 
