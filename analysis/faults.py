@@ -232,9 +232,7 @@ class Relay:
         if random.random() > fault.fraction or not is_affected:
             return unchanged
         match fault.kind:
-            case "link_off" | "state_off" | "state_dropped":
-                return []
-            case "dropped" | "body_dropped" | "grid_dropped":
+            case kind if kind == "dropped" or kind.endswith(("_dropped", "_off")):
                 return []
             case "delayed" | "state_delayed":
                 return [(DELAY, data)]

@@ -1,7 +1,7 @@
 """Scenes to download: measured scenes, packed into a folder that any file server can offer.
 
-`scenes.json` has, by name, what is known of each scene, and the size and digest of its files. Their
-folder, of the scene's name, is a scene folder too.
+`scenes.json` has, by name, the license of each scene, and the size and digest of its files. They are
+in a folder of that name, which is a scene folder too.
 """
 
 import json
@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from splatpilot.analysis.environments import INDEX, read_index
+from splatpilot.analysis.environments import INDEX, Record, read_index
 from splatpilot.diagrams.worlds.scene_folder import (
     ENVIRONMENT,
     ESDF,
@@ -52,13 +52,9 @@ class PackedFile:
 
 @dataclass(frozen=True)
 class PackedScene:
-    """A scene in `LIST`; for units see `environments.Record`."""
+    """A scene in `LIST`."""
 
     license: str
-    split: str
-    size: list[float]
-    gaussians: int
-    psnr_db: float | None
     files: dict[str, PackedFile]
 
 
@@ -79,23 +75,23 @@ def pack(*, names: Sequence[str], scenes: Path, out: Path) -> dict[str, PackedSc
     for name in Progress(names, "packing", unit="scene"):
         record = records[name]
         with folder_written_atomically(out / name, replace=True) as folder:
-            _pack(scenes / name, folder, record.source)
+            _pack(scenes / name, folder, record)
             files = {
                 file.name: PackedFile(file.stat().st_size, sha256(file.read_bytes()).hexdigest())
                 for file in sorted(folder.iterdir())
             }
-        known = record.license, record.split, record.size, record.gaussians, record.psnr_db
-        listed[name] = PackedScene(*known, files)
+        listed[name] = PackedScene(record.license, files)
         with written_atomically(out / LIST) as partial:
             content = {each: asdict(scene) for each, scene in sorted(listed.items())}
             partial.write_text(json.dumps(content, indent=1))
     return {name: listed[name] for name in names}
 
 
-def _pack(scene: Path, folder: Path, source: str) -> None:
+def _pack(scene: Path, folder: Path, record: Record) -> None:
     metadata = read_scene_metadata(scene)
     # The capture stays where it is.
-    made_of = metadata.provenance.replace(metadata.capture or source, source)
+    made_of = metadata.provenance.replace(metadata.capture or record.source, record.source)
+    made_of += f"; license {record.license}"
     write_scene_metadata(folder, replace(metadata, capture="", provenance=made_of))
     write_splats(read_gaussians(scene), folder / PACKED_GAUSSIANS)
     esdf = Esdf.load(scene / ESDF)

@@ -10,7 +10,7 @@ import numpy as np
 
 from splatpilot.systems.common.extras import import_extra
 
-_PERIOD = 0.0195  # [s] Min time between messages of a type: streams of 50 Hz, and jitter.
+_PERIOD = 0.0195  # [s] Minimum time between messages of a type: streams of 50 Hz, and jitter.
 _MODES = {4: (4, 3), 14: (6, 0), 18: (4, 6)}  # nav_state of hold, offboard and land.
 _OTHER = (1, 0)  # Manual, for all modes that no part of this program knows.
 _ARMED, _CUSTOM_MODE = 128, 1  # MAV_MODE_FLAGs

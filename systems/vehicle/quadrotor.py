@@ -539,13 +539,12 @@ def QuadrotorPlant_(T):
             if not self._ideal:
                 command = limit_command(command, params)
             native = ()
-            if T is not float or disturbance is not None:
-                pass
-            elif not self._ideal and knows_natively(params):
+            plain = T is float and disturbance is None
+            if plain and not self._ideal and knows_natively(params):
                 numbers = dict.fromkeys(_native.FLIGHT_PARAMETERS, 0.0)
                 numbers |= native_vehicle(params, (0.0,) * 3 if wind is None else wind)
                 native = np.array(command), np.array([*numbers.values()])
-            elif self._ideal and parameters[1] and wind is None:
+            elif plain and self._ideal and parameters[1] and wind is None:
                 native = np.array(command), *parameters
             inputs.set_value(((command, *parameters, wind, disturbance), native))
 

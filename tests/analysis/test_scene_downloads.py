@@ -86,7 +86,7 @@ def test_packed_scene_is_got_from_a_server_and_is_the_same_scene(scenes, world, 
     assert (lower >= 0).all() and lower.max() <= 1e-3
     assert isinstance(found.background, EnvironmentMap)
     metadata = read_scene_metadata(got / "shed")
-    assert metadata.provenance == "TUM sequence worlds/shed.glb, 9 frames"
+    assert metadata.provenance == "TUM sequence worlds/shed.glb, 9 frames; license MIT-0"
     assert str(tmp_path) not in (got / "shed/scene.yaml").read_text()
     # Again, and from the folder itself: nothing is written.
     before = (got / "shed").stat().st_mtime_ns
