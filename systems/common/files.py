@@ -15,7 +15,6 @@ import re
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +24,7 @@ DATA = "SPLATPILOT_DATA"
 SCENES = "SPLATPILOT_SCENES"
 """Environment variable with the folder of scenes."""
 
-SHIPPED_SCENES = Path(str(resources.files("splatpilot"))) / "scenes"
+SHIPPED_SCENES = Path(__file__).parents[2] / "scenes"
 """The folder of the scenes of this package."""
 
 _HOST = re.sub(r"[^\w-]", "-", platform.node()) or "host"
