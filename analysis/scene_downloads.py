@@ -1,7 +1,7 @@
 """Scenes to download: measured scenes, packed into a folder that any file server can offer.
 
-`scenes.json` has the license of each scene by name, and the size and digest of its files. They are in
-a folder of that name, which is a scene folder too.
+`scenes.json` has the license of each scene by name, and the size and digest of its files. These are
+in a folder of that name, which is a scene folder too.
 """
 
 import json
