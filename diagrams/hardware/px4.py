@@ -159,8 +159,10 @@ def run(*, config: Px4Config, duration: float = np.inf, log: Path | None = None)
                 silence = f"{silences * REMINDER:g} s at {address}"
                 print(f"{now:8.2f} s: no heartbeat for {silence}", flush=True)
             reminders = silences
-            ages.append(vector_output(diagram, "state_age", root)[0])
-            return now >= duration or (isinstance(inbox, LogInbox) and inbox.is_over)
+            if isinstance(inbox, LogInbox):
+                ages.append(vector_output(diagram, "state_age", root)[0])
+                return inbox.is_over
+            return now >= duration
 
         run_in_real_time(simulator, diagram, config.tick, over)
         if isinstance(inbox, LogInbox):
