@@ -1,0 +1,101 @@
+"""Exports the network of a policy as ONNX, for other programs and processors.
+
+python -m splatpilot.training.policies.export distilled_rgb out/distilled_rgb.onnx
+
+The module of the policy in `systems/policies` defines its inputs and its command.
+"""
+
+import argparse
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from splatpilot.systems.common.files import written_atomically
+from splatpilot.systems.policies import student
+from splatpilot.systems.policies.agile_autonomy import AGILE_NETWORK, STATE_SIZE
+from splatpilot.systems.policies.checkpoint import (
+    PolicyCheckpoint,
+    checkpoint_policy,
+    shipped_weights,
+)
+from splatpilot.systems.policies.depthnav import DEPTHNAV_NETWORK
+from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK
+from splatpilot.systems.policies.diffaero_rgb import CHANNELS, HEIGHT, WIDTH
+from splatpilot.training.policies.networks import (
+    TrainableNetwork,
+    TrajectoryModule,
+    load_weights,
+)
+from splatpilot.training.policies.student_network import StudentModule
+from splatpilot.training.policies.train_distilled_rgb import DistilledRgbModule
+
+_RECURRENT = {
+    "diffaero": DIFFAERO_NETWORK,
+    "diffaero_tof": DIFFAERO_NETWORK,
+    "depthnav": DEPTHNAV_NETWORK,
+}
+
+
+class _Distilled(nn.Module):
+    """Both networks of `distilled_rgb`, from a view to an output."""
+
+    def __init__(self, networks: DistilledRgbModule) -> None:
+        super().__init__()
+        self.networks = networks
+
+    def forward(self, view: Tensor, state: Tensor, hidden: Tensor) -> tuple[Tensor, Tensor]:
+        image, _ = self.networks.see(view, bfloat16=False)
+        return self.networks.policy(image, state, hidden)
+
+
+def export(weights: Path, out: Path) -> None:
+    """Writes the network of a file of weights to an ONNX file, for one image at a time.
+
+    Inputs are `image`, `state` and, with memory, `hidden`; outputs are `output` and the next
+    hidden state, or `waypoints` and `costs`. Raises ValueError for a policy without an export.
+    """
+    policy = checkpoint_policy(weights)
+    if policy in _RECURRENT:
+        spec = _RECURRENT[policy]
+        module = TrainableNetwork(spec)
+        load_weights(module, PolicyCheckpoint.load(weights, policy, spec))
+        sizes = [spec.image_size()[1:], (spec.state_size,), (spec.hidden_size,)]
+    elif policy == "distilled_rgb":
+        module = _Distilled(DistilledRgbModule(str(weights)))
+        spec = module.networks.spec.policy
+        sizes = [(CHANNELS, HEIGHT, WIDTH), (spec.state_size,), (spec.hidden_size,)]
+    elif policy == "agile_autonomy":
+        spec = AGILE_NETWORK
+        module = TrajectoryModule(spec)
+        load_weights(module, PolicyCheckpoint.load(weights, policy, spec))
+        sizes = [spec.image_size()[1:], (STATE_SIZE,)]
+    elif policy in ("student_rgb", "student_depth"):
+        checkpoint = student.load_checkpoint(str(weights), policy.removeprefix("student_"))
+        spec = checkpoint.spec
+        module = StudentModule(spec)
+        load_weights(module, checkpoint)
+        sizes = [(3, spec.height, spec.width), (student.STATE_SIZE,)]
+    else:
+        raise ValueError(f"{weights}: the policy {policy!r} has no export")
+    recurrent = len(sizes) == 3
+    with written_atomically(out) as partial:
+        torch.onnx.export(
+            module.eval(),
+            tuple(torch.zeros(1, *size) for size in sizes),
+            partial,
+            input_names=["image", "state", "hidden"][: len(sizes)],
+            output_names=["output", "next_hidden"] if recurrent else ["waypoints", "costs"],
+            dynamo=True,
+            external_data=False,
+            verbose=False,
+        )
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("weights", help="file of weights, or the name of a policy that ships")
+    parser.add_argument("out", type=Path, help="ONNX file")
+    options = parser.parse_args()
+    given = Path(options.weights)
+    export(given if given.is_file() else shipped_weights(options.weights), options.out)
