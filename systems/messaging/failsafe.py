@@ -143,6 +143,7 @@ _INPUTS = {
     **{"state": 13, "measured_state": 13, "velocity_setpoint": 4, "command": 4},
     **{"state_age": 1, "observation_age": 1, "body_age": 1, "lag": 1, "policy_failed": 1},
     **{"vehicle_status": 2, "vehicle_status_age": 1, "clearance": 1, "gradient": 3},
+    "unix_time": 1,
 }
 _AGES = {
     status.STATE_OLD: "state_age",
@@ -159,7 +160,8 @@ class Failsafe(LeafSystem):
 
         name: Failsafe
         input_ports: [state, measured_state, velocity_setpoint, command, state_age, observation_age,
-            body_age, lag, policy_failed, vehicle_status, vehicle_status_age, clearance, gradient]
+            body_age, lag, policy_failed, vehicle_status, vehicle_status_age, clearance, gradient,
+            unix_time]
         output_ports: [velocity_setpoint, command, mode, state_is_known, is_ready, in_charge]
 
     - ``state``, ``measured_state`` (13 each): predicted for now, and as measured.
@@ -173,6 +175,7 @@ class Failsafe(LeafSystem):
       without them the failsafe is always in charge.
     - ``clearance`` (1) [m], ``gradient`` (3), optional: from the collision sphere to the nearest
       known obstacle, and the direction away from it; NaN and 0 if none is known.
+    - ``unix_time`` (1) [s], optional: see `UnixClock`; the Context's time stops in a lag.
     - ``mode`` (2): mode and reason, constants of ``lcmt_bridge_status``.
     - ``state_is_known`` (1): 1 if body rates can be flown by the state, which is at most 0.1 s old.
     - ``is_ready`` (1): 0 in the mode WAITING, else 1.
@@ -271,7 +274,7 @@ class Failsafe(LeafSystem):
         now, modes, signals = context.get_time(), Modes.read(context), self._signals(context)
         measured, age = optional_input(self, "measured_state", context), signals.ages
         if measured is not None and not math.isinf(age[status.STATE_OLD]):
-            time = now - age[status.STATE_OLD]
+            time = self._number("unix_time", context, now) - age[status.STATE_OLD]
             track = Track.read(context).after(measured, time, now, self._config.max_age)
             discrete_state.set_value(1, np.hstack(track))
         waits = any(map(math.isinf, age.values()))

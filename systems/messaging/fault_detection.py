@@ -82,8 +82,8 @@ _FORGETTING = 0.5  # [s] time constant with which such differences fade.
 class Track(NamedTuple):
     """The sequence of measured states, in the discrete state of a `Failsafe`."""
 
-    time: float = -math.inf  # [s] of the measurement of the last state with new content,
-    changed: float = 0.0  # [s] and of its arrival.
+    time: float = -math.inf  # [s] Unix time of the last measurement with new content,
+    changed: float = 0.0  # [s] and time of its arrival.
     jumped: float = 0.0  # 1 if it does not follow from those before.
     state: np.ndarray = np.full(13, math.nan)
     expected: np.ndarray = np.full(13, math.nan)  # state predicted by velocities and body rates.
@@ -95,7 +95,7 @@ class Track(NamedTuple):
         return cls(*vector[:3], state=vector[3:16], expected=vector[16:])
 
     def after(self, state: np.ndarray, time: float, now: float, max_gap: float) -> "Track":
-        """Adds a state (13,) that was measured at `time` [s].
+        """Adds a state (13,) that was measured at the Unix time `time` [s].
 
         It has jumped if it is not where the velocities of the states have led, or not rotated as
         their angular velocities say. Small differences fade. A jump remains one until the state

@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from failsafe_bench import LOWER, UPPER, Bench
+from failsafe_bench import LOWER, PERIOD, UPPER, Bench
 
 from splatpilot.systems.messaging.failsafe import FailsafeConfig
 from splatpilot.systems.messaging.flight_limits import FlightLimits
@@ -121,6 +121,15 @@ def test_a_state_that_jumped_is_used_again_when_it_comes_back(what):
         bench.advance(0.7, measured=path)
         assert bench.out("mode")[0] == status.FLYING
         assert bench.out("state_is_known")[0] == 1
+
+
+def test_flight_during_a_lag_of_the_process_is_not_a_jump():
+    bench = Bench(CONFIG)
+    path = moving([6.0, 0.0, 3.0], [3.0, 0.0, 0.0])
+    for lag in [0.0] * 20 + [0.25] * 20 + [0.8] * 20:
+        bench.give(unix_time=bench.tick * PERIOD + lag)
+        bench.advance(PERIOD, measured=lambda now, lag=lag: path(now + lag))
+        assert bench.mode() == (status.FLYING, status.NONE)
 
 
 def test_harsh_flight_is_not_a_jump():
