@@ -13,6 +13,7 @@
 Files are written atomically; a flight is complete if its file in `rollouts/` exists.
 """
 
+import contextlib
 import hashlib
 import inspect
 import json
@@ -33,12 +34,14 @@ from splatpilot.analysis.benchmark.variants import LIVE, SCENARIO
 from splatpilot.diagrams.flight.policies import POLICIES, weights_file
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.flight.sensors import SENSORS
+from splatpilot.diagrams.worlds.mesh_world import MeshWorld
 from splatpilot.diagrams.worlds.scene_folder import (
     CAPTURE,
     ENVIRONMENT,
     ESDF,
     FRONTIER,
     GAUSSIANS,
+    OBSERVATIONS,
     PACKED_GAUSSIANS,
     SceneSource,
     find_scene,
@@ -48,6 +51,7 @@ from splatpilot.diagrams.worlds.splits import find_test_source, part_digests
 from splatpilot.diagrams.worlds.world_registry import WORLDS
 from splatpilot.systems.common.config import dump_config, load_config, parse_config
 from splatpilot.systems.common.files import (
+    find_data,
     folder_written_atomically,
     require_writable_folder,
     written_atomically,
@@ -64,7 +68,7 @@ _REQUIRED = {
     *("min_clearance_m", "jerk_m_s3"),
 }
 """Columns of all flights that were flown."""
-_SCENE_FILES = GAUSSIANS, PACKED_GAUSSIANS, ESDF, FRONTIER, ENVIRONMENT
+_SCENE_FILES = GAUSSIANS, PACKED_GAUSSIANS, ESDF, FRONTIER, ENVIRONMENT, OBSERVATIONS
 """The files of a scene folder that flights depend on."""
 _OWN = "scenarios/"  # before the name of a scenario: label of the weights of its own policy
 _KNOWN = {"splatpilot", "__main__"} | sys.stdlib_module_names
@@ -241,7 +245,13 @@ def _keep_scene(folder: StudyFolder, world: SceneSource) -> str:
     """Copies a scene into the study, and returns its path there."""
     scene = find_scene(world)
     kept = folder.path / "scenes" / scene.name
-    if not kept.exists():
+    if kept.exists():
+        if _digest(_scene_files(kept)) != _digest(_scene_files(scene)):
+            raise ValueError(
+                f"{scene} differs from {kept}, a scene of the same name; rename it, or choose "
+                "another folder with --out"
+            )
+    else:
         if scene.is_dir():
             with folder_written_atomically(kept) as partial:
                 ignored = shutil.ignore_patterns(CAPTURE)
@@ -317,8 +327,8 @@ def kept_flights(
 
 
 def input_digests(config: StudyConfig, scenarios: dict[str, Scenario]) -> dict[str, str]:
-    """Returns digests of weights and existing scenes: by "weights of LABEL", "weights of LABEL in
-    SCENARIO" and "scene of SCENARIO"."""
+    """Returns digests of weights and existing scenes and meshes: by "weights of LABEL", "weights of
+    LABEL in SCENARIO" and "scene of SCENARIO"."""
     digests = {}
     for name, scenario in scenarios.items():
         for variant in config.variants:
@@ -331,14 +341,20 @@ def input_digests(config: StudyConfig, scenarios: dict[str, Scenario]) -> dict[s
                 file = weights_file(variant.config(config.speeds[0], scenario.policy))
                 if file is not None:
                     digests[key] = _digest([file])
-        if isinstance(scenario.world, SceneSource):
-            try:
-                scene = find_scene(scenario.world)
-            except FileNotFoundError:
-                continue
-            files = [scene / file for file in _SCENE_FILES] if scene.is_dir() else [scene]
-            digests[f"scene of {name}"] = _digest([file for file in files if file.is_file()])
+        with contextlib.suppress(FileNotFoundError):
+            if isinstance(scenario.world, SceneSource):
+                digests[f"scene of {name}"] = _digest(_scene_files(find_scene(scenario.world)))
+            elif isinstance(scenario.world, MeshWorld):
+                mesh = find_data(Path(scenario.world.path), "a mesh")
+                parts = sorted(file for file in mesh.parent.iterdir() if file.stem == mesh.stem)
+                digests[f"scene of {name}"] = _digest([file for file in parts if file.is_file()])
     return digests
+
+
+def _scene_files(scene: Path) -> list[Path]:
+    """Returns the files of a scene that flights depend on."""
+    files = [scene / file for file in _SCENE_FILES] if scene.is_dir() else [scene]
+    return [file for file in files if file.is_file()]
 
 
 def plugin_digests(scenarios: Iterable[Scenario]) -> dict[str, str]:

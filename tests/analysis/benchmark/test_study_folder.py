@@ -11,6 +11,7 @@ from splatpilot.analysis.benchmark.study import StudyConfig
 from splatpilot.analysis.benchmark.study_folder import (
     StudyFolder,
     input_digests,
+    keep_inputs,
     plugin_digests,
 )
 from splatpilot.analysis.commands.main import main
@@ -151,13 +152,42 @@ def test_own_policy_of_a_scenario_flies_and_is_kept(short_scenario, tmp_path, ca
     assert f"The policy of {short_scenario} is not flown" in capsys.readouterr().out
 
 
-def test_digest_of_a_scene_is_that_of_its_flown_files(room, tmp_path):
-    file = tmp_path / "hall.yaml"
+def scene_study(file, scene, kind: str = "SceneConfig") -> StudyConfig:
+    file.write_text(f"world: !{kind} {{path: {scene}}}\n")
+    return StudyConfig([str(file)], ["straight"], seeds=1)
 
+
+def scene_digest(config: StudyConfig) -> str:
+    (digest,) = input_digests(config, config.load_scenarios()).values()
+    return digest
+
+
+@pytest.mark.parametrize("part", ["hall.gltf", "hall.bin"])
+def test_digest_of_a_mesh_is_that_of_its_files(tmp_path, part):
+    for name in ("hall.gltf", "hall.bin"):
+        (tmp_path / name).write_text("first")
+    config = scene_study(tmp_path / "hall.yaml", tmp_path / "hall.gltf", "MeshWorld")
+    first = scene_digest(config)
+    (tmp_path / part).write_text("second")
+    assert scene_digest(config) != first
+
+
+def test_two_scenes_of_one_name_are_not_flown_as_one(room, tmp_path):
+    (tmp_path / "other").mkdir()
+    moved = room.scene("moved").rename(tmp_path / "other/hall")
+    (moved / "observations.npz").write_bytes(b"other")
+    files = [tmp_path / "first.yaml", tmp_path / "second.yaml"]
+    for file, scene in zip(files, (room.scene("hall"), moved), strict=True):
+        scene_study(file, scene)
+    config, folder = StudyConfig([str(file) for file in files], ["straight"]), tmp_path / "out"
+    StudyFolder(folder).begin(config, {})
+    with pytest.raises(ValueError, match=r"hall differs from .*scenes/hall, .*; rename it"):
+        keep_inputs(StudyFolder(folder), config, config.load_scenarios())
+
+
+def test_digest_of_a_scene_is_that_of_its_flown_files(room, tmp_path):
     def digest(scene) -> str:
-        file.write_text(f"world: !SceneConfig {{path: {scene}}}\n")
-        config = StudyConfig([str(file)], ["straight"], seeds=1)
-        return input_digests(config, config.load_scenarios())["scene of hall"]
+        return scene_digest(scene_study(tmp_path / "hall.yaml", scene))
 
     scene = room.scene("hall")
     first = digest(scene)
