@@ -304,6 +304,7 @@ class Failsafe(LeafSystem):
             np.zeros(3) if gradient is None else gradient,
             self._box,
             self._field,
+            self._vehicle.radius,
         )
         setpoint, limit = modes.setpoint(signals.setpoint, motion, near, config)
         value.set_value((setpoint, int(modes.mode), int(modes.reason) or limit))

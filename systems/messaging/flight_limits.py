@@ -59,6 +59,7 @@ class Surroundings(NamedTuple):
     gradient: np.ndarray  # (3,) direction away from that obstacle, any length; 0 if unknown.
     box: Box  # that must hold the collision sphere.
     field: Distances | None  # distances to known obstacles.
+    radius: float = VEHICLE_RADIUS  # [m] of the collision sphere.
 
 
 class Motion(NamedTuple):
@@ -110,7 +111,7 @@ def limit_velocity(
             apply(limited, status.LIMITED_CLEARANCE)
 
     # The box.
-    lower, upper = near.box.lower_W + VEHICLE_RADIUS, near.box.upper_W - VEHICLE_RADIUS
+    lower, upper = near.box.lower_W + near.radius, near.box.upper_W - near.radius
     if landing:
         lower[2] = -math.inf
     limited, rest = velocity, motion.p_WB + motion.stop
@@ -121,7 +122,7 @@ def limit_velocity(
 
     # The path, last: velocities along a fence or an obstacle may lead into another.
     if near.field is not None and not landing:
-        limited = limit_ahead(velocity, motion, near.field, limits.min_clearance)
+        limited = limit_ahead(velocity, motion, near.field, near.radius, limits.min_clearance)
         apply(limited, status.LIMITED_CLEARANCE)
     return velocity, reason
 
@@ -162,13 +163,13 @@ def limit_approach(
 
 
 def limit_ahead(
-    velocity: np.ndarray, motion: Motion, field: Distances, min_clearance: float
+    velocity: np.ndarray, motion: Motion, field: Distances, radius: float, min_clearance: float
 ) -> np.ndarray:
     """Limits a commanded velocity (3,) [m/s] by obstacles on the path: straight to the point of
     rest, and from there along the velocity. Outside of the field, where distances are NaN, the path
     is free. A vehicle that is nearer than `min_clearance` [m] may leave."""
     p, stop, reaction_time = motion
-    nearest = min(min_clearance, float(field.distance(p)) - VEHICLE_RADIUS)
+    nearest = min(min_clearance, float(field.distance(p)) - radius)
     for start, path in ((p, stop), (p + stop, velocity * reaction_time)):
         length = float(np.linalg.norm(path))
         if length < 1e-6:
@@ -176,7 +177,7 @@ def limit_ahead(
         steps = math.ceil(min(length / _STEP, _MAX_STEPS))
         along = np.linspace(0.0, length, steps + 1)  # (N,) [m]
         points = start + path * (along / length)[:, None]
-        blocked = field.distance(points) - VEHICLE_RADIUS < nearest - 1e-9
+        blocked = field.distance(points) - radius < nearest - 1e-9
         if blocked.any():
             free = along[max(int(np.argmax(blocked)) - 1, 0)]
             room = free - length if path is stop else free

@@ -1,6 +1,7 @@
 """A failsafe in closed loop: the real law, controller and dynamics, flown in steps of 20 ms."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from pydrake.systems.analysis import Simulator
@@ -34,8 +35,10 @@ class Bench:
         by: str = "body_rates",
         box=(LOWER, UPPER),
         field: DistanceField | None = None,
+        radius: float = VEHICLE.radius,
     ):
-        self.failsafe = Failsafe(config or FailsafeConfig(), LAW, VEHICLE, *box, field)
+        vehicle, self.radius = replace(VEHICLE, radius=radius), radius
+        self.failsafe = Failsafe(config or FailsafeConfig(), LAW, vehicle, *box, field)
         self.simulator = Simulator(self.failsafe)
         self.context = self.simulator.get_mutable_context()
         self.age, self.by, self.box, self.field = age, by, box, field
@@ -59,9 +62,7 @@ class Bench:
         self.give(state=state, measured_state=measured, state_age=self.age)
         if self.field is not None:
             sample = self.field.query(state[:3])
-            self.give(
-                clearance=sample.distance - quadrotor.VEHICLE_RADIUS, gradient=sample.gradient
-            )
+            self.give(clearance=sample.distance - self.radius, gradient=sample.gradient)
 
     def accelerate(self, a_WB, v_WB=None) -> None:
         """Gives setpoint and command of a policy that desires an acceleration."""
@@ -95,9 +96,9 @@ class Bench:
     def _room(self) -> float:
         """The distance [m] by which limits are kept: min_clearance, and the sphere in the box."""
         p_WB, (lower, upper) = self.state[:3], self.box
-        room = float(np.min([p_WB - lower, upper - p_WB])) - quadrotor.VEHICLE_RADIUS
+        room = float(np.min([p_WB - lower, upper - p_WB])) - self.radius
         if self.field is not None:
-            room = min(room, float(self.field.distance(p_WB)) - quadrotor.VEHICLE_RADIUS - 0.1)
+            room = min(room, float(self.field.distance(p_WB)) - self.radius - 0.1)
         return room
 
     def out(self, name: str) -> np.ndarray:

@@ -249,6 +249,14 @@ def test_limits_are_kept_if_the_policy_is_lost_on_the_way(what, moment):
     assert np.linalg.norm(bench.state[3:6]) < 0.1
 
 
+@pytest.mark.parametrize("what", ["post", "fence"])
+def test_limits_are_kept_by_the_radius_of_the_vehicle(what):
+    field, box, direction = AHEAD[what]
+    bench = Bench(None, (-3.0, 0.3, 0.0), direction, 0.02, "body_rates", box, field, radius=0.6)
+    bench.advance(3.0, desired=direction)
+    assert -1e-3 <= bench.min_room < 0.15
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_limits_are_kept_for_any_accelerations(seed):
     random = np.random.default_rng(seed)

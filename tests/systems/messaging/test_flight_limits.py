@@ -79,6 +79,6 @@ ROOM = 4.0 - 0.5 - VEHICLE_RADIUS - 0.1
 )
 def test_obstacles_ahead_limit_the_velocity(v, p, stop, limited):
     motion = Motion(np.array([p, 0.0, 0.0]), np.array([stop, 0.0, 0.0]), 1.0)
-    result = limit_ahead(np.array([v, 0.0, 0.0]), motion, FIELD, 0.1)
+    result = limit_ahead(np.array([v, 0.0, 0.0]), motion, FIELD, VEHICLE_RADIUS, 0.1)
     np.testing.assert_allclose(result, [limited, 0.0, 0.0], atol=0.06)
     assert result[0] <= max(limited, 0.1)
