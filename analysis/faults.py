@@ -29,7 +29,8 @@ from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.common.drake import vector_input, vector_output, weak_callback
 from splatpilot.systems.common.files import claim_folder, locks_folder, written_atomically
 from splatpilot.systems.common.progress import Progress
-from splatpilot.systems.common.validation import Config, bounded
+from splatpilot.systems.common.provenance import revision
+from splatpilot.systems.common.validation import Config, bounded, require
 from splatpilot.systems.messaging import codecs
 from splatpilot.systems.messaging.bridge_status import UnixClock
 from splatpilot.systems.messaging.failsafe import FailsafeConfig
@@ -350,8 +351,8 @@ def fly_trial(
         if any(f.kind in ("policy_killed", "policy_stalled") and f.is_on(now) for f in faults):
             stalled += TICK
         else:
-            bridge_simulator.AdvanceTo(now - stalled + 2 * PUBLISH_OFFSET)
             clock.set_epoch(bridge_root, stalled)
+            bridge_simulator.AdvanceTo(now - stalled + 2 * PUBLISH_OFFSET)
             mode, reason = vector_output(bridge, "status", bridge_root)[:2]
             reasons.add(int(reason))
         state = QuadrotorState.of(vector_output(vehicle, "state", root))
@@ -422,21 +423,28 @@ class FaultsConfig(Config):
 
 @locks_folder("out")
 def run(*, config: FaultsConfig, out: Path) -> dict[str, Any]:
-    """Flies the trials, or resumes an interrupted campaign of the same configuration. Writes into
-    `out`: `trials.jsonl`, results of `fly_trial`; `config.yaml`; `summary.json`, the number of safe
-    trials and the outcomes by the type of fault, which is also returned."""
+    """Flies the trials, or resumes an interrupted campaign of the same configuration and program.
+
+    Writes into `out`: `trials.jsonl`, revision and results of `fly_trial`; `config.yaml`;
+    `summary.json`, the number of safe trials and the outcomes by the type of fault, which is also
+    returned."""
     config.validate()
     claim_folder(out / "config.yaml", config)
     table = PX4_KINDS if config.table == "px4" else KINDS
     lines = out / "trials.jsonl"
     rows = [json.loads(line) for line in lines.read_text().splitlines()] if lines.exists() else []
+    flown_by = revision()
+    for row in rows if len(rows) < config.trials else ():
+        before, remedy = row.get("revision"), "go back to that revision, or choose another --out"
+        require(before == flown_by, f"revision of {lines}", flown_by, before, remedy)
     world_of_seed = cache(lambda seed: make_world(config.scenario.world, seed))
     for number in Progress(range(len(rows), config.trials), "flying trials", unit="trial"):
         world = world_of_seed(config.seed + number % config.worlds)
         trial = Trial.sample(number, np.random.default_rng([config.seed, number]), table)
         seed, policy = config.seed + number, policy_named(trial.policy, config.speed)
         scenario = replace(config.scenario, seed=seed, policy=policy)
-        rows.append(fly_trial(scenario, world, trial, config.limits, seed))
+        flown = fly_trial(scenario, world, trial, config.limits, seed)
+        rows.append({"revision": flown_by} | flown)
         with written_atomically(lines) as path:
             path.write_text("".join(json.dumps(row) + "\n" for row in rows))
     summary = summarize(rows, table)

@@ -170,7 +170,7 @@ def test_a_state_that_freezes_while_images_are_lost_ends_safely():
     assert row["min_clearance"] >= 0.09
 
 
-def test_a_campaign_is_safe_resumes_and_repeats(tmp_path, set_fields):
+def test_a_campaign_is_safe_resumes_and_repeats(tmp_path, set_fields, capsys):
     fields = set_fields(
         *("trials=2", "worlds=1", "scenario.world.length=10.0", "scenario.world.width=6.0"),
         "scenario.start_radius=0.05",
@@ -188,6 +188,9 @@ def test_a_campaign_is_safe_resumes_and_repeats(tmp_path, set_fields):
     assert (summary["trials"], summary["safe"]) == (2, 2)
     for other in ("seed=1", "trials=0"):
         assert main([*words, *set_fields(other), "--out", str(again)]) == 1
+    (again / "trials.jsonl").write_text(json.dumps(json.loads(rows[0]) | {"revision": "other"}))
+    assert main([*words, "--out", str(again)]) == 1
+    assert "revision of" in capsys.readouterr().err
 
 
 def test_accidents_are_counted():
