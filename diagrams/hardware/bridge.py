@@ -110,6 +110,9 @@ def BuildHardwareDiagram(
     cameras, period = image_codecs(scenario, policy), blocks.decision_period(scenario, policy)
     if can_be_triggered(policy):
         policy = ArrivalTriggered(policy, config.tick)
+    else:
+        name = type(policy).__name__
+        _log.warning("%s has state that is not discrete: its exceptions end the bridge", name)
     decided, failed, heading, plans = (
         policy.GetOutputPort(name) if policy.HasOutputPort(name) else None
         for name in ("decided", "failed", "heading", "hypotheses")

@@ -40,8 +40,9 @@ class ArrivalTriggered(LeafSystem):
 
     It runs no more often than at the system's rate: it skips some of faster images, by virtual
     scheduling (ITU-T I.371, the generic cell rate algorithm), and runs without an image 1.6
-    periods after the last update. An exception of the system is logged, once until the system
-    succeeds again, and its state is kept.
+    periods after the last update. A system without state, whose outputs are evaluated as they are
+    needed, counts as updated by each observation. An exception of the system is logged, once until
+    the system succeeds again, and its state is kept.
 
     .. pydrake_system::
 
@@ -61,8 +62,7 @@ class ArrivalTriggered(LeafSystem):
         super().__init__()
         self._system = system
         update = system.GetUniquePeriodicDiscreteUpdateAttribute()
-        assert update is not None
-        self._period = update.period_sec()
+        self._period = 0.0 if update is None else update.period_sec()
         declare_input_ports_like(self, system)
         self.DeclareVectorInputPort("observation_age", 1)
         default = system.CreateDefaultContext()
@@ -111,7 +111,7 @@ class ArrivalTriggered(LeafSystem):
         last, now = self._get_last(context), context.get_time()
         observed = now - float(vector_input(self, "observation_age", context)[0])
         comes, is_new = (observed > seen + _NOISE for seen in (last.looked, last.observed))
-        is_late = now >= last.time + _MAX_WAIT * self._period - 1e-6
+        is_late = self._period > 0.0 and now >= last.time + _MAX_WAIT * self._period - 1e-6
         discrete_state.set_value(self._last, np.array(last._replace(looked=observed)))
         if math.isinf(observed) or not ((comes and now >= last.due) or is_late):
             return
@@ -125,8 +125,10 @@ class ArrivalTriggered(LeafSystem):
         """Updates the system's state; returns False, and logs why, if it raises an exception."""
         inner = self._inner(context, list(range(self._system.num_input_ports())))
         try:
-            updated = self._system.EvalUniquePeriodicDiscreteUpdate(inner)
-            values = [updated.value(group) for group in range(inner.num_discrete_state_groups())]
+            values = []
+            if self._period > 0.0:
+                updated = self._system.EvalUniquePeriodicDiscreteUpdate(inner)
+                values = [updated.value(k) for k in range(inner.num_discrete_state_groups())]
             for group, value in enumerate(values):
                 inner.SetDiscreteState(group, value)
             for index in range(self._system.num_output_ports()):
@@ -144,13 +146,14 @@ class ArrivalTriggered(LeafSystem):
 
 
 def can_be_triggered(system: System) -> bool:
-    """Checks if `ArrivalTriggered` can run a system: all its state is discrete, with updates of
-    one period, and its outputs are vectors."""
+    """Checks if `ArrivalTriggered` can run a system: all its state, if any, is discrete, with
+    updates of one period, and its outputs are vectors."""
     context = system.CreateDefaultContext()
     others = context.num_continuous_states() + context.num_abstract_states()
+    updates = system.GetUniquePeriodicDiscreteUpdateAttribute() is not None
     outputs = (system.get_output_port(index) for index in range(system.num_output_ports()))
     return (
         others == 0
-        and system.GetUniquePeriodicDiscreteUpdateAttribute() is not None
+        and (updates or context.num_discrete_state_groups() == 0)
         and all(port.get_data_type() == PortDataType.kVectorValued for port in outputs)
     )

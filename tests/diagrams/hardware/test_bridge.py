@@ -110,14 +110,15 @@ class Erratic(LeafSystem):
 
     raises = False
 
-    def __init__(self, port: str, heading: float | None = None):
+    def __init__(self, port: str, heading: float | None = None, updates: bool = True):
         super().__init__()
         self.target = np.zeros(3)
         self.DeclareVectorInputPort("state", 13)
         self.DeclareVectorOutputPort(port, 3, self._calc)
         if heading is not None:
             self.DeclareStateOutputPort("heading", self.DeclareDiscreteState([heading]))
-        self.DeclarePeriodicDiscreteUpdateEvent(0.1, 0.0, lambda context, state: None)
+        if updates:
+            self.DeclarePeriodicDiscreteUpdateEvent(0.1, 0.0, lambda context, state: None)
 
     def _calc(self, context, output) -> None:
         if self.raises:
@@ -139,8 +140,9 @@ def test_a_target_that_is_not_finite_ends_no_flight(post_world, port):
     assert halves.mode()[0] == status.FLYING
 
 
-def test_a_policy_that_raises_ends_no_flight(post_world, caplog):
-    policy = Erratic("velocity")
+@pytest.mark.parametrize("updates", [True, False])
+def test_a_policy_that_raises_ends_no_flight(post_world, caplog, updates):
+    policy = Erratic("velocity", updates=updates)
     policy.target = np.array([0.3, 0.0, 0.0])
     halves = Halves(STRAIGHT, post_world, policy=policy)
     halves.advance_to(0.3)
