@@ -17,11 +17,13 @@ import yaml
 
 from splatpilot.analysis.benchmark import run_study
 from splatpilot.analysis.benchmark.study import StudyConfig
+from splatpilot.analysis.benchmark.study_folder import StudyFolder
 from splatpilot.analysis.benchmark.tables import Row
 from splatpilot.analysis.output import write_csv
 from splatpilot.diagrams.flight.policies import POLICIES
 from splatpilot.diagrams.scenarios import benchmark_scenarios, profile_file
 from splatpilot.systems.common.files import written_atomically
+from splatpilot.systems.common.validation import require
 
 PROFILES = "ideal", "realistic", "harsh"
 _ROTORS = ["vehicle=!Kingfisher {radius: 0.354}", "controller.disturbance_time=1.0"]
@@ -77,7 +79,7 @@ def run(
     """Flies `seeds` flights of each scenario and profile, and `effect_seeds` of each effect."""
     scenarios = [name for name in benchmark_scenarios() if name.startswith("P")]
     profiles = {name: [] if name == "ideal" else [f"profile={name}"] for name in PROFILES}
-    table, ideal = [], []
+    table, ideal, first = [], [], ""
     for name, overrides in (profiles | write_effects(out / "effects")).items():
         count = seeds if name in profiles else effect_seeds
         if not count:
@@ -85,7 +87,10 @@ def run(
         config = StudyConfig(scenarios, list(policies), seeds=count, split=split)
         config.overrides = overrides
         rows = run_study.run(config=config, out=out / name, jobs=1, report=False).rows
-        ideal = ideal or rows
+        flown_by = StudyFolder(out / name).program()["splatpilot"]
+        first, ideal = first or flown_by, ideal or rows
+        remedy = "choose another folder for all conditions"
+        require(flown_by == first, f"revision of {out / name}", first, flown_by, remedy)
         table += compare(name, rows, ideal)
         write_csv(out / "realism.csv", table)
     return table

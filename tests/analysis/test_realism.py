@@ -1,4 +1,7 @@
+import pytest
+
 from splatpilot.analysis import realism
+from splatpilot.analysis.benchmark.study_folder import StudyFolder
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.systems.common.config import load_config
 
@@ -27,3 +30,14 @@ def test_flights_are_compared_with_the_ideal_ones_of_the_same_seed():
     assert (row["flights"], row["successes"], row["collision"]) == (3, 2, 1)
     assert (row["lost"], row["gained"]) == (1, 1)
     assert (row["clearance_m"], row["time_s"]) == ("0.100", "11.00")
+
+
+def test_conditions_are_compared_within_one_revision(tmp_path, monkeypatch):
+    def run(config, out, **_):
+        out.mkdir()
+        StudyFolder(out).record(config, {"splatpilot": f"revision of {out.name}"})
+        return realism.run_study.Flown([flight(0, True)], [])
+
+    monkeypatch.setattr(realism.run_study, "run", run)
+    with pytest.raises(ValueError, match=r"realistic must be revision of ideal, got"):
+        realism.run(out=tmp_path, policies=["planner"], seeds=1, effect_seeds=0)
