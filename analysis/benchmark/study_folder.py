@@ -223,9 +223,12 @@ def keep_inputs(folder: StudyFolder, config: StudyConfig, scenarios: dict[str, S
     for variant in config.variants:
         if variant.weights is not None:
             _keep_weights(folder, variant.weights, variant.label)
+    scenes: dict[Path, str] = {}
     for name, scenario in scenarios.items():
         if isinstance(scenario.world, SceneSource):
-            world = replace(scenario.world, path=_keep_scene(folder, scenario.world))
+            if (scene := find_scene(scenario.world)) not in scenes:
+                scenes[scene] = _keep_scene(folder, scene)
+            world = replace(scenario.world, path=scenes[scene])
             scenario = replace(scenario, world=world)
         weights = getattr(scenario.policy, "weights", "")
         if config.flies_own_policies and weights:
@@ -241,9 +244,8 @@ def keep_inputs(folder: StudyFolder, config: StudyConfig, scenarios: dict[str, S
             path.write_text(text)
 
 
-def _keep_scene(folder: StudyFolder, world: SceneSource) -> str:
+def _keep_scene(folder: StudyFolder, scene: Path) -> str:
     """Copies a scene into the study, and returns its path there."""
-    scene = find_scene(world)
     kept = folder.path / "scenes" / scene.name
     if kept.exists():
         if _digest(_scene_files(kept)) != _digest(_scene_files(scene)):
