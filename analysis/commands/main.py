@@ -4,6 +4,7 @@ import argparse
 import atexit
 import contextlib
 import json
+import locale
 import logging
 import os
 import re
@@ -139,6 +140,11 @@ def find_command(name: str) -> Command:
 
 def run() -> NoReturn:
     """Runs `main`; signals before and after it end the process at once, alike."""
+    # pydrake cannot be imported in locales without UTF-8.
+    is_utf8 = sys.flags.utf8_mode or locale.getencoding().upper() == "UTF-8"
+    if not is_utf8 and "PYTHONUTF8" not in os.environ:
+        again = [sys.executable, *sys.orig_argv[1:]]
+        os.execve(sys.executable, again, os.environ | {"PYTHONUTF8": "1"})
     heeded = _heeded_signals()
     for number in heeded:
         signal.signal(number, _exit_at_once)

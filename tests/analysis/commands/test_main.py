@@ -1,5 +1,6 @@
 import os
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -234,6 +235,17 @@ def test_a_signal_during_an_import_or_after_the_end_ends_at_once(number, status,
     for script in (importing, after):
         ended = execute(INTERRUPTIBLE + script, tmp_path)
         assert ended == (status, "before\n", f"splatpilot: {word}\n")
+
+
+def test_commands_run_in_a_locale_other_than_utf_8(tmp_path):
+    locale = tmp_path / "de_DE.ISO-8859-1"
+    if shutil.which("localedef"):
+        subprocess.run(["localedef", "-i", "de_DE", "-f", "ISO-8859-1", locale], check=False)
+    if not locale.exists():
+        pytest.skip("the locale cannot be made here")
+    words = ["fly", "--set", "world.spacing=abc"]
+    ended = execute("run()", tmp_path, words, LOCPATH=str(tmp_path), LC_ALL=locale.name)
+    assert ended[0] == 1 and "must be a number" in ended[2]
 
 
 def test_a_signal_while_modules_are_unloaded_is_ignored():
