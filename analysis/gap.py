@@ -137,12 +137,14 @@ def run(
     """Compares plans in scene folders, and writes `gap.csv`, with a row for each plan, `gap.yaml`
     and `views.png` into `out`; returns and prints the table."""
     config.validate()
+    names = [scene.resolve().name for scene in scenes]
+    unique = len(set(names)) == len(names)
+    require(unique, "names of scenes", "different", ", ".join(names), "rename one folder")
     claim_folder(out / "gap.yaml", config, overwrite)
     policies = {name: _policy(name, config.speed) for name in config.policies}
     rows: list[Row] = []
     panels: dict[str, list[Panel | None]] = {}
-    for scene in scenes:
-        name = scene.resolve().name
+    for name, scene in zip(names, scenes, strict=True):
         capture = read_scene_capture(scene, read_scene_metadata(scene))
         world = read_scene_folder(scene)
         viewpoints = captured_viewpoints(capture, world, config)

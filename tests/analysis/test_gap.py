@@ -135,3 +135,9 @@ def test_policies_without_a_camera_are_refused(room, set_fields, capsys):
     words = ["gap", str(room.scene("room")), "--out", str(room.folder / "out")]
     assert main([*words, *set_fields("policies=[straight]")]) == 1
     assert "with the color or depth of a camera, got 'straight'" in capsys.readouterr().err
+
+
+def test_two_scenes_of_one_name_are_refused(tmp_path):
+    scenes = [tmp_path / "a/hall", tmp_path / "b/hall"]
+    with pytest.raises(ValueError, match="names of scenes must be different, got hall, hall"):
+        run(scenes, tmp_path / "out", GapConfig(**SMALL))
