@@ -274,8 +274,8 @@ class Failsafe(LeafSystem):
         now, modes, signals = context.get_time(), Modes.read(context), self._signals(context)
         measured, age = optional_input(self, "measured_state", context), signals.ages
         if measured is not None and not math.isinf(age[status.STATE_OLD]):
-            time = self._number("unix_time", context, now) - age[status.STATE_OLD]
-            track = Track.read(context).after(measured, time, now, self._config.max_age)
+            time, epoch = now - age[status.STATE_OLD], self._number("unix_time", context, now) - now
+            track = Track.read(context).after(measured, time, now, self._config.max_age, epoch)
             discrete_state.set_value(1, np.hstack(track))
         waits = any(map(math.isinf, age.values()))
         is_idle = waits and modes.mode == status.WAITING

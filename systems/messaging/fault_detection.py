@@ -76,15 +76,17 @@ def worst(*reasons: int) -> int:
 _POSITION_JUMP = 0.3  # [m] max difference of a position from the integral of velocities, and
 _ROTATION_JUMP = 0.3  # [rad] of an attitude from that of angular velocities, in addition to
 _TIME_ERROR = 0.1  # [s] of motion, for wrong times of measurement.
+_MAX_LAG = 1e-3  # [s] by which the Context's time may fall behind between two states.
 _FORGETTING = 0.5  # [s] time constant with which such differences fade.
 
 
 class Track(NamedTuple):
     """The sequence of measured states, in the discrete state of a `Failsafe`."""
 
-    time: float = -math.inf  # [s] Unix time of the last measurement with new content,
-    changed: float = 0.0  # [s] and time of its arrival.
+    time: float = -math.inf  # [s] of the measurement of the last state with new content,
+    changed: float = 0.0  # [s] and of its arrival.
     jumped: float = 0.0  # 1 if it does not follow from those before.
+    epoch: float = 0.0  # [s] Unix time of the Context's time 0, which a lag of the process moves.
     state: np.ndarray = np.full(13, math.nan)
     expected: np.ndarray = np.full(13, math.nan)  # state predicted by velocities and body rates.
 
@@ -92,21 +94,23 @@ class Track(NamedTuple):
     def read(cls, context: Context) -> "Track":
         """Inverts `np.hstack`."""
         vector = np.asarray(context.get_discrete_state(1).value())
-        return cls(*vector[:3], state=vector[3:16], expected=vector[16:])
+        return cls(*vector[:4], state=vector[4:17], expected=vector[17:])
 
-    def after(self, state: np.ndarray, time: float, now: float, max_gap: float) -> "Track":
-        """Adds a state (13,) that was measured at the Unix time `time` [s].
+    def after(
+        self, state: np.ndarray, time: float, now: float, max_gap: float, epoch: float
+    ) -> "Track":
+        """Adds a state (13,) that was measured at `time` [s].
 
         It has jumped if it is not where the velocities of the states have led, or not rotated as
         their angular velocities say. Small differences fade. A jump remains one until the state
         comes back, since the map does not fit to the position any more. Measurements more than
-        `max_gap` [s] apart start again.
+        `max_gap` [s] apart, or before and after a lag of the process, start again.
         """
         if np.array_equal(state, self.state):
             return self
         duration = time - self.time
-        if not 0.0 < duration <= max_gap:
-            return Track(time, now, 0.0, state, state)
+        if not 0.0 < duration <= max_gap or abs(epoch - self.epoch) > _MAX_LAG:
+            return Track(time, now, 0.0, epoch, state, state)
         old, new = QuadrotorState.of(self.state), QuadrotorState.of(state)
         p_WB, _, q_WB, _ = QuadrotorState.of(self.expected)
         mean = QuadrotorState(p_WB, (old.v_WB + new.v_WB) / 2, q_WB, (old.w_WB_B + new.w_WB_B) / 2)
@@ -125,4 +129,4 @@ class Track(NamedTuple):
             p_WB += duration / _FORGETTING * (new.p_WB - p_WB)
             q_WB += duration / _FORGETTING * (math.copysign(1.0, dot) * new.q_WB - q_WB)
             q_WB /= np.linalg.norm(q_WB)
-        return Track(time, now, float(jumped), state, expected)
+        return Track(time, now, float(jumped), epoch, state, expected)
