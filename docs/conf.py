@@ -29,5 +29,5 @@ napoleon_numpy_docstring = False
 html_theme = "furo"
 html_title = "splatpilot"
 html_static_path = ["_static"]
-html_css_files = ["ports.css"]
+html_css_files = ["ports.css", "report.css"]
 html_show_sourcelink = False

@@ -1,23 +1,35 @@
-"""Stores the results of studies, and renders the tables of pages from them.
+"""Stores the results of studies, and renders the tables and figures of pages from them.
 
 python docs/results.py keep out/study development
 python docs/results.py keep_realism out/realism
 python docs/results.py write
+python docs/results.py pdf
 
-`docs/results/NAME.csv` has a row for each policy, speed and scenario. `NAME.yaml` has the command,
-the date, the machine and the program. A table of a page is between `<!-- table KIND NAME -->` and
-`<!-- end of table -->`, where KIND is policies, paper or realism.
+`docs/results/NAME.csv` has the numbers. `NAME.yaml` has the command, the date, the machine and the
+program, as far as they are known, and in `columns` the format of each cell by the heading.
+
+A table of a page is between `<!-- table KIND NAME -->` and `<!-- end of table -->`. A number is
+before `<!-- value NAME "ROW" "FORMAT" -->`, where ROW is the text of the first column. Figures are
+`docs/report/NAME.svg`, see `report_figures.py`.
 """
 
 import argparse
 import csv
 import re
 import shlex
-from collections.abc import Callable, Sequence
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from datetime import date
+from functools import cache
 from pathlib import Path
+from string import Formatter
 from typing import Any, NamedTuple
 
+import numpy as np
+import report_figures
 import yaml
 
 from splatpilot.analysis.benchmark.study import StudyConfig
@@ -25,17 +37,25 @@ from splatpilot.analysis.benchmark.study_folder import StudyFolder
 from splatpilot.analysis.benchmark.tables import (
     PAPER,
     PAPER_FLIGHTS,
-    Interval,
     cluster_interval,
     wilson_interval,
 )
+from splatpilot.analysis.fidelity.study import band
+from splatpilot.analysis.twin import predictions
 from splatpilot.diagrams.scenarios import benchmark_scenarios
 from splatpilot.systems.common.seeds import describe_seeds
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "docs" / "results"
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+REPORT = ROOT / "docs" / "report"
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), REPORT / "index.md"]
+STUDY = "development"
+"""The study of the report: development or test."""
+
 TABLE = re.compile(r"(<!-- table (\w+) (\w+) -->\n).*?(<!-- end of table -->)", re.DOTALL)
+VALUE = re.compile(r"[^\s(|]*(<!-- value ([^>]*) -->)")
+
+Row = dict[str, Any]
 
 _OUTCOMES = "collision", "timeout", "left_volume", "infeasible"
 _SUMS = {"clearance_sum_m": "min_clearance_m", "speed_sum_m_s": "mean_speed_m_s"}
@@ -91,7 +111,8 @@ def keep_realism(folders: Sequence[Path]) -> None:
         writer.writerows(rows)
     flown = (folders[0] / "realism.csv").stat().st_mtime
     program = StudyFolder(folders[0] / "ideal").program()["splatpilot"]
-    about = {"date": date.fromtimestamp(flown).isoformat(), "program": program}
+    about = {"command": "python -m splatpilot.analysis.realism out/realism"}
+    about |= {"date": date.fromtimestamp(flown).isoformat(), "program": program}
     (RESULTS / "realism.yaml").write_text(yaml.safe_dump(about, sort_keys=False))
 
 
@@ -110,175 +131,326 @@ def _command(config: StudyConfig) -> str:
 
 
 class Results(NamedTuple):
-    """Stored results of a study."""
+    """Stored results."""
 
-    rows: list[dict[str, str]]
+    rows: list[Row]
     about: dict[str, Any]
 
     @classmethod
+    @cache
     def read(cls, name: str) -> "Results":
-        with (RESULTS / f"{name}.csv").open() as file:
-            rows = list(csv.DictReader(file))
-        return cls(rows, yaml.safe_load((RESULTS / f"{name}.yaml").read_text()))
+        """Reads or computes the results `name`; "study" is the study of the report."""
+        name = STUDY if name == "study" else name
+        if name in DERIVED:
+            rows = list(DERIVED[name]())
+        else:
+            with (RESULTS / f"{name}.csv").open() as file:
+                texts = list(csv.DictReader(file))
+            rows = [{key: _number(text) for key, text in row.items()} for row in texts]
+        return cls(rows, _about(name))
 
     @property
     def scenarios(self) -> list[str]:
         return list(dict.fromkeys(row["scenario"] for row in self.rows))
 
     @property
-    def entries(self) -> list[tuple[str, str]]:
+    def entries(self) -> list[tuple[str, float]]:
         """Pairs of policy and speed."""
         return list(dict.fromkeys((row["policy"], row["speed"]) for row in self.rows))
-
-    def select(self, entry: tuple[str, str], scenarios: Sequence[str] = ()) -> list[dict[str, str]]:
-        """Returns the rows of a policy and speed."""
-        return [
-            row
-            for row in self.rows
-            if (row["policy"], row["speed"]) == entry
-            and (not scenarios or row["scenario"] in scenarios)
-        ]
 
     def description(self) -> str:
         """Describes seeds, date, program, machine and command in Markdown."""
         about = self.about
         seeds = describe_seeds(about["split"], about["seeds"]).capitalize()
-        program = about["program"]["splatpilot"]
         command = about["command"].replace(" --scenarios", " \\\n    --scenarios")
         return (
             f"{seeds}, {len(self.scenarios)} scenarios, flown on {about['date']} by program "
-            f"`{program[:7]}{program[40:]}` on {about['machine']}:\n\n"
-            f"```\n{command}\n```\n"
+            f"`{_program(about)}` on {about['machine']}:\n\n```\n{command}\n```\n"
         )
 
 
-def total(rows: list[dict[str, str]], column: str) -> int:
-    return sum(int(row[column]) for row in rows)
+def _about(name: str) -> dict[str, Any]:
+    file = RESULTS / f"{name}.yaml"
+    return yaml.safe_load(file.read_text()) if file.is_file() else {}
 
 
-def mean(rows: list[dict[str, str]], column: str) -> float:
-    """Returns the mean over feasible flights from a column of sums."""
-    flown = total(rows, "flights") - total(rows, "infeasible")
-    return sum(float(row[column]) for row in rows) / flown if flown else float("nan")
+def _number(text: str) -> int | float | str:
+    for kind in (int, float):
+        with suppress(ValueError):
+            return kind(text)
+    return text
 
 
-def percent(interval: Interval) -> str:
-    return f"{interval.lower:.0%} to {interval.upper:.0%}"
+def _program(about: dict[str, Any]) -> str:
+    """Returns the first digits of the revision, with the mark of uncommitted changes."""
+    program = about.get("program", "")
+    revision = program["splatpilot"] if isinstance(program, dict) else program
+    return revision[:7] + revision[40:] if re.match(r"[0-9a-f]{40}", revision) else revision
+
+
+def success() -> Iterable[Row]:
+    """Yields the success of each policy and speed of the report's study."""
+    return success_rows(Results.read("study"))
+
+
+def success_rows(results: Results) -> Iterable[Row]:
+    """Yields success rates with intervals, and means over feasible flights, by policy and speed;
+    and the paper's, if all of its scenarios were flown."""
+    complete = set(benchmark_scenarios()) <= set(results.scenarios)
+    for policy, speed in results.entries:
+        rows = [row for row in results.rows if (row["policy"], row["speed"]) == (policy, speed)]
+        counts = [(row["successes"], row["flights"]) for row in rows]
+        successes, flights = total(rows, "successes"), total(rows, "flights")
+        these = wilson_interval(successes, flights)
+        new = cluster_interval([k for k, _ in counts], [n for _, n in counts])
+        generated = [row for row in rows if row["scenario"].startswith("P")]
+        flown = flights - total(rows, "infeasible")
+        yield {
+            "policy": policy,
+            "speed": speed,
+            "successes": successes,
+            "flights": flights,
+            "rate": successes / flights,
+            "low": these.lower,
+            "high": these.upper,
+            "new_low": new.lower,
+            "new_high": new.upper,
+            "generated": total(generated, "successes"),
+            "generated_flights": total(generated, "flights"),
+            "passed": sum(2 * k > n for k, n in counts),
+            "scenarios": len(rows),
+            "clearance_m": total(rows, "clearance_sum_m") / flown if flown else np.nan,
+            "speed_m_s": total(rows, "speed_sum_m_s") / flown if flown else np.nan,
+            **{outcome: total(rows, outcome) for outcome in _OUTCOMES},
+            **(_paper_row(policy) if complete and policy in PAPER else {}),
+        }
+
+
+def _paper_row(policy: str) -> Row:
+    theirs = PAPER[policy]
+    limits = wilson_interval(theirs.successes, PAPER_FLIGHTS)
+    row = theirs._asdict() | {"policy": policy, "flights": PAPER_FLIGHTS}
+    row |= {"low": limits.lower, "high": limits.upper}
+    return {f"paper_{name}": value for name, value in row.items()}
+
+
+def twins() -> Iterable[Row]:
+    """Yields the agreement of flights in scenes and meshes, by environment and of all."""
+    pairs = Results.read("twin_flights").rows
+    for row in predictions(pairs):
+        these = [pair for pair in pairs if row["environment"] in (pair["environment"], "all")]
+        gaps = [
+            pair["splat_clearance_m"] - pair["mesh_clearance_m"]
+            for pair in these
+            if pair["splat"] and pair["mesh"]
+        ]
+        yield row | {
+            "splat_only": sum(pair["splat"] > pair["mesh"] for pair in these),
+            "mesh_only": sum(pair["mesh"] > pair["splat"] for pair in these),
+            "clearance_gap_m": float(np.median(gaps)),
+        }
+
+
+def twin_policies() -> Iterable[Row]:
+    """Yields each policy's success in meshes and scenes."""
+    pairs = Results.read("twin_flights").rows
+    for policy in dict.fromkeys(pair["policy"] for pair in pairs):
+        these = [pair for pair in pairs if pair["policy"] == policy]
+        rates = {kind: total(these, kind) / len(these) for kind in ("mesh", "splat")}
+        yield {"policy": policy, "flights": len(these), **rates}
+
+
+def off_path() -> Iterable[Row]:
+    """Yields medians and percentiles 10 and 90 of views off the path, by scene and offset."""
+    views = Results.read("off_path_views").rows
+    for scene in dict.fromkeys(view["scene"] for view in views):
+        these = [view for view in views if view["scene"] == scene]
+        offsets = [view["offset"] for view in these]
+        metrics = "psnr_db", "depth_mae_m", "depth_relative"
+        bands = {name: band(offsets, [view[name] for view in these]) for name in metrics}
+        for k, offset in enumerate(bands["psnr_db"].at):
+            row: Row = {"scene": scene, "offset_m": offset, "views": bands["psnr_db"].counts[k]}
+            for name, found in bands.items():
+                row |= {name: found.middle[k], f"{name}_low": found.low[k]}
+                row[f"{name}_high"] = found.high[k]
+            yield row
+
+
+def trainings() -> Iterable[Row]:
+    """Yields seed, minutes and program of the training of the weights, from their cards."""
+    for card in sorted((ROOT / "systems" / "policies" / "weights").glob("*.md")):
+        text = " ".join(card.read_text().split())
+        yield {
+            "policy": card.stem,
+            "seed": re.findall(r"\bseed: (\d+)", text)[0],
+            "minutes": " + ".join(re.findall(r"in ([\d.]+) minutes of one core", text)),
+            "program": re.findall(r"revision (\w{7})", text)[0],
+        }
+
+
+def sources() -> Iterable[Row]:
+    """Yields command, date, machine and program of the results in the report."""
+    shown: list[str] = re.findall(
+        r"<!-- (?:table \w+|value) (\w+)", (REPORT / "index.md").read_text()
+    )
+    shown += report_figures.FIGURES.values()
+    for name in sorted({_INPUTS.get(name, name) for name in shown}):
+        if name not in DERIVED:
+            about = Results.read(name).about
+            row = {key: about.get(key, "") for key in ("command", "date", "machine")}
+            yield {"file": f"{name}.csv", **row, "program": _program(about)}
+
+
+DERIVED: dict[str, Callable[[], Iterable[Row]]] = {
+    each.__name__: each for each in (success, twins, twin_policies, off_path, trainings, sources)
+}
+"""Results that are computed from others."""
+
+_INPUTS = {
+    "study": STUDY,
+    "success": STUDY,
+    "twins": "twin_flights",
+    "twin_policies": "twin_flights",
+    "off_path": "off_path_views",
+}
+"""The files that results in the report are computed from."""
+
+
+def total(rows: list[Row], column: str) -> Any:
+    return sum(row[column] for row in rows)
 
 
 def table(header: list[str], lines: list[list[str]]) -> str:
-    return "\n".join(
-        "| " + " | ".join(cells) + " |" for cells in [header, ["---"] * len(header), *lines]
-    )
+    return "\n".join(f"|{'|'.join(cells)}|" for cells in [header, ["---"] * len(header), *lines])
 
 
-def label(entry: tuple[str, str]) -> str:
-    return f"`{entry[0]}`, {float(entry[1]):g} m/s"
+def cell(form: str, row: Row) -> str:
+    """Formats a cell, which is empty if one of its values is missing."""
+    names = [name for _, name, _, _ in Formatter().parse(form) if name]
+    return "" if any(row.get(name, "") == "" for name in names) else form.format_map(row)
+
+
+def columns(results: Results) -> str:
+    """Renders a row for each row, by the formats in `columns`."""
+    formats = results.about["columns"]
+    return table(list(formats), [[cell(f, row) for f in formats.values()] for row in results.rows])
 
 
 def policies(results: Results) -> str:
-    header = ["policy", "success", "these scenarios", "new scenarios", "P01 to P12"]
-    header += ["scenarios passed", "clearance [m]", "velocity [m/s]"]
-    header += ["collision, timeout, left, infeasible"]
-    lines = []
-    for entry in results.entries:
-        rows = results.select(entry)
-        flights, successes = total(rows, "flights"), total(rows, "successes")
-        counts = [(int(row["successes"]), int(row["flights"])) for row in rows]
-        generated = [row for row in rows if row["scenario"].startswith("P")]
-        lines.append(
-            [
-                label(entry),
-                f"{successes}/{flights} ({successes / flights:.0%})",
-                percent(wilson_interval(successes, flights)),
-                percent(cluster_interval([k for k, _ in counts], [n for _, n in counts])),
-                f"{total(generated, 'successes')}/{total(generated, 'flights')}",
-                f"{sum(2 * k > n for k, n in counts)}/{len(rows)}",
-                f"{mean(rows, 'clearance_sum_m'):+.2f}",
-                f"{mean(rows, 'speed_sum_m_s'):.2f}",
-                ", ".join(str(total(rows, outcome)) for outcome in _OUTCOMES),
-            ]
-        )
-    return results.description() + "\n" + table(header, lines)
+    rows = list(success_rows(results))
+    return f"{results.description()}\n{columns(Results(rows, _about('policies')))}"
+
+
+def paper(results: Results) -> str:
+    """Renders the paper's Table I, next to our policies if the study flew all scenarios."""
+    missing = sorted(set(benchmark_scenarios()) - set(results.scenarios))
+    ours = [] if missing else [row for row in success_rows(results) if row["policy"] in PAPER]
+    others = [name for name in PAPER if name not in [row["policy"] for row in ours]]
+    rendered = columns(Results([*ours, *map(_paper_row, others)], _about("paper")))
+    if not missing:
+        return rendered
+    unflown = f"This study did not fly {', '.join(missing)}"
+    return f"{rendered}\n\n{unflown}, so there is no comparison with the paper's Table I."
+
+
+def pivot(results: Results, name: str) -> str:
+    """Renders successes/flights by policy and the column `name`."""
+    header = list(dict.fromkeys(row[name] for row in results.rows))
+    lines: dict[str, dict[str, str]] = {}
+    for row in results.rows:
+        speed = f", {row['speed']:g} m/s" if "speed" in row else ""
+        cells = lines.setdefault(f"`{row['policy']}`{speed}", {})
+        cells[row[name]] = f"{row['successes']}/{row['flights']}"
+    return table(
+        ["policy", *header],
+        [[policy, *(cells.get(each, "") for each in header)] for policy, cells in lines.items()],
+    )
+
+
+def scenarios(results: Results) -> str:
+    return pivot(results, "scenario")
 
 
 def realism(results: Results) -> str:
     """Renders successes and flights by policy and condition of `splatpilot.analysis.realism`."""
-    header = list(dict.fromkeys(row["conditions"] for row in results.rows))
-    lines = []
-    for policy in dict.fromkeys(row["policy"] for row in results.rows):
-        cells = {
-            row["conditions"]: f"{row['successes']}/{row['flights']}"
-            for row in results.rows
-            if row["policy"] == policy
-        }
-        lines.append([f"`{policy}`", *(cells.get(name, "") for name in header)])
-    flown_on, program = results.about["date"], results.about["program"][:7]
     seeds = "Successes/flights, test seeds from 1000 on"
-    flown = f"{seeds}, flown on {flown_on} by program `{program}`:"
-    return f"{flown}\n\n{re.sub(' *[|] *', '|', table(['policy', *header], lines))}"
+    flown = f"{seeds}, flown on {results.about['date']} by program `{_program(results.about)}`:"
+    return f"{flown}\n\n{pivot(results, 'conditions')}"
 
 
-def paper(results: Results) -> str:
-    missing = sorted(set(benchmark_scenarios()) - set(results.scenarios))
-    if missing:
-        return (
-            f"This study did not fly {', '.join(missing)}, so there is no comparison with the "
-            "paper's Table I."
-        )
-    header = ["policy", "method in the paper", "paper: passed, clearance, velocity"]
-    header += ["here: passed, clearance, velocity"]
-    lines = []
-    for entry in results.entries:
-        if entry[0] not in PAPER:
-            continue
-        rows, theirs = results.select(entry), PAPER[entry[0]]
-        passed = sum(2 * int(row["successes"]) > int(row["flights"]) for row in rows)
-        lines.append(
-            [
-                label(entry),
-                theirs.method,
-                f"{theirs.successes}/{PAPER_FLIGHTS}, {theirs.min_clearance_m:+.2f} m, "
-                f"{theirs.mean_speed_m_s:.2f} m/s",
-                f"{passed}/{len(rows)}, {mean(rows, 'clearance_sum_m'):+.2f} m, "
-                f"{mean(rows, 'speed_sum_m_s'):.2f} m/s",
-            ]
-        )
-    return table(header, lines)
+def rates(results: Results) -> str:
+    """Renders success rates with intervals as a sentence."""
+    form = "`{policy}` {rate:.0%} ({low:.0%} to {high:.0%})"
+    found = "; ".join(cell(form, row) for row in success_rows(results))
+    about = results.about
+    seeds = describe_seeds(about["split"], about["seeds"])
+    return f"Success in {len(results.scenarios)} scenarios, {seeds}: {found}."
 
 
 KINDS: dict[str, Callable[[Results], str]] = {
-    "policies": policies,
-    "paper": paper,
-    "realism": realism,
+    each.__name__: each for each in (columns, policies, paper, scenarios, realism, rates)
 }
 
 
 def with_tables(text: str) -> str:
-    """Renders the tables in the text of a page."""
+    """Renders the tables and values in the text of a page."""
 
     def render(found: re.Match) -> str:
         begin, kind, name, end = found.groups()
         return f"{begin}\n{KINDS[kind](Results.read(name))}\n\n{end}"
 
-    return TABLE.sub(render, text)
+    def value(found: re.Match) -> str:
+        comment, words = found.groups()
+        name, key, form = shlex.split(words)
+        (row,) = [row for row in Results.read(name).rows if next(iter(row.values())) == key]
+        return f"{cell(form, row)}{comment}"
+
+    return VALUE.sub(value, TABLE.sub(render, text))
+
+
+def figures() -> dict[str, report_figures.Figure]:
+    """Draws the figures of the report by name."""
+    return report_figures.draw_all(lambda name: Results.read(name).rows)
 
 
 def write() -> None:
-    """Renders the tables of all pages."""
+    """Renders the tables and the figures of all pages."""
     for page in PAGES:
         page.write_text(with_tables(page.read_text()))
+    for name, figure in figures().items():
+        (REPORT / f"{name}.svg").write_text(report_figures.svg(figure))
+
+
+def pdf() -> None:
+    """Prints the report to `docs/report/report.pdf`, by Sphinx and Chromium."""
+    from playwright.sync_api import sync_playwright
+
+    site = ROOT / "build" / "report"
+    command = [sys.executable, "-m", "sphinx", "-q", "-c", str(ROOT / "docs"), str(REPORT)]
+    # Links to other pages lead nowhere in a document of its own.
+    subprocess.run([*command, "-D", "suppress_warnings=myst.xref_missing", str(site)], check=True)
+    html = site / "index.html"
+    html.write_text(re.sub(r'(<a [^>]*)href="(?!#|https:)[^"]*"', r"\1", html.read_text()))
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(
+            executable_path=shutil.which("chromium"), args=["--no-sandbox"]
+        )
+        tab = browser.new_page()
+        tab.goto(html.as_uri())
+        tab.pdf(path=REPORT / "report.pdf", format="A4", prefer_css_page_size=True)
+        browser.close()
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     commands = parser.add_subparsers(dest="command", required=True)
     commands.add_parser("write", help=write.__doc__)
+    commands.add_parser("pdf", help=pdf.__doc__)
     keep_parser = commands.add_parser("keep", help=keep.__doc__)
     keep_parser.add_argument("study", type=Path)
     keep_parser.add_argument("name")
     realism_parser = commands.add_parser("keep_realism", help=keep_realism.__doc__)
     realism_parser.add_argument("folders", type=Path, nargs="+")
     options = vars(parser.parse_args())
-    known = {"keep": keep, "keep_realism": keep_realism, "write": write}
+    known = {"keep": keep, "keep_realism": keep_realism, "write": write, "pdf": pdf}
     known[options.pop("command")](**options)

@@ -1,20 +1,27 @@
+import csv
 import importlib
 import re
 import runpy
 import shlex
+import shutil
 import subprocess
 import sys
 import zlib
 from argparse import ArgumentParser, Namespace
+from functools import cache
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import pytest
+import report_figures
+import results
 from stable_baselines3 import PPO
 
 from splatpilot.analysis.commands.checks import SCENARIOS
 from splatpilot.analysis.commands.main import main
 from splatpilot.analysis.commands.options import read_scenario
+from splatpilot.analysis.output import write_csv
 from splatpilot.diagrams.flight.policies import POLICIES, policy_named
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.flight.sensors import SENSORS
@@ -27,7 +34,8 @@ from splatpilot.systems.visualization.live import LiveControls
 from splatpilot.training.captures.capture_config import CaptureConfig
 
 ROOT = Path(__file__).parents[1]
-PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").glob("*.md"))]
+DOCS = ROOT / "docs"
+PAGES = [*sorted(ROOT.glob("*.md")), *sorted(DOCS.glob("*.md")), results.REPORT / "index.md"]
 IMAGE = re.compile(r"!\[[^]]*\]\(([^)]+)\)")
 
 
@@ -164,25 +172,66 @@ def test_links_lead_somewhere(page):
 
 
 def test_every_picture_has_its_command():
-    shown = {
-        f"docs/{Path(image).name}" for page in PAGES for image in IMAGE.findall(page.read_text())
-    }
+    images = [image for page in PAGES for image in IMAGE.findall(page.read_text())]
+    shown = {f"docs/{Path(image).name}" for image in images if not image.endswith(".svg")}
     made = {words[-1] for words in commands(ROOT / "docs" / "pictures.md")}
     assert len(shown) > 10
     assert shown <= made
 
 
-RESULTS = runpy.run_path(str(ROOT / "docs" / "results.py"))
-
-
 @pytest.mark.parametrize("page", PAGES, ids=[page.stem for page in PAGES])
 def test_tables_of_pages_are_those_of_the_results(page):
-    assert RESULTS["with_tables"](page.read_text()) == page.read_text()
+    assert results.with_tables(page.read_text()) == page.read_text()
+
+
+@pytest.fixture(scope="module")
+def figures():
+    return results.figures()
+
+
+@pytest.mark.parametrize("name", [draw.__name__ for draw in report_figures.FIGURES])
+def test_figures_show_the_results(name, figures):
+    written = ElementTree.parse(results.REPORT / f"{name}.svg")
+    description = written.findtext(".//{http://purl.org/dc/elements/1.1/}description")
+    assert description == report_figures.plotted(figures[name])
+    assert f"({name}.svg)" in (results.REPORT / "index.md").read_text()
+
+
+@pytest.mark.parametrize(
+    ("name", "column", "table", "draw"),
+    [
+        ("ablation", "psnr_db", "columns ablation", report_figures.ablation),
+        ("off_path_views", "psnr_db", "columns off_path", report_figures.off_path),
+        ("gap", "gap_points", "columns gap", report_figures.gap),
+        ("realism", "successes", "realism realism", report_figures.realism),
+        (results.STUDY, "successes", "policies study", report_figures.success),
+    ],
+)
+def test_a_changed_number_changes_table_and_figure(
+    name, column, table, draw, tmp_path, monkeypatch
+):
+    def rendered() -> tuple[str, str]:
+        monkeypatch.setattr(results.Results, "read", classmethod(cache(read)))
+        figure = draw(results.Results.read(report_figures.FIGURES[draw]).rows)
+        page = f"<!-- table {table} -->\n<!-- end of table -->"
+        return results.with_tables(page), report_figures.plotted(figure)
+
+    read = results.Results.read.__func__.__wrapped__
+    before = rendered()
+    shutil.copytree(results.RESULTS, tmp_path / "results")
+    file = tmp_path / "results" / f"{name}.csv"
+    rows = list(csv.DictReader(file.read_text().splitlines()))
+    rows[0][column] = f"{float(rows[0][column]) - 1:g}"
+    write_csv(file, rows)
+    monkeypatch.setattr(results, "RESULTS", tmp_path / "results")
+    after = rendered()
+    assert after[0] != before[0]
+    assert after[1] != before[1]
 
 
 @pytest.mark.parametrize("page", [p for p in PAGES if p.stem != "CHANGELOG"], ids=lambda p: p.stem)
 def test_success_of_flights_stands_in_tables_of_results_alone(page):
-    text = RESULTS["TABLE"].sub("", page.read_text())
+    text = results.TABLE.sub("", page.read_text())
     success = r"\d+/\d+ \(\d+ ?%\)|\d+ of (its )?\d+ (flights|goals)|arrives? in \d+|\d+/\d\d+ at"
     assert not re.findall(success, text)
 
