@@ -1,7 +1,6 @@
 """Plans camera poses that see the surfaces around a free space, each from several directions."""
 
 import heapq
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -135,7 +134,7 @@ def _free_space(
     shape = np.maximum((extent / spacing).astype(int), 1).tolist()
     p_WN = esdf.lower_W + spacing * (np.stack(np.indices(shape), axis=-1) + 0.5)
     found = esdf.distance(p_WN)
-    above = p_WN[..., 2] - _surface_below(esdf, shape, spacing)
+    above = p_WN[..., 2] - _surface_below(esdf, p_WN, spacing)
     low, high = heights
     usable = (found > clearance) & (above >= low) & (above <= high)
     parts, count = cast(Any, label(usable, np.ones((3, 3, 3))))
@@ -160,13 +159,18 @@ def _free_space(
     return p_WN[parts == part], spacing
 
 
-def _surface_below(esdf: Esdf, shape: Sequence[int], spacing: float) -> NDArray[np.float64]:
+def _surface_below(esdf: Esdf, p_WN: NDArray, spacing: float) -> NDArray[np.float64]:
     """Returns the heights [m] of the next surfaces below the nodes of a grid; -inf for none."""
+    shape = p_WN.shape[:3]
     voxels = np.argwhere(esdf.states == FieldState.OCCUPIED)
     cells = np.minimum(
         ((voxels + 0.5) * esdf.voxel_size / spacing).astype(int), np.array(shape) - 1
     )
     below = np.full(shape, -np.inf)
+    # Ground at the lower end of the field fills no voxel.
+    lowest = p_WN[:, :, 0].copy()
+    lowest[..., 2] = esdf.lower_W[2] + 0.5 * esdf.voxel_size
+    below[esdf.distance(lowest) < esdf.voxel_size, 0] = esdf.lower_W[2]
     np.maximum.at(below, tuple(cells.T), esdf.lower_W[2] + esdf.voxel_size * (voxels[:, 2] + 1))
     return np.maximum.accumulate(below, axis=2)
 

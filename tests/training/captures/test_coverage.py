@@ -113,6 +113,15 @@ def test_heights_are_above_the_ground(tmp_path: Path):
     assert np.ptp(p_WC[:, 2]) > 4.0
 
 
+def test_ground_at_the_lower_end_of_the_field_is_a_surface():
+    solids = [box([-1.0, -1.0, -1.0], [9.0, 7.0, 0.0]), box([3.5, 2.0, 0.0], [4.5, 4.0, 3.0])]
+    distances = AnalyticDistanceField(solids, np.zeros(3), np.array([8.0, 6.0, 3.0]))
+    plan = plan_capture(esdf_from_distance_field(distances, 0.1), K, SIZE, (1.0, 2.2), 0.4)
+    heights = positions(plan)[:, 2]
+    assert plan.free_area > 0.8 * 8.0 * 6.0
+    assert heights.min() >= 1.0 and heights.max() <= 2.2
+
+
 def test_space_without_clearance_is_named(field):
     with pytest.raises(ValueError, match=r"9.0 m must exist, got none in .* m; correct the scale"):
         plan_capture(field, K, SIZE, (1.0, 2.2), 9.0)
