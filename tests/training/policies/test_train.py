@@ -2,10 +2,7 @@ import csv
 import json
 import os
 import re
-import signal
-import subprocess
-import sys
-import time
+import shutil
 import zipfile
 from contextlib import contextmanager
 from pathlib import Path
@@ -48,7 +45,7 @@ TINY = [*SMALL, "rollout.environments=4", "rollout.steps=4"]
 OF_POLICY = {
     "diffaero": TINY[-2:],
     "depthnav": [*TINY[-2:], "empty=0.5", "rollout.noise.latency=0.1"],
-    "distilled_rgb": TINY[-2:],
+    "distilled_rgb": ["rollout.environments=2", "rollout.steps=2"],
     "agile_autonomy": ["rounds=2", "round_updates=3", "environments=4", "steps=16", "batch=8"],
 }
 
@@ -88,22 +85,6 @@ def test_run_writes_its_files(finished):
     assert summary["updates"] == 6 and summary["seed"] == 0
 
 
-def test_killed_run_ends_in_the_same_weights(finished, tmp_path):
-    program = "from splatpilot.analysis.commands.main import main; raise SystemExit(main())"
-    command = [sys.executable, "-c", program, "train", "diffaero", "--out", str(tmp_path)]
-    for override in TINY:
-        command += ["--set", override]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    while not (tmp_path / "checkpoint.pt").exists() and process.poll() is None:
-        time.sleep(0.002)
-    os.kill(process.pid, signal.SIGKILL)
-    process.wait()
-    run(config=tiny(), out=tmp_path, make=TRAINERS.find("diffaero").make)
-    assert_same(tmp_path, finished)
-    rows = (tmp_path / "curves.csv").read_text()
-    assert rows == (finished / "curves.csv").read_text()
-
-
 def test_a_command_trains_seeds_one_after_the_other(finished, tmp_path):
     overrides = [argument for override in TINY for argument in ("--set", override)]
     command = ["train", "diffaero", "--seeds", "0", "1", "--out", str(tmp_path)]
@@ -113,7 +94,7 @@ def test_a_command_trains_seeds_one_after_the_other(finished, tmp_path):
 
 
 @pytest.mark.parametrize("policy", OF_POLICY)
-def test_interrupted_training_ends_in_the_same_weights(policy, tmp_path):
+def test_killed_training_ends_in_the_same_weights(policy, tmp_path):
     trainer_kind = TRAINERS.find(policy)
     config = load_config(trainer_kind.config(), overrides=[*SMALL, *OF_POLICY[policy]])
 
@@ -123,6 +104,7 @@ def test_interrupted_training_ends_in_the_same_weights(policy, tmp_path):
 
         def interrupt(update: int) -> None:
             if update == 5:
+                shutil.copytree(tmp_path / "begun", tmp_path / "again")  # as a kill leaves it
                 raise KeyboardInterrupt
             begin_update(update)
 
@@ -131,7 +113,7 @@ def test_interrupted_training_ends_in_the_same_weights(policy, tmp_path):
 
     run(config=config, out=tmp_path / "whole", make=trainer_kind.make)
     with pytest.raises(KeyboardInterrupt):
-        run(config=config, out=tmp_path / "again", make=make_interrupted)
+        run(config=config, out=tmp_path / "begun", make=make_interrupted)
     run(config=config, out=tmp_path / "again", make=trainer_kind.make)
     assert_same(tmp_path / "again", tmp_path / "whole")
     curves = [(tmp_path / folder / "curves.csv").read_text() for folder in ("again", "whole")]
@@ -309,10 +291,10 @@ def test_miniature_learns_to_fly(tmp_path):
         "worlds.count=3",
         "worlds.held_out=8",
         "worlds.voxel_size=0.5",
-        "rollout.environments=24",
-        "rollout.steps=24",
-        "schedule.updates=70",
-        "schedule.validate_every=70",
+        "rollout.environments=16",
+        "rollout.steps=20",
+        "schedule.updates=60",
+        "schedule.validate_every=60",
         "schedule.learning_rate=0.002",
         "validation.patience=4",
     ]
