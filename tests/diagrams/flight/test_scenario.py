@@ -1,8 +1,5 @@
 """Finding scenarios by name or path, and writing them."""
 
-import subprocess
-import sys
-
 import pytest
 from pydrake.common.schema import Uniform
 
@@ -44,17 +41,6 @@ def test_scenario_that_was_written_is_the_same(name):
     again = parse_config(Scenario(), dump_config(scenario), name)
     assert type(again.world) is type(scenario.world)
     assert again.world == scenario.world
-
-
-def test_drakes_reader_reads_scenarios():
-    text = "world: !WallsConfig {pattern: slalom}\npolicy: !ReactiveConfig {margin: 0.4}\n"
-    program = f"""
-import splatpilot as sp
-from pydrake.common.yaml import yaml_load_typed
-print(sp.dump_config(yaml_load_typed(schema=sp.Scenario, data={text!r})))
-"""
-    ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert ran.stdout.strip() == dump_config(parse_config(Scenario(), text, "text")).strip()
 
 
 def loaded(*overrides: str, **fields) -> Scenario:
