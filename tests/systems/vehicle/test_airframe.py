@@ -2,41 +2,26 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
 
 from splatpilot.systems.vehicle.airframe import QuadrotorAirframe
 from splatpilot.systems.vehicle.quadrotor import QuadrotorParams, QuadrotorPlant, hover_state
 from splatpilot.systems.vehicle.vehicles import Crazyflie21Brushless, Kingfisher, Px4Sih
+from tests.systems.vehicle.responses import fly
 
 START = hover_state([1.0, -2.0, 3.0], yaw=0.7)
 KINGFISHER = Kingfisher(ground_effect=0.3, battery_sag=0.2, battery_endurance=200.0)
 
 
-def fly(plant, step: float, wind=None, push=None) -> np.ndarray:
-    """Returns states (21, 13) every 0.1 s under random commands of 0.1 s."""
-    simulator = Simulator(plant)
-    ResetIntegratorFromFlags(simulator, "runge_kutta5", step)
-    simulator.get_mutable_integrator().set_fixed_step_mode(True)
-    context = simulator.get_mutable_context()
-    random, states = np.random.default_rng(4), [START]
-    for name, value in (("wind", wind), ("disturbance", push)):
-        if value is not None:
-            plant.GetInputPort(name).FixValue(context, value)
-    for k in range(20):
-        command = random.uniform([6.0, -3.0, -3.0, -2.0], [15.0, 3.0, 3.0, 2.0])
-        plant.GetInputPort("command").FixValue(context, command)
-        simulator.AdvanceTo(0.1 * (k + 1))
-        states.append(plant.GetOutputPort("state").Eval(context))
-    return np.array(states)
+COMMANDS = np.random.default_rng(4).uniform([6.0, -3.0, -3.0, -2.0], [15.0, 3.0, 3.0, 2.0], (20, 4))
 
 
 @pytest.mark.parametrize("params", [KINGFISHER, Px4Sih(), Crazyflie21Brushless()])
 def test_rigid_body_with_propellers_flies_as_the_equations_of_the_rotors(params):
-    inputs = {"wind": [2.0, -1.0, 0.5], "push": [0.3, 0.2, -0.4]}
-    expected = fly(QuadrotorPlant(params, START), 0.005, **inputs)
-    found = fly(QuadrotorAirframe(params, START), 0.005, **inputs)
+    inputs = {"wind": [2.0, -1.0, 0.5], "disturbance": [0.3, 0.2, -0.4]}
+    expected = fly(QuadrotorPlant(params, START), COMMANDS, 0.005, **inputs)
+    found = fly(QuadrotorAirframe(params, START), COMMANDS, 0.005, **inputs)
     # Both are within the error of integration, which falls with the step.
-    error = np.abs(fly(QuadrotorPlant(params, START), 0.01, **inputs) - expected).max()
+    error = np.abs(fly(QuadrotorPlant(params, START), COMMANDS, **inputs) - expected).max()
     assert np.linalg.norm(expected[-1, :3] - START[:3]) > 1.0
     np.testing.assert_allclose(np.abs(found[:, 6:10]), np.abs(expected[:, 6:10]), atol=1e-6)
     rest = [*range(6), 10, 11, 12]

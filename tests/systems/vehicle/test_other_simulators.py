@@ -5,12 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
 from rotorpy.vehicles.multirotor import Multirotor
 from scipy.integrate import solve_ivp
 
 from splatpilot.systems.vehicle.quadrotor import QuadrotorPlant, hover_state
 from splatpilot.systems.vehicle.vehicles import Crazyflie21Brushless, Kingfisher
+from tests.systems.vehicle.responses import fly
 
 HOLD = 0.1  # [s] of each command
 KINGFISHER = Kingfisher(drag=0.0, rotor_drag=[0.0] * 3, max_tilt_rate=np.inf, max_yaw_rate=np.inf)
@@ -20,18 +20,7 @@ SPIN = np.array([1, -1, 1, -1])
 
 def fly_ours(params, commands, wind=None):
     """Returns the states (n, 13) at the ends of commands (n, 4), from a hover."""
-    plant = QuadrotorPlant(params)
-    simulator = Simulator(plant)
-    ResetIntegratorFromFlags(simulator, "runge_kutta5", 0.01)
-    simulator.get_mutable_integrator().set_fixed_step_mode(True)
-    context, states = simulator.get_mutable_context(), []
-    if wind is not None:
-        plant.GetInputPort("wind").FixValue(context, wind)
-    for k, command in enumerate(commands):
-        plant.get_input_port().FixValue(context, command)
-        simulator.AdvanceTo((k + 1) * HOLD)
-        states.append(plant.get_output_port().Eval(context).copy())
-    return np.array(states)
+    return fly(QuadrotorPlant(params), commands, wind=wind)
 
 
 def rotorpy_vehicle(params, abstraction, **aero):

@@ -6,9 +6,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from pydrake.autodiffutils import AutoDiffXd, ExtractGradient, ExtractValue, InitializeAutoDiff
-from pydrake.symbolic import Evaluate, MakeVectorVariable
 from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
-from pydrake.systems.primitives import Linearize
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
@@ -165,18 +163,6 @@ def derivatives_at(plant, x):
     return plant.EvalTimeDerivatives(context).CopyToVector()
 
 
-def test_conversions_keep_the_parameters_and_the_equations():
-    plant = QuadrotorPlant(QuadrotorParams(drag=0.2, rate_time_constant=0.1, gravity=3.7))
-    variables, rng = MakeVectorVariable(17, "x"), np.random.default_rng(4)
-    x = np.concatenate([rng.normal(size=13), random_commands(rng)])
-    expected = derivatives_at(plant, x)
-    symbolic = derivatives_at(plant.ToSymbolic(), np.array([1.0 * each for each in variables]))
-    values = Evaluate(symbolic, dict(zip(variables, x, strict=True))).ravel()
-    np.testing.assert_allclose(values, expected, atol=1e-10)
-    dual = derivatives_at(plant.ToAutoDiffXd(), InitializeAutoDiff(x).ravel())
-    np.testing.assert_allclose(ExtractValue(dual).ravel(), expected, atol=1e-10)
-
-
 def test_a_zero_quaternion_is_an_error_that_names_it():
     with pytest.raises(ValueError, match=r"q_WB .* must not be zero, got \[0\.0, "):
         derivatives_at(QuadrotorPlant(), np.zeros(17))
@@ -225,17 +211,6 @@ def test_an_input_that_is_not_finite_is_an_error_with_error_control(convert, por
 def test_wrong_arguments_are_named_at_construction(arguments, message):
     with pytest.raises(ValueError, match=message):
         QuadrotorPlant(*arguments)
-
-
-def test_a_subclass_is_not_linearized_as_its_base():
-    class Draggy(QuadrotorPlant):
-        pass
-
-    plant = Draggy()
-    context = plant.CreateDefaultContext()
-    plant.get_input_port().FixValue(context, [9.81, 0.0, 0.0, 0.0])
-    with pytest.raises(RuntimeError, match="Draggy"):
-        Linearize(plant, context)
 
 
 def test_derivatives_by_a_parameter():
