@@ -26,7 +26,6 @@ from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS as R
 
 LOWER, UPPER = np.array([0.0, -4, 0]), np.array([12.0, 4, 4])
 EMPTY = AnalyticDistanceField([], LOWER, UPPER)
-UP = np.array([0.0, 0, 1])
 START, GOAL = np.array([1.5, 0.1, 2.0]), np.array([10.5, 0.1, 2.0])
 
 

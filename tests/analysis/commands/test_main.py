@@ -117,71 +117,70 @@ def test_an_error_has_status_1_and_one_sentence_and_writes_nothing(
     assert {path: path.is_file() and path.read_bytes() for path in tmp_path.rglob("*")} == before
 
 
-@pytest.mark.parametrize(
-    ("words", "status"),
-    [
-        ("--help", 0),
-        ("--version", 0),
-        ("fly --help", 0),
-        ("fly --nonsense", 2),
-        ("fly --policy missing", 1),
-        ("fly --scene nowhere", 1),
-        ("benchmark --out study --policies planner,missing", 1),
-        ("replay nowhere id", 1),
-        ("reconstruct nowhere --out scene", 1),
-        ("train missing --out run", 1),
-        ("corpus inspect nowhere --out samples.png", 1),
-    ],
-)
-def test_help_and_refusals_import_nothing_heavy(words, status, tmp_path):
+LIGHT = {
+    "--help": 0,
+    "--version": 0,
+    "fly --help": 0,
+    "fly --nonsense": 2,
+    "fly --policy missing": 1,
+    "fly --scene nowhere": 1,
+    "benchmark --out study --policies planner,missing": 1,
+    "replay nowhere id": 1,
+    "reconstruct nowhere --out scene": 1,
+    "train missing --out run": 1,
+    "corpus inspect nowhere --out samples.png": 1,
+}
+
+
+def test_help_and_refusals_import_nothing_heavy_and_no_other_commands(tmp_path):
     script = (
-        f"try: status = main({words.split()})\n"
-        "except SystemExit as ended: status = ended.code\n"
-        "print(status, *{name.partition('.')[0] for name in sys.modules})"
+        "import contextlib, io\n"
+        "def execute(words):\n"
+        "    try: return main(words.split())\n"
+        "    except SystemExit as ended: return ended.code\n"
+        f"for words, status in {LIGHT}.items():\n"
+        "    with contextlib.redirect_stderr(io.StringIO()) as err: found = execute(words)\n"
+        "    assert found == status and (not status or 'splatpilot' in err.getvalue()), words\n"
+        f"    heavy = {HEAVY} & {{name.partition('.')[0] for name in sys.modules}}\n"
+        "    assert not heavy, (words, heavy)\n"
+        "    if words == 'fly --help':\n"
+        "        print(*(n.partition('.commands.')[2] for n in sys.modules))"
     )
-    _, out, err = execute(script, tmp_path)
-    found, *loaded = out.splitlines()[-1].split()
-    assert int(found) == status
-    assert status == 0 or "splatpilot" in err.splitlines()[-1]
+    status, out, err = execute(script, tmp_path)
+    assert (status, err) == (0, "")
+    assert set(out.splitlines()[-1].split()) == {"main", "options", "checks", "flight"}
     assert not list(tmp_path.iterdir())
-    assert "splatpilot" in loaded and not HEAVY & set(loaded)
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
-        "train diffaero --out run",
-        "recover student_rgb --out run",
-        "corpus make --out corpus --worlds 2",
-        "library make forest_splat --out scenes",
-        "reconstruct . --out scene",
-        "scene ablate . --out study",
-        "scene fidelity . --out study",
-        "scene measure .",
-        "capture check .",
-        "capture render P02 --out capture",
-        "benchmark --out study --quick",
-    ],
-)
-def test_long_commands_announce_themselves_before_slow_imports(words, tmp_path):
+LONG = [
+    "train diffaero --out run",
+    "recover student_rgb --out run",
+    "corpus make --out corpus --worlds 2",
+    "library make forest_splat --out scenes",
+    "reconstruct . --out scene",
+    "scene ablate . --out study",
+    "scene fidelity . --out study",
+    "scene measure .",
+    "capture check .",
+    "capture render P02 --out capture",
+    "benchmark --out study --quick",
+]
+
+
+def test_long_commands_announce_themselves_before_slow_imports(tmp_path):
     (tmp_path / "out" / "corpus" / "shards").mkdir(parents=True)
     script = (
         "sys.modules |= dict.fromkeys(['numpy', 'pydrake', 'torch', 'yaml'])\n"  # import errors
-        f"main({words.split()})"
+        f"for words in {LONG}:\n"
+        "    print('>', words, file=sys.stderr)\n"
+        "    main(words.split())"
     )
     _, _, err = execute(script, tmp_path, TMPDIR=str(tmp_path))
-    announced, *failure = err.splitlines()
-    assert not announced.startswith("splatpilot") and "ing " in announced
-    assert failure and "\r" not in err
-
-
-def test_a_flight_imports_no_other_commands(tmp_path):
-    script = (
-        "try: main(['fly', '--help'])\n"
-        "except SystemExit: print(*(n.partition('.commands.')[2] for n in sys.modules))"
-    )
-    _, out, _ = execute(script, tmp_path)
-    assert set(out.splitlines()[-1].split()) == {"main", "options", "checks", "flight"}
+    parts = [part.splitlines() for part in err.split("> ")[1:]]
+    assert [part[0] for part in parts] == LONG
+    for words, announced, *failure in parts:
+        assert not announced.startswith("splatpilot") and "ing " in announced, words
+        assert failure and "\r" not in err
 
 
 def test_version(capsys):
