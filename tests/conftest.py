@@ -18,12 +18,13 @@ settings.load_profile("repeatable")
 # gsply's compiler takes longer than all that it compiles here.
 os.environ["NUMBA_DISABLE_JIT"] = "1"
 
-_SLOWEST = "test_wheel.py", "test_crash.py"
+_SLOWEST = "wheel", "crash", "docs", "train", "optimize", "run_study"
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Begins with the files that take longest, so that parallel workers end together."""
-    items.sort(key=lambda item: item.path.name not in _SLOWEST)
+    order = {f"test_{name}.py": number for number, name in enumerate(_SLOWEST)}
+    items.sort(key=lambda item: order.get(item.path.name, len(order)))
 
 
 @pytest.fixture(scope="session", autouse=True)
