@@ -30,10 +30,12 @@ class Reference(NamedTuple):
     margin: Tensor  # (H, W) least relative distance of an alpha or a T to the threshold it met
 
 
-def single_gaussian(opacity=0.5, scale=0.1, depth=2.0, color=(0.2, 0.4, 0.8)) -> dict[str, Any]:
+def single_gaussian(
+    opacity=0.5, scale=0.1, depth=2.0, color=(0.2, 0.4, 0.8), quat=(1.0, 0, 0, 0)
+) -> dict[str, Any]:
     return {
         "means": torch.tensor([[0.0, 0.0, depth]]),
-        "quats": torch.tensor([[1.0, 0, 0, 0]]),
+        "quats": torch.tensor([quat]),
         "scales": torch.full((1, 3), scale),
         "opacities": torch.tensor([opacity]),
         "colors": torch.tensor([color]),

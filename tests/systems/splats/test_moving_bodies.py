@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from baked_scenes import wall
 from pydrake.common.value import Value
 from pydrake.geometry import RenderLabel
 from pydrake.math import RigidTransform, RotationMatrix
@@ -11,7 +12,6 @@ from splatpilot.systems.collision.esdf_collision import EsdfCollision
 from splatpilot.systems.collision.shapes import AnalyticDistanceField, HalfSpace, MovingSpheres
 from splatpilot.systems.splats.baked_scene import MovingGaussians
 from splatpilot.systems.splats.moving_bodies import Bodies, MovingBodies, MovingObstacles, Track
-from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.splats.splat_camera import SplatCamera
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS, hover_state
 from splatpilot.systems.vehicle.quadrotor_geometry import quadrotor_gaussians
@@ -20,18 +20,6 @@ R_BC = RotationMatrix(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]))
 INFO = CameraInfo(64, 48, 60.0, 60.0, 32.0, 24.0)
 FIELD = AnalyticDistanceField([HalfSpace([0, 0, 1], -50.0)], np.full(3, -60.0), np.full(3, 60.0))
 ROW = [0.0, 1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
-
-
-def wall(x: float) -> GaussianScene:
-    y, z = (grid.ravel() for grid in np.meshgrid(*[np.arange(-20, 20.1, 0.5)] * 2))
-    count = y.size
-    return GaussianScene.from_colors(
-        means=np.column_stack([np.full(count, x), y, z]),
-        quats=np.tile([1.0, 0, 0, 0], (count, 1)),
-        scales=np.tile([1e-3, 0.5, 0.5], (count, 1)),
-        opacities=np.full(count, 0.99),
-        colors=np.tile([1.0, 0.5, 0.0], (count, 1)),
-    )
 
 
 def obstacle(path: np.ndarray, radius: float = 0.5) -> MovingObstacles:
@@ -43,7 +31,7 @@ def two_bodies():
     """A camera and a distance at the origin, with a vehicle whose pose is an input."""
     builder = DiagramBuilder()
     moving = builder.AddSystem(MovingBodies())
-    camera = builder.AddSystem(SplatCamera(wall(5.0), INFO, RigidTransform(R_BC)))
+    camera = builder.AddSystem(SplatCamera(wall(0, 5.0, reach=20.0), INFO, RigidTransform(R_BC)))
     collision = builder.AddSystem(EsdfCollision(FIELD))
     pose = moving.DeclareBody("other", quadrotor_gaussians(), VEHICLE_RADIUS)
     for system in (camera, collision):

@@ -1,5 +1,6 @@
 import copy
 
+import baked_scenes
 import numpy as np
 import pytest
 from pydrake.geometry import (
@@ -65,16 +66,7 @@ class CountingScene(BakedScene):
 
 
 def wall(z: float, opacity: float = 0.99) -> CountingScene:
-    # Orange, at depth `z` [m] of a camera at the origin that looks along z.
-    x, y = (grid.ravel() for grid in np.meshgrid(*[np.arange(-30, 30.1, 0.5)] * 2))
-    scene = GaussianScene.from_colors(
-        means=np.column_stack([x, y, np.full(x.size, z)]),
-        quats=np.tile([1.0, 0, 0, 0], (x.size, 1)),
-        scales=np.tile([0.5, 0.5, 1e-3], (x.size, 1)),
-        opacities=np.full(x.size, opacity),
-        colors=np.tile([1.0, 0.5, 0.0], (x.size, 1)),
-    )
-    return CountingScene(scene)
+    return CountingScene(baked_scenes.wall(2, z, opacity))
 
 
 def core(near: float = 0.01, far: float = 100.0, name: str = "splats") -> RenderCameraCore:

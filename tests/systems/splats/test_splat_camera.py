@@ -1,3 +1,4 @@
+import baked_scenes
 import numpy as np
 import pytest
 from pydrake.geometry import (
@@ -40,16 +41,7 @@ class CountingScene(BakedScene):
 
 
 def wall(x: float, opacity: float = 0.99) -> CountingScene:
-    y, z = (grid.ravel() for grid in np.meshgrid(*[np.arange(-30, 30.1, 0.5)] * 2))
-    count = y.size
-    scene = GaussianScene.from_colors(
-        means=np.column_stack([np.full(count, x), y, z]),
-        quats=np.tile([1.0, 0, 0, 0], (count, 1)),
-        scales=np.tile([1e-3, 0.5, 0.5], (count, 1)),
-        opacities=np.full(count, opacity),
-        colors=np.tile([1.0, 0.5, 0.0], (count, 1)),
-    )
-    return CountingScene(scene)
+    return CountingScene(baked_scenes.wall(0, x, opacity))
 
 
 def evaluate(camera: SplatCamera, port: str, X_WB: RigidTransform) -> np.ndarray:

@@ -9,7 +9,7 @@ import reference_surfels as reference
 import torch
 from random_scenes import normal, normal_tensor, rotation_matrix
 from random_scenes import random_scene as random_gaussians
-from reference_rasterizer import rotation_matrices
+from reference_rasterizer import rotation_matrices, single_gaussian
 
 from splatpilot import _native
 from splatpilot.systems.splats import rasterize, surfel_rasterization
@@ -50,18 +50,6 @@ def edge_on_scene(sine: float, count: int = 60) -> dict[str, Any]:
 
 def dot(a, b) -> float:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-def single_surfel(opacity=0.5, scale=0.1, depth=2.0, quat=(1.0, 0, 0, 0)) -> dict[str, Any]:
-    return {
-        "means": torch.tensor([[0.0, 0.0, depth]]),
-        "quats": torch.tensor([quat]),
-        "scales": torch.full((1, 3), scale),
-        "opacities": torch.tensor([opacity]),
-        "colors": torch.tensor([[0.2, 0.4, 0.8]]),
-        "viewmats": torch.eye(4)[None],
-        "Ks": torch.tensor([[[100.0, 0, 16.5], [0, 100.0, 16.5], [0, 0, 1]]]),
-    }
 
 
 def render(scene, width=WIDTH, height=HEIGHT, **options) -> dict[str, torch.Tensor]:
@@ -185,7 +173,7 @@ def test_third_scale_does_not_matter():
 
 
 def test_surfel_facing_the_camera_is_a_gaussian_disc():
-    images = render(single_surfel(opacity=0.8), width=33, height=33)
+    images = render(single_gaussian(opacity=0.8), width=33, height=33)
     expected = bell(0.8, 5.0**2)  # 100 px * 0.1 m / 2 m
     torch.testing.assert_close(images["alpha"], expected, rtol=1e-5, atol=1e-6)
     torch.testing.assert_close(images["depth"], 2 * expected, rtol=1e-5, atol=1e-6)
@@ -202,7 +190,7 @@ def bell(opacity: float, variance: float) -> torch.Tensor:
 
 
 def test_small_surfel_is_the_blob():
-    images = render(single_surfel(scale=1e-6), width=33, height=33)
+    images = render(single_gaussian(scale=1e-6), width=33, height=33)
     torch.testing.assert_close(images["alpha"], bell(0.5, 0.5), rtol=1e-5, atol=1e-6)
 
 
@@ -211,7 +199,7 @@ def tilted_plane(tilt=1.1) -> tuple[dict[str, Any], torch.Tensor, torch.Tensor]:
     normal = torch.tensor([0.0, math.sin(tilt), -math.cos(tilt)])
     in_plane = torch.tensor([[1.0, 0, 0], [0.0, math.cos(tilt), math.sin(tilt)]])
     count = 3000
-    scene = single_surfel(opacity=0.5, scale=0.15)
+    scene = single_gaussian(opacity=0.5, scale=0.15)
     scene["means"] = torch.tensor([0.0, 0, 2]) + (torch.rand(count, 2, generator=g) - 0.5) @ (
         in_plane * torch.tensor([[2.0], [3.0]])
     )
@@ -269,7 +257,7 @@ def test_depth_without_a_plane_has_no_normal():
 
 
 def test_distortion_is_the_weighted_spread():
-    scene = single_surfel(opacity=0.5)
+    scene = single_gaussian(opacity=0.5)
     scene = {
         k: v if k in ("viewmats", "Ks") else v.repeat(2, *[1] * (v.ndim - 1))
         for k, v in scene.items()
@@ -285,7 +273,7 @@ def test_distortion_is_the_weighted_spread():
 
 @pytest.mark.parametrize("quat", [(1.0, 1.0, 0, 0), (1.0, 1.0 + 1e-6, 0, 0), (1.0, 1.001, 0, 0)])
 def test_edge_on_surfel_is_its_blob(quat):
-    scene = single_surfel(quat=quat)
+    scene = single_gaussian(quat=quat)
     for name in LEARNED:
         scene[name] = scene[name].requires_grad_()
     images = render(scene, width=33, height=33)
@@ -297,7 +285,7 @@ def test_edge_on_surfel_is_its_blob(quat):
 
 def test_surfel_through_the_camera_plane_is_drawn_in_front_only():
     quat = (math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0)  # normal along -y
-    scene = single_surfel(opacity=0.9, scale=3.0, depth=1.0, quat=quat)
+    scene = single_gaussian(opacity=0.9, scale=3.0, depth=1.0, quat=quat)
     scene["means"][0, 1] = 0.5
     expected = call_reference(scene, 33, 33, near=0.2)
     images = render(scene, width=33, height=33, near_plane=0.2)
