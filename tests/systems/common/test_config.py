@@ -224,13 +224,14 @@ def test_drakes_functions_read_and_write_registry_fields():
     program = (
         "from pydrake.common.yaml import yaml_dump_typed, yaml_load_typed\n"
         "import splatpilot as sp\n"
-        "text = 'policy: !ReactiveConfig {margin: 0.3}\\nworld: {spacing: 2.5}'\n"
+        "text = 'policy: !ReactiveConfig {margin: 0.3}\\nworld: !WallsConfig {pattern: slalom}'\n"
         "scenario = yaml_load_typed(schema=sp.Scenario, data=text)\n"
-        "assert type(scenario.policy).__name__ == 'ReactiveConfig', scenario\n"
-        "assert type(scenario.world).__name__ == 'ForestConfig', scenario\n"
+        "policy, world = scenario.policy, scenario.world\n"
+        "assert (type(policy).__name__, policy.margin) == ('ReactiveConfig', 0.3), scenario\n"
+        "assert (type(world).__name__, world.pattern) == ('WallsConfig', 'slalom'), scenario\n"
         "assert yaml_dump_typed(scenario) == sp.dump_config(scenario)\n"
         "again = yaml_load_typed(schema=sp.Scenario, data=yaml_dump_typed(scenario))\n"
-        "assert again.policy == scenario.policy\n"
+        "assert (again.policy, again.world) == (scenario.policy, scenario.world)\n"
     )
     subprocess.run([sys.executable, "-c", program], check=True)
 

@@ -1,11 +1,12 @@
 import resource
+import shutil
 import signal
-import subprocess
-import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from splatpilot.training.captures.capture_registry import read_capture
 from splatpilot.training.reconstruction.checkpoint import event_log
@@ -28,27 +29,9 @@ CONFIG = ReconstructConfig(
     refine_fraction=1.0,
 )
 
-# A process that kills itself, as `kill -9` would, halfway through its second checkpoint.
-_CHILD = """
-import os, signal, sys, torch
-from pathlib import Path
-from splatpilot.training.captures.capture_registry import read_capture
-from splatpilot.training.captures.capture_config import CaptureConfig, ScaleConfig
-from splatpilot.training.reconstruction.config import ReconstructConfig
-from splatpilot.training.reconstruction.reconstruct import reconstruct
 
-room, out, config = sys.argv[1:]
-save = torch.save
-
-def save_half(content, path):
-    if content["step"] == 8:
-        Path(path).write_bytes(b"half of it")
-        os.kill(os.getpid(), signal.SIGKILL)
-    save(content, path)
-
-torch.save = save_half
-reconstruct(read_capture(room), out, eval(config))
-"""
+class KilledError(BaseException):
+    """Ends a run where `kill -9` would."""
 
 
 @pytest.fixture
@@ -58,9 +41,21 @@ def room(tmp_path, write_room):
 
 def test_killed_run_resumes_and_ends_in_the_same_scene(tmp_path, room, write_room, monkeypatch):
     out, whole = tmp_path / "scene", tmp_path / "whole"
-    command = [sys.executable, "-c", _CHILD, str(room), str(out), repr(CONFIG)]
-    child = subprocess.run(command, capture_output=True)
-    assert child.returncode == -signal.SIGKILL, child.stderr.decode()
+    work, left, save = tmp_path / ".scene.partial", tmp_path / "left", torch.save
+
+    def save_half(content, path):
+        if content["step"] == 8:
+            Path(path).write_bytes(b"half of it")
+            shutil.copytree(work, left)  # as a kill would leave it
+            raise KilledError
+        save(content, path)
+
+    with monkeypatch.context() as patch, pytest.raises(KilledError):
+        patch.setattr(torch, "save", save_half)
+        reconstruct(read_capture(room), out, CONFIG)
+    shutil.rmtree(work, ignore_errors=True)
+    left.rename(work)
+    assert any(file.read_bytes() == b"half of it" for file in work.iterdir())
     unread = replace(read_capture(room), load_image=lambda i: pytest.fail("an image was read"))
     with pytest.raises(ValueError, match=r"with depth_weight 0\.2, not 0\.3; .* --restart"):
         reconstruct(unread, out, replace(CONFIG, depth_weight=0.3))
@@ -75,7 +70,6 @@ def test_killed_run_resumes_and_ends_in_the_same_scene(tmp_path, room, write_roo
     )
     reconstruct(read_capture(room), out, CONFIG)
     assert steps == list(range(4, 12))
-    work = tmp_path / ".scene.partial"
     assert not work.exists()
 
     work.mkdir()
