@@ -20,8 +20,13 @@ def test_every_public_name_exists():
 def test_importing_loads_nothing_heavy():
     heavy = "{'pydrake', 'numpy', 'torch', 'scipy', 'cv2', 'matplotlib', 'pycolmap'}"
     assert run(f"import sys, splatpilot; print({heavy} & set(sys.modules))") == "set()"
+
+
+def test_flying_and_looking_need_no_extras():
     names = "sp.Scenario, sp.make_world, sp.BuildFlightDiagram, sp.fly, sp.SplatCamera, sp.Esdf"
-    assert run(f"import sys, splatpilot as sp; {names}; print('torch' in sys.modules)") == "False"
+    modules = "splatpilot.diagrams.flight.fly, splatpilot.analysis.view"
+    found = "{'torch', 'pycolmap'} & set(sys.modules)"
+    assert run(f"import sys, splatpilot as sp, {modules}; {names}; print({found})") == "set()"
 
 
 def test_version_is_the_distributions():

@@ -1,16 +1,20 @@
 import ast
 import re
-import subprocess
-import sys
+import runpy
 import tomllib
 from pathlib import Path
 
+from splatpilot.analysis.commands.main import main
+from splatpilot.diagrams.flight.policies import POLICIES
 from splatpilot.diagrams.flight.simulation import Outcome
 
 README = Path(__file__).parents[1] / "README.md"
 
 
-def test_its_python_runs(tmp_path):
+def test_its_python_runs(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(POLICIES, "_entries", dict(POLICIES._entries))
     policy, flight, training = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
     for text, small in (
         ("Env(16, ", "Env(1, "),
@@ -20,19 +24,17 @@ def test_its_python_runs(tmp_path):
     ):
         assert text in training
         training = training.replace(text, small)
-    (tmp_path / "my_policy.py").write_text(policy)
-    (tmp_path / "flight.py").write_text("from my_policy import *\n" + flight)
-    (tmp_path / "training.py").write_text("import splatpilot as sp\n" + training)
-    for script in "training.py", "flight.py":
-        flown = subprocess.run(
-            [sys.executable, script], cwd=tmp_path, capture_output=True, text=True, check=True
-        )
+    Path("my_policy.py").write_text(policy)
+    Path("flight.py").write_text("from my_policy import *\n" + flight)
+    Path("training.py").write_text("import splatpilot as sp\n" + training)
+    runpy.run_path("training.py")
+    capsys.readouterr()
+    runpy.run_path("flight.py")
+    summary = ast.literal_eval(capsys.readouterr().out)
+    assert summary["outcome"] in set(Outcome) and summary["path_length_m"] > 1.0
     command = re.search(r"splatpilot (--import my_policy fly .*)", README.read_text())
     assert command is not None
-    words = [*command[1].split(), "--set", "timeout=1", "--out", "flight"]
-    subprocess.run([sys.executable, "-m", "splatpilot", *words], cwd=tmp_path, check=True)
-    summary = ast.literal_eval(flown.stdout)
-    assert summary["outcome"] in set(Outcome) and summary["path_length_m"] > 1.0
+    assert main([*command[1].split(), "--set", "timeout=1", "--out", "flight"]) == 0
 
 
 def test_extras_are_those_of_the_package():
