@@ -17,9 +17,8 @@ from pydrake.systems.sensors import CameraInfo
 
 from splatpilot.analysis.fidelity import fidelity
 from splatpilot.analysis.fidelity.fidelity import FidelityConfig
-from splatpilot.analysis.output import write_csv
+from splatpilot.analysis.figures import Panel, colorize, depth_scale, write_grid
 from splatpilot.analysis.reconstruction import run as reconstruction
-from splatpilot.analysis.reconstruction.figures import Panel, colorize, depth_scale, write_grid
 from splatpilot.analysis.reconstruction.measure_scene import (
     METRICS,
     SceneViews,
@@ -48,7 +47,8 @@ from splatpilot.systems.common.files import (
     DATA,
     locked_folder,
     require_existing,
-    written_atomically,
+    write_csv,
+    write_text,
 )
 from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.common.provenance import InfeasibleFlightError
@@ -267,8 +267,7 @@ def _store(scenes: Path, record: Record) -> None:
     with locked_folder(scenes):
         index = read_index(scenes) | {record.name: record}
         content = {name: asdict(each) for name, each in sorted(index.items())}
-        with written_atomically(scenes / INDEX) as partial:
-            partial.write_text(json.dumps(content, indent=1))
+        write_text(scenes / INDEX, json.dumps(content, indent=1))
 
 
 def _source(entry: Entry, data: Path | None) -> Path | str:

@@ -27,7 +27,7 @@ from splatpilot.diagrams.worlds.forest.forest import ForestConfig
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.common.drake import vector_input, vector_output, weak_callback
-from splatpilot.systems.common.files import claim_folder, locks_folder, written_atomically
+from splatpilot.systems.common.files import claim_folder, locks_folder, write_text
 from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.common.provenance import revision
 from splatpilot.systems.common.validation import Config, bounded, require
@@ -445,11 +445,9 @@ def run(*, config: FaultsConfig, out: Path) -> dict[str, Any]:
         scenario = replace(config.scenario, seed=seed, policy=policy)
         flown = fly_trial(scenario, world, trial, config.limits, seed)
         rows.append({"revision": flown_by} | flown)
-        with written_atomically(lines) as path:
-            path.write_text("".join(json.dumps(row) + "\n" for row in rows))
+        write_text(lines, "".join(json.dumps(row) + "\n" for row in rows))
     summary = summarize(rows, table)
-    with written_atomically(out / "summary.json") as path:
-        path.write_text(json.dumps(summary, indent=2) + "\n")
+    write_text(out / "summary.json", json.dumps(summary, indent=2) + "\n")
     print(f"{'fault':<16} {'safe':>9}  ended")
     for kind, row in summary["kinds"].items():
         ends = ", ".join(f"{name} {count}" for name, count in row["outcomes"].items())

@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw
 
-from splatpilot.analysis.output import write_csv
-from splatpilot.analysis.reconstruction.figures import Panel, write_grid
+from splatpilot.analysis.figures import Panel, write_grid
 from splatpilot.diagrams.flight.policies import POLICIES, policy_named
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.worlds.scene_folder import read_scene_folder, read_scene_metadata
@@ -29,7 +28,7 @@ from splatpilot.systems.collision.depth_fusion import (
     esdf_from_depth_images,
 )
 from splatpilot.systems.collision.distance_field import DistanceField
-from splatpilot.systems.common.files import claim_folder, locks_folder
+from splatpilot.systems.common.files import claim_folder, locks_folder, write_csv
 from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.common.seeds import MONTE_CARLO_SEEDS
 from splatpilot.systems.common.validation import Config, bounded, require, require_field

@@ -19,10 +19,9 @@ from splatpilot.analysis.benchmark import run_study
 from splatpilot.analysis.benchmark.study import StudyConfig
 from splatpilot.analysis.benchmark.study_folder import StudyFolder
 from splatpilot.analysis.benchmark.tables import Row
-from splatpilot.analysis.output import write_csv
 from splatpilot.diagrams.flight.policies import POLICIES
 from splatpilot.diagrams.scenarios import benchmark_scenarios, profile_file
-from splatpilot.systems.common.files import written_atomically
+from splatpilot.systems.common.files import write_csv, write_text
 from splatpilot.systems.common.validation import require
 
 PROFILES = "ideal", "realistic", "harsh"
@@ -40,8 +39,7 @@ def write_effects(folder: Path) -> dict[str, list[str]]:
     effects = {"rotors": _ROTORS}
     for name, section in sections.items():
         text = yaml.serialize(yaml.MappingNode(root.tag, [controller, section]))
-        with written_atomically(folder / f"{name}.yaml") as path:
-            path.write_text(text)
+        write_text(folder / f"{name}.yaml", text)
         effects[name] = [f"profile={folder / name}.yaml"]
     return effects
 

@@ -19,7 +19,7 @@ from splatpilot.analysis.benchmark.parameters import scenario_texts
 from splatpilot.analysis.benchmark.study import StudyConfig
 from splatpilot.analysis.benchmark.tables import Row
 from splatpilot.analysis.benchmark.variants import parse_variant
-from splatpilot.analysis.output import write_csv, write_png
+from splatpilot.analysis.figures import write_png
 from splatpilot.diagrams.flight.policies import DEFAULT_SPEED
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.worlds.mesh_world import MeshWorld
@@ -31,6 +31,7 @@ from splatpilot.diagrams.worlds.scene_folder import (
 )
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import make_world
+from splatpilot.systems.common.files import write_csv
 from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.common.validation import Config, bounded, require

@@ -26,7 +26,7 @@ from splatpilot.systems.common.config import load_config
 from splatpilot.systems.common.files import (
     require_unused,
     require_writable_folder,
-    written_atomically,
+    write_text,
 )
 from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.common.validation import require
@@ -89,8 +89,7 @@ def run(
         shown.ends or (), ("start", "goal"), (START_COLOR, GOAL_COLOR), strict=False
     ):
         draw_goal(meshcat, f"/splatpilot/{end}", p_W, MARKER_RADIUS, color)
-    with written_atomically(out) as partial:
-        partial.write_text(scene_page(meshcat.StaticHtml(), shown))
+    write_text(out, scene_page(meshcat.StaticHtml(), shown))
     print(f"Wrote {out}, a page for any browser")
     return out
 

@@ -24,7 +24,7 @@ from splatpilot.analysis.benchmark.tables import (
     select,
     success_summary,
 )
-from splatpilot.analysis.output import write_png
+from splatpilot.analysis.figures import write_png
 from splatpilot.diagrams.flight.scenario import goal_position, sample_scenario
 from splatpilot.diagrams.worlds.scene_folder import SceneSource
 from splatpilot.diagrams.worlds.world_registry import make_world

@@ -37,7 +37,6 @@ from splatpilot.analysis.benchmark.tables import (
     policy_table,
 )
 from splatpilot.analysis.benchmark.variants import SCENARIO, ScenarioVariant
-from splatpilot.analysis.output import write_csv
 from splatpilot.diagrams.flight.policies import DEFAULT_SPEED, POLICIES, at_speed, policy_speed
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.flight.sensors import SENSORS
@@ -45,7 +44,7 @@ from splatpilot.diagrams.worlds.scene_folder import SceneSource, find_scene
 from splatpilot.diagrams.worlds.world_registry import WORLDS
 from splatpilot.systems.common.config import dump_config
 from splatpilot.systems.common.extras import import_extra
-from splatpilot.systems.common.files import locks_folder
+from splatpilot.systems.common.files import locks_folder, write_csv
 from splatpilot.systems.common.processes import available_cores, map_processes
 from splatpilot.systems.common.progress import Progress, resumable
 from splatpilot.systems.common.provenance import program

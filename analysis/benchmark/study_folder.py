@@ -54,6 +54,7 @@ from splatpilot.systems.common.files import (
     find_data,
     folder_written_atomically,
     require_writable_folder,
+    write_text,
     written_atomically,
 )
 from splatpilot.systems.common.readers import error_summary, read_archive, read_text, yaml_errors
@@ -114,8 +115,7 @@ class StudyFolder:
         """Writes the study, which may have grown, and the program that flies it."""
         study = yaml.safe_load(dump_config(config))
         described = {"format_version": FORMAT_VERSION, "study": study, "program": program}
-        with written_atomically(self.path / "study.yaml") as path:
-            path.write_text(yaml.safe_dump(described, sort_keys=False))
+        write_text(self.path / "study.yaml", yaml.safe_dump(described, sort_keys=False))
 
     def config(self) -> StudyConfig:
         """Reads the study."""
@@ -152,8 +152,7 @@ class StudyFolder:
     def write(self, rollout: Rollout) -> None:
         """Writes a flight."""
         id = rollout.row["id"]
-        with written_atomically(self.path / "timings" / f"{id}.json") as path:
-            path.write_text(json.dumps(rollout.timing))
+        write_text(self.path / "timings" / f"{id}.json", json.dumps(rollout.timing))
         with written_atomically(self.trajectory(id)) as path:
             path.write_bytes(rollout.trajectory)
 
@@ -161,8 +160,7 @@ class StudyFolder:
         """Writes the traceback of a fault, and returns its file."""
         file = self.path / "errors" / f"{fault.id}.txt"
         file.parent.mkdir(exist_ok=True)
-        with written_atomically(file) as path:
-            path.write_text(fault.traceback)
+        write_text(file, fault.traceback)
         return file
 
     def read(self, spec: RolloutSpec) -> tuple[Row, dict[str, np.ndarray]]:
@@ -240,8 +238,7 @@ def keep_inputs(folder: StudyFolder, config: StudyConfig, scenarios: dict[str, S
                 f"{file} differs from the scenario {name} of this program; choose another folder "
                 "with --out, or finish the study with the program that started it"
             )
-        with written_atomically(file) as path:
-            path.write_text(text)
+        write_text(file, text)
 
 
 def _keep_scene(folder: StudyFolder, scene: Path) -> str:

@@ -18,7 +18,7 @@ from splatpilot.systems.common.files import (
     SCENES,
     data_folder,
     scenes_folder,
-    written_atomically,
+    write_text,
 )
 from splatpilot.systems.common.processes import available_cores
 
@@ -78,8 +78,7 @@ def headlines(options: argparse.Namespace) -> dict[str, Any]:
 
     result = run()
     if options.out is not None:
-        with written_atomically(options.out) as partial:
-            partial.write_text(result["table"])
+        write_text(options.out, result["table"])
     return {name: value for name, value in result.items() if name != "table"}
 
 

@@ -22,8 +22,7 @@ from splatpilot.analysis.fidelity.study import (
     drop_frames,
     first_crossing,
 )
-from splatpilot.analysis.output import write_csv, write_png
-from splatpilot.analysis.reconstruction.figures import depth_scale, error_scale, write_grid
+from splatpilot.analysis.figures import depth_scale, error_scale, write_grid, write_png
 from splatpilot.analysis.reconstruction.measure_scene import SceneViews
 from splatpilot.diagrams.worlds.scene_folder import (
     SceneMetadata,
@@ -32,7 +31,7 @@ from splatpilot.diagrams.worlds.scene_folder import (
 )
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.common.config import dump_config
-from splatpilot.systems.common.files import claim_folder, locks_folder, written_atomically
+from splatpilot.systems.common.files import claim_folder, locks_folder, write_csv, write_text
 from splatpilot.systems.common.progress import Progress, resumable
 from splatpilot.systems.common.validation import Config, bounded, require_field
 from splatpilot.training.captures.capture import CaptureFrame, shrink
@@ -241,8 +240,7 @@ def _held_out_frames(
     if not file.is_file() or file.read_text() != recipe:
         with resumable(lambda: kept_work(out)):
             reconstruct(part, out, settings)
-        with written_atomically(file) as partial:
-            partial.write_text(recipe)
+        write_text(file, recipe)
     measured = Progress(held_out, "measuring held-out frames", unit="frame")
     return SceneViews(out, part), ((i, None, capture.frame(i)) for i in measured)
 

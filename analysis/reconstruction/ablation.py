@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from splatpilot.analysis.output import write_csv
-from splatpilot.analysis.reconstruction import figures
+from splatpilot.analysis import figures
 from splatpilot.analysis.reconstruction.measure_scene import (
     NAMES,
     SceneMetrics,
@@ -21,7 +20,7 @@ from splatpilot.analysis.reconstruction.measure_scene import (
 )
 from splatpilot.diagrams.worlds.scene_folder import read_scene_metadata
 from splatpilot.systems.common.config import dump_config
-from splatpilot.systems.common.files import claim_folder, locks_folder, written_atomically
+from splatpilot.systems.common.files import claim_folder, locks_folder, write_csv, write_text
 from splatpilot.systems.common.progress import resumable
 from splatpilot.systems.common.torch_device import require_renderer
 from splatpilot.systems.common.validation import require
@@ -223,8 +222,7 @@ def _ablate(capture: Capture, out: Path, config: ReconstructConfig) -> dict[str,
             source = replace(capture, points=points) if arm.step == "points" else capture
             with resumable(partial(kept_work, scene)):
                 reconstruct(source, scene, arm_config(arm, config))
-            with written_atomically(file) as written:
-                written.write_text(recipe)
+            write_text(file, recipe)
         found[arm.key] = read_metrics(scene) or measure_scene(scene, capture)
     return found
 
@@ -250,8 +248,7 @@ def _write_tables(out: Path, result: AblationResult, config: ReconstructConfig) 
         *(f"![{name}]({name}.png)" for name in result.captures),
         "",
     ]
-    with written_atomically(out / "ablation.md") as written:
-        written.write_text("\n".join(lines))
+    write_text(out / "ablation.md", "\n".join(lines))
     table = [
         {"capture": name, "arm": arm.key, **{n: arms[arm.key].mean(n) for n in COLUMNS}}
         for name, arms in result.captures.items()

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from splatpilot.analysis.reconstruction.figures import (
+from splatpilot.analysis.figures import (
     Panel,
     Scale,
     colorize,
@@ -18,7 +18,7 @@ from splatpilot.analysis.reconstruction.figures import (
 )
 from splatpilot.diagrams.worlds import scene_folder
 from splatpilot.diagrams.worlds.observed_routes import ObservedViews
-from splatpilot.systems.common.files import require_unused, written_atomically
+from splatpilot.systems.common.files import require_unused, write_text
 from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.policies.time_of_arrival import time_of_arrival
@@ -236,8 +236,7 @@ def measure_scene(scene: Path, capture: Capture | None = None) -> SceneMetrics:
         flight_unseen_fraction=unseen_fraction(scene),
     )
     _write_views(scene / VIEWS, views, metrics)
-    with written_atomically(scene / METRICS) as partial:  # last: it marks the scene as measured
-        partial.write_text(json.dumps(metrics.as_json(), indent=2))
+    write_text(scene / METRICS, json.dumps(metrics.as_json(), indent=2))
     return metrics
 
 

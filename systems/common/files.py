@@ -5,6 +5,7 @@ A killed process leaves it there; `require_writable_folder` removes such leftove
 """
 
 import contextlib
+import csv
 import errno
 import fcntl
 import functools
@@ -13,7 +14,7 @@ import os
 import platform
 import re
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -55,6 +56,22 @@ def written_atomically(path: Path, check: Callable[[Path], None] | None = None) 
             os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Writes a text file, atomically."""
+    with written_atomically(path) as partial:
+        partial.write_text(text)
+
+
+def write_csv(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
+    """Writes rows as CSV, atomically, with the columns of all of them."""
+    rows = list(rows)
+    columns = dict.fromkeys(column for row in rows for column in row)
+    with written_atomically(path) as partial, partial.open("w", newline="") as file:
+        table = csv.DictWriter(file, columns, lineterminator="\n")
+        table.writeheader()
+        table.writerows(rows)
 
 
 @contextmanager

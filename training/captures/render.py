@@ -23,6 +23,7 @@ from splatpilot.systems.common.config import dump_config, load_config
 from splatpilot.systems.common.files import (
     locked_folder,
     require_writable_folder,
+    write_text,
     written_atomically,
 )
 from splatpilot.systems.common.progress import Progress, resumable
@@ -167,8 +168,7 @@ def _render(world: Path, out: Path, partial: Path, config: RenderConfig, seed: i
         esdf = esdf_from_distance_field(spec.distance_field, voxel_size)
     plan = None if config.path else _plan(esdf, config)
     X_WCs = _poses_on_path(esdf, config) if plan is None else plan.X_WCs
-    with written_atomically(partial / RECIPE) as file:
-        file.write_text(text)
+    write_text(partial / RECIPE, text)
     mesh = partial / recipe.mesh
     if spec is not None and not mesh.is_file():
         write_gltf(spec, mesh)
@@ -306,5 +306,4 @@ def _write_frames(
         with written_atomically(image) as file:
             _, content = cv2.imencode(".png", np.ascontiguousarray(frame.image[..., ::-1]))
             file.write_bytes(content.tobytes())
-    with written_atomically(folder / "pose_left.txt") as file:
-        file.write_text("".join(rows))
+    write_text(folder / "pose_left.txt", "".join(rows))

@@ -21,6 +21,7 @@ from splatpilot.systems.common.config import load_config
 from splatpilot.systems.common.files import (
     folder_written_atomically,
     require_corpus,
+    write_csv,
     written_atomically,
 )
 from splatpilot.systems.common.seeds import first_training_seed
@@ -179,11 +180,7 @@ def write_ledger(corpus: Corpus) -> None:
             "revision": shard.revision,
         }
         rows += [same | flight for flight in shard.flights]
-    columns = list(dict.fromkeys(name for row in rows for name in row))
-    with written_atomically(corpus.folder / LEDGER) as path, path.open("w", newline="") as file:
-        table = csv.DictWriter(file, columns, lineterminator="\n")
-        table.writeheader()
-        table.writerows(rows)
+    write_csv(corpus.folder / LEDGER, rows)
 
 
 def link_corpus(source: Path, folder: Path) -> None:

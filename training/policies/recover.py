@@ -21,7 +21,12 @@ from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
 from splatpilot.diagrams.flight.policies import policy_named
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.flight.simulation import fly
-from splatpilot.systems.common.files import claim_folder, locks_folder, written_atomically
+from splatpilot.systems.common.files import (
+    claim_folder,
+    locks_folder,
+    write_text,
+    written_atomically,
+)
 from splatpilot.systems.common.processes import map_processes
 from splatpilot.systems.common.progress import Progress, resumable, say
 from splatpilot.systems.common.provenance import InfeasibleFlightError, revision
@@ -214,8 +219,7 @@ def run[Config: CorpusTraining](
     summary = _count([Corpus(folder) for folder in folders], outcomes)
     summary |= {"flown_by": flown_by} if flown_by else {"stage_1": first}
     summary["stage_2"] = second
-    with written_atomically(out / "recovery.json") as path:
-        path.write_text(json.dumps(summary, indent=2) + "\n")
+    write_text(out / "recovery.json", json.dumps(summary, indent=2) + "\n")
     return summary
 
 

@@ -1,7 +1,5 @@
 """The training loop: any trainer, resumable, with a record next to the weights."""
 
-import csv
-import io
 import json
 import time
 from collections.abc import Callable
@@ -12,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from splatpilot.systems.common.files import claim_folder, locked_folder, written_atomically
+from splatpilot.systems.common.files import claim_folder, locked_folder, write_csv, write_text
 from splatpilot.systems.common.progress import CheckpointClock, Progress, resumable, say
 from splatpilot.systems.common.provenance import revision
 from splatpilot.systems.common.readers import error_summary
@@ -121,8 +119,8 @@ class _Run:
             "cpu_minutes": round(progress.cpu_seconds / 60.0, 2),
             "best": best,
         }
-        self._write("summary.json", json.dumps(summary, indent=2) + "\n")
-        self._write(f"{trainer.policy}.md", self._model_card(summary))
+        write_text(self.out / "summary.json", json.dumps(summary, indent=2) + "\n")
+        write_text(self.out / f"{trainer.policy}.md", self._model_card(summary))
         print(
             f"{trainer.policy}: success in {best['success']:.0%} of held-out {trainer.evaluated} "
             f"after {best['update']} of {progress.update} updates, "
@@ -177,7 +175,7 @@ class _Run:
         }
         with self.clock.writing():
             save_tensors(state, self.checkpoint)
-            self._write_curves()
+            write_csv(self.out / "curves.csv", self.progress.curves)
         self.kept_update = self.progress.update
 
     def _resume(self) -> None:
@@ -205,7 +203,7 @@ class _Run:
             raise ValueError(f"No such file: {weights}, the best weights; restore it, or {remedy}")
         self.kept_update = self.progress.update
         say(f"resuming {self.out} at update {self.kept_update} of {self.schedule.updates}")
-        self._write_curves()
+        write_csv(self.out / "curves.csv", self.progress.curves)
 
     def _write_weights(self) -> None:
         """Writes the weights as float32, or as the `weights_type` of their architecture."""
@@ -224,14 +222,6 @@ class _Run:
         }
         checkpoint = PolicyCheckpoint(trainer.policy, trainer.spec, weights, provenance)
         checkpoint.save(self.out / f"{trainer.policy}.npz")
-
-    def _write_curves(self) -> None:
-        text, rows = io.StringIO(), self.progress.curves
-        names = list(dict.fromkeys(name for row in rows for name in row))
-        table = csv.DictWriter(text, names, lineterminator="\n")
-        table.writeheader()
-        table.writerows(rows)
-        self._write("curves.csv", text.getvalue())
 
     def _model_card(self, summary: dict[str, Any]) -> str:
         policy, best = summary["policy"], summary["best"]
@@ -253,10 +243,6 @@ revision {self.revision} of the source, in {summary["cpu_minutes"]:.1f} minutes 
 ```yaml
 {self.yaml}```
 """
-
-    def _write(self, name: str, text: str) -> None:
-        with written_atomically(self.out / name) as path:
-            path.write_text(text)
 
 
 def step_optimizer(

@@ -1,17 +1,19 @@
-"""Image grids: rows and columns with titles, depth in color, floaters in red."""
+"""Figures of studies, and image grids: titles, depth in color, floaters in red."""
 
+import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from matplotlib import colormaps
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from splatpilot.analysis.output import write_png
+from splatpilot.systems.common.files import written_atomically
 
 _RED = np.array([0.95, 0.05, 0.05])
 _GRAY = 0.35  # of unknown values
@@ -94,3 +96,14 @@ def write_grid(
     for axes, title in zip(grid[0], columns, strict=True):
         axes.set_title(title, fontsize=12)
     write_png(figure, path)
+
+
+def write_png(figure: Figure, path: Path, dpi: int = 130) -> bytes:
+    """Writes a figure as PNG, atomically, and returns the bytes, which are deterministic."""
+    FigureCanvasAgg(figure)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=dpi, metadata={"Software": None})
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with written_atomically(path) as partial:
+        partial.write_bytes(buffer.getvalue())
+    return buffer.getvalue()
