@@ -249,7 +249,7 @@ def images(effort: Effort) -> Iterator[Headline]:
 
     from splatpilot.systems.splats import rasterize
 
-    tensors: dict[str, Any] = _tensors(world, view, X_WCs[:1])
+    tensors: dict[str, Any] = scene_tensors(world.gaussians, view, X_WCs[:1])
     tensors["render_mode"] = "RGB+MD"
     ratio = milliseconds(partial(rasterize, **tensors), repeats) / milliseconds(
         partial(baked.render, *view, X_WCs[0]), repeats
@@ -274,13 +274,15 @@ def _views(
     return (camera.camera_info().intrinsic_matrix(), width, height), X_WCs
 
 
-def _tensors(world: Any, view: tuple[np.ndarray, int, int], X_WCs: Sequence[Any]) -> dict[str, Any]:
+def scene_tensors(
+    scene: Any, view: tuple[np.ndarray, int, int], X_WCs: Sequence[Any]
+) -> dict[str, Any]:
     """Returns arguments of `rasterize`."""
     import torch
 
     names = {name: name for name in ("means", "quats", "scales", "opacities")}
     names["colors"] = "base_colors"
-    arrays = {key: getattr(world.gaussians, name) for key, name in names.items()}
+    arrays = {key: getattr(scene, name) for key, name in names.items()}
     arrays["viewmats"] = np.stack([X_WC.inverse().GetAsMatrix4() for X_WC in X_WCs])
     arrays["Ks"] = np.repeat(view[0][None], len(X_WCs), axis=0)
     tensors = {key: torch.tensor(array, dtype=torch.float32) for key, array in arrays.items()}
@@ -352,7 +354,7 @@ def gpu_images(effort: Effort, device: str = "cuda") -> Iterator[Headline]:
     counts = sorted({1, 16, 256, effort.vehicles})
     for name, (mode, width, height, required) in kinds.items():
         for count in counts:
-            given = _tensors(world, *_views(scenario, world, width, height, count))
+            given = scene_tensors(world.gaussians, *_views(scenario, world, width, height, count))
             given = {k: _moved(v, device) for k, v in given.items()} | {"render_mode": mode}
 
             def render(given: Mapping[str, Any] = given) -> None:
@@ -370,7 +372,7 @@ def gpu_agreement(effort: Effort, device: str = "cuda") -> Iterator[Headline]:
     from splatpilot.systems.splats import rasterize
 
     scenario, world = _forest()
-    given: dict[str, Any] = _tensors(world, *_views(scenario, world, 320, 240, 1))
+    given: dict[str, Any] = scene_tensors(world.gaussians, *_views(scenario, world, 320, 240, 1))
     given["render_mode"] = "RGB+ED"
     ours = rasterize(**given)[0]
     theirs = rasterize(**{k: _moved(v, device) for k, v in given.items()})[0]

@@ -12,7 +12,6 @@ from typing import NamedTuple, cast
 
 import numpy as np
 import torch
-from harness import header, row
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 from pydrake.systems.sensors import ImageDepth32F
@@ -131,14 +130,14 @@ def main() -> None:
     parser.add_argument("--scenarios", nargs="*", default=generated, help="generated, by name")
     parser.add_argument("--frames", type=int, default=24, help="along each flight")
     options = parser.parse_args()
-    header("scenario", "size", "wrong pixels", "median relative error below 4 m")
+    print("| scenario | size | wrong pixels | median relative error below 4 m |\n|---|---|---|---|")
     for name in options.scenarios:
         scenario = load_config(Scenario(), scenario_file(name))
         frames = frames_along_flight(scenario, CAMERAS, options.frames)
         for camera, seen in zip(CAMERAS, frames, strict=True):
             errors = depth_errors(seen, camera.max_depth)
-            cells = (f"{100 * share:.2f} %" for share in (errors.wrong, errors.bias))
-            row(name, f"{camera.width}x{camera.height}", *cells)
+            size, wrong, bias = f"{camera.width}x{camera.height}", errors.wrong, errors.bias
+            print(f"| {name} | {size} | {100 * wrong:.2f} % | {100 * bias:.2f} % |", flush=True)
 
 
 if __name__ == "__main__":

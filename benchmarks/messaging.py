@@ -22,7 +22,6 @@ from pathlib import Path
 import lcm
 import numpy as np
 from drake import lcmt_image_array
-from harness import header, row
 
 from splatpilot.analysis.headlines import machine
 from splatpilot.systems.messaging import generated
@@ -89,6 +88,10 @@ def loop_times(images: np.ndarray, setpoints: np.ndarray) -> np.ndarray:
     return 1e3 * (arrival[first] - images[known, 2])[known >= 0]
 
 
+def row(*cells: object) -> None:
+    print("| " + " | ".join(map(str, cells)) + " |", flush=True)
+
+
 def quantiles(parts: list[np.ndarray]) -> tuple[str, ...]:
     values = np.concatenate(parts)
     return tuple(f"{np.quantile(values, q):.2f}" for q in (0.5, 0.99, 1.0))
@@ -125,7 +128,8 @@ def main() -> None:
             for name in {"DEPTH_IMAGE", "DEPTH_GRID"} & set(heard):
                 loops.append(loop_times(heard[name], heard["VELOCITY_SETPOINT"]))
     print(f"{outcomes.count('goal')} of {seeds} flights reached the goal")
-    header("[ms]", "messages", "lost", "median", "99 of 100", "maximum")
+    row("[ms]", "messages", "lost", "median", "99 of 100", "maximum")
+    print("|---" * 6 + "|")
     row("image to velocity setpoint", sum(map(len, loops)), "", *quantiles(loops))
     for name, parts in sorted(latency.items()):
         row(f"{name}, latency", sum(map(len, parts)), lost[name], *quantiles(parts))

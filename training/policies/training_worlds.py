@@ -1,20 +1,15 @@
 """Worlds to train in: of the benchmark's kinds, by seeds that it does not use, and captured scenes
 in which it does not fly."""
 
-import contextlib
-import json
-import os
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass, field, fields
-from hashlib import blake2b
+from dataclasses import dataclass, field
 from itertools import cycle
-from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 import torch
-from pydrake.math import RigidTransform
+from joblib import Memory
 from torch import Tensor
 
 from splatpilot.diagrams.worlds.feasibility import choose_start_and_goal
@@ -26,24 +21,11 @@ from splatpilot.diagrams.worlds.world_registry import (
 )
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.esdf_build import esdf_from_distance_field
-from splatpilot.systems.collision.shapes import (
-    AnalyticDistanceField,
-    Box,
-    Capsule,
-    Cylinder,
-    HalfSpace,
-    Shape,
-    Sphere,
-)
+from splatpilot.systems.collision.shapes import AnalyticDistanceField, HalfSpace, Shape
 from splatpilot.systems.common.config import dump_config
-from splatpilot.systems.common.files import (
-    cache_folder,
-    require_writable_folder,
-    written_atomically,
-)
+from splatpilot.systems.common.files import cache_folder, require_writable_folder
 from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.common.provenance import program
-from splatpilot.systems.common.readers import read_archive
 from splatpilot.systems.common.seeds import SEEDS_PER_RUN, VALIDATION_SEEDS, first_training_seed
 from splatpilot.systems.common.validation import Config, bounded
 from splatpilot.systems.policies.time_of_arrival import TimeOfArrival, time_of_arrival
@@ -54,38 +36,23 @@ from splatpilot.training.policies.vehicles import Vehicle
 
 _LIMIT = 1 << 30  # [bytes] of the cache; the files that were used last stay.
 
-# Shapes that the cache can store, and points (3,) [m] of a `WorldSpec`.
-_SHAPES = {shape.__name__: shape for shape in (Sphere, Capsule, Cylinder, Box, HalfSpace)}
-_POINTS = "lower_W", "upper_W", "p_WS", "p_WG"
-
 
 class WorldCache:
     """Cache of training worlds and their times of arrival in the user's folder. It depends on the
     version of the program. A folder that cannot be written stays empty."""
 
     def __init__(self) -> None:
-        self._folder = cache_folder("worlds")
-        self._program = repr(program()).encode()
-        with contextlib.suppress(OSError):
-            require_writable_folder(self._folder)
+        folder = cache_folder("worlds")
+        try:
+            require_writable_folder(folder)
+        except OSError:
+            folder = None
+        self._memory, self._program = Memory(folder, verbose=0), program()
 
     def world(self, config: WorldConfig, seed: int) -> "TrainingWorld":
         """Makes the world of a configuration and seed, without its appearance."""
-        file = self._file("json", f"{dump_config(config)}{seed}".encode())
-        with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
-            kept = json.loads(file.read_text())
-            os.utime(file)
-            points = (np.array(kept[name]) for name in _POINTS)
-            return TrainingWorld([_shape(*one) for one in kept["shapes"]], *points)
-        spec = make_spec(config, seed)
-        shapes = [solid.shape for solid in spec.solids]
-        points = {name: getattr(spec, name) for name in _POINTS}
-        if all(type(shape) in _SHAPES.values() for shape in shapes):
-            content = {name: point.tolist() for name, point in points.items()}
-            content["shapes"] = [_fields(shape) for shape in shapes]
-            with contextlib.suppress(OSError), written_atomically(file) as path:
-                path.write_text(json.dumps(content))
-        return TrainingWorld(shapes, *points.values())
+        make = self._memory.cache(_make_world, ignore=["config"])
+        return make(config, dump_config(config), seed, self._program)
 
     def arrival(self, world: "TrainingWorld", voxel_size: float) -> tuple[Esdf, TimeOfArrival]:
         """Returns the conservative distances and the times of arrival in a world, on grids of
@@ -94,55 +61,36 @@ class WorldCache:
         if isinstance(surfaces, Esdf):
             parts = [surfaces.distances, surfaces.states, surfaces.lower_W, surfaces.voxel_size]
         else:
-            named = ((type(shape).__name__.encode(), *shape.parameters()) for shape in surfaces)
-            parts = [part for parts in named for part in parts]
-        parts = world.lower_W, world.upper_W, p_WG, voxel_size, *parts
-        file = self._file("npz", *(np.ascontiguousarray(part).tobytes() for part in parts))
-        with contextlib.suppress(OSError, ValueError, KeyError):
-            kept = read_archive(file)
-            os.utime(file)
-            grid = kept["distances"], kept["states"], kept["lower_W"], voxel_size
-            toa = TimeOfArrival(p_WG, kept["times"], kept["reachable"], *grid[2:])
-            return Esdf(*grid, occupied_outside=True), toa
-        field = surfaces
-        if not isinstance(field, Esdf):
-            field = AnalyticDistanceField(field, world.lower_W, world.upper_W)
-        esdf = esdf_from_distance_field(field, voxel_size).conservative()
-        toa = time_of_arrival(esdf, p_WG)
-        arrays = {name: getattr(esdf, name) for name in ("distances", "states", "lower_W")}
-        with contextlib.suppress(OSError), written_atomically(file) as path:
-            np.savez(path, times=toa.times, reachable=toa.reachable, **arrays)
-        return esdf, toa
+            parts = [(type(shape).__name__, *shape.parameters()) for shape in surfaces]
+        decisive = [world.lower_W, world.upper_W, p_WG, parts, self._program]
+        find = self._memory.cache(_find_arrival, ignore=["world"])
+        distances, states, lower_W, times, reachable = find(world, voxel_size, decisive)
+        grid = lower_W, voxel_size
+        toa = TimeOfArrival(p_WG, times, reachable, *grid)
+        return Esdf(distances, states, *grid, occupied_outside=True), toa
 
     def prune(self) -> None:
         """Removes the files that were used least recently, beyond the limit."""
-        with contextlib.suppress(OSError):
-            files = [(file.stat(), file) for file in self._folder.glob("[!.]*")]
-            left = _LIMIT
-            for status, file in sorted(files, key=lambda one: -one[0].st_mtime):
-                left -= status.st_size
-                if left < 0:
-                    file.unlink(missing_ok=True)
-
-    def _file(self, suffix: str, *decisive: bytes) -> Path:
-        key = blake2b(self._program, digest_size=16)
-        for part in decisive:
-            key.update(part)
-        return self._folder / f"{key.hexdigest()}.{suffix}"
+        self._memory.reduce_size(bytes_limit=_LIMIT)
 
 
-def _fields(shape: Shape) -> tuple[str, dict[str, Any]]:
-    values = {field.name: getattr(shape, field.name) for field in fields(shape)}  # type: ignore
-    return type(shape).__name__, {
-        name: (v.GetAsMatrix34() if isinstance(v, RigidTransform) else np.asarray(v)).tolist()
-        for name, v in values.items()
-    }
+def _make_world(
+    config: WorldConfig, text: str, seed: int, program: dict[str, str]
+) -> "TrainingWorld":
+    spec = make_spec(config, seed)
+    shapes = [solid.shape for solid in spec.solids]
+    return TrainingWorld(shapes, spec.lower_W, spec.upper_W, spec.p_WS, spec.p_WG)
 
 
-def _shape(name: str, values: dict[str, Any]) -> Shape:
-    if "X_WO" in values:
-        values["X_WO"] = RigidTransform(np.array(values["X_WO"]))
-    return _SHAPES[name](**values)
+def _find_arrival(
+    world: "TrainingWorld", voxel_size: float, decisive: list[Any]
+) -> tuple[np.ndarray, ...]:
+    field = world.surfaces
+    if not isinstance(field, Esdf):
+        field = AnalyticDistanceField(field, world.lower_W, world.upper_W)
+    esdf = esdf_from_distance_field(field, voxel_size).conservative()
+    toa = time_of_arrival(esdf, world.p_WG)
+    return esdf.distances, esdf.states, esdf.lower_W, toa.times, toa.reachable
 
 
 STARTS = 256  # positions in each world from which flights of training start

@@ -180,7 +180,7 @@ def test_arrival_is_read_from_the_cache(folder, monkeypatch):
 
 def test_damaged_files_are_made_again(folder):
     made = arrival()
-    [file] = folder.iterdir()
+    [file] = folder.rglob("output.pkl")
     content = file.read_bytes()
     file.write_bytes(content[: len(content) // 2])
     assert_same(arrival(), made)
@@ -198,12 +198,14 @@ def test_least_recently_used_files_are_removed_first(folder, monkeypatch):
     cache = WorldCache()
     for goal in (1.2, 1.3, 1.4):
         arrival(goal)
-    files = sorted(folder.iterdir())
+    files = sorted(folder.rglob("output.pkl"))
     for time, file in enumerate(files):
         os.utime(file, (time, time))
-    monkeypatch.setattr(world_cache, "_LIMIT", 2 * files[0].stat().st_size)
+    monkeypatch.setattr(
+        world_cache, "_LIMIT", 2 * sum(file.stat().st_size for file in files[0].parent.iterdir())
+    )
     cache.prune()
-    assert sorted(folder.iterdir()) == files[1:]
+    assert sorted(folder.rglob("output.pkl")) == files[1:]
 
 
 @pytest.mark.parametrize("kind", ["P02", "P05", "P10", "P11"])
