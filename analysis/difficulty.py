@@ -276,7 +276,6 @@ def run(*, scenarios: Sequence[str], seeds: int) -> list[str]:
 
 
 def _measure(file: Path, seeds: int) -> str:
-    """Returns the columns of a scenario."""
     config = load_config(Scenario(), file).world
     rows, spent = [], []
     for seed in Progress(range(seeds), f"measuring {file.stem}", unit="world", leave=False):

@@ -15,8 +15,8 @@ from pydrake.common.yaml import yaml_load_file
 from pydrake.math import RigidTransform
 from pydrake.systems.sensors import CameraInfo
 
-from splatpilot.analysis.fidelity import fidelity
-from splatpilot.analysis.fidelity.fidelity import FidelityConfig
+from splatpilot.analysis import fidelity
+from splatpilot.analysis.fidelity import FidelityConfig
 from splatpilot.analysis.figures import Panel, colorize, depth_scale, write_grid
 from splatpilot.analysis.reconstruction import run as reconstruction
 from splatpilot.analysis.reconstruction.measure_scene import (
@@ -271,7 +271,6 @@ def _store(scenes: Path, record: Record) -> None:
 
 
 def _source(entry: Entry, data: Path | None) -> Path | str:
-    """Returns the path of a capture, mesh or OctoMap, or the name of a scenario."""
     if entry.source in benchmark_scenarios():
         return entry.source
     if data is None:
@@ -283,7 +282,6 @@ def _source(entry: Entry, data: Path | None) -> Path | str:
 def _make(
     name: str, entry: Entry, source: Path | str, scenes: Path, overrides: Sequence[str]
 ) -> Record:
-    """Makes and measures one environment."""
     if isinstance(source, Path) and source.suffix.lower() == OCTOMAP:
         path = str(source.absolute())
         digest = source_digest(part_digests([source.read_bytes()]))
@@ -400,7 +398,6 @@ def _mesh_license(source: Path | str) -> str:
 
 
 def _write_sheet(path: Path, records: Sequence[Record], scenes: Path) -> None:
-    """Writes the contact sheet."""
     panels: list[Panel | None] = []
     for record in Progress(records, "contact sheet", unit="view", leave=False):
         panels += _panels(record, scenes)

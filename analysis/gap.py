@@ -407,7 +407,6 @@ def format_table(table: dict[str, Any]) -> str:
 def _shown(
     scene: str, viewpoints: Sequence[Viewpoint], policy: Policy, capture: Capture
 ) -> dict[str, list[Panel | None]]:
-    """Returns real and rendered images, as the policy sees them, by the scene and frame."""
     rows: dict[str, list[Panel | None]] = {}
     for viewpoint in viewpoints[:: max(1, len(viewpoints) // _SHOWN)][:_SHOWN]:
         last = viewpoint._replace(X_WCs=viewpoint.X_WCs[-1:], frames=viewpoint.frames[-1:])

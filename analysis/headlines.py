@@ -171,7 +171,6 @@ def environments(effort: Effort) -> Iterator[Headline]:
 
 @cache
 def _forest() -> tuple[Any, Any]:
-    """Returns the scenario P02 and its world."""
     scenario = load_config(sp.Scenario(), scenario_file("P02"))
     return scenario, sp.make_world(scenario.world, scenario.seed)
 

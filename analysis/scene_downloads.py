@@ -155,7 +155,6 @@ def _parse_list(content: bytes, where: str) -> dict[str, PackedScene]:
 
 
 def _fetch(url: str, size: int) -> bytes:
-    """Reads at most `size` bytes from a URL."""
     try:
         with urllib.request.urlopen(url, timeout=_TIMEOUT) as answer:
             content = answer.read(size + 1)

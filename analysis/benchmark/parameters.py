@@ -69,7 +69,6 @@ def scenario_texts(names: Iterable[str], rows: Iterable[Mapping[str, Any]]) -> l
 
 
 def _text(value: Any) -> str:
-    """Returns a value as YAML in one line."""
     if is_distribution(value):
         return distribution_text(value)
     plain = value.tolist() if isinstance(value, np.ndarray | np.generic) else value

@@ -123,7 +123,6 @@ def overlay(
 
 
 def _read_flight(folder: StudyFolder, id: str) -> tuple[RolloutSpec, Row, dict[str, np.ndarray]]:
-    """Reads a flight of a study by its name."""
     specs = {spec.id: spec for spec in folder.config().rollouts()}
     if id not in specs:
         raise ValueError(
@@ -142,7 +141,6 @@ def _read_flight(folder: StudyFolder, id: str) -> tuple[RolloutSpec, Row, dict[s
 
 
 def _likely_reason(folder: StudyFolder, spec: RolloutSpec, scenario: Scenario) -> str:
-    """Returns the likely reason of a difference: program, machine or policy."""
     recorded = folder.program()
     for name, version in (program() | plugin_digests([scenario])).items():
         if recorded.get(name) != version:

@@ -366,7 +366,6 @@ def _conclude(
     absent: dict[str, str],
     damaged: list[str],
 ) -> None:
-    """Writes and prints the tables of a study, and writes its report."""
     timings = [folder.read_timing(row["id"]) for row in rows]
     tables = {"rollouts.csv": rows, "timings.csv": timings, "table.csv": table}
     if pairs := compare(rows, config):

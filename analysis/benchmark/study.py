@@ -183,7 +183,6 @@ class StudyConfig:
 
 
 def _has_own_policy(file: Path) -> bool:
-    """Checks that a file is a scenario with a `policy`."""
     try:
         root = yaml.compose(file.read_text(), yaml.SafeLoader)
     except (OSError, UnicodeDecodeError, yaml.YAMLError):

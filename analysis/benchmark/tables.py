@@ -212,7 +212,6 @@ def _success(successes: int, flights: int, effective: float | None = None) -> Ro
 
 
 def _world(row: Row) -> str:
-    """Returns the name of the world of a flight."""
     return str(row.get("world_id", f"{row['scenario']}-{row['seed']}"))
 
 

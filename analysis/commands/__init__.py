@@ -40,10 +40,10 @@ COMMANDS = {
     ),
     "gap": ("scene", "compare what policies decide by photographs and by renderings"),
     "library": ("", "make and list the environments of a folder of data"),
-    "library make": ("library", "reconstruct, measure and record environments"),
-    "library show": ("library", "print the recorded environments, and draw each"),
-    "library pack": ("library", "write recorded scenes in a form to be shared"),
-    "library get": ("library", "copy packed scenes from a folder or a file server"),
+    "library make": ("capture", "reconstruct, measure and record environments"),
+    "library show": ("capture", "print the recorded environments, and draw each"),
+    "library pack": ("capture", "write recorded scenes in a form to be shared"),
+    "library get": ("capture", "copy packed scenes from a folder or a file server"),
     "train": ("train", "train policies"),
     "recover": (
         "train",
@@ -57,10 +57,10 @@ COMMANDS = {
     "corpus inspect": ("train", "draw samples with their trajectories, and check every byte"),
     "corpus export": ("train", "write the flights as a LeRobotDataset"),
     "hardware": ("", "fly vehicles, real or simulated, by messages"),
-    "hardware vehicle": ("hardware", "simulate a vehicle that is flown by LCM messages"),
-    "hardware bridge": ("hardware", "fly a vehicle, real or simulated, by LCM messages"),
-    "hardware px4": ("hardware", "connect the bridge to PX4 by MAVLink"),
-    "hardware faults": ("hardware", "fly with faults of messages, clocks and policies"),
+    "hardware vehicle": ("flight", "simulate a vehicle that is flown by LCM messages"),
+    "hardware bridge": ("flight", "fly a vehicle, real or simulated, by LCM messages"),
+    "hardware px4": ("flight", "connect the bridge to PX4 by MAVLink"),
+    "hardware faults": ("flight", "fly with faults of messages, clocks and policies"),
     "doctor": (
         "doctor",
         "list what works on this machine, and what to install or set for the rest",
@@ -68,13 +68,3 @@ COMMANDS = {
     "headlines": ("doctor", "measure the documented speeds on this machine"),
 }
 """Module and help of each command, in the order of the help; "" of those with subcommands."""
-
-MOVED = {
-    "tour": "reconstruct",
-    "merge": "benchmark --cluster",
-    "places": "library make",
-    "scene fetch": "library make",
-    **{name: f"scene {name}" for name in ("scale", "measure", "mesh", "ablate", "fidelity")},
-    **{name: f"hardware {name}" for name in ("vehicle", "bridge", "px4", "faults")},
-}
-"""New names of commands that have moved."""

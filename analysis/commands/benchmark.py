@@ -28,7 +28,6 @@ def _names(text: str) -> list[str]:
 
 
 def _check_sweep(text: str) -> str:
-    """Checks the sweep of a policy, or of a field of the scenarios, and returns it."""
     if scenario_sweep(text) is None:
         for policy in sweep(text):
             check_policy(policy)

@@ -1,6 +1,8 @@
-"""`splatpilot fly` and `splatpilot view`."""
+"""`splatpilot fly`, `view` and `hardware`."""
 
 import argparse
+import logging
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -64,7 +66,6 @@ def _flight_name(options: argparse.Namespace, scenario: Any) -> str:
 
 
 def _scenario_defaults(options: argparse.Namespace) -> Any:
-    """Returns the scenario that is viewed, or the default one."""
     from splatpilot.diagrams.flight.scenario import Scenario
     from splatpilot.systems.common.config import load_config
 
@@ -93,3 +94,118 @@ def view(options: argparse.Namespace) -> None:
     from splatpilot.analysis import view
 
     cli.call(view.run, options)
+
+
+_LCM_URL = cli.Option("--lcm-url URL", "LCM's multicast group and port")
+_MESSAGING = (
+    cli.path_option("--hardware FILE", "a YAML file of a HardwareConfig"),
+    _LCM_URL,
+    cli.Option("--patience S", "maximum wait for messages [s]", float),
+    cli.OVERWRITE,
+    *cli.SCENARIO_OPTIONS,
+)
+
+
+def _hardware_config(options: argparse.Namespace) -> Any:
+    from splatpilot.diagrams.hardware.bridge import HardwareConfig
+    from splatpilot.systems.common.config import load_config
+
+    given = {"url": options.lcm_url, "patience": options.patience}
+    given = {name: value for name, value in given.items() if value is not None}
+    return replace(load_config(HardwareConfig(), options.hardware), **given)
+
+
+@cli.command(
+    "hardware vehicle",
+    cli.out_option("output folder", "out/vehicle", unused=True),
+    *_MESSAGING,
+    examples=(
+        "hardware vehicle --scenario P02 --policy diffaero",
+        "hardware vehicle --scenario P02 --seed 3 --patience 60 --out out/vehicle_3",
+    ),
+)
+def vehicle(options: argparse.Namespace) -> None:
+    """Hovers at the scenario's start until it receives commands, and follows them in real time.
+    `splatpilot hardware bridge` flies it instead of a real vehicle."""
+    scenario = cli.read_scenario(options)
+    from splatpilot.diagrams.hardware import vehicle
+
+    cli.call(vehicle.run, options, scenario=scenario, config=_hardware_config(options))
+
+
+@cli.command(
+    "hardware bridge",
+    cli.Option("--log", "write all messages to this file, as lcm-logger does", Path, unused=True),
+    *_MESSAGING,
+    examples=(
+        "hardware bridge --scenario P02 --policy diffaero",
+        "hardware bridge --scenario room.yaml --hardware room_hardware.yaml --log flight.lcm",
+    ),
+)
+def bridge(options: argparse.Namespace) -> None:
+    """Runs policy, controller and failsafe for a vehicle that sends its state and its images, and
+    follows commands."""
+    scenario = cli.read_scenario(options)
+    from splatpilot.diagrams.hardware import bridge
+
+    cli.call(bridge.run, options, scenario=scenario, config=_hardware_config(options))
+
+
+@cli.command(
+    "hardware px4",
+    cli.CONFIG,
+    _LCM_URL,
+    cli.flag("--engage", "request offboard mode"),
+    cli.flag("--arm", "arm the motors, in offboard mode"),
+    cli.path_option("--replay LOG.ulg", "replay a log of PX4 instead, and report on it"),
+    cli.set_option(
+        *("vehicle_host=192.168.8.1", "udp.host=0.0.0.0"),
+        configuration="splatpilot.diagrams.hardware.px4:Px4Config",
+    ),
+    examples=(
+        "hardware px4 --set vehicle_host=192.168.8.1",
+        "hardware px4 --config px4.yaml --engage",
+        "hardware px4 --replay flight.ulg",
+    ),
+)
+def px4(options: argparse.Namespace) -> None:
+    """Sends the estimate of PX4 to the bridge, and its commands to PX4. Arms only with --arm."""
+    from splatpilot.diagrams.hardware import px4
+
+    config = cli.read_config(options)
+    if options.lcm_url is not None:
+        config.url = options.lcm_url
+    config.commander.engage |= options.engage
+    config.commander.arm |= options.arm
+    px4.run(config=config, log=options.replay)
+
+
+@cli.command(
+    "hardware faults",
+    cli.out_option("output folder", "out/faults"),
+    cli.CONFIG,
+    cli.set_option(
+        *("trials=30", "seed=1", "scenario.timeout=20"),
+        configuration="splatpilot.analysis.faults:FaultsConfig",
+    ),
+    examples=(
+        "hardware faults --set trials=30",
+        "hardware faults --out out/faults_1 --set seed=1",
+    ),
+)
+def faults(options: argparse.Namespace) -> None:
+    """Flies hundreds of short flights through the bridge with lost, late or false messages, clock
+    jumps or failing policies, and counts those that end safely. If interrupted, the same command
+    resumes."""
+    from splatpilot.analysis.faults import run
+
+    # Thousands of packets are refused, and policies raise, on purpose.
+    loggers = [logging.getLogger(name) for name in ("drake", "splatpilot")]
+    levels = [logger.level for logger in loggers]
+    try:
+        for logger in loggers:
+            logger.setLevel(logging.CRITICAL)
+        run(config=cli.read_config(options), out=options.out)
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)

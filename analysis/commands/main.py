@@ -19,7 +19,7 @@ from importlib import import_module
 from types import FrameType
 from typing import Any, NoReturn
 
-from splatpilot.analysis.commands import COMMANDS, MOVED
+from splatpilot.analysis.commands import COMMANDS
 from splatpilot.analysis.commands.options import Command, FailureWithResultError, as_json
 from splatpilot.systems.common.extras import missing_extra
 from splatpilot.systems.common.validation import TYPES, did_you_mean, unknown
@@ -64,11 +64,7 @@ class _Parser(argparse.ArgumentParser):
             super()._check_value(action, value)
         else:
             what = str(action.metavar or action.dest).lower()
-            message = unknown(what, value, action.choices)
-            words = f"{self.prog} {value}"
-            if new := MOVED.get(words.removeprefix("splatpilot ")):
-                message = f"`{words}` is now `splatpilot {new}`"
-            raise argparse.ArgumentError(None, message)
+            raise argparse.ArgumentError(None, unknown(what, value, action.choices))
 
     def _get_value(self, action: argparse.Action, arg_string: str) -> Any:
         try:
@@ -247,7 +243,6 @@ def _plugin_line(error: BaseException) -> str:
 
 
 def _progress_bars() -> list[Any]:
-    """Returns the open progress bars of tqdm."""
     return list(getattr(getattr(sys.modules.get("tqdm"), "tqdm", None), "_instances", ()))
 
 
@@ -257,8 +252,6 @@ def _is_warning(record: logging.LogRecord) -> bool:
 
 
 class _SignalError(KeyboardInterrupt):
-    """A signal that ends the command."""
-
     def __init__(self, number: int):
         super().__init__(number)
         self.number = signal.Signals(number)

@@ -16,7 +16,6 @@ from splatpilot.systems.common.validation import require
 
 
 def _trainer_defaults(options: argparse.Namespace) -> Any:
-    """Returns the configuration of the trainer, the first of several."""
     named = getattr(options, "policy", None) or getattr(options, "policies", None)
     if not named:
         raise ValueError("fields depend on the policy; name it before --set help")

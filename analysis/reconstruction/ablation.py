@@ -129,7 +129,6 @@ class AblationResult:
         return rows
 
     def _spread(self, arm: Arm, name: str) -> str:
-        """Returns mean and standard deviation of a metric over the captures."""
         found = (metrics[arm.key].mean(name) for metrics in self.captures.values())
         values, form = [value for value in found if value is not None], NAMES[name][1]
         if not values:
@@ -207,7 +206,6 @@ def run(
 
 
 def _ablate(capture: Capture, out: Path, config: ReconstructConfig) -> dict[str, SceneMetrics]:
-    """Reconstructs and measures the missing arms of a capture."""
     found = {}
     points = capture.points
     for arm in ARMS:

@@ -256,7 +256,6 @@ def run(scene: Path, overwrite: bool = False) -> SceneMetrics:
 
 
 def _write_views(path: Path, views: SceneViews, metrics: SceneMetrics) -> None:
-    """Writes the image grid of some frames: captured and rendered color and depth."""
     indices = list(metrics.frames)
     picked = sorted({indices[k] for k in np.linspace(0, len(indices) - 1, _MAX_ROWS).astype(int)})
     frames = [views.frame(i) for i in picked]

@@ -9,7 +9,7 @@ import numpy as np
 import yaml
 
 from splatpilot.analysis.faults import FaultsConfig
-from splatpilot.analysis.fidelity.fidelity import FidelityConfig
+from splatpilot.analysis.fidelity import FidelityConfig
 from splatpilot.analysis.gap import GapConfig
 from splatpilot.analysis.reconstruction.run import RenderedSceneConfig
 from splatpilot.analysis.twin import TwinConfig

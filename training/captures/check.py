@@ -408,7 +408,6 @@ def _camera_readings(as_read: Reading, capture: Capture) -> list[Reading]:
 
 
 def _fitted_readings(as_read: Reading, measure: Callable[[Reading], ReadingFit]) -> list[Reading]:
-    """Returns readings whose focal length, or principal point, fits best."""
 
     def changed(x: NDArray) -> Reading:
         K = as_read.K.copy()

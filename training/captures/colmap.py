@@ -74,7 +74,6 @@ def _siblings(folder: Path) -> list[Path]:
 
 
 def _images_file(folder: Path) -> Path | None:
-    """Returns the file of registered images of a model's folder."""
     for suffix in (".bin", ".txt"):
         if all((folder / f"{part}{suffix}").is_file() for part in ("cameras", "images")):
             return folder / f"images{suffix}"
@@ -209,7 +208,6 @@ def _existing(files: Iterable[Path]) -> Path | None:
 def _unmasked_points(
     capture: Capture, images: dict[str, "pycolmap.Image"], points: dict[int, "pycolmap.Point3D"]
 ) -> dict[int, "pycolmap.Point3D"]:
-    """Returns the points that at least two images show in valid pixels."""
     times = dict.fromkeys(points, 0)
     for i, name in enumerate(capture.frame_names):
         seen = [point.point3D_id for point in images[name].points2D if point.point3D_id in points]

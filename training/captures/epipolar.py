@@ -56,7 +56,6 @@ def match_frames(capture: Capture, count: int) -> list[MatchedPair]:
 
 
 def _match(first: tuple, second: tuple) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Returns the pixels of matches that some epipolar geometry explains."""
     (p, a), (q, b) = first, second
     nothing = np.zeros((0, 2)), np.zeros((0, 2))
     if a is None or b is None or min(len(a), len(b)) < _MIN_MATCHES:

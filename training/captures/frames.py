@@ -404,7 +404,6 @@ def open_frames(
 
 
 def _notes(lenses: Sequence[Lens], masked: int, transparent: int, total: int) -> list[str]:
-    """Returns notes on the intrinsics and on the pixels that are not used."""
     notes = [f"intrinsics: {lenses[0]}"]
     if len(lenses) > 1:
         notes[0] += f", and {len(lenses) - 1} more cameras"

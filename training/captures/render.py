@@ -29,13 +29,14 @@ from splatpilot.systems.common.files import (
 from splatpilot.systems.common.progress import Progress, resumable
 from splatpilot.systems.common.seeds import TRAINING_SEEDS, VALIDATION_SEEDS
 from splatpilot.systems.common.validation import Config, bounded, require, require_field
-from splatpilot.training.captures.camera_path import (
+from splatpilot.training.captures.capture import CaptureFrame, pinhole
+from splatpilot.training.captures.coverage import (
+    CapturePlan,
     move_left,
+    plan_capture,
     poses_along,
     resample,
 )
-from splatpilot.training.captures.capture import CaptureFrame, pinhole
-from splatpilot.training.captures.coverage import CapturePlan, plan_capture
 from splatpilot.training.captures.frames import pose_row
 from splatpilot.training.captures.tartanair import AXES
 
@@ -231,7 +232,6 @@ def _generated_split(world: WorldConfig, seed: int) -> str:
 
 
 def _poses_on_path(esdf: Esdf, config: RenderConfig) -> list[RigidTransform]:
-    """Returns the camera poses of the given path."""
     X_WCs = poses_along(np.array(config.path), config.spacing, config.yaws, config.pitch)
     stops = np.array([X_WC.translation() for X_WC in X_WCs])
     for p_W in resample(stops, esdf.voxel_size / 2):
@@ -243,7 +243,6 @@ def _poses_on_path(esdf: Esdf, config: RenderConfig) -> list[RigidTransform]:
 
 
 def _plan(esdf: Esdf, config: RenderConfig) -> CapturePlan:
-    """Plans the camera poses; prints how much of the surfaces they see."""
     plan = plan_capture(
         esdf,
         _intrinsics(config),

@@ -112,8 +112,6 @@ def _open(path: Path) -> Any:
 
 
 class _Bag:
-    """Topics of color, depth and poses in an open bag."""
-
     def __init__(self, path: Path, reader: Any, topics: list[str]):
         self._path, self._reader = path, reader
         self._types = {c.topic: c.msgtype for c in reader.connections}

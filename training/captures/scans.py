@@ -1,5 +1,7 @@
-"""ScanNet and 7-Scenes: RGB-D scans with a color camera apart from the depth camera."""
+"""RGB-D scans: ScanNet, 7-Scenes, Polycam's raw data and exports of Record3D."""
 
+import json
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -7,8 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
+from splatpilot.systems.common.readers import read_text, readable
+from splatpilot.systems.common.validation import require
 from splatpilot.training.captures import frames
 from splatpilot.training.captures.capture import (
+    OPENGL_AXES,
     OPTICAL_AXES,
     Capture,
     DepthCamera,
@@ -118,5 +123,138 @@ def read_seven_scenes(path: Path, config: CaptureConfig) -> Capture:
         config=config,
         lens=lens,
         depth_camera=depth_camera,
+        up="cameras",
+    )
+
+
+_METADATA = "metadata.json"
+
+
+def read_polycam(path: Path, config: CaptureConfig) -> Capture:
+    """Opens the raw data of a LiDAR capture of Polycam, as it documents them.
+
+    `keyframes/` holds `images/`, `depth/` and `cameras/`, a JSON file per keyframe with `fx`, `fy`,
+    `cx`, `cy`, `width`, `height` [px] and the entries `t_00` to `t_23` of the pose, from camera
+    axes of OpenGL to a world with y up; depth is in millimeters, in fewer pixels than the image.
+    `corrected_cameras/` and `corrected_images/` hold optimized poses and undistorted images.
+    """
+    folder = path / "keyframes"
+    prefix = "corrected_" if (folder / "corrected_cameras").is_dir() else ""
+
+    def frame(camera: Path) -> frames.FrameFiles:
+        def X_FB() -> RigidTransform:
+            if isinstance(read, ValueError):
+                raise read
+            return frames.pose_from_matrix(read[1], str(camera))
+
+        image = folder / f"{prefix}images" / f"{camera.stem}.jpg"
+        try:
+            read = _read_keyframe(camera, image, config.intrinsics)
+        except ValueError as error:
+            read = error
+        depth = folder / "depth" / f"{camera.stem}.png"
+        lens = None if isinstance(read, ValueError) else read[0]
+        confidence = folder / "confidence" / f"{camera.stem}.png"
+        return frames.FrameFiles(
+            image,
+            X_FB,
+            depth if depth.is_file() else None,
+            lens,
+            confidence=confidence if confidence.is_file() else None,
+        )
+
+    pattern = r"(\d+)\.json"
+    cameras = frames.numbered_files(folder / f"{prefix}cameras", pattern)
+    dropped = []
+    raw_folder = folder / "cameras"
+    if prefix and raw_folder.is_dir() and any(raw_folder.iterdir()):
+        raw = frames.numbered_files(raw_folder, pattern)
+        if alone := len(raw.keys() - cameras.keys()):
+            dropped = [f"{folder}: {alone} of {len(raw)} keyframes have no corrected camera"]
+    return frames.open_frames(
+        path,
+        "Polycam capture",
+        [frame(camera) for camera in cameras.values()],
+        axes=OPENGL_AXES,
+        config=config,
+        stretch_depth=True,
+        up="y",
+        dropped=dropped,
+    )
+
+
+def _read_keyframe(
+    camera: Path, image: Path, intrinsics: Sequence[float]
+) -> tuple[Lens, NDArray[np.float64]]:
+    """Returns the camera and the pose (3, 4) of a keyframe."""
+    text = read_text(camera)
+    with readable(camera, "camera of a keyframe"):
+        values = json.loads(text)
+        focal = intrinsics or [float(values[name]) for name in ("fx", "fy", "cx", "cy")]
+        source = "capture.intrinsics" if intrinsics else f"{camera.parent.name}/"
+        if "width" not in values:  # as in newer corrected cameras
+            values["width"], values["height"] = frames.image_size(image)
+        lens = Lens(pinhole(*focal), int(values["width"]), int(values["height"]), source=source)
+        matrix = [float(values[f"t_{row}{column}"]) for row in range(3) for column in range(4)]
+    return lens, np.array(matrix).reshape(3, 4)
+
+
+def recognizes_record3d(path: Path) -> bool:
+    """Tells whether a path looks like an export of Record3D."""
+    return path.suffix == ".r3d" or ((path / _METADATA).is_file() and (path / "rgb").is_dir())
+
+
+def read_record3d(path: Path, config: CaptureConfig) -> Capture:
+    """Opens an export "EXR + RGB" of Record3D: `metadata.json`, `rgb/0.jpg`, `depth/0.exr`.
+
+    As the application's author documents it, `poses` holds a row qx qy qz qw tx ty tz per frame,
+    from camera axes of OpenGL to the first camera's, so that up is unknown; `K` holds the
+    intrinsics column by column for images of `w` x `h`, and `perFrameIntrinsicCoeffs`, in newer
+    exports, fx fy cx cy of each frame; depth is in meters, in fewer pixels than the image.
+    """
+    if path.suffix == ".r3d":
+        raise ValueError(
+            f"{path}: Record3D's own format, whose depth is compressed; export the recording as "
+            '"EXR + RGB" and name that folder'
+        )
+    file = path / _METADATA
+    text = read_text(file)
+    with readable(file, "file of Record3D's metadata"):
+        content = json.loads(text)
+        poses = np.array(content["poses"], dtype=np.float64)
+        require(poses.ndim == 2 and poses.shape[1] == 7, "poses", "of shape (N, 7)", poses.shape)
+        K = np.array(content["K"], dtype=np.float64).reshape(3, 3).T
+        intrinsics = np.tile([K[0, 0], K[1, 1], K[0, 2], K[1, 2]], (len(poses), 1))
+        own = np.array(content.get("perFrameIntrinsicCoeffs") or [], dtype=np.float64)
+        intrinsics = own if own.shape == intrinsics.shape else intrinsics  # fx fy cx cy
+        size = int(content["w"]), int(content["h"])
+    images = frames.numbered_files(path / "rgb", r"(\d+)\.(?:jpg|jpeg|png)")
+    if max(images) >= len(poses):
+        raise ValueError(
+            f"{file}: {len(poses)} poses, but {images[max(images)].name} is frame {max(images)}; "
+            "the folder and its metadata belong to different exports"
+        )
+    lenses: dict[bytes, Lens] = {}  # Equal cameras share one, and one resampling.
+
+    def frame(i: int, image: Path) -> frames.FrameFiles:
+        values = np.array(config.intrinsics) if config.intrinsics else intrinsics[i]
+        source = "capture.intrinsics" if config.intrinsics else _METADATA
+        lens = Lens(pinhole(*values), *size, source=source)
+        depth, pose = path / "depth" / f"{i}.exr", np.roll(poses[i], 3)
+        return frames.FrameFiles(
+            image,
+            lambda: frames.pose_from_quaternion(pose, f"{file}, frame {i}"),
+            depth if depth.is_file() else None,
+            lenses.setdefault(values.tobytes(), lens),
+        )
+
+    return frames.open_frames(
+        path,
+        "Record3D export",
+        [frame(i, image) for i, image in images.items()],
+        axes=OPENGL_AXES,
+        config=config,
+        depth_unit=1.0,
+        stretch_depth=True,
         up="cameras",
     )

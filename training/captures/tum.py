@@ -163,7 +163,6 @@ def _poses_around(rows: NDArray[np.float64], time: float) -> NDArray[np.float64]
 
 
 def _read_list(file: Path) -> tuple[NDArray[np.float64], list[str]]:
-    """Returns the times [s] and file names of a list."""
     times, names = [], []
     for number, line in enumerate(read_text(file, "replace").splitlines(), start=1):
         if not line.strip() or line.startswith("#"):

@@ -129,7 +129,6 @@ class Corpus:
 
 
 def _require_all(folder: Path, needed: set[str], present: Any) -> None:
-    """Raises ValueError if one of the needed folders is missing."""
     if missing := sorted(needed.difference(present)):
         raise ValueError(
             f"No such folder: {folder / missing[0]}, which {LEDGER} or shards name; {_REMEDY}"

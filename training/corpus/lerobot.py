@@ -104,8 +104,6 @@ def _runs(shard: Shard, corpus: Corpus) -> Iterator[np.ndarray]:
 
 
 class _Writer:
-    """A dataset that is being written, with a file for each shard."""
-
     def __init__(self, folder: Path, corpus: Corpus) -> None:
         camera = self.camera = corpus.config.camera
         sides = camera.width, camera.height
@@ -232,7 +230,6 @@ class _Writer:
             (self.folder / f"meta/{name}.json").write_text(json.dumps(content, indent=4) + "\n")
 
     def _features(self, fps: float) -> dict[str, Any]:
-        """Describes the columns and videos."""
         camera = self.camera
         bounds = {"depth_min": camera.min_depth, "depth_max": camera.max_depth}
         coding = bounds | {"shift": _SHIFT, "use_log": True}
@@ -250,7 +247,6 @@ class _Writer:
 
 
 def _schema() -> pa.Schema:
-    """Returns the types of the columns."""
     types = {name: (pa.type_for_alias(dtype), names) for name, (dtype, names) in _COLUMNS.items()}
     return pa.schema(
         {

@@ -151,7 +151,6 @@ class DifferentiableRollout:
         )
 
     def _restart_ended(self, episodes: Episodes) -> Episodes:
-        """Replaces episodes that have ended by new ones."""
         worlds, world, p = self.worlds, episodes.world, episodes.vehicle.p
         clearance, inside = worlds.clearance(p, world)
         arrived = (p - worlds.p_WG[world]).norm(dim=1) < 0.5

@@ -53,8 +53,6 @@ def run[Config: TrainingConfig](
 
 @dataclass
 class _Progress:
-    """Progress of a run, as its checkpoint holds it."""
-
     update: int = 0
     cpu_seconds: float = 0.0
     best: dict[str, Any] = field(default_factory=dict)
@@ -63,8 +61,6 @@ class _Progress:
 
 
 class _Run:
-    """A run in a folder."""
-
     def __init__(self, config: TrainingConfig, out: Path, make: Callable[[Any], Trainer]) -> None:
         self.config, self.out, self.schedule = config, out, config.schedule
         self.checkpoint = out / "checkpoint.pt"
@@ -157,7 +153,6 @@ class _Run:
         return text
 
     def _kept(self) -> str:
-        """Describes what an interrupted run has kept."""
         if not self.checkpoint.exists():
             return f"no update is in {self.out} yet; the same command starts again"
         updates, kept = self.schedule.updates, self.kept_update

@@ -199,7 +199,6 @@ beyond 5; `error` the mean absolute error of all cells' inverse depths, 3 m / z.
         return np.concatenate(kept)
 
     def _rows(self) -> slice:
-        """Selects the middle rows of the corpora's images."""
         first = (self._data.camera.height - HEIGHT) // 2
         return slice(first, first + HEIGHT)
 

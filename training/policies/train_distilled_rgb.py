@@ -8,6 +8,7 @@ grid, and DiffAero's loss through the dynamics, in which images are constant. Ev
 flies in the mirror image of its world; the appearance of worlds changes.
 """
 
+import os
 from dataclasses import dataclass, field, replace
 from hashlib import blake2b
 from pathlib import Path
@@ -15,9 +16,13 @@ from typing import Any
 
 import numpy as np
 import torch
+from pydrake.math import RigidTransform, RotationMatrix
 from torch import Tensor, nn
 
+from splatpilot.diagrams.worlds.appearance import randomize_appearance
 from splatpilot.diagrams.worlds.scene_folder import gaussians_file
+from splatpilot.diagrams.worlds.world_registry import make_world, scene_config
+from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.common.seeds import VALIDATION_SEEDS, first_training_seed
 from splatpilot.systems.common.validation import bounded
 from splatpilot.systems.policies.checkpoint import (
@@ -43,6 +48,10 @@ from splatpilot.systems.policies.observations import (
 )
 from splatpilot.systems.policies.student import encode_color
 from splatpilot.systems.sensing.noise import ObservationNoise
+from splatpilot.systems.sensing.onboard_camera import OnboardCamera
+from splatpilot.systems.splats.baked_scene import BatchRenderer
+from splatpilot.systems.splats.splat_camera import color_pixels
+from splatpilot.training.corpus import library
 from splatpilot.training.corpus.library import training_scene
 from splatpilot.training.policies.augmentation import (
     Appearance,
@@ -50,7 +59,7 @@ from splatpilot.training.policies.augmentation import (
     check_noise,
     noisy_color,
 )
-from splatpilot.training.policies.evaluation import FlightConditions
+from splatpilot.training.policies.evaluation import FlightConditions, camera_poses
 from splatpilot.training.policies.networks import load_weights
 from splatpilot.training.policies.rollouts import (
     RolloutConfig,
@@ -61,12 +70,78 @@ from splatpilot.training.policies.rollouts import (
 from splatpilot.training.policies.train_diffaero import DiffAeroLearner, DiffAeroLoss
 from splatpilot.training.policies.train_diffaero_rgb import DiffAeroRgbModule, flip
 from splatpilot.training.policies.trainer import Schedule
-from splatpilot.training.policies.vehicles import Observation
-from splatpilot.training.policies.world_views import WorldViews
+from splatpilot.training.policies.training_worlds import WorldSelection, world_turns
+from splatpilot.training.policies.vehicles import Observation, Vehicle
 
 _ACCELERATION = 2.0  # [m/s^2] where Huber's loss of the decisions changes from squares
 # Decisions where something is nearer than 2 m count twice.
 _NEAR = float(inverse_depth(np.float64(2.0), MIN_DEPTH, MAX_DEPTH))
+
+
+class WorldViews:
+    """The Gaussians of the worlds of a `WorldBatch`, seen by the vehicles' cameras.
+
+    Args:
+        count, first: number of worlds, and the seed of the first, as in `training_worlds`.
+        camera: its `merged_spread` may be larger in training than in flight.
+    """
+
+    def __init__(
+        self, selection: WorldSelection, count: int, first: int, camera: OnboardCamera
+    ) -> None:
+        scenes = {
+            scene: make_world(scene_config(library.training_scene(scene)), seed=0)
+            for scene in selection.scenes
+        }
+        turns = Progress(world_turns(selection, count, first), "rendering worlds", unit="world")
+        self._worlds = [
+            scenes.get(turn) or make_world(library.scenario_world(turn), seed)
+            for seed, turn in turns
+        ]
+        self._seen = list(self._worlds)
+        # (W, 2), seed and strength of each appearance; a strength of 0 is the world's own.
+        self.looks = torch.zeros(count, 2, dtype=torch.float64)
+        self._camera, self._renderer = camera, BatchRenderer(os.cpu_count() or 1)
+
+    def repaint(self, strength: float, generator: torch.Generator) -> None:
+        """Gives a random world another appearance, of a strength up to `strength`."""
+        drawn = torch.rand(3, generator=generator, dtype=torch.float64, device=generator.device)
+        world, seed, part = drawn.tolist()
+        index = int(world * len(self._worlds))
+        self.looks[index, 0], self.looks[index, 1] = int(seed * 2**31), part * strength
+        self._paint(index)
+
+    def restore(self, looks: Tensor) -> None:
+        """Restores the appearances `looks`."""
+        self.looks = looks
+        for index in looks[:, 1].nonzero()[:, 0].tolist():
+            self._paint(index)
+
+    def _paint(self, index: int) -> None:
+        seed, strength = self.looks[index].tolist()
+        self._seen[index] = randomize_appearance(self._worlds[index], strength, int(seed))
+
+    @torch.no_grad()
+    def render(self, vehicle: Vehicle, world: Tensor) -> Tensor:
+        """Renders colors (N, H, W, 3), uint8, from the vehicles' cameras, each in its `world`
+        (N,)."""
+        poses = (part.double().cpu().numpy() for part in camera_poses(vehicle))
+        X_WCs = [
+            RigidTransform(RotationMatrix.ProjectToRotationMatrix(R_WC), p_WC)
+            for p_WC, R_WC in zip(*poses, strict=True)
+        ]
+        worlds = [self._seen[index] for index in world.tolist()]
+        info = self._camera.camera_info()
+        color = self._renderer.render_color(
+            [world.baked for world in worlds],
+            info.intrinsic_matrix(),
+            info.width(),
+            info.height(),
+            X_WCs,
+            backgrounds=[world.background for world in worlds],
+            merged_spread=self._camera.merged_spread,
+        )
+        return torch.from_numpy(color_pixels(color)).to(world.device)
 
 
 @dataclass

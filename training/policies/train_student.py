@@ -218,7 +218,6 @@ of error and clearance."""
         return dict(zip(("success", "clear", "error", "best_chosen"), means, strict=True))
 
     def _images(self, indices: np.ndarray, augmented: bool) -> Tensor:
-        """Encodes images, with noise and another appearance if augmented."""
         config, generator = self._config, self.generator
         if self._features:
             return self._features(indices).to(config.device)

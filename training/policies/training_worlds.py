@@ -112,7 +112,7 @@ class TrainingWorld:
 
 
 class Views(Protocol):
-    """Color images of worlds, see `splatpilot.training.policies.world_views`."""
+    """Color images of worlds, see `splatpilot.training.policies.train_distilled_rgb`."""
 
     def render(self, vehicle: Vehicle, world: Tensor) -> Tensor: ...
 

@@ -153,7 +153,6 @@ def _features(layers: nn.Sequential, taps: tuple[int, ...], images: Tensor) -> l
 
 
 def _find_weights(name: str) -> tuple[Path, ...]:
-    """Returns one file with all weights, or torchvision's backbone and the package's layers."""
     data, file = data_folder(), f"weights/lpips_{name}.pt"
     if data is not None and (data / file).is_file():
         return (data / file,)

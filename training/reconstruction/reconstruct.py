@@ -240,7 +240,6 @@ def _source_and_split(capture: Capture, images: set[str], split: str) -> tuple[l
 def _without_depth(
     capture: Capture, numbers: Sequence[int], frames: Sequence[ThinnedFrame]
 ) -> tuple[str, ...]:
-    """Returns a warning that names frames without depth, if others have depth."""
     empty = [i for i, frame in zip(numbers, frames, strict=True) if not frame.depth.any()]
     if not capture.has_depth or not empty:
         return ()

@@ -30,7 +30,6 @@ _HEIGHT, _WIDTH = 128, 256  # texels of the background, powers of two
 
 
 def _depth_codes() -> NDArray[np.float32]:
-    """Returns the depth [m] of each code."""
     depths = np.geomspace(_MIN_DEPTH, FAR, _CODES).astype(np.float32)
     return np.concatenate([np.zeros(1, np.float32), depths[:-1], np.full(1, np.inf, np.float32)])
 

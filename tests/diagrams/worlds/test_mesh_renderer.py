@@ -13,7 +13,7 @@ from splatpilot.diagrams.worlds.mesh import mesh_digests, mesh_distance
 from splatpilot.diagrams.worlds.mesh_renderer import MeshRenderer
 from splatpilot.diagrams.worlds.splits import find_test_source
 from splatpilot.systems.collision.field_mesh import add_primitive, data_uri
-from splatpilot.training.captures.camera_path import look_along
+from splatpilot.training.captures.coverage import look_along
 
 K = np.array([[16.0, 0, 16], [0, 16, 12], [0, 0, 1]])
 X_WC = look_along(np.zeros(3), 0.0, 0.0)  # along x

@@ -15,7 +15,7 @@ from splatpilot.diagrams.worlds.mesh_world import MeshWorld
 from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.common.config import load_config
 from splatpilot.systems.splats.lens import Distortion
-from splatpilot.training.captures.camera_path import look_along
+from splatpilot.training.captures.coverage import look_along
 
 SIZE = np.array([14.0, 8.0, 4.0])  # [m] of a room on the ground, with a pillar in its middle
 K = np.array([[32.0, 0, 32], [0, 32, 24], [0, 0, 1]])

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from splatpilot.training.captures.camera_path import poses_along
+from splatpilot.training.captures.coverage import poses_along
 
 
 def test_poses_stop_evenly_and_look_ahead_and_aside():

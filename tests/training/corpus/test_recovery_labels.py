@@ -7,7 +7,8 @@ from pydrake.math import RigidTransform
 from splatpilot.systems.collision.shapes import AnalyticDistanceField, Box, Cylinder, HalfSpace
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS, hover_state
 from splatpilot.training.corpus.corpus import Corpus
-from splatpilot.training.corpus.recovery_labels import (
+from splatpilot.training.corpus.samples import EXPERT, RECOVERY
+from splatpilot.training.policies.recover import (
     StudentFlight,
     add_recovery,
     near_misses,
@@ -15,7 +16,6 @@ from splatpilot.training.corpus.recovery_labels import (
     rows_before,
     rows_to_recover,
 )
-from splatpilot.training.corpus.samples import EXPERT, RECOVERY
 
 TIMES = np.arange(0.0, 12.0, 0.02)
 

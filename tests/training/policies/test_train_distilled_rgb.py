@@ -19,10 +19,10 @@ from splatpilot.training.policies.train_distilled_rgb import (
     DistilledRgbModule,
     DistilledRgbTrainer,
     DistilledRgbTraining,
+    WorldViews,
 )
 from splatpilot.training.policies.training_worlds import WorldSelection
 from splatpilot.training.policies.vehicles import BodyRate, Observation, PointMass
-from splatpilot.training.policies.world_views import WorldViews
 
 TINY = [
     "worlds.kinds=[P10]",
