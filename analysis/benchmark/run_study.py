@@ -32,7 +32,6 @@ from splatpilot.analysis.benchmark.tables import (
     Row,
     compare,
     external_table,
-    format_external,
     format_table,
     policy_table,
 )
@@ -170,11 +169,6 @@ def run(
     keep_inputs(folder, config, flyable)
     for name, reason in absent.items():
         print(f"{name} is not flown: {reason}")
-    for file in config.unflown_policies(given or ()):
-        print(
-            f"The policy of {file} is not flown, but those of --policies are; add {SCENARIO} to "
-            "them to fly it."
-        )
 
     rows, damaged = _read_flights(folder, specs)
     missing = [spec for spec in specs if spec.id not in rows]
@@ -376,8 +370,6 @@ def _conclude(
         write_csv(folder.path / name, content)
     write_report(folder, config, rows, timings, table, external, absent, damaged)
     print(format_table(table, config))
-    if external:
-        print(format_external(external))
     for row in rows:
         if "reason" in row:
             print(f"{row['id']}, {row['outcome']}: {row['reason']}")

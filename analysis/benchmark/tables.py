@@ -351,15 +351,3 @@ def format_table(table: list[Row], config: StudyConfig) -> str:
             f"{row['min_clearance_m']:>+9.2f} m{row['mean_speed_m_s']:>6.2f} m/s{row['not_run']:>9}"
         )
     return "\n".join(lines)
-
-
-def format_external(table: list[Row]) -> str:
-    """Formats the external table for a terminal."""
-    lines = [f"{'scenario':<20}{'policy':<32}{'speed':>6}{'velocity':>10}{'success':>10}"]
-    for row in table:
-        speed = "-" if row["speed"] is None else f"{row['speed']:g}"
-        lines.append(
-            f"{row['scenario']:<20}{row['policy']:<32}{speed:>6}{row['mean_speed_m_s']:>6.2f} m/s"
-            f"{row['successes']:>6}/{row['flights']}"
-        )
-    return "\n".join([*lines, SOURCES])

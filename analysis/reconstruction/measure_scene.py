@@ -43,7 +43,6 @@ NAMES = {
     "psnr_on_black_db": ("PSNR on black [dB]", "{:.2f}"),
     "ssim": ("SSIM", "{:.4f}"),
     "lpips": ("LPIPS-squeeze", "{:.3f}"),
-    "lpips_vgg": ("LPIPS-VGG", "{:.3f}"),
     "depth_mae_m": ("depth MAE [m]", "{:.3f}"),
     "depth_relative": ("depth error, relative", "{:.2%}"),
     "floater_fraction": ("floaters", "{:.2%}"),
@@ -103,8 +102,6 @@ class SceneMetrics:
             f"{self.strict_width} x {self.strict_height}",
         ]
         for name, (title, form) in NAMES.items():
-            if name == "lpips_vgg" and content[name] is None:
-                continue  # few have its weights
             cell, count = format_metric(content[name], form), content["counts"][name]
             if 0 < count < len(self.frames):
                 cell += f" ({count} of {len(self.frames)} frames)"
@@ -136,8 +133,10 @@ def read_metrics(scene: Path) -> SceneMetrics | None:
     try:
         content = json.loads(file.read_text())
         values = {field.name: content[field.name] for field in fields(SceneMetrics)}
+        names = [field.name for field in fields(ViewMetrics)]
         for name in ("frames", "strict_frames"):
-            values[name] = {int(i): ViewMetrics(**frame) for i, frame in values[name].items()}
+            frames = values[name].items()
+            values[name] = {int(i): ViewMetrics(**{n: f[n] for n in names}) for i, f in frames}
         return SceneMetrics(**values)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{file}: {error!r}; delete the file and measure again") from error
@@ -207,14 +206,11 @@ def measure_scene(scene: Path, capture: Capture | None = None) -> SceneMetrics:
     """Measures a scene folder on its held-out frames or, without any, on every eighth frame, and
     writes `metrics.json` and `views.png` into it."""
     views = SceneViews(scene, capture)
-    lpips, missing = {}, ""
-    for name, backbone in (("lpips_vgg", "vgg"), ("lpips", "squeeze")):
-        try:
-            lpips[name] = Lpips(backbone)
-        except (OSError, ValueError) as error:
-            missing = str(error)
-    if "lpips" in lpips:
-        missing = ""
+    lpips, missing = None, ""
+    try:
+        lpips = Lpips()
+    except (OSError, ValueError) as error:
+        missing = str(error)
     fitted = [ThinnedFrame.of(views.frame(i)) for i in views.fitted]
     gains = views.metadata.gains or [1.0] * len(views.capture)
     frames, strict = {}, {}

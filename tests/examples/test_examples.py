@@ -70,15 +70,6 @@ def test_splats_behind_drake(opengl, run, tmp_path):
     assert red[0] == 0 < red[1]
 
 
-def test_bouncing_sphere(run, tmp_path):
-    run("bouncing_sphere.py", "--out", tmp_path / "sphere.csv")
-    _, _, _, z, clearance = np.loadtxt(tmp_path / "sphere.csv", delimiter=",", skiprows=1).T
-    first = np.flatnonzero(np.diff(z) > 0)[0]
-    assert z[0] - z[first] > 1.0
-    assert z[first:].max() > z[first] + 0.05
-    assert np.abs(clearance[-25:]).max() < 0.05 and clearance.min() > -0.1
-
-
 def test_own_policy(tmp_path):
     (tmp_path / "own_policy.py").write_text((EXAMPLES / "own_policy.py").read_text())
     (tmp_path / "short.yaml").write_text(SHORT)

@@ -364,13 +364,6 @@ def look_along(p_WC: NDArray[np.float64], yaw: float, pitch: float) -> RigidTran
     )
 
 
-def move_left(X_WC: RigidTransform, offset: float) -> RigidTransform:
-    """Returns the pose moved by `offset` [m] to the camera's left, looking where it looked."""
-    return RigidTransform(
-        X_WC.rotation(), X_WC.translation() - offset * X_WC.rotation().matrix()[:, 0]
-    )
-
-
 def resample(path: NDArray[np.float64], spacing: float) -> NDArray[np.float64]:
     """Returns points of a polyline, evenly spaced by about `spacing` [m], ends included."""
     lengths = np.append(0.0, np.linalg.norm(np.diff(path, axis=0), axis=1).cumsum())

@@ -1,6 +1,6 @@
 """Metrics of rendered views against captured frames: color, depth, floaters and holes."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,7 +31,6 @@ class ViewMetrics:
     psnr_on_black_db: float | None  # [dB], before black, except in the sky
     ssim: float | None
     lpips: float | None  # LPIPS-squeeze; None without its weights, too
-    lpips_vgg: float | None  # likewise
     depth_mae_m: float | None  # [m]
     depth_relative: float | None
     floater_fraction: float | None
@@ -145,13 +144,13 @@ def measure_view(
     frame: CaptureFrame,
     vignetting: float = 0.0,
     seen: NDArray[np.bool_] | None = None,
-    lpips: Mapping[str, Lpips] | None = None,
+    lpips: Lpips | None = None,
     *,
     gain: float | None = None,
 ) -> ViewMetrics:
     """Compares a view that is rendered before black with the frame of its camera: colors after
     `fit_exposure`, by default over all pixels, else over those `seen` (H, W). The windows of SSIM
-    and LPIPS reach over others. `lpips` are the networks of `lpips` and `lpips_vgg`, if any."""
+    and LPIPS reach over others."""
     truth, sky = frame.image / 255, frame.depth >= FAR
     seen = frame.valid if seen is None else seen & frame.valid
     camera = truth, vignetting, seen, gain
@@ -159,16 +158,16 @@ def measure_view(
     exposed, gain = fit_exposure(view.color, *camera)
     before_black = np.where(sky[..., None], view.color, on_black.color)
     exposed_before_black, _ = fit_exposure(before_black, *camera)
-    distances = dict.fromkeys(("lpips", "lpips_vgg"))
-    if seen.any():
+    distance = None
+    if lpips is not None and seen.any():
         tensors = [torch.from_numpy(x.astype(np.float32)) for x in (exposed, truth, seen)]
         with torch.no_grad():
-            distances |= {name: f(*tensors).item() for name, f in (lpips or {}).items()}
+            distance = lpips(*tensors).item()
     return ViewMetrics(
         psnr_db=psnr_db(exposed[seen], truth[seen]),
         psnr_on_black_db=psnr_db(exposed_before_black[seen], truth[seen]),
         ssim=ssim(exposed, truth, seen),
-        **distances,
+        lpips=distance,
         **depth_metrics(view.depth, np.where(seen, frame.depth, 0)),
         unseen_fraction=float(1 - seen.mean()),
         gain=gain,

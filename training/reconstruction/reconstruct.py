@@ -40,7 +40,6 @@ from splatpilot.training.reconstruction.initialize import (
     make_initial_gaussians,
     resolve_config,
 )
-from splatpilot.training.reconstruction.lpips import Lpips
 from splatpilot.training.reconstruction.metrics import HeldOutMetrics
 from splatpilot.training.reconstruction.optimize import Optimization
 from splatpilot.training.reconstruction.photometry import (
@@ -154,7 +153,6 @@ def reconstruct(
             background,
             lambda extent: make_initial_gaussians(capture, frames, photometry, extent, config),
             checkpoint,
-            Lpips() if config.lpips_weight > 0 else None,
             fit_gains=not capture.has_depth,
         )
         optimization.run()
@@ -224,10 +222,7 @@ def _source_and_split(capture: Capture, images: set[str], split: str) -> tuple[l
     """Returns the source digest of a scene and its split: those of the world that the capture was
     rendered of, or else of its fitted `images`, by digest. `split` is the user's, or empty."""
     name = capture.folder or capture.name
-    folder = Path(capture.folder)
-    rendered = None
-    if capture.folder:  # a rendered capture may hold others
-        rendered = rendered_world(folder) or rendered_world(folder.parent)
+    rendered = rendered_world(Path(capture.folder)) if capture.folder else None
     if rendered is None:
         digests, found = images, "train"
     elif rendered.source_digest:

@@ -10,7 +10,6 @@ from importlib.metadata import version
 import pytest
 
 from splatpilot.analysis import environments
-from splatpilot.analysis.commands import MOVED
 from splatpilot.analysis.commands import main as cli
 from splatpilot.analysis.commands.main import main
 from splatpilot.analysis.commands.options import Command
@@ -37,7 +36,6 @@ def execute(script, cwd=None, words=(), **environment):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        *((old, f"`splatpilot {old}` is now `splatpilot {new}`") for old, new in MOVED.items()),
         ("fli", "splatpilot: there is no command 'fli'; did you mean fly?"),
         ("capture chek room", "capture: there is no subcommand 'chek'; did you mean check?"),
         ("view P02 --sede 3", "view: unrecognized arguments: --sede 3; did you mean --seed?"),

@@ -80,7 +80,6 @@ def make_metrics(psnr: float, mae: float, floaters: float) -> SceneMetrics:
         psnr_on_black_db=psnr - 1,
         ssim=0.9,
         lpips=None,
-        lpips_vgg=None,
         depth_mae_m=mae,
         depth_relative=mae / 2,
         floater_fraction=floaters,
