@@ -15,10 +15,10 @@ from pydrake.common.yaml import yaml_load_file
 from pydrake.math import RigidTransform
 from pydrake.systems.sensors import CameraInfo
 
-from splatpilot.analysis import fidelity
-from splatpilot.analysis.fidelity import FidelityConfig
 from splatpilot.analysis.figures import Panel, colorize, depth_scale, write_grid
+from splatpilot.analysis.reconstruction import fidelity
 from splatpilot.analysis.reconstruction import run as reconstruction
+from splatpilot.analysis.reconstruction.fidelity import FidelityConfig
 from splatpilot.analysis.reconstruction.measure_scene import (
     METRICS,
     SceneViews,

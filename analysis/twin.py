@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from scipy.stats import rankdata
 
 from splatpilot.analysis.benchmark import run_study
-from splatpilot.analysis.benchmark.parameters import scenario_texts
-from splatpilot.analysis.benchmark.study import StudyConfig
+from splatpilot.analysis.benchmark.study import StudyConfig, scenario_texts
 from splatpilot.analysis.benchmark.tables import Row
 from splatpilot.analysis.benchmark.variants import parse_variant
 from splatpilot.analysis.figures import write_png

@@ -8,15 +8,14 @@ import math
 import platform
 import time
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields
 from typing import Any, NamedTuple
 
 import numpy as np
-from pydrake.systems.framework import System
 
 from splatpilot import _native
-from splatpilot.analysis.benchmark.study import RolloutSpec
+from splatpilot.analysis.benchmark.study import MakeSystem, RolloutSpec
 from splatpilot.analysis.benchmark.variants import ScenarioVariant
 from splatpilot.analysis.difficulty import Difficulty, world_difficulty
 from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
@@ -37,9 +36,6 @@ from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.common.registry import import_modules
 from splatpilot.systems.policies.time_of_arrival import TimeOfArrival, path_lengths
 from splatpilot.systems.vehicle.state import QuadrotorState
-
-MakeSystem = Callable[[Scenario, World], System]
-"""Makes the system of a policy for one flight."""
 
 ARRAYS = "times", "states", "commands", "clearances"
 """The arrays of `Flight` in a study."""

@@ -10,15 +10,17 @@ from itertools import batched, chain, groupby, product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from splatpilot.analysis.benchmark.parameters import (
+from splatpilot.analysis.benchmark.report import write_report
+from splatpilot.analysis.benchmark.rollout import Fault, Rollout, fly_rollouts
+from splatpilot.analysis.benchmark.study import (
+    MakeSystem,
+    RolloutSpec,
+    StudyConfig,
     named_scenarios,
     parameter_rows,
     policy_texts,
     scenario_texts,
 )
-from splatpilot.analysis.benchmark.report import write_report
-from splatpilot.analysis.benchmark.rollout import Fault, MakeSystem, Rollout, fly_rollouts
-from splatpilot.analysis.benchmark.study import RolloutSpec, StudyConfig
 from splatpilot.analysis.benchmark.study_folder import (
     StudyFolder,
     input_digests,

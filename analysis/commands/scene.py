@@ -156,7 +156,8 @@ def ablate(options: argparse.Namespace) -> None:
     cli.out_option("output folder", "out/fidelity"),
     cli.OVERWRITE,
     cli.set_option(
-        "max_depth_error=0.03", configuration="splatpilot.analysis.fidelity:FidelityConfig"
+        "max_depth_error=0.03",
+        configuration="splatpilot.analysis.reconstruction.fidelity:FidelityConfig",
     ),
     examples=(
         "scene fidelity scenes/hospital",
@@ -169,7 +170,7 @@ def fidelity(options: argparse.Namespace) -> None:
     cli.announce(f"comparing views off the path of {len(options.scenes)} scenes in {options.out}")
     for scene in options.scenes:
         check_kind(scene, "scene")
-    from splatpilot.analysis import fidelity
+    from splatpilot.analysis.reconstruction import fidelity
 
     cli.call(fidelity.run, options, config=cli.read_config(options))
 

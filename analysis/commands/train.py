@@ -171,7 +171,7 @@ def inspect_corpus(options: argparse.Namespace) -> None:
     with the trajectories over both."""
     require(options.out.suffix.lower() == ".png", "--out", "a PNG file", options.out)
     require(options.samples >= 1, "--samples", "at least 1", options.samples)
-    from splatpilot.analysis.corpus_sheet import draw_sheet
+    from splatpilot.analysis.figures import draw_sheet
     from splatpilot.training.corpus.corpus import Corpus
 
     corpus = Corpus(options.corpus)

@@ -9,8 +9,8 @@ import numpy as np
 import yaml
 
 from splatpilot.analysis.faults import FaultsConfig
-from splatpilot.analysis.fidelity import FidelityConfig
 from splatpilot.analysis.gap import GapConfig
+from splatpilot.analysis.reconstruction.fidelity import FidelityConfig
 from splatpilot.analysis.reconstruction.run import RenderedSceneConfig
 from splatpilot.analysis.twin import TwinConfig
 from splatpilot.diagrams.flight.policies import POLICIES

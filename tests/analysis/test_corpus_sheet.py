@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from splatpilot.analysis.commands.main import main
-from splatpilot.analysis.corpus_sheet import project
+from splatpilot.analysis.figures import project
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.training.corpus.corpus import Corpus
 

@@ -21,8 +21,8 @@ from splatpilot.systems.vehicle.state import rotation_matrices
 from splatpilot.training.corpus.corpus import Corpus, distinct_shards, distinct_worlds
 from splatpilot.training.corpus.library import require_untested
 from splatpilot.training.corpus.samples import RECOVERY, SHARD, Shard
+from splatpilot.training.policies.networks import StudentModule
 from splatpilot.training.policies.ray_casting import EsdfGeometry
-from splatpilot.training.policies.student_network import StudentModule
 from splatpilot.training.policies.trainer import Trainer
 
 _CHANCES = 1 << 20  # resolution of random choices

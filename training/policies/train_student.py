@@ -35,12 +35,12 @@ from splatpilot.training.policies.augmentation import (
     noisy_color,
     noisy_depth,
 )
-from splatpilot.training.policies.student_data import CorpusTrainer, FrozenFeatures
-from splatpilot.training.policies.student_network import (
+from splatpilot.training.policies.networks import (
     IMAGE_MODULES,
     StudentModule,
     imagenet_weights,
 )
+from splatpilot.training.policies.student_data import CorpusTrainer, FrozenFeatures
 from splatpilot.training.policies.trainer import CorpusTraining, Schedule
 
 GEOMETRIC_WEIGHT = 1.0  # [1/(m s)] weight of the barrier in equation 4

@@ -12,8 +12,12 @@ from pydrake.systems.framework import LeafSystem
 
 import splatpilot as sp
 from splatpilot.analysis.benchmark import replay
-from splatpilot.analysis.benchmark.parameters import parameter_rows, policy_texts, scenario_texts
-from splatpilot.analysis.benchmark.study import StudyConfig
+from splatpilot.analysis.benchmark.study import (
+    StudyConfig,
+    parameter_rows,
+    policy_texts,
+    scenario_texts,
+)
 from splatpilot.analysis.benchmark.study_folder import StudyFolder
 from splatpilot.analysis.benchmark.variants import ScenarioVariant, parse_scenario, parse_variant
 from splatpilot.analysis.commands.main import main

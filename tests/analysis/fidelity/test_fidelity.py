@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform
 
-from splatpilot.analysis import fidelity
 from splatpilot.analysis.commands.main import main
-from splatpilot.analysis.fidelity import FidelityConfig, study_scene
+from splatpilot.analysis.reconstruction import fidelity
+from splatpilot.analysis.reconstruction.fidelity import FidelityConfig, study_scene
 from splatpilot.diagrams.worlds.scene_folder import read_scene_metadata
 from splatpilot.systems.splats.baked_scene import BakedScene
 from splatpilot.training.captures import capture_registry

@@ -12,13 +12,13 @@ from splatpilot.systems.common.config import dump_config
 from splatpilot.systems.policies.student import StudentSpec
 from splatpilot.training.corpus.corpus import CONFIG, Corpus, CorpusConfig
 from splatpilot.training.corpus.library import world_source
+from splatpilot.training.policies.networks import StudentModule
 from splatpilot.training.policies.student_data import (
     FrozenFeatures,
     StudentData,
     encode_images,
     is_held_out,
 )
-from splatpilot.training.policies.student_network import StudentModule
 
 HELD_OUT = 0.2
 """Fraction that holds out one of the three worlds."""

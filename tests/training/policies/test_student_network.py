@@ -9,8 +9,8 @@ from torchvision.models import mobilenet_v2
 from splatpilot.systems.policies import student
 from splatpilot.systems.policies.base import Observation
 from splatpilot.systems.vehicle.state import QuadrotorState
+from splatpilot.training.policies.networks import IN_DATA, StudentModule, imagenet_weights
 from splatpilot.training.policies.student_data import encode_images
-from splatpilot.training.policies.student_network import IN_DATA, StudentModule, imagenet_weights
 
 
 def disturbed(module: StudentModule) -> StudentModule:
