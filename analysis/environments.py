@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 from pydrake.common.yaml import yaml_load_file
 from pydrake.math import RigidTransform
 from pydrake.systems.sensors import CameraInfo
@@ -225,11 +226,8 @@ def show(*, scenes: Path) -> list[Record]:
     `library.png`: a view of each onboard camera, color next to depth."""
     records = list(read_index(scenes).values())
     require(records, f"{scenes / INDEX}", "an index", "none", "`splatpilot library make` makes it")
-    rows = [_row(record) for record in records]
-    widths = {name: max(len(row[name]) for row in [*rows, _TITLES]) for name in _TITLES}
-    for row in (_TITLES, *rows):
-        cells = (row[name].rjust(width) for name, width in widths.items() if name != "name")
-        print("  ".join([row["name"].ljust(widths["name"]), *cells]))
+    table = pd.DataFrame([_row(record) for record in records])
+    print(table.rename(columns=_TITLES).to_string(index=False))
     for record in records:
         if record.feasible_seeds < _SEEDS:
             print(

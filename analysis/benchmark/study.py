@@ -34,7 +34,7 @@ from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.common.config import dump_config, load_config, yaml_line
 from splatpilot.systems.common.distributions import distribution_text, draw, is_distribution
 from splatpilot.systems.common.seeds import study_seeds
-from splatpilot.systems.common.validation import require
+from splatpilot.systems.common.validation import errors_about, require
 
 MakeSystem = Callable[[Scenario, World], System]
 """Makes the system of a policy for one flight."""
@@ -126,11 +126,9 @@ class StudyConfig:
                 file = scenario_file(variant.scenario)
                 scenario = load_config(Scenario(), file, overrides)
                 self._check_own_policy(file)
-            try:
+            with errors_about(f"scenario {variant.label}"):
                 scenario.validate()
                 self._check_policies(variant, scenario.policy)
-            except ValueError as error:
-                raise ValueError(f"scenario {variant.label}: {error}") from None
             scenarios[variant.label] = scenario
         return scenarios
 

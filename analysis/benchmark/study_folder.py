@@ -58,7 +58,7 @@ from splatpilot.systems.common.files import (
     written_atomically,
 )
 from splatpilot.systems.common.readers import error_summary, read_archive, read_text, yaml_errors
-from splatpilot.systems.common.validation import require
+from splatpilot.systems.common.validation import errors_about, require
 from splatpilot.systems.vehicle.vehicles import VEHICLES
 
 FORMAT_VERSION = 1
@@ -121,10 +121,8 @@ class StudyFolder:
         """Reads the study."""
         file = self.path / "study.yaml"
         config = parse_config(StudyConfig(), yaml.safe_dump(self._read()["study"]), str(file))
-        try:
+        with errors_about(file):
             config.validate()
-        except ValueError as error:
-            raise ValueError(f"{file}: {error}") from None
         return config
 
     def program(self) -> dict[str, str]:
@@ -279,10 +277,8 @@ def kept_scenario(folder: StudyFolder, name: str) -> Scenario:
     """Reads a scenario of a study, with scene and weights in the study's folder."""
     file = folder.path / "scenarios" / f"{name}.yaml"
     scenario = load_config(Scenario(), file)
-    try:
+    with errors_about(file):
         scenario.validate()
-    except ValueError as error:
-        raise ValueError(f"{file}: {error}") from None
     if isinstance(scenario.world, SceneSource):
         scenario.world.path = str((folder.path / scenario.world.path).absolute())
     weights = folder.path / str(getattr(scenario.policy, "weights", ""))

@@ -8,7 +8,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from splatpilot.systems.common.validation import require
+from splatpilot.systems.common.validation import errors_about, require
 
 SCENARIO = "scenario"
 """The policy of the scenario itself, its `policy` block."""
@@ -60,11 +60,9 @@ class Variant(NamedTuple):
         overrides = [*self.overrides, *overrides]
         if not overrides:
             return config
-        try:
+        with errors_about(f"policy {self.label}"):
             config = load_config(config, overrides=overrides)
             sample_distributions(config, 0, ("policy",)).validate()
-        except ValueError as error:
-            raise ValueError(f"policy {self.label}: {error}") from None
         return config
 
 

@@ -3,7 +3,6 @@
 import argparse
 import importlib.util
 import platform
-import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
@@ -57,7 +56,7 @@ class Finding:
 def doctor(options: argparse.Namespace) -> list[Finding]:
     """Checks processor, GPU, EGL, the route of LCM messages, the video encoder, the packages of
     each extra, data and scenes. Each missing part has one remedy."""
-    machine = _program, _processor, _gpu, _opengl, _messages, _video, _browser
+    machine = _program, _processor, _gpu, _opengl, _messages, _video
     findings = [each for check in (*machine, _extras, _data, _scenes) for each in check()]
     print(format_findings(findings))
     return findings
@@ -157,13 +156,6 @@ def _video() -> list[Finding]:
     except UnknownCodecError:
         return [Finding("video", f"no H.264 in PyAV {av.__version__}", "pip install av", "videos")]
     return [Finding("video", f"H.264 by PyAV {av.__version__}")]
-
-
-def _browser() -> list[Finding]:
-    chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)
-    if chromium is None:
-        return [Finding("browser", "no Chromium", "apt install chromium", "the tests of pages")]
-    return [Finding("browser", chromium)]
 
 
 def _extras() -> list[Finding]:

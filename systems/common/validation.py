@@ -14,6 +14,7 @@ import dataclasses
 import difflib
 import re
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from numbers import Real
 from typing import Any, cast
 
@@ -36,6 +37,15 @@ def require(valid: object, what: str, condition: str, value: object, remedy: str
         raise ValueError(
             f"{what} must be {condition}, got {value}" + (f"; {remedy}" if remedy else "")
         )
+
+
+@contextmanager
+def errors_about(source: object) -> Iterator[None]:
+    """Writes `source`, such as a file, before the message of a ValueError in the block."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"{source}: {error}") from None
 
 
 def require_type(value: object, kind: type, what: str, remedy: str = "") -> None:
@@ -66,6 +76,14 @@ class FieldError(ValueError):
         """Returns the error with the field's path in `whole`, such as `policy.lattice.speed`."""
         path = _path(whole, self.config)
         return ValueError(f"{path}.{self.name} {self.problem}") if path else self
+
+
+def validate(config: Any) -> None:
+    """Validates a configuration; errors name fields as in its file."""
+    try:
+        config.validate()
+    except FieldError as error:
+        raise error.within(config) from None
 
 
 def _path(whole: object, part: object) -> str:

@@ -8,7 +8,13 @@ from pathlib import Path
 
 from splatpilot.systems.common import files
 from splatpilot.systems.common.config import load_config
-from splatpilot.systems.common.validation import Config, bounded, require, require_field
+from splatpilot.systems.common.validation import (
+    Config,
+    bounded,
+    errors_about,
+    require,
+    require_field,
+)
 
 _UPS = ("x", "y", "z", "-x", "-y", "-z", "cameras", "ground")
 CONFIG_FILE = "capture.yaml"
@@ -114,10 +120,8 @@ def complete_config(path: Path, config: CaptureConfig | None) -> CaptureConfig:
     completed = CaptureConfig()
     if file.is_file():
         completed = load_config(completed, file)
-        try:
+        with errors_about(file):
             completed.validate()
-        except ValueError as error:
-            raise ValueError(f"{file}: {error}") from None
     if config is not None:
         completed = load_config(completed, overrides=config.settings())
     completed.validate()

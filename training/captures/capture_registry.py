@@ -8,6 +8,7 @@ from pathlib import Path
 from splatpilot.diagrams.worlds.scene_folder import SceneMetadata
 from splatpilot.systems.common.config import load_config
 from splatpilot.systems.common.registry import Registry
+from splatpilot.systems.common.validation import errors_about
 from splatpilot.training.captures import (
     colmap,
     nerfstudio,
@@ -121,9 +122,7 @@ def read_scene_capture(scene: Path, metadata: SceneMetadata) -> Capture:
             "rescaled against the depth of its capture; measure the scene that "
             "`splatpilot reconstruct` wrote"
         )
-    try:
+    with errors_about(f"{file}: capture_settings"):
         config = load_config(CaptureConfig(), overrides=metadata.capture_settings)
-    except ValueError as error:
-        raise ValueError(f"{file}: capture_settings: {error}") from None
     config.origin = metadata.origin
     return read_capture(metadata.capture, config)

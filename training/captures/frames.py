@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from splatpilot.systems.common import readers
 from splatpilot.systems.common.extras import import_extra
-from splatpilot.systems.common.validation import require
+from splatpilot.systems.common.validation import errors_about, require
 from splatpilot.training.captures.capture import (
     Capture,
     DepthCamera,
@@ -330,13 +330,11 @@ def open_frames(
             raise ValueError("unknown intrinsics; set capture.intrinsics to [fx, fy, cx, cy]")
         return lens(width, height)
 
-    try:
+    with errors_about(path):
         shared = shared_lens() if any(frame.files.lens is None for frame in usable) else None
         lenses = [frame.files.lens or shared for frame in usable]
         distinct = [each for each in dict.fromkeys(lenses) if each is not None]
         camera = common_pinhole(distinct)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
     # Some cameras focus every frame again: the maps of all would fill the memory.
     cached_maps = lru_cache(_MAPS)(lambda lens: resampling_maps(lens, camera))
 

@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from splatpilot.systems.common.files import written_atomically
 from splatpilot.systems.common.progress import Progress, say
+from splatpilot.systems.common.validation import errors_about
 from splatpilot.training.captures.capture import (
     Capture,
     CaptureFrame,
@@ -307,10 +308,8 @@ def refined_capture(capture: Capture, path: Path, config: CaptureConfig) -> Capt
         factor = shrink_factor(capture.width, _WIDTH)
         numbers = Progress(range(len(capture)), "loading frames", unit="frame")
         frames = [ComparedFrame.prepare(shrink(capture.frame(i), factor)) for i in numbers]
-        try:
+        with errors_about(path):
             refined = refine_poses(frames, capture.X_WCs)
-        except ValueError as error:
-            raise ValueError(f"{path}: {error}") from None
         say(f"{path}: {refined}")
         with written_atomically(file) as written, written.open("wb") as stream:
             np.save(stream, np.array([X_WC.GetAsMatrix34() for X_WC in refined.X_WCs]))

@@ -19,7 +19,7 @@ from splatpilot.systems.common.files import claim_folder, locks_folder, require_
 from splatpilot.systems.common.processes import available_cores, map_processes
 from splatpilot.systems.common.progress import Progress, resumable, say
 from splatpilot.systems.common.provenance import InfeasibleFlightError, revision
-from splatpilot.systems.common.validation import FieldError, require
+from splatpilot.systems.common.validation import require, validate
 from splatpilot.systems.splats.splat_camera import color_pixels, ranged_depth
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 from splatpilot.systems.vehicle.state import QuadrotorState, pose_from_state
@@ -220,10 +220,7 @@ def run(*, config: CorpusConfig, out: Path, worlds: int, jobs: int | None = None
     """Collects the first `worlds` worlds of a corpus in `out`, except those that it has already. An
     interrupted run is resumed by the same call, with bitwise identical results. Damaged shards are
     collected again. `jobs` worker processes, one for each core by default."""
-    try:
-        config.validate()
-    except FieldError as error:
-        raise error.within(config) from None
+    validate(config)
     jobs = available_cores() if jobs is None else jobs
     require(jobs >= 1, "--jobs", "at least 1", jobs)
     require(worlds >= 1, "--worlds", "at least 1", worlds)

@@ -34,7 +34,7 @@ from splatpilot.systems.common.processes import available_cores, map_processes
 from splatpilot.systems.common.progress import Progress, resumable, say
 from splatpilot.systems.common.provenance import InfeasibleFlightError, revision
 from splatpilot.systems.common.readers import read_archive
-from splatpilot.systems.common.validation import require
+from splatpilot.systems.common.validation import require, validate
 from splatpilot.systems.policies.diffaero_rgb import DiffAeroRgbConfig
 from splatpilot.systems.policies.student import StudentConfig
 from splatpilot.training.corpus.collect import keep_clear, render_samples
@@ -322,7 +322,7 @@ def run[Config: CorpusTraining](
     for name, value in (("flights", flights), ("jobs", jobs)):
         require(value >= 1, f"--{name}", "at least 1", value)
     # Missing inputs are refused before anything is written.
-    train.validate(config)
+    validate(config)
     if flown_by:
         policy_named(flown_by)
     worlds = distinct_worlds([Corpus(Path(source)) for source in config.corpora])

@@ -19,18 +19,10 @@ from splatpilot.systems.common.torch_device import (
     one_torch_thread,
     require_device,
 )
-from splatpilot.systems.common.validation import FieldError
+from splatpilot.systems.common.validation import validate
 from splatpilot.systems.policies.checkpoint import PolicyCheckpoint
 from splatpilot.training.policies.trainer import Trainer, TrainingConfig
 from splatpilot.training.reconstruction.checkpoint import event_log, load_tensors, save_tensors
-
-
-def validate(config: Any) -> None:
-    """Checks a configuration; errors name fields as in its file."""
-    try:
-        config.validate()
-    except FieldError as error:
-        raise error.within(config) from None
 
 
 @one_torch_thread()

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 
-from splatpilot.analysis.reconstruction.fidelity import study
+from splatpilot.analysis.reconstruction import fidelity as study
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.training.reconstruction.splat_rendering import SceneRenderer
 
