@@ -195,11 +195,14 @@ def read_config(options: argparse.Namespace, *overrides: str, **changes: Any) ->
     return load_config(config, file, [*options.overrides, *overrides])
 
 
-def path_option(spec: str, what: str, **keywords: Any) -> Option:
-    """Declares an option or argument for existing paths, with `what` there."""
+def path_option(spec: str, what: str, *kinds: str, **keywords: Any) -> Option:
+    """Declares an option or argument for existing paths, with `what` there, of these kinds if any;
+    see `check_kind`."""
 
     def check(path: Path) -> Path:
         require_existing(path, what)
+        if kinds:
+            checks.check_kind(path, *kinds)
         return path
 
     return Option(spec, what, Path, resolve=check, **keywords)

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 from splatpilot.analysis.commands import options as cli
-from splatpilot.analysis.commands.checks import check_kind
 from splatpilot.analysis.commands.flight import WORLD_FIELDS
 from splatpilot.systems.common.extras import import_extra
 
@@ -22,7 +21,7 @@ def _point(text: str) -> list[float]:
 
 @cli.command(
     "scene scale",
-    cli.path_option("scene", "a scene folder or a file of Gaussians"),
+    cli.path_option("scene", "a scene folder or a file of Gaussians", "scene", "gaussians"),
     cli.out_option("scene folder, or PLY, glTF or USD file, to write"),
     cli.Option("--up", "axis of a file that points up (z)", choices=_AXES),
     cli.Option(
@@ -57,7 +56,6 @@ def scale(options: argparse.Namespace) -> None:
     given = options.factor, options.height, options.up
     if not options.between and not options.floor and given == (None, None, None):
         raise ValueError("what is its size? Give --factor, --between with --distance, or --height")
-    check_kind(options.scene, "scene", "gaussians")
     from splatpilot.analysis.reconstruction import rescale
 
     cli.call(rescale.run, options)
@@ -65,7 +63,7 @@ def scale(options: argparse.Namespace) -> None:
 
 @cli.command(
     "scene measure",
-    cli.path_option("scene", "a scene folder"),
+    cli.path_option("scene", "a scene folder", "scene"),
     cli.OVERWRITE,
     examples=("scene measure scenes/room_metric", "scene measure scenes/hospital --overwrite"),
 )
@@ -73,7 +71,6 @@ def measure(options: argparse.Namespace) -> None:
     """Writes metrics.json (PSNR, SSIM, LPIPS, depth errors, floaters) and views.png into a scene
     folder. `splatpilot reconstruct` has written them already."""
     cli.announce(f"measuring {options.scene}")
-    check_kind(options.scene, "scene")
     from splatpilot.analysis.reconstruction import measure_scene
 
     cli.call(measure_scene.run, options)
@@ -152,7 +149,7 @@ def ablate(options: argparse.Namespace) -> None:
 
 @cli.command(
     "scene fidelity",
-    cli.path_option("scenes", "a scene folder", nargs="+", metavar="SCENE"),
+    cli.path_option("scenes", "a scene folder", "scene", nargs="+", metavar="SCENE"),
     cli.out_option("output folder", "out/fidelity"),
     cli.OVERWRITE,
     cli.set_option(
@@ -168,8 +165,6 @@ def fidelity(options: argparse.Namespace) -> None:
     """Renders scenes from poses off their captures' paths, compares with the truth or, without it,
     with other frames, and writes the trusted distance from the path into each scene.yaml."""
     cli.announce(f"comparing views off the path of {len(options.scenes)} scenes in {options.out}")
-    for scene in options.scenes:
-        check_kind(scene, "scene")
     from splatpilot.analysis.reconstruction import fidelity
 
     cli.call(fidelity.run, options, config=cli.read_config(options))
@@ -177,7 +172,9 @@ def fidelity(options: argparse.Namespace) -> None:
 
 @cli.command(
     "scene twin",
-    cli.path_option("scenes", "a scene folder of a rendered capture", nargs="+", metavar="SCENE"),
+    cli.path_option(
+        "scenes", "a scene folder of a rendered capture", "scene", nargs="+", metavar="SCENE"
+    ),
     cli.out_option("output folder", "out/twin"),
     cli.JOBS,
     cli.set_option(
@@ -191,8 +188,6 @@ def twin(options: argparse.Namespace) -> None:
     their captures were rendered of, and writes how well success in the one predicts success in the
     other. If interrupted, the same command resumes."""
     cli.announce(f"flying in {len(options.scenes)} scenes and their meshes in {options.out}")
-    for scene in options.scenes:
-        check_kind(scene, "scene")
     from splatpilot.analysis import twin as twins
 
     cli.call(twins.run, options, config=cli.read_config(options))
@@ -200,7 +195,9 @@ def twin(options: argparse.Namespace) -> None:
 
 @cli.command(
     "gap",
-    cli.path_option("scenes", "a scene folder with its capture", nargs="+", metavar="SCENE"),
+    cli.path_option(
+        "scenes", "a scene folder with its capture", "scene", nargs="+", metavar="SCENE"
+    ),
     cli.out_option("output folder", "out/gap"),
     cli.OVERWRITE,
     cli.set_option(
@@ -214,8 +211,6 @@ def gap(options: argparse.Namespace) -> Any:
     """Asks policies for plans by the real images of captures and by renderings from the same poses,
     and in generated worlds, and compares how many plans are clear of obstacles."""
     cli.announce(f"comparing plans in {len(options.scenes)} scenes in {options.out}")
-    for scene in options.scenes:
-        check_kind(scene, "scene")
     from splatpilot.analysis import gap as gaps
 
     return cli.call(gaps.run, options, config=cli.read_config(options))

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, field
 from itertools import cycle
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -111,12 +111,6 @@ class TrainingWorld:
     p_WG: np.ndarray  # (3,) [m] goal
 
 
-class Views(Protocol):
-    """Color images of worlds, see `splatpilot.training.policies.train_distilled_rgb`."""
-
-    def render(self, vehicle: Vehicle, world: Tensor) -> Tensor: ...
-
-
 class WorldBatch:
     """W worlds as tensors: surfaces, volumes, starts, goals, and the path to each goal by grids of
     the time of arrival with `voxel_size` [m]; None for evaluation, without grids."""
@@ -135,7 +129,7 @@ class WorldBatch:
         self.p_WS, self.p_WG = (
             tensor([getattr(world, name) for world in worlds]) for name in ("p_WS", "p_WG")
         )
-        self.views: Views | None = None  # of colors
+        self.views: Any = None  # of colors, see `WorldViews`
         self._surfaces = [world.surfaces for world in worlds]
         self.geometry: Geometry = MixedGeometry(self._surfaces)
         self._times = None
