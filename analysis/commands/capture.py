@@ -109,7 +109,7 @@ def _points(text: str) -> list[list[float]]:
     cli.UP,
     cli.SEED,
     cli.set_option(
-        *("spacing=0.8", "highest=2.0"),
+        *("spacing=0.8", "highest=2.0", "offsets=[-0.5,0.5]"),
         configuration="splatpilot.training.captures.render:RenderConfig",
     ),
     examples=(

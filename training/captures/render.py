@@ -63,6 +63,9 @@ class RenderConfig(Config):
     # [deg] Viewing directions at each stop of it, from that of travel to the left.
     yaws: list[float] = bounded(lambda: [0.0, 90.0, -90.0], "(-inf, inf) deg")
     pitch: float = bounded(-5.0, "(-90, 90) deg")  # of the camera there, upward
+    # [m] To the camera's left, negative to its right: each adds a second capture `offset_...` of
+    # the poses that are free there.
+    offsets: list[float] = bounded(list, "(-inf, inf) m")
     up: str = bounded("y", "{y, z}")  # axis of the file that points up: y, as glTF says, or z
     scale: float = bounded(1.0, "(0, inf) m")  # unit of the mesh
     # Color of the background; red, green, blue in 0 to 1.
@@ -78,6 +81,7 @@ class RenderConfig(Config):
         require_field(self, "lowest", self.lowest < self.highest, f"below highest, {self.highest}")
         require_field(self, "inside", len(self.inside) in (0, 3), "x, y, z, or empty")
         require_field(self, "yaws", self.yaws, "at least one angle")
+        require_field(self, "offsets", all(self.offsets), "other than 0")
         require_field(self, "background", len(self.background) == 3, "red, green and blue")
 
 
@@ -169,7 +173,11 @@ def _render(world: Path, out: Path, partial: Path, config: RenderConfig, seed: i
     if spec is not None and not mesh.is_file():
         write_gltf(spec, mesh)
     view = _camera(mesh, config)
-    _write_frames(partial, X_WCs, view)
+    _write_frames(partial, "rendering frames", X_WCs, view)
+    for offset in config.offsets:
+        moved = [X_WC @ RigidTransform([-offset, 0.0, 0.0]) for X_WC in X_WCs]
+        free = [X_WC for X_WC in moved if _is_free(esdf, X_WC.translation(), config.clearance)]
+        _write_frames(partial / f"offset_{offset:+.2f}", f"offset {offset:+.2f} m", free, view)
     if plan is not None:
         with written_atomically(partial / COVERAGE) as file:
             _, content = cv2.imencode(".png", np.ascontiguousarray(plan.picture()[..., ::-1]))
@@ -274,6 +282,7 @@ def _is_free(esdf: Esdf, p_WQ: NDArray, clearance: float) -> bool:
 
 def _write_frames(
     folder: Path,
+    what: str,
     X_WCs: Sequence[RigidTransform],
     view: Callable[[RigidTransform], CaptureFrame],
 ) -> None:
@@ -282,7 +291,7 @@ def _write_frames(
     for part in (images, depths):
         require_writable_folder(part)
     rows = []
-    for i, X_WC in enumerate(Progress(X_WCs, "rendering frames", unit="frame")):
+    for i, X_WC in enumerate(Progress(X_WCs, what, unit="frame")):
         R_FW = RigidTransform(AXES.R_WF.inverse())
         rows.append(f"{pose_row(R_FW @ X_WC @ RigidTransform(AXES.R_BC.inverse()))}\n")
         image = images / f"{i:06d}_left.png"

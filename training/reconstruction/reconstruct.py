@@ -222,7 +222,9 @@ def _source_and_split(capture: Capture, images: set[str], split: str) -> tuple[l
     """Returns the source digest of a scene and its split: those of the world that the capture was
     rendered of, or else of its fitted `images`, by digest. `split` is the user's, or empty."""
     name = capture.folder or capture.name
-    rendered = rendered_world(Path(capture.folder)) if capture.folder else None
+    folder, rendered = Path(capture.folder), None
+    if capture.folder:  # a rendered capture may hold others
+        rendered = rendered_world(folder) or rendered_world(folder.parent)
     if rendered is None:
         digests, found = images, "train"
     elif rendered.source_digest:

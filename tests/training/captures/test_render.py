@@ -90,6 +90,18 @@ def test_capture_has_exact_depth_where_its_poses_say(opengl, room, tmp_path):
     np.testing.assert_array_equal(again.K, capture.K)
 
 
+def test_offset_captures_are_lateral(opengl, room, tmp_path):
+    config = small(yaws=[0.0], offsets=[0.5], clearance=0.3)
+    run(world=room, out=tmp_path / "capture", config=config)
+    middle, beside = (read_capture(tmp_path / p) for p in ("capture", "capture/offset_+0.50"))
+    assert len(beside) == len(middle)
+    for X_WC, X_WD in zip(middle.X_WCs, beside.X_WCs, strict=True):
+        moved = (X_WC.inverse() @ X_WD).translation()
+        np.testing.assert_allclose(moved, [-0.5, 0, 0], atol=1e-9)
+    for frame in beside.frames():
+        np.testing.assert_allclose(frame.depth, depth_of_room(frame), rtol=1e-4)
+
+
 def test_interrupted_rendering_resumes(opengl, room, tmp_path):
     run(world=room, out=tmp_path / "whole", config=small())
     partial = tmp_path / ".part.partial"
