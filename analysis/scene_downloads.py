@@ -71,7 +71,8 @@ def pack(*, names: Sequence[str], scenes: Path, out: Path) -> dict[str, PackedSc
         free = license and "non-commercial" not in license
         require(free, f"license of {name}", "a free one", license or "none", remedy)
         require(not records[name].path, name, "a scene folder", "an OctoMap", "share its file")
-    listed = _read_list(out / LIST) if (out / LIST).exists() else {}
+    file = out / LIST
+    listed = _parse_list(read_text(file).encode(), str(file)) if file.exists() else {}
     for name in Progress(names, "packing", unit="scene"):
         record = records[name]
         with folder_written_atomically(out / name, replace=True) as folder:
@@ -112,7 +113,9 @@ def get(*, names: Sequence[str], source: str, scenes: Path) -> dict[str, PackedS
     for name in names:
         packed, target = listed[name], scenes / name
         if target.exists():
-            same = all(_is_same(target / file, about) for file, about in packed.files.items())
+            kept = {file: target / file for file in packed.files if (target / file).is_file()}
+            digests = {name: sha256(file.read_bytes()).hexdigest() for name, file in kept.items()}
+            same = digests == {file: about.sha256 for file, about in packed.files.items()}
             remedy = "choose another --out, or remove it"
             require(same, str(target), f"the scene of {source}", "another one", remedy)
             print(f"{target}: is there already")
@@ -127,14 +130,6 @@ def get(*, names: Sequence[str], source: str, scenes: Path) -> dict[str, PackedS
             read_scene_metadata(folder)
         print(f"Wrote {target}; license: {packed.license}")
     return {name: listed[name] for name in names}
-
-
-def _is_same(file: Path, about: PackedFile) -> bool:
-    return file.is_file() and sha256(file.read_bytes()).hexdigest() == about.sha256
-
-
-def _read_list(file: Path) -> dict[str, PackedScene]:
-    return _parse_list(read_text(file).encode(), str(file))
 
 
 def _parse_list(content: bytes, where: str) -> dict[str, PackedScene]:

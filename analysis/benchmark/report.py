@@ -278,11 +278,6 @@ def _scenarios(
     return _table(["scenario", *header], lines) + (note if single else "")
 
 
-def _link(id: str) -> _Html:
-    """Links a flight to the page that `splatpilot replay` writes."""
-    return _Html(f'<a href="replays/{escape(id)}/flight.html">{escape(id)}</a>')
-
-
 def _flights(rows: list[Row]) -> str:
     header = ["flight", "outcome", "time [s]", "min. clearance [m]", "velocity [m/s]", "replay"]
     columns = {"flight_time_s": ".1f", "min_clearance_m": "+.2f", "mean_speed_m_s": ".2f"}
@@ -292,10 +287,11 @@ def _flights(rows: list[Row]) -> str:
     ]
     for name in dict.fromkeys(row["scenario"] for row in rows):
         lines = [
-            [_link(row["id"]), row["outcome"]]
+            [_Html(f'<a href="replays/{id}/flight.html">{id}</a>'), row["outcome"]]
             + [_number(row.get(column, math.nan), form) for column, form in columns.items()]
-            + [_Html(f"<code>splatpilot replay . {escape(row['id'])} --meshcat</code>")]
+            + [_Html(f"<code>splatpilot replay . {id} --meshcat</code>")]
             for row in select(rows, scenario=name)
+            for id in [escape(row["id"])]
         ]
         summary = f"<summary>{escape(name)}: {len(lines)} flights</summary>"
         sections.append(f"<details>{summary}{_table(header, lines)}</details>")

@@ -27,13 +27,18 @@ def _defaults(options: argparse.Namespace) -> Any:
     "reconstruct",
     cli.input_option("source", "capture", "mesh", "scenario"),
     cli.out_option("scene folder to write"),
-    cli.Option("--iterations", "optimization steps", int),
     cli.UP,
     cli.SEED,
     cli.flag("--restart", "discard an interrupted run"),
     cli.OVERWRITE,
     cli.set_option(
-        *("voxel_size=0.1", "image_width=640", "max_gaussians=200000", "device=cuda"),
+        *(
+            "iterations=3000",
+            "voxel_size=0.1",
+            "image_width=640",
+            "max_gaussians=200000",
+            "device=cuda",
+        ),
         configuration=_defaults,
     ),
     examples=(
@@ -53,12 +58,7 @@ def reconstruct(options: argparse.Namespace) -> None:
     cli.announce(f"reconstructing {source} as {options.out}")
     from splatpilot.analysis.reconstruction import run
 
-    overrides = []
-    if options.iterations is not None:
-        if any(override.startswith("iterations=") for override in options.overrides):
-            raise ValueError("iterations are given by --iterations and by --set; keep one of them")
-        overrides = [f"iterations={options.iterations}"]
-    config: Any = cli.read_config(options, *overrides)
+    config: Any = cli.read_config(options)
     if not rendered:
         cli.call(run.run, options, capture=Path(source), config=config)
         return

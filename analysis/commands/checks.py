@@ -9,7 +9,6 @@ from splatpilot.diagrams.scenarios import benchmark_scenarios, other_scenarios, 
 from splatpilot.systems.common.files import (
     find_data,
     locate_scene,
-    require_corpus,
     require_existing,
 )
 from splatpilot.systems.common.registry import check_name
@@ -93,21 +92,6 @@ def check_study_scenario(text: str) -> str:
     """Checks a scenario of a study, with fields that are changed, and returns the text."""
     check_scenario(parse_scenario(text).scenario)
     return text
-
-
-def check_corpora(policies: Sequence[str], overrides: Sequence[str], config: Path | None) -> None:
-    """Checks that corpora exist, if a policy learns from them; the training checks those in
-    `config`."""
-    given = [text.partition("=")[2] for text in overrides if text.startswith("corpora=")]
-    if (config is not None and not given) or not set(LEARN_FROM_CORPORA) & set(policies):
-        return
-    corpora = ["out/corpus"]
-    if given:
-        import yaml
-
-        corpora = yaml.safe_load(given[-1])
-    for corpus in corpora if isinstance(corpora, list) else ():
-        require_corpus(Path(str(corpus)))
 
 
 def check_kind(path: Path, *accepted: str) -> None:

@@ -182,7 +182,7 @@ def set_option(*examples: str, configuration: str | Callable[[argparse.Namespace
     )
 
 
-def read_config(options: argparse.Namespace, *overrides: str, **changes: Any) -> Any:
+def read_config(options: argparse.Namespace, **changes: Any) -> Any:
     """Reads `--config` and `--set` over a command's defaults with the `changes` that are not
     None."""
     from splatpilot.systems.common.config import load_config
@@ -192,7 +192,7 @@ def read_config(options: argparse.Namespace, *overrides: str, **changes: Any) ->
         if value is not None:
             setattr(config, name, value)
     file = getattr(options, "config", None)
-    return load_config(config, file, [*options.overrides, *overrides])
+    return load_config(config, file, options.overrides)
 
 
 def path_option(spec: str, what: str, *kinds: str, **keywords: Any) -> Option:

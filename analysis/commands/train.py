@@ -8,7 +8,6 @@ from splatpilot.analysis.commands import options as cli
 from splatpilot.analysis.commands.checks import (
     LEARN_FROM_CORPORA,
     TRAINER_NAMES,
-    check_corpora,
     check_scenario,
     check_trainer,
 )
@@ -58,7 +57,6 @@ def train(options: argparse.Namespace) -> None:
     for what, given in (("policy", options.policies), ("seed", options.seeds or [])):
         if repeated := [one for k, one in enumerate(given) if one in given[:k]]:
             raise ValueError(f"the {what} {repeated[0]} is given twice; leave one out")
-    check_corpora(options.policies, options.overrides, options.config)
     cli.announce(f"training {', '.join(options.policies)} in {options.out}")
     from splatpilot.systems.common.config import load_config
     from splatpilot.systems.common.progress import resumable
@@ -111,7 +109,6 @@ def train(options: argparse.Namespace) -> None:
 def recover(options: argparse.Namespace) -> None:
     """Trains a student on corpora, flies it in their worlds, labels what came before its
     near-misses and crashes, and trains it again. If interrupted, the same command resumes."""
-    check_corpora([options.policy], options.overrides, options.config)
     cli.announce(f"training {options.policy} with recovery in {options.out}")
     from splatpilot.systems.common.processes import available_cores
     from splatpilot.systems.common.progress import resumable

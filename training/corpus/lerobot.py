@@ -142,7 +142,8 @@ class _Writer:
             for run in runs:
                 part = slice(first, first + len(run))
                 self._add_episode(shard, run, {key: images[key][part] for key in images})
-                table = {name: _arrow(column) for name, column in self._columns[-1].items()}
+                columns = self._columns[-1].items()
+                table = {k: (c[:, 0] if c.shape[1] == 1 else c).tolist() for k, c in columns}
                 parquet.write_table(pa.table(table, _schema()))
                 seconds = {
                     "from": float(part.start / self.rate),
@@ -254,10 +255,6 @@ def _schema() -> pa.Schema:
             for name, (each, names) in types.items()
         }
     )
-
-
-def _arrow(column: np.ndarray) -> list:
-    return (column[:, 0] if column.shape[1] == 1 else column).tolist()
 
 
 def _stats(column: np.ndarray) -> dict[str, list]:

@@ -193,7 +193,7 @@ def test_flight_through_a_real_capture(tmp_path):
             (capture / part / file.name).symlink_to(file)
     poses = (whole / "pose_left.txt").read_text().splitlines(keepends=True)
     (capture / "pose_left.txt").write_text("".join(poses[::3]))
-    words = ["--iterations", "0", "--set", "voxel_size=0.1"]
+    words = ["--set", "iterations=0", "--set", "voxel_size=0.1"]
     assert main(["reconstruct", str(capture), "--out", str(scene), *words]) == 0
     assert main(["fly", "--scene", str(scene), "--out", str(out)]) == 0
     summary = json.loads((out / "summary.json").read_text())

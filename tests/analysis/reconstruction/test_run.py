@@ -83,7 +83,7 @@ def test_doubts_about_a_capture_are_printed_first_and_last(folder, config, tmp_p
     assert printed.startswith(f"warning: {doubt}\n") and printed.count(doubt) == 2
 
 
-def test_invalid_captures_are_refused(tmp_path, config, capsys):
+def test_invalid_captures_are_refused(tmp_path, config):
     (tmp_path / "file").write_text("")
     with pytest.raises(ValueError, match="must be new, empty or a scene"):
         run(capture=tmp_path / "nowhere", out=tmp_path, config=config)
@@ -91,9 +91,6 @@ def test_invalid_captures_are_refused(tmp_path, config, capsys):
         run(capture=tmp_path, out=tmp_path / "scene", config=config)
     with pytest.raises(FileNotFoundError, match=r"No such file or folder: .*nowhere"):
         run(capture=tmp_path / "nowhere", out=tmp_path / "scene", config=config)
-    words = ["reconstruct", str(tmp_path), "--out", str(tmp_path / "scene"), "--iterations", "5"]
-    assert main([*words, "--set", "iterations=6"]) == 1
-    assert "iterations are given by --iterations and by --set" in capsys.readouterr().err
 
 
 def test_a_mesh_is_rendered_and_reconstructed(opengl, tmp_path, capsys, set_fields):
