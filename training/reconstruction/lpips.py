@@ -144,7 +144,7 @@ def _load(source: tuple[Path, ...], device: torch.device) -> tuple[nn.Sequential
             raise ValueError("linear layers have other sizes")
     except Exception as error:  # unpickling may raise anything
         raise ValueError(
-            f"{' and '.join(map(str, source))}: no LPIPS weights ({str(error)[:200]}); "
+            f"{' and '.join(map(str, source))}: no LPIPS-squeeze weights ({str(error)[:200]}); "
             "get them again"
         ) from error
     layers.requires_grad_(False).eval().to(device)

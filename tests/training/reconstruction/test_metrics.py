@@ -173,7 +173,7 @@ def test_an_unseen_view_has_no_metrics():
         raise AssertionError("measured")
 
     view = make_view(noise(0), noise(1))
-    blind = metrics.measure_view(*view, seen=~EVERYWHERE, lpips={"lpips": never})
+    blind = metrics.measure_view(*view, seen=~EVERYWHERE, lpips=never)
     seeing = metrics.measure_view(*view)
     assert {blind.psnr_db, blind.psnr_on_black_db, blind.ssim, blind.lpips} == {None}
     assert {blind.depth_mae_m, blind.floater_fraction, blind.hole_fraction} == {None}
