@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from splatpilot.analysis import figures
 from splatpilot.analysis.reconstruction.measure_scene import (
@@ -137,9 +136,10 @@ class AblationResult:
         return f"{form.format(np.mean(values))} ± {form.format(np.std(values, ddof=1))}"
 
     def __str__(self) -> str:
-        header, *rows = self.table()
-        table = pd.DataFrame(rows, columns=header).to_string(index=False)
-        return "\n".join([table, "", *self.verdicts()])
+        rows = self.table()
+        widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
+        lines = ["  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)) for row in rows]
+        return "\n".join([*lines, "", *self.verdicts()])
 
 
 def _ratio(before: SceneMetrics, after: SceneMetrics, name: str) -> str:
