@@ -175,7 +175,7 @@ def _render(world: Path, out: Path, partial: Path, config: RenderConfig, seed: i
     view = _camera(mesh, config)
     _write_frames(partial, "rendering frames", X_WCs, view)
     for offset in config.offsets:
-        moved = [X_WC @ RigidTransform([-offset, 0.0, 0.0]) for X_WC in X_WCs]
+        moved = [X_WC @ RigidTransform(np.array([-offset, 0.0, 0.0])) for X_WC in X_WCs]
         free = [X_WC for X_WC in moved if _is_free(esdf, X_WC.translation(), config.clearance)]
         _write_frames(partial / f"offset_{offset:+.2f}", f"offset {offset:+.2f} m", free, view)
     if plan is not None:

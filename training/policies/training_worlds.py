@@ -51,7 +51,7 @@ class WorldCache:
 
     def world(self, config: WorldConfig, seed: int) -> "TrainingWorld":
         """Makes the world of a configuration and seed, without its appearance."""
-        make = self._memory.cache(_make_world, ignore=["config"])
+        make: Any = self._memory.cache(_make_world, ignore=["config"])
         return make(config, dump_config(config), seed, self._program)
 
     def arrival(self, world: "TrainingWorld", voxel_size: float) -> tuple[Esdf, TimeOfArrival]:
@@ -63,7 +63,7 @@ class WorldCache:
         else:
             parts = [(type(shape).__name__, *shape.parameters()) for shape in surfaces]
         decisive = [world.lower_W, world.upper_W, p_WG, parts, self._program]
-        find = self._memory.cache(_find_arrival, ignore=["world"])
+        find: Any = self._memory.cache(_find_arrival, ignore=["world"])
         distances, states, lower_W, times, reachable = find(world, voxel_size, decisive)
         grid = lower_W, voxel_size
         toa = TimeOfArrival(p_WG, times, reachable, *grid)
