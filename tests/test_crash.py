@@ -27,7 +27,8 @@ COMMANDS = {
     ),
     "reconstruct": (
         "reconstruct room --overwrite --out out/scene --set iterations=12 --set voxel_size=0.2"
-        " --set threads=1 --set checkpoint_every=4 --set initial_gaussians=500",
+        " --set threads=1 --set checkpoint_every=4 --set initial_gaussians=500"
+        " --set lpips_weight=0",
         "scene/*",
     ),
 }

@@ -171,6 +171,11 @@ def run(
     keep_inputs(folder, config, flyable)
     for name, reason in absent.items():
         print(f"{name} is not flown: {reason}")
+    for file in config.unflown_policies(given or ()):
+        print(
+            f"The policy of {file} is not flown, but those of --policies are; add {SCENARIO} to "
+            "them to fly it."
+        )
 
     rows, damaged = _read_flights(folder, specs)
     missing = [spec for spec in specs if spec.id not in rows]

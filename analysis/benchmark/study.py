@@ -1,7 +1,7 @@
 """Studies: the same flights for every policy, with a unique name each."""
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
@@ -180,6 +180,15 @@ class StudyConfig:
         """Checks that a scenario's file has a policy, if it should fly."""
         if self.flies_own_policies and not _has_own_policy(file):
             raise ValueError(f"{file} has no `policy`, which --policies {SCENARIO} would fly")
+
+    def unflown_policies(self, given: Collection[str] = ()) -> list[Path]:
+        """Returns the files of scenarios with a policy of their own that the study does not fly;
+        `given` scenarios have no file."""
+        if self.flies_own_policies:
+            return []
+        names = dict.fromkeys(scenario.scenario for scenario in self.scenario_variants)
+        files = [scenario_file(name) for name in names if name not in given]
+        return [file for file in files if _has_own_policy(file)]
 
 
 def _has_own_policy(file: Path) -> bool:

@@ -52,6 +52,8 @@ class ReconstructConfig(Config):
     outline_weight: float = bounded(1.0, "[0, inf)")
     """Weight of the outlines of objects before the sky, see `outline_loss`. Up to
     half of the steps of a view, the more sky it has the more, fit them instead of colors."""
+    lpips_weight: float = bounded(0.0, "[0, inf)")
+    """Weight of LPIPS in the last tenth of the steps."""
     sh_degree: int = bounded(0, "[0, 3]")
     """Degree of the spherical harmonics; 0 gives one color in all directions."""
 

@@ -39,6 +39,7 @@ _SPLIT_SHRINK = 1.6
 # the fractions of all steps after which they start.
 _DISTORTION_WEIGHT, _DISTORTION_START = 0.01, 0.1
 _NORMAL_WEIGHT, _NORMAL_START = 0.05, 7 / 30
+_LPIPS_FRACTION, _LPIPS_EVERY = 0.1, 4  # of the last steps, one in four computes LPIPS
 _SURFACE_FRACTION = 1 / 4  # of the Gaussians in view, drawn in each step for the surface loss
 _GAIN_FITS = (0.1, 0.2, 0.4)  # fractions of all steps after which unknown gains are fitted
 _MIN_LIMIT_STEPS = 500  # between updates of the scale limits, or a quarter of all steps
@@ -138,9 +139,10 @@ def view_loss(
     step: int,
     background: Tensor,
     outlines: bool,
+    perceptual: Callable[[Tensor, Tensor], Tensor] | None = None,
 ) -> Tensor:
     """Returns the loss of the rendering of view `k` before `background` (1, 3), in an image of this
-    gain; `outlines` are fitted instead of colors."""
+    gain; `outlines` are fitted instead of colors. `perceptual` is LPIPS of two images (H, W, 3)."""
     device = config.device
     frame = views.frame(k)
     depth = torch.from_numpy(frame.depth).to(device)
@@ -155,6 +157,10 @@ def view_loss(
             valid, same = torch.tensor(frame.valid, device=device)[..., None], color.detach()
             color, target = (torch.where(valid, image, same) for image in (color, target))
         loss = photometric_loss(color, target)
+        late = step >= (1 - _LPIPS_FRACTION) * config.iterations
+        if perceptual is not None and late and step % _LPIPS_EVERY == 0:
+            distance = perceptual(color.clamp(0, 1), target.clamp(0, 1))
+            loss = loss + config.lpips_weight * _LPIPS_EVERY * distance
     if config.depth_weight > 0:
         loss = loss + config.depth_weight * log_depth_loss(rendering.depth, depth, edges)
     if config.surface_weight > 0:
@@ -177,7 +183,8 @@ def view_loss(
 
 class Optimization:
     """One run, from its first step or from a checkpoint. `initial` makes the Gaussians of a first
-    step, given the extent of the cameras [m]; `fit_gains` fits the gains of `views`."""
+    step, given the extent of the cameras [m]; `perceptual` is the LPIPS of two images (H, W, 3);
+    `fit_gains` fits the gains of `views`."""
 
     def __init__(
         self,
@@ -187,6 +194,7 @@ class Optimization:
         background: Background,
         initial: Callable[[float], GaussianScene],
         checkpoint: Checkpoint,
+        perceptual: Callable[[Tensor, Tensor], Tensor] | None = None,
         fit_gains: bool = False,
     ):
         self._config, self._views, self._held_out = config, views, held_out
@@ -197,6 +205,7 @@ class Optimization:
         if held_out is not None:
             fitted = [ThinnedFrame.of(views.frame(k)) for k in range(len(views))]
             self._seen = [seen_pixels(held_out.frame(k), fitted) for k in range(len(held_out))]
+        self._perceptual = perceptual
         center, extent = views.extent()
         # The distance of the cameras from each other says little about surfaces of known depth.
         self._length = views.median_depth if config.initialization == "depth" else extent
@@ -272,6 +281,7 @@ class Optimization:
             step=self.step,
             background=background,
             outlines=outlines,
+            perceptual=self._perceptual,
         )
         if self._strategy is not None:
             self._strategy.watch(rendering)

@@ -40,6 +40,7 @@ from splatpilot.training.reconstruction.initialize import (
     make_initial_gaussians,
     resolve_config,
 )
+from splatpilot.training.reconstruction.lpips import Lpips
 from splatpilot.training.reconstruction.metrics import HeldOutMetrics
 from splatpilot.training.reconstruction.optimize import Optimization
 from splatpilot.training.reconstruction.photometry import (
@@ -153,6 +154,7 @@ def reconstruct(
             background,
             lambda extent: make_initial_gaussians(capture, frames, photometry, extent, config),
             checkpoint,
+            Lpips() if config.lpips_weight > 0 else None,
             fit_gains=not capture.has_depth,
         )
         optimization.run()

@@ -59,6 +59,8 @@ def test_own_policies_of_scenarios_are_the_default(short_scenario):
     both = [str(own), str(short_scenario)]
     assert default_policies([str(own)]) == ["scenario"]
     assert "reactive" in default_policies(both)
+    assert StudyConfig(both, ["planner"], seeds=1).unflown_policies() == [own]
+    assert StudyConfig([str(own)], ["scenario"], seeds=1).unflown_policies() == []
 
 
 def test_own_policy_flies_at_its_own_speed(short_scenario):

@@ -136,16 +136,20 @@ def test_variants_of_a_policy_fly_side_by_side(short_scenario, tmp_path, rows_of
     assert replay.run(study=out, id="short-slow-2-000")
 
 
-def test_own_policy_of_a_scenario_flies_and_is_kept(short_scenario, tmp_path, save_weights):
+def test_own_policy_of_a_scenario_flies_and_is_kept(short_scenario, tmp_path, capsys, save_weights):
     mine = save_weights(**thrust_weights(0.0))
     text = short_scenario.read_text() + f"policy: !DiffAeroConfig {{weights: {mine}}}\n"
     short_scenario.write_text(text)
     words = ["benchmark", "--scenarios", str(short_scenario), "--seeds", "1", "--jobs", "1"]
     assert main([*words, "--out", str(tmp_path / "out")]) == 0
+    assert "is not flown" not in capsys.readouterr().out
     assert short_scenario.read_text() == text
     mine.unlink()
     moved = (tmp_path / "out").rename(tmp_path / "moved")
     assert replay.run(study=moved, id="short-scenario-2-000")
+
+    assert main([*words, "--out", str(tmp_path / "other"), "--policies", "straight"]) == 0
+    assert f"The policy of {short_scenario} is not flown" in capsys.readouterr().out
 
 
 def scene_study(file, scene, kind: str = "SceneConfig") -> StudyConfig:
