@@ -1,6 +1,7 @@
 """Camera poses: planned to see the surfaces around a free space, or along a path."""
 
 import heapq
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
