@@ -7,7 +7,7 @@ import numpy as np
 from pydrake.systems.framework import Context
 
 from splatpilot.systems.messaging.flight_limits import Box
-from splatpilot.systems.messaging.generated import lcmt_bridge_status as status
+from splatpilot.systems.messaging.messages import lcmt_bridge_status as status
 from splatpilot.systems.vehicle.flatness import FlatnessControllerConfig
 from splatpilot.systems.vehicle.state import QuadrotorState, predict_state
 
