@@ -25,7 +25,7 @@ from splatpilot.diagrams.flight.policies import (
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.scenarios import benchmark_scenarios, scenario_file
 from splatpilot.systems.common.config import load_config
-from splatpilot.systems.common.seeds import study_seeds
+from splatpilot.systems.common.provenance import study_seeds
 from splatpilot.systems.common.validation import require
 
 
@@ -58,7 +58,7 @@ class StudyConfig:
     seeds: int = 20
     # "dotted.field=YAML value", for all scenarios.
     overrides: list[str] = field(default_factory=list)
-    # Seeds: "dev", for choosing, or "test", see `systems/common/seeds.py`.
+    # Seeds: "dev", for choosing, or "test", see `systems/common/provenance.py`.
     split: str = "dev"
 
     @property

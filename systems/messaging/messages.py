@@ -1,5 +1,6 @@
 """LCM messages: classes of the types in `lcmtypes/`, compatible with those of lcm-gen."""
 
+import math
 import re
 import struct
 from io import BytesIO
@@ -69,8 +70,8 @@ class _Message:
         for kind, name, sizes in cls._fields:
             if sizes:
                 shape, dtype = message._shape(sizes), np.dtype(f">{_FORMATS[kind]}")
-                content = packet.read(dtype.itemsize * int(np.prod(shape)))
-                value = tuple(np.frombuffer(content, dtype).reshape(shape).tolist())
+                size = min(dtype.itemsize * math.prod(shape), packet.getbuffer().nbytes)
+                value = tuple(np.frombuffer(packet.read(size), dtype).reshape(shape).tolist())
             elif kind in _FORMATS:
                 form = struct.Struct(f">{_FORMATS[kind]}")
                 [value] = form.unpack(packet.read(form.size))

@@ -9,14 +9,16 @@ from math import atan2
 import numpy as np
 from pydrake.math import RotationMatrix
 
-from splatpilot.systems.policies.base import LearnedPolicyConfig, Observation, Policy
-from splatpilot.systems.policies.observations import (
+from splatpilot.systems.policies.base import (
+    LearnedPolicyConfig,
+    Observation,
+    Policy,
     heading_frame,
     limit_smoothly,
     pool_depth,
     target_velocity,
 )
-from splatpilot.systems.policies.recurrent_network import (
+from splatpilot.systems.policies.networks import (
     NetworkSpec,
     RecurrentNetwork,
     load_network,

@@ -8,15 +8,17 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from splatpilot.systems.policies.base import LearnedPolicyConfig, Observation, Policy
-from splatpilot.systems.policies.observations import (
+from splatpilot.systems.policies.base import (
+    LearnedPolicyConfig,
+    Observation,
+    Policy,
     heading_frame,
     heading_observation,
     inverse_depth,
     limit_smoothly,
     pool_depth,
 )
-from splatpilot.systems.policies.recurrent_network import (
+from splatpilot.systems.policies.networks import (
     NetworkSpec,
     RecurrentNetwork,
     load_network,

@@ -12,9 +12,8 @@ from scipy.spatial import KDTree
 
 from splatpilot.systems.collision.distance_field import soft_barrier
 from splatpilot.systems.common.validation import Config, bounded, require_field
-from splatpilot.systems.policies.base import Observation, Policy
+from splatpilot.systems.policies.base import Observation, Policy, target_velocity
 from splatpilot.systems.policies.lattice import rotation_to, velocity_fan
-from splatpilot.systems.policies.observations import target_velocity
 from splatpilot.systems.policies.velocity import RESPONSE_TIME, SLOWING_TIME, tracking_acceleration
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS

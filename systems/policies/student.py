@@ -20,9 +20,9 @@ from splatpilot.systems.policies.checkpoint import (
     linear_shapes,
     require_shape,
 )
-from splatpilot.systems.policies.convolutions import Convolution, convolution_shapes, opencv_net
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS, Hypotheses, no_plan
 from splatpilot.systems.policies.lattice import HORIZON, reference_trajectory
+from splatpilot.systems.policies.networks import Convolution, convolution_shapes, opencv_net
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.vehicle.state import array_namespace, lengths
 

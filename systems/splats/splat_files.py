@@ -19,6 +19,7 @@ from splatpilot.systems.common.readers import (
     require_readable_size,
 )
 from splatpilot.systems.common.validation import require
+from splatpilot.systems.splats.gltf_usd import unpack_gltf, unpack_usd, write_gltf, write_usd
 from splatpilot.systems.splats.packed_splats import (
     GZIP,
     MAGIC,
@@ -32,8 +33,6 @@ from splatpilot.systems.splats.packed_splats import (
     unpack_spz,
 )
 from splatpilot.systems.splats.scene import GaussianScene, choose_origin, color_to_sh
-from splatpilot.systems.splats.splat_gltf import unpack_gltf, write_gltf
-from splatpilot.systems.splats.splat_usd import unpack_usd, write_usd
 
 _log = logging.getLogger(__name__)
 
