@@ -45,16 +45,8 @@ def EsdfCollision_(T):
         .. pydrake_system::
 
             name: EsdfCollision
-            input_ports:
-            - state
-            - moving (optional)
-            output_ports:
-            - distance
-            - gradient
-            - clearance
-            - in_collision
-            - barrier
-            - field_state
+            input_ports: [state, moving (optional)]
+            output_ports: [distance, gradient, clearance, in_collision, barrier, field_state]
 
         `state` is that of a `QuadrotorState`. `distance` [m] is that of p_WB to occupied surfaces,
         `gradient` its derivative by p_WB in W, `clearance` [m] the distance less the radius of the

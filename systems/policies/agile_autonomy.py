@@ -164,12 +164,8 @@ class AgileAutonomy(Policy):
     .. pydrake_system::
 
         name: AgileAutonomy
-        input_ports:
-        - state
-        - goal
-        - depth_image_32f
-        output_ports:
-        - hypotheses
+        input_ports: [state, goal, depth_image_32f]
+        output_ports: [hypotheses]
 
     - ``hypotheses`` (8 + 31 * 3): as `Hypotheses.to_vector`, in the body frame B at the time of
       planning; NaN before the first update.

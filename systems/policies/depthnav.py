@@ -87,13 +87,8 @@ class DepthNav(Policy):
     .. pydrake_system::
 
         name: DepthNav
-        input_ports:
-        - state
-        - goal
-        - depth_image_32f
-        output_ports:
-        - acceleration
-        - heading
+        input_ports: [state, goal, depth_image_32f]
+        output_ports: [acceleration, heading]
 
     - ``acceleration`` (3): a_WB [m/s^2], W frame, gravity excluded.
     - ``heading`` (1): of body x, from world x seen from above [rad]; NaN before the first update.

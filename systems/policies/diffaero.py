@@ -98,12 +98,8 @@ class DiffAero(Policy):
     .. pydrake_system::
 
         name: DiffAero
-        input_ports:
-        - state
-        - goal
-        - depth_image_32f
-        output_ports:
-        - acceleration
+        input_ports: [state, goal, depth_image_32f]
+        output_ports: [acceleration]
 
     - ``acceleration`` (3): a_WB [m/s^2], W frame, gravity excluded.
     """
@@ -125,12 +121,8 @@ class DiffAeroTof(Policy):
     .. pydrake_system::
 
         name: DiffAeroTof
-        input_ports:
-        - state
-        - goal
-        - depth_grid
-        output_ports:
-        - velocity
+        input_ports: [state, goal, depth_grid]
+        output_ports: [velocity]
 
     - ``velocity`` (3): desired v_WB [m/s], W frame.
     """

@@ -209,12 +209,8 @@ class DiffAeroRgb(Policy):
     .. pydrake_system::
 
         name: DiffAeroRgb
-        input_ports:
-        - state
-        - goal
-        - color_image
-        output_ports:
-        - acceleration
+        input_ports: [state, goal, color_image]
+        output_ports: [acceleration]
 
     - ``acceleration`` (3): a_WB [m/s^2], W frame, gravity excluded.
     """

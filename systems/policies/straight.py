@@ -26,11 +26,8 @@ class Straight(Policy):
     .. pydrake_system::
 
         name: Straight
-        input_ports:
-        - state
-        - goal
-        output_ports:
-        - acceleration
+        input_ports: [state, goal]
+        output_ports: [acceleration]
 
     - ``acceleration`` (3): a_WB [m/s^2], W frame, gravity excluded.
 

@@ -269,12 +269,8 @@ class Student(Policy):
     .. pydrake_system::
 
         name: Student
-        input_ports:
-        - state
-        - goal
-        - color_image or depth_image_32f
-        output_ports:
-        - hypotheses
+        input_ports: [state, goal, color_image or depth_image_32f]
+        output_ports: [hypotheses]
 
     - ``hypotheses`` (8 + 31 * 3): as `Hypotheses.to_vector`, in the body frame B at the time of
       planning; NaN before the first update.
