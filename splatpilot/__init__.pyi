@@ -19,7 +19,6 @@ from .diagrams.flight.simulation import (
     fly,
     fly_all,
     make_flight_simulator,
-    random_flights,
 )
 from .diagrams.gym.flight_env import FlightEnv
 from .diagrams.gym.spaces import FlightEnvConfig, Reward, Transition
@@ -166,7 +165,6 @@ __all__ = [
     "open_meshcat",
     "policy_named",
     "quadrotor_gaussians",
-    "random_flights",
     "rasterize",
     "read_capture",
     "read_ply",

@@ -32,7 +32,7 @@ from splatpilot.systems.splats.packed_splats import (
     unpack_sog,
     unpack_spz,
 )
-from splatpilot.systems.splats.scene import GaussianScene, choose_origin, color_to_sh
+from splatpilot.systems.splats.scene import ARRAYS, GaussianScene, choose_origin, color_to_sh
 
 _log = logging.getLogger(__name__)
 
@@ -270,8 +270,7 @@ def _write_spz(scene: GaussianScene, path: Path) -> None:
     turned = scene.transformed_by(_X_PS.inverse())
     cells = np.round(turned.means - turned.means.min(axis=0), 0).astype(np.int64)
     order = np.lexsort(cells.T)
-    names = "means", "quats", "scales", "opacities", "sh"
-    arrays = {name: getattr(turned, name)[order].astype(float) for name in names}
+    arrays = {name: getattr(turned, name)[order].astype(float) for name in ARRAYS}
     with written_atomically(path) as partial:
         partial.write_bytes(pack_spz(arrays, scene.antialiased))
 
