@@ -19,6 +19,7 @@ from .diagrams.flight.simulation import (
     fly,
     fly_all,
     make_flight_simulator,
+    random_flights,
 )
 from .diagrams.gym.flight_env import FlightEnv
 from .diagrams.gym.spaces import FlightEnvConfig, Reward, Transition
@@ -165,6 +166,7 @@ __all__ = [
     "open_meshcat",
     "policy_named",
     "quadrotor_gaussians",
+    "random_flights",
     "rasterize",
     "read_capture",
     "read_ply",

@@ -478,6 +478,12 @@ def QuadrotorPlant_(T):
         SetRateTimeConstant = parameter_setter("rate_time_constant")
         SetGravity = parameter_setter("gravity")
 
+        def SetParameter(self, context, name, value):
+            """Sets a number of the configuration, or a list of numbers, in a Context."""
+            known = self._parameters[0].names
+            require(name in known, "name", f"one of {', '.join(known)}", name)
+            parameter_setter(name)(self, context, value)
+
         def get_input_port(self, port_index=0):
             """Returns an input port by its index; `command` by default."""
             return super().get_input_port(port_index)

@@ -23,6 +23,7 @@ from splatpilot.diagrams.flight.simulation import (
     FlightError,
     fly,
     make_flight_simulator,
+    random_flights,
 )
 from splatpilot.diagrams.worlds.world_registry import WORLDS, make_world
 from splatpilot.systems.common.config import dump_config, load_config, parse_config
@@ -278,9 +279,8 @@ def test_a_decision_can_be_an_input_of_the_diagram(post_world, decision):
 
 def test_drakes_environment_acts_through_the_decision(post_world):
     scenario = Scenario(timeout=1.0)
-    diagram = BuildFlightDiagram(scenario, post_world, camera=False, policy="velocity")
     env = DrakeGymEnv(
-        lambda generator: make_flight_simulator(diagram),
+        random_flights(scenario, post_world, policy="velocity"),
         time_step=0.1,
         action_space=Box(-1.0, 1.0, (3,)),
         observation_space=Box(-np.inf, np.inf, (13,)),

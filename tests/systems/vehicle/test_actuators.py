@@ -11,7 +11,6 @@ from pydrake.autodiffutils import ExtractGradient, ExtractValue, InitializeAutoD
 from pydrake.symbolic import Evaluate, MakeVectorVariable
 from scipy.spatial.transform import Rotation
 
-from splatpilot.systems.common.drake import parameter_setter
 from splatpilot.systems.vehicle.quadrotor import (
     QuadrotorParams,
     QuadrotorPlant,
@@ -211,13 +210,15 @@ def test_numbers_and_lists_are_parameters_of_the_context():
     state[3] = 2.0
     context.SetContinuousState([*state, *context.get_continuous_state_vector().CopyToVector()[13:]])
     before = plant.EvalTimeDerivatives(context).CopyToVector()
-    parameter_setter("mass")(plant, context, 1.5)
-    parameter_setter("rotor_drag")(plant, context, [0.5, 0.0, 0.0])
+    plant.SetParameter(context, "mass", 1.5)
+    plant.SetParameter(context, "rotor_drag", [0.5, 0.0, 0.0])
     after = plant.EvalTimeDerivatives(context).CopyToVector()
     assert after[5] == pytest.approx(before[5] - 9.81 / 2)
     assert after[3] == pytest.approx(before[3] - 1.0)
     with pytest.raises(ValueError, match=r"Kingfisher.mass must be in \(0, inf\) kg, got -1"):
-        parameter_setter("mass")(plant, context, -1.0)
+        plant.SetParameter(context, "mass", -1.0)
+    with pytest.raises(ValueError, match=r"name must be one of drag, .*, got model"):
+        plant.SetParameter(context, "model", 1.0)
 
 
 @pytest.mark.parametrize(
