@@ -70,24 +70,18 @@ class _Message:
         for kind, name, sizes in cls._fields:
             if sizes:
                 shape, dtype = message._shape(sizes), np.dtype(f">{_FORMATS[kind]}")
-                content = _read(packet, dtype.itemsize * math.prod(shape))
-                value = tuple(np.frombuffer(content, dtype).reshape(shape).tolist())
+                size = min(dtype.itemsize * math.prod(shape), packet.getbuffer().nbytes)
+                value = tuple(np.frombuffer(packet.read(size), dtype).reshape(shape).tolist())
             elif kind in _FORMATS:
                 form = struct.Struct(f">{_FORMATS[kind]}")
-                [value] = form.unpack(_read(packet, form.size))
+                [value] = form.unpack(packet.read(form.size))
             elif kind == "string":
-                [size] = struct.unpack(">I", _read(packet, 4))
-                value = _read(packet, size)[:-1].decode("utf-8", "replace")
+                [size] = struct.unpack(">I", packet.read(4))
+                value = packet.read(size)[:-1].decode("utf-8", "replace")
             else:
                 value = lcmt_header._decode_one(packet)
             setattr(message, name, value)
         return message
-
-
-def _read(packet: BytesIO, size: int) -> bytes:
-    content = packet.read(min(size, packet.getbuffer().nbytes))
-    require(len(content) == size, "the packet", "complete", f"{len(content)} of {size} bytes")
-    return content
 
 
 def _hash(fields: list[_Field]) -> int:

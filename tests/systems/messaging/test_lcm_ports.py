@@ -231,13 +231,10 @@ def test_a_burst_loses_nothing(listener):
 @pytest.mark.parametrize(
     ("data", "reason"),
     [
-        (b"", "the packet must be a lcmt_body_rate_command"),
-        (b"not a message of any type", "the packet must be a lcmt_body_rate_command"),
-        (
-            DepthGridCodec(1, 1, 5.0, "tof").message().encode(),
-            "the packet must be a lcmt_body_rate_command",
-        ),
-        (message(1, 0.01)[:-1], "the packet must be complete"),
+        (b"", "Decode error"),
+        (b"not a message of any type", "Decode error"),
+        (DepthGridCodec(1, 1, 5.0, "tof").message().encode(), "Decode error"),
+        (message(1, 0.01)[:-1], "unpack requires"),
         (message(1, 0.01) + b"\0", "surplus bytes of the message must be 0, got 1"),
         (message(1, 0.01, thrust=np.nan), "must be finite"),
         (message(1, 0.01, frame="ned"), "the frame must be 'body', got 'ned'"),
