@@ -7,7 +7,7 @@ BUILT_FROM := pyproject.toml CMakeLists.txt $(shell find native -type f)
 SPLATPILOT := .venv/bin/splatpilot
 NATIVE := $(shell find native -name '*.hpp' -o -name '*.cpp')
 
-.PHONY: fly test pytest lint docs stub sanitize nightly clean
+.PHONY: fly test pytest lint docs stub messages sanitize nightly clean
 
 fly: .venv/flying
 	$(SPLATPILOT) fly --out out/fly --overwrite
@@ -35,6 +35,12 @@ docs: .venv/installed
 # Writes the types of the native module, after a change of its bindings.
 stub: .venv/installed
 	.venv/bin/python -m nanobind.stubgen --quiet --module splatpilot._native --output-file splatpilot/_native.pyi
+
+# Writes the Python of the messages, after a change in lcmtypes/.
+messages: .venv/installed
+	rm -rf build/messages systems/messaging/generated
+	.venv/bin/lcm-gen --python --ppath build/messages lcmtypes/*.lcm
+	mv build/messages/splatpilot systems/messaging/generated
 
 # The tests of the native kernels on a build with AddressSanitizer and UndefinedBehaviorSanitizer.
 sanitize: .venv/installed

@@ -25,16 +25,16 @@ from drake import lcmt_image_array
 from harness import header, row
 
 from splatpilot.analysis.headlines import machine
-from splatpilot.systems.messaging import messages
+from splatpilot.systems.messaging import generated
 
 TYPES = {
-    "QUADROTOR_STATE": messages.lcmt_quadrotor_state,
+    "QUADROTOR_STATE": generated.lcmt_quadrotor_state,
     "DEPTH_IMAGE": lcmt_image_array,
-    "DEPTH_GRID": messages.lcmt_depth_grid,
-    "TRAJECTORY_HYPOTHESES": messages.lcmt_trajectory_hypotheses,
-    "BODY_RATE_COMMAND": messages.lcmt_body_rate_command,
-    "VELOCITY_SETPOINT": messages.lcmt_velocity_setpoint,
-    "BRIDGE_STATUS": messages.lcmt_bridge_status,
+    "DEPTH_GRID": generated.lcmt_depth_grid,
+    "TRAJECTORY_HYPOTHESES": generated.lcmt_trajectory_hypotheses,
+    "BODY_RATE_COMMAND": generated.lcmt_body_rate_command,
+    "VELOCITY_SETPOINT": generated.lcmt_velocity_setpoint,
+    "BRIDGE_STATUS": generated.lcmt_bridge_status,
 }
 REGULAR = ("QUADROTOR_STATE", "BODY_RATE_COMMAND", "VELOCITY_SETPOINT")
 PERIOD = 20.0  # [ms], of regular messages

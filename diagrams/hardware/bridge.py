@@ -26,6 +26,7 @@ from splatpilot.systems.common.validation import Config, bounded, require
 from splatpilot.systems.messaging import codecs
 from splatpilot.systems.messaging.arrival_triggered import ArrivalTriggered, can_be_triggered
 from splatpilot.systems.messaging.failsafe import Failsafe, FailsafeConfig
+from splatpilot.systems.messaging.generated import lcmt_bridge_status
 from splatpilot.systems.messaging.lcm_ports import (
     DEFAULT_URL,
     BridgeStatus,
@@ -33,7 +34,6 @@ from splatpilot.systems.messaging.lcm_ports import (
     open_lcm,
     recorded,
 )
-from splatpilot.systems.messaging.messages import lcmt_bridge_status
 from splatpilot.systems.messaging.receiver import TimeOfFlightReceiver, TimeOfFlightStream
 from splatpilot.systems.policies.hypotheses import num_hypotheses_in
 from splatpilot.systems.policies.velocity import VelocitySetpoint

@@ -24,7 +24,7 @@ from splatpilot.systems.common.validation import require
 
 _LIBRARIES = "drake", "numpy", "scipy", "torch", "onnx"
 _FOLDERS = "splatpilot", "native", "systems", "diagrams", "training", "analysis"
-_SUFFIXES = ".py", ".yaml", ".lcm", ".cpp", ".hpp", ".npz"  # with the weights that ship
+_SUFFIXES = ".py", ".yaml", ".cpp", ".hpp", ".npz"  # with the weights that ship
 
 
 def program() -> dict[str, str]:

@@ -10,7 +10,7 @@ from drake import lcmt_header, lcmt_image, lcmt_image_array
 from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
 from splatpilot.systems.common.validation import require
-from splatpilot.systems.messaging import messages
+from splatpilot.systems.messaging import generated
 from splatpilot.systems.policies.hypotheses import (
     NUM_WAYPOINTS,
     WAYPOINT_PERIOD,
@@ -78,7 +78,7 @@ class Codec:
 class StateCodec(Codec):
     """State (13): p_WB [m], v_WB [m/s], q_WB (wxyz), w_WB_B [rad/s]."""
 
-    channel, port, message, size = "QUADROTOR_STATE", "state", messages.lcmt_quadrotor_state, 13
+    channel, port, message, size = "QUADROTOR_STATE", "state", generated.lcmt_quadrotor_state, 13
     fields = "p_WB", "v_WB", "q_WB", "w_WB_B"
 
 
@@ -86,14 +86,14 @@ class CommandCodec(Codec):
     """Command (4): thrust over mass [m/s^2] and body rates w_cmd_B [rad/s]."""
 
     channel, port, size, frame = "BODY_RATE_COMMAND", "command", 4, "body"
-    message, fields = messages.lcmt_body_rate_command, ("thrust", "w_cmd_B")
+    message, fields = generated.lcmt_body_rate_command, ("thrust", "w_cmd_B")
 
 
 class VelocitySetpointCodec(Codec):
     """Velocity setpoint (4): v_WB [m/s] and heading [rad], NaN if it is free."""
 
     channel, port, size = "VELOCITY_SETPOINT", "velocity_setpoint", 4
-    message, fields, unbounded = messages.lcmt_velocity_setpoint, ("v_WB", "heading"), ("heading",)
+    message, fields, unbounded = generated.lcmt_velocity_setpoint, ("v_WB", "heading"), ("heading",)
 
     def unpack(self, message, epoch):
         valid = not np.isinf(message.heading)
@@ -105,7 +105,7 @@ class MotionCaptureCodec(Codec):
     """Pose (7) of a body in motion capture: p_WB [m] and q_WB (wxyz)."""
 
     channel, port, size = "MOTION_CAPTURE_POSE", "motion_capture_pose", 7
-    message, fields = messages.lcmt_motion_capture_pose, ("p_WB", "q_WB")
+    message, fields = generated.lcmt_motion_capture_pose, ("p_WB", "q_WB")
 
     def __init__(self, body: str):
         self.body = body
@@ -124,7 +124,7 @@ class MotionCaptureCodec(Codec):
 class StatusCodec(Codec):
     """Status (7): mode, reason, ages of state and observation [s], gaps, rejected, overruns."""
 
-    channel, port, message, size = "BRIDGE_STATUS", "status", messages.lcmt_bridge_status, 7
+    channel, port, message, size = "BRIDGE_STATUS", "status", generated.lcmt_bridge_status, 7
     fields = (
         *("mode", "reason", "state_age", "observation_age"),
         *("num_gaps", "num_rejected", "num_overruns"),
@@ -137,7 +137,7 @@ class VehicleStatusCodec(Codec):
     if unknown."""
 
     channel, port, size, frame = "VEHICLE_STATUS", "vehicle_status", 2, ""
-    message, fields = messages.lcmt_vehicle_status, ("armed", "offboard")
+    message, fields = generated.lcmt_vehicle_status, ("armed", "offboard")
 
     def pack(self, value, header, epoch):
         return None if np.isnan(value).any() else super().pack(value, header, epoch)
@@ -147,7 +147,7 @@ class HypothesesCodec(Codec):
     """Plan of K trajectories, see `splatpilot.systems.policies.hypotheses`."""
 
     channel, port = "TRAJECTORY_HYPOTHESES", "hypotheses"
-    message = messages.lcmt_trajectory_hypotheses
+    message = generated.lcmt_trajectory_hypotheses
 
     def __init__(self, num_hypotheses: int):
         self.num_hypotheses, self.size = num_hypotheses, hypotheses_size(num_hypotheses)
@@ -178,7 +178,7 @@ class DepthGridCodec(Codec):
     """Proximity 1 - range / max_range (height * width) of a sensor, `frame`, row by row from the
     lowest."""
 
-    channel, port, message = "DEPTH_GRID", "depth_grid", messages.lcmt_depth_grid
+    channel, port, message = "DEPTH_GRID", "depth_grid", generated.lcmt_depth_grid
 
     def __init__(self, width: int, height: int, max_range: float, frame: str):
         self.size, self.frame = width * height, frame

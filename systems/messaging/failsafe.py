@@ -27,7 +27,7 @@ from splatpilot.systems.messaging.flight_limits import (
     limit_speed,
     limit_velocity,
 )
-from splatpilot.systems.messaging.messages import lcmt_bridge_status as status
+from splatpilot.systems.messaging.generated import lcmt_bridge_status as status
 from splatpilot.systems.policies.velocity import tracking_acceleration
 from splatpilot.systems.vehicle.flatness import FlatnessControllerConfig, flatness_command
 from splatpilot.systems.vehicle.quadrotor import QuadrotorParams

@@ -8,7 +8,7 @@ import numpy as np
 
 from splatpilot.systems.collision.distance_field import Distances
 from splatpilot.systems.common.validation import Config, bounded, require_field
-from splatpilot.systems.messaging.messages import lcmt_bridge_status as status
+from splatpilot.systems.messaging.generated import lcmt_bridge_status as status
 from splatpilot.systems.policies.velocity import RESPONSE_TIME
 from splatpilot.systems.vehicle.flatness import FlatnessControllerConfig
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS

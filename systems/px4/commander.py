@@ -9,8 +9,8 @@ from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from splatpilot.systems.common.drake import optional_input, vector_input
 from splatpilot.systems.common.validation import Config, bounded, require_field
+from splatpilot.systems.messaging.generated import lcmt_bridge_status as status
 from splatpilot.systems.messaging.lcm_ports import PUBLISH_OFFSET, SAME_TIME
-from splatpilot.systems.messaging.messages import lcmt_bridge_status as status
 from splatpilot.systems.messaging.receiver import Inbox
 from splatpilot.systems.px4.mavlink import HOLD, LAND, OFFBOARD, Mavlink
 from splatpilot.systems.px4.telemetry import HEARTBEAT_TIMEOUT

@@ -29,9 +29,9 @@ from splatpilot.systems.common.drake import vector_output
 from splatpilot.systems.messaging.codecs import StateCodec, VehicleStatusCodec
 from splatpilot.systems.messaging.failsafe import FailsafeConfig
 from splatpilot.systems.messaging.flight_limits import FlightLimits
+from splatpilot.systems.messaging.generated import lcmt_bridge_status as status
+from splatpilot.systems.messaging.generated import lcmt_quadrotor_state, lcmt_trajectory_hypotheses
 from splatpilot.systems.messaging.lcm_ports import MessagePublisher
-from splatpilot.systems.messaging.messages import lcmt_bridge_status as status
-from splatpilot.systems.messaging.messages import lcmt_quadrotor_state, lcmt_trajectory_hypotheses
 from splatpilot.systems.messaging.receiver import (
     TimeOfFlightReceiver,
     TimeOfFlightStream,

@@ -24,8 +24,8 @@ from splatpilot.systems.common.drake import vector_output
 from splatpilot.systems.messaging.codecs import MotionCaptureCodec
 from splatpilot.systems.messaging.failsafe import FailsafeConfig
 from splatpilot.systems.messaging.flight_limits import FlightLimits
+from splatpilot.systems.messaging.generated import lcmt_bridge_status as status
 from splatpilot.systems.messaging.lcm_ports import MessagePublisher
-from splatpilot.systems.messaging.messages import lcmt_bridge_status as status
 from splatpilot.systems.messaging.receiver import UdpConfig, UdpInbox
 from splatpilot.systems.px4.commander import Px4CommanderConfig
 from splatpilot.systems.px4.motion_capture import MotionCaptureConfig

@@ -12,7 +12,7 @@ from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.hardware.bridge import BuildHardwareDiagram
 from splatpilot.diagrams.hardware.px4 import BuildPx4Diagram, Px4Config, replay_report
 from splatpilot.systems.common.drake import vector_output
-from splatpilot.systems.messaging.messages import lcmt_bridge_status as status
+from splatpilot.systems.messaging.generated import lcmt_bridge_status as status
 from splatpilot.systems.px4.ulog import LogInbox
 
 VELOCITY = (0.5, 0.0, 0.0)

@@ -19,7 +19,7 @@ from splatpilot.systems.messaging.flight_limits import (
     Surroundings,
     stopping_displacement,
 )
-from splatpilot.systems.messaging.messages import lcmt_bridge_status as status
+from splatpilot.systems.messaging.generated import lcmt_bridge_status as status
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS, hover_state
 
 CONFIG = FailsafeConfig(patience=2.0)

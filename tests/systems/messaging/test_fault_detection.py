@@ -6,7 +6,7 @@ from failsafe_bench import LOWER, UPPER, Bench
 
 from splatpilot.systems.messaging.failsafe import FailsafeConfig
 from splatpilot.systems.messaging.flight_limits import FlightLimits
-from splatpilot.systems.messaging.messages import lcmt_bridge_status as status
+from splatpilot.systems.messaging.generated import lcmt_bridge_status as status
 from splatpilot.systems.vehicle.quadrotor import hover_state
 
 CONFIG = FailsafeConfig(patience=2.0)

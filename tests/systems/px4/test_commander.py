@@ -7,7 +7,7 @@ import pytest
 from pydrake.systems.analysis import Simulator
 from pymavlink.dialects.v20 import common as dialect
 
-from splatpilot.systems.messaging.messages import lcmt_bridge_status as status
+from splatpilot.systems.messaging.generated import lcmt_bridge_status as status
 from splatpilot.systems.messaging.receiver import UdpConfig, UdpInbox
 from splatpilot.systems.px4.commander import Px4Commander, Px4CommanderConfig
 from splatpilot.systems.px4.mavlink import HOLD, LAND, OFFBOARD, Mavlink
