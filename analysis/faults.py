@@ -32,11 +32,10 @@ from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.common.provenance import revision
 from splatpilot.systems.common.validation import Config, bounded, require
 from splatpilot.systems.messaging import codecs
-from splatpilot.systems.messaging.bridge_status import UnixClock
 from splatpilot.systems.messaging.failsafe import FailsafeConfig
 from splatpilot.systems.messaging.flight_limits import FlightLimits
 from splatpilot.systems.messaging.generated import lcmt_bridge_status as status
-from splatpilot.systems.messaging.lcm_ports import PUBLISH_OFFSET
+from splatpilot.systems.messaging.lcm_ports import PUBLISH_OFFSET, UnixClock
 from splatpilot.systems.messaging.receiver import TimeOfFlightStream, UdpConfig
 from splatpilot.systems.sensing.time_of_flight import GRID_MAGIC
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS

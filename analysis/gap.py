@@ -30,7 +30,7 @@ from splatpilot.systems.collision.depth_fusion import (
 from splatpilot.systems.collision.distance_field import DistanceField
 from splatpilot.systems.common.files import claim_folder, locks_folder, write_csv
 from splatpilot.systems.common.progress import Progress
-from splatpilot.systems.common.seeds import MONTE_CARLO_SEEDS
+from splatpilot.systems.common.provenance import MONTE_CARLO_SEEDS
 from splatpilot.systems.common.validation import Config, bounded, require, require_field
 from splatpilot.systems.policies.base import Policy, observation
 from splatpilot.systems.policies.hypotheses import (

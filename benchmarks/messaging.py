@@ -22,7 +22,6 @@ from pathlib import Path
 import lcm
 import numpy as np
 from drake import lcmt_image_array
-from harness import header, row
 
 from splatpilot.analysis.headlines import machine
 from splatpilot.systems.messaging import generated
@@ -68,6 +67,11 @@ class Listener:
         now = time.time()
         stamp = TYPES[channel].decode(data).header
         self.heard[channel].append((stamp.seq, 1e-6 * stamp.utime, now))
+
+
+def row(*cells: object) -> None:
+    """Prints a row of a Markdown table."""
+    print("| " + " | ".join(map(str, cells)) + " |", flush=True)
 
 
 def fly(options: list[str], folder: Path) -> str:
@@ -125,7 +129,8 @@ def main() -> None:
             for name in {"DEPTH_IMAGE", "DEPTH_GRID"} & set(heard):
                 loops.append(loop_times(heard[name], heard["VELOCITY_SETPOINT"]))
     print(f"{outcomes.count('goal')} of {seeds} flights reached the goal")
-    header("[ms]", "messages", "lost", "median", "99 of 100", "maximum")
+    row("[ms]", "messages", "lost", "median", "99 of 100", "maximum")
+    row(*["---"] * 6)
     row("image to velocity setpoint", sum(map(len, loops)), "", *quantiles(loops))
     for name, parts in sorted(latency.items()):
         row(f"{name}, latency", sum(map(len, parts)), lost[name], *quantiles(parts))

@@ -43,7 +43,7 @@ from splatpilot.analysis.benchmark.tables import (
 from splatpilot.analysis.fidelity.study import band
 from splatpilot.analysis.twin import predictions
 from splatpilot.diagrams.scenarios import benchmark_scenarios
-from splatpilot.systems.common.seeds import describe_seeds
+from splatpilot.systems.common.provenance import describe_seeds
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "docs" / "results"

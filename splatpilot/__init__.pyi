@@ -10,7 +10,6 @@ from .diagrams.flight.flight_diagram import (
 )
 from .diagrams.flight.fly import flight_page
 from .diagrams.flight.monitor import AddFlightMonitor, FlightMonitor, Outcome
-from .diagrams.flight.monte_carlo import random_flights
 from .diagrams.flight.policies import policy_named, register_policy
 from .diagrams.flight.scenario import Scenario, sample_initial_state, sample_scenario
 from .diagrams.flight.sensors import register_sensor
@@ -20,10 +19,10 @@ from .diagrams.flight.simulation import (
     fly,
     fly_all,
     make_flight_simulator,
+    random_flights,
 )
 from .diagrams.gym.flight_env import FlightEnv
-from .diagrams.gym.rewards import Reward, Transition
-from .diagrams.gym.spaces import FlightEnvConfig
+from .diagrams.gym.spaces import FlightEnvConfig, Reward, Transition
 from .diagrams.gym.vector_env import VectorFlightEnv
 from .diagrams.worlds.moving_spheres import MovingSphere
 from .diagrams.worlds.scene_folder import SceneConfig
@@ -31,9 +30,13 @@ from .diagrams.worlds.world import World
 from .diagrams.worlds.world_registry import make_world, register_world
 from .systems.collision.distance_field import FieldState
 from .systems.collision.esdf import Esdf
-from .systems.collision.esdf_collision import EsdfCollision, EsdfCollision_
+from .systems.collision.esdf_collision import (
+    AddBarrierCost,
+    AddClearanceConstraint,
+    EsdfCollision,
+    EsdfCollision_,
+)
 from .systems.collision.field_mesh import field_mesh, write_mesh
-from .systems.collision.optimization import AddBarrierCost, AddClearanceConstraint
 from .systems.common.config import dump_config, load_config
 from .systems.common.provenance import InfeasibleFlightError
 from .systems.common.validation import Config, bounded

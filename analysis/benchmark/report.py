@@ -29,7 +29,7 @@ from splatpilot.diagrams.flight.scenario import goal_position, sample_scenario
 from splatpilot.diagrams.worlds.scene_folder import SceneSource
 from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.common.files import written_atomically
-from splatpilot.systems.common.seeds import SPLIT_NAMES, describe_seeds
+from splatpilot.systems.common.provenance import SPLIT_NAMES, describe_seeds
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 from splatpilot.systems.vehicle.state import QuadrotorState
 

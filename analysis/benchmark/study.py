@@ -33,7 +33,7 @@ from splatpilot.diagrams.scenarios import benchmark_scenarios, scenario_file
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.common.config import dump_config, load_config, yaml_line
 from splatpilot.systems.common.distributions import distribution_text, draw, is_distribution
-from splatpilot.systems.common.seeds import study_seeds
+from splatpilot.systems.common.provenance import study_seeds
 from splatpilot.systems.common.validation import errors_about, require
 
 MakeSystem = Callable[[Scenario, World], System]
@@ -69,7 +69,7 @@ class StudyConfig:
     seeds: int = 20
     # "dotted.field=YAML value", for all scenarios.
     overrides: list[str] = field(default_factory=list)
-    # Seeds: "dev", for choosing, or "test", see `systems/common/seeds.py`.
+    # Seeds: "dev", for choosing, or "test", see `systems/common/provenance.py`.
     split: str = "dev"
 
     @property

@@ -14,7 +14,7 @@ from splatpilot.analysis.benchmark.rollout import INFEASIBLE
 from splatpilot.analysis.benchmark.study import StudyConfig
 from splatpilot.diagrams.flight.monitor import Outcome
 from splatpilot.diagrams.scenarios import benchmark_scenarios
-from splatpilot.systems.common.seeds import describe_seeds
+from splatpilot.systems.common.provenance import describe_seeds
 from splatpilot.training.corpus.library import PROCEDURAL
 
 # Wilson's interval and McNemar's test take worlds as independent: they hold for these scenarios

@@ -26,11 +26,11 @@ from splatpilot.systems.common.validation import require, require_type
 from splatpilot.systems.messaging.failsafe import FiniteVector
 from splatpilot.systems.policies.hypotheses import HypothesisSelector, num_hypotheses_in
 from splatpilot.systems.policies.velocity import VelocityTracker
-from splatpilot.systems.sensing.depth_sensors import Stereo
 from splatpilot.systems.sensing.imaging import (
     AutoExposure,
     Compression,
     DepthSensor,
+    Stereo,
     StereoMatcher,
 )
 from splatpilot.systems.sensing.latency import DecisionDelay, DelayedPose, FrameTimes

@@ -10,6 +10,8 @@ from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.common.config import require_configuration
 from splatpilot.systems.common.registry import Registry
 from splatpilot.systems.sensing.estimators import (
+    InertialFilter,
+    InertialFilterEstimator,
     MotionCapture,
     MotionCaptureEstimator,
     TrueState,
@@ -17,7 +19,6 @@ from splatpilot.systems.sensing.estimators import (
     VisualInertialEstimator,
 )
 from splatpilot.systems.sensing.imu import Imu, ImuSensor
-from splatpilot.systems.sensing.inertial_filter import InertialFilter, InertialFilterEstimator
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.sensing.range_finder import RangeFinder, RangeFinderSensor
 from splatpilot.systems.splats.splat_camera import SplatCamera

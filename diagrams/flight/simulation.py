@@ -1,4 +1,4 @@
-"""Simulation of one flight, and its record."""
+"""Simulation of flights, their records, and random flights for Drake's Monte Carlo tools."""
 
 import json
 import math
@@ -7,24 +7,27 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from html import escape
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 from pydrake.common import RandomGenerator
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorStatus
-from pydrake.systems.framework import Context, Diagram, EventStatus
+from pydrake.systems.framework import Context, Diagram, EventStatus, System
 from pydrake.systems.primitives import VectorLogSink
 
 from splatpilot.diagrams.flight.blocks import policy_images
+from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
 from splatpilot.diagrams.flight.monitor import FlightMonitor, Outcome, flight_monitors
 from splatpilot.diagrams.flight.scenario import (
     Scenario,
+    sample_scenario,
 )
 from splatpilot.diagrams.worlds.observed_routes import ObservedViews
 from splatpilot.diagrams.worlds.world import World
+from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.common.config import dump_config
 from splatpilot.systems.common.files import written_atomically
-from splatpilot.systems.common.provenance import InfeasibleFlightError
+from splatpilot.systems.common.provenance import MONTE_CARLO_SEEDS, InfeasibleFlightError
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.vehicle.state import QuadrotorState, pose_from_state, set_state
@@ -379,3 +382,42 @@ def write_summary(out: Path, summary: dict[str, float | str]) -> None:
     """Writes `summary.json` into the folder `out`."""
     with written_atomically(out / "summary.json") as path:
         path.write_text(json.dumps(summary, indent=2) + "\n")
+
+
+def random_flights(
+    scenario: Scenario,
+    world: World | None = None,
+    **systems: str | Callable[[Scenario, World], System],
+) -> Callable[[RandomGenerator], Simulator]:
+    """Makes simulators of flights with random seeds: starts, noise, latency and worlds differ.
+
+        def clearance(diagram, context):
+            return diagram.GetOutputPort("clearance").Eval(context)[0]
+
+        MonteCarloSimulation(random_flights(scenario), clearance, scenario.timeout, 20)
+
+    Seeds are of `MONTE_CARLO_SEEDS`. The Context is the start of the flight, and a simulation ends
+    with it, see `FlightMonitor`.
+
+    Args:
+        scenario: of the flights; each replaces its seed.
+        world: of all flights; by default made of each seed, which is slow.
+        systems: arguments of `BuildFlightDiagram` such as `policy="velocity"`; functions of
+            scenario and world make a system for each flight.
+
+    Returns:
+        The `make_simulator` of these functions, which raises `InfeasibleFlightError` for a world
+        without clearance at its start or goal.
+    """
+
+    def make_simulator(generator: RandomGenerator) -> Simulator:
+        seed = MONTE_CARLO_SEEDS[generator() % len(MONTE_CARLO_SEEDS)]
+        sample = sample_scenario(replace(scenario, seed=seed))
+        flown = world or make_world(sample.world, sample.seed)
+        made: dict[str, Any] = {
+            name: system if isinstance(system, str) else system(sample, flown)
+            for name, system in systems.items()
+        }
+        return make_flight_simulator(BuildFlightDiagram(sample, flown, camera=False, **made))
+
+    return make_simulator

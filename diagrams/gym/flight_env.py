@@ -35,14 +35,9 @@ from splatpilot.diagrams.flight.scenario import (
     goal_position,
     sample_initial_state,
 )
-from splatpilot.diagrams.gym.native_flight import (
-    NativeFlight,
-    can_fly_natively,
-    only_start_is_random,
-)
-from splatpilot.diagrams.gym.rewards import Transition
 from splatpilot.diagrams.gym.spaces import (
     IMAGES,
+    Transition,
     Vehicles,
     action_space,
     decisions,
@@ -53,6 +48,11 @@ from splatpilot.diagrams.gym.spaces import (
     observe,
     observe_image,
     require_actions,
+)
+from splatpilot.diagrams.gym.world_pool import (
+    NativeFlight,
+    can_fly_natively,
+    only_start_is_random,
 )
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import make_world

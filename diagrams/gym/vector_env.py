@@ -18,9 +18,9 @@ from splatpilot import _native
 from splatpilot.diagrams.flight.flight_diagram import camera_info, camera_mount
 from splatpilot.diagrams.flight.monitor import ENDS, Outcome
 from splatpilot.diagrams.flight.scenario import Scenario, goal_position, sample_initial_state
-from splatpilot.diagrams.gym.rewards import Transition
 from splatpilot.diagrams.gym.spaces import (
     IMAGES,
+    Transition,
     Vehicles,
     action_space,
     decisions,

@@ -25,11 +25,11 @@ from splatpilot.systems.common.drake import vector_output
 from splatpilot.systems.common.validation import Config, bounded, require
 from splatpilot.systems.messaging import codecs
 from splatpilot.systems.messaging.arrival_triggered import ArrivalTriggered, can_be_triggered
-from splatpilot.systems.messaging.bridge_status import BridgeStatus
 from splatpilot.systems.messaging.failsafe import Failsafe, FailsafeConfig
 from splatpilot.systems.messaging.generated import lcmt_bridge_status
 from splatpilot.systems.messaging.lcm_ports import (
     DEFAULT_URL,
+    BridgeStatus,
     MessageSubscriber,
     open_lcm,
     recorded,

@@ -12,13 +12,13 @@ from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort, Syste
 
 from splatpilot.diagrams.flight.blocks import ConnectInputs
 from splatpilot.systems.common.validation import require
-from splatpilot.systems.messaging.bridge_status import UnixClock
 from splatpilot.systems.messaging.codecs import Codec
 from splatpilot.systems.messaging.lcm_ports import (
     PUBLISH_OFFSET,
     MeasurementPublisher,
     MessagePublisher,
     MessageSubscriber,
+    UnixClock,
 )
 
 MAX_LAG = 0.05  # [s] Max lag of a diagram behind the wall clock.

@@ -10,8 +10,7 @@ from scipy.ndimage import label
 from splatpilot.diagrams.worlds.building_blocks import TIGHT_CLEARING, has_clearance, require_order
 from splatpilot.diagrams.worlds.feasibility import TRIES
 from splatpilot.diagrams.worlds.scene_folder import SceneSource, draw_ends, read_scene_world
-from splatpilot.diagrams.worlds.solids.solid import Solid, WorldSpec, cut_faces
-from splatpilot.diagrams.worlds.solids.surfels import draw
+from splatpilot.diagrams.worlds.solids.solid import Solid, WorldSpec, cut_faces, draw
 from splatpilot.diagrams.worlds.solids.textures import Lamplight
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.distance_field import FieldState

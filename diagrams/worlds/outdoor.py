@@ -11,9 +11,8 @@ from splatpilot.diagrams.worlds import building_blocks as blocks
 from splatpilot.diagrams.worlds.feasibility import TRIES, is_feasible, until_feasible
 from splatpilot.diagrams.worlds.forest.forest import Forest, trees_around
 from splatpilot.diagrams.worlds.forest.layout import BARK, TrunksConfig
-from splatpilot.diagrams.worlds.solids.solid import Solid, WorldSpec
+from splatpilot.diagrams.worlds.solids.solid import Solid, WorldSpec, draw
 from splatpilot.diagrams.worlds.solids.surfaces import FloorPlan, merge
-from splatpilot.diagrams.worlds.solids.surfels import draw
 from splatpilot.systems.collision.shapes import Capsule, Sphere
 from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.common.validation import bounded, require_field

@@ -69,11 +69,6 @@ class Observations:
         counts = np.minimum(counts, np.iinfo(np.uint16).max).astype(np.uint16)
         return cls(float(voxel_size), _voxel(key).astype(np.int32), counts, directions)
 
-    def counts_at(self, p_WQ: ArrayLike) -> NDArray[np.uint16]:
-        """Returns the number of images (N,) that saw the voxels of points (N, 3) [m]."""
-        voxel = np.floor(np.asarray(p_WQ) / self.voxel_size).astype(np.int64)
-        return _look_up(self._keys, self.counts, _key(voxel))
-
     def agree_with(self, p_WQ: ArrayLike, p_WC: ArrayLike) -> NDArray[np.bool_]:
         """Checks which points (N, 3) [m] lie within a voxel of a surface that an image saw from at
         most about 60 degrees beside a camera at p_WC (3,) [m]."""

@@ -20,7 +20,7 @@ from pydrake.common.yaml import yaml_load_data, yaml_load_typed
 from splatpilot.systems.common.distributions import (
     FieldPath,
     distribution_text,
-    dump_with_distributions,
+    dump_config,
     find_distributions,
     is_distribution,
     take_distributions,
@@ -137,11 +137,6 @@ def parse_config[Configuration](
             unknown = _UNKNOWN_TAG.match(str(error))
             reason = _unknown_tag(defaults, *unknown.groups()) if unknown else error_summary(error)
             raise ValueError(f"{source}: {reason}") from None
-
-
-def dump_config(config: Any) -> str:
-    """Returns a configuration as YAML with every field."""
-    return dump_with_distributions(config)
 
 
 def equal_by_fields(config: Any, other: object) -> bool:
@@ -278,8 +273,6 @@ def _tagged_types(expected: Any) -> list[Any]:
 
 def _hint(config: Any, name: Any, value: Any, prefix: str) -> str:
     """Suggests fields of the same name elsewhere, fields that `value` names, or similar names."""
-    if instead := getattr(config, "FORMER_FIELDS", {}).get(name):
-        return f"write {prefix}{instead}"
     known = field_types(config)
     fields = _nested(config, str(name), prefix)
     fields += [prefix + each for each in _names(value) if each in known]

@@ -285,7 +285,7 @@ def _read(node: yaml.Node, path: FieldPath) -> Any:
     return yaml_load_typed(schema=kind, data=yaml.serialize(node))
 
 
-def dump_with_distributions(config: Any) -> str:
+def dump_config(config: Any) -> str:
     """Returns a configuration as YAML with every field."""
     if not any(is_distribution(field.distribution) for field in find_distributions(config)):
         return str(yaml_dump_typed(config))

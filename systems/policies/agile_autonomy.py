@@ -5,7 +5,13 @@ from typing import Any
 
 import numpy as np
 
-from splatpilot.systems.policies.base import LearnedPolicyConfig, Observation, Policy
+from splatpilot.systems.policies.base import (
+    LearnedPolicyConfig,
+    Observation,
+    Policy,
+    pool_depth,
+    target_velocity,
+)
 from splatpilot.systems.policies.checkpoint import (
     PolicyCheckpoint,
     check_weights,
@@ -13,13 +19,12 @@ from splatpilot.systems.policies.checkpoint import (
     linear_shapes,
     require_shape,
 )
-from splatpilot.systems.policies.convolutions import convolution_shapes
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS, Hypotheses, no_plan
-from splatpilot.systems.policies.observations import pool_depth, target_velocity
-from splatpilot.systems.policies.recurrent_network import (
+from splatpilot.systems.policies.networks import (
     DepthEncoder,
     DepthLayer,
     DepthSpec,
+    convolution_shapes,
     leaky_relu,
 )
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
@@ -159,12 +164,8 @@ class AgileAutonomy(Policy):
     .. pydrake_system::
 
         name: AgileAutonomy
-        input_ports:
-        - state
-        - goal
-        - depth_image_32f
-        output_ports:
-        - hypotheses
+        input_ports: [state, goal, depth_image_32f]
+        output_ports: [hypotheses]
 
     - ``hypotheses`` (8 + 31 * 3): as `Hypotheses.to_vector`, in the body frame B at the time of
       planning; NaN before the first update.

@@ -9,14 +9,16 @@ from math import atan2
 import numpy as np
 from pydrake.math import RotationMatrix
 
-from splatpilot.systems.policies.base import LearnedPolicyConfig, Observation, Policy
-from splatpilot.systems.policies.observations import (
+from splatpilot.systems.policies.base import (
+    LearnedPolicyConfig,
+    Observation,
+    Policy,
     heading_frame,
     limit_smoothly,
     pool_depth,
     target_velocity,
 )
-from splatpilot.systems.policies.recurrent_network import (
+from splatpilot.systems.policies.networks import (
     NetworkSpec,
     RecurrentNetwork,
     load_network,
@@ -85,13 +87,8 @@ class DepthNav(Policy):
     .. pydrake_system::
 
         name: DepthNav
-        input_ports:
-        - state
-        - goal
-        - depth_image_32f
-        output_ports:
-        - acceleration
-        - heading
+        input_ports: [state, goal, depth_image_32f]
+        output_ports: [acceleration, heading]
 
     - ``acceleration`` (3): a_WB [m/s^2], W frame, gravity excluded.
     - ``heading`` (1): of body x, from world x seen from above [rad]; NaN before the first update.

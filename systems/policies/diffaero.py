@@ -8,15 +8,17 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from splatpilot.systems.policies.base import LearnedPolicyConfig, Observation, Policy
-from splatpilot.systems.policies.observations import (
+from splatpilot.systems.policies.base import (
+    LearnedPolicyConfig,
+    Observation,
+    Policy,
     heading_frame,
     heading_observation,
     inverse_depth,
     limit_smoothly,
     pool_depth,
 )
-from splatpilot.systems.policies.recurrent_network import (
+from splatpilot.systems.policies.networks import (
     NetworkSpec,
     RecurrentNetwork,
     load_network,
@@ -96,12 +98,8 @@ class DiffAero(Policy):
     .. pydrake_system::
 
         name: DiffAero
-        input_ports:
-        - state
-        - goal
-        - depth_image_32f
-        output_ports:
-        - acceleration
+        input_ports: [state, goal, depth_image_32f]
+        output_ports: [acceleration]
 
     - ``acceleration`` (3): a_WB [m/s^2], W frame, gravity excluded.
     """
@@ -123,12 +121,8 @@ class DiffAeroTof(Policy):
     .. pydrake_system::
 
         name: DiffAeroTof
-        input_ports:
-        - state
-        - goal
-        - depth_grid
-        output_ports:
-        - velocity
+        input_ports: [state, goal, depth_grid]
+        output_ports: [velocity]
 
     - ``velocity`` (3): desired v_WB [m/s], W frame.
     """

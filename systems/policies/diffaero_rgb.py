@@ -12,19 +12,16 @@ from typing import ClassVar
 import numpy as np
 
 from splatpilot.systems.common.validation import require, require_field
-from splatpilot.systems.policies.base import LearnedPolicyConfig, Observation, Policy
+from splatpilot.systems.policies.base import LearnedPolicyConfig, Observation, Policy, heading_frame
 from splatpilot.systems.policies.checkpoint import PolicyCheckpoint, check_weights
-from splatpilot.systems.policies.convolutions import (
-    Convolution,
-    convolution_shapes,
-    opencv_net,
-)
 from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK, RATE, compute_command
-from splatpilot.systems.policies.observations import heading_frame
-from splatpilot.systems.policies.recurrent_network import (
+from splatpilot.systems.policies.networks import (
+    Convolution,
     NetworkSpec,
     RecurrentNetwork,
+    convolution_shapes,
     leaky_relu,
+    opencv_net,
 )
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 
@@ -212,12 +209,8 @@ class DiffAeroRgb(Policy):
     .. pydrake_system::
 
         name: DiffAeroRgb
-        input_ports:
-        - state
-        - goal
-        - color_image
-        output_ports:
-        - acceleration
+        input_ports: [state, goal, color_image]
+        output_ports: [acceleration]
 
     - ``acceleration`` (3): a_WB [m/s^2], W frame, gravity excluded.
     """

@@ -116,11 +116,8 @@ def HypothesisSelector_(T):
         .. pydrake_system::
 
             name: HypothesisSelector
-            input_ports:
-            - hypotheses
-            - state
-            output_ports:
-            - waypoint
+            input_ports: [hypotheses, state]
+            output_ports: [waypoint]
 
         - ``hypotheses`` (8 + 31 K): as `Hypotheses.to_vector`.
         - ``state`` (13): ``[p_WB (3) [m], v_WB (3) [m/s], q_WB (4, wxyz), w_WB_B (3) [rad/s]]``.

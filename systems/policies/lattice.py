@@ -75,19 +75,12 @@ def rotation_to(direction_W: np.ndarray) -> np.ndarray:
 
 def select_distinct(
     positions: np.ndarray, costs: np.ndarray, count: int, separation: float
-) -> np.ndarray:
-    """Returns the indices (count,) of cheap distinct trajectories, cheapest first.
+) -> tuple[np.ndarray, bool]:
+    """Returns the indices (count,) of cheap trajectories, cheapest first, and if all are distinct.
 
     Greedy: repeatedly the cheapest of positions (N, S, 3) [m] whose mean distance from all chosen
     ones exceeds `separation` [m]; without one, the most distant.
     """
-    return _choose(positions, costs, count, separation)[0]
-
-
-def _choose(
-    positions: np.ndarray, costs: np.ndarray, count: int, separation: float
-) -> tuple[np.ndarray, bool]:
-    """Returns the indices of `select_distinct`, and if all are distinct."""
     chosen, all_distinct = [int(np.argmin(costs))], len(costs) >= count
     apart = np.full(len(costs), np.inf)
     while len(chosen) < min(count, len(costs)):
@@ -279,7 +272,9 @@ class TrajectoryLattice:
             some = np.sort(order[:count])
             positions = trajectories.positions[some]
             costs = self.costs(Trajectories(positions, trajectories.jerks[some]), p_WB, field, toa)
-            chosen, distinct = _choose(positions, costs, config.num_hypotheses, config.separation)
+            chosen, distinct = select_distinct(
+                positions, costs, config.num_hypotheses, config.separation
+            )
             if len(some) == len(order) or (
                 distinct and costs[chosen[-1]] < arrivals[order[count]] - _ROUNDING
             ):

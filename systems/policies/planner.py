@@ -72,12 +72,8 @@ class PrivilegedPlanner(Policy):
     .. pydrake_system::
 
         name: PrivilegedPlanner
-        input_ports:
-        - state
-        - goal
-        - moving (optional)
-        output_ports:
-        - hypotheses
+        input_ports: [state, goal, moving (optional)]
+        output_ports: [hypotheses]
 
     - ``hypotheses`` (8 + 31 K): as `Hypotheses.to_vector`, cheapest first, in the body frame B at
       the time of planning; NaN before the first update.

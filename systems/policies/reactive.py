@@ -4,7 +4,6 @@ Candidate velocities form a fan around the direction to the goal, each with a fi
 Its cost is the remaining distance, the proximity of seen points and the length in unseen space.
 """
 
-import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,31 +11,24 @@ from scipy.spatial import KDTree
 
 from splatpilot.systems.collision.distance_field import soft_barrier
 from splatpilot.systems.common.validation import Config, bounded, require_field
-from splatpilot.systems.policies.base import Observation, Policy
+from splatpilot.systems.policies.base import Observation, Policy, target_velocity
 from splatpilot.systems.policies.lattice import rotation_to, velocity_fan
-from splatpilot.systems.policies.observations import target_velocity
 from splatpilot.systems.policies.velocity import RESPONSE_TIME, SLOWING_TIME, tracking_acceleration
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
 _MAX_DISTANCE = 1.5  # [m] Points at a greater distance from a trajectory cost nothing.
-_SAMPLE_PERIOD = 0.25  # [s]
+_SAMPLE_PERIOD, _SAMPLES = 0.25, 6  # [s], of candidates
 _FREE_RADIUS = 0.6  # [m] Space around the vehicle that counts as seen.
+
+# Candidates over the maximum speed, in a frame with x toward the goal.
+_YAWS, _PITCHES = (np.deg2rad(np.linspace(-end, end, n)) for end, n in ((100.0, 17), (25.0, 3)))
+_FAN = velocity_fan(_YAWS, _PITCHES, [0.33, 0.67, 1.0])
 
 
 @dataclass
 class ReactiveConfig(Config):
-    """The camera, the candidates and the weights of their cost.
-
-    The cost of a candidate with samples p_i, d_i from the nearest seen point, is::
-
-        |p_G - p_N| + height_weight |z_G - z_N|
-        + sum (barrier_weight soft(d_i) + contact_weight max(0, r + margin - d_i)
-               + unseen_weight [p_i unseen]) |p_i - p_(i-1)|
-        + acceleration_weight |v - v_0|²
-
-    with the soft barrier of equation (3), its margin `barrier_margin`.
-    """
+    """The camera, the seen points and the clearance from them."""
 
     camera: OnboardCamera = field(default_factory=OnboardCamera)
     # [m/s] Maximum speed.
@@ -49,39 +41,16 @@ class ReactiveConfig(Config):
     rows: int = 9
     # [-] Number of images whose points are kept.
     memory: int = bounded(20, "[1, 300]")
-    # [s] Duration of candidates.
-    horizon: float = bounded(1.5, "[0.3, 10] s")
-    # [-] Number of directions to the sides.
-    num_yaws: int = bounded(17, "[1, 100]")
-    # [rad] Maximum angle to the sides from the direction to the goal.
-    max_yaw: float = bounded(math.radians(100.0), "[0, 3.1416] rad")
-    # [-] Number of directions up and down.
-    num_pitches: int = bounded(3, "[1, 100]")
-    # [rad] Maximum angle up and down.
-    max_pitch: float = bounded(math.radians(25.0), "[0, 1.5707] rad")
-    # [-] Speeds as fractions of the maximum.
-    speed_fractions: list[float] = bounded(lambda: [0.33, 0.67, 1.0], "(0, 1]")
     # [m] Clearance for errors of tracking and for obstacles between pixels.
     margin: float = bounded(0.15, "[0, inf) m")
     # [m] Margin of the soft barrier.
     barrier_margin: float = bounded(0.5, "[0, inf) m")
-    # [-] Weight of the height difference from the goal.
-    height_weight: float = bounded(0.3, "[0, inf)")
-    # [1/m] Weight of proximity per meter.
-    barrier_weight: float = bounded(4.0, "[0, inf)")
-    # [1/m] Weight of penetrating radius and margin per meter.
-    contact_weight: float = bounded(100.0, "[0, inf)")
-    # [-] Weight of a meter through unseen space.
-    unseen_weight: float = bounded(2.0, "[0, inf)")
-    # [s^2/m] Weight of the squared change of velocity.
-    acceleration_weight: float = bounded(0.02, "[0, inf)")
 
     def check(self) -> None:
         for name, size in (("columns", self.camera.width), ("rows", self.camera.height)):
             value = getattr(self, name)
             divides = 1 <= value <= size and size % value == 0
             require_field(self, name, divides, f"a divisor of the camera's {size} pixels")
-        require_field(self, "speed_fractions", self.speed_fractions, "one or more values in (0, 1]")
 
 
 def nearest_points(depth: np.ndarray, config: ReactiveConfig) -> np.ndarray:
@@ -100,24 +69,15 @@ def nearest_points(depth: np.ndarray, config: ReactiveConfig) -> np.ndarray:
 
 def candidate_velocities(to_goal: np.ndarray, config: ReactiveConfig) -> np.ndarray:
     """Returns a fan of velocities (N, 3) [m/s] around the goal's direction, and zero."""
-
-    def angles(largest: float, count: int) -> np.ndarray:
-        degrees = math.degrees(largest)  # Exact for whole degrees.
-        return np.deg2rad(np.linspace(-degrees, degrees, count))
-
-    yaws, pitches = angles(config.max_yaw, config.num_yaws), (config.max_pitch, config.num_pitches)
-    fan = velocity_fan(yaws, angles(*pitches), config.speed_fractions)
-    return np.vstack([config.speed * fan @ rotation_to(to_goal).T, np.zeros(3)])
+    return np.vstack([config.speed * _FAN @ rotation_to(to_goal).T, np.zeros(3)])
 
 
-def responses(
-    p_WB: np.ndarray, v_WB: np.ndarray, velocities: np.ndarray, horizon: float
-) -> np.ndarray:
+def responses(p_WB: np.ndarray, v_WB: np.ndarray, velocities: np.ndarray) -> np.ndarray:
     """Returns positions (N, S, 3) [m] while the velocity approaches each of `velocities` (N, 3).
 
     v(t) = v + (v_0 - v) e^(-t/tau), the motion under `tracking_acceleration`.
     """
-    times = _SAMPLE_PERIOD * np.arange(1, round(horizon / _SAMPLE_PERIOD) + 1)[:, None]
+    times = _SAMPLE_PERIOD * np.arange(1, _SAMPLES + 1)[:, None]
     lag = RESPONSE_TIME * -np.expm1(-times / RESPONSE_TIME)  # (S, 1) [s]
     return p_WB + velocities[:, None] * (times - lag) + v_WB * lag
 
@@ -143,8 +103,15 @@ def candidate_costs(
     free: np.ndarray,
     config: ReactiveConfig,
 ) -> np.ndarray:
-    """Computes the costs (N,) [m] of candidates, see `ReactiveConfig`, by their positions
-    (N, S, 3), velocities (N, 3), the seen points_W (M, 3) and whether they are known `free` (N, S).
+    """Computes the costs (N,) [m] of candidates by their positions (N, S, 3), velocities (N, 3),
+    the seen points_W (M, 3) and whether they are known `free` (N, S).
+
+    The cost with samples p_i, d_i from the nearest seen point, is::
+
+        |p_G - p_N| + 0.3 |z_G - z_N| + 0.02 |v - v_0|²
+        + sum (4 soft(d_i) + 100 max(0, r + margin - d_i) + 2 [p_i unseen]) |p_i - p_(i-1)|
+
+    with the soft barrier of equation (3), its margin `barrier_margin`.
     """
     distances = np.full(positions.shape[:2], np.inf)
     farthest = np.linalg.norm(positions - p_WB, axis=2).max() + _MAX_DISTANCE
@@ -157,16 +124,12 @@ def candidate_costs(
     contact = np.maximum(VEHICLE_RADIUS + config.margin - distances, 0.0)
     unseen = ~free & (np.linalg.norm(positions - p_WB, axis=2) > _FREE_RADIUS)
     to_goal = p_WG - positions[:, -1]
-    along = (
-        config.barrier_weight * barrier
-        + config.contact_weight * contact
-        + config.unseen_weight * unseen
-    )
+    along = 4.0 * barrier + 100.0 * contact + 2.0 * unseen
     return (
         np.linalg.norm(to_goal, axis=1)
-        + config.height_weight * np.abs(to_goal[:, 2])
+        + 0.3 * np.abs(to_goal[:, 2])
         + (along * steps).sum(axis=1)
-        + config.acceleration_weight * np.square(velocities - v_WB).sum(axis=1)
+        + 0.02 * np.square(velocities - v_WB).sum(axis=1)
     )
 
 
@@ -185,7 +148,7 @@ def compute_command(
 
     straight = target_velocity(p_WB, observed.p_WG, config.speed, SLOWING_TIME)
     velocities = np.vstack([candidate_velocities(observed.p_WG - p_WB, config), straight])
-    positions = responses(p_WB, v_WB, velocities, config.horizon)
+    positions = responses(p_WB, v_WB, velocities)
     free = is_seen((positions - p_WC) @ R_WC, depth, config.camera)
     costs = candidate_costs(positions, velocities, p_WB, v_WB, observed.p_WG, known, free, config)
     return tracking_acceleration(v_WB, velocities[np.argmin(costs)]), points_W
@@ -197,12 +160,8 @@ class Reactive(Policy):
     .. pydrake_system::
 
         name: Reactive
-        input_ports:
-        - state
-        - goal
-        - depth_image_32f
-        output_ports:
-        - acceleration
+        input_ports: [state, goal, depth_image_32f]
+        output_ports: [acceleration]
 
     - ``acceleration`` (3): a_WB [m/s^2], W frame, gravity excluded.
 

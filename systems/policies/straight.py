@@ -5,8 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from splatpilot.systems.common.validation import Config, bounded, require_type
-from splatpilot.systems.policies.base import Observation, Policy
-from splatpilot.systems.policies.observations import target_velocity
+from splatpilot.systems.policies.base import Observation, Policy, target_velocity
 from splatpilot.systems.policies.velocity import SLOWING_TIME, tracking_acceleration
 
 
@@ -27,11 +26,8 @@ class Straight(Policy):
     .. pydrake_system::
 
         name: Straight
-        input_ports:
-        - state
-        - goal
-        output_ports:
-        - acceleration
+        input_ports: [state, goal]
+        output_ports: [acceleration]
 
     - ``acceleration`` (3): a_WB [m/s^2], W frame, gravity excluded.
 

@@ -20,9 +20,9 @@ from splatpilot.systems.policies.checkpoint import (
     linear_shapes,
     require_shape,
 )
-from splatpilot.systems.policies.convolutions import Convolution, convolution_shapes, opencv_net
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS, Hypotheses, no_plan
 from splatpilot.systems.policies.lattice import HORIZON, reference_trajectory
+from splatpilot.systems.policies.networks import Convolution, convolution_shapes, opencv_net
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.vehicle.state import array_namespace, lengths
 
@@ -269,12 +269,8 @@ class Student(Policy):
     .. pydrake_system::
 
         name: Student
-        input_ports:
-        - state
-        - goal
-        - color_image or depth_image_32f
-        output_ports:
-        - hypotheses
+        input_ports: [state, goal, color_image or depth_image_32f]
+        output_ports: [hypotheses]
 
     - ``hypotheses`` (8 + 31 * 3): as `Hypotheses.to_vector`, in the body frame B at the time of
       planning; NaN before the first update.

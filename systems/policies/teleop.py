@@ -39,12 +39,8 @@ class Teleop(Policy):
     .. pydrake_system::
 
         name: Teleop
-        input_ports:
-        - state
-        - goal
-        output_ports:
-        - velocity
-        - heading
+        input_ports: [state, goal]
+        output_ports: [velocity, heading]
 
     Sliders and the sticks of a gamepad add up: the left one is forward and left, the right one is
     up and turn. Velocities are in the frame of the heading.

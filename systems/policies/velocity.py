@@ -38,11 +38,8 @@ def VelocityTracker_(T):
         .. pydrake_system::
 
             name: VelocityTracker
-            input_ports:
-            - state
-            - velocity
-            output_ports:
-            - acceleration
+            input_ports: [state, velocity]
+            output_ports: [acceleration]
 
         - ``state`` (13): ``[p_WB (3) [m], v_WB (3) [m/s], q_WB (4, wxyz), w_WB_B (3) [rad/s]]``.
         - ``velocity`` (3): desired v_WB [m/s], W frame.
@@ -76,14 +73,8 @@ class VelocitySetpoint(LeafSystem):
     .. pydrake_system::
 
         name: VelocitySetpoint
-        input_ports:
-        - state
-        - waypoint
-        - acceleration
-        - velocity
-        - heading
-        output_ports:
-        - velocity_setpoint
+        input_ports: [state, waypoint, acceleration, velocity, heading]
+        output_ports: [velocity_setpoint]
 
     - ``state`` (13), ``waypoint`` (3), ``acceleration`` (3), ``heading`` (1): those of
       :class:`~splatpilot.systems.vehicle.flatness.FlatnessController`.

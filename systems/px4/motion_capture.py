@@ -12,7 +12,7 @@ from pydrake.systems.framework import Context
 from splatpilot.systems.common.extras import import_extra
 from splatpilot.systems.common.validation import Config, bounded, require_field
 from splatpilot.systems.messaging.receiver import RESTART, Received, Receiver, UdpConfig, UdpInbox
-from splatpilot.systems.px4.frames import pose_from_optitrack
+from splatpilot.systems.px4.mavlink import pose_from_optitrack
 
 _FRAME_OF_DATA = 7  # NatNet's number of the messages that carry poses.
 

@@ -1,7 +1,12 @@
-"""Image formation of a policy's camera: exposure, lens, compression and depth sensor."""
+"""Image formation of a policy's camera: exposure, lens, compression and depth sensor.
+
+Stereo and time-of-flight cameras change exact planar depth; pixels without a measurement read
+infinity.
+"""
 
 import math
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any, cast
 
 import cv2
@@ -11,16 +16,10 @@ from pydrake.common.value import AbstractValue, Value
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
+from scipy.ndimage import gaussian_filter
 
 from splatpilot.systems.common.drake import weak_callback
 from splatpilot.systems.common.validation import Config, bounded
-from splatpilot.systems.sensing.depth_sensors import (
-    Stereo,
-    TimeOfFlightErrors,
-    matched_depth,
-    stereo_depth,
-    time_of_flight_depth,
-)
 from splatpilot.systems.sensing.noise import (
     ImageChange,
     color_of_light,
@@ -28,6 +27,185 @@ from splatpilot.systems.sensing.noise import (
     limit_depth,
 )
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
+
+
+@dataclass
+class Stereo(Config):
+    """A stereo camera, see `stereo_depth`.
+
+    The baseline of 50 mm and the size of 848x480 are those that Intel gives for the RealSense D435
+    ("Tuning depth cameras for best performance"). Noise, step, range and window are our choice, of
+    a usual size.
+    """
+
+    # [m] Distance of the right camera from the left, which takes the depth image.
+    baseline: float = bounded(0.05, "(0, 1] m")
+    # [px] Width of the images that are matched.
+    width: int = bounded(848, "[1, 8192] px")
+    # [px] Standard deviation of disparities; below 0.1 on textured surfaces.
+    noise: float = bounded(0.08, "[0, 10] px")
+    # [px] Step of disparities; 0 is without rounding.
+    step: float = bounded(0.03125, "[0, 1] px")
+    # [px] Maximum disparity; nearer surfaces are not measured.
+    max_disparity: float = bounded(126.0, "(0, inf) px")
+    # [px] Standard deviation of the window of matching, within which errors agree.
+    window: float = bounded(9.0, "[0, 100] px")
+    # Renders and matches the images of both cameras, instead of the formula of errors; see
+    # `matched_depth`. It takes several times as long as the flight.
+    matching: bool = False
+
+
+@dataclass
+class TimeOfFlightErrors(Config):
+    """Errors of a time-of-flight camera, see `time_of_flight_depth`.
+
+    The defaults are our choice for a small camera indoors: 1 % noise, a range of 7 m, and errors of
+    a few centimeters in corners at 2 m.
+    """
+
+    # [-] Standard deviation of the noise, relative to depth.
+    noise: float = bounded(0.01, "[0, 1]")
+    # [m] Range at which ambient light hides the echo; 2 m to 3 m in sunlight.
+    ambient_range: float = bounded(7.0, "(0, inf) m")
+    # [-] Spread of that range between pixels, by their reflectivity; a standard deviation.
+    ambient_spread: float = bounded(0.1, "[0, 1]")
+    # [-] Strength of the light that takes a detour in concave corners.
+    multipath: float = bounded(0.3, "[0, 1]")
+    # [deg] Half the angle of the surface from which such light comes.
+    multipath_angle: float = bounded(5.0, "[0, 45] deg")
+    # [-] Probability that a pixel at an edge reads a depth between near and far.
+    mixed_pixels: float = bounded(0.5, "[0, 1]")
+
+
+_BLOCK = 5  # [px] matched windows
+_EDGE = 0.2  # [-] relative step of depth from which neighbors are different surfaces
+
+
+def correlated_noise(white: np.ndarray, sigma: float) -> np.ndarray:
+    """Correlates white noise (H, W) by a Gaussian of `sigma` [px]; its variance stays."""
+    if sigma < 0.1:
+        return white
+    return gaussian_filter(white, sigma, mode="wrap") / _filtered_deviation(white.shape, sigma)
+
+
+@cache
+def _filtered_deviation(shape: tuple[int, int], sigma: float) -> float:
+    point = np.zeros(shape)
+    point[0, 0] = 1.0
+    return float(np.linalg.norm(gaussian_filter(point, sigma, mode="wrap")))
+
+
+def stereo_depth(
+    depth: np.ndarray, sensor: Stereo, camera: OnboardCamera, noise: np.ndarray
+) -> np.ndarray:
+    """Computes the depth (H, W) [m] that matching measures; `noise` n (H, W) is drawn from N(0, 1).
+
+    With the focal length f [px] at the sensor's width and the baseline b,
+
+        d = round((f b / z + noise n) / step) step,  z' = f b / d.
+
+    A pixel is not measured if d is above `max_disparity` or not positive, if its match lies beyond
+    the left border of the right image, or if a nearer surface hides it from the right camera.
+    """
+    pixels = sensor.width / camera.width  # of the sensor in one of the camera
+    fb = camera.focal_x * pixels * sensor.baseline
+    measured = np.isfinite(depth) & (depth > 0.0)
+    exact = fb / np.where(measured, depth, np.inf)
+    columns = (np.arange(depth.shape[1]) + 0.5) * pixels
+    seen = columns - exact  # columns in the right image
+    right = np.minimum.accumulate(seen[:, ::-1], axis=1)[:, ::-1]
+    hidden = np.zeros(depth.shape, dtype=bool)
+    hidden[:, :-1] = right[:, 1:] <= seen[:, :-1]
+    errors = correlated_noise(noise, sensor.window / pixels)
+    disparity = exact + sensor.noise * errors
+    if sensor.step > 0.0:
+        disparity = np.round(disparity / sensor.step) * sensor.step
+    valid = (disparity > 0.0) & (disparity <= sensor.max_disparity) & (seen >= 0.0) & ~hidden
+    z = fb / np.where(disparity > 0.0, disparity, 1.0)
+    return np.where(measured, np.where(valid, z, np.inf), depth)
+
+
+def matched_depth(
+    left: np.ndarray, right: np.ndarray, sensor: Stereo, camera: OnboardCamera
+) -> np.ndarray:
+    """Computes the depth (H, W) [m] of a camera by semi-global matching of two gray images (h,
+    `width`) of uint8, from the camera and from `baseline` to its right.
+
+    Each pixel has the depth in its middle. Those without a match are not measured.
+    """
+    count = 16 * int(np.ceil(sensor.max_disparity / 16.0))
+    matcher = cv2.StereoSGBM.create(
+        numDisparities=count,
+        blockSize=_BLOCK,
+        P1=8 * _BLOCK**2,
+        P2=32 * _BLOCK**2,
+        disp12MaxDiff=1,
+        uniquenessRatio=10,
+        speckleWindowSize=50,
+        speckleRange=2,
+        mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
+    )
+    # Without a margin, OpenCV leaves out the left border as wide as `count`.
+    left, right = (
+        cv2.copyMakeBorder(x, 0, 0, count, 0, cv2.BORDER_CONSTANT) for x in (left, right)
+    )
+    disparity = matcher.compute(left, right)[:, count:] / np.float32(16.0)
+    rows, columns = (
+        ((np.arange(n) + 0.5) * size / n).astype(int)
+        for n, size in zip((camera.height, camera.width), disparity.shape, strict=True)
+    )
+    disparity = disparity[np.ix_(rows, columns)]
+    fb = camera.focal_x * sensor.width / camera.width * sensor.baseline
+    return np.where(disparity > 0.0, fb / np.where(disparity > 0.0, disparity, 1.0), np.inf)
+
+
+def time_of_flight_depth(
+    depth: np.ndarray,
+    sensor: TimeOfFlightErrors,
+    camera: OnboardCamera,
+    noise: np.ndarray,
+    reflectivity: np.ndarray,
+    mixing: np.ndarray,
+) -> np.ndarray:
+    """Computes the depth (H, W) [m] that a time-of-flight camera measures.
+
+        z' = (z + multipath s)(1 + noise n)
+
+    s is the sag of a concave corner: how far z lies behind the chord between the points at
+    `multipath_angle` to the left and right, or above and below. It is zero on planes. At an edge, a
+    pixel reads a depth between those of its neighbors with the probability `mixed_pixels`. A pixel
+    is not measured if z (1 + ambient_spread r) is above `ambient_range`.
+
+    Args:
+        noise, reflectivity: n and r (H, W), drawn from N(0, 1).
+        mixing: (2, H, W), drawn from U(0, 1).
+    """
+    measured = np.isfinite(depth) & (depth > 0.0)
+    z = np.where(measured, depth, np.float32(sensor.ambient_range))
+    z = z * (1.0 + sensor.multipath * _relative_sag(z, sensor.multipath_angle, camera))
+    kernel = np.ones((3, 3), np.uint8)
+    near, far = cv2.erode(z, kernel), cv2.dilate(z, kernel)
+    mixed = (far > (1.0 + _EDGE) * near) & (mixing[0] < sensor.mixed_pixels)
+    z = np.where(mixed, near + mixing[1] * (far - near), z) * (1.0 + sensor.noise * noise)
+    lost = z * (1.0 + sensor.ambient_spread * reflectivity) > sensor.ambient_range
+    return np.where(measured, np.where(lost, np.inf, z), depth)
+
+
+def _relative_sag(z: np.ndarray, angle: float, camera: OnboardCamera) -> np.ndarray:
+    """Returns the sag of corners over z, 0 at the border: inverse depth is affine on a plane."""
+    sag = np.zeros_like(z)
+    for focal, depth, found in ((camera.focal_y, z, sag), (camera.focal_x, z.T, sag.T)):
+        offset = round(focal * np.tan(np.radians(angle)))
+        if not 0 < 2 * offset < len(depth):
+            continue
+        before, after = 1.0 / depth[: -2 * offset], 1.0 / depth[2 * offset :]
+        relative = 0.5 * depth[offset:-offset] * (before + after) - 1.0
+        edges = np.abs(before - after) > _EDGE * (before + after)
+        relative[edges | (relative > _EDGE)] = 0.0
+        inner = found[offset:-offset]  # a view
+        np.maximum(inner, relative, out=inner)
+    return sag
+
 
 _LIGHT = light_of_color(np.arange(256, dtype=np.float32))
 _MAX_GAIN = 4.0  # [EV] of automatic exposure, up and down

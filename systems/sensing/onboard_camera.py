@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass, field
-from typing import ClassVar
 
 import numpy as np
 from pydrake.common.schema import Rotation, Transform
@@ -46,12 +45,6 @@ class OnboardCamera(Config):
     # [px] Gaussians that spread by less on the image are drawn as one. 1 halves the time of images
     # of 64x48 pixels; 0 draws each.
     merged_spread: float = bounded(0.0, "[0, 4] px")
-
-    FORMER_FIELDS: ClassVar[dict[str, str]] = {
-        "p_BC": "X_BC.translation",
-        "pitch": "X_BC.rotation: !Rpy {deg: [PITCH - 90, 0, -90]}",
-    }
-    """Fields of former versions, and those that replace them."""
 
     __eq__ = equal_by_fields
     __hash__ = None  # pyright: ignore

@@ -64,11 +64,8 @@ class RangeFinderSensor(LeafSystem):
     .. pydrake_system::
 
         name: RangeFinderSensor
-        input_ports:
-        - body_pose
-        - moving (optional)
-        output_ports:
-        - range
+        input_ports: [body_pose, moving (optional)]
+        output_ports: [range]
 
     - ``body_pose``: X_WB.
     - ``moving``: bodies that the ray may hit, see `MovingBodies`.

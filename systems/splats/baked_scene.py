@@ -17,7 +17,7 @@ from splatpilot.systems.splats.background import (
     put_behind,
 )
 from splatpilot.systems.splats.lens import Distortion, hidden_pixels, native_lens
-from splatpilot.systems.splats.scene import GaussianScene, harmonic_degree
+from splatpilot.systems.splats.scene import GaussianScene, concatenated, harmonic_degree
 
 if TYPE_CHECKING:
     from pydrake.math import RigidTransform
@@ -42,15 +42,7 @@ NO_GAUSSIANS = PlacedGaussians(
 
 def placed_together(parts: "Sequence[GaussianScene | PlacedGaussians]") -> PlacedGaussians:
     """Concatenates Gaussians; lower degrees of spherical harmonics are padded with zeros."""
-    if not parts:
-        return NO_GAUSSIANS
-    count = max(part.sh.shape[1] for part in parts)
-    means, quats, scales, opacities = (
-        np.concatenate([getattr(part, name) for part in parts])
-        for name in PlacedGaussians._fields[:-1]
-    )
-    padded = [np.pad(part.sh, ((0, 0), (0, count - part.sh.shape[1]), (0, 0))) for part in parts]
-    return PlacedGaussians(means, quats, scales, opacities, np.concatenate(padded))
+    return PlacedGaussians(*concatenated(parts)) if parts else NO_GAUSSIANS
 
 
 class MovingGaussians:

@@ -98,10 +98,8 @@ class MovingBodies(LeafSystem):
     .. pydrake_system::
 
         name: MovingBodies
-        input_ports:
-        - (name of a body)
-        output_ports:
-        - moving
+        input_ports: [(name of a body)]
+        output_ports: [moving]
 
     `DeclareBody` adds a body whose pose X_WO is an input port. `moving` is a value of `Bodies`;
     connect it to the ports `moving` of `SplatCamera`, `EsdfCollision` and `PrivilegedPlanner`.

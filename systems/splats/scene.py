@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -227,16 +228,21 @@ class GaussianScene:
         The lower of the two degrees of spherical harmonics is padded with zeros. The result is
         `antialiased` as this scene is.
         """
-        K = max(self.sh.shape[1], other.sh.shape[1])
-        merged = {
-            name: np.concatenate([getattr(self, name), getattr(other, name)])
-            for name in ("means", "quats", "scales", "opacities")
-        }
-        padded = [
-            np.pad(scene.sh, ((0, 0), (0, K - scene.sh.shape[1]), (0, 0)))
-            for scene in (self, other)
-        ]
-        return replace(self, **merged, sh=np.concatenate(padded))
+        merged = concatenated([self, other])
+        return replace(self, **dict(zip(ARRAYS, merged, strict=True)))
+
+
+ARRAYS = ("means", "quats", "scales", "opacities", "sh")
+"""The arrays of a scene, in the order of its arguments."""
+
+
+def concatenated(parts: Sequence[Any]) -> list[NDArray[Any]]:
+    """Concatenates the `ARRAYS` of parts; lower degrees of spherical harmonics are padded with
+    zeros."""
+    count = max(part.sh.shape[1] for part in parts)
+    padded = [np.pad(part.sh, ((0, 0), (0, count - part.sh.shape[1]), (0, 0))) for part in parts]
+    plain = [np.concatenate([getattr(part, name) for part in parts]) for name in ARRAYS[:-1]]
+    return [*plain, np.concatenate(padded)]
 
 
 def _vector(p: NDArray[np.float64]) -> tuple[float, float, float]:

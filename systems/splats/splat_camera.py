@@ -169,17 +169,9 @@ class SplatCamera(LeafSystem):
     .. pydrake_system::
 
         name: SplatCamera
-        input_ports:
-        - body_pose
-        - moving (optional)
-        - start_pose (with a readout or an exposure)
-        output_ports:
-        - color_image
-        - depth_image_32f
-        - depth_image_16u
-        - label_image
-        - body_pose_in_world
-        - image_time
+        input_ports: [body_pose, moving (optional), start_pose (with a readout or an exposure)]
+        output_ports: [color_image, depth_image_32f, depth_image_16u, label_image,
+            body_pose_in_world, image_time]
 
     `body_pose` is the pose X_WB of the body that carries the camera; the camera has the pose X_WC =
     X_WB X_BC with x right, y down and z forward for all images. With a `readout`, a rolling

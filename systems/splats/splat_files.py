@@ -19,6 +19,7 @@ from splatpilot.systems.common.readers import (
     require_readable_size,
 )
 from splatpilot.systems.common.validation import require
+from splatpilot.systems.splats.gltf_usd import unpack_gltf, unpack_usd, write_gltf, write_usd
 from splatpilot.systems.splats.packed_splats import (
     GZIP,
     MAGIC,
@@ -31,9 +32,7 @@ from splatpilot.systems.splats.packed_splats import (
     unpack_sog,
     unpack_spz,
 )
-from splatpilot.systems.splats.scene import GaussianScene, choose_origin, color_to_sh
-from splatpilot.systems.splats.splat_gltf import unpack_gltf, write_gltf
-from splatpilot.systems.splats.splat_usd import unpack_usd, write_usd
+from splatpilot.systems.splats.scene import ARRAYS, GaussianScene, choose_origin, color_to_sh
 
 _log = logging.getLogger(__name__)
 
@@ -271,8 +270,7 @@ def _write_spz(scene: GaussianScene, path: Path) -> None:
     turned = scene.transformed_by(_X_PS.inverse())
     cells = np.round(turned.means - turned.means.min(axis=0), 0).astype(np.int64)
     order = np.lexsort(cells.T)
-    names = "means", "quats", "scales", "opacities", "sh"
-    arrays = {name: getattr(turned, name)[order].astype(float) for name in names}
+    arrays = {name: getattr(turned, name)[order].astype(float) for name in ARRAYS}
     with written_atomically(path) as partial:
         partial.write_bytes(pack_spz(arrays, scene.antialiased))
 

@@ -54,28 +54,14 @@ def dryden_scales(wind: Wind) -> tuple[np.ndarray, np.ndarray]:
     return lengths, 0.1 * wind.gusts * np.array([level**-0.4, level**-0.4, 1.0])
 
 
-def dryden_spectra(wind: Wind, frequency: np.ndarray) -> np.ndarray:
-    """Returns the spectra (3, ...) [m^2/s^2/(rad/s)] of the gusts at frequencies (...) [rad/s].
-
-    Their integral over positive frequencies is the variance. With T = L / airspeed (MIL-F-8785C)::
-
-        S_u = sigma² 2 T / pi / (1 + (T w)²)
-        S_v = sigma² T / pi (1 + 3 (T w)²) / (1 + (T w)²)²,  and S_w
-    """
-    lengths, sigmas = dryden_scales(wind)
-    shape = (3, *[1] * np.ndim(frequency))
-    T, variance = (lengths / wind.airspeed).reshape(shape), (sigmas**2).reshape(shape)
-    square = (T * frequency) ** 2
-    spectra = variance * T / np.pi * (1.0 + 3.0 * square) / (1.0 + square) ** 2
-    spectra[0] = (variance * 2.0 * T / np.pi / (1.0 + square))[0]
-    return spectra
-
-
 def dryden_filter(wind: Wind, period: float) -> tuple[Any, Any, Any, Any]:
     """Returns A (5, 5), B (5, 5), C (3, 5) and S (5, 5) of gusts y_k = C x_k every `period` [s].
 
     x_k+1 = A x_k + B n_k and x_0 = S n, with n of N(0, 1), have exactly the joint distribution of
-    samples of the continuous process whose spectra `dryden_spectra` returns.
+    samples of the continuous process of the spectra of MIL-F-8785C, with T = L / airspeed::
+
+        S_u = sigma² 2 T / pi / (1 + (T w)²)
+        S_v = sigma² T / pi (1 + 3 (T w)²) / (1 + (T w)²)²,  and S_w
     """
     lengths, sigmas = dryden_scales(wind)
     u, v, w = wind.airspeed / lengths  # [rad/s]
@@ -97,7 +83,7 @@ def dryden_filter(wind: Wind, period: float) -> tuple[Any, Any, Any, Any]:
 @system_template("DrydenWind_", (float, AutoDiffXd, Expression))
 def DrydenWind_(T):
     class DrydenWind(LeafSystem_[T]):
-        """Outputs a mean wind with Dryden gusts, see `dryden_spectra`.
+        """Outputs a mean wind with Dryden gusts, see `dryden_filter`.
 
         .. pydrake_system::
 

@@ -13,7 +13,7 @@ from pydrake.math import RigidTransform
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.scenarios import benchmark_scenarios
 from splatpilot.diagrams.worlds.mesh import check_mesh, mesh_digests, mesh_distance, suitable_voxel
-from splatpilot.diagrams.worlds.mesh_renderer import MeshRenderer
+from splatpilot.diagrams.worlds.mesh_world import MeshRenderer
 from splatpilot.diagrams.worlds.splits import check_split, choose_split, part_digests, source_digest
 from splatpilot.diagrams.worlds.world_gltf import write_gltf
 from splatpilot.diagrams.worlds.world_registry import WorldConfig, is_procedural, make_spec
@@ -27,7 +27,7 @@ from splatpilot.systems.common.files import (
     written_atomically,
 )
 from splatpilot.systems.common.progress import Progress, resumable
-from splatpilot.systems.common.seeds import TRAINING_SEEDS, VALIDATION_SEEDS
+from splatpilot.systems.common.provenance import TRAINING_SEEDS, VALIDATION_SEEDS
 from splatpilot.systems.common.validation import Config, bounded, require, require_field
 from splatpilot.training.captures.capture import CaptureFrame, pinhole
 from splatpilot.training.captures.coverage import (

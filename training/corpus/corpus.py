@@ -24,7 +24,7 @@ from splatpilot.systems.common.files import (
     write_csv,
     written_atomically,
 )
-from splatpilot.systems.common.seeds import first_training_seed
+from splatpilot.systems.common.provenance import first_training_seed
 from splatpilot.systems.common.validation import Config, bounded, require
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.training.corpus.expert import ExpertConfig

@@ -26,8 +26,12 @@ from splatpilot.diagrams.worlds.world_registry import WORLDS, WorldConfig, is_pr
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.common.config import dump_config, load_config, registry_field
 from splatpilot.systems.common.files import folder_written_atomically
+from splatpilot.systems.common.provenance import (
+    SEEDS_PER_RUN,
+    VALIDATION_SEEDS,
+    first_training_seed,
+)
 from splatpilot.systems.common.readers import require_file
-from splatpilot.systems.common.seeds import SEEDS_PER_RUN, VALIDATION_SEEDS, first_training_seed
 from splatpilot.systems.common.validation import Config, bounded, require
 
 WORLD = "world.yaml"

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from splatpilot.systems.common.seeds import first_training_seed
+from splatpilot.systems.common.provenance import first_training_seed
 from splatpilot.systems.common.validation import Config, bounded, require_field
 from splatpilot.systems.sensing.noise import ObservationNoise
 from splatpilot.training.policies.augmentation import noisy_depth

@@ -15,10 +15,9 @@ from splatpilot.systems.policies.agile_autonomy import (
     TrajectoryNetworkSpec,
 )
 from splatpilot.systems.policies.checkpoint import PolicyCheckpoint
-from splatpilot.systems.policies.convolutions import LEAK, Convolution
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS
 from splatpilot.systems.policies.lattice import BASIS, reference_trajectory
-from splatpilot.systems.policies.recurrent_network import DepthSpec, NetworkSpec
+from splatpilot.systems.policies.networks import LEAK, Convolution, DepthSpec, NetworkSpec
 
 
 class TrainableNetwork(nn.Module):

@@ -18,9 +18,9 @@ from torch import Tensor
 from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.common.validation import bounded, require_field
 from splatpilot.systems.policies import agile_autonomy
+from splatpilot.systems.policies.base import target_velocity
 from splatpilot.systems.policies.hypotheses import NUM_WAYPOINTS
 from splatpilot.systems.policies.lattice import LatticeConfig, TrajectoryLattice
-from splatpilot.systems.policies.observations import target_velocity
 from splatpilot.systems.policies.planner import plan
 from splatpilot.systems.sensing.noise import ObservationNoise
 from splatpilot.systems.vehicle.flatness import FlatnessControllerConfig, reaching_acceleration

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from splatpilot.systems.policies import depthnav
-from splatpilot.systems.policies.observations import heading_frame, limit_smoothly, target_velocity
+from splatpilot.systems.policies.base import heading_frame, limit_smoothly, target_velocity
 from splatpilot.systems.vehicle.quadrotor import GRAVITY
 from splatpilot.training.policies.networks import TrainableNetwork
 from splatpilot.training.policies.ray_casting import PixelRays

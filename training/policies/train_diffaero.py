@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from splatpilot.systems.policies import diffaero
-from splatpilot.systems.policies.observations import (
+from splatpilot.systems.policies.base import (
     heading_frame,
     heading_observation,
     inverse_depth,

@@ -14,8 +14,8 @@ from torch import Tensor, nn
 
 from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.common.validation import bounded
+from splatpilot.systems.policies.base import heading_frame, inverse_depth
 from splatpilot.systems.policies.checkpoint import PolicyCheckpoint
-from splatpilot.systems.policies.convolutions import LEAK
 from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK, MAX_DEPTH, MIN_DEPTH
 from splatpilot.systems.policies.diffaero_rgb import (
     DIFFAERO_RGB_NETWORK,
@@ -26,7 +26,7 @@ from splatpilot.systems.policies.diffaero_rgb import (
     rays_B,
     require_view,
 )
-from splatpilot.systems.policies.observations import heading_frame, inverse_depth
+from splatpilot.systems.policies.networks import LEAK
 from splatpilot.systems.policies.student import encode_color
 from splatpilot.systems.sensing.noise import ObservationNoise
 from splatpilot.systems.vehicle.state import rotation_matrices

@@ -23,14 +23,19 @@ from splatpilot.diagrams.worlds.appearance import randomize_appearance
 from splatpilot.diagrams.worlds.scene_folder import gaussians_file
 from splatpilot.diagrams.worlds.world_registry import make_world, scene_config
 from splatpilot.systems.common.progress import Progress
-from splatpilot.systems.common.seeds import VALIDATION_SEEDS, first_training_seed
+from splatpilot.systems.common.provenance import VALIDATION_SEEDS, first_training_seed
 from splatpilot.systems.common.validation import bounded
+from splatpilot.systems.policies.base import (
+    heading_frame,
+    heading_observation,
+    inverse_depth,
+    limit_smoothly,
+)
 from splatpilot.systems.policies.checkpoint import (
     PolicyCheckpoint,
     checkpoint_policy,
     shipped_weights,
 )
-from splatpilot.systems.policies.convolutions import LEAK
 from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK, MAX_DEPTH, MIN_DEPTH
 from splatpilot.systems.policies.diffaero_rgb import (
     DIFFAERO_RGB_NETWORK,
@@ -40,12 +45,7 @@ from splatpilot.systems.policies.diffaero_rgb import (
     DistilledRgbConfig,
     rays_B,
 )
-from splatpilot.systems.policies.observations import (
-    heading_frame,
-    heading_observation,
-    inverse_depth,
-    limit_smoothly,
-)
+from splatpilot.systems.policies.networks import LEAK
 from splatpilot.systems.policies.student import encode_color
 from splatpilot.systems.sensing.noise import ObservationNoise
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera

@@ -25,8 +25,12 @@ from splatpilot.systems.collision.shapes import AnalyticDistanceField, HalfSpace
 from splatpilot.systems.common.config import dump_config
 from splatpilot.systems.common.files import cache_folder, require_writable_folder
 from splatpilot.systems.common.progress import Progress
-from splatpilot.systems.common.provenance import program
-from splatpilot.systems.common.seeds import SEEDS_PER_RUN, VALIDATION_SEEDS, first_training_seed
+from splatpilot.systems.common.provenance import (
+    SEEDS_PER_RUN,
+    VALIDATION_SEEDS,
+    first_training_seed,
+    program,
+)
 from splatpilot.systems.common.validation import Config, bounded
 from splatpilot.systems.policies.time_of_arrival import TimeOfArrival, time_of_arrival
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS

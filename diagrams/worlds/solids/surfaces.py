@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from splatpilot.systems.splats.scene import GaussianScene
+from splatpilot.systems.splats.scene import GaussianScene, concatenated
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,9 +86,8 @@ def to_gaussians(surfels: Surfels, colors: ArrayLike, opacity: ArrayLike) -> Gau
 
 
 def merge(scenes: list[GaussianScene]) -> GaussianScene:
-    """Joins scenes of one degree of spherical harmonics."""
-    names = ("means", "quats", "scales", "opacities", "sh")
-    return GaussianScene(*(np.concatenate([getattr(s, n) for s in scenes]) for n in names))
+    """Joins scenes."""
+    return GaussianScene(*concatenated(scenes))
 
 
 def perpendicular(d: ArrayLike) -> NDArray[np.float64]:

@@ -15,7 +15,7 @@ from splatpilot.diagrams.flight.sensors import make_onboard_camera
 from splatpilot.diagrams.flight.simulation import fly
 from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.common.config import load_config
-from splatpilot.systems.sensing.depth_sensors import Stereo
+from splatpilot.systems.sensing.imaging import Stereo
 from splatpilot.systems.sensing.noise import ObservationNoise
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.sensing.time_of_flight import equivalent_sensor, time_of_flight_grid

@@ -16,11 +16,15 @@ from pydrake.systems.sensors import ImageDepth32F
 
 from splatpilot.diagrams.flight.flight_diagram import AddFlight, BuildFlightDiagram
 from splatpilot.diagrams.flight.monitor import Outcome
-from splatpilot.diagrams.flight.monte_carlo import random_flights
 from splatpilot.diagrams.flight.policies import POLICIES, policy_named
 from splatpilot.diagrams.flight.scenario import Scenario, sample_initial_state
 from splatpilot.diagrams.flight.sensors import SENSORS, SensorEntry
-from splatpilot.diagrams.flight.simulation import FlightError, fly, make_flight_simulator
+from splatpilot.diagrams.flight.simulation import (
+    FlightError,
+    fly,
+    make_flight_simulator,
+    random_flights,
+)
 from splatpilot.diagrams.worlds.world_registry import WORLDS, make_world
 from splatpilot.systems.common.config import dump_config, load_config, parse_config
 from splatpilot.systems.common.validation import Config

@@ -8,11 +8,10 @@ from pydrake.common import RandomGenerator
 from pydrake.systems.analysis import MonteCarloSimulation
 
 from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
-from splatpilot.diagrams.flight.monte_carlo import random_flights
 from splatpilot.diagrams.flight.policies import policy_named
 from splatpilot.diagrams.flight.scenario import Scenario, sample_initial_state
-from splatpilot.diagrams.flight.simulation import fly
-from splatpilot.systems.common.seeds import MONTE_CARLO_SEEDS
+from splatpilot.diagrams.flight.simulation import fly, random_flights
+from splatpilot.systems.common.provenance import MONTE_CARLO_SEEDS
 from splatpilot.systems.vehicle.quadrotor import QuadrotorPlant
 
 

@@ -3,10 +3,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from splatpilot.diagrams.flight.scenario import Scenario
-from splatpilot.diagrams.gym.rewards import Reward, Transition
 from splatpilot.diagrams.gym.spaces import (
     OBSERVATIONS,
     FlightEnvConfig,
+    Reward,
+    Transition,
     Vehicles,
     action_space,
     decisions,

@@ -6,7 +6,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
 from splatpilot.diagrams.hardware.real_time import MAX_LAG, run_in_real_time
-from splatpilot.systems.messaging.bridge_status import UnixClock
+from splatpilot.systems.messaging.lcm_ports import UnixClock
 
 
 class Worker(LeafSystem):

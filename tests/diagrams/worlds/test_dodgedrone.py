@@ -5,7 +5,7 @@ from pydrake.math import RigidTransform
 from splatpilot.diagrams.flight.scenario import Scenario, sample_initial_state
 from splatpilot.diagrams.flight.sensors import make_onboard_camera
 from splatpilot.diagrams.scenarios import scenario_file
-from splatpilot.diagrams.worlds import dodgedrone
+from splatpilot.diagrams.worlds import moving_spheres as dodgedrone
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.common.config import load_config

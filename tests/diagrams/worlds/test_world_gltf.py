@@ -18,8 +18,7 @@ from pydrake.geometry import (
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageRgba8U
 
-from splatpilot.diagrams.worlds.solids.solid import Solid, WorldSpec
-from splatpilot.diagrams.worlds.solids.surfels import build
+from splatpilot.diagrams.worlds.solids.solid import Solid, WorldSpec, build
 from splatpilot.diagrams.worlds.solids.textures import Daylight, Sunlight
 from splatpilot.diagrams.worlds.world_gltf import write_gltf
 from splatpilot.systems.collision.shapes import Box, Capsule, Cylinder, HalfSpace, Sphere

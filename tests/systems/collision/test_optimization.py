@@ -4,7 +4,7 @@ from pydrake.autodiffutils import ExtractGradient, InitializeAutoDiff
 from pydrake.planning import DirectCollocation
 from pydrake.solvers import IpoptSolver, MathematicalProgram, SnoptSolver
 
-from splatpilot.systems.collision.optimization import AddBarrierCost, AddClearanceConstraint
+from splatpilot.systems.collision.esdf_collision import AddBarrierCost, AddClearanceConstraint
 from splatpilot.systems.collision.shapes import AnalyticDistanceField, Sphere
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS, QuadrotorPlant, hover_state
 

@@ -2,7 +2,7 @@ from itertools import combinations
 
 import pytest
 
-from splatpilot.systems.common.seeds import (
+from splatpilot.systems.common.provenance import (
     MONTE_CARLO_SEEDS,
     SEEDS_PER_RUN,
     STUDY_SEEDS,

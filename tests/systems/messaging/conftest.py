@@ -5,9 +5,8 @@ import pytest
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
-from splatpilot.systems.messaging.bridge_status import UnixClock
 from splatpilot.systems.messaging.codecs import Codec
-from splatpilot.systems.messaging.lcm_ports import MessageSubscriber
+from splatpilot.systems.messaging.lcm_ports import MessageSubscriber, UnixClock
 
 EPOCH = 1_800_000_000.25  # [s]
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from splatpilot.systems.messaging.bridge_status import BridgeStatus, UnixClock
+from splatpilot.systems.messaging.lcm_ports import BridgeStatus, UnixClock
 
 
 @pytest.mark.parametrize(

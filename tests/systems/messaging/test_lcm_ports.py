@@ -13,8 +13,8 @@ from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantVectorSource
 
 from splatpilot.systems.messaging import lcm_ports
-from splatpilot.systems.messaging.bridge_status import UnixClock
 from splatpilot.systems.messaging.codecs import CommandCodec, DepthGridCodec
+from splatpilot.systems.messaging.lcm_ports import UnixClock
 
 EPOCH = 1_800_000_000.25  # [s], also of the listener.
 CHANNEL = CommandCodec.channel

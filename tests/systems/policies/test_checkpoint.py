@@ -7,7 +7,7 @@ import pytest
 
 from splatpilot.systems.policies.checkpoint import PolicyCheckpoint
 from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK
-from splatpilot.systems.policies.recurrent_network import RecurrentNetwork, load_network
+from splatpilot.systems.policies.networks import RecurrentNetwork, load_network
 from splatpilot.systems.policies.student import load_network as load_student
 
 

@@ -1,6 +1,6 @@
 import numpy as np
 
-from splatpilot.systems.policies.convolutions import (
+from splatpilot.systems.policies.networks import (
     Convolution,
     convolution_shapes,
     opencv_net,

@@ -217,10 +217,10 @@ def test_lattice_frame(direction):
 def test_selection_falls_back_to_the_most_distant():
     positions = np.array([0.0, 0.01, 0.02, 1.0, 0.03])[:, None, None] * np.ones((5, 4, 3))
     costs = np.array([1.0, 2.0, 3.0, 9.0, 4.0])
-    np.testing.assert_array_equal(select_distinct(positions, costs, 3, 0.35), [0, 4, 3])
-    np.testing.assert_array_equal(select_distinct(positions, costs, 5, 0.35), [0, 1, 2, 4, 3])
+    np.testing.assert_array_equal(select_distinct(positions, costs, 3, 0.35)[0], [0, 4, 3])
+    np.testing.assert_array_equal(select_distinct(positions, costs, 5, 0.35)[0], [0, 1, 2, 4, 3])
     alike = np.zeros((3, 4, 3))
-    np.testing.assert_array_equal(select_distinct(alike, costs[:3], 3, 0.35), [0, 1, 2])
+    np.testing.assert_array_equal(select_distinct(alike, costs[:3], 3, 0.35)[0], [0, 1, 2])
 
 
 def test_level_acceleration():

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from splatpilot.systems.policies.observations import inverse_depth, pool_depth, target_velocity
+from splatpilot.systems.policies.base import inverse_depth, pool_depth, target_velocity
 
 
 def test_pooling_keeps_the_minimum():

@@ -37,7 +37,7 @@ def test_nearest_points_are_those_of_single_pixels():
 def test_responses_solve_the_tracking_equation():
     p, v = np.array([1.0, 2.0, 3.0]), np.array([2.0, 0.0, -1.0])
     desired = np.array([0.0, 1.0, 1.0])
-    positions = responses(p, v, desired[None], horizon=1.5)[0]
+    positions = responses(p, v, desired[None])[0]
     step, expected = 1e-4, []
     for k in range(1, 15001):
         v = v + step * (desired - v) / RESPONSE_TIME
@@ -59,7 +59,7 @@ def test_seen_is_inside_the_image_and_before_its_depth():
 def cost_of(points_W, velocities, seen=True):
     p_WB, v_WB, p_WG = np.zeros(3), np.array([2.0, 0, 0]), np.array([10.0, 0, 0])
     velocities = np.array(velocities, dtype=float)
-    positions = responses(p_WB, v_WB, velocities, CONFIG.horizon)
+    positions = responses(p_WB, v_WB, velocities)
     known = np.full(positions.shape[:2], seen)
     points_W = np.reshape(points_W, (-1, 3))
     return candidate_costs(
@@ -78,15 +78,16 @@ def test_contact_and_the_unseen_cost():
     (seen,), _ = cost_of([], [ahead])
     far = positions[0, :, 0] > 0.6
     steps = np.diff(positions[0, :, 0], prepend=0.0)
-    assert unseen - seen == pytest.approx(CONFIG.unseen_weight * steps[far].sum())
+    assert unseen - seen == pytest.approx(2.0 * steps[far].sum())
 
 
 def test_candidates_are_those_of_the_planner():
-    angles = {"max_yaw": 0.7, "max_pitch": 0.2, "num_yaws": 5, "num_pitches": 3}
-    v = candidate_velocities(np.array([1.0, 0.0, 0.0]), ReactiveConfig(**angles))
+    yaw, pitch = np.deg2rad([100.0, 25.0])
+    angles = {"max_yaw": yaw, "max_pitch": pitch, "num_yaws": 17, "num_pitches": 3}
+    v = candidate_velocities(np.array([1.0, 0.0, 0.0]), CONFIG)
     lattice = final_velocities(LatticeConfig(**angles))
     np.testing.assert_allclose(v, CONFIG.speed * lattice, atol=1e-12)
-    assert np.arctan2(v[:, 1], v[:, 0]).max() == pytest.approx(0.7)
+    assert np.arctan2(v[:, 1], v[:, 0]).max() == pytest.approx(yaw)
 
 
 def observe(depth: np.ndarray, yaw: float, p_WG: list[float]) -> Observation:
@@ -124,7 +125,6 @@ def test_remembers_points_that_are_no_longer_seen():
         ("speed", 0.0),
         ("columns", 15),
         ("memory", 0),
-        ("speed_fractions", [1.5]),
         ("camera", OnboardCamera(width=0)),
     ],
 )

@@ -6,7 +6,7 @@ from pymavlink.quaternion import Quaternion
 from pymavlink.rotmat import Vector3
 from scipy.spatial.transform import Rotation
 
-from splatpilot.systems.px4.frames import pose_from_optitrack, swap_px4, thrust_to_px4
+from splatpilot.systems.px4.mavlink import pose_from_optitrack, swap_px4, thrust_to_px4
 
 NED_FROM_W = Rotation.from_euler("x", 180, degrees=True)
 W_FROM_O = Rotation.from_euler("x", 90, degrees=True)

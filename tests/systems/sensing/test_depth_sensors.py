@@ -2,7 +2,7 @@ import cv2
 import numpy as np
 import pytest
 
-from splatpilot.systems.sensing.depth_sensors import (
+from splatpilot.systems.sensing.imaging import (
     Stereo,
     TimeOfFlightErrors,
     correlated_noise,

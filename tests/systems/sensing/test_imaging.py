@@ -7,8 +7,13 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.sensors import ImageRgba8U
 
-from splatpilot.systems.sensing.depth_sensors import Stereo, TimeOfFlightErrors
-from splatpilot.systems.sensing.imaging import AutoExposure, Compression, Imaging
+from splatpilot.systems.sensing.imaging import (
+    AutoExposure,
+    Compression,
+    Imaging,
+    Stereo,
+    TimeOfFlightErrors,
+)
 from splatpilot.systems.sensing.noise import color_of_light, light_of_color
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera, focal_length
 

@@ -4,8 +4,8 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import LogVectorOutput
 
+from splatpilot.systems.sensing.estimators import InertialFilter, InertialFilterEstimator
 from splatpilot.systems.sensing.imu import ImuSensor, white_noise
-from splatpilot.systems.sensing.inertial_filter import InertialFilter, InertialFilterEstimator
 from splatpilot.systems.vehicle.flatness import FlatnessController
 from splatpilot.systems.vehicle.quadrotor import QuadrotorParams, QuadrotorPlant, hover_state
 from splatpilot.systems.vehicle.state import QuadrotorState

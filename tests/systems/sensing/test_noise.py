@@ -5,7 +5,7 @@ import pytest
 from pydrake.common.value import Value
 from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
-from splatpilot.systems.policies.observations import pool_depth
+from splatpilot.systems.policies.base import pool_depth
 from splatpilot.systems.sensing.noise import (
     ColorNoise,
     DepthNoise,

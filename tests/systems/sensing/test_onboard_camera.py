@@ -1,9 +1,7 @@
 import numpy as np
 import pytest
 
-from splatpilot.diagrams.flight.scenario import Scenario
-from splatpilot.systems.common.config import dump_config, load_config, parse_config
-from splatpilot.systems.policies.reactive import ReactiveConfig
+from splatpilot.systems.common.config import dump_config, parse_config
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 
 
@@ -39,17 +37,3 @@ def test_a_mount_looks_up_and_left(up, left, direction):
     np.testing.assert_allclose(camera.mount().rotation().col(2), direction, atol=1e-12)
     np.testing.assert_array_equal(camera.mount().translation(), [0.1, 0.0, 0.0])
     assert parse_config(OnboardCamera(), dump_config(camera), "text") == camera != OnboardCamera()
-
-
-@pytest.mark.parametrize(
-    ("override", "message"),
-    [
-        ("policy.camera.p_BC=[0, 0, 0]", r"write policy\.camera\.X_BC\.translation"),
-        ("policy.camera.pitch=-20", r"write policy\.camera\.X_BC\.rotation: !Rpy"),
-        ("sensors={down: !OnboardCamera {pitch: -90}}", r"write .*X_BC\.rotation: !Rpy"),
-    ],
-)
-def test_former_fields_name_what_replaces_them(override, message):
-    scenario = Scenario(policy=ReactiveConfig())
-    with pytest.raises(ValueError, match=message):
-        load_config(scenario, overrides=[override])

@@ -13,7 +13,6 @@ from splatpilot.systems.vehicle.wind import (
     Wind,
     dryden_filter,
     dryden_scales,
-    dryden_spectra,
 )
 
 MODERATE = Wind(gusts=15.4, altitude=6.0, airspeed=3.0)
@@ -30,6 +29,16 @@ def sampled(wind, seed, duration):
     return log.FindLog(simulator.get_context()).data()
 
 
+def dryden_spectra(wind: Wind, frequency: np.ndarray) -> np.ndarray:
+    lengths, sigmas = dryden_scales(wind)
+    shape = (3, *[1] * np.ndim(frequency))
+    T, variance = (lengths / wind.airspeed).reshape(shape), (sigmas**2).reshape(shape)
+    square = (T * frequency) ** 2
+    spectra = variance * T / np.pi * (1.0 + 3.0 * square) / (1.0 + square) ** 2
+    spectra[0] = (variance * 2.0 * T / np.pi / (1.0 + square))[0]
+    return spectra
+
+
 def test_scales_are_those_of_the_specification():
     # At 1000 feet: level is 1, lengths are 1000 feet and deviations a tenth of the wind at 20 feet.
     lengths, sigmas = dryden_scales(Wind(gusts=10.0, altitude=304.8))
@@ -39,13 +48,6 @@ def test_scales_are_those_of_the_specification():
     lengths, sigmas = dryden_scales(Wind(gusts=15.4, altitude=6.096))
     np.testing.assert_allclose(lengths, [43.77, 43.77, 6.096], rtol=2e-3)
     np.testing.assert_allclose(sigmas, [2.971, 2.971, 1.54], rtol=2e-3)
-
-
-@pytest.mark.parametrize("axis", range(3))
-def test_spectra_integrate_to_the_variance(axis):
-    frequency = np.geomspace(1e-5, 1e5, 100_001)
-    integral = np.trapezoid(dryden_spectra(MODERATE, frequency)[axis], frequency)
-    assert integral == pytest.approx(dryden_scales(MODERATE)[1][axis] ** 2, rel=1e-3)
 
 
 def test_the_filter_has_the_spectra_within_5_percent_over_three_decades():

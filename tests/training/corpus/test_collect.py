@@ -12,8 +12,7 @@ from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.esdf_build import esdf_from_distance_field, esdf_from_occupancy
 from splatpilot.systems.collision.shapes import AnalyticDistanceField, Cylinder, HalfSpace
 from splatpilot.systems.common.config import load_config
-from splatpilot.systems.common.provenance import InfeasibleFlightError
-from splatpilot.systems.common.seeds import TRAINING_SEEDS
+from splatpilot.systems.common.provenance import TRAINING_SEEDS, InfeasibleFlightError
 from splatpilot.systems.policies.hypotheses import Hypotheses
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.splats.scene import GaussianScene

@@ -14,7 +14,7 @@ from splatpilot.diagrams.worlds.scene_folder import (
 from splatpilot.diagrams.worlds.splits import load_test_sources
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.esdf_build import esdf_from_occupancy
-from splatpilot.systems.common.seeds import SEEDS_PER_RUN, TRAINING_SEEDS, VALIDATION_SEEDS
+from splatpilot.systems.common.provenance import SEEDS_PER_RUN, TRAINING_SEEDS, VALIDATION_SEEDS
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.training.corpus.library import (
     LibraryConfig,

@@ -6,7 +6,7 @@ from splatpilot.systems.policies import diffaero_rgb, student
 from splatpilot.systems.policies.agile_autonomy import AGILE_NETWORK, TrajectoryNetwork
 from splatpilot.systems.policies.checkpoint import PolicyCheckpoint, shipped_weights
 from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK
-from splatpilot.systems.policies.recurrent_network import leaky_relu
+from splatpilot.systems.policies.networks import leaky_relu
 from splatpilot.training.policies.export import export
 
 

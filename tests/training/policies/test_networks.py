@@ -4,7 +4,7 @@ import torch
 from pydrake.math import RollPitchYaw
 
 from splatpilot.systems.policies import agile_autonomy, base, depthnav, diffaero
-from splatpilot.systems.policies.recurrent_network import RecurrentNetwork
+from splatpilot.systems.policies.networks import RecurrentNetwork
 from splatpilot.systems.policies.velocity import tracking_acceleration
 from splatpilot.systems.sensing.time_of_flight import equivalent_sensor, time_of_flight_grid
 from splatpilot.systems.vehicle.state import QuadrotorState, pose_from_state

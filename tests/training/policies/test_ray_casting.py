@@ -16,7 +16,7 @@ from splatpilot.systems.collision.shapes import (
     ShapeUnion,
     Sphere,
 )
-from splatpilot.systems.policies.observations import pool_depth
+from splatpilot.systems.policies.base import pool_depth
 from splatpilot.training.policies.ray_casting import EsdfGeometry, Grids, PixelRays, ShapeGeometry
 
 LOWER, UPPER = np.array([0.0, -8.0, 0.0]), np.array([20.0, 8.0, 6.0])

@@ -18,7 +18,7 @@ from splatpilot.diagrams.flight.policies import policy_named
 from splatpilot.systems.common.config import load_config
 from splatpilot.systems.common.files import claim_folder
 from splatpilot.systems.common.progress import CheckpointClock
-from splatpilot.systems.common.seeds import TRAINING_SEEDS
+from splatpilot.systems.common.provenance import TRAINING_SEEDS
 from splatpilot.systems.policies import checkpoint as policy_checkpoint
 from splatpilot.systems.policies.checkpoint import PolicyCheckpoint, checkpoint_policy
 from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK

@@ -5,8 +5,7 @@ import pytest
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
-from splatpilot.diagrams.worlds.solids.solid import Solid, WorldSpec
-from splatpilot.diagrams.worlds.solids.surfels import draw
+from splatpilot.diagrams.worlds.solids.solid import Solid, WorldSpec, draw
 from splatpilot.systems.collision.shapes import Box, Capsule, Cylinder, Shape, ShapeUnion, Sphere
 from splatpilot.systems.splats.baked_scene import BakedScene
 
