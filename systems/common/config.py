@@ -81,7 +81,9 @@ def registry_field(registry: Registry, default: Callable[[], Any]) -> Any:
 
 
 def load_config[Configuration](
-    defaults: Configuration, path: Path | None = None, overrides: Sequence[str] | None = None
+    defaults: Configuration,
+    path: str | Path | None = None,
+    overrides: Sequence[str] | None = None,
 ) -> Configuration:
     """Reads a configuration file and applies overrides of single fields.
 
@@ -94,7 +96,7 @@ def load_config[Configuration](
     Raises:
         ValueError: naming the file or override, and the field with its likely spelling.
     """
-    config = defaults if path is None else parse_config(defaults, read_text(path), str(path))
+    config = defaults if path is None else parse_config(defaults, read_text(Path(path)), str(path))
     for override in overrides or ():
         name, equals, value = override.partition("=")
         require(equals, "an override", "FIELD=VALUE", repr(override))
