@@ -35,7 +35,17 @@ from splatpilot.training.captures.capture_config import CaptureConfig
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
-PAGES = [*sorted(ROOT.glob("*.md")), *sorted(DOCS.glob("*.md")), results.REPORT / "index.md"]
+GUIDES = sorted(DOCS.glob("*.md"))
+PAGES = [*sorted(ROOT.glob("*.md")), *GUIDES, *sorted((DOCS / "tutorials").glob("*.md"))]
+PAGES.append(results.REPORT / "index.md")
+FLOORS = "systems", "diagrams", "training", "analysis"
+FOREIGN_MESSAGES = {
+    "CMAKE_CXX_COMPILER not set",
+    "externally-managed-environment",
+    "Failed to establish a new connection",
+    "Could not resolve host",
+    "No space left on device",
+}
 IMAGE = re.compile(r"!\[[^]]*\]\(([^)]+)\)")
 
 
@@ -138,7 +148,7 @@ def test_files_are_configurations(page, tmp_path):
 
 @pytest.mark.parametrize(
     "page",
-    [p for p in PAGES if blocks(p, "python") and p.name != "README.md"],
+    [p for p in GUIDES if blocks(p, "python")],
     ids=lambda page: page.stem,
 )
 def test_python_runs(page, monkeypatch):
@@ -169,6 +179,20 @@ def test_links_lead_somewhere(page):
             continue
         assert target.exists(), link
         assert not anchor or anchor in _anchors(target), link
+
+
+def test_messages_of_troubleshooting_are_those_of_the_source():
+    files = [file for floor in FLOORS for file in (ROOT / floor).rglob("*.py")]
+    source = "\n".join(file.read_text() for file in [*files, ROOT / "Makefile"])
+    source = re.sub(r'"\n\s*f?"', "", source)  # joins the parts of strings
+    page = (ROOT / "docs" / "troubleshooting.md").read_text()
+    lists = re.findall(r"^- ((?:`[^`]+`(?:,\s+)?)+):", page, re.MULTILINE)
+    messages = {message for found in lists for message in re.findall("`([^`]+)`", found)}
+    assert FOREIGN_MESSAGES < messages and len(messages) >= 20
+    for message in messages - FOREIGN_MESSAGES:
+        # Between values, and between the words of `require`.
+        for part in re.split(r"\b(?:[A-Z]{2,}|N)\b|must be |, got ", message):
+            assert part.strip(" :") in source, message
 
 
 def test_every_picture_has_its_command():

@@ -1,5 +1,6 @@
-"""Follows each tutorial in an empty folder: its commands and its Python, in order, with less of what
-is slow (`SMALLER`). Then all that its text promises in `out/` must be there."""
+"""Follows each tutorial in an empty folder, command by command, with smaller sizes (`SMALLER`).
+
+Text blocks of a page must be printed, and files of its text in `out/` must exist."""
 
 import os
 import re
@@ -27,9 +28,9 @@ SMALL_WORLD = "--set world.length=9"
 SMALLER = {
     "first_flight": {
         "git clone REPOSITORY splatpilot && cd splatpilot\n": "",
-        "make fly\n": f"splatpilot fly --out out/fly {SMALL_WORLD}\n",
         ". .venv/bin/activate\n": "",
         "splatpilot fly --": "splatpilot fly --set timeout=1 --",
+        "make fly\n": f"splatpilot fly --out out/fly {SMALL_WORLD}\n",
     },
     "own_policy": {
         " fly --": f" fly {SMALL_WORLD} --set timeout=12 --",
@@ -38,11 +39,9 @@ SMALLER = {
     },
     "own_environment": {
         "UV_TORCH_BACKEND=cpu make .venv/installed\n": "",
-        "0.7,1.4 7.5,0.7": "0.7,1.4 4,0.7",
-        "[0,40,-40]": "[0,40]",
-        "36_left": "10_left",
-        "distance=6": "distance=2.5",
-        "--iterations 2000": "--iterations 20 --set voxel_size=0.2",
+        "spacing=0.5": "spacing=1",
+        "36_left": "18_left",
+        "--iterations 2000": "--iterations 100 --set voxel_size=0.1",
         "fly --scene out/scene": "fly --scene out/scene --set timeout=1",
     },
     "training": {
@@ -72,6 +71,7 @@ SMALLER = {
         "timeout 15 splatpilot hardware bridge": "splatpilot hardware bridge --set timeout=1",
         "--scenario P02 --policy diffaero": f"--scenario P02 --policy diffaero {SMALL_WORLD}",
         "--log": "--set timeout=2 --log",
+        "--patience 60": "--patience 300",
         "trials=10": "trials=1",
         "10 of 10 trials were": "1 of 1 trials were",
     },
