@@ -33,7 +33,7 @@ SMALLER = {
         "make fly\n": f"splatpilot fly --out out/fly {SMALL_WORLD}\n",
     },
     "own_policy": {
-        " fly --": f" fly {SMALL_WORLD} --set timeout=12 --",
+        "sidestep fly": f"sidestep fly {SMALL_WORLD}",
         "P01,P02 --seeds 5": f"P02 --seeds 1 --jobs 1 {SMALL_WORLD}",
         "P02-sidestep-2-003": "P02-sidestep-2-000",
     },
@@ -64,8 +64,8 @@ SMALLER = {
         "2.4,3,4 --seeds 5": f"3,4 --seeds 1 --jobs 1 {SMALL_WORLD}",
     },
     "crash": {
-        "--seeds 5": "--seeds 2 --jobs 1 --set world.length=18",
-        "--seed 1 --live": "--seed 1 --set timeout=1 --live",
+        "--seeds 5": "--seeds 1 --jobs 1",
+        "--seed 0 --live": "--seed 0 --set timeout=1 --live",
     },
     "to_hardware": {
         "timeout 15 splatpilot hardware bridge": "splatpilot hardware bridge --set timeout=1",
