@@ -21,7 +21,6 @@ from stable_baselines3 import PPO
 from splatpilot.analysis.commands.checks import SCENARIOS
 from splatpilot.analysis.commands.main import main
 from splatpilot.analysis.commands.options import read_scenario
-from splatpilot.analysis.output import write_csv
 from splatpilot.diagrams.flight.policies import POLICIES, policy_named
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.flight.sensors import SENSORS
@@ -30,6 +29,7 @@ from splatpilot.diagrams.hardware.px4 import Px4Config
 from splatpilot.diagrams.worlds.world_registry import WORLDS
 from splatpilot.systems.common.config import load_config
 from splatpilot.systems.common.field_help import describe_fields
+from splatpilot.systems.common.files import write_csv
 from splatpilot.systems.visualization.live import LiveControls
 from splatpilot.training.captures.capture_config import CaptureConfig
 

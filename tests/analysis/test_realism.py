@@ -1,6 +1,7 @@
 import pytest
 
 from splatpilot.analysis import realism
+from splatpilot.analysis.benchmark import run_study
 from splatpilot.analysis.benchmark.study_folder import StudyFolder
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.systems.common.config import load_config
@@ -36,8 +37,8 @@ def test_conditions_are_compared_within_one_revision(tmp_path, monkeypatch):
     def run(config, out, **_):
         out.mkdir()
         StudyFolder(out).record(config, {"splatpilot": f"revision of {out.name}"})
-        return realism.run_study.Flown([flight(0, True)], [])
+        return run_study.Flown([flight(0, True)], [])
 
-    monkeypatch.setattr(realism.run_study, "run", run)
+    monkeypatch.setattr(run_study, "run", run)
     with pytest.raises(ValueError, match=r"realistic must be revision of ideal, got"):
         realism.run(out=tmp_path, policies=["planner"], seeds=1, effect_seeds=0)

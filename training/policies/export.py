@@ -23,11 +23,11 @@ from splatpilot.systems.policies.depthnav import DEPTHNAV_NETWORK
 from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK
 from splatpilot.systems.policies.diffaero_rgb import CHANNELS, HEIGHT, WIDTH
 from splatpilot.training.policies.networks import (
+    StudentModule,
     TrainableNetwork,
     TrajectoryModule,
     load_weights,
 )
-from splatpilot.training.policies.student_network import StudentModule
 from splatpilot.training.policies.train_distilled_rgb import DistilledRgbModule
 
 _RECURRENT = {
