@@ -40,7 +40,7 @@ from splatpilot.analysis.benchmark.tables import (
     cluster_interval,
     wilson_interval,
 )
-from splatpilot.analysis.fidelity.study import band
+from splatpilot.analysis.reconstruction.fidelity import band
 from splatpilot.analysis.twin import predictions
 from splatpilot.diagrams.scenarios import benchmark_scenarios
 from splatpilot.systems.common.provenance import describe_seeds
