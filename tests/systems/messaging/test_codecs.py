@@ -84,7 +84,7 @@ def test_fields_have_their_values(codec, fields):
 
 def test_plans_keep_their_time_between_clocks():
     message = sent(PLAN)
-    assert message.waypoints_P[1][0] == list(SIGNALS[PLAN][8 + 30 : 8 + 33])
+    assert message.waypoints_P[1][0] == tuple(SIGNALS[PLAN][8 + 30 : 8 + 33])
     assert PLAN.unpack(message, epoch=EPOCH - 100.0)[0] == pytest.approx(102.5, abs=1e-6)
 
 
