@@ -49,7 +49,7 @@ ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "docs" / "results"
 REPORT = ROOT / "docs" / "report"
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), REPORT / "index.md"]
-STUDY = "development"
+STUDY = "test"
 """The study of the report: development or test."""
 
 TABLE = re.compile(r"(<!-- table (\w+) (\w+) -->\n).*?(<!-- end of table -->)", re.DOTALL)
@@ -195,8 +195,7 @@ def success() -> Iterable[Row]:
 
 def success_rows(results: Results) -> Iterable[Row]:
     """Yields success rates with intervals, and means over feasible flights, by policy and speed;
-    and the paper's, if all of its scenarios were flown."""
-    complete = set(benchmark_scenarios()) <= set(results.scenarios)
+    and the paper's."""
     for policy, speed in results.entries:
         rows = [row for row in results.rows if (row["policy"], row["speed"]) == (policy, speed)]
         counts = [(row["successes"], row["flights"]) for row in rows]
@@ -222,7 +221,7 @@ def success_rows(results: Results) -> Iterable[Row]:
             "clearance_m": total(rows, "clearance_sum_m") / flown if flown else np.nan,
             "speed_m_s": total(rows, "speed_sum_m_s") / flown if flown else np.nan,
             **{outcome: total(rows, outcome) for outcome in _OUTCOMES},
-            **(_paper_row(policy) if complete and policy in PAPER else {}),
+            **(_paper_row(policy) if policy in PAPER else {}),
         }
 
 
