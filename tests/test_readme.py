@@ -38,7 +38,7 @@ def test_its_python_runs(tmp_path, monkeypatch, capsys):
 
 
 def test_extras_are_those_of_the_package():
-    listed = re.search(r"Extras: .*?\n\n", README.read_text(), re.DOTALL)
+    listed = re.search(r"Extras:.*?\n\n", README.read_text(), re.DOTALL)
     assert listed is not None
     project = tomllib.loads((README.parent / "pyproject.toml").read_text())["project"]
     extras = set(project["optional-dependencies"]) - {"dev"}
