@@ -30,6 +30,7 @@ _USES = {
     "lerobot": "`splatpilot corpus export`",
     "mesh": "`splatpilot scene mesh`",
     "mocap": "OptiTrack in `splatpilot hardware px4`",
+    "onnx": "networks of policies as ONNX",
     "photos": "photographs without poses, and COLMAP models",
     "px4": "`splatpilot hardware px4`",
     "rerun": "`splatpilot fly --rerun`",
