@@ -2,12 +2,14 @@
 
 import heapq
 import json
+import logging
 import math
 import socket
 import struct
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
-from functools import cache, partial
+from functools import partial
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, cast
 
@@ -17,7 +19,7 @@ from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
 from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, LeafSystem
 from scipy.spatial.transform import Rotation
 
-from splatpilot.diagrams.flight.blocks import make_policy
+from splatpilot.diagrams.flight.blocks import decision_port, make_policy
 from splatpilot.diagrams.flight.monitor import Outcome, flight_outcome, has_landed
 from splatpilot.diagrams.flight.policies import policy_named
 from splatpilot.diagrams.flight.scenario import Scenario, goal_position, sample_initial_state
@@ -28,6 +30,7 @@ from splatpilot.diagrams.worlds.world import World
 from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.common.drake import vector_input, vector_output, weak_callback
 from splatpilot.systems.common.files import claim_folder, locks_folder, write_text
+from splatpilot.systems.common.processes import available_cores, map_processes
 from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.common.provenance import revision
 from splatpilot.systems.common.validation import Config, bounded, require
@@ -37,6 +40,7 @@ from splatpilot.systems.messaging.flight_limits import FlightLimits
 from splatpilot.systems.messaging.generated import lcmt_bridge_status as status
 from splatpilot.systems.messaging.lcm_ports import PUBLISH_OFFSET, UnixClock
 from splatpilot.systems.messaging.receiver import TimeOfFlightStream, UdpConfig
+from splatpilot.systems.policies.hypotheses import HEADER_SIZE
 from splatpilot.systems.sensing.time_of_flight import GRID_MAGIC
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 from splatpilot.systems.vehicle.state import QuadrotorState, set_state
@@ -58,6 +62,14 @@ PX4_KINDS = (
 )
 """Types of faults by which PX4's failures appear on its link, see `docs/px4.md`; ``_off`` affects
 every message, ``slow`` leaves 2 to 5 messages per second."""
+
+FAULTY_POLICIES = (
+    *("straight", "reactive", "diffaero", "depthnav", "agile_autonomy", "diffaero_tof"),
+    *("student_depth", "student_rgb", "diffaero_rgb", "distilled_rgb"),
+)
+"""Policies that trials alternate between: those for a vehicle, which know no map."""
+
+_TABLES = {"messages": KINDS, "px4": PX4_KINDS}
 
 DELAY = 0.3  # [s] of delayed messages.
 TICK = 0.01  # [s] of both diagrams.
@@ -126,7 +138,7 @@ class Trial:
             kinds.append(int(random.choice([k for k in range(len(table)) if k != kind])))
         faults = tuple(Fault.sample(table[k], random) for k in sorted(kinds))
         needs_grid = any(fault.kind.startswith("grid") for fault in faults)
-        policy = "diffaero_tof" if needs_grid else ("straight", "reactive")[turn // 2 % 2]
+        policy = "diffaero_tof" if needs_grid else FAULTY_POLICIES[turn // 2 % len(FAULTY_POLICIES)]
         return cls(faults, policy, ("velocity", "body_rates")[turn % 2])
 
 
@@ -266,42 +278,45 @@ def _quaternion(rotation: Rotation) -> list[float]:
 
 
 class Nonsense(LeafSystem):
-    """Passes a target (3,), or replaces it by NaN, huge values or an exception during faults."""
+    """Passes a decision, or replaces it by NaN, huge values or an exception during faults."""
 
-    def __init__(self, faults: tuple[Fault, ...]) -> None:
+    def __init__(self, faults: tuple[Fault, ...], size: int) -> None:
         super().__init__()
         self._faults = faults
-        self.DeclareVectorInputPort("sense", 3)
-        self.DeclareVectorOutputPort("decision", 3, self._calc)
+        self.DeclareVectorInputPort("sense", size)
+        self.DeclareVectorOutputPort("decision", size, self._calc)
 
     def _calc(self, context: Context, output: BasicVector) -> None:
-        target = vector_input(self, "sense", context)
+        decision = np.array(vector_input(self, "sense", context))
+        start = HEADER_SIZE if len(decision) > HEADER_SIZE else 0  # hypotheses without time: none
         for fault in self._faults:
             if fault.kind == "policy_raises" and fault.is_on(context.get_time()):
                 raise RuntimeError("the policy fails")
             if fault.kind == "policy_nonsense" and fault.is_on(context.get_time()):
-                target = np.full(3, 1e6 if fault.fraction > 0.65 else np.nan)
-        output.SetFromVector(target)
+                decision[start:] = 1e6 if fault.fraction > 0.65 else np.nan
+        output.SetFromVector(decision)
 
 
 def _faulty_policy(scenario: Scenario, world: World, faults: tuple[Fault, ...]) -> Diagram:
-    """Builds the scenario's policy of accelerations or velocities with `Nonsense` after it."""
+    """Builds the scenario's policy with `Nonsense` after its decision."""
     builder = DiagramBuilder()
     policy = builder.AddNamedSystem("policy", make_policy(scenario, world))
-    nonsense = builder.AddNamedSystem("nonsense", Nonsense(faults))
-    kind = "acceleration" if policy.HasOutputPort("acceleration") else "velocity"
-    builder.Connect(policy.GetOutputPort(kind), nonsense.get_input_port())
+    decision = decision_port(policy)
+    nonsense = builder.AddNamedSystem("nonsense", Nonsense(faults, decision.size()))
+    builder.Connect(decision, nonsense.get_input_port())
     for index in range(policy.num_input_ports()):
         port = policy.get_input_port(index)
         builder.ExportInput(port, port.get_name())
-    builder.ExportOutput(nonsense.get_output_port(), kind)
+    builder.ExportOutput(nonsense.get_output_port(), decision.get_name())
+    if policy.HasOutputPort("heading"):
+        builder.ExportOutput(policy.GetOutputPort("heading"), "heading")
     return builder.Build()
 
 
 def fly_trial(
     scenario: Scenario, world: World, trial: Trial, limits: FlightLimits, seed: int
 ) -> dict[str, Any]:
-    """Flies a scenario, whose policy returns accelerations or velocities, through faults.
+    """Flies a scenario through faults.
 
     Returns the trial; `max_speed` [m/s], `max_tilt` [rad] and, except during landing,
     `min_clearance` [m] and `min_inside` [m], the distance of the collision sphere from the fence;
@@ -421,31 +436,33 @@ class FaultsConfig(Config):
 
 
 @locks_folder("out")
-def run(*, config: FaultsConfig, out: Path) -> dict[str, Any]:
-    """Flies the trials, or resumes an interrupted campaign of the same configuration and program.
+def run(*, config: FaultsConfig, out: Path, jobs: int | None = None) -> dict[str, Any]:
+    """Flies the trials in `jobs` worker processes, one for each core by default, or resumes an
+    interrupted campaign of the same configuration and program.
 
     Writes into `out`: `trials.jsonl`, revision and results of `fly_trial`; `config.yaml`;
     `summary.json`, the number of safe trials and the outcomes by the type of fault, which is also
     returned."""
     config.validate()
+    jobs = available_cores() if jobs is None else jobs
+    require(jobs >= 1, "--jobs", "at least 1", jobs)
     claim_folder(out / "config.yaml", config)
-    table = PX4_KINDS if config.table == "px4" else KINDS
     lines = out / "trials.jsonl"
     rows = [json.loads(line) for line in lines.read_text().splitlines()] if lines.exists() else []
+    flown = {row["seed"] for row in rows}
+    missing = [n for n in range(config.trials) if config.seed + n not in flown]
     flown_by = revision()
-    for row in rows if len(rows) < config.trials else ():
+    for row in rows if missing else ():
         before, remedy = row.get("revision"), "go back to that revision, or choose another --out"
         require(before == flown_by, f"revision of {lines}", flown_by, before, remedy)
-    world_of_seed = cache(lambda seed: make_world(config.scenario.world, seed))
-    for number in Progress(range(len(rows), config.trials), "flying trials", unit="trial"):
-        world = world_of_seed(config.seed + number % config.worlds)
-        trial = Trial.sample(number, np.random.default_rng([config.seed, number]), table)
-        seed, policy = config.seed + number, policy_named(trial.policy, config.speed)
-        scenario = replace(config.scenario, seed=seed, policy=policy)
-        flown = fly_trial(scenario, world, trial, config.limits, seed)
-        rows.append({"revision": flown_by} | flown)
-        write_text(lines, "".join(json.dumps(row) + "\n" for row in rows))
-    summary = summarize(rows, table)
+    bar = Progress(total=config.trials, initial=len(rows), desc="flying trials", unit="trial")
+    with bar:
+        for row in map_processes(partial(_fly, config), missing, jobs):
+            rows.append({"revision": flown_by} | row)
+            rows.sort(key=itemgetter("seed"))
+            write_text(lines, "".join(json.dumps(row) + "\n" for row in rows))
+            bar.update()
+    summary = summarize(rows, _TABLES[config.table])
     write_text(out / "summary.json", json.dumps(summary, indent=2) + "\n")
     print(f"{'fault':<16} {'safe':>9}  ended")
     for kind, row in summary["kinds"].items():
@@ -453,6 +470,25 @@ def run(*, config: FaultsConfig, out: Path) -> dict[str, Any]:
         print(f"{kind:<16} {row['safe']:>4}/{row['trials']:<4}  {ends}")
     print(f"{summary['safe']} of {summary['trials']} trials were safe")
     return summary
+
+
+def _fly(config: FaultsConfig, number: int) -> dict[str, Any]:
+    """Flies the trial of a number."""
+    seed, random = config.seed + number, np.random.default_rng([config.seed, number])
+    world = make_world(config.scenario.world, config.seed + number % config.worlds)
+    trial = Trial.sample(number, random, _TABLES[config.table])
+    policy = policy_named(trial.policy, config.speed)
+    scenario = replace(config.scenario, seed=seed, policy=policy)
+    # Thousands of packets are refused, and policies raise, on purpose.
+    loggers = [logging.getLogger(name) for name in ("drake", "splatpilot")]
+    levels = [logger.level for logger in loggers]
+    try:
+        for logger in loggers:
+            logger.setLevel(logging.CRITICAL)
+        return fly_trial(scenario, world, trial, config.limits, seed)
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
 
 
 def summarize(rows: list[dict[str, Any]], table: tuple[str, ...] = KINDS) -> dict[str, Any]:

@@ -1,7 +1,6 @@
 """`splatpilot fly`, `view` and `hardware`."""
 
 import argparse
-import logging
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -184,6 +183,7 @@ def px4(options: argparse.Namespace) -> None:
     "hardware faults",
     cli.out_option("output folder", "out/faults"),
     cli.CONFIG,
+    cli.JOBS,
     cli.set_option(
         *("trials=30", "seed=1", "scenario.timeout=20"),
         configuration="splatpilot.analysis.faults:FaultsConfig",
@@ -199,13 +199,4 @@ def faults(options: argparse.Namespace) -> None:
     resumes."""
     from splatpilot.analysis.faults import run
 
-    # Thousands of packets are refused, and policies raise, on purpose.
-    loggers = [logging.getLogger(name) for name in ("drake", "splatpilot")]
-    levels = [logger.level for logger in loggers]
-    try:
-        for logger in loggers:
-            logger.setLevel(logging.CRITICAL)
-        run(config=cli.read_config(options), out=options.out)
-    finally:
-        for logger, level in zip(loggers, levels, strict=True):
-            logger.setLevel(level)
+    run(config=cli.read_config(options), out=options.out, jobs=options.jobs)

@@ -155,7 +155,7 @@ def AddPolicyAndController(
         delay: see `DecisionDelay`; adds `delayed_` and the name of each of the policy's outputs.
     """
     add_system(builder, "policy", policy)
-    decision, heading = _decision(policy), None
+    decision, heading = decision_port(policy), None
     if policy.HasOutputPort("heading"):
         heading = policy.GetOutputPort("heading")
     if delay and delay[1] > 0.0:
@@ -183,7 +183,7 @@ def add_system(builder: DiagramBuilder, name: str, system: System) -> None:
         builder.AddNamedSystem(name, system)
 
 
-def _decision(policy: System) -> OutputPort:
+def decision_port(policy: System) -> OutputPort:
     """Returns the policy's hypotheses or decision."""
     if policy.HasOutputPort("hypotheses"):
         return policy.GetOutputPort("hypotheses")

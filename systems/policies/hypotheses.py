@@ -26,19 +26,19 @@ from splatpilot.systems.vehicle.state import QuadrotorState, clip, make_pose
 NUM_WAYPOINTS = 10
 WAYPOINT_PERIOD = 0.1  # [s]
 
-_HEADER = 8  # plan_time, p_WB, q_WB
+HEADER_SIZE = 8  # plan_time, p_WB, q_WB
 
 
 def hypotheses_size(num_hypotheses: int) -> int:
     """Returns the length of the vector of `num_hypotheses` hypotheses."""
     require(num_hypotheses >= 1, "the number of hypotheses", "at least 1", num_hypotheses)
-    return _HEADER + num_hypotheses * (NUM_WAYPOINTS * 3 + 1)
+    return HEADER_SIZE + num_hypotheses * (NUM_WAYPOINTS * 3 + 1)
 
 
 def num_hypotheses_in(size: int) -> int:
     """Returns the number of hypotheses in a vector of this length."""
-    count, rest = divmod(size - _HEADER, NUM_WAYPOINTS * 3 + 1)
-    sizes = f"{_HEADER} + {NUM_WAYPOINTS * 3 + 1} K for K >= 1 hypotheses"
+    count, rest = divmod(size - HEADER_SIZE, NUM_WAYPOINTS * 3 + 1)
+    sizes = f"{HEADER_SIZE} + {NUM_WAYPOINTS * 3 + 1} K for K >= 1 hypotheses"
     require(count >= 1 and not rest, "the size of a hypotheses port", sizes, size)
     return count
 
@@ -103,7 +103,7 @@ class Hypotheses:
         return cls(
             plan_time=vector[0],
             X_WB=make_pose(vector[1:4], vector[4:8]),
-            waypoints_B=vector[_HEADER:-num_hypotheses].reshape(-1, NUM_WAYPOINTS, 3),
+            waypoints_B=vector[HEADER_SIZE:-num_hypotheses].reshape(-1, NUM_WAYPOINTS, 3),
             costs=vector[-num_hypotheses:],
         )
 

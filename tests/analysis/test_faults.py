@@ -10,7 +10,16 @@ import pytest
 from drake import lcmt_header
 
 from splatpilot.analysis.commands.main import main
-from splatpilot.analysis.faults import DELAY, KINDS, Fault, Relay, Trial, fly_trial, summarize
+from splatpilot.analysis.faults import (
+    DELAY,
+    FAULTY_POLICIES,
+    KINDS,
+    Fault,
+    Relay,
+    Trial,
+    fly_trial,
+    summarize,
+)
 from splatpilot.diagrams.flight.policies import policy_named
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.worlds.forest.forest import ForestConfig
@@ -23,6 +32,7 @@ from splatpilot.systems.messaging.codecs import (
     VehicleStatusCodec,
 )
 from splatpilot.systems.messaging.flight_limits import FlightLimits
+from splatpilot.systems.messaging.generated import lcmt_bridge_status
 from splatpilot.systems.vehicle.quadrotor import hover_state
 
 
@@ -146,15 +156,15 @@ def test_grids_travel_as_packets_of_the_sensor(kind, came):
 
 
 def test_faults_interfaces_and_policies_alternate_and_repeat():
-    count = 4 * len(KINDS)
+    count = 2 * len(FAULTY_POLICIES) * len(KINDS)
     trials = [Trial.sample(n, np.random.default_rng([0, n])) for n in range(count)]
     for number, trial in enumerate(trials):
         kinds = [fault.kind for fault in trial.faults]
         assert KINDS[number % len(KINDS)] in kinds and len(set(kinds)) == len(kinds)
         grids = any(kind.startswith("grid") for kind in kinds)
-        assert (trial.policy == "diffaero_tof") == grids
+        assert trial.policy == "diffaero_tof" or not grids
     assert {trial.setpoints for trial in trials} == {"velocity", "body_rates"}
-    assert {trial.policy for trial in trials} == {"straight", "reactive", "diffaero_tof"}
+    assert {trial.policy for trial in trials} == set(FAULTY_POLICIES)
     pairs = sum(len(trial.faults) == 2 for trial in trials)
     assert 0.3 * count < pairs < 0.7 * count
     assert trials[3] == Trial.sample(3, np.random.default_rng([0, 3])) != trials[3 + len(KINDS)]
@@ -191,6 +201,15 @@ def test_a_campaign_is_safe_resumes_and_repeats(tmp_path, set_fields, capsys):
     (again / "trials.jsonl").write_text(json.dumps(json.loads(rows[0]) | {"revision": "other"}))
     assert main([*words, "--out", str(again)]) == 1
     assert "revision of" in capsys.readouterr().err
+
+
+def test_decisions_of_every_kind_are_replaced():
+    world = ForestConfig(length=10.0, width=6.0)
+    for policy in ("diffaero", "agile_autonomy"):  # accelerations and hypotheses
+        scenario = Scenario(world=world, policy=policy_named(policy, 2.0))
+        trial = Trial((Fault("policy_nonsense", 0.5, 0.5, 0.5, 1.0),), policy, "velocity")
+        row = fly_trial(scenario, make_world(world, 0), trial, FlightLimits(max_speed=2.5), 0)
+        assert row["safe"] and lcmt_bridge_status.NOT_FINITE in row["reasons"]
 
 
 def test_accidents_are_counted():
