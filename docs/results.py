@@ -15,6 +15,7 @@ before `<!-- value NAME "ROW" "FORMAT" -->`, where ROW is the text of the first 
 
 import argparse
 import csv
+import hashlib
 import re
 import shlex
 import shutil
@@ -434,8 +435,17 @@ def pdf() -> None:
         )
         tab = browser.new_page()
         tab.goto(html.as_uri())
-        tab.pdf(path=REPORT / "report.pdf", format="A4", prefer_css_page_size=True)
+        printed = tab.pdf(format="A4", prefer_css_page_size=True)
         browser.close()
+    # A comment at the end says which page it is of.
+    (REPORT / "report.pdf").write_bytes(printed + report_digest())
+
+
+def report_digest() -> bytes:
+    """Returns the comment at the end of the PDF: a digest of the page and its figures."""
+    parts = [REPORT / "index.md", *sorted(REPORT.glob("*.svg"))]
+    digest = hashlib.sha256(b"".join(part.read_bytes() for part in parts)).hexdigest()
+    return f"\n% of the page {digest}\n".encode()
 
 
 if __name__ == "__main__":

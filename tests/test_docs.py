@@ -221,6 +221,11 @@ def test_figures_show_the_results(name, figures):
     assert f"({name}.svg)" in (results.REPORT / "index.md").read_text()
 
 
+def test_the_pdf_is_of_the_page():
+    printed = (results.REPORT / "report.pdf").read_bytes()
+    assert printed.startswith(b"%PDF") and printed.endswith(results.report_digest())
+
+
 @pytest.mark.parametrize(
     ("name", "column", "table", "draw"),
     [

@@ -1,11 +1,10 @@
 """Worlds from meshes, drawn by Drake's RenderEngineVtk with holes in textures among them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -28,7 +27,7 @@ from pydrake.geometry import (
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageRgba8U
 
-from splatpilot.diagrams.worlds.feasibility import SHORTEST, choose_ends
+from splatpilot.diagrams.worlds.feasibility import choose_ends
 from splatpilot.diagrams.worlds.mesh import (
     GAMMA,
     CutOuts,
@@ -44,10 +43,11 @@ from splatpilot.diagrams.worlds.solids.surfaces import (
     to_gaussians,
 )
 from splatpilot.diagrams.worlds.world import World
+from splatpilot.diagrams.worlds.world_registry import MeshWorld
 from splatpilot.systems.common.extras import require_opengl
 from splatpilot.systems.common.files import find_data
 from splatpilot.systems.common.readers import readable
-from splatpilot.systems.common.validation import Config, bounded, require, require_field
+from splatpilot.systems.common.validation import require
 from splatpilot.systems.splats.background import BLACK, Background, RenderedView
 from splatpilot.systems.splats.baked_scene import NO_GAUSSIANS, BakedScene, PlacedGaussians
 from splatpilot.systems.splats.lens import Distortion, pixel_slopes
@@ -208,34 +208,10 @@ def _draw(
     )
 
 
-if TYPE_CHECKING:
-    from pydrake.math import RigidTransform
-
 _NEAR, _FAR = 0.02, 500.0  # [m], range of depth in which the mesh is drawn
 _MAX_SLOPE = 4.0  # of rays of a lens, 76 degrees from the axis
 _PREVIEW = 120_000  # number of Gaussians that show the mesh on pages
 _GAP = 1.5  # times the spacing of an even grid, between points drawn at random
-
-
-@dataclass
-class MeshWorld(Config):
-    """An environment as a mesh (.glb, .gltf or .obj) on disk; cameras show the mesh itself."""
-
-    path: str = ""  # here, or in the folder of data (SPLATPILOT_DATA)
-    up: str = bounded("y", "{y, z}")  # axis of the file that points up: y, as glTF says, or z
-    scale: float = bounded(1.0, "(0, inf) m")  # unit of the file
-    # [m] Of the distance field; 0: 0.1 m, or more for 20 million voxels.
-    voxel_size: float = bounded(0.0, "[0, inf) m")
-    # Color of the sky; red, green, blue in 0 to 1.
-    background: list[float] = bounded(lambda: [0.6, 0.75, 0.9], "[0, 1]")
-    # If true, start and goal are drawn from the seed; otherwise a long route decides.
-    draw_ends: bool = False
-    # [m] Minimum length of the shortest route between ends that are drawn.
-    min_path: float = bounded(SHORTEST, "[0, inf) m")
-
-    def check(self) -> None:
-        require_field(self, "path", self.path, "a mesh")
-        require_field(self, "background", len(self.background) == 3, "red, green and blue")
 
 
 def mesh_world(config: MeshWorld, seed: int) -> World:
@@ -273,7 +249,7 @@ class MeshScene(BakedScene):
         K: ArrayLike,
         width: int,
         height: int,
-        X_WC: "RigidTransform",
+        X_WC: RigidTransform,
         near: float = 0.01,
         far: float = 1e10,
         background: Background = BLACK,
@@ -307,7 +283,7 @@ class MeshScene(BakedScene):
         self,
         K: ArrayLike,
         size: tuple[int, int],
-        X_WC: "RigidTransform",
+        X_WC: RigidTransform,
         span: tuple[float, float],
         distortion: Distortion | None,
         with_color: bool,

@@ -2,15 +2,17 @@
 
 import base64
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import trimesh
 
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.common.extras import import_extra
 from splatpilot.systems.common.files import written_atomically
 from splatpilot.systems.common.validation import require
+
+if TYPE_CHECKING:
+    import trimesh  # takes a third of the time of all imports of a flight
 
 SUFFIXES = ".gltf", ".obj"
 
@@ -21,13 +23,15 @@ _FOLD = np.deg2rad(170)
 _MIN_DISTANCE = 0.1  # [voxels] Minimum distance of voxel centers: slivers fold, or tear the mesh
 
 
-def field_mesh(esdf: Esdf, conservative: bool = False) -> trimesh.Trimesh:
+def field_mesh(esdf: Esdf, conservative: bool = False) -> "trimesh.Trimesh":
     """Returns the surface at which a field's distance is 0, normals outwards.
 
     The mesh is watertight: solids end at the faces of the box. Its surface is within half a voxel
     of the field's, with few triangles where that is flat. If `conservative`, unknown space and all
     outside the box are solid too: a shell around free space, a voxel thick at the box's faces.
     """
+    import trimesh
+
     measure = import_extra("skimage.measure", "mesh")
     manifold = import_extra("manifold3d", "mesh")
     field = esdf.conservative() if conservative else esdf
@@ -47,7 +51,7 @@ def field_mesh(esdf: Esdf, conservative: bool = False) -> trimesh.Trimesh:
     require(solid.status() == manifold.Error.NoError, "surface", "closed", solid.status())
     first = 0.5 - (values.shape[0] - esdf.shape[0]) / 2  # [voxels] from the box's corner
 
-    def as_mesh(solid: Any) -> trimesh.Trimesh:
+    def as_mesh(solid: Any) -> "trimesh.Trimesh":
         mesh = solid.to_mesh()
         points = mesh.vert_properties[:, :3].astype(float)
         p_WV = esdf.lower_W + esdf.voxel_size * (points + first)
@@ -69,8 +73,10 @@ def require_mesh_name(path: Path) -> None:
     require(suffix in SUFFIXES, f"{path}: suffix", " or ".join(SUFFIXES), suffix)
 
 
-def write_mesh(path: Path, mesh: trimesh.Trimesh) -> None:
+def write_mesh(path: Path, mesh: "trimesh.Trimesh") -> None:
     """Writes a mesh in world coordinates (z up) atomically: as OBJ, or as glTF (y up)."""
+    import trimesh
+
     require_mesh_name(path)
     if path.suffix.lower() == ".obj":
         data = trimesh.exchange.obj.export_obj(mesh, include_normals=True)  # pyright: ignore
