@@ -1,17 +1,27 @@
 import gc
+import inspect
 import weakref
 
 import numpy as np
 import pytest
+from pydrake.autodiffutils import AutoDiffXd, ExtractGradient, InitializeAutoDiff
 from pydrake.common.value import Value
-from pydrake.systems.framework import DiagramBuilder, LeafSystem
+from pydrake.systems.framework import (
+    DiagramBuilder,
+    LeafSystem,
+    LeafSystem_,  # pyright: ignore[reportAttributeAccessIssue]
+)
 from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
+import splatpilot as sp
 from splatpilot.systems.common.drake import (
     connect,
+    float_values,
     input_port,
+    is_autodiff,
     optional_input,
     output_port,
+    system_template,
     weak_callback,
 )
 
@@ -92,3 +102,121 @@ def test_weak_callbacks_do_not_keep_their_system_alive():
     del system
     gc.collect()
     assert alive() is None
+
+
+@system_template("Power_")
+def Power_(T):
+    class Power(LeafSystem_[T]):
+        """Raises its input to a power."""
+
+        def __init__(self, exponent: float, *, converter=None):
+            super().__init__(converter=converter)
+            self._arguments = (exponent,)
+            self.DeclareVectorInputPort("x", 1)
+            calc = lambda context, y: y.SetFromVector(  # noqa: E731
+                self.get_input_port().Eval(context) ** exponent
+            )
+            self.DeclareVectorOutputPort("y", 1, calc)
+
+    return Power
+
+
+@system_template("Cube_")
+def Cube_(T):
+    class Cube(Power_[T]):
+        def __init__(self, *, converter=None):
+            super().__init__(3.0, converter=converter)
+            self._arguments = ()
+
+    return Cube
+
+
+def output(system, x):
+    context = system.CreateDefaultContext()
+    system.get_input_port().FixValue(context, x)
+    return system.get_output_port().Eval(context)
+
+
+@pytest.mark.parametrize("make", [lambda: Power_[float](3.0), Cube_[float]])
+def test_a_template_converts_with_its_arguments_and_its_name(make):
+    system = make()
+    system.set_name("cube")
+    converted = system.ToAutoDiffXd()
+    assert converted.get_name() == "cube"
+    y = output(converted, InitializeAutoDiff([2.0]).ravel())
+    assert y[0].value() == output(system, [2.0])[0] == 8.0
+    np.testing.assert_allclose(ExtractGradient(y), [[12.0]])
+    assert type(converted) is type(make().ToAutoDiffXd())
+
+
+def test_a_class_has_the_name_and_the_signature_of_its_definition():
+    assert Power_[None].__name__ == "Power"
+    assert str(inspect.signature(Power_[None])) == "(exponent: float)"
+    with pytest.raises(TypeError, match="exponents"):
+        Power_[None](exponents=2.0)  # pyright: ignore[reportCallIssue]
+
+
+def test_a_subclass_is_not_converted_to_its_base():
+    class Other(Power_[None]):
+        pass
+
+    with pytest.raises(RuntimeError, match=r"Other.* does not support scalar conversion"):
+        Other(2.0).ToAutoDiffXd()  # pyright: ignore[reportAttributeAccessIssue]
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "EsdfCollision",
+        "FlatnessController",
+        "HypothesisSelector",
+        "QuadrotorPlant",
+        "StateToPose",
+        "VelocityTracker",
+    ],
+)
+def test_public_systems_are_templates_and_show_their_arguments(name):
+    system, template = getattr(sp, name), getattr(sp, f"{name}_")
+    assert template[None] is template[float] is system
+    assert template[AutoDiffXd] is not system
+    assert "args" not in inspect.signature(system).parameters
+
+
+def test_values_of_autodiff_numbers_keep_their_shape():
+    x = np.arange(6.0).reshape(2, 3)
+    dual = InitializeAutoDiff(x.ravel()).reshape(2, 3)
+    assert is_autodiff(dual) and is_autodiff(dual[0, 0]) and not is_autodiff(x)
+    np.testing.assert_array_equal(float_values(dual), x)
+    assert float_values(dual[1, 2]) == 5.0
+    assert float_values(x) is x
+
+
+GAINS = ["Lookahead", "MinThrust", "MaxThrust", "MaxTilt", "TiltGain", "MaxTiltRate", "YawGain"]
+
+
+@pytest.mark.parametrize(
+    ("system", "names"),
+    [
+        (sp.QuadrotorPlant(), ["Drag", "RateTimeConstant", "Gravity"]),
+        (sp.FlatnessController(), [*GAINS, "MaxYawRate", "YawSpeed", "Drag", "Gravity"]),
+    ],
+)
+def test_setters_change_one_number_of_a_context(system, names):
+    for name in names:
+        context, default = system.CreateDefaultContext(), system.CreateDefaultContext()
+        value = {"Lookahead": 0.75, "MaxThrust": 15.0, "TiltGain": 12.0}.get(name, 1.25)
+        getattr(system, f"Set{name}")(context, value)
+        changed = [
+            (context.get_numeric_parameter(i).value() != default.get_numeric_parameter(i).value())
+            for i in range(context.num_numeric_parameter_groups())
+        ]
+        assert np.concatenate(changed).sum() == 1
+        with pytest.raises(ValueError, match=r"must be in .* got -1\.0"):
+            getattr(system, f"Set{name}")(context, -1.0)
+
+
+def test_a_setter_checks_conditions_between_numbers():
+    controller = sp.FlatnessController()
+    context = controller.CreateDefaultContext()
+    with pytest.raises(ValueError, match=r"lookahead must be at least 2 / tilt_gain"):
+        controller.SetTiltGain(context, 1.0)

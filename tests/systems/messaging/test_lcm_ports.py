@@ -14,7 +14,7 @@ from pydrake.systems.primitives import ConstantVectorSource
 
 from splatpilot.systems.messaging import lcm_ports
 from splatpilot.systems.messaging.codecs import CommandCodec, DepthGridCodec
-from splatpilot.systems.messaging.lcm_ports import UnixClock
+from splatpilot.systems.messaging.lcm_ports import BridgeStatus, UnixClock
 
 EPOCH = 1_800_000_000.25  # [s], also of the listener.
 CHANNEL = CommandCodec.channel
@@ -296,3 +296,32 @@ def test_invalid_logs_are_errors(listener, tmp_path):
     for name, error in (("junk", FileExistsError), ("no folder/log", OSError)):
         with pytest.raises(error), lcm_ports.recorded(ours.lcm, tmp_path / name):
             pass
+
+
+@pytest.mark.parametrize(
+    ("images", "overruns", "status"),
+    [
+        (["depth_image_32f", "color_image"], None, [2, 4, 0.01, 0.07, 6, 12, 0]),
+        ([], 4.0, [2, 4, 0.01, 0, 2, 5, 4]),
+    ],
+)
+def test_status_sums_up_the_inputs(images, overruns, status):
+    system = BridgeStatus(images)
+    context = system.CreateDefaultContext()
+    values = {"age": (0.01, 0.05, 0.07), "gaps": (2.0, 3.0, 1.0), "rejected": (5.0, 7.0, 0.0)}
+    for what, numbers in values.items():
+        for name, value in zip(["state", *images], numbers, strict=False):
+            system.GetInputPort(f"{name}_{what}").FixValue(context, [value])
+    system.GetInputPort("mode").FixValue(context, [2.0, 4.0])
+    if overruns is not None:
+        system.GetInputPort("overruns").FixValue(context, [overruns])
+    np.testing.assert_array_equal(system.GetOutputPort("status").Eval(context), status)
+    assert system.GetOutputPort("observation_age").Eval(context)[0] == status[3]
+
+
+def test_unix_time_is_the_epoch_and_the_contexts_time():
+    clock = UnixClock()
+    context = clock.CreateDefaultContext()
+    clock.set_epoch(context, 1_800_000_000.125)
+    context.SetTime(3600.000001)
+    assert abs(clock.GetOutputPort("unix_time").Eval(context)[0] - 1_800_003_600.125001) < 5e-7

@@ -5,7 +5,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
 from splatpilot.systems.policies.agile_autonomy import AgileAutonomy, AgileAutonomyConfig
-from splatpilot.systems.policies.base import Observation
+from splatpilot.systems.policies.base import Observation, inverse_depth, pool_depth, target_velocity
 from splatpilot.systems.policies.depthnav import DepthNav, DepthNavConfig
 from splatpilot.systems.policies.diffaero import (
     DiffAero,
@@ -88,3 +88,23 @@ def test_speeds_out_of_range_are_refused(make, configure, image, speed):
 def test_cameras_that_cannot_be_pooled_are_refused(make, configure):
     with pytest.raises(ValueError, match=r"whole multiples of .* got 50x30"):
         make(configure(camera=OnboardCamera(width=50, height=30)))
+
+
+def test_pooling_keeps_the_minimum():
+    depth = np.full((4, 6), 9.0)
+    depth[1, 1], depth[3, 5], depth[0, 4] = 2.0, 0.0, np.inf
+    np.testing.assert_array_equal(pool_depth(depth, 2, 3), [[2.0, 9.0, 9.0], [9.0, 9.0, 0.0]])
+
+
+def test_inverse_depth_is_clipped():
+    found = inverse_depth(np.array([0.0, 0.3, 3.0, 12.0, np.inf]), 0.3, 12.0)
+    assert found == pytest.approx([9.4, 9.4, 0.4, -0.35, -0.35])
+
+
+def test_target_velocity_points_to_the_goal_and_falls_near_it():
+    p_WG = np.array([3.0, -4.0, 2.0])
+    far = target_velocity(np.array([0.0, 0.0, 2.0]), p_WG, 2.0, 0.75)
+    np.testing.assert_allclose(far, [1.2, -1.6, 0.0])
+    near = target_velocity(p_WG - [0.3, 0.0, 0.0], p_WG, 2.0, 0.75)
+    np.testing.assert_allclose(near, [0.4, 0.0, 0.0])
+    np.testing.assert_array_equal(target_velocity(p_WG, p_WG, 2.0, 0.75), np.zeros(3))

@@ -1,5 +1,6 @@
 import math
 
+import cv2
 import numpy as np
 import pytest
 from pydrake.common.value import Value
@@ -13,6 +14,10 @@ from splatpilot.systems.sensing.imaging import (
     Imaging,
     Stereo,
     TimeOfFlightErrors,
+    correlated_noise,
+    matched_depth,
+    stereo_depth,
+    time_of_flight_depth,
 )
 from splatpilot.systems.sensing.noise import color_of_light, light_of_color
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera, focal_length
@@ -101,3 +106,147 @@ def test_depth_grids_come_from_time_of_flight_and_images_from_stereo():
     assert both.depth_sensor(is_grid=True) is both.time_of_flight
     assert both.depth_sensor(is_grid=False) is both.stereo
     assert Imaging(stereo=Stereo()).depth_sensor(is_grid=True) is None
+
+
+DEPTH_CAMERA = OnboardCamera(width=64, height=36)
+SHAPE = DEPTH_CAMERA.height, DEPTH_CAMERA.width
+EXACT = {"noise": 0.0, "step": 0.0}
+QUIET = TimeOfFlightErrors(noise=0.0, ambient_spread=0.0, multipath=0.0, mixed_pixels=0.0)
+
+
+def stereo(depth, normal=None, **fields):
+    normal = np.zeros(SHAPE) if normal is None else normal
+    return stereo_depth(depth, Stereo(**fields), DEPTH_CAMERA, normal)
+
+
+def tof(depth, normal=0.0, reflectivity=0.0, mixing=0.0, **fields):
+    draws = (np.full(SHAPE, float(x)) for x in (normal, reflectivity))
+    sensor = TimeOfFlightErrors(**vars(QUIET) | fields)
+    return time_of_flight_depth(
+        depth, sensor, DEPTH_CAMERA, *draws, np.full((2, *SHAPE), float(mixing))
+    )
+
+
+def test_stereo_noise_grows_with_the_square_of_depth():
+    noise = np.random.default_rng(0).standard_normal((100, *SHAPE))
+    for z in np.geomspace(0.2, 20.0, 9):
+        depths = [stereo(np.full(SHAPE, z), n, step=0.0, window=0.0) for n in noise]
+        seen = np.array(depths)[:, :, 12:]  # right of the border without matches
+        expected = z**2 * 0.08 / (424.0 * 0.05)
+        assert seen.std() == pytest.approx(expected, rel=0.05)
+
+
+def test_stereo_disparities_are_rounded():
+    depth = np.tile(np.linspace(4.0, 4.5, 36)[:, None], 64)
+    steps = 424.0 * 0.05 / stereo(depth, **EXACT | {"step": 0.25})[:, 12:] / 0.25
+    np.testing.assert_allclose(steps, np.round(steps), atol=1e-9)
+    assert len(np.unique(np.round(steps))) == 3
+
+
+def test_stereo_errors_are_correlated_within_the_window():
+    white = np.random.default_rng(1).standard_normal((400, 400))
+    noise = correlated_noise(white, 3.0)
+    assert noise.std() == pytest.approx(1.0, rel=0.05)
+    # The autocorrelation of a Gaussian filter is a Gaussian with the variance doubled.
+    for shift in (1, 3, 6):
+        correlation = np.mean(noise * np.roll(noise, shift, axis=1)) / noise.var()
+        assert correlation == pytest.approx(np.exp(-(shift**2) / 36.0), abs=0.05)
+
+
+def test_stereo_has_no_matches_at_the_left_border_and_too_near():
+    measured = np.isfinite(stereo(np.full(SHAPE, 0.5), **EXACT))
+    columns = (np.arange(64) + 0.5) * 848 / 64
+    np.testing.assert_array_equal(measured, np.tile(columns >= 424 * 0.05 / 0.5, (36, 1)))
+    assert not np.isfinite(stereo(np.full(SHAPE, 0.16), **EXACT)).any()
+
+
+def test_a_near_surface_hides_the_one_left_of_it():
+    depth = np.full(SHAPE, 8.0)
+    depth[:, 30:40] = 0.5
+    hidden = ~np.isfinite(stereo(depth, **EXACT))
+    shadow = 424 * 0.05 * (1 / 0.5 - 1 / 8.0) * 64 / 848  # [px]
+    assert hidden[:, 10:].sum(axis=1) == pytest.approx(shadow, abs=1.0)
+    assert hidden[:, 30 - int(shadow) : 30].all() and not hidden[:, 30:].any()
+
+
+def test_unmeasured_pixels_stay_so():
+    depth = np.full(SHAPE, 3.0)
+    depth[0, 40:], depth[1, 40:] = 0.0, np.inf
+    for seen in (stereo(depth), tof(depth, normal=1.0, noise=0.01)):
+        np.testing.assert_array_equal(seen[:2, 40:], depth[:2, 40:])
+
+
+def slanted_plane() -> np.ndarray:
+    slopes = DEPTH_CAMERA.ray_slopes()
+    return 3.0 / (1.0 + 0.4 * slopes[..., 0] + 0.3 * slopes[..., 1])
+
+
+def test_a_plane_has_no_multipath():
+    plane = slanted_plane()
+    np.testing.assert_allclose(tof(plane, multipath=1.0), plane, rtol=1e-12)
+
+
+def test_a_concave_corner_recedes_by_its_sag_and_an_edge_does_not():
+    x = DEPTH_CAMERA.ray_slopes()[..., 0]
+    corner = 2.0 / (1.0 + np.abs(x))  # two walls at 45 degrees to the axis
+    seen = tof(corner, multipath=0.5, multipath_angle=5.0)
+    offset = round(32.0 * np.tan(np.radians(5.0))) / 32.0
+    middle = np.abs(x) < 0.02
+    sag = corner * (1.0 + np.maximum(np.abs(x), offset)) / (1.0 + np.abs(x)) - corner
+    np.testing.assert_allclose((seen - corner)[middle], 0.5 * sag[middle], rtol=1e-9)
+    away = np.abs(x) > offset + 0.05
+    np.testing.assert_allclose(seen[away], corner[away], rtol=1e-9)
+    convex = 2.0 / (1.0 - 0.5 * np.abs(x))
+    np.testing.assert_allclose(tof(convex, multipath=0.5), convex, rtol=1e-12)
+    step = np.where(x > 0.0, 1.0, 4.0)
+    np.testing.assert_array_equal(tof(step, multipath=0.5), step)
+
+
+def test_edges_have_mixed_pixels():
+    step = np.tile(np.where(np.arange(64) < 32, 1.0, 4.0), (36, 1))
+    seen = tof(step, mixing=0.25, mixed_pixels=0.5)
+    np.testing.assert_allclose(seen[:, 31:33], 1.75)
+    np.testing.assert_array_equal(np.delete(seen, [31, 32], 1), np.delete(step, [31, 32], 1))
+
+
+def test_ambient_light_hides_far_surfaces():
+    depth = np.full(SHAPE, 4.0)
+    assert np.isfinite(tof(depth, ambient_range=4.1)).all()
+    assert (tof(depth, ambient_range=3.9) == np.inf).all()
+    assert (tof(depth, reflectivity=1.0, ambient_range=4.1, ambient_spread=0.1) == np.inf).all()
+    np.testing.assert_allclose(tof(depth, normal=2.0, noise=0.01), 4.08)
+
+
+def test_matching_measures_textured_planes_to_a_fifth_of_a_pixel():
+    # A wall at 4 m, and a board at 1.5 m in front of its middle.
+    camera, width = OnboardCamera(width=848, height=480), 848
+    sensor = Stereo(width=width, matching=True)
+    texture = np.random.default_rng(0).uniform(0, 255, (480, 2 * width)).astype(np.float32)
+    texture = cv2.GaussianBlur(texture, (0, 0), 1.2)
+    texture = cv2.normalize(texture, None, 0.0, 255.0, cv2.NORM_MINMAX)  # pyright: ignore
+    x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(480, dtype=np.float32))
+    board = (x > 300) & (x < 550)
+    depth = np.where(board, 1.5, 4.0)
+
+    def seen(near: np.ndarray, shifts: tuple[float, float]) -> np.ndarray:
+        images = [
+            cv2.remap(texture, x + np.float32(shift + start), y, cv2.INTER_CUBIC)
+            for shift, start in zip(shifts, (0.0, 600.0), strict=True)
+        ]
+        return np.where(near, images[1], images[0]).clip(0, 255).astype(np.uint8)
+
+    far, near = (424.0 * 0.05 / z for z in (4.0, 1.5))
+    moved = (x + near > 300) & (x + near < 550)
+    found = matched_depth(seen(board, (0, 0)), seen(moved, (far, near)), sensor, camera)
+    disparity, exact = 424.0 * 0.05 / found, 424.0 * 0.05 / depth
+    matched = np.isfinite(found)
+    errors = np.abs(disparity - exact)[matched]
+    assert matched.mean() > 0.9
+    assert np.median(errors) < 0.2
+    assert np.mean(errors > 1.0) < 0.03  # at the outline of the board
+
+
+def test_matching_measures_nothing_on_a_wall_without_texture():
+    gray = np.full((480, 848), 128, np.uint8)
+    found = matched_depth(gray, gray, Stereo(matching=True), OnboardCamera(width=848, height=480))
+    assert not np.isfinite(found).any()

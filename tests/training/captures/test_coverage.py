@@ -10,7 +10,7 @@ from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.esdf_build import esdf_from_distance_field
 from splatpilot.systems.collision.shapes import AnalyticDistanceField, Box
 from splatpilot.training.captures.capture import pinhole
-from splatpilot.training.captures.coverage import CapturePlan, plan_capture
+from splatpilot.training.captures.coverage import CapturePlan, plan_capture, poses_along
 
 K, SIZE = pinhole(160.0, 160.0, 160.0, 120.0), (320, 240)
 LENGTH, WIDTH, HEIGHT = 12.0, 8.0, 3.0  # [m] of a hall
@@ -125,3 +125,36 @@ def test_ground_at_the_lower_end_of_the_field_is_a_surface():
 def test_space_without_clearance_is_named(field):
     with pytest.raises(ValueError, match=r"9.0 m must exist, got none in .* m; correct the scale"):
         plan_capture(field, K, SIZE, (1.0, 2.2), 9.0)
+
+
+def test_poses_stop_evenly_and_look_ahead_and_aside():
+    path = np.array([[1.0, 2, 1.5], [1, 8, 1.5]])
+    X_WCs = poses_along(path, 0.5, [0.0, 90.0, -90.0], -10.0)
+    assert len(X_WCs) == 3 * 13
+    p_WC = np.array([X.translation() for X in X_WCs]).reshape(13, 3, 3)
+    assert np.ptp(p_WC, axis=1).max() == 0
+    steps = np.linalg.norm(np.diff(p_WC[:, 0], axis=0), axis=1)
+    np.testing.assert_allclose(steps, steps.mean(), rtol=1e-9)
+    c, s = np.cos(np.deg2rad(10)), np.sin(np.deg2rad(10))
+    for X_WC, ahead in zip(X_WCs, 13 * [[0, c, -s], [-c, 0, -s], [c, 0, -s]], strict=True):
+        R_WC = X_WC.rotation().matrix()
+        np.testing.assert_allclose(R_WC[:, 2], ahead, atol=1e-12)
+        assert abs(R_WC[2, 0]) < 1e-12  # x is level,
+        assert R_WC[2, 1] < 0  # and y points down.
+
+
+def test_heading_stays_on_a_climb():
+    path = np.array([[0.0, 0, 1], [3, 3, 1], [3, 3, 6]])
+    ahead = np.array([X.rotation().matrix()[:, 2] for X in poses_along(path, 0.5, [0.0], 0.0)])
+    np.testing.assert_allclose(ahead, np.tile([0.5**0.5, 0.5**0.5, 0], (len(ahead), 1)), atol=1e-6)
+
+
+def test_one_point_is_one_stop():
+    (X_WC,) = poses_along(np.array([[1.0, 2, 3]]), 0.5, [0.0], 0.0)
+    np.testing.assert_array_equal(X_WC.translation(), [1, 2, 3])
+
+
+@pytest.mark.parametrize("path", [[], [[1.0, 2]], [[1.0, 2, np.nan]]])
+def test_invalid_paths_are_refused(path):
+    with pytest.raises(ValueError, match="path must be of finite points x, y, z"):
+        poses_along(np.array(path), 0.5, [0.0], 0.0)
