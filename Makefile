@@ -44,7 +44,6 @@ messages: .venv/installed
 
 # The tests of the native kernels on a build with AddressSanitizer and UndefinedBehaviorSanitizer.
 sanitize: .venv/installed
-	.venv/bin/uv pip install --quiet --python .venv/bin/python cmake ninja
 	native/sanitize.sh
 
 nightly: sanitize
@@ -53,12 +52,14 @@ nightly: sanitize
 clean:
 	rm -rf .venv build
 
-# What flies, and then what trains, reconstructs and checks too: with EXTRAS, it downloads while it compiles.
+# What flies, and then what trains, reconstructs and checks too: with EXTRAS, it downloads while it compiles. Without
+# isolation, later builds compile what has changed.
 .venv/flying: $(BUILT_FROM)
 	@test -n "$(PYTHON)" || { echo "No Python 3.12 or newer found; install one, or name it: make PYTHON=/path/to/python3.12" >&2; exit 1; }
 	$(PYTHON) -m venv .venv
 	.venv/bin/python -m pip install --quiet uv
-	.venv/bin/uv pip install --python .venv/bin/python --editable '.$(EXTRAS)'
+	.venv/bin/uv pip install --quiet --python .venv/bin/python --group build
+	.venv/bin/uv pip install --python .venv/bin/python --no-build-isolation-package splatpilot --editable '.$(EXTRAS)'
 	touch $@
 
 .venv/installed: EXTRAS := [dev]
