@@ -5,8 +5,9 @@
         --scenarios P02 --seeds 5 --out out/sidestep
 
 A policy is a LeafSystem with any of the inputs `state`, `goal` and images of a camera of its own,
-and one of the outputs `hypotheses`, `acceleration`, `velocity` and `waypoint`; and a dataclass that
-configures it. This one flies straight to the goal and avoids obstacles in its depth image.
+and one of the outputs `hypotheses`, `acceleration`, `velocity`, `waypoint` and `command`; and a
+dataclass that configures it. This one flies straight to the goal, around obstacles in its depth
+image.
 `examples/hedgehop` is a package of its own, with worlds and sensors too.
 """
 

@@ -4,7 +4,7 @@
 
 A sphere of Drake's MultibodyPlant flies through a forest of Gaussians, and an RgbdSensor sees both:
 trunks hide the sphere, and the sphere hides trunks. Only the line `AddRenderer` is about splats.
-RenderEngineVtk draws shapes and needs OpenGL (see the README).
+RenderEngineVtk draws shapes and needs OpenGL (see docs/troubleshooting.md).
 """
 
 import argparse

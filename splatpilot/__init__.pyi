@@ -1,6 +1,7 @@
 from .analysis.benchmark.run_study import study
 from .diagrams.flight.flight_diagram import (
     AddFlight,
+    AddMeshcat,
     AddSplatWorld,
     BuildFlightDiagram,
     ExportFlight,
@@ -88,6 +89,7 @@ __all__ = [
     "AddClearanceConstraint",
     "AddFlight",
     "AddFlightMonitor",
+    "AddMeshcat",
     "AddSplatWorld",
     "BakedScene",
     "BuildFlightDiagram",

@@ -32,7 +32,7 @@ def test_its_python_runs(tmp_path, monkeypatch, capsys):
     runpy.run_path("flight.py")
     summary = ast.literal_eval(capsys.readouterr().out)
     assert summary["outcome"] in set(Outcome) and summary["path_length_m"] > 1.0
-    command = re.search(r"splatpilot (--import my_policy fly .*)", README.read_text())
+    command = re.search(r"splatpilot (fly --policy my_policy.*)", README.read_text())
     assert command is not None
     assert main([*command[1].split(), "--set", "timeout=1", "--out", "flight"]) == 0
 

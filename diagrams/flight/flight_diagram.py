@@ -346,7 +346,7 @@ def _require_apart(parts: FlightParts, other: FlightParts) -> None:
         )
 
 
-_RENAME = "rename the sensor, or give AddFlight another name"
+_RENAME = "give AddFlight another name, or rename the sensor or your own system"
 
 
 def AddSplatWorld(
@@ -470,9 +470,10 @@ def check_drawings(draw: Collection[str]) -> None:
 def AddMeshcat(
     builder: DiagramBuilder, parts: FlightParts, meshcat: Meshcat, draw: Collection[str] = ()
 ) -> None:
-    """Draws the Gaussians; adds visualizers of vehicle, plans and camera, and controls of `Teleop`.
+    """Draws a world, and adds visualizers of vehicle, plans and camera, and controls of `Teleop`.
 
     Args:
+        parts: of a flight in the builder, as `AddFlight` returns them.
         draw: names of `DRAWINGS`; "axes" of the body; "depth" of the camera, as points; "frustum"
             of the policy's camera; "limits" of the world.
     """

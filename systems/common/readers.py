@@ -68,6 +68,8 @@ def yaml_errors(source: str) -> Iterator[None]:
         yield
     except yaml.MarkedYAMLError as error:
         line = f"line {error.problem_mark.line + 1}: " if error.problem_mark else ""
+        if "expected a mapping node" in (error.problem or ""):
+            raise ValueError(f"{source}: {line}a tag must have fields, as !Name {{}}") from None
         raise ValueError(f"{source} is not YAML: {line}{error_summary(error.problem)}") from None
     except yaml.YAMLError as error:
         raise ValueError(f"{source} is not YAML: {error_summary(error)}") from None
