@@ -23,6 +23,7 @@ from .diagrams.flight.simulation import (
     random_flights,
 )
 from .diagrams.gym.flight_env import FlightEnv
+from .diagrams.gym.gym_policy import GymPolicy
 from .diagrams.gym.spaces import FlightEnvConfig, Reward, Transition
 from .diagrams.gym.vector_env import VectorFlightEnv
 from .diagrams.worlds.moving_spheres import MovingSphere
@@ -115,6 +116,7 @@ __all__ = [
     "FlightParts",
     "FlightVisualizer",
     "GaussianScene",
+    "GymPolicy",
     "Hypotheses",
     "HypothesisSelector",
     "HypothesisSelector_",

@@ -24,6 +24,7 @@ from splatpilot.analysis.commands.options import read_scenario
 from splatpilot.diagrams.flight.policies import POLICIES, policy_named
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.flight.sensors import SENSORS
+from splatpilot.diagrams.gym.sb3 import Sb3FlightEnv
 from splatpilot.diagrams.hardware.bridge import HardwareConfig
 from splatpilot.diagrams.hardware.px4 import Px4Config
 from splatpilot.diagrams.worlds.world_registry import WORLDS
@@ -153,6 +154,7 @@ def test_files_are_configurations(page, tmp_path):
 )
 def test_python_runs(page, monkeypatch):
     monkeypatch.setattr(LiveControls, "wait_for_viewer", lambda self: None)
+    monkeypatch.setattr(POLICIES, "_entries", dict(POLICIES._entries))
     learn = PPO.learn
     monkeypatch.setattr(PPO, "learn", lambda ppo, **_: learn(ppo, ppo.n_steps * ppo.n_envs))
     names: dict[str, Any] = {}
@@ -160,6 +162,19 @@ def test_python_runs(page, monkeypatch):
         exec(code, names)
     if "flight" in names:
         assert names["flight"].summary()["outcome"] in ("goal", "collision")
+
+
+def test_trained_models_fly_as_the_page_says(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(POLICIES, "_entries", dict(POLICIES._entries))
+    [code] = (each for each in blocks(DOCS / "gym.md", "python") if "GymPolicy" in each)
+    Path("my_ppo.py").write_text(code)
+    envs = Sb3FlightEnv(2, "P01", observation=["state", "goal", "obstacle"])
+    PPO("MultiInputPolicy", envs, seed=0).save("out/ppo")
+    words = ["fly", "--policy", "my_ppo:PpoConfig", "--set", "timeout=1", "--out", "flown"]
+    assert main(words) == 0
+    assert "!PpoConfig" in Path("flown/scenario.yaml").read_text()
 
 
 def _anchors(page: Path) -> set[str]:

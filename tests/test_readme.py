@@ -26,7 +26,7 @@ def test_its_python_runs(tmp_path, monkeypatch, capsys):
         training = training.replace(text, small)
     Path("my_policy.py").write_text(policy)
     Path("flight.py").write_text("from my_policy import *\n" + flight)
-    Path("training.py").write_text("import splatpilot as sp\n" + training)
+    Path("training.py").write_text(training)
     runpy.run_path("training.py")
     capsys.readouterr()
     runpy.run_path("flight.py")

@@ -45,7 +45,7 @@ SMALLER = {
         "fly --scene out/scene": "fly --scene out/scene --set timeout=1",
     },
     "training": {
-        ".venv/bin/uv pip install --python .venv/bin/python -e '.[gym]' stable-baselines3\n": "",
+        ".venv/bin/uv pip install --python .venv/bin/python gymnasium stable-baselines3\n": "",
         "Env(64, ": "Env(2, ",
         "(64, ": "(2, ",
         "num_worlds=16": "num_worlds=1",

@@ -159,8 +159,8 @@ def AddPolicyAndController(
     if policy.HasOutputPort("heading"):
         heading = policy.GetOutputPort("heading")
     if delay and delay[1] > 0.0:
-        decision = _add_delay(builder, policy, decision, delay, scenario.seed)
-        heading = heading and _add_delay(builder, policy, heading, delay, scenario.seed)
+        decision = _add_delay(builder, scenario, policy, decision, delay)
+        heading = heading and _add_delay(builder, scenario, policy, heading, delay)
     target = _add_target(builder, scenario, state, decision)
     if target.get_name() == "command":
         other = controller or guarded
@@ -196,13 +196,20 @@ def decision_port(policy: System) -> OutputPort:
 
 
 def _add_delay(
-    builder: DiagramBuilder, policy: System, output: OutputPort, delay: Sequence[float], seed: int
+    builder: DiagramBuilder,
+    scenario: Scenario,
+    policy: System,
+    output: OutputPort,
+    delay: Sequence[float],
 ) -> OutputPort:
-    update, name = policy.GetUniquePeriodicDiscreteUpdateAttribute(), output.get_name()
+    is_periodic = policy.GetUniquePeriodicDiscreteUpdateAttribute() is not None
     condition = "empty for a policy without a periodic discrete update"
-    require(update, "decision_delay", condition, delay, "declare one in the policy")
-    assert update is not None
-    system = DecisionDelay(name, output.size(), update.period_sec(), delay, seed)
+    valid = is_periodic or getattr(policy, "rate", None) is not None
+    require(valid, "decision_delay", condition, delay, "declare one in the policy")
+    name, period = output.get_name(), decision_period(scenario, policy)
+    system = DecisionDelay(
+        name, output.size(), period, delay, scenario.seed, at_once=not is_periodic
+    )
     builder.AddNamedSystem(f"delayed_{name}", system)
     builder.Connect(output, system.get_input_port())
     return system.get_output_port()

@@ -37,6 +37,7 @@ from splatpilot.diagrams.flight.scenario import (
 )
 from splatpilot.diagrams.gym.spaces import (
     IMAGES,
+    TERMINATED,
     Transition,
     Vehicles,
     action_space,
@@ -66,7 +67,7 @@ class FlightEnv(gymnasium.Env):
         env = gymnasium.make("splatpilot:Flight-v0", scenario="P02", observation=["depth", "goal"])
 
     Observations are those of `observe` and `observe_image`, and outputs of the scenario's sensors
-    by their names, such as `imu_acceleration`. Actions are in [-1, 1], see `decisions`. A flight
+    by their names, such as `imu_accelerometer`. Actions are in [-1, 1], see `decisions`. A flight
     is terminated by a collision, at the goal, and outside of the known volume, and truncated by the
     scenario's timeout; then `info` has the `outcome` and `is_success`. The vehicle's end is found
     within 0.02 s.
@@ -260,11 +261,13 @@ class FlightEnv(gymnasium.Env):
         )
         reward = np.asarray(config.reward(transition))
         require(reward.shape == (1,), "shape of the reward", "(N,) = (1,)", reward.shape)
+        if outcome is None and config.terminates(transition)[0]:
+            outcome = TERMINATED
         self._previous, self._ended = actions, outcome is not None
         info: dict[str, Any] = {}
         if outcome is not None:
             info = {"outcome": str(outcome), "is_success": outcome is Outcome.GOAL}
-        terminated, truncated = outcome in ENDS, outcome is Outcome.TIMEOUT
+        terminated, truncated = outcome in (*ENDS, TERMINATED), outcome is Outcome.TIMEOUT
         return self._observe(), float(reward[0]), terminated, truncated, info
 
     def _observe(self) -> Any:

@@ -118,6 +118,9 @@ _BOUNDS: dict[str, tuple[list[float], list[float]]] = {
 IMAGES = {"depth": "depth_image_32f", "depth_m": "depth_image_32f", "rgb": "color_image"}
 """Observations that are images, and the port of the policy's camera that each needs."""
 
+TERMINATED = "terminated"
+"""Outcome of flights that end by `FlightEnvConfig.terminate`."""
+
 OBSERVATIONS = (*_BOUNDS, *IMAGES)
 """Names of all observations besides the outputs of sensors."""
 
@@ -128,7 +131,7 @@ def observation_space(
     """Returns the space of one vehicle's observation: a Dict, or a Box if `observation` is a name.
 
     Args:
-        sensors: spaces of the outputs of sensors by name, such as `imu_acceleration`.
+        sensors: spaces of the outputs of sensors by name, such as `imu_accelerometer`.
     """
     sensors = sensors or {}
     names = config.observation_names()
@@ -306,6 +309,8 @@ class FlightEnvConfig(Config):
     camera: OnboardCamera = field(default_factory=lambda: OnboardCamera(max_depth=12.0))
     # From transitions of N vehicles to their rewards (N,).
     reward: Callable[[Transition], NDArray[np.float64]] = field(default_factory=Reward)
+    # From transitions of N vehicles to the flights (N,) that end, besides those of `AddFlight`.
+    terminate: Callable[[Transition], NDArray[np.bool_]] | None = None
     # Number of worlds among which resets draw, of the seeds from that of the scenario on.
     num_worlds: int = bounded(1, "[1, 1000000]")
 
@@ -327,6 +332,8 @@ class FlightEnvConfig(Config):
         valid = names and len(set(names)) == len(names)
         require_field(self, "observation", valid, "different names, at least one")
         require_field(self, "reward", callable(self.reward), "a function of a Transition")
+        valid = self.terminate is None or callable(self.terminate)
+        require_field(self, "terminate", valid, "a function of a Transition, or None")
 
     def observation_names(self) -> list[str]:
         """Returns the names of the observations."""
@@ -335,6 +342,17 @@ class FlightEnvConfig(Config):
     def limits(self) -> NDArray[np.float64]:
         """Returns the scale (n,) of actions."""
         return np.array(self.action_limits or _LIMITS[self.action])
+
+    def terminates(self, transition: Transition) -> NDArray[np.bool_]:
+        """Returns the flights (N,) that end by `terminate`."""
+        count = len(transition.actions)
+        if self.terminate is None:
+            return np.zeros(count, bool)
+        ends = np.asarray(self.terminate(transition))
+        found = f"{ends.dtype} of {ends.shape}"
+        valid = ends.shape == (count,) and ends.dtype == bool
+        require(valid, "the result of terminate", f"bool of ({count},)", found)
+        return ends
 
 
 def draw_flight(config: FlightEnvConfig, generator: np.random.Generator) -> tuple[int, Scenario]:

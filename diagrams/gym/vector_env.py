@@ -20,6 +20,7 @@ from splatpilot.diagrams.flight.monitor import ENDS, Outcome
 from splatpilot.diagrams.flight.scenario import Scenario, goal_position, sample_initial_state
 from splatpilot.diagrams.gym.spaces import (
     IMAGES,
+    TERMINATED,
     Transition,
     Vehicles,
     action_space,
@@ -38,9 +39,12 @@ from splatpilot.systems.splats.baked_scene import BatchRenderer
 from splatpilot.systems.splats.splat_camera import color_pixels, ranged_depth
 from splatpilot.systems.vehicle.state import pose_from_state
 
-_OUTCOMES = np.array([None, *ENDS, Outcome.TIMEOUT], dtype=object)  # by the native ends
+# By the native ends, and one more
+_OUTCOMES = np.array([None, *ENDS, Outcome.TIMEOUT, TERMINATED], dtype=object)
 _OPTIONS = "reset_mask", "flight", "start", "goal"
-_GOAL, _TIMEOUT = list(_OUTCOMES).index(Outcome.GOAL), len(_OUTCOMES) - 1
+_GOAL, _TIMEOUT, _TERMINATED = map(
+    list(_OUTCOMES).index, (Outcome.GOAL, Outcome.TIMEOUT, TERMINATED)
+)
 
 
 class VectorFlightEnv(VectorEnv):
@@ -100,6 +104,8 @@ class VectorFlightEnv(VectorEnv):
             "render_modes": ["rgb_array"],
             "render_fps": self.config.rate,
         }
+        for config in configs:
+            require_supported(config)
         self.single_observation_space = observation_space(self.config)
         self.single_action_space = action_space(self.config)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -119,8 +125,6 @@ class VectorFlightEnv(VectorEnv):
         }
         threads = threads or os.cpu_count() or 1
         self._threads, self._renderer = _native.FlightThreads(threads), BatchRenderer(threads)
-        for config in configs:
-            require_supported(config)
         self.pool = pool or WorldPool(configs, world)
         same = self.pool.matches(configs)
         require(same, "pool", "that of the same scenarios and num_worlds", "another")
@@ -173,7 +177,8 @@ class VectorFlightEnv(VectorEnv):
                 [m].
 
         Returns:
-            Observations, and infos with the seeds `world_seed` and `flight_seed` of flights.
+            Observations, and infos with the number `scenario` and the seeds `world_seed` and
+            `flight_seed` of flights.
         """
         options = options or {}
         for name in options:
@@ -195,8 +200,13 @@ class VectorFlightEnv(VectorEnv):
         points = {name: list(options[name]) for name in ("start", "goal") if name in options}
         if points:
             self._move(rows, points)
-        seeds = {"world_seed": self.pool.world_seeds, "flight_seed": self.pool.seeds}
-        infos = {name: np.where(mask, each[self._flight], 0) for name, each in seeds.items()}
+        pool = self.pool
+        drawn = {
+            "scenario": pool.scenario,
+            "world_seed": pool.world_seeds,
+            "flight_seed": pool.seeds,
+        }
+        infos = {name: np.where(mask, each[self._flight], 0) for name, each in drawn.items()}
         return self._observe_again(rows), infos | {f"_{name}": mask.copy() for name in infos}
 
     def _move(self, rows: NDArray[np.intp], points: dict[str, list[float]]) -> None:
@@ -281,25 +291,27 @@ class VectorFlightEnv(VectorEnv):
         ended, reached = ends > 0, ends == _GOAL
         truncated = ends == _TIMEOUT
         terminated = ended ^ truncated
-        rewards = config.reward(
-            Transition(
-                states=before,
-                next_states=np.asfortranarray(self._states),
-                p_WG=p_WG,
-                distances=self._distances,
-                actions=given,
-                previous_actions=self._previous,
-                reached=reached,
-                failed=terminated ^ reached,
-                duration=self.time_step,
-                radius=self.pool.radius,
-            )
+        transition = Transition(
+            states=before,
+            next_states=np.asfortranarray(self._states),
+            p_WG=p_WG,
+            distances=self._distances,
+            actions=given,
+            previous_actions=self._previous,
+            reached=reached,
+            failed=terminated ^ reached,
+            duration=self.time_step,
+            radius=self.pool.radius,
         )
-        rewards = np.asarray(rewards, dtype=float)
+        rewards = np.asarray(config.reward(transition), dtype=float)
         valid = rewards.shape == (self.num_envs,)
         require(valid, "shape of the rewards", f"({self.num_envs},)", rewards.shape)
         if resting.any():
             rewards = np.where(flying, rewards, 0.0)
+        if config.terminate is not None:
+            own = config.terminates(transition) & flying & ~ended
+            ends[own] = _TERMINATED
+            ended, terminated = ended | own, terminated | own
         self._previous[flying] = given[flying]
         self._decisions, self._ended = decided, ended
         self._count += flying
@@ -400,6 +412,8 @@ class VectorFlightEnv(VectorEnv):
         """Returns images (H, W, 3) of the scenario's camera, one of each vehicle."""
         if self.render_mode is None:
             return None
+        if not self._is_seeded:
+            raise ResetNeeded("flights must be begun by reset() before render()")
         config = self.config.scenario.camera
         info, X_BC = camera_info(config), camera_mount(config)
         worlds = [self.pool.worlds[w] for w in self.pool.world[self._flight]]

@@ -63,9 +63,10 @@ class WorldPool:
         self._made: World | None = None  # the last one
         self._fields: dict[int, int] = {}  # native numbers by the identity of distance fields
         self._configs = list(configs)
-        worlds, world_seeds, states = [], [], []
-        turns = [(config, k) for config in configs for k in range(config.num_worlds)]
-        for config, k in Progress(turns, "making worlds", unit="world", delay=1.0):
+        worlds, world_seeds, states, numbers = [], [], [], []
+        turns = [(i, k) for i, config in enumerate(configs) for k in range(config.num_worlds)]
+        for number, k in Progress(turns, "making worlds", unit="world", delay=1.0):
+            config = configs[number]
             seed = config.scenario.seed + k
             made = self._add(world or make_world(config.scenario.world, seed))
             is_varied = config.scenario.appearance > 0.0
@@ -84,6 +85,7 @@ class WorldPool:
                         require(kind is BakedScene, what, "of Gaussians", kind.__name__, _OTHER)
                 worlds.append(len(self.worlds) - 1)
                 world_seeds.append(seed)
+                numbers.append(number)
                 states.append(sample_initial_state(scenario, made))
                 self.scenarios.append(scenario)
         self.world = np.array(worlds)  # (F,), index of `worlds`
@@ -99,6 +101,7 @@ class WorldPool:
         self.is_delayed = bool(self.delays.any())
         self.seeds = np.array([s.seed for s in self.scenarios])  # (F,), of flights
         self.world_seeds = np.array(world_seeds)  # (F,)
+        self.scenario = np.array(numbers)  # (F,), index of `configs`
         self.distances = np.empty(len(self))  # (F,) [m], from the start to surfaces
         self.native.query(
             p_WQ=np.ascontiguousarray(self.states[:, :3]),

@@ -152,17 +152,26 @@ class DecisionDelay(LeafSystem):
         period: time between decisions [s].
         delay: min and max [s]; the max is above 0.
         seed: equal delays follow from equal seeds.
+        at_once: if the input at time t is already the decision of that time; a policy with a
+            discrete update decides at the same instant, and the input is still the one before.
     """
 
     def __init__(
-        self, output: str, size: int, period: float, delay: Sequence[float], seed: int
+        self,
+        output: str,
+        size: int,
+        period: float,
+        delay: Sequence[float],
+        seed: int,
+        at_once: bool = False,
     ) -> None:
         super().__init__()
-        self._delays = decision_delays(delay, seed)
+        self._delays, self._at_once = decision_delays(delay, seed), at_once
         self._period, self._count = period, math.ceil(delay[1] / period - 1e-9)
+        self._kept = self._count + at_once
         self.DeclareVectorInputPort(output, size)
         self.DeclareDiscreteState(np.array([-period]))  # time of the newest decision [s]
-        self.DeclareDiscreteState(self._count * size)  # earlier decisions, the newest first
+        self.DeclareDiscreteState(self._kept * size)  # decisions that are kept, the newest first
         self.DeclareVectorOutputPort(output, size, self._calc)
         self.DeclareInitializationDiscreteUpdateEvent(self._begin)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
@@ -171,19 +180,19 @@ class DecisionDelay(LeafSystem):
         return np.asarray(self.get_input_port().Eval(context))
 
     def _begin(self, context: Context, discrete_state: DiscreteValues) -> None:
-        discrete_state.set_value(1, np.tile(self._decision(context), self._count))
+        discrete_state.set_value(1, np.tile(self._decision(context), self._kept))
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        # The policy updates at the same instant, and the input is the decision before.
-        decision, earlier = self._decision(context), context.get_discrete_state(1).value()
+        decision, kept = self._decision(context), context.get_discrete_state(1).value()
         discrete_state.set_value(0, np.array([context.get_time()]))
-        discrete_state.set_value(1, np.append(decision, earlier)[: len(earlier)])
+        discrete_state.set_value(1, np.append(decision, kept)[: len(kept)])
 
     def _calc(self, context: Context, output: BasicVector) -> None:
         newest = context.get_discrete_state(0).GetAtIndex(0)
-        decision = self._decision(context)
-        rows = np.concatenate([decision, context.get_discrete_state(1).value()])
-        rows = rows.reshape(-1, len(decision))
+        rows = context.get_discrete_state(1).value()
+        if not self._at_once:
+            rows = np.concatenate([self._decision(context), rows])
+        rows = rows.reshape(-1, output.size())
         for back in range(self._count):
             time = newest - back * self._period
             delay = self._delays[round(time / self._period) % CYCLE]

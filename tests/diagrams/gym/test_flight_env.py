@@ -1,6 +1,7 @@
 import subprocess
 import sys
 import warnings
+from functools import partial
 
 import av
 import gymnasium
@@ -14,7 +15,8 @@ from stable_baselines3.common.env_checker import check_env as check_env_of_sb3
 from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.gym.flight_env import FlightEnv
-from splatpilot.systems.common.config import dump_config
+from splatpilot.diagrams.gym.vector_env import VectorFlightEnv
+from splatpilot.systems.common.config import dump_config, load_config
 from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.sensing.estimators import MotionCapture
 from splatpilot.systems.sensing.imu import Imu
@@ -55,6 +57,38 @@ def test_checkers_pass_without_warnings(observation, post_world):
         )
         check_env(env, skip_render_check=True)
         check_env_of_sb3(env)
+
+
+def test_every_profile_flies(post_world):
+    scenario = load_config(Scenario(), overrides=["profile=realistic"])
+    env = FlightEnv(scenario, world=post_world, observation=["depth", "state", "goal"])
+    first, again = flown(env, 3, steps=4), flown(env, 3, steps=4)
+    assert_identical(first, again)
+
+
+def test_delayed_decisions_come_late_in_both_environments(post_world):
+    def moved(make, **fields):
+        scenario = Scenario(start_radius=0.0, **fields)
+        env = make(scenario, world=post_world, observation="full_state")
+        ahead = np.array([1.0, 0.0, 0.0])
+        start = env.reset(seed=0)[0]
+        if make is FlightEnv:
+            return [env.step(ahead)[0][0] - start[0] for _ in range(3)]
+        return [env.step(ahead[None])[0][0, 0] - start[0, 0] for _ in range(3)]
+
+    late = moved(FlightEnv, decision_delay=[0.06, 0.06])
+    assert 0 < late[0] < 0.5 * moved(FlightEnv)[0]
+    many = moved(partial(VectorFlightEnv, 1), decision_delay=[0.06, 0.06])
+    np.testing.assert_allclose(late, many, atol=1e-5)
+
+
+def test_own_ends_terminate_a_flight(post_world):
+    env = FlightEnv(Scenario(), world=post_world, terminate=lambda t: t.actions[:, 2] > 0.5)
+    env.reset(seed=0)
+    assert not env.step(np.zeros(3))[2]
+    _, _, terminated, truncated, info = env.step(np.array([0.0, 0.0, 1.0]))
+    assert terminated and not truncated
+    assert info == {"outcome": "terminated", "is_success": False}
 
 
 @pytest.mark.parametrize("order", ["gymnasium, splatpilot", "splatpilot, gymnasium"])

@@ -5,6 +5,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import data_equivalence
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from pydrake.common.schema import Uniform
@@ -260,6 +261,44 @@ def test_gymnasium_makes_it_without_warnings():
     assert isinstance(made.unwrapped, VectorFlightEnv)
     assert infos["episode"]["l"].max() == 5
     envs.close()
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_flights_end_by_a_function_of_ones_own(post_world, mode):
+    envs = VectorFlightEnv(
+        3,
+        Scenario(start_radius=0.0),
+        world=post_world,
+        autoreset_mode=mode,
+        terminate=lambda transition: transition.next_states[:, 2] > transition.states[:, 2] + 0.01,
+    )
+    envs.reset(seed=0)
+    actions = np.zeros((3, 3))
+    actions[1, 2] = 1.0
+    for _ in range(3):
+        _, rewards, terminated, truncated, infos = envs.step(actions)
+        if terminated.any():
+            break
+    assert terminated.tolist() == [False, True, False] and not truncated.any()
+    infos = infos.get("final_info", infos)
+    assert infos["outcome"][1] == "terminated" and not infos["is_success"][1]
+    assert rewards[1] > -5.0  # No collision
+    for invalid in (lambda t: np.zeros(3), lambda t: np.zeros(2, bool)):
+        envs.config.terminate = invalid
+        with pytest.raises(ValueError, match=r"the result of terminate must be bool of \(3,\)"):
+            envs.step(np.zeros((3, 3)))
+
+
+def test_images_and_scenarios_of_flights_are_known(post_world):
+    envs = VectorFlightEnv(
+        8, [Scenario(), Scenario(timeout=3.0)], world=post_world, render_mode="rgb_array"
+    )
+    with pytest.raises(ResetNeeded, match="before render"):
+        envs.render()
+    _, infos = envs.reset(seed=0)
+    assert set(infos["scenario"]) == {0, 1}
+    second = np.flatnonzero(envs.pool.scenario == 1)[:8]
+    assert set(envs.reset(options={"flight": second})[1]["scenario"]) == {1}
 
 
 def test_delayed_decisions_come_late(post_world):

@@ -1,0 +1,107 @@
+"""GymPolicy: flies by a function that was trained in the environments."""
+
+from collections.abc import Callable
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.common.value import Value
+from pydrake.systems.framework import Context, LeafSystem, State
+from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
+
+from splatpilot.diagrams.flight.blocks import DECISIONS
+from splatpilot.diagrams.gym.spaces import (
+    IMAGES,
+    OBSERVATIONS,
+    FlightEnvConfig,
+    Vehicles,
+    decisions,
+    observe,
+    observe_image,
+    require_actions,
+)
+from splatpilot.diagrams.worlds.world import World
+from splatpilot.systems.common.drake import vector_input
+from splatpilot.systems.common.validation import require
+
+_PORTS = {"depth_image_32f": (ImageDepth32F, 0), "color_image": (ImageRgba8U, slice(3))}
+
+
+class GymPolicy(LeafSystem):
+    """Decides by a function from observations to actions, as it was trained in `FlightEnv`.
+
+        model = PPO.load("out/ppo")
+        config = sp.FlightEnvConfig(observation=["depth", "state", "goal"])
+        policy = sp.GymPolicy(lambda seen: model.predict(seen, deterministic=True)[0], config)
+
+    .. pydrake_system::
+
+        name: GymPolicy
+        input_ports: [state, goal, (images)]
+        output_ports: [(action)]
+
+    The inputs are ``state`` (13), ``goal`` (3), p_WG [m], and the images that the observations
+    need. The output has the name and size of `config.action`, see `AddFlight`. It is decided from
+    time 0 at `config.rate`, and held. Flights equal those of `FlightEnv` with the same actions.
+
+    Args:
+        predict: from the observation of one vehicle to its action (n,) in [-1, 1].
+        config: of the environment of the training; its scenario and reward are not used.
+        world: of the flight, for the observation `obstacle`.
+
+    Raises:
+        ValueError: for outputs of sensors as observations, `obstacle` without a world, and at an
+            update for an action out of range.
+    """
+
+    def __init__(
+        self,
+        predict: Callable[[Any], NDArray[Any]],
+        config: FlightEnvConfig,
+        world: World | None = None,
+    ) -> None:
+        super().__init__()
+        config.validate()
+        self._predict, self._config, self._names = predict, config, config.observation_names()
+        for name in self._names:
+            known = f"one of {', '.join(OBSERVATIONS)} in GymPolicy"
+            require(name in OBSERVATIONS, "observation", known, repr(name))
+        valid = world is not None or "obstacle" not in self._names
+        require(valid, "world", "that of the flight for the observation obstacle", "None")
+        self._field = world.distance_field if world and "obstacle" in self._names else None
+        self.camera, self.rate = config.camera, config.rate
+        self._size = DECISIONS[config.action]
+        self.DeclareVectorInputPort("state", 13)
+        self.DeclareVectorInputPort("goal", 3)
+        size = config.camera.width, config.camera.height
+        for port in dict.fromkeys(IMAGES[name] for name in self._names if name in IMAGES):
+            self.DeclareAbstractInputPort(port, Value(cast(Any, _PORTS[port][0])(*size)))
+        self.DeclareStateOutputPort(config.action, self.DeclareDiscreteState(self._size))
+        # Actions precede the controller's update of the same time, as unrestricted updates do; and
+        # its times are whole numbers of its period, in which sums of other periods are not.
+        period = config.scenario.controller.period
+        self._every, self._turn = round(1.0 / (config.rate * period)), self.DeclareDiscreteState(1)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(period, 0.0, self._update)
+
+    def _update(self, context: Context, state: State) -> None:
+        turn = context.get_discrete_state(self._turn).GetAtIndex(0)
+        state.get_mutable_discrete_state(self._turn).SetAtIndex(0, (turn + 1) % self._every)
+        if turn:
+            return
+        config = self._config
+        states, p_WG = (vector_input(self, name, context)[None] for name in ("state", "goal"))
+        vehicles = Vehicles(states, p_WG, np.full(1, np.nan), np.zeros((1, 3)))
+        if self._field is not None:
+            sample = self._field.query(states[:, :3])
+            vehicles = Vehicles(states, p_WG, sample.distance, sample.gradient)
+        seen: dict[str, Any] = {n: v[0] for n, v in observe(self._names, vehicles).items()}
+        for name in self._names:
+            if name in IMAGES:
+                image: Any = self.GetInputPort(IMAGES[name]).Eval(context)
+                pixels = np.array(image.data[..., _PORTS[IMAGES[name]][1]])
+                seen[name] = observe_image(name, pixels, config.camera.max_depth)
+        ordered = {name: seen[name] for name in self._names}
+        is_one = isinstance(config.observation, str)
+        action = self._predict(ordered[config.observation] if is_one else ordered)
+        decision = decisions(config, require_actions(action, (self._size,))[None], states)
+        state.get_mutable_discrete_state(0).set_value(decision[0])
