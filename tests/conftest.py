@@ -18,7 +18,10 @@ settings.load_profile("repeatable")
 # gsply's compiler takes longer than all that it compiles here.
 os.environ["NUMBA_DISABLE_JIT"] = "1"
 
-_SLOWEST = "wheel", "crash", "docs", "train", "optimize", "run_study"
+_SLOWEST = (
+    *("tutorials", "crash", "docs", "px4", "hedgehop", "bridge", "wheel", "examples", "train"),
+    *("reconstruct", "optimize", "extras", "check", "initialize", "recover", "readme", "run_study"),
+)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -346,7 +346,7 @@ def _require_apart(parts: FlightParts, other: FlightParts) -> None:
         )
 
 
-_RENAME = "give AddFlight another name, or rename the sensor or your own system"
+_RENAME = "rename the sensor or your own system, or give AddFlight another name"
 
 
 def AddSplatWorld(

@@ -91,7 +91,7 @@ def test_worlds_pickle_and_compare_by_configuration_and_seed():
             "world.rocks must be a !UniformDiscrete of whole",
         ),
         ("vehicle.drag=!Uniform {min: 1}", "vehicle.drag must be !Uniform {min: ..., max: ...}"),
-        ("vehicle.drag=!Uniform 3", "expected a mapping"),
+        ("vehicle.drag=!Uniform 3", "a tag must have fields"),
         ("vehicle.drag=!Uniform {min: 2, max: 1}", "min of vehicle.drag must be at most its max"),
         ("vehicle.drag=!UniformDiscrete {values: []}", "values of vehicle.drag .* at least one"),
         ("vehicle.drag=!UniformVector {min: [1], max: [2]}", "vehicle.drag must be one value"),
