@@ -162,6 +162,27 @@ def speed(rows: Sequence[Row]) -> Figure:
     return figure
 
 
+def density(rows: Sequence[Row]) -> Figure:
+    """Draws success by speed and density of trees as heat maps, one of each policy."""
+    policies, speeds, forests = (
+        list(dict.fromkeys(row[name] for row in rows)) for name in ("policy", "speed", "scenario")
+    )
+    figure, axes = _axes(1.0 + 0.3 * len(speeds), len(policies), sharey=True)
+    for each, policy in zip(axes, policies, strict=True):
+        rates = np.full((len(speeds), len(forests)), np.nan)
+        for row in (row for row in rows if row["policy"] == policy):
+            k = speeds.index(row["speed"]), forests.index(row["scenario"])
+            rates[k] = row["successes"] / row["flights"]
+            each.text(k[1], k[0], f"{row['successes']}/{row['flights']}", ha="center", va="center")
+        each.imshow(rates, cmap="RdYlGn", vmin=0.0, vmax=1.0, alpha=0.7, aspect="auto")
+        names = [name.replace("trees_", "1/") for name in forests]
+        each.set_xticks(range(len(forests)), names)
+        each.set(title=policy, xlabel="trees per m²")
+        each.grid(False)
+    _name_rows(axes[0], [f"{speed:g} m/s" for speed in speeds])
+    return figure
+
+
 def gap(rows: Sequence[Row]) -> Figure:
     """Draws success by captured images less that by rendered ones, with intervals."""
     rows = [row for row in rows if row["gap_points"] != ""]
@@ -198,6 +219,7 @@ FIGURES: dict[Callable[[Sequence[Row]], Figure], str] = {
     twin_policies: "twin_policies",
     success: "success",
     speed: "success",
+    density: "density",
     gap: "gap",
     realism: "realism",
 }

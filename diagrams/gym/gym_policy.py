@@ -80,7 +80,8 @@ class GymPolicy(LeafSystem):
         # Actions precede the controller's update of the same time, as unrestricted updates do; and
         # its times are whole numbers of its period, in which sums of other periods are not.
         period = config.scenario.controller.period
-        self._every, self._turn = round(1.0 / (config.rate * period)), self.DeclareDiscreteState(1)
+        self._every = round(1.0 / (config.rate * period))
+        self._turn = int(self.DeclareDiscreteState(1))
         self.DeclarePeriodicUnrestrictedUpdateEvent(period, 0.0, self._update)
 
     def _update(self, context: Context, state: State) -> None:
@@ -102,6 +103,6 @@ class GymPolicy(LeafSystem):
                 seen[name] = observe_image(name, pixels, config.camera.max_depth)
         ordered = {name: seen[name] for name in self._names}
         is_one = isinstance(config.observation, str)
-        action = self._predict(ordered[config.observation] if is_one else ordered)
+        action = self._predict(seen[self._names[0]] if is_one else ordered)
         decision = decisions(config, require_actions(action, (self._size,))[None], states)
         state.get_mutable_discrete_state(0).set_value(decision[0])

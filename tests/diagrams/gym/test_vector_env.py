@@ -273,12 +273,11 @@ def test_flights_end_by_a_function_of_ones_own(post_world, mode):
         terminate=lambda transition: transition.next_states[:, 2] > transition.states[:, 2] + 0.01,
     )
     envs.reset(seed=0)
-    actions = np.zeros((3, 3))
+    actions, terminated = np.zeros((3, 3)), np.zeros(3, bool)
     actions[1, 2] = 1.0
-    for _ in range(3):
+    rewards, truncated, infos = np.zeros(3), terminated, {}
+    while not terminated.any():
         _, rewards, terminated, truncated, infos = envs.step(actions)
-        if terminated.any():
-            break
     assert terminated.tolist() == [False, True, False] and not truncated.any()
     infos = infos.get("final_info", infos)
     assert infos["outcome"][1] == "terminated" and not infos["is_success"][1]
