@@ -100,6 +100,7 @@ _ROTATION_JUMP = 0.3  # [rad] of an attitude from that of angular velocities, in
 _TIME_ERROR = 0.1  # [s] of motion, for wrong times of measurement.
 _MAX_LAG = 1e-3  # [s] by which the Context's time may fall behind between two states.
 _FORGETTING = 0.5  # [s] time constant with which such differences fade.
+_STOPPING = 1.0  # [s] of motion until a vehicle that is not heard hovers.
 
 
 class Track(NamedTuple):
@@ -119,19 +120,29 @@ class Track(NamedTuple):
         return cls(*vector[:4], state=vector[4:17], expected=vector[17:])
 
     def after(
-        self, state: np.ndarray, time: float, now: float, max_gap: float, epoch: float
+        self,
+        state: np.ndarray,
+        time: float,
+        now: float,
+        max_gap: float,
+        epoch: float,
+        in_charge: bool,
     ) -> "Track":
         """Adds a state (13,) that was measured at `time` [s].
 
         It has jumped if it is not where the velocities of the states have led, or not rotated as
         their angular velocities say. Small differences fade. A jump remains one until the state
         comes back, since the map does not fit to the position any more. Measurements more than
-        `max_gap` [s] apart, or before and after a lag of the process, start again.
+        `max_gap` [s] apart, or before and after a lag of the process, start again; if `in_charge`,
+        after a gap as after a stop, since a vehicle that is not heard is made to hover.
         """
         if np.array_equal(state, self.state):
             return self
         duration = time - self.time
-        if not 0.0 < duration <= max_gap or abs(epoch - self.epoch) > _MAX_LAG:
+        has_lagged = abs(epoch - self.epoch) > _MAX_LAG
+        if duration > max_gap and in_charge and not has_lagged and math.isfinite(duration):
+            return self._after_gap(state, time, now)
+        if not 0.0 < duration <= max_gap or has_lagged:
             return Track(time, now, 0.0, epoch, state, state)
         old, new = QuadrotorState.of(self.state), QuadrotorState.of(state)
         p_WB, _, q_WB, _ = QuadrotorState.of(self.expected)
@@ -152,6 +163,20 @@ class Track(NamedTuple):
             q_WB += duration / _FORGETTING * (math.copysign(1.0, dot) * new.q_WB - q_WB)
             q_WB /= np.linalg.norm(q_WB)
         return Track(time, now, float(jumped), epoch, state, expected)
+
+    def _after_gap(self, state: np.ndarray, time: float, now: float) -> "Track":
+        """Adds the first state after a gap, in which the vehicle stopped with its heading."""
+        old, new = QuadrotorState.of(self.state), QuadrotorState.of(state)
+        p_WB, _, q_WB, _ = QuadrotorState.of(self.expected)
+        before = QuadrotorState.of(self.expected).heading
+        turn = abs(math.remainder(float(new.heading - before), math.tau))
+        speed, rate = np.linalg.norm(old.v_WB), np.linalg.norm(old.w_WB_B)
+        is_far = np.linalg.norm(new.p_WB - p_WB) > _POSITION_JUMP + speed * _STOPPING
+        is_turned = turn > _ROTATION_JUMP + rate * _STOPPING
+        expected = np.concatenate(
+            [p_WB if is_far else new.p_WB, new.v_WB, q_WB if is_turned else new.q_WB, new.w_WB_B]
+        )
+        return Track(time, now, float(is_far or is_turned), self.epoch, state, expected)
 
 
 @dataclass
@@ -394,7 +419,9 @@ class Failsafe(LeafSystem):
         measured, age = optional_input(self, "measured_state", context), signals.ages
         if measured is not None and not math.isinf(age[status.STATE_OLD]):
             time, epoch = now - age[status.STATE_OLD], self._number("unix_time", context, now) - now
-            track = Track.read(context).after(measured, time, now, self._config.max_age, epoch)
+            in_charge = bool(modes.in_charge) and self._is_in_charge(context) is not False
+            max_gap = self._config.max_age
+            track = Track.read(context).after(measured, time, now, max_gap, epoch, in_charge)
             discrete_state.set_value(1, np.hstack(track))
         waits = any(map(math.isinf, age.values()))
         is_idle = waits and modes.mode == status.WAITING

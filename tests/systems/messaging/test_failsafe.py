@@ -377,7 +377,7 @@ def test_body_rates_are_flown_only_by_states_that_change():
 
 def test_a_state_that_changes_again_is_used_again_while_landing():
     bench = Bench(CONFIG)
-    bench.advance(2.6, measured=lambda now: hover_state([10.0, 0.0, 3.0]))
+    bench.advance(2.6, measured=lambda now: hover_state([20.5, 0.0, 3.0]))
     assert bench.mode() == (status.LANDING, status.STATE_FROZEN)
     np.testing.assert_array_equal(bench.out("velocity_setpoint")[:3], [0.0, 0.0, -0.5])
     bench.advance(0.2, measured=moving([20.5, 0.0, 3.0], [0.1, 0.0, 0.0], since=2.6))
@@ -411,6 +411,32 @@ def test_a_state_that_jumped_is_used_again_when_it_comes_back(what):
         bench.advance(0.7, measured=path)
         assert bench.out("mode")[0] == status.FLYING
         assert bench.out("state_is_known")[0] == 1
+
+
+@pytest.mark.parametrize("what", ["position", "heading"])
+def test_a_jump_while_the_state_was_lost_is_one(what):
+    bench = Bench(CONFIG)
+    path = moving([10.0, 0.0, 3.0], [0.2, 0.0, 0.0])
+    bench.advance(0.4, measured=path)
+    held = path(0.4)
+    bench.advance(0.5, measured=lambda now: held)
+    assert bench.mode() == (status.HOLDING, status.STATE_FROZEN)
+    stopped = moving([10.2, 0.0, 3.0], [0.01, 0.0, 0.0], since=1.0)
+    bench.advance(1.0, measured=lambda now: JUMPS[what](stopped(now)))
+    assert bench.mode() == (status.HOLDING, status.STATE_FROZEN)
+    assert bench.out("state_is_known")[0] == 0
+    bench.advance(0.7, measured=stopped)
+    assert bench.mode() == (status.FLYING, status.NONE)
+
+
+def test_a_vehicle_that_its_pilot_moved_while_it_was_not_heard_has_not_jumped():
+    bench = Bench(CONFIG)
+    bench.give(vehicle_status=[1.0, 0.0], vehicle_status_age=0.0)
+    bench.advance(0.4, measured=moving([10.0, 0.0, 3.0], [0.2, 0.0, 0.0]))
+    bench.advance(0.5, measured=lambda now: hover_state([10.1, 0.0, 3.0]))
+    elsewhere = moving([14.0, 0.0, 3.0], [0.01, 0.0, 0.0], since=1.0)
+    bench.advance(0.7, measured=lambda now: rotated(elsewhere(now), 2.9))
+    assert bench.mode() == (status.FLYING, status.NONE)
 
 
 def test_flight_during_a_lag_of_the_process_is_not_a_jump():
