@@ -41,7 +41,8 @@ SMALLER = {
         "UV_TORCH_BACKEND=cpu make .venv/installed\n": "",
         "spacing=0.5": "spacing=1",
         "36_left": "18_left",
-        "iterations=2000": "iterations=100 --set voxel_size=0.1",
+        "width=400 --set height=300": "width=280 --set height=210",
+        "iterations=2000": "iterations=50 --set voxel_size=0.1",
         "fly --scene out/scene": "fly --scene out/scene --set timeout=1",
     },
     "training": {
