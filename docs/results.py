@@ -194,6 +194,11 @@ def success() -> Iterable[Row]:
     return success_rows(Results.read("study"))
 
 
+def density_policies() -> Iterable[Row]:
+    """Yields the success of each policy and speed in RAPID's forests."""
+    return success_rows(Results.read("density"))
+
+
 def success_rows(results: Results) -> Iterable[Row]:
     """Yields success rates with intervals, and means over feasible flights, by policy and speed;
     and the paper's."""
@@ -302,13 +307,15 @@ def sources() -> Iterable[Row]:
 
 
 DERIVED: dict[str, Callable[[], Iterable[Row]]] = {
-    each.__name__: each for each in (success, twins, twin_policies, off_path, trainings, sources)
+    each.__name__: each
+    for each in (success, density_policies, twins, twin_policies, off_path, trainings, sources)
 }
 """Results that are computed from others."""
 
 _INPUTS = {
     "study": STUDY,
     "success": STUDY,
+    "density_policies": "density",
     "twins": "twin_flights",
     "twin_policies": "twin_flights",
     "off_path": "off_path_views",

@@ -85,7 +85,7 @@ def write_report(
         "Trajectories through one field": _trajectories(folder, config, rows),
         f"Pairs of policies on the same flights, {seeds}": _pairs(config, rows),
         f"Scenarios, {seeds}": _scenarios(folder, config, rows, absent),
-        "Flights": _flights(rows),
+        "Flights": _flights(config, rows),
         "Program": _table(["part", "version"], [list(p) for p in folder.program().items()]),
     }
     body = [f"<h1>{title}</h1><p>{_scope(config, rows)}</p>", _warnings(rows, absent, damaged)]
@@ -278,7 +278,11 @@ def _scenarios(
     return _table(["scenario", *header], lines) + (note if single else "")
 
 
-def _flights(rows: list[Row]) -> str:
+def _flights(config: StudyConfig, rows: list[Row]) -> str:
+    own = {each.label: each.policy.partition(":") for each in config.variants}
+    imports = {
+        label: f"--import {module} " if colon else "" for label, (module, colon, _) in own.items()
+    }
     header = ["flight", "outcome", "time [s]", "min. clearance [m]", "velocity [m/s]", "replay"]
     columns = {"flight_time_s": ".1f", "min_clearance_m": "+.2f", "mean_speed_m_s": ".2f"}
     sections = [
@@ -289,9 +293,9 @@ def _flights(rows: list[Row]) -> str:
         lines = [
             [_Html(f'<a href="replays/{id}/flight.html">{id}</a>'), row["outcome"]]
             + [_number(row.get(column, math.nan), form) for column, form in columns.items()]
-            + [_Html(f"<code>splatpilot replay . {id} --meshcat</code>")]
+            + [_Html(f"<code>splatpilot {words}replay . {id} --meshcat</code>")]
             for row in select(rows, scenario=name)
-            for id in [escape(row["id"])]
+            for id, words in [(escape(row["id"]), imports.get(row["policy"], ""))]
         ]
         summary = f"<summary>{escape(name)}: {len(lines)} flights</summary>"
         sections.append(f"<details>{summary}{_table(header, lines)}</details>")

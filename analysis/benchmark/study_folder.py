@@ -296,10 +296,10 @@ def kept_flights(
 
     Raises ValueError for a policy whose module is not imported; files never import modules.
     """
-    config = folder.config()
+    config, specs = folder.config(), list(specs)
     overrides = {each.label: each.policy_overrides for each in config.scenario_variants}
-    variants = {}
-    for variant in config.variants:
+    variants, flown = {}, {spec.policy for spec in specs}
+    for variant in (each for each in config.variants if each.label in flown):
         module, colon, _ = variant.policy.partition(":")
         if colon and module not in sys.modules:
             raise ValueError(
