@@ -282,9 +282,7 @@ class FlightEnv(gymnasium.Env):
                 observed[name] = observe_image(name, image, self.config.camera.max_depth)
             elif name not in observed:
                 observed[name] = self._flight.eval(name).astype(self._spaces[name].dtype)
-        if isinstance(self.config.observation, str):
-            return observed[self.config.observation]
-        return {name: observed[name] for name in names}
+        return self.config.arrange(observed)
 
     def render(self) -> NDArray[np.uint8] | None:
         """Returns the image (H, W, 3) of the scenario's camera, or publishes to Meshcat."""

@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.value import Value
 from pydrake.systems.framework import Context, LeafSystem, State
-from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
 from splatpilot.diagrams.flight.blocks import DECISIONS
 from splatpilot.diagrams.gym.spaces import (
@@ -23,8 +22,7 @@ from splatpilot.diagrams.gym.spaces import (
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.common.drake import vector_input
 from splatpilot.systems.common.validation import require
-
-_PORTS = {"depth_image_32f": (ImageDepth32F, 0), "color_image": (ImageRgba8U, slice(3))}
+from splatpilot.systems.policies.base import CHANNELS
 
 
 class GymPolicy(LeafSystem):
@@ -75,7 +73,7 @@ class GymPolicy(LeafSystem):
         self.DeclareVectorInputPort("goal", 3)
         size = config.camera.width, config.camera.height
         for port in dict.fromkeys(IMAGES[name] for name in self._names if name in IMAGES):
-            self.DeclareAbstractInputPort(port, Value(cast(Any, _PORTS[port][0])(*size)))
+            self.DeclareAbstractInputPort(port, Value(cast(Any, CHANNELS[port][0])(*size)))
         self.DeclareStateOutputPort(config.action, self.DeclareDiscreteState(self._size))
         # Actions precede the controller's update of the same time, as unrestricted updates do; and
         # its times are whole numbers of its period, in which sums of other periods are not.
@@ -99,10 +97,8 @@ class GymPolicy(LeafSystem):
         for name in self._names:
             if name in IMAGES:
                 image: Any = self.GetInputPort(IMAGES[name]).Eval(context)
-                pixels = np.array(image.data[..., _PORTS[IMAGES[name]][1]])
+                pixels = np.array(image.data[..., CHANNELS[IMAGES[name]][1]])
                 seen[name] = observe_image(name, pixels, config.camera.max_depth)
-        ordered = {name: seen[name] for name in self._names}
-        is_one = isinstance(config.observation, str)
-        action = self._predict(seen[self._names[0]] if is_one else ordered)
+        action = self._predict(config.arrange(seen))
         decision = decisions(config, require_actions(action, (self._size,))[None], states)
         state.get_mutable_discrete_state(0).set_value(decision[0])

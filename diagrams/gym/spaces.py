@@ -339,6 +339,12 @@ class FlightEnvConfig(Config):
         """Returns the names of the observations."""
         return [self.observation] if isinstance(self.observation, str) else list(self.observation)
 
+    def arrange(self, observed: Mapping[str, Any]) -> Any:
+        """Returns observations by name as the space has them: in its order, or the only one."""
+        if isinstance(self.observation, str):
+            return observed[self.observation]
+        return {name: observed[name] for name in self.observation}
+
     def limits(self) -> NDArray[np.float64]:
         """Returns the scale (n,) of actions."""
         return np.array(self.action_limits or _LIMITS[self.action])

@@ -308,10 +308,9 @@ class VectorFlightEnv(VectorEnv):
         require(valid, "shape of the rewards", f"({self.num_envs},)", rewards.shape)
         if resting.any():
             rewards = np.where(flying, rewards, 0.0)
-        if config.terminate is not None:
-            own = config.terminates(transition) & flying & ~ended
-            ends[own] = _TERMINATED
-            ended, terminated = ended | own, terminated | own
+        own = config.terminates(transition) & flying & ~ended
+        ends[own] = _TERMINATED
+        ended, terminated = ended | own, terminated | own
         self._previous[flying] = given[flying]
         self._decisions, self._ended = decided, ended
         self._count += flying
@@ -382,9 +381,7 @@ class VectorFlightEnv(VectorEnv):
                 if name in IMAGES:
                     max_depth = self.config.camera.max_depth
                     observed[name] = observe_image(name, images[IMAGES[name]], max_depth)
-        if isinstance(self.config.observation, str):
-            return observed[self.config.observation]
-        return {name: observed[name] for name in names}
+        return self.config.arrange(observed)
 
     def _render(self, rows: NDArray[np.intp] | slice, ports: set[str]) -> dict[str, NDArray]:
         """Renders images of the policy's camera, by the ports of `SplatCamera`."""

@@ -66,10 +66,9 @@ def _described(config: Any, prefix: str) -> Iterator[tuple[str, str]]:
     for field in describe_fields(config):
         name = prefix + field.name
         if is_configuration(field.value):
-            configs = []
             if field.registry is not None:
                 field.registry.load_announced()
-                configs = field.registry.configs()
+            configs = field.registry.configs() if field.registry is not None else []
             tags = [f"!{config.__name__}" for config in (type(field.value), *configs)]
             yield f"{name}  ({' or '.join(dict.fromkeys(tags))})", field.text
             yield from _described(field.value, f"{name}.")

@@ -167,16 +167,16 @@ class Track(NamedTuple):
     def _after_gap(self, state: np.ndarray, time: float, now: float) -> "Track":
         """Adds the first state after a gap, in which the vehicle stopped with its heading."""
         old, new = QuadrotorState.of(self.state), QuadrotorState.of(state)
-        p_WB, _, q_WB, _ = QuadrotorState.of(self.expected)
-        before = QuadrotorState.of(self.expected).heading
-        turn = abs(math.remainder(float(new.heading - before), math.tau))
+        held = QuadrotorState.of(self.expected)
+        turn = abs(math.remainder(float(new.heading - held.heading), math.tau))
         speed, rate = np.linalg.norm(old.v_WB), np.linalg.norm(old.w_WB_B)
-        is_far = np.linalg.norm(new.p_WB - p_WB) > _POSITION_JUMP + speed * _STOPPING
+        is_far = np.linalg.norm(new.p_WB - held.p_WB) > _POSITION_JUMP + speed * _STOPPING
         is_turned = turn > _ROTATION_JUMP + rate * _STOPPING
-        expected = np.concatenate(
-            [p_WB if is_far else new.p_WB, new.v_WB, q_WB if is_turned else new.q_WB, new.w_WB_B]
+        expected = new._replace(
+            p_WB=held.p_WB if is_far else new.p_WB, q_WB=held.q_WB if is_turned else new.q_WB
         )
-        return Track(time, now, float(is_far or is_turned), self.epoch, state, expected)
+        jumped = float(is_far or is_turned)
+        return Track(time, now, jumped, self.epoch, state, expected.to_vector())
 
 
 @dataclass

@@ -82,7 +82,8 @@ def limit_smoothly(output: Any, limits: Any) -> Any:
 
 GRID_SHAPE = 9, 16  # rows and columns of a depth grid
 
-_CHANNELS = {"depth_image_32f": (ImageDepth32F, 0), "color_image": (ImageRgba8U, slice(3))}
+CHANNELS = {"depth_image_32f": (ImageDepth32F, 0), "color_image": (ImageRgba8U, slice(3))}
+"""Type and channels of each image port of a camera."""
 
 
 class Observation(NamedTuple):
@@ -158,9 +159,9 @@ class Policy(LeafSystem):
         self.state_outputs: dict[str, DiscreteStateIndex] = {}
         self._state_port = self.DeclareVectorInputPort("state", 13)
         self._goal_port = self.DeclareVectorInputPort("goal", 3)
-        if image in _CHANNELS:
+        if image in CHANNELS:
             size = config.camera.width, config.camera.height
-            value = Value(cast(Any, _CHANNELS[image][0])(*size))
+            value = Value(cast(Any, CHANNELS[image][0])(*size))
             self._image_port = self.DeclareAbstractInputPort(image, value)
         elif image:
             self._image_port = self.DeclareVectorInputPort(image, int(np.prod(GRID_SHAPE)))
@@ -191,8 +192,8 @@ class Policy(LeafSystem):
         if not self.image:
             return np.empty(0)
         image = self._image_port.Eval(context)
-        if self.image in _CHANNELS:
-            return np.asarray(cast(Any, image).data)[..., _CHANNELS[self.image][1]]
+        if self.image in CHANNELS:
+            return np.asarray(cast(Any, image).data)[..., CHANNELS[self.image][1]]
         return np.reshape(cast(Any, image), GRID_SHAPE)
 
 
