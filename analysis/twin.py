@@ -21,6 +21,7 @@ from splatpilot.analysis.benchmark.variants import parse_variant
 from splatpilot.analysis.figures import write_png
 from splatpilot.diagrams.flight.policies import DEFAULT_SPEED
 from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.worlds.mesh_world import MeshWorld
 from splatpilot.diagrams.worlds.scene_folder import (
     SceneConfig,
     draw_ends,
@@ -28,7 +29,7 @@ from splatpilot.diagrams.worlds.scene_folder import (
     read_scene_metadata,
 )
 from splatpilot.diagrams.worlds.world import World
-from splatpilot.diagrams.worlds.world_registry import MeshWorld, make_world
+from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.common.files import write_csv
 from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.common.provenance import InfeasibleFlightError

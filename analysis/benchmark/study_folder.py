@@ -34,6 +34,7 @@ from splatpilot.analysis.benchmark.variants import LIVE, SCENARIO
 from splatpilot.diagrams.flight.policies import POLICIES, weights_file
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.flight.sensors import SENSORS
+from splatpilot.diagrams.worlds.mesh_world import MeshWorld
 from splatpilot.diagrams.worlds.scene_folder import (
     CAPTURE,
     ENVIRONMENT,
@@ -47,7 +48,7 @@ from splatpilot.diagrams.worlds.scene_folder import (
     read_scene_metadata,
 )
 from splatpilot.diagrams.worlds.splits import find_test_source, part_digests
-from splatpilot.diagrams.worlds.world_registry import WORLDS, MeshWorld
+from splatpilot.diagrams.worlds.world_registry import WORLDS
 from splatpilot.systems.common.config import dump_config, load_config, parse_config
 from splatpilot.systems.common.files import (
     find_data,

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
 from splatpilot.diagrams.worlds import indoor, outdoor
-from splatpilot.diagrams.worlds.feasibility import SHORTEST
 from splatpilot.diagrams.worlds.forest.forest import forest_spec
 from splatpilot.diagrams.worlds.forest.layout import ForestConfig
 from splatpilot.diagrams.worlds.inserted import InsertedConfig, inserted_world
+from splatpilot.diagrams.worlds.mesh_world import MeshWorld, mesh_world
 from splatpilot.diagrams.worlds.moving_spheres import DodgeDroneConfig, dodgedrone_world
 from splatpilot.diagrams.worlds.octomap_world import OCTOMAP, OctomapConfig, octomap_world
 from splatpilot.diagrams.worlds.scene_folder import SceneConfig, read_scene_world
@@ -19,7 +19,6 @@ from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.common.config import require_configuration
 from splatpilot.systems.common.distributions import sample_distributions
 from splatpilot.systems.common.registry import Registry
-from splatpilot.systems.common.validation import Config, bounded, require_field
 
 
 class WorldConfig(Protocol):
@@ -96,34 +95,6 @@ def make_spec(config: WorldConfig, seed: int) -> WorldSpec:
     return plan(sample_distributions(config, seed, ("world",)), seed)
 
 
-@dataclass
-class MeshWorld(Config):
-    """An environment as a mesh (.glb, .gltf or .obj) on disk; cameras show the mesh itself."""
-
-    path: str = ""  # here, or in the folder of data (SPLATPILOT_DATA)
-    up: str = bounded("y", "{y, z}")  # axis of the file that points up: y, as glTF says, or z
-    scale: float = bounded(1.0, "(0, inf) m")  # unit of the file
-    # [m] Of the distance field; 0: 0.1 m, or more for 20 million voxels.
-    voxel_size: float = bounded(0.0, "[0, inf) m")
-    # Color of the sky; red, green, blue in 0 to 1.
-    background: list[float] = bounded(lambda: [0.6, 0.75, 0.9], "[0, 1]")
-    # If true, start and goal are drawn from the seed; otherwise a long route decides.
-    draw_ends: bool = False
-    # [m] Minimum length of the shortest route between ends that are drawn.
-    min_path: float = bounded(SHORTEST, "[0, inf) m")
-
-    def check(self) -> None:
-        require_field(self, "path", self.path, "a mesh")
-        require_field(self, "background", len(self.background) == 3, "red, green and blue")
-
-
-def _mesh_world(config: Any, seed: int) -> World:
-    # Trimesh takes a third of the time of all imports of a flight.
-    from splatpilot.diagrams.worlds.mesh_world import mesh_world
-
-    return mesh_world(config, seed)
-
-
 register_world(ForestConfig, make_spec=forest_spec)
 register_world(outdoor.BranchesConfig, make_spec=outdoor.branches_spec)
 register_world(outdoor.ClutterConfig, make_spec=outdoor.clutter_spec)
@@ -134,5 +105,5 @@ register_world(outdoor.OverUnderConfig, make_spec=outdoor.over_under_spec)
 register_world(SceneConfig, read_scene_world)
 register_world(InsertedConfig, inserted_world)
 register_world(OctomapConfig, octomap_world)
-register_world(MeshWorld, _mesh_world)
+register_world(MeshWorld, mesh_world)
 register_world(DodgeDroneConfig, dodgedrone_world)

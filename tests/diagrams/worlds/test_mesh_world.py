@@ -11,7 +11,8 @@ from splatpilot.diagrams.flight.monitor import Outcome
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.flight.simulation import fly
 from splatpilot.diagrams.worlds.mesh import sample_colors
-from splatpilot.diagrams.worlds.world_registry import MeshWorld, make_world
+from splatpilot.diagrams.worlds.mesh_world import MeshWorld
+from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.common.config import load_config
 from splatpilot.systems.splats.lens import Distortion
 from splatpilot.training.captures.coverage import look_along

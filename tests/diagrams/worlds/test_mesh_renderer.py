@@ -10,7 +10,7 @@ import trimesh
 from PIL import Image
 
 from splatpilot.diagrams.worlds.mesh import mesh_digests, mesh_distance
-from splatpilot.diagrams.worlds.mesh_world import MeshRenderer
+from splatpilot.diagrams.worlds.mesh_renderer import MeshRenderer
 from splatpilot.diagrams.worlds.splits import find_test_source
 from splatpilot.systems.collision.field_mesh import add_primitive, data_uri
 from splatpilot.training.captures.coverage import look_along
