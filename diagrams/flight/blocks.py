@@ -21,7 +21,7 @@ from splatpilot.diagrams.flight.scenario import Scenario, policy_rate
 from splatpilot.diagrams.flight.sensors import SENSORS, SensorConfig, make_onboard_camera
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.esdf_collision import EsdfCollision
-from splatpilot.systems.common.drake import connect, vector_input
+from splatpilot.systems.common.drake import connect
 from splatpilot.systems.common.validation import require, require_type
 from splatpilot.systems.messaging.failsafe import FiniteVector
 from splatpilot.systems.policies.hypotheses import HypothesisSelector, num_hypotheses_in
@@ -68,7 +68,7 @@ class DecisionInput(LeafSystem):
         )
 
     def _calc(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(vector_input(self, self.get_input_port().get_name(), context))
+        output.SetFromVector(np.asarray(self.get_input_port().Eval(context)))
 
 
 class Autonomy(NamedTuple):

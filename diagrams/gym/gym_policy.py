@@ -81,6 +81,12 @@ class GymPolicy(LeafSystem):
         self._every = round(1.0 / (config.rate * period))
         self._turn = int(self.DeclareDiscreteState(1))
         self.DeclarePeriodicUnrestrictedUpdateEvent(period, 0.0, self._update)
+        self.DeclareInitializationUnrestrictedUpdateEvent(self._begin)
+
+    def _begin(self, context: Context, state: State) -> None:
+        """Hovers until the first decision has come, as the environment does."""
+        states, hover = vector_input(self, "state", context)[None], np.zeros((1, self._size))
+        state.get_mutable_discrete_state(0).set_value(decisions(self._config, hover, states)[0])
 
     def _update(self, context: Context, state: State) -> None:
         turn = context.get_discrete_state(self._turn).GetAtIndex(0)

@@ -10,16 +10,19 @@ from splatpilot.diagrams.gym.spaces import FlightEnvConfig
 
 
 @pytest.mark.parametrize(
-    ("observation", "action"),
+    ("observation", "action", "delay"),
     [
-        (["state", "goal", "obstacle"], "velocity"),
-        (["depth", "goal"], "acceleration"),
-        (["rgb", "depth_m", "state"], "waypoint"),
-        ("state", "command"),
+        (["state", "goal", "obstacle"], "velocity", []),
+        (["depth", "goal"], "acceleration", []),
+        (["rgb", "depth_m", "state"], "waypoint", []),
+        ("state", "command", []),
+        ("state", "command", [0.06, 0.06]),
+        ("state", "waypoint", [0.06, 0.06]),
     ],
 )
-def test_its_flight_is_that_of_the_environment(observation, action, post_world):
-    scenario, size = Scenario(timeout=2.0), 4 if action == "command" else 3
+def test_its_flight_is_that_of_the_environment(observation, action, delay, post_world):
+    scenario = Scenario(timeout=2.0, decision_delay=delay)
+    size = 4 if action == "command" else 3
     env = FlightEnv(scenario, world=post_world, observation=observation, action=action)
 
     def predict(seen):
