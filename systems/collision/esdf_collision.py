@@ -75,7 +75,6 @@ def EsdfCollision_(T):
             require(valid, "field", "a DistanceField", f"a {name}", remedy)
             params = BarrierParams(radius, beta, margin)
             params.validate()
-            self._arguments = field, radius, beta, margin
             self._field = field
             self._parameters = [ConfigParameter(self, T, params)]
             self.DeclareVectorInputPort("state", 13)

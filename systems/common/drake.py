@@ -159,18 +159,26 @@ class _SystemTemplate(TemplateSystem):
     """A TemplateSystem of classes with an ordinary `__init__`, see `system_template`."""
 
     def _on_add(self, param: Any, cls: Any, skip_rename: bool) -> Any:
-        init = cls.__init__
+        init, name = cls.__init__, cls.__qualname__.rpartition(".")[2]
+        if "__init__" in vars(cls):
+            signature = inspect.signature(init)
+            valid, remedy = "converter" in signature.parameters, "pass converter on to its base"
+            require(valid, f"{name}.__init__", "(self, ..., *, converter=None)", signature, remedy)
+            del cls.__init__
 
         def construct(system: Any, *args: Any, converter: Any = None, **options: Any) -> None:
             if type(system) is not cls and converter is self._converter:
                 converter = SystemScalarConverter()  # A subclass is not converted to its base.
             init(system, *args, converter=converter, **options)
+            if type(system) is cls:
+                given = {key: _kept(value) for key, value in options.items()}
+                system._arguments = [*map(_kept, args)], given
 
         def construct_copy(system: Any, other: Any, converter: Any = None) -> None:
-            construct(system, *other._arguments, converter=converter)
+            args, options = other._arguments
+            construct(system, *args, converter=converter, **options)
 
         cls._construct, cls._construct_copy = construct, construct_copy
-        del cls.__init__
         cls = super()._on_add(param, cls, skip_rename)
         # Drake's constructor takes any arguments.
         functools.update_wrapper(cls.__init__, init)
@@ -182,14 +190,19 @@ class _SystemTemplate(TemplateSystem):
         return cls
 
 
+def _kept(argument: Any) -> Any:
+    """Returns an argument, or a copy if its owner may change it."""
+    return copy(argument) if isinstance(argument, Config | np.ndarray) else argument
+
+
 def system_template(
     name: str, scalars: Sequence[Any] = (float, AutoDiffXd)
 ) -> Callable[[Callable[[Any], type[_S]]], _Template[_S]]:
     """Defines a system for several scalar types by a function from the type to the class.
 
     As Drake's `TemplateSystem.define`, but the class has an `__init__`, with the keyword
-    `converter` for LeafSystem. It stores in `_arguments` the arguments with which a conversion
-    constructs the system again. A subclass does not support conversion, unless it is a template.
+    `converter` for its base. A conversion constructs the system again with the same arguments. A
+    subclass does not support conversion, unless it is a template.
     """
 
     def define(instantiate: Callable[[Any], type[_S]]) -> _Template[_S]:

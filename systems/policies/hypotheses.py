@@ -137,7 +137,7 @@ def HypothesisSelector_(T):
             super().__init__(converter=converter)
             span = NUM_WAYPOINTS * WAYPOINT_PERIOD
             require(0.0 < lookahead <= span, "lookahead", f"in (0, {span:g}] s", lookahead)
-            self._arguments = self._num_hypotheses, self._lookahead = num_hypotheses, lookahead
+            self._num_hypotheses, self._lookahead = num_hypotheses, lookahead
             self.DeclareVectorInputPort("hypotheses", hypotheses_size(num_hypotheses))
             self.DeclareVectorInputPort("state", 13)
             self.DeclareVectorOutputPort("waypoint", 3, self._calc_waypoint)

@@ -50,7 +50,6 @@ def VelocityTracker_(T):
 
         def __init__(self, *, converter: Any = None) -> None:
             super().__init__(converter=converter)
-            self._arguments = ()
             self.DeclareVectorInputPort("state", 13)
             self.DeclareVectorInputPort("velocity", 3)
             inputs = {self.all_input_ports_ticket()}

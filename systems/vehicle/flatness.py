@@ -283,7 +283,7 @@ def FlatnessController_(T):
             params = QuadrotorParams() if params is None else params
             require_type(config, FlatnessControllerConfig, "config")
             require_type(params, QuadrotorParams, "params")
-            self._arguments = config, params = replace(config), replace(params)
+            self._defaults = config, params = replace(config), replace(params)
             params.validate()
             config.validate()
             lift = params.gravity / math.cos(config.max_tilt)
@@ -344,7 +344,7 @@ def FlatnessController_(T):
                 T is float
                 and (heading is None or math.isnan(heading))
                 and (disturbance is None or not use_waypoint)
-                and (config, params) == self._arguments
+                and (config, params) == self._defaults
             ):
                 command = np.empty(4)
                 target = target if disturbance is None else target - disturbance

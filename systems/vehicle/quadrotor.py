@@ -11,7 +11,7 @@ aerodynamics and battery.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -451,7 +451,6 @@ def QuadrotorPlant_(T):
             valid = start.shape == (13,) and np.isfinite(start).all()
             require(valid, "initial_state", "13 finite numbers", start.tolist())
             require_rotation(QuadrotorState.of(start).q_WB)
-            self._arguments = replace(params), start
             self._ideal = params.is_ideal()
             self._derivatives = component_derivatives if self._ideal else actuated_derivatives
             names = _IDEAL if self._ideal else _IDEAL + _FURTHER

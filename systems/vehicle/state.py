@@ -175,7 +175,6 @@ def StateToPose_(T):
 
         def __init__(self, *, converter: Any = None):
             super().__init__(converter=converter)
-            self._arguments = ()
             state = self.DeclareVectorInputPort("state", 13)
             self.DeclareAbstractOutputPort(
                 "pose",

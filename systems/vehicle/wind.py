@@ -105,7 +105,6 @@ def DrydenWind_(T):
             require_type(config, Wind, "config")
             config.validate()
             check_seed(seed)
-            self._arguments = replace(config), seed, period
             self._seed, self._period = seed, period
             # In units of `gusts`, a parameter.
             self._A, self._B, C, start = dryden_filter(replace(config, gusts=1.0), period)
