@@ -2,6 +2,7 @@ from .analysis.benchmark.run_study import study
 from .diagrams.flight.flight_diagram import (
     AddFlight,
     AddMeshcat,
+    AddMovingBody,
     AddSplatWorld,
     BuildFlightDiagram,
     ExportFlight,
@@ -45,10 +46,9 @@ from .systems.common.validation import Config, bounded
 from .systems.policies.hypotheses import Hypotheses, HypothesisSelector, HypothesisSelector_
 from .systems.policies.planner import PrivilegedPlanner
 from .systems.policies.velocity import VelocityTracker, VelocityTracker_
-from .systems.sensing.imu import Imu
+from .systems.sensing.imu import Imu, RangeFinder
 from .systems.sensing.noise import ObservationNoise
 from .systems.sensing.onboard_camera import OnboardCamera
-from .systems.sensing.range_finder import RangeFinder
 from .systems.splats.baked_scene import BakedScene
 from .systems.splats.lens import Distortion
 from .systems.splats.moving_bodies import MovingBodies
@@ -82,7 +82,7 @@ from .systems.visualization.rerun_sink import RerunSink
 from .systems.visualization.video import VideoRecorder
 from .training.captures.capture import Capture
 from .training.captures.capture_registry import read_capture, register_capture
-from .training.policies.trainer_registry import register_trainer
+from .training.policies.train import register_trainer
 from .training.reconstruction.reconstruct import reconstruct
 
 __all__ = [
@@ -91,6 +91,7 @@ __all__ = [
     "AddFlight",
     "AddFlightMonitor",
     "AddMeshcat",
+    "AddMovingBody",
     "AddSplatWorld",
     "BakedScene",
     "BuildFlightDiagram",

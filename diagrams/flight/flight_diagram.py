@@ -58,6 +58,7 @@ from splatpilot.systems.sensing.latency import FrameTimes
 from splatpilot.systems.splats.background import Background, mean_color
 from splatpilot.systems.splats.moving_bodies import MovingBodies
 from splatpilot.systems.splats.render_engine import ObstacleGeometry, SplatRenderEngine
+from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.splats.splat_camera import SplatCamera
 from splatpilot.systems.vehicle.quadrotor import QuadrotorPlant
 from splatpilot.systems.vehicle.quadrotor_geometry import QuadrotorGeometry, quadrotor_gaussians
@@ -105,25 +106,25 @@ def open_meshcat(scenario: Scenario, world: World) -> Meshcat:
 class FlightParts(NamedTuple):
     """Systems and ports of a flight, see `AddFlight`."""
 
-    name: str
-    scenario: Scenario
-    world: World
-    plant: System
-    estimator: System | None
-    policy: System
-    controller: System | None
-    collision: System
-    camera: SplatCamera | None
-    geometry: QuadrotorGeometry | None
-    monitor: FlightMonitor
-    state: OutputPort  # (13), the true one
-    pose: OutputPort  # the true X_WB
-    goal: OutputPort  # (3) p_WG [m]
-    decision: OutputPort  # `hypotheses` or one of `DECISIONS`
-    command: OutputPort  # (4)
-    observation: dict[str, OutputPort]  # for the policy
-    measured: dict[str, OutputPort]  # by sensors
-    systems: list[System]  # all that the flight added
+    name: str  #: Name of the flight.
+    scenario: Scenario  #: Scenario, with values drawn from its distributions.
+    world: World  #: World, with the scenario's moving obstacles and appearance.
+    plant: System  #: Vehicle.
+    estimator: System | None  #: Source of the state that policy and controller know.
+    policy: System  #: Policy.
+    controller: System | None  #: Controller; None if the policy decides the command.
+    collision: System  #: `EsdfCollision`.
+    camera: SplatCamera | None  #: Scenario's camera; policies see `policy_camera`.
+    geometry: QuadrotorGeometry | None  #: Vehicle in the SceneGraph.
+    monitor: FlightMonitor  #: What ends the flight.
+    state: OutputPort  #: (13), the true state.
+    pose: OutputPort  #: The true X_WB.
+    goal: OutputPort  #: (3) p_WG [m].
+    decision: OutputPort  #: Of the policy: `hypotheses` or one of `DECISIONS`.
+    command: OutputPort  #: (4) to the vehicle: thrust [m/s^2], body rates [rad/s].
+    observation: dict[str, OutputPort]  #: Inputs of the policy by name.
+    measured: dict[str, OutputPort]  #: Outputs of sensors by name.
+    systems: list[System]  #: All that the flight added.
 
 
 def AddFlight(
@@ -143,9 +144,11 @@ def AddFlight(
 ) -> FlightParts:
     """Adds the closed loop of one vehicle to a builder.
 
-    Systems: `plant`, `pose`, `collision`, `goal`, `camera`, the sensors under their names, and
-    those of `AddPolicyAndController`, `AddObservation` and `AddFlightMonitor`. Names of a flight
-    that is not named `flight` begin with its name: `two_plant`.
+    Systems: `plant`, `pose`, `collision`, `goal`, `policy`, `controller`, `camera`, `monitor`,
+    `policy_camera`, which renders what the policy sees, the sensors under their names, `selector`
+    for hypotheses, `velocity_tracker` for velocities, and `moving` if anything moves. Names of a
+    flight that is not named `flight` begin with its name: `two_plant`. Values are drawn from the
+    scenario's distributions by its seed.
 
     Systems that are given may be in the builder already, with connected inputs. Open inputs of a
     given plant or controller are exported, as `plant_wind`.
@@ -316,11 +319,29 @@ def AddFlight(
     for other in others:
         _require_apart(parts, other)
         for seeing, seen in ((parts, other), (other, parts)):
-            bodies = _moving_bodies(builder, seeing)
             radius = seen.scenario.vehicle.radius
-            port = bodies.DeclareBody(seen.name, quadrotor_gaussians(radius), radius)
-            builder.Connect(seen.pose, port)
+            drawn = quadrotor_gaussians(radius)
+            AddMovingBody(builder, seeing, seen.name, drawn, radius, seen.pose)
     return parts
+
+
+def AddMovingBody(
+    builder: DiagramBuilder,
+    parts: FlightParts,
+    name: str,
+    gaussians: GaussianScene,
+    radius: float,
+    X_WO: OutputPort,
+) -> None:
+    """Adds a body that cameras, sensors and planner of a flight see, and its vehicle hits.
+
+    Args:
+        parts: of the flight, as `AddFlight` returns them.
+        name, gaussians, radius: see `MovingBodies.DeclareBody`.
+        X_WO: port of the body's pose (RigidTransform).
+    """
+    port = _moving_bodies(builder, parts).DeclareBody(name, gaussians, radius)
+    builder.Connect(X_WO, port)
 
 
 def _moving_bodies(builder: DiagramBuilder, parts: FlightParts) -> MovingBodies:

@@ -102,7 +102,9 @@ def make_flight_simulator(diagram: Diagram, generator: RandomGenerator | None = 
     """Makes a simulator of a diagram with a `FlightMonitor`, as its scenario says.
 
     The Context is that of SetRandomContext with the generator, by default of the scenario's seed,
-    so that Drake's random sources repeat. Its accuracy lets the flight end at the exact instant.
+    so that Drake's random sources repeat. All else that is random follows from the scenario's seed
+    when the diagram is built, see `random_flights`. The Context's accuracy lets the flight end at
+    the exact instant.
 
     Raises:
         ValueError: if the diagram has no `FlightMonitor`.
@@ -387,6 +389,8 @@ def write_summary(out: Path, summary: dict[str, float | str]) -> None:
 def random_flights(
     scenario: Scenario,
     world: World | None = None,
+    *,
+    build: Callable[[Scenario, World], Diagram] | None = None,
     **systems: str | Callable[[Scenario, World], System],
 ) -> Callable[[RandomGenerator], Simulator]:
     """Makes simulators of flights with random seeds: starts, noise, latency and worlds differ.
@@ -402,6 +406,7 @@ def random_flights(
     Args:
         scenario: of the flights; each replaces its seed.
         world: of all flights; by default made of each seed, which is slow.
+        build: builds the diagram of each flight; by default `BuildFlightDiagram` without camera.
         systems: arguments of `BuildFlightDiagram` such as `policy="velocity"`; functions of
             scenario and world make a system for each flight.
 
@@ -414,6 +419,8 @@ def random_flights(
         seed = MONTE_CARLO_SEEDS[generator() % len(MONTE_CARLO_SEEDS)]
         sample = sample_scenario(replace(scenario, seed=seed))
         flown = world or make_world(sample.world, sample.seed)
+        if build is not None:
+            return make_flight_simulator(build(sample, flown))
         made: dict[str, Any] = {
             name: system if isinstance(system, str) else system(sample, flown)
             for name, system in systems.items()
