@@ -77,8 +77,12 @@ class Sb3FlightEnv(VecEnv):
         return [getattr(self.envs, attr_name)] * len(self._rows(indices))
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Sets an attribute of all environments."""
-        setattr(self.envs, attr_name, value)
+        """Refuses attributes: make the environments with other arguments."""
+        raise ValueError(f"{attr_name} must be an argument of Sb3FlightEnv, got it by set_attr")
+
+    def set_options(self, options: Any = None) -> None:
+        """Refuses options but none: flights of this trainer begin without a reset."""
+        require(not options, "options", "left out; use FlightEnv or VectorFlightEnv", options)
 
     def env_method(self, method_name: str, *args: Any, indices: Any = None, **options: Any) -> list:
         """Calls a method of the environments once."""

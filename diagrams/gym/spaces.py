@@ -33,16 +33,16 @@ from splatpilot.systems.vehicle.state import QuadrotorState
 class Transition(NamedTuple):
     """One step of N vehicles."""
 
-    states: NDArray[np.float64]  # (N, 13) at its beginning, see `QuadrotorState`
-    next_states: NDArray[np.float64]  # (N, 13) at its end
-    p_WG: NDArray[np.float64]  # (N, 3) [m], goals
-    distances: NDArray[np.float64]  # (N,) [m] from p_WB at its end to the nearest surface, or NaN
-    actions: NDArray[np.float64]  # (N, n) in [-1, 1]
-    previous_actions: NDArray[np.float64]  # (N, n); zeros in the first step of a flight
-    reached: NDArray[np.bool_]  # (N,), the flight ended at the goal
-    failed: NDArray[np.bool_]  # (N,), the flight ended by a collision or outside of the world
-    duration: float  # [s]
-    radius: float = VEHICLE_RADIUS  # [m] of the vehicle
+    states: NDArray[np.float64]  #: (N, 13) true ones at its beginning, see `QuadrotorState`
+    next_states: NDArray[np.float64]  #: (N, 13) true ones at its end
+    p_WG: NDArray[np.float64]  #: (N, 3) [m], goals
+    distances: NDArray[np.float64]  #: (N,) [m] from p_WB at its end to the nearest surface, or NaN
+    actions: NDArray[np.float64]  #: (N, n) in [-1, 1]
+    previous_actions: NDArray[np.float64]  #: (N, n); zeros in the first step of a flight
+    reached: NDArray[np.bool_]  #: (N,), the flight ended at the goal
+    failed: NDArray[np.bool_]  #: (N,), the flight ended by a collision or outside of the world
+    duration: float  #: [s]
+    radius: float = VEHICLE_RADIUS  #: [m] of the vehicle
 
 
 @dataclass

@@ -56,8 +56,10 @@ class VectorFlightEnv(VectorEnv):
     after each period of the controller. Flights equal those of `AddFlight` with the seeds in the
     infos of `reset` within rounding, and do not depend on the number of threads.
 
-    Each flight is drawn from a `WorldPool`, whose worlds are made at the beginning. Environment i
-    of a `reset` with the seed s draws its flights from the seed s + i.
+    Each flight is drawn from a `WorldPool`, whose worlds are made at the beginning, each with 64
+    flights: starts, goals and values of the scenario's distributions. Environment i of a `reset`
+    with the seed s draws its flights from the seed s + i. A start, goal and flight of the options
+    hold for one flight.
 
     When a flight ends, infos have its `outcome` and `is_success`, by environments, and masks of
     the environments that have them, `_outcome` and `_is_success`.
