@@ -18,20 +18,20 @@ from pydrake.systems.sensors import CameraInfo
 
 from splatpilot.analysis.figures import Panel, colorize, depth_scale, write_grid
 from splatpilot.analysis.reconstruction import fidelity
-from splatpilot.analysis.reconstruction import run as reconstruction
 from splatpilot.analysis.reconstruction.fidelity import FidelityConfig
 from splatpilot.analysis.reconstruction.measure_scene import (
     METRICS,
+    RenderedSceneConfig,
     SceneViews,
     format_metric,
+    make_scene,
     measure_scene,
     read_metrics,
 )
-from splatpilot.analysis.reconstruction.run import RenderedSceneConfig
 from splatpilot.diagrams.flight.flight_diagram import MakeCamera
 from splatpilot.diagrams.flight.scenario import Scenario, sample_initial_state
 from splatpilot.diagrams.scenarios import benchmark_scenarios
-from splatpilot.diagrams.worlds.octomap_world import OCTOMAP, OctomapConfig
+from splatpilot.diagrams.worlds.file_worlds import OCTOMAP, OctomapConfig
 from splatpilot.diagrams.worlds.scene_folder import (
     SceneConfig,
     SceneSource,
@@ -299,7 +299,7 @@ def _make(
         metrics = read_metrics(scene) if (scene / METRICS).is_file() else measure_scene(scene)
     else:
         settings = config.reconstruct()
-        _, metrics = reconstruction.run(capture=capture, out=scene, config=settings)
+        _, metrics = make_scene(capture=capture, out=scene, config=settings)
     assert metrics is not None
     metadata = read_scene_metadata(scene)
     views = SceneViews(scene)

@@ -316,7 +316,7 @@ def training(effort: Effort) -> Iterator[Headline]:
     vehicles, forward, backward and optimizer."""
     import torch
 
-    from splatpilot.systems.common.torch_device import one_torch_thread
+    from splatpilot.systems.common.processes import one_torch_thread
     from splatpilot.training.policies.evaluation import render_depth
     from splatpilot.training.policies.rollouts import DifferentiableRollout, RolloutConfig
     from splatpilot.training.policies.train import step_optimizer
@@ -383,7 +383,7 @@ def gpu_agreement(effort: Effort, device: str = "cuda") -> Iterator[Headline]:
 
 def gpu_reconstruct(effort: Effort, device: str = "cuda") -> Iterator[Headline]:
     """Reconstructs and measures TartanAir's hospital."""
-    from splatpilot.analysis.reconstruction.run import run
+    from splatpilot.analysis.reconstruction.measure_scene import make_scene
     from splatpilot.training.reconstruction.config import ReconstructConfig
 
     data = data_folder()
@@ -392,7 +392,7 @@ def gpu_reconstruct(effort: Effort, device: str = "cuda") -> Iterator[Headline]:
     config, capture = ReconstructConfig(device=device), data / "tartanair" / "hospital"
     with tempfile.TemporaryDirectory() as folder:
         began = time.perf_counter()
-        _, metrics = run(capture=capture, out=Path(folder) / "scene", config=config)
+        _, metrics = make_scene(capture=capture, out=Path(folder) / "scene", config=config)
         yield Headline("GPU, hospital reconstructed", time.perf_counter() - began, "s")
     yield Headline("GPU, PSNR of the hospital", metrics.mean("psnr_db") or np.nan, "dB")
 

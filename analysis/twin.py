@@ -21,7 +21,7 @@ from splatpilot.analysis.benchmark.variants import parse_variant
 from splatpilot.analysis.figures import write_png
 from splatpilot.diagrams.flight.policies import DEFAULT_SPEED
 from splatpilot.diagrams.flight.scenario import Scenario
-from splatpilot.diagrams.worlds.mesh_world import MeshWorld
+from splatpilot.diagrams.worlds.file_worlds import MeshWorld
 from splatpilot.diagrams.worlds.scene_folder import (
     SceneConfig,
     draw_ends,

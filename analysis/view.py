@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 from splatpilot.diagrams.flight.flight_diagram import empty_meshcat
 from splatpilot.diagrams.flight.scenario import Scenario, goal_position, start_position
 from splatpilot.diagrams.scenarios import scenario_file
-from splatpilot.diagrams.worlds.octomap_world import OCTOMAP
+from splatpilot.diagrams.worlds.file_worlds import OCTOMAP
 from splatpilot.diagrams.worlds.scene_folder import (
     read_scene,
     read_scene_folder,

@@ -34,7 +34,7 @@ from splatpilot.analysis.benchmark.variants import LIVE, SCENARIO
 from splatpilot.diagrams.flight.policies import POLICIES, weights_file
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.flight.sensors import SENSORS
-from splatpilot.diagrams.worlds.mesh_world import MeshWorld
+from splatpilot.diagrams.worlds.file_worlds import MeshWorld
 from splatpilot.diagrams.worlds.scene_folder import (
     CAPTURE,
     ENVIRONMENT,

@@ -16,7 +16,7 @@ def _is_rendered(source: str) -> bool:
 
 
 def _defaults(options: argparse.Namespace) -> Any:
-    from splatpilot.analysis.reconstruction.run import RenderedSceneConfig
+    from splatpilot.analysis.reconstruction.measure_scene import RenderedSceneConfig
     from splatpilot.training.reconstruction.config import ReconstructConfig
 
     rendered = options.source and _is_rendered(options.source)
@@ -56,16 +56,17 @@ def reconstruct(options: argparse.Namespace) -> None:
         if getattr(options, name) is not None and not rendered:
             raise ValueError(f"--{name} must be of a mesh or a scenario, got a capture, {source}")
     cli.announce(f"reconstructing {source} as {options.out}")
-    from splatpilot.analysis.reconstruction import run
+    from splatpilot.analysis.reconstruction import measure_scene
 
     config: Any = cli.read_config(options)
     if not rendered:
-        cli.call(run.run, options, capture=Path(source), config=config)
+        cli.call(measure_scene.make_scene, options, capture=Path(source), config=config)
         return
     if options.up is not None:
         config.render.up = options.up
     seed = options.seed or 0
-    cli.call(run.run_rendered, options, world=Path(source), config=config, seed=seed)
+    make, world = measure_scene.make_rendered_scene, Path(source)
+    cli.call(make, options, world=world, config=config, seed=seed)
 
 
 @cli.command(
@@ -141,7 +142,7 @@ _OUT = cli.out_option("folder of scenes (default: $SPLATPILOT_SCENES, or scenes)
     _OUT,
     cli.set_option(
         *("iterations=3000", "render.max_frames=100"),
-        configuration="splatpilot.analysis.reconstruction.run:RenderedSceneConfig",
+        configuration="splatpilot.analysis.reconstruction.measure_scene:RenderedSceneConfig",
     ),
     cli.json_option("the records"),
     examples=("library make --data data", "library make hospital forest_splat --out scenes"),

@@ -71,7 +71,7 @@ def check_policy(text: str) -> str:
 
 def check_trainer(name: str) -> str:
     """Checks the name of a trainer, and returns it."""
-    registry = "splatpilot.training.policies.trainer_registry"
+    registry = "splatpilot.training.policies.train"
     _check_name("trainer", "splatpilot.trainers", name, TRAINER_NAMES, registry)
     return name
 

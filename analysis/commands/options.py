@@ -154,7 +154,7 @@ class SetField(argparse.Action):
         option_string: str | None = None,
     ) -> None:
         if values == "help":
-            from splatpilot.systems.common.field_help import format_fields  # imports Drake
+            from splatpilot.systems.common.config import format_fields  # imports Drake
 
             print(format_fields(self.configuration(namespace)))
             parser.exit()

@@ -18,7 +18,7 @@ def _trainer_defaults(options: argparse.Namespace) -> Any:
     named = getattr(options, "policy", None) or getattr(options, "policies", None)
     if not named:
         raise ValueError("fields depend on the policy; name it before --set help")
-    from splatpilot.training.policies.trainer_registry import TRAINERS
+    from splatpilot.training.policies.train import TRAINERS
 
     return TRAINERS.find(named if isinstance(named, str) else named[0]).config()
 
@@ -61,7 +61,7 @@ def train(options: argparse.Namespace) -> None:
     from splatpilot.systems.common.config import load_config
     from splatpilot.systems.common.progress import resumable
     from splatpilot.training.policies import train
-    from splatpilot.training.policies.trainer_registry import TRAINERS
+    from splatpilot.training.policies.train import TRAINERS
 
     runs = []
     for policy, seed in product(options.policies, options.seeds or [None]):
@@ -113,7 +113,7 @@ def recover(options: argparse.Namespace) -> None:
     from splatpilot.systems.common.processes import available_cores
     from splatpilot.systems.common.progress import resumable
     from splatpilot.training.policies import recover
-    from splatpilot.training.policies.trainer_registry import TRAINERS
+    from splatpilot.training.policies.train import TRAINERS
 
     config, make = cli.read_config(options), TRAINERS.find(options.policy).make
     jobs = available_cores() if options.jobs is None else options.jobs

@@ -21,8 +21,8 @@ from splatpilot.analysis.reconstruction.measure_scene import (
 from splatpilot.diagrams.worlds.scene_folder import read_scene_metadata
 from splatpilot.systems.common.config import dump_config
 from splatpilot.systems.common.files import claim_folder, locks_folder, write_csv, write_text
+from splatpilot.systems.common.processes import require_renderer
 from splatpilot.systems.common.progress import resumable
-from splatpilot.systems.common.torch_device import require_renderer
 from splatpilot.systems.common.validation import require
 from splatpilot.training.captures.capture import Capture
 from splatpilot.training.captures.capture_registry import read_capture, read_scene_capture

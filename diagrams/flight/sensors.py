@@ -18,9 +18,8 @@ from splatpilot.systems.sensing.estimators import (
     VisualInertial,
     VisualInertialEstimator,
 )
-from splatpilot.systems.sensing.imu import Imu, ImuSensor
+from splatpilot.systems.sensing.imu import Imu, ImuSensor, RangeFinder, RangeFinderSensor
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
-from splatpilot.systems.sensing.range_finder import RangeFinder, RangeFinderSensor
 from splatpilot.systems.splats.splat_camera import SplatCamera
 
 

@@ -29,13 +29,13 @@ from splatpilot.systems.collision.depth_fusion import bounds_of_depth_images, es
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.esdf_build import esdf_from_gaussians
-from splatpilot.systems.collision.frontier import (
+from splatpilot.systems.collision.observations import (
+    Observations,
     frontier_faces,
     hidden_frontier,
     reachable_space,
     with_obstacles,
 )
-from splatpilot.systems.collision.observations import Observations
 from splatpilot.systems.common.files import (
     folder_written_atomically,
     require_scene,

@@ -7,12 +7,17 @@ from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
 from splatpilot.diagrams.worlds import indoor, outdoor
+from splatpilot.diagrams.worlds.file_worlds import (
+    OCTOMAP,
+    MeshWorld,
+    OctomapConfig,
+    mesh_world,
+    octomap_world,
+)
 from splatpilot.diagrams.worlds.forest.forest import forest_spec
 from splatpilot.diagrams.worlds.forest.layout import ForestConfig
 from splatpilot.diagrams.worlds.inserted import InsertedConfig, inserted_world
-from splatpilot.diagrams.worlds.mesh_world import MeshWorld, mesh_world
 from splatpilot.diagrams.worlds.moving_spheres import DodgeDroneConfig, dodgedrone_world
-from splatpilot.diagrams.worlds.octomap_world import OCTOMAP, OctomapConfig, octomap_world
 from splatpilot.diagrams.worlds.scene_folder import SceneConfig, read_scene_world
 from splatpilot.diagrams.worlds.solids.solid import WorldSpec, build
 from splatpilot.diagrams.worlds.world import World

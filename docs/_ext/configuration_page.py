@@ -11,7 +11,7 @@ import yaml
 from splatpilot.analysis.faults import FaultsConfig
 from splatpilot.analysis.gap import GapConfig
 from splatpilot.analysis.reconstruction.fidelity import FidelityConfig
-from splatpilot.analysis.reconstruction.run import RenderedSceneConfig
+from splatpilot.analysis.reconstruction.measure_scene import RenderedSceneConfig
 from splatpilot.analysis.twin import TwinConfig
 from splatpilot.diagrams.flight.policies import POLICIES
 from splatpilot.diagrams.flight.scenario import WITHOUT_EFFECT, Scenario
@@ -20,14 +20,13 @@ from splatpilot.diagrams.gym.spaces import FlightEnvConfig
 from splatpilot.diagrams.hardware.bridge import HardwareConfig
 from splatpilot.diagrams.hardware.px4 import Px4Config
 from splatpilot.diagrams.worlds.world_registry import WORLDS
-from splatpilot.systems.common.config import is_configuration
-from splatpilot.systems.common.field_help import FieldDescription, describe_fields
+from splatpilot.systems.common.config import FieldDescription, describe_fields, is_configuration
 from splatpilot.systems.common.registry import Registry
 from splatpilot.systems.vehicle.vehicles import VEHICLES
 from splatpilot.training.captures.check import CheckConfig
 from splatpilot.training.captures.render import RenderConfig
 from splatpilot.training.corpus.corpus import CorpusConfig
-from splatpilot.training.policies.trainer_registry import TRAINERS
+from splatpilot.training.policies.train import TRAINERS
 from splatpilot.training.reconstruction.config import ReconstructConfig
 
 GROUPS: list[tuple[str, str, list[type] | Registry]] = [

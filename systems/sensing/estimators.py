@@ -15,8 +15,7 @@ from scipy.special import ndtr
 
 from splatpilot.systems.common.drake import vector_input
 from splatpilot.systems.common.validation import Config, bounded, require_field
-from splatpilot.systems.sensing.imu import Imu, white_noise
-from splatpilot.systems.sensing.range_finder import RangeFinder
+from splatpilot.systems.sensing.imu import Imu, RangeFinder, white_noise
 from splatpilot.systems.vehicle.quadrotor import QuadrotorParams, hover_state
 from splatpilot.systems.vehicle.state import QuadrotorState, array_namespace
 

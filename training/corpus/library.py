@@ -11,9 +11,9 @@ from pydrake.math import RigidTransform, RollPitchYaw
 
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.scenarios import benchmark_scenarios, scenario_file
+from splatpilot.diagrams.worlds.file_worlds import OCTOMAP
 from splatpilot.diagrams.worlds.forest.forest import ForestConfig
 from splatpilot.diagrams.worlds.inserted import InsertedConfig
-from splatpilot.diagrams.worlds.octomap_world import OCTOMAP
 from splatpilot.diagrams.worlds.scene_folder import (
     SceneConfig,
     SceneSource,

@@ -4,23 +4,47 @@ import json
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 
 from splatpilot.systems.common.files import claim_folder, locked_folder, write_csv, write_text
-from splatpilot.systems.common.progress import CheckpointClock, Progress, resumable, say
-from splatpilot.systems.common.provenance import revision
-from splatpilot.systems.common.readers import error_summary
-from splatpilot.systems.common.torch_device import (
+from splatpilot.systems.common.processes import (
     keep_freed_memory,
     one_torch_thread,
     require_device,
 )
+from splatpilot.systems.common.progress import CheckpointClock, Progress, resumable, say
+from splatpilot.systems.common.provenance import revision
+from splatpilot.systems.common.readers import error_summary
+from splatpilot.systems.common.registry import Registry
 from splatpilot.systems.common.validation import validate
 from splatpilot.systems.policies.checkpoint import PolicyCheckpoint
+from splatpilot.training.policies.rollouts import RolloutTrainer
+from splatpilot.training.policies.train_agile_autonomy import (
+    AgileAutonomyTrainer,
+    AgileAutonomyTraining,
+)
+from splatpilot.training.policies.train_depthnav import DepthNavLearner, DepthNavTraining
+from splatpilot.training.policies.train_diffaero import (
+    DiffAeroLearner,
+    DiffAeroTofLearner,
+    DiffAeroTofTraining,
+    DiffAeroTraining,
+)
+from splatpilot.training.policies.train_diffaero_rgb import DiffAeroRgbTrainer, DiffAeroRgbTraining
+from splatpilot.training.policies.train_distilled_rgb import (
+    DistilledRgbTrainer,
+    DistilledRgbTraining,
+)
+from splatpilot.training.policies.train_student import (
+    StudentDepthTraining,
+    StudentRgbTraining,
+    StudentTrainer,
+)
 from splatpilot.training.policies.trainer import Trainer, TrainingConfig
 from splatpilot.training.reconstruction.checkpoint import event_log, load_tensors, save_tensors
 
@@ -252,3 +276,36 @@ def step_optimizer(
         raise FloatingPointError(f"the gradient of the loss became {norm.item()}")
     optimizer.step()
     return {name: float(term.detach()) for name, term in (terms | {"loss": loss}).items()}
+
+
+class TrainerEntry(NamedTuple):
+    """A registered trainer."""
+
+    config: type  # of its configurations, a dataclass with the fields of `TrainingConfig`
+    make: Callable[[Any], Trainer]  # makes the trainer of a configuration
+
+
+TRAINERS = Registry("trainer", "splatpilot.trainers", TrainerEntry)
+
+
+def register_trainer(name: str, config: type, make: Callable[[Any], Trainer]) -> None:
+    """Registers the trainer of a policy for `splatpilot train`: the type of its configurations, see
+    `splatpilot.training.policies.trainer`, and what makes the `Trainer` of one."""
+    TRAINERS.add(name, TrainerEntry(config, make))
+
+
+def _rollout_trainer(name: str, learner: Any, config: Any) -> Trainer:
+    return RolloutTrainer(name, learner(config.loss, config.device), config)
+
+
+for _name, _config, _learner in (
+    ("diffaero", DiffAeroTraining, DiffAeroLearner),
+    ("depthnav", DepthNavTraining, DepthNavLearner),
+    ("diffaero_tof", DiffAeroTofTraining, DiffAeroTofLearner),
+):
+    register_trainer(_name, _config, partial(_rollout_trainer, _name, _learner))
+register_trainer("agile_autonomy", AgileAutonomyTraining, AgileAutonomyTrainer)
+register_trainer("diffaero_rgb", DiffAeroRgbTraining, DiffAeroRgbTrainer)
+register_trainer("distilled_rgb", DistilledRgbTraining, DistilledRgbTrainer)
+register_trainer("student_rgb", StudentRgbTraining, StudentTrainer)
+register_trainer("student_depth", StudentDepthTraining, StudentTrainer)

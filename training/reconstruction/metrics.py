@@ -1,17 +1,163 @@
-"""Metrics of rendered views against captured frames: color, depth, floaters and holes."""
+"""Metrics of rendered views against captured frames: color, LPIPS, depth, floaters and holes."""
 
+import importlib.util
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn.functional import adaptive_avg_pool2d, conv2d
 
+from splatpilot.systems.common.files import data_folder
+from splatpilot.systems.common.validation import require
 from splatpilot.systems.splats.background import FAR, Background, RenderedView, put_behind
 from splatpilot.training.captures.capture import CaptureFrame
 from splatpilot.training.reconstruction.losses import ssim_map
-from splatpilot.training.reconstruction.lpips import Lpips
 from splatpilot.training.reconstruction.photometry import vignette
+
+# ImageNet's, which LPIPS applies as a shift and a scale of images in [-1, 1].
+_MEAN, _STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+_MIN_SIZE = 17  # [px] for the last pooling
+
+# SqueezeNet 1.1 (Iandola et al. 2016) without its classifier, with torchvision's names of weights.
+# Importing torchvision takes seconds and loads Triton, whose LLVM aborts the process if Mesa's
+# OpenGL has loaded another.
+
+
+class Fire(nn.Module):
+    """A 1x1 convolution to few channels, then parallel 1x1 and 3x3 convolutions to many."""
+
+    def __init__(self, inputs: int, narrow: int, wide: int):
+        super().__init__()
+        self.squeeze = nn.Conv2d(inputs, narrow, 1)
+        self.expand1x1 = nn.Conv2d(narrow, wide, 1)
+        self.expand3x3 = nn.Conv2d(narrow, wide, 3, padding=1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        x = self.squeeze(x).relu()
+        return torch.cat([self.expand1x1(x).relu(), self.expand3x3(x).relu()], 1)
+
+
+def squeezenet_features() -> nn.Sequential:
+    """Returns the untrained layers of SqueezeNet, (N, 3, H, W) to (N, 512, h, w)."""
+
+    def pool() -> nn.MaxPool2d:
+        return nn.MaxPool2d(3, 2, ceil_mode=True)
+
+    return nn.Sequential(
+        *(nn.Conv2d(3, 64, 3, 2), nn.ReLU(), pool()),
+        *(Fire(64, 16, 64), Fire(128, 16, 64), pool()),
+        *(Fire(128, 32, 128), Fire(256, 32, 128), pool()),
+        *(Fire(256, 48, 192), Fire(384, 48, 192), Fire(384, 64, 256), Fire(512, 64, 256)),
+    )
+
+
+_TAPS = 1, 4, 7, 9, 10, 11, 12
+"""The layers whose features are compared."""
+_CHANNELS = 64, 128, 256, 384, 384, 512, 512
+_FILE = Path("weights", "lpips_squeeze.pt")
+
+
+class Lpips:
+    """LPIPS v0.1 with the SqueezeNet 1.1 backbone (Zhang et al., "The Unreasonable Effectiveness
+    of Deep Features as a Perceptual Metric", CVPR 2018).
+
+    With f_l the features of layer l, each pixel's scaled to unit length over channels, the distance
+    is the sum over layers of the mean over pixels of w_l . (f_l(a) - f_l(b))^2. Weights are
+    `{"squeezenet1_1": state dict, "lin": state dict}` in `lpips_squeeze.pt` of
+    `$SPLATPILOT_DATA/weights`. Without the file they are torchvision's downloaded backbone with the
+    linear layers of the installed package `lpips`.
+    """
+
+    def __init__(self) -> None:
+        self._source = _find_weights()
+        _load(self._source, torch.device("cpu"))
+
+    def __call__(self, a: Tensor, b: Tensor, weights: Tensor | None = None) -> Tensor:
+        """Returns the distance of two images (..., H, W, 3) float32, RGB in [0, 1], a scalar at
+        least 0, differentiable in `a`; that of several is their mean. `weights` (..., H, W) of the
+        pixels are averaged over each cell of a layer; equal by default, as published."""
+        valid = a.shape == b.shape and a.ndim >= 3 and a.shape[-1] == 3
+        require(
+            valid and min(a.shape[-3:-1]) >= _MIN_SIZE,
+            "images",
+            f"(..., H, W, 3) of one size of at least {_MIN_SIZE} pixels",
+            f"{tuple(a.shape)} and {tuple(b.shape)}",
+        )
+        layers, linear = _load(self._source, a.device)
+        features = _features(layers, a)
+        with torch.no_grad():
+            other_features = _features(layers, b)
+        distances = [
+            _weighted_mean(conv2d((x - y).square(), w), weights)
+            for x, y, w in zip(features, other_features, linear, strict=True)
+        ]
+        return torch.stack(distances).sum()
+
+
+def _weighted_mean(distances: Tensor, weights: Tensor | None) -> Tensor:
+    """Returns the mean of a layer's distances (N, 1, h, w), weighted by pixels (..., H, W)."""
+    if weights is None:
+        return distances.mean()
+    images = weights.reshape(-1, 1, *weights.shape[-2:])
+    height, width = distances.shape[-2:]
+    shares = adaptive_avg_pool2d(images, (height, width))
+    return (shares * distances).sum() / shares.sum()
+
+
+def _features(layers: nn.Sequential, images: Tensor) -> list[Tensor]:
+    """Returns the features of images (..., H, W, 3), of unit length over channels."""
+    x = images.reshape(-1, *images.shape[-3:])
+    x = ((x - x.new_tensor(_MEAN)) / x.new_tensor(_STD)).movedim(-1, 1)
+    features = []
+    for i, layer in enumerate(layers):
+        x = layer(x)
+        if i in _TAPS:
+            features.append(x / (x.square().sum(dim=1, keepdim=True).sqrt() + 1e-10))
+    return features
+
+
+def _find_weights() -> tuple[Path, ...]:
+    data = data_folder()
+    if data is not None and (data / _FILE).is_file():
+        return (data / _FILE,)
+    backbone = Path(torch.hub.get_dir()) / "checkpoints" / "squeezenet1_1-b8a52dc0.pth"
+    package = importlib.util.find_spec("lpips")
+    if backbone.is_file() and package is not None and package.origin is not None:
+        return (backbone, Path(package.origin).parent / "weights" / "v0.1" / "squeeze.pth")
+    raise FileNotFoundError(
+        f"LPIPS has no weights: neither $SPLATPILOT_DATA/{_FILE} nor torchvision's {backbone} with "
+        "the package `lpips` exists; run `pip install lpips` and `python -c "
+        "\"import torchvision; torchvision.models.squeezenet1_1(weights='DEFAULT')\"` once"
+    )
+
+
+@cache
+def _load(source: tuple[Path, ...], device: torch.device) -> tuple[nn.Sequential, list[Tensor]]:
+    """Returns the layers of the backbone and the weights of the linear layers, (1, C, 1, 1)."""
+    try:
+        files = [torch.load(file, map_location="cpu", weights_only=True) for file in source]
+        backbone, linear = (
+            (files[0]["squeezenet1_1"], files[0]["lin"]) if len(files) == 1 else files
+        )
+        layers = squeezenet_features()
+        names = (name for name in backbone if name.startswith("features."))
+        layers.load_state_dict({n.removeprefix("features."): backbone[n].float() for n in names})
+        weights = [linear[f"lin{i}.model.1.weight"].float() for i in range(len(_TAPS))]
+        if [w.shape for w in weights] != [(1, channels, 1, 1) for channels in _CHANNELS]:
+            raise ValueError("linear layers have other sizes")
+    except Exception as error:  # unpickling may raise anything
+        raise ValueError(
+            f"{' and '.join(map(str, source))}: no LPIPS-squeeze weights ({str(error)[:200]}); "
+            "get them again"
+        ) from error
+    layers.requires_grad_(False).eval().to(device)
+    return layers, [w.to(device) for w in weights]
+
 
 _MIN_DEPTH = 1e-3  # [m], minimum true depth that counts, as in `log_depth_loss`
 _FLOATER_MARGIN = 0.1  # [m], and as a fraction of the true depth

@@ -24,9 +24,9 @@ from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.observations import Observations
+from splatpilot.systems.common.processes import one_torch_thread
 from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.common.provenance import InfeasibleFlightError
-from splatpilot.systems.common.torch_device import one_torch_thread
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 from splatpilot.training.captures.capture import Capture, shrink_factor
@@ -40,8 +40,7 @@ from splatpilot.training.reconstruction.initialize import (
     make_initial_gaussians,
     resolve_config,
 )
-from splatpilot.training.reconstruction.lpips import Lpips
-from splatpilot.training.reconstruction.metrics import HeldOutMetrics
+from splatpilot.training.reconstruction.metrics import HeldOutMetrics, Lpips
 from splatpilot.training.reconstruction.optimize import Optimization
 from splatpilot.training.reconstruction.photometry import (
     Photometry,

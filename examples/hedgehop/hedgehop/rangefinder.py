@@ -10,7 +10,7 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem
 from splatpilot import Config, Scenario, World, bounded, register_sensor
 from splatpilot.systems.collision.distance_field import DistanceField
 from splatpilot.systems.common.validation import require_field
-from splatpilot.systems.sensing.range_finder import cast_ray
+from splatpilot.systems.sensing.imu import cast_ray
 
 
 @dataclass
