@@ -1,9 +1,15 @@
 import os
+import sys
+from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 from hypothesis import settings
 from tqdm import tqdm
 
+from splatpilot.diagrams.flight.policies import POLICIES
+from splatpilot.diagrams.flight.sensors import SENSORS
+from splatpilot.diagrams.worlds.world_registry import WORLDS
 from splatpilot.systems.common.extras import require_opengl
 from splatpilot.systems.messaging.lcm_ports import open_lcm
 
@@ -20,7 +26,7 @@ os.environ["NUMBA_DISABLE_JIT"] = "1"
 
 _SLOWEST = (
     *("tutorials", "crash", "docs", "px4", "hedgehop", "bridge", "wheel", "examples", "train"),
-    *("reconstruct", "optimize", "extras", "check", "initialize", "recover", "readme", "run_study"),
+    *("reconstruct", "optimize", "extras", "check", "initialize", "recover", "run_study"),
 )
 
 
@@ -54,3 +60,14 @@ def udp_url() -> str:
     except OSError as error:
         pytest.skip(str(error))
     return url
+
+
+@pytest.fixture
+def hedgehop(monkeypatch) -> Iterator[None]:
+    """Makes the example package importable; forgets its modules and entries afterwards."""
+    for registry in (POLICIES, SENSORS, WORLDS):
+        monkeypatch.setattr(registry, "_entries", dict(registry._entries))
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "examples" / "hedgehop"))
+    yield
+    for name in [name for name in sys.modules if name.partition(".")[0] == "hedgehop"]:
+        del sys.modules[name]

@@ -52,26 +52,23 @@ def execute(words: list[str], folder: Path, limit: int) -> None:
 class Command:
     """A command and what it leaves undisturbed."""
 
-    def __init__(self, root: Path, name: str) -> None:
+    def __init__(self, folder: Path, name: str) -> None:
         words, self._patterns = COMMANDS[name]
-        self._words, self._valid, self._folder = words.split(), root / "valid", root / "run"
+        self._words, self._folder = words.split(), folder
         self._context = multiprocessing.get_context("forkserver")
         modules = "commands.main", "benchmark.run_study", "reconstruction.run"
         self._context.set_forkserver_preload([f"splatpilot.analysis.{name}" for name in modules])
-        write_room_capture(self._valid / "room")
-        (self._valid / "short.yaml").write_text(SCENARIO)
+        write_room_capture(folder / "room")
+        (folder / "short.yaml").write_text(SCENARIO)
+        os.mkfifo(folder / "errors")
         started = time.monotonic()
         assert self.run() == (0, "")
         self.seconds, self.files = time.monotonic() - started, self.digests()
-        outputs = [file.stat().st_size for file in self._folder.rglob("out/**/*") if file.is_file()]
+        outputs = [file.stat().st_size for file in folder.rglob("out/**/*") if file.is_file()]
         self.largest = max(outputs)
 
-    def run(self, number: int = 0, after: float = 60.0, limit: int = 0, again: bool = False):
+    def run(self, number: int = 0, after: float = 60.0, limit: int = 0) -> tuple[int | None, str]:
         """Returns exit status and last line of errors; sends a signal `after` so many seconds."""
-        if not again:
-            shutil.rmtree(self._folder, ignore_errors=True)
-            shutil.copytree(self._valid, self._folder)
-            os.mkfifo(self._folder / "errors")
         errors = os.open(self._folder / "errors", os.O_RDONLY | os.O_NONBLOCK)
         child = self._context.Process(target=execute, args=(self._words, self._folder, limit))
         child.start()
@@ -92,26 +89,17 @@ class Command:
         ]
         return {f.name: hashlib.sha256(f.read_bytes()).hexdigest() for f in files if f.is_file()}
 
-    def check_again(self) -> None:
-        assert self.run(again=True) == (0, "")
-        assert self.digests() == self.files
-        assert not list(self._folder.rglob("*.partial*"))
 
-
-@pytest.fixture(scope="module", params=COMMANDS)
-def command(request, tmp_path_factory) -> Command:
-    return Command(tmp_path_factory.mktemp("crash"), request.param)
-
-
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
-def test_ended_command_loses_nothing(command, number):
-    status, message = command.run(number, after=0.5 * command.seconds)
-    assert status in (0, -number, 143)
-    assert status != 143 or message.startswith("splatpilot: terminated")
-    command.check_again()
-
-
-def test_full_disk_loses_nothing(command):
+@pytest.mark.parametrize("name", COMMANDS)
+def test_command_that_a_full_disk_or_a_signal_ended_loses_nothing(name, tmp_path):
+    command = Command(tmp_path, name)
+    shutil.rmtree(tmp_path / "out")
     status, message = command.run(limit=command.largest // 2)
     assert status == 1 and message.startswith("splatpilot: ")
-    command.check_again()
+    for number in (signal.SIGKILL, signal.SIGTERM):
+        status, message = command.run(number, after=0.5 * command.seconds)
+        assert status in (0, -number, 143)
+        assert status != 143 or message.startswith("splatpilot: terminated")
+    assert command.run() == (0, "")
+    assert command.digests() == command.files
+    assert not list(tmp_path.rglob("*.partial*"))

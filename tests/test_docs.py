@@ -1,3 +1,4 @@
+import ast
 import csv
 import importlib
 import re
@@ -6,8 +7,9 @@ import shlex
 import shutil
 import subprocess
 import sys
+import tomllib
 import zlib
-from argparse import ArgumentParser, Namespace
+from argparse import Namespace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -18,23 +20,20 @@ import report_figures
 import results
 from stable_baselines3 import PPO
 
+import splatpilot as sp
 from splatpilot.analysis.commands.checks import SCENARIOS
-from splatpilot.analysis.commands.main import main
+from splatpilot.analysis.commands.main import build_parser, main
 from splatpilot.analysis.commands.options import read_scenario
 from splatpilot.diagrams.flight.policies import POLICIES, policy_named
-from splatpilot.diagrams.flight.scenario import Scenario
-from splatpilot.diagrams.flight.sensors import SENSORS
 from splatpilot.diagrams.gym.sb3 import Sb3FlightEnv
 from splatpilot.diagrams.hardware.bridge import HardwareConfig
 from splatpilot.diagrams.hardware.px4 import Px4Config
-from splatpilot.diagrams.worlds.world_registry import WORLDS
-from splatpilot.systems.common.config import load_config
-from splatpilot.systems.common.field_help import describe_fields
+from splatpilot.systems.common.config import describe_fields
 from splatpilot.systems.common.files import write_csv
-from splatpilot.systems.visualization.live import LiveControls
 from splatpilot.training.captures.capture_config import CaptureConfig
 
 ROOT = Path(__file__).parents[1]
+README = ROOT / "README.md"
 DOCS = ROOT / "docs"
 GUIDES = sorted(DOCS.glob("*.md"))
 PAGES = [*sorted(ROOT.glob("*.md")), *GUIDES, *sorted((DOCS / "tutorials").glob("*.md"))]
@@ -64,69 +63,34 @@ def commands(page: Path) -> list[list[str]]:
     return [[word for word in words if word != "&"] for words in lines if words]
 
 
-class ParsedError(BaseException):
-    """Raised instead of running a parsed command; `main` reports all others."""
-
-
-@pytest.fixture
-def parse(monkeypatch):
-    """Parses a command line without running it."""
-    whole, parsed = ArgumentParser.parse_args, []
-
-    def parse_only(parser: ArgumentParser, *words: Any) -> None:
-        parsed.append(whole(parser, *words))
-        raise ParsedError
-
-    monkeypatch.setattr(ArgumentParser, "parse_args", parse_only)
-    # Readers write the modules that pages name.
-    monkeypatch.setattr("splatpilot.systems.common.registry.import_modules", lambda names: None)
-
-    def parse(words: list[str]) -> Namespace:
-        with pytest.raises(ParsedError):
-            main(words)
-        return parsed[-1]
-
-    return parse
-
-
 def default_config(options: Namespace) -> Any:
     """Makes the configuration that a command's `--set` changes, without reading files."""
     if options.command.name == "view" and options.what not in SCENARIOS:
         return CaptureConfig()
     if options.default_config is not read_scenario:
         return options.default_config(options)
-    scenario = Scenario()
+    scenario = sp.Scenario()
     if options.policy in POLICIES.names():
         scenario.policy = policy_named(options.policy)
     return scenario
 
 
-@pytest.fixture
-def hedgehop(monkeypatch):
-    """Registers the entries of the example package."""
-    for registry in (POLICIES, SENSORS, WORLDS):
-        monkeypatch.setattr(registry, "_entries", dict(registry._entries))
-    monkeypatch.syspath_prepend(str(ROOT / "examples" / "hedgehop"))
-    importlib.import_module("hedgehop.climber")
-    importlib.import_module("hedgehop.hedges")
-    yield
-    for name in [name for name in sys.modules if name.partition(".")[0] == "hedgehop"]:
-        del sys.modules[name]
-
-
 @pytest.mark.parametrize("page", PAGES, ids=[page.stem for page in PAGES])
-def test_commands_parse_and_their_fields_can_be_set(page, parse, hedgehop):
-    pictures = runpy.run_path(str(ROOT / "docs" / "pictures.py"))["make_parser"]()
+def test_commands_parse_and_their_fields_can_be_set(page, hedgehop, monkeypatch):
+    for module in ("climber", "hedges"):
+        importlib.import_module(f"hedgehop.{module}")
+    # Readers write the modules that pages name.
+    monkeypatch.setattr("splatpilot.systems.common.registry.import_modules", lambda names: None)
+    pictures = runpy.run_path(str(DOCS / "pictures.py"))["make_parser"]()
     for words in commands(page):
         words = words[1:] if words[0] == "srun" else words
         if words[:2] == ["python", "docs/pictures.py"]:
-            with pytest.raises(ParsedError):
-                pictures.parse_args(words[2:])
+            pictures.parse_args(words[2:])
         if words[0] != "splatpilot" or words[-1] == "help":
             continue
-        options = parse(words[1:])
+        options = build_parser().parse_args(words[1:])
         if hasattr(options, "overrides") and ":" not in (getattr(options, "policy", "") or ""):
-            load_config(default_config(options), overrides=options.overrides)
+            sp.load_config(default_config(options), overrides=options.overrides)
 
 
 @pytest.mark.parametrize(
@@ -137,27 +101,20 @@ def test_files_are_configurations(page, tmp_path):
         if text.startswith("apiVersion:"):
             continue
         named = set(re.findall(r"^(\w+):", text, re.MULTILINE))
-        (config,) = [
-            config
-            for config in (Scenario, HardwareConfig, Px4Config)
-            if named <= {field.name for field in describe_fields(config())}
-            and (config is not Px4Config or "motion_capture" in named)
-        ]
+        kinds = [Px4Config()] if "motion_capture" in named else [sp.Scenario(), HardwareConfig()]
+        fields = [{field.name for field in describe_fields(kind)} for kind in kinds]
+        (config,) = (kind for kind, known in zip(kinds, fields, strict=True) if named <= known)
         (tmp_path / "file.yaml").write_text(text)
-        load_config(config(), tmp_path / "file.yaml").validate()
+        sp.load_config(config, tmp_path / "file.yaml").validate()
 
 
 @pytest.mark.parametrize(
-    "page",
-    [p for p in GUIDES if blocks(p, "python")],
-    ids=lambda page: page.stem,
+    "page", [p for p in GUIDES if blocks(p, "python")], ids=lambda page: page.stem
 )
 def test_python_runs(page, monkeypatch):
-    monkeypatch.setattr(LiveControls, "wait_for_viewer", lambda self: None)
+    monkeypatch.setattr(sp.LiveControls, "wait_for_viewer", lambda self: None)
     monkeypatch.setattr(POLICIES, "_entries", dict(POLICIES._entries))
-    learn = PPO.learn
-    monkeypatch.setattr(PPO, "learn", lambda ppo, **_: learn(ppo, ppo.n_steps * ppo.n_envs))
-    names: dict[str, Any] = {}
+    names: dict[str, Any] = {"__name__": "__main__"}
     for code in blocks(page, "python"):
         exec(code, names)
     if "flight" in names:
@@ -166,22 +123,16 @@ def test_python_runs(page, monkeypatch):
 
 def test_trained_models_fly_as_the_page_says(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
     monkeypatch.setattr(POLICIES, "_entries", dict(POLICIES._entries))
     [code] = (each for each in blocks(DOCS / "gym.md", "python") if "GymPolicy" in each)
     Path("my_ppo.py").write_text(code)
-    envs = Sb3FlightEnv(2, "P01", observation=["state", "goal", "obstacle"])
+    world = sp.load_config(sp.Scenario(), overrides=["world.length=9"])
+    envs = Sb3FlightEnv(2, world, num_worlds=1, observation=["state", "goal", "obstacle"])
     PPO("MultiInputPolicy", envs, seed=0).save("out/ppo")
-    words = ["fly", "--policy", "my_ppo:PpoConfig", "--set", "timeout=1", "--out", "flown"]
-    assert main(words) == 0
+    words = ["fly", "--policy", "my_ppo:PpoConfig", "--set", "world.length=9", "--no-video"]
+    assert main([*words, "--set", "timeout=1", "--out", "flown"]) == 0
     assert "!PpoConfig" in Path("flown/scenario.yaml").read_text()
-
-
-def _anchors(page: Path) -> set[str]:
-    """Returns the link targets of the headings of a page."""
-    headings = re.findall(r"^#+ (.*)$", page.read_text(), re.MULTILINE)
-    kept = [re.sub(r"[^\w\- ]", "", heading.lower()) for heading in headings]
-    return {heading.strip().replace(" ", "-") for heading in kept}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=[page.stem for page in PAGES])
@@ -193,14 +144,17 @@ def test_links_lead_somewhere(page):
         if link.startswith("https://"):
             continue
         assert target.exists(), link
-        assert not anchor or anchor in _anchors(target), link
+        if anchor:
+            headings = re.findall(r"^#+ (.*)$", target.read_text(), re.MULTILINE)
+            kept = [re.sub(r"[^\w\- ]", "", heading.lower()).strip() for heading in headings]
+            assert anchor in [heading.replace(" ", "-") for heading in kept], link
 
 
 def test_messages_of_troubleshooting_are_those_of_the_source():
     files = [file for floor in FLOORS for file in (ROOT / floor).rglob("*.py")]
     source = "\n".join(file.read_text() for file in [*files, ROOT / "Makefile"])
     source = re.sub(r'"\n\s*f?"', "", source)  # joins the parts of strings
-    page = (ROOT / "docs" / "troubleshooting.md").read_text()
+    page = (DOCS / "troubleshooting.md").read_text()
     lists = re.findall(r"^- ((?:`[^`]+`(?:,\s+)?)+):", page, re.MULTILINE)
     messages = {message for found in lists for message in re.findall("`([^`]+)`", found)}
     assert FOREIGN_MESSAGES < messages and len(messages) >= 20
@@ -213,7 +167,7 @@ def test_messages_of_troubleshooting_are_those_of_the_source():
 def test_every_picture_has_its_command():
     images = [image for page in PAGES for image in IMAGE.findall(page.read_text())]
     shown = {f"docs/{Path(image).name}" for image in images if not image.endswith(".svg")}
-    made = {words[-1] for words in commands(ROOT / "docs" / "pictures.md")}
+    made = {words[-1] for words in commands(DOCS / "pictures.md")}
     assert len(shown) > 10
     assert shown <= made
 
@@ -223,17 +177,13 @@ def test_tables_of_pages_are_those_of_the_results(page):
     assert results.with_tables(page.read_text()) == page.read_text()
 
 
-@pytest.fixture(scope="module")
-def figures():
-    return results.figures()
-
-
-@pytest.mark.parametrize("name", [draw.__name__ for draw in report_figures.FIGURES])
-def test_figures_show_the_results(name, figures):
-    written = ElementTree.parse(results.REPORT / f"{name}.svg")
-    description = written.findtext(".//{http://purl.org/dc/elements/1.1/}description")
-    assert description == report_figures.plotted(figures[name])
-    assert f"({name}.svg)" in (results.REPORT / "index.md").read_text()
+def test_figures_show_the_results():
+    figures, page = results.figures(), (results.REPORT / "index.md").read_text()
+    for name in (draw.__name__ for draw in report_figures.FIGURES):
+        written = ElementTree.parse(results.REPORT / f"{name}.svg")
+        description = written.findtext(".//{http://purl.org/dc/elements/1.1/}description")
+        assert description == report_figures.plotted(figures[name]), name
+        assert f"({name}.svg)" in page
 
 
 def test_the_pdf_is_of_the_page():
@@ -268,9 +218,7 @@ def test_a_changed_number_changes_table_and_figure(
     rows[0][column] = f"{float(rows[0][column]) - 1:g}"
     write_csv(file, rows)
     monkeypatch.setattr(results, "RESULTS", tmp_path / "results")
-    after = rendered()
-    assert after[0] != before[0]
-    assert after[1] != before[1]
+    assert all(old != new for old, new in zip(before, rendered(), strict=True))
 
 
 @pytest.mark.parametrize("page", [p for p in PAGES if p.stem != "CHANGELOG"], ids=lambda p: p.stem)
@@ -280,23 +228,15 @@ def test_success_of_flights_stands_in_tables_of_results_alone(page):
     assert not re.findall(success, text)
 
 
-@pytest.fixture(scope="module")
-def configurations() -> list[Any]:
-    """The configurations on their page."""
-    page = runpy.run_path(str(ROOT / "docs" / "_ext" / "configuration_page.py"))
-    return [config for _, _, group in page["configurations"]() for config in group]
-
-
-def test_every_field_has_a_description(configurations):
+def test_configurations_of_commands_have_sections_and_their_fields_descriptions():
+    page = runpy.run_path(str(DOCS / "_ext" / "configuration_page.py"))
+    configurations = [config for _, _, group in page["configurations"]() for config in group]
     for config in configurations:
         if not type(config).__module__.startswith("splatpilot."):
             continue  # Drake's, and those that other tests have registered.
         for field in describe_fields(config):
             said = re.sub(r"\[[^]]*\]", "", field.text).strip()
             assert len(said) > 3, f"{type(config).__name__}.{field.name}: {field.text!r}"
-
-
-def test_every_configuration_of_a_command_has_a_section(configurations):
     loaded = set()
     for module in (ROOT / "analysis" / "commands").glob("*.py"):
         loaded |= set(re.findall(r"\b(\w+Config|Scenario)(?:\(\)|\")", module.read_text()))
@@ -306,18 +246,50 @@ def test_every_configuration_of_a_command_has_a_section(configurations):
 
 def test_site_builds(tmp_path):
     command = [sys.executable, "-m", "sphinx", "--fail-on-warning", "--keep-going", "--quiet"]
-    done = subprocess.run(
-        [*command, str(ROOT / "docs"), str(tmp_path)], capture_output=True, text=True
-    )
+    done = subprocess.run([*command, DOCS, tmp_path], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     inventory = (tmp_path / "objects.inv").read_bytes().split(b"zlib.\n", 1)[1]
     known = {line.split()[0] for line in zlib.decompress(inventory).decode().splitlines()}
-    api = runpy.run_path(str(ROOT / "docs" / "_ext" / "api_page.py"))
+    api = runpy.run_path(str(DOCS / "_ext" / "api_page.py"))
     systems = list(api["leaf_systems"]())
     assert len(systems) > 20
     assert {f"splatpilot.{name}" for name in api["public_names"]()} | set(systems) <= known
     assert "alias of" not in (tmp_path / "api.html").read_text()
     html = (tmp_path / "configuration.html").read_text()
-    for field in describe_fields(Scenario()):
-        assert f">{field.name}<" in html
+    assert all(f">{field.name}<" in html for field in describe_fields(sp.Scenario()))
     assert "https://" not in re.sub(r'href="[^"]*"', "", (tmp_path / "index.html").read_text())
+
+
+def test_python_of_the_readme_runs(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(POLICIES, "_entries", dict(POLICIES._entries))
+    policy, flight, training = blocks(README, "python")
+    for text, small in (
+        ("Env(16, ", "Env(1, "),
+        ("n_steps=64", "n_steps=2"),
+        ("200_000", "2"),
+        ("progress_bar=True", "progress_bar=False"),  # which needs rich
+    ):
+        assert text in training
+        training = training.replace(text, small)
+    Path("my_policy.py").write_text(policy)
+    Path("flight.py").write_text("from my_policy import *\n" + flight)
+    Path("training.py").write_text(training)
+    runpy.run_path("training.py")
+    capsys.readouterr()
+    runpy.run_path("flight.py")
+    summary = ast.literal_eval(capsys.readouterr().out)
+    assert summary["outcome"] in set(sp.Outcome) and summary["path_length_m"] > 1.0
+    command = re.search(r"splatpilot (fly --policy my_policy.*)", README.read_text())
+    assert command is not None
+    assert main([*command[1].split(), "--set", "timeout=1", "--out", "flight"]) == 0
+
+
+def test_readme_is_two_screens_and_lists_all_extras():
+    text = README.read_text()
+    assert len(text.splitlines()) <= 150
+    (listed,) = re.findall(r"Extras:.*?\n\n", text, re.DOTALL)
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = set(project["optional-dependencies"]) - {"dev"}
+    assert set(re.findall(r"`(\w+)`", listed)) == extras

@@ -19,13 +19,10 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 from room import write_room_capture
 
-from splatpilot.diagrams.flight.scenario import Scenario
+import splatpilot as sp
 from splatpilot.diagrams.worlds.mesh import mesh_distance
 from splatpilot.diagrams.worlds.scene_folder import read_scene, write_scene_folder
-from splatpilot.diagrams.worlds.world import World
-from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.octomap import read_octomap
-from splatpilot.systems.common.config import dump_config, load_config
 from splatpilot.systems.messaging import codecs
 from splatpilot.systems.messaging.lcm_ports import decode_message
 from splatpilot.systems.sensing.time_of_flight import (
@@ -35,17 +32,13 @@ from splatpilot.systems.sensing.time_of_flight import (
     after_packet,
 )
 from splatpilot.systems.splats.background import EnvironmentMap
-from splatpilot.systems.splats.baked_scene import BakedScene
-from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.splats.splat_files import read_splats, write_ply
-from splatpilot.training.captures.capture_registry import read_capture
 
 WIDTH, HEIGHT, FRAMES, COUNT = 16, 12, 6, 20
 R_WC = RotationMatrix(np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]]))
 POSES = [RigidTransform(R_WC, [0.2 * i, 0.05 * i**2, 1.0]) for i in range(FRAMES)]
-DEPTH = np.full((HEIGHT, WIDTH), 2.0, np.float32)
 RNG = np.random.default_rng(0)
-GAUSSIANS = GaussianScene(
+GAUSSIANS = sp.GaussianScene(
     means=RNG.uniform(0, 3, (COUNT, 3)).astype(np.float32),
     quats=RNG.normal(size=(COUNT, 4)).astype(np.float32),
     scales=RNG.uniform(0.05, 0.2, (COUNT, 3)).astype(np.float32),
@@ -62,7 +55,7 @@ FOREIGN = gsply.GSData.from_arrays(
     format="ply",
 )
 _STATES = RNG.integers(0, 3, (5, 4, 3), dtype=np.uint8)
-ESDF = Esdf(RNG.normal(size=(5, 4, 3)).astype(np.float32), _STATES, np.zeros(3), 0.5)
+ESDF = sp.Esdf(RNG.normal(size=(5, 4, 3)).astype(np.float32), _STATES, np.zeros(3), 0.5)
 
 
 def write_splat(folder: Path) -> None:
@@ -75,7 +68,7 @@ def write_splat(folder: Path) -> None:
 def write_scene(folder: Path) -> None:
     sky = EnvironmentMap(np.full((4, 8, 3), 0.5, np.float32))
     ends = np.array([0.5, 0.5, 0.5]), np.array([1.5, 1.0, 0.5])
-    world = World("a", GAUSSIANS, ESDF, ESDF, sky, *ends)
+    world = sp.World("a", GAUSSIANS, ESDF, ESDF, sky, *ends)
     write_scene_folder(folder / "scene", world, GAUSSIANS, provenance="by hand")
 
 
@@ -86,59 +79,52 @@ def write_octomap(folder: Path) -> None:
     (folder / "map.bt").write_bytes(head.encode() + np.array(masks, "<u2").tobytes())
 
 
-def write_image(file: Path, i: int) -> None:
-    pixels = np.random.default_rng(i).integers(0, 255, (HEIGHT, WIDTH, 3), dtype=np.uint8)
-    cv2.imwrite(str(file), pixels)
-
-
-def pose_row(X: RigidTransform) -> str:
-    w, x, y, z = X.rotation().ToQuaternion().wxyz()
-    return " ".join(f"{value:.9f}" for value in (*X.translation(), x, y, z, w))
+def write_images(color: str, depth: str = "", unit: int = 1) -> None:
+    """Writes the images of all frames to files by number; `unit` is that of depth per meter."""
+    for i in range(FRAMES):
+        pixels = np.random.default_rng(i).integers(0, 255, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+        cv2.imwrite(color.format(i), pixels)
+        if depth:
+            cv2.imwrite(depth.format(i), np.full((HEIGHT, WIDTH), 2 * unit, np.uint16))
 
 
 def write_tum(folder: Path) -> None:
     (folder / "rgb").mkdir()
     (folder / "depth").mkdir()
-    lines: dict[str, list[str]] = {"rgb": [], "depth": [], "groundtruth": []}
-    for i, X_WC in enumerate(POSES):
-        write_image(folder / f"rgb/{i}.png", i)
-        cv2.imwrite(str(folder / f"depth/{i}.png"), (5000 * DEPTH).astype(np.uint16))
-        lines["rgb"].append(f"{100 + i / 30:.4f} rgb/{i}.png")
-        lines["depth"].append(f"{100 + i / 30:.4f} depth/{i}.png")
-        lines["groundtruth"].append(f"{100 + i / 30:.4f} {pose_row(X_WC)}")
-    for name, rows in lines.items():
-        (folder / f"{name}.txt").write_text("# a list\n" + "\n".join(rows) + "\n")
+    write_images(f"{folder}/rgb/{{}}.png", f"{folder}/depth/{{}}.png", 5000)
+    w, x, y, z = R_WC.ToQuaternion().wxyz()
+    poses = [" ".join(map(str, (*X_WC.translation(), x, y, z, w))) for X_WC in POSES]
+    images = ([f"{name}/{i}.png" for i in range(FRAMES)] for name in ("rgb", "depth"))
+    for name, values in zip(("groundtruth", "rgb", "depth"), (poses, *images), strict=True):
+        rows = [f"{100 + i / 30:.4f} {value}\n" for i, value in enumerate(values)]
+        (folder / f"{name}.txt").write_text("# a list\n" + "".join(rows))
 
 
 def write_seven_scenes(folder: Path) -> None:
+    frame = f"{folder}/frame-{{:06d}}."
+    write_images(frame + "color.png", frame + "depth.png", 1000)
     for i, X_WC in enumerate(POSES):
-        write_image(folder / f"frame-{i:06d}.color.png", i)
-        depth = (1000 * DEPTH).astype(np.uint16)
-        cv2.imwrite(str(folder / f"frame-{i:06d}.depth.png"), depth)
-        np.savetxt(folder / f"frame-{i:06d}.pose.txt", X_WC.GetAsMatrix4())
+        np.savetxt(frame.format(i) + "pose.txt", X_WC.GetAsMatrix4())
 
 
 def write_nerfstudio(folder: Path) -> None:
+    write_images(f"{folder}/{{}}.png", f"{folder}/{{}}.depth.png", 1000)
     frames = []
     for i, X_WC in enumerate(POSES):
-        write_image(folder / f"{i}.png", i)
-        np.save(folder / f"{i}.npy", 1000 * DEPTH)
         matrix = (X_WC.GetAsMatrix4() @ np.diag([1, -1, -1, 1])).tolist()
-        frame = {"file_path": f"{i}.png", "transform_matrix": matrix}
-        frames.append(frame | {"depth_file_path": f"{i}.npy"})
+        files = {"file_path": f"{i}.png", "depth_file_path": f"{i}.depth.png"}
+        frames.append(files | {"transform_matrix": matrix})
     content = {"w": WIDTH, "h": HEIGHT, "fl_x": 10.0, "cx": 8.0, "cy": 6.0, "k1": 0.01}
     (folder / "transforms.json").write_text(json.dumps(content | {"frames": frames}))
 
 
 def write_colmap(folder: Path) -> None:
     (folder / "images").mkdir()
-    model, params = pycolmap.Reconstruction(), [10.0, 10.0, 8.0, 6.0]
-    camera = pycolmap.Camera(
-        model="PINHOLE", width=WIDTH, height=HEIGHT, params=params, camera_id=1
-    )
-    model.add_camera_with_trivial_rig(camera)
+    write_images(f"{folder}/images/{{}}.png")
+    model, size = pycolmap.Reconstruction(), {"width": WIDTH, "height": HEIGHT}
+    lens = {"model": "PINHOLE", "params": [10.0, 10.0, 8.0, 6.0]}
+    model.add_camera_with_trivial_rig(pycolmap.Camera(camera_id=1, **size, **lens))
     for i, X_WC in enumerate(POSES):
-        write_image(folder / f"images/{i}.png", i)
         points = [pycolmap.Point2D([5.0, 5.0]), pycolmap.Point2D([9.0, 3.0])]
         image = pycolmap.Image(name=f"{i}.png", points2D=points, camera_id=1, image_id=i + 1)
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(X_WC.inverse().GetAsMatrix34()))
@@ -174,7 +160,7 @@ def is_finite(*arrays: Any) -> bool:
 def use_gaussians(scene: Any) -> None:
     assert is_finite(scene.means, scene.quats, scene.scales, scene.opacities, scene.sh)
     K = np.array([[10.0, 0, 8], [0, 10, 6], [0, 0, 1]])
-    view = BakedScene(scene).render(K, 16, 12, RigidTransform([1.5, 1.5, -3.0]))
+    view = sp.BakedScene(scene).render(K, 16, 12, RigidTransform([1.5, 1.5, -3.0]))
     assert is_finite(view.color, view.alpha) and not np.isnan(view.depth).any()
 
 
@@ -207,12 +193,8 @@ def use_grid(grid: Any) -> None:
     assert grid is None or ((grid >= 0) & (grid <= 1)).all()
 
 
-def read_gaussians(folder: Path) -> Any:
-    return read_splats(next(folder.glob("scene.*")))
-
-
-def read_scenario(folder: Path) -> Scenario:
-    scenario = load_config(Scenario(), folder / "scenario.yaml")
+def read_scenario(folder: Path) -> sp.Scenario:
+    scenario = sp.load_config(sp.Scenario(), folder / "scenario.yaml")
     scenario.validate()
     return scenario
 
@@ -257,14 +239,17 @@ CAPTURES = {
     "COLMAP": write_colmap,
 }
 READERS = {
-    **{name: (write, read_gaussians, use_gaussians) for name, write in SPLATS.items()},
-    **{name: (write, read_capture, use_capture) for name, write in CAPTURES.items()},
+    **{
+        name: (write, lambda folder: read_splats(next(folder.glob("scene.*"))), use_gaussians)
+        for name, write in SPLATS.items()
+    },
+    **{name: (write, sp.read_capture, use_capture) for name, write in CAPTURES.items()},
     **{name: message_reader(*message) for name, message in MESSAGES.items()},
     "packets": (write_grids, read_grids, use_grid),
     "scene folder": (write_scene, lambda folder: read_scene(folder / "scene"), use_world),
     "distance field": (
         lambda folder: ESDF.save(folder / "esdf.npz"),
-        lambda folder: Esdf.load(folder / "esdf.npz"),
+        lambda folder: sp.Esdf.load(folder / "esdf.npz"),
         use_esdf,
     ),
     "OctoMap": (
@@ -273,14 +258,12 @@ READERS = {
         use_esdf,
     ),
     "mesh": (
-        lambda folder: trimesh.Scene(trimesh.creation.box((2.0, 2.0, 2.0))).export(
-            folder / "m.glb"
-        ),
+        lambda folder: trimesh.creation.box((2.0, 2.0, 2.0)).export(folder / "m.glb"),
         lambda folder: mesh_distance(folder / "m.glb", "y", 0.25),
         use_esdf,
     ),
     "scenario": (
-        lambda folder: (folder / "scenario.yaml").write_text(dump_config(Scenario())),
+        lambda folder: (folder / "scenario.yaml").write_text(sp.dump_config(sp.Scenario())),
         read_scenario,
         lambda scenario: None,
     ),

@@ -24,17 +24,23 @@ TUTORIALS = ROOT / "docs" / "tutorials"
 BLOCK = re.compile(r"^```(\S*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 
 SMALL_WORLD = "--set world.length=9"
+SHORT = f"{SMALL_WORLD} --set timeout=2"
+SHORT_FLIGHT = f"fly --no-video {SHORT}"
 # Per page, each text that the test replaces, and by which. Installations are not repeated.
 SMALLER = {
     "first_flight": {
         "git clone REPOSITORY splatpilot && cd splatpilot\n": "",
         ". .venv/bin/activate\n": "",
-        "splatpilot fly --": "splatpilot fly --set timeout=1 --",
+        "fly --seed": f"{SHORT_FLIGHT} --seed",
+        "fly --set world": f"{SHORT_FLIGHT} --set world",
+        "fly --scenario": "fly --no-video --scenario",
+        "fly --scene ": "fly --set timeout=1 --scene ",
         "make fly\n": f"splatpilot fly --out out/fly {SMALL_WORLD}\n",
     },
     "own_policy": {
-        "sidestep fly": f"sidestep fly {SMALL_WORLD}",
-        "P01,P02 --seeds 5": f"P02 --seeds 1 --jobs 1 {SMALL_WORLD}",
+        "my_policy fly": "my_policy fly --no-video",
+        "sidestep fly": f"sidestep {SHORT_FLIGHT}",
+        "P01,P02 --seeds 5": f"P02 --seeds 1 --jobs 1 {SHORT}",
         "P02-sidestep-2-003": "P02-sidestep-2-000",
     },
     "own_environment": {
@@ -43,7 +49,7 @@ SMALLER = {
         "36_left": "18_left",
         "width=400 --set height=300": "width=280 --set height=210",
         "iterations=2000": "iterations=50 --set voxel_size=0.1",
-        "fly --scene out/scene": "fly --scene out/scene --set timeout=1",
+        "fly --scene": "fly --no-video --set timeout=1 --scene",
     },
     "training": {
         ".venv/bin/uv pip install --python .venv/bin/python gymnasium stable-baselines3\n": "",
@@ -58,15 +64,15 @@ SMALLER = {
         "< 50": "< 2",
     },
     "monte_carlo": {
-        "length=18": "length=9",
+        'length=18", "timeout=20': 'length=9", "timeout=2',
         "samples=10, seeds=2": "samples=2, jobs=1, seeds=1",
         "samples=10, seeds=3": "samples=2, jobs=1, seeds=2",
         "60 flights": "8 flights",
-        "2.4,3,4 --seeds 5": f"3,4 --seeds 1 --jobs 1 {SMALL_WORLD}",
+        "2.4,3,4 --seeds 5": f"3,4 --seeds 1 --jobs 1 {SHORT}",
     },
     "crash": {
-        "--seeds 5": "--seeds 1 --jobs 1",
-        "--seed 0 --live": "--seed 0 --set timeout=1 --live",
+        "--seeds 5": f"--seeds 1 --jobs 1 {SHORT}",
+        "fly --scenario": f"{SHORT_FLIGHT} --scenario",
     },
     "to_hardware": {
         "timeout 15 splatpilot hardware bridge": "splatpilot hardware bridge --set timeout=1",

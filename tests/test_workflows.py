@@ -41,33 +41,27 @@ def test_only_tags_are_published_and_only_that_job_may():
 
 
 def test_wheels_are_built_for_the_declared_pythons():
-    declared = {
-        text.removeprefix("Programming Language :: Python :: ")
-        for text in PROJECT["project"]["classifiers"]
-        if re.fullmatch(r"Programming Language :: Python :: 3\.\d+", text)
-    }
-    recipe = PROJECT["tool"]["cibuildwheel"]
-    assert {f"3.{re.match(r'cp3(\d+)', build)[1]}" for build in recipe["build"]} == declared
-    minors = sorted(int(version.removeprefix("3.")) for version in declared)
-    assert PROJECT["project"]["requires-python"] == f">=3.{minors[0]},<3.{minors[-1] + 1}"
-    for source in recipe["test-sources"]:
-        assert (CHECKOUT / source).exists(), source
-    for word in shlex.split(" ".join(recipe["test-command"])):
-        assert not word.endswith(".py") or (CHECKOUT / word).is_file(), word
+    project, recipe = PROJECT["project"], PROJECT["tool"]["cibuildwheel"]
+    classifiers = "\n".join(project["classifiers"])
+    declared = re.findall(
+        r"^Programming Language :: Python :: (3\.\d+)$", classifiers, re.MULTILINE
+    )
+    assert [f"3.{re.match(r'cp3(\d+)', build)[1]}" for build in recipe["build"]] == declared
+    newest = int(declared[-1].removeprefix("3."))
+    assert project["requires-python"] == f">={declared[0]},<3.{newest + 1}"
+    named = [word for word in shlex.split(" ".join(recipe["test-command"])) if word.endswith(".py")]
+    for file in recipe["test-sources"] + named:
+        assert (CHECKOUT / file).exists(), file
 
 
 def test_the_image_copies_all_that_a_wheel_is_built_from():
-    recipe = (CHECKOUT / "Dockerfile").read_text()
-    copied = {
-        name
-        for line in re.findall(r"^COPY (.*)", recipe, re.MULTILINE)
-        for name in line.split()[:-1]
-    }
+    recipe, project = (CHECKOUT / "Dockerfile").read_text(), PROJECT["project"]
+    copies = re.findall(r"^COPY (.*) \S+$", recipe, re.MULTILINE)
+    copied = set(" ".join(copies).split())
     assert all((CHECKOUT / name).exists() for name in copied)
-    links = {
-        link.readlink().name for link in (CHECKOUT / "splatpilot").iterdir() if link.is_symlink()
-    }
-    read = {PROJECT["project"]["readme"], *PROJECT["project"]["license-files"]}
-    assert copied == links | read | {"CMakeLists.txt", "native", "pyproject.toml", "splatpilot"}
+    package = CHECKOUT / "splatpilot"
+    links = {path.readlink().name for path in package.iterdir() if path.is_symlink()}
+    read = {project["readme"], *project["license-files"], "pyproject.toml", "CMakeLists.txt"}
+    assert copied == links | read | {"native", "splatpilot"}
     stages = re.split(r"^FROM ", recipe, flags=re.MULTILINE)[2:]
     assert all(re.search(r"^USER \d+$", stage, re.MULTILINE) for stage in stages)

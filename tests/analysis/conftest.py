@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 
+import splatpilot as sp
 from splatpilot.analysis.reconstruction import ablation
 from splatpilot.diagrams.worlds.scene_folder import write_scene_folder
-from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.esdf_build import esdf_from_occupancy
-from splatpilot.systems.splats.baked_scene import BakedScene
-from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.training.captures import capture_registry
 from splatpilot.training.captures.capture import Capture, SfmPoints
 
@@ -21,7 +19,7 @@ SIZE = np.array([6.0, 3.0, 2.5])  # [m], the room, its lower corner in the origi
 R_WC = RotationMatrix(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]))  # looking along x, level
 
 
-def make_room() -> GaussianScene:
+def make_room() -> sp.GaussianScene:
     """The inside of the room, in broad colored waves."""
     axes = (np.arange(0.05, size, 0.1) for size in SIZE)
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -30,38 +28,24 @@ def make_room() -> GaussianScene:
     means = np.concatenate(means)
     x, y, z = means.T
     waves = np.column_stack([np.sin(3 * x) * np.cos(4 * z), np.cos(5 * y), np.sin(3 * z + 2 * x)])
-    count = len(means)
-    return GaussianScene.from_colors(
-        means,
-        np.tile([1.0, 0, 0, 0], (count, 1)),
-        np.full((count, 3), 0.06),
-        np.full(count, 0.95),
-        0.5 + 0.3 * waves,
-    )
+    sizes, opacities = np.full_like(means, 0.06), np.full(len(means), 0.95)
+    quats = np.tile([1.0, 0, 0, 0], (len(means), 1))
+    return sp.GaussianScene.from_colors(means, quats, sizes, opacities, 0.5 + 0.3 * waves)
 
 
 @dataclass(frozen=True)
 class Room:
     """The room, its capture and a folder for scenes of it."""
 
-    gaussians: GaussianScene
+    gaussians: sp.GaussianScene
     capture: Capture
     folder: Path
 
-    def scene(self, name: str, gaussians: GaussianScene | None = None, **metadata) -> Path:
+    def scene(self, name: str, gaussians: sp.GaussianScene | None = None, **metadata) -> Path:
         """Writes a scene folder with these Gaussians, the room's own if None."""
-        free = esdf_from_occupancy(
-            np.zeros((60, 30, 25), bool), np.zeros((60, 30, 25), bool), np.zeros(3), 0.1
-        )
-        world = World(
-            name=name,
-            gaussians=self.gaussians if gaussians is None else gaussians,
-            distance_field=free,
-            esdf=free,
-            background=(0.0, 0.0, 0.0),
-            p_WS=np.ones(3),
-            p_WG=np.ones(3),
-        )
+        free = esdf_from_occupancy(*np.zeros((2, 60, 30, 25), bool), np.zeros(3), 0.1)
+        gaussians = self.gaussians if gaussians is None else gaussians
+        world = sp.World(name, gaussians, free, free, (0.0, 0.0, 0.0), np.ones(3), np.ones(3))
         metadata = {"capture": "room", "held_out": [0, 8]} | metadata
         write_scene_folder(self.folder / name, world, provenance="a test", **metadata)
         return self.folder / name
@@ -74,9 +58,9 @@ def set_fields() -> Callable[..., list[str]]:
 
 
 @pytest.fixture(scope="session")
-def seen_room() -> tuple[GaussianScene, Capture]:
+def seen_room() -> tuple[sp.GaussianScene, Capture]:
     gaussians = make_room()
-    baked = BakedScene(gaussians)
+    baked = sp.BakedScene(gaussians)
     X_WCs = [RigidTransform(R_WC, [0.5 + 0.15 * i, 1.5, 1.2]) for i in range(16)]
     views = [baked.render(K, WIDTH, HEIGHT, X_WC) for X_WC in X_WCs]
     images = [np.round(255 * np.clip(view.color, 0, 1)).astype(np.uint8) for view in views]

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform
 
+import splatpilot as sp
 from splatpilot.analysis import difficulty as difficulty_module
 from splatpilot.analysis.difficulty import (
     SPACING,
@@ -19,9 +20,7 @@ from splatpilot.analysis.difficulty import (
     view_obstacle,
 )
 from splatpilot.diagrams.worlds.feasibility import grid_distances
-from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.collision.shapes import AnalyticDistanceField, Box, Capsule
-from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS as R
 
 LOWER, UPPER = np.array([0.0, -4, 0]), np.array([12.0, 4, 4])
@@ -97,32 +96,33 @@ def test_view_obstacle_of_a_wall_ahead():
     assert view_obstacle(CLOSED, path) == pytest.approx(expected, rel=0.01)
 
 
-def test_a_missing_scene_is_not_run(tmp_path, monkeypatch):
+@pytest.fixture
+def small(tmp_path, monkeypatch) -> str:
+    """A scenario in a small room, without scenes."""
     monkeypatch.setenv("SPLATPILOT_SCENES", str(tmp_path))
-    small = tmp_path / "small.yaml"
-    small.write_text("world: !RoomConfig {length: 6, width: 4, height: 2.6, items: 1}\n")
-    lines = run(scenarios=[str(small), "R13"], seeds=1)
-    assert "1/1" in lines[1]
-    assert "not run" in lines[2] and "TartanAir" in lines[2] and str(tmp_path) in lines[2]
+    file = tmp_path / "small.yaml"
+    file.write_text("world: !RoomConfig {length: 6, width: 4, height: 2.6, items: 1}\n")
+    return str(file)
 
 
-def test_infeasible_seeds_are_counted(tmp_path, monkeypatch):
-    small = tmp_path / "small.yaml"
-    small.write_text("world: !RoomConfig {length: 6, width: 4, height: 2.6, items: 1}\n")
+def test_infeasible_seeds_are_counted_and_a_missing_scene_is_not_run(small, monkeypatch):
+    infeasible = {1}
 
     def make(config, seed):
-        if seed % 2:
-            raise InfeasibleFlightError("no path")
-        return make_world(config, seed)
+        if seed in infeasible:
+            raise sp.InfeasibleFlightError("no path")
+        return sp.make_world(config, seed)
 
     monkeypatch.setattr(difficulty_module, "make_world", make)
-    assert "2/3" in run(scenarios=[str(small)], seeds=3)[1]
-    monkeypatch.setattr(difficulty_module, "make_world", lambda config, seed: make(config, 1))
-    assert "0/2" in run(scenarios=[str(small)], seeds=2)[1]
+    lines = run(scenarios=[small, "R13"], seeds=3)
+    assert "2/3" in lines[1]
+    assert "not run" in lines[2] and "TartanAir" in lines[2]
+    infeasible.add(0)
+    assert "0/2" in run(scenarios=[small], seeds=2)[1]
 
 
 def test_a_closed_wall_leaves_no_path():
-    with pytest.raises(InfeasibleFlightError, match="no path"):
+    with pytest.raises(sp.InfeasibleFlightError, match="no path"):
         shortest_path(CLOSED, grid_distances(CLOSED, SPACING), START, GOAL)
 
 

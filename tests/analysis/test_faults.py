@@ -3,12 +3,15 @@ import os
 import shutil
 import socket
 import struct
+from dataclasses import replace
+from functools import cached_property
 
 import lcm
 import numpy as np
 import pytest
 from drake import lcmt_header
 
+import splatpilot as sp
 from splatpilot.analysis.commands.main import main
 from splatpilot.analysis.faults import (
     DELAY,
@@ -20,10 +23,7 @@ from splatpilot.analysis.faults import (
     fly_trial,
     summarize,
 )
-from splatpilot.diagrams.flight.policies import policy_named
-from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.worlds.forest.forest import ForestConfig
-from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.messaging.codecs import (
     CommandCodec,
     DepthGridCodec,
@@ -61,12 +61,16 @@ class Line:
                 pass
         self.during = [data for when, data in self.heard if 1.0 <= when < 2.0]
 
-    def messages(self, data=None) -> list:
-        data = [data for _, data in self.heard] if data is None else data
-        return [StateCodec.message.decode(each) for each in data]
+    @cached_property
+    def messages(self) -> list:
+        return [StateCodec.message.decode(data) for _, data in self.heard]
+
+    def hit(self) -> list:
+        """Returns the messages that have the faults."""
+        return [each for each in self.messages if 50 <= each.header.seq < 100]
 
     def numbers(self) -> list[int]:
-        return [message.header.seq for message in self.messages()]
+        return [message.header.seq for message in self.messages]
 
     def delays(self) -> dict[int, float]:
         return {n: now - 0.02 * n for n, (now, _) in zip(self.numbers(), self.heard, strict=True)}
@@ -86,11 +90,22 @@ def test_a_relay_ends_with_its_transports():
     assert len(os.listdir("/proc/self/fd")) == before
 
 
-def test_messages_are_dropped_delayed_duplicated_and_reordered():
-    assert Line("dropped").numbers() == [*range(50), *range(100, 150)]
-    delays = Line("delayed").delays()
-    assert delays[70] == pytest.approx(DELAY, abs=0.021) and delays[20] == pytest.approx(0.0)
-    assert sorted(Line("duplicated").numbers()) == sorted([*range(150), *range(50, 100)])
+@pytest.mark.parametrize(
+    ("kind", "numbers"),
+    [
+        *((kind, range(0)) for kind in ("dropped", "state_off", "link_off")),
+        *((kind, (50, 75)) for kind in ("slow", "state_slow")),  # 0.5 s, at a fraction of 1
+        ("duplicated", np.repeat(range(50, 100), 2)),
+    ],
+)
+def test_messages_are_dropped_or_duplicated(kind, numbers):
+    assert sorted(Line(kind).numbers()) == [*range(50), *numbers, *range(100, 150)]
+
+
+def test_messages_are_delayed_and_reordered():
+    for kind in ("delayed", "state_delayed"):
+        delays = Line(kind).delays()
+        assert delays[70] == pytest.approx(DELAY, abs=0.021) and delays[20] == pytest.approx(0.0)
     mixed = Line("reordered").numbers()
     assert mixed != sorted(mixed) and sorted(mixed) == list(range(150))
 
@@ -100,59 +115,73 @@ def test_contents_are_corrupted():
         line = Line(kind)
         assert not set(line.during) & set(line.sent[50:100])
     assert all(len(data) == len(line.sent[0]) for data in line.during)
+    noise = Line("state_garbage").hit()
+    np.testing.assert_allclose([np.linalg.norm(message.q_WB) for message in noise], 1.0)
+    assert len({message.p_WB for message in noise}) == 50
 
 
 def test_states_freeze_and_jump_and_clocks_too():
-    line = Line("state_frozen")
-    frozen = line.messages(line.during)
+    frozen = Line("state_frozen").hit()
     assert {message.p_WB for message in frozen} == {(5.0, 0.0, 2.0)}
     assert len({message.header.utime for message in frozen}) == 50
-    line = Line("state_jumped")
-    assert {message.p_WB[1] for message in line.messages(line.during)} == {3.0}
-    last = Line("clock_jump").messages()[-1]
+    assert {message.p_WB[1] for message in Line("state_jumped").hit()} == {3.0}
+    rotated = {message.q_WB for message in Line("heading_jumped").hit()}
+    np.testing.assert_allclose([*rotated], [[np.cos(1.25), 0, 0, np.sin(1.25)]])
+    last = Line("clock_jump").messages[-1]
     assert last.header.utime == round((149 * 0.02 + 2.0) * 1e6)
 
 
 def test_two_faults_both_happen():
     line = Line("delayed", "state_frozen")
-    hit = [message for message in line.messages() if 50 <= message.header.seq < 100]
-    assert {message.p_WB for message in hit} == {(5.0, 0.0, 2.0)}
-    late = [line.delays()[message.header.seq] for message in hit]
+    assert {message.p_WB for message in line.hit()} == {(5.0, 0.0, 2.0)}
+    late = [line.delays()[message.header.seq] for message in line.hit()]
     np.testing.assert_allclose(late, DELAY, atol=0.021)
+
+
+def first_second(kind: str) -> tuple[Fault]:
+    return (Fault(kind, begin=0.0, duration=1.0, fraction=1.0, size=1.0),)
+
+
+def relayed(codec, value, kind: str) -> list:
+    """Returns a message as it comes through a relay with a fault, and "command" if one does."""
+    near, far, heard, random = lcm.LCM("memq://"), lcm.LCM("memq://"), [], np.random.default_rng(0)
+    relay = Relay(near, far, [codec], [CommandCodec()], first_second(kind), random)
+    far.subscribe(codec.channel, lambda _, data: heard.append(codec.message.decode(data)))
+    near.subscribe(CommandCodec.channel, lambda _, data: heard.append("command"))
+    near.publish(codec.channel, encoded(codec, value))
+    far.publish(CommandCodec.channel, encoded(CommandCodec(), [9.8, 0.0, 0.0, 0.0]))
+    relay.step(0.5)
+    while far.handle_timeout(0) or near.handle_timeout(0):
+        pass
+    return heard
 
 
 @pytest.mark.parametrize(
     ("kind", "tracked"), [("body_lost", [False]), ("body_dropped", []), ("grid_dropped", [True])]
 )
 def test_motion_capture_loses_the_body_or_messages(kind, tracked):
-    near, far, heard, codec = lcm.LCM("memq://"), lcm.LCM("memq://"), [], MotionCaptureCodec("a")
-    fault = Fault(kind, begin=0.0, duration=1.0, fraction=1.0, size=1.0)
-    relay = Relay(near, far, [codec], [], (fault,), np.random.default_rng(0))
-    far.subscribe(codec.channel, lambda _, data: heard.append(codec.message.decode(data).tracked))
-    near.publish(codec.channel, encoded(codec, [1.0, 2, 3, 1, 0, 0, 0]))
-    relay.step(0.5)
-    while far.handle_timeout(0):
-        pass
-    assert heard == tracked
+    *messages, command = relayed(MotionCaptureCodec("a"), [1.0, 2, 3, 1, 0, 0, 0], kind)
+    assert [message.tracked for message in messages] == tracked and command == "command"
 
 
-@pytest.mark.parametrize(("kind", "came"), [("body_lost", True), ("grid_dropped", False)])
-def test_grids_travel_as_packets_of_the_sensor(kind, came):
-    codec, near = DepthGridCodec(16, 9, 5.0, "policy_camera"), lcm.LCM("memq://")
+def test_a_vehicle_that_left_offboard_mode_hears_no_commands():
+    (status,) = relayed(VehicleStatusCodec(), [1.0, 1.0], "offboard_left")
+    assert (status.armed, status.offboard) == (True, False)
+
+
+def test_grids_travel_as_packets_of_the_sensor():
+    codec = DepthGridCodec(16, 9, 5.0, "policy_camera")
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as inbox:
         inbox.bind(("127.0.0.1", 0))
-        inbox.settimeout(2.0 if came else 0.1)
-        fault = Fault(kind, begin=0.0, duration=1.0, fraction=1.0, size=1.0)
+        inbox.settimeout(2.0)
         random, port = np.random.default_rng(0), inbox.getsockname()[1]
-        relay = Relay(near, lcm.LCM("memq://"), [codec], [], (fault,), random, port)
-        near.publish(codec.channel, encoded(codec, np.full(144, 0.25), 3, 7))
-        relay.step(0.5)
-        try:
-            packet = inbox.recv(65536)
-        except TimeoutError:
-            packet = b""
-    expected = struct.pack("<IIQ144f", 0x544F4632, 3, 7000, *[0.25] * 144)
-    assert packet == (expected if came else b"")
+        for kind, number in (("grid_dropped", 2), ("body_lost", 3)):  # only the second arrives
+            near, far = lcm.LCM("memq://"), lcm.LCM("memq://")
+            relay = Relay(near, far, [codec], [], first_second(kind), random, port)
+            near.publish(codec.channel, encoded(codec, np.full(144, 0.25), number, 7))
+            relay.step(0.5)
+            del relay
+        assert inbox.recv(65536) == struct.pack("<IIQ144f", 0x544F4632, 3, 7000, *[0.25] * 144)
 
 
 def test_faults_interfaces_and_policies_alternate_and_repeat():
@@ -170,22 +199,10 @@ def test_faults_interfaces_and_policies_alternate_and_repeat():
     assert trials[3] == Trial.sample(3, np.random.default_rng([0, 3])) != trials[3 + len(KINDS)]
 
 
-def test_a_state_that_freezes_while_images_are_lost_ends_safely():
-    world = ForestConfig(length=10.0, width=6.0)
-    scenario = Scenario(world=world, policy=policy_named("straight", 2.0))
-    hit = tuple(Fault(kind, 1.0, 1.0, 1.0, 1.0) for kind in ("dropped", "state_frozen"))
-    trial = Trial(hit, "straight", "body_rates")
-    row = fly_trial(scenario, make_world(world, 0), trial, FlightLimits(max_speed=2.5), 0)
-    assert row["safe"]
-    assert row["min_clearance"] >= 0.09
-
-
 def test_a_campaign_is_safe_resumes_and_repeats(tmp_path, set_fields, capsys):
-    fields = set_fields(
-        *("trials=2", "worlds=1", "scenario.world.length=10.0", "scenario.world.width=6.0"),
-        "scenario.start_radius=0.05",
-    )
-    words, whole, again = ["hardware", "faults", *fields], tmp_path / "whole", tmp_path / "again"
+    fields = ("trials=2", "worlds=1", "scenario.world.length=10.0", "scenario.world.width=6.0")
+    words = ["hardware", "faults", *set_fields(*fields, "scenario.start_radius=0.05")]
+    whole, again = tmp_path / "whole", tmp_path / "again"
     assert main([*words, "--out", str(whole)]) == 0
     rows = (whole / "trials.jsonl").read_text().splitlines(keepends=True)
     assert [json.loads(row)["seed"] for row in rows if json.loads(row)["safe"]] == [0, 1]
@@ -203,13 +220,26 @@ def test_a_campaign_is_safe_resumes_and_repeats(tmp_path, set_fields, capsys):
     assert "revision of" in capsys.readouterr().err
 
 
-def test_decisions_of_every_kind_are_replaced():
-    world = ForestConfig(length=10.0, width=6.0)
-    for policy in ("diffaero", "agile_autonomy"):  # accelerations and hypotheses
-        scenario = Scenario(world=world, policy=policy_named(policy, 2.0))
-        trial = Trial((Fault("policy_nonsense", 0.5, 0.5, 0.5, 1.0),), policy, "velocity")
-        row = fly_trial(scenario, make_world(world, 0), trial, FlightLimits(max_speed=2.5), 0)
-        assert row["safe"] and lcmt_bridge_status.NOT_FINITE in row["reasons"]
+@pytest.mark.parametrize(
+    ("policy", "setpoints", "kinds", "when"),
+    [
+        ("diffaero", "velocity", ["policy_nonsense"], 0.5),  # accelerations
+        ("agile_autonomy", "velocity", ["policy_nonsense"], 0.5),  # hypotheses
+        ("straight", "body_rates", ["dropped", "state_frozen"], 1.0),
+    ],
+)
+def test_a_vehicle_survives(forest, policy, setpoints, kinds, when):
+    scenario, world = replace(forest[0], policy=sp.policy_named(policy, 2.0)), forest[1]
+    trial = Trial(tuple(Fault(kind, when, when, when, 1.0) for kind in kinds), policy, setpoints)
+    row = fly_trial(scenario, world, trial, FlightLimits(max_speed=2.5), 0)
+    assert row["safe"] and row["min_clearance"] >= 0.09
+    assert policy == "straight" or lcmt_bridge_status.NOT_FINITE in row["reasons"]
+
+
+@pytest.fixture(scope="module")
+def forest() -> tuple[sp.Scenario, sp.World]:
+    scenario = sp.Scenario(world=ForestConfig(length=10.0, width=6.0))
+    return scenario, sp.make_world(scenario.world, 0)
 
 
 def test_accidents_are_counted():
@@ -217,33 +247,3 @@ def test_accidents_are_counted():
     summary = summarize([row, {**row, "safe": False, "outcome": "collision"}])
     assert (summary["trials"], summary["safe"]) == (2, 1)
     assert summary["kinds"]["dropped"]["outcomes"] == {"collision": 1, "hover": 1}
-
-
-def test_failures_of_px4_affect_states_or_all_messages():
-    assert Line("state_off").numbers() == Line("link_off").numbers()
-    assert Line("link_off").numbers() == [*range(50), *range(100, 150)]
-    for kind in ("slow", "state_slow"):  # 0.5 s between messages, at a fraction of 1.
-        assert [message.header.seq for message in Line(kind).messages(Line(kind).during)] == [
-            50,
-            75,
-        ]
-    assert Line("state_delayed").delays()[70] == pytest.approx(DELAY, abs=0.021)
-    rotated = {message.q_WB for message in Line("heading_jumped").messages()[50:100]}
-    np.testing.assert_allclose([*rotated], [[np.cos(1.25), 0, 0, np.sin(1.25)]])
-    noise = Line("state_garbage").messages(Line("state_garbage").during)
-    np.testing.assert_allclose([np.linalg.norm(message.q_WB) for message in noise], 1.0)
-    assert len({message.p_WB for message in noise}) == 50
-
-
-def test_a_vehicle_that_left_offboard_mode_hears_no_commands():
-    near, far, status, heard = lcm.LCM("memq://"), lcm.LCM("memq://"), VehicleStatusCodec(), []
-    fault = (Fault("offboard_left", begin=0.0, duration=1.0, fraction=1.0, size=1.0),)
-    relay = Relay(near, far, [status], [CommandCodec()], fault, np.random.default_rng(0))
-    far.subscribe(status.channel, lambda _, data: heard.append(status.message.decode(data)))
-    near.subscribe(CommandCodec.channel, lambda _, data: heard.append("command"))
-    near.publish(status.channel, encoded(status, [1.0, 1.0]))
-    far.publish(CommandCodec.channel, encoded(CommandCodec(), [9.8, 0.0, 0.0, 0.0]))
-    relay.step(0.5)
-    while far.handle_timeout(0) or near.handle_timeout(0):
-        pass
-    assert [(each.armed, each.offboard) for each in heard] == [(True, False)]

@@ -21,14 +21,12 @@ def breaks(effort: Effort) -> Iterator[Headline]:
     raise RuntimeError("out of memory\nat a line")
 
 
-def hangs(effort: Effort) -> Iterator[Headline]:
+def hangs(effort: Effort) -> None:
     time.sleep(30)
-    yield from passes(effort)
 
 
-def needs_package(effort: Effort) -> Iterator[Headline]:
+def needs_package(effort: Effort) -> None:
     raise ModuleNotFoundError("No module named 'torch'", name="torch")
-    yield
 
 
 def test_parts_that_fail_are_named_and_keep_their_values(capsys):
@@ -68,7 +66,3 @@ def test_command_writes_a_table_and_json(tmp_path, monkeypatch, capsys):
     assert "| render | 20 ms | <= 5 | no |" in lines
     assert lines[-1] == "Not measured: GPU: PyTorch finds no GPU."
     assert main(["headlines", "--out", str(out)]) == 1
-
-
-def test_gpu_parts_take_at_most_twelve_minutes():
-    assert 0 < sum(limit for _, limit in headlines.GPU_PARTS.values()) <= 720

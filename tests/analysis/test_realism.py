@@ -1,20 +1,19 @@
 import pytest
 
+import splatpilot as sp
 from splatpilot.analysis import realism
 from splatpilot.analysis.benchmark import run_study
 from splatpilot.analysis.benchmark.study_folder import StudyFolder
-from splatpilot.diagrams.flight.scenario import Scenario
-from splatpilot.systems.common.config import load_config
 
 
 def test_effects_have_their_section_of_harsh_and_no_other(tmp_path):
-    harsh = load_config(Scenario(), overrides=["profile=harsh"])
+    harsh = sp.load_config(sp.Scenario(), overrides=["profile=harsh"])
     effects = realism.write_effects(tmp_path)
     assert {"estimator", "decision_delay", "imaging", "observation", "vehicle", "wind"} < {*effects}
     for name in effects.keys() - {"rotors"}:
-        expected = Scenario(controller=harsh.controller)
+        expected = sp.Scenario(controller=harsh.controller)
         setattr(expected, name, getattr(harsh, name))
-        assert load_config(Scenario(), overrides=effects[name]) == expected
+        assert sp.load_config(sp.Scenario(), overrides=effects[name]) == expected
 
 
 def flight(seed: int, success: bool, **columns) -> dict:

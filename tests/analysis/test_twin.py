@@ -21,27 +21,19 @@ def make_pairs(mesh, splat) -> list[dict]:
     ]
 
 
-def test_perfect_and_useless_predictions():
-    rng = np.random.default_rng(0)
-    rates = np.linspace(0.05, 0.95, 12)[:, None]
-    mesh = rng.uniform(size=(3, 12, 20)) < rates
-    every = predictions(make_pairs(mesh, mesh))[-1]
-    assert every["environment"] == "all" and every["flights"] == 720
-    assert every["agreement"] == every["kappa"] == every["rho"] == every["rho_low"] == 1
-    useless = predictions(make_pairs(mesh, rng.uniform(size=mesh.shape) < 0.5))[-1]
-    assert abs(useless["kappa"]) < 0.1 and useless["rho_low"] < 0 < useless["rho_high"]
-
-
 def test_intervals_cover_the_truth_and_shrink_with_routes():
-    rng = np.random.default_rng(1)
-    rates = np.linspace(0.05, 0.95, 12)[:, None]
-    widths = []
+    rng, rates, widths = np.random.default_rng(1), np.linspace(0.05, 0.95, 12)[:, None], []
     for routes in (5, 80):
         mesh, splat = (rng.uniform(size=(2, 12, routes)) < rates for _ in range(2))
         every = predictions(make_pairs(mesh, splat))[-1]
         assert every["rho_low"] < every["rho"] <= every["rho_high"] <= 1
         widths.append(every["rho_high"] - every["rho_low"])
     assert widths[1] < 0.5 * widths[0]
+    every = predictions(make_pairs(mesh, mesh))[-1]
+    assert every["environment"] == "all" and every["flights"] == 2 * 12 * 80
+    assert every["agreement"] == every["kappa"] == every["rho"] == every["rho_low"] == 1
+    useless = predictions(make_pairs(mesh, rng.uniform(size=mesh.shape) < 0.5))[-1]
+    assert abs(useless["kappa"]) < 0.1 and useless["rho_low"] < 0 < useless["rho_high"]
 
 
 def test_control_is_correlated_with_the_mesh():
@@ -90,19 +82,21 @@ def test_policies_fly_the_same_routes_in_scene_and_mesh(opengl, room, tmp_path, 
     assert (out / "twin.png").is_file() and (out / "twin.csv").is_file()
 
 
-def test_policies_are_checked_before_anything_is_drawn():
+def test_policies_are_grouped_by_speed():
     groups = twin.policies_by_speed(["planner", "fast=diffaero@4", "a=reactive:margin=0.1"])
     assert groups == {2.0: ["planner", "a=reactive:margin=0.1"], 4.0: ["fast=diffaero"]}
-    for text, words in (
-        ("diffaero@fast", r"the speed of diffaero@fast must be a number \[m/s\], got fast"),
-        ("diffaero@50", r"the speed must be in"),
-        ("unregistered", "unregistered"),
-    ):
-        with pytest.raises(ValueError, match=words):
-            twin.policies_by_speed([text])
 
 
-def test_scenes_without_a_mesh_are_refused(room, tmp_path):
-    scene = room.scene("perfect", capture=str(tmp_path))
-    with pytest.raises(ValueError, match=r"must be of a rendered capture, got .*capture render"):
-        twin.run(scenes=[scene], out=tmp_path / "out", config=twin.TwinConfig())
+@pytest.mark.parametrize(
+    ("policies", "message"),
+    [
+        (["diffaero@fast"], r"the speed of diffaero@fast must be a number \[m/s\], got fast"),
+        (["diffaero@50"], r"the speed must be in"),
+        (["unregistered"], "unregistered"),
+        (["straight"], r"must be of a rendered capture, got .*capture render"),
+    ],
+)
+def test_invalid_policies_and_scenes_without_a_mesh_are_refused(room, tmp_path, policies, message):
+    scene, config = room.scene("perfect", capture=str(tmp_path)), twin.TwinConfig(policies=policies)
+    with pytest.raises(ValueError, match=message):
+        twin.run(scenes=[scene], out=tmp_path / "out", config=config)

@@ -7,28 +7,31 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import splatpilot as sp
 from splatpilot.analysis import view
 from splatpilot.analysis.commands.main import main
 from splatpilot.analysis.view import capture_gaussians
-from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.scenarios import scenario_file
-from splatpilot.diagrams.worlds import octomap_world
+from splatpilot.diagrams.worlds import file_worlds
 from splatpilot.diagrams.worlds.scene_folder import read_scene_metadata, write_scene_metadata
-from splatpilot.diagrams.worlds.world_registry import make_world
-from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.octomap import Octomap
-from splatpilot.systems.common.config import load_config
-from splatpilot.systems.splats.splat_files import write_ply
 
 
-def data_of(page) -> dict:
-    """Reads the data of a page."""
+def read_data(page) -> dict:
     found = re.search(r'id="data">([^<]*)<', page.read_text())
     assert found is not None
     return json.loads(gzip.decompress(base64.b64decode(found[1])))
 
 
-def grid_of(data) -> np.ndarray:
+@pytest.fixture
+def show(tmp_path):
+    """Writes a page; returns its data."""
+    return lambda what: read_data(
+        view.run(what=str(what), out=tmp_path / "page.html", overwrite=True)
+    )
+
+
+def read_grid(data) -> np.ndarray:
     """Reads the distances (nx, ny, nz) as bytes."""
     values = gzip.decompress(base64.b64decode(data["grid"]["values"]))
     return np.frombuffer(values, np.uint8).reshape(data["grid"]["shape"], order="F")
@@ -39,20 +42,19 @@ def test_generated_world(tmp_path, capsys, set_fields):
     changes = ["world.length=8", "world.width=5", "world.height=3", "world.voxel_size=0.25"]
     assert main(["view", "P02", "--seed", "3", "--out", str(out), *set_fields(*changes)]) == 0
     assert str(out) in capsys.readouterr().out
-    data = data_of(out)
-    scenario = load_config(Scenario(), scenario_file("P02"), changes)
-    esdf = make_world(scenario.world, 3).esdf
+    data = read_data(out)
+    scenario = sp.load_config(sp.Scenario(), scenario_file("P02"), changes)
+    esdf = sp.make_world(scenario.world, 3).esdf
     expected = np.clip(esdf.distances, 0, 2) * 127
-    np.testing.assert_allclose(grid_of(data), expected, atol=0.51)
+    np.testing.assert_allclose(read_grid(data), expected, atol=0.51)
     np.testing.assert_allclose(data["upper"], esdf.upper_W, atol=1e-4)
     assert [name for _, name in data["legend"]] == ["bounds", "start", "goal"]
     assert data["unit"] == "m" and data["scale_command"] == ""
     assert "seed 3" in data["name"]
 
 
-def test_scene_with_its_capture(room):
-    scene = room.scene("scene")
-    data = data_of(view.run(what=str(scene), out=room.folder / "page.html"))
+def test_scene_with_its_capture(room, show):
+    data = show(scene := room.scene("scene"))
     poses = np.reshape(data["cameras"]["poses"], (-1, 4, 4))
     truth = [X_WC.GetAsMatrix4() for X_WC in room.capture.X_WCs]
     np.testing.assert_allclose(poses, truth, atol=1e-9)
@@ -62,14 +64,14 @@ def test_scene_with_its_capture(room):
     assert data["size"].startswith("6 x 3 x 2.5 m")
 
 
-def test_scene_without_scale_or_capture_is_shown(room, monkeypatch):
+def test_scene_without_scale_or_capture_is_shown(room, show, monkeypatch):
     def lost(path, metadata):
         raise FileNotFoundError("room: no such folder")
 
     monkeypatch.setattr(view, "read_scene_capture", lost)
     scene = room.scene("scene")
     write_scene_metadata(scene, replace(read_scene_metadata(scene), metric=False))
-    data = data_of(view.run(what=str(scene), out=room.folder / "page.html"))
+    data = show(scene)
     assert data["cameras"] is None
     assert data["unit"] == "units"
     assert data["size"].startswith("6 x 3 x 2.5 in units of unknown length")
@@ -77,11 +79,9 @@ def test_scene_without_scale_or_capture_is_shown(room, monkeypatch):
     assert "start" not in [name for _, name in data["legend"]]
 
 
-def test_capture_shows_its_measured_surfaces(room, monkeypatch, tmp_path):
-    folder = tmp_path / "capture"
-    folder.mkdir()
+def test_capture_shows_its_measured_surfaces(room, show, monkeypatch):
     monkeypatch.setattr(view, "read_capture", lambda path, config: room.capture)
-    data = data_of(view.run(what=str(folder), out=tmp_path / "page.html"))
+    data = show(room.folder / "captures")
     assert data["grid"] is None and len(data["cameras"]["poses"]) == 16
     gaussians = capture_gaussians(room.capture, range(16))
     assert gaussians is not None
@@ -93,27 +93,22 @@ def test_capture_shows_its_measured_surfaces(room, monkeypatch, tmp_path):
     np.testing.assert_allclose(points.means, room.capture.points.p_WQ, atol=1e-6)
 
 
-def test_bare_gaussians(room, tmp_path):
+def test_bare_gaussians(room, show, tmp_path):
     path = tmp_path / "room.ply"
-    write_ply(room.gaussians, path)
-    assert data_of(view.run(what=str(path), out=tmp_path / "a.html"))["grid"] is not None
-    write_ply(room.gaussians.scaled_by(1000.0), path)
-    data = data_of(view.run(what=str(path), out=tmp_path / "b.html"))
+    sp.write_ply(room.gaussians, path)
+    assert show(path)["grid"] is not None
+    sp.write_ply(room.gaussians.scaled_by(1000.0), path)
+    data = show(path)
     assert data["grid"] is None and "Without distances" in data["notes"][0]
-    records = np.zeros(100, [("p", "<f4", 3), ("s", "<f4", 3), ("rgba_q", "u1", 8)])
-    records["p"], records["s"] = room.gaussians.means[:100], room.gaussians.scales[:100]
-    records["rgba_q"] = 200
-    records.tofile(tmp_path / "room.splat")
-    data = data_of(view.run(what=str(tmp_path / "room.splat"), out=tmp_path / "c.html"))
-    assert data["name"] == "room"
 
 
-def test_map(tmp_path, monkeypatch):
-    hall = np.full((20, 12, 10), FieldState.FREE, np.uint8)
-    hall[0] = hall[:, 0] = hall[:, :, 0] = FieldState.OCCUPIED
+def test_map(tmp_path, show, monkeypatch):
+    hall = np.full((20, 12, 10), sp.FieldState.FREE, np.uint8)
+    hall[0] = hall[:, 0] = hall[:, :, 0] = sp.FieldState.OCCUPIED
     corners = np.argwhere(np.ones_like(hall))
-    octomap = Octomap(0.3, corners, np.ones(len(corners), int), hall.ravel() == FieldState.OCCUPIED)
-    monkeypatch.setattr(octomap_world, "read_octomap", lambda path: octomap)
+    octomap = Octomap(
+        0.3, corners, np.ones(len(corners), int), hall.ravel() == sp.FieldState.OCCUPIED
+    )
+    monkeypatch.setattr(file_worlds, "read_octomap", lambda path: octomap)
     (tmp_path / "hall.bt").touch()
-    data = data_of(view.run(what=str(tmp_path / "hall.bt"), out=tmp_path / "page.html"))
-    assert grid_of(data).shape == (20, 12, 10)
+    assert read_grid(show(tmp_path / "hall.bt")).shape == (20, 12, 10)

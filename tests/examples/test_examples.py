@@ -1,6 +1,5 @@
 import re
 import runpy
-import subprocess
 import sys
 from pathlib import Path
 
@@ -8,18 +7,12 @@ import cv2
 import numpy as np
 import pytest
 
+from splatpilot.analysis.commands.main import main
+from splatpilot.diagrams.flight.policies import POLICIES
+
 EXAMPLES = Path(__file__).parents[2] / "examples"
 FILES = sorted(EXAMPLES.glob("*.py"))
-MAIN = "from splatpilot.analysis.commands.main import main; raise SystemExit(main())"
 SHORT = "world: {length: 9, width: 6}\ntimeout: 12\n"
-
-
-def splatpilot(*words: str, cwd: Path) -> str:
-    """Runs a command in a process of its own; returns its output."""
-    command = [sys.executable, "-c", MAIN, *words]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=cwd)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
 
 
 @pytest.fixture
@@ -70,24 +63,24 @@ def test_splats_behind_drake(opengl, run, tmp_path):
     assert red[0] == 0 < red[1]
 
 
-def test_own_policy(tmp_path):
-    (tmp_path / "own_policy.py").write_text((EXAMPLES / "own_policy.py").read_text())
-    (tmp_path / "short.yaml").write_text(SHORT)
-    words = ["--policies", "sidestep=own_policy:SidestepConfig", "--scenarios", "short.yaml"]
-    words = ["--import", "own_policy", "benchmark", *words, "--seeds", "1", "--jobs", "1"]
-    out = splatpilot(*words, "--out", "study", cwd=tmp_path)
-    assert re.search(r"sidestep +2 +1/1", out)
-
-
-def test_unregistered_own_policy_flies_in_worker_processes(tmp_path):
-    own = (EXAMPLES / "own_policy.py").read_text().replace("sp.register_policy(", "build = (")
+def test_own_policy_flies_by_its_configuration_and_by_an_unregistered_entry(
+    tmp_path, monkeypatch, capsys
+):
+    own = (EXAMPLES / "own_policy.py").read_text()
+    (tmp_path / "own_policy.py").write_text(own)
     kind = 'PolicyEntry(*build, speed_field="speed")'
+    own = own.replace("sp.register_policy(", "build = (").replace("Sidestep", "Loose")
     own += f"\nfrom splatpilot.diagrams.flight.policies import PolicyEntry\nKIND = {kind}\n"
     (tmp_path / "loose_policy.py").write_text(own)
     (tmp_path / "short.yaml").write_text(SHORT)
-    words = ["benchmark", "--policies", "mine=loose_policy:KIND", "--scenarios", "short.yaml"]
-    out = splatpilot(*words, "--seeds", "2", "--jobs", "2", "--out", "study", cwd=tmp_path)
-    assert re.search(r"mine +2 +2/2", out)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    monkeypatch.setattr(POLICIES, "_entries", dict(POLICIES._entries))
+    policies = "sidestep=own_policy:SidestepConfig,mine=loose_policy:KIND"
+    words = ["--import", "own_policy", "benchmark", "--policies", policies, "--seeds", "1"]
+    assert main([*words, "--scenarios", "short.yaml", "--jobs", "1", "--out", "study"]) == 0
+    out = capsys.readouterr().out
+    assert re.search(r"sidestep +2 +1/1", out) and re.search(r"mine +2 +1/1", out)
 
 
 def test_monte_carlo(run, tmp_path):

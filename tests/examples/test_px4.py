@@ -9,12 +9,9 @@ import yaml
 from px4_stand_in import OFFBOARD, Px4StandIn
 from pydrake.systems.analysis import Simulator
 
-from splatpilot.diagrams.flight.policies import policy_named
-from splatpilot.diagrams.flight.scenario import Scenario
+import splatpilot as sp
 from splatpilot.diagrams.hardware.bridge import BuildHardwareDiagram, HardwareConfig
 from splatpilot.diagrams.hardware.px4 import BuildPx4Diagram, Px4Config
-from splatpilot.diagrams.worlds.world_registry import make_world
-from splatpilot.systems.common.config import load_config
 from splatpilot.systems.messaging.receiver import UdpConfig, UdpInbox
 from splatpilot.systems.px4.commander import Px4CommanderConfig
 
@@ -30,7 +27,7 @@ def test_compose_sets_the_parameters_of_the_page():
     for name in names - {"PX4_SIM_MODEL", "NAV_DLL_ACT", "COM_RCL_EXCEPT", "MPC_XY_VEL_MAX"}:
         value = service["environment"][f"PX4_PARAM_{name}"]
         assert value in re.findall(r"[\d.]+", page[name]), name
-    limits = load_config(HardwareConfig(), FILES / "hardware.yaml").failsafe.limits
+    limits = sp.load_config(HardwareConfig(), FILES / "hardware.yaml").failsafe.limits
     assert float(service["environment"]["PX4_PARAM_MPC_XY_VEL_MAX"]) <= limits.max_speed
     assert service["network_mode"] == "host"
     assert (Px4Config().udp.port, Px4Config().vehicle_port) == (14540, 14580)
@@ -38,10 +35,10 @@ def test_compose_sets_the_parameters_of_the_page():
 
 def test_the_stand_in_takes_off_and_flies(monkeypatch):
     monkeypatch.chdir(FILES)
-    scenario = load_config(Scenario(), Path("scenario.yaml"))
-    scenario.policy = policy_named("straight", 1.5)  # is faster than the planner
-    hardware = load_config(HardwareConfig(tick=0.01), Path("hardware.yaml"))
-    world, memory = make_world(scenario.world, scenario.seed), lcm.LCM("memq://")
+    scenario = sp.load_config(sp.Scenario(), Path("scenario.yaml"))
+    scenario.policy = sp.policy_named("straight", 1.5)  # is faster than the planner
+    hardware = sp.load_config(HardwareConfig(tick=0.01), Path("hardware.yaml"))
+    world, memory = sp.make_world(scenario.world, scenario.seed), lcm.LCM("memq://")
     px4, inbox = Px4StandIn("1.18", [0.0, 0.0, 0.0]), UdpInbox(UdpConfig(port=0))
     px4.peer = ("127.0.0.1", inbox.port)
     commander = Px4CommanderConfig(engage=True, arm=True)

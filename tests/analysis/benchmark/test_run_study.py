@@ -2,21 +2,25 @@ import os
 import re
 import shutil
 import signal
-import subprocess
-import sys
-import time
-from dataclasses import replace
+import threading
+from dataclasses import dataclass, replace
 
 import numpy as np
+import pandas as pd
 import pytest
+from pydrake.common.schema import Uniform, UniformDiscrete
+from pydrake.systems.framework import LeafSystem
 
-from splatpilot.analysis.benchmark import run_study
+import splatpilot as sp
+from splatpilot.analysis.benchmark import replay, run_study
 from splatpilot.analysis.benchmark.run_study import chunks
 from splatpilot.analysis.benchmark.study import StudyConfig
 from splatpilot.analysis.benchmark.study_folder import StudyFolder
 from splatpilot.analysis.benchmark.tables import DODGEDRONE_SPEEDS, PUBLISHED
 from splatpilot.analysis.commands.main import main
-from splatpilot.diagrams.flight.policies import BENCHMARK_POLICIES, policy_named
+from splatpilot.diagrams.flight.policies import BENCHMARK_POLICIES, POLICIES, policy_named
+from splatpilot.systems.policies.reactive import ReactiveConfig
+from splatpilot.systems.policies.straight import Straight, StraightConfig
 
 
 def test_chunks_are_flights_through_one_world(short_scenario):
@@ -33,9 +37,9 @@ def test_variants_of_a_scenario_share_chunks_if_they_share_worlds():
     config = StudyConfig(texts, ["straight"], seeds=2)
     flights = [(spec, spec.id) for spec in config.rollouts()]
     changed = {each.label: each for each in config.scenario_variants}
-    parts = [[spec for spec, _ in part] for part in chunks(flights, 6, changed)]
-    assert [len(part) for part in parts] == [2, 2, 1, 1]
-    assert [spec.scenario for spec in parts[0]] == ["P02-vehicle.drag-0.3", "P02-vehicle.drag-0.5"]
+    parts = [[spec.scenario for spec, _ in part] for part in chunks(flights, 6, changed)]
+    drags = ["P02-vehicle.drag-0.3", "P02-vehicle.drag-0.5"]
+    assert parts == [drags, drags, *[["P02-world.spacing-2"]] * 2]
 
 
 def test_study_has_all_flights_tables_and_a_report(study, rows_of):
@@ -57,45 +61,20 @@ def test_study_has_all_flights_tables_and_a_report(study, rows_of):
     assert all(f"splatpilot replay . {row['id']} --meshcat" in page for row in rows)
     assert all(f'href="replays/{row["id"]}/flight.html"' in page for row in rows)
     assert 'name="viewport"' in page and "color-scheme: light dark" in page
+    for heading in ("Policies", "Scenarios", "Pairs of policies on the same flights"):
+        assert f"<h2>{heading}, development seeds</h2>" in page
     assert not list(out.rglob(".*"))
 
 
-def test_killed_study_is_resumed_and_equals_an_uninterrupted_one(study, tmp_path, contents):
-    config, whole = study
-    out = tmp_path / "killed"
-    script = "from splatpilot.analysis.commands.main import main; main()"
-    words = ["--scenarios", config.scenarios[0], "--policies", ",".join(config.policies)]
-    words += ["--seeds", "3", "--jobs", "2", "--out", str(out)]
-    process = subprocess.Popen(
-        [sys.executable, "-c", script, "benchmark", *words],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
-    while process.poll() is None and not list(out.glob("rollouts/[!.]*.npz")):
-        time.sleep(0.005)
-    process.kill()
-    assert process.wait() == -signal.SIGKILL, "it ended before it could be killed"
-    flown = {path.name: path.stat().st_mtime_ns for path in out.glob("rollouts/[!.]*.npz")}
-    assert 0 < len(flown) < 6
-    assert not (out / "report.html").exists()
-
-    run_study.run(config=config, out=out, jobs=1)
-    assert contents(out) == contents(whole)
-    for name, when in flown.items():
-        assert (out / "rollouts" / name).stat().st_mtime_ns == when
-
-
-def test_study_interrupted_before_its_flights_is_resumed(study, tmp_path, monkeypatch, contents):
-    config, whole = study
-
+def test_study_interrupted_before_its_flights_is_resumed(short_scenario, tmp_path, monkeypatch):
     def interrupt(*words):
         raise KeyboardInterrupt
 
+    config = StudyConfig([str(short_scenario)], ["straight"], seeds=1)
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(run_study, "keep_inputs", interrupt)
         run_study.run(config=config, out=tmp_path / "begun", jobs=1)
-    run_study.run(config=config, out=tmp_path / "begun", jobs=1)
-    assert contents(tmp_path / "begun") == contents(whole)
+    assert len(run_study.run(config=config, out=tmp_path / "begun", jobs=1).rows) == 1
 
 
 def test_damaged_files_are_flown_again_and_reported(study, tmp_path, capsys, contents):
@@ -120,10 +99,13 @@ def test_damaged_files_are_flown_again_and_reported(study, tmp_path, capsys, con
 def test_folder_of_another_study_is_refused(study, tmp_path, contents):
     config, whole = study
     before = contents(whole)
-    with pytest.raises(ValueError, match=r"holds a study with seeds 3, not 2"):
-        run_study.run(config=replace(config, seeds=2), out=whole, jobs=1)
-    with pytest.raises(ValueError, match=r"study with overrides \[\], not \['timeout=2'\]"):
-        run_study.run(config=replace(config, overrides=["timeout=2"]), out=whole, jobs=1)
+    for changes, message in (
+        ({"seeds": 2}, "holds a study with seeds 3, not 2"),
+        ({"overrides": ["timeout=2"]}, r"study with overrides \[\], not \['timeout=2'\]"),
+        ({"split": "test"}, "holds a study with split dev, not test; choose"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            run_study.run(config=replace(config, **changes), out=whole, jobs=1)
     assert contents(whole) == before
     other = tmp_path / "other"
     shutil.copytree(whole, other)
@@ -132,10 +114,9 @@ def test_folder_of_another_study_is_refused(study, tmp_path, contents):
     (other / "study.yaml").write_text(re.sub(r"numpy: .*", "numpy: 0.1", text))
     with pytest.raises(ValueError, match=r"numpy of .* must be 0.1"):
         run_study.run(config=config, out=other, jobs=1)
-    (tmp_path / "full").mkdir()
-    (tmp_path / "full" / "thesis.txt").write_text("")
+    (tmp_path / "thesis.txt").write_text("")
     with pytest.raises(ValueError, match="is not empty and holds no study"):
-        run_study.run(config=config, out=tmp_path / "full", jobs=1)
+        run_study.run(config=config, out=tmp_path, jobs=1)
 
 
 def test_absent_scene_is_not_run_and_never_passed(short_scenario, tmp_path, capsys):
@@ -185,18 +166,7 @@ def test_missing_cluster_is_named(study, tmp_path, monkeypatch):
         run_study.run(config=config, out=tmp_path / "out", cluster="tcp://127.0.0.1:1")
 
 
-@pytest.mark.parametrize(("split", "name"), [("dev", "development"), ("test", "test")])
-def test_report_and_table_name_the_split(short_scenario, tmp_path, capsys, split, name):
-    config = StudyConfig([str(short_scenario)], ["straight", "planner"], seeds=1, split=split)
-    run_study.run(config=config, out=tmp_path / "out", jobs=1)
-    page = (tmp_path / "out" / "report.html").read_text()
-    for heading in ("Policies", "Scenarios", "Pairs of policies on the same flights"):
-        assert f"<h2>{heading}, {name} seeds</h2>" in page
-    assert f"{name} seeds" in capsys.readouterr().out
-    assert f"split: {split}\n" in (tmp_path / "out" / "study.yaml").read_text()
-
-
-def test_test_study_flies_only_in_test_scenes_each_one_environment(room, tmp_path):
+def test_test_study_flies_only_in_test_scenes_each_one_environment(room, tmp_path, capsys):
     hall = tmp_path / "hall.yaml"
     config = StudyConfig([str(hall)], ["straight"], seeds=1, split="test")
     hall.write_text(f"world: !SceneConfig {{path: {room.scene('own', split='train')}}}\n")
@@ -205,7 +175,9 @@ def test_test_study_flies_only_in_test_scenes_each_one_environment(room, tmp_pat
     hall.write_text(f"world: !SceneConfig {{path: {room.scene('held', split='test')}}}\n")
     (row,) = run_study.run(config=config, out=tmp_path / "out", jobs=1).table
     assert row["flights"] == 1
-    assert "Each of hall is one environment" in (tmp_path / "out" / "report.html").read_text()
+    assert "test seeds" in capsys.readouterr().out
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "Each of hall is one environment" in page and "<h2>Policies, test seeds</h2>" in page
 
 
 def test_one_option_flies_the_dodgedrone_challenge(monkeypatch, tmp_path):
@@ -227,3 +199,153 @@ def test_one_option_flies_the_dodgedrone_challenge(monkeypatch, tmp_path):
     for policy in BENCHMARK_POLICIES:
         for speed in DODGEDRONE_SPEEDS:
             policy_named(policy, speed)
+
+
+class Climb(LeafSystem):
+    def __init__(self, speed: float = 1.0):
+        super().__init__()
+        self.DeclareVectorOutputPort("velocity", 3, lambda _, y: y.SetFromVector([0, 0, speed]))
+
+
+@dataclass
+class ClimbConfig(sp.Config):
+    rate: float = 10.0
+    weights: str = ""
+
+
+@pytest.fixture
+def short(short_scenario) -> sp.Scenario:
+    return sp.load_config(sp.Scenario(), short_scenario, ["timeout=0.5"])
+
+
+def test_a_sweep_is_a_table_of_flights(short):
+    drags = {"vehicle.drag": [0.3, 0.5], "policy.rate": [10.0]}
+    flights = sp.study(short, drags, policies=["straight", "planner"], seeds=2, jobs=1)
+    assert len(flights) == flights.id.nunique() == 8
+    assert set(flights["vehicle.drag"]) == {0.3, 0.5} and set(flights["policy.rate"]) == {10.0}
+    assert flights.groupby("seed").world_id.nunique().tolist() == [1, 1]
+    names = ["outcome", "min_clearance_m", "flight_time_s", "end_x_m", "end_z_m", "bottleneck_m"]
+    assert not flights[names].isna().to_numpy().any()
+    drag = flights[flights.policy == "straight"].groupby("vehicle.drag").path_length_m.mean()
+    assert drag.loc[0.3] > drag.loc[0.5]
+
+
+def test_distributions_are_drawn_for_each_seed_and_recorded(short, tmp_path):
+    rocks = UniformDiscrete(values=[1, 2])
+    parameters = {"vehicle.drag": Uniform(min=0.3, max=0.5), "world.rocks": rocks}
+    out = tmp_path / "out"
+    flights = sp.study(short, parameters, policies="straight", seeds=3, jobs=1, out=out)
+    drags = flights["vehicle.drag"].tolist()
+    assert len(set(drags)) == 3 and 0.3 <= min(drags) <= max(drags) <= 0.5
+    assert set(flights["world.rocks"]) == {1, 2}
+    assert pd.read_csv(out / "rollouts.csv")["vehicle.drag"].tolist() == drags
+    assert replay.run(study=out, id=flights.id[1])
+    drawn = sp.study(short, parameters, policies="straight", seeds=1, samples=2, jobs=1)
+    assert set(drawn.seed) == {0} and len(set(drawn["vehicle.drag"])) == 2
+
+
+def test_a_study_grows_in_place_and_flies_only_what_is_missing(short, tmp_path, contents):
+    def fly(name, drags, seeds, speeds, policies=("planner", "straight")):
+        parameters, config = {"vehicle.drag": drags}, {"seeds": seeds, "speeds": speeds}
+        out = tmp_path / name
+        return sp.study({"short": short}, parameters, policies=policies, **config, jobs=1, out=out)
+
+    assert len(fly("out", [0.3], 1, [2.0], ["straight"])) == 1
+    files = {path: path.stat().st_mtime_ns for path in (tmp_path / "out/rollouts").iterdir()}
+    assert len(fly("out", [0.3, 0.5], 2, [1.0, 2.0])) == 16
+    assert all(path.stat().st_mtime_ns == then for path, then in files.items())
+    fly("whole", [0.3, 0.5], 2, [1.0, 2.0])
+    assert contents(tmp_path / "out") == contents(tmp_path / "whole")
+    with pytest.raises(ValueError, match=r"holds a study with seeds 2, not 1; choose another"):
+        fly("out", [0.3, 0.5], 1, [1.0, 2.0])
+
+
+def test_systems_of_functions_fly_in_worker_processes_too(short, tmp_path):
+    here = sp.study(short, policies={"up": lambda *_: Climb(), "s": "straight"}, seeds=1, jobs=1)
+    assert here.end_z_m[0] > here.end_z_m[1]
+    policies, out = {"up": lambda scenario, world: Climb(), "s": "straight"}, tmp_path / "out"
+    there = sp.study(short, policies=policies, seeds=1, jobs=2, out=out)
+    assert here.digest.tolist() == there.digest.tolist()
+    with pytest.raises(ValueError, match="flown by a system that a function of Python made"):
+        replay.run(study=out, id=there.id[0])
+
+
+def test_what_worker_processes_cannot_import_is_refused(short, monkeypatch):
+    lock = threading.Lock()
+    with pytest.raises(ValueError, match=r"policy up must be picklable .*; use one job"):
+        sp.study(short, policies={"up": lambda *_: lock and Climb()}, seeds=1, jobs=2)
+    monkeypatch.setattr(POLICIES, "_entries", dict(POLICIES._entries))
+    for _ in range(2):  # as runs of a notebook's cell
+
+        @dataclass
+        class HoldConfig(StraightConfig):
+            __module__ = "__main__"
+
+        sp.register_policy(HoldConfig, lambda config, world, scenario: Straight(config))
+    assert len(sp.study(short, policies="hold", seeds=1, jobs=1)) == 1
+    message = "HoldConfig must be of a module that worker processes import, got __main__; put it"
+    with pytest.raises(ValueError, match=message):
+        sp.study(short, policies="hold", seeds=1, jobs=2)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "samples", "message"),
+    [
+        ({"timeout": 3.0}, None, r"parameters\['timeout'\] must be a list of values or a distrib"),
+        ({"timeout": [3.0]}, 5, "samples must be None without distributions, got 5"),
+        ({"timeout": Uniform(min=1, max=2)}, 0, "samples must be at least 1, got 0"),
+        ({"seed": [1, 2]}, None, "must not override seed by scenario"),
+        ({"policy": ["planner"]}, None, "must not override policy"),
+        ({"policy.speed": [1.0]}, None, "must not set policy.speed; give the speeds"),
+        ({"policy.margn": [1.0]}, None, "did you mean policy.margin|did you mean margin"),
+        ({"vehicle.drag": [-1.0]}, None, r"vehicle.drag must be in \[0, inf"),
+        ({"seed": Uniform(min=1, max=2)}, None, "must not override seed"),
+        ({"world.rocks": Uniform(min=1, max=2)}, None, "a !UniformDiscrete of whole numbers"),
+    ],
+)
+def test_invalid_studies_are_refused_before_they_start(
+    short, tmp_path, parameters, samples, message
+):
+    out = tmp_path / "out"
+    with pytest.raises(ValueError, match=message):
+        sp.study(short, parameters, samples=samples, policies="reactive", jobs=1, out=out)
+    assert not out.exists() or not list(out.iterdir())
+
+
+def test_speeds_are_those_of_the_configurations(short):
+    short.policy = ReactiveConfig(speed=1.5)
+    assert set(sp.study(short, seeds=1, jobs=1).speed) == {1.5}
+    assert set(sp.study(short, seeds=1, speeds=[1.0], jobs=1).speed) == {1.0}
+    with pytest.raises(ValueError, match=r"speeds of the policies must be equal, got 1.5, 3"):
+        sp.study(short, policies=["scenario", ReactiveConfig(speed=3.0)], seeds=1, jobs=1)
+
+
+def test_command_line_sweeps_fields_of_scenarios(short_scenario, tmp_path, rows_of):
+    out, goal_radius = tmp_path / "out", "goal_radius=!Uniform {min: 0.3, max: 0.4}"
+    words = ["benchmark", "--scenarios", str(short_scenario), "--policies", "straight", "--seeds"]
+    words += ["1", "--jobs", "1", "--out", str(out), "--sweep", "vehicle.drag=0.3,0.5"]
+    assert main([*words, "--set", goal_radius]) == 0
+    rows = rows_of(out / "rollouts.csv")
+    assert [row["vehicle.drag"] for row in rows] == ["0.3", "0.5"]
+    assert all(0.3 <= float(row["goal_radius"]) <= 0.4 for row in rows)
+    assert [row["scenario"] for row in rows] == ["short-vehicle.drag-0.3", "short-vehicle.drag-0.5"]
+    scenarios = [f"{short_scenario}:vehicle.drag={drag}" for drag in ("0.3", "0.5")]
+    expected = StudyConfig(scenarios, ["straight"], seeds=1, overrides=[goal_radius])
+    assert StudyFolder(out).config() == expected
+
+
+def test_policies_of_others_have_their_own_files_of_weights(short, tmp_path, monkeypatch):
+    monkeypatch.setattr(POLICIES, "_entries", dict(POLICIES._entries))
+    sp.register_policy(ClimbConfig, lambda config, *_: Climb(float(np.loadtxt(config.weights))))
+    file, out = tmp_path / "w.txt", tmp_path / "out"
+    file.write_text("1")
+    policy = f"mine=climb:weights={file}"
+    flights = sp.study(short, policies=policy, seeds=1, jobs=1, out=out)
+    assert flights.end_z_m[0] > 1.85
+    assert (out / "weights/mine.txt").read_text() == "1"
+    assert "weights of mine" in StudyFolder(out).program()
+    file.unlink()
+    assert replay.run(study=out, id=flights.id[0])
+    file.write_text("2")
+    with pytest.raises(ValueError, match=r"w.txt has changed since"):
+        sp.study(short, policies=policy, seeds=1, jobs=1, out=out)

@@ -1,10 +1,10 @@
 import json
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 
 from splatpilot.analysis.benchmark import replay, run_study
 from splatpilot.analysis.benchmark.study import StudyConfig
@@ -57,40 +57,29 @@ def test_invalid_descriptions_name_the_file(tmp_path, text, message):
         StudyFolder(tmp_path).config()
 
 
-def test_missing_fields_have_their_defaults(study, tmp_path):
-    config, _ = study
-    folder = StudyFolder(tmp_path / "out")
-    folder.begin(config, program())
-    file = tmp_path / "out/study.yaml"
+def test_missing_fields_have_their_defaults(short_study, tmp_path):
+    folder, file = StudyFolder(tmp_path / "out"), tmp_path / "out/study.yaml"
+    folder.begin(short_study, program())
     begun = file.read_text()
     assert "  split: dev\n" in begun
     file.write_text(begun.replace("  split: dev\n", ""))
-    folder.begin(config, program())
+    folder.begin(short_study, program())
     with pytest.raises(ValueError, match="holds a study with split dev, not test; choose"):
-        folder.begin(replace(config, split="test"), program())
+        folder.begin(replace(short_study, split="test"), program())
 
 
-@pytest.fixture
-def save_weights(tmp_path):
-    """Saves DiffAero's weights, with other ones for some layers, and returns the file."""
+def save_weights(file: Path, thrust: float = 0.0) -> Path:
+    """Writes weights of DiffAero whose head only pulls up."""
     shipped = PolicyCheckpoint.load("", "diffaero", DIFFAERO_NETWORK)
-
-    def save(name="mine.npz", **changed):
-        weights = dict(shipped.weights) | changed
-        PolicyCheckpoint("diffaero", shipped.spec, weights, {}).save(tmp_path / name)
-        return tmp_path / name
-
-    return save
+    weights = dict(shipped.weights)
+    weights["head.weight"] = 0.0 * weights["head.weight"]
+    weights["head.bias"] = np.array([0.0, 0.0, thrust], np.float32)
+    PolicyCheckpoint("diffaero", shipped.spec, weights, {}).save(file)
+    return file
 
 
-def thrust_weights(thrust: float) -> dict[str, np.ndarray]:
-    """Weights of a head that only pulls up."""
-    head = PolicyCheckpoint.load("", "diffaero", DIFFAERO_NETWORK).weights["head.weight"]
-    return {"head.weight": 0.0 * head, "head.bias": np.array([0.0, 0.0, thrust], np.float32)}
-
-
-def test_weights_from_a_file_fly_and_are_kept(short_scenario, tmp_path, rows_of, save_weights):
-    mine = save_weights(**thrust_weights(2.0))
+def test_weights_from_a_file_fly_and_are_kept(short_scenario, tmp_path, rows_of):
+    mine = save_weights(tmp_path / "mine.npz", 2.0)
     policies = ["diffaero", str(mine), f"diffaero.1={mine}"]
     config = StudyConfig([str(short_scenario)], policies, seeds=1)
     folder = StudyFolder(tmp_path / "out")
@@ -101,24 +90,22 @@ def test_weights_from_a_file_fly_and_are_kept(short_scenario, tmp_path, rows_of,
     states = folder.read(config.rollouts()[1])[1]["states"]
     assert states[-1, 2] - states[0, 2] > 1.0 and states[-1, 5] > 2.0  # straight up
 
-    save_weights(**thrust_weights(-2.0))
+    save_weights(mine, -2.0)
     with pytest.raises(ValueError, match=r"mine.npz has changed since"):
         run_study.run(config=config, out=folder.path, jobs=1)
     mine.unlink()
     assert replay.run(study=folder.path, id="short-mine-2-000")
 
 
-def test_study_is_not_resumed_with_other_shipped_weights(
-    short_scenario, tmp_path, monkeypatch, save_weights
-):
-    save_weights("diffaero.npz")
+def test_study_is_not_resumed_with_other_shipped_weights(short_scenario, tmp_path, monkeypatch):
+    save_weights(tmp_path / "diffaero.npz")
     monkeypatch.setattr(checkpoint, "_SHIPPED", tmp_path)
     config = StudyConfig([str(short_scenario)], ["diffaero"], seeds=2)
     folder = StudyFolder(tmp_path / "out")
     run_study.run(config=config, out=folder.path, jobs=1)
     assert len(folder.program()["weights of diffaero"]) == 16
 
-    save_weights("diffaero.npz", **thrust_weights(0.0))
+    save_weights(tmp_path / "diffaero.npz", 1.0)
     folder.trajectory("short-diffaero-2-001").unlink()
     with pytest.raises(ValueError, match=r"weights of diffaero .*must be .* it was started"):
         run_study.run(config=config, out=folder.path, jobs=1)
@@ -136,8 +123,8 @@ def test_variants_of_a_policy_fly_side_by_side(short_scenario, tmp_path, rows_of
     assert replay.run(study=out, id="short-slow-2-000")
 
 
-def test_own_policy_of_a_scenario_flies_and_is_kept(short_scenario, tmp_path, capsys, save_weights):
-    mine = save_weights(**thrust_weights(0.0))
+def test_own_policy_of_a_scenario_flies_and_is_kept(short_scenario, tmp_path, capsys):
+    mine = save_weights(tmp_path / "mine.npz")
     text = short_scenario.read_text() + f"policy: !DiffAeroConfig {{weights: {mine}}}\n"
     short_scenario.write_text(text)
     words = ["benchmark", "--scenarios", str(short_scenario), "--seeds", "1", "--jobs", "1"]
@@ -152,24 +139,21 @@ def test_own_policy_of_a_scenario_flies_and_is_kept(short_scenario, tmp_path, ca
     assert f"The policy of {short_scenario} is not flown" in capsys.readouterr().out
 
 
-def scene_study(file, scene, kind: str = "SceneConfig") -> StudyConfig:
+def scene_digest(file: Path, scene: Path, kind: str = "SceneConfig") -> str:
+    """Writes a scenario in a scene, and returns the digest of the scene in a study."""
     file.write_text(f"world: !{kind} {{path: {scene}}}\n")
-    return StudyConfig([str(file)], ["straight"], seeds=1)
-
-
-def scene_digest(config: StudyConfig) -> str:
+    config = StudyConfig([str(file)], ["straight"], seeds=1)
     (digest,) = input_digests(config, config.load_scenarios()).values()
     return digest
 
 
-@pytest.mark.parametrize("part", ["hall.gltf", "hall.bin"])
-def test_digest_of_a_mesh_is_that_of_its_files(tmp_path, part):
-    for name in ("hall.gltf", "hall.bin"):
-        (tmp_path / name).write_text("first")
-    config = scene_study(tmp_path / "hall.yaml", tmp_path / "hall.gltf", "MeshWorld")
-    first = scene_digest(config)
-    (tmp_path / part).write_text("second")
-    assert scene_digest(config) != first
+def test_digest_of_a_mesh_is_that_of_its_files(tmp_path):
+    digests, parts = set(), [tmp_path / "hall.gltf", tmp_path / "hall.bin"]
+    for contents in (("a", "a"), ("b", "a"), ("a", "b")):
+        for part, content in zip(parts, contents, strict=True):
+            part.write_text(content)
+        digests.add(scene_digest(tmp_path / "hall.yaml", parts[0], "MeshWorld"))
+    assert len(digests) == 3
 
 
 def test_two_scenes_of_one_name_are_not_flown_as_one(room, tmp_path):
@@ -178,48 +162,28 @@ def test_two_scenes_of_one_name_are_not_flown_as_one(room, tmp_path):
     (moved / "observations.npz").write_bytes(b"other")
     files = [tmp_path / "first.yaml", tmp_path / "second.yaml"]
     for file, scene in zip(files, (room.scene("hall"), moved), strict=True):
-        scene_study(file, scene)
-    config, folder = StudyConfig([str(file) for file in files], ["straight"]), tmp_path / "out"
-    StudyFolder(folder).begin(config, {})
+        file.write_text(f"world: !SceneConfig {{path: {scene}}}\n")
+    config, folder = StudyConfig([*map(str, files)], ["straight"]), StudyFolder(tmp_path / "out")
+    folder.begin(config, {})
     with pytest.raises(ValueError, match=r"hall differs from .*scenes/hall, .*; rename it"):
-        keep_inputs(StudyFolder(folder), config, config.load_scenarios())
+        keep_inputs(folder, config, config.load_scenarios())
 
 
 def test_digest_of_a_scene_is_that_of_its_flown_files(room, tmp_path):
-    def digest(scene) -> str:
-        return scene_digest(scene_study(tmp_path / "hall.yaml", scene))
-
-    scene = room.scene("hall")
-    first = digest(scene)
-    assert digest(scene.rename(tmp_path / "renamed")) == first
+    file, scene = tmp_path / "hall.yaml", room.scene("hall")
+    first = scene_digest(file, scene)
+    assert scene_digest(file, scene.rename(tmp_path / "renamed")) == first
     moved = replace(room.gaussians, means=room.gaussians.means + 0.1)
-    assert digest(room.scene("moved", moved)) != first
+    assert scene_digest(file, room.scene("moved", moved)) != first
 
 
 POLICY = """
-from dataclasses import dataclass
-
-from pydrake.systems.framework import LeafSystem
-
 import splatpilot
-from straying.speed import SPEED
+from splatpilot.systems.policies.straight import Straight, StraightConfig
 
+class StrayingConfig(StraightConfig): ...
 
-class Straying(LeafSystem):
-    def __init__(self):
-        super().__init__()
-        self.DeclareVectorOutputPort("velocity", 3, lambda _, y: y.SetFromVector([SPEED, 0, 0]))
-
-
-@dataclass
-class StrayingConfig:
-    rate: float = 10.0
-
-    def validate(self):
-        pass
-
-
-splatpilot.register_policy(StrayingConfig, lambda config, world, scenario: Straying())
+splatpilot.register_policy(StrayingConfig, lambda config, world, scenario: Straight(config))
 """
 
 
@@ -233,10 +197,13 @@ def test_a_study_is_flown_by_one_version_of_a_plugin(short_scenario, tmp_path, c
     monkeypatch.setattr(sys, "path", list(sys.path))
     monkeypatch.setattr(POLICIES, "_entries", dict(POLICIES._entries))
 
+    def read_versions() -> dict[str, str]:
+        return StudyFolder(tmp_path / "study").program()
+
     words = ["--import", "straying.policy", "benchmark", "--scenarios", "short.yaml", "--policies"]
     words += ["straying", "--seeds", "2", "--jobs", "1", "--out", "study"]
     assert main(words) == 0
-    versions = yaml.safe_load((tmp_path / "study/study.yaml").read_text())["program"]
+    versions = read_versions()
     assert len(versions["source of straying"]) == 16
     assert main(words) == 0  # nothing is missing
 
@@ -251,9 +218,8 @@ def test_a_study_is_flown_by_one_version_of_a_plugin(short_scenario, tmp_path, c
 
     second.unlink()
     assert main(words) == 0  # no flight of the other version is left
-    changed = yaml.safe_load((tmp_path / "study/study.yaml").read_text())["program"]
-    assert changed["source of straying"] != versions["source of straying"]
-    assert changed.keys() == versions.keys()
+    assert read_versions()["source of straying"] != versions["source of straying"]
+    assert read_versions().keys() == versions.keys()
 
 
 def test_our_own_code_is_no_plugin():

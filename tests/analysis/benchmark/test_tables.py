@@ -36,18 +36,13 @@ def test_wilson_interval_is_the_published_one(successes, flights, lower, upper):
     assert wilson_interval(successes, flights) == pytest.approx((lower, upper), abs=5e-5)
 
 
-def paired(only_first: int, only_second: int, both: int, neither: int):
-    first = [True] * only_first + [False] * only_second + [True] * both + [False] * neither
-    second = [False] * only_first + [True] * only_second + [True] * both + [False] * neither
-    return np.array(first), np.array(second)
-
-
 def test_mcnemar_is_the_binomial_of_unequal_pairs():
-    first, second = paired(6, 16, 80, 59)
+    first = np.repeat([True, False, True, False], [6, 16, 80, 59])
+    second = np.repeat([False, True, True, False], [6, 16, 80, 59])
     p_value = pytest.approx(2 * 110056 / 2**22)
     assert mcnemar(first, second) == (6, 16, p_value)
     assert mcnemar(second, first) == (16, 6, p_value)
-    assert mcnemar(*paired(0, 0, 5, 3)) == (0, 0, 1.0)
+    assert mcnemar(first, first) == (0, 0, 1.0)
 
 
 def test_cluster_interval_covers_at_its_confidence():
@@ -102,35 +97,29 @@ def test_holm_steps_down():
 
 
 def flights(policy: str, scenario: str, successes: list[bool]) -> list[dict]:
+    outcomes = {True: ("goal", 0.5), False: ("timeout", 0.1)}
+    spec = {"policy": policy, "scenario": scenario, "speed": 2.0}
     return [
-        {
-            "policy": policy,
-            "scenario": scenario,
-            "speed": 2.0,
-            "seed": seed,
-            "success": success,
-            "outcome": "goal" if success else "timeout",
-            "min_clearance_m": 0.5 if success else 0.1,
-        }
+        spec
+        | dict(zip(("outcome", "min_clearance_m"), outcomes[success], strict=True))
+        | {"seed": seed, "success": success}
         for seed, success in enumerate(successes)
     ]
 
 
-def test_scenario_is_passed_if_most_flights_succeed():
-    rows = flights("a", "P01", [True, True, False]) + flights("a", "P02", [True, False])
-    summary = success_summary(rows + flights("a", "P03", [False]))
-    assert (summary["scenarios"], summary["scenarios_passed"]) == (3, 1)
-
-
 def test_table_has_a_row_for_each_policy():
-    rows = flights("planner", "P01", [True, True]) + flights("straight", "P01", [True, False])
-    config = StudyConfig(["P01"], ["planner", "straight"], [2.0], seeds=2)
+    rows = flights("planner", "P01", [True, True, False]) + flights("planner", "P02", [True, False])
+    rows += flights("planner", "P03", [False])
+    summary = success_summary(rows)
+    assert (summary["scenarios"], summary["scenarios_passed"]) == (3, 1)  # by most flights
+    rows += flights("straight", "P01", [True, False])
+    config = StudyConfig(["P01", "P02", "P03"], ["planner", "straight"], [2.0], seeds=2)
     table = policy_table(rows, config)
-    assert [row["successes"] for row in table] == [2, 1]
-    assert [row["timeout"] for row in table] == [0, 1]
-    assert [round(row["min_clearance_m"], 6) for row in table] == [0.5, 0.3]
+    assert [row["successes"] for row in table] == [3, 1]
+    assert [row["timeout"] for row in table] == [3, 1]
+    assert [round(row["min_clearance_m"], 6) for row in table] == [0.3, 0.3]
     planner, straight = format_table(table, config).splitlines()[2:]
-    assert "2/2" in planner and "1/1" in planner and "0/1" in straight
+    assert "3/6" in planner and "1/3" in planner and "0/1" in straight
 
 
 def test_effective_flights_are_those_over_the_design_effect():
@@ -146,19 +135,16 @@ def test_effective_flights_are_those_over_the_design_effect():
 
 
 def test_flights_that_share_worlds_are_clustered():
-    """Two vehicles in each of ten worlds: the second policy fails in six worlds, for both."""
+    # Two vehicles in each of ten worlds: the second policy fails in six worlds, for both.
     variants = ["P01:vehicle.drag=0.3", "P01:vehicle.drag=0.5"]
-    config = StudyConfig(variants, ["a", "b"], [2.0], seeds=10)
-    rows = []
+    config, rows = StudyConfig(variants, ["a", "b"], [2.0], seeds=10), []
     for scenario in config.scenario_variants:
         rows += flights("a", scenario.label, [True] * 10)
         rows += flights("b", scenario.label, [False] * 6 + [True] * 4)
-    apart = compare(rows, config)[0]
-    for row in rows:
-        row["world_id"] = f"P01-{row['seed']:03d}"
+    assert compare(rows, config)[0].p_seeds == 2 / 2**12
+    rows = [row | {"world_id": f"P01-{row['seed']:03d}"} for row in rows]
     (pair,) = compare(rows, config)
     assert (pair.only_first, pair.p_seeds) == (12, 2 / 2**6)
-    assert apart.p_seeds == 2 / 2**12
     assert pair.p_scenarios == 1.0  # one scenario
     table = policy_table(rows, config)
     assert (table[0]["wilson_lower"], table[0]["wilson_upper"]) == wilson_interval(10, 10)
@@ -167,22 +153,21 @@ def test_flights_that_share_worlds_are_clustered():
 
 
 def test_paper_is_compared_with_unchanged_policies_in_all_scenarios():
-    seventeen = list(benchmark_scenarios())
+    seventeen, policies = list(benchmark_scenarios()), ["planner", "diffaero", "depthnav:rate=12"]
     assert len(seventeen) == 17
-    policies = ["planner", "diffaero", "depthnav:camera.width=128"]
     assert list(paper_rows(StudyConfig(seventeen, policies))) == ["diffaero"]
-    assert paper_rows(StudyConfig(seventeen, ["planner"])) == {}
-    assert paper_rows(StudyConfig(seventeen, ["diffaero=planner"])) == {}
+    for other in (["planner"], ["diffaero=planner"]):
+        assert paper_rows(StudyConfig(seventeen, other)) == {}
     assert paper_rows(StudyConfig(seventeen[1:], policies)) == {}
     assert paper_rows(StudyConfig(seventeen, policies, overrides=["timeout=5"])) == {}
     assert paper_rows(StudyConfig(seventeen, policies), absent={"R13": "no scene"}) == {}
 
 
 def test_all_pairs_are_compared_by_flights_and_by_scenarios():
-    names = [f"P{k:02d}" for k in range(6)]
-    rows = [row for name in names for row in flights("a", name, [True, True])]
-    rows += [row for name in names for row in flights("b", name, [False, False])]
-    rows += [row for name in names for row in flights("c", name, [False, False])]
+    names, success = [f"P{k:02d}" for k in range(6)], {"a": True, "b": False, "c": False}
+    rows = [
+        row for p, won in success.items() for name in names for row in flights(p, name, [won] * 2)
+    ]
     pairs = compare(rows, StudyConfig(names, ["a", "b", "c"], [2.0], seeds=2))
     assert [(pair.first, pair.second) for pair in pairs] == [("a", "b"), ("a", "c"), ("b", "c")]
     assert [(pair.only_first, pair.only_second) for pair in pairs] == [(12, 0), (12, 0), (0, 0)]

@@ -9,9 +9,9 @@ import pytest
 from splatpilot.analysis.commands import COMMANDS
 from splatpilot.analysis.commands.checks import POLICY_NAMES, TRAINER_NAMES
 from splatpilot.analysis.commands.main import build_parser, find_command, main
-from splatpilot.diagrams.flight import policies
+from splatpilot.diagrams.flight.policies import POLICIES
 from splatpilot.systems.common.config import load_config
-from splatpilot.training.policies import trainer_registry
+from splatpilot.training.policies.train import TRAINERS
 
 
 @pytest.mark.parametrize("name", [name for name, (module, _) in COMMANDS.items() if module])
@@ -46,19 +46,13 @@ def test_set_help_lists_the_fields_of_the_configuration(capsys):
     assert "voxel_size=" in capsys.readouterr().out
 
 
-def test_names_that_are_checked_early_are_those_of_the_registries():
-    assert set(POLICY_NAMES) <= set(policies.POLICIES.registered())
-    assert set(TRAINER_NAMES) <= set(trainer_registry.TRAINERS.registered())
-    for registry, names in (
-        (policies.POLICIES, POLICY_NAMES),
-        (trainer_registry.TRAINERS, TRAINER_NAMES),
-    ):
-        ours = {n for n in registry.registered() if _is_ours(registry.find(n).config)}
-        assert ours == set(names)
-
-
-def _is_ours(config: type) -> bool:
-    return config.__module__.startswith("splatpilot.")
+@pytest.mark.parametrize(
+    ("registry", "names"), [(POLICIES, POLICY_NAMES), (TRAINERS, TRAINER_NAMES)]
+)
+def test_names_that_are_checked_early_are_those_of_the_registries(registry, names):
+    found = {name: registry.find(name).config.__module__ for name in registry.registered()}
+    ours = {name for name, module in found.items() if module.startswith("splatpilot.")}
+    assert ours == set(names)
 
 
 @pytest.mark.parametrize(
@@ -73,15 +67,10 @@ def _is_ours(config: type) -> bool:
 )
 def test_shells_complete_commands_options_and_names(line, completions, tmp_path):
     out = tmp_path / "completions"
-    environment = os.environ | {
-        "_ARGCOMPLETE": "1",
-        "_ARGCOMPLETE_IFS": "\n",
-        "_ARGCOMPLETE_STDOUT_FILENAME": str(out),
-        "COMP_LINE": line,
-        "COMP_POINT": str(len(line)),
-    }
+    shell = {"_ARGCOMPLETE": "1", "_ARGCOMPLETE_IFS": "\n", "COMP_POINT": str(len(line))}
+    shell |= {"_ARGCOMPLETE_STDOUT_FILENAME": str(out), "COMP_LINE": line}
     script = "from splatpilot.analysis.commands.main import main; main()"
-    subprocess.run([sys.executable, "-c", script], env=environment, check=False)
+    subprocess.run([sys.executable, "-c", script], env=os.environ | shell, check=False)
     assert set(out.read_text().split("\n")) == completions
 
 

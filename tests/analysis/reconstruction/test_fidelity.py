@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 
+import splatpilot as sp
 from splatpilot.analysis.commands.main import main
 from splatpilot.analysis.reconstruction import fidelity
 from splatpilot.analysis.reconstruction.fidelity import FidelityConfig, study_scene
 from splatpilot.diagrams.worlds.scene_folder import read_scene_metadata
-from splatpilot.systems.splats.baked_scene import BakedScene
-from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.training.captures import capture_registry
 from splatpilot.training.captures.capture import CaptureFrame, no_depth
 from splatpilot.training.reconstruction.splat_rendering import SceneRenderer
@@ -20,7 +19,7 @@ from splatpilot.training.reconstruction.splat_rendering import SceneRenderer
 @pytest.fixture
 def find_camera(room):
     """Makes the room a world that can be rendered from anywhere."""
-    baked, capture = BakedScene(room.gaussians), room.capture
+    baked, capture = sp.BakedScene(room.gaussians), room.capture
 
     def camera(X_WC: RigidTransform) -> CaptureFrame:
         view = baked.render(capture.K, capture.width, capture.height, X_WC)
@@ -60,36 +59,25 @@ def test_studies_write_bounds_and_are_not_mixed(room, find_camera, capsys):
     assert read_scene_metadata(scene).perturbation_bound == pytest.approx(0.2)
 
 
-def test_a_wrong_scene_is_not_trusted(room, find_camera):
+def test_a_wrong_scene_is_not_trusted_and_cameras_stay_inside_walls(room, find_camera):
     gaussians = room.gaussians
     kept = ~((gaussians.means[:, 1] > 2.9) & (gaussians.means[:, 0] > 3.0))
     names = ("means", "quats", "scales", "opacities", "sh")
     part = replace(gaussians, **{name: getattr(gaussians, name)[kept] for name in names})
     scene = room.scene("part", part, held_out=[0])
-    config = FidelityConfig(offsets=[0.0, 0.3], max_depth_error=0.02)
+    # The walls are 1.5 m to either side; the field knows nothing beyond them.
+    config = FidelityConfig(offsets=[0.0, 0.3, 1.4], max_depth_error=0.02)
     found = study_scene(scene, room.folder / "out", config, find_camera)
     assert found.column("depth_relative").min() > 0.02 and found.reach == 0
-
-
-def test_cameras_stay_inside_walls(room, find_camera):
-    scene = room.scene("room_with_walls", held_out=[0])
-    # The walls are 1.5 m to either side; the field knows nothing beyond them.
-    config = FidelityConfig(offsets=[0.0, 1.0, 1.4])
-    found = study_scene(scene, room.folder / "out", config, find_camera)
-    assert set(found.column("offset")) == {0.0, 1.0}
+    assert set(found.column("offset")) == {0.0, 0.3}
 
 
 def test_held_out_stretches(room, set_fields):
     scene, out = room.scene("real", held_out=[0]), room.folder / "out"
+    small = ("iterations=10", "threads=1", "initial_gaussians=2000", "voxel_size=0.2")
     fields = set_fields(
-        "stretches=[1, 3]",
-        "kept=3",
-        "reconstruct.iterations=10",
-        "reconstruct.threads=1",
-        "reconstruct.initial_gaussians=2000",
-        "reconstruct.voxel_size=0.2",
-        "max_depth_error=0.5",
-        "max_psnr_drop=30",
+        *("stretches=[1, 3]", "kept=3", "max_depth_error=0.5", "max_psnr_drop=30"),
+        *(f"reconstruct.{field}" for field in small),
     )
     command = ["scene", "fidelity", str(scene), "--out", str(out), *fields]
     assert main(command) == 0
@@ -113,39 +101,32 @@ def test_held_out_stretches(room, set_fields):
     [
         ("offsets=[0.5, 0.1]", "offsets must be at least one, rising, got [0.5, 0.1]"),
         ("stretches=[]", "stretches must be at least one, got []"),
+        ("kept=2", "has no metric depth"),
     ],
 )
-def test_invalid_settings(room, capsys, setting, message):
+def test_invalid_settings_and_captures_are_refused(room, monkeypatch, capsys, setting, message):
+    blind = replace(room.capture, load_depth=no_depth)
+    monkeypatch.setattr(capture_registry, "read_capture", lambda path, config: blind)
     scene, out = room.scene("scene"), room.folder / "out"
     assert main(["scene", "fidelity", str(scene), "--out", str(out), "--set", setting]) == 1
     assert message in capsys.readouterr().err
 
 
-def test_capture_without_depth(room, monkeypatch, capsys):
-    blind = replace(room.capture, load_depth=no_depth)
-    monkeypatch.setattr(capture_registry, "read_capture", lambda path, config: blind)
-    scene = room.scene("blind")
-    assert main(["scene", "fidelity", str(scene), "--out", str(room.folder / "out")]) == 1
-    assert "has no metric depth" in capsys.readouterr().err
-
-
-def make_study(psnr, relative) -> fidelity.FidelityStudy:
+@pytest.mark.parametrize(
+    ("psnr_slope", "relative_slope", "reach"), [(-5, 0.125, 0.4), (-20, 0.01, 0.3)]
+)
+def test_reach_is_the_offset_of_the_first_limit(psnr_slope, relative_slope, reach):
     samples = [
-        fidelity.Sample(0, x, x / 2, psnr(x), 2 * relative(x), relative(x), 0.0)
+        fidelity.Sample(
+            *(0, x, x / 2, 30 + psnr_slope * x, 2 * relative_slope * x, relative_slope * x, 0.0)
+        )
         for x in np.linspace(0, 1, 11)
     ]
-    return fidelity.FidelityStudy(
-        "room", "rendered", 30.0, samples, max_depth_error=0.05, max_psnr_drop=6.0
-    )
-
-
-def test_reach_is_the_offset_of_the_first_limit():
-    by_depth = make_study(lambda x: 30 - 5 * x, lambda x: 0.125 * x)
-    assert by_depth.reach == pytest.approx(0.4)
-    assert by_depth.unseen_limit == pytest.approx(0.2)
-    assert by_depth.agreement() == (1.0, 0.0)
-    by_color = make_study(lambda x: 30 - 20 * x, lambda x: 0.01 * x)
-    assert by_color.reach == pytest.approx(0.3)
+    limits = {"max_depth_error": 0.05, "max_psnr_drop": 6.0}
+    found = fidelity.FidelityStudy("room", "rendered", 30.0, samples, **limits)
+    assert found.reach == pytest.approx(reach)
+    assert found.unseen_limit == pytest.approx(reach / 2)
+    assert found.agreement() == (1.0, 0.0)
 
 
 def test_reach_is_the_crossing_of_the_fit():
@@ -154,10 +135,9 @@ def test_reach_is_the_crossing_of_the_fit():
     y[0] = 300.0  # one wrong view
     assert fidelity.reach(x, y, 0.15) == pytest.approx(0.5)
     rng = np.random.default_rng(0)
-    many = rng.uniform(0, 2, 4000)
-    assert fidelity.reach(many, 0.3 * many + rng.normal(0, 0.05, 4000), 0.15) == pytest.approx(
-        0.5, abs=0.08
-    )
+    x = rng.uniform(0, 2, 4000)
+    y = 0.3 * x + rng.normal(0, 0.05, 4000)
+    assert fidelity.reach(x, y, 0.15) == pytest.approx(0.5, abs=0.08)
     assert fidelity.reach([0.0, 0.4, 0.8], [0, 0.1, 0.2], 1.0) == 0.8
     assert fidelity.reach([0.1, 0.4, 0.8], [2, 2, 2], 1.0) == 0
 
@@ -203,7 +183,7 @@ def look(room):
 def support(room):
     """Returns the support by one fitted camera in the room, perhaps with more Gaussians."""
 
-    def make(X_WC: RigidTransform, more: GaussianScene | None = None) -> fidelity.ViewSupport:
+    def make(X_WC: RigidTransform, more: sp.GaussianScene | None = None) -> fidelity.ViewSupport:
         capture, scene = room.capture, room.gaussians
         renderer = SceneRenderer(scene if more is None else scene.merged_with(more), "3dgs")
         return fidelity.ViewSupport(renderer, (capture.K, capture.width, capture.height), [X_WC])
@@ -223,13 +203,10 @@ def test_support_falls_with_the_distance_from_the_camera(support, look):
 
 def test_occluded_surfaces_are_unseen(support, look):
     y, z = (g.ravel() for g in np.meshgrid(np.arange(0, 3, 0.08), np.arange(0, 2.5, 0.08)))
-    wall = GaussianScene.from_colors(
-        np.column_stack([np.full(len(y), 3.0), y, z]),
-        np.tile([1.0, 0, 0, 0], (len(y), 1)),
-        np.full((len(y), 3), 0.06),
-        np.full(len(y), 0.99),
-        np.full((len(y), 3), 0.5),
-    )
+    ones = np.ones((len(y), 1))
+    means, quats = np.column_stack([3.0 * ones, y, z]), ones * [1.0, 0, 0, 0]
+    sizes, gray = 0.06 * np.tile(ones, 3), 0.5 * np.tile(ones, 3)
+    wall = sp.GaussianScene.from_colors(means, quats, sizes, 0.99 * ones[:, 0], gray)
     assert support(look(1.0)).fraction(look(3.5)) > 0.3
     assert support(look(1.0), wall).fraction(look(3.5)) < 0.02
 

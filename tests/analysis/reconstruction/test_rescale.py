@@ -6,14 +6,11 @@ import pytest
 import trimesh
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
+import splatpilot as sp
 from splatpilot.analysis.commands.main import main
 from splatpilot.analysis.reconstruction.rescale import rescale, run
 from splatpilot.diagrams.worlds import scene_folder
-from splatpilot.diagrams.worlds.world import World
-from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf_build import esdf_from_occupancy
-from splatpilot.systems.splats.baked_scene import BakedScene
-from splatpilot.systems.splats.splat_files import read_ply, write_ply
 from splatpilot.training.captures.capture_registry import read_scene_capture
 
 SHRUNK = 0.25  # units of files per meter
@@ -35,32 +32,16 @@ def photographs(seen_room, write_nerfstudio, tmp_path):
 @pytest.fixture
 def unscaled(seen_room, photographs, tmp_path):
     """The room as a scene of photographs; space behind the cameras is unknown."""
-    gaussians, _ = seen_room
     occupied, unknown = np.zeros((2, 60, 30, 25), bool)
     occupied[5:, :, 0] = True
     unknown[:5] = True
     field = esdf_from_occupancy(occupied, unknown, np.zeros(3), 0.1 * SHRUNK)
-    world = World(
-        name="room",
-        gaussians=gaussians.scaled_by(SHRUNK),
-        distance_field=field,
-        esdf=field,
-        background=(0.1, 0.2, 0.3),
-        p_WS=np.full(3, SHRUNK),
-        p_WG=np.full(3, SHRUNK),
-    )
+    gaussians, end = seen_room[0].scaled_by(SHRUNK), np.full(3, SHRUNK)
+    world = sp.World("room", gaussians, field, field, (0.1, 0.2, 0.3), end, end)
+    source = {"capture": str(photographs), "gains": [1.0] * 16, "held_out": [0, 8]}
+    source |= {"split": "validation", "source_digest": ["0123456789abcdef"], "metric": False}
     path = tmp_path / "unscaled"
-    scene_folder.write_scene_folder(
-        path,
-        world,
-        provenance="photographs",
-        gains=[1.0] * 16,
-        metric=False,
-        capture=str(photographs),
-        held_out=[0, 8],
-        split="validation",
-        source_digest=["0123456789abcdef"],
-    )
+    scene_folder.write_scene_folder(path, world, provenance="photographs", **source)
     return path
 
 
@@ -91,19 +72,18 @@ def test_scene_of_photographs_can_be_flown_in_at_its_scale(unscaled, seen_room, 
         assert again.X_WCs[i].IsNearlyEqualTo(capture.X_WCs[i], 1e-9)
     # The near end is closed.
     assert metadata.frontier and (new.esdf.states == old.esdf.states).mean() > 0.9
-    free = old.esdf.states == FieldState.FREE
+    free = old.esdf.states == sp.FieldState.FREE
     assert (new.esdf.distances <= old.esdf.distances / SHRUNK + 1e-5)[free].all()
-    occupied = (np.sum(world.esdf.states == FieldState.OCCUPIED) for world in (old, new))
+    occupied = (np.sum(world.esdf.states == sp.FieldState.OCCUPIED) for world in (old, new))
     assert next(occupied) < next(occupied)
     assert np.linalg.norm(new.p_WG - new.p_WS) > 1.0
 
 
 def test_factors_multiply(unscaled, tmp_path):
-    origin = [100.0, 200.0, -30.0]
-    scene_folder.write_scene_metadata(
-        unscaled, replace(scene_folder.read_scene_metadata(unscaled), origin=origin)
-    )
-    poses = read_scene_capture(unscaled, scene_folder.read_scene_metadata(unscaled)).X_WCs
+    metadata = scene_folder.read_scene_metadata(unscaled)
+    metadata = replace(metadata, origin=[100.0, 200.0, -30.0])
+    scene_folder.write_scene_metadata(unscaled, metadata)
+    poses = read_scene_capture(unscaled, metadata).X_WCs
     rescale(unscaled, tmp_path / "once", 4.0)
     summary = rescale(tmp_path / "once", tmp_path / "twice", 0.5)
     once, twice = (scene_folder.read_scene(tmp_path / name) for name in ("once", "twice"))
@@ -138,16 +118,16 @@ def test_file_in_meters_and_upright(seen_room, tmp_path, up):
     x_F = np.roll(np.eye(3)[along], 1)
     R_FW = RotationMatrix(np.column_stack([x_F, np.cross(up_F, x_F), up_F]))
     file, out = tmp_path / "file.ply", tmp_path / "upright.ply"
-    write_ply(gaussians.scaled_by(SHRUNK).transformed_by(RigidTransform(R_FW)), file)
+    sp.write_ply(gaussians.scaled_by(SHRUNK).transformed_by(RigidTransform(R_FW)), file)
     assert scale(file, "--out", out, "--up", up, "--factor", 1 / SHRUNK) == 0
-    found = read_ply(out)
+    found = sp.read_ply(out)
     np.testing.assert_allclose(found.means[:, 2], gaussians.means[:, 2], atol=1e-5)
     a, b = (means[:, 0] + 1j * means[:, 1] for means in (gaussians.means, found.means))
     X_WV = RigidTransform(RotationMatrix.MakeZRotation(float(np.angle(np.vdot(a, b)))))
     # Askew, for Gaussians of a wall seen squarely have one depth, and may change their order.
     X_WC = capture.X_WCs[3] @ RigidTransform(RollPitchYaw(0.11, 0.23, 0.37), np.zeros(3))
-    before = BakedScene(gaussians).render(capture.K, 64, 48, X_WC)
-    after = BakedScene(found).render(capture.K, 64, 48, X_WV @ X_WC)
+    before = sp.BakedScene(gaussians).render(capture.K, 64, 48, X_WC)
+    after = sp.BakedScene(found).render(capture.K, 64, 48, X_WV @ X_WC)
     assert np.abs(after.color - before.color).mean() < 1e-3
     assert np.quantile(np.abs(after.depth / before.depth - 1), 0.95) < 1e-3
 
@@ -156,25 +136,24 @@ def test_tilted_file_becomes_level(seen_room, tmp_path):
     gaussians, _ = seen_room
     X_FW = RigidTransform(RollPitchYaw(0.3, -0.2, 0.5), [1.0, 2.0, 3.0])
     file = tmp_path / "file.ply"
-    write_ply(gaussians.transformed_by(X_FW), file)
+    sp.write_ply(gaussians.transformed_by(X_FW), file)
     lowest = gaussians.means[:, 2].min()
     corners = [X_FW @ np.array([x, y, lowest]) for x, y in ((0, 0), (3, 0.5), (0.5, 2))]
     for k, points in enumerate((corners, corners[::-1])):
         words = [",".join(str(x) for x in point) for point in points]
         assert scale(file, "--out", tmp_path / f"{k}.ply", "--floor", *words, "--factor", 2) == 0
-        heights = read_ply(tmp_path / f"{k}.ply").means[:, 2]
+        heights = sp.read_ply(tmp_path / f"{k}.ply").means[:, 2]
         np.testing.assert_allclose(heights, 2 * (gaussians.means[:, 2] - lowest), atol=2e-5)
 
 
 def test_length_in_a_file(seen_room, tmp_path, capsys):
-    gaussians, _ = seen_room
     file, out = tmp_path / "file.ply", tmp_path / "b.ply"
-    write_ply(gaussians, file)
+    sp.write_ply(seen_room[0], file)
     summary = run(scene=file, out=out, between=[[0, 0, 0], [0, 2, 0]], distance=3.0, up="z")
     assert summary.factor == 1.5
-    np.testing.assert_allclose(read_ply(out).means, 1.5 * gaussians.means, rtol=1e-6)
+    np.testing.assert_allclose(sp.read_ply(out).means, 1.5 * seen_room[0].means, rtol=1e-6)
     assert run(scene=file, out=tmp_path / "c.ply", up="-z").factor == 1.0
-    assert f"Gaussians          {len(gaussians)}\n" in capsys.readouterr().out
+    assert f"Gaussians          {len(seen_room[0])}\n" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -191,10 +170,7 @@ def test_length_in_a_file(seen_room, tmp_path, capsys):
         ("unscaled --out unscaled --factor 2", "unscaled: exists already"),
         ("unscaled --out out --up -y", "z is up in scene folders; leave --up"),
         ("unscaled --out out --height nan", "height must be finite and > 0, got nan"),
-        (
-            "unscaled --out out --between 0,0,0 0,0,0 --distance 1",
-            "--between must differ",
-        ),
+        ("unscaled --out out --between 0,0,0 0,0,0 --distance 1", "--between must differ"),
         ("unscaled --out out --between 0,0,1 0,0,0", "--between and --distance belong together"),
     ],
 )

@@ -1,5 +1,3 @@
-"""Ends of flights: in Drake's own simulations, and in diagrams wired by hand."""
-
 import numpy as np
 import pytest
 from pydrake.common import RandomDistribution
@@ -24,7 +22,7 @@ def toward(name: str, value: list[float]) -> LeafSystem:
 
 @pytest.mark.parametrize("accuracy", [None, 1e-5])
 def test_any_simulator_ends_with_the_flight(post_world, accuracy):
-    scenario = Scenario(policy=policy_named("straight", 6.0), start=[1.0, 0.0, 2.0])
+    scenario = Scenario(policy=policy_named("straight", 6.0), start=[3.0, 0.0, 2.0])
     diagram = BuildFlightDiagram(scenario, post_world, camera=False)
     simulator = Simulator(diagram)
     root = simulator.get_mutable_context()
@@ -38,7 +36,7 @@ def test_any_simulator_ends_with_the_flight(post_world, accuracy):
     assert -(1e-6 if accuracy else 0.2) < clearance <= 0
 
 
-@pytest.mark.parametrize("speed", [1.0, 3.0, 6.0])
+@pytest.mark.parametrize("speed", [1.0, 6.0])
 def test_contact_is_found_to_a_micrometer(post_world, speed):
     scenario = Scenario(policy=policy_named("straight", speed))
     flight = fly(BuildFlightDiagram(scenario, post_world, camera=False))
@@ -51,10 +49,8 @@ def test_goal_and_bounds_end_at_the_exact_instant(post_world):
     flight = fly(BuildFlightDiagram(scenario, post_world, camera=False))
     to_goal = np.linalg.norm(flight.states[-1, :3] - post_world.p_WG)
     assert flight.outcome == Outcome.GOAL and abs(to_goal - scenario.goal_radius) < 1e-6
-    up = BuildFlightDiagram(
-        Scenario(), post_world, camera=False, policy=toward("velocity", [0.0, 0.0, 2.0])
-    )
-    flight = fly(up)
+    up = toward("velocity", [0.0, 0.0, 2.0])
+    flight = fly(BuildFlightDiagram(Scenario(), post_world, camera=False, policy=up))
     assert flight.outcome == Outcome.LEFT_VOLUME
     assert abs(flight.states[-1, 2] - post_world.distance_field.upper_W[2]) < 1e-6
 
@@ -64,7 +60,7 @@ def test_random_sources_repeat_with_the_seed_of_the_scenario(post_world):
         builder = DiagramBuilder()
         source = builder.AddSystem(RandomSource(RandomDistribution.kGaussian, 3, 0.1))
         builder.ExportOutput(source.get_output_port(), "velocity")
-        scenario = Scenario(seed=seed, timeout=1.0, start_radius=0.0)
+        scenario = Scenario(seed=seed, timeout=0.5, start_radius=0.0)
         diagram = BuildFlightDiagram(scenario, post_world, camera=False, policy=builder.Build())
         return fly(diagram).states
 
@@ -89,18 +85,16 @@ def hand_wired(scenario: Scenario, world) -> DiagramBuilder:
 
 def test_a_loop_wired_by_hand_flies_also_within_another_diagram(post_world):
     scenario = Scenario(goal=[2.5, 0.0, 2.0], timeout=10.0)
-    inner = hand_wired(scenario, post_world).Build()
     outer = DiagramBuilder()
-    outer.AddSystem(inner)
+    outer.AddSystem(hand_wired(scenario, post_world).Build())
     flight = fly(outer.Build())
     assert flight.outcome == Outcome.GOAL
-    np.testing.assert_array_equal(
-        flight.states, fly(hand_wired(scenario, post_world).Build()).states
-    )
+    bare = fly(hand_wired(scenario, post_world).Build())
+    np.testing.assert_array_equal(flight.states, bare.states)
 
 
 class DiscretePlant(LeafSystem):
-    """Moves as commanded: a discrete vehicle that climbs with thrust less 9.81 m/s^2."""
+    """Climbs by thrust less 9.81 m/s^2 as if it were a speed, in steps."""
 
     def __init__(self, start: np.ndarray) -> None:
         super().__init__()
@@ -110,19 +104,16 @@ class DiscretePlant(LeafSystem):
 
     def _update(self, context, discrete_state) -> None:
         state = context.get_discrete_state_vector().CopyToVector()
-        state[:3] += 0.01 * state[3:6]
-        state[5] += 0.01 * (self.EvalVectorInput(context, 0).CopyToVector()[0] - 9.81)
+        state[2] += 0.01 * (self.get_input_port().Eval(context)[0] - 9.81)
         discrete_state.set_value(state)
 
 
 def test_a_discrete_plant_flies_from_its_own_start(post_world):
-    plant = DiscretePlant(hover_state([2.0, 0.0, 1.0]))
-    policy = toward("command", [10.81, 0.0, 0.0, 0.0])
-    flight = fly(
-        BuildFlightDiagram(Scenario(), post_world, camera=False, plant=plant, policy=policy)
-    )
+    plant = DiscretePlant(hover_state([2.0, 0.0, 3.0]))
+    systems = {"plant": plant, "policy": toward("command", [10.81, 0.0, 0.0, 0.0])}
+    flight = fly(BuildFlightDiagram(Scenario(), post_world, camera=False, **systems))
     assert flight.outcome == Outcome.LEFT_VOLUME
-    np.testing.assert_array_equal(flight.states[0, :3], [2.0, 0.0, 1.0])
+    np.testing.assert_array_equal(flight.states[0, :3], [2.0, 0.0, 3.0])
     assert (flight.commands == [10.81, 0, 0, 0]).all()
 
 
@@ -133,7 +124,7 @@ def test_a_plant_that_starts_outside_of_the_world_is_refused(post_world):
         fly(diagram)
 
 
-def test_a_monitor_of_the_caller_ends_the_flight_too(post_world):
+def test_a_flight_that_its_caller_ends_keeps_its_record(post_world):
     diagram = BuildFlightDiagram(Scenario(), post_world, camera=False)
 
     def half_a_second(context):
@@ -141,20 +132,15 @@ def test_a_monitor_of_the_caller_ends_the_flight_too(post_world):
             return EventStatus.ReachedTermination(diagram, "enough")
         return None
 
-    flight = fly(diagram, monitor=half_a_second)
-    assert flight.outcome == Outcome.INTERRUPTED and flight.times[-1] == pytest.approx(0.5)
-
-
-def test_an_interrupted_flight_keeps_its_record(post_world):
     def interrupt(time: float) -> None:
         if time >= 0.5:
             raise KeyboardInterrupt
 
-    diagram = BuildFlightDiagram(Scenario(), post_world, camera=False)
     with pytest.raises(KeyboardInterrupt) as raised:
         fly(diagram, progress=interrupt)
-    flight = vars(raised.value)["flight"]
-    assert flight.outcome == Outcome.INTERRUPTED and flight.times[-1] == pytest.approx(0.5)
+    for flight in (fly(diagram, monitor=half_a_second), vars(raised.value)["flight"]):
+        assert flight.outcome == Outcome.INTERRUPTED
+        assert flight.times[-1] == pytest.approx(0.5)
 
 
 def test_each_of_two_flights_in_a_diagram_has_its_own_end(post_world):
@@ -165,18 +151,13 @@ def test_each_of_two_flights_in_a_diagram_has_its_own_end(post_world):
     diagram = builder.Build()
     flights = fly_all(diagram)
     assert [flight.outcome for flight in flights.values()] == [Outcome.GOAL] * 2
-    one, two = flights["one_monitor"], flights["two_monitor"]
-    assert one.times[-1] < two.times[-1]
+    assert flights["one_monitor"].times[-1] < flights["two_monitor"].times[-1]
     with pytest.raises(ValueError, match="flights in the diagram must be 1, got 2; call fly_all"):
         fly(diagram)
 
 
 def test_a_diagram_without_monitor_is_refused():
-    with pytest.raises(ValueError, match="must have a FlightMonitor"):
-        make_flight_simulator(Simulator(_empty()).get_system())
-
-
-def _empty():
     builder = DiagramBuilder()
     builder.AddSystem(ConstantVectorSource(np.zeros(1)))
-    return builder.Build()
+    with pytest.raises(ValueError, match="must have a FlightMonitor"):
+        make_flight_simulator(builder.Build())

@@ -17,27 +17,22 @@ from splatpilot.systems.vehicle.vehicles import Kingfisher
 
 def test_names_and_paths_are_found(tmp_path):
     assert scenario_file("P01") == benchmark_scenarios()["P01"]
-    assert scenario_file("P01").is_file()
+    assert scenario_file("P01").is_file() and scenario_file("alley_splat").is_file()
     other = tmp_path / "other"
     other.write_text("")
     assert scenario_file(str(other)) == other
     assert scenario_file("mine.yaml").name == "mine.yaml"
-
-
-def test_scenarios_outside_the_benchmark_have_names_too():
-    assert len(benchmark_scenarios()) == 17
-    assert not set(benchmark_scenarios()) & set(other_scenarios())
-    assert scenario_file("alley_splat").is_file()
-
-
-def test_unknown_scenario_lists_the_known_ones():
     with pytest.raises(ValueError, match=r"no scenario 'nothing'.*P01, P02"):
         scenario_file("nothing")
+    numbered = [*(f"P{k:02d}" for k in range(1, 13)), *(f"R{k}" for k in range(13, 18))]
+    assert sorted(benchmark_scenarios()) == numbered
+    assert not set(benchmark_scenarios()) & set(other_scenarios())
 
 
 @pytest.mark.parametrize("name", benchmark_scenarios() | other_scenarios())
 def test_scenario_that_was_written_is_the_same(name):
     scenario = load_config(Scenario(), scenario_file(name))
+    scenario.validate()
     again = parse_config(Scenario(), dump_config(scenario), name)
     assert type(again.world) is type(scenario.world)
     assert again.world == scenario.world
@@ -57,6 +52,14 @@ def test_a_profile_sets_its_fields_and_keeps_the_others():
     assert drawn[0].stereo == drawn[1].stereo != scenario.imaging.stereo
     again = parse_config(Scenario(), dump_config(scenario), "again")
     assert again == scenario
+
+
+def test_a_vehicle_is_chosen_by_its_tag_and_written_with_it():
+    scenario = loaded("vehicle=!Kingfisher {model: lags}")
+    assert scenario.vehicle == Kingfisher(model="lags")
+    assert "vehicle: !Kingfisher" in dump_config(scenario)
+    assert load_config(scenario, overrides=["vehicle.mass=0.8"]).vehicle.mass == 0.8
+    assert "!QuadrotorParams" not in dump_config(Scenario())
 
 
 def test_a_profile_keeps_the_type_of_the_vehicle(tmp_path):
@@ -85,7 +88,7 @@ def test_a_profile_may_be_a_file(tmp_path):
 @pytest.mark.parametrize("name", profiles())
 @pytest.mark.parametrize("policy", ["planner", "diffaero", "diffaero_tof", "diffaero_rgb"])
 def test_profiles_are_valid_for_every_seed(name, policy):
-    for seed in range(20):
+    for seed in range(8):
         loaded(f"profile={name}", f"seed={seed}", policy=policy_named(policy)).validate()
 
 
@@ -104,8 +107,14 @@ def test_profiles_are_valid_for_every_seed(name, policy):
             ["imaging.exposure_time=0.04", "observation.frame_rate=[20, 30]"],
             r"exposure_time must be at most 0\.03333 s",
         ),
+        (
+            ["vehicle.rate_time_constant=0.004"],
+            r"shortest time constant .* at least half of .*0.02 s.*, got 0.004 s; set .* 0.008",
+        ),
         (["decision_delay=[0.1, 0.05]"], r"decision_delay must be two numbers in ascending"),
         (["decision_delay=[0.0, 2.0]"], r"decision_delay must be in \[0, 1\] s"),
+        (["camera.output_delay=2"], r"camera\.output_delay must be"),
+        (["camera.capture_offset=0.1"], r"camera\.capture_offset must be"),
         (["imaging.stereo={baseline: 0}"], r"imaging\.stereo\.baseline must be in \(0, 1\] m"),
     ],
 )

@@ -1,6 +1,3 @@
-"""One flight: how it starts, how it ends, and that it repeats."""
-
-import dataclasses
 import gc
 import re
 import weakref
@@ -8,6 +5,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from gymnasium.spaces import Box
+from pydrake.common import RandomGenerator
+from pydrake.gym import DrakeGymEnv
+from pydrake.systems.analysis import MonteCarloSimulation
 from pydrake.systems.framework import EventStatus, LeafSystem
 
 from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
@@ -15,40 +16,54 @@ from splatpilot.diagrams.flight.fly import flight_page
 from splatpilot.diagrams.flight.monitor import flight_outcome
 from splatpilot.diagrams.flight.policies import policy_named
 from splatpilot.diagrams.flight.scenario import Scenario, sample_initial_state
-from splatpilot.diagrams.flight.simulation import FlightError, Outcome, fly
+from splatpilot.diagrams.flight.simulation import FlightError, Outcome, fly, random_flights
 from splatpilot.diagrams.worlds.world_registry import make_world
-from splatpilot.systems.common.provenance import InfeasibleFlightError
+from splatpilot.systems.common.provenance import MONTE_CARLO_SEEDS, InfeasibleFlightError
 from splatpilot.systems.policies.hypotheses import Hypotheses
 from splatpilot.systems.sensing.noise import ObservationNoise
-from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS, hover_state
+from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS, QuadrotorPlant, hover_state
 from splatpilot.systems.visualization.live import RESTART
 
 
-def test_flies_round_the_post_to_the_goal(post_world):
-    scenario = Scenario(timeout=20.0)
+@pytest.fixture(scope="module")
+def flight(post_world):
     seen = []
-    flight = fly(BuildFlightDiagram(scenario, post_world), progress=seen.append)
+    flight = fly(BuildFlightDiagram(Scenario(), post_world), progress=seen.append)
+    assert seen[-1] == flight.times[-1]
+    return flight
+
+
+def test_flies_round_the_post_to_the_goal(post_world, flight):
     assert flight.outcome == Outcome.GOAL
-    assert np.linalg.norm(flight.states[-1, :3] - post_world.p_WG) <= scenario.goal_radius
+    assert np.linalg.norm(flight.states[-1, :3] - post_world.p_WG) <= Scenario().goal_radius
     post_distance = np.linalg.norm(flight.states[:, :2] - [5.0, 0.0], axis=1) - 0.5
     assert flight.clearances.min() == pytest.approx(post_distance.min() - VEHICLE_RADIUS, abs=1e-6)
     assert flight.clearances.min() > 0
     assert np.all(np.diff(flight.times) > 0)
-    assert seen[-1] == flight.times[-1]
 
     summary: dict[str, Any] = flight.summary()
     assert summary["outcome"] == "goal"
     assert summary["flight_time_s"] == flight.times[-1]
     # At least the way there, and 0.1 m of start_radius and 0.3 m of goal_radius less.
     assert 7.6 < summary["path_length_m"] < 12.0
-    assert summary["mean_speed_m_s"] == pytest.approx(
-        summary["path_length_m"] / summary["flight_time_s"]
-    )
+    speed = summary["path_length_m"] / summary["flight_time_s"]
+    assert summary["mean_speed_m_s"] == pytest.approx(speed)
     assert summary["real_time_factor"] == pytest.approx(flight.times[-1] / flight.wall_time)
 
 
+def test_plans_are_recorded_as_flown(flight):
+    num_hypotheses = Scenario().policy.lattice.num_hypotheses
+    plans = [Hypotheses.from_vector(row, num_hypotheses) for row in flight.hypotheses]
+    count = np.floor(15 * flight.times[-1]) + 1
+    np.testing.assert_allclose([p.plan_time for p in plans], np.arange(count) / 15, atol=1e-9)
+    for plan in plans:
+        nearest = np.argmin(np.abs(flight.times - plan.plan_time))
+        offset = plan.X_WB.translation() - flight.states[nearest, :3]
+        assert np.linalg.norm(offset) <= 0.01 * 2.5  # Half a log period at top speed.
+
+
 def test_monitor_restarts_a_flight(post_world):
-    diagram = BuildFlightDiagram(Scenario(timeout=1.0), post_world, camera=False)
+    diagram = BuildFlightDiagram(Scenario(timeout=0.5), post_world, camera=False)
     times = []
 
     def restart_once(context):
@@ -58,7 +73,8 @@ def test_monitor_restarts_a_flight(post_world):
 
     flight = fly(diagram, monitor=restart_once)
     assert times.count(0.0) == 2
-    assert flight.outcome == Outcome.TIMEOUT and flight.times[0] == 0.0
+    assert flight.outcome == Outcome.TIMEOUT
+    np.testing.assert_allclose(flight.times[[0, -1]], [0.0, 0.5], atol=1e-9)
     assert (np.diff(flight.times) > 0).all()
 
 
@@ -70,20 +86,6 @@ def test_flight_and_world_are_short_in_notebooks(post_world):
     assert len(repr(post_world)) < 80
     shown = flight_page(scenario, post_world, [flight])._repr_html_()
     assert shown.startswith("<iframe srcdoc=") and "&lt;title&gt;" in shown
-
-
-def test_plans_are_recorded_as_flown(post_world):
-    scenario = Scenario(timeout=1.0)
-    flight = fly(BuildFlightDiagram(scenario, post_world))
-    num_hypotheses = scenario.policy.lattice.num_hypotheses
-    plans = [Hypotheses.from_vector(row, num_hypotheses) for row in flight.hypotheses]
-    times = [plan.plan_time for plan in plans if plan is not None]
-    np.testing.assert_allclose(times, np.arange(15) / 15, atol=1e-9)
-    for plan in plans:
-        assert plan is not None
-        nearest = np.argmin(np.abs(flight.times - plan.plan_time))
-        offset = plan.X_WB.translation() - flight.states[nearest, :3]
-        assert np.linalg.norm(offset) <= 0.01 * 2.5  # Half a log period at top speed.
 
 
 class Failing(LeafSystem):
@@ -100,27 +102,22 @@ class Failing(LeafSystem):
         output.SetFromVector([1.0, 0.0, 0.0])
 
 
-def test_an_exception_in_flight_keeps_the_record(post_world):
-    scenario = Scenario(timeout=5.0)
-    diagram = BuildFlightDiagram(scenario, post_world, policy=Failing(KeyError("depth")))
-    message = r"at t = 0.5\d* s, p_WB = \[.*KeyError: 'depth'"
-    with pytest.raises(FlightError, match=message) as raised:
-        fly(diagram)
-    flight = raised.value.flight
+@pytest.mark.parametrize("error", [KeyError("depth"), InfeasibleFlightError("no route leads")])
+def test_an_exception_in_flight_keeps_the_record(post_world, error):
+    diagram = BuildFlightDiagram(Scenario(), post_world, camera=False, policy=Failing(error))
+    if isinstance(error, KeyError):
+        message = r"at t = 0.5\d* s, p_WB = \[.*KeyError: 'depth'"
+        with pytest.raises(FlightError, match=message) as raised:
+            fly(diagram)
+        flight = raised.value.flight
+        assert isinstance(raised.value.__cause__, KeyError)
+    else:
+        flight = fly(diagram)
+        assert flight.reason.endswith("m/s: no route leads")
     assert flight.outcome == Outcome.ERROR
-    assert isinstance(raised.value.__cause__, KeyError)
     assert 0.45 < flight.times[-1] <= 0.55
     assert len(flight.times) == len(flight.states) == len(flight.commands)
     assert flight.summary()["reason"] == flight.reason
-
-
-def test_a_flight_that_becomes_infeasible_ends_with_an_error(post_world):
-    scenario = Scenario(timeout=5.0)
-    error = InfeasibleFlightError("no route leads to the goal")
-    diagram = BuildFlightDiagram(scenario, post_world, policy=Failing(error))
-    flight = fly(diagram)
-    assert flight.outcome == Outcome.ERROR
-    assert flight.reason.endswith("m/s: no route leads to the goal")
 
 
 @pytest.mark.parametrize(
@@ -136,31 +133,11 @@ def test_a_flight_that_becomes_infeasible_ends_with_an_error(post_world):
 )
 def test_outcome_at_an_instant(post_world, p_WB, outcome):
     scenario = Scenario()
-    diagram = BuildFlightDiagram(scenario, post_world)
+    diagram = BuildFlightDiagram(scenario, post_world, camera=False)
     context = diagram.CreateDefaultContext()
     plant = diagram.GetSubsystemByName("plant")
     plant.GetMyMutableContextFromRoot(context).SetContinuousState(hover_state(p_WB))
     assert flight_outcome(diagram, context, post_world.p_WG, scenario.goal_radius) == outcome
-
-
-def test_collision_ends_the_flight(post_world):
-    nothing = np.full_like(post_world.esdf.distances, 5.0)
-    empty = dataclasses.replace(
-        post_world.esdf, distances=nothing, states=np.zeros(nothing.shape, np.uint8)
-    )
-    world = dataclasses.replace(post_world, esdf=empty)
-    scenario = Scenario(start_radius=0.0)
-    flight = fly(BuildFlightDiagram(scenario, world))
-    assert flight.outcome == Outcome.COLLISION
-    assert -0.1 < flight.clearances[-1] < 0
-    assert flight.clearances[:-1].min() >= 0
-
-
-def test_timeout_ends_the_flight(post_world):
-    scenario = Scenario(timeout=0.5)
-    flight = fly(BuildFlightDiagram(scenario, post_world))
-    assert flight.outcome == Outcome.TIMEOUT
-    assert flight.times[-1] == pytest.approx(0.5)
 
 
 def test_start_is_drawn_from_the_seed(post_world):
@@ -174,35 +151,31 @@ def test_start_is_drawn_from_the_seed(post_world):
 
 
 @pytest.mark.parametrize(
-    ("field", "point", "message"),
+    ("fields", "message"),
     [
-        ("start", [5.0, 0.0, 2.0], r"start \[5.0, 0.0, 2.0\] is -0.500 m from the nearest surface"),
-        ("start", [5.0, 0.8, 2.0], r"0.300 m from the nearest surface.*radius is 0.354 m"),
-        ("goal", [11.0, 0.0, 2.0], r"goal \[11.0, 0.0, 2.0\] is outside the world.*\[10.0, 3.0"),
+        (
+            {"start": [5.0, 0.0, 2.0]},
+            r"start \[5.0, 0.0, 2.0\] is -0.500 m from the nearest surface",
+        ),
+        ({"start": [5.0, 0.8, 2.0]}, r"0.300 m from the nearest surface.*radius is 0.354 m"),
+        ({"goal": [11.0, 0.0, 2.0]}, r"goal \[11.0, 0.0, 2.0\] is outside the world.*\[10.0, 3.0"),
+        ({"goal": [1.25, 0.0, 2.0]}, r"goal_radius, 0\.3 m, got 0\.25 m"),
     ],
 )
-def test_start_and_goal_need_room(post_world, field, point, message):
+def test_start_and_goal_need_room(post_world, fields, message):
     with pytest.raises(ValueError, match=message):
-        sample_initial_state(Scenario(**{field: point}), post_world)
+        sample_initial_state(Scenario(**fields), post_world)
+    if fields == {"goal": [1.25, 0.0, 2.0]}:
+        sample_initial_state(Scenario(**fields, goal_radius=0.2), post_world)
 
 
-def test_a_flight_that_starts_at_its_goal_is_refused(post_world):
-    start = [float(x) for x in post_world.p_WS]
-    near = [start[0] + 0.25, *start[1:]]
-    with pytest.raises(ValueError, match=r"goal_radius, 0\.3 m, got 0\.25 m"):
-        sample_initial_state(Scenario(goal=near), post_world)
-    sample_initial_state(Scenario(goal=near, goal_radius=0.2), post_world)
-
-
-@pytest.mark.parametrize("seed", [10, 11])
-def test_forests_are_flown_through_at_nominal_speed(seed):
-    scenario = Scenario(seed=seed)
+def test_a_forest_is_flown_through_at_nominal_speed():
+    scenario = Scenario(seed=10)
     world = make_world(scenario.world, scenario.seed)
-    flight = fly(BuildFlightDiagram(scenario, world))
+    flight = fly(BuildFlightDiagram(scenario, world, camera=False))
     assert flight.outcome == Outcome.GOAL
     assert np.nanmin(flight.clearances) > 0
-    summary: dict[str, Any] = flight.summary()
-    assert summary["mean_speed_m_s"] > 1.7
+    assert flight.summary()["mean_speed_m_s"] > 1.7
 
 
 @pytest.mark.parametrize("name", ["planner", "reactive"])
@@ -216,3 +189,76 @@ def test_flown_diagrams_are_freed(name, post_world):
     del diagram
     gc.collect()
     assert [reference() for reference in references if reference() is not None] == []
+
+
+def test_default_context_is_the_start_of_the_scenario(post_world):
+    scenario = Scenario(timeout=0.5, seed=MONTE_CARLO_SEEDS[3])
+    diagram = BuildFlightDiagram(scenario, post_world, camera=False)
+    start = sample_initial_state(scenario, post_world)
+    state = diagram.GetOutputPort("state")
+    np.testing.assert_array_equal(state.Eval(diagram.CreateDefaultContext()), start)
+    plant = QuadrotorPlant(scenario.vehicle, start).ToAutoDiffXd()
+    converted = plant.CreateDefaultContext().get_continuous_state_vector().CopyToVector()
+    np.testing.assert_array_equal([x.value() for x in converted], start)
+    simulator = random_flights(scenario, post_world)(lambda: 3)
+    simulator.AdvanceTo(scenario.timeout)
+    ended = simulator.get_system().GetOutputPort("state").Eval(simulator.get_context())
+    np.testing.assert_array_equal(ended, fly(diagram).states[-1])
+
+
+def test_monte_carlo_simulation_varies_what_the_scenario_varies(post_world):
+    scenario = Scenario(timeout=0.2, start_radius=0.3, policy=policy_named("straight"))
+    small = Scenario()
+    small.world.length, small.world.width, small.world.voxel_size = 10.0, 6.0, 0.3
+    make = random_flights(scenario, post_world)
+
+    def simulated(make, port, element, duration, count, seed=1):
+        def output(diagram, context):
+            return float(diagram.GetOutputPort(port).Eval(context)[element])
+
+        generator = RandomGenerator(seed) if isinstance(seed, int) else seed
+        return MonteCarloSimulation(make, output, duration, count, generator)
+
+    runs = [simulated(make, "state", 1, 0.2, 5) for _ in range(2)]
+    first, second = ([result.output for result in results] for results in runs)
+    assert first == second and len(set(first)) == 5
+    again = simulated(make, "state", 1, 0.0, 1, runs[0][2].generator_snapshot)
+    starts = simulated(make, "state", 1, 0.0, 5)
+    assert again[0].output == starts[2].output
+    assert max(abs(result.output - post_world.p_WS[1]) for result in starts) <= 0.3
+    built = random_flights(scenario, post_world, build=BuildFlightDiagram)
+    assert [each.output for each in simulated(built, "state", 1, 0.2, 5)] == first
+    worlds = simulated(random_flights(small), "clearance", 0, 0.0, 2)
+    assert worlds[0].output != worlds[1].output
+
+
+def test_drakes_environment_acts_through_the_decision(post_world):
+    env = DrakeGymEnv(
+        random_flights(Scenario(timeout=1.0), post_world, policy="velocity"),
+        time_step=0.1,
+        action_space=Box(-1.0, 1.0, (3,)),
+        observation_space=Box(-np.inf, np.inf, (13,)),
+        reward=lambda system, context: 0.0,
+        action_port_id="velocity",
+        observation_port_id="observation_state",
+    )
+    env.reset(seed=1)
+    steps = (env.step(np.array([1.0, 0.0, 0.0])) for _ in range(20))
+    ended = next(observation for observation, _, terminated, _, _ in steps if terminated)
+    assert ended[0] > 1.4
+
+
+def test_a_simulation_ends_with_its_flight_and_is_freed(post_world):
+    ends = {"start": [3.0, 0.0, 1.5], "goal": [4.0, 0.0, 1.5]}
+    scenario = Scenario(timeout=20.0, policy=policy_named("straight"), **ends)
+    make, built = random_flights(scenario, post_world), []
+
+    def remembered(generator):
+        simulator = make(generator)
+        built.append(weakref.ref(simulator.get_system()))
+        return simulator
+
+    results = MonteCarloSimulation(remembered, lambda _, c: c.get_time(), scenario.timeout, 1)
+    assert 0.0 < results[0].output < scenario.timeout
+    gc.collect()
+    assert built[0]() is None

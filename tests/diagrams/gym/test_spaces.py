@@ -3,35 +3,24 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from splatpilot.diagrams.flight.scenario import Scenario
-from splatpilot.diagrams.gym.spaces import (
-    OBSERVATIONS,
-    FlightEnvConfig,
-    Reward,
-    Transition,
-    Vehicles,
-    action_space,
-    decisions,
-    env_config,
-    observation_space,
-    observe,
-    observe_image,
-    require_actions,
-)
+from splatpilot.diagrams.gym import spaces
 
 COUNT = 50
 
 
 @pytest.fixture
-def vehicles() -> Vehicles:
+def vehicles() -> spaces.Vehicles:
     generator = np.random.default_rng(0)
     states = generator.normal(size=(COUNT, 13))
     states[:, 6:10] /= np.linalg.norm(states[:, 6:10], axis=-1, keepdims=True)
     gradients = generator.normal(size=(COUNT, 3))
     gradients /= np.linalg.norm(gradients, axis=-1, keepdims=True)
-    return Vehicles(states, generator.normal(size=(COUNT, 3)), generator.random(COUNT), gradients)
+    return spaces.Vehicles(
+        states, generator.normal(size=(COUNT, 3)), generator.random(COUNT), gradients
+    )
 
 
-def rotations(vehicles: Vehicles) -> tuple[Rotation, Rotation]:
+def rotations(vehicles: spaces.Vehicles) -> tuple[Rotation, Rotation]:
     """Returns R_WB and R_WH."""
     R_WB = Rotation.from_quat(vehicles.states[:, 6:10], scalar_first=True)
     ahead = R_WB.apply([1.0, 0.0, 0.0])
@@ -39,7 +28,7 @@ def rotations(vehicles: Vehicles) -> tuple[Rotation, Rotation]:
 
 
 def test_observations_are_in_the_heading_frame(vehicles):
-    observed = observe(OBSERVATIONS, vehicles)
+    observed = spaces.observe(spaces.OBSERVATIONS, vehicles)
     R_WB, R_WH = rotations(vehicles)
     state, to_goal = observed["state"], vehicles.p_WG - vehicles.states[:, :3]
     np.testing.assert_allclose(R_WH.apply(state[:, :3]), vehicles.states[:, 3:6], atol=1e-6)
@@ -59,30 +48,38 @@ def test_observations_stay_in_their_space_outside_of_the_world(vehicles):
         distances=np.full(COUNT, np.nan),
         gradients=np.zeros((COUNT, 3)),
     )
-    space = observation_space(FlightEnvConfig(observation=OBSERVATIONS))
-    for name, values in observe(OBSERVATIONS, far).items():
+    space = spaces.observation_space(spaces.FlightEnvConfig(observation=spaces.OBSERVATIONS))
+    for name, values in spaces.observe(spaces.OBSERVATIONS, far).items():
         assert all(value in space[name] for value in values), name
 
 
 def test_depth_becomes_proximity():
     depth = np.array([[0.0, 3.0, 12.0, np.inf]], np.float32)
-    np.testing.assert_array_equal(observe_image("depth", depth, 12.0)[..., 0], [[255, 191, 0, 0]])
-    np.testing.assert_array_equal(observe_image("depth_m", depth, 12.0), [[0, 3, 12, 12]])
+    np.testing.assert_array_equal(
+        spaces.observe_image("depth", depth, 12.0)[..., 0], [[255, 191, 0, 0]]
+    )
+    np.testing.assert_array_equal(spaces.observe_image("depth_m", depth, 12.0), [[0, 3, 12, 12]])
 
 
 @pytest.mark.parametrize("action", ["acceleration", "velocity", "waypoint"])
 def test_actions_are_in_the_heading_frame(action, vehicles):
-    config = FlightEnvConfig(action=action, action_limits=[1.0, 2.0, 3.0])
+    config = spaces.FlightEnvConfig(action=action, action_limits=[1.0, 2.0, 3.0])
     actions = np.random.default_rng(1).uniform(-1.0, 1.0, (COUNT, 3))
     expected = rotations(vehicles)[1].apply(actions * [1.0, 2.0, 3.0])
     if action == "waypoint":
         expected = expected + vehicles.states[:, :3]
-    np.testing.assert_allclose(decisions(config, actions, vehicles.states), expected, atol=1e-9)
+    np.testing.assert_allclose(
+        spaces.decisions(config, actions, vehicles.states), expected, atol=1e-9
+    )
 
 
-def test_a_zero_command_hovers(vehicles):
-    commands = decisions(FlightEnvConfig(action="command"), np.zeros((COUNT, 4)), vehicles.states)
-    np.testing.assert_array_equal(commands, np.tile([9.81, 0.0, 0.0, 0.0], (COUNT, 1)))
+def test_a_zero_command_hovers_and_others_are_scaled(vehicles):
+    actions = np.zeros((COUNT, 4))
+    actions[1] = [0.125, 0.5, -0.5, 0.25]
+    commands = spaces.decisions(spaces.FlightEnvConfig(action="command"), actions, vehicles.states)
+    expected = np.tile([9.81, 0.0, 0.0, 0.0], (COUNT, 1))
+    expected[1] = [1.125 * 9.81, 3.0, -3.0, 0.5]
+    np.testing.assert_allclose(commands, expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("value", [np.nan, 1.5, -np.inf])
@@ -90,9 +87,9 @@ def test_invalid_actions_are_errors(value):
     actions = np.zeros((2, 3))
     actions[1, 1] = value
     with pytest.raises(ValueError, match=rf"action must be in \[-1, 1\], got {value}"):
-        require_actions(actions, (2, 3))
+        spaces.require_actions(actions, (2, 3))
     with pytest.raises(ValueError, match=r"shape of action must be \(3,\), got \(2, 3\)"):
-        require_actions(actions, (3,))
+        spaces.require_actions(actions, (3,))
 
 
 @pytest.mark.parametrize(
@@ -106,40 +103,35 @@ def test_invalid_actions_are_errors(value):
         ({"observation": ["goal", "goal"]}, "observation must be different"),
         ({"reward": 1.0}, "reward must be a function"),
         ({"actions": "velocity"}, "there is no argument 'actions'; did you mean"),
+        ({"observation": ["depht"]}, r"observation must be one of state, .* got 'depht'"),
     ],
 )
 def test_invalid_configurations_are_errors(fields, message):
     with pytest.raises(ValueError, match=message):
-        env_config(Scenario(), **fields)
-
-
-def test_unknown_observations_are_errors():
-    config = env_config("P01", observation=["depht"])
-    with pytest.raises(ValueError, match=r"observation must be one of state, .* got 'depht'"):
-        observation_space(config)
+        spaces.observation_space(spaces.env_config(Scenario(), **fields))
 
 
 def test_one_name_makes_a_box():
-    config = env_config("P01", observation="depth", action="command")
-    assert observation_space(config).shape == (36, 64, 1)
-    assert action_space(config).shape == (4,)
+    config = spaces.env_config("P01", observation="depth", action="command")
+    assert spaces.observation_space(config).shape == (36, 64, 1)
+    assert spaces.action_space(config).shape == (4,)
 
 
 def test_rewards_sum_weighted_terms():
-    states, next_states = np.zeros((3, 13)), np.zeros((3, 13))
+    next_states = np.zeros((3, 13))
     next_states[:, 0] = [1.0, 0.0, -0.5]
-    transition = Transition(
-        states=states,
+    transition = spaces.Transition(
+        states=np.zeros((3, 13)),
         next_states=next_states,
         p_WG=np.tile([4.0, 0.0, 0.0], (3, 1)),
         distances=np.array([5.0, 0.354, np.nan]),
-        actions=np.array([[1.0, 0.0, 0.0]] * 3),
+        actions=np.tile([1.0, 0.0, 0.0], (3, 1)),
         previous_actions=np.zeros((3, 3)),
         reached=np.array([True, False, False]),
         failed=np.array([False, True, True]),
         duration=0.1,
     )
-    reward = Reward(barrier=-2.0, smoothness=-0.3, time=-1.0)
+    reward = spaces.Reward(barrier=-2.0, smoothness=-0.3, time=-1.0)
     terms = reward.terms(transition)
     np.testing.assert_allclose(terms["progress"], [1.0, 0.0, -0.5])
     np.testing.assert_allclose(terms["barrier"], [0.0, -0.2 * 0.3, 0.0], atol=4e-3)

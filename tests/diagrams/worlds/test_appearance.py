@@ -36,11 +36,12 @@ def draw(seed: int, strength: float = 1.0):
 
 
 def test_no_strength_changes_nothing(scene):
-    same = recolored(scene, draw(1, strength=0.0))
+    plain = draw(1, strength=0.0)
+    same = recolored(scene, plain)
     np.testing.assert_allclose(same.base_colors, scene.base_colors, atol=1e-5)
     np.testing.assert_allclose(same.sh[:, 1:], scene.sh[:, 1:], atol=1e-5)
-    sky = recolored_background((0.2, 0.5, 0.9), draw(1, strength=0.0))
-    np.testing.assert_allclose(sky, (0.2, 0.5, 0.9), atol=1e-5)
+    sky = (0.2, 0.5, 0.9)
+    np.testing.assert_allclose(recolored_background(sky, plain), sky, atol=1e-5)
 
 
 def test_geometry_stays_and_colors_change(scene):
@@ -72,13 +73,11 @@ def test_hue_turns_colors_and_leaves_grays(scene):
     np.testing.assert_allclose(recolored(two, look).base_colors, expected, atol=1e-5)
 
 
-def test_light_from_one_side_falls_off_with_the_cosine(scene):
+def test_light_from_one_side_falls_off_with_the_cosine():
     angles = np.linspace(0, np.pi / 2, 7)
     quats = np.column_stack([np.cos(angles / 2), np.sin(angles / 2), *np.zeros((2, 7))])
-    flat = GaussianScene.from_colors(
-        np.zeros((7, 3)), quats, np.tile([0.1, 0.1, 0.001], (7, 1)), np.full(7, 0.9),
-        np.full((7, 3), 0.5),
-    )  # fmt: skip
+    scales, gray = np.tile([0.1, 0.1, 0.001], (7, 1)), np.full((7, 3), 0.5)
+    flat = GaussianScene.from_colors(np.zeros((7, 3)), quats, scales, np.full(7, 0.9), gray)
     look = replace(draw(0, 0.0), light_W=np.float32([0, 0, 1]), relief=1.0)
     linear = recolored(flat, look).base_colors[:, 0] ** 2.2
     np.testing.assert_allclose(linear, 2 * 0.5**2.2 * np.cos(angles), atol=1e-5)

@@ -17,15 +17,12 @@ from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 @pytest.fixture(scope="module")
 def hall(tmp_path_factory) -> Path:
     """A folder of scenes with one in it: an empty room of 9 x 5 x 4 m on a grid."""
-    field = AnalyticDistanceField(
-        [HalfSpace([0.0, 0, 1], 0.0)], np.array([0.0, 0, -0.2]), np.array([9.0, 5, 4])
-    )
+    ground = HalfSpace([0.0, 0, 1], 0.0)
+    field = AnalyticDistanceField([ground], np.array([0.0, 0, -0.2]), np.array([9.0, 5, 4]))
     esdf = esdf_from_distance_field(field, 0.1)
-    gaussians = GaussianScene.from_colors(
-        np.zeros((1, 3)), [[1, 0, 0, 0]], np.full((1, 3), 0.1), [0.5], np.full((1, 3), 0.5)
-    )
+    dot = [[0] * 3], [[1, 0, 0, 0]], [[0.1] * 3], [0.5], [[0.5] * 3]
     ends = np.array([1.0, 2.5, 2.0]), np.array([8.0, 2.5, 2.0])
-    world = World("hall", gaussians, esdf, esdf, (0.0, 0.0, 0.0), *ends)
+    world = World("hall", GaussianScene.from_colors(*dot), esdf, esdf, (0.0, 0.0, 0.0), *ends)
     folder = tmp_path_factory.mktemp("scenes")
     write_scene_folder(folder / "hall", world, provenance="test")
     return folder

@@ -8,12 +8,12 @@ from pydrake.math import RigidTransform
 
 from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
 from splatpilot.diagrams.flight.monitor import Outcome
+from splatpilot.diagrams.flight.policies import policy_named
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.flight.simulation import fly
+from splatpilot.diagrams.worlds.file_worlds import MeshWorld
 from splatpilot.diagrams.worlds.mesh import sample_colors
-from splatpilot.diagrams.worlds.mesh_world import MeshWorld
 from splatpilot.diagrams.worlds.world_registry import make_world
-from splatpilot.systems.common.config import load_config
 from splatpilot.systems.splats.lens import Distortion
 from splatpilot.training.captures.coverage import look_along
 
@@ -35,20 +35,8 @@ def room(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def config(room):
-    return MeshWorld(path=str(room), up="z")
-
-
-@pytest.fixture(scope="module")
-def world(config):
-    return make_world(config, 0)
-
-
-def test_distance_field_is_that_of_the_triangles(world):
-    p_WQ = np.array([[-6.0, 0, 2.0], [-3, 2, 2], [1.3, 0, 2], [0, 0, 5]])
-    found = world.esdf.distance(p_WQ)
-    np.testing.assert_allclose(found[:3], [1.0, 2.0, 1.0], atol=0.2)
-    assert np.isnan(found[3])
+def world(room):
+    return make_world(MeshWorld(path=str(room), up="z"), 0)
 
 
 def test_viewers_show_the_colors_of_textures(tmp_path):
@@ -65,7 +53,7 @@ def test_viewers_show_the_colors_of_textures(tmp_path):
     assert (colors[blue, 2] > 0.4).all() and (colors[blue, 0] < 0.01).all()
 
 
-def test_camera_shows_the_mesh(opengl, world):
+def test_camera_shows_the_mesh_also_through_a_lens(opengl, world):
     X_WC = look_along(np.array([-4.0, 0, 2.0]), 0.0, 0.0)
     view = world.baked.render(K, 64, 48, X_WC)
     assert view.depth[24, 32] == pytest.approx(3.7, abs=1e-3)
@@ -73,29 +61,21 @@ def test_camera_shows_the_mesh(opengl, world):
     assert view.color[24, 32, 0] > 2 * view.color[24, 32, 2]
     depth = world.baked.render_depth(K, 64, 48, X_WC, max_depth=5.0)
     np.testing.assert_array_equal(depth, np.where(view.depth <= 5, view.depth, 0))
-
-
-def test_lens_bends_the_image(opengl, world):
-    X_WC = look_along(np.array([-4.0, 0, 2.0]), 0.0, 0.0)
-    plain = world.baked.render(K, 64, 48, X_WC)
     bent = world.baked.render(K, 64, 48, X_WC, distortion=Distortion(radial=[-0.1, 0.0]))
     assert bent.depth.shape == (48, 64)
-    assert bent.depth[24, 32] == pytest.approx(plain.depth[24, 32], abs=1e-3)
+    assert bent.depth[24, 32] == pytest.approx(view.depth[24, 32], abs=1e-3)
     # Barrel distortion shows more of the side walls: they are nearer at the border.
-    assert bent.depth[24, 0] < plain.depth[24, 0] - 0.1
+    assert bent.depth[24, 0] < view.depth[24, 0] - 0.1
 
 
 def test_world_pickles_by_its_configuration(world):
     assert pickle.loads(pickle.dumps(world)) == world
 
 
-@pytest.mark.parametrize("policy", ["!PrivilegedPlannerConfig {}", "!DiffAeroConfig {}"])
-def test_policies_fly_in_a_mesh(opengl, room, tmp_path, policy):
-    world = f"world: !MeshWorld {{path: {room}, up: z}}\n"
-    text = f"{world}policy: {policy}\nstart: [-5.0, -1.0, 2.0]\ngoal: [5.0, 1.0, 2.0]\n"
-    (tmp_path / "scenario.yaml").write_text(text)
-    scenario = load_config(Scenario(), tmp_path / "scenario.yaml")
-    world = make_world(scenario.world, scenario.seed)
+@pytest.mark.parametrize("policy", ["planner", "diffaero"])
+def test_policies_fly_in_a_mesh(opengl, world, policy):
+    ends = {"start": [-3.0, -1.0, 2.0], "goal": [3.0, 1.0, 2.0]}
+    scenario = Scenario(policy=policy_named(policy), **ends)
     flight = fly(BuildFlightDiagram(scenario, world, camera=False))
     assert flight.outcome is Outcome.GOAL
     assert flight.clearances.min() > 0

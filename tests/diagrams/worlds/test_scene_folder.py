@@ -1,8 +1,9 @@
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
-from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.math import RigidTransform
 
 from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
 from splatpilot.diagrams.flight.monitor import Outcome, flight_outcome
@@ -19,55 +20,29 @@ from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.splats.splat_camera import ranged_depth
 from splatpilot.systems.splats.splat_files import read_ply, write_ply
 from splatpilot.systems.vehicle.quadrotor import hover_state
-
-
-def box_of_gaussians(size=(6.0, 3.0, 3.0), step=0.1) -> GaussianScene:
-    """The walls of a box with its lower corner in the origin, as round Gaussians."""
-    axes = [np.arange(step / 2, length, step) for length in size]
-    sides = []
-    for axis, length in enumerate(size):
-        for at in (0, length):
-            grids = [np.array([at]) if a == axis else axes[a] for a in range(3)]
-            sides.append(np.stack(np.meshgrid(*grids, indexing="ij"), -1).reshape(-1, 3))
-    means = np.concatenate(sides)
-    N = len(means)
-    return GaussianScene.from_colors(
-        means,
-        np.tile([1, 0, 0, 0], (N, 1)),
-        np.full((N, 3), step),
-        np.full(N, 0.99),
-        np.full((N, 3), 0.3),
-    )
+from splatpilot.training.captures.coverage import look_along
 
 
 @pytest.fixture
-def world() -> World:
+def world(box_room) -> World:
     occupied = np.zeros((20, 10, 10), bool)
     occupied[0] = True
     unknown = np.zeros_like(occupied)
     unknown[15:] = True
     esdf = esdf_from_occupancy(occupied, unknown, np.array([1.0, 2.0, 3.0]), 0.2)
-    return World(
-        name="box",
-        gaussians=box_of_gaussians(step=0.5),
-        distance_field=esdf,
-        esdf=esdf,
-        background=(0.1, 0.2, 0.3),
-        p_WS=np.array([2.0, 3.0, 4.0]),
-        p_WG=np.array([3.0, 3.0, 4.0]),
-    )
+    gaussians, ends = box_room(6, 3, 3).gaussians(0.5), np.array([[2.0, 3, 4], [3.0, 3, 4]])
+    return World("box", gaussians, esdf, esdf, (0.1, 0.2, 0.3), *ends)
 
 
 def test_round_trip(tmp_path, world):
     folder = tmp_path / "scene"
     written = scene_folder.write_scene_folder(
-        folder, world, gains=np.array([1.0, 1.25]), representation="2dgs"
+        folder, world, gains=np.array([1.0, 1.25]), representation="2dgs", image_width=320
     )
     assert {file.name for file in folder.iterdir()} == {"gaussians.ply", "esdf.npz", "scene.yaml"}
     back = scene_folder.read_scene(folder)
     assert (back.name, back.background) == ("box", (0.1, 0.2, 0.3))
-    np.testing.assert_array_equal(back.p_WS, world.p_WS)
-    np.testing.assert_array_equal(back.p_WG, world.p_WG)
+    np.testing.assert_array_equal([back.p_WS, back.p_WG], [world.p_WS, world.p_WG])
     np.testing.assert_array_equal(back.gaussians.means, world.gaussians.means)
     np.testing.assert_array_equal(back.esdf.distances, world.esdf.distances)
     np.testing.assert_array_equal(back.esdf.states, world.esdf.states)
@@ -75,92 +50,74 @@ def test_round_trip(tmp_path, world):
     metadata = scene_folder.read_scene_metadata(folder)
     assert metadata == written
     assert (metadata.gains, metadata.representation) == ([1.0, 1.25], "2dgs")
-    np.testing.assert_allclose(metadata.lower_W, [1, 2, 3])
-    np.testing.assert_allclose(metadata.upper_W, [5, 4, 5])
+    np.testing.assert_allclose([metadata.lower_W, metadata.upper_W], [[1, 2, 3], [5, 4, 5]])
     assert metadata.observed_free_volume == pytest.approx(14 * 10 * 10 * 0.2**3)
     measured = replace(written, perturbation_bound=0.4, pose_perturbation_bounds=[0.3, 0.5])
     scene_folder.write_scene_metadata(folder, measured)
     assert scene_folder.read_scene_metadata(folder) == measured
+    text = (folder / "scene.yaml").read_text()
+    (folder / "scene.yaml").write_text(text.replace("image_width: 320\n", ""))
+    assert scene_folder.read_scene_metadata(folder).image_width == 0
 
 
-def test_missing_fields_have_defaults(tmp_path, world):
-    scene_folder.write_scene_folder(tmp_path / "scene", world, image_width=320)
-    file = tmp_path / "scene" / "scene.yaml"
-    lines = file.read_text().splitlines(keepends=True)
-    file.write_text("".join(line for line in lines if not line.startswith("image_width")))
-    assert scene_folder.read_scene_metadata(tmp_path / "scene").image_width == 0
-
-
-def test_frontier_is_seen_in_flight_and_kept_apart(tmp_path, world):
-    folder, frontier = tmp_path / "scene", box_of_gaussians(step=1.0)
-    written = scene_folder.write_scene_folder(folder, world, frontier, provenance="")
-    assert written.frontier and len(read_ply(folder / "gaussians.ply")) == len(world.gaussians)
-    means = np.concatenate([world.gaussians.means, frontier.means])
-    np.testing.assert_array_equal(scene_folder.read_scene(folder).gaussians.means, means)
-    (folder / "frontier.ply").unlink()
-    with pytest.raises(FileNotFoundError, match=r"frontier\.ply"):
-        scene_folder.read_scene(folder)
-
-
-def test_an_environment_is_kept(tmp_path, world):
-    folder = tmp_path / "scene"
+@pytest.fixture
+def painted(tmp_path, world, box_room):
+    """A scene folder with a frontier and a sky, what is in it, and what was written."""
     texels = np.random.default_rng(0).random((8, 16, 3), np.float32)
-    sky = replace(world, background=EnvironmentMap(texels))
-    metadata = scene_folder.write_scene_folder(folder, sky, provenance="")
-    back = scene_folder.read_scene(folder).background
-    assert isinstance(back, EnvironmentMap)
-    np.testing.assert_allclose(back.texels, texels, atol=0.5 / 255 + 1e-6)
-    assert metadata.background == pytest.approx(mean_color(sky.background))
-    (folder / "environment.png").unlink()
-    with pytest.raises(FileNotFoundError, match=r"No such file: .*environment\.png"):
-        scene_folder.read_scene(folder)
-    scene_folder.write_scene_folder(folder, world, provenance="")
-    assert scene_folder.read_scene(folder).background == world.background
-
-
-def test_a_scene_is_replaced_whole(tmp_path, world):
+    world = replace(world, background=EnvironmentMap(texels))
+    frontier = box_room(6, 3, 3).gaussians(1.0)
     folder = tmp_path / "scene"
-    scene_folder.write_scene_folder(folder, world, provenance="first")
+    metadata = scene_folder.write_scene_folder(folder, world, frontier, provenance="first")
+    return folder, metadata, world, frontier
+
+
+def test_frontier_and_environment_are_seen_in_flight_and_kept_apart(painted):
+    folder, metadata, world, frontier = painted
+    assert metadata.frontier and len(read_ply(folder / "gaussians.ply")) == len(world.gaussians)
+    back = scene_folder.read_scene(folder)
+    means = np.concatenate([world.gaussians.means, frontier.means])
+    np.testing.assert_array_equal(back.gaussians.means, means)
+    texels = world.background.texels
+    np.testing.assert_allclose(back.background.texels, texels, atol=0.5 / 255 + 1e-6)
+    assert metadata.background == pytest.approx(mean_color(world.background))
+
+
+def test_a_scene_is_replaced_whole(painted, tmp_path, world):
+    folder, *_ = painted
     (folder / "metrics.json").write_text("{}")
     scene_folder.write_scene_folder(folder, world, provenance="second")
     assert scene_folder.read_scene_metadata(folder).provenance == "second"
     assert not (folder / "metrics.json").exists()
     assert list(tmp_path.iterdir()) == [folder]
+    assert scene_folder.read_scene(folder).background == world.background
 
 
 def test_other_folders_are_not_overwritten(tmp_path, world):
     folder = tmp_path / "holiday"
     folder.mkdir()
+    scene_folder.check_scene_target(folder)
     (folder / "photo.jpg").write_bytes(b"x")
     for target in (folder, folder / "photo.jpg"):
         with pytest.raises(ValueError, match="scene folder must be new, empty or a scene"):
             scene_folder.write_scene_folder(target, world, provenance="")
     assert (folder / "photo.jpg").read_bytes() == b"x"
-    empty = tmp_path / "empty"
-    empty.mkdir()
-    scene_folder.check_scene_target(empty)
-
-
-def test_unwritable_place(tmp_path, world):
-    scene_folder.write_scene_folder(tmp_path / "new" / "folder" / "scene", world, provenance="")
-    assert scene_folder.read_scene(tmp_path / "new" / "folder" / "scene").name == world.name
-    (tmp_path / "file").write_text("")
-    with pytest.raises(NotADirectoryError, match="file: is a file"):
-        scene_folder.check_scene_target(tmp_path / "file" / "scene")
+    with pytest.raises(NotADirectoryError, match=r"photo.jpg: is a file"):
+        scene_folder.check_scene_target(folder / "photo.jpg" / "scene")
     with pytest.raises(OSError, match="cannot write to the output folder /proc"):
         scene_folder.check_scene_target("/proc/scene")
 
 
-@pytest.mark.parametrize("missing", ["gaussians.ply", "esdf.npz", "scene.yaml"])
-def test_missing_file(tmp_path, world, missing):
-    folder = tmp_path / "scene"
-    scene_folder.write_scene_folder(folder, world, provenance="")
+@pytest.mark.parametrize(
+    "missing", ["gaussians.ply", "esdf.npz", "scene.yaml", "frontier.ply", "environment.png"]
+)
+def test_missing_file_is_named(painted, missing):
+    folder, *_ = painted
     (folder / missing).unlink()
-    with pytest.raises(FileNotFoundError, match=rf"No such file: .*{missing}"):
+    with pytest.raises(FileNotFoundError, match=rf"{missing}"):
         scene_folder.read_scene(folder)
     for read in (scene_folder.read_scene, scene_folder.read_scene_folder):
         with pytest.raises(FileNotFoundError, match=r"nowhere"):
-            read(tmp_path / "nowhere")
+            read(folder / "nowhere")
 
 
 @pytest.mark.parametrize(
@@ -185,119 +142,94 @@ def test_bad_metadata(tmp_path, world, old, new, message):
         scene_folder.read_scene(folder)
 
 
-def test_bare_ply(tmp_path):
-    path = tmp_path / "hall.ply"
-    write_ply(box_of_gaussians(), path)
+@pytest.mark.parametrize("with_stray", [False, True])
+def test_bare_ply(tmp_path, box_room, with_stray):
+    path, scene = tmp_path / "hall.ply", box_room(6, 3, 3).gaussians(0.1)
+    stray = GaussianScene.from_colors([[1000, 0, 0]], [[1, 0, 0, 0]], [[1] * 3], [0.9], [[1] * 3])
+    write_ply(scene.merged_with(stray) if with_stray else scene, path)
     world = scene_folder.read_scene(path)
     assert world.name == "hall"
     assert len(world.gaussians) > 1000
-    assert world.distance_field is world.esdf
+    assert world.distance_field is world.esdf and (world.esdf.upper_W < 10).all()
     # In the middle the walls are 1.5 m away, less their thickness.
     assert world.esdf.distance(np.array([3.0, 1.5, 1.5])) == pytest.approx(1.3, abs=0.2)
     assert world.esdf.distance(np.array([0.0, 1.5, 1.5])) < 0
-    for p in (world.p_WS, world.p_WG):
-        assert (p > 0.354).all() and (p < np.array([6.0, 3.0, 3.0]) - 0.354).all()
+    ends = np.array([world.p_WS, world.p_WG])
+    assert (ends > 0.354).all() and (ends < np.array([6.0, 3.0, 3.0]) - 0.354).all()
     assert np.linalg.norm(world.p_WS - world.p_WG) > 4
 
 
-def test_stray_gaussians_do_not_stretch_a_bare_ply(tmp_path):
-    scene = box_of_gaussians()
-    stray = GaussianScene.from_colors(
-        [[1000, 0, 0]], [[1, 0, 0, 0]], [[1, 1, 1]], [0.9], [[1, 1, 1]]
-    )
-    write_ply(scene.merged_with(stray), tmp_path / "hall.ply")
-    assert (scene_folder.read_scene(tmp_path / "hall.ply").esdf.upper_W < 10).all()
-
-
-SIZE = np.array([6.0, 4.0, 3.0])  # [m]
-K = np.array([[80.0, 0.0, 80.0], [0.0, 80.0, 60.0], [0.0, 0.0, 1.0]])
 VOXEL = 0.1  # [m]
 
 
-def looking(yaw: float, p_WC: list[float]) -> RigidTransform:
-    """A level camera (x right, y down, z forward) that looks along `yaw` from p_WC."""
-    R_BC = RollPitchYaw(-np.pi / 2, 0.0, -np.pi / 2).ToRotationMatrix()
-    return RigidTransform(RollPitchYaw(0.0, 0.0, yaw).ToRotationMatrix() @ R_BC, p_WC)
-
-
-def rays(X_WC: RigidTransform) -> np.ndarray:
-    """(120, 160, 3) of depth 1, in W."""
-    x, y = np.meshgrid((np.arange(160) - 79.5) / 80.0, (np.arange(120) - 59.5) / 80.0)
-    return np.stack([x, y, np.ones_like(x)], -1) @ X_WC.rotation().matrix().T
-
-
-def room_depth(X_WC: RigidTransform) -> np.ndarray:
-    """(120, 160) [m] to the walls of an empty room between the origin and SIZE."""
-    with np.errstate(divide="ignore"):
-        ways = np.stack([(end - X_WC.translation()) / rays(X_WC) for end in (np.zeros(3), SIZE)])
-    return ways.max(axis=0).min(axis=-1).astype(np.float32)
+@pytest.fixture(scope="module")
+def room(box_room):
+    return box_room(6.0, 4.0, 3.0)
 
 
 @pytest.fixture(scope="module")
-def captured() -> tuple[Esdf, list[np.ndarray], list[RigidTransform]]:
-    """The room from two poses at its near end that look along it, one of them askew."""
-    X_WCs = [looking(0.0, [0.3, 2.0, 1.5]), looking(0.5, [0.3, 1.0, 1.5])]
-    depths = [room_depth(X_WC) for X_WC in X_WCs]
-    field = esdf_from_depth_images(depths, K, X_WCs, np.full(3, -0.4), SIZE + 0.4, VOXEL)
-    return field, depths, X_WCs
+def captured(room):
+    """Depths and poses in the room near its end that look along it, one askew; makes a field."""
+    X_WCs = [
+        look_along(np.array([0.3, 2.0, 1.5]), 0.0, 0.0),
+        look_along(np.array([0.3, 1.0, 1.5]), 0.5, 0.0),
+    ]
+    depths = [room.depth(X_WC) for X_WC in X_WCs]
+    box = np.full(3, -0.4), room.size + 0.4
+    return depths, X_WCs, partial(esdf_from_depth_images, depths, room.K, X_WCs, *box, VOXEL)
 
 
-@pytest.fixture(scope="module")
-def closed(captured) -> tuple[Esdf, GaussianScene]:
-    field, depths, X_WCs = captured
-    closed, frontier = scene_folder.close_frontier(field, depths, K, X_WCs)
-    assert frontier is not None
-    return closed, frontier
+@pytest.fixture(scope="module", params=[None, 3.0])
+def closed(request, room, captured):
+    """The field of the captured room up to a range, the same with its frontier closed, and what a
+    depth camera at a pose sees of the frontier."""
+    depths, X_WCs, fuse = captured
+    field = fuse(**({"max_range": request.param} if request.param else {}))
+    distances, frontier = scene_folder.close_frontier(field, depths, room.K, X_WCs)
+    scene = BakedScene(frontier)
 
+    def seen(X_WC: RigidTransform) -> np.ndarray:
+        return ranged_depth(scene.render(room.K, 160, 120, X_WC).depth, 0.0, 50.0)
 
-def seen_depth(frontier: GaussianScene, X_WC: RigidTransform) -> np.ndarray:
-    """(120, 160) [m], what a depth camera sees of the frontier."""
-    return ranged_depth(BakedScene(frontier).render(K, 160, 120, X_WC).depth, 0.0, 50.0)
+    return field, distances, frontier, seen
 
 
 def test_frontier_hides_nothing_that_was_captured(captured, closed):
-    _, depths, X_WCs = captured
+    depths, X_WCs, _ = captured
+    *_, seen = closed
     for depth, X_WC in zip(depths, X_WCs, strict=True):
-        assert np.mean(seen_depth(closed[1], X_WC) < depth - 0.1) < 0.005
+        assert np.mean(seen(X_WC) < depth - 0.1) < 0.005
+    aside = look_along(np.array([2.8, 2.0, 1.5]), np.pi, 0.0)
+    assert np.mean(np.isfinite(seen(aside))) > 0.5  # in the corners beside the cameras
 
 
-def test_surfaces_beyond_the_range_of_the_field_are_not_hidden(captured):
-    _, depths, X_WCs = captured
-    box = np.full(3, -0.4), SIZE + 0.4
-    field = esdf_from_depth_images(depths, K, X_WCs, *box, VOXEL, max_range=3.0)
-    _, frontier = scene_folder.close_frontier(field, depths, K, X_WCs)
-    assert frontier is not None
-    for depth, X_WC in zip(depths, X_WCs, strict=True):
-        assert np.mean(seen_depth(frontier, X_WC) < depth - 0.1) < 0.005
-    aside = looking(np.pi, [2.8, 2.0, 1.5])  # back into the corners beside the cameras
-    assert np.mean(np.isfinite(seen_depth(frontier, aside))) > 0.5
-
-
-def test_frontier_is_seen_where_it_is_hit(captured, closed):
-    field, (distances, frontier) = captured[0], closed
+@pytest.mark.parametrize("closed", [None], indirect=True)
+def test_frontier_is_seen_where_it_is_hit(room, closed):
+    field, distances, frontier, seen = closed
     missed, ends = 0, 0
     for yaw in np.arange(4) * np.pi / 2:
-        X_WC = looking(yaw, [2.8, 2.0, 1.5])
-        way, depth = rays(X_WC), np.zeros((120, 160))
+        X_WC = look_along(np.array([2.8, 2.0, 1.5]), yaw, 0.0)
+        rays, depth = room.rays(X_WC), np.zeros((120, 160))
         p_WQ = np.tile(X_WC.translation(), (120, 160, 1))
         for _ in range(60):
             depth += 0.7 * np.clip(np.nan_to_num(distances.distance(p_WQ)), 0.0, None)
-            p_WQ = X_WC.translation() + depth[..., None] * way
+            p_WQ = X_WC.translation() + depth[..., None] * rays
         at_frontier = (np.abs(distances.distance(p_WQ)) < 0.02) & (field.distance(p_WQ) > 0.1)
         ends += at_frontier.sum()
-        missed += (at_frontier & (seen_depth(frontier, X_WC) > depth + 2 * VOXEL)).sum()
+        missed += (at_frontier & (seen(X_WC) > depth + 2 * VOXEL)).sum()
     assert ends > 5000
     assert missed < 0.01 * ends
     assert len(frontier) < 1000
 
 
-def test_touching_the_frontier_is_a_collision(captured, closed):
+@pytest.mark.parametrize("closed", [None], indirect=True)
+def test_touching_the_frontier_is_a_collision(closed):
     scenario = Scenario(policy=policy_named("straight"))
     p_WS, p_WG = np.array([2.8, 2.0, 1.5]), np.array([4.0, 2.0, 1.5])
     hidden_W = [0.7, 2.0, 0.3]  # beside the near camera, below all it saw
     ended = []
-    for field in (captured[0], closed[0]):
-        world = World("room", closed[1], field, field, (0.0, 0.0, 0.0), p_WS, p_WG)
+    for field in closed[:2]:
+        world = World("room", closed[2], field, field, (0.0, 0.0, 0.0), p_WS, p_WG)
         diagram = BuildFlightDiagram(scenario, world, camera=False)
         context = diagram.CreateDefaultContext()
         plant = diagram.GetSubsystemByName("plant")
@@ -307,7 +239,7 @@ def test_touching_the_frontier_is_a_collision(captured, closed):
     assert ended == [Outcome.LEFT_VOLUME, None, Outcome.COLLISION, None]
 
 
-def test_closed_place_is_left_as_it_is(captured):
-    field = captured[0]
+def test_a_room_without_frontier_is_left_as_it_is(captured, room):
+    field = captured[2]()
     known = Esdf(np.abs(field.distances) + 0.4, 0 * field.states, field.lower_W, VOXEL)
-    assert scene_folder.close_frontier(known, [], K, []) == (known, None)
+    assert scene_folder.close_frontier(known, [], room.K, []) == (known, None)

@@ -2,26 +2,14 @@ import json
 
 import numpy as np
 import pytest
-from pydrake.geometry import (
-    ClippingRange,
-    ColorRenderCamera,
-    DepthRange,
-    DepthRenderCamera,
-    GeometryId,
-    MakeRenderEngineVtk,
-    Mesh,
-    PerceptionProperties,
-    RenderCameraCore,
-    RenderEngineVtkParams,
-    RenderLabel,
-)
-from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
-from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageRgba8U
+from pydrake.math import RigidTransform, RollPitchYaw
 
+from splatpilot.diagrams.worlds import mesh_renderer
 from splatpilot.diagrams.worlds.solids.solid import Solid, WorldSpec, build
 from splatpilot.diagrams.worlds.solids.textures import Daylight, Sunlight
 from splatpilot.diagrams.worlds.world_gltf import write_gltf
 from splatpilot.systems.collision.shapes import Box, Capsule, Cylinder, HalfSpace, Sphere
+from splatpilot.training.captures.coverage import look_along
 
 WIDTH, HEIGHT, FOCAL = 160, 120, 80.0
 
@@ -48,34 +36,18 @@ def spec() -> WorldSpec:
     )
 
 
-@pytest.fixture(scope="module")
-def X_WC() -> RigidTransform:
-    forward = np.array([np.cos(0.2), 0.0, -np.sin(0.2)])
-    right = np.array([0.0, -1.0, 0.0])
-    return RigidTransform(
-        RotationMatrix(np.column_stack([right, np.cross(forward, right), forward])), [1.0, 0, 1.8]
-    )
-
-
-def _rendered(path, X_WC) -> tuple[np.ndarray, np.ndarray]:
-    engine = MakeRenderEngineVtk(RenderEngineVtkParams())
-    properties = PerceptionProperties()
-    properties.AddProperty("label", "id", RenderLabel(1))
-    mesh = Mesh(str(path))
-    engine.RegisterVisual(GeometryId.get_new_id(), mesh, properties, RigidTransform(), False)
-    engine.UpdateViewpoint(X_WC)
-    info = CameraInfo(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
-    core = RenderCameraCore("", info, ClippingRange(0.2, 60), RigidTransform())
-    color, depth = ImageRgba8U(WIDTH, HEIGHT), ImageDepth32F(WIDTH, HEIGHT)
-    engine.RenderColorImage(ColorRenderCamera(core), color)
-    engine.RenderDepthImage(DepthRenderCamera(core, DepthRange(0.2, 50)), depth)
-    return color.data[..., :3] / 255.0, depth.data[..., 0].astype(float)
-
-
-def test_mesh_lies_on_the_surfaces_and_looks_like_the_gaussians(opengl, spec, X_WC, tmp_path):
+def test_mesh_lies_on_the_surfaces_and_looks_like_the_gaussians(
+    opengl, spec, tmp_path, monkeypatch
+):
     path = tmp_path / "world.gltf"
     write_gltf(spec, path)
-    color, depth = _rendered(path, X_WC)
+    X_WC = look_along(np.array([1.0, 0, 1.8]), 0.0, -0.2)
+    K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
+    # All light is baked in; lamps add only gloss.
+    monkeypatch.setattr(mesh_renderer, "_LAMPS", [((0, 0, -1), 0.0)])
+    color, depth = mesh_renderer.MeshRenderer(path, "y", (0, 0, 0)).render(
+        X_WC, K, WIDTH, HEIGHT, (0.2, 50.0)
+    )
     v, u = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     rays = np.stack([(u - WIDTH / 2) / FOCAL, (v - HEIGHT / 2) / FOCAL, np.ones_like(u)], axis=-1)
     seen = np.isfinite(depth)
@@ -86,12 +58,12 @@ def test_mesh_lies_on_the_surfaces_and_looks_like_the_gaussians(opengl, spec, X_
     assert np.abs(distance[inside]).max() < 0.004
 
     world = build(spec)
-    K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
     view = world.baked.render(K, WIDTH, HEIGHT, X_WC, background=world.background)
     solid = seen & (view.alpha > 0.99)
     assert solid.sum() > 0.4 * depth.size
-    assert np.abs(view.color - color)[solid].mean() < 0.06
-    assert np.abs(view.color[solid].mean(axis=0) - color[solid].mean(axis=0)).max() < 0.02
+    difference = (view.color - color / 255.0)[solid]
+    assert np.abs(difference).mean() < 0.06
+    assert np.abs(difference.mean(axis=0)).max() < 0.02
     near = solid & (depth < 6)
     # Expected depth of flat Gaussians seen at a slant reads near, here by up to 0.06 m.
     assert np.median(np.abs(view.depth - depth)[near]) < 0.08

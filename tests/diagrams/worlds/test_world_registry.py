@@ -1,41 +1,24 @@
-from pathlib import Path
-
 import numpy as np
 import pytest
-from pydrake.math import RigidTransform, RotationMatrix
 
 from splatpilot.diagrams.flight.scenario import Scenario
+from splatpilot.diagrams.scenarios import benchmark_scenarios, scenario_file
 from splatpilot.diagrams.worlds.feasibility import CLEARANCE, connects
+from splatpilot.diagrams.worlds.file_worlds import OctomapConfig
 from splatpilot.diagrams.worlds.indoor import OfficeConfig
 from splatpilot.diagrams.worlds.inserted import InsertedConfig
-from splatpilot.diagrams.worlds.octomap_world import OctomapConfig
 from splatpilot.diagrams.worlds.outdoor import ClutterConfig, OverUnderConfig, WallsConfig
 from splatpilot.diagrams.worlds.world_registry import make_spec, make_world
 from splatpilot.systems.common.config import load_config
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
-
-FILES = sorted((Path(__file__).parents[3] / "diagrams" / "scenarios").glob("*.yaml"))
-GENERATED = [file for file in FILES if file.stem.startswith("P")]
+from splatpilot.training.captures.coverage import look_along
 
 
-def _config(name: str):
-    return load_config(Scenario(), next(f for f in FILES if f.stem == name)).world
-
-
-def test_all_seventeen_scenarios_are_valid():
-    assert [file.stem for file in FILES] == [
-        *(f"P{k:02d}" for k in range(1, 13)),
-        *(f"R{k}" for k in range(13, 18)),
-    ]
-    for file in FILES:
-        load_config(Scenario(), file).validate()
-
-
-@pytest.mark.parametrize("file", GENERATED, ids=lambda file: file.stem)
-def test_instances_are_feasible_and_repeatable(file):
-    config = load_config(Scenario(), file).world
+@pytest.mark.parametrize("name", [name for name in benchmark_scenarios() if name[0] == "P"])
+def test_instances_are_feasible_and_repeatable(name):
+    config = load_config(Scenario(), scenario_file(name)).world
     one, again, other = (make_spec(config, seed) for seed in (3, 3, 4))
-    if file.stem != "P08":  # its slits need a finer grid than is worth searching twice
+    if name != "P08":  # its slits need a finer grid than is worth searching twice
         ends = one.p_WS, one.p_WG
         assert connects(one.distance_field, *ends, VEHICLE_RADIUS, 0.3)
     p = np.random.default_rng(0).uniform(one.lower_W, one.upper_W, (500, 3))
@@ -46,17 +29,14 @@ def test_instances_are_feasible_and_repeatable(file):
 
 
 def test_drawn_surfaces_are_those_of_the_distance_field():
-    world = make_world(_config("P10"), 1)
+    world = make_world(load_config(Scenario(), scenario_file("P10")).world, 1)
     p = world.gaussians.means.astype(float)
     lower, upper = world.distance_field.lower_W, world.distance_field.upper_W
     inside = ((p >= lower) & (p <= upper)).all(axis=1)
     distance = np.abs(world.distance_field.distance(p[inside]))
     assert inside.sum() > 20_000 and distance.max() < 0.07
-    forward = (world.p_WG - world.p_WS) * (1, 1, 0)
-    forward = forward / np.linalg.norm(forward)
-    right = np.cross(forward, (0.0, 0.0, 1.0))
-    axes = np.column_stack([right, np.cross(forward, right), forward])
-    X_WC = RigidTransform(RotationMatrix(axes), world.p_WS)
+    forward = world.p_WG - world.p_WS
+    X_WC = look_along(world.p_WS, np.arctan2(forward[1], forward[0]), 0.0)
     K = np.array([[60.0, 0, 60], [0, 60, 45], [0, 0, 1]])
     view = world.baked.render(K, 120, 90, X_WC, near=0.05)
     v, u = np.mgrid[:90, :120] + 0.5

@@ -23,39 +23,22 @@ WIDTH, HEIGHT = 120, 90
 R_BC = RotationMatrix(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]))
 
 
-def room() -> AnalyticDistanceField:
-    """A room of 4 x 3 x 2.5 m with a sphere, a pillar and a crate."""
-    walls = [
-        HalfSpace(np.array(normal, float), offset)
-        for normal, offset in (
-            ([1, 0, 0], 0.0),
-            ([-1, 0, 0], -4.0),
-            ([0, 1, 0], 0.0),
-            ([0, -1, 0], -3.0),
-            ([0, 0, 1], 0.0),
-            ([0, 0, -1], -2.5),
-        )
-    ]
-    objects = [
-        Sphere(np.array([2.5, 1.5, 0.8]), 0.5),
-        Cylinder(np.array([1.2, 2.2, 0.0]), np.array([1.3, 2.2, 2.5]), 0.15),
-        Box(
-            RigidTransform(RollPitchYaw(0.0, 0.0, 0.5), np.array([3.2, 0.6, 0.3])), [0.6, 0.4, 0.6]
-        ),
-    ]
-    return AnalyticDistanceField([*walls, *objects], np.full(3, -1.0), np.array([5.0, 4.0, 3.5]))
-
-
-def render(field: AnalyticDistanceField, X_WC: RigidTransform) -> np.ndarray:
-    """The depth image of a distance field, by sphere tracing."""
-    row, column = np.mgrid[0:HEIGHT, 0:WIDTH] + 0.5
-    ray_C = np.stack([(column - 60.0) / 60.0, (row - 45.0) / 60.0, np.ones_like(row)], -1)
-    length = np.linalg.norm(ray_C, axis=-1)
-    way_W = (ray_C / length[..., None]) @ X_WC.rotation().matrix().T
-    traveled = np.zeros_like(length)
-    for _ in range(40):
-        traveled += field.distance(X_WC.translation() + traveled[..., None] * way_W)
-    return (traveled / length).astype(np.float32)
+WALLS = ([1, 0, 0], 0.0), ([-1, 0, 0], -4.0), ([0, 1, 0], 0.0), ([0, -1, 0], -3.0)
+FLOOR_AND_CEILING = ([0, 0, 1], 0.0), ([0, 0, -1], -2.5)
+X_CRATE = RigidTransform(RollPitchYaw(0.0, 0.0, 0.5), np.array([3.2, 0.6, 0.3]))
+# 4 x 3 x 2.5 m with a sphere, a pillar and a crate.
+ROOM = AnalyticDistanceField(
+    [
+        *(HalfSpace(*plane) for plane in (*WALLS, *FLOOR_AND_CEILING)),
+        Sphere([2.5, 1.5, 0.8], 0.5),
+        Cylinder([1.2, 2.2, 0.0], [1.3, 2.2, 2.5], 0.15),
+        Box(X_CRATE, [0.6, 0.4, 0.6]),
+    ],
+    np.full(3, -1.0),
+    np.array([5.0, 4.0, 3.5]),
+)
+# Before a wall 1.5 m ahead of a camera at the origin.
+BOX = np.array([-0.5, -0.4, 0.2]), np.array([0.5, 0.4, 2.4])
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +51,17 @@ def capture() -> tuple[list[np.ndarray], list[RigidTransform]]:
         )
         for k in range(16)
     ]
-    return [render(room(), X_WC) for X_WC in X_WCs], X_WCs
+    row, column = np.mgrid[0:HEIGHT, 0:WIDTH] + 0.5
+    ray_C = np.stack([(column - 60.0) / 60.0, (row - 45.0) / 60.0, np.ones_like(row)], -1)
+    length = np.linalg.norm(ray_C, axis=-1)
+    depths = []
+    for X_WC in X_WCs:
+        ray_W = (ray_C / length[..., None]) @ X_WC.rotation().matrix().T
+        traveled = np.zeros_like(length)
+        for _ in range(40):  # sphere tracing
+            traveled += ROOM.distance(X_WC.translation() + traveled[..., None] * ray_W)
+        depths.append((traveled / length).astype(np.float32))
+    return depths, X_WCs
 
 
 def test_the_fused_field_is_that_of_the_room(capture):
@@ -77,7 +70,7 @@ def test_the_fused_field_is_that_of_the_room(capture):
     voxel_size = 0.1
     field = esdf_from_depth_images(depths, K, X_WCs, lower_W, upper_W, voxel_size)
     p = np.stack(np.meshgrid(*field.voxel_centers(), indexing="ij"), -1)
-    truth = room().distance(p)
+    truth = ROOM.distance(p)
     free = field.states == FREE
     error = (field.distances - truth) / voxel_size
     near = free & (truth < 1.5 * voxel_size)
@@ -103,20 +96,17 @@ def test_space_behind_surfaces_and_out_of_view_stays_unknown(capture):
     seen = (p_C[..., 2] > 0.0) & (slope[..., 0] <= 1.0) & (slope[..., 1] <= 0.75)
     seen &= np.linalg.norm(p_C, axis=-1) <= 2.0
     assert (field.states[~seen] == UNKNOWN).all()
-    open_air = seen & (room().distance(p) > 0.3) & (p[..., 0] < 2.0)
+    open_air = seen & (ROOM.distance(p) > 0.3) & (p[..., 0] < 2.0)
     assert (field.states[open_air] == FREE).mean() > 0.97
-    assert (field.states[room().distance(p) < -0.35] == UNKNOWN).all()
+    assert (field.states[ROOM.distance(p) < -0.35] == UNKNOWN).all()
 
 
 def test_skipping_unseen_blocks_changes_nothing(capture, monkeypatch):
     (depths, X_WCs), voxel_size = capture, 0.037
     box = np.array([0.3, 0.2, -0.1]), np.array([2.9, 2.6, 1.6])
     skipping = esdf_from_depth_images(depths[:5], K, X_WCs[:5], *box, voxel_size)
-    monkeypatch.setattr(
-        DepthFusion,
-        "visible_blocks",
-        lambda self, depth, K, center_C, max_range: np.arange(len(center_C)),
-    )
+    everywhere = lambda self, depth, K, center_C, max_range: np.arange(len(center_C))  # noqa: E731
+    monkeypatch.setattr(DepthFusion, "visible_blocks", everywhere)
     complete = esdf_from_depth_images(depths[:5], K, X_WCs[:5], *box, voxel_size)
     np.testing.assert_array_equal(skipping.states, complete.states)
     np.testing.assert_array_equal(skipping.distances, complete.distances)
@@ -130,8 +120,7 @@ def wall(distance: float, slope: float = 0.0) -> np.ndarray:
 
 @pytest.mark.parametrize("slope", [0.0, 1.0, 2.0])
 def test_a_wall_is_measured_along_its_normal(slope):
-    box = np.array([-0.5, -0.4, 0.2]), np.array([0.5, 0.4, 2.4])
-    field = esdf_from_depth_images([wall(1.5, slope)], K, [RigidTransform()], *box, 0.05)
+    field = esdf_from_depth_images([wall(1.5, slope)], K, [RigidTransform()], *BOX, 0.05)
     p = np.stack(np.meshgrid(*field.voxel_centers(), indexing="ij"), -1)
     plane = (1.5 + slope * p[..., 0] - p[..., 2]) / np.sqrt(1.0 + slope**2)
     # Away from the sides of the box, beyond which the wall continues.
@@ -143,34 +132,29 @@ def test_a_wall_is_measured_along_its_normal(slope):
 
 
 def test_pixels_without_depth_are_ignored():
-    box = np.array([-0.5, -0.4, 0.2]), np.array([0.5, 0.4, 2.4])
-    clean = wall(1.5)
     for unknown in (0.0, np.nan, -1.0):
-        depth = clean.copy()
+        depth = wall(1.5)
         depth[:, :60] = unknown
-        field = esdf_from_depth_images([depth], K, [RigidTransform()], *box, 0.05)
+        field = esdf_from_depth_images([depth], K, [RigidTransform()], *BOX, 0.05)
         half = field.shape[0] // 2
         assert (field.states[:half] == UNKNOWN).all()
         assert (field.states[half:] == FREE).any() and (field.states[half:] == OCCUPIED).any()
-        blind = esdf_from_depth_images(
-            [np.full_like(depth, unknown)], K, [RigidTransform()], *box, 0.05
-        )
+        depth[:] = unknown
+        blind = esdf_from_depth_images([depth], K, [RigidTransform()], *BOX, 0.05)
         assert (blind.states == UNKNOWN).all()
 
 
 def test_the_sky_clears_the_space_before_it():
-    box = np.array([-0.5, -0.4, 0.2]), np.array([0.5, 0.4, 2.4])
     half_sky = wall(1.5)
     half_sky[:, :60] = np.inf
-    field = esdf_from_depth_images([half_sky], K, [RigidTransform()], *box, 0.05, max_range=2.0)
+    field = esdf_from_depth_images([half_sky], K, [RigidTransform()], *BOX, 0.05, max_range=2.0)
     sample = field.query([[-0.2, 0.0, 0.5], [-0.2, 0.0, 1.7], [-0.2, 0.0, 2.2], [0.2, 0.0, 1.6]])
     np.testing.assert_array_equal(sample.state, [FREE, FREE, UNKNOWN, OCCUPIED])
     both = [half_sky, wall(1.5)], K, [RigidTransform()] * 2
-    field = esdf_from_depth_images(*both, *box, 0.05)
+    field = esdf_from_depth_images(*both, *BOX, 0.05)
     assert (field.query([[-0.2, 0.0, 1.56], [0.2, 0.0, 1.56]]).state == OCCUPIED).all()
-    np.testing.assert_allclose(
-        bounds_of_depth_images([half_sky], K, [RigidTransform()])[1][2], 1.7, atol=1e-6
-    )
+    _, upper_W = bounds_of_depth_images([half_sky], K, [RigidTransform()])
+    np.testing.assert_allclose(upper_W[2], 1.7, atol=1e-6)
 
 
 def test_bounds_hold_all_seen_points_and_cameras(capture):
@@ -178,10 +162,9 @@ def test_bounds_hold_all_seen_points_and_cameras(capture):
     lower_W, upper_W = bounds_of_depth_images(depths, K, X_WCs)
     np.testing.assert_allclose(lower_W, [-0.2, -0.2, -0.2], atol=0.01)
     np.testing.assert_allclose(upper_W, [4.2, 3.2, 2.7], atol=0.01)
-    lower_W, upper_W = bounds_of_depth_images(
-        [wall(9.0)], K, [RigidTransform(np.array([1.0, 2.0, 3.0]))], max_range=2.0
-    )
-    assert (lower_W >= np.array([1.0, 2.0, 3.0]) - 2.2).all()
+    X_WC = RigidTransform(np.array([1.0, 2.0, 3.0]))
+    lower_W, upper_W = bounds_of_depth_images([wall(9.0)], K, [X_WC], max_range=2.0)
+    assert (lower_W >= X_WC.translation() - 2.2).all()
     assert 5.1 < upper_W[2] <= 5.2 and lower_W[2] == 2.8
 
 
@@ -197,14 +180,8 @@ def test_bounds_hold_all_seen_points_and_cameras(capture):
     ],
 )
 def test_bad_arguments_are_refused(change, message):
-    good = {
-        "depths": [wall(1.0)],
-        "K": K,
-        "X_WCs": [RigidTransform()],
-        "lower_W": np.zeros(3),
-        "upper_W": np.ones(3),
-        "voxel_size": 0.1,
-    }
+    good = {"depths": [wall(1.0)], "K": K, "X_WCs": [RigidTransform()], "voxel_size": 0.1}
+    good |= {"lower_W": np.zeros(3), "upper_W": np.ones(3)}
     esdf_from_depth_images(**good)
     with pytest.raises(ValueError, match=message):
         esdf_from_depth_images(**good | change)

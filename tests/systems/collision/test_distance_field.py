@@ -14,7 +14,7 @@ def test_equation_three_at_hand_computed_values():
     )
 
 
-def test_stable_at_both_ends():
+def test_barrier_is_stable_at_both_ends():
     d = np.array([-1e6, -100.0, 100.0])
     np.testing.assert_allclose(soft_barrier(d, 0.354)[:2], 1.354 - d[:2])
     assert soft_barrier(d, 0.354)[2] == pytest.approx(math.exp(4.0 * (1.354 - 100.0)) / 4.0)
@@ -29,9 +29,6 @@ def test_torch_gives_the_same_values_and_gradients():
     value.sum().backward()
     expected = -torch.sigmoid(4.0 * (1.354 - d.detach()))
     torch.testing.assert_close(d.grad, expected, rtol=1e-12, atol=0.0)
-    assert torch.autograd.gradcheck(
-        lambda d: soft_barrier(d, 0.354), d[1:5].detach().requires_grad_()
-    )
 
 
 def test_beta_must_be_positive():

@@ -60,8 +60,10 @@ def test_density_is_the_sum_of_all_gaussians():
 
 
 @pytest.mark.parametrize(("spacing", "opacity"), [(0.06, 0.9), (0.04, 0.5), (0.1, 0.95)])
-def test_a_shell_of_flat_gaussians_is_seen_a_little_too_near(spacing, opacity):
-    field = in_its_box(shell(1.2, spacing, opacity))
+def test_a_shell_of_flat_gaussians_is_seen_a_little_too_near_without_holes(spacing, opacity):
+    scene = shell(1.2, spacing, opacity)
+    box = scene.means.min(axis=0) - 0.5, scene.means.max(axis=0) + 0.5
+    field = esdf_from_gaussians(scene, VOXEL, *box)
     p = np.stack(np.meshgrid(*field.voxel_centers(), indexing="ij"), -1)
     height = np.linalg.norm(p, axis=-1) - 1.2
     error = (field.distances - np.abs(height)) / VOXEL
@@ -69,21 +71,9 @@ def test_a_shell_of_flat_gaussians_is_seen_a_little_too_near(spacing, opacity):
         assert -0.65 < error[part].mean() < -0.4
         assert error[part].std() < 0.1
         assert error[part].max() < 0.1
-
-
-def test_a_shell_has_no_holes():
-    field = in_its_box(shell())
-    components = np.zeros(field.shape, int)
-    label(field.states == FieldState.FREE, output=components)
-    middle = tuple(n // 2 for n in field.shape)
-    assert components[middle] != components[0, 0, 0]
-    assert components[middle] > 0 and components[0, 0, 0] > 0
-
-
-def in_its_box(scene: GaussianScene):
-    return esdf_from_gaussians(
-        scene, VOXEL, scene.means.min(axis=0) - 0.5, scene.means.max(axis=0) + 0.5
-    )
+    components, count = np.asarray(label(field.states == FieldState.FREE), dtype=object)
+    middle = components[tuple(n // 2 for n in field.shape)]
+    assert count == 2 and middle > 0 and middle != components[0, 0, 0] > 0
 
 
 def test_a_cloud_thicker_than_a_voxel_reaches_to_half_of_its_density():
@@ -96,12 +86,8 @@ def test_a_cloud_thicker_than_a_voxel_reaches_to_half_of_its_density():
 
 
 def test_values_at_the_voxel_centers_are_the_fields_own():
-    pillar = Cylinder(np.array([0.4, 0.3, -1.0]), np.array([0.5, 0.5, 3.0]), 0.2)
-    field = AnalyticDistanceField(
-        [HalfSpace(np.array([0.0, 0.0, 1.0]), 0.07), pillar],
-        np.array([-0.5, 0.0, 0.0]),
-        np.array([1.5, 1.1, 0.75]),
-    )
+    solids = [HalfSpace([0.0, 0.0, 1.0], 0.07), Cylinder([0.4, 0.3, -1.0], [0.5, 0.5, 3.0], 0.2)]
+    field = AnalyticDistanceField(solids, [-0.5, 0.0, 0.0], [1.5, 1.1, 0.75])
     grid = esdf_from_distance_field(field, 0.1)
     assert grid.shape == (20, 11, 8)
     p = np.stack(np.meshgrid(*grid.voxel_centers(), indexing="ij"), -1)
@@ -111,54 +97,48 @@ def test_values_at_the_voxel_centers_are_the_fields_own():
     assert (grid.states == FieldState.OCCUPIED).any()
 
 
-FREE, OCCUPIED, UNKNOWN, _ = FieldState
+X = 1.0 + 0.1 * (np.arange(30)[:, None, None] + 0.5) + np.zeros((30, 4, 4))  # [m]
+SLAB = (X > 2.0) & (X < 2.5)
+LOWER_W = np.array([1.0, 0.0, 0.0])
 
 
-def slab() -> np.ndarray:
-    """Occupied for x index 10 to 14 of 30."""
-    occupied = np.zeros((30, 4, 4), bool)
-    occupied[10:15] = True
-    return occupied
+def distances_along_x(field, *x: float) -> np.ndarray:
+    return field.distance([[each, 0.2, 0.2] for each in x])
 
 
 def test_offsets_move_the_surface_within_the_voxels():
-    x = 1.0 + 0.1 * (np.arange(30) + 0.5)
-    offset = np.maximum(2.03 - x, x - 2.46)[:, None, None] + np.zeros((30, 4, 4))
+    offset = np.maximum(2.03 - X, X - 2.46)
     offset[np.abs(offset) > 0.1] = np.nan
-    field = esdf_from_occupancy(offset <= 0.0, None, np.array([1.0, 0.0, 0.0]), 0.1, offset)
-    p = np.array([[2.03, 0.2, 0.2], [2.46, 0.2, 0.2], [1.2, 0.2, 0.2], [3.5, 0.2, 0.2]])
-    np.testing.assert_allclose(field.distance(p), [0.0, 0.0, 0.83, 1.04], atol=1e-6)
+    field = esdf_from_occupancy(offset <= 0.0, None, LOWER_W, 0.1, offset)
+    found = distances_along_x(field, 2.03, 2.46, 1.2, 3.5)
+    np.testing.assert_allclose(found, [0.0, 0.0, 0.83, 1.04], atol=1e-6)
 
 
 def test_faces_without_offsets_stay_on_the_voxel_faces():
-    x = 1.0 + 0.1 * (np.arange(30) + 0.5)
-    offset = (2.03 - x)[:, None, None] + np.zeros((30, 4, 4))
-    offset[x > 2.1] = np.nan
-    occupied = slab()
-    field = esdf_from_occupancy(occupied, None, np.array([1.0, 0.0, 0.0]), 0.1, offset)
-    p = np.array([[1.2, 0.2, 0.2], [3.5, 0.2, 0.2]])
-    np.testing.assert_allclose(field.distance(p), [0.83, 1.0], atol=1e-6)
+    offset = np.where(X > 2.1, np.nan, 2.03 - X)
+    field = esdf_from_occupancy(SLAB, None, LOWER_W, 0.1, offset)
+    np.testing.assert_allclose(distances_along_x(field, 1.2, 3.5), [0.83, 1.0], atol=1e-6)
 
 
 def test_unknown_voxels_are_marked_and_measured_to_what_was_seen():
-    unknown = np.zeros((30, 4, 4), bool)
-    unknown[20:] = True
-    field = esdf_from_occupancy(slab(), unknown, np.array([1.0, 0.0, 0.0]), 0.1)
-    sample = field.query([[3.5, 0.2, 0.2], [1.5, 0.2, 0.2]])
-    np.testing.assert_array_equal(sample.state, [UNKNOWN, FREE])
-    np.testing.assert_allclose(sample.distance, [1.0, 0.5], atol=1e-6)
+    field = esdf_from_occupancy(SLAB, X > 3.0, LOWER_W, 0.1)
+    states = field.query([[3.5, 0.2, 0.2], [1.5, 0.2, 0.2]]).state
+    np.testing.assert_array_equal(states, [FieldState.UNKNOWN, FieldState.FREE])
+    np.testing.assert_allclose(distances_along_x(field, 3.5, 1.5), [1.0, 0.5], atol=1e-6)
 
 
-def test_contradictions_are_refused():
-    occupied, zero = slab(), np.zeros(3)
-    for unknown, offset, message in (
+@pytest.mark.parametrize(
+    ("unknown", "offset", "message"),
+    [
         (np.zeros((2, 2, 2), bool), None, r"shape of unknown .* got \(2, 2, 2\)"),
-        (occupied, None, "both occupied and unknown must be 0, got 80"),
+        (SLAB, None, "both occupied and unknown must be 0, got 80"),
         (None, np.zeros(3), r"shape of surface_offset .* got \(3,\)"),
-        (None, np.full(occupied.shape, 0.05), "surface_offset must be .* got 80 voxels"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            esdf_from_occupancy(occupied, unknown, zero, 0.1, offset)
+        (None, np.full(SLAB.shape, 0.05), "surface_offset must be .* got 80 voxels"),
+    ],
+)
+def test_contradictions_are_refused(unknown, offset, message):
+    with pytest.raises(ValueError, match=message):
+        esdf_from_occupancy(SLAB, unknown, LOWER_W, 0.1, offset)
 
 
 def test_grid_shape_covers_the_box_with_whole_voxels():

@@ -5,7 +5,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.esdf_build import esdf_from_occupancy
-from splatpilot.systems.collision.frontier import (
+from splatpilot.systems.collision.observations import (
     frontier_faces,
     hidden_frontier,
     reachable_space,

@@ -1,6 +1,6 @@
 import errno
-import subprocess
-import sys
+import fcntl
+import os
 from pathlib import Path
 
 import pytest
@@ -14,7 +14,6 @@ from splatpilot.systems.common.files import (
     folder_written_atomically,
     locked_folder,
     locks_folder,
-    remove_leftovers,
     require_existing,
     require_unused,
     require_writable_folder,
@@ -29,8 +28,7 @@ def test_file_is_replaced_when_the_block_ends(tmp_path):
         assert partial.suffix == ".txt"
         partial.write_text("new")
         assert path.read_text() == "old"
-    assert path.read_text() == "new"
-    assert list(tmp_path.iterdir()) == [path]
+    assert path.read_text() == "new" and list(tmp_path.iterdir()) == [path]
 
 
 def broken(written: Path) -> None:
@@ -60,58 +58,35 @@ def test_file_stays_if_writing_fails(tmp_path, raised, check, error, message):
 
 def test_folder_appears_when_the_block_ends(tmp_path):
     path = tmp_path / "a"
-    with folder_written_atomically(path) as left:
-        pass
-    path.rmdir()
+    with pytest.raises(RuntimeError, match="half way"), folder_written_atomically(path) as left:
+        (left / "file").write_text("ne")
+        raise RuntimeError("half way")
+    assert list(tmp_path.iterdir()) == []
     left.mkdir()
     (left / "old").write_text("")  # as a kill leaves it
     with folder_written_atomically(path) as partial:
         (partial / "file").write_text("new")
         assert not path.exists()
     assert list(path.iterdir()) == [path / "file"]
+    with folder_written_atomically(path) as partial:
+        (partial / "file").write_text("another")
+    assert (path / "file").read_text() == "new"
     with folder_written_atomically(path, replace=True) as partial:
         (partial / "other").write_text("newer")
-    assert list(path.iterdir()) == [path / "other"]
-    assert list(tmp_path.iterdir()) == [path]
-
-
-def test_folder_of_another_process_stays(tmp_path):
-    path = tmp_path / "a"
-    with pytest.raises(RuntimeError, match="half way"), folder_written_atomically(path) as partial:
-        (partial / "file").write_text("ne")
-        raise RuntimeError("half way")
-    assert list(tmp_path.iterdir()) == []
-    with folder_written_atomically(path) as partial:
-        (partial / "file").write_text("mine")
-        path.mkdir()
-        (path / "file").write_text("theirs")
-    assert (path / "file").read_text() == "theirs"
-    assert list(tmp_path.iterdir()) == [path]
-
-
-_KILLED = """
-import os, signal, sys
-from pathlib import Path
-from splatpilot.systems.common.files import folder_written_atomically, written_atomically
-folder = Path(sys.argv[1])
-with written_atomically(folder / "a.txt") as file, folder_written_atomically(folder / "b") as inner:
-    file.write_text("half")
-    (inner / "c").write_text("half")
-    os.kill(os.getpid(), signal.SIGKILL)
-"""
+    assert list(path.iterdir()) == [path / "other"] and list(tmp_path.iterdir()) == [path]
 
 
 def test_leftovers_of_ended_processes_are_removed(tmp_path):
-    subprocess.run([sys.executable, "-c", _KILLED, str(tmp_path)], check=False)
-    assert len(list(tmp_path.iterdir())) == 2
-    require_unused(tmp_path, overwrite=False)
-    (tmp_path / ".mine.partial").write_text("")
-    with written_atomically(tmp_path / "mine.txt") as partial:
-        partial.write_text("")
+    with written_atomically(tmp_path / "mine.txt") as mine:
+        mine.write_text("")
+        ended = mine.name.replace(str(os.getpid()), str(2**31 - 1))
+        (tmp_path / ended).touch()
+        (tmp_path / f"{ended}b").mkdir()
+        (tmp_path / ".mine.partial").touch()
         require_writable_folder(tmp_path)
-        assert sorted(tmp_path.iterdir()) == sorted([tmp_path / ".mine.partial", partial])
-    remove_leftovers(tmp_path)
-    assert sorted(path.name for path in tmp_path.iterdir()) == [".mine.partial", "mine.txt"]
+        assert sorted(tmp_path.iterdir()) == sorted([tmp_path / ".mine.partial", mine])
+        (tmp_path / ".mine.partial").unlink()
+        require_unused(tmp_path, overwrite=False)
 
 
 def test_paths_are_checked(tmp_path):
@@ -148,21 +123,15 @@ def test_a_folder_belongs_to_one_configuration(tmp_path):
     assert [path.name for path in other.iterdir()] == ["letters"]
 
 
-def test_a_locked_folder_is_refused_until_its_process_ends(tmp_path):
-    holding = (
-        "import sys, time; from pathlib import Path\n"
-        "from splatpilot.systems.common.files import locked_folder\n"
-        "with locked_folder(Path(sys.argv[1])): print('held', flush=True); time.sleep(60)\n"
-    )
+def test_a_locked_folder_is_refused_until_its_holder_ends(tmp_path):
     folder = tmp_path / "out" / "folder"
-    words = [sys.executable, "-c", holding, str(folder)]
-    with subprocess.Popen(words, stdout=subprocess.PIPE) as other:
-        assert other.stdout is not None and other.stdout.readline() == b"held\n"
-        told = "folder is in use by another process; wait"
-        with pytest.raises(OSError, match=told), locked_folder(folder):
-            pass
-        other.kill()
-        other.wait()
+    folder.mkdir(parents=True)
+    holder = os.open(folder, os.O_RDONLY)
+    fcntl.flock(holder, fcntl.LOCK_EX)
+    told = "folder is in use by another process; wait"
+    with pytest.raises(OSError, match=told), locked_folder(folder):
+        pass
+    os.close(holder)
     with locked_folder(folder):
         (folder / "file").touch()
     assert folder.is_dir()
@@ -183,30 +152,21 @@ def test_a_locked_folder_that_stays_empty_is_removed(tmp_path):
     assert (tmp_path / "a" / "b" / "file").read_text() == "something"
 
 
-@pytest.fixture
-def data(tmp_path, monkeypatch) -> Path:
-    (tmp_path / "data" / "tartanair" / "hospital").mkdir(parents=True)
+def test_data_are_found_here_or_in_their_folder(tmp_path, monkeypatch, capsys):
+    found = tmp_path / "data" / "tartanair" / "hospital"
+    found.mkdir(parents=True)
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
     monkeypatch.setenv(DATA, str(tmp_path / "data"))
-    return tmp_path / "data"
-
-
-@pytest.mark.parametrize("name", ["hospital", "tartanair/hospital"])
-def test_a_capture_is_found_in_the_folder_of_data(name, data, capsys):
-    found = data / "tartanair" / "hospital"
-    assert find_data(Path(name), "a capture") == found
-    assert capsys.readouterr().out == f"{name} is {found}\n"
-    Path(name).mkdir(parents=True)
-    assert find_data(Path(name), "a capture") == Path(name)
-    assert not capsys.readouterr().out
-
-
-@pytest.mark.parametrize("is_set", [True, False])
-def test_a_missing_capture_names_the_folders(is_set, data, monkeypatch):
-    if not is_set:
-        monkeypatch.delenv(DATA)
-    where = str(data) if is_set else rf"the folder that {DATA} names \(it is not set\)"
-    message = rf"^No such file or folder: hospitl; expected a capture, here or in {where}$"
-    with pytest.raises(FileNotFoundError, match=message):
+    for name in ("hospital", "tartanair/hospital"):
+        assert find_data(Path(name), "a capture") == found
+        assert capsys.readouterr().out == f"{name} is {found}\n"
+        Path(name).mkdir(parents=True)
+        assert find_data(Path(name), "a capture") == Path(name)
+        assert not capsys.readouterr().out
+    message = "^No such file or folder: hospitl; expected a capture, here or in "
+    with pytest.raises(FileNotFoundError, match=message + str(tmp_path / "data$")):
+        find_data(Path("hospitl"), "a capture")
+    monkeypatch.delenv(DATA)
+    with pytest.raises(FileNotFoundError, match=rf"{message}the folder that {DATA} names \(it is"):
         find_data(Path("hospitl"), "a capture")

@@ -1,4 +1,5 @@
 import os
+import platform
 import signal
 import subprocess
 import sys
@@ -6,8 +7,15 @@ import time
 from pathlib import Path
 
 import pytest
+import torch
 
-from splatpilot.systems.common.processes import available_cores, map_processes, run_in_subprocess
+from splatpilot.systems.common.processes import (
+    available_cores,
+    map_processes,
+    require_device,
+    require_renderer,
+    run_in_subprocess,
+)
 
 
 def _square(number: int) -> tuple[int, int]:
@@ -25,23 +33,14 @@ def _killed(folder: Path) -> str:
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_results_are_those_of_the_function(jobs):
+def test_results_are_those_of_the_function_and_may_be_given_up(jobs, recwarn):
     results = list(map_processes(_square, range(7), jobs))
     assert sorted(square for square, _ in results) == [n * n for n in range(7)]
     assert ({pid for _, pid in results} == {os.getpid()}) == (jobs == 1)
-
-
-def _slow(number: int) -> int:
-    time.sleep(0.2 * number)
-    return number
-
-
-def test_closing_early_gives_no_warning(recwarn):
-    results = map_processes(_slow, range(6), jobs=2)
-    assert next(results) == 0
-    results.close()
+    given_up = map_processes(_square, range(20), jobs)
+    assert next(given_up)[0] in [n * n for n in range(20)]
+    given_up.close()
     assert not recwarn.list
-    assert sorted(map_processes(_slow, range(2), jobs=2)) == [0, 1]
 
 
 def test_killed_process_is_named_and_the_next_call_works(tmp_path):
@@ -80,26 +79,76 @@ def test_processes_end_with_a_parent_that_is_killed(tmp_path):
         time.sleep(0.1)
 
 
-def _abort(work):
+def _work(work):
     if work == "abort":
         os.abort()
-    if work == "refuse":
-        raise ValueError(f"{work}: no")
-    if work == "fail":
-        raise RuntimeError("no factory")
-    return work, os.getpid()
+    if work == "count":
+        return os.getpid()
+    raise {"refuse": ValueError, "fail": RuntimeError}[work]("no factory")
 
 
 def test_work_in_a_subprocess():
-    work, process = run_in_subprocess("a: counting", _abort, "count")
-    assert work == "count" and process != os.getpid()
-    with pytest.raises(ValueError, match="refuse: no"):
-        run_in_subprocess("a: counting", _abort, "refuse")
+    assert run_in_subprocess("a: counting", _work, "count") != os.getpid()
+    with pytest.raises(ValueError, match="no factory"):
+        run_in_subprocess("a: counting", _work, "refuse")
     for work, why in (("abort", "its process was ended"), ("fail", "no factory")):
         with pytest.raises(OSError, match=f"a: counting: {why}, perhaps out of disk space"):
-            run_in_subprocess("a: counting", _abort, work)
+            run_in_subprocess("a: counting", _work, work)
 
 
 def test_cores_are_those_that_the_process_may_use(monkeypatch):
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {1, 5, 7})
     assert available_cores() == 3
+
+
+@pytest.mark.parametrize("device", ["cuda", "cuda:1", "gpu"])
+def test_only_the_cpu_is_a_device_without_a_gpu(device, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    for require in (require_device, require_renderer):
+        require("cpu")
+        with pytest.raises(ValueError, match=rf"device must be cpu.*, got '{device}'"):
+            require(device)
+
+
+def test_rendering_on_a_gpu_needs_gsplat(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    require_device("cuda")
+    with pytest.raises(ValueError, match=r"splatpilot\[cuda\]"):
+        require_renderer("cuda")
+
+
+PASSES = """
+import resource
+import torch
+from splatpilot.systems.common.processes import keep_freed_memory
+
+torch.set_num_threads(1)
+layer = torch.nn.Conv2d(3, 96, 1)
+image = torch.zeros(8, 3, 60, 80)  # its four outputs take 15 MB each
+
+
+def faults():
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    for _ in range(10):
+        with torch.no_grad():
+            kept = [layer(image) for _ in range(4)]
+        del kept
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+
+given_back = min(faults() for _ in range(3))
+keep_freed_memory()
+# The minimum of several: a fragmented heap may still grow.
+print(given_back, min(faults() for _ in range(6)))
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="an option of glibc")
+def test_memory_of_freed_tensors_is_kept():
+    # The initial value of glibc, which raises it at times, so far that nothing is cleared.
+    environment = os.environ | {"MALLOC_MMAP_THRESHOLD_": "131072"}
+    command = [sys.executable, "-c", PASSES]
+    ended = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
+    given_back, kept = (int(word) for word in ended.stdout.split())
+    assert given_back > 100_000 > 100 > kept

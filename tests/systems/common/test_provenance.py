@@ -51,53 +51,26 @@ def installed(package: Path):
 def checkout(tmp_path) -> Path:
     """A git checkout without a commit."""
     git(tmp_path, "init", "--quiet")
+    (tmp_path / "pyproject.toml").write_text('[project]\nname = "splatpilot"\n')
     return tmp_path
 
 
-def test_checkout_says_its_commit_and_what_was_changed(checkout):
-    """The revision is HEAD; changed source adds a digest of the change, changed prose nothing."""
+def test_revision_is_the_commit_with_a_digest_of_changed_and_new_source(checkout):
     copied = installed(checkout)
-    (checkout / "pyproject.toml").write_text('[project]\nname = "splatpilot"\n')
+    assert copied.revision() == VERSION  # without a commit
     (checkout / "README.md").write_text("one\n")
-    source = checkout / "systems" / "other.py"
-    source.write_text("x = 1\n")
-    assert copied.revision() == VERSION  # of no commit yet
     head = commit(checkout)
-    assert copied.revision() == head
     (checkout / "README.md").write_text("two\n")
-    assert copied.revision() == head
-    source.write_text("x = 2\n")
-    two = copied.revision()
-    source.write_text("x = 3\n")
-    three = copied.revision()
-    assert len({head, two, three}) == 3
-    assert two.startswith(f"{head}+") and three.startswith(f"{head}+")
-
-
-@pytest.mark.parametrize(
-    "name", ["systems/policies/new.py", "systems/policies/weights/diffaero.npz", "native/new.hpp"]
-)
-def test_untracked_module_and_replaced_weights_change_the_revision(checkout, name):
-    copied = installed(checkout)
-    (checkout / "pyproject.toml").write_text('[project]\nname = "splatpilot"\n')
-    head = commit(checkout)
-    file = checkout / name
-    file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_bytes(b"\x00one")
-    untracked = copied.revision()
-    commit(checkout)
-    file.write_bytes(b"\x00two")
-    replaced = copied.revision()
-    assert untracked.startswith(f"{head}+")
-    assert replaced.startswith(f"{git(checkout, 'rev-parse', 'HEAD')}+")
-
-
-def test_untracked_file_outside_the_program_does_not_change_the_revision(checkout):
-    copied = installed(checkout)
-    (checkout / "pyproject.toml").write_text('[project]\nname = "splatpilot"\n')
-    head = commit(checkout)
     (checkout / "my_policy.py").write_text("x = 1\n")
     assert copied.revision() == head
+    revisions = []
+    for name in ("systems/common/provenance.py", "systems/new.py", "systems/a.npz", "native/a.hpp"):
+        (checkout / name).parent.mkdir(exist_ok=True)
+        for content in (b"\x00one", b"\x00two"):
+            (checkout / name).write_bytes(content)
+            revisions.append(copied.revision())
+    assert len(set(revisions)) == 8
+    assert all(revision.startswith(f"{head}+") for revision in revisions)
 
 
 def test_program_states_the_versions_of_what_computes_policies():
@@ -105,45 +78,37 @@ def test_program_states_the_versions_of_what_computes_policies():
 
 
 @pytest.mark.parametrize("package", ["lib/site-packages/splatpilot", "third_party/splatpilot", "."])
-def test_checkout_of_something_else_says_nothing(checkout, package):
+def test_outside_a_checkout_of_its_own_the_revision_is_the_version(checkout, package):
     copied = installed(checkout / package)
+    (checkout / "pyproject.toml").write_text('[project]\nname = "theirs"\n')
     if package.startswith("third_party"):
         (checkout / package / "pyproject.toml").write_text('[project]\nname = "splatpilot"\n')
-    (checkout / "pyproject.toml").write_text('[project]\nname = "theirs"\n')
     commit(checkout)
-    before = copied.program()
-    (checkout / "theirs.py").write_text("")
-    commit(checkout)
-    assert before["splatpilot"] == VERSION
-    assert copied.program() == before
+    assert copied.program()["splatpilot"] == VERSION
+    shutil.rmtree(checkout / ".git")
+    assert copied.revision() == VERSION
 
 
-def test_program_without_git_says_its_version(tmp_path):
-    assert installed(tmp_path / "splatpilot").revision() == VERSION
-
-
-def test_runs_fill_the_seeds_between_benchmark_and_validation():
-    """The seeds of the thousand runs follow each other without gap or overlap, from the first that
-    the benchmark leaves to the last before validation's."""
+def test_ranges_of_seeds_are_filled_and_do_not_overlap():
     firsts = [first_training_seed(run) for run in range(1000)]
     assert firsts == list(range(TRAINING_SEEDS, VALIDATION_SEEDS, SEEDS_PER_RUN))
-
-
-def test_ranges_of_seeds_do_not_overlap():
-    training = range(TRAINING_SEEDS, first_training_seed(999) + SEEDS_PER_RUN)
+    training = range(TRAINING_SEEDS, firsts[-1] + SEEDS_PER_RUN)
     validation = range(VALIDATION_SEEDS, VALIDATION_SEEDS + SEEDS_PER_RUN)
     ranges = [*STUDY_SEEDS.values(), training, validation, MONTE_CARLO_SEEDS]
     for a, b in combinations(ranges, 2):
         assert a[-1] < b[0] or b[-1] < a[0]
 
 
-@pytest.mark.parametrize("run", [-1, 1000])
-def test_run_without_seeds_of_its_own_is_refused(run):
-    with pytest.raises(ValueError, match=rf"seed .*999\], got {run}"):
-        first_training_seed(run)
-
-
-@pytest.mark.parametrize(("split", "count"), [("dev", 101), ("test", 999_001), ("dev", 0)])
-def test_more_seeds_than_a_split_has_are_refused(split, count):
-    with pytest.raises(ValueError, match=f"got {count}"):
-        study_seeds(split, count)
+@pytest.mark.parametrize(
+    ("seeds", "arguments", "message"),
+    [
+        (first_training_seed, (-1,), r"seed .*999\], got -1"),
+        (first_training_seed, (1000,), r"seed .*999\], got 1000"),
+        (study_seeds, ("dev", 101), "got 101"),
+        (study_seeds, ("test", 999_001), "got 999001"),
+        (study_seeds, ("dev", 0), "got 0"),
+    ],
+)
+def test_seeds_outside_their_range_are_refused(seeds, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        seeds(*arguments)

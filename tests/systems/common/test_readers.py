@@ -42,7 +42,6 @@ def test_arrays_are_read_as_numpy_wrote_them(tmp_path, save):
     for name, array in arrays.items():
         np.testing.assert_array_equal(read[name], array)
         assert read[name].dtype == array.dtype
-    for array in arrays.values():
         np.save(tmp_path / "a.npy", array)
         assert array_layout(tmp_path / "a.npy") == (array.shape, array.dtype)
         np.testing.assert_array_equal(read_array(tmp_path / "a.npy"), array)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from pydrake.common.value import Value
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import DiagramBuilder, LeafSystem
+from pydrake.systems.framework import LeafSystem
 
 from splatpilot.systems.messaging.arrival_triggered import ArrivalTriggered
 
@@ -41,38 +41,17 @@ class Policy(LeafSystem):
         output[0] = context.get_discrete_state(0)[0] + self.GetInputPort("image").Eval(context)[0]
 
 
-class Camera(LeafSystem):
-    """Sends an image, its index, at each of its times, which comes 0.01 s later."""
-
-    def __init__(self, times: np.ndarray):
-        super().__init__()
-        self._times = times
-        self.DeclareVectorOutputPort("image", 1, self._calc_image)
-        self.DeclareVectorOutputPort("age", 1, self._calc_age)
-
-    def _last(self, context) -> int:
-        return int((self._times + 0.01 <= context.get_time() + 1e-9).sum()) - 1
-
-    def _calc_image(self, context, output):
-        output[0] = self._last(context)
-
-    def _calc_age(self, context, output):
-        last = self._last(context)
-        output[0] = math.inf if last < 0 else context.get_time() - self._times[last]
-
-
 def decisions(times: np.ndarray, until: float) -> np.ndarray:
-    """Time and image of each decision (n, 2)."""
-    builder = DiagramBuilder()
-    camera = builder.AddSystem(Camera(times))
-    triggered = builder.AddSystem(ArrivalTriggered(Policy(), TICK))
-    builder.Connect(camera.GetOutputPort("image"), triggered.GetInputPort("image"))
-    builder.Connect(camera.GetOutputPort("age"), triggered.GetInputPort("observation_age"))
-    simulator = Simulator(builder.Build())
-    context = triggered.GetMyContextFromRoot(simulator.get_context())
-    rows = [np.zeros(3)]
+    """Time and image of each decision (n, 2), by images that come 0.01 s after their times."""
+    triggered = ArrivalTriggered(Policy(), TICK)
+    simulator, rows = Simulator(triggered), [np.zeros(3)]
+    context = simulator.get_mutable_context()
     for k in range(round(until / TICK)):
-        simulator.AdvanceTo(k * TICK + 0.5 * TICK)
+        last = int((times + 0.01 <= k * TICK + 1e-9).sum()) - 1
+        age = math.inf if last < 0 else k * TICK - times[last]
+        triggered.GetInputPort("image").FixValue(context, [last])
+        triggered.GetInputPort("observation_age").FixValue(context, [age])
+        simulator.AdvanceTo((k + 0.5) * TICK)
         ports = "decided", "seen", "count"
         rows.append([triggered.GetOutputPort(port).Eval(context)[0] for port in ports])
     rows = np.array(rows)
@@ -88,13 +67,13 @@ def test_decides_as_images_come():
 
 @pytest.mark.parametrize("faster", [1.33, 3.0])
 def test_fast_images_do_not_make_it_faster(faster):
-    made = decisions(PERIOD / faster * np.arange(200), 5.0)
+    made = decisions(PERIOD / faster * np.arange(120), 3.0)
     late = made[:, 0] - (made[:, 1] * PERIOD / faster + 0.01)
     assert late.max() < TICK
     assert 0.95 * PERIOD - TICK < np.mean(np.diff(made[1:, 0])) < 1.1 * PERIOD
 
 
-@pytest.mark.parametrize("phase", [0.2, 0.4, 0.6, 0.8])
+@pytest.mark.parametrize("phase", [0.4, 0.8])
 def test_images_that_change_their_phase_are_found_again(phase):
     jitter = 0.2 * PERIOD * np.random.default_rng(0).uniform(-1.0, 1.0, 40)
     times = PERIOD * (np.arange(40) + np.where(np.arange(40) < 20, 0.0, phase)) + 0.05 + jitter

@@ -4,14 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from failsafe_bench import LAW, LOWER, PERIOD, UPPER, Bench
 from hypothesis import given
 from hypothesis import strategies as st
 from pydrake.math import RigidTransform
+from pydrake.systems.analysis import Simulator
 
+from splatpilot.systems.collision.distance_field import DistanceField
 from splatpilot.systems.collision.shapes import AnalyticDistanceField, Box, Cylinder
 from splatpilot.systems.messaging import flight_limits
-from splatpilot.systems.messaging.failsafe import FailsafeConfig, FiniteVector, Modes
+from splatpilot.systems.messaging.failsafe import Failsafe, FailsafeConfig, FiniteVector, Modes
 from splatpilot.systems.messaging.flight_limits import (
     RETURN_SPEED,
     FlightLimits,
@@ -20,10 +21,108 @@ from splatpilot.systems.messaging.flight_limits import (
     stopping_displacement,
 )
 from splatpilot.systems.messaging.generated import lcmt_bridge_status as status
+from splatpilot.systems.policies.velocity import RESPONSE_TIME, tracking_acceleration
+from splatpilot.systems.vehicle import quadrotor
+from splatpilot.systems.vehicle.flatness import FlatnessControllerConfig, flatness_command
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS, hover_state
+from splatpilot.systems.vehicle.state import predict_state
+
+LOWER, UPPER = np.array([0.0, -5.0, 0.0]), np.array([20.0, 5.0, 6.0])
+HOVER = np.array([quadrotor.GRAVITY, 0.0, 0.0, 0.0])
+LAW, VEHICLE = FlatnessControllerConfig(), quadrotor.QuadrotorParams()
+PERIOD = LAW.period
+
+
+class Bench:
+    """A failsafe and a vehicle that it flies by velocities or by body rates, in steps of 20 ms.
+
+    The test gives inputs; the state, which is `age` [s] old, comes by itself, unless the test gives
+    one.
+    """
+
+    def __init__(
+        self,
+        config: FailsafeConfig | None = None,
+        p_WB=(10.0, 0.0, 3.0),
+        v_WB=(1e-3, 0.0, 0.0),  # At exact rest a state would not change, and seem frozen.
+        age: float = 0.0,
+        by: str = "body_rates",
+        box=(LOWER, UPPER),
+        field: DistanceField | None = None,
+        radius: float = VEHICLE.radius,
+    ):
+        vehicle, self.radius = replace(VEHICLE, radius=radius), radius
+        self.failsafe = Failsafe(config or FailsafeConfig(), LAW, vehicle, *box, field)
+        self.simulator = Simulator(self.failsafe)
+        self.context = self.simulator.get_mutable_context()
+        self.age, self.by, self.box, self.field = age, by, box, field
+        self.state = hover_state(p_WB)
+        self.state[3:6] = v_WB
+        moved = np.append(PERIOD * self.state[3:6], np.zeros(10))
+        self.states = [self.state - k * moved for k in range(round(age / PERIOD), -1, -1)]
+        self.tick, self.min_room = 0, math.inf
+        self.give(velocity_setpoint=[0.0, 0.0, 0.0, 0.5], command=HOVER)
+        self.give_state()
+
+    def give(self, **inputs) -> None:
+        for name, value in inputs.items():
+            self.failsafe.GetInputPort(name).FixValue(self.context, np.atleast_1d(value))
+
+    def give_state(self, measured: np.ndarray | None = None) -> None:
+        """Gives the failsafe a state, that of the vehicle by default."""
+        if measured is None:
+            measured = self.states[-1 - round(self.age / PERIOD)]
+        state = predict_state(measured, self.age)
+        self.give(state=state, measured_state=measured, state_age=self.age)
+        if self.field is not None:
+            sample = self.field.query(state[:3])
+            self.give(clearance=sample.distance - self.radius, gradient=sample.gradient)
+
+    def accelerate(self, a_WB, v_WB=None) -> None:
+        """Gives setpoint and command of a policy that desires an acceleration."""
+        state = np.asarray(self.failsafe.GetInputPort("state").Eval(self.context))
+        command = flatness_command(state, a_WB, state[3:6], math.nan, LAW, VEHICLE)
+        setpoint = state[3:6] + RESPONSE_TIME * a_WB if v_WB is None else v_WB
+        self.give(velocity_setpoint=[*setpoint, math.nan], command=command)
+
+    def advance(self, duration: float, measured=None, desired=None) -> None:
+        """Flies on; `measured` is the state that the failsafe gets at a time, by default the
+        vehicle's; `desired` is the velocity of the policy."""
+        for _ in range(round(duration / PERIOD)):
+            now = self.tick * PERIOD
+            self.give_state(None if measured is None else measured(now))
+            if desired is not None:
+                state = np.asarray(self.failsafe.GetInputPort("state").Eval(self.context))
+                self.accelerate(tracking_acceleration(state[3:6], np.asarray(desired)), desired)
+            self.simulator.AdvanceTo(now + 1e-6)
+            command = self.out("command")
+            if self.by == "velocity":
+                setpoint = self.out("velocity_setpoint")
+                acceleration = tracking_acceleration(self.state[3:6], setpoint[:3])
+                command = flatness_command(
+                    self.state, acceleration, np.zeros(3), setpoint[3], LAW, VEHICLE
+                )
+            self.state = quadrotor.rk4_step(self.state, command, VEHICLE, PERIOD)
+            self.states.append(self.state)
+            self.min_room = min(self.min_room, self._room())
+            self.tick += 1
+
+    def _room(self) -> float:
+        """The distance [m] by which limits are kept: min_clearance, and the sphere in the box."""
+        p_WB, (lower, upper) = self.state[:3], self.box
+        room = float(np.min([p_WB - lower, upper - p_WB])) - self.radius
+        if self.field is not None:
+            room = min(room, float(self.field.distance(p_WB)) - self.radius - 0.1)
+        return room
+
+    def out(self, name: str) -> np.ndarray:
+        return self.failsafe.GetOutputPort(name).Eval(self.context)
+
+    def mode(self) -> tuple[float, float]:
+        return tuple(self.out("mode"))
+
 
 CONFIG = FailsafeConfig(patience=2.0)
-IN_CHARGE, NOT_IN_CHARGE = [1.0, 1.0], [1.0, 0.0]
 
 
 def test_a_healthy_policy_is_passed_unchanged():
@@ -52,32 +151,55 @@ def test_after_a_fault_the_vehicle_stops_and_then_lands():
     np.testing.assert_allclose(bench.state[:2], p[:2], atol=0.3)
 
 
-def test_holding_ends_after_recovery_and_landing_does_not():
+FLYING, WAITING = (status.FLYING, status.NONE), (status.WAITING, status.NONE)
+HOLDING, LANDING = (
+    (status.HOLDING, status.OBSERVATION_OLD),
+    (status.LANDING, status.OBSERVATION_OLD),
+)
+OLD, NEW = {"observation_age": 1.0}, {"observation_age": 0.0}
+HEARD, UNHEARD = {"vehicle_status_age": 0.0}, {"vehicle_status_age": 1.1}
+OBEYS, DISARMED = {"vehicle_status": [1.0, 1.0]}, {"vehicle_status": [0.0, 1.0]}
+STRAYS = {"vehicle_status": [1.0, 0.0]}
+
+
+def landing_of_a_vehicle_that_does_not_obey(others: dict) -> list:
+    return [
+        (OLD | others | HEARD, 2.5, HOLDING, 0),
+        (OBEYS, 1.9, HOLDING, 1),
+        ({}, 0.2, LANDING, 1),
+        (others, 0.06, HOLDING, 0),
+        (NEW, 0.6, FLYING, 0),
+    ]
+
+
+@pytest.mark.parametrize(
+    "steps",
+    [
+        [({"observation_age": np.inf}, 5.0, WAITING, 1), (NEW, 0.06, FLYING, 1)],
+        [
+            (NEW, 0.1, FLYING, 1),
+            (OLD, 0.2, HOLDING, 1),
+            (NEW, 0.4, HOLDING, 1),
+            ({}, 0.2, FLYING, 1),
+        ],
+        [(OLD, 2.2, LANDING, 1), (NEW, 2.0, LANDING, 1)],
+        landing_of_a_vehicle_that_does_not_obey(STRAYS),
+        landing_of_a_vehicle_that_does_not_obey(DISARMED),
+        [
+            (OLD | OBEYS | UNHEARD, 2.5, HOLDING, 0),
+            (HEARD, 0.06, HOLDING, 1),
+            (UNHEARD, 2.2, LANDING, 0),
+        ],
+    ],
+    ids=["first inputs", "recovery", "patience", "strays", "disarmed", "old status"],
+)
+def test_modes_follow_the_inputs(steps):
     bench = Bench(CONFIG, v_WB=(0.1, 0.0, 0.0))
-    bench.advance(0.1)
-    bench.give(observation_age=1.0)
-    bench.advance(0.2)
-    bench.give(observation_age=0.0)
-    bench.advance(0.4)
-    assert bench.out("mode")[0] == status.HOLDING
-    bench.advance(0.2)
-    assert bench.mode() == (status.FLYING, status.NONE)
-    bench.give(observation_age=1.0)
-    bench.advance(2.2)
-    bench.give(observation_age=0.0)
-    bench.advance(2.0)
-    assert bench.mode() == (status.LANDING, status.OBSERVATION_OLD)
-
-
-def test_nothing_is_commanded_before_the_first_state_and_observation():
-    bench = Bench()
-    bench.give(observation_age=np.inf)
-    bench.advance(5.0)
-    assert bench.mode() == (status.WAITING, status.NONE)
-    assert bench.out("is_ready")[0] == bench.out("state_is_known")[0] == 0
-    bench.give(observation_age=0.1, command=[10.0, 0.0, 0.0, 0.0])
-    bench.advance(0.06)
-    assert bench.out("mode")[0] == status.FLYING
+    for inputs, duration, mode, in_charge in steps:
+        bench.give(**inputs)
+        bench.advance(duration)
+        assert (bench.mode(), bench.out("in_charge")[0]) == (mode, in_charge)
+        assert bench.out("is_ready")[0] == (mode != WAITING)
 
 
 def test_a_vehicle_that_tips_over_is_leveled():
@@ -103,88 +225,28 @@ def test_landing_touches_only_level_surfaces(gradient, descends):
     assert descends or v.dot(gradient) >= -0.01
 
 
-def test_patience_is_counted_only_in_charge():
-    bench = Bench(CONFIG, v_WB=(0.1, 0.0, 0.0))
-    bench.give(vehicle_status=NOT_IN_CHARGE, vehicle_status_age=0.0, observation_age=1.0)
-    bench.advance(5.0)
-    assert bench.mode() == (status.HOLDING, status.OBSERVATION_OLD)
-    bench.give(vehicle_status=IN_CHARGE)
-    bench.advance(1.9)
-    assert bench.out("mode")[0] == status.HOLDING
-    bench.advance(0.2)
-    assert bench.out("mode")[0] == status.LANDING
-
-
-@pytest.mark.parametrize("vehicle_status", [NOT_IN_CHARGE, [0.0, 1.0]])
-def test_a_landing_ends_when_the_vehicle_obeys_another(vehicle_status):
-    bench = Bench(CONFIG, v_WB=(0.1, 0.0, 0.0))
-    bench.give(vehicle_status=IN_CHARGE, vehicle_status_age=0.0, observation_age=1.0)
-    bench.advance(2.2)
-    assert bench.out("mode")[0] == status.LANDING
-    bench.give(vehicle_status=vehicle_status)
-    bench.advance(0.06)
-    assert bench.out("in_charge")[0] == 0
-    assert bench.out("mode")[0] == status.HOLDING
-    bench.give(observation_age=0.0)
-    bench.advance(0.6)
-    assert bench.out("mode")[0] == status.FLYING
-
-
-def test_an_old_status_neither_begins_nor_ends_a_landing():
-    bench = Bench(CONFIG, v_WB=(0.1, 0.0, 0.0))
-    bench.give(vehicle_status=IN_CHARGE, vehicle_status_age=1.1, observation_age=1.0)
-    bench.advance(4.0)
-    assert (bench.out("in_charge")[0], bench.out("mode")[0]) == (0, status.HOLDING)
-    bench.give(vehicle_status_age=0.0)
-    bench.advance(0.06)
-    bench.give(vehicle_status_age=1.1)
-    bench.advance(2.2)
-    assert (bench.out("in_charge")[0], bench.out("mode")[0]) == (0, status.LANDING)
-
-
-def test_a_vehicle_on_the_ground_below_its_fence_takes_off_into_it():
-    limits = FlightLimits(geofence=[[0.0, -5, 1.0], [20.0, 5, 6]])
-    bench = Bench(replace(CONFIG, limits=limits), p_WB=(10.0, 0.0, 0.1))
-    bench.give(vehicle_status=NOT_IN_CHARGE, vehicle_status_age=0.0)
-    bench.advance(0.1)
-    assert bench.mode() == (status.FLYING, status.LIMITED_GEOFENCE)
-    bench.give(vehicle_status=IN_CHARGE)
-    bench.advance(0.4)
-    assert bench.mode() == (status.HOLDING, status.OUTSIDE)
-    bench.advance(1.8)
-    assert bench.out("mode")[0] == status.FLYING
-    assert bench.state[2] > 1.0
-
-
 WIDE = np.full(3, -60.0), np.full(3, 60.0)
 WALL = AnalyticDistanceField([Box(RigidTransform([0.5, 0, 0]), np.array([1.0, 90, 90]))], *WIDE)
 POST = AnalyticDistanceField([Cylinder(p_WA=[0.5, 0, -50], p_WB=[0.5, 0, 50], radius=0.5)], *WIDE)
 
-vectors = st.lists(st.floats(-1e4, 1e4), min_size=3, max_size=3).map(np.array)
-
 
 @given(
-    p_WB=vectors,
-    v_WB=vectors,
-    desired=vectors,
-    held=vectors,
-    gradient=vectors,
-    clearance=st.floats(-1e4, 1e4) | st.just(math.nan),
+    numbers=st.lists(st.floats(-1e4, 1e4), min_size=16, max_size=16),
     age=st.floats(-0.2, 0.3),
     max_speed=st.floats(0.1, 6.0),
     mode=st.sampled_from([status.FLYING, status.HOLDING, status.LANDING]),
-    known=st.booleans(),
-    field=st.sampled_from([None, POST]),
+    is_known=st.booleans(),
+    has_map=st.booleans(),
 )
 def test_no_state_and_no_map_is_flown_faster_than_the_limit(
-    p_WB, v_WB, desired, held, gradient, clearance, age, max_speed, mode, known, field
+    numbers, age, max_speed, mode, is_known, has_map
 ):
-    limits = FlightLimits(max_speed=max_speed)
-    motion = Motion.predict(p_WB, v_WB, age, 0.1, limits.deceleration, LAW) if known else None
-    near = Surroundings(clearance, gradient, flight_limits.Box(-np.ones(3), np.ones(3)), field)
-    config = FailsafeConfig(limits=limits)
-    modes = Modes(mode, p_WH=held)
-    setpoint, _ = modes.setpoint(np.append(desired, 0.0), motion, near, config)
+    p_WB, v_WB, desired, held, gradient = np.reshape(numbers[:15], (5, 3))
+    limits, box = FlightLimits(max_speed=max_speed), flight_limits.Box(-np.ones(3), np.ones(3))
+    motion = Motion.predict(p_WB, v_WB, age, 0.1, limits.deceleration, LAW) if is_known else None
+    clearance, field = (numbers[15], POST) if has_map else (math.nan, None)
+    near, config = Surroundings(clearance, gradient, box, field), FailsafeConfig(limits=limits)
+    setpoint, _ = Modes(mode, p_WH=held).setpoint(np.append(desired, 0.0), motion, near, config)
     fastest = max_speed if mode == status.FLYING else min(max_speed, RETURN_SPEED)
     assert np.linalg.norm(setpoint[:3]) <= fastest * (1 + 1e-9)
 
@@ -199,26 +261,18 @@ def test_from_outside_the_fence_the_vehicle_returns_slowly():
     assert 0.9 * RETURN_SPEED < fastest < 1.05 * RETURN_SPEED
 
 
-def fenced(**corners: float) -> tuple[np.ndarray, np.ndarray]:
-    """A wide box whose faces are moved: `x1` is that at the greater x, `z0` the floor."""
-    box = np.array(WIDE)
-    for face, value in corners.items():
-        box[int(face[1]), "xyz".index(face[0])] = value
-    return box[0], box[1]
-
-
 AHEAD = {
     "wall": (WALL, WIDE, [1.0, 0.0, 0.0]),
     "post": (POST, WIDE, [1.0, 0.0, 0.0]),
-    "fence": (None, fenced(x1=0.0), [1.0, 0.0, 0.0]),
-    "floor": (None, fenced(z0=0.0), [0.0, 0.0, -1.0]),
-    "ceiling": (None, fenced(z1=0.0), [0.0, 0.0, 1.0]),
+    "fence": (None, (WIDE[0], np.array([0.0, 60.0, 60.0])), [1.0, 0.0, 0.0]),
+    "floor": (None, (np.array([-60.0, -60.0, 0.0]), WIDE[1]), [0.0, 0.0, -1.0]),
+    "ceiling": (None, (WIDE[0], np.array([60.0, 60.0, 0.0])), [0.0, 0.0, 1.0]),
 }
 HEAD_ON = [
-    *itertools.product(["wall", "post"], ["velocity", "body_rates"], [0.1], [1.0, 6.0]),
-    *itertools.product(["wall", "fence", "floor", "ceiling"], ["velocity"], [0.3], [3.0, 6.0]),
-    *itertools.product(["fence", "floor", "ceiling"], ["body_rates"], [0.1], [1.0, 6.0]),
-    *itertools.product(["post", "floor"], ["body_rates"], [0.0], [3.0]),
+    *itertools.product(["wall", "post"], ["velocity", "body_rates"], [0.1], [6.0]),
+    *itertools.product(["wall", "fence", "floor", "ceiling"], ["velocity"], [0.3], [3.0]),
+    *itertools.product(["fence", "ceiling"], ["body_rates"], [0.1], [1.0]),
+    ("floor", "body_rates", 0.0, 6.0),
 ]
 
 
@@ -236,7 +290,7 @@ def test_limits_are_kept_head_on_at_any_speed_and_age(what, by, age, speed):
     assert bench.out("mode")[1] in (status.LIMITED_CLEARANCE, status.LIMITED_GEOFENCE)
 
 
-@pytest.mark.parametrize("moment", [0.2, 0.6, 1.0])
+@pytest.mark.parametrize("moment", [0.2, 0.8])
 @pytest.mark.parametrize("what", ["post", "fence"])
 def test_limits_are_kept_if_the_policy_is_lost_on_the_way(what, moment):
     field, box, direction = AHEAD[what]
@@ -257,7 +311,7 @@ def test_limits_are_kept_by_the_radius_of_the_vehicle(what):
     assert -1e-3 <= bench.min_room < 0.15
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_limits_are_kept_for_any_accelerations(seed):
     random = np.random.default_rng(seed)
     bench = Bench(None, (-3.0, 0.0, 0.0), (0.01, 0.0, 0.0), 0.02, "body_rates", WIDE, POST)
@@ -286,19 +340,12 @@ def test_a_policy_that_desires_too_fast_flight_is_flown_at_the_limit():
     assert bench.mode() == (status.FLYING, status.LIMITED_SPEED)
 
 
-@pytest.mark.parametrize(
-    ("signal", "substitute", "finite"),
-    [
-        ([1.0, -2.0], 0.0, [1.0, -2.0]),
-        ([1.0, np.nan], 0.0, [0.0, 0.0]),
-        ([-np.inf, 0.0], np.nan, [np.nan, np.nan]),
-    ],
-)
-def test_a_vector_is_replaced_if_any_element_is_not_finite(signal, substitute, finite):
-    system = FiniteVector(2, substitute)
+def test_a_vector_is_replaced_if_any_element_is_not_finite():
+    system = FiniteVector(2, -1.0)
     context = system.CreateDefaultContext()
-    system.GetInputPort("signal").FixValue(context, signal)
-    np.testing.assert_array_equal(system.GetOutputPort("finite").Eval(context), finite)
+    for signal, finite in (([1, -2], [1, -2]), ([1, np.nan], [-1, -1]), ([-np.inf, 0], [-1, -1])):
+        system.GetInputPort("signal").FixValue(context, signal)
+        np.testing.assert_array_equal(system.GetOutputPort("finite").Eval(context), finite)
 
 
 FAULTS = [
@@ -353,26 +400,19 @@ def moving(p_WB, v_WB, since: float = 0.0):
     return lambda now: np.r_[np.add(p_WB, np.multiply(v_WB, now - since)), v_WB, attitude]
 
 
-@pytest.mark.parametrize("speed", [0.0, 2.0])
-@pytest.mark.parametrize("first", [{}, {"observation_age": 1.0}, {"lag": 1.0}])
+@pytest.mark.parametrize(
+    ("speed", "first"), [(0.0, {}), (2.0, {}), (0.0, {"observation_age": 1.0}), (2.0, {"lag": 1.0})]
+)
 def test_a_state_that_does_not_change_is_frozen_at_any_speed_in_any_mode(speed, first):
     bench = Bench(CONFIG)
     frozen = moving([10.0, 0.0, 3.0], [speed, 0.0, 0.0])(0.0)
     bench.give(**first)
-    bench.advance(0.4, measured=lambda now: frozen)
-    assert bench.mode() == (status.HOLDING, status.STATE_FROZEN)
-    assert bench.out("state_is_known")[0] == 0
-    np.testing.assert_array_equal(bench.out("velocity_setpoint")[:3], np.zeros(3))
-
-
-def test_body_rates_are_flown_only_by_states_that_change():
-    bench = Bench(CONFIG)
-    bench.advance(0.2)
-    assert bench.out("state_is_known")[0] == 1
-    frozen = bench.state.copy()
     bench.advance(0.14, measured=lambda now: frozen)
-    assert bench.out("state_is_known")[0] == 0
-    assert bench.out("mode")[0] == status.FLYING
+    assert bench.out("state_is_known")[0] == 0  # Body rates need newer states than velocities.
+    assert bench.out("mode")[0] == (status.HOLDING if first else status.FLYING)
+    bench.advance(0.26, measured=lambda now: frozen)
+    assert bench.mode() == (status.HOLDING, status.STATE_FROZEN)
+    np.testing.assert_array_equal(bench.out("velocity_setpoint")[:3], np.zeros(3))
 
 
 def test_a_state_that_changes_again_is_used_again_while_landing():

@@ -13,7 +13,7 @@ from splatpilot.systems.messaging.flight_limits import (
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 
 
-@pytest.mark.parametrize("speed", [0.0, 0.5, 1.19, 2.0, 6.0])
+@pytest.mark.parametrize("speed", [0.0, 1.19, 6.0])
 def test_stopping_displacement_is_the_integral_of_the_braking_velocity(speed):
     direction, response, deceleration, dt = np.array([0.6, 0.0, -0.8]), 0.4, 3.0, 1e-3
     v, moved = speed, 0.0
@@ -25,19 +25,11 @@ def test_stopping_displacement_is_the_integral_of_the_braking_velocity(speed):
     np.testing.assert_allclose(stop, moved * direction, atol=1e-3)
 
 
-@pytest.mark.parametrize("room", [0.01, 0.3, 1.0, 4.0])
-def test_an_approach_takes_the_reaction_time_and_motion_along_is_kept(room):
-    away, along = np.array([0.6, 0.8, 0.0]), np.array([0.8, -0.6, 0.0])
-    left = limit_approach(-20.0 * away + 3.0 * along, away, room, 0.5)
-    assert -left.dot(away) * 0.5 == pytest.approx(room)
-    assert left.dot(along) == pytest.approx(3.0)
-
-
 @pytest.mark.parametrize("dead_time", [0.1, 0.42])
 def test_a_point_that_obeys_late_approaches_without_overshoot(dead_time):
     dt, away, room = 0.002, np.array([-1.0, 0.0, 0.0]), 2.0
     late = [0.0] * round(dead_time / dt)
-    for _ in range(5_000):
+    for _ in range(3_000):
         desired = limit_approach(np.array([6.0, 0.0, 0.0]), away, room, np.e * dead_time)
         late.append(desired[0])
         room -= dt * late.pop(0)
@@ -48,12 +40,14 @@ def test_a_point_that_obeys_late_approaches_without_overshoot(dead_time):
     ("velocity", "room", "limited"),
     [
         ([1.0, 2.0, -0.5], 1.0, [1.0, 2.0, -0.5]),
+        ([3.0, 2.0, -20.0], 4.0, [3.0, 2.0, -4.0 / 0.5]),
+        ([3.0, 2.0, -20.0], 0.01, [3.0, 2.0, -0.01 / 0.5]),
         ([0.0, 0.0, 9.0], 1.0, [0.0, 0.0, 9.0]),
         ([0.0, 0.0, 0.0], -0.1, [0.0, 0.0, 0.2]),
         ([0.0, 0.0, 0.0], -100.0, [0.0, 0.0, RETURN_SPEED]),
     ],
 )
-def test_slow_approaches_and_flight_away_are_kept_and_the_return_is_slow(velocity, room, limited):
+def test_only_fast_approaches_are_limited_and_the_return_is_slow(velocity, room, limited):
     away = np.array([0.0, 0.0, 1.0])
     np.testing.assert_allclose(limit_approach(np.array(velocity), away, room, 0.5), limited)
 

@@ -4,7 +4,8 @@ from pydrake.math import RigidTransform
 
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.esdf_build import esdf_from_distance_field, esdf_from_occupancy
-from splatpilot.systems.collision.shapes import AnalyticDistanceField, Box, Cylinder, HalfSpace
+from splatpilot.systems.collision.shapes import AnalyticDistanceField, Box, Cylinder
+from splatpilot.systems.policies.time_of_arrival import TimeOfArrival, time_of_arrival
 
 VOXEL_SIZE = 0.2
 
@@ -33,6 +34,12 @@ def empty() -> Esdf:
 def pillar() -> Esdf:
     """16 x 8 x 6 m with a pillar of radius 0.4 m at (6, 4)."""
     return field_of([Cylinder([6, 4, -1], [6, 4, 7], 0.4)], [16.0, 8.0, 6.0])
+
+
+@pytest.fixture(scope="session")
+def pillar_toa(pillar) -> TimeOfArrival:
+    """Times of arrival behind the pillar, at (14, 4, 3)."""
+    return time_of_arrival(pillar, np.array([14.0, 4.0, 3.0]))
 
 
 @pytest.fixture(scope="session")
@@ -66,26 +73,3 @@ def narrow_bend() -> Esdf:
         occupied[x, y, 3:-3] = False
     occupied[43:93, 43:61, 3:-3] = False
     return esdf_from_occupancy(occupied, np.zeros_like(occupied), np.zeros(3), 0.05).conservative()
-
-
-@pytest.fixture(scope="session")
-def make_forest():
-    """Makes (world, field) of 20 x 10 x 5 m: ground and trunks at least 2.5 m apart."""
-
-    def make(seed: int) -> tuple[AnalyticDistanceField, Esdf]:
-        rng = np.random.default_rng(seed)
-        trunks = []
-        for p in rng.uniform([0, 0], [20, 10], (300, 2)):
-            keep_clear = [(1.5, 5.0), (18.5, 5.0)]  # start and goal
-            apart = all(np.linalg.norm(p - q) > 2.5 for q in trunks)
-            if apart and all(np.linalg.norm(p - q) > 1.5 for q in keep_clear):
-                trunks.append(p)
-        shapes = [
-            Cylinder([x, y, -1], [x, y, 6], radius)
-            for (x, y), radius in zip(trunks, rng.uniform(0.2, 0.4, len(trunks)), strict=True)
-        ]
-        ground = HalfSpace(np.array([0.0, 0.0, 1.0]), 0.0)
-        world = AnalyticDistanceField([*shapes, ground], np.zeros(3), np.array([20.0, 10.0, 5.0]))
-        return world, esdf_from_distance_field(world, VOXEL_SIZE)
-
-    return make

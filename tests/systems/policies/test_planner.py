@@ -4,21 +4,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydrake.math import RollPitchYaw
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import DiagramBuilder, EventStatus
+from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import LogVectorOutput
 
-from splatpilot.systems.collision.shapes import AnalyticDistanceField
 from splatpilot.systems.policies import planner as privileged_planner
-from splatpilot.systems.policies.hypotheses import Hypotheses, HypothesisSelector
+from splatpilot.systems.policies.hypotheses import HypothesisSelector
 from splatpilot.systems.policies.lattice import LatticeConfig, TrajectoryLattice
 from splatpilot.systems.policies.planner import PrivilegedPlanner, PrivilegedPlannerConfig, plan
 from splatpilot.systems.policies.time_of_arrival import time_of_arrival
 from splatpilot.systems.vehicle.flatness import FlatnessController, FlatnessControllerConfig
-from splatpilot.systems.vehicle.quadrotor import (
-    VEHICLE_RADIUS,
-    QuadrotorPlant,
-    hover_state,
-)
+from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS, QuadrotorPlant, hover_state
 
 MARGIN = LatticeConfig().margin
 
@@ -35,16 +30,14 @@ def flying(p_WB, v_WB, a_WB=(0.0, 0.0, 0.0)):
     return state
 
 
-def fly(esdf, p_WB, p_WG, duration, config=None, truth=None, arrival_distance=0.0):
-    builder = DiagramBuilder()
-    config = config or PrivilegedPlannerConfig()
-    plant = builder.AddNamedSystem("plant", QuadrotorPlant())
-    planner = builder.AddNamedSystem("planner", PrivilegedPlanner(esdf, config))
+def fly(esdf, p_WB, p_WG, duration):
+    """Returns the states (N, 13) of a flight, every 20 ms."""
+    builder, config = DiagramBuilder(), PrivilegedPlannerConfig()
+    plant = builder.AddSystem(QuadrotorPlant(initial_state=hover_state(p_WB)))
+    planner = builder.AddSystem(PrivilegedPlanner(esdf, config))
     lookahead = FlatnessControllerConfig().lookahead
-    selector = builder.AddNamedSystem(
-        "selector", HypothesisSelector(config.lattice.num_hypotheses, lookahead)
-    )
-    controller = builder.AddNamedSystem("controller", FlatnessController())
+    selector = builder.AddSystem(HypothesisSelector(config.lattice.num_hypotheses, lookahead))
+    controller = builder.AddSystem(FlatnessController())
     state = plant.GetOutputPort("state")
     for system in (planner, selector, controller):
         builder.Connect(state, system.GetInputPort("state"))
@@ -53,27 +46,11 @@ def fly(esdf, p_WB, p_WG, duration, config=None, truth=None, arrival_distance=0.
     builder.Connect(controller.GetOutputPort("command"), plant.GetInputPort("command"))
     builder.ExportInput(planner.GetInputPort("goal"), "goal")
     states = LogVectorOutput(state, builder, publish_period=0.02)
-    plans = LogVectorOutput(planner.GetOutputPort("hypotheses"), builder, publish_period=0.2)
     diagram = builder.Build()
-
     simulator = Simulator(diagram)
-    context = simulator.get_mutable_context()
-    diagram.GetInputPort("goal").FixValue(context, p_WG)
-    plant.GetMyMutableContextFromRoot(context).SetContinuousState(hover_state(p_WB))
-
-    def monitor(root_context):
-        p = root_context.get_continuous_state_vector().CopyToVector()[:3]
-        if np.linalg.norm(p - p_WG) < arrival_distance:
-            return EventStatus.ReachedTermination(diagram, "goal")
-        if truth is not None and truth.distance(p) < VEHICLE_RADIUS:
-            return EventStatus.ReachedTermination(diagram, "collision")
-        return EventStatus.DidNothing()
-
-    simulator.set_monitor(monitor)
+    diagram.GetInputPort("goal").FixValue(simulator.get_mutable_context(), p_WG)
     simulator.AdvanceTo(duration)
-    # The log ends up to a sample before the flight does.
-    last = context.get_continuous_state_vector().CopyToVector()
-    return np.vstack([states.FindLog(context).data().T, last]), plans.FindLog(context).data().T
+    return states.FindLog(simulator.get_context()).data().T
 
 
 def test_flies_straight_at_nominal_speed(empty):
@@ -93,15 +70,14 @@ def test_all_hypotheses_avoid_an_obstacle(pillar, y):
     assert np.all(np.diff(hypotheses.costs) >= 0.0)
 
 
-def test_a_state_in_an_obstacle_leads_out(pillar):
-    toa = time_of_arrival(pillar, np.array([14.0, 4.0, 3.0]))
+def test_a_state_in_an_obstacle_leads_out(pillar, pillar_plan):
     state = hover_state([5.4, 4.1, 3.0])
-    way_W = plan(0.0, state, pillar, toa, TrajectoryLattice()).waypoints_W[0]
+    way_W = pillar_plan(state).waypoints_W[0]
     assert pillar.distance(state[:3]) < VEHICLE_RADIUS
     assert pillar.distance(way_W[-1]) > pillar.distance(state[:3]) + 0.1
 
 
-@pytest.mark.parametrize("p_WB", [[7.0, 5.0, 2.0], [7.3, 6.5, 2.0], [4.5, 3.0, 1.5]])
+@pytest.mark.parametrize("p_WB", [[7.3, 6.5, 2.0], [4.5, 3.0, 1.5]])
 def test_escapes_a_u_trap(u_trap, p_WB):
     p_WG = np.array([12.0, 5.0, 2.0])
     toa, lattice = time_of_arrival(u_trap, p_WG, MARGIN), TrajectoryLattice()
@@ -117,8 +93,8 @@ def test_escapes_a_u_trap(u_trap, p_WB):
 
 def test_follows_a_narrow_bend(narrow_bend):
     p_WG = np.array([4.2, 2.6, 0.8])
-    states, _ = fly(narrow_bend, [1.0, 1.0, 0.8], p_WG, 12.0, arrival_distance=0.3)
-    assert np.linalg.norm(states[-1, :3] - p_WG) < 0.31
+    states = fly(narrow_bend, [1.0, 1.0, 0.8], p_WG, 12.0)
+    assert np.linalg.norm(states[:, :3] - p_WG, axis=1).min() < 0.31
     assert narrow_bend.distance(states[:, :3]).min() > VEHICLE_RADIUS
 
 
@@ -131,27 +107,13 @@ def test_a_vehicle_that_drifts_to_less_than_the_margin_is_not_cut_off(narrow_ben
     assert np.isfinite(hypotheses.costs).all()
 
 
-@pytest.mark.parametrize("clearance", [0.1, 0.5])
-def test_arrives_and_stops_near_an_obstacle(pillar, clearance):
-    p_WG = np.array([6.0 - 0.4 - VEHICLE_RADIUS - clearance, 4.0, 3.0])
-    states, _ = fly(pillar, [2.0, 2.5, 2.5], p_WG, 9.0)
+def test_arrives_and_stops_near_an_obstacle(pillar):
+    p_WG = np.array([6.0 - 0.4 - VEHICLE_RADIUS - 0.1, 4.0, 3.0])
+    states = fly(pillar, [2.0, 2.5, 2.5], p_WG, 9.0)
     rest = states[-50:]  # the last second
     assert np.linalg.norm(rest[:, :3] - p_WG, axis=1).max() < 0.1
     assert np.linalg.norm(rest[:, 3:6], axis=1).max() < 0.1
     assert pillar.distance(states[:, :3]).min() > VEHICLE_RADIUS
-
-
-@pytest.mark.parametrize("seed", range(2))
-def test_flies_through_a_forest(make_forest, seed):
-    world, esdf = make_forest(seed)
-    p_WB, p_WG = np.array([1.5, 5.0, 1.5]), np.array([18.5, 5.0, 1.5])
-    states, plans = fly(esdf, p_WB, p_WG, 16.0, truth=world, arrival_distance=0.5)
-    p, speed = states[:, :3], np.linalg.norm(states[:, 3:6], axis=1)
-    assert np.linalg.norm(p[-1] - p_WG) < 0.5
-    assert world.distance(p).min() > VEHICLE_RADIUS
-    assert speed.max() < 1.15 * 2.0 and speed.mean() > 1.5
-    later = [Hypotheses.from_vector(vector, 3) for vector in plans[1:]]
-    assert all(h is not None and np.isfinite(h.costs).all() for h in later)
 
 
 @given(
@@ -159,7 +121,7 @@ def test_flies_through_a_forest(make_forest, seed):
     v=st.tuples(*[st.floats(-30, 30)] * 3),
     rpy=st.tuples(*[st.floats(-4, 4)] * 3),
 )
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60)
 def test_any_state_gets_finite_plans(pillar_plan, p, v, rpy):
     q = RollPitchYaw(rpy).ToQuaternion().wxyz()
     hypotheses = pillar_plan(np.array([*p, *v, *q, 0.0, 0.0, 0.0]))
@@ -168,9 +130,9 @@ def test_any_state_gets_finite_plans(pillar_plan, p, v, rpy):
 
 
 @pytest.fixture(scope="session")
-def pillar_plan(pillar):
-    toa, lattice = time_of_arrival(pillar, np.array([14.0, 4.0, 3.0])), TrajectoryLattice()
-    return lambda state: plan(0.0, state, pillar, toa, lattice)
+def pillar_plan(pillar, pillar_toa):
+    lattice = TrajectoryLattice()
+    return lambda state: plan(0.0, state, pillar, pillar_toa, lattice)
 
 
 def test_time_of_arrival_is_computed_once_per_goal(empty, monkeypatch):
@@ -191,12 +153,11 @@ def test_time_of_arrival_is_computed_once_per_goal(empty, monkeypatch):
     assert goals == [[9.0, 4.0, 3.0], [9.0, 6.0, 3.0]]
 
 
-def test_unknown_space_is_not_planned_through(make_forest):
-    _, esdf = make_forest(0)
-    planner = PrivilegedPlanner(esdf)
+def test_unknown_space_is_not_planned_through(empty):
+    planner = PrivilegedPlanner(empty)
     context = planner.CreateDefaultContext()
     planner.GetInputPort("state").FixValue(context, hover_state([1.5, 5.0, 1.5]))
-    planner.GetInputPort("goal").FixValue(context, [19.8, 5.0, 1.5])
+    planner.GetInputPort("goal").FixValue(context, [15.8, 5.0, 1.5])
     with pytest.raises(ValueError, match="boundary of the known volume"):
         Simulator(planner, context).AdvanceTo(0.1)
 
@@ -209,22 +170,5 @@ def test_a_goal_that_is_cut_off_is_refused(closed_wall):
 
 
 def test_a_state_that_is_not_finite_is_refused(pillar_plan):
-    state = hover_state([3.0, 4.0, 3.0])
-    state[4] = np.nan
     with pytest.raises(ValueError, match="must be 13 finite numbers"):
-        pillar_plan(state)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (
-            (AnalyticDistanceField([], [0, 0, 0], [1, 1, 1]),),
-            "esdf must be .* got a Analytic.*`esdf`",
-        ),
-        ((None,), "esdf must be of type Esdf"),
-    ],
-)
-def test_what_is_not_a_grid_is_named_at_construction(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        PrivilegedPlanner(*arguments)
+        pillar_plan(np.full(13, np.nan))

@@ -4,7 +4,6 @@ import pytest
 from splatpilot.systems.policies.base import Observation
 from splatpilot.systems.policies.lattice import LatticeConfig, final_velocities
 from splatpilot.systems.policies.reactive import (
-    Reactive,
     ReactiveConfig,
     candidate_costs,
     candidate_velocities,
@@ -14,7 +13,6 @@ from splatpilot.systems.policies.reactive import (
     responses,
 )
 from splatpilot.systems.policies.velocity import RESPONSE_TIME
-from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS, hover_state
 from splatpilot.systems.vehicle.state import QuadrotorState, pose_from_state
 
@@ -117,18 +115,3 @@ def test_remembers_points_that_are_no_longer_seen():
         known = points[np.isfinite(points[:, 0])]
         assert len(known) == (144 if k < 2 else 0)
         np.testing.assert_allclose(known[:, 1], 3.1, atol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("field", "value"),
-    [
-        ("speed", 0.0),
-        ("columns", 15),
-        ("memory", 0),
-        ("camera", OnboardCamera(width=0)),
-    ],
-)
-def test_bad_config_is_named(field, value):
-    name = "OnboardCamera.width" if field == "camera" else f"ReactiveConfig.{field}"
-    with pytest.raises(ValueError, match=name):
-        Reactive(ReactiveConfig(**{field: value}))

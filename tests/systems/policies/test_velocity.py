@@ -1,6 +1,5 @@
 import numpy as np
 import pytest
-from pydrake.autodiffutils import ExtractGradient, InitializeAutoDiff
 
 from splatpilot.systems.messaging.failsafe import FiniteVector
 from splatpilot.systems.policies.velocity import (
@@ -13,22 +12,16 @@ from splatpilot.systems.vehicle.flatness import FlatnessController, FlatnessCont
 from splatpilot.systems.vehicle.quadrotor import QuadrotorParams, hover_state
 
 
-def test_velocities_are_approached_in_four_tenths_of_a_second():
-    system = VelocityTracker()
-    context = system.CreateDefaultContext()
-    state = np.array([9.0, 9, 9, 1, 0, -1, 1, 0, 0, 0, 0, 0, 0])
-    system.GetInputPort("state").FixValue(context, state)
-    for desired, expected in (([2, 1, -1], [2.5, 2.5, 0]), ([1, 0, 7], [0, 0, 6])):
-        system.GetInputPort("velocity").FixValue(context, np.array(desired, dtype=float))
-        found = system.GetOutputPort("acceleration").Eval(context)
-        np.testing.assert_allclose(found, expected, atol=1e-12)
-
-
 def test_tracking_is_exponential_and_limited():
     v, desired, step = np.zeros(3), np.array([0.5, 0.0, 0.2]), 1e-4
     for _ in range(round(RESPONSE_TIME / step)):
         v = v + step * tracking_acceleration(v, desired)
     np.testing.assert_allclose(v, desired * (1 - np.exp(-1)), rtol=1e-3)
+    system = VelocityTracker()
+    context = system.CreateDefaultContext()
+    system.GetInputPort("state").FixValue(context, [9, 9, 9, 1, 0, -1, 1, 0, 0, 0, 0, 0, 0])
+    system.GetInputPort("velocity").FixValue(context, [1, 0, 7])
+    np.testing.assert_allclose(system.GetOutputPort("acceleration").Eval(context), [0, 0, 6])
 
 
 CONTROLLER = FlatnessControllerConfig(lookahead=0.5)
@@ -43,22 +36,16 @@ def setpoint(**inputs) -> np.ndarray:
     return system.GetOutputPort("velocity_setpoint").Eval(context)
 
 
-def test_acceleration_leads_to_the_desired_velocity():
+def test_setpoints_lead_to_the_decision():
     desired = np.array([1.5, 0.5, -0.3])
     acceleration = tracking_acceleration(STATE[3:6], desired)
     np.testing.assert_allclose(setpoint(acceleration=acceleration)[:3], desired)
-
-
-def test_velocity_passes_unchanged():
     np.testing.assert_array_equal(setpoint(velocity=np.array([1.0, -2, 3]))[:3], [1, -2, 3])
-
-
-def test_waypoint_is_reached_in_time():
     found = setpoint(waypoint=np.array([2.0, 2, 2]), heading=np.array([0.7]))
     np.testing.assert_allclose(found, [2.0, 0.0, -2.0, 0.7])
 
 
-@pytest.mark.parametrize("speed", [0.1, 0.3, 0.5, 2.0])
+@pytest.mark.parametrize("speed", [0.0, 0.3, 2.0])
 @pytest.mark.parametrize("decision", ["waypoint", "acceleration"])
 @pytest.mark.parametrize("heading", [{}, {"heading": np.array([np.nan])}])
 def test_without_a_heading_the_turn_is_that_of_the_controller(decision, speed, heading):
@@ -76,31 +63,6 @@ def test_without_a_heading_the_turn_is_that_of_the_controller(decision, speed, h
     command = controller.EvalUniquePeriodicDiscreteUpdate(context).value(0)
     assert CONTROLLER.yaw_gain * (found[3] - 3.0) == pytest.approx(command[3], abs=1e-9)
     assert command[3] == pytest.approx(3.0 * (2 * np.pi - 5.8) * min(1.0, speed / 0.5) ** 2)
-
-
-def test_heading_stays_at_rest():
-    state = hover_state([1.0, 2.0, 3.0], yaw=3.0)
-    assert setpoint(state=state, acceleration=np.array([1.0, 0, 0]))[3] == pytest.approx(3.0)
-
-
-def test_derivatives_of_tracking_equal_differences():
-    system = VelocityTracker()
-
-    def acceleration(system, x):
-        context = system.CreateDefaultContext()
-        system.GetInputPort("state").FixValue(context, x[:13])
-        system.GetInputPort("velocity").FixValue(context, x[13:])
-        return system.get_output_port().Eval(context)
-
-    for velocity in ([1.0, 0.0, 0.5], [9.0, -4.0, 1.0]):
-        x = np.concatenate([STATE, velocity])
-        dual = acceleration(system.ToAutoDiffXd(), InitializeAutoDiff(x).ravel())
-        h = 1e-6
-        differences = [
-            acceleration(system, x + h * e) - acceleration(system, x - h * e) for e in np.eye(16)
-        ]
-        expected = np.transpose(differences) / (2 * h)
-        np.testing.assert_allclose(ExtractGradient(dual), expected, atol=1e-7)
 
 
 @pytest.mark.parametrize(
@@ -127,8 +89,3 @@ def test_outputs_are_not_computed_again_as_time_moves(kind, arguments, inputs):
         context.SetTime(time)
         system.get_output_port().Eval(context)
     assert system.calls == 1
-
-
-def test_wrong_arguments_are_named_at_construction():
-    with pytest.raises(ValueError, match="controller must be of type FlatnessControllerConfig"):
-        VelocitySetpoint(None)  # pyright: ignore[reportArgumentType]

@@ -1,14 +1,12 @@
-import contextlib
-import socket
 from collections.abc import Callable
 
 import numpy as np
 import pytest
+from packets import Packets
 from pydrake.systems.analysis import Simulator
 from pymavlink.dialects.v20 import common as dialect
 from scipy.spatial.transform import Rotation
 
-from splatpilot.systems.messaging.receiver import UdpConfig, UdpInbox
 from splatpilot.systems.px4.mavlink import Mavlink
 from splatpilot.systems.px4.telemetry import Px4Telemetry
 
@@ -29,12 +27,8 @@ class Link:
     """Telemetry, and PX4's end of it."""
 
     def __init__(self, now: Callable[[], float] | None = None):
-        self.px4 = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self.px4.bind(("127.0.0.1", 0))
-        self.px4.setblocking(False)
-        self.inbox = UdpInbox(UdpConfig(port=0))
-        self.mavlink = dialect.MAVLink(None, 1, 1)
-        self.system = Px4Telemetry(self.inbox, Mavlink(), self.px4.getsockname(), 0.01, now)
+        self.packets, self.mavlink = Packets(), dialect.MAVLink(None, 1, 1)
+        self.system = Px4Telemetry(self.packets, Mavlink(), ("127.0.0.1", 9), 0.01, now)
         self.simulator = Simulator(self.system)
         self.tell_time()
         self.simulator.Initialize()
@@ -52,12 +46,10 @@ class Link:
         context = self.simulator.get_mutable_context()
         self.system.GetInputPort("unix_time").FixValue(context, [EPOCH + context.get_time()])
 
-    def send(self, *messages, raw: bytes = b"", sender: str = "127.0.0.1") -> None:
+    def send(self, *messages, raw: bytes = b"") -> None:
         """Sends messages in one packet."""
-        packet = b"".join(bytes(message.pack(self.mavlink)) for message in messages) + raw
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
-            out.bind((sender, 0))
-            out.sendto(packet, ("127.0.0.1", self.inbox.port))
+        packed = (bytes(message.pack(self.mavlink)) for message in messages)
+        self.packets.waiting.append(b"".join(packed) + raw)
 
     def send_state(self, late: float = 0.0, **values) -> None:
         """Sends position and attitude of `late` [s] ago."""
@@ -69,11 +61,7 @@ class Link:
         for _ in range(round(duration / 0.01)):
             self.simulator.AdvanceTo(round(self.now + 0.01, 6))
             self.tell_time()
-        messages = []
-        with contextlib.suppress(BlockingIOError):
-            while True:
-                messages += dialect.MAVLink(None).parse_buffer(self.px4.recv(4096)) or []
-        return messages
+        return self.packets.take_sent()
 
     def out(self, name: str):
         value = self.system.GetOutputPort(name).Eval(self.simulator.get_context()).copy()
@@ -81,22 +69,8 @@ class Link:
 
 
 @pytest.fixture
-def make():
-    made = []
-
-    def make(*args) -> Link:
-        made.append(Link(*args))
-        return made[-1]
-
-    yield make
-    for each in made:
-        each.px4.close()
-        each.inbox.close()
-
-
-@pytest.fixture
-def link(make):
-    return make()
+def link() -> Link:
+    return Link()
 
 
 def test_state_needs_position_and_attitude(link, caplog):
@@ -109,7 +83,7 @@ def test_state_needs_position_and_attitude(link, caplog):
     np.testing.assert_allclose(link.out("state"), expected, rtol=1e-6)
     assert link.out("age") == pytest.approx(0.05, abs=1e-3)
     link.send(raw=b"nonsense")
-    link.send(position(link.boot_time, x=7.0), sender="127.0.0.9")
+    link.packets.strangers = 1
     link.advance(0.05)
     np.testing.assert_allclose(link.out("state"), expected, rtol=1e-6)
     assert link.out("rejected") == 2
@@ -145,7 +119,10 @@ def test_older_states_are_counted_and_change_nothing(link, back):
     assert link.out("rejected") == 2
 
 
-def test_px4_may_start_again(link):
+def test_px4_may_start_again_and_asks_for_the_time(link):
+    link.send(dialect.MAVLink_timesync_message(0, 12345))
+    (answer,) = [each for each in link.advance(0.05) if each.tc1]
+    assert (answer.ts1, answer.tc1) == (12345, pytest.approx(1e9 * EPOCH, abs=2e4))
     link.send_state()
     link.advance(1.5)
     link.send(position(2.0, x=9.0))
@@ -172,7 +149,7 @@ def test_a_link_that_buffers_is_seen_in_the_age(link, silence):
 
 def test_a_link_that_is_slow_from_the_start_is_seen_by_answers(link):
     waiting = []
-    for _ in range(150):
+    for _ in range(100):
         waiting += [
             (link.now + 0.07, dialect.MAVLink_timesync_message(round(1e9 * at), message.ts1))
             for message in link.advance(0.01)
@@ -184,20 +161,13 @@ def test_a_link_that_is_slow_from_the_start_is_seen_by_answers(link):
     assert link.out("age") == pytest.approx(0.05, abs=2e-3)
 
 
-def test_a_process_that_is_behind_takes_no_message_for_faster(make):
+def test_a_process_that_is_behind_takes_no_message_for_faster():
     late = 0.0
-    link = make(lambda: EPOCH + link.now + late)
+    link = Link(lambda: EPOCH + link.now + late)
     for late in (0.0, 0.05, 0.0):
         link.send_state(-late)
         link.advance(0.1)
     assert link.out("age") == pytest.approx(0.1, abs=1e-3)
-
-
-def test_px4s_requests_for_the_time_are_answered(link):
-    link.advance(0.5)
-    link.send(dialect.MAVLink_timesync_message(0, 12345))
-    (answer,) = link.advance(0.05)
-    assert (answer.ts1, answer.tc1) == (12345, pytest.approx(1e9 * (EPOCH + 0.5), abs=2e4))
 
 
 def test_granted_commands_are_remembered(link):
@@ -215,7 +185,7 @@ def test_granted_commands_are_remembered(link):
 
 
 @pytest.mark.parametrize(
-    ("base", "mode", "told"), [(129, 6, [1, 1]), (129, 3, [1, 0]), (1, 6, [0, 1]), (1, 3, [0, 0])]
+    ("base", "mode", "told"), [(129, 6, [1, 1]), (129, 3, [1, 0]), (1, 6, [0, 1])]
 )
 def test_modes_are_those_of_the_last_heartbeat_unless_it_is_old(link, base, mode, told):
     link.advance(0.1)

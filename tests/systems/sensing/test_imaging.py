@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 from pydrake.common.value import Value
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.sensors import ImageRgba8U
 
 from splatpilot.systems.sensing.imaging import (
@@ -32,40 +31,19 @@ def picture(color: float | np.ndarray) -> ImageRgba8U:
     return image
 
 
-class Scene(LeafSystem):
-    """Outputs an image whose light is halved twice at 1 s."""
-
-    def __init__(self, light: float) -> None:
-        super().__init__()
-        self._light = light
-        self.DeclareAbstractOutputPort("color_image", lambda: Value(picture(0)), self._calc)
-
-    def _calc(self, context, output) -> None:
-        light = self._light * (0.25 if context.get_time() >= 1.0 else 1.0)
-        output.set_value(picture(color_of_light(np.array(light))))
-
-
-def gains(imaging: Imaging, light: float, *times: float) -> list[float]:
-    builder = DiagramBuilder()
-    scene = builder.AddSystem(Scene(light))
-    exposure = builder.AddSystem(AutoExposure(imaging, CAMERA, PERIOD))
-    builder.Connect(scene.get_output_port(), exposure.get_input_port())
-    simulator = Simulator(builder.Build())
-    context, found = simulator.get_mutable_context(), []
-    simulator.Initialize()
-    for time in times:
-        simulator.AdvanceTo(time)
-        state = exposure.GetMyContextFromRoot(context).get_discrete_state_vector()
-        found.append(state.GetAtIndex(0))
-    return found
-
-
 @pytest.mark.parametrize("response", [0.1, 0.4])
 def test_exposure_follows_light_with_its_time_constant(response):
-    times = 0.5, 1.0 - 1e-6 + response, 1.0 - 1e-6 + 3 * response
-    before, *after = gains(Imaging(exposure_response=response), 0.36, *times)
-    assert before == pytest.approx(-1.0, abs=0.03)
-    left = [(before + 2.0 - gain) / 2.0 for gain in after]
+    exposure = AutoExposure(Imaging(exposure_response=response), CAMERA, PERIOD)
+    simulator, gains = Simulator(exposure), []
+    context = simulator.get_mutable_context()
+    # The light is halved twice at 1 s.
+    for light, time in ((0.36, 0.0), (0.09, response), (0.09, 3 * response)):
+        color = color_of_light(np.array(light))
+        exposure.get_input_port().FixValue(context, Value(picture(color)))
+        simulator.AdvanceTo(1.0 - 1e-6 + time)
+        gains.append(context.get_discrete_state_vector().GetAtIndex(0))
+    assert gains[0] == pytest.approx(-1.0, abs=0.03)
+    left = [(gains[0] + 2.0 - gain) / 2.0 for gain in gains[1:]]
     assert left == pytest.approx([math.exp(-1.0), math.exp(-3.0)], abs=0.02)
 
 
@@ -84,20 +62,15 @@ def test_vignetting_follows_the_cosine_of_the_angle():
 
 def test_compression_costs_detail_by_its_quality():
     noise = np.random.default_rng(0).uniform(0, 255, (18, 32, 1)) * np.ones(3)
-    errors = [
-        np.abs(
-            changed(Compression(Imaging(jpeg_quality=q), CAMERA, 15.0, 0), noise)[..., :3] - noise
-        )
-        for q in (95, 20)
-    ]
-    assert errors[0].mean() < 3.0 < errors[1].mean()
+    systems = [Compression(Imaging(jpeg_quality=q), CAMERA, 15.0, 0) for q in (95, 20)]
+    errors = [np.abs(changed(system, noise)[..., :3] - noise).mean() for system in systems]
+    assert errors[0] < 3.0 < errors[1]
 
 
 @pytest.mark.parametrize(("scale", "fov_x"), [(1.0, 90.0), (1.5, 67.38), (0.75, 106.26)])
 def test_the_focal_length_changes_the_field_of_view(scale, fov_x):
     camera = Imaging(focal_scale=scale).camera(OnboardCamera(fov_x=90.0, fov_y=60.0))
     assert camera.fov_x == pytest.approx(fov_x, abs=0.01)
-    assert camera.focal_x == pytest.approx(scale * focal_length(camera.width, 90.0))
     assert camera.focal_y == pytest.approx(scale * focal_length(camera.height, 60.0))
 
 
@@ -128,8 +101,8 @@ def tof(depth, normal=0.0, reflectivity=0.0, mixing=0.0, **fields):
 
 
 def test_stereo_noise_grows_with_the_square_of_depth():
-    noise = np.random.default_rng(0).standard_normal((100, *SHAPE))
-    for z in np.geomspace(0.2, 20.0, 9):
+    noise = np.random.default_rng(0).standard_normal((30, *SHAPE))
+    for z in (0.2, 2.0, 20.0):
         depths = [stereo(np.full(SHAPE, z), n, step=0.0, window=0.0) for n in noise]
         seen = np.array(depths)[:, :, 12:]  # right of the border without matches
         expected = z**2 * 0.08 / (424.0 * 0.05)
@@ -176,18 +149,10 @@ def test_unmeasured_pixels_stay_so():
         np.testing.assert_array_equal(seen[:2, 40:], depth[:2, 40:])
 
 
-def slanted_plane() -> np.ndarray:
-    slopes = DEPTH_CAMERA.ray_slopes()
-    return 3.0 / (1.0 + 0.4 * slopes[..., 0] + 0.3 * slopes[..., 1])
-
-
-def test_a_plane_has_no_multipath():
-    plane = slanted_plane()
+def test_a_concave_corner_recedes_by_its_sag_and_a_plane_and_an_edge_do_not():
+    x, y = np.moveaxis(DEPTH_CAMERA.ray_slopes()[..., :2], 2, 0)
+    plane = 3.0 / (1.0 + 0.4 * x + 0.3 * y)
     np.testing.assert_allclose(tof(plane, multipath=1.0), plane, rtol=1e-12)
-
-
-def test_a_concave_corner_recedes_by_its_sag_and_an_edge_does_not():
-    x = DEPTH_CAMERA.ray_slopes()[..., 0]
     corner = 2.0 / (1.0 + np.abs(x))  # two walls at 45 degrees to the axis
     seen = tof(corner, multipath=0.5, multipath_angle=5.0)
     offset = round(32.0 * np.tan(np.radians(5.0))) / 32.0
@@ -217,7 +182,7 @@ def test_ambient_light_hides_far_surfaces():
     np.testing.assert_allclose(tof(depth, normal=2.0, noise=0.01), 4.08)
 
 
-def test_matching_measures_textured_planes_to_a_fifth_of_a_pixel():
+def test_matching_measures_only_textured_planes_to_a_fifth_of_a_pixel():
     # A wall at 4 m, and a board at 1.5 m in front of its middle.
     camera, width = OnboardCamera(width=848, height=480), 848
     sensor = Stereo(width=width, matching=True)
@@ -244,9 +209,5 @@ def test_matching_measures_textured_planes_to_a_fifth_of_a_pixel():
     assert matched.mean() > 0.9
     assert np.median(errors) < 0.2
     assert np.mean(errors > 1.0) < 0.03  # at the outline of the board
-
-
-def test_matching_measures_nothing_on_a_wall_without_texture():
     gray = np.full((480, 848), 128, np.uint8)
-    found = matched_depth(gray, gray, Stereo(matching=True), OnboardCamera(width=848, height=480))
-    assert not np.isfinite(found).any()
+    assert not np.isfinite(matched_depth(gray, gray, sensor, camera)).any()

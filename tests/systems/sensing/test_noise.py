@@ -110,10 +110,10 @@ def test_exposure_scales_light_within_its_error():
     assert (expose(np.full(3, 250.0), noise, 1.0, np.zeros(3)) == 255.0).all()
 
 
-@pytest.mark.parametrize("electrons", [100.0, 225.0, 300.0])
+@pytest.mark.parametrize("electrons", [100.0, 300.0])
 def test_shot_and_read_noise_have_their_variances(electrons):
     noise = ObservationNoise(full_well=400.0, read_noise=6.0)
-    photons = np.random.default_rng(0).standard_normal((400, 400, 3))
+    photons = np.random.default_rng(0).standard_normal((200, 200, 3))
     level = np.full(photons.shape, 255 * (electrons / 400) ** (1 / 2.2))
     counted = 400 * (expose(level, noise, 0.0, photons) / 255) ** 2.2
     assert counted.mean() == pytest.approx(electrons, rel=2e-3)
@@ -135,7 +135,7 @@ def test_noise_follows_from_seed_and_image_number(image):
 
 def test_no_noise_changes_nothing_and_alpha_is_kept():
     none = ObservationNoise()
-    assert not none.changes_depth and not none.changes_color and not none.is_late
+    assert not (none.changes_depth or none.changes_color or none.is_late)
     np.testing.assert_array_equal(noisy(depth(4.0)), depth(4.0))
     image = ImageRgba8U(8, 6)
     image.mutable_data[:] = np.arange(192).reshape(6, 8, 4)

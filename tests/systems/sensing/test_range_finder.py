@@ -3,13 +3,8 @@ import pytest
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform, RotationMatrix
 
-from splatpilot.systems.collision.shapes import (
-    AnalyticDistanceField,
-    Box,
-    HalfSpace,
-    MovingSpheres,
-)
-from splatpilot.systems.sensing.range_finder import RangeFinder, RangeFinderSensor
+from splatpilot.systems.collision.shapes import AnalyticDistanceField, Box, HalfSpace, MovingSpheres
+from splatpilot.systems.sensing.imu import RangeFinder, RangeFinderSensor
 from splatpilot.systems.splats.baked_scene import MovingGaussians
 from splatpilot.systems.splats.moving_bodies import Bodies, MovingObstacles
 from splatpilot.systems.vehicle.quadrotor_geometry import quadrotor_gaussians
@@ -59,11 +54,3 @@ def test_noise_follows_from_the_seed_and_the_sample():
     assert np.mean(values) == pytest.approx(3.0, abs=0.02)
     first, again, other = (measure(X_WB, seed=seed, noise=0.1) for seed in (4, 4, 5))
     assert first == again != other
-
-
-@pytest.mark.parametrize(
-    ("field", "value"), [("direction", [0.0, 0.0, 0.0]), ("direction", [1.0]), ("max_range", 0.0)]
-)
-def test_invalid_fields_are_named(field, value):
-    with pytest.raises(ValueError, match=rf"RangeFinder\.{field} must be .*, got"):
-        RangeFinder(**{field: value}).validate()

@@ -10,7 +10,7 @@ from torch import Tensor
 ALPHA_CUT = 1 / 255
 MAX_ALPHA = 0.99
 MIN_TRANSMITTANCE = 1e-4
-TILE = 32  # [px]
+SCENE = ("means", "quats", "scales", "opacities", "colors")
 
 
 class Projection(NamedTuple):
@@ -91,18 +91,7 @@ def seen_colors(means: Tensor, colors: Tensor, viewmat: Tensor, sh_degree: int |
 
 
 def project(
-    means,
-    quats,
-    scales,
-    opacities,
-    viewmat,
-    K,
-    width,
-    height,
-    near=0.01,
-    far=1e10,
-    eps2d=0.3,
-    antialiased=False,
+    means, quats, scales, opacities, viewmat, K, width, height, eps2d=0.3, antialiased=False
 ) -> Projection:
     """EWA projection: J R Sigma R^T J^T + eps2d I (Zwicker et al. 2001; Kerbl et al. 2023).
 
@@ -114,7 +103,7 @@ def project(
     factor = rotation_matrices(quats) * scales[:, None, :]
     sigma = R @ (factor @ factor.transpose(1, 2)) @ R.T
     x, y, z = (means @ R.T + t).unbind(1)
-    inside = (z >= near) & (z <= far)
+    inside = z >= 0.01
     z = torch.where(inside, z, 1.0)
 
     # The Jacobian is taken no farther out than 15 % of the image beyond its borders.
@@ -140,70 +129,43 @@ def project(
     return Projection(mean[index], covariance[index], z[index], index, opacities[index])
 
 
+def pixel_centers(width: int, height: int) -> Tensor:
+    """(P, 1, 2) float64, row by row."""
+    v, u = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    return torch.stack([u, v], -1).reshape(-1, 1, 2).double()
+
+
 def composite(projection: Projection, colors: Tensor, width: int, height: int) -> Reference:
     """Front-to-back blending; `colors` (M, 3) in the projection's order."""
     conic = torch.linalg.inv(projection.covariance)
-    reach = 3.5 * torch.sqrt(torch.linalg.eigvalsh(projection.covariance)[:, 1])
-    rows = []
-    for top in range(0, height, TILE):
-        row = []
-        for left in range(0, width, TILE):
-            w, h = min(TILE, width - left), min(TILE, height - top)
-            center = torch.tensor([left + w / 2, top + h / 2])
-            half = torch.tensor([w / 2, h / 2])
-            gap = ((projection.mean - center).abs() - half).amax(1)
-            near = torch.nonzero(gap < reach)[:, 0]
-            v, u = torch.meshgrid(
-                torch.arange(top, top + h) + 0.5, torch.arange(left, left + w) + 0.5, indexing="ij"
-            )
-            pixels = torch.stack([u, v], -1).reshape(-1, 1, 2).to(conic)
-            d = pixels - projection.mean[near]  # (P, G, 2)
-            power = -0.5 * torch.einsum("pgi,gij,pgj->pg", d, conic[near], d)
-            raw = projection.opacity[near] * torch.exp(power)
-            alpha = torch.where(raw >= ALPHA_CUT, raw.clamp(max=MAX_ALPHA), 0.0)
-            after = torch.cumprod(1 - alpha, 1)
-            before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], 1)
-            weight = torch.where(after > MIN_TRANSMITTANCE, alpha * before, 0.0)
+    d = pixel_centers(width, height) - projection.mean  # (P, M, 2)
+    power = -0.5 * torch.einsum("pgi,gij,pgj->pg", d, conic, d)
+    raw = projection.opacity * torch.exp(power)
+    alpha = torch.where(raw >= ALPHA_CUT, raw.clamp(max=MAX_ALPHA), 0.0)
+    after = torch.cumprod(1 - alpha, 1)
+    before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], 1)
+    weight = torch.where(after > MIN_TRANSMITTANCE, alpha * before, 0.0)
 
-            met = before > MIN_TRANSMITTANCE
-            margins = torch.where(met, (raw / ALPHA_CUT - 1).abs(), torch.inf)
-            stops = torch.where(met, (after / MIN_TRANSMITTANCE - 1).abs(), torch.inf)
-            infinite = torch.full((len(pixels), 1), torch.inf)
-            margin = torch.cat([margins, stops, infinite], 1).amin(1)
-            values = [
-                weight @ colors[near],
-                (weight @ projection.depth[near])[:, None],
-                weight.sum(1, keepdim=True),
-                margin[:, None],
-            ]
-            row.append(torch.cat(values, 1).reshape(h, w, 6))
-        rows.append(torch.cat(row, 1))
-    image = torch.cat(rows, 0)
-    return Reference(image[..., :3], image[..., 3], image[..., 4], image[..., 5])
+    met = before > MIN_TRANSMITTANCE
+    margins = torch.minimum((raw / ALPHA_CUT - 1).abs(), (after / MIN_TRANSMITTANCE - 1).abs())
+    margin = torch.where(met, margins, torch.inf).amin(1)
+    images = weight @ colors, weight @ projection.depth, weight.sum(1), margin
+    return Reference(*(image.reshape(height, width, *image.shape[1:]) for image in images))
 
 
-def render(
-    means,
-    quats,
-    scales,
-    opacities,
-    colors,
-    viewmat,
-    K,
-    width,
-    height,
-    sh_degree=None,
-    background=(0.0, 0.0, 0.0),
-    **projection_options,
-) -> Reference:
-    means, quats, scales, opacities, colors, viewmat, K = (
-        a.double() for a in (means, quats, scales, opacities, colors, viewmat, K)
-    )
-    p = project(means, quats, scales, opacities, viewmat, K, width, height, **projection_options)
+def first_view(scene: dict[str, Any], dtype=torch.float64) -> list[Tensor]:
+    """The arrays of `SCENE`, and the pose and the intrinsics of the first camera."""
+    arrays = [scene[name] for name in SCENE]
+    return [a.to(dtype) for a in (*arrays, scene["viewmats"][0], scene["Ks"][0])]
+
+
+def render(scene: dict[str, Any], width: int, height: int, sh_degree=None, **options) -> Reference:
+    means, quats, scales, opacities, colors, viewmat, K = first_view(scene)
+    p = project(means, quats, scales, opacities, viewmat, K, width, height, **options)
     seen = seen_colors(means[p.ids], colors[p.ids], viewmat, sh_degree)
     result = composite(p, seen, width, height)
-    behind = (1 - result.alpha)[..., None] * torch.as_tensor(background, dtype=torch.float64)
-    return result._replace(color=result.color + behind)
+    behind = scene.get("backgrounds", torch.zeros(1, 3))[0].double()
+    return result._replace(color=result.color + (1 - result.alpha)[..., None] * behind)
 
 
 BLUR = 0.3  # [px^2]
@@ -211,9 +173,7 @@ MARGIN = 1e-8  # [px^2]
 REACH = 3.33  # standard deviations
 
 
-def median_depth(
-    means, quats, scales, opacities, viewmat, K, width, height
-) -> tuple[Tensor, Tensor]:
+def median_depth(scene: dict[str, Any], width: int, height: int) -> tuple[Tensor, Tensor]:
     """Returns the depth (H, W) [m] where transmittance without blur falls to one half, else 0.
 
     On a Gaussian with the covariance S about c, in the camera frame, the depth is where the ray d
@@ -222,8 +182,7 @@ def median_depth(
     that is farther than the center, a distance on the image counts as much longer. Also returns
     the relative distance (H, W) of alpha or transmittance to a threshold.
     """
-    arguments = (a.double() for a in (means, quats, scales, opacities, viewmat, K))
-    means, quats, scales, opacities, viewmat, K = arguments
+    means, quats, scales, opacities, _, viewmat, K = first_view(scene)
     visible = project(means, quats, scales, opacities, viewmat, K, width, height, eps2d=BLUR)
     sharp = visible.covariance + (MARGIN - BLUR) * torch.eye(2, dtype=torch.float64)
     conic = torch.linalg.inv(sharp)
@@ -233,8 +192,7 @@ def median_depth(
     factor = R @ rotation_matrices(quats[visible.ids]) * scales[visible.ids][:, None, :]
     covariance = factor @ factor.transpose(1, 2)
     n = torch.linalg.solve(covariance, p_C[..., None])[..., 0]
-    v, u = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
-    pixels = torch.stack([u, v], -1).reshape(-1, 1, 2).double()
+    pixels = pixel_centers(width, height)
     slope = n[:, :2] / torch.stack([K[0, 0], K[1, 1]]) / (n * p_C).sum(1, keepdim=True)  # (M, 2)
     spread = torch.einsum("gi,gij,gj->g", slope, sharp, slope).sqrt()
     turn = (0.9 / p_C[:, 2] / (REACH * spread)).clamp(max=1)

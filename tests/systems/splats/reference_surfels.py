@@ -2,13 +2,15 @@
 the homography H from a surfel's plane to the image, the ray as the intersection of two planes
 mapped back by H^T, and the larger of the two Gaussians."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from reference_rasterizer import (
     ALPHA_CUT,
     MAX_ALPHA,
     MIN_TRANSMITTANCE,
+    first_view,
+    pixel_centers,
     rotation_matrices,
     seen_colors,
 )
@@ -29,27 +31,12 @@ class Reference(NamedTuple):
 
 
 def render(
-    means,
-    quats,
-    scales,
-    opacities,
-    colors,
-    viewmat,
-    K,
-    width,
-    height,
-    near=0.01,
-    far=1e10,
-    sh_degree=None,
-    background=(0.0, 0.0, 0.0),
-    dtype=torch.float64,
+    scene: dict[str, Any], width: int, height: int, near=0.01, sh_degree=None, dtype=torch.float64
 ) -> Reference:
-    means, quats, scales, opacities, colors, viewmat, K = (
-        a.to(dtype) for a in (means, quats, scales, opacities, colors, viewmat, K)
-    )
+    means, quats, scales, opacities, colors, viewmat, K = first_view(scene, dtype)
     R, t = viewmat[:3, :3], viewmat[:3, 3]
     p_C = means @ R.T + t
-    index = torch.nonzero((p_C[:, 2] >= near) & (p_C[:, 2] <= far))[:, 0]
+    index = torch.nonzero(p_C[:, 2] >= near)[:, 0]
     index = index[torch.argsort(p_C[index, 2], stable=True)]
     p_C, axes_W, opacity = p_C[index], rotation_matrices(quats[index]), opacities[index]
     tangents_C = R @ axes_W[:, :, :2]  # (M, 3, 2)
@@ -63,8 +50,7 @@ def render(
     center = (p_C @ K.T)[:, :2] / p_C[:, 2:]
 
     seen = seen_colors(means[index], colors[index], viewmat, sh_degree)
-    y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
-    x, y = x.reshape(-1, 1).to(dtype), y.reshape(-1, 1).to(dtype)  # (P, 1)
+    x, y = pixel_centers(width, height).to(dtype).unbind(-1)  # (P, 1)
     # The planes of the pixel's column and row, in the surfel's coordinates; a ray lies in both.
     h_u = x[..., None] * H[:, 2] - H[:, 0]  # (P, M, 3)
     h_v = y[..., None] * H[:, 2] - H[:, 1]
@@ -106,14 +92,8 @@ def render(
     ).amin(0)
     margin = torch.cat([margin, torch.inf * ones], 1).amin(1)
     total = weight.sum(1)
-    color = weight @ seen + (1 - total)[:, None] * torch.tensor(background, dtype=dtype)
-    shape = (height, width)
-    return Reference(
-        color.reshape(*shape, 3),
-        total.reshape(shape),
-        (weight @ normal_W).reshape(*shape, 3),
-        (weight * depth).sum(1).reshape(shape),
-        median.reshape(shape),
-        distort.reshape(shape),
-        margin.reshape(shape),
-    )
+    behind = scene.get("backgrounds", torch.zeros(1, 3))[0].to(dtype)
+    color = weight @ seen + (1 - total)[:, None] * behind
+    depths = (weight * depth).sum(1), median, distort, margin
+    images = color, total, weight @ normal_W, *depths
+    return Reference(*(image.reshape(height, width, *image.shape[1:]) for image in images))

@@ -3,7 +3,7 @@ import math
 import cv2
 import numpy as np
 import pytest
-from baked_scenes import random_scene
+from baked_scenes import plane, plane_depth, random_scene
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.sensors import CameraInfo
 
@@ -12,14 +12,12 @@ from splatpilot.systems.sensing.time_of_flight import equivalent_sensor
 from splatpilot.systems.splats.background import EnvironmentMap
 from splatpilot.systems.splats.baked_scene import BakedScene
 from splatpilot.systems.splats.lens import Distortion, pixel_slopes
-from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.splats.splat_camera import SplatCamera
 
 WIDTH, HEIGHT = 160, 120
 FISHEYE = Distortion("fisheye", [0.04, -0.012, 0.005, -0.001])
 BARREL = Distortion("opencv", [-0.28, 0.09, -0.012, 0.03, 0.01, 0.002], [0.003, -0.002])
 FEW = Distortion("opencv", [-0.2, 0.05])
-LENSES = (FISHEYE, BARREL, FEW)
 K = np.array([[110.0, 0, 78.0], [0, 105.0, 61.0], [0, 0, 1]])
 # A fisheye whose image circle lies in the image.
 K_CIRCLE = np.array([[45.0, 0, 78.0], [0, 45.0, 61.0], [0, 0, 1]])
@@ -35,24 +33,7 @@ def opencv_pixels(lens: Distortion, p_C: np.ndarray) -> np.ndarray:
     return cv2.projectPoints(p_C, none, none, K, coefficients)[0][:, 0]
 
 
-def wall(n_W: np.ndarray, offset: float) -> GaussianScene:
-    u, v = np.meshgrid(np.arange(-4.0, 4.0, 0.04), np.arange(-4.0, 4.0, 0.04))
-    x, y = u.ravel(), v.ravel()
-    z = (offset - n_W[0] * x - n_W[1] * y) / n_W[2]
-    count = len(x)
-    turn = np.cross([0.0, 0.0, 1.0], n_W)
-    quat = np.array([1.0 + n_W[2], *turn])
-    arrays = (
-        np.stack([x, y, z], -1),
-        np.tile(quat / np.linalg.norm(quat), (count, 1)),
-        np.tile([0.04, 0.04, 1e-4], (count, 1)),
-        np.full(count, 0.95),
-        np.zeros((count, 1, 3)),
-    )
-    return GaussianScene(*(a.astype(np.float32) for a in arrays))
-
-
-@pytest.mark.parametrize("lens", LENSES, ids=lambda lens: f"{lens.model}{len(lens.radial)}")
+@pytest.mark.parametrize("lens", [FISHEYE, BARREL, FEW])
 def test_points_are_where_opencv_has_them(lens):
     slopes = np.random.default_rng(0).uniform(-0.8, 0.8, (500, 2))
     points = lens.project(slopes)
@@ -71,36 +52,34 @@ def test_pixels_beyond_the_lens_look_nowhere():
     assert np.isnan(folding.project(np.array([1.1, 0.0]))).all()
 
 
-@pytest.mark.parametrize("lens", [FISHEYE, BARREL], ids=lambda lens: lens.model)
+@pytest.mark.parametrize("lens", [None, FISHEYE, BARREL])
 def test_depth_of_a_plane_is_that_of_the_rays(lens):
-    n_W = RollPitchYaw(0.3, -0.4, 0.0).ToRotationMatrix().matrix()[:, 2]
-    view = BakedScene(wall(n_W, 2.0)).render(K, WIDTH, HEIGHT, RigidTransform(), distortion=lens)
-    slopes = pixel_slopes(lens, K, WIDTH, HEIGHT)
-    expected = 2.0 / (slopes @ n_W[:2] + n_W[2])
+    R_CP = RollPitchYaw(0.3, -0.4, 0.0).ToRotationMatrix()
+    X_CP = RigidTransform(R_CP, 2.0 * R_CP.matrix()[:, 2])
+    camera = K * [[0.5], [0.5], [1.0]], WIDTH // 2, HEIGHT // 2
+    depth = BakedScene(plane(X_CP, 6.0, step=0.08)).render_depth(
+        *camera, RigidTransform(), distortion=lens
+    )
+    slopes = pixel_slopes(lens, *camera)
+    expected = plane_depth(X_CP, slopes)
     x, y = expected * slopes[..., 0], expected * slopes[..., 1]
     inside = (expected > 0) & (np.maximum(np.abs(x), np.abs(y)) < 3.8)
     assert inside.mean() > 0.5
-    error = np.abs(view.depth / expected - 1)[inside]
+    error = np.abs(depth / expected - 1)[inside]
     assert np.median(error) < 1e-3
     assert np.quantile(error, 0.99) < 0.01
 
 
 def test_only_what_the_lens_shows_is_drawn():
     scene = random_scene(2000, seed=1, sh_degree=0)
-    scene = scene.transformed_by(RigidTransform([0, 0, 4.0]))
-    images = []
-    for threads in (1, 3):
-        camera = SplatCamera(
-            BakedScene(scene, threads),
-            CameraInfo(WIDTH, HEIGHT, 45.0, 45.0, 78.0, 61.0),
-            background=EnvironmentMap(np.ones((4, 8, 3), np.float32)),
-            distortion=FISHEYE,
-        )
-        images.append(camera.render(RigidTransform()))
-    for one, other in zip(*images, strict=True):
-        np.testing.assert_array_equal(one, other)
+    camera = SplatCamera(
+        scene.transformed_by(RigidTransform([0, 0, 4.0])),
+        CameraInfo(WIDTH, HEIGHT, 45.0, 45.0, 78.0, 61.0),
+        background=EnvironmentMap(np.ones((4, 8, 3), np.float32)),
+        distortion=FISHEYE,
+    )
+    view = camera.render(RigidTransform())
     shown = np.isfinite(pixel_slopes(FISHEYE, K_CIRCLE, WIDTH, HEIGHT)[..., 0])
-    view = images[0]
     assert (view.color[~shown] == 0).all() and (view.alpha[~shown] == 0).all()
     assert (view.depth[~shown] == 0).all()
     # The map is white, and pixels without Gaussians show it.
@@ -115,9 +94,7 @@ def test_onboard_cameras_have_lenses():
     slopes = pixel_slopes(FISHEYE, info.intrinsic_matrix(), WIDTH, HEIGHT)
     half_pixel = abs(slopes[60, 1, 0] - slopes[60, 0, 0])
     assert slopes[60, 0, 0] == pytest.approx(-math.tan(math.radians(75.0)), abs=half_pixel)
-    with pytest.raises(
-        ValueError, match=r"fov_x must be below 170\.0 deg, the limit of the lens, got 170"
-    ):
+    with pytest.raises(ValueError, match=r"fov_x must be below 170\.0 deg, .* got 170"):
         OnboardCamera(fov_x=170.0, distortion=FISHEYE).validate()
     with pytest.raises(ValueError, match="distortion must be left out"):
         equivalent_sensor(camera)

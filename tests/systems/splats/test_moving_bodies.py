@@ -19,7 +19,6 @@ from splatpilot.systems.vehicle.quadrotor_geometry import quadrotor_gaussians
 R_BC = RotationMatrix(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]))
 INFO = CameraInfo(64, 48, 60.0, 60.0, 32.0, 24.0)
 FIELD = AnalyticDistanceField([HalfSpace([0, 0, 1], -50.0)], np.full(3, -60.0), np.full(3, 60.0))
-ROW = [0.0, 1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
 
 
 def obstacle(path: np.ndarray, radius: float = 0.5) -> MovingObstacles:
@@ -27,8 +26,9 @@ def obstacle(path: np.ndarray, radius: float = 0.5) -> MovingObstacles:
     return MovingObstacles(spheres, MovingGaussians([quadrotor_gaussians()], spheres.centers))
 
 
-def two_bodies():
-    """A camera and a distance at the origin, with a vehicle whose pose is an input."""
+@pytest.fixture(scope="module")
+def evaluate():
+    """Evaluates a port of a camera or a distance at the origin, with a body at a pose."""
     builder = DiagramBuilder()
     moving = builder.AddSystem(MovingBodies())
     camera = builder.AddSystem(SplatCamera(wall(0, 5.0, reach=20.0), INFO, RigidTransform(R_BC)))
@@ -37,50 +37,40 @@ def two_bodies():
     for system in (camera, collision):
         builder.Connect(moving.moving_output_port(), system.GetInputPort("moving"))
     builder.ExportInput(pose, "other")
-    builder.ExportInput(camera.GetInputPort("body_pose"), "body_pose")
-    builder.ExportInput(collision.GetInputPort("state"), "state")
-    for name in ("color_image", "depth_image_32f", "label_image"):
-        builder.ExportOutput(camera.GetOutputPort(name), name)
-    for name in ("distance", "in_collision"):
-        builder.ExportOutput(collision.GetOutputPort(name), name)
     diagram = builder.Build()
     context = diagram.CreateDefaultContext()
-    diagram.GetInputPort("body_pose").FixValue(context, RigidTransform())
-    diagram.GetInputPort("state").FixValue(context, hover_state([0.0, 0.0, 0.0]))
-    return diagram, context
+    for system, name, value in (
+        (camera, "body_pose", RigidTransform()),
+        (collision, "state", hover_state([0.0, 0.0, 0.0])),
+    ):
+        system.GetInputPort(name).FixValue(system.GetMyContextFromRoot(context), value)
+
+    def evaluated(X_WO: RigidTransform, port: str):
+        diagram.GetInputPort("other").FixValue(context, X_WO)
+        system = camera if camera.HasOutputPort(port) else collision
+        return system.GetOutputPort(port).Eval(system.GetMyContextFromRoot(context))
+
+    return evaluated
 
 
 @pytest.mark.parametrize(("x", "collides"), [(2.0, False), (0.7, True)])
-def test_a_body_with_a_pose_is_seen_labeled_and_hit(x, collides):
-    diagram, context = two_bodies()
+def test_a_body_with_a_pose_is_seen_labeled_and_hit(evaluate, x, collides):
     X_WO = RigidTransform(RotationMatrix.MakeYRotation(np.pi / 2), [x, 0.0, 0.0])
-    diagram.GetInputPort("other").FixValue(context, X_WO)
-    depth = diagram.GetOutputPort("depth_image_32f").Eval(context).data[..., 0]
-    labels = diagram.GetOutputPort("label_image").Eval(context).data[..., 0]
+    depth = evaluate(X_WO, "depth_image_32f").data[..., 0]
+    labels = evaluate(X_WO, "label_image").data[..., 0]
     assert depth[24, 32] == pytest.approx(x - 0.1 * VEHICLE_RADIUS, abs=0.1)
     assert depth[0, 0] == pytest.approx(5.0, abs=0.01)
     shown = depth < 4.0
     assert shown.sum() > 40
     np.testing.assert_array_equal(labels == 0, shown)
     assert (labels[~shown] == int(RenderLabel.kUnspecified)).all()
-    distance = diagram.GetOutputPort("distance").Eval(context)[0]
-    assert distance == pytest.approx(x - VEHICLE_RADIUS)
-    assert diagram.GetOutputPort("in_collision").Eval(context)[0] == collides
+    assert evaluate(X_WO, "distance")[0] == pytest.approx(x - VEHICLE_RADIUS)
+    assert evaluate(X_WO, "in_collision")[0] == collides
 
 
-def test_a_body_behind_a_surface_has_no_label():
-    diagram, context = two_bodies()
-    diagram.GetInputPort("other").FixValue(context, RigidTransform([6.0, 0.0, 0.0]))
-    labels = diagram.GetOutputPort("label_image").Eval(context).data
+def test_a_body_behind_a_surface_has_no_label(evaluate):
+    labels = evaluate(RigidTransform([6.0, 0.0, 0.0]), "label_image").data
     assert (labels == int(RenderLabel.kUnspecified)).all()
-
-
-def test_bodies_follow_their_poses_without_a_new_build():
-    diagram, context = two_bodies()
-    for x in (1.0, 2.0, 3.0):
-        diagram.GetInputPort("other").FixValue(context, RigidTransform([x, 0.0, 0.0]))
-        distance = diagram.GetOutputPort("distance").Eval(context)[0]
-        assert distance == pytest.approx(x - VEHICLE_RADIUS)
 
 
 class Flyby(LeafSystem):
@@ -111,7 +101,8 @@ def test_poses_are_remembered_and_predicted():
 def test_obstacles_and_bodies_are_together():
     obstacles = obstacle(np.array([[0.0, 3.0, 0.0], [1.0, 3.0, 0.0]]))
     both = obstacles.merged_with(obstacle(np.array([[0.0, -3.0, 0.0]]), 0.25))
-    bodies = Bodies(1.0, both, (Track(quadrotor_gaussians(), 0.3, np.array([ROW])),))
+    row = [0.0, 1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
+    bodies = Bodies(1.0, both, (Track(quadrotor_gaussians(), 0.3, np.array([row])),))
     np.testing.assert_array_equal(bodies.centers(1.0), [[1, 3, 0], [0, -3, 0], [1, 0, 0]])
     np.testing.assert_array_equal(bodies.radii, [0.5, 0.25, 0.3])
     assert len(bodies.gaussians(1.0).means) == 3 * len(quadrotor_gaussians())
@@ -122,11 +113,10 @@ def test_obstacles_and_bodies_are_together():
 
 def test_invalid_bodies_are_refused():
     moving = MovingBodies()
-    with pytest.raises(ValueError, match=r"radius must be in \[0, inf\) m, got -1"):
-        moving.DeclareBody("a", quadrotor_gaussians(), -1)
     moving.DeclareBody("a", quadrotor_gaussians(), 0.3)
-    with pytest.raises(ValueError, match="name must be new among the bodies, got 'a'"):
-        moving.DeclareBody("a", quadrotor_gaussians(), 0.3)
+    for radius, message in ((-1, r"in \[0, inf\) m, got -1"), (0.3, "new among .* got 'a'")):
+        with pytest.raises(ValueError, match=message):
+            moving.DeclareBody("a", quadrotor_gaussians(), radius)
 
 
 def test_the_quadrotor_of_gaussians_fits_its_sphere():

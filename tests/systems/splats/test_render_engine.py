@@ -3,36 +3,13 @@ import copy
 import baked_scenes
 import numpy as np
 import pytest
-from pydrake.geometry import (
-    Box,
-    ClippingRange,
-    ColorRenderCamera,
-    DepthRange,
-    DepthRenderCamera,
-    FramePoseVector,
-    GeometryFrame,
-    GeometryId,
-    GeometryInstance,
-    MakeRenderEngineVtk,
-    PerceptionProperties,
-    RenderCameraCore,
-    RenderEngine,
-    RenderEngineVtkParams,
-    RenderLabel,
-    Rgba,
-    SceneGraph,
-)
+from pydrake import geometry
+from pydrake.geometry import Box, GeometryId, RenderEngine, RenderEngineVtkParams, RenderLabel
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
+from pydrake.systems import sensors
 from pydrake.systems.framework import DiagramBuilder
-from pydrake.systems.sensors import (
-    CameraInfo,
-    ImageDepth32F,
-    ImageLabel16I,
-    ImageRgba8U,
-    RgbdSensor,
-)
 
 from splatpilot.systems.collision.shapes import MovingSpheres
 from splatpilot.systems.splats.background import EnvironmentMap, pixel_rays
@@ -49,12 +26,15 @@ from splatpilot.systems.splats.splat_camera import SplatCamera
 pytestmark = pytest.mark.usefixtures("opengl")
 
 WIDTH, HEIGHT = 32, 24
-INFO = CameraInfo(WIDTH, HEIGHT, fov_y=np.pi / 2)
+INFO = sensors.CameraInfo(WIDTH, HEIGHT, fov_y=np.pi / 2)
 BACKGROUND = (0.2, 0.4, 0.6)
 BOX_LABEL = RenderLabel(7)
 UNSPECIFIED, EMPTY = int(RenderLabel.kUnspecified), int(RenderLabel.kEmpty)
-CENTER = HEIGHT // 2, WIDTH // 2
-CORNER = 1, 1
+CENTER, CORNER, OTHER_CORNER = (HEIGHT // 2, WIDTH // 2), (1, 1), (1, WIDTH - 2)
+CORE = geometry.RenderCameraCore(
+    "splats", INFO, geometry.ClippingRange(0.01, 100.0), RigidTransform()
+)
+COLOR_CAMERA = geometry.ColorRenderCamera(CORE)
 
 
 class CountingScene(BakedScene):
@@ -69,45 +49,42 @@ def wall(z: float, opacity: float = 0.99) -> CountingScene:
     return CountingScene(baked_scenes.wall(2, z, opacity))
 
 
-def core(near: float = 0.01, far: float = 100.0, name: str = "splats") -> RenderCameraCore:
-    return RenderCameraCore(name, INFO, ClippingRange(near, far), RigidTransform())
+def depth_camera(min_depth: float = 0.1, max_depth: float = 50.0) -> geometry.DepthRenderCamera:
+    return geometry.DepthRenderCamera(CORE, geometry.DepthRange(min_depth, max_depth))
 
 
-COLOR_CAMERA = ColorRenderCamera(core())
+def rgbd_sensor() -> sensors.RgbdSensor:
+    world = geometry.SceneGraph.world_frame_id()
+    return sensors.RgbdSensor(world, RigidTransform(), COLOR_CAMERA, depth_camera())
 
 
-def depth_camera(min_depth: float = 0.1, max_depth: float = 50.0) -> DepthRenderCamera:
-    return DepthRenderCamera(core(), DepthRange(min_depth, max_depth))
-
-
-def green() -> PerceptionProperties:
-    properties = PerceptionProperties()
-    properties.AddProperty("phong", "diffuse", Rgba(0, 1, 0, 1))
+def green() -> geometry.PerceptionProperties:
+    properties = geometry.PerceptionProperties()
+    properties.AddProperty("phong", "diffuse", geometry.Rgba(0, 1, 0, 1))
     properties.AddProperty("label", "id", BOX_LABEL)
     return properties
 
 
 def add_box(engine: RenderEngine, z: float) -> GeometryId:
     id = GeometryId.get_new_id()
-    X_WG = RigidTransform([0, 0, z + 0.5])
-    assert engine.RegisterVisual(id, Box(1, 1, 1), green(), X_WG, True)
+    assert engine.RegisterVisual(id, Box(1, 1, 1), green(), RigidTransform([0, 0, z + 0.5]), True)
     return id
 
 
 def color(engine: RenderEngine) -> np.ndarray:
-    image = ImageRgba8U(WIDTH, HEIGHT)
+    image = sensors.ImageRgba8U(WIDTH, HEIGHT)
     engine.RenderColorImage(COLOR_CAMERA, image)
     return image.data.astype(int)
 
 
-def depth(engine: RenderEngine, camera: DepthRenderCamera | None = None) -> np.ndarray:
-    image = ImageDepth32F(WIDTH, HEIGHT)
-    engine.RenderDepthImage(camera or depth_camera(), image)
+def depth(engine: RenderEngine, *depth_range: float) -> np.ndarray:
+    image = sensors.ImageDepth32F(WIDTH, HEIGHT)
+    engine.RenderDepthImage(depth_camera(*depth_range), image)
     return image.data[..., 0].copy()
 
 
 def label(engine: RenderEngine) -> np.ndarray:
-    image = ImageLabel16I(WIDTH, HEIGHT)
+    image = sensors.ImageLabel16I(WIDTH, HEIGHT)
     engine.RenderLabelImage(COLOR_CAMERA, image)
     return image.data[..., 0].copy()
 
@@ -120,45 +97,39 @@ def is_orange(rgba: np.ndarray) -> bool:
     return bool(np.allclose(rgba, [255, 127.5, 0, 255], atol=4))
 
 
-def test_box_before_the_wall_is_seen():
+def test_box_before_the_wall_is_seen_in_the_depth_range():
     engine = SplatRenderEngine(wall(4.0), background=BACKGROUND)
     add_box(engine, 2.0)
     assert is_green(color(engine)[CENTER]) and is_orange(color(engine)[CORNER])
-    assert depth(engine)[CENTER] == pytest.approx(2.0, abs=1e-4)
-    assert depth(engine)[CORNER] == pytest.approx(4.0, rel=2e-3)
     assert label(engine)[CENTER] == int(BOX_LABEL) and label(engine)[CORNER] == UNSPECIFIED
+    for depth_range, center, corner in (
+        ((0.1, 50.0), 2.0, 4.0),
+        ((3.0, 5.0), 0.0, 4.0),
+        ((0.1, 3.0), 2.0, np.inf),
+        ((5.0, 9.0), 0.0, 0.0),
+        ((0.1, 1.0), np.inf, np.inf),
+    ):
+        image = depth(engine, *depth_range)
+        assert image[CENTER] == pytest.approx(center, abs=1e-4)
+        assert image[CORNER] == pytest.approx(corner, rel=2e-3)
 
 
 def test_depth_is_the_minimum():
     engine = SplatRenderEngine(wall(4.0))
-    alone = MakeRenderEngineVtk(RenderEngineVtkParams())
+    alone = geometry.MakeRenderEngineVtk(RenderEngineVtkParams())
     for target in (engine, alone):
-        id = GeometryId.get_new_id()
         # This rotated box pierces the wall.
         X_WG = RigidTransform(RotationMatrix.MakeYRotation(0.6), [0.3, 0, 4.5])
-        target.RegisterVisual(id, Box(2, 2, 2), green(), X_WG, True)
-    camera = SplatCamera(wall(4.0), INFO, min_depth=0.1, max_depth=50.0)
-    context = camera.CreateDefaultContext()
-    camera.GetInputPort("body_pose").FixValue(context, RigidTransform())
-    splats = camera.GetOutputPort("depth_image_32f").Eval(context).data[..., 0]
+        target.RegisterVisual(GeometryId.get_new_id(), Box(2, 2, 2), green(), X_WG, True)
+    splats = SplatCamera(wall(4.0), INFO).render(RigidTransform()).depth
     shapes = depth(alone)
     assert np.any(shapes < splats) and np.any(shapes > splats)
     np.testing.assert_array_equal(depth(engine), np.minimum(shapes, splats))
 
 
-def test_out_of_range_reads_as_in_drake():
-    engine = SplatRenderEngine(wall(4.0))
-    add_box(engine, 2.0)
-    assert depth(engine, depth_camera(3.0, 5.0))[CENTER] == 0.0
-    assert depth(engine, depth_camera(0.1, 3.0))[CENTER] == pytest.approx(2.0, abs=1e-4)
-    assert depth(engine, depth_camera(0.1, 3.0))[CORNER] == np.inf
-    assert np.all(depth(engine, depth_camera(5.0, 9.0)) == 0.0)
-    assert np.all(depth(engine, depth_camera(0.1, 1.0)) == np.inf)
-
-
 def test_nothing_in_view_is_background():
     params = RenderEngineVtkParams(default_clear_color=[1, 0, 1])
-    engine = SplatRenderEngine(wall(-4.0), MakeRenderEngineVtk(params))
+    engine = SplatRenderEngine(wall(-4.0), geometry.MakeRenderEngineVtk(params))
     assert np.all(color(engine) == [255, 0, 255, 255])
     engine = SplatRenderEngine(wall(-4.0), background=BACKGROUND)
     assert np.all(color(engine) == [51, 102, 153, 255])
@@ -179,33 +150,22 @@ def test_shapes_shine_through_thin_gaussians():
     assert label(engine)[CENTER] == int(BOX_LABEL) and label(engine)[CORNER] == EMPTY
 
 
-def test_removed_shape_is_gone_and_can_come_back():
-    engine = SplatRenderEngine(wall(4.0))
-    id = add_box(engine, 2.0)
-    assert depth(engine)[CENTER] < 3
-    assert engine.RemoveGeometry(id) and not engine.has_geometry(id)
-    assert not engine.RemoveGeometry(id)
-    assert depth(engine)[CENTER] == pytest.approx(4.0, rel=2e-3)
-    engine.RegisterVisual(id, Box(1, 1, 1), green(), RigidTransform([0, 0, 3.5]), True)
-    assert depth(engine)[CENTER] == pytest.approx(3.0, abs=1e-4)
-
-
 @pytest.mark.parametrize("duplicate", [copy.deepcopy, RenderEngine.Clone])
 def test_copies_share_the_scene_and_nothing_else(duplicate):
     engine = SplatRenderEngine(wall(4.0))
     id = add_box(engine, 2.0)
     other = duplicate(engine)
     assert isinstance(other, SplatRenderEngine) and other.scene is engine.scene
-    assert other.has_geometry(id)
     for image in (color, depth, label):
         np.testing.assert_array_equal(image(other), image(engine))
     other.UpdateViewpoint(RigidTransform([0, 0, 1.0]))
     assert depth(other)[CENTER] == pytest.approx(1.0, abs=1e-4)
-    assert other.RemoveGeometry(id)
+    assert other.RemoveGeometry(id) and not other.has_geometry(id)
+    assert not other.RemoveGeometry(id)
     assert depth(other)[CENTER] == pytest.approx(3.0, rel=2e-3)
     assert depth(engine)[CENTER] == pytest.approx(2.0, abs=1e-4)
-    assert engine.RemoveGeometry(id)
-    assert depth(engine)[CENTER] == pytest.approx(4.0, rel=2e-3)
+    other.RegisterVisual(id, Box(1, 1, 1), green(), RigidTransform([0, 0, 3.5]), True)
+    assert depth(other)[CENTER] == pytest.approx(2.0, abs=1e-4)
 
 
 def test_an_environment_is_behind_everything():
@@ -228,82 +188,55 @@ def test_background_must_be_a_color(background):
         SplatRenderEngine(wall(4.0), background=background)
 
 
-def test_rgbd_sensor_in_a_diagram():
+def test_rgbd_sensor_sees_moving_and_anchored_shapes_that_accept_the_renderer():
     scene = wall(4.0)
     builder = DiagramBuilder()
-    scene_graph = builder.AddSystem(SceneGraph())
+    plant, scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=0.0)
     scene_graph.AddRenderer("splats", SplatRenderEngine(scene))
+    visual = """
+        <visual name='{name}'>
+          <origin xyz='{x} -2 3.5'/><geometry><box size='2 2 1'/></geometry>
+          <drake:accepting_renderer name='{name}'/>
+        </visual>"""
+    visuals = visual.format(name="splats", x=-3) + visual.format(name="other", x=3)
+    urdf = f"<robot name='props'><link name='world'>{visuals}</link></robot>"
+    Parser(plant).AddModelsFromString(urdf, "urdf")
+    plant.Finalize()
     source = scene_graph.RegisterSource("test")
-    frame = scene_graph.RegisterFrame(source, GeometryFrame("moving"))
-    moving = GeometryInstance(RigidTransform([0, 0, 0.5]), Box(1, 1, 1), "moving")
+    frame = scene_graph.RegisterFrame(source, geometry.GeometryFrame("moving"))
+    moving = geometry.GeometryInstance(RigidTransform([0, 0, 0.5]), Box(1, 1, 1), "moving")
     moving.set_perception_properties(green())
     scene_graph.RegisterGeometry(source, frame, moving)
-    anchored = GeometryInstance(RigidTransform([-3.0, -2.0, 3.5]), Box(2, 2, 1), "anchored")
-    anchored.set_perception_properties(green())
-    scene_graph.RegisterAnchoredGeometry(source, anchored)
-    sensor = builder.AddSystem(
-        RgbdSensor(SceneGraph.world_frame_id(), RigidTransform(), COLOR_CAMERA, depth_camera())
-    )
+    sensor = builder.AddSystem(rgbd_sensor())
     builder.Connect(scene_graph.get_query_output_port(), sensor.query_object_input_port())
     builder.ExportInput(scene_graph.get_source_pose_port(source), "poses")
     diagram = builder.Build()
     root = diagram.CreateDefaultContext()
-    context = sensor.GetMyContextFromRoot(root)
-
-    def see(z: float) -> dict[str, np.ndarray]:
-        poses = FramePoseVector()
+    for z, box_is_seen in ((2.0, True), (3.0, True), (6.0, False)):
+        poses = geometry.FramePoseVector()
         poses.set_value(frame, RigidTransform([0, 0, z]))
         diagram.GetInputPort("poses").FixValue(root, poses)
-        names = "color_image", "depth_image_32f", "depth_image_16u", "label_image"
-        return {name: sensor.GetOutputPort(name).Eval(context).data.copy() for name in names}
-
-    for z, box_is_seen in ((2.0, True), (3.0, True), (6.0, False)):
-        images = see(z)
-        assert is_green(images["color_image"][CENTER]) == box_is_seen
-        assert (images["label_image"][CENTER] == int(BOX_LABEL)) == box_is_seen
-        meters = images["depth_image_32f"][..., 0]
+        rgb, meters, millimeters, labels = (
+            sensor.GetOutputPort(name).Eval(sensor.GetMyContextFromRoot(root)).data.squeeze()
+            for name in ("color_image", "depth_image_32f", "depth_image_16u", "label_image")
+        )
+        assert is_green(rgb[CENTER]) == box_is_seen
+        assert (labels[CENTER] == int(BOX_LABEL)) == box_is_seen
         assert meters[CENTER] == pytest.approx(z if box_is_seen else 4.0, rel=2e-3)
         assert meters[CORNER] == pytest.approx(3.0, rel=1e-4)
-        np.testing.assert_allclose(images["depth_image_16u"][..., 0], meters * 1000, atol=1)
+        assert meters[OTHER_CORNER] == pytest.approx(4.0, rel=2e-3)
+        np.testing.assert_allclose(millimeters, meters * 1000, atol=1)
     assert scene.renders == 1
 
 
-def test_shapes_that_name_their_renderer():
-    builder = DiagramBuilder()
-    plant, scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=0.0)
-    scene_graph.AddRenderer("splats", SplatRenderEngine(wall(4.0)))
-    visual = """
-        <visual name='{name}'>
-          <origin xyz='{x} 0 2.5'/>
-          <geometry><box size='1 1 1'/></geometry>
-          <drake:accepting_renderer name='{name}'/>
-        </visual>"""
-    Parser(plant).AddModelsFromString(
-        "<robot name='props'><link name='world'>"
-        + visual.format(name="splats", x=0)
-        + visual.format(name="other", x=-2)
-        + "</link></robot>",
-        "urdf",
-    )
-    plant.Finalize()
-    diagram = builder.Build()
-    context = scene_graph.GetMyContextFromRoot(diagram.CreateDefaultContext())
-    query = scene_graph.get_query_output_port().Eval(context)
-    image = query.RenderDepthImage(depth_camera(), SceneGraph.world_frame_id(), RigidTransform())
-    assert image.data[CENTER][0] == pytest.approx(2.0, abs=1e-4)
-    assert image.data[CENTER[0], 2][0] == pytest.approx(4.0, rel=2e-3)
-
-
-def body_of_gaussians(x: float) -> GaussianScene:
-    return GaussianScene.from_colors(
-        np.array([[x, 0.0, 0.0]]), [[1.0, 0, 0, 0]], [[0.4, 0.4, 0.001]], [0.99], [[1.0, 0, 0]]
-    )
+def disc() -> GaussianScene:
+    return baked_scenes.uniform_scene(np.zeros((1, 3)), [0.4, 0.4, 0.001], color=(1.0, 0, 0))
 
 
 def test_a_geometry_is_drawn_as_gaussians_at_its_pose():
     engine = SplatRenderEngine(wall(4.0))
     id, pose = GeometryId.get_new_id(), RigidTransform([0.0, 0.0, 2.0])
-    properties = gaussian_properties(body_of_gaussians(0.0), label=RenderLabel(3))
+    properties = gaussian_properties(disc(), label=RenderLabel(3))
     engine.RegisterVisual(id, Box(1, 1, 1), properties, pose)
     for copied in (engine, copy.deepcopy(engine)):
         copied.UpdateViewpoint(RigidTransform())
@@ -318,28 +251,20 @@ def test_a_geometry_is_drawn_as_gaussians_at_its_pose():
     assert label(engine)[CENTER] == UNSPECIFIED
 
 
-def test_a_scene_is_baked():
-    engine = SplatRenderEngine(body_of_gaussians(0.0))
-    engine.UpdateViewpoint(RigidTransform([0.0, 0.0, -1.0]))
-    assert depth(engine)[CENTER] == pytest.approx(1.0, abs=0.01)
-
-
 @pytest.mark.parametrize("time", [0.0, 3.0])
 def test_moving_obstacles_are_seen_as_by_a_splat_camera(time):
     path = np.array([[0.0, 0.0, 2.0], [0.0, 0.0, 2.5], [0.0, 0.0, 3.0], [np.inf] * 3])
     spheres = MovingSpheres([0.4], [path], 1.0)
-    obstacles = MovingObstacles(spheres, MovingGaussians([body_of_gaussians(0.0)], spheres.centers))
-    builder = DiagramBuilder()
-    scene_graph = builder.AddSystem(SceneGraph())
-    scene_graph.AddRenderer("splats", SplatRenderEngine(wall(4.0)))
+    obstacles = MovingObstacles(spheres, MovingGaussians([disc()], spheres.centers))
+    scene, builder = baked_scenes.wall(2, 4.0), DiagramBuilder()
+    scene_graph = builder.AddSystem(geometry.SceneGraph())
+    scene_graph.AddRenderer("splats", SplatRenderEngine(scene))
     ObstacleGeometry.AddToBuilder(builder, scene_graph, obstacles)
-    sensor = builder.AddSystem(
-        RgbdSensor(SceneGraph.world_frame_id(), RigidTransform(), COLOR_CAMERA, depth_camera())
-    )
+    sensor = builder.AddSystem(rgbd_sensor())
     builder.Connect(scene_graph.get_query_output_port(), sensor.query_object_input_port())
     root = builder.Build().CreateDefaultContext()
     root.SetTime(time)
     image = sensor.depth_image_32F_output_port().Eval(sensor.GetMyContextFromRoot(root)).data
-    seen = SplatCamera(wall(4.0), INFO).render(RigidTransform(), Bodies(time, obstacles)).depth
+    seen = SplatCamera(scene, INFO).render(RigidTransform(), Bodies(time, obstacles)).depth
     np.testing.assert_allclose(image[..., 0], seen, rtol=1e-5)
     assert image[CENTER][0] == pytest.approx(2.0 if time == 0.0 else 4.0, rel=2e-3)

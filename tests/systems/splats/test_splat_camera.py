@@ -19,7 +19,6 @@ from splatpilot.systems.splats.background import EnvironmentMap
 from splatpilot.systems.splats.baked_scene import BakedScene, MovingGaussians
 from splatpilot.systems.splats.lens import Distortion
 from splatpilot.systems.splats.moving_bodies import Bodies, MovingObstacles
-from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.splats.splat_camera import SplatCamera, row_bands
 from splatpilot.systems.vehicle.state import pose_between
 
@@ -52,57 +51,46 @@ def evaluate(camera: SplatCamera, port: str, X_WB: RigidTransform) -> np.ndarray
 
 def test_output_ports_are_those_of_rgbd_sensor():
     core = RenderCameraCore("none", INFO, ClippingRange(0.01, 10), RigidTransform())
-    sensor = RgbdSensor(
-        SceneGraph.world_frame_id(),
-        RigidTransform(),
-        ColorRenderCamera(core),
-        DepthRenderCamera(core, DepthRange(0.1, 5)),
-    )
+    cameras = ColorRenderCamera(core), DepthRenderCamera(core, DepthRange(0.1, 5))
+    sensor = RgbdSensor(SceneGraph.world_frame_id(), RigidTransform(), *cameras)
     camera = SplatCamera(wall(3), INFO)
-    for i in range(sensor.num_output_ports()):
-        theirs = sensor.get_output_port(i)
-        ours = camera.GetOutputPort(theirs.get_name())
-        assert ours.get_data_type() == theirs.get_data_type()
-        assert type(ours.Allocate()) is type(theirs.Allocate())
     methods = [name for name in dir(sensor) if name.endswith("_output_port") and name[:3] != "get"]
     assert len(methods) == sensor.num_output_ports()
     for name in methods:
-        assert getattr(camera, name)().get_name() == getattr(sensor, name)().get_name()
+        ours, theirs = getattr(camera, name)(), getattr(sensor, name)()
+        assert ours.get_name() == theirs.get_name()
+        assert ours.get_data_type() == theirs.get_data_type()
+        assert type(ours.Allocate()) is type(theirs.Allocate())
     assert camera.body_pose_input_port().get_name() == "body_pose"
 
 
-def test_wall_is_seen_at_its_distance_and_in_its_color():
-    camera = SplatCamera(wall(3), INFO, X_BC)
-    images = [
-        evaluate(camera, port, RigidTransform())
-        for port in ("depth_image_32f", "depth_image_16u", "label_image", "color_image")
-    ]
-    np.testing.assert_allclose(images[0], 2.9, rtol=2e-3)
-    np.testing.assert_allclose(images[1], 2900, rtol=2e-3)
-    assert np.all(images[2] == int(RenderLabel.kUnspecified))
-    np.testing.assert_allclose(images[3].reshape(-1, 4), [[255, 127.5, 0, 255]] * 32 * 24, atol=3)
-
-
 @pytest.mark.parametrize(
-    ("x", "opacity", "meters", "millimeters"),
+    ("x", "opacity", "meters", "millimeters", "tolerance"),
     [
-        (1.0, 0.99, 0.0, 0),  # nearer than the range
-        (9.0, 0.99, np.inf, 65535),  # farther than the range
-        (3.0, 0.02, np.inf, 65535),  # hardly there
+        (3.0, 0.99, 2.9, 2900, 2e-3),
+        (1.0, 0.99, 0.0, 0, 0),  # nearer than the range
+        (9.0, 0.99, np.inf, 65535, 0),  # farther than the range
+        (3.0, 0.02, np.inf, 65535, 0),  # too thin for a surface
     ],
 )
-def test_out_of_range_reads_as_in_drake(x, opacity, meters, millimeters):
+def test_wall_is_seen_at_its_distance(x, opacity, meters, millimeters, tolerance):
     camera = SplatCamera(wall(x, opacity), INFO, X_BC, min_depth=2.0, max_depth=5.0)
-    assert np.all(evaluate(camera, "depth_image_32f", RigidTransform()) == meters)
-    assert np.all(evaluate(camera, "depth_image_16u", RigidTransform()) == millimeters)
+    for port, expected in (("depth_image_32f", meters), ("depth_image_16u", millimeters)):
+        image = evaluate(camera, port, RigidTransform())
+        np.testing.assert_allclose(image, expected, rtol=tolerance)
 
 
-def test_nothing_in_view_is_background():
+def test_color_and_label_are_those_of_the_wall_or_of_the_background():
     camera = SplatCamera(wall(3), INFO, X_BC, background=(0.2, 0.4, 0.6))
-    X_WB = RigidTransform(RotationMatrix.MakeZRotation(np.pi), [0, 0, 0])
-    assert np.all(np.isinf(evaluate(camera, "depth_image_32f", X_WB)))
-    assert np.all(evaluate(camera, "label_image", X_WB) == int(RenderLabel.kEmpty))
-    np.testing.assert_array_equal(evaluate(camera, "color_image", X_WB)[0, 0], [51, 102, 153, 255])
+    ahead, back = RigidTransform(), RigidTransform(RotationMatrix.MakeZRotation(np.pi))
+    for X_WB, color, label, tolerance in (
+        (ahead, [255, 127.5, 0, 255], RenderLabel.kUnspecified, 3),
+        (back, [51, 102, 153, 255], RenderLabel.kEmpty, 0),
+    ):
+        pixels = evaluate(camera, "color_image", X_WB).reshape(-1, 4)
+        np.testing.assert_allclose(pixels, [color] * 32 * 24, atol=tolerance)
+        assert np.all(evaluate(camera, "label_image", X_WB) == int(label))
+    assert np.all(np.isinf(evaluate(camera, "depth_image_32f", back)))
 
 
 def test_renders_once_per_pose_and_only_when_asked():
@@ -136,15 +124,10 @@ WIDTH, HEIGHT, FOCAL = 64, 48, 40.0
 SHUTTER_INFO = CameraInfo(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
 
 
-def pole(x: float = 0.0) -> GaussianScene:
+def pole(x: float = 0.0):
     y = np.arange(-6.0, 6.0, 0.02)
-    return GaussianScene.from_colors(
-        means=np.column_stack([np.full(y.size, x), y, np.full(y.size, 4.0)]),
-        quats=np.tile([1.0, 0, 0, 0], (y.size, 1)),
-        scales=np.full((y.size, 3), 0.08),
-        opacities=np.full(y.size, 0.99),
-        colors=np.tile([1.0, 1.0, 1.0], (y.size, 1)),
-    )
+    means = np.column_stack([np.full(y.size, x), y, np.full(y.size, 4.0)])
+    return baked_scenes.uniform_scene(means, [0.08] * 3, color=(1.0, 1.0, 1.0))
 
 
 def columns(color: np.ndarray) -> np.ndarray:
@@ -164,25 +147,6 @@ def test_a_pole_leans_as_the_camera_turns():
     assert np.ptp(columns(SplatCamera(pole(), SHUTTER_INFO).render(yawed(0.1)).color)) < 0.1
 
 
-def test_each_row_is_that_of_its_pose():
-    camera = SplatCamera(pole(), SHUTTER_INFO, readout=0.02)
-    X_0 = RigidTransform(RotationMatrix.MakeXRotation(0.3), [0.1, 0.0, -0.2])
-    X_1 = RigidTransform(RotationMatrix.MakeYRotation(0.6), [0.3, 0.1, 0.4])
-    assert len(row_bands(X_0, X_1, FOCAL, HEIGHT)) == HEIGHT
-    view = camera.render(X_1, None, X_0)
-    for row in range(0, HEIGHT, 7):
-        own = camera.render(pose_between(X_0, X_1, (row + 0.5) / HEIGHT))
-        np.testing.assert_allclose(view.color[row], own.color[row], atol=2e-2)
-        seen = own.depth[row] > 0
-        assert seen.any() and (view.depth[row] > 0)[seen].mean() > 0.9
-        both = seen & (view.depth[row] > 0)
-        np.testing.assert_allclose(view.depth[row][both], own.depth[row][both], rtol=5e-3)
-
-
-def light(view) -> np.ndarray:
-    return light_of_color(255.0 * view.color)
-
-
 @pytest.mark.parametrize("readout", [0.0, 0.01])
 def test_motion_blur_is_the_mean_light_of_the_exposure(readout):
     exposure, end = 0.02, (0.02 + readout) / 0.02
@@ -190,19 +154,16 @@ def test_motion_blur_is_the_mean_light_of_the_exposure(readout):
     sharp = SplatCamera(pole(), SHUTTER_INFO, readout=readout)
     X_0, X_1 = yawed(-0.15), RigidTransform(yawed(0.15 * (2 * end - 1)).rotation(), [0.1, 0.2, 0.0])
     view = camera.render(X_1, None, X_0)
-    instants = [
-        sharp.render(
-            pose_between(X_0, X_1, (s + end - 1) / end),
-            None,
-            pose_between(X_0, X_1, s / end) if readout else None,
-        )
-        for s in (np.arange(400) + 0.5) / 400
-    ]
-    expected = np.mean([light(each) for each in instants], axis=0)
-    assert np.abs(light(instants[200]) - expected).max() > 0.5  # A sharp image is another.
-    assert np.abs(light(view) - expected).max() < 0.05
-    np.testing.assert_allclose(light(view).sum(axis=1), expected.sum(axis=1), rtol=0.02)
-    assert np.mean(np.abs(view.depth - instants[199].depth) > 0.05) < 0.01
+    instants = []
+    for s in (np.arange(100) + 0.5) / 100:
+        start = pose_between(X_0, X_1, s / end) if readout else None
+        instants.append(sharp.render(pose_between(X_0, X_1, (s + end - 1) / end), None, start))
+    light, *lights = (light_of_color(255.0 * each.color) for each in (view, *instants))
+    expected = np.mean(lights, axis=0)
+    assert np.abs(lights[50] - expected).max() > 0.5  # A sharp image is another.
+    assert np.abs(light - expected).max() < 0.05
+    np.testing.assert_allclose(light.sum(axis=1), expected.sum(axis=1), rtol=0.02)
+    assert np.mean(np.abs(view.depth - instants[49].depth) > 0.05) < 0.01
 
 
 def test_a_still_camera_renders_once():
@@ -222,55 +183,40 @@ def test_bands():
     assert len(row_bands(X, yawed(1.0), FOCAL, HEIGHT)) == HEIGHT
 
 
-def ports(camera: SplatCamera, X_0: RigidTransform, X_1: RigidTransform, names: list[str]):
-    context = camera.CreateDefaultContext()
-    camera.GetInputPort("start_pose").FixValue(context, X_0)
-    camera.GetInputPort("body_pose").FixValue(context, X_1)
-    images = [np.array(camera.GetOutputPort(name).Eval(context).data) for name in names]
-    camera.GetInputPort("start_pose").FixValue(context, X_1)
-    return images, np.array(camera.GetOutputPort(names[-1]).Eval(context).data)
-
-
 @pytest.mark.parametrize("distortion", [None, Distortion("fisheye", [-0.02, 0.01, 0, 0])])
-def test_ports(distortion):
+def test_a_rolling_shutter_needs_the_pose_at_its_start(distortion):
     sky = EnvironmentMap(np.tile([[0.2, 0.4, 0.9]], (8, 16, 1)).astype(np.float32))
-    camera = SplatCamera(
-        pole(), SHUTTER_INFO, readout=0.02, distortion=distortion, background=sky, max_depth=30.0
-    )
-    names = ["color_image", "depth_image_32f"]
-    (color, depth), still = ports(camera, yawed(-0.1), yawed(0.1), names)
-    (alone,), _ = ports(camera, yawed(-0.1), yawed(0.1), names[1:])
-    np.testing.assert_array_equal(depth, alone)
-    assert np.any(still != depth)
+    options = {"readout": 0.02, "distortion": distortion, "background": sky, "max_depth": 30.0}
+    camera = SplatCamera(pole(), SHUTTER_INFO, **options)
+
+    def images(*ports, start=-0.1):
+        context = camera.CreateDefaultContext()
+        camera.GetInputPort("start_pose").FixValue(context, yawed(start))
+        camera.GetInputPort("body_pose").FixValue(context, yawed(0.1))
+        return [camera.GetOutputPort(name).Eval(context).data.copy() for name in ports]
+
+    color, depth = images("color_image", "depth_image_32f")
+    np.testing.assert_array_equal(images("depth_image_32f")[0], depth)
+    assert np.any(images("depth_image_32f", start=0.1)[0] != depth)
     where = np.isfinite(depth[..., 0])
     assert where.any(axis=1).all()
     assert color[..., :3][where].min() > 100 and (color[0, 0, :3] == [51, 102, 230]).all()
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("change", "message"),
     [
         ({"min_depth": 2.0, "max_depth": 1.0}, r"depth range must be .* got \[2.0, 1.0\]"),
         ({"exposure": -0.01}, r"exposure must be finite and >= 0 s, got -0\.01"),
         ({"readout": -0.01}, r"readout must be finite and >= 0 s, got -0\.01"),
+        ({"scene": "hall"}, r"scene must be of type BakedScene, got a str; pass `baked`"),
+        ({"X_BC": np.eye(4)}, "X_BC must be of type RigidTransform, got a ndarray"),
+        ({"camera_info": (64, 48)}, "camera_info must be of type CameraInfo, got a tuple"),
     ],
 )
-def test_invalid_options_are_named(options, message):
+def test_invalid_arguments_are_named_at_construction(change, message):
     with pytest.raises(ValueError, match=message):
-        SplatCamera(pole(), INFO, **options)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("hall", INFO), r"scene must be of type BakedScene, got a str; pass `baked`"),
-        ((pole(), INFO, np.eye(4)), "X_BC must be of type RigidTransform, got a ndarray"),
-        ((pole(), (64, 48)), "camera_info must be of type CameraInfo, got a tuple"),
-    ],
-)
-def test_wrong_arguments_are_named_at_construction(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        SplatCamera(*arguments)
+        SplatCamera(**{"scene": pole(), "camera_info": INFO} | change)
 
 
 def test_a_moving_body_is_seen_at_the_time_of_each_row():
@@ -295,22 +241,17 @@ def test_mount_and_intrinsics_are_parameters_of_the_context():
     assert port.Eval(context).data[12, 16, 0] == pytest.approx(3.5, abs=1e-3)
     assert camera.X_BC(context).IsExactlyEqualTo(X) and camera.X_BC().IsExactlyEqualTo(X_BC)
 
-    turned = RigidTransform(RotationMatrix.MakeZRotation(0.5)) @ X
-    camera.SetX_BC(context, turned)
+    X = RigidTransform(RotationMatrix.MakeZRotation(0.5)) @ X
+    camera.SetX_BC(context, X)
     before = port.Eval(context).data.copy()
-    camera.SetCameraInfo(context, CameraInfo(32, 24, 40.0, 40.0, 16.0, 12.0))
+    info = CameraInfo(32, 24, 40.0, 40.0, 16.0, 12.0)
+    camera.SetCameraInfo(context, info)
     assert camera.camera_info(context).focal_x() == 40.0
     assert np.abs(port.Eval(context).data - before).max() > 0.1
-    other = SplatCamera(wall(5.0), CameraInfo(32, 24, 40.0, 40.0, 16.0, 12.0), turned)
-    np.testing.assert_array_equal(
-        port.Eval(context).data, evaluate(other, "depth_image_32f", RigidTransform())
-    )
-
-
-def test_intrinsics_of_another_size_are_refused():
-    camera = SplatCamera(wall(5.0), INFO, X_BC)
+    expected = evaluate(SplatCamera(wall(5.0), info, X), "depth_image_32f", RigidTransform())
+    np.testing.assert_array_equal(port.Eval(context).data, expected)
     with pytest.raises(ValueError, match="image size must be 32x24 pixels, got 16x24"):
-        camera.SetCameraInfo(camera.CreateDefaultContext(), CameraInfo(16, 24, 1.0))
+        camera.SetCameraInfo(context, CameraInfo(16, 24, 1.0))
 
 
 @pytest.mark.parametrize(
@@ -322,3 +263,29 @@ def test_image_time_is_that_of_the_capture(latency, time, taken):
     context = camera.CreateDefaultContext()
     context.SetTime(time)
     assert camera.image_time_output_port().Eval(context)[0] == pytest.approx(taken)
+
+
+def test_late_images_show_bodies_where_they_were():
+    spheres = MovingSpheres([0.5], [np.array([[1.0, 0, 0], [2.0, 0, 0], [3.0, 0, 0]])], 1.0)
+    obstacles = MovingObstacles(spheres, MovingGaussians([pole(-2.0)], spheres.centers))
+    late, prompt = (SplatCamera(wall(5.0), SHUTTER_INFO, latency=t) for t in (1.0, 0.0))
+    for time, then in ((0.5, 0.0), (1.5, 0.5), (2.5, 1.5)):
+        expected = prompt.render(RigidTransform(), Bodies(then, obstacles)).color
+        image = late.render(RigidTransform(), Bodies(time, obstacles)).color
+        np.testing.assert_array_equal(image, expected)
+    assert np.any(prompt.render(RigidTransform(), Bodies(time, obstacles)).color != image)
+
+
+def test_each_row_is_that_of_its_pose():
+    camera = SplatCamera(pole(), SHUTTER_INFO, readout=0.02)
+    X_0 = RigidTransform(RotationMatrix.MakeXRotation(0.3), [0.1, 0.0, -0.2])
+    X_1 = RigidTransform(RotationMatrix.MakeYRotation(0.6), [0.3, 0.1, 0.4])
+    assert len(row_bands(X_0, X_1, FOCAL, HEIGHT)) == HEIGHT
+    view = camera.render(X_1, None, X_0)
+    for row in range(0, HEIGHT, 7):
+        own = camera.render(pose_between(X_0, X_1, (row + 0.5) / HEIGHT))
+        np.testing.assert_allclose(view.color[row], own.color[row], atol=2e-2)
+        seen = own.depth[row] > 0
+        assert seen.any() and (view.depth[row] > 0)[seen].mean() > 0.9
+        both = seen & (view.depth[row] > 0)
+        np.testing.assert_allclose(view.depth[row][both], own.depth[row][both], rtol=5e-3)

@@ -5,7 +5,7 @@ import pytest
 import torch
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from pydrake.autodiffutils import AutoDiffXd, ExtractGradient, ExtractValue, InitializeAutoDiff
+from pydrake.autodiffutils import ExtractGradient, ExtractValue, InitializeAutoDiff
 from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import Linearize, VectorLogSink
@@ -142,12 +142,12 @@ def fly(state, duration, *, config=None, params=None, **inputs):
     return states.sample_times(), states.data().T, commands.data().T
 
 
-def command_for(state, config=None, time=0.0, **inputs):
+def command_for(controller=None, time=0.0, **inputs):
     """The command (4,) that one update computes."""
-    controller = FlatnessController(config)
+    controller = controller or FlatnessController()
     context = controller.CreateDefaultContext()
     context.SetTime(time)
-    for port, value in {"state": state, **inputs}.items():
+    for port, value in inputs.items():
         controller.GetInputPort(port).FixValue(context, value)
     return controller.EvalUniquePeriodicDiscreteUpdate(context).value(0)
 
@@ -167,32 +167,25 @@ def test_the_command_is_held_between_updates():
     assert set(changed % 5) == {0}
 
 
-@pytest.mark.parametrize("step", [[-2.0, 2.0, 4.0], [0.0, 0.0, -3.0], [30, 40, 5]])
+@pytest.mark.parametrize("step", [[-2.0, 2.0, 4.0], [30, 40, 5]])
 def test_a_step_of_the_waypoint_converges(step):
     _, states, _ = fly(hover_state([0.0, 0.0, 0.0]), 20.0, waypoint=lambda t: step)
-    assert np.isfinite(states).all()
     np.testing.assert_allclose(states[-1, 0:3], step, atol=1e-3)
     np.testing.assert_allclose(states[-1, 3:6], 0.0, atol=1e-3)
 
 
-@pytest.mark.parametrize("time", [0.0, 0.5, 2.0])
+@pytest.mark.parametrize("time", [0.0, 0.5])
 def test_the_disturbance_estimate_removes_the_error_of_the_hover_thrust(time):
     params = QuadrotorParams(thrust_scale=0.95)
     config = FlatnessControllerConfig(disturbance_time=time)
     start = np.append(hover_state([0.0, 0.0, 2.0]), 1.0)  # the last is the charge
     _, states, commands = fly(
-        start, 30.0, config=config, params=params, waypoint=lambda t: [0.0, 0.0, 2.0]
+        start, 15.0, config=config, params=params, waypoint=lambda t: [0.0, 0.0, 2.0]
     )
     missing = 9.81 * (1.0 / 0.95 - 1.0)
     sag = 0.0 if time else 0.5 * config.lookahead**2 * missing
     assert commands[-1, 0] == pytest.approx(9.81 + missing, abs=1e-6)
     assert states[-1, 2] == pytest.approx(2.0 - sag, abs=1e-3)
-
-
-def test_a_disturbance_estimate_faster_than_the_vehicle_is_refused():
-    match = r"disturbance_time must be 0 or at least lookahead, 0\.4 s, got 0\.1"
-    with pytest.raises(ValueError, match=match):
-        FlatnessController(FlatnessControllerConfig(disturbance_time=0.1))
 
 
 def test_the_disturbance_estimate_does_not_wind_up_while_thrust_saturates():
@@ -226,7 +219,7 @@ def circle(t, radius=3.0, speed=2.0):
 def test_tracks_a_circle_to_a_centimeter():
     state = hover_state(circle(0.0), yaw=math.pi / 2)
     state[3:6] = [0.0, 2.0, 0.0]
-    times, states, _ = fly(state, 20.0, waypoint=lambda t: circle(t + CONFIG.lookahead))
+    times, states, _ = fly(state, 12.0, waypoint=lambda t: circle(t + CONFIG.lookahead))
     error = np.linalg.norm(states[:, 0:3] - [circle(t) for t in times], axis=1)
     steady = times > 8.0
     assert error[steady].max() < 0.01
@@ -253,7 +246,7 @@ def test_yaw_rests_when_slow(velocity):
 finite = st.floats(-1e6, 1e6) | st.floats(-3, 3)
 
 
-@settings(max_examples=200)
+@settings(max_examples=80)
 @given(
     state=st.lists(finite, min_size=13, max_size=13),
     port=st.sampled_from(["waypoint", "acceleration"]),
@@ -263,23 +256,18 @@ def test_commands_are_limited_for_any_input(state, port, value):
     state = np.array(state)
     if np.linalg.norm(state[6:10]) < 1e-6:
         state[6] = 1.0
-    command = command_for(state, **{port: value})
+    command = command_for(state=state, **{port: value})
     assert CONFIG.min_thrust <= command[0] <= CONFIG.max_thrust
     assert math.hypot(command[1], command[2]) <= CONFIG.max_tilt_rate * (1 + 1e-12)
     assert abs(command[3]) <= CONFIG.max_yaw_rate
 
 
-def test_the_thrust_must_carry_the_weight_at_any_tilt():
-    with pytest.raises(ValueError, match=r"max_thrust must be above 14\.08 .* got 12\.0"):
-        FlatnessController(FlatnessControllerConfig(max_thrust=12.0))
-
-
 def test_one_of_the_two_targets_must_be_connected():
-    state = hover_state([0.0, 0.0, 0.0])
+    state, target = hover_state([0.0, 0.0, 0.0]), np.zeros(3)
     with pytest.raises(ValueError, match="got neither"):
-        fly(state, 0.1)
+        command_for(state=state)
     with pytest.raises(ValueError, match="got both"):
-        fly(state, 0.1, waypoint=lambda t: np.zeros(3), acceleration=lambda t: np.zeros(3))
+        command_for(state=state, waypoint=target, acceleration=target)
 
 
 @pytest.mark.parametrize("port", ["state", "waypoint", "acceleration"])
@@ -291,41 +279,20 @@ def test_an_input_that_is_not_finite_is_an_error(port):
         command_for(time=0.5, **inputs)
 
 
-def update(controller, x, port="waypoint", heading=None):
-    """The command (4,) of an update for a state (13) and a target (3)."""
-    context = controller.CreateDefaultContext()
-    controller.GetInputPort("state").FixValue(context, x[:13])
-    controller.GetInputPort(port).FixValue(context, x[13:])
-    if heading is not None:
-        controller.GetInputPort("heading").FixValue(context, [heading])
-    return controller.EvalUniquePeriodicDiscreteUpdate(context).value(0)
-
-
 @pytest.mark.parametrize("port", ["waypoint", "acceleration"])
-@pytest.mark.parametrize("heading", [None, math.nan, 0.4])
+@pytest.mark.parametrize("heading", [{}, {"heading": [math.nan]}, {"heading": [0.4]}])
 def test_derivatives_of_an_update_equal_differences(port, heading):
+    def update(controller, x):
+        return command_for(controller, state=x[:13], **{port: x[13:]}, **heading)
+
     controller = FlatnessController(CONFIG, PARAMS)
     x = np.concatenate([hover_state([0.0, 0.0, 2.0], 0.3), [0.4, 0.1, 0.2]])
     x += 0.05 * np.random.default_rng(1).normal(size=16)
-    dual = update(controller.ToAutoDiffXd(), InitializeAutoDiff(x).ravel(), port, heading)
-    h = 1e-6
-    differences = [
-        update(controller, x + h * e, port, heading) - update(controller, x - h * e, port, heading)
-        for e in np.eye(16)
-    ]
-    np.testing.assert_allclose(ExtractValue(dual).ravel(), update(controller, x, port, heading))
-    expected = np.column_stack(differences) / (2 * h)
-    np.testing.assert_allclose(ExtractGradient(dual), expected, rtol=1e-6, atol=1e-6)
-
-
-def test_derivatives_of_an_update_by_a_gain():
-    controller, x = FlatnessController().ToAutoDiffXd(), hover_state([0.0, 0.0, 2.0])
-    context = controller.CreateDefaultContext()
-    controller.GetInputPort("state").FixValue(context, x)
-    controller.GetInputPort("waypoint").FixValue(context, [0.1, 0.0, 2.0])
-    controller.SetTiltGain(context, AutoDiffXd(10.0, [1.0]))
-    command = controller.EvalUniquePeriodicDiscreteUpdate(context).value(0)
-    assert command[2].derivatives()[0] == pytest.approx(command[2].value() / 10.0)
+    dual = update(controller.ToAutoDiffXd(), InitializeAutoDiff(x).ravel())
+    steps = 1e-6 * np.eye(16)
+    expected = [(update(controller, x + h) - update(controller, x - h)) / 2e-6 for h in steps]
+    np.testing.assert_allclose(ExtractValue(dual).ravel(), update(controller, x))
+    np.testing.assert_allclose(ExtractGradient(dual), np.transpose(expected), rtol=1e-6, atol=1e-6)
 
 
 def test_the_controller_is_linearized_at_rest():
@@ -340,9 +307,3 @@ def test_the_controller_is_linearized_at_rest():
     tilt = CONFIG.tilt_gain * lift / 9.81
     expected = [[0, 0, lift], [0, -tilt, 0], [tilt, 0, 0], [0, 0, 0]]
     np.testing.assert_allclose(linear.B(), expected, atol=1e-6)
-
-
-@pytest.mark.parametrize("arguments", [("x",), (None, "x")])
-def test_wrong_arguments_are_named_at_construction(arguments):
-    with pytest.raises(ValueError, match=r"(config|params) must be of type .* got a str"):
-        FlatnessController(*arguments)

@@ -82,10 +82,10 @@ def test_distances_are_those_of_the_field(kind):
             voxel_size=field.voxel_size,
             occupied_outside=outside,
         )
-    points = np.random.default_rng(1).uniform(field.lower_W - 1, field.upper_W + 1, (5000, 3))
+    points = np.random.default_rng(1).uniform(field.lower_W - 1, field.upper_W + 1, (2000, 3))
     points[:3] = field.lower_W, field.upper_W, [np.nan] * 3
-    distances, gradients = np.empty(5000), np.empty((5000, 3))
-    states, world = np.empty(5000, np.uint8), np.full(5000, number)
+    distances, gradients = np.empty(2000), np.empty((2000, 3))
+    states, world = np.empty(2000, np.uint8), np.full(2000, number)
     given = {"p_WQ": points, "world": world, "distances": distances, "states": states}
     worlds.query(**given, gradients=gradients)
     with np.errstate(invalid="ignore"):
@@ -142,16 +142,16 @@ def advance(
     vehicle: QuadrotorParams,
     kind: str,
     actions: np.ndarray,
-    simd: str = "",
-    steps: int = 1,
-    states: np.ndarray | None = None,
-    solids: list[Shape] | None = None,
+    simd="",
+    steps=1,
+    states=None,
+    solids=(),
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns states (N, 13) after one period of the controller, and ends (N,)."""
     count = len(actions)
     states = some_states(count) if states is None else states
     worlds, ends = _native.FlightWorlds(), np.zeros(count, np.uint8)
-    add_shapes(worlds, solids or [])
+    add_shapes(worlds, list(solids))
     packs = np.repeat(parameters(vehicle)[None, :, None], 16, axis=-1)
     vehicles = _native.Vehicles(
         states=states,
@@ -197,10 +197,10 @@ def command_of_python(kind: str, state: np.ndarray, action: np.ndarray, vehicle:
 @pytest.mark.parametrize("vehicle", [IDEAL, LAGGING], ids=["ideal", "lagging"])
 @pytest.mark.parametrize("kind", ["command", "acceleration", "velocity", "waypoint"])
 def test_flights_solve_the_equations_of_motion(kind, vehicle):
-    actions = np.random.default_rng(4).normal(size=(20, 4 if kind == "command" else 3))
+    actions = np.random.default_rng(4).normal(size=(8, 4 if kind == "command" else 3))
     actions += [9.0, 0.0, 0.0, 0.0] if kind == "command" else 2.0
     flown, _ = advance(vehicle, kind, actions, steps=8)
-    for state, action, end in zip(some_states(20), actions, flown, strict=True):
+    for state, action, end in zip(some_states(8), actions, flown, strict=True):
         command = limit_command(command_of_python(kind, state, action, vehicle).tolist(), vehicle)
 
         def rates(_, x, command=command):
@@ -227,13 +227,8 @@ def test_simd_levels_agree_bitwise(vehicle):
 def test_the_first_end_counts():
     states = np.zeros((5, 13))
     states[:, 6] = 1.0
-    states[:, :3] = (
-        [2.0, 0.0, 1.5],
-        [4.0, 0.0, 1.5],
-        [4.0, 5.0, 1.5],
-        [8.2, 0.0, 1.5],
-        [7.8, 0, 1.5],
-    )
+    states[:, 0] = 2.0, 4.0, 4.0, 8.2, 7.8
+    states[2, 1], states[:, 2] = 5.0, 1.5
     solids: list[Shape] = [Sphere([4.0, 0.0, 1.0], 0.3), Sphere([7.5, 0.0, 1.5], 0.1)]
     hover = np.tile([IDEAL.gravity, 0.0, 0.0, 0.0], (5, 1))
     _, ends = advance(IDEAL, "command", hover, states=states, solids=solids)

@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -6,17 +7,26 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from pydrake.autodiffutils import AutoDiffXd, ExtractGradient, ExtractValue, InitializeAutoDiff
+from pydrake.symbolic import Evaluate, MakeVectorVariable
 from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
+from splatpilot.systems.common.drake import float_values
 from splatpilot.systems.vehicle.quadrotor import (
     QuadrotorParams,
     QuadrotorPlant,
+    actuated_derivatives,
     hover_state,
+    knows_natively,
+    limit_command,
+    mix,
     quadrotor_derivatives,
     rk4_step,
+    torques,
 )
+from splatpilot.systems.vehicle.vehicles import Kingfisher
+from tests.systems.vehicle.responses import respond
 
 PARAMS = QuadrotorParams(drag=0.3, rate_time_constant=0.07, gravity=9.7)
 PERIOD = 0.02  # [s] of the commands and of the integration
@@ -119,10 +129,10 @@ def test_rk4_step_has_fourth_order():
     assert math.log2(error(20) / error(40)) == pytest.approx(4.0, abs=0.3)
 
 
-@given(yaw=st.floats(-10, 10), x=st.floats(-5, 5))
-def test_hover_state_is_level_at_rest_and_faces_yaw(yaw, x):
-    state = hover_state([x, 2.0, 3.0], yaw)
-    np.testing.assert_array_equal(state[0:3], [x, 2.0, 3.0])
+@pytest.mark.parametrize("yaw", [-9.0, 0.0, 0.5, 3.0])
+def test_hover_state_is_level_at_rest_and_faces_yaw(yaw):
+    state = hover_state([1.0, 2.0, 3.0], yaw)
+    np.testing.assert_array_equal(state[0:3], [1.0, 2.0, 3.0])
     forward = rotation_WB(state).as_matrix()[:, 0]
     np.testing.assert_allclose(forward, [math.cos(yaw), math.sin(yaw), 0.0], atol=1e-12)
     hover = quadrotor_derivatives(state, np.array([9.7, 0.0, 0.0, 0.0]), PARAMS)
@@ -135,82 +145,72 @@ def test_the_plant_agrees_with_rk4():
     ResetIntegratorFromFlags(simulator, "runge_kutta3", PERIOD)
     simulator.get_mutable_integrator().set_fixed_step_mode(True)
     context = simulator.get_mutable_context()
-    for k, command in enumerate(random_commands(np.random.default_rng(2), 250)):
+    for k, command in enumerate(random_commands(np.random.default_rng(2), 100)):
         plant.get_input_port().FixValue(context, command)
         simulator.AdvanceTo((k + 1) * PERIOD)
         x = rk4_step(x, command, QuadrotorParams(), PERIOD)
-    end = context.get_continuous_state_vector().CopyToVector()
+    end = plant.GetOutputPort("state").Eval(context)
     assert np.linalg.norm(end[0:3] - x[0:3]) < 0.02
     assert np.linalg.norm(end[6:10]) == pytest.approx(1.0, abs=2e-4)
 
 
-def test_ports_and_parameters_have_their_documented_names_and_order():
-    plant = QuadrotorPlant(QuadrotorParams(drag=0.1, rate_time_constant=0.2, gravity=3.7))
-    context = plant.CreateDefaultContext()
-    np.testing.assert_array_equal(context.get_numeric_parameter(0).CopyToVector(), [0.1, 0.2, 3.7])
-    state = np.arange(1.0, 14.0)
-    context.SetContinuousState(state)
-    np.testing.assert_array_equal(plant.GetOutputPort("state").Eval(context), state)
-    assert plant.GetInputPort("command").size() == 4
-    assert not plant.HasDirectFeedthrough(output_port=0)
+HOVER = [9.81, 0.0, 0.0, 0.0]
+LAGS = QuadrotorParams(
+    rotor_drag=[0.1, 0.2, 0.3],
+    quadratic_drag=[0.01, 0.02, 0.03],
+    yaw_time_ratio=3.0,
+    motor_time_constant=0.04,
+    max_thrust=25.0,
+    max_tilt_rate=5.0,
+    battery_sag=0.2,
+    battery_charge=0.9,
+    battery_endurance=300.0,
+    ground_effect=0.5,
+)
+ROTORS = replace(LAGS, model="rotors", max_thrust=30.0)
 
 
-def derivatives_at(plant, x):
-    """Time derivatives at a state (13) and a command (4)."""
-    context = plant.CreateDefaultContext()
-    context.SetContinuousState(x[:13])
-    plant.get_input_port().FixValue(context, x[13:])
-    return plant.EvalTimeDerivatives(context).CopyToVector()
+def random_state(seed):
+    state = random_states(np.random.default_rng(seed))
+    state[2] = 2.0
+    return state
 
 
-def test_a_zero_quaternion_is_an_error_that_names_it():
-    with pytest.raises(ValueError, match=r"q_WB .* must not be zero, got \[0\.0, "):
-        derivatives_at(QuadrotorPlant(), np.zeros(17))
+def derivatives_at(plant, state, command=HOVER, context=None, **inputs):
+    context = context or plant.CreateDefaultContext()
+    whole = context.get_continuous_state_vector().CopyToVector()
+    context.SetContinuousState(np.concatenate([state, whole[13:]]))
+    for port, value in {"command": command, **inputs}.items():
+        plant.GetInputPort(port).FixValue(context, value)
+    return float_values(plant.EvalTimeDerivatives(context).CopyToVector())
 
 
-@pytest.mark.parametrize("convert", [lambda plant: plant, lambda plant: plant.ToAutoDiffXd()])
-def test_wind_moves_the_air_and_a_disturbance_accelerates(convert):
-    plant = convert(QuadrotorPlant(QuadrotorParams(drag=0.5)))
-    context = plant.CreateDefaultContext()
-    plant.get_input_port().FixValue(context, [9.81, 0.0, 0.0, 0.0])
-
-    def acceleration():
-        derivatives = plant.EvalTimeDerivatives(context).CopyToVector()
-        return np.float64([x if isinstance(x, float) else x.value() for x in derivatives[3:6]])
-
-    np.testing.assert_allclose(acceleration(), 0.0, atol=1e-12)
-    plant.GetInputPort("wind").FixValue(context, [3.0, -1.0, 2.0])
-    np.testing.assert_allclose(acceleration(), [1.5, -0.5, 1.0], atol=1e-12)
-    plant.GetInputPort("disturbance").FixValue(context, [0.0, 0.25, -1.0])
-    np.testing.assert_allclose(acceleration(), [1.5, -0.25, 0.0], atol=1e-12)
+PLANTS = [QuadrotorPlant(QuadrotorParams(drag=0.5))]
+PLANTS.append(PLANTS[0].ToAutoDiffXd())
 
 
-@pytest.mark.parametrize("convert", [lambda plant: plant, lambda plant: plant.ToAutoDiffXd()])
-@pytest.mark.parametrize("port", ["command", "wind", "disturbance"])
-def test_an_input_that_is_not_finite_is_an_error_with_error_control(convert, port):
-    plant = convert(QuadrotorPlant())
-    context = plant.CreateDefaultContext()
-    plant.get_input_port().FixValue(context, [9.81, 0.0, 0.0, 0.0])
-    plant.GetInputPort(port).FixValue(context, np.full(plant.GetInputPort(port).size(), np.nan))
+@pytest.mark.parametrize("plant", PLANTS)
+def test_wind_moves_the_air_and_a_disturbance_accelerates(plant):
+    for inputs, expected in (
+        ({}, [0.0, 0.0, 0.0]),
+        ({"wind": [3.0, -1.0, 2.0]}, [1.5, -0.5, 1.0]),
+        ({"wind": [3.0, -1.0, 2.0], "disturbance": [0.0, 0.25, -1.0]}, [1.5, -0.25, 0.0]),
+    ):
+        found = derivatives_at(plant, hover_state([0.0, 0.0, 0.0]), **inputs)
+        np.testing.assert_allclose(found[3:6], expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("plant", PLANTS)
+@pytest.mark.parametrize(("port", "size"), [("command", 4), ("wind", 3), ("disturbance", 3)])
+def test_states_and_inputs_that_are_invalid_are_errors(plant, port, size):
+    context, state = plant.CreateDefaultContext(), hover_state([0.0, 0.0, 0.0])
     with pytest.raises(ValueError, match=rf"'{port}' of 'Quadrotor.* finite, got \[.*nan.*; check"):
-        plant.EvalTimeDerivatives(context)
-    if isinstance(plant, QuadrotorPlant):
+        derivatives_at(plant, state, context=context, **{port: np.full(size, np.nan)})
+    if isinstance(plant, QuadrotorPlant):  # with error control
         with pytest.raises(ValueError, match="must be finite"):
             Simulator(plant, context).AdvanceTo(0.1)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("x",), "params must be of type QuadrotorParams, got a str"),
-        ((None, np.zeros(13)), r"q_WB must be a rotation .* got \[0\.0, 0\.0, 0\.0, 0\.0\]"),
-        ((None, np.zeros(12)), "initial_state must be 13 finite numbers"),
-        ((None, np.full(13, np.nan)), "initial_state must be 13 finite numbers"),
-    ],
-)
-def test_wrong_arguments_are_named_at_construction(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        QuadrotorPlant(*arguments)
+        with pytest.raises(ValueError, match=r"q_WB .* must not be zero, got \[0\.0, "):
+            derivatives_at(plant, np.zeros(13))
 
 
 def test_derivatives_by_a_parameter():
@@ -218,7 +218,186 @@ def test_derivatives_by_a_parameter():
     context = plant.CreateDefaultContext()
     state = hover_state([0.0, 0.0, 0.0])
     state[3] = 2.0
-    context.SetContinuousState(state)
-    plant.get_input_port().FixValue(context, [9.81, 0.0, 0.0, 0.0])
     plant.SetDrag(context, AutoDiffXd(0.5, [1.0]))
+    derivatives_at(plant, state, context=context)
     assert plant.EvalTimeDerivatives(context)[3].derivatives() == [-2.0]
+
+
+def test_effects_that_are_neutral_leave_the_equations():
+    params = QuadrotorParams(drag=0.3, rate_time_constant=0.07, max_thrust=1e6)
+    assert not params.is_ideal() and QuadrotorParams(drag=0.3, radius=0.1).is_ideal()
+    for seed in range(10):
+        state, command = random_state(seed), np.array([12.0, 1.0, -2.0, 3.0])
+        expected = quadrotor_derivatives(state, command, params)
+        found = derivatives_at(QuadrotorPlant(params), state, command)
+        np.testing.assert_allclose(found[:13], expected, atol=1e-12)
+
+
+def test_drag_acts_along_the_body_axes_against_the_air():
+    drags = {"rotor_drag": LAGS.rotor_drag, "quadratic_drag": LAGS.quadratic_drag}
+    plant = QuadrotorPlant(QuadrotorParams(drag=0.0, **drags))
+    wind, state = np.array([1.0, -2.0, 0.5]), random_state(1)
+    R_WB = Rotation.from_quat(state[6:10], scalar_first=True)
+    v_B = R_WB.inv().apply(state[3:6] - wind)
+    drag_B = -(np.array([0.1, 0.2, 0.3]) + np.linalg.norm(v_B) * np.array([0.01, 0.02, 0.03])) * v_B
+    expected = R_WB.apply(np.add(drag_B, [0.0, 0.0, 9.81])) - [0.0, 0.0, 9.81]
+    found = derivatives_at(plant, state, wind=wind)
+    np.testing.assert_allclose(found[3:6], expected, atol=1e-9)
+
+
+def test_thrust_and_rates_lag_and_yaw_is_slower():
+    params = QuadrotorParams(drag=0.0, motor_time_constant=0.04, yaw_time_ratio=3.0)
+    times = np.array([0.02, 0.05, 0.1])
+    states = respond(params, [12.0, 1.0, 0.0, 0.5], times)
+    np.testing.assert_allclose(states[:, 10], 1.0 - np.exp(-times / 0.05), rtol=1e-6)
+    np.testing.assert_allclose(states[:, 12], 0.5 - 0.5 * np.exp(-times / 0.15), rtol=1e-6)
+    thrust = 12.0 - (12.0 - 9.81) * np.exp(-times / 0.04)
+    np.testing.assert_allclose(states[:, 14], thrust, rtol=1e-6)
+
+
+def test_commands_beyond_the_limits_are_clipped():
+    limits = {"min_thrust": 5.0, "max_thrust": 15.0, "max_tilt_rate": 4.0, "max_yaw_rate": 1.0}
+    plant = QuadrotorPlant(QuadrotorParams(**limits))
+    state = hover_state([0.0, 0.0, 5.0])
+    for command, thrust in (([40.0, 9.0, -9.0, 9.0], 15.0), ([0.0, 9.0, -9.0, 9.0], 5.0)):
+        found = derivatives_at(plant, state, command)
+        assert found[5] == pytest.approx(thrust - 9.81)
+        np.testing.assert_allclose(0.05 * found[10:13], [4.0, -4.0, 1.0])
+
+
+def test_a_battery_empties_by_hovering_and_takes_thrust():
+    params = QuadrotorParams(battery_sag=0.3, battery_charge=0.5, battery_endurance=100.0)
+    at_start = derivatives_at(QuadrotorPlant(params), hover_state([0.0, 0.0, 5.0]))
+    lift = 1.0 - 0.3 * 0.5
+    assert at_start[5] == pytest.approx(9.81 * (lift - 1.0))
+    assert at_start[13] == pytest.approx(-(lift**1.5) / 100.0)
+    steady = replace(params, battery_sag=0.0, battery_charge=1.0, thrust_scale=1.0)
+    charge = respond(steady, HOVER, [50.0], step=0.02)[0, 13]
+    assert charge == pytest.approx(0.5, rel=1e-6)
+
+
+def test_thrust_scale_and_ground_effect_multiply_the_thrust():
+    for scale, z in ((0.9, 0.5), (1.1, 2.0), (1.0, 0.25), (1.0, 0.1)):
+        params = QuadrotorParams(thrust_scale=scale, ground_effect=0.5)
+        found = derivatives_at(QuadrotorPlant(params), hover_state([0.0, 0.0, z]))
+        factor = scale / (1.0 - (0.5 / (4.0 * max(z, 0.25))) ** 2)
+        assert found[5] == pytest.approx(9.81 * (factor - 1.0))
+
+
+def test_fast_rotors_follow_as_the_lags_do():
+    rotors = QuadrotorParams(model="rotors", motor_time_constant=1e-4, max_thrust=60.0)
+    command, times = [12.0, 0.5, -0.5, 0.1], [0.05, 0.2, 0.4]
+    expected = respond(QuadrotorParams(max_thrust=60.0), command, times)
+    found = respond(replace(rotors, motor_time_constant=2e-3), command, times)
+    np.testing.assert_allclose(found[:, :13], expected[:, :13], atol=0.02)
+
+
+forces = st.floats(-60.0, 60.0)
+
+
+@given(thrust=forces, roll=forces, pitch=forces, yaw=forces)
+def test_the_mixer_meets_what_rotors_can_and_gives_up_yaw_first(thrust, roll, pitch, yaw):
+    params = Kingfisher()
+    low, high = 0.0, 0.25 * params.mass * params.max_thrust
+    torque = 0.1 * np.array([roll, pitch, 0.1 * yaw])
+    found = np.array(mix(thrust, torque, params))
+    assert (found >= low - 1e-9).all() and (found <= high + 1e-9).all()
+    (x, y), kappa = params.arm, params.torque_ratio
+    sides = np.array([[1, 1, 1, 1], [y, y, -y, -y], [-x, x, x, -x], [kappa, -kappa] * 2])
+    np.testing.assert_allclose(torques(found, params), sides[1:] @ found, atol=1e-9)
+    desired = np.linalg.solve(sides, [thrust, *torque])
+    if (desired >= low).all() and (desired <= high).all():
+        np.testing.assert_allclose(found, desired, atol=1e-9)
+    tilt = np.linalg.solve(sides, [0.0, *torque[:2], 0.0])
+    if np.ptp(tilt) < high - low:
+        np.testing.assert_allclose((sides @ found)[1:3], torque[:2], atol=1e-9)
+    without_yaw = np.linalg.solve(sides, [thrust, *torque[:2], 0.0])
+    if (without_yaw >= low).all() and (without_yaw <= high).all():
+        assert found.sum() == pytest.approx(thrust, abs=1e-9)
+
+
+TURNING = {"model": "rotors", "max_thrust": 20.0}
+IDEAL = QuadrotorParams(drag=0.2, rate_time_constant=0.1, gravity=3.7)
+
+
+@pytest.mark.parametrize(
+    "params", [IDEAL, LAGS, ROTORS, Kingfisher()], ids=["ideal", "lags", "rotors", "preset"]
+)
+def test_conversions_keep_the_equations(params):
+    plant = QuadrotorPlant(params)
+    size = plant.num_continuous_states()
+    rng, context = np.random.default_rng(3), plant.CreateDefaultContext()
+    start = context.get_continuous_state_vector().CopyToVector()
+    start[:13] = random_state(2)
+    start[14:] *= rng.uniform(0.9, 1.1, max(size - 14, 0))
+    x = np.concatenate([start, [11.0, 0.5, -1.0, 0.3]])
+
+    def evaluate(system, x):
+        context = system.CreateDefaultContext()
+        context.SetContinuousState(x[:size])
+        system.get_input_port().FixValue(context, x[size:])
+        acceleration = system.GetOutputPort("acceleration").Eval(context)
+        return system.EvalTimeDerivatives(context).CopyToVector(), acceleration
+
+    expected, acceleration = evaluate(plant, x)
+    np.testing.assert_array_equal(acceleration, expected[3:6])
+    variables = MakeVectorVariable(len(x), "x")
+    symbolic, _ = evaluate(plant.ToSymbolic(), np.array([1.0 * each for each in variables]))
+    values = Evaluate(symbolic, dict(zip(variables, x, strict=True))).ravel()
+    np.testing.assert_allclose(values, expected, atol=1e-9)
+    dual, _ = evaluate(plant.ToAutoDiffXd(), InitializeAutoDiff(x).ravel())
+    np.testing.assert_allclose(ExtractValue(dual).ravel(), expected, atol=1e-12)
+    steps = 1e-6 * np.maximum(1.0, np.abs(x))
+    differences = [
+        (evaluate(plant, x + h * e)[0] - evaluate(plant, x - h * e)[0]) / (2 * h)
+        for h, e in zip(steps, np.eye(len(x)), strict=True)
+    ]
+    scale = 1e-6 * np.abs(ExtractGradient(dual)).max()
+    np.testing.assert_allclose(ExtractGradient(dual), np.transpose(differences), atol=scale)
+
+
+def test_native_derivatives_are_those_of_the_equations():
+    params = replace(LAGS, battery_sag=0.0, ground_effect=0.0)
+    plant, wind, command = QuadrotorPlant(params), [1.0, -2.0, 0.5], [30.0, 9.0, -1.0, 0.3]
+    whole = plant.CreateDefaultContext().get_continuous_state_vector().CopyToVector()
+    assert knows_natively(params)
+    for seed in range(5):
+        state = random_state(seed)
+        found = derivatives_at(plant, state, command, wind=wind)
+        expected = actuated_derivatives(
+            [*state, *whole[13:]], limit_command(command, params), params, wind
+        )
+        np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-13)
+
+
+def test_numbers_and_lists_are_parameters_of_the_context():
+    plant = QuadrotorPlant(Kingfisher())
+    context, state = plant.CreateDefaultContext(), hover_state([0.0, 0.0, 5.0])
+    state[3] = 2.0
+    before = derivatives_at(plant, state, context=context)
+    plant.SetParameter(context, "mass", 1.5)
+    plant.SetParameter(context, "rotor_drag", [0.5, 0.0, 0.0])
+    after = derivatives_at(plant, state, context=context)
+    assert after[5] == pytest.approx(before[5] - 9.81 / 2)
+    assert after[3] == pytest.approx(before[3] - 1.0)
+    with pytest.raises(ValueError, match=r"Kingfisher.mass must be in \(0, inf\) kg, got -1"):
+        plant.SetParameter(context, "mass", -1.0)
+    with pytest.raises(ValueError, match=r"name must be one of drag, .*, got model"):
+        plant.SetParameter(context, "model", 1.0)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        (
+            {"max_thrust": 12.0, "battery_sag": 0.4, "battery_charge": 0.3},
+            r"max_thrust must be above 13.63 m/s\^2, to hover, got 12",
+        ),
+        ({"model": "rotors"}, "max_thrust must be finite .* with rotors, got inf"),
+        (TURNING, "motor_time_constant must be above 0 s with rotors, got 0"),
+        (TURNING | {"motor_time_constant": 0.2}, "rate_time_constant must be at least 0.1 s, half"),
+    ],
+)
+def test_a_vehicle_that_cannot_fly_is_named_with_its_limit(fields, message):
+    with pytest.raises(ValueError, match=f"QuadrotorParams.{message}"):
+        QuadrotorPlant(QuadrotorParams(**fields))

@@ -8,36 +8,25 @@ from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS, QuadrotorPlant,
 from splatpilot.systems.vehicle.quadrotor_geometry import QuadrotorGeometry
 
 
-def test_the_vehicle_is_in_a_scene_graph():
+def test_the_vehicle_is_seen_and_collides_in_a_scene_graph():
     builder = DiagramBuilder()
     scene_graph = builder.AddSystem(SceneGraph())
     plant = builder.AddSystem(QuadrotorPlant(None, hover_state([1.0, 2.0, 3.0], yaw=0.5)))
     state = plant.GetOutputPort("state")
     first = QuadrotorGeometry.AddToBuilder(builder, state, scene_graph, label=RenderLabel(4))
     QuadrotorGeometry.AddToBuilder(builder, state, scene_graph, name="other")
+    wall = GeometryInstance(RigidTransform([2.0, 2.0, 3.0]), Box(1, 1, 1), "wall")
+    wall.set_proximity_properties(ProximityProperties())
+    anchored = scene_graph.RegisterAnchoredGeometry(scene_graph.RegisterSource("wall"), wall)
     root = builder.Build().CreateDefaultContext()
     query = scene_graph.get_query_output_port().Eval(scene_graph.GetMyContextFromRoot(root))
     X_WB = query.GetPoseInWorld(first.get_frame_id())
     np.testing.assert_allclose(X_WB.translation(), [1.0, 2.0, 3.0])
     assert X_WB.rotation().ToRollPitchYaw().yaw_angle() == pytest.approx(0.5)
-    [nearest, _] = query.ComputeSignedDistanceToPoint(np.array([2.0, 2.0, 3.0]))
-    assert nearest.distance == pytest.approx(1.0 - VEHICLE_RADIUS)
     frame = first.get_frame_id()
     geometries = query.inspector().GetGeometries(frame)
     labels = [query.inspector().GetPerceptionProperties(id) for id in geometries]
     assert {int(p.GetProperty("label", "id")) for p in labels if p is not None} == {4}
-
-
-def test_the_vehicle_collides_with_shapes():
-    builder = DiagramBuilder()
-    scene_graph = builder.AddSystem(SceneGraph())
-    plant = builder.AddSystem(QuadrotorPlant())
-    geometry = QuadrotorGeometry.AddToBuilder(builder, plant.GetOutputPort("state"), scene_graph)
-    wall = GeometryInstance(RigidTransform([1.0, 0.0, 0.0]), Box(1, 1, 1), "wall")
-    wall.set_proximity_properties(ProximityProperties())
-    scene_graph.RegisterAnchoredGeometry(scene_graph.RegisterSource("wall"), wall)
-    root = builder.Build().CreateDefaultContext()
-    query = scene_graph.get_query_output_port().Eval(scene_graph.GetMyContextFromRoot(root))
-    [pair] = query.ComputeSignedDistancePairwiseClosestPoints()
-    assert pair.distance == pytest.approx(0.5 - VEHICLE_RADIUS)
-    assert geometry.get_frame_id().is_valid()
+    pairs = query.ComputeSignedDistancePairwiseClosestPoints()
+    to_wall = [pair.distance for pair in pairs if anchored in (pair.id_A, pair.id_B)]
+    assert to_wall == [pytest.approx(0.5 - VEHICLE_RADIUS)] * 2

@@ -3,9 +3,8 @@ import math
 import numpy as np
 import pytest
 import torch
-from hypothesis import assume, given
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from pydrake.autodiffutils import ExtractGradient, InitializeAutoDiff
 from pydrake.common.eigen_geometry import AngleAxis, Quaternion
 from pydrake.math import RigidTransform, RotationMatrix
 from scipy.spatial.transform import Rotation
@@ -22,23 +21,18 @@ from splatpilot.systems.vehicle.state import (
 )
 
 
-@pytest.mark.parametrize("x", [np.arange(13.0), np.arange(2 * 3 * 13.0).reshape(2, 3, 13)])
-def test_parts_are_where_the_plant_has_them(x):
+@pytest.mark.parametrize("x", [np.arange(13.0), torch.arange(78.0).reshape(2, 3, 13)])
+def test_parts_are_views_where_the_plant_has_them(x):
     state = QuadrotorState.of(x)
     np.testing.assert_array_equal(state.p_WB, x[..., [0, 1, 2]])
     np.testing.assert_array_equal(state.v_WB, x[..., [3, 4, 5]])
     np.testing.assert_array_equal(state.q_WB, x[..., [6, 7, 8, 9]])
     np.testing.assert_array_equal(state.w_WB_B, x[..., [10, 11, 12]])
     np.testing.assert_array_equal(state.to_vector(), x)
-
-
-@pytest.mark.parametrize("zeros", [np.zeros, torch.zeros])
-def test_parts_are_views(zeros):
-    x = zeros((2, 13))
-    QuadrotorState.of(x).v_WB[:, 1] = 3.0
-    assert x[:, 4].tolist() == [3.0, 3.0] and x.sum() == 6.0
-    with pytest.raises(ValueError, match=r"got \(13, 2\)"):
-        QuadrotorState.of(zeros((13, 2)))
+    state.v_WB[..., 1] = -3.0
+    assert (x[..., 4] == -3.0).all() and (x == -3.0).sum() == len(x[..., 0].ravel())
+    with pytest.raises(ValueError, match=r"got \(.*12,?\)"):
+        QuadrotorState.of(x[..., :12])
 
 
 def test_heading_and_tilt_are_those_of_the_body_axes():
@@ -59,6 +53,7 @@ def pose_of(state):
     return X_WB
 
 
+@settings(max_examples=30)
 @given(q=st.lists(st.floats(-2, 2), min_size=4, max_size=4))
 def test_pose_has_the_position_and_the_attitude_of_the_normalized_quaternion(q):
     assume(np.linalg.norm(q) > 1e-6)
@@ -130,19 +125,3 @@ def test_the_length_of_zero_has_no_gradient():
     zero = torch.zeros(2, 3, requires_grad=True)
     lengths(zero).sum().backward()
     assert zero.grad is not None and (zero.grad == 0).all()
-
-
-def test_derivatives_of_a_pose_equal_differences():
-    system, x = StateToPose(), hover_state([1.0, 2.0, 3.0], 0.4)
-
-    def point(system, x):
-        context = system.CreateDefaultContext()
-        system.get_input_port().FixValue(context, x)
-        return system.get_output_port().Eval(context) @ np.array([1.0, -2.0, 0.5])
-
-    dual = point(system.ToAutoDiffXd(), InitializeAutoDiff(x).ravel())
-    h = 1e-6
-    differences = [point(system, x + h * e) - point(system, x - h * e) for e in np.eye(13)]
-    np.testing.assert_allclose(
-        ExtractGradient(dual), np.transpose(differences) / (2 * h), atol=1e-8
-    )

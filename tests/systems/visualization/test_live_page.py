@@ -3,12 +3,12 @@
 import dataclasses
 
 import numpy as np
+from baked_scenes import uniform_scene
 from pydrake.common import MemoryFile
 from pydrake.geometry import Box, InMemoryMesh, Mesh, Meshcat, Rgba
 from pydrake.math import RigidTransform
 
 from splatpilot.systems.splats.background import EnvironmentMap
-from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.visualization.meshcat_drawing import (
     draw_gaussians,
     picture_gltf,
@@ -24,9 +24,7 @@ def test_page_follows_meshcat(open_in_browser):
     meshcat.SetCameraPose([-4, 0, 0], [0, 0, 0])
     for path in ("/Grid", "/Axes"):
         meshcat.SetProperty(path, "visible", False)
-    red = GaussianScene.from_colors(
-        [[0.0, 0.0, 0.0]], [[1.0, 0, 0, 0]], [[0.6] * 3], [0.99], [[0.9, 0.0, 0.0]]
-    )
+    red = uniform_scene([[0.0, 0.0, 0.0]], [0.6] * 3, color=(0.9, 0.0, 0.0))
     view = ReplayView("forest", RigidTransform(), fov_y=1.0, radius=0.3, lower=-2.0, upper=2.0)
     html = live_page(meshcat, red, SKY, view, cut=1.0)
     # Nearer than the Gaussian, to be seen if they were drawn.

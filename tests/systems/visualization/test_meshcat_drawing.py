@@ -7,23 +7,19 @@ import cv2
 import msgpack
 import numpy as np
 import pytest
+from baked_scenes import uniform_scene
 from pydrake.common.value import Value
 from pydrake.geometry import Meshcat
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
-from pydrake.systems.primitives import (
-    ConstantValueSource,
-    ConstantVectorSource,
-    TrajectorySource,
-)
+from pydrake.systems.primitives import ConstantVectorSource, TrajectorySource
 from pydrake.systems.sensors import CameraInfo, ImageRgba8U
 from pydrake.trajectories import PiecewisePolynomial
 
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.shapes import AnalyticDistanceField, MovingSpheres, Sphere
 from splatpilot.systems.policies.hypotheses import Hypotheses
-from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.splats.splat_camera import SplatCamera
 from splatpilot.systems.vehicle.quadrotor import hover_state
 from splatpilot.systems.vehicle.state import StateToPose
@@ -38,7 +34,6 @@ from splatpilot.systems.visualization.meshcat_drawing import (
     draw_distance_slice,
     draw_gaussians,
     draw_goal,
-    draw_vehicle,
     picture_gltf,
 )
 from splatpilot.systems.visualization.video import VideoRecorder
@@ -55,6 +50,22 @@ def meshcat(shared_meshcat):
     return shared_meshcat
 
 
+def position(meshcat, path: str) -> list[float]:
+    """The position of a path in its parent [m]."""
+    return msgpack.unpackb(meshcat._GetPackedTransform(path))["matrix"][12:15]
+
+
+def drawn(meshcat, path: str) -> dict:
+    """The object at a path, as the page gets it: its geometry, its material and itself."""
+    return msgpack.unpackb(meshcat._GetPackedObject(path))["object"]
+
+
+def vertices(meshcat, path: str, attribute: str = "position") -> np.ndarray:
+    """(n, 3) An attribute of the vertices of a drawing: position [m] or color."""
+    packed = drawn(meshcat, path)["geometries"][0]["data"]["attributes"][attribute]["array"]
+    return np.frombuffer(packed.data, "<f4").reshape(-1, 3)
+
+
 def test_flight_is_drawn_with_its_trail_and_plan(meshcat):
     waypoints_B = np.cumsum(np.full((3, 10, 3), 0.1), axis=1)
     plan = Hypotheses(0.0, RigidTransform([1, 0, 2]), waypoints_B, np.array([1.0, 2.0, 3.0]))
@@ -66,50 +77,19 @@ def test_flight_is_drawn_with_its_trail_and_plan(meshcat):
     visualizer = builder.AddSystem(FlightVisualizer(meshcat, num_hypotheses=3, period=0.1))
     builder.Connect(state.get_output_port(), visualizer.GetInputPort("state"))
     builder.Connect(hypotheses.get_output_port(), visualizer.GetInputPort("hypotheses"))
-    draw_vehicle(meshcat, "/splatpilot/vehicle", radius=0.354)
     Simulator(builder.Build()).AdvanceTo(0.35)
     assert meshcat.HasPath("/splatpilot/vehicle/body")
-    trail = vertices(drawn(meshcat, "/splatpilot/trail"), "position")
+    trail = vertices(meshcat, "/splatpilot/trail")
     np.testing.assert_allclose(trail, [[1 + 0.2 * k, 0, 2] for k in range(4)], atol=1e-6)
-    fan = vertices(drawn(meshcat, "/splatpilot/hypotheses"), "position")
-    assert len(fan) == 3 * 11 * 2
+    assert len(vertices(meshcat, "/splatpilot/hypotheses")) == 3 * 11 * 2
 
 
-def position(meshcat, path: str) -> list[float]:
-    """The position of a path in its parent [m]."""
-    return msgpack.unpackb(meshcat._GetPackedTransform(path))["matrix"][12:15]
-
-
-def test_forced_publish_draws_vehicle_camera_and_spheres(meshcat):
+def test_visualizers_of_two_vehicles_draw_by_forced_publish(meshcat):
     builder = DiagramBuilder()
-    state = builder.AddSystem(ConstantVectorSource(hover_state([1, 2, 3])))
-    image = builder.AddSystem(ConstantValueSource(Value(ImageRgba8U(32, 24))))
-    FlightVisualizer.AddToBuilder(builder, state.get_output_port(), meshcat)
-    camera = builder.AddSystem(
-        CameraVisualizer(meshcat, CameraInfo(32, 24, 1.0), RigidTransform(), stride=3)
-    )
-    builder.Connect(image.get_output_port(), camera.get_input_port())
-    spheres = MovingSpheres([0.5], [np.array([[float(k), 0, 1] for k in range(20)])], 0.1)
-    MovingSpheresVisualizer.AddToBuilder(builder, spheres, meshcat)
-    diagram = builder.Build()
-    context = diagram.CreateDefaultContext()
-    context.SetTime(16 / 15)  # not a multiple of the stride
-    diagram.ForcedPublish(context)
-    vehicle = f"/splatpilot/{state.get_name()}/vehicle"
-    assert position(meshcat, vehicle) == [1, 2, 3]
-    assert meshcat.HasPath("/splatpilot/vehicle/camera/picture")
-    assert position(meshcat, "/splatpilot/spheres/0") == [10, 0, 1]
-
-
-def test_visualizers_of_two_vehicles_share_a_diagram(meshcat):
-    builder = DiagramBuilder()
-    scene = GaussianScene.from_colors(
-        [[3.0, 0, 1]], [[1.0, 0, 0, 0]], [[0.3] * 3], [0.9], [[1] * 3]
-    )
+    scene = uniform_scene([[3.0, 0, 1]], [0.3] * 3)
     for k, prefix in enumerate(("", "b_")):
-        plant = builder.AddNamedSystem(
-            f"{prefix}plant", ConstantVectorSource(hover_state([k, 0, 1]))
-        )
+        source = ConstantVectorSource(hover_state([k, 0, 1]))
+        plant = builder.AddNamedSystem(f"{prefix}plant", source)
         pose = builder.AddSystem(StateToPose())
         camera = SplatCamera(scene, CameraInfo(32, 24, 1.0), RigidTransform())
         builder.AddNamedSystem(f"{prefix}camera", camera)
@@ -118,9 +98,14 @@ def test_visualizers_of_two_vehicles_share_a_diagram(meshcat):
         FlightVisualizer.AddToBuilder(builder, plant.get_output_port(), meshcat)
         CameraVisualizer.AddToBuilder(builder, camera, meshcat, depth=True)
         VideoRecorder.AddToBuilder(builder, camera, 15.0)
+    spheres = MovingSpheres([0.5], [np.array([[float(k), 0, 1] for k in range(20)])], 0.1)
+    MovingSpheresVisualizer.AddToBuilder(builder, spheres, meshcat)
     diagram = builder.Build()
     assert diagram.HasSubsystemNamed("b_flight_visualizer") and diagram.HasSubsystemNamed("video")
-    diagram.ForcedPublish(diagram.CreateDefaultContext())
+    context = diagram.CreateDefaultContext()
+    context.SetTime(16 / 15)  # not a multiple of the stride
+    diagram.ForcedPublish(context)
+    assert position(meshcat, "/splatpilot/spheres/0") == [10, 0, 1]
     assert position(meshcat, "/splatpilot/vehicle") == [0, 0, 1]
     assert position(meshcat, "/splatpilot/b/vehicle") == [1, 0, 1]
     for name in ("picture", "frustum", "depth"):
@@ -128,13 +113,8 @@ def test_visualizers_of_two_vehicles_share_a_diagram(meshcat):
 
 
 def test_arrows_are_drawn_on_request(meshcat):
-    values = {
-        "command": [9.81, 0.2, 0, 0],
-        "waypoint": [2.0, 0, 1],
-        "distance": [2.0],
-        "gradient": [0, 1.0, 0],
-        "barrier": [0.5],
-    }
+    values = {"command": [9.81, 0.2, 0, 0], "waypoint": [2.0, 0, 1]}
+    values |= {"distance": [2.0], "gradient": [0, 1.0, 0], "barrier": [0.5]}
     builder = DiagramBuilder()
     ports = {
         name: builder.AddSystem(ConstantVectorSource(value)).get_output_port()
@@ -143,10 +123,8 @@ def test_arrows_are_drawn_on_request(meshcat):
     x = hover_state([1, 0, 1])
     x[3:6] = 2, 0, 0
     plant = builder.AddNamedSystem("plant", ConstantVectorSource(x))
-    draw = [*DRAWINGS, "axes"]
-    FlightVisualizer.AddToBuilder(
-        builder, plant.get_output_port(), meshcat, draw=draw, sources=ports
-    )
+    options = {"draw": [*DRAWINGS, "axes"], "sources": ports}
+    FlightVisualizer.AddToBuilder(builder, plant.get_output_port(), meshcat, **options)
     diagram = builder.Build()
     diagram.ForcedPublish(diagram.CreateDefaultContext())
     for name, tip in {
@@ -157,15 +135,14 @@ def test_arrows_are_drawn_on_request(meshcat):
         "nearest": [1, -2, 1],
         "barrier": [1, 0.5, 1],
     }.items():
-        drawing = vertices(drawn(meshcat, f"/splatpilot/{name}"), "position")
-        np.testing.assert_allclose(drawing, [[1, 0, 1], tip], atol=1e-6)
+        arrow = vertices(meshcat, f"/splatpilot/{name}")
+        np.testing.assert_allclose(arrow, [[1, 0, 1], tip], atol=1e-6)
     assert meshcat.HasPath("/splatpilot/vehicle/axes/z")
     with pytest.raises(ValueError, match=r"draw must be names of velocity, .*, got wings"):
         FlightVisualizer(meshcat, draw=["wings"])
     with pytest.raises(ValueError, match="sources must be with command"):
-        FlightVisualizer.AddToBuilder(
-            DiagramBuilder(), plant.get_output_port(), meshcat, draw=["thrust"]
-        )
+        port = plant.get_output_port()
+        FlightVisualizer.AddToBuilder(DiagramBuilder(), port, meshcat, draw=["thrust"])
 
 
 def test_fan_is_ribbons_along_the_plans_in_the_colors_of_their_costs():
@@ -196,52 +173,29 @@ def test_moving_spheres_are_drawn(meshcat):
     for time, expected in ((0.15, [[2, 2, 3], [0, 0, -1000]]), (0.25, [[4, 2, 3], [0, 0, 1]])):
         simulator.AdvanceTo(time)
         for k, p_WO in enumerate(expected):
-            packed = msgpack.unpackb(meshcat._GetPackedTransform(f"/splatpilot/spheres/{k}"))
-            assert packed["matrix"][12:15] == p_WO
+            assert position(meshcat, f"/splatpilot/spheres/{k}") == p_WO
     assert drawn(meshcat, "/splatpilot/spheres/1")["geometries"][0]["radius"] == 0.25
 
 
-def drawn(meshcat, path: str) -> dict:
-    """The object at a path, as the page gets it: its geometry, its material and itself."""
-    return msgpack.unpackb(meshcat._GetPackedObject(path))["object"]
-
-
-def vertices(drawing: dict, attribute: str) -> np.ndarray:
-    """(n, 3) An attribute of the vertices of a drawing: position [m] or color."""
-    packed = drawing["geometries"][0]["data"]["attributes"][attribute]["array"]
-    return np.frombuffer(packed.data, "<f4").reshape(-1, 3)
-
-
 def test_gaussians_are_drawn_as_points_of_their_size(meshcat):
-    scene = GaussianScene.from_colors(
-        means=[[1, 0, 1], [2, 0.5, 1], [100, 0, 1]],
-        quats=np.tile([1.0, 0, 0, 0], (3, 1)),
-        scales=[[0.1, 0.02, 0.01], [0.01, 0.3, 0.1], [9, 9, 9]],
-        opacities=np.full(3, 0.9),
-        colors=[[1.0, 0.5, 0.0], [0.2, 0.2, 0.8], [1, 1, 1]],
-    )
+    scales = np.array([[0.1, 0.02, 0.01], [0.01, 0.3, 0.1], [9, 9, 9]])
+    colors = np.array([[1.0, 0.5, 0.0], [0.2, 0.2, 0.8], [1, 1, 1]])
+    scene = uniform_scene([[1, 0, 1], [2, 0.5, 1], [100, 0, 1]], scales, color=colors)
     draw_gaussians(meshcat, "/splatpilot/scene", scene, np.zeros(3) - 1, np.full(3, 4.0))
-    drawing = drawn(meshcat, "/splatpilot/scene")
-    np.testing.assert_array_equal(vertices(drawing, "position"), [[1, 0, 1], [2, 0.5, 1]])
-    shown = vertices(drawing, "color") ** (1 / 2.2)  # as the screen encodes it
-    np.testing.assert_allclose(shown, [[1, 0.5, 0], [0.2, 0.2, 0.8]], atol=0.02)
+    points = vertices(meshcat, "/splatpilot/scene")
+    np.testing.assert_array_equal(points, [[1, 0, 1], [2, 0.5, 1]])
+    shown = vertices(meshcat, "/splatpilot/scene", "color") ** (1 / 2.2)  # as the screen encodes it
+    np.testing.assert_allclose(shown, colors[:2], atol=0.02)
     # As wide as the median over Gaussians of their largest deviations, 0.1 m and 0.3 m.
-    assert drawing["materials"][0]["size"] == pytest.approx(2 * 0.2)
+    size = drawn(meshcat, "/splatpilot/scene")["materials"][0]["size"]
+    assert size == pytest.approx(2 * 0.2)
 
 
 def test_many_gaussians_are_thinned_evenly(meshcat):
     x = np.arange(301.0)
-    scene = GaussianScene.from_colors(
-        means=np.column_stack([x, 0 * x, 0 * x]),
-        quats=np.tile([1.0, 0, 0, 0], (301, 1)),
-        scales=np.full((301, 3), 0.1),
-        opacities=np.full(301, 0.9),
-        colors=np.full((301, 3), 0.5),
-    )
-    box = np.full(3, 1e3)
+    scene, box = uniform_scene(np.column_stack([x, 0 * x, 0 * x]), [0.1] * 3), np.full(3, 1e3)
     draw_gaussians(meshcat, "/splatpilot/scene", scene, -box, box, max_points=101)
-    position = vertices(drawn(meshcat, "/splatpilot/scene"), "position")
-    np.testing.assert_array_equal(position[:, 0], x[::3])
+    np.testing.assert_array_equal(vertices(meshcat, "/splatpilot/scene")[:, 0], x[::3])
 
 
 def test_goal_is_a_sphere_at_its_position(meshcat):
@@ -249,15 +203,14 @@ def test_goal_is_a_sphere_at_its_position(meshcat):
     drawing = drawn(meshcat, "/splatpilot/goal")
     assert drawing["geometries"][0]["radius"] == 0.3
     assert drawing["materials"][0]["transparent"]
-    matrix = msgpack.unpackb(meshcat._GetPackedTransform("/splatpilot/goal"))["matrix"]
-    assert matrix[12:15] == [3.0, -1.0, 2.0]
+    assert position(meshcat, "/splatpilot/goal") == [3.0, -1.0, 2.0]
 
 
 def test_distance_slice_is_colored_by_distance(meshcat):
     field = AnalyticDistanceField([Sphere([2, 0, 1], 0.5)], [0, -1, 0], [6, 1, 2])
     draw_distance_slice(meshcat, "/splatpilot/slice", field, height=1.0)
     drawing = drawn(meshcat, "/splatpilot/slice")
-    p, color = (vertices(drawing, name) for name in ("position", "color"))
+    p, color = (vertices(meshcat, "/splatpilot/slice", name) for name in ("position", "color"))
     index = np.frombuffer(drawing["geometries"][0]["data"]["index"]["array"].data, "<u4")
     a, b, c = np.moveaxis(p[index].reshape(-1, 3, 3), 1, 0)
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2
@@ -276,10 +229,9 @@ def test_distance_slice_is_colored_by_distance(meshcat):
             sample.state[...] = FieldState.UNKNOWN
             return sample
 
-    unknown = Unknown([Sphere([2, 0, 1], 0.5)], [0, -1, 0], [6, 1, 2])
+    unknown = Unknown([], [0, -1, 0], [6, 1, 2])
     draw_distance_slice(meshcat, "/splatpilot/slice", unknown, height=1.0)
-    color = vertices(drawn(meshcat, "/splatpilot/slice"), "color")
-    np.testing.assert_allclose(color, 0.4)
+    np.testing.assert_allclose(vertices(meshcat, "/splatpilot/slice", "color"), 0.4)
 
 
 def test_camera_picture_is_shown_at_its_rate(meshcat):
@@ -309,16 +261,15 @@ def test_picture_document_is_the_picture():
     rgb[:12, :, 0] = 250
     corners = np.array([[-1.0, -2, 3], [1, -2, 3], [1, 2, 3], [-1, 2, 3]])
     document = json.loads(picture_gltf(rgb, corners))
-    decoded = cv2.imdecode(_bytes(document["images"][0]["uri"]), cv2.IMREAD_COLOR)[..., ::-1]
+
+    def data(uri: str) -> np.ndarray:
+        return np.frombuffer(base64.b64decode(uri.split(",")[1]), np.uint8)
+
+    decoded = cv2.imdecode(data(document["images"][0]["uri"]), cv2.IMREAD_COLOR)[..., ::-1]
     assert np.abs(decoded.astype(int) - rgb).mean() < 3
-    binary = _bytes(document["buffers"][0]["uri"])
+    binary = data(document["buffers"][0]["uri"])
     assert len(binary) == document["buffers"][0]["byteLength"]
     positions = binary[:48].view("<f4").reshape(4, 3)
     # glTF's (x, y, z) is Drake's (x, -z, y).
-    np.testing.assert_allclose(
-        np.column_stack([positions[:, 0], -positions[:, 2], positions[:, 1]]), corners
-    )
-
-
-def _bytes(uri: str) -> np.ndarray:
-    return np.frombuffer(base64.b64decode(uri.split(",")[1]), np.uint8)
+    drake = np.column_stack([positions[:, 0], -positions[:, 2], positions[:, 1]])
+    np.testing.assert_allclose(drake, corners)

@@ -89,16 +89,8 @@ def open_page(open_in_browser):
 
 def seen(gaussians, background, X_WB: RigidTransform) -> np.ndarray:
     """The onboard camera's image, in the format of `Page.picture`."""
-    info = CameraInfo(WIDTH, HEIGHT, FOV_Y)
-    view = BakedScene(gaussians).render(
-        info.intrinsic_matrix(),
-        info.width(),
-        info.height(),
-        X_WB @ X_BC,
-        0.01,
-        1e3,
-        background,
-    )
+    K = CameraInfo(WIDTH, HEIGHT, FOV_Y).intrinsic_matrix()
+    view = BakedScene(gaussians).render(K, WIDTH, HEIGHT, X_WB @ X_BC, 0.01, 1e3, background)
     return np.round(255 * np.clip(view.color[..., ::-1], 0, 1)).astype(np.uint8)
 
 
@@ -127,8 +119,20 @@ def test_page_shows_what_the_camera_sees(open_page, background):
     assert page.errors == []
 
 
-def test_controls_move_time_and_view(open_page):
+def test_controls_move_time_and_view_and_playback_changes_speed_and_loops(open_page):
     page = open_page(cloud(np.random.default_rng(1)), [straight("a", "goal")])
+    page.tab.select_option("#replay-speed", "4")
+    page.run("() => { replay.seek(0); replay.play(true); }")
+    page.tab.wait_for_function("!replay.playing")
+    assert page.run("() => replay.time") == 4.0
+    page.tab.keyboard.press("l")
+    # Beyond the end it starts again, and does not stop.
+    looped = "() => { replay.play(true); replay.seek(4.5); return [replay.time, replay.playing]; }"
+    assert page.tab.evaluate(looped) == [0, True]
+    page.run("() => replay.play(false)")
+    # The mouse does not lead below the ground.
+    assert page.run("() => viewer.controls.maxPolarAngle") == pytest.approx(np.pi / 2)
+
     page.run("() => replay.look('chase')")
     for time in (0.0, 1.0, 3.9):
         x, y, depth = page.run(
@@ -168,42 +172,42 @@ def test_controls_move_time_and_view(open_page):
 def test_flights_are_told_apart_and_crashes_start_before_their_end(open_page):
     spheres = MovingSpheres([0.5], [np.array([[3.0, 0, 1], [4.0, 0, 1], [np.inf] * 3])], period=2.0)
     flights = [straight("a", "collision"), straight("b", "goal", y=1.0)]
+    flights[1].states[:, 3] = 0.75
     page = open_page(cloud(np.random.default_rng(2)), flights, spheres=spheres)
     assert page.run("() => replay.time") == pytest.approx(2.0)
-    colors = page.run("() => replay.flights.map((f) => f.trail.material.color.getHex())")
-    assert len(set(colors)) == 2
     positions = page.run("() => replay.flights.map((f) => f.vehicle.matrix.elements.slice(12, 15))")
     np.testing.assert_allclose(positions, [[0.5, 0, 1.5], [0.5, 1, 1.5]], atol=1e-3)
     page.run("() => replay.choose(replay.flights[1])")
     assert page.run("() => replay.flights.map((f) => Boolean(f.fan.visible))") == [False, True]
-    for time, x in ((1, 3.0), (2.5, 4.0)):
+    for time, x in ((1, 3.0), (2.5, 4.0), (4, None)):
         page.run(f"() => replay.seek({time})")
         sphere = page.run("() => Array.from(replay.spheres.mesh.instanceMatrix.array)")
-        placed = np.array([[0.5, 0, 0, x], [0, 0.5, 0, 0], [0, 0, 0.5, 1]])
-        np.testing.assert_allclose(np.reshape(sphere, (4, 4)).T[:3], placed, atol=1e-6)
-    page.run("() => replay.seek(4)")
-    sphere = page.run("() => Array.from(replay.spheres.mesh.instanceMatrix.array)")
-    assert sphere[0] == 0
+        if x is None:
+            assert sphere[0] == 0
+        else:
+            placed = np.array([[0.5, 0, 0, x], [0, 0.5, 0, 0], [0, 0, 0.5, 1]])
+            np.testing.assert_allclose(np.reshape(sphere, (4, 4)).T[:3], placed, atol=1e-6)
+
+    # Curves lie over one another on axes, in the colors of the trails.
+    assert page.run("() => Plot.ticks(-0.3, 4, 4)") == [0, 2, 4]
+    assert page.run("() => Plot.ticks(0, 1, 4)") == [0, 0.5, 1]
+    colors = page.run("() => replay.flights.map((f) => f.color)")
+    trails = page.run("() => replay.flights.map((f) => f.trail.material.color.getHex())")
+    assert len(set(colors)) == len(set(trails)) == 2
+    for color, speed in zip(colors, (0.25, 0.75), strict=True):
+        pixel = page.run(
+            f"""() => {{
+              replay.seek(0);
+              const plot = replay.plots[0], context = plot.canvas.getContext("2d");
+              const [x, y] = [plot.x(3), plot.y({speed})].map(Math.round);
+              return Array.from(context.getImageData(x, y, 1, 1).data.slice(0, 3));
+            }}"""
+        )
+        assert "#" + bytes(pixel).hex() == color
     assert page.errors == []
 
 
-def test_playback_changes_its_speed_and_loops(open_page):
-    page = open_page(cloud(np.random.default_rng(1)), [straight("a", "goal")])
-    page.tab.select_option("#replay-speed", "4")
-    page.run("() => { replay.seek(0); replay.play(true); }")
-    page.tab.wait_for_function("!replay.playing")
-    assert page.run("() => replay.time") == 4.0
-    page.tab.keyboard.press("l")
-    # Beyond the end it starts again, and does not stop.
-    looped = "() => { replay.play(true); replay.seek(4.5); return [replay.time, replay.playing]; }"
-    assert page.tab.evaluate(looped) == [0, True]
-    page.run("() => replay.play(false)")
-    # The mouse does not lead below the ground.
-    assert page.run("() => viewer.controls.maxPolarAngle") == pytest.approx(np.pi / 2)
-    assert page.errors == []
-
-
-def test_frontier_is_hidden_from_above_and_seen_on_board(open_page):
+def test_page_names_its_environment_hides_the_frontier_from_above_and_fits_phones(open_page):
     view = dataclasses.replace(VIEW, num_frontier=100)
     page = open_page(cloud(np.random.default_rng(1)), [straight("a", "goal")], view=view)
     shown = "() => replay.splats.mesh.material.uniforms.shown.value"
@@ -215,29 +219,6 @@ def test_frontier_is_hidden_from_above_and_seen_on_board(open_page):
     page.tab.keyboard.press("1")
     assert page.run(shown) == 300
 
-
-def test_curves_of_flights_lie_over_one_another_on_axes(open_page):
-    flights = [straight("a", "goal"), straight("b", "goal", y=1.0)]
-    flights[1].states[:, 3] = 0.75
-    page = open_page(cloud(np.random.default_rng(1)), flights)
-    assert page.run("() => Plot.ticks(-0.3, 4, 4)") == [0, 2, 4]
-    assert page.run("() => Plot.ticks(0, 1, 4)") == [0, 0.5, 1]
-    for flight, speed in zip((0, 1), (0.25, 0.75), strict=True):
-        pixel = page.run(
-            f"""() => {{
-              replay.seek(0);
-              const plot = replay.plots[0], context = plot.canvas.getContext("2d");
-              const [x, y] = [plot.x(3), plot.y({speed})].map(Math.round);
-              return Array.from(context.getImageData(x, y, 1, 1).data.slice(0, 3));
-            }}"""
-        )
-        color = page.run(f"() => replay.flights[{flight}].color")
-        drawn = "#" + "".join(f"{value:02x}" for value in pixel)
-        assert drawn == color
-
-
-def test_page_names_its_environment_and_fits_phones(open_page):
-    page = open_page(cloud(np.random.default_rng(1)), [straight("a", "goal")])
     assert page.tab.title() == "forest, seed 3"
     content = page.tab.get_attribute("meta[name=viewport]", "content")
     assert content == "width=device-width, initial-scale=1"
@@ -251,7 +232,7 @@ def test_page_names_its_environment_and_fits_phones(open_page):
     assert "0.5 m" in page.tab.inner_text("#replay-scale")
 
 
-def test_page_holds_its_gaussians_and_is_the_same_every_time():
+def test_page_holds_its_gaussians_is_the_same_every_time_and_needs_a_flight():
     gaussians, flights = cloud(np.random.default_rng(4)), [straight("a", "goal")]
     pages = [replay_page("<body></body>", gaussians, SKY, VIEW, flights) for _ in range(2)]
     assert pages[0] == pages[1]
@@ -259,8 +240,5 @@ def test_page_holds_its_gaussians_and_is_the_same_every_time():
     assert packed is not None
     held = np.frombuffer(gzip.decompress(base64.b64decode(packed[1])), np.uint32)
     np.testing.assert_array_equal(held.reshape(-1, 8), pack_gaussians(gaussians))
-
-
-def test_page_without_flights_is_refused():
     with pytest.raises(ValueError, match="flights must be at least one"):
-        replay_page("<body></body>", cloud(np.random.default_rng(3)), (0.0, 0.0, 0.0), VIEW, [])
+        replay_page("<body></body>", gaussians, SKY, VIEW, [])

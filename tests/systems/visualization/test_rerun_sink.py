@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from baked_scenes import uniform_scene
 from pydrake.common.value import Value
 from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
@@ -15,7 +16,6 @@ from pydrake.systems.primitives import ConstantVectorSource
 from pydrake.systems.sensors import CameraInfo
 
 from splatpilot.systems.policies.hypotheses import Hypotheses
-from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.splats.splat_camera import SplatCamera
 from splatpilot.systems.vehicle.quadrotor import hover_state
 from splatpilot.systems.vehicle.state import StateToPose
@@ -48,8 +48,8 @@ def recording(tmp_path_factory) -> Path:
         for name, value in (values | {"hypotheses": plan.to_vector()}).items()
     }
     ports["outcome"] = builder.AddSystem(Outcome()).get_output_port()
-    shape = [[3.0, 0, 2], [4.0, 0, 2]], [[1.0, 0, 0, 0], [0, 1.0, 0, 0]], [[0.3] * 3] * 2
-    scene = GaussianScene.from_colors(*shape, [0.9] * 2, [[1.0, 0, 0]] * 2)
+    quats = np.array([[1.0, 0, 0, 0], [0, 1.0, 0, 0]])
+    scene = uniform_scene([[3.0, 0, 2], [4.0, 0, 2]], [0.3] * 3, color=(1.0, 0, 0), quat=quats)
     pose = builder.AddSystem(StateToPose())
     camera = builder.AddSystem(SplatCamera(scene, CameraInfo(32, 24, 1.0), RigidTransform()))
     builder.Connect(ports["state"], pose.get_input_port())
@@ -73,9 +73,8 @@ def columns(path: Path, entity: str) -> dict[str, list]:
 
 
 def test_recording_is_valid_and_holds_everything_on_one_timeline(recording):
-    verified = subprocess.run(
-        [sys.executable, "-m", "rerun", "rrd", "verify", str(recording)], capture_output=True
-    )
+    verify = [sys.executable, "-m", "rerun_cli", "rrd", "verify", str(recording)]
+    verified = subprocess.run(verify, capture_output=True)
     assert verified.returncode == 0, verified.stderr
     for entity in (
         *("/world/vehicle", "/world/hypotheses", "/world/vehicle/camera/color"),

@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 import pytest
+from baked_scenes import uniform_scene
 from pydrake.geometry import Meshcat
 from pydrake.math import RigidTransform, RotationMatrix
 
@@ -34,13 +35,8 @@ def disks(step: float = 0.08) -> GaussianScene:
             quats.append(np.tile(turns[axis], (len(points), 1)))
     means = np.concatenate(means)
     shade = 0.5 + 0.15 * np.sin(4 * means).sum(axis=1)
-    return GaussianScene.from_colors(
-        means,
-        np.concatenate(quats),
-        np.tile([0.6 * step, 0.6 * step, 0.002], (len(means), 1)),
-        np.full(len(means), 0.95),
-        np.tile(shade[:, None], (1, 3)),
-    )
+    size = [0.6 * step, 0.6 * step, 0.002]
+    return uniform_scene(means, size, 0.95, shade[:, None] * [1, 1, 1], np.concatenate(quats))
 
 
 def room(**options) -> ViewerScene:
@@ -120,21 +116,6 @@ def test_ruler_measures_the_room(open_page):
     assert page.errors == []
 
 
-def test_surface_of_a_ray_is_where_the_camera_measures_it(open_page):
-    scene = room()
-    page = open_page(scene)
-    page.run("() => { view.choose(0); view.lookFromCamera(); }")
-    depth = BakedScene(scene.gaussians).render(K, 120, 90, X_WCS[0]).depth
-    for u, v in ((60, 45), (20, 20), (100, 80), (75, 70), (31, 8)):
-        ray_C = np.array([(u + 0.5 - 60) / 60, (v + 0.5 - 45) / 60, 1.0])
-        z = depth[v, u]
-        eye = X_WCS[0].translation().tolist()
-        ray = (R_WC @ (ray_C / np.linalg.norm(ray_C))).tolist()
-        p = page.run(f"() => surfaceAlong(view.splats, {eye}, {ray}, [1, 0, 0])")
-        np.testing.assert_allclose(p, X_WCS[0].multiply(z * ray_C), atol=0.01)
-    assert page.errors == []
-
-
 def test_slider_and_switches_change_the_picture(open_page):
     page = open_page(room(images=None))
     low = page.picture()
@@ -167,7 +148,7 @@ def test_slider_and_switches_change_the_picture(open_page):
     assert page.errors == []
 
 
-def test_frustum_shows_its_image_when_clicked(open_page):
+def test_frustum_shows_its_image_when_clicked_and_rays_end_on_surfaces(open_page):
     scene = room()
     page = open_page(scene)
     page.run("() => view.setHeight(1.5)")
@@ -189,17 +170,24 @@ def test_frustum_shows_its_image_when_clicked(open_page):
     truth = BakedScene(scene.gaussians).render(4 * K * [[1], [1], [0.25]], WIDTH, HEIGHT, X_WCS[1])
     seen = np.round(255 * np.clip(truth.color[..., ::-1], 0, 1)).astype(np.uint8)
     assert differ(cv2.blur(page.picture(), (5, 5)), cv2.blur(seen, (5, 5))) < 3
+
+    # Rays end where the camera measures the surface.
+    page.run("() => { view.choose(0); view.lookFromCamera(); }")
+    depth = BakedScene(scene.gaussians).render(K, 120, 90, X_WCS[0]).depth
+    for u, v in ((60, 45), (20, 20), (100, 80), (75, 70), (31, 8)):
+        ray_C = np.array([(u + 0.5 - 60) / 60, (v + 0.5 - 45) / 60, 1.0])
+        z = depth[v, u]
+        eye = X_WCS[0].translation().tolist()
+        ray = (R_WC @ (ray_C / np.linalg.norm(ray_C))).tolist()
+        p = page.run(f"() => surfaceAlong(view.splats, {eye}, {ray}, [1, 0, 0])")
+        np.testing.assert_allclose(p, X_WCS[0].multiply(z * ray_C), atol=0.01)
     assert page.errors == []
 
 
 def test_hatched_surfaces_and_surroundings_are_apart(open_page):
     gaussians = disks()
-    beyond = GaussianScene.from_colors(
-        [[9.0, 2, 0.5]], [[1, 0, 0, 0]], [[0.5] * 3], [0.95], [[1] * 3]
-    )
-    unknown = GaussianScene.from_colors(
-        [[3.0, 2, 1]], [[1, 0, 0, 0]], [[0.5] * 3], [0.95], [[1] * 3]
-    )
+    beyond = uniform_scene([[9.0, 2, 0.5]], [0.5] * 3, 0.95, (1, 1, 1))
+    unknown = uniform_scene([[3.0, 2, 1]], [0.5] * 3, 0.95, (1, 1, 1))
     merged = gaussians.merged_with(beyond).merged_with(unknown)
     page = open_page(room(gaussians=merged, num_frontier=1, beyond=False, images=None))
 

@@ -13,11 +13,7 @@ LOWER, UPPER = np.array([0.0, -1.5, 0.0]), np.array([6.0, 1.5, 2.5])
 
 def color_at(p_W: np.ndarray) -> np.ndarray:
     x, y, z = np.moveaxis(p_W, -1, 0)
-    waves = [
-        np.sin(3.1 * x) * np.cos(4 * z + 1),
-        np.cos(5 * y + x),
-        np.sin(2.2 * z + 1.7 * x + y),
-    ]
+    waves = [np.sin(3.1 * x) * np.cos(4 * z + 1), np.cos(5 * y + x), np.sin(2.2 * z + 1.7 * x + y)]
     return np.round(127.5 + 90 * np.stack(waves, axis=-1)).astype(np.uint8)
 
 
@@ -76,31 +72,29 @@ def assert_shows_room(capture, X_RW=None, color=6.0, depth: float | None = 1e-5)
             assert np.median(np.abs(frame.depth[known] / seen.depth[known] - 1)) < depth
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def room_views() -> Callable[..., list[RoomView]]:
-    def views(
-        K: np.ndarray, width: int, height: int, poses=POSES, finer: float = 1.0
-    ) -> list[RoomView]:
+    def views(K, width: int, height: int, poses=POSES, finer: float = 1.0) -> list[RoomView]:
         return [trace(X_WC, pinhole_rays(K, width, height), finer) for X_WC in poses]
 
     return views
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def trace_rays() -> Callable[..., RoomView]:
     return trace
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def room_poses() -> list[RigidTransform]:
     return POSES
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def shows_room() -> Callable[..., None]:
     return assert_shows_room
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def K() -> np.ndarray:
     return np.array([[50.0, 0, 31.0], [0, 52.0, 25.0], [0, 0, 1]])

@@ -5,23 +5,10 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 
-from splatpilot.training.captures import capture
-from splatpilot.training.captures.capture_config import (
-    CaptureConfig,
-    cache_folder,
-    cache_key,
-    prepare_cache,
-)
+from splatpilot.training.captures import capture, capture_config
 
 K = capture.pinhole(46.0, 46.0, 32.0, 24.0)
 RAYS = np.random.default_rng(0).uniform(-0.7, 0.7, (50, 2))
-
-
-def test_fourth_radial_term_is_of_the_eighth_power():
-    lens = capture.opencv_lens(K, 64, 48, [0.02, -0.01, 0, 0, 0.005], k4=0.12)
-    r2 = (RAYS**2).sum(axis=1, keepdims=True)
-    stretch = 1 + 0.02 * r2 - 0.01 * r2**2 + 0.005 * r2**3 + 0.12 * r2**4
-    np.testing.assert_allclose(lens.pixels(RAYS), 46 * stretch * RAYS + [32, 24], atol=1e-9)
 
 
 def test_fisheye_is_that_of_kannala_and_brandt():
@@ -39,19 +26,8 @@ def test_pinhole_sees_no_farther_than_the_radius_of_a_lens():
     assert np.linalg.norm(lens.pixels(corner[None]) - [32, 24]) == pytest.approx(20, rel=2e-3)
 
 
-@pytest.mark.parametrize("center", [(64.8, 24.0), (32.0, -1.0)])
-def test_principal_point_outside_the_image_is_refused(center):
-    with pytest.raises(ValueError, match=r"principal point must be in the image of 64x48 px, got"):
-        capture.Lens(capture.pinhole(46, 46, *center), 64, 48)
-
-
-@pytest.mark.parametrize(("cx", "eccentric"), [(32, False), (47, False), (49, True), (15, True)])
-def test_eccentric_lenses_are_recognized(cx, eccentric):
-    assert capture.Lens(capture.pinhole(46, 46, cx, 24), 64, 48).is_eccentric == eccentric
-
-
-K_D = np.array([[58.5, 0, 32], [0, 58.5, 24], [0, 0, 1.0]])
-K_C = np.array([[52.0, 0, 32], [0, 52.0, 24], [0, 0, 1.0]])
+K_D = capture.pinhole(58.5, 58.5, 32, 24)
+K_C = capture.pinhole(52, 52, 32, 24)
 
 
 def plane_depth(n, d, K, width, height):
@@ -61,37 +37,32 @@ def plane_depth(n, d, K, width, height):
 
 
 @pytest.mark.parametrize("finer", [1, 3])
-def test_plane(finer):
+def test_depth_of_a_plane_is_registered_to_the_color_camera(finer):
     X_CD = RigidTransform(RotationMatrix.MakeYRotation(0.05), [0.024, 0.005, -0.01])
-    K = np.diag([finer, finer, 1]) @ K_C
+    K, size = np.diag([finer, finer, 1]) @ K_C, (64 * finer, 48 * finer)
     n, d = np.array([0.2, -0.1, 1.0]), 2.0
     n_C = X_CD.rotation().multiply(n)
-    d_C = d + n_C @ X_CD.translation()
     depth = plane_depth(n, d, K_D, 64, 48).astype(np.float32)
-    got = capture.register_depth(
-        depth, capture.DepthCamera(K_D, 64, 48, X_CD), K, 64 * finer, 48 * finer
-    )
-    want = plane_depth(n_C, d_C, K, 64 * finer, 48 * finer)
+    found = capture.register_depth(depth, capture.DepthCamera(K_D, 64, 48, X_CD), K, *size)
+    expected = plane_depth(n_C, d + n_C @ X_CD.translation(), K, *size)
     inner = np.s_[8 * finer : -8 * finer, 8 * finer : -8 * finer]
     # Half a pixel of the coarser camera on this slope.
-    np.testing.assert_allclose(got[inner], want[inner], rtol=0.004)
+    np.testing.assert_allclose(found[inner], expected[inner], rtol=0.004)
 
 
 def test_nearer_surface_hides_the_farther():
     depth = np.full((48, 64), 4.0, np.float32)
     depth[:, 20:30] = 1.0
-    got = capture.register_depth(
-        depth, capture.DepthCamera(K_D, 64, 48, RigidTransform([0.3, 0, 0])), K_D, 64, 48
-    )
+    camera = capture.DepthCamera(K_D, 64, 48, RigidTransform([0.3, 0, 0]))
     shift = 0.3 * 58.5
-    covered = got[:, int(np.ceil(20 + shift)) : int(30 + shift)]
-    np.testing.assert_array_equal(covered, 1.0)
+    covered = np.s_[:, int(np.ceil(20 + shift)) : int(30 + shift)]
+    assert (capture.register_depth(depth, camera, K_D, 64, 48)[covered] == 1.0).all()
 
 
 def make_frame(depth: np.ndarray) -> capture.CaptureFrame:
     height, width = depth.shape
-    K = np.array([[30.0, 0, width / 2], [0, 30.0, height / 2], [0, 0, 1]])
     image = np.arange(height * width * 3, dtype=np.uint8).reshape(height, width, 3)
+    K = capture.pinhole(30, 30, width / 2, height / 2)
     return capture.CaptureFrame(image, depth.astype(np.float32), RigidTransform(), K)
 
 
@@ -113,58 +84,48 @@ def test_a_slanted_plane_keeps_its_depth(factor):
     np.testing.assert_allclose(small.depth, plane(small.K, 32 // factor, 25 // factor), rtol=1e-6)
 
 
-def test_edges_holes_and_sky():
+def test_shrunken_depth_keeps_edges_holes_and_sky_and_colors_are_averaged():
     inf = np.inf
-    depth = np.array(
-        [
-            [1, 5, 0, 0, inf, inf, 0, 4],
-            [1, 5, 0, 3, inf, inf, 4, 4],
-            [1, 1, 2, inf, 0, 0, 1, 1.02],
-            [5, 5, 2, inf, 0, 0, 1, 1.02],
-        ]
-    )
-    expected = [[1, 0, inf, 4], [1, 2, 0, 2 / (1 + 1 / 1.02)]]
-    np.testing.assert_allclose(capture.shrink(make_frame(depth), 2).depth, expected, rtol=1e-6)
+    depth = [
+        [1, 5, 0, 0, inf, inf, 0, 4],
+        [1, 5, 0, 3, inf, inf, 4, 4],
+        [1, 1, 2, inf, 0, 0, 1, 1.02],
+        [5, 5, 2, inf, 0, 0, 1, 1.02],
+    ]
+    valid = np.ones((4, 8), bool)
+    valid[1, 4] = False
+    frame = dataclasses.replace(make_frame(np.array(depth)), valid=valid)
+    small = capture.shrink(frame, 2)
+    expected = [[1, 0, 0, 4], [1, 2, 0, 2 / (1 + 1 / 1.02)]]
+    np.testing.assert_allclose(small.depth, expected, rtol=1e-6)
+    np.testing.assert_array_equal(small.valid, [[True, True, False, True], [True] * 4])
+    mean = frame.image.reshape(2, 2, 4, 2, 3).mean(axis=(1, 3))
+    assert np.abs(small.image - mean).max() <= 0.5
+    sky = capture.shrink(make_frame(np.array(depth)), 2)
+    assert sky.depth[0, 2] == inf and sky.valid.all()
 
 
-def test_shrunken_pixels_are_valid_if_all_replaced_ones_are():
-    frame = make_frame(np.ones((5, 8)))
-    valid = np.ones((5, 8), bool)
-    valid[1, 2] = valid[3, 6:] = valid[4] = False
-    small = capture.shrink(dataclasses.replace(frame, valid=valid), 2)
-    expected = [[True, False, True, True], [True, True, True, False]]
-    np.testing.assert_array_equal(small.valid, expected)
-    np.testing.assert_array_equal(small.depth > 0, expected)
-
-
-def test_colors_are_averaged():
-    frame = make_frame(np.ones((4, 6)))
-    mean = frame.image.reshape(2, 2, 3, 2, 3).mean(axis=(1, 3))
-    assert np.abs(capture.shrink(frame, 2).image - mean).max() <= 0.5
-
-
-def test_cache_folder(monkeypatch, tmp_path):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert cache_folder(CaptureConfig(cache="here"), "bags", "a") == Path("here")
-    assert cache_folder(CaptureConfig(), "bags", "a") == tmp_path / "splatpilot/bags/a"
-    monkeypatch.delenv("XDG_CACHE_HOME")
-    assert cache_folder(CaptureConfig(), "bags") == Path.home() / ".cache/splatpilot/bags"
-
-
-def test_cache_keys(tmp_path):
+def test_cache_keys_are_those_of_files_and_settings(tmp_path):
     one, other = tmp_path / "a", tmp_path / "b"
     one.write_text("1")
     other.write_text("1")
-    names = [cache_key([one], 2), cache_key([other], 2), cache_key([one], 3)]
-    assert cache_key([one], 2) == names[0]
+    key = capture_config.cache_key
+    names = [key([one], 2), key([other], 2), key([one], 3)]
+    assert key([one], 2) == names[0]
     one.write_text("12")
-    names.append(cache_key([one], 2))
-    assert len(set(names)) == 4
+    assert len({*names, key([one], 2)}) == 4
 
 
-def test_cache_that_cannot_be_written_is_refused(tmp_path):
+def test_cache_folder_is_made_where_it_can_be_written(tmp_path, monkeypatch):
+    here, default = capture_config.CaptureConfig(cache="here"), capture_config.CaptureConfig()
+    folder = capture_config.cache_folder
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert folder(here, "bags", "a") == Path("here")
+    assert folder(default, "bags", "a") == tmp_path / "splatpilot/bags/a"
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    assert folder(default, "bags") == Path.home() / ".cache/splatpilot/bags"
+    capture_config.prepare_cache(tmp_path / "made/deep")
+    assert (tmp_path / "made/deep").is_dir()
     (tmp_path / "file").touch()
     with pytest.raises(OSError, match=r"file/deep: cannot be written .*; set capture\.cache to"):
-        prepare_cache(tmp_path / "file/deep")
-    prepare_cache(tmp_path / "made/deep")
-    assert (tmp_path / "made/deep").is_dir()
+        capture_config.prepare_cache(tmp_path / "file/deep")

@@ -1,4 +1,3 @@
-import subprocess
 import sys
 from pathlib import Path
 
@@ -10,7 +9,7 @@ from splatpilot.training.captures import capture_registry as module
 from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.capture_registry import read_capture, register_capture
 
-_PACKAGE = '''
+_PACKAGE = """
 import cv2
 import numpy as np
 from pydrake.math import RigidTransform
@@ -20,7 +19,6 @@ from splatpilot.training.captures.capture_registry import CaptureFormat
 
 
 def read(path, config):
-    """Two images of one camera, whose focal length the configuration may give."""
     f = config.intrinsics[0] if config.intrinsics else 20.0
     return Capture(
         name=path.name,
@@ -35,7 +33,7 @@ def read(path, config):
 
 PAIR = CaptureFormat(lambda path: (path / "pair.txt").exists(), read)
 NUMBER = 3
-'''
+"""
 
 
 @pytest.fixture
@@ -61,36 +59,28 @@ def test_format_of_another_package(folder, tmp_path):
     (info / "entry_points.txt").write_text("[splatpilot.captures]\npair = pairs:PAIR\n")
     config = CaptureConfig(intrinsics=[30.0, 30.0, 16.0, 12.0])
     capture = read_capture(folder, config)
-    assert capture.source == f"pair {folder}" and len(capture) == 2
-    assert capture.K[0, 0] == 30
-    assert (capture.folder, capture.config) == (str(folder), config)
+    assert (capture.K[0, 0], len(capture), capture.folder) == (30, 2, str(folder))
+    assert capture.config == config
     plain = read_capture(folder, CaptureConfig(kind="pair", cache="kept"))
     assert plain.K[0, 0] == 20 and plain.config.cache == str(Path("kept").absolute())
-
-
-def test_format_that_is_not_installed(folder):
     assert read_capture(folder, CaptureConfig(kind="pairs:PAIR")).source == f"pair {folder}"
-    for kind, message in (
-        ("pairs:NUMBER", "pairs:NUMBER must be a CaptureFormat"),
-        ("pairs:NOWHERE", "'pairs:NOWHERE' is not at"),
-        ("kinect", r"no capture format 'kinect'; there are tartanair_v1, .*photographs"),
-    ):
+    for kind, message in {
+        "pairs:NUMBER": "pairs:NUMBER must be a CaptureFormat",
+        "pairs:NOWHERE": "'pairs:NOWHERE' is not at",
+        "kinect": r"no capture format 'kinect'; there are tartanair_v1, .*photographs",
+    }.items():
         with pytest.raises(ValueError, match=message):
             read_capture(folder, CaptureConfig(kind=kind))
 
 
 def test_registered_formats_are_listed(folder):
-    register_capture(
-        "cubes", lambda path: False, lambda path, config: None, description="cubes (*)"
-    )
+    register_capture("cubes", lambda path: False, None, description="cubes (*)")
     (folder / "0.png").unlink()
-    with pytest.raises(
-        ValueError,
-        match=r"known are TartanAir V1 .*, photographs alone, a ROS bag, a video .*, cubes",
-    ):
+    known = "known are TartanAir V1 .*, photographs alone, a ROS bag, a video .*, cubes"
+    with pytest.raises(ValueError, match=known):
         read_capture(folder)
     with pytest.raises(ValueError, match="there is a capture format 'tum' already"):
-        register_capture("tum", lambda path: True, lambda path, config: None)
+        register_capture("tum", lambda path: True, None)
 
 
 def test_settings_are_the_fields_without_default_values(folder):
@@ -103,22 +93,3 @@ def test_settings_are_the_fields_without_default_values(folder):
     ]
     assert load_config(CaptureConfig(), overrides=settings) == config
     assert CaptureConfig().settings() == []
-
-
-def test_captures_are_read_without_torch_and_pycolmap(tmp_path):
-    (tmp_path / "model").mkdir()
-    for part in ("cameras", "images"):
-        (tmp_path / "model" / f"{part}.txt").touch()
-    program = (
-        "import sys; sys.modules['torch'] = sys.modules['pycolmap'] = None\n"
-        "from splatpilot.training.captures.capture_registry import read_capture\n"
-        "try:\n"
-        "    read_capture(sys.argv[1])\n"
-        "except ModuleNotFoundError as error:\n"
-        "    print(error)\n"
-    )
-    found = subprocess.run(
-        [sys.executable, "-c", program, tmp_path / "model"], capture_output=True, text=True
-    )
-    assert found.stderr == ""
-    assert "pip install 'splatpilot[photos]'" in found.stdout

@@ -21,8 +21,15 @@ X_MW = RigidTransform(
 )
 
 
-def write_model(path, K, views) -> pycolmap.Reconstruction:
-    rng = np.random.default_rng(0)
+@pytest.fixture
+def views(room_views, K):
+    return room_views(K, 64, 48)
+
+
+@pytest.fixture
+def model(tmp_path, K, views):
+    """A folder of images with a model, whose points are seen by one image each."""
+    path, rng = tmp_path / "castle", np.random.default_rng(0)
     model = pycolmap.Reconstruction()
     params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
     camera = pycolmap.Camera(model="PINHOLE", width=64, height=48, params=params, camera_id=1)
@@ -33,23 +40,18 @@ def write_model(path, K, views) -> pycolmap.Reconstruction:
         X_MC = X_MW @ view.X_WC
         X_CM = RigidTransform(X_MC.rotation(), SHRINK * X_MC.translation()).inverse()
         columns, rows = rng.integers(0, 64, 60), rng.integers(0, 48, 60)
-        points = [pycolmap.Point2D([u + 0.5, v + 0.5]) for u, v in zip(columns, rows, strict=True)]
+        pixels = np.stack([columns, rows], axis=1) + 0.5
+        points = [pycolmap.Point2D(pixel) for pixel in pixels]
         image = pycolmap.Image(name=f"{i:02d}.png", points2D=points, camera_id=1, image_id=i + 1)
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(X_CM.GetAsMatrix34()))
-        for k, (u, v) in enumerate(zip(columns, rows, strict=True)):
-            z = view.depth[v, u]
-            q = [(u + 0.5 - K[0, 2]) / K[0, 0] * z, (v + 0.5 - K[1, 2]) / K[1, 1] * z, z]
-            p = SHRINK * X_MW.multiply(view.X_WC.multiply(np.array(q)))
+        z = view.depth[rows, columns]
+        p_CQ = np.column_stack([pixels, np.ones(60)]) @ np.linalg.inv(K).T * z[:, None]
+        p_MQ = SHRINK * X_MC.multiply(p_CQ.T).T
+        for k, p in enumerate(p_MQ):
             track = pycolmap.Track([pycolmap.TrackElement(i + 1, k)])
-            model.add_point3D(p, track, view.image[v, u])
-    return model
-
-
-@pytest.fixture
-def model(tmp_path, K, room_views):
-    path = tmp_path / "castle"
+            model.add_point3D(p, track, view.image[rows[k], columns[k]])
     (path / "sparse/0").mkdir(parents=True)
-    write_model(path, K, room_views(K, 64, 48)).write(path / "sparse/0")
+    model.write(path / "sparse/0")
     return path
 
 
@@ -66,61 +68,50 @@ def test_model(model, room_poses, shows_room):
     assert capture.metric
     X_RW = room_poses[0] @ capture.X_WCs[0].inverse()
     shows_room(capture, X_RW, color=0.5, depth=None)
-    assert capture.points is not None
     p_RQ = X_RW.multiply(capture.points.p_WQ.T).T
     to_wall = np.minimum(np.abs(p_RQ - [0, -1.5, 0]), np.abs(p_RQ - [6, 1.5, 2.5])).min(axis=1)
     assert to_wall.max() < 1e-9
     assert 0 <= capture.points.colors.min() and capture.points.colors.max() <= 1
 
 
-@pytest.mark.parametrize("up", ["cameras", "ground"])
-def test_up(model, room_poses, up):
+@pytest.mark.parametrize(("up", "tilt"), [("cameras", 2.0), ("ground", 0.1)])
+def test_up(model, room_poses, up, tilt):
     capture = read_capture(model, CaptureConfig(up=up))
-    X_RW = room_poses[0] @ capture.X_WCs[0].inverse()
-    tilt = np.rad2deg(np.arccos(X_RW.rotation().matrix()[2, 2]))
-    assert tilt < (0.1 if up == "ground" else 2)
-
-
-def test_camera_height(model, room_poses):
-    height = np.median([X_WC.translation()[2] for X_WC in room_poses])
-    capture = read_capture(model, CaptureConfig(scale=ScaleConfig(camera_height=float(height))))
-    np.testing.assert_allclose(lengths(capture.X_WCs), lengths(room_poses), rtol=1e-3)
+    R_RW = (room_poses[0] @ capture.X_WCs[0].inverse()).rotation().matrix()
+    assert np.rad2deg(np.arccos(R_RW[2, 2])) < tilt
 
 
 @pytest.mark.parametrize("turn", [RotationMatrix.MakeXRotation, RotationMatrix.MakeYRotation])
-def test_ground_that_cameras_contradict(model, turn):
+def test_height_is_above_a_ground_that_agrees_with_the_cameras(model, turn, room_poses):
+    height = float(np.median([X_WC.translation()[2] for X_WC in room_poses]))
+    scaled = read_capture(model, CaptureConfig(scale=ScaleConfig(camera_height=height)))
+    np.testing.assert_allclose(lengths(scaled.X_WCs), lengths(room_poses), rtol=1e-3)
     level = read_capture(model)
     center = np.mean([X_WC.translation() for X_WC in level.X_WCs], axis=0)
+    p_SQ = np.random.default_rng(0).uniform([-5, -5, 0], [5, 5, 0], (500, 3))
 
-    def over_slope(degrees: float, depth: float) -> Capture:
-        p_SQ = np.random.default_rng(0).uniform([-5, -5, 0], [5, 5, 0], (500, 3))
-        p_WQ = center + turn(np.deg2rad(degrees)).multiply(p_SQ.T).T - [0, 0, depth]
+    def over_slope(degrees: float) -> Capture:
+        p_WQ = center + turn(np.deg2rad(degrees)).multiply(p_SQ.T).T - [0, 0, 2.0]
         return dataclasses.replace(level, points=SfmPoints(p_WQ, np.zeros((500, 3))))
 
-    assert camera_height(over_slope(5, 2.0)) == pytest.approx(2.0, rel=0.05)
-    with pytest.raises(
-        ValueError, match=r"castle: the most likely ground tilts by (19|20|21) degrees"
-    ):
-        camera_height(over_slope(20, 2.0))
+    assert camera_height(over_slope(5)) == pytest.approx(2.0, rel=0.05)
+    with pytest.raises(ValueError, match=r"castle: the most likely ground tilts by (19|20|21) deg"):
+        camera_height(over_slope(20))
 
 
-def test_distance_between_points(model, K, room_views, room_poses):
+def test_distance_between_points(model, room_poses):
     reconstruction = pycolmap.Reconstruction(model / "sparse/0")
     points = [list(reconstruction.images[i].points2D)[7] for i in (1, 4)]
     a, b = (reconstruction.points3D[point.point3D_id].xyz for point in points)
-    between = [
-        f"{name}@{point.xy[0] + 0.3:.2f},{point.xy[1]:.2f}"
-        for name, point in zip(("00.png", "03.png"), points, strict=True)
-    ]
-    distance = float(np.linalg.norm(a - b)) / SHRINK
-    scale = ScaleConfig(between=between, distance=distance)
+    (u, v), (x, y) = (point.xy for point in points)
+    between = [f"00.png@{u + 0.3:.2f},{v:.2f}", f"03.png@{x + 0.3:.2f},{y:.2f}"]
+    scale = ScaleConfig(between=between, distance=float(np.linalg.norm(a - b)) / SHRINK)
     capture = read_capture(model, CaptureConfig(scale=scale))
     np.testing.assert_allclose(lengths(capture.X_WCs), lengths(room_poses), rtol=1e-9)
 
 
-def test_depth_of_some_images(model, K, room_views, room_poses):
+def test_depth_of_some_images(model, views, room_poses):
     (model / "depth").mkdir()
-    views = room_views(K, 64, 48)
     for i in (2, 5):
         millimeters = np.round(1000 * views[i].depth).astype(np.uint16)
         cv2.imwrite(str(model / f"depth/{i:02d}.png"), millimeters)
@@ -129,22 +120,6 @@ def test_depth_of_some_images(model, K, room_views, room_poses):
     np.testing.assert_allclose(lengths(capture.X_WCs), lengths(room_poses), rtol=0.02)
     np.testing.assert_allclose(capture.frame(5).depth, views[5].depth, atol=0.001)
     assert capture.load_depth(0) is None and not capture.frame(0).depth.any()
-
-
-@pytest.fixture
-def tracked(model):
-    reconstruction = pycolmap.Reconstruction(model / "sparse/0")
-    for number in range(1, 10):
-        seen = [point.point3D_id for point in reconstruction.images[number].points2D][:60]
-        image = reconstruction.images[number + 1]
-        for each in seen:
-            pixel = image.project_point(reconstruction.points3D[each].xyz)
-            if pixel is not None and (pixel >= 0).all() and (pixel < [64, 48]).all():
-                image.points2D.append(pycolmap.Point2D(pixel))
-                element = pycolmap.TrackElement(number + 1, len(image.points2D) - 1)
-                reconstruction.add_observation(each, element)
-    reconstruction.write(model / "sparse/0")
-    return model
 
 
 @pytest.mark.parametrize("name", ["00.png.png", "00.png"])
@@ -158,15 +133,25 @@ def test_masks_of_images_are_those_of_their_names(model, name):
     assert capture.frame(1).valid.all()
 
 
-def test_points_that_only_masked_pixels_show_are_left_out(tracked):
-    before = read_capture(tracked).points
-    (tracked / "masks").mkdir()
+def test_points_that_only_masked_pixels_show_are_left_out(model):
+    reconstruction = pycolmap.Reconstruction(model / "sparse/0")
+    for number in range(1, 10):
+        seen = [point.point3D_id for point in reconstruction.images[number].points2D][:60]
+        image = reconstruction.images[number + 1]
+        for each in seen:
+            pixel = image.project_point(reconstruction.points3D[each].xyz)
+            if pixel is not None and (pixel >= 0).all() and (pixel < [64, 48]).all():
+                image.points2D.append(pycolmap.Point2D(pixel))
+                element = pycolmap.TrackElement(number + 1, len(image.points2D) - 1)
+                reconstruction.add_observation(each, element)
+    reconstruction.write(model / "sparse/0")
+    before = read_capture(model).points
+    (model / "masks").mkdir()
     mask = np.full((48, 64), 255, np.uint8)
     mask[:, :32] = 0
     for i in range(10):
-        cv2.imwrite(str(tracked / f"masks/{i:02d}.png.png"), mask)
-    capture = read_capture(tracked)
-    assert before is not None and capture.points is not None
+        cv2.imwrite(str(model / f"masks/{i:02d}.png.png"), mask)
+    capture = read_capture(model)
     assert 50 < len(capture.points.p_WQ) < len(before.p_WQ) / 2
     times = np.zeros(len(capture.points.p_WQ), int)
     for X_WC in capture.X_WCs:
@@ -175,110 +160,94 @@ def test_points_that_only_masked_pixels_show_are_left_out(tracked):
     assert (times >= 2).all()
 
 
-@pytest.fixture
-def rig(model):
+def test_images_in_subfolders_keep_their_paths(model, views, room_poses):
     reconstruction = pycolmap.Reconstruction(model / "sparse/0")
     for image in reconstruction.images.values():
         i = image.image_id - 1
         image.name = f"cam{i // 5}/{i % 5:02d}.png"
-        file = model / "images" / image.name
-        file.parent.mkdir(exist_ok=True)
-        (model / f"images/{i:02d}.png").rename(file)
+        (model / "images" / image.name).parent.mkdir(exist_ok=True)
+        (model / f"images/{i:02d}.png").rename(model / "images" / image.name)
     reconstruction.write(model / "sparse/0")
-    return model
-
-
-def test_images_in_subfolders_keep_their_paths(rig, room_poses):
-    capture = read_capture(rig)
+    capture = read_capture(model)
     assert list(capture.frame_names) == [f"cam{k}/{i:02d}.png" for k in (0, 1) for i in range(5)]
-    baseline = room_poses[0].translation() - room_poses[5].translation()
-    between, distance = ["cam0/00.png", "cam1/00.png"], float(np.linalg.norm(baseline))
-    scaled = read_capture(rig, CaptureConfig(scale=ScaleConfig(between=between, distance=distance)))
-    np.testing.assert_allclose(lengths(scaled.X_WCs), lengths(room_poses), rtol=1e-9)
-    scale = ScaleConfig(between=["00.png", "cam1/01.png"], distance=1)
+
+    def scaled(*between, distance=1.0):
+        scale = ScaleConfig(between=list(between), distance=distance)
+        return read_capture(model, CaptureConfig(scale=scale))
+
+    baseline = np.linalg.norm(room_poses[0].translation() - room_poses[5].translation())
+    found = scaled("cam0/00.png", "cam1/00.png", distance=float(baseline))
+    np.testing.assert_allclose(lengths(found.X_WCs), lengths(room_poses), rtol=1e-9)
+    u, v = reconstruction.images[6].points2D[7].xy
+    assert scaled(f"cam1/00.png@{u},{v}", "cam0/01.png").metric
     with pytest.raises(ValueError, match=r"several .* called '00.png'; choose one of cam0/00.png"):
-        read_capture(rig, CaptureConfig(scale=scale))
-
-
-def test_pixels_and_depth_of_images_in_subfolders(rig, K, room_views):
-    point = pycolmap.Reconstruction(rig / "sparse/0").images[6].points2D[7].xy
-    between = [f"cam1/00.png@{point[0]},{point[1]}", "cam0/01.png"]
-    assert read_capture(rig, CaptureConfig(scale=ScaleConfig(between=between, distance=2))).metric
-    depth = room_views(K, 64, 48)[7].depth
-    (rig / "depth/cam1").mkdir(parents=True)
-    np.save(rig / "depth/cam1/02.npy", (1000 * depth).astype(np.float32))
-    capture = read_capture(rig, CaptureConfig(scale=ScaleConfig(depth_folder="depth")))
-    np.testing.assert_allclose(capture.frame(7).depth, depth, rtol=1e-5)
+        scaled("00.png", "cam1/01.png")
+    (model / "depth/cam1").mkdir(parents=True)
+    np.save(model / "depth/cam1/02.npy", (1000 * views[7].depth).astype(np.float32))
+    capture = read_capture(model, CaptureConfig(scale=ScaleConfig(depth_folder="depth")))
+    np.testing.assert_allclose(capture.frame(7).depth, views[7].depth, rtol=1e-5)
     assert capture.load_depth(2) is None
 
 
 @pytest.mark.parametrize(
     ("scale", "message"),
     [
-        (
-            ScaleConfig(between=["00.png", "xx.png"], distance=1),
-            "no registered image is called 'xx.png'",
-        ),
-        (ScaleConfig(between=["00.png", "00.png"], distance=1), "are the same point"),
-        (ScaleConfig(between=["00.png@900,1", "00.png"], distance=1), "no registered point within"),
-        (ScaleConfig(between=["00.png@9", "00.png"], distance=1), "does not end in a pixel"),
-        (ScaleConfig(between=["00.png", "01.png"]), "scale.between and scale.distance must be two"),
-        (ScaleConfig(camera_height=1, factor=1), "given once, got scale.factor and scale.cam"),
-        (ScaleConfig(camera_height=-1), "camera_height must be in \\[0, inf\\) m, got -1"),
-        (ScaleConfig(depth_folder="nothing"), "0 points have a measured depth"),
+        ({"between": ["00.png", "xx.png"], "distance": 1}, "no registered image is called 'xx.p"),
+        ({"between": ["00.png", "00.png"], "distance": 1}, "are the same point"),
+        ({"between": ["00.png@900,1", "00.png"], "distance": 1}, "no registered point within"),
+        ({"between": ["00.png@9", "00.png"], "distance": 1}, "does not end in a pixel"),
+        ({"between": ["00.png", "01.png"]}, "scale.between and scale.distance must be two"),
+        ({"camera_height": 1, "factor": 1}, "given once, got scale.factor and scale.cam"),
+        ({"camera_height": -1}, r"camera_height must be in \[0, inf\) m, got -1"),
+        ({"depth_folder": "nothing"}, "0 points have a measured depth"),
     ],
 )
 def test_invalid_scale_is_refused(model, scale, message):
     with pytest.raises(ValueError, match=message):
-        read_capture(model, CaptureConfig(scale=scale))
+        read_capture(model, CaptureConfig(scale=ScaleConfig(**scale)))
 
 
-def test_distorted_model(model, K, shows_room, room_poses, trace_rays):
+def test_distorted_model(model, shows_room, room_poses, trace_rays):
     reconstruction = pycolmap.Reconstruction(model / "sparse/0")
     camera = reconstruction.cameras[1]
     camera.model = pycolmap.CameraModelId.SIMPLE_RADIAL
     camera.params = [50.0, 31.0, 25.0, -0.12]
     reconstruction.write(model / "sparse/0")
-    v, u = np.mgrid[0:48, 0:64] + 0.5
-    K = np.array([[50.0, 0, 31], [0, 50, 25], [0, 0, 1]])
-    pixels = np.stack([u, v], axis=-1).reshape(-1, 1, 2)
-    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 50, 1e-12)
-    rays = cv2.undistortPoints(pixels, K, np.array([-0.12, 0, 0, 0]), criteria=criteria)
+    pixels = np.stack(np.meshgrid(np.arange(64) + 0.5, np.arange(48) + 0.5), axis=-1)
+    rays = camera.cam_from_img(pixels.reshape(-1, 2)).reshape(48, 64, 2)
     for i, X_WC in enumerate(room_poses):
-        view = trace_rays(X_WC, rays.reshape(48, 64, 2))
-        cv2.imwrite(str(model / f"images/{i:02d}.png"), view.image[..., ::-1])
+        image = trace_rays(X_WC, rays).image
+        cv2.imwrite(str(model / f"images/{i:02d}.png"), image[..., ::-1])
     capture = read_capture(model, CaptureConfig(scale=ScaleConfig(factor=1 / SHRINK)))
     shows_room(capture, room_poses[0] @ capture.X_WCs[0].inverse(), color=3.0, depth=None)
 
 
-def test_missing_parts(model):
+def test_missing_and_damaged_parts_are_refused(model):
+    points, folder = len(read_capture(model).points.p_WQ), model / "sparse/0"
+    reconstruction = pycolmap.Reconstruction(folder)
+    next(iter(reconstruction.points3D.values())).xyz = [0, 1e300, 0]
+    reconstruction.write(folder)
+    assert len(read_capture(model).points.p_WQ) == points - 1
+    for name in ("cameras", "images", "points3D", "rigs", "frames"):
+        file = folder / f"{name}.bin"
+        content = file.read_bytes()
+        for damaged in (b"\xff" * 8 + content[8:], content[:-1], content + b"\0"):
+            file.write_bytes(damaged)
+            with pytest.raises(ValueError, match=r"sparse/0: not a readable COLMAP model"):
+                read_capture(model)
+        file.write_bytes(content)
     (model / "images").rename(model / "elsewhere")
     with pytest.raises(FileNotFoundError, match="none of the model's images"):
         read_capture(model)
-    (model / "sparse/0/images.bin").unlink()
-    (model / "sparse/0/images.txt").write_text("1234")
-    (model / "sparse/0/cameras.txt").write_text("1 PINHOLE 64")
-    with pytest.raises(ValueError, match="not a readable COLMAP model"):
-        read_capture(model)
-
-
-def test_points_at_invalid_positions_are_left_out(model):
-    before = read_capture(model).points
-    reconstruction = pycolmap.Reconstruction(model / "sparse" / "0")
-    next(iter(reconstruction.points3D.values())).xyz = [0, 1e300, 0]
-    reconstruction.write(model / "sparse" / "0")
-    after = read_capture(model).points
-    assert before is not None and after is not None
-    assert len(after.p_WQ) == len(before.p_WQ) - 1
-
-
-def test_image_name_in_another_encoding_is_refused(model):
-    pycolmap.Reconstruction(model / "sparse" / "0").write_text(model / "sparse" / "0")
-    for file in (model / "sparse" / "0").glob("*.bin"):
+    reconstruction.write_text(folder)
+    for file in folder.glob("*.bin"):
         file.unlink()
-    listed = model / "sparse/0/images.txt"
+    listed = folder / "images.txt"
     listed.write_bytes(listed.read_bytes().replace(b"03.png", b"\xb5.png"))
     with pytest.raises(ValueError, match=r"sparse/0: not a readable COLMAP model \(.*utf-8"):
+        read_capture(model)
+    (folder / "cameras.txt").write_text("1 PINHOLE 64")
+    with pytest.raises(ValueError, match="not a readable COLMAP model"):
         read_capture(model)
 
 
@@ -292,16 +261,6 @@ def test_photographs_are_registered_once(model, tmp_path):
     assert len(capture) == 10 and not capture.metric
     assert "empty.jpg: not a readable image" in capture.dropped[0]
     assert "blank.png: not registered" in capture.dropped[1]
-
-
-@pytest.mark.parametrize("name", ["cameras", "images", "points3D", "rigs", "frames"])
-def test_damaged_truncated_or_extended_model_is_refused(model, name):
-    file = model / f"sparse/0/{name}.bin"
-    content = file.read_bytes()
-    for damaged in (b"\xff" * 8 + content[8:], content[:-1], content + b"\0"):
-        file.write_bytes(damaged)
-        with pytest.raises(ValueError, match=r"sparse/0: not a readable COLMAP model"):
-            read_capture(model)
 
 
 def test_pycolmap_leaves_signal_handlers_and_png_files_alone(tmp_path):

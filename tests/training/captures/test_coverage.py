@@ -14,7 +14,6 @@ from splatpilot.training.captures.coverage import CapturePlan, plan_capture, pos
 
 K, SIZE = pinhole(160.0, 160.0, 160.0, 120.0), (320, 240)
 LENGTH, WIDTH, HEIGHT = 12.0, 8.0, 3.0  # [m] of a hall
-_WALL = 0.3  # [m]
 
 
 def box(lower, upper) -> Box:
@@ -22,9 +21,10 @@ def box(lower, upper) -> Box:
     return Box(RigidTransform(0.5 * (lower + upper)), upper - lower)
 
 
-def hall() -> Esdf:
+@pytest.fixture(scope="module")
+def field() -> Esdf:
     """A closed hall with a wall in its middle that leaves a gap, in a larger box of free space."""
-    t, margin = _WALL, 3.0  # [m]
+    t, margin = 0.3, 3.0  # [m]
     solids = [
         box([-t, -t, -t], [LENGTH + t, WIDTH + t, 0]),
         box([-t, -t, HEIGHT], [LENGTH + t, WIDTH + t, HEIGHT + t]),
@@ -38,11 +38,6 @@ def hall() -> Esdf:
     lower_W = np.array([-margin, -margin, -0.9])
     upper_W = np.array([LENGTH + margin, WIDTH + margin, 4.5])
     return esdf_from_distance_field(AnalyticDistanceField(solids, lower_W, upper_W), 0.1)
-
-
-@pytest.fixture(scope="module")
-def field() -> Esdf:
-    return hall()
 
 
 @pytest.fixture(scope="module")
@@ -81,13 +76,15 @@ def test_surfaces_are_seen_from_three_directions(plan):
     assert np.mean([len(cells[k]) >= 3 for k in np.flatnonzero(west)]) > 0.85
 
 
-def test_fewer_frames_are_said_to_be_too_few(field, plan):
+def test_too_few_frames_and_too_little_clearance_are_reported(field, plan):
     some = plan_capture(field, K, SIZE, (1.0, 2.2), 0.4, max_frames=10)
     assert len(some.X_WCs) == 10
     assert some.more_frames == len(plan.X_WCs) - 10
     assert some.coverage < plan.coverage
-    red = (some.picture() == [220, 0, 0]).all(axis=2).sum()
-    assert red > 4 * (plan.picture() == [220, 0, 0]).all(axis=2).sum()
+    red, more = ((each.picture() == [220, 0, 0]).all(axis=2).sum() for each in (plan, some))
+    assert more > 4 * red
+    with pytest.raises(ValueError, match=r"9.0 m must exist, got none in .* m; correct the scale"):
+        plan_capture(field, K, SIZE, (1.0, 2.2), 9.0)
 
 
 def test_space_outside_is_captured_on_request(field):
@@ -102,9 +99,8 @@ def test_heights_are_above_the_ground(tmp_path: Path):
     a, b, c, d = grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]
     faces = np.concatenate([np.stack(t, -1).reshape(-1, 3) for t in ((a, b, c), (a, c, d))])
     ground = trimesh.Trimesh(np.stack([x, y, 0.4 * x], -1).reshape(-1, 3), faces, process=False)
-    post = trimesh.creation.box(
-        [0.4, 0.4, 14.0], trimesh.transformations.translation_matrix([10, 6, 7])
-    )
+    at = trimesh.transformations.translation_matrix([10, 6, 7])
+    post = trimesh.creation.box([0.4, 0.4, 14.0], at)
     trimesh.util.concatenate([ground, post]).export(tmp_path / "hill.obj")
     esdf = mesh_distance(tmp_path / "hill.obj", "z", 0.2)
     p_WC = positions(plan_capture(esdf, K, SIZE, (1.0, 2.5), 0.5, reach=5.0))
@@ -122,11 +118,6 @@ def test_ground_at_the_lower_end_of_the_field_is_a_surface():
     assert heights.min() >= 1.0 and heights.max() <= 2.2
 
 
-def test_space_without_clearance_is_named(field):
-    with pytest.raises(ValueError, match=r"9.0 m must exist, got none in .* m; correct the scale"):
-        plan_capture(field, K, SIZE, (1.0, 2.2), 9.0)
-
-
 def test_poses_stop_evenly_and_look_ahead_and_aside():
     path = np.array([[1.0, 2, 1.5], [1, 8, 1.5]])
     X_WCs = poses_along(path, 0.5, [0.0, 90.0, -90.0], -10.0)
@@ -141,17 +132,12 @@ def test_poses_stop_evenly_and_look_ahead_and_aside():
         np.testing.assert_allclose(R_WC[:, 2], ahead, atol=1e-12)
         assert abs(R_WC[2, 0]) < 1e-12  # x is level,
         assert R_WC[2, 1] < 0  # and y points down.
-
-
-def test_heading_stays_on_a_climb():
-    path = np.array([[0.0, 0, 1], [3, 3, 1], [3, 3, 6]])
-    ahead = np.array([X.rotation().matrix()[:, 2] for X in poses_along(path, 0.5, [0.0], 0.0)])
-    np.testing.assert_allclose(ahead, np.tile([0.5**0.5, 0.5**0.5, 0], (len(ahead), 1)), atol=1e-6)
-
-
-def test_one_point_is_one_stop():
     (X_WC,) = poses_along(np.array([[1.0, 2, 3]]), 0.5, [0.0], 0.0)
     np.testing.assert_array_equal(X_WC.translation(), [1, 2, 3])
+    climb = np.array([[0.0, 0, 1], [3, 3, 1], [3, 3, 6]])
+    for X_WC in poses_along(climb, 0.5, [0.0], 0.0):
+        ahead = X_WC.rotation().matrix()[:, 2]
+        np.testing.assert_allclose(ahead, [0.5**0.5, 0.5**0.5, 0], atol=1e-6)
 
 
 @pytest.mark.parametrize("path", [[], [[1.0, 2]], [[1.0, 2, np.nan]]])

@@ -28,30 +28,18 @@ def change(path, **keys):
     return path
 
 
-def write_images(path, image):
-    for i in range(10):
-        cv2.imwrite(str(path / f"{i:02d}.png"), image)
-
-
-DISTORTION = {"k1": -0.15, "k2": 0.03, "p1": 0.002, "p2": -0.001}
-
-
 @pytest.fixture
 def write(tmp_path, K, room_poses, trace_rays):
     def write(rays=None, depth=True, **extra):
         rays = pinhole_rays(K) if rays is None else rays
-        views = [trace_rays(X_WC, rays) for X_WC in room_poses]
         frames = []
-        for i, view in enumerate(views):
+        for i, X_WC in enumerate(room_poses):
+            view, matrix = trace_rays(X_WC, rays), (X_WC.GetAsMatrix4() @ OPENGL).tolist()
             cv2.imwrite(str(tmp_path / f"{i:02d}.png"), view.image[..., ::-1])
-            frame = {
-                "file_path": f"./{i:02d}.png",
-                "transform_matrix": (view.X_WC.GetAsMatrix4() @ OPENGL).tolist(),
-            }
+            frames.append({"file_path": f"./{i:02d}.png", "transform_matrix": matrix})
             if depth:
                 np.save(tmp_path / f"{i:02d}.npy", (1000 * view.depth).astype(np.float32))
-                frame["depth_file_path"] = f"{i:02d}.npy"
-            frames.append(frame)
+                frames[i]["depth_file_path"] = f"{i:02d}.npy"
         camera = {"w": 64, "h": 48, "fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
         content = camera | extra | {"frames": frames}
         (tmp_path / "transforms.json").write_text(json.dumps(content))
@@ -64,35 +52,6 @@ def test_room(write, shows_room):
     capture = read_capture(write())
     assert capture.metric and capture.depth_camera is None
     shows_room(capture, color=0.5)
-
-
-def test_distortion_is_taken_out(write, K, shows_room):
-    v, u = np.mgrid[0:48, 0:64] + 0.5
-    pixels = np.stack([u, v], axis=-1).reshape(-1, 1, 2)
-    coefficients = np.array([DISTORTION[name] for name in ("k1", "k2", "p1", "p2")])
-    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 50, 1e-12)
-    rays = cv2.undistortPoints(pixels, K, coefficients, criteria=criteria)
-    path = write(rays.reshape(48, 64, 2), camera_model="OPENCV", **DISTORTION)
-    capture = read_capture(path)
-    assert capture.K[0, 0] == K[0, 0]
-    shows_room(capture, color=3.0, depth=0.02)
-    # Taken for a pinhole, the same files show another room.
-    change(path, **dict.fromkeys(DISTORTION, 0))
-    with pytest.raises(AssertionError):
-        shows_room(read_capture(path), color=3.0, depth=0.02)
-
-
-def test_edges_of_undistorted_images_are_not_dark(write, K):
-    path = write(camera_model="OPENCV", k1=0.02)
-    write_images(path, np.full((48, 64, 3), 200, np.uint8))
-    assert (read_capture(path).frame(0).image == 200).all()
-
-
-def test_fisheye(write, K, shows_room):
-    bent = pinhole_rays(K)
-    theta = np.linalg.norm(bent, axis=-1, keepdims=True)
-    path = write(bent * np.tan(theta) / theta, camera_model="OPENCV_FISHEYE")
-    shows_room(read_capture(path), color=3.0, depth=0.02)
 
 
 def test_each_frame_may_have_its_camera(write, K, shows_room):
@@ -108,47 +67,39 @@ def test_each_frame_may_have_its_camera(write, K, shows_room):
     shows_room(capture, color=4.0, depth=0.02)
 
 
-def test_small_depth(write, shows_room, room_views, K):
+def test_depth_may_be_smaller_but_not_of_another_view(write, shows_room, room_views, K):
     path = write()
     for i, view in enumerate(room_views(np.diag([0.5, 0.5, 1]) @ K, 32, 24)):
         np.save(path / f"{i:02d}.npy", (1000 * view.depth).astype(np.float32))
     capture = read_capture(path)
     assert capture.frame(0).depth.shape == (48, 64)
     shows_room(capture, color=0.5, depth=0.03)
-
-
-def test_depth_of_another_view_is_refused(write, room_views, K):
-    path = write()
     for i in range(10):
         np.save(path / f"{i:02d}.npy", np.ones((24, 24), np.float32))
     with pytest.raises(ValueError, match="24x24 pixels of depth do not show what 64x48 pixels"):
         read_capture(path)
 
 
-def test_pixels_are_valid_where_the_mask_is_not_black(write):
-    path = write()
-    mask = np.full((48, 64), 1, np.uint8)
+def test_pixels_are_invalid_where_the_mask_is_black_or_alpha_is_less_than_a_half(write):
+    path, mask = write(), np.full((48, 64), 1, np.uint8)
     mask[10:30, 20:50] = 0
     cv2.imwrite(str(path / "mask.png"), mask)
-    capture = read_capture(change(path, frame_3={"mask_path": "mask.png"}))
-    frame = capture.frame(3)
-    np.testing.assert_array_equal(frame.valid, mask > 0)
-    np.testing.assert_array_equal(frame.depth > 0, mask > 0)
-    assert capture.frame(2).valid.all()
-    assert any("1 of 10 images have a mask" in note for note in capture.notes)
-
-
-def test_pixels_are_invalid_where_alpha_is_less_than_a_half(write):
-    path = write()
     image = cv2.imread(str(path / "05.png"))
     alpha = np.repeat(np.linspace(0, 255, 64).astype(np.uint8)[None], 48, axis=0)
     cv2.imwrite(str(path / "05.png"), np.dstack([image, alpha]))
-    capture = read_capture(path)
-    frame = capture.frame(5)
-    np.testing.assert_array_equal(frame.valid, alpha >= 128)
-    np.testing.assert_array_equal(frame.image, image[..., ::-1])
-    assert not frame.depth[alpha < 128].any()
-    assert any("1 of 10 images have an alpha channel" in note for note in capture.notes)
+    capture = read_capture(change(path, frame_3={"mask_path": "mask.png"}))
+    for i, valid in ((2, mask >= 0), (3, mask > 0), (5, alpha >= 128)):
+        frame = capture.frame(i)
+        np.testing.assert_array_equal(frame.valid, valid)
+        np.testing.assert_array_equal(frame.depth > 0, valid)
+    np.testing.assert_array_equal(capture.frame(5).image, image[..., ::-1])
+    for kind in ("a mask", "an alpha channel"):
+        assert any(f"1 of 10 images have {kind}" in note for note in capture.notes)
+
+
+def write_images(path, image):
+    for i in range(10):
+        cv2.imwrite(str(path / f"{i:02d}.png"), image)
 
 
 def test_pixels_interpolated_from_masked_ones_are_invalid(write):
@@ -168,90 +119,79 @@ def test_pixels_interpolated_from_masked_ones_are_invalid(write):
     [
         ({}, None, 10),
         ({"test_filenames": ["./03.png"], "val_filenames": ["04.png"]}, [3, 4], 10),
-        ({"train_filenames": [f"{i:02d}.png" for i in range(7)], "test_filenames": ["08.png"]},
-         [7], 8),
+        ({"train_filenames": ["00.png", "02.png"], "test_filenames": ["08.png"]}, [2], 3),
         ({"test_frames": ["09.png"]}, [9], 10),
+        ({"test_frames": slice(6, 10), "frames": slice(6)}, [6, 7, 8, 9], 10),
         ({f"frame_{i}": {"is_bad": True} for i in (1, 2, 5, 6)}, None, 6),
     ],
-)  # fmt: skip
+)
 def test_split_and_flags_of_the_files_are_kept(write, keys, held_out, frames):
-    capture = read_capture(change(write(), **keys))
+    path = write()
+    every = json.loads((path / "transforms.json").read_text())["frames"]
+    keys = {name: every[key] if isinstance(key, slice) else key for name, key in keys.items()}
+    capture = read_capture(change(path, **keys))
     assert capture.held_out == held_out and len(capture) == frames
     assert len(capture.dropped) == 10 - frames
 
 
-def test_additional_test_frames_are_held_out(write):
-    path = write()
-    content = json.loads((path / "transforms.json").read_text())
-    frames = content["frames"]
-    capture = read_capture(change(path, frames=frames[:6], test_frames=frames[6:]))
-    assert len(capture) == 10 and capture.held_out == [6, 7, 8, 9]
-
-
-def test_keys_that_are_not_used_are_named(write):
-    path = change(write(), aabb_scale=16, applied_scale=1.0, frame_2={"sharpness": 30.0})
-    assert "transforms.json: aabb_scale, sharpness is not used" in read_capture(path).notes
-
-
 @pytest.mark.parametrize("model", ["OPENCV", "PINHOLE", "SIMPLE_RADIAL"])
-def test_distortion_to_the_eighth_power_is_taken_out(write, K, shows_room, trace_rays, model):
-    k = [0.02, -0.01, 0.005, 0.4]
-    bent = pinhole_rays(K)
-    rays = bent.copy()
+@pytest.mark.parametrize("k", [(0.02, -0.01, 0.005, 0.4, 0, 0), (-0.15, 0.03, 0, 0, 0.002, -0.001)])
+def test_distortion_is_taken_out(write, K, shows_room, trace_rays, model, k):
+    bent = rays = pinhole_rays(K)
     for _ in range(50):
-        r2 = (rays**2).sum(axis=-1, keepdims=True)
-        rays = bent / (1 + k[0] * r2 + k[1] * r2**2 + k[2] * r2**3 + k[3] * r2**4)
-    path = write(rays, camera_model=model, k1=k[0], k2=k[1], k3=k[2], k4=k[3])
-    captures = [read_capture(path)]
-    listed = change(path, k1=0, k2=0, k3=0, k4=0, distortion_params=[*k, 0, 0])
-    for capture in (*captures, read_capture(listed)):
-        shows_room(capture, color=2.0, depth=0.01)
-        corner = pinhole_rays(capture.K)[:6, :6]
+        x, y = rays[..., :1], rays[..., 1:]
+        r2 = x**2 + y**2
+        radial = 1 + k[0] * r2 + k[1] * r2**2 + k[2] * r2**3 + k[3] * r2**4
+        aside = 2 * k[4] * x * y + k[5] * (r2 + 2 * x**2), k[4] * (r2 + 2 * y**2) + 2 * k[5] * x * y
+        rays = (bent - np.concatenate(aside, axis=-1)) / radial
+    names = "k1", "k2", "k3", "k4", "p1", "p2"
+    path = write(rays, camera_model=model, **dict(zip(names, k, strict=True)))
+    named = read_capture(path)
+    listed = change(path, **dict.fromkeys(names, 0), distortion_params=k)
+    for capture in (named, read_capture(listed)):
+        shows_room(capture, color=3.0, depth=0.02)
         frame = capture.frame(0)
-        seen = trace_rays(frame.X_WC, corner)
+        seen = trace_rays(frame.X_WC, pinhole_rays(capture.K)[:6, :6])
         np.testing.assert_allclose(frame.depth[:6, :6], seen.depth, rtol=0.03)
 
 
-def test_fisheye_is_cropped_to_its_radius(write):
-    path = write(camera_model="OPENCV_FISHEYE", fisheye_crop_radius=20.0)
+def test_fisheye_is_taken_out_and_cropped_to_its_radius(write, K, shows_room):
+    bent = pinhole_rays(K)
+    theta = np.linalg.norm(bent, axis=-1, keepdims=True)
+    path = write(bent * np.tan(theta) / theta, camera_model="OPENCV_FISHEYE")
+    shows_room(read_capture(path), color=3.0, depth=0.02)
     image = np.zeros((48, 64, 3), np.uint8)
     v, u = np.mgrid[0:48, 0:64] + 0.5
     image[np.hypot(u - 32, v - 24) < 21] = 90
-    write_images(path, image)
+    write_images(change(path, fisheye_crop_radius=20.0), image)
     assert (read_capture(path).frame(0).image == 90).all()
 
 
-def test_intrinsics_and_their_source_are_noted(write):
-    path = write(cx=10)
+def test_intrinsics_their_source_and_unused_keys_are_noted(write):
+    path = change(write(cx=10), aabb_scale=16, applied_scale=1.0, frame_2={"sharpness": 30.0})
     notes = read_capture(path).notes
-    assert "fx 50.0, fy 52.0, cx 10.0, cy 25.0 px for 64x48 px, from transforms.json" in notes[0]
+    size = "fx 50.0, fy 52.0, cx 10.0, cy 25.0 px for 64x48 px"
+    assert any(note.endswith(f"{size}, from transforms.json") for note in notes)
     assert any("(10.0, 25.0) px is far from the center" in note for note in notes)
-    [note] = read_capture(path, CaptureConfig(intrinsics=[40, 41, 32, 24])).notes
-    assert note.endswith("fx 40.0, fy 41.0, cx 32.0, cy 24.0 px for 64x48 px, from "
-                         "capture.intrinsics")  # fmt: skip
+    assert "transforms.json: aabb_scale, sharpness is not used" in notes
+    _, note = read_capture(path, CaptureConfig(intrinsics=[40, 41, 32, 24])).notes
+    assert "fx 40.0, fy 41.0, cx 32.0, cy 24.0 px for 64x48 px, from capture.intrinsics" in note
 
 
-def test_scale(write):
-    path = write(depth=False)
-    capture = read_capture(path)
-    assert not capture.metric and not capture.has_depth
-    scale = ScaleConfig(between=["00.png", "09.png"], distance=10.0)
-    scaled = read_capture(path, CaptureConfig(scale=scale))
-    assert scaled.metric
-    p = [X_WC.translation() for X_WC in scaled.X_WCs]
-    assert np.linalg.norm(p[9] - p[0]) == pytest.approx(10)
-
-
-def test_points(write):
-    path = write(ply_file_path="points.ply")
+def test_points_and_scale_of_a_capture_without_depth(write):
+    path = write(depth=False, ply_file_path="points.ply")
     rows = [(1.0, 2.0, 3.0, 255, 0, 51)]
     kinds = [("x", "f4"), ("y", "f4"), ("z", "f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
     vertices = PlyElement.describe(np.array(rows, dtype=kinds), "vertex")
     PlyData([vertices]).write(str(path / "points.ply"))
-    points = read_capture(path).points
-    assert points is not None
-    np.testing.assert_allclose(points.p_WQ, [[1, 2, 3]])
-    np.testing.assert_allclose(points.colors, [[1, 0, 0.2]])
+    capture = read_capture(path)
+    assert not capture.metric and not capture.has_depth
+    np.testing.assert_allclose(capture.points.p_WQ, [[1, 2, 3]])
+    np.testing.assert_allclose(capture.points.colors, [[1, 0, 0.2]])
+    scale = ScaleConfig(between=["00.png", "09.png"], distance=10.0)
+    scaled = read_capture(path, CaptureConfig(scale=scale))
+    p = [X_WC.translation() for X_WC in scaled.X_WCs]
+    assert scaled.metric and np.linalg.norm(p[9] - p[0]) == pytest.approx(10)
 
 
 _CAMERA = "invalid camera of 00.png .*"
@@ -281,34 +221,24 @@ def test_invalid_transforms_are_refused(write, keys, message):
 
 
 @pytest.mark.parametrize(
-    "depth",
+    ("frame", "depth", "message"),
     [
-        np.full((48, 64), 1 + 1j),
-        np.full((48, 64), np.datetime64("2026-01-01")),
-        np.ones((48, 64), bool),
-        b"\x93NUMPY\x01\x00G\x00{'descr': '<f4', 'fortran_order': False, 'shape': (99999, 99999)}",
-        b"\x93NUMPY\x01\x00\xff\xff nonsense",
+        ({}, np.full((48, 64), 1 + 1j), "02.npy"),
+        ({}, np.full((48, 64), np.datetime64("2026-01-01")), "02.npy"),
+        ({}, np.ones((48, 64), bool), "02.npy"),
+        ({}, b"\x93NUMPY\x01\x00G\x00{'descr': '<f4', 'fortran_order': False, 'shape': (99999,"
+             b" 99999)}", "02.npy"),
+        ({}, b"\x93NUMPY\x01\x00\xff\xff nonsense", "02.npy"),
+        ({"transform_matrix": [[1, 2], [3, 4]]}, None, "frame 2 (./02.png): transform_matrix"),
+        ({"mask_path": "small.png"}, None, "small.png must be of 64x48 pixels"),
     ],
-)
-def test_frame_of_damaged_depth_is_left_out(write, depth):
-    path = write()
-    if isinstance(depth, bytes):
-        (path / "03.npy").write_bytes(depth)
-    else:
-        np.save(path / "03.npy", depth)
-    capture = read_capture(path)
-    assert len(capture) == 9 and "03.npy" in capture.dropped[0]
-
-
-@pytest.mark.parametrize(
-    ("frame", "message"),
-    [
-        ({"transform_matrix": [[1, 2], [3, 4]]}, "frame 2 (./02.png): transform_matrix"),
-        ({"mask_path": "small.png"}, "small.png must be of 64x48 pixels"),
-    ],
-)
-def test_invalid_frame_is_left_out(write, frame, message):
+)  # fmt: skip
+def test_invalid_frame_is_left_out(write, frame, depth, message):
     path = change(write(), frame_2=frame)
     cv2.imwrite(str(path / "small.png"), np.ones((24, 32), np.uint8))
+    if isinstance(depth, bytes):
+        (path / "02.npy").write_bytes(depth)
+    elif depth is not None:
+        np.save(path / "02.npy", depth)
     capture = read_capture(path)
     assert len(capture) == 9 and message in capture.dropped[0]

@@ -25,11 +25,8 @@ def write(tmp_path, K, room_views):
             view = room_views(focused, 64, 48)[i]
             depth = room_views(np.diag([0.5, 0.5, 1]) @ focused, 32, 24)[i].depth
             stem = str(638443502 + i)
-            cv2.imwrite(
-                str(folder / f"{prefix}images/{stem}.jpg"),
-                view.image[..., ::-1],
-                [cv2.IMWRITE_JPEG_QUALITY, 100],
-            )
+            image = folder / f"{prefix}images/{stem}.jpg"
+            cv2.imwrite(str(image), view.image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 100])
             millimeters = np.round(1000 * depth).astype(np.uint16)
             cv2.imwrite(str(folder / f"depth/{stem}.png"), millimeters)
             pose = (X_RF.inverse() @ view.X_WC).GetAsMatrix4() @ OPENGL
@@ -46,43 +43,54 @@ def write(tmp_path, K, room_views):
 def test_room(write, shows_room, prefix):
     path = write(prefix)
     (path / "keyframes/cameras").mkdir(exist_ok=True)
+    if prefix:
+        for i in range(13):
+            (path / f"keyframes/cameras/{638443502 + i}.json").write_text("{}")
+        for camera in (path / "keyframes/corrected_cameras").iterdir():  # of the images' size
+            values = json.loads(camera.read_text())
+            del values["width"], values["height"]
+            camera.write_text(json.dumps(values))
     capture = read_capture(path)
-    assert capture.source.startswith("Polycam") and capture.metric and not capture.dropped
+    assert capture.source.startswith("Polycam") and capture.metric
     shows_room(capture, color=4.0, depth=0.03)
+    dropped = "3 of 13 keyframes have no corrected camera" if prefix else ""
+    assert len(capture.dropped) == bool(prefix) and dropped in "".join(capture.dropped)
 
 
-def test_damaged_keyframes_are_named(write):
+def test_damaged_keyframes_are_named_and_depth_without_confidence_is_unknown(write):
     path = write()
     cameras = sorted((path / "keyframes/cameras").iterdir())
     cameras[2].write_text("{}")
     (path / "keyframes/depth" / f"{cameras[4].stem}.png").unlink()
+    (path / "keyframes/confidence").mkdir()
+    confidence = np.full((24, 32), 255, np.uint8)
+    confidence[:, :16] = 0
+    cv2.imwrite(str(path / "keyframes/confidence/638443502.png"), confidence)
     capture = read_capture(path)
     assert len(capture) == 9
     assert "638443504.json: not a readable camera of a keyframe" in capture.dropped[0]
-    assert not capture.registered_depth(3).any() and capture.registered_depth(2).any()
+    assert not capture.registered_depth(3).any() and capture.registered_depth(2).all()
+    known = capture.registered_depth(0) > 0
+    assert not known[:, :30].any() and known[:, 34:].all()
     for camera in cameras[3:6]:
         camera.write_text('{"fx": "wide"}')
     with pytest.raises(ValueError, match="6 of 10 frames can be used"):
         read_capture(path)
 
 
-def write_exr(file, depth) -> None:
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    with OpenEXR.File(header, {"R": depth.astype(np.float32)}) as exr:
-        exr.write(str(file))
-
-
 @pytest.fixture
 def write_record3d(tmp_path, K, room_views):
-    def write_record3d(intrinsics=None, **extra):
+    def write_record3d(**extra):
         (tmp_path / "rgb").mkdir()
         (tmp_path / "depth").mkdir()
         views = room_views(K, 64, 48)
         depths = room_views(np.diag([0.5, 0.5, 1]) @ K, 32, 24)
+        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
         poses = []
         for i, (view, small) in enumerate(zip(views, depths, strict=True)):
             cv2.imwrite(str(tmp_path / f"rgb/{i}.png"), view.image[..., ::-1])
-            write_exr(tmp_path / f"depth/{i}.exr", small.depth)
+            with OpenEXR.File(header, {"R": small.depth.astype(np.float32)}) as exr:
+                exr.write(str(tmp_path / f"depth/{i}.exr"))
             X = views[0].X_WC.inverse() @ view.X_WC
             w, x, y, z = X.rotation().ToQuaternion().wxyz()
             # From optical axes to OpenGL's at both ends.
@@ -94,24 +102,16 @@ def write_record3d(tmp_path, K, room_views):
     return write_record3d
 
 
-def relative(capture, room_poses):
-    return room_poses[0] @ capture.X_WCs[0].inverse()
-
-
-def test_record3d_room(write_record3d, shows_room, room_poses):
-    capture = read_capture(write_record3d())
+@pytest.mark.parametrize("per_frame", [False, True])
+def test_record3d_room(write_record3d, K, shows_room, room_poses, per_frame):
+    own = [[K[0, 0], K[1, 1], K[0, 2], K[1, 2]]] * 10
+    wrong = (np.diag([2.0, 2.0, 1]) @ K).T.ravel().tolist()
+    intrinsics = {"K": wrong, "perFrameIntrinsicCoeffs": own} if per_frame else {}
+    capture = read_capture(write_record3d(**intrinsics))
     assert capture.source.startswith("Record3D") and capture.metric and not capture.dropped
-    X_RW = relative(capture, room_poses)
+    X_RW = room_poses[0] @ capture.X_WCs[0].inverse()
     shows_room(capture, X_RW, color=0.5, depth=0.03)
     assert X_RW.rotation().matrix()[2, 2] > np.cos(np.deg2rad(15))
-
-
-def test_intrinsics_of_each_frame(write_record3d, K, shows_room, room_poses):
-    own = [[K[0, 0], K[1, 1], K[0, 2], K[1, 2]]] * 10
-    wrong = np.diag([2.0, 2.0, 1]) @ K
-    path = write_record3d(K=wrong.T.ravel().tolist(), perFrameIntrinsicCoeffs=own)
-    capture = read_capture(path)
-    shows_room(capture, relative(capture, room_poses), color=0.5, depth=0.03)
 
 
 def test_invalid_exports_are_refused(write_record3d, tmp_path):
@@ -120,49 +120,14 @@ def test_invalid_exports_are_refused(write_record3d, tmp_path):
     with pytest.raises(ValueError, match=r'own format.*export the recording as "EXR'):
         read_capture(recording)
     path = write_record3d()
-    content = json.loads((path / "metadata.json").read_text())
-    (path / "metadata.json").write_text(json.dumps(content | {"poses": content["poses"][:4]}))
-    with pytest.raises(ValueError, match=r"4 poses, but 9\.png is frame 9"):
-        read_capture(path)
-    (path / "metadata.json").write_text(json.dumps(content | {"poses": [[1, 2]]}))
-    with pytest.raises(
-        ValueError, match=r"file of Record3D's metadata \(poses must be .* got \(1, 2\)"
-    ):
-        read_capture(path)
-
-
-def test_damaged_depth_is_named(write_record3d):
-    path = write_record3d()
-    whole = (path / "depth/3.exr").read_bytes()
-    (path / "depth/3.exr").write_bytes(whole[:40])
+    (path / "depth/3.exr").write_bytes((path / "depth/3.exr").read_bytes()[:40])
     capture = read_capture(path)
     assert len(capture) == 9 and "3.exr: not a readable EXR file" in capture.dropped[0]
-
-
-def test_size_of_keyframes_is_that_of_their_images(write):
-    path = write("corrected_")
-    for camera in (path / "keyframes/corrected_cameras").iterdir():
-        values = json.loads(camera.read_text())
-        del values["width"], values["height"]
-        camera.write_text(json.dumps(values))
-    capture = read_capture(path)
-    assert len(capture) == 10 and not capture.dropped
-
-
-def test_keyframes_without_corrected_cameras_are_counted(write):
-    path = write("corrected_")
-    (path / "keyframes/cameras").mkdir()
-    for i in range(13):
-        (path / f"keyframes/cameras/{638443502 + i}.json").write_text("{}")
-    assert "3 of 13 keyframes have no corrected camera" in read_capture(path).dropped[0]
-
-
-def test_depth_without_confidence_is_unknown(write):
-    path = write()
-    (path / "keyframes/confidence").mkdir()
-    confidence = np.full((24, 32), 255, np.uint8)
-    confidence[:, :16] = 0
-    cv2.imwrite(str(path / "keyframes/confidence/638443502.png"), confidence)
-    capture = read_capture(path)
-    known = capture.registered_depth(0) > 0
-    assert not known[:, :30].any() and known[:, 34:].all() and capture.registered_depth(1).all()
+    content = json.loads((path / "metadata.json").read_text())
+    for poses, message in (
+        (content["poses"][:4], r"4 poses, but 9\.png is frame 9"),
+        ([[1, 2]], r"file of Record3D's metadata \(poses must be .* got \(1, 2\)"),
+    ):
+        (path / "metadata.json").write_text(json.dumps(content | {"poses": poses}))
+        with pytest.raises(ValueError, match=message):
+            read_capture(path)

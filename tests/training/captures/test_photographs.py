@@ -6,11 +6,7 @@ from splatpilot.training.captures import frames as image_files
 from splatpilot.training.captures import photographs as video
 from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.capture_registry import read_capture
-from splatpilot.training.captures.photographs import (
-    import_pycolmap,
-    likely_pairs,
-    similarity,
-)
+from splatpilot.training.captures.photographs import import_pycolmap, likely_pairs, similarity
 
 
 @pytest.mark.parametrize("partners", [4, 8])
@@ -40,9 +36,8 @@ def test_features_of_a_database(tmp_path):
     file = tmp_path / "features.db"
     pycolmap.Database.open(file).close()
     pycolmap.import_images(file, tmp_path, pycolmap.CameraMode.SINGLE, names)
-    pycolmap.extract_features(
-        file, tmp_path, names, extraction_options=pycolmap.FeatureExtractionOptions(use_gpu=False)
-    )
+    options = pycolmap.FeatureExtractionOptions(use_gpu=False)
+    pycolmap.extract_features(file, tmp_path, names, extraction_options=options)
     database = pycolmap.Database.open(file)
     found = similarity(database, names)
     database.close()
@@ -51,97 +46,76 @@ def test_features_of_a_database(tmp_path):
     np.testing.assert_allclose(np.diag(found), [1, 1, 1, 1, 0], atol=1e-6)
 
 
-RATE = 30.0  # [Hz]
-
-
-def write_video(path, frames) -> None:
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), RATE, (160, 120))
-    assert writer.isOpened()
-    for frame in frames:
-        writer.write(frame)
-    writer.release()
-
-
-def frames(count: int, sharp: set[int]) -> list[np.ndarray]:
+def write_video(path, count: int, sharp: set[int]) -> list[np.ndarray]:
+    """Writes a video of 30 Hz that brightens; returns its frames, blurred except for `sharp`."""
     rng = np.random.default_rng(0)
     pattern = cv2.resize(rng.integers(0, 80, (30, 40), dtype=np.uint8), (160, 120), interpolation=0)
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 30.0, (160, 120))
     made = []
     for i in range(count):
         image = np.stack([pattern + 2 * i] * 3, axis=-1).astype(np.uint8)
         made.append(image if i in sharp else cv2.GaussianBlur(image, (0, 0), 4))
+        writer.write(made[i])
+    writer.release()
     return made
 
 
-@pytest.fixture
-def registered(monkeypatch):
-    seen = {}
+def test_the_sharpest_frame_of_each_interval_is_taken(tmp_path, monkeypatch):
+    registered = {}
 
     def read(path, config):
-        files = sorted(path.iterdir())
-        seen[path] = [image_files.read_image(file).mean() for file in files]
-        seen["names"] = [file.name for file in files]
+        registered.update({file.name: file for file in sorted(path.iterdir())})
         raise ValueError(f"{path}: enough")
 
     monkeypatch.setattr(video, "read_photographs", read)
-    return seen
-
-
-def test_the_sharpest_frame_of_each_interval_is_taken(tmp_path, registered):
-    made = frames(60, sharp={3, 29, 30, 50})
-    write_video(tmp_path / "flight.mp4", made)
+    made = write_video(tmp_path / "flight.mp4", 60, sharp={3, 29, 30, 50})
     config = CaptureConfig(cache=str(tmp_path / "cache"))
     for _ in range(2):  # at the default rate of 2 Hz
-        with pytest.raises(ValueError, match="enough"):
+        with pytest.raises(ValueError, match="cache/frames: enough"):
             read_capture(tmp_path / "flight.mp4", config)
-        brightness = registered[tmp_path / "cache/frames"]
-        expected = [made[i].mean() for i in (3, 29, 30, 50)]
+        assert list(registered) == [f"{i:05d}.jpg" for i in range(4)]
+        brightness = [image_files.read_image(file).mean() for file in registered.values()]
         # 15 frames an interval: 0 to 14, 15 to 29, 30 to 44, 45 to 59.
-        np.testing.assert_allclose(brightness, expected, atol=3)
-    assert registered["names"] == [f"{i:05d}.jpg" for i in range(4)]
+        np.testing.assert_allclose(brightness, [made[i].mean() for i in (3, 29, 30, 50)], atol=3)
     config = CaptureConfig(cache=str(tmp_path / "other"), video_rate=10)
     with pytest.raises(ValueError, match="enough"):
         read_capture(tmp_path / "flight.mp4", config)
-    assert len(registered["names"]) == 20
+    assert len(registered) == 20
 
 
 def test_invalid_videos_are_refused(tmp_path):
-    config = CaptureConfig(cache=str(tmp_path / "cache"))
     (tmp_path / "a.mp4").write_bytes(b"something else")
-    with pytest.raises(ValueError, match=r"a\.mp4: not a readable video"):
-        read_capture(tmp_path / "a.mp4", config)
-    write_video(tmp_path / "b.mp4", frames(20, sharp=set()))
-    with pytest.raises(ValueError, match=r"b\.mp4: 20 frames in 0\.7 s give 2 of 2 a second"):
-        read_capture(tmp_path / "b.mp4", config)
-    assert list((tmp_path / "cache").iterdir()) == []
-    with pytest.raises(ValueError, match=r"video_rate must be in \(0, 100\] Hz, got 0"):
-        read_capture(tmp_path / "b.mp4", CaptureConfig(video_rate=0))
-    with pytest.raises(ValueError, match=r"partners must be in \[0, inf\), got -1"):
-        read_capture(tmp_path / "b.mp4", CaptureConfig(partners=-1))
+    write_video(tmp_path / "b.mp4", 20, sharp=set())
     (tmp_path / "c.txt").write_text("a text")
-    with pytest.raises(ValueError, match=r"c\.txt: unknown capture format.*a video"):
-        read_capture(tmp_path / "c.txt")
+    for name, fields, message in (
+        ("a.mp4", {}, r"a\.mp4: not a readable video"),
+        ("b.mp4", {}, r"b\.mp4: 20 frames in 0\.7 s give 2 of 2 a second"),
+        ("b.mp4", {"video_rate": 0}, r"video_rate must be in \(0, 100\] Hz, got 0"),
+        ("b.mp4", {"partners": -1}, r"partners must be in \[0, inf\), got -1"),
+        ("c.txt", {}, r"c\.txt: unknown capture format.*a video"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            read_capture(tmp_path / name, CaptureConfig(cache=str(tmp_path / "cache"), **fields))
+    assert list((tmp_path / "cache").iterdir()) == []
 
 
-def test_photographs_that_show_nothing(tmp_path):
+def test_images_that_are_not_photographs_are_named(tmp_path):
+    (tmp_path / "gray").mkdir()
+    for i in range(3):
+        cv2.imwrite(str(tmp_path / f"gray/{i}.png"), np.full((48, 64, 3), 100, np.uint8))
+    with pytest.raises(ValueError, match="3 photographs could not be registered"):
+        read_capture(tmp_path / "gray", CaptureConfig(cache=str(tmp_path / "cache")))
+    assert not list((tmp_path / "cache").iterdir())
     path = tmp_path / "photos"
     path.mkdir()
-    for i in range(3):
-        cv2.imwrite(str(path / f"{i}.png"), np.full((48, 64, 3), 100, np.uint8))
-    with pytest.raises(ValueError, match="3 photographs could not be registered"):
-        read_capture(path, CaptureConfig(cache=str(tmp_path / "cache")))
-    assert not list((tmp_path / "cache").iterdir())
-
-
-def test_images_that_are_no_readable_photographs_are_named(tmp_path):
-    cv2.imwrite(str(tmp_path / "depth0.png"), np.ones((8, 8), np.uint16))
+    cv2.imwrite(str(path / "depth0.png"), np.ones((8, 8), np.uint16))
     with pytest.raises(ValueError, match=r"got 0; .*depth0\.png must be a photograph, got depth"):
-        read_capture(tmp_path)
-    (tmp_path / "a.HEIC").write_bytes(b"ftypheic")
-    with pytest.raises(ValueError, match="1 HEIC images cannot be read; convert them to JPEG"):
-        read_capture(tmp_path)
-    (tmp_path / "poses_bounds.npy").touch()
-    with pytest.raises(ValueError, match=r"its poses in poses_bounds\.npy are not read"):
-        read_capture(tmp_path)
-    (tmp_path / "means_l.webp").touch()
-    with pytest.raises(ValueError, match="unknown capture format"):
-        read_capture(tmp_path)
+        read_capture(path)
+    for name, message in (
+        ("a.HEIC", "1 HEIC images cannot be read; convert them to JPEG"),
+        ("poses_bounds.npy", r"its poses in poses_bounds\.npy are not read"),
+        ("means_l.webp", "unknown capture format"),
+    ):
+        (path / name).write_bytes(b"ftypheic")
+        with pytest.raises(ValueError, match=message):
+            read_capture(path)

@@ -3,38 +3,32 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from room import room_color, write_room_capture
 
 from splatpilot.training.captures.capture_registry import read_capture
 
 
 @pytest.fixture
-def room(tmp_path, write_room) -> Path:
-    return write_room(tmp_path / "room")
+def room(tmp_path) -> Path:
+    return write_room_capture(tmp_path / "room")
 
 
-def back_projected(frame) -> np.ndarray:
-    height, width = frame.depth.shape
-    rows, columns = np.mgrid[0:height, 0:width]
-    p_CQ = frame.back_project(columns + 0.5, rows + 0.5, frame.depth.astype(float))
-    return frame.X_WC.multiply(p_CQ.reshape(-1, 3).T).T.reshape(height, width, 3)
-
-
-def test_world_is_north_west_up(room, room_in_W, color_of_room):
+def test_world_is_north_west_up(room):
     capture = read_capture(room)
     assert (len(capture), capture.width, capture.height, capture.name) == (12, 64, 48, "room")
     np.testing.assert_array_equal(capture.K, [[32, 0, 32], [0, 32, 24], [0, 0, 1]])
-    lower, upper = room_in_W
+    lower, upper = np.array([0.0, -1.5, 0.0]), np.array([6.0, 1.5, 2.5])
+    v, u = np.mgrid[0:48, 0:64] + 0.5
     for frame in capture.frames():
-        p_W = back_projected(frame)
+        p_CQ = frame.back_project(u, v, frame.depth.astype(float))
+        p_W = frame.X_WC.multiply(p_CQ.reshape(-1, 3).T).T.reshape(48, 64, 3)
         to_wall = np.minimum(np.abs(p_W - lower), np.abs(p_W - upper)).min(axis=-1)
         assert to_wall.max() < 1e-5
         assert (p_W > lower - 1e-5).all() and (p_W < upper + 1e-5).all()
-        color = color_of_room(p_W * [1, -1, -1])
+        color = room_color(p_W * [1, -1, -1])
         np.testing.assert_allclose(frame.image / 255, color, atol=0.5 / 255 + 1e-4)
-    X_WC = capture.X_WCs[0]
-    np.testing.assert_allclose(X_WC.translation(), [0.8, 0, 1.1], atol=1e-9)
-    optical = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
-    np.testing.assert_allclose(X_WC.rotation().matrix(), optical, atol=1e-8)
+    optical = [[0, 0, 1, 0.8], [-1, 0, 0, 0], [0, -1, 0, 1.1]]
+    np.testing.assert_allclose(capture.X_WCs[0].GetAsMatrix34(), optical, atol=1e-8)
 
 
 def test_frames_are_loaded_on_demand(room):
@@ -58,9 +52,14 @@ def test_invalid_depth_is_unknown(room):
 
 
 def test_poses_stay_with_their_frames_if_files_are_missing(room):
+    images, depths = room / "image_left", room / "depth_left"
+    extra = depths / "000012_left_depth.npy"
+    extra.write_bytes((depths / "000011_left_depth.npy").read_bytes())
     whole = read_capture(room)
-    (room / "image_left" / "000003_left.png").unlink()
-    (room / "depth_left" / "000008_left_depth.npy").unlink()
+    assert len(whole) == 12 and "000012_left_depth.npy: has no image" in whole.dropped[0]
+    extra.unlink()
+    (images / "000003_left.png").unlink()
+    (depths / "000008_left_depth.npy").unlink()
     capture = read_capture(room)
     assert len(capture) == 10 and len(capture.dropped) == 2
     assert "000003_left.png" in capture.dropped[0]
@@ -69,23 +68,10 @@ def test_poses_stay_with_their_frames_if_files_are_missing(room):
     assert capture.X_WCs[3].IsExactlyEqualTo(whole.X_WCs[4])
 
 
-def test_depth_without_an_image_is_left_out(room):
-    depth = room / "depth_left" / "000012_left_depth.npy"
-    depth.write_bytes((room / "depth_left" / "000011_left_depth.npy").read_bytes())
-    capture = read_capture(room)
-    assert len(capture) == 12 and "000012_left_depth.npy: has no image" in capture.dropped[0]
-
-
-def lines(change):
-    def damage(room):
-        file = room / "pose_left.txt"
-        file.write_text("\n".join(change(file.read_text().splitlines())))
-
-    return damage
-
-
-def line_5(line: str):
-    return lines(lambda all_lines: [*all_lines[:4], line, *all_lines[5:]])
+def change_line_5(room: Path, *lines: str) -> None:
+    file = room / "pose_left.txt"
+    every = file.read_text().splitlines()
+    file.write_text("\n".join([*every[:4], *lines, *every[5:]]))
 
 
 @pytest.mark.parametrize(
@@ -93,14 +79,13 @@ def line_5(line: str):
     [
         (lambda room: (room / "depth_left").rename(room / "moved"), "No such folder: .*depth_left"),
         (lambda room: (room / "pose_left.txt").unlink(), "No such file: .*pose_left.txt"),
-        (
-            lambda room: [file.unlink() for file in (room / "image_left").iterdir()],
-            "image_left: holds no file named like",
-        ),
-        (lines(lambda each: each[:-1]), r"pose_left\.txt: 11 poses for 12 images and 12 dep"),
-        (line_5("0 0 0 0 0 0"), r"pose_left\.txt, line 5 must be a pose tx ty tz"),
+        (lambda room: [file.unlink() for file in (room / "image_left").iterdir()],
+         "image_left: holds no file named like"),
+        (change_line_5, r"pose_left\.txt: 11 poses for 12 images and 12 dep"),
+        (lambda room: change_line_5(room, "0 0 0 0 0 0"),
+         r"pose_left\.txt, line 5 must be a pose tx ty tz"),
     ],
-)
+)  # fmt: skip
 def test_damaged_sequence_is_refused(room, damage, message):
     damage(room)
     with pytest.raises((ValueError, FileNotFoundError), match=message):
@@ -116,7 +101,7 @@ def test_damaged_sequence_is_refused(room, damage, message):
     ],
 )
 def test_frame_of_an_invalid_pose_is_left_out(room, line, message):
-    line_5(line)(room)
+    change_line_5(room, line)
     capture = read_capture(room)
     assert len(capture) == 11 and len(capture.dropped) == 1
     assert "pose_left.txt, line 5: " in capture.dropped[0] and message in capture.dropped[0]

@@ -37,9 +37,13 @@ def all_bytes(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in files}
 
 
-def test_interrupted_run_ends_with_identical_files(small, collected, tmp_path, monkeypatch):
-    whole = all_bytes(collected.shards[0].path.parents[1])
+@pytest.fixture
+def copy(collected, tmp_path) -> Path:
+    """A copy of the corpus, to be damaged."""
+    return shutil.copytree(collected.folder, tmp_path / "copy")
 
+
+def test_interrupted_run_ends_with_identical_files(small, collected, tmp_path, monkeypatch):
     def killed(path, *args, **kwargs):
         (path.parent / f".{path.name}.1.partial").mkdir()
         raise KeyboardInterrupt
@@ -49,154 +53,120 @@ def test_interrupted_run_ends_with_identical_files(small, collected, tmp_path, m
         patch.setattr(collect, "write_shard", killed)
         collect.run(config=small, out=tmp_path, worlds=2, jobs=1)
     collect.run(config=small, out=tmp_path, worlds=2, jobs=1)
-    assert all_bytes(tmp_path) == whole
-
-
-def test_damaged_worlds_are_collected_again(small, collected, tmp_path, monkeypatch):
-    folder = collected.shards[0].path.parents[1]
-    out = shutil.copytree(folder, tmp_path / "corpus")
-    again = []
-    collect_world = collect.collect_world
-    monkeypatch.setattr(
-        collect, "collect_world", lambda *a: (again.append(a[2]), collect_world(*a))
-    )
-    collect.run(config=small, out=out, worlds=2, jobs=1)
-    assert again == []
-    depth = out / "shards" / collected.shards[1].path.name / "depth.npy"
-    depth.write_bytes(depth.read_bytes()[:-1])
-    esdf = out / "worlds" / collected.worlds[0].name / "esdf.npz"
-    content = bytearray(esdf.read_bytes())
-    content[len(content) // 2] ^= 1
-    esdf.write_bytes(content)
-    collect.run(config=small, out=out, worlds=2, jobs=1)
-    assert again == [0, 1]
-    assert all_bytes(out) == all_bytes(folder)
-
-
-def test_samples_of_another_version_stay(small, collected, tmp_path):
-    out = shutil.copytree(collected.shards[0].path.parents[1], tmp_path / "corpus")
-    about = out / "shards" / collected.shards[0].path.name / "shard.json"
-    about.write_text(about.read_text().replace('"format_version": 2', '"format_version": 3'))
-    before = all_bytes(out)
-    with pytest.raises(ValueError, match="must be 2, got 3; use the version"):
-        collect.run(config=small, out=out, worlds=2, jobs=1)
-    assert all_bytes(out) == before
-
-
-def test_states_off_the_path_have_their_own_shards(small, collected, tmp_path):
-    config = replace(small, off_path=70)
-    corpus = collect.run(config=config, out=tmp_path, worlds=1, jobs=1)
-    shard, off_path = corpus.shards
-    assert (shard.source, off_path.source) == (EXPERT, OFF_PATH)
-    np.testing.assert_array_equal(shard.arrays["depth"], collected.shards[0].arrays["depth"])
-    assert 35 <= len(off_path) <= 70 and not np.isnan(off_path.arrays["trajectories_B"][:, 0]).any()
-    before = all_bytes(tmp_path)
-    with (off_path.path / "color.npy").open("r+b") as file:
-        file.seek(5000)
-        file.write(b"damage")
-    collect.run(config=config, out=tmp_path, worlds=1, jobs=1)
-    assert all_bytes(tmp_path) == before
+    assert all_bytes(tmp_path) == all_bytes(collected.folder)
     rows = list(csv.DictReader((tmp_path / "ledger.csv").open()))
-    assert [(row["source"], row["states"]) for row in rows][-1] == ("off_path", str(len(off_path)))
-
-
-def test_the_ledger_accounts_for_every_sample(collected):
-    folder = collected.shards[0].path.parents[1]
-    rows = list(csv.DictReader((folder / "ledger.csv").open()))
     assert len(rows) == 4
     assert 2 * sum(int(row["states"]) for row in rows) == len(collected) > 0
     assert {int(row["seed"]) for row in rows} == {TRAINING_SEEDS, TRAINING_SEEDS + 1}
     assert all(row["outcome"] == "goal" and float(row["least_clearance_m"]) > 0 for row in rows)
 
 
-def test_worlds_that_cannot_be_flown_are_left_out(small, collected, tmp_path, monkeypatch, capsys):
+def test_damaged_and_half_worlds_are_collected_again(small, copy, collected, monkeypatch, capsys):
+    calls = []
+
     def collect_world(folder, config, index, revision):
-        if index == 0:
-            raise InfeasibleFlightError("no path")
-        shutil.copytree(collected.shards[0].path.parents[1], folder, dirs_exist_ok=True)
+        calls.append(index)
+        for part in ("shards", "worlds"):
+            whole = sorted((collected.folder / part).iterdir())[index]
+            shutil.copytree(whole, folder / part / whole.name, dirs_exist_ok=True)
 
     monkeypatch.setattr(collect, "collect_world", collect_world)
-    collect.run(config=small, out=tmp_path, worlds=2, jobs=1)
+    collect.run(config=small, out=copy, worlds=2, jobs=1)
+    assert calls == []
+    first, second = (copy / "worlds" / record.path.name / "esdf.npz" for record in collected.worlds)
+    content = bytearray(first.read_bytes())
+    content[len(content) // 2] ^= 1
+    first.write_bytes(content)
+    depth = copy / "shards" / collected.shards[1].path.name / "depth.npy"
+    depth.write_bytes(depth.read_bytes()[:-1])
+    collect.run(config=small, out=copy, worlds=2, jobs=1)
+    assert calls == [0, 1]
+    assert all_bytes(copy) == all_bytes(collected.folder)
+    shutil.rmtree(depth.parent)  # as an interrupted run leaves a world
+    shutil.copy(first, second)
+    collect.run(config=small, out=copy, worlds=2, jobs=1)
+    assert calls == [0, 1, 1]
+    assert all_bytes(copy) == all_bytes(collected.folder)
+
+
+def test_worlds_that_cannot_be_flown_are_left_out(small, copy, collected, monkeypatch, capsys):
+    def collect_world(folder, config, index, revision):
+        raise InfeasibleFlightError("no path")
+
+    monkeypatch.setattr(collect, "collect_world", collect_world)
+    shutil.rmtree(copy / "shards" / collected.shards[0].path.name)
+    collect.run(config=small, out=copy, worlds=2, jobs=1)
     assert "world 0 is left out: no path" in "".join(capsys.readouterr())
 
 
+def test_states_off_the_path_have_their_own_shards(small, collected, tmp_path, monkeypatch):
+    config = replace(small, off_path=70)
+    shard, off_path = collect.run(config=config, out=tmp_path, worlds=1, jobs=1).shards
+    assert (shard.source, off_path.source) == (EXPERT, OFF_PATH)
+    np.testing.assert_array_equal(shard.arrays["depth"], collected.shards[0].arrays["depth"])
+    assert 35 <= len(off_path) <= 70 and not np.isnan(off_path.arrays["trajectories_B"][:, 0]).any()
+    *_, row = csv.DictReader((tmp_path / "ledger.csv").open())
+    assert (row["source"], row["states"]) == ("off_path", str(len(off_path)))
+    with (off_path.path / "color.npy").open("r+b") as file:
+        file.seek(5000)
+        file.write(b"damage")
+    monkeypatch.setattr(collect, "collect_world", None)
+    with pytest.raises(TypeError):  # as it is collected again
+        collect.run(config=config, out=tmp_path, worlds=1, jobs=1)
+
+
 @pytest.mark.parametrize(
-    ("override", "message"),
+    ("override", "numbers", "message"),
     [
-        ("appearance=1.5", r"appearance must be in \[0, 1\], got 1.5"),
-        ("expert.policy=unknown", "no policy 'unknown'"),
-        ("worlds.kinds=[R13]", "worlds.kinds must be of generated worlds, got R13"),
+        ("appearance=1.5", {}, r"appearance must be in \[0, 1\], got 1.5"),
+        ("expert.policy=unknown", {}, "no policy 'unknown'"),
+        ("worlds.kinds=[R13]", {}, "worlds.kinds must be of generated worlds, got R13"),
+        ("seed=0", {"worlds": 0}, "--worlds must be at least 1, got 0"),
+        ("seed=0", {"jobs": 0}, "--jobs must be at least 1, got 0"),
     ],
 )
-def test_values_out_of_range_are_named(small, tmp_path, override, message):
+def test_values_out_of_range_are_named(small, tmp_path, override, numbers, message):
     config = load_config(small, overrides=[override])
     with pytest.raises(ValueError, match=message):
-        collect.run(config=config, out=tmp_path / "c", worlds=1)
+        collect.run(config=config, out=tmp_path / "c", **{"worlds": 1, "jobs": 1} | numbers)
     assert not (tmp_path / "c").exists()
 
 
-@pytest.mark.parametrize("number", ["worlds", "jobs"])
-def test_numbers_below_one_are_refused(small, tmp_path, number):
-    with pytest.raises(ValueError, match=f"--{number} must be at least 1, got 0"):
-        collect.run(config=small, out=tmp_path, **{"worlds": 1, "jobs": 1} | {number: 0})
+def test_another_program_version_or_configuration_adds_no_worlds(small, copy, monkeypatch):
+    def refused(message, config=small, worlds=2):
+        with pytest.raises(ValueError, match=message):
+            collect.run(config=config, out=copy, worlds=worlds, jobs=1)
+        assert all_bytes(copy) == before
 
-
-def test_another_program_adds_no_worlds(small, collected, tmp_path, monkeypatch):
-    out = shutil.copytree(collected.folder, tmp_path / "corpus")
-    before = all_bytes(out)
-    monkeypatch.setattr(collect, "revision", lambda: "another")
-    assert len(collect.run(config=small, out=out, worlds=2, jobs=1)) == len(collected)
-    depth = out / "shards" / collected.shards[1].path.name / "depth.npy"
-    content = depth.read_bytes()
-    for wrong in (content, content[:-1]):
-        depth.write_bytes(wrong)
-        with pytest.raises(ValueError, match="must be that of the program, another, got"):
-            collect.run(config=small, out=out, worlds=2 + (wrong == content), jobs=1)
-    depth.write_bytes(content)
-    assert all_bytes(out) == before
-
-
-def test_corpus_of_a_changed_kind_is_not_extended(small, collected, tmp_path):
-    grove = tmp_path / "grove.yaml"
-    grove.write_text(Path(small.worlds.kinds[0]).read_text())
-    config = replace(small, worlds=replace(small.worlds, kinds=[str(grove)]))
-    collect.run(config=config, out=tmp_path / "corpus", worlds=1, jobs=1)
-    grove.write_text("world: !ForestConfig {length: 11, width: 8, height: 4}\n")
-    with pytest.raises(ValueError, match="grove-1000000 is a world of another definition"):
-        collect.run(config=config, out=tmp_path / "corpus", worlds=2, jobs=1)
-
-
-def test_half_a_world_of_an_interrupted_run_is_not_used(small, collected, tmp_path):
-    out = shutil.copytree(collected.folder, tmp_path / "corpus")
-    other, world = (record.path.name for record in collected.worlds)
-    shutil.rmtree(out / "shards" / collected.shards[1].path.name)
-    shutil.copy(out / "worlds" / other / "esdf.npz", out / "worlds" / world / "esdf.npz")
-    collect.run(config=small, out=out, worlds=2, jobs=1)
-    assert all_bytes(out) == all_bytes(collected.folder)
-
-
-def test_corpus_of_another_configuration_is_not_extended(small, collected):
-    folder = collected.shards[0].path.parents[1]
-    other = load_config(small, overrides=["flights=3"])
-    with pytest.raises(ValueError, match="another configuration"):
-        collect.run(config=other, out=folder, worlds=1)
+    before = all_bytes(copy)
+    refused("another configuration", load_config(small, overrides=["flights=3"]))
+    grove = Path(small.worlds.kinds[0])
+    text = grove.read_text()
+    grove.write_text(text.replace("10", "11"))
+    refused("grove-1000000 is a world of another definition", worlds=3)
+    grove.write_text(text)
+    with monkeypatch.context() as patch:
+        patch.setattr(collect, "revision", lambda: "another")
+        collect.run(config=small, out=copy, worlds=2, jobs=1)
+        refused("must be that of the program, another, got", worlds=3)
+        [depth, *_] = sorted((copy / "shards").glob("*/depth.npy"))
+        depth.write_bytes(depth.read_bytes()[:-1])
+        before = all_bytes(copy)
+        refused("must be that of the program, another, got")
+    about = depth.parent / "shard.json"
+    about.write_text(about.read_text().replace('"format_version": 2', '"format_version": 3'))
+    before = all_bytes(copy)
+    refused("must be 2, got 3; use the version")
 
 
 P_WG = np.array([11.0, 4.0, 1.5])
-AXES = np.array([[4.0, 2.5], [7.0, 5.5]])
-RADIUS = 0.4
-
-
-def labeler_of(radius: float = RADIUS) -> Labeler:
-    """12 x 8 x 3 m of ground with two pillars."""
-    shapes = [HalfSpace(np.array([0.0, 0.0, 1.0]), 0.0)]
-    shapes += [Cylinder([x, y, -1], [x, y, 4], radius) for x, y in AXES]
-    exact = AnalyticDistanceField(shapes, np.zeros(3), np.array([12.0, 8.0, 3.0]))
-    return Labeler(esdf_from_distance_field(exact, 0.2), P_WG, ExpertConfig())
 
 
 def test_half_of_the_states_are_before_a_pillar_and_none_in_one():
-    labeler, count = labeler_of(), 400
+    shapes = [HalfSpace(np.array([0.0, 0.0, 1.0]), 0.0)]
+    shapes += [Cylinder([x, y, -1], [x, y, 4], 0.4) for x, y in ((4.0, 2.5), (7.0, 5.5))]
+    exact = AnalyticDistanceField(shapes, np.zeros(3), np.array([12.0, 8.0, 3.0]))
+    labeler, count = Labeler(esdf_from_distance_field(exact, 0.2), P_WG, ExpertConfig()), 400
     states = draw_off_path(labeler, count, 2.5, np.random.default_rng(0))
     assert states.shape == (count, 13)
     p_WB, v_WB = states[:, :3], states[:, 3:6]
@@ -205,13 +175,9 @@ def test_half_of_the_states_are_before_a_pillar_and_none_in_one():
     ahead = np.hypot(v_WB[:, 0], v_WB[:, 1])
     assert 1.5 < ahead.max() < 4.0
     assert (ahead - np.sqrt(6.0 * room) < 1.5).all()  # but for what goes sideways
-    yaws, leans = [], []
-    for state in states:
-        R_WB = RotationMatrix(Quaternion(QuadrotorState.of(state).q_WB))
-        roll, pitch, yaw = RollPitchYaw(R_WB).vector()
-        yaws.append(yaw)
-        leans += [roll, pitch]
-    assert 0.08 < np.std(leans) < 0.16
+    rotations = [RotationMatrix(Quaternion(wxyz)) for wxyz in states[:, 6:10]]
+    roll, pitch, yaws = np.array([RollPitchYaw(R_WB).vector() for R_WB in rotations]).T
+    assert 0.08 < np.std([roll, pitch]) < 0.16
     looking = np.stack([np.cos(yaws), np.sin(yaws)], 1)
 
     before, others = slice(0, count // 2), slice(count // 2, count)
@@ -226,10 +192,6 @@ def test_half_of_the_states_are_before_a_pillar_and_none_in_one():
     to_goal /= np.linalg.norm(to_goal, axis=1, keepdims=True)
     assert np.median((to_goal * looking[anywhere]).sum(1)) > 0.6
     assert np.ptp(p_WB[others], axis=0) == pytest.approx([11.0, 7.0, 2.2], abs=1.2)
-
-
-def test_world_without_free_space_is_refused():
-    labeler = labeler_of()
     labeler.toa = replace(labeler.toa, reachable=np.zeros_like(labeler.toa.reachable))
     with pytest.raises(InfeasibleFlightError, match="no free position with a path"):
         draw_off_path(labeler, 5, 2.0, np.random.default_rng(0))
@@ -267,28 +229,27 @@ def labeler(world) -> Labeler:
 
 def tilted_state(p_WB) -> np.ndarray:
     q_WB = np.array([1.0, 0.05, -0.08, 0.15])
-    return QuadrotorState(
-        p_WB, [1.5, 0.4, -0.2], q_WB / np.linalg.norm(q_WB), np.zeros(3)
-    ).to_vector()
+    q_WB /= np.linalg.norm(q_WB)
+    return QuadrotorState(p_WB, [1.5, 0.4, -0.2], q_WB, np.zeros(3)).to_vector()
 
 
 STATES = [tilted_state(p) for p in ([1.5, 0.2, 2.0], [2.0, -0.5, 1.5])]
 
 
 def see(world, labeler, bound=np.inf, config=CONFIG):
+    """The demonstrations of `STATES`, their samples, and the poses of these."""
     demonstrations = keep_clear(labeler.labels(STATES), labeler.field)
     rng = np.random.default_rng(3)
-    return demonstrations, render_samples(demonstrations, world, labeler, config, bound, rng)
+    samples = render_samples(demonstrations, world, labeler, config, bound, rng)
+    rows = samples.X_WB
+    return demonstrations, samples, [RigidTransform(Quaternion(X[:4]), X[4:]) for X in rows]
 
 
-def poses(samples) -> list[RigidTransform]:
-    return [RigidTransform(Quaternion(wxyz=row[:4]), row[4:]) for row in samples.X_WB]
-
-
-def test_labels_are_the_same_in_the_world_from_every_pose(world, labeler):
-    demonstrations, samples = see(world, labeler)
+def test_labels_and_images_are_those_of_the_recorded_pose(world, labeler):
+    demonstrations, samples, poses = see(world, labeler)
     assert len(samples) == 6
-    for k, X_WP in enumerate(poses(samples)):
+    camera = CONFIG.camera
+    for k, X_WP in enumerate(poses):
         state, waypoints_W = demonstrations[k // 3]
         R_WP = X_WP.rotation().matrix()
         found = samples.trajectories_B[k] @ R_WP.T + X_WP.translation()
@@ -296,14 +257,6 @@ def test_labels_are_the_same_in_the_world_from_every_pose(world, labeler):
         np.testing.assert_allclose(R_WP @ samples.v_B[k], state[3:6], atol=1e-6)
         to_goal = world.p_WG - X_WP.translation()
         np.testing.assert_allclose(R_WP @ samples.goal_B[k], to_goal, atol=1e-5)
-    for k in (0, 3):
-        assert poses(samples)[k].IsNearlyEqualTo(pose_from_state(STATES[k // 3]), 1e-9)
-
-
-def test_images_are_taken_from_the_pose_that_is_recorded(world, labeler):
-    _, samples = see(world, labeler)
-    camera = CONFIG.camera
-    for k, X_WP in enumerate(poses(samples)):
         forward, left, up = X_WP.inverse().multiply(SPHERE) - camera.mount().translation()
         column = camera.width / 2 - camera.focal_x * left / forward
         row = camera.height / 2 - camera.focal_y * up / forward
@@ -315,26 +268,29 @@ def test_images_are_taken_from_the_pose_that_is_recorded(world, labeler):
         depth = samples.depth[k][int(row), int(column)]
         assert depth == pytest.approx(forward, abs=0.06)
         assert np.isinf(samples.depth[k]).mean() > 0.9
+    for k in (0, 3):
+        assert poses[k].IsNearlyEqualTo(pose_from_state(STATES[k // 3]), 1e-9)
 
 
-@pytest.mark.parametrize(("bound", "farthest"), [(np.inf, 0.3), (0.1, 0.1), (0.0, 0.0)])
-def test_perturbations_keep_the_bound_of_the_world(world, labeler, bound, farthest):
-    _, samples = see(world, labeler, bound)
-    moved = [
-        np.linalg.norm(X.translation() - STATES[k // 3][:3]) for k, X in enumerate(poses(samples))
-    ]
-    assert max(moved) <= farthest + 1e-9
-    assert max(moved) > 0.4 * farthest or farthest == 0.0
-
-
-def test_perturbations_keep_clear_of_obstacles(world, labeler):
-    config = replace(CONFIG, perturbation=PerturbationConfig(copies=50, distance=1.0))
-    state = tilted_state([5.0, 0.0, 0.5])  # 0.15 m of clearance above the floor of the hall
+@pytest.mark.parametrize(
+    ("height", "bound", "radius"),
+    [
+        (0.5, np.inf, 0.5 - 0.354),  # the clearance above the floor of the hall
+        (2.0, np.inf, 1.0),
+        (2.0, 0.1, 0.1),
+        (2.0, 0.0, 0.0),
+    ],
+)
+def test_perturbations_keep_their_bounds_and_clear_of_obstacles(
+    world, labeler, height, bound, radius
+):
+    config = replace(CONFIG, perturbation=PerturbationConfig(copies=30, distance=1.0))
+    state = tilted_state([5.0, 0.0, height])
     demonstration = Demonstration(state, np.zeros((3, 10, 3)))
     rng = np.random.default_rng(0)
-    samples = render_samples([demonstration], world, labeler, config, np.inf, rng)
+    samples = render_samples([demonstration], world, labeler, config, bound, rng)
     moved = np.linalg.norm(samples.X_WB[:, 4:] - state[:3], axis=1)
-    assert 0.05 < moved.max() <= 0.5 - 0.354 + 1e-9
+    assert 0.3 * radius <= moved.max() <= radius + 1e-9
 
 
 def test_trajectories_in_contact_are_no_demonstrations(labeler):
@@ -351,8 +307,8 @@ def test_trajectories_in_contact_are_no_demonstrations(labeler):
 
 
 def test_appearance_changes_colors_but_not_depth(world, labeler):
-    _, plain = see(world, labeler)
+    _, plain, _ = see(world, labeler)
     config = replace(CONFIG, appearance=1.0, perturbation=PerturbationConfig(copies=0))
-    _, other = see(world, labeler, config=config)
+    _, other, _ = see(world, labeler, config=config)
     np.testing.assert_array_equal(plain.depth[::3], other.depth)
     assert np.abs(plain.color[::3].astype(int) - other.color).max() > 10

@@ -35,39 +35,30 @@ def flights(starts, world, labeler):
     return fly_planner(starts, world, ExpertConfig(), labeler)
 
 
-def test_policy_flies_and_planner_labels(world, labeler, starts):
-    flight = fly_policy(starts[1], world, REACTIVE, labeler)
-    assert flight.outcome is Outcome.GOAL and flight.is_demonstration
-    np.testing.assert_allclose(flight.labels[0].state[:3], starts[1])
-    check_labels(flight, world)
-
-
-def test_planner_labels_every_period(world, flights):
-    for flight in flights:
-        assert flight.is_demonstration
-        check_labels(flight, world)
-
-
-def check_labels(flight, world) -> None:
-    assert flight.min_clearance > 0.0
-    assert len(flight.labels) == np.ceil(flight.time / 0.4 - 1e-6)
-    for label in flight.labels:
-        assert label.plan.waypoints_B.shape == (3, 10, 3)
-        assert (np.diff(label.plan.costs) >= 0.0).all()
-        assert (world.distance_field.distance(label.plan.waypoints_W[0]) > VEHICLE_RADIUS).all()
+def test_planner_labels_every_period_of_its_and_other_flights(world, labeler, starts, flights):
+    reactive = fly_policy(starts[1], world, REACTIVE, labeler)
+    np.testing.assert_allclose(reactive.labels[0].state[:3], starts[1])
+    for flight in (*flights, reactive):
+        assert flight.outcome is Outcome.GOAL and flight.is_demonstration
+        assert flight.min_clearance > 0.0
+        assert len(flight.labels) == np.ceil(flight.time / 0.4 - 1e-6)
+        for label in flight.labels:
+            assert label.plan.waypoints_B.shape == (3, 10, 3)
+            assert (np.diff(label.plan.costs) >= 0.0).all()
+            p_WQ = label.plan.waypoints_W[0]
+            assert (world.distance_field.distance(p_WQ) > VEHICLE_RADIUS).all()
 
 
 def test_planner_flies_as_in_the_diagram(world, starts, flights):
-    policy = PrivilegedPlannerConfig(rate=2.5)
-    start = starts[0].tolist()
+    policy, start = PrivilegedPlannerConfig(rate=2.5), starts[0].tolist()
     scenario = Scenario(world=WORLD, start_radius=0.0, start=start, policy=policy)
     drake = fly(BuildFlightDiagram(scenario, world, camera=False))
     found = flights[0]
     assert found.outcome is drake.outcome is Outcome.GOAL
     assert found.time == pytest.approx(drake.times[-1], abs=0.3)
-    for k, label in enumerate(found.labels):
-        row = np.searchsorted(drake.times, 0.4 * k - 1e-9)
-        assert np.linalg.norm(label.state[:3] - drake.states[row, :3]) < 0.15
+    rows = np.searchsorted(drake.times, 0.4 * np.arange(len(found.labels)) - 1e-9)
+    p_WB = np.array([label.state[:3] for label in found.labels])
+    assert np.linalg.norm(p_WB - drake.states[rows, :3], axis=1).max() < 0.15
 
 
 def test_flights_are_independent(starts, world, labeler, flights):

@@ -21,8 +21,8 @@ def dataset(collected, tmp_path_factory) -> Path:
     return out
 
 
-def read_video(path: Path, pixels: str) -> tuple[np.ndarray, np.ndarray]:
-    with av.open(str(path)) as container:
+def read_video(path: str, pixels: str) -> tuple[np.ndarray, np.ndarray]:
+    with av.open(path) as container:
         frames = [(frame.time, frame.to_ndarray(format=pixels)) for frame in container.decode()]
     return np.array([time for time, _ in frames]), np.stack([image for _, image in frames])
 
@@ -38,16 +38,14 @@ def test_rows_and_videos_are_those_of_the_corpus(collected, dataset):
         own = {name: array[::2] for name, array in shard.arrays.items()}  # one perturbed copy
         state = own["X_WB"][:, 4:], own["X_WB"][:, :4], own["v_B"], own["goal_B"]
         np.testing.assert_allclose(rows["observation.state"], np.hstack(state), rtol=1e-6)
-        np.testing.assert_array_equal(
-            np.reshape(rows["action"], (-1, 10, 3)), own["trajectories_B"][:, 0]
-        )
-        paths = [
-            dataset / info["video_path"].format(video_key=key, **place) for key in (COLOR, DEPTH)
-        ]
-        times, colors = read_video(paths[0], "rgb24")
+        action = np.reshape(rows["action"], (-1, 10, 3))
+        np.testing.assert_array_equal(action, own["trajectories_B"][:, 0])
+        video = dataset / info["video_path"]
+        color, depth = (str(video).format(video_key=key, **place) for key in (COLOR, DEPTH))
+        times, colors = read_video(color, "rgb24")
         np.testing.assert_allclose(times, 0.5 * np.arange(len(times)))
         assert np.abs(colors.astype(float) - own["color"]).mean() < 8.0
-        _, codes = read_video(paths[1], "gray12le")
+        _, codes = read_video(depth, "gray12le")
         depth = np.exp(low + codes / 4095 * (high - low)) - 3.5
         np.testing.assert_allclose(depth, np.clip(own["depth"].astype(float), 0.1, 20.0), atol=0.01)
 
@@ -55,27 +53,26 @@ def test_rows_and_videos_are_those_of_the_corpus(collected, dataset):
 def test_episodes_locate_the_rows_and_images_of_flights(collected, dataset):
     episodes = pq.read_table(dataset / "meta/episodes/chunk-000/file-000.parquet").to_pandas()
     flights = [flight["states"] for shard in collected.shards for flight in shard.flights]
-    assert list(episodes["length"]) == flights
     ends = np.cumsum(flights)
-    assert list(episodes["dataset_to_index"]) == list(ends)
-    assert list(episodes["dataset_from_index"]) == [0, *ends[:-1]]
     starts = [0.0, flights[0] / 2, 0.0, flights[2] / 2]
-    assert list(episodes[f"videos/{COLOR}/from_timestamp"]) == starts
-    assert list(episodes[f"videos/{DEPTH}/file_index"]) == [0, 0, 1, 1]
+    for name, expected in {
+        "length": flights,
+        "dataset_to_index": [*ends],
+        "dataset_from_index": [0, *ends[:-1]],
+        f"videos/{COLOR}/from_timestamp": starts,
+        f"videos/{DEPTH}/file_index": [0, 0, 1, 1],
+    }.items():
+        assert list(episodes[name]) == expected, name
+    assert list(pd.read_parquet(dataset / "meta/tasks.parquet").index) == [TASK]
     first = pq.read_table(dataset / "data/chunk-000/file-000.parquet").to_pandas()[: flights[0]]
     actions = np.stack(list(first["action"]))
-    for name in ("min", "max", "mean", "std"):
-        stats = episodes[f"stats/action/{name}"][0]
-        np.testing.assert_allclose(stats, getattr(actions, name)(axis=0), rtol=1e-5, atol=1e-6)
-    tasks = pd.read_parquet(dataset / "meta/tasks.parquet")
-    assert list(tasks.index) == [TASK]
-
-
-def test_statistics_are_those_of_all_pixels(collected, dataset):
-    stats = json.loads((dataset / "meta/stats.json").read_text())[COLOR]
     pixels = np.concatenate([shard.arrays["color"][::2] for shard in collected.shards]) / 255
+    stats = json.loads((dataset / "meta/stats.json").read_text())[COLOR]
     assert stats["count"] == [len(pixels)]
     for name in ("min", "max", "mean", "std"):
+        expected = getattr(actions, name)(axis=0)
+        found = episodes[f"stats/action/{name}"][0]
+        np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
         expected = getattr(pixels, name)(axis=(0, 1, 2))
         np.testing.assert_allclose(np.ravel(stats[name]), expected, atol=1e-9)
     expected = np.quantile(pixels, 0.9, axis=(0, 1, 2), method="inverted_cdf")
@@ -91,9 +88,8 @@ def test_a_flight_is_split_where_a_state_is_missing(collected, tmp_path):
     kept = np.delete(np.arange(len(shard)), [10, 11])  # state 5 of the first flight
     parts = {name: array[kept] for name, array in shard.arrays.items()}
     parts |= {f.name: np.zeros(len(kept)) for f in fields(Samples) if f.name not in parts}
-    flights = [
-        flight | {"states": flight["states"] - (k == 0)} for k, flight in enumerate(shard.flights)
-    ]
+    flights = [flight | {"states": flight["states"]} for flight in shard.flights]
+    flights[0]["states"] -= 1
     about = {"world": shard.world, "source": shard.source, "flights": flights, "revision": ""}
     write_shard(folder / "shards/a", [Samples(**parts)], collected.config.size, **about)
     write_ledger(Corpus(folder))
@@ -108,21 +104,18 @@ def test_a_flight_is_split_where_a_state_is_missing(collected, tmp_path):
     [
         ({"width": 33}, "image size of .* must be even and at least 16 px, as video, got 33x24"),
         ({"height": 8}, "image size of .* must be even and at least 16 px, as video, got 32x8"),
+        (None, "a corpus with flights of an expert, got none"),
     ],
 )
-def test_images_that_no_video_has_are_refused(collected, tmp_path, camera, message):
+def test_corpora_that_cannot_be_exported_are_refused(collected, tmp_path, camera, message):
     corpus = Corpus(collected.folder)
-    corpus.config = replace(corpus.config, camera=replace(corpus.config.camera, **camera))
+    if camera is None:
+        corpus.shards = []
+    else:
+        corpus.config = replace(corpus.config, camera=replace(corpus.config.camera, **camera))
     with pytest.raises(ValueError, match=message):
         export(corpus, tmp_path / "out")
     assert not (tmp_path / "out").exists()
-
-
-def test_a_corpus_without_flights_is_refused(collected, tmp_path):
-    corpus = Corpus(collected.folder)
-    corpus.shards = []
-    with pytest.raises(ValueError, match="a corpus with flights of an expert, got none"):
-        export(corpus, tmp_path / "out")
 
 
 def test_lerobot_opens_it(dataset):

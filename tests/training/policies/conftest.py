@@ -3,8 +3,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from pydrake.common.eigen_geometry import Quaternion
-from pydrake.math import RollPitchYaw, RotationMatrix
+from pydrake.math import RollPitchYaw
 
 from splatpilot.systems.collision.esdf_build import esdf_from_distance_field
 from splatpilot.systems.collision.shapes import AnalyticDistanceField, Cylinder, HalfSpace, Shape
@@ -42,6 +41,7 @@ def _write_corpus(folder: Path, worlds: int, states: int, camera: OnboardCamera)
     claim_folder(folder / CONFIG, config)
     for part in ("worlds", "shards"):
         (folder / part).mkdir()
+    rays = PixelRays.of(camera.width, camera.height, camera.fov_x)
     for number in range(worlds):
         rng = np.random.default_rng(number)
         shapes: list[Shape] = [HalfSpace(np.array([0.0, 0.0, 1.0]), 0.0)]
@@ -51,48 +51,28 @@ def _write_corpus(folder: Path, worlds: int, states: int, camera: OnboardCamera)
         esdf = esdf_from_distance_field(exact, 0.25)
         source = WorldSource(f"pillars-{number}", seed=number)
         record_world(folder / "worlds" / source.name, source, esdf)
-        labeler, rows = Labeler(esdf, P_WG, config.expert), []
-        while len(rows) < states:
+        labeler, geometry = Labeler(esdf, P_WG, config.expert), ShapeGeometry([shapes])
+        samples, n = Samples.zeros(states, config.size), 0
+        while n < states:
             p_WB = rng.uniform([1, 2, 1], [9, 6, 2])
             if labeler.field.distance(p_WB) < 0.7:
                 continue
             yaw = np.arctan2(*(P_WG - p_WB)[1::-1]) + rng.normal(0, 0.4)
             rotation = RollPitchYaw(*rng.normal(0, 0.1, 2), yaw)
-            v_WB = rotation.ToRotationMatrix() @ rng.normal([1.5, 0, 0], 0.3)
-            q_WB = rotation.ToQuaternion().wxyz()
-            label = labeler.label(0.0, np.concatenate([p_WB, v_WB, q_WB, np.zeros(3)]))
-            rows.append((q_WB, p_WB, v_WB, label.waypoints_B))
-        samples = _seen(rows, shapes, config)
-        write_shard(
-            shard_folder(folder, source.name),
-            [samples],
-            config.size,
-            world=source.name,
-            source=EXPERT,
-            flights=[],
-            revision="",
-        )
+            R_WB, q_WB = rotation.ToRotationMatrix().matrix(), rotation.ToQuaternion().wxyz()
+            v_B = rng.normal([1.5, 0, 0], 0.3)
+            label = labeler.label(0.0, np.concatenate([p_WB, R_WB @ v_B, q_WB, np.zeros(3)]))
+            x, y, z = R_WB.T
+            p_WC = torch.tensor((p_WB + CAMERA_AHEAD * x)[None], dtype=torch.float32)
+            R_WC = torch.tensor(np.stack([-y, -z, x], 1)[None], dtype=torch.float32)
+            depth = geometry.depth(p_WC, R_WC, rays, torch.zeros(1, dtype=torch.int64))
+            samples.depth[n] = depth.reshape(camera.height, camera.width).clamp(max=1e4)
+            near = np.clip(1.0 - samples.depth[n].astype(float) / 10.0, 0.0, 1.0)
+            samples.color[n] = 255.0 * np.stack([near, 0.0 * near, 1.0 - near], 2)
+            samples.X_WB[n], samples.v_B[n] = (*q_WB, *p_WB), v_B
+            samples.goal_B[n] = (P_WG - p_WB) @ R_WB
+            samples.trajectories_B[n] = label.waypoints_B
+            n += 1
+        about = {"world": source.name, "source": EXPERT, "flights": [], "revision": ""}
+        write_shard(shard_folder(folder, source.name), [samples], config.size, **about)
     return folder
-
-
-def _seen(rows: list, shapes: list[Shape], config: CorpusConfig) -> Samples:
-    samples = Samples.zeros(len(rows), config.size)
-    camera = config.camera
-    rays, geometry = (
-        PixelRays.of(camera.width, camera.height, camera.fov_x),
-        ShapeGeometry([shapes]),
-    )
-    for n, (q_WB, p_WB, v_WB, waypoints_B) in enumerate(rows):
-        R_WB = RotationMatrix(Quaternion(q_WB)).matrix()
-        x, y, z = R_WB.T
-        p_WC = torch.tensor((p_WB + CAMERA_AHEAD * x)[None], dtype=torch.float32)
-        R_WC = torch.tensor(np.stack([-y, -z, x], 1)[None], dtype=torch.float32)
-        depth = geometry.depth(p_WC, R_WC, rays, torch.zeros(1, dtype=torch.int64))
-        samples.depth[n] = depth.reshape(camera.height, camera.width).clamp(max=1e4)
-        near = np.clip(1.0 - samples.depth[n].astype(float) / 10.0, 0.0, 1.0)
-        samples.color[n] = 255.0 * np.stack([near, 0.0 * near, 1.0 - near], 2)
-        samples.X_WB[n] = *q_WB, *p_WB
-        samples.v_B[n] = v_WB @ R_WB
-        samples.goal_B[n] = (P_WG - p_WB) @ R_WB
-        samples.trajectories_B[n] = waypoints_B
-    return samples

@@ -4,10 +4,7 @@ import torch
 from splatpilot.training.policies.augmentation import depth_noise
 from splatpilot.training.policies.evaluation import FlightConditions, Outcomes, evaluate_agent
 from splatpilot.training.policies.ray_casting import PixelRays
-from splatpilot.training.policies.training_worlds import (
-    WorldSelection,
-    validation_worlds,
-)
+from splatpilot.training.policies.training_worlds import WorldSelection, validation_worlds
 
 WORLDS = WorldSelection(kinds=["P01"], held_out=7)
 

@@ -52,20 +52,14 @@ def cameras(seed: int, count: int) -> tuple[torch.Tensor, torch.Tensor]:
     return floats(p), floats(R)
 
 
-def numbers(count: int) -> torch.Tensor:
-    return torch.arange(count)
-
-
-def one_image(
-    geometry: ShapeGeometry | EsdfGeometry, rays: PixelRays, p_WC: list[float]
-) -> np.ndarray:
+def one_image(geometry, rays: PixelRays, p_WC: list[float]) -> np.ndarray:
     """The depth (R,) that a level camera looking along x sees in the only world."""
-    return geometry.depth(floats([p_WC]), floats([R_BC]), rays, numbers(1))[0].numpy()
+    return geometry.depth(floats([p_WC]), floats([R_BC]), rays, torch.arange(1))[0].numpy()
 
 
 @pytest.fixture(scope="module")
 def worlds() -> tuple[list[list[Shape]], ShapeGeometry]:
-    shapes = [some_world(seed) for seed in range(3)]
+    shapes = [some_world(seed, count) for seed, count in ((0, 8), (1, 8), (2, 60))]
     shapes.append([HalfSpace([0, 0, 1], 0.0), Sphere([10, 0, 3], 1.0)])  # few kinds
     return shapes, ShapeGeometry(shapes)
 
@@ -82,7 +76,7 @@ def marched(distance, p_WC: np.ndarray, rays_W: np.ndarray) -> np.ndarray:
 def test_depth_is_where_marched_rays_end(worlds):
     shapes, geometry = worlds
     p, R = cameras(1, 4)
-    depth = geometry.depth(p, R, THIN, numbers(4)).numpy()
+    depth = geometry.depth(p, R, THIN, torch.arange(4)).numpy()
     for w in range(4):
         field = AnalyticDistanceField(shapes[w], LOWER - 60, UPPER + 60)
         expected = marched(field.distance, p[w].numpy(), THIN.directions_C @ R[w].numpy().T)
@@ -114,21 +108,10 @@ def test_wide_pixels_see_what_the_pooled_image_of_a_finer_camera_sees(shape):
     assert (np.abs(coarse - pooled)[near] > 0.05 * pooled[near]).mean() <= outlines
 
 
-def test_depth_of_many_shapes_is_the_minimum_of_each():
-    shapes = some_world(3, 60)
-    p, R = cameras(3, 8)
-    world = ShapeGeometry([shapes]).depth(p, R, RAYS, numbers(8) * 0)
-    alone = ShapeGeometry([[shape] for shape in shapes])
-    for n in range(8):
-        P, D = p[n].expand(len(shapes), 3), R[n].expand(len(shapes), 3, 3)
-        images = alone.depth(P, D, RAYS, numbers(len(shapes)))
-        assert torch.equal(world[n], images.amin(0))
-
-
 def test_the_nearest_of_many_are_the_first_when_all_are_sorted():
     shapes = some_world(4, 60)
     p_WQ = np.random.default_rng(40).uniform(LOWER, UPPER, (50, 3))
-    distances, normals = ShapeGeometry([shapes]).nearest(floats(p_WQ), numbers(50) * 0, 4)
+    distances, normals = ShapeGeometry([shapes]).nearest(floats(p_WQ), torch.arange(50) * 0, 4)
     exact = np.array([ShapeUnion.of([s]).distance(p_WQ) for s in shapes]).T  # (50, M)
     order = np.argsort(exact, axis=1)[:, :4]
     np.testing.assert_allclose(distances, np.take_along_axis(exact, order, 1), atol=1e-5)
@@ -138,28 +121,21 @@ def test_the_nearest_of_many_are_the_first_when_all_are_sorted():
             np.testing.assert_allclose(normals[n, k], gradient, atol=1e-3)
 
 
-def test_missing_shapes_are_at_infinite_distance():
-    distances, normals = ShapeGeometry([[Sphere([3, 0, 0], 1.0)]]).nearest(
-        floats([[0, 0, 0]]), numbers(1), 3
-    )
-    assert distances.tolist() == [[2.0, torch.inf, torch.inf]]
-    assert normals.tolist() == [[[-1.0, 0.0, 0.0], [0.0] * 3, [0.0] * 3]]
-
-
-def test_normals_are_unit_vectors_where_distances_have_a_ridge():
+def test_normals_are_unit_vectors_where_distances_have_a_ridge_and_0_of_missing_shapes():
     sphere, log, post = Sphere([1, 1, 1], 0.5), Capsule([0] * 3, [2, 0, 0], 0.5), [0.0, 0.0, 3.0]
     geometry = ShapeGeometry([[sphere], [log], [Cylinder([0, 0, 0], [0, 0, 6], 0.5)]])
-    _, normals = geometry.nearest(floats([[1, 1, 1], [1, 0, 0], post]), numbers(3), 1)
-    np.testing.assert_allclose(normals.norm(dim=2), 1.0, atol=1e-6)
-    assert normals[1, 0, 0] == 0.0
-    assert normals[2, 0, 2] == 0.0
+    points = floats([[1, 1, 1], [1, 0, 0], post])
+    distances, normals = geometry.nearest(points, torch.arange(3), 2)
+    np.testing.assert_allclose(normals[:, 0].norm(dim=1), 1.0, atol=1e-6)
+    assert normals[1, 0, 0] == normals[2, 0, 2] == 0.0
+    assert (distances[:, 1] == torch.inf).all() and not normals[:, 1].any()
 
 
 def field_of(shapes: list[Shape]) -> Esdf:
     return esdf_from_distance_field(AnalyticDistanceField(shapes, LOWER, UPPER), 0.1)
 
 
-def test_distance_fields_show_what_their_shapes_do():
+def test_distance_fields_show_what_their_shapes_do_from_inside_and_outside():
     shapes = [
         HalfSpace([0, 0, 1], 0.0),
         Sphere([6, 1, 3], 0.8),
@@ -176,9 +152,6 @@ def test_distance_fields_show_what_their_shapes_do():
         off = np.abs(seen - expected)[known] - 2.0 * rays.half_pixel * expected[known]
         assert np.quantile(off, 0.9) < 0.1  # the others are at outlines
         assert (seen[~known] == np.inf).mean() > 0.95
-
-
-def test_cameras_outside_a_field_see_into_it_and_nothing_beyond():
     geometry = EsdfGeometry([field_of([Sphere([4, 0, 3], 1.0)])])
     rays = PixelRays.of(5, 3, 60.0)._replace(half_pixel=0.0)
     assert one_image(geometry, rays, [-5.0, 0.0, 3.0])[7] == pytest.approx(8.0, abs=0.05)
@@ -191,66 +164,55 @@ def test_grids_are_interpolated_as_the_distance_field_is():
     p_WQ = np.random.default_rng(0).uniform(LOWER + 0.06, UPPER - 0.06, (300, 3))
     for w, field in enumerate(fields):
         expected = field.query(p_WQ)
-        world = numbers(300) * 0 + w
+        world = torch.arange(300) * 0 + w
         distances, gradients = geometry.interpolate(floats(p_WQ), world)
         np.testing.assert_allclose(distances, expected.distance, atol=2e-5)
         # Points within rounding of a cell's face may have the gradient of its other side.
         off = np.abs(gradients.numpy() - expected.gradient).max(axis=1)
         assert np.quantile(off, 0.98) < 1e-3
     edge, beyond = floats([[0.05, 0.0, 3.0]]), floats([[-7.0, 0.0, 3.0]])
-    for a, b in zip(*(geometry.interpolate(p, numbers(1)) for p in (edge, beyond)), strict=True):
+    for a, b in zip(
+        *(geometry.interpolate(p, torch.arange(1)) for p in (edge, beyond)), strict=True
+    ):
         np.testing.assert_allclose(a, b, atol=1e-5)
 
 
 def test_threads_and_instructions_do_not_change_results():
     shapes, fields = some_world(5, 30), [field_of(some_world(5))]
     p, R = cameras(5, 13)
-    world = numbers(13) * 0
-    settings = [{"threads": n} for n in (1, 2, 3)]
-    settings += [{"simd": level} for level in _native.simd_levels()]
-    results = []
-    for setting in settings:
+    world, results = torch.arange(13) * 0, []
+    for setting in (
+        *({"threads": n} for n in (1, 2, 3)),
+        *({"simd": level} for level in _native.simd_levels()),
+    ):
         exact, field = ShapeGeometry([shapes], **setting), EsdfGeometry(fields, **setting)
-        results.append(
-            [
-                exact.depth(p, R, RAYS, world),
-                *exact.nearest(p, world, 4),
-                field.depth(p, R, RAYS, world),
-                *field.nearest(p, world, 1),
-            ]
-        )
+        images = exact.depth(p, R, RAYS, world), field.depth(p, R, RAYS, world)
+        results.append([*images, *exact.nearest(p, world, 4), *field.nearest(p, world, 1)])
     for result in results[1:]:
-        for ours, first in zip(result, results[0], strict=True):
-            assert torch.equal(ours, first)
+        assert all(map(torch.equal, result, results[0]))
 
 
 def test_bad_input_is_refused():
     geometry = ShapeGeometry([some_world(0)])
     field = EsdfGeometry([field_of(some_world(0))])
     p, R = cameras(0, 2)
-    for world in ([0, 1], [-1, 0]):
-        for g in (geometry, field):
-            with pytest.raises(ValueError, match=r"world must be in \[0, 1\), got -?1"):
-                g.nearest(p, torch.tensor(world), 1)
-            with pytest.raises(ValueError, match=r"world must be in \[0, 1\), got -?1"):
-                g.depth(p, R, RAYS, torch.tensor(world))
-    world = numbers(2) * 0
-    with pytest.raises(ValueError, match="differ in number"):
-        geometry.nearest(p, numbers(1), 1)
-    with pytest.raises(ValueError, match="differ in shape"):
-        geometry.depth(p, R[:1], RAYS, world)
-    with pytest.raises(ValueError, match=r"in \[1, 16\]"):
-        geometry.nearest(p, world, 17)
-    with pytest.raises(ValueError, match="depth 1"):
-        geometry.depth(p, R, RAYS._replace(directions_C=2.0 * RAYS.directions_C), world)
-    with pytest.raises(ValueError, match="threads"):
-        ShapeGeometry([[]], threads=0)
-    with pytest.raises(ValueError, match="2 to 32768 voxels"):
-        Grids([np.zeros((1, 2, 2))], [LOWER], [0.1])
-    with pytest.raises(ValueError, match="voxel sizes must be"):
-        Grids([np.zeros((2, 2, 2))], [LOWER], [0.0])
-    with pytest.raises(ValueError, match=r"Sphere\.radius"):
-        ShapeGeometry([[Sphere([0, 0, 0], -1.0)]])
+    world, twice = torch.zeros(2, dtype=int), RAYS._replace(directions_C=2.0 * RAYS.directions_C)
+    outside = [torch.tensor(index) for index in ([0, 1], [-1, 0])]
+    calls = [lambda g=g, w=w: g.nearest(p, w, 1) for g in (geometry, field) for w in outside]
+    calls += [lambda g=g, w=w: g.depth(p, R, RAYS, w) for g in (geometry, field) for w in outside]
+    for call, message in (
+        *((call, r"world must be in \[0, 1\), got -?1") for call in calls),
+        (lambda: geometry.nearest(p, world[:1], 1), "differ in number"),
+        (lambda: geometry.depth(p, R[:1], RAYS, world), "differ in shape"),
+        (lambda: geometry.nearest(p, world, 17), r"in \[1, 16\]"),
+        (lambda: geometry.depth(p, R, twice, world), "depth 1"),
+        (lambda: ShapeGeometry([[]], threads=0), "threads"),
+        (lambda: Grids([np.zeros((1, 2, 2))], [LOWER], [0.1]), "2 to 32768 voxels"),
+        (lambda: Grids([np.zeros((2, 2, 2))], [LOWER], [0.0]), "voxel sizes must be"),
+        (lambda: ShapeGeometry([[Sphere([0, 0, 0], -1.0)]]), r"Sphere\.radius"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            call()
     nowhere = floats([[torch.nan] * 3] * 2)
-    assert geometry.depth(nowhere, R, RAYS, world).shape == (2, 24 * 14)
-    assert field.depth(nowhere, R, RAYS, world).shape == (2, 24 * 14)
+    for g in (geometry, field):
+        assert g.depth(nowhere, R, RAYS, world).shape == (2, 24 * 14)

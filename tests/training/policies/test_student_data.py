@@ -1,4 +1,3 @@
-import copy
 import shutil
 from dataclasses import replace
 
@@ -8,9 +7,8 @@ import torch
 
 from splatpilot.diagrams.worlds import splits
 from splatpilot.diagrams.worlds.inserted import InsertedConfig
-from splatpilot.systems.common.config import dump_config
 from splatpilot.systems.policies.student import StudentSpec
-from splatpilot.training.corpus.corpus import CONFIG, Corpus, CorpusConfig
+from splatpilot.training.corpus.corpus import Corpus, CorpusConfig
 from splatpilot.training.corpus.library import world_source
 from splatpilot.training.policies.networks import StudentModule
 from splatpilot.training.policies.student_data import (
@@ -20,8 +18,7 @@ from splatpilot.training.policies.student_data import (
     is_held_out,
 )
 
-HELD_OUT = 0.2
-"""Fraction that holds out one of the three worlds."""
+HELD_OUT = 0.2  # of three worlds, which holds out one
 
 
 @pytest.fixture(scope="module")
@@ -93,8 +90,7 @@ def test_distances_change_as_waypoints_do(two):
     [([], "missing source_digest"), (["0123456789abcdef"], "shows hospital, in which")],
 )
 def test_corpora_of_test_scenes_are_refused(two, monkeypatch, digest, message):
-    tested = {"hospital": ["0123456789abcdef"]}
-    monkeypatch.setattr(splits, "load_test_sources", lambda: tested)
+    monkeypatch.setattr(splits, "load_test_sources", lambda: {"hospital": ["0123456789abcdef"]})
     source = two[0].worlds[0].source
     monkeypatch.setattr(source, "world", InsertedConfig(path="corridor"))
     monkeypatch.setattr(source, "source_digest", digest)
@@ -112,74 +108,48 @@ def test_held_out_worlds_depend_only_on_their_names():
     assert {name for name, held_out in sides.items() if held_out} < more
 
 
-def test_different_worlds_of_one_name_are_refused(two, tmp_path):
-    other = tmp_path / "corpus"
-    shutil.copytree(two[0].folder, other)
-    assert StudentData([two[0], Corpus(other)], HELD_OUT).worlds == [w.name for w in two[0].worlds]
-    record = Corpus(other).worlds[1]
+def test_corpora_that_differ_or_hold_out_too_many_or_few_worlds_are_refused(two, tmp_path):
+    other = Corpus(shutil.copytree(two[0].folder, tmp_path / "corpus"))
+    assert StudentData([two[0], other], HELD_OUT).worlds == [w.name for w in two[0].worlds]
+    record, config = other.worlds[1], two[0].config
     esdf = record.esdf
     replace(esdf, distances=esdf.distances + 0.5).save(record.path / "esdf.npz")
-    with pytest.raises(ValueError, match=r"pillars-1 and .*pillars-1 are different worlds of one"):
-        StudentData([two[0], Corpus(other)], HELD_OUT)
-
-
-def test_corpora_with_different_settings_are_refused(two, tmp_path):
-    other = tmp_path / "corpus"
-    shutil.copytree(two[1].worlds[0].path.parents[1], other)
-    config = two[0].config
-    wider = replace(config, camera=replace(config.camera, fov_x=100.0))
-    assert isinstance(wider, CorpusConfig)
-    (other / CONFIG).write_text(dump_config(wider))
-    with pytest.raises(ValueError, match="cameras of the corpora must be equal"):
-        StudentData([two[0], Corpus(other)], HELD_OUT)
-    with pytest.raises(ValueError, match=r"0 of 3 worlds are held out, .* set held_out to 0\.17"):
-        StudentData(two[:1], 0.16)
-    with pytest.raises(ValueError, match="3 of 3 worlds are held out, which leaves 0 samples"):
-        StudentData(two[:1], 1.0)
+    wide = Corpus(two[1].folder)
+    wide.config = replace(config, camera=replace(config.camera, fov_x=100.0))
+    for corpora, held_out, message in (
+        ([two[0], Corpus(other.folder)], HELD_OUT, r"pillars-1 and .*pillars-1 are different wor"),
+        ([two[0], wide], HELD_OUT, "cameras of the corpora must be equal"),
+        (two[:1], 0.16, r"0 of 3 worlds are held out, .* set held_out to 0\.17"),
+        (two[:1], 1.0, "3 of 3 worlds are held out, which leaves 0 samples"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            StudentData(corpora, held_out)
 
 
 FROZEN = 7
 
 
-@pytest.fixture(scope="module")
-def network() -> StudentModule:
+def test_features_are_computed_once_for_the_same_weights(student_corpus, tmp_path):
     torch.manual_seed(0)
-    return StudentModule(StudentSpec("depth", 32, 24))
-
-
-@pytest.fixture
-def data(student_corpus) -> StudentData:
-    return StudentData([Corpus(student_corpus)], HELD_OUT)
-
-
-def test_features_equal_the_output_of_the_modules(data, network, tmp_path):
+    network = StudentModule(StudentSpec("depth", 32, 24))
+    data = StudentData([Corpus(student_corpus)], HELD_OUT)
     indices = np.concatenate([data.held_out[[3, 0]], data.training[[5, 30]]])
+    features = FrozenFeatures(tmp_path, data, network, FROZEN)(indices)
     with torch.no_grad():
         expected = network.features[:FROZEN](encode_images(data.pixels(indices, "depth")))
-    found = FrozenFeatures(tmp_path, data, network, FROZEN)(indices)
-    torch.testing.assert_close(found, expected, atol=4e-3, rtol=4e-3)
-
-
-def test_features_are_computed_once_for_the_same_weights(data, network, tmp_path):
-    FrozenFeatures(tmp_path, data, network, FROZEN)
+    torch.testing.assert_close(features, expected, atol=4e-3, rtol=4e-3)
     made = {file: (file.stat().st_mtime_ns, file.read_bytes()) for file in tmp_path.iterdir()}
     assert len(made) == len(data.shards)
     lost = min(made)
-    lost.unlink()
-    FrozenFeatures(tmp_path, data, network, FROZEN)
-    for file, (time, content) in made.items():
-        assert file.read_bytes() == content and (file == lost) != (file.stat().st_mtime_ns == time)
-    changed = copy.deepcopy(network)
+    content = made[lost][1]
+    for damaged in (None, b"", b"junk", content[:-100]):
+        lost.unlink() if damaged is None else lost.write_bytes(damaged)
+        again = FrozenFeatures(tmp_path, data, network, FROZEN)(indices)
+        torch.testing.assert_close(again, features, atol=0, rtol=0)
+        for file, (time, content) in made.items():
+            assert file.read_bytes() == content
+            assert (file == lost) != (file.stat().st_mtime_ns == time)
     with torch.no_grad():
-        changed.features[0][0].weight[0, 0, 0, 0] += 1.0
-    FrozenFeatures(tmp_path, data, changed, FROZEN)
+        network.features[0][0].weight[0, 0, 0, 0] += 1.0
+    FrozenFeatures(tmp_path, data, network, FROZEN)
     assert len(list(tmp_path.iterdir())) == 2 * len(made)
-
-
-@pytest.mark.parametrize("content", [b"", b"junk", None])
-def test_damaged_features_are_computed_again(data, network, tmp_path, content):
-    expected = FrozenFeatures(tmp_path, data, network, FROZEN)(data.training[[5]])
-    for file in tmp_path.iterdir():
-        file.write_bytes(file.read_bytes()[:-100] if content is None else content)
-    found = FrozenFeatures(tmp_path, data, network, FROZEN)(data.training[[5]])
-    torch.testing.assert_close(found, expected, atol=0, rtol=0)

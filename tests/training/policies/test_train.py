@@ -3,10 +3,10 @@ import json
 import os
 import re
 import shutil
+import sys
 import zipfile
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -24,9 +24,8 @@ from splatpilot.systems.policies.checkpoint import PolicyCheckpoint, checkpoint_
 from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK
 from splatpilot.training.policies import train, training_worlds
 from splatpilot.training.policies.evaluation import evaluate_agent
-from splatpilot.training.policies.train import run
+from splatpilot.training.policies.train import TRAINERS, run
 from splatpilot.training.policies.train_diffaero import DiffAeroLearner, DiffAeroTraining
-from splatpilot.training.policies.trainer_registry import TRAINERS
 from splatpilot.training.policies.training_worlds import WorldCache
 
 CARDS = sorted((Path(policy_checkpoint.__file__).parent / "weights").glob("*.md"))
@@ -54,14 +53,11 @@ def tiny(*more: str) -> DiffAeroTraining:
     return load_config(DiffAeroTraining(), overrides=[*TINY, *more])
 
 
-def weights(out: Path) -> dict[str, np.ndarray]:
-    saved = torch.load(out / "checkpoint.pt", weights_only=True)
-    return {name: value.numpy() for name, value in saved["network"].items()}
-
-
 def assert_same(a: Path, b: Path) -> None:
-    for name, value in weights(a).items():
-        np.testing.assert_array_equal(value, weights(b)[name], err_msg=name)
+    first, second = (
+        torch.load(out / "checkpoint.pt", weights_only=True)["network"] for out in (a, b)
+    )
+    assert all(torch.equal(value, second[name]) for name, value in first.items())
 
 
 @pytest.fixture(scope="module")
@@ -97,28 +93,25 @@ def test_a_command_trains_seeds_one_after_the_other(finished, tmp_path):
 def test_killed_training_ends_in_the_same_weights(policy, tmp_path):
     trainer_kind = TRAINERS.find(policy)
     config = load_config(trainer_kind.config(), overrides=[*SMALL, *OF_POLICY[policy]])
+    whole, again = tmp_path / "whole", tmp_path / "again"
 
-    def make_interrupted(config):
+    def make(config):
         trainer = trainer_kind.make(config)
         begin_update = trainer.begin_update
 
-        def interrupt(update: int) -> None:
+        def copy_before(update: int) -> None:
             if update == 5:
-                shutil.copytree(tmp_path / "begun", tmp_path / "again")  # as a kill leaves it
-                raise KeyboardInterrupt
+                shutil.copytree(whole, again)  # as a kill leaves it
             begin_update(update)
 
-        trainer.begin_update = interrupt
+        trainer.begin_update = copy_before
         return trainer
 
-    run(config=config, out=tmp_path / "whole", make=trainer_kind.make)
-    with pytest.raises(KeyboardInterrupt):
-        run(config=config, out=tmp_path / "begun", make=make_interrupted)
-    run(config=config, out=tmp_path / "again", make=trainer_kind.make)
-    assert_same(tmp_path / "again", tmp_path / "whole")
-    curves = [(tmp_path / folder / "curves.csv").read_text() for folder in ("again", "whole")]
-    assert curves[0] == curves[1]
-    assert policy_named(str(tmp_path / "whole" / f"{policy}.npz")).rate > 0.0
+    run(config=config, out=whole, make=make)
+    run(config=config, out=again, make=trainer_kind.make)
+    assert_same(again, whole)
+    assert (again / "curves.csv").read_text() == (whole / "curves.csv").read_text()
+    assert policy_named(str(whole / f"{policy}.npz")).rate > 0.0
 
 
 @pytest.mark.parametrize("card", CARDS, ids=lambda card: card.stem)
@@ -126,66 +119,61 @@ def test_model_cards_hold_configurations_that_train(card, tmp_path, monkeypatch)
     config = tmp_path / "config.yaml"
     config.write_text(re.search("```yaml\n(.*?)```", card.read_text(), re.DOTALL)[1])
     trainer = TRAINERS.find(checkpoint_policy(card.with_suffix(".npz")))
-    made_with: Any = load_config(trainer.config(), config)
-    if getattr(getattr(made_with, "worlds", None), "scenes", ()):
+    made_with = load_config(trainer.config(), config)
+    if scenes := getattr(getattr(made_with, "worlds", None), "scenes", ()):
         if "SPLATPILOT_DATA" not in os.environ:
             pytest.skip("SPLATPILOT_DATA is not set")
         monkeypatch.chdir(os.environ["SPLATPILOT_DATA"])
         # Reconstructed scenes are not part of the data.
-        made_with.worlds.scenes = [s for s in made_with.worlds.scenes if Path(s).exists()]
+        made_with.worlds.scenes = [scene for scene in scenes if Path(scene).exists()]
     made_with.validate()
 
 
+class FragileTrainer(TinyTrainer):
+    def losses(self) -> dict[str, torch.Tensor]:
+        assert torch.get_num_threads() == 1
+        size = super().losses()["size"]
+        return {"first": size, "second": size * (torch.nan if self.update >= 5 else 1.0)}
+
+
 def test_loss_that_is_not_a_number_ends_a_run_which_keeps_weights_and_curves(tmp_path, monkeypatch):
-    rows, is_open = [], []
+    rows = []
 
     @contextmanager
     def event_log(folder):
         assert folder == str(tmp_path)
-        is_open.append(True)
         try:
             yield lambda update, row: rows.append((update, row["success"]))
         finally:
-            is_open.pop()
+            rows.append("closed")
 
     monkeypatch.setattr(train, "event_log", event_log)
     config = TinyTraining()
     config.schedule.tensorboard = True
-    threads, used = torch.get_num_threads(), []
+    threads = torch.get_num_threads()
     torch.set_num_threads(2)
-
-    def make(config):
-        used.append(torch.get_num_threads())
-        return FragileTrainer(config)
-
     try:
         with pytest.raises(ValueError, match="update 5: the term 'second' of the loss became nan"):
-            run(config=config, out=tmp_path, make=make)
-        assert (used, torch.get_num_threads()) == ([1], 2)
+            run(config=config, out=tmp_path, make=FragileTrainer)
+        assert torch.get_num_threads() == 2
     finally:
         torch.set_num_threads(threads)
-    assert (rows, is_open) == ([(2, 0.5), (4, 0.5)], [])
+    assert rows == [(2, 0.5), (4, 0.5), "closed"]
     checkpoint = PolicyCheckpoint.load(tmp_path / "diffaero.npz", "diffaero", DIFFAERO_NETWORK)
     assert all(np.isfinite(value).all() for value in checkpoint.weights.values())
     assert checkpoint.provenance["best"]["update"] == 4
     assert torch.load(tmp_path / "checkpoint.pt", weights_only=True)["progress"]["update"] == 4
 
 
-def test_other_configuration_or_broken_checkpoint_is_refused(finished, tmp_path):
-    with pytest.raises(ValueError, match="another configuration"):
-        run(config=tiny("seed=1"), out=finished, make=TRAINERS.find("diffaero").make)
+def test_broken_checkpoint_or_invalid_schedule_is_refused(tmp_path):
     claim_folder(tmp_path / "config.yaml", tiny())
     (tmp_path / "checkpoint.pt").write_bytes(b"nonsense")
-    with pytest.raises(ValueError, match=r"delete .*checkpoint\.pt to start again"):
-        run(config=tiny(), out=tmp_path, make=TRAINERS.find("diffaero").make)
-    with pytest.raises(ValueError, match=r"schedule\.updates must be in \[1, inf\), got 0"):
-        run(config=tiny("schedule.updates=0"), out=tmp_path, make=TRAINERS.find("diffaero").make)
-
-
-class FragileTrainer(TinyTrainer):
-    def losses(self) -> dict[str, torch.Tensor]:
-        size = super().losses()["size"]
-        return {"first": size, "second": size * (torch.nan if self.update >= 5 else 1.0)}
+    for config, message in (
+        (tiny(), r"delete .*checkpoint\.pt to start again"),
+        (tiny("schedule.updates=0"), r"schedule\.updates must be in \[1, inf\), got 0"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            run(config=config, out=tmp_path, make=TRAINERS.find("diffaero").make)
 
 
 def test_training_seeds_are_not_those_of_the_benchmark(monkeypatch):
@@ -203,12 +191,8 @@ def test_training_seeds_are_not_those_of_the_benchmark(monkeypatch):
         training_worlds.training_worlds(selection, 1000)
 
 
-class Reader(TinyTrainer):
-    learns_from = "one corpus"
-
-
-class OtherReader(Reader):
-    learns_from = "another"
+def interrupt() -> None:
+    raise KeyboardInterrupt
 
 
 class Interrupted(TinyTrainer):
@@ -218,78 +202,74 @@ class Interrupted(TinyTrainer):
         if Interrupted.first is None:
             Interrupted.first = update
         if update == 5:
-            raise KeyboardInterrupt
+            interrupt()
 
 
 def test_stopped_run_reports_its_checkpoint_and_resumes_there(tmp_path, monkeypatch, capsys):
-    config = TinyTraining()
-    with pytest.raises(KeyboardInterrupt) as ended:
-        run(config=config, out=tmp_path / "at_updates", make=Interrupted)
-    kept = f"update 4 of 9 is in {tmp_path / 'at_updates'}; the same command resumes there"
-    assert ended.value.__notes__ == [kept]
+    def stopped(out: str, make=Interrupted) -> str:
+        with pytest.raises(KeyboardInterrupt) as ended:
+            run(config=TinyTraining(), out=tmp_path / out, make=make)
+        [note] = ended.value.__notes__
+        return note.replace(str(tmp_path), "")
+
+    none = stopped("none", make=lambda config: interrupt())
+    assert none == "no update is in /none yet; the same command starts again"
+    assert stopped("a") == "update 4 of 9 is in /a; the same command resumes there"
     monkeypatch.setattr(CheckpointClock, "is_due", True)
-    with pytest.raises(KeyboardInterrupt):
-        run(config=config, out=tmp_path / "by_time", make=Interrupted)
+    stopped("by_time")
     capsys.readouterr()
     monkeypatch.setattr(Interrupted, "first", None)
-    with pytest.raises(KeyboardInterrupt):
-        run(config=config, out=tmp_path / "by_time", make=Interrupted)
+    stopped("by_time")
     assert Interrupted.first == 5
     lines = capsys.readouterr().err.splitlines()
     assert lines[0] == f"resuming {tmp_path / 'by_time'} at update 5 of 9"
 
 
-def test_stopped_run_without_a_checkpoint_reports_it(tmp_path):
-    def interrupted(config):
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt) as ended:
-        run(config=TinyTraining(), out=tmp_path, make=interrupted)
-    [note] = ended.value.__notes__
-    assert note == f"no update is in {tmp_path} yet; the same command starts again"
+class Reader(TinyTrainer):
+    learns_from = "one corpus"
 
 
-def test_run_with_changed_inputs_is_not_resumed(tmp_path):
-    config = TinyTraining()
-    summary = run(config=config, out=tmp_path, make=Reader)
+def test_run_with_changed_inputs_is_not_resumed(tmp_path, monkeypatch):
+    def refused(message: str) -> None:
+        with pytest.raises(ValueError, match=message):
+            run(config=TinyTraining(), out=tmp_path, make=Reader)
+
+    summary = run(config=TinyTraining(), out=tmp_path, make=Reader)
     curves = (tmp_path / "curves.csv").read_text()
     (tmp_path / "curves.csv").write_text(curves.splitlines()[0])
-    assert run(config=config, out=tmp_path, make=Reader) == summary
+    assert run(config=TinyTraining(), out=tmp_path, make=Reader) == summary
     assert (tmp_path / "curves.csv").read_text() == curves
-    with pytest.raises(ValueError, match="learned from other files: corpora, or the weights"):
-        run(config=config, out=tmp_path, make=OtherReader)
-    weights = (tmp_path / "diffaero.npz").read_bytes()
-    (tmp_path / "diffaero.npz").unlink()
-    with pytest.raises(ValueError, match=r"No such file: .*diffaero\.npz, .* delete .*checkpoint"):
-        run(config=config, out=tmp_path, make=Reader)
-    (tmp_path / "diffaero.npz").write_bytes(weights)
+    with monkeypatch.context() as patch:
+        patch.setattr(Reader, "learns_from", "another")
+        refused("learned from other files: corpora, or the weights")
+    weights = (tmp_path / "diffaero.npz").rename(tmp_path / "weights")
+    refused(r"No such file: .*diffaero\.npz, .* delete .*checkpoint")
+    weights.rename(tmp_path / "diffaero.npz")
     with zipfile.ZipFile(tmp_path / "checkpoint.pt") as archive:
         largest = max(archive.infolist(), key=lambda entry: entry.file_size)
     content = bytearray((tmp_path / "checkpoint.pt").read_bytes())
     content[largest.header_offset + 500] ^= 1
     (tmp_path / "checkpoint.pt").write_bytes(content)
-    with pytest.raises(ValueError, match=r"must be a checkpoint .*; delete .* to start again"):
-        run(config=config, out=tmp_path, make=Reader)
+    refused(r"must be a checkpoint .*; delete .* to start again")
 
 
-def test_run_with_an_invalid_input_leaves_its_folder_free(student_corpus, tmp_path):
-    trainer = TRAINERS.find("student_depth")
-    tiny_student = ["pretrained=false", "frozen=0", "batch=2", "held_out=0.2"]
-    tiny_student += ["schedule.updates=1", "schedule.checkpoint_every=1"]
-    wrong = load_config(trainer.config(), overrides=["corpora=[nowhere]", *tiny_student])
-    with pytest.raises(FileNotFoundError, match="nowhere holds no corpus"):
-        run(config=wrong, out=tmp_path / "out", make=trainer.make)
-    right = load_config(trainer.config(), overrides=[f"corpora=[{student_corpus}]", *tiny_student])
-    run(config=right, out=tmp_path / "out", make=trainer.make)
-    with pytest.raises(ValueError, match=r"another configuration, with corpora: .*; choose"):
-        run(config=wrong, out=tmp_path / "out", make=trainer.make)
+def test_run_with_an_invalid_input_leaves_its_folder_free(tmp_path):
+    def refuse(config):
+        raise ValueError("no corpus")
+
+    other = TinyTraining(seed=1)
+    with pytest.raises(ValueError, match="no corpus"):
+        run(config=other, out=tmp_path, make=refuse)
+    run(config=TinyTraining(), out=tmp_path, make=TinyTrainer)
+    with pytest.raises(ValueError, match=r"another configuration, with seed: 0; choose"):
+        run(config=other, out=tmp_path, make=TinyTrainer)
 
 
 def test_miniature_learns_to_fly(tmp_path):
     overrides = [
         "worlds.kinds=[P01]",
         "worlds.count=3",
-        "worlds.held_out=8",
+        "worlds.held_out=4",
         "worlds.voxel_size=0.5",
         "rollout.environments=16",
         "rollout.steps=20",
@@ -306,3 +286,38 @@ def test_miniature_learns_to_fly(tmp_path):
     summary = run(config=config, out=tmp_path, make=TRAINERS.find("diffaero").make)
     assert before.metrics()["success"] == 0.0
     assert summary["best"]["success"] >= 0.5
+
+
+PACKAGE = """
+from tiny_trainer import TinyTrainer, TinyTraining
+
+from splatpilot import register_trainer
+
+
+class MeanTraining(TinyTraining):
+    pass
+
+
+register_trainer("mean", MeanTraining, TinyTrainer)
+"""
+
+
+def test_trainer_of_another_package_trains_by_the_same_command(tmp_path, monkeypatch):
+    (tmp_path / "mean_package.py").write_text(PACKAGE)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(TRAINERS, "_entries", dict(TRAINERS._entries))
+    out = tmp_path / "out"
+    command = ["train", "mean_package:MeanTraining", "--out", str(out), "--set", "seed=3"]
+    assert main(command) == 0
+    with np.load(out / "diffaero.npz") as weights:
+        assert "head.weight" in weights
+    assert "seed: 3" in (out / "config.yaml").read_text()
+    sys.modules.pop("mean_package")
+
+
+def test_policy_without_a_trainer_is_refused_with_the_known_ones(tmp_path, capsys):
+    assert main(["train", "planner", "--out", str(tmp_path / "out")]) == 1
+    message = capsys.readouterr().err
+    assert "no trainer 'planner'" in message
+    assert all(name in message for name in ("diffaero", "depthnav", "agile_autonomy"))
+    assert not (tmp_path / "out").exists()

@@ -4,6 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from pydrake.math import RollPitchYaw
 
 from splatpilot.diagrams.flight.flight_diagram import BuildFlightDiagram
 from splatpilot.diagrams.flight.policies import policy_named
@@ -14,33 +15,16 @@ from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.common.config import load_config
 from splatpilot.systems.policies.checkpoint import PolicyCheckpoint
 from splatpilot.systems.policies.diffaero import DIFFAERO_NETWORK
-from splatpilot.systems.policies.diffaero_rgb import (
-    MonocularDepth,
-    MonocularSpec,
-    encode_view,
-    load_network,
-)
+from splatpilot.systems.policies.diffaero_rgb import encode_view, load_network
 from splatpilot.systems.vehicle.state import rotation_matrices
-from splatpilot.training.policies.train import run
-from splatpilot.training.policies.train_diffaero_rgb import (
-    DiffAeroRgbTrainer,
-    DiffAeroRgbTraining,
-    MonocularModule,
-    flip,
-)
-from splatpilot.training.policies.trainer_registry import TRAINERS
+from splatpilot.training.policies import train_diffaero_rgb
+from splatpilot.training.policies.train import TRAINERS, run
 
 
-def training(corpus: Path, *overrides: str) -> DiffAeroRgbTraining:
-    settings = [
-        f"corpora=[{corpus}]",
-        "held_out=0.2",
-        "batch=8",
-        "schedule.updates=40",
-        "schedule.validate_every=40",
-        "schedule.checkpoint_every=20",
-    ]
-    return load_config(DiffAeroRgbTraining(), overrides=[*settings, *overrides])
+def training(corpus: Path, *overrides: str) -> train_diffaero_rgb.DiffAeroRgbTraining:
+    settings = [f"corpora=[{corpus}]", "held_out=0.2", "batch=8", "schedule.updates=40"]
+    settings += ["schedule.validate_every=40", "schedule.checkpoint_every=20"]
+    return load_config(train_diffaero_rgb.DiffAeroRgbTraining(), overrides=[*settings, *overrides])
 
 
 @pytest.fixture(scope="module")
@@ -51,22 +35,8 @@ def trained(wide_corpus, tmp_path_factory) -> Path:
     return out
 
 
-def test_flight_computes_what_training_computes():
-    torch.manual_seed(0)
-    spec = MonocularSpec()
-    module = MonocularModule(spec)
-    for weights in module.parameters():
-        torch.nn.init.normal_(weights, std=0.05)
-    weights = {name: values.numpy() for name, values in module.state_dict().items()}
-    view = np.random.default_rng(0).uniform(-1, 1, (6, 90, 160)).astype(np.float32)
-    found = np.stack(MonocularDepth(spec, weights)(view))
-    with torch.no_grad():
-        expected = module(torch.from_numpy(view)[None])[0].numpy()
-    np.testing.assert_allclose(found, expected, atol=1e-4 * np.abs(expected).max())
-
-
 def test_training_views_are_those_of_flight(wide_corpus):
-    trainer = DiffAeroRgbTrainer(training(wide_corpus))
+    trainer = train_diffaero_rgb.DiffAeroRgbTrainer(training(wide_corpus))
     numbers = np.array([3, 20])
     color, rays, target = trainer._samples(numbers)
     data = trainer._data
@@ -84,15 +54,12 @@ def test_training_views_are_those_of_flight(wide_corpus):
 
 
 def test_flipped_views_have_flipped_rays():
-    rng = np.random.default_rng(4)
-    color = rng.integers(0, 256, (90, 160, 3)).astype(np.uint8)
+    color = np.random.default_rng(4).integers(0, 256, (90, 160, 3)).astype(np.uint8)
     mirror = np.diag([1.0, -1.0, 1.0])
-    angle, axis = 0.3, np.array([0.6, 0.8, 0.0])
-    cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
-    R_WB = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    R_WB = RollPitchYaw(0.2, 0.3, 0.0).ToRotationMatrix().matrix()
     views = [encode_view(color, R_WB), encode_view(color[:, ::-1], mirror @ R_WB @ mirror)]
     view = torch.from_numpy(np.stack([views[0], views[0]]))
-    found = flip(view, torch.tensor([True, False])).numpy()
+    found = train_diffaero_rgb.flip(view, torch.tensor([True, False])).numpy()
     np.testing.assert_allclose(found[0], views[1], atol=1e-5)
     np.testing.assert_array_equal(found[1], views[0])
 
@@ -114,9 +81,9 @@ def test_trained_network_predicts_depth_and_flies(trained):
     assert np.linalg.norm(flight.states[-1, :3] - flight.states[0, :3]) > 0.1
 
 
-def test_training_continues_from_given_weights(trained, wide_corpus, tmp_path):
+def test_training_continues_from_given_weights(trained, wide_corpus, student_corpus, tmp_path):
     file = trained / "diffaero_rgb.npz"
-    trainer = DiffAeroRgbTrainer(training(wide_corpus, f"begin={file}"))
+    trainer = train_diffaero_rgb.DiffAeroRgbTrainer(training(wide_corpus, f"begin={file}"))
     with np.load(file) as weights:
         for name, values in trainer.network.state_dict().items():
             np.testing.assert_array_equal(values.numpy(), weights[name])
@@ -126,9 +93,6 @@ def test_training_continues_from_given_weights(trained, wide_corpus, tmp_path):
     other = tmp_path / "diffaero.npz"
     PolicyCheckpoint.load(None, "diffaero", DIFFAERO_NETWORK).save(other)
     with pytest.raises(ValueError, match="got 'diffaero'"):
-        DiffAeroRgbTrainer(training(wide_corpus, f"begin={other}"))
-
-
-def test_corpus_of_another_camera_is_refused(student_corpus):
+        train_diffaero_rgb.DiffAeroRgbTrainer(training(wide_corpus, f"begin={other}"))
     with pytest.raises(ValueError, match=r"160 pixels wide.* got 32x24"):
-        DiffAeroRgbTrainer(training(student_corpus))
+        train_diffaero_rgb.DiffAeroRgbTrainer(training(student_corpus))

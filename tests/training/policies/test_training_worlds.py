@@ -36,17 +36,9 @@ def write_yard(folder: Path, split: str = "train") -> str:
     """A captured yard with a post in it."""
     shapes = [HalfSpace([0, 0, 1], 0.0), Capsule([6.0, 3.5, 0.0], [6.0, 3.5, 5.0], 0.5)]
     esdf = esdf_from_distance_field(AnalyticDistanceField(shapes, np.zeros(3), UPPER), 0.2)
-    one = np.ones((1, 3))
-    world = World(
-        name=folder.name,
-        gaussians=GaussianScene.from_colors(one, [[1, 0, 0, 0]], one, [0.5], one),
-        distance_field=esdf,
-        esdf=esdf,
-        background=(0.0, 0.0, 0.0),
-        p_WS=np.ones(3),
-        p_WG=2 * np.ones(3),
-    )
-    digest = ["0123456789abcdef"]
+    one, digest = np.ones((1, 3)), ["0123456789abcdef"]
+    gaussians = GaussianScene.from_colors(one, [[1, 0, 0, 0]], one, [0.5], one)
+    world = World(folder.name, gaussians, esdf, esdf, (0.0, 0.0, 0.0), one[0], 2 * one[0])
     write_scene_folder(folder, world, provenance="", split=split, source_digest=digest)
     return str(folder)
 
@@ -56,33 +48,37 @@ def yard(tmp_path_factory) -> str:
     return write_yard(tmp_path_factory.mktemp("scenes") / "yard")
 
 
-def selection(yard: str, **fields) -> WorldSelection:
-    return WorldSelection(kinds=["P02"], scenes=[yard], count=4, held_out=2, **fields)
-
-
-def field_of(yard: str) -> Esdf:
+@pytest.fixture(scope="module")
+def field(yard) -> Esdf:
     return make_world(SceneConfig(path=yard), seed=0).esdf
 
 
-def test_kinds_and_scenes_take_turns(yard):
-    worlds = training_worlds(selection(yard, voxel_size=0.5), seed=3)
-    held_out = validation_worlds(selection(yard))
+@pytest.fixture(scope="module")
+def selection(yard) -> WorldSelection:
+    return WorldSelection(kinds=["P02"], scenes=[yard], count=4, held_out=2, voxel_size=0.5)
+
+
+@pytest.fixture(scope="module")
+def worlds(selection):
+    return training_worlds(selection, seed=3)
+
+
+def test_kinds_and_scenes_take_turns(field, selection, worlds):
+    held_out = validation_worlds(selection)
     for batch, number, seed in ((worlds, 2, 1_003_002), (held_out, 0, 2_000_000)):
         generated = WorldCache().world(scenario_world("P02"), seed)
         np.testing.assert_allclose(batch.p_WS[number], generated.p_WS, rtol=1e-6)
         np.testing.assert_allclose(batch.p_WG[number], generated.p_WG, rtol=1e-6)
     np.testing.assert_allclose(worlds.upper_W[1::2], [UPPER] * 2, atol=1e-5)
-    ends = torch.cat([b.p_WS[1::2] for b in (worlds, held_out)]).numpy()
+    starts = torch.cat([b.p_WS[1::2] for b in (worlds, held_out)]).numpy()
     goals = torch.cat([b.p_WG[1::2] for b in (worlds, held_out)]).numpy()
-    assert len(np.unique(ends.round(3), axis=0)) == len(ends) == 3
-    assert (np.linalg.norm(goals - ends, axis=1) > 3.0).all()
-    field = field_of(yard)
-    assert (field.distance(np.concatenate([ends, goals]).astype(float)) > VEHICLE_RADIUS).all()
+    assert len(np.unique(starts.round(3), axis=0)) == len(starts) == 3
+    assert (np.linalg.norm(goals - starts, axis=1) > 3.0).all()
+    assert (field.distance(np.concatenate([starts, goals]).astype(float)) > VEHICLE_RADIUS).all()
 
 
-def test_images_of_scenes_show_their_distance_field(yard):
-    worlds = training_worlds(selection(yard, voxel_size=0.5), seed=0)
-    alone = EsdfGeometry([field_of(yard).conservative()])
+def test_images_of_scenes_show_their_distance_field(field, worlds):
+    alone = EsdfGeometry([field.conservative()])
     rays = PixelRays.of(16, 9, 90.0)
     p = torch.tensor([[2.0, 3.0, 1.5], [3.0, 2.0, 1.0], [9.0, 4.0, 2.0], [2.0, 3.5, 2.0]])
     R = torch.tensor([[[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]]).expand(4, 3, 3)
@@ -99,48 +95,41 @@ def test_images_of_scenes_show_their_distance_field(yard):
     assert distances[1].isfinite().all()  # a forest has more than four trees
 
 
-def test_paths_in_scenes_lead_around_obstacles(yard):
-    worlds = training_worlds(selection(yard), seed=0)
+def test_paths_in_scenes_lead_around_obstacles(field, worlds):
     p, world = torch.tensor([[3.0, 3.5, 1.5]]), torch.tensor([1])
-    field = field_of(yard)
     for _ in range(300):
         p = p + 0.05 * worlds.direction(p, world)
         assert field.distance(p[0].double().numpy()) > 0.2
     assert (p - worlds.p_WG[1]).norm() < 0.2
 
 
-def test_policies_learn_in_scenes(yard):
-    worlds = training_worlds(WorldSelection(kinds=["P02"], scenes=[yard], count=2), seed=0)
+def test_policies_learn_in_scenes(worlds):
+    config = RolloutConfig(environments=8, steps=6)
     for batch in (worlds, worlds.without_obstacles()):
         learner = DiffAeroLearner(DiffAeroLoss())
-        rollout = DifferentiableRollout(
-            learner, batch, RolloutConfig(environments=8, steps=6), torch.Generator().manual_seed(0)
-        )
+        rollout = DifferentiableRollout(learner, batch, config, torch.Generator().manual_seed(0))
         torch.stack(list(rollout.losses().values())).sum().backward()
         gradients = [weight.grad for weight in learner.network.parameters()]
         assert all(g is not None and g.isfinite().all() and g.any() for g in gradients)
 
 
-def test_bad_selections_are_refused(yard, tmp_path):
-    WorldSelection(kinds=["office"]).validate()  # other scenarios than the benchmark's are kinds
+def test_bad_selections_are_refused(tmp_path, monkeypatch):
+    map_file = tmp_path / "renamed.bt"
+    map_file.write_bytes(b"a map")
+    # Other scenarios than the benchmark's are kinds.
+    WorldSelection(kinds=["office"], scenes=[str(map_file)]).validate()
+    monkeypatch.setattr(
+        splits, "load_test_sources", lambda: {"lab": source_digest(part_digests([b"a map"]))}
+    )
     tested = write_yard(tmp_path / "warehouse", "test")
     for fields, message in (
         ({"kinds": ["R13"]}, "worlds.kinds must be of generated worlds, got R13"),
         ({"scenes": [tested]}, "split of .*warehouse must be train, got 'test'"),
         ({"count": 1001}, r"count must be in \[1, 1000\], got 1001"),
+        ({"scenes": [str(map_file)]}, "renamed.bt shows lab, in which the benchmark tests"),
     ):
         with pytest.raises(ValueError, match=message):
             WorldSelection(**fields).validate()
-
-
-def test_octomap_of_a_test_source_is_refused(tmp_path, monkeypatch):
-    map_file = tmp_path / "renamed.bt"
-    map_file.write_bytes(b"a map")
-    WorldSelection(scenes=[str(map_file)]).validate()
-    tested = {"lab": source_digest(part_digests([b"a map"]))}
-    monkeypatch.setattr(splits, "load_test_sources", lambda: tested)
-    with pytest.raises(ValueError, match=r"renamed.bt shows lab, in which the benchmark tests"):
-        WorldSelection(scenes=[str(map_file)]).validate()
 
 
 GROUND = HalfSpace([0, 0, 1], 0.0)
@@ -168,29 +157,21 @@ def assert_same(a, b) -> None:
 
 def test_arrival_is_read_from_the_cache(folder, monkeypatch):
     made = arrival()
-    monkeypatch.setattr(world_cache, "time_of_arrival", None)
-    assert_same(arrival(), made)
-    for other in ({"goal": 1.4}, {"radius": 0.4}):
+    with monkeypatch.context() as patch:
+        patch.setattr(world_cache, "time_of_arrival", None)
+        assert_same(arrival(), made)
+        for other in ({"goal": 1.4}, {"radius": 0.4}):
+            with pytest.raises(TypeError):
+                arrival(**other)
+        patch.setattr(world_cache, "program", lambda: {"splatpilot": "another"})
         with pytest.raises(TypeError):
-            arrival(**other)
-    monkeypatch.setattr(world_cache, "program", lambda: {"splatpilot": "another"})
-    with pytest.raises(TypeError):
-        arrival()
-
-
-def test_damaged_files_are_made_again(folder):
-    made = arrival()
+            arrival()
     [file] = folder.rglob("output.pkl")
     content = file.read_bytes()
     file.write_bytes(content[: len(content) // 2])
     assert_same(arrival(), made)
     assert file.read_bytes() == content
-
-
-def test_unwritable_cache_is_not_used(folder, tmp_path, monkeypatch):
-    made = arrival()
-    (tmp_path / "file").touch()
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(file))  # where none can be written
     assert_same(arrival(), made)
 
 

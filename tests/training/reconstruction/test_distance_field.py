@@ -1,4 +1,5 @@
 import numpy as np
+import pytest
 from pydrake.math import RigidTransform
 
 from splatpilot.systems.collision.distance_field import FieldState
@@ -20,16 +21,12 @@ K = np.array([[40.0, 0, 40], [0, 40, 30], [0, 0, 1]])
 
 
 GRID = FieldGrid(np.array([-1.0, -1.0, 0.5]), np.array([1.0, 1.0, 2.5]), 0.1, 8.0)
+ALL = np.ones((60, 80), bool)
 
 
 def make_capture(depth: np.ndarray, valid: np.ndarray) -> Capture:
     return Capture(
-        name="half",
-        source="a test",
-        K=K,
-        width=80,
-        height=60,
-        X_WCs=[RigidTransform()] * 2,
+        *("half", "a test", K, 80, 60, [RigidTransform()] * 2),
         load_image=lambda i: np.zeros((60, 80, 3), np.uint8),
         load_depth=lambda i: depth,
         load_valid=lambda i: valid,
@@ -44,7 +41,7 @@ def assert_right_half_is_unknown(source: DepthSource) -> None:
 def test_space_before_the_sky_is_free_only_if_a_fitted_frame_measured_it():
     measured = np.full((60, 80), np.inf, dtype=np.float32)
     measured[:, 40:] = 0.0
-    capture = make_capture(measured, np.ones((60, 80), bool))
+    capture = make_capture(measured, ALL)
     rendered = np.zeros((30, 40), dtype=np.float32)
     rendered[:15] = 2.0
     source = DepthSource(lambda i: rendered, np.diag([0.5, 0.5, 1.0]) @ K, capture.X_WCs)
@@ -57,42 +54,34 @@ def test_space_before_the_sky_is_free_only_if_a_fitted_frame_measured_it():
 
 
 def test_masked_pixels_leave_space_unknown():
-    valid = np.ones((60, 80), bool)
-    valid[:, 40:] = False
+    valid = ALL & (np.arange(80) < 40)
     capture = make_capture(np.full((60, 80), 2.0, np.float32), valid)
     x, y = (g.ravel() for g in np.meshgrid(*[np.linspace(-3, 3, 61)] * 2))
-    wall = GaussianScene.from_colors(
-        np.column_stack([x, y, np.full(len(x), 2.0)]),
-        np.tile([1.0, 0, 0, 0], (len(x), 1)),
-        np.tile([0.1, 0.1, 1e-3], (len(x), 1)),
-        np.full(len(x), 0.99),
-        np.zeros((len(x), 3)),
-    )
+    one = np.ones((len(x), 1))
+    means = np.column_stack([x, y, 2 * one])
+    quats, scales = one * [1.0, 0, 0, 0], one * [0.1, 0.1, 1e-3]
+    wall = GaussianScene.from_colors(means, quats, scales, 0.99 * one[:, 0], 0 * means)
     assert_right_half_is_unknown(captured_depth(capture, [0]))
     assert_right_half_is_unknown(render_depth(capture, 2, wall, "3dgs", 1))
 
 
-def _wall(depth: float) -> DepthSource:
-    """Half of each image shows a wall, half the sky."""
+def _grid(depth: float, metric: bool = True, **config) -> FieldGrid:
+    """The grid of images that show half a wall, half the sky."""
     image = np.full((60, 80), depth, dtype=np.float32)
     image[:30] = np.inf
-    return DepthSource(lambda i: image, K, [RigidTransform()] * 3)
+    wall = DepthSource(lambda i: image, K, [RigidTransform()] * 3)
+    return choose_grid(wall, metric, ReconstructConfig(**config))
 
 
 def test_grid_follows_the_config_or_the_size_of_the_scene():
-    room = choose_grid(_wall(3.0), True, ReconstructConfig())
+    room, large = _grid(3.0), _grid(40.0)
     assert (room.voxel_size, room.max_range) == (0.05, 8.0)
-    large = choose_grid(_wall(40.0), True, ReconstructConfig())
     assert large.max_range == 60.0 and large.upper_W[2] >= 40.0
     voxels = np.prod((large.upper_W - large.lower_W) / large.voxel_size)
     assert large.voxel_size > 0.05 and abs(voxels - 20e6) < 0.01 * 20e6
-    given = choose_grid(_wall(40.0), True, ReconstructConfig(voxel_size=0.1, max_range=8.0))
+    given = _grid(40.0, voxel_size=0.1, max_range=8.0)
     assert (given.voxel_size, given.max_range) == (0.1, 8.0) and given.upper_W[2] < 9.0
-
-
-def test_grid_without_scale_is_relative_to_the_median_depth():
-    small, large = (choose_grid(_wall(depth), False, ReconstructConfig()) for depth in (3.0, 300.0))
-    np.testing.assert_allclose(large.max_range, 100 * small.max_range)
-    np.testing.assert_allclose(small.max_range, 8.0 * 3.0 / 2.0)
-    np.testing.assert_allclose(small.voxel_size, 0.05 * 3.0 / 2.0)
-    np.testing.assert_allclose(large.voxel_size, 100 * small.voxel_size)
+    for depth in (3.0, 300.0):  # without scale, relative to the median depth
+        unscaled = _grid(depth, metric=False)
+        assert unscaled.max_range == pytest.approx(8.0 * depth / 2.0)
+        assert unscaled.voxel_size == pytest.approx(0.05 * depth / 2.0)

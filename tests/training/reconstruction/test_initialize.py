@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+from room import write_room_capture
 
 from splatpilot.systems.splats.background import FAR
 from splatpilot.systems.splats.baked_scene import BakedScene
 from splatpilot.training.captures.capture import (
     Capture,
     CaptureFrame,
+    no_depth,
     pixel_rays,
     project_points,
 )
@@ -19,18 +21,6 @@ from splatpilot.training.captures.capture_registry import read_capture
 from splatpilot.training.reconstruction import initialize
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.photometry import ThinnedFrame, estimate_photometry
-
-
-class Frames:
-    """The properties of a capture that settings depend on."""
-
-    points = None
-
-    def __init__(self, count, has_depth, held_out=None):
-        self.count, self.has_depth, self.held_out = count, has_depth, held_out
-
-    def __len__(self):
-        return self.count
 
 
 @pytest.mark.parametrize(
@@ -45,10 +35,21 @@ class Frames:
     ],
 )
 def test_steps_follow_the_fitted_images(count, has_depth, iterations, expected):
-    config = ReconstructConfig(iterations=iterations)
-    resolved = initialize.resolve_config(config, Frames(count, has_depth))  # pyright: ignore[reportArgumentType]
+    depth = {} if has_depth else {"load_depth": no_depth}
+    capture = Capture("", "", K, WIDTH, HEIGHT, [X_WC] * count, None, **{"load_depth": ""} | depth)
+    resolved = initialize.resolve_config(ReconstructConfig(iterations=iterations), capture)
     assert resolved.iterations == expected
     assert resolved.initialization == ("depth" if has_depth else "points")
+
+
+@pytest.mark.parametrize(
+    ("hold_out", "in_files", "expected"),
+    [(-1, None, [0, 8]), (-1, [3, 4], [3, 4]), (5, [3, 4], [0, 5]), (0, [3, 4], [])],
+)
+def test_held_out_frames(hold_out, in_files, expected):
+    config = ReconstructConfig(hold_out=hold_out)
+    capture = Capture("", "", K, WIDTH, HEIGHT, [X_WC] * 10, None, held_out=in_files)
+    assert initialize.held_out_frames(capture, config) == expected
 
 
 def from_depth(frames, **changes):
@@ -57,19 +58,18 @@ def from_depth(frames, **changes):
     return initialize.gaussians_from_depth(frames, photometry, **options | changes)
 
 
-@pytest.fixture
-def capture(write_room, tmp_path):
-    return read_capture(write_room(tmp_path / "room"))
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    return read_capture(write_room_capture(tmp_path_factory.mktemp("room") / "room"))
 
 
 def test_the_sky_has_no_gaussians(capture):
-    def with_sky(frame):
+    frames, below = list(capture.frames()), []
+    for frame in frames:
         depth = frame.depth.copy()
         depth[:10], depth[10:14] = np.inf, 1e4
-        return replace(frame, depth=depth)
-
-    frames = list(capture.frames())
-    whole, below = from_depth(frames), from_depth([with_sky(frame) for frame in frames])
+        below.append(replace(frame, depth=depth))
+    whole, below = from_depth(frames), from_depth(below)
     assert 0 < len(below) < len(whole)
     assert np.abs(below.means).max() <= np.abs(whole.means).max() + 0.1
 
@@ -91,9 +91,8 @@ def test_too_many_gaussians_to_optimize_are_sampled(capture, capsys):
 
 
 def test_invalid_pixels_give_no_gaussians(capture):
-    valid = np.ones((capture.height, capture.width), bool)
+    magenta, valid = np.uint8([255, 0, 255]), np.ones((capture.height, capture.width), bool)
     valid[15:33, 20:44] = False
-    magenta = np.uint8([255, 0, 255])
     masked = replace(
         capture,
         load_image=lambda i: np.where(valid[..., None], capture.load_image(i), magenta),
@@ -106,27 +105,7 @@ def test_invalid_pixels_give_no_gaussians(capture):
         assert not ((np.abs(found - magenta / 255) < 0.05).all(axis=1)).any()
 
 
-@pytest.mark.parametrize(
-    ("hold_out", "in_files", "expected"),
-    [(-1, None, [0, 8]), (-1, [3, 4], [3, 4]), (5, [3, 4], [0, 5]), (0, [3, 4], [])],
-)
-def test_held_out_frames(hold_out, in_files, expected):
-    config = ReconstructConfig(hold_out=hold_out)
-    assert initialize.held_out_frames(Frames(10, True, in_files), config) == expected  # pyright: ignore[reportArgumentType]
-
-
-def test_points_become_gaussians_of_their_spacing():
-    p_WQ = np.stack(np.meshgrid(*[0.2 * np.arange(5)] * 3), axis=-1).reshape(-1, 3)
-    colors = np.random.default_rng(0).uniform(size=p_WQ.shape)
-    scene = initialize.gaussians_from_points(p_WQ, colors)
-    np.testing.assert_allclose(scene.scales, 0.1, rtol=1e-5)
-    np.testing.assert_allclose(scene.means, p_WQ, rtol=1e-6)
-    np.testing.assert_allclose(scene.base_colors, colors, atol=1e-5)
-    with pytest.raises(ValueError, match="3 points are too few"):
-        initialize.gaussians_from_points(p_WQ[:3], colors[:3])
-
-
-def test_random_points_lie_in_view(capture):
+def test_random_points_lie_in_view_and_become_gaussians_of_their_spacing(capture):
     frame = capture.frame(2)
     p_WQ, colors = initialize.random_points([frame], 500, 0.5, 8.0, seed=1)
     assert p_WQ.shape == (500, 3)
@@ -135,6 +114,13 @@ def test_random_points_lie_in_view(capture):
     inside, v, u = project_points(frame.K, p_CQ, capture.width, capture.height)
     assert inside.all()
     np.testing.assert_array_equal(frame.image[v, u], colors * 255)
+    p_WQ = np.stack(np.meshgrid(*[0.2 * np.arange(5)] * 3), axis=-1).reshape(-1, 3)
+    scene = initialize.gaussians_from_points(p_WQ, colors[:125])
+    np.testing.assert_allclose(scene.scales, 0.1, rtol=1e-5)
+    np.testing.assert_allclose(scene.means, p_WQ, rtol=1e-6)
+    np.testing.assert_allclose(scene.base_colors, colors[:125], atol=1e-5)
+    with pytest.raises(ValueError, match="3 points are too few"):
+        initialize.gaussians_from_points(p_WQ[:3], colors[:3])
 
 
 HEIGHT, WIDTH, F = 48, 64, 50.0
@@ -169,31 +155,25 @@ def test_plain_plane_takes_the_largest_cells(rows, columns):
     assert (covered(cells)[:rows, :columns] == 1).all()
 
 
-def test_texture_and_edges_take_small_cells():
-    frame = plane_frame([0, 0, 1], 2.0)
+def test_texture_and_edges_take_small_cells_and_pixels_without_depth_or_mask_none():
+    frame, mask = plane_frame([0, 0, 1], 2.0), ALL.copy()
     depth = frame.depth.copy()
     depth[:, 41:] = 3.0
-    frame = replace(frame, depth=depth)
     image = GRAY.copy()
     image[20] = 0.1
-    cells = initialize.BlockMeans(frame, image, ALL, 8).split(0.05, 8, 0.75, 9)
+    means = initialize.BlockMeans(replace(frame, depth=depth), image, mask, 8)
+    cells = means.split(0.05, 8, 0.75, 9)
     assert (covered(cells) == 1).all()
     on_step = np.abs(cells.u - 41) < 1
     assert set(cells.size[on_step]) == {1}
     on_line = (np.abs(cells.v - 20.5) < cells.size / 2 + 0.1) & (np.abs(cells.u - 20) < 10)
     assert set(cells.size[on_line]) == {2}
     assert set(cells.size[(cells.v > 32) & (cells.u < 32)]) == {8}
-
-
-def test_only_masked_pixels_with_depth_are_covered():
-    frame = plane_frame([0, 0, 1], 2.0)
-    depth, mask = frame.depth.copy(), ALL.copy()
     depth[:4], depth[4:8] = 0, np.inf
     mask[:, 32:] = False
     means = initialize.BlockMeans(replace(frame, depth=depth), GRAY, mask, 8)
-    count = covered(means.split(1, 8, 0.75, 9))
-    assert (count[8:, :32] == 1).all()
-    assert count[:8].sum() == count[:, 32:].sum() == 0
+    expected = mask & (np.arange(HEIGHT) >= 8)[:, None]
+    np.testing.assert_array_equal(covered(means.split(1, 8, 0.75, 9)), expected)
 
 
 def test_gaussians_are_flat_and_cover_their_cell_in_the_image():
@@ -240,24 +220,11 @@ def test_underlay_lies_behind_and_closes_gaps():
     np.testing.assert_allclose(colors, 0.5)
 
 
-def test_third_principal_axis_is_the_normal():
-    R, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(20, 3, 3)))
-    covariances = R @ np.diag([0.04, 1e-6, 0.01]) @ R.transpose(0, 2, 1)
-    quats, scales = initialize.principal_axes(covariances)
-    np.testing.assert_allclose(scales, [[0.2, 0.1, 1e-3]] * 20, rtol=1e-3)
-    found = np.array([RotationMatrix(Quaternion(quat)).matrix() for quat in quats])
-    axes = found * scales[:, None]
-    np.testing.assert_allclose(axes @ axes.transpose(0, 2, 1), covariances, atol=1e-10)
-    _, flat = initialize.principal_axes(np.diag([0.0, 1.0, 4.0])[None])
-    assert (flat > 0).all() and flat.max() == pytest.approx(2)
-
-
 POSTER_K = np.array([[140.0, 0, 80], [0, 140.0, 60], [0, 0, 1]])
 
 
 def posters() -> Capture:
-    """Four views of a plane at z = 2 m with soft blobs of texture, from cameras that slide along
-    it."""
+    """Four views of a textured plane at z = 2 m, from cameras that slide along it."""
     rng = np.random.default_rng(0)
     texture = rng.uniform(0, 255, (120, 160, 3)).astype(np.float32)  # 2.5 cm a texel
     R_WCs = [RotationMatrix.MakeYRotation(-0.05 * i) for i in range(4)]
@@ -265,11 +232,9 @@ def posters() -> Capture:
 
     def load_image(i: int) -> np.ndarray:
         rays = pixel_rays(POSTER_K, 160, 120) @ R_WCs[i].matrix().T
-        x, y, _ = X_WCs[i].translation()
-        u = (x + 2.0 * rays[..., 0] / rays[..., 2] + 1.6) / 0.025
-        v = (y + 2.0 * rays[..., 1] / rays[..., 2] + 1.4) / 0.025
-        maps = u.astype(np.float32), v.astype(np.float32)
-        return cv2.remap(texture, *maps, cv2.INTER_LINEAR).astype(np.uint8)
+        p_WQ = X_WCs[i].translation() + 2.0 * rays / rays[..., 2:]
+        u, v = np.moveaxis(((p_WQ[..., :2] + [1.6, 1.4]) / 0.025).astype(np.float32), -1, 0)
+        return cv2.remap(texture, u, v, cv2.INTER_LINEAR).astype(np.uint8)
 
     return Capture("posters", "four posters", POSTER_K, 160, 120, X_WCs, load_image)
 
@@ -281,9 +246,8 @@ def test_triangulated_points_lie_on_the_plane():
         loaded.append(i)
         return capture.load_image(i)
 
-    points, again = (
-        initialize.triangulate(replace(capture, load_image=load_image), [0, 1, 3]) for _ in "ab"
-    )
+    watched = replace(capture, load_image=load_image)
+    points, again = (initialize.triangulate(watched, [0, 1, 3]) for _ in "ab")
     np.testing.assert_array_equal(points.p_WQ, again.p_WQ)
     assert loaded == [0, 1, 3] * 2
     x, y, z = points.p_WQ.T
@@ -293,13 +257,6 @@ def test_triangulated_points_lie_on_the_plane():
     inside, v, u = project_points(POSTER_K, points.p_WQ, 160, 120)
     difference = np.abs(points.colors[inside] - capture.load_image(0)[v, u] / 255)
     assert np.median(difference) < 0.1
-
-
-def test_too_little_texture():
-    gray = np.full((120, 160, 3), 128, np.uint8)
-    capture = replace(posters(), source="gray walls", load_image=lambda i: gray)
-    with pytest.raises(ValueError, match=r"gray walls: .* must be at least 100, got 0"):
-        initialize.triangulate(capture, [0, 1])
 
 
 def test_gaussians_to_optimize_cover_all_that_the_frames_show(capture):
@@ -325,3 +282,15 @@ def test_gaussians_of_pixels_lie_on_the_surface(tilt):
     inner = (slice(1, -1), slice(None))
     expected = 0.65 / F * np.hypot(1, tilt * depth[inner]) * depth[inner]
     np.testing.assert_allclose(length.reshape(16, 16)[inner], expected, rtol=0.02)
+
+
+def test_third_principal_axis_is_the_normal():
+    R, _ = np.linalg.qr(np.random.default_rng(0).normal(size=(20, 3, 3)))
+    covariances = R @ np.diag([0.04, 1e-6, 0.01]) @ R.transpose(0, 2, 1)
+    quats, scales = initialize.principal_axes(covariances)
+    np.testing.assert_allclose(scales, [[0.2, 0.1, 1e-3]] * 20, rtol=1e-3)
+    found = np.array([RotationMatrix(Quaternion(quat)).matrix() for quat in quats])
+    axes = found * scales[:, None]
+    np.testing.assert_allclose(axes @ axes.transpose(0, 2, 1), covariances, atol=1e-10)
+    _, flat = initialize.principal_axes(np.diag([0.0, 1.0, 4.0])[None])
+    assert (flat > 0).all() and flat.max() == pytest.approx(2)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from pydrake.math import RigidTransform
+from room import write_room_capture
 
 from splatpilot.diagrams.worlds.scene_folder import read_scene, read_scene_metadata
 from splatpilot.systems.splats.scene import GaussianScene
@@ -26,14 +27,8 @@ from splatpilot.training.reconstruction.reconstruct import reconstruct
 from splatpilot.training.reconstruction.splat_rendering import Rendering, render
 from splatpilot.training.reconstruction.views import ReconstructionViews
 
-CONFIG = ReconstructConfig(
-    iterations=60,
-    initial_gaussians=3000,
-    image_width=0,
-    hold_out=6,
-    voxel_size=0.1,
-    threads=1,
-)
+CONFIG = ReconstructConfig(iterations=60, initial_gaussians=3000, image_width=0, hold_out=6)
+CONFIG = replace(CONFIG, voxel_size=0.2, threads=1)
 
 
 # A walk in small steps, with the held-out frames 0 and 6 in the middle of it.
@@ -43,36 +38,34 @@ POSES = [
 ]
 
 
-@pytest.fixture
-def room(tmp_path, write_room):
-    return write_room(tmp_path / "room", poses=POSES)
+@pytest.fixture(scope="module")
+def room(tmp_path_factory):
+    return read_capture(write_room_capture(tmp_path_factory.mktemp("room") / "room", poses=POSES))
 
 
 def fit(capture, out, **changes) -> HeldOutMetrics:
     """Reconstructs and returns the metrics of the held-out frames."""
-    held_out = reconstruct(capture, out, replace(CONFIG, **changes)).held_out
-    assert held_out is not None
-    return held_out
+    return reconstruct(capture, out, replace(CONFIG, **changes)).held_out
 
 
 @pytest.mark.parametrize(("representation", "count"), [("3dgs", 3000), ("2dgs", 8000)])
 def test_held_out_frames_are_reconstructed(tmp_path, room, representation, count):
     # Surfels have no blur of pixels, so more are required.
     changes = {"representation": representation, "initial_gaussians": count}
-    start = fit(read_capture(room), tmp_path / "start", **changes, iterations=1).means()
-    found = fit(read_capture(room), tmp_path / "scene", **changes, iterations=250)
+    start = fit(room, tmp_path / "start", **changes, iterations=1).means()
+    found = fit(room, tmp_path / "scene", **changes, iterations=250)
     assert found.means()["psnr_db"] > max(30, start["psnr_db"] + 2)
     assert found.means()["depth_mae_m"] < 0.1
     if representation == "3dgs":
         for view in found.views:
             assert view.hole_fraction is not None and view.hole_fraction < 0.005
         baked = read_scene(tmp_path / "scene").baked
-        for frame in read_capture(room).frames():
+        for frame in room.frames():
             alpha = baked.render(frame.K, 64, 48, frame.X_WC).alpha
             assert np.median(alpha) > 0.97 and np.mean(alpha < 0.5) < 0.02
     metadata = read_scene_metadata(tmp_path / "scene")
     assert (metadata.held_out, metadata.representation) == ([0, 6], representation)
-    assert (metadata.capture, metadata.image_width) == (str(room), 0)
+    assert (metadata.capture, metadata.image_width) == (room.folder, 0)
     scales = read_ply(tmp_path / "scene" / "gaussians.ply").scales
     assert (scales[:, 2] < 2e-6).all() == (representation == "2dgs")
 
@@ -80,40 +73,39 @@ def test_held_out_frames_are_reconstructed(tmp_path, room, representation, count
 def test_scene_depends_only_on_the_seed(tmp_path, room):
     for name, threads in (("a", 1), ("b", 2)):
         config = replace(CONFIG, iterations=20, threads=threads)
-        reconstruct(read_capture(room), tmp_path / name, config)
+        reconstruct(room, tmp_path / name, config)
     for file in ("gaussians.ply", "scene.yaml", "esdf.npz"):
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
 
 
-def test_depth_term_moves_gaussians_to_surfaces(tmp_path, room):
-    changes = {"initialization": "random", "surface_weight": 0.0, "iterations": 200}
-    errors = [
-        fit(read_capture(room), tmp_path / "scene", **changes, depth_weight=weight)
-        for weight in (0.0, 0.2)
-    ]
-    without, found = (metrics.means()["depth_mae_m"] for metrics in errors)
-    assert 0 < found < 0.5 * without
-
-
 def test_gaussians_are_added_only_without_depth(tmp_path, room):
-    config = replace(CONFIG, initial_gaussians=300, iterations=30, refine_start=5, refine_every=10)
-
     def count(**changes) -> int:
-        return reconstruct(
-            read_capture(room), tmp_path / "scene", replace(config, **changes)
-        ).gaussians
+        few = {"initial_gaussians": 300, "iterations": 30, "refine_start": 5, "refine_every": 10}
+        return reconstruct(room, tmp_path / "scene", replace(CONFIG, **few | changes)).gaussians
 
     assert count(initialization="random") > 300
     assert count(initialization="random", strategy="none") == 300
     assert count() == count(strategy="none")
+    with pytest.raises(ValueError, match="number of points between its images must be at least"):
+        count(initialization="points")
 
 
-def test_without_depth_from_points(tmp_path, write_room):
+def test_depth_term_moves_gaussians_to_surfaces(tmp_path, room):
+    changes = {"initialization": "random", "surface_weight": 0.0, "iterations": 200}
+    without, found = (
+        fit(room, tmp_path / "scene", **changes, depth_weight=weight).means()["depth_mae_m"]
+        for weight in (0.0, 0.2)
+    )
+    assert 0 < found < 0.5 * without
+
+
+def test_without_depth_from_points(tmp_path):
     factors = np.where(np.arange(12) % 3 == 1, 0.8, 1.0)
-    brightness = {"brightness": lambda i, rho: np.full(1, factors[i])}
-    capture = read_capture(write_room(tmp_path / "dim", poses=POSES, **brightness))
+    dim = write_room_capture(
+        tmp_path / "dim", poses=POSES, brightness=lambda i, rho: np.full(1, factors[i])
+    )
+    capture, p_WQ, colors = read_capture(dim), [], []
     rows, columns = np.mgrid[2:48:4, 2:64:4]
-    p_WQ, colors = [], []
     for frame in capture.frames():
         p_CQ = frame.back_project(columns + 0.5, rows + 0.5, frame.depth[rows, columns])
         p_WQ.append(frame.X_WC.multiply(p_CQ.reshape(-1, 3).T).T)
@@ -137,7 +129,7 @@ def optimization(out, views, initial, fit_gains=False, **changes) -> Optimizatio
 
 
 def test_fitted_gains_leave_the_views_unchanged(tmp_path, room):
-    frames = list(read_capture(room).frames())
+    frames = list(room.frames())
     views = ReconstructionViews(frames, Photometry(np.ones(len(frames)), 0.0))
     points = gaussians_from_points(*random_points(frames, 500, 0.5, 4.0, seed=0))
     run = optimization(tmp_path / "scene", views, points, True, iterations=10, depth_weight=0.0)
@@ -170,20 +162,12 @@ def test_outline_weight_closes_holes_at_outlines(tmp_path):
 
 
 def test_scene_of_unknown_scale_cannot_be_flown_in(tmp_path, room):
-    capture = replace(read_capture(room), metric=False)
+    capture = replace(room, metric=False)
     summary = reconstruct(capture, tmp_path / "scene", replace(CONFIG, iterations=5))
     assert "cannot be flown in: its scale is unknown" in str(summary)
     assert "units of an unknown length" in str(summary) and "[m]" not in str(summary)
     with pytest.raises(ValueError, match=r"scene\.yaml: metric must be true to fly, got false"):
         read_scene(tmp_path / "scene")
-
-
-def test_initialization_that_the_capture_does_not_have(tmp_path, room):
-    with pytest.raises(
-        ValueError, match="number of points between its images must be at least 100"
-    ):
-        fit(read_capture(room), tmp_path / "scene", initialization="points")
-    assert not (tmp_path / "scene").exists()
 
 
 SMALL_K = torch.tensor([[[40.0, 0, 32], [0, 40, 24], [0, 0, 1]]])
@@ -192,23 +176,15 @@ VIEWMAT = torch.eye(4)[None]
 
 def three_gaussians(scales=(0.005, 0.5, 0.005), opacities=(0.9, 0.9, 0.9)) -> SplatParameters:
     means = [[-0.3, 0, 2.0], [0.3, 0, 2.0], [0.0, 0.3, 2.0]]
-    scene = GaussianScene.from_colors(
-        means,
-        np.tile([1.0, 0, 0, 0], (3, 1)),
-        np.repeat(scales, 3).reshape(3, 3),
-        opacities,
-        [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
-    )
+    sizes = np.repeat(scales, 3).reshape(3, 3)
+    scene = GaussianScene.from_colors(means, [[1.0, 0, 0, 0]] * 3, sizes, opacities, np.eye(3))
     return SplatParameters.of_scene(scene, 0, "cpu")
 
 
 def strategy_for(splats: SplatParameters, **changes) -> DefaultStrategy:
-    config = ReconstructConfig(
-        **{"strategy": "default", "iterations": 100, "refine_start": 1, "refine_every": 1}
-        | {"reset_every": 0, "refine_fraction": 1.0}
-        | changes
-    )
-    return DefaultStrategy(config, torch.zeros(3), 1.0, len(splats))
+    fields = {"strategy": "default", "iterations": 100, "refine_start": 1, "refine_every": 1}
+    fields |= {"reset_every": 0, "refine_fraction": 1.0}
+    return DefaultStrategy(ReconstructConfig(**fields | changes), torch.zeros(3), 1.0, len(splats))
 
 
 def test_large_gradients_double_small_gaussians_and_split_large_ones():
@@ -225,9 +201,7 @@ def test_large_gradients_double_small_gaussians_and_split_large_ones():
     distance = (means[parts] - large).norm(dim=1)
     assert (distance > 0).all() and (distance < 3).all()
     assert (splats.sh[parts] == splats.sh[parts[0]]).all()
-
-
-def test_only_the_strongest_grow_up_to_the_limit():
+    # Only the strongest grow up to the limit.
     splats = three_gaussians(scales=(0.005, 0.005, 0.005))
     strategy = strategy_for(splats, max_gaussians=4)
     strategy.gradients, strategy.counts = torch.tensor([1.0, 3.0, 2.0]), torch.ones(3)

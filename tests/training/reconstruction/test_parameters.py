@@ -22,25 +22,6 @@ MEANS = torch.tensor([[0.0, 0.0, 4.0], [0.0, 0.0, 6.0], [9.0, 0.0, 4.0], [0.0, 0
 N = 45  # not a multiple of any register
 
 
-@pytest.mark.parametrize("start", ["points", "depth"])
-def test_learning_rates(start):
-    first, middle, last = (
-        learning_rates(ReconstructConfig(initialization=start), 3.0, progress)
-        for progress in (0.0, 0.5, 1.0)
-    )
-    published = {"means": 3.0 * 1.6e-4, "quats": 1e-3, "log_scales": 5e-3}
-    published |= {"logit_opacities": 5e-2, "sh_0": 2.5e-3, "sh_rest": 1.25e-4}
-    assert first["means"] == pytest.approx(published.pop("means"))
-    assert last["means"] == pytest.approx(first["means"] / 100)
-    for name, rate in published.items():
-        if start == "points":
-            assert first[name] == last[name] == rate
-        else:  # fast at first and slow at last
-            assert first[name] >= rate
-            assert middle[name] == pytest.approx(0.55 * first[name])
-            assert last[name] == pytest.approx(0.1 * first[name])
-
-
 def shapes_and_gradients(dtype):
     generator = torch.Generator().manual_seed(3)
     log_scales = -6 + 4 * torch.randn(N, 3, generator=generator, dtype=torch.float64)
@@ -150,3 +131,22 @@ def test_adam_keeps_its_averages_of_rebuilt_and_restored_gaussians():
     assert torch.equal(restored["means"], splats["means"])
     assert torch.equal(splats["means"][:2], whole["means"][[2, 0]])
     assert not torch.equal(splats["means"][2], whole["means"][2])
+
+
+@pytest.mark.parametrize("start", ["points", "depth"])
+def test_learning_rates(start):
+    first, middle, last = (
+        learning_rates(ReconstructConfig(initialization=start), 3.0, progress)
+        for progress in (0.0, 0.5, 1.0)
+    )
+    published = {"means": 3.0 * 1.6e-4, "quats": 1e-3, "log_scales": 5e-3}
+    published |= {"logit_opacities": 5e-2, "sh_0": 2.5e-3, "sh_rest": 1.25e-4}
+    assert first["means"] == pytest.approx(published.pop("means"))
+    assert last["means"] == pytest.approx(first["means"] / 100)
+    for name, rate in published.items():
+        if start == "points":
+            assert first[name] == last[name] == rate
+        else:  # fast at first and slow at last
+            assert first[name] >= rate
+            assert middle[name] == pytest.approx(0.55 * first[name])
+            assert last[name] == pytest.approx(0.1 * first[name])

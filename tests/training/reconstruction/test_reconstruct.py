@@ -1,9 +1,12 @@
+import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import torch
+from room import write_room_capture
 
 from splatpilot.diagrams.worlds import splits
 from splatpilot.diagrams.worlds.scene_folder import read_scene, read_scene_metadata
@@ -17,28 +20,24 @@ from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.photometry import Photometry
 from splatpilot.training.reconstruction.reconstruct import reconstruct
 
-CONFIG = ReconstructConfig(iterations=0, voxel_size=0.1)
+CONFIG = ReconstructConfig(iterations=0, voxel_size=0.2)
 
 
-def image_digests(capture: Capture) -> set[str]:
-    return part_digests(capture.load_image(i).tobytes() for i in range(len(capture)))
-
-
-def test_room_end_to_end(tmp_path, write_room, room_in_W):
-    room = write_room(tmp_path / "room", width=128, height=96)
-    summary = reconstruct(read_capture(room), tmp_path / "scene", CONFIG)
+def test_room_end_to_end(tmp_path):
+    room = write_room_capture(tmp_path / "room", width=128, height=96)
+    fine = replace(CONFIG, voxel_size=0.1)
+    summary = reconstruct(read_capture(room), tmp_path / "scene", fine)
     assert f"Gaussians          {summary.gaussians}\n" in str(summary)
     size = " x ".join(f"{length:.3g}" for length in summary.field.upper_W - summary.field.lower_W)
     assert f"size               {size} m, from (" in str(summary)
-    world = read_scene(tmp_path / "scene")
-    metadata = read_scene_metadata(tmp_path / "scene")
+    world, metadata = read_scene(tmp_path / "scene"), read_scene_metadata(tmp_path / "scene")
     assert (world.name, metadata.frontier) == ("room", True)
     of_scene = read_ply(tmp_path / "scene" / "gaussians.ply")
     assert len(of_scene) == summary.gaussians < len(world.gaussians)
     assert "TartanAir V1" in metadata.provenance and len(metadata.gains) == 12
 
     # It collides like the room: 6 x 3 x 2.5 m, not all of it seen.
-    lower, upper = room_in_W
+    lower, upper = np.array([0.0, -1.5, 0.0]), np.array([6.0, 1.5, 2.5])
     assert 30 < metadata.observed_free_volume <= 6 * 3 * 2.5 * 1.05
     p_WQ = np.array([[2.0, 0.0, 1.2], [4.0, 0.3, 1.4]])
     truth = np.minimum(p_WQ - lower, upper - p_WQ).min(axis=-1)
@@ -51,12 +50,28 @@ def test_room_end_to_end(tmp_path, write_room, room_in_W):
     assert (np.minimum(ends - lower, upper - ends) > VEHICLE_RADIUS).all()
     assert (world.esdf.conservative().distance(ends) > VEHICLE_RADIUS).all()
 
-    assert_renders_like(tmp_path / "scene", room, range(12), min_psnr=28, max_error=0.04)
+    photometry = Photometry(np.array(metadata.gains), metadata.vignetting)
+    for i, frame in enumerate(read_capture(room).frames()):
+        view = world.baked.render(frame.K, 128, 96, frame.X_WC, background=world.background)
+        color = view.color * photometry.factor(i, 96, 128)[..., None]
+        psnr = -10 * np.log10(np.mean((color.clip(0, 1) - frame.image / 255) ** 2))
+        assert psnr > 28
+        assert np.median(np.abs(view.depth / frame.depth - 1)) < 0.04
+        assert view.alpha.mean() > 0.98
 
 
-@pytest.mark.parametrize("iterations", [0, 2])
-def test_images_are_read_once_on_one_thread(tmp_path, write_room, iterations):
-    capture = read_capture(write_room(tmp_path / "room"))
+@pytest.fixture(scope="module")
+def room(tmp_path_factory) -> Path:
+    return write_room_capture(tmp_path_factory.mktemp("room") / "P001")
+
+
+@pytest.fixture
+def capture(room) -> Capture:
+    return read_capture(room)
+
+
+@pytest.mark.parametrize(("iterations", "limit"), [(0, 5_000), (2, 100_000)])
+def test_images_are_read_once_on_one_thread(tmp_path, capture, iterations, limit):
     threads, read = torch.get_num_threads(), []
 
     def load_image(i: int) -> np.ndarray:
@@ -65,41 +80,25 @@ def test_images_are_read_once_on_one_thread(tmp_path, write_room, iterations):
 
     torch.set_num_threads(2)
     try:
-        config = replace(CONFIG, iterations=iterations)
-        reconstruct(replace(capture, load_image=load_image), tmp_path / "scene", config)
+        config = replace(CONFIG, iterations=iterations, max_gaussians=limit)
+        watched = replace(capture, load_image=load_image)
+        assert 0 < reconstruct(watched, tmp_path / "scene", config).gaussians <= limit
         assert torch.get_num_threads() == 2
     finally:
         torch.set_num_threads(threads)
     assert sorted(read) == [(i, 1) for i in range(len(capture))]
 
 
-def test_number_of_gaussians_is_limited(tmp_path, write_room):
-    capture = read_capture(write_room(tmp_path / "room"))
-    free = reconstruct(capture, tmp_path / "a", CONFIG).gaussians
-    limit = replace(CONFIG, max_gaussians=free // 3)
-    assert 0 < reconstruct(capture, tmp_path / "b", limit).gaussians <= free // 3
+def test_frames_without_depth_are_named_and_a_capture_without_any_leaves_nothing(tmp_path, capture):
+    def without_depth(*frames: int) -> Capture:
+        return replace(capture, load_depth=lambda i: (i not in frames) * capture.load_depth(i))
 
-
-def remove_depth(room, indices) -> None:
-    files = sorted((room / "depth_left").iterdir())
-    for i in indices:
-        np.save(files[i], np.zeros_like(np.load(files[i])))
-
-
-@pytest.mark.parametrize("iterations", [0, 2])
-def test_a_capture_without_any_depth_leaves_nothing(tmp_path, write_room, iterations):
-    room = write_room(tmp_path / "room")
-    remove_depth(room, range(12))
-    config = replace(CONFIG, iterations=iterations)
-    with pytest.raises(ValueError, match=r"no pixel of \d+ frames has a depth that a"):
-        reconstruct(read_capture(room), tmp_path / "scene", config)
-    assert list(tmp_path.iterdir()) == [room]
-
-
-def test_frames_without_depth_are_named(tmp_path, write_room):
-    room = write_room(tmp_path / "room")
-    remove_depth(room, (3, 4))
-    summary = reconstruct(read_capture(room), tmp_path / "scene", CONFIG)
+    for iterations in (0, 2):
+        config = replace(CONFIG, iterations=iterations)
+        with pytest.raises(ValueError, match=r"no pixel of \d+ frames has a depth that a"):
+            reconstruct(without_depth(*range(12)), tmp_path / "scene", config)
+        assert not list(tmp_path.iterdir())
+    summary = reconstruct(without_depth(3, 4), tmp_path / "scene", CONFIG)
     names = "000003_left.png, 000004_left.png"
     assert f"2 of 12 frames have no pixel with depth: {names}" in summary.warnings
 
@@ -113,46 +112,29 @@ def test_frames_without_depth_are_named(tmp_path, write_room):
         ({"max_range": 0.2, "voxel_size": 0.2}, r"max_range must be above voxel_size 0\.2 m"),
     ],
 )
-def test_invalid_config(tmp_path, write_room, change, message):
-    room = write_room(tmp_path / "room")
+def test_invalid_config(tmp_path, capture, change, message):
     with pytest.raises(ValueError, match=message):
-        reconstruct(read_capture(room), tmp_path / "scene", replace(CONFIG, **change))
+        reconstruct(capture, tmp_path / "scene", replace(CONFIG, **change))
     assert not (tmp_path / "scene").exists()
 
 
 @pytest.mark.parametrize("split", ["", "validation"])
-def test_scene_has_the_split_and_digest_of_its_capture(tmp_path, write_room, split):
-    room = write_room(tmp_path / "hospital")
-    reconstruct(read_capture(room), tmp_path / "scene", replace(CONFIG, split=split))
-    metadata = read_scene_metadata(tmp_path / "scene")
+def test_scene_has_the_split_and_digest_of_its_capture(tmp_path, room, capture, monkeypatch, split):
+    scene = tmp_path / "scene"
+    reconstruct(capture, scene, replace(CONFIG, split=split))
+    metadata = read_scene_metadata(scene)
     assert metadata.split == (split or "train") and len(metadata.source_digest) == 8
-    for image in (room / "image_left").iterdir():  # the same pixels in another file format
-        pixels = cv2.imread(str(image))
-        image.unlink()
-        cv2.imwrite(str(image), pixels, [cv2.IMWRITE_PNG_COMPRESSION, 0])
-    renamed = read_capture(room.rename(tmp_path / "P001"))
-    assert set(metadata.source_digest) <= image_digests(renamed)
+    copy = shutil.copytree(room, tmp_path / "renamed")
+    for image in (copy / "image_left").iterdir():  # the same pixels in another file format
+        cv2.imwrite(str(image), cv2.imread(str(image)), [cv2.IMWRITE_PNG_COMPRESSION, 0])
+    renamed = read_capture(copy)
+    digests = part_digests(renamed.load_image(i).tobytes() for i in range(12))
+    assert set(metadata.source_digest) <= digests
 
-
-def test_renamed_copy_of_a_test_capture_is_of_split_test(tmp_path, write_room, monkeypatch):
-    room = read_capture(write_room(tmp_path / "P001"))
-    tested = {"hospital": source_digest(image_digests(room))}
-    monkeypatch.setattr(splits, "load_test_sources", lambda: tested)
-    reconstruct(room, tmp_path / "scene", CONFIG)
-    assert read_scene_metadata(tmp_path / "scene").split == "test"
-    with pytest.raises(ValueError, match="must be test, got train; it shows hospital"):
-        reconstruct(room, tmp_path / "scene", replace(CONFIG, split="train"))
-
-
-def assert_renders_like(scene, capture, frames, min_psnr: float, max_error: float) -> None:
-    world, metadata = read_scene(scene), read_scene_metadata(scene)
-    photometry = Photometry(np.array(metadata.gains), metadata.vignetting)
-    for i in frames:
-        frame = read_capture(capture).frame(i)
-        height, width = frame.depth.shape
-        view = world.baked.render(frame.K, width, height, frame.X_WC, background=world.background)
-        color = view.color * photometry.factor(i, height, width)[..., None]
-        psnr = -10 * np.log10(np.mean((color.clip(0, 1) - frame.image / 255) ** 2))
-        assert psnr > min_psnr
-        assert np.median(np.abs(view.depth / frame.depth - 1)) < max_error
-        assert view.alpha.mean() > 0.98
+    monkeypatch.setattr(splits, "load_test_sources", lambda: {"hospital": source_digest(digests)})
+    if split:
+        with pytest.raises(ValueError, match=f"must be test, got {split}; it shows hospital"):
+            reconstruct(renamed, tmp_path / "other", replace(CONFIG, split=split))
+    else:
+        reconstruct(renamed, tmp_path / "other", CONFIG)
+        assert read_scene_metadata(tmp_path / "other").split == "test"

@@ -21,20 +21,7 @@ KINDS = {
 
 @pytest.fixture(scope="module")
 def world() -> World:
-    return make_world(ForestConfig(), seed=0)
-
-
-def _inside(world: World) -> np.ndarray:
-    """Centers (N, 3) of the Gaussians in the flyable volume."""
-    p = world.gaussians.means.astype(float)
-    lower, upper = world.distance_field.lower_W, world.distance_field.upper_W
-    return p[((p >= lower) & (p <= upper)).all(axis=1)]
-
-
-def _shapes(world: World) -> tuple:
-    """What can be hit."""
-    assert isinstance(world.distance_field, AnalyticDistanceField)
-    return world.distance_field.shapes
+    return make_world(ForestConfig(length=18.0, width=12.0), seed=0)
 
 
 def _layout(config: ForestConfig, seed: int):
@@ -49,8 +36,9 @@ def _layout(config: ForestConfig, seed: int):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_trunks_are_as_far_apart_and_as_thick_as_configured(kind):
+def test_trunks_are_as_configured_and_let_the_vehicle_through_at_every_height(kind):
     config = KINDS[kind]
+    assert config.narrowest >= PASSAGE
     for seed in range(2):
         trees = _layout(config, seed)[0].trees
         assert pdist(trees.base).min() >= config.spacing
@@ -58,22 +46,17 @@ def test_trunks_are_as_far_apart_and_as_thick_as_configured(kind):
         assert config.radius_max - 0.03 < trees.radius.max() <= config.radius_max
         tilt = np.rad2deg(np.arctan(np.linalg.norm(trees.lean, axis=1)))
         assert tilt.max() <= config.lean_max
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_gaps_between_trunks_let_the_vehicle_through_at_every_height(kind):
-    config = KINDS[kind]
-    assert config.narrowest >= PASSAGE
-    trees = _layout(config, seed=1)[0].trees
-    radii = trees.radius[:, None] + trees.radius - np.diag(np.full(len(trees), np.inf))
-    for z in np.linspace(0, config.height, 7):
-        axes = trees.at(z)
-        gap = np.linalg.norm(axes[:, None] - axes, axis=-1) - radii
-        assert gap.min() >= config.narrowest
+        radii = trees.radius[:, None] + trees.radius - np.diag(np.full(len(trees), np.inf))
+        for z in np.linspace(0, config.height, 7):
+            axes = trees.at(z)
+            gap = np.linalg.norm(axes[:, None] - axes, axis=-1) - radii
+            assert gap.min() >= config.narrowest
 
 
 def test_everything_drawn_in_the_volume_is_solid(world):
-    distance = np.abs(world.distance_field.distance(_inside(world)))
+    p, field = world.gaussians.means.astype(float), world.distance_field
+    inside = ((p >= field.lower_W) & (p <= field.upper_W)).all(axis=1)
+    distance = np.abs(field.distance(p[inside]))
     assert distance.max() < 0.07
     assert np.quantile(distance, 0.95) < 0.04
 
@@ -83,32 +66,29 @@ def test_leaves_around_the_volume_stay_out_of_it(world):
     p = scene.means.astype(float)
     beyond = np.linalg.norm(p - np.clip(p, field.lower_W, field.upper_W), axis=1)
     solid = p[:, 2] < 0.1  # ground and litter
-    for shape in _shapes(world):
+    for shape in field.shapes:
         if isinstance(shape, (Capsule, Sphere)):
             solid |= np.abs(ShapeUnion.of([shape]).distance(p)) < 0.15
     reach = 3 * scene.scales.max(axis=1)
     leaves = (beyond > 0) & ~solid
-    assert leaves.sum() > 10_000
+    assert leaves.sum() > 5_000
     assert (reach <= beyond + 0.1)[leaves].all()
 
 
 def test_every_solid_is_drawn(world):
-    p = world.gaussians.means.astype(float)
-    field = world.distance_field
+    p, field = world.gaussians.means.astype(float), world.distance_field
     seen = 0
-    for shape in _shapes(world):
-        if isinstance(shape, Capsule):
-            center = (np.asarray(shape.p_WA) + np.asarray(shape.p_WB)) / 2
-        elif isinstance(shape, Sphere):
-            center = np.asarray(shape.p_WO)
-        else:
+    for shape in field.shapes:
+        if not isinstance(shape, (Capsule, Sphere)):
             continue
+        ends = [shape.p_WO] if isinstance(shape, Sphere) else [shape.p_WA, shape.p_WB]
+        center = np.mean(ends, axis=0)
         if ((center < field.lower_W) | (center > field.upper_W))[:2].any():
             continue
         on_it = np.abs(ShapeUnion.of([shape]).distance(p)) < 0.03
         assert on_it.sum() > 40
         seen += 1
-    assert seen > 30
+    assert seen > 15
 
 
 def test_trees_left_out_of_the_field_are_never_the_nearest():

@@ -1,6 +1,7 @@
 import itertools
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -9,30 +10,24 @@ from splatpilot.diagrams.worlds.solids import surfaces
 P_A, P_B = np.array([1.0, 2.0, -0.5]), np.array([1.4, 1.8, 4.0])
 
 
+AXIS = (P_B - P_A) / np.linalg.norm(P_B - P_A)
+
+
 def _tube(taper=1.0) -> surfaces.Surfels:
     return surfaces.tube(P_A, P_B, 0.4, (0.1, 0.2), np.random.default_rng(0), taper)
 
 
-def _along_and_radial(p: NDArray) -> tuple[NDArray, NDArray]:
-    axis = (P_B - P_A) / np.linalg.norm(P_B - P_A)
-    along = (p - P_A) @ axis
-    return along, p - P_A - np.outer(along, axis)
-
-
-def test_patches_of_a_tube_lie_on_the_cylinder():
-    surfels = _tube()
-    along, radial = _along_and_radial(surfels.p)
-    length = np.linalg.norm(P_B - P_A)
-    np.testing.assert_allclose(np.linalg.norm(radial, axis=1), 0.4, atol=1e-12)
+@pytest.mark.parametrize("taper", [1.0, 0.25])
+def test_patches_of_a_tube_lie_on_the_cylinder_or_cone(taper):
+    surfels = _tube(taper)
+    along, length = (surfels.p - P_A) @ AXIS, np.linalg.norm(P_B - P_A)
     assert along.min() >= -1e-12 and along.max() <= length + 1e-12
-    np.testing.assert_allclose(surfels.n, radial / 0.4, atol=1e-12)
-    np.testing.assert_allclose(surfels.t, np.tile((P_B - P_A) / length, (len(surfels), 1)))
-
-
-def test_a_tapered_tube_narrows_linearly():
-    along, radial = _along_and_radial(_tube(taper=0.25).p)
-    expected = 0.4 * (1 - 0.75 * along / np.linalg.norm(P_B - P_A))
-    np.testing.assert_allclose(np.linalg.norm(radial, axis=1), expected, atol=1e-12)
+    radial = surfels.p - P_A - np.outer(along, AXIS)
+    radii = 0.4 * (1 - (1 - taper) * along / length)
+    np.testing.assert_allclose(np.linalg.norm(radial, axis=1), radii, atol=1e-12)
+    if taper == 1.0:
+        np.testing.assert_allclose(surfels.n, radial / 0.4, atol=1e-12)
+        np.testing.assert_allclose(surfels.t, np.tile(AXIS, (len(surfels), 1)))
 
 
 def test_patches_of_a_sphere_lie_on_it():
@@ -54,9 +49,8 @@ def _transmittance(surfels: surfaces.Surfels, p: NDArray, n: NDArray) -> NDArray
 def test_layers_have_no_holes():
     rng = np.random.default_rng(1)
     angle, s = rng.uniform(0, 2 * np.pi, 300), rng.uniform(0.1, 0.9, 300)
-    axis = (P_B - P_A) / np.linalg.norm(P_B - P_A)
-    e_1 = np.cross(axis, (0, 1, 0)) / np.linalg.norm(np.cross(axis, (0, 1, 0)))
-    n = np.outer(np.cos(angle), e_1) + np.outer(np.sin(angle), np.cross(axis, e_1))
+    e_1 = np.cross(AXIS, (0, 1, 0)) / np.linalg.norm(np.cross(AXIS, (0, 1, 0)))
+    n = np.outer(np.cos(angle), e_1) + np.outer(np.sin(angle), np.cross(AXIS, e_1))
     p = P_A + np.outer(s, P_B - P_A) + 0.4 * n
     assert _transmittance(_tube(), p, n).max() < 0.2
     assert _transmittance(_tube(), p, n).mean() < 0.05

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from splatpilot.diagrams.worlds import octomap_world as module
-from splatpilot.diagrams.worlds.octomap_world import OctomapConfig, octomap_world, voxel_gaussians
+from splatpilot.diagrams.worlds import file_worlds as module
+from splatpilot.diagrams.worlds.file_worlds import OctomapConfig, octomap_world, voxel_gaussians
 from splatpilot.diagrams.worlds.scene_folder import SceneConfig
 from splatpilot.diagrams.worlds.solids.textures import Daylight
 from splatpilot.diagrams.worlds.world_registry import scene_config
@@ -46,24 +46,16 @@ def test_large_maps_are_cropped_about_free_space(in_map, monkeypatch, caplog):
     np.testing.assert_allclose(named.esdf.upper_W, [10, 10, 4])
 
 
-def test_short_routes_are_warned_of(in_map, caplog):
+def test_routes_are_as_long_as_the_scenario_says_and_short_ones_are_warned_of(in_map, caplog):
     in_map(hall(24, 12))
     assert "map.bt: the longest route from a start to a goal is" in caplog.text
-
-
-def test_drawn_ends_are_as_far_apart_as_the_scenario_says(in_map):
     in_map(hall(40, 20), draw_ends=True, min_path=6.0)
     with pytest.raises(InfeasibleFlightError, match="at least 30 m, got"):
         in_map(hall(40, 20), draw_ends=True, min_path=30.0)
-
-
-def test_maps_without_free_space_are_refused(in_map):
-    octomap = hall(20, 20)
-    octomap.occupied[:] = True
-    with pytest.raises(
-        InfeasibleFlightError, match=r"map\.bt: no space from .* is known to be free"
-    ):
-        in_map(octomap)
+    full = hall(20, 20)
+    full.occupied[:] = True
+    with pytest.raises(InfeasibleFlightError, match=r"map\.bt: no space from .* known to be free"):
+        in_map(full)
 
 
 def test_suffixes_tell_scenes_from_maps(tmp_path):
