@@ -116,7 +116,7 @@ class FlightParts(NamedTuple):
     collision: System  #: `EsdfCollision`.
     camera: SplatCamera | None  #: Scenario's camera; policies see `policy_camera`.
     geometry: QuadrotorGeometry | None  #: Vehicle in the SceneGraph.
-    monitor: FlightMonitor  #: What ends the flight.
+    monitor: FlightMonitor  #: Ends the flight.
     state: OutputPort  #: (13), the true state.
     pose: OutputPort  #: The true X_WB.
     goal: OutputPort  #: (3) p_WG [m].

@@ -406,7 +406,7 @@ def random_flights(
     Args:
         scenario: of the flights; each replaces its seed.
         world: of all flights; by default made of each seed, which is slow.
-        build: builds the diagram of each flight; by default `BuildFlightDiagram` without camera.
+        build: builds the diagram of each flight, instead of `BuildFlightDiagram` without camera.
         systems: arguments of `BuildFlightDiagram` such as `policy="velocity"`; functions of
             scenario and world make a system for each flight.
 
@@ -414,6 +414,7 @@ def random_flights(
         The `make_simulator` of these functions, which raises `InfeasibleFlightError` for a world
         without clearance at its start or goal.
     """
+    require(build is None or not systems, "build", "without other systems", ", ".join(systems))
 
     def make_simulator(generator: RandomGenerator) -> Simulator:
         seed = MONTE_CARLO_SEEDS[generator() % len(MONTE_CARLO_SEEDS)]

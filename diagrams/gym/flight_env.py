@@ -37,7 +37,6 @@ from splatpilot.diagrams.flight.scenario import (
 )
 from splatpilot.diagrams.gym.spaces import (
     IMAGES,
-    OBSERVATIONS,
     TERMINATED,
     Transition,
     Vehicles,
@@ -121,11 +120,8 @@ class FlightEnv(gymnasium.Env):
         world = self._find_world(self.config.scenario)
         self._take(self._find_flight(self.config.scenario, world))
         ports = self.parts.measured
-        for name in self._names():
-            known = [*OBSERVATIONS, *ports]
-            require(name in known, "observation", f"one of {', '.join(known)}", repr(name))
         self._spaces = {n: _port_space(ports[n]) for n in self._names() if n in ports}
-        self.observation_space = observation_space(self.config, self._spaces)
+        self.observation_space = observation_space(self.config, self._spaces, ports)
         self.action_space = action_space(self.config)
 
     def _names(self) -> list[str]:

@@ -77,11 +77,11 @@ class Sb3FlightEnv(VecEnv):
         return [getattr(self.envs, attr_name)] * len(self._rows(indices))
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Refuses attributes: make the environments with other arguments."""
+        """Refuses attributes, which the environments take as arguments alone."""
         raise ValueError(f"{attr_name} must be an argument of Sb3FlightEnv, got it by set_attr")
 
     def set_options(self, options: Any = None) -> None:
-        """Refuses options but none: flights of this trainer begin without a reset."""
+        """Refuses options, since flights begin without a reset of the trainer."""
         require(not options, "options", "left out; use FlightEnv or VectorFlightEnv", options)
 
     def env_method(self, method_name: str, *args: Any, indices: Any = None, **options: Any) -> list:

@@ -3,7 +3,7 @@
 The heading frame H has its origin in the vehicle, z up and x above the body's x axis.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
@@ -126,19 +126,22 @@ OBSERVATIONS = (*_BOUNDS, *IMAGES)
 
 
 def observation_space(
-    config: "FlightEnvConfig", sensors: Mapping[str, Space[Any]] | None = None
+    config: "FlightEnvConfig",
+    sensors: Mapping[str, Space[Any]] | None = None,
+    outputs: Collection[str] = (),
 ) -> Space[Any]:
     """Returns the space of one vehicle's observation: a Dict, or a Box if `observation` is a name.
 
     Args:
-        sensors: spaces of the outputs of sensors by name, such as `imu_accelerometer`.
+        sensors: spaces of the observed outputs of sensors by name, such as `imu_accelerometer`.
+        outputs: names of all outputs of sensors, if they are known.
     """
     sensors = sensors or {}
     names = config.observation_names()
     for name in names:
-        known = [*OBSERVATIONS, *sensors]
-        condition = f"one of {', '.join(known)}, or an output of the scenario's sensors"
-        require(name in known, "observation", condition, repr(name))
+        known = [*OBSERVATIONS, *outputs]
+        others = "" if outputs else ", or in FlightEnv an output of the scenario's sensors"
+        require(name in known, "observation", f"one of {', '.join(known)}{others}", repr(name))
     spaces = {name: sensors.get(name) or _space(name, config.camera) for name in names}
     return spaces[names[0]] if isinstance(config.observation, str) else Dict(spaces)
 

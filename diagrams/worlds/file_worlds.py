@@ -10,7 +10,6 @@ from scipy.ndimage import binary_dilation, gaussian_filter, map_coordinates
 
 from splatpilot.diagrams.worlds.feasibility import SHORTEST, choose_ends
 from splatpilot.diagrams.worlds.scene_folder import SceneSource, find_scene
-from splatpilot.diagrams.worlds.solids import surfaces
 from splatpilot.diagrams.worlds.solids.surfaces import (
     COVERAGE,
     Surfels,
@@ -114,9 +113,9 @@ def voxel_gaussians(esdf: Esdf, hour: Daylight) -> GaussianScene:
     albedo = albedo * (0.75 + 0.5 * hash_unit(index, seed=302))[:, None]
     colors = develop(albedo**GAMMA * hour.irradiance(n, np.full(len(p), 0.7)))
     # Voxels of a slanted surface are up to sqrt 3 apart: 1.3 times the closed layer's size.
-    extent = np.full((len(p), 2), 1.3 * surfaces.COVERAGE * esdf.voxel_size)
-    surfels = surfaces.Surfels(p, n, surfaces.perpendicular(n), extent)
-    return surfaces.to_gaussians(surfels, colors, 0.99)
+    extent = np.full((len(p), 2), 1.3 * COVERAGE * esdf.voxel_size)
+    surfels = Surfels(p, n, perpendicular(n), extent)
+    return to_gaussians(surfels, colors, 0.99)
 
 
 _PREVIEW = 120_000  # number of Gaussians that show the mesh on pages

@@ -1,4 +1,4 @@
-"""Reading and writing of configurations: dataclasses that YAML files and the command line set.
+"""Configurations: dataclasses that YAML files and the command line set, and their descriptions.
 
 Drake's `yaml_load_typed` and `yaml_dump_typed` do the work. `load_config` adds overrides of single
 fields and messages that name the field and its likely spelling.

@@ -1,4 +1,5 @@
-"""The training loop: any trainer, resumable, with a record next to the weights."""
+"""The training loop: any trainer, resumable, with a record next to the weights; and the trainers by
+the names of their policies."""
 
 import json
 import time
