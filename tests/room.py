@@ -3,6 +3,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from pydrake.math import RigidTransform, RotationMatrix
+
+from splatpilot.training.captures.capture import OPTICAL_AXES, Capture, pinhole
 
 # The inside of a box [m], in north-east-down: 6 m north, 3 m east, 2.5 m high, floor at z = 0.
 LOWER_N = np.array([0.0, -1.5, -2.5])
@@ -86,3 +89,18 @@ def write_room_capture(
         lines.append(" ".join(f"{x:.9f}" for x in (*p_N, *xyzw)))
     (path / "pose_left.txt").write_text("\n".join(lines) + "\n")
     return path
+
+
+def tiled_flight(turn: float = 1.0, aside: float = 1.0) -> Capture:
+    """A flight along the tiled room, in images of 320x240 px without depth."""
+    K, poses, images = pinhole(160, 160, 160, 120), [], []
+    R_WN = RotationMatrix(np.diag([1.0, -1, -1]))
+    R_BC = RotationMatrix(np.array([[0, 0, 1.0], [1, 0, 0], [0, 1, 0]]))
+    for i in range(8):
+        R_NB, _ = rotation_from_yaw_pitch(0.3 * turn * np.sin(i), 0.1 * turn * np.cos(2 * i))
+        y, z = 0.4 * aside * np.sin(1.3 * i), -1.2 + 0.2 * aside * np.cos(i)
+        p_N = np.array([0.5 + 0.15 * i, y, z])
+        image = trace_room(p_N, R_NB, 320, 240, tiled_color)[1]
+        images.append((255 * image).astype(np.uint8))
+        poses.append(RigidTransform(R_WN @ RotationMatrix(R_NB) @ R_BC, R_WN.multiply(p_N)))
+    return Capture("flight", "a flight", K, 320, 240, poses, lambda i: images[i], axes=OPTICAL_AXES)

@@ -62,7 +62,7 @@ class CaptureConfig(Config):
     """Capture format: a name in `splatpilot.training.captures.capture_registry.CAPTURES`, or
     `module:attribute` of a `CaptureFormat`; empty: recognized by the files."""
     intrinsics: list[float] = bounded(list, "(-inf, inf) px")
-    """fx, fy, cx, cy [px] of the color camera."""
+    """fx, fy, cx, cy [px] of the color camera, which the registration of photographs keeps."""
     depth_intrinsics: list[float] = bounded(list, "(-inf, inf) px")
     """fx, fy, cx, cy [px] of a depth camera other than the color camera."""
     p_DC: list[float] = bounded(list, "(-inf, inf) m")
@@ -129,8 +129,8 @@ def complete_config(path: Path, config: CaptureConfig | None) -> CaptureConfig:
 
 
 def cache_folder(config: CaptureConfig, *parts: str) -> Path:
-    """Returns `config.cache` or, without it, a folder in the user's cache."""
-    return Path(config.cache) if config.cache else files.cache_folder(*parts)
+    """Returns a folder in `config.cache` or, without it, in the user's cache."""
+    return Path(config.cache, *parts) if config.cache else files.cache_folder(*parts)
 
 
 def cache_key(paths: Iterable[Path], *others: object) -> str:

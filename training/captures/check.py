@@ -51,6 +51,7 @@ _DEPTH_POINTS = 5000  # approximate number of pixels per image whose depth is co
 # The same of epipolar errors, in focal lengths.
 _EPIPOLAR_TOLERANCE, _EPIPOLAR_NEGLIGIBLE = 0.01, 0.002
 _MIN_BEFORE = 0.5  # fraction of points that must lie before both cameras for a reading to count
+_ZOOMS = (0.75, 4 / 3)  # other focal lengths that frames must tell from the right one
 
 # The same of colors, whose error is 1 - their correlation between frames: 0.02 to 0.04 in captures
 # of real cameras, and 0.11 if one is wrongly read as registered.
@@ -129,6 +130,7 @@ class CheckReport:
     others: tuple[ReadingFit, ...] = ()  # other readings, the best first
     color: ColorFit | None = None
     problem: str = ""  # the most likely error in one sentence; empty if none was found
+    undetermined: str = ""  # what the frames leave open, and the remedy; empty if nothing
 
     @property
     def agrees(self) -> bool:
@@ -156,6 +158,7 @@ class CheckReport:
         ]
         if self.color is not None:
             lines += ["color against depth, 1 - correlation between frames:", str(self.color)]
+        lines += [self.undetermined] if self.undetermined else []
         lines.append("does not agree" if self.problem else "agrees")
         return "\n".join(lines)
 
@@ -177,14 +180,16 @@ def run(*, capture: str | Path, config: CheckConfig) -> CheckReport:
 
 
 def doubts(capture: Capture) -> tuple[str, ...]:
-    """Returns the error that `check_capture` finds, if any, as a warning."""
+    """Returns the error that `check_capture` finds, and what it leaves open, as warnings."""
     try:
-        problem = check_capture(capture).problem
+        report = check_capture(capture)
     except ValueError as error:
         return (f"not checked whether the capture agrees with itself: {error}",)
-    if not problem:
-        return ()
-    return (f"the capture does not agree with itself, {problem}; see `splatpilot capture check`",)
+    found = (report.undetermined,) if report.undetermined else ()
+    if report.problem:
+        what = f"the capture does not agree with itself, {report.problem}"
+        found = f"{what}; see `splatpilot capture check`", *found
+    return found
 
 
 def check_capture(capture: Capture, pairs: int = 12) -> CheckReport:
@@ -278,7 +283,18 @@ def _check_features(capture: Capture, pairs: int) -> CheckReport:
             f"{best.name}, leaves {best.error:.1%}); poses may be inaccurate, or things may have "
             "moved"
         )
-    return CheckReport(capture, len(matched), agreement, tuple(others), None, problem)
+    # Along the optical axis any focal length fits, if distances along it grow alike.
+    zoomed = [replace(as_read, K=as_read.K @ np.diag([zoom, zoom, 1.0])) for zoom in _ZOOMS]
+    other = min(zoomed, key=lambda reading: measure(reading).error)
+    undetermined, focal = "", as_read.K[0, 0]
+    if measure(other).error < max(2.0 * agreement.error, _EPIPOLAR_NEGLIGIBLE):
+        angle = 2.0 * np.degrees(np.arctan2(capture.width / 2, focal))
+        undetermined = (
+            f"these frames do not tell the focal length: {other.K[0, 0]:.0f} px fits about as well "
+            f"as {focal:.0f} px, a field of view of {angle:.0f} degrees; film turns and motion to "
+            "the side, too, or set capture.intrinsics"
+        )
+    return CheckReport(capture, len(matched), agreement, tuple(others), None, problem, undetermined)
 
 
 def _choose_pairs(capture: Capture, count: int) -> list[FramePair]:

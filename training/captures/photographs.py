@@ -62,7 +62,7 @@ def image_files(path: Path) -> list[Path]:
 
 def read_photographs(path: Path, config: CaptureConfig) -> Capture:
     """Opens photographs without poses, registered by pycolmap; the cache keeps the registration. At
-    least three, and half of them, must be registered."""
+    least three, and half of them, must be registered. Registration keeps `config.intrinsics`."""
     files, dropped = [], []
     if poses := [name for name in _POSES if (path / name).exists()]:
         if config.kind != "photographs":
@@ -95,10 +95,10 @@ def read_photographs(path: Path, config: CaptureConfig) -> Capture:
     names = [file.name for file in files]
     masks = sorted(file for file in mask_folder(folder).rglob("*") if file.is_file())
     version = import_pycolmap().__version__
-    key = cache_key([*files, *masks], version, _MAX_SIZE, _SEED, config.partners)
+    key = cache_key([*files, *masks], version, _MAX_SIZE, _SEED, config.partners, config.intrinsics)
 
     def register(written: Path) -> None:
-        work = folder, names, _one_camera(files), config.partners, written
+        work = folder, names, _one_camera(files), config, written
         kept = "nothing is kept of the registration; the same command starts again"
         with resumable(lambda: kept):
             run_in_subprocess(f"{path}: registration", _register, work)
@@ -130,11 +130,11 @@ def _one_camera(files: list[Path]) -> bool:
     return len(cameras) == 1
 
 
-def _register(work: tuple[Path, list[str], bool, int, Path]) -> None:
+def _register(work: tuple[Path, list[str], bool, CaptureConfig, Path]) -> None:
     """Writes the largest model of a folder's images, for `work`: the folder, names of images, true
-    for one camera, partners, and the folder to write. Seeds are fixed and images are numbered in
-    order, so that threads do not change the result."""
-    folder, names, is_one_camera, partners, written = work
+    for one camera, and the folder to write. Seeds are fixed and images are numbered in order, so
+    that threads do not change the result."""
+    folder, names, is_one_camera, config, written = work
     temporary = written / "work"
     temporary.mkdir()
     pycolmap = import_pycolmap()
@@ -143,12 +143,15 @@ def _register(work: tuple[Path, list[str], bool, int, Path]) -> None:
     database = temporary / "database.db"
     mode = pycolmap.CameraMode.SINGLE if is_one_camera else pycolmap.CameraMode.AUTO
     pycolmap.Database.open(database).close()
-    pycolmap.import_images(database, folder, mode, names)
+    reader = pycolmap.ImageReaderOptions()
+    if config.intrinsics:
+        reader.camera_model = "PINHOLE"
+        reader.camera_params = ",".join(map(str, config.intrinsics))
+    pycolmap.import_images(database, folder, mode, names, reader)
     extraction = pycolmap.FeatureExtractionOptions(max_image_size=_MAX_SIZE, use_gpu=False)
     # Enlarging the image first finds more in small ones and takes four times as long.
     small = max(max(image_size(folder / name)) for name in names) < _SMALL
     extraction.sift.first_octave = -1 if small else 0
-    reader = pycolmap.ImageReaderOptions()
     if (masks := mask_folder(folder)).is_dir():
         reader.mask_path = masks
     for some in _batches(names, available_cores(), "extracting features", "photo"):
@@ -157,7 +160,7 @@ def _register(work: tuple[Path, list[str], bool, int, Path]) -> None:
         )
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = _SEED
-    pairs, listed = _pairs(database, names, partners), temporary / "pairs.txt"
+    pairs, listed = _pairs(database, names, config.partners), temporary / "pairs.txt"
     for some in _batches(pairs, max(1, len(pairs) // 20), "matching pairs", "pair"):
         listed.write_text("".join(f"{names[a]} {names[b]}\n" for a, b in some))
         pycolmap.match_image_pairs(
@@ -170,6 +173,8 @@ def _register(work: tuple[Path, list[str], bool, int, Path]) -> None:
     options.mapper.random_seed = options.triangulation.random_seed = _SEED
     options.mapper.num_threads = 1
     options.min_model_size = min(options.min_model_size, len(names))
+    is_known = bool(config.intrinsics)
+    options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = not is_known
     with Progress(total=len(names), desc="registering photographs", unit="photo") as progress:
         models = pycolmap.incremental_mapping(
             database,

@@ -120,7 +120,7 @@ def test_cache_folder_is_made_where_it_can_be_written(tmp_path, monkeypatch):
     here, default = capture_config.CaptureConfig(cache="here"), capture_config.CaptureConfig()
     folder = capture_config.cache_folder
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert folder(here, "bags", "a") == Path("here")
+    assert folder(here, "bags", "a") == Path("here/bags/a")
     assert folder(default, "bags", "a") == tmp_path / "splatpilot/bags/a"
     monkeypatch.delenv("XDG_CACHE_HOME")
     assert folder(default, "bags") == Path.home() / ".cache/splatpilot/bags"

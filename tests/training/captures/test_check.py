@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform, RotationMatrix
-from room import rotation_from_yaw_pitch, tiled_color, trace_room, write_room_capture
+from room import tiled_flight, write_room_capture
 
 from splatpilot.analysis.commands.main import main
 from splatpilot.training.captures.capture import (
     OPENGL_AXES,
-    OPTICAL_AXES,
     Capture,
     DepthCamera,
     FileAxes,
@@ -168,16 +167,7 @@ def test_without_depth_and_features_nothing_is_compared(room):
 
 @pytest.fixture(scope="module")
 def flight() -> Capture:
-    """A flight along a tiled room, in images of 320x240 px without depth."""
-    K, poses, images = pinhole(160, 160, 160, 120), [], []
-    R_WN = RotationMatrix(np.diag([1.0, -1, -1]))
-    for i in range(8):
-        R_NB, _ = rotation_from_yaw_pitch(0.3 * np.sin(i), 0.1 * np.cos(2 * i))
-        p_N = np.array([0.5 + 0.15 * i, 0.4 * np.sin(1.3 * i), -1.2 + 0.2 * np.cos(i)])
-        images.append((255 * trace_room(p_N, R_NB, 320, 240, tiled_color)[1]).astype(np.uint8))
-        R_WC = R_WN @ RotationMatrix(R_NB) @ NED
-        poses.append(RigidTransform(R_WC, R_WN.multiply(p_N)))
-    return Capture("flight", "a flight", K, 320, 240, poses, lambda i: images[i], axes=OPTICAL_AXES)
+    return tiled_flight()
 
 
 def distorted(image: np.ndarray, K: np.ndarray, k1: float) -> np.ndarray:
@@ -205,6 +195,17 @@ def test_features_without_depth_tell_errors_apart(flight, change, problem):
     report = check_capture(replace(flight, **change(flight)))
     assert report.agreement is not None and report.agrees == (not problem), report
     assert re.match(problem, report.problem), report.problem
+
+
+def test_flight_along_the_optical_axis_leaves_the_focal_length_open(flight):
+    assert doubts(flight) == ()
+    forward = tiled_flight(turn=0.0, aside=0.0)
+    for focal, angle in ((160, 90), (960, 19)):
+        report = check_capture(replace(forward, K=pinhole(focal, focal, 160, 120)))
+        said = f"px fits about as well as {focal} px, a field of view of {angle} degrees"
+        assert report.agrees and said in report.undetermined and said in str(report)
+    [doubt] = doubts(forward)
+    assert doubt.endswith("or set capture.intrinsics")
 
 
 def test_command(tmp_path, capsys):

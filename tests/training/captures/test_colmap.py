@@ -8,6 +8,7 @@ import pycolmap
 import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 
+from splatpilot.training.captures import photographs
 from splatpilot.training.captures.capture import Capture, SfmPoints
 from splatpilot.training.captures.capture_config import CaptureConfig, ScaleConfig
 from splatpilot.training.captures.capture_registry import read_capture
@@ -251,13 +252,12 @@ def test_missing_and_damaged_parts_are_refused(model):
         read_capture(model)
 
 
-def test_photographs_are_registered_once(model, tmp_path):
-    cache = tmp_path / "cache"
-    cache.mkdir()
-    (model / "sparse/0").rename(cache / "model")
+def test_photographs_are_registered_once(model, tmp_path, monkeypatch):
+    (model / "sparse/0").rename(tmp_path / "model")
+    monkeypatch.setattr(photographs, "cached_folder", lambda folder, write: tmp_path / "model")
     cv2.imwrite(str(model / "images/blank.png"), np.zeros((48, 64, 3), np.uint8))
     (model / "images/empty.jpg").write_bytes(b"")
-    capture = read_capture(model, CaptureConfig(cache=str(cache)))
+    capture = read_capture(model)
     assert len(capture) == 10 and not capture.metric
     assert "empty.jpg: not a readable image" in capture.dropped[0]
     assert "blank.png: not registered" in capture.dropped[1]

@@ -1,6 +1,8 @@
 import cv2
 import numpy as np
+import pycolmap
 import pytest
+from room import tiled_flight
 
 from splatpilot.training.captures import frames as image_files
 from splatpilot.training.captures import photographs as video
@@ -71,13 +73,13 @@ def test_the_sharpest_frame_of_each_interval_is_taken(tmp_path, monkeypatch):
     made = write_video(tmp_path / "flight.mp4", 60, sharp={3, 29, 30, 50})
     config = CaptureConfig(cache=str(tmp_path / "cache"))
     for _ in range(2):  # at the default rate of 2 Hz
-        with pytest.raises(ValueError, match="cache/frames: enough"):
+        with pytest.raises(ValueError, match=r"cache/videos/\w+/frames: enough"):
             read_capture(tmp_path / "flight.mp4", config)
         assert list(registered) == [f"{i:05d}.jpg" for i in range(4)]
         brightness = [image_files.read_image(file).mean() for file in registered.values()]
         # 15 frames an interval: 0 to 14, 15 to 29, 30 to 44, 45 to 59.
         np.testing.assert_allclose(brightness, [made[i].mean() for i in (3, 29, 30, 50)], atol=3)
-    config = CaptureConfig(cache=str(tmp_path / "other"), video_rate=10)
+    config.video_rate = 10
     with pytest.raises(ValueError, match="enough"):
         read_capture(tmp_path / "flight.mp4", config)
     assert len(registered) == 20
@@ -96,7 +98,7 @@ def test_invalid_videos_are_refused(tmp_path):
     ):
         with pytest.raises(ValueError, match=message):
             read_capture(tmp_path / name, CaptureConfig(cache=str(tmp_path / "cache"), **fields))
-    assert list((tmp_path / "cache").iterdir()) == []
+    assert not any(path.is_file() for path in (tmp_path / "cache").rglob("*"))
 
 
 def test_images_that_are_not_photographs_are_named(tmp_path):
@@ -105,7 +107,7 @@ def test_images_that_are_not_photographs_are_named(tmp_path):
         cv2.imwrite(str(tmp_path / f"gray/{i}.png"), np.full((48, 64, 3), 100, np.uint8))
     with pytest.raises(ValueError, match="3 photographs could not be registered"):
         read_capture(tmp_path / "gray", CaptureConfig(cache=str(tmp_path / "cache")))
-    assert not list((tmp_path / "cache").iterdir())
+    assert not any(path.is_file() for path in (tmp_path / "cache").rglob("*"))
     path = tmp_path / "photos"
     path.mkdir()
     cv2.imwrite(str(path / "depth0.png"), np.ones((8, 8), np.uint16))
@@ -119,3 +121,15 @@ def test_images_that_are_not_photographs_are_named(tmp_path):
         (path / name).write_bytes(b"ftypheic")
         with pytest.raises(ValueError, match=message):
             read_capture(path)
+
+
+def test_registration_keeps_given_intrinsics(tmp_path):
+    flight = tiled_flight()
+    for i in range(len(flight)):
+        cv2.imwrite(str(tmp_path / f"{i}.png"), flight.load_image(i)[..., ::-1])
+    config = CaptureConfig(cache=str(tmp_path / "cache"), intrinsics=[150.0, 155.0, 160.0, 120.0])
+    capture = read_capture(tmp_path, config)
+    assert np.diag(capture.K).tolist() == [150.0, 155.0, 1.0] and len(capture) == 8
+    model = next((tmp_path / "cache").rglob("cameras.bin")).parent
+    [camera] = pycolmap.Reconstruction(model).cameras.values()
+    assert camera.params.tolist() == config.intrinsics
