@@ -12,6 +12,7 @@ from scipy.spatial import KDTree
 from splatpilot.diagrams.worlds.feasibility import CLEARANCE, LONG_ENOUGH, SHORTEST, longest_part
 from splatpilot.diagrams.worlds.world import World
 from splatpilot.systems.collision.observations import HEADINGS
+from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.splats.background import EnvironmentMap
@@ -98,7 +99,8 @@ def with_views(world: World) -> World:
             break
         spacing *= 1.2
     views, yaws = ObservedViews(world), 2.0 * np.pi * np.arange(HEADINGS) / HEADINGS
-    table = np.array([[views.ahead(p, yaw) for yaw in yaws] for p in points[first]])
+    shown = Progress(points[first], "rendering views of routes", unit="position", delay=2.0)
+    table = np.array([[views.ahead(p, yaw) for yaw in yaws] for p in shown])
     observations = replace(world.observations, view_points=points[first], unobserved=table)
     return replace(world, observations=observations)
 

@@ -26,6 +26,8 @@ _PITCHES = np.deg2rad([-20.0, 15.0])
 _GRAZING = 0.2  # cosine between normal and line of sight below which a surface is not seen
 _OUTSIDE = 0.1  # min. volume of an enclosed space, relative to that which the border bounds
 _WORTH = 0.03  # gain of a frame relative to the first, below which frames are not worth it
+_LEGEND = 100  # [px], height of the legend of a picture
+_SMALL = 4.0  # [m^2] of free space that is left out without a word
 _CHUNK = 400_000  # lines of sight that are tested at once
 
 
@@ -41,6 +43,8 @@ class CapturePlan:
     reach: float  # [m] from which surfaces are seen
     more_frames: int  # that would be worth it beyond the maximum number
     free_area: float  # [m^2], of the free space from above
+    # [m^2] and a point (3,) [m] of each part of free space that only the clearance cuts off.
+    others: list[tuple[float, NDArray[np.float64]]]
 
     @property
     def coverage(self) -> float:
@@ -54,7 +58,7 @@ class CapturePlan:
         scale = 1000 / max(upper - lower)  # [px/m]
         radius = max(2, int(0.4 * scale * self.reach / _PATCHES))
         width, height = (scale * (upper - lower)).astype(int) + 2 * radius + 1
-        image = np.full((height, width, 3), 255, np.uint8)
+        image = np.full((height + _LEGEND, max(width, 6 * _LEGEND), 3), 255, np.uint8)
 
         def pixel(p_WQ: NDArray) -> tuple[int, int]:
             x, y = scale * (p_WQ[:2] - lower) + radius
@@ -69,6 +73,16 @@ class CapturePlan:
             here, ahead = X_WC.translation(), X_WC.rotation().matrix()[:, 2]
             cv2.line(image, pixel(here), pixel(here + 0.5 * ahead), (30, 60, 220), 1)
             cv2.circle(image, pixel(here), 2, (30, 60, 220), -1)
+        for k, (name, color) in enumerate(
+            {
+                "never seen": (220, 0, 0),
+                f"from too few of {self.required} directions": (220, 150, 0),
+                "seen from enough": (150, 150, 150),
+                "cameras": (30, 60, 220),
+            }.items()
+        ):
+            row = height + (k + 1) * _LEGEND // 5
+            cv2.putText(image, name, (radius, row), cv2.FONT_HERSHEY_SIMPLEX, 0.5, color)
         return image
 
 
@@ -100,7 +114,7 @@ def plan_capture(
         max_frames: maximum number of poses.
         inside: (3,) [m], a point of the space; None to choose as above.
     """
-    p_WN, spacing = _free_space(esdf, heights, clearance, inside)
+    p_WN, spacing, others = _free_space(esdf, heights, clearance, inside)
     reach = reach or float(np.clip(_openness(esdf, p_WN), *_REACH))
     stops = p_WN[_one_per_cell(p_WN, reach / _STOPS)]
     p_WQ, normals = _patches(esdf, reach / _PATCHES)
@@ -117,8 +131,13 @@ def plan_capture(
     lines = np.concatenate([candidates[k][1] for k in chosen]) if chosen else np.zeros(0, int)
     counts = _count(patch[lines], direction[lines], len(p_WQ))
     X_WCs = _in_order([candidates[k][0] for k in chosen])
-    area = len(np.unique(p_WN[:, :2], axis=0)) * spacing**2
-    return CapturePlan(X_WCs, p_WQ, counts, possible, views, reach, more, area)
+    area = _area(p_WN, spacing)
+    return CapturePlan(X_WCs, p_WQ, counts, possible, views, reach, more, area, others)
+
+
+def _area(p_WN: NDArray, spacing: float) -> float:
+    """Returns the area [m^2] of nodes (N, 3) from above."""
+    return len(np.unique(p_WN[:, :2], axis=0)) * spacing**2
 
 
 def _count(patch: NDArray, direction: NDArray, size: int) -> NDArray[np.intp]:
@@ -128,8 +147,9 @@ def _count(patch: NDArray, direction: NDArray, size: int) -> NDArray[np.intp]:
 
 def _free_space(
     esdf: Esdf, heights: tuple[float, float], clearance: float, inside: NDArray | None
-) -> tuple[NDArray[np.float64], float]:
-    """Returns nodes (N, 3) [m] of the space in which the camera moves, and their spacing [m]."""
+) -> tuple[NDArray[np.float64], float, list[tuple[float, NDArray[np.float64]]]]:
+    """Returns nodes (N, 3) [m] of the space in which the camera moves, and their spacing [m]; and
+    the areas [m^2] and a point (3,) [m] each of the parts that only `clearance` cuts off."""
     extent = esdf.upper_W - esdf.lower_W
     spacing = max(esdf.voxel_size, 0.2, float(np.cbrt(np.prod(extent) / _MAX_NODES)))
     shape = np.maximum((extent / spacing).astype(int), 1).tolist()
@@ -157,7 +177,13 @@ def _free_space(
         enclosed = sizes.copy()
         enclosed[np.unique(border)] = 0
         part = sizes.argmax() if enclosed.max() < _OUTSIDE * sizes.max() else enclosed.argmax()
-    return p_WN[parts == part], spacing
+    wider = (found > min(clearance, esdf.voxel_size)) & (above >= low) & (above <= high)
+    wider, _ = cast(Any, label(wider))
+    within = np.unique(parts[np.isin(wider, wider[parts == part])])
+    left = [p_WN[parts == other] for other in within if other not in (0, part)]
+    others = [(_area(nodes, spacing), nodes[len(nodes) // 2]) for nodes in left]
+    others = sorted((each for each in others if each[0] > _SMALL), key=lambda each: -each[0])
+    return p_WN[parts == part], spacing, others
 
 
 def _surface_below(esdf: Esdf, p_WN: NDArray, spacing: float) -> NDArray[np.float64]:

@@ -259,6 +259,14 @@ def _plan(esdf: Esdf, config: RenderConfig) -> CapturePlan:
         f"surfaces from {config.views} directions ({possible:.0%} are possible) and {once:.0%} at "
         f"least once, within {plan.reach:.1f} m"
     )
+    for area, p_W in plan.others[:3]:
+        _log.warning(
+            "%.0f m^2 around %s m are not captured: with a clearance of %g m no path leads there; "
+            "set less clearance, or inside",
+            area,
+            np.round(p_W, 1).tolist(),
+            config.clearance,
+        )
     if plan.coverage < _COVERED:
         remedies = [f"see {COVERAGE} of the capture for where"]
         if plan.more_frames:

@@ -1,6 +1,6 @@
 """The distance field of a reconstruction, fused from depth at the poses of the capture."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +9,7 @@ from pydrake.math import RigidTransform
 
 from splatpilot.systems.collision.depth_fusion import bounds_of_depth_images, esdf_from_depth_images
 from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.splats.background import FAR
 from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
@@ -32,8 +33,10 @@ class DepthSource:
     K: NDArray[np.float64]  # (3, 3) [px]
     X_WCs: Sequence[RigidTransform]
 
-    def images(self) -> Iterator[NDArray[np.float32]]:
-        return (self.load(i) for i in range(len(self.X_WCs)))
+    def images(self, what: str = "") -> Iterable[NDArray[np.float32]]:
+        """Loads all images; shows progress of `what` is done with them, if given."""
+        images = map(self.load, range(len(self.X_WCs)))
+        return Progress(images, what, len(self.X_WCs), unit="image", delay=2.0) if what else images
 
     def median(self, far: float) -> float:
         """Returns the median depth [m] below `far` [m] of images along the path; 0 without any."""

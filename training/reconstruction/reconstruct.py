@@ -167,7 +167,8 @@ def reconstruct(
     observations = observe(depth, field.voxel_size)
     frontier = None
     if capture.metric:
-        field, frontier = close_frontier(field, depth.images(), depth.K, depth.X_WCs)
+        images = depth.images("finding unobserved space")
+        field, frontier = close_frontier(field, images, depth.K, depth.X_WCs)
     ends = capture.X_WCs[0].translation(), capture.X_WCs[-1].translation()
     world = World(
         capture.name, gaussians, field, field, background, *ends, observations=observations
@@ -248,7 +249,7 @@ def _without_depth(
 
 def observe(depth: DepthSource, voxel_size: float) -> Observations:
     """Counts the observations of surfaces, in voxels twice as large as those of the field."""
-    images = depth.images()
+    images = depth.images("counting observations")
     return Observations.from_depth_images(images, depth.K, depth.X_WCs, 2.0 * voxel_size)
 
 

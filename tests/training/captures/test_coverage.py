@@ -85,6 +85,9 @@ def test_too_few_frames_and_too_little_clearance_are_reported(field, plan):
     assert more > 4 * red
     with pytest.raises(ValueError, match=r"9.0 m must exist, got none in .* m; correct the scale"):
         plan_capture(field, K, SIZE, (1.0, 2.2), 9.0)
+    assert not plan.others
+    [(area, p_W)] = plan_capture(field, K, SIZE, (1.0, 2.2), 1.1).others  # The gap is 2 m wide.
+    assert 15 < area < 25 and (p_W > 1.0).all() and (p_W < [LENGTH - 1, WIDTH - 1, 2]).all()
 
 
 def test_space_outside_is_captured_on_request(field):
