@@ -2,6 +2,7 @@
 the frontier, where observed free space ends."""
 
 import itertools
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -30,6 +31,8 @@ HEADINGS = 8  # of a table of views, counterclockwise from the x axis
 
 _WIDTH = 160  # [px] approximate width to which depth images are subsampled
 _BITS = 21  # of a voxel's index along each axis, in its key
+# Of confirmed surfaces: in a room of 39 photographs, space wrongly free fell from 187 to 19 m^3.
+_MIN_IMAGES, _MIN_PARALLAX = 3, math.radians(8.0)
 _MIN_COSINE = 0.5  # of the angle between two views of a surface that agree
 # Directions are those to the 26 neighbors of a voxel; the middle one, number 13, is not used.
 _AXES = np.array(list(itertools.product((-1, 0, 1), repeat=3)))  # (27, 3)
@@ -61,18 +64,9 @@ class Observations:
         """Counts the images that saw each voxel; see `esdf_from_depth_images` for the images."""
         keys, bits = [], []
         for depth, X_WC in zip(depths, X_WCs, strict=True):
-            step = max(depth.shape[1] // _WIDTH, 1)
-            x, y = np.meshgrid(
-                *(slopes[step // 2 :: step] for slopes in ray_slopes(depth.shape, K))
-            )
-            z = depth[step // 2 :: step, step // 2 :: step]
-            known = (z > 0.0) & (z < FAR)
-            p_CQ = (np.stack([x, y, np.ones_like(x)], axis=-1) * z[..., None])[known]
-            p_WQ = p_CQ @ X_WC.rotation().matrix().T + X_WC.translation()
-            key = np.unique(_key(np.floor(p_WQ / voxel_size).astype(np.int64)))
+            key, p_QC = _seen_voxels(depth, K, X_WC, voxel_size)
             keys.append(key)
-            to_camera = X_WC.translation() - voxel_size * (_voxel(key) + 0.5)
-            bits.append(_FLAGS[np.argmax(to_camera @ _UNIT.T, axis=1)])
+            bits.append(_FLAGS[np.argmax(p_QC @ _UNIT.T, axis=1)])
         key, order, counts = _grouped(keys)
         directions = np.bitwise_or.reduceat(np.concatenate(bits)[order], _starts(counts))
         counts = np.minimum(counts, np.iinfo(np.uint16).max).astype(np.uint16)
@@ -141,6 +135,66 @@ class Observations:
         return cls(
             float(size), voxels, counts, directions, points.astype(float), unobserved.astype(float)
         )
+
+
+def _points(
+    depth: np.ndarray, K: np.ndarray, X_WC: RigidTransform, step: int
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Returns points p_WQ (n, 3) [m] of every `step`-th pixel of a depth image along both axes, and
+    the mask (h, w) of those pixels that show a surface."""
+    x, y = np.meshgrid(*(slopes[step // 2 :: step] for slopes in ray_slopes(depth.shape, K)))
+    z = depth[step // 2 :: step, step // 2 :: step]
+    known = (z > 0.0) & (z < FAR)
+    p_CQ = np.stack([x, y, np.ones_like(x)], axis=-1)[known] * z[known, None]
+    return p_CQ @ X_WC.rotation().matrix().T + X_WC.translation(), known
+
+
+def _seen_voxels(
+    depth: np.ndarray, K: np.ndarray, X_WC: RigidTransform, voxel_size: float
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Returns the keys (V,) of the voxels of surfaces in an image, and p_QC (V, 3) [m], the camera
+    seen from their centers."""
+    p_WQ, _ = _points(depth, K, X_WC, max(depth.shape[1] // _WIDTH, 1))
+    key = np.unique(_key(np.floor(p_WQ / voxel_size).astype(np.int64)))
+    return key, X_WC.translation() - voxel_size * (_voxel(key) + 0.5)
+
+
+class ConfirmedSurfaces:
+    """Surfaces that several images show in the same voxel, from different directions.
+
+    Photographs determine no depth of what is seen once, or from one direction: it may be rendered
+    too far away, and the space before it is not known to be free.
+    """
+
+    def __init__(
+        self,
+        depths: Iterable[np.ndarray],
+        K: np.ndarray,
+        X_WCs: Sequence[RigidTransform],
+        voxel_size: float,
+    ) -> None:
+        """Finds the voxels that at least three images show. The directions to them must differ at
+        least as two that are 8 degrees apart, by the length of their mean. For the images see
+        `esdf_from_depth_images`."""
+        keys, directions = [], []
+        for depth, X_WC in zip(depths, X_WCs, strict=True):
+            key, p_QC = _seen_voxels(depth, K, X_WC, voxel_size)
+            keys.append(key)
+            directions.append(p_QC / np.linalg.norm(p_QC, axis=1, keepdims=True))
+        key, order, counts = _grouped(keys)
+        sums = np.add.reduceat(np.concatenate(directions)[order], _starts(counts))
+        differ = np.linalg.norm(sums, axis=1) / counts < math.cos(0.5 * _MIN_PARALLAX)
+        self._keys = key[(counts >= _MIN_IMAGES) & differ]
+        self._voxel_size, self._K = voxel_size, K
+
+    def keep(self, depth: np.ndarray, X_WC: RigidTransform) -> NDArray[np.float32]:
+        """Returns a depth image (H, W) [m] that is 0 at other surfaces."""
+        p_WQ, known = _points(depth, self._K, X_WC, 1)
+        key = _key(np.floor(p_WQ / self._voxel_size).astype(np.int64))
+        confirmed = _look_up(self._keys, np.ones(len(self._keys), dtype=bool), key)
+        kept = depth.astype(np.float32)
+        kept[known] *= confirmed
+        return kept
 
 
 def _key(voxel: NDArray) -> NDArray[np.int64]:

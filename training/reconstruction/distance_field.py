@@ -1,7 +1,7 @@
 """The distance field of a reconstruction, fused from depth at the poses of the capture."""
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +9,7 @@ from pydrake.math import RigidTransform
 
 from splatpilot.systems.collision.depth_fusion import bounds_of_depth_images, esdf_from_depth_images
 from splatpilot.systems.collision.esdf import Esdf
+from splatpilot.systems.collision.observations import ConfirmedSurfaces
 from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.splats.background import FAR
 from splatpilot.systems.splats.scene import GaussianScene
@@ -85,6 +86,18 @@ def add_sky(rendered: DepthSource, frames: ShrunkFrames) -> DepthSource:
     return DepthSource(load, rendered.K, rendered.X_WCs)
 
 
+def keep_confirmed(rendered: DepthSource, voxel_size: float) -> DepthSource:
+    """Returns rendered depth without that which photographs do not determine, see
+    `ConfirmedSurfaces`."""
+    images = rendered.images("confirming surfaces")
+    surfaces = ConfirmedSurfaces(images, rendered.K, rendered.X_WCs, voxel_size)
+
+    def load(i: int) -> NDArray[np.float32]:
+        return surfaces.keep(rendered.load(i), rendered.X_WCs[i])
+
+    return DepthSource(load, rendered.K, rendered.X_WCs)
+
+
 @dataclass(frozen=True)
 class FieldGrid:
     """The grid of a distance field, and the maximum depth that counts."""
@@ -135,7 +148,9 @@ def make_distance_field(
         capture, frames.factor, gaussians, config.representation, config.renderer_threads
     )
     if not capture.has_depth:
-        # Depth that was not measured leaves gaps where the camera, and so the vehicle, has been.
         grid = choose_grid(rendered, capture.metric, config)
-        return fuse(rendered, grid, VEHICLE_RADIUS if capture.metric else 0.0), rendered
+        confirmed = keep_confirmed(rendered, 2.0 * grid.voxel_size)
+        grid = replace(choose_grid(confirmed, capture.metric, config), voxel_size=grid.voxel_size)
+        # Depth that was not measured leaves gaps where the camera, and so the vehicle, has been.
+        return fuse(confirmed, grid, VEHICLE_RADIUS if capture.metric else 0.0), confirmed
     return fuse_within(add_sky(rendered, frames), captured), captured

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 
-from splatpilot.systems.collision.observations import Observations
+from splatpilot.systems.collision.observations import ConfirmedSurfaces, Observations
 
 K = np.array([[80.0, 0.0, 80.0], [0.0, 80.0, 60.0], [0.0, 0.0, 1.0]])
 AHEAD = RotationMatrix(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]))
@@ -30,6 +30,27 @@ def test_views_agree_from_the_observed_side_within_a_voxel_of_the_surface(wall):
     offsets = np.array([[0.1, 0.0, 0.0], [0.25, 0.0, 0.0]])
     assert wall.agree_with(WALL[0] + offsets, np.zeros(3)).tolist() == [True, False]
     assert wall.scaled_by(2.0).agree_with(2.0 * WALL, np.zeros(3)).all()
+
+
+def test_surfaces_are_confirmed_by_three_images_from_different_directions():
+    depth = np.full((120, 160), 2.03, np.float32)
+    depth[:10] = np.inf
+    wrong = np.full_like(depth, 3.03)
+    wrong[60] = 0.0
+
+    def kept(aside: list[float], shown: np.ndarray) -> np.ndarray:
+        X_WCs = [RigidTransform(AHEAD, np.array([0.0, y, 0.0])) for y in aside]
+        depths = [depth] * (len(aside) - 1) + [shown]
+        surfaces = ConfirmedSurfaces(depths, K, X_WCs, 0.1)
+        return surfaces.keep(shown, X_WCs[-1])
+
+    middle = slice(20, 50), slice(40, 120)
+    assert (kept([-0.4, 0.4, 0.0], depth)[middle] == depth[middle]).all()
+    for aside, shown in ([0.4, 0.0], depth), ([0.0, 0.02, 0.04], depth), ([-0.4, 0.4, 0.0], wrong):
+        assert not kept(aside, shown)[middle].any()
+    assert np.isinf(kept([-0.4, 0.4, 0.0], depth)[:10]).all()
+    nothing = ConfirmedSurfaces([np.zeros_like(depth)], K, [RigidTransform()], 0.1)
+    assert not nothing.keep(wrong, RigidTransform()).any()
 
 
 def test_a_file_comes_back_the_same(wall, tmp_path):

@@ -1,10 +1,12 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from pydrake.math import RigidTransform
 
 from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.splats.scene import GaussianScene
-from splatpilot.training.captures.capture import Capture
+from splatpilot.training.captures.capture import Capture, no_depth
 from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.distance_field import (
     DepthSource,
@@ -13,6 +15,7 @@ from splatpilot.training.reconstruction.distance_field import (
     captured_depth,
     choose_grid,
     fuse,
+    make_distance_field,
     render_depth,
 )
 from splatpilot.training.reconstruction.views import ShrunkFrames
@@ -31,6 +34,14 @@ def make_capture(depth: np.ndarray, valid: np.ndarray) -> Capture:
         load_depth=lambda i: depth,
         load_valid=lambda i: valid,
     )
+
+
+def wall(depth: float) -> GaussianScene:
+    x, y = (g.ravel() for g in np.meshgrid(*[np.linspace(-3, 3, 61)] * 2))
+    one = np.ones((len(x), 1))
+    means = np.column_stack([x, y, depth * one])
+    quats, scales = one * [1.0, 0, 0, 0], one * [0.1, 0.1, 1e-3]
+    return GaussianScene.from_colors(means, quats, scales, 0.99 * one[:, 0], 0 * means)
 
 
 def assert_right_half_is_unknown(source: DepthSource) -> None:
@@ -56,13 +67,17 @@ def test_space_before_the_sky_is_free_only_if_a_fitted_frame_measured_it():
 def test_masked_pixels_leave_space_unknown():
     valid = ALL & (np.arange(80) < 40)
     capture = make_capture(np.full((60, 80), 2.0, np.float32), valid)
-    x, y = (g.ravel() for g in np.meshgrid(*[np.linspace(-3, 3, 61)] * 2))
-    one = np.ones((len(x), 1))
-    means = np.column_stack([x, y, 2 * one])
-    quats, scales = one * [1.0, 0, 0, 0], one * [0.1, 0.1, 1e-3]
-    wall = GaussianScene.from_colors(means, quats, scales, 0.99 * one[:, 0], 0 * means)
     assert_right_half_is_unknown(captured_depth(capture, [0]))
-    assert_right_half_is_unknown(render_depth(capture, 2, wall, "3dgs", 1))
+    assert_right_half_is_unknown(render_depth(capture, 2, wall(2.0), "3dgs", 1))
+
+
+@pytest.mark.parametrize(("aside", "state"), [(0.4, FieldState.FREE), (0.0, FieldState.OUTSIDE)])
+def test_photographs_from_one_place_leave_space_unknown(aside, state):
+    X_WCs = [RigidTransform(np.array([x, 0.0, 0.0])) for x in (-aside, 0.0, aside)]
+    capture = replace(make_capture(ALL, ALL), X_WCs=X_WCs, load_depth=no_depth)
+    config = ReconstructConfig(iterations=1, voxel_size=0.1)
+    field, _ = make_distance_field(capture, ShrunkFrames(capture, [0], 1), wall(2.03), config)
+    assert field.query([[0.0, 0.0, 1.5]]).state == [state]
 
 
 def _grid(depth: float, metric: bool = True, **config) -> FieldGrid:
