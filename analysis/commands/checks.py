@@ -40,8 +40,9 @@ _FLY = "fly in it with `splatpilot fly --scene {path}`"
 _KINDS = {
     "mesh": (
         "a mesh",
-        "render a capture of it with `splatpilot capture render {path} --out out/capture` (--up z "
-        "if z points up in it), then `splatpilot reconstruct out/capture --out out/scene`",
+        "fly in it with `splatpilot fly --set 'world=!MeshWorld {{path: {path}}}'`, or render a "
+        "capture of it with `splatpilot capture render {path} --out out/capture`, then `splatpilot "
+        "reconstruct out/capture --out out/scene` (up: z and --up z if z points up in it)",
     ),
     "capture": ("a capture", "make a scene of it with `splatpilot reconstruct {path} --out SCENE`"),
     "scene": ("a scene folder", _FLY),
