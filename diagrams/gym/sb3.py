@@ -59,6 +59,7 @@ class Sb3FlightEnv(VecEnv):
                 "TimeLimit.truncated": bool(truncated[i] and not terminated[i]),
                 "outcome": str(last["outcome"][i]),
                 "is_success": bool(last["is_success"][i]),
+                "scenario": int(last["scenario"][i]),
                 "episode": {"r": self._returns[i], "l": int(self._lengths[i]), "t": 0.0},
             }
         self._returns[ended], self._lengths[ended] = 0.0, 0

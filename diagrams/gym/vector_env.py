@@ -12,7 +12,7 @@ from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Box
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from splatpilot import _native
 from splatpilot.diagrams.flight.flight_diagram import camera_info, camera_mount
@@ -62,7 +62,8 @@ class VectorFlightEnv(VectorEnv):
     hold for one flight.
 
     When a flight ends, infos have its `outcome` and `is_success`, by environments, and masks of
-    the environments that have them, `_outcome` and `_is_success`.
+    the environments that have them, `_outcome` and `_is_success`. Then and when the next begins,
+    they have its number `scenario` and seeds `world_seed` and `flight_seed`, as those of `reset`.
 
     Args:
         num_envs: number of environments.
@@ -147,6 +148,7 @@ class VectorFlightEnv(VectorEnv):
         self._delays, self._decisions = np.zeros(n, np.int32), np.zeros((n, size))
         self._previous, self._count = np.zeros((n, size)), np.zeros(n, np.int64)
         self._seeds, self._episodes = np.zeros(n, np.uint64), np.zeros(n, np.uint64)
+        self._choices = np.arange(len(self.pool))
         self._ended = np.ones(n, bool)
         self._vehicles = _native.Vehicles(
             states=self._states,
@@ -163,6 +165,22 @@ class VectorFlightEnv(VectorEnv):
         )
         self._is_seeded = False
         self._last: Any = None  # observations, if environments are reset by masks
+
+    @property
+    def choices(self) -> NDArray[np.intp]:
+        """Numbers of the pool's flights that environments draw among, all at first; set others for
+        a curriculum."""
+        return self._choices
+
+    @choices.setter
+    def choices(self, flights: ArrayLike) -> None:
+        flights = np.asarray(flights, int)
+        valid = flights.ndim == 1 and len(flights) and self._in_pool(flights)
+        require(valid, "choices", f"one or more in [0, {len(self.pool)})", flights.tolist())
+        self._choices = flights
+
+    def _in_pool(self, flights: NDArray[np.intp]) -> bool:
+        return bool(((flights >= 0) & (flights < len(self.pool))).all())
 
     def reset(
         self,
@@ -196,12 +214,16 @@ class VectorFlightEnv(VectorEnv):
         flights = None
         if "flight" in options:
             flights = np.broadcast_to(np.asarray(options["flight"], int), rows.shape)
-            valid = ((flights >= 0) & (flights < len(self.pool))).all()
-            require(valid, "flight", f"in [0, {len(self.pool)})", flights.tolist())
+            within = f"in [0, {len(self.pool)})"
+            require(self._in_pool(flights), "flight", within, flights.tolist())
         self._begin(rows, flights)
         points = {name: list(options[name]) for name in ("start", "goal") if name in options}
         if points:
             self._move(rows, points)
+        return self._observe_again(rows), self._drawn(mask)
+
+    def _drawn(self, mask: NDArray[np.bool_]) -> dict[str, Any]:
+        """Returns infos of the present flights of the environments in a mask (N,)."""
         pool = self.pool
         drawn = {
             "scenario": pool.scenario,
@@ -209,7 +231,7 @@ class VectorFlightEnv(VectorEnv):
             "flight_seed": pool.seeds,
         }
         infos = {name: np.where(mask, each[self._flight], 0) for name, each in drawn.items()}
-        return self._observe_again(rows), infos | {f"_{name}": mask.copy() for name in infos}
+        return infos | {f"_{name}": mask.copy() for name in infos}
 
     def _move(self, rows: NDArray[np.intp], points: dict[str, list[float]]) -> None:
         """Moves start or goal of flights that have not begun."""
@@ -243,7 +265,7 @@ class VectorFlightEnv(VectorEnv):
         pool = self.pool
         if flights is None:
             drawn = _hash(_hash(self._seeds[rows]) + self._episodes[rows])
-            flights = (drawn % np.uint64(len(pool))).astype(int)
+            flights = self._choices[(drawn % np.uint64(len(self._choices))).astype(int)]
         self._episodes[rows] += np.uint64(1)
         self._flight[rows] = flights
         self._states[rows], self._p_WG[rows] = pool.states[flights], pool.p_WG[flights]
@@ -319,9 +341,11 @@ class VectorFlightEnv(VectorEnv):
         infos: dict[str, Any] = {}
         if ended.any():
             infos = {"outcome": _OUTCOMES[ends], "is_success": reached}
-            infos |= {f"_{name}": ended.copy() for name in infos}
+            infos |= {f"_{name}": ended.copy() for name in infos} | self._drawn(ended)
             if self._mode is AutoresetMode.SAME_STEP:
                 return self._reset_same_step(rewards, terminated, truncated, infos)
+        if resting.any():
+            infos |= self._drawn(resting | ended)
         observed = self._observe()
         if self._mode is AutoresetMode.DISABLED:
             self._last = deepcopy(observed)
@@ -343,7 +367,7 @@ class VectorFlightEnv(VectorEnv):
             final[row] = {name: v[k] for name, v in last.items()} if is_whole else last[k]
         self._begin(rows)
         further = {"final_obs": final, "_final_obs": ended}
-        further |= {"final_info": infos, "_final_info": ended.copy()}
+        further |= {"final_info": infos, "_final_info": ended.copy()} | self._drawn(ended)
         return self._observe(), rewards, terminated, truncated, further
 
     def _observe_again(self, rows: NDArray[np.intp]) -> Any:

@@ -187,6 +187,7 @@ def test_autoreset_modes(mode, post_world):
     assert infos.get("final_info", infos)["outcome"].tolist() == ["timeout"] * 3
     if mode == "SameStep":
         np.testing.assert_array_equal(observed, start)
+        assert infos["_flight_seed"].all() and infos["final_info"]["_flight_seed"].all()
         assert infos["final_obs"][2][0] > start[2, 0] and infos["_final_obs"].all()
     elif mode == "Disabled":
         with pytest.raises(ResetNeeded, match=r"got \[0, 1, 2\]"):
@@ -194,8 +195,9 @@ def test_autoreset_modes(mode, post_world):
         envs.reset(options={"reset_mask": np.ones(3, bool)})
         assert not envs.step(ahead)[3].any()
     else:
-        observed, rewards, _, truncated, _ = envs.step(ahead)
+        observed, rewards, _, truncated, infos = envs.step(ahead)
         np.testing.assert_array_equal(observed, start)
+        assert infos["_flight_seed"].all()
         assert not rewards.any() and not truncated.any()
 
 
@@ -255,6 +257,23 @@ def test_flights_end_by_a_function_of_ones_own(post_world, mode):
         envs.config.terminate = invalid
         with pytest.raises(ValueError, match=r"the result of terminate must be bool of \(3,\)"):
             envs.step(np.zeros((3, 3)))
+
+
+def test_a_curriculum_chooses_flights(post_world):
+    scenarios = [Scenario(timeout=0.1), Scenario(timeout=0.2)]
+    envs = VectorFlightEnv(8, scenarios, world=post_world, autoreset_mode="SameStep")
+    assert len(set(envs.reset(seed=0)[1]["scenario"])) == 2
+    envs.choices = np.flatnonzero(envs.pool.scenario == 1)
+    while True:
+        *_, truncated, infos = envs.step(np.zeros((8, 3)))
+        if truncated.any():
+            break
+    assert (infos["scenario"][truncated] == 1).all()
+    assert not infos["final_info"]["scenario"].any()
+    assert (envs.reset()[1]["scenario"] == 1).all()
+    for invalid in ([], [len(envs.pool)], [[0]]):
+        with pytest.raises(ValueError, match=r"choices must be one or more in \[0, "):
+            envs.choices = invalid
 
 
 def test_seeds_and_scenarios_of_flights_are_known(post_world):
