@@ -41,7 +41,8 @@ def program() -> dict[str, str]:
 def revision() -> str:
     """Returns the git revision of this checkout, with a digest of changed and untracked source.
 
-    Outside a checkout of splatpilot it is the version of the installation.
+    Outside a checkout of splatpilot it is the version of the installation, with a digest of the
+    files of a wheel.
     """
     checkout = Path(__file__).resolve().parents[2]
 
@@ -67,7 +68,12 @@ def revision() -> str:
             return f"{head}+{digest.hexdigest()[:8]}" if names else head
     except (OSError, KeyError, tomllib.TOMLDecodeError, subprocess.CalledProcessError):
         pass  # not a checkout, without a commit, or no git
-    return importlib.metadata.version("splatpilot")
+    wheel = importlib.metadata.distribution("splatpilot")
+    hashes = {f: f.hash.value for f in wheel.files or () if f.parts[0] == "splatpilot" and f.hash}
+    if not any(file.suffix == ".py" for file in hashes):  # only native code, of an editable one
+        return wheel.version
+    text = "".join(sorted(f"{file} {value}\n" for file, value in hashes.items()))
+    return f"{wheel.version}+{hashlib.sha256(text.encode()).hexdigest()[:8]}"
 
 
 class InfeasibleFlightError(ValueError):

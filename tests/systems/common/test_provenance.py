@@ -4,6 +4,7 @@ import shutil
 import subprocess
 from itertools import combinations
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -87,6 +88,17 @@ def test_outside_a_checkout_of_its_own_the_revision_is_the_version(checkout, pac
     assert copied.program()["splatpilot"] == VERSION
     shutil.rmtree(checkout / ".git")
     assert copied.revision() == VERSION
+
+
+def test_revision_of_a_wheel_depends_on_its_files(checkout, monkeypatch):
+    copied, revisions = installed(checkout / "lib/splatpilot"), []
+    for content in ("one", "two", "one"):
+        file = importlib.metadata.PackagePath("splatpilot/a.py")
+        file.hash = importlib.metadata.FileHash(f"sha256={content}")
+        wheel = SimpleNamespace(version="1.0", files=[file])
+        monkeypatch.setattr(importlib.metadata, "distribution", lambda name, wheel=wheel: wheel)
+        revisions.append(copied.revision())
+    assert revisions[0] == revisions[2] != revisions[1] and revisions[0].startswith("1.0+")
 
 
 def test_ranges_of_seeds_are_filled_and_do_not_overlap():
