@@ -21,7 +21,6 @@ from torch import nn
 from torch.distributions import Normal
 
 import splatpilot as sp
-from splatpilot.diagrams.gym.spaces import find_scenario
 
 STEPS, EPOCHS, BATCHES = 64, 4, 8
 GAMMA, LAMBDA, CLIP, ENTROPY, RATE = 0.99, 0.95, 0.2, 0.001, 5e-4
@@ -75,7 +74,7 @@ def test(agent: Agent, scenario: sp.Scenario, count: int, **options) -> float:
 def main(options: argparse.Namespace) -> None:
     torch.manual_seed(options.seed)
     torch.set_num_threads(options.threads)
-    scenario = replace(find_scenario(options.scenario), timeout=30.0)
+    scenario = replace(sp.find_scenario(options.scenario), timeout=30.0)
     fields = {"observation": options.observation, "threads": options.threads}
     envs = gymnasium.make_vec(
         *("splatpilot:Flight-v0", options.envs, "vector_entry_point"),

@@ -25,9 +25,13 @@ from .diagrams.flight.simulation import (
 )
 from .diagrams.gym.flight_env import FlightEnv
 from .diagrams.gym.gym_policy import GymPolicy
-from .diagrams.gym.spaces import FlightEnvConfig, Reward, Transition
+from .diagrams.gym.spaces import FlightEnvConfig, Reward, Transition, find_scenario
 from .diagrams.gym.vector_env import VectorFlightEnv
+from .diagrams.worlds.file_worlds import MeshWorld, OctomapConfig
+from .diagrams.worlds.forest.layout import ForestConfig
+from .diagrams.worlds.indoor import OfficeConfig, RoomConfig
 from .diagrams.worlds.moving_spheres import MovingSphere
+from .diagrams.worlds.outdoor import BranchesConfig, ClutterConfig, OverUnderConfig, WallsConfig
 from .diagrams.worlds.scene_folder import SceneConfig
 from .diagrams.worlds.world import World
 from .diagrams.worlds.world_registry import make_world, register_world
@@ -81,8 +85,11 @@ from .systems.visualization.meshcat_drawing import CameraVisualizer
 from .systems.visualization.rerun_sink import RerunSink
 from .systems.visualization.video import VideoRecorder
 from .training.captures.capture import Capture
+from .training.captures.capture_config import CaptureConfig
 from .training.captures.capture_registry import read_capture, register_capture
+from .training.corpus.corpus import Corpus
 from .training.policies.train import register_trainer
+from .training.reconstruction.config import ReconstructConfig
 from .training.reconstruction.reconstruct import reconstruct
 
 __all__ = [
@@ -94,10 +101,14 @@ __all__ = [
     "AddMovingBody",
     "AddSplatWorld",
     "BakedScene",
+    "BranchesConfig",
     "BuildFlightDiagram",
     "CameraVisualizer",
     "Capture",
+    "CaptureConfig",
+    "ClutterConfig",
     "Config",
+    "Corpus",
     "Crazyflie21Brushless",
     "Distortion",
     "DrydenWind",
@@ -116,6 +127,7 @@ __all__ = [
     "FlightMonitor",
     "FlightParts",
     "FlightVisualizer",
+    "ForestConfig",
     "GaussianScene",
     "GymPolicy",
     "Hypotheses",
@@ -126,11 +138,15 @@ __all__ = [
     "Kingfisher",
     "LiveControls",
     "MakeCamera",
+    "MeshWorld",
     "MovingBodies",
     "MovingSphere",
     "ObservationNoise",
+    "OctomapConfig",
+    "OfficeConfig",
     "OnboardCamera",
     "Outcome",
+    "OverUnderConfig",
     "PrivilegedPlanner",
     "Px4Sih",
     "QuadrotorAirframe",
@@ -140,8 +156,10 @@ __all__ = [
     "QuadrotorPlant_",
     "QuadrotorState",
     "RangeFinder",
+    "ReconstructConfig",
     "RerunSink",
     "Reward",
+    "RoomConfig",
     "Scenario",
     "SceneConfig",
     "SplatCamera",
@@ -154,12 +172,14 @@ __all__ = [
     "VelocityTracker",
     "VelocityTracker_",
     "VideoRecorder",
+    "WallsConfig",
     "Wind",
     "World",
     "__version__",
     "bounded",
     "dump_config",
     "field_mesh",
+    "find_scenario",
     "flight_page",
     "fly",
     "fly_all",
