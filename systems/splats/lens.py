@@ -22,6 +22,7 @@ NUM_RADIAL = {"opencv": 6, "fisheye": 4}
 """Maximum number of radial coefficients of each model."""
 
 _MARGIN = 0.15  # fraction of the image around it in which rays are still projected as if inside
+_NEWTON_STEPS, _STEP = 6, 1e-5  # of tangential distortion; [-] of slopes for its derivatives
 _SAMPLES, _STEPS = 4097, 6  # of the radial table and of its refinement, to rounding
 
 
@@ -83,11 +84,19 @@ class Distortion(Config):
         """
         points = np.asarray(points, dtype=np.float64)
         slopes = self._undistort_radially(points)
-        for _ in range(60 if any(self.tangential) else 0):
-            off = self.project(slopes) - self._bent(slopes, [])
-            last, slopes = slopes, self._undistort_radially(points - off)
-            if np.nanmax(np.abs(slopes - last), initial=0.0) < 1e-12:
-                break
+        if not any(self.tangential):
+            return slopes
+        known = np.isfinite(slopes[..., 0])
+        found = slopes[known]
+        for _ in range(_NEWTON_STEPS):
+            ahead, behind = (
+                [self._bent(found + step, self.tangential) for step in sign * _STEP * np.eye(2)]
+                for sign in (1.0, -1.0)
+            )
+            jacobian = (np.stack(ahead, -1) - np.stack(behind, -1)) / (2.0 * _STEP)
+            off = points[known] - self._bent(found, self.tangential)
+            found = found + np.linalg.solve(jacobian, off[..., None])[..., 0]
+        slopes[known] = np.where(_lengths(found)[..., None] < self.limit, found, np.nan)
         return slopes
 
     def _bent(
