@@ -112,7 +112,11 @@ def BuildHardwareDiagram(
         policy = ArrivalTriggered(policy, config.tick)
     else:
         name = type(policy).__name__
-        _log.warning("%s has state that is not discrete: its exceptions end the bridge", name)
+        _log.warning(
+            "%s has state, updates or outputs other than discrete state of one period and vectors: "
+            "it does not wait for images, and its exceptions end the bridge",
+            name,
+        )
     decided, failed, heading, plans = (
         policy.GetOutputPort(name) if policy.HasOutputPort(name) else None
         for name in ("decided", "failed", "heading", "hypotheses")

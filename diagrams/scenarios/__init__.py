@@ -2,7 +2,8 @@
 
 from pathlib import Path
 
-from splatpilot.systems.common.validation import unknown
+from splatpilot.systems.common.files import locate_scene
+from splatpilot.systems.common.validation import require, unknown
 
 _FOLDER = Path(__file__).parent
 
@@ -24,7 +25,12 @@ def profiles() -> dict[str, Path]:
 
 def scenario_file(scenario: str) -> Path:
     """Returns the file of a scenario, given by its name or its path."""
-    return _file("scenario", scenario, benchmark_scenarios() | other_scenarios())
+    known = benchmark_scenarios() | other_scenarios()
+    remedy = f"fly --scene {scenario}, or Scenario(world=SceneConfig(path={scenario!r}))"
+    scene = None if scenario in known else locate_scene(scenario)
+    is_scene = scene is not None and (scene / "scene.yaml").is_file()
+    require(not is_scene, scenario, "the name or file of a scenario", "a scene", remedy)
+    return _file("scenario", scenario, known)
 
 
 def profile_file(profile: str) -> Path:

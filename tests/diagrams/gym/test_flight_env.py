@@ -149,6 +149,7 @@ def test_options_choose_the_scenario(tmp_path):
         ({}, {"goal": [5.0, 0, 2]}, InfeasibleFlightError, "goal .* from the nearest surface"),
         ({}, {"start": [50.0, 0, 2]}, InfeasibleFlightError, "start .* outside the world"),
         ({}, {"scenario": "P99"}, ValueError, "there is no scenario 'P99'"),
+        ({}, {"scenario": "small_house"}, ValueError, r"got a scene; fly --scene small_house, or"),
         ({"observation": ["state", "sonar"]}, {}, ValueError, "observation must be one of state"),
         ({"render_mode": "ansi"}, {}, ValueError, "render_mode must be one of rgb_array, human"),
         ({"num_worlds": 2}, {}, ValueError, "num_worlds must be 1 with a world"),
