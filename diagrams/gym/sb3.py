@@ -17,8 +17,9 @@ class Sb3FlightEnv(VecEnv):
 
         model = PPO("MultiInputPolicy", Sb3FlightEnv(64, "P01", num_worlds=16))
 
-    At the end of each flight its info has `is_success`, `outcome`, and as `episode` the sum `r` of
-    its rewards and the number `l` of its steps, which trainers report.
+    At the end of each flight its info has `is_success`, `outcome`, the number `scenario`, and as
+    `episode` the sum `r` of its rewards and the number `l` of its steps, which trainers report. For
+    a curriculum, call `set_attr("choices", ...)`, see `VectorFlightEnv.choices`.
 
     Args:
         num_envs, scenario, fields: of `VectorFlightEnv`.
@@ -78,7 +79,10 @@ class Sb3FlightEnv(VecEnv):
         return [getattr(self.envs, attr_name)] * len(self._rows(indices))
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Refuses attributes, which the environments take as arguments alone."""
+        """Sets `choices` of the environments; they take others as arguments alone."""
+        if attr_name == "choices":
+            self.envs.choices = value
+            return
         raise ValueError(f"{attr_name} must be an argument of Sb3FlightEnv, got it by set_attr")
 
     def set_options(self, options: Any = None) -> None:

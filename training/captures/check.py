@@ -284,15 +284,16 @@ def _check_features(capture: Capture, pairs: int) -> CheckReport:
             "moved"
         )
     # Along the optical axis any focal length fits, if distances along it grow alike.
-    zoomed = [replace(as_read, K=as_read.K @ np.diag([zoom, zoom, 1.0])) for zoom in _ZOOMS]
-    other = min(zoomed, key=lambda reading: measure(reading).error)
     undetermined, focal = "", as_read.K[0, 0]
-    if measure(other).error < max(2.0 * agreement.error, _EPIPOLAR_NEGLIGIBLE):
+    zoomed = [(z * focal, as_read.K @ np.diag([z, z, 1.0])) for z in _ZOOMS]
+    error, other = min((measure(replace(as_read, K=K)).error, f) for f, K in zoomed)
+    fits = error < max(2.0 * agreement.error, _EPIPOLAR_NEGLIGIBLE)
+    if fits and not problem and not capture.config.intrinsics:
         angle = 2.0 * np.degrees(np.arctan2(capture.width / 2, focal))
         undetermined = (
-            f"these frames do not tell the focal length: {other.K[0, 0]:.0f} px fits about as well "
-            f"as {focal:.0f} px, a field of view of {angle:.0f} degrees; film turns and motion to "
-            "the side, too, or set capture.intrinsics"
+            f"these frames do not tell the focal length: {other:.0f} px fits about as well as "
+            f"{focal:.0f} px, a field of view of {angle:.0f} degrees; film turns and motion to the "
+            "side, too, or set capture.intrinsics"
         )
     return CheckReport(capture, len(matched), agreement, tuple(others), None, problem, undetermined)
 

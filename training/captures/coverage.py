@@ -179,8 +179,8 @@ def _free_space(
         part = sizes.argmax() if enclosed.max() < _OUTSIDE * sizes.max() else enclosed.argmax()
     wider = (found > min(clearance, esdf.voxel_size)) & (above >= low) & (above <= high)
     wider, _ = cast(Any, label(wider))
-    within = np.unique(parts[np.isin(wider, wider[parts == part])])
-    left = [p_WN[parts == other] for other in within if other not in (0, part)]
+    numbers = np.unique(parts[np.isin(wider, wider[parts == part])])
+    left = [p_WN[parts == other] for other in numbers if other not in (0, part)]
     others = [(_area(nodes, spacing), nodes[len(nodes) // 2]) for nodes in left]
     others = sorted((each for each in others if each[0] > _SMALL), key=lambda each: -each[0])
     return p_WN[parts == part], spacing, others

@@ -35,7 +35,7 @@ class DepthSource:
     X_WCs: Sequence[RigidTransform]
 
     def images(self, what: str = "") -> Iterable[NDArray[np.float32]]:
-        """Loads all images; shows progress of `what` is done with them, if given."""
+        """Loads all images, with a progress bar named `what` if given."""
         images = map(self.load, range(len(self.X_WCs)))
         return Progress(images, what, len(self.X_WCs), unit="image", delay=2.0) if what else images
 
@@ -150,7 +150,9 @@ def make_distance_field(
     if not capture.has_depth:
         grid = choose_grid(rendered, capture.metric, config)
         confirmed = keep_confirmed(rendered, 2.0 * grid.voxel_size)
-        grid = replace(choose_grid(confirmed, capture.metric, config), voxel_size=grid.voxel_size)
+        images = confirmed.images()
+        bounds = bounds_of_depth_images(images, confirmed.K, confirmed.X_WCs, grid.max_range)
+        grid = replace(grid, lower_W=bounds[0], upper_W=bounds[1])
         # Depth that was not measured leaves gaps where the camera, and so the vehicle, has been.
         return fuse(confirmed, grid, VEHICLE_RADIUS if capture.metric else 0.0), confirmed
     return fuse_within(add_sky(rendered, frames), captured), captured

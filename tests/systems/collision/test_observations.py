@@ -48,6 +48,7 @@ def test_surfaces_are_confirmed_by_three_images_from_different_directions():
     assert (kept([-0.4, 0.4, 0.0], depth)[middle] == depth[middle]).all()
     for aside, shown in ([0.4, 0.0], depth), ([0.0, 0.02, 0.04], depth), ([-0.4, 0.4, 0.0], wrong):
         assert not kept(aside, shown)[middle].any()
+    assert (kept([-0.4, 0.4, *20 * [0.0]], depth)[middle] == depth[middle]).all()
     assert np.isinf(kept([-0.4, 0.4, 0.0], depth)[:10]).all()
     nothing = ConfirmedSurfaces([np.zeros_like(depth)], K, [RigidTransform()], 0.1)
     assert not nothing.keep(wrong, RigidTransform()).any()

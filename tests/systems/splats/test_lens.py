@@ -42,6 +42,17 @@ def test_points_are_where_opencv_has_them(lens):
     np.testing.assert_allclose(lens.slopes(points), slopes, atol=1e-9)
 
 
+def test_rays_of_a_lens_that_folds_are_exact_or_none():
+    u, v = np.meshgrid(np.linspace(-0.8, 0.8, 65), np.linspace(-0.6, 0.6, 49))
+    points = np.stack([u, v], axis=-1)
+    folding = Distortion(radial=[-0.3], tangential=[0.005, 0.005])
+    slopes = folding.slopes(points)
+    known = np.isfinite(slopes[..., 0])
+    assert 0.5 < known.mean() < 1.0
+    np.testing.assert_allclose(folding.project(slopes)[known], points[known], atol=1e-9)
+    assert np.isnan(folding.slopes(points[:1, :1] + 5.0)).all()
+
+
 def test_pixels_beyond_the_lens_look_nowhere():
     slopes = pixel_slopes(FISHEYE, K_CIRCLE, WIDTH, HEIGHT)
     shown = np.isfinite(slopes[..., 0])

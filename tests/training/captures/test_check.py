@@ -20,6 +20,7 @@ from splatpilot.training.captures.capture import (
     no_depth,
     pinhole,
 )
+from splatpilot.training.captures.capture_config import CaptureConfig
 from splatpilot.training.captures.capture_registry import read_capture
 from splatpilot.training.captures.check import check_capture, doubts
 
@@ -195,6 +196,7 @@ def test_features_without_depth_tell_errors_apart(flight, change, problem):
     report = check_capture(replace(flight, **change(flight)))
     assert report.agreement is not None and report.agrees == (not problem), report
     assert re.match(problem, report.problem), report.problem
+    assert not report.undetermined
 
 
 def test_flight_along_the_optical_axis_leaves_the_focal_length_open(flight):
@@ -202,10 +204,12 @@ def test_flight_along_the_optical_axis_leaves_the_focal_length_open(flight):
     forward = tiled_flight(turn=0.0, aside=0.0)
     for focal, angle in ((160, 90), (960, 19)):
         report = check_capture(replace(forward, K=pinhole(focal, focal, 160, 120)))
-        said = f"px fits about as well as {focal} px, a field of view of {angle} degrees"
-        assert report.agrees and said in report.undetermined and said in str(report)
+        message = f"px fits about as well as {focal} px, a field of view of {angle} degrees"
+        assert report.agrees and message in report.undetermined and message in str(report)
     [doubt] = doubts(forward)
     assert doubt.endswith("or set capture.intrinsics")
+    given = CaptureConfig(intrinsics=[160.0, 160.0, 160.0, 120.0])
+    assert doubts(replace(forward, config=given)) == ()
 
 
 def test_command(tmp_path, capsys):

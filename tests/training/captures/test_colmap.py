@@ -252,7 +252,7 @@ def test_missing_and_damaged_parts_are_refused(model):
         read_capture(model)
 
 
-def test_photographs_are_registered_once(model, tmp_path, monkeypatch):
+def test_photographs_that_are_left_out_are_named(model, tmp_path, monkeypatch):
     (model / "sparse/0").rename(tmp_path / "model")
     monkeypatch.setattr(photographs, "cached_folder", lambda folder, write: tmp_path / "model")
     cv2.imwrite(str(model / "images/blank.png"), np.zeros((48, 64, 3), np.uint8))

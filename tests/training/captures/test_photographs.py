@@ -123,7 +123,7 @@ def test_images_that_are_not_photographs_are_named(tmp_path):
             read_capture(path)
 
 
-def test_registration_keeps_given_intrinsics(tmp_path):
+def test_registration_keeps_given_intrinsics_and_is_cached(tmp_path, monkeypatch):
     flight = tiled_flight()
     for i in range(len(flight)):
         cv2.imwrite(str(tmp_path / f"{i}.png"), flight.load_image(i)[..., ::-1])
@@ -133,3 +133,5 @@ def test_registration_keeps_given_intrinsics(tmp_path):
     model = next((tmp_path / "cache").rglob("cameras.bin")).parent
     [camera] = pycolmap.Reconstruction(model).cameras.values()
     assert camera.params.tolist() == config.intrinsics
+    monkeypatch.setattr(video, "_register", None)
+    assert len(read_capture(tmp_path, config)) == 8
