@@ -353,6 +353,7 @@ def fly_trial(
 
     # Flight.
     p_WG, box = goal_position(scenario, world), world.distance_field
+    lower_W, upper_W = map(np.array, limits.geofence or (box.lower_W, box.upper_W))
     max_speed, max_tilt, min_clearance, min_inside = 0.0, 0.0, math.inf, math.inf
     reasons, outcome, mode, stalled = set[int](), None, status.WAITING, 0.0
     last = max(fault.begin + min(fault.duration, 4.0) for fault in faults)
@@ -379,7 +380,7 @@ def fly_trial(
         own_mode = vector_output(autopilot, "mode", autopilot_context)[0]
         if status.LANDING not in (mode, own_mode):
             min_clearance = min(min_clearance, float(vector_output(vehicle, "clearance", root)[0]))
-            to_fence = np.min([state.p_WB - box.lower_W, box.upper_W - state.p_WB])
+            to_fence = np.min([state.p_WB - lower_W, upper_W - state.p_WB])
             min_inside = min(min_inside, float(to_fence) - VEHICLE_RADIUS)
         outcome = flight_outcome(vehicle, root, p_WG, scenario.goal_radius)
         if outcome is not None:

@@ -158,11 +158,12 @@ def bridge(options: argparse.Namespace) -> None:
     cli.flag("--arm", "arm the motors, in offboard mode"),
     cli.path_option("--replay LOG.ulg", "replay a log of PX4 instead, and report on it"),
     cli.set_option(
-        *("vehicle_host=192.168.8.1", "udp.host=0.0.0.0"),
+        *("udp.host=0.0.0.0", "vehicle_host=192.168.8.1", "'udp.senders=[192.168.8.1]'"),
         configuration="splatpilot.diagrams.hardware.px4:Px4Config",
     ),
     examples=(
-        "hardware px4 --set vehicle_host=192.168.8.1",
+        "hardware px4 --set vehicle_host=192.168.8.1 --set udp.host=0.0.0.0 --set "
+        "'udp.senders=[192.168.8.1]'",
         "hardware px4 --config px4.yaml --engage",
         "hardware px4 --replay flight.ulg",
     ),

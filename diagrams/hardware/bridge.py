@@ -58,7 +58,7 @@ class HardwareConfig(Config):
     status_rate: float = bounded(5.0, "(0, inf) Hz")
     # [s] Without a message after which bridge and vehicle give up.
     patience: float = bounded(10.0, "(0, inf) s")
-    # Commands for a simulated vehicle: "body_rates" or "velocity"; see `px4.setpoints` for PX4.
+    # Commands for a simulated vehicle: "body_rates" or "velocity"; px4 has `commander.setpoints`.
     setpoints: str = bounded("body_rates", "{velocity, body_rates}")
     # Body that motion capture must track; none if empty.
     body: str = ""

@@ -4,6 +4,7 @@ import contextlib
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from ipaddress import ip_address
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from pydrake.systems.primitives import Demultiplexer
 from splatpilot.diagrams.hardware.real_time import MessagePorts, run_in_real_time
 from splatpilot.diagrams.hardware.vehicle import STATUS_PERIOD
 from splatpilot.systems.common.drake import vector_output
-from splatpilot.systems.common.validation import Config, bounded, require_field
+from splatpilot.systems.common.validation import Config, bounded, require, require_field
 from splatpilot.systems.messaging import codecs
 from splatpilot.systems.messaging.lcm_ports import DEFAULT_URL, open_lcm
 from splatpilot.systems.messaging.receiver import Inbox, UdpConfig, UdpInbox
@@ -55,6 +56,11 @@ class Px4Config(Config):
         UdpConfig(self.vehicle_port, self.vehicle_host).validate()
         named = bool(self.body) or self.motion_capture is None
         require_field(self, "body", named, "a name, which motion_capture needs")
+        host, senders = self.vehicle_host, self.udp.senders
+        require(host in senders, "udp.senders", f"a list with vehicle_host, {host}", senders)
+        is_reached = ip_address(host).is_loopback or not ip_address(self.udp.host).is_loopback
+        condition = "0.0.0.0 or an address that the vehicle reaches"
+        require(is_reached, "udp.host", condition, self.udp.host)
 
 
 def BuildPx4Diagram(
@@ -66,9 +72,9 @@ def BuildPx4Diagram(
     .. pydrake_system::
 
         name: px4
-        output_ports: [state, state_age, heartbeat_age, armed, mode, rejected]
+        output_ports: [state, state_age, heartbeat_age, armed, mode, rejected, ended]
 
-    The ports are those of `Px4Telemetry`; for `now` see `Receiver`.
+    `ended` is that of `Px4Commander`, the others those of `Px4Telemetry`; for `now` see `Receiver`.
     """
     config.validate()
     builder = DiagramBuilder()
@@ -103,9 +109,10 @@ def BuildPx4Diagram(
         if config.motion_capture is not None:
             ports.publish_measurement("motion_capture", body, pose, pose_age)
 
+    commander = Px4Commander(config.commander, inbox, mavlink, address, GRAVITY, tick=config.tick)
     ports.add(
         "commander",
-        Px4Commander(config.commander, inbox, mavlink, address, GRAVITY, tick=config.tick),
+        commander,
         setpoint=setpoint.GetOutputPort(codec.port),
         setpoint_age=setpoint.GetOutputPort("age"),
         bridge_mode=mode.get_output_port(0),
@@ -119,6 +126,7 @@ def BuildPx4Diagram(
 
     for name in ("state", "age", "heartbeat_age", "armed", "mode", "rejected"):
         builder.ExportOutput(telemetry.GetOutputPort(name), "state_age" if name == "age" else name)
+    builder.ExportOutput(commander.GetOutputPort("ended"), "ended")
     diagram = builder.Build()
     diagram.set_name("px4")
     return diagram
@@ -142,22 +150,27 @@ def run(*, config: Px4Config, duration: float = np.inf, log: Path | None = None)
             print(f"{name} is {'requested' if requested else 'left to the pilot'}.", flush=True)
         before, reminders, ages = "not heard", 0, []
 
+        def say(text: str) -> None:
+            with contextlib.suppress(OSError):  # A closed pipe would end the flight.
+                print(text, flush=True)
+
         def over(now: float) -> bool:
             nonlocal before, reminders
-            age, armed, mode = (
-                vector_output(diagram, name, root) for name in ("heartbeat_age", "armed", "mode")
-            )
+            names = "heartbeat_age", "armed", "mode", "ended"
+            age, armed, mode, ended = (vector_output(diagram, name, root) for name in names)
             report = "not heard"
             if age[0] <= HEARTBEAT_TIMEOUT:
                 offboard = "in" if mode[0] == OFFBOARD[0] else "not in"
                 report = f"heard, {'armed' if armed[0] else 'disarmed'}, {offboard} offboard mode"
+            if ended[0]:
+                report += "; setpoints have ended, restart this command to fly again"
             if report != before:
-                print(f"{now:8.2f} s: PX4 is {report}", flush=True)
+                say(f"{now:8.2f} s: PX4 is {report}")
                 before = report
             silences = int(min(age[0], now) / REMINDER)
             if silences > reminders:
                 silence = f"{silences * REMINDER:g} s at {address}"
-                print(f"{now:8.2f} s: no heartbeat for {silence}", flush=True)
+                say(f"{now:8.2f} s: no heartbeat for {silence}")
             reminders = silences
             if isinstance(inbox, LogInbox):
                 ages.append(vector_output(diagram, "state_age", root)[0])

@@ -236,8 +236,8 @@ class Modes(NamedTuple):
         if self.mode == status.HOLDING:
             if now - healthy >= config.recovery:
                 return modes._begin(status.FLYING, status.NONE, now)
-            if not in_charge:
-                return modes._replace(since=now)
+            if not in_charge:  # A pilot may move it.
+                return modes._replace(since=now, p_WH=_NO_POSITION)
             if now - self.since > config.patience:
                 return modes._replace(mode=status.LANDING, since=now)
         return modes

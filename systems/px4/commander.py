@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from splatpilot.systems.common.drake import optional_input, vector_input
 from splatpilot.systems.common.validation import Config, bounded, require_field
@@ -14,6 +14,7 @@ from splatpilot.systems.messaging.lcm_ports import PUBLISH_OFFSET, SAME_TIME
 from splatpilot.systems.messaging.receiver import Inbox
 from splatpilot.systems.px4.mavlink import HOLD, LAND, OFFBOARD, Mavlink
 from splatpilot.systems.px4.telemetry import HEARTBEAT_TIMEOUT
+from splatpilot.systems.vehicle.state import LONGEST_PREDICTION
 
 _PERIOD = 0.02  # [s] between setpoints.
 _HEARTBEAT_PERIOD = 1.0  # [s], also between repeated commands.
@@ -37,7 +38,8 @@ class Px4CommanderConfig(Config):
     hover_thrust: float = bounded(0.5, "[0.05, 0.95]")
     # [s] Of streaming setpoints before requesting offboard mode.
     streaming: float = bounded(1.5, "(0, 10] s")
-    # [s] Max age of setpoints that are sent on; then offboard mode is left.
+    # [s] Max age of setpoints that are sent on, of body rates at most 0.1 s; then offboard mode is
+    # left.
     max_age: float = bounded(0.3, "(0, 10] s")
     # Requests offboard mode; without it the pilot does by remote control.
     engage: bool = False
@@ -78,11 +80,13 @@ class Px4Commander(LeafSystem):
         name: Px4Commander
         input_ports: [setpoint, setpoint_age, bridge_mode, heartbeat_age, armed, mode, granted,
             motion_capture_pose, motion_capture_age, unix_time]
+        output_ports: [ended]
 
     - ``setpoint`` (4), ``setpoint_age`` (1) [s]: velocities or body rates, as configured.
     - ``bridge_mode`` (1), optional: the mode in the bridge's status, see ``lcmt_bridge_status``.
     - ``heartbeat_age`` (1) [s], ``armed`` (1), ``mode`` (2), ``granted`` (2): of `Px4Telemetry`.
     - ``motion_capture_pose`` (7), ``motion_capture_age`` (1) [s], optional: p_WB [m] and q_WB.
+    - ``ended`` (1): 1 once no more setpoints are sent, else 0.
 
     Sends setpoints, if fresh, every 0.02 s from time 0 and as they come, for which it looks every
     ``tick`` [s]; every second a heartbeat; and poses as ODOMETRY, each once and at most every
@@ -120,14 +124,17 @@ class Px4Commander(LeafSystem):
             name: (interval, int(self.DeclareDiscreteState(np.array(_Arrival()))))
             for name, interval in intervals.items()
         }
+        self.DeclareVectorOutputPort("ended", 1, _calc_ended, {self.xd_ticket()})
         self.DeclarePeriodicDiscreteUpdateEvent(_PERIOD, 0.0, self._update)
         self.DeclarePeriodicDiscreteUpdateEvent(tick, 0.0, self._look)
         self.DeclarePeriodicPublishEvent(_PERIOD, PUBLISH_OFFSET, self._publish)
         self.DeclarePeriodicPublishEvent(tick, PUBLISH_OFFSET, self._publish_arrivals)
 
     def _is_fresh(self, context: Context, name: str) -> bool:
-        age = optional_input(self, name, context)
-        return age is not None and bool(age[0] <= self._config.max_age)
+        age, limit = optional_input(self, name, context), self._config.max_age
+        if name == "setpoint_age" and self._config.setpoints == "body_rates":
+            limit = min(limit, LONGEST_PREDICTION)  # A vehicle would turn over.
+        return age is not None and bool(age[0] <= limit)
 
     def _is_in(self, context: Context, mode: tuple[int, int]) -> bool:
         now = vector_input(self, "mode", context)
@@ -230,3 +237,7 @@ class Px4Commander(LeafSystem):
         self._publish_setpoint(context)
         if abs(now - memory.asked) < 0.5 * _PERIOD and (request := self._request(context)):
             self._send(request)
+
+
+def _calc_ended(context: Context, output: BasicVector) -> None:
+    output[0] = _Memory.read(context).left != 0.0

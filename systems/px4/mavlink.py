@@ -34,7 +34,8 @@ def thrust_to_px4(thrust: float, hover_thrust: float, gravity: float) -> float:
 
 _ONBOARD_COMPUTER = 191  # MAV_COMP_ID_ONBOARD_COMPUTER
 _CUSTOM_MODE, _ARMED = 1, 128  # MAV_MODE_FLAGs
-_ACCEPTED = 0  # MAV_RESULT_ACCEPTED
+_RESULTS = "ACCEPTED", "TEMPORARILY_REJECTED", "DENIED", "UNSUPPORTED", "FAILED", "IN_PROGRESS"
+_WARNING = 4  # MAV_SEVERITY_WARNING; more severe ones are smaller.
 SET_MODE, ARM = 176, 400  # Commands: MAV_CMD_DO_SET_MODE and MAV_CMD_COMPONENT_ARM_DISARM.
 VELOCITY_AND_YAW_RATE, VELOCITY_AND_YAW, BODY_RATES = 1479, 2503, 128
 """Type masks of setpoints: fields that PX4 ignores."""
@@ -78,7 +79,13 @@ class Granted(NamedTuple):
     command: int
 
 
-Message = Heartbeat | Position | Attitude | Timesync | Granted
+class Notice(NamedTuple):
+    """A warning of PX4, or its refusal of a command of ours."""
+
+    text: str
+
+
+Message = Heartbeat | Position | Attitude | Timesync | Granted | Notice
 
 
 class Mavlink:
@@ -125,7 +132,8 @@ class Mavlink:
             *map(float, swap_px4(pose[:3])),
             [float(x) for x in swap_px4(pose[3:])],
             *[math.nan] * 6,
-            *(unknown, unknown, 0, d.MAV_ESTIMATOR_TYPE_MOCAP, 0),
+            # PX4's EKF2 reads no odometry of the type MOCAP.
+            *(unknown, unknown, 0, d.MAV_ESTIMATOR_TYPE_VISION, 0),
         )
 
     def heartbeat(self) -> bytes:
@@ -196,6 +204,13 @@ def _message(m: Any) -> list[Message]:
         case "TIMESYNC":
             return [Timesync(m.tc1, m.ts1)]
         case "COMMAND_ACK":
-            is_ours = m.target_component in (0, _ONBOARD_COMPUTER)
-            return [Granted(m.command)] if is_ours and m.result == _ACCEPTED else []
+            if m.target_component not in (0, _ONBOARD_COMPUTER):
+                return []
+            if m.result == 0:
+                return [Granted(m.command)]
+            result = _RESULTS[m.result] if m.result < len(_RESULTS) else f"result {m.result}"
+            what = {SET_MODE: "a mode", ARM: "arming"}.get(m.command, f"command {m.command}")
+            return [Notice(f"the answer to the request for {what} is {result}")]
+        case "STATUSTEXT" if m.severity <= _WARNING:
+            return [Notice(m.text)]
     return []

@@ -1,5 +1,6 @@
 """Px4Telemetry: receives PX4's state and mode."""
 
+import logging
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -13,6 +14,8 @@ from splatpilot.systems.messaging.receiver import RESTART, Inbox, Received, Rece
 from splatpilot.systems.px4 import mavlink
 from splatpilot.systems.vehicle.quadrotor import hover_state
 from splatpilot.systems.vehicle.state import QuadrotorState, predict_state
+
+_log = logging.getLogger(__name__)
 
 HEARTBEAT_TIMEOUT = 3.0
 """[s] without a heartbeat, which PX4 sends every second, after which its mode is unknown."""
@@ -50,6 +53,7 @@ class _Telemetry(Received):
     heartbeat: mavlink.Heartbeat = field(default_factory=lambda: mavlink.Heartbeat(False, (0, 0)))
     heard: float = -math.inf  # [s] of the Context, of the heartbeat.
     granted: frozenset[int] = frozenset()  # accepted commands.
+    notice: str = ""  # the last warning or refusal.
     offset: _Offset = field(default_factory=_Offset)
     position: mavlink.Position | None = None
     position_time: float = -math.inf  # [s] Unix time.
@@ -65,7 +69,11 @@ class _Telemetry(Received):
         if isinstance(message, mavlink.Heartbeat):
             return replace(self, heartbeat=message, heard=now)
         if isinstance(message, mavlink.Granted):
-            return replace(self, granted=self.granted | {message.command})
+            return replace(self, granted=self.granted | {message.command}, notice="")
+        if isinstance(message, mavlink.Notice):
+            if message.text != self.notice:
+                _log.warning("PX4: %s", message.text)
+            return replace(self, notice=message.text)
         if isinstance(message, mavlink.Timesync):
             return self._after_timesync(message, now, unix_time)
         last = self.position if isinstance(message, mavlink.Position) else self.attitude

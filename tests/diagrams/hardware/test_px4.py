@@ -316,6 +316,11 @@ def test_the_process_prints_its_limits_and_missing_heartbeats(udp_url, capsys, m
         ("--arm", "arm must be false without engage"),
         ("--set motion_capture={}", "body must be a name, which motion_capture needs"),
         ("--set system=0", "system must be in [1, 255], got 0"),
+        ("--set vehicle_host=192.168.8.1", "udp.senders must be a list with vehicle_host, 192."),
+        (
+            "--set vehicle_host=192.168.8.1 --set udp.senders=[192.168.8.1]",
+            "udp.host must be 0.0.0.0 or an address that the vehicle reaches, got 127.0.0.1",
+        ),
         ("--lcm-url tcp://there", "must begin with udpm://"),
         ("--replay flight.ulg", "flight.ulg must be a ULog"),
     ],

@@ -202,6 +202,18 @@ def test_modes_follow_the_inputs(steps):
         assert bench.out("is_ready")[0] == (mode != WAITING)
 
 
+def test_a_vehicle_is_held_where_its_pilot_left_it():
+    bench = Bench(FailsafeConfig(patience=20.0))
+    bench.give(observation_age=1.0, vehicle_status=[1.0, 0.0], vehicle_status_age=0.0)
+    bench.advance(1.0)
+    assert bench.mode()[0] == status.HOLDING
+    bench.state[:3] += [1.0, 0.0, 0.5]  # by the pilot
+    bench.advance(0.5)
+    bench.give(vehicle_status=[1.0, 1.0])
+    bench.advance(0.1)
+    np.testing.assert_allclose(bench.out("velocity_setpoint")[:3], 0.0, atol=0.05)
+
+
 def test_a_vehicle_that_tips_over_is_leveled():
     bench = Bench()
     bench.advance(0.06)

@@ -81,7 +81,7 @@ class Px4StandIn:
             self._streamed(now)
             frd = [message.body_roll_rate, message.body_pitch_rate, message.body_yaw_rate]
             self.rates = np.append(message.thrust / 0.5 * GRAVITY, HALF_TURN.apply(frd))
-        elif kind == "ODOMETRY":
+        elif kind == "ODOMETRY" and message.estimator_type <= dialect.MAV_ESTIMATOR_TYPE_VIO:
             self.odometry.append(message)
         elif kind == "TIMESYNC" and message.tc1 == 0:
             self._send(dialect.MAVLink_timesync_message(round(1e9 * (now - BOOT)), message.ts1))

@@ -125,15 +125,17 @@ def test_a_mode_is_requested_after_a_heartbeat_that_is_newer_than_the_loss(loss,
         assert modes(vehicle.advance_without_heartbeats(0.02, silence)) == []
         vehicle.give(heartbeat_age=[0.0])
         assert modes(vehicle.advance(0.04)) == [mode]
+    context = vehicle.simulator.get_context()
+    assert vehicle.system.GetOutputPort("ended").Eval(context) == 1.0
     vehicle.give(mode=list(mode), bridge_mode=[float(status.FLYING)], setpoint_age=[0.0])
     assert vehicle.advance(3.0) == []
 
 
-@pytest.mark.parametrize("interface", ["velocity", "body_rates"])
-def test_until_then_the_vehicle_is_told_to_stop(interface):
+@pytest.mark.parametrize(("interface", "age"), [("velocity", 0.31), ("body_rates", 0.11)])
+def test_until_then_the_vehicle_is_told_to_stop(interface, age):
     vehicle = Told(Px4CommanderConfig(setpoints=interface), **FLYING)
     vehicle.advance(1.0)
-    vehicle.give(**LOST)
+    vehicle.give(setpoint_age=[age])
     sent = vehicle.advance_without_heartbeats(0.02, 3.0)
     assert set(setpoints(sent)) == {(0.0, 0.0, 0.0)}
     assert len(sent) == pytest.approx(100, abs=2)

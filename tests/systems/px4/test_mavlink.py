@@ -62,6 +62,7 @@ def test_odometry_is_that_of_ekf2():
     assert (message.x, message.y, message.z, *message.q) == (1, -2, -3, 0.5, 0.5, -0.5, 0.5)
     assert math.isnan(message.vx) and math.isnan(message.pose_covariance[0])
     assert message.time_usec == 1_800_000_000_000_000
+    assert message.estimator_type == dialect.MAV_ESTIMATOR_TYPE_VISION  # EKF2 reads no MOCAP.
 
 
 def test_requests_are_those_of_px4():

@@ -184,6 +184,18 @@ def test_granted_commands_are_remembered(link):
     assert link.out("granted").tolist() == [1, 1]
 
 
+def test_refusals_and_warnings_of_px4_are_logged_once(link, caplog):
+    denied = dialect.MAVLink_command_ack_message(176, dialect.MAV_RESULT_DENIED)
+    for severity, text in ((2, b"Arming denied: no home"), (6, b"Takeoff detected")):
+        for _ in range(2):
+            link.send(denied)
+            link.advance(0.02)
+        link.send(dialect.MAVLink_statustext_message(severity, text))
+        link.advance(0.02)
+    refusal = "PX4: the answer to the request for a mode is DENIED"
+    assert caplog.messages == [refusal, "PX4: Arming denied: no home", refusal]
+
+
 @pytest.mark.parametrize(
     ("base", "mode", "told"), [(129, 6, [1, 1]), (129, 3, [1, 0]), (1, 6, [0, 1])]
 )
