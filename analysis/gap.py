@@ -170,10 +170,17 @@ def _policy(name: str, speed: float) -> Policy:
 
 
 def captured_viewpoints(capture: Capture, world: World, config: GapConfig) -> list[Viewpoint]:
-    """Returns viewpoints along a capture, evenly spaced, with the frames that precede each."""
+    """Returns viewpoints along a capture, evenly spaced over the frames at which a vehicle would
+    be free, with the frames that precede each."""
     depth_field = _fused(capture, config.voxel_size) if capture.has_depth else world.distance_field
+    p_WCs = np.array([X_WC.translation() for X_WC in capture.X_WCs])
+    free = np.flatnonzero(~(depth_field.distance(p_WCs) <= VEHICLE_RADIUS))
+    require(len(free), capture.name, f"with a frame {VEHICLE_RADIUS} m from surfaces", "none")
+    print(f"{capture.name}: a vehicle would be free at {len(free)} of {len(capture)} frames")
+    chosen = np.unique(np.linspace(0, len(free) - 1, config.viewpoints).round().astype(int))
+    chosen = np.linspace(0, len(free) - 1, config.viewpoints).round().astype(int)
     viewpoints = []
-    for last in np.unique(np.linspace(0, len(capture) - 1, config.viewpoints).round()).astype(int):
+    for last in free[np.unique(chosen)]:
         frames = [int(last)]
         while len(frames) < config.frames and frames[0] > 0:
             X = capture.X_WCs[frames[0] - 1].InvertAndCompose(capture.X_WCs[frames[0]])
@@ -242,7 +249,9 @@ def _plans(
                 for draw, (v_WB, p_WG) in enumerate(draws):
                     path = plan(policy, [X @ X_CB for X in viewpoint.X_WCs], views, v_WB, p_WG)
                     p_WB = (viewpoint.X_WCs[-1] @ X_CB).translation()
-                    clearance = float(viewpoint.field.distance(path).min()) - VEHICLE_RADIUS
+                    # Outside the field, where distance is NaN, nothing is known to be hit.
+                    nearest = np.nanmin(viewpoint.field.distance(path), initial=np.inf)
+                    clearance = float(nearest) - VEHICLE_RADIUS
                     before, after = (np.linalg.norm(p_WG - p) for p in (p_WB, path[-1]))
                     measured = seen, clearance, float(before - after), *map(float, path[-1])
                     rows.append(Row(scene, name, kind, viewpoint.name, draw, *measured))

@@ -179,13 +179,16 @@ def run(
 
     rows, damaged = _read_flights(folder, specs)
     missing = [spec for spec in specs if spec.id not in rows]
-    if rows and missing:
+    if rows:
         for name, version in folder.program().items():
-            if flown_by.get(name) != version:
+            # A complete study may be read by another program, but not as one of other policies.
+            is_needed = missing or name.startswith("system of ")
+            if is_needed and flown_by.get(name) != version:
                 raise ValueError(
                     f"{name} of {out} must be {version}, with which it was started, got "
                     f"{flown_by.get(name)}; use that one or choose another --out"
                 )
+    if rows and missing:
         print(f"{len(rows)} of {len(specs)} flights exist already.")
     if missing:
         folder.record(config, flown_by)

@@ -21,6 +21,7 @@ import shutil
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -371,13 +372,23 @@ def plugin_digests(scenarios: Iterable[Scenario]) -> dict[str, str]:
 
 
 def source_digest(function: Callable[..., Any]) -> str:
-    """Returns a digest of the source of a function or callable object, or else of its name."""
+    """Returns a digest of the source of a function or callable object, or else of its name, and of
+    the values that it holds as a closure, as defaults, or as a `functools.partial`."""
     code = function if hasattr(function, "__code__") else type(function)
+    held: list[Any] = [*(getattr(function, "__defaults__", None) or ())]
+    held += [cell.cell_contents for cell in getattr(function, "__closure__", None) or ()]
+    if isinstance(function, partial):
+        code, held = function.func, [*function.args, *sorted(function.keywords.items())]
     try:
         text = inspect.getsource(code)
     except (OSError, TypeError):
         text = getattr(code, "__qualname__", repr(code))
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
+    return hashlib.sha256("\n".join([text, *map(_described, held)]).encode()).hexdigest()[:16]
+
+
+def _described(value: Any) -> str:
+    text = source_digest(value) if hasattr(value, "__code__") else repr(value)
+    return type(value).__qualname__ if " at 0x" in text else text  # An address is of one process.
 
 
 def _source_digest(package: str) -> str:

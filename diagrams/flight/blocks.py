@@ -202,7 +202,10 @@ def _add_delay(
     output: OutputPort,
     delay: Sequence[float],
 ) -> OutputPort:
-    is_periodic = policy.GetUniquePeriodicDiscreteUpdateAttribute() is not None
+    update = policy.GetUniquePeriodicDiscreteUpdateAttribute()
+    is_periodic = update is not None
+    at_zero = update is None or update.offset_sec() == 0.0
+    require(at_zero, "decision_delay", "empty for a policy that first updates after time 0", delay)
     condition = "empty for a policy without a periodic discrete update"
     valid = is_periodic or getattr(policy, "rate", None) is not None
     require(valid, "decision_delay", condition, delay, "declare one in the policy")
@@ -384,7 +387,7 @@ def AddObservation(
 
     # Sensor and noise.
     period, is_grid = decision_period(scenario, policy), "depth_grid" in names
-    rest = config, 1 / period, scenario.seed
+    rest = config, 1 / period, scenario.seed, frames.number
     changes: list[tuple[str, System]] = []
     if depth_sensor is not None:
         changes.append(("depth_sensor", DepthSensor(depth_sensor, *rest)))

@@ -5,7 +5,7 @@ import inspect
 import sys
 import weakref
 from collections.abc import Callable, Sequence
-from copy import copy
+from copy import copy, deepcopy
 from dataclasses import fields, replace
 from typing import Any, Protocol, TypeVar, cast
 
@@ -13,6 +13,7 @@ import numpy as np
 from pydrake.autodiffutils import AutoDiffXd
 from pydrake.common.value import Value
 from pydrake.geometry import Meshcat
+from pydrake.symbolic import Expression
 from pydrake.systems import sensors
 from pydrake.systems.framework import (
     BasicVector_,  # pyright: ignore[reportAttributeAccessIssue]
@@ -192,7 +193,7 @@ class _SystemTemplate(TemplateSystem):
 
 def _kept(argument: Any) -> Any:
     """Returns an argument, or a copy if its owner may change it."""
-    return copy(argument) if isinstance(argument, Config | np.ndarray) else argument
+    return deepcopy(argument) if isinstance(argument, Config | np.ndarray) else argument
 
 
 def system_template(
@@ -278,7 +279,7 @@ class ConfigParameter:
 
     def __init__(self, system: Any, scalar: Any, config: Config, names: Sequence[str] = ()) -> None:
         """Declares the parameter; `names` are the fields it has, all by default."""
-        self._config = config
+        self._config = config = deepcopy(config)  # Its owner may change it.
         self.names = names or [field.name for field in fields(config)]  # pyright: ignore
         defaults = np.hstack([getattr(config, name) for name in self.names]).tolist()
         self._defaults = defaults if scalar is float else None
@@ -301,13 +302,21 @@ class ConfigParameter:
         return values
 
     def set(self, context: Context, name: str, value: Any) -> None:
-        """Sets a field; raises ValueError if the configuration is invalid with it."""
+        """Sets a field, a number or a sequence of numbers; raises ValueError if the configuration
+        is invalid with it. Symbolic values are not checked."""
         vector = context.get_mutable_numeric_parameter(self._index)
-        numbers = self._by_name(float_values(vector.CopyToVector()).tolist())
-        changed = [*map(float_values, value)] if isinstance(value, list) else float_values(value)
-        replace(self._config, **numbers | {name: changed}).validate()  # pyright: ignore
-        start = sum(np.size(numbers[each]) for each in self.names[: self.names.index(name)])
-        for k, number in enumerate(value if isinstance(value, list) else [value]):
+        is_list = isinstance(getattr(self._config, name), list)
+        condition = "a list of numbers" if is_list else "a number"
+        require(is_list == (np.ndim(value) == 1), name, condition, value)
+        values, numbers = list(value) if is_list else [value], vector.CopyToVector()
+        if not isinstance(numbers[0], Expression):
+            known = self._by_name(float_values(numbers).tolist())
+            changed = [*map(float_values, values)] if is_list else float_values(value)
+            replace(self._config, **known | {name: changed}).validate()  # pyright: ignore
+        sizes = {each: np.size(getattr(self._config, each)) for each in self.names}
+        start = sum(sizes[each] for each in self.names[: self.names.index(name)])
+        require(len(values) == sizes[name], name, f"{sizes[name]} numbers", len(values))
+        for k, number in enumerate(values):
             vector.SetAtIndex(start + k, number)
 
 

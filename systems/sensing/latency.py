@@ -56,6 +56,14 @@ class FrameTimes:
         [age] = frame_ages(self.delays[None], rate, phase, self.lookback, now)
         return float(age) + self.before
 
+    def number(self, time: float) -> int | None:
+        """Returns the number, from `CYCLE` on, of the last frame that arrived at a time [s]; None
+        without a rate."""
+        if self.rate is None:
+            return None
+        taken = time - self.age(time) + self.before
+        return round(taken * self.rate - self.phase) + CYCLE
+
     @property
     def oldest(self) -> float:
         """Maximum age [s]."""

@@ -6,6 +6,7 @@ them, in `training/policies/augmentation.py`.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar, cast
 
@@ -174,18 +175,27 @@ def corrupt_color(color: Any, noise: ObservationNoise, brighter: Any, grain: Any
 class ImageChange(LeafSystem):
     """Base of systems that change images of a `camera`, by a `config`.
 
-    Stateless: the noise follows from the seed and the image's number, the time in units of 1 /
-    `rate` [Hz], so that evaluations at one time agree. Types differ in their `stream`.
+    Stateless: the noise follows from the seed and the image's number, `frame_number` of a time [s]
+    or, if that is None, the time in units of 1 / `rate` [Hz], so that evaluations of one image
+    agree. Types differ in their `stream`.
     """
 
     port: ClassVar[str]
     image: ClassVar[type]
     stream: ClassVar[tuple[int, ...]] = ()
 
-    def __init__(self, config: Config, camera: OnboardCamera, rate: float, seed: int) -> None:
+    def __init__(
+        self,
+        config: Config,
+        camera: OnboardCamera,
+        rate: float,
+        seed: int,
+        frame_number: Callable[[float], int | None] = lambda time: None,
+    ) -> None:
         super().__init__()
         config.validate()
         self.config: Any = config
+        self._frame_number = frame_number
         self.camera, self._rate, self._seed = camera, rate, seed
         blank = self.image(camera.width, camera.height)
         self.DeclareAbstractInputPort(self.port, Value(blank))
@@ -193,7 +203,9 @@ class ImageChange(LeafSystem):
 
     def _calc(self, context: Context, output: AbstractValue) -> None:
         image = np.asarray(cast(Any, self.get_input_port().Eval(context)).data)
-        number = round(context.get_time() * self._rate)
+        time = context.get_time()
+        if (number := self._frame_number(time)) is None:
+            number = math.floor(time * self._rate + 1e-6)
         random = np.random.default_rng([self._seed, number, *self.stream])
         pixels = cast(Any, output.get_mutable_value()).mutable_data
         pixels[:] = self.changed(image, random)

@@ -313,10 +313,12 @@ class SplatCamera(LeafSystem):
 
     def SetX_BC(self, context: Context, X_BC: RigidTransform) -> None:
         """Sets the camera's pose in the body, in this system's Context."""
+        self.ValidateContext(context)
         context.get_mutable_abstract_parameter(self._mount_index).set_value(X_BC)
 
     def SetCameraInfo(self, context: Context, camera_info: CameraInfo) -> None:
         """Sets the intrinsics, in this system's Context; the image keeps its size."""
+        self.ValidateContext(context)
         sizes = [f"{info.width()}x{info.height()}" for info in (self._camera_info, camera_info)]
         require(sizes[0] == sizes[1], "the image size", f"{sizes[0]} pixels", sizes[1])
         context.get_mutable_abstract_parameter(self._info_index).set_value(camera_info)

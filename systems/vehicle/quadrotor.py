@@ -307,7 +307,8 @@ def actuated_derivatives(
 
 
 def charge_rate(thrust: Any, params: QuadrotorParams) -> Any:
-    """Returns the rate [1/s] of the charge at a thrust over mass [m/s^2]."""
+    """Returns the rate [1/s] of the charge at a thrust over mass [m/s^2]; `battery_endurance` is
+    that at standard gravity."""
     power = maximum(thrust / GRAVITY, _TINY)
     return -power * sqrt(power) * (1.0 / params.battery_endurance)  # x / inf of AutoDiffXd is NaN
 
@@ -481,6 +482,10 @@ def QuadrotorPlant_(T):
             """Sets a number of the configuration, or a list of numbers, in a Context."""
             known = self._parameters[0].names
             require(name in known, "name", f"one of {', '.join(known)}", name)
+            if name == "motor_time_constant":  # The thrust is a state only if it is not 0.
+                has_lag = bool(self._parameters[0].config(context).motor_time_constant)
+                remedy = "construct another plant"
+                require(has_lag == bool(value), name, "0 only if it was", value, remedy)
             parameter_setter(name)(self, context, value)
 
         def get_input_port(self, port_index=0):

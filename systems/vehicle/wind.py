@@ -93,7 +93,8 @@ def DrydenWind_(T):
         - ``wind`` (3): v_WA [m/s] of the air in W, held for ``period`` [s].
         - Discrete state (5), see `dryden_filter`: it begins with a draw of its stationary
           distribution, and its noise follows from the seed and the time.
-        - Numeric parameter 0 (4): ``[mean (3) [m/s], gusts [m/s]]``.
+        - Numeric parameter 0 (4): ``[mean (3) [m/s], gusts [m/s]]``. Gusts keep the direction
+          of the constructor's mean.
 
         Supports the scalars float, AutoDiffXd and Expression.
         """

@@ -1,6 +1,7 @@
 import csv
 from dataclasses import dataclass, field, replace
-from typing import ClassVar
+from types import SimpleNamespace
+from typing import Any, ClassVar
 
 import cv2
 import numpy as np
@@ -9,11 +10,20 @@ from pydrake.math import RigidTransform, RollPitchYaw
 
 import splatpilot as sp
 from splatpilot.analysis.commands.main import main
-from splatpilot.analysis.gap import GapConfig, Row, View, _photograph, plan, run, summarize
+from splatpilot.analysis.gap import (
+    GapConfig,
+    Row,
+    View,
+    _photograph,
+    captured_viewpoints,
+    plan,
+    run,
+    summarize,
+)
 from splatpilot.systems.policies.base import Policy
 from splatpilot.systems.policies.hypotheses import Hypotheses, hypotheses_size
 from splatpilot.systems.policies.velocity import RESPONSE_TIME
-from splatpilot.training.captures.capture import pixel_rays
+from splatpilot.training.captures.capture import Capture, pixel_rays
 
 SMALL = {"policies": ["diffaero"], "viewpoints": 3, "draws": 2, "frames": 2, "generated": ["P10"]}
 
@@ -39,6 +49,18 @@ class Fixed(Policy):
 
 
 START = RigidTransform([1.0, 2.0, 3.0])
+
+
+def test_frames_at_which_a_vehicle_would_collide_are_left_out():
+    at = [RigidTransform([0.2 * k, 0.0, 0.0]) for k in range(10)]
+    capture = Capture("c", "a test", np.eye(3), 8, 8, at, lambda i: np.zeros((8, 8, 3), np.uint8))
+
+    def distance(p_WQ):  # a wall at 1 m, and nothing known beyond 1.7 m
+        return np.where(p_WQ[..., 0] > 1.7, np.nan, abs(p_WQ[..., 0] - 1.0))
+
+    world: Any = SimpleNamespace(distance_field=SimpleNamespace(distance=distance))
+    chosen = captured_viewpoints(capture, world, GapConfig(viewpoints=30, frames=1))
+    assert [viewpoint.name for viewpoint in chosen] == [f"frame {k}" for k in (0, 1, 2, 3, 7, 8, 9)]
 
 
 def path_of(policy, v_WB, X_WBs=(START,)):

@@ -4,6 +4,7 @@ import shutil
 import signal
 import threading
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import pandas as pd
@@ -268,6 +269,20 @@ def test_systems_of_functions_fly_in_worker_processes_too(short, tmp_path):
     assert here.digest.tolist() == there.digest.tolist()
     with pytest.raises(ValueError, match="flown by a system that a function of Python made"):
         replay.run(study=out, id=there.id[0])
+
+
+def test_a_study_is_not_continued_by_a_function_that_holds_other_values(short, tmp_path):
+    def climbing(speed):
+        return lambda *_: speed and Climb()
+
+    def fly(make):
+        return sp.study(short, policies={"up": make}, seeds=1, jobs=1, out=tmp_path / "out")
+
+    fly(climbing(1.0))
+    assert len(fly(climbing(1.0))) == 1
+    for other in (climbing(2.0), partial(lambda a, *_: Climb(), 1.0)):
+        with pytest.raises(ValueError, match=r"system of up of .* must be"):
+            fly(other)
 
 
 def test_what_worker_processes_cannot_import_is_refused(short, monkeypatch):

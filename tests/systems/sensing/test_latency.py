@@ -3,7 +3,7 @@ import pytest
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
-from splatpilot.systems.sensing.latency import DecisionDelay, DelayedPose, FrameTimes
+from splatpilot.systems.sensing.latency import CYCLE, DecisionDelay, DelayedPose, FrameTimes
 from splatpilot.systems.vehicle.quadrotor import hover_state
 
 
@@ -49,6 +49,14 @@ class Counter(LeafSystem):
 
     def _update(self, context, discrete_state) -> None:
         discrete_state.set_value(context.get_discrete_state_vector().value() + 1.0)
+
+
+def test_a_frame_keeps_its_number_until_the_next_comes():
+    frames = FrameTimes(np.full(CYCLE, 0.01), rate=10.0, phase=0.25, lookback=3)
+    times = [0.036, 0.1, 0.134, 0.136, 0.2, 0.236]  # Frames come at 0.035, 0.135 and 0.235 s.
+    numbers = [frames.number(time) for time in times]
+    assert numbers == [CYCLE + k for k in (0, 0, 0, 1, 1, 2)]
+    assert FrameTimes.late(0.1).number(1.0) is None
 
 
 @pytest.mark.parametrize("delay", [(0.0, 0.08), (0.03, 0.03), (0.09, 0.09)])

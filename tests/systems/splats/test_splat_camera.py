@@ -250,6 +250,10 @@ def test_mount_and_intrinsics_are_parameters_of_the_context():
     assert np.abs(port.Eval(context).data - before).max() > 0.1
     expected = evaluate(SplatCamera(wall(5.0), info, X), "depth_image_32f", RigidTransform())
     np.testing.assert_array_equal(port.Eval(context).data, expected)
+    other = SplatCamera(wall(5.0), INFO, X_BC).CreateDefaultContext()
+    for change, value in ((camera.SetX_BC, X), (camera.SetCameraInfo, info)):
+        with pytest.raises(RuntimeError, match="Context"):
+            change(other, value)
     with pytest.raises(ValueError, match="image size must be 32x24 pixels, got 16x24"):
         camera.SetCameraInfo(context, CameraInfo(16, 24, 1.0))
 

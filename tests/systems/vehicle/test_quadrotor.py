@@ -7,7 +7,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from pydrake.autodiffutils import AutoDiffXd, ExtractGradient, ExtractValue, InitializeAutoDiff
-from pydrake.symbolic import Evaluate, MakeVectorVariable
+from pydrake.symbolic import Evaluate, Expression, MakeVectorVariable, Variable
 from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
@@ -380,10 +380,29 @@ def test_numbers_and_lists_are_parameters_of_the_context():
     after = derivatives_at(plant, state, context=context)
     assert after[5] == pytest.approx(before[5] - 9.81 / 2)
     assert after[3] == pytest.approx(before[3] - 1.0)
+    plant.SetParameter(context, "rotor_drag", np.array([0.4, 0.0, 0.0]))
+    with pytest.raises(ValueError, match=r"rotor_drag must be a list of numbers, got 0.1"):
+        plant.SetParameter(context, "rotor_drag", 0.1)
+    with pytest.raises(ValueError, match=r"motor_time_constant must be 0 only if it was, got 0"):
+        plant.SetParameter(context, "motor_time_constant", 0.0)
+    symbolic = QuadrotorPlant().ToSymbolic()
+    context = symbolic.CreateDefaultContext()
+    symbolic.SetDrag(context, Expression(Variable("drag")))
+    assert str(context.get_numeric_parameter(0).value()[0]) == "drag"
+    context = plant.CreateDefaultContext()
     with pytest.raises(ValueError, match=r"Kingfisher.mass must be in \(0, inf\) kg, got -1"):
         plant.SetParameter(context, "mass", -1.0)
     with pytest.raises(ValueError, match=r"name must be one of drag, .*, got model"):
         plant.SetParameter(context, "model", 1.0)
+
+
+def test_a_plant_keeps_its_configuration():
+    params = QuadrotorParams()
+    plant, state = QuadrotorPlant(params), hover_state([0.0, 0.0, 5.0])
+    state[3] = 1.0
+    before = derivatives_at(plant, state)
+    params.drag = 5.0
+    np.testing.assert_array_equal(derivatives_at(plant, state), before)
 
 
 @pytest.mark.parametrize(
