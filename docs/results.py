@@ -111,8 +111,12 @@ def keep_realism(folders: Sequence[Path]) -> None:
         writer.writeheader()
         writer.writerows(rows)
     flown = (folders[0] / "realism.csv").stat().st_mtime
-    program = StudyFolder(folders[0] / "ideal").program()["splatpilot"]
-    about = {"command": "python -m splatpilot.analysis.realism out/realism"}
+    ideal = StudyFolder(folders[0] / "ideal")
+    program, seeds = ideal.program()["splatpilot"], ideal.config().seeds
+    effects = [path.parent for path in folders[0].glob("*/study.yaml")]
+    effect_seeds = min(StudyFolder(path).config().seeds for path in effects)
+    command = f"python -m splatpilot.analysis.realism out/realism --seeds {seeds}"
+    about = {"command": f"{command} --effect-seeds {effect_seeds}"}
     about |= {"date": date.fromtimestamp(flown).isoformat(), "program": program}
     (RESULTS / "realism.yaml").write_text(yaml.safe_dump(about, sort_keys=False))
 
