@@ -16,6 +16,7 @@ from splatpilot.analysis import environments
 from splatpilot.analysis.commands import main as cli
 from splatpilot.analysis.commands.main import main
 from splatpilot.analysis.commands.options import Command
+from splatpilot.systems.common import registry
 from splatpilot.systems.common.progress import resumable
 from splatpilot.systems.common.registry import import_modules
 
@@ -57,7 +58,9 @@ def test_an_invalid_command_line_has_status_2_and_one_sentence(words, message, c
     assert message in error
 
 
-RENDER = "got a mesh; render a capture of it with `splatpilot capture render room.gltf"
+RENDER = (
+    "got a mesh; fly in it with `splatpilot fly --set 'world=!MeshWorld {path: room.gltf}'`, or"
+)
 
 
 @pytest.mark.parametrize(
@@ -283,8 +286,9 @@ def test_drake_prints_only_warnings(caplog):
 
 @pytest.fixture
 def failing(monkeypatch, tmp_path):
-    """Makes `splatpilot fly` raise."""
+    """Makes `splatpilot fly` raise, without plugins of other tests."""
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(registry, "_plugins", set())
 
     def fail(error: BaseException) -> int:
         def raise_error(options):
