@@ -188,6 +188,8 @@ def test_published_results_are_compared_with_unchanged_scenarios():
     assert {row["scenario"] for row in table} == {"dodgedrone_medium"}
     assert [(row["successes"], row["flights"]) for row in published] == [(187, 303), (130, 303)]
     assert all(row["speed"] is None for row in published)
+    courses = wilson_interval(187 / 303 * 101, 101)  # Three flights on each are alike.
+    assert (published[0]["wilson_lower"], published[0]["wilson_upper"]) == pytest.approx(courses)
     assert (slow["policy"], slow["speed"], slow["successes"], slow["flights"]) == (
         ("straight", 2.0, 1, 2)
     )
