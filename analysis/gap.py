@@ -177,7 +177,6 @@ def captured_viewpoints(capture: Capture, world: World, config: GapConfig) -> li
     free = np.flatnonzero(~(depth_field.distance(p_WCs) <= VEHICLE_RADIUS))
     require(len(free), capture.name, f"with a frame {VEHICLE_RADIUS} m from surfaces", "none")
     print(f"{capture.name}: a vehicle would be free at {len(free)} of {len(capture)} frames")
-    chosen = np.unique(np.linspace(0, len(free) - 1, config.viewpoints).round().astype(int))
     chosen = np.linspace(0, len(free) - 1, config.viewpoints).round().astype(int)
     viewpoints = []
     for last in free[np.unique(chosen)]:

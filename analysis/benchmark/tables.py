@@ -275,7 +275,8 @@ def external_table(rows: list[Row], config: StudyConfig) -> list[Row]:
                 flown = select(rows, scenario=scenario, policy=policy, speed=speed)
                 successes = sum(row["success"] for row in flown)
                 mean_speed = mean_column(flown, "mean_speed_m_s")
-                entries.append((policy, speed, mean_speed, successes, *2 * (len(flown),)))
+                flights = courses = len(flown)
+                entries.append((policy, speed, mean_speed, successes, flights, courses))
         for policy, speed, mean_speed, *counts in entries:
             row = {"scenario": scenario, "policy": policy, "speed": speed}
             table.append(row | {"mean_speed_m_s": mean_speed} | _success(*counts))

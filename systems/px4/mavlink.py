@@ -206,7 +206,7 @@ def _message(m: Any) -> list[Message]:
         case "COMMAND_ACK":
             if m.target_component not in (0, _ONBOARD_COMPUTER):
                 return []
-            if m.result == 0:
+            if m.result == _RESULTS.index("ACCEPTED"):
                 return [Granted(m.command)]
             result = _RESULTS[m.result] if m.result < len(_RESULTS) else f"result {m.result}"
             what = {SET_MODE: "a mode", ARM: "arming"}.get(m.command, f"command {m.command}")
