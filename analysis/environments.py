@@ -177,7 +177,7 @@ def make(
     The same call resumes. Rendered captures are kept in `scenes/captures/NAME`.
 
     Args:
-        names: of environments; all of the split if empty.
+        names: of environments; if empty, all of the split whose sources exist.
         data: folder of captures, meshes and OctoMaps.
         split: "train", "validation" or "test"; all of them if empty.
         overrides: settings of `RenderedSceneConfig`, after those of the entries.
@@ -191,10 +191,19 @@ def make(
         for name, entry in entries.items()
         if name in (names or entries) and (not split or entry.split == split)
     }
-    require(chosen, "names", f"of environments of the split {split}", ", ".join(names))
-    sources = {name: _source(entry, data) for name, entry in chosen.items()}
+    for name in names:
+        remedy = "leave out the split, or the name"
+        require(name in chosen, f"the split of {name}", split, entries[name].split, remedy)
+    require(chosen, "the split", "that of an environment", split)
     for entry in chosen.values():
         entry.config(overrides).validate()
+    sources = {name: _source(entry, data) for name, entry in chosen.items()}
+    for name, source in sources.items():
+        if isinstance(source, Path) and not source.exists():
+            if names:
+                require_existing(source, f"the capture, mesh or OctoMap of {name}")
+            print(f"{name}: is left out, without {source}", flush=True)
+            del chosen[name]
     failed = []
     for number, (name, entry) in enumerate(chosen.items(), 1):
         print(f"== {name} ({number} of {len(chosen)}), from {sources[name]}", flush=True)
@@ -273,7 +282,6 @@ def _source(entry: Entry, data: Path | None) -> Path | str:
         return entry.source
     if data is None:
         raise ValueError(f"No folder with {entry.source}; give --data or set {DATA}")
-    require_existing(data / entry.source, "a capture, a mesh or an OctoMap")
     return data / entry.source
 
 

@@ -31,7 +31,7 @@ from splatpilot.systems.common.files import (
 from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.common.validation import require
 from splatpilot.systems.splats.scene import GaussianScene
-from splatpilot.systems.splats.splat_files import read_splats
+from splatpilot.systems.splats.splat_files import read_splats, sog_meta
 from splatpilot.systems.visualization.meshcat_drawing import (
     GOAL_COLOR,
     MARKER_RADIUS,
@@ -81,7 +81,8 @@ def run(
             raise ValueError(
                 f"--set must be of a scenario or a capture, got {overrides[0]}; leave it out"
             )
-        shown = _scene(path) if path.is_dir() else _gaussians(path)
+        is_scene = (path / "scene.yaml").is_file()
+        shown = _scene(path) if is_scene else _gaussians(path)
     require_writable_folder(out.absolute().parent)
     meshcat = empty_meshcat(shown.background)
     draw_box(meshcat, "/splatpilot/bounds", shown.lower_W, shown.upper_W)
@@ -107,8 +108,8 @@ def generated_scenario(path: Path, seed: int | None, overrides: Sequence[str]) -
 
 
 def _may_hold_gaussians(path: Path) -> bool:
-    suffix = path.suffix.lower()
-    return path.is_file() and suffix not in _SCENARIOS | {OCTOMAP} and not is_video(path)
+    other = path.suffix.lower() in _SCENARIOS | {OCTOMAP} or is_video(path)
+    return sog_meta(path) is not None or (path.is_file() and not other)
 
 
 def _generated(scenario: Scenario) -> ViewerScene:
@@ -162,7 +163,8 @@ def _origin_notes(origin: Sequence[float]) -> list[str]:
 
 
 def _capture(path: Path, overrides: Sequence[str]) -> ViewerScene:
-    capture = read_capture(path, load_config(CaptureConfig(), overrides=list(overrides)))
+    fields = [override.removeprefix("capture.") for override in overrides]
+    capture = read_capture(path, load_config(CaptureConfig(), overrides=fields))
     gaussians = capture_gaussians(capture, _shown_frames(capture))
     if gaussians is None:
         raise ValueError(

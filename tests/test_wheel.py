@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from splatpilot.diagrams.flight.policies import BENCHMARK_POLICIES
+from splatpilot.analysis.benchmark.variants import BENCHMARK_POLICIES
 
 CHECKOUT = Path(__file__).parents[1]
 PACKAGE = CHECKOUT / "splatpilot"

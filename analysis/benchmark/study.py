@@ -12,6 +12,7 @@ import yaml
 from pydrake.systems.framework import System
 
 from splatpilot.analysis.benchmark.variants import (
+    BENCHMARK_POLICIES,
     LIVE,
     SCENARIO,
     ScenarioVariant,
@@ -22,7 +23,6 @@ from splatpilot.analysis.benchmark.variants import (
     parse_variant,
 )
 from splatpilot.diagrams.flight.policies import (
-    BENCHMARK_POLICIES,
     MAX_SPEED,
     POLICIES,
     policy_name,
@@ -205,6 +205,20 @@ def default_policies(scenarios: list[str]) -> list[str]:
     files = [scenario_file(parse_scenario(scenario).scenario) for scenario in scenarios]
     own = all(map(_has_own_policy, files))
     return [SCENARIO] if own else list(BENCHMARK_POLICIES)
+
+
+def own_speeds(config: StudyConfig) -> list[float]:
+    """Returns the speed of the scenarios' own policies, if no other ones fly; empty if they have
+    none or several."""
+    if config.policies != [SCENARIO]:
+        return []
+    files = {scenario_file(variant.scenario) for variant in config.scenario_variants}
+    speeds = [policy_speed(load_config(Scenario(), file).policy) for file in files]
+    return (
+        speeds[:1]
+        if isinstance(speeds[0], float) and speeds.count(speeds[0]) == len(speeds)
+        else []
+    )
 
 
 def _check_override(override: str, where: str) -> None:

@@ -16,6 +16,9 @@ SCENARIO = "scenario"
 LIVE = "live"
 """A policy that a function of Python makes for each flight, see `run_study.study`."""
 
+BENCHMARK_POLICIES = "planner", "straight", "reactive", "diffaero", "depthnav", "agile_autonomy"
+"""Default policies of a study: the planner, baselines and the published policies."""
+
 _LABEL = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+-]{0,79}")
 _WEIGHTS = "weights="
 _FIELD = r"[A-Za-z_][\w.]*="

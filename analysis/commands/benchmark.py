@@ -5,7 +5,12 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from splatpilot.analysis.benchmark.variants import scenario_sweep, split_policies, sweep
+from splatpilot.analysis.benchmark.variants import (
+    BENCHMARK_POLICIES,
+    scenario_sweep,
+    split_policies,
+    sweep,
+)
 from splatpilot.analysis.commands import options as cli
 from splatpilot.analysis.commands.checks import (
     SCENARIOS,
@@ -58,7 +63,7 @@ def _speed(text: str) -> float:
         "--policies A,B.npz,C:FIELD=VALUE,...",
         "names, files of weights or module:Class, with LABEL= before and fields after; "
         "'scenario' is each scenario's own policy, the default if all have one; otherwise the "
-        "default is all policies",
+        f"default is {', '.join(BENCHMARK_POLICIES)}",
         split_policies,
         resolve=check_policy,
     ),
@@ -76,7 +81,12 @@ def _speed(text: str) -> float:
         split_policies,
         resolve=check_study_scenario,
     ),
-    cli.Option("--speeds 2,3", "nominal speeds [m/s]; default: 2", _names, resolve=_speed),
+    cli.Option(
+        "--speeds 2,3",
+        "nominal speeds [m/s]; default: 2, or that of the scenarios' own policy",
+        _names,
+        resolve=_speed,
+    ),
     cli.Option(
         "--seeds N",
         "flights of each policy, scenario and speed; default: 20",
@@ -103,7 +113,7 @@ def benchmark(options: argparse.Namespace) -> Any:
     could be flown."""
     cli.announce(f"flying a study in {options.out}")
     from splatpilot.analysis.benchmark import run_study
-    from splatpilot.analysis.benchmark.study import StudyConfig, default_policies
+    from splatpilot.analysis.benchmark.study import StudyConfig, default_policies, own_speeds
     from splatpilot.analysis.benchmark.tables import DODGEDRONE_SPEEDS, PUBLISHED
 
     fields: dict[str, Any] = {"overrides": options.overrides}
@@ -122,6 +132,8 @@ def benchmark(options: argparse.Namespace) -> Any:
     config.scenarios = [":".join(each) for each in product(config.scenarios, *swept)]
     if "policies" not in fields:
         config.policies = default_policies(config.scenarios)
+    if "speeds" not in fields:
+        config.speeds = own_speeds(config) or config.speeds
     table = cli.call(run_study.run, options, config=config).table
     if table and all(row["infeasible"] == row["flights"] for row in table):
         raise cli.FailureWithResultError(
@@ -151,6 +163,10 @@ def replay(options: argparse.Namespace) -> None:
 
     first, *others = options.ids
     if others:
+        given = "--meshcat", "--video", "--rerun"
+        kinds = [flag for flag in given if getattr(options, flag[2:])]
+        remedy = "name one flight"
+        require(not kinds, f"{len(options.ids)} flights", "without options", kinds[0:], remedy)
         cli.call(replay.overlay, options)
     elif not cli.call(replay.run, options, id=first):
         raise ValueError(f"{first}: the replay differs from the recorded flight")

@@ -7,9 +7,11 @@ from pathlib import Path
 from splatpilot.analysis.benchmark.variants import SCENARIO, parse_scenario, parse_variant
 from splatpilot.diagrams.scenarios import benchmark_scenarios, other_scenarios, scenario_file
 from splatpilot.systems.common.files import (
+    SCENES,
     find_data,
     locate_scene,
     require_existing,
+    scenes_folder,
 )
 from splatpilot.systems.common.registry import check_name
 from splatpilot.systems.common.validation import did_you_mean, require
@@ -108,6 +110,7 @@ def check_kind(path: Path, *accepted: str) -> None:
 
             captures = map(CAPTURES.find, CAPTURES.names())
             kind = "capture" if any(each.recognizes(path) for each in captures) else ""
+            require(kind, str(path), _list_kinds(accepted), "a folder without scene.yaml")
     if kind and kind not in accepted:
         what, remedy = _KINDS[kind]
         require(False, str(path), _list_kinds(accepted), what, remedy.format(path=path))
@@ -132,8 +135,10 @@ def find_input(path: str, *accepted: str) -> str:
     scenarios = SCENARIOS if "scenario" in accepted else ()
     if path in scenarios:
         return path
-    hint = did_you_mean(path, scenarios)
-    scene = locate_scene(path) if "scene" in accepted else None
+    hint, scene = did_you_mean(path, scenarios), None
+    if "scene" in accepted:
+        scene = locate_scene(path)
+        hint = hint or f"scenes are also looked for in {scenes_folder()} ({SCENES})"
     found = scene or find_data(Path(path), _list_kinds(accepted), hint)
     check_kind(found, *accepted)
     return str(found)

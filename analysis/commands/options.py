@@ -196,11 +196,14 @@ def read_config(options: argparse.Namespace, **changes: Any) -> Any:
 
 
 def path_option(spec: str, what: str, *kinds: str, **keywords: Any) -> Option:
-    """Declares an option or argument for existing paths, with `what` there, of these kinds if any;
-    see `check_kind`."""
+    """Declares an option or argument for existing paths, with `what` there, of these kinds if any,
+    see `check_kind`; scenes may be given by name, see `locate_scene`."""
 
     def check(path: Path) -> Path:
-        require_existing(path, what)
+        if "scene" in kinds:
+            path = require_scene(str(path))
+        else:
+            require_existing(path, what)
         if kinds:
             checks.check_kind(path, *kinds)
         return path
@@ -249,15 +252,10 @@ def read_scenario(options: argparse.Namespace) -> "Scenario":
     if options.speed is not None:
         scenario.policy = at_speed(scenario.policy, options.speed)
     if options.scene is not None:
-        scenario.world = scene_config(require_scene(str(options.scene)).absolute())
+        scenario.world = scene_config(options.scene.absolute())
     if options.seed is not None:
         scenario.seed = options.seed
     return sample_scenario(load_config(scenario, overrides=options.overrides))
-
-
-def _check_scene(path: Path) -> Path:
-    checks.check_kind(require_scene(str(path)), "scene", "gaussians", "map")
-    return path
 
 
 SCENARIO_OPTIONS = (
@@ -274,11 +272,10 @@ SCENARIO_OPTIONS = (
         completions=checks.POLICY_NAMES,
     ),
     Option("--speed M/S", "nominal speed of the policy", float),
-    Option(
+    path_option(
         "--scene DIR_OR_FILE",
         "fly in this scene folder, file of Gaussians (meters, z up) or OctoMap (.bt)",
-        Path,
-        resolve=_check_scene,
+        *("scene", "gaussians", "map"),
     ),
     Option("--seed", "seed of the world and the start", int),
     set_option(

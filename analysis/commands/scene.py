@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 from splatpilot.analysis.commands import options as cli
-from splatpilot.analysis.commands.checks import check_kind
 from splatpilot.analysis.commands.flight import WORLD_FIELDS
 from splatpilot.systems.common.extras import import_extra
 
@@ -64,7 +63,7 @@ def scale(options: argparse.Namespace) -> None:
 
 @cli.command(
     "scene measure",
-    cli.path_option("scene", "a scene folder"),
+    cli.path_option("scene", "a scene folder", "scene"),
     cli.OVERWRITE,
     examples=("scene measure scenes/room_metric", "scene measure scenes/hospital --overwrite"),
 )
@@ -72,7 +71,6 @@ def measure(options: argparse.Namespace) -> None:
     """Writes metrics.json (PSNR, SSIM, LPIPS, depth errors, floaters) and views.png into a scene
     folder. `splatpilot reconstruct` has written them already."""
     cli.announce(f"measuring {options.scene}")
-    check_kind(options.scene, "scene")
     from splatpilot.analysis.reconstruction import measure_scene
 
     cli.call(measure_scene.run, options)
@@ -151,7 +149,7 @@ def ablate(options: argparse.Namespace) -> None:
 
 @cli.command(
     "scene fidelity",
-    cli.path_option("scenes", "a scene folder", nargs="+", metavar="SCENE"),
+    cli.path_option("scenes", "a scene folder", "scene", nargs="+", metavar="SCENE"),
     cli.out_option("output folder", "out/fidelity"),
     cli.OVERWRITE,
     cli.set_option(
@@ -167,8 +165,6 @@ def fidelity(options: argparse.Namespace) -> None:
     """Renders scenes from poses off their captures' paths, compares with the truth or, without it,
     with other frames, and writes the trusted distance from the path into each scene.yaml."""
     cli.announce(f"comparing views off the path of {len(options.scenes)} scenes in {options.out}")
-    for scene in options.scenes:
-        check_kind(scene, "scene")
     from splatpilot.analysis.reconstruction import fidelity
 
     cli.call(fidelity.run, options, config=cli.read_config(options))

@@ -210,9 +210,8 @@ def _add_delay(
     valid = is_periodic or getattr(policy, "rate", None) is not None
     require(valid, "decision_delay", condition, delay, "declare one in the policy")
     name, period = output.get_name(), decision_period(scenario, policy)
-    system = DecisionDelay(
-        name, output.size(), period, delay, scenario.seed, at_once=not is_periodic
-    )
+    step, seed = scenario.controller.period, scenario.seed
+    system = DecisionDelay(name, output.size(), period, delay, step, seed, not is_periodic)
     builder.AddNamedSystem(f"delayed_{name}", system)
     builder.Connect(output, system.get_input_port())
     return system.get_output_port()

@@ -121,9 +121,6 @@ for _name, _config, _system in (
         _config, lambda config, world, scenario, system=_system: system(config), name=_name
     )
 
-BENCHMARK_POLICIES = "planner", "straight", "reactive", "diffaero", "depthnav", "agile_autonomy"
-"""Default policies of a study."""
-
 DEFAULT_SPEED, MAX_SPEED = 2.0, 20.0
 """[m/s] Default nominal speed of policies, and its maximum."""
 

@@ -201,7 +201,7 @@ class FlightEnv(gymnasium.Env):
         world = self._find_world(replace(self.config.scenario, seed=world_seed))
         self._take(self._find_flight(scenario, world))
         if only_start_is_random(self.config.scenario):
-            self._restart(scenario, world)
+            self._restart(scenario)
         else:
             context = self.simulator.get_mutable_context()
             self.diagram.SetRandomContext(context, RandomGenerator(scenario.seed))
@@ -214,8 +214,9 @@ class FlightEnv(gymnasium.Env):
         self._steps, self._ended = 0, False
         return self._observe(), {}
 
-    def _restart(self, scenario: Scenario, world: World) -> None:
+    def _restart(self, scenario: Scenario) -> None:
         """Sets the Context of the diagram of a world to the start of a flight."""
+        world = self.parts.world
         state, p_WG = sample_initial_state(scenario, world), goal_position(scenario, world)
         context = self.simulator.get_mutable_context()
         context.SetTime(0.0)
@@ -231,12 +232,12 @@ class FlightEnv(gymnasium.Env):
         """Flies for one period with an action in [-1, 1]."""
         if self._ended:
             raise gymnasium.error.ResetNeeded("the flight must be begun by reset() before step()")
-        config, before = self.config, self._vehicles
+        config, scenario, before = self.config, self.parts.scenario, self._vehicles
         actions = require_actions(action, cast(Box, self.action_space).shape)[None]
         decision = decisions(config, actions, self._estimates)
         self._action.FixValue(self.simulator.get_mutable_context(), decision[0])
         self._steps += 1
-        flight, period = self._flight, config.scenario.controller.period
+        flight, period = self._flight, scenario.controller.period
         periods = round(self.time_step / period)
         if flight.native:
             outcome = flight.native.step(decision, periods)
@@ -244,7 +245,7 @@ class FlightEnv(gymnasium.Env):
         else:
             # The time of the controller's update as Drake computes it, which saves a tiny step.
             end = self._steps * periods * period
-            self.simulator.AdvanceTo(min(end, config.scenario.timeout))
+            self.simulator.AdvanceTo(min(end, scenario.timeout))
             outcome = flight.parts.monitor.outcome(flight.monitor_context)
             self._vehicles = flight.vehicles()
         transition = Transition(
@@ -257,7 +258,7 @@ class FlightEnv(gymnasium.Env):
             reached=np.array([outcome is Outcome.GOAL]),
             failed=np.array([outcome in (Outcome.COLLISION, Outcome.LEFT_VOLUME)]),
             duration=self.time_step,
-            radius=config.scenario.vehicle.radius,
+            radius=scenario.vehicle.radius,
         )
         reward = np.asarray(config.reward(transition))
         require(reward.shape == (1,), "shape of the reward", "(N,) = (1,)", reward.shape)

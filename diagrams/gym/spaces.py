@@ -17,6 +17,7 @@ from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.scenarios import scenario_file
 from splatpilot.systems.collision.distance_field import soft_barrier
 from splatpilot.systems.common.config import load_config
+from splatpilot.systems.common.distributions import is_distribution
 from splatpilot.systems.common.validation import (
     MAX_SEED,
     Config,
@@ -252,7 +253,7 @@ def decisions(
     """
     scaled = actions * config.limits()
     if config.action == "command":
-        scaled[..., 0] += GRAVITY
+        scaled[..., 0] += config.gravity
         return scaled
     p_WB, _, q_WB, _ = QuadrotorState.of(states)
     cos, sin = _heading(q_WB)
@@ -325,8 +326,8 @@ class FlightEnvConfig(Config):
         valid = len(limits) in (0, size) and np.isfinite(limits).all()
         require_field(self, "action_limits", valid, f"{size} finite numbers, or empty")
         if limits and self.action == "command":
-            condition = f"at most g = {GRAVITY} m/s^2 for the thrust, which must not be negative"
-            require_field(self, "action_limits", limits[0] <= GRAVITY, condition)
+            condition = f"at most {self.gravity} m/s^2, as the thrust must not be negative"
+            require_field(self, "action_limits", limits[0] <= self.gravity, condition)
         steps = 1.0 / (self.rate * self.scenario.controller.period)
         valid = steps > 0.5 and abs(steps - round(steps)) < 1e-6
         condition = f"{1.0 / self.scenario.controller.period:g} Hz, the controller's, over a whole "
@@ -337,6 +338,12 @@ class FlightEnvConfig(Config):
         require_field(self, "reward", callable(self.reward), "a function of a Transition")
         valid = self.terminate is None or callable(self.terminate)
         require_field(self, "terminate", valid, "a function of a Transition, or None")
+
+    @property
+    def gravity(self) -> float:
+        """Acceleration of gravity [m/s^2]; Earth's, if it differs from flight to flight."""
+        gravity = self.scenario.vehicle.gravity
+        return GRAVITY if is_distribution(gravity) else gravity
 
     def observation_names(self) -> list[str]:
         """Returns the names of the observations."""
@@ -350,7 +357,10 @@ class FlightEnvConfig(Config):
 
     def limits(self) -> NDArray[np.float64]:
         """Returns the scale (n,) of actions."""
-        return np.array(self.action_limits or _LIMITS[self.action])
+        limits = np.array(self.action_limits or _LIMITS[self.action])
+        if self.action == "command" and not self.action_limits:
+            limits[0] = self.gravity
+        return limits
 
     def terminates(self, transition: Transition) -> NDArray[np.bool_]:
         """Returns the flights (N,) that end by `terminate`."""

@@ -1,6 +1,5 @@
 """VectorFlightEnv: many flights as one Gymnasium environment, flown as arrays by native code."""
 
-import os
 from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import replace
@@ -17,7 +16,12 @@ from numpy.typing import ArrayLike, NDArray
 from splatpilot import _native
 from splatpilot.diagrams.flight.flight_diagram import camera_info, camera_mount
 from splatpilot.diagrams.flight.monitor import ENDS, Outcome
-from splatpilot.diagrams.flight.scenario import Scenario, goal_position, sample_initial_state
+from splatpilot.diagrams.flight.scenario import (
+    Scenario,
+    goal_position,
+    sample_initial_state,
+    sample_scenario,
+)
 from splatpilot.diagrams.gym.spaces import (
     IMAGES,
     TERMINATED,
@@ -33,6 +37,7 @@ from splatpilot.diagrams.gym.spaces import (
 )
 from splatpilot.diagrams.gym.world_pool import PACK, WorldPool, require_supported
 from splatpilot.diagrams.worlds.world import World
+from splatpilot.systems.common.processes import available_cores
 from splatpilot.systems.common.validation import MAX_SEED, require, require_type
 from splatpilot.systems.sensing.latency import CYCLE
 from splatpilot.systems.splats.baked_scene import BatchRenderer
@@ -99,6 +104,7 @@ class VectorFlightEnv(VectorEnv):
         require(scenarios, "scenario", "one or several scenarios", scenarios)
         valid = world is None or fields.get("num_worlds", 1) == 1
         require(valid, "num_worlds", "1 with a world", fields.get("num_worlds"))
+        require(world is None or pool is None, "world", "left out with a pool", world)
         configs = [env_config(each, **fields) for each in scenarios]
         self.num_envs, self.render_mode, self.config = num_envs, render_mode, configs[0]
         self._mode = AutoresetMode(autoreset_mode)
@@ -108,7 +114,7 @@ class VectorFlightEnv(VectorEnv):
             "render_fps": self.config.rate,
         }
         for config in configs:
-            require_supported(config)
+            require_supported(config, sample_scenario(config.scenario))
         self.single_observation_space = observation_space(self.config)
         self.single_action_space = action_space(self.config)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -126,7 +132,7 @@ class VectorFlightEnv(VectorEnv):
             "steps": count,
             "step": period / count,
         }
-        threads = threads or os.cpu_count() or 1
+        threads = threads or available_cores()
         self._threads, self._renderer = _native.FlightThreads(threads), BatchRenderer(threads)
         self.pool = pool or WorldPool(configs, world)
         same = self.pool.matches(configs)
@@ -163,7 +169,7 @@ class VectorFlightEnv(VectorEnv):
             field_states=self._field_states,
             ends=self._ends,
         )
-        self._is_seeded = False
+        self._begun = np.zeros(n, bool)  # by a reset that did not fail
         self._last: Any = None  # observations, if environments are reset by masks
 
     @property
@@ -216,10 +222,10 @@ class VectorFlightEnv(VectorEnv):
             flights = np.broadcast_to(np.asarray(options["flight"], int), rows.shape)
             condition = f"in [0, {len(self.pool)})"
             require(self._in_pool(flights), "flight", condition, flights.tolist())
-        self._begin(rows, flights)
         points = {name: list(options[name]) for name in ("start", "goal") if name in options}
-        if points:
-            self._move(rows, points)
+        self._begun[rows] = False  # also if this fails
+        self._begin(rows, flights, points)
+        self._begun[rows] = True
         return self._observe_again(rows), self._drawn(mask)
 
     def _drawn(self, mask: NDArray[np.bool_]) -> dict[str, Any]:
@@ -234,7 +240,7 @@ class VectorFlightEnv(VectorEnv):
         return infos | {f"_{name}": mask.copy() for name in infos}
 
     def _move(self, rows: NDArray[np.intp], points: dict[str, list[float]]) -> None:
-        """Moves start or goal of flights that have not begun."""
+        """Moves start or goal of flights."""
         for row in rows:
             flight = self._flight[row]
             world = self.pool.worlds[self.pool.world[flight]]
@@ -245,23 +251,29 @@ class VectorFlightEnv(VectorEnv):
             self._distances[row] = world.distance_field.distance(self._states[row, :3])
 
     def _seed(self, seed: int | Sequence[int | None] | None, mask: NDArray[np.bool_]) -> None:
-        if seed is None and self._is_seeded:
-            return
-        if seed is None or isinstance(seed, int | np.integer):
-            super().reset(seed=None if seed is None else int(seed))
-            first = int(self.np_random.integers(MAX_SEED)) if seed is None else int(seed)
-            seeds = [first + i for i in range(self.num_envs)]
-        else:
+        seeds: list[int | None] = [None] * self.num_envs
+        if isinstance(seed, int | np.integer):
+            super().reset(seed=int(seed))
+            seeds = [int(seed) + i for i in range(self.num_envs)]
+        elif seed is not None:
             seeds = list(seed)
             condition = f"a number, or {self.num_envs} numbers"
             require(len(seeds) == self.num_envs, "seed", condition, f"{len(seeds)} numbers")
-        for i, each in enumerate(seeds):
-            if mask[i] and each is not None:
-                self._seeds[i], self._episodes[i] = each, 0
-        self._is_seeded = True
+        for i in np.flatnonzero(mask):
+            given = seeds[i]
+            if given is None and not self._begun[i]:
+                given = int(self.np_random.integers(MAX_SEED))
+            if given is not None:
+                self._seeds[i], self._episodes[i] = given, 0
 
-    def _begin(self, rows: NDArray[np.intp], flights: NDArray[np.intp] | None = None) -> None:
-        """Begins flights of the environments `rows`, drawn from the pool unless they are given."""
+    def _begin(
+        self,
+        rows: NDArray[np.intp],
+        flights: NDArray[np.intp] | None = None,
+        points: dict[str, list[float]] | None = None,
+    ) -> None:
+        """Begins flights of the environments `rows`, drawn from the pool unless they are given;
+        `points` moves their start or goal."""
         pool = self.pool
         if flights is None:
             drawn = _hash(_hash(self._seeds[rows]) + self._episodes[rows])
@@ -274,6 +286,8 @@ class VectorFlightEnv(VectorEnv):
         self._goal_radii[rows], self._field[rows] = pool.goal_radii[flights], pool.field[flights]
         self._previous[rows], self._count[rows] = 0.0, 0
         self._distances[rows] = pool.distances[flights]
+        if points:
+            self._move(rows, points)
         self._ends[rows], self._ended[rows] = 0, False
         if pool.is_delayed:  # Until the first action has come, that of zeros counts.
             zeros = self._previous[rows]
@@ -289,14 +303,17 @@ class VectorFlightEnv(VectorEnv):
         config = self.config
         given = require_actions(actions, self._previous.shape)
         resting = self._ended.copy()
+        late = ~self._begun
+        if self._mode is not AutoresetMode.NEXT_STEP:
+            late |= resting
+        if late.any():
+            ended = np.flatnonzero(late).tolist()
+            raise ResetNeeded(f"flights must be begun by reset() before step(), got {ended}")
         if resting.any():
-            if self._mode is not AutoresetMode.NEXT_STEP or not self._is_seeded:
-                ended = np.flatnonzero(resting).tolist()
-                raise ResetNeeded(f"flights must be begun by reset() before step(), got {ended}")
             self._begin(np.flatnonzero(resting))
         flying = ~resting
-        # By columns, which are several times faster to compute with.
-        before, p_WG = np.asfortranarray(self._states), np.asfortranarray(self._p_WG)
+        # Copies by columns, which are several times faster to compute with.
+        before, p_WG = (np.array(each, order="F") for each in (self._states, self._p_WG))
         decided = np.ascontiguousarray(decisions(config, given, before))
         if self.pool.is_delayed:
             self._delays[:] = self.pool.delays[self._flight, self._count % CYCLE]
@@ -317,7 +334,7 @@ class VectorFlightEnv(VectorEnv):
         terminated = ended ^ truncated
         transition = Transition(
             states=before,
-            next_states=np.asfortranarray(self._states),
+            next_states=np.array(self._states, order="F"),
             p_WG=p_WG,
             distances=self._distances,
             actions=given,
@@ -327,7 +344,7 @@ class VectorFlightEnv(VectorEnv):
             duration=self.time_step,
             radius=self.pool.radius,
         )
-        rewards = np.asarray(config.reward(transition), dtype=float)
+        rewards = np.array(config.reward(transition), dtype=float)
         valid = rewards.shape == (self.num_envs,)
         require(valid, "shape of the rewards", f"({self.num_envs},)", rewards.shape)
         if resting.any():
@@ -336,7 +353,7 @@ class VectorFlightEnv(VectorEnv):
         ends[own] = _TERMINATED
         ended, terminated = ended | own, terminated | own
         self._previous[flying] = given[flying]
-        self._decisions, self._ended = decided, ended
+        self._decisions[flying], self._ended = decided[flying], ended
         self._count += flying
         infos: dict[str, Any] = {}
         if ended.any():
@@ -385,7 +402,7 @@ class VectorFlightEnv(VectorEnv):
     def _observe(self, rows: NDArray[np.intp] | slice = slice(None)) -> Any:
         """Returns the observations of environments, in new arrays."""
         names = self.config.observation_names()
-        states, p_WG = (np.asfortranarray(each[rows]) for each in (self._states, self._p_WG))
+        states, p_WG = (np.array(each[rows], order="F") for each in (self._states, self._p_WG))
         vehicles = Vehicles(states, p_WG, self._distances[rows], self._gradients[rows])
         if "obstacle" in names:
             distances, gradients = np.empty(len(states)), np.empty((len(states), 3))
@@ -435,7 +452,7 @@ class VectorFlightEnv(VectorEnv):
         """Returns images (H, W, 3) of the scenario's camera, one of each vehicle."""
         if self.render_mode is None:
             return None
-        if not self._is_seeded:
+        if not self._begun.all():
             raise ResetNeeded("flights must be begun by reset() before render()")
         config = self.config.scenario.camera
         info, X_BC = camera_info(config), camera_mount(config)

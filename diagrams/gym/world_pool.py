@@ -25,6 +25,7 @@ from splatpilot.diagrams.worlds.world_registry import make_world
 from splatpilot.systems.collision.distance_field import DistanceField
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.shapes import AnalyticDistanceField, shape_rows
+from splatpilot.systems.common.distributions import is_distribution
 from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.common.validation import MAX_SEED, require, require_type
 from splatpilot.systems.policies.velocity import MAX_ACCELERATION, RESPONSE_TIME
@@ -69,11 +70,13 @@ class WorldPool:
             config = configs[number]
             seed = config.scenario.seed + k
             made = self._add(world or make_world(config.scenario.world, seed))
-            is_varied = config.scenario.appearance > 0.0
+            appearance = config.scenario.appearance
+            is_varied = is_distribution(appearance) or appearance > 0.0
             drawn = np.random.default_rng([config.scenario.seed, k])
             for i in range(_LOOKS if is_varied else _FLIGHTS):
                 flight_seed = int(drawn.integers(MAX_SEED))
                 scenario = sample_scenario(replace(config.scenario, seed=flight_seed))
+                require_supported(config, scenario)
                 if is_varied or i == 0:
                     self.worlds.append(
                         randomize_appearance(made, scenario.appearance, scenario.seed)
@@ -96,8 +99,8 @@ class WorldPool:
         )
         period = configs[0].scenario.controller.period
         # (F, CYCLE), of decisions, in periods
-        delays = np.array([decision_delays(s.decision_delay, s.seed) for s in self.scenarios])
-        self.delays = np.ceil(delays / period - 1e-9).astype(np.int32)
+        drawn = [decision_delays(s.decision_delay, s.seed, period) for s in self.scenarios]
+        self.delays = np.round(np.array(drawn) / period).astype(np.int32)
         self.is_delayed = bool(self.delays.any())
         self.seeds = np.array([s.seed for s in self.scenarios])  # (F,), of flights
         self.world_seeds = np.array(world_seeds)  # (F,)
@@ -175,9 +178,9 @@ def add_field(worlds: _native.FlightWorlds, field: DistanceField, name: str) -> 
     return worlds.add_shapes(shapes=rows, kinds=kinds, lower_W=field.lower_W, upper_W=field.upper_W)
 
 
-def require_supported(config: FlightEnvConfig) -> None:
-    """Raises ValueError for what `VectorFlightEnv` cannot fly, by the name of the field."""
-    scenario = sample_scenario(config.scenario)
+def require_supported(config: FlightEnvConfig, scenario: Scenario) -> None:
+    """Raises ValueError, with the name of the field, for what `VectorFlightEnv` cannot fly;
+    `scenario` is that of the configuration, drawn."""
     vehicle, simulator = scenario.vehicle, scenario.simulator
     scheme, estimator = simulator.integration_scheme, type(scenario.estimator).__name__
     images = [n for n in config.observation_names() if n in IMAGES]
@@ -240,6 +243,7 @@ def can_fly_natively(config: FlightEnvConfig, world: World) -> bool:
         and world.moving is None
         and not scenario.moving
         and config.camera.readout == 0.0
+        and scenario.camera.output_delay == 0.0
         and simulator.integration_scheme == "runge_kutta5"
         and not simulator.use_error_control
         and isinstance(world.distance_field, AnalyticDistanceField | Esdf)

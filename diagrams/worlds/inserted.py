@@ -143,5 +143,13 @@ def _insert(world: World, solids: list[Solid], esdf: Esdf, seed: int) -> World:
     box = esdf.lower_W, esdf.upper_W
     spec = WorldSpec(name, *box, solids, *ends, light=lambda _: light, seed=seed)
     gaussians = draw(spec, solids, light).merged_with(world.gaussians)  # the frontier stays last
+    observations = world.observations
+    if observations is not None:
+        surfaces = np.concatenate([_surface(solid.shape) for solid in solids])
+        observations = observations.with_surfaces(surfaces)
     frontier = world.num_frontier
-    return World(name, gaussians, esdf, esdf, world.background, *ends, num_frontier=frontier)
+    return World(
+        *(name, gaussians, esdf, esdf, world.background, *ends),
+        num_frontier=frontier,
+        observations=observations,
+    )

@@ -1,6 +1,6 @@
 """A world: its Gaussians, distance fields, start and goal."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -31,7 +31,8 @@ class World:
     num_frontier: int = 0  # last Gaussians, which close unobserved space
     observations: Observations | None = None  # of the capture; None if not known
     rendered: BakedScene | None = None  # for cameras, instead of the Gaussians
-    source: tuple[Any, int] | None = None  # the configuration and seed that make this world
+    # The configuration and seed that make this world; `replace` leaves them out.
+    source: tuple[Any, int] | None = field(default=None, init=False)
 
     def __eq__(self, other: object) -> bool:
         """Compares the configurations and seeds that make the worlds, or else the objects."""
@@ -67,6 +68,6 @@ class World:
 
     def recolored(self, gaussians: GaussianScene, background: Background) -> "World":
         """Returns this world with the colors of `gaussians`; shares the baked geometry."""
-        world = replace(self, gaussians=gaussians, background=background, source=None)
+        world = replace(self, gaussians=gaussians, background=background)
         vars(world)["baked"] = self.baked.recolored(gaussians.sh)
         return world

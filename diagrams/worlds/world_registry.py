@@ -75,7 +75,8 @@ def make_world(config: WorldConfig, seed: int) -> World:
     if not isinstance(world, World):
         name, made = type(config).__name__, type(world).__name__
         raise ValueError(f"result of make for {name} must be a World, got {made}")
-    made = replace(world, source=(copy.deepcopy(config), seed))
+    made = replace(world)
+    vars(made)["source"] = copy.deepcopy(config), seed
     if "baked" in vars(world):
         vars(made)["baked"] = world.baked
     return made

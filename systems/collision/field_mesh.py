@@ -70,7 +70,7 @@ def _surround(values: np.ndarray, layer: np.ndarray) -> np.ndarray:
 def require_mesh_name(path: Path) -> None:
     """Checks the suffix of a mesh file."""
     suffix = path.suffix.lower()
-    require(suffix in SUFFIXES, f"{path}: suffix", " or ".join(SUFFIXES), suffix)
+    require(suffix in SUFFIXES, f"{path}: suffix", " or ".join(SUFFIXES), suffix or "none")
 
 
 def write_mesh(path: Path, mesh: "trimesh.Trimesh") -> None:

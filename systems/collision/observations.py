@@ -4,7 +4,7 @@ the frontier, where observed free space ends."""
 import itertools
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -96,6 +96,19 @@ class Observations:
             keys, order, counts = _grouped([keys - offset, keys, keys + offset])
             directions = np.bitwise_or.reduceat(np.tile(directions, 3)[order], _starts(counts))
         return keys, directions
+
+    def with_surfaces(self, p_WQ: NDArray[np.float64]) -> "Observations":
+        """Returns the voxels and those of points (N, 3) [m], which are seen from all directions."""
+        added = np.unique(np.floor(p_WQ / self.voxel_size).astype(np.int64), axis=0)
+        key, order, counts = _grouped([self._keys, _key(added)])
+        seen = np.concatenate([self.counts, np.ones(len(added), np.uint16)])[order]
+        directions = np.concatenate([self.directions, np.full(len(added), _FLAGS.sum(), np.uint32)])
+        return replace(
+            self,
+            voxels=_voxel(key).astype(np.int32),
+            counts=np.maximum.reduceat(seen, _starts(counts)),
+            directions=np.bitwise_or.reduceat(directions[order], _starts(counts)),
+        )
 
     def scaled_by(self, factor: float) -> "Observations":
         """Returns the voxels with all lengths from the origin times `factor`, without views."""

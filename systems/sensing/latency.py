@@ -144,21 +144,25 @@ class DelayedPose(LeafSystem):
         output.set_value(pose_from_state(state))
 
 
-def decision_delays(delay: Sequence[float], seed: int) -> np.ndarray:
-    """Draws the delays (CYCLE,) [s] of decisions from U(`delay`), in turn; zeros if it is empty."""
+def decision_delays(delay: Sequence[float], seed: int, step: float) -> np.ndarray:
+    """Draws the delays (CYCLE,) [s] of decisions from U(`delay`), in turn, rounded up to the times
+    of what follows decisions every `step` [s]; zeros if `delay` is empty."""
     low, high = delay or (0.0, 0.0)
-    return np.random.default_rng([seed, CYCLE, 1]).uniform(low, high, CYCLE)
+    drawn = np.random.default_rng([seed, CYCLE, 1]).uniform(low, high, CYCLE)
+    return step * np.ceil(drawn / step - 1e-9)
 
 
 class DecisionDelay(LeafSystem):
     """Delays an output of a policy by the time of inference and of the link to the controller.
 
     Its input and its output have the output's name and size. The decision at time t comes at t + d,
-    with d drawn for each from U(`delay`) [s]; the newest that has come is held.
+    with d drawn for each by `decision_delays`; the newest that has come is held. A `command`, which
+    the plant integrates, changes at multiples of `step` only.
 
     Args:
         period: time between decisions [s].
         delay: min and max [s]; the max is above 0.
+        step: period [s] of the controller, which follows decisions.
         seed: equal delays follow from equal seeds.
         at_once: if the input at time t is already the decision of that time; a policy with a
             discrete update decides at the same instant, and the input is still the one before.
@@ -170,41 +174,53 @@ class DecisionDelay(LeafSystem):
         size: int,
         period: float,
         delay: Sequence[float],
+        step: float,
         seed: int,
         at_once: bool = False,
     ) -> None:
         super().__init__()
-        self._delays, self._at_once = decision_delays(delay, seed), at_once
-        self._period, self._count = period, math.ceil(delay[1] / period - 1e-9)
+        self._delays, self._at_once = decision_delays(delay, seed, step), at_once
+        self._period, self._count = period, math.ceil(self._delays.max() / period - 1e-9)
         self._kept = self._count + at_once
         self.DeclareVectorInputPort(output, size)
         self.DeclareDiscreteState(np.array([-period]))  # time of the newest decision [s]
         self.DeclareDiscreteState(self._kept * size)  # decisions that are kept, the newest first
+        self._is_held = output == "command"
+        self.DeclareDiscreteState(size)  # the command
         self.DeclareVectorOutputPort(output, size, self._calc)
         self.DeclareInitializationDiscreteUpdateEvent(self._begin)
         self.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, self._update)
+        if self._is_held:  # sees what the update before it has written
+            self.DeclarePeriodicDiscreteUpdateEvent(step, 0.0, self._hold)
 
     def _decision(self, context: Context) -> np.ndarray:
         return np.asarray(self.get_input_port().Eval(context))
 
     def _begin(self, context: Context, discrete_state: DiscreteValues) -> None:
         discrete_state.set_value(1, np.tile(self._decision(context), self._kept))
+        discrete_state.set_value(2, self._decision(context))
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         decision, kept = self._decision(context), context.get_discrete_state(1).value()
         discrete_state.set_value(0, np.array([context.get_time()]))
         discrete_state.set_value(1, np.append(decision, kept)[: len(kept)])
 
+    def _hold(self, context: Context, discrete_state: DiscreteValues) -> None:
+        discrete_state.set_value(2, self._newest(context, discrete_state))
+
     def _calc(self, context: Context, output: BasicVector) -> None:
-        newest = context.get_discrete_state(0).GetAtIndex(0)
-        rows = context.get_discrete_state(1).value()
+        state = context.get_discrete_state()
+        output.SetFromVector(state.value(2) if self._is_held else self._newest(context, state))
+
+    def _newest(self, context: Context, state: DiscreteValues) -> np.ndarray:
+        """Returns the newest decision that has come."""
+        newest, rows = state.value(0)[0], state.value(1)
         if not self._at_once:
             rows = np.concatenate([self._decision(context), rows])
-        rows = rows.reshape(-1, output.size())
+        rows = rows.reshape(-1, self.get_output_port().size())
         for back in range(self._count):
             time = newest - back * self._period
             delay = self._delays[round(time / self._period) % CYCLE]
-            if time + delay <= context.get_time():
-                output.SetFromVector(rows[back])
-                return
-        output.SetFromVector(rows[-1])
+            if time + delay <= context.get_time() + 1e-9:
+                return rows[back]
+        return rows[-1]

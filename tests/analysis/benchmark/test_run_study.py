@@ -18,8 +18,9 @@ from splatpilot.analysis.benchmark.run_study import chunks
 from splatpilot.analysis.benchmark.study import StudyConfig
 from splatpilot.analysis.benchmark.study_folder import StudyFolder
 from splatpilot.analysis.benchmark.tables import DODGEDRONE_SPEEDS, PUBLISHED
+from splatpilot.analysis.benchmark.variants import BENCHMARK_POLICIES
 from splatpilot.analysis.commands.main import main
-from splatpilot.diagrams.flight.policies import BENCHMARK_POLICIES, POLICIES, policy_named
+from splatpilot.diagrams.flight.policies import POLICIES, policy_named
 from splatpilot.systems.policies.reactive import ReactiveConfig
 from splatpilot.systems.policies.straight import Straight, StraightConfig
 

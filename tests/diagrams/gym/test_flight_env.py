@@ -9,15 +9,18 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env, data_equivalence
 from gymnasium.wrappers import RecordEpisodeStatistics, RecordVideo
+from pydrake.common.schema import Uniform
 from stable_baselines3.common.env_checker import check_env as check_env_of_sb3
 
 from splatpilot.diagrams.flight.scenario import Scenario
 from splatpilot.diagrams.gym.flight_env import FlightEnv
 from splatpilot.diagrams.gym.vector_env import VectorFlightEnv
+from splatpilot.diagrams.worlds.moving_spheres import MovingSphere
 from splatpilot.systems.common.config import dump_config, load_config
 from splatpilot.systems.common.provenance import InfeasibleFlightError
 from splatpilot.systems.sensing.estimators import MotionCapture
 from splatpilot.systems.sensing.imu import Imu
+from splatpilot.systems.vehicle.quadrotor import QuadrotorParams
 
 AHEAD = np.array([0.5, 0.0, 0.0], np.float32)
 
@@ -47,17 +50,50 @@ def test_checkers_pass_without_warnings(observation, post_world):
 
 
 def test_delayed_decisions_come_late_in_both_environments(post_world):
-    def moved(make, **fields):
+    def moved(make, action, axis, **fields):
         scenario = Scenario(start_radius=0.0, **fields)
-        env = make(scenario, world=post_world, observation="full_state")
+        env = make(scenario, world=post_world, observation="full_state", action=action)
         start = env.reset(seed=0)[0]
-        ahead = np.broadcast_to([1.0, 0.0, 0.0], (*start.shape[:-1], 3))
-        return [(env.step(ahead)[0] - start)[..., 0].item() for _ in range(3)]
+        ahead = np.zeros(env.action_space.shape)
+        ahead[..., 0] = 1.0
+        return [(env.step(ahead)[0] - start)[..., axis].item() for _ in range(3)]
 
-    late = moved(FlightEnv, decision_delay=[0.06, 0.06])
-    assert 0 < late[0] < 0.5 * moved(FlightEnv)[0]
-    many = moved(partial(VectorFlightEnv, 1), decision_delay=[0.06, 0.06])
-    np.testing.assert_allclose(late, many, atol=1e-5)
+    for action, axis, delay in (("velocity", 0, 0.06), ("command", 2, 0.05)):
+        late = moved(FlightEnv, action, axis, decision_delay=[delay, delay])
+        assert 0 < late[0] < 0.5 * moved(FlightEnv, action, axis)[0]
+        many = moved(partial(VectorFlightEnv, 1), action, axis, decision_delay=[delay, delay])
+        np.testing.assert_allclose(late, many, atol=1e-5)
+
+
+def test_drawn_fields_are_those_of_the_flight(post_world):
+    scenario = Scenario(timeout=Uniform(0.1, 0.3), appearance=Uniform(0.5, 1.0))  # pyright: ignore
+    for env in (
+        FlightEnv(scenario, world=post_world),
+        VectorFlightEnv(1, scenario, world=post_world),
+    ):
+        env.reset(seed=0)
+        action, steps = np.zeros(env.action_space.shape), 0
+        while not np.any(env.step(action)[3]):
+            steps += 1
+        assert steps < 3
+
+
+def test_a_zero_command_hovers_on_another_planet(post_world):
+    scenario = Scenario(vehicle=QuadrotorParams(gravity=3.7), start_radius=0.0)
+    env = FlightEnv(scenario, world=post_world, action="command", observation="full_state")
+    start = env.reset(seed=0)[0]
+    assert env.config.limits()[0] == 3.7
+    np.testing.assert_allclose(env.step(np.zeros(4))[0], start, atol=1e-6)
+
+
+def test_flights_do_not_begin_in_moving_obstacles(post_world):
+    sphere = MovingSphere(radius=0.3, waypoints=[[1.0, 0.7, 2.0], [1.0, 0.7, 2.01]])
+    env = FlightEnv(Scenario(moving={"ball": sphere}), world=post_world)
+    for seed in range(12):
+        env.reset(seed=seed)
+        assert env.diagram.GetOutputPort("clearance").Eval(env.simulator.get_context())[0] > 0.0
+    with pytest.raises(InfeasibleFlightError):
+        env.reset(options={"start": [1.0, 0.7, 2.0]})
 
 
 def test_own_ends_terminate_a_flight(post_world):

@@ -1,5 +1,6 @@
 import warnings
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import gymnasium
@@ -8,7 +9,7 @@ import pytest
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import data_equivalence
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
-from pydrake.common.schema import Uniform
+from pydrake.common.schema import Uniform, UniformDiscrete
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator
 from pydrake.systems.framework import DiagramBuilder
 
@@ -117,25 +118,56 @@ def test_each_flight_draws_its_vehicle(post_world):
     assert len(set(scales)) > 16
 
 
-def test_images_and_rewards_are_those_of_flight_env(post_world):
+@pytest.mark.parametrize("count", [1, 3])
+def test_images_and_rewards_are_those_of_flight_env(count, post_world):
     names = ["depth", "depth_m", "rgb", "state", "goal", "obstacle"]
     scenario = Scenario(start=[3.0, 0.0, 2.0], start_radius=0.0)
     env = FlightEnv(scenario, world=post_world, observation=names, native=False)
-    envs = VectorFlightEnv(3, scenario, world=post_world, observation=names)
+    envs = VectorFlightEnv(count, scenario, world=post_world, observation=names)
     one, many = env.reset(seed=0)[0], envs.reset(seed=0)[0]
     terminated = False
     while not terminated:
         for name in ("depth", "depth_m", "rgb"):
-            np.testing.assert_array_equal(many[name][1], one[name], name)
+            np.testing.assert_array_equal(many[name][-1], one[name], name)
         for name in ("state", "goal", "obstacle"):
-            np.testing.assert_allclose(many[name][1], one[name], atol=1e-6)
+            np.testing.assert_allclose(many[name][-1], one[name], atol=1e-6)
         action = np.array([0.4, 0.05, 0.0])
         one, reward, terminated, truncated, info = env.step(action)
-        many, rewards, terminations, truncations, infos = envs.step(np.tile(action, (3, 1)))
-        assert rewards[1] == pytest.approx(reward, abs=1e-9)
-        assert (terminations[1], truncations[1]) == (terminated, truncated)
-    assert infos["outcome"][1] == info["outcome"] == Outcome.COLLISION
-    assert not infos["is_success"][1]
+        many, rewards, terminations, truncations, infos = envs.step(np.tile(action, (count, 1)))
+        assert rewards[-1] == pytest.approx(reward, abs=1e-9)
+        assert (terminations[-1], truncations[-1]) == (terminated, truncated)
+    assert infos["outcome"][-1] == info["outcome"] == Outcome.COLLISION
+    assert not infos["is_success"][-1]
+
+
+@pytest.mark.parametrize("action", ["velocity", "waypoint"])
+def test_flights_with_a_decision_delay_begin_at_rest(action, post_world):
+    scenario = Scenario(timeout=0.2, start_radius=0.0, decision_delay=[0.06, 0.06])
+    options = {"action": action, "observation": "full_state"}
+    envs = VectorFlightEnv(1, scenario, world=post_world, **options)
+    envs.reset(seed=0)
+    rest = np.zeros((1, 3))
+    first = envs.step(rest)[0]
+    assert envs.step(rest)[3].all()
+    envs.step(np.ones((1, 3)))  # begins the next flight, whatever the action
+    np.testing.assert_array_equal(envs.step(rest)[0], first)
+    envs.reset(options={"start": [3.0, 1.0, 2.0]})
+    np.testing.assert_allclose(envs.step(rest)[0][0, :3], [3.0, 1.0, 2.0], atol=1e-6)
+
+
+def test_rewards_and_transitions_are_not_changed_later(post_world):
+    seen = []
+
+    def reward(transition):
+        seen.append((transition.states, transition.next_states))
+        return transition.distances
+
+    envs = VectorFlightEnv(1, Scenario(), world=post_world, reward=reward)
+    envs.reset(seed=0)
+    rewards = [envs.step(np.array([[1.0, 0.0, 0.0]]))[1] for _ in range(3)]
+    assert len({float(each[0]) for each in rewards}) == 3
+    for (_, reached), (left, _) in pairwise(seen):
+        np.testing.assert_array_equal(reached, left)
 
 
 def test_color_of_random_appearance_is_that_of_add_flight(post_world):
@@ -286,6 +318,9 @@ def test_seeds_and_scenarios_of_flights_are_known(post_world):
     assert set(infos["scenario"]) == {0, 1}
     listed, _ = envs.reset(seed=[8, 7, 6, 5])
     np.testing.assert_array_equal(listed[::-1], observed)
+    fresh = VectorFlightEnv(4, scenarios, pool=envs.pool)
+    _, infos = fresh.reset(seed=[None] * 4)
+    assert len(set(infos["flight_seed"].tolist())) > 1
     second = np.flatnonzero(envs.pool.scenario == 1)[:4]
     assert set(envs.reset(options={"flight": second})[1]["scenario"]) == {1}
 
@@ -295,6 +330,11 @@ def test_seeds_and_scenarios_of_flights_are_known(post_world):
     [
         ({"scenario": Scenario(moving={"a": MovingSphere()})}, "moving of VectorFlightEnv"),
         ({"scenario": Scenario(wind=Wind(gusts=5.0))}, "wind.gusts of VectorFlightEnv must be 0"),
+        # The seed of the scenario draws no gusts, but others do.
+        (
+            {"scenario": Scenario(seed=6, wind=Wind(gusts=UniformDiscrete(values=[0.0, 15.4])))},
+            "wind.gusts of VectorFlightEnv must be 0, got 15.4",
+        ),
         ({"scenario": Scenario(decision_delay=[0.0, 0.2])}, "decision_delay must be at most"),
         ({"scenario": Scenario(start=[5.0, 0.0, 2.0])}, "start .* from the nearest surface"),
         (
@@ -320,6 +360,12 @@ def test_invalid_steps_and_resets_are_errors(post_world):
     envs = VectorFlightEnv(2, Scenario(), world=post_world)
     with pytest.raises(ResetNeeded):
         envs.step(np.zeros((2, 3)))
+    with pytest.raises(InfeasibleFlightError):
+        envs.reset(options={"goal": [5.0, 0.0, 2.0]})
+    with pytest.raises(ResetNeeded, match=r"got \[0, 1\]"):
+        envs.step(np.zeros((2, 3)))
+    with pytest.raises(ValueError, match="world must be left out with a pool"):
+        VectorFlightEnv(2, Scenario(), world=post_world, pool=envs.pool)
     envs.reset(seed=0)
     for actions in (np.full((2, 3), np.nan), np.full((2, 3), 1.1), np.zeros(3)):
         with pytest.raises(ValueError, match="action must be"):

@@ -63,7 +63,7 @@ def test_a_frame_keeps_its_number_until_the_next_comes():
 def test_decisions_come_when_their_delay_is_over(delay):
     builder, period = DiagramBuilder(), 0.05
     policy = builder.AddSystem(Counter(period))
-    late = builder.AddSystem(DecisionDelay("velocity", 1, period, delay, 3))
+    late = builder.AddSystem(DecisionDelay("velocity", 1, period, delay, 0.001, 3))
     builder.Connect(policy.get_output_port(), late.get_input_port())
     simulator = Simulator(builder.Build())
     port, context = late.get_output_port(), late.GetMyContextFromRoot(simulator.get_context())
