@@ -51,7 +51,7 @@ class GaussianGradients:
 class Camera:
     """A pinhole camera or one with a lens."""
 
-    def __init__(self, *, K: Annotated[NDArray[numpy.float64], dict(shape=(3, 3), order='C', device='cpu', writable=False)], X_CW: Annotated[NDArray[numpy.float64], dict(shape=(4, 4), order='C', device='cpu', writable=False)], width: int, height: int, near_plane: float, far_plane: float, radius_clip: float = 0.0, eps2d: float = 0.0, antialiased: bool = False, max_depth: float = float('inf'), merged_spread: float = 0.0, distortion: int = 0, lens: Annotated[NDArray[numpy.float64], dict(shape=(13), order='C', device='cpu', writable=False)] | None = None) -> None: ...
+    def __init__(self, *, K: Annotated[NDArray[numpy.float64], dict(shape=(3, 3), order='C', device='cpu', writable=False)], X_CW: Annotated[NDArray[numpy.float64], dict(shape=(4, 4), order='C', device='cpu', writable=False)], width: int, height: int, near_plane: float, far_plane: float, radius_clip: float = 0.0, eps2d: float = 0.0, antialiased: bool = False, max_depth: float = float('inf'), merged_spread: float = 0.0, rows_above: int = 0, rows_below: int = 0, distortion: int = 0, lens: Annotated[NDArray[numpy.float64], dict(shape=(17), order='C', device='cpu', writable=False)] | None = None) -> None: ...
 
 class Frame:
     """A rendered image, for its backward pass."""

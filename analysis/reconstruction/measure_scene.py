@@ -200,7 +200,8 @@ class SceneViews:
 
     def render(self, frame: CaptureFrame) -> RenderedView:
         """Renders the scene from the camera of `frame`."""
-        return put_behind(self._render_on_black(frame), self.background, frame.K, frame.X_WC)
+        view = self._render_on_black(frame)
+        return put_behind(view, self.background, frame.slopes, frame.X_WC)
 
     def measure(self, frame: CaptureFrame, **options: Any) -> ViewMetrics:
         """Compares frame and scene, see `measure_view` for the options."""

@@ -28,8 +28,8 @@ struct RenderedFrame {
 void init_camera(CameraParameters* self, const Doubles<nb::shape<3, 3>>& K,
                  const Doubles<nb::shape<4, 4>>& X_CW, int width, int height, double near_plane,
                  double far_plane, double radius_clip, double eps2d, bool antialiased,
-                 double max_depth, double merged_spread, int distortion,
-                 const std::optional<Doubles<nb::shape<13>>>& lens) {
+                 double max_depth, double merged_spread, int rows_above, int rows_below,
+                 int distortion, const std::optional<Doubles<nb::shape<17>>>& lens) {
   require(width > 0 && height > 0 && width <= 32768 && height <= 32768,
           "the image size must be in [1, 32768] px");
   CameraParameters p{};
@@ -42,6 +42,9 @@ void init_camera(CameraParameters* self, const Doubles<nb::shape<3, 3>>& K,
   p.antialiased = antialiased;
   p.max_depth = max_depth;
   p.merged_spread = merged_spread;
+  require(rows_above >= 0 && rows_below >= 0, "the rows must be of the image");
+  p.rows_above = rows_above;
+  p.rows_below = rows_below;
   std::copy_n(K.data(), 9, p.K);
   std::copy_n(X_CW.data(), 16, p.X_CW);
   if (lens) {
@@ -53,6 +56,8 @@ void init_camera(CameraParameters* self, const Doubles<nb::shape<3, 3>>& K,
     p.distortion.max_squared_slope = static_cast<float>(n[8]);
     std::copy_n(n + 9, 2, p.min_slope);
     std::copy_n(n + 11, 2, p.max_slope);
+    std::copy_n(n + 13, 2, p.min_side);
+    std::copy_n(n + 15, 2, p.max_side);
   }
   new (self) CameraParameters(p);
 }
@@ -126,7 +131,8 @@ struct BakedView {
       : image{color, 3, depth, 1, DepthMode::kMedian, alpha, {}} {
     if (!color) parameters.eps2d = kDepthBlur;
     if (!depth) image.depth_mode = DepthMode::kExpected;
-    require(parameters.merged_spread == 0.0 || scene.merged_geometry, "neighbors are not merged");
+    const bool merged = scene.merged_geometry || scene.groups == 0;
+    require(parameters.merged_spread == 0.0 || merged, "neighbors are not merged");
     camera = make_camera(parameters);
     camera.depth_alone = !color;
     std::copy_n(background, 3, image.background);
@@ -269,7 +275,8 @@ NB_MODULE(_native, m) {
       .def("__init__", &init_camera, nb::kw_only(), "K"_a, "X_CW"_a, "width"_a, "height"_a,
            "near_plane"_a, "far_plane"_a, "radius_clip"_a = 0.0, "eps2d"_a = 0.0,
            "antialiased"_a = false, "max_depth"_a = std::numeric_limits<double>::infinity(),
-           "merged_spread"_a = 0.0, "distortion"_a = 0, "lens"_a = nb::none());
+           "merged_spread"_a = 0.0, "rows_above"_a = 0, "rows_below"_a = 0, "distortion"_a = 0,
+           "lens"_a = nb::none());
   nb::class_<RenderedFrame>(m, "Frame", "A rendered image, for its backward pass.")
       .def_ro("splat_count", &RenderedFrame::splat_count, "Number of visible Gaussians.");
   m.def("projected", &projected, "renderer"_a, "frame"_a, "opacities"_a.none(),

@@ -24,10 +24,12 @@ void bound(Camera& c, const double min_slope[2], const double max_slope[2],
 
 void bound_by_pinhole(const CameraParameters& p, Camera& c) {
   const double fx = p.K[0], cx = p.K[2], fy = p.K[4], cy = p.K[5];
-  // The slopes x/z and y/z that enter the Jacobian stay within the image plus 15 % of its size.
-  const double margin_x = 0.15 * p.width / fx, margin_y = 0.15 * p.height / fy;
-  const double low[2] = {-cx / fx - margin_x, -cy / fy - margin_y};
-  const double high[2] = {(p.width - cx) / fx + margin_x, (p.height - cy) / fy + margin_y};
+  // The slopes x/z and y/z that enter the Jacobian stay within the whole image plus 15 % of its
+  // size.
+  const double top = -p.rows_above, bottom = p.height + p.rows_below;
+  const double margin_x = 0.15 * p.width / fx, margin_y = 0.15 * (bottom - top) / fy;
+  const double low[2] = {-cx / fx - margin_x, (top - cy) / fy - margin_y};
+  const double high[2] = {(p.width - cx) / fx + margin_x, (bottom - cy) / fy + margin_y};
   // |J_x| <= fx / z sqrt(1 + slope^2), so the extent is at most kMaxExtent (|J_x| s + sqrt(eps2d)):
   // left of the image means fx x / z + cx + extent <= 0, which times z is linear. A pixel and 1 %
   // are added for rounding.
@@ -43,10 +45,10 @@ void bound_by_pinhole(const CameraParameters& p, Camera& c) {
 
 // The rays of a lens lie in a frustum, and Gaussians up to their extent.
 void bound_by_frustum(const CameraParameters& p, Camera& c) {
-  double sides[4][4] = {{1, 0, -p.min_slope[0], 1},
-                        {-1, 0, p.max_slope[0], 1},
-                        {0, 1, -p.min_slope[1], 1},
-                        {0, -1, p.max_slope[1], 1}};
+  double sides[4][4] = {{1, 0, -p.min_side[0], 1},
+                        {-1, 0, p.max_side[0], 1},
+                        {0, 1, -p.min_side[1], 1},
+                        {0, -1, p.max_side[1], 1}};
   for (auto& n : sides) {
     const double length = std::hypot(n[0], n[1], n[2]);
     for (int axis = 0; axis < 3; ++axis) n[axis] /= length;

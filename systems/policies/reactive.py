@@ -84,9 +84,11 @@ def responses(p_WB: np.ndarray, v_WB: np.ndarray, velocities: np.ndarray) -> np.
 
 def is_seen(p_CQ: np.ndarray, depth: np.ndarray, camera: OnboardCamera) -> np.ndarray:
     """Checks that points p_CQ (..., 3) [m] are inside the image and before its depth (H, W) [m]."""
-    z = np.maximum(p_CQ[..., 2], 1e-6)
-    u = camera.focal_x * p_CQ[..., 0] / z + 0.5 * camera.width
-    v = camera.focal_y * p_CQ[..., 1] / z + 0.5 * camera.height
+    slopes = p_CQ[..., :2] / np.maximum(p_CQ[..., 2:], 1e-6)
+    if camera.distortion is not None:
+        slopes = camera.distortion.project(slopes)
+    u = camera.focal_x * slopes[..., 0] + 0.5 * camera.width
+    v = camera.focal_y * slopes[..., 1] + 0.5 * camera.height
     inside = (p_CQ[..., 2] > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
     row = np.where(inside, v, 0).astype(np.intp)
     column = np.where(inside, u, 0).astype(np.intp)

@@ -242,7 +242,7 @@ class MotionCaptureEstimator(_Estimator):
         super().__init__(config, seed, 14)
 
     def first(self, state: np.ndarray) -> np.ndarray:
-        return np.append(state, 1.0)  # the last estimate, and its age in frames
+        return np.append(state, 0.0)  # the last estimate, and its age in frames
 
     def estimate(
         self, state: np.ndarray, memory: np.ndarray, normal: np.ndarray
@@ -257,9 +257,10 @@ class MotionCaptureEstimator(_Estimator):
         p_WB = true.p_WB + config.position_noise * normal[0]
         turn = Rotation.from_rotvec(config.rotation_noise * normal[1])
         q_WB = Rotation.from_quat(true.q_WB, scalar_first=True) * turn
-        duration = missed / config.rate
-        follow = duration / (duration + config.velocity_filter)
-        v_WB = last.v_WB + follow * ((p_WB - last.p_WB) / duration - last.v_WB)
+        v_WB, duration = last.v_WB, missed / config.rate
+        if duration > 0.0:
+            follow = duration / (duration + config.velocity_filter)
+            v_WB = v_WB + follow * ((p_WB - last.p_WB) / duration - v_WB)
         q = q_WB.as_quat(scalar_first=True)
         measured = QuadrotorState(p_WB, v_WB, q, w_WB_B).to_vector()
         return measured, np.append(measured, 1.0)

@@ -19,7 +19,7 @@ from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 from scipy.ndimage import gaussian_filter
 
 from splatpilot.systems.common.drake import weak_callback
-from splatpilot.systems.common.validation import Config, bounded
+from splatpilot.systems.common.validation import Config, bounded, require
 from splatpilot.systems.sensing.noise import (
     ImageChange,
     color_of_light,
@@ -107,10 +107,11 @@ def stereo_depth(
     A pixel is not measured if d is above `max_disparity` or not positive, if its match lies beyond
     the left border of the right image, or if a nearer surface hides it from the right camera.
     """
+    _require_pinhole("imaging.stereo", camera)
     pixels = sensor.width / camera.width  # of the sensor in one of the camera
     fb = camera.focal_x * pixels * sensor.baseline
     measured = np.isfinite(depth) & (depth > 0.0)
-    exact = fb / np.where(measured, depth, np.inf)
+    exact = fb / _known_depth(depth, camera, np.inf)
     columns = (np.arange(depth.shape[1]) + 0.5) * pixels
     seen = columns - exact  # columns in the right image
     right = np.minimum.accumulate(seen[:, ::-1], axis=1)[:, ::-1]
@@ -181,7 +182,7 @@ def time_of_flight_depth(
         mixing: (2, H, W), drawn from U(0, 1).
     """
     measured = np.isfinite(depth) & (depth > 0.0)
-    z = np.where(measured, depth, np.float32(sensor.ambient_range))
+    z = _known_depth(depth, camera, sensor.ambient_range)
     z = z * (1.0 + sensor.multipath * _relative_sag(z, sensor.multipath_angle, camera))
     kernel = np.ones((3, 3), np.uint8)
     near, far = cv2.erode(z, kernel), cv2.dilate(z, kernel)
@@ -189,6 +190,18 @@ def time_of_flight_depth(
     z = np.where(mixed, near + mixing[1] * (far - near), z) * (1.0 + sensor.noise * noise)
     lost = z * (1.0 + sensor.ambient_spread * reflectivity) > sensor.ambient_range
     return np.where(measured, np.where(lost, np.inf, z), depth)
+
+
+def _known_depth(depth: np.ndarray, camera: OnboardCamera, far: float) -> np.ndarray:
+    """Returns a depth image whose zeros, surfaces too near, are at the minimum, and infinity at
+    `far` [m]."""
+    near = np.where(depth > 0.0, depth, np.float32(camera.min_depth or far))
+    return np.where(np.isfinite(depth), near, np.float32(far))
+
+
+def _require_pinhole(what: str, camera: OnboardCamera) -> None:
+    condition = "of a camera without distortion"
+    require(camera.distortion is None, what, condition, camera.distortion)
 
 
 def _relative_sag(z: np.ndarray, angle: float, camera: OnboardCamera) -> np.ndarray:
@@ -242,6 +255,7 @@ class Imaging(Config):
         """Returns the true camera of a nominal one."""
         if self.focal_scale == 1.0:
             return nominal
+        _require_pinhole("imaging.focal_scale", nominal)
 
         def scaled(fov: float | None) -> float | None:
             slope = None if fov is None else math.tan(math.radians(0.5 * fov))
@@ -278,7 +292,7 @@ class AutoExposure(LeafSystem):
         imaging.validate()
         self._imaging = imaging
         slopes = camera.ray_slopes()
-        cos = 1.0 / np.linalg.norm(slopes, axis=-1, keepdims=True)
+        cos = np.nan_to_num(1.0 / np.linalg.norm(slopes, axis=-1, keepdims=True))
         self._falloff = (cos**imaging.vignetting).astype(np.float32)
         blank = ImageRgba8U(camera.width, camera.height)
         self.DeclareAbstractInputPort("color_image", Value(blank))
@@ -343,6 +357,7 @@ class StereoMatcher(LeafSystem):
     def __init__(self, sensor: Stereo, camera: OnboardCamera) -> None:
         super().__init__()
         sensor.validate()
+        _require_pinhole("imaging.stereo", camera)
         self._sensor, self._camera = sensor, camera
         for name, config in self.cameras(sensor, camera).items():
             self.DeclareAbstractInputPort(name, Value(ImageRgba8U(config.width, config.height)))

@@ -57,12 +57,11 @@ class FrameTimes:
         return float(age) + self.before
 
     def number(self, time: float) -> int | None:
-        """Returns the number, from `CYCLE` on, of the last frame that arrived at a time [s]; None
-        without a rate."""
+        """Returns the number (>= 0) of the last frame that came by a time [s], or None."""
         if self.rate is None:
             return None
         taken = time - self.age(time) + self.before
-        return round(taken * self.rate - self.phase) + CYCLE
+        return round(taken * self.rate - self.phase) + max(CYCLE, self.lookback + 1)
 
     @property
     def oldest(self) -> float:

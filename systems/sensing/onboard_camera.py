@@ -10,7 +10,7 @@ from pydrake.systems.sensors import CameraInfo
 
 from splatpilot.systems.common.config import equal_by_fields
 from splatpilot.systems.common.validation import Config, bounded, require_field
-from splatpilot.systems.splats.lens import Distortion
+from splatpilot.systems.splats.lens import Distortion, pixel_slopes
 
 
 def _level_mount() -> Transform:
@@ -94,10 +94,11 @@ class OnboardCamera(Config):
         return RigidTransform(RotationMatrix(R_BC), X_BC.translation())
 
     def ray_slopes(self) -> np.ndarray:
-        """Returns the points p_CQ (height, width, 3) of the pixels at planar depth 1."""
-        x = (np.arange(self.width) + 0.5 - 0.5 * self.width) / self.focal_x
-        y = (np.arange(self.height) + 0.5 - 0.5 * self.height) / self.focal_y
-        return np.stack([*np.meshgrid(x, y), np.ones((self.height, self.width))], axis=-1)
+        """Returns the points p_CQ (height, width, 3) of the pixels at planar depth 1; NaN without a
+        ray."""
+        K = self.camera_info().intrinsic_matrix()
+        slopes = pixel_slopes(self.distortion, K, self.width, self.height)
+        return np.dstack([slopes, np.ones((self.height, self.width))])
 
 
 def focal_length(size: int, fov: float) -> float:

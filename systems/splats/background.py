@@ -9,7 +9,6 @@ import numpy as np
 
 from splatpilot.systems.common.files import written_atomically
 from splatpilot.systems.common.readers import readable, require_file, require_readable_size
-from splatpilot.systems.splats.lens import Distortion, pixel_slopes
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -99,21 +98,15 @@ def pixel_rays(
 def put_behind(
     view: RenderedView,
     background: Background,
-    K: "NDArray",
+    slopes: "NDArray[np.float64]",
     X_WC: "RigidTransform",
-    distortion: Distortion | None = None,
 ) -> RenderedView:
-    """Adds a background to a view on black; pixels without a ray stay black. K is (3, 3) [px]."""
+    """Adds a background to a view on black; pixels without a ray stay black. For `slopes` (H, W, 2)
+    of the pixels see `pixel_slopes`."""
     color = view.color.copy()
-    rows, columns = np.nonzero(view.alpha < 1 - _MIN_LIGHT)
-    if distortion is None:
-        v_W = pixel_rays(K, rows, columns, X_WC)
-    else:
-        slopes = pixel_slopes(distortion, K, *view.alpha.shape[::-1])[rows, columns]
-        shown = np.isfinite(slopes[:, 0])
-        rows, columns = rows[shown], columns[shown]
-        v_C = np.column_stack([slopes[shown], np.ones(len(rows))])
-        v_W = v_C @ X_WC.rotation().matrix().T
+    rows, columns = np.nonzero((view.alpha < 1 - _MIN_LIGHT) & np.isfinite(slopes[..., 0]))
+    v_C = np.column_stack([slopes[rows, columns], np.ones(len(rows))])
+    v_W = v_C @ X_WC.rotation().matrix().T
     if isinstance(background, EnvironmentMap):
         behind = background.color(v_W)
     else:

@@ -16,7 +16,7 @@ from splatpilot.systems.splats.background import (
     RenderedView,
     put_behind,
 )
-from splatpilot.systems.splats.lens import Distortion, hidden_pixels, native_lens
+from splatpilot.systems.splats.lens import Distortion, native_lens, pixel_slopes
 from splatpilot.systems.splats.scene import GaussianScene, concatenated, harmonic_degree
 
 if TYPE_CHECKING:
@@ -162,6 +162,7 @@ class BakedScene:
         distortion: Distortion | None = None,
         max_depth: float = np.inf,
         merged_spread: float = 0.0,
+        rows: tuple[int, int] | None = None,
     ) -> RenderedView:
         """Renders color, median depth and alpha.
 
@@ -178,9 +179,10 @@ class BakedScene:
             merged_spread: Neighbors that spread by less on the image [px] are drawn as one, which
                 is faster where Gaussians are smaller than pixels; 0 merges none. The first such
                 image prepares the scene.
+            rows: The first row to render, and the one after the last; by default all.
         """
         options = {"moving": moving, "distortion": distortion, "max_depth": max_depth}
-        options |= {"background": background, "merged_spread": merged_spread}
+        options |= {"background": background, "merged_spread": merged_spread, "rows": rows}
         return self._render(_ALL, K, width, height, X_WC, near, far, **options)
 
     def render_color(self, *camera: Any, **options: Any) -> NDArray[np.float32]:
@@ -210,9 +212,17 @@ class BakedScene:
         **options: Any,
     ) -> RenderedView:
         """Renders images of these names; the others are empty."""
+        if names == _ALL and self._antialiased:
+            # The blur of the color makes opacities lower than they are for depth.
+            arguments = K, width, height, X_WC, *clip
+            options |= {"background": background, "moving": moving}
+            depth = self._render(("depth",), *arguments, **options).depth
+            return self._render(("color", "alpha"), *arguments, **options)._replace(depth=depth)
         camera = _checked_camera(K, width, height, *clip, **options)
         (color,) = _background_colors([background])
-        images = _new_images(names, (height, width))
+        slopes = _slopes(K, width, height, [background], **options)
+        first, last = options.get("rows") or (0, height)
+        images = _new_images(names, (last - first, width))
         _native.render_baked(
             self._scene,
             self._renderer,
@@ -221,7 +231,7 @@ class BakedScene:
             background=color,
             **{name: image if name in names else None for name, image in images.items()},
         )
-        return _finished(images, [background], K, [X_WC], options.get("distortion"))
+        return _finished(images, [background], [X_WC], slopes)
 
 
 class BatchRenderer:
@@ -270,7 +280,13 @@ class BatchRenderer:
         for name, rows in (("poses", X_WCs), ("backgrounds", backgrounds)):
             condition = f"that of scenes, {count}"
             require(len(rows) == count, f"the number of {name}", condition, len(rows))
+        if names == _ALL and any(scene._antialiased for scene in scenes):
+            arguments = scenes, K, width, height, X_WCs, *clip
+            options |= {"backgrounds": backgrounds}
+            depth = self._render(("depth",), *arguments, **options).depth
+            return self._render(("color", "alpha"), *arguments, **options)._replace(depth=depth)
         camera = _checked_camera(K, width, height, *clip, **options)
+        slopes = _slopes(K, width, height, backgrounds, **options)
         images = _new_images(names, (count, height, width))
         _native.render_views(
             self._renderer,
@@ -279,7 +295,7 @@ class BatchRenderer:
             backgrounds=_background_colors(backgrounds),
             **{name: image if name in names else None for name, image in images.items()},
         )
-        return _finished(images, backgrounds, K, X_WCs, options.get("distortion"))
+        return _finished(images, backgrounds, X_WCs, slopes)
 
 
 def _new_images(names: tuple[str, ...], shape: tuple[int, ...]) -> dict[str, NDArray[np.float32]]:
@@ -300,12 +316,27 @@ def _background_colors(backgrounds: Sequence[Background]) -> NDArray[np.float32]
     return np.array(colors, np.float32).reshape(-1, 3)
 
 
+def _slopes(
+    K: ArrayLike,
+    width: int,
+    height: int,
+    backgrounds: Sequence[Background],
+    *,
+    distortion: Distortion | None = None,
+    rows: tuple[int, int] | None = None,
+    **_: Any,
+) -> NDArray[np.float64] | None:
+    """Returns the slopes (H, W, 2) of the pixels that are rendered, if `_finished` needs them."""
+    if distortion is None and not any(isinstance(each, EnvironmentMap) for each in backgrounds):
+        return None
+    return pixel_slopes(distortion, np.asarray(K, float), width, height)[slice(*rows or (None,))]
+
+
 def _finished(
     images: dict[str, NDArray[np.float32]],
     backgrounds: Sequence[Background],
-    K: ArrayLike,
     X_WCs: "Sequence[RigidTransform]",
-    distortion: Distortion | None,
+    slopes: NDArray[np.float64] | None,
 ) -> RenderedView:
     """Returns the views of images (..., H, W, channels): pixels without a ray are zero, and
     environments stand behind.
@@ -313,16 +344,17 @@ def _finished(
     Args:
         backgrounds, X_WCs: of the N views.
     """
-    if distortion is not None:
+    if slopes is not None:
+        hidden = np.flatnonzero(np.isnan(slopes[..., 0]))
         for image in filter(np.size, images.values()):
             height, width, channels = image.shape[-3:]
-            hidden = hidden_pixels(distortion, np.asarray(K, float), width, height)
             image.reshape(-1, height * width, channels)[:, hidden] = 0.0
     view = RenderedView(images["color"], images["depth"][..., 0], images["alpha"][..., 0])
     for i, background in enumerate(backgrounds):
         if view.color.size and isinstance(background, EnvironmentMap):
             part = view if view.depth.ndim == 2 else RenderedView(*(image[i] for image in view))
-            part.color[:] = put_behind(part, background, np.asarray(K), X_WCs[i], distortion).color
+            assert slopes is not None
+            part.color[:] = put_behind(part, background, slopes, X_WCs[i]).color
     return view
 
 
@@ -336,21 +368,32 @@ def _checked_camera(
     distortion: Distortion | None = None,
     max_depth: float = np.inf,
     merged_spread: float = 0.0,
+    rows: tuple[int, int] | None = None,
 ) -> "Callable[[BakedScene, RigidTransform], _native.Camera]":
     """Checks a camera; returns the function from a scene and the pose to the native one."""
     K = check_camera(K, width, height, near, far)
     require(max_depth > 0, "max_depth", "> 0 m", max_depth)
     require(0 <= merged_spread < np.inf, "merged_spread", "finite and >= 0 px", merged_spread)
-    lens = {} if distortion is None else native_lens(distortion, K, width, height)._asdict()
+    first, last = rows or (0, height)
+    require(0 <= first < last <= height, "rows", f"in [0, {height}]", rows)
+    K_rows, num_rows = K.copy(), last - first
+    K_rows[1, 2] -= first
+    lens = {}
+    if distortion is not None:
+        whole = native_lens(distortion, K, width, height)
+        part = native_lens(distortion, K_rows, width, num_rows)
+        lens = whole.with_rows(part)._asdict()
 
     def make(scene: BakedScene, X_WC: "RigidTransform") -> _native.Camera:
         if merged_spread:
             scene._scene.merge_neighbors()
         return _native.Camera(
-            K=K,
+            K=K_rows,
             X_CW=np.ascontiguousarray(X_WC.inverse().GetAsMatrix4()),
             width=width,
-            height=height,
+            height=num_rows,
+            rows_above=first,
+            rows_below=height - last,
             near_plane=near,
             far_plane=far,
             eps2d=EPS2D,

@@ -22,6 +22,7 @@ NUM_RADIAL = {"opencv": 6, "fisheye": 4}
 """Maximum number of radial coefficients of each model."""
 
 _MARGIN = 0.15  # fraction of the image around it in which rays are still projected as if inside
+_BLUR = 3.0  # [px] by which the blur of a pixel spreads Gaussians around the image
 _NEWTON_STEPS, _STEP = 6, 1e-5  # of tangential distortion; [-] of slopes for its derivatives
 _SAMPLES, _STEPS = 4097, 6  # of the radial table and of its refinement, to rounding
 
@@ -135,7 +136,12 @@ class NativeLens(NamedTuple):
     """A lens before an image, as the renderer takes it."""
 
     distortion: int
-    lens: "NDArray[np.float64]"  # (13,): radial 6, tangential 2, limit^2, min and max slopes
+    # (17,): radial 6, tangential 2, limit^2, min and max slopes of the image and of its rows
+    lens: "NDArray[np.float64]"
+
+    def with_rows(self, rows: "NativeLens") -> "NativeLens":
+        """Returns this lens for a camera that shows the rows of another one alone."""
+        return self._replace(lens=np.append(self.lens[:13], rows.lens[13:]))
 
 
 type _Intrinsics = tuple[float, float, float, float]  # fx, fy, cx, cy
@@ -162,10 +168,12 @@ def native_lens(
 ) -> NativeLens:
     """Returns the lens of a camera with the intrinsics K (3, 3) [px] for `_native.render_baked`."""
     fx, fy, cx, cy = intrinsics
-    along = np.linspace(-_MARGIN, 1.0 + _MARGIN, 257)
-    edges = [(along, np.full(257, end)) for end in (-_MARGIN, 1.0 + _MARGIN)]
+    along = np.linspace(-1.0, 1.0, 257)
+    edges = [(along, np.full(257, end)) for end in (-1.0, 1.0)]
     border = np.concatenate([np.stack(pair, -1) for a, b in edges for pair in ((a, b), (b, a))])
-    points = (border * [width, height] - [cx, cy]) / [fx, fy]
+    size = np.array([width, height])
+    half = 0.5 * size + np.maximum(_MARGIN * size, _BLUR)
+    points = (0.5 * size + border * half - [cx, cy]) / [fx, fy]
     slopes = distortion.slopes(points)
     # The limit of the lens replaces a border beyond it.
     outward = distortion.limit * points / np.maximum(_lengths(points), 1e-12)[:, None]
@@ -174,8 +182,7 @@ def native_lens(
         *_padded(distortion.radial, 6),
         *_padded(distortion.tangential, 2),
         min(distortion.limit**2, 1e12),
-        *slopes.min(axis=0),
-        *slopes.max(axis=0),
+        *(*slopes.min(axis=0), *slopes.max(axis=0)) * 2,
     ]
     return NativeLens(1 + list(NUM_RADIAL).index(distortion.model), np.array(numbers))
 
@@ -192,16 +199,6 @@ def pixel_slopes(
     slopes = points if distortion is None else distortion.slopes(points)
     slopes.setflags(write=False)
     return slopes
-
-
-@_cached(8)
-def hidden_pixels(
-    distortion: Distortion, intrinsics: _Intrinsics, width: int, height: int
-) -> "NDArray[np.intp]":
-    """Returns the pixels without a ray, counted row by row."""
-    fx, fy, cx, cy = intrinsics
-    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    return np.flatnonzero(np.isnan(pixel_slopes(distortion, K, width, height)[..., 0]))
 
 
 def _padded(numbers: Sequence[float], count: int) -> list[float]:

@@ -246,6 +246,7 @@ class SplatRenderEngine(RenderEngine):
         if properties.HasProperty(*_PROPERTY):
             self._bodies[id] = shape, PerceptionProperties(properties)
             self._body_poses[id] = RigidTransform(X_WG)
+            self._last_view = None
             return True
         name = str(id.get_value())
         if id not in self._frames:
@@ -272,6 +273,7 @@ class SplatRenderEngine(RenderEngine):
     def DoRemoveGeometry(self, id: GeometryId) -> bool:
         if id in self._bodies:
             del self._bodies[id], self._body_poses[id]
+            self._last_view = None
             return True
         if id not in self._geometries:
             return False

@@ -397,8 +397,7 @@ class SplatCamera(LeafSystem):
     ) -> list[NDArray[np.float32]]:
         """Renders the bands of an image, or of a view of several, and joins them."""
         bands = [
-            render(*band, moving=moving, **self._options, **options)
-            for band, moving in self._bands(camera)
+            render(*view, **band, **self._options, **options) for view, band in self._bands(camera)
         ]
         parts = [band if isinstance(band, RenderedView) else (band,) for band in bands]
         return (
@@ -408,23 +407,26 @@ class SplatCamera(LeafSystem):
     def _render_depth(self, scene: BakedScene, camera: CameraState) -> NDArray[np.float32]:
         return self._render_instant(scene.render_depth, self._shutter(camera, 0.5))[0]
 
-    def _bands(self, camera: CameraState) -> Iterator[tuple[tuple[Any, ...], PlacedGaussians]]:
-        """Yields K (3, 3) [px], width, height, X_WC, near and far of each band, and its bodies."""
+    def _bands(self, camera: CameraState) -> Iterator[tuple[tuple[Any, ...], dict[str, Any]]]:
+        """Yields K (3, 3) [px], width, height, X_WC, near and far of each band, its rows and
+        bodies."""
         info, X_WC1 = camera.camera_info, camera.X_WB @ camera.X_BC
         K, width, height = info.intrinsic_matrix(), info.width(), info.height()
         if camera.X_WB_start is None:
-            yield (K, width, height, X_WC1, *self._clipping), _placed(camera.bodies, camera.time)
+            placed = _placed(camera.bodies, camera.time)
+            yield (K, width, height, X_WC1, *self._clipping), {"moving": placed}
             return
         X_WC0 = camera.X_WB_start @ camera.X_BC
         min_count = 1 if camera.bodies is None else _MIN_BANDS
         focal = float(max(K[0, 0], K[1, 1]))
         for first, last in row_bands(X_WC0, X_WC1, focal, height, min_count):
             s = 0.5 * (first + last) / height  # of the time from the first row to the last
-            K_band = K.copy()
-            K_band[1, 2] -= first
             X_WC = pose_between(X_WC0, X_WC1, s)
             placed = _placed(camera.bodies, camera.time - (1.0 - s) * self._readout)
-            yield (K_band, width, last - first, X_WC, *self._clipping), placed
+            yield (
+                (K, width, height, X_WC, *self._clipping),
+                {"moving": placed, "rows": (first, last)},
+            )
 
     def _age(self, time: float) -> float:
         return self._latency(time) if callable(self._latency) else self._latency

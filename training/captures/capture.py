@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
 from splatpilot.systems.common.validation import require
-from splatpilot.systems.splats.lens import Distortion
+from splatpilot.systems.splats.lens import Distortion, pixel_slopes
 from splatpilot.training.captures.capture_config import CaptureConfig
 
 _MAX_SIZE = 1 << 16  # [px]
@@ -260,6 +260,11 @@ class CaptureFrame:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "valid", np.broadcast_to(self.valid, self.depth.shape))
+
+    @property
+    def slopes(self) -> NDArray[np.float64]:
+        """The slopes (H, W, 2) of the pixels, see `pixel_slopes`."""
+        return pixel_slopes(None, self.K, *self.depth.shape[::-1])
 
     def back_project(self, u: NDArray, v: NDArray, depth: NDArray) -> NDArray[np.float64]:
         """Returns the points p_CQ (..., 3) [m] at image coordinates [px] and depths [m]."""

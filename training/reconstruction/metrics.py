@@ -300,7 +300,7 @@ def measure_view(
     truth, sky = frame.image / 255, frame.depth >= FAR
     seen = frame.valid if seen is None else seen & frame.valid
     camera = truth, vignetting, seen, gain
-    view = put_behind(on_black, background, frame.K, frame.X_WC)
+    view = put_behind(on_black, background, frame.slopes, frame.X_WC)
     exposed, gain = fit_exposure(view.color, *camera)
     before_black = np.where(sky[..., None], view.color, on_black.color)
     exposed_before_black, _ = fit_exposure(before_black, *camera)

@@ -99,6 +99,7 @@ def test_estimates_are_held_and_late():
 def test_motion_capture_has_its_noise_and_follows_velocity():
     config = MotionCapture(dropout=0.0, latency=0.0, position_noise=1e-3, velocity_filter=0.09)
     times, seen = estimates(MotionCaptureEstimator(config, 4), config.rate, 30.0)
+    np.testing.assert_allclose(seen.v_WB[0], SPEED)  # as at the start
     late = times > 1.0
     errors = (seen.p_WB - [0.0, 0.0, 2.0] - (times - 0.01)[:, None] * SPEED)[late]
     assert errors.std() == pytest.approx(1e-3, rel=0.05)

@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -12,6 +13,7 @@ from splatpilot.systems.sensing.imaging import (
     Compression,
     Imaging,
     Stereo,
+    StereoMatcher,
     TimeOfFlightErrors,
     correlated_noise,
     matched_depth,
@@ -20,6 +22,7 @@ from splatpilot.systems.sensing.imaging import (
 )
 from splatpilot.systems.sensing.noise import color_of_light, light_of_color
 from splatpilot.systems.sensing.onboard_camera import OnboardCamera, focal_length
+from splatpilot.systems.splats.lens import Distortion, pixel_slopes
 
 CAMERA = OnboardCamera(width=32, height=18)
 PERIOD = 0.02  # [s]
@@ -58,6 +61,19 @@ def test_vignetting_follows_the_cosine_of_the_angle():
     x, y = CAMERA.ray_slopes()[..., 0], CAMERA.ray_slopes()[..., 1]
     expected = light_of_color(200.0) / (1.0 + x**2 + y**2) ** 2
     np.testing.assert_allclose(light_of_color(seen.astype(float)), expected, atol=4e-3)
+
+
+def test_vignetting_follows_the_rays_of_a_lens():
+    lens = Distortion("fisheye", max_angle=80.0)
+    camera = replace(CAMERA, fov_x=150.0, distortion=lens)
+    seen = changed(AutoExposure(Imaging(vignetting=4.0), camera, PERIOD), 255.0)[..., 0]
+    slopes = pixel_slopes(lens, camera.camera_info().intrinsic_matrix(), *seen.shape[::-1])
+    expected = np.nan_to_num((1.0 + (slopes**2).sum(-1)) ** -2)
+    np.testing.assert_allclose(light_of_color(seen.astype(float)), expected, atol=4e-3)
+    with pytest.raises(ValueError, match=r"imaging.stereo must be of a camera without distortion"):
+        StereoMatcher(Stereo(), camera)
+    with pytest.raises(ValueError, match=r"imaging.focal_scale must be of a camera without dist"):
+        Imaging(focal_scale=0.8).camera(camera)
 
 
 def test_compression_costs_detail_by_its_quality():
@@ -147,6 +163,17 @@ def test_unmeasured_pixels_stay_so():
     depth[0, 40:], depth[1, 40:] = 0.0, np.inf
     for seen in (stereo(depth), tof(depth, normal=1.0, noise=0.01)):
         np.testing.assert_array_equal(seen[:2, 40:], depth[:2, 40:])
+
+
+def test_surfaces_that_are_too_near_are_not_far():
+    depth = np.full(SHAPE, 0.12)
+    depth[:, 30:34] = 0.0
+    seen = tof(depth, mixing=0.5, mixed_pixels=1.0)
+    assert seen.max() <= 0.121 and (seen[:, 30:34] == 0.0).all()
+    depth = np.full(SHAPE, 8.0)
+    depth[:, 30:40] = 0.0
+    hidden = ~np.isfinite(stereo(depth, max_disparity=500.0, **EXACT))
+    assert hidden[:, 20:30].all()
 
 
 def test_a_concave_corner_recedes_by_its_sag_and_a_plane_and_an_edge_do_not():

@@ -8,6 +8,7 @@ from splatpilot.systems.splats.background import (
     mean_color,
     put_behind,
 )
+from splatpilot.systems.splats.lens import pixel_slopes
 
 K = np.array([[20.0, 0, 16], [0, 20.0, 12], [0, 0, 1]])
 
@@ -36,11 +37,11 @@ def test_a_camera_sees_what_lies_behind():
     rows, columns = np.mgrid[:24, :32]
     rays = np.stack([(columns + 0.5 - 16) / 20, (rows + 0.5 - 12) / 20, np.ones((24, 32))])
     v_W = np.einsum("ij,jkl->kli", X_WC.rotation().matrix(), rays / np.linalg.norm(rays, axis=0))
-    behind = 0.5 + 0.4 * v_W[..., [2, 0, 1]]
-    seen = put_behind(RenderedView(color, alpha, alpha), gradient(), K, X_WC)
+    behind, slopes = 0.5 + 0.4 * v_W[..., [2, 0, 1]], pixel_slopes(None, K, 32, 24)
+    seen = put_behind(RenderedView(color, alpha, alpha), gradient(), slopes, X_WC)
     np.testing.assert_allclose(seen.color, color + (1 - alpha[..., None]) * behind, atol=3e-3)
     np.testing.assert_array_equal(seen.color[:4], color[:4])
-    plain = put_behind(RenderedView(color, alpha, alpha), (0.1, 0.2, 0.3), K, X_WC)
+    plain = put_behind(RenderedView(color, alpha, alpha), (0.1, 0.2, 0.3), slopes, X_WC)
     expected = color + (1 - alpha[..., None]) * [0.1, 0.2, 0.3]
     np.testing.assert_allclose(plain.color, expected, atol=1e-3)
 

@@ -157,10 +157,11 @@ def test_environment_selects_the_simd_level(monkeypatch):
 @pytest.mark.parametrize("simd", LEVELS)
 @pytest.mark.parametrize("lens", LENSES)
 @pytest.mark.parametrize("size", [0.02, 1.0, 6.0])
-def test_depth_or_color_rendered_alone_is_identical(simd, lens, size):
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_depth_or_color_rendered_alone_is_identical(simd, lens, size, antialiased):
     bodies = random_scene(count=200, seed=1, sh_degree=0)
     moving = PlacedGaussians(*(getattr(bodies, name) for name in PlacedGaussians._fields))
-    scene = random_scene(count=3000)
+    scene = replace(random_scene(count=3000), antialiased=antialiased)
     scene = BakedScene(replace(scene, scales=np.float32(size) * scene.scales), simd=simd)
     options = {"background": (0.1, 0.2, 0.3), "moving": moving, "distortion": lens}
     for X, max_depth, spread in (
@@ -174,6 +175,27 @@ def test_depth_or_color_rendered_alone_is_identical(simd, lens, size):
         np.testing.assert_array_equal(scene.render_depth(*CAMERA, X, **options), view.depth)
         np.testing.assert_array_equal(scene.render_color(*CAMERA, X, **options), view.color)
         assert max_depth < np.inf or (view.depth > 0).mean() > 0.1
+
+
+@pytest.mark.parametrize("lens", [*LENSES, Distortion("opencv", [-1e-6])])
+@pytest.mark.parametrize("sky", [False, True])
+def test_rows_are_those_of_the_whole_image(lens, sky):
+    texels = np.random.default_rng(0).uniform(size=(8, 16, 3)).astype(np.float32)
+    behind = EnvironmentMap(texels) if sky else (0.1, 0.2, 0.3)
+    scene = BakedScene(random_scene(count=3000))
+    options = {"background": behind, "distortion": lens}
+    whole = scene.render(*CAMERA, X_WC, **options)
+    for rows in ((0, 1), (7, 8), (HEIGHT - 5, HEIGHT)):
+        part = scene.render(*CAMERA, X_WC, rows=rows, **options)
+        for one, other in zip(part, whole, strict=True):
+            np.testing.assert_allclose(one, other[slice(*rows)], atol=1e-5)
+    with pytest.raises(ValueError, match=r"rows must be in \[0, "):
+        scene.render(*CAMERA, X_WC, rows=(3, HEIGHT + 1))
+
+
+def test_nothing_can_be_rendered_with_merged_neighbors():
+    nothing = BakedScene(random_scene(count=0))
+    assert not nothing.render_depth(*CAMERA, X_WC, merged_spread=0.5).any()
 
 
 @pytest.mark.parametrize("simd", LEVELS)

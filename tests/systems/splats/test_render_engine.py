@@ -249,6 +249,13 @@ def test_a_geometry_is_drawn_as_gaussians_at_its_pose():
         assert depth(copied)[CENTER] == pytest.approx(4.0, rel=2e-3)
     assert engine.RemoveGeometry(id)
     assert label(engine)[CENTER] == UNSPECIFIED
+    # Another body at the same pose.
+    for value in (1, 2):
+        id = GeometryId.get_new_id()
+        properties = gaussian_properties(disc(), label=RenderLabel(value))
+        engine.RegisterVisual(id, Box(1, 1, 1), properties, pose)
+        assert label(engine)[CENTER] == value
+        assert engine.RemoveGeometry(id)
 
 
 @pytest.mark.parametrize("time", [0.0, 3.0])

@@ -19,6 +19,7 @@ from splatpilot.systems.splats.background import EnvironmentMap
 from splatpilot.systems.splats.baked_scene import BakedScene, MovingGaussians
 from splatpilot.systems.splats.lens import Distortion
 from splatpilot.systems.splats.moving_bodies import Bodies, MovingObstacles
+from splatpilot.systems.splats.scene import GaussianScene
 from splatpilot.systems.splats.splat_camera import SplatCamera, row_bands
 from splatpilot.systems.vehicle.state import pose_between
 
@@ -181,6 +182,24 @@ def test_bands():
     assert len(bands) == 8  # 0.1 m at 1 m are 4 px
     assert [row for band in bands for row in range(*band)] == list(range(HEIGHT))
     assert len(row_bands(X, yawed(1.0), FOCAL, HEIGHT)) == HEIGHT
+
+
+def test_a_rolling_shutter_changes_nothing_for_a_still_camera():
+    random = np.random.default_rng(0)
+    x, y = np.mgrid[0.5:8.0:0.25, -3.0:3.0:0.25].reshape(2, -1)
+    count = len(x)
+    floor = GaussianScene.from_colors(
+        np.column_stack([x, y, np.full(count, -1.0)]),
+        np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
+        np.tile([0.2, 0.2, 0.002], (count, 1)),
+        np.full(count, 0.9),
+        random.uniform(size=(count, 3)),
+    )
+    X, bodies = RigidTransform(), Bodies(1.0)
+    whole = SplatCamera(BakedScene(floor), SHUTTER_INFO).render(X)
+    rows = SplatCamera(BakedScene(floor), SHUTTER_INFO, readout=0.02).render(X, bodies, X)
+    for one, other in zip(rows, whole, strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-5)
 
 
 @pytest.mark.parametrize("distortion", [None, Distortion("fisheye", [-0.02, 0.01, 0, 0])])
