@@ -160,7 +160,8 @@ class AblationStudy:
 
 def arm_config(arm: Arm, config: ReconstructConfig) -> ReconstructConfig:
     """Returns the settings of an arm. The last of a representation follows `config`; the first uses
-    no metric depth. All have the same steps, images, maximum number of Gaussians and photometry."""
+    no metric depth, but for photometry and the least size of Gaussians. All have the same steps,
+    images and photometry."""
     return replace(
         config,
         representation=arm.representation,
@@ -196,7 +197,7 @@ def run(
     claim_folder(out / "ablation.yaml", study, overwrite)
     with resumable(lambda: f"arms that are finished are in {out}; the same command resumes"):
         result = AblationResult(
-            {capture.name: _ablate(capture, out / capture.name, config) for capture in opened}
+            {each.name: _ablate(each, out / each.name, config, overwrite) for each in opened}
         )
     for capture in opened:
         _write_grid(out / f"{capture.name}.png", capture, out / capture.name, result)
@@ -205,12 +206,15 @@ def run(
     return result
 
 
-def _ablate(capture: Capture, out: Path, config: ReconstructConfig) -> dict[str, SceneMetrics]:
+def _ablate(
+    capture: Capture, out: Path, config: ReconstructConfig, overwrite: bool
+) -> dict[str, SceneMetrics]:
     found = {}
     points = capture.points
     for arm in ARMS:
         scene = out / arm.key
-        recipe = f"capture: {capture.folder}\n{dump_config(arm_config(arm, config))}"
+        recipe = f"capture: {capture.folder}\ncameras: {capture.camera_digest()}\n"
+        recipe += dump_config(arm_config(arm, config))
         file = scene / _RECIPE
         if not file.is_file() or file.read_text() != recipe:
             print(f"{capture.name}: {arm.title}", flush=True)
@@ -219,7 +223,7 @@ def _ablate(capture: Capture, out: Path, config: ReconstructConfig) -> dict[str,
                 points = triangulate(capture, [i for i in range(len(capture)) if i not in held_out])
             source = replace(capture, points=points) if arm.step == "points" else capture
             with resumable(partial(kept_work, scene)):
-                reconstruct(source, scene, arm_config(arm, config))
+                reconstruct(source, scene, arm_config(arm, config), restart=overwrite)
             write_text(file, recipe)
         found[arm.key] = read_metrics(scene) or measure_scene(scene, capture)
     return found

@@ -28,6 +28,7 @@ from splatpilot.systems.common.config import dump_config
 from splatpilot.systems.common.files import claim_folder, locks_folder, write_csv, write_text
 from splatpilot.systems.common.progress import Progress, resumable
 from splatpilot.systems.common.validation import Config, bounded, require_field
+from splatpilot.systems.splats.background import EnvironmentMap
 from splatpilot.training.captures.capture import (
     Capture,
     CaptureFrame,
@@ -38,7 +39,7 @@ from splatpilot.training.captures.capture import (
 )
 from splatpilot.training.captures.render import true_camera
 from splatpilot.training.reconstruction.checkpoint import kept_work
-from splatpilot.training.reconstruction.config import ReconstructConfig
+from splatpilot.training.reconstruction.config import HOLD_OUT, ReconstructConfig
 from splatpilot.training.reconstruction.metrics import mean_metric
 from splatpilot.training.reconstruction.reconstruct import reconstruct
 from splatpilot.training.reconstruction.splat_rendering import SceneRenderer
@@ -241,15 +242,18 @@ def displace_pose(
 class ViewSupport:
     """The fraction of a view's pixels whose surface a fitted camera saw similarly. One of the 16
     closest cameras saw the point at the depth of the scene (within 5 %), from a direction within 45
-    degrees and from at most twice the distance. `camera` is K (3, 3), width and height [px]."""
+    degrees and from at most twice the distance. `camera` is K (3, 3), width and height [px]; pixels
+    without a surface count, unless the capture saw the sky."""
 
     def __init__(
         self,
         renderer: SceneRenderer,
         camera: tuple[NDArray, int, int],
         X_WCs: Sequence[RigidTransform],
+        has_sky: bool = False,
     ):
         K, width, height = camera
+        self._has_sky = has_sky
         shrunk = _WIDTH / width
         self._K = K.copy()
         self._K[:2] *= shrunk
@@ -270,7 +274,8 @@ class ViewSupport:
         distances = np.linalg.norm(self._p_WCs - X_WC.translation(), axis=1)
         for i in np.argsort(distances, kind="stable")[:_CAMERAS]:
             unseen = unseen[~self._sees(i, p_WQ[:, unseen], ray[:, unseen])]
-        return float((len(z) - len(unseen)) / depth.size)
+        count = len(z) if self._has_sky else depth.size
+        return float((len(z) - len(unseen)) / max(count, 1))
 
     def distance(self, p_WC: ArrayLike) -> float:
         """Returns the distance to the closest camera [m]."""
@@ -396,15 +401,15 @@ def study_scene(
     capture = views.capture
     if not capture.has_depth or not capture.metric:
         raise ValueError(f"{scene}: its capture {capture.source} has no metric depth to compare")
-    # Over all pixels, as off the path.
-    on_path = (views.measure(views.frame(i)) for i in views.measured)
-    on_path_psnr_db, _ = mean_metric(on_path, "psnr_db")
-    assert on_path_psnr_db is not None
     camera = find_camera(Path(views.metadata.capture))
     if camera is not None:
         frames = _rendered_frames(views, scene, camera, config)
     else:
         views, frames = _held_out_frames(views, out, config)
+    # Over all pixels, as off the path, and of the same reconstruction.
+    on_path = (views.measure(views.frame(i)) for i in views.measured)
+    on_path_psnr_db, _ = mean_metric(on_path, "psnr_db")
+    assert on_path_psnr_db is not None
     support = _support(views)
     samples, shown = [], []
     for i, offset, frame in frames:
@@ -461,7 +466,8 @@ def store_bounds(scene: Path, study: FidelityStudy) -> SceneMetadata:
 def _support(views: SceneViews) -> ViewSupport:
     capture = views.capture
     camera = capture.K, capture.width, capture.height
-    return ViewSupport(views.renderer, camera, [capture.X_WCs[i] for i in views.fitted])
+    X_WCs = [capture.X_WCs[i] for i in views.fitted]
+    return ViewSupport(views.renderer, camera, X_WCs, isinstance(views.background, EnvironmentMap))
 
 
 def _rendered_frames(
@@ -477,7 +483,8 @@ def _rendered_frames(
                 path = np.linspace(X_WCs[i].translation(), X_WC.translation(), 11)
                 if offset and esdf.distance(path[1:]).min() < config.clearance:
                     continue
-                yield i, offset, camera(X_WC)
+                frame = camera(RigidTransform(views.capture.origin) @ X_WC)
+                yield i, offset, replace(frame, X_WC=X_WC)
 
 
 def _held_out_frames(
@@ -487,10 +494,10 @@ def _held_out_frames(
     capture = views.capture
     held_out = choose_held_out(len(capture), config.stretches, config.kept)
     representation = views.metadata.representation
-    settings = replace(config.reconstruct, representation=representation, hold_out=0)
-    recipe = f"{dump_config(settings)}held_out: {held_out}\n"
-    file = out / _RECIPE
+    settings = replace(config.reconstruct, representation=representation, hold_out=HOLD_OUT)
     part = drop_frames(capture, held_out)
+    recipe = f"{dump_config(settings)}held_out: {held_out}\ncameras: {part.camera_digest()}\n"
+    file = out / _RECIPE
     if not file.is_file() or file.read_text() != recipe:
         with resumable(lambda: kept_work(out)):
             reconstruct(part, out, settings)

@@ -24,7 +24,7 @@ from splatpilot.systems.common.files import locked_folder, require_unused, write
 from splatpilot.systems.common.processes import require_renderer
 from splatpilot.systems.common.progress import Progress, resumable
 from splatpilot.systems.common.provenance import InfeasibleFlightError
-from splatpilot.systems.common.validation import bounded
+from splatpilot.systems.common.validation import bounded, require
 from splatpilot.systems.policies.time_of_arrival import time_of_arrival
 from splatpilot.systems.splats.background import RenderedView, put_behind
 from splatpilot.training.captures import render as render_capture
@@ -159,12 +159,10 @@ class SceneViews:
         self.metadata: scene_folder.SceneMetadata = scene_folder.read_scene_metadata(scene)
         self.background = scene_folder.read_background(scene, self.metadata)
         self.capture = capture = capture or read_scene_capture(scene, self.metadata)
-        missing = [i for i in self.metadata.held_out if i >= len(capture)]
-        if missing:
-            raise ValueError(
-                f"{scene / 'scene.yaml'}: frame {missing[0]} is held out, but {capture.source} has "
-                f"only {len(capture)} frames; the capture has changed, reconstruct the scene again"
-            )
+        fitted = len(self.metadata.gains) or len(capture)
+        valid = fitted == len(capture) > max(self.metadata.held_out, default=0)
+        remedy = "the capture has changed since; reconstruct the scene again"
+        require(valid, f"frames of {capture.source}", f"those of {scene}", len(capture), remedy)
         held_out = set(self.metadata.held_out)
         self.fitted = [i for i in range(len(capture)) if i not in held_out]
         self.factor = shrink_factor(capture.width, self.metadata.image_width)

@@ -11,6 +11,8 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from splatpilot.diagrams.worlds import scene_folder
 from splatpilot.diagrams.worlds.world import World
+from splatpilot.systems.collision.depth_fusion import swept_space
+from splatpilot.systems.collision.distance_field import FieldState
 from splatpilot.systems.collision.esdf import Esdf
 from splatpilot.systems.collision.observations import Observations
 from splatpilot.systems.common.config import load_config
@@ -23,12 +25,13 @@ from splatpilot.systems.splats.splat_files import (
     sog_meta,
     write_splats,
 )
+from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 from splatpilot.training.captures.capture import shrink_factor
 from splatpilot.training.captures.capture_config import CaptureConfig, complete_config
 from splatpilot.training.captures.capture_registry import read_scene_capture
 from splatpilot.training.captures.up_and_scale import camera_height
 from splatpilot.training.reconstruction.config import ReconstructConfig
-from splatpilot.training.reconstruction.distance_field import render_depth
+from splatpilot.training.reconstruction.distance_field import keep_confirmed, render_depth
 from splatpilot.training.reconstruction.reconstruct import with_default_route
 
 _KEPT = (
@@ -173,6 +176,15 @@ def rescale(scene: Path, out: Path, factor: float) -> RescaleSummary:
             shrunk = shrink_factor(capture.width, about.image_width)
             threads = ReconstructConfig().renderer_threads
             depth = render_depth(capture, shrunk, gaussians, about.representation, threads)
+            if not capture.has_depth:  # as `make_distance_field` does
+                depth = keep_confirmed(depth, 2.0 * field.voxel_size)
+                path = swept_space(
+                    *(capture.X_WCs, field.lower_W, field.states.shape, field.voxel_size),
+                    VEHICLE_RADIUS,
+                )
+                states = field.states.copy()
+                states[path & (states == FieldState.UNKNOWN)] = FieldState.FREE
+                field = replace(field, states=states)
             field, frontier = scene_folder.close_frontier(
                 field, depth.images(), depth.K, depth.X_WCs
             )

@@ -152,23 +152,28 @@ class Observations:
 
 
 def _points(
-    depth: np.ndarray, K: np.ndarray, X_WC: RigidTransform, step: int
+    depth: np.ndarray, K: np.ndarray, X_WC: RigidTransform, step: int, far: float = FAR
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Returns points p_WQ (n, 3) [m] of every `step`-th pixel of a depth image along both axes, and
-    the mask (h, w) of those pixels that show a surface."""
+    the mask (h, w) of those pixels that show a surface nearer than `far` [m]."""
     x, y = np.meshgrid(*(slopes[step // 2 :: step] for slopes in ray_slopes(depth.shape, K)))
     z = depth[step // 2 :: step, step // 2 :: step]
-    known = (z > 0.0) & (z < FAR)
+    known = (z > 0.0) & (z < far)
     p_CQ = np.stack([x, y, np.ones_like(x)], axis=-1)[known] * z[known, None]
     return p_CQ @ X_WC.rotation().matrix().T + X_WC.translation(), known
 
 
 def _seen_voxels(
-    depth: np.ndarray, K: np.ndarray, X_WC: RigidTransform, voxel_size: float, step: int
+    depth: np.ndarray,
+    K: np.ndarray,
+    X_WC: RigidTransform,
+    voxel_size: float,
+    step: int,
+    far: float = FAR,
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Returns the keys (V,) of the voxels of surfaces in every `step`-th pixel of an image, and
     p_QC (V, 3) [m], the camera seen from their centers."""
-    p_WQ, _ = _points(depth, K, X_WC, step)
+    p_WQ, _ = _points(depth, K, X_WC, step, far)
     key = np.unique(_key(np.floor(p_WQ / voxel_size).astype(np.int64)))
     return key, X_WC.translation() - voxel_size * (_voxel(key) + 0.5)
 
@@ -190,8 +195,9 @@ class ConfirmedSurfaces:
         """Finds the voxels that at least three images show, from directions that span at least 12
         degrees. For the images see `esdf_from_depth_images`."""
         keys, directions = [], []
+        self._far = (1 << (_BITS - 2)) * voxel_size  # keys hold no farther points
         for depth, X_WC in zip(depths, X_WCs, strict=True):
-            key, p_QC = _seen_voxels(depth, K, X_WC, voxel_size, step=1)
+            key, p_QC = _seen_voxels(depth, K, X_WC, voxel_size, 1, self._far)
             keys.append(key)
             directions.append(p_QC / np.linalg.norm(p_QC, axis=1, keepdims=True))
         key, order, counts = _grouped(keys)
@@ -202,12 +208,12 @@ class ConfirmedSurfaces:
         self._voxel_size, self._K = voxel_size, K
 
     def keep(self, depth: np.ndarray, X_WC: RigidTransform) -> NDArray[np.float32]:
-        """Returns a depth image (H, W) [m] that is 0 at other surfaces."""
-        p_WQ, known = _points(depth, self._K, X_WC, 1)
+        """Returns a depth image (H, W) [m] that is 0 at other surfaces; infinity stays."""
+        p_WQ, known = _points(depth, self._K, X_WC, 1, self._far)
         key = _key(np.floor(p_WQ / self._voxel_size).astype(np.int64))
         confirmed = _look_up(self._keys, np.ones(len(self._keys), dtype=bool), key)
-        kept = depth.astype(np.float32)
-        kept[known] *= confirmed
+        kept = np.where(np.isinf(depth), depth, 0.0).astype(np.float32)
+        kept[known] = depth[known] * confirmed
         return kept
 
 

@@ -1,5 +1,6 @@
 """A capture: posed images of a scene, with the cameras that took them."""
 
+import hashlib
 from bisect import bisect_left
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -338,6 +339,13 @@ class Capture:
 
     def __len__(self) -> int:
         return len(self.X_WCs)
+
+    def camera_digest(self) -> str:
+        """Returns a digest of the cameras and their poses."""
+        parts = [self.K, *(X_WC.GetAsMatrix34() for X_WC in self.X_WCs)]
+        if self.depth_camera is not None:
+            parts += [self.depth_camera.K, self.depth_camera.X_CD.GetAsMatrix34()]
+        return hashlib.sha256(b"".join(each.tobytes() for each in parts)).hexdigest()
 
     @property
     def has_depth(self) -> bool:

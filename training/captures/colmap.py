@@ -32,7 +32,12 @@ from splatpilot.training.captures.capture import (
     project_points,
 )
 from splatpilot.training.captures.capture_config import CaptureConfig
-from splatpilot.training.captures.frames import FrameFiles, open_frames, pose_from_matrix
+from splatpilot.training.captures.frames import (
+    FrameFiles,
+    open_frames,
+    pose_from_matrix,
+    read_depth,
+)
 from splatpilot.training.captures.up_and_scale import make_metric, turn_upright
 
 if TYPE_CHECKING:
@@ -153,6 +158,9 @@ def open_model(
             name=image.name,
         )
 
+    def read(file: Path, unit: float) -> NDArray[np.float32]:
+        return read_depth(file, 1.0 if file.suffix == ".npy" and not config.depth_unit else unit)
+
     registered = [image for image in reconstruction.images.values() if image.has_pose]
     total = max(len(reconstruction.images), len(registered) + len(dropped))
     note = f"{len(registered)} of {total} images are registered"
@@ -165,6 +173,7 @@ def open_model(
         [frame(image) for image in sorted(registered, key=lambda image: image.name)],
         axes=OPTICAL_AXES,
         config=config,
+        read_depth=read,
         up="",
         dropped=dropped,
         notes=[note],

@@ -93,6 +93,9 @@ def read_photographs(path: Path, config: CaptureConfig) -> Capture:
         raise ValueError(f"{path}: readable photographs must be at least 3, got {len(files)}{why}")
     folder = files[0].parent
     names = [file.name for file in files]
+    for name in names:
+        valid = not any(map(str.isspace, name))  # which separates names in COLMAP's lists
+        require(valid, f"{folder}: names", "without spaces", repr(name), "rename the files")
     masks = sorted(file for file in mask_folder(folder).rglob("*") if file.is_file())
     version = import_pycolmap().__version__
     key = cache_key([*files, *masks], version, _MAX_SIZE, _SEED, config.partners, config.intrinsics)

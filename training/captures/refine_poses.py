@@ -5,7 +5,6 @@ shows every surface twice. This is direct bundle adjustment of RGB-D frames (Ker
 2013; Schops, Sattler and Pollefeys 2019), by Gauss-Newton, of all frames at once.
 """
 
-import hashlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -296,12 +295,11 @@ def refined_capture(capture: Capture, path: Path, config: CaptureConfig) -> Capt
     keeps them."""
     if not capture.has_depth:
         raise ValueError(f"{path}: capture.refine_poses needs depth, and it has none; omit it")
-    parts = [capture.K, *(X_WC.GetAsMatrix34() for X_WC in capture.X_WCs)]
-    if capture.depth_camera is not None:
-        parts += [capture.depth_camera.K, capture.depth_camera.X_CD.GetAsMatrix34()]
-    read = hashlib.sha256(b"".join(each.tobytes() for each in parts)).hexdigest()
+    settings = replace(config, cache="").settings()
     files = sorted(path.rglob("*")) if path.is_dir() else [path]
-    key = cache_key(filter(Path.is_file, files), _VERSION, np.__version__, read)
+    key = cache_key(
+        filter(Path.is_file, files), _VERSION, np.__version__, capture.camera_digest(), settings
+    )
     file = cache_folder(config, "poses") / f"poses-{key}.npy"
     if not file.is_file():
         prepare_cache(file.parent)

@@ -11,7 +11,7 @@ cache once, in TUM's format.
 import json
 import struct
 from bisect import bisect_left, insort
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import closing
 from dataclasses import replace
 from operator import itemgetter
@@ -122,9 +122,9 @@ class _Bag:
         )
         poses = self._topics(*_POSES) or [t for t in self._topics(_TF) if t != "/tf_static"]
         given = topics or ["", "", ""]
-        self._color = self._choose("color images", colors, given[0])
-        self._depth = self._choose("depth images", depths, given[1])
-        self._pose = self._choose("poses", poses, given[2])
+        self._color = self._choose("color images", colors, given[0], _IMAGES)
+        self._depth = self._choose("depth images", depths, given[1], _IMAGES)
+        self._pose = self._choose("poses", poses, given[2], (*_POSES, _TF))
 
     def write(self, folder: Path) -> None:
         """Writes images, lists of times and poses, and the calibration."""
@@ -138,7 +138,11 @@ class _Bag:
             pose_field = _POSES[self._types[self._pose]]
             for message in self._messages(self._pose):
                 body = getattr(message, "child_frame_id", "").lstrip("/")
-                X_BC = tree.fixed_pose(body, frame) or RigidTransform()
+                X_BC = tree.fixed_pose(body, frame) if body else RigidTransform()
+                if X_BC is None:
+                    what = f"{self._path}: {body!r}, whose poses are in {self._pose},"
+                    condition = f"connected by /tf_static with {frame!r}, of {self._color}"
+                    require(False, what, condition, "no transform", "record it in the bag")
                 poses.append((_time(message), _pose(pose_field(message), self._pose) @ X_BC))
         what = f"{self._path}: poses of {frame!r}, the frame of {self._color}, in {self._pose}"
         require(len(poses) >= 2, what, "at least 2", len(poses))
@@ -149,8 +153,11 @@ class _Bag:
     def _topics(self, *types: str) -> list[str]:
         return sorted(topic for topic, each in self._types.items() if each in types)
 
-    def _choose(self, what: str, topics: list[str], given: str) -> str:
+    def _choose(self, what: str, topics: list[str], given: str, types: Collection[str]) -> str:
         if given in self._types:
+            found = self._types[given] if self._first(given) else "no message"
+            kinds = f"of {' or '.join(types)}"
+            require(found in types, f"{self._path}: {what}, {given},", kinds, found)
             return given
         if given or not topics:
             missing = given or f"of {what}"

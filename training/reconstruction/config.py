@@ -28,10 +28,11 @@ class ReconstructConfig(Config):
     "auto" takes depth or, without it, points."""
     initial_gaussians: int = bounded(0, "[0, inf)")
     """Maximum number of initial Gaussians. 0 takes as many as shape and texture need at the
-    resolution of the closest images, at most 1,000,000, if they start from depth, and 120,000 if
-    they start at random."""
-    max_gaussians: int = bounded(180_000, "[1, inf)")
-    """Maximum number of Gaussians. Without iterations, it sets how finely texture is resolved."""
+    resolution of the closest images, at most `max_gaussians`, if they start from depth, and 120,000
+    if they start at random."""
+    max_gaussians: int = bounded(0, "[0, inf)")
+    """Maximum number of Gaussians. 0 is 1,000,000 if they start from depth, else 180,000. Without
+    iterations, for which 0 is 180,000, it sets how finely texture is resolved."""
     split: str = bounded("", "{, train, validation, test}")
     """Use of the scene; empty takes the capture's, or "train". Scenes of the benchmark are "test".
     """

@@ -51,7 +51,7 @@ _OPACITY = 0.99  # on surfaces
 _BEHIND = 0.1  # relative difference of depth, above which another surface shows
 _POINT_OPACITY, _POINT_SIZE = 0.1, 0.5  # size relative to the distance of the three closest others
 _RANDOM_DEPTH = (0.1, 10.0)  # in extents of the cameras
-_MAX_FROM_DEPTH, _RANDOM = 1_000_000, 120_000  # default maximum numbers of initial Gaussians
+_MAX_FROM_DEPTH, _MAX_ADDED, _RANDOM = 1_000_000, 180_000, 120_000  # numbers of Gaussians
 _OVERLAP, _FEATURES = 10, 2048  # of images to be matched, and maximum of an image
 _MIN_POINTS = 100  # that are triangulated
 
@@ -232,7 +232,11 @@ def resolve_config(config: ReconstructConfig, capture: Capture) -> ReconstructCo
         fitted = len(capture) - len(held_out_frames(capture, config))
         iterations = min(max(_STEPS_PER_IMAGE * fitted, _MIN_STEPS), MAX_STEPS)
         iterations = iterations if kind == "depth" else MAX_STEPS
-    return replace(config, initialization=kind, strategy=strategy, iterations=iterations)
+    most = config.max_gaussians or _MAX_FROM_DEPTH
+    if not config.max_gaussians and (kind != "depth" or iterations == 0):
+        most = _MAX_ADDED
+    steps = {"strategy": strategy, "iterations": iterations, "max_gaussians": most}
+    return replace(config, initialization=kind, **steps)
 
 
 def held_out_frames(capture: Capture, config: ReconstructConfig) -> list[int]:
@@ -256,7 +260,7 @@ def make_initial_gaussians(
     possible = " or ".join(name for name, exists in available.items() if exists)
     require(available[kind], "initialization", f"{possible} for {capture.name}", kind)
     if kind == "depth":
-        count = config.initial_gaussians or _MAX_FROM_DEPTH
+        count = min(config.initial_gaussians or config.max_gaussians, config.max_gaussians)
         return gaussians_from_depth(frames, photometry, count, config.contrast, optimized=True)
     if kind == "points":
         points = capture.points

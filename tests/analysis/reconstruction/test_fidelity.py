@@ -86,7 +86,7 @@ def test_held_out_stretches(room, set_fields):
     expected = [0.15, 0.15, 0.3, 0.15]
     np.testing.assert_allclose([float(row["offset"]) for row in rows], expected, atol=1e-9)
     part = read_scene_metadata(out / "real")
-    assert len(part.gains) == 12 and part.held_out == []
+    assert len(part.gains) == 12 and part.held_out == [0, 8]
     metadata = read_scene_metadata(scene)
     middle = np.median(metadata.pose_perturbation_bounds)
     assert 0 < middle < 0.31 and metadata.perturbation_bound == middle

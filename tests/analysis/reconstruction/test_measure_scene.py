@@ -101,8 +101,9 @@ def test_a_scene_against_its_own_views_with_and_without_depth(room):
 def test_scenes_that_cannot_be_measured(room):
     with pytest.raises(ValueError, match=r"scene\.yaml: names no capture"):
         SceneViews(room.scene("lost", capture=""))
-    with pytest.raises(ValueError, match=r"frame 16 is held out, but a room .* only 16 frames"):
-        SceneViews(room.scene("other", held_out=[0, 16]))
+    for name, fields in (("other", {"held_out": [0, 16]}), ("shorter", {"gains": [1.0] * 17})):
+        with pytest.raises(ValueError, match=r"frames of a room .*must be those of .*, got 16"):
+            SceneViews(room.scene(name, **fields))
     scene = room.scene("damaged")
     assert read_metrics(scene) is None
     (scene / "metrics.json").write_text("{}")

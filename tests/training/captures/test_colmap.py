@@ -184,7 +184,7 @@ def test_images_in_subfolders_keep_their_paths(model, views, room_poses):
     with pytest.raises(ValueError, match=r"several .* called '00.png'; choose one of cam0/00.png"):
         scaled("00.png", "cam1/01.png")
     (model / "depth/cam1").mkdir(parents=True)
-    np.save(model / "depth/cam1/02.npy", (1000 * views[7].depth).astype(np.float32))
+    np.save(model / "depth/cam1/02.npy", views[7].depth.astype(np.float32))
     capture = read_capture(model, CaptureConfig(scale=ScaleConfig(depth_folder="depth")))
     np.testing.assert_allclose(capture.frame(7).depth, views[7].depth, rtol=1e-5)
     assert capture.load_depth(2) is None

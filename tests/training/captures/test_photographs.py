@@ -108,6 +108,9 @@ def test_images_that_are_not_photographs_are_named(tmp_path):
     with pytest.raises(ValueError, match="3 photographs could not be registered"):
         read_capture(tmp_path / "gray", CaptureConfig(cache=str(tmp_path / "cache")))
     assert not any(path.is_file() for path in (tmp_path / "cache").rglob("*"))
+    (tmp_path / "gray/1.png").rename(tmp_path / "gray/photo 1.png")
+    with pytest.raises(ValueError, match=r"names must be without spaces, got 'photo 1\.png'"):
+        read_capture(tmp_path / "gray")
     path = tmp_path / "photos"
     path.mkdir()
     cv2.imwrite(str(path / "depth0.png"), np.ones((8, 8), np.uint16))

@@ -142,6 +142,8 @@ def test_poses_are_refined_once(folder, room_poses, monkeypatch, capfd):
     for X_WC, same in zip(capture.X_WCs, again.X_WCs, strict=True):
         assert X_WC.IsExactlyEqualTo(same)
     assert capfd.readouterr().err == ""
+    with pytest.raises(TypeError):  # it would refine them again
+        read_capture(folder, CaptureConfig(depth_unit=500.0))
     (folder / "frame-000003.depth.png").touch()
     with pytest.raises(TypeError):
         read_capture(folder)

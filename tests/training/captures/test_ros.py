@@ -238,8 +238,12 @@ def test_missing_parts_are_named(bag, config, tmp_path):
         read_capture(path, config())
     with pytest.raises(ValueError, match=r"has no topic /vicon; it has /color, /depth"):
         read_capture(path, config(topics=["/color", "/depth", "/vicon"]))
-    capture = read_capture(path, config(topics=["/color", "/depth", "/slam"]))
-    assert len(capture) == 10  # of the body: nothing says where on it the camera is
+    with pytest.raises(ValueError, match=r"poses, /color, must be of .*Odometry.*, got .*Image"):
+        read_capture(path, config(topics=["/color", "/depth", "/color"]))
+    # Nothing says where on the body the camera is.
+    condition = f"connected by /tf_static with '{FRAME}', of /color, got no transform"
+    with pytest.raises(ValueError, match=f"'base_link', .* in /slam, must be {condition}"):
+        read_capture(path, config(topics=["/color", "/depth", "/slam"]))
     with pytest.raises(ValueError, match=r"a part of a bag; name its folder"):
         read_capture(next(path.glob("*.db3")), config())
 

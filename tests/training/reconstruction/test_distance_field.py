@@ -71,12 +71,12 @@ def test_masked_pixels_leave_space_unknown():
     assert_right_half_is_unknown(render_depth(capture, 2, wall(2.0), "3dgs", 1))
 
 
-@pytest.mark.parametrize("aside", [0.4, 0.0])
-def test_depth_of_photographs_from_one_position_frees_no_space(aside):
+@pytest.mark.parametrize(("aside", "distance"), [(0.4, 2.03), (0.0, 2.03), (0.0, 203.0)])
+def test_depth_of_photographs_from_one_position_frees_no_space(aside, distance):
     X_WCs = [RigidTransform(np.array([x, 0.0, 0.0])) for x in (-aside, 0.0, aside)]
     capture = replace(make_capture(ALL, ALL), X_WCs=X_WCs, load_depth=no_depth)
     config = ReconstructConfig(iterations=1, voxel_size=0.1)
-    field, _ = make_distance_field(capture, ShrunkFrames(capture, [0], 1), wall(2.03), config)
+    field, _ = make_distance_field(capture, ShrunkFrames(capture, [0], 1), wall(distance), config)
     assert (field.query([[0.0, 0.0, 1.5]]).state == [FieldState.FREE]) == (aside > 0.0)
 
 

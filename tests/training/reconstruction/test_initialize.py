@@ -74,6 +74,16 @@ def test_the_sky_has_no_gaussians(capture):
     assert np.abs(below.means).max() <= np.abs(whole.means).max() + 0.1
 
 
+def test_the_maximum_number_of_gaussians_is_kept(capture):
+    for most, expected in ((0, 1_000_000), (500, 500)):
+        config = initialize.resolve_config(ReconstructConfig(max_gaussians=most), capture)
+        assert config.max_gaussians == expected
+    frames = list(capture.frames())
+    photometry = estimate_photometry([ThinnedFrame.of(frame) for frame in frames], 0)
+    made = initialize.make_initial_gaussians(capture, frames, photometry, 1.0, config)
+    assert len(made) <= 500
+
+
 def test_too_many_gaussians_to_optimize_are_sampled(capture, capsys):
     frames = list(capture.frames())
     every = from_depth(frames)
