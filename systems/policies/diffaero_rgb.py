@@ -43,8 +43,7 @@ class DiffAeroRgbConfig(LearnedPolicyConfig):
     )
 
     def check(self) -> None:
-        require_view(self.camera.width, self.camera.height)
-        require_field(self.camera, "fov_x", self.camera.fov_x == FOV_X, f"{FOV_X:g} deg")
+        require_view(self.camera)
 
 
 @dataclass
@@ -175,7 +174,7 @@ def encode_view(color: np.ndarray, R_WB: np.ndarray) -> np.ndarray:
     """Returns the network's input (6, 90, 160): RGB in [-1, 1] of images (H, 160, 3) uint8, and
     rays in the heading frame at the attitude R_WB (3, 3)."""
     H, W = color.shape[:2]
-    require_view(W, H)
+    _require_size(W, H)
     first = (H - HEIGHT) // 2
     view = np.empty((CHANNELS, HEIGHT, WIDTH), np.float32)
     view[:3] = color[first : first + HEIGHT].transpose(2, 0, 1) * np.float32(1.0 / 127.5)
@@ -186,8 +185,18 @@ def encode_view(color: np.ndarray, R_WB: np.ndarray) -> np.ndarray:
     return view
 
 
-def require_view(width: int, height: int) -> None:
-    """Checks that images of this size [px] contain the view."""
+def require_view(camera: OnboardCamera) -> None:
+    """Checks that images of a camera contain the view of `rays_B`."""
+    _require_size(camera.width, camera.height)
+    require_field(camera, "fov_x", camera.fov_x == FOV_X, f"{FOV_X:g} deg")
+    square = camera.fov_y is None and camera.distortion is None
+    condition = "left out, as distortion: the policy knows pinholes with square pixels"
+    require_field(camera, "fov_y", square, condition)
+    ahead = camera.mount().rotation().IsNearlyEqualTo(OnboardCamera().mount().rotation(), 1e-6)
+    require_field(camera, "X_BC", ahead, "that of a camera along body x")
+
+
+def _require_size(width: int, height: int) -> None:
     valid = width == WIDTH and height >= HEIGHT and height % 2 == 0
     condition = f"{WIDTH} pixels wide, with an even height of at least {HEIGHT}"
     require(valid, "the color image", condition, f"{width}x{height}")

@@ -168,7 +168,7 @@ def collect_world(folder: Path, config: CorpusConfig, index: int, revision: str)
         about = {"world": source.name, "source": kind, "flights": flights, "revision": revision}
         write_shard(shard_folder(folder, source.name, kind), parts, config.size, **about)
 
-    parts = []
+    off_path = []
     own_pose = replace(config, perturbation=replace(config.perturbation, copies=0))
     for first in range(0, config.off_path, STATES_PER_APPEARANCE):
         # The expert's flights use the numbers from 0.
@@ -176,9 +176,7 @@ def collect_world(folder: Path, config: CorpusConfig, index: int, revision: str)
         count = min(STATES_PER_APPEARANCE, config.off_path - first)
         states = draw_off_path(labeler, count, config.expert.speed, rng)
         shown = keep_clear(labeler.labels(states), labeler.field)
-        parts.append(render_samples(shown, world, labeler, own_pose, bound, rng))
-    if config.off_path:
-        write(OFF_PATH, parts, [{"states": sum(map(len, parts))}])
+        off_path.append(render_samples(shown, world, labeler, own_pose, bound, rng))
 
     rngs = [np.random.default_rng([config.seed, source.seed, k]) for k in range(config.flights)]
     min_time = 0.5 * labeler.toa.value(world.p_WS)
@@ -207,6 +205,8 @@ def collect_world(folder: Path, config: CorpusConfig, index: int, revision: str)
                 "states": len(shown),
             }
         )
+    if config.off_path:
+        write(OFF_PATH, off_path, [{"states": sum(map(len, off_path))}])
     write(EXPERT, parts, entries)
 
 

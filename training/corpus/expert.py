@@ -1,5 +1,6 @@
 """The expert to imitate: its flights, and the best trajectories from any state."""
 
+import contextlib
 from collections.abc import Iterable
 from dataclasses import dataclass
 from math import ceil
@@ -144,11 +145,14 @@ def fly_planner(
     for number in range(ceil(Scenario.timeout / config.period)):
         if not len(flying):
             break
-        paths = np.empty((len(flying), NUM_WAYPOINTS + 1, 3))
+        paths = np.full((len(flying), NUM_WAYPOINTS + 1, 3), np.nan)
         for row, (n, state) in enumerate(zip(flying, states, strict=True)):
-            plan = labeler.label(number * config.period, state)
-            labels[n].append(Label(state, plan))
-            paths[row] = np.vstack([state[:3], plan.waypoints_W[plan.best]])
+            with contextlib.suppress(InfeasibleFlightError):  # No path: the flight does not arrive.
+                plan = labeler.label(number * config.period, state)
+                labels[n].append(Label(state, plan))
+                paths[row] = np.vstack([state[:3], plan.waypoints_W[plan.best]])
+        keep = np.isfinite(paths[:, 0, 0])
+        flying, paths, states = flying[keep], paths[keep], states[keep]
         for step in range(substeps):
             p_WB, v_WB, _, _ = QuadrotorState.of(states)
             along = (step * dt + control.lookahead) / WAYPOINT_PERIOD

@@ -87,7 +87,7 @@ def change_appearance(color: Tensor, appearance: Appearance, generator: torch.Ge
     """Changes exposure and hue of colors (N, H, W, 3), 0 to 255."""
     draws = torch.rand(2, len(color), 1, 1, 1, generator=generator, device=color.device)
     exposure, hue = 2.0 * draws - 1.0
-    color = 2.0 ** (appearance.exposure * exposure) * color
+    color = (2.0 ** (appearance.exposure * exposure) * color).clamp(max=255.0)
     if appearance.hue == 0.0:
         return color
     angle = (appearance.hue * hue).deg2rad()

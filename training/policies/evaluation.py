@@ -188,7 +188,7 @@ class FlightTrainer(Trainer):
         self.generator = torch.Generator(config.device).manual_seed(config.seed)
         self.worlds = training_worlds(config.worlds, config.seed, config.device)
         self._validation = validation_worlds(config.worlds, config.device)
-        self._kinds = config.worlds.turns
+        self._kinds, self.learns_from = config.worlds.turns, config.worlds.digest()
 
     def evaluate(self) -> dict[str, float]:
         outcomes = evaluate_agent(self.agent, self._validation, self.conditions, self.noise)

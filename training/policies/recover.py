@@ -50,7 +50,7 @@ from splatpilot.training.corpus.expert import Labeler
 from splatpilot.training.corpus.library import WorldRecord
 from splatpilot.training.corpus.samples import EXPERT, RECOVERY, Shard, write_shard
 from splatpilot.training.policies import train
-from splatpilot.training.policies.student_data import is_held_out
+from splatpilot.training.policies.student_data import held_out_worlds
 from splatpilot.training.policies.trainer import CorpusTraining, Trainer
 
 _PATIENCE = 2.0  # maximum time of a student's flight, in times of the expert's
@@ -345,7 +345,7 @@ def run[Config: CorpusTraining](
             f"samples of the corpora were labeled by revision {', '.join(sorted(others))} of the "
             f"program, recovery by {revision()}; see ledger.csv"
         )
-    held_out = {name for name in worlds if is_held_out(name, config.held_out)}
+    held_out = set(held_out_worlds(worlds, config.held_out))
     outcomes: Counter[str] = Counter()
     for folder, corpus, shards in zip(folders, corpora, distinct_shards(corpora), strict=True):
         tasks = list_tasks([shard for shard in shards if shard.world not in held_out], flights)

@@ -1,6 +1,6 @@
 """Samples of corpora for training: labels, images, distances in their worlds, cached features."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from hashlib import blake2b
 from itertools import chain
@@ -16,10 +16,11 @@ from splatpilot.diagrams.worlds.scene_folder import SceneSource
 from splatpilot.systems.common.files import require_writable_folder, written_atomically
 from splatpilot.systems.common.progress import Progress, say
 from splatpilot.systems.common.readers import error_summary
+from splatpilot.systems.common.validation import require
 from splatpilot.systems.policies.student import encode_color, encode_depth
 from splatpilot.systems.vehicle.state import rotation_matrices
 from splatpilot.training.corpus.corpus import Corpus, distinct_shards, distinct_worlds
-from splatpilot.training.corpus.library import require_untested
+from splatpilot.training.corpus.library import WorldRecord, require_untested
 from splatpilot.training.corpus.samples import RECOVERY, SHARD, Shard
 from splatpilot.training.policies.networks import StudentModule
 from splatpilot.training.policies.ray_casting import EsdfGeometry
@@ -42,7 +43,7 @@ class Labels(NamedTuple):
 
 class StudentData:
     """The distinct samples of several corpora. A fraction of their worlds is held out, see
-    `is_held_out`. Labels are on a device; images stay on disk."""
+    `held_out_worlds`. Labels are on a device; images stay on disk."""
 
     def __init__(self, corpora: Sequence[Corpus], held_out: float, device: str = "cpu") -> None:
         configs = [corpus.config for corpus in corpora]
@@ -58,11 +59,14 @@ class StudentData:
                     "them with the same"
                 )
         self._records = distinct_worlds(corpora)
+        for corpus in corpora:
+            valid, found = not corpus.config.worlds.held_out, "one of worlds.held_out"
+            require(valid, f"{corpus.folder}", "a corpus to train with", found, "collect another")
         for record in self._records.values():
             if isinstance(record.source.world, SceneSource):
                 require_untested(record.source.source_digest, str(record.path))
         self.worlds = sorted(self._records)  # names
-        self.held_out_worlds = [name for name in self.worlds if is_held_out(name, held_out)]
+        self.held_out_worlds = held_out_worlds(self._records, held_out)
         self.shards = [shard for shard in chain(*distinct_shards(corpora)) if len(shard)]
         counts = [len(shard) for shard in self.shards]
         self.first = np.cumsum([0, *counts])  # index of the first sample of each shard
@@ -75,7 +79,8 @@ class StudentData:
         self.recovered = np.flatnonzero(~outside & recovered)
         self._shown = np.flatnonzero(~outside & ~recovered)
         if not (len(self.training) and len(self.held_out)):
-            smallest = ceil(100 * min(map(_digest, self.worlds)) / _DIGESTS) / 100
+            numbers = map(_digest, map(_environment, self._records.values()))
+            smallest = ceil(100 * min(numbers) / _DIGESTS) / 100
             raise ValueError(
                 f"{len(self.held_out_worlds)} of {len(self.worlds)} worlds are held out, which "
                 f"leaves {len(self.training)} samples to train with and {len(self.held_out)} to "
@@ -143,10 +148,21 @@ class StudentData:
         return EsdfGeometry([f if f.occupied_outside else f.conservative() for f in fields])
 
 
+def held_out_worlds(records: Mapping[str, WorldRecord], fraction: float) -> list[str]:
+    """Returns the names, in order, of the `fraction` of all worlds that validate. Only the name of
+    a world counts, or the source of its scene, so that it stays on its side when corpora grow. The
+    worlds of a smaller fraction are among those of a larger one."""
+    return [n for n in sorted(records) if is_held_out(_environment(records[n]), fraction)]
+
+
+def _environment(record: WorldRecord) -> str:
+    """Returns the name of a generated world, or the digest of the source of a scene."""
+    source = record.source
+    return "".join(source.source_digest) or source.name
+
+
 def is_held_out(name: str, fraction: float) -> bool:
-    """Tells whether a world is among the `fraction` of all worlds that validate. Only its name
-    counts, so that it stays on its side when corpora grow. The worlds of a smaller fraction are
-    among those of a larger one."""
+    """Tells whether an environment is among the `fraction` of all that validate."""
     return _digest(name) < fraction * _DIGESTS
 
 

@@ -22,7 +22,7 @@ from splatpilot.systems.common.progress import CheckpointClock, Progress, resuma
 from splatpilot.systems.common.provenance import revision
 from splatpilot.systems.common.readers import error_summary
 from splatpilot.systems.common.registry import Registry
-from splatpilot.systems.common.validation import validate
+from splatpilot.systems.common.validation import require, validate
 from splatpilot.systems.policies.checkpoint import PolicyCheckpoint
 from splatpilot.training.policies.rollouts import RolloutTrainer
 from splatpilot.training.policies.train_agile_autonomy import (
@@ -184,6 +184,7 @@ class _Run:
             "optimizer": self.optimizer.state_dict(),
             "trainer": self.trainer.state_dict(),
             "learns_from": self.trainer.learns_from,
+            "revision": self.revision,
         }
         with self.clock.writing():
             save_tensors(state, self.checkpoint)
@@ -195,7 +196,7 @@ class _Run:
         remedy = f"delete {path} to start again"
         try:
             saved = load_tensors(path)
-            learns_from = saved["learns_from"]
+            learns_from, made_by = saved["learns_from"], saved["revision"]
             trainer.network.load_state_dict(saved["network"])
             self.optimizer.load_state_dict(saved["optimizer"])
             trainer.load_state_dict(saved["trainer"])
@@ -207,9 +208,11 @@ class _Run:
             ) from None
         if learns_from != trainer.learns_from:
             raise ValueError(
-                f"{path} is of a run that learned from other files: corpora, or the weights that "
-                "it began with, have changed since; choose another --out, or restore them"
+                f"{path} is of a run that learned from other files: corpora, scenes, or the first "
+                "weights have changed since; choose another --out, or restore them"
             )
+        other = "choose another --out, or go back to that revision"
+        require(made_by == self.revision, f"revision of {path}", self.revision, made_by, other)
         weights = self.out / f"{trainer.policy}.npz"
         if self.progress.best and not weights.is_file():
             raise ValueError(f"No such file: {weights}, the best weights; restore it, or {remedy}")

@@ -5,8 +5,10 @@ Policy Learning" (2025). Different here: the convolutional and recurrent variant
 perceptron; depth to 12 m as 3 / z - 0.6 instead of 1 - range / 5 m; the nearest surface in each
 pixel instead of one ray; 15 Hz instead of 30; accelerations without gravity; 64 environments
 instead of 1024; in the loss, desired velocities along the path around obstacles (time of arrival)
-instead of straight to the goal; the clearance terms of "Back to Newton's Laws: Learning
-Vision-based Agile Flight via Differentiable Physics" (2024); the benchmark's kinds of worlds.
+instead of straight to the goal; clearance terms after "Back to Newton's Laws: Learning
+Vision-based Agile Flight via Differentiable Physics" (2024), weighted by the speed of approach,
+through which the gradient flows, instead of that speed as a constant of at least 1 m/s; a vehicle
+that collides flies on until the update ends; the benchmark's kinds of worlds.
 """
 
 from dataclasses import dataclass, field, replace

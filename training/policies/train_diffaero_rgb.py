@@ -128,7 +128,7 @@ beyond 5; `error` the mean absolute error of all cells' inverse depths, 3 m / z.
 
     def __init__(self, config: DiffAeroRgbTraining) -> None:
         super().__init__(config)
-        require_view(self._data.camera.width, self._data.camera.height)
+        require_view(self._data.camera)
         self.network = DiffAeroRgbModule().to(config.device)
         policy = PolicyCheckpoint.load(config.policy, "diffaero", DIFFAERO_NETWORK)
         load_weights(self.network.policy, policy)

@@ -20,11 +20,10 @@ from pydrake.math import RigidTransform, RotationMatrix
 from torch import Tensor, nn
 
 from splatpilot.diagrams.worlds.appearance import randomize_appearance
-from splatpilot.diagrams.worlds.scene_folder import gaussians_file
 from splatpilot.diagrams.worlds.world_registry import make_world, scene_config
 from splatpilot.systems.common.progress import Progress
 from splatpilot.systems.common.provenance import VALIDATION_SEEDS, first_training_seed
-from splatpilot.systems.common.validation import bounded
+from splatpilot.systems.common.validation import bounded, require_field
 from splatpilot.systems.policies.base import (
     heading_frame,
     heading_observation,
@@ -52,7 +51,6 @@ from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.splats.baked_scene import BatchRenderer
 from splatpilot.systems.splats.splat_camera import color_pixels
 from splatpilot.training.corpus import library
-from splatpilot.training.corpus.library import training_scene
 from splatpilot.training.policies.augmentation import (
     Appearance,
     change_appearance,
@@ -198,6 +196,7 @@ class DistilledRgbTraining(RolloutTraining):
     def check(self) -> None:
         super().check()
         check_noise(self.noise, color=True, time=False)
+        require_field(self, "empty", self.empty == 0.0, "0: images show the obstacles")
 
 
 class DistilledRgbModule(DiffAeroRgbModule):
@@ -323,10 +322,7 @@ class DistilledRgbTrainer(RolloutTrainer):
         digest = blake2b(digest_size=16)
         for file, shipped in ((config.begin, "diffaero_rgb"), (config.teacher, "diffaero")):
             digest.update(Path(file or shipped_weights(shipped)).read_bytes())
-        for scene in dict.fromkeys(config.worlds.scenes):
-            found = training_scene(scene)
-            digest.update((gaussians_file(found) if found.is_dir() else found).read_bytes())
-        self.learns_from = digest.hexdigest()
+        self.learns_from += digest.hexdigest()
         selection, self._repaint = config.worlds, config.repaint
         camera = replace(DistilledRgbConfig().camera, merged_spread=config.merged_spread)
         first = first_training_seed(config.seed)

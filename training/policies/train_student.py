@@ -6,7 +6,7 @@ waypoints at 0.1 s with a cost each. The loss is relaxed winner-takes-all, and c
 clearance (equation 4). `docs/reproduction.md` lists the differences from the paper.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import ClassVar, NamedTuple
 
@@ -15,7 +15,8 @@ import torch
 from torch import Tensor
 
 from splatpilot.systems.collision.distance_field import soft_barrier
-from splatpilot.systems.common.validation import bounded, require_field
+from splatpilot.systems.common.config import dump_config
+from splatpilot.systems.common.validation import bounded, require, require_field
 from splatpilot.systems.policies.checkpoint import check_weights
 from splatpilot.systems.policies.hypotheses import WAYPOINT_PERIOD
 from splatpilot.systems.policies.student import (
@@ -26,6 +27,7 @@ from splatpilot.systems.policies.student import (
     load_checkpoint,
 )
 from splatpilot.systems.sensing.noise import ObservationNoise
+from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 from splatpilot.systems.vehicle.quadrotor import VEHICLE_RADIUS
 from splatpilot.systems.vehicle.state import rotation_matrices
 from splatpilot.training.policies.augmentation import (
@@ -121,8 +123,9 @@ def imitation_terms(errors: Tensor, epsilon: float) -> tuple[Tensor, Tensor]:
 
 
 def penalties(errors: Tensor, distances: Tensor) -> Tensor:
-    """Computes u_m (N, M) = L_m + GEOMETRIC_WEIGHT g_m of equation 4; g is the soft barrier of
-    equation 3, integrated over the trajectory by signed distances (N, M, T) [m]."""
+    """Computes u_m (N, M) = L_m + GEOMETRIC_WEIGHT g_m of equation 4, with the errors L_m to the
+    expert's best trajectory alone; g is the soft barrier of equation 3, integrated over the
+    trajectory by signed distances (N, M, T) [m]."""
     barrier = WAYPOINT_PERIOD * soft_barrier(distances, VEHICLE_RADIUS).sum(2)
     return errors + GEOMETRIC_WEIGHT * barrier
 
@@ -164,6 +167,10 @@ of error and clearance."""
         self.policy = f"student_{config.observation}"
         camera = self._data.camera
         size = camera.width, camera.height, camera.fov_x
+        # Others are not kept with the weights.
+        level = replace(camera, X_BC=OnboardCamera().X_BC, fov_y=None, distortion=None)
+        condition = "level, with square pixels and without distortion"
+        require(camera == level, "the camera of the corpora", condition, dump_config(camera))
         self.spec = StudentSpec(config.observation, *size, nominal_speed=self._data.speed)
         self.network = StudentModule(self.spec)
         if config.begin:

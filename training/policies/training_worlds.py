@@ -4,7 +4,9 @@ in which it does not fly."""
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, field
+from hashlib import blake2b
 from itertools import cycle
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,6 +14,7 @@ import torch
 from joblib import Memory
 from torch import Tensor
 
+from splatpilot.diagrams.scenarios import scenario_file
 from splatpilot.diagrams.worlds.feasibility import choose_start_and_goal
 from splatpilot.diagrams.worlds.world_registry import (
     WorldConfig,
@@ -222,6 +225,18 @@ class WorldSelection(Config):
         library.check_library(self.kinds, self.scenes)
         for scene in self.scenes:
             library.training_scene(scene)
+
+    def digest(self) -> str:
+        """Computes a digest of the files of kinds and scenes."""
+        files = [scenario_file(kind) for kind in self.kinds]
+        for scene in map(library.training_scene, self.scenes):
+            files += sorted(filter(Path.is_file, scene.iterdir())) if scene.is_dir() else [scene]
+        made_later = "metrics.json", "views.png"
+        digest = blake2b(digest_size=16)
+        for file in files:
+            if file.name not in made_later:
+                digest.update(file.read_bytes())
+        return digest.hexdigest()
 
     @property
     def turns(self) -> list[str]:

@@ -1,7 +1,8 @@
 import cv2
 import numpy as np
 import pytest
-from pydrake.math import RollPitchYaw
+from pydrake.common.schema import Transform
+from pydrake.math import RigidTransform, RollPitchYaw
 
 from splatpilot.systems.policies.diffaero_rgb import (
     DiffAeroRgb,
@@ -26,6 +27,21 @@ from splatpilot.systems.sensing.onboard_camera import OnboardCamera
 def test_cameras_without_the_view_are_refused(size, fov_x, message):
     with pytest.raises(ValueError, match=message):
         DiffAeroRgb(DiffAeroRgbConfig(camera=OnboardCamera(*size, fov_x=fov_x)))
+
+
+@pytest.mark.parametrize(
+    ("camera", "message"),
+    [
+        (OnboardCamera(160, 90, fov_x=90.0, fov_y=90.0), "fov_y must be left out"),
+        (
+            OnboardCamera(160, 90, fov_x=90.0, X_BC=Transform(RigidTransform())),
+            "X_BC must be that of a camera along body x",
+        ),
+    ],
+)
+def test_cameras_of_other_rays_are_refused(camera, message):
+    with pytest.raises(ValueError, match=message):
+        DiffAeroRgb(DiffAeroRgbConfig(camera=camera))
 
 
 def test_rays_are_those_of_the_camera():

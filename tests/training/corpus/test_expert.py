@@ -1,3 +1,5 @@
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -88,3 +90,8 @@ def test_states_without_a_path_are_not_labeled():
     before, behind = hover_state([8.0, 2.0, 2.0]), hover_state([3.0, 2.0, 2.0])
     [label] = labeler.labels([behind, before])
     np.testing.assert_array_equal(label.state, before)
+    world = SimpleNamespace(distance_field=esdf)
+    starts = np.stack([behind[:3], before[:3]])
+    lost, flown = fly_planner(starts, world, ExpertConfig(), labeler)  # pyright: ignore
+    assert (lost.outcome, lost.labels) == (Outcome.TIMEOUT, [])
+    assert flown.outcome is Outcome.GOAL

@@ -69,6 +69,7 @@ def test_appearance_has_its_sizes():
     stops = (change_appearance(color, Appearance(2.0, 0.0), generator)[:, 0, 0, 0] / 20.0).log2()
     assert stops.min() == pytest.approx(-2.0, abs=0.02)
     assert stops.max() == pytest.approx(2.0, abs=0.02)
+    assert change_appearance(10.0 * color, Appearance(2.0, 0.0), generator).max() == 255.0
     gray = change_appearance(color, Appearance(0.0, 180.0), generator)
     torch.testing.assert_close(gray, color, atol=1e-4, rtol=0)
     red = torch.tensor([90.0, 0.0, 0.0]).expand(500, 1, 1, 3)

@@ -15,6 +15,7 @@ from splatpilot.training.policies.student_data import (
     FrozenFeatures,
     StudentData,
     encode_images,
+    held_out_worlds,
     is_held_out,
 )
 
@@ -95,6 +96,21 @@ def test_corpora_of_test_scenes_are_refused(two, monkeypatch, digest, message):
     monkeypatch.setattr(source, "world", InsertedConfig(path="corridor"))
     monkeypatch.setattr(source, "source_digest", digest)
     with pytest.raises(ValueError, match=message):
+        StudentData(two, 0.3)
+
+
+def test_worlds_of_one_scene_are_on_one_side(two, monkeypatch):
+    records = {record.name: record for record in two[0].worlds}
+    assert 0 < len(held_out_worlds(records, HELD_OUT)) < len(records)
+    for record in records.values():
+        monkeypatch.setattr(record.source, "source_digest", ["0123456789abcdef"])
+    assert len(held_out_worlds(records, 0.01)) in (0, len(records))
+    assert len(held_out_worlds(records, 1.0)) == len(records)
+
+
+def test_corpora_for_validation_are_not_trained_on(two, monkeypatch):
+    monkeypatch.setattr(two[0].config.worlds, "held_out", True)
+    with pytest.raises(ValueError, match=r"must be a corpus to train with, got one of worlds.held"):
         StudentData(two, 0.3)
 
 

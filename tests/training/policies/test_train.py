@@ -241,7 +241,10 @@ def test_run_with_changed_inputs_is_not_resumed(tmp_path, monkeypatch):
     assert (tmp_path / "curves.csv").read_text() == curves
     with monkeypatch.context() as patch:
         patch.setattr(Reader, "learns_from", "another")
-        refused("learned from other files: corpora, or the weights")
+        refused("learned from other files: corpora, scenes, or the first weights")
+    with monkeypatch.context() as patch:
+        patch.setattr(train, "revision", lambda: "another")
+        refused("revision of .*checkpoint.pt must be another, got .*; choose another --out")
     weights = (tmp_path / "diffaero.npz").rename(tmp_path / "weights")
     refused(r"No such file: .*diffaero\.npz, .* delete .*checkpoint")
     weights.rename(tmp_path / "diffaero.npz")

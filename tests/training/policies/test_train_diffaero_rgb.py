@@ -68,7 +68,7 @@ def test_trained_network_predicts_depth_and_flies(trained):
     rows = list(csv.DictReader((trained / "curves.csv").open()))
     curve = [{name: float(value) for name, value in row.items() if value} for row in rows]
     assert curve[-1]["likelihood"] < curve[0]["likelihood"] - 0.3
-    assert curve[-1]["error"] < 0.7 * curve[0]["error"]
+    assert curve[-1]["error"] < 0.8 * curve[0]["error"]
     file = str(trained / "diffaero_rgb.npz")
     shipped = PolicyCheckpoint.load(None, "diffaero", DIFFAERO_NETWORK).weights
     with np.load(file) as weights:
