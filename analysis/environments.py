@@ -204,6 +204,8 @@ def make(
                 require_existing(source, f"the capture, mesh or OctoMap of {name}")
             print(f"{name}: is left out, without {source}", flush=True)
             del chosen[name]
+    remedy = f"give --data, or set {DATA}"
+    require(chosen, f"environments whose sources are in {data}", "one or more", "none", remedy)
     failed = []
     for number, (name, entry) in enumerate(chosen.items(), 1):
         print(f"== {name} ({number} of {len(chosen)}), from {sources[name]}", flush=True)
@@ -280,9 +282,7 @@ def _store(scenes: Path, record: Record) -> None:
 def _source(entry: Entry, data: Path | None) -> Path | str:
     if entry.source in benchmark_scenarios():
         return entry.source
-    if data is None:
-        raise ValueError(f"No folder with {entry.source}; give --data or set {DATA}")
-    return data / entry.source
+    return (data or Path(f"${DATA}")) / entry.source
 
 
 def _make(

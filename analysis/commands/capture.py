@@ -134,7 +134,9 @@ _OUT = cli.out_option("folder of scenes (default: $SPLATPILOT_SCENES, or scenes)
 
 @cli.command(
     "library make",
-    cli.Option("names", "hospital, cafe, ... (default: all)", nargs="*", metavar="NAME"),
+    cli.Option(
+        "names", "hospital, cafe, ... (default: all whose sources exist)", nargs="*", metavar="NAME"
+    ),
     cli.Option("--data", "folder of captures, meshes and maps (default: $SPLATPILOT_DATA)", Path),
     cli.Option(
         "--split", "only environments of this split", choices=("train", "validation", "test")

@@ -105,12 +105,9 @@ def check_kind(path: Path, *accepted: str) -> None:
     if path.is_dir():
         kind = "scene" if (path / "scene.yaml").is_file() else ""
         kind = "gaussians" if (path / "means_l.webp").is_file() else kind  # an unbundled SOG
-        if not kind and "capture" not in accepted:  # takes seconds to import, for a message
-            from splatpilot.training.captures.capture_registry import CAPTURES
-
-            captures = map(CAPTURES.find, CAPTURES.names())
-            kind = "capture" if any(each.recognizes(path) for each in captures) else ""
-            require(kind, str(path), _list_kinds(accepted), "a folder without scene.yaml")
+        if not kind and "capture" not in accepted:
+            remedy = f"of a capture, {_KINDS['capture'][1].format(path=path)}"
+            require(kind, str(path), _list_kinds(accepted), "a folder without scene.yaml", remedy)
     if kind and kind not in accepted:
         what, remedy = _KINDS[kind]
         require(False, str(path), _list_kinds(accepted), what, remedy.format(path=path))

@@ -64,19 +64,18 @@ def _flight_name(options: argparse.Namespace, scenario: Any) -> str:
     return flight_name(Path(world).stem, policy, policy_speed(scenario.policy), scenario.seed)
 
 
-def _world_defaults(options: argparse.Namespace) -> Any:
+def _scenario_defaults(options: argparse.Namespace) -> Any:
     from splatpilot.diagrams.flight.scenario import Scenario
     from splatpilot.systems.common.config import load_config
-    from splatpilot.training.captures.capture_config import CaptureConfig
 
-    if Path(options.what).is_dir():
-        return CaptureConfig()
     return load_config(
         Scenario(), scenario_file(options.what) if options.what in SCENARIOS else None
     )
 
 
-WORLD_FIELDS = cli.set_option("world.spacing=2.4", "world.height=8", configuration=_world_defaults)
+WORLD_FIELDS = cli.set_option(
+    "world.spacing=2.4", "world.height=8", configuration=_scenario_defaults
+)
 
 
 @cli.command(

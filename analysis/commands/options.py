@@ -252,7 +252,7 @@ def read_scenario(options: argparse.Namespace) -> "Scenario":
     if options.speed is not None:
         scenario.policy = at_speed(scenario.policy, options.speed)
     if options.scene is not None:
-        scenario.world = scene_config(options.scene.absolute())
+        scenario.world = scene_config(require_scene(str(options.scene)).absolute())
     if options.seed is not None:
         scenario.seed = options.seed
     return sample_scenario(load_config(scenario, overrides=options.overrides))

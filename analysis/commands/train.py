@@ -134,13 +134,10 @@ def recover(options: argparse.Namespace) -> None:
     cli.JOBS,
     cli.CONFIG,
     cli.set_option(
-        *("expert.speed=2.5", "worlds.held_out=true", "perturbation.copies=3"),
+        *("expert.speed=2.5", "perturbation.copies=3"),
         configuration="splatpilot.training.corpus.corpus:CorpusConfig",
     ),
-    examples=(
-        "corpus make --out out/corpus --worlds 180",
-        "corpus make --out out/held_out --worlds 36 --set worlds.held_out=true",
-    ),
+    examples=("corpus make --out out/corpus --worlds 180",),
 )
 def make_corpus(options: argparse.Namespace) -> None:
     """Collects the samples that the folder is missing. The same command resumes, and extends the

@@ -197,7 +197,7 @@ def run(
     claim_folder(out / "ablation.yaml", study, overwrite)
     with resumable(lambda: f"arms that are finished are in {out}; the same command resumes"):
         result = AblationResult(
-            {each.name: _ablate(each, out / each.name, config, overwrite) for each in opened}
+            {each.name: _ablate(each, out / each.name, config) for each in opened}
         )
     for capture in opened:
         _write_grid(out / f"{capture.name}.png", capture, out / capture.name, result)
@@ -206,9 +206,7 @@ def run(
     return result
 
 
-def _ablate(
-    capture: Capture, out: Path, config: ReconstructConfig, overwrite: bool
-) -> dict[str, SceneMetrics]:
+def _ablate(capture: Capture, out: Path, config: ReconstructConfig) -> dict[str, SceneMetrics]:
     found = {}
     points = capture.points
     for arm in ARMS:
@@ -223,7 +221,7 @@ def _ablate(
                 points = triangulate(capture, [i for i in range(len(capture)) if i not in held_out])
             source = replace(capture, points=points) if arm.step == "points" else capture
             with resumable(partial(kept_work, scene)):
-                reconstruct(source, scene, arm_config(arm, config), restart=overwrite)
+                reconstruct(source, scene, arm_config(arm, config))
             write_text(file, recipe)
         found[arm.key] = read_metrics(scene) or measure_scene(scene, capture)
     return found

@@ -371,7 +371,9 @@ def AddObservation(
     builder.Connect(pose, camera.GetInputPort("body_pose"))
     rendered = {"depth_image_32f" if name == "depth_grid" else name for name in names}
     images = {name: camera.GetOutputPort(name) for name in sorted(rendered)}
-    depth_sensor = imaging.depth_sensor("depth_grid" in names)
+    depth_sensor = None
+    if "depth_image_32f" in images:
+        depth_sensor = imaging.depth_sensor("depth_grid" in names, config)
     if isinstance(depth_sensor, Stereo) and depth_sensor.matching and "depth_image_32f" in images:
         matcher = builder.AddNamedSystem("depth_sensor", StereoMatcher(depth_sensor, config))
         for name, each in StereoMatcher.cameras(depth_sensor, config).items():

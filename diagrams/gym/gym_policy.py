@@ -44,7 +44,7 @@ class GymPolicy(LeafSystem):
 
     Args:
         predict: from the observation of one vehicle to its action (n,) in [-1, 1].
-        config: of the environment of the training; its scenario and reward are not used.
+        config: of the environment of the training; of its scenario, gravity counts alone.
         world: of the flight, for the observation `obstacle`.
 
     Raises:

@@ -122,7 +122,9 @@ class VectorFlightEnv(VectorEnv):
         self.time_step = 1.0 / self.config.rate
         periods = {each.scenario.controller.period for each in configs}
         steps = {each.scenario.simulator.max_step_size for each in configs}
-        for name, values in (("controller.period", periods), ("simulator.max_step_size", steps)):
+        gravities = {config.gravity for config in configs}
+        alike = {"controller.period": periods, "simulator.max_step_size": steps}
+        for name, values in (alike | {"vehicle.gravity": gravities}).items():
             require(len(values) == 1, name, "the same in all scenarios", sorted(values))
         (period,), (step,) = periods, steps
         # As Drake divides the time between updates of the controller.
@@ -336,9 +338,9 @@ class VectorFlightEnv(VectorEnv):
             states=before,
             next_states=np.array(self._states, order="F"),
             p_WG=p_WG,
-            distances=self._distances,
+            distances=self._distances.copy(),
             actions=given,
-            previous_actions=self._previous,
+            previous_actions=self._previous.copy(),
             reached=reached,
             failed=terminated ^ reached,
             duration=self.time_step,

@@ -226,10 +226,14 @@ class MeshScene(BakedScene):
         distortion: Distortion | None = None,
         max_depth: float = np.inf,
         merged_spread: float = 0.0,
+        rows: tuple[int, int] | None = None,
         with_color: bool = True,
     ) -> RenderedView:
         """Renders color and depth; see `BakedScene.render`. The background is that of the mesh, and
         `merged_spread` has no effect."""
+        if rows is not None:
+            K, height = np.array(K, dtype=np.float64), rows[1] - rows[0]
+            K[1, 2] -= rows[0]
         span = max(near, _NEAR), min(far, _FAR)
         color, depth = self._images(K, (width, height), X_WC, span, distortion, with_color)
         view = RenderedView((color / 255).astype(np.float32), depth, (depth > 0).astype(np.float32))

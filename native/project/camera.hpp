@@ -19,7 +19,7 @@ struct CameraParameters {
   double radius_clip, eps2d;     // [px], [px^2]
   bool antialiased;
   Distortion distortion;
-  int rows_above, rows_below;  // of the whole image, of which these rows are a part
+  int rows_above, rows_below;  // of these rows in the whole image
   // Bounds of the slopes x/z, y/z of rays that meet the whole image, or these rows, or their
   // surroundings through a lens.
   double min_slope[2], max_slope[2], min_side[2], max_side[2];

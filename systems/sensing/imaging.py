@@ -107,7 +107,6 @@ def stereo_depth(
     A pixel is not measured if d is above `max_disparity` or not positive, if its match lies beyond
     the left border of the right image, or if a nearer surface hides it from the right camera.
     """
-    _require_pinhole("imaging.stereo", camera)
     pixels = sensor.width / camera.width  # of the sensor in one of the camera
     fb = camera.focal_x * pixels * sensor.baseline
     measured = np.isfinite(depth) & (depth > 0.0)
@@ -264,9 +263,13 @@ class Imaging(Config):
         fov_x, fov_y = scaled(nominal.fov_x), scaled(nominal.fov_y)
         return replace(nominal, fov_x=cast(float, fov_x), fov_y=fov_y)
 
-    def depth_sensor(self, is_grid: bool) -> Stereo | TimeOfFlightErrors | None:
-        """Returns the sensor of depth grids or else of depth images."""
+    def depth_sensor(
+        self, is_grid: bool, camera: OnboardCamera
+    ) -> Stereo | TimeOfFlightErrors | None:
+        """Returns the sensor of depth grids or else of depth images of a camera."""
         stereo = None if is_grid else self.stereo
+        if stereo is not None:
+            _require_pinhole("imaging.stereo", camera)
         return stereo or self.time_of_flight
 
 
@@ -357,7 +360,6 @@ class StereoMatcher(LeafSystem):
     def __init__(self, sensor: Stereo, camera: OnboardCamera) -> None:
         super().__init__()
         sensor.validate()
-        _require_pinhole("imaging.stereo", camera)
         self._sensor, self._camera = sensor, camera
         for name, config in self.cameras(sensor, camera).items():
             self.DeclareAbstractInputPort(name, Value(ImageRgba8U(config.width, config.height)))

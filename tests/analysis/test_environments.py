@@ -88,11 +88,12 @@ def test_missing_inputs_are_reported_first(tmp_path):
     out = tmp_path / "scenes"
     for names, data, error, words in (
         (["nowhere"], tmp_path, ValueError, "no environment 'nowhere'; there are hospital"),
-        (["forest_splat", "hospital"], None, ValueError, "No folder with tartanair/hospital; give"),
+        (["hospital"], None, FileNotFoundError, "No such file.*DATA/tartanair/hospital"),
+        ([], tmp_path / "empty", ValueError, "sources are in .*empty must be one or more"),
         (["bookstore"], tmp_path, FileNotFoundError, "No such file.*worlds/bookstore.gltf"),
     ):
         with pytest.raises(error, match=words):
-            environments.make(names=names, data=data, scenes=out)
+            environments.make(names=names, data=data, scenes=out, split="validation" * (not names))
     with pytest.raises(ValueError, match=r"library\.json must be an index, got none"):
         environments.show(scenes=out)
     assert not out.exists()

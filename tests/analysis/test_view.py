@@ -26,8 +26,8 @@ def read_data(page) -> dict:
 @pytest.fixture
 def show(tmp_path):
     """Writes a page; returns its data."""
-    return lambda what: read_data(
-        view.run(what=str(what), out=tmp_path / "page.html", overwrite=True)
+    return lambda what, **options: read_data(
+        view.run(what=str(what), out=tmp_path / "page.html", overwrite=True, **options)
     )
 
 
@@ -81,7 +81,7 @@ def test_scene_without_scale_or_capture_is_shown(room, show, monkeypatch):
 
 def test_capture_shows_its_measured_surfaces(room, show, monkeypatch):
     monkeypatch.setattr(view, "read_capture", lambda path, config: room.capture)
-    data = show(room.folder / "captures")
+    data = show(room.folder / "captures", overrides=["capture.depth_unit=5000"])
     assert data["grid"] is None and len(data["cameras"]["poses"]) == 16
     gaussians = capture_gaussians(room.capture, range(16))
     assert gaussians is not None

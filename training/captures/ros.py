@@ -3,9 +3,9 @@
 A bag has topics of color images, of depth images in their pixels (16UC1 in millimeters or 32FC1 in
 meters), of the calibration of the color camera, and of poses. Poses are those of the only topic of
 `PoseStamped`, `PoseWithCovarianceStamped`, `TransformStamped` or `Odometry`, of the body that
-`child_frame_id` names, moved to the frame of the images if `/tf_static` connects them; without such
-a topic they are those of `/tf`, from its root to that frame. Images and poses are written to the
-cache once, in TUM's format.
+`child_frame_id` names, if it names one, moved to the frame of the images by `/tf_static`; without
+such a topic they are those of `/tf`, from its root to that frame. Images and poses are written to
+the cache once, in TUM's format.
 """
 
 import json
@@ -60,7 +60,7 @@ _POSES = {
 }
 _TRANSPORTS = ("/compressed", "/compressedDepth", "/theora")
 _CAMERA = "camera.json"
-_VERSION = 2  # version of the cache's content; others are written again
+_VERSION = 3  # version of the cache's content; others are written again
 _MODELS = {"": opencv_lens, "plumb_bob": opencv_lens, "rational_polynomial": opencv_lens}
 _MODELS |= {"equidistant": fisheye_lens, "fisheye": fisheye_lens}
 

@@ -79,7 +79,7 @@ class StudentData:
         self.recovered = np.flatnonzero(~outside & recovered)
         self._shown = np.flatnonzero(~outside & ~recovered)
         if not (len(self.training) and len(self.held_out)):
-            numbers = map(_digest, map(_environment, self._records.values()))
+            numbers = map(_digest, _environments(self._records).values())
             smallest = ceil(100 * min(numbers) / _DIGESTS) / 100
             raise ValueError(
                 f"{len(self.held_out_worlds)} of {len(self.worlds)} worlds are held out, which "
@@ -150,15 +150,18 @@ class StudentData:
 
 def held_out_worlds(records: Mapping[str, WorldRecord], fraction: float) -> list[str]:
     """Returns the names, in order, of the `fraction` of all worlds that validate. Only the name of
-    a world counts, or the source of its scene, so that it stays on its side when corpora grow. The
-    worlds of a smaller fraction are among those of a larger one."""
-    return [n for n in sorted(records) if is_held_out(_environment(records[n]), fraction)]
+    a world counts, or the source of its scene if there are others, so that it stays on its side
+    when corpora grow. The worlds of a smaller fraction are among those of a larger one."""
+    environments = _environments(records)
+    return [name for name in sorted(records) if is_held_out(environments[name], fraction)]
 
 
-def _environment(record: WorldRecord) -> str:
-    """Returns the name of a generated world, or the digest of the source of a scene."""
-    source = record.source
-    return "".join(source.source_digest) or source.name
+def _environments(records: Mapping[str, WorldRecord]) -> dict[str, str]:
+    """Returns the source of the scene of each world, or else its name."""
+    sources = {name: "".join(record.source.source_digest) for name, record in records.items()}
+    if len(set(sources.values())) == 1:
+        return {name: name for name in records}
+    return {name: source or name for name, source in sources.items()}
 
 
 def is_held_out(name: str, fraction: float) -> bool:

@@ -196,7 +196,7 @@ class _Run:
         remedy = f"delete {path} to start again"
         try:
             saved = load_tensors(path)
-            learns_from, made_by = saved["learns_from"], saved["revision"]
+            learns_from, made_by = saved["learns_from"], saved.get("revision", "an older one")
             trainer.network.load_state_dict(saved["network"])
             self.optimizer.load_state_dict(saved["optimizer"])
             trainer.load_state_dict(saved["trainer"])
@@ -212,7 +212,8 @@ class _Run:
                 "weights have changed since; choose another --out, or restore them"
             )
         other = "choose another --out, or go back to that revision"
-        require(made_by == self.revision, f"revision of {path}", self.revision, made_by, other)
+        valid = made_by == self.revision or self.progress.update == self.schedule.updates
+        require(valid, f"revision of {path}", self.revision, made_by, other)
         weights = self.out / f"{trainer.policy}.npz"
         if self.progress.best and not weights.is_file():
             raise ValueError(f"No such file: {weights}, the best weights; restore it, or {remedy}")

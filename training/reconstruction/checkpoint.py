@@ -17,7 +17,7 @@ from splatpilot.training.reconstruction.config import ReconstructConfig
 from splatpilot.training.reconstruction.views import ReconstructionViews
 
 _VERSION = 3
-_REMEDY = "start again with --restart, which discards it"
+_REMEDY = "start again with --restart, or delete that file"
 # Fields that may differ when a run resumes: they do not change the optimization.
 _UNCOMPARED = {"threads", "checkpoint_every", "tensorboard", "split"}
 _UNCOMPARED |= {"voxel_size", "max_range", "distance_field"}

@@ -31,8 +31,9 @@ class ReconstructConfig(Config):
     resolution of the closest images, at most `max_gaussians`, if they start from depth, and 120,000
     if they start at random."""
     max_gaussians: int = bounded(0, "[0, inf)")
-    """Maximum number of Gaussians. 0 is 1,000,000 if they start from depth, else 180,000. Without
-    iterations, for which 0 is 180,000, it sets how finely texture is resolved."""
+    """Maximum number of Gaussians. 0 is 1,000,000, or `initial_gaussians` if more, if they start
+    from depth and none are added, else 180,000. Without iterations, it sets how finely texture is
+    resolved."""
     split: str = bounded("", "{, train, validation, test}")
     """Use of the scene; empty takes the capture's, or "train". Scenes of the benchmark are "test".
     """

@@ -232,9 +232,10 @@ def resolve_config(config: ReconstructConfig, capture: Capture) -> ReconstructCo
         fitted = len(capture) - len(held_out_frames(capture, config))
         iterations = min(max(_STEPS_PER_IMAGE * fitted, _MIN_STEPS), MAX_STEPS)
         iterations = iterations if kind == "depth" else MAX_STEPS
-    most = config.max_gaussians or _MAX_FROM_DEPTH
-    if not config.max_gaussians and (kind != "depth" or iterations == 0):
-        most = _MAX_ADDED
+    most = config.max_gaussians
+    if not most:
+        given = kind == "depth" and strategy == "none" and iterations > 0
+        most = max(config.initial_gaussians, _MAX_FROM_DEPTH) if given else _MAX_ADDED
     steps = {"strategy": strategy, "iterations": iterations, "max_gaussians": most}
     return replace(config, initialization=kind, **steps)
 

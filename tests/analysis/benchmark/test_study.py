@@ -10,6 +10,7 @@ from splatpilot.analysis.benchmark.study import (
     RolloutSpec,
     StudyConfig,
     default_policies,
+    own_speeds,
     parameter_rows,
     policy_texts,
     scenario_texts,
@@ -78,6 +79,7 @@ def test_own_policies_of_scenarios_are_the_default_and_fly_at_their_speed(short_
     with pytest.raises(ValueError, match=r"at 1.5 m/s, its own speed; give --speeds 1.5"):
         config.load_scenarios()
     assert replace(config, speeds=[1.5]).load_scenarios()["own"].policy.speed == 1.5
+    assert own_speeds(config) == [1.5] and own_speeds(StudyConfig(both, ["planner"])) == []
 
 
 def test_all_benchmark_scenarios_load():

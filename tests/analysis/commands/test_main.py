@@ -70,7 +70,11 @@ RENDER = (
         ("fly --set start=[1.5,0,0.2]", "0.200 m from the nearest surface"),
         ("fly --set 'camera.focal=!FocalLength {x: 0}'", "camera.focal must be positive"),
         ("fly --scenario nowhere.yaml", "No such file or folder: nowhere.yaml"),
-        ("fly --scene images", "got a capture; make a scene of it with `splatpilot reconstruct im"),
+        ("fly --scene images", "got a folder without scene.yaml; of a capture, make a scene of"),
+        ("scene measure folder", "must be a scene folder, got a folder without scene.yaml"),
+        ("gap nowhere", "No such file or folder: nowhere; expected a scene, here or in scenes"),
+        ("replay folder a b --video", "2 flights must be without options, got ['--video']"),
+        ("library make hospital --split train", "the split of hospital must be train, got test"),
         ("fly --scene room.gltf", RENDER),
         ("fly --scene damaged.ply", "damaged.ply"),
         ("fly --policy reactive:margin", "without a value; write reactive:margin=VALUE"),
@@ -171,8 +175,8 @@ LONG = [
     "library make forest_splat --out scenes",
     "reconstruct . --out scene",
     "scene ablate . --out study",
-    "scene fidelity . --out study",
-    "scene measure .",
+    "scene fidelity scene --out study",
+    "scene measure scene",
     "capture check .",
     "capture render P02 --out capture",
     "benchmark --out study --quick",
@@ -181,6 +185,8 @@ LONG = [
 
 def test_long_commands_announce_themselves_before_slow_imports(tmp_path):
     (tmp_path / "out" / "corpus" / "shards").mkdir(parents=True)
+    (tmp_path / "scene").mkdir()
+    (tmp_path / "scene/scene.yaml").touch()
     script = (
         "sys.modules |= dict.fromkeys(['numpy', 'pydrake', 'torch', 'yaml'])\n"  # import errors
         f"for words in {LONG}:\n"

@@ -36,7 +36,9 @@ def test_the_scenario_camera_changes_no_flight(post_world):
     np.testing.assert_array_equal(bare.states, watched.states)
 
 
-@pytest.mark.parametrize("name", ["planner", "reactive", "depthnav", "agile_autonomy"])
+@pytest.mark.parametrize(
+    "name", ["planner", "straight", "reactive", "diffaero", "depthnav", "agile_autonomy"]
+)
 def test_name_gives_a_policy_of_that_speed(name, post_world):
     reach = []
     for speed in (1.5, 3.0):

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import trimesh
 from PIL import Image
+from pydrake.math import RigidTransform
 
 from splatpilot.diagrams.worlds.mesh import check_mesh, mesh_digests, mesh_distance
-from splatpilot.diagrams.worlds.mesh_renderer import MeshRenderer
+from splatpilot.diagrams.worlds.mesh_renderer import MeshRenderer, MeshScene
 from splatpilot.diagrams.worlds.splits import find_test_source
 from splatpilot.systems.collision.field_mesh import add_primitive, data_uri
 from splatpilot.training.captures.coverage import look_along
@@ -150,6 +151,14 @@ def test_nothing_is_cut_behind_what_is_opaque(opengl, scene):
     frame = MeshRenderer(file, "y", SKY).render(behind, K, 32, 24)
     assert [color for color, _ in sides(frame)] == ["red", "red"]
     np.testing.assert_allclose(frame.depth[12, 8:24], 6 - WALL, atol=1e-4)
+
+
+def test_a_rolling_shutter_of_a_still_camera_changes_nothing(opengl, scene):
+    seen = MeshScene(scene({}, None), "y", (0.5, 0.5, 0.5), 1.0)
+    camera = np.array([[60.0, 0, 32], [0, 60.0, 24], [0, 0, 1]]), 64, 48, RigidTransform()
+    whole, rows = seen.render(*camera), seen.render(*camera, rows=(10, 30))
+    for one, other in zip(rows, whole, strict=True):
+        np.testing.assert_allclose(one, other[10:30], atol=1.1 / 255)
 
 
 @pytest.mark.parametrize("uri", ["grün weiß.png", "gr%C3%BCn%20wei%C3%9F.png"])

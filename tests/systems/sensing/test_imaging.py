@@ -13,7 +13,6 @@ from splatpilot.systems.sensing.imaging import (
     Compression,
     Imaging,
     Stereo,
-    StereoMatcher,
     TimeOfFlightErrors,
     correlated_noise,
     matched_depth,
@@ -71,7 +70,7 @@ def test_vignetting_follows_the_rays_of_a_lens():
     expected = np.nan_to_num((1.0 + (slopes**2).sum(-1)) ** -2)
     np.testing.assert_allclose(light_of_color(seen.astype(float)), expected, atol=4e-3)
     with pytest.raises(ValueError, match=r"imaging.stereo must be of a camera without distortion"):
-        StereoMatcher(Stereo(), camera)
+        Imaging(stereo=Stereo()).depth_sensor(False, camera)
     with pytest.raises(ValueError, match=r"imaging.focal_scale must be of a camera without dist"):
         Imaging(focal_scale=0.8).camera(camera)
 
@@ -92,9 +91,9 @@ def test_the_focal_length_changes_the_field_of_view(scale, fov_x):
 
 def test_depth_grids_come_from_time_of_flight_and_images_from_stereo():
     both = Imaging(stereo=Stereo(), time_of_flight=TimeOfFlightErrors())
-    assert both.depth_sensor(is_grid=True) is both.time_of_flight
-    assert both.depth_sensor(is_grid=False) is both.stereo
-    assert Imaging(stereo=Stereo()).depth_sensor(is_grid=True) is None
+    assert both.depth_sensor(True, CAMERA) is both.time_of_flight
+    assert both.depth_sensor(False, CAMERA) is both.stereo
+    assert Imaging(stereo=Stereo()).depth_sensor(True, CAMERA) is None
 
 
 DEPTH_CAMERA = OnboardCamera(width=64, height=36)

@@ -234,6 +234,15 @@ def test_run_with_changed_inputs_is_not_resumed(tmp_path, monkeypatch):
         with pytest.raises(ValueError, match=message):
             run(config=TinyTraining(), out=tmp_path, make=Reader)
 
+    with monkeypatch.context() as patch:
+        patch.setattr(
+            Reader, "begin_update", lambda self, update: interrupt() if update == 6 else None
+        )
+        with pytest.raises(KeyboardInterrupt):
+            run(config=TinyTraining(), out=tmp_path, make=Reader)
+    with monkeypatch.context() as patch:
+        patch.setattr(train, "revision", lambda: "another")
+        refused("revision of .*checkpoint.pt must be another, got .*; choose another --out")
     summary = run(config=TinyTraining(), out=tmp_path, make=Reader)
     curves = (tmp_path / "curves.csv").read_text()
     (tmp_path / "curves.csv").write_text(curves.splitlines()[0])
@@ -242,9 +251,6 @@ def test_run_with_changed_inputs_is_not_resumed(tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(Reader, "learns_from", "another")
         refused("learned from other files: corpora, scenes, or the first weights")
-    with monkeypatch.context() as patch:
-        patch.setattr(train, "revision", lambda: "another")
-        refused("revision of .*checkpoint.pt must be another, got .*; choose another --out")
     weights = (tmp_path / "diffaero.npz").rename(tmp_path / "weights")
     refused(r"No such file: .*diffaero\.npz, .* delete .*checkpoint")
     weights.rename(tmp_path / "diffaero.npz")
